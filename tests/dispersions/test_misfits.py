@@ -35,6 +35,11 @@ DRAWN = {
 }
 
 
+def roomy(parts):
+    """With samples and steps for a longer run, and faster modes, so that one program flies both."""
+    return replace(parts, clock=replace(parts.clock, after=64), substeps=30)
+
+
 @pytest.fixture(scope="module")
 def drawn():
     ready = scenario.study(scenario.from_tables({**FLIGHT, "dispersion": DRAWN}))
@@ -43,6 +48,7 @@ def drawn():
         "wheel_failure",
         "timing_jitter",
     }
+    ready = replace(ready, parts=roomy(ready.parts))
     return ready, montecarlo.run(ready.parts, ready.dispersion, 5, np.arange(3))
 
 
@@ -52,24 +58,26 @@ def numbers(flown, trial, name, *shape):
     return vector(np.array(kept).reshape(shape))
 
 
+def misfitted(parts, frequency, coupling, device, sensors):
+    """The flexible spacecraft with these misfits."""
+    body = parts.plant
+    plant = flexible_body.flexible(body.inertia, frequency, body.damping, coupling).with_rest_inverse()
+    device, sensors = actuators.Actuators(**device), replace(parts.sensors, **sensors)
+    return replace(parts, plant=plant, actuators=device, sensors=sensors)
+
+
 def test_every_trial_is_the_run_by_hand_of_its_row(drawn):
     ready, flown = drawn
-    body = ready.parts.plant
     for trial in range(3):
-        plant = flexible_body.flexible(
-            body.inertia, numbers(flown, trial, "mode_frequency", 2), body.damping,
+        by_hand = misfitted(
+            ready.parts,
+            numbers(flown, trial, "mode_frequency", 2),
             numbers(flown, trial, "mode_coupling", 2, 3),
+            {"scale": numbers(flown, trial, "actuator_scale", 3),
+             "directions": numbers(flown, trial, "actuator_misalignment", 3, 3).T},
+            {"misalignment": numbers(flown, trial, "star_tracker_misalignment", 3),
+             "rate_scale": numbers(flown, trial, "gyro_scale", 3)},
         )  # fmt: skip
-        device = actuators.Actuators(
-            scale=numbers(flown, trial, "actuator_scale", 3),
-            directions=numbers(flown, trial, "actuator_misalignment", 3, 3).T,
-        )
-        sensors = replace(
-            ready.parts.sensors,
-            misalignment=numbers(flown, trial, "star_tracker_misalignment", 3),
-            rate_scale=numbers(flown, trial, "gyro_scale", 3),
-        )
-        by_hand = replace(ready.parts, plant=plant.with_rest_inverse(), actuators=device, sensors=sensors)
         found = fly(by_hand, 5, trial).metrics
         for name in ("window_error", "peak_torque", "effort", "residual_modal", "peak_torque_delivered"):
             value = getattr(found, name)  # by another program: roundings differ
@@ -102,17 +110,20 @@ def test_a_misfit_of_nothing_changes_no_digit():
 
 
 def test_a_turned_star_tracker_turns_the_body_the_other_way_by_half_the_angle_in_the_error():
-    """No noise, no disturbance, rest: the law brings what it sees to the target."""
+    """No noise, no disturbance, no modes, rest: the law brings what it sees to the target."""
     tables = {
+        **FLIGHT,
         "controller": {"t_f": 5.0, "delta": 0.5, "error": "multiplicative", "k1": 4.0, "surface_rate": 2.0},
         "initial": {"rotvec_deg": [2.0, 0.0, 0.0]},
-        "disturbance": {"kind": "none"},
+        "disturbance": {"amplitude": [0.0, 0.0, 0.0]},
         "loop": {"mode": "sampled", "period": 0.25, "t_end": 20.0},
         "hardware": {"attitude_noise": 0.0, "rate_noise": 0.0},
     }
     parts = scenario.study(scenario.from_tables(tables)).parts
-    turn = np.array([1e-3, -2e-3, 5e-4])
-    log = fly(replace(parts, sensors=replace(parts.sensors, misalignment=vector(turn)))).log
+    turn, rigid = np.array([1e-3, -2e-3, 5e-4]), vector(np.zeros((2, 3)))
+    device = {"scale": vector(np.ones(3)), "directions": vector(np.eye(3))}
+    sensors = {"misalignment": vector(turn), "rate_scale": vector(np.ones(3))}
+    log = fly(misfitted(roomy(parts), parts.plant.frequency, rigid, device, sensors)).log
     np.testing.assert_allclose(Rotation.from_quat(log.x.q[-1]).as_rotvec(), -turn, rtol=0, atol=1e-9)
 
 
@@ -146,7 +157,8 @@ WHEELED = {
 @pytest.mark.parametrize("known", [False, True])
 def test_a_wheel_fails_and_the_others_take_over_where_it_is_known(known):
     failing = {"kind": "uniform", "earliest": 1.0, "latest": 3.0, "known": known}
-    ready = scenario.study(scenario.from_tables({**WHEELED, "dispersion": {"wheel_failure": failing}}))
+    drawn = {"wheel_failure": failing, "star_tracker_outage": {"kind": "uniform", "duration": 0.5, "latest": 3.0}}
+    ready = scenario.study(scenario.from_tables({**WHEELED, "dispersion": drawn}))
     run = runs.fly(ready, 0, 2)
     row = {key: float(v) for key, v in ready.dispersion.values(run.parts).items() if key.startswith("wheel_")}
     when, wheel = row["wheel_failure_time"], round(row["wheel_failure_wheel"]) - 1
@@ -166,9 +178,11 @@ def test_a_wheel_fails_and_the_others_take_over_where_it_is_known(known):
 
 
 def test_an_outage_of_the_whole_run_is_a_filter_that_corrects_nothing():
+    """With wheels of which one would fail after the end: the program of wheels that fail."""
     lasting = {"kind": "uniform", "duration": 100.0, "latest": 0.0}
-    tables = {key: table for key, table in WHEELED.items() if key != "wheels"}
-    ready = scenario.study(scenario.from_tables({**tables, "dispersion": {"star_tracker_outage": lasting}}))
+    after_end = {"kind": "uniform", "earliest": 50.0, "latest": 60.0}
+    drawn = {"star_tracker_outage": lasting, "wheel_failure": after_end}
+    ready = scenario.study(scenario.from_tables({**WHEELED, "dispersion": drawn}))
     run = runs.fly(ready, 0, 0)
     assert {key: float(v) for key, v in ready.dispersion.values(run.parts).items()}["star_tracker_outage_begin"] == 0.0
     parts = ready.parts
@@ -186,6 +200,7 @@ CHAIN = {
     "controller": {"t_f": 5.0, "delta": 0.45, "disturbance_bound": 0.0},
     "disturbance": {"kind": "constant", "amplitude": [0.01]},
     "loop": {"mode": "sampled", "period": 0.1, "t_end": 7.0},
+    "hardware": {"state_noise": [0.0, 0.0]},
     "dispersion": {"timing_jitter": {"kind": "uniform", "largest": 0.4, "smallest": 0.2}},
 }
 
