@@ -195,14 +195,16 @@ def made_of_a_run():
     return ("trial", "plan_trial", "plan_seed", "status", "reason", "bad_time", *catalogues.CATALOGUES["spacecraft"])
 
 
-def test_what_a_row_does_not_give_is_drawn(everything):
-    made, _, plan = everything
-    rates = pl.DataFrame({f"initial_w{k}": [0.01 * k, -0.01] for k in (1, 2, 3)})
-    drawn = of_plan(made, rates).draw(range(2))
-    given = list(rates.columns)
-    assert_frame_equal(drawn.select(given), rates)
-    others = [name for name in plan.columns if name not in given]
-    assert_frame_equal(drawn.select(others), plan.head(2).select(others), rel_tol=1e-14, abs_tol=1e-18)
+def test_what_a_row_does_not_give_is_drawn():
+    made = campaign.Campaign(ready(CHAIN), SEED)
+    plan = made.draw(range(2))
+    states = pl.DataFrame({f"initial_x{k}": [0.1 * k, -0.1] for k in (1, 2, 3)})
+    drawn = of_plan(made, states).draw(range(2))
+    given = list(states.columns)
+    assert_frame_equal(drawn.select(given), states)
+    others = [name for name in plan.columns if name not in given and name != "initial_angle"]
+    assert sum(name.startswith("state_noise") for name in others) == 3
+    assert_frame_equal(drawn.select(others), plan.select(others), rel_tol=1e-14, abs_tol=1e-18)
 
 
 FILTER = '[filter]\nkind = "steady_state"\n'

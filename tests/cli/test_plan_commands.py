@@ -6,14 +6,17 @@ import polars as pl
 import pytest
 
 from ptsmc_jax.campaigns import campaign
+from tests.helpers import SHORT_CHAIN
 from tests.output.pages import checked
 
-CORNERS = "initial_w1,initial_w2,initial_w3\n0.02,0.0,0.0\n0.0,0.02,0.0\n0.0,0.0,-0.02\n"
+CORNERS = "initial_x1,initial_x2\n1.4,0.0\n1.0,0.02\n0.5,-0.02\n"
+CHAIN = SHORT_CHAIN.replace("[dispersion]", '[dispersion]\nstate_noise = { kind = "relative_normal" }')
 
 
 @pytest.fixture(autouse=True)
-def _small_parts(monkeypatch):
+def _small_parts_of_a_chain(monkeypatch, command, tmp_path):
     monkeypatch.setattr(campaign, "PART", 100)
+    (tmp_path / "s.toml").write_text(CHAIN)
 
 
 def rows_of(folder):
@@ -41,8 +44,8 @@ def test_corner_cases_are_flown_resumed_replayed_and_put_on_a_page(command, tmp_
     assert "for trials drawn at random: of the plan as far as its rows are" in said
     rows = rows_of(folder)
     assert rows["trial"].to_list() == [0, 1, 2]
-    assert rows["initial_w3"].to_list() == [0.0, 0.0, -0.02]
-    assert rows["initial_q1"].n_unique() == 3  # attitudes are drawn as ever
+    assert rows["initial_x2"].to_list() == [0.0, 0.02, -0.02]
+    assert rows["state_noise_1"].n_unique() == 3  # noises are drawn as ever
     read = checked(folder)
     assert "ptsmc montecarlo scenario.toml --plan corners.csv --seed 1000" in read.text
 
@@ -50,11 +53,11 @@ def test_corner_cases_are_flown_resumed_replayed_and_put_on_a_page(command, tmp_
     part.unlink()
     assert command(*asked, "--quiet")[0] == 0  # again what is missing
     assert rows_of(folder).equals(rows)
-    assert command("worst", folder, "--by", "peak_rate", "-n", 1)[0] == 0
+    assert command("worst", folder, "--by", "peak_torque", "-n", 1)[0] == 0
     code, said, _ = command("replay", folder, "--trial", 1, "--no-figures")
     assert (code, "equal to its row, to the last digit" in said) == (0, True)
     history = pl.read_csv(folder / "replay" / "1" / "trajectory.csv")
-    assert history["w2"][0] == 0.02
+    assert history["x2"][0] == 0.02
     assert command("replay", folder, "--trial", 3)[0] == 2
 
     (tmp_path / "corners.csv").write_text(CORNERS.replace("-0.02", "-0.03"))
@@ -66,7 +69,7 @@ def test_corner_cases_are_flown_resumed_replayed_and_put_on_a_page(command, tmp_
         assert (code, out) == (2, "")
         assert "plan.parquet is not the plan that the campaign was begun with" in error
     assert command(*asked, "--force", "--quiet")[0] == 0
-    assert rows_of(folder)["initial_w3"][2] == -0.03
+    assert rows_of(folder)["initial_x2"][2] == -0.03
     assert command("montecarlo", "s.toml", "--out", folder, "--force", "--quiet", "--trials", 5, "--no-figures")[0] == 0
     assert not (folder / "plan.parquet").exists()
 
@@ -76,13 +79,13 @@ def test_corner_cases_are_flown_resumed_replayed_and_put_on_a_page(command, tmp_
     [
         (["--plan", "none.csv"], "--plan is none.csv, which is not there"),
         (["--plan", "s.toml"], "--plan is s.toml, but must be a .csv or .parquet file"),
-        (["--plan", "bad.csv"], "the plan bad.csv has initial_w2 nan in row 1, but must have a finite number"),
+        (["--plan", "bad.csv"], "the plan bad.csv has initial_x2 nan in row 1, but must have a finite number"),
         (["--plan", "bad.csv", "--trials", "5"], "--trials does not go with --plan"),
         (["--plan", "bad.csv", "--until-confident", "0.1"], "does not go with --plan"),
     ],
 )
 def test_a_plan_that_cannot_be_flown_is_refused_and_nothing_is_written(command, tmp_path, options, said):
-    (tmp_path / "bad.csv").write_text("initial_w1,initial_w2,initial_w3\n0,0,0\n0,nan,0\n")
+    (tmp_path / "bad.csv").write_text("initial_x1,initial_x2\n0,0\n0,nan\n")
     code, out, error = command("montecarlo", "s.toml", *options)
     assert (code, out) == (2, "")
     assert said in error
