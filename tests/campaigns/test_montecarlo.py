@@ -8,7 +8,7 @@ from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.dispersions import attitudes, variation
 from ptsmc_jax.simulation import rollout
-from tests.helpers import FIRST_FLIGHT, parts, short, vector
+from tests.helpers import FIRST_FLIGHT, short, vector
 
 # eta, delta [s], observer gain: RMS window error and mean peak torque [N m], without and with noise (theory notes, 6)
 TABLE = (
@@ -21,17 +21,21 @@ TABLE = (
 SPREAD = variation.Dispersion(attitudes.AxisAngle(vector(np.deg2rad(20.0)), vector(np.deg2rad(140.0))))
 
 
+# on the flight clock one program flies all gains
+FIRST = scenario.replace(scenario.read(FIRST_FLIGHT), controller__delta=0.5, loop__clock="flight")
+
+
 @pytest.fixture(scope="module")
 def flown():
-    run = parts(20.0, 3.0, 0.5, period=0.1, noise=(2e-5, 1e-6), t_end=22.0)
+    run = scenario.study(FIRST).parts
     return run, montecarlo.run(run, SPREAD, 5, np.arange(256))
 
 
 def test_256_trials_equal_the_loop_over_them(flown):
-    """Each flown alone."""
+    """Flown alone, every fifth of them, and the last and the first of each device."""
     run, trials = flown
     draw = jax.jit(lambda trial: SPREAD.apply(run, np.uint32(5), trial))
-    for k in range(256):
+    for k in {*range(0, 256, 5), 127, 128, 255}:
         drawn = draw(np.uint32(k))
         alone = rollout.simulate_jit(drawn, np.uint32(5), np.uint32(k))
         assert int(alone.status) == trials.status[k]
@@ -113,13 +117,8 @@ def test_failed_trials_are_counted_and_leave_the_others_alone(flown):
 
 @pytest.mark.parametrize(("eta", "delta", "gain", "quiet", "noisy"), short(TABLE, TABLE[::4]))
 def test_sampling_and_noise_do_what_the_theory_notes_measured(eta, delta, gain, quiet, noisy):
-    base = scenario.replace(
-        scenario.read(FIRST_FLIGHT),
-        controller__eta=eta,
-        controller__delta=delta,
-        observer__gain=[gain] * 3,
-        loop__clock="flight",  # one program for all rows
-    )
+    gains = {"controller__eta": eta, "controller__delta": delta, "observer__gain": [gain] * 3}
+    base = scenario.replace(FIRST, **gains)
     silent = scenario.replace(base, hardware={"attitude_noise": 0.0, "rate_noise": 0.0})
     for case, (rms, peak) in ((silent, quiet), (base, noisy)):
         ready = scenario.study(case)
