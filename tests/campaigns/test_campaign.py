@@ -14,12 +14,14 @@ from ptsmc_jax import configure, scenario
 from ptsmc_jax.campaigns import campaign, montecarlo, rows, runs
 from tests.helpers import SHORT, SHORT_CHAIN, same, short, untuned
 
-TABLES = untuned(SHORT)
+
+def of_scenario(tables, seed):
+    return campaign.Campaign(scenario.study(scenario.from_tables(tables)), seed)
 
 
 @pytest.fixture(scope="module")
 def flown():
-    made = campaign.Campaign(scenario.study(scenario.from_tables(TABLES)), 3)
+    made = of_scenario(untuned(SHORT_CHAIN), 3)
     return made, made.fly(range(300))
 
 
@@ -27,9 +29,7 @@ def test_a_row_says_everything_of_its_trial(flown):
     made, frame = flown
     assert frame.columns[:4] == ["trial", "status", "reason", "bad_time"]
     assert frame.columns[4 : 4 + len(made.ready.catalogue)] == list(made.ready.catalogue)
-    assert frame.columns[4 + len(made.ready.catalogue) :] == [
-        "initial_angle", *(f"initial_q{k}" for k in range(1, 5)), *(f"initial_w{k}" for k in range(1, 4))
-    ]  # fmt: skip
+    assert frame.columns[4 + len(made.ready.catalogue) :] == ["initial_angle", "initial_x1", "initial_x2"]
     assert frame["trial"].to_list() == list(range(300))
     assert frame["bad_time"].null_count() == 300
     run = runs.fly(made.ready, 3, 250)
@@ -67,8 +67,11 @@ def test_the_plan_is_what_is_flown(flown):
 def test_a_third_that_goes_wrong_leaves_the_others_as_they_are():
     """Starts near 180 deg: a third of the trials comes upon the law's singularity, or tumbles."""
     far = {"kind": "axis_angle", "min_deg": 170.0, "max_deg": 180.0}
-    made = campaign.Campaign(scenario.study(scenario.from_tables({**TABLES, "dispersion": {"attitude": far}})), 0)
+    made = of_scenario({**untuned(SHORT), "dispersion": {"attitude": far}}, 0)
     frame = made.fly(range(600))
+    assert frame.columns[4 + len(made.ready.catalogue) :] == [
+        "initial_angle", *(f"initial_q{k}" for k in range(1, 5)), *(f"initial_w{k}" for k in range(1, 4))
+    ]  # fmt: skip
     bad = frame.filter(pl.col("status").is_in(["diverged", "singular"]))
     assert 0.2 < bad.height / 600 < 0.5
     assert {"singular", "diverged"} == set(bad["status"])
@@ -170,7 +173,7 @@ def overshoot(result, parts):
 
 
 def test_metrics_of_ones_own_stand_in_the_rows():
-    made = campaign.Campaign(scenario.study(scenario.from_tables(untuned(SHORT_CHAIN))), 3)
+    made = of_scenario(untuned(SHORT_CHAIN), 3)
     own = replace(made, own=overshoot)
     assert own.own_names() == ["overshoot", "rows"]
     more = own.fly(range(100))
@@ -222,7 +225,7 @@ def test_histories_are_those_of_the_runs(flown):
 
 @pytest.mark.parametrize("kind", [np.float64, np.float32])
 def test_what_a_trial_lacks_is_null_whatever_the_precision(monkeypatch, kind):
-    made = campaign.Campaign(scenario.study(scenario.from_tables(tomllib.loads(SHORT_CHAIN))), 3)
+    made = of_scenario(tomllib.loads(SHORT_CHAIN), 3)
     flown = montecarlo.run(made.ready.parts, made.ready.dispersion, 3, np.arange(montecarlo.FEW))
     lacking = flown.metrics._replace(settling_time=np.full(montecarlo.FEW, np.nan))
     as_kind = replace(
