@@ -1,6 +1,7 @@
 """Other parameters in the struct, without another export, fly what the library flies with them."""
 
 import subprocess
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -73,7 +74,8 @@ def off(known, library):
     """Largest difference of a command by C from one by the library, of the largest one; two trials."""
     ready = scenario.study(folder.flown(known))
     computer, trials = board(ready.parts), jnp.arange(2, dtype=jnp.uint32)
-    flown = vectors.fly_many(ready.parts, vectors.known_alike(ready.dispersion), jnp.uint32(0), trials)
+    parts = replace(ready.parts, substeps=10)  # as many for all gains, which one program then flies
+    flown = vectors.fly_many(parts, vectors.known_alike(ready.dispersion), jnp.uint32(0), trials)
     flown = jax.tree.map(np.asarray, flown)
     at, worst = library.columns["out"].index("command[0]"), 0.0
     for k in range(len(trials)):
