@@ -5,7 +5,10 @@ import os
 import re
 import shutil
 import subprocess
+from dataclasses import replace
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -13,6 +16,7 @@ import pytest
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.onboard import folder
+from ptsmc_jax.onboard.board import board
 from ptsmc_jax.onboard.library import compiler
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.law_tables import LAWS
@@ -182,6 +186,28 @@ def test_a_continuous_loop_and_a_full_folder_are_refused(exported, tmp_path):
     with pytest.raises(RefusedError, match="holds something already"):
         folder.export(scenario.from_tables({"loop": {"mode": "sampled"}}), exported)
     assert not (tmp_path / "x").exists()
+
+
+def test_a_filter_of_the_command_goes_on_by_a_whole_period_wherever_samples_are_missed():
+    """The prewarped tan(W h / 2) of a gap may be anything; at the first sample there is none, and nothing goes out."""
+    tables = flight(controller={"error": "multiplicative"}, hardware={"command_filter": {"kind": "first_order"}})
+    parts: Any = scenario.study(scenario.from_tables(tables)).parts
+    known = {"t": 1.0, "tracking": 1, "out.d_hat": np.zeros(3), "before.law": parts.controller.begin(),
+             "before.command_filter": np.zeros(3), "now.attitude": parts.initial.q, "now.rate": np.zeros(3),
+             "before.clearance_unit": 1.0, "last.command": np.ones(3), "last.s": np.zeros(3)}  # fmt: skip
+
+    def commanded(flown, gap):
+        made = board(flown)
+        (stage,) = (one for one in made.stages if one.name == "command")
+        read = [jax.tree.map(jnp.asarray, (known | {"dt": gap})[name]) for name in stage.reads]
+        return np.asarray(stage.run(made.parameters, *read)["out.command"])
+
+    period = float(parts.period)
+    g = np.tan(0.5 * float(parts.command_filter.corner) * period)
+    once = commanded(parts, period)
+    np.testing.assert_allclose(once, g / (1.0 + g) * commanded(replace(parts, command_filter=None), period), rtol=1e-13)
+    np.testing.assert_array_equal(commanded(parts, 7.0 * period), once)
+    np.testing.assert_array_equal(commanded(parts, 0.0), 0.0)
 
 
 def test_names_are_ones_that_c_takes():
