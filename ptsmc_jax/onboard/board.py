@@ -303,52 +303,47 @@ def _commanding(computer: Board, law: Law, observer: Observer, command_filter: C
         "command": f"what the law asks for{filtered}{computer.unit}",
         "s": "sliding variable",
     }
-    memories, shaped = ("before.law",), ()
+    memories, shaped = ["law"], ()
     if command_filter is not None:
         computer.state["command_filter"] = shapes(command_filter.begin(m))
         computer.about["command_filter"] = "integrators of the command's filter, advanced by half a period"
-        memories, shaped = ("before.law", "before.command_filter", "dt"), (command_filter,)
+        memories, shaped = ["law", "command_filter"], (command_filter,)
     singular = any(_depends(law.clearance, x, target))
     if singular:
         computer.state |= {"clearance": real(), "clearance_unit": real()}
         computer.about |= {"clearance": "distance from the law's singularity, by `clearance_unit` [-]",
                        "clearance_unit": "what that is counted in"}  # fmt: skip
 
-    def command(parameters: Any, t: Any, tracking: Any, d_hat: Any, *read: Any) -> dict[str, Any]:
-        known, period, filtering = parameters["law"], parameters["period"], parameters["command_filter"]
-        remembered, read = read[: len(memories)], read[len(memories) :]
-        now, reference = computer.state_of(read[: len(computer.seen)]), parameters["reference"](t)
+    seen = [f"now.{name}" for name in computer.seen]
+    reads = ("t", "tracking", "out.d_hat", *(f"before.{name}" for name in memories), *seen,
+             *(("dt",) if shaped else ()),
+             *(("before.clearance_unit", "last.command", "last.s") if singular else ()))  # fmt: skip
+
+    def command(parameters: Any, *read: Any) -> dict[str, Any]:
+        given, known, period = dict(zip(reads, read, strict=True)), parameters["law"], parameters["period"]
+        t, last = given["t"], {name: given[f"before.{name}"] for name in memories}
+        now, reference = computer.state_of(tuple(given[name] for name in seen)), parameters["reference"](t)
         hold = t >= known.hand_over - guards.rounding(period, known.hand_over)  # as the clock has it
 
-        def decided() -> Any:
-            u, s, after = known.command(
-                remembered[0], Sample(t, hold, period), now, reference, d_hat, parameters["bound"](t)
-            )
-            if filtering is None:
-                return u, s, (after,)
-            _, integrators, dt = remembered
-            before = jnp.where(dt > 0.0, period, 0.0)  # a whole period, also where samples were missed
-            u, integrators = filtering.step(integrators, u, before, period)
-            return u, s, (after, integrators)
+        def decided() -> tuple[Any, Any, dict[str, Any]]:
+            sample, d_hat, k2 = Sample(t, hold, period), given["out.d_hat"], parameters["bound"](t)
+            u, s, law = known.command(last["law"], sample, now, reference, d_hat, k2)
+            if command_filter is None:
+                return u, s, {"law": law}
+            before = jnp.where(given["dt"] > 0.0, period, 0.0)  # a whole period, also where samples were missed
+            u, integrators = parameters["command_filter"].step(last["command_filter"], u, before, period)
+            return u, s, {"law": law, "command_filter": integrators}
 
-        def kept(after: tuple) -> dict[str, Any]:
-            return dict(zip(("now.law", "now.command_filter"), after, strict=False))
+        if singular:
+            distance = known.clearance(now, reference)
+            unit = jnp.where(given["tracking"] != 0, given["before.clearance_unit"], known.clearance_unit(distance))
+            clearance, stays = distance / unit, (given["last.command"], given["last.s"], last)
+            u, s, kept = jax.lax.cond(clearance >= SINGULAR_CLEARANCE, decided, lambda: stays)
+            kept |= {"clearance": clearance, "clearance_unit": unit}
+        else:
+            u, s, kept = decided()
+        return {"out.command": u, "out.s": s} | {f"now.{name}": value for name, value in kept.items()}
 
-        if not singular:
-            u, s, after = decided()
-            return {"out.command": u, "out.s": s, **kept(after)}
-        last_unit, last_u, last_s = read[len(computer.seen) :]
-        distance = known.clearance(now, reference)
-        unit = jnp.where(tracking != 0, last_unit, known.clearance_unit(distance))
-        clearance = distance / unit
-        stays = (last_u, last_s, remembered[:2])
-        u, s, after = jax.lax.cond(clearance >= SINGULAR_CLEARANCE, decided, lambda: stays)
-        written = {"now.clearance": clearance, "now.clearance_unit": unit}
-        return {"out.command": u, "out.s": s, **kept(after), **written}
-
-    states = tuple(f"now.{name}" for name in computer.seen)
-    lasts = ("before.clearance_unit", "last.command", "last.s") if singular else ()
-    reads = ("t", "tracking", "out.d_hat", *memories, *states, *lasts)
     about = f"The law: the input for the state as it is seen{filtered}; the last one where the law is singular."
     computer.stages.append(Stage("command", about, reads, command, (law, *shaped)))
 
