@@ -103,7 +103,7 @@ class Program:
     def _prepared(self, *args: Any, **kwargs: Any) -> None:
         known = self._known(args, kwargs)
         if known is not None and known[0] not in self._ready:
-            self._ready[known[0]] = _beside().submit(_on(configure.default_device(), self._begun), *known)
+            self._ready[known[0]] = _beside().submit(_as_here(self._begun), *known)
 
     def _placed(self, method: Callable, args: tuple, kwargs: dict) -> Any:
         """What the method returns, on the processor, where JAX would run something else that is not a batch."""
@@ -131,7 +131,7 @@ class Program:
         fixed = tuple((name, v) for name, v in bound.arguments.items() if name in self._static)
         leaves, structure = jax.tree.flatten(given)
         try:
-            key = (structure, tuple(_shape(leaf) for leaf in leaves), fixed)
+            key = (structure, tuple(_shape(leaf) for leaf in leaves), fixed, _bits())
             known = self._ready.get(key)
             said = self._said(key) if known is None or isinstance(known, Future) else ""
         except (_UnknownError, TypeError):  # traced, spread over devices, of a user's own class, not hashable
@@ -140,7 +140,7 @@ class Program:
 
     def _said(self, key: tuple) -> str:
         """All that the program hangs on, in words that mean the same in every process."""
-        structure, shapes, fixed = key
+        structure, shapes, fixed, _ = key  # bits are among the surroundings
         return repr((self._origin(), _structure(structure), shapes, _plain(fixed), self._options, _surroundings()))
 
     def _compiled(self, key: tuple, said: str, given: dict) -> Callable:
@@ -242,25 +242,32 @@ def _apart(function: Callable, *args: Any) -> Future:
     segmentation fault. An exit waits for threads.
     """
     alone = ThreadPoolExecutor(1, "compiling")
-    future = alone.submit(_on(configure.default_device(), function), *args)
+    future = alone.submit(_as_here(function), *args)
     alone.shutdown(wait=False)
     return future
 
 
-def _on(device: Any, function: Callable) -> Callable:
-    """The function as it runs in a thread whose default device is this one."""
+def _as_here(function: Callable) -> Callable:
+    """The function as it runs in another thread, with what this one has as default device and bits."""
+    device, bits = configure.default_device(), _bits()
 
     def called(*args: Any) -> Any:
-        with jax.default_device(device):
+        with jax.default_device(device), jax.enable_x64(bits):
             return function(*args)
 
     return called
+
+
+def _bits() -> bool:
+    """Whether numbers have 64 of them, in this thread."""
+    return bool(jax.config.jax_enable_x64)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def stop() -> None:
     """Compile nothing more beside: what has not begun is not needed any more."""
     if _beside.cache_info().currsize:
         _beside().shutdown(wait=False, cancel_futures=True)
+        _beside.cache_clear()
 
 
 @functools.cache

@@ -22,6 +22,8 @@ import jax  # noqa: E402
 jax.devices()  # reads the flags
 os.environ["XLA_FLAGS"] = os.environ["XLA_FLAGS"].replace(QUICKLY, "").strip()
 
+from tests import kept  # noqa: E402
+
 jax.config.update("jax_numpy_rank_promotion", "raise")
 # modules that name shapes: a function inside another is decorated anew whenever that one is called. Not folders, whose
 # names would stand for all modules in them
@@ -76,6 +78,12 @@ def pytest_xdist_make_scheduler(config, log):
 @pytest.fixture(autouse=True, scope="module")
 def _shapes_are_checked_where_a_thing_is_tested_by_itself(request):
     jaxtyping.config.update("jaxtyping_disable", request.path.parent.name in CALLERS)
+    kept.keep()
+
+
+@pytest.fixture(autouse=True)
+def _programs_are_kept():
+    kept.keep()
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -85,6 +93,7 @@ def _room_for_compiled_programs():
     maps = Path("/proc/self/maps")
     if maps.exists() and maps.read_bytes().count(b"\n") > MANY:
         jax.clear_caches()
+        kept.forget()
         gc.unfreeze()
         gc.collect()
     gc.freeze()  # programs live on: no collection is to walk through them again

@@ -114,6 +114,27 @@ def test_compiling_is_out_of_reach_of_a_ctrl_c(folder, monkeypatch):
     assert not [thread for thread in threads if thread.daemon]  # an exit waits for it
 
 
+def test_a_thread_with_bits_of_its_own_has_programs_of_its_own(folder):
+    """They are compiled in other threads, in which numbers would have 64 all the same."""
+    program, _ = spied()
+    double = program(X)["both"]
+    with jax.enable_x64(False):
+        program.prepare(X[:3])
+        single = program(X)["both"]
+        assert program(X[:3])["both"].dtype == single.dtype == np.float32
+    np.testing.assert_allclose(single, double, rtol=1e-6)
+    assert program(X)["both"].dtype == np.float64
+    assert len(list(folder.iterdir())) == 3
+
+
+def test_another_command_in_the_same_process_prepares_programs_too(folder):
+    program, _ = spied()
+    program.prepare(X)
+    programs.stop()
+    program.prepare(X[:3])
+    assert program(X[:3])["both"].shape == (3,)
+
+
 def test_what_is_not_to_be_compiled_is_not(folder):
     program, _ = spied()
     with jax.disable_jit():

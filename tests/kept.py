@@ -1,0 +1,86 @@
+"""Whole compiled programs kept between runs of the tests, as the command keeps them.
+
+Until a line of the code changes, no test traces again what an earlier run has traced. What a test patches, programs may
+hang on: numbers and words have a folder of their own, and with anything else in its place nothing is kept or loaded.
+Programs that were made without looking at shapes lie apart.
+"""
+
+import hashlib
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import jax
+import jaxtyping
+import pytest
+
+from ptsmc_jax import configure, programs
+from tests.tree import PACKAGES, QUICKLY
+
+programs.KEPT = 1500
+# rooms that compile nothing, and what else no program hangs on: sizes of searches and campaigns, what is called between
+# programs
+HOST = ("tuning.cli", "tuning.output", "tuning.studies", "ptsmc_jax.figures")
+OUTSIDE = set(
+    """
+    configure.configure programs.KEPT campaign.PART montecarlo.CAPACITY montecarlo.run montecarlo.block_size
+    margin_verdicts.TRIALS margin_verdicts.JUDGED margin_verdicts.OFF margin_verdicts.over_trials
+    worst.SCREENED worst.STEPS starts.SWEPT descents.MANY descents.again descents.explore descents.descend
+    cma_es.GENERATIONS global_check.GENERATIONS global_check.POPULATION flights.ROW flights.fly flights.trials
+    confirm.FRESH confirm.FEWEST confirm.count rounds.harder evaluate.slopes journal.get posing.search
+    systems._ran systems._files
+    """.split()
+)
+_setattr, _undo = pytest.MonkeyPatch.setattr, pytest.MonkeyPatch.undo
+_patched: dict[int, dict[str, Any]] = {}  # by whom, and what is in the place of what
+
+
+def keep() -> None:
+    """In the folder that goes with what is patched now, and whether shapes are looked at."""
+    patches = {name: value for by in _patched.values() for name, value in by.items()}
+    if "ptsmc_jax.configure.programs" in patches:  # the test itself says where
+        return
+    cache = jax.config.values["jax_compilation_cache_dir"]
+    if cache is None or not all(isinstance(value, int | float | str) for value in patches.values()):
+        configure.programs = None
+        return
+    made = repr((QUICKLY, sorted(patches.items()))).encode()
+    checked = "unchecked" if jaxtyping.config.jaxtyping_disable else "checked"
+    configure.programs = Path(cache, "programs-of-tests", f"{checked}-{hashlib.sha256(made).hexdigest()[:8]}")
+
+
+def forget() -> None:
+    """The programs that this process has ready."""
+    for name, module in list(sys.modules.items()):
+        if name.split(".")[0] in PACKAGES:
+            for program in vars(module).values():
+                if isinstance(program, programs.Program):
+                    program._ready.clear()
+
+
+def _set(self: pytest.MonkeyPatch, target: Any, name: Any, *value: Any, **how: Any) -> None:
+    if isinstance(target, str):
+        (owner, _, attribute), to = target.rpartition("."), name
+    else:
+        owner, attribute, to = _module(target), name, value[0]
+    named = f"{owner.rpartition('.')[2]}.{attribute}"
+    if owner.split(".")[0] in (*PACKAGES, "jax", "numpy") and not owner.startswith(HOST) and named not in OUTSIDE:
+        _patched.setdefault(id(self), {})[f"{owner}.{attribute}"] = to
+        keep()
+    _setattr(self, target, name, *value, **how)
+
+
+def _module(target: Any) -> str:
+    if isinstance(target, ModuleType):
+        return target.__name__
+    return (target if isinstance(target, type) else type(target)).__module__
+
+
+def _undone(self: pytest.MonkeyPatch) -> None:
+    _undo(self)
+    _patched.pop(id(self), None)
+    keep()
+
+
+pytest.MonkeyPatch.setattr, pytest.MonkeyPatch.undo = _set, _undone
