@@ -1,12 +1,15 @@
 """Whole compiled programs kept between runs of the tests, as the command keeps them.
 
 Until a line of the code changes, no test traces again what an earlier run has traced. What a test patches, programs may
-hang on: numbers and words have a folder of their own, and with anything else in its place nothing is kept or loaded.
-Programs that were made without looking at shapes lie apart.
+hang on: numbers and words have a folder of their own, and with anything else in its place nothing is written or read.
+Programs that were made without looking at shapes lie apart; before a test that looks takes one, it is traced.
 """
 
 import hashlib
+import os
 import sys
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -32,6 +35,8 @@ OUTSIDE = set(
     systems._ran systems._files
     """.split()
 )
+NOWHERE = Path(os.devnull, "none")  # can be neither written nor read
+_begun = programs.Program._begun
 _setattr, _undo = pytest.MonkeyPatch.setattr, pytest.MonkeyPatch.undo
 _patched: dict[int, dict[str, Any]] = {}  # by whom, and what is in the place of what
 
@@ -43,11 +48,11 @@ def keep() -> None:
         return
     cache = jax.config.values["jax_compilation_cache_dir"]
     if cache is None or not all(isinstance(value, int | float | str) for value in patches.values()):
-        configure.programs = None
+        configure.programs = NOWHERE
         return
     made = repr((QUICKLY, sorted(patches.items()))).encode()
-    checked = "unchecked" if jaxtyping.config.jaxtyping_disable else "checked"
-    configure.programs = Path(cache, "programs-of-tests", f"{checked}-{hashlib.sha256(made).hexdigest()[:8]}")
+    folder = Path(cache, "programs-of-tests", hashlib.sha256(made).hexdigest()[:8])
+    configure.programs = folder / ("unchecked" if jaxtyping.config.jaxtyping_disable else "checked")
 
 
 def forget() -> None:
@@ -57,6 +62,20 @@ def forget() -> None:
             for program in vars(module).values():
                 if isinstance(program, programs.Program):
                     program._ready.clear()
+
+
+def _begin(self: programs.Program, key: tuple, said: str, given: dict) -> tuple:
+    """The program, the one made in the other way of looking at shapes if there is no other."""
+    path = programs._path(said)
+    looked = path.parent.name
+    other = path.parents[1] / {"checked": "unchecked", "unchecked": "checked"}.get(looked, "none") / path.name
+    if other.is_file() and not path.exists():
+        if looked == "checked":
+            jax.eval_shape(partial(self._function, **dict(key[2])), **given)
+        with suppress(OSError):
+            path.parent.mkdir(mode=0o700, exist_ok=True)
+            os.link(other, path)
+    return _begun(self, key, said, given)
 
 
 def _set(self: pytest.MonkeyPatch, target: Any, name: Any, *value: Any, **how: Any) -> None:
@@ -83,4 +102,5 @@ def _undone(self: pytest.MonkeyPatch) -> None:
     keep()
 
 
+programs.Program._begun = _begin
 pytest.MonkeyPatch.setattr, pytest.MonkeyPatch.undo = _set, _undone

@@ -2,9 +2,10 @@
 
 import jax
 import jaxtyping
+import numpy as np
 import pytest
 
-from ptsmc_jax import configure
+from ptsmc_jax import configure, programs
 from ptsmc_jax.batching import kernel
 from ptsmc_jax.theory import linear
 from tests import kept
@@ -18,7 +19,7 @@ def where():
 def test_what_is_patched_is_kept_by_itself():
     usual = where()
     assert usual is not None
-    assert usual.parent.parent.samefile(jax.config.values["jax_compilation_cache_dir"])
+    assert usual.parents[2].samefile(jax.config.values["jax_compilation_cache_dir"])
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(linear, "TOGETHER", 4)
         four = where()
@@ -36,9 +37,9 @@ def test_nothing_is_kept_where_code_is_patched(target, name):
         outer.setattr(target, name, lambda *_: None)
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(linear, "TOGETHER", 4)
-            assert where() is None
-        assert where() is None  # the outer one still is
-    assert where() is not None
+            assert where() == kept.NOWHERE
+        assert where() == kept.NOWHERE  # the outer one still is
+    assert where() != kept.NOWHERE
 
 
 def test_what_no_program_hangs_on_is_not_looked_at(monkeypatch):
@@ -57,3 +58,25 @@ def test_programs_without_checks_of_shapes_lie_apart():
         assert unchecked != checked
     finally:
         jaxtyping.config.update("jaxtyping_disable", False)
+
+
+def test_a_program_made_without_looking_is_traced_before_a_test_that_looks_takes_it(tmp_path, monkeypatch):
+    """Traced anew, not compiled; the other way round it is taken as it is."""
+    traced, compiled = [], programs.Program._compiled
+    monkeypatch.setattr(programs.Program, "_compiled", lambda *how: traced.append("compiled") or compiled(*how))
+
+    def function(x):
+        traced.append("traced")
+        return 2.0 * x
+
+    function.__module__, function.__qualname__, function.__name__ = "ptsmc_jax.numerics.attitude", "looked", "looked"
+    for name, wanted in (
+        ("unchecked", ["compiled", "traced"]),
+        ("checked", ["traced"]),
+        ("checked", []),
+        ("unchecked", []),
+    ):
+        monkeypatch.setattr(configure, "programs", tmp_path / name)
+        np.testing.assert_array_equal(programs.jit(function)(np.arange(3.0)), [0.0, 2.0, 4.0])
+        assert traced == wanted, name
+        traced.clear()
