@@ -2,16 +2,19 @@
 
 Until a line of the code changes, no test traces again what an earlier run has traced. What a test patches, programs may
 hang on: numbers and words have a folder of their own, and with anything else in its place nothing is written or read.
+What the compile cache knows, after a change that leaves it as it was, comes from there, and cannot be written again.
 Programs that were made without looking at shapes lie apart; before a test that looks takes one, it is traced.
 """
 
 import hashlib
 import os
+import secrets
 import sys
+import threading
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import jax
@@ -22,6 +25,16 @@ from ptsmc_jax import configure, programs
 from tests.tree import PACKAGES, QUICKLY
 
 programs.KEPT = 1500
+programs.secrets = SimpleNamespace(token_hex=lambda count: secrets.token_hex(count) if _of_a_test() else "kept")
+_seen = threading.local()  # by this thread: whether the last program that it compiled was in the compile cache
+
+
+@jax.monitoring.register_event_listener
+def _listen(event: str, **_: Any) -> None:
+    if event.startswith("/jax/compilation_cache/"):
+        _seen.read = event.endswith("cache_hits")
+
+
 # rooms that compile nothing, and what else no program hangs on: sizes of searches and campaigns, what is called between
 # programs
 HOST = ("tuning.cli", "tuning.output", "tuning.studies", "ptsmc_jax.figures")
@@ -36,7 +49,7 @@ OUTSIDE = set(
     """.split()
 )
 NOWHERE = Path(os.devnull, "none")  # can be neither written nor read
-_begun = programs.Program._begun
+_begun, _write = programs.Program._begun, programs._write
 _setattr, _undo = pytest.MonkeyPatch.setattr, pytest.MonkeyPatch.undo
 _patched: dict[int, dict[str, Any]] = {}  # by whom, and what is in the place of what
 
@@ -44,7 +57,7 @@ _patched: dict[int, dict[str, Any]] = {}  # by whom, and what is in the place of
 def keep() -> None:
     """In the folder that goes with what is patched now, and whether shapes are looked at."""
     patches = {name: value for by in _patched.values() for name, value in by.items()}
-    if "ptsmc_jax.configure.programs" in patches:  # the test itself says where
+    if _of_a_test():
         return
     cache = jax.config.values["jax_compilation_cache_dir"]
     if cache is None or not all(isinstance(value, int | float | str) for value in patches.values()):
@@ -53,6 +66,11 @@ def keep() -> None:
     made = repr((QUICKLY, sorted(patches.items()))).encode()
     folder = Path(cache, "programs-of-tests", hashlib.sha256(made).hexdigest()[:8])
     configure.programs = folder / ("unchecked" if jaxtyping.config.jaxtyping_disable else "checked")
+
+
+def _of_a_test() -> bool:
+    """Whether a test says by itself where programs are kept."""
+    return any("ptsmc_jax.configure.programs" in by for by in _patched.values())
 
 
 def forget() -> None:
@@ -76,6 +94,11 @@ def _begin(self: programs.Program, key: tuple, said: str, given: dict) -> tuple:
             path.parent.mkdir(mode=0o700, exist_ok=True)
             os.link(other, path)
     return _begun(self, key, said, given)
+
+
+def _write_new(path: Path, said: str, compiled: Any) -> None:
+    if _of_a_test() or not (_seen.read or path.parent == NOWHERE):
+        _write(path, said, compiled)
 
 
 def _set(self: pytest.MonkeyPatch, target: Any, name: Any, *value: Any, **how: Any) -> None:
@@ -102,5 +125,5 @@ def _undone(self: pytest.MonkeyPatch) -> None:
     keep()
 
 
-programs.Program._begun = _begin
+programs.Program._begun, programs._write = _begin, _write_new
 pytest.MonkeyPatch.setattr, pytest.MonkeyPatch.undo = _set, _undone
