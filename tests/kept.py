@@ -2,7 +2,7 @@
 
 Until a line of the code changes, no test traces again what an earlier run has traced. What a test patches, programs may
 hang on: numbers and words have a folder of their own, and with anything else in its place nothing is written or read.
-What the compile cache knows, after a change that leaves it as it was, comes from there, and cannot be written again.
+What the compile cache knows after a change comes from there, and cannot be written again.
 Programs that were made without looking at shapes lie apart; before a test that looks takes one, it is traced.
 """
 
@@ -11,6 +11,7 @@ import os
 import secrets
 import sys
 import threading
+import time
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -22,8 +23,9 @@ import jaxtyping
 import pytest
 
 from ptsmc_jax import configure, programs
-from tests.tree import PACKAGES, QUICKLY
+from tests.tree import PACKAGES, QUICKLY, modules
 
+STARTED, SOURCES = time.time(), modules().values()
 programs.KEPT = 1500
 programs.secrets = SimpleNamespace(token_hex=lambda count: secrets.token_hex(count) if _of_a_test() else "kept")
 _seen = threading.local()  # by this thread: whether the last program that it compiled was in the compile cache
@@ -56,9 +58,9 @@ _patched: dict[int, dict[str, Any]] = {}  # by whom, and what is in the place of
 
 def keep() -> None:
     """In the folder that goes with what is patched now, and whether shapes are looked at."""
-    patches = {name: value for by in _patched.values() for name, value in by.items()}
     if _of_a_test():
         return
+    patches = {name: value for by in _patched.values() for name, value in by.items()}
     cache = jax.config.values["jax_compilation_cache_dir"]
     if cache is None or not all(isinstance(value, int | float | str) for value in patches.values()):
         configure.programs = NOWHERE
@@ -84,6 +86,8 @@ def forget() -> None:
 
 def _begin(self: programs.Program, key: tuple, said: str, given: dict) -> tuple:
     """The program, the one made in the other way of looking at shapes if there is no other."""
+    if any(not source.exists() or source.stat().st_mtime > STARTED for source in SOURCES):
+        configure.programs = NOWHERE  # edited since: what was imported is not what the digest is of
     path = programs._path(said)
     looked = path.parent.name
     other = path.parents[1] / {"checked": "unchecked", "unchecked": "checked"}.get(looked, "none") / path.name
@@ -97,7 +101,7 @@ def _begin(self: programs.Program, key: tuple, said: str, given: dict) -> tuple:
 
 
 def _write_new(path: Path, said: str, compiled: Any) -> None:
-    if _of_a_test() or not (_seen.read or path.parent == NOWHERE):
+    if _of_a_test() or not (getattr(_seen, "read", False) or path.parent == NOWHERE):
         _write(path, said, compiled)
 
 

@@ -11,6 +11,18 @@ from ptsmc_jax.theory import linear
 from tests import kept
 
 
+def doubled():
+    """A function as if it stood in one of our files, and what its traces are noted in."""
+    traced = []
+
+    def function(x):
+        traced.append("traced")
+        return 2.0 * x
+
+    function.__module__, function.__qualname__, function.__name__ = "ptsmc_jax.numerics.attitude", "looked", "looked"
+    return traced, function
+
+
 def where():
     kept.keep()
     return configure.programs
@@ -62,14 +74,8 @@ def test_programs_without_checks_of_shapes_lie_apart():
 
 def test_a_program_made_without_looking_is_traced_before_a_test_that_looks_takes_it(tmp_path, monkeypatch):
     """Traced anew, not compiled; the other way round it is taken as it is."""
-    traced, compiled = [], programs.Program._compiled
+    compiled, (traced, function) = programs.Program._compiled, doubled()
     monkeypatch.setattr(programs.Program, "_compiled", lambda *how: traced.append("compiled") or compiled(*how))
-
-    def function(x):
-        traced.append("traced")
-        return 2.0 * x
-
-    function.__module__, function.__qualname__, function.__name__ = "ptsmc_jax.numerics.attitude", "looked", "looked"
     for name, wanted in (
         ("unchecked", ["compiled", "traced"]),
         ("checked", ["traced"]),
@@ -80,3 +86,13 @@ def test_a_program_made_without_looking_is_traced_before_a_test_that_looks_takes
         np.testing.assert_array_equal(programs.jit(function)(np.arange(3.0)), [0.0, 2.0, 4.0])
         assert traced == wanted, name
         traced.clear()
+
+
+def test_nothing_is_kept_once_a_file_was_edited(tmp_path, monkeypatch):
+    """Code that was imported before goes with no digest that is taken after."""
+    _, function = doubled()
+    for started, count in ((0.0, 0), (kept.STARTED, 1)):
+        monkeypatch.setattr(configure, "programs", tmp_path)
+        monkeypatch.setattr(kept, "STARTED", started)
+        np.testing.assert_array_equal(programs.jit(function)(np.arange(3.0)), [0.0, 2.0, 4.0])
+        assert len(list(tmp_path.iterdir())) == count
