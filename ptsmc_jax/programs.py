@@ -82,6 +82,8 @@ class Program:
             return self._jitted(*args, **kwargs)
         key, said, given = known
         ready = self._ready.get(key)
+        if isinstance(ready, Future) and ready.cancelled():  # by `stop`
+            ready = None
         if ready is None or isinstance(ready, Future):
             ready, loaded = (ready or _apart(self._begun, key, said, given)).result()
             if loaded:

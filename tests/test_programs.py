@@ -129,10 +129,12 @@ def test_a_thread_with_bits_of_its_own_has_programs_of_its_own(folder):
 
 def test_another_command_in_the_same_process_prepares_programs_too(folder):
     program, _ = spied()
-    program.prepare(X)
+    for count in range(1, 5):  # the last ones wait, and are not begun any more
+        program.prepare(X[:count])
     programs.stop()
-    program.prepare(X[:3])
-    assert program(X[:3])["both"].shape == (3,)
+    program.prepare(X)
+    for count in range(1, 6):
+        assert program(X[:count])["both"].shape == (count,)
 
 
 def test_what_is_not_to_be_compiled_is_not(folder):
