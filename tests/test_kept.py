@@ -1,5 +1,8 @@
 """Programs that runs of the tests leave each other: what is patched has a folder of its own, or none."""
 
+import importlib
+import re
+
 import jax
 import jaxtyping
 import numpy as np
@@ -9,6 +12,7 @@ from ptsmc_jax import configure, programs
 from ptsmc_jax.batching import kernel
 from ptsmc_jax.theory import linear
 from tests import kept
+from tests.tree import modules
 
 
 def doubled():
@@ -90,9 +94,24 @@ def test_a_program_made_without_looking_is_traced_before_a_test_that_looks_takes
 
 def test_nothing_is_kept_once_a_file_was_edited(tmp_path, monkeypatch):
     """Code that was imported before goes with no digest that is taken after."""
-    _, function = doubled()
-    for started, count in ((0.0, 0), (kept.STARTED, 1)):
-        monkeypatch.setattr(configure, "programs", tmp_path)
-        monkeypatch.setattr(kept, "STARTED", started)
-        np.testing.assert_array_equal(programs.jit(function)(np.arange(3.0)), [0.0, 2.0, 4.0])
-        assert len(list(tmp_path.iterdir())) == count
+    source = tmp_path / "source.py"
+    source.touch()
+    monkeypatch.setattr(kept, "SOURCES", [source])
+    at = source.stat().st_mtime
+    assert [kept._edited(at - 1.0), kept._edited(at + 1.0)] == [True, False]
+    source.unlink()
+    assert kept._edited(at + 1.0)
+    np.testing.assert_array_equal(programs.jit(doubled()[1])(np.arange(3.0)), [0.0, 2.0, 4.0])
+    assert configure.programs == kept.NOWHERE
+
+
+def test_what_is_said_to_be_seen_by_no_program_is_there():
+    """A name that is gone would be let through for whatever is called so next."""
+    found = {name.rpartition(".")[2]: importlib.import_module(name) for name in modules() if name.count(".") >= 1}
+    for named in kept.OUTSIDE:
+        module, _, attribute = named.partition(".")
+        owners = [found[module], *(v for v in vars(found[module]).values() if isinstance(v, type))]
+        assert any(hasattr(owner, attribute) for owner in owners), named
+    for name, path in modules().items():
+        if name.startswith(kept.HOST):
+            assert not re.search(r"\b(programs|jax)\.jit\b", path.read_text()), name
