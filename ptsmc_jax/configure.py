@@ -24,12 +24,17 @@ _FASTER = (
     "--xla_cpu_prefer_vector_width=512",
     "--xla_disable_hlo_passes=cpu_multi_output_fusion",
 )
-# What takes a quarter of compiling such a kernel, and does not make it faster. A GPU's compiler would read these, too.
+# What takes a part of compiling, and makes nothing faster: of a kernel a quarter, of what flies single runs, of slopes
+# and of margins a third or two besides. A GPU's compiler would read these, too. The older emitters of fused loops are
+# gone in jaxlib 0.11.
+OLDER_EMITTERS = tuple(int(part) for part in version("jaxlib").split(".")[:2]) < (0, 11)
 _SOONER = (
     "-unroll-runtime=false",
     "-unroll-allow-partial=false",
     "-post-RA-scheduler=false",
     *(["-x86-machine-combiner=false"] if platform.machine() in ("x86_64", "AMD64") else []),
+    "--xla_backend_optimization_level=1",
+    *(["--xla_cpu_use_fusion_emitters=false"] if OLDER_EMITTERS else []),
 )
 _OPTIONS = (*_FASTER, *_SOONER)
 
@@ -68,11 +73,12 @@ def configure(
     None for none; by default a folder of this processor's own below the user's cache folder. fast: compiler options
     that make loops 2 to 15 times as fast. They are tried out in a process of its own, once for each version of JAX and
     processor where there is a cache; those that are refused, or give other numbers, are left out with a warning.
-    XLA_FLAGS that set `xla_backend_extra_options` or `xla_disable_hlo_passes` are left as they are. device: what
-    batches fly on, by default the first that JAX finds; raises NoDeviceError where there is none of that kind. bits: of
-    every number; what 32 put out of reach stands in docs/python.md. keep_programs: keep whole compiled programs too,
-    and load them, in a process in which no code is patched, see `ptsmc_jax.programs`, or looked for faults in: JAX's
-    checks for NaN, infinity, promotion and transfers, which stop runs, are off there whatever the environment says.
+    XLA_FLAGS that set `xla_backend_extra_options` or `xla_disable_hlo_passes` are left as they are, and so is any other
+    option that they set. device: what batches fly on, by default the first that JAX finds; raises NoDeviceError where
+    there is none of that kind. bits: of every number; what 32 put out of reach stands in docs/python.md. keep_programs:
+    keep whole compiled programs too, and load them, in a process in which no code is patched, see `ptsmc_jax.programs`,
+    or looked for faults in: JAX's checks for NaN, infinity, promotion and transfers, which stop runs, are off there
+    whatever the environment says.
     Called before JAX is imported, it also silences what XLA says to stderr by itself ("Very slow compile?" after two
     minutes), unless TF_CPP_MIN_LOG_LEVEL is set. Call it before anything runs on JAX; later it raises RuntimeError
     where the backend has already started with something else, and ValueError at any time for other bits and devices.
@@ -123,7 +129,8 @@ def _set_compiler_options(fast: bool, folder: Path | None, device: str | None) -
     before = os.environ.get("XLA_FLAGS", "")
     flags = before.replace(_added, "").strip()
     theirs = any(option in flags for option in ("xla_backend_extra_options", "xla_disable_hlo_passes"))
-    ours = _flags(_options(folder, device)) if fast and not theirs else ""
+    options = _options(folder, device) if fast and not theirs else ()
+    ours = _flags(tuple(option for option in options if f"{option.split('=')[0]}=" not in flags))
     wanted = f"{flags} {ours}".strip()
     if sorted(wanted.split()) == sorted(before.split()):
         return

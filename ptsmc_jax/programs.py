@@ -34,8 +34,8 @@ from ptsmc_jax import configure
 
 KEPT = 400  # programs; those not used for longest make room
 # for what runs for a moment: optimising would take longer. The older emitters of fused loops and one part of the code
-# compile in half the time besides, and run faster, at this level; jaxlib 0.11 has newer ones only
-_OLDER = {"xla_cpu_use_fusion_emitters": False} if jaxlib.version.__version_info__ < (0, 11) else {}
+# compile in half the time besides, and run faster, at this level
+_OLDER = {"xla_cpu_use_fusion_emitters": False} if configure.OLDER_EMITTERS else {}
 QUICKLY = {"xla_backend_optimization_level": 0, "xla_cpu_parallel_codegen_split_count": 1, **_OLDER}
 # for batches in `lanes`: with the pass that `configure` leaves out they compile in 0.7 to 0.9 of the time, and fly in
 # 0.88 to 0.97 of it. Loops in them write one array of each type of number, see `numerics.stacking`

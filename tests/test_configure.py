@@ -109,6 +109,16 @@ def test_what_makes_a_processors_programs_sooner_is_left_out_where_a_gpu_may_fly
     assert len(tried) == 1
 
 
+def test_an_option_that_the_user_has_set_stays(tried, monkeypatch):
+    """XLA takes the last of two."""
+    monkeypatch.setattr(setup, "_has_started", lambda: False)
+    monkeypatch.setattr(setup, "_added", "nothing yet")
+    monkeypatch.setenv("XLA_FLAGS", "--xla_backend_optimization_level=3")
+    setup._set_compiler_options(fast=True, folder=None, device="cpu")
+    others = tuple(option for option in GOOD if "optimization_level" not in option)
+    assert os.environ["XLA_FLAGS"] == f"--xla_backend_optimization_level=3 {setup._flags(others)}"
+
+
 def test_a_cache_that_cannot_be_written_is_none(tried, tmp_path):
     (tmp_path / "file").write_text("")
     assert setup._accepted(tmp_path / "file") == GOOD
