@@ -346,3 +346,7 @@ def test_what_a_chain_lacks_has_no_value():
     assert np.isnan(float(result.metrics.peak_momentum))
     assert float(result.metrics.peak_rate) == pytest.approx(np.abs(result.log.x[:, 1]).max())
     assert float(result.metrics.terminal_angle) == float(result.metrics.terminal_error)
+
+
+def test_the_rate_of_a_chain_is_that_of_its_first_state_whatever_its_order():
+    assert float(integrator_chain.chain(3).speed(vector([0.5, -2.0, 7.0]))) == 2.0

@@ -251,3 +251,15 @@ def test_multiplicative_law_is_singular_at_a_true_error_of_180_degrees_only():
     error, error_rate = calm.controller.errors(calm.initial, calm.reference(vector(0.0)))
     assert np.linalg.norm(error) + 20.0 * np.linalg.norm(error_rate) / (np.e * 3.5) < 1.0
     assert fly(calm).status == rollout.OK
+
+
+@pytest.mark.parametrize("hold", [False, True])
+def test_the_switching_rate_is_what_the_sign_does_to_s_at_the_reference(hold):
+    """K2 takes s' down by tau times it before the hand-over, by it after; at T = I, where |T J^-1| is largest."""
+    run = parts(20.0, 3.5, 0.5, inertia=FULL_INERTIA, law=LAWS[1], sign_width=1e-6)
+    law, t = run.controller, vector(4.0)
+    x = AttitudeState(vector([0.0, 0.0, 0.0, 1.0]), vector([0.3, 0.2, 0.1]))
+    target = references.Fixed(vector([0.0, 0.0, 0.0, 1.0]))(t)
+    quiet, switched = (law.torque(t, jnp.asarray(hold), x, target, jnp.zeros(3), vector(k2))[0] for k2 in (0.0, 0.05))
+    acceleration = 0.5 * run.plant.inertia_inverse @ (switched - quiet)
+    np.testing.assert_allclose(acceleration, np.full(3, -law.switching_rate(vector(0.05))), rtol=1e-12)

@@ -10,9 +10,9 @@ import pytest
 from ptsmc_jax import scenario
 from ptsmc_jax.laws.base import Sample
 from ptsmc_jax.laws.closed_forms import expansion
-from ptsmc_jax.laws.prescribed_time import PrescribedTimeMultiplicative, PrescribedTimeSystem
+from ptsmc_jax.laws.prescribed_time import PrescribedTimeChain, PrescribedTimeMultiplicative, PrescribedTimeSystem
 from ptsmc_jax.numerics import integrators
-from ptsmc_jax.plants import rigid_body, system
+from ptsmc_jax.plants import integrator_chain, rigid_body, system
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.signals import references
 from ptsmc_jax.simulation import clock, rollout
@@ -266,3 +266,21 @@ def test_rounding_costs_no_period_before_the_holds_surface_is_aimed_for(bits):
         many = jax.jit(jax.vmap(jax.vmap(aimed)))
         first = many(*(vector(np.broadcast_to(v, t_f.shape)) for v in (period, t_f, delta)))
     np.testing.assert_array_equal(first, np.broadcast_to(count - 101 - before, t_f.shape))
+
+
+@pytest.mark.parametrize("left", [1.0, 0.5, 0.45, 0.3])
+def test_a_double_integrator_is_given_the_same_input_as_a_system_and_as_a_chain(left):
+    """Also in a period that the hand-over ends, or lies in: the s handed over is that of r^eta, whatever the law."""
+    double = system(1, lambda t, x, v: v, lambda t, x, v: 0.0 * v, lambda t, x, v: jnp.eye(1))
+    gains = {
+        "t_f": vector(T_F), "eta": vector(2.7), "delta": vector(0.4), "k1": vector(1.3), "sign_width": vector(1e-3),
+        "surface_rate": vector(1.7),
+    }  # fmt: skip
+    chain = PrescribedTimeChain(integrator_chain.chain(2), a=vector([1.0]), **gains, implicit=True)
+    now = Sample(vector(T_F - left), jnp.asarray(left < 0.4), vector(H))
+    (u, s, _), (other, other_s, _) = (
+        law.command(None, now, vector([0.3, -0.4]), now.t, jnp.zeros(1), vector(0.0))
+        for law in (PrescribedTimeSystem(double, **gains, implicit=True), chain)
+    )
+    np.testing.assert_allclose(u, other, rtol=1e-12)
+    np.testing.assert_allclose(s, other_s, rtol=1e-12)

@@ -69,3 +69,15 @@ def test_the_fastest_surface_that_can_be_held_is_the_border_of_small_k(delay, im
         return
     assert borders.largest_reaching(0.999 * border, float(delay), implicit=implicit) > 0.0
     assert borders.largest_reaching(1.001 * border, float(delay), implicit=implicit) == 0.0
+
+
+@pytest.mark.parametrize("anchored", [False, True])
+@pytest.mark.parametrize("implicit", [False, True])
+def test_at_the_smallest_delta_the_last_sample_before_the_hand_over_is_on_the_border(implicit, anchored):
+    """It lies at delta on the flight clock, a period earlier on the anchored one, and one more if implicit."""
+    eta, h = 4.0, 0.05
+    delta = borders.smallest_delta(eta, h, 1.0, anchored=anchored, implicit=implicit)
+    tau = delta / h + anchored + implicit
+    kp, kd = borders.implicit_gains(eta, tau) if implicit else ((eta / tau) ** 2, (2 * eta - 1) / tau)
+    assert delta > 0.0
+    assert borders.radius(kp, kd, 1.0, 1.0) == pytest.approx(1.0, abs=1e-6)
