@@ -99,6 +99,7 @@ def test_of_many_loops_the_smallest_margin_counts_and_one_without_a_value_breaks
         ({"reference": {}}, True),
         ({"disturbance_phase": {}}, False),
         ({"attitude_noise": {"kind": "relative_normal"}}, False),
+        ({"actuator_scale": {"kind": "relative_normal"}}, True),
     ],
 )
 def test_loops_differ_where_what_they_hang_on_is_drawn(dispersion, differ):

@@ -267,3 +267,11 @@ def test_density_becomes_a_sigma_a_sample():
     for period in (0.01, 0.2):
         sigma = formulas.per_sample(1e-5, period)
         np.testing.assert_allclose(sigma * period * np.sqrt(100.0 / period), 1e-5 * np.sqrt(100.0), rtol=1e-12)
+
+
+def test_the_best_bandwidth_hangs_on_what_sensors_tell_in_a_time():
+    """A star tracker with twice the noise, or four times the interval, tells as much; a gyro's periods likewise."""
+    best = formulas.best_bandwidth(2e-5, 1e-6, 0.1, 0.4)
+    assert best == pytest.approx(1e-6 / 2e-5 / 2.0, rel=1e-12)
+    for same in ((1e-5, 1e-6, 0.1, 1.6), (2e-5, 5e-7, 0.4, 0.4)):
+        assert formulas.best_bandwidth(*same) == pytest.approx(best, rel=1e-12)

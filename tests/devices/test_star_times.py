@@ -203,6 +203,14 @@ def test_in_an_outage_a_period_is_what_the_gyro_says_of_it(run):
     np.testing.assert_allclose(found.q, alone.q, rtol=0, atol=1e-15)
 
 
+def test_an_outage_loses_the_samples_that_were_taken_in_it_whenever_they_are_used():
+    """The sample of 0.25 s is used at 0.3 s."""
+    own = of(star_tracker_period=0.25).parts.sensors
+    now = Ticks(vector(0.3), vector(0.4), jnp.asarray(False), jnp.int32(3), vector(1.0), jnp.asarray(False))
+    for outage, weight in (([0.2, 0.27], 0.0), ([0.28, 0.4], 1.0)):
+        assert float(dataclasses.replace(own, outage=vector(outage)).star_weight(now)) == weight
+
+
 @pytest.fixture(scope="module")
 def anchored():
     """Such parts on the anchored clock."""

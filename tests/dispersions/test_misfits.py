@@ -177,6 +177,16 @@ def test_a_wheel_fails_and_the_others_take_over_where_it_is_known(known):
     assert np.all(off[after[:-1]] < 1e-5) == known
 
 
+def test_any_wheel_fails_as_often_and_times_that_are_not_given_end_with_the_run():
+    drawn = {"wheel_failure": {"kind": "uniform"}, "star_tracker_outage": {"kind": "uniform", "duration": 0.5}}
+    ready = scenario.study(scenario.from_tables({**WHEELED, "dispersion": drawn}))
+    failure, outage = (ready.dispersion.misfits[name] for name in drawn)
+    for k in range(4):
+        for share in (0.01, 0.99):
+            np.testing.assert_allclose(failure.at(vector([1.0, (k + share) / 4]), ready.parts), [7.0, k + 1.0])
+    np.testing.assert_allclose(outage.at(vector([1.0]), ready.parts), [7.0, 7.5])
+
+
 def test_an_outage_of_the_whole_run_is_a_filter_that_corrects_nothing():
     """With wheels of which one would fail after the end: the program of wheels that fail."""
     lasting = {"kind": "uniform", "duration": 100.0, "latest": 0.0}

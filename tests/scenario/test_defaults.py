@@ -116,6 +116,10 @@ def test_the_gravity_gradient_reaches_what_its_moments_allow():
     assert size == pytest.approx(1.5 * n**2 * apart, rel=1e-3)
     turns = n + 2 * np.pi / 30.0
     assert rate == pytest.approx(3 * n**2 * apart * turns, rel=1e-3)
+    # drawn moments, three sigma apart the other way
+    least, _, most = np.linalg.eigvalsh(inertia)
+    drawn, _ = bounds(**tables, dispersion={"inertia": {"kind": "relative_normal", "std": 0.05}})
+    assert drawn == pytest.approx(1.5 * n**2 * (1.15 * most - 0.85 * least), rel=1e-3)
 
 
 def test_a_random_walk_counts_with_three_sigma():

@@ -212,3 +212,14 @@ def test_a_slew_may_go_the_long_way_round():
 
 
 MULTIPLICATIVE = {"controller": {"error": "multiplicative"}}
+
+
+def test_a_bias_takes_the_place_of_the_one_before():
+    """As a plan gives it to parts that have one."""
+    still = disturbances.Constant(vector([0.1, -0.2, 0.3]))
+    biased = still
+    for value in ([0.01, 0.02, 0.03], [1e-3, 0.0, -1e-3]):
+        biased = disturbances.with_bias(biased, vector(value))
+        np.testing.assert_array_equal(disturbances.bias(biased, 3), value)
+        np.testing.assert_allclose(biased(vector(2.0), None), np.add([0.1, -0.2, 0.3], value), rtol=1e-15)
+    np.testing.assert_array_equal(disturbances.bias(still, 3), np.zeros(3))
