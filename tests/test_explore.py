@@ -244,3 +244,13 @@ def test_an_animation_draws_body_and_reference_at_even_times(monkeypatch):
             np.testing.assert_allclose(
                 [end for _, end in three], animation.turned(np.asarray(at), np.eye(3)), atol=1e-12
             )
+
+
+def test_plans_and_floors_are_those_of_the_seed_that_is_asked_for(monkeypatch):
+    monkeypatch.setattr(campaign.Campaign, "fly", lambda self, trials: self.seed)
+    monkeypatch.setattr(runs, "floor", lambda ready, seed=0, rows=(): seed)
+    made = scenario.from_tables(TABLES)
+    plan = pl.DataFrame({f"initial_w{k}": [0.01, 0.0] for k in (1, 2, 3)})
+    seed: Any = explore.trials(made, plan, seed=3)
+    assert seed == 3
+    assert explore.floor(made, seed=5) == 5

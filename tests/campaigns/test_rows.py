@@ -85,3 +85,9 @@ def test_keys_tell_campaigns_apart():
     assert rows.key_of({"a": {"b": 1}}, {"seed": 1}) == rows.key_of({"a": {"b": 1}}, {"seed": 1})
     others = [({"a": {"b": 2}}, {"seed": 1}), ({"a": {"b": 1}}, {"seed": 2}), ({"a": {"b": 1}}, {"seed": 1, "m": "x"})]
     assert len({rows.key_of(*o) for o in others} | {rows.key_of({"a": {"b": 1}}, {"seed": 1})}) == 4
+
+
+def test_trials_that_a_longer_part_has_are_not_read_twice(kept):
+    long, _, after = kept.write(0, frame(0, 50)), kept.write(20, frame(20, 20)), kept.write(50, frame(50, 10))
+    assert kept.parts() == ([long, after], [])
+    assert rows.read(kept.parts()[0])["trial"].to_list() == list(range(60))

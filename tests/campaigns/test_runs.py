@@ -1,6 +1,7 @@
 """Which runs say what is told of a scenario."""
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -28,3 +29,12 @@ def test_a_scenarios_floor_is_pooled_over_the_first_trials_or_those_of_a_plan(mo
     squares = [(1.0 + (k or 0)) ** 2 for j, k in enumerate(flown) if j != 1]
     assert runs.floor(ready, 5, rows) == pytest.approx(math.sqrt(sum(squares) / len(squares)))
     assert seen == [(5, k) for k in flown]
+
+
+@pytest.mark.parametrize("status", ["missed", "singular", "diverged"])
+def test_a_run_that_does_not_end_well_has_met_nothing_even_where_nothing_is_asked(status):
+    """By it `ptsmc simulate` ends with 1."""
+    none: Any = None
+    run = runs.Run(none, none, {}, {}, "ok", "", math.nan, [], {})
+    assert run.met
+    assert not replace(run, status=status).met
