@@ -208,3 +208,14 @@ def test_they_are_those_of_scipys_statistics(seed):
         np.testing.assert_allclose(statistics.percentile(values, value), expected, rtol=1e-12)
     if np.ptp(values) > 0.0:
         np.testing.assert_allclose(statistics._ranks(values), stats.zscore(stats.rankdata(values)), atol=1e-12)
+
+
+def test_a_share_of_the_variance_is_beyond_chance_from_three_sigma_of_unrelated_inputs_on():
+    """Their spread over 2000 shuffles is known to 2 %."""
+    n, rng = 3200, np.random.default_rng(5)
+    ranks = statistics._ranks(np.arange(float(n)))
+    orders = (rng.permutation(ranks).reshape(statistics.SOBOL_BINS, -1) for _ in range(2000))
+    sigma = np.std([np.mean(bins.mean(axis=1) ** 2) for bins in orders])
+    for times, told in ((2.75, False), (3.25, True)):
+        driver = {"rank_correlation": 0.0, "first_order": times * sigma}
+        assert statistics.beyond_chance(driver, n) == told

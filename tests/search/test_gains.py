@@ -89,6 +89,8 @@ def test_names_and_bounds_axis_by_axis():
     assert some.names == names
     assert (some.lower[1:], some.upper[1:]) == ((1.0,) * 3, (50.0,) * 3)
     assert gains.gains_of(ready.parts)["observer_gain"] == 4.0
+    again = gains.with_gains(ready.parts, gains.gains_of(ready.parts))  # each axis by its own name, not the mean
+    np.testing.assert_array_equal(again.observer.gain, [3.0, 4.0, 5.0])
     assert [gains.base(name) for name in names] == ["eta", "observer_gain", "observer_gain", "observer_gain"]
 
 

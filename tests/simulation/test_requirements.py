@@ -214,6 +214,8 @@ def test_mixed_is_a_random_run_at_a_random_time():
     fewer = of_time("mixed", kept, confidence=0.9)
     assert fewer.shown == pytest.approx(0.9975 - 2.3 / RUNS, abs=1e-4)
     assert not fewer.met
+    assert fewer.shown is not None
+    assert sure.margin <= 1.0 < fewer.margin == pytest.approx((1.0 - fewer.shown) / (1.0 - 0.9973))
     failed = of_time("mixed", kept, ok=np.arange(RUNS) > 0)
     assert failed.share_of_time == pytest.approx(0.9975 - 0.995 / RUNS)
 
