@@ -8,6 +8,7 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -372,3 +373,22 @@ def test_every_program_is_a_function_of_its_module():
             assert named is program or named is program._function, program._function
             found += 1
     assert found > 20
+
+
+def test_a_program_of_the_search_hangs_on_the_files_of_the_library_too(tmp_path, monkeypatch):
+    for name in programs.OURS:
+        (tmp_path / name).mkdir()
+        source: Any = SimpleNamespace(__file__=str(tmp_path / name / "__init__.py"))
+        monkeypatch.setitem(sys.modules, name, source)
+    library, search = (tmp_path / name / "part.py" for name in ("ptsmc_jax", "tuning"))
+
+    def digests():
+        return [programs._code.__wrapped__(name) for name in ("ptsmc_jax", "tuning")]
+
+    first = digests()
+    library.write_text("a = 1")
+    second = digests()
+    search.write_text("a = 1")
+    third = digests()
+    assert [a != b for a, b in zip(first, second, strict=True)] == [True, True]
+    assert [a != b for a, b in zip(second, third, strict=True)] == [False, True]

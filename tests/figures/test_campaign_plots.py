@@ -78,3 +78,11 @@ def test_a_metric_over_what_was_drawn_has_plain_numbers():
     labels = [tick.get_text() for tick in figure.axes[0].get_yticklabels(which="both")]
     assert {"0.05", "0.1", "0.2", "0.5"} <= set(labels)
     assert not any("10^" in label for label in labels)
+
+
+@pytest.mark.parametrize(("kind", "unit", "factor"), [("spacecraft", "[deg]", 180.0 / np.pi), ("chain", "[x1]", 1.0)])
+def test_initial_angles_are_drawn_in_the_unit_of_their_axis(kind, unit, factor):
+    angle, outcome = np.array([0.5, 1.0, 2.0]), np.full(3, "ok", dtype=object)
+    (axes,) = campaign_plots.torque_by_angle(angle, angle, outcome, {"ok": 3}, None, kind).axes
+    assert axes.get_xlabel().endswith(unit)
+    np.testing.assert_allclose(np.asarray(axes.collections[0].get_offsets())[:, 0], factor * angle)

@@ -404,3 +404,14 @@ def test_a_compiler_that_knows_no_nan_tells_parameters_apart(filtered):
     statuses, outputs = flown(Library(library.folder, options=("-ffinite-math-only",)), samples)
     assert not statuses.any()
     np.testing.assert_allclose(outputs, flown(library, samples)[1], rtol=1e-9, atol=1e-12)
+
+
+@needs_compiler
+def test_of_many_parameters_that_c_has_otherwise_some_are_named_and_the_others_counted(exported):
+    made, library = exported("chain")
+    own = library.parameters.copy()
+    changed = np.flatnonzero(own)[:6]
+    library.parameters[changed] = 2.0 * own[changed]
+    said = InTheLoop(library, made.ready.parts).otherwise
+    assert said.count(" instead of ") == 4
+    assert said.endswith(" and 2 more")
