@@ -52,3 +52,13 @@ def test_the_contour_of_a_nichols_chart_is_where_the_sensitivity_is_six_decibels
     away = 1.0 + 10.0 ** (size / 20.0) * np.exp(1j * np.deg2rad(phase))
     np.testing.assert_allclose(-20.0 * np.log10(np.abs(away)), 6.0, rtol=1e-9)
     assert phase.min() < -180.0 < phase.max()
+
+
+def test_each_of_both_sensitivities_is_the_one_that_it_is_said_to_be():
+    """Where L is large S is small, and T is 1."""
+    w = np.geomspace(1e-2, 1.0, 50)
+    L = 0.1 / (1j * w)[:, None]
+    (axes,) = margin_plots.sensitivity(w, L, ["x"]).axes
+    drawn = {str(line.get_label()): np.asarray(line.get_ydata()) for line in axes.lines}
+    np.testing.assert_allclose(drawn["S x"], -20.0 * np.log10(np.abs(1.0 + L[:, 0])), rtol=1e-9)
+    np.testing.assert_allclose(drawn["T x"], -20.0 * np.log10(np.abs(1.0 + 1.0 / L[:, 0])), rtol=1e-9, atol=1e-9)

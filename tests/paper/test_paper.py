@@ -49,6 +49,7 @@ def test_verdicts_are_those_that_the_theory_notes_expect(made):
     assert told["so does a larger eta"].values["ratio"] == pytest.approx((5 / 3) ** 2, rel=1e-12)
     shorter = told["a shorter t_f asks for a larger initial torque"]
     assert shorter.values["ratio"] == pytest.approx((4 / 3) ** 2, rel=1e-12)
+    assert shorter.values["ratio_by_theory"] == pytest.approx((4 / 3) ** 2, rel=1e-12)
     assert shorter.values["larger"] == pytest.approx(0.28, rel=1e-12)  # theory notes, 3.3
     at_t_f = told["errors of 10E-4 at t_f = 30 and 40 s"].values["at_t_f"]
     assert 1e-8 < at_t_f < 1e-7
@@ -80,6 +81,7 @@ def test_slips_show_what_they_say(made):
     assert term["with"] < 1e-9
     (factor,) = [v for k, v in values.items() if k.startswith("(55)sqrt")]
     assert factor["over_corrected"] < 1.0 < factor["over_printed"]
+    assert factor["over_printed"] == pytest.approx(3**0.5 * factor["over_corrected"], rel=1e-12)  # a 2-norm's factor
     (decay,) = [v for k, v in values.items() if k.startswith("(55)the")]
     assert decay["corrected"] < decay["printed"]
     (gain,) = [v for k, v in values.items() if k.startswith("(60)")]

@@ -122,3 +122,10 @@ def test_nothing_but_failures_keeps_the_start():
     best, _ = refined(Valley(np.eye(2), wall=-1.0), [0.1, 0.2])
     assert not np.isfinite(best.f)
     np.testing.assert_allclose(best.share, [0.6, 0.7])
+
+
+def test_of_many_points_one_that_keeps_the_limits_is_better_than_one_of_a_better_goal():
+    share, f, over = np.asarray([[0.2], [0.7]]), np.asarray([1.0, 2.0]), np.asarray([0.5, -0.1])
+    best = Best(np.zeros(1), 1, 0.0)
+    best.offer(share, Measured(share, f, over[:, None, None], f))
+    assert (best.share[0], best.f, best.over) == (0.7, 2.0, 0.0)

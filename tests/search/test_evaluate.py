@@ -1,13 +1,16 @@
 """What is measured of a problem: rows of flown trials and rows of margins side by side."""
 
+import math
 from types import SimpleNamespace
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from tuning.search import evaluate
 from tuning.search.evaluate import Evaluator, Sloped
+from tuning.search.objective import Rules, judge
 from tuning.search.shares import Bounds
 
 
@@ -34,3 +37,15 @@ def test_rows_of_trials_and_of_loops_are_filled_up_by_what_breaks_no_limit(monke
             assert np.all(rows[:, :, size:] == filled)
     largest = np.maximum(flown["c"].max(axis=(1, 2)), of_loop["c"].max(axis=(1, 2)))
     np.testing.assert_array_equal(found.beyond, largest)
+
+
+def test_the_torque_weighs_over_the_averaged_trials_as_the_error_does():
+    """Those that joined for a limit are hard ones, and count in the constraints alone."""
+    none = np.zeros((0, 3), dtype=bool)
+    rules = Rules(limits=np.zeros(0), among=none, counted=none, averaged=2, names=("eta",), may_break=(),
+                  torque_weight=0.3)  # fmt: skip
+    metrics, status = jnp.asarray([[3.0, 0.3], [4.0, 0.4], [40.0, 9.0]]), jnp.zeros(3, jnp.int32)
+    f, c, value = judge(rules, jnp.asarray([3.0]), metrics, status)
+    assert float(value) == pytest.approx(math.log(math.sqrt(12.5)), rel=1e-12)
+    assert float(f) == pytest.approx(float(value) + 0.3 * math.log(math.sqrt(0.125)), rel=1e-12)
+    assert c.shape == (0, 3)
