@@ -7,6 +7,7 @@ import pytest
 
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo
+from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.requirements import Requirement
 from tests.helpers import ticks_of, vector
 from tuning.search import design
@@ -82,19 +83,33 @@ def test_shortest_time_of_a_chain():
     assert run.metrics.peak_torque[0] <= 5.0 * (1 + 1e-6)
 
 
-def test_the_observer_keeps_its_time_however_much_torque_there_is():
-    """Its error is gone 4 s after the start: t_f is looked for from a twentieth later on, and closed in on by 1e-3."""
-    tables = {
-        "plant": {"kind": "chain", "order": 2, "x0": [1.0, 0.0]},
-        "controller": {"t_f": 5.0, "delta": 0.5},
-        "observer": {"kind": "prescribed_time", "t_o": 4.0},
-        "loop": {"mode": "sampled", "clock": "flight", "period": 0.1, "t_end": 6.0},
-    }
-    found = design.shortest_time(scenario.from_tables(tables), Requirement("peak_torque", 1e4), 0, np.arange(1))
+OBSERVED = {
+    "plant": {"kind": "chain", "order": 2, "x0": [1.0, 0.0]},
+    "controller": {"t_f": 5.0, "delta": 0.5},
+    "observer": {"kind": "prescribed_time", "t_o": 4.0},
+    "loop": {"mode": "sampled", "clock": "flight", "period": 0.1, "t_end": 6.0},
+}
+
+
+@pytest.mark.parametrize("fails_until", [None, 4.5])
+def test_the_observer_keeps_its_time_however_much_torque_there_is(fails_until, monkeypatch):
+    """Its error is gone 4 s after the start: t_f is looked for from a twentieth later on, and closed in on by 1e-3.
+
+    A run that fails keeps no limit, however small its torque was.
+    """
+
+    def run(parts, *others, flown=montecarlo.run):
+        result = flown(parts, *others)
+        fails = fails_until is not None and parts.controller.t_f < fails_until
+        return replace(result, status=np.full_like(result.status, rollout.DIVERGED)) if fails else result
+
+    monkeypatch.setattr(montecarlo, "run", run)
+    found = design.shortest_time(scenario.from_tables(OBSERVED), Requirement("peak_torque", 1e4), 0, np.arange(1))
     assert found.theory is not None
     assert found.simulated is not None
     assert 4.2 < found.theory <= 4.2 * (1.0 + 2e-3)
-    assert 4.2 < found.simulated <= 4.2 * (1.0 + 2e-3)
+    least = 4.2 if fails_until is None else fails_until
+    assert least < found.simulated <= least * (1.0 + 2e-3)
 
 
 @pytest.mark.parametrize(("confidence", "least"), [(None, 6), (0.5, 7)])

@@ -491,6 +491,8 @@ def test_a_problem_of_fewer_trials_keeps_those_added_and_shares_of_the_others():
     np.testing.assert_allclose(c[1] + 1, flown.effort / 5.0, rtol=1e-10)
     np.testing.assert_allclose(c[0].max(), np.sort(flown.peak_torque[:4])[2] / 0.7 - 1, rtol=1e-10)
     assert objective.fewer_trials(some, 8) is some
+    one_of_8 = replace(some, may_break=(1, None, None))
+    assert objective.fewer_trials(one_of_8, 4).may_break == (0, None, None)
 
 
 def test_judged_is_the_very_law_on_the_flight_clock():

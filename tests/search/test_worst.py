@@ -265,6 +265,7 @@ def test_where_nothing_can_be_moved_the_hardest_drawn_one_is_the_worst():
     at = np.array([ETA, 1.0])
     found = worst.hardest(problem, wanted, at)
     trials, ratio = worst.screen(problem, wanted, at)
+    assert trials[0] == problem.averaged  # none that the gains are tuned on
     assert found.moved == ()
     assert found.trial == trials[np.argmax(ratio)]
     np.testing.assert_allclose([found.ratio, found.screened], ratio.max(), rtol=1e-9)

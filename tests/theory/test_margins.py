@@ -1,6 +1,7 @@
 """Margins against closed forms, an independent frequency response, central differences and the flown loop."""
 
 import itertools
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -116,7 +117,13 @@ def test_margins_are_those_of_an_independent_transfer_function(k1, period, rate,
 def test_gain_margin_of_a_sampled_double_integrator():
     """A pole comes to -1 at k kd h = 2."""
     _, loop, (_, kd) = chain(hardware={"delay": 0, "state_noise": [1e-6, 1e-6]})
-    np.testing.assert_allclose(10 ** (of(loop).gain_up / 20), 2.0 / (kd * 0.05), rtol=1e-10)
+    found, factor = of(loop), 2.0 / (kd * 0.05)
+    np.testing.assert_allclose(10 ** (found.gain_up / 20), factor, rtol=1e-10)
+    lost = of(replace(loop, command=2.0 * factor * loop.command, direct=2.0 * factor * loop.direct))
+    assert (found.stable, lost.stable) == (True, False)
+    np.testing.assert_allclose([lost.gain_up, lost.gain_down], -20.0 * np.log10(2.0), rtol=1e-10)
+    assert lost.phase < 0.0 < found.phase
+    assert lost.delay == 0.0
 
 
 def test_slopes_of_margins_are_those_of_central_differences():
