@@ -78,10 +78,10 @@ def configure(
     there is none of that kind. bits: of every number; what 32 put out of reach stands in docs/python.md. keep_programs:
     keep whole compiled programs too, and load them, in a process in which no code is patched, see `ptsmc_jax.programs`,
     or looked for faults in: JAX's checks for NaN, infinity, promotion and transfers, which stop runs, are off there
-    whatever the environment says.
-    Called before JAX is imported, it also silences what XLA says to stderr by itself ("Very slow compile?" after two
-    minutes), unless TF_CPP_MIN_LOG_LEVEL is set. Call it before anything runs on JAX; later it raises RuntimeError
-    where the backend has already started with something else, and ValueError at any time for other bits and devices.
+    whatever the environment says. Called before JAX is imported, it also silences what XLA says to stderr by itself
+    ("Very slow compile?" after two minutes), unless TF_CPP_MIN_LOG_LEVEL is set. Call it before anything runs on JAX;
+    later it raises RuntimeError where the backend has already started with something else, and ValueError at any time
+    for other bits and devices.
     """
     if bits not in (32, 64):
         raise ValueError(f"bits is {bits!r}, but must be 32 or 64")
@@ -130,7 +130,8 @@ def _set_compiler_options(fast: bool, folder: Path | None, device: str | None) -
     flags = before.replace(_added, "").strip()
     theirs = any(option in flags for option in ("xla_backend_extra_options", "xla_disable_hlo_passes"))
     options = _options(folder, device) if fast and not theirs else ()
-    ours = _flags(tuple(option for option in options if f"{option.split('=')[0]}=" not in flags))
+    given = {flag.split("=")[0] for flag in flags.split()}
+    ours = _flags(tuple(option for option in options if option.split("=")[0] not in given))
     wanted = f"{flags} {ours}".strip()
     if sorted(wanted.split()) == sorted(before.split()):
         return
