@@ -10,7 +10,7 @@ import pytest
 from ptsmc_jax import scenario
 from ptsmc_jax.numerics import draws
 from ptsmc_jax.simulation.requirements import Requirement
-from tests.helpers import ROOT, SHORT_CHAIN, small_search
+from tests.helpers import FIRST_FLIGHT, ROOT, SHORT_CHAIN, small_search
 from tuning.output import search_sentences
 from tuning.search import trust, worst
 from tuning.search.descents import Step
@@ -197,3 +197,20 @@ def test_what_more_accurate_gains_break_is_known(monkeypatch):
     assert broken_by(flown([1.0, 2.0]), flown([1.0, 1.0])) == {"paper": ["gain_margin"], "before": []}
     assert broken_by(flown([3.0, 2.0]), flown([2.0, 2.0])) == {}
     assert [*broken_by(flown([1.0, 9.0], (True, False)), flown([0.0, 0.0], (False, False)))] == ["paper"]
+
+
+def test_judged_is_the_very_law_on_the_flight_clock():
+    own = scenario.read(FIRST_FLIGHT)
+    flown = judging.as_flown(own)
+    assert flown.loop.clock == "flight"
+    assert flown.controller == own.controller
+    assert judging.as_flown(scenario.from_tables({})) == scenario.from_tables({})
+
+
+@pytest.mark.parametrize(("law", "words"), [
+    ({"sign_width": 0.01}, "flight clock, sign 0.01 wide"),
+    ({"sign_width": 0.0}, "flight clock, exact sign"),
+    ({"kind": "pd"}, "flight clock"),
+])  # fmt: skip
+def test_what_gains_are_judged_on_is_said_in_the_laws_own_terms(law, words):
+    assert judging.judged_on(scenario.from_tables({"controller": law, "loop": {"mode": "sampled"}})) == words
