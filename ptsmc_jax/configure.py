@@ -127,7 +127,7 @@ def _set_compiler_options(fast: bool, folder: Path | None, device: str | None) -
     """XLA_FLAGS with our options or without; raises RuntimeError where JAX has already started with others."""
     global _added
     before = os.environ.get("XLA_FLAGS", "")
-    flags = before.replace(_added, "").strip()
+    flags = _without_ours(before)
     theirs = any(option in flags for option in ("xla_backend_extra_options", "xla_disable_hlo_passes"))
     options = _options(folder, device) if fast and not theirs else ()
     given = {flag.split("=")[0] for flag in flags.split()}
@@ -141,6 +141,12 @@ def _set_compiler_options(fast: bool, folder: Path | None, device: str | None) -
             f"than fast={fast} asks for; call it first, right after the imports"
         )
     os.environ["XLA_FLAGS"], _added = wanted, ours or _added
+
+
+def _without_ours(flags: str) -> str:
+    """XLA_FLAGS without what an earlier call added, or a process that began this one, beside options of the user's."""
+    given, ours = flags.split(), _added.split()
+    return " ".join(flag for flag in given if flag not in ours) if ours[0] in given else flags
 
 
 def _has_started() -> bool:

@@ -117,6 +117,11 @@ def test_an_option_that_the_user_has_set_stays(tried, monkeypatch):
     setup._set_compiler_options(fast=True, folder=None, device="cpu")
     others = tuple(option for option in GOOD if "optimization_level" not in option)
     assert os.environ["XLA_FLAGS"] == f"--xla_backend_optimization_level=3 {setup._flags(others)}"
+    for added in (setup._added, setup._flags(GOOD)):  # here, and in a process that this one begins
+        monkeypatch.setattr(setup, "_added", added)
+        monkeypatch.setenv("XLA_FLAGS", f"--xla_backend_optimization_level=3 {setup._flags(others)}")
+        setup._set_compiler_options(fast=False, folder=None, device="cpu")
+        assert os.environ["XLA_FLAGS"] == "--xla_backend_optimization_level=3"
 
 
 def test_a_cache_that_cannot_be_written_is_none(tried, tmp_path):
