@@ -128,9 +128,9 @@ def _set_compiler_options(fast: bool, folder: Path | None, device: str | None) -
     global _added
     before = os.environ.get("XLA_FLAGS", "")
     flags = _without_ours(before)
-    theirs = any(option in flags for option in ("xla_backend_extra_options", "xla_disable_hlo_passes"))
-    options = _options(folder, device) if fast and not theirs else ()
     given = {flag.split("=")[0] for flag in flags.split()}
+    theirs = given & {"--xla_backend_extra_options", "--xla_disable_hlo_passes"}
+    options = _options(folder, device) if fast and not theirs else ()
     ours = _flags(tuple(option for option in options if option.split("=")[0] not in given))
     wanted = f"{flags} {ours}".strip()
     if sorted(wanted.split()) == sorted(before.split()):
