@@ -55,10 +55,13 @@ class Run:
 
         None: it was not flown to the end, or with sensors of one's own, of which it is not known what they say.
         """
-        if self.status not in montecarlo.FINISHED:
-            return None
+        return error_floor.along(self.parts, self.log) if self.has_floor else None
+
+    @property
+    def has_floor(self) -> bool:
+        """Whether there is a `floor`."""
         known = self.parts.sensors is None or hasattr(self.parts.sensors, "reading")
-        return error_floor.along(self.parts, self.log) if known else None
+        return known and self.status in montecarlo.FINISHED
 
     def columns(self) -> dict[str, np.ndarray]:
         """The history by column, (time,) each: t [s], state, estimate, delivered torque, s, wheels, flexible modes."""
@@ -122,5 +125,5 @@ def floor(ready: Study, seed: int = 0, rows: Sequence[int | Row] = ()) -> float 
     rows. None: none of these is flown to the end.
     """
     trials = rows or (range(FLOORS) if ready.dispersion.varies else (None,))
-    runs = (_fly(ready, seed, trial) for trial in trials)
-    return error_floor.pooled(run.floor for run in runs if run.floor is not None)
+    runs = [_fly(ready, seed, trial) for trial in trials]
+    return error_floor.pooled(error_floor.along_each([(run.parts, run.log) for run in runs if run.has_floor]))

@@ -15,7 +15,7 @@ It bounds the mean over trials. A single run, or a small campaign, may come out 
 """
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -47,29 +47,54 @@ class Floor:
 
 
 class Model(NamedTuple):
-    """A linear-Gaussian model of `periods` control periods: z' = F (z + B v), y = H z + n.
+    """A linear-Gaussian model of `periods` control periods: z' = F (z + B v), y = H z + n; or those of several runs.
 
     In a period the sample comes first, then v acts, then the state moves. v, n: independent, of 1 sigma each as said.
+    Runs, where there are several, have the axis after the periods, and the same samples.
     """
 
-    start: np.ndarray  # (n, k) factor of the covariance before the first sample: S S'
-    rows: np.ndarray  # (m, n) H, or (periods, m, n)
-    noise: np.ndarray  # (periods, m) 1 sigma of each reading; infinite: there is none
-    kick: np.ndarray  # (periods, n, v) B, times 1 sigma
-    move: np.ndarray  # (periods, n, n) F
-    output: np.ndarray  # (periods, outputs, n) what is asked, of z + B v
+    start: np.ndarray  # (.., n, k) factor of the covariance before the first sample: S S'
+    rows: np.ndarray  # (m, n) H, or (periods, .., m, n)
+    noise: np.ndarray  # (periods, .., m) 1 sigma of each reading; infinite: there is none
+    kick: np.ndarray  # (periods, .., n, v) B, times 1 sigma
+    move: np.ndarray  # (periods, .., n, n) F
+    output: np.ndarray  # (periods, .., outputs, n) what is asked, of z + B v
 
 
 def along(parts: Parts, log: Log) -> Floor:
     """The floor along a run with this history (`rollout.simulate`, record=True)."""
-    ticks, log = _lasting(parts, log)
-    if not parts.clock.sampled or (parts.sensors is None and parts.walk_rate is None):
-        return Floor(0.0, ticks.t_next, np.zeros_like(ticks.t_next))
-    sizes = deviations(_model(parts, log, ticks), parts.effective_actuators.delay)
-    squares = np.sum(sizes.reshape(len(sizes), 3, -1) ** 2, axis=2)
+    return along_each([(parts, log)])[0]
+
+
+def along_each(runs: Sequence[tuple[Parts, Log]]) -> list[Floor]:
+    """The floor along each of several runs of a scenario, side by side."""
+    lasting = [(parts, *_lasting(parts, log)) for parts, log in runs]
+    alike = dict[tuple, dict[int, Model]]()  # by the samples and the delay
+    for k, (parts, ticks, log) in enumerate(lasting):
+        if parts.clock.sampled and (parts.sensors is not None or parts.walk_rate is not None):  # something is unknown
+            model = _model(parts, log, ticks)
+            delay = parts.effective_actuators.delay
+            alike.setdefault((delay, np.isfinite(model.noise).tobytes(), *map(np.shape, model)), {})[k] = model
+    squares = [np.zeros((len(ticks.t), 3)) for _, ticks, _ in lasting]
+    for (delay, *_), models in alike.items():
+        sizes = deviations(_together([*models.values()]), delay)
+        for number, k in enumerate(models):
+            squares[k] = np.sum(sizes[:, number].reshape(len(sizes), 3, -1) ** 2, axis=2)
+    return [_floor(parts, ticks, of_run) for (parts, ticks, _), of_run in zip(lasting, squares, strict=True)]
+
+
+def _together(models: Sequence[Model]) -> Model:
+    """The models of several runs as one."""
+    rows = [np.broadcast_to(one.rows, (len(one.move), *one.rows.shape[-2:])) for one in models]
+    start, *others = zip(*(one._replace(rows=of_run) for one, of_run in zip(models, rows, strict=True)), strict=True)
+    return Model(np.stack(start), *(np.stack(some, axis=1) for some in others))
+
+
+def _floor(parts: Parts, ticks: Ticks, squares: np.ndarray) -> Floor:
+    """From squares of the error (periods, 3) at start, middle and end of each period."""
     criteria = Criteria(parts.controller.t_f, parts.t_end, parts.window, parts.settling_angle)
-    total = float(_total(ticks.t, ticks.t_next, squares, criteria))
-    return Floor(float(np.sqrt(total / float(parts.window))), ticks.t_next, np.sqrt(squares[:, 2]))
+    total = float(_total(ticks.t, ticks.t_next, squares, criteria)) if squares.any() else 0.0
+    return Floor(float(np.sqrt(total / float(parts.window))), np.asarray(ticks.t_next), np.sqrt(squares[:, 2]))
 
 
 def pooled(floors: Iterable[Floor]) -> float | None:
@@ -100,49 +125,56 @@ def _total(t: Array, t_next: Array, squares: Array, criteria: Criteria) -> Array
 
 
 def deviations(model: Model, delay: int = 0) -> np.ndarray:
-    """1 sigma of each output (periods, outputs) given all samples up to `delay` periods before.
+    """1 sigma of each output (periods, .., outputs) given all samples up to `delay` periods before.
 
     Factors S of P = S S' are carried by orthogonal transformations (Kaminski, Bryson, Schmidt, IEEE TAC 16(6), 1971):
     nothing is subtracted or inverted, so that noises of any sizes go together.
     """
-    sizes = np.zeros(model.output.shape[:2])
-    rows = np.broadcast_to(model.rows, (len(model.move), *model.rows.shape[-2:]))
-    factor, largest = model.start, np.zeros(rows.shape[1])
+    periods, sizes = len(model.move), np.zeros(model.output.shape[:-1])
+    shape = (*model.move.shape[:-2], *model.rows.shape[-2:])
+    rows, available = np.broadcast_to(model.rows, shape), np.isfinite(model.noise).reshape(periods, -1, shape[-2])
+    factor, largest = model.start, np.zeros(shape[1:-1])
     known = deque([(0, factor)], maxlen=delay + 1)  # period, and what the samples up to it say
 
     def moved(k: int, factor: np.ndarray) -> np.ndarray:
-        return _triangular(model.move[k] @ np.hstack([factor, model.kick[k]]))
+        return model.move[k] @ np.concatenate([factor, model.kick[k]], axis=-1)
 
-    for k in range(len(model.move)):
-        read, there = rows[k] @ factor, np.isfinite(model.noise[k])
+    for k in range(periods):
+        read, there = rows[k] @ factor, available[k, 0]
         largest = np.maximum(largest, _sizes(read))
-        noise = np.maximum(model.noise[k], EXACT * largest)[there]
-        factor = _corrected(factor, read[there], np.diag(noise))
+        noise = np.maximum(model.noise[k], EXACT * largest)[..., there]
+        factor = _corrected(factor, read[..., there, :], noise[..., None] * np.eye(noise.shape[-1]))
         known.append((k, factor))
         period, late = known[0]
         for j in range(period, k):
-            late = moved(j, late)
-        sizes[k] = _sizes(model.output[k] @ np.hstack([late, model.kick[k]]))
+            late = _triangular(moved(j, late))
+        sizes[k] = _sizes(model.output[k] @ np.concatenate([late, model.kick[k]], axis=-1))
         factor = moved(k, factor)
     return sizes
 
 
 def _triangular(factor: np.ndarray) -> np.ndarray:
-    """A lower triangular factor (n, n) of the same covariance as a factor (n, k), k >= n."""
-    return np.asarray(np.linalg.qr(factor.T, mode="r")).T
+    """A lower triangular factor (.., n, n) of the same covariance as a factor (.., n, k), k >= n."""
+    return np.swapaxes(np.linalg.qr(np.swapaxes(factor, -1, -2), mode="r"), -1, -2)
 
 
 def _corrected(factor: np.ndarray, read: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """Factor of the covariance after readings; read: their rows by the factor, (m, n); noise: a factor of theirs."""
-    m, n = read.shape
-    both = np.zeros((m + len(factor), m + n))
-    both[:m, :m], both[:m, m:], both[m:, m:] = noise, read, factor
-    return _triangular(both)[m:, m:]
+    """Factor (.., n, n) of the covariance after readings.
+
+    Args:
+        factor: of the covariance before, (.., n, k), k >= n.
+        read: the readings' rows by the factor, (.., m, k).
+        noise: a factor of the readings' covariance, (.., m, m).
+    """
+    *many, m, k = read.shape
+    both = np.zeros((*many, m + factor.shape[-2], m + k))
+    both[..., :m, :m], both[..., :m, m:], both[..., m:, m:] = noise, read, factor
+    return _triangular(both)[..., m:, m:]
 
 
 def _sizes(rows: np.ndarray) -> np.ndarray:
     """2-norms of the rows."""
-    return np.sqrt(np.einsum("ij,ij->i", rows, rows))
+    return np.sqrt(np.einsum("...ij,...ij->...i", rows, rows))
 
 
 def _model(parts: Parts, log: Log, ticks: Ticks) -> Model:

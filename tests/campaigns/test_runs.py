@@ -21,10 +21,13 @@ def test_a_scenarios_floor_is_pooled_over_the_first_trials_or_those_of_a_plan(mo
 
     def fly(ready, seed, trial):
         seen.append((seed, trial))
-        at = np.zeros(1)
-        return SimpleNamespace(floor=None if len(seen) == 2 else error_floor.Floor(1.0 + (trial or 0), at, at))
+        return SimpleNamespace(has_floor=len(seen) != 2, parts=1.0 + (trial or 0), log=None)
+
+    def along_each(flown):
+        return [error_floor.Floor(floor, np.zeros(1), np.zeros(1)) for floor, _ in flown]
 
     monkeypatch.setattr(runs, "_fly", fly)
+    monkeypatch.setattr(error_floor, "along_each", along_each)
     ready: Any = SimpleNamespace(dispersion=SimpleNamespace(varies=varies))
     squares = [(1.0 + (k or 0)) ** 2 for j, k in enumerate(flown) if j != 1]
     assert runs.floor(ready, 5, rows) == pytest.approx(math.sqrt(sum(squares) / len(squares)))

@@ -170,6 +170,27 @@ def test_a_body_at_rest_as_by_a_brute_force_estimator(kind):
     np.testing.assert_allclose(found.window_error, pooled_in_window(made, squares), rtol=1e-8)
 
 
+def test_side_by_side_each_run_has_its_own_floor():
+    """Runs alike but for their noise, one that acts later, a longer one, and one without anything unknown."""
+
+    def chain(t_f=2.0, noise: Any = (1e-3, 5e-2), delay=0):
+        made = chain_parts([0.5, -0.2], t_f=t_f, period=PERIOD, noise=noise)
+        return flown_at(made, actuators=delayed(delay))
+
+    runs = [chain(), chain(noise=(2e-3, 1e-2)), chain(delay=2), chain(t_f=2.2), chain(noise=None), chain(delay=2)]
+    flown = [(made, still(made)) for made in runs]
+    for (made, log), found in zip(flown, error_floor.along_each(flown), strict=True):
+        alone = error_floor.along(made, log)
+        # QR of the same matrices, one after the other
+        np.testing.assert_allclose(found.error, alone.error, rtol=1e-13)
+        np.testing.assert_allclose(found.window_error, alone.window_error, rtol=1e-13)
+        np.testing.assert_array_equal(found.t, alone.t)
+    floors = [found.window_error for found in error_floor.along_each(flown)]
+    assert len(set(floors)) == 5  # of six, two of which are the same
+    assert floors[4] == 0.0
+    assert error_floor.along_each([]) == []
+
+
 def test_a_state_that_is_measured_without_noise_is_known():
     """With the rate known the position does not move: it is known as the mean of all samples."""
     made = flown_at(chain_parts([1.0, 0.0], t_f=2.0, period=PERIOD, noise=[1e-3, 0.0]))

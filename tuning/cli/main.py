@@ -215,6 +215,7 @@ def tune(
         write=lambda making, tuning: tune_files.write(making, loaded, tuning, figures, known_by),
         summary=tune_files.summary,
         show=terminal.tuning,
+        needs=("scipy.stats", *(["ptsmc_jax.figures.study_plots"] if figures else [])),
     )
     return searches.run(search, loaded, folder, force=force, quiet=quiet)
 

@@ -1,6 +1,8 @@
 """What `tune`, `pareto` and `compare` share: a long search that is shown again, gone on with, or begun."""
 
+import importlib
 import sys
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +30,7 @@ class LongSearch:
     summary: Callable[[Any], dict[str, Any]]  # what `summary.json` says of it
     show: Callable[[dict[str, Any], Path, str], None]  # prints such a summary, the folder, and how it came about
     check: Callable[[], Any] = lambda: None  # raises what is refused besides the scenario, before a folder is begun
+    needs: tuple[str, ...] = ()  # modules that take long to import, and only what follows the first steps needs
 
 
 def say_seen(scenario: Path, seed: int) -> None:
@@ -75,6 +78,7 @@ def run(search: LongSearch, loaded: "Scenario", folder: Path, *, force: bool, qu
     journal = Journal(store.begin(folder, tables, search.known_by, fresh=not going_on))
 
     def searched() -> Any:
+        threading.Thread(target=lambda: [*map(importlib.import_module, search.needs)], daemon=True).start()
         with terminal.Progress(quiet, search.goal) as report:
             outcome = search.work(report, journal)
         store.write(folder, lambda making: search.write(making, outcome))

@@ -23,6 +23,7 @@ from tuning.search.work import ROUND, SLOPED
 
 AGAIN = 3  # starts from whose best points a further round goes on
 EXPLORED, AVERAGED = 32, 16  # trials on which most starts are given up; at least so many count in the objective
+TOGETHER = 2  # descents of each device that go in step: it waits for one call where they think, not for two
 FOLLOWED = 3  # of the explored starts go on with all trials
 SAME = 1e-4  # points whose F differs by less are equally good: 0.01 % of the error
 FINISH = 1e-2  # share of `CLOSE` at which the last descent, from the best point, ends
@@ -193,7 +194,7 @@ class Descents:
         *,
         afresh: bool,
     ) -> None:
-        """Descend from each of these starts, as many at a time as there are devices."""
+        """Descend from each of these starts, `TOGETHER` at a time of each device."""
         tightened, bests, reports = self.tightened(problem), dict[int, Best](), 0
 
         def race(k: int, ask: Ask) -> None:
@@ -215,7 +216,7 @@ class Descents:
             return [measured.at(k) for k in range(len(points))]
 
         try:
-            in_step([partial(race, k) for k in racers], fly, len(configure.devices()))
+            in_step([partial(race, k) for k in racers], fly, TOGETHER * len(configure.devices()))
             tell()
         finally:  # interrupted too
             for k in racers:

@@ -108,7 +108,8 @@ def _smallest(
 ) -> float | None:
     """Smallest t_f at which peak(t_f) <= limit, the last crossing when t_f shrinks from where the limit is kept.
 
-    Peaks fall about like 1 / t_f^2, so each guess is the last one times sqrt(peak / limit), kept inside the bracket.
+    Peaks fall about like 1 / t_f^2, so each guess is the last one times sqrt(peak / limit); every third one doubles it,
+    or halves the bracket, whatever the peaks are like.
 
     Args:
         peak: of the input by t_f [s].
@@ -121,7 +122,7 @@ def _smallest(
     """
     over, kept = lowest, None  # t_f known to break the limit, and to keep it
     guess = start
-    for _ in range(most):
+    for looked in range(most):
         value = peak(guess)
         if value <= limit:
             kept = guess
@@ -132,10 +133,10 @@ def _smallest(
         if kept is None and over >= longest:
             return None
         step = guess * (value / limit) ** 0.5 if np.isfinite(value) and value > 0 else 2 * guess
+        step *= 1 - 0.5 * close if value <= limit else 1 + 0.2 * close  # to the other side of the limit
+        bold = looked % 3 == 2
         if kept is None:
-            guess = min(max(step, 1.001 * over) * (1 + 0.2 * close), longest)
+            guess = min(2 * over if bold else max(step, 1.001 * over), longest)
         else:
-            inside = over + 0.02 * (kept - over), kept - 0.02 * (kept - over)
-            step *= 1 + 0.2 * close
-            guess = step if inside[0] < step < inside[1] else 0.5 * (over + kept)
+            guess = step if over < step < kept and not bold else 0.5 * (over + kept)
     return kept

@@ -7,7 +7,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from scipy.stats import qmc
 
 from tuning.search.evaluate import Evaluator, Measured, Sloped
 from tuning.search.objective import FAILED, Problem, failures
@@ -51,6 +50,8 @@ def held_by_limits(at: Sloped) -> list[int]:
 
 def spread(gains: int, count: int, rng: np.random.Generator) -> np.ndarray:
     """(count, gains) shares spread evenly: Sobol's sequence, scrambled."""
+    from scipy.stats import qmc  # takes half a second, in which a search flies
+
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # counts other than powers of 2 are a little less even
         return qmc.Sobol(gains, rng=rng).random(count)

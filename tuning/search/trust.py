@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
 from ptsmc_jax.simulation import rollout
 from tuning.search import flights
@@ -125,6 +124,8 @@ def ratio_interval(numerator: np.ndarray, denominator: np.ndarray) -> tuple[floa
 def _bootstrap(samples: tuple, statistic, *, paired: bool) -> tuple[float, float] | None:
     if len(samples[0]) < 8 or all(np.ptp(one) == 0.0 for one in samples):
         return None
+    from scipy import stats  # takes half a second, in which a search flies
+
     bootstrap = stats.bootstrap(
         samples,
         statistic,

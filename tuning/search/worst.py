@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from scipy.stats import chi2
+from scipy import special  # `scipy.stats` takes half a second to import
 
 from ptsmc_jax import programs
 from ptsmc_jax.dispersions.base import Coordinates
@@ -149,7 +149,7 @@ def _normal(problem: Problem, moved: tuple[str, ...]) -> list[tuple[slice, float
 
 def _farthest(count: int) -> float:
     """Radius of the ball that holds `HELD` of so many normal numbers."""
-    return float(np.sqrt(chi2.ppf(HELD, count)))
+    return float(np.sqrt(2.0 * special.gammaincinv(count / 2.0, HELD)))  # of chi square
 
 
 def _within(y: np.ndarray, normal: list[tuple[slice, float]], slope: np.ndarray | None = None) -> np.ndarray:

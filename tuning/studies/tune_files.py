@@ -10,7 +10,6 @@ import numpy as np
 
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.montecarlo import Trials
-from ptsmc_jax.figures import study_plots, style
 from ptsmc_jax.scenario import cautions, free_gains, own, parsing
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import catalogues
@@ -173,6 +172,8 @@ def write(folder: Path, scenario: Scenario, tuning: Tuning, figures: bool, known
     ]
     store.write_csv(folder / "history.csv", history_columns(scenario, tuning.search.problem.rows), rows)
     if figures:
+        from ptsmc_jax.figures import style
+
         style.save(figures_of(scenario, tuning), folder / "figures")
 
 
@@ -195,6 +196,8 @@ def identity(scenario: Scenario, seed: int, *, globally: bool) -> dict[str, Any]
 
 def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
     """Figures of a tuning run by name."""
+    from ptsmc_jax.figures import study_plots  # takes a while, in which the search flies
+
     kind, names = scenario.plant.kind, gain_names.named(scenario)
     unit_of = gain_names.units_of(scenario)
     units = [unit_of[gain_names.base(name)] for name in names]
