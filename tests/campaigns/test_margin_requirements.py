@@ -184,7 +184,7 @@ def test_rows_of_constraints_are_met_where_the_verdicts_are_and_have_slopes(draw
 def test_no_product_has_an_inertia_for_each_case(drawn):
     """With one XLA (jaxlib 0.10.2) aborts the process, by chance of its layout: "Check failed: IsMonotonicWith.."."""
     asked, bounds = drawn.problem.margins, drawn.evaluate.bounds
-    trace = jax.make_jaxpr(lambda share: jax.jacfwd(lambda at: margin_rows.rows(asked, bounds.gains(at)))(share))
+    trace = jax.make_jaxpr(lambda share: margin_rows.with_slopes(asked, bounds, share))
     products = [e for e in equations(trace(np.full(len(bounds.names), 0.5))) if e.primitive.name == "dot_general"]
     assert products
     each = (margin_rows.CASES, 3, 3)

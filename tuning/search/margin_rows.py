@@ -3,7 +3,9 @@
 One for each axis, time and case, so that what is the least of several has slopes where two of them change places.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +21,8 @@ from ptsmc_jax.scenario import Study
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.catalogues import MARGINS
 from ptsmc_jax.simulation.requirements import over
-from ptsmc_jax.theory import margins, run_margins
+from ptsmc_jax.theory import linear, margins, run_margins
+from ptsmc_jax.theory.linear import Loop
 from tuning.search import gains as gain_names
 from tuning.search.gains import with_gains
 from tuning.search.shares import Bounds
@@ -90,21 +93,20 @@ def hardest(asked: Asked, gains: Float[np.ndarray, " gains"]) -> tuple[Asked, fl
     return _of_trials(asked, np.argsort(-near, kind="stable")[:CASES]), max(float(near.max()), 0.0)
 
 
-def rows(asked: Asked, gains: Float[Array, " gains"]) -> Float[Array, "margins entries"]:
+def rows(
+    asked: Asked, gains: Float[Array, " gains"], runs: linear.Nominal | None = None
+) -> Float[Array, "margins entries"]:
     """Constraints c, met where c <= 0: how near to its limit each margin comes, over `limits`, less 1.
 
-    A loop without slopes is as far beyond as one without any margin.
+    A loop without slopes is as far beyond as one without any margin. runs: what `nominal_runs` says, if known.
     """
-    parts = with_gains(asked.parts, dict(zip(asked.names, gains, strict=True)))
     late = margin_verdicts.DELAY in asked.metrics
 
-    if asked.coordinates:
-        # one after the other: XLA aborts the process on products with an inertia of each case, with some sets of gains
-        drawn = asked.coordinates
-        each = jax.lax.map(lambda c: run_margins.judged_loops(asked.dispersion.at(parts, c), late=late)[0], drawn)
-        loops = jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), each)
-    else:
-        loops, _ = run_margins.judged_loops(parts, late=late)
+    def loops_of(parts: Parts, run: linear.Nominal) -> Loop:
+        return run_margins.judged_loops(parts, run, late=late)[0]
+
+    each = _by_case(asked, gains, loops_of, nominal_runs(asked, gains) if runs is None else runs)
+    loops = jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), each)
     values = margins.of_each(loops, with_delay=late).each()
     shares = [
         over(values[name].reshape(-1), wanted, at_least=MARGINS[name].at_least)
@@ -112,6 +114,49 @@ def rows(asked: Asked, gains: Float[Array, " gains"]) -> Float[Array, "margins e
     ]
     near = jnp.stack([jnp.where(jnp.isnan(share), WITHOUT, share) for share in shares])
     return near / asked.limits[:, None] - 1.0
+
+
+def nominal_runs(asked: Asked, gains: Float[Array, " gains"]) -> linear.Nominal:
+    """The nominal run of each case, arrays over them first; of the parts alone where there is no case."""
+    return _by_case(asked, gains, linear.nominal)
+
+
+def _by_case(asked: Asked, gains: Float[Array, " gains"], of: Callable[..., Any], *by_case: Any) -> Any:
+    """What `of` says of each case's parts, and of what is known of each; arrays over the cases first.
+
+    One after the other: XLA aborts the process on products with an inertia of each case, with some sets of gains.
+    """
+    parts = with_gains(asked.parts, dict(zip(asked.names, gains, strict=True)))
+    if asked.coordinates:
+        return jax.lax.map(lambda one: of(asked.dispersion.at(parts, one[0]), *one[1:]), (asked.coordinates, *by_case))
+    known = jax.tree.map(lambda v: v[0], by_case)
+    return jax.tree.map(lambda v: v[None], of(parts, *known))
+
+
+def with_slopes(asked: Asked, bounds: Bounds, share: Float[Array, " gains"]) -> tuple[Array, Array]:
+    """The `rows` at a share of the bounds' intervals, and their slopes by it, (margins, entries, gains).
+
+    The runs' own slopes along one gain after the other, which takes a quarter of the time: a loop over periods with all
+    of them in it is one of many small products.
+    """
+
+    def flown(share: Array) -> tuple[list[Array], list[Array]]:
+        leaves = jax.tree.leaves(nominal_runs(asked, bounds.gains(share)))
+        return [v for v in leaves if _sloped(v)], [v for v in leaves if not _sloped(v)]
+
+    def judged(share: Array, numbers: list[Array]) -> Array:
+        left, others_left = iter(numbers), iter(others)
+        runs = [next(left if _sloped(shape) else others_left) for shape in shapes]
+        return rows(asked, bounds.gains(share), jax.tree.unflatten(structure, runs))
+
+    shapes, structure = jax.tree.flatten(jax.eval_shape(lambda at: nominal_runs(asked, bounds.gains(at)), share))
+    each = jax.lax.map(lambda by: jax.jvp(flown, (share,), (by,), has_aux=True), jnp.eye(share.size))
+    (numbers, others), moved = jax.tree.map(lambda v: v[0], (each[0], each[2])), each[1]
+    return jax.vmap(lambda *by: jax.jvp(judged, (share, numbers), by), out_axes=(None, -1))(jnp.eye(share.size), moved)
+
+
+def _sloped(leaf: Any) -> bool:
+    return jnp.issubdtype(leaf.dtype, jnp.inexact)
 
 
 def of_points(asked: Asked, bounds: Bounds, share: Float[np.ndarray, "points gains"]) -> dict[str, np.ndarray]:
@@ -127,11 +172,7 @@ def sloped(asked: Asked, bounds: Bounds, share: Array) -> dict[str, Array]:
     """See `of_points`; one point for each device."""
 
     def on_device(share: Array) -> dict[str, Array]:
-        def twice(share: Array) -> tuple[Array, Array]:
-            c = rows(asked, bounds.gains(share))
-            return c, c
-
-        slope, c = jax.jacfwd(twice, has_aux=True)(share[0])
+        c, slope = with_slopes(asked, bounds, share[0])
         return {"c": c[None], "c_slope": jnp.nan_to_num(slope)[None]}
 
     return montecarlo.spread(on_device, share, share.shape[0])
