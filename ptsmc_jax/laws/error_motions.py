@@ -8,7 +8,7 @@ from typing import Any, ClassVar, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ptsmc_jax.numerics import attitude, guards, matrices
+from ptsmc_jax.numerics import attitude, elementary, guards, integrators, matrices
 from ptsmc_jax.numerics.pytrees import Scalar, Vector
 from ptsmc_jax.plants.integrator_chain import Chain
 from ptsmc_jax.plants.rigid_body import AttitudeState, Spacecraft
@@ -52,6 +52,10 @@ class ErrorMotion:
         """The scalar that settles: the angle to the reference [rad], for other plants |x_1|."""
         raise NotImplementedError
 
+    def middle_angle(self, start: tuple[Any, Any], end: tuple[Any, Any], dt: Scalar) -> Scalar:
+        """`angle` in the middle of dt [s] between two (state, target), by the error's cubic (Hermite)."""
+        return guards.norm(integrators.hermite_middle(*self.errors(*start), *self.errors(*end), dt))
+
     def influence(self, x: Any, target: Any) -> Scalar:
         """The factor N: how much a unit of disturbance changes 2 eps'' at most."""
         raise NotImplementedError
@@ -69,10 +73,30 @@ class ErrorMotion:
         return straight
 
 
-class ErrorVector(ErrorMotion):
-    """The paper's eps_1 = q_1 - q_1f (4); singular at q4 = 0, see `prescribed_time.PrescribedTime`."""
+class AttitudeMotion(ErrorMotion):
+    """Base of a spacecraft's errors: their angle."""
 
     model: Spacecraft
+
+    def angle(self, x: AttitudeState, target: Target) -> Scalar:
+        """Angle between the attitude and its reference [rad]."""
+        return attitude.angle(x.q, target.q)
+
+    def middle_angle(self, start: tuple[Any, Any], end: tuple[Any, Any], dt: Scalar) -> Scalar:
+        """`angle` in the middle [rad], by the cubic of the quaternion q_f* q, which is smooth where the angle is 0."""
+
+        def turned(x: AttitudeState, target: Target) -> tuple[Array, Array]:
+            back, back_rate = (attitude.conjugate(q) for q in (target.q, attitude.derivative(target.q, target.w)))
+            rate = attitude.multiply(back_rate, x.q) + attitude.multiply(back, attitude.derivative(x.q, x.w))
+            return attitude.multiply(back, x.q), rate
+
+        middle = integrators.hermite_middle(*turned(*start), *turned(*end), dt)
+        return 2.0 * elementary.arctan2(guards.norm(middle[:3]), jnp.abs(middle[3]))
+
+
+class ErrorVector(AttitudeMotion):
+    """The paper's eps_1 = q_1 - q_1f (4); singular at q4 = 0, see `prescribed_time.PrescribedTime`."""
+
     additive: ClassVar[bool] = True
 
     def align(self, x: AttitudeState, target: Target) -> AttitudeState:
@@ -83,10 +107,6 @@ class ErrorVector(ErrorMotion):
     def clearance(self, x: AttitudeState, target: Target) -> Scalar:
         """q4 counted positive on the reference's side [-]: at 0 the law is singular, beyond it cannot come back."""
         return jnp.where(target.q[3] < 0.0, -x.q[3], x.q[3])
-
-    def angle(self, x: AttitudeState, target: Target) -> Scalar:
-        """Angle between the attitude and its reference [rad]."""
-        return attitude.angle(x.q, target.q)
 
     def errors(self, x: AttitudeState, target: Target) -> tuple[Vector, Vector]:
         """eps_1 [-] and its derivative [1/s], (4)."""
@@ -114,13 +134,11 @@ class RelativeMotion(NamedTuple):
     feedforward: Array  # (3,) (R w_f)' = R w_f' - w_e x R w_f [rad/s^2]
 
 
-class ErrorQuaternion(ErrorMotion):
+class ErrorQuaternion(AttitudeMotion):
     """The vector part v of the error quaternion q_e = q_f* q, whatever the inertial frame.
 
     With R the rotation from the reference's axes to the body's and w_e = w - R w_f: v' = T(q_e) w_e / 2.
     """
-
-    model: Spacecraft
 
     def align(self, x: AttitudeState, target: Target) -> AttitudeState:
         """The same attitude with the sign of q for which q_e4 >= 0."""
@@ -130,10 +148,6 @@ class ErrorQuaternion(ErrorMotion):
     def clearance(self, x: AttitudeState, target: Target) -> Scalar:
         """q_e4 [-]: at 0, a true error of 180 degrees, the law is singular."""
         return jnp.dot(x.q, target.q)
-
-    def angle(self, x: AttitudeState, target: Target) -> Scalar:
-        """Angle between the attitude and its reference [rad]."""
-        return attitude.angle(x.q, target.q)
 
     def relative(self, x: AttitudeState, target: Target) -> RelativeMotion:
         """The motion of the body relative to its reference."""

@@ -35,6 +35,11 @@ def _simpson(y: Any, dt: Scalar, k1: Any, k2: Any, k3: Any, k4: Any) -> Any:
     return jax.tree.map(lambda y, a, b, c, d: y + dt / 6 * (a + 2 * (b + c) + d), y, k1, k2, k3, k4)
 
 
+def hermite_middle(start: Array, start_rate: Array, end: Array, end_rate: Array, dt: Scalar) -> Array:
+    """Value in the middle of dt [s] of the cubic through both ends with these slopes [per s]."""
+    return (start + end) / 2 + dt / 8 * (start_rate - end_rate)
+
+
 _TERMS = 15  # of the Taylor series at a norm of at most 1/2: the rest is below 2^-16 / 15!
 _DOUBLINGS = 40  # at most: enough for norms up to 2^39
 _USUAL_DOUBLINGS = 4  # enough for norms up to 8, which few matrices exceed

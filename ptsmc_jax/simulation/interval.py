@@ -72,6 +72,7 @@ class Interval(NamedTuple):
     start: Snapshot
     end: Snapshot
     errors: Callable[[], Errors]  # called from t_f on only
+    middle_angle: Callable[[], Array]  # angle in the middle, by the error's cubic [rad]; called from t_f on only
     arrival: Callable[[], Arrival]  # called in the interval that t_f lies in only
     last_torque: Array  # (m,) delivered at the end of the interval before [N m]
     torques: Torques

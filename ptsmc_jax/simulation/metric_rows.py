@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ptsmc_jax.numerics import guards
+from ptsmc_jax.numerics import guards, integrators
 from ptsmc_jax.simulation import pointing
 from ptsmc_jax.simulation.catalogues import AXES, WITHIN
 from ptsmc_jax.simulation.interval import Arrival, Criteria, Errors, Interval, Snapshot, Start, integral_in_window
@@ -86,7 +86,7 @@ def _square_error(square: Array, interval: Interval, errors: Errors, criteria: C
     The error in between is the cubic through both ends and slopes (Hermite), its square the parabola through the ends
     and the middle, integrated exactly.
     """
-    middle = (errors.start + errors.end) / 2 + interval.length / 8 * (errors.start_rate - errors.end_rate)
+    middle = integrators.hermite_middle(*errors, interval.length)
     g0, g1, g2 = (jnp.sum(e * e) for e in (errors.start, middle, errors.end))
     return square + integral_in_window(interval.t, interval.t_next, (g0, g1, g2), criteria)
 
@@ -121,9 +121,9 @@ def _chattering(variation: Array, running: Running, criteria: Criteria) -> Array
 
 
 def _square_angle(square: Array, interval: Interval, errors: Errors, criteria: Criteria) -> Array:
-    """Integral of angle^2 over the window so far; an angle has a kink where it is zero: by the mean of both ends."""
-    start, end = interval.start.angle, interval.end.angle
-    squares = (start * start, (0.5 * (start + end)) ** 2, end * end)
+    """Integral of angle^2 over the window so far, as that of |error|^2: an angle has a kink where it is zero."""
+    start, middle, end = interval.start.angle, interval.middle_angle(), interval.end.angle
+    squares = (start * start, middle * middle, end * end)
     return square + integral_in_window(interval.t, interval.t_next, squares, criteria)
 
 

@@ -125,14 +125,15 @@ def advance(run: Run, state: RunState, now: Ticks, target: Any, flown: Flown) ->
         return Arrival(law.errors(x, run.target_t_f)[0], law.angle(x, run.target_t_f))
 
     attitude_error = knowledge_error = None
+    begun, ended, length = (state.x, target), (flown.x, target_next), now.t_next - now.t
     if criteria.pointing is not None:
-        frame, length = criteria.pointing.frame, now.t_next - now.t
-        attitude_error = partial(pointing.error_path, (state.x, target), (flown.x, target_next), frame, length)
+        frame = criteria.pointing.frame
+        attitude_error = partial(pointing.error_path, begun, ended, frame, length)
         if flown.seen is not None:
             knowledge_error = partial(pointing.constant_path, flown.seen.q, state.x.q, frame, length)
     interval = Interval(
-        now.t, now.t_next, state.snapshot, snapshot, errors, arrival, state.u, flown.torques,
-        attitude_error, knowledge_error,
+        now.t, now.t_next, state.snapshot, snapshot, errors, partial(law.middle_angle, begun, ended, length), arrival,
+        state.u, flown.torques, attitude_error, knowledge_error,
     )  # fmt: skip
     u_end = flown.torques.delivered[-1]
     state = state._replace(

@@ -6,6 +6,10 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicHermiteSpline
 
+from ptsmc_jax.laws import prescribed_time
+from ptsmc_jax.numerics import attitude
+from ptsmc_jax.plants.rigid_body import AttitudeState
+from ptsmc_jax.signals import references
 from ptsmc_jax.simulation import catalogues, metrics
 from ptsmc_jax.simulation.interval import Arrival, Criteria, Errors, Interval, Snapshot, Start, Torques
 from tests.helpers import fly, parts, short, vector
@@ -24,14 +28,33 @@ def run(request):
     return flown(**{"continuous": {}, "sampled": noisy, "flight": {**noisy, "flight": True}}[request.param])
 
 
-def test_window_error_is_the_integral_of_the_squared_error(run):
+def test_window_metrics_are_integrals_of_the_squared_error_and_of_the_squared_angle(run):
     parts, found, log = run
     rates = jax.jit(jax.vmap(lambda t, x: parts.controller.errors(x, parts.reference(t))[1]))
     slope = rates(jnp.asarray(log.t), jax.tree.map(jnp.asarray, log.x))
     spline = CubicHermiteSpline(log.t, log.error, slope)
     t = np.linspace(20.0, 21.0, 20001)
-    expected = np.sqrt(np.trapezoid(np.sum(spline(t) ** 2, axis=1), t))
-    np.testing.assert_allclose(found.window_error, expected, rtol=1e-5)  # Simpson in a step: 0.1^4 times slopes of 1/s
+    squares = np.sum(spline(t) ** 2, axis=1)
+    angles = 2.0 * np.arcsin(np.sqrt(squares))  # the reference is the identity
+    expected = np.sqrt([np.trapezoid(squares, t), np.trapezoid(angles**2, t)])
+    # Simpson in a step: 0.1^4 times slopes of 1/s
+    np.testing.assert_allclose([found.window_error, found.window_angle], expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("law", [prescribed_time.PrescribedTime, prescribed_time.PrescribedTimeMultiplicative])
+def test_the_angle_in_the_middle_is_that_of_a_turn_which_passes_the_reference(law):
+    """From -0.1 to 0.3 rad about a reference that turns itself: 0.1 rad, where the mean of both ends is 0.2 rad."""
+    axis = np.array([0.6, 0.0, 0.8])
+    first = attitude.from_rotation_vector(vector([0.2, -0.3, 0.1]))
+
+    def state(t, angle):
+        turned, beyond = (attitude.from_rotation_vector(vector(a * axis)) for a in (0.7 * t, angle))
+        q_f = attitude.multiply(first, turned)
+        body = AttitudeState(attitude.multiply(q_f, beyond), vector((0.7 + 4.0) * axis))
+        return body, references.Target(q_f, vector(0.7 * axis), jnp.zeros(3))
+
+    middle = parts(law=law).controller.middle_angle(state(0.0, -0.1), state(0.1, 0.3), vector(0.1))
+    np.testing.assert_allclose(middle, 0.1, rtol=1e-4)
 
 
 def test_torque_metrics(run):
@@ -84,6 +107,7 @@ def interval(t, t_next, angles, torque=0.0, delivered=None):
         start=start,
         end=end,
         errors=lambda: Errors(*first, *last),
+        middle_angle=lambda: (start.angle + end.angle) / 2,
         arrival=lambda: Arrival(last[0], end.angle),
         last_torque=jnp.zeros(3),
         torques=Torques((u,), (got,), (1.0,), jnp.asarray(delivered is not None), None),
