@@ -193,14 +193,19 @@ def _pointing_rows(
 
 def _time_within(tally: pointing.Tally, criteria: Criteria) -> Array:
     assert criteria.pointing is not None
-    return 1.0 - tally.beyond / (criteria.t_end - criteria.t_f - criteria.pointing.after)
+    return _share_left(tally.beyond, criteria.t_end - criteria.t_f - criteria.pointing.after)
 
 
 def _share_of_windows(beyond: Array, tally: pointing.Tally, criteria: Criteria) -> Array:
     """Share of the time in whole windows that a time beyond limits leaves; NaN where no window has ended."""
     assert criteria.pointing is not None
     observed = tally.windows * criteria.pointing.window
-    return jnp.where(observed > 0.0, 1.0 - beyond / jnp.where(observed > 0.0, observed, 1.0), jnp.nan)
+    return jnp.where(observed > 0.0, _share_left(beyond, jnp.where(observed > 0.0, observed, 1.0)), jnp.nan)
+
+
+def _share_left(beyond: Array, total: Array) -> Array:
+    """Share of a time [s] that times beyond limits [s] leave; by rounding their sum may be more than all of it."""
+    return jnp.maximum(0.0, 1.0 - beyond / total)
 
 
 _PEAK_MODAL = _peak(lambda interval: interval.end.modal_amplitude, lambda start: start.snapshot.modal_amplitude)
