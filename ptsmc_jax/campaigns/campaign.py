@@ -97,7 +97,7 @@ class Campaign:
         def asked(result: Any, parts: Any) -> Any:
             try:
                 returned: Any = made(result, parts)
-            except Exception as error:
+            except (Exception, SystemExit) as error:
                 file = getattr(getattr(made, "__code__", None), "co_filename", "")
                 raise ValueError(f"it {own_checks.what_fails(error, file)}") from error
             if not isinstance(returned, dict) or not returned or not all(isinstance(name, str) for name in returned):

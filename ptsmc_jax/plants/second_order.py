@@ -227,7 +227,7 @@ def _check(name: str, function: Callable, arguments: tuple, shape: tuple[int, ..
     def traced(what: str, of: Callable) -> Any:
         try:
             return jax.eval_shape(of, *arguments)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             first_line = (str(error).splitlines() or [""])[0]
             told = f"{first_line.rstrip('.')}; {INSTEAD}" if isinstance(error, TRACED) else first_line
             failure = f"{type(error).__name__}: {told}"

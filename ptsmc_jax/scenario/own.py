@@ -268,7 +268,7 @@ def _bounds(gain: Any, called: str) -> GainBounds:
     def interval(choice: Choice) -> tuple[float, float]:
         try:
             low, high = (float(v) for v in bounds_of(choice.t_f, choice.scenario.loop.period))
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             said = f"{type(error).__name__}: {error}"
             raise ScenarioError(f"the usual bounds of the {called} fail: {said}") from None
         if not gain.above < low < high < gain.below:

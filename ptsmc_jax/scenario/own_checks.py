@@ -37,7 +37,7 @@ def check(parts: Parts, dispersion: Dispersion, scenario: Scenario) -> None:
         _draw(parts, dispersion, _Asked("dispersion.own", getattr(scenario.dispersion, "own", None)))
 
 
-def what_fails(error: Exception, file: str) -> str:
+def what_fails(error: BaseException, file: str) -> str:
     """What is wrong with code of one's own in this file that ended in an error while it was asked, or traced."""
     if isinstance(error, TRACED):
         return f"needs the value of a number that is known in flight only{systems.line(error, file)}; {INSTEAD}"
@@ -63,7 +63,7 @@ class _Asked:
             returned = jax.tree.map(jnp.asarray, function(*args))
             _trace(function, args)
             return returned
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             told = what_fails(error, inspect.getsourcefile(self._made) or "")
             raise ScenarioError(f"{self._said} {method} {told}") from None
 

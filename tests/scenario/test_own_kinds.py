@@ -258,6 +258,7 @@ BAD = [
     (changed("return 0.5 * wanted, s", "0.5 * wanted, s"), {}, "acceleration returns nothing", "a sliding variable"),
     (changed("def acceleration", "def accelerate"), {}, "the class Mine has no method", "acceleration or step"),
     (changed("return 0.5 * wanted, s", "return 1 / 0 * wanted, s"), {}, "acceleration fails", "line 19 of mine.py"),
+    (changed("return 0.5 * wanted", "exit(0)"), {}, "acceleration fails: SystemExit", "line 19 of mine.py"),
     (
         changed("return 0.5 * wanted", "return jnp.log(-1.0) * wanted"), {},
         "returns an acceleration [nan]", "finite numbers",
@@ -403,6 +404,16 @@ def test_what_fails_late_in_code_of_ones_own_is_one_sentence_too(command, here, 
     with pytest.raises(ValueError, match="JVP") as no_slopes:  # as in a search: JAX alone is on the way
         jax.jvp(lambda x: jax.pure_callback(lambda x: x, x, x), (1.0,), (1.0,))
     assert systems.at_fault(no_slopes.value) == str(here / "mine.py")
+
+
+def test_code_of_ones_own_that_exits_late_is_bad_input(command, here):
+    """It ended the command with its own status, 0: done and every requirement met."""
+    late = LAW.replace("        left =", "        asked.append(0)\n        if len(asked) > 2: exit(0)\n        left =")
+    (here / "mine.py").write_text(HEAD + "asked = []\n" + late)
+    (here / "s.toml").write_text(SHORT.replace("[controller]\n", '[controller]\nkind = "own"\ncode = "mine.py:Mine"\n'))
+    code, _, error = command("simulate", "s.toml", "--no-figures", "--quiet")
+    assert (code, error) == (2, f"ptsmc: {here}/mine.py fails: SystemExit: 0 (line 16 of mine.py)\n")
+    assert not (here / "out").exists()
 
 
 def test_where_there_is_no_gain_at_all_it_is_said_before_a_search(command, here):

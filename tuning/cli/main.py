@@ -340,7 +340,7 @@ def main() -> None:
     except OSError as error:
         name = error.filename2 or error.filename  # where it was to be moved; of a full disk it is not known
         _fail(f"{error.strerror or error}{'' if name is None else f': {name}'}")
-    except Exception as error:
+    except (Exception, SystemExit) as error:  # code of one's own may exit
         _fail(_of_own_code(error))
     finally:
         sys.unraisablehook = unraisable
@@ -384,7 +384,7 @@ def _expected(error: ValueError) -> bool:
     return isinstance(error, ScenarioError | RefusedError | UsageError)
 
 
-def _of_own_code(error: Exception) -> str:
+def _of_own_code(error: BaseException) -> str:
     """What fails in code of one's own that was run; raises the error where it did not come by any."""
     systems = sys.modules.get("ptsmc_jax.scenario.systems")
     file = None if systems is None else systems.at_fault(error)
