@@ -14,7 +14,7 @@ from ptsmc_jax.scenario import attitude_keys, disturbance_bounds
 from ptsmc_jax.scenario.attitude_keys import Attitude
 from ptsmc_jax.scenario.disturbance_bounds import Bounds
 from ptsmc_jax.scenario.errors import ScenarioError, brief
-from ptsmc_jax.scenario.own import Code, Own, build
+from ptsmc_jax.scenario.own import Code, Own, build, fastest
 from ptsmc_jax.scenario.values import (
     Each,
     EachNotNegative,
@@ -268,7 +268,7 @@ class OwnDisturbance(Own, DisturbanceTable, kw_only=True, frozen=True):
 
     def quickest(self) -> float:
         """What its method `fastest` says; 0 before its code is run."""
-        return 0.0 if self.waits else float(build(self).fastest())
+        return 0.0 if self.waits else fastest(self, "disturbance", build(self))
 
     def bounds(self, scenario: Any) -> Bounds | None:
         """See `disturbance_bounds.along_the_run`."""

@@ -200,6 +200,23 @@ def build(table: Any, **common: Any) -> Any:
     return _registered(table.made)(**common, **{name: vector(getattr(table, name)) for name in fields})
 
 
+def fastest(table: Any, name: str, part: Any) -> float:
+    """What the method `fastest` of a part says that the code of this table names [rad/s]."""
+    said = part.fastest()
+    try:
+        rate = float(said)
+    except (TypeError, ValueError):
+        rate = math.nan
+    if not rate >= 0.0:
+        other = "nothing" if said is None else f"a {type(said).__name__}"
+        shown = brief(said) if isinstance(said, int | float | str) else other
+        raise ScenarioError(
+            f"{name}.code names a class {table.made.__name__} whose fastest returns {shown}, but must return a number "
+            "of at least 0 [rad/s]"
+        )
+    return rate
+
+
 @functools.cache
 def _registered(made: type) -> type:
     from ptsmc_jax.numerics.pytrees import pytree

@@ -12,6 +12,7 @@ import numpy as np
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.laws.acceleration import AccelerationLaw
 from ptsmc_jax.laws.base import Sample
+from ptsmc_jax.observers.base import Bound
 from ptsmc_jax.plants.second_order import INSTEAD, TRACED
 from ptsmc_jax.scenario import systems
 from ptsmc_jax.scenario.errors import ScenarioError, brief
@@ -109,8 +110,9 @@ def _described(returned: Any) -> str:
         return "nothing"
     if isinstance(returned, jax.Array):
         return f"an array of shape {returned.shape}"
-    count = f"{len(returned)} values" if isinstance(returned, tuple | list) else None
-    return count or f"a {type(returned).__name__}"
+    if isinstance(returned, tuple | list):
+        return f"{'a list of ' if isinstance(returned, list) else ''}{len(returned)} values"
+    return f"a {type(returned).__name__}"
 
 
 def _changed(parts: Parts, drawn: Parts) -> str:
@@ -151,9 +153,11 @@ def _sensors(parts: Parts, ask: _Asked) -> None:
     was, now = (jax.tree.map(_kind, one) for one in (jax.tree.map(jnp.asarray, x), returned[0]))
     if was != now:
         raise ask.refused("see", f"a state {now}", f"one as the plant's, {was}")
-    if not all(np.all(np.isfinite(v)) for v in jax.tree.leaves(returned[0])):
-        raise ask.refused("see", f"a state {jax.tree.map(np.asarray, returned[0])}", "finite numbers")
     ask.same_memory("see", memory, returned[1])
+    first = ask("see", own.see, memory, x, jnp.zeros(own.draws), zero, zero)
+    for (seen, _), where in ((returned, ""), (first, ", also where dt is 0, at the first sample")):
+        if not all(np.all(np.isfinite(v)) for v in jax.tree.leaves(seen)):
+            raise ask.refused("see", f"a state {jax.tree.map(np.asarray, seen)}", f"finite numbers{where}")
 
 
 def _draw(parts: Parts, dispersion: Dispersion, ask: _Asked) -> None:
@@ -189,8 +193,9 @@ def _observer(parts: Parts, ask: _Asked) -> None:
     ask.same_memory("step", memory, kept)
     ask.check("estimate", "an estimate", ask("estimate", observer.estimate, kept), (m,))
     bound = observer.error_bound()
-    if not callable(bound):
-        raise ask.refused("error_bound", _described(bound), "a function of t, see observers.base.Bound")
+    if not isinstance(bound, Bound):
+        must = "a bound such as ptsmc_jax.observers.base.constant_bound(K, components)"
+        raise ask.refused("error_bound", _described(bound), must)
     ask.check("error_bound", "a bound", ask("error_bound", bound.__call__, period), ())
 
 
@@ -213,7 +218,7 @@ def _law(parts: Parts, ask: _Asked) -> None:
     expected = ("an input" if method == "command" else "an acceleration", "a sliding variable", "its memory")
     expected = expected[: 2 if method == "acceleration" else 3]
     if not isinstance(returned, tuple) or len(returned) != len(expected):
-        raise ask.refused(method, _described(returned), ", ".join(expected))
+        raise ask.refused(method, _described(returned), ", ".join(expected) + ", in parentheses")
     ask.check(method, expected[0], returned[0], (m,))
     ask.check(method, expected[1], returned[1], (m,))
     if method != "acceleration":

@@ -9,7 +9,7 @@ import numpy as np
 
 from ptsmc_jax.scenario import attitude_keys
 from ptsmc_jax.scenario.attitude_keys import Attitude
-from ptsmc_jax.scenario.own import Code, Own, build
+from ptsmc_jax.scenario.own import Code, Own, build, fastest
 from ptsmc_jax.scenario.values import Four, Kinds, Positive, Three
 
 
@@ -164,7 +164,7 @@ class OwnReference(Own, ReferenceTable, kw_only=True, frozen=True):
 
     def frequencies(self) -> dict[str, float]:
         """What its method `fastest` says."""
-        return {"reference.code": float(self.build().fastest())}
+        return {"reference.code": fastest(self, "reference", self.build())}
 
     def build(self) -> Any:
         """What the code names."""

@@ -244,6 +244,7 @@ SEES = [
     ("return jnp.concatenate([memory, seen[1:]]), seen[:1]", "return seen[:1], seen[:1]", "a state float64(1,)"),
     ("seen[1:]]), seen[:1]", "seen[1:]]), seen", "see returns a memory f64(2,)"),
     ("x + self.sigma", "jnp.nan * x + self.sigma", "must return finite numbers"),
+    ("x + self.sigma", "x + 0.0 / dt + self.sigma", "finite numbers, also where dt is 0, at the first sample"),
     ("draws = 2\n    sigma", "draws = 2.5\n    sigma", "draws is 2.5, but must be a whole number of at least 0"),
     ("x + self.sigma", "1 / 0 + self.sigma", "see fails: ZeroDivisionError: division by zero (line 18 of mine.py)"),
 ]

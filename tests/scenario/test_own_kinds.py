@@ -252,6 +252,10 @@ BAD = [
         "acceleration returns an acceleration that is a list", "an array of shape (1,)",
     ),
     (
+        changed("return 0.5 * wanted, s", "return [0.5 * wanted, s]"), {},
+        "acceleration returns a list of 2 values", "a sliding variable, in parentheses",
+    ),
+    (
         changed("return 0.5 * wanted, s", "return 0.5 * wanted"), {},
         "acceleration returns an array of shape (1,)", "an acceleration, a sliding variable",
     ),
@@ -333,6 +337,26 @@ def test_what_is_wrong_with_ones_own_law_is_one_sentence(here, law, keys, of_wha
         ("observer", "def step", "def stop", "has no method step"),
         ("observer", "share: float", "gain: float", "another than gain"),
         ("observer", "share: float", "update: float", "a field of the class Filtered is called update, which has its"),
+        (
+            "observer",
+            "def estimate",
+            "def error_bound(self):\n        return lambda t: 0.1\n\n    def estimate",
+            "error_bound returns a function at t = 0, but must return a bound such as",
+        ),
+        (
+            "disturbance",
+            "float(self.rates[1])",
+            "'fast'",
+            'disturbance.code names a class Wave whose fastest returns "fa',
+        ),
+        (
+            "disturbance",
+            "float(self.rates[1])",
+            "None",
+            "whose fastest returns nothing, but must return a number of at least 0",
+        ),
+        ("disturbance", "float(self.rates[1])", "float('nan')", "whose fastest returns nan"),
+        ("disturbance", "float(self.rates[1])", "-1.0", "whose fastest returns -1.0"),
         ("disturbance", "* jnp.ones(1)", "* jnp.ones(3)", "__call__ returns a disturbance of shape (3,)"),
         ("disturbance", "jnp.sin(self.rates[0] * t)", "jnp.log(-1.0)", "returns a disturbance [nan]"),
         ("disturbance", "(0.5, 1.5)", "(0.5, 1e9)", "disturbance.frequency"),
@@ -351,7 +375,15 @@ def test_what_is_wrong_with_other_parts_is_one_sentence(here, name, old, new, of
 
 @pytest.mark.parametrize(
     ("old", "new", "said"),
-    [("jnp.cos(half)", "2.0 * jnp.cos(half)", "one of length 1"), ("jnp.stack([0.0 * half, ", "jnp.stack([", "(4,)")],
+    [
+        ("jnp.cos(half)", "2.0 * jnp.cos(half)", "one of length 1"),
+        ("jnp.stack([0.0 * half, ", "jnp.stack([", "(4,)"),
+        (
+            "    def attitude",
+            "    def fastest(self):\n        pass\n\n    def attitude",
+            "Turning whose fastest returns nothing",
+        ),
+    ],
 )
 def test_a_reference_that_is_no_attitude_is_refused(here, old, new, said):
     (here / "other.py").write_text(HEAD + OTHER.replace(old, new))
