@@ -29,12 +29,12 @@ def exported(tmp_path_factory):
 
 
 def test_export_leaves_a_folder_and_says_what_a_step_takes(command, tmp_path, exported):
-    status, out, err = command("export", "s.toml", "--trials", 1, "--out", "c")
+    status, out, err = command("export", "s.toml", "--trials", 1, "--out", "the c")
     assert (status, err) == (0, "")
     assert "a step takes at most" in out
-    assert "controller in c; make -C c check" in out
-    assert tree(tmp_path / "c") == tree(exported)
-    assert json.loads((tmp_path / "c" / "versions.json").read_text())["command"] == "export"
+    assert "controller in the c; make -C 'the c' check" in out  # to be pasted into a shell
+    assert tree(tmp_path / "the c") == tree(exported)
+    assert json.loads((tmp_path / "the c" / "versions.json").read_text())["command"] == "export"
 
 
 @needs_compiler

@@ -4,8 +4,10 @@ import contextlib
 import os
 import re
 import time
+from pathlib import Path
 
 import numpy as np
+import polars as pl
 import pytest
 
 from ptsmc_jax.campaigns import campaign
@@ -197,3 +199,9 @@ def test_how_far_beyond_a_limit_has_no_exponent(capsys):
     tell._lines = Lines(silent=False, clock=iter([0.0, 99.0]).__next__)
     tell("searching", 1, 7, 1e-5, 19.2)
     assert "1920 % beyond a limit" in capsys.readouterr().err
+
+
+def test_how_to_replay_the_worst_trial_can_be_pasted_into_a_shell(capsys):
+    rows = pl.DataFrame({"trial": [7], "window_error": [0.1]})
+    campaign_terminal.worst(rows, "window_error", Path("my out"), "chain")
+    assert "one in full: ptsmc replay 'my out' --trial 7\n" in capsys.readouterr().out

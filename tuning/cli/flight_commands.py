@@ -1,5 +1,6 @@
 """The command that takes gains to flight, and what flies its C in the loop."""
 
+import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -49,7 +50,8 @@ def export(
     store.write(folder, lambda making: controllers.write(making, controller, seed, trials))
     if not quiet:
         costs = ", ".join(f"{n} {what}" for what, n in templates.operations(controller.code.counts).items() if n)
-        terminal.say(f"a step takes at most {costs}", f"controller in {folder}; make -C {folder} check")
+        check = f"make -C {shlex.quote(str(folder))} check"
+        terminal.say(f"a step takes at most {costs}", f"controller in {folder}; {check}")
     return 0
 
 

@@ -1,6 +1,7 @@
 """What the commands of a campaign print."""
 
 import itertools
+import shlex
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -84,7 +85,7 @@ def worst(frame: "pl.DataFrame", by: str, folder: Path, kind: str, *, own_code: 
         for row in frame.select(names).iter_rows()
     ]
     terminal.table(Table(tuple(sentences.with_unit(name, kind) for name in names), rows))
-    one = f"ptsmc replay {folder} --trial {frame['trial'][0]}" + (" --trust" if own_code else "")
+    one = f"ptsmc replay {shlex.quote(str(folder))} --trial {frame['trial'][0]}" + (" --trust" if own_code else "")
     terminal.say(f"whole rows in {folder / 'worst.csv'}; one in full: {one}")
 
 

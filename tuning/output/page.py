@@ -271,8 +271,8 @@ def _compare(result: Result) -> tuple[Heading, list[Section]]:
 def _montecarlo(result: Result) -> tuple[Heading, list[Section]]:
     summary = result.summary
     note = (
-        "Quantiles lie between order statistics, with 95 % intervals (-: so few trials bound them on one side only); a "
-        "failed trial is beyond every quantile."
+        "Quantiles lie between order statistics, with 95 % intervals (-: beyond every trial, since so many fail or "
+        "never settle, or so few are flown); a failed trial is beyond every quantile."
     )
     larger = (
         "Shares of time within a limit, of which more is better: what 99.73 % of the trials reach, and the smallest. A "
