@@ -91,9 +91,9 @@ def parse(raw: Mapping[str, Any], *, run: bool = False) -> Scenario:
     for name in ("initial", "reference"):
         if name in tables:
             attitude_keys.at_most_one(name, tables[name])
-    tables["requirements"] = {
-        key: _requirement(key, value, kind_of_scenario.metrics) for key, value in raw.get("requirements", {}).items()
-    }
+    # plain limits first, as TOML writes them: verdicts come in the same order when a result's own scenario is read
+    asked = sorted(raw.get("requirements", {}).items(), key=lambda one: isinstance(one[1], Mapping))
+    tables["requirements"] = {key: _requirement(key, value, kind_of_scenario.metrics) for key, value in asked}
     return kind_of_scenario(**tables)
 
 

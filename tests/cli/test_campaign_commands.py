@@ -353,6 +353,18 @@ def test_a_folder_without_a_campaign_is_refused(command, tmp_path, asked):
     assert "holds results of `ptsmc simulate`" in command(asked[0], "run", *asked[1:])[2]
 
 
+def test_a_summary_made_anew_is_the_same_in_whatever_order_limits_stand(command, tmp_path):
+    """Verdicts came in another order, so page and worst trials went as if they were another campaign's."""
+    limits = "[requirements]\npeak_torque = { limit = 3.0, quantile = 0.9 }\nwindow_error = 1.0"
+    (tmp_path / "s.toml").write_text(SHORT_CHAIN.replace("[requirements]\npeak_torque = 3.0", limits))
+    code, said, _ = command("montecarlo", "s.toml", "--trials", 120, "--no-figures", "--seed", 3)
+    made = summary(tmp_path / FOLDER)
+    command("worst", FOLDER)
+    assert command("summarize", FOLDER, "--no-figures") == (code, said, "")
+    assert summary(tmp_path / FOLDER) == made
+    assert (tmp_path / FOLDER / "worst.csv").exists()
+
+
 def test_metrics_of_ones_own_are_kept_and_judged_by(command, tmp_path):
     (tmp_path / "m.py").write_text(OVERSHOOT)
     (tmp_path / "s.toml").write_text(SHORT_CHAIN)
