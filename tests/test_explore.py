@@ -197,6 +197,7 @@ def test_numbers_of_trials_are_whole_and_metrics_of_ones_own_come_along():
     ("own", "said"),
     [
         (lambda result, parts: result.metrics.effort, "but must return named numbers, a dict"),
+        (lambda result, parts: {}, "it returns an empty dict, but must return named numbers"),
         (lambda result, parts: {"mine": result.log.t}, "its mine is no single number"),
         (lambda result, parts: {"window_error": result.metrics.effort}, "has the name of a column that the rows have"),
     ],

@@ -101,7 +101,8 @@ class Campaign:
                 file = getattr(getattr(made, "__code__", None), "co_filename", "")
                 raise ValueError(f"it {own_checks.what_fails(error, file)}") from error
             if not isinstance(returned, dict) or not returned or not all(isinstance(name, str) for name in returned):
-                raise ValueError(f"it returns {type(returned).__name__}, but must return named numbers, a dict")
+                what = "an empty dict" if isinstance(returned, dict) and not returned else type(returned).__name__
+                raise ValueError(f"it returns {what}, but must return named numbers, a dict")
             for name, value in returned.items():
                 single = isinstance(value, int | float | np.generic | np.ndarray | jax.Array) and not np.ndim(value)
                 if not single or jnp.result_type(value).kind not in "iuf":

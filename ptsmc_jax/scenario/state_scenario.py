@@ -209,7 +209,10 @@ class SystemScenario(StateScenario, frozen=True, kw_only=True):
                 f"plant.system is {errors.brief(value)}, which has states that no law knows (Z, z0); "
                 "allowed is one without, and this one as plant.truth"
             )
-        n = found.inputs
+        n, known = found.inputs, len(self.plant.x0) // 2
+        if n != known and key == "truth":  # x0 fits the system, which is loaded first
+            shown = errors.brief(value)
+            raise ScenarioError(f"plant.truth is {shown}, which has n = {n}; allowed is n = {known}, as plant.system")
         if n * 2 != len(self.plant.x0):
             raise wrong("plant.x0", self.plant.x0, f"a list of {2 * n} numbers, since plant.{key} has n = {n}")
         return found

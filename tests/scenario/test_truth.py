@@ -185,7 +185,7 @@ def test_a_truth_is_a_program_too():
         ("my.py:gone", "plant.truth is"),
         ("my.py:number", "my.py has a int of that name"),
         ("gone.py:true", "the file gone.py is not there"),
-        ("my.py:two", "a list of 4 numbers, since plant.truth has n = 2"),
+        ("my.py:two", 'plant.truth is "my.py:two", which has n = 2; allowed is n = 1, as plant.system'),
         (3, "plant.truth is 3"),
     ],
 )
