@@ -219,6 +219,12 @@ WORDS = {
 }
 
 
+def alike(summary: Summary) -> str:
+    """How the laws were tuned and judged."""
+    tuned = "each law is tuned alike, the scenario's own in the gains of tune.free, the others in all of theirs"
+    return f"{tuned}, and judged on {summary['trials']} fresh trials, {summary['judged_on']}"
+
+
 def winner(summary: Summary) -> str:
     """Which law has the smallest error of those that meet every requirement, and how far the paper's is behind it."""
     errors = {name: law["window_error"] for name, law in summary["laws"].items() if law["met"]}

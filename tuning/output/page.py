@@ -250,9 +250,8 @@ def _with_headline(summary: dict[str, Any], lines: list[str], headline: str) -> 
 
 def _compare(result: Result) -> tuple[Heading, list[Section]]:
     summary = result.summary
-    judged = f"{summary['trials']} fresh trials, {summary['judged_on']}"
     lines = [
-        f"each law is tuned alike, with all of its gains free, and judged on {judged}",
+        law_sentences.alike(summary),
         law_sentences.winner(summary),
         *sentences.cautions(summary),
     ]

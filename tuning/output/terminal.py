@@ -85,8 +85,7 @@ def comparison(summary: dict[str, Any], folder: Path, how: str) -> None:
     """Laws side by side, as `summary.json` says."""
     from tuning.output import law_sentences, sentences
 
-    alike = f"each law is tuned alike and judged on {summary['trials']} fresh trials, {summary['judged_on']}"
-    say(f"comparison {how}: {alike}")
+    say(f"comparison {how}: {law_sentences.alike(summary)}")
     for answer in law_sentences.answers(summary):
         table(answer.table, title=answer.title, title_justify="left")
     say(law_sentences.winner(summary), *law_sentences.lines(summary))
