@@ -28,7 +28,7 @@ from ptsmc_jax import programs
 from ptsmc_jax.batching import lapack
 from ptsmc_jax.devices.sensors import Reading
 from ptsmc_jax.devices.ticks import Ticks
-from ptsmc_jax.numerics import stacking
+from ptsmc_jax.numerics import integrators, stacking
 from ptsmc_jax.simulation.interval import Criteria, integral_in_window
 from ptsmc_jax.simulation.rollout import Log, Parts
 from ptsmc_jax.simulation.sampled import PeriodMotion
@@ -267,7 +267,7 @@ def _linear(parts: Parts, log: Log, ticks: Ticks) -> _Linear:
             near = plant.retract(x, z)
             near_next = PeriodMotion(parts, tick.t, near, drive, pushed + push).after(dt)
             (start, rate), (end, rate_next) = law.errors(near, target), law.errors(near_next, target_next)
-            middle = (start + end) / 2 + dt / 8 * (rate - rate_next)
+            middle = integrators.hermite_middle(start, rate, end, rate_next, dt)
             return plant.local_coordinates(x_next, near_next), jnp.concatenate([start, middle, end])
 
         still = jnp.zeros_like(plant.local_coordinates(x, x))

@@ -221,7 +221,7 @@ WORDS = {
 
 def alike(summary: Summary) -> str:
     """How the laws were tuned and judged."""
-    tuned = "each law is tuned alike, the scenario's own in the gains of tune.free, the others in all of theirs"
+    tuned = "each law is tuned alike in all of its gains, the scenario's own in those of tune.free where that is given"
     return f"{tuned}, and judged on {summary['trials']} fresh trials, {summary['judged_on']}"
 
 
