@@ -140,23 +140,27 @@ def with_slopes(asked: Asked, bounds: Bounds, share: Float[Array, " gains"]) -> 
     of them in it is one of many small products.
     """
 
-    def flown(share: Array) -> tuple[list[Array], list[Array]]:
-        leaves = jax.tree.leaves(nominal_runs(asked, bounds.gains(share)))
-        return [v for v in leaves if _sloped(v)], [v for v in leaves if not _sloped(v)]
+    def flown(share: Array) -> tuple[Any, Any]:
+        runs = nominal_runs(asked, bounds.gains(share))
+        return tuple(
+            jax.tree.map(lambda v, kept=kept: v if _has_slopes(v) is kept else None, runs) for kept in (True, False)
+        )
 
-    def judged(share: Array, numbers: list[Array]) -> Array:
-        left, others_left = iter(numbers), iter(others)
-        runs = [next(left if _sloped(shape) else others_left) for shape in shapes]
-        return rows(asked, bounds.gains(share), jax.tree.unflatten(structure, runs))
+    def judged(share: Array, numbers: Any) -> Array:
+        def either(one: Any, other: Any) -> Any:
+            return other if one is None else one
 
-    shapes, structure = jax.tree.flatten(jax.eval_shape(lambda at: nominal_runs(asked, bounds.gains(at)), share))
-    each = jax.lax.map(lambda by: jax.jvp(flown, (share,), (by,), has_aux=True), jnp.eye(share.size))
+        runs = jax.tree.map(either, numbers, others, is_leaf=lambda v: v is None)
+        return rows(asked, bounds.gains(share), runs)
+
+    axes = jnp.eye(share.size)
+    each = jax.lax.map(lambda axis: jax.jvp(flown, (share,), (axis,), has_aux=True), axes)
     (numbers, others), moved = jax.tree.map(lambda v: v[0], (each[0], each[2])), each[1]
-    return jax.vmap(lambda *by: jax.jvp(judged, (share, numbers), by), out_axes=(None, -1))(jnp.eye(share.size), moved)
+    return jax.vmap(lambda *by: jax.jvp(judged, (share, numbers), by), out_axes=(None, -1))(axes, moved)
 
 
-def _sloped(leaf: Any) -> bool:
-    return jnp.issubdtype(leaf.dtype, jnp.inexact)
+def _has_slopes(leaf: Any) -> bool:
+    return bool(jnp.issubdtype(leaf.dtype, jnp.inexact))
 
 
 def of_points(asked: Asked, bounds: Bounds, share: Float[np.ndarray, "points gains"]) -> dict[str, np.ndarray]:
