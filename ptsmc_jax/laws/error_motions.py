@@ -5,10 +5,11 @@ A law has one of them as a base, which turns the eps'' that it asks for into the
 
 from typing import Any, ClassVar, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ptsmc_jax.numerics import attitude, elementary, guards, integrators, matrices
+from ptsmc_jax.numerics import attitude, guards, integrators, matrices
 from ptsmc_jax.numerics.pytrees import Scalar, Vector
 from ptsmc_jax.plants.integrator_chain import Chain
 from ptsmc_jax.plants.rigid_body import AttitudeState, Spacecraft
@@ -86,12 +87,10 @@ class AttitudeMotion(ErrorMotion):
         """`angle` in the middle [rad], by the cubic of the quaternion q_f* q, which is smooth where the angle is 0."""
 
         def turned(x: AttitudeState, target: Target) -> tuple[Array, Array]:
-            back, back_rate = (attitude.conjugate(q) for q in (target.q, attitude.derivative(target.q, target.w)))
-            rate = attitude.multiply(back_rate, x.q) + attitude.multiply(back, attitude.derivative(x.q, x.w))
-            return attitude.multiply(back, x.q), rate
+            rates = attitude.derivative(target.q, target.w), attitude.derivative(x.q, x.w)
+            return jax.jvp(lambda q_f, q: attitude.multiply(attitude.conjugate(q_f), q), (target.q, x.q), rates)
 
-        middle = integrators.hermite_middle(*turned(*start), *turned(*end), dt)
-        return 2.0 * elementary.arctan2(guards.norm(middle[:3]), jnp.abs(middle[3]))
+        return attitude.rotation_angle(integrators.hermite_middle(*turned(*start), *turned(*end), dt))
 
 
 class ErrorVector(AttitudeMotion):

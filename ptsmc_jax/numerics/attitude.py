@@ -142,5 +142,9 @@ def angle(q: Quaternion, reference: Quaternion) -> Float[Array, ""]:
     >>> f"{angle(start, end):.6f}"
     '0.500000'
     """
-    error = multiply(conjugate(reference), q)
-    return 2.0 * elementary.arctan2(guards.norm(error[:3]), jnp.abs(error[3]))
+    return rotation_angle(multiply(conjugate(reference), q))
+
+
+def rotation_angle(q: Quaternion) -> Float[Array, ""]:
+    """Angle that a quaternion of any length turns by [rad], 0 to pi, accurate down to 0; gradient 0 there."""
+    return 2.0 * elementary.arctan2(guards.norm(q[:3]), jnp.abs(q[3]))

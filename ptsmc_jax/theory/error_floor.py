@@ -85,8 +85,7 @@ def along_each(runs: Sequence[tuple[Parts, Log]]) -> list[Floor]:
 
 def _together(models: Sequence[Model]) -> Model:
     """The models of several runs as one."""
-    rows = [np.broadcast_to(one.rows, (len(one.move), *one.rows.shape[-2:])) for one in models]
-    start, *others = zip(*(one._replace(rows=of_run) for one, of_run in zip(models, rows, strict=True)), strict=True)
+    start, *others = zip(*models, strict=True)
     return Model(np.stack(start), *(np.stack(some, axis=1) for some in others))
 
 
@@ -204,9 +203,10 @@ def _model(parts: Parts, log: Log, ticks: Ticks) -> Model:
     move[:, :n, :n], move[:, :n, torque] = linear.move, linear.push
     output = np.zeros((periods, linear.seen.shape[1], size))
     output[:, :, :n], output[:, :, torque] = linear.seen, linear.seen_push
+    rows = wide(reading.rows_at(sample, np.append(0.0, lengths[:-1])))
     return Model(
         start=start,
-        rows=wide(reading.rows_at(sample, np.append(0.0, lengths[:-1]))),
+        rows=np.broadcast_to(rows, (periods, *rows.shape[-2:])),
         noise=np.where(reading.available(sample), reading.noise, np.inf),
         kick=lengths[:, None, None] * drift,
         move=move,

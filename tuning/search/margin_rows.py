@@ -93,19 +93,17 @@ def hardest(asked: Asked, gains: Float[np.ndarray, " gains"]) -> tuple[Asked, fl
     return _of_trials(asked, np.argsort(-near, kind="stable")[:CASES]), max(float(near.max()), 0.0)
 
 
-def rows(
-    asked: Asked, gains: Float[Array, " gains"], runs: linear.Nominal | None = None
-) -> Float[Array, "margins entries"]:
+def rows(asked: Asked, gains: Float[Array, " gains"], runs: linear.Nominal) -> Float[Array, "margins entries"]:
     """Constraints c, met where c <= 0: how near to its limit each margin comes, over `limits`, less 1.
 
-    A loop without slopes is as far beyond as one without any margin. runs: what `nominal_runs` says, if known.
+    A loop without slopes is as far beyond as one without any margin. runs: see `nominal_runs`.
     """
     late = margin_verdicts.DELAY in asked.metrics
 
     def loops_of(parts: Parts, run: linear.Nominal) -> Loop:
         return run_margins.judged_loops(parts, run, late=late)[0]
 
-    each = _by_case(asked, gains, loops_of, nominal_runs(asked, gains) if runs is None else runs)
+    each = _by_case(asked, gains, loops_of, runs)
     loops = jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), each)
     values = margins.of_each(loops, with_delay=late).each()
     shares = [
