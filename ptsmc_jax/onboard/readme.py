@@ -10,11 +10,12 @@ from ptsmc_jax.onboard.templates import STATUS, About, filled, operations, stack
 def readme(code: Code, about: About) -> str:
     """What it is, what it takes, how it is linked."""
     deriving = _listed(code.deriving)
+    several = "s" if about.delay != 1 else ""
     delay = (
-        f"\n\nThe scenario has a delay of {about.delay} control periods between measuring and acting. `command` is "
-        "what the law asks for now, `torque` and the wheels' torques are what acts from this sample on, by the "
-        f"command of {about.delay} samples ago. Send those where this program is to make the delay, and `command` "
-        "where computer and bus make it."
+        f"\n\nThe scenario has a delay of {about.delay} control period{several} between measuring and acting. "
+        "`command` is what the law asks for now, `torque` and the wheels' torques are what acts from this sample on, "
+        f"by the command of {about.delay} sample{several} ago. Send those where this program is to make the delay, "
+        "and `command` where computer and bus make it."
     )
     motors = " and `ArrayMotorTorqueMsg` (the torque on a wheel is minus `wheel_torque`)"
     return filled(
