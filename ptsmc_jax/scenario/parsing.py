@@ -130,15 +130,13 @@ def _unknown(name: str, value: Any, kind: str) -> ScenarioError:
     if others:
         return ScenarioError(f"[{name}] goes with plant.kind = {show(others[0])} only, but it is {show(kind)}")
     if isinstance(value, Mapping):
-        return ScenarioError(f"[{name}] is not a known table; {nearest(name, (*layout, 'requirements'), '[{}]')}")
-    return ScenarioError(f"{name} = {brief(value)} stands outside a table; {_place(name, layout)}")
-
-
-def _place(key: str, layout: Mapping[str, Any]) -> str:
-    """Where a key that stands outside a table may belong."""
+        of_kind = f"such a plant is [plant] with kind = {show(name)}"
+        hint = of_kind if name in TABLES else nearest(name, (*layout, "requirements"), "[{}]")
+        return ScenarioError(f"[{name}] is not a known table; {hint}")
     homes = keys.homes(layout)
-    closest = difflib.get_close_matches(key, homes, n=1, cutoff=0.0)[0]
-    return f"the nearest known key is {homes[closest][-1]}.{closest}"
+    closest = difflib.get_close_matches(name, homes, n=1, cutoff=0.0)[0]
+    place = f"{homes[closest][-1]}.{closest}"
+    return ScenarioError(f"{name} = {brief(value)} stands outside a table; the nearest known key is {place}")
 
 
 def _with_defaults(given: Mapping[str, Any], fallback: Mapping[str, Any]) -> Mapping[str, Any]:

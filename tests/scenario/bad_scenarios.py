@@ -42,6 +42,7 @@ BAD = [
     ("contrller.eta = 3.0", "[contrller] is not a known table", "nearest known one is [controller]"),
     ("eta = 3.0", "eta = 3.0 stands outside a table", "nearest known key is controller.eta"),
     ("etta = 3.0", "etta = 3.0 stands outside a table", "nearest known key is controller.eta"),
+    ("[chain]", "[chain] is not a known table", "[plant] with kind = "),
     ("[etta]", "[etta] is not a known table", "known are [plant], [spacecraft], ["),
     ("controller = 3", "controller is 3", "a table"),
     ("[[loop]]\nt_end = 40.0", "loop is [{ t_end = 40.0 }]", "a table"),
