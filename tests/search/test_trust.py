@@ -55,6 +55,25 @@ def test_a_goal_that_a_gain_cannot_move_is_called_flat(quiet):
     np.testing.assert_allclose(eta.over / eta.over[0], (eta.gain / eta.gain[0]) ** 2, rtol=1e-4)
 
 
+def test_beside_the_gain_that_a_profile_is_of_all_are_as_found():
+    """The width's too, whose interval begins elsewhere for every observer's gain."""
+    names = ("eta", "observer_gain", "sign_width")
+    bounds = Bounds(names, (2.5, 0.5, 1e-6), (5.0, 1000.0, 0.1), hop=1e-3)
+    found = np.array([3.0, 20.0, 1e-3])
+
+    def fly(problem: Any, share: np.ndarray) -> Measured:
+        gains, none = np.stack([bounds.gains(one) for one in share]), np.zeros(len(share))
+        return Measured(gains, none, np.zeros((len(share), 0, 1)), gains @ [0.0, 0.0, 1.0])
+
+    evaluate: Any = SimpleNamespace(bounds=bounds, fly=fly)
+    asked: Any = SimpleNamespace(rows=(), names=names)
+    profiles = trust.profiles(evaluate, asked, bounds.share(found))
+    for name in ("eta", "observer_gain"):
+        np.testing.assert_allclose(np.log(profiles[name].value), 1e-3, rtol=1e-12)
+    np.testing.assert_allclose(profiles["observer_gain"].gain[[0, -1]], [0.5, 1000.0])
+    np.testing.assert_allclose(profiles["sign_width"].gain[[0, -1]], [1e-3 / 20.0, 0.1])
+
+
 def test_sensitivities_at_a_bound_are_taken_inside_it(quiet):
     """The clock has no samples beyond; a power p is the same to one side: off by p (p - 1) h / 2 for a step of h."""
     for at in (0, 1):

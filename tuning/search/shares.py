@@ -55,11 +55,15 @@ class Bounds:
 
     def share(self, gains: np.ndarray) -> np.ndarray:
         """Shares of gains, (gains,); of those beyond a bound the bound's."""
+        return np.clip(self.share_of(gains), 0.0, 1.0)
+
+    def share_of(self, gains: np.ndarray) -> np.ndarray:
+        """Shares of gains, (gains,); of those beyond a bound below 0 or above 1."""
         low, high = self._scaled()
         inner = np.where(self.logarithmic, np.log(np.maximum(gains, 1e-300)), gains)
         if self.hop:
             low[self._width] = np.log(self._least_width(gains))
-        return np.clip((inner - low) / (high - low), 0.0, 1.0)
+        return (inner - low) / (high - low)
 
     @property
     def _width(self) -> int:
