@@ -658,10 +658,12 @@ def test_other_hand_overs_are_on_samples_within_the_bounds_and_twice_delta():
 
 
 def test_a_gain_that_makes_no_difference_keeps_the_scenarios_value_and_the_others_do_not():
-    some = replace(problem(), names=THREE.names)
+    """So does a width whose interval begins elsewhere for the observer's gain that was found."""
     own = np.array([3.0, 5.0, 2e-3])
-    for kept in (True, False):
-        run = descents.Descents(Valley(THREE), 0.0, 40, np.random.default_rng(0))
+    hops = shares.Bounds(("observer_gain", *THREE.names[1:]), (2.05, 0.1, 1e-5), (600.0, 50.0, 1e-1), hop=5e-3)
+    for bounds, kept in ((THREE, True), (THREE, False), (hops, True)):
+        some = replace(problem(), names=bounds.names)
+        run = descents.Descents(Valley(bounds), 0.0, 40, np.random.default_rng(0))
         if kept:
             run.set_out(some, own)
         run.descend(some, {0: np.array([0.9, 0.1, 0.1])})

@@ -294,7 +294,8 @@ class Descents:
         tightened, current = self.tightened(problem), self.best
 
         def judged(changes: Sequence[Sequence[int]]) -> list[Best]:
-            share = np.stack([np.where(np.isin(np.arange(own.size), change), own, current.share) for change in changes])
+            back = (np.isin(np.arange(own.size), change) for change in changes)
+            share = np.stack([np.clip(self._evaluate.bounds.mixed(current.share, own, of), 0.0, 1.0) for of in back])
             flown = self._evaluate.slopes(tightened, share)  # the program that is compiled already
             bests = [Best(one, len(problem.rows), self._margin) for one in share]
             for k, best in enumerate(bests):

@@ -55,9 +55,20 @@ class Bounds:
 
     def share(self, gains: np.ndarray) -> np.ndarray:
         """Shares of gains, (gains,); of those beyond a bound the bound's."""
-        return np.clip(self.share_of(gains), 0.0, 1.0)
+        return np.clip(self._share(gains), 0.0, 1.0)
 
-    def share_of(self, gains: np.ndarray) -> np.ndarray:
+    def mixed(self, share: np.ndarray, other: np.ndarray, of_other: np.ndarray) -> np.ndarray:
+        """Shares (gains,) whose gains are those of one set of shares, and, where `of_other`, those of another.
+
+        A share of sign_width is another width where the observer's gain is another one; a width that is then too narrow
+        has a share below 0.
+        """
+        both = np.where(of_other, other, share)
+        if self.hop:
+            both[self._width] = self._share(np.where(of_other, self.gains(other), self.gains(share)))[self._width]
+        return both
+
+    def _share(self, gains: np.ndarray) -> np.ndarray:
         """Shares of gains, (gains,); of those beyond a bound below 0 or above 1."""
         low, high = self._scaled()
         inner = np.where(self.logarithmic, np.log(np.maximum(gains, 1e-300)), gains)

@@ -55,14 +55,11 @@ class Profile:
 
 def profiles(evaluate: Evaluator, problem: Problem, share: np.ndarray) -> dict[str, Profile]:
     """How the goal goes with each gain, by its name; share: (gains,) of the bounds' intervals, of what was found."""
-    count, bounds = share.size, evaluate.bounds
-    found = bounds.gains(share)
+    count = share.size
     points = np.tile(share, (count, ACROSS + 1, 1))
     for k in range(count):
         points[k, :, k] = np.sort(np.append(np.linspace(0.0, 1.0, ACROSS), share[k]))
-        if bounds.hop:  # a share of sign_width is another width where the observer's gain is another one
-            each = (np.where(np.arange(count) == k, bounds.gains(point), found) for point in points[k])
-            points[k] = [bounds.share_of(gains) for gains in each]
+        points[k] = [evaluate.bounds.mixed(share, point, np.arange(count) == k) for point in points[k]]
     flown = evaluate.fly(problem, points.reshape(-1, count))
     arrays = (flown.gains, np.exp(flown.value), flown.beyond + 1.0, flown.f)
     gains, value, over, f = (v.reshape(count, ACROSS + 1, -1) for v in arrays)
