@@ -25,7 +25,7 @@ class Bounds(NamedTuple):
 
 
 def of(scenario: Any) -> tuple[float, float] | None:
-    """K and c of a scenario's disturbance; None: it is one's own, and its code was not run.
+    """K and c of a scenario's disturbance; None: it, or a reference on which it depends, is one's own, and was not run.
 
     Raises ScenarioError where they are beyond all numbers.
     """
@@ -81,12 +81,19 @@ def turning(scenario: Any) -> float:
     return scenario.turning + target + 2.0 * math.pi / scenario.controller.t_f
 
 
-def gravity_gradient(scenario: Any, orbit_rate: float) -> Bounds:
+def target_waits(scenario: Any) -> bool:
+    """Whether the reference is one's own whose code was not run, so that nobody knows yet how it turns."""
+    return getattr(getattr(scenario, "reference", None), "waits", False)
+
+
+def gravity_gradient(scenario: Any, orbit_rate: float) -> Bounds | None:
     """Of 3 n^2 c x J c, c a unit vector: |c x J c| <= (J_3 - J_1)/2, and c x J c changes by J_3 - J_1 times |c'|.
 
     J_1 and J_3 are the smallest and the largest principal moment of the true body, three sigma apart where drawn; c
-    moves in the body's axes as the orbit and the body turn.
+    moves in the body's axes as the orbit and the body turn. None: see `target_waits`.
     """
+    if target_waits(scenario):
+        return None
     inertia = np.asarray(scenario.true_inertia, dtype=float)
     moments = np.sort(inertia) if inertia.ndim == 1 else np.linalg.eigvalsh(inertia)
     drawn = getattr(scenario.dispersion, "inertia", None)
@@ -96,11 +103,14 @@ def gravity_gradient(scenario: Any, orbit_rate: float) -> Bounds:
     return Bounds(np.full(3, 0.5 * most), np.full(3, most * (orbit_rate + turning(scenario))))
 
 
-def along_the_run(scenario: Any, signal: Any) -> Bounds:
+def along_the_run(scenario: Any, signal: Any) -> Bounds | None:
     """Largest size and rate of a disturbance of one's own d(t, x) on the way from the start to the target.
 
-    The way is the nominal one: the error falls like (t_f - t)^3 until t_f, then the target is followed.
+    The way is the nominal one: the error falls like (t_f - t)^3 until t_f, then the target is followed. None: see
+    `target_waits`.
     """
+    if target_waits(scenario):
+        return None
     import jax
     import jax.numpy as jnp
 

@@ -152,7 +152,7 @@ class GravityGradient(Attitude, DisturbanceTable, frozen=True):
         elif self.sequence is not None:
             raise ScenarioError(f"{name}.sequence is {brief(self.sequence)}, but goes with euler_deg only")
 
-    def bounds(self, scenario: Any) -> Bounds:
+    def bounds(self, scenario: Any) -> Bounds | None:
         """See `disturbance_bounds.gravity_gradient`."""
         return disturbance_bounds.gravity_gradient(scenario, self.orbit_rate)
 

@@ -179,6 +179,13 @@ class Wave(ptsmc.Disturbance):
         return float(self.rates[1])
 
 
+class Steady(ptsmc.Disturbance):
+    '''Constant.'''
+
+    def __call__(self, t, x):
+        return 0.01 * jnp.ones(3)
+
+
 class Turning(ptsmc.Reference):
     '''Turns about z.'''
 
@@ -217,6 +224,23 @@ def test_a_disturbance_and_an_observer_do_what_they_say(here):
     seen = np.diff(x[:, 1]) / np.diff(t) - u[:-1, 0]  # x_2' = u + d: the mean of d over each period
     wanted = 0.7 * seen[1:] + 0.3 * seen[:-1]
     np.testing.assert_allclose(np.asarray(watched.log.d_hat)[kept][2:-1, 0], wanted[:-1], atol=1e-12)
+
+
+def test_a_disturbance_that_depends_on_a_reference_of_ones_own_is_bounded_once_that_is_run(here):
+    """Reading runs nothing, so how the reference turns is not known then; the disturbance may be there already."""
+    (here / "other.py").write_text(HEAD + OTHER)
+    shared = {"loop": SAMPLED, "controller": {"t_f": 5.0}}
+    waiting = {**shared, "reference": {"kind": "own", "code": "other.py:Turning", "rate": 0.03}}
+    spin = {**shared, "reference": {"kind": "spin", "rate": [0.0, 0.0, 0.03]}}
+    there = {"kind": "own", "code": made("other.py", "Steady")}
+    for acting in ({"kind": "gravity_gradient", "orbit_rate": 1e-2}, there):
+        loaded = scenario.from_tables({**waiting, "disturbance": acting})
+        assert loaded.controller.disturbance_rate_bound is None
+        # what `fastest` says of the reference, nothing, is not asked of one that turns steadily
+        known = reading.complete(scenario.from_tables({**spin, "disturbance": acting})).controller
+        found = reading.complete(loaded).controller
+        assert found.disturbance_bound == known.disturbance_bound > 0.0
+        assert 0.0 <= found.disturbance_rate_bound <= known.disturbance_rate_bound
 
 
 def test_a_reference_of_ones_own_has_exact_rates(here):
