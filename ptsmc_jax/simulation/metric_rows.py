@@ -204,8 +204,9 @@ def _share_of_windows(beyond: Array, tally: pointing.Tally, criteria: Criteria) 
 
 
 def _share_left(beyond: Array, total: Array) -> Array:
-    """Share of a time [s] that times beyond limits [s] leave; by rounding their sum may be more than all of it."""
-    return jnp.maximum(0.0, 1.0 - beyond / total)
+    """Share of a time [s] that times beyond limits [s] leave; by rounding their sum may be off all of it."""
+    left = total - beyond
+    return jnp.where(left <= guards.rounding(total, total), 0.0, left / total)
 
 
 _PEAK_MODAL = _peak(lambda interval: interval.end.modal_amplitude, lambda start: start.snapshot.modal_amplitude)

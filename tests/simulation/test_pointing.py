@@ -272,8 +272,8 @@ def test_indices_of_a_run_are_those_of_its_history(flown):
     assert 0.1 < relative < 0.9
 
 
-def test_a_run_that_never_keeps_a_limit_has_no_share_below_0(flown):
-    """Times beyond it may add up to more than the observation, by rounding."""
+def test_a_run_that_never_keeps_a_limit_has_a_share_of_0(flown):
+    """Times beyond it may add up to more or less than the observation, by rounding: no two programs by the same."""
     observed = flown[0].parts.pointing
     observed = dataclasses.replace(observed, limits={name: vector(1e-12) for name in observed.limits})
     for after in (0.2, 0.25, 0.3, 0.31, 0.37):
@@ -282,7 +282,7 @@ def test_a_run_that_never_keeps_a_limit_has_no_share_below_0(flown):
         )
         found = fly(run, 3, 5).metrics
         for share in (found.within_ape_boresight, found.within_rke_x):
-            assert 0.0 <= float(share) < 1e-14
+            assert float(share) == 0.0
 
 
 def test_what_the_law_is_told_is_off_by_its_noise(flown):
