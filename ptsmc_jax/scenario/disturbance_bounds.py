@@ -86,14 +86,12 @@ def target_waits(scenario: Any) -> bool:
     return getattr(getattr(scenario, "reference", None), "waits", False)
 
 
-def gravity_gradient(scenario: Any, orbit_rate: float) -> Bounds | None:
+def gravity_gradient(scenario: Any, orbit_rate: float) -> Bounds:
     """Of 3 n^2 c x J c, c a unit vector: |c x J c| <= (J_3 - J_1)/2, and c x J c changes by J_3 - J_1 times |c'|.
 
     J_1 and J_3 are the smallest and the largest principal moment of the true body, three sigma apart where drawn; c
-    moves in the body's axes as the orbit and the body turn. None: see `target_waits`.
+    moves in the body's axes as the orbit and the body turn.
     """
-    if target_waits(scenario):
-        return None
     inertia = np.asarray(scenario.true_inertia, dtype=float)
     moments = np.sort(inertia) if inertia.ndim == 1 else np.linalg.eigvalsh(inertia)
     drawn = getattr(scenario.dispersion, "inertia", None)
@@ -103,14 +101,11 @@ def gravity_gradient(scenario: Any, orbit_rate: float) -> Bounds | None:
     return Bounds(np.full(3, 0.5 * most), np.full(3, most * (orbit_rate + turning(scenario))))
 
 
-def along_the_run(scenario: Any, signal: Any) -> Bounds | None:
+def along_the_run(scenario: Any, signal: Any) -> Bounds:
     """Largest size and rate of a disturbance of one's own d(t, x) on the way from the start to the target.
 
-    The way is the nominal one: the error falls like (t_f - t)^3 until t_f, then the target is followed. None: see
-    `target_waits`.
+    The way is the nominal one: the error falls like (t_f - t)^3 until t_f, then the target is followed.
     """
-    if target_waits(scenario):
-        return None
     import jax
     import jax.numpy as jnp
 

@@ -154,6 +154,8 @@ class GravityGradient(Attitude, DisturbanceTable, frozen=True):
 
     def bounds(self, scenario: Any) -> Bounds | None:
         """See `disturbance_bounds.gravity_gradient`."""
+        if disturbance_bounds.target_waits(scenario):
+            return None
         return disturbance_bounds.gravity_gradient(scenario, self.orbit_rate)
 
     def build(self, inertia: Any) -> Any:
@@ -272,7 +274,9 @@ class OwnDisturbance(Own, DisturbanceTable, kw_only=True, frozen=True):
 
     def bounds(self, scenario: Any) -> Bounds | None:
         """See `disturbance_bounds.along_the_run`."""
-        return None if self.waits else disturbance_bounds.along_the_run(scenario, build(self))
+        if self.waits or disturbance_bounds.target_waits(scenario):
+            return None
+        return disturbance_bounds.along_the_run(scenario, build(self))
 
     def build(self, inertia: Any) -> Any:
         """What the code names."""
