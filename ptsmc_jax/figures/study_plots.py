@@ -100,7 +100,7 @@ def tuning_history(
         ax.plot(steps, courses, color=STYLES[1][0], lw=1.0)
         ax.set_ylabel(f"{name}\n[{unit}]")
         if wide(np.nanmin(courses), np.nanmax(courses)):
-            ax.set_yscale("log")
+            logarithmic(ax, "y")
     axes[-1].set_xlabel("step")
     axes[-1].xaxis.set_major_locator(matplotlib.ticker.MaxNLocator(integer=True))
     return figure
