@@ -658,17 +658,16 @@ def test_other_hand_overs_are_on_samples_within_the_bounds_and_twice_delta():
 
 
 def test_a_gain_that_makes_no_difference_keeps_the_scenarios_value_and_the_others_do_not():
-    """So does a width whose interval begins elsewhere for the observer's gain that was found."""
-    own = np.array([3.0, 5.0, 2e-3])
+    """So does a width whose interval begins elsewhere, and above it, for the scenario's own observer's gain."""
     hops = shares.Bounds(("observer_gain", *THREE.names[1:]), (2.05, 0.1, 1e-5), (600.0, 50.0, 1e-1), hop=5e-3)
-    for bounds, kept in ((THREE, True), (THREE, False), (hops, True)):
-        some = replace(problem(), names=bounds.names)
+    for bounds, width, kept in ((THREE, 2e-3, True), (THREE, 2e-3, False), (hops, 2e-3, True), (hops, 1e-3, True)):
+        some, own = replace(problem(), names=bounds.names), np.array([3.0, 5.0, width])
         run = descents.Descents(Valley(bounds), 0.0, 40, np.random.default_rng(0))
         if kept:
             run.set_out(some, own)
         run.descend(some, {0: np.array([0.9, 0.1, 0.1])})
         np.testing.assert_allclose(run.share[:2], [0.2, 0.04], atol=0.02)
-        np.testing.assert_allclose(run.gains[2], 2e-3 if kept else 1e-5 * 1e4**0.1)
+        np.testing.assert_allclose(run.gains[2], width if kept else 1e-5 * 1e4**0.1)
 
 
 def test_starts_are_the_best_that_lie_far_apart_and_then_nearer_ones():

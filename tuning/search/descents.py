@@ -89,7 +89,7 @@ class Descents:
         report: Report = lambda *_: None,
     ):
         self._evaluate, self._margin, self._steps, self._rng, self._report = evaluate, margin, steps, rng, report
-        self._own: np.ndarray | None = None  # (gains,) shares to come back to where a gain makes no difference
+        self._own: np.ndarray | None = None  # (gains,) to come back to where one makes no difference
         self._best: Best | None = None
         self._problem: Problem | None = None
         self._history: dict[int, list[Step]] = {}  # by the start
@@ -135,9 +135,9 @@ class Descents:
 
     def set_out(self, problem: Problem, own: np.ndarray) -> None:
         """Descend from the scenario's own gains, (gains,), on a few trials."""
-        self._own = self._evaluate.bounds.share(own)
+        self._own, share = own, self._evaluate.bounds.share(own)
         self._report(SETTING_OUT, 0, 2, *self.so_far)
-        self._descend(_few_trials(problem), 0, Start(self._own, CAREFUL), max(2, self._steps // 2))
+        self._descend(_few_trials(problem), 0, Start(share, CAREFUL), max(2, self._steps // 2))
 
     def explore(self, problem: Problem, starts: int, seed: int) -> dict[int, np.ndarray]:
         """The shares where the most promising of so many starts end, after a few steps from each on a few trials.
@@ -294,8 +294,9 @@ class Descents:
         tightened, current = self.tightened(problem), self.best
 
         def judged(changes: Sequence[Sequence[int]]) -> list[Best]:
-            back = (np.isin(np.arange(own.size), change) for change in changes)
-            share = np.stack([np.clip(self._evaluate.bounds.mixed(current.share, own, of), 0.0, 1.0) for of in back])
+            back = [np.isin(np.arange(own.size), change) for change in changes]
+            share = [self._evaluate.bounds.replaced(current.share, own, which) for which in back]
+            share = np.clip(share, 0.0, 1.0)
             flown = self._evaluate.slopes(tightened, share)  # the program that is compiled already
             bests = [Best(one, len(problem.rows), self._margin) for one in share]
             for k, best in enumerate(bests):

@@ -57,15 +57,15 @@ class Bounds:
         """Shares of gains, (gains,); of those beyond a bound the bound's."""
         return np.clip(self._share(gains), 0.0, 1.0)
 
-    def mixed(self, share: np.ndarray, other: np.ndarray, of_other: np.ndarray) -> np.ndarray:
-        """Shares (gains,) whose gains are those of one set of shares, and, where `of_other`, those of another.
+    def replaced(self, share: np.ndarray, gains: np.ndarray, which: np.ndarray) -> np.ndarray:
+        """Shares (gains,) where some gains, `which`, are others, (gains,), and the rest stay what they are.
 
         A share of sign_width is another width where the observer's gain is another one; a width that is then too narrow
         has a share below 0.
         """
-        both = np.where(of_other, other, share)
+        both = np.where(which, self.share(gains), share)
         if self.hop:
-            both[self._width] = self._share(np.where(of_other, self.gains(other), self.gains(share)))[self._width]
+            both[self._width] = self._share(np.where(which, gains, self.gains(share)))[self._width]
         return both
 
     def _share(self, gains: np.ndarray) -> np.ndarray:

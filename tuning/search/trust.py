@@ -55,11 +55,11 @@ class Profile:
 
 def profiles(evaluate: Evaluator, problem: Problem, share: np.ndarray) -> dict[str, Profile]:
     """How the goal goes with each gain, by its name; share: (gains,) of the bounds' intervals, of what was found."""
-    count = share.size
+    count, bounds = share.size, evaluate.bounds
     points = np.tile(share, (count, ACROSS + 1, 1))
     for k in range(count):
         points[k, :, k] = np.sort(np.append(np.linspace(0.0, 1.0, ACROSS), share[k]))
-        points[k] = [evaluate.bounds.mixed(share, point, np.arange(count) == k) for point in points[k]]
+        points[k] = [bounds.replaced(share, bounds.gains(point), np.arange(count) == k) for point in points[k]]
     flown = evaluate.fly(problem, points.reshape(-1, count))
     arrays = (flown.gains, np.exp(flown.value), flown.beyond + 1.0, flown.f)
     gains, value, over, f = (v.reshape(count, ACROSS + 1, -1) for v in arrays)
