@@ -22,6 +22,7 @@ from ptsmc_jax.theory.crossings import MOST, SPLIT, Brackets, Triangles
 from ptsmc_jax.theory.linear import Loop, Opening
 
 NEUTRAL = 1e-6  # by which a pole may lie outside the unit circle: rounding of those of stored momentum
+NEAREST = 3  # places where |L| is 1 from which a delay is searched for, those of the least estimates
 STARTS, FARTHER = 8, 0.15  # of Newton's search for a delay, at most, and by how many periods each lies beyond the last
 
 
@@ -192,16 +193,16 @@ def _axis(root: Array, L: Array, slope: Array, there: Array, stable: Array) -> M
 
 def _delay(loop: Loop, w: Array, seen: Array, axis: Array) -> Scalar:
     """Further delay [s] at which the loop comes to its border, the axis's command late by it."""
-    sizes, crossed = crossings.delay_at(w, seen)
-    j = jnp.argmin(sizes)
-    known = jnp.isfinite(sizes[j])
-    start = jnp.stack([jnp.log(crossed[j]), sizes[j] / loop.period])
+    sizes, crossed = jax.lax.stop_gradient(crossings.delay_at(w, seen))
+    # the hold moves each border away from its estimate, by its own share: the least estimate need not be the nearest
+    nearest = jax.lax.top_k(-sizes, min(NEAREST, sizes.size))[1]
     # not by LAPACK's solutions: jaxlib's wait for XLA's threads, on which two of them beside each other stand for ever
     of_a = crossings.triangle(loop.closed_at_sensors()[0])
+    still, fixed = jax.lax.stop_gradient((loop, of_a))
 
-    def newton(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+    def newton(state: tuple[Array, Array, Array, Array], start: Array) -> tuple[Array, Array, Array, Array]:
         steps, starts, x, _ = state
-        by = _delay_step(loop, of_a, axis, x)
+        by = _delay_step(still, fixed, axis, x)
         x = x - by
         settled = jnp.all(jnp.abs(by) <= 1e-9 * jnp.maximum(jnp.abs(x), 1.0))  # the last step, below, is of its square
         found = settled & (x[1] > 0.0)
@@ -210,11 +211,21 @@ def _delay(loop: Loop, w: Array, seen: Array, axis: Array) -> Scalar:
         x = jnp.where(lost, start.at[1].add(FARTHER * starts), x)
         return jnp.where(lost, 0, steps + 1), starts, x, found
 
-    zero = jnp.zeros((), int)
-    first = (zero, zero, jnp.where(known, start, 1.0), ~known)
-    *_, root, found = jax.lax.while_loop(lambda at: ~at[3] & (at[1] < STARTS), newton, jax.lax.stop_gradient(first))
-    root = jax.lax.stop_gradient(jnp.where(found, root, 1.0))
-    return jnp.where(found & known, (root - _delay_step(loop, of_a, axis, root))[1] * loop.period, sizes[j])
+    def nearer(best: Array, j: Array) -> tuple[Array, None]:
+        periods = sizes[j] / still.period
+        start = jnp.stack([jnp.log(crossed[j]), periods])
+        known = jnp.isfinite(periods) & (periods < best[1])
+        zero = jnp.zeros((), int)
+        first = (zero, zero, jnp.where(known, start, 1.0), ~known)
+        *_, root, found = jax.lax.while_loop(lambda at: ~at[3] & (at[1] < STARTS), lambda at: newton(at, start), first)
+        return jnp.where(known & found & (root[1] < best[1]), root, best), None
+
+    none = jnp.stack([jnp.zeros_like(loop.period), jnp.full_like(loop.period, jnp.inf)])
+    root = jax.lax.stop_gradient(jax.lax.scan(nearer, none, nearest)[0])
+    found = jnp.isfinite(root[1])
+    root = jnp.where(found, root, 1.0)
+    least = crossings.delay_at(w, seen)[0][nearest[0]]
+    return jnp.where(found, (root - _delay_step(loop, of_a, axis, root))[1] * loop.period, least)
 
 
 @jax.jit

@@ -303,6 +303,32 @@ def test_one_input_is_all_of_them_at_once_and_the_closed_loop_is_the_same_wherev
     np.testing.assert_allclose(elsewhere, here, rtol=0.0, atol=1e-12 * np.abs(here).max())
 
 
+def test_the_delay_is_the_least_at_which_any_crossing_comes_to_its_border():
+    """Behind a notch, where the crossing of the least estimate has its border at twice the delay of another's."""
+    tables = {
+        "spacecraft": {"inertia": [5.2, 4.3, 5.5]},
+        "initial": {"rotvec_deg": [8.0, 2.0, -9.0], "rate": [-0.018, -0.016, -0.029]},
+        "disturbance": {"kind": "constant", "amplitude": [0.1, 0.01, 0.04]},
+        "controller": {"kind": "terminal", "t_f": 6.0, "p": 1.16, "b": 2.6, "k": 0.18, "sign_width": 0.047},
+        "observer": {"kind": "finite_time"},
+        "loop": {"mode": "sampled", "period": 0.143, "clock": "flight", "t_end": 8.86},
+        "hardware": {"command_filter": {"kind": "notch", "corner": 7.9, "damping": 0.74}},
+    }
+    loop = opened(scenario.study(scenario.from_tables(tables)).parts, hold=False)
+    of_a = crossings.triangle(loop.closed_at_sensors()[0])
+
+    def border(start):
+        """The delay [periods] at which Newton's search ends, infinite where it ends nowhere."""
+        step = jax.jit(lambda x: margins._delay_step(loop, of_a, jnp.int32(1), x))
+        x = jax.lax.fori_loop(0, 30, lambda _, x: x - step(x), start)
+        good = jnp.all(jnp.abs(step(x)) < 1e-9) & (x[1] > 0.0) & (jnp.exp(x[0]) * loop.period < jnp.pi)
+        return jnp.where(good, x[1], jnp.inf)
+
+    w, late = jnp.meshgrid(jnp.geomspace(2.0, 20.0, 10), jnp.linspace(0.1, 1.5, 6), indexing="ij")
+    least = jax.jit(jax.vmap(border))(jnp.stack([jnp.log(w.ravel()), late.ravel()], axis=1)).min()
+    assert of(loop).delay[1] == pytest.approx(float(least * loop.period), rel=1e-6)
+
+
 def test_a_delay_is_found_where_the_loop_crosses_next_to_the_nyquist_frequency():
     """By poles; Newton's search stepped beyond that frequency, or to the border of an advance, and found no number."""
     found = []
