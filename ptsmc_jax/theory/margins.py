@@ -200,32 +200,30 @@ def _delay(loop: Loop, w: Array, seen: Array, axis: Array) -> Scalar:
     of_a = crossings.triangle(loop.closed_at_sensors()[0])
     still, fixed = jax.lax.stop_gradient((loop, of_a))
 
-    def newton(state: tuple[Array, Array, Array, Array], start: Array) -> tuple[Array, Array, Array, Array]:
-        steps, starts, x, _ = state
-        by = _delay_step(still, fixed, axis, x)
-        x = x - by
-        settled = jnp.all(jnp.abs(by) <= 1e-9 * jnp.maximum(jnp.abs(x), 1.0))  # the last step, below, is of its square
-        found = settled & (x[1] > 0.0)
-        lost = ~found & (settled | (steps == 11) | ~jnp.all(jnp.isfinite(x)))  # a border of less delay, or none
-        starts = starts + lost
-        x = jnp.where(lost, start.at[1].add(FARTHER * starts), x)
-        return jnp.where(lost, 0, steps + 1), starts, x, found
+    def border(j: Array) -> tuple[Array, Array]:  # ln w and delay, searched from a crossing; whether one is found
+        start, known = jnp.stack([jnp.log(crossed[j]), sizes[j] / still.period]), jnp.isfinite(sizes[j])
 
-    def nearer(best: Array, j: Array) -> tuple[Array, None]:
-        periods = sizes[j] / still.period
-        start = jnp.stack([jnp.log(crossed[j]), periods])
-        known = jnp.isfinite(periods) & (periods < best[1])
+        def newton(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+            steps, starts, x, _ = state
+            by = _delay_step(still, fixed, axis, x)
+            x = x - by
+            settled = jnp.all(jnp.abs(by) <= 1e-9 * jnp.maximum(jnp.abs(x), 1.0))  # one step more is of its square
+            found = settled & (x[1] > 0.0)
+            lost = ~found & (settled | (steps == 11) | ~jnp.all(jnp.isfinite(x)))  # a border of less delay, or none
+            starts = starts + lost
+            x = jnp.where(lost, start.at[1].add(FARTHER * starts), x)
+            return jnp.where(lost, 0, steps + 1), starts, x, found
+
         zero = jnp.zeros((), int)
-        first = (zero, zero, jnp.where(known, start, 1.0), ~known)
-        *_, root, found = jax.lax.while_loop(lambda at: ~at[3] & (at[1] < STARTS), lambda at: newton(at, start), first)
-        return jnp.where(known & found & (root[1] < best[1]), root, best), None
+        begun = (zero, zero, jnp.where(known, start, 1.0), ~known)
+        *_, root, found = jax.lax.while_loop(lambda at: ~at[3] & (at[1] < STARTS), newton, begun)
+        return root, known & found
 
-    none = jnp.stack([jnp.zeros_like(loop.period), jnp.full_like(loop.period, jnp.inf)])
-    root = jax.lax.stop_gradient(jax.lax.scan(nearer, none, nearest)[0])
-    found = jnp.isfinite(root[1])
-    root = jnp.where(found, root, 1.0)
-    least = crossings.delay_at(w, seen)[0][nearest[0]]
-    return jnp.where(found, (root - _delay_step(loop, of_a, axis, root))[1] * loop.period, least)
+    roots, found = jax.lax.map(border, nearest)
+    first = jnp.argmin(jnp.where(found, roots[:, 1] * still.period, sizes[nearest]))  # to be reached
+    root = jax.lax.stop_gradient(jnp.where(found[first], roots[first], 1.0))
+    estimate = crossings.delay_at(w, seen)[0][nearest[first]]
+    return jnp.where(found[first], (root - _delay_step(loop, of_a, axis, root))[1] * loop.period, estimate)
 
 
 @jax.jit
