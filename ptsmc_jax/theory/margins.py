@@ -193,7 +193,8 @@ def _axis(root: Array, L: Array, slope: Array, there: Array, stable: Array) -> M
 
 def _delay(loop: Loop, w: Array, seen: Array, axis: Array) -> Scalar:
     """Further delay [s] at which the loop comes to its border, the axis's command late by it."""
-    sizes, crossed = jax.lax.stop_gradient(crossings.delay_at(w, seen))
+    estimates, crossed = crossings.delay_at(w, seen)
+    sizes, crossed = jax.lax.stop_gradient((estimates, crossed))
     # the hold moves each border away from its estimate, by its own share: the least estimate need not be the nearest
     nearest = jax.lax.top_k(-sizes, min(NEAREST, sizes.size))[1]
     # not by LAPACK's solutions: jaxlib's wait for XLA's threads, on which two of them beside each other stand for ever
@@ -222,8 +223,8 @@ def _delay(loop: Loop, w: Array, seen: Array, axis: Array) -> Scalar:
     roots, found = jax.lax.map(border, nearest)
     first = jnp.argmin(jnp.where(found, roots[:, 1] * still.period, sizes[nearest]))  # to be reached
     root = jax.lax.stop_gradient(jnp.where(found[first], roots[first], 1.0))
-    estimate = crossings.delay_at(w, seen)[0][nearest[first]]
-    return jnp.where(found[first], (root - _delay_step(loop, of_a, axis, root))[1] * loop.period, estimate)
+    exact = (root - _delay_step(loop, of_a, axis, root))[1] * loop.period
+    return jnp.where(found[first], exact, estimates[nearest[first]])
 
 
 @jax.jit

@@ -295,8 +295,7 @@ class Descents:
 
         def judged(changes: Sequence[Sequence[int]]) -> list[Best]:
             back = [np.isin(np.arange(own.size), change) for change in changes]
-            share = [self._evaluate.bounds.replaced(current.share, own, which) for which in back]
-            share = np.clip(share, 0.0, 1.0)
+            share = np.clip([self._evaluate.bounds.replaced(current.share, own, which) for which in back], 0.0, 1.0)
             flown = self._evaluate.slopes(tightened, share)  # the program that is compiled already
             bests = [Best(one, len(problem.rows), self._margin) for one in share]
             for k, best in enumerate(bests):
