@@ -1,6 +1,6 @@
 """Slopes, influence, sensitivities, intervals and the global check, against what is known."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -203,31 +203,41 @@ def test_a_global_search_is_judged_by_the_limits_themselves(monkeypatch, share, 
     assert global_check.check(evaluate, found, 0).kept is kept
 
 
-def test_a_global_search_keeps_the_margin_that_the_search_keeps(monkeypatch):
-    """F = 3 + share, as of a t_f, and a metric of 1.05, from 0.3 on 0.95, from 0.6 on 0.8: 10 % from a limit of 1.
+@dataclass(frozen=True)
+class Told:
+    """A problem of one gain with one requirement, and margins or None."""
 
-    What breaks the limit by a little is not looked at for its F, which is less there, nor what has none, beyond 0.9.
+    limit: float = 1.0
+    margins: Any = None
+    names, rows = ("eta",), ("peak_torque",)
+
+    def tightened(self, factor):
+        return replace(self, limit=self.limit * factor)
+
+
+class Steps:
+    """Evaluates F = 3 + share, as of a t_f, without a value beyond 0.9, and c; counts what is asked for margins."""
+
+    def __init__(self, c):
+        self.c, self.rollouts, self.judged = c, 0, 0
+
+    def fly(self, problem, share):
+        self.rollouts += len(share)
+        self.judged += len(share) * (problem.margins is not None)
+        f = np.where(share[:, 0] > 0.9, np.inf, 3.0 + share[:, 0])
+        return Measured(2.0 + share, f, self.c(problem, share)[:, :, None], f)
+
+
+def test_a_global_search_keeps_the_margin_that_the_search_keeps(monkeypatch):
+    """A metric of 1.05, from 0.3 on 0.95, from 0.6 on 0.8: 10 % from a limit of 1.
+
+    What breaks the limit by a little is not looked at for its F, which is less there, nor what has none.
     """
     monkeypatch.setattr(global_check, "POPULATION", 10)
-
-    class Told:
-        names, rows, limit = ("eta",), ("peak_torque",), 1.0
-
-        def tightened(self, factor):
-            told = Told()
-            told.limit = self.limit * factor
-            return told
-
-    class Evaluate:
-        rollouts = 0
-
-        def fly(self, problem, share):
-            self.rollouts += len(share)
-            f = np.where(share[:, 0] > 0.9, np.inf, 3.0 + share[:, 0])
-            c = np.select([share < 0.3, share < 0.6], [1.05, 0.95], 0.8)[:, :, None] / problem.limit - 1.0
-            return Measured(2.0 + share, f, c, f)
-
-    evaluate: Any = Evaluate()
+    metric = [1.05, 0.95, 0.8]
+    evaluate: Any = Steps(
+        lambda problem, share: np.select([share < 0.3, share < 0.6], metric[:2], 0.8) / problem.limit - 1.0
+    )
     searched: Any = SimpleNamespace(problem=Told(), margin=0.1, share=np.array([0.8]))
     found = global_check.check(evaluate, searched, 1, sloped=False)
     assert found.kept
@@ -235,3 +245,28 @@ def test_a_global_search_keeps_the_margin_that_the_search_keeps(monkeypatch):
     np.testing.assert_allclose(np.log(found.value), found.gains["eta"] + 1.0, rtol=1e-12)
     np.testing.assert_allclose(found.distance, 2.8 - found.gains["eta"], rtol=1e-12)
     assert found.rollouts == evaluate.rollouts
+
+
+def test_a_global_search_asks_for_margins_only_where_they_decide(monkeypatch):
+    """And ends where it would with them at every point: there the row of margins is one of what is flown."""
+    monkeypatch.setattr(global_check, "POPULATION", 10)
+
+    def lazily(problem, share):  # breaks the requirement below 0.2, the margins below 0.6
+        rows = [0.2 - share, 0.6 - share] if problem.margins else [0.2 - share]
+        return np.concatenate(rows, axis=1)
+
+    ends = {}
+    for told, c in (
+        (Told(margins="gain_margin"), lazily),
+        (Told(), lambda _, share: np.concatenate([0.2 - share, 0.6 - share], axis=1)),
+    ):
+        evaluate: Any = Steps(c)
+        searched: Any = SimpleNamespace(problem=told, margin=0.1, share=np.array([0.8]))
+        ends[told.margins] = global_check.check(evaluate, searched, 1, sloped=False), evaluate
+    (found, lazy), (eager, every) = ends["gain_margin"], ends[None]
+    assert (found.gains, found.value) == (eager.gains, eager.value)
+    assert found.kept
+    assert (
+        lazy.rollouts - lazy.judged == every.rollouts - 3
+    )  # the best alone, it once more and the search's end: with all
+    assert lazy.judged < 0.9 * every.rollouts  # all of them if it asked everywhere

@@ -1,6 +1,6 @@
 """A global search of the same problem without slopes: how far the gradient search ended from it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import differential_evolution
@@ -8,6 +8,7 @@ from scipy.optimize import differential_evolution
 from tuning.search.descent import SLACK, Best
 from tuning.search.descents import Descents
 from tuning.search.evaluate import Evaluator
+from tuning.search.objective import Problem
 from tuning.search.optimise import Search
 from tuning.search.progress import Report
 
@@ -37,16 +38,25 @@ def check(
     Then the same descent as in the search, where F has slopes: what is compared is the valley that each of them found.
     """
     problem = searched.problem.tightened(1.0 - searched.margin)
-    before, generation = evaluate.rollouts, 0
+    without = problem if problem.margins is None else replace(problem, margins=None)
+    before, generation, replaced = evaluate.rollouts, 0, np.asarray(np.inf)
 
-    def merit(share: np.ndarray) -> np.ndarray:
-        flown = evaluate.fly(problem, share.T)
+    def merit_of(problem: Problem, share: np.ndarray) -> np.ndarray:
+        flown = evaluate.fly(problem, share)
         bad = FORBIDDEN * np.where(np.isfinite(flown.f), 1.0, 2.0) + np.log1p(np.maximum(flown.beyond, 0.0))
         return np.where((flown.beyond <= SLACK) & np.isfinite(flown.f), flown.f, bad)
 
+    def merit(share: np.ndarray) -> np.ndarray:
+        found = merit_of(without, share.T)
+        # margins, which take far longer, can only add to it: of what is not chosen anyway they are not asked for
+        chosen = found <= replaced
+        if without is not problem and chosen.any():
+            found[chosen] = merit_of(problem, share.T[chosen])
+        return found
+
     def tell(intermediate_result) -> None:
-        nonlocal generation
-        generation += 1
+        nonlocal generation, replaced
+        generation, replaced = generation + 1, intermediate_result.population_energies.copy()
         best = float(intermediate_result.fun)
         report("differential evolution", generation, GENERATIONS, float(np.exp(best)), 0.0 if best < FORBIDDEN else 1.0)
 
