@@ -30,6 +30,10 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 SHAPES = re.compile(r"\b(Float|Int|Bool|Complex)\[")
 checked = [name for name, path in modules().items() if path.name != "__init__.py" and SHAPES.search(path.read_text())]
 hook = jaxtyping.install_import_hook(checked, "beartype.beartype")
+
+from ptsmc_jax.simulation import rollout  # noqa: E402
+
+rollout.simulate_once = rollout.simulate_jit  # all programs are compiled quickly here: not the same one twice
 # rooms of tests whose commands and campaigns call what other rooms test by itself, with its shapes
 CALLERS = ("campaigns", "cli", "onboard", "output", "paper", "scenario", "studies")
 

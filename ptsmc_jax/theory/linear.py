@@ -104,7 +104,7 @@ def nominal(parts: Parts) -> Nominal:
     return stacking.scan(step, first, listed)[1]
 
 
-nominal_jit = programs.jit(nominal)
+nominal_jit = programs.jit(nominal, compiler_options=programs.QUICKLY)
 
 
 def _computed(

@@ -353,3 +353,11 @@ def test_gains_that_the_clock_has_no_samples_for_are_said():
     assert codes["late"] == (rollout.UNFINISHED, 0.0)
     assert codes["early"] == (rollout.UNFINISHED, 28.25)
     assert rollout.UNFINISHED not in rollout.FINISHED
+
+
+def test_a_run_to_be_looked_at_is_optimised_where_it_is_long(monkeypatch):
+    monkeypatch.setattr(rollout, "simulate_once", once := object())
+    run = parts(30.0, period=0.01, t_end=31.0)
+    assert rollout.looked_at(run) is once
+    longer = replace(run, clock=clock.flight(1e-3, 31.0))
+    assert rollout.looked_at(longer) is rollout.simulate_jit
