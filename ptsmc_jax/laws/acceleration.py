@@ -5,7 +5,7 @@ or of a system of one's own. They fly in the sampled loop.
 """
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 from ptsmc_jax.laws.base import Law, Sample
@@ -77,6 +77,14 @@ class SlidingLaw(AccelerationLaw):
 @functools.cache
 def law_on_error(motion: type[ErrorMotion], law: type[Law]) -> type[Law]:
     """The law on an error: a class with the law's fields and the error's motion."""
-    combined = type(f"{law.__name__}On{motion.__name__}", (law, motion), {"__module__": law.__module__})
-    combined.__doc__ = law.__doc__
-    return pytree(dataclass(frozen=True)(combined))
+
+    def reduced(self: Any) -> tuple:
+        return _restored, (motion, law, {f.name: getattr(self, f.name) for f in fields(self)})
+
+    inside = {"__module__": law.__module__, "__doc__": law.__doc__, "__reduce__": reduced}
+    return pytree(dataclass(frozen=True)(type(f"{law.__name__}On{motion.__name__}", (law, motion), inside)))
+
+
+def _restored(motion: type[ErrorMotion], law: type[Law], values: dict[str, Any]) -> Law:
+    """A law on an error from a pickle, which finds no class of that name in the law's module."""
+    return law_on_error(motion, law)(**values)

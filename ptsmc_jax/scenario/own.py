@@ -115,7 +115,7 @@ def waits(scenario: Table) -> bool:
 def waiting(table: Any) -> Any:
     """The table as it is before its code is run."""
     rest = ("rest", dict[str, Any], msgspec.field(default_factory=dict))
-    space = {"__doc__": table.__doc__, "__module__": table.__module__, "waits": True}
+    space = {"__doc__": table.__doc__, "__module__": table.__module__, "waits": True, "__reduce__": _reduced}
     return msgspec.defstruct(table.__name__, [rest], bases=(table,), frozen=True, kw_only=True, namespace=space)
 
 
@@ -176,8 +176,18 @@ def _with_keys(table: Any, found: Any) -> Any:
             "gains": {**table.gains, **gains},
             "free_by_default": tuple(gains),
             "made": found,
+            "__reduce__": _reduced,
         },
     )  # fmt: skip
+
+
+def _reduced(self: Any) -> tuple:
+    """How a table made here is pickled: by the table that it derives from, since its module has no such name."""
+    return _restored, (type(self).__base__, self.waits, {name: getattr(self, name) for name in self.__struct_fields__})
+
+
+def _restored(table: Any, waits: bool, values: dict[str, Any]) -> Any:
+    return (waiting(table) if waits else read(table, table.__name__, values["code"]))(**values)
 
 
 def _annotated(found: type, base: type) -> Iterator[str]:

@@ -1,6 +1,8 @@
 """The family of laws for eps'' = a + d: against closed forms, their papers' claims and loops written in NumPy."""
 
+import copy
 import math
+import pickle
 from dataclasses import replace
 from typing import Any
 
@@ -57,6 +59,14 @@ def made(name, error: Any = ErrorOfChain, model: Any = CHAIN, t_f=T_F, delta=DEL
 @jax.jit
 def stepped(law, memory, now, error, rate, bound):
     return law.step(memory, now, error, rate, bound)
+
+
+@pytest.mark.parametrize("name", CLASSES)
+def test_a_law_on_an_error_is_pickled_and_copied(name):
+    law = made(name, ErrorQuaternion, BODY)
+    for other in (pickle.loads(pickle.dumps(law)), copy.deepcopy(law)):
+        assert jax.tree.structure(other) == jax.tree.structure(law)
+        assert jax.tree.leaves(jax.tree.map(np.array_equal, other, law)) == [True] * len(jax.tree.leaves(law))
 
 
 # ---- the laws once more, in NumPy and from their papers

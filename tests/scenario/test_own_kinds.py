@@ -1,6 +1,7 @@
 """Laws, observers, disturbances and references of one's own: keys and gains of their classes, flown like the others."""
 
 import dataclasses
+import pickle
 import tomllib
 from typing import Any
 
@@ -93,6 +94,15 @@ def test_reading_runs_nothing_and_completing_finds_keys_gains_and_bounds():
     again = scenario.replace(whole, controller__eta=4.0)  # stays complete
     assert again.controller.eta == 4.0
     assert reading.complete(scenario.from_tables(parsing.dump(whole))) == whole
+
+
+def test_a_scenario_with_code_of_ones_own_is_pickled_run_or_not(here):
+    (here / "mine.toml").write_text('controller = { kind = "own", code = "mine.py:Mine" }\nloop.mode = "sampled"\n')
+    waits = ptsmc.read("mine.toml")
+    for read in (waits, reading.complete(waits)):
+        again = pickle.loads(pickle.dumps(read))
+        assert again == read
+        assert own.waits(again) == own.waits(read)
 
 
 def test_gains_of_ones_own_are_set_in_parts_and_in_the_scenario():
