@@ -72,8 +72,9 @@ def simulate(
 
 
 def _check(parts: Parts) -> None:
-    """Raise TypeError where start or disturbance have another shape than the plant's: JAX would from deep inside."""
+    """Raise TypeError where parts do not fit each other, or JAX as it is set: JAX would from deep inside."""
     check_parts(parts)
+    _check_bits(parts.t_end)
     for name, size in (("q", 4), ("w", 3)) if parts.plant.attitude else ():
         _check_shape(f"initial.{name}", getattr(parts.initial, name, None), [(size,)])
     if parts.plant.states is not None:
@@ -82,6 +83,15 @@ def _check(parts: Parts) -> None:
         raise TypeError(f"the disturbance must be a function of (t, x), but is {parts.disturbance!r}")
     value = jax.eval_shape(lambda: parts.disturbance(jnp.zeros_like(parts.t_end), parts.initial))
     _check_shape("what the disturbance returns", value, [(parts.plant.inputs,), ()])
+
+
+def _check_bits(time: Any) -> None:
+    """Raise TypeError where parts were made before JAX was set to compute with other bits, as their times show."""
+    real = jnp.result_type(float)
+    if isinstance(time, jax.Array) and jnp.issubdtype(time.dtype, jnp.floating) and time.dtype != real:
+        had, has = (jnp.finfo(kind).bits for kind in (time.dtype, real))
+        made = f"the parts have numbers of {had} bits, but JAX computes with {has} now"
+        raise TypeError(f"{made}: make them anew, by study")
 
 
 def _check_shape(name: str, value: Any, allowed: list[tuple[int, ...]]) -> None:

@@ -110,6 +110,10 @@ REFUSED = {
         lambda: ptsmc.simulate_jit(replace(RUN, disturbance=None)),
         r"the disturbance must be a function of \(t, x\), but is None",
     ),
+    "parts from before JAX had 64 bits": (
+        lambda: ptsmc.simulate_jit(jax.tree.map(lambda leaf: leaf.astype(jnp.float32), RUN)),
+        "the parts have numbers of 32 bits, but JAX computes with 64 now: make them anew, by study",
+    ),
     "a scenario for parts": (lambda: ptsmc.simulate_jit(FLIGHT), "parts are needed, such as study"),
     "a scenario's gains": (lambda: API.gains_of(FLIGHT), "parts are needed, such as study"),
     "gains in a scenario": (lambda: API.with_gains(FLIGHT, {"eta": 3.0}), "parts are needed, such as study"),
