@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import polars as pl
 from matplotlib.figure import Figure
 
@@ -177,7 +178,8 @@ def trials(
             as its scenario says.
 
     Raises RefusedError, with one sentence, where a plan cannot be flown, ScenarioError where the controller is none of
-    the scenario, and ValueError where metrics of one's own are no named numbers, or have the name of a column.
+    the scenario, and ValueError where metrics of one's own are no named numbers, or have the name of a column, and
+    where `count` is neither a whole number nor such a table.
     """
     draws.check_whole_number("seed", seed)
     ready = _ready(what if controller is None else folder.flown(_read(what)))
@@ -187,6 +189,8 @@ def trials(
     if isinstance(count, pl.DataFrame):
         plan = plans.checked(count, ready.parts, own=[*names, *ready.dispersion.own_names()])
         drawn, count = replace(campaign.of_plan(ready, seed, plan, own), software=software), plan.count
+    if np.ndim(count) or np.asarray(count).dtype == object:
+        raise ValueError(f"count is a {type(count).__name__}, but must be a whole number, or a plan as a polars table")
     draws.check_whole_number("count", count, 1)
     return drawn.fly(range(count))
 

@@ -136,6 +136,10 @@ REFUSED = {
         lambda: API.run(RUN, Dispersion(), 0, [1], block=0),
         "block is 0, but must be a whole number from 1 to",
     ),
+    "a plan in no table": (
+        lambda: API.trials(FLIGHT, {"trial": [0, 1]}),
+        "count is a dict, but must be a whole number, or a plan as a polars table",
+    ),
     "verdicts on no table": (lambda: API.verdicts(FLIGHT, {}), "rows are needed in a polars DataFrame"),
     "vectors of no trial": (
         lambda: API.export(FLIGHT, "never", trials=0),
