@@ -2,6 +2,7 @@
 
 import ast
 import importlib
+import inspect
 import json
 import re
 import subprocess
@@ -280,6 +281,15 @@ def test_type_checkers_see_the_same_exports(package):
             assert alias.asname == alias.name  # marks a re-export
             seen[alias.name] = str(node.module).removeprefix(f"{package}.")
     assert seen == importlib.import_module(package)._EXPORTS
+
+
+@pytest.mark.parametrize("package", ["ptsmc_jax", "ptsmc_jax.scenario"])
+def test_type_checkers_know_every_argument_of_the_functions_offered(package):
+    offering = importlib.import_module(package)
+    functions = [item for item in map(offering.__getattr__, offering._EXPORTS) if inspect.isfunction(item)]
+    assert len(functions) > 3  # it did look
+    for function in functions:
+        assert set(inspect.signature(function).parameters) <= set(function.__annotations__), function.__name__
 
 
 def test_tests_lie_in_the_rooms_of_what_they_test():

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import Array
 
 from ptsmc_jax import configure, programs
 from ptsmc_jax.batching import lanes
@@ -16,7 +17,7 @@ from ptsmc_jax.dispersions import planned
 from ptsmc_jax.dispersions.base import OWN, Coordinates
 from ptsmc_jax.dispersions.planned import Row
 from ptsmc_jax.dispersions.variation import Dispersion, check_dispersion
-from ptsmc_jax.numerics.draws import check_whole_number
+from ptsmc_jax.numerics.draws import WholeNumber, check_whole_number
 from ptsmc_jax.numerics.pytrees import listing
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.assembly import Parts, check_parts
@@ -87,8 +88,8 @@ class Flown(NamedTuple):
 def one(
     parts: Parts,
     dispersion: Dispersion,
-    seed,
-    trial,
+    seed: WholeNumber,
+    trial: WholeNumber | Row,
     coordinates: Coordinates | None = None,
     own: OwnMetrics | None = None,
     software: Software = OURS,
@@ -124,7 +125,7 @@ def coordinates(dispersion: Dispersion, seed: jax.Array, trials: jax.Array) -> C
     return jax.vmap(lambda trial: dispersion.coordinates(seed, trial))(trials)
 
 
-def values(parts: Parts, dispersion: Dispersion, seed, trial) -> dict[str, jax.Array]:
+def values(parts: Parts, dispersion: Dispersion, seed: WholeNumber, trial: WholeNumber | Row) -> dict[str, jax.Array]:
     """What a trial flies with, by name, without flying it; trial: see `one`."""
     about = planned.about(parts, dispersion, seed, trial)
     coordinates = about.dispersion.coordinates(about.seed, about.trial)
@@ -145,7 +146,7 @@ def run(
     parts: Parts,
     dispersion: Dispersion,
     seed: int,
-    trials: Sequence[int] | np.ndarray | Row,
+    trials: Sequence[int] | np.ndarray | Array | Row,
     block: int | None = None,
     own: OwnMetrics | None = None,
     kernel: bool | None = None,
