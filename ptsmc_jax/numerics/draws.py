@@ -40,6 +40,15 @@ def _word(value: WholeNumber) -> Array:
     return number.astype(jnp.uint32)
 
 
+def _one(value: WholeNumber) -> Array:
+    """A seed or trial as a word. Raises ValueError for several, whose streams would be mixed, sample by sample."""
+    word = _word(value)
+    if word.ndim:
+        several = f"a seed or trial is of shape {word.shape}, but must be one number"
+        raise ValueError(f"{several}; jax.vmap takes one at a time")
+    return word
+
+
 def check_whole_number(name: str, value: object, least: int = 0) -> None:
     """Raise ValueError where JAX would overflow, cut a fraction off, or count backwards; value: a known one."""
     number = np.asarray(value)
@@ -67,12 +76,12 @@ def threefry(key: Key, counter: tuple[Word, Word]) -> tuple[Word, Word]:
 
 def stream(seed: WholeNumber, trial: WholeNumber, name: str) -> Key:
     """Key [-] of the stream `name` of a trial; seed and trial are whole numbers from 0 to 2^32 - 1."""
-    return _key(seed, trial, jnp.uint32(_label(name)))
+    return _key(_one(seed), _one(trial), jnp.uint32(_label(name)))
 
 
 def streams(seed: WholeNumber, trial: WholeNumber, names: Sequence[str]) -> list[Key]:
     """Keys [-] of several streams of a trial, each as `stream` gives it: less code to compile than one by one."""
-    seed, trial = _word(seed), _word(trial)
+    seed, trial = _one(seed), _one(trial)
     keys = jax.lax.map(lambda label: _key(seed, trial, label), np.array([_label(name) for name in names], np.uint32))
     return [Key(keys.a[k], keys.b[k]) for k in range(len(names))]
 
@@ -151,7 +160,7 @@ def several(
     counts: how many, by the stream's name. All of them by one loop, over blocks of two numbers: the same work, but a
     fraction of the code to compile.
     """
-    return _several(_word(seed), _word(trial), distribution, tuple(counts.items()))
+    return _several(_one(seed), _one(trial), distribution, tuple(counts.items()))
 
 
 @partial(jax.jit, static_argnames=("distribution", "counts"))

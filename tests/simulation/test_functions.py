@@ -13,6 +13,7 @@ import pytest
 
 import ptsmc_jax as ptsmc
 from ptsmc_jax import scenario
+from ptsmc_jax.dispersions import numbers
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.numerics import draws
 from ptsmc_jax.numerics.pytrees import vector
@@ -168,6 +169,14 @@ REFUSED = {
     "half a seed of one run": (
         lambda: jax.eval_shape(lambda seed: draws.stream(seed, 0, "noise"), 0.5),
         "a seed, trial or sample is of type float64, but must be a whole number",
+    ),
+    "several trials at once": (
+        lambda: jax.eval_shape(lambda trial: draws.stream(0, trial, "noise"), jnp.arange(2)),
+        r"a seed or trial is of shape \(2,\), but must be one number; jax.vmap takes one at a time",
+    ),
+    "the draws of several trials at once": (
+        lambda: API.one(RUN, Dispersion(rate=numbers.Normal(vector([0.1, 0.1, 0.1]))), 0, jnp.arange(3)),
+        r"a seed or trial is of shape \(3,\), but must be one number",
     ),
     "half a seed": (
         lambda: API.run(RUN, None, 0.5, [1]),
