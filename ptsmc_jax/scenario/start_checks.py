@@ -59,6 +59,12 @@ def reference(scenario: Any, parts: Parts) -> None:
         return
     grid = np.linspace(0.0, float(parts.t_end), 4001)
     held = np.asarray(_scalar_part(parts.reference, grid))
+    if not np.all(np.isfinite(held)):
+        when = float(grid[int(np.argmin(np.isfinite(held)))])
+        raise ScenarioError(
+            f"reference.kind is {errors.show(scenario.reference.kind)}, but its attitude is not finite at "
+            f"t = {when:.4g} s; allowed are finite numbers until t_end"
+        )
     worst = int(np.argmin(np.abs(held)))
     crosses = np.any(np.sign(held) != np.sign(held[0]))
     if crosses or abs(held[worst]) < SINGULAR_CLEARANCE:

@@ -428,6 +428,20 @@ def test_a_reference_that_is_no_attitude_is_refused(here, old, new, said):
     assert said in str(caught.value)
 
 
+def test_a_reference_that_ends_on_the_way_is_none_that_is_crossed(here):
+    (here / "other.py").write_text(HEAD + OTHER.replace("jnp.cos(half)", "jnp.where(t > 3.0, jnp.nan, jnp.cos(half))"))
+    tables = {"loop": SAMPLED, "controller": {"t_f": 5.0}, "reference": {"kind": "own", "code": "other.py:Turning"}}
+    with pytest.raises(ScenarioError, match=r"^reference.*its attitude is not finite at t = 3\.00. s; allowed are"):
+        scenario.study(scenario.from_tables(tables))
+
+
+def test_a_class_from_python_is_named_in_a_file_and_refused_when_it_is_read(here):
+    made_here = ptsmc.replace(scenario.from_tables(CHAIN), controller={"kind": "own", "code": made("mine.py", "Mine")})
+    ptsmc.write(made_here, "s.toml")
+    with pytest.raises(ScenarioError, match=r'^controller\.code is "<Mine made in Python>": it names nothing'):
+        scenario.read("s.toml")
+
+
 def test_results_with_code_of_ones_own_ask_before_it_is_run(command, here):
     text = SHORT.replace("[controller]\n", '[controller]\nkind = "own"\ncode = "mine.py:Mine"\n')
     (here / "s.toml").write_text(text)
