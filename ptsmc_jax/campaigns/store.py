@@ -303,4 +303,5 @@ def _named(value: Any) -> Any:
         return {k: _named(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
         return [_named(v) for v in value]
-    return value if isinstance(value, bool | int | float | str) else f"<{type(value).__name__} made in Python>"
+    kind = value if isinstance(value, type) else type(value)
+    return value if isinstance(value, bool | int | float | str) else f"<{kind.__name__} made in Python>"
