@@ -183,6 +183,8 @@ def test_where_a_limit_cuts_the_command_the_loop_is_said_to_be_open():
     found = stability.summary(*stability.find(free))
     assert not any(one["open"] for one in (found, *found["before"]))
     assert not any("limit of the actuators" in line for line in margin_sentences.lines(found))
+    # not those of all inputs at once and of the sensors, which the table has beside them and which may be less
+    assert any(line.startswith("the worst margins at one input, in hold") for line in margin_sentences.lines(found))
     # as of one axis of several, of which another makes the loop unstable
     least = np.full_like(course.at_input.modulus, -100.0)
     lost = {"gain_up": least, "gain_down": least, "modulus": np.copysign(0.0, least), "stable": least > 0.0}

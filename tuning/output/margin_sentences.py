@@ -53,7 +53,7 @@ def lines(summary: Summary, *, with_least: bool = True) -> Iterator[str]:
             yield f"before the hand-over the loop with its gains frozen is unstable at {_span(times)}{caveat}"
     yield from _cut(summary)
     if summary["stable"] and with_least and not summary.get("open"):
-        yield f"the worst margins in hold, and before the hand-over where judged: {left(summary)}"
+        yield f"the worst margins at one input, in hold and before the hand-over where judged: {left(summary)}"
     if summary["said"]:
         yield summary["said"]
 
