@@ -60,6 +60,10 @@ class Actuators(Table, frozen=True):
 
     def check(self, scenario: Any) -> None:
         """Raise ScenarioError where its keys contradict each other, or the scenario's."""
+        step, limit = self.torque_step, self.torque_limit
+        if step is not None and limit is not None and step >= 2.0 * limit and getattr(scenario, "wheels", None) is None:
+            allowed = f"less than twice hardware.torque_limit, {limit}, which rounds to no torque at all"
+            raise wrong("hardware.torque_step", step, allowed)
 
     def noise_of_s(self, scenario: Any) -> float:
         """Noise of the sliding variable after the hand-over, 1 sigma an axis and raw sample, in its units."""
@@ -127,6 +131,7 @@ class Hardware(Actuators, frozen=True):
 
     def check(self, scenario: Any) -> None:
         """One noise of the gyro; a star tracker that pauses needs a filter."""
+        super().check(scenario)
         if self.rate_noise is not None and self.rate_noise_density is not None:
             raise wrong("hardware.rate_noise_density", self.rate_noise_density, "absent where rate_noise is given")
         own, every, period = self.star_tracker_period, self.star_tracker_every, scenario.loop.period
@@ -193,6 +198,7 @@ class StateHardware(Actuators, frozen=True):
 
     def check(self, scenario: Any) -> None:
         """One number for each state."""
+        super().check(scenario)
         states = len(scenario.plant.x0)
         if self.state_noise is not None and len(self.state_noise) != states:
             raise wrong("hardware.state_noise", self.state_noise, f"a list of {states} numbers, one for each state")

@@ -226,6 +226,11 @@ BAD = [
     # devices
     ("hardware.torque_lag = 0.1", "hardware.torque_lag needs the sampled loop", 'loop.mode is "continuous"'),
     (SAMPLED + "hardware.torque_limit = 0", "hardware.torque_limit is 0", "greater than 0"),
+    (
+        SAMPLED + "hardware = { torque_limit = 0.2, torque_step = 0.4 }",
+        "hardware.torque_step is 0.4",
+        "less than twice hardware.torque_limit, 0.2, which rounds to no torque at all",
+    ),
     (SAMPLED + "hardware.delay = -1", "hardware.delay is -1", "a whole number, at least 0"),
     (SAMPLED + "hardware.star_tracker_every = 0", "hardware.star_tracker_every is 0", "a whole number, at least 1"),
     (
