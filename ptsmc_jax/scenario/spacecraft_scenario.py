@@ -201,6 +201,9 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
     def check_plant(self) -> None:
         """Attitudes that are given once, devices that fit, and modes that a body can have however they are drawn."""
         attitude_keys.quaternion(self.initial, "initial")
+        settled = self.loop.settling_angle
+        if settled >= math.pi:  # as in degrees: nothing would ever be away from the reference, or missed
+            raise wrong("loop.settling_angle", settled, 'less than pi [rad], or with its unit, such as "0.5 deg"')
         self.reference.check()
         for place, term in self.placed_terms.items():
             term.check(place)
