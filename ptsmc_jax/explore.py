@@ -185,7 +185,10 @@ def trials(
     ready = _ready(what if controller is None else folder.flown(_read(what)))
     software = _software(controller, ready)
     drawn = campaign.Campaign(ready, seed, own, software=software)
-    names = drawn.own_names()
+    try:
+        names = drawn.own_names()
+    except ValueError as error:
+        raise ValueError(f"own is {getattr(own, '__name__', type(own).__name__)}: {error}") from None
     if isinstance(count, pl.DataFrame):
         plan = plans.checked(count, ready.parts, own=[*names, *ready.dispersion.own_names()])
         drawn, count = replace(campaign.of_plan(ready, seed, plan, own), software=software), plan.count

@@ -28,7 +28,12 @@ def from_tables(raw: Mapping[str, Any], *, run: bool = False) -> Scenario:
     """The scenario of raw tables (a parsed file), checked; raises ScenarioError with one sentence.
 
     run: code of one's own may be run, without which its keys and gains are not known, and not checked: see `complete`.
+
+    Raises TypeError where these are no tables.
     """
+    if not isinstance(raw, Mapping):
+        found = f"this is a {type(raw).__name__}"
+        raise TypeError(f'tables are needed, such as {{"controller": {{"t_f": 35.0}}}}, but {found}')
     scenario = resolve(parsing.parse(raw, run=run))
     checks.check(scenario)
     if scenario.tune is not None and not own.waits(scenario):

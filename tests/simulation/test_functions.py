@@ -122,6 +122,10 @@ REFUSED = {
     "parts in a file": (lambda: API.write(RUN, "never.toml"), "a scenario is needed, as read or from_tables"),
     "parts for a scenario": (lambda: API.simulate(RUN), "a scenario is needed, as read or from_tables return it"),
     "tables for a scenario": (lambda: API.study({}), "a scenario is needed, as read or from_tables return it"),
+    "a list of tables": (
+        lambda: scenario.from_tables([1]),  # pyright: ignore[reportArgumentType]
+        r'tables are needed, such as \{"controller": \{"t_f": 35.0\}\}, but this is a list',
+    ),
     "a reach of no scenario": (lambda: API.reach_of("file"), "a scenario is needed, as read .* but this is a str"),
     "a number for a reach": (
         lambda: API.study(FLIGHT, reach=2.0),
