@@ -47,18 +47,19 @@ def test_a_line_comes_also_while_nothing_new_is_said(capsys, monkeypatch):
 
 
 def test_trials_a_second_are_those_flown_since_the_command_began(monkeypatch):
-    """3 000 in four seconds, of a campaign that goes on from 1 000; at first nothing is known."""
-    at, said = iter([10.0, 14.0, 14.0]), []
+    """3 000 in four seconds, of a campaign that goes on from 1 000; at first nothing is known. A slow rate is not 0."""
+    at, said = iter([10.0, 14.0, 14.0, 16010.0]), []
     monkeypatch.setattr(campaign_terminal.time, "monotonic", lambda: 0.0)
     progress = campaign_terminal.Progress(quiet=True)
     monkeypatch.setattr(campaign_terminal.time, "monotonic", lambda: next(at))
     monkeypatch.setattr(progress, "_lines", lambda text, done, total: said.append(text))
-    for done, failed in ((1000, 0), (4000, 2), (9000, 2)):
+    for done, failed in ((1000, 0), (4000, 2), (9000, 2), (9000, 2)):
         progress(campaign.Tally(done, 9000, failed))
     assert said == [
         "1000 of 9000 trials, compiling",
         "4000 of 9000 trials, 750 a second, 2 failed or missed",
         "9000 of 9000 trials, 2,000 a second, 2 failed or missed",
+        "9000 of 9000 trials, 0.5 a second, 2 failed or missed",
     ]
 
 

@@ -34,7 +34,10 @@ class Progress(Bar):
         since, before = self._started
         rate = (standing.done - before) / (now - since) if standing.done > before else 0.0
         text = f"{standing.done} of {standing.total} trials"
-        text += f", {rate:,.0f} a second" if rate else ", compiling" if standing.done < standing.total else ""
+        if rate:
+            text += f", {rate:,.0f} a second" if rate >= 1.0 else f", {rate:.1g} a second"
+        elif standing.done < standing.total:
+            text += ", compiling"
         text += f", {standing.failed} failed or missed" if standing.failed else ""
         self._bar.update(self._task, completed=standing.done, total=standing.total, description=text)
         self._lines(text, 0, 0)
