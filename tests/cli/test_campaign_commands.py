@@ -11,7 +11,7 @@ import pytest
 from ptsmc_jax.campaigns import campaign, store
 from tests.helpers import SHORT_CHAIN, same, short
 from tests.output.pages import checked
-from tuning.output import sentences
+from tuning.output import progress_lines, sentences
 from tuning.studies import campaign_summary
 
 FOLDER = "out/montecarlo-s"
@@ -47,10 +47,12 @@ def flown(command, tmp_path):
     return tmp_path / FOLDER
 
 
-def test_a_campaign_leaves_rows_summary_and_figures(command, tmp_path):
-    code, said, _ = command("montecarlo", "s.toml", "--trials", 250, "--seed", 3)
+def test_a_campaign_leaves_rows_summary_and_figures(command, tmp_path, monkeypatch):
+    monkeypatch.setattr(progress_lines, "EVERY", 0.05)
+    code, said, progress = command("montecarlo", "s.toml", "--trials", 250, "--seed", 3)
     folder = tmp_path / FOLDER
     assert code == 0
+    assert "ptsmc: summing up, " in progress
     assert "250 trials of seed 3: 250 ok" in said
     assert "peak_torque at most 30 N m: worst" in said
     assert "100 % of trials keep the limit (95 %: 98.54 to 100 %)" in said  # 0.025^(1/250)

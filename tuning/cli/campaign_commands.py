@@ -299,8 +299,10 @@ def _configured(folder: Path) -> None:
 def _summarised(folder: "Folder", quiet: bool, figures: bool) -> int:
     from tuning.studies import campaign_summary
 
-    summary = campaign_summary.summarise(folder)
-    campaign_summary.write_summary(folder, summary, figures)
+    with terminal.Progress(quiet) as report:
+        report("summing up", 0, 0)
+        summary = campaign_summary.summarise(folder)
+        campaign_summary.write_summary(folder, summary, figures)
     if not quiet:
         campaign_terminal.campaign(summary, folder.path)
     return 0 if summary["status"] == "met" else 1
