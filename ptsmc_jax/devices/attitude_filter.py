@@ -47,10 +47,13 @@ class AttitudeFilter:
             share: below 1 in a partial first period, where the errors are between those before this sample and before
                 the next one.
         """
-        every = self.spread.shape[0]
-        root = guards.lerp(share, self.spread[(sample - 1) % every], self.spread[sample % every])
-        turn, drift = root @ normals.reshape(2, 3)
+        turn, drift = self.first_spread(sample, share) @ normals.reshape(2, 3)
         return Estimate(attitude.multiply(q, attitude.from_rotation_vector(turn)), bias + drift)
+
+    def first_spread(self, sample: Any, share: Scalar) -> Float[Array, "2 2"]:
+        """The factor of `spread` that `begin` draws errors by, (2, 2) [rad, rad/s]; arguments as there."""
+        every = self.spread.shape[0]
+        return guards.lerp(share, self.spread[(sample - 1) % every], self.spread[sample % every])
 
     def propagate(self, old: Estimate, w: Float[Array, "3"], w_next: Float[Array, "3"], dt: Scalar) -> Estimate:
         """The estimate dt [s] later, from the rates measured at both ends [rad/s], coning to second order included."""

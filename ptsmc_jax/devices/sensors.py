@@ -10,6 +10,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -73,29 +74,11 @@ class Reading(NamedTuple):
 
     rows: np.ndarray  # (m, n + own) of the readings by these coordinates
     noise: np.ndarray  # (m,) 1 sigma of each reading, in its unit
-    every: np.ndarray  # (m,) control periods from one reading to the next; 0: it is read at `own_times`
     own: np.ndarray  # (own,) 1 sigma of its own states at t = 0
     own_drift: np.ndarray  # (own,) 1 sigma of their change in a control period, per second
-    start: tuple[np.ndarray, np.ndarray] | None = None  # rows (k, n + own) and covariance (k, k) of what t = 0 knows
-    own_times: StarTimes | None = None
-    slopes: np.ndarray | None = None  # (m, n + own) derivatives of `rows`, for readings at own times [1/s]
-
-    def available(self, sample: np.ndarray) -> np.ndarray:
-        """Whether control samples (N,), by their numbers, have each of the readings, (N, m) bool [-]."""
-        by_count = sample[:, None] % np.maximum(self.every, 1) == 0
-        if self.own_times is None:
-            return by_count
-        return np.where(self.every == 0, np.asarray(self.own_times.due(sample))[:, None], by_count)
-
-    def rows_at(self, sample: np.ndarray, dt: np.ndarray) -> np.ndarray:
-        """The rows at control samples (N,), (N, m, n + own), to first order in the age of the readings.
-
-        dt: lengths of the periods before them, (N,) [s].
-        """
-        if self.own_times is None or self.slopes is None:
-            return np.broadcast_to(self.rows, (len(sample), *self.rows.shape))
-        age = np.minimum(np.asarray(self.own_times.age(sample)), dt)
-        return self.rows - (age[:, None] * (self.every == 0))[:, :, None] * self.slopes
+    # rows (k, n + own) of what is known at t = 0, and a factor (k, k) of its covariance
+    start: tuple[np.ndarray, np.ndarray] | None = None
+    early: np.ndarray | None = None  # (m,) bool: of the state at the time of `computer.star_state`; None: none is
 
 
 class Memory(NamedTuple):
@@ -259,18 +242,28 @@ class Sensors(Sensor):
         turn = 2.0 * attitude.multiply(attitude.conjugate(memory.estimate.q), other.estimate.q)[:3]
         return jnp.concatenate([turn, other.estimate.bias - memory.estimate.bias, other.rate - memory.rate])
 
-    def reading(self, period: float) -> Reading:
-        """Rotation [rad], behind a filter every `every` periods, and rate with its bias [rad/s], every period [s]."""
+    def reading(self, period: float, sample: int = 0, share: float = 1.0) -> Reading:
+        """Rotation [rad] and rate with its bias [rad/s], a control sample each period [s].
+
+        sample: number of the first one; share: its weight, see `AttitudeFilter.begin`.
+        """
         one, zero = np.eye(3), np.zeros((3, 3))
         star, gyro = (float(v) for v in (self.attitude_noise, self.rate_noise))
         bias, drift = (0.0 if v is None else float(v) for v in (self.rate_bias, self.bias_rate))
-        start, star_every = None, 1
+        scale = one if self.rate_scale is None else np.diag(np.asarray(self.rate_scale))
+        start = early = None
         if self.filter is not None:
-            root, star_every = np.asarray(self.filter.spread)[-1], self.every
-            start = np.block([[one, zero, zero], [zero, zero, one]]), np.kron(root @ root.T, one)
-        rows, slopes = np.block([[one, zero, zero], [zero, one, one]]), np.block([[zero, one, zero], [zero] * 3])
-        noise, every = np.repeat([star, gyro], 3), np.repeat([star_every if self.own_times is None else 0, 1], 3)
-        return Reading(rows, noise, every, np.full(3, bias), np.full(3, drift), start, self.own_times, slopes)
+            root = np.asarray(self.filter.first_spread(sample, jnp.asarray(share)))
+            start = np.block([[one, zero, zero], [zero, zero, one]]), np.kron(root, one)
+        if self.own_times is not None:
+            early = np.repeat([True, False], 3)
+        rows, noise = np.block([[one, zero, zero], [zero, scale, one]]), np.repeat([star, gyro], 3)
+        return Reading(rows, noise, np.full(3, bias), np.full(3, drift), start, early)
+
+    def available(self, now: Ticks) -> np.ndarray:
+        """Whether control samples have each of the readings, (N, 6) bool."""
+        star = np.asarray(jax.vmap(self.star_weight)(now)) > 0.0
+        return np.repeat(np.stack([star, np.ones_like(star)], axis=1), 3, axis=1)
 
     def in_step(self) -> "Sensors":
         """The sensors with a star tracker of weaker measurements at every control sample, where it has its own times.
@@ -316,7 +309,11 @@ class StateSensor(Sensor):
         """The sensor without noise."""
         return replace(self, sigma=0.0 * self.sigma)
 
-    def reading(self, period: float) -> Reading:
+    def reading(self, period: float, sample: int = 0, share: float = 1.0) -> Reading:
         """Every state, every period [s]."""
         sigma = np.asarray(self.sigma)
-        return Reading(np.eye(sigma.size), sigma, np.ones(sigma.size, int), np.zeros(0), np.zeros(0))
+        return Reading(np.eye(sigma.size), sigma, np.zeros(0), np.zeros(0))
+
+    def available(self, now: Ticks) -> np.ndarray:
+        """Whether control samples have each of the readings, (N, n) bool."""
+        return np.ones((len(now.t), self.sigma.shape[-1]), bool)

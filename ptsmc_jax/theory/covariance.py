@@ -43,11 +43,12 @@ def noise(parts: Parts) -> Noise:
     run = linear.nominal_jit(parts)
     ticks = jax.tree.map(np.asarray, run.period.now)
     lasting = np.flatnonzero(ticks.t_next - ticks.t > 1e-9 * float(parts.period))  # beyond rounding
+    ticks = jax.tree.map(lambda v: v[lasting], ticks)
     flown = getattr(parts.controller, "sign_width", None)
     if flown is None:
-        return _covariance(parts, ticks, lasting, linear.opened_in(parts, run, lasting, late=False))[0]
+        return _covariance(parts, ticks, linear.opened_in(parts, run, lasting, late=False))[0]
     flat = linear.opened_in(parts, run, lasting, np.full(lasting.size, FLAT), late=False)
-    own = _State(parts, flat).rows(flat.s_command, flat.s_direct).noise  # of this sample alone
+    own = _State(parts, ticks, flat).rows(flat.s_command, flat.s_direct).noise  # of this sample alone
     found = np.asarray([_mean_width(float(flown), float(np.sqrt(np.sum(by**2) / len(by)))) for by in own])
     sizes, widths = None, np.zeros(lasting.size)
     for _ in range(ROUNDS):
@@ -55,7 +56,7 @@ def noise(parts: Parts) -> Noise:
             break
         widths = found
         sign = _Sign(linear.opened_in(parts, run, lasting, widths, late=False).loop, widths, float(flown))
-        sizes, found = _covariance(parts, ticks, lasting, flat, sign)
+        sizes, found = _covariance(parts, ticks, flat, sign)
     assert sizes is not None
     return sizes
 
@@ -104,12 +105,12 @@ class _Rows(NamedTuple):
 class _State:
     """The state that is propagated: z, the commands on their way, the sensors' own states, the random walk's torque."""
 
-    def __init__(self, parts: Parts, opened: linear.Opened):
+    def __init__(self, parts: Parts, ticks: Any, opened: linear.Opened):
         loop: Any = opened.loop
         self._n, self._m, k = loop.a.shape[1], loop.command.shape[1], loop.seen.shape[2]
         self.plant = slice(0, opened.error.shape[2])
         sensors = None if parts.sensors is None else parts.sensors.in_step()
-        self._reading = reading = error_floor.reading_of(sensors, k, float(parts.period))
+        self._reading = reading = error_floor.reading_of(sensors, k, float(parts.period), ticks)
         self._waiting = loop.delay * self._m
         before = self._n + self._waiting
         self._own = slice(before, before + reading.own.size)
@@ -130,7 +131,7 @@ class _State:
         if reading.start is not None:  # the filter's errors: of its attitude, and of its bias beside the gyro's
             start = np.zeros((self.size, 6))
             first = self.plant.stop + len(self._seen.state)  # after x and what the computer saw of it
-            start[first : first + 6] = error_floor.root(reading.start[1])
+            start[first : first + 6] = reading.start[1]
             factor[first + 3 : first + 6] = np.diag(reading.own)
             factor = np.hstack([factor, start])
         return factor @ factor.T
@@ -158,16 +159,14 @@ class _State:
         return command, _Rows(state, noise)
 
 
-def _covariance(
-    parts: Parts, ticks: Any, lasting: np.ndarray, opened: linear.Opened, sign: _Sign | None = None
-) -> tuple[Noise, np.ndarray]:
+def _covariance(parts: Parts, ticks: Any, opened: linear.Opened, sign: _Sign | None = None) -> tuple[Noise, np.ndarray]:
     """The covariance propagated along the run, and what it makes of error, command and s; widths of the sign."""
-    lengths = (ticks.t_next - ticks.t)[lasting]
-    state = _State(parts, opened)
+    lengths = ticks.t_next - ticks.t
+    state = _State(parts, ticks, opened)
     p, sliding = state.start(), state.rows(opened.s_command, opened.s_direct)
     command, moved = state.moved(opened.loop)
     sloped = (None, None) if sign is None else state.moved(sign.loops)
-    squares, torque, widths = np.zeros((len(lasting), 2)), 0.0, np.zeros(len(lasting))  # of the error and of s
+    squares, torque, widths = np.zeros((len(lengths), 2)), 0.0, np.zeros(len(lengths))  # of the error and of s
     for j, length in enumerate(lengths):
         error, s = opened.error[j], sliding.at(j).covariance(p)
         squares[j] = np.trace(error @ p[state.plant, state.plant] @ error.T), np.mean(np.diag(s))
@@ -178,7 +177,7 @@ def _covariance(
         commanded = command.at(j, sloped[0], share).covariance(p)
         torque = max(torque, float(np.sqrt(np.diag(commanded).max())))
         p = moved.at(j, sloped[1], share).covariance(p) + np.diag((state.drift * length) ** 2)
-    t, t_f = ticks.t[lasting], float(parts.controller.t_f)
+    t, t_f = ticks.t, float(parts.controller.t_f)
     in_window = (t >= t_f - 1e-9) & (t <= t_f + float(parts.window))
     error, s_size = np.sqrt(np.mean(squares[in_window], axis=0))
     return Noise(float(error), torque, float(s_size)), widths

@@ -29,6 +29,7 @@ from ptsmc_jax.batching import lapack
 from ptsmc_jax.devices.sensors import Reading
 from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.numerics import integrators, stacking
+from ptsmc_jax.simulation.computer import star_state
 from ptsmc_jax.simulation.interval import Criteria, integral_in_window
 from ptsmc_jax.simulation.rollout import Log, Parts
 from ptsmc_jax.simulation.sampled import PeriodMotion
@@ -103,13 +104,17 @@ def pooled(floors: Iterable[Floor]) -> float | None:
 
 
 def _lasting(parts: Parts, log: Log) -> tuple[Any, Any]:
-    """`Ticks` of a run that have a length, beyond rounding, its `Log` at their starts and at t_end; numpy arrays."""
+    """`Ticks` of a run that have a length, beyond rounding, its `Log` at their starts and at t_end; numpy arrays.
+
+    They begin and end when samples came, which may be early or late.
+    """
     ticks = jax.tree.map(np.asarray, _ticks(parts.clock, parts.controller.t_f, parts.controller.delta))
     lengths = ticks.t_next - ticks.t
     least = 1e-9 * float(np.max(lengths))
     at_starts = np.append(np.diff(np.asarray(log.t)) > least, True)
     lasting = jax.tree.map(lambda v: v[lengths > least], ticks)
-    return lasting, jax.tree.map(lambda v: np.asarray(v)[at_starts], log)
+    log = jax.tree.map(lambda v: np.asarray(v)[at_starts], log)
+    return lasting._replace(t=log.t[:-1], t_next=log.t[1:]) if parts.clock.sampled else lasting, log
 
 
 @programs.jit
@@ -177,12 +182,16 @@ def _sizes(rows: np.ndarray) -> np.ndarray:
 
 
 def _model(parts: Parts, log: Log, ticks: Ticks) -> Model:
-    """What a run's samples say, and its error, of (the plant's local coordinates, the sensor's, the walk's torque)."""
+    """What a run's samples say, and its error, of these states.
+
+    The plant's local coordinates, the sensor's, the walk's torque, and readings that were taken before the sample.
+    """
     linear: Any = jax.tree.map(np.asarray, _linear(parts, log, ticks))
     periods, n, m = linear.push.shape
-    reading = reading_of(parts.sensors, n, float(parts.period))
-    size = n + reading.own.size + m
-    torque = slice(size - m, size)
+    reading = reading_of(parts.sensors, n, float(parts.period), ticks)
+    early = np.flatnonzero(np.zeros(0) if reading.early is None else reading.early)
+    before = n + reading.own.size + m
+    size, torque, taken = before + early.size, slice(before - m, before), slice(before, before + early.size)
 
     def wide(rows: np.ndarray) -> np.ndarray:
         seen = rows.shape[-1] - reading.own.size  # what no sensor reads, the modes of a flexible body, comes after it
@@ -193,32 +202,40 @@ def _model(parts: Parts, log: Log, ticks: Ticks) -> Model:
     read = wide(reading.rows)
     off = np.hypot(reading.noise, np.linalg.norm(read[:, n : n + reading.own.size] * reading.own, axis=1))
     unknown = UNKNOWN * np.max(np.abs(read[:, :n]) * off[:, None], axis=0)
-    start = np.diag(np.concatenate([unknown, reading.own, np.zeros(m)]))
+    start = np.diag(np.concatenate([unknown, reading.own, np.zeros(m + early.size)]))
+    start[taken] = read[early] @ start  # the first sample's readings are of its own time
     if reading.start is not None:
-        rows, covariance = reading.start
-        start = _corrected(start, wide(rows) @ start, root(covariance))
-    lengths, sample = np.asarray(ticks.t_next - ticks.t), np.asarray(ticks.sample)
-    drift = np.diag(np.concatenate([np.zeros(n), reading.own_drift, walk_of(parts)]))[:, n:]
+        rows, factor = reading.start
+        start = _corrected(start, wide(rows) @ start, factor)
+    lengths = np.asarray(ticks.t_next - ticks.t)
+    drift = np.diag(np.concatenate([np.zeros(n), reading.own_drift, walk_of(parts), np.zeros(early.size)]))
     move = np.tile(np.eye(size), (periods, 1, 1))
     move[:, :n, :n], move[:, :n, torque] = linear.move, linear.push
     output = np.zeros((periods, linear.seen.shape[1], size))
     output[:, :, :n], output[:, :, torque] = linear.seen, linear.seen_push
-    rows = wide(reading.rows_at(sample, np.append(0.0, lengths[:-1])))
+    if early.size:
+        by_state = reading.rows[early, : linear.early.shape[1]]
+        move[:, taken], read[early] = 0.0, np.eye(size)[taken]
+        move[:, taken, :n], move[:, taken, torque] = by_state @ linear.early, by_state @ linear.early_push
+    there = np.ones((periods, len(read)), bool) if parts.sensors is None else parts.sensors.available(ticks)
     return Model(
         start=start,
-        rows=np.broadcast_to(rows, (periods, *rows.shape[-2:])),
-        noise=np.where(reading.available(sample), reading.noise, np.inf),
-        kick=lengths[:, None, None] * drift,
+        rows=np.broadcast_to(read, (periods, *read.shape)),
+        noise=np.where(there, reading.noise, np.inf),
+        kick=lengths[:, None, None] * drift[:, n:before],
         move=move,
         output=output,
     )
 
 
-def reading_of(sensors: Any, size: int, period: float) -> Reading:
-    """What sensors read of a state of this size, a sample each period [s]; where there are none, all of it, exactly."""
+def reading_of(sensors: Any, size: int, period: float, ticks: Ticks) -> Reading:
+    """What sensors read of a state of this size, a sample each period [s]; where there are none, all of it, exactly.
+
+    ticks: periods that have a length, of which the first is asked for what is known then.
+    """
     if sensors is None:
-        return Reading(np.eye(size), np.zeros(size), np.ones(size, int), np.zeros(0), np.zeros(0))
-    return sensors.reading(period)
+        return Reading(np.eye(size), np.zeros(size), np.zeros(0), np.zeros(0))
+    return sensors.reading(period, int(ticks.sample[0]), float(ticks.noise_weight[0]))
 
 
 def walk_of(parts: Parts) -> np.ndarray:
@@ -226,23 +243,19 @@ def walk_of(parts: Parts) -> np.ndarray:
     return np.zeros(parts.plant.inputs) if parts.walk_rate is None else np.asarray(parts.walk_rate)
 
 
-def root(covariance: np.ndarray) -> np.ndarray:
-    """A factor (n, n) of a covariance, which may be singular."""
-    values, vectors = np.linalg.eigh(covariance)
-    return vectors * np.sqrt(np.maximum(values, 0.0))
-
-
 class _Linear(NamedTuple):
     """Derivatives of a period by the plant's local coordinates z at its start and by a torque p held through it.
 
     seen: of the error at the start, in the middle and at the end, one after the other; in the middle it is that of the
-    cubic that `metric_rows` draws.
+    cubic that `metric_rows` draws. early: of what sensors can see at the time of `star_state`.
     """
 
     move: Array  # (periods, n, n)
     push: Array  # (periods, n, m)
     seen: Array  # (periods, 3 m, n)
     seen_push: Array  # (periods, 3 m, m)
+    early: Array  # (periods, k, n); of no rows where there is no such time
+    early_push: Array  # (periods, k, m)
 
 
 @programs.jit(compiler_options=programs.QUICKLY)
@@ -263,15 +276,23 @@ def _linear(parts: Parts, log: Log, ticks: Ticks) -> _Linear:
         dt, target, target_next = tick.t_next - tick.t, parts.reference(tick.t), parts.reference(tick.t_next)
         pushed = disturbance - parts.disturbance(tick.t, x)
 
-        def flown(z: Float[Array, " n"], push: Float[Array, " m"]) -> tuple[Array, Array]:
+        def motion(x: Any, push: Array) -> PeriodMotion:
+            return PeriodMotion(parts, tick.t, x, drive, pushed + push)
+
+        taken = star_state(parts, tick, motion(x, jnp.zeros_like(pushed)).at)
+
+        def flown(z: Float[Array, " n"], push: Float[Array, " m"]) -> tuple[Array, Array, Array]:
             near = plant.retract(x, z)
-            near_next = PeriodMotion(parts, tick.t, near, drive, pushed + push).after(dt)
+            moving, early = motion(near, push), jnp.zeros(0)
+            near_next = moving.after(dt)
             (start, rate), (end, rate_next) = law.errors(near, target), law.errors(near_next, target_next)
             middle = integrators.hermite_middle(start, rate, end, rate_next, dt)
-            return plant.local_coordinates(x_next, near_next), jnp.concatenate([start, middle, end])
+            if taken is not None:
+                early = parts.observer.model.local_coordinates(taken, star_state(parts, tick, moving.at))
+            return plant.local_coordinates(x_next, near_next), jnp.concatenate([start, middle, end]), early
 
         still = jnp.zeros_like(plant.local_coordinates(x, x))
-        (move, push), (seen, seen_push) = jax.jacfwd(flown, argnums=(0, 1))(still, jnp.zeros(plant.inputs))
-        return _Linear(move, push, seen, seen_push)
+        by = jax.jacfwd(flown, argnums=(0, 1))(still, jnp.zeros(plant.inputs))
+        return _Linear(*by[0], *by[1], *by[2])
 
     return lapack.vmap(period)(ticks, before, after, drives, log.disturbance[:-1])

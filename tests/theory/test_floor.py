@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from ptsmc_jax.devices import actuators, attitude_filter, reaction_wheels, sensors
+from ptsmc_jax.devices import actuators, attitude_filter, reaction_wheels, sensors, star_times
 from ptsmc_jax.signals import disturbances
 from ptsmc_jax.simulation import clock, rollout
 from ptsmc_jax.theory import error_floor
@@ -47,10 +47,12 @@ def delayed(periods):
 def by_least_squares(move, push, rows, noise, prior, output, delay):
     """Variances (periods, outputs) by conditioning on all samples at once.
 
-    z_{k+1} = move z_k + push v_k, v_k standard normal; samples rows z_k with noise (periods, m), infinite where there
-    is none; prior: information (n, n) on z_0; output: rows of (z_k, v_k) that are asked for, (outputs, n + v).
+    z_{k+1} = move z_k + push v_k, v_k standard normal; samples rows z_k, those of all periods or of each, with noise
+    (periods, m), infinite where there is none; prior: information (n, n) on z_0; output: rows of (z_k, v_k) that are
+    asked for, (outputs, n + v).
     """
     periods, n, v = len(noise), len(move), push.shape[1]
+    rows = np.broadcast_to(rows, (periods, noise.shape[1], n))
     total = n + v * periods  # (z_0, v_0, v_1, ..)
     state = [np.eye(n, total)]
     for k in range(periods - 1):
@@ -65,7 +67,7 @@ def by_least_squares(move, push, rows, noise, prior, output, delay):
         information = start.copy()
         for j in range(k - delay + 1):
             there = np.isfinite(noise[j])
-            read = (rows @ state[j])[there] / noise[j][there, None]
+            read = (rows[j] @ state[j])[there] / noise[j][there, None]
             information += read.T @ read
         asked = output @ np.vstack([state[k], np.eye(v, total, n + v * k)])
         covariance = np.linalg.inv(information * np.outer(scale, scale))
@@ -132,27 +134,64 @@ def test_a_chain_as_by_a_brute_force_estimator(order, delay):
     np.testing.assert_allclose(found.window_error, pooled_in_window(made, squares), rtol=1e-9)
 
 
+def test_samples_say_what_they_do_at_the_times_when_they_came():
+    """Of a chain whose samples are early or late: all of them at once, moved to the last one's time."""
+    made = flown_at(chain_parts([0.5, -0.2], t_f=2.0, period=PERIOD, noise=[1e-3, 5e-3]))
+    log = still(made)
+    late = 0.4 * PERIOD * np.sin(7.0 * np.arange(len(log.t)))
+    late[[0, -1]] = 0.0
+    log = log._replace(t=log.t + late)
+    found = error_floor.along(made, log)
+    np.testing.assert_allclose(found.t, log.t[1:], rtol=1e-15)
+    for k, wanted in enumerate(found.error):
+        since = log.t[: k + 1] - log.t[k + 1]
+        reads = np.array([[[1.0, t], [0.0, 1.0]] for t in since]) / np.array([[1e-3], [5e-3]])
+        np.testing.assert_allclose(
+            wanted, np.sqrt(np.linalg.inv(np.einsum("kij,kil->jl", reads, reads))[0, 0]), rtol=1e-8
+        )
+
+
 AT_REST = {"q": [0.0, 0.0, 0.0, 1.0], "t_f": 3.0, "t_end": 5.0, "period": PERIOD}
 
 
-@pytest.mark.parametrize("kind", ["raw", "bias", "filter"])
+# of the filter: a star tracker by its own clock, one that is not due at the first sample, one that pauses; a wrong gyro
+KINDS = ["raw", "bias", "filter", "own times", "later", "outage", "scale"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_a_body_at_rest_as_by_a_brute_force_estimator(kind):
     """Each axis on its own: angle, rate, the gyro's bias and its walk, the torque's walk."""
     star, gyro, bias, drift, every = 2e-5, 1e-6, 3e-6, 4e-7, 4
     walk = np.array([1e-5, 2e-5, 0.0])
-    held: Any = attitude_filter.attitude_filter(0.2, star, gyro, drift * math.sqrt(PERIOD), PERIOD, every)
     own: tuple[Any, Any] = vector(bias), vector(drift)
-    if kind != "filter":
-        every, held = 1, None
+    if kind in ("raw", "bias"):
+        every = 1
     if kind == "raw":
         bias, drift, own = 0.0, 0.0, (None, None)
-    sensor = sensors.Sensors(vector(star), vector(gyro), *own, held, every)
-    made = flown_at(parts(**AT_REST), sensors=sensor, walk_rate=vector(walk), actuators=delayed(1))
+    if kind == "own times":
+        every, walk = 1, 1e3 * walk  # so large that it tells within a period
+    sensor = sensors.Sensors(vector(star), vector(gyro), *own, None, every)
+    if kind == "own times":
+        sensor = dataclasses.replace(sensor, own_times=star_times.star_times(2.5 * PERIOD, PERIOD))
+    if kind not in ("raw", "bias"):
+        sensor = sensor.with_bandwidth(0.2, vector(PERIOD))
+    outage, scale = (0.4, 2.2) if kind == "outage" else (0.0, 0.0), 1.1 if kind == "scale" else 1.0
+    misfits = {"outage": {"outage": vector(outage)}, "scale": {"rate_scale": vector([scale] * 3)}}
+    sensor = dataclasses.replace(sensor, **misfits.get(kind, {}))
+    made = flown_at(parts(**AT_REST, delta=2 * PERIOD), sensors=sensor, walk_rate=vector(walk), actuators=delayed(1))
+    first = 0
+    if kind == "later":
+        made, first = dataclasses.replace(made, clock=parts(**AT_REST, delta=2 * PERIOD).clock), -22
     found = error_floor.along(made, still(made))
     periods = len(found.t)
     squares = np.zeros((periods, 3))
-    noise = np.array([[star if k % every == 0 else np.inf, gyro] for k in range(periods)])
-    rows = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 1.0, 0.0]])
+    numbers = first + np.arange(periods)
+    due, age = numbers % every == 0, np.zeros(periods)
+    if kind == "own times":
+        age = 0.5 * PERIOD * (numbers % 5 == 3)
+        due = np.isin(numbers % 5, (0, 3))
+    due &= ~((numbers * PERIOD >= outage[0]) & (numbers * PERIOD < outage[1]))
+    noise = np.where(due[:, None] & [True, False], star, np.array([np.inf, gyro]))
     for axis, inertia in enumerate(np.diag(np.asarray(made.plant.inertia))):
         # angle, rate, bias, torque
         a = np.zeros((4, 4))
@@ -160,9 +199,10 @@ def test_a_body_at_rest_as_by_a_brute_force_estimator(kind):
         move = expm(a * PERIOD)
         steps = np.zeros((4, 2))
         steps[2, 0], steps[3, 1] = drift * PERIOD, walk[axis] * PERIOD
+        rows = np.stack([[expm(-a * late)[0], [0.0, scale, 1.0, 0.0]] for late in age])
         prior = np.diag([0.0, 0.0, 1.0 / max(bias, 1e-20) ** 2, 1e40])
-        if kind == "filter":
-            root = np.asarray(held.spread[-1])
+        if sensor.filter is not None:
+            root = np.asarray(sensor.filter.spread[(first - 1) % len(sensor.filter.spread)])
             prior[np.ix_([0, 2], [0, 2])] += np.linalg.inv(root @ root.T)
         output = np.stack([expm(a * t)[0] / 2 for t in (0.0, PERIOD / 2, PERIOD)])
         squares += by_least_squares(move, move @ steps, rows, noise, prior, np.hstack([output, output @ steps]), 1)
