@@ -7,6 +7,7 @@ continuous stand-in.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -23,6 +24,7 @@ from ptsmc_jax.theory.linear import Loop, Opening
 
 NEUTRAL = 1e-6  # by which a pole may lie outside the unit circle: rounding of those of stored momentum
 NEAREST = 3  # places where |L| is 1 from which a delay is searched for, those of the least estimates
+LOOKED, PARTS = 8, 16  # periods of delay that are looked through, and in how many steps each
 STARTS, FARTHER = 8, 0.15  # of Newton's search for a delay, at most, and by how many periods each lies beyond the last
 
 
@@ -193,23 +195,33 @@ def _axis(root: Array, L: Array, slope: Array, there: Array, stable: Array) -> M
 
 def _delay(loop: Loop, w: Array, seen: Array, axis: Array) -> Scalar:
     """Further delay [s] at which the loop comes to its border, the axis's command late by it."""
-    estimates, crossed = crossings.delay_at(w, seen)
-    sizes, crossed = jax.lax.stop_gradient((estimates, crossed))
-    # the hold moves each border away from its estimate, by its own share: the least estimate need not be the nearest
-    nearest = jax.lax.top_k(-sizes, min(NEAREST, sizes.size))[1]
     # not by LAPACK's solutions: jaxlib's wait for XLA's threads, on which two of them beside each other stand for ever
     of_a = crossings.triangle(loop.closed_at_sensors()[0])
     still, fixed = jax.lax.stop_gradient((loop, of_a))
+    near = _looked_through(still, fixed, w, axis)
+    estimates, crossed = crossings.delay_at(w, seen)
+    far = jnp.where(estimates >= LOOKED * loop.period, estimates, jnp.inf)
+    sizes, crossed = jax.lax.stop_gradient((far, crossed))
+    # the hold moves each border away from its estimate, by its own share: the least estimate need not be the nearest
+    nearest = jax.lax.top_k(-sizes, min(NEAREST, sizes.size))[1]
+    starts = jnp.stack([jnp.log(crossed), sizes / still.period], axis=1)[nearest]
+    starts = jnp.concatenate([near, starts])
+    values = jnp.append(near[:, 1] * loop.period, far[nearest])  # of those that Newton's search does not find
+    # from where to where a border is that border
+    lows = jnp.append(near[:, 1] - 1.0 / PARTS, jnp.full(nearest.size, LOOKED - 1.0 / PARTS))
+    tries = jnp.append(jnp.ones(NEAREST, int), jnp.full(nearest.size, STARTS))
+    highs = jnp.append(near[:, 1] + 1.0 / PARTS, jnp.full(nearest.size, jnp.inf))
 
-    def border(j: Array) -> tuple[Array, Array]:  # ln w and delay, searched from a crossing; whether one is found
-        start, known = jnp.stack([jnp.log(crossed[j]), sizes[j] / still.period]), jnp.isfinite(sizes[j])
+    def border(of: tuple) -> tuple[Array, Array]:  # ln w and delay, searched from a start; whether one is found
+        start, low, high, tries = of
+        known = jnp.isfinite(start[1])
 
         def newton(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
             steps, starts, x, _ = state
             by = _delay_step(still, fixed, axis, x)
             x = x - by
             settled = jnp.all(jnp.abs(by) <= 1e-9 * jnp.maximum(jnp.abs(x), 1.0))  # one step more is of its square
-            found = settled & (x[1] > 0.0)
+            found = settled & (x[1] > jnp.maximum(low, 0.0)) & (x[1] < high)
             lost = ~found & (settled | (steps == 11) | ~jnp.all(jnp.isfinite(x)))  # a border of less delay, or none
             starts = starts + lost
             x = jnp.where(lost, start.at[1].add(FARTHER * starts), x)
@@ -217,14 +229,50 @@ def _delay(loop: Loop, w: Array, seen: Array, axis: Array) -> Scalar:
 
         zero = jnp.zeros((), int)
         begun = (zero, zero, jnp.where(known, start, 1.0), ~known)
-        *_, root, found = jax.lax.while_loop(lambda at: ~at[3] & (at[1] < STARTS), newton, begun)
+        *_, root, found = jax.lax.while_loop(lambda at: ~at[3] & (at[1] < tries), newton, begun)
         return root, known & found
 
-    roots, found = jax.lax.map(border, nearest)
-    first = jnp.argmin(jnp.where(found, roots[:, 1] * still.period, sizes[nearest]))  # to be reached
+    roots, found = jax.lax.map(border, (starts, lows, highs, tries))
+    sizes = jax.lax.stop_gradient(values)
+    # one that is near and not found is none, but for where none is found
+    counts = jnp.where((jnp.arange(sizes.size) < NEAREST) & jnp.any(found), jnp.inf, sizes)
+    first = jnp.argmin(jnp.where(found, roots[:, 1] * still.period, counts))  # to be reached
     root = jax.lax.stop_gradient(jnp.where(found[first], roots[first], 1.0))
     exact = (root - _delay_step(loop, of_a, axis, root))[1] * loop.period
-    return jnp.where(found[first], exact, estimates[nearest[first]])
+    return jnp.where(found[first], exact, values[first])
+
+
+def _looked_through(loop: Loop, of_a: tuple[Array, Array], w: Array, axis: Array) -> Array:
+    """Near where the loop comes to its border as the axis is later and later, in steps: (NEAREST, 2), see `border`.
+
+    At each step L is known, and how far to go from there it tells as it does of no delay: by far less than a step the
+    hold does not matter. Those of the least delays; infinite where there are none. of_a: as in `_delay_step`.
+    """
+    a, command = loop.closed_at_sensors()
+    z = jnp.exp(1j * w * loop.period)
+    opening = Opening(a, loop.new[0], command)
+    quick = crossings.in_triangles(opening, of_a)
+    y = quick.halves(z)[1] * (z**-loop.delay)[None, None]
+    into = jnp.conj(quick.axes.T)
+    response = -jnp.einsum("nkp,nm->pkm", y, into @ loop.new[0])
+
+    def back(response: Array, column: Array) -> Array:  # linear in the axis's column
+        return crossings.one_axis(response.at[:, axis].set(column), axis)
+
+    each = jnp.eye(command.shape[0]) + 0j
+    by_column = jax.vmap(jax.vmap(back, (None, 0)), (0, None))(response, each)
+    y = jnp.einsum("nkp,pk->np", y, by_column)
+    new, old = (-jnp.einsum("np,nq->qp", y, into @ late[:, :, axis].T) for late in (loop.new, loop.old))
+    nodes = replace(loop, new=new, old=old / z[None])
+    parts = jnp.arange(PARTS) / PARTS
+    within = jax.vmap(lambda part: jnp.add(*linear.acting(nodes, part)))(parts)
+    whole = z[None] ** -jnp.arange(LOOKED)[:, None]
+    seen = (whole[:, None] * within[None]).reshape(-1, z.size)
+    left, crossed = jax.vmap(crossings.delay_at, (None, 0))(w, seen)
+    left = left / loop.period
+    late = jnp.where(left < 1.25 / PARTS, left + (jnp.arange(len(seen)) / PARTS)[:, None], jnp.inf).reshape(-1)
+    least = jax.lax.top_k(-late, NEAREST)[1]
+    return jnp.stack([jnp.log(crossed.reshape(-1)[least]), late[least]], axis=1)
 
 
 @jax.jit

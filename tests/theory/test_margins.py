@@ -329,6 +329,45 @@ def test_the_delay_is_the_least_at_which_any_crossing_comes_to_its_border():
     assert of(loop).delay[1] == pytest.approx(float(least * loop.period), rel=1e-6)
 
 
+def radius_late(loop, axis, late):
+    """Largest modulus of the poles of a loop without delay, an axis late by so many periods."""
+    (a, command), whole = loop.closed_at_sensors(np), int(late)
+    (m, n), pushes = command.shape, np.zeros((whole + 2, *command.T.shape))
+    pushes[0] = loop.new[0] * (np.arange(m) != axis)
+    for push, acts in zip(pushes[whole:], linear.acting(loop, late - whole, np), strict=True):
+        push[:, axis] += acts[:, axis]
+    closed = np.eye(n + (whole + 1) * m, k=-m)
+    closed[:n], closed[n : n + m] = np.hstack([a + pushes[0] @ command, *pushes[1:]]), 0.0
+    closed[n : n + m, :n] = command
+    return np.abs(np.linalg.eigvals(closed)).max()
+
+
+@pytest.mark.parametrize("frequency", [7.08, 6.9])
+def test_a_loop_bears_all_delays_below_its_margin(frequency):
+    """Of a mode that is sampled a few times a turn: over a part of a period its crossing moves far from its estimate.
+
+    Newton's search from there ended at another border, at twice the delay.
+    """
+    tables = {
+        "spacecraft": {"inertia": [[1.24, 0.107, 0.038], [0.107, 1.41, 0.076], [0.038, 0.076, 1.24]]},
+        "flexible": {"frequency": [frequency], "damping": [0.01], "coupling": [[-0.478, 0.167, -0.235]]},
+        "filter": {"bandwidth": 0.114},
+        "initial": {"rotvec_deg": [45.0, 9.0, 4.0]},
+        "controller": {"t_f": 13.5, "eta": 2.84, "delta": 5.75, "k1": 0.23, "sign_width": 0.14, "surface_rate": 0.29},
+        "observer": {"gain": [6.55, 6.55, 6.55]},
+        "disturbance": {"kind": "none"},
+        "loop": {"mode": "sampled", "period": 0.2476, "t_end": 25.0, "clock": "flight"},
+        "hardware": {"attitude_noise": 2e-5, "rate_noise": 1e-6},
+    }
+    loop = jax.tree.map(np.asarray, opened(scenario.study(scenario.from_tables(tables)).parts, hold=False))
+    found = np.asarray(of(loop).delay) / float(loop.period)
+    assert radius_late(loop, 0, 0.0) < 1.0
+    for axis, border in enumerate(found):
+        for share in np.append(np.arange(0.02, 1.0, 0.02), 0.9999):
+            assert radius_late(loop, axis, share * border) < 1.0, (axis, border, share)
+        assert radius_late(loop, axis, 1.0001 * border) > 1.0
+
+
 def test_a_delay_is_found_where_the_loop_crosses_next_to_the_nyquist_frequency():
     """By poles; Newton's search stepped beyond that frequency, or to the border of an advance, and found no number."""
     found = []
