@@ -88,10 +88,10 @@ class _Spectrum(NamedTuple):
         return own_L.reshape(m, places), slope.reshape(m, places)
 
 
-def _spectrum(loop: Loop, sensors: bool) -> _Spectrum:
+def _spectrum(loop: Loop, opened: Callable[[Loop], Opening] = linear.at_input) -> _Spectrum:
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(v)) for v in jax.tree.leaves(loop)]))
     loop = jax.tree.map(lambda v: jnp.where(finite, v, jnp.ones_like(v)), loop)
-    opening = linear.at_sensors(loop) if sensors else linear.at_input(loop)
+    opening = opened(loop)
     fixed, h = jax.lax.stop_gradient((opening, loop.period))
     poles = crossings.poles_of(fixed)
     quick, w = crossings.in_triangles(opening), crossings.grid(poles, h)
@@ -105,14 +105,29 @@ def of(loop: Loop, sensors: bool = False, with_delay: bool = True) -> Margins:
 
     NaN where the loop has a number that is not finite; with_delay: of delay too, else it is NaN.
     """
-    spectrum = _spectrum(loop, sensors)
+    if not sensors:
+        return _of(_spectrum(loop), with_delay)
+
+    def at_one(axis: Array) -> Margins:  # L of all of them is so large at low frequencies that rounding is left of one
+        def opened(loop: Loop) -> Opening:
+            opening, only = linear.at_sensors(loop), jax.nn.one_hot(axis, loop.seen.shape[1])
+            a = opening.closed(jnp.diag(1.0 - only))
+            return Opening(a, opening.b @ only[:, None], only[None] @ opening.c)
+
+        return _of(_spectrum(loop, opened), False)
+
+    return jax.tree.map(lambda v: v[:, 0], jax.lax.map(at_one, jnp.arange(loop.seen.shape[1])))
+
+
+def _of(spectrum: _Spectrum, with_delay: bool) -> Margins:
+    """Margins of each axis of an opened loop, see `of`."""
     brackets = jax.vmap(partial(crossings.brackets, spectrum.w))(spectrum.each)
     root = jax.lax.stop_gradient(_closed_in(spectrum, brackets))
     L, slope = spectrum.at(jnp.append(root, brackets.elsewhere, axis=1), sloped=True)
     values = jax.vmap(_axis, in_axes=(0, 0, 0, 0, None))(root, L, slope, brackets.there, spectrum.stable)
     axes = jnp.arange(root.shape[0])
     delay = jnp.full(axes.size, jnp.nan)
-    if with_delay and not sensors:
+    if with_delay:
         delay = jax.vmap(partial(_delay, spectrum.loop, spectrum.w))(spectrum.each, axes)
     values = values._replace(delay=jnp.where(spectrum.stable, delay, 0.0))
     return jax.tree.map(lambda v: v if v.dtype == bool else jnp.where(spectrum.finite, v, jnp.nan), values)
@@ -153,7 +168,7 @@ def roughly(loop: Loop) -> dict[str, Array]:
 
     A tenth of the work of `of`.
     """
-    spectrum = _spectrum(loop, sensors=False)
+    spectrum = _spectrum(loop)
     gain, phase, modulus = jax.vmap(crossings.straight)(spectrum.each)
     delay = jnp.min(jax.vmap(partial(crossings.delay_at, spectrum.w))(spectrum.each)[0], axis=1)
     sign = jnp.where(spectrum.stable, 1.0, -1.0)

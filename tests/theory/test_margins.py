@@ -303,6 +303,30 @@ def test_one_input_is_all_of_them_at_once_and_the_closed_loop_is_the_same_wherev
     np.testing.assert_allclose(elsewhere, here, rtol=0.0, atol=1e-12 * np.abs(here).max())
 
 
+def test_each_sensor_has_its_own_phase_margin_where_the_loop_of_all_is_steep():
+    """A chain of order 5: at low frequencies rounding of the loop of all its sensors told 0.1 deg of one."""
+    tables = {
+        "plant": {"kind": "chain", "x0": [1.0, 0.0, 0.0, 0.0, 0.0]},
+        "controller": {"t_f": 7.0, "eta": 6.0, "delta": 1.0, "k1": 1.0, "surface_rate": 0.6, "sampling": "implicit"},
+        "observer": {"kind": "nonlinear", "gain": [1.0]},
+        "disturbance": {"kind": "none"},
+        "loop": {"mode": "sampled", "period": 0.05, "t_end": 9.0, "clock": "flight"},
+        "hardware": {"state_noise": [1e-5] * 5},
+    }
+    loop = opened(scenario.study(scenario.from_tables(tables)).parts)
+    opening = jax.tree.map(np.asarray, linear.at_sensors(loop))
+    assert np.abs(np.linalg.eigvals(opening.closed())).max() < 1.0
+
+    def radius(sensor, degrees):
+        turned = np.eye(5) + 0j
+        turned[sensor, sensor] = np.exp(-1j * np.deg2rad(degrees))
+        return np.abs(np.linalg.eigvals(opening.closed(turned))).max()
+
+    for sensor, phase in enumerate(np.asarray(margins.of(loop, sensors=True).phase)):
+        assert 5.0 < phase < 180.0
+        assert radius(sensor, 0.9999 * phase) < 1.0 < radius(sensor, 1.0001 * phase)
+
+
 def test_the_delay_is_the_least_at_which_any_crossing_comes_to_its_border():
     """Behind a notch, where the crossing of the least estimate has its border at twice the delay of another's."""
     tables = {
