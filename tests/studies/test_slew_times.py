@@ -111,12 +111,21 @@ def test_what_cannot_be_asked_is_refused_in_one_sentence(command, tmp_path, opti
         ),
         ({"tune": {"worst_case": True}}, "tune.worst_case is true, but must be false"),
         ({"requirements": {"gain_margin": 6.0}, "tune": {}}, "requirements.gain_margin is asked of one loop"),
+        (  # every time was flown with a third of the scenario's own t_f, which another t_f would not have had
+            {"observer": {"kind": "prescribed_time"}, "tune": {}},
+            "observer.t_o is absent and would follow t_f; allowed is one that is given",
+        ),
     ],
 )
 def test_what_has_no_answer_is_refused(changes, said):
     known = scenario.from_tables({"loop": {"mode": "sampled"}, "controller": {"t_f": 20.0}, **changes})
     with pytest.raises(ScenarioError, match=said.replace("(", r"\(")):
         slew_times.check(known, (20.0, 30.0))
+
+
+def test_an_observer_with_a_time_of_its_own_is_asked():
+    known = {"observer": {"kind": "prescribed_time", "t_o": 4.0}, "tune": {}, "loop": {"mode": "sampled"}}
+    slew_times.check(scenario.from_tables({"controller": {"t_f": 20.0}, **known}), (20.0, 30.0))
 
 
 def test_usual_times_go_from_half_to_twice_the_scenarios():
