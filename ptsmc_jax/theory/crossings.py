@@ -143,7 +143,7 @@ def brackets(w: Array, seen: Array) -> Brackets:
     least = (near[1:-1] <= near[:-2]) & (near[1:-1] <= near[2:])
     nearest = jnp.append(jnp.inf, jnp.where(least, near[1:-1], jnp.inf))
     how_far = (more, less, jnp.where(even, jnp.abs(phase), jnp.inf), nearest)
-    values, places = zip(*map(_smallest, how_far), strict=True)
+    values, places = zip(*map(smallest, how_far), strict=True)
     j, k = jnp.concatenate(places[:3]), jnp.maximum(places[3], 1)
     slope = (near[1:] - near[:-1]) / jnp.where(w[1:] == w[:-1], 1.0, w[1:] - w[:-1]) / 2
 
@@ -160,10 +160,10 @@ def brackets(w: Array, seen: Array) -> Brackets:
     )
 
 
-def _smallest(values: Array) -> tuple[Array, Array]:
-    """The `NEAREST` least of them and their places, in order; several times as fast as to sort them all."""
+def smallest(values: Array, count: int = NEAREST) -> tuple[Array, Array]:
+    """The least of them, so many, and their places, in order; several times as fast as to sort them all."""
     least, places = [], []
-    for _ in range(NEAREST):
+    for _ in range(count):
         place = jnp.argmin(values)
         least.append(values[place])
         places.append(place)

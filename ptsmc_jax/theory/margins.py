@@ -281,13 +281,16 @@ def _looked_through(loop: Loop, of_a: tuple[Array, Array], w: Array, axis: Array
     nodes = replace(loop, new=new, old=old / z[None])
     parts = jnp.arange(PARTS) / PARTS
     within = jax.vmap(lambda part: jnp.add(*linear.acting(nodes, part)))(parts)
-    whole = z[None] ** -jnp.arange(LOOKED)[:, None]
-    seen = (whole[:, None] * within[None]).reshape(-1, z.size)
-    left, crossed = jax.vmap(crossings.delay_at, (None, 0))(w, seen)
-    left = left / loop.period
-    late = jnp.where(left < 1.25 / PARTS, left + (jnp.arange(len(seen)) / PARTS)[:, None], jnp.inf).reshape(-1)
-    least = jax.lax.top_k(-late, NEAREST)[1]
-    return jnp.stack([jnp.log(crossed.reshape(-1)[least]), late[least]], axis=1)
+    left, crossed = jax.vmap(crossings.delay_at, (None, 0))(w, within)
+    left, turn = left / loop.period, 2.0 * jnp.pi / (crossed * loop.period)
+
+    def after(whole: Array) -> Array:
+        # a period turns L and leaves its size: of the delays, a turn apart, the first one after so many
+        rest = jnp.where(jnp.isfinite(left), jnp.mod(left - whole, turn), jnp.inf)
+        return jnp.where(rest < 1.25 / PARTS, whole + parts[:, None] + rest, jnp.inf)
+
+    values, places = crossings.smallest(jax.vmap(after)(jnp.arange(LOOKED)).reshape(-1), NEAREST)
+    return jnp.stack([jnp.log(crossed.reshape(-1)[places % crossed.size]), values], axis=1)
 
 
 @jax.jit
