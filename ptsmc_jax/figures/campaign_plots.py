@@ -102,12 +102,19 @@ def distributions(metrics: Mapping[str, Column]) -> Figure:
             logarithmic(axes, "x")
         if column.limit is not None:
             axes.axvline(column.limit, color=STYLES[1][0], ls="--", label=column.within())
-            place = axes.transData + axes.transAxes.inverted()
-            right = place.transform((column.limit, 0.5))[0] > 0.5
-            # the shares rise from the lower left to the upper right; the limit's line leaves one of the other two free
-            axes.legend(fontsize=9, loc="upper left" if right else "lower right")
+            axes.legend(fontsize=9, loc=_free(axes, column.limit, ordered[:known]))
         axes.set(xlabel=column.label(name), ylabel="share of the trials")
     return figure
+
+
+def _free(axes: Axes, limit: float, ordered: np.ndarray) -> str:
+    """Where neither shares, which rise from the lower left to the upper right, nor the limit's line are in the way."""
+    axes.autoscale_view()  # which waits for drawing
+    place = axes.transData + axes.transAxes.inverted()
+    at, *ends = (place.transform((x, 0.5))[0] for x in (limit, *ordered[:1], *ordered[-1:]))
+    if at > 0.5:
+        return "upper left" if not ends or ends[1] > 0.5 else "center"
+    return "lower right" if not ends or ends[0] < 0.5 else "center"
 
 
 def torque_by_angle(

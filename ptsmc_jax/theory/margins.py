@@ -25,6 +25,7 @@ from ptsmc_jax.theory.linear import Loop, Opening
 NEUTRAL = 1e-6  # by which a pole may lie outside the unit circle: rounding of those of stored momentum
 NEAREST = 3  # places where |L| is 1 from which a delay is searched for, those of the least estimates
 LOOKED, PARTS = 8, 16  # periods of delay that are looked through, and in how many steps each
+NEAR = 6  # places from there that it is searched from too, about two for each border
 STARTS, FARTHER = 8, 0.15  # of Newton's search for a delay, at most, and by how many periods each lies beyond the last
 
 
@@ -215,20 +216,14 @@ def _delay(loop: Loop, w: Array, seen: Array, axis: Array) -> Scalar:
     still, fixed = jax.lax.stop_gradient((loop, of_a))
     near = _looked_through(still, fixed, w, axis)
     estimates, crossed = crossings.delay_at(w, seen)
-    far = jnp.where(estimates >= LOOKED * loop.period, estimates, jnp.inf)
-    sizes, crossed = jax.lax.stop_gradient((far, crossed))
+    sizes, crossed = jax.lax.stop_gradient((estimates, crossed))
     # the hold moves each border away from its estimate, by its own share: the least estimate need not be the nearest
-    nearest = jax.lax.top_k(-sizes, min(NEAREST, sizes.size))[1]
-    starts = jnp.stack([jnp.log(crossed), sizes / still.period], axis=1)[nearest]
-    starts = jnp.concatenate([near, starts])
-    values = jnp.append(near[:, 1] * loop.period, far[nearest])  # of those that Newton's search does not find
-    # from where to where a border is that border
-    lows = jnp.append(near[:, 1] - 1.0 / PARTS, jnp.full(nearest.size, LOOKED - 1.0 / PARTS))
-    tries = jnp.append(jnp.ones(NEAREST, int), jnp.full(nearest.size, STARTS))
-    highs = jnp.append(near[:, 1] + 1.0 / PARTS, jnp.full(nearest.size, jnp.inf))
+    values, places = crossings.smallest(sizes, NEAREST)
+    starts = jnp.append(near, jnp.stack([jnp.log(crossed[places]), values / still.period], axis=1), axis=0)
+    tries = jnp.append(jnp.ones(len(near), int), jnp.full(NEAREST, STARTS))
 
     def border(of: tuple) -> tuple[Array, Array]:  # ln w and delay, searched from a start; whether one is found
-        start, low, high, tries = of
+        start, tries = of
         known = jnp.isfinite(start[1])
 
         def newton(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
@@ -236,7 +231,7 @@ def _delay(loop: Loop, w: Array, seen: Array, axis: Array) -> Scalar:
             by = _delay_step(still, fixed, axis, x)
             x = x - by
             settled = jnp.all(jnp.abs(by) <= 1e-9 * jnp.maximum(jnp.abs(x), 1.0))  # one step more is of its square
-            found = settled & (x[1] > jnp.maximum(low, 0.0)) & (x[1] < high)
+            found = settled & (x[1] > 0.0)
             lost = ~found & (settled | (steps == 11) | ~jnp.all(jnp.isfinite(x)))  # a border of less delay, or none
             starts = starts + lost
             x = jnp.where(lost, start.at[1].add(FARTHER * starts), x)
@@ -247,21 +242,20 @@ def _delay(loop: Loop, w: Array, seen: Array, axis: Array) -> Scalar:
         *_, root, found = jax.lax.while_loop(lambda at: ~at[3] & (at[1] < tries), newton, begun)
         return root, known & found
 
-    roots, found = jax.lax.map(border, (starts, lows, highs, tries))
-    sizes = jax.lax.stop_gradient(values)
+    roots, found = jax.lax.map(border, (starts, tries))
     # one that is near and not found is none, but for where none is found
-    counts = jnp.where((jnp.arange(sizes.size) < NEAREST) & jnp.any(found), jnp.inf, sizes)
-    first = jnp.argmin(jnp.where(found, roots[:, 1] * still.period, counts))  # to be reached
+    counts = jnp.where((starts[:, 1] < LOOKED) & jnp.any(found), jnp.inf, starts[:, 1])
+    first = jnp.argmin(jnp.where(found, roots[:, 1], counts))  # to be reached
     root = jax.lax.stop_gradient(jnp.where(found[first], roots[first], 1.0))
     exact = (root - _delay_step(loop, of_a, axis, root))[1] * loop.period
-    return jnp.where(found[first], exact, values[first])
+    return jnp.where(found[first], exact, jnp.append(near[:, 1] * still.period, estimates[places])[first])
 
 
 def _looked_through(loop: Loop, of_a: tuple[Array, Array], w: Array, axis: Array) -> Array:
-    """Near where the loop comes to its border as the axis is later and later, in steps: (NEAREST, 2), see `border`.
+    """Near where the loop comes to its border as the axis is later and later, in steps: (NEAR, 2), see `border`.
 
-    At each step L is known, and how far to go from there it tells as it does of no delay: by far less than a step the
-    hold does not matter. Those of the least delays; infinite where there are none. of_a: as in `_delay_step`.
+    At each step L is known, and how far to go from there, or back, it tells as it does of no delay: for about a step
+    the hold does not matter. Those of the least delays; infinite where there are none. of_a: as in `_delay_step`.
     """
     a, command = loop.closed_at_sensors()
     z = jnp.exp(1j * w * loop.period)
@@ -285,11 +279,12 @@ def _looked_through(loop: Loop, of_a: tuple[Array, Array], w: Array, axis: Array
     left, turn = left / loop.period, 2.0 * jnp.pi / (crossed * loop.period)
 
     def after(whole: Array) -> Array:
-        # a period turns L and leaves its size: of the delays, a turn apart, the first one after so many
-        rest = jnp.where(jnp.isfinite(left), jnp.mod(left - whole, turn), jnp.inf)
-        return jnp.where(rest < 1.25 / PARTS, whole + parts[:, None] + rest, jnp.inf)
+        # a period turns L and leaves its size: of the delays, a turn apart, the one that is nearest to so many
+        rest = jnp.where(jnp.isfinite(left), jnp.mod(left - whole + 0.5 * turn, turn) - 0.5 * turn, jnp.inf)
+        late = whole + parts[:, None] + rest
+        return jnp.where((jnp.abs(rest) < 1.25 / PARTS) & (late > 0.0), late, jnp.inf)
 
-    values, places = crossings.smallest(jax.vmap(after)(jnp.arange(LOOKED)).reshape(-1), NEAREST)
+    values, places = crossings.smallest(jax.vmap(after)(jnp.arange(LOOKED)).reshape(-1), NEAR)
     return jnp.stack([jnp.log(crossed.reshape(-1)[places % crossed.size]), values], axis=1)
 
 

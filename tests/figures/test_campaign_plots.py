@@ -24,9 +24,11 @@ def test_a_value_stands_at_the_share_of_the_trials_up_to_the_middle_of_its_own()
     np.testing.assert_allclose(np.asarray(axes.lines[0].get_xydata()), [[1.0, 1 / 8], [2.0, 3 / 8], [3.0, 5 / 8]])
 
 
-@pytest.mark.parametrize("limit", [0.2, 1.5, 50.0, 1e4])
-def test_the_line_of_a_limit_does_not_run_through_its_label(limit):
-    values = np.random.default_rng(0).lognormal(0.0, 1.0, 2000)
+@pytest.mark.parametrize(
+    ("limit", "spread"), [(0.2, 1.0), (1.5, 1.0), (50.0, 1.0), (1e4, 1.0), (20.0, 0.1), (1e-3, 0.01)]
+)
+def test_the_line_of_a_limit_does_not_run_through_its_label(limit, spread):
+    values = np.random.default_rng(0).lognormal(0.0, spread, 2000)
     figure = campaign_plots.distributions({"a": campaign_plots.Column("rad", values, limit)})
     figure.draw_without_rendering()
     (axes,) = figure.axes

@@ -392,6 +392,37 @@ def test_a_loop_bears_all_delays_below_its_margin(frequency):
         assert radius_late(loop, axis, 1.0001 * border) > 1.0
 
 
+def test_a_border_that_moves_by_more_than_a_step_is_not_passed_over():
+    """Of a plant whose command is late by two periods: looked at one step before, its border is farther than a step."""
+    plant = second_order.system(
+        1,
+        F=lambda t, x_1, x_2: x_2 + 0.1 * jnp.sin(x_1),
+        H=lambda t, x_1, x_2: -0.4 * x_1 - 0.2 * x_2,
+        G=lambda t, x_1, x_2: 1.3 * jnp.eye(1),
+        D=lambda t, x_1, x_2: 1.3 * jnp.eye(1),
+    )
+    tables = {
+        "plant": {"kind": "system", "system": plant, "x0": [0.5, 0.0]},
+        "controller": {
+            "t_f": 19.3,
+            "eta": 3.11,
+            "delta": 3.41,
+            "k1": 0.449,
+            "sign_width": 0.0388,
+            "surface_rate": 0.0997,
+        },
+        "observer": {"kind": "nonlinear", "gain": [5.47]},
+        "disturbance": {"kind": "none"},
+        "loop": {"mode": "sampled", "period": 0.2027, "t_end": 30.6, "window": 5.67, "clock": "flight"},
+        "hardware": {"delay": 2, "torque_rate_limit": 13.2, "state_noise": [1e-5, 1e-5]},
+    }
+    loop = jax.tree.map(np.asarray, opened(scenario.study(scenario.from_tables(tables)).parts, hold=True))
+    border = float(of(loop).delay[0] / loop.period)
+    for share in np.append(np.arange(0.05, 1.0, 0.05), 0.9999):
+        assert radius_late(loop, 0, 2.0 + share * border) < 1.0, (border, share)
+    assert radius_late(loop, 0, 2.0 + 1.0001 * border) > 1.0
+
+
 def test_a_delay_is_found_where_the_loop_crosses_next_to_the_nyquist_frequency():
     """By poles; Newton's search stepped beyond that frequency, or to the border of an advance, and found no number."""
     found = []
