@@ -120,12 +120,12 @@ def judged(parts: Parts) -> tuple[Margins, Array, History]:
 judged_jit = programs.jit(judged, compiler_options=programs.QUICKLY)
 
 
-def along(parts: Parts, times: int = 24, flown: linear.Nominal | None = None) -> Course:
+def along(parts: Parts, times: int = 24) -> Course:
     """Margins of sampled parts along their nominal run: in hold, where judged, and at about so many times besides.
 
     None is left in hold where the run does not come to rest, see `rest`.
     """
-    run = linear.nominal_jit(parts) if flown is None else flown
+    run = linear.nominal_jit(parts)
     looked_at, commands = _along(parts, run, times)
     at_times = at(parts, looked_at, run)
     first_at = {t: k for k, t in reversed(list(enumerate(at_times.t.tolist()))) if not at_times.hold[k]}

@@ -14,7 +14,7 @@ from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.catalogues import CATALOGUES, NO_SIGN
-from ptsmc_jax.theory import linear, margins, rest, run_margins
+from ptsmc_jax.theory import margins, rest, run_margins
 from ptsmc_jax.theory.crossings import MOST
 from ptsmc_jax.theory.margins import FIELDS
 from ptsmc_jax.theory.rest import Swing
@@ -29,10 +29,8 @@ def find(scenario: Scenario) -> tuple[Study, Course]:
     if not scenario.sampled:
         raise ScenarioError(f'margins need the sampled loop, but loop.mode is "{scenario.loop.mode}"')
     ready = study(scenario)
-    run = linear.nominal_jit(ready.parts)
-    lost = not np.isfinite(run.command).all()  # no need to look for slopes then, which takes longer
-    course = None if lost else run_margins.along(ready.parts, flown=run)
-    if course is None or np.isnan(course.hold[1].modulus).any():
+    course = run_margins.along(ready.parts)
+    if np.isnan(course.hold[1].modulus).any():
         code = int(rollout.simulate_jit(ready.parts, np.uint32(0), np.uint32(0)).status)
         if code not in rollout.FINISHED:
             status, why = rollout.STATUS[code]
