@@ -257,7 +257,7 @@ class _AskedError(Exception):
     ("owner", "program", "prepare", "ask"),
     [
         (margin_verdicts, "_look", margin_verdicts.prepare, lambda ready: margin_verdicts.over_trials(ready, 3)),
-        (rollout, "simulate_jit", runs.prepare, lambda ready: runs.floor(ready, 3)),
+        (rollout, "simulate_once", runs.prepare, lambda ready: runs.floor(ready, 3)),
     ],
     ids=["margins", "floor"],
 )
