@@ -62,7 +62,7 @@ class Actuators(Table, frozen=True):
         """Raise ScenarioError where its keys contradict each other, or the scenario's."""
         step, limit = self.torque_step, self.torque_limit
         if step is not None and limit is not None and step >= 2.0 * limit and getattr(scenario, "wheels", None) is None:
-            allowed = f"less than twice hardware.torque_limit, {limit}, which rounds to no torque at all"
+            allowed = f"less than twice hardware.torque_limit, {limit}: larger ones round every torque to zero"
             raise wrong("hardware.torque_step", step, allowed)
 
     def noise_of_s(self, scenario: Any) -> float:

@@ -230,7 +230,7 @@ BAD = [
     (
         SAMPLED + "hardware = { torque_limit = 0.2, torque_step = 0.4 }",
         "hardware.torque_step is 0.4",
-        "less than twice hardware.torque_limit, 0.2, which rounds to no torque at all",
+        "less than twice hardware.torque_limit, 0.2: larger ones round every torque to zero",
     ),
     (SAMPLED + "hardware.delay = -1", "hardware.delay is -1", "a whole number, at least 0"),
     (SAMPLED + "hardware.star_tracker_every = 0", "hardware.star_tracker_every is 0", "a whole number, at least 1"),
