@@ -242,8 +242,8 @@ class Sensors(Sensor):
         turn = 2.0 * attitude.multiply(attitude.conjugate(memory.estimate.q), other.estimate.q)[:3]
         return jnp.concatenate([turn, other.estimate.bias - memory.estimate.bias, other.rate - memory.rate])
 
-    def reading(self, period: float, sample: int = 0, share: float = 1.0) -> Reading:
-        """Rotation [rad] and rate with its bias [rad/s], a control sample each period [s].
+    def reading(self, sample: int = 0, share: float = 1.0) -> Reading:
+        """Rotation [rad] and rate with its bias [rad/s], at each control sample.
 
         sample: number of the first one; share: its weight, see `AttitudeFilter.begin`.
         """
@@ -309,8 +309,8 @@ class StateSensor(Sensor):
         """The sensor without noise."""
         return replace(self, sigma=0.0 * self.sigma)
 
-    def reading(self, period: float, sample: int = 0, share: float = 1.0) -> Reading:
-        """Every state, every period [s]."""
+    def reading(self, sample: int = 0, share: float = 1.0) -> Reading:
+        """Every state, at each control sample."""
         sigma = np.asarray(self.sigma)
         return Reading(np.eye(sigma.size), sigma, np.zeros(0), np.zeros(0))
 

@@ -76,12 +76,12 @@ def threefry(key: Key, counter: tuple[Word, Word]) -> tuple[Word, Word]:
 
 def stream(seed: WholeNumber, trial: WholeNumber, name: str) -> Key:
     """Key [-] of the stream `name` of a trial; seed and trial are whole numbers from 0 to 2^32 - 1."""
-    return _key(_one(seed), _one(trial), jnp.uint32(_label(name)))
+    return _key(seed, trial, jnp.uint32(_label(name)))
 
 
 def streams(seed: WholeNumber, trial: WholeNumber, names: Sequence[str]) -> list[Key]:
     """Keys [-] of several streams of a trial, each as `stream` gives it: less code to compile than one by one."""
-    seed, trial = _one(seed), _one(trial)
+    seed, trial = _word(seed), _word(trial)
     keys = jax.lax.map(lambda label: _key(seed, trial, label), np.array([_label(name) for name in names], np.uint32))
     return [Key(keys.a[k], keys.b[k]) for k in range(len(names))]
 
@@ -91,7 +91,7 @@ def _label(name: str) -> int:
 
 
 def _key(seed: WholeNumber, trial: WholeNumber, label: Word) -> Key:
-    return Key(*threefry(Key(_word(seed), jnp.uint32(0)), (_word(trial), label)))
+    return Key(*threefry(Key(_one(seed), jnp.uint32(0)), (_one(trial), label)))
 
 
 def derive(seed: int, name: str) -> int:
@@ -160,7 +160,7 @@ def several(
     counts: how many, by the stream's name. All of them by one loop, over blocks of two numbers: the same work, but a
     fraction of the code to compile.
     """
-    return _several(_one(seed), _one(trial), distribution, tuple(counts.items()))
+    return _several(_word(seed), _word(trial), distribution, tuple(counts.items()))
 
 
 @partial(jax.jit, static_argnames=("distribution", "counts"))

@@ -44,6 +44,11 @@ def need_some(scenario: Scenario) -> None:
         )
 
 
+def observer_follows(scenario: Scenario) -> bool:
+    """Whether the observer's t_o is absent, and so a share of t_f."""
+    return getattr(scenario.observer, "t_o", 0.0) is None
+
+
 def _check(scenario: Scenario, tune: tables.Tune) -> None:
     """Raise ScenarioError where the table asks for what cannot be tuned, before defaults are computed from it."""
     free, own = tune.gains, scenario.gains
@@ -55,7 +60,7 @@ def _check(scenario: Scenario, tune: tables.Tune) -> None:
     for name in free:
         if name not in own:
             raise ScenarioError(f"{said} {_absent(scenario, name)}")
-    if "t_f" in free and getattr(scenario.observer, "t_o", 0.0) is None:
+    if "t_f" in free and observer_follows(scenario):
         raise ScenarioError(f"{said} observer.t_o then follows t_f; allowed is t_f with observer.t_o given")
     if tune.per_axis and "observer_gain" not in free:
         raise ScenarioError(f"tune.per_axis is true, but tune.free is {errors.brief(free)}, without observer_gain")

@@ -110,7 +110,7 @@ class _State:
         self._n, self._m, k = loop.a.shape[1], loop.command.shape[1], loop.seen.shape[2]
         self.plant = slice(0, opened.error.shape[2])
         sensors = None if parts.sensors is None else parts.sensors.in_step()
-        self._reading = reading = error_floor.reading_of(sensors, k, float(parts.period), ticks)
+        self._reading = reading = error_floor.reading_of(sensors, k, ticks)
         self._waiting = loop.delay * self._m
         before = self._n + self._waiting
         self._own = slice(before, before + reading.own.size)

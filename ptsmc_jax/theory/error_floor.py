@@ -188,7 +188,7 @@ def _model(parts: Parts, log: Log, ticks: Ticks) -> Model:
     """
     linear: Any = jax.tree.map(np.asarray, _linear(parts, log, ticks))
     periods, n, m = linear.push.shape
-    reading = reading_of(parts.sensors, n, float(parts.period), ticks)
+    reading = reading_of(parts.sensors, n, ticks)
     early = np.flatnonzero(np.zeros(0) if reading.early is None else reading.early)
     before = n + reading.own.size + m
     size, torque, taken = before + early.size, slice(before - m, before), slice(before, before + early.size)
@@ -228,14 +228,14 @@ def _model(parts: Parts, log: Log, ticks: Ticks) -> Model:
     )
 
 
-def reading_of(sensors: Any, size: int, period: float, ticks: Ticks) -> Reading:
-    """What sensors read of a state of this size, a sample each period [s]; where there are none, all of it, exactly.
+def reading_of(sensors: Any, size: int, ticks: Ticks) -> Reading:
+    """What sensors read of a state of this size at each control sample; where there are none, all of it, exactly.
 
     ticks: periods that have a length, of which the first is asked for what is known then.
     """
     if sensors is None:
         return Reading(np.eye(size), np.zeros(size), np.zeros(0), np.zeros(0))
-    return sensors.reading(period, int(ticks.sample[0]), float(ticks.noise_weight[0]))
+    return sensors.reading(int(ticks.sample[0]), float(ticks.noise_weight[0]))
 
 
 def walk_of(parts: Parts) -> np.ndarray:

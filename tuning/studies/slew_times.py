@@ -74,7 +74,7 @@ def check(scenario: Scenario, times: Sequence[float]) -> None:
     pareto.check_search(scenario, against)
     if T_F in scenario.search.gains:
         raise wrong("tune.free", list(scenario.search.gains), f"without t_f {against}")
-    if getattr(scenario.observer, "t_o", 0.0) is None:
+    if free_gains.observer_follows(scenario):
         raise ScenarioError(f"observer.t_o is absent and would follow t_f; allowed is one that is given {against}")
     for key in scenario.requirements:
         if key in catalogues.MARGINS:
