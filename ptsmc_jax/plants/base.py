@@ -22,7 +22,7 @@ class Plant(ABC):
 
     inertia: Any  # (m, m)
     inertia_inverse: Any  # (m, m)
-    unknown_pace: ClassVar[bool] = False  # made of functions of one's own: only a run shows how fast it is
+    of_own_functions: ClassVar[bool] = False  # how large they are is not known, and only a run shows how fast it is
     attitude: ClassVar[bool] = False  # its state holds a quaternion q and a body rate w
 
     @property

@@ -27,7 +27,7 @@ class System(Plant):
     H: Any  # -> (n,)
     G: Any  # -> (n, n)
     D: Any  # -> (n, n), or None for the identity
-    unknown_pace: ClassVar[bool] = True
+    of_own_functions: ClassVar[bool] = True
     inertia: Leaf  # (n, n) that observers read their gains against, the identity if nothing else is said
     inertia_inverse: Leaf  # (n, n)
 

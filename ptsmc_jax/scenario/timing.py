@@ -79,7 +79,7 @@ def timing(scenario: Scenario, setup: Setup, reach: Reach, saves: object) -> tup
     Raises ScenarioError where too many steps would be needed, naming what asks for them.
     """
     loop, frequencies, visited = scenario.loop, _frequencies(scenario, setup, reach), None
-    if setup.plant.unknown_pace:
+    if setup.plant.of_own_functions:
         hurried = _with_papers_law(setup.with_t_f(vector(reach.smallest_t_f)))
         visited = solutions.visited(hurried)
         frequencies["plant.system"] = _fastest_of_system(hurried, visited)

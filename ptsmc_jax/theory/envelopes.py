@@ -43,7 +43,7 @@ def switching_rate(parts: Parts) -> float:
 def _switching_rates(parts: Parts) -> tuple[Scalar, Scalar]:
     """The largest factor under the largest K2, and under the K2 that is left when the observer has settled."""
     law, bound = parts.controller, parts.observer.error_bound()
-    seen = visited(parts) if parts.plant.unknown_pace else None
+    seen = visited(parts) if parts.plant.of_own_functions else None
     return law.switching_rate(bound.largest, seen), law.switching_rate(bound(parts.t_end), seen)
 
 

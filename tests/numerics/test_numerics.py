@@ -129,6 +129,23 @@ def march(step, y, end, count):
     return lax.scan(advance, y, jnp.arange(count))[0]
 
 
+def test_stages_in_a_loop_are_the_same_step():
+    """To rounding, of a state of several parts, with the same slopes forward and in reverse."""
+
+    def rate(t, y):
+        a, b = y
+        return jnp.sin(t) * b - a, jnp.stack([a[0] * b[1], -a[1]]) + jnp.cos(3.0 * t)
+
+    def step(dt, rolled):
+        y = vector([0.3, -1.2]), vector([0.8, 0.1])
+        return jnp.concatenate(integrators.rk4(rate, vector(0.4), y, dt, rolled=rolled))
+
+    at, eps = vector(0.3), np.finfo(float).eps
+    for of in (lambda f: f, jax.jacfwd, jax.jacrev):
+        written, looped = (of(lambda dt, rolled=rolled: step(dt, rolled))(at) for rolled in (False, True))
+        np.testing.assert_allclose(looped, written, rtol=0.0, atol=16 * eps)  # some ten operations on numbers below 2
+
+
 def test_rk4_is_of_order_4():
     # growth' = growth cos t and turning at the rate 2 t: exp(sin t) and the angle t^2
     def rate(t, y):
