@@ -228,6 +228,36 @@ def test_trials_until_the_share_is_known(command, tmp_path):
     assert summary(tmp_path / FOLDER)["flown"] == 600  # what was flown besides counts
 
 
+@pytest.mark.parametrize("before", [0, 150])
+def test_trials_until_the_share_is_known_are_as_many_after_an_interruption(command, tmp_path, monkeypatch, before):
+    """300 trials would do, but looked at are 200 and 400; behind 150 of another campaign 150 and 300, not 250."""
+    text = (tmp_path / "s.toml").read_text()
+    (tmp_path / "s.toml").write_text(text.replace("peak_torque = 30.0", "peak_torque = 3.0"))
+    width = "0.12" if before == 0 else "0.135"
+    confident = "montecarlo", "s.toml", "--trials", 5000, "--until-confident", width, "--no-figures"
+    put = campaign.Rows.put
+    for interrupted in (False, True):
+        out = "--out", f"out/{interrupted}"
+        if before:
+            command("montecarlo", "s.toml", "--trials", before, "--no-figures", *out)
+        if interrupted:
+
+            def until(self, first, count, content):
+                if first + count > (300 if before == 0 else 250):
+                    raise KeyboardInterrupt
+                return put(self, first, count, content)
+
+            monkeypatch.setattr(campaign.Rows, "put", until)
+            assert command(*confident, *out)[0] == 130
+            monkeypatch.setattr(campaign.Rows, "put", put)
+        assert command(*confident, *out)[0] == 1
+    whole, again = (tmp_path / "out" / name for name in ("False", "True"))
+    assert summary(whole) == summary(again)
+    assert summary(whole)["flown"] == (400 if before == 0 else 300)
+    assert (whole / "versions.json").read_bytes() == (again / "versions.json").read_bytes()
+    assert rows_of(whole).equals(rows_of(again))
+
+
 @pytest.mark.parametrize(("made", "said"), [("tune", 1), ("montecarlo", 0)])
 def test_trials_that_gains_were_found_with_are_told(command, tmp_path, made, said):
     """`tune --seed 1000` and a campaign by default fly the same draws and noise: a proof of nothing."""

@@ -140,6 +140,10 @@ def montecarlo(
         folder = replace(folder, path=path.with_name("-".join(names)))
     if scenario is not None:
         searches.say_seen(scenario, seed)
+    if confident:
+        from tuning.studies import campaign_summary
+
+        folder = replace(folder, first_look=campaign_summary.first_look(folder, force))
     _ = folder.campaign  # what it refuses, it refuses before anything is written
     if folder.computer is not None:
         flight_commands.say_otherwise(folder.computer)

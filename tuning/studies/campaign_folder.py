@@ -47,6 +47,7 @@ class Made(msgspec.Struct, frozen=True):
     metrics_names: tuple[str, ...] | None = None
     plan: str | None = None  # the name of its file
     controller_otherwise: str | None = None
+    first_look: Annotated[int, Meta(ge=1, le=2**32)] | None = None
 
 
 @dataclass(frozen=True)
@@ -65,6 +66,7 @@ class Folder:
     plan: str | None = None  # of the trials, what its file is called
     table: pl.DataFrame | None = None  # of that plan
     controller: Path | None = None  # folder of the C that decides; None: the parts' own code does
+    first_look: int | None = None  # trials after which it is first asked whether they are enough; None: never
 
     @cached_property
     def programs(self) -> dict[str, str]:
@@ -88,7 +90,8 @@ class Folder:
     def versions(self) -> dict[str, Any]:
         """What its `versions.json` says."""
         names = None if self.own is None else self.own_names
-        entries = {**self.identity, "trials": self.trials, "metrics_names": names, "plan": self.plan}
+        counts = {"trials": self.trials, "first_look": self.first_look}
+        entries = {**self.identity, **counts, "metrics_names": names, "plan": self.plan}
         if self.controller is not None:
             entries |= {C: C, "controller_otherwise": self.otherwise or None}
         return store.versions(**{name: value for name, value in entries.items() if value is not None})
@@ -322,6 +325,7 @@ def opened(path: Path) -> Folder:
         plan=made.plan,
         table=None if made.plan is None else plans.read(path / TABLE),
         controller=path / C if own.digest_name(own_parts.CONTROLLER) in digests else None,
+        first_look=made.first_look,
     )
 
 
@@ -385,6 +389,6 @@ def write_plan(folder: Folder, report: Callable[[Tally], None]) -> None:
 
 def settle(folder: Folder, trials: int) -> Folder:
     """The campaign as one of so many trials."""
-    settled = replace(folder, trials=trials)
+    settled = replace(folder, trials=trials, first_look=None)
     store.write_json(folder.path / "versions.json", settled.versions)
     return settled

@@ -18,7 +18,7 @@ from ptsmc_jax.scenario import cautions, parsing
 from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.requirements import Requirement, Verdict, must_keep
 from ptsmc_jax.simulation.rollout import STATUS
-from tuning.studies.campaign_folder import Folder
+from tuning.studies.campaign_folder import Folder, opened
 from tuning.studies.campaign_theory import floor_of, margins_of, unjudged
 
 SAME = 1e-12  # how far a replayed run may be off its row, relative
@@ -28,21 +28,42 @@ SHOWN = 0.9973  # share of the runs that a pointing budget holds for: three sigm
 SEARCHED = 100_000  # trials by which it is judged what drives a metric
 
 
+def first_look(folder: Folder, force: bool) -> int:
+    """How many trials are looked at first: a part, or all that a finished campaign has that goes on.
+
+    One that was interrupted has the same first look when it goes on, and so stops where it would have stopped anyway.
+    """
+    try:
+        before = None if force else opened(folder.path)
+    except RefusedError:  # there is none
+        before = None
+    if before is None:
+        return flying.PART
+    finished = before.trials < folder.trials and _there(before) >= before.trials
+    return before.trials if finished else before.first_look or flying.PART
+
+
 def until_confident(folder: Folder, width: float, fly_first: Callable[[int], None]) -> int:
     """Fly ever more trials until every requirement's share is known to within `width`; returns how many.
 
     Looked at after each doubling. The intervals are those of a campaign whose size was fixed beforehand: looking
     often, and stopping by what is seen, makes them a little too sure.
     """
-    there = sum(part.count for part in folder.rows.parts()[0])  # of a campaign that goes on none is left out
-    count = min(max(flying.PART, there), folder.trials)
+    count, there = folder.first_look or flying.PART, _there(folder)
+    while count < there:  # none is left out
+        count *= 2
     while True:
+        count = min(count, folder.trials)
         fly_first(count)
         intervals = [verdict["share_interval"] for verdict in judged(folder, first=count)]
         widths = [high - low for low, high in intervals]
         if count == folder.trials or all(w <= width for w in widths):
             return count
-        count = min(2 * count, folder.trials)
+        count *= 2
+
+
+def _there(folder: Folder) -> int:
+    return sum(part.count for part in folder.rows.parts()[0])
 
 
 def judged(folder: Folder, first: int | None = None) -> list[dict[str, Any]]:
