@@ -82,7 +82,8 @@ def law_on_error(motion: type[ErrorMotion], law: type[Law]) -> type[Law]:
         return _restored, (motion, law, {f.name: getattr(self, f.name) for f in fields(self)})
 
     inside = {"__module__": law.__module__, "__doc__": law.__doc__, "__reduce__": reduced}
-    return pytree(dataclass(frozen=True)(type(f"{law.__name__}On{motion.__name__}", (law, motion), inside)))
+    inside["__qualname__"] = f"{law.__name__}On{motion.__name__}"  # which tells programs; errors name the law's class
+    return pytree(dataclass(frozen=True)(type(law.__name__, (law, motion), inside)))
 
 
 def _restored(motion: type[ErrorMotion], law: type[Law], values: dict[str, Any]) -> Law:

@@ -79,7 +79,7 @@ class Board:
 def _kind(part: Any) -> str:
     fixed = [entry.name for entry in dataclasses.fields(part) if entry.metadata.get("static")]
     said = ", ".join(f"{name}={getattr(part, name)!r}" for name in fixed)
-    return type(part).__name__ + (f"({said})" if said else "")
+    return type(part).__qualname__ + (f"({said})" if said else "")
 
 
 SCALARS = ("t", "dt", "regular", "tracking")  # arguments of C's functions
@@ -296,7 +296,7 @@ def _commanding(computer: Board, law: Law, observer: Observer, command_filter: C
                            jnp.zeros(()))[1]  # fmt: skip
 
     computer.state["law"] = shapes(memory)
-    computer.outputs |= {"command": real(m), "s": jax.eval_shape(once, law, x, target)}
+    computer.outputs |= {"command": real(m), "s": real(*jax.eval_shape(once, law, x, target).shape)}
     filtered = "" if command_filter is None else " behind the filter of its command"
     computer.about |= {
         "law": "memory of the law",
@@ -328,6 +328,7 @@ def _commanding(computer: Board, law: Law, observer: Observer, command_filter: C
         def decided() -> tuple[Any, Any, dict[str, Any]]:
             sample, d_hat, k2 = Sample(t, hold, period), given["out.d_hat"], parameters["bound"](t)
             u, s, law = known.command(last["law"], sample, now, reference, d_hat, k2)
+            u, s = (jnp.asarray(v, jnp.result_type(float)) for v in (u, s))  # a law of one's own may say whole numbers
             if command_filter is None:
                 return u, s, {"law": law}
             before = jnp.where(given["dt"] > 0.0, period, 0.0)  # a whole period, also where samples were missed

@@ -13,6 +13,10 @@ import numpy as np
 REAL, BOOL = "real", "bool"  # kinds of numbers; the others are C's names of whole ones
 
 
+class NoRuleError(ValueError):
+    """What cannot be written in C. Its text is one sentence that names it, and the line it stands in."""
+
+
 class Title:
     """A name that the source gives to a value, of which a node is a component."""
 

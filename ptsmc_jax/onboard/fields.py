@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from ptsmc_jax.batching.components import object_array
-from ptsmc_jax.onboard.expressions import Pool, kind_of
+from ptsmc_jax.onboard.expressions import NoRuleError, Pool, kind_of
 from ptsmc_jax.onboard.origins import comments
 
 
@@ -49,12 +49,20 @@ class Struct:
             parts, meaning = spoken(path, tree)
             full = "_".join([name, *parts]) if name else "_".join(parts)
             full = re.sub(r"\W+", "_", full).strip("_").lower() or "x"
-            made = Field(full, tuple(np.shape(leaf)), kind_of(leaf.dtype), meaning or about)
-            assert full not in self.fields, full
-            self.fields[full] = made
+            while full in self.fields:  # keys of a memory may differ in capitals, or in what no name has
+                full += "_"
+            try:
+                kind = kind_of(leaf.dtype)
+            except KeyError:
+                raise NoRuleError(f"{full} holds {leaf.dtype}, which C has no number for here") from None
+            self.fields[full] = Field(full, tuple(np.shape(leaf)), kind, meaning or about)
             return full
 
         return jax.tree_util.tree_map_with_path(one, tree)
+
+    def listed(self) -> list[Field]:
+        """Its fields as C declares them, which knows no array of no numbers."""
+        return [made for made in self.fields.values() if made.size]
 
     def nodes(self, pool: Pool, tree: Any) -> Any:
         """The tree of names with arrays of what C reads there."""

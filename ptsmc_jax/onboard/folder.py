@@ -39,7 +39,7 @@ class Controller:
             raise ScenarioError(str(error)) from None
         law, device = self.ready.parts.controller, self.ready.parts.actuators
         self.about = About(
-            name, source, digest(self.scenario), type(law).__name__, self.board.parameters["filter"] is not None,
+            name, source, digest(self.scenario), type(law).__qualname__, self.board.parameters["filter"] is not None,
             self.board.spacecraft, device is not None and device.wheels is not None,
             0 if device is None else device.delay, float((law.t_f / self.last) ** 2),
         )  # fmt: skip
@@ -89,7 +89,7 @@ def fly(made: Controller, seed: int, trials: int) -> dict[int, vectors.Samples]:
     usable = {k: samples for k, samples in each.items() if vectors.usable(samples)}
     if not usable:
         raise ScenarioError(
-            f"none of the first {trials} trials keeps away from the law's singularity: nothing to check by"
+            f"none of the first {trials} trials stays finite and away from the law's singularity: nothing to check by"
         )
     return usable
 

@@ -15,7 +15,7 @@ from ptsmc_jax.laws.error_motions import ErrorMotion
 from ptsmc_jax.observers.base import Observer
 from ptsmc_jax.onboard import origins, parameters, printing
 from ptsmc_jax.onboard.board import SCALARS, Board, Stage
-from ptsmc_jax.onboard.expressions import Node, Pool, Title
+from ptsmc_jax.onboard.expressions import REAL, Node, Pool, Title
 from ptsmc_jax.onboard.fields import Field, Struct
 from ptsmc_jax.onboard.translate import Translator
 
@@ -53,8 +53,7 @@ def generate(board: Board) -> Code:
     known = parameters.parameters(board)
     structs, trees = _structs(board)
     known.used.add("period")
-    code = Code([], {}, list(structs["in"].fields.values()), list(structs["before"].fields.values()),
-                list(structs["out"].fields.values()))  # fmt: skip
+    code = Code([], {}, structs["in"].listed(), structs["before"].listed(), structs["out"].listed())
     for stage in board.stages:
         _function(code, board, stage, structs, trees, known)
     _derivation(code, known)
@@ -81,7 +80,7 @@ def _derivation(code: Code, known: parameters.Parameters) -> None:
     copies = [f"    d->of_{element} = p->{element};" for made in code.basis for element in made.elements()]
     about = printing.comment("What follows from the parameters, and the parameters that it follows from.")
     head = [*about, "static void derive(const ptsmc_params *p, ptsmc_derived *d)", "{"]
-    code.derivation = "\n".join([*head, *_shortened(body), "", *copies, "}"])
+    code.derivation = "\n".join([*head, *_shortened(body, {}), "", *copies, "}"])
     code.deriving = dict(printer.counts)
     code.variables = max(code.variables, len(printer.names))
 
@@ -113,7 +112,7 @@ def columns(inputs: Sequence[Field], state: Sequence[Field], outputs: Sequence[F
 def names_of(board: Board) -> dict[str, list[str]]:
     """The columns of a flight computer, without its C."""
     structs, _ = _structs(board)
-    return columns(*(list(structs[name].fields.values()) for name in ("in", "before", "out")))
+    return columns(*(structs[name].listed() for name in ("in", "before", "out")))
 
 
 # of what a stage reads and writes, by the first part of its name: its struct, and what C has before the field's name
@@ -160,6 +159,8 @@ def _function(
             ends += [
                 (PLACES[prefix] + element, node) for element, node in zip(made.elements(), result.flat, strict=True)
             ]
+    kinds = {place + made.name: made.kind for prefix, place in PLACES.items()
+             for made in structs[STRUCTS[prefix]].fields.values()}  # fmt: skip
     printer = printing.Printer(ARGUMENTS)
     body = [line.replace("return = ", "return ") for line in printer.body(pool.block, [*ends, *returned])]
     needed = {places[node.value] for node in printer.nodes.values() if node.op == "place"} | writes
@@ -167,7 +168,7 @@ def _function(
     arguments = {name: text for name, text in (POINTERS | ARGUMENTS).items() if name in needed}
     kind = "int" if returned else "void"
     head = printing.wrapped(f"static {kind} {stage.name}({', '.join(arguments.values())})", "")
-    code.functions.append("\n".join([*_documents(stage), *head, "{", *_shortened(body), "}"]))
+    code.functions.append("\n".join([*_documents(stage), *head, "{", *_shortened(body, kinds), "}"]))
     if stage.name != "begin":
         code.about[stage.name] = stage.about
     code.calls[stage.name] = f"{stage.name}({', '.join(PASSED.get(name, name) for name in arguments)})"
@@ -175,8 +176,8 @@ def _function(
     code.variables = max(code.variables, len(printer.names))
 
 
-def _shortened(body: list[str]) -> list[str]:
-    """Lines in which an array of a struct that is read often has a name of its own."""
+def _shortened(body: list[str], kinds: dict[str, str]) -> list[str]:
+    """Lines in which an array of a struct that is read often has a name of its own; kinds: of arrays, by place."""
     text = "\n".join(body)
     reads = Counter(re.findall(r"(?<![\w>])((?:in|before|now|out)->(?:last\.)?\w+)\[(?!\d+\](?: =(?!=)|\[))", text))
     short_names, taken = {}, set(re.findall(r"(?<![\w>.])[A-Za-z_]\w*", text))
@@ -189,7 +190,10 @@ def _shortened(body: list[str]) -> list[str]:
             short_names[place] = name
     for place, name in short_names.items():
         body = [re.sub(rf"(?<![\w>]){re.escape(place)}\[(?!\d+\] =(?!=))", f"{name}[", line) for line in body]
-    heads = [f"    const real *const {name} = {place};" for place, name in sorted(short_names.items())]
+    heads = [
+        f"    const {printing.declared(kinds.get(place, REAL))} *const {name} = {place};"
+        for place, name in sorted(short_names.items())
+    ]
     return [*heads, *body]
 
 

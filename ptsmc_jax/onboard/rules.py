@@ -4,6 +4,8 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+import jax.numpy as jnp
+
 from ptsmc_jax.onboard.expressions import BOOL, REAL, Node, Pool
 
 # functions of `numerics.elementary` that are written out for XLA: C has them
@@ -36,6 +38,13 @@ def convert(pool: Pool, kind: str, x: Node) -> Node:
         return pool.make("select", x, pool.constant(1, kind), pool.constant(0, kind), kind=kind) if kind == REAL \
             else pool.make("convert", x, kind=kind)  # fmt: skip
     return pool.make("convert", x, kind=kind)
+
+
+def _wide(dtype: Any, kind: str) -> str:
+    """The kind of numbers of this type; raises KeyError for real ones of fewer digits than C's are computed with."""
+    if kind == REAL and jnp.finfo(dtype).bits < jnp.finfo(jnp.result_type(float)).bits:
+        raise KeyError(dtype)
+    return kind
 
 
 def _plain(op: str) -> Callable:
@@ -110,7 +119,7 @@ ELEMENTWISE: dict[str, Callable] = {
     "logistic": lambda pool, params, kind, x: _one_over(
         pool, pool.make("add", pool.constant(1.0, REAL), pool.make("exp", pool.make("neg", x)))
     ),
-    "convert_element_type": lambda pool, params, kind, x: convert(pool, kind, x),
+    "convert_element_type": lambda pool, params, kind, x: convert(pool, _wide(params["new_dtype"], kind), x),
     **dict.fromkeys("stop_gradient copy copy_p reduce_precision optimization_barrier pvary".split(),
                     lambda pool, params, kind, x: x),
 }  # fmt: skip

@@ -17,14 +17,10 @@ from ptsmc_jax.batching.components import object_array
 from ptsmc_jax.batching.dependence import called, opened
 from ptsmc_jax.onboard import origins
 from ptsmc_jax.onboard.control import CONTROL
-from ptsmc_jax.onboard.expressions import BOOL, Node, Pool, Title, kind_of
+from ptsmc_jax.onboard.expressions import BOOL, Node, NoRuleError, Pool, Title, kind_of
 from ptsmc_jax.onboard.rules import ELEMENTWISE, KNOWN_FUNCTIONS
 
 LARGEST = 4096  # components of an array
-
-
-class NoRuleError(ValueError):
-    """What cannot be written in C. Its text is one sentence that names the line it stands in."""
 
 
 class Translator:

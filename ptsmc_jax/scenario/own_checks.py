@@ -79,7 +79,7 @@ class _Asked:
         got = np.asarray(value)
         if got.shape != shape:
             raise self.refused(method, f"{what} of shape {got.shape}", f"one of shape {shape}")
-        if np.iscomplexobj(got) or not np.all(np.isfinite(got)):
+        if got.dtype.kind not in "iuf" or not np.all(np.isfinite(got)):
             raise self.refused(method, f"{what} {got.tolist()}", "finite numbers, real ones")
 
     def same_memory(self, method: str, before: Any, after: Any) -> None:

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import ptsmc_jax as ptsmc
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.onboard import folder
@@ -83,6 +84,65 @@ def test_every_law_of_the_registry_replays_the_simulator(plant, kind, tmp_path):
     done = make(place, "check")
     assert done.returncode == 0, done.stdout + done.stderr
     assert "other status: 0" in done.stdout
+
+
+class Odd(ptsmc.AccelerationLaw):
+    """A law whose memory has whole numbers, nothing at all, and names that no field of a struct has."""
+
+    def begin(self) -> Any:
+        """The memory, of [-] all."""
+        return {"none": jnp.zeros(0), "I": jnp.zeros(3), "i": jnp.zeros((2, 3), int), "a b": jnp.zeros(()), "a-b": 0.0}
+
+    def step(self, memory: Any, now: Any, error: Any, error_rate: Any, bound: Any) -> Any:
+        """PD, the sliding variable by its sign."""
+        whole = jnp.sign(error).astype(int)
+        kept = {**memory, "I": memory["I"] + error, "i": jnp.stack([memory["i"][1] - 1, memory["i"].sum() % 3 - whole])}
+        return -error - 2.0 * error_rate - 0.1 * kept["I"] + 1e-3 * kept["i"][0], whole, kept
+
+
+@needs_compiler
+@pytest.mark.skipif(shutil.which("make") is None, reason="this machine has no make")
+def test_a_memory_of_any_kind_is_written(tmp_path):
+    """C did not compile, or was not written at all."""
+    flown = {**FLIGHTS["raw"], "controller": {"kind": "own", "code": Odd, "t_f": 5.0}}
+    made = scenario.reading.complete(scenario.from_tables(flown))
+    done = make(folder.export(made, tmp_path / "controller", name="law", trials=1), "check")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "other status: 0" in done.stdout
+
+
+class Unsigned(Odd):
+    """With numbers that C has no kind for."""
+
+    def begin(self) -> Any:
+        """The memory [-]."""
+        return jnp.zeros(3, jnp.uint64)
+
+    def step(self, memory: Any, now: Any, error: Any, error_rate: Any, bound: Any) -> Any:
+        """PD, which counts."""
+        return -error - 2.0 * error_rate, error, memory + jnp.uint64(1)
+
+
+class Lost(ptsmc.AccelerationLaw):
+    """Ends in no number."""
+
+    def acceleration(self, now: Any, error: Any, error_rate: Any, bound: Any) -> Any:
+        """NaN behind 2 s."""
+        return jnp.where(now.t > 2.0, jnp.nan, -error - 2.0 * error_rate), error
+
+
+@pytest.mark.parametrize(
+    ("law", "said"),
+    [
+        (Unsigned, "^law holds uint64, which C has no number for"),
+        (Lost, "^none of the first 1 trials stays finite and away from the law's singularity"),
+    ],
+)
+def test_what_cannot_be_written_or_checked_is_said(tmp_path, law, said):
+    flown = {**FLIGHTS["raw"], "controller": {"kind": "own", "code": law, "t_f": 5.0}}
+    made = scenario.reading.complete(scenario.from_tables(flown))
+    with pytest.raises(ScenarioError, match=said):
+        folder.export(made, tmp_path / "controller", name="law", trials=1)
 
 
 @needs_compiler

@@ -115,10 +115,15 @@ def test_branches_are_branches_and_loops_loops():
     assert "break;" in text(until, X)
 
 
-def test_what_c_cannot_say_is_refused_by_its_line():
-    def law(x):
-        return jnp.linalg.eigvalsh(jnp.outer(x, x))
-
-    line = law.__code__.co_firstlineno + 1
-    with pytest.raises(NoRuleError, match=rf"^`eigh` \(.*test_translate\.py:{line}\) cannot be written in C, but must"):
+@pytest.mark.parametrize(
+    ("law", "primitive"),
+    [
+        (lambda x: jnp.linalg.eigvalsh(jnp.outer(x, x)), "eigh"),
+        (lambda x: x.astype(jnp.float32) + 1.0, "convert_element_type"),  # C went on with 64 bits, and was 3e-8 off
+    ],
+)
+def test_what_c_cannot_say_is_refused_by_its_line(law, primitive):
+    line = law.__code__.co_firstlineno
+    said = rf"^`{primitive}` \(.*test_translate\.py:{line}\) cannot be written in C, but must"
+    with pytest.raises(NoRuleError, match=said):
         body(law, X)

@@ -294,6 +294,14 @@ BAD = [
         "acceleration returns an array of shape (1,)", "an acceleration, a sliding variable",
     ),
     (changed("return 0.5 * wanted, s", "0.5 * wanted, s"), {}, "acceleration returns nothing", "a sliding variable"),
+    (  # it flew as 0 and 1, and margins ended in a traceback
+        changed("return 0.5 * wanted, s", "return 0.5 * wanted, s > 0.0"), {},
+        "acceleration returns a sliding variable [", "must return finite numbers, real ones",
+    ),
+    (  # it was MineOnErrorOfChain
+        changed("return 0.5 * wanted", "return self.width_ * wanted"), {},
+        "acceleration fails: AttributeError: 'Mine' object has no attribute 'width_'", "line 19 of mine.py",
+    ),
     (changed("def acceleration", "def accelerate"), {}, "the class Mine has no method", "acceleration or step"),
     (changed("return 0.5 * wanted, s", "return 1 / 0 * wanted, s"), {}, "acceleration fails", "line 19 of mine.py"),
     (changed("return 0.5 * wanted", "exit(0)"), {}, "acceleration fails: SystemExit", "line 19 of mine.py"),
