@@ -190,7 +190,7 @@ def trials(
     except ValueError as error:
         raise ValueError(f"own is {getattr(own, '__name__', type(own).__name__)}: {error}") from None
     if isinstance(count, pl.DataFrame):
-        plan = plans.checked(count, ready.parts, own=[*names, *ready.dispersion.own_names()])
+        plan = plans.checked(count, ready.parts, own=names, drawn=ready.dispersion.own_names())
         drawn, count = replace(campaign.of_plan(ready, seed, plan, own), software=software), plan.count
     if np.ndim(count) or np.asarray(count).dtype == object:
         raise ValueError(f"count is a {type(count).__name__}, but must be a whole number, or a plan as a polars table")

@@ -138,7 +138,7 @@ def of_plan(ready: Study, seed: int, plan: Plan, own: OwnMetrics | None = None, 
         own: metrics of one's own.
         where: what errors call the plan.
 
-    Raises RefusedError where initial angles that the plan says do not follow from the rest.
+    Raises RefusedError where initial angles, or numbers of draws of one's own, are not those that follow or are drawn.
     """
     kinds = {*ready.dispersion.kinds, RATE_BIAS}
     same = []  # quantities that the plan gives as they would be without it
@@ -156,9 +156,11 @@ def of_plan(ready: Study, seed: int, plan: Plan, own: OwnMetrics | None = None, 
         if np.array_equal(np.broadcast_to(usual, values.shape), values):
             same.append(name)
     campaign = Campaign(ready, seed, own, plan.without(same))
-    if plan.angle is not None:
+    if plan.angle is not None or plan.own:
         rows = drawn if drawn is not None and not campaign.plan_given else campaign.draw(range(plan.count))
-        plans.check_angle(plan.angle, rows[plans.ANGLE].to_numpy(), where)
+        plans.check_drawn(plan.own, rows, where)
+        if plan.angle is not None:
+            plans.check_angle(plan.angle, rows[plans.ANGLE].to_numpy(), where)
     return campaign
 
 

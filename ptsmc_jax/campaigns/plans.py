@@ -8,7 +8,7 @@ What is neither given nor drawn is nominal. Results (status, metrics) may stand 
 import hashlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import jax
@@ -43,6 +43,7 @@ class Plan:
     seed: np.ndarray | None
     angle: np.ndarray | None  # (rows,) initial angle that the table says
     count: int  # rows
+    own: dict[str, np.ndarray] = field(default_factory=dict)  # (rows,) numbers of draws of one's own that it says
 
     @property
     def digest(self) -> str:
@@ -105,7 +106,9 @@ def read(path: Path) -> pl.DataFrame:
         raise RefusedError(f"--plan is {path}, which cannot be read: {first_line}") from None
 
 
-def checked(table: pl.DataFrame, parts: Parts, where: str = "the plan", own: Iterable[str] = ()) -> Plan:
+def checked(
+    table: pl.DataFrame, parts: Parts, where: str = "the plan", own: Iterable[str] = (), drawn: Iterable[str] = ()
+) -> Plan:
     """The plan that a table says.
 
     Args:
@@ -113,6 +116,7 @@ def checked(table: pl.DataFrame, parts: Parts, where: str = "the plan", own: Ite
         parts: the nominal ones, that say which quantities there are.
         where: what errors call the plan.
         own: names of metrics of one's own, which may stand beside.
+        drawn: names of the numbers that draws of one's own say, see `check_drawn`.
 
     Raises RefusedError, in one sentence with column and row (counted from 0, as trials are), where a column is not
     known or comes without the others of its vector, a cell is empty or no finite number, or a value is none that can be
@@ -126,7 +130,7 @@ def checked(table: pl.DataFrame, parts: Parts, where: str = "the plan", own: Ite
     quantity_of = {column: name for name, columns in columns_of.items() for column in columns}
     whose = [*OF_ROWS, *OF_ROWS.values()]
     for column in table.columns:
-        if column not in (*quantity_of, *whose, ANGLE, *RESULTS, *SAMPLES, *own):
+        if column not in (*quantity_of, *whose, ANGLE, *RESULTS, *SAMPLES, *own, *drawn):
             close = parsing.nearest(column, (*quantity_of, *OF_ROWS))
             raise RefusedError(f"{where} has the column {column}, with which no trial of this scenario flies; {close}")
     given = {}
@@ -150,7 +154,8 @@ def checked(table: pl.DataFrame, parts: Parts, where: str = "the plan", own: Ite
     if whose_draws[TRIAL] is not None and np.array_equal(whose_draws[TRIAL], np.arange(table.height)):
         whose_draws[TRIAL] = None  # their own numbers
     angle = _numbers(table, ANGLE, where) if ANGLE in table.columns else None
-    return Plan(given, whose_draws[TRIAL], whose_draws[SEED], angle, table.height)
+    said = {name: _cells(table[name]) for name in drawn if name in table.columns}
+    return Plan(given, whose_draws[TRIAL], whose_draws[SEED], angle, table.height, said)
 
 
 def check_angle(said: np.ndarray, flown: np.ndarray, where: str) -> None:
@@ -162,6 +167,23 @@ def check_angle(said: np.ndarray, flown: np.ndarray, where: str) -> None:
             f"{where} has {ANGLE} {said[k]:g} in row {k}, but must have {flown[k]:.9g} there, which follows from "
             "the rest, or no such column"
         )
+
+
+def check_drawn(said: dict[str, np.ndarray], rows: pl.DataFrame, where: str) -> None:
+    """Raise RefusedError where numbers of draws of one's own, (rows,) by name, are not those that are drawn.
+
+    A plan cannot give them: only `Draw.at` knows what follows from them.
+    """
+    for name, values in said.items():
+        flown = _cells(rows[name])
+        near = 1e-5 * np.max(np.abs(flown), initial=0.0, where=np.isfinite(flown))
+        same = (np.abs(flown - values) <= near) | (np.isnan(flown) & np.isnan(values))
+        if not same.all():
+            k = int(np.argmin(same))
+            raise RefusedError(
+                f"{where} has {name} {values[k]:g} in row {k}, but must have {flown[k]:.9g} there, which is drawn "
+                "for its trial and seed, or no such column: what a draw of one's own draws, no plan gives"
+            )
 
 
 def _all(columns: list[str]) -> str:
@@ -182,13 +204,16 @@ def _refuse(bad: np.ndarray, table: pl.DataFrame, column: str, where: str, allow
 
 def _numbers(table: pl.DataFrame, column: str, where: str) -> np.ndarray:
     """A column of finite numbers."""
-    values = table[column]
-    if values.dtype.is_numeric() or values.dtype == pl.String:
-        numbers = values.cast(pl.Float64, strict=False).to_numpy().astype(float)  # what is none, or empty, is NaN
-    else:
-        numbers = np.full(values.len(), np.nan)
+    numbers = _cells(table[column])
     _refuse(~np.isfinite(numbers), table, column, where, "a finite number")
     return numbers
+
+
+def _cells(values: pl.Series) -> np.ndarray:
+    """The numbers of a column; what is none, or empty, is NaN."""
+    if values.dtype.is_numeric() or values.dtype == pl.String:
+        return values.cast(pl.Float64, strict=False).to_numpy().astype(float)
+    return np.full(values.len(), np.nan)
 
 
 def _whole_numbers(table: pl.DataFrame, column: str, where: str) -> np.ndarray:

@@ -120,6 +120,23 @@ def test_a_written_plan_with_a_draw_of_ones_own_is_flown_as_written():
     assert set(other.plan.given) == {"initial_state"}
 
 
+def test_numbers_of_a_draw_of_ones_own_are_what_is_drawn_or_refused():
+    """A plan that gave others was flown as if it had not."""
+    known = scenario.from_tables({"plant": {"kind": "chain"}, "loop": {"mode": "sampled"}})
+    ready = scenario.study(ptsmc.replace(known, dispersion={"own": {"kind": "own", "code": Farther}}))
+    written = campaign.Campaign(ready, SEED).draw(range(5))
+
+    def again(table):
+        return campaign.of_plan(ready, SEED, plans.checked(table, ready.parts, drawn=ready.dispersion.own_names()))
+
+    assert_frame_equal(again(written).draw(range(5)), written, check_exact=True)
+    worst = written[[3, 1]]
+    assert again(worst).draw(range(2))["own_1"].to_list() == worst["own_1"].to_list()
+    for table in (written.with_columns(own_1=pl.lit(3.0)), worst.drop("trial", "initial_angle")):
+        with pytest.raises(RefusedError, match=r"^the plan has own_1 \S+ in row 0, but must have \S+ there, which is"):
+            again(table)
+
+
 @pytest.fixture(scope="module")
 def corners(everything):
     """A table that gives everything otherwise than it is drawn, and its rows."""

@@ -258,6 +258,8 @@ DRAWS = [
     ("0.01 * c[1]", "1 / 0 * c[1]", "at fails: ZeroDivisionError"),
     ('{"drift": 1.0', '{" ": 1.0', "returns a number ' ' at t = 0, but must return names that can be printed"),
     ('{"drift": 1.0', '{"status": 1.0', "names that no column of the rows has"),
+    ('{"drift": 1.0', '{"plan_trial": 1.0', "names that no column of the rows has"),  # took that column's place
+    ('{"drift": 1.0 + self.std * c[0]}', '{"drift": c[0] > 0.0}', "a number drift True"),  # a summary had no rank of it
     ('{"drift": 1.0 + self.std * c[0]}', "[c[0]]", "must return a dict of numbers by name"),
     ('{"drift": 1.0 + self.std * c[0]}', '{"drift": 1 / 0}', "values fails: ZeroDivisionError"),
     ("count = 2", "count = 0", "count is 0, but must be a whole number of at least 1"),

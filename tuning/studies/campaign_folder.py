@@ -177,8 +177,8 @@ class Folder:
         assert self.table is not None
         assert self.ready is not None
         where = f"the plan {self.plan}"
-        own = *self.own_names, *self.ready.dispersion.own_names()
-        plan = plans.checked(self.table, self.ready.parts, where, own)
+        drawn = self.ready.dispersion.own_names()
+        plan = plans.checked(self.table, self.ready.parts, where, self.own_names, drawn)
         if self.made is not None and plan.digest != self.digests.get(PLAN):
             raise RefusedError(f"{self.path / TABLE} is not the plan that the campaign was begun with")
         return plan
