@@ -32,6 +32,7 @@ class Key(NamedTuple):
 
 
 def _word(value: WholeNumber) -> Array:
+    check_fits("a seed, trial or sample", value)
     if isinstance(value, int):
         return jnp.asarray(np.uint32(value & 0xFFFFFFFF), dtype=jnp.uint32)
     number = jnp.asarray(value)
@@ -54,6 +55,12 @@ def check_whole_number(name: str, value: object, least: int = 0) -> None:
     number = np.asarray(value)
     if number.ndim or not np.issubdtype(number.dtype, np.integer) or not least <= number < 2**32:
         raise ValueError(f"{name} is {value!r}, but must be a whole number from {least} to {2**32 - 1}")
+
+
+def check_fits(name: str, value: object) -> None:
+    """Raise ValueError where a known whole number has more than 32 bits: its stream would be that of another one."""
+    if isinstance(value, int | np.integer) and not -(2**31) <= value < 2**32:
+        raise ValueError(f"{name} is {value}, but must be a whole number below 2^32 = {2**32}")
 
 
 @jax.jit

@@ -85,6 +85,8 @@ def _check_loop(scenario: Scenario) -> None:
     if not controller.prescribed:
         scenario.need_samples(f"controller.kind = {errors.show(controller.kind)}")
     controller.check(scenario)
+    if scenario.sampled and t_f <= loop.period:  # whatever delta is, which has at least a period
+        raise wrong("controller.t_f", t_f, f"greater than one control period, loop.period = {loop.period}")
     if delta >= t_f:
         raise wrong("controller.delta", delta, f"less than controller.t_f, {t_f}")
     if scenario.end < t_f:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from ptsmc_jax import programs
 from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.numerics import guards
-from ptsmc_jax.numerics.draws import WholeNumber
+from ptsmc_jax.numerics.draws import WholeNumber, check_fits
 from ptsmc_jax.numerics.pytrees import Scalar
 from ptsmc_jax.simulation import continuous, sampled
 from ptsmc_jax.simulation.assembly import Parts, check_parts
@@ -109,11 +109,14 @@ def _gap(ticks: Ticks, t_end: Scalar) -> Scalar:
 
 
 class _Flights(programs.Program):
-    """`simulate` compiled: what is no parts is refused before JAX says that it is no array."""
+    """`simulate` compiled: what is no parts, seed or trial is refused before JAX is given arrays made of it."""
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """Call it as `simulate` is called."""
-        check_parts(args[0] if args else kwargs.get("parts"))
+        given = dict(zip(("parts", "seed", "trial"), args, strict=False)) | kwargs
+        check_parts(given.get("parts"))
+        for name in ("seed", "trial"):
+            check_fits(name, given.get(name))
         return super().__call__(*args, **kwargs)
 
 

@@ -28,6 +28,11 @@ BAD = [
     ("controller.delta = 30.0", "controller.delta is 30.0", "less than controller.t_f, 30.0"),
     ("controller.delta = 31", "controller.delta is 31", "less than controller.t_f, 30.0"),
     ("controller.t_f = 0.05", "controller.delta is 0.05", "less than controller.t_f, 0.05"),
+    (  # it was told as a delta that nobody had written
+        'controller.t_f = 0.03\nloop.mode = "sampled"',
+        "controller.t_f is 0.03",
+        "greater than one control period, loop.period = 0.05",
+    ),
     ("controller.t_f = 0", "controller.t_f is 0", "greater than 0"),
     ("controller.k1 = 0.0", "controller.k1 is 0.0", "greater than 0"),
     ("controller.k1 = 1e7", "controller.k1 is 10000000.0", "lower: the continuous loop would need"),

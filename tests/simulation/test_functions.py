@@ -115,6 +115,15 @@ REFUSED = {
         lambda: ptsmc.simulate_jit(jax.tree.map(lambda leaf: leaf.astype(jnp.float32), RUN)),
         "the parts have numbers of 32 bits, but JAX computes with 64 now: make them anew, by study",
     ),
+    "a trial of 40 bits": (  # it was trial 0
+        lambda: ptsmc.simulate_jit(RUN, 0, trial=2**40),
+        "trial is 1099511627776, but must be a whole number below 2.32 = 4294967296",
+    ),
+    "a seed of 70 bits, by position": (lambda: ptsmc.simulate_jit(RUN, 2**70), "seed is 11805916207.* below 2.32"),
+    "a draw of a trial of 33 bits": (
+        lambda: draws.stream(0, np.int64(2**32), "rate"),
+        "a seed, trial or sample is 4294967296, but must be a whole number below 2.32",
+    ),
     "a scenario for parts": (lambda: ptsmc.simulate_jit(FLIGHT), "parts are needed, such as study"),
     "a scenario's gains": (lambda: API.gains_of(FLIGHT), "parts are needed, such as study"),
     "gains in a scenario": (lambda: API.with_gains(FLIGHT, {"eta": 3.0}), "parts are needed, such as study"),
