@@ -628,3 +628,18 @@ def test_a_long_run_says_how_many_steps_it_takes_before_it_is_flown(command, mon
     monkeypatch.setattr("tuning.cli.main.LONG", steps - 1)
     assert command(*run)[1].startswith(f"flying {steps} integration steps, with their history\n")
     assert command(*run, "--quiet")[1] == ""
+
+
+def test_a_backend_that_matplotlib_does_not_know_is_none_of_a_campaigns_business():
+    """All rows were flown, and then came a traceback instead of a summary."""
+    code = """
+from tuning.cli import main
+main.main = lambda: __import__("matplotlib") and print("whole")
+from tuning.cli import command
+command()
+"""
+    bogus = {**os.environ, "MPLBACKEND": "bogus"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, env=bogus, check=False
+    )
+    assert (done.returncode, done.stdout) == (0, "whole\n"), done.stderr

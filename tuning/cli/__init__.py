@@ -2,6 +2,7 @@
 
 import atexit
 import gc
+import os
 import sys
 
 
@@ -11,6 +12,7 @@ def command() -> None:
     # through all of them at the end, took a fifth of a second
     gc.set_threshold(1_000_000)
     atexit.register(gc.freeze)
+    os.environ["MPLBACKEND"] = "agg"  # figures are files: of a name that it does not know Matplotlib makes a traceback
     try:
         from tuning.cli.main import main
     except KeyboardInterrupt:
