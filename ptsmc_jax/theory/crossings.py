@@ -17,6 +17,7 @@ AROUND = np.array([-3.0, -1.0, -0.3, 0.3, 1.0, 3.0])  # of a pole, in times its 
 NEAREST = 3  # crossings of a kind that are closed in on
 SPLIT = (2 * NEAREST, 3 * NEAREST)  # of the places looked for: L real, |L| = 1, L nearest to -1
 REAL = 1e-2  # share of the real part below which the imaginary one counts as none, at the ends of the grid
+EVEN = 1e-6  # share by which sizes of L may differ that are the same: of points of the grid that fall on each other
 MOST = 100.0  # dB: no limit of the gain; of the sensitivity, that of an unstable loop
 
 
@@ -127,7 +128,7 @@ class Brackets(NamedTuple):
 
     low: Array  # [rad/s]
     high: Array  # [rad/s]
-    at_low: Array  # what is zero in between: Im L, ln |L|, the slope of |1 + L|^2 by w
+    at_low: Array  # what is zero in between: `sine`, ln |L|, the slope of |1 + L|^2 by w
     at_high: Array
     there: Array  # bool
     elsewhere: Array  # frequencies to look at besides [rad/s]: where L is nearest to -1, and both ends
@@ -135,7 +136,7 @@ class Brackets(NamedTuple):
 
 def brackets(w: Array, seen: Array) -> Brackets:
     """The `Brackets` of an L [-] at frequencies w [rad/s], (points,) each."""
-    imag, size, near = seen.imag, jnp.log(jnp.abs(seen)), jnp.abs(1.0 + seen) ** 2
+    turned, size, near = sine(seen), jnp.log(jnp.abs(seen)), jnp.abs(1.0 + seen) ** 2
     real, factor = real_at(seen)
     # one that lies a little to the other side may turn out to lie on this one
     more, less = (jnp.where(real & (side * factor > -0.1), side * factor, jnp.inf) for side in (1.0, -1.0))
@@ -148,7 +149,7 @@ def brackets(w: Array, seen: Array) -> Brackets:
     slope = (near[1:] - near[:-1]) / jnp.where(w[1:] == w[:-1], 1.0, w[1:] - w[:-1]) / 2
 
     def crossed(at: Array) -> Array:
-        return jnp.append(imag[at][: SPLIT[0]], size[at][SPLIT[0] :])
+        return jnp.append(turned[at][: SPLIT[0]], size[at][SPLIT[0] :])
 
     return Brackets(
         low=jnp.append(w[j], w[k - 1]),
@@ -158,6 +159,11 @@ def brackets(w: Array, seen: Array) -> Brackets:
         there=jnp.isfinite(jnp.concatenate(values)),
         elsewhere=w[jnp.stack([jnp.argmin(near), 0, -1])],
     )
+
+
+def sine(L: Array) -> Array:
+    """Of the phase of L [-]: zero where L is real, as Im L is, but no larger next to a pole."""
+    return L.imag / jnp.maximum(jnp.abs(L), 1e-300)
 
 
 def smallest(values: Array, count: int = NEAREST) -> tuple[Array, Array]:
@@ -174,14 +180,23 @@ def smallest(values: Array, count: int = NEAREST) -> tuple[Array, Array]:
 def real_at(seen: Array) -> tuple[Array, Array]:
     """Between which points L [-] is real and negative, bool, and ln of the gain with which it is -1 there.
 
-    What no gain below `MOST` brings to -1 counts for nothing: so large an L is rounding, next to poles at 1.
+    What no gain below `MOST` brings to -1 counts for nothing: so large an L is rounding, next to poles at 1. Nor does a
+    way through infinity, past a pole on the unit circle.
     """
     real, imag = seen.real, seen.imag
     share = imag[:-1] / jnp.where(imag[:-1] == imag[1:], 1.0, imag[:-1] - imag[1:])
     crossing = real[:-1] + share * (real[1:] - real[:-1])
     limit = 10.0 ** (MOST / 20.0)
-    there = (imag[:-1] * imag[1:] < 0.0) & (crossing < -1.0 / limit) & (crossing > -limit)
+    there = (imag[:-1] * imag[1:] < 0.0) & (crossing < -1.0 / limit) & (crossing > -limit) & ~_through_infinity(seen)
     return there, -jnp.log(jnp.where(there, -crossing, 1.0))
+
+
+def _through_infinity(seen: Array) -> Array:
+    """Between which points L [-] turns back, (points - 1,) bool, larger and larger on its way there from both sides."""
+    size = jnp.abs(seen)
+    grows, falls = size[1:-1] >= (1.0 - EVEN) * size[:-2], size[1:-1] >= (1.0 - EVEN) * size[2:]
+    back = (seen[1:] * jnp.conj(seen[:-1])).real < 0.0
+    return back & jnp.append(True, grows) & jnp.append(falls, True)
 
 
 def even_at(seen: Array) -> tuple[Array, Array]:

@@ -151,7 +151,8 @@ def _closed_in(spectrum: _Spectrum, brackets: Brackets) -> Array:
         c = b - f_b * (b - a) / jnp.where(f_b == f_a, 1.0, f_b - f_a)
         c = jnp.clip(c, jnp.minimum(a, b), jnp.maximum(a, b))
         L, slope = spectrum.at(c, sloped=False)
-        f_c = jnp.append(_crossed(L), (jnp.conj(1.0 + L) * slope).real[:, SPLIT[1] :], axis=1)
+        crossed = crossings.sine(L[:, : SPLIT[0]]), _crossed(L)[:, SPLIT[0] :]
+        f_c = jnp.concatenate([*crossed, (jnp.conj(1.0 + L) * slope).real[:, SPLIT[1] :]], axis=1)
         between = f_c * f_b < 0.0
         moves = jnp.any(brackets.there & (jnp.abs(c - b) > 1e-9 * b))
         return k + 1, (jnp.where(between, b, a), c, jnp.where(between, f_b, f_a / 2), f_c), moves

@@ -489,6 +489,42 @@ def test_rounding_next_to_a_pole_at_one_is_no_crossing():
     assert factor[-1] == pytest.approx(-np.log(2.0), rel=1e-12)
 
 
+def a_loop(a, b, c):
+    """The loop x' = a x + b u, u = c x of one input, seen by no sensor, at a period of 1 s."""
+    n, zero = len(a), jnp.zeros
+    push = jnp.tile(jnp.reshape(jnp.asarray(b, float), (n, 1)), (linear.NODES.size, 1, 1))
+    c = jnp.reshape(jnp.asarray(c, float), (1, n))
+    period = jnp.ones(())
+    return linear.Loop(a, zero((n, 1)), push, 0.0 * push, c, zero((1, 1)), zero((n, 1)), period, delay=0)
+
+
+SWINGS = [
+    (1.5, 0.1, [-0.5, 0.5, 0.3]),
+    (0.9, 0.3, [-0.5, 0.0, 0.4]),
+    (1.3, 0.2, [0.3, 0.0, 0.3]),
+    (1.1, -0.2, [0.4, 0.2, 0.4]),  # of one that is, next to it, 32.25 dB: L is 4 000 where it begins to be looked for
+]
+
+
+@pytest.mark.parametrize(("at", "lag", "feedback"), SWINGS)
+def test_a_pole_on_the_unit_circle_is_no_crossing(at, lag, feedback):
+    """L turns by 180 degrees there through infinity: its sign changes, but no gain brings it to -1."""
+    a = np.zeros((3, 3))
+    a[:2, :2], a[2, 2] = [[np.cos(at), -np.sin(at)], [np.sin(at), np.cos(at)]], lag
+    b, c = np.array([[1.0], [0.0], [1.0]]), np.asarray([feedback])
+    found = of(a_loop(jnp.asarray(a), b, c))
+
+    def radius(dB):
+        return np.abs(np.linalg.eigvals(a + 10.0 ** (dB / 20.0) * b @ c)).max()
+
+    for sign, limit in ((1.0, found.gain_up[0]), (-1.0, found.gain_down[0])):
+        held = np.linspace(0.01, min(limit, 40.0), 200, endpoint=False)
+        assert max(map(radius, sign * held)) < 1.0
+        if np.isfinite(limit):
+            assert radius(sign * 0.9999 * limit) < 1.0 < radius(sign * 1.0001 * limit)
+    assert np.isfinite(found.gain_up[0])
+
+
 def test_momentum_in_wheels_is_no_border_of_stability_while_the_body_turns():
     """No gain changes it: its poles stay at 1, and gains are limited where other poles leave the circle.
 
