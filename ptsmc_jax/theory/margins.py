@@ -125,7 +125,8 @@ def _of(spectrum: _Spectrum, with_delay: bool) -> Margins:
     brackets = jax.vmap(partial(crossings.brackets, spectrum.w))(spectrum.each)
     root = jax.lax.stop_gradient(_closed_in(spectrum, brackets))
     L, slope = spectrum.at(jnp.append(root, brackets.elsewhere, axis=1), sloped=True)
-    values = jax.vmap(_axis, in_axes=(0, 0, 0, 0, None))(root, L, slope, brackets.there, spectrum.stable)
+    in_axes = (0, 0, 0, 0, None, None)
+    values = jax.vmap(_axis, in_axes=in_axes)(root, L, slope, brackets.there, spectrum.stable, spectrum.w[0])
     axes = jnp.arange(root.shape[0])
     delay = jnp.full(axes.size, jnp.nan)
     if with_delay:
@@ -183,16 +184,17 @@ def roughly(loop: Loop) -> dict[str, Array]:
     return {name: jnp.where(spectrum.finite, v, jnp.nan) for name, v in each.items()}
 
 
-def _axis(root: Array, L: Array, slope: Array, there: Array, stable: Array) -> Margins:
+def _axis(root: Array, L: Array, slope: Array, there: Array, stable: Array, lowest: Scalar) -> Margins:
     """Margins of one axis, from its L and slopes by w at the crossings and at what `brackets` looks at besides."""
     crosses = SPLIT[1]
+    ends = L[-2:]  # where a pole comes to 1, and to -1
+    on_ends = crossings.ends_at(ends.at[0].add(-lowest * slope[-2]))  # where w is 0: of a slow loop not yet at `lowest`
     slope = slope[:crosses]
     fall = jnp.append(slope[: SPLIT[0]].imag, (slope / L[:crosses]).real[SPLIT[0] :])
     # one step of Newton's, with slopes that stay: through it the crossing has its derivative
     rate = jax.lax.stop_gradient(slope / jnp.where(fall == 0.0, 1.0, fall))
     real, even = jnp.split(L[:crosses] - rate * _crossed(L), SPLIT[:1])
-    ends = L[-2:]  # where a pole comes to 1, and to -1
-    on = jnp.append(there[: real.size], crossings.ends_at(ends))
+    on = jnp.append(there[: real.size], on_ends)
     real = jnp.append(real.real, ends.real)
     factor = -20.0 * jnp.log10(jnp.where(on & (real < 0.0), -real, 1.0))
     up, down = (jnp.min(jnp.where(side * factor > 0.0, side * factor, MOST)) for side in (1.0, -1.0))

@@ -502,7 +502,7 @@ SWINGS = [
     (1.5, 0.1, [-0.5, 0.5, 0.3]),
     (0.9, 0.3, [-0.5, 0.0, 0.4]),
     (1.3, 0.2, [0.3, 0.0, 0.3]),
-    (1.1, -0.2, [0.4, 0.2, 0.4]),  # of one that is, next to it, 32.25 dB: L is 4 000 where it begins to be looked for
+    (1.1, -0.2, [0.4, 0.2, 0.4]),  # of one that is, next to it, 32.25 dB: L is 24 000 where it begins to be looked for
 ]
 
 
@@ -523,6 +523,13 @@ def test_a_pole_on_the_unit_circle_is_no_crossing(at, lag, feedback):
         if np.isfinite(limit):
             assert radius(sign * 0.9999 * limit) < 1.0 < radius(sign * 1.0001 * limit)
     assert np.isfinite(found.gain_up[0])
+
+
+def test_a_slow_pole_comes_to_one_where_the_loop_is_real_at_rest_only():
+    """x' = (1 + e) x - c x bears a gain of e / c; at the lowest frequency of the grid L is 0.8 deg from real."""
+    e, c = 2.2e-4, 0.033
+    found = of(a_loop(jnp.asarray([[1.0 + e]]), [1.0], [-c]))
+    np.testing.assert_allclose(found.gain_down, 20.0 * np.log10(c / e), rtol=1e-4)
 
 
 def test_momentum_in_wheels_is_no_border_of_stability_while_the_body_turns():
