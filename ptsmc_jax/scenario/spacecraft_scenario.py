@@ -266,7 +266,7 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
             found[key] = found.get(key, 0.0) + rate
         if self.flexible is not None:
             modes, drawn = self.flexible, getattr(self.dispersion, "mode_frequency", None)
-            most = 1.0 if drawn is None else 1.0 + drawn.widest * float(drawn.of()[0])
+            most = 1.0 if drawn is None else 1.0 + drawn.farthest * float(drawn.of()[0])
             inertia = np.asarray(setup.plant.inertia)
             fastest = formulas.free_modes(inertia, modes.frequency, modes.coupling).max()
             found["flexible.frequency"] = most * float(fastest)

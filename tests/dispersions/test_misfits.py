@@ -300,3 +300,15 @@ def test_streams_of_their_own():
     ]
     one, other = (dispersion.coordinates(jnp.uint32(5), jnp.uint32(2))["gyro_scale"] for dispersion in ready)
     np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize(
+    ("drawn", "most"),
+    [({"kind": "relative_uniform", "half_width": 0.4}, 1.4), ({"kind": "relative_normal", "std": 0.1}, 1.3)],
+)
+def test_steps_follow_modes_as_fast_as_they_are_drawn(drawn, most):
+    found = []
+    for dispersion in ({}, {"mode_frequency": drawn}):
+        known = scenario.from_tables({**FLIGHT, "dispersion": dispersion})
+        found.append(known.frequencies(scenario.study(known).parts, 5.0)["flexible.frequency"])
+    assert found[1] / found[0] == pytest.approx(most)

@@ -12,7 +12,9 @@ from ptsmc_jax import scenario
 from ptsmc_jax.devices import attitude_filter
 from ptsmc_jax.scenario import free_gains, from_tables, study, timing
 from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.scenario.gain_record import Choice
 from ptsmc_jax.scenario.law_tables import LAWS
+from ptsmc_jax.scenario.observer_tables import OBSERVERS
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.theory import borders
 from tests.helpers import FIRST_FLIGHT, SHORT, finer, short, ticks_of, vector
@@ -324,3 +326,35 @@ def test_a_laws_table_has_bounds_for_what_its_physics_lets_tuning_move(plant, ki
     assert set(table.gains) == set(table().physics(plant).tunable)
     assert {*table.free_by_default, *table.free_if_sampled} <= set(table.gains)
     assert set(table.gains) <= set(gains.units(plant))
+
+
+PLANTS = {
+    "spacecraft": {"loop": {"mode": "sampled"}},
+    "chain": {"plant": {"kind": "chain"}, "loop": {"mode": "sampled"}},
+}
+
+
+@pytest.mark.parametrize(
+    ("plant", "table", "kind"),
+    [
+        (plant, table, kind)
+        for plant in PLANTS
+        for table, kinds in (("controller", LAWS), ("observer", OBSERVERS))
+        for kind in kinds[plant]
+        if kind != "own" and kinds[plant][kind].gains
+    ],
+)
+def test_usual_bounds_of_every_gain_are_allowed_and_hold_the_own_one(plant, table, kind):
+    """Alone and with all others, since what is allowed of one may hang on whether another is free."""
+    tables = {**PLANTS[plant], table: {"kind": kind}}
+    law = from_tables(tables)
+    names = list(getattr(law, table).gains)
+    for free in (*([name] for name in names), names):
+        loaded = from_tables({**tables, "tune": {"free": free}})
+        choice = Choice(loaded, loaded.search.gains, loaded.search.bounds)
+        for name in free:
+            (low, high), (least, most, closed) = loaded.search.bounds[name], loaded.gains[name].allowed(choice)
+            assert least <= low if closed else least < low, name
+            assert low < high < most, name
+            own = free_gains._own(loaded, name)
+            assert all(low <= value <= high for value in own), name
