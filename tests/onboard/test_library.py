@@ -127,6 +127,23 @@ def test_bad_input_gets_a_status_the_last_good_output_and_is_forgotten(filtered,
 
 
 @needs_compiler
+@pytest.mark.parametrize("name", ["raw", "star tracker out of step"])
+def test_a_measured_attitude_may_come_with_either_sign(name, exported):
+    """Of the quaternion, from the first sample on: the command is the same to the last digit."""
+    made, library = exported(name)
+    samples = given(made)
+    turned, columns = samples.copy(), [k for k, column in enumerate(library.columns["in"]) if "attitude[" in column]
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], size=len(samples))
+    signs[0] = -1.0
+    turned[:, columns] *= signs[:, None]
+    (statuses, outputs), (again, others) = flown(library, samples), flown(library, turned)
+    assert not statuses.any()
+    assert not again.any()
+    np.testing.assert_array_equal(others, outputs)
+    assert np.ptp(outputs, axis=0).max() > 0.0
+
+
+@needs_compiler
 def test_a_star_tracker_without_an_attitude_is_not_missed(filtered):
     library, samples = filtered
     statuses, outputs = flown(library, changed(library, samples, 10, attitude_valid=0.0, attitude=np.nan))
