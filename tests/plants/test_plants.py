@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from ptsmc_jax import formulas
 from ptsmc_jax.numerics import integrators
-from ptsmc_jax.plants import rigid_body
+from ptsmc_jax.plants import integrator_chain, rigid_body, second_order
 from tests.helpers import FULL_INERTIA, PAPER_INERTIA, vector
 
 EPS = np.finfo(float).eps
@@ -223,3 +223,36 @@ def test_a_control_period_of_twenty_hertz_needs_one_step(rate):
     assert abs(np.linalg.norm(long.q) - 1) < 1.5 * norm
     now = Rotation.from_quat(np.asarray(long.q)).apply(inertia @ np.asarray(long.w))
     assert np.linalg.norm(now - inertia @ w0) / np.linalg.norm(inertia @ w0) < 1.5 * momentum
+
+
+# of any plant
+
+
+ARM = second_order.system(
+    2,
+    F=lambda t, a, b: b + jnp.sin(t),
+    H=lambda t, a, b: -b * jnp.abs(b) + a[::-1],
+    G=lambda t, a, b: jnp.stack([jnp.stack([2.0 + jnp.cos(a[1]), a[0]]), jnp.stack([0.3 * a[0], 1.5 + b[0] ** 2])]),
+    D=lambda t, a, b: jnp.eye(2) + 0.2 * jnp.outer(a, a),
+)
+PLANTS = {
+    "body": (
+        rigid_body.spacecraft(FULL_INERTIA),
+        rigid_body.AttitudeState(vector([0.5, -0.5, 0.1, 0.7]), vector([0.2, -0.1, 0.3])),
+    ),
+    "chain": (
+        integrator_chain.chain(3, lambda x: -x[0] * x[1], lambda x: 2.0 + jnp.cos(x[2])), vector([0.4, -1.2, 0.7]),
+    ),
+    "system": (ARM, vector([0.4, -0.3, 0.9, 0.2])),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_input_for_an_acceleration_gives_it_and_what_is_unexplained_is_the_disturbance(name):
+    plant, x = PLANTS[name]
+    t, (w_dot, d) = vector(0.6), np.random.default_rng(5).normal(size=(2, plant.inputs))
+    u = plant.input_for(t, x, vector(w_dot), vector(d))
+    x_dot = plant.rate(t, x, u, vector(d))
+    unit = 100 * EPS * np.linalg.norm(plant.inertia)  # some ten sums of numbers of the order of it
+    np.testing.assert_allclose(plant.velocity(x_dot), w_dot, rtol=0, atol=unit)
+    np.testing.assert_allclose(plant.unexplained(t, x, x_dot, u), d, rtol=0, atol=unit)
