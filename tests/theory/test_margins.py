@@ -281,6 +281,18 @@ def test_the_flown_loop_loses_stability_where_the_margins_say(kind):
     assert checked >= 4
 
 
+@pytest.mark.parametrize("delay", [0, 1, 2, 3])
+def test_any_loop_closes_to_the_same_wherever_it_is_opened(delay):
+    """Whatever its matrices and however many commands are on their way."""
+    rng, (n, k, m) = np.random.default_rng(delay), (5, 3, 2)
+    shapes = (n, n), (n, k), (m, n), (m, k), (1, n, m)
+    a, seen, command, direct, push = (jnp.asarray(rng.normal(size=shape)) for shape in shapes)
+    loop = linear.Loop(a, seen, push, 0.0 * push, command, direct, jnp.zeros((n, m)), jnp.ones(()), delay)
+    elsewhere, here = linear.at_sensors(loop).closed(), linear.at_input(loop).closed()
+    assert here.shape == (n + delay * m,) * 2
+    np.testing.assert_allclose(elsewhere, here, rtol=0.0, atol=1e-14 * np.abs(here).max())
+
+
 @pytest.mark.parametrize("delay", short([0, 1], [1]))
 def test_one_input_is_all_of_them_at_once_and_the_closed_loop_is_the_same_wherever_it_is_opened(delay):
     """Of three integrators, which less gain makes unstable too; by poles, where one may be 1e-6 outside of the circle.
