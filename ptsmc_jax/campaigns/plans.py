@@ -16,7 +16,7 @@ import numpy as np
 import polars as pl
 
 from ptsmc_jax.campaigns.store import RefusedError
-from ptsmc_jax.dispersions.planned import Row
+from ptsmc_jax.dispersions.planned import OF_ROWS, SEED, TRIAL, Row
 from ptsmc_jax.dispersions.quantities import QUANTITIES, UnfitError
 from ptsmc_jax.scenario import parsing
 from ptsmc_jax.simulation import computer
@@ -24,8 +24,6 @@ from ptsmc_jax.simulation.metrics import Metrics
 from ptsmc_jax.simulation.rollout import Parts
 
 ALLOWED = "a .csv or .parquet file with a row for each trial, or a folder of such .parquet files"
-TRIAL, SEED = "trial", "seed"
-OF_ROWS = {TRIAL: "plan_trial", SEED: "plan_seed"}  # what rows call them, where `trial` is the row's own number
 ANGLE = "initial_angle"  # follows from others
 HEADING = ("status", "reason", "bad_time")  # of a row
 RESULTS = {*HEADING, *Metrics._fields}
@@ -161,12 +159,7 @@ def checked(
 def check_angle(said: np.ndarray, flown: np.ndarray, where: str) -> None:
     """Raise RefusedError where the initial angles (rows,) that a plan says are not those that follow from the rest."""
     off = np.abs(flown - said) > 1e-5 * np.maximum(1.0, np.abs(said))
-    if off.any():
-        k = int(np.argmax(off))
-        raise RefusedError(
-            f"{where} has {ANGLE} {said[k]:g} in row {k}, but must have {flown[k]:.9g} there, which follows from "
-            "the rest, or no such column"
-        )
+    _refuse_said(off, ANGLE, said, flown, where, "follows from the rest, or no such column")
 
 
 def check_drawn(said: dict[str, np.ndarray], rows: pl.DataFrame, where: str) -> None:
@@ -178,12 +171,17 @@ def check_drawn(said: dict[str, np.ndarray], rows: pl.DataFrame, where: str) -> 
         flown = _cells(rows[name])
         near = 1e-5 * np.max(np.abs(flown), initial=0.0, where=np.isfinite(flown))
         same = (np.abs(flown - values) <= near) | (np.isnan(flown) & np.isnan(values))
-        if not same.all():
-            k = int(np.argmin(same))
-            raise RefusedError(
-                f"{where} has {name} {values[k]:g} in row {k}, but must have {flown[k]:.9g} there, which is drawn "
-                "for its trial and seed, or no such column: what a draw of one's own draws, no plan gives"
-            )
+        _refuse_said(~same, name, values, flown, where, "is drawn for its trial and seed, or no such column: what a "
+                     "draw of one's own draws, no plan gives")  # fmt: skip
+
+
+def _refuse_said(off: np.ndarray, column: str, said: np.ndarray, flown: np.ndarray, where: str, why: str) -> None:
+    """Raise RefusedError for the first row in which a column says another number than is flown."""
+    if off.any():
+        k = int(np.argmax(off))
+        raise RefusedError(
+            f"{where} has {column} {said[k]:g} in row {k}, but must have {flown[k]:.9g} there, which {why}"
+        )
 
 
 def _all(columns: list[str]) -> str:

@@ -7,6 +7,9 @@ from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.numerics.draws import WholeNumber
 from ptsmc_jax.simulation.rollout import Parts
 
+TRIAL, SEED = "trial", "seed"  # columns that say whose draws a row of a plan has
+OF_ROWS = {TRIAL: "plan_trial", SEED: "plan_seed"}  # what rows call them, where `trial` is the row's own number
+
 
 class Row(NamedTuple):
     """What a plan says of a trial; of many, with a leading axis over them."""

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ptsmc_jax.dispersions.planned import OF_ROWS
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.laws.acceleration import AccelerationLaw
 from ptsmc_jax.laws.base import Sample
@@ -162,8 +163,7 @@ def _sensors(parts: Parts, ask: _Asked) -> None:
 
 def _draw(parts: Parts, dispersion: Dispersion, ask: _Asked) -> None:
     own: Any = dispersion.own
-    taken = {"trial", "status", "reason", "bad_time", *Metrics._fields, *dispersion.values(parts)}
-    taken |= {"seed", "plan_trial", "plan_seed"}  # by which a plan says whose draws a row has
+    taken = {"status", "reason", "bad_time", *OF_ROWS, *OF_ROWS.values(), *Metrics._fields, *dispersion.values(parts)}
     c = jnp.full(own.count, 0.5)
     drawn = ask("at", own.at, c, parts)
     was, now = (jax.tree.map(lambda v: _kind(jnp.asarray(v)), one) for one in (parts, drawn))

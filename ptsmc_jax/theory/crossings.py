@@ -163,7 +163,8 @@ def brackets(w: Array, seen: Array) -> Brackets:
 
 def sine(L: Array) -> Array:
     """Of the phase of L [-]: zero where L is real, as Im L is, but no larger next to a pole."""
-    return L.imag / jnp.maximum(jnp.abs(L), 1e-300)
+    size = jnp.abs(L)
+    return L.imag / jnp.where(size > 0.0, size, 1.0)
 
 
 def smallest(values: Array, count: int = NEAREST) -> tuple[Array, Array]:

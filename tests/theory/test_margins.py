@@ -537,6 +537,12 @@ def test_a_pole_on_the_unit_circle_is_no_crossing(at, lag, feedback):
     assert np.isfinite(found.gain_up[0])
 
 
+def test_the_phase_of_an_open_loop_is_a_number_in_single_precision():
+    """Its L is zero, and what kept 0 / 0 away there was itself zero in 32 bits."""
+    with jax.enable_x64(False):
+        np.testing.assert_array_equal(crossings.sine(jnp.asarray([0.0, 2j, -3.0], jnp.complex64)), [0.0, 1.0, 0.0])
+
+
 def test_a_slow_pole_comes_to_one_where_the_loop_is_real_at_rest_only():
     """x' = (1 + e) x - c x bears a gain of e / c; at the lowest frequency of the grid L is 0.8 deg from real."""
     e, c = 2.2e-4, 0.033

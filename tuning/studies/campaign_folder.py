@@ -66,7 +66,7 @@ class Folder:
     plan: str | None = None  # of the trials, what its file is called
     table: pl.DataFrame | None = None  # of that plan
     controller: Path | None = None  # folder of the C that decides; None: the parts' own code does
-    first_look: int | None = None  # trials after which it is first asked whether they are enough; None: never
+    first_look: int | None = None  # trials after which `--until-confident` first looks; None: a part
 
     @cached_property
     def programs(self) -> dict[str, str]:

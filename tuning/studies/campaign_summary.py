@@ -28,8 +28,8 @@ SHOWN = 0.9973  # share of the runs that a pointing budget holds for: three sigm
 SEARCHED = 100_000  # trials by which it is judged what drives a metric
 
 
-def first_look(folder: Folder, force: bool) -> int:
-    """How many trials are looked at first: a part, or all that a finished campaign has that goes on.
+def first_look(folder: Folder, force: bool) -> int | None:
+    """How many trials are looked at first: all that a finished campaign has that goes on; None: a part.
 
     One that was interrupted has the same first look when it goes on, and so stops where it would have stopped anyway.
     """
@@ -38,9 +38,9 @@ def first_look(folder: Folder, force: bool) -> int:
     except RefusedError:  # there is none
         before = None
     if before is None:
-        return flying.PART
+        return None
     finished = before.trials < folder.trials and _there(before) >= before.trials
-    return before.trials if finished else before.first_look or flying.PART
+    return before.trials if finished else before.first_look
 
 
 def until_confident(folder: Folder, width: float, fly_first: Callable[[int], None]) -> int:
