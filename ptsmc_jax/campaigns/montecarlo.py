@@ -179,9 +179,8 @@ def run(
     check_whole_number("block", 1 if block is None else block, 1)
     trials = trials if isinstance(trials, Row) else _numbers(trials)
     number = np.asarray(trials.trial if isinstance(trials, Row) else trials)
-    count, devices = number.shape[0], len(configure.devices())
-    block = -(-FEW // devices) if count < FEW else block_size() if block is None else block
-    rows = max(1, CAPACITY // (devices * block)) if count >= FEW else 1
+    count = number.shape[0]
+    devices, rows, block = _slots(count, block)
     size = devices * rows * block
     kernel = by_kernel() if kernel is None else kernel
     calls = []
@@ -225,11 +224,20 @@ def gathered(results: np.ndarray, share: int) -> np.ndarray:
     return own.reshape(-1, *own.shape[2:])
 
 
-def prepare(parts: Parts, dispersion: Dispersion) -> None:
-    """Begin to compile what flies many trials of such parts, beside what is being done."""
-    devices, block = len(configure.devices()), block_size()
-    numbers = np.zeros((devices, max(1, CAPACITY // (devices * block)), block), dtype=np.uint32)
-    _fly.prepare(parts, dispersion, jnp.uint32(0), numbers, jnp.int32(0), devices, None, by_kernel(), OURS)
+def _slots(count: int, block: int | None = None) -> tuple[int, int, int]:
+    """For how many trials the program is made that flies so many: devices, rows and block, see `_fly`."""
+    devices = len(configure.devices())
+    if count < FEW:
+        return devices, 1, -(-FEW // devices)
+    block = block_size() if block is None else block
+    return devices, max(1, CAPACITY // (devices * block)), block
+
+
+def prepare(parts: Parts, dispersion: Dispersion, count: int) -> None:
+    """Begin to compile what flies so many trials of such parts, beside what is being done."""
+    slots = _slots(count)
+    numbers = np.zeros(slots, dtype=np.uint32)
+    _fly.prepare(parts, dispersion, jnp.uint32(0), numbers, jnp.int32(0), slots[0], None, by_kernel(), OURS)
 
 
 @programs.jit(static_argnames=("devices", "own", "kernel", "software"), compiler_options=programs.BATCHED, batch=True)

@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from ptsmc_jax import scenario
+from ptsmc_jax import programs, scenario
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.dispersions import attitudes, variation
 from ptsmc_jax.simulation import rollout
@@ -54,6 +54,32 @@ def test_any_number_of_trials_is_flown(flown, count):
     # one program below `FEW` and another from there on: roundings differ
     np.testing.assert_allclose(some.vectors("initial_q"), trials.vectors("initial_q")[:count], rtol=0, atol=1e-15)
     np.testing.assert_allclose(some.metrics.window_error, trials.metrics.window_error[:count], rtol=1e-12)
+
+
+class _AskedError(Exception):
+    pass
+
+
+@pytest.mark.parametrize("count", [1, 63, 64, 1000])
+def test_what_is_prepared_for_so_many_trials_is_what_flies_them(flown, count, monkeypatch):
+    """Another program, by a shape or a type, would be compiled for nothing."""
+    known = []
+
+    def heard(parts, dispersion, *numbers_and_fixed):
+        *numbers, devices, own, kernel, software = numbers_and_fixed
+        known.append(([programs._shape(v) for v in numbers], devices, own, kernel, software))
+
+    def called(*given):
+        heard(*given)
+        raise _AskedError
+
+    called.prepare = heard  # pyright: ignore[reportFunctionMemberAccess]
+    monkeypatch.setattr(montecarlo, "_fly", called)
+    montecarlo.prepare(flown[0], SPREAD, count)
+    with pytest.raises(_AskedError):
+        montecarlo.run(flown[0], SPREAD, 5, np.arange(count))
+    assert len(known) == 2
+    assert known[0] == known[1]
 
 
 @pytest.mark.parametrize(

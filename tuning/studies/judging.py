@@ -47,10 +47,9 @@ def beside(scenario: Scenario) -> tuple[dict[str, Scenario], str | None]:
 
 
 def judge(scenario: Scenario, fresh_seed: int) -> Trials:
-    """A scenario's gains on fresh trials, as flown; as many as every quantile that it asks for takes."""
+    """A scenario's gains on fresh trials, as flown; see `fresh_trials`."""
     flown = study(as_flown(scenario))
-    trials = np.arange(trials_of(flown, confirm.fresh_trials(flown.requirements)))
-    return montecarlo.run(flown.parts, flown.dispersion, fresh_seed, trials)
+    return montecarlo.run(flown.parts, flown.dispersion, fresh_seed, np.arange(fresh_trials(flown)))
 
 
 def floor_of(scenario: Scenario, fresh_seed: int) -> float | None:
@@ -126,3 +125,8 @@ def judged_on(flown: Scenario) -> str:
 def trials_of(ready: Study, wanted: int) -> int:
     """How many trials differ at all: one where nothing is drawn."""
     return wanted if ready.drawn else 1
+
+
+def fresh_trials(ready: Study) -> int:
+    """On how many fresh trials gains are judged."""
+    return trials_of(ready, confirm.fresh_trials(ready.requirements))

@@ -20,7 +20,7 @@ from ptsmc_jax.scenario import cautions, free_gains, own, parsing, study
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import catalogues
-from tuning.search import confirm, gains, trust
+from tuning.search import gains, trust
 from tuning.search.journal import Journal
 from tuning.search.objective import T_F
 from tuning.search.progress import Report, headed
@@ -122,7 +122,7 @@ def trace(
     best = pareto.climbed(rungs, shares, posed, tell)
     fresh_seed, slews = judging.seed_of_judge(seed), []
     ready = study(judging.as_flown(base), reach=posing.reach(base, base.search, t_f=times[-1]))
-    count = judging.trials_of(ready, confirm.fresh_trials(ready.requirements)) if best else 0
+    count = judging.fresh_trials(ready) if best else 0
     for done, k in enumerate(sorted(best)):
         tell("judging on fresh trials", done, len(best), np.nan, 0.0)
         named = posed.named(best[k].share)

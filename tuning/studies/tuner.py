@@ -312,6 +312,6 @@ def _broken(verdicts: list[Verdict], trials: Trials) -> str | None:
 def _prepare(scenario: Scenario) -> None:
     """Begin to compile what judges a scenario's gains."""
     flown = study(judging.as_flown(scenario))
-    montecarlo.prepare(flown.parts, flown.dispersion)
+    montecarlo.prepare(flown.parts, flown.dispersion, judging.fresh_trials(flown))
     if scenario.sampled:
         run_margins.judged_jit.prepare(flown.parts)
