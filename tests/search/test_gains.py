@@ -124,6 +124,18 @@ def test_default_bounds_of_a_filters_bandwidth_end_where_its_star_tracker_is_too
     np.testing.assert_allclose(made.search.bounds["filter_bandwidth"], (0.05, highest), rtol=1e-12)
 
 
+def test_a_corner_of_the_command_is_tuned_anywhere_below_the_nyquist_frequency():
+    """By default from a tenth of 0.5 rad/s to ten times as much."""
+    device, free = {"kind": "first_order", "corner": 0.5}, {"free": ["command_corner"]}
+    tables = {"loop": {"mode": "sampled", "period": 0.1}, "hardware": {"command_filter": device}}
+    assert from_tables({**tables, "tune": free}).search.bounds == {"command_corner": (0.05, 5.0)}
+    wide = {**free, "bounds": {"command_corner": [1e-3, 31.4]}}
+    assert from_tables({**tables, "tune": wide}).search.bounds == {"command_corner": (1e-3, 31.4)}
+    for bounds in ([0.0, 3.0], [0.5, 31.5]):
+        with pytest.raises(ScenarioError, match=r"must be two numbers above 0\.0 and below 31\.4"):
+            from_tables({**tables, "tune": {**free, "bounds": {"command_corner": bounds}}})
+
+
 @pytest.mark.parametrize("tables", [{}, {"plant": {"kind": "chain", "order": 2}}], ids=["spacecraft", "chain"])
 @pytest.mark.parametrize("name", ["filter_bandwidth", "command_corner"])
 def test_a_scenario_is_given_no_filter_that_it_does_not_have(tables, name):
