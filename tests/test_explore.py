@@ -3,6 +3,7 @@ import tomllib
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import polars as pl
 import pytest
@@ -89,6 +90,17 @@ def test_another_inertia_is_known_to_law_and_observer_or_to_none_but_the_truth(f
     np.testing.assert_array_equal(unknown.plant.inertia, np.diag([9.0, 8.0, 7.0]))
     np.testing.assert_array_equal(unknown.controller.model.inertia, own.controller.model.inertia)
     np.testing.assert_array_equal(unknown.observer.model.inertia, own.observer.model.inertia)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_gravity_gradient_acts_on_the_body_that_another_inertia_makes(flight, known):
+    orbit = {"kind": "gravity_gradient", "orbit_rate": 0.001, "quat_xyzw": [0.6, 0.0, 0.0, 0.8]}
+    pushed = scenario.replace(flight.scenario, disturbance={"kind": "sum", "terms": [orbit, {"kind": "constant"}]})
+    body = {"spacecraft__inertia" if known else "spacecraft__true_inertia": [4.0, 12.0, 14.0]}
+    wanted = scenario.study(scenario.replace(pushed, **body)).parts
+    moved = scenario.study(pushed).parts.with_inertia([4.0, 12.0, 14.0], known=known)
+    torque, expected = (run.disturbance(jnp.asarray(3.0), run.initial) for run in (moved, wanted))
+    np.testing.assert_array_equal(torque, expected)
 
 
 def test_a_nominal_flight_refuses_what_a_nominal_run_refuses():

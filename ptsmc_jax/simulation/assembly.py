@@ -11,6 +11,7 @@ from ptsmc_jax.devices.command_filter import CommandFilter
 from ptsmc_jax.numerics.pytrees import Function, Leaf, pytree
 from ptsmc_jax.plants.base import Plant
 from ptsmc_jax.plants.rigid_body import spacecraft
+from ptsmc_jax.signals import disturbances
 from ptsmc_jax.signals.references import TurningFunction
 from ptsmc_jax.simulation.clock import Anchored, Flight, Graded
 from ptsmc_jax.simulation.pointing import Pointing
@@ -58,8 +59,8 @@ class Setup:
     def with_inertia(self: _Setup, inertia: Any, *, known: bool = True) -> _Setup:
         """The parts of a spacecraft with another inertia [kg m^2], see `spacecraft`; traced ones too.
 
-        known: the law and the observer know it; else it is that of the truth alone. Raises ValueError where a plant
-        has none.
+        On that body a gravity gradient acts, too. known: the law and the observer know it; else it is that of the truth
+        alone. Raises ValueError where a plant has none.
         """
         body = spacecraft(inertia)
 
@@ -68,7 +69,8 @@ class Setup:
                 raise ValueError(f"the {name} is a {type(plant).__name__}, but with_inertia goes with a spacecraft")
             return plant.with_inertia(body.inertia, body.inertia_inverse)
 
-        changes = {"plant": changed(self.plant, "plant")}
+        acting = disturbances.on_body(self.disturbance, body.inertia)
+        changes = {"plant": changed(self.plant, "plant"), "disturbance": acting}
         for name in ("controller", "observer") if known else ():
             part = getattr(self, name)
             if hasattr(part, "model"):
