@@ -90,7 +90,10 @@ class Flight:
 
     @property
     def floor(self) -> Floor | None:
-        """What no controller can beat along this run, and its course over time; None: not flown to the end."""
+        """What no controller can beat along this run, and its course over time.
+
+        None: not flown to the end, or with sensors of one's own, of which it is not known what they say.
+        """
         return self.run.floor
 
     def plot(self, *names: str) -> "Figures":
@@ -211,7 +214,8 @@ def _software(controller: str | Path | None, ready: Study) -> Software:
 def floor(what: Scenario | Study | str | Path, *, seed: int = 0) -> float | None:
     """RMS window error that no controller can beat in a scenario, in the unit of the metric; 0: nothing is unknown.
 
-    Pooled over a few trials, see `runs.floor`; what is taken as known: `error_floor`. None: none of them flies.
+    Pooled over a few trials, see `runs.floor`; what is taken as known: `error_floor`. None: none of them flies, or with
+    sensors of one's own, of which it is not known what they say.
     """
     draws.check_whole_number("seed", seed)
     return runs.floor(_ready(what), seed)

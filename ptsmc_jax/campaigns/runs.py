@@ -122,7 +122,7 @@ def floor(ready: Study, seed: int = 0, rows: Sequence[int | Row] = ()) -> float 
     """RMS window error that no controller can beat, in its unit, see `error_floor`; 0: nothing is unknown.
 
     Along the nominal run, or, where something is drawn, pooled over the first `FLOORS` trials, of a plan over these
-    rows. None: none of these is flown to the end.
+    rows. None: none of these has a `Run.floor`.
     """
     trials = rows or (range(FLOORS) if ready.dispersion.varies else (None,))
     runs = [_fly(ready, seed, trial) for trial in trials]
