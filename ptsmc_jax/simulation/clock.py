@@ -18,6 +18,8 @@ from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.numerics import guards
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree, vector
 
+COARSEST = 0.25  # of the time to go that a step before the hand-over may be: the window error is then 5e-4 off
+
 
 def _not_above(t: Array, limit: Scalar, rounding: Scalar | float = 0.0) -> Array:
     """min(t, limit), with the derivative of `limit` where they are equal; rounding: what counts as equal."""
@@ -133,9 +135,17 @@ class Graded:
         hold = jnp.arange(t.size) >= early.size - 1
         return _whole(t, t_next, hold)
 
+    def too_coarse(self, t_f: Any, delta: Any, xp: Any = jnp) -> Any:
+        """Whether steps are beyond `COARSEST`, as where t_f is twice that which the grid was made for; times in [s]."""
+        return self._grading(t_f, delta, xp) < 1.0 / COARSEST
+
+    def _grading(self, t_f: Any, delta: Any, xp: Any = jnp) -> Any:
+        """The weight a of ln(tau): how many steps there are while the time to go falls to 1/e, but for `max_step`."""
+        return (self.before - (t_f - delta) / self.max_step) / xp.log(t_f / delta)
+
     def _graded(self, t_f: Scalar, delta: Scalar) -> Float[Array, " nodes"]:
         """Nodes from 0 to the hand-over [s]."""
-        a = (self.before - (t_f - delta) / self.max_step) / jnp.log(t_f / delta)
+        a = self._grading(t_f, delta)
         start, end = a * jnp.log(t_f) + t_f / self.max_step, a * jnp.log(delta) + delta / self.max_step
         level = start + (end - start) * jnp.arange(self.before + 1).astype(float) / self.before
 

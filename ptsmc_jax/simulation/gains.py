@@ -15,6 +15,7 @@ from jaxtyping import Array
 from ptsmc_jax.simulation.assembly import Parts, check_parts
 
 AXIS = "observer_gain_"
+MADE_ANEW = "make the parts for them, with ptsmc_jax.replace or with the reach of scenario.study"
 SENSORS = "sensors_"  # prefix of the gains that sensors of one's own have
 
 
@@ -70,8 +71,8 @@ def with_gains(parts: Parts, gains: Mapping[str, Array | float]) -> Parts:
     Which numbers a law has theorems for is not asked here, as eta > 2; scenarios ask it, see `in_scenario`.
 
     Raises ValueError where there is no such gain, where one is no finite number, and where the parts' anchored clock
-    has too few samples for them, as far as they are known: under a transformation such a run comes back as
-    `unfinished`; TypeError where there are no parts.
+    has too few samples for them, or a continuous loop too few steps before the hand-over, as far as they are known:
+    under a transformation such a run comes back as `unfinished`; TypeError where there are no parts.
     """
     check_parts(parts)
     _check_names(parts, gains)
@@ -132,22 +133,27 @@ def _tunable_of_sensors(parts: Parts) -> tuple[str, ...]:
 
 
 def _check_clock(parts: Parts) -> None:
-    """Raises ValueError where an anchored clock has too few samples for t_f and delta, as far as these are known."""
+    """Raises ValueError where a clock has too few samples or steps for t_f and delta, as far as these are known."""
     clock: Any = parts.clock
     law = parts.controller
-    if not clock.anchored:
-        return
-    times = [law.t_f, law.delta, parts.t_end, clock.period]
+    times = [law.t_f, law.delta, parts.t_end, clock.period if clock.sampled else clock.max_step]
     if any(isinstance(v, core.Tracer) or np.ndim(v) > 0 for v in times):
         return
     t_f, delta, t_end, period = map(float, times)
+    # by plain numbers: where another gain is traced, JAX's would be too
+    if not clock.sampled and replace(clock, max_step=period).too_coarse(t_f, delta, np):
+        raise ValueError(
+            f"t_f = {t_f:g} s with delta = {delta:g} s needs more than the {clock.before} steps that the parts' "
+            f"continuous loop has before the hand-over; {MADE_ANEW}"
+        )
+    if not clock.anchored:
+        return
     hand_over = t_f - delta
     for where, needed, samples in (("before", hand_over, clock.before), ("after", t_end - hand_over, clock.after)):
         if needed > samples * period * (1.0 + 1e-9):
             raise ValueError(
                 f"t_f = {t_f:g} s with delta = {delta:g} s needs {needed:g} s of samples {where} the hand-over, but "
-                f"the parts' clock has {samples * period:g}; make the parts for them, with ptsmc_jax.replace or with "
-                "the reach of scenario.study"
+                f"the parts' clock has {samples * period:g}; {MADE_ANEW}"
             )
 
 

@@ -66,7 +66,7 @@ def simulate(
     x0 = jax.tree.map(lambda v: jnp.asarray(v, float), parts.controller.align(parts.initial, target))
     unit = parts.controller.clearance_unit(parts.controller.clearance(x0, target))
     target_t_f = parts.reference(criteria.t_f)
-    unit, gap = jax.lax.stop_gradient(unit), _gap(ticks, parts.t_end)
+    unit, gap = jax.lax.stop_gradient(unit), _first_missing(parts, ticks)
     run = Run(parts, ticks, criteria, x0, target, target_t_f, unit, gap, record)
     return sampled.fly(run, seed, trial, software) if parts.clock.sampled else continuous.fly(run)
 
@@ -106,6 +106,16 @@ def _gap(ticks: Ticks, t_end: Scalar) -> Scalar:
     first, last = ticks.t[0], ticks.t_next[-1]
     ends = jnp.where(last < t_end - guards.rounding(t_end, t_end), last, jnp.nan)
     return jax.lax.stop_gradient(jnp.where(first > 0.0, 0.0, ends))
+
+
+def _first_missing(parts: Parts, ticks: Ticks) -> Scalar:
+    """The `_gap` [s]; of a continuous loop whose steps are too coarse for t_f and delta 0."""
+    clock: Any = parts.clock
+    gap = _gap(ticks, parts.t_end)
+    if clock.sampled:
+        return gap
+    law = parts.controller
+    return jax.lax.stop_gradient(jnp.where(clock.too_coarse(law.t_f, law.delta), 0.0, gap))
 
 
 class _Flights(programs.Program):

@@ -25,7 +25,7 @@ STATUS = {
     SINGULAR: ("singular", "the law's singularity came nearer than 1e-3"),
     MISSED: ("missed", "at t_f more than 5 % of the initial error is left"),
     UNBOUNDED: ("diverged", "a metric is not finite"),
-    UNFINISHED: ("unfinished", "the clock was made for other gains, and has too few samples for these"),
+    UNFINISHED: ("unfinished", "the clock was made for other gains, and has too few samples or steps for these"),
 }
 FINISHED = (OK, MISSED)  # flown to t_end: the metrics are those of the run
 SINGULAR_CLEARANCE = 1e-3  # there the law's gain, which grows like 1 / clearance, is a thousand times as large
@@ -179,7 +179,7 @@ def finish(
     missed = (state.status == OK) & (
         angle_at_t_f > jnp.maximum(MISSED_SHARE * first.angle, MISSED_SETTLING_ANGLES * criteria.settling_angle)
     )
-    cut = (state.status == OK) & ~jnp.isnan(run.gap)
+    cut = ~jnp.isnan(run.gap) & ~(state.bad_time < run.gap)  # what went wrong without samples means nothing
     status = jnp.where(unbounded, UNBOUNDED, jnp.where(missed, MISSED, state.status))
     status = jnp.where(cut, UNFINISHED, status).astype(jnp.int32)
     bad_time = jnp.where(unbounded, criteria.t_end, jnp.where(missed, criteria.t_f, state.bad_time))

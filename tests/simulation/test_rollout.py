@@ -11,6 +11,7 @@ from ptsmc_jax.observers import nonlinear
 from ptsmc_jax.plants import integrator_chain, rigid_body, second_order
 from ptsmc_jax.signals import disturbances, references
 from ptsmc_jax.simulation import clock, rollout, sampled
+from ptsmc_jax.simulation.gains import with_gains
 from tests.helpers import (
     FULL_INERTIA,
     REFERENCE,
@@ -353,6 +354,18 @@ def test_gains_that_the_clock_has_no_samples_for_are_said():
     assert codes["late"] == (rollout.UNFINISHED, 0.0)
     assert codes["early"] == (rollout.UNFINISHED, 28.25)
     assert rollout.UNFINISHED not in rollout.FINISHED
+
+
+def test_a_t_f_that_the_steps_of_a_continuous_loop_are_too_coarse_for_is_said():
+    """Twice the t_f that its grid was made for leaves no steps to close in on it: the window error was 66 % off."""
+    run = parts(30.0)
+    run = replace(run, clock=replace(run.clock, before=414, after=101))
+    codes = {t_f: int(fly(run.with_t_f(vector(t_f))).status) for t_f in (30.0, 45.0, 60.0, 90.0)}
+    assert codes == {30.0: rollout.OK, 45.0: rollout.OK, 60.0: rollout.UNFINISHED, 90.0: rollout.UNFINISHED}
+    assert float(with_gains(run, {"t_f": 45.0}).controller.t_f) == 45.0
+    with pytest.raises(ValueError, match=r"t_f = 60 s with delta = 0\.05 s needs more than the 414 steps .* hand-over"):
+        with_gains(run, {"t_f": 60.0})
+    assert float(jax.jit(lambda eta: with_gains(run, {"eta": eta}).controller.eta)(3.5)) == 3.5
 
 
 def test_a_run_to_be_looked_at_is_optimised_where_it_is_long(monkeypatch):
