@@ -30,7 +30,10 @@ STARTS, FARTHER = 8, 0.15  # of Newton's search for a delay, at most, and by how
 
 
 class Margins(NamedTuple):
-    """The margins of each axis, (m,); of an unstable loop they are negative: how far the border is, from beyond it."""
+    """The margins of each axis, (m,); of an unstable loop they are negative: how far the nearest border is.
+
+    There a pole crosses the unit circle, by more gain or by less; others may still be outside. Its delay margin is 0.
+    """
 
     gain_up: Array  # [dB]; infinite: stable with any gain
     gain_down: Array  # [dB]

@@ -3,8 +3,11 @@
 import csv
 import json
 import tomllib
+from dataclasses import replace
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -153,6 +156,17 @@ def test_margins_of_every_law_stand_in_the_map():
         assert radius(0.999 * cell.hold_gain_margin) < 1.0 < radius(1.001 * cell.hold_gain_margin)
         assert 0.0 < cell.hold_delay_margin < 10.0
         assert np.isnan(cell.linear_window_error)  # which was compared with flown trials of the paper's law alone
+
+
+def test_a_factor_below_one_is_how_near_the_border_is_on_either_side():
+    """A plant that moves a thousandth as much as the observer takes it to: what it lacks is gain."""
+    parts = scenario.study(scenario.from_tables(tomllib.loads(CHAIN))).parts
+    loops = run_margins.at(parts, jnp.asarray([1.0])).loops
+    weak = replace(loops, new=1e-3 * loops.new, old=1e-3 * loops.old)
+    factor = float(10.0 ** (margins.of_each(weak).gain_up[-1, 0] / 20.0))
+    weak = jax.tree.map(lambda v: v[-1], weak)
+    assert factor < 1.0 < linear.radius(weak, factor)
+    assert linear.radius(weak, 0.999 / factor) > 1.0 > linear.radius(weak, 1.001 / factor)
 
 
 @pytest.mark.long

@@ -2,9 +2,9 @@
 
 MAP = (
     "linear_window_error and linear_torque are what linear theory predicts of the noise alone, where sampling is "
-    "explicit; radius, gain_margin (a factor up to which the loop is stable) and delay_margin [s] are those of the "
-    "frozen loop at the hand-over, stable where the radius of its poles is not above 1, and hold_radius, .. those in "
-    "hold."
+    "explicit; radius, gain_margin (a factor up to which the loop is stable; below 1 it is not, and its nearest border "
+    "is a factor so far from 1, less gain or more) and delay_margin [s] are those of the frozen loop at the hand-over, "
+    "stable where the radius of its poles is not above 1, and hold_radius, .. those in hold."
 )
 # under the scenario, by the command: whose gains it has
 SCENARIO = {

@@ -185,7 +185,8 @@ def _cell(x: float, y: float, ready: Study, common: Callable[[Parts], Parts], se
     if ready.scenario.sampled:
         ends = run_margins.at_ends(parts)
         for prefix, (left, radius) in (("", ends["hand_over"]), ("hold_", ends["hold"])):
-            # the factor on the gain of the worst axis at the nearest border; below 1 where the loop is not stable
+            # the factor on the gain of the worst axis up to which it is stable; below 1 where it is not: how near its
+            # nearest border is, which may as well be one of more gain
             figures[f"{prefix}gain_margin"] = float(10.0 ** (left.gain_up.min() / 20.0))
             figures[f"{prefix}delay_margin"] = float(left.delay.min())
             figures[f"{prefix}radius"] = radius
