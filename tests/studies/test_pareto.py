@@ -183,6 +183,20 @@ def test_the_ladder_says_which_rung_it_is_on(monkeypatch):
     assert told == [f"ladder, peak torque {limit}" for limit in (0.4, 0.2, 0.2, 0.4)]
 
 
+@pytest.mark.parametrize(("least", "limits"), [(9.0, [5.0]), (2.0, [5.0, 0.25]), (1e-9, [5.0, 0.25, 0.0125])])
+def test_the_least_torque_is_looked_for_under_a_limit_that_no_gains_keep(least, limits):
+    """Gains that keep a limit are the most accurate that do: a front began there, above what others ask for."""
+    asked = []
+
+    def asking_for(limit):
+        asked.append(limit)
+        return len(asked), max(0.97 * limit, least)
+
+    found, peak = pareto.least_torque(asking_for, 100.0)
+    np.testing.assert_allclose(asked, limits)
+    assert (found, peak) == (len(limits), max(0.97 * limits[-1], least))
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("stage", ["least torque: searching", "ladder"])
 def test_an_interrupted_front_goes_on(command, tmp_path, monkeypatch, stage):

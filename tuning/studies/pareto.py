@@ -5,7 +5,7 @@ those that no limit holds back; each step starts from what its neighbours found 
 SMC 1(3), 1971).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -33,7 +33,8 @@ from tuning.studies import judging, posing
 
 TORQUE = "peak_torque"
 OFF = 1e9  # a limit that holds nothing back
-HARDLY = 0.05  # of the largest torque that gains accuracy: a limit that nothing keeps
+HARDLY = 0.05  # of the largest torque that gains accuracy: a limit that hardly any gains keep
+TIGHTEST = HARDLY**3  # of it, where gains keep that
 FEWER = 4  # starts of the search for the least torque
 WARM = 3  # of the gains known so far, from which each step of the ladder starts
 NEARLY = 0.05  # of a limit: known gains that are beyond it by less are as good a start as those that keep it
@@ -106,10 +107,13 @@ def trace(
     free = uninterrupted(posed.search(under(OFF), posed.own, starts, loose, judged=False, report=report))
     problem = replace(free.problem, limits=problem.limits)
     highest = free.ended[at] * OFF
-    tight = HARDLY * highest
     report = headed(tell, "least torque")
-    least = uninterrupted(posed.search(under(tight), posed.own, FEWER, (), judged=False, report=report))
-    lowest = least.ended[at] * tight
+
+    def asking_for(limit: float) -> tuple[Search, float]:
+        found = uninterrupted(posed.search(under(limit), posed.own, FEWER, (), judged=False, report=report))
+        return found, found.ended[at] * limit
+
+    least, lowest = least_torque(asking_for, highest)
     ladder = np.geomspace(lowest / (1.0 - MARGIN), RANGE * highest / (1.0 - MARGIN), points)
     if own_limit is not None and ladder[0] < own_limit < ladder[-1]:
         ladder[1 + np.argmin(np.abs(np.log(ladder[1:-1] / own_limit)))] = own_limit
@@ -133,6 +137,19 @@ def trace(
         rollouts=evaluate.rollouts,
         gradients=evaluate.gradients,
     )
+
+
+def least_torque(asking_for: Callable[[float], tuple[Any, float]], highest: float) -> tuple[Any, float]:
+    """What asks for the least torque, and that torque [N m]: gains that keep a limit are only the most accurate ones.
+
+    asking_for: what is found for a limit, and its peak torque; highest: the largest that gains accuracy.
+    """
+    limit = HARDLY * highest
+    found, peak = asking_for(limit)
+    while peak <= limit and limit > TIGHTEST * highest * (1.0 + 1e-9):
+        limit *= HARDLY
+        found, peak = asking_for(limit)
+    return found, peak
 
 
 def check(scenario: Scenario) -> None:
