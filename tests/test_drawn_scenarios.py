@@ -1,0 +1,128 @@
+"""Scenarios drawn from every table that there is: each flies alike by every way, and has the slopes of differences.
+
+What goes with what nobody has chosen here: a table or a key that is refused beside the others is left out again.
+"""
+
+import random
+import re
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from polars.testing import assert_frame_equal
+
+import ptsmc_jax as ptsmc
+from ptsmc_jax import scenario
+from ptsmc_jax.campaigns import montecarlo
+from ptsmc_jax.onboard.library import InTheLoop, Library
+from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.scenario.layouts import OPTIONAL
+from ptsmc_jax.simulation import rollout
+from tests.scenario.test_schema import COMPLETE
+from tuning.search.gains import gains_of, with_gains
+
+SEED, TRIALS = 7, 3
+# of two ways to fly the same: rounding, which a thin sign makes larger
+close = partial(np.testing.assert_allclose, rtol=1e-6, atol=1e-12)
+METRICS = ("window_error", "terminal_error", "peak_torque", "effort")  # of every plant
+
+
+def drawn(seed):
+    """A sampled scenario from `COMPLETE`: of each table one of those there, of hardware and dispersion some keys."""
+    chance = random.Random(seed)
+    kind = chance.choice(["spacecraft", "spacecraft", "spacecraft", "chain"])
+    tables = {}
+    for some in COMPLETE:
+        if some.get("plant", {}).get("kind", "spacecraft") == kind:
+            for name, table in some.items():
+                tables.setdefault(name, []).append(table)
+    chosen = {}
+    for name, ones in tables.items():
+        if name in ("hardware", "dispersion"):
+            keys = {key: value for table in chance.sample(ones, len(ones)) for key, value in table.items()}
+            chosen[name] = {key: value for key, value in keys.items() if chance.random() < 0.4}
+        elif name not in ("loop", "requirements", "tune") and (name not in OPTIONAL or chance.random() < 0.4):
+            chosen[name] = dict(chance.choice(ones))
+    chosen["controller"]["t_f"] = chance.uniform(6.0, 12.0)
+    loop = {"mode": "sampled", "clock": "flight", "period": chance.choice([0.05, 0.1, 0.17])}
+    return accepted({**chosen, "loop": {**loop, "t_end": chosen["controller"]["t_f"] + 2.5}})
+
+
+def accepted(tables):
+    """The scenario, without the keys that are refused, or their tables where what is lacking is another key."""
+    while said := refusal(lambda: scenario.study(scenario.from_tables(tables))):
+        table, key = re.findall(r"\w+", said)[:2]
+        del (tables[table] if key in tables[table] else tables)[key if key in tables[table] else table]
+    return scenario.from_tables(tables)
+
+
+def refusal(call):
+    """Why it is refused; empty where it is not."""
+    try:
+        call()
+    except ScenarioError as error:
+        return str(error)
+    return ""
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(12))
+def test_a_drawn_scenario_flies_alike_by_every_way(seed, tmp_path):
+    """In a batch, alone, from its file, as the plan that its rows are, and by its C."""
+    known = drawn(seed)
+    ready = scenario.study(known)
+    rows = ptsmc.trials(known, TRIALS, seed=SEED)
+    ptsmc.write(known, tmp_path / "drawn.toml")
+    again = scenario.study(ptsmc.read(tmp_path / "drawn.toml")).parts
+    assert jax.tree.structure(again) == jax.tree.structure(ready.parts)
+    for one, other in zip(jax.tree.leaves(again), jax.tree.leaves(ready.parts), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-14)
+    alone = ptsmc.simulate(known, seed=SEED, trial=1).metrics
+    for name in METRICS:
+        close(np.float64(alone[name]), np.float64(rows[name][1]), err_msg=name)
+    if ready.drawn:
+        planned = ptsmc.trials(known, rows, seed=SEED).select(rows.columns)
+        assert_frame_equal(planned, rows, rel_tol=1e-6, abs_tol=1e-12)
+    if said := refusal(lambda: ptsmc.export(known, tmp_path / "controller")):
+        assert re.search(
+            "the C is not told of|nothing to check by", said
+        )  # failures of wheels, or trials that are lost
+        return
+    alike = rows["status"].is_in(montecarlo.FINISHED).to_numpy()
+    if "peak_rate" in rows:  # a body that turns by a radian in a period makes rounding as large as its errors
+        alike &= rows["peak_rate"].fill_null(np.inf).to_numpy() * known.loop.period < 1.0
+    software = InTheLoop(Library(tmp_path / "controller"), ready.parts).software
+    flown = montecarlo.run(ready.parts, ready.dispersion, SEED, np.arange(TRIALS), software=software)
+    for name in METRICS:
+        by_c = np.asarray(getattr(flown.metrics, name))
+        close(by_c[alike], rows[name].to_numpy()[alike], err_msg=name)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(100, 108))
+def test_a_drawn_scenario_has_the_slopes_of_differences(seed):
+    """Along all gains at once; of order 4, of steps between truncation and rounding one of which is right to 1e-4.
+
+    On the flight clock t_f and delta have a corner at each sample, and a quantised torque has no slope.
+    """
+    known = drawn(seed)
+    if known.hardware is not None and known.hardware.torque_step is not None:
+        known = scenario.replace(known, hardware__torque_step=None)
+    parts = scenario.study(known).parts
+    gains = {name: v for name, v in gains_of(parts).items() if name not in ("t_f", "delta")}
+    along = np.random.default_rng(seed).normal(size=len(gains))
+
+    def fly(x):
+        moved = {name: v * (1.0 + x * by) for (name, v), by in zip(gains.items(), along, strict=True)}
+        metrics = rollout.simulate(with_gains(parts, moved), np.uint32(SEED), np.uint32(0)).metrics
+        return jnp.stack([getattr(metrics, name) for name in METRICS])
+
+    slope = np.asarray(jax.jit(lambda x: jax.jvp(fly, (x,), (1.0,))[1])(0.0))
+    value = jax.jit(fly)
+    steps = (1e-4, 1e-5, 1e-6, 1e-7)
+    numeric = [np.asarray(value(-2 * h) - 8 * value(-h) + 8 * value(h) - value(2 * h)) / (12 * h) for h in steps]
+    off = np.abs(np.stack(numeric) - slope).min(axis=0)
+    assert np.all(np.isfinite(slope))
+    np.testing.assert_array_less(off, 1e-4 * np.abs(slope) + 1e-9 * np.abs(value(0.0)) + 1e-15)
