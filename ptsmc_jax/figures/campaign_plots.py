@@ -183,5 +183,5 @@ def _points(axes: Axes, x: np.ndarray, y: np.ndarray, outcome: np.ndarray, total
         those = outcome == name
         if np.any(those):
             label = f"{name}: {totals[name]}"
-            width = 1.2 if marker == "x" else 0.0
+            width = 1.2 if marker in ("x", "+") else 0.0  # these are lines, and nothing without a width
             axes.scatter(x[those], y[those], s=size, c=colour, marker=marker, alpha=0.6, label=label, linewidths=width)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from matplotlib.markers import MarkerStyle
 
 from ptsmc_jax.figures import campaign_plots
 
@@ -45,6 +46,10 @@ def test_each_outcome_is_counted_and_drawn():
     x, totals = 1.0 + np.arange(outcome.size), dict.fromkeys(campaign_plots.MARKS, 7)
     (axes,) = campaign_plots.torque_by_angle(x, x, outcome, totals, None).axes
     assert axes.get_legend_handles_labels()[1] == [f"{name}: 7" for name in outcome]
+    for points, marker in zip(
+        axes.collections, (marker for _, marker, _ in campaign_plots.MARKS.values()), strict=True
+    ):
+        assert points.get_linewidth()[0] > 0.0 or MarkerStyle(marker).is_filled()  # else nothing of it is seen
     flown = x[np.isin(outcome, ("ok", campaign_plots.AT_TIMES, campaign_plots.BEYOND, "missed"))]
     assert axes.get_ylim() == pytest.approx((flown.min() / 1.3, flown.max() * 1.5))
 
