@@ -59,6 +59,7 @@ def flown(x, y, text=SHORT, trials=6):
         ("controller.delta=0.05:5:3", [0.05, 0.5, 5.0]),
         ("controller.delta=1:2:2", [1.0, 2.0]),
         ("hardware.delay=0:2:5", [0.0, 1.0, 2.0]),
+        ("loop.t_end=100:100.001:5", [100.0, 100.001]),
     ],
 )
 def test_axes(text, values):
@@ -79,7 +80,8 @@ def test_axes_have_the_units_of_their_keys():
 
 @pytest.mark.parametrize(
     "text", ["", "delta=1:2:3", "controller.delta", "controller.delta=1:2", "controller.delta=2:1:3", "a.b=1:2:1",
-             "a.b=1:nan:3", "a.b=x:2:3", "a.b=1:2:101", "a.b.c=1:2:3"]
+             "a.b=1:nan:3", "a.b=x:2:3", "a.b=1:2:101", "a.b.c=1:2:3",
+             "hardware.delay=0:0.4:2", "hardware.star_tracker_every=0.6:1.4:9", "a.b=1:1.0000001:5"]
 )  # fmt: skip
 def test_bad_axes_are_refused_in_a_sentence(text):
     with pytest.raises(UsageError, match=r"--y is .*KEY=LOW:HIGH:COUNT"):

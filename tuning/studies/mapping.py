@@ -98,8 +98,12 @@ def axis(text: str, option: str) -> Axis:
     spaced = np.geomspace if Axis(key, (low, high)).logarithmic else np.linspace
     values = spaced(low, high, count)
     if key in WHOLE_NUMBERS:
-        values = np.unique(np.round(values))
-    return Axis(key, tuple(float(f"{v:.6g}") for v in values))
+        values = np.round(values)
+    different = tuple(dict.fromkeys(float(f"{v:.6g}") for v in values))
+    if len(different) < 2:  # a single value has no cells to draw
+        those = "two whole numbers" if key in WHOLE_NUMBERS else "two values that differ in six digits"
+        raise UsageError(f"{wanted}, with {those} between LOW and HIGH at least")
+    return Axis(key, different)
 
 
 def fly(scenario: Scenario, x: Axis, y: Axis, seed: int, trials: int, tell: Callable[[int, int], None]) -> Map:
