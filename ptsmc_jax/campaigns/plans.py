@@ -97,8 +97,8 @@ def read(path: Path) -> pl.DataFrame:
         raise RefusedError(f"--plan is {path}, but must be {ALLOWED}")
     try:
         if kinds == {".csv"}:
-            return pl.read_csv(path, infer_schema_length=None)
-        return pl.concat([pl.read_parquet(file) for file in files])
+            return pl.read_csv(path, infer_schema_length=None, glob=False)
+        return pl.concat([pl.read_parquet(file, glob=False) for file in files])
     except (OSError, pl.exceptions.PolarsError) as error:
         first_line = (str(error).splitlines() or [type(error).__name__])[0]
         raise RefusedError(f"--plan is {path}, which cannot be read: {first_line}") from None

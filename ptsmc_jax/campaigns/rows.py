@@ -109,4 +109,11 @@ def encoded(frame: pl.DataFrame) -> bytes:
 def read(parts: Sequence[Part], columns: Iterable[str] | None = None) -> pl.DataFrame:
     """The rows of these parts, in order; columns: those wanted, all if None."""
     wanted = None if columns is None else list(columns)
-    return pl.read_parquet([part.path for part in parts], columns=wanted).rechunk()
+    # without globbing: a folder called runs[1], or runs*, is no pattern
+    return pl.read_parquet([part.path for part in parts], columns=wanted, glob=False).rechunk()
+
+
+def columns_of(part: Part) -> list[str]:
+    """The names of the columns of a part, in order."""
+    with part.path.open("rb") as file:  # a path would be taken as a pattern
+        return list(pl.read_parquet_schema(file))

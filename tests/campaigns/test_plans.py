@@ -399,6 +399,17 @@ def test_plans_that_fly_other_trials_have_other_digests():
     assert dataclasses.replace(some, angle=np.ones(2)).digest == some.digest
 
 
+@pytest.mark.parametrize("folder", ["plans[1]", "plans*"])
+def test_a_plan_in_a_folder_whose_name_is_a_pattern_is_read(tmp_path, folder):
+    table = pl.DataFrame({"trial": [4, 2]})
+    for name, rows in ((folder, table), ("plans1", table.head(1))):
+        (tmp_path / name).mkdir()
+        rows.write_csv(tmp_path / name / "plan.csv")
+        rows.write_parquet(tmp_path / name / "plan.parquet")
+    for path in ("plan.csv", "plan.parquet"):
+        assert plans.read(tmp_path / folder / path)["trial"].to_list() == [4, 2]
+
+
 def test_files_that_are_no_plan_are_refused(tmp_path):
     for name, content, said in (
         ("none.csv", None, "which is not there; allowed is a .csv or .parquet file with a row for each trial"),

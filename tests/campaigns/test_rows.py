@@ -2,7 +2,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from ptsmc_jax.campaigns import rows
+from ptsmc_jax.campaigns import campaign, rows
 
 KEY = rows.key_of({"loop": {"period": 0.1}}, {"seed": 1})
 
@@ -91,3 +91,14 @@ def test_trials_that_a_longer_part_has_are_not_read_twice(kept):
     long, _, after = kept.write(0, frame(0, 50)), kept.write(20, frame(20, 20)), kept.write(50, frame(50, 10))
     assert kept.parts() == ([long, after], [])
     assert rows.read(kept.parts()[0])["trial"].to_list() == list(range(60))
+
+
+@pytest.mark.parametrize("name", ["runs[1]", "runs*", "runs?"])
+def test_a_folder_whose_name_is_a_pattern_is_that_folder_alone(tmp_path, name):
+    for folder in (name, "runs1"):
+        kept = rows.Rows(tmp_path / folder, KEY)
+        kept.write(0, frame(0, 50).with_columns(status=pl.lit("ok" if folder == name else "diverged")))
+    parts, _ = rows.Rows(tmp_path / name, KEY).parts()
+    assert rows.read(parts)["trial"].to_list() == list(range(50))
+    assert rows.columns_of(parts[0]) == ["trial", "x", "status"]
+    assert campaign.tally(parts, 50) == campaign.Tally(done=50, total=50, failed=0)

@@ -150,7 +150,7 @@ def _samples(folder: Folder, parts: list[rows.Part]) -> dict[str, Any]:
     """How many samples the controller's C ended with each status, and in how many trials; nothing without one."""
     if folder.controller is None:
         return {}
-    kept = pl.read_parquet_schema(parts[0].path)
+    kept = rows.columns_of(parts[0])
     names = [name for name in plans.SAMPLES if name in kept]  # the gravest last
     counts = rows.read(parts, names).head(folder.trials)
     told = {
@@ -162,7 +162,7 @@ def _samples(folder: Folder, parts: list[rows.Part]) -> dict[str, Any]:
 
 def drawn_columns(folder: Folder, parts: list[rows.Part]) -> list[str]:
     """The columns that say what trials flew with: those from the initial angle on, but for metrics of one's own."""
-    names = list(pl.read_parquet_schema(parts[0].path))
+    names = rows.columns_of(parts[0])
     return [name for name in names[names.index("initial_angle") :] if name not in folder.own_names]
 
 
@@ -252,7 +252,7 @@ def write_summary(folder: Folder, summary: dict[str, Any], figures: bool) -> Non
 def worst(folder: Folder, by: str, count: int) -> pl.DataFrame:
     """The rows of the worst trials by a metric, failed ones first."""
     parts = folder.whole_parts()
-    names = list(pl.read_parquet_schema(parts[0].path))
+    names = rows.columns_of(parts[0])
     allowed = [name for name in names if name not in (plans.TRIAL, *plans.HEADING, *plans.OF_ROWS.values())]
     if by not in allowed:
         listed = f"the head of {folder.path / 'worst.csv'}, which ptsmc worst writes without --by, has all of them"
@@ -290,7 +290,7 @@ def replay(folder: Folder, trial: int) -> Replay:
     off = None
     for part in folder.rows.parts()[0]:
         if part.first <= trial < part.end:
-            row = pl.read_parquet(part.path).filter(pl.col("trial") == trial).row(0, named=True)
+            row = rows.read([part]).filter(pl.col("trial") == trial).row(0, named=True)
             off = max(_off(value, again[name]) for name, value in row.items())
     return Replay(run, off, rounding)
 
