@@ -49,7 +49,8 @@ def test_each_outcome_is_counted_and_drawn():
     for points, marker in zip(
         axes.collections, (marker for _, marker, _ in campaign_plots.MARKS.values()), strict=True
     ):
-        assert points.get_linewidth()[0] > 0.0 or MarkerStyle(marker).is_filled()  # else nothing of it is seen
+        drawn = np.all(np.asarray(points.get_linewidth()) > 0.0)
+        assert drawn or MarkerStyle(marker).is_filled(), marker  # else nothing of it is seen
     flown = x[np.isin(outcome, ("ok", campaign_plots.AT_TIMES, campaign_plots.BEYOND, "missed"))]
     assert axes.get_ylim() == pytest.approx((flown.min() / 1.3, flown.max() * 1.5))
 

@@ -239,13 +239,14 @@ def test_without_plotly_it_says_how_to_install_it(command, flown, monkeypatch):
     assert error == "ptsmc: the page needs plotly.offline: pip install 'ptsmc-jax[report]'\n"
 
 
-def test_a_front_has_its_intervals_and_its_knee():
+def test_a_front_has_its_intervals_and_its_knee_and_not_what_no_trial_ends_with():
     def point(peak, rms, **marks):
         own = {"gains": {"eta": 3.0}, "interval": [0.9 * rms, 1.2 * rms], "knee": False, "dominated": False}
         return {"peak": peak, "rms": rms, **own, **marks}
 
     summary = {"points": [point(1.0, 4e-5, knee=True), point(2.0, 1e-5), point(3.0, 2e-5, dominated=True)],
-               "paper": point(5.0, 1e-4, interval=None)}  # fmt: skip
+               "paper": point(5.0, 1e-4, interval=None),
+               "before": {**point(1.0, 1.0), "peak": None, "rms": None, "interval": None}}  # fmt: skip
     drawn = page_charts.front(summary, {"peak_torque": "N m", "window_error": "-"}, 1.5)
     named = {trace["name"]: trace for trace in drawn["data"]}
     assert {name: trace["x"] for name, trace in named.items()} == {

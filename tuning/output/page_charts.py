@@ -132,7 +132,8 @@ def front(summary: dict[str, Any], units: Mapping[str, str], limit: float | None
           for name, label in (("paper", summary.get("paper_is", "paper")), ("before", "before")) if name in summary),
     ]  # fmt: skip
     data = []
-    for k, (name, group, style) in enumerate(groups):
+    for k, (name, points_of, style) in enumerate(groups):
+        group = [p for p in points_of if p["rms"] is not None]  # none where no fresh trial is flown to the end
         if group:
             data.append({
                 "type": "scatter", "name": name, "x": [p["peak"] for p in group], "y": [p["rms"] for p in group],
