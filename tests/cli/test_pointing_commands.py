@@ -115,15 +115,16 @@ def test_a_budget_is_the_order_statistic_that_shows_it(monkeypatch, flown):
     )
 
 
-@pytest.mark.parametrize(("flown", "ok", "said"), [
-    (2000, 2000, "1109 runs without a failure show a value, and 852 with 90 % confidence"),
-    (1108, 1098, "1109 runs without a failure show a value"),  # too few for 95 %, whether or not some fail
-    (1109, 1099, "10 runs that are not ok are beyond every angle"),
+@pytest.mark.parametrize(("flown", "ok", "missed", "said"), [
+    (2000, 2000, 0, "1109 runs without a failure show a value, and 852 with 90 % confidence"),
+    (1108, 1098, 0, "1109 runs without a failure show a value"),  # too few for 95 %, whether or not some fail
+    (1109, 1099, 0, "10 runs that were not flown to the end are beyond every angle"),
+    (1109, 1049, 50, "10 runs that were not flown to the end are beyond every angle"),  # a run that misses t_f has its angles
 ])  # fmt: skip
-def test_why_a_budget_has_no_value_is_said(flown, ok, said):
+def test_why_a_budget_has_no_value_is_said(flown, ok, missed, said):
     told = {"after": 0.0, "boresight": [1.0, 0.0, 0.0], "probability": 0.9973, "confidence": 0.95,
             "budget": {"ape": {"x": None}}}  # fmt: skip
-    *_, last = pointing_sentences.heading({"pointing": told, "flown": flown, "counts": {"ok": ok}})
+    *_, last = pointing_sentences.heading({"pointing": told, "flown": flown, "counts": {"ok": ok, "missed": missed}})
     assert last.startswith(f"where the budget has -, {said}")
 
 

@@ -65,8 +65,9 @@ def heading(summary: Summary) -> Iterator[str]:
     if any(value is None for axes in pointing["budget"].values() for value in axes.values()):
         few, more = (fewest_trials(pointing["probability"], confidence) for confidence in USUAL)
         least = f"{more} runs without a failure show a value, and {few} with 90 % confidence"
-        lost = summary["flown"] - summary["counts"]["ok"]
-        why = f"{lost} runs that are not ok are beyond every angle" if summary["flown"] >= more and lost else least
+        lost = summary["flown"] - summary["counts"]["ok"] - summary["counts"].get("missed", 0)  # which have angles
+        beyond = f"{lost} runs that were not flown to the end are beyond every angle"
+        why = beyond if summary["flown"] >= more and lost else least
         yield f"where the budget has -, {why}"
 
 
