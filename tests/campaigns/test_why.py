@@ -35,7 +35,7 @@ def test_each_input_of_a_worst_trial_is_a_percentile_beside_the_median(monkeypat
         "trial": np.arange(401), "status": ["ok"] * 401, "peak_torque": angle**2, "initial_angle": angle,
         "initial_q4": np.cos(angle / 2), "initial_w1": rate, "always": np.ones(401),
     })  # fmt: skip
-    monkeypatch.setattr(campaign_summary.pl, "read_parquet_schema", lambda path: dict(table.schema))
+    monkeypatch.setattr(campaign_summary.rows, "columns_of", lambda part: list(table.schema))
     monkeypatch.setattr(campaign_summary.rows, "read", lambda parts, names: table.select(names))
     why: Any = inspect.unwrap(reasons.why)  # which would refuse these rows by their type
     told = why(Rows(), ["peak_torque"], 1)
@@ -43,7 +43,7 @@ def test_each_input_of_a_worst_trial_is_a_percentile_beside_the_median(monkeypat
     assert told[0] == {"metric": "peak_torque", "trial": 400, "value": 4.0, "input": "initial_angle", "drawn": 2.0,
                        "unit": "rad", "percentile": 100.0, "median": 1.0, "share": None,
                        "rank_correlation": pytest.approx(1.0, rel=1e-12),
-                       "first_order": pytest.approx(1.0, abs=0.05)}  # fmt: skip
+                       "first_order": pytest.approx(1.0, abs=0.05), "trials": 401}  # fmt: skip
     assert told[1]["percentile"] == 100.0 * np.mean(rate <= rate[400])
     campaign_terminal.why(told, "spacecraft", 401)
     (said,) = capsys.readouterr().out.splitlines()
@@ -81,9 +81,19 @@ def test_each_input_of_a_worst_trial_is_a_percentile_beside_the_median(monkeypat
     driven = statistics.drivers({"initial_w1": ended["initial_w1"].to_numpy()}, ended["peak_torque"].to_numpy())
     (one,) = [row for row in why(Rows(), ["peak_torque"], 1) if row["input"] == "initial_w1"]
     assert one["rank_correlation"] == pytest.approx(driven["initial_w1"]["rank_correlation"], rel=1e-12)
+    assert one["trials"] == ended.height
     table = table.with_columns(peak_torque=pl.Series([*cut[:-1], None]))  # as of a run that never settles
     assert {row["value"] for row in why(Rows(), ["peak_torque"], 401) if row["trial"] == 400} == {None}
     assert statistics.distinct({"a": angle, "b": -angle, "c": rate}) == ["a", "c"]
+
+
+def test_what_chance_shows_among_the_few_trials_that_have_a_metric_is_no_reason(capsys):
+    """A correlation of 0.15 is nothing among 200 of 10 000 trials, as many as settle, say."""
+    told = [{"metric": "settling_time", "trial": 3, "value": 1.0, "input": "initial_w1", "drawn": 2.0, "unit": "rad/s",
+             "percentile": 70.0, "median": 1.0, "share": None, "rank_correlation": 0.15, "first_order": 0.06,
+             "trials": 200}]  # fmt: skip
+    campaign_terminal.why(told, "spacecraft", 10_000)
+    assert "goes with nothing that was drawn" in capsys.readouterr().out
 
 
 def test_of_a_trial_that_failed_the_four_most_unusual_inputs_are_told(capsys):

@@ -158,6 +158,8 @@ def test_what_chance_shows_is_not_said_to_drive_a_metric():
     assert max(abs(one["rank_correlation"]) for one in drivers.values()) > 0.1
     summary = {"verdicts": [], "flown": 300, "drivers": {"window_error": drivers}}
     assert not list(campaign_sentences.drivers(summary))
+    # as where most trials fail: 300 of 10 000 have the metric
+    assert not list(campaign_sentences.drivers({**summary, "flown": 10_000, "driver_trials": {"window_error": 300}}))
     summary["drivers"] = {"window_error": statistics.drivers({"y": metric + rng.normal(size=300)}, metric)}
     (said,) = campaign_sentences.drivers(summary)
     assert said.startswith("window_error hangs on y +0.")

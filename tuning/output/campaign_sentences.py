@@ -96,12 +96,13 @@ def flown_gains(scenario: dict[str, Any], kind: str) -> Table:
 
 
 def drivers(summary: Summary) -> Iterator[str]:
-    """What drives the error and the metrics of the requirements, by more than chance shows among so many trials."""
+    """What drives the error and the metrics of the requirements, by more than chance shows in trials that have them."""
     from ptsmc_jax.numerics import statistics
 
     for name in dict.fromkeys(("window_error", *(v["metric"] for v in summary["verdicts"]))):
         known = summary["drivers"].get(name, {})
-        seen = [key for key, driver in known.items() if statistics.beyond_chance(driver, summary["flown"])]
+        trials = summary.get("driver_trials", {}).get(name, summary["flown"])  # not yet said in earlier results
+        seen = [key for key, driver in known.items() if statistics.beyond_chance(driver, trials)]
         strength = {key: max(abs(v) for v in known[key].values() if v is not None) for key in seen}
         strongest = sorted((key for key in strength if strength[key] >= WEAK), key=lambda key: -strength[key])[:3]
         if strongest:

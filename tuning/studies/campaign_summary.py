@@ -112,7 +112,7 @@ def summarise(folder: Folder) -> dict[str, Any]:
         {"status": status, "reason": reason, "trials": int(part.height), "first_bad_time": part["bad_time"].min()}
         for (status, reason), part in sorted(failed.group_by(["status", "reason"]))
     ]
-    quantiles, drivers = {}, {}
+    quantiles, drivers, driver_trials = {}, {}, {}
     ranks: dict[bytes, dict[str, tuple]] = {}  # of the inputs, by the trials that they are ranked among
     drawn = drawn_columns(folder, parts)
     inputs = rows.read(parts, drawn).head(min(SEARCHED, folder.trials))
@@ -120,6 +120,7 @@ def summarise(folder: Folder) -> dict[str, Any]:
         values = rows.read(parts, [name]).head(folder.trials)[name].to_numpy().astype(float)
         quantiles[name] = (_of_share if name in catalogues.LARGER_IS_BETTER else _of_metric)(values, finished)
         known = np.isfinite(values[:SEARCHED]) & finished[:SEARCHED]
+        driver_trials[name] = int(known.sum())
         of = {key: inputs[key].to_numpy()[known] for key in drawn}
         ranked = ranks.setdefault(known.tobytes(), {})
         drivers[name] = statistics.drivers(of, values[:SEARCHED][known], ranked, CATEGORIES) if known.sum() > 1 else {}
@@ -141,6 +142,7 @@ def summarise(folder: Folder) -> dict[str, Any]:
         **_pointing(folder, parts, finished),
         "quantiles": quantiles,
         "drivers": drivers,
+        "driver_trials": driver_trials,  # in which they were seen: those that have the metric
         **_samples(folder, parts),
         "cautions": [*cautions.of(folder.scenario), *filter(None, [folder.otherwise]), *_alike(quantiles, done)],
     }

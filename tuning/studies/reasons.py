@@ -18,8 +18,8 @@ def why(folder: Folder, metrics: Sequence[str], count: int) -> list[dict[str, An
 
     Failed trials first, as in `campaign_summary.worst`; of inputs that rank the trials alike only the first. For one
     that says which of several things, such as a wheel, there is instead the share of the trials that have the same.
-    Beside each stands how the metric goes with it over all trials that end, see `statistics.drivers`; None where so few
-    trials do not show it.
+    Beside each stands how the metric goes with it over all trials that end with a value, how many "trials" these are,
+    see `statistics.drivers`; None where so few do not show it.
     """
     parts, unit_of = folder.whole_parts(), folder.units
     drawn = campaign_summary.drawn_columns(folder, parts)
@@ -46,6 +46,7 @@ def why(folder: Folder, metrics: Sequence[str], count: int) -> list[dict[str, An
                     "unit": unit_of.get(name, ""),
                     **_among(name, inputs[name], float(inputs[name][at])),
                     **drivers.get(name, {"rank_correlation": None, "first_order": None}),
+                    "trials": int(known.sum()),
                 }
                 for name in names
             ]
