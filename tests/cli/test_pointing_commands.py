@@ -119,7 +119,7 @@ def test_a_budget_is_the_order_statistic_that_shows_it(monkeypatch, flown):
     (2000, 2000, 0, "1109 runs without a failure show a value, and 852 with 90 % confidence"),
     (1108, 1098, 0, "1109 runs without a failure show a value"),  # too few for 95 %, whether or not some fail
     (1109, 1099, 0, "10 runs that were not flown to the end are beyond every angle"),
-    (1109, 1049, 50, "10 runs that were not flown to the end are beyond every angle"),  # a run that misses t_f has its angles
+    (1109, 1049, 50, "10 runs that were not flown to the end are beyond every angle"),  # who misses has angles
 ])  # fmt: skip
 def test_why_a_budget_has_no_value_is_said(flown, ok, missed, said):
     told = {"after": 0.0, "boresight": [1.0, 0.0, 0.0], "probability": 0.9973, "confidence": 0.95,
