@@ -1,13 +1,17 @@
 """Ctrl-C where it came to nothing, or was told wrongly."""
 
 import importlib
+import math
 import subprocess
 import sys
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from ptsmc_jax import scenario
+from ptsmc_jax.campaigns import store
+from ptsmc_jax.scenario import parsing
 from tests.helpers import ROOT, SHORT_CHAIN, tree
 from tuning.cli import options, searches
 
@@ -95,6 +99,24 @@ def test_a_search_that_leaves_its_best_where_it_is_interrupted_goes_on_without_f
     assert shown == [("interrupted", "interrupted")]
     assert capsys.readouterr().err == (f"{told} goes on from here\n" if told else "")
     assert {"journal.bin", "summary.json"} <= set(tree(tmp_path / "out"))
+
+
+def test_a_search_is_shown_as_it_is_when_it_is_read_again(tmp_path):
+    """A front without gains told "|S| at most inf dB" when it was done, and what it meant when it was shown again."""
+    (tmp_path / "s.toml").write_text(SHORT_CHAIN)
+    loaded, shown = scenario.read(tmp_path / "s.toml"), []
+    said = {"status": "not met", "without": [math.inf, 6.0], "slews": ({"rms": np.float64(math.nan)},)}
+    search = searches.LongSearch(
+        {"command": "pareto", "seed": 0},
+        "window error",
+        work=lambda report, journal: SimpleNamespace(status="not met"),
+        write=lambda making, _: store.record(making, parsing.dump(loaded), search.known_by, said),
+        summary=lambda _: said,
+        show=lambda summary, folder, how: shown.append(summary),
+    )
+    for _ in range(2):
+        assert searches.run(search, loaded, tmp_path / "out", force=False, quiet=False) == 1
+    assert shown == 2 * [{"status": "not met", "without": [None, 6.0], "slews": [{"rms": None}]}]
 
 
 TWICE = """

@@ -92,5 +92,6 @@ def run(search: LongSearch, loaded: "Scenario", folder: Path, *, force: bool, qu
     elif force:
         interrupted(force)
     if not quiet:
-        search.show(search.summary(outcome), folder, "interrupted" if outcome.status == "interrupted" else "done")
+        said = store.plain(search.summary(outcome))  # as it is read when it is shown again
+        search.show(said, folder, "interrupted" if outcome.status == "interrupted" else "done")
     return STATUS[outcome.status]
