@@ -86,6 +86,23 @@ def test_an_unstable_hold_is_said_and_has_negative_margins(command, tmp_path):
     assert found["worst"]["gain_margin"] < 0.0
 
 
+@pytest.mark.parametrize(("judged", "mood", "said"), [
+    (True, "bad",
+     "The loop is stable in hold, but before the hand-over, with its gains frozen, it is NOT: gain -1.9 dB"),
+    (False, "calm", "The loop is stable: gain -1.9 dB"),  # there its margins do not count
+])  # fmt: skip
+def test_a_loop_that_is_unstable_before_the_hand_over_is_not_called_stable(tmp_path, judged, mood, said):
+    """With a period of half of t_f the page opened with a stable loop of -1.9 dB and -180 deg."""
+    margins = dict.fromkeys(("gain_up", "gain_down", "phase", "delay", "modulus"), 6.0)
+    summary = {
+        "stable": True, "open": [], "said": None, "hold": {"u1": margins}, "together": margins, "sensors": {},
+        "before": [{"time_to_go": 1.0, "judged": judged, "stable": False, "open": []}],
+        "worst": {"gain_margin": -1.9, "phase_margin": None, "delay_margin": None, "modulus_margin": None},
+    }  # fmt: skip
+    heading, _ = page._margins(page.Result(tmp_path, {}, summary, {}))
+    assert (heading.mood, heading.headline) == (mood, said)
+
+
 def test_the_page_opens_with_what_is_left():
     known = {"gain_margin": 6.1, "phase_margin": 40.0, "delay_margin": 0.05, "modulus_margin": 5.0}
     assert margin_sentences.left({"worst": known}) == "gain 6.1 dB, phase 40 deg, delay 0.05 s, modulus 5 dB"

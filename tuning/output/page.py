@@ -307,6 +307,9 @@ def _margins(result: Result) -> tuple[Heading, list[Section]]:
     lines = list(margin_sentences.lines(summary, with_least=False))
     if summary.get("open"):
         heading = Heading("bad", "The loop in hold is open: a limit of the actuators cuts the command", lines)
+    elif summary["stable"] and any(loop["judged"] and not loop["stable"] for loop in summary["before"]):
+        said = "The loop is stable in hold, but before the hand-over, with its gains frozen, it is NOT"
+        heading = Heading("bad", f"{said}: {margin_sentences.left(summary)}", lines)
     elif summary["stable"]:
         heading = Heading("calm", f"The loop is stable: {margin_sentences.left(summary)}", lines)
     else:
