@@ -272,6 +272,16 @@ def test_margins_of_the_exact_sign_are_told_to_be_without_it(slopes):
     assert (NO_SIGN in said) == (slopes is None)
 
 
+@pytest.mark.parametrize(("start", "end", "said"), [
+    (None, None, "are not checked"), (1e-9, None, "agree with differences to 1e-09 at the start"),
+])  # fmt: skip
+def test_slopes_that_have_no_differences_are_not_said_to_agree_with_them(start, end, said):
+    """Without any number the sentence ended with "agree with differences to "."""
+    found = {"influence": {}, "slopes_off_central_differences": {"start": start, "end": end}}
+    (told,) = search_sentences.trust({"trust": found, "at_bound": {}, "verdicts": []})
+    assert told.startswith(f"slopes by automatic differentiation {said}")
+
+
 def test_slopes_that_are_off_may_be_due_to_steps_of_the_torque():
     """With steps of 1 mN m on a large satellite they were off by 3 in a loop that neither chatters nor breaks off."""
     found = {"influence": {}, "slopes_off_central_differences": {"start": 3.0, "end": 2.0}}

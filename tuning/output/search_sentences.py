@@ -175,7 +175,12 @@ def trust(summary: Summary) -> Iterator[str]:
         return
     off = {place: value for place, value in record["slopes_off_central_differences"].items() if value is not None}
     shown = " and ".join(f"{value:.0e} at the {place}" for place, value in off.items())
-    if max(off.values(), default=0.0) <= AGREE:
+    if not off:
+        yield (
+            "slopes by automatic differentiation are not checked: differences of the goal's logarithm are no numbers, "
+            "as where the error is zero or no trial ends"
+        )
+    elif max(off.values(), default=0.0) <= AGREE:
         yield f"slopes by automatic differentiation agree with differences to {shown}"
     else:
         yield (
