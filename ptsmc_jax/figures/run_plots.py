@@ -243,11 +243,13 @@ def _names(parts: Parts) -> tuple[str, str, str]:
 
 def _components(axes: Axes, t: ArrayLike, values: ArrayLike, symbol: str, **kwargs: Any) -> None:
     values = np.asarray(values)
-    for k in range(values.shape[1]):  # beyond as many as there are styles, the same in thin lines
+    for k in range(values.shape[1]):  # beyond as many as there are styles, the same in thin lines, then both paler
         colour, style = STYLES[k % len(STYLES)]
-        width = {"lw": 0.8} if k >= len(STYLES) else {}
+        turn = k // len(STYLES)
+        width = {"lw": 0.8} if turn % 2 else {}
+        paler = {"alpha": 0.45 * kwargs.get("alpha", 1.0)} if turn >= 2 else {}
         label = f"${symbol}_{{{k + 1}}}$"
-        axes.plot(np.asarray(t), values[:, k], color=colour, ls=style, label=label, **width, **kwargs)
+        axes.plot(np.asarray(t), values[:, k], color=colour, ls=style, label=label, **width, **{**kwargs, **paler})
 
 
 def _positive(sizes: np.ndarray) -> np.ndarray:

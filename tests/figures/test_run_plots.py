@@ -37,6 +37,14 @@ def test_the_time_to_go_has_plain_numbers():
     assert all(re.fullmatch(r"[\d.]+", label) for label in labels)
 
 
+def test_no_two_of_twenty_states_look_alike():
+    """Of a chain of order 20, x6, x11 and x16 did: the legend named three lines of the same colour, style and width."""
+    axes = Figure().subplots()
+    run_plots._components(axes, np.arange(3.0), np.zeros((3, 20)), "x")
+    looks = {(one.get_color(), one.get_linestyle(), one.get_linewidth(), one.get_alpha()) for one in axes.lines}
+    assert len(looks) == 20
+
+
 @pytest.mark.parametrize("order", [2, 3])
 def test_slopes_of_theory_are_drawn_with_the_powers_that_they_are_said_to_have(order):
     """The error falls like r^eta, and of a chain of order 3 s like r^(eta + 1)."""
