@@ -11,6 +11,7 @@ import pytest
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns.montecarlo import Trials
 from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.metrics import Metrics
 from tests.helpers import SHORT, small_search, tree
 from tests.output.pages import checked
@@ -24,6 +25,16 @@ def test_the_knee_is_where_a_front_bends(scale):
     torque = np.geomspace(0.1, 10.0, 21)
     error = np.where(torque < 1.0, torque**-3.0, torque**-0.2) * scale
     assert pareto.knee_of(np.stack([torque, error], axis=1)) == 10
+
+
+@pytest.mark.parametrize(("lost", "largest"), [(0, 90.0), (5, 90.0), (20, 80.0)])
+def test_the_share_that_a_torque_stays_below_is_one_of_all_trials(lost, largest):
+    """With 5 of 100 lost it was told of 90 % of the 95 others, which are 86 % of the trials."""
+    asked = scenario.from_tables({"requirements": {"peak_torque": {"limit": 1.0, "quantile": 0.9}}})
+    peaks, status = np.arange(1.0, 101.0), np.full(100, rollout.OK)
+    status[100 - lost :] = rollout.DIVERGED
+    metrics = Metrics(*(peaks if name == "peak_torque" else None for name in Metrics._fields))
+    assert judging.largest("peak_torque", asked, Trials(np.arange(100), metrics, status, peaks, {})) == largest
 
 
 def point(peak, rms, **others):

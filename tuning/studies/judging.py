@@ -92,11 +92,14 @@ def figures(scenario: Scenario, trials: Trials, fresh_seed: int) -> dict[str, An
 
 
 def largest(name: str, scenario: Scenario, trials: Trials) -> float:
-    """What a metric stays below in the share of trials that its requirement asks for, or in all; NaN: none ended."""
+    """What a metric stays below in the share of trials that its requirement asks for, or in all; NaN: none ended.
+
+    A trial that failed is beyond all others, as in the verdict; where so many are, it is the largest of those that end.
+    """
     values = np.sort(np.asarray(getattr(trials.metrics, name))[trials.finished])
     asked = scenario.requirements.get(name)
     share = (asked.share if isinstance(asked, Limit) else None) or 1.0
-    return statistics.value_at(values, share) if values.size else np.nan
+    return statistics.value_at(values, min(1.0, share * trials.status.size / values.size)) if values.size else np.nan
 
 
 def limit_of(name: str, scenario: Scenario) -> float | None:
