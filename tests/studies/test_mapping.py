@@ -66,6 +66,16 @@ def test_axes(text, values):
     np.testing.assert_allclose(mapping.axis(text, "--x").values, values)
 
 
+@pytest.mark.parametrize(
+    "text", ["hardware.delay=1:6:5", "hardware.delay=0.6:8.4:9", "hardware.delay=0:2:5", "controller.delta=0.05:5:9",
+             "loop.t_end=100:100.001:5"]
+)  # fmt: skip
+def test_an_axis_is_made_again_by_what_is_kept_of_it(text):
+    """Of 1, 2, 4 and 6 periods of delay 1:6:4 was kept, which are 1, 2, 3 and 6."""
+    once = mapping.axis(text, "--x")
+    assert mapping.axis(once.text, "--x").values == once.values
+
+
 def test_axes_have_the_units_of_their_keys():
     loaded = scenario.from_tables(tomllib.loads(SHORT))
     shown = {"controller.delta": "[s]", "observer.gain[0]": "[N m s]", "hardware.rate_noise": "[rad/s]"}

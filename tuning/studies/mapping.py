@@ -30,11 +30,12 @@ class Axis:
 
     key: str
     values: tuple[float, ...]
+    span: str = ""  # LOW:HIGH:COUNT that they are of, where their ends and number do not say it
 
     @property
     def text(self) -> str:
         """The axis as `axis` reads it."""
-        return f"{self.key}={self.values[0]:g}:{self.values[-1]:g}:{len(self.values)}"
+        return f"{self.key}={self.span or f'{self.values[0]:g}:{self.values[-1]:g}:{len(self.values)}'}"
 
     @property
     def logarithmic(self) -> bool:
@@ -103,7 +104,7 @@ def axis(text: str, option: str) -> Axis:
     if len(different) < 2:  # a single value has no cells to draw
         those = "two whole numbers" if key in WHOLE_NUMBERS else "two values that differ in six digits"
         raise UsageError(f"{wanted}, with {those} between LOW and HIGH at least")
-    return Axis(key, different)
+    return Axis(key, different, span if len(different) < count or key in WHOLE_NUMBERS else "")
 
 
 def fly(scenario: Scenario, x: Axis, y: Axis, seed: int, trials: int, tell: Callable[[int, int], None]) -> Map:
