@@ -208,3 +208,24 @@ def test_where_a_limit_cuts_the_command_the_loop_is_said_to_be_open():
     found = stability.summary(ready, course._replace(at_input=course.at_input._replace(**lost)))
     assert found["open"] == ["u1"]
     assert str(found["hold"]["u1"]["modulus"]) == "0.0"  # was -0
+
+
+@pytest.mark.parametrize("hardware", [{}, {"torque_limit": 0.02}])
+def test_a_sample_of_which_the_law_makes_nothing_is_blamed_on_no_limit(hardware):
+    """The first one of a time base, whose profile begins where the error is: `margins` said that a limit cuts it."""
+    tables = {"plant": {"kind": "chain", "x0": [1.0, 0.0]}, "disturbance": {"kind": "none"},
+              "controller": {"kind": "time_base_pd", "t_f": 3.0},
+              "loop": {"mode": "sampled", "period": 0.1, "window": 1.0},
+              "hardware": hardware}  # fmt: skip
+    found = stability.summary(*stability.find(scenario.from_tables(tables)))
+    first = found["before"][0]
+    assert (first["time_to_go"], first["open"], first["cut"]) == (3.0, ["u1"], [])
+    assert any(loop["cut"] for loop in (found, *found["before"])) == bool(hardware)
+    lines = list(margin_sentences.lines(found))
+    assert (
+        sum("make nothing of the state at input u1 before the hand-over, at 3 s to go" in line for line in lines) == 1
+    )
+    assert any("limit of the actuators" in line for line in lines) == bool(hardware)
+    itself: Any = SimpleNamespace(summary=found | {"open": ["u1"], "cut": []})
+    heading, _ = page._margins(itself)
+    assert "limit" not in heading.headline

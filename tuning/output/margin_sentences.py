@@ -59,19 +59,35 @@ def lines(summary: Summary, *, with_least: bool = True) -> Iterator[str]:
 
 
 def _cut(summary: Summary) -> Iterator[str]:
-    """Where a limit of the actuators opens the loop, so that what is infinite is no margin."""
-    cut = {}  # inputs, by where; none in results of before it was looked at
-    if summary.get("open"):
-        cut["in hold"] = summary["open"]
-    loops = [loop for loop in summary["before"] if loop.get("open")]
+    """Where the loop is open, so that what is infinite is no margin: by a limit of the actuators, or by itself."""
+    for by_limit in (True, False):
+        for where, names in _opened(summary, by_limit).items():
+            if by_limit:
+                yield (
+                    f"a limit of the actuators cuts the nominal run's command at input {', '.join(names)} {where}: the "
+                    "loop is open there, and margins without a limit say nothing of it once the limit is left"
+                )
+            else:
+                yield (
+                    f"law and sensors make nothing of the state at input {', '.join(names)} {where}: the loop is open "
+                    "in that sample, and margins without a limit say nothing of the samples beside it"
+                )
+
+
+def _opened(summary: Summary, by_limit: bool) -> dict[str, dict[str, None]]:
+    """Inputs at which nothing comes back, by where; of results of before this was told apart, by a limit."""
+
+    def at(loop: Mapping[str, Any]) -> list[str]:
+        opened = loop.get("open") or []  # none in results of before it was looked at
+        cut = loop.get("cut", opened)
+        return [name for name in opened if (name in cut) == by_limit]
+
+    found = {"in hold": dict.fromkeys(at(summary))}
+    loops = [loop for loop in summary["before"] if at(loop)]
     if loops:
         span = _span(sorted(loop["time_to_go"] for loop in loops))
-        cut[f"before the hand-over, at {span}"] = dict.fromkeys(name for loop in loops for name in loop["open"])
-    for where, names in cut.items():
-        yield (
-            f"a limit of the actuators cuts the nominal run's command at input {', '.join(names)} {where}: the "
-            "loop is open there, and margins without a limit say nothing of it once the limit is left"
-        )
+        found[f"before the hand-over, at {span}"] = dict.fromkeys(name for loop in loops for name in at(loop))
+    return {where: names for where, names in found.items() if names}
 
 
 def _span(times: list[float]) -> str:

@@ -306,7 +306,8 @@ def _margins(result: Result) -> tuple[Heading, list[Section]]:
     summary = result.summary
     lines = list(margin_sentences.lines(summary, with_least=False))
     if summary.get("open"):
-        heading = Heading("bad", "The loop in hold is open: a limit of the actuators cuts the command", lines)
+        why = ": a limit of the actuators cuts the command" if summary.get("cut", True) else " in the sample looked at"
+        heading = Heading("bad", f"The loop in hold is open{why}", lines)
     elif summary["stable"] and any(loop["judged"] and not loop["stable"] for loop in summary["before"]):
         said = "The loop is stable in hold, but before the hand-over, with its gains frozen, it is NOT"
         heading = Heading("bad", f"{said}: {margin_sentences.left(summary)}", lines)

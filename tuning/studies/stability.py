@@ -93,13 +93,17 @@ def summary(ready: Study, course: Course) -> dict[str, Any]:
     def table(left: margins.Margins, labels: list[str], fields: tuple[str, ...]) -> dict[str, Any]:
         return {label: {name: _number(getattr(left, name)[k]) for name in fields} for k, label in enumerate(labels)}
 
-    def opened(left: margins.Margins) -> list[str]:
-        return [name for name, cut in zip(inputs, _open(left), strict=True) if cut]
+    def opened(k: int) -> dict[str, list[str]]:
+        left, new = jax.tree.map(lambda v: v[k], (course.at_input, course.loops.new))
+        none_back = _open(left)
+        cut = none_back & ~np.any(new[0], axis=0)  # the plant does not feel the command
+        return {key: [name for name, it in zip(inputs, rows, strict=True) if it]
+                for key, rows in (("open", none_back), ("cut", cut))}  # fmt: skip
 
     t_f = float(ready.parts.controller.t_f)
     return {
         "stable": bool(hold.stable.all()),
-        "open": opened(hold),
+        **opened(-1),
         "worst": {name: _number(v) for name, v in course.worst().items()},
         "hold": table(hold, inputs, (*FIELDS, "crossover")),
         "together": {name: _number(course.together[name]) for name in FIELDS},
@@ -110,7 +114,7 @@ def summary(ready: Study, course: Course) -> dict[str, Any]:
                 "judged": bool(counts),
                 "stable": bool(before.stable[k].all()),
                 **{name: _number((max if name == "modulus" else min)(getattr(before, name)[k])) for name in FIELDS},
-                "open": opened(jax.tree.map(lambda v, k=k: v[k], before)),
+                **opened(k),
             }
             for k, (t, counts) in enumerate(zip(course.t[:-1], course.judged, strict=False))
         ],
@@ -121,7 +125,10 @@ def summary(ready: Study, course: Course) -> dict[str, Any]:
 
 
 def _open(left: margins.Margins) -> np.ndarray:
-    """Where nothing comes back (m,), bool, as where a limit cuts the command of the nominal run: L = 0."""
+    """Where nothing comes back (m,), bool: L = 0.
+
+    As where a limit cuts the command of the nominal run, or the law or sensors pass nothing on at this sample.
+    """
     # infinite, or, where other axes make the loop unstable, as far from a border as is told
     unlimited = (np.abs(left.gain_up) >= MOST) & (np.abs(left.gain_down) >= MOST)
     return unlimited & (np.abs(left.modulus) < 1e-9) & np.isnan(left.crossover)
