@@ -1,6 +1,7 @@
 """Why trials are the worst: their inputs as percentiles of all trials, beside the median one."""
 
 import inspect
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -8,6 +9,7 @@ import polars as pl
 import pytest
 
 from ptsmc_jax import scenario as scenarios
+from ptsmc_jax.campaigns import campaign, plans
 from ptsmc_jax.dispersions.quantities import CATEGORIES
 from ptsmc_jax.numerics import statistics
 from tuning.output import campaign_sentences, campaign_terminal
@@ -85,6 +87,20 @@ def test_each_input_of_a_worst_trial_is_a_percentile_beside_the_median(monkeypat
     table = table.with_columns(peak_torque=pl.Series([*cut[:-1], None]))  # as of a run that never settles
     assert {row["value"] for row in why(Rows(), ["peak_torque"], 401) if row["trial"] == 400} == {None}
     assert statistics.distinct({"a": angle, "b": -angle, "c": rate}) == ["a", "c"]
+
+
+def test_whatever_is_drawn_may_be_a_reason(monkeypatch):
+    """Columns are in the order of their names, and inertia and disturbance, before the initial angle, were left out."""
+    drawn = {"attitude": {"kind": "uniform"}, "inertia": {"kind": "relative_normal", "std": 0.1},
+             "disturbance_phase": {"kind": "uniform"}}  # fmt: skip
+    ready = scenarios.study(scenarios.from_tables({"dispersion": drawn}))
+    columns = campaign.Campaign(ready, 0).draw(range(2)).drop("trial").columns
+    assert {"inertia_11", "initial_angle"} <= set(columns)
+    assert any(name.startswith("disturbance") for name in columns)
+    kept = ["trial", *plans.HEADING, *plans.OF_ROWS.values(), *ready.catalogue, *plans.SAMPLES, *columns, "mine"]
+    monkeypatch.setattr(campaign_summary.rows, "columns_of", lambda part: kept)
+    folder: Any = SimpleNamespace(own_names=["mine"])
+    assert inspect.unwrap(campaign_summary.drawn_columns)(folder, [None]) == columns
 
 
 def test_what_chance_shows_among_the_few_trials_that_have_a_metric_is_no_reason(capsys):

@@ -98,6 +98,9 @@ def test_trials_that_are_all_the_same_flight_are_said(command, tmp_path, flown):
 
 def test_trials_that_all_fail_are_not_said_to_be_the_same():
     assert campaign_summary._alike({"window_error": {"without_value": 5}}, 5) == []
+    at_rest = {"window_error": {"without_value": 0, "mean": 0.0, "max": 0.0}}
+    (said,) = campaign_summary._alike(at_rest, 5, drawn=True)  # another inertia of a body that stays at rest
+    assert said == "all 5 trials have the same metrics: what is drawn in them changes none"
 
 
 def test_more_trials_add_to_what_is_there(command, flown):

@@ -125,6 +125,7 @@ def summarise(folder: Folder) -> dict[str, Any]:
         ranked = ranks.setdefault(known.tobytes(), {})
         drivers[name] = statistics.drivers(of, values[:SEARCHED][known], ranked, CATEGORIES) if known.sum() > 1 else {}
     done = int(head.height)
+    differ = any(statistics.vary(inputs[key].to_numpy().astype(float)) for key in drawn)
     met = all(v["met"] for v in verdicts) if verdicts else counts["ok"] == done
     return {
         "status": "unfinished" if done < folder.trials or waiting else "met" if met else "not met",
@@ -144,7 +145,11 @@ def summarise(folder: Folder) -> dict[str, Any]:
         "drivers": drivers,
         "driver_trials": driver_trials,  # in which they were seen: those that have the metric
         **_samples(folder, parts),
-        "cautions": [*cautions.of(folder.scenario), *filter(None, [folder.otherwise]), *_alike(quantiles, done)],
+        "cautions": [
+            *cautions.of(folder.scenario),
+            *filter(None, [folder.otherwise]),
+            *_alike(quantiles, done, drawn=differ),
+        ],
     }
 
 
@@ -163,16 +168,21 @@ def _samples(folder: Folder, parts: list[rows.Part]) -> dict[str, Any]:
 
 
 def drawn_columns(folder: Folder, parts: list[rows.Part]) -> list[str]:
-    """The columns that say what trials flew with: those from the initial angle on, but for metrics of one's own."""
-    names = rows.columns_of(parts[0])
-    return [name for name in names[names.index("initial_angle") :] if name not in folder.own_names]
+    """The columns that say what trials flew with: all but results, and whose draws a row has.
+
+    They stand in the order of their names: inertias and disturbances before the initial angle.
+    """
+    others = {plans.TRIAL, *plans.OF_ROWS.values(), *plans.RESULTS, *plans.SAMPLES, *folder.own_names}
+    return [name for name in rows.columns_of(parts[0]) if name not in others]
 
 
-def _alike(quantiles: dict[str, Any], trials: int) -> list[str]:
-    """Whether every trial is the same flight, to round-off."""
+def _alike(quantiles: dict[str, Any], trials: int, *, drawn: bool = False) -> list[str]:
+    """Whether every trial is the same flight, to round-off; drawn: something is that differs between them."""
     known = [metric for metric in quantiles.values() if "max" in metric]
     if trials < 2 or not known or any(abs(m["max"] - m["mean"]) > SAME * abs(m["max"]) for m in known):
         return []
+    if drawn:  # as another inertia of a body that stays at rest
+        return [f"all {trials} trials have the same metrics: what is drawn in them changes none"]
     return [
         f"all {trials} trials are the same flight: nothing is drawn in them, neither by [dispersion] nor as noise of "
         "[hardware], and one would do"
