@@ -170,6 +170,8 @@ def test_less_accurate_gains_are_not_praised():
     assert said.endswith(
         "(95 %: 10 to 20); broken by the paper's gains, scaled to this body and period: gain_margin and effort"
     )
+    (said,) = sentences.accuracy(tuned(0.08, {"ok": 64}, met=False))  # which is no consolation
+    assert said.endswith("they leave 12.5 times the error, and break peak_torque")
     (said,) = sentences.accuracy(tuned(40.0, {"ok": 64}, met=False, paper_is="paper's law"))
     assert said == (
         "the tuned gains are 40 times as accurate as the paper's law with the paper's gains, but break peak_torque"

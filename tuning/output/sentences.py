@@ -143,15 +143,17 @@ def accuracy(summary: Summary) -> Iterator[str]:
     paper = PAPER[summary.get("paper_is", "paper")]
     if times is not None and fresh["counts"].get("ok", 0):
         within = summary.get("accuracy_gain_interval")
-        but = f", but break {' and '.join(broken)}" if broken else ""
+        they_break = f"break {' and '.join(broken)}" if broken else ""
         if times >= 1.0:
+            but = f", but {they_break}" if broken else ""
             yield f"the tuned gains are {ratio(times)} times as accurate as {paper}{_between(within, ratio)}{but}"
         else:
             within = None if within is None else [1.0 / v for v in reversed(within)]
             worse = f"the tuned gains are less accurate than {paper}: they leave {ratio(1.0 / times)} times the error"
             theirs = summary.get("broken_by", {}).get("paper")
             by_paper = f"; broken by {paper}: {' and '.join(theirs)}" if theirs else ""
-            yield f"{worse}{_between(within, ratio)}{but}{by_paper}"
+            and_too = f", and {they_break}" if broken else ""
+            yield f"{worse}{_between(within, ratio)}{and_too}{by_paper}"
     yield from paper_refused(summary)
     cut = fresh.get("saturated")
     if cut and cut["max"]:
