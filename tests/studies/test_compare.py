@@ -182,6 +182,14 @@ def test_the_command(command, tmp_path, monkeypatch, others):
     assert command("compare", "s.toml", "--seed", "x")[0] == 2
 
 
+@pytest.mark.parametrize(("least", "said"), [(2e-6, "2 times that"), (0.0, "4.00e-06")])
+def test_how_far_the_papers_law_is_behind_one_that_leaves_no_error_is_said_by_its_own(least, said):
+    """A quotient by zero broke off after all laws were tuned."""
+    laws = {"pd": {"window_error": least, "met": True}, "prescribed_time": {"window_error": 4e-6, "met": True}}
+    assert law_sentences.winner({"laws": laws}).endswith(f"; prescribed time has {said}")
+    assert law_sentences.alike({"trials": 1, "judged_on": "flight clock"}).endswith("on 1 fresh trial, flight clock")
+
+
 def test_laws_are_flown_once_more_with_what_they_are_not_told_of(eight):
     """The plant that flies is a tenth heavier and lighter, or a period later; law and observer know what they knew."""
     base = scenario.from_tables(TABLES)

@@ -73,6 +73,13 @@ def test_only_what_is_beaten_beyond_its_interval_is_dominated():
     assert not any(p.knee and p.dominated for p in marked)
 
 
+def test_gains_without_an_error_or_without_a_trial_that_ends_are_no_knee_of_a_front():
+    """Their logarithms are no numbers, and one such made itself the knee."""
+    sizes = {0.2: 4.0, 0.3: 2.0, 0.5: 1.6, 0.6: 0.0, np.nan: np.nan}
+    judged = {peak: (point(peak, size), trials([size])) for peak, size in sizes.items()}
+    assert [p.peak for p in pareto._marked(judged) if p.knee] == [0.3]
+
+
 def test_more_failures_or_too_few_trials_beat_nothing():
     """Half the error at less torque, but from trials of which some failed; from too few; where nothing is drawn."""
     rng = np.random.default_rng(0)

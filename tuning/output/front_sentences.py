@@ -77,7 +77,7 @@ def front_lines(summary: Summary) -> Iterator[str]:
 def front_heading(summary: Summary) -> str:
     """How many points, and on what they were judged."""
     kept = sum(not point["dominated"] for point in summary["points"])
-    return f"{kept} points, each judged on {summary['trials']} fresh trials"
+    return f"{kept} points, each judged on {sentences.fresh_trials(summary['trials'])}"
 
 
 def slew_times(summary: Summary) -> Table:
@@ -122,7 +122,7 @@ def _tuned_for(summary: Summary, points: str, what: str, of: str = "") -> str:
     """How many points of such a name there are, what each is tuned for, and on what they were judged."""
     count = len(summary[points])
     many, each = ("s", "each ") if count != 1 else ("", "")
-    return f"gains tuned for {count} {what}{many}{of}, {each}judged on {summary['trials']} fresh trials"
+    return f"gains tuned for {count} {what}{many}{of}, {each}judged on {sentences.fresh_trials(summary['trials'])}"
 
 
 def robust(summary: Summary) -> Table:

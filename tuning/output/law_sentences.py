@@ -222,7 +222,7 @@ WORDS = {
 def alike(summary: Summary) -> str:
     """How the laws were tuned and judged."""
     tuned = "each law is tuned alike in all of its gains, the scenario's own in those of tune.free where that is given"
-    return f"{tuned}, and judged on {summary['trials']} fresh trials, {summary['judged_on']}"
+    return f"{tuned}, and judged on {sentences.fresh_trials(summary['trials'])}, {summary['judged_on']}"
 
 
 def winner(summary: Summary) -> str:
@@ -234,7 +234,8 @@ def winner(summary: Summary) -> str:
     best, ours = min(errors, key=errors.__getitem__), "prescribed_time"
     behind = ""
     if ours in errors and best != ours:
-        behind = f"; {_name(ours)} has {errors[ours] / errors[best]:.3g} times that"
+        theirs = f"{errors[ours] / errors[best]:.3g} times that" if errors[best] else f"{errors[ours]:.2e}"
+        behind = f"; {_name(ours)} has {theirs}"
     return f"of the laws that meet every requirement {_name(best)} has the smallest error, {errors[best]:.2e}{behind}"
 
 

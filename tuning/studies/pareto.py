@@ -260,7 +260,8 @@ def _marked(judged: dict[float, tuple[Point, Trials]]) -> list[Point]:
     points = [
         replace(point, dominated=any(_beats(other, (point, trials)) for other in pairs)) for point, trials in pairs
     ]
-    front = [k for k, point in enumerate(points) if not point.dominated]
+    # with logarithms, so without zeros, and without gains with which no trial ends
+    front = [k for k, p in enumerate(points) if not p.dominated and p.peak > 0.0 and p.rms > 0.0]
     if len(front) > 2:
         knee = front[knee_of(np.asarray([[points[k].peak, points[k].rms] for k in front]))]
         points[knee] = replace(points[knee], knee=True)
