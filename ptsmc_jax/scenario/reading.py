@@ -83,8 +83,8 @@ def replace(scenario: Scenario | str | Path, **changes: Any) -> Scenario:
     """
     scenario = of(scenario)
     tables = parsing.stated(scenario)
-    for name, value in changes.items():
-        table, _, key = name.partition("__")
+    for name in sorted(changes, key=_comes):
+        value, (table, _, key) = changes[name], name.partition("__")
         if value is None and _is_known(scenario, table, key):
             removed = tables if not key else tables.get(table, {})
             removed.pop(key or table, None)
@@ -95,6 +95,12 @@ def replace(scenario: Scenario | str | Path, **changes: Any) -> Scenario:
         else:
             tables[table] = {**tables.get(table, {}), key: value}
     return from_tables(tables, run=not own.waits(scenario))
+
+
+def _comes(name: str) -> int:
+    """When a change is made: whole tables and kinds first, which would drop the keys that go with them."""
+    _, _, key = name.partition("__")
+    return 0 if not key else 1 if key == "kind" else 2
 
 
 def _is_known(scenario: Scenario, table: str, key: str) -> bool:

@@ -370,6 +370,15 @@ def test_replace_by_none_returns_a_key_to_its_default():
     assert turned.initial == reference_tables.Initial(rotvec_deg=(0.0, 0.0, 90.0))
 
 
+@pytest.mark.parametrize(
+    "whole", [{"controller__kind": "pd"}, {"controller": {"kind": "pd"}}], ids=["a kind", "a whole table"]
+)
+def test_replace_keeps_the_keys_that_stand_before_a_kind_or_a_table(whole):
+    sampled = from_tables({"loop": {"mode": "sampled"}})
+    law: Any = replace(sampled, controller__k_p=0.5, **whole).controller
+    assert (law.kind, law.k_p) == ("pd", 0.5)
+
+
 def test_replace_adds_a_table():
     tune = replace(from_tables({}), tune__steps=5).tune
     assert tune is not None
