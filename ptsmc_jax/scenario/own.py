@@ -160,6 +160,8 @@ def _with_keys(table: Any, found: Any) -> Any:
             continue
         if (hasattr(table, field.name) or field.name == "rest") and field.name not in common:  # tables have it
             raise _taken(found, field.name, "another name")
+        if table.prefix + field.name == "observer_gain":
+            raise ValueError("the name of its field must be another than gain, which has a number for each axis")
         gain = field.metadata.get("gain")
         key_types.append((field.name, *_key(field, gain)))
         meaning = "" if gain is None else " ".join(gain.meaning.split())
@@ -267,8 +269,6 @@ def _gain(table: Any, found: Any, field: dataclasses.Field, gain: Any) -> GainBo
         raise ValueError(f"its field {field.name} is a gain, but of such a part none is tuned; allowed is a number")
     if not table.prefix and not of_law({field.name: gain}):
         raise ValueError(f"the name of its gain {field.name} stands for one of another part")
-    if table.prefix + field.name == "observer_gain":
-        raise ValueError("the name of its gain must be another than gain, which has a number for each axis")
     bounds = _bounds(gain, f"gain {field.name} of the class {found.__name__}")
     _inside(field, gain.usual)
     return bounds

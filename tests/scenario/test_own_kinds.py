@@ -378,6 +378,8 @@ def test_what_is_wrong_with_ones_own_law_is_one_sentence(here, law, keys, of_wha
         ("observer", 'return {"last": seen,', 'return {"last": jnp.zeros(3),', "observer.code is"),
         ("observer", "def step", "def stop", "has no method step"),
         ("observer", "share: float", "gain: float", "another than gain"),
+        ("observer", "    share: float", "    gain: float = 0.5\n    share: float", "another than gain"),
+        ("observer", "    share: float", "    gain: tuple = (0.5,)\n    share: float", "another than gain"),
         ("observer", "share: float", "update: float", "a field of the class Filtered is called update, which has its"),
         (
             "observer",
