@@ -1,8 +1,9 @@
 """What single keys of a scenario cannot tell: keys against each other."""
 
 import math
+from typing import Any
 
-from ptsmc_jax.scenario import errors, tables
+from ptsmc_jax.scenario import errors, own, tables
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.gain_bounds import hand_over
 from ptsmc_jax.scenario.tables import Scenario
@@ -142,7 +143,7 @@ def _check_dispersion(scenario: Scenario) -> None:
     dispersion = scenario.dispersion
     for what, allowed in (("phase", "a sinusoid, or gravity_gradient"), ("amplitude", "a sinusoid, or constant")):
         asked = getattr(dispersion, f"disturbance_{what}", None) is not None
-        if asked and not any(hasattr(term, what) for term in scenario.terms):
+        if asked and not any(_has(term, what) for term in scenario.terms):
             raise ScenarioError(
                 f"dispersion.disturbance_{what} needs a disturbance that has {'a' if what == 'phase' else 'an'} {what},"
                 f" but disturbance.kind is {errors.show(scenario.disturbance.kind)}; allowed is {allowed}"
@@ -162,6 +163,13 @@ def _check_dispersion(scenario: Scenario) -> None:
         value = getattr(drawn, key)
         if len(value) != states:
             raise wrong(f"dispersion.x0.{key}", value, f"a list of {states} numbers, one for each state")
+
+
+def _has(term: Any, what: str) -> bool:
+    """Whether a disturbance may have its phase or amplitude drawn; a key of one's own of that name is any number."""
+    if isinstance(term, own.Own):
+        return term.waits or what in term.made.drawn
+    return hasattr(term, what)
 
 
 def _check_misfits(scenario: Scenario) -> None:

@@ -207,6 +207,26 @@ class Turning(ptsmc.Reference):
 """
 
 
+@pytest.mark.parametrize("what", ["amplitude", "phase"])
+def test_a_number_of_a_disturbance_of_ones_own_is_drawn_only_where_its_class_says_so(here, what):
+    """A key of that name alone is any number."""
+    how = {"amplitude": "relative_normal", "phase": "uniform"}[what]
+    tables = {
+        **CHAIN,
+        "disturbance": {"kind": "own", "code": "other.py:Wave"},
+        "dispersion": {f"disturbance_{what}": {"kind": how}},
+    }
+    named = OTHER.replace("size", what)
+    (here / "other.py").write_text(HEAD + named)
+    with pytest.raises(ScenarioError, match=f"dispersion.disturbance_{what} needs a disturbance that has"):
+        scenario.study(scenario.from_tables(tables))
+    said = f"    drawn = {{'{what}': '{what}'}}\n    {what}: float = 0.02"
+    (here / "other.py").write_text(HEAD + named.replace(f"    {what}: float = 0.02", said))
+    ready = scenario.study(scenario.from_tables(tables))
+    flown = [ready.dispersion.apply(ready.parts, 0, trial).disturbance for trial in range(2)]
+    assert getattr(flown[0], what) != getattr(flown[1], what)
+
+
 @pytest.mark.parametrize("beside", ["none", "random_walk"])
 def test_a_disturbance_is_looked_at_beside_one_that_is_no_signal(here, beside):
     """The sum of the two is then the disturbance itself."""
