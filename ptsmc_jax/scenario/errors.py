@@ -1,6 +1,7 @@
 """What is wrong in a scenario, in one sentence, and values as such a sentence says them."""
 
 import json
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -27,6 +28,11 @@ def brief(value: Any) -> str:
     return shown if len(shown) <= LONGEST_VALUE else f"{shown[:LONGEST_VALUE]} ... ({len(shown)} characters)"
 
 
+def show_key(key: str) -> str:
+    """A key as a scenario file would write it: in quotes where it has other letters than TOML's own."""
+    return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else json.dumps(key, ensure_ascii=False)
+
+
 def show(value: Any) -> str:
     """A value as a scenario file would write it."""
     if isinstance(value, bool):
@@ -38,7 +44,7 @@ def show(value: Any) -> str:
     if isinstance(value, list | tuple):
         return "[" + ", ".join(map(show, value)) + "]"
     if isinstance(value, Mapping):
-        return "{ " + ", ".join(f"{k} = {show(v)}" for k, v in value.items()) + " }"
+        return "{ " + ", ".join(f"{show_key(k)} = {show(v)}" for k, v in value.items()) + " }"
     if isinstance(value, int) and value.bit_length() > MOST_BITS:  # Python refuses to write very long ones out
         return f"a whole number of {value.bit_length()} bits"
     return str(value)

@@ -79,6 +79,16 @@ def test_a_scenario_like_another_is_that_one(path):
     assert all(set(given) <= set(written[table]) for table, given in raw.items())
 
 
+def test_keys_of_ones_own_stay_in_order_and_are_quoted_where_toml_asks_for_it():
+    """A field of a class may have any letters; bare keys have not."""
+    own = {"kind": "own", "code": "mine.py:Mine", "größe": 3.0, "beta": 1.0, "alpha": 4.0}
+    terms = [own, {"kind": "none"}]
+    raw = {"disturbance": {"kind": "sum", "terms": terms}, "dispersion": {"own": own}, "reference": own}
+    written = tomllib.loads(new.text(None, raw))
+    assert list(written["reference"])[-3:] == ["größe", "beta", "alpha"]
+    assert (written["dispersion"]["own"], written["disturbance"]["terms"]) == (own, terms)
+
+
 @pytest.mark.parametrize("plant", layouts.TABLES)
 def test_every_key_of_the_plant_is_there_with_its_meaning(plant):
     text = new.text(plant, {})

@@ -109,7 +109,7 @@ class _File:
                 yield from _line(off, key.name, value, _meaning(key))
         known = struct.__struct_fields__
         if issubclass(struct, Own):
-            for key in dict(live or {}).keys() - {"kind", *known}:
+            for key in (key for key in live or () if key not in ("kind", *known)):
                 yield from _line(False, key, values[key], "of one's own")
         if issubclass(struct, Attitude) and borrowed:
             yield from _prose("its attitude by any one of the keys that [initial] has")
@@ -201,7 +201,7 @@ def _meaning(key: keys.Key) -> str:
 
 def _line(off: bool, key: str, value: Any, meaning: str) -> Iterator[str]:
     """`key = value  # meaning`; a meaning too long for that stands above."""
-    shown = f"{'#' if off else ''}{key} = {errors.show(value)}"
+    shown = f"{'#' if off else ''}{errors.show_key(key)} = {errors.show(value)}"
     line = f"{shown:<{COLUMN - 1}} # {meaning}"
     if len(line) > WIDTH:
         yield from _prose(meaning)
