@@ -47,11 +47,17 @@ class Reach:
     period: float  # largest [s]
 
 
+_INTERVALS = (  # of `Reach`
+    ("smallest_t_f", "t_f"), ("smallest_delta", "delta"), ("gain", "largest_gain"), ("smallest_period", "period")
+)  # fmt: skip
+_ABOVE_ZERO = ("smallest_t_f", "t_f", "smallest_period", "period")  # what clocks and steps are divided by
+
+
 def reach_of(scenario: Scenario, **farther: float) -> Reach:
     """The reach of a scenario's own gains, none beyond them; farther: fields of `Reach` that are to be others.
 
-    Raises ValueError where there is no such field, or one of these is no finite number, or negative; TypeError where
-    there is no scenario.
+    Raises ValueError where there is no such field, one of these is no finite number, negative, or a time of zero, and
+    where a smallest one exceeds its largest; TypeError where there is no scenario.
 
     >>> from ptsmc_jax.scenario import from_tables
     >>> reach = reach_of(from_tables({}), delta=2.0)
@@ -65,12 +71,18 @@ def reach_of(scenario: Scenario, **farther: float) -> Reach:
             raise ValueError(f"there is no {name} in a reach; allowed are {', '.join(names)}")
         if np.ndim(value) or np.asarray(value).dtype.kind not in "iuf" or not 0.0 <= value < math.inf:
             raise ValueError(f"{name} is {value!r}, but must be a finite number of at least 0")
+        if name in _ABOVE_ZERO and value == 0.0:
+            raise ValueError(f"{name} is {value!r}, but must be greater than 0")
     table = scenario.controller
     gains, delta = getattr(scenario.observer, "gain", (0.0,)), hand_over(scenario)
     k1, width, rate = getattr(table, "k1", 1.0), getattr(table, "sign_width", 0.0), getattr(table, "surface_rate", 1.0)
     period = scenario.loop.period
     own = Reach(table.t_f, table.t_f, delta, delta, min(gains), max(gains), k1, width, rate, period, period)
-    return dataclasses.replace(own, **farther)
+    made = dataclasses.replace(own, **farther)
+    for low, high in _INTERVALS:
+        if getattr(made, low) > getattr(made, high):
+            raise ValueError(f"{low} is {getattr(made, low):g}, but must be at most {high}, {getattr(made, high):g}")
+    return made
 
 
 def timing(scenario: Scenario, setup: Setup, reach: Reach, saves: object) -> tuple[Any, int]:

@@ -1,5 +1,6 @@
 import contextlib
 import copy
+import re
 import tomllib
 from typing import Any
 
@@ -314,6 +315,21 @@ def test_the_clock_has_room_for_the_reach_of_the_gains(mode):
         assert float((ticks.t_next - ticks.t).max()) <= 0.05 * (1 + ROUNDING) + 40 * np.finfo(float).eps
     with pytest.raises(ValueError, match="delta is -3, but must be a finite number of at least 0"):
         reach_of(scenario, delta=-3)
+
+
+@pytest.mark.parametrize(
+    ("farther", "refused"),
+    [
+        ({"smallest_t_f": 0.0}, "smallest_t_f is 0.0, but must be greater than 0"),
+        ({"smallest_period": 0}, "smallest_period is 0, but must be greater than 0"),
+        ({"t_f": 20.0}, "smallest_t_f is 30, but must be at most t_f, 20"),
+        ({"smallest_delta": 1e9}, "smallest_delta is 1e+09, but must be at most delta, 0.05"),
+    ],
+    ids=str,
+)
+def test_a_reach_that_no_clock_can_have_is_refused(farther, refused):
+    with pytest.raises(ValueError, match=f"^{re.escape(refused)}$"):
+        reach_of(from_tables({"loop": {"mode": "sampled"}}), **farther)
 
 
 @pytest.mark.parametrize("mode", ["anchored", "flight"])
