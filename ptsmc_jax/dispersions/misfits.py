@@ -112,6 +112,16 @@ def _check_coupling(given: Given, parts: Parts) -> None:
     )
 
 
+def check_inertia(given: Given, parts: Parts) -> None:
+    """A flexible body can be with the inertia of a row and the nominal coupling, where the row gives no other."""
+    if _modes(parts) and "mode_coupling" not in given:
+        inertia, coupling = tensors(given[INERTIA]), np.asarray(plant_of(parts).coupling)
+        UnfitError.check(
+            formulas.flexible_bodies(inertia, np.broadcast_to(coupling, (len(inertia), *coupling.shape))),
+            lambda k: f"a flexible body's inertia ({reason(formulas.rest_inertia, inertia[k], coupling)})",
+        )
+
+
 _OUTAGE = ["star_tracker_outage_begin", "star_tracker_outage_end"]
 _FAILURE = ("wheel_failure_time", "wheel_failure_wheel")
 OF_MISFITS: dict[str, Quantity] = {

@@ -36,7 +36,7 @@ from ptsmc_jax.dispersions.base import (
     reason,
     tensors,
 )
-from ptsmc_jax.dispersions.misfits import OF_MISFITS
+from ptsmc_jax.dispersions.misfits import OF_MISFITS, check_inertia
 from ptsmc_jax.numerics import matrices
 from ptsmc_jax.plants.rigid_body import Spacecraft
 from ptsmc_jax.signals import disturbances
@@ -141,6 +141,7 @@ QUANTITIES: dict[str, Quantity] = {
         lambda parts: jnp.stack([plant_of(parts).inertia[i, j] for i, j in PAIRS]),
         _with_inertia,
         _inertia_checked,
+        check_inertia,
         unit="kg m^2",
     ),
     DISTURBANCE_PHASE: _of_disturbance(DISTURBANCE_PHASE, "phase", "rad"),

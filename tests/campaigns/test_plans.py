@@ -339,6 +339,9 @@ MISFIT = [
     ([*COUPLING, *J], [(3.1, 0.0, 0.0, *body) for body in ((10.0, 0.0, 0.0, 12.0, 0.0, 14.0), (9.0, 0, 0, 9, 0, 9))],
      f"mode_coupling_11 to mode_coupling_13 = 3.1, 0, 0 in row 1, {NO_BODY}positive definite (its smallest principal "
      "moment is -0.61 kg m^2))"),
+    ([*J], [(10.0, 0.0, 0.0, 12.0, 0.0, 14.0), (2.0, 0.0, 0.0, 2.0, 0.0, 2.0)],  # less the nominal coupling's 2.25
+     f"inertia_11 to inertia_33 = 2, 0, 0, 2, 0, 2 in row 1, {NO_BODY.replace('coupling', 'inertia')}positive "
+     "definite (its smallest principal moment is -0.25 kg m^2))"),
 ]  # fmt: skip
 
 
