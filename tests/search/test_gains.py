@@ -81,6 +81,21 @@ def test_the_time_after_t_f_is_kept():
     assert gains.in_scenario(scenario, {"eta": 4.0}).loop.t_end == 10.0
 
 
+@pytest.mark.parametrize(
+    ("name", "key"),
+    [
+        ("filter_bandwidth", "filter.bandwidth"),
+        ("command_corner", "hardware.command_filter.corner"),
+        ("k1", "controller.k1"),
+    ],
+)
+def test_a_gain_that_is_refused_is_named_also_where_t_f_comes_with_it(name, key):
+    hardware = {"attitude_noise": 1e-5, "rate_noise": 1e-6, "command_filter": {"kind": "notch"}}
+    ready = from_tables({"loop": {"mode": "sampled"}, "hardware": hardware, "filter": {}})
+    with pytest.raises(ScenarioError, match=rf"^{key} is -1.0, but must be a number greater than 0"):
+        gains.in_scenario(ready, {"t_f": 20.0, name: -1.0})
+
+
 def test_names_and_bounds_axis_by_axis():
     tables = {"free": ["eta", "observer_gain"], "per_axis": True, "bounds": {"observer_gain": [1.0, 50.0]}}
     scenario, ready = wide({"tune": tables, "observer": {"gain": [3.0, 4.0, 5.0]}})
