@@ -14,9 +14,12 @@ LONGEST = 90  # characters of an expression that is written inside another one
 RESERVED = set(
     "auto break case char const continue default do double else enum extern float for goto if inline int long register "
     "restrict return short signed sizeof static struct switch typedef union unsigned void volatile while real R in p "
-    "out before now y0 y1 yn j0 j1 jn gamma main index div exp log sin cos tan sqrt pow abs larger smaller "
-    "sign_of resolution".split()
+    "out before now y0 y1 yn j0 j1 jn gamma main index div abs larger smaller sign_of resolution NAN INFINITY".split()
 )
+# of math.h: a variable of such a name would hide the function that is called beside it
+MATH = ("acos acosh asin asinh atan atan2 atanh cbrt ceil cos cosh erf erfc exp exp2 expm1 fabs floor fmod lgamma log "
+        "log1p nextafter pow rint round sin sinh sqrt tan tanh")  # fmt: skip
+RESERVED |= {name + end for name in MATH.split() for end in ("", "f")}
 INFIX = {"add": ("+", 12), "sub": ("-", 12), "mul": ("*", 13), "div": ("/", 13), "rem": ("%", 13), "lt": ("<", 10),
          "le": ("<=", 10), "gt": (">", 10), "ge": (">=", 10), "eq": ("==", 9), "ne": ("!=", 9), "and": ("&&", 5),
          "or": ("||", 4)}  # fmt: skip

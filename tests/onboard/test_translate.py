@@ -108,6 +108,21 @@ def test_names_are_those_of_the_source():
     assert "const real speed = wanted_1 * wanted_1" in code
 
 
+@needs_compiler
+def test_a_name_of_the_source_hides_no_function_of_c(tmp_path):
+    """A law with `tanh = jnp.tanh(s)` in it did not compile."""
+
+    def law(x):
+        tanh, NAN = jnp.tanh(x[0]), jnp.sin(x[1])
+        fabs, floor = jnp.abs(tanh + NAN), jnp.floor(tanh * 9.0)
+        rint, expm1, atan2 = jnp.round(9.0 * fabs), jnp.expm1(floor), jnp.arctan2(NAN, tanh)
+        turned = jnp.sin(tanh * fabs) + jnp.tanh(rint * expm1) + jnp.floor(rint * NAN)
+        return turned * jnp.abs(atan2 - fabs) + jnp.expm1(atan2 * tanh) + jnp.arctan2(turned, rint)
+
+    found, expected = both(tmp_path, law, X)
+    np.testing.assert_allclose(found, expected, rtol=4e-15)
+
+
 def test_branches_are_branches_and_loops_loops():
     assert "if (in[0] > R(0)) {" in text(branched, X)
     assert "for (int k" in text(counted, X)
