@@ -85,6 +85,8 @@ class Translator:
             with jax.ensure_compile_time_eval():
                 known = [jnp.asarray(_known(value), v.aval.dtype) for value, v in zip(values, eqn.invars, strict=True)]
                 return [self.constant(found) for found in components.bind(eqn, known)]
+        if _wraps(eqn):
+            raise self.refused(eqn, where)
         if name in ELEMENTWISE:
             found = self._elementwise(eqn, values)
             if found is not None:
@@ -225,6 +227,12 @@ class Translator:
         return object_array(out.shape, (pool[i if ok else -1] for i, ok in zip(out.flat, inside.flat, strict=True)))
 
 
+def _wraps(eqn: Any) -> bool:
+    """Whether it computes whole numbers of 8 or 16 bits, which wrap around where C's, of 32, go on."""
+    narrow = any(jnp.issubdtype(v.aval.dtype, jnp.integer) and v.aval.dtype.itemsize < 4 for v in eqn.outvars)
+    return narrow and eqn.primitive.name not in _KEPT and any(v.aval.dtype != bool for v in eqn.invars)
+
+
 def _known(value: np.ndarray) -> np.ndarray:
     """An array of nodes that are all known."""
     return np.asarray([node.value for node in value.flat]).reshape(value.shape)
@@ -237,3 +245,8 @@ _MOVES = set(
     "broadcast_in_dim concatenate expand_dims pad reshape rev slice split squeeze stack tile transpose unstack "
     "dynamic_slice dynamic_update_slice gather scatter".split()
 )
+# what gives numbers that it is given
+_KEPT = {
+    *_MOVES,
+    *"clamp copy copy_p max min optimization_barrier reduce_max reduce_min select_n stop_gradient".split(),
+}

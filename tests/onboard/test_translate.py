@@ -61,6 +61,10 @@ FUNCTIONS = {
     "moved": (lambda m: (m[1], m[:, ::-1], jnp.roll(m, 1), jnp.concatenate([m[0], m[2]]), m.reshape(-1)[3:7]), MATRIX),
     "places": (lambda x, m: (jnp.argmax(x), x.at[1].set(4.0), m[:, 2], jnp.pad(x, 1)), X, MATRIX),
     "whole numbers": (lambda k, x: (x * k, k // 2 + 1, jnp.where(k % 3 == 1, x, -x)), np.int32(7), X),
+    "flags of 8 bits": (
+        lambda x: jnp.where(jnp.maximum((x > 0.0).astype(jnp.int8), jnp.int8(0))[::-1] == 1, x, 2.0 * x),
+        X,
+    ),
     "counted loop": (counted, X),
     "loop over a table": (gone_through, X),
     "loop backwards": (backwards, X),
@@ -135,6 +139,9 @@ def test_branches_are_branches_and_loops_loops():
     [
         (lambda x: jnp.linalg.eigvalsh(jnp.outer(x, x)), "eigh"),
         (lambda x: x.astype(jnp.float32) + 1.0, "convert_element_type"),  # C went on with 64 bits, and was 3e-8 off
+        # which wrap around: C gave 300 for 44
+        (lambda x: (x[0] > 0.0).astype(jnp.uint8) * jnp.uint8(200) + jnp.uint8(100), "mul"),
+        (lambda x: jnp.int32(x[0]).astype(jnp.int8) * x, "convert_element_type"),
     ],
 )
 def test_what_c_cannot_say_is_refused_by_its_line(law, primitive):
