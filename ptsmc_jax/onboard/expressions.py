@@ -100,6 +100,8 @@ FOLDED: dict[str, Callable] = {
 
 def kind_of(dtype: Any) -> str:
     """The kind of C's number for a type of JAX's; raises KeyError where there is none."""
+    if not isinstance(dtype, type | np.dtype):  # a type of JAX's own, of keys of random numbers
+        raise KeyError(dtype)
     dtype = np.dtype(dtype)
     if dtype.kind == "b":
         return BOOL

@@ -32,6 +32,8 @@ class Translator:
 
     def constant(self, array: Any) -> np.ndarray:
         """An array that is known, taken apart."""
+        if jnp.issubdtype(jnp.result_type(array), jax.dtypes.extended):
+            raise NoRuleError(f"{array.dtype} cannot be written in C, but must be numbers: C has no random ones here")
         array = np.asarray(array)
         if array.size > LARGEST:
             raise NoRuleError(f"a table of {array.size} numbers is too large to be written in C, at most {LARGEST} are")
@@ -81,6 +83,8 @@ class Translator:
             return results
         if name in CONTROL:
             return CONTROL[name](self, eqn, values)
+        if any(jnp.issubdtype(v.aval.dtype, jax.dtypes.extended) for v in eqn.outvars):  # keys of random numbers
+            raise self.refused(eqn, where)
         if all(node.op == "constant" for value in values for node in value.flat):
             with jax.ensure_compile_time_eval():
                 known = [jnp.asarray(_known(value), v.aval.dtype) for value, v in zip(values, eqn.invars, strict=True)]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from ptsmc_jax.numerics import attitude, elementary, guards, matrices
+from ptsmc_jax.onboard.fields import Struct
 from ptsmc_jax.onboard.translate import NoRuleError
 from tests.onboard.compiled import body, both, needs_compiler
 
@@ -142,6 +143,8 @@ def test_branches_are_branches_and_loops_loops():
         # which wrap around: C gave 300 for 44
         (lambda x: (x[0] > 0.0).astype(jnp.uint8) * jnp.uint8(200) + jnp.uint8(100), "mul"),
         (lambda x: jnp.int32(x[0]).astype(jnp.int8) * x, "convert_element_type"),
+        (lambda x: x + jax.random.normal(jax.random.key(jnp.int32(x[0]))), "random_seed"),
+        (lambda x: x + jax.random.normal(jax.random.PRNGKey(0)), "random_seed"),
     ],
 )
 def test_what_c_cannot_say_is_refused_by_its_line(law, primitive):
@@ -149,3 +152,12 @@ def test_what_c_cannot_say_is_refused_by_its_line(law, primitive):
     said = rf"^`{primitive}` \(.*test_translate\.py:{line}\) cannot be written in C, but must"
     with pytest.raises(NoRuleError, match=said):
         body(law, X)
+
+
+def test_keys_of_random_numbers_are_refused_wherever_they_come_from():
+    """They ended in a traceback, in a law's memory too."""
+    key = jax.random.key(0)
+    with pytest.raises(NoRuleError, match=r"^key<fry> cannot be written in C, but must be numbers"):
+        body(lambda x: x + jax.random.normal(key), X)
+    with pytest.raises(NoRuleError, match=r"^law holds key<fry>, which C has no number for here$"):
+        Struct("before").add("law", jax.ShapeDtypeStruct((), key.dtype))
