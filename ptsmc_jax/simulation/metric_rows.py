@@ -110,9 +110,10 @@ def _rms_in_window(update: Callable[[Array, Interval, Errors, Criteria], Array])
 def _variation(variation: Array, interval: Interval, errors: Errors, criteria: Criteria) -> Array:
     """Total variation of the torque delivered from t_f on, (m,) [N m]: the jump at its start, then inside."""
     delivered = interval.torques.delivered
-    jump = jnp.where(interval.t > criteria.t_f, jnp.abs(delivered[0] - interval.last_torque), 0.0)
+    by_rounding = guards.rounding(interval.length, criteria.t_f)  # which must not count the jump of a sample at t_f
+    jump = jnp.where(interval.t > criteria.t_f + by_rounding, jnp.abs(delivered[0] - interval.last_torque), 0.0)
     inside = sum((jnp.abs(v - u) for u, v in pairwise(delivered)), start=jnp.zeros_like(jump))
-    return variation + jump + jnp.where(interval.t >= criteria.t_f, inside, 0.0)
+    return variation + jump + jnp.where(interval.t >= criteria.t_f - by_rounding, inside, 0.0)
 
 
 def _chattering(variation: Array, running: Running, criteria: Criteria) -> Array:

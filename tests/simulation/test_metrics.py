@@ -139,6 +139,11 @@ def test_saturation_counts_time_and_peaks_tell_commanded_from_delivered():
     np.testing.assert_allclose([found.peak_torque, found.peak_torque_delivered], [3.0, 2.0])
     np.testing.assert_allclose(found.effort, 2.0 + 2.0 + 1.0)
     np.testing.assert_allclose(found.chattering, 2.0 / 3.0)  # the jump at t_f itself does not count
+    for late in (1.0 - 1e-15, 1.0 + 1e-15):  # 53 periods of 0.1 s are more than 5.3 s, 52 are 5.2 s
+        found = judge(
+            [interval(0, late, (1, 1), 3.0, 2.0), interval(late, 3, (1, 1), 1.0), interval(3, 4, (1, 1), -1.0)]
+        )
+        np.testing.assert_allclose(found.chattering, 2.0 / 3.0)
 
 
 def test_angles_after_t_f_are_the_largest_and_the_rms_of_the_parabola_through_their_squares():
