@@ -186,7 +186,7 @@ SMALL void period(const Study *s, State *z, int i, real t, real dt, real dt_befo
 #if METRICS
     real t_next = t + dt;
     z->effort[i] += dt * (fabs(u[0]) + fabs(u[1]) + fabs(u[2]));
-    for (int k = 0; k < 3; k++) z->variation[k][i] += t > s->t_f ? jump[k] : 0.0;
+    for (int k = 0; k < 3; k++) z->variation[k][i] += t > s->t_f + 1e-9 * s->period ? jump[k] : 0.0;
     /* error over the interval: cubic, its square a parabola */
     real end[7];
     slope(s, x, zero, zero, end);
