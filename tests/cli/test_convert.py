@@ -89,6 +89,7 @@ def test_gimbal_lock_is_said(command):
     (("--dcm-body-to-inertial", "1,0,0,0,1,0,0,0,-1"), "--dcm-body-to-inertial is [[1.0, 0.0, 0.0], "),
     (("--dcm-body-to-inertial", "1,0,0"), "--dcm-body-to-inertial is [1.0, 0.0, 0.0], but must be three rows"),
     (("--euler-deg", "1,2,3", "--sequence", "abc"), '--sequence is "abc", but must be three axes'),
+    (("--euler-deg", "1,2,3", "--sequence", ""), '--sequence is "", but must be three axes'),
     (("--mrp", "0,0,0", "--sequence", "abc"), "--sequence is abc, but must be three axes"),
 ])  # fmt: skip
 def test_what_is_no_attitude_is_refused(command, options, said):

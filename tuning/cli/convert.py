@@ -32,7 +32,8 @@ def quaternion(texts: Mapping[str, str | None]) -> np.ndarray:
     rows = key == "dcm_body_to_inertial" and len(values) == 9
     raw: dict[str, object] = {key: [values[k : k + 3] for k in (0, 3, 6)] if rows else values}
     if key == "euler_deg":
-        raw["sequence"] = texts.get("sequence") or SEQUENCE
+        sequence = texts.get("sequence")
+        raw["sequence"] = SEQUENCE if sequence is None else sequence
     try:
         scenario = typing.cast(SpacecraftScenario, parsing.parse({"initial": raw}))
         return attitude_keys.quaternion(scenario.initial, "initial")
@@ -44,7 +45,7 @@ def lines(q: np.ndarray, sequence: str | None = None) -> list[str]:
     """The same attitude in every form, as a scenario file has it; q (4,) scalar last. Raises UsageError."""
     from scipy.spatial.transform import Rotation
 
-    order = sequence or SEQUENCE
+    order = SEQUENCE if sequence is None else sequence
     turn = Rotation.from_quat(q)
     x, y, z, w = (float(v) for v in q)
     vector = np.round(turn.as_rotvec(degrees=True), DIGITS)  # of a whole turn there is rounding left
