@@ -85,15 +85,20 @@ def replace(scenario: Scenario | str | Path, **changes: Any) -> Scenario:
     tables = parsing.stated(scenario)
     for name in sorted(changes, key=_comes):
         value, (table, _, key) = changes[name], name.partition("__")
+        within = tables.get(table, {})
+        if key and not isinstance(within, Mapping):
+            continue  # given beside it, and refused as in a file
         if value is None and _is_known(scenario, table, key):
-            removed = tables if not key else tables.get(table, {})
-            removed.pop(key or table, None)
+            if not key:
+                tables.pop(table, None)
+            elif key in within:  # of a copy: it may be the caller's
+                tables[table] = {other: kept for other, kept in within.items() if other != key}
         elif not key:
             tables[table] = value
         elif key == "kind" and getattr(getattr(scenario, table, None), "kind", None) != value:
             tables[table] = {"kind": value}
         else:
-            tables[table] = {**tables.get(table, {}), key: value}
+            tables[table] = {**within, key: value}
     return from_tables(tables, run=not own.waits(scenario))
 
 

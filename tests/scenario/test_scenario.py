@@ -395,6 +395,12 @@ def test_replace_keeps_the_keys_that_stand_before_a_kind_or_a_table(whole):
     assert (law.kind, law.k_p) == ("pd", 0.5)
 
 
+def test_replace_leaves_the_tables_that_it_is_given():
+    given = {"t_f": 20.0, "eta": 4.0}
+    assert replace(from_tables({}), controller=given, controller__eta=None).controller.eta == 3.0
+    assert given == {"t_f": 20.0, "eta": 4.0}
+
+
 def test_replace_adds_a_table():
     tune = replace(from_tables({}), tune__steps=5).tune
     assert tune is not None
@@ -417,6 +423,8 @@ def test_replace_adds_a_table():
             ONE_KEY,
         ),
         ({"hardware__rate_noise": 1e-6}, "hardware.rate_noise needs the sampled loop", 'loop.mode is "continuous"'),
+        ({"controller": 5, "controller__eta": 3.0}, "controller is 5", "a table"),
+        ({"controller": 5, "controller__eta": None}, "controller is 5", "a table"),
     ],
     ids=str,
 )
