@@ -101,7 +101,7 @@ def scan(to: Any, eqn: Any, values: list[np.ndarray]) -> list[np.ndarray]:
     if length <= 1 or (length <= UNROLLED and length * len(body.jaxpr.eqns) <= WRITTEN):
         carry, rows = list(init), [[] for _ in body.jaxpr.outvars[carried:]]
         for k in order:
-            results = to.evaluate(body, [*consts, *carry, *(x[k] if x.ndim else x for x in map(np.asarray, xs))])
+            results = to.evaluate(body, [*consts, *carry, *(x[k, ...] for x in xs)])
             carry = results[:carried]
             for row, result in zip(rows, results[carried:], strict=True):
                 row.append(result)

@@ -69,6 +69,7 @@ FUNCTIONS = {
     "counted loop": (counted, X),
     "loop over a table": (gone_through, X),
     "loop backwards": (backwards, X),
+    "short loop over numbers": (lambda x: jnp.polyval(jnp.asarray([1.0, 2.0, 3.0]), x), X),
     "loop until": (until, X),
     "branch": (branched, X),
     "branches": (switched, X),
