@@ -88,12 +88,26 @@ def _integer_pow(pool: Pool, params: Any, kind: str, x: Node) -> Node:
     return power(pool, x, params["y"])
 
 
+def _divided(op: str) -> Callable:
+    """A quotient, or what is left; of whole numbers by 0 what XLA gives, -1 and the number: C's program ends there."""
+
+    def rule(pool: Pool, params: Any, kind: str, a: Node, b: Node) -> Node:
+        if kind == REAL:
+            return pool.make("fmod" if op == "rem" else op, a, b)
+        zero = pool.make("eq", b, pool.constant(0, kind), kind=BOOL)
+        by = pool.make("select", zero, pool.constant(1, kind), b, kind=kind)
+        gone = pool.make("convert", pool.constant(-1, "int32_t"), kind=kind) if op == "div" else a
+        return pool.make("select", zero, gone, pool.make(op, a, by, kind=kind), kind=kind)
+
+    return rule
+
+
 def _one_over(pool: Pool, x: Node) -> Node:
     return pool.make("div", pool.constant(1.0, REAL), x)
 
 
 ELEMENTWISE: dict[str, Callable] = {
-    **{op: _plain(op) for op in ("add", "sub", "mul", "div", "neg", "max", "min", "abs", "sign", "atan2")},
+    **{op: _plain(op) for op in ("add", "sub", "mul", "neg", "max", "min", "abs", "sign", "atan2")},
     **{op: _plain(op) for op in ("lt", "le", "gt", "ge", "eq", "ne")},
     **{op: _plain(op) for op in "sqrt cbrt exp exp2 expm1 log log1p sin cos tan asin acos atan sinh cosh tanh asinh "
        "acosh atanh erf erfc floor ceil".split()},
@@ -115,7 +129,7 @@ ELEMENTWISE: dict[str, Callable] = {
     "clamp": lambda pool, params, kind, low, x, high: pool.make(
         "min", pool.make("max", x, low, kind=kind), high, kind=kind
     ),
-    "rem": lambda pool, params, kind, a, b: pool.make("fmod" if kind == REAL else "rem", a, b, kind=kind),
+    "div": _divided("div"), "rem": _divided("rem"),
     "logistic": lambda pool, params, kind, x: _one_over(
         pool, pool.make("add", pool.constant(1.0, REAL), pool.make("exp", pool.make("neg", x)))
     ),

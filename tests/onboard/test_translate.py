@@ -66,6 +66,8 @@ FUNCTIONS = {
         lambda x: jnp.where(jnp.maximum((x > 0.0).astype(jnp.int8), jnp.int8(0))[::-1] == 1, x, 2.0 * x),
         X,
     ),
+    "unsigned ones by 0": (lambda k, x: jax.lax.div(k.astype(jnp.uint32), jnp.uint32(k - 7)) * x, np.int32(7), X),
+    "whole numbers by 0": (lambda k, x: (jax.lax.div(k, k - 7) * x, jax.lax.rem(k, k - 7) * x), np.int32(7), X),
     "counted loop": (counted, X),
     "loop over a table": (gone_through, X),
     "loop backwards": (backwards, X),
