@@ -195,7 +195,8 @@ class Translator:
             return [self._at(eqn, values, arrays, None, 0)]
         chosen, index = open_places[0], None
         bound = max(values[0].shape)
-        for k in range(bound - 1, -1, -1):
+        least = 0 if chosen.kind.startswith("u") else -1
+        for k in range(bound, least - 1, -1):  # beyond either end, too, where what is to be set may be dropped
             case = self._at(eqn, values, arrays, chosen, k)
             if index is None:
                 index = case

@@ -68,6 +68,11 @@ FUNCTIONS = {
     ),
     "unsigned ones by 0": (lambda k, x: jax.lax.div(k.astype(jnp.uint32), jnp.uint32(k - 7)) * x, np.int32(7), X),
     "whole numbers by 0": (lambda k, x: (jax.lax.div(k, k - 7) * x, jax.lax.rem(k, k - 7) * x), np.int32(7), X),
+    "set beyond the end": (
+        lambda k, x: (x.at[k].set(5.0), x.at[k - 10].set(5.0), x.at[k - 6].set(5.0), x[k], x[k - 20]),
+        np.int32(7),
+        X,
+    ),
     "counted loop": (counted, X),
     "loop over a table": (gone_through, X),
     "loop backwards": (backwards, X),
