@@ -246,13 +246,13 @@ def _options(folder: Path | None, device: str | None) -> tuple[str, ...]:
 def _accepted(folder: Path | None) -> tuple[str, ...]:
     """The options that this machine's compiler takes and that leave the numbers as they are; kept in the cache."""
     file = None if folder is None else folder / f"options-{version('jaxlib')}.json"
-    if file is not None and file.is_file():
+    if file is not None:
         try:
             answer = json.loads(file.read_text(encoding="utf-8"))
             if answer["tried"] == list(_OPTIONS):
                 return tuple(answer["accepted"])
-        except (ValueError, KeyError, TypeError):
-            pass  # not ours, or cut short: try again
+        except (OSError, ValueError, KeyError, TypeError):
+            pass  # none, not to be read, not ours, or cut short: try
     accepted: tuple[str, ...] = _OPTIONS
     if not _tried(_OPTIONS):
         accepted = tuple(option for option in _OPTIONS if _tried((option,)))

@@ -129,6 +129,18 @@ def test_a_cache_that_cannot_be_written_is_none(tried, tmp_path):
     assert setup._accepted(tmp_path / "file") == GOOD
 
 
+def test_a_cache_of_somebody_else_that_cannot_be_read_is_none(tried, tmp_path, monkeypatch):
+    """As in a container that runs as a user whose HOME is root's."""
+
+    def closed(self, *args, **kwargs):
+        raise PermissionError(13, "Permission denied", str(self))
+
+    monkeypatch.setattr(setup, "version", lambda package: "0.10.2")  # read from a file, too
+    for name in ("stat", "read_text", "write_text", "mkdir"):
+        monkeypatch.setattr(setup.Path, name, closed)
+    assert setup._accepted(tmp_path / "closed") == GOOD
+
+
 def test_programs_that_are_cut_short_in_the_cache_are_compiled_again(tmp_path):
     """As another process sees them that starts at the same time."""
     code = (
