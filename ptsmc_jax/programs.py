@@ -5,6 +5,7 @@ in which code may be patched should not ask: a program is told from another by t
 file cut short among them, falls back to compiling.
 """
 
+import contextlib
 import functools
 import hashlib
 import inspect
@@ -90,7 +91,8 @@ class Program:
                 try:
                     result = jax.block_until_ready(ready(given))
                 except Exception:  # it was whole, and yet does not run here
-                    _path(said).unlink(missing_ok=True)
+                    with contextlib.suppress(OSError):
+                        _path(said).unlink(missing_ok=True)
                     ready = _apart(self._compiled, key, said, given).result()
                 else:
                     self._ready[key] = ready
@@ -319,7 +321,8 @@ def _read(path: Path, said: str, inside: Any) -> Callable | None:
         program = serialize_executable.deserialize_and_load(
             payload, inside, jax.tree.structure(skeleton), execution_devices=configure.devices()[:count]
         )
-        os.utime(path)  # used
+        with contextlib.suppress(OSError):  # where nothing can be written, it stays as it is
+            os.utime(path)  # used
     except Exception:  # whatever is wrong with it, it can be compiled again
         return None
     return program

@@ -272,6 +272,27 @@ def test_a_program_that_does_not_run_is_compiled_again(folder, monkeypatch):
     assert len(traced) == 1
 
 
+@pytest.mark.parametrize("runs", [True, False])
+def test_programs_in_a_folder_that_cannot_be_written_are_loaded_all_the_same(folder, monkeypatch, runs):
+    """As in an image of a container, mounted to be read only: there was no noting that one was used, or removing it."""
+    program, _ = spied()
+    program(X)
+
+    def refused(*args, **kwargs):
+        raise OSError(30, "Read-only file system")
+
+    def fails(given):
+        raise RuntimeError("Function fusion not found")
+
+    for place, name in ((programs.os, "utime"), (programs.Path, "unlink"), (programs.tempfile, "mkstemp")):
+        monkeypatch.setattr(place, name, refused)
+    if not runs:
+        monkeypatch.setattr(programs, "_read", lambda *told: fails)
+    again, traced = spied()
+    np.testing.assert_allclose(again(X)["both"], np.sin(2 * X) + 5.0, rtol=1e-15)
+    assert len(traced) == (0 if runs else 1)
+
+
 def test_what_cannot_be_told_from_files_is_compiled_as_ever(folder):
     """A user's own function or class, a tracer, arrays spread over devices."""
 
