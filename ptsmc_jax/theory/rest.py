@@ -76,10 +76,14 @@ def swing(parts: Parts, seen: History | None = None) -> Swing | None:
     suspect &= _turns(off, SHARE * np.abs(off).max(axis=0)) & (np.ptp(off, axis=0) > SHARE * np.ptp(size, axis=0))
     if not suspect.any():
         return None
-    sizes = np.where(suspect, np.ptp(np.diff(u[last], axis=0), axis=0) / 2.0, 0.0)
-    axis = int(np.argmax(sizes))
-    back = float(np.count_nonzero(_reversals(off[:, axis], 0.0)))
-    return Swing(float(sizes[axis]), 2.0 * (last.size - 1) / back)
+    return max(_measured(u[last, axis], off[:, axis]) for axis in np.flatnonzero(suspect))
+
+
+def _measured(u: np.ndarray, off: np.ndarray) -> Swing:
+    """The swing of an axis's commands (times,), of which slopes leave `off`; what is slower adds little in a turn."""
+    periods = 2.0 * (off.size - 1) / float(np.count_nonzero(_reversals(off, 0.0)))
+    turns = np.lib.stride_tricks.sliding_window_view(u, int(np.ceil(periods)))
+    return Swing(float(np.median(np.ptp(turns, axis=1))), periods)
 
 
 def _reversals(values: np.ndarray, least: Any) -> np.ndarray:

@@ -36,6 +36,19 @@ def test_a_sign_that_is_too_narrow_swings_as_its_closed_form_says(k1):
     assert found.periods == 2.0  # it turns at every sample between the first and the last
 
 
+@pytest.mark.parametrize("delay", short([1, 3, 8], [8]))
+def test_a_slow_swing_is_told_from_peak_to_peak_too(delay):
+    """Its commands change from one sample to the next by much less than from one peak to the other."""
+    delayed = {"controller__sign_width": 1e-7, "hardware__delay": delay}
+    parts = scenario.study(scenario.replace(scenario.from_tables(CHAIN), **delayed)).parts
+    seen = rest.history(parts, linear.nominal_jit(parts))
+    found = rest.swing(parts, seen)
+    assert found is not None
+    assert found.periods > 4 * delay
+    last = np.asarray(seen.command)[np.flatnonzero(seen.in_hold)][-100:]
+    np.testing.assert_allclose(found.size, np.ptp(last), rtol=0.05)
+
+
 @pytest.mark.parametrize(("share", "swings"), [(0.5, True), (0.9, True), (1.2, False), (50.0, False)])
 def test_it_swings_from_the_width_on_at_which_the_layer_is_unstable(share, swings):
     """The pole at 1 - h (K1 + K / width), but for c h, is at -1 where width = h K / (2 - h K1)."""
