@@ -126,7 +126,7 @@ def configure(
 def _set_compiler_options(fast: bool, folder: Path | None, device: str | None) -> None:
     """XLA_FLAGS with our options or without; raises RuntimeError where JAX has already started with others."""
     global _added
-    before = os.environ.get("XLA_FLAGS", "")
+    before = _given(os.environ.get("XLA_FLAGS", ""))
     flags = _without_ours(before)
     given = {flag.split("=")[0] for flag in flags.split()}
     theirs = given & {"--xla_backend_extra_options", "--xla_disable_hlo_passes"}
@@ -141,6 +141,17 @@ def _set_compiler_options(fast: bool, folder: Path | None, device: str | None) -
             f"than fast={fast} asks for; call it first, right after the imports"
         )
     os.environ["XLA_FLAGS"], _added = wanted, ours or _added
+
+
+def _given(flags: str) -> str:
+    """XLA_FLAGS, which may be the name of a file instead: XLA would look for one that is named as ours besides."""
+    if not flags.strip() or flags.lstrip().startswith("-"):
+        return flags
+    try:
+        lines = Path(flags).read_text(encoding="utf-8").splitlines()
+    except (OSError, ValueError):
+        return flags  # XLA says so, and ends the process
+    return " ".join(line.strip() for line in lines if not line.lstrip().startswith("#")).strip()
 
 
 def _without_ours(flags: str) -> str:

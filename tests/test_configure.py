@@ -124,6 +124,20 @@ def test_an_option_that_the_user_has_set_stays(tried, monkeypatch):
         assert os.environ["XLA_FLAGS"] == "--xla_backend_optimization_level=3"
 
 
+@pytest.mark.parametrize("fast", [True, False])
+def test_options_that_the_user_has_in_a_file_stay(tried, tmp_path, monkeypatch, fast):
+    """XLA took the file's name with ours behind it for the name of another one, and ended the process."""
+    file = tmp_path / "options"
+    file.write_text("# of all\n--xla_backend_optimization_level=3\n --xla_cpu_enable_fast_math=false\n")
+    monkeypatch.setattr(setup, "_has_started", lambda: not fast)
+    monkeypatch.setattr(setup, "_added", "nothing yet")
+    monkeypatch.setenv("XLA_FLAGS", str(file))
+    setup._set_compiler_options(fast=fast, folder=None, device="cpu")
+    theirs = "--xla_backend_optimization_level=3 --xla_cpu_enable_fast_math=false"
+    others = tuple(option for option in GOOD if "optimization_level" not in option)
+    assert os.environ["XLA_FLAGS"] == (f"{theirs} {setup._flags(others)}" if fast else str(file))
+
+
 def test_a_cache_that_cannot_be_written_is_none(tried, tmp_path):
     (tmp_path / "file").write_text("")
     assert setup._accepted(tmp_path / "file") == GOOD
