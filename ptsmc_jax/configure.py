@@ -173,29 +173,35 @@ def _has_started() -> bool:
     return False
 
 
-_REJECTED = "Error reading persistent compilation cache"
+_REJECTED, _REFUSED = (f"Error {does} persistent compilation cache" for does in ("reading", "writing"))
 SEVERAL = 3  # entries
 
 
 def _tell_of_rejected_once(folder: Path) -> None:
-    """JAX warns of every entry of its cache that it cannot read; say it once, when there are several.
+    """JAX warns of every entry of its cache that it cannot read, or write; say it once, when there are several.
 
     One or two may be entries that another process is still writing, which appear byte by byte. Some processors' caches
-    reject all of their own.
+    reject all of their own; some folders are not to be written.
     """
-    rejected, show = list[str](), warnings.showwarning
+    cache = f"the compile cache {folder}"
+    texts = {
+        _REJECTED: f"{cache} rejects its own entries, so programs are compiled anew in every process",
+        _REFUSED: f"{cache} takes no new entries, so those that it lacks are compiled in every process",
+    }
+    told, show = {kind: list[str]() for kind in texts}, warnings.showwarning
 
     def showing(message: Any, category: Any, *where: Any, **more: Any) -> None:
-        if not str(message).startswith(_REJECTED):
+        kind = next((kind for kind in texts if str(message).startswith(kind)), None)
+        if kind is None:
             show(message, category, *where, **more)
             return
-        rejected.append(str(message))
-        if len(rejected) == SEVERAL:
-            text = f"the compile cache {folder} rejects its own entries, so programs are compiled anew in every process"
-            show(f"{text}: {rejected[0]}", RuntimeWarning, *where, **more)
+        told[kind].append(str(message))
+        if len(told[kind]) == SEVERAL:
+            show(f"{texts[kind]}: {told[kind][0]}", RuntimeWarning, *where, **more)
 
     warnings.showwarning = showing
-    warnings.filterwarnings("always", _REJECTED)
+    for kind in texts:
+        warnings.filterwarnings("always", kind)
 
 
 def default_device() -> Any:
