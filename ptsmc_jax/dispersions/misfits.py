@@ -113,7 +113,7 @@ def _check_coupling(given: Given, parts: Parts) -> None:
 
 
 def check_inertia(given: Given, parts: Parts) -> None:
-    """A flexible body can be with the inertia of a row and the nominal coupling, where the row gives no other."""
+    """A flexible body can be with the inertia [kg m^2] of a row and the nominal coupling, where it gives no other."""
     if _modes(parts) and "mode_coupling" not in given:
         inertia, coupling = tensors(given[INERTIA]), np.asarray(plant_of(parts).coupling)
         UnfitError.check(
