@@ -19,7 +19,7 @@ from ptsmc_jax.batching import lanes
 from ptsmc_jax.campaigns import montecarlo, plans
 from ptsmc_jax.campaigns.montecarlo import OwnMetrics
 from ptsmc_jax.campaigns.plans import Plan
-from ptsmc_jax.campaigns.rows import Part, Rows
+from ptsmc_jax.campaigns.rows import Part, Rows, read
 from ptsmc_jax.devices.sensors import RATE_BIAS
 from ptsmc_jax.dispersions import planned
 from ptsmc_jax.dispersions.base import OWN
@@ -188,7 +188,7 @@ class Tally:
 
 def tally(parts: list[Part], total: int) -> Tally:
     """Where a campaign with these parts stands."""
-    failed = sum(failures(pl.read_parquet(part.path, columns=["status"], glob=False)) for part in parts)
+    failed = sum(failures(read([part], ["status"])) for part in parts)
     return Tally(sum(part.count for part in parts), total, failed)
 
 

@@ -136,12 +136,13 @@ def _check_clock(parts: Parts) -> None:
     """Raises ValueError where a clock has too few samples or steps for t_f and delta, as far as these are known."""
     clock: Any = parts.clock
     law = parts.controller
-    times = [law.t_f, law.delta, parts.t_end, clock.period if clock.sampled else clock.max_step]
+    longest = clock.period if clock.sampled else clock.max_step  # step
+    times = [law.t_f, law.delta, parts.t_end, longest]
     if any(isinstance(v, core.Tracer) or np.ndim(v) > 0 for v in times):
         return
-    t_f, delta, t_end, period = map(float, times)
+    t_f, delta, t_end, longest = map(float, times)
     # by plain numbers: where another gain is traced, JAX's would be too
-    if not clock.sampled and replace(clock, max_step=period).too_coarse(t_f, delta, np):
+    if not clock.sampled and replace(clock, max_step=longest).too_coarse(t_f, delta, np):
         raise ValueError(
             f"t_f = {t_f:g} s with delta = {delta:g} s needs more than the {clock.before} steps that the parts' "
             f"continuous loop has before the hand-over; {MADE_ANEW}"
@@ -150,10 +151,10 @@ def _check_clock(parts: Parts) -> None:
         return
     hand_over = t_f - delta
     for where, needed, samples in (("before", hand_over, clock.before), ("after", t_end - hand_over, clock.after)):
-        if needed > samples * period * (1.0 + 1e-9):
+        if needed > samples * longest * (1.0 + 1e-9):
             raise ValueError(
                 f"t_f = {t_f:g} s with delta = {delta:g} s needs {needed:g} s of samples {where} the hand-over, but "
-                f"the parts' clock has {samples * period:g}; {MADE_ANEW}"
+                f"the parts' clock has {samples * longest:g}; {MADE_ANEW}"
             )
 
 

@@ -112,10 +112,8 @@ def _first_missing(parts: Parts, ticks: Ticks) -> Scalar:
     """The `_gap` [s]; of a continuous loop whose steps are too coarse for t_f and delta 0."""
     clock: Any = parts.clock
     gap = _gap(ticks, parts.t_end)
-    if clock.sampled:
-        return gap
     law = parts.controller
-    return jax.lax.stop_gradient(jnp.where(clock.too_coarse(law.t_f, law.delta), 0.0, gap))
+    return gap if clock.sampled else jnp.where(clock.too_coarse(law.t_f, law.delta), 0.0, gap)
 
 
 class _Flights(programs.Program):

@@ -47,13 +47,13 @@ def test_each_input_of_a_worst_trial_is_a_percentile_beside_the_median(monkeypat
                        "rank_correlation": pytest.approx(1.0, rel=1e-12),
                        "first_order": pytest.approx(1.0, abs=0.05), "trials": 401}  # fmt: skip
     assert told[1]["percentile"] == 100.0 * np.mean(rate <= rate[400])
-    campaign_terminal.why(told, "spacecraft", 401)
+    campaign_terminal.why(told, "spacecraft")
     (said,) = capsys.readouterr().out.splitlines()
     assert (
         said == "peak_torque 4 N m in trial 400: initial_angle 2 rad at 100.0 % (median 1)"
     )  # the rate is drawn apart from it
     table = table.with_columns(peak_torque=np.random.default_rng(5).permutation(401) / 50.0)
-    campaign_terminal.why(why(Rows(), ["peak_torque"], 1), "spacecraft", 401)
+    campaign_terminal.why(why(Rows(), ["peak_torque"], 1), "spacecraft")
     assert "goes with nothing that was drawn" in capsys.readouterr().out
     # of the number of a wheel none is more: what fails is one of four, here the second, whose number is no middle
     wheel = np.arange(401) % 4 + 1.0
@@ -63,7 +63,7 @@ def test_each_input_of_a_worst_trial_is_a_percentile_beside_the_median(monkeypat
     assert (one["percentile"], one["median"], one["share"]) == (None, None, pytest.approx(100 / 401))
     assert one["rank_correlation"] is None
     assert one["first_order"] > 0.5
-    campaign_terminal.why(told, "spacecraft", 401)
+    campaign_terminal.why(told, "spacecraft")
     assert "wheel_failure_wheel 2 as in 24.9 % of the trials" in capsys.readouterr().out
     drivers = {"peak_torque": statistics.drivers({"wheel_failure_wheel": wheel, "initial_w1": rate},
                                                  table["peak_torque"].to_numpy(), categories=CATEGORIES)}  # fmt: skip
@@ -72,7 +72,7 @@ def test_each_input_of_a_worst_trial_is_a_percentile_beside_the_median(monkeypat
     assert ", wheel_failure_wheel (56 %): rank correlation" in said
     table = table.with_columns(status=pl.Series(["diverged"] + ["ok"] * 400))
     told = why(Rows(), ["peak_torque"], 1)
-    campaign_terminal.why(told, "spacecraft", 401)  # of one that failed: what is unusual in it
+    campaign_terminal.why(told, "spacecraft")  # of one that failed: what is unusual in it
     assert "wheel_failure_wheel 1 as in 25.2 % of the trials" in capsys.readouterr().out
     # a run that failed has metrics until then, which say nothing of what drives those of a whole run
     cut = np.where(np.arange(401) % 3 == 0, 1e3 * (1.0 - rate), table["peak_torque"].to_numpy())
@@ -108,7 +108,7 @@ def test_what_chance_shows_among_the_few_trials_that_have_a_metric_is_no_reason(
     told = [{"metric": "settling_time", "trial": 3, "value": 1.0, "input": "initial_w1", "drawn": 2.0, "unit": "rad/s",
              "percentile": 70.0, "median": 1.0, "share": None, "rank_correlation": 0.15, "first_order": 0.06,
              "trials": 200}]  # fmt: skip
-    campaign_terminal.why(told, "spacecraft", 10_000)
+    campaign_terminal.why(told, "spacecraft")
     assert "goes with nothing that was drawn" in capsys.readouterr().out
 
 
@@ -122,7 +122,7 @@ def test_of_a_trial_that_failed_the_four_most_unusual_inputs_are_told(capsys):
         *({**alike, "input": name, "percentile": at, "median": 1.0, "share": None} for name, at in ranked.items()),
         *({**alike, "input": name, "percentile": None, "median": None, "share": at} for name, at in shared.items()),
     ]
-    campaign_terminal.why(told, "spacecraft", 401)
+    campaign_terminal.why(told, "spacecraft")
     (said,) = capsys.readouterr().out.splitlines()
     assert said.startswith("no effort in trial 3: ")
     named = [part.split()[0] for part in said.split(": ")[1].split(", ")]

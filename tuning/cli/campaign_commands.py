@@ -252,7 +252,7 @@ def worst(
         store.write_csv(folder / "why.csv", list(inputs[0]) if inputs else [], [list(row.values()) for row in inputs])
     if not quiet:
         campaign_terminal.worst(frame, by, folder, opened.scenario.plant.kind, own_code=bool(opened.programs))
-        campaign_terminal.why(inputs, opened.scenario.plant.kind, opened.trials)
+        campaign_terminal.why(inputs, opened.scenario.plant.kind)
     return 0
 
 

@@ -92,12 +92,11 @@ def worst(frame: "pl.DataFrame", by: str, folder: Path, kind: str, *, own_code: 
     terminal.say(f"whole rows in {folder / 'worst.csv'}; one in full: {one}")
 
 
-def why(inputs: list[dict[str, Any]], kind: str, trials: int) -> None:
+def why(inputs: list[dict[str, Any]], kind: str) -> None:
     """The inputs that the metric goes with in each worst trial, as percentiles of all trials.
 
     Of one that failed, or where so few trials do not show what a metric goes with, those farthest from the middle.
-    inputs: rows as `reasons.why` makes them; kind: of the plant; trials: of the campaign, where rows do not say how
-    many have the metric.
+    inputs: rows as `reasons.why` makes them; kind: of the plant.
     """
     from ptsmc_jax.numerics import statistics
 
@@ -106,8 +105,7 @@ def why(inputs: list[dict[str, Any]], kind: str, trials: int) -> None:
         value = rows[0]["value"]
         with_share = [row for row in rows if row["first_order"] is not None]
         if with_share and value is not None:
-            seen_in = rows[0].get("trials", trials)
-            with_share = [row for row in with_share if statistics.beyond_chance(row, seen_in)]
+            with_share = [row for row in with_share if statistics.beyond_chance(row, row["trials"])]
             rows = sorted((row for row in with_share if _explained(row) >= COUNTS), key=_explained, reverse=True)
         else:
             rows.sort(key=_unusual, reverse=True)

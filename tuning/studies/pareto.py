@@ -34,7 +34,7 @@ from tuning.studies import judging, posing
 TORQUE = "peak_torque"
 OFF = 1e9  # a limit that holds nothing back
 HARDLY = 0.05  # of the largest torque that gains accuracy: a limit that hardly any gains keep
-TIGHTEST = HARDLY**3  # of it, where gains keep that
+TIGHTER = 3  # such limits at most, each of the one before, where gains keep that
 FEWER = 4  # starts of the search for the least torque
 WARM = 3  # of the gains known so far, from which each step of the ladder starts
 NEARLY = 0.05  # of a limit: known gains that are beyond it by less are as good a start as those that keep it
@@ -139,17 +139,17 @@ def trace(
     )
 
 
-def least_torque(asking_for: Callable[[float], tuple[Any, float]], highest: float) -> tuple[Any, float]:
+def least_torque(
+    asking_for: Callable[[float], tuple[Any, float]], highest: float, tighter: int = TIGHTER
+) -> tuple[Any, float]:
     """What asks for the least torque, and that torque [N m]: gains that keep a limit are only the most accurate ones.
 
-    asking_for: what is found for a limit, and its peak torque; highest: the largest that gains accuracy.
+    asking_for: what is found for a limit, and its peak torque; highest: the largest that gains accuracy; tighter: how
+    many limits are tried.
     """
     limit = HARDLY * highest
     found, peak = asking_for(limit)
-    while peak <= limit and limit > TIGHTEST * highest * (1.0 + 1e-9):
-        limit *= HARDLY
-        found, peak = asking_for(limit)
-    return found, peak
+    return (found, peak) if peak > limit or tighter == 1 else least_torque(asking_for, limit, tighter - 1)
 
 
 def check(scenario: Scenario) -> None:
