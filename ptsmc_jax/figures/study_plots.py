@@ -289,6 +289,9 @@ def _coloured(axes: Any, x: MapAxis, y: MapAxis, grid: np.ndarray, alike: Sequen
         logarithmic(axes, "x")
     if y.logarithmic:
         logarithmic(axes, "y")
+    for line, one in ((axes.xaxis, x), (axes.yaxis, y)):
+        if not one.logarithmic and all(float(value).is_integer() for value in one.values):
+            line.set_major_locator(matplotlib.ticker.MaxNLocator(integer=True))  # a delay has no halves of a period
     axes.set_facecolor("0.9")  # of pairs without a number: no colour of the map
     mesh = axes.pcolormesh(x.edges, y.edges, np.ma.masked_invalid(grid), norm=norm, cmap="cividis")
     bar = axes.figure.colorbar(mesh, ax=axes, extend="max" if known.size and known.max() > high else "neither")

@@ -106,3 +106,11 @@ def test_numbers_of_a_maps_logarithmic_axis_do_not_overlap(low, high):
     up = study_plots.MapAxis("delta [s]", [1.0, 2.0], False)
     figure = study_plots.accuracy_map(across, up, dict.fromkeys(NAMES, GRID), np.zeros((2, 2), bool), {})
     assert numbers_apart(figure.axes[2]) >= 2
+
+
+def test_whole_numbers_along_a_map_have_no_halves_between_them():
+    delay = study_plots.MapAxis("hardware.delay", [0.0, 1.0], False)
+    figure = study_plots.accuracy_map(delay, delay, dict.fromkeys(NAMES, GRID), np.zeros((2, 2), bool), {})
+    for line in (figure.axes[0].xaxis, figure.axes[0].yaxis):
+        low, high = line.get_view_interval()
+        assert [tick for tick in line.get_majorticklocs() if low <= tick <= high] == [0.0, 1.0]

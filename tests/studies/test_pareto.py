@@ -2,6 +2,7 @@
 
 import csv
 import json
+from types import SimpleNamespace
 from typing import Any
 
 import jax.numpy as jnp
@@ -16,6 +17,8 @@ from ptsmc_jax.simulation.metrics import Metrics
 from tests.helpers import SHORT, small_search, tree
 from tests.output.pages import checked
 from tuning.output import front_sentences, terminal
+from tuning.search import descent, descents
+from tuning.search.evaluate import Measured
 from tuning.studies import judging, pareto
 
 
@@ -120,6 +123,13 @@ def test_a_front_from_start_to_end(command, tmp_path, monkeypatch):
     small_search(monkeypatch, 60)
     text = SHORT.replace("peak_torque = 30.0", "peak_torque = 8.0").replace("steps = 4", "steps = 6")
     (tmp_path / "s.toml").write_text(text)
+    climbed, begun = pareto.climbed, []
+
+    def spied(ladder, known, posed, tell):
+        begun.append((dict(ladder), np.asarray(known), posed.evaluate))
+        return climbed(ladder, known, posed, tell)
+
+    monkeypatch.setattr(pareto, "climbed", spied)
     status, told, _ = command("pareto", "s.toml", "--points", 4, "--out", "p")
     assert set(tree(tmp_path / "p")) == {
         "front.csv", "summary.json", "scenario.toml", "versions.json", "figures/front.png"
@@ -133,7 +143,12 @@ def test_a_front_from_start_to_end(command, tmp_path, monkeypatch):
     assert sum(row["knee"] == "1" for row in rows) == 1
     peaks = [float(row["peak_torque"]) for row in rows]
     assert peaks == sorted(peaks)
-    assert any(float(row["limit"]) == 8.0 for row in rows)  # the scenario's own limit is one of the rungs
+    # the scenario's own limit is one of the rungs, and as accurate as what a search for it alone found
+    (own,) = [float(row["trained_goal"]) for row in rows if float(row["limit"]) == 8.0]
+    ((rungs, known, evaluate),) = begun
+    alone = evaluate.fly(rungs["peak torque 8"].tightened(1.0 - pareto.MARGIN), known[2:3])
+    assert alone.beyond[0] <= descent.SLACK
+    assert own <= np.exp(alone.value[0]) * (1.0 + 1e-9)
     for row in rows:
         assert float(row["rms_low"]) <= float(row["rms_window_error"]) <= float(row["rms_high"])
         # the gains of a row, flown as the row says
@@ -199,6 +214,32 @@ def test_the_ladder_says_which_rung_it_is_on(monkeypatch):
     rungs = [("peak torque 0.2", problem), ("peak torque 0.4", problem)]
     assert pareto.climbed(rungs, [np.zeros(1)], problem, lambda what, *_: told.append(what)) == {}
     assert told == [f"ladder, peak torque {limit}" for limit in (0.4, 0.2, 0.2, 0.4)]
+
+
+@pytest.mark.parametrize(("found", "best"), [(None, 2.0), (3.0, 2.0), (1.5, 1.5)])
+def test_a_rung_is_as_good_as_the_gains_known_to_keep_it(monkeypatch, found, best):
+    """F as the gain itself: 1 is beyond the limit, 2 keeps it; descents from them may find nothing, worse or better."""
+
+    def measured(problem, share):
+        f = share[:, 0]
+        return Measured(share, f, np.where(f < 1.4, 0.1, -0.1)[:, None, None], f)
+
+    class Found(descents.Descents):
+        def descend(self, problem, starts):
+            if found is not None:
+                self._best = descent.Best(np.full(1, found), 1, pareto.MARGIN)
+                self._best.offer(self._best.share[None], measured(problem, self._best.share[None]))
+
+        def tightened(self, problem):
+            return problem
+
+    monkeypatch.setattr(pareto, "Descents", Found)
+    posed: Any = SimpleNamespace(evaluate=SimpleNamespace(fly=measured), sloped=True)
+    problem: Any = SimpleNamespace(rows=["peak_torque"])
+    step = pareto._step(posed, problem, np.asarray([[1.0], [2.0], [4.0]]))
+    assert step is not None
+    assert (step.f, step.over) == (best, 0.0)
+    assert pareto._step(posed, problem, np.asarray([[1.0]])) is None or found is not None
 
 
 @pytest.mark.parametrize(("least", "limits"), [(9.0, [5.0]), (2.0, [5.0, 0.25]), (1e-9, [5.0, 0.25, 0.0125])])

@@ -2,7 +2,7 @@
 
 The smallest window error is found for a ladder of limits on the peak torque, from the gains that ask for the least to
 those that no limit holds back; each step starts from what its neighbours found (Haimes, Lasdon and Wismer, IEEE Trans.
-SMC 1(3), 1971).
+SMC 1(3), 1971), and from what searches found at both ends and at the scenario's own limit, or in the middle.
 """
 
 from collections.abc import Callable, Sequence
@@ -40,7 +40,6 @@ WARM = 3  # of the gains known so far, from which each step of the ladder starts
 NEARLY = 0.05  # of a limit: known gains that are beyond it by less are as good a start as those that keep it
 STEPS = 40  # points looked at from each of them, at most
 APART = 1e-3  # of the bounds' intervals between two points, at least
-RANGE = 0.99  # of the ladder ends this share of the largest torque that still gains accuracy
 
 
 @dataclass(frozen=True)
@@ -114,11 +113,16 @@ def trace(
         return found, found.ended[at] * limit
 
     least, lowest = least_torque(asking_for, highest)
-    ladder = np.geomspace(lowest / (1.0 - MARGIN), RANGE * highest / (1.0 - MARGIN), points)
+    ladder = np.geomspace(lowest / (1.0 - MARGIN), highest / (1.0 - MARGIN), points)
+    middle = points // 2
     if own_limit is not None and ladder[0] < own_limit < ladder[-1]:
-        ladder[1 + np.argmin(np.abs(np.log(ladder[1:-1] / own_limit)))] = own_limit
+        middle = 1 + int(np.argmin(np.abs(np.log(ladder[1:-1] / own_limit))))
+        ladder[middle] = own_limit
+    # gains at the ends need not lead to the best valley between them
+    report = headed(tell, f"peak torque {ladder[middle]:.3g}")
+    between = uninterrupted(posed.search(under(ladder[middle]), posed.own, starts, (), judged=False, report=report))
     rungs = [(f"peak torque {limit:.3g}", under(limit)) for limit in ladder]
-    best = apart(climbed(rungs, [free.share, least.share], posed, tell))
+    best = apart(climbed(rungs, [free.share, least.share, between.share], posed, tell))
     by_limit = {float(ladder[k]): one for k, one in best.items()}
     fresh_seed = judging.seed_of_judge(seed)
     judged = _judge(limited, posed, by_limit, fresh_seed, tell)
@@ -216,15 +220,18 @@ def apart(best: dict[int, Best]) -> dict[int, Best]:
 
 
 def _step(posed: posing.Posed, problem: Problem, known: np.ndarray) -> Best | None:
-    """The best gains that keep these limits, from the most promising known ones."""
-    flown = posed.evaluate.fly(problem, known)
-    chosen = known[np.lexsort((flown.f, np.maximum(flown.beyond - NEARLY, 0.0)))[:WARM]]
+    """The best gains that keep these limits: known ones, or what is found from the most promising of them."""
     run = Descents(posed.evaluate, MARGIN, STEPS, np.random.default_rng(0))
+    flown = posed.evaluate.fly(run.tightened(problem), known)
+    chosen = known[np.lexsort((flown.f, np.maximum(flown.beyond - NEARLY, 0.0)))[:WARM]]
+    best = Best(known[0], len(problem.rows), MARGIN)
+    best.offer(known, flown)
     if posed.sloped:
         run.descend(problem, dict(enumerate(chosen)))
     else:
         run.evolve(problem, chosen[0], NEARBY)
-    return run.best if run.started and run.best.over == 0.0 else None
+    best = min(best, run.best, key=lambda one: one.rank) if run.started else best
+    return best if best.over == 0.0 else None
 
 
 def _judge(
