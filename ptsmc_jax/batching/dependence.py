@@ -3,8 +3,10 @@
 import operator
 from collections.abc import Mapping, Sequence
 from functools import reduce
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
+import jax
+from jax import lax
 from jax.extend import core
 from jax.interpreters import partial_eval
 
@@ -43,6 +45,47 @@ def of_while(params: Mapping[str, Any], operands: Sequence[T]) -> tuple[Sequence
     """The operands of a `lax.while_loop`: constants of its test, constants of its body, and carries."""
     first, second = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
     return operands[:first], operands[first:second], operands[second:]
+
+
+class Loop(NamedTuple):
+    """A `lax.while_loop`: the traces of its test, which is one truth, and of its body, and their operands."""
+
+    test: core.ClosedJaxpr
+    body: core.ClosedJaxpr
+    test_consts: Sequence
+    body_consts: Sequence
+    init: Sequence
+
+
+def loop_of(eqn: Any, operands: Sequence) -> Loop:
+    """The loop that an equation stands for.
+
+    `jax.vmap` in what a user wrote makes loops whose test has a truth for each row of the carries: they go on while it
+    holds for one of these, and rows for which it does not stay as they are.
+    """
+    test, body = eqn.params["cond_jaxpr"], eqn.params["body_jaxpr"]
+    test_consts, body_consts, init = of_while(eqn.params, operands)
+    (truth,) = test.out_avals
+    if not truth.shape:
+        return Loop(test, body, test_consts, body_consts, init)
+
+    def going(*inside: Any) -> Any:
+        (on,) = core.jaxpr_as_fun(test)(*inside)
+        return on
+
+    def one_going(*inside: Any) -> Any:
+        return lax.reduce_or(going(*inside), range(len(truth.shape)))
+
+    def step(*inside: Any) -> list:
+        tested, fixed, carried = of_while(eqn.params, inside)
+        on = going(*tested, *carried)
+        after = core.jaxpr_as_fun(body)(*fixed, *carried)
+        rows = (lax.broadcast_in_dim(on, new.shape, range(on.ndim)) for new in after)
+        return [lax.select(row, new, old) for row, new, old in zip(rows, after, carried, strict=True)]
+
+    tested, _, carried = of_while(eqn.params, [v.aval for v in eqn.invars])
+    kept = jax.make_jaxpr(step)(*(v.aval for v in eqn.invars))
+    return Loop(jax.make_jaxpr(one_going)(*tested, *carried), kept, test_consts, [*test_consts, *body_consts], init)
 
 
 def either(differs: Sequence[int]) -> int:

@@ -21,7 +21,7 @@ from jaxtyping import Array
 from ptsmc_jax import configure
 from ptsmc_jax.batching import components, lapack
 from ptsmc_jax.batching.components import DIRECTION, TRIAL, Lane, Shared, dense_of, object_array, plain
-from ptsmc_jax.batching.dependence import called, dependence, either, of_scan, of_while, opened, place, settle, used
+from ptsmc_jax.batching.dependence import called, dependence, either, loop_of, of_scan, opened, place, settle, used
 from ptsmc_jax.batching.packed import Packed
 from ptsmc_jax.numerics import stacking
 
@@ -278,8 +278,7 @@ class _Lanes:
 
     def loop(self, eqn: Any, values: list) -> list:
         """lax.while_loop; where the trials end at different times each stays as it is from its end on."""
-        test, body = eqn.params["cond_jaxpr"], eqn.params["body_jaxpr"]
-        *consts, init = of_while(eqn.params, values)
+        test, body, *consts, init = loop_of(eqn, values)
         test_consts, body_consts = ([_apart(value) for value in some] for some in consts)
         differs = settle(body.jaxpr, _which(body_consts), _which(init), [])
         (each,) = dependence(test.jaxpr, [*_which(test_consts), *differs])

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ptsmc_jax.batching.components import object_array
-from ptsmc_jax.batching.dependence import of_scan, of_while
+from ptsmc_jax.batching.dependence import loop_of, of_scan
 from ptsmc_jax.onboard.expressions import BOOL, Block, Node, Region, kind_of
 
 UNROLLED = 8  # passes of a loop that are written out, and
@@ -75,8 +75,7 @@ def _switch(to: Any, eqn: Any, test: Node, branches: Sequence[Any], operands: li
 
 def loop(to: Any, eqn: Any, values: list[np.ndarray]) -> list[np.ndarray]:
     """lax.while_loop."""
-    test, body = eqn.params["cond_jaxpr"], eqn.params["body_jaxpr"]
-    test_consts, body_consts, init = of_while(eqn.params, values)
+    test, body, test_consts, body_consts, init = loop_of(eqn, values)
     region = Region("while")
     carry = _carry(to, region, init, eqn.outvars)
     _inside(to, region, lambda: to.evaluate(test, [*test_consts, *carry]))

@@ -257,6 +257,13 @@ def used_in_an_inner_loop_and_after(x, m):
     return scan(outer, x, None, 3)
 
 
+def stepping(a, s):
+    """How far numbers go until their sum is beyond 3, in how many steps."""
+    return while_loop(
+        lambda c: jnp.sum(c[0]) < 3 + jnp.sin(s), lambda c: (c[0] + 0.7 * jnp.abs(s) + 0.1, c[1] + 1), (a, 0)
+    )
+
+
 LOOPS: dict[str, tuple] = {
     "argument used in a loop and after": (used_in_a_loop_and_after, X, M),
     "value used in a loop and after": (made_used_in_a_loop_and_after, X, Y),
@@ -286,6 +293,9 @@ LOOPS: dict[str, tuple] = {
     "fori_loop up to the trial's": (lambda x, i: fori_loop(0, jnp.abs(i), lambda k, x: jnp.cos(x) + k, x), X, whole()),
     "while, uniform": (lambda x: while_loop(lambda c: c[0] < 4, lambda c: (c[0] + 1, jnp.sin(c[1])), (0, x)), X),
     "while, each to its end": (lambda s: while_loop(lambda c: c[1] < 3, lambda c: (c[0] + 1, c[1] + 0.7), (0, s)), S),
+    "while, each row to its end": (jax.vmap(stepping, (0, None)), X, S),
+    "while, each row of a table to its end": (lambda s: jax.vmap(stepping, (0, None))(TABLE, s), S),
+    "while, each row to its end, alike": (lambda x: x * jnp.sum(jax.vmap(stepping, (0, None))(FIXED, 0.5)[1]), X),
     "while in a scan": (lambda s: scan(lambda c, _: (while_loop(lambda v: v > 1, jnp.sin, c * 3), c), s, None, 5), S),
 }  # fmt: skip
 

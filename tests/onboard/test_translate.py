@@ -78,6 +78,7 @@ FUNCTIONS = {
     "loop backwards": (backwards, X),
     "short loop over numbers": (lambda x: jnp.polyval(jnp.asarray([1.0, 2.0, 3.0]), x), X),
     "loop until": (until, X),
+    "loops until, row by row": (jax.vmap(until), MATRIX),
     "branch": (branched, X),
     "branches": (switched, X),
     "table": (tabled, X),
