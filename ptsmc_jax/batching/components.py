@@ -269,7 +269,10 @@ def picked(eqn: Any, arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
     """What a primitive that only moves entries makes of these."""
     shape, params, first = eqn.outvars[0].aval.shape, eqn.params, arrays[0]
     match eqn.primitive.name:
-        case "reshape" | "squeeze" | "expand_dims" if params.get("dimensions") is None or len(shape) < 2:
+        case "reshape":
+            order = params.get("dimensions")  # of the axes, where they are read in another one
+            return [(first if order is None else first.transpose(order)).reshape(shape)]
+        case "squeeze" | "expand_dims":
             return [first.reshape(shape)]
         case "broadcast_in_dim":
             spread = [1] * len(shape)

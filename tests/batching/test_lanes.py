@@ -120,6 +120,7 @@ INTEGERS: dict[str, tuple] = {
 
 STRUCTURE: dict[str, tuple] = {
     "reshape": (lambda m: (m.reshape(9), m.reshape(1, 9, 1), m.ravel(), m.reshape(3, 3, order="F")), M),
+    "reshape by columns": (lambda n: (n.ravel(order="F"), n[None].reshape(2, 3, order="F")), N),
     "transpose": (lambda n: (n.T, jnp.swapaxes(n, 0, 1), jnp.moveaxis(n[None], 0, 2)), N),
     "transpose of three": (lambda t: jnp.transpose(t, (2, 0, 1)), CUBE),
     "concatenate": (lambda x, n: (jnp.concatenate([x, FIXED, x]), jnp.concatenate([n, n[:, :1]], axis=1)), X, N),

@@ -60,6 +60,7 @@ FUNCTIONS = {
     "products": (lambda x, m: (m @ x, x @ m @ x, m @ m, jnp.outer(x, x), jnp.cross(x, m[0]), m.T @ x), X, MATRIX),
     "reductions": (lambda m: (m.sum(), m.max(axis=0), m.min(axis=1), m.prod(), jnp.cumsum(m, axis=1)), MATRIX),
     "moved": (lambda m: (m[1], m[:, ::-1], jnp.roll(m, 1), jnp.concatenate([m[0], m[2]]), m.reshape(-1)[3:7]), MATRIX),
+    "read by columns": (lambda m: (m.ravel(order="F"), m[:2].reshape(2, 3, order="F")), MATRIX),
     "places": (lambda x, m: (jnp.argmax(x), x.at[1].set(4.0), m[:, 2], jnp.pad(x, 1)), X, MATRIX),
     "whole numbers": (lambda k, x: (x * k, k // 2 + 1, jnp.where(k % 3 == 1, x, -x)), np.int32(7), X),
     "flags of 8 bits": (
