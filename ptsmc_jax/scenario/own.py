@@ -138,6 +138,8 @@ def read(table: Any, name: str, code: object) -> Any:
 
 @functools.lru_cache(maxsize=256)
 def _with_keys(table: Any, found: Any) -> Any:
+    from ptsmc_jax.simulation.gains import base as base_of_gain
+
     base = table.base()
     if all(getattr(found, method, None) is getattr(base, method, None) for method in table.needs):
         raise ValueError(f"the class {found.__name__} has no method {' or '.join(table.needs)}")
@@ -160,8 +162,10 @@ def _with_keys(table: Any, found: Any) -> Any:
             continue
         if (hasattr(table, field.name) or field.name == "rest") and field.name not in common:  # tables have it
             raise _taken(found, field.name, "another name")
-        if table.prefix + field.name == "observer_gain":
-            raise ValueError("the name of its field must be another than gain, which has a number for each axis")
+        if base_of_gain(table.prefix + field.name) == "observer_gain":
+            raise ValueError(
+                f"the name of its field must be another than {field.name}: gain has a number for each axis, gain_1 .."
+            )
         gain = field.metadata.get("gain")
         key_types.append((field.name, *_key(field, gain)))
         meaning = "" if gain is None else " ".join(gain.meaning.split())

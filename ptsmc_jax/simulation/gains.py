@@ -43,7 +43,8 @@ _DEVICES = {
 
 def base(name: str) -> str:
     """The gain that a name stands for: `observer_gain` for `observer_gain_2`."""
-    return "observer_gain" if name.startswith(AXIS) else name
+    of_axis = name.startswith(AXIS) and name.removeprefix(AXIS).isdecimal()  # not one that a part of one's own has
+    return "observer_gain" if of_axis else name
 
 
 def of_observer(gains: Mapping[str, Any]) -> dict[str, Any]:

@@ -400,6 +400,7 @@ def test_what_is_wrong_with_ones_own_law_is_one_sentence(here, law, keys, of_wha
         ("observer", "share: float", "gain: float", "another than gain"),
         ("observer", "    share: float", "    gain: float = 0.5\n    share: float", "another than gain"),
         ("observer", "    share: float", "    gain: tuple = (0.5,)\n    share: float", "another than gain"),
+        ("observer", "share: float", "gain_2: float", "another than gain_2"),
         ("observer", "share: float", "update: float", "a field of the class Filtered is called update, which has its"),
         (
             "observer",
@@ -647,3 +648,16 @@ def test_a_law_has_no_gain_of_the_name_of_another_parts(here, name):
     (here / "mine.py").write_text(HEAD + LAW.replace("width: float", gain))
     with pytest.raises(ScenarioError, match=f"the name of its gain {name} stands for one of another part"):
         scenario.study(scenario.from_tables({**CHAIN, "controller": MINE}))
+
+
+def test_a_gain_of_an_observer_may_begin_like_one_of_an_axis(here):
+    """It was taken for the gain of an axis, of which this observer has none: a search ended in a traceback."""
+    low = OTHER.replace("self.share", "self.gain_low").replace("share: float", "gain_low: float")
+    (here / "mine.py").write_text(HEAD + low)
+    observer = {"kind": "own", "code": "mine.py:Filtered", "gain_low": 0.7}
+    whole = reading.complete(scenario.from_tables({**CHAIN, "observer": observer, "tune": {}}))
+    parts = gains.with_gains(scenario.study(whole).parts, {"observer_gain_low": 0.3})
+    assert parts.observer.gain_low == 0.3
+    assert gains.in_scenario(whole, {"observer_gain_low": 0.4}).observer.gain_low == 0.4
+    assert gains.base("observer_gain_low") == "observer_gain_low"
+    assert gains.base("observer_gain_2") == "observer_gain"
