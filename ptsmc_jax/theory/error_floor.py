@@ -78,7 +78,7 @@ def along_each(runs: Sequence[tuple[Parts, Log]]) -> list[Floor]:
             alike.setdefault((delay, np.isfinite(model.noise).tobytes(), *map(np.shape, model)), {})[k] = model
     squares = [np.zeros((len(ticks.t), 3)) for _, ticks, _ in lasting]
     for (delay, *_), models in alike.items():
-        sizes = deviations(_together([*models.values()]), delay)
+        sizes = _unknown(_together([*models.values()]), delay)
         for number, k in enumerate(models):
             squares[k] = np.sum(sizes[:, number].reshape(len(sizes), 3, -1) ** 2, axis=2)
     return [_floor(parts, ticks, of_run) for (parts, ticks, _), of_run in zip(lasting, squares, strict=True)]
@@ -128,8 +128,19 @@ def _total(t: Array, t_next: Array, squares: Array, criteria: Criteria) -> Array
     return jnp.sum(integral_in_window(t, t_next, (squares[:, 0], squares[:, 1], squares[:, 2]), criteria))
 
 
-def deviations(model: Model, delay: int = 0) -> np.ndarray:
+def _unknown(model: Model, delay: int) -> np.ndarray:
+    """`deviations`, those zero that are nothing but how exact sensors without noise are taken to be."""
+    sizes = deviations(model, delay)
+    if np.all(model.noise > 0.0):
+        return sizes
+    # ten times as exact, what is left of them is a tenth
+    return np.where(sizes > 3.0 * deviations(model, delay, EXACT / 10.0), 0.0, sizes)
+
+
+def deviations(model: Model, delay: int = 0, exact: float = EXACT) -> np.ndarray:
     """1 sigma of each output (periods, .., outputs) given all samples up to `delay` periods before.
+
+    exact: `EXACT`, or another one.
 
     Factors S of P = S S' are carried by orthogonal transformations (Kaminski, Bryson, Schmidt, IEEE TAC 16(6), 1971):
     nothing is subtracted or inverted, so that noises of any sizes go together.
@@ -146,7 +157,7 @@ def deviations(model: Model, delay: int = 0) -> np.ndarray:
     for k in range(periods):
         read, there = rows[k] @ factor, available[k, 0]
         largest = np.maximum(largest, _sizes(read))
-        noise = np.maximum(model.noise[k], EXACT * largest)[..., there]
+        noise = np.maximum(model.noise[k], exact * largest)[..., there]
         factor = _corrected(factor, read[..., there, :], noise[..., None] * np.eye(noise.shape[-1]))
         known.append((k, factor))
         period, late = known[0]

@@ -246,6 +246,16 @@ def test_without_noise_only_what_pushes_is_unknown():
     np.testing.assert_allclose(found.error, density * PERIOD * PERIOD**2 / 2, rtol=1e-6)  # EXACT, over one period
 
 
+@pytest.mark.parametrize("delay", [0, 2])
+def test_where_positions_without_noise_tell_the_rate_there_is_no_floor(delay):
+    """From the second sample on, however noisy the rate is; 1e-14 of rounding would be told as a floor."""
+    made = flown_at(chain_parts([1.0, 0.0], t_f=2.0, period=PERIOD, noise=[0.0, 1e-3]), actuators=delayed(delay))
+    found = error_floor.along(made, still(made))
+    np.testing.assert_allclose(found.error[delay], (1 + delay) * PERIOD * 1e-3, rtol=1e-9)  # by its only sample
+    np.testing.assert_array_equal(found.error[delay + 1 :], 0.0)
+    assert found.window_error == 0.0
+
+
 def test_without_noise_there_is_no_floor():
     continuous = parts(t_f=3.0)
     assert error_floor.along(continuous, still(continuous)).window_error == 0.0
