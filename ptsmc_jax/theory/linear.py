@@ -164,6 +164,7 @@ def opened(parts: Parts, during: Nominal, *, late: bool = True) -> Opened:
     """
     parts = quiet(parts)
     period, before, after, arriving = during
+    period = _whole(period)
     k2, plant, law = parts.observer.error_bound(), parts.plant, parts.controller
     here, there, now, dt = Local(parts, before), Local(parts, after), period.now, period.length
     z0, x0, known, u0 = (jnp.zeros(n) for n in (sum(here.sizes), *here.sizes[:2], plant.inputs))
@@ -192,6 +193,17 @@ def opened(parts: Parts, during: Nominal, *, late: bool = True) -> Opened:
     loop = Loop(a, seen, new, old, command, direct, disturbed[0], dt, delay=parts.effective_actuators.delay)
     error = jax.jacfwd(lambda by: law.errors(plant.retract(before.x, by), target)[0])(x0)
     return Opened(loop, error, s_command, s_direct)
+
+
+def _whole(period: Period) -> Period:
+    """A period whose length [s], where it is a whole one, is that of the clock's periods, and has its slopes.
+
+    The last of a run may end at t_end, which stays where it is when the sample before it moves with delta: that one is
+    then no whole one any more, and those before it are as long as ever.
+    """
+    now, length = period.now, period.full_length
+    ends = jnp.where(is_full(now, length), now.t + length, now.t_next)
+    return period._replace(now=now._replace(t_next=ends))
 
 
 TOGETHER = 64  # periods that one call of the compiled program opens

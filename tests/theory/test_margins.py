@@ -593,6 +593,23 @@ def test_a_loop_that_grows_is_linearised_where_it_is_near_yet(growth, last):
     assert abs(float(run.period.now.t[found[0]]) - 4.0) < 0.05 + 1e-9
 
 
+@pytest.mark.parametrize("delta", [0.5, 0.53])
+def test_the_loop_in_hold_does_not_hang_on_when_it_was_handed_over(delta):
+    """Also where the run ends with a whole period, from a sample that moves with delta to t_end, which does not."""
+    tables = {"plant": {"kind": "chain"}, "controller": {"t_f": 5.0, "delta": delta}, "disturbance": {"kind": "none"},
+              "loop": {"mode": "sampled", "period": 0.125, "t_end": 7.0, "window": 1.0}}  # fmt: skip
+    parts = scenario.study(scenario.from_tables(tables)).parts
+
+    def in_hold(delta):
+        loops, _ = run_margins.judged_loops(with_gains(parts, {"delta": delta}), late=False)
+        return jax.tree.map(lambda v: v[-1], loops)
+
+    loop, slopes = jax.jit(lambda by: jax.jvp(in_hold, (by,), (1.0,)))(delta)
+    assert float(loop.period) == pytest.approx(0.125, rel=1e-12)
+    for v in jax.tree.leaves(slopes):
+        np.testing.assert_allclose(v, 0.0, atol=1e-9)
+
+
 @pytest.mark.parametrize(("t_f", "delta", "period", "ends"), [
     (40.0, 2.0, 0.05, (2.0, 10.0)),  # from the hand-over to a quarter of t_f
     (40.0, 0.2, 0.1, (1.0, 10.0)),  # ten periods: from one to the next gains change by a tenth
