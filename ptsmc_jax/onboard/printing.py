@@ -13,7 +13,7 @@ WIDTH = 110  # of a line
 LONGEST = 90  # characters of an expression that is written inside another one
 RESERVED = set(
     "auto break case char const continue default do double else enum extern float for goto if inline int long register "
-    "restrict return short signed sizeof static struct switch typedef union unsigned void volatile while real R in p "
+    "restrict return short signed sizeof static struct switch typedef union unsigned void volatile while real R in p d "
     "out before now y0 y1 yn j0 j1 jn gamma main index div abs larger smaller sign_of resolution NAN INFINITY".split()
 )
 # of math.h: a variable of such a name would hide the function that is called beside it
@@ -280,10 +280,14 @@ def wrapped(text: str, indent: str) -> list[str]:
                          break_long_words=False, break_on_hyphens=False)  # fmt: skip
 
 
+def inside_comment(text: str) -> str:
+    """The text without what begins or ends a comment of C."""
+    return text.replace("*/", "* /").replace("/*", "/ *")
+
+
 def comment(text: str, indent: str = "") -> list[str]:
     """A comment of C, a paragraph a line of the text, wrapped."""
-    safe = text.replace("*/", "* /").replace("/*", "/ *")
-    lines = [line for paragraph in safe.splitlines()
+    lines = [line for paragraph in inside_comment(text).splitlines()
              for line in textwrap.wrap(paragraph, WIDTH - len(indent) - 6, break_long_words=False,
                                        break_on_hyphens=False)]  # fmt: skip
     if len(lines) == 1:

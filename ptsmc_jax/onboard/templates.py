@@ -12,7 +12,7 @@ from ptsmc_jax.onboard import generate
 from ptsmc_jax.onboard.expressions import REAL
 from ptsmc_jax.onboard.fields import Field
 from ptsmc_jax.onboard.generate import Code
-from ptsmc_jax.onboard.printing import comment, declared, number
+from ptsmc_jax.onboard.printing import comment, declared, inside_comment, number
 
 STATUS = {
     "OK": "done",
@@ -51,7 +51,7 @@ def member(field: Field) -> list[str]:
     """A line of a struct, with what the field is."""
     size = "".join(f"[{n}]" for n in field.shape)
     text = f"    {declared(field.kind).replace('real', 'ptsmc_real')} {field.name}{size};"
-    about = " ".join(field.about.split()).replace("*/", "* /")
+    about = inside_comment(" ".join(field.about.split()))
     if not about:
         return [text]
     line = f"{text} /* {about} */"

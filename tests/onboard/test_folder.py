@@ -111,6 +111,28 @@ def test_a_memory_of_any_kind_is_written(tmp_path):
     assert "other status: 0" in done.stdout
 
 
+class Named(ptsmc.AccelerationLaw):
+    """PD whose names and words are C's."""
+
+    k: float = ptsmc.gain(1.0, (0.1, 10.0), meaning="of v, */ and of /* v", unit="1/s^2")
+
+    def command(self, memory: Any, now: Any, x: Any, target: Any, d_hat: Any, k2: Any) -> Any:
+        """What the function has as a pointer, and what it is given by it: the inverse of the inertia."""
+        d = jnp.sum(x.w * x.w)
+        damped = self.model.inertia_inverse @ (-self.k * x.q[:3] - 2.0 * x.w) / (1.0 + d)
+        return self.model.inertia @ self.model.inertia @ damped * (1.0 + d), x.w, memory
+
+
+@needs_compiler
+@pytest.mark.skipif(shutil.which("make") is None, reason="this machine has no make")
+def test_names_and_words_of_c_in_a_part_of_one_s_own_compile(tmp_path):
+    flown = {**FLIGHTS["raw"], "controller": {"kind": "own", "code": Named, "t_f": 5.0}}
+    made = scenario.reading.complete(scenario.from_tables(flown))
+    done = make(folder.export(made, tmp_path / "controller", name="law", trials=1), "check")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "other status: 0" in done.stdout
+
+
 class Unsigned(Odd):
     """With numbers that C has no kind for."""
 
