@@ -262,11 +262,11 @@ class Printer:
         return f"M({'fabs' if node.op == 'abs' else node.op})({listed})", ATOM
 
     def _infix(self, sign: str, level: int, a: Node, b: Node) -> tuple[str, int]:
-        logical = sign in ("&&", "||")  # compilers warn where these are mixed, or comparisons compared
-        mixed = logical and a.op in ("and", "or") and INFIX[a.op][0] != sign
+        # compilers warn where && and || are mixed, or comparisons compared
+        mixed = {"&&": "or", "||": "and"}.get(sign)
         compared = level in (9, 10)
-        left = self._at_least(a, ATOM if mixed else 11 if compared else level)
-        right = self._at_least(b, 11 if compared else level + 1)
+        left = self._at_least(a, ATOM if a.op == mixed else 11 if compared else level)
+        right = self._at_least(b, ATOM if b.op == mixed else 11 if compared else level + 1)
         return f"{left} {sign} {f'({right})' if right.startswith('-') else right}", level
 
     def _at_least(self, node: Node, level: int) -> str:

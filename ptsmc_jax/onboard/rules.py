@@ -47,6 +47,13 @@ def _wide(dtype: Any, kind: str) -> str:
     return kind
 
 
+def _rounded(pool: Pool, params: Any, kind: str, x: Node) -> Node:
+    known = jnp.finfo(jnp.result_type(float))
+    if params["exponent_bits"] < known.nexp or params["mantissa_bits"] < known.nmant:
+        raise KeyError("reduce_precision")  # to fewer digits
+    return x
+
+
 def _plain(op: str) -> Callable:
     return lambda pool, params, kind, *x: pool.make(op, *x, kind=kind)
 
@@ -134,6 +141,6 @@ ELEMENTWISE: dict[str, Callable] = {
         pool, pool.make("add", pool.constant(1.0, REAL), pool.make("exp", pool.make("neg", x)))
     ),
     "convert_element_type": lambda pool, params, kind, x: convert(pool, _wide(params["new_dtype"], kind), x),
-    **dict.fromkeys("stop_gradient copy copy_p reduce_precision optimization_barrier pvary".split(),
-                    lambda pool, params, kind, x: x),
+    **dict.fromkeys("stop_gradient copy copy_p optimization_barrier pvary".split(), lambda pool, params, kind, x: x),
+    "reduce_precision": _rounded,
 }  # fmt: skip

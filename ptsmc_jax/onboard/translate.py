@@ -4,6 +4,7 @@ As `batching.lanes` does it: reshapes and slices move components, small products
 regions; short loops with a fixed length are written out.
 """
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -15,6 +16,7 @@ from jax.extend import core
 from ptsmc_jax.batching import components
 from ptsmc_jax.batching.components import object_array
 from ptsmc_jax.batching.dependence import called, opened
+from ptsmc_jax.numerics import elementary
 from ptsmc_jax.onboard import origins
 from ptsmc_jax.onboard.control import CONTROL
 from ptsmc_jax.onboard.expressions import BOOL, Node, NoRuleError, Pool, Title, kind_of
@@ -37,6 +39,8 @@ class Translator:
         array = np.asarray(array)
         if array.size > LARGEST:
             raise NoRuleError(f"a table of {array.size} numbers is too large to be written in C, at most {LARGEST} are")
+        if not _has_kind(array.dtype):
+            raise NoRuleError(f"{array.dtype} cannot be written in C, which has no number for it here")
         kind = kind_of(array.dtype)
         return object_array(array.shape, (self.pool.constant(v, kind) for v in array.reshape(-1)))
 
@@ -74,17 +78,19 @@ class Translator:
             inner = eqn.params.get("call_jaxpr", eqn.params.get("fun_jaxpr"))
             debug_info = getattr(getattr(inner, "jaxpr", inner), "debug_info", None)
             known = KNOWN_FUNCTIONS.get(getattr(debug_info, "func_name", ""))
-            if known is not None and len(eqn.outvars) == 1:
+            # one of one's own may have its name
+            ours = getattr(debug_info, "func_filename", None) == elementary.__file__
+            if known is not None and ours and len(eqn.outvars) == 1:
                 return [self._each(lambda *entry: self.pool.make(known, *entry), values, eqn.outvars[0].aval.shape)]
         if inner is not None:
             outer, self.held = self.held, where
             results = self.evaluate(inner, values)
             self.held = outer
             return results
+        if not all(_has_kind(v.aval.dtype) for v in eqn.outvars):  # keys of random numbers, complex ones
+            raise self.refused(eqn, where)
         if name in CONTROL:
             return CONTROL[name](self, eqn, values)
-        if any(jnp.issubdtype(v.aval.dtype, jax.dtypes.extended) for v in eqn.outvars):  # keys of random numbers
-            raise self.refused(eqn, where)
         if all(node.op == "constant" for value in values for node in value.flat):
             with jax.ensure_compile_time_eval():
                 known = [jnp.asarray(_known(value), v.aval.dtype) for value, v in zip(values, eqn.invars, strict=True)]
@@ -95,7 +101,7 @@ class Translator:
             found = self._elementwise(eqn, values)
             if found is not None:
                 return [found]
-        if name in _FOLDS:
+        if name in _FOLDS and (kind_of(eqn.outvars[0].aval.dtype) == BOOL or name not in _OF_BITS):
             return [self._reduction(eqn, values[0])]
         if name == "dot_general":
             return [self._contraction(eqn, *values)]
@@ -143,10 +149,11 @@ class Translator:
 
     def _contraction(self, eqn: Any, left: np.ndarray, right: np.ndarray) -> np.ndarray:
         kind = kind_of(eqn.outvars[0].aval.dtype)
+        total, product = ("or", "and") if kind == BOOL else ("add", "mul")
 
         def inner(row: np.ndarray, column: np.ndarray) -> Node:
             return self._fold(
-                "add", kind, (self.pool.make("mul", *p, kind=kind) for p in zip(row, column, strict=True))
+                total, kind, (self.pool.make(product, *p, kind=kind) for p in zip(row, column, strict=True))
             )
 
         return components.contracted(eqn, left, right, inner)
@@ -218,7 +225,7 @@ class Translator:
         for array in arrays:
             numbered[id(array)] = np.arange(len(pool), len(pool) + array.size, dtype=np.int32).reshape(array.shape)
             pool += list(array.flat)
-        pool.append(self.pool.constant(0, arrays[0].flat[0].kind))
+        pool.append(_filling(self.pool, eqn))
         operands = []
         for variable, value in zip(eqn.invars, values, strict=True):
             if id(value) in numbered:
@@ -227,15 +234,39 @@ class Translator:
                 known = [k if node is chosen else node.value for node in value.flat]
                 operands.append(jnp.asarray(np.asarray(known).reshape(value.shape), dtype=variable.aval.dtype))
         with jax.ensure_compile_time_eval():
-            out = np.asarray(components.bind(eqn, operands)[0])
+            out = np.asarray(components.bind(_numbering(eqn), operands)[0])
         inside = (out >= 0) & (out < len(pool) - 1)
         return object_array(out.shape, (pool[i if ok else -1] for i, ok in zip(out.flat, inside.flat, strict=True)))
+
+
+def _numbering(eqn: Any) -> Any:
+    """The equation as it moves the entries' numbers, with -1 for what lies in none of them."""
+    return eqn.replace(params={**eqn.params, "fill_value": -1}) if "fill_value" in eqn.params else eqn
+
+
+def _filling(pool: Pool, eqn: Any) -> Node:
+    """What a gather that fills has where a place lies beyond the array: NaN, or another extreme, if it does not say."""
+    dtype, value = eqn.outvars[0].aval.dtype, eqn.params.get("fill_value")
+    if value is None and jnp.issubdtype(dtype, jnp.integer):
+        limits = jnp.iinfo(dtype)
+        value = limits.min or limits.max
+    elif value is None:
+        value = math.nan  # as a truth: yes
+    return pool.constant(value, kind_of(dtype))
 
 
 def _wraps(eqn: Any) -> bool:
     """Whether it computes whole numbers of 8 or 16 bits, which wrap around where C's, of 32, go on."""
     narrow = any(jnp.issubdtype(v.aval.dtype, jnp.integer) and v.aval.dtype.itemsize < 4 for v in eqn.outvars)
     return narrow and eqn.primitive.name not in _KEPT and any(v.aval.dtype != bool for v in eqn.invars)
+
+
+def _has_kind(dtype: Any) -> bool:
+    """Whether C has numbers for a type of JAX's."""
+    try:
+        return bool(kind_of(dtype))
+    except KeyError:
+        return False
 
 
 def _known(value: np.ndarray) -> np.ndarray:
@@ -245,6 +276,7 @@ def _known(value: np.ndarray) -> np.ndarray:
 
 _FOLDS = {"reduce_sum": "add", "reduce_max": "max", "reduce_min": "min", "reduce_prod": "mul", "reduce_and": "and",
           "reduce_or": "or"}  # fmt: skip
+_OF_BITS = ("reduce_and", "reduce_or")  # of whole numbers
 _SCANS = {"cumsum": "add", "cumprod": "mul", "cummax": "max", "cummin": "min"}
 _MOVES = set(
     "broadcast_in_dim concatenate expand_dims pad reshape rev slice split squeeze stack tile transpose unstack "

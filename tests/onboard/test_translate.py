@@ -46,6 +46,13 @@ def tabled(x):
     return jnp.interp(x[0], jnp.linspace(-1.0, 1.0, 5), jnp.asarray([1.0, 3.0, 2.0, -1.0, 0.5]))
 
 
+@jax.custom_jvp
+def log(x):
+    return jnp.log(x + 1.0)
+
+
+log.defjvps(lambda t, _, x: t / (x + 1.0))
+
 FUNCTIONS = {
     "elementary": (lambda x: (jnp.sin(x) * jnp.cos(x) + jnp.tan(x), jnp.exp(x), jnp.tanh(x), jnp.arctan(x)), X),
     "slopes of tanh": (lambda x: jax.jvp(jnp.tanh, (x,), (jnp.ones_like(x),)), POSITIVE),
@@ -74,6 +81,22 @@ FUNCTIONS = {
         np.int32(7),
         X,
     ),
+    "taken beyond the end": (
+        lambda k, x: (
+            jnp.take(x, k),
+            jnp.take(x, k - 5),
+            jnp.take(x, k - 8),
+            x.at[k].get(mode="fill", fill_value=1.0),
+            jnp.take(jnp.outer(x, x), k, axis=0, fill_value=2),
+            jnp.take(jnp.asarray([True, False]), k),
+            x.at[k].get(mode="clip"),
+        ),
+        np.int32(7),
+        X,
+    ),
+    "a logarithm of one's own": (lambda x: (log(x), elementary.log(x)), POSITIVE),
+    "truths multiplied": (lambda x: jnp.where((x > 0.0) @ (x < 1.0) == (x > 0.0), x, 2.0 * x), X),
+    "either and both": (lambda x: jnp.where((x > 0.5) | (x < 0.5) & (x > -1.0), x, 2.0 * x), X),
     "counted loop": (counted, X),
     "loop over a table": (gone_through, X),
     "loop backwards": (backwards, X),
@@ -155,6 +178,9 @@ def test_branches_are_branches_and_loops_loops():
         (lambda x: jnp.int32(x[0]).astype(jnp.int8) * x, "convert_element_type"),
         (lambda x: x + jax.random.normal(jax.random.key(jnp.int32(x[0]))), "random_seed"),
         (lambda x: x + jax.random.normal(jax.random.PRNGKey(0)), "random_seed"),
+        (lambda x: jax.lax.reduce_precision(x, 8, 23), "reduce_precision"),  # C had all digits
+        (lambda x: jnp.bitwise_or.reduce(x.astype(jnp.int32)) * x, "reduce_or"),  # C had 1, or 0
+        (lambda x: jax.lax.while_loop(lambda c: c.real < 9.0, lambda c: c + 1.0, jax.lax.complex(x, x)[0]), "complex"),
     ],
 )
 def test_what_c_cannot_say_is_refused_by_its_line(law, primitive):
@@ -171,3 +197,10 @@ def test_keys_of_random_numbers_are_refused_wherever_they_come_from():
         body(lambda x: x + jax.random.normal(key), X)
     with pytest.raises(NoRuleError, match=r"^law holds key<fry>, which C has no number for here$"):
         Struct("before").add("law", jax.ShapeDtypeStruct((), key.dtype))
+
+
+@pytest.mark.parametrize("known", [jnp.asarray([1.0 + 2.0j, 2.0, 3.0]), jnp.asarray([1, 2, 3], jnp.uint64)])
+def test_known_numbers_of_which_c_has_none_are_refused(known):
+    """They ended in a traceback."""
+    with pytest.raises(NoRuleError, match=rf"^{known.dtype} cannot be written in C, which has no number for it here$"):
+        body(lambda x: (x * known).real, X)
