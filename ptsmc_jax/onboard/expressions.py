@@ -78,8 +78,8 @@ FOLDED: dict[str, Callable] = {
     "sub": lambda a, b: a - b,
     "mul": lambda a, b: a * b,
     "neg": lambda a: -a,
-    "max": lambda a, b: a if a >= b else b,
-    "min": lambda a, b: a if a <= b else b,
+    "max": lambda a, b: a if a >= b or a != a else b,
+    "min": lambda a, b: a if a <= b or a != a else b,
     "abs": abs,
     "lt": lambda a, b: a < b,
     "le": lambda a, b: a <= b,
@@ -94,7 +94,7 @@ FOLDED: dict[str, Callable] = {
     "floor": lambda a: float(np.floor(a)),
     "ceil": lambda a: float(np.ceil(a)),
     "rint": lambda a: float(np.rint(a)),
-    "sign": lambda a: float((a > 0) - (a < 0)),
+    "sign": lambda a: a if a != a else (a > 0) - (a < 0),
 }
 
 
@@ -172,6 +172,8 @@ class Pool:
             if known[0]:
                 return yes if test.value else no
             return yes if yes is no else None
+        if op in ("lt", "ge") and known[1] and args[0].kind.startswith("u") and args[1].value == 0:
+            return self.constant(op == "ge", BOOL)  # of which compilers warn
         if not any(known) and not (op == "sub" and args[0] is args[1]):
             return args[0].args[0] if op in ("neg", "not") and args[0].op == op else None
         if op in ("add", "sub", "mul", "div") and len(args) == 2:

@@ -24,8 +24,49 @@ INFIX = {"add": ("+", 12), "sub": ("-", 12), "mul": ("*", 13), "div": ("/", 13),
          "le": ("<=", 10), "gt": (">", 10), "ge": (">=", 10), "eq": ("==", 9), "ne": ("!=", 9), "and": ("&&", 5),
          "or": ("||", 4)}  # fmt: skip
 PLAIN = {"max": "larger", "min": "smaller", "sign": "sign_of"}  # functions of the file's own, by operation
+# of whole numbers by type: how they are written, and what of a real one is beyond them
+WHOLE = {"int32_t": ("{}", "2147483648"), "int64_t": ("{}", "9223372036854775808.0"),
+         "uint32_t": ("{}u", "4294967296")}  # fmt: skip
 ATOMS = ("constant", "place", "variable", "index", "table")
 ATOM, UNARY, CHOICE = 20, 14, 3  # precedences
+
+
+def _ends(kind: str) -> tuple[str, str]:
+    """The least and the largest whole number of a type, as C has them."""
+    name = kind.removesuffix("_t").upper()
+    return "0" if kind.startswith("u") else f"{name}_MIN", f"{name}_MAX"
+
+
+def _of_whole(kind: str) -> dict[str, str]:
+    """Functions of whole numbers of a type, by name."""
+    (low, high), end = _ends(kind), _whole(kind)
+    sign = "x > 0" if low == "0" else "(x > 0) - (x < 0)"
+    return {
+        f"larger{end}": f"static {kind} larger{end}({kind} a, {kind} b)\n{{\n    return a > b ? a : b;\n}}\n",
+        f"smaller{end}": f"static {kind} smaller{end}({kind} a, {kind} b)\n{{\n    return a < b ? a : b;\n}}\n",
+        f"sign_of{end}": f"static {kind} sign_of{end}({kind} x)\n{{\n    return {sign};\n}}\n",
+        f"whole{end}": "/* A real number without what is behind its point; the nearest there is, 0 of NaN. */\n"
+        f"static {kind} whole{end}(real x)\n{{\n    if (isnan(x)) {{\n        return 0;\n    }}\n"
+        f"    return x >= R({WHOLE[kind][1]}) ? {high} : (x <= R({low}) ? {low} : ({kind})x);\n}}\n",
+    }
+
+
+def _whole(kind: str) -> str:
+    """How the names of functions end that are of these whole numbers; of real ones they have no end."""
+    return {REAL: "", BOOL: "_int32"}.get(kind, f"_{kind.removesuffix('_t')}")
+
+
+# of the file's own, by name: what it calls of them stands in it
+HELPERS = {
+    "larger": "/* Of two numbers; NaN where either is. */\nstatic real larger(real a, real b)\n{\n"
+    "    return a > b || isnan(a) ? a : b;\n}\n",
+    "smaller": "/* Likewise. */\nstatic real smaller(real a, real b)\n{\n    return a < b || isnan(a) ? a : b;\n}\n",
+    "resolution": "/* By how much numbers of the type in use may be off, relative: four times what 1 and the next are\n"
+    "   apart. */\nstatic real resolution(void)\n{\n"
+    "    return sizeof(real) < sizeof(double) ? R(4.76837158203125e-07) : R(8.881784197001252e-16);\n}\n",
+    "sign_of": "static real sign_of(real x)\n{\n    return x > R(0) ? R(1) : (x < R(0) ? R(-1) : x);\n}\n",
+    **{name: text for kind in WHOLE for name, text in _of_whole(kind).items()},
+}
 
 
 def number(value: Any, kind: str) -> str:
@@ -33,7 +74,8 @@ def number(value: Any, kind: str) -> str:
     if kind == BOOL:
         return "1" if value else "0"
     if kind != REAL:
-        return str(int(value))
+        least = kind[0] == "i" and value == -(2 ** (int(kind[3:5]) - 1))
+        return _ends(kind)[0] if least else WHOLE[kind][0].format(int(value))
     if value != value:
         return "R(NAN)"
     if value in (float("inf"), float("-inf")):
@@ -246,17 +288,20 @@ class Printer:
             return ("-" if node.op == "neg" else "!") + self._at_least(node.args[0], UNARY + 1), UNARY
         if node.op == "select":
             test, yes, no = (self._at_least(arg, CHOICE + 1) for arg in node.args)
+            if node.kind == "int64_t":  # beside nothing of that type small constants have another
+                yes, no = (f"INT64_C({text})" if re.fullmatch(r"-?\d+", text) else text for text in (yes, no))
             return f"{test} ? {yes} : {no}", CHOICE
+        if node.op == "convert" and node.args[0].kind == REAL:  # what C casts must lie within its type
+            return f"whole{_whole(node.kind)}({self.text(node.args[0])})", ATOM
         if node.op == "convert":
             return f"({declared(node.kind)}){self._at_least(node.args[0], UNARY + 1)}", UNARY
         if node.op == "entry":
             return f"{self._name(node.args[0])}[{self.text(node.args[1])}]", ATOM
         listed = ", ".join(self.text(arg) for arg in node.args)
         if node.op in PLAIN:
-            own = PLAIN[node.op] + ("" if node.kind == REAL else "_whole")
-            return f"{own}({listed})", ATOM
+            return f"{PLAIN[node.op]}{_whole(node.kind)}({listed})", ATOM
         if node.op == "abs" and node.kind != REAL:
-            return f"larger_whole({listed}, -{self._at_least(node.args[0], UNARY + 1)})", ATOM
+            return f"larger{_whole(node.kind)}({listed}, -{self._at_least(node.args[0], UNARY + 1)})", ATOM
         if node.op == "isfinite":
             return f"isfinite({listed})", ATOM
         return f"M({'fabs' if node.op == 'abs' else node.op})({listed})", ATOM

@@ -30,7 +30,7 @@ def convert(pool: Pool, kind: str, x: Node) -> Node:
     """A number of another kind."""
     if x.kind == kind:
         return x
-    if x.op == "constant":
+    if x.op == "constant" and (kind == REAL or 0 <= x.value < 2**31):  # others as C has them beyond its types
         return pool.constant(x.value, kind)
     if kind == BOOL:
         return pool.make("ne", x, pool.constant(0, x.kind), kind=BOOL)

@@ -12,7 +12,7 @@ from ptsmc_jax.onboard import generate
 from ptsmc_jax.onboard.expressions import REAL
 from ptsmc_jax.onboard.fields import Field
 from ptsmc_jax.onboard.generate import Code
-from ptsmc_jax.onboard.printing import comment, declared, inside_comment, number
+from ptsmc_jax.onboard.printing import HELPERS, comment, declared, inside_comment, number
 
 STATUS = {
     "OK": "done",
@@ -162,19 +162,6 @@ typedef ptsmc_real real;
     last = ["", code.derivation] if code.derived else []  # long, and not what a reader looks for
     body = [*ahead, body, "", *_checks(code, about), "", *_step(code, about), *last, ""]
     return "\n".join([*doc, "", head, *helpers, *body])
-
-
-HELPERS = {
-    "larger": "static real larger(real a, real b)\n{\n    return a > b ? a : b;\n}\n",
-    "smaller": "static real smaller(real a, real b)\n{\n    return a < b ? a : b;\n}\n",
-    "resolution": "/* By how much numbers of the type in use may be off, relative: four times what 1 and the next are\n"
-    "   apart. */\nstatic real resolution(void)\n{\n"
-    "    return sizeof(real) < sizeof(double) ? R(4.76837158203125e-07) : R(8.881784197001252e-16);\n}\n",
-    "sign_of": "static real sign_of(real x)\n{\n    return x > R(0) ? R(1) : (x < R(0) ? R(-1) : R(0));\n}\n",
-    "larger_whole": "static int32_t larger_whole(int32_t a, int32_t b)\n{\n    return a > b ? a : b;\n}\n",
-    "smaller_whole": "static int32_t smaller_whole(int32_t a, int32_t b)\n{\n    return a < b ? a : b;\n}\n",
-    "sign_of_whole": "static int32_t sign_of_whole(int32_t x)\n{\n    return (x > 0) - (x < 0);\n}\n",
-}
 
 
 def _within(field: Field, owner: str) -> str:
