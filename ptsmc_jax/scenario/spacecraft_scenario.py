@@ -251,13 +251,18 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
     @property
     def turning(self) -> float:
         """How fast the body turns at t = 0 [rad/s]; where it is drawn, all but one in 10 000."""
+        return sum(self._turning.values())
+
+    @property
+    def _turning(self) -> dict[str, float]:
+        """What that is made of, by the key that says so."""
         table = getattr(self.dispersion, "rate", None)
-        drawn = 0.0 if table is None else table.widest * table.of()[0]
-        return float(np.linalg.norm(self.initial.rate)) + drawn
+        drawn = {} if table is None else {f"dispersion.rate.{table.width}": float(table.widest * table.of()[0])}
+        return {"initial.rate": float(np.linalg.norm(self.initial.rate)), **drawn}
 
     def frequencies(self, setup: Any, t_f: float) -> dict[str, float]:
         """How fast start, reference, law, wheels and flexible modes move the body [rad/s], by key."""
-        found = {"initial.rate": self.turning, **self.reference.frequencies()}
+        found = {**self._turning, **self.reference.frequencies()}
         key, rate = self.controller.turning(t_f)
         if not self.controller.prescribed:
             rate = min(rate, 0.5 * BASELINES * 0.025 / self.loop.period)
@@ -284,7 +289,7 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
         least, middle, largest = np.linalg.eigvalsh(np.asarray(setup.plant.inertia))
         shares = {
             "wheels.momentum": np.linalg.norm(np.asarray(wheels.axes) @ np.asarray(wheels.initial)),
-            "initial.rate": largest * self.turning,
+            **{key: largest * rate for key, rate in self._turning.items()},
             "disturbance.amplitude": sum(term.impulse(self.end) for term in self.terms),
         }
         return {key: float(share) / math.sqrt(least * middle) for key, share in shares.items()}

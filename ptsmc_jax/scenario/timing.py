@@ -1,6 +1,7 @@
 """How fast things happen in a scenario, and the clock and steps that follow it."""
 
 import dataclasses
+import functools
 import math
 import typing
 from collections.abc import Mapping
@@ -163,7 +164,8 @@ def _lower(scenario: Scenario, key: str, asks: str) -> ScenarioError:
         eta = f"with controller.eta = {scenario.controller.eta}"
         shorter = ", or loop.period shorter" if scenario.sampled else ""
         return wrong("controller.t_f", scenario.controller.t_f, f"longer {eta}{shorter}: {asks}")
-    value = getattr(getattr(scenario, table), name, None)
+    *tables, name = name.split(".")
+    value = getattr(functools.reduce(getattr, tables, getattr(scenario, table)), name, None)
     if value is None:  # of a term in a sum
         value = [getattr(term, name) for term in scenario.terms if hasattr(term, name)]
     if value == []:

@@ -228,6 +228,8 @@ BAD = [
     ("controller = { t_f = 1e-4, delta = 1e-5 }", "controller.t_f is 0.0001", "longer with controller.eta = 3.0"),
     (SAMPLED + "controller.eta = 1e6", "controller.t_f is 30.0", "or loop.period shorter: loop.period = 0.05"),
     ("initial.rate = [1e5, 0, 0]", "initial.rate is [100000.0, 0.0, 0.0]", "lower"),
+    (SAMPLED + "dispersion.rate = { std = 30.0 }", "dispersion.rate.std is 30.0", "lower"),  # initial.rate was, of 0
+    (SAMPLED + "dispersion.rate = { kind = 'uniform', half_width = 99 }\nwheels = {}", "rate.half_width is 99", "low"),
     ("loop.settling_angle = 5.0", "loop.settling_angle is 5.0", "less than pi [rad]"),
     # devices
     ("hardware.torque_lag = 0.1", "hardware.torque_lag needs the sampled loop", 'loop.mode is "continuous"'),
