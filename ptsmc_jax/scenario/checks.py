@@ -10,15 +10,16 @@ from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.scenario.values import MOST_STEPS
 from ptsmc_jax.simulation import catalogues
 
+OF_SENSORS = ("star_tracker_misalignment", "gyro_scale", "star_tracker_outage")  # what is drawn of the built-in ones
 SHORTEST_WINDOW = 1e-5  # of t_f, continuous loop: 80 times what 32 bits tell apart at t_f, whose steps may be finer
 
 
 def check(scenario: Scenario) -> None:
     """Raise ScenarioError where keys contradict each other or ask for what the project cannot do yet."""
+    _check_sensors(scenario)
     scenario.check_plant()
     _check_requirements(scenario)
     scenario.observer.check(scenario)
-    _check_sensors(scenario)
     _check_loop(scenario)
     _check_dispersion(scenario)
 
@@ -78,6 +79,13 @@ def _check_sensors(scenario: Scenario) -> None:
             raise wrong(f"hardware.{key}", value, "absent where [sensors] says what is seen")
     if scenario.estimator.kind != "none":
         raise ScenarioError('filter.kind is "steady_state", but must be absent where [sensors] says what is seen')
+    noises = (key for key, given_by in scenario.devices.levels.items() if set(given_by) <= {*scenario.devices.noises})
+    for key in (*noises, *OF_SENSORS):
+        if getattr(scenario.dispersion, key, None) is not None:
+            raise ScenarioError(
+                f"dispersion.{key} is drawn of what [hardware] says, but [sensors] says what is seen; allowed is "
+                "dispersion.own, which can draw numbers of these sensors"
+            )
 
 
 def _check_loop(scenario: Scenario) -> None:

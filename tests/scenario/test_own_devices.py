@@ -291,8 +291,14 @@ def test_sensors_of_ones_own_are_all_that_there_are(tables, said):
     with pytest.raises(ScenarioError) as caught:
         scenario.from_tables({**CHAIN, "sensors": NOISY, **tables})
     assert said in str(caught.value)
+    flight = {"loop": {"mode": "sampled"}, "sensors": NOISY}
     with pytest.raises(ScenarioError, match=r"filter\.kind"):
-        scenario.from_tables({"loop": {"mode": "sampled"}, "filter": {"bandwidth": 1.0}, "sensors": NOISY})
+        scenario.from_tables({**flight, "filter": {}})  # was asked for its bandwidth
+    for key in ("attitude_noise", "rate_noise", "star_tracker_misalignment", "gyro_scale", "star_tracker_outage"):
+        with pytest.raises(
+            ScenarioError, match=rf"^dispersion\.{key} is drawn of what \[hardware\] says, but \[sensors\]"
+        ):
+            scenario.from_tables({**flight, "dispersion": {key: {}}})  # was asked for a noise that must be absent
     assert dataclasses.is_dataclass(ptsmc.SampledSensor)
 
 
