@@ -39,6 +39,7 @@ class Code:
     calls: dict[str, str] = field(default_factory=dict)  # by stage
     about: dict[str, str] = field(default_factory=dict)  # what each stage does, of those of a sample
     counts: Counter[str] = field(default_factory=Counter)  # operations of a step at most
+    open: bool = False  # whether the passes of a loop are not known, of which one is counted
     derived: list[Field] = field(default_factory=list)  # what follows from parameters
     basis: list[Field] = field(default_factory=list)  # the parameters that it follows from
     derivation: str = ""  # the text of the function that does
@@ -82,7 +83,7 @@ def _derivation(code: Code, known: parameters.Parameters) -> None:
     head = [*about, "static void derive(const ptsmc_params *p, ptsmc_derived *d)", "{"]
     code.derivation = "\n".join([*head, *_shortened(body, {}), "", *copies, "}"])
     code.deriving = dict(printer.counts)
-    code.variables = max(code.variables, len(printer.names))
+    code.variables = max(code.variables, printer.variables)
 
 
 def _structs(board: Board) -> tuple[dict[str, Struct], dict[str, Any]]:
@@ -173,7 +174,8 @@ def _function(
         code.about[stage.name] = stage.about
     code.calls[stage.name] = f"{stage.name}({', '.join(PASSED.get(name, name) for name in arguments)})"
     code.counts.update(printer.counts)
-    code.variables = max(code.variables, len(printer.names))
+    code.open |= printer.open
+    code.variables = max(code.variables, printer.variables)
 
 
 def _shortened(body: list[str], kinds: dict[str, str]) -> list[str]:

@@ -103,6 +103,13 @@ class Printer:
         self.counts: Counter[str] = Counter()
         self.section: Any = None
         self.count = 0
+        self.entries = 0  # of the tables of its loops
+        self.open = False  # whether it has a loop until something is so, of which one pass is counted
+
+    @property
+    def variables(self) -> int:
+        """How many numbers the function holds at most, the entries of its tables among them."""
+        return len(self.names) + self.entries
 
     def body(self, block: Block, outputs: Sequence[tuple[str, Node]], indent: str = "    ") -> list[str]:
         """Lines of a block that sets these places."""
@@ -205,6 +212,7 @@ class Printer:
             node.title, node.part = result.title, result.part
             self.names[id(result)] = self._name(node)
             lines += wrapped(f"{declared(node.kind)} {self._name(node)} = {self.text(start)};", indent)
+        self.entries += sum(len(entries) for _, entries in region.tables) + len(region.rows) * region.length
         for table, entries in region.tables:
             listed = ", ".join(self.text(entry) for entry in entries)
             lines += wrapped(f"const {declared(table.kind)} {self._name(table)}[{len(entries)}] = {{{listed}}};",
@@ -216,6 +224,7 @@ class Printer:
             k = self._name(region.index)
             lines.append(f"{indent}for (int {k} = 0; {k} < {region.length}; {k}++) {{")
         else:
+            self.open = True
             lines.append(f"{indent}for (;;) {{")
             lines += self._block(region.blocks[0], inner)
             lines += wrapped(f"if (!({self.text(region.outputs[0][0])})) {{", inner)
@@ -233,7 +242,7 @@ class Printer:
             k = self._name(region.index) if region.index is not None else ""
             lines += wrapped(f"{self._name(table)}[{k}] = {self.text(region.outputs[-1][which])};", inner)
         self.section = None
-        for op in self.counts:  # of a loop until something is so, one pass is counted
+        for op in self.counts:
             self.counts[op] += (self.counts[op] - once[op]) * max(region.length - 1, 0)
         return [*lines, *after, f"{indent}}}"]
 

@@ -30,6 +30,7 @@ def readme(code: Code, about: About) -> str:
         statuses="\n".join(f"| `PTSMC_{key}` = {k} | {said} |" for k, (key, said) in enumerate(STATUS.items())),
         delay=delay if about.delay else "",
         costs=_listed(code.counts),
+        passes=", and one pass of each loop whose passes are not known" if code.open else "",
         deriving=f" Where parameters have changed, and in `ptsmc_init`, {deriving} more." if deriving else "",
         stack=str(stack(code)),
         derived=_derived(code),

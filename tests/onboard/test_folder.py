@@ -133,6 +133,44 @@ def test_names_and_words_of_c_in_a_part_of_one_s_own_compile(tmp_path):
     assert "other status: 0" in done.stdout
 
 
+class Tabled(ptsmc.AccelerationLaw):
+    """PD with a loop through a table, which fills another one."""
+
+    def acceleration(self, now: Any, error: Any, error_rate: Any, bound: Any) -> Any:
+        """With 600 and 900 numbers."""
+        shares = jnp.linspace(0.0, 1e-3, 300), jnp.linspace(1e-3, 0.0, 300)
+        end, rows = jax.lax.scan(lambda c, row: (0.99 * c + row[0] * error, c * row[1]), jnp.zeros(3), shares)
+        return -error - 2.0 * error_rate + 1e-3 * (end + rows[7] + rows[299]), error
+
+
+@pytest.mark.skipif(shutil.which("make") is None or shutil.which("gcc") is None, reason="this machine has no gcc")
+def test_the_stack_that_is_stated_has_the_tables_of_loops(tmp_path):
+    """2 800 bytes were stated, where gcc counts 12 632."""
+    flown = {**FLIGHTS["raw"], "controller": {"kind": "own", "code": Tabled, "t_f": 5.0}}
+    made = scenario.reading.complete(scenario.from_tables(flown))
+    place = folder.export(made, tmp_path / "controller", name="law", trials=1)
+    (stated,) = re.findall(r"At most (\d+) bytes of stack", (place / "README.md").read_text())
+    counted = dict(re.findall(r":(\w+)\t(\d+)", make(place, "stack").stdout))
+    assert int(counted["ptsmc_step"]) + int(counted["command"]) <= int(stated) < 20_000
+
+
+class Halving(ptsmc.AccelerationLaw):
+    """PD, its command halved until it is small."""
+
+    def acceleration(self, now: Any, error: Any, error_rate: Any, bound: Any) -> Any:
+        """Of as many passes as it takes."""
+        start = -error - 2.0 * error_rate
+        return jax.lax.while_loop(lambda a: jnp.max(jnp.abs(a)) > 1.0, lambda a: 0.5 * a, start), error
+
+
+@pytest.mark.parametrize(("law", "said"), [(Halving, True), (Odd, False)])
+def test_operations_of_loops_whose_passes_are_not_known_are_those_of_one(law, said, tmp_path):
+    flown = {**FLIGHTS["raw"], "controller": {"kind": "own", "code": law, "t_f": 5.0}}
+    made = folder.Controller(scenario.reading.complete(scenario.from_tables(flown)), "law", "a scenario")
+    folder.write_program(tmp_path, made)
+    assert ("one pass of each loop whose passes are not known" in (tmp_path / "README.md").read_text()) == said
+
+
 class Unsigned(Odd):
     """With numbers that C has no kind for."""
 
