@@ -83,10 +83,10 @@ FUNCTIONS = {
     ),
     "taken beyond the end": (
         lambda k, x: (
-            jnp.take(x, k),
-            jnp.take(x, k - 5),
-            jnp.take(x, k - 8),
-            x.at[k].get(mode="fill", fill_value=1.0),
+            [jnp.take(x, place) for place in (k, k - 5, k - 8, k - 11)],
+            [x.at[place].get(mode="fill", fill_value=1.0) for place in (k, k - 6, k - 9, k - 11)],
+            jnp.arange(3).at[k].get(mode="fill") * x,
+            (x > 0.0).at[k].get(mode="fill") * x,
             jnp.take(jnp.outer(x, x), k, axis=0, fill_value=2),
             jnp.take(jnp.asarray([True, False]), k),
             x.at[k].get(mode="clip"),
