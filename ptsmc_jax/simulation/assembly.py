@@ -1,10 +1,9 @@
 """The parts of a run."""
 
 from dataclasses import dataclass, field, fields, replace
-from types import FunctionType
 from typing import Any, TypeVar
 
-from jax.tree_util import Partial
+from jax.tree_util import Partial, all_leaves
 
 from ptsmc_jax.devices.actuators import Actuators
 from ptsmc_jax.devices.command_filter import CommandFilter
@@ -43,12 +42,12 @@ class Setup:
     def __post_init__(self) -> None:
         """Wraps functions as reference of an attitude, which may give a quaternion, and plain ones as any signal."""
         path = self.reference
-        if isinstance(path, FunctionType | Partial) and self.plant.attitude:
+        if (isinstance(path, Partial) or _is_function(path)) and self.plant.attitude:
             whole = path if isinstance(path, Partial) else Partial(path)  # one of another has no leaves
             object.__setattr__(self, "reference", TurningFunction(whole))
         for name in ("disturbance", "reference"):
             value = getattr(self, name)
-            if isinstance(value, FunctionType):
+            if _is_function(value):
                 object.__setattr__(self, name, Function(value))
 
     def with_t_f(self: _Setup, t_f: Leaf) -> _Setup:
@@ -85,6 +84,11 @@ class Setup:
     def timed(self, clock: Anchored | Flight | Graded, substeps: int) -> "Parts":
         """The parts of a run by this clock."""
         return Parts(clock=clock, substeps=substeps, **{f.name: getattr(self, f.name) for f in fields(self)})
+
+
+def _is_function(value: Any) -> bool:
+    """Whether it is called and JAX would take it for a number: a plain function, a jitted one, a bound method."""
+    return callable(value) and all_leaves([value])
 
 
 def check_parts(what: object) -> None:

@@ -4,6 +4,7 @@ import re
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -38,6 +39,33 @@ def test_a_lambda_is_a_disturbance_and_a_function_a_reference_under_jit():
                   period=0.1, flight=True)  # fmt: skip
     expected, found = (ptsmc.simulate_jit(run, np.uint32(0), np.uint32(0)).metrics for run in (wave, plain))
     np.testing.assert_allclose(found.window_error, expected.window_error, rtol=1e-9)
+
+
+class Push:
+    """What is called, and no pytree."""
+
+    def __call__(self, t, x):
+        """The wave of a chain."""
+        return self.wave(0.1, t, x)
+
+    def wave(self, size, t, x):
+        """A wave of any size."""
+        return size * jnp.sin(t) * jnp.ones(1)
+
+
+def test_whatever_is_called_is_a_disturbance():
+    """JAX took all but plain functions for arrays, and said so from deep inside."""
+    push = Push()
+    for called in (jax.jit(push), partial(push.wave, 0.1), push, push.__call__):
+        run = chain_parts([1.0, 0.0], period=0.5, disturbance=called)
+        assert jax.tree.leaves(run.disturbance) == []
+        again = jax.tree.unflatten(jax.tree.structure(run), jax.tree.leaves(run))
+        np.testing.assert_allclose(
+            jax.jit(lambda run: run.disturbance(jnp.asarray(2.0), run.initial))(again), 0.1 * np.sin(2.0)
+        )
+    turning = jax.jit(lambda t: jnp.stack([0.0 * t, 0.0 * t, jnp.sin(0.01 * t), jnp.cos(0.01 * t)]))
+    turned = jax.jit(lambda run: run.reference(jnp.asarray(7.0)).w)(parts(8.0, 3.0, 0.5, reference=turning))
+    np.testing.assert_allclose(turned, [0.0, 0.0, 0.02], atol=1e-15)
 
 
 def test_a_function_that_returns_a_quaternion_is_a_reference():
