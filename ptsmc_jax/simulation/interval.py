@@ -1,9 +1,8 @@
 """One interval of a run as its metrics see it: both ends, the torques in between, and the criteria of the run."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 from jaxtyping import Array
 
 from ptsmc_jax.simulation.pointing import ConstantPath, ErrorPath, Pointing
@@ -85,14 +84,17 @@ class Interval(NamedTuple):
         return self.t_next - self.t
 
 
-def integral_in_window(t: Array, t_next: Array, squares: tuple[Array, Array, Array], criteria: Criteria) -> Array:
-    """Integral over the part of an interval inside the window of the parabola through its start, middle and end [s]."""
+def integral_in_window(t: Any, t_next: Any, squares: tuple[Any, Any, Any], criteria: Criteria) -> Any:
+    """Integral over the part of an interval inside the window of the parabola through its start, middle and end [s].
+
+    Of JAX's arrays or NumPy's.
+    """
     dt, (g0, g1, g2) = t_next - t, squares
 
-    def fraction(time: Array) -> Array:
-        return jnp.clip((time - t) / dt, 0.0, 1.0)
+    def fraction(time: Any) -> Any:
+        return ((time - t) / dt).clip(0.0, 1.0)
 
-    def primitive(x: Array) -> Array:
+    def primitive(x: Any) -> Any:
         return x * (g0 + x * ((-3 * g0 + 4 * g1 - g2) / 2 + x * (2 * g0 - 4 * g1 + 2 * g2) / 3))
 
     return dt * (primitive(fraction(criteria.t_f + criteria.window)) - primitive(fraction(criteria.t_f)))

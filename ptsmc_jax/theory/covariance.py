@@ -166,18 +166,39 @@ def _covariance(parts: Parts, ticks: Any, opened: linear.Opened, sign: _Sign | N
     p, sliding = state.start(), state.rows(opened.s_command, opened.s_direct)
     command, moved = state.moved(opened.loop)
     sloped = (None, None) if sign is None else state.moved(sign.loops)
-    squares, torque, widths = np.zeros((len(lengths), 2)), 0.0, np.zeros(len(lengths))  # of the error and of s
+    # of the error at the start of a period and in its middle, of s
+    squares, torque, widths = np.zeros((len(lengths) + 1, 3)), 0.0, np.zeros(len(lengths))
+
+    def square(error: Any) -> float:
+        return float(np.trace(error @ p[state.plant, state.plant] @ error.T))
+
     for j, length in enumerate(lengths):
-        error, s = opened.error[j], sliding.at(j).covariance(p)
-        squares[j] = np.trace(error @ p[state.plant, state.plant] @ error.T), np.mean(np.diag(s))
+        s = sliding.at(j).covariance(p)
+        squares[j] = square(opened.error[j]), 0.0, np.mean(np.diag(s))
         share = 0.0
         if sign is not None:
-            widths[j] = _mean_width(sign.flown, min(float(np.sqrt(squares[j, 1])), BEYOND))
+            widths[j] = _mean_width(sign.flown, min(float(np.sqrt(squares[j, 2])), BEYOND))
             share = sign.widths[j] / widths[j] if widths[j] > 0.0 else 1.0
         commanded = command.at(j, sloped[0], share).covariance(p)
         torque = max(torque, float(np.sqrt(np.diag(commanded).max())))
-        p = moved.at(j, sloped[1], share).covariance(p) + np.diag((state.drift * length) ** 2)
+        later = moved.at(j, sloped[1], share)
+        squares[j, 1] = np.trace(_middle(opened, j, float(length), later, state.plant).covariance(p))
+        p = later.covariance(p) + np.diag((state.drift * length) ** 2)
+    squares[-1, 0] = square(opened.error[-1])
+    error = error_floor.window_error(parts, ticks, np.stack([squares[:-1, 0], squares[:-1, 1], squares[1:, 0]], axis=1))
     t, t_f = ticks.t, float(parts.controller.t_f)
     in_window = (t >= t_f - 1e-9) & (t <= t_f + float(parts.window))
-    error, s_size = np.sqrt(np.mean(squares[in_window], axis=0))
-    return Noise(float(error), torque, float(s_size)), widths
+    return Noise(error, torque, float(np.sqrt(np.mean(squares[:-1][in_window, 2])))), widths
+
+
+def _middle(opened: linear.Opened, j: int, length: float, later: _Rows, plant: slice) -> _Rows:
+    """The error in the middle of the j-th period, by the cubic that metrics draw, `integrators.hermite_middle`.
+
+    later: the state a period later, without what walks by then.
+    """
+    after = min(j + 1, len(opened.error) - 1)
+    start = np.asarray(opened.error[j] / 2 + length / 8 * opened.error_rate[j])
+    end = np.asarray(opened.error[after] / 2 - length / 8 * opened.error_rate[after])
+    state = end @ later.state[plant]
+    state[:, plant] += start
+    return _Rows(state, end @ later.noise[plant])

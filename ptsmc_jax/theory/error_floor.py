@@ -92,9 +92,15 @@ def _together(models: Sequence[Model]) -> Model:
 
 def _floor(parts: Parts, ticks: Ticks, squares: np.ndarray) -> Floor:
     """From squares of the error (periods, 3) at start, middle and end of each period."""
-    criteria = Criteria(parts.controller.t_f, parts.t_end, parts.window, parts.settling_angle)
-    total = float(_total(ticks.t, ticks.t_next, squares, criteria)) if squares.any() else 0.0
-    return Floor(float(np.sqrt(total / float(parts.window))), np.asarray(ticks.t_next), np.sqrt(squares[:, 2]))
+    return Floor(window_error(parts, ticks, squares), np.asarray(ticks.t_next), np.sqrt(squares[:, 2]))
+
+
+def window_error(parts: Parts, ticks: Ticks, squares: np.ndarray) -> float:
+    """RMS over the window, from squares of the error (periods, 3) as the metric has it of a run."""
+    times: Any = map(np.asarray, (parts.controller.t_f, parts.t_end, parts.window, parts.settling_angle))
+    start, middle, end = squares.T
+    total = np.sum(integral_in_window(ticks.t, ticks.t_next, (start, middle, end), Criteria(*times)))
+    return float(np.sqrt(total / float(parts.window)))
 
 
 def pooled(floors: Iterable[Floor]) -> float | None:
@@ -120,12 +126,6 @@ def _lasting(parts: Parts, log: Log) -> tuple[Any, Any]:
 @programs.jit
 def _ticks(clock: Any, t_f: Array, delta: Array) -> Ticks:
     return clock.ticks(t_f, delta)
-
-
-@programs.jit
-def _total(t: Array, t_next: Array, squares: Array, criteria: Criteria) -> Array:
-    """Over the window, of squares (periods, 3) at start, middle and end."""
-    return jnp.sum(integral_in_window(t, t_next, (squares[:, 0], squares[:, 1], squares[:, 2]), criteria))
 
 
 def _unknown(model: Model, delay: int) -> np.ndarray:

@@ -152,6 +152,7 @@ class Opened(NamedTuple):
 
     loop: Loop
     error: Array  # (m, x) of what the law drives to zero, by x
+    error_rate: Array  # (m, x) and of its rate
     s_command: Array  # (components, n) of s by z
     s_direct: Array  # (components, k) and by x_seen
 
@@ -191,8 +192,8 @@ def opened(parts: Parts, during: Nominal, *, late: bool = True) -> Opened:
     (a, seen), (command, direct), (s_command, s_direct) = jax.jacfwd(flown, argnums=(0, 1))(z0, known)
     old, new, disturbed = lapack.vmap(pushed)(jnp.asarray(NODES if late else NODES[:1]))
     loop = Loop(a, seen, new, old, command, direct, disturbed[0], dt, delay=parts.effective_actuators.delay)
-    error = jax.jacfwd(lambda by: law.errors(plant.retract(before.x, by), target)[0])(x0)
-    return Opened(loop, error, s_command, s_direct)
+    error, error_rate = jax.jacfwd(lambda by: law.errors(plant.retract(before.x, by), target))(x0)
+    return Opened(loop, error, error_rate, s_command, s_direct)
 
 
 def _whole(period: Period) -> Period:
