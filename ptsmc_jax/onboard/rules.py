@@ -17,11 +17,11 @@ def power(pool: Pool, x: Node, exponent: int) -> Node:
     left, found, square = abs(exponent), None, x
     while left:
         if left & 1:
-            found = square if found is None else pool.make("mul", found, square)
+            found = square if found is None else pool.make("mul", found, square, kind=x.kind)
         left >>= 1
         if left:
-            square = pool.make("mul", square, square)
-    one = pool.constant(1.0, REAL)
+            square = pool.make("mul", square, square, kind=x.kind)
+    one = pool.constant(1, x.kind)
     found = one if found is None else found
     return pool.make("div", one, found) if exponent < 0 else found
 
@@ -90,9 +90,7 @@ def _round(pool: Pool, params: Any, kind: str, x: Node) -> Node:
 
 
 def _integer_pow(pool: Pool, params: Any, kind: str, x: Node) -> Node:
-    if kind != REAL:
-        raise KeyError("integer_pow")
-    return power(pool, x, params["y"])
+    return power(pool, x, params["y"])  # of whole numbers no quotients
 
 
 def _divided(op: str) -> Callable:

@@ -109,7 +109,7 @@ class Translator:
             return [self._cumulative(eqn, values[0])]
         if name in ("argmax", "argmin"):
             return [self._place_of_extreme(eqn, values[0])]
-        if name in _MOVES:
+        if name in _MOVES or name in _ADDS:
             found = self._moved(eqn, values)
             if found is not None:
                 return found
@@ -184,7 +184,7 @@ class Translator:
                 arrays, places = values[:1], values[1:]
             case "dynamic_update_slice":
                 arrays, places = values[:2], values[2:]
-            case "gather" | "scatter":
+            case "gather" | "scatter" | "scatter-add" | "scatter-sub":
                 arrays, places = values[::2], values[1:2]
             case _:
                 return components.picked(eqn, values)
@@ -220,6 +220,9 @@ class Translator:
         self, eqn: Any, values: Sequence[np.ndarray], arrays: Sequence[np.ndarray], chosen: Node | None, k: int
     ) -> np.ndarray:
         """What is moved where the place that is computed, `chosen`, is k."""
+        if eqn.primitive.name in _ADDS:
+            array, at, more = values
+            return self._added(eqn, array, at, more, chosen, k)
         pool: list[Node] = []
         numbered: dict[int, np.ndarray] = {}
         for array in arrays:
@@ -237,6 +240,26 @@ class Translator:
             out = np.asarray(components.bind(_numbering(eqn), operands)[0])
         inside = (out >= 0) & (out < len(pool) - 1)
         return object_array(out.shape, (pool[i if ok else -1] for i, ok in zip(out.flat, inside.flat, strict=True)))
+
+    def _added(
+        self, eqn: Any, array: np.ndarray, places: np.ndarray, more: np.ndarray, chosen: Node | None, k: int
+    ) -> np.ndarray:
+        """An array with more, or less, at places in turn, where the place that is computed, `chosen`, is k."""
+        known = np.asarray([k if node is chosen else node.value for node in places.flat]).reshape(places.shape)
+        types = [variable.aval.dtype for variable in eqn.invars]
+        total = array.copy()
+        for index in np.ndindex(*more.shape):  # where each of them comes
+            one = np.zeros(more.shape)
+            one[index] = 1.0
+            with jax.ensure_compile_time_eval():
+                arrays = [
+                    jnp.asarray(v, dtype) for v, dtype in zip((np.zeros(array.shape), known, one), types, strict=True)
+                ]
+                hit = np.asarray(components.bind(eqn, arrays)[0])
+            for at in map(tuple, np.argwhere(hit)):
+                both: Any = total[at], more[index]
+                total[at] = self.pool.make(_ADDS[eqn.primitive.name], *both, kind=kind_of(types[0]))
+        return total
 
 
 def _numbering(eqn: Any) -> Any:
@@ -282,6 +305,7 @@ _MOVES = set(
     "broadcast_in_dim concatenate expand_dims pad reshape rev slice split squeeze stack tile transpose unstack "
     "dynamic_slice dynamic_update_slice gather scatter".split()
 )
+_ADDS = {"scatter-add": "add", "scatter-sub": "sub"}
 # what gives numbers that it is given
 _KEPT = {
     *_MOVES,

@@ -81,6 +81,32 @@ FUNCTIONS = {
         np.int32(7),
         X,
     ),
+    "added at places": (
+        lambda k, x, m: (
+            x.at[1].add(4.0),
+            x.at[k].add(x[0]),
+            x.at[k + 1].add(x[0]),
+            x.at[k - 9].add(1.0),
+            x.at[jnp.asarray([0, 2, 0])].add(x * 1e-9),
+            x.at[1:].add(x[:2]),
+            x.at[::-1].add(x),
+            m.at[k].add(x),
+            m.at[:, k].add(1.0),
+            m.at[k, 1].add(x[2]),
+            m.at[0].add(jnp.ones((2, 3)).sum(0)),
+            x.at[1].subtract(x[2]),
+            (jnp.zeros(3, int).at[k].add(k)) * 1.0,
+            jax.grad(lambda y: jnp.sum(jnp.sin(y[1:]) * y[:2]))(x),
+        ),
+        np.int32(2),
+        X,
+        MATRIX,
+    ),
+    "powers of whole numbers": (
+        lambda k, x: (k**2 * x, k**3 * x, (k * 10) ** 5 * x, (-k) ** 7 * x, k**0 * x),
+        np.int64(7),
+        X,
+    ),
     "taken beyond the end": (
         lambda k, x: (
             [jnp.take(x, place) for place in (k, k - 5, k - 8, k - 11)],
