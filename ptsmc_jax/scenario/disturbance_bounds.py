@@ -11,10 +11,12 @@ import numpy as np
 
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.gain_bounds import rounded, size
+from ptsmc_jax.scenario.values import MOST_STEPS
 
 RATE = 10.0 / 12.0  # l / J of the paper's observer, 10 N m s on its mean moment of 12 kg m^2 [1/s]
 SIGMAS = 3.0  # of what is normal, and has no largest value
-POINTS = 2001  # of the run along which a disturbance of one's own is looked at
+POINTS = 2001  # of the run at least, along which a disturbance of one's own is looked at, and
+FINE = 0.1  # of its fastest rate a step at most [rad]: its own is then 0.2 % off
 
 
 class Bounds(NamedTuple):
@@ -101,17 +103,19 @@ def gravity_gradient(scenario: Any, orbit_rate: float) -> Bounds:
     return Bounds(np.full(3, 0.5 * most), np.full(3, most * (orbit_rate + turning(scenario))))
 
 
-def along_the_run(scenario: Any, signal: Any) -> Bounds:
+def along_the_run(scenario: Any, signal: Any, fastest: float = 0.0) -> Bounds:
     """Largest size and rate of a disturbance of one's own d(t, x) on the way from the start to the target.
 
-    The way is the nominal one: the error falls like (t_f - t)^3 until t_f, then the target is followed.
+    The way is the nominal one: the error falls like (t_f - t)^3 until t_f, then the target is followed. fastest: how
+    fast the disturbance says that it changes [rad/s].
     """
     import jax
     import jax.numpy as jnp
 
     from ptsmc_jax.batching import lapack
 
-    t = np.linspace(0.0, float(scenario.loop.t_end), POINTS)
+    needed = min(float(scenario.loop.t_end) * fastest / FINE, MOST_STEPS)
+    t = np.linspace(0.0, float(scenario.loop.t_end), max(POINTS, math.ceil(needed) + 1))
     left = np.clip(1.0 - t / scenario.controller.t_f, 0.0, 1.0) ** 3
     states = left[:, None] * scenario.plant.x0 if scenario.moments[0] is None else _attitudes(scenario, t, left)
     try:
@@ -119,7 +123,7 @@ def along_the_run(scenario: Any, signal: Any) -> Bounds:
     except Exception:  # which `own_checks` refuses before a flight, in one sentence
         acting = np.zeros(0)
     inputs = scenario.inputs
-    if acting.shape != (POINTS, inputs) or not np.all(np.isfinite(acting)):
+    if acting.shape != (t.size, inputs) or not np.all(np.isfinite(acting)):
         return Bounds(np.zeros(inputs), np.zeros(inputs))
     return Bounds(np.max(np.abs(acting), axis=0), np.max(np.abs(np.gradient(acting, t, axis=0)), axis=0))
 

@@ -276,7 +276,7 @@ class OwnDisturbance(Own, DisturbanceTable, kw_only=True, frozen=True):
         """See `disturbance_bounds.along_the_run`."""
         if self.waits or disturbance_bounds.target_waits(scenario):
             return None
-        return disturbance_bounds.along_the_run(scenario, build(self))
+        return disturbance_bounds.along_the_run(scenario, build(self), self.quickest())
 
     def build(self, inertia: Any) -> Any:
         """What the code names."""
