@@ -104,8 +104,9 @@ def scan(to: Any, eqn: Any, values: list[np.ndarray]) -> list[np.ndarray]:
             carry = results[:carried]
             for row, result in zip(rows, results[carried:], strict=True):
                 row.append(result)
-        stacked = [np.stack(row[:: -1 if params["reverse"] else 1]) if row else np.empty((0,), object)
-                   for row in rows]  # fmt: skip
+        rows = [row[:: -1 if params["reverse"] else 1] for row in rows]
+        stacked = [np.stack(row) if row else np.empty(v.aval.shape, object)
+                   for row, v in zip(rows, eqn.outvars[carried:], strict=True)]  # fmt: skip
         return [*carry, *stacked]
     region = Region("count")
     region.length, region.index = length, to.pool.fresh("int32_t", "index")

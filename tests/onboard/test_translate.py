@@ -174,6 +174,10 @@ FUNCTIONS = {
     "counted loop": (counted, X),
     "loop over a table": (gone_through, X),
     "loop backwards": (backwards, X),
+    "loop without steps": (
+        lambda x: jnp.concatenate([jax.lax.scan(lambda c, r: (c * r, c), x, jnp.zeros(0))[1], x[None]]),
+        X,
+    ),
     "short loop over numbers": (lambda x: jnp.polyval(jnp.asarray([1.0, 2.0, 3.0]), x), X),
     "loop until": (until, X),
     "loops until, row by row": (jax.vmap(until), MATRIX),
