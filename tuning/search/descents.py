@@ -129,6 +129,11 @@ class Descents:
         return self._evaluate.bounds.gains(self.share)
 
     @property
+    def ends(self) -> list[np.ndarray]:
+        """Shares, (gains,) each, where the starts ended that were followed to the end, the best first."""
+        return [end.share for _, end in _ranked(self._ends)]
+
+    @property
     def history(self) -> list[Step]:
         """The points gone through, in the order of the starts and of each start's steps."""
         return [step for _, steps in sorted(self._history.items()) for step in steps]

@@ -47,6 +47,7 @@ class Search:
     value: float  # its goal over the training trials
     worst: np.ndarray  # (requirements,) its largest metric / limit, infinite where a trial fails
     ended: np.ndarray  # (requirements,) the same over the trials that end
+    ends: list[np.ndarray]  # shares where the starts ended that were followed, the best first
     history: list[Step]  # in the order of the starts, and of each start's steps
     problem: Problem  # with the hardest trials
     rounds: int = 0  # searches again with harder trials
@@ -113,6 +114,7 @@ def search(
         value=best.value,
         worst=np.where(best.failed, np.inf, best.worst),
         ended=best.worst,
+        ends=descents.ends,
         history=descents.history,
         problem=descents.problem,
         rounds=rounds.count,

@@ -122,7 +122,8 @@ def trace(
     report = headed(tell, f"peak torque {ladder[middle]:.3g}")
     between = uninterrupted(posed.search(under(ladder[middle]), posed.own, starts, (), judged=False, report=report))
     rungs = [(f"peak torque {limit:.3g}", under(limit)) for limit in ladder]
-    best = apart(climbed(rungs, [free.share, least.share, between.share], posed, tell))
+    known = [share for found in (free, least, between) for share in (found.share, *found.ends)]
+    best = apart(climbed(rungs, known, posed, tell))
     by_limit = {float(ladder[k]): one for k, one in best.items()}
     fresh_seed = judging.seed_of_judge(seed)
     judged = _judge(limited, posed, by_limit, fresh_seed, tell)
