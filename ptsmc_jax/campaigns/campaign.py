@@ -177,6 +177,12 @@ def missing(parts: Iterable[Part], trials: int, shard: tuple[int, int] = (1, 1))
     return [(first, count) for first, count in every[number - 1 :: shards] if flown.get(first, 0) < count]
 
 
+def staying(parts: Iterable[Part], wanted: Iterable[Wanted]) -> list[Part]:
+    """The parts that are not flown anew: one that is to have more trials is, and none of its own are done yet."""
+    anew = {first for first, _ in wanted}
+    return [part for part in parts if part.first not in anew]
+
+
 @dataclass
 class Tally:
     """Where a campaign stands."""

@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 
 import jax
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 from ptsmc_jax.campaigns import campaign, store
 from tests.helpers import SHORT_CHAIN, same, short
 from tests.output.pages import checked
-from tuning.output import progress_lines, sentences
+from tuning.output import campaign_terminal, progress_lines, sentences
 from tuning.studies import campaign_summary
 
 FOLDER = "out/montecarlo-s"
@@ -101,6 +102,8 @@ def test_trials_that_all_fail_are_not_said_to_be_the_same():
     at_rest = {"window_error": {"without_value": 0, "mean": 0.0, "max": 0.0}}
     (said,) = campaign_summary._alike(at_rest, 5, drawn=True)  # another inertia of a body that stays at rest
     assert said == "all 5 trials have the same metrics: what is drawn in them changes none"
+    at_rest["window_error"]["without_value"] = 4  # one is all that is left of them
+    assert campaign_summary._alike(at_rest, 5, drawn=True) == campaign_summary._alike(at_rest, 5) == []
 
 
 def test_more_trials_add_to_what_is_there(command, flown):
@@ -115,6 +118,16 @@ def test_more_trials_add_to_what_is_there(command, flown):
     code, _, said = command("montecarlo", "s.toml", "--trials", 300, "--seed", 3)
     assert (code, said.count("\n")) == (2, 1)
     assert "--trials is 300, but must be at least 420" in said
+
+
+@pytest.mark.parametrize("planned", [False, True])
+def test_a_part_that_is_flown_anew_is_not_counted_twice(command, monkeypatch, planned):
+    standing = []
+    monkeypatch.setattr(campaign_terminal.Progress, "__call__", lambda _, tally: standing.append(replace(tally)))
+    for trials in (10, 20):
+        dry = ["--dry-run"] if planned else []
+        command("montecarlo", "s.toml", "--trials", trials, "--out", "more", "--no-figures", "--quiet", *dry)
+    assert [(tally.done, tally.total) for tally in standing] == [(0, 10), (10, 10), (0, 20), (20, 20)]
 
 
 def test_a_campaign_interrupted_while_it_is_summed_up_is_not_said_to_be_nothing(command, flown, monkeypatch):

@@ -374,7 +374,7 @@ def fly(
         folder.rows.tidy(parts)
     wanted = flying.missing(parts, trials, shard)
     landing = elsewhere(folder, wanted) if elsewhere else flying.here(folder.campaign.fly, folder.rows, wanted)
-    flying.follow(landing, flying.tally(parts, trials), report)
+    flying.follow(landing, flying.tally(flying.staying(parts, wanted), trials), report)
     if alone:
         folder.rows.tidy(folder.rows.parts()[0])
 
@@ -383,8 +383,9 @@ def write_plan(folder: Folder, report: Callable[[Tally], None]) -> None:
     """Write what each trial flies with, without flying it."""
     parts, _ = folder.dry.parts()
     folder.dry.tidy(parts)
-    landing = flying.here(folder.campaign.draw, folder.dry, flying.missing(parts, folder.trials))
-    flying.follow(landing, Tally(sum(part.count for part in parts), folder.trials, 0), report)
+    wanted = flying.missing(parts, folder.trials)
+    landing = flying.here(folder.campaign.draw, folder.dry, wanted)
+    flying.follow(landing, Tally(sum(part.count for part in flying.staying(parts, wanted)), folder.trials, 0), report)
 
 
 def settle(folder: Folder, trials: int) -> Folder:

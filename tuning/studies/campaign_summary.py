@@ -181,6 +181,8 @@ def _alike(quantiles: dict[str, Any], trials: int, *, drawn: bool = False) -> li
     known = [metric for metric in quantiles.values() if "max" in metric]
     if trials < 2 or not known or any(abs(m["max"] - m["mean"]) > SAME * abs(m["max"]) for m in known):
         return []
+    if any(m["without_value"] for m in known):  # a trial that failed is no flight of one that did not
+        return []
     if drawn:  # as another inertia of a body that stays at rest
         return [f"all {trials} trials have the same metrics: what is drawn in them changes none"]
     return [
