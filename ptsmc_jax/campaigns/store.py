@@ -21,6 +21,7 @@ from ptsmc_jax.scenario import parsing
 
 JOURNAL = "journal.bin"  # of a run that is not finished
 SUMMARY = "summary.json"  # of one that is
+WHOSE = (SUMMARY, "versions.json", "scenario.toml")  # tell a result from the one before: a map has the last two
 MAKING = ".making-"  # how the name of a file begins that is being written
 MADE_OF_RESULTS = {  # they would pass for those of the next one; by what is near its beginning each is known as ours
     "figures/*.png": b"Creator\0ptsmc",  # see `style.save`
@@ -197,7 +198,7 @@ def write(folder: Path, fill: Callable[[Path], None]) -> None:
     """Make a result folder: `fill` writes into a new one beside it, whose files are then moved into place.
 
     Where nothing may stand beside it, or on another disk only, the new one is inside it. Of another result that was
-    there, known by its summary, figures and tables go; what says whose the files are is moved first, the new summary
+    there, see `WHOSE`, summary, figures and tables go; what says whose the files are is moved first, the new summary
     last, since it says that the result is whole.
     """
     asked, folder = folder, Path(os.path.realpath(folder))  # of a link, what it leads to
@@ -218,7 +219,7 @@ def write(folder: Path, fill: Callable[[Path], None]) -> None:
                 pass
         order = {"versions.json": -1, SUMMARY: 1}
         files = (path for path in making.rglob("*") if path.is_file())
-        if (making / SUMMARY).exists() and not _alike(making / SUMMARY, folder / SUMMARY):
+        if any((making / name).exists() and not _alike(making / name, folder / name) for name in WHOSE):
             forget(folder)
         for path in sorted(files, key=lambda path: order.get(path.name, 0)):
             target = folder / path.relative_to(making)

@@ -101,6 +101,26 @@ def test_scenarios_of_laws_that_are_compared_no_more_go_and_a_users_own_stay(tmp
     assert (out / "other.toml").exists()
 
 
+@pytest.mark.parametrize("changed", ["versions.json", "scenario.toml"])
+def test_a_result_without_a_summary_takes_the_place_of_another_one_too(tmp_path, changed):
+    """As a map does: the figures of what was there would stand on its page."""
+
+    def a_map(folder, other=""):
+        (folder / "versions.json").write_text('{"command": "map"}' + (" " if other == "versions.json" else ""))
+        (folder / "scenario.toml").write_text("# other" if other == "scenario.toml" else "")
+
+    out = tmp_path / "out"
+    (out / "figures").mkdir(parents=True)
+    (out / "figures" / "map.png").write_bytes(store.MADE_OF_RESULTS["figures/*.png"])
+    a_map(out)
+    store.write(out, a_map)  # the same one, without figures
+    assert (out / "figures" / "map.png").exists()
+    (out / "summary.json").write_text("{}")
+    store.write(out, lambda folder: a_map(folder, changed))
+    assert not (out / "figures" / "map.png").exists()
+    assert not (out / "summary.json").exists()
+
+
 def test_check_refuses_files_and_full_folders(tmp_path):
     store.check(tmp_path / "new", force=False)
     store.check(tmp_path, force=False)  # empty
