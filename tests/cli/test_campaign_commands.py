@@ -482,6 +482,8 @@ def test_single_precision_is_another_campaign_whose_rows_are_nearly_the_same(com
         assert command(*run, "--out", "half", "--precision", 32)[0] == 0
         code, _, error = command("replay", "half", "--trial", 7, "--no-figures")
     assert (code, error) == (0, "")
+    made = json.loads((tmp_path / "half" / "replay" / "7" / "versions.json").read_text())
+    assert made["campaign"] == str(tmp_path / "half")  # simulate has 64 bits
     assert asked == [{"device": "cpu", "bits": bits, "keep_programs": True} for bits in (64, 32, 32)]
     whole, half = (pl.read_parquet(tmp_path / name / "trials") for name in ("whole", "half"))
     assert half["window_error"].dtype == pl.Float32

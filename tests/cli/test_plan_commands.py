@@ -1,6 +1,7 @@
 """`ptsmc montecarlo --plan`: the rows of a table as a campaign that is resumed, replayed and put on a page."""
 
 import json
+import shlex
 
 import polars as pl
 import pytest
@@ -58,6 +59,9 @@ def test_corner_cases_are_flown_resumed_replayed_and_put_on_a_page(command, tmp_
     assert (code, "equal to its row, to the last digit" in said) == (0, True)
     history = pl.read_csv(folder / "replay" / "1" / "trajectory.csv")
     assert history["x2"][0] == 0.02
+    again = checked(folder / "replay" / "1").text  # simulate flies no row of a plan
+    assert f"ptsmc replay {shlex.quote(str(folder))} --trial 1" in again
+    assert "ptsmc simulate scenario.toml" not in again
     assert command("replay", folder, "--trial", 3)[0] == 2
 
     (tmp_path / "corners.csv").write_text(CORNERS.replace("-0.02", "-0.03"))

@@ -287,6 +287,10 @@ def test_a_comparison_is_made_again_with_its_laws():
     bits = {"command": "montecarlo", "precision": 32}
     assert made_again.call(bits, {"loop": {}}) == "ptsmc montecarlo scenario.toml --precision 32"
     assert made_again.call({"command": "reproduce", "seed": None}, {}) == "ptsmc reproduce"
+    trial = {"command": "simulate", "seed": 1000, "trial": 7, "campaign": "of mine", "metrics": None}
+    assert made_again.call(trial, {"loop": {}}) == "ptsmc replay 'of mine' --trial 7"
+    for key in ("metrics", "controller"):
+        assert made_again.call({**trial, key: "x"}, {"loop": {}}) == "ptsmc replay 'of mine' --trial 7 --trust"
 
 
 @pytest.mark.parametrize(("values", "kind"), [([2.7, 3.05], None), ([1e-6, 4e-4], "log"), ([0.0, 5.0], None)])

@@ -285,7 +285,10 @@ def replay(
     opened = replace(opened, trusted=True)
     again = campaign_summary.replay(opened, trial)
     about = opened.scenario, again.run, opened.seed, trial, figures, opened.computer
-    store.write(place, lambda making: single.write(making, *about))
+    # what simulate does not fly: a plan's row, numbers of 32 bits
+    from_here = opened.plan is not None or opened.bits != 64
+    replayed = {"campaign": str(folder.absolute()), "metrics": opened.own} if from_here else {}
+    store.write(place, lambda making: single.write(making, *about, replayed))
     if not quiet:
         terminal.run(single.summary(again.run, opened.scenario, opened.computer), opened.scenario.plant.kind, place)
         campaign_terminal.replayed(again.off, again.rounding, campaign_summary.SAME)

@@ -15,6 +15,11 @@ OPTIONS = (
 
 def call(versions: Mapping[str, Any], scenario: Mapping[str, Any]) -> str:
     """The call as it is typed; scenario: its tables, none where there was no file."""
+    trusted = any(own.named(scenario)) or versions.get("metrics") is not None
+    if versions.get("campaign") is not None:  # of a trial that `simulate` does not fly
+        trusted = trusted or versions.get("controller") is not None
+        command = ["ptsmc", "replay", versions["campaign"], "--trial", str(versions["trial"])]
+        return shlex.join([*command, *(["--trust"] if trusted else [])])
     command = ["ptsmc", versions["command"], *(["scenario.toml"] if scenario else [])]
     for key in OPTIONS:
         if key == "trials" and versions.get("plan") is not None:
@@ -29,6 +34,6 @@ def call(versions: Mapping[str, Any], scenario: Mapping[str, Any]) -> str:
         command += ["--against", kind]
     for file in files:
         command += ["--law", file]
-    if any(own.named(scenario)) or versions.get("metrics") is not None:
+    if trusted:
         command.append("--trust")
     return shlex.join(command)

@@ -1,6 +1,8 @@
 """What `ptsmc simulate` leaves: the history of one run as CSV, its metrics and verdicts, figures."""
 
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -45,9 +47,10 @@ def write(
     trial: int | None,
     figures: bool,
     computer: "InTheLoop | None" = None,
+    replayed: Mapping[str, Any] = MappingProxyType({}),
 ) -> None:
-    """Fill a result folder; computer: see `summary`."""
-    made_by = {"command": "simulate", "seed": seed, "trial": trial, **own.digests(scenario)}
+    """Fill a result folder; computer: see `summary`; replayed: what else `versions.json` says of a campaign's trial."""
+    made_by = {"command": "simulate", "seed": seed, "trial": trial, **replayed, **own.digests(scenario)}
     if computer is not None:
         place = computer.library.folder
         made_by |= {"controller": str(place.absolute()), own.digest_name(own.CONTROLLER): sources.digest(place)}
