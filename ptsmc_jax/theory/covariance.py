@@ -120,8 +120,10 @@ class _State:
         self._seen = _Rows(np.zeros((k, self.size)), from_readings * reading.noise)
         self._seen.state[:, :k] = np.eye(k)
         self._seen.state[:, self._own] = from_readings @ reading.rows[:, k:]
-        # by how much the state moves by itself in a second, 1 sigma
-        self.drift = np.concatenate([np.zeros(before), reading.own_drift, error_floor.walk_of(parts)])
+        # by how much the state moves by itself in a second, 1 sigma: the random walk as a period begins, in which it
+        # acts, the sensors' own states after its sample
+        self.walk = np.concatenate([np.zeros(self.size - self._m), error_floor.walk_of(parts)])
+        self.drift = np.concatenate([np.zeros(before), reading.own_drift, np.zeros(self._m)])
 
     def start(self) -> np.ndarray:
         """Covariance (size, size) before the first sample."""
@@ -182,6 +184,7 @@ def _covariance(parts: Parts, ticks: Any, opened: linear.Opened, sign: _Sign | N
         commanded = command.at(j, sloped[0], share).covariance(p)
         torque = max(torque, float(np.sqrt(np.diag(commanded).max())))
         later = moved.at(j, sloped[1], share)
+        p = p + np.diag((state.walk * length) ** 2)
         squares[j, 1] = np.trace(_middle(opened, j, float(length), later, state.plant).covariance(p))
         p = later.covariance(p) + np.diag((state.drift * length) ** 2)
     squares[-1, 0] = square(opened.error[-1])
@@ -194,7 +197,7 @@ def _covariance(parts: Parts, ticks: Any, opened: linear.Opened, sign: _Sign | N
 def _middle(opened: linear.Opened, j: int, length: float, later: _Rows, plant: slice) -> _Rows:
     """The error in the middle of the j-th period, by the cubic that metrics draw, `integrators.hermite_middle`.
 
-    later: the state a period later, without what walks by then.
+    later: the state a period later, without what the sensors' own states drift by then.
     """
     after = min(j + 1, len(opened.error) - 1)
     start = np.asarray(opened.error[j] / 2 + length / 8 * opened.error_rate[j])

@@ -83,6 +83,21 @@ def test_the_error_between_samples_counts_where_few_of_them_are_in_the_window():
     np.testing.assert_allclose(covariance.noise(ready.parts).window_error, np.sqrt(np.mean(flown**2)), rtol=0.05)
 
 
+def test_a_random_walk_acts_from_the_start_of_its_period_on():
+    """Over four periods of 1 s, on 2 000 trials known to 1 %; a period later it would say 12 % less."""
+    tables = {
+        "controller": {"t_f": 4.0, "delta": 2.0, "k1": 0.5, "sign_width": 1e3},
+        "observer": {"gain": [3.0] * 3},
+        "initial": {"rotvec_deg": [0.0, 0.0, 0.0]},
+        "disturbance": {"kind": "random_walk", "density": [1e-5] * 3},
+        "loop": {"mode": "sampled", "clock": "flight", "period": 1.0, "t_end": 5.0},
+        "hardware": {"attitude_noise": 1e-12, "rate_noise": 1e-12},
+    }
+    ready = scenario.study(scenario.from_tables(tables))
+    flown = montecarlo.run(ready.parts, ready.dispersion, 0, np.arange(2000)).metrics.window_error
+    np.testing.assert_allclose(covariance.noise(ready.parts).window_error, np.sqrt(np.mean(flown**2)), rtol=0.04)
+
+
 def test_implicit_sampling_is_not_predicted():
     """A noise beyond what its switching reaches would count thirteen times in the torque."""
     parts = scenario.study(scenario.from_tables({"loop": {"mode": "sampled"}, "hardware": {"rate_noise": 1e-6}})).parts
