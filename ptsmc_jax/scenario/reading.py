@@ -6,7 +6,7 @@ from typing import Any
 
 import msgspec
 
-from ptsmc_jax.scenario import checks, free_gains, own, parsing
+from ptsmc_jax.scenario import checks, free_gains, layouts, own, parsing
 from ptsmc_jax.scenario.tables import Scenario, check_scenario
 
 USUAL_WINDOW = 1.0  # [s]
@@ -91,6 +91,8 @@ def replace(scenario: Scenario | str | Path, **changes: Any) -> Scenario:
         if value is None and _is_known(scenario, table, key):
             if not key:
                 tables.pop(table, None)
+            elif key == "kind" and _is_another_kind(scenario, table):
+                tables[table] = {}
             elif key in within:  # of a copy: it may be the caller's
                 tables[table] = {other: kept for other, kept in within.items() if other != key}
         elif not key:
@@ -106,6 +108,13 @@ def _comes(name: str) -> int:
     """When a change is made: whole tables and kinds first, which would drop the keys that go with them."""
     _, _, key = name.partition("__")
     return 0 if not key else 1 if key == "kind" else 2
+
+
+def _is_another_kind(scenario: Scenario, table: str) -> bool:
+    """Whether a table is of another kind than the default one."""
+    kinds = layouts.SCENARIOS if table == "plant" else scenario.TABLES.get(table)
+    kind = getattr(getattr(scenario, table), "kind", None)
+    return isinstance(kinds, Mapping) and kind not in (None, next(iter(kinds)))
 
 
 def _is_known(scenario: Scenario, table: str, key: str) -> bool:

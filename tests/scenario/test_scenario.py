@@ -395,6 +395,24 @@ def test_replace_keeps_the_keys_that_stand_before_a_kind_or_a_table(whole):
     assert (law.kind, law.k_p) == ("pd", 0.5)
 
 
+@pytest.mark.parametrize(
+    ("table", "given"),
+    [
+        ("reference", {"kind": "spin", "rate": [0.0, 0.0, 0.01]}),
+        ("disturbance", {"kind": "random_walk", "density": [0.01] * 3}),
+        ("observer", {"kind": "prescribed_time", "t_o": 1.0}),
+        ("plant", {"kind": "chain", "order": 3}),
+        ("requirements", {}),  # has no kinds
+    ],
+)
+def test_a_kind_that_returns_to_its_default_takes_the_keys_of_the_old_one_with_it(table, given):
+    sampled = {"loop": {"mode": "sampled"}}
+    back = replace(from_tables({**sampled, table: given}), **{f"{table}__kind": None})
+    assert back == from_tables(sampled)
+    kept = replace(from_tables({"controller": {"kind": "prescribed_time", "t_f": 20.0}}), controller__kind=None)
+    assert kept.controller.t_f == 20.0  # it was the default one
+
+
 def test_replace_leaves_the_tables_that_it_is_given():
     given = {"t_f": 20.0, "eta": 4.0}
     assert replace(from_tables({}), controller=given, controller__eta=None).controller.eta == 3.0
