@@ -17,6 +17,7 @@ RATE = 10.0 / 12.0  # l / J of the paper's observer, 10 N m s on its mean moment
 SIGMAS = 3.0  # of what is normal, and has no largest value
 POINTS = 2001  # of the run at least, along which a disturbance of one's own is looked at, and
 FINE = 0.1  # of its fastest rate a step at most [rad]: its own is then 0.2 % off
+PHASES = 16  # at which one is looked at whose phase is drawn
 
 
 class Bounds(NamedTuple):
@@ -107,7 +108,7 @@ def along_the_run(scenario: Any, signal: Any, fastest: float = 0.0) -> Bounds:
     """Largest size and rate of a disturbance of one's own d(t, x) on the way from the start to the target.
 
     The way is the nominal one: the error falls like (t_f - t)^3 until t_f, then the target is followed. fastest: how
-    fast the disturbance says that it changes [rad/s].
+    fast the disturbance says that it changes [rad/s]. What is drawn of it counts as `_as_drawn`.
     """
     import jax
     import jax.numpy as jnp
@@ -118,14 +119,31 @@ def along_the_run(scenario: Any, signal: Any, fastest: float = 0.0) -> Bounds:
     t = np.linspace(0.0, float(scenario.loop.t_end), max(POINTS, math.ceil(needed) + 1))
     left = np.clip(1.0 - t / scenario.controller.t_f, 0.0, 1.0) ** 3
     states = left[:, None] * scenario.plant.x0 if scenario.moments[0] is None else _attitudes(scenario, t, left)
-    try:
-        acting = np.asarray(lapack.vmap(signal)(jnp.asarray(t), jax.tree.map(jnp.asarray, states)))
-    except Exception:  # which `own_checks` refuses before a flight, in one sentence
-        acting = np.zeros(0)
-    inputs = scenario.inputs
-    if acting.shape != (t.size, inputs) or not np.all(np.isfinite(acting)):
-        return Bounds(np.zeros(inputs), np.zeros(inputs))
-    return Bounds(np.max(np.abs(acting), axis=0), np.max(np.abs(np.gradient(acting, t, axis=0)), axis=0))
+    largest = np.zeros((2, scenario.inputs))
+    for drawn in _as_drawn(scenario, signal):
+        try:
+            acting = np.asarray(lapack.vmap(drawn)(jnp.asarray(t), jax.tree.map(jnp.asarray, states)))
+        except Exception:  # which `own_checks` refuses before a flight, in one sentence
+            acting = np.zeros(0)
+        if acting.shape != (t.size, scenario.inputs) or not np.all(np.isfinite(acting)):
+            return Bounds(*np.zeros_like(largest))
+        sizes = (np.max(np.abs(d), axis=0) for d in (acting, np.gradient(acting, t, axis=0)))
+        largest = np.maximum(largest, [*sizes])
+    return Bounds(*largest)
+
+
+def _as_drawn(scenario: Any, signal: Any) -> list[Any]:
+    """A disturbance of one's own with the smallest and the largest amplitudes that are drawn, at phases all around."""
+    from ptsmc_jax.signals import disturbances
+
+    found, most = [signal], drawn_factor(scenario)
+    if most != 1.0 and disturbances.count(signal, "amplitude"):
+        amplitudes = disturbances.values(signal, "amplitude")
+        found = [disturbances.with_values(signal, "amplitude", amplitudes * k) for k in (most, 2.0 - most)]
+    if getattr(scenario.dispersion, "disturbance_phase", None) is None or not disturbances.count(signal, "phase"):
+        return found
+    around, phases = np.linspace(0.0, 2.0 * np.pi, PHASES, endpoint=False), disturbances.values(signal, "phase")
+    return [disturbances.with_values(one, "phase", phases + angle) for one in found for angle in around]
 
 
 def _attitudes(scenario: Any, t: np.ndarray, left: np.ndarray) -> Any:

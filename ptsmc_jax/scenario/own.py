@@ -237,7 +237,10 @@ def fastest(table: Any, name: str, part: Any) -> float:
 def _registered(made: type) -> type:
     from ptsmc_jax.numerics.pytrees import pytree
 
-    return pytree(made)
+    try:
+        return pytree(made)
+    except ValueError:  # its file says `pytree` itself
+        return made
 
 
 def _key(field: dataclasses.Field, about: Any) -> tuple[Any, Any]:

@@ -1,6 +1,7 @@
 """Defaults that follow from what is flown: bounds on the disturbance, the observer's gain; what is odd is said."""
 
 import math
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -306,6 +307,34 @@ def test_bounds_of_a_fast_disturbance_of_ones_own_are_what_it_reaches(rate):
     known = disturbance_bounds.of(said)
     assert known is not None
     np.testing.assert_allclose(known, (0.01, 0.01 * rate), rtol=3e-3)
+
+
+class Swell(Disturbance):
+    """What takes ten minutes, of a size and a phase that are drawn [N m, rad]."""
+
+    size: float = 0.01
+    late: float = 0.0
+    drawn: ClassVar = {"amplitude": "size", "phase": "late"}
+
+    def __call__(self, t, x):
+        """Size sin(0.01 t + late) on each axis [N m]."""
+        return self.size * jnp.sin(0.01 * t + self.late) * jnp.ones(3)
+
+
+@pytest.mark.parametrize(
+    ("drawn", "most"),
+    [
+        ({}, math.sin(0.4)),  # as far as it comes in 40 s
+        ({"disturbance_amplitude": {"kind": "relative_uniform", "half_width": 0.5}}, 1.5 * math.sin(0.4)),
+        ({"disturbance_phase": {}}, 1.0),
+        ({"disturbance_amplitude": {"kind": "relative_normal", "std": 0.1}, "disturbance_phase": {}}, 1.3),
+    ],
+)
+def test_bounds_of_a_disturbance_of_ones_own_hold_what_is_drawn_of_it(drawn, most):
+    dispersion = {"dispersion": drawn} if drawn else {}
+    known = disturbance_bounds.of(scenario.from_tables({"disturbance": {"kind": "own", "code": Swell}, **dispersion}))
+    assert known is not None
+    np.testing.assert_allclose(known[0], 0.01 * most, rtol=3e-3)
 
 
 @pytest.mark.parametrize(

@@ -73,6 +73,19 @@ def test_the_papers_law_as_ones_own_flies_like_the_built_in():
         np.testing.assert_allclose(mine, builtin, rtol=1e-9, atol=1e-10)
 
 
+def test_a_part_of_ones_own_may_say_itself_that_it_is_a_pytree(here):
+    """As a class that is used from Python does."""
+    (here / "said.py").write_text(
+        "from dataclasses import dataclass\nfrom ptsmc_jax.numerics.pytrees import pytree\n"
+        + HEAD
+        + OTHER.replace("class Wave(", "@pytree\n@dataclass(frozen=True)\nclass Wave(")
+    )
+    (here / "other.py").write_text(HEAD + OTHER)
+    one, other = (flown({**CHAIN, "disturbance": {"kind": "own", "code": f"{file}.py:Wave"}}, record=False)
+                  for file in ("said", "other"))  # fmt: skip
+    assert one.metrics.effort == other.metrics.effort > 0.0
+
+
 def test_reading_runs_nothing_and_completing_finds_keys_gains_and_bounds():
     (systems.Path("mine.py")).write_text(HEAD + "raise RuntimeError('was run')\n" + LAW)
     tables = {**CHAIN, "controller": {**MINE, "k1": 2}, "tune": {"trials": 8}}
