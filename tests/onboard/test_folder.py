@@ -100,17 +100,6 @@ class Odd(ptsmc.AccelerationLaw):
         return -error - 2.0 * error_rate - 0.1 * kept["I"] + 1e-3 * kept["i"][0], whole, kept
 
 
-@needs_compiler
-@pytest.mark.skipif(shutil.which("make") is None, reason="this machine has no make")
-def test_a_memory_of_any_kind_is_written(tmp_path):
-    """C did not compile, or was not written at all."""
-    flown = {**FLIGHTS["raw"], "controller": {"kind": "own", "code": Odd, "t_f": 5.0}}
-    made = scenario.reading.complete(scenario.from_tables(flown))
-    done = make(folder.export(made, tmp_path / "controller", name="law", trials=1), "check")
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "other status: 0" in done.stdout
-
-
 class Named(ptsmc.AccelerationLaw):
     """PD whose names and words are C's."""
 
@@ -123,12 +112,18 @@ class Named(ptsmc.AccelerationLaw):
         return self.model.inertia @ self.model.inertia @ damped * (1.0 + d), x.w, memory
 
 
+def of_own(law):
+    """A short flight under a law of one's own."""
+    flown = {**FLIGHTS["raw"], "controller": {"kind": "own", "code": law, "t_f": 5.0}}
+    return scenario.reading.complete(scenario.from_tables(flown))
+
+
 @needs_compiler
 @pytest.mark.skipif(shutil.which("make") is None, reason="this machine has no make")
-def test_names_and_words_of_c_in_a_part_of_one_s_own_compile(tmp_path):
-    flown = {**FLIGHTS["raw"], "controller": {"kind": "own", "code": Named, "t_f": 5.0}}
-    made = scenario.reading.complete(scenario.from_tables(flown))
-    done = make(folder.export(made, tmp_path / "controller", name="law", trials=1), "check")
+@pytest.mark.parametrize("law", [Odd, Named])
+def test_memories_names_and_words_of_any_kind_are_written(law, tmp_path):
+    """C did not compile, or was not written at all."""
+    done = make(folder.export(of_own(law), tmp_path / "controller", name="law", trials=1), "check")
     assert done.returncode == 0, done.stdout + done.stderr
     assert "other status: 0" in done.stdout
 
@@ -146,9 +141,7 @@ class Tabled(ptsmc.AccelerationLaw):
 @pytest.mark.skipif(shutil.which("make") is None or shutil.which("gcc") is None, reason="this machine has no gcc")
 def test_the_stack_that_is_stated_has_the_tables_of_loops(tmp_path):
     """2 800 bytes were stated, where gcc counts 12 632."""
-    flown = {**FLIGHTS["raw"], "controller": {"kind": "own", "code": Tabled, "t_f": 5.0}}
-    made = scenario.reading.complete(scenario.from_tables(flown))
-    place = folder.export(made, tmp_path / "controller", name="law", trials=1)
+    place = folder.export(of_own(Tabled), tmp_path / "controller", name="law", trials=1)
     (stated,) = re.findall(r"At most (\d+) bytes of stack", (place / "README.md").read_text())
     counted = dict(re.findall(r":(\w+)\t(\d+)", make(place, "stack").stdout))
     assert int(counted["ptsmc_step"]) + int(counted["command"]) <= int(stated) < 20_000
@@ -165,9 +158,7 @@ class Halving(ptsmc.AccelerationLaw):
 
 @pytest.mark.parametrize(("law", "said"), [(Halving, True), (Odd, False)])
 def test_operations_of_loops_whose_passes_are_not_known_are_those_of_one(law, said, tmp_path):
-    flown = {**FLIGHTS["raw"], "controller": {"kind": "own", "code": law, "t_f": 5.0}}
-    made = folder.Controller(scenario.reading.complete(scenario.from_tables(flown)), "law", "a scenario")
-    folder.write_program(tmp_path, made)
+    folder.write_program(tmp_path, folder.Controller(of_own(law), "law", "a scenario"))
     assert ("one pass of each loop whose passes are not known" in (tmp_path / "README.md").read_text()) == said
 
 
