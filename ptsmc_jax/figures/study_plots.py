@@ -27,7 +27,7 @@ class Profile(NamedTuple):
 
     unit: str
     gain: np.ndarray  # (points,)
-    goal: np.ndarray  # (points,)
+    goal: np.ndarray  # (points,), NaN where there is none
     over: np.ndarray  # (points,) largest metric / limit
     nearest: Sequence[str]  # (points,) whose that is
     tuned: float  # the gain that was found
@@ -134,6 +134,7 @@ def profiles(gains: Mapping[str, Profile], goal: str) -> Figure:
     figure = Figure(figsize=(8.0, 2.7 * len(gains)), layout="constrained")
     axes = figure.subplots(len(gains), 1, sharey=True, squeeze=False)[:, 0]
     for ax, (name, one) in zip(axes, gains.items(), strict=True):
+        ax.update_datalim(np.stack([one.gain, one.gain], axis=1), updatey=False)  # where no trial has a goal, too
         ax.semilogy(one.gain, one.goal, color="0.6", lw=1.2, label="goal")
         within = one.over <= 1.0
         ax.semilogy(one.gain[within], one.goal[within], "o", color=STYLES[0][0], label="limits kept")

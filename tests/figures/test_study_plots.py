@@ -1,5 +1,6 @@
 """What figures of studies draw, read back from their lines and axes."""
 
+import warnings
 from itertools import pairwise
 
 import numpy as np
@@ -59,6 +60,20 @@ def test_profiles_name_the_limit_that_is_broken_and_their_numbers_do_not_overlap
     assert drawn["beyond the limit of peak_torque"] == [at[0], at[3]]
     assert drawn["beyond the limit of gain_margin"] == [at[2]]
     assert numbers_apart(axes) >= least
+
+
+@pytest.mark.parametrize("known", [0, 1])
+def test_a_profile_with_hardly_a_goal_has_the_whole_interval_of_its_gain(known):
+    at = np.geomspace(1e-3, 1.0, 4)
+    goal = np.where(np.arange(4) < known, 1e-5, np.nan)
+    one = study_plots.Profile("-", at, goal, np.full(4, 1e9), ["peak_torque"] * 4, 0.1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        figure = study_plots.profiles({"k1": one}, "goal")
+        figure.draw_without_rendering()
+    low, high = figure.axes[0].get_xlim()
+    assert low < 1e-3
+    assert high > 1.0
 
 
 @pytest.mark.parametrize(("limit", "drawn"), [(2.9, True), (3.1, False)])

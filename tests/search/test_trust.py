@@ -17,6 +17,7 @@ from tests.helpers import parts, vector
 from tests.search.test_tuning import problem
 from tuning.search import global_check, objective, optimise, trust
 from tuning.search.evaluate import Evaluator, Measured
+from tuning.search.objective import FAILED
 from tuning.search.shares import Bounds
 
 SPREAD = variation.Dispersion(attitudes.AxisAngle(vector(np.deg2rad(20.0)), vector(np.deg2rad(140.0))))
@@ -72,6 +73,29 @@ def test_beside_the_gain_that_a_profile_is_of_all_are_as_found():
         np.testing.assert_allclose(np.log(profiles[name].value), 1e-3, rtol=1e-12)
     np.testing.assert_allclose(profiles["observer_gain"].gain[[0, -1]], [0.5, 1000.0])
     np.testing.assert_allclose(profiles["sign_width"].gain[[0, -1]], [1e-3 / 20.0, 0.1])
+
+
+def test_where_a_trial_fails_no_limit_is_kept_and_without_one_that_ends_there_is_no_goal_and_no_slope():
+    """Of two trials the first fails below 0.5 of the gain, the other below 0.25; those that end keep the limit."""
+    bounds = Bounds(("k",), (0.01,), (1.0,))
+
+    def fly(problem: Any, share: np.ndarray) -> Measured:
+        gains = np.stack([bounds.gains(one) for one in share])
+        c = np.where(gains[:, None, :] < [0.5, 0.25], FAILED - 1.0, -0.5)
+        value = np.log(np.where(gains[:, 0] < 0.25, FAILED, 1e-3))
+        return Measured(gains, value + np.log(FAILED) * (c[:, 0] > 0.0).sum(axis=1), c, value)
+
+    def slopes(problem: Any, share: np.ndarray) -> Any:
+        return SimpleNamespace(f_slope=np.zeros_like(share))
+
+    evaluate: Any = SimpleNamespace(bounds=bounds, fly=fly, slopes=slopes)
+    asked: Any = SimpleNamespace(rows=("peak_torque",), names=("k",))
+    found = trust.profiles(evaluate, asked, bounds.share(np.array([0.7])))["k"]
+    np.testing.assert_array_equal(found.over <= 1.0, found.gain >= 0.5)
+    np.testing.assert_array_equal(np.isnan(found.value), found.gain < 0.25)
+    assert not found.flat
+    assert np.isnan(trust.slope_error(evaluate, asked, bounds.share(np.array([0.1]))))
+    assert trust.slope_error(evaluate, asked, bounds.share(np.array([0.7]))) == 0.0
 
 
 def test_sensitivities_at_a_bound_are_taken_inside_it(quiet):

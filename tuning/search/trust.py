@@ -8,8 +8,8 @@ import numpy as np
 
 from ptsmc_jax.simulation import rollout
 from tuning.search import flights
-from tuning.search.evaluate import Evaluator
-from tuning.search.objective import Problem
+from tuning.search.evaluate import Evaluator, Measured
+from tuning.search.objective import FAILED, Problem
 from tuning.search.shares import TIMES, Bounds
 
 DIFFERENCE = 3e-4  # of the bounds' intervals, for slopes by differences
@@ -26,14 +26,23 @@ def slope_error(evaluate: Evaluator, problem: Problem, share: np.ndarray) -> flo
 
     Over the largest slope by a share; differences of order 4 over +-`DIFFERENCE`, beside a bound just inside it, beside
     a hand-over on a sample just behind it: F has a kink there, where the first period of the anchored clock vanishes.
+    NaN where there is nothing to compare, as where the error is zero or no trial ends.
     """
     behind = 3 * DIFFERENCE * np.isin(problem.names, TIMES)
     count, inside = share.size, np.clip(share + behind, 2 * DIFFERENCE, 1.0 - 2 * DIFFERENCE)
     offsets = np.concatenate([k * DIFFERENCE * np.eye(count) for k in (-2, -1, 1, 2)])
-    f = evaluate.fly(problem, inside + offsets).f.reshape(4, count)
+    flown = evaluate.fly(problem, inside + offsets)
+    if not np.any(_ends(flown)):  # what stands for the goal is the same everywhere
+        return np.nan
+    f = flown.f.reshape(4, count)
     numeric = (f[0] - 8 * f[1] + 8 * f[2] - f[3]) / (12 * DIFFERENCE)
     exact = evaluate.slopes(problem, inside[None]).f_slope[0]
     return float(np.abs(exact - numeric).max() / max(np.abs(exact).max(), SMALLEST))
+
+
+def _ends(flown: Measured) -> np.ndarray:
+    """At which of many points a trial has a goal (points,), bool: else one stands for it."""
+    return flown.value < np.log(FAILED / 2.0)
 
 
 @dataclass(frozen=True)
@@ -41,8 +50,8 @@ class Profile:
     """The goal along one gain between its bounds, the others as they were found."""
 
     gain: np.ndarray  # (points,)
-    value: np.ndarray  # (points,) the goal
-    over: np.ndarray  # (points,) largest metric / limit; zero without a requirement
+    value: np.ndarray  # (points,) the goal, NaN where no trial has one
+    over: np.ndarray  # (points,) largest metric / limit, `FAILED` where a trial fails; zero without a requirement
     f: np.ndarray  # (points,) F: ln of the goal, with what the torque weighs in it
     nearest: list[str] = field(default_factory=list)  # (points,) whose the largest metric / limit is
 
@@ -61,9 +70,12 @@ def profiles(evaluate: Evaluator, problem: Problem, share: np.ndarray) -> dict[s
         points[k, :, k] = np.sort(np.append(np.linspace(0.0, 1.0, ACROSS), share[k]))
         points[k] = [bounds.replaced(share, bounds.gains(point), np.arange(count) == k) for point in points[k]]
     flown = evaluate.fly(problem, points.reshape(-1, count))
-    arrays = (flown.gains, np.exp(flown.value), flown.beyond + 1.0, flown.f)
+    largest = flown.c.max(axis=2, initial=-1.0)  # (points, rows); a trial that fails keeps no limit
+    goal = np.where(_ends(flown), np.exp(flown.value), np.nan)
+    arrays = (flown.gains, goal, largest.max(axis=1, initial=-1.0) + 1.0, flown.f)
     gains, value, over, f = (v.reshape(count, ACROSS + 1, -1) for v in arrays)
-    nearest = np.asarray(problem.rows or ("",))[flown.nearest].reshape(count, ACROSS + 1)
+    rows = largest.argmax(axis=1) if problem.rows else np.zeros(len(largest), int)
+    nearest = np.asarray(problem.rows or ("",))[rows].reshape(count, ACROSS + 1)
     return {
         name: Profile(gains[k, :, k], value[k, :, 0], over[k, :, 0], f[k, :, 0], nearest[k].tolist())
         for k, name in enumerate(problem.names)
