@@ -386,6 +386,16 @@ def test_what_a_rival_cannot_fly_is_refused_before_any_search(monkeypatch, eight
     assert not asked
 
 
+@pytest.mark.parametrize(("period", "scaled"), [(0.05, False), (0.2, True)])
+def test_gains_that_the_paper_does_not_give_are_said_to_be_scaled(eight, period, scaled):
+    """Its delta of 0.05 s is shorter than a period of 0.2 s."""
+    flown = gains.papers(scenario.from_tables({"loop": {"mode": "sampled", "period": period}}))
+    made = {compare.PAPER: replace(contender(eight), flown=flown), compare.OURS: contender(eight)}
+    lines = list(law_sentences.lines(compare.summary(compare.Comparison(made, 0, False))))
+    assert any(line.startswith("gains of paper, scaled to this body and period: ") for line in lines) == scaled
+    assert any(line.startswith("gains of paper: ") for line in lines) != scaled
+
+
 def test_margins_that_are_asked_for_stand_beside_what_is_flown(eight, tmp_path):
     """Of every law, in the table, in compare.csv and, where it breaks a limit, in words; one without a limit too."""
     asked = Requirement("gain_margin", 6.0, "dB", at_least=True), Requirement("delay_margin", 0.1, "s", at_least=True)

@@ -201,7 +201,8 @@ def lines(summary: Summary) -> Iterator[str]:
     for name, law in summary["laws"].items():
         gains = ", ".join(f"{gain} {value:.4g}" for gain, value in law["gains"].items())
         bound = "".join(f"; {gain} on its {side} bound" for gain, side in law["at_bound"].items())
-        yield f"gains of {name}: {gains}{bound}"
+        scaled = name == "paper" and summary.get("paper_is") == "paper, scaled"
+        yield f"gains of {name}{', scaled to this body and period' if scaled else ''}: {gains}{bound}"
         bad, ended = lost(law["counts"])
         if bad:
             yield f"  of {summary['trials']} trials {ended}"

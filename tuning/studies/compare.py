@@ -328,6 +328,7 @@ def summary(comparison: Comparison) -> dict[str, Any]:
         "seed": comparison.fresh_seed,
         "trials": int(first.trials.status.size),
         "paper_refused": comparison.paper_refused,
+        "paper_is": gains.paper_is(found[PAPER].flown) if PAPER in found else None,
         "judged_on": "flight clock",  # each with a sign of its own, or none
         "settling_angle": first.flown.loop.settling_angle,
         "laws": {law: figures_of(contender) for law, contender in found.items()},
