@@ -56,9 +56,9 @@ run
 run.plot("states", "error")
 
 # %% [markdown]
-# Five starts, one time: until the hand-over (dotted) the law brings every error down to its share of the same small number,
-# whatever it was at first, which is what "prescribed" means. What is left after it is what the observer had not yet
-# learned, and that does depend on the start; it fades with the constant gains, in seconds.
+# Five starts, one time: at the hand-over (dotted) every error is below 2e-3 rad, whatever it was at first, which is what
+# "prescribed" means. Two things are left after it. The rate with which each one arrives does depend on the start, and the
+# constant gains take it out in seconds. What the observer lags by is the same from every start, and stays: 7e-4 rad.
 
 # %%
 figure, axes = plt.subplots(figsize=(8, 4))
