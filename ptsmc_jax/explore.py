@@ -205,7 +205,7 @@ def _software(controller: str | Path | None, ready: Study) -> Software:
     """The flight computer that a folder's C is, or the parts' own code; what C has otherwise is warned of."""
     if controller is None:
         return OURS
-    computer = InTheLoop(Library(controller), ready.parts)
+    computer = InTheLoop(Library(controller), ready.parts, ready.dispersion)
     if computer.otherwise:
         warnings.warn(computer.otherwise, RuntimeWarning, stacklevel=3)
     return computer.software

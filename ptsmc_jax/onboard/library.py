@@ -17,10 +17,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from ptsmc_jax.devices.actuators import ActuatorState
+from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.onboard import sources
 from ptsmc_jax.onboard.board import board, known
 from ptsmc_jax.onboard.generate import names_of
-from ptsmc_jax.onboard.parameters import named
+from ptsmc_jax.onboard.parameters import COMPUTED, named, parameters
 from ptsmc_jax.onboard.templates import filled
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation.assembly import Parts
@@ -162,8 +163,8 @@ class InTheLoop:
     makes of it is what acts.
     """
 
-    def __init__(self, library: Library, parts: Parts):
-        """Raises ScenarioError where the controller is one of other parts."""
+    def __init__(self, library: Library, parts: Parts, dispersion: Dispersion | None = None):
+        """Raises ScenarioError where the controller is one of other parts, or cannot have what is drawn of them."""
         self.library, self.board, self.nominal = library, board(parts), parts
         mine = names_of(self.board)
         for kind, said in (("in", "inputs"), ("out", "outputs"), ("state", "state")):
@@ -188,6 +189,30 @@ class InTheLoop:
         firsts = zip(paths, (made.elements()[:1] for made in named(self.board).fields), strict=True)
         # of the parameters that C has, by their paths: the first column
         self._columns = {path: columns.index(*first) for (path, _), first in firsts if first and first[0] in columns}
+        if dispersion is not None and dispersion.own is not None:
+            self._check_draw(Dispersion(own=dispersion.own))
+
+    def _check_draw(self, dispersion: Dispersion) -> None:
+        """Raise ScenarioError where draws of one's own tell apart what C has as one parameter, or derives from it."""
+        made, numbers = parameters(self.board), (jnp.uint32(0), jnp.uint32(0))
+        drawn = had = known(dispersion.apply(self.nominal, *numbers))
+        for rule in made.rules:
+            had = rule(had)
+        wanted, derived = (dict(jax.tree_util.tree_leaves_with_path(tree)) for tree in (drawn, had))
+        firsts = dict[str, Any]()
+        listed = zip(jax.tree_util.tree_leaves_with_path(self.board.parameters), made.fields, strict=True)
+        for (path, _), field in sorted(listed, key=lambda one: one[0][0][0].key in COMPUTED):
+            value = wanted.get(path)
+            stands = derived.get(path) if field.name in made.derived else firsts.setdefault(field.name, value)
+            if value is None or stands is None:
+                continue
+            off = SAME * float(jnp.max(jnp.abs(value), initial=0.0))
+            if not np.allclose(stands, value, rtol=0.0, atol=off, equal_nan=True):
+                raise ScenarioError(
+                    f"dispersion.own draws {jax.tree_util.keystr(path, simple=True, separator='.')} by itself, but the "
+                    f"controller in {self.library.folder} has one {field.name} for it and others; allowed are draws "
+                    "that change all of them alike"
+                )
 
     @property
     def otherwise(self) -> str:

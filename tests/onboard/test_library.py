@@ -2,7 +2,7 @@
 
 import re
 import shutil
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 
 import jax
@@ -14,11 +14,13 @@ from ptsmc_jax import configure, scenario
 from ptsmc_jax.campaigns import runs
 from ptsmc_jax.devices.attitude_filter import filter_gains
 from ptsmc_jax.dispersions.base import plant_of
+from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.numerics.pytrees import pytree
 from ptsmc_jax.onboard import folder
 from ptsmc_jax.onboard.generate import names_of
 from ptsmc_jax.onboard.library import InTheLoop, Library
 from ptsmc_jax.onboard.templates import STATUS
+from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import computer
 from tests.helpers import gpus, short
 from tests.onboard.compiled import needs_compiler, program
@@ -392,7 +394,7 @@ def test_what_a_trial_draws_and_its_computer_knows_is_told(name, exported):
     ready = scenario.study(folder.flown(scenario.from_tables({**FLIGHTS[name], "dispersion": drawn})))
     ready = replace(ready, dispersion=replace(ready.dispersion, own=Measured()))
     ours = runs.fly(ready, 3, 2)
-    software = InTheLoop(library, ready.parts).software
+    software = InTheLoop(library, ready.parts, ready.dispersion).software
     theirs = runs.fly(ready, 3, 2, software)
     assert theirs.samples["saturated"] > 0 or name == "filter"
     for metric in ("window_error", "peak_torque", "peak_torque_delivered"):
@@ -401,6 +403,32 @@ def test_what_a_trial_draws_and_its_computer_knows_is_told(name, exported):
         nominal = runs.fly(made.ready, 0, 0, software)
         assert nominal.samples["saturated"] > 0
         assert np.max(np.abs(nominal.log.u)) <= 3.0
+
+
+@pytree
+@dataclass(frozen=True)
+class Apart(ptsmc.Draw):
+    """Another inertia in one place alone."""
+
+    where: str = field(metadata={"static": True})
+
+    def at(self, c, parts):
+        """The part with a model of its own, or the inverse alone."""
+        part, factor = getattr(parts, self.where or "controller"), 1.0 + 0.1 * c[0]
+        changed = {"inertia": part.model.inertia * factor} if self.where else {}
+        model = replace(part.model, inertia_inverse=part.model.inertia_inverse / factor, **changed)
+        if not self.where:
+            return replace(parts, controller=replace(part, model=model), observer=replace(parts.observer, model=model))
+        return replace(parts, **{self.where: replace(part, model=model)})
+
+
+@needs_compiler
+@pytest.mark.parametrize("where", ["controller", "observer", ""])
+def test_a_draw_that_tells_apart_what_is_one_parameter_of_c_is_refused(where, exported):
+    """C flew the nominal body, or the observer's in the law too, and nothing was said."""
+    made, library = exported("delay, limit, quantised")
+    with pytest.raises(ScenarioError, match=r"dispersion\.own draws .*inertia.* by itself, but the controller in"):
+        InTheLoop(library, made.ready.parts, Dispersion(own=Apart(where)))
 
 
 @needs_compiler

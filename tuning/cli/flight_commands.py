@@ -69,7 +69,7 @@ def compiled(controller: Path, ready: "Study") -> "InTheLoop":
     """
     from ptsmc_jax.onboard.library import InTheLoop, Library
 
-    computer = InTheLoop(Library(controller), ready.parts)
+    computer = InTheLoop(Library(controller), ready.parts, ready.dispersion)
     say_otherwise(computer)
     return computer
 

@@ -148,7 +148,7 @@ class Folder:
             raise self._untrusted
         assert self.ready is not None
         self._check_unchanged(own_parts.CONTROLLER)
-        return InTheLoop(Library(self.controller), self.ready.parts)
+        return InTheLoop(Library(self.controller), self.ready.parts, self.ready.dispersion)
 
     @property
     def otherwise(self) -> str:
