@@ -10,6 +10,7 @@ from scipy import special  # `scipy.stats` takes half a second to import
 STEEPEST = 60.0  # tilt of a mean towards its largest values or its smallest, at which nothing else is left
 SOBOL_BINS = 32  # of an input, with equally many trials each
 SAME_INPUT = 0.9999  # rank correlation above which two inputs count as one
+BY_CHANCE = 0.0027  # probability of what is taken for chance in a category: that of a normal number beyond three sigma
 ROUNDING = 1e-12  # of the largest value: by how much values may differ that are one number
 
 
@@ -129,7 +130,7 @@ def drivers(
         metric: (trials,).
         ranked: what the inputs are ranked to, kept here for other metrics of the same trials.
         categories: names of inputs that say which of several things. They have no rank, and instead of bins their
-            trials with the same number.
+            trials with the same number; their share is 0 where unrelated ones would show as much.
 
     Returns:
         {"rank_correlation", "first_order"} by the input's name, the first None of a category; empty where the metric or
@@ -144,7 +145,9 @@ def drivers(
             continue
         if name in categories:
             bins = [metric_ranks[values == one] for one in np.unique(values)]
-            effects[name] = {"rank_correlation": None, "first_order": _first_order(bins, metric.size)}
+            chance = special.chdtrc(len(bins) - 1, metric.size * _between(bins, metric.size))
+            share = _first_order(bins, metric.size) if chance < BY_CHANCE else 0.0
+            effects[name] = {"rank_correlation": None, "first_order": share}
             continue
         if name not in ranked:
             ranks = _ranks(values)
@@ -164,10 +167,14 @@ def drivers(
 def beyond_chance(driver: Mapping[str, float | None], trials: int) -> bool:
     """Whether one of `drivers` says more than unrelated numbers do among so many trials, by three sigma.
 
+    A category, which has no rank correlation, has no share either where it does not.
+
     >>> weak = {"rank_correlation": 0.1, "first_order": 0.01}
     >>> beyond_chance(weak, 300), beyond_chance(weak, 3000)
     (False, True)
     """
+    if driver["rank_correlation"] is None:
+        return bool(driver["first_order"])
     by_chance = {"rank_correlation": 1.0 / np.sqrt(trials), "first_order": np.sqrt(2.0 * (SOBOL_BINS - 1)) / trials}
     shown = ((driver[name], sigma) for name, sigma in by_chance.items())
     return any(value is not None and abs(value) > 3.0 * sigma for value, sigma in shown)
@@ -175,9 +182,14 @@ def beyond_chance(driver: Mapping[str, float | None], trials: int) -> bool:
 
 def _first_order(bins: Sequence[np.ndarray], count: int) -> float:
     """The share of the variance of `count` ranks that is one of the means over bins, less what chance would show."""
-    between = sum(part.size * part.mean() ** 2 for part in bins) / count
+    between = _between(bins, count)
     by_chance = (len(bins) - 1) / max(1, count - len(bins)) * (1.0 - between)
     return max(0.0, float(between - by_chance))
+
+
+def _between(bins: Sequence[np.ndarray], count: int) -> float:
+    """The variance of the means of `count` ranks over bins; times `count` chi-squared where bins say nothing."""
+    return float(sum(part.size * part.mean() ** 2 for part in bins) / count)
 
 
 def _ranks(values: np.ndarray) -> np.ndarray:

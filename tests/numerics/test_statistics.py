@@ -219,3 +219,19 @@ def test_a_share_of_the_variance_is_beyond_chance_from_three_sigma_of_unrelated_
     for times, told in ((2.75, False), (3.25, True)):
         driver = {"rank_correlation": 0.0, "first_order": times * sigma}
         assert statistics.beyond_chance(driver, n) == told
+
+
+@pytest.mark.parametrize("values", [2, 4])
+def test_a_category_that_moves_a_metric_is_told_among_few_trials_and_an_unrelated_one_is_not(values):
+    """By 1.2 times what it spreads by itself; with the chance of 32 bins every second one of 4 was missed."""
+    rng, told, false = np.random.default_rng(1), 0, 0
+    for _ in range(300):
+        which, noise = rng.integers(0, values, 128).astype(float), rng.normal(size=128)
+        moved, unrelated = (
+            statistics.drivers({"which": which}, metric, categories=["which"])["which"]
+            for metric in (noise + 1.2 * (which == 0.0), noise)
+        )
+        told += statistics.beyond_chance(moved, 128)
+        false += statistics.beyond_chance(unrelated, 128)
+    assert told > 0.95 * 300
+    assert false <= 4  # 0.8 are to be expected
