@@ -8,9 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import ptsmc_jax as ptsmc
+from ptsmc_jax import scenario
 from tuning.search import evaluate
 from tuning.search.evaluate import Evaluator, Sloped
-from tuning.search.objective import Rules, judge
+from tuning.search.objective import Rules, judge, problem
 from tuning.search.shares import Bounds
 
 
@@ -49,3 +51,20 @@ def test_the_torque_weighs_over_the_averaged_trials_as_the_error_does():
     assert float(value) == pytest.approx(math.log(math.sqrt(12.5)), rel=1e-12)
     assert float(f) == pytest.approx(float(value) + 0.3 * math.log(math.sqrt(0.125)), rel=1e-12)
     assert c.shape == (0, 3)
+
+
+def test_a_system_of_ones_own_has_the_same_questions_in_another_process():
+    """Whose functions lie elsewhere in memory: a search that went on after an interrupt began anew."""
+
+    def question():
+        pendulum = ptsmc.system(
+            1, F=lambda t, x_1, x_2: x_2, H=lambda t, x_1, x_2: -jnp.sin(x_1), G=lambda t, x_1, x_2: jnp.eye(1)
+        )
+        tables = {"plant": {"kind": "system", "system": pendulum, "x0": [1.0, 0.0]}, "loop": {"mode": "sampled"}}
+        ready = scenario.study(scenario.from_tables(tables))
+        posed = problem(ready.parts, ready.dispersion, 0, np.arange(2), ("eta",))
+        return pendulum, evaluate._question(b"fly", posed, np.zeros((1, 1)))
+
+    (one, asked), (other, again) = question(), question()
+    assert one != other
+    assert asked == again

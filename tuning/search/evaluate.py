@@ -1,5 +1,6 @@
 """Evaluates tuning problems at many gains: flown by `flights`, judged by the problem, journaled."""
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import partial
@@ -128,9 +129,13 @@ def _in_calls(program: Callable[..., dict[str, jax.Array]], *arrays: np.ndarray)
     return {name: np.concatenate([call[name] for call in calls])[:count] for name in calls[0]}
 
 
+_ADDRESS = re.compile("0x[0-9a-f]+")  # of a function in a system of one's own: another one in each process
+
+
 def _question(kind: bytes, problem: Problem, share: np.ndarray) -> bytes:
     leaves, structure = jax.tree.flatten(problem)
-    return b"|".join([kind, share.tobytes(), str(structure).encode(), *(np.asarray(leaf).tobytes() for leaf in leaves)])
+    said = _ADDRESS.sub("", str(structure)).encode()
+    return b"|".join([kind, share.tobytes(), said, *(np.asarray(leaf).tobytes() for leaf in leaves)])
 
 
 @programs.jit(static_argnames="bounds", compiler_options=programs.QUICKLY)
