@@ -186,6 +186,9 @@ def test_where_nothing_arrives_it_is_said_and_nothing_compared():
         s for s in search_sentences.search(summary(None, searched=None) | {"training": training}) if "no gains" in s
     ]
     assert said.endswith("14 of 16 training trials do not arrive (14 missed), and so keep no limit")
+    several = summary(None, searched=None) | {"training": training}
+    several["search"]["largest_over_limit"] |= {"effort": None, "chattering": float("inf")}
+    assert [s for s in search_sentences.search(several) if "no gains" in s] == [said]  # once, however many limits
 
 
 def test_a_broken_requirement_is_named_with_its_limit():

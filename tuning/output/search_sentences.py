@@ -13,10 +13,10 @@ AGREE = 0.01  # slopes off from differences by more than this share say little
 def search(summary: Summary) -> Iterator[str]:
     """How the search went."""
     record = summary["search"]
-    for metric, ratio in record.get("largest_over_limit", {}).items():
-        if ratio is None or ratio > 1.0:
-            how_far = _how_far(summary, metric, ratio)
-            yield f"no gains found within the bounds keep every limit: with the best ones {how_far}"
+    over = {metric: r for metric, r in record.get("largest_over_limit", {}).items() if r is None or r > 1.0}
+    # once of trials that do not arrive, which keep no limit
+    for how_far in dict.fromkeys(_how_far(summary, metric, ratio) for metric, ratio in over.items()):
+        yield f"no gains found within the bounds keep every limit: with the best ones {how_far}"
     yield from _went_on(record)
     for count in record.get("confirmed", []):
         most = "none would have to be" if count["allowed"] is None else f"at most {count['allowed']} allowed"
