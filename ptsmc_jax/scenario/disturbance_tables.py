@@ -3,6 +3,7 @@
 A disturbance is its physics in `signals.disturbances`, a table here, and a row in `DISTURBANCES`.
 """
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -276,11 +277,21 @@ class OwnDisturbance(Own, DisturbanceTable, kw_only=True, frozen=True):
         """See `disturbance_bounds.along_the_run`."""
         if self.waits or disturbance_bounds.target_waits(scenario):
             return None
-        return disturbance_bounds.along_the_run(scenario, build(self), self.quickest())
+        return disturbance_bounds.along_the_run(scenario, self.build(None), self.quickest())
 
     def build(self, inertia: Any) -> Any:
-        """What the code names."""
-        return build(self)
+        """What the code names; raises ScenarioError where it says of no field of its own that it is drawn."""
+        made = build(self)
+        fields = tuple(field.name for field in dataclasses.fields(made))
+        known = isinstance(made.drawn, Mapping) and all(
+            what in ("phase", "amplitude") and name in fields for what, name in made.drawn.items()
+        )
+        if not known:
+            raise ScenarioError(
+                f"disturbance.code names a class {type(made).__name__} whose drawn is {brief(made.drawn)}, but must "
+                'name fields of it by "phase" and "amplitude"'
+            )
+        return made
 
 
 _EACH: Kinds = {

@@ -13,6 +13,7 @@ from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.observers.nonlinear import NonlinearObserver
 from ptsmc_jax.plants import rigid_body
 from ptsmc_jax.scenario import build, cautions, disturbance_bounds, free_gains, parsing, reading
+from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.signals.disturbances import Disturbance
 from tests.helpers import FULL_INERTIA
 from tuning.search import gains
@@ -335,6 +336,15 @@ def test_bounds_of_a_disturbance_of_ones_own_hold_what_is_drawn_of_it(drawn, mos
     known = disturbance_bounds.of(scenario.from_tables({"disturbance": {"kind": "own", "code": Swell}, **dispersion}))
     assert known is not None
     np.testing.assert_allclose(known[0], 0.01 * most, rtol=3e-3)
+
+
+@pytest.mark.parametrize(
+    ("drawn", "said"), [({"amplitude": "siz"}, "siz"), ({"sizes": "size"}, "sizes"), (("size",), "size")]
+)
+def test_a_disturbance_of_ones_own_that_draws_what_it_has_not_is_refused(drawn, said):
+    wrong = type("Wrong", (Swell,), {"drawn": drawn, "__annotations__": {"drawn": ClassVar}})
+    with pytest.raises(ScenarioError, match=rf"class Wrong whose drawn is .*{said}.*, but must name fields of it"):
+        scenario.from_tables({"disturbance": {"kind": "own", "code": wrong}})
 
 
 @pytest.mark.parametrize(
