@@ -76,8 +76,8 @@ def hardest(
 ) -> Hardest:
     """The worst trial for these gains inside the dispersions' support, by gradient ascent from the hardest drawn.
 
-    Moved are initial attitude or state, initial rate and disturbance phase; true inertia and noise stay as drawn. A
-    normal dispersion, which has no bounds, is searched where `HELD` of it lies.
+    Moved is all that is drawn but the true inertia, which stays as drawn, as noise does. A normal dispersion, which has
+    no bounds, is searched where `HELD` of it lies.
 
     Args:
         problem: of the search.
