@@ -98,8 +98,9 @@ def configure(
     import jax
 
     jax.config.update("jax_enable_x64", bits == 64)
-    if jax.__version_info__ >= (0, 11):  # jaxlib 0.11.2 crashes in it where an operand of shard_map turns out unused
-        jax.config.update("jax_use_shardy_partitioner", False)
+    # takes a fifth of compiling, of programs for one device too, and jaxlib 0.11.2 crashes in it where an operand of
+    # shard_map turns out unused
+    jax.config.update("jax_use_shardy_partitioner", False)
     if keep_programs:
         jax.config.update("jax_debug_nans", False)
         jax.config.update("jax_debug_infs", False)
