@@ -14,8 +14,9 @@ def executed(source: Path):
     """The notebook of a source file, executed; raises what a cell raises."""
     book = jupytext.read(source)
     NotebookClient(book, timeout=600, kernel_name="python3", resources={"metadata": {"path": str(HERE)}}).execute()
-    for cell in book.cells:  # times and process numbers would be a change each time
+    for place, cell in enumerate(book.cells):  # times, process numbers and drawn ids would be a change each time
         cell.metadata.pop("execution", None)
+        cell["id"] = f"cell-{place}"
     book.metadata.pop("widgets", None)  # what a widget shows needs its kernel, and names hosts
     return book
 

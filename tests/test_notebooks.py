@@ -123,6 +123,7 @@ def test_what_is_kept_is_this_source_with_its_outputs(source):
     assert [(cell.cell_type, cell.source) for cell in kept.cells] == [
         (cell.cell_type, cell.source) for cell in edited.cells
     ], "run: make notebooks-kept"
+    assert [cell["id"] for cell in kept.cells] == [f"cell-{k}" for k in range(len(kept.cells))]  # not drawn anew
     outputs = [output for cell in kept.cells if cell.cell_type == "code" for output in cell.outputs]
     assert outputs
     assert all(output.output_type != "error" for output in outputs)
