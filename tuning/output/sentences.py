@@ -58,13 +58,19 @@ def grid(pairs: Sequence[Mapping[str, Any]], keys: tuple[str, str], kind: str) -
     flown = [pair for pair in pairs if pair["status"] == "flown"]
     with_error = [pair for pair in flown if pair["window_error"] == pair["window_error"]]  # not NaN
     if with_error:
-        best = min(with_error, key=lambda pair: (pair["failures"], pair["window_error"]))
+        best = min(with_error, key=lambda pair: (_lost(pair), pair["window_error"]))
         where = f"{keys[0]} = {best['x']:.4g} and {keys[1]} = {best['y']:.4g}"
-        failed = f", where {best['failures']:.0f} trials failed" if best["failures"] else ""
+        failed = f", where {_lost(best):.0f} trials failed or missed" if _lost(best) else ""
         error, peak = (valued(best[name], name, kind) for name in ("window_error", "peak_torque"))
         beside = f"where the mean peak of the input is {peak}{failed}"
         yield f"the smallest RMS window error is {error}, at {where}, {beside}"
-    yield f"{len(flown)} of {len(pairs)} pairs flown, {sum(pair['failures'] > 0 for pair in flown)} with failed trials"
+    lost = sum(_lost(pair) > 0 for pair in flown)
+    yield f"{len(flown)} of {len(pairs)} pairs flown, {lost} with trials that failed or missed"
+
+
+def _lost(pair: Mapping[str, Any]) -> float:
+    """How many trials of a pair did not end well."""
+    return pair["failures"] + pair["missed"]
 
 
 def run_lines(summary: Summary) -> list[str]:
