@@ -45,8 +45,10 @@ def opened(parts, hold=True):
     return jax.tree.map(lambda v: v[0], linear.loops_in(parts, run, index))
 
 
-def of(loop):
-    return jax.tree.map(lambda v: np.asarray(v)[0], margins.of_each(jax.tree.map(lambda v: v[None], loop)))
+def of(loop, **how):
+    return jax.tree.map(
+        lambda v: np.asarray(v)[0], margins.of_each(jax.tree.map(lambda v: np.asarray(v)[None], loop), **how)
+    )
 
 
 @pytest.mark.parametrize("m", [1, 3, 4])
@@ -281,6 +283,12 @@ def test_the_flown_loop_loses_stability_where_the_margins_say(kind):
     assert checked >= 4
 
 
+@jax.jit
+def closed_at_both(loop):
+    """The closed loop as it was opened at the sensors, and at the input."""
+    return linear.at_sensors(loop).closed(), linear.at_input(loop).closed()
+
+
 @pytest.mark.parametrize("delay", [0, 1, 2, 3])
 def test_any_loop_closes_to_the_same_wherever_it_is_opened(delay):
     """Whatever its matrices and however many commands are on their way."""
@@ -288,7 +296,7 @@ def test_any_loop_closes_to_the_same_wherever_it_is_opened(delay):
     shapes = (n, n), (n, k), (m, n), (m, k), (1, n, m)
     a, seen, command, direct, push = (jnp.asarray(rng.normal(size=shape)) for shape in shapes)
     loop = linear.Loop(a, seen, push, 0.0 * push, command, direct, jnp.zeros((n, m)), jnp.ones(()), delay)
-    elsewhere, here = linear.at_sensors(loop).closed(), linear.at_input(loop).closed()
+    elsewhere, here = closed_at_both(loop)
     assert here.shape == (n + delay * m,) * 2
     np.testing.assert_allclose(elsewhere, here, rtol=0.0, atol=1e-14 * np.abs(here).max())
 
@@ -311,7 +319,7 @@ def test_one_input_is_all_of_them_at_once_and_the_closed_loop_is_the_same_wherev
         assert 0.0 < at_once[name] < np.inf
         np.testing.assert_allclose(at_once[name], getattr(found, name)[0], rtol=1e-4)
     np.testing.assert_allclose(at_once["modulus"], found.modulus[0], atol=1e-3)  # on the grid
-    elsewhere, here = linear.at_sensors(loop).closed(), linear.at_input(loop).closed()
+    elsewhere, here = closed_at_both(loop)
     np.testing.assert_allclose(elsewhere, here, rtol=0.0, atol=1e-12 * np.abs(here).max())
 
 
@@ -326,7 +334,7 @@ def test_each_sensor_has_its_own_phase_margin_where_the_loop_of_all_is_steep():
         "hardware": {"state_noise": [1e-5] * 5},
     }
     loop = opened(scenario.study(scenario.from_tables(tables)).parts)
-    opening = jax.tree.map(np.asarray, linear.at_sensors(loop))
+    opening = jax.tree.map(np.asarray, jax.jit(linear.at_sensors)(loop))
     assert np.abs(np.linalg.eigvals(opening.closed())).max() < 1.0
 
     def radius(sensor, degrees):
@@ -334,7 +342,7 @@ def test_each_sensor_has_its_own_phase_margin_where_the_loop_of_all_is_steep():
         turned[sensor, sensor] = np.exp(-1j * np.deg2rad(degrees))
         return np.abs(np.linalg.eigvals(opening.closed(turned))).max()
 
-    for sensor, phase in enumerate(np.asarray(margins.of(loop, sensors=True).phase)):
+    for sensor, phase in enumerate(of(loop, sensors=True).phase):
         assert 5.0 < phase < 180.0
         assert radius(sensor, 0.9999 * phase) < 1.0 < radius(sensor, 1.0001 * phase)
 
