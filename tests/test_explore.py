@@ -220,7 +220,7 @@ def test_metrics_of_ones_own_are_named_numbers_that_hide_no_others(own, said):
 
 
 def test_a_run_that_ends_early_says_why_and_what_it_never_did_is_a_dash():
-    slow = scenario.replace(scenario.from_tables(TABLES), hardware__torque_limit=1e-3)
+    slow = scenario.replace(scenario.from_tables(CHAIN), hardware__torque_limit=1e-3)
     run = ptsmc_jax.simulate(slow)
     assert repr(run).startswith("status: missed, at t_f more than 5 % of the initial error is left, at 5 s")
     assert "<td>settling_time</td><td>-</td><td>s</td>" in run.metrics._repr_html_()

@@ -67,7 +67,8 @@ def test_a_number_may_have_its_unit(table, key, said, value):
 
 
 def test_a_limit_of_zero_is_kept_by_zero_alone():
-    ready = scenario.study(scenario.from_tables({"requirements": {"saturated": 0}, "loop": SAMPLED}))
+    tables = {"plant": {"kind": "chain"}, "requirements": {"saturated": 0}, "loop": SAMPLED}
+    ready = scenario.study(scenario.from_tables(tables))
     (requirement,) = ready.requirements
     kept = requirement.verdict(np.zeros(3), np.ones(3, bool))
     assert (kept.met, kept.margin) == (True, 0.0)

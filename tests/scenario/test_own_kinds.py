@@ -17,7 +17,7 @@ from ptsmc_jax.laws.base import Sample
 from ptsmc_jax.scenario import own, parsing, reading, systems
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import rollout
-from tests.helpers import ROOT, SHORT, small_search, vector
+from tests.helpers import ROOT, SHORT, SHORT_CHAIN, small_search, vector
 from tests.scenario.bad_scenarios import check_sentence
 from tuning.search import gains
 
@@ -487,7 +487,7 @@ def test_a_class_from_python_is_named_in_a_file_and_refused_when_it_is_read(here
 
 
 def test_results_with_code_of_ones_own_ask_before_it_is_run(command, here):
-    text = SHORT.replace("[controller]\n", '[controller]\nkind = "own"\ncode = "mine.py:Mine"\n')
+    text = SHORT_CHAIN.replace("[controller]\n", '[controller]\nkind = "own"\ncode = "mine.py:Mine"\n')
     (here / "s.toml").write_text(text)
     assert command("simulate", "s.toml", "--no-figures", "--quiet")[0] == 0
     left = here / "out/simulate-s/scenario.toml"

@@ -14,6 +14,8 @@ import pytest
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.simulation import rollout
+from ptsmc_jax.simulation.metrics import Metrics
 from ptsmc_jax.theory import linear, margins, run_margins
 from tests.helpers import ROOT
 from tuning.errors import UsageError
@@ -152,6 +154,15 @@ def test_margins_of_the_worst_axis_stand_in_the_map(mapped, monkeypatch):
     assert np.isnan(cell.linear_window_error)  # of an unstable loop nothing is predicted
 
 
+@pytest.fixture
+def unflown(monkeypatch):
+    """Cells of whose trials nothing is looked at: what flies them takes the longest to compile."""
+    zeros = Metrics(*(np.zeros(1) for _ in Metrics._fields))
+    trials = montecarlo.Trials(np.arange(1), zeros, np.full(1, rollout.OK), np.full(1, np.nan), {})
+    monkeypatch.setattr(montecarlo, "run", lambda *_: trials)
+
+
+@pytest.mark.usefixtures("unflown")
 def test_margins_of_every_law_stand_in_the_map():
     """PD on two integrators, held over a period, in closed form; they were those of the paper's law alone."""
     text = CHAIN.replace("t_f = 5.0, delta = 0.5", 'kind = "pd", t_f = 5.0')
@@ -282,6 +293,7 @@ flexible = { frequency = [3.0, 9.0], damping = [0.002, 0.02], coupling = [[1.0, 
 """
 
 
+@pytest.mark.usefixtures("unflown")
 def test_one_mode_is_moved_and_the_border_of_spillover_lies_between_stable_and_unstable_pairs():
     loaded, x, y, cells = flown("flexible.frequency[0]=2.0:8.0:3", "controller.delta=1.0:2.0:2", FLEXIBLE, 1)
     changed: Any = mapping._with(loaded, {"flexible.frequency[0]": 5.0})

@@ -19,6 +19,8 @@ from tests.helpers import SHORT, SHORT_CHAIN, short
 from tuning.output import margin_sentences, page
 from tuning.studies import stability
 
+CHAIN = SHORT_CHAIN.replace("state_noise =", "#")  # its loop has as many states as those below that a limit cuts
+
 
 def tables(path):
     with path.open() as file:
@@ -63,7 +65,7 @@ def test_margins_leaves_its_table_figures_and_page(command, tmp_path):
 
 def test_a_run_is_judged_by_the_margins_of_its_loop(command, tmp_path):
     asked = "[requirements]\ngain_margin = 1.0\nphase_margin = 89.0\n"
-    (tmp_path / "asks.toml").write_text(SHORT_CHAIN.split("[requirements]")[0] + asked)
+    (tmp_path / "asks.toml").write_text(CHAIN.split("[requirements]")[0] + asked)
     status, out, _ = command("simulate", "asks.toml", "--no-figures")
     assert status == 1
     assert "gain_margin at least 1 dB" in out
@@ -148,7 +150,7 @@ def test_few_margins_are_warned_of():
 
 def at_hand_over(period):
     """A chain whose t_f - delta is half a period."""
-    tables = {**tomllib.loads(SHORT_CHAIN), "controller": {"t_f": 5.0, "delta": 5.0 - 0.5 * period}, "tune": {}}
+    tables = {**tomllib.loads(CHAIN), "controller": {"t_f": 5.0, "delta": 5.0 - 0.5 * period}, "tune": {}}
     tables["loop"]["period"] = period
     return scenario.study(scenario.from_tables(tables))
 

@@ -29,10 +29,16 @@ def test_fresh_trials_have_another_seed_than_those_of_the_search_and_of_other_tu
     assert (seeds[1:] == plain) == (seed not in plain)
 
 
-def test_gains_that_break_a_limit_on_fresh_trials_are_tuned_on(monkeypatch):
-    """The hardest of two training trials and two screened ones is easier than of 200 fresh ones."""
+@pytest.fixture
+def small(monkeypatch):
+    """A search of few trials, judged on as many as are enough to break a limit: by one program."""
     small_search(monkeypatch, 200)
     monkeypatch.setattr(worst, "SCREENED", 2)
+    monkeypatch.setattr(tuner, "_prepare", lambda _: None)  # a program of margins, for which nobody asks here
+
+
+def test_gains_that_break_a_limit_on_fresh_trials_are_tuned_on(small):
+    """The hardest of two training trials and two screened ones is easier than of 200 fresh ones."""
     text = SHORT_CHAIN.replace("peak_torque = 3.0", f"peak_torque = {LIMIT}").replace("trials = 8", "trials = 2")
     loaded = scenario.from_tables(tomllib.loads(text))
     found = tuner.tune(loaded, 0, trusted=False)
@@ -69,9 +75,7 @@ def test_gains_that_break_a_limit_on_fresh_trials_are_tuned_on(monkeypatch):
     assert not once.met
 
 
-def test_progress_after_a_search_says_whether_it_kept_the_limits(monkeypatch):
-    small_search(monkeypatch, 8)
-    monkeypatch.setattr(worst, "SCREENED", 2)
+def test_progress_after_a_search_says_whether_it_kept_the_limits(small):
     for limit, kept in ((0.01, False), (50.0, True)):
         text = SHORT_CHAIN.replace("peak_torque = 3.0", f"peak_torque = {limit}")
         told = []
