@@ -8,7 +8,7 @@ from ptsmc_jax import programs, scenario
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.dispersions import attitudes, variation
 from ptsmc_jax.simulation import rollout
-from tests.helpers import FIRST_FLIGHT, short, vector
+from tests.helpers import FIRST_FLIGHT, SHORT_CHAIN, short, untuned, vector
 
 # eta, delta [s], observer gain: RMS window error and mean peak torque [N m], without and with noise (theory notes, 6)
 TABLE = (
@@ -26,34 +26,39 @@ FIRST = scenario.replace(scenario.read(FIRST_FLIGHT), controller__delta=0.5, loo
 
 
 @pytest.fixture(scope="module")
-def flown():
-    run = scenario.study(FIRST).parts
-    return run, montecarlo.run(run, SPREAD, 5, np.arange(256))
+def chain():
+    """How trials are shared out hangs on no spacecraft."""
+    ready = scenario.study(scenario.from_tables(untuned(SHORT_CHAIN)))
+    return ready.parts, ready.dispersion
 
 
-def test_256_trials_equal_the_loop_over_them(flown):
+@pytest.fixture(scope="module")
+def flown(chain):
+    return montecarlo.run(*chain, 5, np.arange(256))
+
+
+def test_256_trials_equal_the_loop_over_them(chain, flown):
     """Flown alone, every fifth of them, and the last and the first of each device."""
-    run, trials = flown
-    draw = jax.jit(lambda trial: SPREAD.apply(run, np.uint32(5), trial))
+    run, spread = chain
+    draw = jax.jit(lambda trial: spread.apply(run, np.uint32(5), trial))
     for k in {*range(0, 256, 5), 127, 128, 255}:
         drawn = draw(np.uint32(k))
-        alone = rollout.simulate_jit(drawn, np.uint32(5), np.uint32(k))
-        assert int(alone.status) == trials.status[k]
-        np.testing.assert_allclose(drawn.initial.q, trials.vectors("initial_q")[k], atol=1e-15)
+        alone = rollout.simulate_jit(drawn, np.uint32(5), np.uint32(k), record=True)
+        assert int(alone.status) == flown.status[k]
+        np.testing.assert_allclose(drawn.initial, flown.vectors("initial_x")[k], atol=1e-15)
         for name in alone.metrics._fields:
-            a, b = float(getattr(alone.metrics, name)), float(getattr(trials.metrics, name)[k])
+            a, b = float(getattr(alone.metrics, name)), float(getattr(flown.metrics, name)[k])
             assert a == pytest.approx(b, rel=1e-12, abs=1e-12, nan_ok=True), (k, name)
 
 
 @pytest.mark.parametrize("count", [1, 3, 63, 64, 65, 129, 255])
-def test_any_number_of_trials_is_flown(flown, count):
+def test_any_number_of_trials_is_flown(chain, flown, count):
     """Shared out over two devices, in rows of 128 lanes or all at once: none is lost, none comes twice."""
-    run, trials = flown
-    some = montecarlo.run(run, SPREAD, 5, np.arange(count))
+    some = montecarlo.run(*chain, 5, np.arange(count))
     assert some.status.shape == some.metrics.window_error.shape == (count,)
     # one program below `FEW` and another from there on: roundings differ
-    np.testing.assert_allclose(some.vectors("initial_q"), trials.vectors("initial_q")[:count], rtol=0, atol=1e-15)
-    np.testing.assert_allclose(some.metrics.window_error, trials.metrics.window_error[:count], rtol=1e-12)
+    np.testing.assert_allclose(some.vectors("initial_x"), flown.vectors("initial_x")[:count], rtol=0, atol=1e-15)
+    np.testing.assert_allclose(some.metrics.window_error, flown.metrics.window_error[:count], rtol=1e-12)
 
 
 class _AskedError(Exception):
@@ -61,7 +66,7 @@ class _AskedError(Exception):
 
 
 @pytest.mark.parametrize("count", [1, 63, 64, 1000])
-def test_what_is_prepared_for_so_many_trials_is_what_flies_them(flown, count, monkeypatch):
+def test_what_is_prepared_for_so_many_trials_is_what_flies_them(chain, count, monkeypatch):
     """Another program, by a shape or a type, would be compiled for nothing."""
     known = []
 
@@ -75,9 +80,9 @@ def test_what_is_prepared_for_so_many_trials_is_what_flies_them(flown, count, mo
 
     called.prepare = heard  # pyright: ignore[reportFunctionMemberAccess]
     monkeypatch.setattr(montecarlo, "_fly", called)
-    montecarlo.prepare(flown[0], SPREAD, count)
+    montecarlo.prepare(*chain, count)
     with pytest.raises(_AskedError):
-        montecarlo.run(flown[0], SPREAD, 5, np.arange(count))
+        montecarlo.run(*chain, 5, np.arange(count))
     assert len(known) == 2
     assert known[0] == known[1]
 
@@ -94,23 +99,23 @@ def test_what_is_prepared_for_so_many_trials_is_what_flies_them(flown, count, mo
         ([True, False], "of type bool"),
     ],
 )
-def test_numbers_that_name_no_trials_are_refused(flown, trials, said):
+def test_numbers_that_name_no_trials_are_refused(chain, trials, said):
     """None of them is cut off, or counted from the other end, without a word."""
     with pytest.raises(ValueError, match=said):
-        montecarlo.run(flown[0], SPREAD, 5, trials)
+        montecarlo.run(*chain, 5, trials)
 
 
 @pytest.mark.long  # campaigns of several calls: `test_campaign.py`
-def test_more_trials_than_one_call_takes(flown, monkeypatch):
-    run, trials = flown
+def test_more_trials_than_one_call_takes(chain, flown, monkeypatch):
     monkeypatch.setattr(montecarlo, "CAPACITY", 64)
-    some = montecarlo.run(run, SPREAD, 5, np.arange(201), block=16)
-    np.testing.assert_allclose(some.metrics.window_error, trials.metrics.window_error[:201], rtol=1e-12)
+    some = montecarlo.run(*chain, 5, np.arange(201), block=16)
+    np.testing.assert_allclose(some.metrics.window_error, flown.metrics.window_error[:201], rtol=1e-12)
 
 
 @pytest.mark.long  # the loop over them is the same with less; `test_conformity.py` has vmap for each kind
-def test_trials_equal_plain_vmap(flown):
-    run, trials = flown
+def test_trials_equal_plain_vmap():
+    run = scenario.study(FIRST).parts
+    trials = montecarlo.run(run, SPREAD, 5, np.arange(256))
     plain = jax.jit(jax.vmap(lambda trial: montecarlo.one(run, SPREAD, np.uint32(5), trial)))
     metrics, *_ = plain(np.arange(256, dtype=np.uint32))
     for name in metrics._fields:
@@ -118,22 +123,23 @@ def test_trials_equal_plain_vmap(flown):
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12, err_msg=name)
 
 
-def test_a_trial_does_not_depend_on_the_others(flown):
-    run, trials = flown
+def test_a_trial_does_not_depend_on_the_others(chain, flown):
     some = np.array([200, 3, 3, 77])
-    again = montecarlo.run(run, SPREAD, 5, some)
-    np.testing.assert_allclose(again.metrics.window_error, trials.metrics.window_error[some], rtol=1e-12)
-    np.testing.assert_allclose(again.vectors("initial_q"), trials.vectors("initial_q")[some], atol=1e-15)
-    other = montecarlo.run(run, SPREAD, 6, some)
+    again = montecarlo.run(*chain, 5, some)
+    np.testing.assert_allclose(again.metrics.window_error, flown.metrics.window_error[some], rtol=1e-12)
+    np.testing.assert_allclose(again.vectors("initial_x"), flown.vectors("initial_x")[some], atol=1e-15)
+    other = montecarlo.run(*chain, 6, some)
     assert not np.any(other.metrics.window_error == again.metrics.window_error)
 
 
-def test_failed_trials_are_counted_and_leave_the_others_alone(flown):
-    run, trials = flown
+def test_failed_trials_are_counted_and_leave_the_others_alone():
+    """Spacecraft, as many at least as the program of many trials flies."""
+    run = scenario.study(FIRST).parts
+    trials = montecarlo.run(run, SPREAD, 5, np.arange(256))
     wide = replace(SPREAD, attitude=attitudes.AxisAngle(vector(np.deg2rad(20.0)), vector(np.pi)))
     near = replace(wide, attitude=attitudes.AxisAngle(vector(np.pi - 1e-4), vector(np.pi)))
-    failed = montecarlo.run(run, near, 5, np.arange(8))
-    assert failed.counts() == {"ok": 0, "diverged": 0, "singular": 8, "missed": 0, "unfinished": 0}
+    failed = montecarlo.run(run, near, 5, np.arange(montecarlo.FEW))
+    assert failed.counts() == {"ok": 0, "diverged": 0, "singular": montecarlo.FEW, "missed": 0, "unfinished": 0}
     assert np.all(failed.bad_time >= 0.0)
     mixed = montecarlo.run(run, wide, 5, np.arange(256))
     assert sum(mixed.counts().values()) == 256
