@@ -156,12 +156,11 @@ def stream_names():
     """Names given to `stream` and `derive` anywhere in the source, constants of the module looked up."""
     names = []
     for module, path in modules().items():
-        known = vars(importlib.import_module(module))
+        calls = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)]
+        drawing = [node for node in calls if ast.unparse(node.func) in DRAWING]
+        known = vars(importlib.import_module(module)) if drawing else {}
         constants = {k: v for k, v in known.items() if k.isupper() and isinstance(v, str)}
-        tree = ast.parse(path.read_text())
-        for node in ast.walk(tree):
-            if not isinstance(node, ast.Call) or ast.unparse(node.func) not in DRAWING:
-                continue
+        for node in drawing:
             last = node.args[-1]
             for name in last.elts if isinstance(last, ast.Tuple) else [last]:
                 if isinstance(name, ast.Constant):

@@ -9,32 +9,37 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from ptsmc_jax.dispersions import attitudes, variation
-from ptsmc_jax.signals import disturbances
+from ptsmc_jax.devices import sensors
+from ptsmc_jax.dispersions import variation
 from ptsmc_jax.simulation import clock
 from ptsmc_jax.simulation.requirements import Requirement
-from tests.helpers import parts, vector
+from tests.helpers import parts
 from tests.search.test_tuning import problem
 from tuning.search import global_check, objective, optimise, trust
 from tuning.search.evaluate import Evaluator, Measured
 from tuning.search.objective import FAILED
 from tuning.search.shares import Bounds
 
-SPREAD = variation.Dispersion(attitudes.AxisAngle(vector(np.deg2rad(20.0)), vector(np.deg2rad(140.0))))
 BOUNDS = Bounds(("eta", "delta", "t_f"), (2.5, 0.3, 15.0), (5.0, 4.0, 25.0))
+
+
+def moved_in_time(**limits):
+    """A double integrator with noise on a clock for all of `BOUNDS`: one program flies all that is flown here."""
+    noisy = problem(**limits)
+    far = replace(noisy.parts, clock=clock.anchored(0.2, 21.0, 25.0, 5.0))
+    return replace(noisy, parts=far, names=BOUNDS.names)
 
 
 @pytest.fixture(scope="module")
 def quiet():
-    """From rest, without noise or disturbance: the first torque is the largest, 2 eta^2 |J v / q4| / t_f^2."""
-    run = parts(20.0, 3.0, 1.0, period=0.2, t_end=21.0, disturbance=disturbances.Constant(jnp.zeros(3)))
-    run = replace(run, clock=clock.anchored(0.2, 21.0, 25.0, 5.0))
-    return objective.problem(run, SPREAD, 3, np.arange(8), BOUNDS.names, [Requirement("peak_torque", 0.9)])
+    """From rest, without noise or disturbance: the first input is the largest, eta^2 |x| / t_f^2."""
+    noisy = moved_in_time(peak_torque=0.9)
+    return replace(noisy, parts=replace(noisy.parts, sensors=sensors.StateSensor(jnp.zeros(2))))
 
 
 def test_sensitivities_of_the_first_torque_are_its_powers(quiet):
     found = trust.sensitivities(
-        quiet, BOUNDS, np.array([3.3, 1.0, 19.0]), ("peak_torque", "window_error", "settling_time")
+        quiet, BOUNDS, np.array([3.3, 2.0, 19.0]), ("peak_torque", "window_error", "settling_time")
     )
     powers = found["peak_torque"]
     # central differences of a power p in logs: p atanh(h) / h, off by h^2 / 3 for a relative step h of 0.01
@@ -131,7 +136,7 @@ def test_what_moves_goal_and_limits_by_less_than_a_percent_is_flat(ratio, flat):
 
 
 def test_without_a_requirement_there_is_no_limit_to_move(quiet):
-    free = objective.problem(quiet.parts, SPREAD, 3, np.arange(8), BOUNDS.names)
+    free = objective.problem(quiet.parts, quiet.dispersion, 3, np.arange(8), BOUNDS.names)
     found = trust.profiles(
         Evaluator(BOUNDS), replace(free, goal="peak_torque"), BOUNDS.share(np.array([3.3, 1.0, 19.0]))
     )
@@ -139,9 +144,7 @@ def test_without_a_requirement_there_is_no_limit_to_move(quiet):
 
 
 def test_slopes_are_checked_against_differences():
-    noisy = problem()
-    far = replace(noisy.parts, clock=clock.anchored(0.2, 21.0, 25.0, 5.0))
-    noisy = replace(noisy, parts=far, names=BOUNDS.names)
+    noisy = moved_in_time()
     # not where t_f - delta is a multiple of the period: there the first period's noise has a kink
     evaluate, z = Evaluator(BOUNDS), BOUNDS.share(np.array([3.3, 1.07, 19.0]))
     assert trust.slope_error(evaluate, noisy, z) < 1e-6  # of order 4 over 1e-3
@@ -215,14 +218,11 @@ def test_a_global_search_is_judged_by_the_limits_themselves(monkeypatch, share, 
     """Gains that keep a limit, but not all of the margin that a search keeps from it, keep the limit."""
     monkeypatch.setattr(global_check, "GENERATIONS", 1)
     monkeypatch.setattr(global_check, "POPULATION", 4)
-    evaluate = Evaluator(Bounds(("eta", "delta"), (3.0, 0.5), (3.0001, 0.5001)))  # all gains ask for one torque
-
-    def asked(limit: float) -> objective.Problem:
-        return problem(2, peak_torque=limit)
-
-    peak = float(evaluate.fly(asked(1.0), np.full((1, 2), 0.5)).beyond[0]) + 1.0
+    bounds = Bounds(BOUNDS.names, (3.0, 0.5, 20.0), (3.0001, 0.5001, 20.0001))  # all gains ask for one torque
+    evaluate = Evaluator(bounds)
+    peak = float(evaluate.fly(moved_in_time(peak_torque=1.0), np.full((1, 3), 0.5)).beyond[0]) + 1.0
     settings, limit = optimise.Settings(1, 2, 1, judged=False, margin=0.03), peak / share
-    found = optimise.search(evaluate, asked(limit), (), np.array([3.0, 0.5]), settings)
+    found = optimise.search(evaluate, moved_in_time(peak_torque=limit), (), np.array([3.0, 0.5, 20.0]), settings)
     assert bool(found.worst[0] <= 1.0) is kept
     assert global_check.check(evaluate, found, 0).kept is kept
 

@@ -358,8 +358,7 @@ def test_gains_that_the_clock_has_no_samples_for_are_said():
 
 def test_a_t_f_that_the_steps_of_a_continuous_loop_are_too_coarse_for_is_said():
     """Twice the t_f that its grid was made for leaves no steps to close in on it: the window error was 66 % off."""
-    run = parts(30.0)
-    run = replace(run, clock=replace(run.clock, before=414, after=101))
+    run = reference_run(REFERENCE["cases"][0])
     codes = {t_f: int(fly(run.with_t_f(vector(t_f))).status) for t_f in (30.0, 45.0, 60.0, 90.0)}
     assert codes == {30.0: rollout.OK, 45.0: rollout.OK, 60.0: rollout.UNFINISHED, 90.0: rollout.UNFINISHED}
     assert float(with_gains(run, {"t_f": 45.0}).controller.t_f) == 45.0
