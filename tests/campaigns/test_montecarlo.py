@@ -28,19 +28,17 @@ FIRST = scenario.replace(scenario.read(FIRST_FLIGHT), controller__delta=0.5, loo
 @pytest.fixture(scope="module")
 def chain():
     """How trials are shared out hangs on no spacecraft."""
-    ready = scenario.study(scenario.from_tables(untuned(SHORT_CHAIN)))
-    return ready.parts, ready.dispersion
+    return scenario.study(scenario.from_tables(untuned(SHORT_CHAIN)))
 
 
 @pytest.fixture(scope="module")
 def flown(chain):
-    return montecarlo.run(*chain, 5, np.arange(256))
+    return montecarlo.run(chain.parts, chain.dispersion, 5, np.arange(256))
 
 
 def test_256_trials_equal_the_loop_over_them(chain, flown):
     """Flown alone, every fifth of them, and the last and the first of each device."""
-    run, spread = chain
-    draw = jax.jit(lambda trial: spread.apply(run, np.uint32(5), trial))
+    draw = jax.jit(lambda trial: chain.dispersion.apply(chain.parts, np.uint32(5), trial))
     for k in {*range(0, 256, 5), 127, 128, 255}:
         drawn = draw(np.uint32(k))
         alone = rollout.simulate_jit(drawn, np.uint32(5), np.uint32(k), record=True)
@@ -54,7 +52,7 @@ def test_256_trials_equal_the_loop_over_them(chain, flown):
 @pytest.mark.parametrize("count", [1, 3, 63, 64, 65, 129, 255])
 def test_any_number_of_trials_is_flown(chain, flown, count):
     """Shared out over two devices, in rows of 128 lanes or all at once: none is lost, none comes twice."""
-    some = montecarlo.run(*chain, 5, np.arange(count))
+    some = montecarlo.run(chain.parts, chain.dispersion, 5, np.arange(count))
     assert some.status.shape == some.metrics.window_error.shape == (count,)
     # one program below `FEW` and another from there on: roundings differ
     np.testing.assert_allclose(some.vectors("initial_x"), flown.vectors("initial_x")[:count], rtol=0, atol=1e-15)
@@ -80,9 +78,9 @@ def test_what_is_prepared_for_so_many_trials_is_what_flies_them(chain, count, mo
 
     called.prepare = heard  # pyright: ignore[reportFunctionMemberAccess]
     monkeypatch.setattr(montecarlo, "_fly", called)
-    montecarlo.prepare(*chain, count)
+    montecarlo.prepare(chain.parts, chain.dispersion, count)
     with pytest.raises(_AskedError):
-        montecarlo.run(*chain, 5, np.arange(count))
+        montecarlo.run(chain.parts, chain.dispersion, 5, np.arange(count))
     assert len(known) == 2
     assert known[0] == known[1]
 
@@ -102,13 +100,13 @@ def test_what_is_prepared_for_so_many_trials_is_what_flies_them(chain, count, mo
 def test_numbers_that_name_no_trials_are_refused(chain, trials, said):
     """None of them is cut off, or counted from the other end, without a word."""
     with pytest.raises(ValueError, match=said):
-        montecarlo.run(*chain, 5, trials)
+        montecarlo.run(chain.parts, chain.dispersion, 5, trials)
 
 
 @pytest.mark.long  # campaigns of several calls: `test_campaign.py`
 def test_more_trials_than_one_call_takes(chain, flown, monkeypatch):
     monkeypatch.setattr(montecarlo, "CAPACITY", 64)
-    some = montecarlo.run(*chain, 5, np.arange(201), block=16)
+    some = montecarlo.run(chain.parts, chain.dispersion, 5, np.arange(201), block=16)
     np.testing.assert_allclose(some.metrics.window_error, flown.metrics.window_error[:201], rtol=1e-12)
 
 
@@ -125,10 +123,10 @@ def test_trials_equal_plain_vmap():
 
 def test_a_trial_does_not_depend_on_the_others(chain, flown):
     some = np.array([200, 3, 3, 77])
-    again = montecarlo.run(*chain, 5, some)
+    again = montecarlo.run(chain.parts, chain.dispersion, 5, some)
     np.testing.assert_allclose(again.metrics.window_error, flown.metrics.window_error[some], rtol=1e-12)
     np.testing.assert_allclose(again.vectors("initial_x"), flown.vectors("initial_x")[some], atol=1e-15)
-    other = montecarlo.run(*chain, 6, some)
+    other = montecarlo.run(chain.parts, chain.dispersion, 6, some)
     assert not np.any(other.metrics.window_error == again.metrics.window_error)
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from ptsmc_jax.simulation.requirements import Requirement
 from tests.helpers import parts
-from tests.search.test_trust import SPREAD
+from tests.search.test_tuning import TURNED
 from tuning.search import cma_es, objective
 from tuning.search.descent import Best
 from tuning.search.descents import Descents
@@ -36,7 +36,7 @@ class Valley(Evaluator):
 
 def refined(valley, start, seed=3):
     names = valley.bounds.names
-    some = objective.problem(parts(20.0, 3.0, 1.0), SPREAD, 0, np.arange(1), names, [Requirement("peak_torque", 1.0)])
+    some = objective.problem(parts(20.0, 3.0, 1.0), TURNED, 0, np.arange(1), names, [Requirement("peak_torque", 1.0)])
     share = 0.5 + np.asarray(start)
     best, told = Best(share, 1, 0.0), []
     best.offer(share[None], valley.fly(some, share[None]))
@@ -77,7 +77,7 @@ def test_what_evolution_sets_out_from_is_the_first_of_the_history():
     valley = Valley(np.eye(2))
     names = valley.bounds.names
     valley.bounds = Bounds(names, (1.0, 1.0), (2.0, 2.0))
-    some = objective.problem(parts(20.0, 3.0, 1.0), SPREAD, 0, np.arange(1), names, [Requirement("peak_torque", 1.0)])
+    some = objective.problem(parts(20.0, 3.0, 1.0), TURNED, 0, np.arange(1), names, [Requirement("peak_torque", 1.0)])
     search = Descents(valley, 0.0, 4, np.random.default_rng(0))
     search.sweep(some, np.full(2, 1.9))
     (first,) = search.history
