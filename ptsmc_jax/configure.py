@@ -98,8 +98,8 @@ def configure(
     import jax
 
     jax.config.update("jax_enable_x64", bits == 64)
-    # takes a fifth of compiling, of programs for one device too, and jaxlib 0.11.2 crashes in it where an operand of
-    # shard_map turns out unused
+    # of programs for several devices it takes a tenth to a quarter of compiling, and jaxlib 0.11.2 crashes in it where
+    # an operand of shard_map turns out unused
     jax.config.update("jax_use_shardy_partitioner", False)
     if keep_programs:
         jax.config.update("jax_debug_nans", False)
