@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from ptsmc_jax import programs
 from ptsmc_jax.batching import lapack
+from ptsmc_jax.numerics.pytrees import Scalar
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.theory import linear, margins, rest
 from ptsmc_jax.theory.linear import Loop
@@ -28,6 +29,7 @@ class Course(NamedTuple):
     at_input: Margins  # (times, m)
     at_sensors: Margins  # (k,) in hold
     together: dict[str, float]  # the same of all axes of the input at once, in hold
+    clearance: float  # the run's least, as `run_state.SINGULAR_CLEARANCE` has it
     swing: rest.Swing | None = None  # by which the run does not come to rest in hold
 
     @property
@@ -126,7 +128,7 @@ def along(parts: Parts, times: int = 24) -> Course:
     None is left in hold where the run does not come to rest, see `rest`.
     """
     run = linear.nominal_jit(parts)
-    looked_at, commands = _along(parts, run, times)
+    looked_at, commands, clearance = _along(parts, run, times)
     at_times = at(parts, looked_at, run)
     first_at = {t: k for k, t in reversed(list(enumerate(at_times.t.tolist()))) if not at_times.hold[k]}
     order = np.asarray([k for _, k in sorted(first_at.items())] + [len(at_times.t) - 1])
@@ -140,14 +142,21 @@ def along(parts: Parts, times: int = 24) -> Course:
     else:
         at_once = dict.fromkeys(FIELDS, float("nan"))
         at_input, at_sensors = rest.none_left(at_input, order == order[-1]), rest.none_left(at_sensors, [True])
-    return Course(t, counts, loops, at_input, jax.tree.map(lambda v: np.asarray(v)[0], at_sensors), at_once, swing)
+    at_sensors = jax.tree.map(lambda v: np.asarray(v)[0], at_sensors)
+    return Course(t, counts, loops, at_input, at_sensors, at_once, float(clearance), swing)
 
 
 @programs.jit(static_argnames="times", compiler_options=programs.QUICKLY)
-def _along(parts: Parts, run: linear.Nominal, times: int) -> tuple[Array, History]:
-    """The times to go that `along` looks at, (TIMES + times,) [s], those that are judged first; the commands."""
-    besides = jnp.geomspace(parts.period, parts.controller.t_f, times)
-    return jnp.append(judged_times(parts), besides), history(parts, run)
+def _along(parts: Parts, run: linear.Nominal, times: int) -> tuple[Array, History, Scalar]:
+    """The times to go that `along` looks at, (TIMES + times,) [s], those that are judged first; the commands.
+
+    And the least clearance from the law's singularity [-].
+    """
+    law = parts.controller
+    besides = jnp.geomspace(parts.period, law.t_f, times)
+    clear = lapack.vmap(lambda x, t: law.clearance(x, parts.reference(t)))(run.carry.x, run.period.now.t)
+    nearest = jnp.min(clear / law.clearance_unit(clear[0]))
+    return jnp.append(judged_times(parts), besides), history(parts, run), nearest
 
 
 def at_ends(parts: Parts) -> dict[str, tuple[Margins, float]]:

@@ -167,6 +167,17 @@ def test_a_run_that_is_not_finite_leaves_no_margins_and_is_no_error(monkeypatch)
         stability.find(lost.scenario)
 
 
+def test_a_run_that_comes_to_the_laws_singularity_has_no_margins(monkeypatch):
+    """`margins` called its loop in hold stable."""
+    ready = at_hand_over(0.1)
+    course = run_margins.along(ready.parts)
+    assert course.clearance == 1.0  # a chain's law has no singularity
+    stability.find(ready.scenario)
+    monkeypatch.setattr(run_margins, "along", lambda _: course._replace(clearance=0.9e-3))
+    with pytest.raises(ScenarioError, match="which ends singular: the law's singularity came nearer than 1e-3"):
+        stability.find(ready.scenario)
+
+
 @pytest.mark.parametrize("period", short([0.1, 0.5], [0.1]))
 def test_without_a_whole_period_before_the_hand_over_margins_are_those_in_hold(period):
     """No sample before the hand-over lasts a whole one."""

@@ -501,6 +501,19 @@ def test_the_mean_over_a_slow_star_trackers_interval_in_hold_has_no_loop_from_be
     assert index == first + linear.averaged(parts) - 1
 
 
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_runs_clearance_is_its_least_from_the_side_that_it_begins_on(side):
+    """q4, at which the paper's law is singular; its sign is that of a start that `align` has looked at."""
+    slow = KINDS["slow star tracker, filter, delay and lag"]
+    parts = scenario.study(scenario.from_tables({**slow, "controller": {"t_f": 10.0, "delta": 0.5}})).parts
+    run = linear.nominal_jit(parts)
+    q = np.asarray(run.carry.x.q) * np.sign(run.carry.x.q[:1, 3:])
+    for q4 in (0.2, 4e-4, -0.3):
+        turned = jnp.asarray(side * np.vstack([q[:5], [[np.sqrt(1.0 - q4**2), 0.0, 0.0, q4]], q[6:]]))
+        there = run._replace(carry=run.carry._replace(x=run.carry.x._replace(q=turned)))
+        np.testing.assert_allclose(run_margins._along(parts, there, 24)[2], q4, rtol=1e-12)
+
+
 def test_rounding_next_to_a_pole_at_one_is_no_crossing():
     """Where L is as large as 1e9, beside the poles of stored momentum, its sign is noise: no gain brings it to -1."""
     seen = jnp.asarray([-1e9 + 1e8j, -1e9 - 1e8j, 3.0 - 3.0j, -2.0 - 1.0j, -2.0 + 3.0j])

@@ -30,11 +30,15 @@ def find(scenario: Scenario) -> tuple[Study, Course]:
         raise ScenarioError(f'margins need the sampled loop, but loop.mode is "{scenario.loop.mode}"')
     ready = study(scenario)
     course = run_margins.along(ready.parts)
-    if np.isnan(course.hold[1].modulus).any():
+    without_slopes, code = np.isnan(course.hold[1].modulus).any(), rollout.OK
+    if course.clearance < rollout.SINGULAR_CLEARANCE:
+        code = rollout.SINGULAR
+    elif without_slopes:
         code = int(rollout.simulate_jit(ready.parts, np.uint32(0), np.uint32(0)).status)
-        if code not in rollout.FINISHED:
-            status, why = rollout.STATUS[code]
-            raise ScenarioError(f"margins are those about the nominal run, which ends {status}: {why}")
+    if code not in rollout.FINISHED:
+        status, why = rollout.STATUS[code]
+        raise ScenarioError(f"margins are those about the nominal run, which ends {status}: {why}")
+    if without_slopes:
         raise ScenarioError(
             f"margins need slopes of the loop by all that it carries, but with controller.kind = "
             f"{errors.show(scenario.controller.kind)} one is not finite in hold; allowed is a law that has them there"
