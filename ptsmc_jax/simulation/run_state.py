@@ -176,15 +176,18 @@ def finish(
     values = metrics.finish(state.running, criteria)
     start = _start(run.parts, first, wheel_momentum)
     unbounded = (state.status == OK) & metrics.unbounded(values, metrics.begin(start, criteria))
-    missed = (state.status == OK) & (
-        angle_at_t_f > jnp.maximum(MISSED_SHARE * first.angle, MISSED_SETTLING_ANGLES * criteria.settling_angle)
-    )
+    missed = (state.status == OK) & misses(angle_at_t_f, first.angle, criteria.settling_angle)
     cut = ~jnp.isnan(run.gap) & ~(state.bad_time < run.gap)  # what went wrong without samples means nothing
     status = jnp.where(unbounded, UNBOUNDED, jnp.where(missed, MISSED, state.status))
     status = jnp.where(cut, UNFINISHED, status).astype(jnp.int32)
     bad_time = jnp.where(unbounded, criteria.t_end, jnp.where(missed, criteria.t_f, state.bad_time))
     bad_time = jnp.where(cut, run.gap, bad_time)
     return Result(values, status, bad_time, log, samples or {})
+
+
+def misses(angle_at_t_f: Scalar, first: Scalar, settling_angle: Scalar) -> Array:
+    """Whether a run that is flown to its end has missed t_f, by its angles then and at the start [rad]."""
+    return angle_at_t_f > jnp.maximum(MISSED_SHARE * first, MISSED_SETTLING_ANGLES * settling_angle)
 
 
 def _start(parts: Parts, snapshot: Snapshot, wheel_momentum: Array | None) -> Start:

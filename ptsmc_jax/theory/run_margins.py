@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from ptsmc_jax import programs
 from ptsmc_jax.batching import lapack
 from ptsmc_jax.numerics.pytrees import Scalar
+from ptsmc_jax.simulation import run_state
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.theory import linear, margins, rest
 from ptsmc_jax.theory.linear import Loop
@@ -30,6 +31,7 @@ class Course(NamedTuple):
     at_sensors: Margins  # (k,) in hold
     together: dict[str, float]  # the same of all axes of the input at once, in hold
     clearance: float  # the run's least, as `run_state.SINGULAR_CLEARANCE` has it
+    missed: bool  # the run is not where it should be at t_f, as `run_state.misses` has it
     swing: rest.Swing | None = None  # by which the run does not come to rest in hold
 
     @property
@@ -128,7 +130,7 @@ def along(parts: Parts, times: int = 24) -> Course:
     None is left in hold where the run does not come to rest, see `rest`.
     """
     run = linear.nominal_jit(parts)
-    looked_at, commands, clearance = _along(parts, run, times)
+    looked_at, commands, clearance, missed = _along(parts, run, times)
     at_times = at(parts, looked_at, run)
     first_at = {t: k for k, t in reversed(list(enumerate(at_times.t.tolist()))) if not at_times.hold[k]}
     order = np.asarray([k for _, k in sorted(first_at.items())] + [len(at_times.t) - 1])
@@ -143,20 +145,26 @@ def along(parts: Parts, times: int = 24) -> Course:
         at_once = dict.fromkeys(FIELDS, float("nan"))
         at_input, at_sensors = rest.none_left(at_input, order == order[-1]), rest.none_left(at_sensors, [True])
     at_sensors = jax.tree.map(lambda v: np.asarray(v)[0], at_sensors)
-    return Course(t, counts, loops, at_input, at_sensors, at_once, float(clearance), swing)
+    return Course(t, counts, loops, at_input, at_sensors, at_once, float(clearance), bool(missed), swing)
 
 
 @programs.jit(static_argnames="times", compiler_options=programs.QUICKLY)
-def _along(parts: Parts, run: linear.Nominal, times: int) -> tuple[Array, History, Scalar]:
+def _along(parts: Parts, run: linear.Nominal, times: int) -> tuple[Array, History, Scalar, Array]:
     """The times to go that `along` looks at, (TIMES + times,) [s], those that are judged first; the commands.
 
-    And the least clearance from the law's singularity [-].
+    And the least clearance from the law's singularity [-], and whether the run misses t_f.
     """
     law = parts.controller
     besides = jnp.geomspace(parts.period, law.t_f, times)
     clear = lapack.vmap(lambda x, t: law.clearance(x, parts.reference(t)))(run.carry.x, run.period.now.t)
     nearest = jnp.min(clear / law.clearance_unit(clear[0]))
-    return jnp.append(judged_times(parts), besides), history(parts, run), nearest
+    t = run.period.now.t
+    first, arrived = (
+        law.angle(jax.tree.map(lambda v, k=k: v[k], run.carry.x), parts.reference(t[k]))
+        for k in (0, jnp.argmax(t >= law.t_f))
+    )
+    missed = run_state.misses(arrived, first, parts.settling_angle)
+    return jnp.append(judged_times(parts), besides), history(parts, run), nearest, missed
 
 
 def at_ends(parts: Parts) -> dict[str, tuple[Margins, float]]:

@@ -206,13 +206,16 @@ def test_where_a_limit_cuts_the_command_the_loop_is_said_to_be_open():
     assert "cuts the nominal run's command at input u1 in hold: the loop is open there" in held
     assert "cuts the nominal run's command at input u1 before the hand-over, at " in before
     assert not any("stable" in line or "worst margins" in line for line in margin_sentences.lines(found))
+    assert found["missed"]  # in 3 s it comes from 1 to 1 - 0.02 3^2 / 2 = 0.91 at best
+    assert any(line.startswith("the nominal run misses t_f") for line in margin_sentences.lines(found))
     result: Any = SimpleNamespace(summary=found)
     heading, _ = page._margins(result)
     assert heading.headline.startswith("The loop in hold is open")
     free = scenario.from_tables(tables | {"hardware": {"torque_limit": 50.0}})
     found = stability.summary(*stability.find(free))
     assert not any(one["open"] for one in (found, *found["before"]))
-    assert not any("limit of the actuators" in line for line in margin_sentences.lines(found))
+    assert "missed" not in found
+    assert not any("misses" in line or "limit of the actuators" in line for line in margin_sentences.lines(found))
     # not those of all inputs at once and of the sensors, which the table has beside them and which may be less
     assert any(line.startswith("the worst margins at one input, in hold") for line in margin_sentences.lines(found))
     # as of one axis of several, of which another makes the loop unstable

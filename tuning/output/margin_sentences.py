@@ -44,6 +44,8 @@ def lines(summary: Summary, *, with_least: bool = True) -> Iterator[str]:
             f"these margins are of the nominal run, which starts {summary['start_deg']:.4g} deg from the reference "
             "(another start: [initial])"
         )
+    if summary.get("missed"):
+        yield "the nominal run misses t_f: margins in hold are those on its way there, not at the reference"
     unstable = [loop for loop in summary["before"] if not loop["stable"]]
     for judged, caveat in (
         (True, ""), (False, ", where gains change too fast, or the loop is too slow, for that to say much"),

@@ -122,6 +122,7 @@ def summary(ready: Study, course: Course) -> dict[str, Any]:
             }
             for k, (t, counts) in enumerate(zip(course.t[:-1], course.judged, strict=False))
         ],
+        **({"missed": True} if course.missed else {}),
         "said": NO_SIGN if ready.scenario.exact_sign else None,
         **({"start_deg": _start(ready)} if ready.parts.plant.attitude else {}),
         **({} if course.swing is None else _swing(ready.scenario, course.swing)),
