@@ -10,8 +10,11 @@ import pytest
 
 import ptsmc_jax as ptsmc
 from ptsmc_jax import scenario
+from ptsmc_jax.simulation import rollout
 from tuning.search import evaluate
-from tuning.search.evaluate import Evaluator, Sloped
+from tuning.search.descent import Best
+from tuning.search.descents import Descents
+from tuning.search.evaluate import Evaluator, Measured, Sloped
 from tuning.search.objective import Rules, judge, problem
 from tuning.search.shares import Bounds
 
@@ -51,6 +54,26 @@ def test_the_torque_weighs_over_the_averaged_trials_as_the_error_does():
     assert float(value) == pytest.approx(math.log(math.sqrt(12.5)), rel=1e-12)
     assert float(f) == pytest.approx(float(value) + 0.3 * math.log(math.sqrt(0.125)), rel=1e-12)
     assert c.shape == (0, 3)
+
+
+def test_where_no_trial_has_a_goal_there_is_none():
+    """What stands for it in F is no error of the gains': histories and progress had it as one of 1e9."""
+    shape = {"limits": np.array([0.5]), "among": np.zeros((1, 2), bool), "counted": np.ones((1, 2), bool)}
+    rules = Rules(averaged=2, names=("eta",), may_break=(None,), **shape)
+    status = jnp.asarray([[rollout.OK, rollout.DIVERGED], [rollout.DIVERGED] * 2], jnp.int32)
+    judged = [judge(rules, jnp.asarray([3.0]), jnp.asarray([[4.0, 0.3, 0.3], [5.0, 0.2, 0.2]]), one) for one in status]
+    f, c, value = map(np.asarray, zip(*judged, strict=True))
+    seen = Measured(gains=np.array([[3.0], [3.0]]), f=f, c=c, value=value)
+    np.testing.assert_allclose(seen.goal, [4.0, np.nan], rtol=1e-12)
+    run = Descents(Evaluator(Bounds(("eta",), (2.0,), (4.0,))), 0.0, 2, np.random.default_rng(0))
+    best = Best(np.array([0.5]), 1, 0.0)
+    best.offer(np.array([[0.5]]), seen.at(1))
+    assert np.isnan(best.value)
+    assert best.failed
+    for point in (0, 1):
+        run._keep(point, seen.at(point))
+    np.testing.assert_allclose([step.value for step in run.history], [4.0, np.nan], rtol=1e-12)
+    assert [step.worst.tolist() for step in run.history] == [[np.inf], [np.inf]]
 
 
 def test_a_system_of_ones_own_has_the_same_questions_in_another_process():

@@ -146,10 +146,10 @@ def test_a_search_of_gains_with_which_no_trial_ends_is_drawn():
     some = scenario.from_tables(tomllib.loads(SHORT_CHAIN) | {"tune": {"free": ["eta"]}})
     lost = np.full(2, np.nan)
     trials = SimpleNamespace(finished=np.zeros(2, bool), metrics=SimpleNamespace(window_error=lost, peak_torque=lost))
-    profile = trust.Profile(np.array([3.0, 4.0]), np.full(2, FAILED), np.full(2, 0.0), np.zeros(2), ["", ""])
-    steps = [Step(0, np.array([eta]), FAILED, np.array([FAILED])) for eta in (3.0, 3.5)]
+    profile = trust.Profile(np.array([3.0, 4.0]), lost, np.full(2, FAILED), np.zeros(2), ["", ""])
+    steps = [Step(0, np.array([eta]), np.nan, np.array([np.inf])) for eta in (3.0, 3.5)]
     tuning = SimpleNamespace(
-        search=SimpleNamespace(history=steps, value=FAILED, gains=np.array([3.0])),
+        search=SimpleNamespace(history=steps, value=np.nan, gains=np.array([3.0])),
         fresh={"tuned": trials},
         floors={"tuned": None},
         trust=SimpleNamespace(sensitivities={}, profiles={"eta": profile}),

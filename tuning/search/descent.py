@@ -64,7 +64,7 @@ class Best:
         first = int(np.lexsort((seen.f, over, lost))[0])
         if np.isfinite(seen.f[first]) and (lost[first], over[first], seen.f[first]) < self.rank:
             self.share, self.worst = share[first].copy(), worst[first]
-            self.f, self.value = float(seen.f[first]), float(np.exp(seen.value[first]))
+            self.f, self.value = float(seen.f[first]), float(seen.goal[first])
             self.lost, self.over = float(lost[first]), float(over[first])
 
 

@@ -15,7 +15,7 @@ from tuning.search.cma_es import GENERATIONS, WIDELY, evolve
 from tuning.search.descent import BOLD, CAREFUL, CLOSE, Best, Start, descend, largest, prices
 from tuning.search.evaluate import Evaluator, Measured, Sloped
 from tuning.search.lockstep import Ask, in_step
-from tuning.search.objective import FAILED, Problem, ended, failures, fewer_trials
+from tuning.search.objective import Problem, ended, failures, fewer_trials
 from tuning.search.progress import Report
 from tuning.search.shares import TIMES
 from tuning.search.starts import CHOOSING, NEARLY, STEEP, SWEPT, charged, promising, spread, starting_points
@@ -41,8 +41,8 @@ class Step:
 
     start: int
     gains: np.ndarray  # (gains,)
-    value: float  # the goal over the training trials
-    worst: np.ndarray  # (requirements,) largest metric / limit, `FAILED` where a trial fails
+    value: float  # the goal over the training trials, NaN where none has one
+    worst: np.ndarray  # (requirements,) largest metric / limit, infinite where a trial fails
 
 
 @dataclass(frozen=True)
@@ -370,8 +370,8 @@ class Descents:
             self._best, self._problem, self._from = best, tightened, start
 
     def _keep(self, start: int, seen: Measured) -> None:
-        worst = np.where(failures(seen.c)[0] > 0, FAILED, largest(seen.c, self._margin)[0])
-        step = Step(start, seen.gains[0], float(np.exp(seen.value[0])), worst)
+        worst = np.where(failures(seen.c)[0] > 0, np.inf, largest(seen.c, self._margin)[0])
+        step = Step(start, seen.gains[0], float(seen.goal[0]), worst)
         self._history.setdefault(start, []).append(step)
 
     def tightened(self, problem: Problem) -> Problem:

@@ -13,7 +13,7 @@ import numpy as np
 from ptsmc_jax import programs
 from tuning.search import flights, margin_rows
 from tuning.search.journal import Journal
-from tuning.search.objective import Problem, Rules, ended, judge, watched
+from tuning.search.objective import FAILED, Problem, Rules, ended, judge, watched
 from tuning.search.shares import Bounds
 
 TOGETHER = 16  # points that are judged in one call
@@ -28,6 +28,11 @@ class Measured:
     f: np.ndarray  # (points,)
     c: np.ndarray  # (points, rows, trials), see `Problem.rows`
     value: np.ndarray  # (points,)
+
+    @property
+    def goal(self) -> np.ndarray:
+        """(points,) of the trials that have one; NaN where none has, for which `FAILED` stands."""
+        return np.where(self.value < np.log(FAILED / 2.0), np.exp(self.value), np.nan)
 
     @property
     def beyond(self) -> np.ndarray:

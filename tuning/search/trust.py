@@ -8,8 +8,8 @@ import numpy as np
 
 from ptsmc_jax.simulation import rollout
 from tuning.search import flights
-from tuning.search.evaluate import Evaluator, Measured
-from tuning.search.objective import FAILED, Problem
+from tuning.search.evaluate import Evaluator
+from tuning.search.objective import Problem
 from tuning.search.shares import TIMES, Bounds
 
 DIFFERENCE = 3e-4  # of the bounds' intervals, for slopes by differences
@@ -32,17 +32,12 @@ def slope_error(evaluate: Evaluator, problem: Problem, share: np.ndarray) -> flo
     count, inside = share.size, np.clip(share + behind, 2 * DIFFERENCE, 1.0 - 2 * DIFFERENCE)
     offsets = np.concatenate([k * DIFFERENCE * np.eye(count) for k in (-2, -1, 1, 2)])
     flown = evaluate.fly(problem, inside + offsets)
-    if not np.any(_ends(flown)):  # what stands for the goal is the same everywhere
+    if np.isnan(flown.goal).all():  # what stands for the goal is the same everywhere
         return np.nan
     f = flown.f.reshape(4, count)
     numeric = (f[0] - 8 * f[1] + 8 * f[2] - f[3]) / (12 * DIFFERENCE)
     exact = evaluate.slopes(problem, inside[None]).f_slope[0]
     return float(np.abs(exact - numeric).max() / max(np.abs(exact).max(), SMALLEST))
-
-
-def _ends(flown: Measured) -> np.ndarray:
-    """At which of many points a trial has a goal (points,), bool: else one stands for it."""
-    return flown.value < np.log(FAILED / 2.0)
 
 
 @dataclass(frozen=True)
@@ -71,8 +66,7 @@ def profiles(evaluate: Evaluator, problem: Problem, share: np.ndarray) -> dict[s
         points[k] = [bounds.replaced(share, bounds.gains(point), np.arange(count) == k) for point in points[k]]
     flown = evaluate.fly(problem, points.reshape(-1, count))
     largest = flown.c.max(axis=2, initial=-1.0)  # (points, rows); a trial that fails keeps no limit
-    goal = np.where(_ends(flown), np.exp(flown.value), np.nan)
-    arrays = (flown.gains, goal, largest.max(axis=1, initial=-1.0) + 1.0, flown.f)
+    arrays = (flown.gains, flown.goal, largest.max(axis=1, initial=-1.0) + 1.0, flown.f)
     gains, value, over, f = (v.reshape(count, ACROSS + 1, -1) for v in arrays)
     rows = largest.argmax(axis=1) if problem.rows else np.zeros(len(largest), int)
     nearest = np.asarray(problem.rows or ("",))[rows].reshape(count, ACROSS + 1)
