@@ -1,0 +1,68 @@
+"""Loops by their matrices, for which no scenario has to be linearised, and what they are."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy import linalg
+
+from ptsmc_jax.theory import linear, margins
+
+
+def of(loop, **how):
+    return jax.tree.map(
+        lambda v: np.asarray(v)[0], margins.of_each(jax.tree.map(lambda v: np.asarray(v)[None], loop), **how)
+    )
+
+
+def a_loop(a, b, c):
+    """The loop x' = a x + b u, u = c x of one input, seen by no sensor, at a period of 1 s."""
+    n, zero = len(a), jnp.zeros
+    push = jnp.tile(jnp.reshape(jnp.asarray(b, float), (n, 1)), (linear.NODES.size, 1, 1))
+    c = jnp.reshape(jnp.asarray(c, float), (1, n))
+    period = jnp.ones(())
+    return linear.Loop(a, zero((n, 1)), push, 0.0 * push, c, zero((1, 1)), zero((n, 1)), period, delay=0)
+
+
+def held(a, b, c, h=1.0, sensors=False):
+    """The loop of dx/dt = a x + b u, u = c x held for h [s]; sensors: that see all of x, else none does."""
+    n, m = b.shape
+    both = np.vstack([np.hstack([a, b]), np.zeros((m, n + m))])
+    spans = [[linalg.expm(both * share * h) for share in (part, 1.0 - part)] for part in linear.NODES]
+    new = jnp.asarray([later[:n, n:] for _, later in spans])
+    old = jnp.asarray([later[:n, :n] @ first[:n, n:] for first, later in spans])
+    command, direct = (0.0 * c, c) if sensors else (c, np.zeros((m, 1)))
+    values = (linalg.expm(a * h), np.zeros((n, direct.shape[1])), new, old, command, direct, np.zeros((n, m)), h)
+    return linear.Loop(*map(jnp.asarray, values), delay=0)
+
+
+INTEGRATORS = np.eye(3, k=1), np.eye(3)[:, 2:], -np.array([[0.027, 0.27, 0.9]])  # three, whose poles are at -0.3 / s
+
+
+def drawn_loop(seed):
+    """Two oscillators or integrators with damping, two inputs, linear-quadratic feedback that is a little off."""
+    rng = np.random.default_rng(seed)
+    turns, damping, a = rng.uniform(0.3, 2.8, 2), 10 ** rng.uniform(-3.0, -0.5, 2), np.zeros((4, 4))
+    for k, (w, share) in enumerate(zip(turns, damping, strict=True)):
+        swings = rng.integers(3) > 0
+        row = [-(w**2), -2.0 * share * w] if swings else [0.0, -0.2 * rng.random()]
+        a[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = [[0.0, 1.0], row]
+    b = rng.normal(size=(4, 2))
+    moved = linalg.expm(np.vstack([np.hstack([a, b]), np.zeros((2, 6))]))
+    a_1, b_1 = moved[:4, :4], moved[:4, 4:]
+    dear = np.eye(2) * 10 ** rng.uniform(-0.5, 2.0)
+    costs = linalg.solve_discrete_are(a_1, b_1, np.diag(10 ** rng.uniform(-2.0, 1.0, 4)), dear)
+    gains = np.linalg.solve(dear + b_1.T @ costs @ b_1, b_1.T @ costs @ a_1)
+    return held(2.0 * a, 2.0 * b, -gains * rng.uniform(0.6, 1.3), 0.5)
+
+
+def radius_late(loop, axis, late):
+    """Largest modulus of the poles of a loop without delay, an axis late by so many periods."""
+    (a, command), whole = loop.closed_at_sensors(np), int(late)
+    (m, n), pushes = command.shape, np.zeros((whole + 2, *command.T.shape))
+    pushes[0] = loop.new[0] * (np.arange(m) != axis)
+    for push, acts in zip(pushes[whole:], linear.acting(loop, late - whole, np), strict=True):
+        push[:, axis] += acts[:, axis]
+    closed = np.eye(n + (whole + 1) * m, k=-m)
+    closed[:n], closed[n : n + m] = np.hstack([a + pushes[0] @ command, *pushes[1:]]), 0.0
+    closed[n : n + m, :n] = command
+    return np.abs(np.linalg.eigvals(closed)).max()
