@@ -7,6 +7,19 @@ from scipy import linalg
 
 from ptsmc_jax.theory import linear, margins
 
+# a body with all that a loop may have
+ALL_AT_ONCE = {
+    "controller": {"t_f": 10.0, "delta": 0.5},
+    "loop": {"mode": "sampled", "period": 0.1, "t_end": 14.0},
+    "hardware": {
+        "attitude_noise": 2e-5, "rate_noise": 1e-6, "rate_bias": 1e-5, "rate_bias_walk": 1e-6,
+        "star_tracker_every": 4, "delay": 1, "torque_lag": 0.1,
+    },
+    "filter": {"kind": "steady_state", "bandwidth": 1.0},
+    "wheels": {"momentum": [1.0, -2.0, 0.5, 3.0]},
+    "reference": {"kind": "spin", "rate": [0.0, 0.0, 0.0]},
+}  # fmt: skip
+
 
 def of(loop, **how):
     return jax.tree.map(

@@ -9,8 +9,9 @@ import pytest
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.simulation import rollout
-from ptsmc_jax.theory import covariance
+from ptsmc_jax.theory import covariance, linear
 from tests.helpers import FIRST_FLIGHT
+from tests.theory.loops import ALL_AT_ONCE
 
 FILTER = {"filter": {"kind": "steady_state", "bandwidth": 0.1}}
 # no disturbance, and a law that has arrived: what is left is the noise
@@ -35,7 +36,7 @@ CASES = {
 NOISES = {"attitude_noise": 1e-13, "rate_noise": 1e-13, "rate_bias": 1e-16, "rate_bias_walk": 1e-16}
 
 
-SHORT = ("filter, slow star tracker, wheels, lag",)  # delay and random walk: tests/theory/test_spillover.py
+SHORT = ("filter, slow star tracker, wheels, lag",)
 # from nearby a law arrives in 15 s, too
 NEAR = {
     "dispersion": {"attitude": {"kind": "axis_angle", "min_deg": 0.1, "max_deg": 0.5}},
@@ -43,9 +44,10 @@ NEAR = {
 }  # fmt: skip
 
 
+@pytest.mark.long  # delay, noise and random walk: theory/test_spillover.py; a filter's part: in its steady state, below
 @pytest.mark.parametrize(
     ("case", "trials", "start"),
-    [(case, 500, NEAR) for case in SHORT] + [pytest.param(case, 2000, {}, marks=pytest.mark.long) for case in CASES],
+    [(case, 500, NEAR) for case in SHORT] + [(case, 2000, {}) for case in CASES],
 )
 def test_covariance_predicts_the_accuracy_of_flown_trials(case, trials, start):
     """RMS of 500 trials, 3 % of sampling error at most; the rest is what the law does beyond first order.
@@ -68,7 +70,49 @@ def test_covariance_predicts_the_accuracy_of_flown_trials(case, trials, start):
     np.testing.assert_allclose(covariance.noise(scenario.study(noisy).parts).window_error, share, rtol=0.1)
 
 
+def flown_chain(**changes):
+    """A chain of order 2 from rest at its target; 2 000 trials, all by one program."""
+    tables = {
+        "plant": {"kind": "chain", "x0": [0.0, 0.0]},
+        "loop": {"mode": "sampled", "clock": "flight", **changes.pop("loop")},
+        **changes,
+    }
+    parts = scenario.study(scenario.from_tables(tables)).parts
+    parts = replace(parts, clock=replace(parts.clock, count=40))
+    each = [_fly(parts, np.arange(200, dtype=np.uint32) + np.uint32(200 * k)) for k in range(10)]
+    errors = np.concatenate([one.metrics.window_error for one in each])
+    return parts, float(np.sqrt(np.mean(errors**2)))
+
+
+_fly = jax.jit(jax.vmap(lambda parts, k: rollout.simulate(parts, np.uint32(1), k), (None, 0)))
+
+
 def test_the_error_between_samples_counts_where_few_of_them_are_in_the_window():
+    """One, 0.49 s after t_f and 0.11 s before the window's end."""
+    parts, flown = flown_chain(
+        controller={"t_f": 15.01, "delta": 0.9, "k1": 3.0, "sign_width": 0.01, "surface_rate": 1.5},
+        observer={"kind": "nonlinear", "gain": [5.0]},
+        disturbance={"kind": "random_walk", "density": [1e-16]},
+        loop={"period": 0.5, "t_end": 18.0, "window": 0.6},
+        hardware={"state_noise": [2e-5, 1e-6]},
+    )
+    np.testing.assert_allclose(covariance.noise(parts).window_error, flown, rtol=0.05)
+
+
+def test_a_random_walk_acts_from_the_start_of_its_period_on():
+    """Over four periods of 1 s, on 2 000 trials known to 1 %; a period later it would say much less."""
+    parts, flown = flown_chain(
+        controller={"t_f": 4.0, "delta": 2.0, "k1": 0.5, "sign_width": 1e3},
+        observer={"kind": "nonlinear", "gain": [0.3]},
+        disturbance={"kind": "random_walk", "density": [1e-5]},
+        loop={"period": 1.0, "t_end": 5.0},
+        hardware={"state_noise": [1e-12, 1e-12]},
+    )
+    np.testing.assert_allclose(covariance.noise(parts).window_error, flown, rtol=0.04)
+
+
+@pytest.mark.long  # of a chain above
+def test_the_error_of_a_body_between_samples_counts_where_few_of_them_are_in_the_window():
     """One, 0.49 s after t_f and 0.11 s before the window's end: it says three quarters of the error of 2 000 trials."""
     tables = {
         "controller": {"t_f": 15.01, "delta": 0.9, "k1": 3.0, "sign_width": 0.01, "surface_rate": 1.5},
@@ -83,7 +127,8 @@ def test_the_error_between_samples_counts_where_few_of_them_are_in_the_window():
     np.testing.assert_allclose(covariance.noise(ready.parts).window_error, np.sqrt(np.mean(flown**2)), rtol=0.05)
 
 
-def test_a_random_walk_acts_from_the_start_of_its_period_on():
+@pytest.mark.long  # of a chain above
+def test_a_random_walk_on_a_body_acts_from_the_start_of_its_period_on():
     """Over four periods of 1 s, on 2 000 trials known to 1 %; a period later it would say 12 % less."""
     tables = {
         "controller": {"t_f": 4.0, "delta": 2.0, "k1": 0.5, "sign_width": 1e3},
@@ -96,6 +141,27 @@ def test_a_random_walk_acts_from_the_start_of_its_period_on():
     ready = scenario.study(scenario.from_tables(tables))
     flown = montecarlo.run(ready.parts, ready.dispersion, 0, np.arange(2000)).metrics.window_error
     np.testing.assert_allclose(covariance.noise(ready.parts).window_error, np.sqrt(np.mean(flown**2)), rtol=0.04)
+
+
+def test_a_filters_errors_stay_in_the_steady_state_that_they_start_in():
+    """Of attitude and bias, for six of its time constants; means over a star tracker's interval are off by a tenth."""
+    parts = scenario.study(scenario.from_tables(ALL_AT_ONCE)).parts
+    run, periods = linear.nominal_jit(parts), np.arange(linear.TOGETHER)
+    opened = linear.opened_in(parts, run, periods)
+    ticks = jax.tree.map(lambda v: np.asarray(v)[periods], run.period.now)
+    state = covariance._State(parts, ticks, opened)
+    _, moved = state.moved(opened.loop)
+    first = state.plant.stop + len(state._seen.state)
+    known = np.eye(state.size)[first : first + 6]  # the filter's attitude and bias
+    known[:3, :3] -= np.eye(3)
+    known[3:, state._own] -= np.eye(3)
+    p = state.start()
+    begun, sizes = np.sqrt(np.diag(known @ p @ known.T)), []
+    np.testing.assert_allclose(np.sqrt(np.diag(p)[state._own]), 1e-5, rtol=1e-12)
+    for j, length in enumerate(ticks.t_next - ticks.t):
+        p = moved.at(j).covariance(p) + np.diag((state.drift * length) ** 2)
+        sizes.append(np.sqrt(np.diag(known @ p @ known.T)))
+    np.testing.assert_allclose(np.asarray(sizes) / begun, 1.0, atol=0.15)
 
 
 def test_implicit_sampling_is_not_predicted():

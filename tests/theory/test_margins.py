@@ -17,7 +17,7 @@ from ptsmc_jax.theory import borders, crossings, linear, margins, rest, run_marg
 from ptsmc_jax.theory.carries import Local
 from tests.helpers import equations, fly, short
 from tests.helpers import parts as a_body
-from tests.theory.loops import INTEGRATORS, a_loop, drawn_loop, held, of, radius_late
+from tests.theory.loops import ALL_AT_ONCE, INTEGRATORS, a_loop, drawn_loop, held, of, radius_late
 from tuning.search.gains import with_gains
 
 CHAIN = {
@@ -242,10 +242,7 @@ KINDS = {
     "a system of one's own": COUPLED,
 }
 SLOW = "slow star tracker, wheels, filter, delay and lag"
-KINDS[SLOW] = {
-    **KINDS["wheels, filter, delay and lag"],
-    "hardware": {**BODY["hardware"], "star_tracker_every": 4, "delay": 1, "torque_lag": 0.1},
-}
+KINDS[SLOW] = ALL_AT_ONCE
 
 
 @pytest.mark.parametrize("kind", short(KINDS, [SLOW]))
