@@ -43,7 +43,7 @@ HOST = ("tuning.cli", "tuning.output", "tuning.studies", "ptsmc_jax.figures")
 OUTSIDE = set(
     """
     configure.configure programs.KEPT campaign.PART montecarlo.CAPACITY montecarlo.run montecarlo.block_size
-    margin_verdicts.TRIALS margin_verdicts.JUDGED margin_verdicts.OFF margin_verdicts.over_trials
+    rest.swing margin_verdicts.TRIALS margin_verdicts.JUDGED margin_verdicts.OFF margin_verdicts.over_trials
     worst.SCREENED worst.STEPS starts.SWEPT descents.MANY descents.again descents.explore descents.descend
     cma_es.GENERATIONS global_check.GENERATIONS global_check.POPULATION flights.ROW flights.fly flights.trials
     confirm.FRESH confirm.FEWEST confirm.count rounds.harder evaluate.slopes journal.get posing.search

@@ -14,7 +14,7 @@ import pytest
 
 from ptsmc_jax import scenario
 from ptsmc_jax.scenario.errors import ScenarioError
-from ptsmc_jax.theory import run_margins
+from ptsmc_jax.theory import rest, run_margins
 from tests.helpers import SHORT, SHORT_CHAIN, short
 from tuning.output import margin_sentences, page
 from tuning.studies import stability
@@ -63,9 +63,11 @@ def test_margins_leaves_its_table_figures_and_page(command, tmp_path):
     assert "all inputs" in made
 
 
+ASKS = CHAIN.split("[requirements]")[0] + "[requirements]\ngain_margin = 1.0\nphase_margin = 89.0\n"
+
+
 def test_a_run_is_judged_by_the_margins_of_its_loop(command, tmp_path):
-    asked = "[requirements]\ngain_margin = 1.0\nphase_margin = 89.0\n"
-    (tmp_path / "asks.toml").write_text(CHAIN.split("[requirements]")[0] + asked)
+    (tmp_path / "asks.toml").write_text(ASKS)
     status, out, _ = command("simulate", "asks.toml", "--no-figures")
     assert status == 1
     assert "gain_margin at least 1 dB" in out
@@ -74,6 +76,24 @@ def test_a_run_is_judged_by_the_margins_of_its_loop(command, tmp_path):
     assert (said["gain_margin"]["met"], said["phase_margin"]["met"]) == (True, False)
     _, course = stability.find(scenario.read(tmp_path / "asks.toml"))
     np.testing.assert_allclose(said["phase_margin"]["worst"], course.worst()["phase_margin"], rtol=1e-9)
+
+
+def test_of_a_run_that_does_not_come_to_rest_no_margins_are_left(command, tmp_path, monkeypatch):
+    """By the command and in the verdicts of a run; which runs do not, theory/test_rest.py has."""
+    (tmp_path / "asks.toml").write_text(ASKS)
+    monkeypatch.setattr(rest, "swing", lambda *_: rest.Swing(0.04, 2.0))
+    status, said, _ = command("margins", "asks.toml", "--no-figures")
+    assert status == 1
+    assert "the nominal run does NOT come to rest in hold" in said
+    found = json.loads((tmp_path / "out" / "margins-asks" / "summary.json").read_text())
+    assert found["worst"]["gain_margin"] == found["worst"]["delay_margin"] == 0.0
+    assert found["swing"] == {"size": 0.04, "periods": 2.0, "unit": "u"}
+    assert not found["stable"]
+    status, said, _ = command("simulate", "asks.toml", "--no-figures")
+    assert status == 1
+    assert "gain_margin" in said
+    verdict = json.loads((tmp_path / "out" / "simulate-asks" / "summary.json").read_text())["verdicts"]["gain_margin"]
+    assert (verdict["met"], verdict["worst"]) == (False, 0.0)
 
 
 def test_an_unstable_hold_is_said_and_has_negative_margins(command, tmp_path):

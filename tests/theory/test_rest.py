@@ -1,8 +1,10 @@
 """Nominal runs that do not come to rest in hold: their closed form, and what must not be taken for them."""
 
 import json
+from types import SimpleNamespace
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -112,6 +114,19 @@ class Relay(ptsmc.AccelerationLaw):
 """
 
 
+def test_a_law_without_a_width_of_its_sign_is_judged_as_others(monkeypatch):
+    """As one's own: of commands that turn at every sample, of which slopes explain a tenth or all."""
+    turning = np.where(np.arange(40) % 2, 0.5, -0.5)[:, None]
+    law: Any = SimpleNamespace(controller=SimpleNamespace())
+    run = SimpleNamespace(command=turning)
+    monkeypatch.setattr(linear, "nominal_jit", lambda _: run)
+    seen = rest.History(jnp.asarray(turning), jnp.ones(40, bool))
+    for left, found in ((0.9, rest.Swing(1.0, 2.0)), (0.0, None)):
+        monkeypatch.setattr(rest, "_unexplained", lambda *_, left=left: (left * turning, turning))
+        assert rest.swing(law, seen) == found
+
+
+@pytest.mark.long  # above, and of a chain in studies/test_stability.py
 def test_an_own_law_that_swings_has_no_margins_left(command, tmp_path):
     (tmp_path / "relay.py").write_text(OWN)
     (tmp_path / "relay.toml").write_text(
