@@ -92,7 +92,8 @@ def await_parts(folder, count, run, patience=120.0, out="out/montecarlo-s"):
     return False
 
 
-@pytest.mark.parametrize("times", [1, pytest.param(20, marks=pytest.mark.long)])
+@pytest.mark.long  # what it leaves, a full disk, parts flown anew: `test_rows.py` and `test_campaign_commands.py`
+@pytest.mark.parametrize("times", [1, 20])
 def test_killed_at_some_moments_it_ends_with_the_same_rows(folder, request, times):
     """kill -9 a random while after the first part that a run adds, then the same command again, so many times over."""
     rng, killed = np.random.default_rng(0), 0

@@ -139,7 +139,7 @@ def test_numbers_of_a_draw_of_ones_own_are_what_is_drawn_or_refused():
 
 @pytest.fixture(scope="module")
 def corners(everything):
-    """A table that gives everything otherwise than it is drawn, and its rows."""
+    """A table that gives everything otherwise than it is drawn, and its campaign."""
     made, _, plan = everything
     generator = np.random.default_rng(1)
     table = plan.head(2).drop("trial", "initial_angle")
@@ -150,16 +150,33 @@ def corners(everything):
         q /= np.linalg.norm(q, axis=1, keepdims=True)
         columns |= {f"{what}_q{k + 1}": q[:, k] for k in range(4)}
     table = pl.DataFrame({"trial": [5, 9], "seed": [SEED, 11], **columns})
-    return table, of_plan(made, table).fly(range(2))
+    return table, of_plan(made, table)
 
 
-def test_what_stands_in_a_row_is_what_is_flown(everything, corners):
-    """Drawn or given, every number: against parts set by hand, from the nominal ones alone."""
-    made, drawn, _ = everything
-    table, given = corners
+def stands(given, table):
+    """What is given stands in these rows."""
     assert given["plan_trial"].to_list() == [5, 9]
     assert given["plan_seed"].to_list() == [SEED, 11]
-    for row in (*drawn.head(2).iter_rows(named=True), *given.iter_rows(named=True)):
+    for name in set(table.columns) - {"trial", "seed"}:  # quaternions come normalised
+        np.testing.assert_allclose(given[name], table[name], rtol=1e-12, err_msg=name)
+
+
+def test_every_number_that_is_given_is_what_a_trial_would_fly_with(corners):
+    table, planned = corners
+    stands(planned.draw(range(2)), table)
+
+
+# given ones fly by a program of their own; a chain has one too, below
+@pytest.mark.parametrize("kind", ["drawn", pytest.param("given", marks=pytest.mark.long)])
+def test_what_stands_in_a_row_is_what_is_flown(everything, corners, kind):
+    """Every number: against parts set by hand, from the nominal ones alone."""
+    made, drawn, _ = everything
+    rows = drawn.head(2)
+    if kind == "given":
+        table, planned = corners
+        rows = planned.fly(range(2))
+        stands(rows, table)
+    for row in rows.iter_rows(named=True):
         by_hand = set_by_hand(made.ready.parts, row)
         seed, trial = row.get("plan_seed", SEED), row.get("plan_trial", row["trial"])
         run = rollout.simulate_jit(by_hand, jnp.uint32(seed), jnp.uint32(trial))
@@ -169,8 +186,6 @@ def test_what_stands_in_a_row_is_what_is_flown(everything, corners):
             assert row[name] == pytest.approx(value, rel=1e-11) or np.isnan(value), name
         turn = Rotation.from_quat(by_hand.reference.q).inv() * Rotation.from_quat(by_hand.initial.q)
         assert row["initial_angle"] == pytest.approx(turn.magnitude(), rel=1e-12)
-    for name in set(table.columns) - {"trial", "seed"}:  # quaternions come normalised
-        np.testing.assert_allclose(given[name], table[name], rtol=1e-12, err_msg=name)
 
 
 def set_by_hand(parts, row):
@@ -257,15 +272,23 @@ def test_flight_software_does_not_know_what_is_drawn():
 
 
 def test_a_chain_flies_a_plan():
+    """From where the plan says, with the noise of the seeds and trials that it says."""
     flight = scenario.from_tables(tomllib.loads(CHAIN))
-    rows = ptsmc.trials(flight, 3, seed=SEED)
-    states = ["initial_x1", "initial_x2", "initial_x3"]
-    table = rows.select("trial", *states)[[2, 0]]
-    again = ptsmc.trials(flight, table, seed=SEED)
-    # not all of them as drawn in the first rows: another program
-    for name in ("terminal_error", "peak_torque", "state_noise_1", *states):
-        np.testing.assert_allclose(again[name], rows[name].gather([2, 0]), rtol=1e-9)
-    assert again["plan_trial"].to_list() == [2, 0]
+    states = {"initial_x1": [1.1, -0.4], "initial_x2": [0.2, 0.3], "initial_x3": [-0.1, 0.0]}
+    whose = {"trial": [2, 0], "seed": [SEED, 11]}
+    flown = ptsmc.trials(flight, pl.DataFrame(whose | states), seed=SEED)
+    assert flown["plan_trial"].to_list() == whose["trial"]
+    assert flown["plan_seed"].to_list() == whose["seed"]
+    known = scenario.study(flight)
+    for k, (trial, seed) in enumerate(zip(*whose.values(), strict=True)):
+        row, at = flown.row(k, named=True), (jnp.uint32(seed), jnp.uint32(trial))
+        assert [row[name] for name in states] == [values[k] for values in states.values()]
+        drawn = known.dispersion.apply(known.parts, *at)
+        start = vector([row[name] for name in states])
+        run = rollout.simulate_jit(dataclasses.replace(drawn, initial=start), *at)
+        np.testing.assert_allclose(row["state_noise_1"], drawn.sensors.sigma[0], rtol=1e-12)
+        for name in ("terminal_error", "peak_torque", "window_error"):
+            np.testing.assert_allclose(row[name], getattr(run.metrics, name), rtol=1e-9)
 
 
 Q = {f"initial_q{k}": [0.0, 0.0] for k in (1, 2, 3)}

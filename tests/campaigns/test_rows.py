@@ -87,6 +87,11 @@ def test_keys_tell_campaigns_apart():
     assert len({rows.key_of(*o) for o in others} | {rows.key_of({"a": {"b": 1}}, {"seed": 1})}) == 4
 
 
+def test_a_key_is_the_same_in_every_process():
+    """What another process has flown is known again."""
+    assert KEY.hex() == "79ec63fbf7446be36358bada73ee7bbd0088b974470097e1ab1365364697ff48"
+
+
 def test_trials_that_a_longer_part_has_are_not_read_twice(kept):
     long, _, after = kept.write(0, frame(0, 50)), kept.write(20, frame(20, 20)), kept.write(50, frame(50, 10))
     assert kept.parts() == ([long, after], [])
