@@ -293,14 +293,40 @@ flexible = { frequency = [3.0, 9.0], damping = [0.002, 0.02], coupling = [[1.0, 
 """
 
 
+MODES = ("flexible.frequency[0]=2.0:8.0:3", "controller.delta=1.0:2.0:2", FLEXIBLE, 1)
+
+
 @pytest.mark.usefixtures("unflown")
-def test_one_mode_is_moved_and_the_border_of_spillover_lies_between_stable_and_unstable_pairs():
-    loaded, x, y, cells = flown("flexible.frequency[0]=2.0:8.0:3", "controller.delta=1.0:2.0:2", FLEXIBLE, 1)
+def test_one_mode_is_moved_and_the_border_of_spillover_lies_between_stable_and_unstable_pairs(monkeypatch):
+    """With poles whose logarithm is even in frequency and delta, the border is a straight line."""
+
+    def at_ends(parts):
+        law, frequency = parts.controller, np.asarray(parts.plant.frequency)
+        assert frequency[1] == 9.0
+        none = margins.Margins(*(jnp.zeros(3) for _ in margins.Margins._fields))
+        in_hold = np.exp((frequency[0] - 6.0 + 1.6 * (law.delta - 1.5)) / 10.0)
+        return {"hand_over": (none, 1.1), "hold": (none, float(in_hold))}
+
+    monkeypatch.setattr(mapping.run_margins, "at_ends", at_ends)
+    loaded, x, y, cells = flown(*MODES)
+    ((label, (across, up)),) = mapping.spillover(mapping.Map(loaded, x, y, cells)).items()  # all spill at the hand-over
+    assert label == "the same in hold"
+    drawn = np.isfinite(across)
+    np.testing.assert_allclose(across[drawn], 6.0 - 1.6 * (up[drawn] - 1.5), atol=1e-4)
+    assert (up[drawn].min(), up[drawn].max()) == (1.0, 2.0)
     changed: Any = mapping._with(loaded, {"flexible.frequency[0]": 5.0})
     assert changed.flexible is not None
     assert changed.flexible.frequency == (5.0, 9.0)
     with pytest.raises(ScenarioError, match=r"flexible.frequency\[2\] names a number that .* has not"):
         mapping._with(loaded, {"flexible.frequency[2]": 5.0})
+    rigid, *_ = asked("loop.period=0.1:0.4:3", "controller.delta=0.5:1:3")
+    assert mapping.spillover(mapping.Map(rigid, x, y, cells)) == {}
+
+
+@pytest.mark.long  # with the loop's own poles, which `test_spillover.py` has
+@pytest.mark.usefixtures("unflown")
+def test_a_slow_mode_is_damped_and_one_that_the_loop_is_late_for_is_driven():
+    loaded, x, y, cells = flown(*MODES)
     radii = np.array([cell.hold_radius for cell in cells]).reshape(2, 3)
     assert np.all(radii[:, 0] < 1.0 + 1e-6)  # a slow mode is damped
     assert np.all(radii[:, -1] > 1.0 + 1e-3)  # one that the loop is late for is driven
@@ -308,5 +334,3 @@ def test_one_mode_is_moved_and_the_border_of_spillover_lies_between_stable_and_u
     after = np.flatnonzero(radii[0] > 1.0 + 1e-6)[0]
     assert np.all((across[np.isfinite(across)] > x.values[0]) & (across[np.isfinite(across)] < x.values[-1]))
     assert x.values[after - 1] < np.nanmin(across) < x.values[after]
-    rigid, *_ = asked("loop.period=0.1:0.4:3", "controller.delta=0.5:1:3")
-    assert mapping.spillover(mapping.Map(rigid, x, y, cells)) == {}
