@@ -3,6 +3,7 @@
 from dataclasses import replace
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 
@@ -51,6 +52,7 @@ def few_screened(monkeypatch):
     monkeypatch.setattr(flights, "ROW", 10)
 
 
+@pytest.mark.long  # what an ascent finds of a chain, and turns of a body by slopes and theory: below
 @pytest.mark.parametrize("inertia", [(10.0, 12.0, 14.0), ((11.0, 1.5, -0.7), (1.5, 9.0, 0.4), (-0.7, 0.4, 14.0))])
 def test_the_worst_attitude_is_the_one_theory_names(inertia):
     """For a torque component i, |(J n)_i| is largest along row i of J: the worst axis is that of the longest row."""
@@ -73,32 +75,57 @@ def test_the_worst_attitude_is_the_one_theory_names(inertia):
     assert found.moved == ("initial_attitude",)
 
 
-HALF_TURNS = [attitudes.UniformAttitude(), attitudes.AxisAngle(vector(np.pi / 2), vector(np.pi))]
-
-
-@pytest.mark.parametrize("kind", short(HALF_TURNS, HALF_TURNS[1:]))
+@pytest.mark.long  # beyond all numbers: below
+@pytest.mark.parametrize("kind", [attitudes.UniformAttitude(), attitudes.AxisAngle(vector(np.pi / 2), vector(np.pi))])
 def test_attitudes_up_to_180_degrees_have_no_worst_case(kind):
     problem, wanted = posed(variation.Dispersion(kind))
     assert worst.hardest(problem, wanted, np.array([ETA, 1.0])).unbounded
 
 
+def test_turns_have_slopes_by_what_they_are_drawn_from():
+    """Against central differences, as the ascent moves them; at the ends of the angles too, where reals turn back."""
+    kind = attitudes.AxisAngle(vector(0.4), vector(2.0))
+    name, spread, step = "initial_attitude", variation.Dispersion(kind), 1e-6
+    problem, _ = posed(spread)
+    y = np.array([[0.3, 0.6, 0.2], [0.7, 0.9, 1.0]])
+
+    def moved(y):
+        return worst._moved(spread, {name: y}, y, (name,))
+
+    def turns(y):
+        drawn = [spread.at(problem.parts, {name: one}).initial.q for one in moved(y)[0][name]]
+        return np.stack(drawn)
+
+    c, by = moved(y)
+    np.testing.assert_allclose(worst._charted(problem, name, c[name]), y, rtol=1e-7)
+    for k, to in enumerate(step * np.eye(3)):
+        along = [
+            jax.jvp(lambda c: spread.at(problem.parts, {name: c}).initial.q, (one,), (each[k],))[1]
+            for one, each in zip(c[name], by[name], strict=True)
+        ]
+        np.testing.assert_allclose(along, (turns(y + to) - turns(y - to)) / (2.0 * step), rtol=1e-6, atol=1e-8)
+    longest = 2.0 * np.arccos(np.abs(turns(y)[1, 3]))
+    np.testing.assert_allclose(longest, 2.0, rtol=1e-12)
+
+
 EDGE = 0.02  # of what an actuator may do too much
 
 
-def swinging(x0, std, amplitude, **limits):
+def swinging(x0, std, amplitude, settling_angle=1e9, **limits):
     """A chain's problem: starts drawn, normal with these deviations (2,), the phase of a disturbance, two misfits.
 
-    Limits that are not asked for are far off.
+    Limits that are not asked for are far off; settled, unless asked for, from the start.
     """
     acting = disturbances.Sinusoid(*(vector([v]) for v in (amplitude, 0.1, 0.0, 0.0)))
     run = chain_parts([x0, 0.0], T_F, ETA, 1.0, period=0.2, disturbance=acting)
     run = replace(run, clock=clock.anchored(0.2, 21.0, T_F, 5.0), t_end=vector(21.0))
+    run = replace(run, settling_angle=vector(settling_angle))
     drawn: dict[str, Any] = {
         "actuator_scale": misfits.Factors(numbers.Uniform(vector([EDGE]))),
         "timing_jitter": misfits.Jitter(vector(0.0), vector(0.3)),
     }
     spread = variation.Dispersion(state=numbers.Normal(vector(std)), phase=numbers.UniformPhase(1), misfits=drawn)
-    asked = dict.fromkeys(("peak_rate", "effort", "peak_torque_delivered"), 1e9) | limits
+    asked = dict.fromkeys(("peak_rate", "effort", "peak_torque_delivered", "settling_time"), 1e9) | limits
     wanted = [Requirement(metric, limit) for metric, limit in asked.items()]
     return objective.problem(run, spread, 5, np.arange(8), ("eta", "delta"), wanted), wanted
 
@@ -162,7 +189,10 @@ def test_the_worst_turn_of_a_star_tracker_is_found_by_its_slopes():
     np.testing.assert_allclose(np.abs(turn), edge, rtol=1e-3)
 
 
-@pytest.mark.parametrize("what", ["attitudes", "normal starts, a phase and misfits"])
+MOVED = ["attitudes", "normal starts, a phase and misfits"]
+
+
+@pytest.mark.parametrize("what", short(MOVED, MOVED[1:]))
 def test_slopes_of_the_ascent_agree_with_central_differences(what):
     if what == "attitudes":
         problem, _ = posed(variation.Dispersion(attitudes.AxisAngle(vector(0.4), vector(2.0))))
@@ -185,16 +215,22 @@ def test_slopes_of_the_ascent_agree_with_central_differences(what):
         np.testing.assert_allclose(slope[:, k], numeric, rtol=1e-5, atol=1e-6 * np.abs(slope).max())
 
 
-def test_a_robust_search_keeps_the_limit_in_the_worst_case(monkeypatch):
-    """Closed form again: the largest eta that keeps the limit at 140 degrees about the longest row."""
+@pytest.mark.parametrize("plant", short(["chain", "spacecraft"], ["chain"]))
+def test_a_robust_search_keeps_the_limit_in_the_worst_case(monkeypatch, plant):
+    """The largest eta that keeps the limit at 140 degrees about the longest row, or at misfits' edge."""
     steps = worst.STEPS
     small_search(monkeypatch)
     monkeypatch.setattr(worst, "STEPS", steps)  # all of the ascent, which is what finds it
-    largest = np.deg2rad(140.0)
-    spread = variation.Dispersion(attitudes.AxisAngle(vector(np.deg2rad(20.0)), vector(largest)))
-    problem, wanted = posed(spread, Requirement("peak_torque", 1.9))
+    if plant == "spacecraft":
+        largest, limit = np.deg2rad(140.0), 1.9
+        spread = variation.Dispersion(attitudes.AxisAngle(vector(np.deg2rad(20.0)), vector(largest)))
+        problem, wanted = posed(spread, Requirement("peak_torque", limit))
+        eta = np.sqrt(limit / first_torque(np.diag([10.0, 12.0, 14.0]), largest, 1.0))
+    else:
+        limit = 0.04
+        problem, wanted = swinging(1.0, [0.0, 0.0], 0.0, peak_torque_delivered=limit)
+        eta = np.sqrt(limit / (1.0 + EDGE)) * T_F
     evaluate = Evaluator(Bounds(("eta", "delta"), (2.5, 0.3), (6.0, 4.0)))
-    eta = np.sqrt(1.9 / first_torque(np.diag([10.0, 12.0, 14.0]), largest, 1.0))
     robust, plain = (
         optimise.search(evaluate, problem, wanted, np.array([3.0, 1.0]), optimise.Settings(2, 20, 0, robust=robust))
         for robust in (True, False)
@@ -209,8 +245,7 @@ def test_a_robust_search_keeps_the_limit_in_the_worst_case(monkeypatch):
 
 def test_what_has_no_worst_case_to_look_for_keeps_the_whole_margin(monkeypatch):
     """With a quantile no single trial counts: `robust` finds nothing to do."""
-    spread = variation.Dispersion(attitudes.AxisAngle(vector(0.4), vector(2.0)))
-    problem, wanted = posed(spread)
+    problem, wanted = swinging(1.0, [0.2, 0.1], 0.01)
     wanted = [replace(one, quantile=0.9) for one in wanted]
     small_search(monkeypatch)
     evaluate = Evaluator(Bounds(("eta", "delta"), (2.5, 0.3), (6.0, 4.0)))
@@ -277,10 +312,14 @@ def test_where_nothing_can_be_moved_the_hardest_drawn_one_is_the_worst():
     np.testing.assert_allclose(alone.metrics.peak_rate / 0.1, ratio[[3, -1, -2]], rtol=1e-12)
 
 
-def test_a_trial_without_a_value_is_the_hardest():
+@pytest.mark.parametrize("plant", short(["chain", "spacecraft"], ["chain"]))
+def test_a_trial_without_a_value_is_the_hardest(plant):
     """Nearer ones settle, farther ones not before the end."""
-    spread = variation.Dispersion(attitudes.AxisAngle(vector(0.01), vector(2.0)))
-    problem, wanted = posed(spread, Requirement("settling_time", 19.0), settling_angle=1e-4)
+    if plant == "spacecraft":
+        spread = variation.Dispersion(attitudes.AxisAngle(vector(0.01), vector(2.0)))
+        problem, wanted = posed(spread, Requirement("settling_time", 19.0), settling_angle=1e-4)
+    else:
+        problem, wanted = swinging(1.0, [2.0, 0.0], 0.0, settling_angle=1e-4, settling_time=19.0)
     at = np.array([ETA, 1.0])
     _, ratio = worst.screen(problem, wanted, at)
     assert 0 < np.isinf(ratio).sum() < ratio.size
@@ -292,3 +331,12 @@ def test_a_trial_without_a_value_is_the_hardest():
     found = evaluate.slopes(problem, evaluate.bounds.share(at)[None])
     assert all(np.isfinite(v).all() for v in vars(found).values())
     assert (found.c == objective.FAILED - 1.0).any()
+
+
+def test_trials_that_fail_have_no_worst_case():
+    """Starts no square of which is finite."""
+    problem, wanted = swinging(1.0, [1e160, 0.0], 0.0)
+    found = worst.hardest(problem, wanted, np.array([ETA, 1.0]))
+    assert found.unbounded
+    told = {status: replace(found, status=status).unbounded for status in ("ok", "missed", "singular", "diverged")}
+    assert told == {"ok": False, "missed": False, "singular": True, "diverged": True}
