@@ -9,7 +9,7 @@ from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.requirements import Requirement
-from tests.helpers import ticks_of, vector
+from tests.helpers import short, ticks_of, vector
 from tuning.search import design
 from tuning.search.gains import with_gains
 
@@ -46,21 +46,32 @@ def test_shortest_time_is_where_flown_trials_cross_the_limit():
     assert str(found).endswith(" s as flown")
 
 
-def test_shortest_time_from_rest_is_the_rule():
+PLANTS = short(["chain", "spacecraft"], ["chain"])
+STARTS = {
+    "chain": {"plant": {"kind": "chain", "order": 2, "x0": [14.0, 0.0]}},
+    "spacecraft": {"initial": {"rotvec_deg": [0, 0, 90]}},
+}
+RULES = {"chain": 14.0, "spacecraft": 2 * 14.0 * np.tan(np.pi / 4)}  # peak torque t_f^2 / eta^2
+
+
+@pytest.mark.parametrize("plant", PLANTS)
+def test_shortest_time_from_rest_is_the_rule(plant):
     """3.5 in closed form: without a disturbance the search finds it."""
     tables = {
+        **STARTS[plant],
         "controller": {"eta": 4.0, "disturbance_rate_bound": 0.0},
         "disturbance": {"kind": "none"},
-        "initial": {"rotvec_deg": [0, 0, 90]},
     }
     found = design.shortest_time(scenario.from_tables(tables), Requirement("peak_torque", 0.25), 0, np.arange(1))
-    rule = 4.0 * np.sqrt(2 * 14.0 * np.tan(np.pi / 4) / 0.25)
+    rule = 4.0 * np.sqrt(RULES[plant] / 0.25)
     assert found.theory == pytest.approx(rule, rel=2e-3)
     assert found.simulated == pytest.approx(rule, rel=2e-3)
 
 
-def test_a_limit_below_the_disturbance_cannot_be_kept():
-    found = design.shortest_time(scenario.from_tables({}), Requirement("peak_torque", 0.009), 0, np.arange(1))
+@pytest.mark.parametrize("plant", PLANTS)
+def test_a_limit_below_the_disturbance_cannot_be_kept(plant):
+    tables = {} if plant == "spacecraft" else STARTS[plant]
+    found = design.shortest_time(scenario.from_tables(tables), Requirement("peak_torque", 0.009), 0, np.arange(1))
     assert (found.theory, found.simulated) == (None, None)
     assert str(found) == "no t_f up to 100 times the scenario's keeps peak_torque below 0.009 with the tuned gains"
 

@@ -58,7 +58,25 @@ def wide(tables=None):
     return scenario, posing.pose(scenario, 0).ready
 
 
-@pytest.mark.parametrize("name", short(OTHERS, ["t_f"]))
+@pytest.mark.parametrize("name", OTHERS)
+def test_gains_moved_in_the_parts_are_those_of_the_scenario(name):
+    """Every number of law, observer, sensors and times, of the parts as the changed scenario is built into them."""
+    scenario, ready = wide()
+    moved = gains.with_gains(ready.parts, OTHERS[name])
+    changed = study(gains.in_scenario(scenario, OTHERS[name])).parts
+    for what in ("controller", "observer", "sensors", "actuators", "t_end", "window"):
+        one, other = (jax.tree.leaves_with_path(getattr(parts, what)) for parts in (moved, changed))
+        for (path, value), (place, expected) in zip(one, other, strict=True):
+            assert path == place
+            np.testing.assert_allclose(value, expected, rtol=1e-12, atol=1e-18, err_msg=f"{what}{path}")
+    assert float(moved.clock.t_end) == float(changed.clock.t_end)
+    known = gains.gains_of(moved)
+    for gain, value in OTHERS[name].items():
+        np.testing.assert_allclose(known[gain], value, rtol=1e-12)
+
+
+@pytest.mark.long  # the numbers that are flown: above; a flight of a chain: below
+@pytest.mark.parametrize("name", OTHERS)
 def test_gains_moved_in_the_parts_fly_as_in_the_scenario(name):
     """The parts of a search, moved, against the parts that the changed scenario is built into."""
     scenario, ready = wide()
