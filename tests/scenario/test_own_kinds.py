@@ -17,7 +17,7 @@ from ptsmc_jax.laws.base import Sample
 from ptsmc_jax.scenario import own, parsing, reading, systems
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import rollout
-from tests.helpers import ROOT, SHORT, SHORT_CHAIN, small_search, vector
+from tests.helpers import ROOT, SHORT, SHORT_CHAIN, short, small_search, vector
 from tests.scenario.bad_scenarios import check_sentence
 from tuning.search import gains
 
@@ -62,12 +62,16 @@ def flown(tables, record=True):
     return rollout.simulate_jit(scenario.study(scenario.from_tables(tables)).parts, record=record)
 
 
-def test_the_papers_law_as_ones_own_flies_like_the_built_in():
-    tables = tomllib.loads(SHORT) | {"tune": {}}
+@pytest.mark.parametrize("plant", short(["chain", "spacecraft"], ["chain"]))
+def test_the_papers_law_as_ones_own_flies_like_the_built_in(plant):
+    tables = tomllib.loads(SHORT if plant == "spacecraft" else SHORT_CHAIN)
     del tables["tune"]
+    if plant == "chain":
+        tables |= {"disturbance": {"kind": "sinusoid"}, "observer": {"kind": "nonlinear", "gain": [10.0]}}
+    error, rate = ({"error": "additive"}, 1.5) if plant == "spacecraft" else ({}, 0.75)  # k1 of (29) is half of (60)'s
     both = []
-    for law in (MINE | {"error": "additive"}, {"kind": "prescribed_time", "t_f": 5.0}):
-        both.append(flown({**tables, "controller": {**law, "eta": 2.7, "delta": 0.5, "k1": 1.5}}))
+    for law in (MINE | error | {"k1": 1.5}, {"kind": "prescribed_time", "t_f": 5.0, "k1": rate}):
+        both.append(flown({**tables, "controller": {**law, "eta": 2.7, "delta": 0.5}}))
     # bit for bit with the command's own settings; here two programs may fuse differently, which the gains amplify
     for mine, builtin in zip(*map(jax.tree.leaves, both), strict=True):
         np.testing.assert_allclose(mine, builtin, rtol=1e-9, atol=1e-10)
