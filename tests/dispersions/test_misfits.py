@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ptsmc_jax import scenario
+from ptsmc_jax import formulas, scenario
 from ptsmc_jax.campaigns import montecarlo, runs
-from ptsmc_jax.devices import actuators
+from ptsmc_jax.devices import actuators, reaction_wheels
 from ptsmc_jax.dispersions import misfits
 from ptsmc_jax.dispersions.base import FARTHEST, plant_of
 from ptsmc_jax.numerics import draws
 from ptsmc_jax.plants import flexible_body
 from ptsmc_jax.simulation import sampled
-from tests.helpers import fly, vector
+from tests.helpers import fly, short, vector
 
 FLIGHT = {
     "flexible": {"frequency": [3.0, 5.0], "damping": [0.01, 0.01], "coupling": [[1.2, 0.0, 0.3], [0.1, 0.9, 0.0]]},
@@ -48,13 +48,12 @@ def drawn():
         "wheel_failure",
         "timing_jitter",
     }
-    ready = replace(ready, parts=roomy(ready.parts))
-    return ready, montecarlo.run(ready.parts, ready.dispersion, 5, np.arange(3))
+    return replace(ready, parts=roomy(ready.parts))
 
 
-def numbers(flown, trial, name, *shape):
+def numbers(row, name, *shape):
     """The columns of a trial's row that begin with a name, in their order."""
-    kept = [v[trial] for key, v in flown.drawn.items() if key.rpartition("_")[0] == name]
+    kept = [v for key, v in row.items() if key.rpartition("_")[0] == name]
     return vector(np.array(kept).reshape(shape))
 
 
@@ -66,28 +65,41 @@ def misfitted(parts, frequency, coupling, device, sensors):
     return replace(parts, plant=plant, actuators=device, sensors=sensors)
 
 
+METRICS = ("window_error", "peak_torque", "effort", "residual_modal", "peak_torque_delivered")
+
+
 def test_every_trial_is_the_run_by_hand_of_its_row(drawn):
-    ready, flown = drawn
-    for trial in range(3):
+    flown = [runs.fly(drawn, 5, trial) for trial in range(3)]
+    for trial, run in enumerate(flown):
+        row = drawn.dispersion.values(run.parts)
         by_hand = misfitted(
-            ready.parts,
-            numbers(flown, trial, "mode_frequency", 2),
-            numbers(flown, trial, "mode_coupling", 2, 3),
-            {"scale": numbers(flown, trial, "actuator_scale", 3),
-             "directions": numbers(flown, trial, "actuator_misalignment", 3, 3).T},
-            {"misalignment": numbers(flown, trial, "star_tracker_misalignment", 3),
-             "rate_scale": numbers(flown, trial, "gyro_scale", 3)},
+            drawn.parts,
+            numbers(row, "mode_frequency", 2),
+            numbers(row, "mode_coupling", 2, 3),
+            {"scale": numbers(row, "actuator_scale", 3),
+             "directions": numbers(row, "actuator_misalignment", 3, 3).T},
+            {"misalignment": numbers(row, "star_tracker_misalignment", 3),
+             "rate_scale": numbers(row, "gyro_scale", 3)},
         )  # fmt: skip
         found = fly(by_hand, 5, trial).metrics
-        for name in ("window_error", "peak_torque", "effort", "residual_modal", "peak_torque_delivered"):
-            value = getattr(found, name)  # by another program: roundings differ
-            np.testing.assert_allclose(getattr(flown.metrics, name)[trial], value, rtol=1e-11, err_msg=name)
-    assert np.ptp(flown.metrics.window_error) > 1e-5
+        for name in METRICS:
+            np.testing.assert_allclose(run.metrics[name], getattr(found, name), rtol=1e-11, err_msg=name)
+    assert np.ptp([run.metrics["window_error"] for run in flown]) > 1e-5
+
+
+@pytest.mark.long  # batches: `test_conformity.py`; what is drawn in them: `test_dispersions.py`
+def test_trials_of_a_batch_are_flown_with_their_misfits(drawn):
+    batch = montecarlo.run(drawn.parts, drawn.dispersion, 5, np.arange(3))
+    for trial in range(3):
+        run = runs.fly(drawn, 5, trial)
+        for name in METRICS:  # by another program: roundings differ
+            np.testing.assert_allclose(getattr(batch.metrics, name)[trial], run.metrics[name], rtol=1e-11, err_msg=name)
+        for name, value in drawn.dispersion.values(run.parts).items():
+            np.testing.assert_allclose(batch.drawn[name][trial], value, rtol=1e-11, err_msg=name)
 
 
 def test_the_body_gets_what_scaled_and_turned_actuators_give_and_flight_software_knows_nothing_of_it(drawn):
-    ready, _ = drawn
-    run = runs.fly(ready, 5, 1)
+    run = runs.fly(drawn, 5, 1)
     device = run.parts.actuators
     assert device is not None
     given = run.log.commanded[:-1] * np.asarray(device.scale)
@@ -127,6 +139,29 @@ def test_a_turned_star_tracker_turns_the_body_the_other_way_by_half_the_angle_in
     np.testing.assert_allclose(Rotation.from_quat(log.x.q[-1]).as_rotvec(), -turn, rtol=0, atol=1e-9)
 
 
+def test_wheels_that_are_scaled_and_turned_give_and_store_along_their_true_axes():
+    wheels = reaction_wheels.wheels(formulas.pyramid(), [0.5, -0.2, 0.1, 0.3])
+    turned = np.array(wheels.axes) + 0.02 * np.random.default_rng(0).normal(size=(3, 4))
+    scale, asked = np.array([1.1, 0.9, 1.05, 0.95]), vector([0.13, -0.2, 0.25])
+    device = actuators.Actuators(wheels=wheels, scale=vector(scale), directions=vector(turned))
+    start, dt = device.begin(3), vector(0.5)
+    drive, queue = device.command(start, asked, vector(np.zeros(3)), vector(0.0), dt, vector(1.0))
+    torque = scale * (np.linalg.pinv(np.array(wheels.axes)) @ np.array(asked))
+    assert np.abs(torque).min() > 1e-2
+    stored = np.array([0.5, -0.2, 0.1, 0.3])
+    applied = device.over(drive, vector(0.2), vector(0.1))
+    np.testing.assert_allclose(applied.mean, turned @ torque, rtol=1e-13)
+    np.testing.assert_allclose(applied.stored, turned @ (stored - 0.2 * torque), rtol=1e-13)
+    np.testing.assert_allclose(device.torque(drive, dt), turned @ torque, rtol=1e-13)
+    np.testing.assert_allclose(device.end(start, drive, queue, dt).h, stored - 0.5 * torque, rtol=1e-13)
+    failing = replace(device, failure_times=vector([np.inf, 0.0, np.inf, np.inf]))  # which no one knows of
+    drive, queue = failing.command(start, asked, vector(np.zeros(3)), vector(0.0), dt, vector(1.0))
+    torque[1] = 0.0
+    np.testing.assert_allclose(failing.torque(drive, dt), turned @ torque, rtol=1e-13)
+    np.testing.assert_allclose(failing.end(start, drive, queue, dt).h, stored - 0.5 * torque, rtol=1e-13)
+
+
+@pytest.mark.long  # torque and momentum of a period: the test above; their flights: `test_hardware.py`
 def test_wheels_that_are_scaled_and_turned_keep_the_total_momentum():
     tables = {
         **{key: FLIGHT[key] for key in ("controller", "initial", "loop")},
@@ -154,7 +189,7 @@ WHEELED = {
 }
 
 
-@pytest.mark.parametrize("known", [False, True])
+@pytest.mark.parametrize("known", short([False, True], [True]))
 def test_a_wheel_fails_and_the_others_take_over_where_it_is_known(known):
     failing = {"kind": "uniform", "earliest": 1.0, "latest": 3.0, "known": known}
     drawn = {"wheel_failure": failing, "star_tracker_outage": {"kind": "uniform", "duration": 0.5, "latest": 3.0}}
@@ -177,10 +212,14 @@ def test_a_wheel_fails_and_the_others_take_over_where_it_is_known(known):
     assert np.all(off[after[:-1]] < 1e-5) == known
 
 
-def test_any_wheel_fails_as_often_and_times_that_are_not_given_end_with_the_run():
+def test_any_wheel_fails_as_often_known_or_not_and_times_that_are_not_given_end_with_the_run():
     drawn = {"wheel_failure": {"kind": "uniform"}, "star_tracker_outage": {"kind": "uniform", "duration": 0.5}}
+    known = {"wheel_failure": {"kind": "uniform", "known": True}}
+    parts = scenario.study(scenario.from_tables({**WHEELED, "dispersion": known})).parts
+    assert parts.effective_actuators.spare_allocations is not None
     ready = scenario.study(scenario.from_tables({**WHEELED, "dispersion": drawn}))
     failure, outage = (ready.dispersion.misfits[name] for name in drawn)
+    assert ready.parts.effective_actuators.spare_allocations is None  # the others do not take over
     for k in range(4):
         for share in (0.01, 0.99):
             np.testing.assert_allclose(failure.at(vector([1.0, (k + share) / 4]), ready.parts), [7.0, k + 1.0])
@@ -190,7 +229,7 @@ def test_any_wheel_fails_as_often_and_times_that_are_not_given_end_with_the_run(
 def test_an_outage_of_the_whole_run_is_a_filter_that_corrects_nothing():
     """With wheels of which one would fail after the end: the program of wheels that fail."""
     lasting = {"kind": "uniform", "duration": 100.0, "latest": 0.0}
-    after_end = {"kind": "uniform", "earliest": 50.0, "latest": 60.0}
+    after_end = {"kind": "uniform", "earliest": 50.0, "latest": 60.0, "known": True}
     drawn = {"star_tracker_outage": lasting, "wheel_failure": after_end}
     ready = scenario.study(scenario.from_tables({**WHEELED, "dispersion": drawn}))
     run = runs.fly(ready, 0, 0)
