@@ -100,7 +100,8 @@ def test_law_for_a_system_is_the_hand_written_law_and_its_jacobians_those_derive
     np.testing.assert_allclose(force, run.plant.generalised_force(t, x, u), rtol=0, atol=1e-13)
 
 
-@pytest.mark.parametrize("period", short([None, 0.05], [0.05]))
+@pytest.mark.long  # laws and observers at one state: the test above, `test_observers_others.py`
+@pytest.mark.parametrize("period", [None, 0.05])
 def test_a_spacecraft_written_as_a_system_flies_the_hand_written_trajectory(period):
     start = vector(0.4, -0.3, 0.2, np.sqrt(1 - 0.29))
     others = {"inertia": FULL_INERTIA, "reference": SPIN, "q": start, "sign_width": 0.05, "delta": 0.4}
@@ -128,6 +129,7 @@ def arm_tables(**changes):
     return {name: {**table, **changes.get(name, {})} for name, table in tables.items()}
 
 
+@pytest.mark.long  # its mass matrix: the books of energy below; exact motions of a system: Newton's below
 def test_arm_follows_the_exact_solution_without_a_disturbance():
     """A mass matrix by the book: the error moves as solution 1 says whatever M, C and g are."""
     tables = arm_tables(controller={"disturbance_rate_bound": 0.0})
