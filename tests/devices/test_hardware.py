@@ -133,6 +133,7 @@ def test_limits_and_steps_as_delivered_whole_periods_later(step):
     np.testing.assert_allclose(result.metrics.saturated, np.sum(np.diff(log.t)[3:][beyond]) / 120.0, rtol=1e-9)
 
 
+@pytest.mark.long  # with wheels besides: `test_wheels_exchange_momentum_with_the_body`
 def test_held_torque_with_lag_is_what_an_adaptive_integrator_makes_of_it():
     device = actuators.Actuators(rate_limit=vector(0.5), lag=vector(0.04))
     log = fly(with_device(device, inertia=FULL_INERTIA), 1, 2).log
@@ -402,10 +403,26 @@ def test_gravity_gradient_is_the_textbook_torque():
         np.testing.assert_allclose(later, [0.0, 0.0, 1.5 * rate**2 * 2.0 * np.sin(2 * angle)], atol=1e-18)
 
 
-def test_random_walk_grows_like_the_square_root_of_time():
+def walking():
+    """A run with a random walk of 1e-3 N m / sqrt(s) for its disturbance."""
     run = parts(10.0, 3.0, 0.5, period=0.1, t_end=12.0, disturbance=disturbances.Constant(vector([0.0] * 3)))
-    density = 1e-3
-    run = dataclasses.replace(run, walk_rate=vector([density / np.sqrt(0.1)] * 3))
+    return dataclasses.replace(run, walk_rate=vector([1e-3 / np.sqrt(0.1)] * 3))
+
+
+def test_random_walk_is_the_sum_of_its_stream():
+    """By hand, from the stream that is documented."""
+    run = walking()
+    d = fly(run, 4, 7).log.disturbance
+    ticks, key = ticks_of(run.clock, run.controller.t_f, run.controller.delta), draws.stream(4, 7, "disturbance_walk")
+    steps = jax.vmap(lambda now: run.walk_rate * (now.t_next - now.t) * draws.normals(key, 3, now.sample))(ticks)
+    grown = jnp.cumsum(steps, axis=0)
+    np.testing.assert_allclose(d[:-1], grown, rtol=0, atol=1e-13 * float(jnp.max(jnp.abs(grown))))
+    assert np.ptp(grown, axis=0).min() > 1e-4
+
+
+@pytest.mark.long  # its steps: the test above; how these are distributed: `test_draws.py`
+def test_random_walk_grows_like_the_square_root_of_time():
+    run, density = walking(), 1e-3
 
     def found(trial):
         log = rollout.simulate(run, 4, trial, record=True).log
@@ -423,11 +440,6 @@ def test_random_walk_grows_like_the_square_root_of_time():
     limit = 5 / np.sqrt(512 * 99)
     assert np.abs(np.corrcoef(steps[:, 1:, 0].ravel(), steps[:, :-1, 0].ravel())[0, 1]) < limit
     assert np.abs(np.corrcoef(steps[..., 0].ravel(), steps[..., 1].ravel())[0, 1]) < limit
-    # by hand, from the stream that is documented
-    ticks, key = ticks_of(run.clock, run.controller.t_f, run.controller.delta), draws.stream(4, 7, "disturbance_walk")
-    steps = jax.vmap(lambda now: run.walk_rate * (now.t_next - now.t) * draws.normals(key, 3, now.sample))(ticks)
-    grown = jnp.cumsum(steps, axis=0)
-    np.testing.assert_allclose(d[7, :-1], grown, rtol=0, atol=1e-13 * float(jnp.max(jnp.abs(grown))))
 
 
 def test_gradients_are_finite_at_the_corners():
@@ -467,7 +479,7 @@ def test_a_saturated_slew_misses_t_f_stays_finite_and_arrives_later():
     assert np.abs(result.log.u).max() <= 0.1
 
 
-@pytest.mark.parametrize("lag", [None, 0.08])
+@pytest.mark.parametrize("lag", short([None, 0.08], [None]))
 def test_momentum_limit_is_kept_and_never_at_the_cost_of_the_torque_limit(lag):
     limits = reaction_wheels.wheels(PYRAMID, [0.4, 0.0, 0.0, -0.4], torque_limit=0.1, momentum_limit=0.45)
     device = actuators.Actuators(lag=None if lag is None else vector(lag), wheels=limits)
