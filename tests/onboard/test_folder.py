@@ -22,7 +22,7 @@ from ptsmc_jax.onboard.library import compiler
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.law_tables import LAWS
 from tests.helpers import SHORT, fly, short
-from tests.onboard.compiled import CC, needs_compiler
+from tests.onboard.compiled import CC, STRICT, needs_compiler
 from tests.onboard.flights import FILTER, FLIGHTS, flight
 
 
@@ -77,7 +77,8 @@ def of_law(plant, kind):
 
 @needs_compiler
 @pytest.mark.skipif(shutil.which("make") is None, reason="this machine has no make")
-@pytest.mark.parametrize(("plant", "kind"), short(EVERY, [("spacecraft", "super_twisting")]))
+@pytest.mark.long  # laws with memories: `Odd` below; the paper's, and of one's own: `test_library.py`
+@pytest.mark.parametrize(("plant", "kind"), EVERY)
 def test_every_law_of_the_registry_replays_the_simulator(plant, kind, tmp_path):
     made = scenario.reading.complete(scenario.from_tables(of_law(plant, kind)))
     place = folder.export(made, tmp_path / "controller", name="law", trials=1)
@@ -113,19 +114,29 @@ class Named(ptsmc.AccelerationLaw):
 
 
 def of_own(law):
-    """A short flight under a law of one's own."""
-    flown = {**FLIGHTS["raw"], "controller": {"kind": "own", "code": law, "t_f": 5.0}}
+    """A short flight under a law of one's own, to a reference that moves."""
+    moving = {"kind": "spin", "rate": [0.01, 0.02, -0.01]}
+    flown = {**FLIGHTS["raw"], "reference": moving, "controller": {"kind": "own", "code": law, "t_f": 5.0}}
     return scenario.reading.complete(scenario.from_tables(flown))
 
 
 @needs_compiler
 @pytest.mark.skipif(shutil.which("make") is None, reason="this machine has no make")
-@pytest.mark.parametrize("law", [Odd, Named])
+@pytest.mark.parametrize("law", short([Odd, Named], [Odd]))
 def test_memories_names_and_words_of_any_kind_are_written(law, tmp_path):
     """C did not compile, or was not written at all."""
     done = make(folder.export(of_own(law), tmp_path / "controller", name="law", trials=1), "check")
     assert done.returncode == 0, done.stdout + done.stderr
     assert "other status: 0" in done.stdout
+
+
+@needs_compiler
+@pytest.mark.parametrize("law", [Named])
+def test_names_and_words_of_c_compile(law, tmp_path):
+    folder.write_program(tmp_path, folder.Controller(of_own(law), "law", "a scenario"))
+    called = [*compiler(), *STRICT, "-fsyntax-only", *map(str, sorted(tmp_path.glob("*.c")))]
+    done = subprocess.run(called, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
 
 
 class Tabled(ptsmc.AccelerationLaw):
@@ -141,9 +152,9 @@ class Tabled(ptsmc.AccelerationLaw):
 @pytest.mark.skipif(shutil.which("make") is None or shutil.which("gcc") is None, reason="this machine has no gcc")
 def test_the_stack_that_is_stated_has_the_tables_of_loops(tmp_path):
     """2 800 bytes were stated, where gcc counts 12 632."""
-    place = folder.export(of_own(Tabled), tmp_path / "controller", name="law", trials=1)
-    (stated,) = re.findall(r"At most (\d+) bytes of stack", (place / "README.md").read_text())
-    counted = dict(re.findall(r":(\w+)\t(\d+)", make(place, "stack").stdout))
+    folder.write_program(tmp_path, folder.Controller(of_own(Tabled), "law", "a scenario"))
+    (stated,) = re.findall(r"At most (\d+) bytes of stack", (tmp_path / "README.md").read_text())
+    counted = dict(re.findall(r":(\w+)\t(\d+)", make(tmp_path, "stack").stdout))
     assert int(counted["ptsmc_step"]) + int(counted["command"]) <= int(stated) < 20_000
 
 
@@ -196,6 +207,7 @@ def test_what_cannot_be_written_or_checked_is_said(tmp_path, law, said):
         folder.export(made, tmp_path / "controller", name="law", trials=1)
 
 
+@pytest.mark.long  # what is allowed for it: `test_what_rounding_may_leave_is_reckoned_to_the_last_sample..`
 @needs_compiler
 @pytest.mark.skipif(shutil.which("make") is None, reason="this machine has no make")
 def test_a_slew_of_a_third_of_a_degree_replays_too(tmp_path):
@@ -213,6 +225,21 @@ def test_a_slew_of_a_third_of_a_degree_replays_too(tmp_path):
     assert done.returncode == 0, done.stdout + done.stderr
 
 
+@needs_compiler
+@pytest.mark.skipif(shutil.which("make") is None, reason="this machine has no make")
+def test_each_sample_begins_where_the_simulator_was(exported, tmp_path):
+    """And not where C was, whose rounding would add up: from a state of another time the next sample is bad input."""
+    place = shutil.copytree(exported, tmp_path / "controller")
+    with (place / "vectors.csv").open() as file:
+        header, *rows = csv.reader(file)
+    rows[20][header.index("state.t")] = "100.0"
+    (place / "vectors.csv").write_text("\n".join(map(",".join, [header, *rows])) + "\n")
+    done = make(place, "check")
+    assert done.returncode != 0
+    assert "130 samples; other status: 1;" in done.stdout
+
+
+@pytest.mark.long  # that nothing can add up: the test above; implicit sampling: `test_library.py`
 @needs_compiler
 @pytest.mark.skipif(shutil.which("make") is None, reason="this machine has no make")
 def test_what_rounding_leaves_does_not_add_up(tmp_path):

@@ -46,7 +46,7 @@ def exported(tmp_path_factory):
 
 
 @needs_compiler
-@pytest.mark.parametrize("name", short(list(FLIGHTS), ["wheels", "own law"]))
+@pytest.mark.parametrize("name", short(list(FLIGHTS), ["wheels"]))
 def test_the_compiled_controller_flies_what_the_simulator_flies(name, exported):
     made, library = exported(name)
     ours = runs.fly(made.ready, 3, 2)
@@ -432,7 +432,7 @@ def test_a_draw_that_tells_apart_what_is_one_parameter_of_c_is_refused(where, ex
 
 
 @needs_compiler
-@pytest.mark.parametrize("name", ["wheels", "implicit chain"])
+@pytest.mark.parametrize("name", short(["wheels", "implicit chain"], ["implicit chain"]))
 def test_single_precision_flies_as_well(exported, name):
     """Statistics to three digits: see `benchmarks/exported_c.py`; one run's peak, and its error at t_f."""
     made, library = exported(name, "float")
