@@ -210,6 +210,7 @@ def test_errors_of_the_filter_are_the_same_from_the_first_sample_on(first, filte
     assert smallest < 0.6 * TRACKED["attitude_noise"]  # what the filter is for
 
 
+@pytest.mark.long  # its covariance: `test_spread_of_the_filter_solves_lyapunovs_equation`, and the test above
 def test_filter_comes_to_its_steady_state_from_far_away(filtered):
     covariance, keep, star = steady()
     wanted = keep @ covariance[-1] @ keep.T + star

@@ -218,6 +218,7 @@ def anchored():
     return scenario.study(scenario.from_tables(tables)).parts
 
 
+@pytest.mark.long  # what it is made of: `test_the_filter_of_a_whole_ratio..`, `tests/theory/test_floor.py`
 def test_the_floor_lies_between_those_of_the_whole_ratios(anchored):
     parts, log = anchored, fly(anchored, 3).log
     floors = [error_floor.along(parts, log).window_error]

@@ -13,6 +13,7 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
 from ptsmc_jax import scenario
+from ptsmc_jax.numerics import attitude
 from ptsmc_jax.simulation import catalogues, pointing, rollout
 from tests.helpers import SHORT, drawn, fly, untuned, vector
 
@@ -325,6 +326,27 @@ def test_a_run_that_is_not_sampled_has_room_for_all_its_steps():
     assert dataclasses.replace(asked, samples=12).of_run(700).segments("rpe") == 14
 
 
+def test_slopes_of_indices_are_those_of_differences():
+    """Along attitudes, their rates, the times of the nodes and where the observation begins, all at once."""
+    rng, frame = np.random.default_rng(5), vector(pointing.across((1.0, 2.0, -0.5)))
+    decay = np.exp(-0.3 * NODES)[:, None]  # so that the first window and its first moment are among the largest
+    turns, aside = (vector(0.01 * decay * (1.0 + 0.1 * rng.normal(size=(NODES.size, 3)))) for _ in range(2))
+    rates, none = 0.01 * rng.normal(size=(NODES.size, 5)), np.full((3, 4), np.inf)
+
+    def of(size):
+        q = jax.vmap(lambda turn, side: attitude.from_rotation_vector(turn + size * side))(turns, aside)
+        error = jax.vmap(lambda q: pointing.attitude_error(q, vector([0.0, 0.0, 0.0, 1.0]), frame))(q)
+        tally = tallied(NODES * (1.0 + 0.01 * size), error, rates * (0.1 + size), 4.03 + 0.02 * size, 0.37, none)
+        return jnp.stack(list(indices(tally).values()))
+
+    sloped, at, step = jax.jit(lambda size: jax.jvp(of, (size,), (vector(1.0),))), 0.3, 1e-6
+    slopes = sloped(vector(at))[1]
+    differences = (sloped(vector(at + step))[0] - sloped(vector(at - step))[0]) / (2 * step)
+    np.testing.assert_allclose(slopes, differences, rtol=1e-6, atol=1e-9)
+    assert np.all(np.abs(slopes) > 1e-6)
+
+
+@pytest.mark.long  # the test above, and metrics' slopes in `test_rollout.py`
 def test_indices_have_slopes(flown):
     """Against central differences, of a gain that moves the hand-over with everything behind it."""
     ready, _ = flown
