@@ -90,7 +90,8 @@ MOVING = {
 }
 
 
-@pytest.mark.parametrize("kind", short(MOVING, ["spin"]))
+@pytest.mark.long  # laws for moving references at a state: `test_controllers.py`
+@pytest.mark.parametrize("kind", MOVING)
 def test_exact_solution_for_a_moving_reference(kind):
     moving = MOVING[kind]
     run = finer(perfect(parts(20.0, 3.5, 0.1, inertia=FULL_INERTIA, reference=moving, rate=(0.01, 0.0, -0.01))), 2)
@@ -124,6 +125,7 @@ def test_derivatives_of_the_whole_rollout_are_those_of_the_exact_solution(plant)
     np.testing.assert_allclose(by_delta, r**3 * (3.0 * (start + s0 * log_r) - s0) / 0.5, rtol=1e-8)
 
 
+@pytest.mark.long  # RK4: `test_numerics.py`; exact motions to what its steps leave: the tests above and `test_chain.py`
 def test_order_of_convergence_is_four():
     """Of the whole loop, for a chain with an observer of a sinusoid."""
     wave = disturbances.Sinusoid(*(vector([v]) for v in (0.05, 0.7, 0.3, 0.0)))
