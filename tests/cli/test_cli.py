@@ -15,7 +15,9 @@ import pytest
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo, runs, store
 from ptsmc_jax.scenario import parsing, timing
-from ptsmc_jax.simulation import catalogues
+from ptsmc_jax.simulation import catalogues, rollout
+from ptsmc_jax.simulation.metrics import Metrics
+from ptsmc_jax.theory import covariance, margins, run_margins
 from tests.helpers import PAPER_ATTITUDE, QUICKLY, ROOT, SHORT, SHORT_CHAIN, short, small_search, tree
 from tests.output.pages import checked
 from tests.scenario.bad_scenarios import BAD as BAD_SCENARIOS
@@ -571,6 +573,20 @@ def test_simulate_without_a_trial_refuses_a_nominal_start_that_the_law_cannot_le
     assert command("simulate", "s.toml", "--trial", 0, "--no-figures", "--quiet")[0] in (0, 1)  # drawn instead
 
 
+@pytest.fixture(params=short(["made up", "flown"], ["made up"]))
+def cells(request, monkeypatch):
+    """Of `map`, made up: `tests/studies/test_mapping.py` flies them and opens their loops."""
+    if request.param == "flown":
+        return
+    metrics = Metrics(*(np.full(2, 1e-3) for _ in Metrics._fields))
+    trials = montecarlo.Trials(np.arange(2), metrics, np.full(2, rollout.OK), np.full(2, np.nan), {})
+    left = margins.Margins(**dict.fromkeys(margins.Margins._fields, np.ones(1)))
+    monkeypatch.setattr(montecarlo, "run", lambda *_: trials)
+    monkeypatch.setattr(run_margins, "at_ends", lambda _: {"hand_over": (left, 0.9), "hold": (left, 0.9)})
+    monkeypatch.setattr(covariance, "noise", lambda _: covariance.Noise(5e-4, 2.0, 0.1))
+
+
+@pytest.mark.usefixtures("cells")
 def test_map_leaves_what_the_contract_says(command, tmp_path):
     (tmp_path / "c.toml").write_text(SHORT_CHAIN)
     pairs = ("--x", "controller.eta=2.7:2.9:2", "--y", "controller.k1=0.8:1.6:2")  # of one program

@@ -2,13 +2,15 @@
 
 import json
 
+import jax
 import numpy as np
 import polars as pl
 import pytest
 
-from ptsmc_jax.campaigns import campaign, store
+from ptsmc_jax.campaigns import campaign, montecarlo, store
 from ptsmc_jax.numerics import statistics
 from ptsmc_jax.simulation.catalogues import percent
+from tests.helpers import short
 from tests.output.pages import checked
 from tuning.output import pointing_sentences
 
@@ -26,8 +28,21 @@ ake_x = { limit = 1e-4, probability = 0.9973, interpretation = "temporal" }
 FOLDER = "out/montecarlo-s"
 
 
-@pytest.fixture
-def flown(command, tmp_path, monkeypatch):
+alone = jax.jit(montecarlo.one)
+
+
+def one_by_one(parts, dispersion, seed, trials, **_):
+    """The trials by the program of one, which is compiled in half the time."""
+    found = [alone(parts, dispersion, np.uint32(seed), trial) for trial in trials]
+    return montecarlo.Trials(np.asarray(trials), *jax.tree.map(lambda *many: np.stack(many), *found))
+
+
+# batches: `test_montecarlo.py`; what they are made of in lanes: `test_lanes.py`
+@pytest.fixture(params=short(["alone", "in a batch"], ["alone"]))
+def flown(request, command, tmp_path, monkeypatch):
+    if request.param == "alone":
+        monkeypatch.setattr(montecarlo, "run", one_by_one)
+        monkeypatch.setattr(montecarlo, "prepare", lambda *_: None)
     monkeypatch.setattr(campaign, "PART", 100)
     text = (tmp_path / "s.toml").read_text().replace("[requirements]\npeak_torque = 30.0\n", ASKED)
     (tmp_path / "s.toml").write_text(text)
