@@ -107,13 +107,15 @@ def agree(function, unit, options=None):
     assert checked > 10
 
 
-@pytest.mark.parametrize("name", short(["flight", "chain", "continuous"], ["continuous"]))
+@pytest.mark.long  # the scan of a chain: `test_a_batch_flown_by_kernel_is_the_batch`
+@pytest.mark.parametrize("name", ["flight", "chain", "continuous"])
 def test_interpreted_it_is_the_scan(name, kernels):
     tables = {"flight": FLIGHT, "chain": CHAIN, "continuous": CONTINUOUS}[name]
     agree(primal(tables), 1e-12, AS_FLOWN)
     assert len(kernels) == 1
 
 
+@pytest.mark.long  # slopes along one direction are those along several, below
 def test_values_and_slopes_taken_inside_are_those_of_the_scan(kernels):
     agree(derivative(CHAIN), 1e-12)
     assert len(kernels) == 1

@@ -413,6 +413,7 @@ def test_a_summary_made_anew_is_the_same_in_whatever_order_limits_stand(command,
     assert (tmp_path / FOLDER / "worst.csv").exists()
 
 
+@pytest.mark.long  # rows with them: `test_campaign.py`; that they are asked for: the folder refuses another campaign
 def test_metrics_of_ones_own_are_kept_and_judged_by(command, tmp_path):
     (tmp_path / "m.py").write_text(OVERSHOOT)
     (tmp_path / "s.toml").write_text(SHORT_CHAIN)

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 import time
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -580,7 +581,8 @@ def cells(request, monkeypatch):
         return
     metrics = Metrics(*(np.full(2, 1e-3) for _ in Metrics._fields))
     trials = montecarlo.Trials(np.arange(2), metrics, np.full(2, rollout.OK), np.full(2, np.nan), {})
-    left = margins.Margins(**dict.fromkeys(margins.Margins._fields, np.ones(1)))
+    ones: dict[str, Any] = dict.fromkeys(margins.Margins._fields, np.ones(1))
+    left = margins.Margins(**ones)
     monkeypatch.setattr(montecarlo, "run", lambda *_: trials)
     monkeypatch.setattr(run_margins, "at_ends", lambda _: {"hand_over": (left, 0.9), "hold": (left, 0.9)})
     monkeypatch.setattr(covariance, "noise", lambda _: covariance.Noise(5e-4, 2.0, 0.1))

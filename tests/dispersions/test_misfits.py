@@ -151,14 +151,14 @@ def test_wheels_that_are_scaled_and_turned_give_and_store_along_their_true_axes(
     stored = np.array([0.5, -0.2, 0.1, 0.3])
     applied = device.over(drive, vector(0.2), vector(0.1))
     np.testing.assert_allclose(applied.mean, turned @ torque, rtol=1e-13)
-    np.testing.assert_allclose(applied.stored, turned @ (stored - 0.2 * torque), rtol=1e-13)
+    np.testing.assert_allclose(np.asarray(applied.stored), turned @ (stored - 0.2 * torque), rtol=1e-13)
     np.testing.assert_allclose(device.torque(drive, dt), turned @ torque, rtol=1e-13)
-    np.testing.assert_allclose(device.end(start, drive, queue, dt).h, stored - 0.5 * torque, rtol=1e-13)
+    np.testing.assert_allclose(np.asarray(device.end(start, drive, queue, dt).h), stored - 0.5 * torque, rtol=1e-13)
     failing = replace(device, failure_times=vector([np.inf, 0.0, np.inf, np.inf]))  # which no one knows of
     drive, queue = failing.command(start, asked, vector(np.zeros(3)), vector(0.0), dt, vector(1.0))
     torque[1] = 0.0
     np.testing.assert_allclose(failing.torque(drive, dt), turned @ torque, rtol=1e-13)
-    np.testing.assert_allclose(failing.end(start, drive, queue, dt).h, stored - 0.5 * torque, rtol=1e-13)
+    np.testing.assert_allclose(np.asarray(failing.end(start, drive, queue, dt).h), stored - 0.5 * torque, rtol=1e-13)
 
 
 @pytest.mark.long  # torque and momentum of a period: the test above; their flights: `test_hardware.py`

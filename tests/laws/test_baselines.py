@@ -116,6 +116,7 @@ def flown(law, angle, rate, t_end, period=0.005):
     return log.t[log.has_length], log.error[log.has_length, 2]
 
 
+@pytest.mark.long  # its torque at a state: `test_pd_turns_the_body_as_its_formula_says`
 def test_pd_flies_its_eigenaxis_equation():
     """theta'' + k_d theta' + k_p sin(theta/2) = 0; held over 5 ms, which is what the two differ by."""
     t, v = flown(LAWS["pd"], 2.0, 0.0, 15.0)
@@ -132,8 +133,8 @@ def sliding(name, v):
     return -((0.6 * v) ** (1 / 1.3)) if name == "terminal" else -(0.3 * v**2.0 + 0.5 * v**0.8)
 
 
-@pytest.mark.parametrize("v", short([0.1, 0.4, 0.8], [0.4]))
-@pytest.mark.parametrize("name", SLIDING)
+# how a surface is drawn near to at a state is tested of both
+@pytest.mark.parametrize(("name", "v"), short([(n, v) for n in SLIDING for v in (0.1, 0.4, 0.8)], [("terminal", 0.4)]))
 def test_on_their_surfaces_they_arrive_when_their_papers_say(name, v):
     law = replace(LAWS[name], k=vector(5.0)) if name == "terminal" else LAWS[name]
     arrival = quad(lambda v: -1.0 / sliding(name, v), 0.0, v)[0]

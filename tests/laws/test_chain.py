@@ -307,6 +307,25 @@ def test_plant_with_drift_and_gain_is_linearised_exactly():
     assert np.abs(bent.u - bare.u).max() > 0.1
 
 
+@pytest.mark.parametrize("hold", [False, True])
+def test_input_and_surface_have_slopes_in_every_gain(hold):
+    run = chain_parts([0.1, -0.02, 0.03])
+    gains = ("t_f", "eta", "k1", "surface_rate", "sign_width")
+    point = vector([5.0, 4.5, 1.2, 1.7, 0.5])
+
+    @jax.jit
+    def given(point):
+        law = with_controller(run, **dict(zip(gains, point, strict=True))).controller
+        return jnp.stack(law.torque(vector(3.1), jnp.asarray(hold), run.initial, None, jnp.zeros(1), vector(0.4)))
+
+    steps = 1e-6 * np.eye(5)
+    differences = np.stack([(given(point + h) - given(point - h)) / 2e-6 for h in steps], axis=-1)
+    np.testing.assert_allclose(jax.jacfwd(given)(point), differences, rtol=1e-6, atol=1e-6)
+    assert np.count_nonzero(np.abs(differences[0]) > 1e-4) == 3  # each phase has gains of its own, and the sign's width
+
+
+# lanes: `test_conformity.py`; slopes of the law: the test above; of sampled flights: `test_implicit.py`
+@pytest.mark.long
 def test_batches_of_chains_and_their_gradients():
     run = chain_parts([5.0, 3.0, 2.0], delta=0.5, period=0.05, noise=[1e-4, 1e-4, 1e-4], bound=0.01)
 

@@ -183,6 +183,7 @@ def test_chromium_draws_it_without_an_error_or_a_request(flown, tmp_path, hostil
     assert not any("hare" in title for title in re.findall(r'data-title="([^"]*)"', body))  # nothing is uploaded
 
 
+@pytest.mark.long  # the policy that forbids it: `checked`, of every page
 @pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
 def test_a_foreign_script_would_be_told(flown, tmp_path):
     """That the test above can fail."""
