@@ -525,6 +525,7 @@ steps = 4
 """
 
 
+@pytest.mark.long  # files of a chain: `test_other_plants_have_pages_too`; noises and starts: of campaigns of chains
 def test_a_chain_is_simulated(command, tmp_path):
     (tmp_path / "c.toml").write_text(CHAIN)
     status, out, err = command("simulate", "c.toml", "--trial", 2)

@@ -158,7 +158,7 @@ def test_what_cannot_be_written_is_refused():
         new.text(None, {"controller": {"eta": 1.0}})
 
 
-def test_the_command_writes_a_file_that_flies(command, tmp_path):
+def test_the_command_writes_a_file_and_over_none(command, tmp_path):
     assert command("new") == (0, "scenario in scenario.toml\n", "")
     written = (tmp_path / "scenario.toml").read_text()
     assert written == new.text(None, {})
@@ -170,6 +170,11 @@ def test_the_command_writes_a_file_that_flies(command, tmp_path):
     )
     assert command("new", "--like", FLIGHT, "--force", "--quiet") == (0, "", "")
     assert (tmp_path / "scenario.toml").read_text() == new.text(None, parsing.load(FLIGHT)) != written
+
+
+@pytest.mark.long  # what is written is what it is like: the test above
+def test_what_is_written_flies(command):
+    assert command("new", "--like", FLIGHT, "--quiet") == (0, "", "")
     code, said, _ = command("simulate", "scenario.toml", "--trial", 1, "--no-figures")
     assert code == 1  # with the paper's gains, over its limit
     assert "peak_torque" in said

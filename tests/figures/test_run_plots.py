@@ -12,17 +12,19 @@ from ptsmc_jax.figures import run_plots
 from ptsmc_jax.scenario import from_tables
 from tests.helpers import SHORT, SHORT_CHAIN, untuned
 
+PEAKS = [(SHORT, 0, " N m", r"peak \d"), (SHORT_CHAIN, 1, "", r"peak of the command \d")]
 
-@pytest.mark.parametrize(("delay", "said"), [(0, r"peak \d"), (1, r"peak of the command \d")])
-def test_a_peak_that_is_not_on_the_curves_is_said_to_be_the_commands(delay, said):
+
+@pytest.mark.parametrize(("text", "delay", "unit", "said"), PEAKS, ids=["0", "1"])
+def test_a_peak_that_is_not_on_the_curves_is_said_to_be_the_commands(text, delay, unit, said):
     """Delivered torque is drawn, and the metric `peak_torque` is marked, which is what was asked for."""
-    late = ptsmc_jax.replace(from_tables(untuned(SHORT)), hardware__delay=delay)
+    late = ptsmc_jax.replace(from_tables(untuned(text)), hardware__delay=delay)
     flight = ptsmc_jax.simulate(late)
     log = flight.run.log._replace(commanded=flight.run.log.commanded.copy())
-    log.commanded[17, 1] = -50.0  # the peak, at a time and about an axis that are known
+    log.commanded[17, -1] = -50.0  # the peak, at a time and about an axis that are known
     (axes,) = run_plots.torque(flight.run.parts, log).axes
     (label,) = [label for label in axes.get_legend_handles_labels()[1] if label.startswith("peak")]
-    assert label.startswith(f"peak of the command 50 N m at {log.t[17]:.4g} s")
+    assert label.startswith(f"peak of the command 50{unit} at {log.t[17]:.4g} s")
     (axes,) = flight.plot("torque")["torque"].axes
     assert any(re.match(said, label) for label in axes.get_legend_handles_labels()[1])
 

@@ -182,6 +182,7 @@ def test_vector_part_moves_as_solution_1_says_while_the_reference_crosses_the_ad
     assert np.all(np.abs(u - result.log.u[before]).max(axis=1) < 1e-9 * np.maximum(feedback, 1.0))
 
 
+@pytest.mark.long  # each of both is seen by itself: `test_align_chooses..`, and the test above
 def test_a_slew_on_which_the_additive_law_fails_and_the_multiplicative_one_does_not():
     additive, other = (fly(flown(law, CROSSING, AWAY, quiet=False)) for law in LAWS)
     assert additive.status == rollout.SINGULAR

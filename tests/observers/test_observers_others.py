@@ -101,7 +101,8 @@ def test_prescribed_time_bound_holds_against_the_worst_disturbance_and_is_no_emp
     np.testing.assert_allclose(bare(vector(2.0)), exact, rtol=1e-6)
 
 
-@pytest.mark.parametrize("mode", short(["continuous", "sampled"], ["continuous"]))
+@pytest.mark.long  # its motion and its bound by closed forms: the tests above; of every plant: below
+@pytest.mark.parametrize("mode", ["continuous", "sampled"])
 def test_prescribed_time_observer_is_inside_its_bound_at_its_own_time(mode):
     """For a spacecraft with a full inertia under a sinusoid, in the whole loop."""
     tables = {

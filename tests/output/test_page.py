@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from ptsmc_jax.campaigns import store
+from ptsmc_jax.simulation import catalogues
 from tests.helpers import short, tree
 from tests.output.pages import Page, checked
 from tuning.output import made_again, page, page_charts, search_sentences
@@ -275,8 +276,14 @@ def test_a_long_history_is_thinned_and_what_is_not_finite_is_a_gap():
 def test_other_plants_have_pages_too(command, tmp_path):
     (tmp_path / "c.toml").write_text('[plant]\nkind = "chain"\norder = 2\nx0 = [1.0, 0.0]\n[controller]\nt_f = 5.0\n')
     command("simulate", "c.toml", "--out", "chain", "--quiet")
-    read = checked(tmp_path / "chain")
-    assert set(read.charts) == {"history"}
+    folder = tmp_path / "chain"
+    assert set(checked(folder).charts) == {"history"}
+    assert (folder / "trajectory.csv").read_text().splitlines()[0] == "t,x1,x2,d_hat1,u1,s1"
+    names = {path.stem for path in (folder / "figures").iterdir()}
+    assert names == {"states", "error", "torque", "sliding", "convergence"}
+    summary = json.loads((folder / "summary.json").read_text())
+    assert set(catalogues.STATE_CATALOGUE) <= set(summary)
+    assert not {"peak_momentum", "terminal_angle"} & set(summary)
 
 
 def test_a_comparison_is_made_again_with_its_laws():
