@@ -178,7 +178,7 @@ class Unsigned(Odd):
 
     def begin(self) -> Any:
         """The memory [-]."""
-        return jnp.zeros(3, jnp.uint64)
+        return jnp.zeros(1, jnp.uint64)
 
     def step(self, memory: Any, now: Any, error: Any, error_rate: Any, bound: Any) -> Any:
         """PD, which counts."""
@@ -201,7 +201,7 @@ class Lost(ptsmc.AccelerationLaw):
     ],
 )
 def test_what_cannot_be_written_or_checked_is_said(tmp_path, law, said):
-    flown = {**FLIGHTS["raw"], "controller": {"kind": "own", "code": law, "t_f": 5.0}}
+    flown = {**FLIGHTS["chain"], "controller": {"kind": "own", "code": law, "t_f": 5.0}}
     made = scenario.reading.complete(scenario.from_tables(flown))
     with pytest.raises(ScenarioError, match=said):
         folder.export(made, tmp_path / "controller", name="law", trials=1)

@@ -157,6 +157,7 @@ def test_a_free_undamped_mode_rings_at_its_frequency_over_the_root_of_what_is_le
     np.testing.assert_allclose(formulas.free_modes(np.diag(J), [W], [[d, 0.0, 0.0]]), [omega], rtol=1e-12)
 
 
+@pytest.mark.long  # with coupling: the independent integration above
 def test_without_coupling_it_flies_as_a_rigid_body():
     uncoupled = {**SATELLITE, "flexible": {**SATELLITE["flexible"], "coupling": [[0.0] * 3] * 4}}
     ready = scenario.study(scenario.from_tables(uncoupled))

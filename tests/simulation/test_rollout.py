@@ -197,6 +197,7 @@ def test_held_torque_is_what_an_adaptive_integrator_makes_of_it():
     np.testing.assert_allclose(np.concatenate([log.x.q[-1], log.x.w[-1]]), y, atol=1e-7)
 
 
+@pytest.mark.long  # of sampled runs by the command: `tests/cli/test_cli.py`; clocks by themselves: `test_clock.py`
 def test_the_last_row_is_at_t_end_and_time_never_runs_backwards():
     for run in (parts(), parts(period=0.07), parts(period=0.069, flight=True, t_end=41.37)):
         log = fly(run).log
