@@ -211,13 +211,17 @@ def test_without_a_whole_period_before_the_hand_over_margins_are_those_in_hold(p
     assert np.isnan(course.at_sensors.delay).all()  # what comes late is a command
 
 
+LIMITED = {
+    "plant": {"kind": "chain", "x0": [1.0, 0.0]}, "disturbance": {"kind": "none"},
+    "controller": {"t_f": 3.0, "delta": 1.0, "sign_width": 0.1},
+    "loop": {"mode": "sampled", "period": 0.1, "window": 1.0},
+    "hardware": {"torque_limit": 0.02},
+}  # fmt: skip
+
+
 def test_where_a_limit_cuts_the_command_the_loop_is_said_to_be_open():
     """There L is zero: margins have no limit, which is no merit of the gains."""
-    tables = {"plant": {"kind": "chain", "x0": [1.0, 0.0]}, "disturbance": {"kind": "none"},
-              "controller": {"t_f": 3.0, "delta": 1.0, "sign_width": 0.1},
-              "loop": {"mode": "sampled", "period": 0.1, "window": 1.0},
-              "hardware": {"torque_limit": 0.02}}  # fmt: skip
-    ready, course = stability.find(scenario.from_tables(tables))
+    ready, course = stability.find(scenario.from_tables(LIMITED))
     found = stability.summary(ready, course)
     cut = [one for one in found["before"] if one["open"]]
     assert cut
@@ -231,7 +235,7 @@ def test_where_a_limit_cuts_the_command_the_loop_is_said_to_be_open():
     result: Any = SimpleNamespace(summary=found)
     heading, _ = page._margins(result)
     assert heading.headline.startswith("The loop in hold is open")
-    free = scenario.from_tables(tables | {"hardware": {"torque_limit": 50.0}})
+    free = scenario.from_tables(LIMITED | {"hardware": {"torque_limit": 50.0}})
     found = stability.summary(*stability.find(free))
     assert not any(one["open"] for one in (found, *found["before"]))
     assert "missed" not in found
@@ -246,22 +250,39 @@ def test_where_a_limit_cuts_the_command_the_loop_is_said_to_be_open():
     assert str(found["hold"]["u1"]["modulus"]) == "0.0"  # was -0
 
 
+def blamed_on_no_limit(found, first, limited):
+    """Checks what is said of a sample of which the law makes nothing, in a run that a limit cuts elsewhere or not."""
+    assert (first["open"], first["cut"]) == (["u1"], [])
+    assert any(loop["cut"] for loop in (found, *found["before"])) == limited
+    lines, left = list(margin_sentences.lines(found)), f"{first['time_to_go']:.3g} s to go"
+    assert sum(f"make nothing of the state at input u1 before the hand-over, at {left}" in line for line in lines) == 1
+    assert any("limit of the actuators" in line for line in lines) == limited
+    itself: Any = SimpleNamespace(summary=found | {"open": ["u1"], "cut": []})
+    heading, _ = page._margins(itself)
+    assert "limit" not in heading.headline
+
+
+@pytest.mark.parametrize("limit", [50.0, 0.5])
+def test_a_sample_of_which_the_law_makes_nothing_is_blamed_on_no_limit(limit):
+    """`margins` said that a limit cuts it."""
+    ready, course = stability.find(scenario.from_tables(LIMITED | {"hardware": {"torque_limit": limit}}))
+    k = np.flatnonzero(course.loops.new[:-1, 0].any(axis=(1, 2)))[0]  # where no limit cuts the command
+    nothing = {"gain_up": np.inf, "gain_down": np.inf, "phase": 180.0, "modulus": 0.0, "crossover": np.nan}
+    each = {name: getattr(course.at_input, name).copy() for name in nothing}
+    for name, value in nothing.items():
+        each[name][k] = value
+    found = stability.summary(ready, course._replace(at_input=course.at_input._replace(**each)))
+    blamed_on_no_limit(found, found["before"][k], limit < 1.0)
+
+
+@pytest.mark.long  # what is said of such a sample: above
 @pytest.mark.parametrize("hardware", [{}, {"torque_limit": 0.02}])
-def test_a_sample_of_which_the_law_makes_nothing_is_blamed_on_no_limit(hardware):
-    """The first one of a time base, whose profile begins where the error is: `margins` said that a limit cuts it."""
+def test_the_first_sample_of_a_time_base_is_one_of_which_the_law_makes_nothing(hardware):
+    """Its profile begins where the error is."""
     tables = {"plant": {"kind": "chain", "x0": [1.0, 0.0]}, "disturbance": {"kind": "none"},
               "controller": {"kind": "time_base_pd", "t_f": 3.0},
               "loop": {"mode": "sampled", "period": 0.1, "window": 1.0},
               "hardware": hardware}  # fmt: skip
     found = stability.summary(*stability.find(scenario.from_tables(tables)))
-    first = found["before"][0]
-    assert (first["time_to_go"], first["open"], first["cut"]) == (3.0, ["u1"], [])
-    assert any(loop["cut"] for loop in (found, *found["before"])) == bool(hardware)
-    lines = list(margin_sentences.lines(found))
-    assert (
-        sum("make nothing of the state at input u1 before the hand-over, at 3 s to go" in line for line in lines) == 1
-    )
-    assert any("limit of the actuators" in line for line in lines) == bool(hardware)
-    itself: Any = SimpleNamespace(summary=found | {"open": ["u1"], "cut": []})
-    heading, _ = page._margins(itself)
-    assert "limit" not in heading.headline
+    assert found["before"][0]["time_to_go"] == 3.0
+    blamed_on_no_limit(found, found["before"][0], bool(hardware))
