@@ -198,7 +198,7 @@ def test_slopes_of_the_ascent_agree_with_central_differences(what):
         problem, _ = posed(variation.Dispersion(attitudes.AxisAngle(vector(0.4), vector(2.0))))
         limits = {"peak_torque": 0.5, "effort": 3.0}
     else:
-        limits = {"peak_rate": 0.05, "effort": 3.0}
+        limits = {"effort": 3.0, "peak_rate": 0.05}
         problem, _ = swinging(0.0, [1.0, 0.1], 0.01, **limits)
     fleet = problem.others(np.arange(4, 7))
     y = np.concatenate([worst._charted(problem, name, v) for name, v in fleet.coordinates.items()], axis=1)
