@@ -221,6 +221,38 @@ def delay_at(w: Array, seen: Array) -> tuple[Array, Array]:
     return jnp.where(there, jnp.where(left < 0.0, left + 2.0 * jnp.pi, left) / at, jnp.inf), at
 
 
+def zeros_of(values: Complex[Array, "rows points"], count: int) -> tuple[Array, Array]:
+    """Near zeros of an analytic function that is real at the last point: rows and points, (count,) each, with shares.
+
+    Those of the first rows; infinite rows where there are no more. By the argument principle: there is one between two
+    rows and two points around which the function goes around zero, as it crosses the negative real axis along the four
+    lines from one to the next, and at the last point where its sign changes. Two of them in one place may be missed.
+    """
+    x, y = values.real, values.imag.at[:, -1].set(0.0)
+    above = (y >= 0.0).astype(int)
+
+    def crossed(begin: tuple, end: tuple) -> Array:
+        """1 where the line from one to the next comes from above, -1 where it comes from below, else 0."""
+        way = above[begin] - above[end]
+        return jnp.where(way * (x[begin] * y[end] - x[end] * y[begin]) > 0.0, way, 0)
+
+    every, first, later = slice(None), slice(None, -1), slice(1, None)
+    by_points, by_rows = crossed((every, first), (every, later)), crossed((first, every), (later, every))
+    turns = by_points[:-1] + by_rows[:, 1:] - by_points[1:] - by_rows[:, :-1]
+    inside = jnp.append(turns != 0, x[:-1, -1:] * x[1:, -1:] < 0.0, axis=1)
+    rows, places = smallest(jnp.where(inside, jnp.arange(len(inside))[:, None], jnp.inf).reshape(-1), count)
+    row, point = jnp.divmod(places, values.shape[1])
+    last = point == values.shape[1] - 1
+    # by a plane through three corners
+    here = values[row, point]
+    to_row, to_point = values[row + 1, point] - here, jnp.where(last, 1j, values[row, point + 1] - here)
+    area = (jnp.conj(to_point) * to_row).imag
+    area = jnp.where(area == 0.0, 1.0, area)
+    by_row = -(jnp.conj(to_point) * here).imag / area
+    by_point = jnp.where(last, 0.0, (jnp.conj(to_row) * here).imag / area)
+    return rows + by_row.clip(0.0, 1.0), point + by_point.clip(0.0, 1.0)
+
+
 def ends_at(ends: Array) -> Array:
     """Whether L [-] is real at the ends of the grid too, bool: a pole comes to 1 there, or to -1."""
     return jnp.abs(ends.imag) < REAL * jnp.abs(ends.real)

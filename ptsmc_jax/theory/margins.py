@@ -260,8 +260,8 @@ def _delay(loop: Loop, w: Array, seen: Array, axis: Array) -> Scalar:
 def _looked_through(loop: Loop, of_a: tuple[Array, Array], w: Array, axis: Array) -> Array:
     """Near where the loop comes to its border as the axis is later and later, in steps: (NEAR, 2), see `border`.
 
-    At each step L is known, and how far to go from there, or back, it tells as it does of no delay: for about a step
-    the hold does not matter. Those of the least delays; infinite where there are none. of_a: as in `_delay_step`.
+    At each step L is known at all frequencies, and 1 + L is zero near where it goes around zero. Those of the least
+    delays; infinite where there are none. of_a: as in `_delay_step`.
     """
     a, command = loop.closed_at_sensors()
     z = jnp.exp(1j * w * loop.period)
@@ -281,17 +281,10 @@ def _looked_through(loop: Loop, of_a: tuple[Array, Array], w: Array, axis: Array
     nodes = replace(loop, new=new, old=old / z[None])
     parts = jnp.arange(PARTS) / PARTS
     within = jax.vmap(lambda part: jnp.add(*linear.acting(nodes, part)))(parts)
-    left, crossed = jax.vmap(crossings.delay_at, (None, 0))(w, within)
-    left, turn = left / loop.period, 2.0 * jnp.pi / (crossed * loop.period)
-
-    def after(whole: Array) -> Array:
-        # a period turns L and leaves its size: of the delays, a turn apart, the one that is nearest to so many
-        rest = jnp.where(jnp.isfinite(left), jnp.mod(left - whole + 0.5 * turn, turn) - 0.5 * turn, jnp.inf)
-        late = whole + parts[:, None] + rest
-        return jnp.where((jnp.abs(rest) < 1.25 / PARTS) & (late > 0.0), late, jnp.inf)
-
-    values, places = crossings.smallest(jax.vmap(after)(jnp.arange(LOOKED)).reshape(-1), NEAR)
-    return jnp.stack([jnp.log(crossed.reshape(-1)[places % crossed.size]), values], axis=1)
+    wholes = jnp.arange(LOOKED)[:, None, None]
+    late = (within[None] * z[None, None] ** -wholes).reshape(-1, w.size)  # a period turns L and leaves its size
+    step, point = crossings.zeros_of(1.0 + late, NEAR)
+    return jnp.stack([jnp.log(jnp.interp(point, jnp.arange(w.size), w)), step / PARTS], axis=1)
 
 
 @jax.jit
