@@ -87,7 +87,8 @@ class Interval(NamedTuple):
 def integral_in_window(t: Any, t_next: Any, squares: tuple[Any, Any, Any], criteria: Criteria) -> Any:
     """Integral over the part of an interval inside the window of the parabola through its start, middle and end [s].
 
-    Of JAX's arrays or NumPy's.
+    Of JAX's arrays or NumPy's. The parabola may fall below zero in between, where squares do not: a share L of the
+    interval has at least L^3 / 4 of the whole, as of an error that moves along a line through zero in its midst.
     """
     dt, (g0, g1, g2) = t_next - t, squares
 
@@ -97,4 +98,6 @@ def integral_in_window(t: Any, t_next: Any, squares: tuple[Any, Any, Any], crite
     def primitive(x: Any) -> Any:
         return x * (g0 + x * ((-3 * g0 + 4 * g1 - g2) / 2 + x * (2 * g0 - 4 * g1 + 2 * g2) / 3))
 
-    return dt * (primitive(fraction(criteria.t_f + criteria.window)) - primitive(fraction(criteria.t_f)))
+    begin, end = fraction(criteria.t_f), fraction(criteria.t_f + criteria.window)
+    least = (end - begin) ** 3 / 4 * (g0 + 4 * g1 + g2) / 6
+    return dt * (primitive(end) - primitive(begin)).clip(min=least)

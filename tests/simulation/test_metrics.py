@@ -11,7 +11,16 @@ from ptsmc_jax.numerics import attitude
 from ptsmc_jax.plants.rigid_body import AttitudeState
 from ptsmc_jax.signals import references
 from ptsmc_jax.simulation import catalogues, metrics
-from ptsmc_jax.simulation.interval import Arrival, Criteria, Errors, Interval, Snapshot, Start, Torques
+from ptsmc_jax.simulation.interval import (
+    Arrival,
+    Criteria,
+    Errors,
+    Interval,
+    Snapshot,
+    Start,
+    Torques,
+    integral_in_window,
+)
 from tests.helpers import fly, parts, short, vector
 
 
@@ -153,6 +162,27 @@ def test_angles_after_t_f_are_the_largest_and_the_rms_of_the_parabola_through_th
     np.testing.assert_allclose(found.window_angle, np.sqrt((0.09 + 0.03 + 0.01) / 3), rtol=1e-14)
     later = judge([interval(0, 1, (1.0, 0.1)), interval(1, 2, (0.1, 0.2)), interval(2, 4, (0.2, 0.4))])
     np.testing.assert_allclose(later.hold_angle, 0.4)  # to the end of the run, not of the window
+
+
+def part(squares, begin, end):
+    """Of an interval from 2 to 2.5 s, between these shares of it."""
+    times = (2.0 + 0.5 * begin, 9.0, 0.5 * (end - begin), 0.1)
+    return integral_in_window(vector(2.0), vector(2.5), squares, Criteria(*map(vector, times)))
+
+
+def test_a_part_of_an_interval_has_a_share_of_its_square_however_near_the_error_comes_to_zero_in_it():
+    """Of errors along a line exactly; else the parabola may be below zero there: a run's RMS was no number."""
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        zero, (begin, end) = rng.uniform(-0.2, 1.2), np.sort(rng.uniform(0.0, 1.0, 2))
+        exact = 0.5 * ((end - zero) ** 3 - (begin - zero) ** 3) / 3.0
+        along = [(x - zero) ** 2 for x in (0.0, 0.5, 1.0)]
+        np.testing.assert_allclose(part(along, begin, end), exact, rtol=1e-9)
+    bent = (1.0, 0.01, 4.0)  # an error that is nearly zero in the middle, and no line
+    np.testing.assert_allclose(part(bent, 0.0, 1.0), 0.5 * 5.04 / 6.0, rtol=1e-14)  # Simpson's
+    np.testing.assert_allclose(part(bent, 0.3, 0.5), 0.5 * 0.2**3 / 4.0 * 5.04 / 6.0, rtol=1e-9)
+    wider = [float(part(bent, 0.3, end)) for end in np.linspace(0.31, 1.0, 70)]
+    assert np.all(np.diff(wider) > 0.0)
 
 
 def test_the_torque_of_wheels_is_the_largest_of_any():
