@@ -109,6 +109,14 @@ def test_the_body_is_turned_by_its_rate():
     np.testing.assert_allclose(x.q * np.sign(x.q[3]), end * np.sign(end[3]), rtol=0, atol=100 * 0.01**5 / 120)
 
 
+@pytest.mark.parametrize("dt", [0.02, 0.5, 4.0])
+def test_a_body_that_turns_more_than_a_radian_in_a_step_is_too_fast(dt):
+    body, still = rigid_body.spacecraft(PAPER_INERTIA), vector([0.0, 0.0, 0.0, 1.0])
+    for turn, too_fast in ((0.99, False), (1.01, True)):
+        w = turn / dt * vector([0.6, 0.0, -0.8])
+        assert bool(body.too_fast(rigid_body.AttitudeState(still, w), vector(dt))) == too_fast
+
+
 def test_normalise_restores_the_norm_alone():
     x = rigid_body.AttitudeState(vector([0.1, 0.2, -0.3, 0.4]), vector([1.0, 2.0, 3.0]))
     got = rigid_body.spacecraft(PAPER_INERTIA).normalise(x)
