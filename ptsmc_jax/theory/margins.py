@@ -25,7 +25,7 @@ from ptsmc_jax.theory.linear import Loop, Opening
 NEUTRAL = 1e-6  # by which a pole may lie outside the unit circle: rounding of those of stored momentum
 NEAREST = 3  # places where |L| is 1 from which a delay is searched for, those of the least estimates
 LOOKED, PARTS = 8, 16  # periods of delay that are looked through, and in how many steps each
-NEAR = 6  # places from there that it is searched from too, about two for each border
+NEAR = 6  # places from there that it is searched from too
 STARTS, FARTHER = 8, 0.15  # of Newton's search for a delay, at most, and by how many periods each lies beyond the last
 
 
