@@ -423,9 +423,8 @@ def test_each_sensor_of_a_chain_has_its_own_phase_margin():
     held_by_each_sensor(loop)
 
 
-def bears_delays_below_its_margin(seed, most=1.0):
-    """Checks by poles that a drawn loop does; most: their largest modulus."""
-    loop = jax.tree.map(np.asarray, drawn_loop(seed))
+def bears_delays_below_its_margin(loop, most=1.0):
+    """Checks by poles that a loop of NumPy's arrays does; most: their largest modulus."""
     for axis, border in enumerate(np.asarray(of(loop).delay) / loop.period):
         for share in np.append(np.arange(0.02, 1.0, 0.02), 0.9999):
             assert radius_late(loop, axis, share * min(border, 12.0)) < most, (axis, border, share)
@@ -435,15 +434,16 @@ def bears_delays_below_its_margin(seed, most=1.0):
 @pytest.mark.parametrize("seed", [*LATE, *AT_NYQUIST])
 def test_a_loop_bears_all_delays_below_its_margin(seed):
     """Of loops where it hangs on which crossings are looked at, and on how far they are looked for."""
-    bears_delays_below_its_margin(seed)
+    bears_delays_below_its_margin(jax.tree.map(np.asarray, drawn_loop(seed)))
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("seed", range(3000, 3200))
 def test_any_stable_loop_bears_all_delays_below_its_margin(seed):
     """But for those between two steps of a sixteenth of a period, with which a pole hardly leaves the circle."""
-    if radius_late(jax.tree.map(np.asarray, drawn_loop(seed)), 0, 0.0) < 1.0:
-        bears_delays_below_its_margin(seed, most=1.001)
+    loop = jax.tree.map(np.asarray, drawn_loop(seed))
+    if radius_late(loop, 0, 0.0) < 1.0:
+        bears_delays_below_its_margin(loop, most=1.001)
 
 
 def test_zeros_are_found_near_where_they_are():
@@ -510,12 +510,9 @@ def test_a_flexible_body_bears_all_delays_below_its_margin(frequency):
         "hardware": {"attitude_noise": 2e-5, "rate_noise": 1e-6},
     }
     loop = jax.tree.map(np.asarray, opened(scenario.study(scenario.from_tables(tables)).parts, hold=False))
-    found = np.asarray(of(loop).delay) / float(loop.period)
     assert radius_late(loop, 0, 0.0) < 1.0
-    for axis, border in enumerate(found):
-        for share in np.append(np.arange(0.02, 1.0, 0.02), 0.9999):
-            assert radius_late(loop, axis, share * border) < 1.0, (axis, border, share)
-        assert radius_late(loop, axis, 1.0001 * border) > 1.0
+    assert np.all(of(loop).delay < 12.0 * loop.period)
+    bears_delays_below_its_margin(loop)
 
 
 @pytest.mark.long
