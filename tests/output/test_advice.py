@@ -287,6 +287,13 @@ def test_slopes_that_have_no_differences_are_not_said_to_agree_with_them(start, 
     assert told.startswith(f"slopes by automatic differentiation {said}")
 
 
+def test_gains_that_no_trial_ends_with_have_no_known_influence():
+    found = {"influence": {"eta": "unknown", "delta": "unknown"}, "slopes_off_central_differences": None}
+    told = list(search_sentences.trust({"trust": found, "at_bound": {"eta": "upper"}, "verdicts": []}))
+    assert told[0].startswith("what eta, delta does is unknown: no training trial ends")
+    assert not [line for line in told if "bound" in line[:30] or "influence" in line]
+
+
 def test_slopes_that_are_off_may_be_due_to_steps_of_the_torque():
     """With steps of 1 mN m on a large satellite they were off by 3 in a loop that neither chatters nor breaks off."""
     found = {"influence": {}, "slopes_off_central_differences": {"start": 3.0, "end": 2.0}}

@@ -98,6 +98,7 @@ def test_where_a_trial_fails_no_limit_is_kept_and_without_one_that_ends_there_is
     found = trust.profiles(evaluate, asked, bounds.share(np.array([0.7])))["k"]
     np.testing.assert_array_equal(found.over <= 1.0, found.gain >= 0.5)
     np.testing.assert_array_equal(np.isnan(found.value), found.gain < 0.25)
+    assert found.seen
     assert not found.flat
     assert np.isnan(trust.slope_error(evaluate, asked, bounds.share(np.array([0.1]))))
     assert trust.slope_error(evaluate, asked, bounds.share(np.array([0.7]))) == 0.0

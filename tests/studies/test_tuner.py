@@ -136,6 +136,15 @@ def test_accuracy_beside_the_papers_gains_is_over_the_trials_that_both_fly_to_th
     assert tune_files._accuracy_gain({"tuned": flown(errors, 3)}) == nothing
 
 
+@pytest.mark.parametrize(("goal", "said"), [(np.nan, "unknown"), (1e-3, "none")])
+def test_a_gain_with_which_no_trial_ends_anywhere_is_not_one_without_influence(goal, said):
+    """What stands for the goal where no trial has one is the same for all gains."""
+    profile = trust.Profile(np.arange(3.0), np.full(3, goal), np.ones(3), np.zeros(3))
+    found: Any = SimpleNamespace(slope_error=None, profiles={"eta": profile}, sensitivities={}, margins={})
+    tuning: Any = SimpleNamespace(tuned=SimpleNamespace(sampled=True, hardware=None), at_bound={"eta": "upper"})
+    assert tune_files._trust(found, tuning)["influence"] == {"eta": said}
+
+
 def test_every_column_of_a_history_has_a_name_of_its_own():
     tables = tomllib.loads(SHORT_CHAIN) | {"tune": {"objective": "t_f", "free": ["eta", "t_f"]}}
     columns = tune_files.history_columns(scenario.from_tables(tables), ["peak_torque"])

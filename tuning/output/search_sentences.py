@@ -154,12 +154,15 @@ def trust(summary: Summary) -> Iterator[str]:
     record = summary.get("trust")
     influence = {} if record is None else record["influence"]
     for gain, side in summary["at_bound"].items():
-        if influence.get(gain) == "none":
+        if influence.get(gain) in ("none", "unknown"):
             continue
         yield f"{gain} ended on its {side} bound" + (f": {influence[gain]}" if gain in influence else "")
     for gain, how in influence.items():
         if how == "none":
             yield f"{gain} has no influence: goal and limits change by less than 1 % between its bounds"
+    unknown = ", ".join(gain for gain, how in influence.items() if how == "unknown")
+    if unknown:
+        yield f"what {unknown} does is unknown: no training trial ends, wherever between the bounds"
     if record is None:
         return
     # where no gain is flown with the exact sign, whose loop has no margins to ask for

@@ -51,6 +51,11 @@ class Profile:
     nearest: list[str] = field(default_factory=list)  # (points,) whose the largest metric / limit is
 
     @property
+    def seen(self) -> bool:
+        """Whether a trial has a goal anywhere: if none has, what stands for it is the same everywhere."""
+        return bool(np.isfinite(self.value).any())
+
+    @property
     def flat(self) -> bool:
         """Whether neither F nor the nearest limit depends on the gain."""
         steady = self.f.max() - self.f.min() <= np.log1p(FLAT)

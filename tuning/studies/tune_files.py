@@ -125,7 +125,9 @@ def _trust(found: Trust, tuning: Tuning) -> dict[str, Any]:
     ideal = not tuning.tuned.sampled and tuning.tuned.hardware is None
     influence = {}
     for name, profile in found.profiles.items():
-        if profile.flat:
+        if not profile.seen:
+            influence[name] = "unknown"
+        elif profile.flat:
             influence[name] = "none"
         elif name not in tuning.at_bound:
             influence[name] = "optimum inside its bounds"
