@@ -63,7 +63,8 @@ def sliding_bound(parts: Parts, t: ArrayLike) -> np.ndarray:
     law, n = parts.controller, parts.controller.order
     s0, floor = sliding_envelope(parts)
     tau = np.maximum(float(law.t_f) - np.asarray(t), 0.0)
-    return np.sqrt(s0**2 * (tau / float(law.t_f)) ** (2.0 * (float(law.eta) + n - 2.0)) + floor * tau**n)
+    falling = s0 * (tau / float(law.t_f)) ** (float(law.eta) + n - 2.0)
+    return np.hypot(falling, np.sqrt(floor * tau**n))
 
 
 def error_bound(parts: Parts, t: ArrayLike) -> np.ndarray:

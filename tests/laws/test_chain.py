@@ -226,6 +226,14 @@ def test_envelopes_are_not_empty():
     assert np.max(np.abs(log.x[before, 0]) / flown) > 0.99
 
 
+def test_the_bound_on_s_is_a_number_where_its_square_is_none():
+    """Without a residual it is |s(0)| (tau / t_f)^(eta + n - 2), and s(0) is linear in the start."""
+    t = np.linspace(0.0, 5.0, 6)
+    one, far = (envelopes.sliding_bound(chain_parts([x, 0.0, 0.0], eta=4.0), t) for x in (1.0, 1e153))
+    assert far[0] > np.sqrt(np.finfo(float).max)
+    np.testing.assert_allclose(far, 1e153 * one, rtol=1e-12)
+
+
 def test_exact_chain_of_order_two_is_the_exact_error():
     for t in (0.0, 1.0, 6.9):
         both = solutions.exact_error(vector(t), vector(7.0), vector(2.7), vector([0.7]), vector([-0.3]))
