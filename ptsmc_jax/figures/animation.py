@@ -70,7 +70,7 @@ def of_run(parts: Parts, log: Log, frames: int = 40) -> Animation:
             edges, axes_of_body = body(q[k])
             for lines, ends in ((box, edges), (own, axes_of_body), (wanted, body(q_f[k])[1])):
                 for line, both in zip(lines, ends, strict=True):
-                    line.set_data_3d(*both.T)  # pyright: ignore[reportAttributeAccessIssue]
+                    line.set_data_3d(*both.T)
             title.set_text(f"t = {t[shown[k]]:.1f} s; dashed: reference")
             return [*box, *own, *wanted, title]
 

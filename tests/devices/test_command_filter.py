@@ -94,7 +94,7 @@ def test_the_loop_of_linear_theory_has_the_filter_in_it():
         found.append(jax.jit(crossings.in_triangles(opening).response)(np.exp(1j * H * np.array(tones)))[0])
     b, a = signal.bilinear([36.0], [1.0, 2 * 0.7 * 6.0, 36.0], fs=6.0 / (2 * np.tan(6.0 * H / 2)))
     for w, without, behind in zip(tones, *found, strict=True):
-        _, factor = signal.freqz(np.asarray(b), np.asarray(a), worN=np.array([w * H]))  # pyright: ignore[reportArgumentType]
+        _, factor = signal.freqz(np.asarray(b), np.asarray(a), worN=np.array([w * H]))
         np.testing.assert_allclose(behind, factor[0] * without, rtol=0, atol=1e-4 * np.abs(without).max())
 
 

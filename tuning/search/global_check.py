@@ -66,7 +66,7 @@ def check(
         popsize=POPULATION,
         maxiter=GENERATIONS,
         tol=0.0,
-        atol=SPREAD,  # pyright: ignore[reportArgumentType]
+        atol=SPREAD,
         rng=np.random.default_rng(seed),
         polish=False,
         vectorized=True,
