@@ -19,7 +19,6 @@ from jaxtyping import Array
 
 from ptsmc_jax import programs
 from ptsmc_jax.batching import lapack
-from ptsmc_jax.numerics import matrices
 from ptsmc_jax.simulation import computer
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.theory import linear
@@ -122,7 +121,8 @@ def _unexplained(parts: Parts, run: linear.Nominal) -> tuple[Array, Array]:
             return computer.command(parts, k2, period, before, model.retract(seen, by), target, d_hat)[0]
 
         zero = jnp.zeros(model.local_coordinates(seen, seen).size)
-        way = -matrices.solve(jax.jacfwd(error)(zero), error(zero))
+        # LAPACK's: written out, a body's six equations are compiled for longer than all else here
+        way = -jnp.linalg.solve(jax.jacfwd(error)(zero), error(zero))
         here, sloped = jax.jvp(commanded, (zero,), (way,))
         whole = commanded(way) - here
         return whole - sloped, whole
