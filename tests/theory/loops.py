@@ -1,5 +1,7 @@
 """Loops by their matrices, for which no scenario has to be linearised, and what they are."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,10 +23,43 @@ ALL_AT_ONCE = {
 }  # fmt: skip
 
 
+# states, what sensors see of them, inputs: as many as a chain has, whose loops need no programs of their own
+ROOM, LATE_ROOM = (8, 2, 2), (9, 2, 1)
+
+
 def of(loop, **how):
-    return jax.tree.map(
-        lambda v: np.asarray(v)[0], margins.of_each(jax.tree.map(lambda v: np.asarray(v)[None], loop), **how)
-    )
+    """Its margins; of small loops by one program without delay, by that of slopes behind a period of it."""
+    sizes, room = (*loop.seen.shape, len(loop.command)), {0: ROOM, 1: LATE_ROOM}.get(loop.delay)
+    if not how and room is not None and np.all(np.array(sizes) <= room):
+        loop = larger(loop, *room)
+        if loop.delay == 1:
+            return jax.tree.map(np.asarray, sloped(loop, jax.tree.map(np.zeros_like, loop))[2])
+    each = margins.of_each(jax.tree.map(lambda v: np.asarray(v)[None], loop), **how)
+    return jax.tree.map(lambda v: np.asarray(v)[0] if how else np.asarray(v)[0, : sizes[2]], each)
+
+
+@jax.jit
+def sloped(loop, way):
+    """Those of the first input, their slopes along a way, and all of them."""
+
+    def margins_of(loop):
+        found = margins.of(loop)
+        return jnp.stack([getattr(found, name)[0] for name in margins.FIELDS]), found
+
+    return jax.jvp(margins_of, (loop,), (way,), has_aux=True)
+
+
+def larger(loop, n, k, m):
+    """The loop with states and inputs besides that nothing moves, and that move nothing."""
+    sizes = {"a": (n, n), "seen": (n, k), "new": (n, m), "old": (n, m), "command": (m, n), "direct": (m, k),
+             "disturbed": (n, m)}  # fmt: skip
+
+    def grown(v, sizes):
+        more = [(0, to - size) for to, size in zip(sizes, np.shape(v)[-2:], strict=True)]
+        return np.pad(np.asarray(v), [(0, 0)] * (np.ndim(v) - 2) + more)
+
+    all_of = replace(loop, **{name: grown(getattr(loop, name), to) for name, to in sizes.items()})
+    return jax.tree.map(np.asarray, all_of)  # whose types are never weak
 
 
 def a_loop(a, b, c):

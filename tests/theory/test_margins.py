@@ -17,7 +17,18 @@ from ptsmc_jax.theory import borders, crossings, linear, margins, rest, run_marg
 from ptsmc_jax.theory.carries import Local
 from tests.helpers import equations, fly, short
 from tests.helpers import parts as a_body
-from tests.theory.loops import ALL_AT_ONCE, INTEGRATORS, a_loop, drawn_loop, held, of, radius_late
+from tests.theory.loops import (
+    ALL_AT_ONCE,
+    INTEGRATORS,
+    LATE_ROOM,
+    a_loop,
+    drawn_loop,
+    held,
+    larger,
+    of,
+    radius_late,
+    sloped,
+)
 from tuning.search.gains import with_gains
 
 CHAIN = {
@@ -126,20 +137,15 @@ def test_gain_margin_of_a_sampled_double_integrator():
 
 def test_slopes_of_margins_are_those_of_central_differences():
     """Along all numbers of a loop, its period too; of a chain's gains see below."""
-    loop = replace(held(*INTEGRATORS, 0.2), delay=1)
+    loop = larger(replace(held(*INTEGRATORS, 0.2), delay=1), *LATE_ROOM)
     rng = np.random.default_rng(5)
-    ways = [jax.tree.map(lambda v: v * rng.normal(size=v.shape), loop) for _ in range(3)]
-
-    def margins_at(step, way):
-        found = margins.of(jax.tree.map(lambda v, by: v + step * by, loop, way))
-        return jnp.stack([found.gain_up[0], found.gain_down[0], found.phase[0], found.delay[0], found.modulus[0]])
-
-    sloped = jax.jit(lambda step, way: jax.jvp(lambda step: margins_at(step, way), (step,), (1.0,)))
+    ways = [jax.tree.map(lambda v: v * rng.normal(size=np.shape(v)), loop) for _ in range(3)]
     h = 1e-4
     for way in ways:
-        far_down, down, up, far_up = (np.asarray(sloped(n * h, way)[0]) for n in (-2, -1, 1, 2))
+        moved = {n: jax.tree.map(lambda v, by, n=n: v + n * h * by, loop, way) for n in (-2, -1, 1, 2)}
+        far_down, down, up, far_up = (np.asarray(sloped(one, way)[0]) for one in moved.values())
         numeric = (8 * (up - down) - far_up + far_down) / (12 * h)
-        exact = np.asarray(sloped(0.0, way)[1])
+        exact = np.asarray(sloped(loop, way)[1])
         assert np.all(np.abs(exact) > 1e-6)
         np.testing.assert_allclose(exact, numeric, rtol=1e-6, atol=1e-9 * np.abs(exact).max())
 
@@ -453,14 +459,15 @@ def test_zeros_are_found_near_where_they_are():
     def at(k, j):
         return (row - k) * np.exp(0.7j) + (point - j) * np.exp(2.0j)
 
+    zeros_of = jax.jit(lambda values: crossings.zeros_of(values, 2))
     for k, j in ((3.3, 4.6), (0.2, 0.7)):
         turned = at(k, j)
         turned[:, -1] = 1.0
-        rows, points = crossings.zeros_of(jnp.asarray(turned), 2)
+        rows, points = zeros_of(jnp.asarray(turned))
         np.testing.assert_allclose((rows[0], points[0]), (k, j), rtol=1e-12)
         assert np.isinf(rows[1])
     last = (row - 2.4) + 1j * (8.0 - point) * 3.0 + (8.0 - point) ** 2
-    rows, points = crossings.zeros_of(jnp.asarray(last), 1)
+    rows, points = zeros_of(jnp.asarray(last))
     np.testing.assert_allclose((rows[0], points[0]), (2.4, 8.0), rtol=1e-12)
 
 
@@ -688,6 +695,7 @@ def test_a_slow_pole_comes_to_one_where_the_loop_is_real_at_rest_only():
     np.testing.assert_allclose(found.gain_down, 20.0 * np.log10(c / e), rtol=1e-4)
 
 
+@pytest.mark.long  # rounding beside such poles: above; of a memory that stays, a pole at 1 too, a chain's margins
 def test_momentum_in_wheels_is_no_border_of_stability_while_the_body_turns():
     """No gain changes it: its poles stay at 1, and gains are limited where other poles leave the circle.
 
@@ -757,7 +765,7 @@ def test_frozen_gains_are_judged_where_they_mean_something(t_f, delta, period, e
 
 def test_lapack_is_given_one_matrix_at_a_time():
     """Many it shares among XLA's threads, and waits in one of them: two at once stood still for ever (jaxlib 0.10)."""
-    _, loop, _ = chain(hardware={"delay": 1})
+    loop = replace(held(*INTEGRATORS, 0.5), delay=1)
     body = a_body(period=0.1)
     loops = jax.tree.map(lambda v: jnp.stack([v, v]), loop)
     sloped = jax.jacfwd(lambda x: margins.of_each(jax.tree.map(lambda v: x * v, loops)))
