@@ -1,16 +1,21 @@
 """The covariance of the linearised loop against flown trials."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo
+from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.theory import covariance, linear
 from tests.helpers import FIRST_FLIGHT
+from tests.helpers import parts as a_body
 from tests.theory.loops import ALL_AT_ONCE
 
 FILTER = {"filter": {"kind": "steady_state", "bandwidth": 0.1}}
@@ -44,7 +49,7 @@ NEAR = {
 }  # fmt: skip
 
 
-@pytest.mark.long  # delay, noise and random walk: theory/test_spillover.py; a filter's part: in its steady state, below
+@pytest.mark.long  # noise and random walk: theory/test_spillover.py; delays and a filter's steady state: below
 @pytest.mark.parametrize(
     ("case", "trials", "start"),
     [(case, 500, NEAR) for case in SHORT] + [(case, 2000, {}) for case in CASES],
@@ -162,6 +167,23 @@ def test_a_filters_errors_stay_in_the_steady_state_that_they_start_in():
         p = moved.at(j).covariance(p) + np.diag((state.drift * length) ** 2)
         sizes.append(np.sqrt(np.diag(known @ p @ known.T)))
     np.testing.assert_allclose(np.asarray(sizes) / begun, 1.0, atol=0.15)
+
+
+@pytest.mark.parametrize("delay", [0, 1, 2, 3])
+def test_what_is_propagated_moves_as_the_closed_loop(delay):
+    """Whatever its matrices and however many commands are on their way; besides, a torque pushes it and stays."""
+    rng, (n, k, m) = np.random.default_rng(delay), (6, 4, 3)
+    shapes = (n, n), (n, k), (1, n, m), (m, n), (m, k), (n, m)
+    a, seen, push, command, direct, pushed = (jnp.asarray(rng.normal(size=(1, *shape))) for shape in shapes)
+    loop = linear.Loop(a, seen, push, 0.0 * push, command, direct, pushed, jnp.ones(1), delay)
+    opened: Any = SimpleNamespace(loop=jax.tree.map(np.asarray, loop), error=np.zeros((1, m, 5)))
+    state = covariance._State(a_body(period=0.1), Ticks(*[jnp.zeros(1)] * 6), opened)
+    commanded, moved = state.moved(opened.loop)
+    at_input = linear.at_input(jax.tree.map(lambda v: v[0], opened.loop), xp=np)
+    closed, size = at_input.closed(), n + delay * m
+    expected = np.block([[closed, np.eye(size, n) @ opened.loop.disturbed[0]], [np.zeros((m, size)), np.eye(m)]])
+    np.testing.assert_allclose(moved.state[0], expected, rtol=0.0, atol=1e-14 * np.abs(closed).max())
+    np.testing.assert_allclose(commanded.state[0], np.pad(at_input.c, ((0, 0), (0, m))), rtol=0.0, atol=1e-14)
 
 
 def test_implicit_sampling_is_not_predicted():
