@@ -78,7 +78,7 @@ def _expansion() -> Slip:
 
 def _theorem_3() -> Slip:
     tables = claims.CASES["third_order"][2]
-    quiet = {"disturbance": {"kind": "none"}, "controller": {**tables["controller"], "disturbance_bound": 0.0}}
+    quiet = {"disturbance": {"amplitude": [0.0]}, "controller": {**tables["controller"], "disturbance_bound": 0.0}}
     run = runs.fly(study(from_tables({**tables, **quiet})))
     law, n = run.parts.controller, run.parts.controller.order
     before = run.log.t < float(law.hand_over)
@@ -155,7 +155,7 @@ def _decay_of_the_bound() -> Slip:
 
 def _initial_estimate() -> Slip:
     bound = {"disturbance_rate_bound": 1e-3}  # the paper's, not that of a constant
-    tables = {"disturbance": {"kind": "constant"}}
+    tables = {"disturbance": {"frequency": [0.0] * 3, "phase": [np.pi / 2] * 3}}  # constant
     true_bound = {**bound, "initial_estimate_error": 0.01 * 3**0.5}
     ratios = [
         _over_bound(runs.fly(study(from_tables({**tables, "controller": controller}))), 1.0)
@@ -173,7 +173,7 @@ def _initial_estimate() -> Slip:
 
 def _effective_gain() -> Slip:
     tables = {
-        "disturbance": {"kind": "none"},
+        "disturbance": claims.CALM,
         "controller": {"disturbance_rate_bound": 0.0, "delta": 5.0, "k1": 1.6},
     }
     run = runs.fly(study(from_tables(tables)))
@@ -204,7 +204,7 @@ def _sign_of_q4() -> Slip:
     tables = {
         "initial": {"quat_xyzw": [0.0, 0.0, 0.0, -1.0]},
         "reference": {"rotvec_deg": [0.0, 0.0, 60.0]},
-        "disturbance": {"kind": "none"},
+        "disturbance": claims.CALM,
         "controller": {"disturbance_rate_bound": 0.0},
     }
     ready = study(from_tables(tables))
