@@ -231,18 +231,45 @@ def test_rows_of_constraints_are_met_where_the_verdicts_are_and_have_slopes(draw
     np.testing.assert_allclose(sloped(tight, bounds, share)["c"] + 1, (found["c"] + 1) / 0.9, rtol=1e-12)
 
 
-def test_no_product_has_an_inertia_for_each_case(monkeypatch):
-    """With one XLA (jaxlib 0.10.2) aborts the process, by chance of its layout: "Check failed: IsMonotonicWith.."."""
+def products_for_each_case(of, posed):
+    """What multiplies with an inertia of each case in such a function of the shares, and whether any product is there.
+
+    With one XLA (jaxlib 0.10.2) aborts the process, by chance of its layout: "Check failed: IsMonotonicWith..".
+    """
+    trace = jax.make_jaxpr(of)(np.full(len(posed.evaluate.bounds.names), 0.5))
+    products = [e for e in equations(trace) if e.primitive.name == "dot_general"]
+    each = (margin_rows.CASES, 3, 3)
+    batched = [e for e in products if e.params["dimension_numbers"][1][0]]
+    return [e for e in batched if each in [v.aval.shape for v in e.invars]], bool(products)
+
+
+@pytest.fixture
+def of_two_trials(monkeypatch):
+    """The spacecraft's problem, traced only."""
     monkeypatch.setattr(margin_rows.sloped, "prepare", lambda *_: None)
     monkeypatch.setattr(margin_rows, "hardest", lambda asked, _: (margin_rows._of_trials(asked, np.arange(2)), 0.0))
-    posed = posed_of("spacecraft")
-    asked, bounds = posed.problem.margins, posed.evaluate.bounds
-    assert asked is not None
-    trace = jax.make_jaxpr(lambda share: margin_rows.with_slopes(asked, bounds, share))
-    products = [e for e in equations(trace(np.full(len(bounds.names), 0.5))) if e.primitive.name == "dot_general"]
-    assert products
-    each = (margin_rows.CASES, 3, 3)
-    assert not [e for e in products if e.params["dimension_numbers"][1][0] and each in [v.aval.shape for v in e.invars]]
+    return posed_of("spacecraft")
+
+
+def test_cases_are_flown_one_after_the_other(of_two_trials):
+    """What `by_case` is given, here a momentum, in place of runs and loops."""
+    asked, bounds = of_two_trials.problem.margins, of_two_trials.evaluate.bounds
+
+    def momenta(share):
+        rates = np.ones((2, 3))
+        return margin_rows._by_case(asked, bounds.gains(share), lambda parts, w: parts.plant.inertia @ w, rates)
+
+    assert products_for_each_case(momenta, of_two_trials) == ([], True)
+
+
+@pytest.mark.long  # how cases follow each other is seen above
+def test_no_product_has_an_inertia_for_each_case(of_two_trials):
+    asked, bounds = of_two_trials.problem.margins, of_two_trials.evaluate.bounds
+
+    def with_slopes(share):
+        return margin_rows.with_slopes(asked, bounds, share)
+
+    assert products_for_each_case(with_slopes, of_two_trials) == ([], True)
 
 
 @pytest.mark.long
@@ -263,11 +290,14 @@ def test_rows_of_drawn_inertias_are_compiled_where_the_hand_over_is_free():
     assert (done.returncode, done.stdout) == (0, "(1, 1, 30, 5)\n"), done.stderr[-2000:]
 
 
-def test_the_evaluator_puts_margins_beside_what_is_flown_and_drawn_loops_are_judged_by_the_worst(drawn):
+def test_the_evaluator_puts_margins_beside_what_is_flown_and_drawn_loops_are_judged_by_the_worst(drawn, monkeypatch):
     posed = drawn
     assert posed.problem.rows == ("peak_torque", "gain_margin", "modulus_margin")
     share = posed.evaluate.bounds.share(posed.own)[None]
+    flown = {"gains": share, "f": np.zeros(1), "c": np.array([[[-0.3, -0.2, -0.4]]]), "value": np.zeros(1)}
+    monkeypatch.setattr(posed.evaluate, "_fly", lambda *_: dict(flown))
     c = posed.evaluate.fly(posed.problem, share).c[0]
+    assert c[0].tolist() == [-0.3, -0.2, -0.4] + [-1.0] * (c.shape[1] - 3)  # as wide as a row of loops
     verdicts = margin_verdicts.over_trials(posed.ready, 3)
     assert [v.trials for v in verdicts] == [TRIALS, TRIALS]
     # its two hardest cases hold the worst of all
@@ -414,10 +444,20 @@ def test_lines_are_off_by_a_share_of_a_period_where_they_tell_a_delay(monkeypatc
     assert seen == judged
 
 
-@pytest.mark.parametrize("left", [None, '{"window_error": 1e-6, "marg', '{"window_error": 1e-6}'])
-def test_a_campaign_is_not_finished_before_its_margins_are_judged(command, tmp_path, left):
+@pytest.mark.parametrize(
+    ("left", "of_loops"),
+    [
+        pytest.param(None, True, marks=pytest.mark.long),  # what its loops have of margins is seen above
+        (None, False), ('{"window_error": 1e-6, "marg', False), ('{"window_error": 1e-6}', False),
+    ],
+)  # fmt: skip
+def test_a_campaign_is_not_finished_before_its_margins_are_judged(command, tmp_path, monkeypatch, left, of_loops):
     """A kill may come between the last trial and them; and a file may be damaged."""
     tables = {**untuned(SHORT_CHAIN), "requirements": {"peak_torque": 50.0, "gain_margin": 0.1}}
+    if not of_loops:
+        told = Requirement("gain_margin", 0.1, "dB", at_least=True).verdict(np.asarray(7.0), np.asarray(True))
+        monkeypatch.setattr(margin_verdicts, "over_trials", lambda *_: [told])
+        monkeypatch.setattr(margin_verdicts, "prepare", lambda *_: None)
     store.write_toml(tmp_path / "s.toml", tables)
     again, folder = ("montecarlo", "s.toml", "--trials", 2, "--no-figures"), tmp_path / "out" / "montecarlo-s"
     assert command(*again, "--quiet") == (0, "", "")
