@@ -3,6 +3,7 @@
 import json
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -13,7 +14,7 @@ from ptsmc_jax.campaigns import campaign, store
 from tests.helpers import SHORT_CHAIN, same, short
 from tests.output.pages import checked
 from tuning.output import campaign_terminal, progress_lines, sentences
-from tuning.studies import campaign_summary
+from tuning.studies import campaign_figures, campaign_summary
 
 FOLDER = "out/montecarlo-s"
 MANY = 70  # trials, so many that the program of hundreds flies them
@@ -48,6 +49,17 @@ def flown(command, tmp_path):
     return tmp_path / FOLDER
 
 
+@pytest.fixture(params=short([False, True], [False]), ids=["rows alone", "histories too"])
+def _fan(request, monkeypatch):
+    """Whether histories are flown for the fan: so they are for a chain, and what they are `test_campaign.py` says."""
+    if not request.param:
+        told = SimpleNamespace(
+            finished=campaign.finished, history=lambda _, trials: (np.arange(1.0, 7.0), np.ones((trials.size, 6)))
+        )
+        monkeypatch.setattr(campaign_figures, "flying", told)
+
+
+@pytest.mark.usefixtures("_fan")
 def test_a_campaign_leaves_rows_summary_and_figures(command, tmp_path, monkeypatch):
     monkeypatch.setattr(progress_lines, "EVERY", 0.05)
     code, said, progress = command("montecarlo", "s.toml", "--trials", 250, "--seed", 3)
@@ -89,9 +101,12 @@ def test_a_campaign_leaves_rows_summary_and_figures(command, tmp_path, monkeypat
     assert found["quantiles"]["settling_time"]["without_value"] == unsettled
 
 
-def test_trials_that_are_all_the_same_flight_are_said(command, tmp_path, flown):
+@pytest.mark.parametrize(("drawn", "instead"), short([(r"\[0.5, 0.1\]", "[0, 0]"), ("x0 = {.*", "")],
+                                                     [(r"\[0.5, 0.1\]", "[0, 0]")]))  # fmt: skip
+def test_trials_that_are_all_the_same_flight_are_said(command, tmp_path, flown, drawn, instead):
+    """Nothing in the file, or nothing by its numbers, which other tests' programs fly."""
     assert not [said for said in summary(flown)["cautions"] if "the same flight" in said]
-    text = re.sub("x0 = {.*", "", SHORT_CHAIN).replace("[2e-5, 1e-5]", "[0, 0]")
+    text = re.sub(drawn, instead, SHORT_CHAIN).replace("[2e-5, 1e-5]", "[0, 0]")
     (tmp_path / "same.toml").write_text(text)
     _, said, _ = command("montecarlo", "same.toml", "--trials", 250, "--no-figures")
     assert "CAUTION: all 250 trials are the same flight: nothing is drawn" in said
@@ -432,6 +447,7 @@ def wild(text):
     return text.replace("min_deg = 20.0, max_deg = 90.0", "min_deg = 170.0, max_deg = 180.0")
 
 
+@pytest.mark.usefixtures("_fan")
 def test_failures_are_counted_with_reason_and_time(command, tmp_path):
     (tmp_path / "s.toml").write_text(wild((tmp_path / "s.toml").read_text()))
     code, said, _ = command("montecarlo", "s.toml", "--trials", 250)
