@@ -13,13 +13,13 @@ from scipy.spatial.transform import Rotation
 
 import ptsmc_jax as ptsmc
 from ptsmc_jax import scenario
-from ptsmc_jax.campaigns import campaign, plans
+from ptsmc_jax.campaigns import campaign, montecarlo, plans
 from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.dispersions.quantities import QUANTITIES
 from ptsmc_jax.plants import rigid_body
 from ptsmc_jax.signals import disturbances
 from ptsmc_jax.simulation import catalogues, rollout
-from tests.helpers import vector
+from tests.helpers import SHORT_CHAIN, untuned, vector
 
 SEED, FLOWN = 3, 50  # trials, so few that the program of two of them flies them
 EVERYTHING = """
@@ -65,17 +65,27 @@ def ready(text):
 
 @pytest.fixture(scope="module")
 def everything():
-    """A campaign in which all is drawn that a spacecraft has, its rows and its plan."""
+    """A campaign in which all is drawn that a spacecraft has, and its plan."""
     made = campaign.Campaign(ready(EVERYTHING), SEED)
-    return made, made.fly(range(FLOWN)), made.draw(range(FLOWN))
+    return made, made.draw(range(FLOWN))
+
+
+@pytest.fixture(scope="module")
+def of_a_chain():
+    """A campaign that the program of other tests flies, and its plan."""
+    made = campaign.Campaign(scenario.study(scenario.from_tables(untuned(SHORT_CHAIN))), SEED)
+    return made, made.draw(range(FLOWN))
 
 
 def of_plan(made, table):
     return campaign.of_plan(made.ready, made.seed, plans.checked(table, made.ready.parts))
 
 
-def test_a_written_plan_flown_is_the_campaign_to_the_last_digit(everything, tmp_path):
-    made, frame, plan = everything
+# where trials are flown hangs on no spacecraft; what is drawn for one stands in its plan to the last digit, below
+@pytest.mark.parametrize("which", ["of_a_chain", pytest.param("everything", marks=pytest.mark.long)])
+def test_a_written_plan_flown_is_the_campaign_to_the_last_digit(which, request, tmp_path):
+    made, plan = request.getfixturevalue(which)
+    frame = made.fly(range(FLOWN))
     plan.write_csv(tmp_path / "plan.csv")
     plan.write_parquet(tmp_path / "plan.parquet")
     digests = set()
@@ -92,6 +102,15 @@ def test_a_written_plan_flown_is_the_campaign_to_the_last_digit(everything, tmp_
     assert flown["plan_trial"].to_list() == [40, 7]
     assert_frame_equal(flown.select(frame.columns[1:]), frame[[40, 7]].select(frame.columns[1:]), check_exact=True)
     assert of_plan(made, flown).fly(range(2)).equals(flown)  # and so are its rows again
+
+
+def test_a_written_plan_is_what_a_campaign_draws_to_the_last_digit(everything, tmp_path):
+    made, plan = everything
+    plan.write_csv(tmp_path / "plan.csv")
+    again = of_plan(made, plans.read(tmp_path / "plan.csv"))
+    assert again.plan is not None
+    assert not again.plan.given
+    assert_frame_equal(again.draw(range(FLOWN)).select(plan.columns), plan, check_exact=True)
 
 
 class Farther(ptsmc.Draw):
@@ -140,7 +159,7 @@ def test_numbers_of_a_draw_of_ones_own_are_what_is_drawn_or_refused():
 @pytest.fixture(scope="module")
 def corners(everything):
     """A table that gives everything otherwise than it is drawn, and its campaign."""
-    made, _, plan = everything
+    made, plan = everything
     generator = np.random.default_rng(1)
     table = plan.head(2).drop("trial", "initial_angle")
     columns = {name: table[name].to_numpy() * (1.0 + 0.01 * generator.uniform(size=2)) for name in table.columns}
@@ -166,13 +185,26 @@ def test_every_number_that_is_given_is_what_a_trial_would_fly_with(corners):
     stands(planned.draw(range(2)), table)
 
 
-# given ones fly by a program of their own; a chain has one too, below
-@pytest.mark.parametrize("kind", ["drawn", pytest.param("given", marks=pytest.mark.long)])
+alone = jax.jit(montecarlo.one)
+
+
+# given ones fly by a program of their own; a chain has one too, below; a batch: `test_montecarlo.py`
+@pytest.mark.parametrize(
+    "kind", ["alone", *(pytest.param(kind, marks=pytest.mark.long) for kind in ("drawn", "given"))]
+)
 def test_what_stands_in_a_row_is_what_is_flown(everything, corners, kind):
     """Every number: against parts set by hand, from the nominal ones alone."""
-    made, drawn, _ = everything
-    rows = drawn.head(2)
-    if kind == "given":
+    made, rows = everything[0], everything[1].head(2)
+    if kind == "alone":
+        flown = [alone(made.ready.parts, made.ready.dispersion, jnp.uint32(SEED), jnp.uint32(k)) for k in range(2)]
+        metrics = {name: [float(getattr(one.metrics, name)) for one in flown] for name in made.ready.catalogue}
+        status = [rollout.STATUS[int(one.status)][0] for one in flown]
+        for name in flown[0].drawn:
+            np.testing.assert_allclose(rows[name], [one.drawn[name] for one in flown], rtol=1e-12, err_msg=name)
+        rows = rows.with_columns(status=pl.Series(status), **{name: pl.Series(v) for name, v in metrics.items()})
+    elif kind == "drawn":
+        rows = made.fly(range(2))
+    else:
         table, planned = corners
         rows = planned.fly(range(2))
         stands(rows, table)
@@ -273,8 +305,9 @@ def test_flight_software_does_not_know_what_is_drawn():
 
 def test_a_chain_flies_a_plan():
     """From where the plan says, with the noise of the seeds and trials that it says."""
-    flight = scenario.from_tables(tomllib.loads(CHAIN))
-    states = {"initial_x1": [1.1, -0.4], "initial_x2": [0.2, 0.3], "initial_x3": [-0.1, 0.0]}
+    noise = '[dispersion]\nstate_noise = { kind = "relative_normal" }'  # as `test_plan_commands.py`, by its program
+    flight = scenario.from_tables(untuned(SHORT_CHAIN.replace("[dispersion]", noise)))
+    states = {"initial_x1": [1.1, -0.4], "initial_x2": [0.2, 0.3]}
     whose = {"trial": [2, 0], "seed": [SEED, 11]}
     flown = ptsmc.trials(flight, pl.DataFrame(whose | states), seed=SEED)
     assert flown["plan_trial"].to_list() == whose["trial"]
@@ -395,7 +428,7 @@ def test_no_outage_no_failure_and_a_coupling_that_the_rows_own_body_bears_are_no
 
 
 def test_an_angle_that_does_not_follow_is_refused(everything):
-    made, _, plan = everything
+    made, plan = everything
     wrong = pl.when(pl.col("trial") == 2).then(3.0).otherwise("initial_angle")
     with pytest.raises(RefusedError, match="has initial_angle 3 in row 2, but must have "):
         of_plan(made, plan.with_columns(wrong.alias("initial_angle")))
