@@ -234,13 +234,13 @@ def test_an_outage_of_the_whole_run_is_a_filter_that_corrects_nothing():
     ready = scenario.study(scenario.from_tables({**WHEELED, "dispersion": drawn}))
     run = runs.fly(ready, 0, 0)
     assert {key: float(v) for key, v in ready.dispersion.values(run.parts).items()}["star_tracker_outage_begin"] == 0.0
-    parts = ready.parts
-    assert parts.sensors.filter is not None
-    idle = replace(parts.sensors.filter, attitude_gain=0.0 * parts.sensors.filter.attitude_gain,
-                   bias_gain=0.0 * parts.sensors.filter.bias_gain)  # fmt: skip
-    other = fly(replace(parts, sensors=replace(parts.sensors, filter=idle)))
+    whole = replace(run.parts.sensors, outage=vector([50.0, 60.0]))  # after the end, too
+    assert whole.filter is not None
+    idle = replace(whole.filter, attitude_gain=0.0 * whole.filter.attitude_gain,
+                   bias_gain=0.0 * whole.filter.bias_gain)  # fmt: skip
+    other = fly(replace(run.parts, sensors=replace(whole, filter=idle)))
     np.testing.assert_allclose(run.metrics["window_error"], other.metrics.window_error, rtol=1e-12)
-    whole = fly(parts)
+    whole = fly(replace(run.parts, sensors=whole))
     assert abs(float(whole.metrics.window_error) / run.metrics["window_error"] - 1.0) > 1e-6
 
 
