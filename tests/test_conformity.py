@@ -6,6 +6,7 @@ another new part joins one here.
 
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -201,7 +202,7 @@ KINDS = (
 )
 
 
-IN_FULL = KINDS[-1:]  # with slopes, and in a loop
+IN_FULL = KINDS[-1:]  # with slopes, under vmap and in a loop; the other in lanes and in a loop
 CASES = [pytest.param(name, name in IN_FULL, id=name) for name in KINDS] + [
     pytest.param(name, True, id=f"{name}, in full", marks=pytest.mark.long) for name in ROWS if name not in IN_FULL
 ]
@@ -275,10 +276,29 @@ def agree(values, wanted, unit, name, skip=()):
         assert metric in skip or off <= unit * max(scale, 1e-3), (name, metric, off, scale)
 
 
-def compare(parts, dispersion, name, sloped):
+def one_by_one(parts, still, dispersion, sloped):
+    """The same as `batch`, in a loop, whose program is compiled in half the time; without slopes."""
+    assert not sloped
+    runs = [drawn(dispersion, parts, trial) for trial in (*NUMBERS, np.uint32(NUMBERS.size))]
+    runs[-1] = replace(runs[-1], initial=still.initial)
+    if hasattr(still.controller, "sign_width"):
+        width = still.controller.sign_width
+        runs[-1] = replace(runs[-1], controller=replace(runs[-1].controller, sign_width=width))
+    flown = [rollout.simulate_jit(run, SEED, np.uint32(trial)) for trial, run in enumerate(runs)]
+    each = [(one.metrics._asdict(), one.status, one.bad_time, {}) for one in flown]
+    return jax.tree.map(lambda *v: np.stack(v), *each)
+
+
+drawn = jax.jit(lambda dispersion, parts, trial: dispersion.apply(parts, SEED, trial))
+
+
+under_vmap = partial(batch, vmap=jax.vmap)
+
+
+def compare(parts, dispersion, name, sloped, reference: Any = under_vmap):
     """In lanes and under vmap: (metrics of the trials) and (status, metrics, slopes) of the awkward one."""
-    still = at_rest_on_the_target(parts)
-    both = [jax.tree.map(np.asarray, batch(parts, still, dispersion, vmap, sloped)) for vmap in (strict, jax.vmap)]
+    still, by_lanes = at_rest_on_the_target(parts), partial(batch, vmap=strict)
+    both = [jax.tree.map(np.asarray, of(parts, still, dispersion, sloped=sloped)) for of in (by_lanes, reference)]
     got, expected = (jax.tree.map(lambda v: v[:-1], one) for one in both)
     last = jax.tree.map(lambda v: v[-1], both[1])
     np.testing.assert_array_equal(got[1], expected[1])
@@ -300,7 +320,8 @@ def singles(ready, fly):
 @pytest.mark.parametrize(("name", "in_full"), CASES)
 def test_every_part_is_the_same_in_lanes_under_vmap_and_in_a_loop_with_finite_slopes(name, in_full):
     ready = scenario.study(scenario.from_tables(ROWS[name]))
-    metrics, (status, values, slopes) = compare(ready.parts, ready.dispersion, name, in_full)
+    reference = under_vmap if in_full else one_by_one
+    metrics, (status, values, slopes) = compare(ready.parts, ready.dispersion, name, in_full, reference)
     assert status in (0, 4)
     for metric, slope in slopes.items():
         assert np.isfinite(slope) or not np.isfinite(values[metric]), metric
