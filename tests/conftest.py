@@ -53,7 +53,7 @@ LONGEST = """
     studies/test_tuner observers/test_observers_others campaigns/test_campaign paper/test_paper
     studies/test_stability theory/test_theory dispersions/test_dispersions
 """.split()
-TOGETHER = {"cli/test_cli", "studies/test_compare", "studies/test_pareto"}  # tune by the same programs, in one worker
+TOGETHER = {"cli/test_cli", "studies/test_compare", "studies/test_pareto"}  # fly by the same programs, in one worker
 assert all((ROOT / "tests" / f"{name}.py").exists() for name in {*LONGEST, *TOGETHER})
 
 

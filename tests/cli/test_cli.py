@@ -107,8 +107,11 @@ def test_bad_input_is_one_sentence_and_exit_status_two(command, tmp_path, args, 
     assert not (tmp_path / "out").exists()
 
 
-def test_tune_from_start_to_end(command, tmp_path, monkeypatch):
+# a chain's programs, which fly other searches too, are compiled in a third of the time
+@pytest.mark.parametrize("text", [SHORT_CHAIN, pytest.param(SHORT, marks=pytest.mark.long)], ids=["chain", "spacecraft"])
+def test_tune_from_start_to_end(command, tmp_path, monkeypatch, text):
     small_search(monkeypatch)
+    (tmp_path / "s.toml").write_text(text)
     status, _, _ = command("tune", "s.toml", "--out", "t")
     summary = json.loads((tmp_path / "t" / "summary.json").read_text())
     assert status == (0 if summary["status"] == "met" else 1)
@@ -135,6 +138,7 @@ def test_tune_from_start_to_end(command, tmp_path, monkeypatch):
     assert summary["fresh"]["window_error"]["rms"] < summary["paper"]["window_error"]["rms"]
 
     assert summary["trust"]["margins"] == stability.worst(scenario.study(tuned))
+    assert summary["shortest_t_f"]["theory"] > 0.0
 
     read = checked(tmp_path / "t")
     assert (
@@ -347,7 +351,7 @@ def stop_at(monkeypatch, call):
 def test_an_interrupted_search_leaves_its_best_and_goes_on(command, tmp_path, monkeypatch, calls):
     """At the first evaluation there is nothing yet; later it is in the middle of a descent."""
     small_search(monkeypatch)
-    (tmp_path / "s.toml").write_text(SHORT.replace("steps = 4", "steps = 2"))
+    (tmp_path / "s.toml").write_text(SHORT_CHAIN.replace("steps = 4", "steps = 2"))
     with monkeypatch.context() as patch:
         computed = stop_at(patch, 0)
         whole = command("tune", "s.toml", "--out", "whole", "--quiet", "--no-figures")[0]

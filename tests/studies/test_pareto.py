@@ -14,7 +14,7 @@ from ptsmc_jax.campaigns.montecarlo import Trials
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.metrics import Metrics
-from tests.helpers import SHORT, small_search, tree
+from tests.helpers import SHORT, SHORT_CHAIN, small_search, tree
 from tests.output.pages import checked
 from tuning.output import front_sentences, terminal
 from tuning.search import descent, descents
@@ -119,10 +119,16 @@ def test_gains_of_each_axis_stand_beside_a_law_with_one_gain_for_all_or_none():
     assert [row[5:7] for row in rows] == [("5", "6"), ("10", "10"), ("-", "-")]
 
 
-def test_a_front_from_start_to_end(command, tmp_path, monkeypatch):
+CHAIN = SHORT_CHAIN.replace("peak_torque = 3.0", "peak_torque = 0.55")
+SPACECRAFT = SHORT.replace("peak_torque = 30.0", "peak_torque = 8.0")
+
+
+@pytest.mark.parametrize(
+    ("text", "limit"), [(CHAIN, 0.55), pytest.param(SPACECRAFT, 8.0, marks=pytest.mark.long)], ids=["chain", "spacecraft"]
+)
+def test_a_front_from_start_to_end(command, tmp_path, monkeypatch, text, limit):
     small_search(monkeypatch, 60)
-    text = SHORT.replace("peak_torque = 30.0", "peak_torque = 8.0").replace("steps = 4", "steps = 6")
-    (tmp_path / "s.toml").write_text(text)
+    (tmp_path / "s.toml").write_text(text.replace("steps = 4", "steps = 6"))
     climbed, search, begun, searched = pareto.climbed, posing.Posed.search, [], []
 
     def spied(ladder, known, posed, tell):
@@ -149,11 +155,11 @@ def test_a_front_from_start_to_end(command, tmp_path, monkeypatch):
     peaks = [float(row["peak_torque"]) for row in rows]
     assert peaks == sorted(peaks)
     # the scenario's own limit is one of the rungs, and as accurate as what a search for it alone found
-    (own,) = [float(row["trained_goal"]) for row in rows if float(row["limit"]) == 8.0]
+    (own,) = [float(row["trained_goal"]) for row in rows if float(row["limit"]) == limit]
     ((rungs, known, evaluate),) = begun
-    flown = evaluate.fly(rungs["peak torque 8"].tightened(1.0 - pareto.MARGIN), known)
+    flown = evaluate.fly(rungs[f"peak torque {limit:g}"].tightened(1.0 - pareto.MARGIN), known)
     assert len(known) > len(searched)  # other valleys that the searches found among them
-    assert searched.count(8.0) == 1
+    assert searched.count(limit) == 1
     assert own <= np.exp(flown.value[flown.beyond <= descent.SLACK].min()) * (1.0 + 1e-9)
     for row in rows:
         assert float(row["rms_low"]) <= float(row["rms_window_error"]) <= float(row["rms_high"])

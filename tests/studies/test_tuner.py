@@ -31,14 +31,15 @@ def test_fresh_trials_have_another_seed_than_those_of_the_search_and_of_other_tu
 
 @pytest.fixture
 def small(monkeypatch):
-    """A search of few trials, judged on as many as are enough to break a limit: by one program."""
-    small_search(monkeypatch, 200)
+    """A search of few trials, judged on as many as are enough to break a limit: by the programs of test_cli.py."""
+    small_search(monkeypatch, 60)
     monkeypatch.setattr(worst, "SCREENED", 2)
     monkeypatch.setattr(tuner, "_prepare", lambda _: None)  # a program of margins, for which nobody asks here
+    monkeypatch.setattr(tuner, "_shortest", lambda *_: None)  # flown on a clock of its own
 
 
 def test_gains_that_break_a_limit_on_fresh_trials_are_tuned_on(small):
-    """The hardest of two training trials and two screened ones is easier than of 200 fresh ones."""
+    """The hardest of two training trials and two screened ones is easier than of 60 fresh ones."""
     text = SHORT_CHAIN.replace("peak_torque = 3.0", f"peak_torque = {LIMIT}").replace("trials = 8", "trials = 2")
     loaded = scenario.from_tables(tomllib.loads(text))
     found = tuner.tune(loaded, 0, trusted=False)
