@@ -26,6 +26,7 @@ NEUTRAL = 1e-6  # by which a pole may lie outside the unit circle: rounding of t
 NEAREST = 3  # places where |L| is 1 from which a delay is searched for, those of the least estimates
 LOOKED, PARTS = 8, 16  # periods of delay that are looked through, and in how many steps each
 NEAR = 6  # places from there that it is searched from too
+PAIR = 2  # loops that one call of the compiled program judges: of a map's cell there are no more
 STARTS, FARTHER = 8, 0.15  # of Newton's search for a delay, at most, and by how many periods each lies beyond the last
 
 
@@ -65,6 +66,18 @@ FIELDS = Margins._fields[:5]  # that are margins
 def of_each(loops: Loop, sensors: bool = False, with_delay: bool = True) -> Margins:
     """Margins of several loops, arrays over them first; see `of`."""
     return jax.lax.map(partial(of, sensors=sensors, with_delay=with_delay), loops)
+
+
+def in_turn(loops: Loop) -> Margins:
+    """Margins of several loops, arrays over them first, in NumPy: by one program, however many they are."""
+    count = np.shape(loops.period)[0]
+
+    def call(k: int) -> Margins:
+        some = np.resize(np.arange(k, min(k + PAIR, count)), PAIR)
+        return jax.tree.map(np.asarray, of_each(jax.tree.map(lambda v: np.asarray(v)[some], loops)))
+
+    calls = [call(k) for k in range(0, count, PAIR)]
+    return jax.tree.map(lambda *many: np.concatenate(many)[:count], *calls)
 
 
 class _Spectrum(NamedTuple):

@@ -101,7 +101,7 @@ def at(parts: Parts, left: Float[Array, " times"], flown: linear.Nominal | None 
     indices = np.asarray(_moments(parts, run, left))
     loops = linear.loops_in(parts, run, indices)
     ticks = jax.tree.map(lambda v: np.asarray(v)[indices], run.period.now)
-    return TimedMargins(ticks.t, ticks.hold, loops, jax.tree.map(np.asarray, margins.of_each(loops)))
+    return TimedMargins(ticks.t, ticks.hold, loops, margins.in_turn(loops))
 
 
 def judged_loops(parts: Parts, flown: linear.Nominal | None = None, *, late: bool = True) -> tuple[Loop, Array]:

@@ -148,7 +148,7 @@ def test_what_cannot_be_compared_is_refused(tables, said):
 def given(posed, problem, own, starts, prepare=None, **_):
     """What a search hands over, without one: the gains that it was given, a little farther."""
     gains = 1.02 * np.asarray(own)
-    return optimise.Search(gains, posed.evaluate.bounds.share(gains), 0.0, *(np.zeros(1),) * 2, [], [], problem)
+    return optimise.Search(gains, posed.evaluate.bounds.share(gains), 0.0, np.zeros(1), np.zeros(1), [], [], problem)
 
 
 # tuned by a search of a spacecraft's flights in `make test-long`; of a chain's by test_cli.py

@@ -14,7 +14,7 @@ from ptsmc_jax.campaigns.montecarlo import Trials
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.metrics import Metrics
-from tests.helpers import SHORT, SHORT_CHAIN, small_search, tree
+from tests.helpers import SHORT, SHORT_CHAIN, short, small_search, tree
 from tests.output.pages import checked
 from tuning.output import front_sentences, terminal
 from tuning.search import descent, descents
@@ -124,7 +124,7 @@ SPACECRAFT = SHORT.replace("peak_torque = 30.0", "peak_torque = 8.0")
 
 
 @pytest.mark.parametrize(
-    ("text", "limit"), [(CHAIN, 0.55), pytest.param(SPACECRAFT, 8.0, marks=pytest.mark.long)], ids=["chain", "spacecraft"]
+    ("text", "limit"), short([(CHAIN, 0.55), (SPACECRAFT, 8.0)], [(CHAIN, 0.55)]), ids=["chain", "spacecraft"]
 )
 def test_a_front_from_start_to_end(command, tmp_path, monkeypatch, text, limit):
     small_search(monkeypatch, 60)

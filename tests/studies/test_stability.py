@@ -14,12 +14,13 @@ import pytest
 
 from ptsmc_jax import scenario
 from ptsmc_jax.scenario.errors import ScenarioError
-from ptsmc_jax.theory import rest, run_margins
+from ptsmc_jax.theory import linear, margins, rest, run_margins
 from tests.helpers import SHORT, SHORT_CHAIN, short
 from tuning.output import margin_sentences, page
 from tuning.studies import stability
 
-CHAIN = SHORT_CHAIN.replace("state_noise =", "#")  # its loop has as many states as those below that a limit cuts
+# on the clock of what is tuned, whose loop is judged by the same program
+CHAIN = SHORT_CHAIN.replace('mode = "sampled"', 'mode = "sampled"\nclock = "flight"')
 
 
 def tables(path):
@@ -96,6 +97,15 @@ def test_of_a_run_that_does_not_come_to_rest_no_margins_are_left(command, tmp_pa
     assert (verdict["met"], verdict["worst"]) == (False, 0.0)
 
 
+def test_each_of_several_loops_is_judged_once_and_in_its_place(monkeypatch):
+    monkeypatch.setattr(margins, "of_each", lambda loops: margins.Margins(*(loops.period[:, None],) * 7))
+    for count in (1, 2, 5):
+        numbers = np.arange(float(count))
+        each: Any = dict.fromkeys([field.name for field in dataclasses.fields(linear.Loop)], numbers) | {"delay": 0}
+        loops = linear.Loop(**each)
+        np.testing.assert_array_equal(margins.in_turn(loops).phase[:, 0], numbers)
+
+
 def test_an_unstable_hold_is_said_and_has_negative_margins(command, tmp_path):
     (tmp_path / "wild.toml").write_text(SHORT.replace("[controller]", "[controller]\nk1 = 60.0"))
     loaded = scenario.read(tmp_path / "wild.toml")
@@ -115,9 +125,9 @@ def test_an_unstable_hold_is_said_and_has_negative_margins(command, tmp_path):
 ])  # fmt: skip
 def test_a_loop_that_is_unstable_before_the_hand_over_is_not_called_stable(tmp_path, judged, mood, said):
     """With a period of half of t_f the page opened with a stable loop of -1.9 dB and -180 deg."""
-    margins = dict.fromkeys(("gain_up", "gain_down", "phase", "delay", "modulus"), 6.0)
+    left = dict.fromkeys(("gain_up", "gain_down", "phase", "delay", "modulus"), 6.0)
     summary = {
-        "stable": True, "open": [], "said": None, "hold": {"u1": margins}, "together": margins, "sensors": {},
+        "stable": True, "open": [], "said": None, "hold": {"u1": left}, "together": left, "sensors": {},
         "before": [{"time_to_go": 1.0, "judged": judged, "stable": False, "open": []}],
         "worst": {"gain_margin": -1.9, "phase_margin": None, "delay_margin": None, "modulus_margin": None},
     }  # fmt: skip
@@ -169,9 +179,9 @@ def test_few_margins_are_warned_of():
 
 
 def at_hand_over(period):
-    """A chain whose t_f - delta is half a period."""
+    """A chain whose t_f - delta is half a period, with a sample there."""
     tables = {**tomllib.loads(CHAIN), "controller": {"t_f": 5.0, "delta": 5.0 - 0.5 * period}, "tune": {}}
-    tables["loop"]["period"] = period
+    tables["loop"] |= {"period": period, "clock": "anchored"}
     return scenario.study(scenario.from_tables(tables))
 
 
@@ -215,8 +225,12 @@ LIMITED = {
     "plant": {"kind": "chain", "x0": [1.0, 0.0]}, "disturbance": {"kind": "none"},
     "controller": {"t_f": 3.0, "delta": 1.0, "sign_width": 0.1},
     "loop": {"mode": "sampled", "period": 0.1, "window": 1.0},
-    "hardware": {"torque_limit": 0.02},
+    "hardware": {"torque_limit": 0.02, "state_noise": [2e-5, 1e-5]},  # with it the loop has as many states as `CHAIN`
 }  # fmt: skip
+
+
+def limited_to(limit):
+    return scenario.from_tables(LIMITED | {"hardware": LIMITED["hardware"] | {"torque_limit": limit}})
 
 
 def test_where_a_limit_cuts_the_command_the_loop_is_said_to_be_open():
@@ -235,8 +249,7 @@ def test_where_a_limit_cuts_the_command_the_loop_is_said_to_be_open():
     result: Any = SimpleNamespace(summary=found)
     heading, _ = page._margins(result)
     assert heading.headline.startswith("The loop in hold is open")
-    free = scenario.from_tables(LIMITED | {"hardware": {"torque_limit": 50.0}})
-    found = stability.summary(*stability.find(free))
+    found = stability.summary(*stability.find(limited_to(50.0)))
     assert not any(one["open"] for one in (found, *found["before"]))
     assert "missed" not in found
     assert not any("misses" in line or "limit of the actuators" in line for line in margin_sentences.lines(found))
@@ -265,7 +278,7 @@ def blamed_on_no_limit(found, first, limited):
 @pytest.mark.parametrize("limit", [50.0, 0.5])
 def test_a_sample_of_which_the_law_makes_nothing_is_blamed_on_no_limit(limit):
     """`margins` said that a limit cuts it."""
-    ready, course = stability.find(scenario.from_tables(LIMITED | {"hardware": {"torque_limit": limit}}))
+    ready, course = stability.find(limited_to(limit))
     k = np.flatnonzero(course.loops.new[:-1, 0].any(axis=(1, 2)))[0]  # where no limit cuts the command
     nothing = {"gain_up": np.inf, "gain_down": np.inf, "phase": 180.0, "modulus": 0.0, "crossover": np.nan}
     each = {name: getattr(course.at_input, name).copy() for name in nothing}
