@@ -15,7 +15,7 @@ from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.figures import study_plots
-from ptsmc_jax.scenario import parsing, systems
+from ptsmc_jax.scenario import systems
 from ptsmc_jax.scenario.baseline_tables import BASELINES
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import rollout
@@ -25,8 +25,8 @@ from tests.output.pages import checked
 from tuning.cli import options
 from tuning.errors import UsageError
 from tuning.output import law_sentences, page
-from tuning.search import flights, gains, optimise, own_parts
-from tuning.studies import compare, judging, posing, stability, tuner
+from tuning.search import gains, own_parts
+from tuning.studies import compare, judging, stability, tuner
 
 TABLES = tomllib.loads(SHORT)
 
@@ -145,22 +145,9 @@ def test_what_cannot_be_compared_is_refused(tables, said):
         compare.check(scenario.from_tables(tables))
 
 
-def given(posed, problem, own, starts, prepare=None, **_):
-    """What a search hands over, without one: the gains that it was given, a little farther."""
-    gains = 1.02 * np.asarray(own)
-    return optimise.Search(gains, posed.evaluate.bounds.share(gains), 0.0, np.zeros(1), np.zeros(1), [], [], problem)
-
-
-# tuned by a search of a spacecraft's flights in `make test-long`; of a chain's by test_cli.py
 @pytest.mark.parametrize("others", short([[], ["pd"]], [[]]))
 def test_the_command(command, tmp_path, monkeypatch, others):
     small_search(monkeypatch)
-    looked_at, hold = [], {"stable": True, "gain_margin": 7.5, "phase_margin": 40.0, "delay_margin": None,
-                           "modulus_margin": 3.0}  # fmt: skip
-    if not others:
-        monkeypatch.setattr(posing.Posed, "search", given)
-        monkeypatch.setattr(flights, "trials", lambda *_: None)  # those that it was trained on
-        monkeypatch.setattr(stability, "worst", lambda ready: looked_at.append(ready.scenario) or {"hold": hold})
     monkeypatch.setattr(compare, "laws", lambda: [compare.OURS, *others])  # each compiles as long again
     untold = compare.UNTOLD if others else ("heavier", "lighter")  # as one that is later does
     perturbed = compare.perturbed
@@ -185,9 +172,7 @@ def test_the_command(command, tmp_path, monkeypatch, others):
         again = scenario.read(folder / "scenarios" / f"{law}.toml")  # what was judged can be flown again
         flown, _ = judging.window_error(judging.judge(again, found["seed"]))  # on the same trials as the others
         assert flown == pytest.approx(found["laws"][law]["window_error"], rel=1e-9)
-        if not others:
-            assert parsing.dump(looked_at.pop(0)) == parsing.dump(again)
-            assert found["laws"][law]["margins"] == {"hold": hold}
+        assert found["laws"][law]["margins"] == stability.worst(scenario.study(again))
         assert found["laws"][law]["gains"].keys() >= {"pd": {"k_p", "k_d"}}.get(law, {"eta", "delta"})
         for name, value in found["laws"][law]["gains"].items():
             if name != "observer_gain":
