@@ -47,7 +47,7 @@ OUTSIDE = set(
     worst.SCREENED worst.STEPS starts.SWEPT descents.MANY descents.again descents.explore descents.descend
     cma_es.GENERATIONS global_check.GENERATIONS global_check.POPULATION flights.ROW flights.fly flights.trials
     confirm.FRESH confirm.FEWEST confirm.count rounds.harder evaluate.slopes journal.get posing.search
-    systems._ran systems._files
+    systems._ran systems._files ptsmc_jax.read
     """.split()
 )
 NOWHERE = Path(os.devnull, "none")  # can be neither written nor read

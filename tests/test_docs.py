@@ -14,13 +14,16 @@ import tomllib
 import types
 from collections.abc import Mapping
 
+import jaxtyping
 import pytest
 from jaxtyping import Array
 
 import ptsmc_jax
+from ptsmc_jax import scenario
 from ptsmc_jax.scenario import from_tables, layouts
 from ptsmc_jax.simulation import catalogues
-from tests.helpers import short
+from tests import kept
+from tests.helpers import SHORT
 from tests.scenario.test_schema import COMPLETE
 from tests.tree import ROOT, modules
 from tuning.cli.main import app
@@ -156,12 +159,25 @@ def test_names_in_the_text_exist(path):
 CODED = [page for page in WRITTEN if blocks(page, "python")]
 
 
+LARGE = [page for page in CODED if page.name in ("README.md", "python.md", "export.md")]
+
+
 @pytest.mark.parametrize(
-    "path", short(CODED, [page for page in CODED if page.name not in ("python.md", "export.md")]), ids=page_name
+    ("path", "small"),
+    [
+        *(pytest.param(page, False, id=page_name(page)) for page in CODED if page not in LARGE),
+        *(pytest.param(page, False, id=page_name(page), marks=pytest.mark.long) for page in LARGE),
+        pytest.param(LARGE[0], True, id="README.md, on a flight of five seconds"),
+    ],
 )
-def test_code_in_the_text_runs(path, monkeypatch, capsys):
+def test_code_in_the_text_runs(path, small, monkeypatch, capsys, request):
     monkeypatch.chdir(ROOT)
     monkeypatch.setattr("ptsmc_jax.configure.configure", lambda **_: None)  # conftest did
+    if small:  # flown by programs of other tests, as rooms of callers have them
+        request.addfinalizer(lambda: jaxtyping.config.update("jaxtyping_disable", False))
+        jaxtyping.config.update("jaxtyping_disable", True)
+        kept.keep()
+        monkeypatch.setattr("ptsmc_jax.read", lambda name: scenario.read(name) and from_tables(tomllib.loads(SHORT)))
     space = {}
     for block in blocks(path, "python"):
         exec(compile(block, str(path), "exec"), space)
