@@ -221,6 +221,12 @@ def chain_parts(
     )
 
 
+def chain_flight() -> Parts:
+    """A chain with noise on the flight clock, t_f between two samples and t_end too."""
+    run = chain_parts([1.0, 0.2], 5.02, delta=0.53, period=0.05, noise=[2e-4, 1e-4])
+    return dataclasses.replace(run, clock=clock.flight(0.05, 7.02))
+
+
 def with_controller(run: Parts, **changes: Any) -> Parts:
     """The parts with other values in the controller."""
     return dataclasses.replace(run, controller=dataclasses.replace(run.controller, **changes))
