@@ -148,7 +148,7 @@ def test_multiplicative_error_is_the_vector_part_of_the_error_quaternion_and_its
 
 
 def flown(law, reference, start, rate=(0.0, 0.0, 0.0), quiet=True, **others):
-    """A run with the default disturbance, or by the same program without one; of the multiplicative law finely stepped."""
+    """A run with the default disturbance, or by the same program without; of the multiplicative law finely stepped."""
     none = {"disturbance": disturbances.Sinusoid(*[jnp.zeros(3)] * 4), "rate_bound": 0.0} if quiet else {}
     run = parts(
         20.0, 3.5, 0.1, inertia=FULL_INERTIA, q=start, rate=rate, reference=reference, law=law, **none, **others

@@ -211,10 +211,8 @@ def test_catalogue_names_every_metric():
 @pytest.mark.parametrize("flight", [False, True])
 def test_the_last_row_holds_the_torque_of_the_last_period(flight):
     """Periods beyond t_end, of length zero, and the first one before t = 0 leave nothing behind."""
-    if flight:  # on either clock by the program of another test
-        run = chain_flight()
-    else:
-        run = parts(20.0, 3.0, 0.53, period=0.05, noise=(2e-4, 1e-5), reach=(25.0, 2.0))
+    body = parts(20.0, 3.0, 0.53, period=0.05, noise=(2e-4, 1e-5), reach=(25.0, 2.0))
+    run = chain_flight() if flight else body  # by the programs of other tests
     log = fly(run, 1, 4).log
     rows = np.flatnonzero(np.asarray(log.has_length))
     np.testing.assert_array_equal(log.u[rows[-1]], log.u[rows[-2]])

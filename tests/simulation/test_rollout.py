@@ -214,10 +214,8 @@ def test_the_last_row_is_at_t_end_and_time_never_runs_backwards():
 
 @pytest.mark.parametrize("flight", [False, True])
 def test_metrics_at_t_f_are_taken_inside_the_period(flight):
-    if flight:
-        run = chain_flight()
-    else:
-        run = with_controller(at_20_hz(20.0, 3.0, 0.53), t_f=vector(20.02))  # t_f = t_s + 10.6 periods
+    body = with_controller(at_20_hz(20.0, 3.0, 0.53), t_f=vector(20.02))  # t_f = t_s + 10.6 periods
+    run = chain_flight() if flight else body
     t_f = float(run.controller.t_f)
     result = fly(run)
     log = result.log
