@@ -211,12 +211,42 @@ def test_a_run_that_meets_a_singular_input_gain_is_marked_with_the_time(mode):
     assert result.bad_time == pytest.approx(t[np.argmax(x < 0.2)], abs=0.06)
 
 
-def test_newton_finds_x_2_where_x_1_dot_is_no_linear_function_of_it():
-    def F(t, x_1, x_2):  # noqa: N802
-        return jnp.sinh(x_2) - 0.1 * jnp.sin(t) + 0.2 * x_1[::-1]
+def no_linear_rate(t, x_1, x_2):
+    return jnp.sinh(x_2) - 0.1 * jnp.sin(t) + 0.2 * x_1[::-1]
 
-    model = second_order.system(2, F, lambda t, a, b: -b, lambda t, a, b: jnp.eye(2) + 0.1 * jnp.outer(a, a))
-    tables = {"plant": {"kind": "system", "system": model, "x0": [0.4, -0.2, 0.3, 0.1]}, "controller": {"delta": 0.1}}
+
+CURVED = second_order.system(2, no_linear_rate, lambda t, a, b: -b, lambda t, a, b: jnp.eye(2) + 0.1 * jnp.outer(a, a))
+AT_FIRST = (0.4, -0.2, 0.3, 0.1)
+
+
+def test_newton_finds_x_2_where_x_1_dot_is_no_linear_function_of_it():
+    """And the law, there, asks for the input that keeps it on the exact motion."""
+    law = prescribed_time.PrescribedTimeSystem(CURVED, *(vector(v) for v in (5.0, 3.0, 0.1, 1.0, 1e-3, 1.0)))
+    start, none_known = vector(AT_FIRST), jnp.zeros(2)
+    begun = law.errors(start, vector(0.0))
+
+    @jax.jit
+    @jax.vmap
+    def looked_at(t):
+        def exact(t):
+            return solutions.exact_error(t, law.t_f, law.eta, *begun).error_rate
+
+        error, rate = solutions.exact_error(t, law.t_f, law.eta, *begun).error, exact(t)
+        motion = law.motion(t, start, error, rate, jax.jvp(exact, (t,), (jnp.ones_like(t),))[1])
+        u, _ = torque(law, t, jnp.asarray(False), motion.x, t, none_known, vector(0.0))
+        return motion.x, error, rate, CURVED.input_for(t, motion.x, motion.w_dot, none_known), u
+
+    t = np.linspace(0.0, 4.8, 25)
+    x, error, rate, exact, u = (np.asarray(v) for v in looked_at(vector(t)))
+    np.testing.assert_array_equal(x[:, :2], error)
+    found = np.sinh(x[:, 2:]) - 0.1 * np.sin(t)[:, None] + 0.2 * x[:, 1::-1]
+    np.testing.assert_allclose(found, rate, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(u, exact, rtol=0, atol=1e-12)  # gains of up to 225 times rounding
+
+
+@pytest.mark.long  # at states of the exact motion: above
+def test_a_run_flies_by_the_x_2_that_newton_finds():
+    tables = {"plant": {"kind": "system", "system": CURVED, "x0": list(AT_FIRST)}, "controller": {"delta": 0.1}}
     ready = scenario.study(scenario.from_tables({**tables, "observer": {"kind": "nonlinear"}}))
     quiet = replace(ready.parts.observer, disturbance_rate_bound=vector(0.0))
     run = replace(ready.parts, observer=quiet)
