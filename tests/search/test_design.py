@@ -84,13 +84,17 @@ def test_the_sentence_says_what_simulation_found():
     assert share.startswith("the tuned gains keep peak_torque below 0.5 N m in 90 % of trials from t_f = 20.12 s on")
 
 
-def test_shortest_time_of_a_chain():
+# posed for that time alone, on a clock of its own, in `make test-long`; that t_f alone is moved: below
+@pytest.mark.parametrize("posed_anew", short([False, True], [False]))
+def test_shortest_time_of_a_chain(posed_anew):
     chain = scenario.from_tables({"plant": {"kind": "chain", "order": 3}})
     found = design.shortest_time(chain, Requirement("peak_torque", 5.0), 0, np.arange(1))
     assert found.theory is not None
+    assert found.simulated is not None
     assert found.simulated == pytest.approx(found.theory, rel=5e-3)  # the disturbance is 0.01 of 5
-    ready = scenario.study(scenario.replace(chain, controller__t_f=found.simulated))
-    run = montecarlo.run(ready.parts, ready.dispersion, 0, np.arange(1))
+    t_f = found.simulated if posed_anew else 1.5 * found.theory  # the longest that was looked at: by its program
+    ready = scenario.study(scenario.replace(chain, controller__t_f=t_f, loop__t_end=t_f + 10.0))
+    run = montecarlo.run(with_gains(ready.parts, {"t_f": found.simulated}), ready.dispersion, 0, np.arange(1))
     assert run.metrics.peak_torque[0] <= 5.0 * (1 + 1e-6)
 
 
@@ -129,7 +133,8 @@ def test_a_limit_on_a_share_of_the_trials_is_kept_by_that_share(confidence, leas
     tables = {
         "plant": {"kind": "chain", "order": 2, "x0": [1.0, 0.0]},
         "controller": {"t_f": 5.0, "delta": 0.5},
-        "loop": {"mode": "sampled", "clock": "flight", "period": 0.1, "t_end": 6.0},
+        "loop": {"mode": "sampled", "clock": "flight", "period": 0.1, "t_end": 6.5},  # with what is judged one program
+        "hardware": {"state_noise": [2e-5, 1e-5]},
         "dispersion": {"x0": {"kind": "uniform", "half_width": [0.5, 0.1]}},
     }
     trials, asked = np.arange(8), Requirement("peak_torque", 2.0, quantile=0.75, confidence=confidence)
