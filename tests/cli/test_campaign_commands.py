@@ -3,18 +3,18 @@
 import json
 import re
 from dataclasses import replace
-from types import SimpleNamespace
 
 import jax
 import numpy as np
 import polars as pl
 import pytest
 
-from ptsmc_jax.campaigns import campaign, store
-from tests.helpers import SHORT_CHAIN, same, short
+from ptsmc_jax.campaigns import campaign, montecarlo, store
+from ptsmc_jax.simulation import rollout
+from tests.helpers import SHORT, SHORT_CHAIN, same, short
 from tests.output.pages import checked
 from tuning.output import campaign_terminal, progress_lines, sentences
-from tuning.studies import campaign_figures, campaign_summary
+from tuning.studies import campaign_summary
 
 FOLDER = "out/montecarlo-s"
 MANY = 70  # trials, so many that the program of hundreds flies them
@@ -30,7 +30,8 @@ nothing = 3
 
 
 @pytest.fixture(autouse=True)
-def _small_parts(monkeypatch):
+def _of_a_chain_in_small_parts(command, tmp_path, monkeypatch):
+    (tmp_path / "s.toml").write_text(SHORT_CHAIN)
     monkeypatch.setattr(campaign, "PART", 100)
 
 
@@ -49,25 +50,20 @@ def flown(command, tmp_path):
     return tmp_path / FOLDER
 
 
-@pytest.fixture(params=short([False, True], [False]), ids=["rows alone", "histories too"])
-def _fan(request, monkeypatch):
-    """Whether histories are flown for the fan: so they are for a chain, and what they are `test_campaign.py` says."""
-    if not request.param:
-        told = SimpleNamespace(
-            finished=campaign.finished, history=lambda _, trials: (np.arange(1.0, 7.0), np.ones((trials.size, 6)))
-        )
-        monkeypatch.setattr(campaign_figures, "flying", told)
+PLANTS = {"chain": (SHORT_CHAIN, "3 u"), "spacecraft": (SHORT, "30 N m")}
 
 
-@pytest.mark.usefixtures("_fan")
-def test_a_campaign_leaves_rows_summary_and_figures(command, tmp_path, monkeypatch):
+@pytest.mark.parametrize("plant", short(PLANTS, ["chain"]))
+def test_a_campaign_leaves_rows_summary_and_figures(command, tmp_path, monkeypatch, plant):
+    text, limit = PLANTS[plant]
+    (tmp_path / "s.toml").write_text(text)
     monkeypatch.setattr(progress_lines, "EVERY", 0.05)
     code, said, progress = command("montecarlo", "s.toml", "--trials", 250, "--seed", 3)
     folder = tmp_path / FOLDER
     assert code == 0
     assert "ptsmc: summing up, " in progress
     assert "250 trials of seed 3: 250 ok" in said
-    assert "peak_torque at most 30 N m: worst" in said
+    assert f"peak_torque at most {limit}: worst" in said
     assert "100 % of trials keep the limit (95 %: 98.54 to 100 %)" in said  # 0.025^(1/250)
     names = {"scenario.toml", "versions.json", "floor.json", "summary.json", "trials", "figures"}
     assert {path.name for path in folder.iterdir()} == names
@@ -235,7 +231,7 @@ def test_bad_options_end_in_one_sentence_and_nothing_is_written(command, tmp_pat
 
 def test_a_width_needs_requirements(command, tmp_path):
     text = (tmp_path / "s.toml").read_text()
-    (tmp_path / "s.toml").write_text(text.replace("[requirements]\npeak_torque = 30.0\n", ""))
+    (tmp_path / "s.toml").write_text(text.replace("[requirements]\npeak_torque = 3.0\n", ""))
     code, _, error = command("montecarlo", "s.toml", "--until-confident", "0.1")
     assert (code, "needs [requirements]" in error) == (2, True)
 
@@ -243,7 +239,7 @@ def test_a_width_needs_requirements(command, tmp_path):
 def test_trials_until_the_share_is_known(command, tmp_path):
     """A limit that about half of the trials keep: the width is about 4 sqrt(p (1 - p) / n), so 400 trials for 0.1."""
     text = (tmp_path / "s.toml").read_text()
-    (tmp_path / "s.toml").write_text(text.replace("peak_torque = 30.0", "peak_torque = 3.0"))
+    (tmp_path / "s.toml").write_text(text.replace("peak_torque = 3.0", "peak_torque = 0.38"))
     code, said, _ = command("montecarlo", "s.toml", "--until-confident", "0.11", "--trials", 5000, "--no-figures")
     found = summary(tmp_path / FOLDER)
     assert code == 1
@@ -263,7 +259,7 @@ def test_trials_until_the_share_is_known(command, tmp_path):
 def test_trials_until_the_share_is_known_are_as_many_after_an_interruption(command, tmp_path, monkeypatch, before):
     """300 trials would do, but looked at are 200 and 400; behind 150 of another campaign 150 and 300, not 250."""
     text = (tmp_path / "s.toml").read_text()
-    (tmp_path / "s.toml").write_text(text.replace("peak_torque = 30.0", "peak_torque = 3.0"))
+    (tmp_path / "s.toml").write_text(text.replace("peak_torque = 3.0", "peak_torque = 0.38"))
     width = "0.12" if before == 0 else "0.135"
     confident = "montecarlo", "s.toml", "--trials", 5000, "--until-confident", width, "--no-figures"
     put = campaign.Rows.put
@@ -354,7 +350,7 @@ def test_the_worst_trials_and_their_replay(command, flown, tmp_path):
     assert code == 0
     assert kept["trial"].to_list() == order["trial"].to_list()
     assert str(order["trial"][0]) in said
-    head = ("trial", "status", "peak_torque [N m]", "window_error", "settling_time [s]", "initial_angle [rad]")
+    head = ("trial", "status", "peak_torque [u]", "window_error [x1]", "settling_time [s]", "initial_angle")
     assert re.split("  +", said.splitlines()[0].strip()) == list(head)
     trial = order["trial"][0]
     code, said, _ = command("replay", FOLDER, "--trial", trial, "--no-figures")
@@ -442,14 +438,38 @@ def test_metrics_of_ones_own_are_kept_and_judged_by(command, tmp_path):
     assert pl.read_csv(tmp_path / FOLDER / "worst.csv")["overshoot"][0] == rows["overshoot"].max()
 
 
-def wild(text):
-    """Starts near 180 deg, of which the law cannot turn many back."""
-    return text.replace("min_deg = 20.0, max_deg = 90.0", "min_deg = 170.0, max_deg = 180.0")
+WILD = SHORT.replace("min_deg = 20.0, max_deg = 90.0", "min_deg = 170.0, max_deg = 180.0")  # few are turned back
 
 
-@pytest.mark.usefixtures("_fan")
-def test_failures_are_counted_with_reason_and_time(command, tmp_path):
-    (tmp_path / "s.toml").write_text(wild((tmp_path / "s.toml").read_text()))
+@pytest.fixture(params=short(["made up", "flown"], ["made up"]))
+def lost(request, tmp_path, monkeypatch):
+    """Makes many trials fail, or, made up, be said to: every fourth; returns which of both."""
+
+    def run(parts, dispersion, seed, trials, *more, flown=montecarlo.run, **how):
+        result, fails = flown(parts, dispersion, seed, trials, *more, **how), np.asarray(trials) % 4 == 0
+        codes = np.where(np.asarray(trials) % 8 == 0, rollout.DIVERGED, rollout.SINGULAR)
+        return replace(
+            result,
+            status=np.where(fails, codes, result.status).astype(result.status.dtype),
+            bad_time=np.where(fails, 1e-2 * np.asarray(trials), result.bad_time),
+        )
+
+    def begin():
+        if request.param == "made up":
+            monkeypatch.setattr(montecarlo, "run", run)
+        else:
+            text = (tmp_path / "s.toml").read_text()
+            (tmp_path / "s.toml").write_text(WILD if "[requirements]" in text else WILD.replace(ASKED, ""))
+        return request.param
+
+    return begin
+
+
+ASKED = "[requirements]\npeak_torque = 30.0\n"
+
+
+def test_failures_are_counted_with_reason_and_time(command, tmp_path, lost):
+    of_what = lost()
     code, said, _ = command("montecarlo", "s.toml", "--trials", 250)
     found = summary(tmp_path / FOLDER)
     assert code == 1
@@ -457,17 +477,20 @@ def test_failures_are_counted_with_reason_and_time(command, tmp_path):
     for reason in found["reasons"]:
         assert f"{reason['trials']} {reason['status']}: {reason['reason']}, the first at" in said
         assert 0.0 <= reason["first_bad_time"] <= 6.5
+    if of_what == "made up":
+        first = {reason["status"]: (reason["trials"], reason["first_bad_time"]) for reason in found["reasons"]}
+        assert first == {"diverged": (32, 0.0), "singular": (31, 0.04)}
     failed = found["counts"]["diverged"] + found["counts"]["singular"]
     assert found["verdicts"][0]["failures"] >= failed > 30
     code, said, _ = command("worst", FOLDER, "-n", 2)
     assert set(pl.read_csv(tmp_path / FOLDER / "worst.csv")["status"]) <= {"diverged", "singular"}
 
 
-def test_without_requirements_a_failed_trial_is_the_exit_status(command, tmp_path):
-    text = (tmp_path / "s.toml").read_text().replace("[requirements]\npeak_torque = 30.0\n", "")
+def test_without_requirements_a_failed_trial_is_the_exit_status(command, tmp_path, lost):
+    text = (tmp_path / "s.toml").read_text().replace("[requirements]\npeak_torque = 3.0\n", "")
     (tmp_path / "s.toml").write_text(text)
     assert command("montecarlo", "s.toml", "--trials", MANY, "--no-figures", "--quiet")[0] == 0
-    (tmp_path / "s.toml").write_text(wild(text))
+    lost()
     assert command("montecarlo", "s.toml", "--trials", MANY, "--no-figures", "--quiet", "--out", "b")[0] == 1
 
 
@@ -478,7 +501,8 @@ def test_other_plants_and_the_continuous_loop(command, tmp_path, plant):
         "continuous": 'controller = { t_f = 20.0, delta = 0.5 }\n'
                       'dispersion = { attitude = { kind = "uniform" }, disturbance_phase = {} }\n',
     }[plant])  # fmt: skip
-    code, said, _ = command("montecarlo", "o.toml", "--trials", 70)
+    drawn = ["--no-figures"] if plant == "chain" else []  # those of a chain: above
+    code, said, _ = command("montecarlo", "o.toml", "--trials", 70, *drawn)
     assert code in (0, 1)
     assert "70 trials of seed 1000" in said
     frame = rows_of(tmp_path / "out/montecarlo-o")
