@@ -117,8 +117,10 @@ def test_tune_from_start_to_end(command, tmp_path, monkeypatch, text):
     assert {"gains", "training", "fresh", "paper", "verdicts"} <= set(summary)
     assert summary["fresh"]["trials"] == 40
     assert summary["fresh"]["seed"] != summary["training"]["seed"]
-    for group in ("fresh", "paper"):
+    known = {"fresh": summary["gains"], "paper": {"eta": 3.0, "delta": 0.1}}  # a period: the paper's 0.05 s is less
+    for group, of_group in known.items():
         assert 0.0 < summary[group]["floor"] < summary[group]["window_error"]["rms"]
+        assert summary[group]["gains"].items() >= of_group.items()
     files = {"tuned.toml", "history.csv", "summary.json", "scenario.toml", "versions.json"}
     drawn = {f"figures/{name}.png" for name in ("history", "tradeoff", "sensitivities", "profiles")}
     assert set(tree(tmp_path / "t")) == files | drawn
