@@ -219,6 +219,17 @@ def replace_tune(made, **changes):
     return scenario.replace(made, tune={**changes})
 
 
+@pytest.mark.parametrize("own", [None, 0.5, 1.001, 1.4, 1.5, 3.0, 5.0, 6.0, 15.9, 16.0])
+def test_a_limit_of_ones_own_takes_the_place_of_the_nearest_rung(own):
+    """By logarithms; the ends stay, which are known to be kept."""
+    usual = np.array([1.0, 2.0, 4.0, 8.0, 16.0])
+    ladder, middle = pareto.ladder_between(1.0, 16.0, 5, own)
+    rungs = {1.001: 1, 1.4: 1, 1.5: 1, 3.0: 2, 5.0: 2, 6.0: 3, 15.9: 3}  # from 2 sqrt(2) on 4 is nearer than 2
+    assert middle == rungs.get(own, 2)
+    np.testing.assert_allclose(np.delete(ladder, middle), np.delete(usual, middle), rtol=1e-14)
+    assert ladder[middle] == (own if own in rungs else pytest.approx(4.0, rel=1e-14))
+
+
 def test_the_ladder_says_which_rung_it_is_on(monkeypatch):
     told = []
     monkeypatch.setattr(pareto, "_step", lambda *_: None)

@@ -113,11 +113,7 @@ def trace(
         return found, found.ended[at] * limit
 
     least, lowest = least_torque(asking_for, highest)
-    ladder = np.geomspace(lowest / (1.0 - MARGIN), highest / (1.0 - MARGIN), points)
-    middle = points // 2
-    if own_limit is not None and ladder[0] < own_limit < ladder[-1]:
-        middle = 1 + int(np.argmin(np.abs(np.log(ladder[1:-1] / own_limit))))
-        ladder[middle] = own_limit
+    ladder, middle = ladder_between(lowest / (1.0 - MARGIN), highest / (1.0 - MARGIN), points, own_limit)
     # gains at the ends need not lead to the best valley between them
     report = headed(tell, f"peak torque {ladder[middle]:.3g}")
     between = uninterrupted(posed.search(under(ladder[middle]), posed.own, starts, (), judged=False, report=report))
@@ -142,6 +138,18 @@ def trace(
         rollouts=evaluate.rollouts,
         gradients=evaluate.gradients,
     )
+
+
+def ladder_between(lowest: float, highest: float, points: int, own: float | None) -> tuple[np.ndarray, int]:
+    """Limits (points,) evenly spread by their logarithms, and which of them the search between the ends is for.
+
+    That is the scenario's own, in place of the one that is nearest to it, where it lies between the ends.
+    """
+    ladder, middle = np.geomspace(lowest, highest, points), points // 2
+    if own is not None and lowest < own < highest:
+        middle = 1 + int(np.argmin(np.abs(np.log(ladder[1:-1] / own))))
+        ladder[middle] = own
+    return ladder, middle
 
 
 def least_torque(
