@@ -141,7 +141,10 @@ def test_a_limit_on_a_share_of_the_trials_is_kept_by_that_share(confidence, leas
     found = design.shortest_time(scenario.from_tables(tables), asked, 4, trials)
     ready = scenario.study(scenario.from_tables(tables))
     assert found.simulated is not None
+    assert found.theory is not None
     for factor, shown in ((1.0, True), (0.995, False)):
+        drawn = ready.dispersion, np.uint32(4), trials.astype(np.uint32)
+        assert (np.sum(design._predicted(ready.parts, *drawn, factor * found.theory) <= 2.0) >= least) == shown
         parts = with_gains(ready.parts, {"t_f": factor * found.simulated})
         peaks = montecarlo.run(parts, ready.dispersion, 4, trials).metrics.peak_torque
         assert asked.verdict(peaks, np.ones(8, bool)).met == shown
