@@ -13,6 +13,7 @@ import textwrap
 import tomllib
 import types
 from collections.abc import Mapping
+from pathlib import Path
 
 import jaxtyping
 import pytest
@@ -168,14 +169,17 @@ LARGE = [page for page in CODED if page.name in ("README.md", "python.md", "expo
         pytest.param(ROOT / "README.md", True, id="README.md, on a flight of five seconds"),
     ],
 )
-def test_code_in_the_text_runs(path, small, monkeypatch, capsys, request):
-    monkeypatch.chdir(ROOT)
+def test_code_in_the_text_runs(path, small, monkeypatch, tmp_path, capsys, request):
+    monkeypatch.chdir(tmp_path)
+    Path("scenarios").symlink_to(ROOT / "scenarios")
     monkeypatch.setattr("ptsmc_jax.configure.configure", lambda **_: None)  # conftest did
     if small:  # flown by programs of other tests, as rooms of callers have them
         request.addfinalizer(lambda: jaxtyping.config.update("jaxtyping_disable", False))
         jaxtyping.config.update("jaxtyping_disable", True)
         kept.keep()
         monkeypatch.setattr("ptsmc_jax.read", lambda name: scenario.read(name) and from_tables(tomllib.loads(SHORT)))
+    if path.name == "export.md":  # the page does so by the command
+        ptsmc_jax.export("scenarios/first_flight.toml", "out/controller")
     space = {}
     for block in blocks(path, "python"):
         exec(compile(block, str(path), "exec"), space)
