@@ -242,24 +242,21 @@ def test_importing_the_package_and_the_command_does_not_import_jax():
 def test_importing_the_library_changes_nothing_of_jax_or_the_environment():
     names = list(modules())
     changed = python(f"""
-import importlib, json, os, sys, warnings
+import importlib, json, os, warnings
 import jax, polars  # which sets a variable of its allocator's own
 def state():
     return {{**jax.config.values, "flags": os.environ.get("XLA_FLAGS"), "environment": dict(os.environ)}}
 before, filters = state(), list(warnings.filters)
-importlib.import_module("tuning.studies.tuner")
-slow = "scipy.stats" in sys.modules
 for name in {names}:
     importlib.import_module(name)
 after = state()
 changed = [key for key in after if after[key] is not before.get(key) and after[key] != before.get(key)]
 started = bool(jax._src.xla_bridge._backends)
-print(json.dumps([changed, started, len(before), slow]))
+print(json.dumps([changed, started, len(before)]))
 """)
     assert changed[0] == []
     assert changed[1] is False  # no backend has started: `configure` can still be called
     assert changed[2] > 50  # it did look
-    assert changed[3] is False  # half a second, in which a search flies
 
 
 @pytest.mark.parametrize("package", ["ptsmc_jax", "ptsmc_jax.scenario"])

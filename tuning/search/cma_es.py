@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 import numpy as np
+from cmaes import CMA
 
 from tuning.search.descent import SLACK, Best
 from tuning.search.evaluate import Evaluator, Measured
@@ -31,8 +32,6 @@ def evolve(
     Covariance matrix adaptation (Hansen and Ostermeier, Evol. Comput. 9(2), 2001). keep is called with the best point
     of each generation, as it was measured.
     """
-    from cmaes import CMA  # imports `scipy.stats`, in half a second
-
     within = np.tile([0.0, 1.0], (len(problem.names), 1))
     population, spread = size
     evolution = CMA(share, spread, bounds=within, seed=seed, population_size=population)
