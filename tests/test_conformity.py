@@ -310,13 +310,6 @@ def compare(parts, dispersion, name, sloped, reference: Any = under_vmap):
     return expected[0], (last[1], last[0], last[3])
 
 
-def singles(ready, fly):
-    """The same trials one by one: metrics (trials,) by name."""
-    drawn = [ready.dispersion.apply(ready.parts, SEED, trial) for trial in NUMBERS]
-    runs = [fly(run, SEED, trial).metrics for run, trial in zip(drawn, NUMBERS, strict=True)]
-    return {metric: np.array([getattr(run, metric) for run in runs]) for metric in runs[0]._fields}
-
-
 @pytest.mark.parametrize(("name", "in_full"), CASES)
 def test_every_part_is_the_same_in_lanes_under_vmap_and_in_a_loop_with_finite_slopes(name, in_full):
     ready = scenario.study(scenario.from_tables(ROWS[name]))
@@ -326,7 +319,8 @@ def test_every_part_is_the_same_in_lanes_under_vmap_and_in_a_loop_with_finite_sl
     for metric, slope in slopes.items():
         assert np.isfinite(slope) or not np.isfinite(values[metric]), metric
     if in_full:
-        agree(singles(ready, rollout.simulate_jit), metrics, 1e-12, name)
+        alone = one_by_one(ready.parts, at_rest_on_the_target(ready.parts), ready.dispersion, sloped=False)[0]
+        agree({metric: values[:-1] for metric, values in alone.items()}, metrics, 1e-12, name)
 
 
 @pytest.mark.parametrize(

@@ -439,6 +439,7 @@ def test_metrics_of_ones_own_are_kept_and_judged_by(command, tmp_path):
 
 
 WILD = SHORT.replace("min_deg = 20.0, max_deg = 90.0", "min_deg = 170.0, max_deg = 180.0")  # few are turned back
+ASKED = "[requirements]\npeak_torque = 30.0\n"
 
 
 @pytest.fixture(params=short(["made up", "flown"], ["made up"]))
@@ -463,9 +464,6 @@ def lost(request, tmp_path, monkeypatch):
         return request.param
 
     return begin
-
-
-ASKED = "[requirements]\npeak_torque = 30.0\n"
 
 
 def test_failures_are_counted_with_reason_and_time(command, tmp_path, lost):
