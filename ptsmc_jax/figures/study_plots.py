@@ -142,6 +142,8 @@ def profiles(gains: Mapping[str, Profile], goal: str) -> Figure:
             beyond = ~within & (np.asarray(one.nearest) == of)
             label = f"beyond the limit of {of}"
             ax.semilogy(one.gain[beyond], one.goal[beyond], mark, color=STYLES[1][0], label=label)
+        if not np.any(np.isfinite(one.goal)):
+            ax.text(0.5, 0.5, "no goal: no trial ends", transform=ax.transAxes, ha="center", va="center")
         ax.axvline(one.tuned, color="0.3", lw=0.9, ls=":", label="tuned")
         if wide(one.gain[0], one.gain[-1]):
             logarithmic(ax, "x")

@@ -6,6 +6,7 @@ from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ptsmc_jax.numerics.pytrees import Scalar
@@ -124,3 +125,17 @@ def as_pytree(function: Callable | None) -> Any:
     """A callable that may be a field of a plant: a plain function is wrapped, a pytree and None are that already."""
     plain = function is not None and jax.tree.leaves(function) == [function]
     return jax.tree_util.Partial(function) if plain else function
+
+
+def check_indices(function: Callable, *arguments: Any) -> None:
+    """Raise IndexError where a function of one's own takes an element that none of its arguments has.
+
+    JAX would take the last one in its place, and say nothing. arguments: pytrees of arrays, or of their shapes.
+    """
+    known = jax.tree.map(lambda one: np.zeros(one.shape, one.dtype), arguments)  # NumPy looks
+    try:
+        jax.eval_shape(lambda: function(*known))
+    except IndexError:
+        raise
+    except (Exception, SystemExit):  # what works with JAX's arrays alone
+        return

@@ -4,11 +4,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ptsmc_jax.numerics.pytrees import Scalar, pytree
-from ptsmc_jax.plants.base import Plant, as_pytree
+from ptsmc_jax.plants.base import Plant, as_pytree, check_indices
 
 
 @pytree
@@ -74,7 +75,16 @@ class Chain(Plant):
 
 
 def chain(order: int, f: Callable | None = None, g: Callable | None = None) -> Chain:
-    """Integrator chain of an order n; f, g: functions of the state (n,), see `Chain`. Raises ValueError for n < 2."""
+    """Integrator chain of an order n; f, g: functions of the state (n,), see `Chain`.
+
+    Raises ValueError for n < 2, and where a function takes a state that there is not.
+    """
     if not isinstance(order, int) or isinstance(order, bool) or order < 2:
         raise ValueError(f"order is {order!r}, but must be a whole number of at least 2")
+    for name, function in (("f", f), ("g", g)):
+        try:
+            if function is not None:
+                check_indices(function, jax.ShapeDtypeStruct((order,), float))
+        except IndexError as error:
+            raise ValueError(f"{name}(x) fails for x of shape ({order},): {error}") from error
     return Chain(order, as_pytree(f), as_pytree(g))

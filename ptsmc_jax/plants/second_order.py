@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from ptsmc_jax.numerics import guards, matrices
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
-from ptsmc_jax.plants.base import Plant, as_pytree
+from ptsmc_jax.plants.base import Plant, as_pytree, check_indices
 
 
 @pytree
@@ -226,6 +226,7 @@ def _check(name: str, function: Callable, arguments: tuple, shape: tuple[int, ..
 
     def traced(what: str, of: Callable) -> Any:
         try:
+            check_indices(of, *arguments)
             return jax.eval_shape(of, *arguments)
         except (Exception, SystemExit) as error:
             first_line = (str(error).splitlines() or [""])[0]

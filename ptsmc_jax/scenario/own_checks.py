@@ -14,6 +14,7 @@ from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.laws.acceleration import AccelerationLaw
 from ptsmc_jax.laws.base import Sample
 from ptsmc_jax.observers.base import Bound
+from ptsmc_jax.plants.base import check_indices
 from ptsmc_jax.plants.second_order import INSTEAD, TRACED
 from ptsmc_jax.scenario import systems
 from ptsmc_jax.scenario.errors import ScenarioError, brief
@@ -64,6 +65,7 @@ class _Asked:
         try:
             returned = jax.tree.map(jnp.asarray, function(*args))
             _trace(function, args)
+            check_indices(function, *args)
             return returned
         except (Exception, SystemExit) as error:
             told = what_fails(error, inspect.getsourcefile(self._made) or "")

@@ -74,6 +74,7 @@ def test_a_profile_with_hardly_a_goal_has_the_whole_interval_of_its_gain(known):
     low, high = figure.axes[0].get_xlim()
     assert low < 1e-3
     assert high > 1.0
+    assert [text.get_text() for text in figure.axes[0].texts] == ["no goal: no trial ends"] * (not known)
 
 
 @pytest.mark.parametrize(("limit", "drawn"), [(2.9, True), (3.1, False)])

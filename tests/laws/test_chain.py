@@ -360,6 +360,8 @@ def test_batches_of_chains_and_their_gradients():
 def test_chain_is_built_with_an_order_and_functions():
     with pytest.raises(ValueError, match="order is 1, but must be a whole number of at least 2"):
         integrator_chain.chain(1)
+    with pytest.raises(ValueError, match=r"^g\(x\) fails for x of shape \(3,\): index 3 is out of bounds"):
+        integrator_chain.chain(3, g=lambda x: 1.0 + x[3] ** 2)
     stiff = jax.tree_util.Partial(lambda k, x: -k * x[0], vector(2.0))
     found = integrator_chain.chain(3, stiff)
     assert found.f is stiff

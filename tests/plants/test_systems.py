@@ -267,6 +267,8 @@ def test_what_is_no_system_is_refused_in_one_sentence():
         second_order.system(3, F, F, G)
     with pytest.raises(ValueError, match=r"H\(t, x_1, x_2\) fails for x_1 and x_2 of shape \(2,\)"):
         second_order.system(2, F, lambda t, x: x, G)
+    with pytest.raises(ValueError, match=r"^H\(t, x_1, x_2\) fails .*: IndexError: index 2 is out of bounds [^\n]*$"):
+        second_order.system(2, F, lambda t, a, b: -a * b[2], G)  # JAX takes b[1]
     with pytest.raises(ValueError, match="n is 0"):
         second_order.system(0, F, F, G)
     for size in (1.0, 1e-9):  # of small systems too

@@ -246,6 +246,7 @@ SEES = [
     ("x + self.sigma", "jnp.nan * x + self.sigma", "must return finite numbers"),
     ("x + self.sigma", "x + 0.0 / dt + self.sigma", "finite numbers, also where dt is 0, at the first sample"),
     ("draws = 2\n    sigma", "draws = 2.5\n    sigma", "draws is 2.5, but must be a whole number of at least 0"),
+    ("sigma * noise", "sigma * noise[2]", "see fails: IndexError: index 2 is out of bounds for axis 0 with size 2"),
     ("x + self.sigma", "1 / 0 + self.sigma", "see fails: ZeroDivisionError: division by zero (line 18 of mine.py)"),
 ]
 DRAWS = [
@@ -255,6 +256,7 @@ DRAWS = [
     ("initial=parts.initial + 0.01 * c[1]", "initial=jnp.zeros(3)", "parts with f64(3,) in place of f64(2,)"),
     ("initial=parts.initial + 0.01 * c[1]", "initial=None", "parts with initial absent in place of an array of shape"),
     ("0.01 * c[1]", "jnp.inf * c[1]", "numbers that are not finite"),
+    ("0.01 * c[1]", "0.01 * c[2]", "at fails: IndexError: index 2 is out of bounds for axis 0 with size 2 (line"),
     ("0.01 * c[1]", "1 / 0 * c[1]", "at fails: ZeroDivisionError"),
     ('{"drift": 1.0', '{" ": 1.0', "returns a number ' ' at t = 0, but must return names that can be printed"),
     ('{"drift": 1.0', '{"status": 1.0', "names that no column of the rows has"),

@@ -42,10 +42,12 @@ def with_unit(name: str, kind: str) -> str:
 
     >>> with_unit("largest_peak_torque", "spacecraft"), with_unit("delay_margin", "chain"), with_unit("status", "chain")
     ('largest_peak_torque [N m]', 'delay_margin [s]', 'status')
+    >>> with_unit("initial_angle", "spacecraft"), with_unit("initial_angle", "chain")
+    ('initial_angle [rad]', 'initial_angle [x1]')
     """
     units = catalogues.units(kind)
-    units |= {"torque": units["peak_torque"], "delay_margin": "s"}
-    units |= {"initial_angle": "rad"} if kind == "spacecraft" else {}
+    start = "rad" if kind == "spacecraft" else units["window_error"]  # of others |x_1| stands in that column
+    units |= {"torque": units["peak_torque"], "delay_margin": "s", "initial_angle": start}
     unit = units.get(re.sub("^(linear|largest|hold)_(?=torque|peak|window|delay)", "", name), "-")
     return name if unit == "-" else f"{name} [{unit}]"
 
