@@ -4,6 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 SCENARIO := scenarios/first_flight.toml
 OUT := out/tune-first_flight
+TYPED := ptsmc_jax tuning tests docs benchmarks
 
 .PHONY: tune test types suite test-long setup table docs notebooks notebooks-kept clean
 
@@ -16,8 +17,12 @@ test: $(VENV)/.installed-dev
 	$(BIN)/ruff format --check .
 	$(MAKE) --jobs 2 types suite
 
-types:
+types: $(VENV)/.types
+
+# looked at anew where something has changed since; folders: what is taken away, too
+$(VENV)/.types: $(VENV)/.installed-dev $(shell find $(TYPED) -mindepth 1 -name '*.py' -o -type d ! -name __pycache__)
 	$(BIN)/pyright
+	@touch $@
 
 suite:
 	$(BIN)/python -m pytest -n 2 --no-loadscope-reorder
@@ -47,15 +52,15 @@ setup: $(VENV)/.installed-dev
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit("ptsmc-jax needs Python 3.11 or newer; name one with make PYTHON=...") if sys.version_info < (3, 11) else None'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[report]'
+	$(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable '.[report]'
 	@touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	$(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable '.[dev]'
 	@touch $@
 
 $(VENV)/.installed-notebooks: $(VENV)/.installed
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[notebooks]'
+	$(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable '.[notebooks]'
 	@touch $@
 
 clean:

@@ -269,6 +269,7 @@ def test_what_is_no_system_is_refused_in_one_sentence():
         second_order.system(2, F, lambda t, x: x, G)
     with pytest.raises(ValueError, match=r"^H\(t, x_1, x_2\) fails .*: IndexError: index 2 is out of bounds [^\n]*$"):
         second_order.system(2, F, lambda t, a, b: -a * b[2], G)  # JAX takes b[1]
+    second_order.system(2, F, lambda t, a, b: -a * b[jnp.argmax(a)] - b[jnp.array([1, 0])], G)
     with pytest.raises(ValueError, match="n is 0"):
         second_order.system(0, F, F, G)
     for size in (1.0, 1e-9):  # of small systems too
