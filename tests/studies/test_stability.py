@@ -15,7 +15,8 @@ import pytest
 from ptsmc_jax import scenario
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.theory import linear, margins, rest, run_margins
-from tests.helpers import SHORT, SHORT_CHAIN, short
+from tests.helpers import SHORT, SHORT_CHAIN, short, untuned
+from tests.theory.loops import held
 from tuning.output import margin_sentences, page
 from tuning.studies import stability
 
@@ -28,7 +29,13 @@ def tables(path):
         return list(csv.DictReader(file))
 
 
-def test_margins_leaves_its_table_figures_and_page(command, tmp_path):
+SCENARIOS = {"body": (SHORT, list("xyz"), 6), "chain": (CHAIN, ["u1"], 2)}  # axes, and how much sensors see
+
+
+@pytest.mark.parametrize("plant", short(SCENARIOS, ["chain"]))
+def test_margins_leaves_its_table_figures_and_page(command, tmp_path, plant):
+    text, names, seen = SCENARIOS[plant]
+    (tmp_path / "s.toml").write_text(text)
     status, out, _ = command("margins", "s.toml")
     folder = tmp_path / "out" / "margins-s"
     assert status == 0
@@ -36,17 +43,29 @@ def test_margins_leaves_its_table_figures_and_page(command, tmp_path):
     assert "the loop in hold is stable" in out
     assert {p.name for p in (folder / "figures").iterdir()} == {"nichols.png", "sensitivity.png", "margins.png"}
     found = json.loads((folder / "summary.json").read_text())
-    rows = tables(folder / "margins.csv")
+    of_axes(tables(folder / "margins.csv"), found, names, seen)
+    # one axis alone bears at least as much as all at once
+    alone = min(one["gain_up"] for one in found["hold"].values())
+    assert found["together"]["gain_up"] <= alone * (1 + 1e-6)
+    if len(names) == 1:
+        np.testing.assert_allclose(found["together"]["gain_up"], alone, rtol=1e-6)
+    made = page.build(folder)
+    assert "ptsmc margins scenario.toml" in made
+    assert "all inputs" in made
+
+
+def of_axes(rows, found, names, seen):
+    """What the table and the summary say of each axis, and of the worst of them."""
     hold = [row for row in rows if row["t"] == rows[-1]["t"]]
-    assert [row["axis"] for row in hold] == ["x", "y", "z"]
+    assert [row["axis"] for row in hold] == names
     for row in hold:
         said = found["hold"][row["axis"]]
         for column, name in (("gain_up_dB", "gain_up"), ("phase_deg", "phase"), ("delay_s", "delay")):
             np.testing.assert_allclose(float(row[column]), said[name], rtol=1e-12)
-    assert len(found["before"]) == len(rows) / 3 - 1
+    assert len(found["before"]) == len(rows) / len(names) - 1
     for one in found["before"]:  # of the worst axis
         axes = [row for row in rows if float(row["time_to_go"]) == one["time_to_go"]]
-        assert len({row["modulus_dB"] for row in axes}) == 3
+        assert len({row["modulus_dB"] for row in axes}) == len(names)
         assert one["modulus"] == max(float(row["modulus_dB"]) for row in axes)
         assert one["phase"] == min(float(row["phase_deg"]) for row in axes)
         assert one["delay"] == min(float(row["delay_s"]) for row in axes)
@@ -54,14 +73,28 @@ def test_margins_leaves_its_table_figures_and_page(command, tmp_path):
     in_hold = [one["phase"] for one in found["hold"].values()]
     np.testing.assert_allclose(found["worst"]["phase_margin"], min([*in_hold, *judged]))
     assert judged
-    # one axis alone bears at least as much as all at once
-    assert found["together"]["gain_up"] <= min(one["gain_up"] for one in found["hold"].values()) * (1 + 1e-6)
-    assert len(found["sensors"]) == 6
+    assert len(found["sensors"]) == seen
     assert all({"gain_up", "phase", "modulus"} <= set(one) and "delay" not in one for one in found["sensors"].values())
     assert all(float(row["time_to_go"]) > 0.0 for row in rows if row not in hold)
-    made = page.build(folder)
-    assert "ptsmc margins scenario.toml" in made
-    assert "all inputs" in made
+
+
+def test_the_table_has_every_axis_and_the_summary_the_worst(tmp_path):
+    """By numbers of no loop."""
+    ready, rng = scenario.study(scenario.from_tables(untuned(SHORT))), np.random.default_rng(3)
+
+    def left(*shape):
+        each = margins.Margins(*rng.uniform(1.0, 9.0, (7, *shape)))
+        return each._replace(stable=each.stable > 0.0)
+
+    three = np.eye(6, k=3), np.eye(6)[:, 3:], -np.tile(np.eye(3), 2)
+    loops = jax.tree.map(lambda v: np.stack([v] * 5), held(*three, 0.1))
+    t, together = np.array([3.0, 3.5, 4.0, 4.5, 6.4]), dict.fromkeys(margins.FIELDS, 0.5)
+    judged = np.array([False, True, False, True, True])
+    course = run_margins.Course(t, judged, loops, left(5, 3), left(6), together, 1.0, missed=False)
+    (tmp_path / "made").mkdir()
+    stability.write(tmp_path / "made", ready, course, figures=False)
+    found = json.loads((tmp_path / "made" / "summary.json").read_text())
+    of_axes(tables(tmp_path / "made" / "margins.csv"), found, list("xyz"), 6)
 
 
 ASKS = CHAIN.split("[requirements]")[0] + "[requirements]\ngain_margin = 1.0\nphase_margin = 89.0\n"
@@ -107,7 +140,7 @@ def test_each_of_several_loops_is_judged_once_and_in_its_place(monkeypatch):
 
 
 def test_an_unstable_hold_is_said_and_has_negative_margins(command, tmp_path):
-    (tmp_path / "wild.toml").write_text(SHORT.replace("[controller]", "[controller]\nk1 = 60.0"))
+    (tmp_path / "wild.toml").write_text(CHAIN.replace("[controller]", "[controller]\nk1 = 60.0"))
     loaded = scenario.read(tmp_path / "wild.toml")
     assert loaded.controller.k1 * loaded.loop.period > 4.0  # K1 h / 2 beyond 2: the border without delay
     status, out, _ = command("margins", "wild.toml", "--no-figures")
