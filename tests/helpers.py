@@ -16,7 +16,7 @@ import pytest
 from hypothesis import given, settings
 from polars.testing import assert_frame_equal
 
-from ptsmc_jax import configure
+from ptsmc_jax import configure, programs
 from ptsmc_jax.devices import sensors
 from ptsmc_jax.laws import prescribed_time
 from ptsmc_jax.observers import none, nonlinear
@@ -107,7 +107,7 @@ def fly(run: Parts, seed: int = 0, trial: int = 0) -> Any:
     return jax.tree.map(np.asarray, flown)
 
 
-@jax.jit
+@programs.jit
 def inputs_along(run: Parts, t: Any) -> Any:
     """Inputs (time, m) of the exact motion at times t (time,), which mean something before the hand-over."""
     return jax.vmap(lambda time: solutions.exact_input(run, time)[0])(t)

@@ -4,8 +4,10 @@ Until a line of the code changes, no test traces again what an earlier run has t
 hang on: numbers and words have a folder of their own, and with anything else in its place nothing is written or read.
 What the compile cache knows after a change comes from there, and cannot be written again.
 Programs that were made without looking at shapes lie apart; before a test that looks takes one, it is traced.
+Functions at the top of the tests' own modules are kept too, by `programs.jit`, until a line of any test changes.
 """
 
+import functools
 import hashlib
 import os
 import secrets
@@ -25,7 +27,7 @@ import pytest
 from ptsmc_jax import configure, programs
 from tests.tree import PACKAGES, QUICKLY, modules
 
-STARTED, SOURCES = time.time(), modules().values()
+STARTED, SOURCES = time.time(), modules(*PACKAGES, "tests").values()
 programs.KEPT = 1500
 programs.secrets = SimpleNamespace(token_hex=lambda count: secrets.token_hex(count) if _of_a_test() else "kept")
 _seen = threading.local()  # by this thread: whether the last program that it compiled was in the compile cache
@@ -51,7 +53,7 @@ OUTSIDE = set(
     """.split()
 )
 NOWHERE = Path(os.devnull, "none")  # can be neither written nor read
-_begun, _write = programs.Program._begun, programs._write
+_begun, _write, _known_by = programs.Program._begun, programs._write, programs.Program._origin
 _setattr, _undo = pytest.MonkeyPatch.setattr, pytest.MonkeyPatch.undo
 _patched: dict[int, dict[str, Any]] = {}  # by whom, and what is in the place of what
 
@@ -78,7 +80,7 @@ def _of_a_test() -> bool:
 def forget() -> None:
     """The programs that this process has ready."""
     for name, module in list(sys.modules.items()):
-        if name.split(".")[0] in PACKAGES:
+        if name.split(".")[0] in (*PACKAGES, "tests"):
             for program in vars(module).values():
                 if isinstance(program, programs.Program):
                     program._ready.clear()
@@ -98,6 +100,24 @@ def _begin(self: programs.Program, key: tuple, said: str, given: dict) -> tuple:
             path.parent.mkdir(mode=0o700, exist_ok=True)
             os.link(other, path)
     return _begun(self, key, said, given)
+
+
+def _origin(self: programs.Program) -> tuple[str, str, str]:
+    """Of our code as ever, and of the tests', but for lambdas, all of which have one name."""
+    function = self._function
+    if function.__module__.split(".")[0] != "tests" or "<" in function.__qualname__:
+        return _known_by(self)
+    return function.__module__, function.__qualname__, programs._code(PACKAGES[-1]) + _code_of_tests()
+
+
+@functools.cache
+def _code_of_tests() -> str:
+    """Digest of their files."""
+    digest = hashlib.sha256()
+    for name, path in modules("tests").items():
+        digest.update(f"{name} {path.stat().st_size}".encode())
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
 
 
 def _edited(since: float) -> bool:
@@ -134,5 +154,5 @@ def _undone(self: pytest.MonkeyPatch) -> None:
     keep()
 
 
-programs.Program._begun, programs._write = _begin, _write_new
+programs.Program._begun, programs._write, programs.Program._origin = _begin, _write_new, _origin
 pytest.MonkeyPatch.setattr, pytest.MonkeyPatch.undo = _set, _undone

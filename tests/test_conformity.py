@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ptsmc_jax import scenario
+from ptsmc_jax import programs, scenario
 from ptsmc_jax.batching import lanes
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.dispersions import variation
@@ -223,9 +223,10 @@ def test_every_kind_has_a_row(name, known):
     assert {table.get("kind", next(iter(known))) for table in asked} >= set(known) - {"none"}
 
 
-@partial(jax.jit, static_argnames=("vmap", "sloped"))
-def batch(parts, still, dispersion, vmap, sloped):
+@programs.jit(static_argnames=("in_lanes", "sloped"))
+def batch(parts, still, dispersion, in_lanes, sloped):
     """Metrics, status and bad times of some trials, `still` the last, and the metrics' slopes along the law's gains."""
+    vmap = strict if in_lanes else jax.vmap
     names = [name for name in parts.controller.tunable if name not in ("sign_width", "t_f", "k1")]
     gains = {name: getattr(parts.controller, name) for name in names}
 
@@ -292,12 +293,12 @@ def one_by_one(parts, still, dispersion, sloped):
 drawn = jax.jit(lambda dispersion, parts, trial: dispersion.apply(parts, SEED, trial))
 
 
-under_vmap = partial(batch, vmap=jax.vmap)
+under_vmap = partial(batch, in_lanes=False)
 
 
 def compare(parts, dispersion, name, sloped, reference: Any = under_vmap):
     """In lanes and under vmap: (metrics of the trials) and (status, metrics, slopes) of the awkward one."""
-    still, by_lanes = at_rest_on_the_target(parts), partial(batch, vmap=strict)
+    still, by_lanes = at_rest_on_the_target(parts), partial(batch, in_lanes=True)
     both = [jax.tree.map(np.asarray, of(parts, still, dispersion, sloped=sloped)) for of in (by_lanes, reference)]
     got, expected = (jax.tree.map(lambda v: v[:-1], one) for one in both)
     last = jax.tree.map(lambda v: v[-1], both[1])

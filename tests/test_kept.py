@@ -105,6 +105,22 @@ def test_nothing_is_kept_once_a_file_was_edited(tmp_path, monkeypatch):
     assert configure.programs == kept.NOWHERE
 
 
+def test_a_function_of_a_test_hangs_on_the_tests_and_on_our_code():
+    """Not a lambda: all of a module's have one name."""
+    _, function = doubled()
+    function.__module__ = "tests.helpers"
+    program = programs.jit(function)
+    *name, code = program._origin()
+    assert name == ["tests.helpers", "looked"]
+    for where, changed in ((kept, "_code_of_tests"), (programs, "_code")):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(where, changed, lambda *_: "other")
+            assert program._origin()[2] != code
+    function.__qualname__ = "<lambda>"
+    with pytest.raises(programs._UnknownError):
+        program._origin()
+
+
 def test_what_is_said_to_be_seen_by_no_program_is_there():
     """A name that is gone would be let through for whatever is called so next."""
     found = {name.rpartition(".")[2]: importlib.import_module(name) for name in modules()}

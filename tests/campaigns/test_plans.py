@@ -12,7 +12,7 @@ from polars.testing import assert_frame_equal
 from scipy.spatial.transform import Rotation
 
 import ptsmc_jax as ptsmc
-from ptsmc_jax import scenario
+from ptsmc_jax import programs, scenario
 from ptsmc_jax.campaigns import campaign, montecarlo, plans
 from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.dispersions.quantities import QUANTITIES
@@ -185,7 +185,7 @@ def test_every_number_that_is_given_is_what_a_trial_would_fly_with(corners):
     stands(planned.draw(range(2)), table)
 
 
-alone = jax.jit(montecarlo.one)
+alone = programs.jit(montecarlo.one)
 
 
 # given ones fly by a program of their own; a chain has one too, below; a batch: `test_montecarlo.py`

@@ -10,7 +10,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from ptsmc_jax import formulas, scenario
+from ptsmc_jax import formulas, programs, scenario
 from ptsmc_jax.batching import lanes
 from ptsmc_jax.campaigns import runs
 from ptsmc_jax.devices import actuators, attitude_filter, reaction_wheels, sensors
@@ -360,7 +360,7 @@ def error_with_everything(eta, delta, gain):
     return rollout.simulate(run, 3, 5).metrics.window_error
 
 
-@jax.jit
+@programs.jit
 def sloped_with_everything(gains, along):
     """The error and its slope along a direction of eta, delta and the observer's gain."""
     return jax.jvp(lambda gains: error_with_everything(*gains), (gains,), (along,))

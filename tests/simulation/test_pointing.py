@@ -1,7 +1,6 @@
 """Pointing error indices against brute force: over made-up errors, and over the recorded history of a run."""
 
 import dataclasses
-from functools import partial
 from typing import Any
 
 import jax
@@ -12,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
-from ptsmc_jax import scenario
+from ptsmc_jax import programs, scenario
 from ptsmc_jax.numerics import attitude
 from ptsmc_jax.simulation import catalogues, pointing, rollout
 from tests.helpers import SHORT, drawn, fly, untuned, vector
@@ -79,7 +78,7 @@ def relative_share(t, error, mean_of, begins, window, t_end, limits) -> Any:
     return np.mean(shares, axis=0)
 
 
-@partial(jax.jit, static_argnames="segments")
+@programs.jit(static_argnames="segments")
 def tallied(nodes, error, rate, begins, window, limits, segments=33):
     """A tally over errors (n, 5) with their rates at nodes (n,)."""
 
@@ -149,7 +148,7 @@ def test_a_constant_error_has_no_deviation_and_a_ramp_has_half_its_rise():
     np.testing.assert_allclose(tally.mean[:3], 9.5, rtol=1e-12)
 
 
-@jax.jit
+@programs.jit
 def held(nodes, error, begins, window):
     """A tally over errors (n, 5) that are each held from a node to the next one."""
 

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import linalg
 
+from ptsmc_jax import programs
 from ptsmc_jax.theory import linear, margins
 
 # a body with all that a loop may have
@@ -38,7 +39,7 @@ def of(loop, **how):
     return jax.tree.map(lambda v: np.asarray(v)[0] if how else np.asarray(v)[0, : sizes[2]], each)
 
 
-@jax.jit
+@programs.jit
 def sloped(loop, way):
     """Those of the first input, their slopes along a way, and all of them."""
 
