@@ -224,6 +224,8 @@ def _plain(value: Any) -> Any:
     where = kind.__module__, kind.__qualname__
     if where[0].split(".")[0] not in (*OURS, "builtins", "collections") or "<locals>" in where[1]:
         raise _UnknownError
+    if inspect.isfunction(value) and not _stands(value):  # what functools.wraps has given its name
+        raise _UnknownError
     if kind is value:
         return where
     if isinstance(value, Enum):
@@ -231,6 +233,12 @@ def _plain(value: Any) -> Any:
     if is_dataclass(value):
         return where, [(f.name, _plain(getattr(value, f.name))) for f in fields(value)]
     raise _UnknownError
+
+
+def _stands(value: Any) -> bool:
+    """Whether a function, or a type, is what its module has under its name."""
+    names = value.__qualname__.split(".")
+    return functools.reduce(lambda of, name: getattr(of, name, None), names, sys.modules[value.__module__]) is value
 
 
 @functools.cache

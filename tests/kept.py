@@ -4,7 +4,8 @@ Until a line of the code changes, no test traces again what an earlier run has t
 hang on: numbers and words have a folder of their own, and with anything else in its place nothing is written or read.
 What the compile cache knows after a change comes from there, and cannot be written again.
 Programs that were made without looking at shapes lie apart; before a test that looks takes one, it is traced.
-Functions at the top of the tests' own modules are kept too, by `programs.jit`, until a line of any test changes.
+Functions of the tests are kept too, by `programs.jit` and as parts of what flies, until a line of any test changes:
+they are known by where they stand and by what they remember.
 """
 
 import functools
@@ -17,15 +18,17 @@ import time
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import FunctionType, MethodType, ModuleType, SimpleNamespace
 from typing import Any
 
 import jax
 import jaxtyping
+import numpy as np
 import pytest
 
 from ptsmc_jax import configure, programs
-from tests.tree import PACKAGES, QUICKLY, modules
+from ptsmc_jax.scenario import systems
+from tests.tree import PACKAGES, QUICKLY, ROOT, modules
 
 STARTED, SOURCES = time.time(), modules(*PACKAGES, "tests").values()
 programs.KEPT = 1500
@@ -44,8 +47,9 @@ def _listen(event: str, **_: Any) -> None:
 HOST = ("tuning.cli", "tuning.output", "tuning.studies", "ptsmc_jax.figures")
 OUTSIDE = set(
     """
-    configure.configure programs.KEPT campaign.PART montecarlo.CAPACITY montecarlo.run montecarlo.block_size
-    rest.swing margin_verdicts.TRIALS margin_verdicts.JUDGED margin_verdicts.OFF margin_verdicts.over_trials
+    configure.configure programs.KEPT programs.prepare campaign.PART montecarlo.CAPACITY montecarlo.run
+    montecarlo.prepare montecarlo.block_size rest.swing solutions.visited margin_rows.hardest margin_verdicts.prepare
+    margin_verdicts.TRIALS margin_verdicts.JUDGED margin_verdicts.OFF margin_verdicts.over_trials evaluate._fly
     worst.SCREENED worst.STEPS starts.SWEPT descents.MANY descents.again descents.explore descents.descend
     cma_es.GENERATIONS global_check.GENERATIONS global_check.POPULATION flights.ROW flights.fly flights.trials
     confirm.FRESH confirm.FEWEST confirm.count rounds.harder evaluate.slopes journal.get posing.search
@@ -54,6 +58,7 @@ OUTSIDE = set(
 )
 NOWHERE = Path(os.devnull, "none")  # can be neither written nor read
 _begun, _write, _known_by = programs.Program._begun, programs._write, programs.Program._origin
+_plainly, _run = programs._plain, systems._run
 _setattr, _undo = pytest.MonkeyPatch.setattr, pytest.MonkeyPatch.undo
 _patched: dict[int, dict[str, Any]] = {}  # by whom, and what is in the place of what
 
@@ -102,12 +107,54 @@ def _begin(self: programs.Program, key: tuple, said: str, given: dict) -> tuple:
     return _begun(self, key, said, given)
 
 
-def _origin(self: programs.Program) -> tuple[str, str, str]:
-    """Of our code as ever, and of the tests', but for lambdas, all of which have one name."""
-    function = self._function
-    if function.__module__.split(".")[0] != "tests" or "<" in function.__qualname__:
+def _origin(self: programs.Program) -> Any:
+    """Of our code as ever, and of the tests'."""
+    if not _ours(self._function, "tests"):
         return _known_by(self)
-    return function.__module__, function.__qualname__, programs._code(PACKAGES[-1]) + _code_of_tests()
+    return *_told(self._function), programs._code(PACKAGES[-1])
+
+
+def _told(value: Any) -> Any:
+    """What is fixed in a program, in words: functions, types, arrays and data of the tests, too."""
+    if _of_a_test():
+        return _plainly(value)
+    if isinstance(value, np.ndarray | np.generic | jax.Array):
+        array = np.asarray(value)
+        return array.shape, array.dtype.str, hashlib.sha256(array.tobytes()).hexdigest()
+    if isinstance(value, FunctionType) and _ours(value, "tests"):
+        code, cells = value.__code__, [cell.cell_contents for cell in value.__closure__ or ()]
+        remembered = [_told(one) for one in (*cells, value.__defaults__, value.__kwdefaults__)]
+        return value.__module__, value.__qualname__, repr((*code.co_positions(),)), remembered, _code_of_tests()
+    if isinstance(value, MethodType):
+        return _told(value.__func__), _told(value.__self__)
+    if isinstance(value, ModuleType):
+        return value.__name__
+    if _ours(value, *PACKAGES, "jax", "numpy") and hasattr(value, "__qualname__") and programs._stands(value):
+        return value.__module__, value.__qualname__
+    kind: Any = value if isinstance(value, type) else type(value)
+    if not _ours(kind, "tests") or not programs._stands(kind):
+        return _plainly(value)
+    fixed = [] if kind is value else [(name, _told(getattr(value, name))) for name in kind.__dataclass_fields__]
+    return kind.__module__, kind.__qualname__, fixed, _code_of_tests()
+
+
+def _ours(value: Any, *packages: str) -> bool:
+    """Whether it comes from one of these packages; among the tests are the scenarios' files, named by their digest."""
+    module = getattr(value, "__module__", None) or ""
+    ran = "tests" in packages and module.startswith("_ptsmc_jax_") and _of_scenarios(sys.modules[module].__file__)
+    return ran or module.split(".")[0] in packages
+
+
+def _of_scenarios(path: Any) -> bool:
+    return Path(path).resolve().parent == ROOT / "scenarios"
+
+
+def _run_own(path: Path, content: bytes) -> ModuleType:
+    """One's own code may patch anything; that of the scenarios does not."""
+    module = _run(path, content)
+    if _of_scenarios(path):
+        keep()
+    return module
 
 
 @functools.cache
@@ -155,4 +202,5 @@ def _undone(self: pytest.MonkeyPatch) -> None:
 
 
 programs.Program._begun, programs._write, programs.Program._origin = _begin, _write_new, _origin
+programs._plain, systems._run = _told, _run_own
 pytest.MonkeyPatch.setattr, pytest.MonkeyPatch.undo = _set, _undone

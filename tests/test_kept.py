@@ -1,5 +1,6 @@
 """Programs that runs of the tests leave each other: what is patched has a folder of its own, or none."""
 
+import functools
 import importlib
 import re
 
@@ -10,6 +11,9 @@ import pytest
 
 from ptsmc_jax import configure, programs
 from ptsmc_jax.batching import kernel
+from ptsmc_jax.numerics import attitude
+from ptsmc_jax.numerics.pytrees import vector
+from ptsmc_jax.signals import disturbances
 from ptsmc_jax.theory import linear
 from tests import kept
 from tests.tree import modules
@@ -106,19 +110,49 @@ def test_nothing_is_kept_once_a_file_was_edited(tmp_path, monkeypatch):
 
 
 def test_a_function_of_a_test_hangs_on_the_tests_and_on_our_code():
-    """Not a lambda: all of a module's have one name."""
-    _, function = doubled()
-    function.__module__ = "tests.helpers"
-    program = programs.jit(function)
-    *name, code = program._origin()
-    assert name == ["tests.helpers", "looked"]
-    for where, changed in ((kept, "_code_of_tests"), (programs, "_code")):
+    program = programs.jit(where)
+    said = program._origin()
+    assert said[:2] == ("tests.test_kept", "where")
+    for where_, changed in ((kept, "_code_of_tests"), (programs, "_code")):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(where, changed, lambda *_: "other")
-            assert program._origin()[2] != code
-    function.__qualname__ = "<lambda>"
-    with pytest.raises(programs._UnknownError):
-        program._origin()
+            patch.setattr(where_, changed, lambda *_: "other")
+            assert program._origin() != said
+
+
+def scaled(by):
+    return lambda x, power=1: by * x**power
+
+
+def test_functions_of_tests_are_told_apart_by_where_they_stand_and_by_what_they_remember():
+    two, *others = map(programs._plain, (scaled(2.0), scaled(3.0), scaled(np.ones(2)), scaled(np.ones((2, 1)))))
+    assert programs._plain(scaled(2.0)) == two
+    others += map(programs._plain, (lambda x, power=1: 2.0 * x**power, lambda x, power=2: 2.0 * x**power))
+    others += map(programs._plain, (scaled(scaled(2.0)), scaled(jax.numpy.sin), scaled(jax.numpy.cos), scaled(where)))
+    acting = [disturbances.Constant(vector([size])) for size in (1.0, 2.0)]
+    others += map(programs._plain, (scaled(attitude.rotate), *map(scaled, acting), scaled(acting[0].__call__)))
+    for k, one in enumerate(others):
+        assert one not in (two, *others[:k])
+
+
+def test_what_remembers_something_that_cannot_be_told_is_not_kept():
+    class Local:
+        pass
+
+    @functools.wraps(attitude.rotate)
+    def turned(q, y):
+        return attitude.rotate(q, 2.0 * y)
+
+    for one in (
+        object(),
+        Local(),
+        Local,
+        np.random.default_rng(0),
+        jax.grad(scaled(2.0)),
+        jax.jit(scaled(2.0)),
+        turned,
+    ):
+        with pytest.raises(programs._UnknownError):
+            programs._plain(scaled(one))
 
 
 def test_what_is_said_to_be_seen_by_no_program_is_there():
