@@ -111,7 +111,7 @@ def _origin(self: programs.Program) -> Any:
     """Of our code as ever, and of the tests'."""
     if not _ours(self._function, "tests"):
         return _known_by(self)
-    return *_told(self._function), programs._code(PACKAGES[-1])
+    return _told(self._function)
 
 
 def _told(value: Any) -> Any:
@@ -124,7 +124,7 @@ def _told(value: Any) -> Any:
     if isinstance(value, FunctionType) and _ours(value, "tests"):
         code, cells = value.__code__, [cell.cell_contents for cell in value.__closure__ or ()]
         remembered = [_told(one) for one in (*cells, value.__defaults__, value.__kwdefaults__)]
-        return value.__module__, value.__qualname__, repr((*code.co_positions(),)), remembered, _code_of_tests()
+        return value.__module__, value.__qualname__, repr((*code.co_positions(),)), remembered, _code()
     if isinstance(value, MethodType):
         return _told(value.__func__), _told(value.__self__)
     if isinstance(value, ModuleType):
@@ -135,7 +135,7 @@ def _told(value: Any) -> Any:
     if not _ours(kind, "tests") or not programs._stands(kind):
         return _plainly(value)
     fixed = [] if kind is value else [(name, _told(getattr(value, name))) for name in kind.__dataclass_fields__]
-    return kind.__module__, kind.__qualname__, fixed, _code_of_tests()
+    return kind.__module__, kind.__qualname__, fixed, _code()
 
 
 def _ours(value: Any, *packages: str) -> bool:
@@ -158,10 +158,10 @@ def _run_own(path: Path, content: bytes) -> ModuleType:
 
 
 @functools.cache
-def _code_of_tests() -> str:
-    """Digest of their files."""
+def _code() -> str:
+    """Digest of all files, of packages too that are not imported yet."""
     digest = hashlib.sha256()
-    for name, path in modules("tests").items():
+    for name, path in modules(*PACKAGES, "tests").items():
         digest.update(f"{name} {path.stat().st_size}".encode())
         digest.update(path.read_bytes())
     return digest.hexdigest()

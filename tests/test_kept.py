@@ -110,13 +110,13 @@ def test_nothing_is_kept_once_a_file_was_edited(tmp_path, monkeypatch):
 
 
 def test_a_function_of_a_test_hangs_on_the_tests_and_on_our_code():
-    program = programs.jit(where)
-    said = program._origin()
-    assert said[:2] == ("tests.test_kept", "where")
-    for where_, changed in ((kept, "_code_of_tests"), (programs, "_code")):
+    *said, code = programs.jit(where)._origin()
+    assert said[:2] == ["tests.test_kept", "where"]
+    assert code == kept._code()
+    for package in ("ptsmc_jax", "tuning", "tests"):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(where_, changed, lambda *_: "other")
-            assert program._origin() != said
+            patch.setattr(kept, "modules", lambda *asked, out=package: modules(*(one for one in asked if one != out)))
+            assert kept._code.__wrapped__() != code
 
 
 def scaled(by):
