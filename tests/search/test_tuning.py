@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ptsmc_jax import scenario
+from ptsmc_jax import programs, scenario
 from ptsmc_jax.batching import lanes
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.dispersions import attitudes, numbers, variation
@@ -70,7 +70,8 @@ def loss(request):
 
         return 0.5 * jnp.log(jnp.mean(lanes.vmap(fly)(jnp.arange(6, dtype=jnp.uint32)) ** 2))
 
-    return jax.jit(value), jax.jit(jax.jacfwd(value))
+    both = jax.jit(jax.jacfwd(lambda at: (value(at),) * 2, has_aux=True))
+    return lambda at: both(at)[1], lambda at: both(at)[0]
 
 
 def central(value, at, k, h):
@@ -180,7 +181,7 @@ def test_gains_handed_over_are_rounded_inside_their_bounds():
     assert times.rounded(np.array([7 * 0.123456789]), 6)["delta"] == pytest.approx(7 * 0.123456789, rel=1e-11)
 
 
-measure = jax.jit(objective.measure)
+measure = programs.jit(objective.measure)
 WITHIN = shares.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0))
 FAR_OFF = dict.fromkeys(("peak_torque", "effort", "window_error"), 1e9)  # limits that nothing comes near
 
@@ -248,21 +249,30 @@ def test_a_limit_for_a_share_of_the_trials_is_the_limit_on_the_last_of_them(leas
     np.testing.assert_allclose(c[1] + 1, flown.effort / 5.0, rtol=1e-10)
 
 
-def test_slopes_of_tail_and_share_agree_in_both_modes_and_with_central_differences():
-    some = replace(problem(may_break=2, peak_torque=0.7), tail=2)
+@programs.jit
+def backwards(some, at):
+    """Slopes of F and of the largest c by the gains, in reverse mode."""
 
-    @jax.jit
-    def value(gains):
-        f, c, _ = measure(some, gains)
+    def value(at):
+        f, c, _ = objective.measure(some, at)
         return jnp.stack([f, c.max()])
 
-    at = np.array([3.1, 0.73])
-    exact, reverse = (np.asarray(jax.jit(mode(value))(jnp.asarray(at))) for mode in (jax.jacfwd, jax.jacrev))
-    np.testing.assert_allclose(exact, reverse, rtol=1e-9)
+    return jax.jacrev(value)(at)
+
+
+def test_slopes_of_tail_and_share_agree_in_both_modes_and_with_central_differences():
+    some, evaluate = replace(problem(may_break=2, peak_torque=0.7), tail=2), Evaluator(WITHIN)
+    at, h = np.array([3.1, 0.73]), 1e-4
+    share = WITHIN.share(at)
+    found = evaluate.slopes(some, share[None])
+    last = np.unravel_index(found.c[0].argmax(), found.c[0].shape)
+    exact = np.stack([found.f_slope[0], found.c_slope[0][last]])
+    np.testing.assert_allclose(exact, backwards(some, at) @ jax.jacfwd(WITHIN.gains)(share), rtol=1e-9)
     for k in range(2):
-        for row in range(2):
-            numeric = central(lambda g, row=row: value(g)[row], at, k, 1e-4)
-            np.testing.assert_allclose(exact[row, k], numeric, rtol=1e-4, atol=1e-6)
+        seen = evaluate.fly(some, np.stack([share + n * h * np.eye(2)[k] for n in (-2, -1, 1, 2)]))
+        for slope, f in zip(exact[:, k], (seen.f, seen.c.reshape(4, -1).max(axis=1)), strict=True):
+            numeric = (f[0] - 8 * f[1] + 8 * f[2] - f[3]) / (12 * h)
+            np.testing.assert_allclose(slope, numeric, rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.long
