@@ -13,7 +13,7 @@ import pytest
 
 from ptsmc_jax import configure as setup
 from ptsmc_jax import programs
-from tests.helpers import ROOT, SHORT_CHAIN
+from tests.helpers import ROOT
 
 GOOD = setup._OPTIONS
 
@@ -155,22 +155,6 @@ def test_a_cache_of_somebody_else_that_cannot_be_read_is_none(tried, tmp_path, m
     assert setup._accepted(tmp_path / "closed") == GOOD
 
 
-def test_programs_that_are_cut_short_in_the_cache_are_compiled_again(tmp_path):
-    """As another process sees them that starts at the same time."""
-    code = (
-        "import sys; from ptsmc_jax.configure import configure; configure(1, sys.argv[1], fast=False); "
-        "import jax; print(float(jax.jit(lambda x: 3.0 * x + 1.0)(2.0)))"
-    )
-    call = [sys.executable, "-c", code, str(tmp_path)]
-    for _ in range(2):
-        done = subprocess.run(call, cwd=ROOT, capture_output=True, text=True, check=True)
-        assert (done.stdout, done.stderr) == ("7.0\n", "")
-        entries = list(tmp_path.glob("*-cache"))
-        assert entries
-        for entry in entries:
-            entry.write_bytes(entry.read_bytes()[:-20])
-
-
 def test_the_trial_run_accepts_these_options_and_refuses_unknown_ones(monkeypatch):
     """In processes of their own, as a user's first call: an unknown flag ends the process, wrong numbers too."""
     monkeypatch.setenv("JAX_NUMPY_DTYPE_PROMOTION", "strict")  # of a user's own code: no word on the options
@@ -178,22 +162,25 @@ def test_the_trial_run_accepts_these_options_and_refuses_unknown_ones(monkeypatc
     assert not setup._tried((*GOOD, "--xla_no_such_flag=true"))
 
 
-def test_the_trial_run_refuses_other_numbers(monkeypatch):
-    monkeypatch.setattr(setup, "_TRIAL", setup._TRIAL.replace("scan, x, 100)", "scan, 1.000001 * x, 100)"))
-    assert not setup._tried(())
+def test_the_trial_run_refuses_other_numbers():
+    """In this process: how one of its own ends is told above."""
+    exec(setup._TRIAL, {})
+    with pytest.raises(SystemExit, match="1"):
+        exec(setup._TRIAL.replace("scan, x, 100)", "scan, 1.000001 * x, 100)"), {})
 
 
 @pytest.mark.skipif(shutil.which("nvidia-smi") is not None, reason="there is a GPU")
 def test_a_gpu_that_is_not_there_is_refused_in_one_sentence(tmp_path):
-    """In a process of its own, as a user's first call."""
+    """In a process of its own, as a user's first call; it is looked for as JAX does by itself, whatever it is told."""
     call = [sys.executable, "-c", "from tuning.cli.main import main; main()", "montecarlo", "--device", "gpu"]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "JAX_PLATFORMS": ""}
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "tpu"}
     done = subprocess.run(call, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == "ptsmc: --device is gpu, but JAX finds no GPU here; allowed is cpu, or install jax[cuda12]\n"
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.long  # asked for by that name, or a TPU: no such sentence as above
 def test_a_gpu_is_looked_for_as_jax_does_by_itself(tmp_path):
     """Asked for by the name "gpu", JAX wants every maker's, and finds none where one of them is missing."""
     code = (
@@ -206,37 +193,67 @@ def test_a_gpu_is_looked_for_as_jax_does_by_itself(tmp_path):
     assert (done.stdout, done.stderr) == ("None True\n", "")
 
 
-def test_a_command_flies_where_the_environment_has_jax_look_for_faults(tmp_path):
-    """In code of a user's own: it stops at the NaN of a metric that a run lacks, at a number that a run begins with."""
-    (tmp_path / "s.toml").write_text(SHORT_CHAIN)
-    asked = dict.fromkeys(("JAX_DEBUG_NANS", "JAX_DEBUG_INFS"), "1")
-    asked |= {"JAX_NUMPY_DTYPE_PROMOTION": "strict", "JAX_TRANSFER_GUARD": "disallow"}
-    call = [sys.executable, "-c", "from tuning.cli import command; command()", "simulate", "s.toml", "--no-figures"]
-    environment = {**os.environ, **asked, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(call, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
-    assert (done.stdout.splitlines()[0], done.stderr) == ("status: ok", "")
-
-
-WATCHING = """
-import os, sys
+IN_TURN = """
+import json, os, pathlib, sys
 class Watching:
     def find_spec(self, name, *_):
         if name == "jaxlib":
-            print(os.environ["TF_CPP_MIN_LOG_LEVEL"])
+            told["level"] = os.environ["TF_CPP_MIN_LOG_LEVEL"]
+told, cache = {"flags": []}, pathlib.Path(sys.argv[1])
 sys.meta_path.insert(0, Watching())
+from ptsmc_jax.configure import configure
+
+for fast in (True, False, True):
+    configure(1, cache, fast, device="cpu", bits=32)
+    told["flags"].append(os.environ["XLA_FLAGS"])
+import jax
+
+f = jax.jit(lambda x: 3.0 * x + 1.0)
+told["found"] = [float(f(2.0))]
+told["set"] = [str(jax.numpy.zeros(1).dtype), jax.config.jax_platforms]
+configure(1, cache, device="cpu", bits=32)
+told["flags"].append(os.environ["XLA_FLAGS"])
+try:
+    configure(1, cache, fast=False, device="cpu", bits=32)
+except RuntimeError as error:
+    told["refused"] = str(error)
+for entry in cache.glob("*-cache"):
+    entry.write_bytes(entry.read_bytes()[:-20])
+    told["cut"] = True
+jax.clear_caches()
+told["found"].append(float(f(2.0)))
+print(json.dumps(told))
 """
 
 
-def test_bits_and_device_are_set_and_the_compiler_is_silent():
-    """XLA's log ("Very slow compile?") is off when jaxlib is looked for, which reads its level once."""
-    code = WATCHING + (
-        "from ptsmc_jax.configure import configure; configure(device='cpu', bits=32)\n"
-        "import jax; print(jax.numpy.zeros(1).dtype, jax.config.jax_platforms)"
-    )
+@pytest.fixture(scope="module")
+def told(tmp_path_factory):
+    """What a process says that calls `configure` several times, before anything runs on JAX and after."""
     environment = {name: value for name, value in os.environ.items() if name != "TF_CPP_MIN_LOG_LEVEL"}
-    call = [sys.executable, "-c", code]
+    cache, ours = tmp_path_factory.mktemp("cache"), setup._cache_folder()
+    for verdict in ours.glob("options-*.json") if ours else ():
+        shutil.copy(verdict, cache)
+    call = [sys.executable, "-c", IN_TURN, str(cache)]
     done = subprocess.run(call, cwd=ROOT, env=environment, capture_output=True, text=True, check=True)
-    assert done.stdout == "3\nfloat32 cpu\n"
+    assert done.stderr == ""
+    return json.loads(done.stdout)
+
+
+def test_bits_and_device_are_set_and_the_compiler_is_silent(told):
+    """XLA's log ("Very slow compile?") is off when jaxlib is looked for, which reads its level once."""
+    assert (told["level"], told["set"]) == ("3", ["float32", "cpu"])
+
+
+def test_other_compiler_options_are_set_before_anything_runs_or_refused(told):
+    fast, plain, again, late = told["flags"]
+    assert fast == again == late != ""
+    assert plain.strip() == ""
+    assert "than fast=False asks for" in told["refused"]
+
+
+def test_programs_that_are_cut_short_in_the_cache_are_compiled_again(told):
+    """As another process sees them that starts at the same time: nothing is said of the first ones."""
+    assert (told["found"], told["cut"]) == ([7.0, 7.0], True)
 
 
 @pytest.mark.parametrize(

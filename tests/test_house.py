@@ -7,6 +7,7 @@ import json
 import re
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -149,17 +150,32 @@ def names(package):
     return sorted(name.partition(".")[2] for name in modules(package) if name != package)
 
 
+def tells(node):
+    """Whether it imports, if only by a call, or is of the package itself."""
+    if isinstance(node, ast.Call):
+        return ast.unparse(node.func) in ("importlib.import_module", "__import__")
+    if isinstance(node, ast.Attribute):
+        return isinstance(node.value, ast.Name) and node.value.id == "ptsmc_jax"
+    return isinstance(node, ast.Import | ast.ImportFrom)
+
+
+@cache
+def telling(source):
+    """The nodes of a source that tell what it imports, wherever they stand."""
+    return [node for node in ast.walk(ast.parse(source)) if tells(node)]
+
+
 def imported(source):
     """(package, module) of every import of ours, wherever it stands: in functions and under TYPE_CHECKING too."""
-    for node in ast.walk(ast.parse(source)):
+    for node in telling(source):
         if isinstance(node, ast.Import):
             found = [alias.name.split(".") for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             assert node.module  # relative imports are refused by ruff
             found = [[*node.module.split("."), alias.name] for alias in node.names]
-        elif ast.unparse(node) in LAZY:
-            continue
-        elif isinstance(node, ast.Call) and ast.unparse(node.func) in ("importlib.import_module", "__import__"):
+        elif isinstance(node, ast.Call):
+            if ast.unparse(node) in LAZY:
+                continue
             assert isinstance(node.args[0], ast.Constant), "an import that cannot be read"
             found = [str(node.args[0].value).split(".")]
         else:
@@ -195,11 +211,10 @@ def test_files_import_from_floors_below_only(package, name):
 def test_the_package_itself_is_imported_for_its_version_at_most():
     """Its lazy names would hide what floor they come from."""
     for name, path in modules().items():
-        tree = ast.parse(path.read_text())
-        for node in ast.walk(tree):
+        for node in telling(path.read_text()):
             if isinstance(node, ast.ImportFrom) and node.module in HOUSE:
                 assert not {alias.name for alias in node.names} & set(ptsmc_jax._EXPORTS), name
-            if isinstance(node, ast.Attribute) and ast.unparse(node.value) == "ptsmc_jax":
+            if isinstance(node, ast.Attribute):
                 assert node.attr == "__version__", name
 
 
@@ -240,8 +255,9 @@ def test_importing_the_package_and_the_command_does_not_import_jax():
 
 
 def test_importing_the_library_changes_nothing_of_jax_or_the_environment():
+    """So that `configure` can still be called: who forgets it is warned by a study, and told when it comes too late."""
     names = list(modules())
-    changed = python(f"""
+    changed, started, looked, warned, late = python(f"""
 import importlib, json, os, warnings
 import jax, polars  # which sets a variable of its allocator's own
 def state():
@@ -252,11 +268,25 @@ for name in {names}:
 after = state()
 changed = [key for key in after if after[key] is not before.get(key) and after[key] != before.get(key)]
 started = bool(jax._src.xla_bridge._backends)
-print(json.dumps([changed, started, len(before)]))
+
+from ptsmc_jax import configure, scenario, study
+warnings.simplefilter("error")  # which stops it there
+try:
+    study(scenario.from_tables({{}}))
+except RuntimeWarning as warning:
+    warned = str(warning)
+jax.numpy.zeros(3)
+try:
+    configure.configure(devices=2, cache=None, fast=False)
+except RuntimeError as error:
+    late = str(error)
+print(json.dumps([changed, started, len(before), warned, late]))
 """)
-    assert changed[0] == []
-    assert changed[1] is False  # no backend has started: `configure` can still be called
-    assert changed[2] > 50  # it did look
+    assert changed == []
+    assert started is False
+    assert looked > 50  # it did look
+    assert warned.startswith("JAX computes with 32 bits here")
+    assert late.startswith("configure() comes too late")
 
 
 @pytest.mark.parametrize("package", ["ptsmc_jax", "ptsmc_jax.scenario"])

@@ -1,5 +1,6 @@
 """Where the project's files lie, and what its modules are called; imports none of them."""
 
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 
@@ -13,6 +14,7 @@ QUICKLY = (
 )
 
 
+@cache
 def modules(*packages: str) -> dict[str, Path]:
     """Files by the dotted names of their modules, folders' own `__init__` among them."""
     found = {}

@@ -1,8 +1,6 @@
-"""What those who know JAX expect: plain functions among the parts, names at the top, a late configure in a sentence."""
+"""What those who know JAX expect: plain functions among the parts, names at the top."""
 
 import re
-import subprocess
-import sys
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -300,28 +298,3 @@ def test_the_names_that_everybody_needs_are_at_the_top():
     for name in ("one", "run", "study", "Reach", "reach_of"):
         assert callable(getattr(ptsmc, name))
     assert len(dir(ptsmc)) == len(set(dir(ptsmc)))
-
-
-def said(code):
-    call = subprocess.run([sys.executable, "-W", "always", "-c", code], capture_output=True, text=True, check=False)
-    return call.stderr
-
-
-def test_forgetting_configure_warns_and_calling_it_late_says_so_in_one_sentence():
-    late = said(
-        "import ptsmc_jax as ptsmc\nfrom ptsmc_jax.scenario import from_tables\nptsmc.study(from_tables({}))\n"
-        "from ptsmc_jax.configure import configure\nconfigure(devices=2, cache=None, fast=False)"
-    )
-    assert "JAX computes with 32 bits here" in late
-    assert late.splitlines()[-1].startswith("RuntimeError: configure() comes too late")
-
-
-def test_other_compiler_options_are_set_before_anything_runs_or_refused():
-    begin = "from ptsmc_jax.configure import configure\nimport jax, os\n"
-    run = "jax.numpy.zeros(3).block_until_ready()\n"
-    tell = "print(os.environ['XLA_FLAGS'], file=__import__('sys').stderr)\n"
-    fast, plain = "configure()\n", "configure(fast=False)\n"
-    first, again, *_, last = said(begin + fast + tell + run + fast + tell + plain).splitlines()
-    assert first == again != ""
-    assert "than fast=False asks for" in last
-    assert said(begin + fast + plain + run + tell).strip() == ""
