@@ -140,9 +140,12 @@ def test_stages_in_a_loop_are_the_same_step():
         y = vector([0.3, -1.2]), vector([0.8, 0.1])
         return jnp.concatenate(integrators.rk4(rate, vector(0.4), y, dt, rolled=rolled))
 
-    at, eps = vector(0.3), np.finfo(float).eps
-    for of in (lambda f: f, jax.jacfwd, jax.jacrev):
-        written, looped = (of(lambda dt, rolled=rolled: step(dt, rolled))(at) for rolled in (False, True))
+    @partial(jax.jit, static_argnums=1)
+    def found(at, rolled):
+        return [of(lambda dt: step(dt, rolled))(at) for of in (lambda f: f, jax.jacfwd, jax.jacrev)]
+
+    eps = np.finfo(float).eps
+    for written, looped in zip(*(found(vector(0.3), rolled) for rolled in (False, True)), strict=True):
         np.testing.assert_allclose(looped, written, rtol=0.0, atol=16 * eps)  # some ten operations on numbers below 2
 
 
@@ -178,13 +181,17 @@ def phi_exact(x, order, slope=False):
 
 
 def phi_series(x, order):
-    """phi_k of a matrix, sum of x^j / (j + k)!, in fractions: nothing is rounded (SciPy is 1e-12 off at norm 9)."""
-    x = np.array([[Fraction(float(v)) for v in row] for row in x])
-    power, total = np.array([[Fraction(int(i == j)) for j in range(len(x))] for i in range(len(x))]), 0
-    for j in range(90):  # 20^90 / 90! = 1e-21
-        total = total + power / math.factorial(j + order)
-        power = power.dot(x)
-    return np.asarray(total, dtype=float)
+    """phi_k of a matrix, sum of x^j / (j + k)!, in whole numbers: nothing is rounded (SciPy is 1e-12 off at norm 9)."""
+    exact = np.array([[Fraction(float(v)) for v in row] for row in x])
+    unit = max(v.denominator for v in exact.flat)  # a power of two
+    whole = np.array([[int(v * unit) for v in row] for row in exact], object)
+    one = np.eye(len(x), dtype=int).astype(object)
+    total, scale = one, 1
+    for j in range(89, 0, -1):  # 1 + x / (k + 1) (1 + x / (k + 2) ..), to 20^90 / 90! = 1e-21
+        scale *= unit * (j + order)
+        total = scale * one + whole.dot(total)
+    scale *= math.factorial(order)
+    return np.array([[float(Fraction(int(v), scale)) for v in row] for row in total])
 
 
 three_phis = jax.jit(lambda x: integrators.phi_functions(x, 3))
