@@ -5,13 +5,17 @@ import importlib
 import re
 import sys
 import tomllib
+from functools import partial
 
+import jax
 import jupytext
 import matplotlib.pyplot as plt
 import nbformat
+import numpy as np
 import pytest
 
 from ptsmc_jax import scenario
+from ptsmc_jax.simulation import rollout
 from tests.helpers import ROOT, SHORT, small_search
 
 sys.path.insert(0, str(ROOT / "notebooks"))
@@ -49,16 +53,8 @@ SMALLER = {
 }
 
 
-QUICK = ("05_your_own_plant",)
-
-
-@pytest.mark.parametrize(
-    "source",
-    [pytest.param(path, marks=[] if path.stem in QUICK else pytest.mark.long, id=path.stem) for path in SOURCES],
-)
-def test_its_cells_run_at_a_small_size(source, monkeypatch):
-    """In this process, on a flight of five seconds; as they stand, in a kernel, see below."""
-    small_search(monkeypatch)
+def cells(source, monkeypatch):
+    """Runs them at a small size, on a flight of five seconds."""
     monkeypatch.setattr("ptsmc_jax.configure.configure", lambda: None)  # conftest did
     monkeypatch.setattr("ptsmc_jax.read", lambda path: scenario.from_tables(tomllib.loads(SHORT)))
     code = "\n".join(cell.source for cell in jupytext.read(source).cells if cell.cell_type == "code")
@@ -67,6 +63,35 @@ def test_its_cells_run_at_a_small_size(source, monkeypatch):
         code = code.replace(of_the_notebook, small)
     exec(compile(code, source.name, "exec"), {})
     plt.close("all")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("source", SOURCES, ids=lambda path: path.stem)
+def test_its_cells_run_at_a_small_size(source, monkeypatch):
+    """In this process; as they stand, in a kernel, see below."""
+    small_search(monkeypatch)
+    cells(source, monkeypatch)
+
+
+def test_cells_run_on_flights_that_are_traced(monkeypatch):
+    """Nothing is compiled but what a plant is asked before: a flight's numbers are made up, of its own shapes."""
+    traced = {}
+
+    def flown(*args, **how):
+        structure = jax.tree.structure(args)
+        if structure not in traced:
+            traced[structure] = jax.eval_shape(partial(rollout.simulate, **how), *args)
+        shapes = traced[structure]
+        made_up = jax.tree.map(lambda v: np.linspace(1.0, 2.0, v.size).reshape(v.shape).astype(v.dtype), shapes)
+        return made_up._replace(status=np.asarray(rollout.OK))
+
+    monkeypatch.setattr(rollout, "looked_at", lambda parts: flown)
+    slope = "jax.jacfwd(peak)(jnp.asarray(3.0))"
+    shape = slope.replace("(peak)(", "(peak), ")
+    monkeypatch.setitem(SMALLER["05_your_own_plant"], slope, f"jnp.ones(jax.eval_shape({shape}.shape)")
+    (source,) = (path for path in SOURCES if path.stem == "05_your_own_plant")
+    cells(source, monkeypatch)
+    assert len(traced) == 5
 
 
 SLIDING = [source for source in SOURCES if "interact(" in source.read_text()]
