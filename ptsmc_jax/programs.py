@@ -148,11 +148,7 @@ class Program:
         return repr((self._origin(), _structure(structure), shapes, _plain(fixed), self._options, _surroundings()))
 
     def _compiled(self, key: tuple, said: str, given: dict) -> Callable:
-        fixed = dict(key[2])
-
-        def function(given: dict) -> Any:
-            return self._function(**given, **fixed)
-
+        function = self._by_name(dict(key[2]))
         # a name that the compile cache does not know: what it gives back cannot be written again, its copy would lack
         # its functions
         function.__name__ = f"{self._function.__name__}_{secrets.token_hex(4)}"
@@ -160,9 +156,20 @@ class Program:
         _write(_path(said), said, compiled)
         return compiled
 
+    def _by_name(self, fixed: dict) -> Callable[[dict], Any]:
+        """The function, of its arguments by their names but for the fixed ones."""
+
+        def function(given: dict) -> Any:
+            named = {**given, **fixed}
+            in_order = {name: named[name] for name in self._signature.parameters if name in named}
+            bound = inspect.BoundArguments(self._signature, in_order)
+            return self._function(*bound.args, **bound.kwargs)  # jax.grad takes none by its name
+
+        return function
+
     def _origin(self) -> tuple[str, str, str]:
         package = self._function.__module__.split(".")[0]
-        if package not in OURS or "<locals>" in self._function.__qualname__:
+        if package not in OURS or "<locals>" in self._function.__qualname__ or not inspect.isfunction(self._function):
             raise _UnknownError
         return self._function.__module__, self._function.__qualname__, _code(package)
 

@@ -16,7 +16,6 @@ import sys
 import threading
 import time
 from contextlib import suppress
-from functools import partial
 from pathlib import Path
 from types import FunctionType, MethodType, ModuleType, SimpleNamespace
 from typing import Any
@@ -100,7 +99,7 @@ def _begin(self: programs.Program, key: tuple, said: str, given: dict) -> tuple:
     other = path.parents[1] / {"checked": "unchecked", "unchecked": "checked"}.get(looked, "none") / path.name
     if other.is_file() and not path.exists():
         if looked == "checked":
-            jax.eval_shape(partial(self._function, **dict(key[2])), **given)
+            jax.eval_shape(self._by_name(dict(key[2])), given)
         with suppress(OSError):
             path.parent.mkdir(mode=0o700, exist_ok=True)
             os.link(other, path)
@@ -109,7 +108,8 @@ def _begin(self: programs.Program, key: tuple, said: str, given: dict) -> tuple:
 
 def _origin(self: programs.Program) -> Any:
     """Of our code as ever, and of the tests'."""
-    return _known_by(self) if _ours(self._function, *PACKAGES) else _told(self._function)
+    function = self._function
+    return _known_by(self) if isinstance(function, FunctionType) and _ours(function, *PACKAGES) else _told(function)
 
 
 def _told(value: Any) -> Any:
