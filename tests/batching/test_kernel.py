@@ -123,7 +123,7 @@ def test_values_and_slopes_taken_inside_are_those_of_the_scan(kernels):
 
 def test_slopes_along_several_directions_are_those_of_the_scan(kernels):
     """delta moves the times that the loop goes through, eta what it is given, the initial state each trial its own."""
-    ready = scenario.study(scenario.from_tables(CHAIN))
+    ready = scenario.study(scenario.from_tables({**CHAIN, "hardware": {}}))
     law = ready.parts.controller
 
     def of(gains, trial, x0):
