@@ -403,3 +403,14 @@ def test_usual_bounds_of_every_gain_are_allowed_and_hold_the_own_one(plant, tabl
             assert low < high < most, name
             own = free_gains._own(loaded, name)
             assert all(low <= value <= high for value in own), name
+
+
+@pytest.mark.parametrize("order", [2, 4])
+def test_the_papers_gains_are_those_of_its_case_i_and_of_a_chains_order(order):
+    tables = {"controller": {"t_f": 5.0}, "loop": {"mode": "sampled", "period": 0.1}}
+    known = {"eta": 3.0, "delta": 0.1, "k1": 1.0, "sign_width": 1e-3, "surface_rate": 1.0, "observer_gain": 10.0}
+    assert gains.of_paper(from_tables(tables)) == known
+    known |= {"eta": order + 1.0}
+    of_chain = gains.of_paper(from_tables({**tables, "plant": {"kind": "chain", "order": order}}))
+    assert of_chain == {name: known[name] for name in of_chain}
+    assert {"eta", "delta", "k1"} <= set(of_chain)
