@@ -12,7 +12,7 @@ import pytest
 
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.simulation import catalogues
-from tests.helpers import short, tree
+from tests.helpers import SHORT_CHAIN, short, tree
 from tests.output.pages import Page, checked
 from tuning.output import made_again, page, page_charts, search_sentences
 
@@ -274,7 +274,7 @@ def test_a_long_history_is_thinned_and_what_is_not_finite_is_a_gap():
 
 
 def test_other_plants_have_pages_too(command, tmp_path):
-    (tmp_path / "c.toml").write_text('[plant]\nkind = "chain"\norder = 2\nx0 = [1.0, 0.0]\n[controller]\nt_f = 5.0\n')
+    (tmp_path / "c.toml").write_text(SHORT_CHAIN)
     command("simulate", "c.toml", "--out", "chain", "--quiet")
     folder = tmp_path / "chain"
     assert set(checked(folder).charts) == {"history"}
