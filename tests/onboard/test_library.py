@@ -31,18 +31,24 @@ OK, SATURATED, MISSED, SINGULAR, INPUT, OVERFLOW = range(len(STATUS))
 
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
-    """Writes a flight's controller without vectors, once, and compiles it: its study, and the library."""
+    """Writes a flight's controller without vectors and compiles it, once: its study, and the library as it was."""
 
     @cache
     def written(name):
         place = tmp_path_factory.mktemp("exported") / "controller"
         return program(name, place), place
 
-    def compiled(name, real="double"):
-        made, place = written(name)
-        return made, Library(place, real)
+    @cache
+    def compiled(name, real):
+        library = Library(written(name)[1], real)
+        return library, library.parameters.copy()
 
-    return compiled
+    def as_it_was(name, real="double"):
+        library, own = compiled(name, real)
+        library.parameters[:] = own
+        return written(name)[0], library
+
+    return as_it_was
 
 
 @needs_compiler
