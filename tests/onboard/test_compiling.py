@@ -16,10 +16,10 @@ from tests.onboard.flights import FLIGHTS
 
 
 @pytest.fixture(scope="module")
-def raw(tmp_path_factory):
-    """The folder of a controller on raw samples."""
+def chain(tmp_path_factory):
+    """The folder of a small controller."""
     place = tmp_path_factory.mktemp("exported") / "controller"
-    program("raw", place)
+    program("chain", place)
     return place
 
 
@@ -30,24 +30,24 @@ def parts(name, **loop):
 
 
 @needs_compiler
-def test_what_is_no_controller_is_refused(raw, tmp_path):
+def test_what_is_no_controller_is_refused(chain, tmp_path):
     with pytest.raises(ScenarioError, match=r"^the controller is .*nothing, but must be a folder that ptsmc export"):
         Library(tmp_path / "nothing")
-    library = Library(raw)
+    library = Library(chain)
     with pytest.raises(ScenarioError, match="has other inputs than the scenario"):
-        InTheLoop(library, parts("chain"))
+        InTheLoop(library, parts("raw"))
     with pytest.raises(ScenarioError, match=r"^loop\.period is 0\.2 s, but must be 0\.1 s, that of the controller in "):
-        InTheLoop(library, parts("raw", period=0.2))
-    shutil.copytree(raw, tmp_path / "controller")
+        InTheLoop(library, parts("chain", period=0.2))
+    shutil.copytree(chain, tmp_path / "controller")
     (tmp_path / "controller" / "ptsmc_flight.c").write_text("int main(void) { return }\n")
     with pytest.raises(ScenarioError, match=r"does not compile from the \*\.c and \*\.h in it: .*error: "):
         Library(tmp_path / "controller")
 
 
 @needs_compiler
-def test_what_flies_is_what_a_campaign_keeps_and_knows_of_a_folder(raw, tmp_path):
+def test_what_flies_is_what_a_campaign_keeps_and_knows_of_a_folder(chain, tmp_path):
     """A header elsewhere flew, changed or not in the same campaign, and its replay did not compile."""
-    changed = shutil.copytree(raw, tmp_path / "changed")
+    changed = shutil.copytree(chain, tmp_path / "changed")
     code = changed / "ptsmc_flight.c"
     code.write_text('#include "board.h"\n' + code.read_text())
     (changed / ".#ptsmc_flight.c").symlink_to("somebody@elsewhere:1")  # an editor's, of nothing
@@ -66,9 +66,9 @@ def test_what_flies_is_what_a_campaign_keeps_and_knows_of_a_folder(raw, tmp_path
 
 
 @needs_compiler
-def test_a_second_file_flies_where_it_is_included_and_is_asked_for_where_not(raw, tmp_path):
+def test_a_second_file_flies_where_it_is_included_and_is_asked_for_where_not(chain, tmp_path):
     """It was said that the compiler must be one for this machine."""
-    changed = shutil.copytree(raw, tmp_path / "changed")
+    changed = shutil.copytree(chain, tmp_path / "changed")
     code = changed / "ptsmc_flight.c"
     (changed / "mine.c").write_text("double mine(double x) { return 2.0 * x; }\n")
     call = r"\1\n    if (mine(p->period) < 0.0) return 1;"
@@ -83,10 +83,10 @@ def test_a_second_file_flies_where_it_is_included_and_is_asked_for_where_not(raw
 
 
 @needs_compiler
-def test_a_folder_of_two_controllers_is_none(raw, tmp_path):
+def test_a_folder_of_two_controllers_is_none(chain, tmp_path):
     """C wrote beyond the rows of a controller.json that was not its own; numbers for a name ended in a traceback."""
-    shutil.copytree(raw, tmp_path / "other")
-    layout = json.loads((raw / "controller.json").read_text())
+    shutil.copytree(chain, tmp_path / "other")
+    layout = json.loads((chain / "controller.json").read_text())
     fewer = {**layout["columns"], "state": layout["columns"]["state"][1:]}
     for changed in ({"name": 5}, {"period": 10**400}, {"columns": {"params": [1]}}, {"columns": fewer}):
         (tmp_path / "other" / "controller.json").write_text(json.dumps({**layout, **changed}))
@@ -95,10 +95,10 @@ def test_a_folder_of_two_controllers_is_none(raw, tmp_path):
 
 
 @needs_compiler
-def test_cc_may_have_options_and_be_a_compiler_for_this_machine_only(raw, monkeypatch, tmp_path):
+def test_cc_may_have_options_and_be_a_compiler_for_this_machine_only(chain, monkeypatch, tmp_path):
     """XLA's headers have what -pedantic warns of; what cannot be loaded ended in a traceback."""
     monkeypatch.chdir(tmp_path)
-    shutil.copytree(raw, "-c")
+    shutil.copytree(chain, "-c")
     monkeypatch.setenv("CC", f"{CC} -pedantic -Wall -Wextra -Werror")
     Library("-c")
     for cc, said in (("true", "does not load as true compiles it, which must be a C compiler for this machine: "),
@@ -109,10 +109,10 @@ def test_cc_may_have_options_and_be_a_compiler_for_this_machine_only(raw, monkey
 
 
 @needs_compiler
-def test_a_period_read_with_32_bits_is_the_same(raw):
+def test_a_period_read_with_32_bits_is_the_same(chain):
     """It was refused: 0.1 s, but must be 0.1 s."""
-    library = Library(raw)
+    library = Library(chain)
     with jax.enable_x64(False):
-        known = parts("raw")
+        known = parts("chain")
         assert float(known.period) != library.period
         InTheLoop(library, known)
