@@ -55,7 +55,7 @@ class Errors(NamedTuple):
 
 
 class Torques(NamedTuple):
-    """Torques of an interval at the quadrature nodes of `weights`: one where they are held, else start, middle, end."""
+    """Torques of an interval at the nodes of `weights`: one where they are held, else its ends, or also its middle."""
 
     commanded: tuple[Array, ...]  # (m,) each [N m]
     delivered: tuple[Array, ...]  # (m,) each [N m]
