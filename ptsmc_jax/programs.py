@@ -148,24 +148,17 @@ class Program:
         return repr((self._origin(), _structure(structure), shapes, _plain(fixed), self._options, _surroundings()))
 
     def _compiled(self, key: tuple, said: str, given: dict) -> Callable:
-        function = self._by_name(dict(key[2]))
+        fixed = dict(key[2])
+
+        def function(given: dict) -> Any:
+            return self._function(**given, **fixed)
+
         # a name that the compile cache does not know: what it gives back cannot be written again, its copy would lack
         # its functions
         function.__name__ = f"{self._function.__name__}_{secrets.token_hex(4)}"
         compiled = jax.jit(function, compiler_options=self._options).lower(given).compile()
         _write(_path(said), said, compiled)
         return compiled
-
-    def _by_name(self, fixed: dict) -> Callable[[dict], Any]:
-        """The function, of its arguments by their names but for the fixed ones."""
-
-        def function(given: dict) -> Any:
-            named = {**given, **fixed}
-            in_order = {name: named[name] for name in self._signature.parameters if name in named}
-            bound = inspect.BoundArguments(self._signature, in_order)
-            return self._function(*bound.args, **bound.kwargs)  # jax.grad takes none by its name
-
-        return function
 
     def _origin(self) -> tuple[str, str, str]:
         package = self._function.__module__.split(".")[0]

@@ -142,17 +142,12 @@ def test_what_remembers_something_that_cannot_be_told_is_not_kept():
     def turned(q, y):
         return attitude.rotate(q, 2.0 * y)
 
-    for one in (
-        object(),
-        Local(),
-        Local,
-        np.random.default_rng(0),
-        jax.grad(scaled(2.0)),
-        jax.jit(scaled(2.0)),
-        turned,
-    ):
+    made = jax.grad(scaled(2.0)), jax.jit(scaled(2.0)), turned
+    for one in (object(), Local(), Local, np.random.default_rng(0), *made):
         with pytest.raises(programs._UnknownError):
             programs._plain(scaled(one))
+    with pytest.raises(programs._UnknownError):
+        programs.jit(disturbances.Constant(vector([1.0])).__call__)._origin()  # hangs on its number
 
 
 def test_what_is_said_to_be_seen_by_no_program_is_there():
