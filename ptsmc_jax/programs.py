@@ -221,7 +221,7 @@ def _plain(value: Any) -> Any:
     if isinstance(value, dict):
         return [(_plain(k), _plain(v)) for k, v in value.items()]
     kind = value if isinstance(value, type) or inspect.isfunction(value) else type(value)
-    where = kind.__module__, kind.__qualname__
+    where = str(kind.__module__), kind.__qualname__  # None: of code that was run by itself
     if where[0].split(".")[0] not in (*OURS, "builtins", "collections") or "<locals>" in where[1]:
         raise _UnknownError
     if inspect.isfunction(value) and not _stands(value):  # what functools.wraps has given its name

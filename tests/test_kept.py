@@ -142,7 +142,7 @@ def test_what_remembers_something_that_cannot_be_told_is_not_kept():
     def turned(q, y):
         return attitude.rotate(q, 2.0 * y)
 
-    made = jax.grad(scaled(2.0)), jax.jit(scaled(2.0)), turned
+    made = jax.grad(scaled(2.0)), jax.jit(scaled(2.0)), turned, eval("lambda x: x", {})
     for one in (object(), Local(), Local, np.random.default_rng(0), *made):
         with pytest.raises(programs._UnknownError):
             programs._plain(scaled(one))

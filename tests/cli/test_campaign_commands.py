@@ -350,7 +350,7 @@ def test_the_worst_trials_and_their_replay(command, flown, tmp_path):
     assert code == 0
     assert kept["trial"].to_list() == order["trial"].to_list()
     assert str(order["trial"][0]) in said
-    head = ("trial", "status", "peak_torque [u]", "window_error [x1]", "settling_time [s]", "initial_angle")
+    head = ("trial", "status", "peak_torque [u]", "window_error [x1]", "settling_time [s]", "initial_angle [x1]")
     assert re.split("  +", said.splitlines()[0].strip()) == list(head)
     trial = order["trial"][0]
     code, said, _ = command("replay", FOLDER, "--trial", trial, "--no-figures")
