@@ -18,6 +18,7 @@ os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {QUICKLY}"
 configure(devices=2)
 
 import jax  # noqa: E402
+import matplotlib  # noqa: E402
 
 jax.devices()  # reads the flags
 os.environ["XLA_FLAGS"] = os.environ["XLA_FLAGS"].replace(QUICKLY, "").strip()
@@ -36,6 +37,8 @@ from ptsmc_jax.simulation import rollout  # noqa: E402
 rollout.simulate_once = rollout.simulate_jit  # all programs are compiled quickly here: not the same one twice
 # rooms of tests whose commands and campaigns call what other rooms test by itself, with its shapes
 CALLERS = ("campaigns", "cli", "onboard", "output", "paper", "scenario", "studies")
+
+matplotlib.rcParams["savefig.dpi"] = 30  # what figures show, tests ask of these themselves: not of their files
 
 # tracing makes objects by the million, and hardly any in cycles: looking for these took a fifth of its time
 gc.set_threshold(200_000, 10, 10)

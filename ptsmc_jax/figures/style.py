@@ -22,7 +22,6 @@ RC: Any = {
     "axes.spines.right": False,
     "lines.linewidth": 1.6,
     "legend.frameon": False,
-    "savefig.dpi": 130,
 }
 styled = matplotlib.rc_context(RC)  # decorates functions that draw in this look
 LIMIT: Any = {"color": "0.3", "lw": 1.0, "ls": (0, (6, 3))}  # how the line of a limit is drawn, and of the floor

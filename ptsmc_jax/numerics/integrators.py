@@ -125,18 +125,18 @@ def decay(a: Float[Array, "n n"], dt: Scalar, largest: Scalar | None = None) -> 
 
 
 def etdrk4(rate: Callable, linear: Decay, t: Scalar, y: Any, m: Float[Array, " n"], dt: Scalar) -> tuple:
-    """One step of order 4 of y' = f(t, y, m), m' = -A m + g(t, y, m), exact in A: (y, m) at t + dt and stage outputs.
+    """One step of order 4 of y' = f(t, y, m), m' = -A m + g(t, y, m), exact in A: (y, m) at t + dt, and aux at t.
 
     rate(t, y, m) returns (f, g, aux). With A = 0 it is `rk4`; however stiff A is, the step stays stable and exact
-    for a constant g. Returned besides: aux of the first and the third stage (start and middle of the step).
+    for a constant g.
     """
-    f1, g1, start = rate(t, y, m)
+    f1, g1, aux = rate(t, y, m)
     m2 = linear.half @ m + linear.stage @ g1
     f2, g2, _ = rate(t + dt / 2, _ahead(y, f1, dt / 2), m2)
     m3 = linear.half @ m + linear.stage @ g2
-    f3, g3, middle = rate(t + dt / 2, _ahead(y, f2, dt / 2), m3)
+    f3, g3, _ = rate(t + dt / 2, _ahead(y, f2, dt / 2), m3)
     m4 = linear.half @ m2 + linear.stage @ (2 * g3 - g1)
     f4, g4, _ = rate(t + dt, _ahead(y, f3, dt), m4)
     w1, w2, w4 = linear.ends
     m_next = linear.full @ m + w1 @ g1 + w2 @ (g2 + g3) + w4 @ g4
-    return _simpson(y, dt, f1, f2, f3, f4), m_next, start, middle
+    return _simpson(y, dt, f1, f2, f3, f4), m_next, aux

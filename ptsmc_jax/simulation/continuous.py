@@ -35,7 +35,7 @@ def fly(run: Run) -> Result:
             d_eff = model.unexplained(t, x, x_dot, u)
             return x_dot, observer.forcing(t, (now.t, now.t_next), memory, d_eff), (u, s)
 
-        x, memory_next, (u, s), _ = integrators.etdrk4(rate, linear, now.t, state.x, memory, dt)
+        x, memory_next, (u, s) = integrators.etdrk4(rate, linear, now.t, state.x, memory, dt)
         d_hat = observer.estimate(memory)
         signals, has_length = (d_hat, u, u, s), dt > 0.0
         row = run_state.row(run, now.t, state.x, target, signals, has_length) if run.record else None
