@@ -204,13 +204,13 @@ sys.meta_path.insert(0, Watching())
 from ptsmc_jax.configure import configure
 
 for fast in (True, False, True):
-    configure(1, cache, fast, device="cpu", bits=32)
+    configure(1, cache, fast, device="cpu", bits=32, keep_programs=True)
     told["flags"].append(os.environ["XLA_FLAGS"])
 import jax
 
 f = jax.jit(lambda x: 3.0 * x + 1.0)
 told["found"] = [float(f(2.0))]
-told["set"] = [str(jax.numpy.zeros(1).dtype), jax.config.jax_platforms]
+told["set"] = [str(jax.numpy.zeros(1).dtype), jax.config.jax_platforms, jax.config.jax_numpy_dtype_promotion]
 configure(1, cache, device="cpu", bits=32)
 told["flags"].append(os.environ["XLA_FLAGS"])
 try:
@@ -230,6 +230,7 @@ print(json.dumps(told))
 def told(tmp_path_factory):
     """What a process says that calls `configure` several times, before anything runs on JAX and after."""
     environment = {name: value for name, value in os.environ.items() if name != "TF_CPP_MIN_LOG_LEVEL"}
+    environment["JAX_NUMPY_DTYPE_PROMOTION"] = "strict"  # of a user's own code: not of what is kept
     cache, ours = tmp_path_factory.mktemp("cache"), setup._cache_folder()
     for verdict in ours.glob("options-*.json") if ours else ():
         shutil.copy(verdict, cache)
@@ -241,7 +242,7 @@ def told(tmp_path_factory):
 
 def test_bits_and_device_are_set_and_the_compiler_is_silent(told):
     """XLA's log ("Very slow compile?") is off when jaxlib is looked for, which reads its level once."""
-    assert (told["level"], told["set"]) == ("3", ["float32", "cpu"])
+    assert (told["level"], told["set"]) == ("3", ["float32", "cpu", "standard"])
 
 
 def test_other_compiler_options_are_set_before_anything_runs_or_refused(told):
