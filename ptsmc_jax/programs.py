@@ -237,8 +237,8 @@ def _plain(value: Any) -> Any:
 
 def _stands(value: Any) -> bool:
     """Whether a function, or a type, is what its module has under its name."""
-    names = value.__qualname__.split(".")
-    return functools.reduce(lambda of, name: getattr(of, name, None), names, sys.modules[value.__module__]) is value
+    module, names = sys.modules.get(value.__module__), value.__qualname__.split(".")
+    return functools.reduce(lambda of, name: getattr(of, name, None), names, module) is value
 
 
 @functools.cache

@@ -130,10 +130,12 @@ def as_pytree(function: Callable | None) -> Any:
 def check_indices(function: Callable, *arguments: Any) -> None:
     """Raise IndexError where a function of one's own takes an element that none of its arguments has.
 
-    JAX would take the last one in its place, and say nothing. arguments: pytrees of arrays, or of their shapes.
+    JAX would take the last one in its place, and say nothing. arguments: pytrees of arrays, or of their shapes, and of
+    plain numbers.
     """
-    known = jax.tree.map(lambda one: np.zeros(one.shape, one.dtype), arguments)  # NumPy looks
     try:
+        # NumPy looks
+        known = jax.tree.map(lambda v: np.zeros(v.shape, v.dtype) if hasattr(v, "shape") else v, arguments)
         jax.eval_shape(lambda: function(*known))
     except IndexError:
         raise

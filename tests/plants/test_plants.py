@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from ptsmc_jax import formulas
 from ptsmc_jax.numerics import integrators
-from ptsmc_jax.plants import integrator_chain, rigid_body, second_order
+from ptsmc_jax.plants import base, integrator_chain, rigid_body, second_order
 from tests.helpers import FULL_INERTIA, PAPER_INERTIA, vector
 
 EPS = np.finfo(float).eps
@@ -264,3 +264,12 @@ def test_input_for_an_acceleration_gives_it_and_what_is_unexplained_is_the_distu
     unit = 100 * EPS * np.linalg.norm(plant.inertia)  # some ten sums of numbers of the order of it
     np.testing.assert_allclose(plant.velocity(x_dot), w_dot, rtol=0, atol=unit)
     np.testing.assert_allclose(plant.unexplained(t, x, x_dot, u), d, rtol=0, atol=unit)
+
+
+def test_indices_beyond_an_argument_are_seen_beside_plain_numbers_and_others_left_alone():
+    given = {"a": vector([1.0, 2.0, 3.0])}, 2.0
+    for beyond in (3, -4):
+        with pytest.raises(IndexError, match=f"index {beyond} is out of bounds"):
+            base.check_indices(lambda x, k, at=beyond: k * x["a"][at], *given)
+    base.check_indices(lambda x, k: k * x["a"][jnp.argmax(x["a"])] + x["a"][-3], *given)
+    base.check_indices(lambda x, k: x["a"].at[0].set(k), *given)  # NumPy has none
