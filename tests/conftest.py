@@ -4,6 +4,7 @@ import gc
 import os
 import re
 import sys
+import threading
 from pathlib import Path
 
 import jaxtyping
@@ -19,6 +20,8 @@ configure(devices=2)
 
 import jax  # noqa: E402
 import matplotlib  # noqa: E402
+from jax._src.interpreters import mlir  # noqa: E402
+from jaxlib.mlir import ir  # noqa: E402
 
 jax.devices()  # reads the flags
 os.environ["XLA_FLAGS"] = os.environ["XLA_FLAGS"].replace(QUICKLY, "").strip()
@@ -43,7 +46,23 @@ matplotlib.rcParams["savefig.dpi"] = 30  # what figures show, tests ask of these
 # tracing makes objects by the million, and hardly any in cycles: looking for these took a fifth of its time
 gc.set_threshold(200_000, 10, 10)
 
-MANY = 15_000  # mappings of memory; Linux allows a process 65 530, but with 33 000 a worker came to 7 GB, now to 5 or 6
+# JAX lowers every program in a context of its own: making it takes longer than lowering what most tests compile
+_context, _new_context = threading.local(), mlir.make_ir_context
+
+
+def _context_of_many():
+    """This thread's; begun anew now and then, for it keeps what every program in it has named."""
+    if ir.Context.current is not None:  # amid the lowering of another, it would be put into that one
+        return _new_context()
+    _context.programs = getattr(_context, "programs", -1) + 1
+    if _context.programs % 200 == 0:
+        _context.made = _new_context()
+    return _context.made
+
+
+mlir.make_ir_context = _context_of_many
+
+MANY = 25_000  # mappings of memory; Linux allows a process 65 530: with these a worker comes to 3 GB
 
 
 # files that a worker is to begin with, the longest first: the last ones would keep one of them waiting

@@ -6,6 +6,7 @@ another new part joins one here.
 
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -13,9 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ptsmc_jax import programs, scenario
+from ptsmc_jax import configure, programs, scenario
 from ptsmc_jax.batching import lanes
-from ptsmc_jax.campaigns import montecarlo
+from ptsmc_jax.campaigns import montecarlo, runs
 from ptsmc_jax.dispersions import variation
 from ptsmc_jax.plants import integrator_chain, rigid_body
 from ptsmc_jax.scenario.disturbance_tables import DISTURBANCES
@@ -280,12 +281,12 @@ def agree(values, wanted, unit, name, skip=()):
 def one_by_one(parts, still, dispersion, sloped):
     """The same as `batch`, in a loop, whose program is compiled in half the time; without slopes."""
     assert not sloped
-    runs = [drawn(dispersion, parts, trial) for trial in (*NUMBERS, np.uint32(NUMBERS.size))]
-    runs[-1] = replace(runs[-1], initial=still.initial)
+    begun = [drawn(dispersion, parts, trial) for trial in (*NUMBERS, np.uint32(NUMBERS.size))]
+    begun[-1] = replace(begun[-1], initial=still.initial)
     if hasattr(still.controller, "sign_width"):
         width = still.controller.sign_width
-        runs[-1] = replace(runs[-1], controller=replace(runs[-1].controller, sign_width=width))
-    flown = [rollout.simulate_jit(run, SEED, np.uint32(trial)) for trial, run in enumerate(runs)]
+        begun[-1] = replace(begun[-1], controller=replace(begun[-1].controller, sign_width=width))
+    flown = [rollout.simulate_jit(run, SEED, np.uint32(trial)) for trial, run in enumerate(begun)]
     each = [(one.metrics._asdict(), one.status, one.bad_time, {}) for one in flown]
     return jax.tree.map(lambda *v: np.stack(v), *each)
 
@@ -353,6 +354,21 @@ def test_carries_keep_their_shapes_whatever_is_batched(name):
     rows = one.log.t.shape[0]
     assert all(leaf.shape[0] == rows for leaf in jax.tree.leaves(one.log))
     assert one.log.u.shape == (rows, ready.parts.plant.inputs)
+
+
+@pytest.mark.parametrize("name", ROWS)
+def test_what_flies_parts_of_ours_is_kept_for_the_next_command(name, tmp_path, monkeypatch):
+    """Whatever is fixed in them, flight software too, is told from files: alone and in a batch; one's own code never.
+
+    What cannot be told is compiled in every process, and nothing but its time shows.
+    """
+    monkeypatch.setattr(configure, "programs", tmp_path)
+    asked: list[Any] = []
+    monkeypatch.setattr(programs, "_beside", lambda: SimpleNamespace(submit=lambda *known: asked.append(known)))
+    ready = scenario.study(scenario.from_tables(ROWS[name]))
+    runs.prepare(ready)
+    montecarlo.prepare(ready.parts, ready.dispersion, len(NUMBERS))
+    assert len(asked) == (0 if ARM in str(ROWS[name]) or OWN in str(ROWS[name]) else 2)
 
 
 def test_lanes_equal_vmap_for_a_plant_from_python():
