@@ -764,7 +764,10 @@ def test_frozen_gains_are_judged_where_they_mean_something(t_f, delta, period, e
 
 
 def test_lapack_is_given_one_matrix_at_a_time():
-    """Many it shares among XLA's threads, and waits in one of them: two at once stood still for ever (jaxlib 0.10)."""
+    """Many it shares among XLA's threads, and waits in one of them: two at once stood still for ever (jaxlib 0.10).
+
+    What `lapack.vmap` takes over many is one at a time there alone.
+    """
     loop = replace(held(*INTEGRATORS, 0.5), delay=1)
     body = a_body(period=0.1)
     loops = jax.tree.map(lambda v: jnp.stack([v, v]), loop)
@@ -778,5 +781,6 @@ def test_lapack_is_given_one_matrix_at_a_time():
     }
     for name, trace in traces.items():
         solved = [e for e in equations(trace.jaxpr) if e.primitive.name in lapack.COUNTED | lapack.SHARED]
-        assert {e.invars[0].aval.ndim for e in solved} <= {2}, name
+        most = 2 if lapack.WAITS or name != "at rest" else 3
+        assert max(e.invars[0].aval.ndim for e in solved) <= most, name
         assert ("eig" in {e.primitive.name for e in solved}) == (name != "at rest")  # it is looked at
