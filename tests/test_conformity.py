@@ -365,6 +365,8 @@ def test_what_flies_parts_of_ours_is_kept_for_the_next_command(name, tmp_path, m
     monkeypatch.setattr(configure, "programs", tmp_path)
     asked: list[Any] = []
     monkeypatch.setattr(programs, "_beside", lambda: SimpleNamespace(submit=lambda *known: asked.append(known)))
+    for program in (rollout.simulate_jit, montecarlo._fly):  # whatever was flown before
+        monkeypatch.setattr(program, "_ready", {})
     ready = scenario.study(scenario.from_tables(ROWS[name]))
     runs.prepare(ready)
     montecarlo.prepare(ready.parts, ready.dispersion, len(NUMBERS))

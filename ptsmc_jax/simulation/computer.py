@@ -168,7 +168,7 @@ def decide(
 
 
 def statuses(computer: Computer) -> dict[str, Array]:
-    """Of our own samples none ends otherwise than another."""
+    """How many samples ended with each status: ours have none."""
     return {}
 
 
