@@ -1,5 +1,7 @@
 """Envelopes of s and of the error by Theorems 1 to 3, and how narrow the smooth sign may be."""
 
+import math
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,15 +26,14 @@ def sliding_envelope(parts: Parts) -> tuple[float, float]:
     """
     law, n = parts.controller, parts.controller.order
     beta = switching_rate(parts) * parts.plant.inputs * GIVEN_AWAY * float(law.sign_width)
-    return float(_outset(parts)), 2.0 * beta / (2.0 * float(law.eta) + n - 4.0)
+    s0 = math.hypot(*np.ravel(_outset(parts)))  # a number where its square is none
+    return s0, 2.0 * beta / (2.0 * float(law.eta) + n - 4.0)
 
 
 @programs.jit
-def _outset(parts: Parts) -> Scalar:
-    """s0, the 2-norm of s at t = 0."""
-    _, s = parts.controller.exact(jnp.zeros_like(parts.t_end), starts(parts))
-    largest = jnp.max(jnp.abs(s))
-    return largest * jnp.linalg.norm(s / jnp.where(largest == 0.0, 1.0, largest))  # its square may be no number
+def _outset(parts: Parts) -> Array:
+    """What s is at t = 0, (m,)."""
+    return parts.controller.exact(jnp.zeros_like(parts.t_end), starts(parts))[1]
 
 
 def switching_rate(parts: Parts) -> float:
