@@ -4,13 +4,15 @@ import math
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
+import msgspec
 from msgspec import Meta
 
 from ptsmc_jax.scenario import gain_bounds
 from ptsmc_jax.scenario.baseline_record import BaselineTable, over_t_f, until_sampling
 from ptsmc_jax.scenario.errors import wrong
 from ptsmc_jax.scenario.gain_record import Allowed, Choice, GainBounds, between
-from ptsmc_jax.scenario.values import NotNegative, Positive
+from ptsmc_jax.scenario.mission import Design, scales
+from ptsmc_jax.scenario.values import NotNegative, Positive, Scaled
 
 Power = Annotated[float, Meta(gt=1, lt=2, description="a number between 1 and 2")]
 AboveOne = Annotated[float, Meta(gt=1, description="a number greater than 1")]
@@ -26,8 +28,9 @@ class PDController(BaselineTable, frozen=True):
 
     kind: Literal["pd"] = "pd"
     switches: ClassVar[bool] = False
-    k_p: Positive = 0.2
-    k_d: Positive = 0.6
+    k_p: Positive | None = None
+    k_d: Positive | None = None
+    scaled: ClassVar[Mapping[str, Scaled]] = {"k_p": Scaled(0.2, time=-2), "k_d": Scaled(0.6, time=-1)}
     gains: ClassVar[Mapping[str, GainBounds]] = {
         "k_p": over_t_f(2.0, 2000.0, 2),
         "k_d": over_t_f(0.3, 100.0),
@@ -49,7 +52,11 @@ class PDController(BaselineTable, frozen=True):
 
     def turning(self, t_f: float) -> tuple[str, float]:
         """The rate at the goal if all of its spring's potential energy had become motion."""
-        return "controller.k_p", 2.0 * math.sqrt(self.k_p)
+        return "controller.k_p", 2.0 * math.sqrt(self.k_p or 0.0)
+
+    def gains_of(self, design: Design, scenario: Any) -> dict[str, float]:
+        """Return gains that follow t_f, within the bandwidth."""
+        return {"k_p": 0.2 * design.rate**2, "k_d": 0.6 * design.rate}
 
 
 class TerminalController(BaselineTable, frozen=True):
@@ -64,9 +71,24 @@ class TerminalController(BaselineTable, frozen=True):
 
     kind: Literal["terminal"] = "terminal"
     p: Power = 1.3
-    b: Positive = 0.1
-    k: Positive = 0.1
+    b: Positive | None = None
+    k: Positive | None = None
     sign_width: NotNegative = 1e-3
+    scaled: ClassVar[Mapping[str, Scaled]] = {"k": Scaled(0.1, time=-2)}
+
+    def filled(self, scenario: Any) -> Any:
+        """Fill absent gains; the unit of b depends on p."""
+        made = super().filled(scenario)
+        return msgspec.structs.replace(made, b=0.1 * scales(scenario).time ** -self.p) if made.b is None else made
+
+    def gains_of(self, design: Design, scenario: Any) -> dict[str, float]:
+        """Return gains that follow t_f, within the bandwidth."""
+        return {"b": 0.1 * design.rate**self.p, "k": 0.1 * design.rate**2}
+
+    def noise_of_s(self, position: float, velocity: float, t_f: float) -> float:
+        """Return the noise of s = v + sig^p(v') / b."""
+        return math.hypot(position, velocity**self.p / self.b)  # pyright: ignore[reportOperatorIssue]
+
     gains: ClassVar[Mapping[str, GainBounds]] = {
         "p": GainBounds(lambda _: (1.05, 1.95), between(1.0, 2.0)),
         "b": over_t_f(0.01, 100.0),
@@ -85,7 +107,7 @@ class TerminalController(BaselineTable, frozen=True):
 
     def turning(self, t_f: float) -> tuple[str, float]:
         """On its surface, at |v| = 1."""
-        return "controller.b", 2.0 * self.b ** (1.0 / self.p)
+        return "controller.b", 2.0 * (self.b or 0.0) ** (1.0 / self.p)
 
 
 def _usual_p(choice: Choice) -> tuple[float, float]:
@@ -96,6 +118,11 @@ def _usual_p(choice: Choice) -> tuple[float, float]:
 def _allowed_p(choice: Choice) -> Allowed:
     """For gamma - 1/p > 1; where gamma is free too, it follows p."""
     return Allowed(1.0 if "gamma" in choice.free else max(1.0, 1.0 / (choice.law.gamma - 1.0)), 2.0)
+
+
+def _usual_reaching(choice: Choice) -> tuple[float, float]:
+    unit = scales(choice.scenario).time ** (choice.law.p - 2.0)
+    return 1e-4 * unit, 10.0 * unit
 
 
 def _usual_gamma(choice: Choice) -> tuple[float, float]:
@@ -124,10 +151,10 @@ class FixedTimeController(BaselineTable, frozen=True):
     """
 
     kind: Literal["fixed_time"] = "fixed_time"
-    a1: Positive = 0.1
-    b1: Positive = 0.2
-    a2: Positive = 1.0
-    b2: Positive = 1.0
+    a1: Positive | None = None
+    b1: Positive | None = None
+    a2: Positive | None = None
+    b2: Positive | None = None
     p: Power = 1.25
     gamma: AboveOne = 2.0
     m: AboveOne = 1.5
@@ -136,7 +163,7 @@ class FixedTimeController(BaselineTable, frozen=True):
     gains: ClassVar[Mapping[str, GainBounds]] = {
         "p": GainBounds(_usual_p, _allowed_p),  # before gamma, whose bounds go by it
         **dict.fromkeys(("a1", "b1"), over_t_f(0.01, 100.0)),
-        **dict.fromkeys(("a2", "b2"), GainBounds(lambda _: (1e-4, 10.0))),
+        **dict.fromkeys(("a2", "b2"), GainBounds(_usual_reaching)),
         "gamma": GainBounds(_usual_gamma, _allowed_gamma),
         "m": GainBounds(lambda _: (1.05, 3.0), between(1.0, math.inf)),
         "n": GainBounds(lambda _: (0.05, 0.95), between(0.0, 1.0)),
@@ -154,7 +181,23 @@ class FixedTimeController(BaselineTable, frozen=True):
 
     def turning(self, t_f: float) -> tuple[str, float]:
         """On its surface, at |v| = 1."""
-        return "controller.a1", 2.0 * (self.a1 + self.b1)
+        return "controller.a1", 2.0 * ((self.a1 or 0.0) + (self.b1 or 0.0))
+
+    scaled: ClassVar[Mapping[str, Scaled]] = {"a1": Scaled(0.1, time=-1), "b1": Scaled(0.2, time=-1)}
+
+    def filled(self, scenario: Any) -> Any:
+        """Fill absent gains; the unit of a2 and b2 depends on p."""
+        made, reaching = super().filled(scenario), scales(scenario).time ** (self.p - 2.0)
+        return msgspec.structs.replace(made, a2=made.a2 or reaching, b2=made.b2 or reaching)
+
+    def gains_of(self, design: Design, scenario: Any) -> dict[str, float]:
+        """Return gains that follow t_f, within the bandwidth."""
+        reaching = design.rate ** (2.0 - self.p)
+        return {"a1": 0.1 * design.rate, "b1": 0.2 * design.rate, "a2": reaching, "b2": reaching}
+
+    def noise_of_s(self, position: float, velocity: float, t_f: float) -> float:
+        """Return the noise of s = v + sig^p(v' / b1) near the reference."""
+        return math.hypot(position, (velocity / self.b1) ** self.p)  # pyright: ignore[reportOperatorIssue]
 
     def check(self, scenario: Any) -> None:
         """Its surface is nonsingular for gamma - 1/p > 1 only."""
@@ -173,8 +216,14 @@ class TimeBasePDController(BaselineTable, frozen=True):
 
     kind: Literal["time_base_pd"] = "time_base_pd"
     switches: ClassVar[bool] = False
-    k_p: Positive = 1.0
-    k_d: Positive = 2.0
+    k_p: Positive | None = None
+    k_d: Positive | None = None
+    scaled: ClassVar[Mapping[str, Scaled]] = {"k_p": Scaled(1.0, time=-2), "k_d": Scaled(2.0, time=-1)}
+
+    def gains_of(self, design: Design, scenario: Any) -> dict[str, float]:
+        """Return both poles of the tracking loop at the design's."""
+        return {"k_p": design.pole**2, "k_d": 2.0 * design.pole}
+
     gains: ClassVar[Mapping[str, GainBounds]] = {
         "k_p": until_sampling(2.0, 0.25, 2),
         "k_d": until_sampling(0.3, 1.0),
@@ -207,9 +256,19 @@ class TimeBaseSlidingController(BaselineTable, frozen=True):
     """
 
     kind: Literal["time_base_sliding"] = "time_base_sliding"
-    surface_rate: Positive = 1.0
-    k: Positive = 1.0
-    sign_width: NotNegative = 1e-3
+    surface_rate: Positive | None = None
+    k: Positive | None = None
+    sign_width: NotNegative | None = None
+    scaled: ClassVar[Mapping[str, Scaled]] = {
+        "surface_rate": Scaled(1.0, time=-1),
+        "k": Scaled(1.0, time=-1),
+        "sign_width": Scaled(1e-3, time=-1),
+    }
+
+    def gains_of(self, design: Design, scenario: Any) -> dict[str, float]:
+        """Return both poles of the tracking loop at the design's."""
+        return {"surface_rate": design.pole, "k": design.pole, "sign_width": design.width}
+
     gains: ClassVar[Mapping[str, GainBounds]] = {
         "surface_rate": until_sampling(0.3, 1.0),
         "k": until_sampling(0.3, 1.0),
@@ -242,10 +301,20 @@ class ScalingController(BaselineTable, frozen=True):
 
     kind: Literal["scaling"] = "scaling"
     switches: ClassVar[bool] = False
-    delta: Positive = 2.0
+    delta: Positive | None = None
     m: Annotated[float, Meta(ge=1, description="a number, at least 1")] = 1.0
-    k1: Positive = 1.0
-    k: Positive = 1e-3
+    k1: Positive | None = None
+    k: Positive | None = None
+    scaled: ClassVar[Mapping[str, Scaled]] = {
+        "delta": Scaled(2.0, time=1),
+        "k1": Scaled(1.0, time=-1),
+        "k": Scaled(1e-3, time=-1),
+    }
+
+    def gains_of(self, design: Design, scenario: Any) -> dict[str, float]:
+        """Return the hold phase's poles at the design's, and a hand-over where the approach is as fast."""
+        return {"delta": design.delta, "k1": design.pole, "k": 1e-3 * design.rate}
+
     gains: ClassVar[Mapping[str, GainBounds]] = {
         "delta": gain_bounds.DELTA,
         "m": GainBounds(lambda _: (1.0, 5.0), lambda _: Allowed(1.0, math.inf, lower_included=True)),
@@ -280,7 +349,8 @@ class PredefinedTimeController(BaselineTable, frozen=True):
     share: Annotated[float, Meta(gt=0, lt=1, description="a number between 0 and 1")] = 0.6
     q1: Annotated[float, Meta(gt=0, le=0.5, description="a number above 0 and at most 0.5")] = 0.3
     q2: Annotated[float, Meta(gt=0, lt=1, description="a number between 0 and 1")] = 0.3
-    sign_width: NotNegative = 1e-2
+    sign_width: NotNegative | None = None
+    scaled: ClassVar[Mapping[str, Scaled]] = {"sign_width": Scaled(1e-2, time=-1)}
     gains: ClassVar[Mapping[str, GainBounds]] = {
         "share": GainBounds(lambda _: (0.05, 0.95), between(0.0, 1.0)),
         "q1": GainBounds(lambda _: (0.05, 0.49), between(0.0, 0.5)),
@@ -313,9 +383,19 @@ class SuperTwistingController(BaselineTable, frozen=True):
 
     kind: Literal["super_twisting"] = "super_twisting"
     switches: ClassVar[bool] = False
-    surface_rate: Positive = 0.4
-    lipschitz: Positive = 0.01
-    sign_width: NotNegative = 1e-3
+    surface_rate: Positive | None = None
+    lipschitz: Positive | None = None
+    sign_width: NotNegative | None = None
+    scaled: ClassVar[Mapping[str, Scaled]] = {
+        "surface_rate": Scaled(0.4, time=-1),
+        "lipschitz": Scaled(0.01, time=-3),
+        "sign_width": Scaled(1e-3, time=-1),
+    }
+
+    def gains_of(self, design: Design, scenario: Any) -> dict[str, float]:
+        """Return gains that follow t_f, within the bandwidth."""
+        return {"surface_rate": 0.4 * design.rate, "lipschitz": 0.01 * design.rate**3, "sign_width": design.width}
+
     gains: ClassVar[Mapping[str, GainBounds]] = {
         "surface_rate": until_sampling(3.0, 0.2),
         "lipschitz": GainBounds(lambda choice: (0.1 / choice.t_f**3, 1e4 / choice.t_f**3)),
@@ -333,7 +413,7 @@ class SuperTwistingController(BaselineTable, frozen=True):
 
     def turning(self, t_f: float) -> tuple[str, float]:
         """On its surface, at |v| = 1."""
-        return "controller.surface_rate", 2.0 * self.surface_rate
+        return "controller.surface_rate", 2.0 * (self.surface_rate or 0.0)
 
 
 BASELINES: Mapping[str, type[BaselineTable]] = {

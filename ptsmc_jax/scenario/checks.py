@@ -100,7 +100,7 @@ def _check_loop(scenario: Scenario) -> None:
         raise wrong("controller.delta", delta, f"less than controller.t_f, {t_f}")
     if scenario.end < t_f:
         raise wrong("loop.t_end", loop.t_end, f"at least controller.t_f + loop.window, {t_f + window}")
-    if scenario.end < t_f + window - 1e-9:
+    if scenario.end < (t_f + window) * (1 - 1e-9):
         raise wrong("loop.window", window, f"at most loop.t_end - controller.t_f, {scenario.end - t_f}")
     if scenario.sampled:
         _check_periods(scenario)

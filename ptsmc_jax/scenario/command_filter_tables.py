@@ -33,6 +33,10 @@ class CommandFilter(Table, frozen=True):
         """A class of `devices.command_filter`."""
         raise NotImplementedError
 
+    def dead_time(self) -> float:
+        """Return the slope of its phase at low frequencies [s]."""
+        raise NotImplementedError
+
     def build(self) -> Any:
         """The filter, with the keys as its numbers."""
         from ptsmc_jax.numerics.pytrees import vector
@@ -51,6 +55,10 @@ class FirstOrderFilter(CommandFilter, frozen=True):
 
         return Physics
 
+    def dead_time(self) -> float:
+        """Return the slope of its phase at low frequencies [s]."""
+        return 1.0 / self.corner
+
 
 class SecondOrderFilter(CommandFilter, frozen=True):
     """Roll-off of second order, W^2 / (s^2 + 2 z W s + W^2).
@@ -68,6 +76,10 @@ class SecondOrderFilter(CommandFilter, frozen=True):
 
         return Physics
 
+    def dead_time(self) -> float:
+        """Return the slope of its phase at low frequencies [s]."""
+        return 2.0 * self.damping / self.corner
+
 
 class NotchFilter(CommandFilter, frozen=True):
     """Notch, (s^2 + W^2) / (s^2 + 2 z W s + W^2).
@@ -84,6 +96,10 @@ class NotchFilter(CommandFilter, frozen=True):
         from ptsmc_jax.devices.command_filter import Notch as Physics
 
         return Physics
+
+    def dead_time(self) -> float:
+        """Return the slope of its phase at low frequencies [s]."""
+        return 2.0 * self.damping / self.corner
 
 
 COMMAND_FILTERS: Kinds = {"first_order": FirstOrderFilter, "second_order": SecondOrderFilter, "notch": NotchFilter}

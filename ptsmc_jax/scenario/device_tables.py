@@ -65,9 +65,13 @@ class Actuators(Table, frozen=True):
             allowed = f"less than twice hardware.torque_limit, {limit}: larger ones round every torque to zero"
             raise wrong("hardware.torque_step", step, allowed)
 
-    def noise_of_s(self, scenario: Any) -> float:
-        """Noise of the sliding variable after the hand-over, 1 sigma an axis and raw sample, in its units."""
+    def noise_of_error(self, scenario: Any) -> tuple[float, float]:
+        """Return the noise of the error and of its rate [1/s], 1 sigma an axis and raw sample, in their units."""
         raise NotImplementedError
+
+    def noise_of_s(self, scenario: Any) -> float:
+        """Return the noise of the sliding variable after the hand-over, 1 sigma an axis and raw sample."""
+        return scenario.controller.noise_of_s(*self.noise_of_error(scenario), scenario.controller.t_f)
 
     def sensors(self, scenario: Any) -> Any:
         """Parts of `devices.sensors`; None: the law sees the true state."""
@@ -146,13 +150,12 @@ class Hardware(Actuators, frozen=True):
                 f'sample every period; allowed is {one}, or [filter] with kind = "steady_state"'
             )
 
-    def noise_of_s(self, scenario: Any) -> float:
-        """The error is half an angle: s = eps' + c eps has sigma_s = (sigma_w^2 + c^2 sigma_q^2)^(1/2) / 2 [1/s].
+    def noise_of_error(self, scenario: Any) -> tuple[float, float]:
+        """Return half of both noises: the error is half an angle.
 
-        Of the additive error at most that, where the reference is turned away from the inertial axes.
+        The additive error has at most that noise, if the reference is turned away from the inertial axes.
         """
-        rate = getattr(scenario.controller, "surface_rate", 1.0)
-        return 0.5 * math.hypot(self.gyro_noise(scenario.loop.period), rate * (self.attitude_noise or 0.0))
+        return 0.5 * (self.attitude_noise or 0.0), 0.5 * self.gyro_noise(scenario.loop.period)
 
     def sensors(self, scenario: Any) -> Any:
         """Star tracker, gyro and filter."""
@@ -203,16 +206,20 @@ class StateHardware(Actuators, frozen=True):
         if self.state_noise is not None and len(self.state_noise) != states:
             raise wrong("hardware.state_noise", self.state_noise, f"a list of {states} numbers, one for each state")
 
+    def noise_of_error(self, scenario: Any) -> tuple[float, float]:
+        """Return the noise of the first state and of its derivative; of a system, of its noisiest components."""
+        noises = self.state_noise or (0.0, 0.0)
+        inputs = scenario.inputs  # a system's positions, then its rates
+        return max(noises[:inputs]), max(noises[inputs : 2 * inputs])
+
     def noise_of_s(self, scenario: Any) -> float:
-        """The weights of the surface times the noises; for a system, that of its noisiest component."""
-        law = scenario.controller
-        a, rate = getattr(law, "a", (1.0,)), getattr(law, "surface_rate", 1.0)
+        """Return the weights of the surface times the noises; for a system, of its noisiest component."""
+        law, noises = scenario.controller, self.state_noise
+        if scenario.order == 2 or noises is None:
+            return super().noise_of_s(scenario)
+        a, rate = getattr(law, "a", (1.0,)), getattr(law, "surface_rate", None) or 1.0 / law.t_f
         weights = [one * rate ** (len(a) - i) for i, one in enumerate([*a, 1.0])]
-        noises = self.state_noise or [0.0] * len(weights)
-        if len(noises) == len(weights):
-            return math.hypot(*(w * noise for w, noise in zip(weights, noises, strict=True)))
-        inputs = len(noises) // 2  # a system's positions and rates
-        return max(math.hypot(weights[0] * x, weights[1] * v) for x, v in zip(noises, noises[inputs:], strict=False))
+        return math.hypot(*(w * noise for w, noise in zip(weights, noises, strict=False)))
 
     def sensors(self, scenario: Any) -> Any:
         """`sensors.StateSensor`."""
@@ -228,6 +235,10 @@ class FilterTable(Kind, frozen=True):
     on: ClassVar[bool] = True
     prefix: ClassVar[str] = "filter_"
     gains: ClassVar[Mapping[str, GainBounds]] = {}
+
+    def passes(self, scenario: Any) -> float:
+        """Return the fraction of a star tracker sample's noise that reaches the law at once."""
+        return 1.0
 
     def check(self, scenario: Any) -> None:
         """Raise ScenarioError where its keys contradict each other, or the scenario's."""
@@ -276,6 +287,10 @@ class SteadyStateFilter(FilterTable, frozen=True):
         """With its bandwidth, where there are noises that it follows from."""
         noisy = self._noisy(scenario.devices)
         return msgspec.structs.replace(self, bandwidth=self.width(scenario)) if noisy else self
+
+    def passes(self, scenario: Any) -> float:
+        """Return the attitude gain of a correction, see `devices.attitude_filter.filter_gains`."""
+        return -math.expm1(-2.0 * self.width(scenario) * scenario.devices.interval(scenario.loop.period))
 
     def check(self, scenario: Any) -> None:
         """Noises that the bandwidth follows from."""

@@ -1,11 +1,12 @@
 """The tables of a scenario file that say what is drawn for each trial."""
 
+from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from msgspec import Meta
 
-from ptsmc_jax.scenario.values import NotNegative, NotNegatives, Positive, Table, Truth
+from ptsmc_jax.scenario.values import NotNegative, NotNegatives, Positive, Scaled, Table, Truth
 
 
 class Numbers(Table, frozen=True):
@@ -68,6 +69,10 @@ class UniformAttitude(Table, frozen=True):
 
     kind: Literal["uniform"] = "uniform"
 
+    def farthest(self, angle: float) -> float:
+        """Return the largest angle [rad] of an attitude drawn about one at this angle."""
+        return np.pi
+
     def build(self) -> Any:
         """`attitudes.UniformAttitude`."""
         from ptsmc_jax.dispersions.attitudes import UniformAttitude as Physics
@@ -87,6 +92,10 @@ class AxisAngle(Table, frozen=True):
     min_deg: Annotated[float, Meta(ge=0, le=180, description="an angle from 0 to 180 degrees")] = 20.0
     max_deg: Annotated[float, Meta(ge=0, le=180, description="an angle from 0 to 180 degrees")] = 140.0
 
+    def farthest(self, angle: float) -> float:
+        """Return the largest angle [rad] of an attitude drawn about one at this angle."""
+        return float(np.deg2rad(self.max_deg))
+
     def build(self) -> Any:
         """`attitudes.AxisAngle`."""
         from ptsmc_jax.dispersions.attitudes import AxisAngle as Physics
@@ -105,6 +114,10 @@ class NormalAttitude(Table, frozen=True):
     kind: Literal["normal"] = "normal"
     std_deg: NotNegative = 1.0
 
+    def farthest(self, angle: float) -> float:
+        """Return the angle [rad] that all but one of 10 000 attitudes drawn about one at this angle stay below."""
+        return min(angle + 4.6 * float(np.deg2rad(self.std_deg)), np.pi)
+
     def build(self) -> Any:
         """`attitudes.NormalAttitude`."""
         from ptsmc_jax.dispersions.attitudes import NormalAttitude as Physics
@@ -117,22 +130,24 @@ class NormalRate(Normal, frozen=True):
     """Each axis normal about initial.rate.
 
     Attributes:
-        std: 1 sigma per axis [rad/s]
+        std: 1 sigma per axis; default: 0.01, scaled to the mission [rad/s]
     """
 
     kind: Literal["normal"] = "normal"
-    std: NotNegative = 0.01
+    std: NotNegative | None = None
+    scaled: ClassVar[Mapping[str, Scaled]] = {"std": Scaled(0.01, time=-1)}
 
 
 class UniformRate(Uniform, frozen=True):
     """Each axis uniform about initial.rate.
 
     Attributes:
-        half_width: largest deviation per axis [rad/s]
+        half_width: largest deviation per axis; default: 0.01, scaled to the mission [rad/s]
     """
 
     kind: Literal["uniform"] = "uniform"
-    half_width: NotNegative = 0.01
+    half_width: NotNegative | None = None
+    scaled: ClassVar[Mapping[str, Scaled]] = {"half_width": Scaled(0.01, time=-1)}
 
 
 class RelativeInertia(Table, frozen=True):
@@ -222,13 +237,14 @@ class Outage(Table, frozen=True):
     """Begins at any time between two, uniformly.
 
     Attributes:
-        duration: how long it lasts [s]
+        duration: how long it lasts; default: 10, scaled to the mission [s]
         earliest: from when on it may begin [s]
         latest: until when; default: loop.t_end [s]
     """
 
     kind: Literal["uniform"] = "uniform"
-    duration: Positive = 10.0
+    duration: Positive | None = None
+    scaled: ClassVar[Mapping[str, Scaled]] = {"duration": Scaled(10.0, time=1)}
     earliest: NotNegative = 0.0
     latest: NotNegative | None = None
 
@@ -265,22 +281,24 @@ class NormalBias(Normal, frozen=True):
     """Normal about what [disturbance] says.
 
     Attributes:
-        std: 1 sigma of each component [N m, or unit of d]
+        std: 1 sigma of each component; default: 1e-3, scaled to the mission [N m, or unit of d]
     """
 
     kind: Literal["normal"] = "normal"
-    std: NotNegative = 1e-3
+    std: NotNegative | None = None
+    scaled: ClassVar[Mapping[str, Scaled]] = {"std": Scaled(1e-3, inertia=1, order=-1)}
 
 
 class UniformBias(Uniform, frozen=True):
     """Uniform about what [disturbance] says.
 
     Attributes:
-        half_width: largest deviation of each component [N m, or unit of d]
+        half_width: largest deviation of each component; default: 1e-3, scaled to the mission [N m, or unit of d]
     """
 
     kind: Literal["uniform"] = "uniform"
-    half_width: NotNegative = 1e-3
+    half_width: NotNegative | None = None
+    scaled: ClassVar[Mapping[str, Scaled]] = {"half_width": Scaled(1e-3, inertia=1, order=-1)}
 
 
 class UniformState(Uniform, frozen=True):

@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ptsmc_jax.scenario import mission
 from ptsmc_jax.scenario.errors import ScenarioError
-from ptsmc_jax.scenario.gain_bounds import rounded, size
-from ptsmc_jax.scenario.values import MOST_STEPS
+from ptsmc_jax.scenario.values import MOST_STEPS, Scaled
 
 RATE = 10.0 / 12.0  # l / J of the paper's observer, 10 N m s on its mean moment of 12 kg m^2 [1/s]
 SIGMAS = 3.0  # of what is normal, and has no largest value
@@ -41,7 +41,7 @@ def of(scenario: Any) -> tuple[float, float] | None:
         fastest = sum((one.rate for one in found), np.zeros(inputs))
     if not np.all(np.isfinite([largest, fastest])):
         raise ScenarioError("disturbance is larger or faster than any number; allowed are smaller numbers in it")
-    return rounded(float(np.max(largest))), rounded(float(np.max(fastest)))
+    return float(np.max(largest)), float(np.max(fastest))
 
 
 def drawn_factor(scenario: Any) -> float:
@@ -66,16 +66,14 @@ def walk_rate(scenario: Any, density: np.ndarray) -> np.ndarray:
 
 
 def observer_rate(scenario: Any) -> float:
-    """Rate l / J of an observer whose gain is not given [1/s]: the paper's, 10 without a body, at most one a period."""
-    rate = 10.0 if scenario.moments[0] is None else RATE
+    """Return l / J of the paper's observer, scaled to the mission and at most 1 / h [1/s]; 10 without a body."""
+    rate = mission.scales(scenario).of(Scaled(10.0 if scenario.moments[0] is None else RATE, time=-1))
     return min(rate, 1.0 / scenario.loop.period) if scenario.sampled else rate
 
 
 def observer_gain(scenario: Any) -> float:
-    """An observer's gain l where none is given: 10 N m s times J over the paper's 12 kg m^2, to one digit."""
-    if scenario.moments[0] is None:
-        return observer_rate(scenario)
-    return float(f"{observer_rate(scenario) * 12.0 * size(scenario):.1g}")
+    """Gain l of the paper's observer, 10 N m s on a mean moment of 12 kg m^2, scaled to the mission."""
+    return observer_rate(scenario) * (scenario.moments[0] or 1.0)
 
 
 def turning(scenario: Any) -> float:

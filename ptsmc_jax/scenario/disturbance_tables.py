@@ -7,7 +7,6 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
-import msgspec
 import numpy as np
 from msgspec import Meta
 
@@ -22,6 +21,7 @@ from ptsmc_jax.scenario.values import (
     Kind,
     Kinds,
     Number,
+    Scaled,
     Three,
     ThreeNotNegative,
 )
@@ -68,11 +68,12 @@ class ConstantDisturbance(DisturbanceTable, frozen=True):
     """A constant torque.
 
     Attributes:
-        amplitude: the torque, per body axis [N m]
+        amplitude: the torque, per body axis; default: 0.01 each, scaled to the mission [N m]
     """
 
     kind: Literal["constant"] = "constant"
-    amplitude: Three = (0.01, 0.01, 0.01)
+    amplitude: Three | None = None
+    scaled: ClassVar[Mapping[str, Scaled]] = {"amplitude": Scaled((0.01, 0.01, 0.01), inertia=1, time=-2)}
 
     def impulse(self, end: float) -> float:
         """It acts all the time."""
@@ -95,17 +96,21 @@ class SinusoidDisturbance(DisturbanceTable, frozen=True):
     """The torque bias + amplitude sin(frequency t + phase), axis by axis.
 
     Attributes:
-        amplitude: per body axis [N m]
-        frequency: per axis [rad/s]
+        amplitude: per body axis; default: 0.01 each, scaled to the mission [N m]
+        frequency: per axis; default: 0.1 each, scaled to the mission [rad/s]
         phase: per axis [rad]
         bias: constant part, per axis [N m]
     """
 
     kind: Literal["sinusoid"] = "sinusoid"
-    amplitude: Three = (0.01, 0.01, 0.01)
-    frequency: Three = (0.1, 0.1, 0.1)
+    amplitude: Three | None = None
+    frequency: Three | None = None
     phase: Three = (0.0, 0.0, 0.0)
     bias: Three = (0.0, 0.0, 0.0)
+    scaled: ClassVar[Mapping[str, Scaled]] = {
+        "amplitude": Scaled((0.01, 0.01, 0.01), inertia=1, time=-2),
+        "frequency": Scaled((0.1, 0.1, 0.1), time=-1),
+    }
 
     def quickest(self) -> float:
         """Its fastest axis."""
@@ -173,11 +178,12 @@ class RandomWalk(DisturbanceTable, frozen=True):
     """A torque that wanders from zero, a new step each period; sampled loop only.
 
     Attributes:
-        density: of the walk's white noise, per axis [N m/sqrt(s)]
+        density: of the walk's white noise, per axis; default: 1e-4 each, scaled to the mission [N m/sqrt(s)]
     """
 
     kind: Literal["random_walk"] = "random_walk"
-    density: ThreeNotNegative = (1e-4, 1e-4, 1e-4)
+    density: ThreeNotNegative | None = None
+    scaled: ClassVar[Mapping[str, Scaled]] = {"density": Scaled((1e-4, 1e-4, 1e-4), inertia=1, time=-2.5)}
     sampled_only: ClassVar[bool] = True
 
     def bounds(self, scenario: Any) -> Bounds:
@@ -210,40 +216,36 @@ class SumDisturbance(Kind, frozen=True):
         """The terms of the sum."""
         return {f"{name}.terms[{k}]": term for k, term in enumerate(self.terms)}
 
-    def filled(self, scenario: Any) -> Any:
-        """The sum, each term of it with its lists where they are absent."""
-        each = tuple(term.filled(scenario) for term in self.terms)
-        return msgspec.structs.replace(self, terms=each)
-
 
 class EachRandomWalk(RandomWalk, frozen=True):
     """A disturbance that wanders from zero, a new step each period; sampled loop only.
 
     Attributes:
-        density: of the walk's white noise, one number for each input; default: 1e-4 each [unit of d/sqrt(s)]
+        density: of the walk's white noise, one number for each input; default: 1e-4 each, scaled to the mission
+            [unit of d/sqrt(s)]
     """
 
     density: EachNotNegative | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
-    each: ClassVar[Mapping[str, float]] = {"density": 1e-4}
+    scaled: ClassVar[Mapping[str, Scaled]] = {"density": Scaled(1e-4, time=-0.5, order=-1, each=True)}
 
 
 class EachConstant(ConstantDisturbance, frozen=True):
     """A constant disturbance.
 
     Attributes:
-        amplitude: one number for each input; default: 0.01 each [unit of d]
+        amplitude: one number for each input; default: 0.01 each, scaled to the mission [unit of d]
     """
 
     amplitude: Each | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
-    each: ClassVar[Mapping[str, float]] = {"amplitude": 0.01}
+    scaled: ClassVar[Mapping[str, Scaled]] = {"amplitude": Scaled(0.01, order=-1, each=True)}
 
 
 class EachSinusoid(SinusoidDisturbance, frozen=True):
     """The disturbance bias + amplitude sin(frequency t + phase), input by input.
 
     Attributes:
-        amplitude: one number for each input; default: 0.01 each [unit of d]
-        frequency: one for each; default: 1 each [rad/s]
+        amplitude: one number for each input; default: 0.01 each, scaled to the mission [unit of d]
+        frequency: one for each; default: 1 each, scaled to the mission [rad/s]
         phase: one for each; default: 0 each [rad]
         bias: constant part, one for each; default: 0 each [unit of d]
     """
@@ -252,7 +254,12 @@ class EachSinusoid(SinusoidDisturbance, frozen=True):
     frequency: Each | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
     phase: Each | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
     bias: Each | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
-    each: ClassVar[Mapping[str, float]] = {"amplitude": 0.01, "frequency": 1.0, "phase": 0.0, "bias": 0.0}
+    scaled: ClassVar[Mapping[str, Scaled]] = {
+        "amplitude": Scaled(0.01, order=-1, each=True),
+        "frequency": Scaled(1.0, time=-1, each=True),
+        "phase": Scaled(0.0, each=True),
+        "bias": Scaled(0.0, each=True),
+    }
 
 
 class OwnDisturbance(Own, DisturbanceTable, kw_only=True, frozen=True):

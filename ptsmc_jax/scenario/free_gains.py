@@ -1,6 +1,7 @@
 """What tuning may move in a scenario: the default bounds of each gain, and how far they may be set."""
 
 import math
+from collections.abc import Container, Mapping
 
 import msgspec
 
@@ -8,6 +9,9 @@ from ptsmc_jax.scenario import errors, parsing, tables
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.gain_record import Choice, wide
 from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.simulation import catalogues
+
+FIRST = ("t_f", "p", "surface_rate")  # whose bounds those of other gains follow
 
 
 def resolve(scenario: Scenario, tune: tables.Tune) -> tables.Tune:
@@ -21,11 +25,11 @@ def resolve(scenario: Scenario, tune: tables.Tune) -> tables.Tune:
         first, rest = law.free(sampled=scenario.sampled)
         others = [name for name in scenario.gains if name not in (*law.gains, *scenario.observer.gains)]
         free = (*first, *scenario.observer.gains, *rest, *others)
-    level = 0.9 if tune.objective == "cvar" and tune.level is None else tune.level
+    level = 0.9 if tune.statistic in tables.LEVELS and tune.level is None else tune.level
     tune = msgspec.structs.replace(tune, free=free, level=level)
     _check(scenario, tune)
     bounds = dict(tune.bounds)
-    for key in sorted(free, key=lambda name: name not in ("t_f", "p")):  # those first that bounds of others go by
+    for key in sorted(free, key=lambda name: name not in FIRST):
         if key not in bounds:
             bounds[key] = _default(Choice(scenario, free, bounds), key)
     tune = msgspec.structs.replace(tune, bounds={key: bounds[key] for key in free})
@@ -64,17 +68,38 @@ def _check(scenario: Scenario, tune: tables.Tune) -> None:
         raise ScenarioError(f"{said} observer.t_o then follows t_f; allowed is t_f with observer.t_o given")
     if tune.per_axis and "observer_gain" not in free:
         raise ScenarioError(f"tune.per_axis is true, but tune.free is {errors.brief(free)}, without observer_gain")
-    if tune.level is not None and tune.objective != "cvar":
-        raise ScenarioError(f'tune.level is {tune.level}, but goes with tune.objective = "cvar" only')
-    if tune.objective == "t_f":
-        if "t_f" not in free:
-            raise ScenarioError(f'{said} tune.objective = "t_f" needs t_f to be free')
-        if not scenario.requirements:
-            raise ScenarioError('tune.objective is "t_f", but there is no requirement that a short t_f could break')
-        if tune.torque_weight:
-            raise wrong("tune.torque_weight", tune.torque_weight, 'absent where tune.objective is "t_f"')
+    _check_objective(scenario, tune, said)
     for name in tune.bounds:
         _check_bounds(Choice(scenario, free, tune.bounds), name)
+
+
+def _check_objective(scenario: Scenario, tune: tables.Tune, said: str) -> None:
+    """Raise ScenarioError if there is no such objective; said: the beginning of a sentence about tune.free."""
+    if tune.level is not None and tune.statistic not in tables.LEVELS:
+        raise ScenarioError(f'tune.level is {tune.level}, but goes with tune.statistic = "quantile" or "cvar" only')
+    shown = f"tune.minimise is {errors.show(tune.minimise)}"
+    if tune.minimise in (tables.T_F, tables.LIMITS):
+        if tune.minimise == tables.T_F and "t_f" not in tune.gains:
+            raise ScenarioError(f'{said} tune.minimise = "t_f" needs t_f to be free')
+        if not scenario.requirements:
+            raise ScenarioError(
+                f"{shown}, but there is no requirement; allowed is a metric, or [requirements] with one"
+            )
+        if tune.torque_weight:
+            raise wrong("tune.torque_weight", tune.torque_weight, f"absent with tune.minimise = {tune.minimise!r}")
+        if tune.statistic != "rms":
+            raise ScenarioError(f"{shown}, which has no statistic, but tune.statistic is {tune.statistic!r}")
+        return
+    known = [name for name in scenario.metrics if name not in catalogues.LARGER_IS_BETTER]
+    if tune.minimise not in known:
+        raise ScenarioError(
+            f'{shown}, but must be a metric, "t_f" or "limits"; {parsing.nearest(tune.minimise, known)}'
+        )
+    table = scenario.metrics[tune.minimise].table
+    if table is not None and getattr(scenario, table, None) is None:
+        raise ScenarioError(f"{shown}, which needs [{table}], but there is no [{table}] table")
+    if tune.minimise.startswith(catalogues.KNOWLEDGE) and not scenario.measured:
+        raise ScenarioError(f"{shown}, which needs noise in [hardware]: without it the law sees the true state")
 
 
 def _absent(scenario: Scenario, name: str) -> str:
@@ -169,6 +194,37 @@ def beyond(scenario: Scenario, name: str, side: str) -> float | None:
         value = low - 0.1 * (high - low) if side == "lower" else high + 0.1 * (high - low)
     value = max(value, 0.5 * (least + low)) if side == "lower" else min(value, 0.5 * (most + high))
     return None if value in (low, high) else float(f"{value:.4g}")  # on it: the least that there is
+
+
+def widened(
+    scenario: Scenario, sides: Mapping[str, str], defaulted: Container[tuple[str, ...]]
+) -> dict[str, tuple[float, float]]:
+    """Return bounds for gains that ended on a default one, by name.
+
+    Args:
+        scenario: with the bounds that were searched.
+        sides: on which each gain ended, "lower" or "upper", by its name.
+        defaulted: paths of the keys that the user's scenario leaves out.
+
+    An interval on a log scale grows tenfold on that side, another one by half of itself, as far as is allowed. Bounds
+    beyond which the loop is unstable, or the gain has no influence, stay.
+    """
+    tune, found = scenario.search, dict[str, tuple[float, float]]()
+    for name, side in sides.items():
+        low, high = tune.bounds[name]
+        by_default = ("tune", "bounds", name) in defaulted
+        if not by_default or border(scenario, name, side, low if side == "lower" else high) is not None:
+            continue
+        least, most, _ = scenario.gains[name].allowed(Choice(scenario, tune.gains, tune.bounds))
+        if name == "delta":  # whose samples are planned for
+            most = high
+        if side == "lower":
+            low = max(low / 10.0 if wide(low, high) else low - 0.5 * (high - low), 0.5 * (least + low))
+        else:
+            high = min(10.0 * high if wide(low, high) else high + 0.5 * (high - low), 0.5 * (most + high))
+        if (low, high) != tune.bounds[name]:
+            found[name] = low, high
+    return found
 
 
 def usual(scenario: Scenario, name: str) -> tuple[float, float]:

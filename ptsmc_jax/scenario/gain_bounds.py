@@ -4,25 +4,16 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from ptsmc_jax.scenario import scales
+from ptsmc_jax.scenario import mission, scales
 from ptsmc_jax.scenario.gain_record import Allowed, Choice, GainBounds, Interval
 from ptsmc_jax.scenario.values import MOST_STEPS
 
-
-def rounded(bound: float) -> float:
-    """A bound in four digits."""
-    return float(f"{bound:.4g}")
+SLOWEST_DECAY = 3.5  # t_f times the least K1
 
 
 def hand_over(scenario: Any) -> float:
     """How long before t_f the law hands over [s]; a period for a law that does not."""
     return getattr(scenario.controller, "delta", None) or scenario.loop.period
-
-
-def size(scenario: Any) -> float:
-    """A body's mean moment of inertia, as a share of the paper's 12 kg m^2; 1 without a body."""
-    mean, _ = scenario.moments
-    return 1.0 if mean is None else mean / 12.0
 
 
 def _converged(scenario: Any) -> float:
@@ -43,27 +34,32 @@ def _allowed_t_f(choice: Choice) -> Allowed:
 
 
 def _usual_delta(choice: Choice) -> Interval:
+    """A period to a quarter of t_f, or to twice the design's delta if that is longer."""
     t_f = choice.smallest("t_f")  # below every one
-    lower = choice.shortest_delta or min(0.05, t_f / 4)
-    return lower, min(max(5.0, t_f / 8, 4 * lower), (lower + t_f) / 2)
+    lower = choice.shortest_delta or t_f / 600.0
+    upper = max(t_f / 4.0, 4.0 * lower)
+    if choice.sampled:
+        upper = max(upper, 2.0 * mission.design(choice.scenario).delta)
+    return lower, min(upper, (lower + t_f) / 2.0)
 
 
 def _usual_width(choice: Choice) -> Interval:
-    low, high = scales.widths(choice.scenario) if choice.sampled else scales.QUIET
-    return rounded(low), rounded(high)
+    return scales.widths(choice.scenario) if choice.sampled else scales.quiet(choice.scenario)
 
 
 def _usual_k1(choice: Choice) -> Interval:
-    least = 3.5 / choice.t_f
-    border = scales.largest_k1(choice.scenario) if choice.sampled else 0.0
-    return least, rounded(border) if border > least else 350.0 / choice.t_f
+    """From a decay that takes t_f to the stability limit; if c is free, to the limit for the smallest c."""
+    least = SLOWEST_DECAY / choice.t_f
+    surface = choice.smallest("surface_rate") if "surface_rate" in choice.free else choice.law.surface_rate
+    limit = scales.largest_k1(choice.scenario, surface) if choice.sampled else 0.0
+    return least, limit if limit > least else 100.0 * least
 
 
 def _usual_rate(choice: Choice) -> Interval:
-    """Two decades; sampled, the frozen loop is stable for (c + K1/2) h < 2: to half of that."""
-    high = 700.0 / choice.t_f
-    high = min(high, 1.0 / choice.scenario.loop.period) if choice.sampled else high
-    return 0.01 * high, high
+    """From a decay that takes t_f to half of the stability limit of the sampled loop."""
+    least = SLOWEST_DECAY / (2.0 * choice.t_f)
+    high = scales.largest_rate(choice.scenario) if choice.sampled else 0.0
+    return least, high if high > least else 200.0 * least
 
 
 T_F = GainBounds(_usual_t_f, _allowed_t_f)
@@ -92,7 +88,8 @@ def eta(order: Callable[[Any], float]) -> GainBounds:
 
 
 def dead_beat(choice: Choice) -> Interval:
-    """An observer's gain, up to that of a dead-beat one."""
-    share = size(choice.scenario)
-    high = rounded(scales.dead_beat_gain(choice.scenario)) if choice.sampled else 300.0 * share
-    return 0.5 * share, high
+    """An observer's gain: from l / J = 1.5 / t_f up to that of a deadbeat one."""
+    mean, _ = choice.scenario.moments
+    least = 1.5 / choice.t_f * (1.0 if mean is None else mean)
+    high = scales.dead_beat_gain(choice.scenario) if choice.sampled else 0.0
+    return least, high if high > least else 600.0 * least

@@ -1,12 +1,13 @@
 """What every law of a scenario file is: a table of keys, the gains among them, and what they are made into."""
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import msgspec
 
-from ptsmc_jax.scenario import disturbance_bounds, gain_bounds
+from ptsmc_jax.scenario import disturbance_bounds, gain_bounds, mission
 from ptsmc_jax.scenario.gain_record import GainBounds
 from ptsmc_jax.scenario.values import Kind
 
@@ -32,12 +33,34 @@ class LawTable(Kind, frozen=True):
         return self.free_by_default, self.free_if_sampled if sampled else ()
 
     def filled(self, scenario: Any) -> Any:
-        """With the bounds of Assumption 1 where they are absent and what the disturbance reaches is known."""
+        """Fill absent bounds of Assumption 1 from the disturbance, then absent gains by `designed`."""
         found = disturbance_bounds.of(scenario)
-        if found is None:
-            return self
-        follows = dict(zip(("disturbance_bound", "disturbance_rate_bound"), found, strict=True))
+        if found is not None:
+            self = self._with(dict(zip(("disturbance_bound", "disturbance_rate_bound"), found, strict=True)))
+        made = self._with(self.designed(msgspec.structs.replace(scenario, controller=self)))
+        made = mission.with_defaults(made, mission.scales(scenario))
+        delta, by_default = getattr(made, "delta", None), getattr(self, "delta", 0.0) is None
+        if scenario.sampled and by_default and delta is not None:
+            made = msgspec.structs.replace(made, delta=max(delta, scenario.loop.period))
+        return made
+
+    def _with(self, follows: Mapping[str, Any]) -> Any:
+        """Return the table with these values for its absent keys."""
         return msgspec.structs.replace(self, **{k: v for k, v in follows.items() if getattr(self, k) is None})
+
+    def designed(self, scenario: Any) -> dict[str, float]:
+        """Return the gains that the mission suggests; none if those of the paper's case stay, scaled or not."""
+        if not scenario.sampled or mission.published(scenario):
+            return {}
+        return self.gains_of(mission.design(scenario), scenario)
+
+    def gains_of(self, design: mission.Design, scenario: Any) -> dict[str, float]:
+        """Return this law's gains for a design of the sampled loop, by key."""
+        return {}
+
+    def noise_of_s(self, position: float, velocity: float, t_f: float) -> float:
+        """Return the noise of the sliding variable (1 sigma) for noise of the error and of its rate [1/s]."""
+        return math.hypot(velocity, (getattr(self, "surface_rate", None) or 1.0 / t_f) * position)
 
     def turning(self, t_f: float) -> tuple[str, float]:
         """How fast it turns the body [rad/s], at most, and the key that says so."""

@@ -7,7 +7,6 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
-import msgspec
 from msgspec import Meta
 
 from ptsmc_jax import formulas
@@ -16,8 +15,9 @@ from ptsmc_jax.scenario.baseline_tables import BASELINES
 from ptsmc_jax.scenario.errors import wrong
 from ptsmc_jax.scenario.gain_record import GainBounds
 from ptsmc_jax.scenario.law_record import LawTable
+from ptsmc_jax.scenario.mission import Design
 from ptsmc_jax.scenario.own_laws import OwnAttitudeLaw, OwnLaw
-from ptsmc_jax.scenario.values import NotNegative, Positive
+from ptsmc_jax.scenario.values import NotNegative, Positive, Scaled
 
 Eta = Annotated[float, Meta(gt=2, description="a number greater than 2 (Theorem 2)")]
 
@@ -39,7 +39,14 @@ class PrescribedTable(LawTable, frozen=True):
         "t_f": gain_bounds.T_F,
     }
     free_by_default: ClassVar[tuple[str, ...]] = ("eta", "delta")
-    free_if_sampled: ClassVar[tuple[str, ...]] = ("k1", "sign_width")
+    free_if_sampled: ClassVar[tuple[str, ...]] = ("k1", "sign_width", "surface_rate")
+    scaled: ClassVar[Mapping[str, Scaled]] = {
+        "eta": Scaled(3.0),
+        "delta": Scaled(0.05, time=1),
+        "k1": Scaled(1.0, time=-1),
+        "sign_width": Scaled(1e-3, time=-1),
+        "surface_rate": Scaled(1.0, time=-1),
+    }
 
     @property
     def implicit(self) -> bool:
@@ -56,11 +63,15 @@ class PrescribedTable(LawTable, frozen=True):
         if self.implicit:
             scenario.need_samples('controller.sampling = "implicit"')
 
-    def filled(self, scenario: Any) -> Any:
-        """With a hand-over that is one, too."""
-        made = super().filled(scenario)
-        shortest = max(0.05, scenario.loop.period) if scenario.sampled else 0.05
-        return msgspec.structs.replace(made, delta=shortest) if made.delta is None else made
+    def gains_of(self, design: Design, scenario: Any) -> dict[str, float]:
+        """Return both hold poles at the design's, with `reaching` the factor of K1 in (60)."""
+        return {
+            "eta": design.eta,
+            "delta": design.delta,
+            "k1": scenario.reaching * design.pole,
+            "sign_width": design.width,
+            "surface_rate": design.pole,
+        }
 
     def build(self, scenario: Any, model: Any) -> Any:
         """The law of a plant's model."""
@@ -77,10 +88,10 @@ class SpacecraftController(PrescribedTable, frozen=True):
     Attributes:
         error: the paper's q_1 - q_1f, or the vector part of q_f* q, singular 180 degrees from the reference only
         t_f: the prescribed time [s]
-        eta: power of the approach: the error falls like (t_f - t)^eta, up to a logarithm
-        delta: hand-over to constant gains so long before t_f (Remark 1); default: 0.05, or a period if longer [s]
-        k1: K1, rate of s from the hand-over on, halved by (60) [1/s]
-        sign_width: of the smooth sign tanh(s / sign_width); 0 is the exact sign
+        eta: power of the approach: the error falls like (t_f - t)^eta, up to a logarithm; 3 in the paper
+        delta: hand-over to constant gains so long before t_f (Remark 1); 0.05 in the paper [s]
+        k1: K1, rate of s from the hand-over on, halved by (60); 1 in the paper [1/s]
+        sign_width: thickness of the boundary layer, tanh(s / sign_width); 0 is the discontinuous sign [1/s]
         surface_rate: c of s = eps' + c eps, the error's rate on the surface from the hand-over on; 1 in the paper [1/s]
         sampling: held input by s at the sample, or by where s is to land at the period's end, which needs no sign_width
         disturbance_rate_bound: c of Assumption 1, on each component of d'; default: by [disturbance] as drawn [N m/s]
@@ -91,11 +102,11 @@ class SpacecraftController(PrescribedTable, frozen=True):
     kind: Literal["prescribed_time"] = "prescribed_time"
     error: Literal["additive", "multiplicative"] = "additive"
     t_f: Positive = 30.0
-    eta: Eta = 3.0
+    eta: Eta | None = None
     delta: Positive | None = None
-    k1: Positive = 1.0
-    sign_width: NotNegative = 1e-3
-    surface_rate: Positive = 1.0
+    k1: Positive | None = None
+    sign_width: NotNegative | None = None
+    surface_rate: Positive | None = None
     sampling: Literal["explicit", "implicit"] = "explicit"
     disturbance_rate_bound: NotNegative | None = None
     disturbance_bound: NotNegative | None = None
@@ -113,10 +124,10 @@ class SystemController(PrescribedTable, frozen=True):
 
     Attributes:
         t_f: the prescribed time [s]
-        eta: power of the approach: the error falls like (t_f - t)^eta, up to a logarithm
-        delta: hand-over to constant gains so long before t_f (Remark 1); default: 0.05, or a period if longer [s]
-        k1: K1, rate of s from the hand-over on [1/s]
-        sign_width: of the smooth sign tanh(s / sign_width); 0 is the exact sign [unit of s]
+        eta: power of the approach: the error falls like (t_f - t)^eta, up to a logarithm; 3 in the paper
+        delta: hand-over to constant gains so long before t_f (Remark 1); 0.05 in the paper [s]
+        k1: K1, rate of s from the hand-over on; 1 in the paper [1/s]
+        sign_width: thickness of the boundary layer, tanh(s / sign_width); 0 is the discontinuous sign [unit of s]
         surface_rate: c of s = eps' + c eps, the error's rate on the surface from the hand-over on; 1 in the paper [1/s]
         sampling: held input by s at the sample, or by where s is to land at the period's end, which needs no sign_width
         disturbance_rate_bound: c of Assumption 1, on each component of d'; default: by [disturbance] [unit of d/s]
@@ -126,11 +137,11 @@ class SystemController(PrescribedTable, frozen=True):
 
     kind: Literal["prescribed_time"] = "prescribed_time"
     t_f: Positive = 5.0
-    eta: Eta = 3.0
+    eta: Eta | None = None
     delta: Positive | None = None
-    k1: Positive = 1.0
-    sign_width: NotNegative = 1e-3
-    surface_rate: Positive = 1.0
+    k1: Positive | None = None
+    sign_width: NotNegative | None = None
+    surface_rate: Positive | None = None
     sampling: Literal["explicit", "implicit"] = "explicit"
     disturbance_rate_bound: NotNegative | None = None
     disturbance_bound: NotNegative | None = None
@@ -152,10 +163,14 @@ class ChainController(SystemController, frozen=True):
         surface_rate: the poles of (39) are this times those of a; 1 in the paper [1/s]
     """
 
-    eta: Annotated[float, Meta(gt=0, description="a number greater than the order (Theorems 1 and 3)")] = 3.0
+    eta: Annotated[float, Meta(gt=0, description="a number greater than the order (Theorems 1 and 3)")] | None = None
     a: Annotated[tuple[float, ...], Meta(min_length=1, description="a list of numbers, a_1 to a_(order-1) of (39)")] = (
         1.0,
     )
+    scaled: ClassVar[Mapping[str, Scaled]] = {
+        **PrescribedTable.scaled,
+        "sign_width": Scaled(1e-3, time=1, order=-1),
+    }
     gains: ClassVar[Mapping[str, GainBounds]] = {
         **PrescribedTable.gains,
         "eta": gain_bounds.eta(lambda scenario: float(scenario.order)),  # Theorem 3

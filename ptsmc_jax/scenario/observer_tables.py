@@ -10,12 +10,14 @@ from typing import Annotated, Any, ClassVar, Literal
 import msgspec
 from msgspec import Meta
 
-from ptsmc_jax.scenario import disturbance_bounds
+from ptsmc_jax.scenario import disturbance_bounds, mission
 from ptsmc_jax.scenario.errors import wrong
-from ptsmc_jax.scenario.gain_bounds import dead_beat, size
+from ptsmc_jax.scenario.gain_bounds import dead_beat
 from ptsmc_jax.scenario.gain_record import Allowed, Choice, GainBounds
 from ptsmc_jax.scenario.own import Code, Own, build
-from ptsmc_jax.scenario.values import EachPositive, Kind, Kinds, NotNegative, Positive, ThreePositive
+from ptsmc_jax.scenario.values import EachPositive, Kind, Kinds, NotNegative, Positive, Scaled, ThreePositive
+
+SHORTEST = Scaled(0.05, time=1)  # delta_o of the prescribed-time observer [s]
 
 
 class ObserverTable(Kind, frozen=True):
@@ -55,24 +57,28 @@ class NoObserver(ObserverTable, frozen=True):
 class LinearTable(ObserverTable, frozen=True):
     """An observer with the key `gain`, that of l(w) in (53), or its constant part."""
 
-    each: ClassVar[Mapping[str, float]] = {"gain": 1.0}
+    lists: ClassVar[tuple[str, ...]] = ("gain",)
     gains: ClassVar[Mapping[str, GainBounds]] = {
         "observer_gain": GainBounds(
             dead_beat, above="a dead-beat observer: nothing of its error is left after a period"
         )
     }
 
-    def scale_of_each(self, scenario: Any) -> float:
-        """The default gain: in proportion to the body's inertia, and limited by the period."""
-        return disturbance_bounds.observer_gain(scenario)
+    def filled(self, scenario: Any) -> Any:
+        """Fill an absent gain, the same on each axis: as in the paper's case, or designed for the sampled loop."""
+        if self.gain is not None:  # pyright: ignore[reportAttributeAccessIssue]
+            return self
+        gain = disturbance_bounds.observer_gain(scenario)
+        if scenario.sampled and not mission.published(scenario):
+            gain = mission.design(scenario).observer * (scenario.moments[0] or 1.0)
+        return msgspec.structs.replace(self, gain=(gain,) * scenario.inputs)
 
 
 class NonlinearObserver(LinearTable, frozen=True):
     """The paper's nonlinear disturbance observer (53), its estimate zero at t = 0.
 
     Attributes:
-        gain: diagonal of l(w); default: 10 times the mean moment over the paper's 12 kg m^2, to one digit, and at most
-            12 times that share over a period [N m s]
+        gain: diagonal of l(w); 10 in the paper; default: as fast as the hold phase if sampled [N m s]
     """
 
     kind: Literal["nonlinear"] = "nonlinear"
@@ -89,7 +95,7 @@ class EachNonlinearObserver(NonlinearObserver, frozen=True):
     """The paper's nonlinear disturbance observer (53), its estimate zero at t = 0.
 
     Attributes:
-        gain: one number for each input; default: 10 each, at most 1 over a period [1/s]
+        gain: one number for each input; default: 10 each, or as fast as the hold phase if sampled [1/s]
     """
 
     gain: EachPositive | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -101,7 +107,7 @@ class PrescribedTimeObserver(LinearTable, frozen=True):
     Attributes:
         mu: the error at t = 0 falls like (t_o - t)^mu; what a moving disturbance adds, like c (t_o - t)/(mu - 1)
         t_o: time by which it has converged; default: a third of t_f [s]
-        delta_o: mu/(t_o - t) is off from so long before t_o; default: 0.05, or a period, at most t_o/4 [s]
+        delta_o: mu/(t_o - t) is off from so long before t_o; default: t_f / 600, or a period, at most t_o/4 [s]
         gain: diagonal of the constant part of l; default: that of the nonlinear one [N m s]
     """
 
@@ -112,9 +118,9 @@ class PrescribedTimeObserver(LinearTable, frozen=True):
     gain: ThreePositive | None = None
 
     def times(self, scenario: Any) -> tuple[float, float]:
-        """T_o and delta_o [s]; a third of t_f, and 0.05 s or a period, if not given."""
+        """T_o and delta_o [s]; a third of t_f, and the paper's 0.05 s scaled or a period, if not given."""
         t_o = scenario.controller.t_f / 3 if self.t_o is None else self.t_o
-        shortest = max(0.05, scenario.loop.period if scenario.sampled else 0.0)
+        shortest = max(mission.scales(scenario).of(SHORTEST), scenario.loop.period if scenario.sampled else 0.0)
         return t_o, min(shortest, t_o / 4) if self.delta_o is None else self.delta_o
 
     def written(self, scenario: Any) -> Any:
@@ -143,7 +149,7 @@ class EachPrescribedTimeObserver(PrescribedTimeObserver, frozen=True):
     """An observer that has converged by t_o, the nonlinear one from then on.
 
     Attributes:
-        gain: constant part, one number for each input; default: 10 each, at most 1 over a period [1/s]
+        gain: constant part, one number for each input; default: that of the nonlinear one [1/s]
     """
 
     gain: EachPositive | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -170,14 +176,18 @@ class FiniteTimeObserver(ObserverTable, frozen=True):
 
     kind: Literal["finite_time"] = "finite_time"
     gain: ThreePositive | None = None
-    sign_width: NotNegative = 1e-5
+    sign_width: NotNegative | None = None
     gains: ClassVar[Mapping[str, GainBounds]] = {"observer_gain": GainBounds(_usual_bound, _allowed_bound)}
+    lists: ClassVar[tuple[str, ...]] = ("gain",)
+    scaled: ClassVar[Mapping[str, Scaled]] = {"sign_width": Scaled(1e-5, inertia=1, time=1, order=-1)}
 
-    each: ClassVar[Mapping[str, float]] = {"gain": 20.0}
-
-    def scale_of_each(self, scenario: Any) -> float:
-        """The bound on the disturbance's rate."""
-        return scenario.controller.disturbance_rate_bound or 1e-3 * size(scenario)
+    def filled(self, scenario: Any) -> Any:
+        """Fill an absent gain from the bound on the disturbance's rate."""
+        if self.gain is not None:
+            return self
+        rate = scenario.controller.disturbance_rate_bound
+        rate = rate or mission.scales(scenario).of(Scaled(1e-3, inertia=1, time=-1, order=-1))
+        return msgspec.structs.replace(self, gain=(20.0 * rate,) * scenario.inputs)
 
     def check(self, scenario: Any) -> None:
         """Its gain is a bound on the disturbance's rate."""

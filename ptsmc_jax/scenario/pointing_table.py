@@ -1,15 +1,16 @@
 """The table of a scenario file that says what pointing is observed."""
 
 import math
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import numpy as np
 
 from ptsmc_jax.scenario.errors import wrong
-from ptsmc_jax.scenario.values import NotNegative, Positive, Table, Three
+from ptsmc_jax.scenario.values import NotNegative, Positive, Scaled, Table, Three
 from ptsmc_jax.simulation import catalogues
 
-LONGEST_STEP = 0.1  # of the continuous loop after the hand-over [s], see `clock`
+LONGEST_STEP = 0.02  # of the continuous loop after the hand-over, over t_f, see `clock`
 
 
 class Pointing(Table, frozen=True):
@@ -17,13 +18,14 @@ class Pointing(Table, frozen=True):
 
     Attributes:
         boresight: direction of an instrument in body axes, of any length; its half-cones are given beside the axes
-        window: time over which means are taken (MPE, RPE, PDE), one window after the other [s]
+        window: time over which means are taken (MPE, RPE, PDE), one window after the other; default: t_f / 30 [s]
         after: from t_f to when the observation begins [s]
     """
 
     boresight: Three = (0.0, 0.0, 1.0)
-    window: Positive = 1.0
+    window: Positive | None = None
     after: NotNegative = 0.0
+    scaled: ClassVar[Mapping[str, Scaled]] = {"window": Scaled(1.0, time=1)}
 
     def check(self, scenario: Any) -> None:
         """Raise ScenarioError where no direction is given, or not two windows fit into the observation."""
@@ -36,7 +38,8 @@ class Pointing(Table, frozen=True):
             latest = f"at most {left - 2.0 * self.window:.6g}, two windows of {self.window:g} s before loop.t_end"
             raise wrong("pointing.after", self.after, latest)
         sampled = scenario.sampled
-        least, what = (scenario.loop.period, "loop.period") if sampled else (LONGEST_STEP, "the longest step")
+        longest = LONGEST_STEP * scenario.controller.t_f
+        least, what = (scenario.loop.period, "loop.period") if sampled else (longest, "the longest step")
         jitter = getattr(scenario.dispersion, "timing_jitter", None)
         if sampled and jitter is not None:  # in which a period may end late that began early
             least, what = least * (1.0 + 2.0 * jitter.largest), "the longest control period with its jitter"

@@ -6,10 +6,11 @@ from typing import Any
 
 import msgspec
 
-from ptsmc_jax.scenario import checks, free_gains, layouts, own, parsing
+from ptsmc_jax.scenario import checks, free_gains, layouts, mission, own, parsing
 from ptsmc_jax.scenario.tables import Scenario, check_scenario
+from ptsmc_jax.scenario.values import Scaled, Table
 
-USUAL_WINDOW = 1.0  # [s]
+AFTER = Scaled(10.0, time=1)  # from t_f to the end of a run [s]
 
 
 def read(path: str | Path) -> Scenario:
@@ -47,15 +48,24 @@ def resolve(scenario: Scenario) -> Scenario:
     Raises ScenarioError where the body is none, from whose inertia some follow.
     """
     scenario.check_body()
-    loop, t_f = scenario.loop, scenario.controller.t_f
-    window = loop.window
-    if window is None:
-        window = max(USUAL_WINDOW, loop.period) if scenario.sampled else USUAL_WINDOW
-    t_end = t_f + max(10.0, window) if loop.t_end is None else loop.t_end
-    loop = msgspec.structs.replace(loop, window=window, t_end=t_end)
-    scenario = msgspec.structs.replace(scenario, disturbance=scenario.disturbance.filled(scenario), loop=loop)
-    scenario = msgspec.structs.replace(scenario, controller=scenario.controller.filled(scenario))
-    return msgspec.structs.replace(scenario, observer=scenario.observer.filled(scenario)).resolved()
+    units, law = mission.scales(scenario), scenario.controller
+    filled = {
+        name: mission.with_defaults(getattr(scenario, name), units)
+        for name in scenario.__struct_fields__
+        if isinstance(getattr(scenario, name), Table) and name not in ("controller", "observer", "tune")
+    }
+    loop = filled["loop"]
+    if scenario.loop.window is None and scenario.sampled:
+        loop = msgspec.structs.replace(loop, window=max(loop.window, loop.period))
+    if loop.t_end is None:
+        loop = msgspec.structs.replace(loop, t_end=law.t_f + max(units.of(AFTER), loop.window))
+    scenario = msgspec.structs.replace(scenario, **{**filled, "loop": loop})
+    if loop.settling_angle is None:
+        loop = msgspec.structs.replace(loop, settling_angle=scenario.usual_settling())
+        scenario = msgspec.structs.replace(scenario, loop=loop)
+    scenario = msgspec.structs.replace(scenario, controller=law.filled(scenario))
+    observer = mission.with_defaults(scenario.observer.filled(scenario), units)
+    return msgspec.structs.replace(scenario, observer=observer).resolved()
 
 
 def complete(scenario: Scenario) -> Scenario:

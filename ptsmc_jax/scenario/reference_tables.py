@@ -3,6 +3,7 @@
 A reference is its physics in `signals.references`, a table here, and a row in `REFERENCES`.
 """
 
+from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -10,7 +11,7 @@ import numpy as np
 from ptsmc_jax.scenario import attitude_keys
 from ptsmc_jax.scenario.attitude_keys import Attitude
 from ptsmc_jax.scenario.own import Code, Own, build, fastest
-from ptsmc_jax.scenario.values import Four, Kinds, Positive, Three
+from ptsmc_jax.scenario.values import Four, Kinds, Positive, Scaled, Three
 
 
 class Initial(Attitude, frozen=True):
@@ -83,13 +84,14 @@ class SinusoidReference(ReferenceTable, frozen=True):
 
     Attributes:
         amplitude: of the rotation vector, per axis [rad]
-        frequency: per axis [rad/s]
+        frequency: per axis; default: 0.1 each, scaled to the mission [rad/s]
         phase: per axis [rad]
     """
 
     kind: Literal["sinusoid"] = "sinusoid"
     amplitude: Three = (0.1, 0.1, 0.1)
-    frequency: Three = (0.1, 0.1, 0.1)
+    frequency: Three | None = None
+    scaled: ClassVar[Mapping[str, Scaled]] = {"frequency": Scaled((0.1, 0.1, 0.1), time=-1)}
     phase: Three = (0.0, 0.0, 0.0)
 
     def frequencies(self) -> dict[str, float]:
@@ -110,13 +112,14 @@ class SlewReference(ReferenceTable, frozen=True):
 
     Attributes:
         to_quat_xyzw: the attitude at the end, unit quaternion, scalar last
-        duration: how long it takes [s]
+        duration: how long it takes; default: 30, scaled to the mission [s]
         way: the short way, or the long way round
     """
 
     kind: Literal["slew"] = "slew"
     to_quat_xyzw: Four = (0.0, 0.0, 0.0, 1.0)
-    duration: Positive = 30.0
+    duration: Positive | None = None
+    scaled: ClassVar[Mapping[str, Scaled]] = {"duration": Scaled(30.0, time=1)}
     way: Literal["short", "long"] = "short"
 
     def turn(self) -> np.ndarray:

@@ -8,12 +8,14 @@ coordinates; their ends are here.
 import math
 from typing import Any
 
+from ptsmc_jax.scenario import mission
+from ptsmc_jax.scenario.values import Scaled
 from ptsmc_jax.theory import borders
 
 LEFT = 5e-5  # share of the observer's error that a dead-beat one leaves after a period
 SHARE = 0.05  # of the slope toward s = 0: what changes less does not matter
 WIDEST = 1e4  # times the noise of s: hardly a switching term any more
-QUIET = (1e-5, 1e-1)  # widths of the smooth sign without noise, in the units of s
+QUIET = (1e-2, 1e2)  # widths without noise, over the default one of the paper's case, scaled
 
 
 def dead_beat_gain(scenario: Any) -> float:
@@ -26,7 +28,7 @@ def dead_beat_gain(scenario: Any) -> float:
     return math.log(1.0 / LEFT) * (1.0 if largest is None else largest) / scenario.loop.period
 
 
-def largest_k1(scenario: Any) -> float:
+def largest_k1(scenario: Any, surface_rate: float) -> float:
     """The largest K1 [1/s] with which the sampled loop is stable after the hand-over, by delay and `surface_rate`.
 
     `borders.largest_reaching` is K1 h / 2 for a spacecraft (60), K1 h for laws with the K1 of (10) and (29); without
@@ -37,7 +39,7 @@ def largest_k1(scenario: Any) -> float:
     h = scenario.loop.period
     delay = float(scenario.devices.delay_periods)
     implicit = scenario.controller.implicit
-    border = borders.largest_reaching(scenario.controller.surface_rate * h, delay, implicit=implicit)
+    border = borders.largest_reaching(surface_rate * h, delay, implicit=implicit)
     reaching = min(border, math.log(1.0 / LEFT)) / h
     return scenario.reaching * reaching
 
@@ -51,7 +53,20 @@ def narrowest_that_matters(noise: float) -> float:
     return math.sqrt(24.0 * SHARE) / math.pi * noise
 
 
+def largest_rate(scenario: Any) -> float:
+    """Return half of the largest surface rate c [1/s] for which some K1 leaves the sampled hold phase stable."""
+    h, delay = scenario.loop.period, scenario.devices.delay_periods
+    limit = borders.largest_surface(delay, implicit=scenario.controller.implicit)
+    return 0.5 * min(limit, math.log(1.0 / LEFT)) / h
+
+
+def quiet(scenario: Any) -> tuple[float, float]:
+    """Return widths of the boundary layer to search without noise, in the units of s."""
+    width = mission.scales(scenario).of(type(scenario.controller).scaled.get("sign_width", Scaled(1e-3)))
+    return QUIET[0] * width, QUIET[1] * width
+
+
 def widths(scenario: Any) -> tuple[float, float]:
     """Between which the width of the smooth sign matters, in the units of s: by the noise of s, if there is any."""
     noise = scenario.devices.noise_of_s(scenario)
-    return (narrowest_that_matters(noise), WIDEST * noise) if noise > 0.0 else QUIET
+    return (narrowest_that_matters(noise), WIDEST * noise) if noise > 0.0 else quiet(scenario)

@@ -9,7 +9,7 @@ import numpy as np
 from msgspec import Meta
 
 from ptsmc_jax import formulas
-from ptsmc_jax.scenario import attitude_keys, dispersion_tables, errors
+from ptsmc_jax.scenario import attitude_keys, dispersion_tables, errors, tables
 from ptsmc_jax.scenario.device_tables import FILTERS, WHEELS, FilterTable, Hardware, NoFilter, WheelLimits
 from ptsmc_jax.scenario.disturbance_tables import DISTURBANCES
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
@@ -19,7 +19,7 @@ from ptsmc_jax.scenario.own_devices import SENSORS
 from ptsmc_jax.scenario.pointing_table import Pointing
 from ptsmc_jax.scenario.reference_tables import REFERENCES, Initial
 from ptsmc_jax.scenario.tables import Loop, Scenario, Tune
-from ptsmc_jax.scenario.values import Inertia, Kinds, NotNegative, Positive, Table, Three
+from ptsmc_jax.scenario.values import Inertia, Kinds, NotNegative, Positive, Scaled, Table, Three
 from ptsmc_jax.simulation.catalogues import CATALOGUE
 
 # of a law to compare with, at most so many steps of 0.025 rad in two periods: a run that turns faster is marked
@@ -57,20 +57,28 @@ class Flexible(Table, frozen=True):
     inertia of the whole body and D the rows of `coupling`.
 
     Attributes:
-        frequency: W of each mode, the body held [rad/s]
+        frequency: W of each mode, the body held; default: 6, scaled to the mission [rad/s]
         damping: damping ratio z of each mode
-        coupling: D, a row for each mode: how much it turns the body about each axis [sqrt(kg) m]
+        coupling: D, a row for each mode: how much it turns the body about each axis; default: 0.8 about x, scaled to
+            the mission [sqrt(kg) m]
     """
 
-    frequency: Annotated[
-        tuple[Positive, ...], Meta(min_length=1, description="a list of numbers greater than 0, one for each mode")
-    ] = (6.0,)
+    frequency: (
+        Annotated[
+            tuple[Positive, ...], Meta(min_length=1, description="a list of numbers greater than 0, one for each mode")
+        ]
+        | None
+    ) = None
     damping: Annotated[
         tuple[NotNegative, ...], Meta(min_length=1, description="a list of numbers of at least 0, one for each mode")
     ] = (0.005,)
-    coupling: Annotated[tuple[Three, ...], Meta(min_length=1, description="a list of rows of three numbers")] = (
-        (0.8, 0.0, 0.0),
+    coupling: Annotated[tuple[Three, ...], Meta(min_length=1, description="a list of rows of three numbers")] | None = (
+        None
     )
+    scaled: ClassVar[Mapping[str, Scaled]] = {
+        "frequency": Scaled((6.0,), time=-1),
+        "coupling": Scaled(((0.8, 0.0, 0.0),), inertia=0.5),
+    }
 
     def check(self, inertia: Any) -> None:
         """Refuse lists of other lengths, and modes that no body can have; inertia: of the body that flies [kg m^2]."""
@@ -174,6 +182,57 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
         if values.ndim == 1:
             return float(np.mean(values)), float(values.max())
         return float(np.mean(np.diag(values))), float(np.linalg.eigvalsh(values).max())
+
+    @property
+    def influence(self) -> float:
+        """Acceleration of the error for a unit torque about the mean axis, 1 / (2 J) [1/(kg m^2)]."""
+        return 0.5 / self.moments[0]
+
+    def modes(self) -> list[tuple[float, float, float]]:
+        """Return the frequency [rad/s], damping and fraction of the inertia of each mode of the free body."""
+        if self.flexible is None:
+            return []
+        table, rows = self.flexible, np.asarray(self.flexible.coupling)
+        inertia = formulas.check_inertia(self.true_inertia)
+        fractions = [float(row @ np.linalg.solve(inertia, row)) for row in rows]
+        return [
+            (frequency / math.sqrt(1.0 - fraction), damping, fraction / (1.0 - fraction))
+            for frequency, damping, fraction in zip(table.frequency or (), table.damping, fractions, strict=True)
+        ]
+
+    def largest_acceleration(self) -> float | None:
+        """Return the acceleration of the error that the weakest axis allows [1/s^2], None without a torque limit."""
+        inertia, found = formulas.check_inertia(self.spacecraft.inertia), []
+        limits = [self.devices.torque_limit, tables.limit_of(self, "peak_torque")]
+        found += [limit / np.diag(inertia).max() for limit in limits if limit is not None]
+        if self.wheels is not None:
+            spread = np.linalg.pinv(formulas.wheel_axes(self.wheels.spin_axes()).T)
+            asked = np.abs(spread @ inertia).max()  # torque of one wheel for a unit acceleration about one axis
+            limits = [self.wheels.torque_limit, tables.limit_of(self, "peak_wheel_torque")]
+            found += [limit / asked for limit in limits if limit is not None]
+        return 0.5 * float(min(found)) if found else None
+
+    def start_angle(self) -> float:
+        """Return the largest angle to the reference at t = 0 [rad]: of the nominal run, or of dispersed ones."""
+        from scipy.spatial.transform import Rotation
+
+        start, target = (
+            Rotation.from_quat(attitude_keys.quaternion(table, name))
+            for table, name in ((self.initial, "initial"), (self.reference, "reference"))
+        )
+        angle = float((target.inv() * start).magnitude())
+        for table in (getattr(self.dispersion, "attitude", None), getattr(self.dispersion, "reference", None)):
+            angle = angle if table is None else table.farthest(angle)
+        return angle
+
+    def start_tangent(self) -> float:
+        """Return tan(angle / 2) at the start, at most that of 160 degrees."""
+        return math.tan(0.5 * min(self.start_angle(), math.radians(160.0)))
+
+    def usual_settling(self) -> float:
+        """Return the default of `loop.settling_angle` [rad]."""
+        noise = getattr(self.hardware, "attitude_noise", None) or 0.0
+        return max(1e-3 * min(1.0, self.start_angle() or 1.0), 5.0 * noise)
 
     def written(self) -> Any:
         """With the filter's keys too."""

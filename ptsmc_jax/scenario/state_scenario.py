@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import msgspec
 from msgspec import Meta
 
-from ptsmc_jax.scenario import device_tables, dispersion_tables, errors, systems
+from ptsmc_jax.scenario import device_tables, dispersion_tables, errors, systems, tables
 from ptsmc_jax.scenario.disturbance_tables import DISTURBANCES
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.law_tables import LAWS
@@ -81,6 +81,25 @@ class StateScenario(Scenario, frozen=True, kw_only=True):
         drawn = msgspec.structs.replace(drawn, **{drawn.width: width})
         return msgspec.structs.replace(self, dispersion=msgspec.structs.replace(self.dispersion, x0=drawn))
 
+    def start_size(self) -> float:
+        """Return the size of x_1 at t = 0."""
+        return math.hypot(*self.plant.x0[: self.inputs])
+
+    def start_tangent(self) -> float:
+        """Return the size of x_1 at t = 0."""
+        return self.start_size()
+
+    def largest_acceleration(self) -> float | None:
+        """Return the limit on a chain's input; a system's own input matrix is not known here."""
+        limits = [self.devices.torque_limit, tables.limit_of(self, "peak_torque")]
+        known = [limit for limit in limits if limit is not None]
+        return min(known) if known and self.plant.kind == "chain" else None
+
+    def usual_settling(self) -> float:
+        """Return the default of `loop.settling_angle`, in units of x_1: 1e-3 of the start in the paper, 5."""
+        noises = getattr(self.hardware, "state_noise", None) or (0.0,)
+        return max(2e-4 * (self.start_size() or 5.0), 5.0 * max(noises[: self.inputs]))
+
     def check_plant(self) -> None:
         """Refuse lists that are not as long as there are inputs, or states."""
         for place, table in {**self.placed_terms, "observer": self.observer}.items():
@@ -89,7 +108,7 @@ class StateScenario(Scenario, frozen=True, kw_only=True):
 
     def _check_each(self, name: str, table: Kind) -> None:
         m = self.inputs
-        for key in table.each:
+        for key in (*(key for key, default in table.scaled.items() if default.each), *table.lists):
             value = getattr(table, key)
             if len(value) != m:
                 raise wrong(f"{name}.{key}", value, f"a list of {m} number{'s' * (m > 1)}, one for each input")

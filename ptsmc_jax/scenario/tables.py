@@ -14,7 +14,7 @@ from ptsmc_jax.scenario.device_tables import NoFilter
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.gain_record import GainBounds
 from ptsmc_jax.scenario.law_tables import LAWS
-from ptsmc_jax.scenario.values import Interval, Kinds, NotNegative, Positive, Quantile, Table, Truth
+from ptsmc_jax.scenario.values import Interval, Kinds, NotNegative, Positive, Quantile, Scaled, Table, Truth
 from ptsmc_jax.simulation.catalogues import Entry
 
 
@@ -23,19 +23,25 @@ class Loop(Table, frozen=True):
 
     Attributes:
         mode: the law inside the integrator, or computed and held once a period
-        period: control period, sampled loop only [s]
+        period: control period, sampled loop only; default: t_f / 600, of other plants t_f / 100 [s]
         clock: a sample at t_f - delta, as `tune` has where it moves either, or at whole periods, as a computer has
-        t_end: end of the run; default: t_f + 10, or + window if that is longer [s]
-        window: time after t_f over which window_error is taken; default: 1, or a control period if that is longer [s]
-        settling_angle: angle to the reference that counts as settled; of other plants |x_1| [rad]
+        t_end: end of the run; default: 4/3 t_f, or longer for the window; of other plants 3 t_f [s]
+        window: time after t_f over which window_error is taken; default: t_f / 30, or a control period if longer; of
+            other plants t_f / 5 [s]
+        settling_angle: angle to the reference that counts as settled; default: 1e-3, less for small initial errors, at
+            least five sigma of the noise; of other plants |x_1| [rad]
     """
 
     mode: Literal["continuous", "sampled"] = "continuous"
-    period: Positive = 0.05
+    period: Positive | None = None
     clock: Literal["anchored", "flight"] = "anchored"
     t_end: Positive | None = None
     window: Positive | None = None
-    settling_angle: Positive = 1e-3
+    settling_angle: Positive | None = None
+    scaled: ClassVar[Mapping[str, Scaled]] = {
+        "period": Scaled(0.05, time=1),
+        "window": Scaled(1.0, time=1),
+    }
 
 
 class Limit(Table, frozen=True):
@@ -69,14 +75,18 @@ FreeGains = Annotated[tuple[str, ...], Meta(min_length=1, description=FREE_ALLOW
 
 
 class Tune(Table, frozen=True):
-    """What `tune`, `pareto` and `compare` search for: the smallest window error that keeps every requirement.
+    """What `tune`, `pareto` and `compare` search for: the smallest objective that keeps every requirement.
 
     Attributes:
-        free: the gains to find; default: all but surface_rate and t_f, of k1 and sign_width only if sampled
-        bounds: two numbers for each gain; by default from law, period, t_f and body: see scenario.toml of a run
+        free: the gains to find; default: all but t_f; without sampling all but k1, sign_width and surface_rate too
+        bounds: two numbers for each gain; defaults follow the mission and move with the search: see scenario.toml of a
+            run
         per_axis: observer_gain as one number for each axis
-        objective: minimised: RMS window error, the largest one, its CVaR, or t_f, the shortest for the requirements
-        level: the CVaR is the RMS of the worst 1 - level of the trials; with "cvar" only, default: 0.9
+        minimise: the objective: a metric, "t_f" (the shortest for the requirements), or "limits" (the largest metric
+            over its limit: as far inside all limits as possible)
+        statistic: of that metric over the trials: its RMS, mean, largest value, a quantile, or CVaR (the RMS of the
+            worst 1 - level of the trials)
+        level: of the quantile or the CVaR; default: 0.9
         torque_weight: weight of ln(RMS peak torque) beside ln(error), Remark 1's trade-off
         worst_case: keep the requirements in the worst case inside the dispersions too, not only where drawn
         trials: trials to tune on; what quantiles take more of are counted besides
@@ -87,7 +97,8 @@ class Tune(Table, frozen=True):
     free: FreeGains | None = None
     bounds: Annotated[dict[str, Interval], Meta(description="a table of two numbers for each gain")] = {}  # noqa: RUF012
     per_axis: Truth = False
-    objective: Literal["rms", "worst", "cvar", "t_f"] = "rms"
+    minimise: Annotated[str, Meta(description='a metric, "t_f" or "limits"')] = "window_error"
+    statistic: Literal["rms", "mean", "worst", "quantile", "cvar"] = "rms"
     level: Quantile | None = None
     torque_weight: NotNegative = 0.0
     worst_case: Truth = False
@@ -100,6 +111,25 @@ class Tune(Table, frozen=True):
     def gains(self) -> tuple[str, ...]:
         """The gains to find, in a checked scenario, where `free` is filled in."""
         return self.free or ()
+
+
+STATISTICS = {
+    "rms": "RMS {}", "mean": "mean {}", "worst": "largest {}", "quantile": "{level:g} % quantile of {}",
+    "cvar": "CVaR of the {}",
+}  # fmt: skip
+LEVELS = ("quantile", "cvar")  # statistics with a level
+T_F, LIMITS = "t_f", "limits"  # objectives that are no metric of a run
+
+
+def objective_name(tune: Tune) -> str:
+    """Name what a search minimises.
+
+    >>> objective_name(Tune()), objective_name(Tune(minimise="effort", statistic="quantile", level=0.9))
+    ('RMS window error', '90 % quantile of effort')
+    """
+    if tune.minimise in (T_F, LIMITS):
+        return {T_F: "t_f", LIMITS: "largest metric over its limit"}[tune.minimise]
+    return STATISTICS[tune.statistic].format(tune.minimise.replace("_", " "), level=100.0 * (tune.level or 0.0))
 
 
 class Scenario(Table, frozen=True, kw_only=True, eq=False):
@@ -192,6 +222,32 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
     def reaction_wheels(self) -> Any:
         """The table [wheels]; None: there are none."""
         return None
+
+    @property
+    def influence(self) -> float:
+        """Acceleration of the error for a unit of the disturbance."""
+        return 1.0
+
+    @property
+    def least_eta(self) -> float:
+        """The number that eta must exceed (Theorems 2 and 3)."""
+        return float(self.order)
+
+    def modes(self) -> list[tuple[float, float, float]]:
+        """Return the frequency [rad/s], damping and fraction of the inertia of each flexible mode."""
+        return []
+
+    def largest_acceleration(self) -> float | None:
+        """Return the largest acceleration of the error that the actuators allow, None if it is not known."""
+        return None
+
+    def start_tangent(self) -> float:
+        """Return what the first acceleration is proportional to, eta^2 / t_f^2 times this."""
+        raise NotImplementedError
+
+    def usual_settling(self) -> float:
+        """Return the default of `loop.settling_angle`."""
+        raise NotImplementedError
 
     @property
     def moments(self) -> tuple[float, float] | tuple[None, None]:
@@ -291,6 +347,12 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
         """Two scenarios are equal where their values are, whether a file says them or not."""
         names = [name for name in self.__struct_fields__ if name != "defaulted"]
         return isinstance(other, Scenario) and all(getattr(self, name) == getattr(other, name) for name in names)
+
+
+def limit_of(scenario: Scenario, metric: str) -> float | None:
+    """Return the limit that a scenario requires for a metric, None if there is none."""
+    required = scenario.requirements.get(metric)
+    return required.limit if isinstance(required, Limit) else required
 
 
 def check_scenario(what: object, besides: str = "") -> Scenario:

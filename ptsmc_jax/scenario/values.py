@@ -1,7 +1,7 @@
 """What a scenario file is made of: the table, and types of values with their ranges and what is allowed in words."""
 
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import msgspec
 from msgspec import Meta
@@ -34,8 +34,23 @@ Quantile = Annotated[float, Meta(gt=0, lt=1, description="a number between 0 and
 MOST_STEPS = 200_000  # of a run
 
 
+class Scaled(NamedTuple):
+    """A default in the paper's case, with the powers of inertia and time in its unit; see `mission`.
+
+    The unit of a disturbance on a chain of order n has the power -n of time, which is `order` = -1.
+    """
+
+    value: Any
+    inertia: float = 0.0
+    time: float = 0.0
+    order: float = 0.0
+    each: bool = False  # one number for each input
+
+
 class Table(msgspec.Struct, kw_only=True, frozen=True, omit_defaults=False):
     """A table of a scenario file."""
+
+    scaled: ClassVar[Mapping[str, Scaled]] = {}  # defaults that follow the mission
 
     def __repr__(self) -> str:
         keys = {key: getattr(self, key) for key in self.__struct_fields__}
@@ -45,21 +60,15 @@ class Table(msgspec.Struct, kw_only=True, frozen=True, omit_defaults=False):
 class Kind(Table, frozen=True):
     """A kind of a table, which may have lists of one number for each input of the plant."""
 
-    each: ClassVar[Mapping[str, float]] = {}  # such lists: their default numbers, times `scale_of_each`
-
-    def scale_of_each(self, scenario: Any) -> float:
-        """What the numbers of `each` are multiplied by."""
-        return 1.0
-
     def written(self, scenario: Any) -> Any:
         """With its keys that follow from others of a checked scenario."""
         return self
 
+    lists: ClassVar[tuple[str, ...]] = ()  # keys with one number for each input, besides those in `scaled`
+
     def filled(self, scenario: Any) -> Any:
-        """With its lists where they are absent."""
-        scale = self.scale_of_each(scenario)
-        lists = {key: (scale * value,) * scenario.inputs for key, value in self.each.items()}
-        return msgspec.structs.replace(self, **{k: v for k, v in lists.items() if getattr(self, k) is None})
+        """Return the table with the defaults that follow from other keys, besides those in `scaled`."""
+        return self
 
 
 Kinds = Mapping[str, type[Table]]  # of a table by name, the default first

@@ -190,7 +190,7 @@ def _covariance(parts: Parts, ticks: Any, opened: linear.Opened, sign: _Sign | N
     squares[-1, 0] = square(opened.error[-1])
     error = error_floor.window_error(parts, ticks, np.stack([squares[:-1, 0], squares[:-1, 1], squares[1:, 0]], axis=1))
     t, t_f = ticks.t, float(parts.controller.t_f)
-    in_window = (t >= t_f - 1e-9) & (t <= t_f + float(parts.window))
+    in_window = (t >= t_f - 1e-9 * float(parts.period)) & (t <= t_f + float(parts.window))
     return Noise(error, torque, float(np.sqrt(np.mean(squares[:-1][in_window, 2])))), widths
 
 

@@ -119,8 +119,13 @@ def map_(
     scenario: SampledFile = None,
     /,
     *,
-    x: Annotated[str, Parameter(help="KEY=LOW:HIGH:COUNT of the scenario.")] = "loop.period=0.02:0.5:9",
-    y: Annotated[str, Parameter(help="KEY=LOW:HIGH:COUNT of the scenario.")] = "controller.delta=0.05:5:9",
+    x: Annotated[
+        str | None,
+        Parameter(help="KEY=LOW:HIGH:COUNT of the scenario; by default loop.period, 0.4 to 10 times its own."),
+    ] = None,
+    y: Annotated[
+        str | None, Parameter(help="KEY=LOW:HIGH:COUNT; by default controller.delta, from a period to t_f / 7 or more.")
+    ] = None,
     trials: Annotated[
         int, whole_number("--trials", "Trials of each pair, a whole number from 1 to 1000000.", 1, 1_000_000)
     ] = 32,
@@ -140,9 +145,10 @@ def map_(
     from ptsmc_jax.campaigns import store
     from tuning.studies import mapping
 
-    across, up = mapping.axis(x, "--x"), mapping.axis(y, "--y")
+    across = mapping.axis(x or mapping.usual_periods(loaded), "--x")
+    up = mapping.axis(y or mapping.usual_deltas(loaded), "--y")
     if across.key == up.key:
-        raise UsageError(f"--y is {y}, but must be another key than --x")
+        raise UsageError(f"--y is {up.text}, but must be another key than --x")
     with terminal.Progress(quiet) as report:
         flown = mapping.fly(loaded, across, up, seed, trials, lambda done, total: report("flying pairs", done, total))
     store.write(folder, lambda making: mapping.write(making, flown, seed, figures))
@@ -204,13 +210,14 @@ def tune(
     Exit status: 0 done and every requirement met on the fresh trials, 1 done but not met, 2 bad input, 130 interrupted.
     """
     loaded, folder = prepare(scenario, "tune", out, device, trust=trust)
+    from ptsmc_jax.scenario.tables import objective_name
     from tuning.studies import tune_files, tuner
 
     loaded = searches.with_tune(loaded)
     known_by = tune_files.identity(loaded, seed, globally=global_check)
     search = searches.LongSearch(
         known_by,
-        tuner.GOALS[loaded.search.objective],
+        objective_name(loaded.search),
         work=lambda report, journal: tuner.tune(loaded, seed, report, journal, globally=global_check),
         write=lambda making, tuning: tune_files.write(making, loaded, tuning, figures, known_by),
         summary=tune_files.summary,
@@ -285,8 +292,8 @@ def compare(
     interrupted.
     """
     loaded, folder = prepare(scenario, "compare", out, device, trust=trust)
+    from ptsmc_jax.scenario.tables import objective_name
     from tuning.studies import compare as comparing
-    from tuning.studies import tuner
 
     rivals = comparing.Rivals(against, law)
     rivals.check()
@@ -296,7 +303,7 @@ def compare(
     known_by = comparing.identity(loaded, seed, rivals)
     search = searches.LongSearch(
         known_by,
-        tuner.GOALS[loaded.search.objective],
+        objective_name(loaded.search),
         work=lambda report, journal: comparing.compare(loaded, seed, report, journal, posed()),
         write=lambda making, comparison: comparing.write(making, loaded, comparison, figures, known_by),
         summary=comparing.summary,

@@ -14,9 +14,13 @@ def search(summary: Summary) -> Iterator[str]:
     """How the search went."""
     record = summary["search"]
     over = {metric: r for metric, r in record.get("largest_over_limit", {}).items() if r is None or r > 1.0}
+    if over:
+        globally = ", nor did a global search" if record.get("conflict") else ""
+        yield f"the search found no gains that meet every requirement{globally}"
     # once of trials that do not arrive, which keep no limit
     for how_far in dict.fromkeys(_how_far(summary, metric, ratio) for metric, ratio in over.items()):
-        yield f"no gains found within the bounds keep every limit: with the best ones {how_far}"
+        yield f"with the best compromise {how_far}"
+    yield from _conflict(summary)
     yield from _went_on(record)
     for count in record.get("confirmed", []):
         most = "none would have to be" if count["allowed"] is None else f"at most {count['allowed']} allowed"
@@ -35,6 +39,30 @@ def search(summary: Summary) -> Iterator[str]:
         )
     if summary.get("differential_evolution") is not None:
         yield _beside_evolution(summary["differential_evolution"], record)
+
+
+def _conflict(summary: Summary) -> Iterator[str]:
+    """Which requirements conflict, and by how much each of them would have to give way."""
+    conflict, worst = summary["search"].get("conflict") or {}, summary["search"]["largest_over_limit"]
+    verdicts = {one["metric"]: one for one in summary["verdicts"]}
+    if len(conflict) > 1:
+        yield f"{' and '.join(conflict)} conflict: the gains that improve one of them worsen another"
+    for metric, alone in conflict.items():
+        one = verdicts.get(metric)
+        if one is None or alone is None:
+            yield f"no value of {metric} alone resolves the conflict: the other requirements cannot be met either"
+            continue
+        needed = one["limit"] * (2.0 - alone if one.get("at_least") else alone)
+        if alone <= 1.0:
+            yield f"{metric} can be met, but only if another requirement gives way"
+        elif one.get("at_least") and needed <= 0.0:
+            yield f"{metric} alone cannot give way far enough: the loop would be unstable"
+        else:
+            instead = f"{needed:.3g} {one['unit']} instead of {one['limit']:g}"
+            yield f"if {metric} alone gives way, its limit must be {instead}"
+    ratios = [worst[metric] for metric in conflict]
+    if len(conflict) > 1 and all(ratios):
+        yield f"if all of them give way together, each must by {100.0 * (max(ratios) - 1.0):.2g} % of its limit"
 
 
 def _went_on(record: Summary) -> Iterator[str]:
@@ -198,7 +226,8 @@ def shortest(summary: Summary) -> Iterator[str]:
     from tuning.search import design
 
     times = summary.get("shortest_t_f")
-    if times is not None:
+    # the theory knows no noise: without a simulation that keeps the limit its t_f would contradict the verdict
+    if times is not None and (times["simulated"] is not None or times["theory"] is None):
         yield str(design.ShortestTime(**times))
 
 

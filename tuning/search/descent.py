@@ -12,6 +12,7 @@ from tuning.search.objective import ended, failures
 
 ACTIVE = 1e-3  # of a limit, nearer to which it is active
 SLACK = 1e-4  # of a limit that an admissible point may use
+ELASTIC = 0.1  # of a limit, beyond which the violation is minimised before the objective
 BROKEN = 1e3  # metric / limit by which a trial that fails is over, as progress tells it, beside those that end
 CLOSE = 1e-5  # change of F at which a descent ends
 BOLD, CAREFUL = 1.0, 4.0  # a first step that may lead across the bounds into a better valley, and one that stays
@@ -83,6 +84,18 @@ class Start:
     seen: dict[bytes, Sloped] = field(default_factory=dict)
 
 
+class _FeasibleError(Exception):
+    """A point keeps every limit: what is minimised from there on is the objective."""
+
+
+@dataclass(frozen=True)
+class Relaxed:
+    """Which limits are exceeded by as little as possible, instead of minimising the objective."""
+
+    rows: Sequence[int] | None = None  # of the problem; None: all of them
+    to_the_end: bool = False  # also once every limit is kept: as far inside the limits as possible
+
+
 def descend(
     slopes: Callable[[np.ndarray], Sloped],
     best: Best,
@@ -90,54 +103,146 @@ def descend(
     steps: int,
     keep: Callable[[Sloped], None],
     close: float = CLOSE,
+    relaxed: Relaxed | None = None,
 ) -> None:
-    """Go downhill from a start inside the bounds.
+    """Search locally from a starting point inside the bounds, by sequential quadratic programming (SLSQP).
+
+    From a point that breaks a limit by more than `ELASTIC`, or if the search ends at a point that breaks one, the
+    largest relative violation is minimised first: min t subject to c <= t for every limit and trial. Its linearised
+    constraints can always be met, whereas those of the problem itself can contradict each other far from a solution.
 
     Args:
         slopes: measures the problem at a point (1, gains).
         best: is offered every point.
         start: where it begins.
         steps: how many points may be looked at.
-        keep: is called with what was measured at each point that the descent goes through, without those that it only
+        keep: is called with what was measured at each point that the search goes through, without those that it only
             tries.
         close: change of F at which it ends.
+        relaxed: minimise the violation of these limits only, the others being constraints.
     """
-    seen, scale = start.seen, start.scale
-
-    def at(scaled: np.ndarray) -> Sloped:
-        key, point = scaled.tobytes(), np.clip(scaled / scale, 0.0, 1.0)[None]
-        if key not in seen:
-            if len(seen) == steps:
-                raise _EnoughError
-            seen[key] = slopes(point)
-        if seen[key].finite[0]:
-            best.offer(point, seen[key])
-        return seen[key]
-
-    limits = {
-        "type": "ineq",
-        "fun": lambda scaled: -ended(at(scaled).c).reshape(-1),
-        "jac": lambda scaled: -_usable(at(scaled).c_slope.reshape(-1, scaled.size)) / scale,
-    }
-
-    def passed(scaled: np.ndarray) -> None:
-        if scaled.tobytes() in seen:
-            keep(seen[scaled.tobytes()])
-
-    first = scale * start.share
-    at_start = at(first)
-    keep(at_start)
+    local = _Local(slopes, best, start, steps, keep, close)
+    first = start.scale * start.share
     with contextlib.suppress(_EnoughError):
-        minimize(
-            lambda scaled: float(at(scaled).f[0]),
-            first.copy(),
-            jac=lambda scaled: _usable(at(scaled).f_slope)[0] / scale,
+        keep(local.at(first))
+        if relaxed is not None:
+            local.least_violation(first, relaxed)
+            return
+        if local.violation(first) > ELASTIC:
+            first = local.least_violation(first, Relaxed())
+            if local.violation(first) > SLACK:
+                return
+        last = local.minimise(first)
+        if local.violation(last) > SLACK:
+            nearer = local.least_violation(last, Relaxed())
+            if local.violation(nearer) <= SLACK:
+                local.minimise(nearer)
+
+
+class _Local:
+    """Both programs of a local search, which share the points that were measured. Points are shares times a scale."""
+
+    def __init__(
+        self,
+        slopes: Callable[[np.ndarray], Sloped],
+        best: Best,
+        start: Start,
+        steps: int,
+        keep: Callable[[Sloped], None],
+        close: float,
+    ):
+        self._slopes, self._best, self._start = slopes, best, start
+        self._steps, self._keep, self._close = steps, keep, close
+        self._seen, self._scale = start.seen, start.scale
+        scaled = self._scale * start.share
+        self._bounds = [(own, own) if k in start.fixed else (0.0, self._scale) for k, own in enumerate(scaled)]
+
+    def at(self, scaled: np.ndarray) -> Sloped:
+        """What is measured at a point, from memory if it was measured before."""
+        key, point = scaled.tobytes(), np.clip(scaled / self._scale, 0.0, 1.0)[None]
+        if key not in self._seen:
+            if len(self._seen) == self._steps:
+                raise _EnoughError
+            self._seen[key] = self._slopes(point)
+        if self._seen[key].finite[0]:
+            self._best.offer(point, self._seen[key])
+        return self._seen[key]
+
+    def violation(self, scaled: np.ndarray) -> float:
+        """The largest c of the trials that end."""
+        return float(ended(self.at(scaled).c).max(initial=-1.0))
+
+    def minimise(self, scaled: np.ndarray) -> np.ndarray:
+        """Minimise F subject to c <= 0, and return the last point."""
+        limits = {
+            "type": "ineq",
+            "fun": lambda x: -_compressed(self.at(x))[0],
+            "jac": lambda x: -_compressed(self.at(x))[1] / self._scale,
+        }
+        found = minimize(
+            lambda x: float(self.at(x).f[0]),
+            scaled.copy(),
+            jac=lambda x: _usable(self.at(x).f_slope)[0] / self._scale,
             method="SLSQP",
-            bounds=[(own, own) if k in start.fixed else (0.0, scale) for k, own in enumerate(first)],
-            constraints=[limits] if at_start.c.shape[1] else [],
-            callback=passed,
-            options={"maxiter": steps, "ftol": close},
+            bounds=self._bounds,
+            constraints=[limits] if self.at(scaled).c.shape[1] else [],
+            callback=self._passed,
+            options={"maxiter": self._steps, "ftol": self._close},
         )
+        return np.clip(found.x, *np.transpose(self._bounds))
+
+    def least_violation(self, scaled: np.ndarray, relaxed: Relaxed) -> np.ndarray:
+        """Minimise t subject to c <= t, and return the last point, or the first one that keeps every limit."""
+        rows, trials = self.at(scaled).c.shape[1:]
+        if not rows:
+            return scaled
+        soft = np.repeat(np.isin(np.arange(rows), range(rows) if relaxed.rows is None else relaxed.rows), trials)
+        reached = np.array(scaled)
+
+        def excess(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            nonlocal reached
+            seen = self.at(x)
+            if not relaxed.to_the_end and relaxed.rows is None and ended(seen.c).max() <= 0.0:
+                reached = np.array(x)
+                raise _FeasibleError
+            return _compressed(seen)
+
+        limits = {
+            "type": "ineq",
+            "fun": lambda y: y[-1] * soft - excess(y[:-1])[0],
+            "jac": lambda y: np.column_stack([-excess(y[:-1])[1] / self._scale, soft.astype(float)]),
+        }
+        first = _compressed(self.at(scaled))[0][soft].max()
+        try:
+            found = minimize(
+                lambda y: y[-1],
+                np.append(scaled, first),
+                jac=lambda y: np.append(np.zeros(scaled.size), 1.0),
+                method="SLSQP",
+                bounds=[*self._bounds, (-1.0, None)],
+                constraints=[limits],
+                callback=lambda y: self._passed(y[:-1]),
+                options={"maxiter": self._steps, "ftol": self._close},
+            )
+        except _FeasibleError:
+            return reached
+        return np.clip(found.x[:-1], *np.transpose(self._bounds))
+
+    def _passed(self, scaled: np.ndarray) -> None:
+        key = np.ascontiguousarray(scaled).tobytes()
+        if key in self._seen:
+            self._keep(self._seen[key])
+
+
+def _compressed(seen: Sloped) -> tuple[np.ndarray, np.ndarray]:
+    """(limits,) ln(1 + c) for c above 0, else c, and its derivatives (limits, gains).
+
+    Far beyond a limit c spans orders of magnitude; its logarithm has the same sign and the same slope at 0.
+    """
+    c = ended(seen.c).reshape(-1)
+    beyond = np.maximum(c, 0.0)
+    slopes = seen.c_slope.reshape(c.size, -1) / (1.0 + beyond)[:, None]
+    return np.where(c > 0.0, np.log1p(beyond), c), _usable(slopes)
 
 
 def prices(at: Sloped, share: np.ndarray) -> np.ndarray:

@@ -12,13 +12,23 @@ import numpy as np
 from ptsmc_jax import configure
 from tuning.search import hand_overs
 from tuning.search.cma_es import GENERATIONS, WIDELY, evolve
-from tuning.search.descent import BOLD, CAREFUL, CLOSE, Best, Start, descend, largest, prices
+from tuning.search.descent import BOLD, CAREFUL, CLOSE, SLACK, Best, Relaxed, Start, descend, largest, prices
 from tuning.search.evaluate import Evaluator, Measured, Sloped
 from tuning.search.lockstep import Ask, in_step
-from tuning.search.objective import Problem, ended, failures, fewer_trials
+from tuning.search.objective import LIMITS, Problem, ended, failures, fewer_trials
 from tuning.search.progress import Report
 from tuning.search.shares import TIMES
-from tuning.search.starts import CHOOSING, NEARLY, STEEP, SWEPT, charged, promising, spread, starting_points
+from tuning.search.starts import (
+    CHOOSING,
+    NEARLY,
+    STEEP,
+    SWEPT,
+    charged,
+    promising,
+    spread,
+    spread_widely,
+    starting_points,
+)
 from tuning.search.work import ROUND, SLOPED
 
 AGAIN = 3  # starts from whose best points a further round goes on
@@ -27,6 +37,7 @@ TOGETHER = 2  # descents of each device that go in step: it waits for one call w
 FOLLOWED = 3  # of the explored starts go on with all trials
 SAME = 1e-4  # points whose F differs by less are equally good: 0.01 % of the error
 FINISH = 1e-2  # share of `CLOSE` at which the last descent, from the best point, ends
+CONFLICTING = 0.1  # limits exceeded by so much less than the worst one, relatively, conflict with it
 LOOKS = 3  # at other hand-overs, at most
 MANY = 512  # points swept where there are no slopes
 
@@ -90,6 +101,7 @@ class Descents:
     ):
         self._evaluate, self._margin, self._steps, self._rng, self._report = evaluate, margin, steps, rng, report
         self._own: np.ndarray | None = None  # (gains,) to come back to where one makes no difference
+        self._designs = np.zeros((0, 0))  # (designs, gains) shares
         self._best: Best | None = None
         self._problem: Problem | None = None
         self._history: dict[int, list[Step]] = {}  # by the start
@@ -138,25 +150,43 @@ class Descents:
         """The points gone through, in the order of the starts and of each start's steps."""
         return [step for _, steps in sorted(self._history.items()) for step in steps]
 
-    def set_out(self, problem: Problem, own: np.ndarray) -> None:
-        """Descend from the scenario's own gains, (gains,), on a few trials."""
-        self._own, share = own, self._evaluate.bounds.share(own)
+    def set_out(self, problem: Problem, own: np.ndarray, designs: np.ndarray) -> None:
+        """Search locally on a few trials, from the best of the scenario's gains, (gains,), and of the designs.
+
+        designs: (designs, gains).
+        """
+        few = _few_trials(problem)
+        self._own, self._designs = own, np.asarray([self._evaluate.bounds.share(one) for one in designs])
         self._report(SETTING_OUT, 0, 2, *self.so_far)
-        self._descend(_few_trials(problem), 0, Start(share, CAREFUL), max(2, self._steps // 2))
+        points = np.concatenate([self._evaluate.bounds.share(own)[None], self._designs.reshape(-1, own.size)])
+        first = points[0]
+        if len(points) > 1:
+            (first,) = promising(self._evaluate, self.tightened(few), points, 1, lambda *_: None)
+        self._descend(few, 0, Start(first, CAREFUL), max(2, self._steps // 2))
 
     def explore(self, problem: Problem, starts: int, seed: int) -> dict[int, np.ndarray]:
         """The shares where the most promising of so many starts end, after a few steps from each on a few trials.
 
         The first goes on from where it set out to, with what has joined the problem; the others are chosen from there.
         """
-        problem, few, more = _few_trials(problem), max(2, self._steps // 4), max(2, self._steps // 2)
+        problem, more = _few_trials(problem), max(2, self._steps // 2)
         self._report(SETTING_OUT, 1, 2, *self.so_far)
         self._descend(problem, 0, Start(self.share, CAREFUL), more, afresh=True)
-        first = starting_points(self._evaluate, self.tightened(problem), self.share, starts, seed, self._report)
-        racing = dict(enumerate(first))
+        first = starting_points(
+            self._evaluate, self.tightened(problem), self.share, self._designs, starts, seed, self._report
+        )
+        return self._promising(problem, first)
+
+    def _promising(self, problem: Problem, first: np.ndarray, number: int = 0) -> dict[int, np.ndarray]:
+        """Return the best ends of short local searches from these starting points, by their number.
+
+        first: (starts, gains) shares; number: of the first one.
+        """
+        few, more = max(2, self._steps // 4), max(2, self._steps // 2)
+        racing = dict(enumerate(first, number))
         rungs = ((len(racing), few), (max(FOLLOWED, len(racing) // 2), more))
         ranked = self._race(problem, racing, rungs, SEARCHING, scales=(CAREFUL, BOLD))
-        return {k: self._ends[k].share for k in ranked[:FOLLOWED]} or {0: first[0]}
+        return {k: self._ends[k].share for k in ranked[:FOLLOWED]} or {number: first[0]}
 
     def descend(self, problem: Problem, starts: Mapping[int, np.ndarray]) -> None:
         """Descend part of the way from each of these shares, and from the best end to the optimum next to it."""
@@ -205,7 +235,7 @@ class Descents:
         def race(k: int, ask: Ask) -> None:
             bests[k] = Best(racers[k].start.share, len(problem.rows), self._margin)
             self._history[k] = list(racers[k].before)  # it goes through the same points again, and on
-            descend(ask, bests[k], racers[k].start, steps, partial(self._keep, k))
+            descend(ask, bests[k], racers[k].start, steps, partial(self._keep, k), relaxed=_relaxed(problem))
 
         def tell() -> None:
             nonlocal reports
@@ -234,14 +264,13 @@ class Descents:
         self._instead(problem, [(start, end.share) for start, end in _ranked(self._ends)[:AGAIN]])
         self._finish(problem)
 
-    def start_over(self, problem: Problem, starts: int, seed: int) -> None:
-        """From other starts, with what has joined the problem; what was found of it before stays unless this is better.
-
-        Where harder trials have joined, going on from what was found for easier ones may end where no step is better.
-        """
+    def search_globally(self, problem: Problem, starts: int, seed: int) -> None:
+        """Search from the best of many points of the whole box; what was found before stays unless this is better."""
         found, better = (self.best, self._problem, self._from, self._ends), False
         try:
-            self.descend(problem, self.explore(problem, starts, seed))
+            few = _few_trials(problem)
+            first = spread_widely(self._evaluate, self.tightened(few), starts, seed, self._report)
+            self.descend(problem, self._promising(few, first, 1 + max(self._history, default=-1)))
             better = self.best.rank < found[0].rank
         finally:  # interrupted too
             if not better:
@@ -281,6 +310,34 @@ class Descents:
         if on_samples.size:
             best, _ = self._best_of(tightened, on_samples)
             self._take(best, tightened, 0, afresh=best.beyond <= self.best.beyond)
+
+    def conflict(self, problem: Problem) -> dict[str, float | None]:
+        """Return the limits that the best compromise exceeds most, and the least excess of each alone.
+
+        Values are metric over limit, at the least that can be reached with every other limit kept; None if the others
+        cannot be kept then either.
+        """
+        tightened, found = self.tightened(problem), dict[str, float | None]()
+        worst = largest(self._evaluate.slopes(tightened, self.share[None]).c, 0.0)[0]
+        for row in np.flatnonzero(worst >= 1.0 + (worst.max() - 1.0) * (1.0 - CONFLICTING)):
+            others = np.arange(worst.size) != row
+            seen: list[tuple[float, float]] = []
+
+            def keep(one: Sloped, row: int = int(row), others: np.ndarray = others, seen: list = seen) -> None:
+                each = largest(one.c, 0.0)[0]
+                seen.append((float(each[others].max(initial=0.0)), float(each[row])))
+
+            descend(
+                partial(self._evaluate.slopes, tightened),
+                Best(self.share, worst.size, self._margin),
+                Start(self.share, CAREFUL),
+                self._steps,
+                keep,
+                relaxed=Relaxed(rows=[int(row)], to_the_end=True),
+            )
+            kept = [own for rest, own in seen if rest <= 1.0 + 10.0 * SLACK]
+            found[problem.rows[row]] = (1.0 - self._margin) * min(kept) if kept else None
+        return found
 
     def _finish(self, problem: Problem) -> None:
         self._report(FINISHING, 0, 1, *self.so_far)
@@ -358,7 +415,8 @@ class Descents:
         """Descend from a start of this number, and take what it finds."""
         best, tightened = Best(start.share, len(problem.rows), self._margin), self.tightened(problem)
         try:
-            descend(partial(self._evaluate.slopes, tightened), best, start, steps, partial(self._keep, number), close)
+            keep = partial(self._keep, number)
+            descend(partial(self._evaluate.slopes, tightened), best, start, steps, keep, close, _relaxed(problem))
         finally:  # interrupted too
             self._take(best, tightened, number, afresh=afresh)
 
@@ -377,6 +435,11 @@ class Descents:
     def tightened(self, problem: Problem) -> Problem:
         """With the margin kept from the limits."""
         return problem.tightened(1.0 - self._margin)
+
+
+def _relaxed(problem: Problem) -> Relaxed | None:
+    """Return what a local search minimises, if that is not F subject to the limits."""
+    return Relaxed(to_the_end=True) if problem.goal == LIMITS else None
 
 
 def _ranked(ends: Mapping[int, Best]) -> list[tuple[int, Best]]:

@@ -13,8 +13,8 @@ import numpy as np
 from ptsmc_jax import programs
 from tuning.search import flights, margin_rows
 from tuning.search.journal import Journal
-from tuning.search.objective import FAILED, Problem, Rules, ended, judge, watched
-from tuning.search.shares import Bounds
+from tuning.search.objective import FAILED, LEAST, LIMITS, Problem, Rules, ended, judge, watched
+from tuning.search.shares import Bounds, Scale
 
 TOGETHER = 16  # points that are judged in one call
 M = TypeVar("M", bound="Measured")
@@ -94,7 +94,7 @@ class Evaluator:
         if problem.margins is None:
             return flown
         # slopes or not, by the one program: another takes longer to compile than most searches would save by it
-        of_loop = margin_rows.of_points(problem.margins, self.bounds, share)
+        of_loop = margin_rows.of_points(problem.margins, self.bounds.scale, share)
         wide = max(flown["c"].shape[2], of_loop["c"].shape[2])
 
         def padded(c: np.ndarray, fill: float) -> np.ndarray:  # every row as long as the longest
@@ -104,7 +104,7 @@ class Evaluator:
         for name, fill in (("c", -1.0), ("c_slope", 0.0)):
             if name in flown:
                 flown[name] = np.concatenate([padded(flown[name], fill), padded(of_loop[name], fill)], axis=1)
-        return flown
+        return _with_margins(flown) if problem.goal == LIMITS else flown
 
     def _fly(self, problem: Problem, share: np.ndarray) -> dict[str, np.ndarray]:
         gains = self._gains(share)[0]
@@ -119,8 +119,19 @@ class Evaluator:
 
     def _gains(self, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Gains of shares, (points, gains), and what a share of each more makes of them, (points, gains, gains)."""
-        gains = _in_calls(partial(_gains, bounds=self.bounds), share)
+        gains = _in_calls(partial(_gains, scale=self.bounds.scale), share)
         return gains["gains"], gains["along"]
+
+
+def _with_margins(flown: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return F = ln of the largest metric over its limit with the rows of the margins among them, and its slopes."""
+    c = ended(flown["c"]).reshape(len(flown["c"]), -1)
+    at, points = c.argmax(axis=1), np.arange(len(c))
+    largest = np.maximum(1.0 + c[points, at], LEAST)
+    flown["f"] = flown["value"] = np.log(largest)
+    if "c_slope" in flown:
+        flown["f_slope"] = flown["c_slope"].reshape(*c.shape, -1)[points, at] / largest[:, None]
+    return flown
 
 
 def _in_calls(program: Callable[..., dict[str, jax.Array]], *arrays: np.ndarray) -> dict[str, np.ndarray]:
@@ -143,10 +154,10 @@ def _question(kind: bytes, problem: Problem, share: np.ndarray) -> bytes:
     return b"|".join([kind, share.tobytes(), said, *(np.asarray(leaf).tobytes() for leaf in leaves)])
 
 
-@programs.jit(static_argnames="bounds", compiler_options=programs.QUICKLY)
-def _gains(share: jax.Array, bounds: Bounds) -> dict[str, jax.Array]:
-    slopes = jax.vmap(jax.jacfwd(bounds.gains))(share)
-    return {"gains": jax.vmap(bounds.gains)(share), "along": jnp.swapaxes(slopes, 1, 2)}
+@programs.jit(compiler_options=programs.QUICKLY)
+def _gains(share: jax.Array, scale: Scale) -> dict[str, jax.Array]:
+    slopes = jax.vmap(jax.jacfwd(scale.gains))(share)
+    return {"gains": jax.vmap(scale.gains)(share), "along": jnp.swapaxes(slopes, 1, 2)}
 
 
 @programs.jit(compiler_options=programs.QUICKLY)

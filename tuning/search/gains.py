@@ -7,10 +7,11 @@ from collections.abc import Iterable
 from typing import Any
 
 from ptsmc_jax import scenario as scenarios
-from ptsmc_jax.scenario import disturbance_bounds, keys
+from ptsmc_jax.scenario import disturbance_bounds, keys, mission
 from ptsmc_jax.scenario.command_filter_tables import CommandFilter
 from ptsmc_jax.scenario.device_tables import FILTERS
 from ptsmc_jax.scenario.law_record import common_keys
+from ptsmc_jax.scenario.law_tables import LAWS
 from ptsmc_jax.scenario.layouts import SCENARIOS
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.scenario.tuned import in_scenario as in_scenario
@@ -19,6 +20,9 @@ from ptsmc_jax.simulation.gains import base as base
 from ptsmc_jax.simulation.gains import gains_of as gains_of
 from ptsmc_jax.simulation.gains import own as own
 from ptsmc_jax.simulation.gains import with_gains as with_gains
+from ptsmc_jax.simulation.rollout import Parts
+
+AS_PUBLISHED = 0.05  # delta in the paper [s]
 
 
 def units(plant: str) -> dict[str, str]:
@@ -50,17 +54,34 @@ def named(scenario: Scenario) -> tuple[str, ...]:
 
 
 def of_paper(scenario: Scenario) -> dict[str, float]:
-    """The paper's gains for this plant: its Case I, or eta = n + 1 as in Figs. 1 and 2; a smooth sign 1e-3 wide.
+    """Return the published gains, scaled to the mission: those of Case I, or eta = n + 1 as in Figs. 1 and 2.
 
-    delta is a period or more, and half of t_f or less where a period is; the observer's gain is that of this body.
+    delta is at least a period.
     """
-    shortest = scenario.loop.period if scenario.sampled else 0.0
-    delta = max(min(0.05, 0.5 * scenario.controller.t_f), shortest)
-    gains = {"eta": 3.0, "delta": delta, "k1": 1.0, "sign_width": 1e-3, "surface_rate": 1.0}
+    units, table = mission.scales(scenario), LAWS[scenario.plant.kind]["prescribed_time"]
+    gains = {name: float(units.of(scaled)) for name, scaled in table.scaled.items()}
+    if scenario.sampled:
+        gains["delta"] = max(gains["delta"], scenario.loop.period)
     if scenario.motion == "chain":
         gains["eta"] = scenario.order + 1.0
     observer_gain = disturbance_bounds.observer_gain(scenario)
     return gains | ({"observer_gain": observer_gain} if scenario.observer.kind == "nonlinear" else {})
+
+
+def of_designs(scenario: Scenario, parts: Parts, names: tuple[str, ...]) -> list[list[float]]:
+    """Return starting points (designs, gains) that follow from the mission, see `mission.designs`.
+
+    Gains that no design has, as those of a custom law, stay the scenario's.
+    """
+    if not scenario.sampled:
+        return []
+    found, current = [], dict(zip(names, own(parts, names), strict=True))
+    for design in mission.designs(scenario):
+        gains = scenario.controller.gains_of(design, scenario)
+        if getattr(parts.observer, "linear", False):
+            gains["observer_gain"] = design.observer * (scenario.moments[0] or 1.0)
+        found.append([gains.get(base(name), value) for name, value in current.items()])
+    return found
 
 
 def papers(scenario: Scenario) -> Scenario:
@@ -77,8 +98,8 @@ def paper_is(scenario: Scenario) -> str:
     """What the paper's gains are for a scenario: its own, scaled to another body or period, or those of its law."""
     if not scenario.controller.prescribed:
         return "paper's law"
-    own, as_written = of_paper(scenario), {"delta": 0.05, "observer_gain": 10.0}
-    return "paper" if all(own.get(name, value) == value for name, value in as_written.items()) else "paper, scaled"
+    as_published = mission.published(scenario) and of_paper(scenario)["delta"] == AS_PUBLISHED
+    return "paper" if as_published else "paper, scaled"
 
 
 def differ(one: Scenario, other: Scenario) -> bool:

@@ -25,7 +25,7 @@ from ptsmc_jax.theory import linear, margins, run_margins
 from ptsmc_jax.theory.linear import Loop
 from tuning.search import gains as gain_names
 from tuning.search.gains import with_gains
-from tuning.search.shares import Bounds
+from tuning.search.shares import Bounds, Scale
 
 CASES = 2  # loops of drawn trials, those that come nearest to a limit
 WITHOUT = 2.0  # how near to its limit a loop without slopes comes: as one without any margin
@@ -68,7 +68,7 @@ def ask(ready: Study, bounds: Bounds, seed: int) -> Asked | None:
         names=bounds.names,
     )
     some = _of_trials(asked, np.arange(CASES)) if margin_verdicts.differ(asked.dispersion) else asked
-    sloped.prepare(some, bounds, np.zeros((len(configure.processors()), len(bounds.names))))
+    sloped.prepare(some, bounds.scale, np.zeros((len(configure.processors()), len(bounds.names))))
     return hardest(asked, np.asarray(gain_names.own(ready.parts, bounds.names)))[0]
 
 
@@ -131,7 +131,7 @@ def _by_case(asked: Asked, gains: Float[Array, " gains"], of: Callable[..., Any]
     return jax.tree.map(lambda v: v[None], of(parts, *known))
 
 
-def with_slopes(asked: Asked, bounds: Bounds, share: Float[Array, " gains"]) -> tuple[Array, Array]:
+def with_slopes(asked: Asked, scale: Scale, share: Float[Array, " gains"]) -> tuple[Array, Array]:
     """The `rows` at a share of the bounds' intervals, and their slopes by it, (margins, entries, gains).
 
     The runs' own slopes along one gain after the other, which takes a quarter of the time: a loop over periods with all
@@ -139,7 +139,7 @@ def with_slopes(asked: Asked, bounds: Bounds, share: Float[Array, " gains"]) -> 
     """
 
     def flown(share: Array) -> tuple[Any, Any]:
-        runs = nominal_runs(asked, bounds.gains(share))
+        runs = nominal_runs(asked, scale.gains(share))
         return tuple(
             jax.tree.map(lambda v, kept=kept: v if _has_slopes(v) is kept else None, runs) for kept in (True, False)
         )
@@ -149,7 +149,7 @@ def with_slopes(asked: Asked, bounds: Bounds, share: Float[Array, " gains"]) -> 
             return other if one is None else one
 
         runs = jax.tree.map(either, numbers, others, is_leaf=lambda v: v is None)
-        return rows(asked, bounds.gains(share), runs)
+        return rows(asked, scale.gains(share), runs)
 
     axes = jnp.eye(share.size)
     each = jax.lax.map(lambda axis: jax.jvp(flown, (share,), (axis,), has_aux=True), axes)
@@ -161,20 +161,20 @@ def _has_slopes(leaf: Any) -> bool:
     return bool(jnp.issubdtype(leaf.dtype, jnp.inexact))
 
 
-def of_points(asked: Asked, bounds: Bounds, share: Float[np.ndarray, "points gains"]) -> dict[str, np.ndarray]:
+def of_points(asked: Asked, scale: Scale, share: Float[np.ndarray, "points gains"]) -> dict[str, np.ndarray]:
     """The rows "c" at shares of the bounds' intervals, and "c_slope" by these, arrays over the points first."""
     count = len(configure.processors())
     padded = np.resize(share, (-(-len(share) // count) * count, share.shape[1]))
-    each = [sloped(asked, bounds, padded[k : k + count]) for k in range(0, len(padded), count)]
+    each = [sloped(asked, scale, padded[k : k + count]) for k in range(0, len(padded), count)]
     return jax.tree.map(lambda *v: np.concatenate(v)[: len(share)], *each)
 
 
-@programs.jit(static_argnames="bounds")
-def sloped(asked: Asked, bounds: Bounds, share: Array) -> dict[str, Array]:
+@programs.jit
+def sloped(asked: Asked, scale: Scale, share: Array) -> dict[str, Array]:
     """See `of_points`; one point for each device."""
 
     def on_device(share: Array) -> dict[str, Array]:
-        c, slope = with_slopes(asked, bounds, share[0])
+        c, slope = with_slopes(asked, scale, share[0])
         return {"c": c[None], "c_slope": jnp.nan_to_num(slope)[None]}
 
     return montecarlo.spread(on_device, share, share.shape[0])

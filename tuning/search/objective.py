@@ -14,6 +14,8 @@ from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.dispersions.base import Coordinates
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.numerics.pytrees import Leaf, pytree
+from ptsmc_jax.scenario.tables import LIMITS as LIMITS
+from ptsmc_jax.scenario.tables import T_F as T_F
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.requirements import Requirement
 from ptsmc_jax.simulation.requirements import over as near
@@ -23,7 +25,7 @@ from tuning.search.gains import with_gains
 from tuning.search.margin_rows import Asked
 
 FAILED = 1e9  # stands for the goal, and for metric / limit, of a trial that failed: beyond those of any that ends
-T_F = "t_f"
+LEAST = 1e-300  # of what a logarithm is taken of
 DRAWN = 128  # trials whose coordinates are drawn in one call
 
 
@@ -43,8 +45,10 @@ class Rules:
     names: tuple[str, ...] = field(metadata={"static": True})  # of the free gains
     # of those that are among, how many may break each limit; None: it is one on every trial
     may_break: tuple[int | None, ...] = field(metadata={"static": True})
-    goal: str = field(default="window_error", metadata={"static": True})  # a metric, or t_f itself
+    goal: str = field(default="window_error", metadata={"static": True})  # a metric, `T_F` or `LIMITS`
     tail: int | None = field(default=None, metadata={"static": True})  # the worst trials that count; None: all
+    # RMS of those, or their mean, or the least of them, which with a tail is a quantile
+    statistic: str = field(default="rms", metadata={"static": True})
     torque_weight: float = field(default=0.0, metadata={"static": True})
 
 
@@ -195,7 +199,8 @@ def kept_by_every_trial(problem: Problem) -> np.ndarray:
 
 def watched(problem: Problem) -> tuple[str, ...]:
     """Metrics that a problem is judged by: that of the goal, the peak torque, those of its requirements."""
-    return ("window_error" if problem.goal == T_F else problem.goal, "peak_torque", *problem.metrics)
+    goal = "window_error" if problem.goal in (T_F, LIMITS) else problem.goal
+    return (goal, "peak_torque", *problem.metrics)
 
 
 def measure(problem: Problem, gains: Float[Array, " gains"]) -> tuple[Array, Array, Array]:
@@ -218,25 +223,34 @@ def judge(
 ) -> tuple[Array, Array, Array]:
     """F, c and ln of the goal, see `measure`, from the metrics that are `watched`, and the statuses, of all trials.
 
-    The goal is the RMS of a metric over the averaged trials, or over the `tail` worst of them: CVaR, or with one the
-    worst case; or t_f. F is its logarithm, plus `torque_weight` times that of the RMS peak torque (Remark 1). Where
-    only some trials must keep a limit, c of the others is cut down to that of the last one that must. Where a trial
-    fails, or has no value, c is `FAILED` - 1; the goal is that of the others, and each such trial adds ln `FAILED` to
-    F.
+    The goal is a statistic of a metric over the averaged trials, or over the `tail` worst of them: CVaR, or with one
+    the worst case; or t_f; or the largest metric over its limit, to which `Evaluator` adds the margins. F is its
+    logarithm, plus `torque_weight` times that of the RMS peak torque (Remark 1). Where only some trials must keep a
+    limit, c of the others is cut down to that of the last one that must. Where a trial fails, or has no value, c is
+    `FAILED` - 1; the goal is that of the others, and each such trial adds ln `FAILED` to F.
     """
     goal, torque, *limited = metrics.T
-    squares, torques = (judged(v, status) ** 2 for v in (goal, torque))
-    value = weighted = (
-        jnp.log(gains[rules.names.index(T_F)]) if rules.goal == T_F else _log_rms(squares[: rules.averaged], rules.tail)
-    )
-    if rules.goal != T_F:
-        weighted = value + jnp.sum(squares[: rules.averaged] >= FAILED**2) * math.log(FAILED)
-    if rules.torque_weight:
-        weighted = weighted + rules.torque_weight * _log_rms(torques[: rules.averaged], rules.tail)
+    values, torques = (judged(v, status)[: rules.averaged] for v in (goal, torque))
     over = [judged(near(one, rules.limits[k], at_least=False), status) - 1.0 for k, one in enumerate(limited)]
     rows = [_asked(rules, k, one) for k, one in enumerate(over)]
     constraints = jnp.stack(rows) if rows else jnp.zeros((0, metrics.shape[0]))
+    if rules.goal == T_F:
+        value = jnp.log(gains[rules.names.index(T_F)])
+        return value, constraints, value
+    if rules.goal == LIMITS:
+        value = log_largest(constraints)
+        return value, constraints, value
+    value = _log_statistic(values, rules.tail, rules.statistic)
+    weighted = value + jnp.sum(values >= FAILED) * math.log(FAILED)
+    if rules.torque_weight:
+        weighted = weighted + rules.torque_weight * _log_statistic(torques, rules.tail, "rms")
     return weighted, constraints, value
+
+
+def log_largest(constraints: Array) -> Array:
+    """Return ln of the largest metric over its limit among the trials that end, from c (rows, trials)."""
+    ended = jnp.where(constraints < FAILED - 1.0, constraints, -1.0)
+    return jnp.log(jnp.maximum(1.0 + jnp.max(ended, initial=-1.0), LEAST))
 
 
 def judged(value: Array, status: Array) -> Array:
@@ -255,14 +269,18 @@ def failures(c: np.ndarray) -> np.ndarray:
     return np.sum(np.any(c >= FAILED - 1.0, axis=1), axis=1)
 
 
-def _log_rms(squares: Float[Array, " trials"], tail: int | None) -> Float[Array, ""]:
-    """Over those that end, or the `tail` worst of them: beside `FAILED`^2 no digit of theirs would be left."""
-    ends = squares < FAILED**2
+def _log_statistic(values: Float[Array, " trials"], tail: int | None, statistic: str) -> Float[Array, ""]:
+    """Return ln of a statistic of the trials that end, or of the `tail` worst of them; ln `FAILED` if none ends."""
+    ends = values < FAILED
     count = jnp.sum(ends)
-    counted = jnp.where(ends, squares, 0.0)
+    counted = jnp.where(ends, values, 0.0)
     if tail is not None:
         counted, count = jax.lax.top_k(counted, tail)[0], jnp.minimum(count, tail)
-    return 0.5 * jnp.log(jnp.where(count > 0, jnp.sum(counted) / jnp.maximum(count, 1), FAILED**2))
+    if statistic == "quantile":
+        return jnp.log(jnp.where(count > 0, jnp.maximum(counted[-1], LEAST), FAILED))
+    power = 2 if statistic == "rms" else 1
+    mean = jnp.sum(counted**power) / jnp.maximum(count, 1)
+    return jnp.log(jnp.where(count > 0, mean, FAILED**power)) / power
 
 
 def _asked(rules: Rules, row: int, over: Float[Array, " trials"]) -> Float[Array, " trials"]:

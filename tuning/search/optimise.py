@@ -22,6 +22,7 @@ from tuning.search.worst import Hardest
 
 Tell = Callable[[str], None]  # says what is being done
 
+GLOBALLY = "no gains so far meet every requirement: searching globally"
 HOPELESS = 1.1  # times a limit that the best gains reach: harder trials would bring them no nearer
 
 
@@ -36,6 +37,7 @@ class Settings:
     robust: bool = False  # what joins is the worst case inside the dispersions' support
     judged: bool = True  # say how hard the worst case is
     margin: float = 0.0  # to keep from the limits, where it is more than the search's own
+    designs: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))  # (designs, gains) besides the scenario's
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,8 @@ class Search:
     rounds: int = 0  # searches again with harder trials
     margin: float = MARGIN  # that was kept from the limits
     over: float = 0.0  # how far the best point is beyond a limit less that margin, as progress tells it
+    # if no gains meet every requirement: the limits that conflict, see `Descents.conflict`
+    conflict: dict[str, float | None] = field(default_factory=dict)
     hardest: Hardest | None = None  # for the gains found; None: no requirement hangs on the hardest trial
     counts: list[confirm.Count] = field(default_factory=list)  # of requirements on a share, on other trials
     seconds: dict[str, float] = field(default_factory=dict)  # that each step of the search took
@@ -88,7 +92,7 @@ def search(
     margin = max(settings.margin, rounds.margin)
     report = Work(report, evaluate, *planned(rounds.problem, settings.starts, settings.steps, sloped=sloped))
     descents = Descents(evaluate, margin, settings.steps, np.random.default_rng(settings.seed), report)
-    interrupted = False
+    interrupted, conflict = False, dict[str, float | None]()
 
     def tell(what: str) -> None:
         report(what, 0, 0, *descents.so_far)
@@ -102,6 +106,9 @@ def search(
             _by_evolution(rounds, descents, own, tell)
         if settings.judged:
             rounds.judge(descents.gains, tell)
+            if sloped and descents.best.over > 0.0 and not descents.best.failed:
+                tell("finding the conflicting requirements")
+                conflict = descents.conflict(rounds.problem)
     except KeyboardInterrupt:
         if not descents.started:
             raise
@@ -120,6 +127,7 @@ def search(
         rounds=rounds.count,
         margin=margin,
         over=best.over,
+        conflict=conflict,
         hardest=rounds.hardest,
         counts=[] if interrupted else rounds.counts,
         seconds=report.seconds,
@@ -129,13 +137,14 @@ def search(
 
 def _by_slopes(rounds: Rounds, descents: Descents, own: np.ndarray, settings: Settings, tell: Tell) -> None:
     starts, seed = settings.starts, settings.seed
-    descents.set_out(rounds.problem, own)
+    descents.set_out(rounds.problem, own, settings.designs)
     rounds.begin(descents.gains)
     shares = descents.explore(rounds.problem, starts, seed) if starts > 1 else {0: descents.share}
     descents.descend(rounds.problem, shares)
     _go_on(rounds, descents, descents.again, tell)
-    if starts > 1 and rounds.count and descents.best.over > 0.0:
-        descents.start_over(rounds.problem, starts, seed + 1)
+    if starts > 1 and descents.best.over > 0.0:
+        tell(GLOBALLY)
+        descents.search_globally(rounds.problem, starts, seed + 1)
         _go_on(rounds, descents, descents.again, tell)
 
 

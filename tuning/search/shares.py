@@ -1,10 +1,11 @@
 """Intervals of the free gains; shares of them, from 0 to 1, <-> gains."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from ptsmc_jax.numerics.pytrees import Leaf, pytree
 from ptsmc_jax.scenario import free_gains
 from ptsmc_jax.scenario.gain_record import wide
 from ptsmc_jax.scenario.tables import Scenario
@@ -16,6 +17,37 @@ TIMES, TIME_DIGITS = ("delta", "t_f"), 12  # with fewer digits a hand-over may f
 
 HALF = 0.5  # the lower bound of sign_width is at most this share of its upper one
 NEAR = 0.01  # share of its interval by which a gain is on a bound
+
+
+@pytree
+@dataclass(frozen=True)
+class Scale:
+    """The map from shares of the bounds' intervals to gains, for compiled programs: other bounds, the same program."""
+
+    lower: Leaf  # (gains,)
+    upper: Leaf  # (gains,)
+    hop: Leaf  # see `Bounds`
+    log: tuple[bool, ...] = field(metadata={"static": True})  # gains that are searched on a log scale
+    width: int | None = field(metadata={"static": True})  # place of a sign_width whose lower bound moves with `hop`
+    observers: tuple[int, ...] = field(metadata={"static": True})  # places of the observer's gains
+
+    def gains(self, share: Any) -> Any:
+        """Gains of shares of the intervals, (gains,), NumPy's or JAX's: 0 is the lower bound, 1 the upper one.
+
+        Bounds enter by their ratio only, so that other units of the gains change no share.
+        """
+        xp, low, high, log = share.__array_namespace__(), self.lower, self.upper, np.asarray(self.log)
+        ratio = xp.where(log, high, 1.0) / xp.where(log, low, 1.0)
+        gains = xp.where(log, low * ratio**share, low + (high - low) * share)
+        if self.width is None:
+            return gains
+        k, least = self.width, self.least_width(gains)
+        return xp.where(np.arange(len(self.log)) == k, least * (high[k] / least) ** share[k], gains)
+
+    def least_width(self, gains: Any) -> Any:
+        """Lower bound of sign_width for these gains of the observer."""
+        least = self.hop / gains[np.asarray(self.observers)].min()
+        return gains.__array_namespace__().clip(least, self.lower[self.width], HALF * self.upper[self.width])
 
 
 @dataclass(frozen=True)
@@ -36,22 +68,17 @@ class Bounds:
         """(gains,) bool: searched on a log scale."""
         return wide(np.asarray(self.lower), np.asarray(self.upper))
 
-    def _scaled(self) -> tuple[np.ndarray, np.ndarray]:
-        lower, upper = np.asarray(self.lower), np.asarray(self.upper)
-        log = self.logarithmic
-        logarithms = (np.log(np.where(log, bound, 1.0)) for bound in (lower, upper))
-        low, high = (np.where(log, inner, bound) for inner, bound in zip(logarithms, (lower, upper), strict=True))
-        return low, high
+    @property
+    def scale(self) -> Scale:
+        """What turns shares into gains."""
+        observers = tuple(k for k, name in enumerate(self.names) if gain_names.base(name) == "observer_gain")
+        width = self.names.index("sign_width") if self.hop else None
+        log = tuple(map(bool, self.logarithmic))
+        return Scale(np.asarray(self.lower), np.asarray(self.upper), np.asarray(self.hop), log, width, observers)
 
     def gains(self, share: Any) -> Any:
-        """Gains of shares of the intervals, (gains,), NumPy's or JAX's: 0 is the lower bound, 1 the upper one."""
-        xp, (low, high) = share.__array_namespace__(), self._scaled()
-        inner = low + (high - low) * share
-        gains = xp.where(self.logarithmic, xp.exp(inner), inner)
-        if not self.hop:
-            return gains
-        k, least = self._width, self._least_width(gains)
-        return xp.where(np.arange(len(self.names)) == k, least * (self.upper[k] / least) ** share[k], gains)
+        """Gains of shares of the intervals, see `Scale.gains`."""
+        return self.scale.gains(share)
 
     def share(self, gains: np.ndarray) -> np.ndarray:
         """Shares of gains, (gains,); of those beyond a bound the bound's."""
@@ -65,25 +92,19 @@ class Bounds:
         """
         both = np.where(which, self.share(gains), share)
         if self.hop:
-            both[self._width] = self._share(np.where(which, gains, self.gains(share)))[self._width]
+            width = self.names.index("sign_width")
+            both[width] = self._share(np.where(which, gains, self.gains(share)))[width]
         return both
 
     def _share(self, gains: np.ndarray) -> np.ndarray:
         """Shares of gains, (gains,); of those beyond a bound below 0 or above 1."""
-        low, high = self._scaled()
-        inner = np.where(self.logarithmic, np.log(np.maximum(gains, 1e-300)), gains)
-        if self.hop:
-            low[self._width] = np.log(self._least_width(gains))
-        return (inner - low) / (high - low)
-
-    @property
-    def _width(self) -> int:
-        return self.names.index("sign_width")
-
-    def _least_width(self, gains: Any) -> Any:
-        observers = [k for k, name in enumerate(self.names) if gain_names.base(name) == "observer_gain"]
-        least = self.hop / gains[np.asarray(observers)].min()
-        return gains.__array_namespace__().clip(least, self.lower[self._width], HALF * self.upper[self._width])
+        scale = self.scale
+        low, high, log = scale.lower.copy(), scale.upper, np.asarray(scale.log)
+        if scale.width is not None:
+            low[scale.width] = scale.least_width(gains)
+        ratio = np.where(log, high, np.e) / np.where(log, low, 1.0)
+        logarithms = np.log(np.maximum(np.where(log, gains, 1.0) / np.where(log, low, 1.0), 1e-300))
+        return np.where(log, logarithms / np.log(ratio), (gains - low) / (high - low))
 
     def at_bound(self, gains: np.ndarray) -> dict[str, str]:
         """Gains that ended within the share `NEAR` of their interval from a bound: name to "lower" or "upper"."""

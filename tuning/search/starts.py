@@ -3,6 +3,7 @@
 import math
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -17,23 +18,70 @@ CALL = 16  # of them between two reports
 CHARGE = 3.0  # F is a logarithm: a metric at twice its limit counts like 2^3 times the error
 APART = (0.5, 0.35, 0.2, 0.0)  # in the unit cube, along the gain in which two points differ most
 STEEP = 10.0  # times the charge, where many points are close to a limit
-CHOOSING = "choosing starts"
+CHOOSING, SPREADING = "choosing starts", "searching the whole box"
+WIDELY, MARGINS_LOOKED = 2048, 256  # points of a global search, and how many of them margins are evaluated for
 NEARLY = 0.05  # of a limit
 
 
 def starting_points(
-    evaluate: Evaluator, problem: Problem, first: np.ndarray, starts: int, seed: int, report: Report
+    evaluate: Evaluator,
+    problem: Problem,
+    first: np.ndarray,
+    designs: np.ndarray,
+    starts: int,
+    seed: int,
+    report: Report,
 ) -> np.ndarray:
-    """(starts, gains) these shares first, (gains,), then the most promising ones of a sweep over the others, far apart.
+    """Return starting points: these shares first, then the most promising of designs and a sweep that lie far apart.
 
-    A gain that an active limit hangs on, as the peak torque hangs on eta, keeps its value: else most of the sweep would
-    break the limit.
+    In the sweep a gain that an active limit depends on most, as the peak torque depends on eta, keeps its value: else
+    most of the points would break the limit.
+
+    Args:
+        evaluate: measures the problem.
+        problem: what is minimised.
+        first: (gains,) shares of the first point.
+        designs: (designs, gains) shares.
+        starts: how many points to return.
+        seed: of the sweep.
+        report: is called after every few points.
+
+    Returns:
+        (starts, gains) shares.
     """
-    share = spread(len(problem.names), max(SWEPT, starts), np.random.default_rng(seed))
+    share = spread(len(problem.names), max(SWEPT - len(designs), starts), np.random.default_rng(seed))
     held = held_by_limits(evaluate.slopes(problem, first[None]))
     share[:, held] = first[held]
+    share = np.concatenate([designs.reshape(-1, first.size), share])
     chosen = promising(evaluate, problem, share, starts - 1, partial(report, CHOOSING))
     return np.concatenate([first[None], chosen])
+
+
+def spread_widely(evaluate: Evaluator, problem: Problem, count: int, seed: int, report: Report) -> np.ndarray:
+    """Return the most promising of `WIDELY` points of the whole box that lie far apart, (count, gains) shares.
+
+    Margins take far longer than simulations and can only add to a violation. They are evaluated for the points in the
+    order of the rest of their merit, until no further point can be among the best.
+    """
+    share = spread(len(problem.names), WIDELY, np.random.default_rng(seed))
+    without = problem if problem.margins is None else replace(problem, margins=None)
+    merits = np.zeros(0)
+    for k in range(0, WIDELY, CALL):
+        merits = np.append(merits, merit(evaluate.fly(without, share[k : k + CALL]), STEEP))
+        report(SPREADING, k + CALL, WIDELY, np.nan, np.nan)
+    order = np.argsort(merits, kind="stable")
+    if without is not problem:
+        known = np.full(WIDELY, np.inf)
+        for k in range(0, MARGINS_LOOKED, CALL):
+            some = order[k : k + CALL]
+            if merits[some[0]] >= np.sort(known)[count]:
+                break
+            known[some] = merit(evaluate.fly(problem, share[some]), STEEP)
+            report(SPREADING, WIDELY, WIDELY, np.nan, np.nan)
+        merits = known
+        order = np.argsort(merits, kind="stable")
+    promising = [int(k) for k in order[: 8 * count] if np.isfinite(merits[k])]
+    return share[far_apart(promising, distances(share), count)]
 
 
 def held_by_limits(at: Sloped) -> list[int]:

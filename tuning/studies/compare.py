@@ -33,7 +33,16 @@ from tuning.studies import judging, stability, tuner
 OURS, PAPER = "prescribed_time", "paper"  # the paper's law as tuned, and with the paper's gains
 OFF = 0.1  # share by which the inertia differs from what laws are told
 UNTOLD = ("heavier", "lighter", "later")
-KEPT = ("objective", "level", "torque_weight", "worst_case", "trials", "starts", "steps")  # of `tune`, for every law
+KEPT = (
+    "minimise",
+    "statistic",
+    "level",
+    "torque_weight",
+    "worst_case",
+    "trials",
+    "starts",
+    "steps",
+)  # of `tune`, for every law
 
 
 @dataclass(frozen=True)
@@ -187,7 +196,7 @@ def that_fly(scenario: Scenario, rivals: Rivals = Rivals()) -> dict[str, Scenari
 
 def _posed(other: Scenario, tune: tables.Tune, same: dict[str, Any]) -> Scenario:
     """With the default gains of its law free, and t_f in the same interval where it is what is minimised."""
-    if tune.objective != T_F:
+    if tune.minimise != T_F:
         return replace(other, tune=same)
     free = [*replace(other, tune={}).search.gains, "t_f"]
     return replace(other, tune={**same, "free": free, "bounds": {"t_f": tune.bounds["t_f"]}})

@@ -13,6 +13,7 @@ from ptsmc_jax.figures import study_plots, style
 from ptsmc_jax.scenario import Study, errors, keys, own, parsing, study
 from ptsmc_jax.scenario import replace as changed
 from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.scenario.gain_bounds import hand_over
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation.rollout import Parts
 from ptsmc_jax.theory import borders, covariance, margins, run_margins
@@ -105,6 +106,19 @@ def axis(text: str, option: str) -> Axis:
         those = "two whole numbers" if key in WHOLE_NUMBERS else "two values that differ in six digits"
         raise UsageError(f"{wanted}, with {those} between LOW and HIGH at least")
     return Axis(key, different, span if len(different) < count or key in WHOLE_NUMBERS else "")
+
+
+def usual_periods(scenario: Scenario) -> str:
+    """Return the default axis across: periods about the scenario's own."""
+    period = scenario.loop.period
+    return f"{PERIOD}={0.4 * period:.4g}:{10.0 * period:.4g}:9"
+
+
+def usual_deltas(scenario: Scenario) -> str:
+    """Return the default axis up: hand-over times from a period to a seventh of t_f, the scenario's own among them."""
+    delta, shortest = hand_over(scenario), scenario.loop.period
+    longest = max(scenario.controller.t_f / 7.0, 2.0 * delta)
+    return f"{DELTA}={min(delta, shortest):.4g}:{longest:.4g}:9"
 
 
 def fly(scenario: Scenario, x: Axis, y: Axis, seed: int, trials: int, tell: Callable[[int, int], None]) -> Map:

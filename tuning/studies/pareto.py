@@ -25,7 +25,7 @@ from tuning.search.cma_es import NEARBY
 from tuning.search.descent import Best
 from tuning.search.descents import Descents
 from tuning.search.journal import Journal
-from tuning.search.objective import T_F, Problem, replaced
+from tuning.search.objective import Problem, replaced
 from tuning.search.optimise import Search
 from tuning.search.progress import Report, headed
 from tuning.search.rounds import MARGIN
@@ -178,8 +178,8 @@ def check_search(scenario: Scenario, against: str, why: str = "") -> None:
 
     why: what speaks against moving them.
     """
-    if scenario.search.objective == T_F:
-        raise wrong("tune.objective", T_F, f'"rms", "worst" or "cvar" {against}')
+    if scenario.search.minimise != "window_error":
+        raise wrong("tune.minimise", scenario.search.minimise, f'"window_error" {against}')
     if scenario.search.worst_case:
         raise wrong("tune.worst_case", True, f"false {against}{why}")
 

@@ -1,9 +1,11 @@
 """The tuning problem of a scenario over its training trials, and what evaluates it."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
 from ptsmc_jax.scenario import Study, replace, study, tables
@@ -14,11 +16,11 @@ from tuning.search import confirm, gains, margin_rows, objective
 from tuning.search import shares as gain_bounds
 from tuning.search.evaluate import Evaluator
 from tuning.search.journal import Journal
-from tuning.search.objective import T_F, Problem
+from tuning.search.objective import Problem
 from tuning.search.optimise import Search, Settings, search
 from tuning.studies import judging
 
-DIGITS = 6  # of the gains handed over; what is judged is what is handed over
+DIGITS = 10  # of the gains handed over; what is judged is what is handed over
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,7 @@ class Posed:
     sloped: bool  # F has slopes to go by: no gain is flown with the exact sign
     asked: list[Requirement]  # what the search keeps
     seed: int
+    designs: np.ndarray  # (designs, gains) starting points that follow from the mission
 
     def search(
         self,
@@ -50,7 +53,7 @@ class Posed:
         callbacks: `report` and `prepare` of `search`.
         """
         table, asked = self.ready.scenario.search, self.asked if asked is None else asked
-        settings = Settings(starts, table.steps, self.seed, self.sloped, table.worst_case, judged, margin)
+        settings = Settings(starts, table.steps, self.seed, self.sloped, table.worst_case, judged, margin, self.designs)
         return search(self.evaluate, problem, asked, gains, settings, **callbacks)
 
     def named(self, share: np.ndarray) -> dict[str, float]:
@@ -58,8 +61,24 @@ class Posed:
         return self.evaluate.bounds.rounded(self.evaluate.bounds.gains(share), DIGITS)
 
 
-def pose(scenario: Scenario, seed: int, journal: Journal | None = None, **farther: float) -> Posed:
-    """The tuning problem of a scenario; farther: see `reach`."""
+def with_bounds(scenario: Scenario, moved: Mapping[str, tuple[float, float]]) -> Scenario:
+    """Return the scenario with other bounds of some gains, which still count as default ones."""
+    tune = msgspec.structs.replace(scenario.search, bounds={**scenario.search.bounds, **moved})
+    return msgspec.structs.replace(scenario, tune=tune)
+
+
+def pose(
+    scenario: Scenario, seed: int, journal: Journal | None = None, evaluate: Evaluator | None = None, **farther: float
+) -> Posed:
+    """Return the tuning problem of a scenario.
+
+    Args:
+        scenario: what is tuned.
+        seed: of the training trials and the search.
+        journal: of evaluations.
+        evaluate: what counted the simulations of an earlier search of the scenario with other bounds.
+        farther: see `reach`.
+    """
     scenario, table = as_trained(scenario), scenario.search
     ready = study(scenario, reach=reach(scenario, table, **farther))
     bounds = gain_bounds.of_scenario(scenario, ready.parts)
@@ -75,14 +94,19 @@ def pose(scenario: Scenario, seed: int, journal: Journal | None = None, **farthe
         asked,
         may_break=tuple(allowed for allowed, _ in may_break),
         banded=tuple(banded for _, banded in may_break),
-        goal=T_F if table.objective == T_F else "window_error",
+        goal=table.minimise,
         tail=_tail(table, trained),
+        statistic="quantile" if table.statistic == "quantile" else "mean" if table.statistic == "mean" else "rms",
         torque_weight=table.torque_weight,
         margins=margin_rows.ask(ready, bounds, seed),
     )
     own = np.asarray(gains.own(ready.parts, bounds.names))
     exact = scenario.exact_sign and "sign_width" not in bounds.names
-    return Posed(ready, problem, Evaluator(bounds, journal), own, not exact, asked, seed)
+    designs = np.asarray(gains.of_designs(scenario, ready.parts, bounds.names))
+    measures = Evaluator(bounds, journal)
+    if evaluate is not None:
+        measures.rollouts, measures.gradients = evaluate.rollouts, evaluate.gradients
+    return Posed(ready, problem, measures, own, not exact, asked, seed, designs)
 
 
 def as_trained(scenario: Scenario) -> Scenario:
@@ -122,7 +146,10 @@ def reach(scenario: Scenario, table: tables.Tune, **farther: float) -> Reach:
 
 def _tail(table: tables.Tune, trials: int) -> int | None:
     """How many of the worst training trials are averaged."""
-    if table.objective in ("rms", T_F):
+    if table.statistic in ("rms", "mean"):
         return None
-    assert table.level is not None or table.objective == "worst"
-    return 1 if table.level is None else max(1, round((1.0 - table.level) * trials))
+    if table.statistic == "worst":
+        return 1
+    assert table.level is not None
+    beyond = (1.0 - table.level) * trials
+    return max(1, round(beyond) if table.statistic == "cvar" else math.floor(beyond + 1e-9) + 1)

@@ -11,13 +11,13 @@ import numpy as np
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.montecarlo import Trials
 from ptsmc_jax.scenario import cautions, free_gains, own, parsing
-from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.scenario.tables import LIMITS, T_F, Scenario, objective_name
 from ptsmc_jax.simulation import catalogues
 from tuning.search import gains as gain_names
 from tuning.search import own_parts, trust
 from tuning.search.descents import Step
 from tuning.studies import judging
-from tuning.studies.tuner import GOALS, Beyond, Trust, Tuning
+from tuning.studies.tuner import Beyond, Trust, Tuning
 
 JUDGED = {"window_error": "rms", "peak_torque": "mean", "effort": "mean"}  # statistics with an interval
 
@@ -83,7 +83,8 @@ def summary(tuning: Tuning) -> dict[str, Any]:
         "judged_on": judging.judged_on(tuning.tuned),
         "cautions": cautions.of(tuning.tuned),
         "search": {
-            "objective": tuning.tuned.search.objective,
+            "objective": objective_name(tuning.tuned.search),
+            "minimise": tuning.tuned.search.minimise,
             "goal": search.value,
             "starts": len({step.start for step in search.history}),
             "steps": len(search.history),
@@ -91,6 +92,7 @@ def summary(tuning: Tuning) -> dict[str, Any]:
             "margin": search.margin,
             "earlier": [asdict(earlier) for earlier in tuning.earlier],
             "largest_over_limit": dict(zip(search.problem.rows, search.worst.tolist(), strict=True)),
+            "conflict": search.conflict,
             "confirmed": [
                 {**{k: v for k, v in asdict(one).items() if k != "harder"}, "held": one.held} for one in search.counts
             ],
@@ -181,8 +183,8 @@ def write(folder: Path, scenario: Scenario, tuning: Tuning, figures: bool, known
 
 def history_columns(scenario: Scenario, limited: Iterable[str]) -> list[str]:
     """Names of the columns of `history.csv`; limited: metrics that the last ones tell as shares of limits."""
-    objective = scenario.search.objective
-    goal = "goal_t_f" if objective == "t_f" else f"{objective}_window_error"  # t_f is a gain's name too
+    tune = scenario.search
+    goal = f"objective_{tune.minimise}" if tune.minimise in (T_F, LIMITS) else f"{tune.statistic}_{tune.minimise}"
     return ["step", "start", goal, *gain_names.named(scenario), *(f"{metric}_over_limit" for metric in limited)]
 
 
@@ -210,8 +212,10 @@ def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
         beyond = np.full_like(np.asarray(of(paths[0][0])), missing)
         return np.stack([[of(path[k]) if k < len(path) else beyond for path in paths] for k in range(longest)])
 
-    unit = "s" if scenario.search.objective == "t_f" else catalogues.CATALOGUES[kind]["window_error"].unit
-    goal = f"{GOALS[scenario.search.objective].replace(' window', chr(10) + 'window')} [{unit}]"
+    known = {T_F: "s", LIMITS: "-", **catalogues.units(kind)}
+    goal = (
+        f"{objective_name(scenario.search).replace(' window', chr(10) + 'window')} [{known[scenario.search.minimise]}]"
+    )
     moved = over_steps(lambda step: step.gains)
     figures: dict[str, Any] = {
         "history": study_plots.tuning_history(

@@ -26,7 +26,7 @@ from tuning.search.trust import Profile
 from tuning.studies import judging, posing, stability
 from tuning.studies.posing import Posed
 
-GOALS = {"rms": "RMS window error", "worst": "largest window error", "cvar": "CVaR of the window error", "t_f": "t_f"}
+WIDENED, NEARBY = 3, 4  # searches in larger bounds, at most, and starting points of each
 TRIES = 3  # searches at most, each of whose gains are judged on fresh trials of their own
 FARTHER = 1.02  # a further search keeps so much more from the limits than what fresh trials found too little
 SENSITIVE = ("window_error", "hold_error", "peak_torque", "effort", "chattering")  # metrics whose slopes are shown
@@ -143,9 +143,9 @@ def tune(
     started = time.monotonic()
     report("compiling", 0, 0, np.nan, 0.0)
     posed = posing.pose(scenario, seed, journal)
-    evaluate = posed.evaluate
     others, refused = judging.beside(scenario)
-    judged, earlier = _search_and_judge(scenario, posed, seed, report, tries)
+    judged, earlier, posed = _search_and_judge(scenario, posed, journal, report, tries)
+    evaluate = posed.evaluate
     outcome, rollouts, gradients = judged.search, evaluate.rollouts, evaluate.gradients
     check = None
     if globally and not outcome.interrupted:
@@ -187,24 +187,61 @@ def tune(
 
 
 def _search_and_judge(
-    scenario: Scenario, posed: Posed, seed: int, report: Report, tries: int
-) -> tuple[_Judged, list[Try]]:
-    """Search and judge; again, with more distance from the limits, where fresh trials break what the search kept."""
-    look = partial(posed.search, posed.problem, report=report)
+    scenario: Scenario, posed: Posed, journal: Journal | None, report: Report, tries: int
+) -> tuple[_Judged, list[Try], Posed]:
+    """Search, in larger bounds if gains end on default ones, and verify on held-out trials.
+
+    If these break a limit that the search kept, search again with more distance from the limits.
+    """
     starts = scenario.search.starts  # of a further search too: near the gains found there may be none that keep more
-    outcome = look(posed.own, starts, prepare=partial(_prepare, scenario))
+    outcome = posed.search(posed.problem, posed.own, starts, report=report, prepare=partial(_prepare, scenario))
+    outcome, posed = _in_larger_bounds(outcome, posed, journal, report)
+    look, seed = partial(posed.search, posed.problem, report=report), posed.seed
+    scenario = posed.ready.scenario
     earlier = list[Try]()
     while True:
         report("judging on fresh trials", 0, 0, outcome.value, outcome.over)
         judged = _judge(scenario, posed, outcome, judging.seed_of_judge(seed, len(earlier)))
         over = _over(outcome, judged.verdicts)
         if not over or outcome.interrupted or len(earlier) + 1 >= tries:
-            return judged, earlier
+            return judged, earlier, posed
         earlier.append(Try(judged.seed, judged.gains, outcome.margin, over))
         reached = dict(zip(outcome.problem.rows, outcome.worst, strict=True))  # on the trials of the search
         margin = 1.0 - min(float(reached[name]) / (FARTHER * over[name]) for name in over)
         more = look(outcome.gains, starts, margin=margin)
         outcome = replace(more, history=[*outcome.history, *_after(outcome.history, more.history)])
+
+
+def _in_larger_bounds(outcome: Search, posed: Posed, journal: Journal | None, report: Report) -> tuple[Search, Posed]:
+    """Search on in larger bounds as long as gains end on default bounds that matter, several gains at once."""
+    defaulted = posed.ready.scenario.defaulted
+    for _ in range(WIDENED):
+        if outcome.interrupted or not posed.sloped:
+            break
+        sides = _that_matter(posed, outcome, posed.evaluate.bounds.at_bound(outcome.gains))
+        scenario = posed.ready.scenario
+        moved = free_gains.widened(scenario, {gains.base(name): side for name, side in sides.items()}, defaulted)
+        if not moved:
+            break
+        report(f"searching beyond the bounds of {', '.join(moved)}", 0, 0, outcome.value, outcome.over)
+        larger = posing.pose(posing.with_bounds(scenario, moved), posed.seed, journal, evaluate=posed.evaluate)
+        more = larger.search(larger.problem, outcome.gains, NEARBY, report=report)
+        history = [*outcome.history, *_after(outcome.history, more.history)]
+        better = (more.over, more.value) < (outcome.over, outcome.value * (1.0 - trust.FLAT))
+        if not better:
+            outcome = replace(outcome, history=history)
+            break
+        outcome, posed = replace(more, history=history), larger
+    return outcome, posed
+
+
+def _that_matter(posed: Posed, outcome: Search, sides: dict[str, str]) -> dict[str, str]:
+    """Return the gains on a bound that the objective or a limit depends on there."""
+    names, found = posed.evaluate.bounds.names, outcome.share
+    points = np.asarray([found, *(np.where(np.isin(names, name), np.abs(found - 0.1), found) for name in sides)])
+    seen = posed.evaluate.fly(outcome.problem, points)
+    changes = np.abs(seen.f - seen.f[0]) + np.abs(seen.beyond - seen.beyond[0])
+    return {name: side for (name, side), change in zip(sides.items(), changes[1:], strict=True) if change > trust.FLAT}
 
 
 def _judge(scenario: Scenario, posed: Posed, outcome: Search, fresh_seed: int) -> _Judged:
@@ -282,7 +319,7 @@ def _beyond(judged: _Judged, at_bound: dict[str, str]) -> dict[str, Beyond]:
     Of the sampled loop, where what is minimised is an error.
     """
     beyond, tuned = dict[str, Beyond](), judged.scenario
-    if not tuned.sampled or tuned.search.objective == T_F:
+    if not tuned.sampled or tuned.search.minimise != "window_error":
         return beyond
     for name, side in at_bound.items():
         value = free_gains.beyond(tuned, gains.base(name), side)

@@ -1,0 +1,216 @@
+"""Defaults that follow from the mission: the paper's numbers, scaled, and gains designed for the sampled loop.
+
+Two scales carry every default with a unit. Time is measured in t_f, and inertia in the mean moment of the body. A
+scenario whose times, inertias and torques are all stated in other units therefore gets the same defaults in those
+units. The paper's own cases keep the paper's numbers (`published`).
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+
+from ptsmc_jax.scenario.values import Scaled, Table
+
+PAPER_INERTIA = (10.0, 12.0, 14.0)  # of the paper's spacecraft [kg m^2]
+PAPER_TIMES = (30.0, 40.0)  # range of t_f in the paper's cases of a spacecraft [s]
+CHAIN_TIME = 5.0  # t_f of the paper's integrator chains [s]
+
+# p T, the rate of both poles in the hold phase over the inverse dead time. A double integrator with both poles at -p
+# has its crossover at 2.06 p with 76 deg of phase. At p T = 0.25 the dead time T takes 30 deg of it; the gain margin is
+# then about 9 dB.
+STABLE = 0.25
+FASTEST_MODE = math.pi / 3  # w T up to which a mode is phase stabilised: its circle stays 30 deg away from -1
+SIGMAS = 5.0  # largest of the noise in a campaign, in sigmas
+NOISE_FRACTION = 0.5  # of the torque limit that noise may take
+SLOWEST = 20.0  # p t_f, at least: the rest at the hand-over has then decayed by t_f + t_f / 4
+LEAST_ETA = 2.4  # below 2.386 the braking peak exceeds the first torque, see `theory.rules.later_peak_ratio`
+TRIED = 256  # rates among which the most accurate is chosen
+
+
+class Scales(NamedTuple):
+    """Units of a mission: its mean moment of inertia and its t_f, over those of the paper's case."""
+
+    inertia: float
+    time: float
+    order: int = 2  # of the plant
+    inputs: int = 3
+
+    def of(self, scaled: Scaled) -> Any:
+        """Return a number of the paper's case, or a tuple of numbers, in these units."""
+        factor = self.inertia**scaled.inertia * self.time ** (scaled.time + scaled.order * self.order)
+        return _times((scaled.value,) * self.inputs if scaled.each else scaled.value, factor)
+
+
+def _times(value: Any, factor: float) -> Any:
+    return tuple(_times(one, factor) for one in value) if isinstance(value, tuple) else factor * value
+
+
+def published(scenario: Any) -> bool:
+    """Whether the scenario is one of the paper's cases, whose numbers then stay as published."""
+    t_f = scenario.controller.t_f
+    if scenario.moments[0] is None:
+        return t_f == CHAIN_TIME
+    return tuple(np.ravel(scenario.spacecraft.inertia)) == PAPER_INERTIA and PAPER_TIMES[0] <= t_f <= PAPER_TIMES[1]
+
+
+def scales(scenario: Any) -> Scales:
+    """Return the mission's units: 1 for the paper's cases, and for the inertia of a plant without a body."""
+    plant, mean, t_f = (scenario.order, scenario.inputs), scenario.moments[0], scenario.controller.t_f
+    if published(scenario):
+        return Scales(1.0, 1.0, *plant)
+    if mean is None:
+        return Scales(1.0, t_f / CHAIN_TIME, *plant)
+    return Scales(mean / PAPER_INERTIA[1], t_f / PAPER_TIMES[0], *plant)
+
+
+def with_defaults(table: Any, units: Scales) -> Any:
+    """Fill the absent keys of a table, and of the tables in it, that have a number of the paper's case as default."""
+    changes: dict[str, Any] = {}
+    for key in table.__struct_fields__:
+        value = getattr(table, key)
+        if value is None and key in table.scaled:
+            changes[key] = units.of(table.scaled[key])
+        elif isinstance(value, Table):
+            changes[key] = with_defaults(value, units)
+        elif isinstance(value, tuple) and value and isinstance(value[0], Table):
+            changes[key] = tuple(with_defaults(one, units) for one in value)
+    return msgspec.structs.replace(table, **changes) if changes else table
+
+
+class Design(NamedTuple):
+    """Gains of the sampled loop in terms of the mission, whatever the law.
+
+    After the hand-over the closed loop is (s + p)^2; before it the rate gain (2 eta - 1) / tau reaches its value in the
+    hold phase, 2 p, at tau = delta.
+    """
+
+    eta: float
+    pole: float  # p [1/s]
+    observer: float  # l / J [1/s]
+    width: float  # of the boundary layer, in units of s
+    time: float  # t_f in the units of the paper's case, see `Scales`
+
+    @property
+    def delta(self) -> float:
+        """The hand-over lies this long before t_f [s]."""
+        return (2.0 * self.eta - 1.0) / (2.0 * self.pole)
+
+    @property
+    def rate(self) -> float:
+        """Factor on the rates of laws whose gains follow t_f [-]: as in the paper's case, but within the bandwidth."""
+        return min(1.0 / self.time, 2.0 * self.pole)
+
+
+class _Limits(NamedTuple):
+    """Rates [1/s] between which p lies, and the most accurate one."""
+
+    least: float
+    accurate: float
+    most: float
+
+
+def design(scenario: Any) -> Design:
+    """Return the design whose predicted error in the hold phase is the smallest."""
+    limits = _limits(scenario)
+    return _design(scenario, limits.accurate, _eta(scenario), 1.0)
+
+
+def designs(scenario: Any) -> list[Design]:
+    """Return starting points of a search: slow to fast hold phases, slow and fast observers, the default first."""
+    limits, eta, stable = _limits(scenario), _eta(scenario), STABLE / dead_time(scenario)
+    rates = [limits.accurate, limits.most, math.sqrt(limits.least * limits.most), limits.least, stable]
+    found = [_design(scenario, rate, eta, observer) for observer in (1.0, 0.1) for rate in rates]
+    return [*found, _design(scenario, limits.accurate, _least_eta(scenario), 0.3)]
+
+
+def dead_time(scenario: Any) -> float:
+    """Time from measuring to acting [s]: the delay, half a period of the hold, lag and command filter."""
+    devices, period = scenario.devices, scenario.loop.period
+    filtering = devices.command_filter
+    return (
+        (devices.delay_periods + 0.5) * period
+        + (devices.torque_lag or 0.0)
+        + (0.0 if filtering is None else filtering.dead_time())
+    )
+
+
+def _design(scenario: Any, pole: float, eta: float, observer: float) -> Design:
+    law, limits = scenario.controller, _limits(scenario)
+    pole, period = max(pole, limits.least), scenario.loop.period
+    longest = 0.5 * (law.t_f + period)  # of delta
+    eta = min(eta, max(0.5 + pole * longest, _least_eta(scenario)))
+    rate = min(observer * pole, 1.0 / period)
+    position, velocity = scenario.devices.noise_of_error(scenario)
+    # the slope of the boundary layer adds a quarter to the gain p, and its width exceeds the noise of s
+    residual = _disturbance(scenario)[1] / rate
+    width = max(4.0 * residual / pole, 2.0 * math.hypot(velocity, pole * position)) or 1e-3 * pole
+    return Design(eta, pole, rate, width, scales(scenario).time)
+
+
+def _limits(scenario: Any) -> _Limits:
+    """Return the range of p.
+
+    The most is what dead time, flexible modes, and noise against the torque limit allow. The most accurate is where the
+    sum of the squares of three errors is least: the lag c / p^3 behind a disturbance that changes by c, the position
+    noise sigma (p h)^(1/2), and the rate noise sigma (h / p)^(1/2).
+    """
+    t_f, period = scenario.controller.t_f, scenario.loop.period
+    most = min(STABLE / dead_time(scenario), _with_modes(scenario), _with_noise(scenario))
+    least = SLOWEST / t_f
+    if most <= least:  # slow by need, but the hand-over lies within the second half of t_f
+        slow = max(most, (2.0 * _least_eta(scenario) - 1.0) / t_f)
+        return _Limits(slow, slow, slow)
+    position, velocity = scenario.devices.noise_of_error(scenario)
+    position = 0.0 if scenario.estimator.on else position  # an attitude filter passes slow errors only
+    rates = least * (most / least) ** np.linspace(0.0, 1.0, TRIED)
+    lag = _disturbance(scenario)[1] / rates**3
+    error = lag**2 + position**2 * rates * period + velocity**2 * period / rates
+    return _Limits(least, float(rates[int(np.argmin(error))]), most)
+
+
+def _with_modes(scenario: Any) -> float:
+    """Return the largest p [1/s] that keeps the resonance of every late mode 6 dB below 1.
+
+    At its resonance w a mode with the fraction k of the inertia and the damping z raises the loop gain 2 p / w by
+    k / (2 z). A mode with w T up to `FASTEST_MODE` needs no limit.
+    """
+    found = math.inf
+    for frequency, damping, fraction in scenario.modes():
+        if frequency * dead_time(scenario) > FASTEST_MODE and fraction > 0.0:
+            found = min(found, 0.5 * damping * frequency / fraction)
+    return found
+
+
+def _with_noise(scenario: Any) -> float:
+    """Return the largest p [1/s] whose noise leaves the torque within `NOISE_FRACTION` of its limit.
+
+    A sample's noise asks for the acceleration of the error (2 p + l / J) v + p^2 x, with l / J = p / 2.
+    """
+    limit = scenario.largest_acceleration()
+    position, velocity = scenario.devices.noise_of_error(scenario)
+    position *= scenario.estimator.passes(scenario)
+    if limit is None or not (position or velocity):
+        return math.inf
+    allowed, square = NOISE_FRACTION * limit / SIGMAS, (2.5 * velocity) ** 2
+    return math.sqrt(2.0 * allowed**2 / (square + math.sqrt(square**2 + 4.0 * (position * allowed) ** 2)))
+
+
+def _disturbance(scenario: Any) -> tuple[float, float]:
+    """Return size and rate of what disturbs the error's acceleration; zeros if they are not known yet."""
+    law = scenario.controller
+    return tuple((value or 0.0) * scenario.influence for value in (law.disturbance_bound, law.disturbance_rate_bound))
+
+
+def _least_eta(scenario: Any) -> float:
+    return scenario.least_eta + (LEAST_ETA - 2.0)
+
+
+def _eta(scenario: Any) -> float:
+    """Return the paper's eta, or a smaller one if its first torque would exceed the limit."""
+    usual, limit, angle = scenario.least_eta + 1.0, scenario.largest_acceleration(), scenario.start_tangent()
+    if limit is None or angle == 0.0:
+        return usual
+    # the error's first acceleration is eta^2 tan(angle / 2) / t_f^2; a tenth of the limit is left for the rest
+    return min(usual, max(scenario.controller.t_f * math.sqrt(0.9 * limit / angle), _least_eta(scenario)))
