@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
+from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.values import Scaled, Table
 
 PAPER_INERTIA = (10.0, 12.0, 14.0)  # of the paper's spacecraft [kg m^2]
@@ -39,7 +40,14 @@ class Scales(NamedTuple):
 
     def of(self, scaled: Scaled) -> Any:
         """Return a number of the paper's case, or a tuple of numbers, in these units."""
-        factor = self.inertia**scaled.inertia * self.time ** (scaled.time + scaled.order * self.order)
+        with np.errstate(all="ignore"):
+            time = np.float64(self.time) ** (scaled.time + scaled.order * self.order)
+            factor = float(np.float64(self.inertia) ** scaled.inertia * time)
+        if not 0.0 < factor < math.inf:
+            raise ScenarioError(
+                f"controller.t_f is {self.time:g} times and the body's inertia {self.inertia:g} times the paper's, "
+                "beyond which defaults are no numbers; allowed are numbers nearer to the paper's"
+            )
         return _times((scaled.value,) * self.inputs if scaled.each else scaled.value, factor)
 
 
@@ -165,8 +173,9 @@ def _limits(scenario: Any) -> _Limits:
     position, velocity = scenario.devices.noise_of_error(scenario)
     position = 0.0 if scenario.estimator.on else position  # an attitude filter passes slow errors only
     rates = least * (most / least) ** np.linspace(0.0, 1.0, TRIED)
-    lag = _disturbance(scenario)[1] / rates**3
-    error = lag**2 + position**2 * rates * period + velocity**2 * period / rates
+    with np.errstate(all="ignore"):
+        lag = _disturbance(scenario)[1] / rates**3
+        error = lag**2 + position**2 * rates * period + velocity**2 * period / rates
     return _Limits(least, float(rates[int(np.argmin(error))]), most)
 
 

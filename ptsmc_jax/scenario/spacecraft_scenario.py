@@ -254,6 +254,9 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
                     formulas.check_inertia(value)
                 except ValueError as error:
                     raise ScenarioError(f"spacecraft.{key} is {errors.brief(value)}: {error}") from None
+
+    def check_modes(self) -> None:
+        """Modes that a body can have."""
         if self.flexible is not None:
             self.flexible.check(self.true_inertia)
 

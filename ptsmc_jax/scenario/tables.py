@@ -310,7 +310,10 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
         return msgspec.structs.replace(self, observer=self.observer.written(self))
 
     def check_body(self) -> None:
-        """Raise ScenarioError where there is no such body: before defaults follow from it."""
+        """Raise ScenarioError if there is no such body: before defaults follow from its inertia."""
+
+    def check_modes(self) -> None:
+        """Raise ScenarioError if no body has such modes: before gains are designed for them."""
 
     def check_plant(self) -> None:
         """Raise ScenarioError where keys of the plant contradict each other."""

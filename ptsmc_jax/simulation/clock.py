@@ -232,4 +232,4 @@ def _largest_steps(
     """Largest steps before and after the hand-over [s]."""
     rapid = 0.3 / max(frequency, 1e-12)
     before = min(t_f / 200.0 / _refinement(order), rapid, 1.5 / max(layer[0], 1e-12))
-    return before, min(t_f / 50.0, 0.1 / hold_rate, rapid, 1.5 / max(layer[1], 1e-12))
+    return before, min(t_f / 50.0, 0.1 / max(hold_rate, 1e-300), rapid, 1.5 / max(layer[1], 1e-12))
