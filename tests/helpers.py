@@ -36,16 +36,27 @@ FULL_INERTIA = ((11.0, 1.5, -0.7), (1.5, 9.0, 0.4), (-0.7, 0.4, 14.0))
 PAPER_ATTITUDE = np.array([np.sqrt(2) / 3, -1 / 3, np.sqrt(3) / 3, np.sqrt(3) / 3])
 
 
-# a scenario that flies and tunes in seconds; within the bounds, and a step beyond them, a period has five integration
-# steps, so that one program flies all gains
+# A scenario whose simulation and search take seconds. Within the bounds, and a step beyond them, a period has five
+# integration steps, so that one program simulates all gains. Gains, disturbance and window are stated, because their
+# defaults follow t_f.
 SHORT = """
 [controller]
 t_f = 5.0
 delta = 0.5
+eta = 3.0
+k1 = 1.0
+surface_rate = 1.0
+sign_width = 1e-3
+[observer]
+gain = [10.0, 10.0, 10.0]
+[disturbance]
+amplitude = [0.01, 0.01, 0.01]
+frequency = [0.1, 0.1, 0.1]
 [loop]
 mode = "sampled"
 period = 0.1
 t_end = 6.5
+window = 1.0
 [hardware]
 attitude_noise = 2e-5
 rate_noise = 1e-6
@@ -270,6 +281,7 @@ def small_search(monkeypatch, fresh=40):
         (confirm, "FRESH", fresh),
         (confirm, "FEWEST", 64),
         (starts, "SWEPT", 16),
+        (starts, "WIDELY", 64),
         (descents, "MANY", 16),
         (cma_es, "GENERATIONS", 3),
     ):

@@ -57,8 +57,8 @@ HOUSE = {
         """,
         "scenario": """
             errors systems values
-            attitude_keys dispersion_tables gain_record keys pointing_table scales
-            command_filter_tables
+            attitude_keys dispersion_tables gain_record keys mission pointing_table
+            command_filter_tables scales
             device_tables gain_bounds own start_checks
             disturbance_bounds
             disturbance_tables law_record observer_tables own_devices reference_tables

@@ -55,6 +55,16 @@ class Bias(Constant):
     drawn: ClassVar[Mapping[str, str]] = {}
 
 
+def _shifted(angle: Array, phase: Any) -> tuple[Array, Array]:
+    """Return sin and cos of angle + phase.
+
+    In a batch of trials with drawn phases, sin and cos of the angle are shared, and those of the phase are constant.
+    """
+    sine, cosine = jnp.sin(angle), jnp.cos(angle)
+    sine_0, cosine_0 = jnp.sin(phase), jnp.cos(phase)
+    return sine * cosine_0 + cosine * sine_0, cosine * cosine_0 - sine * sine_0
+
+
 @pytree
 @dataclass(frozen=True)
 class Sinusoid(Disturbance):
@@ -68,7 +78,8 @@ class Sinusoid(Disturbance):
 
     def __call__(self, t: Time, x: Any = None) -> Float[Array, " m"]:
         """Disturbance at t [s], (m,) [N m]."""
-        return self.bias + self.amplitude * jnp.sin(self.frequency * t + self.phase)
+        swing, _ = _shifted(self.frequency * t, self.phase)
+        return self.bias + self.amplitude * swing
 
 
 @pytree
@@ -87,8 +98,8 @@ class GravityGradient(Disturbance):
 
     def __call__(self, t: Time, x: AttitudeState) -> Float[Array, "3"]:
         """Torque at t [s] in the state x, (3,) [N m]."""
-        along = self.rate * t + self.phase
-        radial = jnp.stack([jnp.cos(along), jnp.sin(along), jnp.zeros_like(along)])
+        sine, cosine = _shifted(self.rate * t, self.phase)
+        radial = jnp.stack([cosine, sine, jnp.zeros_like(sine)])
         c = attitude.rotate(attitude.multiply(attitude.conjugate(x.q), self.orbit), radial)
         return 3.0 * self.rate**2 * attitude.cross(c, self.inertia @ c)
 

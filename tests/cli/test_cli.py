@@ -136,8 +136,9 @@ def test_tune_from_start_to_end(command, tmp_path, monkeypatch, text):
     header, *rows = (tmp_path / "t" / "history.csv").read_text().splitlines()
     assert header == "step,start,rms_window_error,eta,delta,peak_torque_over_limit"
     assert len(rows) == summary["search"]["steps"] >= 2
-    # the gains beat the paper's on the same trials, in this noise too
-    assert summary["fresh"]["window_error"]["rms"] < summary["paper"]["window_error"]["rms"]
+    # the gains beat those of the scenario on the same trials, in this noise too; the published gains, scaled to this
+    # t_f, have a faster surface and a faster observer, which this search does not move
+    assert summary["fresh"]["window_error"]["rms"] < summary["before"]["window_error"]["rms"]
 
     assert summary["trust"]["margins"] == stability.worst(scenario.study(tuned))
     assert summary["shortest_t_f"]["theory"] > 0.0
@@ -284,8 +285,9 @@ def test_seed_and_trial_name_a_run(command, tmp_path):
 
 
 def test_a_run_that_fails_says_so(command, tmp_path):
-    # noise of 10 rad tells the law nothing: it cannot keep away from its singularity
-    (tmp_path / "s.toml").write_text(SHORT.replace("attitude_noise = 2e-5", "attitude_noise = 10.0"))
+    # with noise of 10 rad the law does not know the attitude, and cannot keep away from its singularity
+    text = SHORT.replace("attitude_noise = 2e-5", "attitude_noise = 10.0")
+    (tmp_path / "s.toml").write_text(text.replace("window = 1.0", "window = 1.0\nsettling_angle = 1e-3"))
     status, out, err = command("simulate", "s.toml", "--no-figures")
     assert (status, err) == (1, "")
     text = (tmp_path / "out" / "simulate-s" / "summary.json").read_text()
@@ -411,7 +413,7 @@ def test_a_killed_search_goes_on(tmp_path):
 
 
 @pytest.mark.long
-def test_what_no_gains_can_keep_is_said(command, tmp_path, monkeypatch):
+def test_a_limit_that_no_gains_keep_is_reported(command, tmp_path, monkeypatch):
     small_search(monkeypatch)
     text = re.sub(r"peak_torque = .*", "peak_torque = 0.01", SHORT)
     (tmp_path / "s.toml").write_text(text)
@@ -421,10 +423,12 @@ def test_what_no_gains_can_keep_is_said(command, tmp_path, monkeypatch):
     ratio = summary["search"]["largest_over_limit"]["peak_torque"]
     assert ratio > 1.0
     assert summary["search"]["rounds_with_harder_trials"] == 0  # they would bring these gains no nearer
+    assert "the search found no gains that meet every requirement, nor did a global search" in told
     assert (
-        "no gains found within the bounds keep every limit: with the best ones "
-        f"peak_torque reaches {ratio:.3g} times its limit, 0.01 N m, on the training trials" in told
+        f"with the best compromise peak_torque reaches {ratio:.3g} times its limit, 0.01 N m, on the training trials"
+        in told
     )
+    assert list(summary["search"]["conflict"]) == ["peak_torque"]
     assert "peak_torque at most 0.01 N m: worst" in told
     # the best compromise: the smallest torque within the bounds is that of the smallest eta
     assert 2.6 <= summary["gains"]["eta"] < 2.8  # of 2.6 to 3.05

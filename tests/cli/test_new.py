@@ -130,7 +130,7 @@ def test_what_is_off_is_allowed_as_it_stands(plant):
         for table in map(values, groups):
             if name == "initial":  # one attitude key at a time, below
                 table = {**{key: value for key, value in table.items() if key not in ATTITUDE}, **attitude}
-            given = {"loop": {"mode": "sampled"}, "tune": {"objective": "cvar"}}.get(name, {})  # cvar has a level
+            given = {"loop": {"mode": "sampled"}, "tune": {"statistic": "cvar"}}.get(name, {})  # cvar has a level
             alone = {"hardware": {}} if name == "sensors" else {}  # of one's own, in place of noise
             from_tables({**base, **alone, name: hardware if name == "hardware" else {**table, **given}})
             tried += 1

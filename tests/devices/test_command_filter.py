@@ -76,7 +76,7 @@ def test_periods_of_any_length_integrate_the_same_filter(kind):
 # a law alone, that nothing tells of what it commands: L of the loop is that of the filter times that without it
 ALONE = {
     "plant": {"kind": "chain", "order": 2, "x0": [0.01, 0.0]},
-    "controller": {"t_f": 4.0, "delta": 1.0, "disturbance_bound": 0.0},
+    "controller": {"t_f": 4.0, "delta": 1.0, "eta": 3.0, "k1": 1.0, "surface_rate": 1.0, "disturbance_bound": 0.0},
     "disturbance": {"kind": "none"},
     "observer": {"kind": "none"},
     "loop": {"mode": "sampled", "period": H, "t_end": 20.0},

@@ -23,7 +23,8 @@ SIGMAS = 6.0
 
 def of(**hardware):
     """The study of a short flight behind a filter, on the flight clock."""
-    tables = flight(**FILTER, hardware=hardware, loop={"clock": "flight"})
+    case_one = {"amplitude": [0.01] * 3, "frequency": [0.1] * 3}
+    tables = flight(**FILTER, hardware=hardware, loop={"clock": "flight"}, disturbance=case_one)
     return scenario.study(scenario.from_tables({**tables, "dispersion": {}}))
 
 

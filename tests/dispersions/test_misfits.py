@@ -319,7 +319,7 @@ def test_the_widest_couplings_that_are_allowed_leave_a_body_at_their_farthest(co
     """Rows as long and moments as small as can be drawn, and a tenth of the width more is refused."""
     drawn = {"mode_coupling": coupling, **({"inertia": inertia} if inertia else {})}
     tables = {**FLIGHT, "spacecraft": {"inertia": [10.0, 12.0, 14.0]},
-              "flexible": {"coupling": [[3.0, 0.0, 0.0]]}, "dispersion": drawn}  # fmt: skip
+              "flexible": {"frequency": [6.0], "coupling": [[3.0, 0.0, 0.0]]}, "dispersion": drawn}  # fmt: skip
     ready = scenario.study(scenario.from_tables(tables))
     ends = {"mode_coupling": vector([1.0]), "inertia": jnp.zeros(67).at[:3].set(-FARTHEST)}
     plant = plant_of(ready.dispersion.at(ready.parts, ends))

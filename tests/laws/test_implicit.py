@@ -247,7 +247,7 @@ def test_it_needs_samples_and_leaves_the_boundary_layer_out_of_the_search():
     tables = {"controller": {"sampling": "implicit"}, "loop": {"mode": "sampled"}, "tune": {}}
     tune = scenario.from_tables(tables).tune
     assert tune is not None
-    assert tune.free == ("eta", "delta", "observer_gain", "k1")
+    assert tune.free == ("eta", "delta", "observer_gain", "k1", "surface_rate")
 
 
 @pytest.mark.parametrize("bits", [64, 32])

@@ -50,8 +50,10 @@ FLIGHTS: dict[str, dict[str, Any]] = {
     "chain of order 4": {**CHAIN, "plant": {"kind": "chain", "order": 4, "x0": [1.0, 0.0, 0.0, 0.0]},
                          "hardware": {}, "dispersion": {}, "controller": {"t_f": 5.0, "delta": 1.0}},
     "implicit chain": {**CHAIN, "controller": {**BETWEEN, "sampling": "implicit"}},
-    "delay, limit, quantised": flight(hardware={"delay": 2, "torque_limit": 3.0, "torque_step": 1e-3},
-                                      controller={"delta": 1.0}),
+    # stated gains: the designed ones would keep the torque below its limit
+    "delay, limit, quantised": flight(
+        hardware={"delay": 2, "torque_limit": 3.0, "torque_step": 1e-3}, observer={"gain": [10.0] * 3},
+        controller={"delta": 1.0, "eta": 3.0, "k1": 1.0, "surface_rate": 1.0, "sign_width": 1e-3}),
     "lag and rate limit": flight(
         **FILTER, hardware={"torque_lag": 0.1, "torque_rate_limit": 20.0, "torque_limit": 4.0}),
     "first-order roll-off of a chain": {

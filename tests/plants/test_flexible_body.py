@@ -31,10 +31,14 @@ SATELLITE = {
     "spacecraft": {"inertia": INERTIA.tolist()},
     "flexible": {"frequency": FREQUENCY, "damping": DAMPING, "coupling": COUPLING},
     "initial": {"rotvec_deg": [30.0, -20.0, 40.0], "rate": [0.01, -0.02, 0.015]},
-    "controller": {"t_f": 12.0, "delta": 1.0, "error": "multiplicative"},
+    "controller": {
+        "t_f": 12.0, "delta": 1.0, "eta": 3.0, "k1": 1.0, "surface_rate": 1.0, "sign_width": 1e-3,
+        "error": "multiplicative",
+    },
+    "disturbance": {"amplitude": [0.01] * 3, "frequency": [0.1] * 3},
     "observer": {"gain": [200.0, 200.0, 200.0]},
-    "loop": {"mode": "sampled", "period": 0.25, "t_end": 16.0},
-}
+    "loop": {"mode": "sampled", "period": 0.25, "t_end": 16.0, "window": 1.0},
+}  # fmt: skip
 
 
 def body(damping=DAMPING):

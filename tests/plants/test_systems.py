@@ -118,11 +118,14 @@ def test_a_spacecraft_written_as_a_system_flies_the_hand_written_trajectory(peri
     assert np.all(off <= 1e-10 * np.maximum(gain, 1.0))
 
 
+GAINS = {"eta": 3.0, "delta": 0.05, "k1": 1.0, "surface_rate": 1.0, "sign_width": 1e-3}
+
+
 def arm_tables(**changes):
     tables = {
         "plant": {"kind": "system", "system": ARM, "x0": [0.8, -1.0, 0.5, 0.2]},
-        "controller": {"t_f": 3.0, "delta": 0.05, "disturbance_rate_bound": 0.6, "disturbance_bound": 0.45},
-        "observer": {"kind": "nonlinear"},
+        "controller": {"t_f": 3.0, **GAINS, "disturbance_rate_bound": 0.6, "disturbance_bound": 0.45},
+        "observer": {"kind": "nonlinear", "gain": [10.0, 10.0]},
         "disturbance": {"kind": "sinusoid", "amplitude": [0.4, 0.05], "frequency": [1.0, 3.0]},
         "loop": {"t_end": 4.0, "window": 0.5},
     }
@@ -473,8 +476,8 @@ def test_a_scenario_with_a_system_made_in_python_is_written_and_refused_when_rea
 def test_steps_follow_the_run_with_the_shortest_t_f_that_tuning_may_try(monkeypatch):
     tables = {
         "plant": {"kind": "system", "system": ARM, "x0": [0.8, -1.0, 0.0, 0.0]},
-        "controller": {"t_f": 3.0},
-        "loop": {"mode": "sampled", "period": 0.05},
+        "controller": {"t_f": 3.0, **GAINS},
+        "loop": {"mode": "sampled", "period": 0.05, "t_end": 13.0},
         "tune": {"free": ["t_f", "eta"], "bounds": {"t_f": [0.5, 4.0]}},
     }
     looked_at, visited = [], solutions.visited

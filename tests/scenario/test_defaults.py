@@ -81,7 +81,7 @@ def test_what_is_drawn_counts():
     assert 0.9 * 1.5e-3 < seen[1] <= 1.5e-3
     normal = {"disturbance_amplitude": {"kind": "relative_normal", "std": 0.1},
               "disturbance_bias": {"kind": "normal", "std": 1e-3}}  # fmt: skip
-    assert bounds(disturbance=table, dispersion=normal) == (4.3e-3, 1.3e-3)
+    assert bounds(disturbance=table, dispersion=normal) == pytest.approx((4.3e-3, 1.3e-3), rel=1e-15)  # rounding
 
 
 def test_several_disturbances_add_up_component_by_component():
@@ -165,12 +165,22 @@ def test_the_observers_gain_follows_body_and_period():
         (value,) = set(scenario.from_tables(tables).observer.gain)
         return value
 
-    assert gain(spacecraft={"inertia": CUBESAT}) == 0.07  # 10 / 12 of 0.08 kg m^2
-    assert gain(spacecraft={"inertia": FULL_INERTIA}) == 9.0  # 34 / 3 kg m^2
+    cubesat_gain = pytest.approx(0.08 * 10.0 / 12.0, rel=1e-12)
+    assert gain(spacecraft={"inertia": CUBESAT}) == cubesat_gain
+    mean = (FULL_INERTIA[0][0] + FULL_INERTIA[1][1] + FULL_INERTIA[2][2]) / 3.0
+    assert gain(spacecraft={"inertia": FULL_INERTIA}) == pytest.approx(mean * 10.0 / 12.0, rel=1e-12)
     assert gain(loop={"mode": "sampled", "period": 4.0, "window": 4.0}) == 3.0  # 12 / 4
     assert gain(plant={"kind": "chain"}, observer={"kind": "nonlinear"}) == 10.0
     cubesat = scenario.from_tables({"spacecraft": {"inertia": CUBESAT}})
-    assert gains.of_paper(cubesat)["observer_gain"] == 0.07
+    assert gains.of_paper(cubesat)["observer_gain"] == cubesat_gain
+
+
+def test_the_observer_gain_scales_with_the_inverse_of_t_f():
+    """Continuous loop: the paper's 10 / 12 1/s holds at t_f = 30 s, the chain's 10 1/s at t_f = 5 s."""
+    body = scenario.from_tables({"controller": {"t_f": 120.0}})
+    assert body.observer.gain == pytest.approx((2.5, 2.5, 2.5), rel=1e-12)
+    chain = {"plant": {"kind": "chain"}, "observer": {"kind": "nonlinear"}, "controller": {"t_f": 20.0}}
+    assert scenario.from_tables(chain).observer.gain == pytest.approx((2.5,), rel=1e-12)
 
 
 def test_bounds_that_are_given_stay():
@@ -181,11 +191,12 @@ def test_bounds_that_are_given_stay():
 def test_what_is_not_said_follows_what_is_replaced():
     """Bounds of gains follow the period, t_end t_f, bounds on the disturbance the disturbance; what is said stays."""
     said = scenario.from_tables({"loop": SAMPLED, "tune": {"bounds": {"eta": [2.1, 5.0]}}})
-    slow = scenario.replace(said, loop__period=0.5, controller__t_f=45.0)
+    slow = scenario.replace(said, loop__period=0.5, controller__t_f=36.0)
     assert slow.tune is not None
     assert slow.controller.delta == slow.tune.bounds["delta"][0] == 0.5
     assert slow.tune.bounds["eta"] == (2.1, 5.0)
-    assert slow.loop.t_end == 55.0
+    assert slow.loop.t_end == 46.0  # one of the paper's cases, which end 10 s after t_f
+    assert scenario.replace(said, controller__t_f=45.0).loop.t_end == pytest.approx(60.0)  # another one: 4/3 t_f
     assert scenario.replace(said, disturbance__amplitude=[0.02] * 3).controller.disturbance_bound == 0.02
     assert "observer_gain" not in free(scenario.replace(said, observer__kind="none"))
     assert scenario.replace(slow, loop__t_end=50.0, controller__t_f=30.0).loop.t_end == 50.0
@@ -219,7 +230,10 @@ QUIET = {"kind": "constant", "amplitude": [1e-6] * 3}
             ({"controller": {"kind": law, "disturbance_rate_bound": 1e-3}, "disturbance": QUIET, "loop": SAMPLED}, said)
             for law, said in (("pd", []), ("super_twisting", []), ("terminal", ["the law switches"]))
         ),
-        ({**NOISY, "disturbance": QUIET}, ["observer.gain is 0.07", "more than the disturbance", "at most 1e-06"]),
+        (
+            {**NOISY, "disturbance": QUIET, "observer": {"gain": [0.07] * 3}},
+            ["observer.gain is 0.07", "more than the disturbance", "at most 1e-06"],
+        ),
         ({**NOISY, "disturbance": QUIET, "observer": {"gain": [1e-4] * 3}}, []),
         ({**NOISY, "disturbance": {"kind": "none"}}, []),
     ],
@@ -233,10 +247,11 @@ def test_what_is_odd_is_said(tables, said):
 
 @pytest.mark.parametrize(("share", "said"), [(1.02, False), (0.98, True)])
 def test_an_estimate_is_noisy_where_its_noise_is_more_than_what_it_estimates(share, said):
-    noise = cautions.estimate_noise(scenario.from_tables({**NOISY, "disturbance": {"kind": "none"}}))
+    observed = {**NOISY, "observer": {"gain": [0.07] * 3}}
+    noise = cautions.estimate_noise(scenario.from_tables({**observed, "disturbance": {"kind": "none"}}))
     acting = {"kind": "constant", "amplitude": [share * noise, 0.0, 0.0]}
-    tables = {**NOISY, "disturbance": acting, "observer": {"gain": [0.07] * 3}}
-    assert cautions.estimate_noise(scenario.from_tables(tables)) == noise  # the same observer as by default
+    tables = {**observed, "disturbance": acting}
+    assert cautions.estimate_noise(scenario.from_tables(tables)) == noise  # whatever acts
     assert any("look at a smaller gain" in one for one in cautions.of(scenario.from_tables(tables))) is said
 
 
@@ -382,17 +397,21 @@ def test_a_noise_that_no_star_tracker_has_is_said(noise, said):
     assert not said or f'"{noise:g} arcsec"' in found[0]
 
 
+SURFACE = {"t_f": 60.0, "surface_rate": 1.0}
+
+
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({}, True),  # c h = 5
+        ({"controller": {"surface_rate": 1.0}}, True),  # c h = 5
+        ({}, False),  # the default is designed for the period
         ({"controller": {"surface_rate": 0.39}}, False),
         ({"controller": {"surface_rate": 0.41}}, True),
         ({"controller": {"surface_rate": 0.39}, "hardware": {"delay": 1}}, True),  # there c h must be below 1
-        ({"controller": {"sampling": "implicit"}}, False),
+        ({"controller": {"surface_rate": 1.0, "sampling": "implicit"}}, False),
         ({"controller": {"kind": "pd"}}, False),
-        ({"plant": {"kind": "chain", "order": 2}, "controller": {"t_f": 60.0, "a": [0.1]}}, False),
-        ({"plant": {"kind": "chain", "order": 2}, "controller": {"t_f": 60.0, "a": [0.5]}}, True),
+        ({"plant": {"kind": "chain", "order": 2}, "controller": {**SURFACE, "a": [0.1]}}, False),
+        ({"plant": {"kind": "chain", "order": 2}, "controller": {**SURFACE, "a": [0.5]}}, True),
     ],
     ids=str,
 )

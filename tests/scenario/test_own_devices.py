@@ -147,7 +147,7 @@ def test_a_spacecrafts_sensors_see_attitude_and_rate(command, here):
     )
     text = SHORT.replace("attitude_noise = 2e-5\n", "").replace("rate_noise = 1e-6\n", "").replace("[hardware]\n", "")
     text = text[: text.index("[requirements]")] + '[sensors]\nkind = "own"\ncode = "mine.py:Tilted"\n'
-    text = text.replace("t_end = 6.5", "t_end = 25.0").replace("[controller]\n", "[controller]\nk1 = 4.0\n")
+    text = text.replace("t_end = 6.5", "t_end = 25.0").replace("k1 = 1.0\n", "k1 = 4.0\n")
     (here / "s.toml").write_text(text)
     run = explore.simulate(scenario.read("s.toml"))
     turned = np.asarray(run.run.log.x.q)[-1]

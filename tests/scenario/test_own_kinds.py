@@ -42,6 +42,10 @@ class Mine(ptsmc.AccelerationLaw):
 SAMPLED = {"mode": "sampled", "period": 0.1, "t_end": 6.5}
 CHAIN = {"plant": {"kind": "chain", "order": 2, "x0": [1.0, 0.0]}, "loop": SAMPLED}
 MINE = {"kind": "own", "code": "mine.py:Mine", "t_f": 5.0}
+# the law above in place of the paper's, without the keys that only the paper's law has
+SHORT_OWN = SHORT.replace("[controller]\n", '[controller]\nkind = "own"\ncode = "mine.py:Mine"\n').replace(
+    "surface_rate = 1.0\nsign_width = 1e-3\n", ""
+)
 
 
 @pytest.fixture(autouse=True)
@@ -518,7 +522,7 @@ def test_what_fails_late_in_code_of_ones_own_is_one_sentence_too(command, here, 
     monkeypatch.setattr(systems, "_files", set())
     kept = LAW.replace("        left =", "        kept.append(error)\n        error = kept[-2:][0]\n        left =")
     (here / "mine.py").write_text(HEAD + "kept = []\n\n\ndef fails():\n    return 1 / 0\n" + kept)
-    (here / "s.toml").write_text(SHORT.replace("[controller]\n", '[controller]\nkind = "own"\ncode = "mine.py:Mine"\n'))
+    (here / "s.toml").write_text(SHORT_OWN)
     code, _, error = command("simulate", "s.toml", "--no-figures", "--quiet")
     assert code == 2
     check_sentence(error.removeprefix("ptsmc: ").strip(), f"{here}/mine.py keeps a number of a run", "its memory")
@@ -538,7 +542,7 @@ def test_code_of_ones_own_that_exits_late_is_bad_input(command, here):
     """It ended the command with its own status, 0: done and every requirement met."""
     late = LAW.replace("        left =", "        asked.append(0)\n        if len(asked) > 2: exit(0)\n        left =")
     (here / "mine.py").write_text(HEAD + "asked = []\n" + late)
-    (here / "s.toml").write_text(SHORT.replace("[controller]\n", '[controller]\nkind = "own"\ncode = "mine.py:Mine"\n'))
+    (here / "s.toml").write_text(SHORT_OWN)
     code, _, error = command("simulate", "s.toml", "--no-figures", "--quiet")
     assert (code, error) == (2, f"ptsmc: {here}/mine.py fails: SystemExit: 0 (line 16 of mine.py)\n")
     assert not (here / "out").exists()
@@ -562,7 +566,7 @@ def test_where_there_is_no_gain_at_all_it_is_said_before_a_search(command, here)
 @pytest.mark.long
 def test_the_command_tunes_it(command, here, monkeypatch):
     small_search(monkeypatch)
-    text = SHORT.replace("[controller]\n", '[controller]\nkind = "own"\ncode = "mine.py:Mine"\n')
+    text = SHORT_OWN
     (here / "s.toml").write_text(text)
     assert command("tune", "s.toml", "--no-figures")[0] in (0, 1)
     found = tomllib.loads((here / "out/tune-s/tuned.toml").read_text())["controller"]

@@ -69,14 +69,14 @@ def test_border_of_the_hold_phase_is_where_a_loop_stepped_by_hand_begins_to_grow
 
 
 def test_largest_k1_is_twice_the_border_for_a_spacecraft_and_none_beyond_it():
-    np.testing.assert_allclose(scales.largest_k1(flight()), 2.0 * (2.0 / 0.05 - 1.0), rtol=1e-9)
-    late = flight(hardware__delay=1, controller__surface_rate=3.0)
-    np.testing.assert_allclose(scales.largest_k1(late), 2.0 * borders.largest_reaching(0.15, 1.0) / 0.05)
-    assert scales.largest_k1(flight(controller__surface_rate=41.0)) == 0.0
+    np.testing.assert_allclose(scales.largest_k1(flight(), 1.0), 2.0 * (2.0 / 0.05 - 1.0), rtol=1e-9)
+    late = flight(hardware__delay=1)
+    np.testing.assert_allclose(scales.largest_k1(late, 3.0), 2.0 * borders.largest_reaching(0.15, 1.0) / 0.05)
+    assert scales.largest_k1(flight(), 41.0) == 0.0
     loop = {"mode": "sampled", "period": 0.05}
     for plant in ({"kind": "chain", "order": 2}, ARM["plant"]):
         other = scenario.from_tables({"plant": plant, "loop": loop})
-        np.testing.assert_allclose(scales.largest_k1(other), 2.0 / 0.05 - 1.0, rtol=1e-9)
+        np.testing.assert_allclose(scales.largest_k1(other, 1.0), 2.0 / 0.05 - 1.0, rtol=1e-9)
 
 
 @pytest.mark.parametrize("rate", [0.3, 1.0, 6.0])
@@ -123,7 +123,9 @@ def test_widths_go_by_the_noise_where_there_is_some():
     noise = 0.5 * math.hypot(1e-6, 2e-5)
     low, high = scales.widths(flight())
     np.testing.assert_allclose([low, high], [math.sqrt(1.2) / math.pi * noise, 1e4 * noise])
-    assert scales.widths(flight(hardware__attitude_noise=0.0, hardware__rate_noise=0.0)) == scales.QUIET
+    assert scales.widths(flight(hardware__attitude_noise=0.0, hardware__rate_noise=0.0)) == pytest.approx((1e-5, 1e-1))
+    slow = scenario.from_tables({"controller": {"t_f": 120.0}, "loop": {"mode": "sampled"}})
+    assert scales.widths(slow) == pytest.approx((2.5e-6, 2.5e-2))  # four times the paper's t_f: s in 1/s is a quarter
     arm = {**ARM, "loop": {"mode": "sampled"}, "hardware": {"state_noise": [3e-4, 4e-4]},
            "controller": {"surface_rate": 2.0}}  # fmt: skip
     np.testing.assert_allclose(noise_of_s(scenario.from_tables(arm)), math.hypot(6e-4, 4e-4))

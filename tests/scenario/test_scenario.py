@@ -106,10 +106,22 @@ def test_tune_without_bounds_is_taken_wherever_the_scenario_is(text):
 
 
 @pytest.mark.parametrize(
-    ("text", "t_end"), [("", 40.0), ("controller.t_f = 12.5", 22.5), ("loop.t_end = 33.0", 33.0)], ids=str
+    ("text", "t_end"),
+    [
+        ("", 40.0),
+        ("controller.t_f = 36.0", 46.0),  # one of the paper's cases, with its 10 s
+        ("controller.t_f = 12.5", 12.5 * 4.0 / 3.0),
+        ("controller.t_f = 1200.0", 1600.0),
+        ("controller.t_f = 1200.0\nloop.window = 500.0", 1700.0),
+        ("loop.t_end = 33.0", 33.0),
+        ('plant.kind = "chain"', 15.0),
+        ('plant.kind = "chain"\ncontroller.t_f = 20.0', 60.0),
+    ],
+    ids=str,
 )
-def test_t_end_is_ten_seconds_after_t_f_unless_said(text, t_end):
-    assert from_tables(tomllib.loads(text)).loop.t_end == t_end
+def test_a_run_ends_a_third_of_t_f_or_the_window_after_t_f_by_default(text, t_end):
+    """A chain's run ends at 3 t_f."""
+    assert from_tables(tomllib.loads(text)).loop.t_end == pytest.approx(t_end, rel=1e-12)
 
 
 @pytest.mark.parametrize(("period", "window", "t_end"), [(0.5, 1.0, 40.0), (2.5, 2.5, 40.0), (12.0, 12.0, 42.0)])
@@ -350,7 +362,8 @@ def test_periods_within_a_reach_share_a_structure_and_each_has_samples_to_the_en
 
 
 def test_steps_are_bounded_for_the_longest_run_that_tuning_may_try():
-    scenario = from_tables(tomllib.loads(SAMPLED + "loop.period = 0.5\ncontroller = { t_f = 6e4, delta = 1.0 }"))
+    loop = {"mode": "sampled", "period": 0.5, "t_end": 60_010.0, "window": 1.0}
+    scenario = from_tables({"loop": loop, "controller": {"t_f": 6e4, "delta": 1.0}})
     reach = reach_of(scenario, t_f=12e4)
     assert 120_020 <= timing.steps(study(scenario).parts) <= 120_025  # (6e4 + 10) / 0.5, and a few for the clock's ends
     with pytest.raises(ScenarioError) as caught:
@@ -381,7 +394,7 @@ def test_replace_changes_what_is_said_and_keeps_the_rest():
 
 def test_replace_by_none_returns_a_key_to_its_default():
     scenario = replace(from_tables({}), controller__t_f=20.0, loop__t_end=None)
-    assert scenario.loop.t_end == 30.0
+    assert scenario.loop.t_end == pytest.approx(20.0 * 4.0 / 3.0, rel=1e-12)
     turned: Any = replace(scenario, initial__quat_xyzw=None, initial__rotvec_deg=[0.0, 0.0, 90.0])
     assert turned.initial == reference_tables.Initial(rotvec_deg=(0.0, 0.0, 90.0))
 

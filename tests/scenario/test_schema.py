@@ -83,9 +83,11 @@ CHAIN_DEFAULTS = {
 }
 TUNE_DEFAULTS = {
     "free": ["eta", "delta", "observer_gain"],
-    "bounds": {"eta": [2.05, 8.0], "delta": [0.05, 5.0], "observer_gain": [0.5, 300.0]},
+    # delta: t_f / 600 to t_f / 4; observer_gain: 1.5 J / t_f to 600 times as much
+    "bounds": {"eta": [2.05, 8.0], "delta": [0.05, 7.5], "observer_gain": [0.6, 360.0]},
     "per_axis": False,
-    "objective": "rms",
+    "minimise": "window_error",
+    "statistic": "rms",
     "torque_weight": 0.0,
     "worst_case": False,
     "trials": 256,
@@ -157,7 +159,7 @@ COMPLETE = [
     {"flexible": {"frequency": [6.0, 9.0], "damping": [0.005, 0.0], "coupling": [[0.8, 0.0, 0.1], [0.0, 0.5, 0.0]]}},
     {"wheels": {"kind": "pyramid", "cant_deg": 30.0, "torque_limit": 0.2, "momentum_limit": 4.0}},
     {"wheels": {"kind": "axes", "momentum": [0.1, 0.2, 0.3]}},
-    {"pointing": {"boresight": [0.0, 0.6, 0.8], "window": 0.5, "after": 2.0}},
+    {"pointing": {"boresight": [0.0, 0.6, 0.8], "window": 1.0, "after": 2.0}},
     {
         "pointing": {},
         "hardware": {"attitude_noise": 1e-5},
@@ -215,7 +217,7 @@ COMPLETE = [
     },
     {"requirements": dict.fromkeys(CATALOGUE, 0.5)},
     {"requirements": {"window_error": {"limit": 1e-4, "quantile": 0.9973, "confidence": 0.9}}},
-    {"tune": {**TUNE_DEFAULTS, "objective": "cvar", "level": 0.9}},
+    {"tune": {**TUNE_DEFAULTS, "statistic": "cvar", "level": 0.9}},
     *({"controller": {"kind": kind, **gains, **BASELINE}} for kind, gains in BASELINES.items()),
     {"observer": {"kind": "none"}},
     {"observer": {"kind": "finite_time", "gain": [0.1, 0.1, 0.1], "sign_width": 1e-5}},
@@ -313,7 +315,10 @@ each_list = pytest.mark.parametrize(
 
 def test_defaults_are_the_papers_case_one():
     assert parsing.dump(from_tables({})) == DEFAULTS
-    assert parsing.dump(from_tables({"tune": {}}))["tune"] == TUNE_DEFAULTS
+    tune = parsing.dump(from_tables({"tune": {}}))["tune"]
+    for name, bounds in TUNE_DEFAULTS["bounds"].items():
+        assert tune["bounds"].pop(name) == pytest.approx(bounds, rel=1e-12)  # rounding
+    assert tune == {**TUNE_DEFAULTS, "bounds": {}}
 
 
 def test_defaults_of_a_chain_are_the_papers_figures_one_and_two():
@@ -323,7 +328,7 @@ def test_defaults_of_a_chain_are_the_papers_figures_one_and_two():
     fourth = parsing.dump(from_tables({"plant": {"kind": "chain", "x0": [1, 0, 0, 0]}, "tune": {}}))
     assert (fourth["plant"]["order"], fourth["controller"]["eta"], fourth["controller"]["a"]) == (4, 5.0, [1, 3, 3])
     assert fourth["tune"]["free"] == ["eta", "delta"]  # no observer, no gain
-    assert fourth["tune"]["bounds"] == {"eta": [4.05, 10.0], "delta": [0.05, 2.525]}
+    assert fourth["tune"]["bounds"] == {"eta": [4.05, 10.0], "delta": [5.0 / 600.0, 5.0 / 4.0]}
 
 
 def test_off_when_absent():

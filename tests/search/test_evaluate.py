@@ -15,7 +15,7 @@ from tuning.search import evaluate
 from tuning.search.descent import Best
 from tuning.search.descents import Descents
 from tuning.search.evaluate import Evaluator, Measured, Sloped
-from tuning.search.objective import Rules, judge, problem
+from tuning.search.objective import FAILED, Rules, judge, problem
 from tuning.search.shares import Bounds
 
 
@@ -30,7 +30,7 @@ def test_rows_of_trials_and_of_loops_are_filled_up_by_what_breaks_no_limit(monke
     of_loop = {"c": rng.uniform(-0.9, -0.5, (2, 1, loops)), "c_slope": rng.normal(size=(2, 1, loops, 2))}
     share = np.array([[0.0, 0.0], [1.0, 1.0]])
     monkeypatch.setattr(evaluate.margin_rows, "of_points", lambda margins, bounds, share: of_loop)
-    some: Any = SimpleNamespace(margins=object())
+    some: Any = SimpleNamespace(margins=object(), goal="window_error")
     evaluator = Evaluator(Bounds(("eta", "delta"), (2.0, 0.1), (3.0, 1.0)))
     rest = {"gains": share, "f": np.zeros(2), "value": np.zeros(2), "f_slope": np.zeros((2, 2))}
     found = Sloped(**evaluator._measured(lambda problem, share: {**rest, **flown}, some, share))
@@ -54,6 +54,57 @@ def test_the_torque_weighs_over_the_averaged_trials_as_the_error_does():
     assert float(value) == pytest.approx(math.log(math.sqrt(12.5)), rel=1e-12)
     assert float(f) == pytest.approx(float(value) + 0.3 * math.log(math.sqrt(0.125)), rel=1e-12)
     assert c.shape == (0, 3)
+
+
+@pytest.mark.parametrize(
+    ("statistic", "tail", "expected"),
+    [
+        ("rms", None, lambda v: np.sqrt(np.mean(v**2))),
+        ("mean", None, np.mean),
+        ("rms", 1, np.max),
+        ("quantile", 3, lambda v: np.quantile(v, 0.75, method="inverted_cdf")),  # the third worst of eight
+        ("rms", 3, lambda v: np.sqrt(np.mean(np.sort(v)[-3:] ** 2))),
+    ],
+    ids=["rms", "mean", "worst", "quantile", "cvar"],
+)
+def test_f_is_the_logarithm_of_the_statistic_of_the_averaged_trials(statistic, tail, expected):
+    """The last of nine trials joined for a limit, and does not count. NumPy computes the expected values."""
+    values = np.random.default_rng(5).lognormal(size=9)
+    values[8] = 1e3
+    none = np.zeros((0, 9), dtype=bool)
+    rules = Rules(limits=np.zeros(0), among=none, counted=none, averaged=8, names=("eta",), may_break=(),
+                  tail=tail, statistic=statistic)  # fmt: skip
+    metrics = jnp.asarray(np.stack([values, np.ones(9)], axis=1))
+    f, _, value = judge(rules, jnp.asarray([3.0]), metrics, jnp.zeros(9, jnp.int32))
+    np.testing.assert_allclose(np.exp([f, value]), expected(values[:8]), rtol=1e-12)
+
+
+def test_a_search_for_limits_minimises_the_largest_metric_over_its_limit():
+    """A trial that fails does not count in F, and its c stays that of a failure."""
+    limits, status = np.array([0.5, 8.0]), np.array([rollout.OK, rollout.OK, rollout.DIVERGED])
+    limited = np.array([[0.3, 5.0], [0.4, 7.0], [2.0, 90.0]])
+    some = {"among": np.zeros((2, 3), bool), "counted": np.ones((2, 3), bool)}
+    rules = Rules(limits=limits, averaged=3, names=("eta",), may_break=(None, None), goal="limits", **some)
+    metrics = jnp.asarray(np.concatenate([np.ones((3, 2)), limited], axis=1))
+    f, c, value = judge(rules, jnp.asarray([3.0]), metrics, jnp.asarray(status, jnp.int32))
+    np.testing.assert_allclose(np.exp([f, value]), np.max(limited[:2] / limits), rtol=1e-12)
+    np.testing.assert_allclose(c[:, :2], (limited[:2] / limits).T - 1.0, rtol=1e-12)
+    assert np.all(c[:, 2] == FAILED - 1.0)
+
+
+def test_a_search_for_limits_counts_the_margins_too(monkeypatch):
+    """F and its slope are those of the largest row: at the first point a metric's, at the second one a margin's."""
+    flown = {"c": np.array([[[0.3, -0.2]], [[-0.5, -0.4]]]), "c_slope": np.arange(8.0).reshape(2, 1, 2, 2)}
+    of_loop = {"c": np.array([[[-0.1]], [[0.6]]]), "c_slope": 10.0 + np.arange(4.0).reshape(2, 1, 1, 2)}
+    monkeypatch.setattr(evaluate.margin_rows, "of_points", lambda margins, scale, share: of_loop)
+    some: Any = SimpleNamespace(margins=object(), goal="limits")
+    evaluator = Evaluator(Bounds(("eta", "delta"), (2.0, 0.1), (3.0, 1.0)))
+    share = np.zeros((2, 2))
+    rest = {"gains": share, "f": np.zeros(2), "value": np.zeros(2), "f_slope": np.zeros((2, 2))}
+    found = Sloped(**evaluator._measured(lambda problem, share: {**rest, **flown}, some, share))
+    np.testing.assert_allclose(np.exp(found.f), [1.3, 1.6], rtol=1e-12)
+    np.testing.assert_array_equal(found.value, found.f)
+    np.testing.assert_allclose(found.f_slope, [[0.0, 1.0 / 1.3], [12.0 / 1.6, 13.0 / 1.6]], rtol=1e-12)
 
 
 def test_where_no_trial_has_a_goal_there_is_none():

@@ -207,33 +207,39 @@ def test_a_chain_and_its_observer_gain_move_too(kind):
 
 
 @pytest.mark.parametrize(
-    ("inertia", "gain", "expected"),
+    ("inertia", "t_f", "gain", "expected"),
     [
-        ([10.0, 12.0, 14.0], 10.0, (0.5, 300.0)),
-        ([0.01, 0.012, 0.014], 0.01, (0.0005, 0.3)),
-        ([[1e7, 3e6, -2e6], [3e6, 2e7, 1e6], [-2e6, 1e6, 1.5e7]], 1e7, (6.25e5, 3.75e8)),
-        ([10.0, 12.0, 14.0], 0.1, (0.05, 300.0)),  # the scenario's own is inside
-        ([10.0, 12.0, 14.0], 500.0, (0.5, 1000.0)),
+        ([10.0, 12.0, 14.0], 30.0, 10.0, (0.6, 360.0)),
+        ([10.0, 12.0, 14.0], 60.0, 10.0, (0.3, 180.0)),
+        ([0.01, 0.012, 0.014], 30.0, 0.01, (0.0006, 0.36)),
+        ([[1e7, 3e6, -2e6], [3e6, 2e7, 1e6], [-2e6, 1e6, 1.5e7]], 30.0, 1e7, (7.5e5, 4.5e8)),
+        ([10.0, 12.0, 14.0], 30.0, 0.1, (0.05, 360.0)),  # the bounds include the scenario's gain
+        ([10.0, 12.0, 14.0], 30.0, 500.0, (0.6, 1000.0)),
     ],
 )
-def test_default_bounds_of_the_observers_gain_go_with_the_body_and_hold_the_scenarios_own(inertia, gain, expected):
+def test_default_bounds_of_the_observer_gain_scale_with_inertia_and_time(inertia, t_f, gain, expected):
+    """They are 1.5 / t_f and 900 / t_f times the mean moment of inertia, and include the scenario's gain."""
     tables = {"spacecraft": {"inertia": inertia}, "observer": {"gain": [gain] * 3}, "tune": {}}
-    made = from_tables({**tables, "disturbance": {"kind": "none"}})
+    made = from_tables({**tables, "controller": {"t_f": t_f}, "disturbance": {"kind": "none"}})
     assert made.tune is not None
     np.testing.assert_allclose(made.tune.bounds["observer_gain"], expected, rtol=1e-12)
 
 
-def test_default_bounds_of_delta_and_k1_go_with_t_f():
+def test_default_bounds_of_delta_and_k1_scale_with_t_f():
+    """Delta is searched from t_f / 600 to t_f / 4, and K1 from 3.5 / t_f to 350 / t_f.
+
+    The bounds include the scenario's gain: delta at 3.5 s and K1 at 4000 s lie outside the usual ones.
+    """
     made = {}
-    for t_f in (3.5, 35.0, 4000.0):
-        law = {"t_f": t_f, "delta": 0.01 * t_f, "error": "multiplicative"}
+    for t_f, delta, k1 in ((3.5, 0.0035, 8.0), (35.0, 0.35, 1.0), (4000.0, 40.0, 1.0)):
+        law = {"t_f": t_f, "delta": delta, "k1": k1, "error": "multiplicative"}
         tune = {"free": ["delta", "k1"]}
-        one = from_tables({"controller": law, "loop": {"t_end": t_f + 10.0}, "tune": tune})
+        one = from_tables({"controller": law, "loop": {"t_end": t_f + 10.0, "window": 1.0}, "tune": tune})
         assert one.tune is not None
         made[t_f] = one.tune.bounds
-    assert {t_f: tuple(b["delta"]) for t_f, b in made.items()} == {  # that of 3.5 s moved to hold the scenario's own
-        3.5: (0.0175, 1.775), 35.0: (0.05, 5.0), 4000.0: (0.05, 500.0),
-    }  # fmt: skip
+    np.testing.assert_allclose(made[3.5]["delta"], (0.00175, 3.5 / 4.0))
+    np.testing.assert_allclose(made[35.0]["delta"], (35.0 / 600.0, 35.0 / 4.0))
+    np.testing.assert_allclose(made[4000.0]["delta"], (4000.0 / 600.0, 1000.0))
     np.testing.assert_allclose(made[3.5]["k1"], (1.0, 100.0))
     np.testing.assert_allclose(made[35.0]["k1"], (0.1, 10.0))
     np.testing.assert_allclose(made[4000.0]["k1"], (3.5 / 4000.0, 2.0))
@@ -242,21 +248,23 @@ def test_default_bounds_of_delta_and_k1_go_with_t_f():
 @pytest.mark.parametrize(
     ("period", "t_f", "expected"),
     [
-        (0.05, 35.0, (0.2, 20.0)),
-        (None, 35.0, (0.2, 20.0)),
-        (0.5, 35.0, (0.02, 2.0)),
-        (0.05, 3500.0, (0.002, 2.0)),  # moved to hold the scenario's own, 1 1/s
+        (0.05, 35.0, (0.05, 20.0)),
+        (None, 35.0, (0.05, 10.0)),
+        (0.5, 35.0, (0.05, 2.0)),
+        (0.05, 3500.0, (0.0005, 20.0)),
     ],
 )
-def test_default_bounds_of_the_surfaces_rate_go_with_t_f_and_end_at_half_of_the_sampled_loops_border(
+def test_default_bounds_of_surface_rate_begin_at_1_75_over_t_f_and_end_at_half_of_the_stability_limit(
     period, t_f, expected
 ):
-    loop = {"t_end": t_f + 10.0} if period is None else {"mode": "sampled", "period": period, "t_end": t_f + 10.0}
+    loop = {"t_end": t_f + 10.0, "window": 1.0}
+    if period is not None:
+        loop |= {"mode": "sampled", "period": period}
     law = {"t_f": t_f, "delta": 0.5, "error": "multiplicative"}
     made = from_tables({"controller": law, "loop": loop, "tune": {"free": ["surface_rate"]}})
     assert made.tune is not None
     np.testing.assert_allclose(made.tune.bounds["surface_rate"], expected)
-    if period is not None:  # the border itself, without K1 and the switching term
+    if period is not None:  # the stability limit itself, without K1 and the switching term
         for c, stable in ((1.999 / period, True), (2.001 / period, False)):
             kp, kd = borders.gains(np.asarray(t_f), t_f, 3.0, 0.5, 0.0, 0.0, c)
             assert (borders.radius(float(kp) + 1e-9, float(kd), period) < 1.0) == stable
@@ -299,12 +307,33 @@ def test_default_bounds_of_t_f_leave_the_observer_its_time(t_o, shortest):
 
 
 @pytest.mark.parametrize("delta", [0.02, 0.05])
-def test_delta_is_looked_for_from_one_period_on_and_that_is_said_where_it_ends_there(delta):
+def test_the_lower_bound_of_delta_is_one_period_and_a_message_names_it_if_delta_ends_there(delta):
     made = from_tables({"controller": {"delta": delta}, "loop": {"mode": "sampled", "period": 0.02}, "tune": {}})
     assert made.tune is not None
-    assert made.tune.bounds["delta"] == (0.02, 5.0)
+    assert made.tune.bounds["delta"] == (0.02, 7.5)  # t_f / 4
     assert "one period" in str(free_gains.border(made, "delta", "lower", 0.02))
     assert free_gains.border(made, "delta", "lower", 0.05) is None
+
+
+def test_default_bounds_are_widened_on_the_side_where_a_gain_ended():
+    """Tenfold on a log scale, else by half of the interval, but only halfway to a value that is not allowed.
+
+    Stated bounds stay, and so do bounds beyond which the sampled loop is unstable or a gain has no influence.
+    """
+    free = ["eta", "delta", "observer_gain", "k1", "surface_rate"]
+    tune = {"free": free, "bounds": {"surface_rate": [0.1, 1.0]}}
+    sides = dict.fromkeys(free, "upper")
+    for mode, moved in (("continuous", ["eta", "observer_gain", "k1"]), ("sampled", ["eta"])):
+        made = from_tables({"controller": {"t_f": 30.0}, "loop": {"mode": mode}, "tune": tune})
+        found, bounds = free_gains.widened(made, sides, made.defaulted), made.search.bounds
+        assert list(found) == moved
+        for name, (low, high) in found.items():
+            least, most = bounds[name]
+            farther = most + 0.5 * (most - least) if name == "eta" else 10.0 * most
+            assert (low, high) == (least, pytest.approx(farther, rel=1e-12))
+    found = free_gains.widened(made, {"eta": "lower"}, made.defaulted)
+    assert found["eta"] == (pytest.approx(0.5 * (2.0 + bounds["eta"][0])), bounds["eta"][1])  # eta exceeds 2
+    assert free_gains.widened(made, sides, set()) == {}
 
 
 def test_bounds_of_a_baseline_hold_no_gains_that_are_refused_later():
@@ -344,8 +373,8 @@ def test_gains_that_the_clock_has_no_samples_for_are_refused(other, where, neede
     assert float(ticks_of(moved.clock, law.t_f, law.delta).t_next[-1]) == pytest.approx(float(moved.t_end))
 
 
-def test_gains_are_set_beside_the_papers_only_where_these_can_fly():
-    """Spinning at 0.6 rad/s, the paper's eta of 3 overshoots past 180 degrees; 6 does not."""
+def test_gains_are_compared_with_the_published_ones_only_if_these_can_be_simulated():
+    """At a spin of 0.6 rad/s the published eta of 3 overshoots past 180 degrees; 6 does not."""
     fast = {"initial": {"rotvec_deg": [0.0, 0.0, 0.0], "rate": [0.6, 0.0, 0.0]}, "loop": {"mode": "sampled"}}
     law = {"t_f": 30.0, "delta": 0.5, "error": "multiplicative"}
     own = from_tables({**fast, "controller": {**law, "eta": 6.0}})
@@ -353,13 +382,13 @@ def test_gains_are_set_beside_the_papers_only_where_these_can_fly():
     assert found == {"before": own}
     assert refused is not None
     assert refused.startswith("initial.rotvec_deg is")
-    quick = {"t_f": 0.04, "delta": 0.01}  # shorter than the paper's delta
+    quick = {"t_f": 0.04, "delta": 0.01}  # t_f is shorter than the published delta
     tiny = from_tables(
         {"controller": quick, "loop": {"mode": "sampled", "period": 0.001, "t_end": 0.05, "window": 0.01}}
     )
     found, refused = judging.beside(tiny)
     assert refused is None
-    assert found["paper"].controller.delta == 0.02
+    assert found["paper"].controller.delta == 0.001  # one period, longer than the scaled delta
     assert list(judging.beside(found["paper"])[0]) == ["paper"]
 
 
@@ -406,10 +435,13 @@ def test_usual_bounds_of_every_gain_are_allowed_and_hold_the_own_one(plant, tabl
 
 
 @pytest.mark.parametrize("order", [2, 4])
-def test_the_papers_gains_are_those_of_its_case_i_and_of_a_chains_order(order):
+def test_the_published_gains_scale_with_the_mission_and_follow_the_order_of_a_chain(order):
+    """The published t_f is 30 s for a spacecraft and 5 s for a chain; delta is at least one period."""
     tables = {"controller": {"t_f": 5.0}, "loop": {"mode": "sampled", "period": 0.1}}
     known = {"eta": 3.0, "delta": 0.1, "k1": 1.0, "sign_width": 1e-3, "surface_rate": 1.0, "observer_gain": 10.0}
-    assert gains.of_paper(from_tables(tables)) == known
+    six_times = dict.fromkeys(("k1", "sign_width", "surface_rate", "observer_gain"), 6.0)
+    expected = {name: six_times.get(name, 1.0) * value for name, value in known.items()}
+    assert gains.of_paper(from_tables(tables)) == pytest.approx(expected, rel=1e-12)
     known |= {"eta": order + 1.0}
     of_chain = gains.of_paper(from_tables({**tables, "plant": {"kind": "chain", "order": order}}))
     assert of_chain == {name: known[name] for name in of_chain}

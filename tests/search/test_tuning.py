@@ -1,7 +1,6 @@
 """Gradients of the noisy loss, bounds, the search and what is handed over."""
 
 from dataclasses import replace
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -143,7 +142,8 @@ def test_a_gain_that_may_be_negative_is_searched_between_its_bounds_as_they_are(
 
 def test_the_narrowest_sign_follows_the_observer():
     """K2 is inverse to the observer's gain, and at half of what K2 moves s by in a period the sampled sign hops."""
-    table = {"loop": {"mode": "sampled", "period": 0.05}, "hardware": {"rate_noise": 1e-6}, "tune": {}}
+    tune = {"free": ["eta", "delta", "observer_gain", "k1", "sign_width"]}
+    table = {"loop": {"mode": "sampled", "period": 0.05}, "hardware": {"rate_noise": 1e-6}, "tune": tune}
     made = scenario.from_tables(table)
     ready = scenario.study(made)
     some = shares.of_scenario(made, ready.parts)
@@ -156,7 +156,7 @@ def test_the_narrowest_sign_follows_the_observer():
         inside = np.append(share[:4], 0.3)
         np.testing.assert_allclose(some.share(np.asarray(some.gains(jnp.asarray(inside)))), inside, rtol=1e-9)
     # bounds that are the user's stay as they are
-    given = scenario.replace(made, tune={"bounds": {"sign_width": [1e-7, 1e-2]}})
+    given = scenario.replace(made, tune=tune | {"bounds": {"sign_width": [1e-7, 1e-2]}})
     assert shares.of_scenario(given, ready.parts).hop == 0.0
 
 
@@ -229,11 +229,17 @@ def test_the_tail_is_the_mean_of_the_worst(tail):
     np.testing.assert_allclose(np.exp(f), np.sqrt(np.mean(worst**2)), rtol=1e-10)
 
 
-@pytest.mark.parametrize(("tail", "mean"), [(None, 10.0), (1, 16.0), (2, 10.0), (3, 10.0)])
-def test_a_tail_of_more_trials_than_end_is_of_those_that_end(tail, mean):
-    """Two of four, with squares of 4 and 16."""
-    squares = jnp.array([4.0, objective.FAILED**2, 16.0, objective.FAILED**2])
-    np.testing.assert_allclose(np.exp(2.0 * objective._log_rms(squares, tail)), mean, rtol=1e-12)
+@pytest.mark.parametrize(
+    ("statistic", "tail", "value"),
+    [
+        ("rms", None, 10.0**0.5), ("rms", 1, 4.0), ("rms", 2, 10.0**0.5), ("rms", 3, 10.0**0.5),
+        ("mean", None, 3.0), ("quantile", 1, 4.0), ("quantile", 2, 2.0),
+    ],
+)  # fmt: skip
+def test_a_statistic_ignores_trials_that_fail(statistic, tail, value):
+    """Two of four trials end, with the values 2 and 4. A tail may have more trials than end."""
+    values = jnp.array([2.0, objective.FAILED, 4.0, objective.FAILED])
+    np.testing.assert_allclose(np.exp(objective._log_statistic(values, tail, statistic)), value, rtol=1e-12)
 
 
 @pytest.mark.parametrize("least", helpers.short([1, 5, 8], [5]))
@@ -287,14 +293,15 @@ def test_a_search_for_the_worst_case_ends_with_a_smaller_one_than_a_search_for_t
     assert largest[1] <= largest[None] * (1 + 1e-6)
 
 
-def test_requirements_and_objective_of_a_scenario_reach_the_problem():
+def test_requirements_and_statistic_of_a_scenario_reach_the_problem():
+    """Of 64 trials the worst 6 are the tail for CVaR at 90 %; the 7th worst is the 90 % quantile."""
     share = Requirement("peak_torque", 0.5, None, 0.9, None)
     sure = Requirement("peak_torque", 0.5, None, 0.9973, 0.9)
     assert confirm.fresh_trials([share]) == confirm.FRESH
     assert confirm.fresh_trials([share, sure]) == 2 * 852
-    tables = {"rms": None, "worst": 1, "cvar": 6}
+    tables = {"rms": None, "mean": None, "worst": 1, "quantile": 7, "cvar": 6}
     for kind, tail in tables.items():
-        table = scenario.from_tables({"tune": {"objective": kind}}).tune
+        table = scenario.from_tables({"tune": {"statistic": kind}}).tune
         assert table is not None
         assert posing._tail(table, 64) == tail
 
@@ -327,19 +334,27 @@ def test_a_limit_that_is_far_out_of_reach_is_no_failed_trial(monkeypatch):
     assert found.worst[2] > descent.BROKEN
     assert found.worst[:2].max() < 1.0
     np.testing.assert_array_equal(found.worst, found.ended)
+    assert list(found.conflict) == ["window_error"]
 
 
-def test_what_is_out_of_reach_is_not_searched_on(monkeypatch):
-    """Harder trials would bring gains no nearer, and where none have joined the same starts lead to the same end."""
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_search_whose_limit_is_out_of_reach_adds_no_trials(monkeypatch, count):
+    """Harder trials would bring the gains no nearer. A search from several starting points ends with a global one."""
     helpers.small_search(monkeypatch)
     monkeypatch.setattr(worst, "SCREENED", 16)
-    for owner, name in ((rounds.Rounds, "harder"), (descents.Descents, "start_over")):
-        monkeypatch.setattr(owner, name, lambda *_, name=name: pytest.fail(name))
+    monkeypatch.setattr(rounds.Rounds, "harder", lambda *_: pytest.fail("harder"))
+    seeds = []
+
+    def search_globally(run, some, count, seed):
+        seeds.append((count, seed))
+
+    monkeypatch.setattr(descents.Descents, "search_globally", search_globally)
     wanted = [Requirement("window_error", 1e-9)]
-    settings = optimise.Settings(2, 2, 1, judged=False)
+    settings = optimise.Settings(count, 2, 1, judged=False)
     found = optimise.search(Evaluator(WITHIN), problem(window_error=1e-9), wanted, np.array([3.0, 0.5]), settings)
     assert found.worst[2] > optimise.HOPELESS
     assert found.rounds == 0
+    assert seeds == [(count, 2)] * (count > 1)
 
 
 @pytest.mark.parametrize(("joined", "averaged"), [(0, 32), (8, 24), (16, 16), (24, 16)])
@@ -430,8 +445,11 @@ def test_search_finds_the_constrained_optimum(monkeypatch):
 
 
 @pytest.mark.parametrize("second", ["better", "worse"])
-def test_where_going_on_with_harder_trials_leads_beyond_a_limit_it_starts_over(monkeypatch, second):
-    """Going on is made to end at gains that break the limit; starting over may find others, and nothing worse."""
+def test_a_global_search_follows_if_harder_trials_lead_beyond_a_limit(monkeypatch, second):
+    """The search with harder trials is made to end at gains that break the limit.
+
+    The global search may find better gains. If it finds worse ones, the search keeps those that it had.
+    """
     helpers.small_search(monkeypatch)
     monkeypatch.setattr(worst, "SCREENED", 16)
     some, wanted = problem(peak_torque=1.4), [Requirement("peak_torque", 1.4)]
@@ -444,29 +462,30 @@ def test_where_going_on_with_harder_trials_leads_beyond_a_limit_it_starts_over(m
         bad.offer(lost, evaluate.fly(run.tightened(harder), lost))
         run._take(bad, run.tightened(harder), 0, afresh=True)
 
-    def explore(run, harder, starts, seed, own=descents.Descents.explore):
+    def search_globally(run, harder, starts, seed, own=descents.Descents.search_globally):
         seeds.append(seed)
-        return own(run, harder, starts, seed)
+        own(run, harder, starts, seed)
 
     def descend(run, harder, shares, own=descents.Descents.descend):
         own(run, harder, shares)
-        if second == "worse" and len(seeds) == 2:
+        if second == "worse" and seeds:
             run._best.over = np.inf
 
     joins = iter([True])  # once, nothing in fact
     monkeypatch.setattr(rounds.Rounds, "harder", lambda self, *_: next(joins, False) and not vars(self).update(count=1))
     monkeypatch.setattr(descents.Descents, "again", end_lost)
-    monkeypatch.setattr(descents.Descents, "explore", explore)
+    monkeypatch.setattr(descents.Descents, "search_globally", search_globally)
     monkeypatch.setattr(descents.Descents, "descend", descend)
     found = optimise.search(evaluate, some, wanted, np.array([3.0, 0.5]), optimise.Settings(2, 10, 1))
-    assert seeds == [1, 2]
+    assert seeds == [2]
     assert bool(found.worst[0] <= 1.0) is (second == "better")
     assert np.array_equal(found.share, lost[0]) is (second == "worse")
 
 
 @pytest.mark.long
 def test_starts_begin_with_the_first_one_and_differ():
-    share = starts.starting_points(Evaluator(WITHIN), problem(), np.array([0.2, 0.3]), 4, 7, lambda *told: None)
+    first, designs = np.array([0.2, 0.3]), np.array([[0.4, 0.5]])
+    share = starts.starting_points(Evaluator(WITHIN), problem(), first, designs, 4, 7, lambda *told: None)
     assert share.shape == (4, 2)
     np.testing.assert_array_equal(share[0], [0.2, 0.3])
     assert len(np.unique(share, axis=0)) == 4
@@ -525,190 +544,6 @@ def test_a_search_without_slopes_finds_the_optimum_too(monkeypatch):
         found[sloped] = optimise.search(evaluate, problem(), (), np.array([3.0, 0.5]), settings)
     assert evaluates[False].gradients == 0
     np.testing.assert_allclose(found[False].value, found[True].value, rtol=1e-3)
-
-
-class Valley(Evaluator):
-    """F = (x0 - 0.2)^2 + 100 (x1 - x0^2)^2 and x2 of no account, without limits; what is asked for is counted."""
-
-    def slopes(self, problem, share):
-        self.gradients += len(share)
-        x0, x1, _ = share.T
-        f, c = (x0 - 0.2) ** 2 + 100 * (x1 - x0**2) ** 2, np.full((len(share), 0, 8), -1.0)
-        slope = np.stack([2 * (x0 - 0.2) - 400 * x0 * (x1 - x0**2), 200 * (x1 - x0**2), 0.0 * x0], axis=1)
-        return Sloped(share, f, c, f, slope, np.zeros((*c.shape, 3)))
-
-
-THREE = shares.Bounds(("eta", "k1", "sign_width"), (2.05, 0.1, 1e-5), (6.0, 50.0, 1e-1))
-
-
-def test_a_descent_goes_on_where_a_shorter_one_from_the_same_start_stopped():
-    ends, counts = [], []
-    for parts_of_it in ((7, 30), (30,)):
-        evaluate, start = Valley(THREE), descent.Start(np.array([0.9, 0.1, 0.5]))
-        best, kept = descent.Best(start.share, 0, 0.0), []
-        for steps in parts_of_it:
-            kept.clear()
-            descent.descend(partial(evaluate.slopes, problem()), best, start, steps, kept.append)
-        ends.append((best.f, best.share.tolist(), [float(one.f[0]) for one in kept]))
-        counts.append(evaluate.gradients)
-    assert ends[0] == ends[1]
-    assert counts[0] == counts[1] > 7
-    assert ends[0][0] < 1e-3
-
-
-def test_where_t_f_is_free_the_hand_over_is_moved_to_a_sample_with_it_too():
-    """By delta alone, t_f as short as it can be, a limit might be broken: later ones are looked at."""
-    some = replace(problem(2), names=("t_f", "delta"))
-    evaluate = Evaluator(shares.Bounds(("t_f", "delta"), (10.0, 0.2), (20.0, 5.0)))
-    run = descents.Descents(evaluate, 0.0, 2, np.random.default_rng(0))
-    own = np.array([15.13, 0.79])  # handed over at 14.34 s, between samples 71 and 72
-    share = evaluate.bounds.share(own)
-    run._take(descent.Best(share, 0, 0.0), some, 0, afresh=True)
-    moved = [
-        np.asarray(evaluate.bounds.gains(jnp.asarray(one)))
-        for one in hand_overs.on_samples(some, evaluate.bounds, run.share)
-    ]
-    on_samples = np.asarray([(t_f - delta) / 0.2 for t_f, delta in moved])
-    np.testing.assert_allclose(on_samples, np.round(on_samples), atol=1e-9)
-    with_delta = sorted(delta for t_f, delta in moved if abs(t_f - own[0]) < 1e-9)
-    np.testing.assert_allclose(with_delta, [0.73, 0.93], atol=1e-9)
-    with_t_f = sorted(t_f for t_f, delta in moved if abs(delta - own[1]) < 1e-9)
-    np.testing.assert_allclose(with_t_f, 0.79 + 0.2 * np.arange(71, 71 + hand_overs.LATER), atol=1e-9)
-
-
-def test_the_hand_over_is_moved_to_a_sample_where_t_f_is_free_and_delta_is_not():
-    """What is trained with it between two samples, a flight computer hands over later."""
-    some = replace(problem(2), names=("t_f",))
-    evaluate = Evaluator(shares.Bounds(("t_f",), (10.0,), (20.0,)))
-    run = descents.Descents(evaluate, 0.0, 2, np.random.default_rng(0))
-    run._take(descent.Best(evaluate.bounds.share(np.array([15.13])), 0, 0.0), some, 0, afresh=True)
-    moved = [
-        float(evaluate.bounds.gains(jnp.asarray(one))[0])
-        for one in hand_overs.on_samples(some, evaluate.bounds, run.share)
-    ]
-    delta = float(some.parts.controller.delta)
-    before = np.floor((15.13 - delta) / 0.2)
-    np.testing.assert_allclose(moved, delta + 0.2 * (before + np.arange(hand_overs.LATER)), atol=1e-9)
-
-
-class Narrow(Evaluator):
-    """F = (delta - 1.1)^2 below delta = 2, where a limit is broken next to the samples, every 0.2 s; then 1 + .."""
-
-    def slopes(self, problem, share):
-        gains = np.asarray(jax.vmap(self.bounds.gains)(jnp.asarray(share)))
-        by_share = np.asarray(jax.vmap(jax.jacfwd(self.bounds.gains))(jnp.asarray(share)))[:, 0, 0]
-        delta = gains[:, 0]
-        near, off = delta < 2.0, np.abs(delta / 0.2 - np.round(delta / 0.2))
-        f = np.where(near, (delta - 1.1) ** 2, 1.0 + (delta - 3.5) ** 2)
-        f_slope = 2.0 * np.where(near, delta - 1.1, delta - 3.5) * by_share
-        broken = np.where(near, 0.3 - off, -1.0)[:, None, None]
-        shape = (len(share), 1, problem.trials.size)
-        return Sloped(gains, f, np.broadcast_to(broken, shape), f, f_slope[:, None], np.zeros((*shape, 1)))
-
-    fly = slopes
-
-
-def test_a_hand_over_that_breaks_a_limit_on_a_sample_gives_way_to_that_of_another_start():
-    """It took the place of what kept the limits: the search ended with "not met" where it knew gains that meet them."""
-    some = replace(problem(peak_torque=1.0), names=("delta",))
-    evaluate = Narrow(shares.Bounds(("delta",), (0.2,), (5.0,)))
-    run = descents.Descents(evaluate, 0.0, 20, np.random.default_rng(0))
-    run.descend(some, {k: evaluate.bounds.share(np.array([delta])) for k, delta in enumerate((1.1, 3.5))})
-    assert run.best.over == 0.0
-    np.testing.assert_allclose(run.best.f, 1.01, rtol=1e-6)  # on the samples beside 3.5 s
-
-
-class Rippled(Evaluator):
-    """F = 0.02 (delta - 1.8)^2 + 0.01 (1 - cos(2 pi delta / 0.6)), a limit broken below 1.7 by more each s."""
-
-    def slopes(self, problem, share):
-        gains = np.asarray(jax.vmap(self.bounds.gains)(jnp.asarray(share)))
-        by_share = np.asarray(jax.vmap(jax.jacfwd(self.bounds.gains))(jnp.asarray(share)))[:, 0, 0]
-        delta, rate = gains[:, 0], 2 * np.pi / 0.6
-        f = 0.02 * (delta - 1.8) ** 2 + 0.01 * (1 - np.cos(rate * delta))
-        f_slope = (0.04 * (delta - 1.8) + 0.01 * rate * np.sin(rate * delta)) * by_share
-        shape = (len(share), 1, problem.trials.size)
-        over, slope = (np.broadcast_to(v[:, None, None], shape) for v in (1.7 - delta, -by_share))
-        return Sloped(gains, f, over, f, f_slope[:, None], slope[..., None])
-
-    fly = slopes
-
-
-@pytest.mark.parametrize("delta", [3.0, 4.8])
-def test_a_search_ends_in_the_best_of_the_ripples_that_noise_makes_over_delta(delta):
-    """Two searches that differed in rounding ended 2.4 % apart, each in a ripple of its own."""
-    some = replace(problem(peak_torque=1.0), names=("delta",))
-    evaluate = Rippled(shares.Bounds(("delta",), (0.2,), (5.0,)))
-    run = descents.Descents(evaluate, 0.0, 20, np.random.default_rng(0))
-    run.descend(some, {0: evaluate.bounds.share(np.array([delta]))})
-    np.testing.assert_allclose(run.gains, 1.8, rtol=1e-9)
-
-
-def test_the_price_of_a_limit_is_what_f_falls_by_where_it_is_less_tight():
-    """F = x0 - 2 x1 with x1 - x0 / 2 <= c, at c = 0 on the bound x0 = 0, and a limit that is not active."""
-    f_slope, c_slope = np.array([[1.0, -2.0]]), np.array([[-0.5, 1.0], [3.0, 3.0]])
-    c = np.array([[[-0.3, 0.0], [-0.5, -0.2]]])
-    at = Sloped(np.zeros((1, 2)), np.zeros(1), c, np.zeros(1), f_slope, np.stack([0 * c_slope, c_slope], axis=1)[None])
-    np.testing.assert_allclose(descent.prices(at, np.array([0.0, 0.4])), [2.0, 0.0], rtol=1e-12)
-    none = Sloped(np.zeros((1, 2)), np.zeros(1), c[:, :0], np.zeros(1), f_slope, np.zeros((1, 0, 2, 2)))
-    assert descent.prices(none, np.array([0.0, 0.4])).size == 0
-
-
-def test_other_hand_overs_are_on_samples_within_the_bounds_and_twice_delta():
-    some = replace(problem(2), names=("t_f", "delta"))
-    bounds = shares.Bounds(("t_f", "delta"), (10.0, 0.9), (20.0, 5.0))
-    looked = hand_overs.elsewhere(some, bounds, bounds.share(np.array([15.13, 1.5])))
-    t_f, delta = np.asarray([bounds.gains(jnp.asarray(one)) for one in looked]).T
-    np.testing.assert_allclose(t_f, 15.13)
-    np.testing.assert_allclose((t_f - delta) / 0.2, np.round((t_f - delta) / 0.2), atol=1e-9)
-    np.testing.assert_allclose([delta.max(), delta.min()], [2.93, 0.93], atol=1e-9)
-    assert (
-        hand_overs.elsewhere(replace(some, names=("t_f",)), shares.Bounds(("t_f",), (10.0,), (20.0,)), np.ones(1)) == []
-    )
-
-
-def test_a_gain_that_makes_no_difference_keeps_the_scenarios_value_and_the_others_do_not():
-    """So does a width whose interval begins elsewhere, and above it, for the scenario's own observer's gain."""
-    hops = shares.Bounds(("observer_gain", *THREE.names[1:]), (2.05, 0.1, 1e-5), (600.0, 50.0, 1e-1), hop=5e-3)
-    for bounds, width, kept in ((THREE, 2e-3, True), (THREE, 2e-3, False), (hops, 2e-3, True), (hops, 1e-3, True)):
-        some, own = replace(problem(), names=bounds.names), np.array([3.0, 5.0, width])
-        run = descents.Descents(Valley(bounds), 0.0, 40, np.random.default_rng(0))
-        if kept:
-            run.set_out(some, own)
-        run.descend(some, {0: np.array([0.9, 0.1, 0.1])})
-        np.testing.assert_allclose(run.share[:2], [0.2, 0.04], atol=0.02)
-        np.testing.assert_allclose(run.gains[2], width if kept else 1e-5 * 1e4**0.1)
-
-
-def test_starts_are_the_best_that_lie_far_apart_and_then_nearer_ones():
-    share = np.array([[0.1, 0.1], [0.1, 0.15], [0.9, 0.1], [0.12, 0.45], [0.1, 0.1]])
-    apart = starts.distances(share)
-    np.testing.assert_allclose(apart[0], [0.0, 0.05, 0.8, 0.35, 0.0], atol=1e-12)
-    assert [starts.far_apart([1, 0, 2, 3], apart, count) for count in (1, 2, 3, 4)] == [
-        [1], [1, 2], [1, 2, 3], [1, 2, 3, 0],
-    ]  # fmt: skip
-
-
-def test_a_descent_looks_at_no_more_points_than_it_may_and_steps_over_slopes_without_sense():
-    """F = ln(1 + |x - a|^2) with slopes of 1e30 in one place, and with a number that is none in another."""
-
-    class Bowl(Evaluator):
-        def slopes(self, problem, share):
-            self.gradients += 1
-            off = share[0] - np.array([0.3, 0.8])
-            f = np.log1p(off @ off)
-            slope = 2 * off / (1 + off @ off) * (1e30 if self.gradients == 1 else 1.0)
-            slope = np.where(self.gradients == 3, np.nan, slope)
-            c = np.full((1, 0, 8), -1.0)
-            return Sloped(share, np.array([f]), c, np.array([f]), slope[None], np.zeros((1, 0, 8, 2)))
-
-    for steps, near in ((3, 1.0), (40, 1e-4)):
-        start = descent.Start(np.array([0.9, 0.1]))
-        evaluate, best, path = Bowl(WITHIN), descent.Best(start.share, 0, 0.0), []
-        descent.descend(partial(evaluate.slopes, problem()), best, start, steps, path.append, close=1e-12)
-        assert evaluate.gradients <= steps
-        assert best.f < near
-        assert len(path) <= evaluate.gradients
 
 
 def test_statistics_count_failures_and_average_the_rest(monkeypatch):
@@ -782,14 +617,44 @@ def test_the_shortest_t_f_for_a_torque_limit_is_the_one_theory_names(plant, monk
 @pytest.mark.parametrize(
     ("ratio", "said"),
     [
-        (1.234, "effort reaches 1.23 times its limit"),
-        (None, "2 of 8 training trials do not arrive (2 diverged), and so keep no limit"),
-        (np.inf, "2 of 8 training trials do not arrive"),
+        (1.234, "with the best compromise effort reaches 1.23 times its limit"),
+        (None, "with the best compromise 2 of 8 training trials do not arrive (2 diverged), and so keep no limit"),
+        (np.inf, "with the best compromise 2 of 8 training trials do not arrive"),
     ],
 )
-def test_what_breaks_a_limit_in_training_is_said(ratio, said):
-    """Infinite in a result, absent from the file it is read from."""
+def test_a_sentence_says_by_how_much_the_best_gains_break_a_limit(ratio, said):
+    """A failed trial is infinite in a result, and absent from the file that it is read from."""
     found = {"largest_over_limit": {"peak_torque": 0.97, "effort": ratio}, "worst_case": False}
     training = {"trials": 8, "counts": {"ok": 6, "diverged": 2}}
-    (line,) = search_sentences.search({"search": found, "verdicts": [], "training": training})
-    assert said in line
+    first, second = search_sentences.search({"search": found, "verdicts": [], "training": training})
+    assert first == "the search found no gains that meet every requirement"
+    assert said in second
+
+
+TORQUE = {"metric": "peak_torque", "limit": 0.5, "unit": "N m"}
+MARGIN = {"metric": "gain_margin", "limit": 6.0, "unit": "dB", "at_least": True}
+
+
+@pytest.mark.parametrize(
+    ("conflict", "lines"),
+    [
+        ({"peak_torque": 1.3}, ["if peak_torque alone gives way, its limit must be 0.65 N m instead of 0.5"]),
+        ({"gain_margin": 1.25}, ["if gain_margin alone gives way, its limit must be 4.5 dB instead of 6"]),
+        ({"gain_margin": 2.5}, ["gain_margin alone cannot give way far enough: the loop would be unstable"]),
+        ({"peak_torque": 0.98}, ["peak_torque can be met, but only if another requirement gives way"]),
+        (
+            {"peak_torque": 1.3, "gain_margin": None},
+            [
+                "peak_torque and gain_margin conflict: the gains that improve one of them worsen another",
+                "if peak_torque alone gives way, its limit must be 0.65 N m instead of 0.5",
+                "no value of gain_margin alone resolves the conflict: the other requirements cannot be met either",
+                "if all of them give way together, each must by 12 % of its limit",
+            ],
+        ),
+    ],
+)
+def test_sentences_name_the_conflicting_limits_and_the_values_that_resolve_the_conflict(conflict, lines):
+    found = {"largest_over_limit": {"peak_torque": 1.12, "gain_margin": 1.119}, "conflict": conflict}
+    told = [*search_sentences.search({"search": found, "verdicts": [TORQUE, MARGIN], "training": {}})]
+    assert told[0] == "the search found no gains that meet every requirement, nor did a global search"
+    assert told[3:] == lines

@@ -183,7 +183,8 @@ def test_a_front_from_start_to_end(command, tmp_path, monkeypatch, text, limit):
     assert command("pareto", "s.toml", "--points", 5, "--out", "p")[0] == 2
 
 
-@pytest.mark.parametrize(("change", "value"), [("objective = \"t_f\"", 'tune.objective is "t_f"'),
+@pytest.mark.parametrize(("change", "value"), [('minimise = "t_f"', 'tune.minimise is "t_f"'),
+                                               ('minimise = "effort"', 'tune.minimise is "effort"'),
                                                ("torque_weight = 0.5", "tune.torque_weight is 0.5"),
                                                ("worst_case = true", "tune.worst_case is true")])  # fmt: skip
 def test_a_front_of_something_else_is_refused(command, tmp_path, change, value):

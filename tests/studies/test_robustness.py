@@ -92,7 +92,7 @@ def test_what_cannot_be_asked_is_refused_in_one_sentence(command, tmp_path, opti
 @pytest.mark.parametrize(
     ("tune", "said"),
     [
-        ({"objective": "t_f", "free": ["t_f"]}, 'tune.objective is "t_f"'),
+        ({"minimise": "t_f", "free": ["t_f"]}, 'tune.minimise is "t_f"'),
         ({"worst_case": True}, "tune.worst_case is true, but must be false to ask what margins cost"),
     ],
 )

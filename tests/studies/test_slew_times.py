@@ -13,6 +13,7 @@ from ptsmc_jax.simulation import catalogues
 from tests.helpers import SHORT_CHAIN, small_search
 from tests.output.pages import checked
 from tuning.output import front_sentences
+from tuning.search import gains
 from tuning.studies import judging, posing, slew_times
 
 
@@ -32,11 +33,10 @@ def test_a_faster_slew_costs_torque_and_accuracy(command, tmp_path, monkeypatch)
     assert 2.5 < fast["peak_torque"] / slow["peak_torque"] < 6.5
     # each time's gains are at least as good at it as the other time's, on the very trials
     for own, other in ((fast, slow), (slow, fast)):
-        end = {"controller__t_f": own["t_f"], "loop__t_end": own["t_f"] + 1.5}
-        flown = scenario.replace(scenario.read(tmp_path / "c.toml"), **end)
+        untuned = scenario.replace(scenario.read(tmp_path / "c.toml"), tune=None)
         errors = []
-        for gains in (own, other):
-            known = scenario.replace(flown, controller__eta=gains["eta"], controller__delta=gains["delta"])
+        for found in (own, other):  # all other gains stay those of t_f = 5 s
+            known = gains.in_scenario(untuned, {"t_f": own["t_f"], "eta": found["eta"], "delta": found["delta"]})
             trials = judging.judge(known, judging.seed_of_judge(0))
             errors.append(np.sqrt(np.mean(trials.metrics.window_error[:60] ** 2)))
         np.testing.assert_allclose(own["rms_window_error"], errors[0], rtol=1e-9)
@@ -107,8 +107,8 @@ def test_what_cannot_be_asked_is_refused_in_one_sentence(command, tmp_path, opti
         ),
         ({"tune": {"free": ["eta", "t_f"]}}, "but must be without t_f to ask what a faster slew costs"),
         (
-            {"tune": {"objective": "t_f", "free": ["t_f"]}, "requirements": {"window_error": 1e-3}},
-            'tune.objective is "t_f"',
+            {"tune": {"minimise": "t_f", "free": ["t_f"]}, "requirements": {"window_error": 1e-3}},
+            'tune.minimise is "t_f"',
         ),
         ({"tune": {"worst_case": True}}, "tune.worst_case is true, but must be false"),
         ({"requirements": {"gain_margin": 6.0}, "tune": {}}, "requirements.gain_margin is asked of one loop"),
@@ -172,16 +172,20 @@ def test_times_without_gains_are_told():
     assert np.isfinite(len(list(front_sentences.slew_times_lines(nothing))))
 
 
-def test_the_usual_bounds_of_delta_lie_below_the_shortest_time():
-    """Those of t_f = 8 s reach to 4.025 s: a time of 4 s was refused, by a key that nobody had given."""
-    tables = {"plant": {"kind": "chain", "x0": [1.0, 0.0]}, "controller": {"t_f": 8.0}, "loop": {"mode": "sampled"}}
+def test_default_bounds_of_delta_follow_the_shortest_time():
+    """The default bounds of t_f = 8 s reach to 2 s, which a prescribed time of 1.9 s does not allow."""
+    tables = {
+        "plant": {"kind": "chain", "x0": [1.0, 0.0]},
+        "controller": {"t_f": 8.0, "delta": 0.5},
+        "loop": {"mode": "sampled", "period": 0.05},
+    }
     known = scenario.from_tables({**tables, "tune": {}})
-    assert known.search.bounds["delta"] == (0.05, 4.025)
-    slew_times.check(known, (4.0, 8.0))
-    given = scenario.from_tables({**tables, "tune": {"bounds": {"delta": [0.05, 4.1]}}})
-    with pytest.raises(ScenarioError, match=r"tune\.bounds\.delta is \[0\.05, 4\.1\]"):
-        slew_times.check(given, (4.0, 8.0))
-    # and so do those that a hand-over of the scenario's own takes farther out
+    assert known.search.bounds["delta"] == (0.05, 2.0)
+    slew_times.check(known, (1.9, 8.0))
+    given = scenario.from_tables({**tables, "tune": {"bounds": {"delta": [0.05, 1.95]}}})
+    with pytest.raises(ScenarioError, match=r"tune\.bounds\.delta is \[0\.05, 1\.95\]"):
+        slew_times.check(given, (1.9, 8.0))
+    # so do the default bounds that include a longer delta of the scenario
     reaching = scenario.from_tables({**tables, "controller": {"t_f": 8.0, "delta": 6.0}, "tune": {}})
     assert reaching.search.bounds["delta"] == (0.05, 7.0)
     slew_times.check(reaching, (6.5, 8.0))

@@ -1,6 +1,7 @@
 """What a tuning run does with what fresh trials say."""
 
 import tomllib
+from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -9,10 +10,11 @@ import pytest
 
 from ptsmc_jax import scenario
 from ptsmc_jax.numerics import draws
+from ptsmc_jax.scenario.tables import objective_name
 from ptsmc_jax.simulation.requirements import Requirement
 from tests.helpers import FIRST_FLIGHT, ROOT, SHORT_CHAIN, small_search
 from tuning.output import search_sentences
-from tuning.search import trust, worst
+from tuning.search import shares, trust, worst
 from tuning.search.descents import Step
 from tuning.search.objective import FAILED
 from tuning.studies import judging, posing, tune_files, tuner
@@ -146,10 +148,82 @@ def test_a_gain_with_which_no_trial_ends_anywhere_is_not_one_without_influence(g
     assert tune_files._trust(found, tuning)["influence"] == {"eta": said}
 
 
-def test_every_column_of_a_history_has_a_name_of_its_own():
-    tables = tomllib.loads(SHORT_CHAIN) | {"tune": {"objective": "t_f", "free": ["eta", "t_f"]}}
-    columns = tune_files.history_columns(scenario.from_tables(tables), ["peak_torque"])
-    assert columns == ["step", "start", "goal_t_f", "eta", "t_f", "peak_torque_over_limit"]
+@pytest.mark.parametrize(
+    ("tune", "column", "name"),
+    [
+        ({"minimise": "t_f"}, "objective_t_f", "t_f"),
+        ({"minimise": "limits"}, "objective_limits", "largest metric over its limit"),
+        ({}, "rms_window_error", "RMS window error"),
+        ({"minimise": "effort", "statistic": "quantile"}, "quantile_effort", "90 % quantile of effort"),
+    ],
+)
+def test_every_column_of_a_history_has_its_own_name(tune, column, name):
+    tables = tomllib.loads(SHORT_CHAIN) | {"tune": {"free": ["eta", "t_f"], **tune}}
+    some = scenario.from_tables(tables)
+    columns = tune_files.history_columns(some, ["peak_torque"])
+    assert columns == ["step", "start", column, "eta", "t_f", "peak_torque_over_limit"]
+    assert objective_name(some.search) == name
+
+
+@dataclass(frozen=True)
+class Found:
+    """The part of a `Search` that a further search in larger bounds depends on."""
+
+    gains: np.ndarray
+    value: float
+    problem: Any = None
+    over: float = 0.0
+    interrupted: bool = False
+    history: tuple[Step, ...] = ()
+
+    @property
+    def share(self) -> np.ndarray:
+        return np.ones(len(self.gains))
+
+
+class Rising:
+    """A posed problem of K1 and eta, F = -ln K1: a search ends at the upper bounds of both, and eta does not matter."""
+
+    def __init__(self, made: scenario.Scenario, searched: list[dict[str, tuple[float, float]]]):
+        self.ready, self.seed, self.sloped, self.problem = SimpleNamespace(scenario=made), 0, True, None
+        self.searched, names = searched, tuple(made.search.bounds)
+        bounds = shares.Bounds(names, *zip(*made.search.bounds.values(), strict=True))
+
+        def fly(problem: Any, share: np.ndarray) -> Any:
+            k1 = np.array([bounds.gains(one)[names.index("k1")] for one in share])
+            return SimpleNamespace(f=-np.log(k1), beyond=np.zeros(len(k1)))
+
+        self.evaluate = SimpleNamespace(bounds=bounds, fly=fly)
+
+    def search(self, problem: Any, gains: Any, starts: int, report: Any) -> Found:
+        self.searched.append(dict(self.ready.scenario.search.bounds))
+        upper = np.array(self.evaluate.bounds.upper)
+        value = float(1.0 / upper[self.evaluate.bounds.names.index("k1")])
+        return Found(upper, value, history=(Step(0, upper, value, upper),))
+
+
+def test_a_search_goes_on_in_larger_bounds_if_a_gain_that_matters_ends_on_a_default_one(monkeypatch):
+    """K1 is searched in bounds that are ten times as large, three times at most; eta, without influence, is not."""
+    tables = {"controller": {"t_f": 30.0}, "tune": {"free": ["eta", "k1"]}}
+    searched = list[dict[str, tuple[float, float]]]()
+    monkeypatch.setattr(posing, "pose", lambda made, *_, **__: Rising(made, searched))
+    monkeypatch.setattr(tuner, "_after", lambda before, more: more)
+    some, told = scenario.from_tables(tables), []
+    first, usual = Rising(some, searched), some.search.bounds
+    outcome = first.search(None, None, 1, None)
+    found, posed = tuner._in_larger_bounds(
+        cast(Any, outcome), cast(Any, first), None, lambda *said: told.append(said[0])
+    )
+    factors = [one["k1"][1] / usual["k1"][1] for one in searched]
+    np.testing.assert_allclose(factors, 10.0 ** np.arange(1 + tuner.WIDENED), rtol=1e-12)
+    assert all(one["eta"] == usual["eta"] for one in searched)
+    assert told == ["searching beyond the bounds of k1"] * tuner.WIDENED
+    assert found.gains[1] == pytest.approx(1e3 * usual["k1"][1])
+    assert len(found.history) == 1 + tuner.WIDENED
+    assert posed.ready.scenario.search.bounds == searched[-1]
+    stated = scenario.replace(some, tune__bounds={"k1": usual["k1"]})  # bounds of the user stay
+    first = Rising(stated, searched)
+    assert tuner._in_larger_bounds(cast(Any, outcome), cast(Any, first), None, lambda *_: None)[1] is first
 
 
 def test_a_search_of_gains_with_which_no_trial_ends_is_drawn():

@@ -96,7 +96,13 @@ REFERENCES = {
 
 @pytest.mark.parametrize("kind", short(REFERENCES, ["moving fast", "quantised"]))
 def test_a_moving_reference_and_quantisation_are_none(kind):
-    tables = {"controller": {"t_f": 10.0, "delta": 0.5}, "loop": {"mode": "sampled"}, **REFERENCES[kind]}
+    tables = {
+        "controller": {"t_f": 10.0, "delta": 0.5, "eta": 3.0, "k1": 1.0, "surface_rate": 1.0, "sign_width": 1e-3},
+        "observer": {"gain": [10.0] * 3},
+        "disturbance": {"amplitude": [0.01] * 3, "frequency": [0.1] * 3},
+        "loop": {"mode": "sampled", "period": 0.05, "t_end": 20.0, "window": 1.0},
+        **REFERENCES[kind],
+    }
     assert rest.swing(scenario.study(scenario.from_tables(tables)).parts) is None
 
 
