@@ -59,6 +59,12 @@ class PDController(BaselineTable, frozen=True):
         return {"k_p": 0.2 * design.rate**2, "k_d": 0.6 * design.rate}
 
 
+def _usual_surface(choice: Choice) -> tuple[float, float]:
+    """Four decades about 0.03 1/s^p in the paper's case."""
+    unit = scales(choice.scenario).time ** -choice.law.p
+    return 3e-4 * unit, 3.0 * unit
+
+
 class TerminalController(BaselineTable, frozen=True):
     """Nonsingular terminal sliding mode, s = v + sig^p(v') / b (Feng, Yu, Man 2002).
 
@@ -91,7 +97,7 @@ class TerminalController(BaselineTable, frozen=True):
 
     gains: ClassVar[Mapping[str, GainBounds]] = {
         "p": GainBounds(lambda _: (1.05, 1.95), between(1.0, 2.0)),
-        "b": over_t_f(0.01, 100.0),
+        "b": GainBounds(_usual_surface),
         "k": over_t_f(2.0, 2000.0, 2),
         "sign_width": gain_bounds.SIGN_WIDTH,
         "t_f": gain_bounds.T_F,
@@ -252,7 +258,7 @@ class TimeBaseSlidingController(BaselineTable, frozen=True):
     Attributes:
         surface_rate: c, rate on the surface [1/s]
         k: rate of s [1/s]
-        sign_width: of the smooth sign; 0 is the exact sign
+        sign_width: thickness of the boundary layer; 0 is the discontinuous sign [1/s]
     """
 
     kind: Literal["time_base_sliding"] = "time_base_sliding"
@@ -342,7 +348,7 @@ class PredefinedTimeController(BaselineTable, frozen=True):
         share: of t_f in which the error settles on the surface, after the rest, in which the surface is reached
         q1: power of the surface
         q2: power of the reaching law
-        sign_width: of the smooth sign; 0 is the exact sign
+        sign_width: thickness of the boundary layer; 0 is the discontinuous sign [1/s]
     """
 
     kind: Literal["predefined_time"] = "predefined_time"
@@ -378,7 +384,7 @@ class SuperTwistingController(BaselineTable, frozen=True):
     Attributes:
         surface_rate: c, rate of the error on the surface [1/s]
         lipschitz: L, bound on each component of the derivative of eps'' that the disturbance makes [1/s^3]
-        sign_width: of the smooth sign; 0 is the exact sign
+        sign_width: thickness of the boundary layer; 0 is the discontinuous sign [1/s]
     """
 
     kind: Literal["super_twisting"] = "super_twisting"

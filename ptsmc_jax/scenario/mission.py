@@ -172,7 +172,7 @@ def _limits(scenario: Any) -> _Limits:
         return _Limits(slow, slow, slow)
     position, velocity = scenario.devices.noise_of_error(scenario)
     position = 0.0 if scenario.estimator.on else position  # an attitude filter passes slow errors only
-    rates = least * (most / least) ** np.linspace(0.0, 1.0, TRIED)
+    rates = least * (most / least) ** np.linspace(1.0, 0.0, TRIED)  # the fastest first: of equal ones it is taken
     with np.errstate(all="ignore"):
         lag = _disturbance(scenario)[1] / rates**3
         error = lag**2 + position**2 * rates * period + velocity**2 * period / rates
