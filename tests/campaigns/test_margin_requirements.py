@@ -155,7 +155,7 @@ def worst_of(each):
 
 def sloped(asked, bounds, share):
     """Rows and slopes at one point."""
-    return {name: v[0] for name, v in margin_rows.of_points(asked, bounds, np.asarray(share)[None]).items()}
+    return {name: v[0] for name, v in margin_rows.of_points(asked, bounds.scale, np.asarray(share)[None]).items()}
 
 
 def farthest(name, values, axis):
@@ -222,7 +222,7 @@ def test_rows_of_constraints_are_met_where_the_verdicts_are_and_have_slopes(draw
         np.testing.assert_allclose(row.max() + 1.0, verdict.margin, rtol=1e-9)
     step, along = 1e-4, np.array([0.6, -0.9, 1.0, 0.7])
     points = [share + k * step * along for k in (-2, -1, 1, 2)]
-    c = margin_rows.of_points(asked, bounds, np.stack(points[:3]))["c"]  # and one more than devices
+    c = margin_rows.of_points(asked, bounds.scale, np.stack(points[:3]))["c"]  # and one more than devices
     c = [*c, sloped(asked, bounds, points[3])["c"]]
     numeric = (c[0] - 8 * c[1] + 8 * c[2] - c[3]) / (12 * step)
     slopes = np.asarray(found["c_slope"])
@@ -272,7 +272,7 @@ def test_no_product_has_an_inertia_for_each_case(of_two_trials):
     asked, bounds = of_two_trials.problem.margins, of_two_trials.evaluate.bounds
 
     def with_slopes(share):
-        return margin_rows.with_slopes(asked, bounds, share)
+        return margin_rows.with_slopes(asked, bounds.scale, share)
 
     assert products_for_each_case(with_slopes, of_two_trials) == ([], True)
 
@@ -289,10 +289,10 @@ def test_rows_of_drawn_inertias_are_compiled_where_the_hand_over_is_free():
         "margin_rows.hardest = lambda asked, _: (margin_rows._of_trials(asked, np.arange(2)), 0.0)\n"
         "ready = scenario.study(known); bounds = of_scenario(known, ready.parts)\n"
         "asked = margin_rows.ask(ready, bounds, 0)\n"
-        "print(margin_rows.of_points(asked, bounds, np.full((1, len(bounds.names)), 0.5))['c_slope'].shape)"
+        "print(margin_rows.of_points(asked, bounds.scale, np.full((1, len(bounds.names)), 0.5))['c_slope'].shape)"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout) == (0, "(1, 1, 30, 5)\n"), done.stderr[-2000:]
+    assert (done.returncode, done.stdout) == (0, "(1, 1, 30, 6)\n"), done.stderr[-2000:]
 
 
 def test_the_evaluator_puts_margins_beside_what_is_flown_and_drawn_loops_are_judged_by_the_worst(drawn, monkeypatch):
@@ -332,9 +332,10 @@ def test_the_program_that_is_compiled_beside_is_the_one_that_the_search_asks_for
     monkeypatch.setattr(margin_rows, "hardest", lambda asked, _: (asked, 0.0))
     bounds = posed.evaluate.bounds
     margin_rows.ask(posed.ready, bounds, 3)
-    known = [(jax.tree.structure(given), [programs._shape(leaf) for leaf in jax.tree.leaves(given)])
-             for given in ((some, share) for some, bound, share in prepared if bound is bounds)]  # fmt: skip
-    asked = (posed.problem.margins, np.stack([bounds.share(posed.own)] * len(jax.local_devices())))
+    known = [
+        (jax.tree.structure(given), [programs._shape(leaf) for leaf in jax.tree.leaves(given)]) for given in prepared
+    ]
+    asked = (posed.problem.margins, bounds.scale, np.stack([bounds.share(posed.own)] * len(jax.local_devices())))
     assert known == [(jax.tree.structure(asked), [programs._shape(leaf) for leaf in jax.tree.leaves(asked)])]
 
 

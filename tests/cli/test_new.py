@@ -132,7 +132,8 @@ def test_what_is_off_is_allowed_as_it_stands(plant):
                 table = {**{key: value for key, value in table.items() if key not in ATTITUDE}, **attitude}
             given = {"loop": {"mode": "sampled"}, "tune": {"statistic": "cvar"}}.get(name, {})  # cvar has a level
             alone = {"hardware": {}} if name == "sensors" else {}  # of one's own, in place of noise
-            from_tables({**base, **alone, name: hardware if name == "hardware" else {**table, **given}})
+            around = written if name == "tune" else base  # default bounds of delta follow the loop's mode
+            from_tables({**around, **alone, name: hardware if name == "hardware" else {**table, **given}})
             tried += 1
     layout = layouts.TABLES[plant]
     dispersion = layout["dispersion"]

@@ -12,6 +12,10 @@ INERTIA, CLEAR = "three principal moments or a symmetric 3x3", "|q4| of at least
 FINITE, PRESCRIBED = "observer.kind = 'finite_time'\n", "observer.kind = 'prescribed_time'\n"
 OPPOSITE = "controller.error = 'multiplicative'\n"
 CHAIN = 'plant.kind = "chain"\n'
+LONG_RUN = (
+    "controller = { t_f = 1e5, delta = 1.0 }\n"
+    "loop = { mode = 'sampled', period = %s, window = 1.0, t_end = 100010.0 }\n"
+)
 FLEXIBLE = "spacecraft.inertia = [10, 12, 14]\nflexible.coupling = [[3, 0, 0]]\n"
 OWN = 'plant = { kind = "system", system = "%s" }'
 
@@ -102,12 +106,12 @@ BAD = [
     (SAMPLED + "loop.window = 1e-16", "loop.window is 1e-16", "at least one control period, loop.period = 0.05"),
     ("loop.window = 1e-16", "loop.window is 1e-16", "at least 0.0003, controller.t_f times 1e-05"),
     (
-        "controller = { t_f = 1e5, delta = 1.0 }\nloop = { mode = 'sampled', period = 0.51, window = 1.0, t_end = 100010.0 }\nhardware.torque_lag = 0.1",
+        LONG_RUN % 0.51 + "hardware.torque_lag = 0.1",
         "loop.t_end is 100010.0",
         "or loop.period longer than 0.51: the sampled loop would take 784392 steps, 4 a period, and at most 200000",
     ),
     (
-        "controller = { t_f = 1e5, delta = 1.0 }\nloop = { mode = 'sampled', period = 1.0, window = 1.0, t_end = 100010.0 }\ninitial.rate = [0.9, 0, 0]",
+        LONG_RUN % 1.0 + "initial.rate = [0.9, 0, 0]",
         "loop.t_end is 100010.0",
         "the sampled loop would take",
     ),

@@ -1,223 +1,166 @@
-"""Defaults, bounds and designs follow the mission: other units of time and inertia rescale them and change nothing."""
+"""Defaults that follow from the mission: they scale with its units, and the designed gains meet their conditions."""
 
-import copy
 import math
-import re
-import tomllib
-from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 import pytest
 
-from ptsmc_jax.scenario import from_tables, keys, layouts, mission, parsing, replace
-from ptsmc_jax.scenario.errors import ScenarioError
-from ptsmc_jax.simulation import catalogues
-from tests.tree import ROOT
-from tuning.search import gains as gain_names
+from ptsmc_jax import scenario
+from ptsmc_jax.scenario import mission, parsing
 
-SATELLITES = sorted((ROOT / "benchmarks" / "satellites").glob("*.toml"))
-# powers of the units of inertia and of time in a unit
-UNITS = {"kg": (1.0, 0.0), "N": (1.0, -2.0), "s": (0.0, 1.0), "Hz": (0.0, -1.0), "rad": (0.0, 0.0), "deg": (0.0, 0.0),
-         "m": (0.0, 0.0), "1": (0.0, 0.0), "-": (0.0, 0.0), "dB": (0.0, 0.0)}  # fmt: skip
-
-
-def powers(unit: str) -> tuple[float, float]:
-    """Return the powers of inertia and time in a unit such as "rad/s/sqrt(Hz)"; lengths are part of the inertia.
-
-    >>> powers("N m s"), powers("rad/s/sqrt(Hz)"), powers("sqrt(kg) m"), powers("1/s^2")
-    ((1.0, -1.0), (0.0, -0.5), (0.5, 0.0), (0.0, -2.0))
-    """
-    total = np.zeros(2)
-    for sign, part in re.findall(r"(^|/)([^/]+)", unit):
-        for root, name, power in re.findall(r"(sqrt\()?([A-Za-z]+|1|-)\)?(?:\^(\d))?", part):
-            weight = (0.5 if root else 1.0) * float(power or 1) * (-1.0 if sign else 1.0)
-            total += weight * np.asarray(UNITS[name])
-    return float(total[0]), float(total[1])
-
-
-def in_units(tables: Mapping[str, Any], inertia: float, time: float) -> dict[str, Any]:
-    """Return the tables of a scenario with every number in other units, by the units that the keys declare."""
-    plant = tables.get("plant", {}).get("kind", "spacecraft")
-    layout, scaled = layouts.TABLES[plant], copy.deepcopy(dict(tables))
-
-    def times(value: Any, unit: str) -> Any:
-        if isinstance(value, list | tuple):
-            return [times(one, unit) for one in value]
-        if isinstance(value, str):
-            found = re.fullmatch(r"([-+.\deE]+) (.*)", value)
-            assert found is not None
-            value = float(found[1]) * catalogues.UNITS[unit][found[2]]
-        mass, second = powers(unit)
-        return value * inertia**mass * time**second
-
-    def of(table: dict[str, Any], struct: Any) -> None:
-        for key in keys.of(struct):
-            if key.name in table and key.unit and not isinstance(table[key.name], dict):
-                table[key.name] = times(table[key.name], key.unit.split(",")[0])
-
-    for name, table in scaled.items():
-        kinds = layout.get(name)
-        if name == "requirements":
-            entries = {**catalogues.CATALOGUE, **catalogues.MARGINS}
-            units = {metric: entry.unit for metric, entry in entries.items()}
-            for metric, value in table.items():
-                if isinstance(value, dict):
-                    value["limit"] = times(value["limit"], units[metric])
-                else:
-                    table[metric] = times(value, units[metric])
-        elif name == "tune":
-            units = gain_names.units(plant)
-            for gain, interval in table.get("bounds", {}).items():
-                table["bounds"][gain] = times(interval, units[gain].replace("1/s^(2-p)", "-").replace("1/s^p", "-"))
-        elif name == "dispersion":
-            for key, one in table.items():
-                of(one, layouts.DISPERSIONS[key][one["kind"]])
-        elif name == "disturbance" and table.get("kind") == "sum":
-            for term in table["terms"]:
-                of(term, kinds[term["kind"]])
-        elif kinds is not None:
-            of(table, kinds[table.get("kind", next(iter(kinds)))] if isinstance(kinds, Mapping) else kinds)
-    return scaled
+# powers of inertia and time in the unit of each default, by table and key
+UNITS = {
+    "loop": {"period": (0, 1), "t_end": (0, 1), "window": (0, 1), "settling_angle": (0, 0)},
+    "controller": {
+        "t_f": (0, 1),
+        "delta": (0, 1),
+        "disturbance_bound": (1, -2),
+        "disturbance_rate_bound": (1, -3),
+        **dict.fromkeys(("k1", "k_d", "surface_rate", "sign_width"), (0, -1)),
+        "k_p": (0, -2),
+        "lipschitz": (0, -3),
+    },
+    "observer": {"gain": (1, -1)},
+    "disturbance": {"amplitude": (1, -2), "density": (1, -2.5), "frequency": (0, -1)},
+    "flexible": {"frequency": (0, -1), "coupling": (0.5, 0)},
+    "reference": {"frequency": (0, -1), "duration": (0, 1)},
+    "pointing": {"window": (0, 1)},
+    "dispersion.rate": {"std": (0, -1), "half_width": (0, -1)},
+    "dispersion.disturbance_bias": {"std": (1, -2), "half_width": (1, -2)},
+    "dispersion.star_tracker_outage": {"duration": (0, 1)},
+    "tune.bounds": {
+        "eta": (0, 0),
+        "delta": (0, 1),
+        "observer_gain": (1, -1),
+        **dict.fromkeys(("k1", "k_d", "surface_rate", "sign_width"), (0, -1)),
+        "k_p": (0, -2),
+        "lipschitz": (0, -3),
+    },
+}
+SAMPLED = {"loop": {"mode": "sampled"}}
+NORMAL = {"rate": {"kind": "normal"}, "disturbance_bias": {"kind": "normal"}}
+UNIFORM = {"rate": {"kind": "uniform"}, "disturbance_bias": {"kind": "uniform"}}
+MISSIONS = {
+    "continuous": {},
+    "sampled": SAMPLED,
+    "flexible modes": {**SAMPLED, "flexible": {}},
+    "moving reference": {**SAMPLED, "reference": {"kind": "sinusoid"}},
+    "slew": {"reference": {"kind": "slew"}, "pointing": {}},
+    "constant disturbance": {**SAMPLED, "disturbance": {"kind": "constant"}},
+    "random walk": {**SAMPLED, "disturbance": {"kind": "random_walk"}},
+    "normal dispersions": {**SAMPLED, "dispersion": NORMAL},
+    "uniform dispersions": {"dispersion": UNIFORM},
+    "outage": {**SAMPLED, "filter": {"kind": "steady_state", "bandwidth": 0.1}, "hardware": {"attitude_noise": 1e-5},
+               "dispersion": {"star_tracker_outage": {}}},
+    "proportional-derivative law": {**SAMPLED, "controller": {"kind": "pd"}},
+    "super-twisting law": {**SAMPLED, "controller": {"kind": "super_twisting"}},
+}  # fmt: skip
 
 
-def flat(tables: Any, path: str = "") -> dict[str, Any]:
-    """Return the numbers of nested tables by their path."""
-    if isinstance(tables, Mapping):
-        return {k: v for key, one in tables.items() for k, v in flat(one, f"{path}.{key}").items()}
-    if isinstance(tables, list | tuple):
-        return {k: v for n, one in enumerate(tables) for k, v in flat(one, f"{path}[{n}]").items()}
-    return {path: tables}
+def numbers_of(tables):
+    """Defaults with a unit, by table and key."""
+    dumped = parsing.dump(scenario.from_tables({**tables, "tune": {}}))
+    found = {}
+    for place, units in UNITS.items():
+        table = dumped
+        for name in place.split("."):
+            table = table.get(name, {})
+        found |= {(place, key): np.asarray(table[key]) for key in units if key in table}
+    return found
 
 
-CHAIN = {"plant": {"kind": "chain", "x0": [1.0, 0.5]}, "loop": {"mode": "sampled"}, "controller": {"t_f": 8.0}}
+def of_body(tables, inertia, t_f):
+    """The scenario's tables for a body of this mean inertia [kg m^2] and this t_f [s]."""
+    body = {"inertia": [0.5 * inertia, inertia, 1.5 * inertia]}
+    return {**tables, "spacecraft": body, "controller": {**tables.get("controller", {}), "t_f": t_f}}
 
 
-@pytest.mark.parametrize("path", SATELLITES, ids=lambda path: path.stem)
-@pytest.mark.parametrize(("inertia", "time"), [(4.0, 1.0), (1.0, 0.25), (0.0625, 16.0)])
-def test_other_units_rescale_every_default_and_every_bound(path, inertia, time):
-    """Powers of 4 leave even square roots exact, so equal means equal but for the last digits of powers."""
-    raw = {**tomllib.loads(path.read_text()), "tune": {}}
-    here = parsing.dump(from_tables(raw))
-    there = parsing.dump(from_tables(in_units(raw, inertia, time)))
-    expected, found = flat(in_units(here, inertia, time)), flat(there)
-    assert expected.keys() == found.keys()
-    for key, value in expected.items():
-        assert found[key] == (pytest.approx(value, rel=1e-12) if isinstance(value, float) else value), key
+@pytest.mark.parametrize("name", MISSIONS)
+def test_defaults_scale_with_the_units_of_the_mission(name):
+    """A body of a thousandth of the inertia in eight times the time gets the same defaults in other units."""
+    inertia, time = 1e-3, 8.0
+    one, other = (
+        numbers_of(of_body(MISSIONS[name], 20.0 * by, 50.0 * slower)) for by, slower in ((1.0, 1.0), (inertia, time))
+    )
+    assert set(one) == set(other)
+    for place, key in one:
+        of_inertia, of_time = UNITS[place][key]
+        expected = one[place, key] * inertia**of_inertia * time**of_time
+        np.testing.assert_allclose(other[place, key], expected, rtol=1e-9, err_msg=f"{place}.{key}")
 
 
-@pytest.mark.parametrize("law", [law for law in layouts.TABLES["spacecraft"]["controller"] if law != "own"])
-def test_gains_of_every_law_follow_the_mission(law):
-    raw = tomllib.loads((ROOT / "benchmarks" / "satellites" / "uosat12.toml").read_text())
-    raw = {**raw, "controller": {"kind": law, "t_f": raw["controller"]["t_f"]}, "tune": {}}
-    here, there = (from_tables(tables) for tables in (raw, in_units(raw, 4.0, 16.0)))
-    units = gain_names.units_of(here)
-    for name in here.gains:
-        p = getattr(here.controller, "p", 0.0)
-        mass, second = {"1/s^p": (0.0, -p), "1/s^(2-p)": (0.0, p - 2.0)}.get(units[name]) or powers(units[name])
-        factor = 4.0**mass * 16.0**second
-        table = next(table for table in here.tuned_tables.values() if name in table.gains)
-        other = next(table for table in there.tuned_tables.values() if name in table.gains)
-        key = name.removeprefix(table.prefix)
-        if getattr(table, key) is not None and name not in ("sign_width",):
-            assert np.asarray(getattr(other, key)) == pytest.approx(np.asarray(getattr(table, key)) * factor, rel=1e-12)
-        if name in here.search.gains and name != "sign_width":
-            bounds = np.asarray(here.search.bounds[name]) * factor
-            assert there.search.bounds[name] == pytest.approx(tuple(bounds), rel=1e-12), name
+@pytest.mark.parametrize("order", [2, 3])
+def test_defaults_of_a_chain_scale_with_t_f(order):
+    """The unit of d is that of x_1 over s^order; that of s is x_1 over s^(order - 1)."""
+    units = {"loop": {"period": 1, "t_end": 1, "window": 1},
+             "controller": {"delta": 1, "k1": -1, "surface_rate": -1, "sign_width": 1 - order,
+                            "disturbance_bound": -order, "disturbance_rate_bound": -order - 1},
+             "observer": {"gain": -1}, "disturbance": {"amplitude": -order, "frequency": -1}}  # fmt: skip
+    plant, law = {"kind": "chain", "order": order}, {"t_f": 40.0}
+    tables = {"plant": plant, "observer": {"kind": "nonlinear"}}
+    one = parsing.dump(scenario.from_tables({**tables, "controller": law}))
+    other = parsing.dump(scenario.from_tables({**tables, "controller": {"t_f": 240.0}}))
+    for place, keys in units.items():
+        for key, power in keys.items():
+            expected = np.asarray(one[place][key]) * 6.0**power
+            np.testing.assert_allclose(other[place][key], expected, rtol=1e-9, err_msg=f"{place}.{key}")
 
 
-def test_the_papers_cases_keep_the_published_numbers():
-    """Case I, and Case II with t_f = 35 and 40 s; another body or time scales them."""
-    for t_f in (30.0, 35.0, 40.0):
-        law = from_tables({"controller": {"t_f": t_f}}).controller
-        assert (law.eta, law.delta, law.k1, law.surface_rate, law.sign_width) == (3.0, 0.05, 1.0, 1.0, 1e-3)
-    slow = from_tables({"controller": {"t_f": 60.0}})
-    assert (slow.controller.delta, slow.controller.k1, slow.disturbance.frequency) == (0.1, 0.5, (0.05,) * 3)
-    assert slow.disturbance.amplitude == (0.0025,) * 3
-    heavy = from_tables({"spacecraft": {"inertia": [40.0, 48.0, 56.0]}})
-    assert heavy.observer.gain == (40.0,) * 3
-    assert heavy.controller.k1 == 1.0
+@pytest.mark.parametrize(
+    ("changes", "published"),
+    [
+        ({}, True),
+        ({"controller": {"t_f": 40.0}}, True),
+        ({"controller": {"t_f": 40.1}}, False),
+        ({"controller": {"t_f": 29.9}}, False),
+        ({"spacecraft": {"inertia": [10.0, 12.0, 14.1]}}, False),
+        ({"plant": {"kind": "chain"}}, True),
+        ({"plant": {"kind": "chain"}, "controller": {"t_f": 5.1}}, False),
+    ],
+    ids=str,
+)
+def test_the_papers_cases_keep_the_published_numbers(changes, published):
+    law = scenario.from_tables({**SAMPLED, **changes}).controller
+    assert mission.published(scenario.from_tables(changes)) == published
+    found = (law.eta, law.delta, law.k1, law.surface_rate, law.sign_width)
+    assert (found == (3.0, 0.05, 1.0, 1.0, 1e-3)) == published
 
 
-def test_a_slew_of_ten_milliseconds_is_taken():
-    """Its run ends 3.3 ms after t_f, not 10 s."""
-    quick = from_tables({"controller": {"t_f": 0.01}, "loop": {"mode": "sampled"}})
-    assert quick.loop.t_end == pytest.approx(0.04 / 3.0)
-    assert quick.loop.window == pytest.approx(0.01 / 30.0)
+@pytest.mark.parametrize("hardware", [{}, {"delay": 2}, {"torque_lag": 0.5}], ids=str)
+@pytest.mark.parametrize("plant", ["spacecraft", "chain"])
+def test_designed_gains_place_both_poles_of_the_hold_phase(plant, hardware):
+    """Both poles are at -p, p times the dead time is at most 1/4, and the rate gain is 2 p at the hand-over."""
+    tables = {**SAMPLED, "hardware": hardware, "controller": {"t_f": 60.0}, "plant": {"kind": plant}}
+    found = scenario.from_tables(tables)
+    law, period = found.controller, found.loop.period
+    pole = law.surface_rate
+    assert law.k1 == pytest.approx(pole * (2.0 if plant == "spacecraft" else 1.0), rel=1e-12)  # (60) halves K1
+    assert (2.0 * law.eta - 1.0) / law.delta == pytest.approx(2.0 * pole, rel=1e-12)
+    dead_time = (hardware.get("delay", 0) + 0.5) * period + hardware.get("torque_lag", 0.0)
+    assert 0.0 < pole * dead_time <= 0.25 * (1.0 + 1e-12)
+    assert period <= law.delta <= 0.5 * law.t_f + period
 
 
-def test_beyond_all_numbers_is_refused():
-    with pytest.raises(ScenarioError, match=r"controller\.t_f"):
-        from_tables({"controller": {"t_f": 1e300}})
+def test_the_default_eta_keeps_the_first_torque_below_its_limit():
+    """The first torque is 2 J eta^2 tan(angle / 2) / t_f^2 about the axis of the turn; a tenth of the limit is left."""
+    body = {"spacecraft": {"inertia": [20.0, 20.0, 20.0]}, "initial": {"rotvec_deg": [0.0, 0.0, 90.0]}}
+    tables = {**SAMPLED, **body, "controller": {"t_f": 60.0}}
+    assert scenario.from_tables(tables).controller.eta == 3.0
+    limit = 2.0 * 20.0 * 2.6**2 / 60.0**2 / 0.9
+    limited = scenario.from_tables({**tables, "hardware": {"torque_limit": limit}})
+    assert limited.controller.eta == pytest.approx(2.6, rel=1e-9)
 
 
-def sampled(**tables: Any) -> Any:
-    """Return a sampled scenario of a body of 50 kg m^2 that turns in 100 s."""
-    base = {"spacecraft": {"inertia": [40.0, 50.0, 60.0]}, "controller": {"t_f": 100.0},
-            "loop": {"mode": "sampled", "period": 0.25}, "disturbance": {"kind": "none"}}  # fmt: skip
-    return from_tables({**base, **tables})
-
-
-def test_dead_time_limits_the_bandwidth():
-    """Without noise p T = 0.25, T of hold, delay and lag together."""
-    for hardware, dead in (({}, 0.125), ({"delay": 2}, 0.625), ({"delay": 1, "torque_lag": 0.3}, 0.675)):
-        said = sampled(hardware=hardware) if hardware else sampled()
-        assert mission.dead_time(said) == pytest.approx(dead)
-        assert mission.design(said).pole == pytest.approx(0.25 / dead)
-
-
-def test_both_poles_of_the_design_keep_the_margins_that_it_promises():
-    """In continuous time, with the dead time as e^(-sT): 46 deg and 9 dB, from L = (2 p s + p^2) e^(-sT) / s^2."""
-    p = mission.STABLE
-    w = np.geomspace(1e-3, 30.0, 200_001)
-    L = (2 * p * 1j * w + p**2) / (1j * w) ** 2 * np.exp(-1j * w)
-    crossover = np.argmin(np.abs(np.abs(L) - 1.0))
-    assert np.rad2deg(np.angle(L[crossover])) + 180.0 == pytest.approx(46.6, abs=0.5)
-    phase = np.unwrap(np.angle(L))
-    at = np.argmin(np.abs(phase + np.pi - 2 * np.pi * np.round((phase[0] + np.pi) / (2 * np.pi))))
-    assert -20.0 * np.log10(np.abs(L[at])) == pytest.approx(9.2, abs=0.5)
-
-
-def test_noise_and_the_torque_limit_limit_the_bandwidth():
-    """Five sigma of the torque noise, J (2 p + l / J) sigma_w with l = J p / 2, take half of the limit."""
-    limit, sigma = 0.1, 1e-4
-    said = sampled(hardware={"rate_noise": sigma, "torque_limit": limit})
-    pole = mission.design(said).pole
-    assert 60.0 * 2.5 * pole * sigma == pytest.approx(0.5 * limit / 5.0)
-
-
-def test_late_modes_limit_the_bandwidth_and_early_ones_do_not():
-    """A mode is late if its frequency times the dead time, 0.125 s, exceeds 60 deg."""
-    modes = {"damping": [0.002], "coupling": [[0.0, 2.0, 0.0]]}
-    early, late = (sampled(flexible={"frequency": [w], **modes}) for w in (4.0, 12.0))
-    fraction = 4.0 / 50.0
-    free = 12.0 / math.sqrt(1.0 - fraction)
-    assert mission.design(early).pole == pytest.approx(2.0)
-    assert mission.design(late).pole == pytest.approx(0.5 * 0.002 * free / (fraction / (1.0 - fraction)))
-
-
-def test_a_weak_actuator_asks_for_a_smaller_eta():
-    """From rest the first torque is 2 eta^2 J tan(angle / 2) / t_f^2; 2.4 is the least."""
-    start = {"dispersion": {"attitude": {"kind": "axis_angle", "min_deg": 60.0, "max_deg": 60.0}}}
-    needed = 2.0 * 60.0 * math.tan(math.radians(30.0)) / 100.0**2
-    weak = sampled(**start, hardware={"torque_limit": 7.0 * needed})
-    assert weak.controller.eta == pytest.approx(math.sqrt(0.9 * 7.0))
-    assert sampled(**start, hardware={"torque_limit": 20.0 * needed}).controller.eta == 3.0
-    assert sampled(**start, hardware={"torque_limit": needed}).controller.eta == pytest.approx(2.4)
-
-
-def test_the_settling_angle_follows_small_slews_and_coarse_sensors():
-    small = {"attitude": {"kind": "axis_angle", "min_deg": 0.1, "max_deg": 0.2}}
-    assert sampled(dispersion=small).loop.settling_angle == pytest.approx(1e-3 * math.radians(0.2))
-    assert sampled(hardware={"attitude_noise": 0.01, "rate_noise": 0.0}).loop.settling_angle == 0.05
-
-
-def test_designs_are_starting_points_within_the_bounds_or_near():
-    """Each has gains for the whole law, delta between a period and t_f."""
-    said = replace(sampled(), tune={})
-    designs = mission.designs(said)
-    assert len(designs) > 5
-    for design in designs:
-        gains = said.controller.gains_of(design, said)
-        assert said.loop.period <= gains["delta"] < said.controller.t_f
-        assert all(value > 0.0 for value in gains.values())
+@pytest.mark.parametrize(
+    ("tables", "angle"),
+    [
+        ({}, 1e-3),
+        ({"initial": {"rotvec_deg": [0.0, 0.0, 180.0 / math.pi]}}, 1e-3),
+        ({"initial": {"rotvec_deg": [0.0, 0.0, 9.0 / math.pi]}}, 5e-5),  # a start angle of 0.05 rad
+        ({**SAMPLED, "hardware": {"attitude_noise": 3e-4}}, 1.5e-3),
+        ({**SAMPLED, "hardware": {"attitude_noise": 1e-5}}, 1e-3),
+    ],
+    ids=str,
+)
+def test_the_default_settling_angle_follows_the_start_and_the_noise(tables, angle):
+    assert scenario.from_tables(tables).loop.settling_angle == pytest.approx(angle, rel=1e-9)

@@ -78,9 +78,9 @@ def test_the_hand_over_is_moved_to_a_sample_where_t_f_is_free_and_delta_is_not()
 
 
 class Conflicting(Evaluator):
-    """F = x0, and limits c = 2 (a - x0) + y, c = x0 - b + y and a constant one, y = (x1 - 0.3)^2.
+    """F = x0, with the limits c = 2 (a - x0) + y and c = x0 - b + y, and a constant limit; y = (x1 - 0.3)^2.
 
-    The largest of the first two is least at x0 = (2 a + b) / 3 and x1 = 0.3, where it is 2 (a - b) / 3.
+    The first two limits are equally far exceeded at x0 = (2 a + b) / 3.
     """
 
     def __init__(self, a, b, third):

@@ -93,7 +93,7 @@ def test_a_search_for_limits_minimises_the_largest_metric_over_its_limit():
 
 
 def test_a_search_for_limits_counts_the_margins_too(monkeypatch):
-    """F and its slope are those of the largest row: at the first point a metric's, at the second one a margin's."""
+    """F and its gradient follow the largest row: a metric's at the first point, a margin's at the second point."""
     flown = {"c": np.array([[[0.3, -0.2]], [[-0.5, -0.4]]]), "c_slope": np.arange(8.0).reshape(2, 1, 2, 2)}
     of_loop = {"c": np.array([[[-0.1]], [[0.6]]]), "c_slope": 10.0 + np.arange(4.0).reshape(2, 1, 1, 2)}
     monkeypatch.setattr(evaluate.margin_rows, "of_points", lambda margins, scale, share: of_loop)

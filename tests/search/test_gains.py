@@ -318,7 +318,7 @@ def test_the_lower_bound_of_delta_is_one_period_and_a_message_names_it_if_delta_
 def test_default_bounds_are_widened_on_the_side_where_a_gain_ended():
     """Tenfold on a log scale, else by half of the interval, but only halfway to a value that is not allowed.
 
-    Stated bounds stay, and so do bounds beyond which the sampled loop is unstable or a gain has no influence.
+    Stated bounds stay. So do bounds at a stability limit of the sampled loop, and those of a deadbeat observer.
     """
     free = ["eta", "delta", "observer_gain", "k1", "surface_rate"]
     tune = {"free": free, "bounds": {"surface_rate": [0.1, 1.0]}}

@@ -55,6 +55,22 @@ def flown(x, y, text=SHORT, trials=6):
 
 
 @pytest.mark.parametrize(
+    ("controller", "period", "ends"),
+    [
+        ({"t_f": 35.0, "delta": 0.5}, 0.05, [(0.02, 0.5), (0.05, 5.0)]),
+        ({"t_f": 3500.0, "delta": 50.0}, 5.0, [(2.0, 50.0), (5.0, 500.0)]),
+        ({"t_f": 35.0, "delta": 4.0}, 0.05, [(0.02, 0.5), (0.05, 8.0)]),  # up to twice the scenario's delta
+    ],
+)
+def test_the_default_axes_follow_the_period_and_t_f_of_the_scenario(controller, period, ends):
+    made = scenario.from_tables({"controller": controller, "loop": {"mode": "sampled", "period": period}})
+    axes = mapping.axis(mapping.usual_periods(made), "--x"), mapping.axis(mapping.usual_deltas(made), "--y")
+    assert [axis.key for axis in axes] == ["loop.period", "controller.delta"]
+    assert [(axis.values[0], axis.values[-1]) for axis in axes] == ends
+    assert [len(axis.values) for axis in axes] == [9, 9]
+
+
+@pytest.mark.parametrize(
     ("text", "values"),
     [
         ("loop.period=0.1:0.4:3", [0.1, 0.25, 0.4]),

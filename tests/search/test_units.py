@@ -1,0 +1,59 @@
+"""A search in other units of time and inertia goes through the same points, and finds the same gains in those units."""
+
+import copy
+import tomllib
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ptsmc_jax.scenario import from_tables
+from tests.tree import ROOT
+from tests.units import in_units, powers
+from tuning.search import gains as gain_names
+from tuning.studies import tuner
+
+SATELLITES = ROOT / "benchmarks" / "satellites"
+INERTIA, TIME = 4.0, 16.0  # powers of 4, so that square roots stay exact
+SMALL = {"trials": 8, "starts": 3, "steps": 8}
+
+
+def tables_of(name: str, **changes: Any) -> dict[str, Any]:
+    """Return the tables of a satellite, tuned by a small search; changes: of tables."""
+    raw = tomllib.loads((SATELLITES / f"{name}.toml").read_text())
+    return {**copy.deepcopy(raw), **changes, "tune": SMALL}
+
+
+def without_margins(name: str) -> dict[str, Any]:
+    """Return the tables of a satellite without requirements on margins, which take long to compile."""
+    tables = tables_of(name)
+    requirements = {key: value for key, value in tables["requirements"].items() if not key.endswith("_margin")}
+    return {**tables, "requirements": requirements}
+
+
+@pytest.mark.parametrize(
+    "tables",
+    [
+        without_margins("cubetas"),
+        pytest.param(without_margins("sixu"), marks=pytest.mark.long),
+        pytest.param(tables_of("microsat"), marks=pytest.mark.long),
+    ],
+    ids=["cubetas", "sixu", "microsat"],
+)
+def test_other_units_rescale_the_tuned_gains_and_change_nothing_else(tables):
+    """To 1e-9; what is left are the last digits of powers and logarithms, which a search amplifies."""
+    here, there = (tuner.tune(from_tables(one), 0, trusted=False) for one in (tables, in_units(tables, INERTIA, TIME)))
+    units = gain_names.units_of(here.tuned)
+    for name, value in here.gains.items():
+        mass, second = powers(units[gain_names.base(name)])
+        assert there.gains[name] == pytest.approx(value * INERTIA**mass * TIME**second, rel=1e-9), name
+    assert there.rollouts == here.rollouts
+    assert there.gradients == here.gradients
+    assert there.search.value == pytest.approx(here.search.value, rel=1e-9)
+    for metric in ("window_error", "terminal_angle", "saturated"):
+        one, other = (np.asarray(getattr(run.fresh["tuned"].metrics, metric)) for run in (here, there))
+        np.testing.assert_allclose(other, one, rtol=1e-9)
+    torque = INERTIA * TIME**-2.0
+    one, other = (np.asarray(run.fresh["tuned"].metrics.peak_torque) for run in (here, there))
+    np.testing.assert_allclose(other, torque * one, rtol=1e-9)
+    np.testing.assert_array_equal(here.fresh["tuned"].status, there.fresh["tuned"].status)
