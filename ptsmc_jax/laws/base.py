@@ -104,12 +104,21 @@ class PrescribedTimeLaw(Law):
     eta: Leaf  # eta > 2, and greater than the order of a chain [-]
     delta: Leaf
     k1: Leaf  # K1 of (10), (29), (40) and (60) [1/s]
-    sign_width: Leaf  # boundary layer of the smooth sign, in the units of s
+    sign_width: Leaf  # thickness of the boundary layer after the hand-over, in the units of s there
     surface_rate: Leaf  # c, decay of the error on the surface after the hand-over; the paper's is 1 [1/s]
     # whether the held input is chosen for s at the end of the period, see `landing`, and not for its rate at the sample
     implicit: bool = field(default=False, metadata={"static": True}, kw_only=True)
+    layer_time: Leaf | float = field(default=1.0, kw_only=True)  # see `layer` [s]
     tunable: ClassVar[tuple[str, ...]] = ("eta", "delta", "k1", "sign_width", "surface_rate", "t_f")
     prescribed: ClassVar[bool] = True
+
+    def layer(self, hold: Bool[Array, ""]) -> Scalar:
+        """Thickness of the boundary layer, in the units of s before or after the hand-over.
+
+        s has one more power of time before it, for each order above 1. The paper has the same number in both, with time
+        in seconds: `layer_time` is that second.
+        """
+        return jnp.where(hold, self.sign_width, self.sign_width * self.layer_time ** (self.order - 1))
 
     def landing(
         self, now: Sample, s: Vector, at_hand_over: Vector, power: Scalar, rate: Scalar, switching: Scalar
@@ -167,7 +176,7 @@ class PrescribedTimeLaw(Law):
     def boundary_layer(self, k2: Scalar, visited: tuple[Any, Any] | None = None) -> tuple[Scalar, Scalar]:
         """Fastest rate of the smooth sign's boundary layer before and after the hand-over [1/s], for K2 up to k2."""
         after = self.switching_rate(k2, visited) / self.sign_width
-        return self.t_f ** (self.order - 1) * after, after
+        return (self.t_f / self.layer_time) ** (self.order - 1) * after, after
 
     def reaching_rate(self) -> Scalar:
         """Rate at which s falls after the hand-over, but for the switching term [1/s]: K1 of (10), (29) and (40)."""
@@ -245,7 +254,7 @@ class SecondOrderLaw(PrescribedTimeLaw):
         gains = self.gains(t, hold)
         error, error_rate = self.errors(x, target)
         s = gains.c * error_rate + gains.e * error
-        switching = self.influence(x, target) * k2 * guards.smooth_sign(s, self.sign_width)
+        switching = self.influence(x, target) * k2 * guards.smooth_sign(s, self.layer(hold))
         twice_acceleration = -switching - gains.a * error_rate - gains.b * s
         return self.invert(x, target, twice_acceleration, d_hat), s
 

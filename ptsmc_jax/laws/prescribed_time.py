@@ -159,7 +159,7 @@ class PrescribedTimeChain(ErrorOfChain, PrescribedTimeLaw):
         rates = [jnp.where(hold, a[i], (c[i] - (i + 1) * c[i + 1]) * tau ** (i - n + 1)) for i in range(n - 1)]
         reaching = jnp.where(hold, self.k1, (self.eta + n - 2) / tau**n)
         equivalent = jnp.dot(jnp.stack(rates), x[1:]) + reaching * s
-        x_n_dot = -equivalent - k2 * guards.smooth_sign(s, self.sign_width)
+        x_n_dot = -equivalent - k2 * guards.smooth_sign(s, self.layer(hold))
         u = (x_n_dot - self.model.drift(x) - d_hat) / self.model.input_gain(x)
         return u, jnp.reshape(s, 1)
 

@@ -93,7 +93,7 @@ class TerminalController(BaselineTable, frozen=True):
 
     def noise_of_s(self, position: float, velocity: float, t_f: float) -> float:
         """Return the noise of s = v + sig^p(v') / b."""
-        return math.hypot(position, velocity**self.p / self.b)  # pyright: ignore[reportOperatorIssue]
+        return math.hypot(position, velocity**self.p / self.b)
 
     gains: ClassVar[Mapping[str, GainBounds]] = {
         "p": GainBounds(lambda _: (1.05, 1.95), between(1.0, 2.0)),

@@ -16,11 +16,13 @@ from ptsmc_jax.scenario.disturbance_bounds import Bounds
 from ptsmc_jax.scenario.errors import ScenarioError, brief
 from ptsmc_jax.scenario.own import Code, Own, build, fastest
 from ptsmc_jax.scenario.values import (
+    ABSENT,
     Each,
     EachNotNegative,
     Kind,
     Kinds,
     Number,
+    ResolvedThree,
     Scaled,
     Three,
     ThreeNotNegative,
@@ -72,7 +74,7 @@ class ConstantDisturbance(DisturbanceTable, frozen=True):
     """
 
     kind: Literal["constant"] = "constant"
-    amplitude: Three | None = None
+    amplitude: ResolvedThree = ABSENT
     scaled: ClassVar[Mapping[str, Scaled]] = {"amplitude": Scaled((0.01, 0.01, 0.01), inertia=1, time=-2)}
 
     def impulse(self, end: float) -> float:
@@ -103,8 +105,8 @@ class SinusoidDisturbance(DisturbanceTable, frozen=True):
     """
 
     kind: Literal["sinusoid"] = "sinusoid"
-    amplitude: Three | None = None
-    frequency: Three | None = None
+    amplitude: ResolvedThree = ABSENT
+    frequency: ResolvedThree = ABSENT
     phase: Three = (0.0, 0.0, 0.0)
     bias: Three = (0.0, 0.0, 0.0)
     scaled: ClassVar[Mapping[str, Scaled]] = {

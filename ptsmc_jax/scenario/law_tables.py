@@ -46,6 +46,7 @@ class PrescribedTable(LawTable, frozen=True):
         "k1": Scaled(1.0, time=-1),
         "sign_width": Scaled(1e-3, time=-1),
         "surface_rate": Scaled(1.0, time=-1),
+        "layer_time": Scaled(1.0, time=1),
     }
 
     @property
@@ -93,6 +94,8 @@ class SpacecraftController(PrescribedTable, frozen=True):
         k1: K1, rate of s from the hand-over on, halved by (60); 1 in the paper [1/s]
         sign_width: thickness of the boundary layer, tanh(s / sign_width); 0 is the discontinuous sign [1/s]
         surface_rate: c of s = eps' + c eps, the error's rate on the surface from the hand-over on; 1 in the paper [1/s]
+        layer_time: time that converts the thickness of the boundary layer into the units of s before the hand-over;
+            1 in the paper [s]
         sampling: held input by s at the sample, or by where s is to land at the period's end, which needs no sign_width
         disturbance_rate_bound: c of Assumption 1, on each component of d'; default: by [disturbance] as drawn [N m/s]
         disturbance_bound: K of Assumption 1, on each component of d, without an observer; default: likewise [N m]
@@ -107,6 +110,7 @@ class SpacecraftController(PrescribedTable, frozen=True):
     k1: Positive | None = None
     sign_width: NotNegative | None = None
     surface_rate: Positive | None = None
+    layer_time: Positive | None = None
     sampling: Literal["explicit", "implicit"] = "explicit"
     disturbance_rate_bound: NotNegative | None = None
     disturbance_bound: NotNegative | None = None
@@ -129,6 +133,8 @@ class SystemController(PrescribedTable, frozen=True):
         k1: K1, rate of s from the hand-over on; 1 in the paper [1/s]
         sign_width: thickness of the boundary layer, tanh(s / sign_width); 0 is the discontinuous sign [unit of s]
         surface_rate: c of s = eps' + c eps, the error's rate on the surface from the hand-over on; 1 in the paper [1/s]
+        layer_time: time that converts the thickness of the boundary layer into the units of s before the hand-over;
+            1 in the paper [s]
         sampling: held input by s at the sample, or by where s is to land at the period's end, which needs no sign_width
         disturbance_rate_bound: c of Assumption 1, on each component of d'; default: by [disturbance] [unit of d/s]
         disturbance_bound: K of Assumption 1, on each component of d, without an observer; default: likewise [unit of d]
@@ -142,6 +148,7 @@ class SystemController(PrescribedTable, frozen=True):
     k1: Positive | None = None
     sign_width: NotNegative | None = None
     surface_rate: Positive | None = None
+    layer_time: Positive | None = None
     sampling: Literal["explicit", "implicit"] = "explicit"
     disturbance_rate_bound: NotNegative | None = None
     disturbance_bound: NotNegative | None = None

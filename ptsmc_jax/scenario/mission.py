@@ -165,7 +165,8 @@ def _limits(scenario: Any) -> _Limits:
     noise sigma (p h)^(1/2), and the rate noise sigma (h / p)^(1/2).
     """
     t_f, period = scenario.controller.t_f, scenario.loop.period
-    most = min(STABLE / dead_time(scenario), _with_modes(scenario), _with_noise(scenario))
+    stable = STABLE * 2.0 / scenario.order  # of n poles at -p the crossover lies near n p
+    most = min(stable / dead_time(scenario), _with_modes(scenario), _with_noise(scenario))
     least = SLOWEST / t_f
     if most <= least:  # slow by need, but the hand-over lies within the second half of t_f
         slow = max(most, (2.0 * _least_eta(scenario) - 1.0) / t_f)

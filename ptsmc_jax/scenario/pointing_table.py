@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ptsmc_jax.scenario.errors import wrong
-from ptsmc_jax.scenario.values import NotNegative, Positive, Scaled, Table, Three
+from ptsmc_jax.scenario.values import ABSENT, NotNegative, ResolvedPositive, Scaled, Table, Three
 from ptsmc_jax.simulation import catalogues
 
 LONGEST_STEP = 0.02  # of the continuous loop after the hand-over, over t_f, see `clock`
@@ -23,7 +23,7 @@ class Pointing(Table, frozen=True):
     """
 
     boresight: Three = (0.0, 0.0, 1.0)
-    window: Positive | None = None
+    window: ResolvedPositive = ABSENT
     after: NotNegative = 0.0
     scaled: ClassVar[Mapping[str, Scaled]] = {"window": Scaled(1.0, time=1)}
 

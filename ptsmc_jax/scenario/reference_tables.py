@@ -11,7 +11,7 @@ import numpy as np
 from ptsmc_jax.scenario import attitude_keys
 from ptsmc_jax.scenario.attitude_keys import Attitude
 from ptsmc_jax.scenario.own import Code, Own, build, fastest
-from ptsmc_jax.scenario.values import Four, Kinds, Positive, Scaled, Three
+from ptsmc_jax.scenario.values import ABSENT, Four, Kinds, ResolvedPositive, ResolvedThree, Scaled, Three
 
 
 class Initial(Attitude, frozen=True):
@@ -90,7 +90,7 @@ class SinusoidReference(ReferenceTable, frozen=True):
 
     kind: Literal["sinusoid"] = "sinusoid"
     amplitude: Three = (0.1, 0.1, 0.1)
-    frequency: Three | None = None
+    frequency: ResolvedThree = ABSENT
     scaled: ClassVar[Mapping[str, Scaled]] = {"frequency": Scaled((0.1, 0.1, 0.1), time=-1)}
     phase: Three = (0.0, 0.0, 0.0)
 
@@ -118,7 +118,7 @@ class SlewReference(ReferenceTable, frozen=True):
 
     kind: Literal["slew"] = "slew"
     to_quat_xyzw: Four = (0.0, 0.0, 0.0, 1.0)
-    duration: Positive | None = None
+    duration: ResolvedPositive = ABSENT
     scaled: ClassVar[Mapping[str, Scaled]] = {"duration": Scaled(30.0, time=1)}
     way: Literal["short", "long"] = "short"
 

@@ -14,7 +14,18 @@ from ptsmc_jax.scenario.device_tables import NoFilter
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.gain_record import GainBounds
 from ptsmc_jax.scenario.law_tables import LAWS
-from ptsmc_jax.scenario.values import Interval, Kinds, NotNegative, Positive, Quantile, Scaled, Table, Truth
+from ptsmc_jax.scenario.values import (
+    ABSENT,
+    Interval,
+    Kinds,
+    NotNegative,
+    Positive,
+    Quantile,
+    ResolvedPositive,
+    Scaled,
+    Table,
+    Truth,
+)
 from ptsmc_jax.simulation.catalogues import Entry
 
 
@@ -33,11 +44,11 @@ class Loop(Table, frozen=True):
     """
 
     mode: Literal["continuous", "sampled"] = "continuous"
-    period: Positive | None = None
+    period: ResolvedPositive = ABSENT
     clock: Literal["anchored", "flight"] = "anchored"
     t_end: Positive | None = None
     window: Positive | None = None
-    settling_angle: Positive | None = None
+    settling_angle: ResolvedPositive = ABSENT
     scaled: ClassVar[Mapping[str, Scaled]] = {
         "period": Scaled(0.05, time=1),
         "window": Scaled(1.0, time=1),

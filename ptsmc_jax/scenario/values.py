@@ -1,7 +1,7 @@
 """What a scenario file is made of: the table, and types of values with their ranges and what is allowed in words."""
 
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
 
 import msgspec
 from msgspec import Meta
@@ -30,6 +30,15 @@ Matrix = Annotated[tuple[Three, Three, Three], Meta(description="three rows of t
 Interval = Annotated[tuple[float, float], Meta(description="two numbers, the lower bound first")]
 Inertia = Annotated[Any, Meta(description="three principal moments or a symmetric 3x3 tensor [kg m^2]")]
 Quantile = Annotated[float, Meta(gt=0, lt=1, description="a number between 0 and 1")]
+
+# Types of keys whose default follows from other keys. They are absent, None, until the scenario is resolved.
+ABSENT: Any = None
+if TYPE_CHECKING:
+    ResolvedPositive = float
+    ResolvedThree = tuple[float, float, float]
+else:
+    ResolvedPositive = Positive | None
+    ResolvedThree = Three | None
 
 MOST_STEPS = 200_000  # of a run
 

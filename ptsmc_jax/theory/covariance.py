@@ -49,13 +49,17 @@ def noise(parts: Parts) -> Noise:
         return _covariance(parts, ticks, linear.opened_in(parts, run, lasting, late=False))[0]
     flat = linear.opened_in(parts, run, lasting, np.full(lasting.size, FLAT), late=False)
     own = _State(parts, ticks, flat).rows(flat.s_command, flat.s_direct).noise  # of this sample alone
-    found = np.asarray([_mean_width(float(flown), float(np.sqrt(np.sum(by**2) / len(by)))) for by in own])
+    units = np.ones(lasting.size)  # of s in each period, over those after the hand-over
+    if parts.controller.prescribed:
+        units[~ticks.hold] = float(parts.controller.layer_time) ** (parts.controller.order - 1)
+    sigmas = [float(np.sqrt(np.sum(by**2) / len(by))) / unit for by, unit in zip(own, units, strict=True)]
+    found = np.asarray([_mean_width(float(flown), sigma) for sigma in sigmas])
     sizes, widths = None, np.zeros(lasting.size)
     for _ in range(ROUNDS):
         if sizes is not None and np.allclose(found, widths, rtol=0.01, atol=0.0):
             break
         widths = found
-        sign = _Sign(linear.opened_in(parts, run, lasting, widths, late=False).loop, widths, float(flown))
+        sign = _Sign(linear.opened_in(parts, run, lasting, widths, late=False).loop, widths, float(flown), units)
         sizes, found = _covariance(parts, ticks, flat, sign)
     assert sizes is not None
     return sizes
@@ -70,6 +74,7 @@ class _Sign(NamedTuple):
     loops: Any
     widths: np.ndarray
     flown: float
+    units: np.ndarray  # (periods,) of s, over those after the hand-over
 
 
 def _mean_width(width: float, sigma: float) -> float:
@@ -179,7 +184,7 @@ def _covariance(parts: Parts, ticks: Any, opened: linear.Opened, sign: _Sign | N
         squares[j] = square(opened.error[j]), 0.0, np.mean(np.diag(s))
         share = 0.0
         if sign is not None:
-            widths[j] = _mean_width(sign.flown, min(float(np.sqrt(squares[j, 2])), BEYOND))
+            widths[j] = _mean_width(sign.flown, min(float(np.sqrt(squares[j, 2])) / sign.units[j], BEYOND))
             share = sign.widths[j] / widths[j] if widths[j] > 0.0 else 1.0
         commanded = command.at(j, sloped[0], share).covariance(p)
         torque = max(torque, float(np.sqrt(np.diag(commanded).max())))

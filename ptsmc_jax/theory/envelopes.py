@@ -25,7 +25,7 @@ def sliding_envelope(parts: Parts) -> tuple[float, float]:
     for the exact sign, which gives the paper's (15), (32) and (43).
     """
     law, n = parts.controller, parts.controller.order
-    beta = switching_rate(parts) * parts.plant.inputs * GIVEN_AWAY * float(law.sign_width)
+    beta = switching_rate(parts) * parts.plant.inputs * GIVEN_AWAY * float(law.layer(jnp.asarray(False)))
     s0 = math.hypot(*np.ravel(_outset(parts)))  # a number where its square is none
     return s0, 2.0 * beta / (2.0 * float(law.eta) + n - 4.0)
 
@@ -50,14 +50,14 @@ def _switching_rates(parts: Parts) -> tuple[Scalar, Scalar]:
 
 
 def narrowest_sign(parts: Parts, period: float) -> float:
-    """Width below which a sampled smooth sign overshoots, in the units of s.
+    """Width below which a sampled smooth sign overshoots, in the units of s after the hand-over.
 
     s' = -c tanh(s / width), c = tau^(n-1) times `switching_rate`, held for a period h, reaches s = 0 in one period from
     inside the boundary layer at width = c h; below c h / 2 it hops from side to side, and slopes grow from hop to hop.
     Of the largest c before the hand-over, at t = 0, under the K2 that is left when the observer has settled.
     """
     law = parts.controller
-    return float(law.t_f) ** (law.order - 1) * float(_switching_rates(parts)[1]) * period
+    return (float(law.t_f) / float(law.layer_time)) ** (law.order - 1) * float(_switching_rates(parts)[1]) * period
 
 
 def sliding_bound(parts: Parts, t: ArrayLike) -> np.ndarray:

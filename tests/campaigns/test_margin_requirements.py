@@ -25,9 +25,10 @@ from tuning.search.gains import with_gains
 from tuning.studies import posing
 
 BODY = {
-    "controller": {"t_f": 8.0, "delta": 0.4, "sign_width": 0.02, "k1": 2.0},
+    "controller": {"t_f": 8.0, "delta": 0.4, "eta": 3.0, "sign_width": 0.02, "k1": 2.0, "surface_rate": 1.0},
+    "disturbance": {"amplitude": [0.01] * 3, "frequency": [0.1] * 3},
     "observer": {"gain": [40.0, 40.0, 40.0]},
-    "loop": {"mode": "sampled", "period": 0.1, "t_end": 10.0},
+    "loop": {"mode": "sampled", "period": 0.1, "t_end": 10.0, "window": 1.0},
     "hardware": {"attitude_noise": 2e-5, "rate_noise": 1e-6},
     "requirements": {"gain_margin": 6.0, "modulus_margin": 5.0},
     "tune": {"trials": 2, "free": ["eta", "observer_gain", "k1", "sign_width"]},
@@ -175,6 +176,7 @@ class Lag(ptsmc.Draw):
 CHAIN = {
     **BODY,
     "plant": {"kind": "chain", "x0": [1.0, 0.0]},
+    "disturbance": {"amplitude": [0.01], "frequency": [1.0]},
     "observer": {"kind": "nonlinear", "gain": [40.0]},
     "hardware": {"state_noise": [2e-5, 1e-6], "torque_lag": 0.03},
 }

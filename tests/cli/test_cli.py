@@ -581,7 +581,7 @@ def test_a_chain_is_tuned(command, tmp_path):
     assert "observer_gain" not in out
     folder = tmp_path / "out" / "tune-c"
     summary = json.loads((folder / "summary.json").read_text())
-    assert set(summary["gains"]) == {"eta", "delta", "k1", "sign_width"}
+    assert set(summary["gains"]) == {"eta", "delta", "k1", "sign_width", "surface_rate"}
     assert summary["gains"]["eta"] > 3.0
     assert "peak_momentum" not in summary["fresh"]
     assert summary["shortest_t_f"]["theory"] > 0.0

@@ -14,6 +14,7 @@ UNITS = {
     "controller": {
         "t_f": (0, 1),
         "delta": (0, 1),
+        "layer_time": (0, 1),
         "disturbance_bound": (1, -2),
         "disturbance_rate_bound": (1, -3),
         **dict.fromkeys(("k1", "k_d", "surface_rate", "sign_width"), (0, -1)),
@@ -93,7 +94,7 @@ def test_defaults_scale_with_the_units_of_the_mission(name):
 def test_defaults_of_a_chain_scale_with_t_f(order):
     """The unit of d is that of x_1 over s^order; that of s is x_1 over s^(order - 1)."""
     units = {"loop": {"period": 1, "t_end": 1, "window": 1},
-             "controller": {"delta": 1, "k1": -1, "surface_rate": -1, "sign_width": 1 - order,
+             "controller": {"delta": 1, "layer_time": 1, "k1": -1, "surface_rate": -1, "sign_width": 1 - order,
                             "disturbance_bound": -order, "disturbance_rate_bound": -order - 1},
              "observer": {"gain": -1}, "disturbance": {"amplitude": -order, "frequency": -1}}  # fmt: skip
     plant, law = {"kind": "chain", "order": order}, {"t_f": 40.0}

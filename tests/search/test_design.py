@@ -11,7 +11,7 @@ from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.requirements import Requirement
 from tests.helpers import short, ticks_of, vector
 from tuning.search import design
-from tuning.search.gains import with_gains
+from tuning.search.gains import in_scenario, with_gains
 
 SPREAD = {"attitude": {"kind": "axis_angle", "min_deg": 20.0, "max_deg": 120.0}}
 FLOWN = {
@@ -93,7 +93,7 @@ def test_shortest_time_of_a_chain(posed_anew):
     assert found.simulated is not None
     assert found.simulated == pytest.approx(found.theory, rel=5e-3)  # the disturbance is 0.01 of 5
     t_f = found.simulated if posed_anew else 1.5 * found.theory  # the longest that was looked at: by its program
-    ready = scenario.study(scenario.replace(chain, controller__t_f=t_f, loop__t_end=t_f + 10.0))
+    ready = scenario.study(in_scenario(chain, {"t_f": t_f}))  # all else stays that of the chain
     run = montecarlo.run(with_gains(ready.parts, {"t_f": found.simulated}), ready.dispersion, 0, np.arange(1))
     assert run.metrics.peak_torque[0] <= 5.0 * (1 + 1e-6)
 

@@ -23,8 +23,10 @@ from tuning.studies import judging, posing
 
 BASE = {
     "spacecraft": {"inertia": [[11.0, 1.5, -0.7], [1.5, 9.0, 0.4], [-0.7, 0.4, 14.0]]},
-    "controller": {"t_f": 8.0, "delta": 0.5},
-    "loop": {"mode": "sampled", "period": 0.1, "t_end": 10.0},
+    "controller": {"t_f": 8.0, "eta": 3.0, "delta": 0.5, "k1": 1.0, "sign_width": 1e-3, "surface_rate": 1.0},
+    "observer": {"gain": [9.0] * 3},
+    "disturbance": {"amplitude": [0.01] * 3, "frequency": [0.1] * 3},
+    "loop": {"mode": "sampled", "period": 0.1, "t_end": 10.0, "window": 1.0},
     "hardware": {"attitude_noise": 2e-5, "rate_noise": 1e-6, "rate_bias_walk": 1e-5, "star_tracker_every": 2},
     "filter": {"kind": "steady_state", "bandwidth": 0.5},
     "dispersion": {"attitude": {"kind": "normal", "std_deg": 10.0}},

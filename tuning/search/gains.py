@@ -59,7 +59,7 @@ def of_paper(scenario: Scenario) -> dict[str, float]:
     delta is at least a period.
     """
     units, table = mission.scales(scenario), LAWS[scenario.plant.kind]["prescribed_time"]
-    gains = {name: float(units.of(scaled)) for name, scaled in table.scaled.items()}
+    gains = {name: float(units.of(scaled)) for name, scaled in table.scaled.items() if name in table.gains}
     if scenario.sampled:
         gains["delta"] = max(gains["delta"], scenario.loop.period)
     if scenario.motion == "chain":

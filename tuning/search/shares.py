@@ -24,9 +24,9 @@ NEAR = 0.01  # share of its interval by which a gain is on a bound
 class Scale:
     """The map from shares of the bounds' intervals to gains, for compiled programs: other bounds, the same program."""
 
-    lower: Leaf  # (gains,)
-    upper: Leaf  # (gains,)
-    hop: Leaf  # see `Bounds`
+    lower: Leaf | np.ndarray  # (gains,)
+    upper: Leaf | np.ndarray  # (gains,)
+    hop: Leaf | np.ndarray  # see `Bounds`
     log: tuple[bool, ...] = field(metadata={"static": True})  # gains that are searched on a log scale
     width: int | None = field(metadata={"static": True})  # place of a sign_width whose lower bound moves with `hop`
     observers: tuple[int, ...] = field(metadata={"static": True})  # places of the observer's gains
