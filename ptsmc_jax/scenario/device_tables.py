@@ -208,8 +208,8 @@ class StateHardware(Actuators, frozen=True):
 
     def noise_of_error(self, scenario: Any) -> tuple[float, float]:
         """Return the noise of the first state and of its derivative; of a system, of its noisiest components."""
-        noises = self.state_noise or (0.0, 0.0)
         inputs = scenario.inputs  # a system's positions, then its rates
+        noises = (*(self.state_noise or ()), *(0.0,) * (2 * inputs))  # `check` refuses lists of another length
         return max(noises[:inputs]), max(noises[inputs : 2 * inputs])
 
     def noise_of_s(self, scenario: Any) -> float:

@@ -86,15 +86,16 @@ def _check_objective(scenario: Scenario, tune: tables.Tune, said: str) -> None:
                 f"{shown}, but there is no requirement; allowed is a metric, or [requirements] with one"
             )
         if tune.torque_weight:
-            raise wrong("tune.torque_weight", tune.torque_weight, f"absent with tune.minimise = {tune.minimise!r}")
+            raise wrong(
+                "tune.torque_weight", tune.torque_weight, f"absent with tune.minimise = {errors.show(tune.minimise)}"
+            )
         if tune.statistic != "rms":
-            raise ScenarioError(f"{shown}, which has no statistic, but tune.statistic is {tune.statistic!r}")
+            raise ScenarioError(f"{shown}, which has no statistic, but tune.statistic is {errors.show(tune.statistic)}")
         return
     known = [name for name in scenario.metrics if name not in catalogues.LARGER_IS_BETTER]
     if tune.minimise not in known:
-        raise ScenarioError(
-            f'{shown}, but must be a metric, "t_f" or "limits"; {parsing.nearest(tune.minimise, known)}'
-        )
+        nearest = parsing.like(tune.minimise, known, "`ptsmc new` lists them")
+        raise ScenarioError(f'{shown}, but must be a metric, "t_f" or "limits"; {nearest}')
     table = scenario.metrics[tune.minimise].table
     if table is not None and getattr(scenario, table, None) is None:
         raise ScenarioError(f"{shown}, which needs [{table}], but there is no [{table}] table")

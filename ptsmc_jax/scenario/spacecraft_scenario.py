@@ -232,7 +232,7 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
     def usual_settling(self) -> float:
         """Return the default of `loop.settling_angle` [rad]."""
         noise = getattr(self.hardware, "attitude_noise", None) or 0.0
-        return max(1e-3 * min(1.0, self.start_angle() or 1.0), 5.0 * noise)
+        return max(1e-3 * min(1.0, self.start_angle() or 1.0), min(5.0 * noise, 1.0))
 
     def written(self) -> Any:
         """With the filter's keys too."""

@@ -489,8 +489,8 @@ BAD = [
     ("tune.free = ['gain']", 'tune.free is ["gain"]', "some of eta, delta, k1, sign_width"),
     ("tune.free = ['eta', 'eta']", 'tune.free is ["eta", "eta"]', "names each gain once"),
     ("tune.statistic = 'median'", 'tune.statistic is "median"', '"rms"'),
-    (CHAIN + "tune.minimise = 'mean'", 'tune.minimise is "mean"', 'a metric, "t_f" or "limits"; known are '),
-    ("tune.minimise = 'window_eror'", 'tune.minimise is "window_eror"', "the nearest known one is window_error"),
+    (CHAIN + "tune.minimise = 'mean'", 'tune.minimise is "mean"', 'a metric, "t_f" or "limits"; the nearest of '),
+    ("tune.minimise = 'window_eror'", 'tune.minimise is "window_eror"', "known ones are window_error"),
     ("tune.level = 0.9", "tune.level is 0.9", 'goes with tune.statistic = "quantile" or "cvar" only'),
     ("tune.trials = 0", "tune.trials is 0", "a whole number from 1 to 1000000"),
     ("tune.starts = 1.5", "tune.starts is 1.5", "a whole number from 1 to 100"),
@@ -682,12 +682,12 @@ BAD = [
     (
         "requirements.effort = 9.0\ntune = { minimise = 't_f', free = ['t_f'], torque_weight = 0.5 }",
         "tune.torque_weight is 0.5",
-        "absent with tune.minimise = 't_f'",
+        'absent with tune.minimise = "t_f"',
     ),
     (
         "requirements.effort = 9.0\ntune = { minimise = 'limits', statistic = 'worst' }",
         'tune.minimise is "limits"',
-        "has no statistic, but tune.statistic is 'worst'",
+        'has no statistic, but tune.statistic is "worst"',
     ),
     ("tune.minimise = 'ape_x'", 'tune.minimise is "ape_x"', "there is no [pointing] table"),
     (

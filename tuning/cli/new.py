@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 
 from ptsmc_jax import scenario
-from ptsmc_jax.scenario import errors, free_gains, keys, layouts, parsing, reading
+from ptsmc_jax.scenario import errors, free_gains, keys, layouts, mission, parsing, reading
 from ptsmc_jax.scenario.attitude_keys import Attitude
 from ptsmc_jax.scenario.own import Own
 from ptsmc_jax.scenario.tables import Scenario, Tune
@@ -137,7 +137,9 @@ class _File:
         """A line for each kind of an inline table of a table of this name; chosen: the one that is there."""
         yield from _prose(f"{key.meaning}:")
         for kind, struct in kinds.items():
-            table = {"kind": kind, **{k.name: self.example(name, kind, k) for k in keys.of(struct)}}
+            scaled = {key: mission.scales(self.resolved).of(one) for key, one in struct.scaled.items()}
+            others = (k for k in keys.of(struct) if k.name not in scaled)
+            table = {"kind": kind, **scaled, **{k.name: self.example(name, kind, k) for k in others}}
             mine = chosen.get("kind") == kind
             yield from _line(not mine, key.name, chosen if mine else table, keys.about(struct))
 
@@ -161,9 +163,9 @@ class _File:
     def defaults(self, name: str, struct: type[Table]) -> dict[str, Any]:
         """What the keys of a table of this kind are where they are absent, as far as they are anything."""
         needed = {"code": EXAMPLES[f"{name}.code"]} if issubclass(struct, Own) else {}
-        table: Any = struct(**needed)
+        table: Any = mission.with_defaults(struct(**needed), mission.scales(self.resolved))
         if isinstance(table, Kind):
-            table = table.filled(self.resolved)
+            table = mission.with_defaults(table.filled(self.resolved), mission.scales(self.resolved))
             table = table.written(self.resolved)
         return {key: value for key, value in parsing.plain(table).items() if value not in ([], {})}
 
