@@ -21,8 +21,9 @@ HERE = Path(__file__).parent
 MADE = "<!-- Made by docs/generate.py from the code, where it is to be changed. -->"
 PLANTS = {"spacecraft": "A spacecraft", "chain": "An integrator chain", "system": "A system of one's own"}
 SCENARIOS = """\
-A scenario is a TOML file of tables; every table and every key is optional. What is not said has the default, for a
-spacecraft the paper's Case I. `flexible`, `hardware`, `sensors`, `wheels`, `filter`, `pointing`, `dispersion`,
+A scenario is a TOML file of tables; every table and every key is optional. A key that is left out has its default.
+Defaults marked with * are those of the paper's case. They [follow the
+mission](method.md#gains-that-follow-from-the-mission) for any other body or t_f, and gains are designed for the sampled loop. `flexible`, `hardware`, `sensors`, `wheels`, `filter`, `pointing`, `dispersion`,
 `requirements` and `tune` are off where they are absent. A key that is misspelt, of the wrong type, out of range or not
 finite is refused by name. `ptsmc new` writes all this into a file, to be changed.
 
@@ -138,7 +139,7 @@ def _keys(table: str, struct: type[Table], plant: str) -> Iterator[str]:
     borrowed = issubclass(struct, Attitude) and table != "initial"
     fallback = _case_i(plant).get(table, {}) if table == "initial" else {}
     rows = [
-        [f"`{key.name}`", key.allowed, _default(fallback.get(key.name, key.default)), key.unit, key.meaning]
+        [f"`{key.name}`", key.allowed, _shown(key, struct, fallback), key.unit, key.meaning]
         for key in keys.of(struct)
         if not (borrowed and key.name in Attitude.__struct_fields__)
     ]
@@ -171,6 +172,13 @@ def _kinds(key: keys.Key, kinds: Kinds) -> Iterator[list[str]]:
             said = [f"default {shown}" if (shown := _default(k.default)) else "", k.text]
             given.append(f"`{k.name}`: {', '.join(filter(None, said))}")
         yield [f"`{key.name}`", key.meaning, "; ".join(given), keys.about(struct)]
+
+
+def _shown(key: keys.Key, struct: type[Table], fallback: Mapping[str, Any]) -> str:
+    """Return the default of a key; one that follows the mission as it is in the paper's case, with a mark."""
+    if key.name in struct.scaled and key.default is None:
+        return f"{_default(struct.scaled[key.name].value)} *"
+    return _default(fallback.get(key.name, key.default))
 
 
 def _default(value: object) -> str:
