@@ -97,7 +97,7 @@ def _noisy(scenario: Scenario, largest: float) -> list[str]:
     if not noise > largest > 0.0:
         return []
     gain = scenario.observer.gain
-    shown = errors.brief(gain[0] if len(set(gain)) == 1 else gain)
+    shown = errors.brief([float(f"{one:.4g}") for one in gain] if len(set(gain)) > 1 else float(f"{gain[0]:.4g}"))
     unit = " N m" if scenario.motion == "spacecraft" else ""
     return [
         f"observer.gain is {shown}, with which the estimate has {noise:.2g}{unit} of noise (1 sigma), more than the "

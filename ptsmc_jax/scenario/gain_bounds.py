@@ -90,6 +90,6 @@ def eta(order: Callable[[Any], float]) -> GainBounds:
 def dead_beat(choice: Choice) -> Interval:
     """An observer's gain: from l / J = 1.5 / t_f up to that of a deadbeat one."""
     mean, _ = choice.scenario.moments
-    least = 1.5 / choice.t_f * (1.0 if mean is None else mean)
+    least = mission.SLOWEST_OBSERVER / choice.t_f * (1.0 if mean is None else mean)
     high = scales.dead_beat_gain(choice.scenario) if choice.sampled else 0.0
     return least, high if high > least else 600.0 * least

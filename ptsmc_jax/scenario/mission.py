@@ -26,6 +26,7 @@ FASTEST_MODE = math.pi / 3  # w T up to which a mode is phase stabilised: its ci
 SIGMAS = 5.0  # largest of the noise in a campaign, in sigmas
 NOISE_FRACTION = 0.5  # of the torque limit that noise may take
 SLOWEST = 20.0  # p t_f, at least: the rest at the hand-over has then decayed by t_f + t_f / 4
+SLOWEST_OBSERVER = 1.5  # t_f l / J, at least
 LEAST_ETA = 2.4  # below 2.386 the braking peak exceeds the first torque, see `theory.rules.later_peak_ratio`
 TRIED = 256  # rates among which the most accurate is chosen
 
@@ -151,8 +152,11 @@ def _design(scenario: Any, pole: float, eta: float, observer: float) -> Design:
     eta = min(eta, max(0.5 + pole * longest, _least_eta(scenario)))
     rate = min(observer * pole, 1.0 / period)
     position, velocity = scenario.devices.noise_of_error(scenario)
+    size, change = _disturbance(scenario)
+    if velocity > 0.0:  # the noise of the estimate, l sigma_w, stays below half of the disturbance
+        rate = min(rate, max(0.5 * size / velocity, SLOWEST_OBSERVER / law.t_f))
     # the slope of the boundary layer adds a quarter to the gain p, and its width exceeds the noise of s
-    residual = _disturbance(scenario)[1] / rate
+    residual = change / rate
     width = max(4.0 * residual / pole, 2.0 * math.hypot(velocity, pole * position)) or 1e-3 * pole
     return Design(eta, pole, rate, width, scales(scenario).time)
 
