@@ -135,7 +135,7 @@ def floors(package):
 
 
 FLOOR = {package: floors(package) for package in HOUSE}
-LONGEST = {"ptsmc_jax": 400, "tuning": 400, "tests": 800}
+LONGEST = {"ptsmc_jax": 480, "tuning": 480, "tests": 800}
 
 
 def allowed(package, name, other_package, other):

@@ -33,7 +33,8 @@ def powers(unit: str) -> tuple[float, float]:
 def in_units(tables: Mapping[str, Any], inertia: float, time: float) -> dict[str, Any]:
     """Return the tables of a scenario with every number in other units, by the units that the keys declare."""
     plant = tables.get("plant", {}).get("kind", "spacecraft")
-    layout, scaled = layouts.TABLES[plant], copy.deepcopy(dict(tables))
+    layout: Mapping[str, Any] = layouts.TABLES[plant]
+    scaled = copy.deepcopy(dict(tables))
 
     def times(value: Any, unit: str) -> Any:
         if isinstance(value, list | tuple):
@@ -69,7 +70,7 @@ def in_units(tables: Mapping[str, Any], inertia: float, time: float) -> dict[str
                 of(one, layouts.DISPERSIONS[key][one["kind"]])
         elif name == "disturbance" and table.get("kind") == "sum":
             for term in table["terms"]:
-                of(term, kinds[term["kind"]])
+                of(term, layout["disturbance"][term["kind"]])
         elif kinds is not None:
             of(table, kinds[table.get("kind", next(iter(kinds)))] if isinstance(kinds, Mapping) else kinds)
     return scaled

@@ -219,8 +219,10 @@ def widened(
         least, most, _ = scenario.gains[name].allowed(Choice(scenario, tune.gains, tune.bounds))
         if name == "delta":  # whose samples are planned for
             most = high
-        if side == "lower":
-            low = max(low / 10.0 if wide(low, high) else low - 0.5 * (high - low), 0.5 * (least + low))
+        if side == "lower" and wide(low, high):
+            low = least + 0.1 * (low - least)
+        elif side == "lower":
+            low = max(low - 0.5 * (high - low), 0.5 * (least + low))
         else:
             high = min(10.0 * high if wide(low, high) else high + 0.5 * (high - low), 0.5 * (most + high))
         if (low, high) != tune.bounds[name]:

@@ -74,7 +74,7 @@ SIGN_WIDTH = GainBounds(
     above="so wide that hardly a switching term is left",
 )
 K1 = GainBounds(_usual_k1, above="the stability border of the sampled loop")
-SURFACE_RATE = GainBounds(_usual_rate)
+SURFACE_RATE = GainBounds(_usual_rate, above="half of the largest rate with which the sampled hold phase is stable")
 
 
 def eta(order: Callable[[Any], float]) -> GainBounds:

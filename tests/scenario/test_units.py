@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ptsmc_jax.scenario import from_tables, layouts, mission, parsing, replace
+from ptsmc_jax.scenario import from_tables, mission, parsing, replace
 from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.scenario.law_tables import LAWS
 from tests.tree import ROOT
 from tests.units import in_units, powers
 from tuning.search import gains as gain_names
@@ -42,7 +43,7 @@ def test_other_units_rescale_every_default_and_every_bound(path, inertia, time):
         assert found[key] == (pytest.approx(value, rel=1e-12) if isinstance(value, float) else value), key
 
 
-@pytest.mark.parametrize("law", [law for law in layouts.TABLES["spacecraft"]["controller"] if law != "own"])
+@pytest.mark.parametrize("law", [law for law in LAWS["spacecraft"] if law != "own"])
 def test_gains_of_every_law_follow_the_mission(law):
     raw = tomllib.loads((ROOT / "benchmarks" / "satellites" / "uosat12.toml").read_text())
     raw = {**raw, "controller": {"kind": law, "t_f": raw["controller"]["t_f"]}, "tune": {}}

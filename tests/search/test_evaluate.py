@@ -83,8 +83,15 @@ def test_a_search_for_limits_minimises_the_largest_metric_over_its_limit():
     """A trial that fails does not count in F, and its c stays that of a failure."""
     limits, status = np.array([0.5, 8.0]), np.array([rollout.OK, rollout.OK, rollout.DIVERGED])
     limited = np.array([[0.3, 5.0], [0.4, 7.0], [2.0, 90.0]])
-    some = {"among": np.zeros((2, 3), bool), "counted": np.ones((2, 3), bool)}
-    rules = Rules(limits=limits, averaged=3, names=("eta",), may_break=(None, None), goal="limits", **some)
+    rules = Rules(
+        limits=limits,
+        among=np.zeros((2, 3), bool),
+        counted=np.ones((2, 3), bool),
+        averaged=3,
+        names=("eta",),
+        may_break=(None, None),
+        goal="limits",
+    )
     metrics = jnp.asarray(np.concatenate([np.ones((3, 2)), limited], axis=1))
     f, c, value = judge(rules, jnp.asarray([3.0]), metrics, jnp.asarray(status, jnp.int32))
     np.testing.assert_allclose(np.exp([f, value]), np.max(limited[:2] / limits), rtol=1e-12)

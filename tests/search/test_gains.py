@@ -441,8 +441,8 @@ def test_the_published_gains_scale_with_the_mission_and_follow_the_order_of_a_ch
     """The published t_f is 30 s for a spacecraft and 5 s for a chain; delta is at least one period."""
     tables = {"controller": {"t_f": 5.0}, "loop": {"mode": "sampled", "period": 0.1}}
     known = {"eta": 3.0, "delta": 0.1, "k1": 1.0, "sign_width": 1e-3, "surface_rate": 1.0, "observer_gain": 10.0}
-    six_times = dict.fromkeys(("k1", "sign_width", "surface_rate", "observer_gain"), 6.0)
-    expected = {name: six_times.get(name, 1.0) * value for name, value in known.items()}
+    six_times = ("k1", "sign_width", "surface_rate", "observer_gain")
+    expected = {name: value * (6.0 if name in six_times else 1.0) for name, value in known.items()}
     assert gains.of_paper(from_tables(tables)) == pytest.approx(expected, rel=1e-12)
     known |= {"eta": order + 1.0}
     of_chain = gains.of_paper(from_tables({**tables, "plant": {"kind": "chain", "order": order}}))

@@ -187,7 +187,8 @@ class Rising:
     def __init__(self, made: scenario.Scenario, searched: list[dict[str, tuple[float, float]]]):
         self.ready, self.seed, self.sloped, self.problem = SimpleNamespace(scenario=made), 0, True, None
         self.searched, names = searched, tuple(made.search.bounds)
-        bounds = shares.Bounds(names, *zip(*made.search.bounds.values(), strict=True))
+        lower, upper = zip(*made.search.bounds.values(), strict=True)
+        bounds = shares.Bounds(names, lower, upper)
 
         def fly(problem: Any, share: np.ndarray) -> Any:
             k1 = np.array([bounds.gains(one)[names.index("k1")] for one in share])

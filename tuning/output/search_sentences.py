@@ -15,7 +15,7 @@ def search(summary: Summary) -> Iterator[str]:
     record = summary["search"]
     over = {metric: r for metric, r in record.get("largest_over_limit", {}).items() if r is None or r > 1.0}
     if over:
-        globally = ", nor did a global search" if record.get("conflict") else ""
+        globally = ", nor did a global search" if record.get("searched_globally") else ""
         yield f"the search found no gains that meet every requirement{globally}"
     # once of trials that do not arrive, which keep no limit
     for how_far in dict.fromkeys(_how_far(summary, metric, ratio) for metric, ratio in over.items()):

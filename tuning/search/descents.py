@@ -101,6 +101,7 @@ class Descents:
     ):
         self._evaluate, self._margin, self._steps, self._rng, self._report = evaluate, margin, steps, rng, report
         self._own: np.ndarray | None = None  # (gains,) to come back to where one makes no difference
+        self.globally = False  # `search_globally` was called
         self._rows = 0  # limits of a step in the history
         self._designs = np.zeros((0, 0))  # (designs, gains) shares
         self._best: Best | None = None
@@ -274,6 +275,7 @@ class Descents:
 
     def search_globally(self, problem: Problem, starts: int, seed: int) -> None:
         """Search from the best of many points of the whole box; what was found before stays unless this is better."""
+        self.globally = True
         found, better = (self.best, self._problem, self._from, self._ends), False
         try:
             few = _few_trials(problem)

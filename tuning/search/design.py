@@ -17,7 +17,7 @@ from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation.requirements import Requirement, must_keep
 from ptsmc_jax.simulation.rollout import Parts
 from ptsmc_jax.theory import solutions
-from tuning.search.gains import with_gains
+from tuning.search.gains import in_scenario, with_gains
 
 FARTHEST = 100.0  # times the scenario's t_f: no longer one is looked at
 CLOSE = 1e-3  # relative width at which the search by simulation ends
@@ -80,9 +80,8 @@ def shortest_time(flown: Scenario, asked: Requirement, seed: int, trials: np.nda
     shortest = simulated_in(ready, own) if rule <= own else None
     if shortest is None:
         longest = max(1.5 * rule, own)
-        t_end = longest + float(ready.parts.t_end) - own
         with contextlib.suppress(ScenarioError):  # a reference that runs into the law's singularity later, say
-            roomy = scenario.study(scenario.replace(flown, controller__t_f=longest, loop__t_end=t_end))
+            roomy = scenario.study(in_scenario(flown, {"t_f": longest}))
             shortest = simulated_in(roomy, longest)
     return ShortestTime(limit, rule, shortest, *told)
 

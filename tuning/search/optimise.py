@@ -57,6 +57,7 @@ class Search:
     over: float = 0.0  # how far the best point is beyond a limit less that margin, as progress tells it
     # if no gains meet every requirement: the limits that conflict, see `Descents.conflict`
     conflict: dict[str, float | None] = field(default_factory=dict)
+    globally: bool = False  # the whole box was searched too
     hardest: Hardest | None = None  # for the gains found; None: no requirement hangs on the hardest trial
     counts: list[confirm.Count] = field(default_factory=list)  # of requirements on a share, on other trials
     seconds: dict[str, float] = field(default_factory=dict)  # that each step of the search took
@@ -128,6 +129,7 @@ def search(
         margin=margin,
         over=best.over,
         conflict=conflict,
+        globally=descents.globally,
         hardest=rounds.hardest,
         counts=[] if interrupted else rounds.counts,
         seconds=report.seconds,

@@ -136,7 +136,7 @@ def fly(scenario: Scenario, x: Axis, y: Axis, seed: int, trials: int, tell: Call
     """
     if PERIOD in (x.key, y.key):
         scenario.need_samples(PERIOD)
-    base = changed(scenario, tune=None)  # its bounds would not fit every pair
+    base = _with_its_gains(changed(scenario, tune=None))  # bounds would not fit every pair
     pairs = [(a, b) for b in y.values for a in x.values]
     studies: list[Study | str] = []
     for a, b in pairs:
@@ -153,6 +153,17 @@ def fly(scenario: Scenario, x: Axis, y: Axis, seed: int, trials: int, tell: Call
         cells.append(Cell(a, b, one) if isinstance(one, str) else _cell(a, b, one, common, seed, trials))
         tell(k + 1, len(pairs))
     return Map(scenario, x, y, cells)
+
+
+def _with_its_gains(scenario: Scenario) -> Scenario:
+    """Return the scenario with its default gains stated: they stay when other keys change."""
+    stated = {
+        f"{where}__{name.removeprefix(table.prefix)}": getattr(table, name.removeprefix(table.prefix))
+        for where, table in scenario.tuned_tables.items()
+        for name in table.gains
+        if "." not in where and name != "t_f"
+    }
+    return changed(scenario, **{key: value for key, value in stated.items() if value is not None})
 
 
 def _with(scenario: Scenario, values: dict[str, float]) -> Scenario:

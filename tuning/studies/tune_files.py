@@ -93,6 +93,7 @@ def summary(tuning: Tuning) -> dict[str, Any]:
             "earlier": [asdict(earlier) for earlier in tuning.earlier],
             "largest_over_limit": dict(zip(search.problem.rows, search.worst.tolist(), strict=True)),
             "conflict": search.conflict,
+            "searched_globally": search.globally,
             "confirmed": [
                 {**{k: v for k, v in asdict(one).items() if k != "harder"}, "held": one.held} for one in search.counts
             ],
