@@ -23,9 +23,10 @@ PLANTS = {"spacecraft": "A spacecraft", "chain": "An integrator chain", "system"
 SCENARIOS = """\
 A scenario is a TOML file of tables; every table and every key is optional. A key that is left out has its default.
 Defaults marked with * are those of the paper's case. They [follow the
-mission](method.md#gains-that-follow-from-the-mission) for any other body or t_f, and gains are designed for the sampled loop. `flexible`, `hardware`, `sensors`, `wheels`, `filter`, `pointing`, `dispersion`,
-`requirements` and `tune` are off where they are absent. A key that is misspelt, of the wrong type, out of range or not
-finite is refused by name. `ptsmc new` writes all this into a file, to be changed.
+mission](method.md#gains-that-follow-from-the-mission) for any other body or t_f, and gains are designed for the sampled
+loop. `flexible`, `hardware`, `sensors`, `wheels`, `filter`, `pointing`, `dispersion`, `requirements` and `tune` are off
+if they are absent. A key that is misspelt, of the wrong type, out of range or not finite is refused by name.
+`ptsmc new` writes all this into a file for you to change.
 
 Numbers are in the unit of their key. One in rad, rad/s, N m, N m s, s or a noise's unit may have another:
 `"10 arcsec"`, `"2 deg/h"`, `"0.02 deg/sqrt(h)"`, `"5 mN m"`, `"50 ms"`; in a list each number may.

@@ -31,6 +31,7 @@ PAPERS = {
     "controller__k1": ("law_k1", 1.7),
     "controller__sign_width": ("law_sign_width", 4e-3),
     "controller__surface_rate": ("law_surface_rate", 1.3),
+    "controller__layer_time": ("law_layer_time", 0.7),
     "controller__disturbance_rate_bound": ("observer_disturbance_rate_bound", 3e-3),
     "controller__initial_estimate_error": ("observer_initial_error", 2e-3),
     "observer__gain": ("observer_gain", [7.0, 11.0, 9.0]),

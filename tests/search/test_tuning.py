@@ -654,7 +654,11 @@ MARGIN = {"metric": "gain_margin", "limit": 6.0, "unit": "dB", "at_least": True}
     ],
 )
 def test_sentences_name_the_conflicting_limits_and_the_values_that_resolve_the_conflict(conflict, lines):
-    found = {"largest_over_limit": {"peak_torque": 1.12, "gain_margin": 1.119}, "conflict": conflict}
+    found = {
+        "largest_over_limit": {"peak_torque": 1.12, "gain_margin": 1.119},
+        "conflict": conflict,
+        "searched_globally": True,
+    }
     told = [*search_sentences.search({"search": found, "verdicts": [TORQUE, MARGIN], "training": {}})]
     assert told[0] == "the search found no gains that meet every requirement, nor did a global search"
     assert told[3:] == lines

