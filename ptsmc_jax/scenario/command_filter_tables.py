@@ -34,7 +34,7 @@ class CommandFilter(Table, frozen=True):
         raise NotImplementedError
 
     def dead_time(self) -> float:
-        """Return the slope of its phase at low frequencies [s]."""
+        """Return its delay at low frequencies, the derivative of its phase [s]."""
         raise NotImplementedError
 
     def build(self) -> Any:
@@ -56,7 +56,7 @@ class FirstOrderFilter(CommandFilter, frozen=True):
         return Physics
 
     def dead_time(self) -> float:
-        """Return the slope of its phase at low frequencies [s]."""
+        """Return its delay at low frequencies, the derivative of its phase [s]."""
         return 1.0 / self.corner
 
 
@@ -77,7 +77,7 @@ class SecondOrderFilter(CommandFilter, frozen=True):
         return Physics
 
     def dead_time(self) -> float:
-        """Return the slope of its phase at low frequencies [s]."""
+        """Return its delay at low frequencies, the derivative of its phase [s]."""
         return 2.0 * self.damping / self.corner
 
 
@@ -98,7 +98,7 @@ class NotchFilter(CommandFilter, frozen=True):
         return Physics
 
     def dead_time(self) -> float:
-        """Return the slope of its phase at low frequencies [s]."""
+        """Return its delay at low frequencies, the derivative of its phase [s]."""
         return 2.0 * self.damping / self.corner
 
 

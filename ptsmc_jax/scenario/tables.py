@@ -86,7 +86,7 @@ FreeGains = Annotated[tuple[str, ...], Meta(min_length=1, description=FREE_ALLOW
 
 
 class Tune(Table, frozen=True):
-    """What `tune`, `pareto` and `compare` search for: the smallest objective that keeps every requirement.
+    """Objective, gains and bounds of `tune`, `pareto` and `compare`.
 
     Attributes:
         free: the gains to find; default: all but t_f; without sampling all but k1, sign_width and surface_rate too
