@@ -200,15 +200,16 @@ def beyond(scenario: Scenario, name: str, side: str) -> float | None:
 def widened(
     scenario: Scenario, sides: Mapping[str, str], defaulted: Container[tuple[str, ...]]
 ) -> dict[str, tuple[float, float]]:
-    """Return bounds for gains that ended on a default one, by name.
+    """Return wider bounds for gains that ended on a default bound, by name.
 
     Args:
         scenario: with the bounds that were searched.
         sides: on which each gain ended, "lower" or "upper", by its name.
         defaulted: paths of the keys that the user's scenario leaves out.
 
-    An interval on a log scale grows tenfold on that side, another one by half of itself, as far as is allowed. Bounds
-    beyond which the loop is unstable, or the gain has no influence, stay.
+    A bound on a log scale moves by a factor of ten, and a bound on a linear scale by half of the interval. Neither
+    moves more than half way to the end of the allowed range. A bound stays if the loop is unstable beyond it, or if
+    the gain has no influence there.
     """
     tune, found = scenario.search, dict[str, tuple[float, float]]()
     for name, side in sides.items():
@@ -217,9 +218,9 @@ def widened(
         if not by_default or border(scenario, name, side, low if side == "lower" else high) is not None:
             continue
         least, most, _ = scenario.gains[name].allowed(Choice(scenario, tune.gains, tune.bounds))
-        if name == "delta":  # whose samples are planned for
+        if name == "delta":  # the upper bound stays: the clock has samples for it only
             most = high
-        if side == "lower" and wide(low, high):
+        if side == "lower" and wide(low, high) and math.isfinite(least):
             low = least + 0.1 * (low - least)
         elif side == "lower":
             low = max(low - 0.5 * (high - low), 0.5 * (least + low))

@@ -18,17 +18,18 @@ PAPER_INERTIA = (10.0, 12.0, 14.0)  # of the paper's spacecraft [kg m^2]
 PAPER_TIMES = (30.0, 40.0)  # range of t_f in the paper's cases of a spacecraft [s]
 CHAIN_TIME = 5.0  # t_f of the paper's integrator chains [s]
 
-# p T, the rate of both poles in the hold phase over the inverse dead time. A double integrator with both poles at -p
-# has its crossover at 2.06 p with 76 deg of phase. At p T = 0.25 the dead time T takes 30 deg of it; the gain margin is
-# then about 9 dB.
+# Largest p T, with p the rate of both hold poles and T the dead time. With an observer of l / J = p / 2 the loop then
+# has a phase margin of 35 deg and a gain margin of 7 dB.
 STABLE = 0.25
-FASTEST_MODE = math.pi / 3  # w T up to which a mode is phase stabilised: its circle stays 30 deg away from -1
-SIGMAS = 5.0  # largest of the noise in a campaign, in sigmas
+OBSERVER = 0.5  # l / J over p
+# Modes with w T below this are phase stabilised: the resonance circle in the Nyquist plot stays 30 deg away from -1.
+FASTEST_MODE = math.pi / 3
+SIGMAS = 5.0  # largest noise sample assumed, in standard deviations
 NOISE_FRACTION = 0.5  # of the torque limit that noise may take
-SLOWEST = 20.0  # p t_f, at least: the rest at the hand-over has then decayed by t_f + t_f / 4
-SLOWEST_OBSERVER = 1.5  # t_f l / J, at least
+SLOWEST = 20.0  # smallest p t_f: the error at the hand-over then decays for five time constants within t_f / 4
+SLOWEST_OBSERVER = 1.5  # smallest t_f l / J
 LEAST_ETA = 2.4  # below 2.386 the braking peak exceeds the first torque, see `theory.rules.later_peak_ratio`
-TRIED = 256  # rates among which the most accurate is chosen
+TRIED = 256  # rates p among which the most accurate one is chosen
 
 
 class Scales(NamedTuple):
@@ -46,8 +47,8 @@ class Scales(NamedTuple):
             factor = float(np.float64(self.inertia) ** scaled.inertia * time)
         if not 0.0 < factor < math.inf:
             raise ScenarioError(
-                f"controller.t_f is {self.time:g} times and the body's inertia {self.inertia:g} times the paper's, "
-                "beyond which defaults are no numbers; allowed are numbers nearer to the paper's"
+                f"controller.t_f is {self.time:g} times and the body's inertia {self.inertia:g} times the published "
+                "one, so default gains overflow or underflow; allowed are numbers nearer to the published ones"
             )
         return _times((scaled.value,) * self.inputs if scaled.each else scaled.value, factor)
 
@@ -65,7 +66,10 @@ def published(scenario: Any) -> bool:
 
 
 def scales(scenario: Any) -> Scales:
-    """Return the mission's units: 1 for the paper's cases, and for the inertia of a plant without a body."""
+    """Return inertia and t_f over those of the published case.
+
+    Both are 1 for a published case. The inertia is 1 for a plant without a body.
+    """
     plant, mean, t_f = (scenario.order, scenario.inputs), scenario.moments[0], scenario.controller.t_f
     if published(scenario):
         return Scales(1.0, 1.0, *plant)
@@ -75,7 +79,7 @@ def scales(scenario: Any) -> Scales:
 
 
 def with_defaults(table: Any, units: Scales) -> Any:
-    """Fill the absent keys of a table, and of the tables in it, that have a number of the paper's case as default."""
+    """Fill absent keys with published numbers in the mission's units, in this table and in the tables inside it."""
     changes: dict[str, Any] = {}
     for key in table.__struct_fields__:
         value = getattr(table, key)
@@ -108,7 +112,7 @@ class Design(NamedTuple):
 
     @property
     def rate(self) -> float:
-        """Factor on the rates of laws whose gains follow t_f [-]: as in the paper's case, but within the bandwidth."""
+        """Factor on the published rates of laws whose gains scale with 1 / t_f [-], at most 2 p."""
         return min(1.0 / self.time, 2.0 * self.pole)
 
 
@@ -123,14 +127,14 @@ class _Limits(NamedTuple):
 def design(scenario: Any) -> Design:
     """Return the design whose predicted error in the hold phase is the smallest."""
     limits = _limits(scenario)
-    return _design(scenario, limits.accurate, _eta(scenario), 1.0)
+    return _design(scenario, limits.accurate, _eta(scenario), OBSERVER)
 
 
 def designs(scenario: Any) -> list[Design]:
     """Return starting points of a search: slow to fast hold phases, slow and fast observers, the default first."""
     limits, eta, stable = _limits(scenario), _eta(scenario), STABLE / dead_time(scenario)
     rates = [limits.accurate, limits.most, math.sqrt(limits.least * limits.most), limits.least, stable]
-    found = [_design(scenario, rate, eta, observer) for observer in (1.0, 0.1) for rate in rates]
+    found = [_design(scenario, rate, eta, observer) for observer in (OBSERVER, 0.1) for rate in rates]
     return [*found, _design(scenario, limits.accurate, _least_eta(scenario), 0.3)]
 
 
@@ -155,31 +159,31 @@ def _design(scenario: Any, pole: float, eta: float, observer: float) -> Design:
     size, change = _disturbance(scenario)
     if velocity > 0.0:  # the noise of the estimate, l sigma_w, stays below half of the disturbance
         rate = min(rate, max(0.5 * size / velocity, SLOWEST_OBSERVER / law.t_f))
-    # the slope of the boundary layer adds a quarter to the gain p, and its width exceeds the noise of s
+    # on three axes N K2 / 2 = 3 residual: the boundary layer adds a quarter to the gain p; it is thicker than the noise
     residual = change / rate
-    width = max(4.0 * residual / pole, 2.0 * math.hypot(velocity, pole * position)) or 1e-3 * pole
+    width = max(12.0 * residual / pole, 2.0 * math.hypot(velocity, pole * position)) or 1e-3 * pole
     return Design(eta, pole, rate, width, scales(scenario).time)
 
 
 def _limits(scenario: Any) -> _Limits:
-    """Return the range of p.
+    """Return the range of p, and the most accurate p in it.
 
-    The most is what dead time, flexible modes, and noise against the torque limit allow. The most accurate is where the
-    sum of the squares of three errors is least: the lag c / p^3 behind a disturbance that changes by c, the position
-    noise sigma (p h)^(1/2), and the rate noise sigma (h / p)^(1/2).
+    Dead time, flexible modes, and noise against the torque limit bound p from above. The most accurate p minimises the
+    sum of the squares of three errors. They are the lag c p / (l / J) / p^3 behind a disturbance of the rate c, the
+    position noise sigma (p h)^(1/2), and the rate noise sigma (h / p)^(1/2).
     """
     t_f, period = scenario.controller.t_f, scenario.loop.period
     stable = STABLE * 2.0 / scenario.order  # of n poles at -p the crossover lies near n p
     most = min(stable / dead_time(scenario), _with_modes(scenario), _with_noise(scenario))
     least = SLOWEST / t_f
-    if most <= least:  # slow by need, but the hand-over lies within the second half of t_f
+    if most <= least:  # the larger of this limit and the p with delta = t_f / 2
         slow = max(most, (2.0 * _least_eta(scenario) - 1.0) / t_f)
         return _Limits(slow, slow, slow)
     position, velocity = scenario.devices.noise_of_error(scenario)
     position = 0.0 if scenario.estimator.on else position  # an attitude filter passes slow errors only
-    rates = least * (most / least) ** np.linspace(1.0, 0.0, TRIED)  # the fastest first: of equal ones it is taken
+    rates = least * (most / least) ** np.linspace(1.0, 0.0, TRIED)  # descending: of equal errors the first
     with np.errstate(all="ignore"):
-        lag = _disturbance(scenario)[1] / rates**3
+        lag = _disturbance(scenario)[1] / (OBSERVER * rates**3)
         error = lag**2 + position**2 * rates * period + velocity**2 * period / rates
     return _Limits(least, float(rates[int(np.argmin(error))]), most)
 
@@ -187,8 +191,8 @@ def _limits(scenario: Any) -> _Limits:
 def _with_modes(scenario: Any) -> float:
     """Return the largest p [1/s] that keeps the resonance of every late mode 6 dB below 1.
 
-    At its resonance w a mode with the fraction k of the inertia and the damping z raises the loop gain 2 p / w by
-    k / (2 z). A mode with w T up to `FASTEST_MODE` needs no limit.
+    At its resonance w, a mode with the damping z and the fraction f of the inertia raises the loop gain 2 p / w by
+    k / (2 z), k = f / (1 - f). A mode is late if w T exceeds `FASTEST_MODE`.
     """
     found = math.inf
     for frequency, damping, fraction in scenario.modes():
@@ -200,14 +204,14 @@ def _with_modes(scenario: Any) -> float:
 def _with_noise(scenario: Any) -> float:
     """Return the largest p [1/s] whose noise leaves the torque within `NOISE_FRACTION` of its limit.
 
-    A sample's noise asks for the acceleration of the error (2 p + l / J) v + p^2 x, with l / J = p / 2.
+    A noise sample (x, v) commands the acceleration (2 p + l / J) v + p^2 x of the error.
     """
     limit = scenario.largest_acceleration()
     position, velocity = scenario.devices.noise_of_error(scenario)
     position *= scenario.estimator.passes(scenario)
     if limit is None or not (position or velocity):
         return math.inf
-    allowed, square = NOISE_FRACTION * limit / SIGMAS, (2.5 * velocity) ** 2
+    allowed, square = NOISE_FRACTION * limit / SIGMAS, ((2.0 + OBSERVER) * velocity) ** 2
     return math.sqrt(2.0 * allowed**2 / (square + math.sqrt(square**2 + 4.0 * (position * allowed) ** 2)))
 
 

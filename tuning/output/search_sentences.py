@@ -58,7 +58,8 @@ def _conflict(summary: Summary) -> Iterator[str]:
         elif one.get("at_least") and needed <= 0.0:
             yield f"{metric} alone cannot give way far enough: the loop would be unstable"
         else:
-            instead = f"{needed:.3g} {one['unit']} instead of {one['limit']:g}"
+            unit = "" if one["unit"] == "-" else f" {one['unit']}"
+            instead = f"{needed:.3g}{unit} instead of {one['limit']:g}"
             yield f"if {metric} alone gives way, its limit must be {instead}"
     ratios = [worst[metric] for metric in conflict]
     if len(conflict) > 1 and all(ratios):

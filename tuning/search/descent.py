@@ -1,4 +1,4 @@
-"""From one start to the optimum next to it, along the active limits, by sequential quadratic programming."""
+"""Local search by sequential quadratic programming (SLSQP)."""
 
 import contextlib
 from collections.abc import Callable, Sequence
@@ -13,10 +13,12 @@ from tuning.search.objective import ended, failures
 ACTIVE = 1e-3  # of a limit, nearer to which it is active
 SLACK = 1e-4  # of a limit that an admissible point may use
 ELASTIC = 0.1  # of a limit, beyond which the violation is minimised before the objective
-BROKEN = 1e3  # metric / limit by which a trial that fails is over, as progress tells it, beside those that end
+BROKEN = 1e3  # added to the relative violation for each failed trial
 CLOSE = 1e-5  # change of F at which a descent ends
-BOLD, CAREFUL = 1.0, 4.0  # a first step that may lead across the bounds into a better valley, and one that stays
-# change of F between two bounds of a gain: where the loop chatters slopes are many orders larger, and say nothing
+# Scaling of the variables. The first step is the gradient over its square: 1 may leave the neighbourhood of the
+# starting point, 4 stays in it.
+BOLD, CAREFUL = 1.0, 4.0
+# Gradients are clipped to this change of F per interval. A chattering loop has useless gradients that are far larger.
 STEEPEST = 30.0
 
 
@@ -26,10 +28,7 @@ def largest(c: np.ndarray, margin: float) -> np.ndarray:
 
 
 class Best:
-    """The best point so far: an admissible one by its F, another one by how many trials fail, then how far it is over.
-
-    However far beyond a limit, a trial that ends is better than one that fails.
-    """
+    """The best point so far. The order is: fewest failed trials, then smallest violation, then smallest F."""
 
     def __init__(self, share: np.ndarray, requirements: int, margin: float):
         self.margin, self.share = margin, share.copy()  # (gains,) where nothing better is known
@@ -43,12 +42,12 @@ class Best:
 
     @property
     def beyond(self) -> tuple[float, float]:
-        """How many trials fail there, or have no value, and how far it is over: none of it where it is admissible."""
+        """Number of failed trials and relative violation; (0, 0) if every limit is kept."""
         return self.lost, self.over
 
     @property
     def rank(self) -> tuple[float, float, float]:
-        """The less, the better."""
+        """Sort key, best first: failed trials, violation, F."""
         return self.lost, self.over, self.f
 
     @property
@@ -80,7 +79,7 @@ class Start:
     share: np.ndarray  # (gains,)
     scale: float = BOLD  # the first step is the slope over its square
     fixed: Sequence[int] = ()  # gains that stay as they are
-    # the points that a shorter descent from here looked at, which are not flown again: a longer one goes on from there
+    # points that a shorter search from the same starting point has measured; a longer one uses them again
     seen: dict[bytes, Sloped] = field(default_factory=dict)
 
 
@@ -93,7 +92,7 @@ class Relaxed:
     """Which limits are exceeded by as little as possible, instead of minimising the objective."""
 
     rows: Sequence[int] | None = None  # of the problem; None: all of them
-    to_the_end: bool = False  # also once every limit is kept: as far inside the limits as possible
+    to_the_end: bool = False  # continue after every limit is kept, to maximise the distance from the limits
 
 
 def descend(
@@ -107,18 +106,18 @@ def descend(
 ) -> None:
     """Search locally from a starting point inside the bounds, by sequential quadratic programming (SLSQP).
 
-    From a point that breaks a limit by more than `ELASTIC`, or if the search ends at a point that breaks one, the
-    largest relative violation is minimised first: min t subject to c <= t for every limit and trial. Its linearised
-    constraints can always be met, whereas those of the problem itself can contradict each other far from a solution.
+    From a point that breaks a limit by more than `ELASTIC`, the largest relative violation is minimised first: min t
+    subject to c <= t for every limit and trial. Its linearised constraints can always be met. Those of the problem
+    itself can contradict each other far from a solution. The same happens if the search ends at a point that breaks a
+    limit. The objective is not minimised if the violation cannot be removed.
 
     Args:
         slopes: measures the problem at a point (1, gains).
         best: is offered every point.
-        start: where it begins.
-        steps: how many points may be looked at.
-        keep: is called with what was measured at each point that the search goes through, without those that it only
-            tries.
-        close: change of F at which it ends.
+        start: the starting point and the scaling of the variables.
+        steps: how many points may be measured.
+        keep: is called with the measurement at accepted points, not at those of a line search.
+        close: change of F at which the search ends.
         relaxed: minimise the violation of these limits only, the others being constraints.
     """
     local = _Local(slopes, best, start, steps, keep, close)
@@ -246,9 +245,9 @@ def _compressed(seen: Sloped) -> tuple[np.ndarray, np.ndarray]:
 
 
 def prices(at: Sloped, share: np.ndarray) -> np.ndarray:
-    """(rows,) what F pays for each limit at an optimum (gains,), over c; none for those that are not active.
+    """Return the Lagrange multiplier of each limit at an optimum (gains,), (rows,); 0 for inactive limits.
 
-    Lagrange multipliers, by least squares over the gains that are not on a bound.
+    They are estimated by nonnegative least squares over the gains that are not on a bound.
     """
     c, inside = ended(at.c[0]), (share > 0.0) & (share < 1.0)
     active = np.flatnonzero(c.max(axis=1, initial=-1.0) > -ACTIVE)

@@ -37,7 +37,7 @@ TOGETHER = 2  # descents of each device that go in step: it waits for one call w
 FOLLOWED = 3  # of the explored starts go on with all trials
 SAME = 1e-4  # points whose F differs by less are equally good: 0.01 % of the error
 FINISH = 1e-2  # share of `CLOSE` at which the last descent, from the best point, ends
-CONFLICTING = 0.1  # limits exceeded by so much less than the worst one, relatively, conflict with it
+CONFLICTING = 0.1  # limits whose excess is within this fraction of the largest excess count as conflicting
 LOOKS = 3  # at other hand-overs, at most
 MANY = 512  # points swept where there are no slopes
 
@@ -180,9 +180,9 @@ class Descents:
         return self._promising(problem, first)
 
     def _promising(self, problem: Problem, first: np.ndarray, number: int = 0) -> dict[int, np.ndarray]:
-        """Return the best ends of short local searches from these starting points, by their number.
+        """Return the end points of the best short local searches, by the index of their starting point.
 
-        first: (starts, gains) shares; number: of the first one.
+        first: (starts, gains) shares; number: index of the first one.
         """
         few, more = max(2, self._steps // 4), max(2, self._steps // 2)
         racing, scales = dict(enumerate(first, number)), (CAREFUL, BOLD)
@@ -274,7 +274,7 @@ class Descents:
         self._finish(problem)
 
     def search_globally(self, problem: Problem, starts: int, seed: int) -> None:
-        """Search from the best of many points of the whole box; what was found before stays unless this is better."""
+        """Search from the best of many points of the whole box, and keep the earlier result if it is better."""
         self.globally = True
         found, better = (self.best, self._problem, self._from, self._ends), False
         try:
@@ -322,10 +322,9 @@ class Descents:
             self._take(best, tightened, 0, afresh=best.beyond <= self.best.beyond)
 
     def conflict(self, problem: Problem) -> dict[str, float | None]:
-        """Return the limits that the best compromise exceeds most, and the least excess of each alone.
+        """Return the limits that the best compromise exceeds most, and the least ratio that each can reach alone.
 
-        Values are metric over limit, at the least that can be reached with every other limit kept; None if the others
-        cannot be kept then either.
+        The ratio is metric over limit, with every other limit kept to 0.1 %. It is None if the others cannot be kept.
         """
         tightened, found = self.tightened(problem), dict[str, float | None]()
         worst = largest(self._evaluate.slopes(tightened, self.share[None]).c, 0.0)[0]

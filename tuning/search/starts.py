@@ -32,10 +32,10 @@ def starting_points(
     seed: int,
     report: Report,
 ) -> np.ndarray:
-    """Return starting points: these shares first, then the most promising of designs and a sweep that lie far apart.
+    """Return `first`, then the most promising points of designs and a Sobol sweep that lie far apart.
 
-    In the sweep a gain that an active limit depends on most, as the peak torque depends on eta, keeps its value: else
-    most of the points would break the limit.
+    The sweep fixes the gain with the largest effect on each nearly active limit, such as eta for the peak torque.
+    Otherwise most of its points would break the limit.
 
     Args:
         evaluate: measures the problem.
@@ -61,8 +61,9 @@ def starting_points(
 def spread_widely(evaluate: Evaluator, problem: Problem, count: int, seed: int, report: Report) -> np.ndarray:
     """Return the most promising of `WIDELY` points of the whole box that lie far apart, (count, gains) shares.
 
-    Margins take far longer than simulations and can only add to a violation. They are evaluated for the points in the
-    order of the rest of their merit, until no further point can be among the best.
+    Margins take far longer than simulations and can only add to a violation. The points are sorted by their merit
+    without margins, and margins are evaluated in this order. That stops when the next merit cannot be among the best,
+    or after `MARGINS_LOOKED` points.
     """
     share = spread(len(problem.names), WIDELY, np.random.default_rng(seed))
     without = problem if problem.margins is None else replace(problem, margins=None)

@@ -236,7 +236,10 @@ def _in_larger_bounds(outcome: Search, posed: Posed, journal: Journal | None, re
 
 
 def _that_matter(posed: Posed, outcome: Search, sides: dict[str, str]) -> dict[str, str]:
-    """Return the gains on a bound that the objective or a limit depends on there."""
+    """Return the gains on a bound that matters.
+
+    It matters if moving the gain inwards by a tenth of its interval changes F or the violation by more than 0.01.
+    """
     names, found = posed.evaluate.bounds.names, outcome.share
     points = np.asarray([found, *(np.where(np.isin(names, name), np.abs(found - 0.1), found) for name in sides)])
     seen = posed.evaluate.fly(outcome.problem, points)
