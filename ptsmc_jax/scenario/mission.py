@@ -133,7 +133,8 @@ def design(scenario: Any) -> Design:
 def designs(scenario: Any) -> list[Design]:
     """Return starting points of a search: slow to fast hold phases, slow and fast observers, the default first."""
     limits, eta, stable = _limits(scenario), _eta(scenario), STABLE / dead_time(scenario)
-    rates = [limits.accurate, limits.most, math.sqrt(limits.least * limits.most), limits.least, stable]
+    rates = [limits.accurate, limits.most, math.sqrt(limits.least * limits.most), limits.least]
+    rates = [*dict.fromkeys([*rates, stable, math.sqrt(limits.most * stable)])]
     found = [_design(scenario, rate, eta, observer) for observer in (OBSERVER, 0.1) for rate in rates]
     return [*found, _design(scenario, limits.accurate, _least_eta(scenario), 0.3)]
 
