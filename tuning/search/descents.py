@@ -4,7 +4,7 @@ Sequential quadratic programming on the slopes of what flies, see `descend`; whe
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -102,7 +102,6 @@ class Descents:
         self._evaluate, self._margin, self._steps, self._rng, self._report = evaluate, margin, steps, rng, report
         self._own: np.ndarray | None = None  # (gains,) to come back to where one makes no difference
         self.globally = False  # `search_globally` was called
-        self._rows = 0  # limits of a step in the history
         self._designs = np.zeros((0, 0))  # (designs, gains) shares
         self._best: Best | None = None
         self._problem: Problem | None = None
@@ -186,15 +185,8 @@ class Descents:
         """
         few, more = max(2, self._steps // 4), max(2, self._steps // 2)
         racing, scales = dict(enumerate(first, number)), (CAREFUL, BOLD)
-        if problem.margins is None or problem.goal == LIMITS:
-            rungs = ((len(racing), few), (max(FOLLOWED, len(racing) // 2), more))
-            ranked = self._race(problem, racing, rungs, SEARCHING, scales=scales)
-        else:  # margins take several times as long as simulations: they join for the best quarter
-            without, best = replace(problem, margins=None), (self.best, self._problem, self._from)
-            ranked = self._race(without, racing, ((len(racing), few),), SEARCHING, scales=scales)
-            racing = {k: self._ends[k].share for k in ranked[: max(FOLLOWED, len(ranked) // 4)]}
-            self._best, self._problem, self._from = best
-            ranked = self._race(problem, racing, ((len(racing), more),), SEARCHING)
+        rungs = ((len(racing), few), (max(FOLLOWED, len(racing) // 2), more))
+        ranked = self._race(problem, racing, rungs, SEARCHING, scales=scales)
         return {k: self._ends[k].share for k in ranked[:FOLLOWED]} or {number: first[0]}
 
     def descend(self, problem: Problem, starts: Mapping[int, np.ndarray]) -> None:
@@ -438,8 +430,6 @@ class Descents:
 
     def _keep(self, start: int, seen: Measured) -> None:
         worst = np.where(failures(seen.c)[0] > 0, np.inf, largest(seen.c, self._margin)[0])
-        self._rows = max(self._rows, worst.size)
-        worst = np.pad(worst, (0, self._rows - worst.size), constant_values=np.nan)  # margins are not known there
         step = Step(start, seen.gains[0], float(seen.goal[0]), worst)
         self._history.setdefault(start, []).append(step)
 

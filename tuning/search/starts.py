@@ -49,7 +49,6 @@ def starting_points(
     Returns:
         (starts, gains) shares.
     """
-    problem = problem if problem.margins is None else replace(problem, margins=None)
     share = spread(len(problem.names), max(SWEPT - len(designs), starts), np.random.default_rng(seed))
     held = held_by_limits(evaluate.slopes(problem, first[None]))
     share[:, held] = first[held]
