@@ -79,6 +79,18 @@ def test_a_scenario_like_another_is_that_one(path):
     assert all(set(given) <= set(written[table]) for table, given in raw.items())
 
 
+@pytest.mark.parametrize("name", ["hubble", "pleiades"])
+def test_keys_of_other_laws_are_the_defaults_of_the_same_mission(name):
+    """Taking the # away from a law's lines is as stating its kind and t_f alone."""
+    raw = parsing.load(ROOT / "benchmarks" / "satellites" / f"{name}.toml")
+    others = [values(lines) for lines in kinds(blocks(new.text(None, raw))["controller"])[1:]]
+    others = [other for other in others if other["kind"] != "own"]
+    assert len(others) > 5
+    for other in others:
+        stated = {"kind": other["kind"], "t_f": raw["controller"]["t_f"]}
+        assert parsing.dump(from_tables({**raw, "controller": stated}))["controller"] == pytest.approx(other)
+
+
 def test_keys_of_ones_own_stay_in_order_and_are_quoted_where_toml_asks_for_it():
     """A field of a class may have any letters; bare keys have not."""
     own = {"kind": "own", "code": "mine.py:Mine", "größe": 3.0, "beta": 1.0, "alpha": 4.0}

@@ -9,6 +9,7 @@ import msgspec
 from ptsmc_jax import scenario
 from ptsmc_jax.scenario import errors, free_gains, keys, layouts, mission, parsing, reading
 from ptsmc_jax.scenario.attitude_keys import Attitude
+from ptsmc_jax.scenario.law_record import LawTable
 from ptsmc_jax.scenario.own import Own
 from ptsmc_jax.scenario.tables import Scenario, Tune
 from ptsmc_jax.scenario.values import Kind, Table
@@ -163,10 +164,11 @@ class _File:
     def defaults(self, name: str, struct: type[Table]) -> dict[str, Any]:
         """What the keys of a table of this kind are where they are absent, as far as they are anything."""
         needed = {"code": EXAMPLES[f"{name}.code"]} if issubclass(struct, Own) else {}
-        table: Any = mission.with_defaults(struct(**needed), mission.scales(self.resolved))
-        if isinstance(table, Kind):
-            table = mission.with_defaults(table.filled(self.resolved), mission.scales(self.resolved))
-            table = table.written(self.resolved)
+        needed |= {"t_f": self.resolved.controller.t_f} if issubclass(struct, LawTable) else {}
+        table: Any = struct(**needed)
+        table = table.filled(self.resolved) if isinstance(table, Kind) else table
+        table = mission.with_defaults(table, mission.scales(self.resolved))
+        table = table.written(self.resolved) if isinstance(table, Kind) else table
         return {key: value for key, value in parsing.plain(table).items() if value not in ([], {})}
 
     def example(self, table: str, kind: str | None, key: keys.Key) -> Any:
