@@ -1,7 +1,7 @@
 """What a tuning run does with what fresh trials say."""
 
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -16,6 +16,7 @@ from tests.helpers import FIRST_FLIGHT, ROOT, SHORT_CHAIN, small_search
 from tuning.output import search_sentences
 from tuning.search import shares, trust, worst
 from tuning.search.descents import Step
+from tuning.search.evaluate import Evaluator
 from tuning.search.objective import FAILED
 from tuning.studies import judging, posing, tune_files, tuner
 
@@ -194,10 +195,12 @@ class Rising:
             k1 = np.array([bounds.gains(one)[names.index("k1")] for one in share])
             return SimpleNamespace(f=-np.log(k1), beyond=np.zeros(len(k1)))
 
-        self.evaluate = SimpleNamespace(bounds=bounds, fly=fly)
+        self.evaluate = Evaluator(bounds)
+        self.evaluate.fly = fly
 
     def search(self, problem: Any, gains: Any, starts: int, report: Any) -> Found:
         self.searched.append(dict(self.ready.scenario.search.bounds))
+        self.evaluate.rollouts += 10
         upper = np.array(self.evaluate.bounds.upper)
         value = float(1.0 / upper[self.evaluate.bounds.names.index("k1")])
         return Found(upper, value, history=(Step(0, upper, value, upper),))
@@ -221,10 +224,21 @@ def test_a_search_goes_on_in_larger_bounds_if_a_gain_that_matters_ends_on_a_defa
     assert told == ["searching beyond the bounds of k1"] * tuner.WIDENED
     assert found.gains[1] == pytest.approx(1e3 * usual["k1"][1])
     assert len(found.history) == 1 + tuner.WIDENED
+    assert posed.evaluate.rollouts == 10 * (1 + tuner.WIDENED)
     assert posed.ready.scenario.search.bounds == searched[-1]
     stated = scenario.replace(some, tune__bounds={"k1": usual["k1"]})  # bounds of the user stay
     first = Rising(stated, searched)
     assert tuner._in_larger_bounds(cast(Any, outcome), cast(Any, first), None, lambda *_: None)[1] is first
+
+
+def test_a_search_in_larger_bounds_that_finds_nothing_better_is_counted_too(monkeypatch):
+    some = scenario.from_tables({"controller": {"t_f": 30.0}, "tune": {"free": ["eta", "k1"]}})
+    monkeypatch.setattr(posing, "pose", lambda made, *_, **__: Rising(made, []))
+    first = Rising(some, [])
+    outcome = replace(first.search(None, None, 1, None), value=1e-9)
+    found, posed = tuner._in_larger_bounds(cast(Any, outcome), cast(Any, first), None, lambda *_: None)
+    assert cast(Any, posed) is first
+    assert (found.value, len(found.history), posed.evaluate.rollouts) == (1e-9, 2, 20)
 
 
 def test_a_search_of_gains_with_which_no_trial_ends_is_drawn():

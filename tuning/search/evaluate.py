@@ -71,6 +71,10 @@ class Evaluator:
         self.bounds, self._journal = bounds, journal or Journal()
         self.rollouts, self.gradients = 0, 0  # trials flown without and with slopes
 
+    def count_on(self, other: "Evaluator") -> None:
+        """Continue from the counts of an evaluator of the same scenario with other bounds."""
+        self.rollouts, self.gradients = other.rollouts, other.gradients
+
     def fly(self, problem: Problem, share: np.ndarray) -> Measured:
         """F, constraints and goal at these points."""
         self.rollouts += len(share) * problem.trials.size

@@ -47,7 +47,7 @@ class Rules:
     may_break: tuple[int | None, ...] = field(metadata={"static": True})
     goal: str = field(default="window_error", metadata={"static": True})  # a metric, `T_F` or `LIMITS`
     tail: int | None = field(default=None, metadata={"static": True})  # the worst trials that count; None: all
-    # RMS of those, or their mean, or the least of them, which with a tail is a quantile
+    # as the key `statistic` of [tune]; a quantile is the smallest of the tail, the worst case its only trial
     statistic: str = field(default="rms", metadata={"static": True})
     torque_weight: float = field(default=0.0, metadata={"static": True})
 
@@ -278,7 +278,7 @@ def _log_statistic(values: Float[Array, " trials"], tail: int | None, statistic:
         counted, count = jax.lax.top_k(counted, tail)[0], jnp.minimum(count, tail)
     if statistic == "quantile":
         return jnp.log(jnp.where(count > 0, jnp.maximum(counted[-1], LEAST), FAILED))
-    power = 2 if statistic == "rms" else 1
+    power = 1 if statistic == "mean" else 2
     mean = jnp.sum(counted**power) / jnp.maximum(count, 1)
     return jnp.log(jnp.where(count > 0, mean, FAILED**power)) / power
 

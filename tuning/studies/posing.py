@@ -67,16 +67,13 @@ def with_bounds(scenario: Scenario, moved: Mapping[str, tuple[float, float]]) ->
     return msgspec.structs.replace(scenario, tune=tune)
 
 
-def pose(
-    scenario: Scenario, seed: int, journal: Journal | None = None, evaluate: Evaluator | None = None, **farther: float
-) -> Posed:
+def pose(scenario: Scenario, seed: int, journal: Journal | None = None, **farther: float) -> Posed:
     """Return the tuning problem of a scenario.
 
     Args:
         scenario: what is tuned.
         seed: of the training trials and the search.
         journal: of evaluations.
-        evaluate: what counted the simulations of an earlier search of the scenario with other bounds.
         farther: see `reach`.
     """
     scenario, table = as_trained(scenario), scenario.search
@@ -96,17 +93,14 @@ def pose(
         banded=tuple(banded for _, banded in may_break),
         goal=table.minimise,
         tail=_tail(table, trained),
-        statistic="quantile" if table.statistic == "quantile" else "mean" if table.statistic == "mean" else "rms",
+        statistic=table.statistic,
         torque_weight=table.torque_weight,
         margins=margin_rows.ask(ready, bounds, seed),
     )
     own = np.asarray(gains.own(ready.parts, bounds.names))
     exact = scenario.exact_sign and "sign_width" not in bounds.names
     designs = np.asarray(gains.of_designs(scenario, ready.parts, bounds.names))
-    measures = Evaluator(bounds, journal)
-    if evaluate is not None:
-        measures.rollouts, measures.gradients = evaluate.rollouts, evaluate.gradients
-    return Posed(ready, problem, measures, own, not exact, asked, seed, designs)
+    return Posed(ready, problem, Evaluator(bounds, journal), own, not exact, asked, seed, designs)
 
 
 def as_trained(scenario: Scenario) -> Scenario:

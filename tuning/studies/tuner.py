@@ -224,13 +224,14 @@ def _in_larger_bounds(outcome: Search, posed: Posed, journal: Journal | None, re
         if not moved:
             break
         report(f"searching beyond the bounds of {', '.join(moved)}", 0, 0, outcome.value, outcome.over)
-        larger = posing.pose(posing.with_bounds(scenario, moved), posed.seed, journal, evaluate=posed.evaluate)
+        larger = posing.pose(posing.with_bounds(scenario, moved), posed.seed, journal)
+        larger.evaluate.count_on(posed.evaluate)
         more = larger.search(larger.problem, outcome.gains, NEARBY, report=report)
         history = [*outcome.history, *_after(outcome.history, more.history)]
         better = (more.over, more.value) < (outcome.over, outcome.value * (1.0 - trust.FLAT))
         if not better:
-            outcome = replace(outcome, history=history)
-            break
+            posed.evaluate.count_on(larger.evaluate)
+            return replace(outcome, history=history), posed
         outcome, posed = replace(more, history=history), larger
     return outcome, posed
 
