@@ -21,14 +21,15 @@ HERE = Path(__file__).parent / "satellites"
 
 def tuned(name: str, seed: int, trials: int | None, half: str | None, *, globally: bool) -> dict[str, Any]:
     """Return the row of one satellite and seed."""
-    from ptsmc_jax.scenario import read, replace
+    from ptsmc_jax.scenario import parsing, read, replace
     from ptsmc_jax.scenario.tables import Limit
     from tuning.studies import tuner
 
     scenario = replace(read(HERE / f"{name}.toml"), tune={} if trials is None else {"trials": trials})
     if half is not None:
         required = scenario.requirements[half]
-        limit = {**_plain(required), "limit": 0.5 * required.limit} if isinstance(required, Limit) else 0.5 * required
+        in_full = parsing.plain(required) if isinstance(required, Limit) else {"limit": required}
+        limit = {**in_full, "limit": 0.5 * in_full["limit"]}
         scenario = replace(scenario, **{f"requirements__{half}": limit})
     begun = time.monotonic()
     found = tuner.tune(scenario, seed, globally=globally)
@@ -53,11 +54,6 @@ def tuned(name: str, seed: int, trials: int | None, half: str | None, *, globall
         "gradients": found.gradients,
         "seconds": time.monotonic() - begun,
     }
-
-
-def _plain(limit: Any) -> dict[str, Any]:
-    keys = ("quantile", "probability", "confidence", "interpretation")
-    return {key: getattr(limit, key) for key in keys if getattr(limit, key) is not None}
 
 
 def main() -> None:

@@ -14,7 +14,8 @@ class BaselineTable(LawTable, frozen=True):
     Attributes:
         t_f: when the law is judged [s]
         disturbance_rate_bound: c of Assumption 1, on each component of d'; default: by [disturbance] as drawn [N m/s]
-        disturbance_bound: K of Assumption 1, on each component of d, without an observer; default: likewise [N m]
+        disturbance_bound: K of Assumption 1, on each component of d, used without an observer; default: by
+            [disturbance] as drawn [N m]
         initial_estimate_error: bound on the observer's error at t = 0 [N m]
     """
 

@@ -4,15 +4,14 @@ import math
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
-import msgspec
 from msgspec import Meta
 
 from ptsmc_jax.scenario import gain_bounds
 from ptsmc_jax.scenario.baseline_record import BaselineTable, over_t_f, until_sampling
 from ptsmc_jax.scenario.errors import wrong
 from ptsmc_jax.scenario.gain_record import Allowed, Choice, GainBounds, between
-from ptsmc_jax.scenario.mission import Design, scales
-from ptsmc_jax.scenario.values import NotNegative, Positive, Scaled
+from ptsmc_jax.scenario.mission import Design, Scales, scales
+from ptsmc_jax.scenario.values import ABSENT, NotNegative, ResolvedNotNegative, ResolvedPositive, Scaled
 
 Power = Annotated[float, Meta(gt=1, lt=2, description="a number between 1 and 2")]
 AboveOne = Annotated[float, Meta(gt=1, description="a number greater than 1")]
@@ -28,8 +27,8 @@ class PDController(BaselineTable, frozen=True):
 
     kind: Literal["pd"] = "pd"
     switches: ClassVar[bool] = False
-    k_p: Positive | None = None
-    k_d: Positive | None = None
+    k_p: ResolvedPositive = ABSENT
+    k_d: ResolvedPositive = ABSENT
     scaled: ClassVar[Mapping[str, Scaled]] = {"k_p": Scaled(0.2, time=-2), "k_d": Scaled(0.6, time=-1)}
     gains: ClassVar[Mapping[str, GainBounds]] = {
         "k_p": over_t_f(2.0, 2000.0, 2),
@@ -52,11 +51,7 @@ class PDController(BaselineTable, frozen=True):
 
     def turning(self, t_f: float) -> tuple[str, float]:
         """The rate at the goal if all of its spring's potential energy had become motion."""
-        return "controller.k_p", 2.0 * math.sqrt(self.k_p or 0.0)
-
-    def gains_of(self, design: Design, scenario: Any) -> dict[str, float]:
-        """Return gains that follow t_f, within the bandwidth."""
-        return {"k_p": 0.2 * design.rate**2, "k_d": 0.6 * design.rate}
+        return "controller.k_p", 2.0 * math.sqrt(self.k_p)
 
 
 def _usual_surface(choice: Choice) -> tuple[float, float]:
@@ -77,24 +72,10 @@ class TerminalController(BaselineTable, frozen=True):
 
     kind: Literal["terminal"] = "terminal"
     p: Power = 1.3
-    b: Positive | None = None
-    k: Positive | None = None
+    b: ResolvedPositive = ABSENT
+    k: ResolvedPositive = ABSENT
     sign_width: NotNegative = 1e-3
     scaled: ClassVar[Mapping[str, Scaled]] = {"k": Scaled(0.1, time=-2)}
-
-    def filled(self, scenario: Any) -> Any:
-        """Fill absent gains; the unit of b depends on p."""
-        made = super().filled(scenario)
-        return msgspec.structs.replace(made, b=0.1 * scales(scenario).time ** -self.p) if made.b is None else made
-
-    def gains_of(self, design: Design, scenario: Any) -> dict[str, float]:
-        """Return gains that follow t_f, within the bandwidth."""
-        return {"b": 0.1 * design.rate**self.p, "k": 0.1 * design.rate**2}
-
-    def noise_of_s(self, position: float, velocity: float, t_f: float) -> float:
-        """Return the noise of s = v + sig^p(v') / b."""
-        return math.hypot(position, velocity**self.p / self.b)
-
     gains: ClassVar[Mapping[str, GainBounds]] = {
         "p": GainBounds(lambda _: (1.05, 1.95), between(1.0, 2.0)),
         "b": GainBounds(_usual_surface),
@@ -111,9 +92,17 @@ class TerminalController(BaselineTable, frozen=True):
 
         return Terminal
 
+    def published_in(self, units: Scales) -> dict[str, Any]:
+        """With b, whose unit depends on p."""
+        return {**super().published_in(units), "b": units.of(Scaled(0.1, time=-self.p))}
+
+    def noise_of_s(self, position: float, velocity: float) -> float:
+        """Return the noise of s = v + sig^p(v') / b."""
+        return math.hypot(position, velocity**self.p / self.b)
+
     def turning(self, t_f: float) -> tuple[str, float]:
         """On its surface, at |v| = 1."""
-        return "controller.b", 2.0 * (self.b or 0.0) ** (1.0 / self.p)
+        return "controller.b", 2.0 * self.b ** (1.0 / self.p)
 
 
 def _usual_p(choice: Choice) -> tuple[float, float]:
@@ -157,15 +146,16 @@ class FixedTimeController(BaselineTable, frozen=True):
     """
 
     kind: Literal["fixed_time"] = "fixed_time"
-    a1: Positive | None = None
-    b1: Positive | None = None
-    a2: Positive | None = None
-    b2: Positive | None = None
+    a1: ResolvedPositive = ABSENT
+    b1: ResolvedPositive = ABSENT
+    a2: ResolvedPositive = ABSENT
+    b2: ResolvedPositive = ABSENT
     p: Power = 1.25
     gamma: AboveOne = 2.0
     m: AboveOne = 1.5
     n: Annotated[float, Meta(gt=0, lt=1, description="a number between 0 and 1")] = 0.5
     sign_width: NotNegative = 1e-3
+    scaled: ClassVar[Mapping[str, Scaled]] = {"a1": Scaled(0.1, time=-1), "b1": Scaled(0.2, time=-1)}
     gains: ClassVar[Mapping[str, GainBounds]] = {
         "p": GainBounds(_usual_p, _allowed_p),  # before gamma, whose bounds go by it
         **dict.fromkeys(("a1", "b1"), over_t_f(0.01, 100.0)),
@@ -187,23 +177,15 @@ class FixedTimeController(BaselineTable, frozen=True):
 
     def turning(self, t_f: float) -> tuple[str, float]:
         """On its surface, at |v| = 1."""
-        return "controller.a1", 2.0 * ((self.a1 or 0.0) + (self.b1 or 0.0))
+        return "controller.a1", 2.0 * (self.a1 + self.b1)
 
-    scaled: ClassVar[Mapping[str, Scaled]] = {"a1": Scaled(0.1, time=-1), "b1": Scaled(0.2, time=-1)}
+    def published_in(self, units: Scales) -> dict[str, Any]:
+        """With a2 and b2, whose unit depends on p."""
+        return {**super().published_in(units), **dict.fromkeys(("a2", "b2"), units.of(Scaled(1.0, time=self.p - 2.0)))}
 
-    def filled(self, scenario: Any) -> Any:
-        """Fill absent gains; the unit of a2 and b2 depends on p."""
-        made, reaching = super().filled(scenario), scales(scenario).time ** (self.p - 2.0)
-        return msgspec.structs.replace(made, a2=made.a2 or reaching, b2=made.b2 or reaching)
-
-    def gains_of(self, design: Design, scenario: Any) -> dict[str, float]:
-        """Return gains that follow t_f, within the bandwidth."""
-        reaching = design.rate ** (2.0 - self.p)
-        return {"a1": 0.1 * design.rate, "b1": 0.2 * design.rate, "a2": reaching, "b2": reaching}
-
-    def noise_of_s(self, position: float, velocity: float, t_f: float) -> float:
+    def noise_of_s(self, position: float, velocity: float) -> float:
         """Return the noise of s = v + sig^p(v' / b1) near the reference."""
-        return math.hypot(position, (velocity / self.b1) ** self.p)  # pyright: ignore[reportOperatorIssue]
+        return math.hypot(position, (velocity / self.b1) ** self.p)
 
     def check(self, scenario: Any) -> None:
         """Its surface is nonsingular for gamma - 1/p > 1 only."""
@@ -222,13 +204,9 @@ class TimeBasePDController(BaselineTable, frozen=True):
 
     kind: Literal["time_base_pd"] = "time_base_pd"
     switches: ClassVar[bool] = False
-    k_p: Positive | None = None
-    k_d: Positive | None = None
+    k_p: ResolvedPositive = ABSENT
+    k_d: ResolvedPositive = ABSENT
     scaled: ClassVar[Mapping[str, Scaled]] = {"k_p": Scaled(1.0, time=-2), "k_d": Scaled(2.0, time=-1)}
-
-    def gains_of(self, design: Design, scenario: Any) -> dict[str, float]:
-        """Return both poles of the tracking loop at the design's."""
-        return {"k_p": design.pole**2, "k_d": 2.0 * design.pole}
 
     gains: ClassVar[Mapping[str, GainBounds]] = {
         "k_p": until_sampling(2.0, 0.25, 2),
@@ -236,6 +214,10 @@ class TimeBasePDController(BaselineTable, frozen=True):
         "t_f": gain_bounds.T_F,
     }
     free_by_default: ClassVar[tuple[str, ...]] = ("k_p", "k_d")
+
+    def gains_of(self, design: Design, scenario: Any) -> dict[str, float]:
+        """Return both poles of the tracking loop at the design's."""
+        return {"k_p": design.pole**2, "k_d": 2.0 * design.pole}
 
     def law(self) -> Any:
         """`laws.time_base`."""
@@ -262,18 +244,14 @@ class TimeBaseSlidingController(BaselineTable, frozen=True):
     """
 
     kind: Literal["time_base_sliding"] = "time_base_sliding"
-    surface_rate: Positive | None = None
-    k: Positive | None = None
-    sign_width: NotNegative | None = None
+    surface_rate: ResolvedPositive = ABSENT
+    k: ResolvedPositive = ABSENT
+    sign_width: ResolvedNotNegative = ABSENT
     scaled: ClassVar[Mapping[str, Scaled]] = {
         "surface_rate": Scaled(1.0, time=-1),
         "k": Scaled(1.0, time=-1),
         "sign_width": Scaled(1e-3, time=-1),
     }
-
-    def gains_of(self, design: Design, scenario: Any) -> dict[str, float]:
-        """Return both poles of the tracking loop at the design's."""
-        return {"surface_rate": design.pole, "k": design.pole, "sign_width": design.width}
 
     gains: ClassVar[Mapping[str, GainBounds]] = {
         "surface_rate": until_sampling(0.3, 1.0),
@@ -283,6 +261,10 @@ class TimeBaseSlidingController(BaselineTable, frozen=True):
     }
     free_by_default: ClassVar[tuple[str, ...]] = ("surface_rate", "k")
     free_if_sampled: ClassVar[tuple[str, ...]] = ("sign_width",)
+
+    def gains_of(self, design: Design, scenario: Any) -> dict[str, float]:
+        """Return both poles of the tracking loop at the design's."""
+        return {"surface_rate": design.pole, "k": design.pole, "sign_width": design.width}
 
     def law(self) -> Any:
         """`laws.time_base`."""
@@ -299,7 +281,7 @@ class ScalingController(BaselineTable, frozen=True):
     """Prescribed time by scaling with (t_f/(t_f - t))^(2+m) (Song, Wang, Holloway, Krstic 2017).
 
     Attributes:
-        delta: gains are held from so long before t_f on [s]
+        delta: time before t_f at which the gains become constant [s]
         m: excess of the power of the scaling
         k1: rate of the scaled error [1/s]
         k: rate of its surface, while the scaling is 1 [1/s]
@@ -307,19 +289,15 @@ class ScalingController(BaselineTable, frozen=True):
 
     kind: Literal["scaling"] = "scaling"
     switches: ClassVar[bool] = False
-    delta: Positive | None = None
+    delta: ResolvedPositive = ABSENT
     m: Annotated[float, Meta(ge=1, description="a number, at least 1")] = 1.0
-    k1: Positive | None = None
-    k: Positive | None = None
+    k1: ResolvedPositive = ABSENT
+    k: ResolvedPositive = ABSENT
     scaled: ClassVar[Mapping[str, Scaled]] = {
         "delta": Scaled(2.0, time=1),
         "k1": Scaled(1.0, time=-1),
         "k": Scaled(1e-3, time=-1),
     }
-
-    def gains_of(self, design: Design, scenario: Any) -> dict[str, float]:
-        """Return the hold phase's poles at the design's, and a hand-over where the approach is as fast."""
-        return {"delta": design.delta, "k1": design.pole, "k": 1e-3 * design.rate}
 
     gains: ClassVar[Mapping[str, GainBounds]] = {
         "delta": gain_bounds.DELTA,
@@ -329,6 +307,10 @@ class ScalingController(BaselineTable, frozen=True):
         "t_f": gain_bounds.T_F,
     }
     free_by_default: ClassVar[tuple[str, ...]] = ("delta", "m", "k1", "k")
+
+    def gains_of(self, design: Design, scenario: Any) -> dict[str, float]:
+        """Return the hold phase's poles at the design's, and a hand-over where the approach is as fast."""
+        return {**super().gains_of(design, scenario), "delta": design.delta, "k1": design.pole}
 
     def law(self) -> Any:
         """`laws.scaling`."""
@@ -355,7 +337,7 @@ class PredefinedTimeController(BaselineTable, frozen=True):
     share: Annotated[float, Meta(gt=0, lt=1, description="a number between 0 and 1")] = 0.6
     q1: Annotated[float, Meta(gt=0, le=0.5, description="a number above 0 and at most 0.5")] = 0.3
     q2: Annotated[float, Meta(gt=0, lt=1, description="a number between 0 and 1")] = 0.3
-    sign_width: NotNegative | None = None
+    sign_width: ResolvedNotNegative = ABSENT
     scaled: ClassVar[Mapping[str, Scaled]] = {"sign_width": Scaled(1e-2, time=-1)}
     gains: ClassVar[Mapping[str, GainBounds]] = {
         "share": GainBounds(lambda _: (0.05, 0.95), between(0.0, 1.0)),
@@ -366,6 +348,10 @@ class PredefinedTimeController(BaselineTable, frozen=True):
     }
     free_by_default: ClassVar[tuple[str, ...]] = ("share", "q1", "q2")
     free_if_sampled: ClassVar[tuple[str, ...]] = ("sign_width",)
+
+    def gains_of(self, design: Design, scenario: Any) -> dict[str, float]:
+        """Return none: its gains follow from t_f, in the sampled loop too."""
+        return {}
 
     def law(self) -> Any:
         """`laws.predefined_time`."""
@@ -389,18 +375,14 @@ class SuperTwistingController(BaselineTable, frozen=True):
 
     kind: Literal["super_twisting"] = "super_twisting"
     switches: ClassVar[bool] = False
-    surface_rate: Positive | None = None
-    lipschitz: Positive | None = None
-    sign_width: NotNegative | None = None
+    surface_rate: ResolvedPositive = ABSENT
+    lipschitz: ResolvedPositive = ABSENT
+    sign_width: ResolvedNotNegative = ABSENT
     scaled: ClassVar[Mapping[str, Scaled]] = {
         "surface_rate": Scaled(0.4, time=-1),
         "lipschitz": Scaled(0.01, time=-3),
         "sign_width": Scaled(1e-3, time=-1),
     }
-
-    def gains_of(self, design: Design, scenario: Any) -> dict[str, float]:
-        """Return gains that follow t_f, within the bandwidth."""
-        return {"surface_rate": 0.4 * design.rate, "lipschitz": 0.01 * design.rate**3, "sign_width": design.width}
 
     gains: ClassVar[Mapping[str, GainBounds]] = {
         "surface_rate": until_sampling(3.0, 0.2),
@@ -411,6 +393,10 @@ class SuperTwistingController(BaselineTable, frozen=True):
     free_by_default: ClassVar[tuple[str, ...]] = ("surface_rate", "lipschitz")
     free_if_sampled: ClassVar[tuple[str, ...]] = ("sign_width",)
 
+    def gains_of(self, design: Design, scenario: Any) -> dict[str, float]:
+        """Return published gains within the bandwidth, and a boundary layer thicker than the noise."""
+        return {**super().gains_of(design, scenario), "sign_width": design.width}
+
     def law(self) -> Any:
         """`laws.super_twisting`."""
         from ptsmc_jax.laws.super_twisting import SuperTwisting
@@ -419,7 +405,7 @@ class SuperTwistingController(BaselineTable, frozen=True):
 
     def turning(self, t_f: float) -> tuple[str, float]:
         """On its surface, at |v| = 1."""
-        return "controller.surface_rate", 2.0 * (self.surface_rate or 0.0)
+        return "controller.surface_rate", 2.0 * self.surface_rate
 
 
 BASELINES: Mapping[str, type[BaselineTable]] = {

@@ -71,7 +71,7 @@ class Actuators(Table, frozen=True):
 
     def noise_of_s(self, scenario: Any) -> float:
         """Return the noise of the sliding variable after the hand-over, 1 sigma an axis and raw sample."""
-        return scenario.controller.noise_of_s(*self.noise_of_error(scenario), scenario.controller.t_f)
+        return scenario.controller.noise_of_s(*self.noise_of_error(scenario))
 
     def sensors(self, scenario: Any) -> Any:
         """Parts of `devices.sensors`; None: the law sees the true state."""

@@ -69,7 +69,7 @@ class UniformAttitude(Table, frozen=True):
 
     kind: Literal["uniform"] = "uniform"
 
-    def farthest(self, angle: float) -> float:
+    def largest_angle(self, angle: float) -> float:
         """Return the largest angle [rad] of an attitude drawn about one at this angle."""
         return np.pi
 
@@ -92,7 +92,7 @@ class AxisAngle(Table, frozen=True):
     min_deg: Annotated[float, Meta(ge=0, le=180, description="an angle from 0 to 180 degrees")] = 20.0
     max_deg: Annotated[float, Meta(ge=0, le=180, description="an angle from 0 to 180 degrees")] = 140.0
 
-    def farthest(self, angle: float) -> float:
+    def largest_angle(self, angle: float) -> float:
         """Return the largest angle [rad] of an attitude drawn about one at this angle."""
         return float(np.deg2rad(self.max_deg))
 
@@ -114,7 +114,7 @@ class NormalAttitude(Table, frozen=True):
     kind: Literal["normal"] = "normal"
     std_deg: NotNegative = 1.0
 
-    def farthest(self, angle: float) -> float:
+    def largest_angle(self, angle: float) -> float:
         """Return the angle [rad] that all but one of 10 000 attitudes drawn about one at this angle stay below."""
         return min(angle + 4.6 * float(np.deg2rad(self.std_deg)), np.pi)
 

@@ -73,7 +73,7 @@ def observer_rate(scenario: Any) -> float:
 
 def observer_gain(scenario: Any) -> float:
     """Gain l of the paper's observer, 10 N m s on a mean moment of 12 kg m^2, scaled to the mission."""
-    return observer_rate(scenario) * (scenario.moments[0] or 1.0)
+    return observer_rate(scenario) * scenario.mean_inertia
 
 
 def turning(scenario: Any) -> float:

@@ -204,7 +204,7 @@ def widened(
 
     Args:
         scenario: with the bounds that were searched.
-        sides: on which each gain ended, "lower" or "upper", by its name.
+        sides: "lower" or "upper" for each gain on a bound, by its name.
         defaulted: paths of the keys that the user's scenario leaves out.
 
     A bound on a log scale moves by a factor of ten, and a bound on a linear scale by half of the interval. Neither

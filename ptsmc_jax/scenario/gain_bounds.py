@@ -1,7 +1,6 @@
 """The bounds of gains that several laws have; each law and observer names its own beside its keys."""
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 from ptsmc_jax.scenario import mission, scales
@@ -62,6 +61,11 @@ def _usual_rate(choice: Choice) -> Interval:
     return least, high if high > least else 200.0 * least
 
 
+def _usual_eta(choice: Choice) -> Interval:
+    return choice.scenario.least_eta + 0.05, choice.scenario.least_eta + 6.0
+
+
+ETA = GainBounds(_usual_eta, lambda choice: Allowed(choice.scenario.least_eta, math.inf))
 T_F = GainBounds(_usual_t_f, _allowed_t_f)
 DELTA = GainBounds(
     _usual_delta,
@@ -74,22 +78,11 @@ SIGN_WIDTH = GainBounds(
     above="so wide that hardly a switching term is left",
 )
 K1 = GainBounds(_usual_k1, above="the stability border of the sampled loop")
-SURFACE_RATE = GainBounds(_usual_rate, above="half of the largest rate with which the sampled hold phase is stable")
-
-
-def eta(order: Callable[[Any], float]) -> GainBounds:
-    """The power of the approach, which must exceed a number that the scenario tells: 2, or the order of a chain."""
-
-    def usual(choice: Choice) -> Interval:
-        least = order(choice.scenario)
-        return least + 0.05, least + 6.0
-
-    return GainBounds(usual, lambda choice: Allowed(order(choice.scenario), math.inf))
+SURFACE_RATE = GainBounds(_usual_rate, above="half of the stability limit of the sampled hold phase")
 
 
 def dead_beat(choice: Choice) -> Interval:
     """An observer's gain: from l / J = 1.5 / t_f up to that of a deadbeat one."""
-    mean, _ = choice.scenario.moments
-    least = mission.SLOWEST_OBSERVER / choice.t_f * (1.0 if mean is None else mean)
+    least = mission.SLOWEST_OBSERVER / choice.t_f * choice.scenario.mean_inertia
     high = scales.dead_beat_gain(choice.scenario) if choice.sampled else 0.0
     return least, high if high > least else 600.0 * least

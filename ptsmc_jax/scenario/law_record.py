@@ -38,7 +38,7 @@ class LawTable(Kind, frozen=True):
         if found is not None:
             self = self._with(dict(zip(("disturbance_bound", "disturbance_rate_bound"), found, strict=True)))
         made = self._with(self.designed(msgspec.structs.replace(scenario, controller=self)))
-        made = mission.with_defaults(made, mission.scales(scenario))
+        made = made._with(made.published_in(mission.scales(scenario)))
         delta, by_default = getattr(made, "delta", None), getattr(self, "delta", 0.0) is None
         if scenario.sampled and by_default and delta is not None:
             made = msgspec.structs.replace(made, delta=max(delta, scenario.loop.period))
@@ -54,13 +54,18 @@ class LawTable(Kind, frozen=True):
             return {}
         return self.gains_of(mission.design(scenario), scenario)
 
-    def gains_of(self, design: mission.Design, scenario: Any) -> dict[str, float]:
-        """Return this law's gains for a design of the sampled loop, by key."""
-        return {}
+    def published_in(self, units: mission.Scales) -> dict[str, Any]:
+        """Return the gains of the paper's case, by key, in the units of a mission."""
+        return {key: units.of(scaled) for key, scaled in self.scaled.items()}
 
-    def noise_of_s(self, position: float, velocity: float, t_f: float) -> float:
+    def gains_of(self, design: mission.Design, scenario: Any) -> dict[str, float]:
+        """Return this law's gains for a design of the sampled loop, by key: published ones within the bandwidth."""
+        return self.published_in(mission.scales(scenario)._replace(time=1.0 / design.rate))
+
+    def noise_of_s(self, position: float, velocity: float) -> float:
         """Return the noise of the sliding variable (1 sigma) for noise of the error and of its rate [1/s]."""
-        return math.hypot(velocity, (getattr(self, "surface_rate", None) or 1.0 / t_f) * position)
+        law: Any = self
+        return math.hypot(velocity, (getattr(law, "surface_rate", None) or 1.0 / law.t_f) * position)
 
     def turning(self, t_f: float) -> tuple[str, float]:
         """How fast it turns the body [rad/s], at most, and the key that says so."""

@@ -17,13 +17,9 @@ from ptsmc_jax.scenario.gain_record import GainBounds
 from ptsmc_jax.scenario.law_record import LawTable
 from ptsmc_jax.scenario.mission import Design
 from ptsmc_jax.scenario.own_laws import OwnAttitudeLaw, OwnLaw
-from ptsmc_jax.scenario.values import NotNegative, Positive, Scaled
+from ptsmc_jax.scenario.values import ABSENT, NotNegative, Positive, ResolvedNotNegative, ResolvedPositive, Scaled
 
 Eta = Annotated[float, Meta(gt=2, description="a number greater than 2 (Theorem 2)")]
-
-
-def _eta_must_exceed_two(_: Any) -> float:
-    return 2.0  # Theorems 1 and 2
 
 
 class PrescribedTable(LawTable, frozen=True):
@@ -31,7 +27,7 @@ class PrescribedTable(LawTable, frozen=True):
 
     prescribed: ClassVar[bool] = True
     gains: ClassVar[Mapping[str, GainBounds]] = {
-        "eta": gain_bounds.eta(_eta_must_exceed_two),
+        "eta": gain_bounds.ETA,
         "delta": gain_bounds.DELTA,
         "k1": gain_bounds.K1,
         "sign_width": gain_bounds.SIGN_WIDTH,
@@ -90,7 +86,7 @@ class SpacecraftController(PrescribedTable, frozen=True):
         error: the paper's q_1 - q_1f, or the vector part of q_f* q, singular 180 degrees from the reference only
         t_f: the prescribed time [s]
         eta: power of the approach: the error falls like (t_f - t)^eta, up to a logarithm; 3 in the paper
-        delta: hand-over to constant gains so long before t_f (Remark 1); 0.05 in the paper [s]
+        delta: time before t_f at which the gains become constant (Remark 1); 0.05 in the paper [s]
         k1: K1, rate of s from the hand-over on, halved by (60); 1 in the paper [1/s]
         sign_width: thickness of the boundary layer, tanh(s / sign_width); 0 is the discontinuous sign [1/s]
         surface_rate: c of s = eps' + c eps, the error's rate on the surface from the hand-over on; 1 in the paper [1/s]
@@ -98,7 +94,8 @@ class SpacecraftController(PrescribedTable, frozen=True):
             1 in the paper [s]
         sampling: held input by s at the sample, or by where s is to land at the period's end, which needs no sign_width
         disturbance_rate_bound: c of Assumption 1, on each component of d'; default: by [disturbance] as drawn [N m/s]
-        disturbance_bound: K of Assumption 1, on each component of d, without an observer; default: likewise [N m]
+        disturbance_bound: K of Assumption 1, on each component of d, used without an observer; default: by
+            [disturbance] as drawn [N m]
         initial_estimate_error: bound on the observer's error at t = 0 [N m]
     """
 
@@ -106,11 +103,11 @@ class SpacecraftController(PrescribedTable, frozen=True):
     error: Literal["additive", "multiplicative"] = "additive"
     t_f: Positive = 30.0
     eta: Eta | None = None
-    delta: Positive | None = None
-    k1: Positive | None = None
-    sign_width: NotNegative | None = None
-    surface_rate: Positive | None = None
-    layer_time: Positive | None = None
+    delta: ResolvedPositive = ABSENT
+    k1: ResolvedPositive = ABSENT
+    sign_width: ResolvedNotNegative = ABSENT
+    surface_rate: ResolvedPositive = ABSENT
+    layer_time: ResolvedPositive = ABSENT
     sampling: Literal["explicit", "implicit"] = "explicit"
     disturbance_rate_bound: NotNegative | None = None
     disturbance_bound: NotNegative | None = None
@@ -129,7 +126,7 @@ class SystemController(PrescribedTable, frozen=True):
     Attributes:
         t_f: the prescribed time [s]
         eta: power of the approach: the error falls like (t_f - t)^eta, up to a logarithm; 3 in the paper
-        delta: hand-over to constant gains so long before t_f (Remark 1); 0.05 in the paper [s]
+        delta: time before t_f at which the gains become constant (Remark 1); 0.05 in the paper [s]
         k1: K1, rate of s from the hand-over on; 1 in the paper [1/s]
         sign_width: thickness of the boundary layer, tanh(s / sign_width); 0 is the discontinuous sign [unit of s]
         surface_rate: c of s = eps' + c eps, the error's rate on the surface from the hand-over on; 1 in the paper [1/s]
@@ -137,18 +134,19 @@ class SystemController(PrescribedTable, frozen=True):
             1 in the paper [s]
         sampling: held input by s at the sample, or by where s is to land at the period's end, which needs no sign_width
         disturbance_rate_bound: c of Assumption 1, on each component of d'; default: by [disturbance] [unit of d/s]
-        disturbance_bound: K of Assumption 1, on each component of d, without an observer; default: likewise [unit of d]
+        disturbance_bound: K of Assumption 1, on each component of d, used without an observer; default: by
+            [disturbance] [unit of d]
         initial_estimate_error: bound on the observer's error at t = 0 [unit of d]
     """
 
     kind: Literal["prescribed_time"] = "prescribed_time"
     t_f: Positive = 5.0
     eta: Eta | None = None
-    delta: Positive | None = None
-    k1: Positive | None = None
-    sign_width: NotNegative | None = None
-    surface_rate: Positive | None = None
-    layer_time: Positive | None = None
+    delta: ResolvedPositive = ABSENT
+    k1: ResolvedPositive = ABSENT
+    sign_width: ResolvedNotNegative = ABSENT
+    surface_rate: ResolvedPositive = ABSENT
+    layer_time: ResolvedPositive = ABSENT
     sampling: Literal["explicit", "implicit"] = "explicit"
     disturbance_rate_bound: NotNegative | None = None
     disturbance_bound: NotNegative | None = None
@@ -177,10 +175,6 @@ class ChainController(SystemController, frozen=True):
     scaled: ClassVar[Mapping[str, Scaled]] = {
         **PrescribedTable.scaled,
         "sign_width": Scaled(1e-3, time=1, order=-1),
-    }
-    gains: ClassVar[Mapping[str, GainBounds]] = {
-        **PrescribedTable.gains,
-        "eta": gain_bounds.eta(lambda scenario: float(scenario.order)),  # Theorem 3
     }
 
     def physics(self, motion: str) -> Any:

@@ -95,13 +95,13 @@ def with_defaults(table: Any, units: Scales) -> Any:
 class Design(NamedTuple):
     """Gains of the sampled loop in terms of the mission, whatever the law.
 
-    After the hand-over the closed loop is (s + p)^2; before it the rate gain (2 eta - 1) / tau reaches its value in the
-    hold phase, 2 p, at tau = delta.
+    After the hand-over the closed loop is (s + p)^2. Before it the rate gain is (2 eta - 1) / tau, with tau the time
+    left until t_f. It reaches its value in the hold phase, 2 p, at tau = delta.
     """
 
     eta: float
     pole: float  # p [1/s]
-    observer: float  # l / J [1/s]
+    observer: float  # l [N m s], or l [1/s] without a body
     width: float  # of the boundary layer, in units of s
     time: float  # t_f in the units of the paper's case, see `Scales`
 
@@ -126,8 +126,7 @@ class _Limits(NamedTuple):
 
 def design(scenario: Any) -> Design:
     """Return the design whose predicted error in the hold phase is the smallest."""
-    limits = _limits(scenario)
-    return _design(scenario, limits.accurate, _eta(scenario), OBSERVER)
+    return _design(scenario, _limits(scenario).accurate, _eta(scenario), OBSERVER)
 
 
 def designs(scenario: Any) -> list[Design]:
@@ -135,6 +134,7 @@ def designs(scenario: Any) -> list[Design]:
     limits, eta, stable = _limits(scenario), _eta(scenario), STABLE / dead_time(scenario)
     rates = [limits.accurate, limits.most, math.sqrt(limits.least * limits.most), limits.least]
     rates = [*dict.fromkeys([*rates, stable, math.sqrt(limits.most * stable)])]
+    rates = [max(rate, limits.least) for rate in rates]
     found = [_design(scenario, rate, eta, observer) for observer in (OBSERVER, 0.1) for rate in rates]
     return [*found, _design(scenario, limits.accurate, _least_eta(scenario), 0.3)]
 
@@ -151,8 +151,7 @@ def dead_time(scenario: Any) -> float:
 
 
 def _design(scenario: Any, pole: float, eta: float, observer: float) -> Design:
-    law, limits = scenario.controller, _limits(scenario)
-    pole, period = max(pole, limits.least), scenario.loop.period
+    law, period = scenario.controller, scenario.loop.period
     longest = 0.5 * (law.t_f + period)  # of delta
     eta = min(eta, max(0.5 + pole * longest, _least_eta(scenario)))
     rate = min(observer * pole, 1.0 / period)
@@ -163,15 +162,18 @@ def _design(scenario: Any, pole: float, eta: float, observer: float) -> Design:
     # on three axes N K2 / 2 = 3 residual: the boundary layer adds a quarter to the gain p; it is thicker than the noise
     residual = change / rate
     width = max(12.0 * residual / pole, 2.0 * math.hypot(velocity, pole * position)) or 1e-3 * pole
-    return Design(eta, pole, rate, width, scales(scenario).time)
+    return Design(eta, pole, rate * scenario.mean_inertia, width, scales(scenario).time)
 
 
 def _limits(scenario: Any) -> _Limits:
     """Return the range of p, and the most accurate p in it.
 
     Dead time, flexible modes, and noise against the torque limit bound p from above. The most accurate p minimises the
-    sum of the squares of three errors. They are the lag c p / (l / J) / p^3 behind a disturbance of the rate c, the
-    position noise sigma (p h)^(1/2), and the rate noise sigma (h / p)^(1/2).
+    sum of the squares of three errors:
+
+    - c p / (l / J) / p^3, the lag behind a disturbance of the rate c;
+    - sigma (p h)^(1/2), from the position noise;
+    - sigma (h / p)^(1/2), from the rate noise.
     """
     t_f, period = scenario.controller.t_f, scenario.loop.period
     stable = STABLE * 2.0 / scenario.order  # of n poles at -p the crossover lies near n p
@@ -192,8 +194,8 @@ def _limits(scenario: Any) -> _Limits:
 def _with_modes(scenario: Any) -> float:
     """Return the largest p [1/s] that keeps the resonance of every late mode 6 dB below 1.
 
-    At its resonance w, a mode with the damping z and the fraction f of the inertia raises the loop gain 2 p / w by
-    k / (2 z), k = f / (1 - f). A mode is late if w T exceeds `FASTEST_MODE`.
+    The loop gain at the resonance w of a mode is 2 p / w times k / (2 z). Here z is its damping, f its fraction of the
+    inertia, and k = f / (1 - f). A mode is late if w T exceeds `FASTEST_MODE`.
     """
     found = math.inf
     for frequency, damping, fraction in scenario.modes():

@@ -70,7 +70,7 @@ class LinearTable(ObserverTable, frozen=True):
             return self
         gain = disturbance_bounds.observer_gain(scenario)
         if scenario.sampled and not mission.published(scenario):
-            gain = mission.design(scenario).observer * (scenario.moments[0] or 1.0)
+            gain = mission.design(scenario).observer
         return msgspec.structs.replace(self, gain=(gain,) * scenario.inputs)
 
 
@@ -106,8 +106,9 @@ class PrescribedTimeObserver(LinearTable, frozen=True):
 
     Attributes:
         mu: the error at t = 0 falls like (t_o - t)^mu; what a moving disturbance adds, like c (t_o - t)/(mu - 1)
-        t_o: time by which it has converged; default: a third of t_f [s]
-        delta_o: mu/(t_o - t) is off from so long before t_o; default: t_f / 600, or a period, at most t_o/4 [s]
+        t_o: prescribed time of convergence; default: a third of t_f [s]
+        delta_o: time before t_o at which mu/(t_o - t) is switched off; default: t_f / 600, or a period, at most
+            t_o/4 [s]
         gain: diagonal of the constant part of l; default: that of the nonlinear one [N m s]
     """
 

@@ -15,7 +15,7 @@ class OwnLaw(Own, BaselineTable, kw_only=True, frozen=True):
     """A law of one's own, a class derived from ptsmc_jax.AccelerationLaw; its further fields are further keys.
 
     Attributes:
-        delta: hand-over so long before t_f, if it has one; default: one control period [s]
+        delta: time from the hand-over to t_f, if the law hands over; default: one control period [s]
     """
 
     kind: Literal["own"] = "own"

@@ -54,7 +54,7 @@ def narrowest_that_matters(noise: float) -> float:
 
 
 def largest_rate(scenario: Any) -> float:
-    """Return half of the largest surface rate c [1/s] for which some K1 leaves the sampled hold phase stable."""
+    """Return half of the stability limit of the surface rate c [1/s] in the sampled hold phase, at the best K1."""
     h, delay = scenario.loop.period, scenario.devices.delay_periods
     limit = borders.largest_surface(delay, implicit=scenario.controller.implicit)
     return 0.5 * min(limit, math.log(1.0 / LEFT)) / h

@@ -186,7 +186,7 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
     @property
     def influence(self) -> float:
         """Acceleration of the error for a unit torque about the mean axis, 1 / (2 J) [1/(kg m^2)]."""
-        return 0.5 / self.moments[0]
+        return 0.5 / self.mean_inertia
 
     def modes(self) -> list[tuple[float, float, float]]:
         """Return the frequency [rad/s], damping and fraction of the inertia of each mode of the free body."""
@@ -214,15 +214,14 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
 
     def start_angle(self) -> float:
         """Return the largest angle to the reference at t = 0 [rad]: of the nominal run, or of dispersed ones."""
-        from scipy.spatial.transform import Rotation
-
         start, target = (
-            Rotation.from_quat(attitude_keys.quaternion(table, name))
+            np.asarray(attitude_keys.quaternion(table, name), dtype=float)
             for table, name in ((self.initial, "initial"), (self.reference, "reference"))
         )
-        angle = float((target.inv() * start).magnitude())
+        target = target * np.copysign(1.0, start @ target)  # both signs are the same attitude
+        angle = 4.0 * float(np.arctan2(np.linalg.norm(start - target), np.linalg.norm(start + target)))
         for table in (getattr(self.dispersion, "attitude", None), getattr(self.dispersion, "reference", None)):
-            angle = angle if table is None else table.farthest(angle)
+            angle = angle if table is None else table.largest_angle(angle)
         return angle
 
     def start_tangent(self) -> float:

@@ -100,9 +100,9 @@ class Tune(Table, frozen=True):
         level: of the quantile or the CVaR; default: 0.9
         torque_weight: weight of ln(RMS peak torque) beside ln(error), Remark 1's trade-off
         worst_case: keep the requirements in the worst case inside the dispersions too, not only where drawn
-        trials: trials to tune on; what quantiles take more of are counted besides
-        starts: points to search from, most of them a few steps: the scenario's, and the best of a sweep
-        steps: points looked at from a start, at most, with slopes
+        trials: trials to tune on; requirements with a quantile add more of them
+        starts: starting points of local searches: the scenario's gains, designs, and the best of a sweep
+        steps: largest number of points with gradients in one local search
     """
 
     free: FreeGains | None = None
@@ -264,6 +264,11 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
     def moments(self) -> tuple[float, float] | tuple[None, None]:
         """Mean and largest moment of inertia [kg m^2]; None without a body."""
         return None, None
+
+    @property
+    def mean_inertia(self) -> float:
+        """Mean moment of inertia [kg m^2]; 1 without a body."""
+        return self.moments[0] or 1.0
 
     @property
     def tuned_tables(self) -> dict[str, Any]:

@@ -35,9 +35,11 @@ Quantile = Annotated[float, Meta(gt=0, lt=1, description="a number between 0 and
 ABSENT: Any = None
 if TYPE_CHECKING:
     ResolvedPositive = float
+    ResolvedNotNegative = float
     ResolvedThree = tuple[float, float, float]
 else:
     ResolvedPositive = Positive | None
+    ResolvedNotNegative = NotNegative | None
     ResolvedThree = Three | None
 
 MOST_STEPS = 200_000  # of a run

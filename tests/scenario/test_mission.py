@@ -1,6 +1,7 @@
 """Defaults that follow from the mission: they scale with its units, and the designed gains meet their conditions."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -142,16 +143,6 @@ def test_designed_gains_place_both_poles_of_the_hold_phase(plant, hardware):
     assert period <= law.delta <= 0.5 * law.t_f + period
 
 
-def test_the_default_eta_keeps_the_first_torque_below_its_limit():
-    """The first torque is 2 J eta^2 tan(angle / 2) / t_f^2 about the axis of the turn; a tenth of the limit is left."""
-    body = {"spacecraft": {"inertia": [20.0, 20.0, 20.0]}, "initial": {"rotvec_deg": [0.0, 0.0, 90.0]}}
-    tables = {**SAMPLED, **body, "controller": {"t_f": 60.0}}
-    assert scenario.from_tables(tables).controller.eta == 3.0
-    limit = 2.0 * 20.0 * 2.6**2 / 60.0**2 / 0.9
-    limited = scenario.from_tables({**tables, "hardware": {"torque_limit": limit}})
-    assert limited.controller.eta == pytest.approx(2.6, rel=1e-9)
-
-
 @pytest.mark.parametrize(
     ("tables", "angle"),
     [
@@ -160,8 +151,91 @@ def test_the_default_eta_keeps_the_first_torque_below_its_limit():
         ({"initial": {"rotvec_deg": [0.0, 0.0, 9.0 / math.pi]}}, 5e-5),  # a start angle of 0.05 rad
         ({**SAMPLED, "hardware": {"attitude_noise": 3e-4}}, 1.5e-3),
         ({**SAMPLED, "hardware": {"attitude_noise": 1e-5}}, 1e-3),
+        (
+            {"dispersion": {"attitude": {"kind": "axis_angle", "min_deg": 0.1, "max_deg": 0.2}}},
+            1e-3 * math.radians(0.2),
+        ),
     ],
     ids=str,
 )
 def test_the_default_settling_angle_follows_the_start_and_the_noise(tables, angle):
     assert scenario.from_tables(tables).loop.settling_angle == pytest.approx(angle, rel=1e-9)
+
+
+def test_another_time_or_body_scales_the_published_numbers():
+    slow = scenario.from_tables({"controller": {"t_f": 60.0}})
+    assert (slow.controller.delta, slow.controller.k1, slow.disturbance.frequency) == (0.1, 0.5, (0.05,) * 3)
+    assert slow.disturbance.amplitude == (0.0025,) * 3
+    heavy = scenario.from_tables({"spacecraft": {"inertia": [40.0, 48.0, 56.0]}})
+    assert heavy.observer.gain == (40.0,) * 3
+    assert heavy.controller.k1 == 1.0
+
+
+def sampled(**tables: Any) -> Any:
+    """Return a sampled scenario of a body of 50 kg m^2 that turns in 100 s."""
+    base = {"spacecraft": {"inertia": [40.0, 50.0, 60.0]}, "controller": {"t_f": 100.0},
+            "loop": {"mode": "sampled", "period": 0.25}, "disturbance": {"kind": "none"}}  # fmt: skip
+    return scenario.from_tables({**base, **tables})
+
+
+def test_dead_time_limits_the_bandwidth():
+    """Without noise p T = 0.25, T of hold, delay and lag together."""
+    for hardware, dead in (({}, 0.125), ({"delay": 2}, 0.625), ({"delay": 1, "torque_lag": 0.3}, 0.675)):
+        said = sampled(hardware=hardware) if hardware else sampled()
+        assert mission.dead_time(said) == pytest.approx(dead)
+        assert mission.design(said).pole == pytest.approx(0.25 / dead)
+
+
+def test_both_poles_of_the_design_keep_the_margins_that_it_promises():
+    """In continuous time, with the dead time as e^(-sT), T = 1, and the observer of the rate l / J = r.
+
+    L = (1 + r / s) (2 p s + p^2) e^(-sT) / s^2 + r e^(-sT) / s, since the estimate is r / s of the unexplained torque.
+    """
+    p, r = mission.STABLE, mission.OBSERVER * mission.STABLE
+    w = np.geomspace(1e-3, 30.0, 200_001)
+    s = 1j * w
+    L = ((1 + r / s) * (2 * p * s + p**2) / s**2 + r / s) * np.exp(-s)
+    crossover = np.argmin(np.abs(np.abs(L) - 1.0))
+    assert np.rad2deg(np.angle(L[crossover])) + 180.0 == pytest.approx(35.6, abs=0.5)
+    real = np.flatnonzero(np.diff(np.sign(L.imag)) != 0)
+    down = -20.0 * np.log10(np.abs(L[real[L[real].real < 0.0]]))
+    assert np.min(down[down > 0.0]) == pytest.approx(7.2, abs=0.3)
+
+
+def test_noise_and_the_torque_limit_limit_the_bandwidth():
+    """Five sigma of the torque noise, J (2 p + l / J) sigma_w with l = J p / 2, take half of the limit."""
+    limit, sigma = 0.1, 1e-4
+    said = sampled(hardware={"rate_noise": sigma, "torque_limit": limit})
+    pole = mission.design(said).pole
+    assert 60.0 * 2.5 * pole * sigma == pytest.approx(0.5 * limit / 5.0)
+
+
+def test_late_modes_limit_the_bandwidth_and_early_ones_do_not():
+    """A mode is late if its frequency times the dead time, 0.125 s, exceeds 60 deg."""
+    modes = {"damping": [0.002], "coupling": [[0.0, 2.0, 0.0]]}
+    early, late = (sampled(flexible={"frequency": [w], **modes}) for w in (4.0, 12.0))
+    fraction = 4.0 / 50.0
+    free = 12.0 / math.sqrt(1.0 - fraction)
+    assert mission.design(early).pole == pytest.approx(2.0)
+    assert mission.design(late).pole == pytest.approx(0.5 * 0.002 * free / (fraction / (1.0 - fraction)))
+
+
+def test_a_weak_actuator_asks_for_a_smaller_eta():
+    """From rest the first torque is 2 eta^2 J tan(angle / 2) / t_f^2; 2.4 is the least."""
+    start = {"dispersion": {"attitude": {"kind": "axis_angle", "min_deg": 60.0, "max_deg": 60.0}}}
+    needed = 2.0 * 60.0 * math.tan(math.radians(30.0)) / 100.0**2
+    weak = sampled(**start, hardware={"torque_limit": 7.0 * needed})
+    assert weak.controller.eta == pytest.approx(math.sqrt(0.9 * 7.0))
+    assert sampled(**start, hardware={"torque_limit": 20.0 * needed}).controller.eta == 3.0
+    assert sampled(**start, hardware={"torque_limit": needed}).controller.eta == pytest.approx(2.4)
+
+
+def test_designs_are_starting_points_within_the_bounds_or_near():
+    """Each has gains for the whole law, delta between a period and t_f."""
+    said = scenario.replace(sampled(), tune={})
+    designs = mission.designs(said)
+    assert len(designs) > 5
+    for design in designs:
+        gains = said.controller.gains_of(design, said)
+        assert said.loop.period <= gains["delta"] < said.controller.t_f
+        assert all(value > 0.0 for value in gains.values())

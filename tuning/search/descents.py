@@ -184,9 +184,9 @@ class Descents:
         first: (starts, gains) shares; number: index of the first one.
         """
         few, more = max(2, self._steps // 4), max(2, self._steps // 2)
-        racing, scales = dict(enumerate(first, number)), (CAREFUL, BOLD)
+        racing = dict(enumerate(first, number))
         rungs = ((len(racing), few), (max(FOLLOWED, len(racing) // 2), more))
-        ranked = self._race(problem, racing, rungs, SEARCHING, scales=scales)
+        ranked = self._race(problem, racing, rungs, SEARCHING, scales=(CAREFUL, BOLD))
         return {k: self._ends[k].share for k in ranked[:FOLLOWED]} or {number: first[0]}
 
     def descend(self, problem: Problem, starts: Mapping[int, np.ndarray]) -> None:

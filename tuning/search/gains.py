@@ -79,7 +79,7 @@ def of_designs(scenario: Scenario, parts: Parts, names: tuple[str, ...]) -> list
     for design in mission.designs(scenario):
         gains = scenario.controller.gains_of(design, scenario)
         if getattr(parts.observer, "linear", False):
-            gains["observer_gain"] = design.observer * (scenario.moments[0] or 1.0)
+            gains["observer_gain"] = design.observer
         found.append([gains.get(base(name), value) for name, value in current.items()])
     return found
 

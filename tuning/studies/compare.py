@@ -391,7 +391,7 @@ def _figures(comparison: Comparison) -> Iterator[tuple[str, Any]]:
         {law: (np.degrees(t.drawn["initial_angle"]), np.where(t.finished, t.metrics.settling_time, np.nan))
          for law, t in sets.items()}, t_f,
     )  # fmt: skip
-    limit = judging.limit_of("peak_torque", ours.flown)
+    limit = tables.limit_of(ours.flown, "peak_torque")
     yield "tradeoff", study_plots.tradeoff(
         {law: (t.metrics.window_error[t.finished], t.metrics.peak_torque[t.finished]) for law, t in sets.items()
          if t.finished.any()}, limit,

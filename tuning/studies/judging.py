@@ -102,12 +102,6 @@ def largest(name: str, scenario: Scenario, trials: Trials) -> float:
     return statistics.value_at(values, min(1.0, share * trials.status.size / values.size)) if values.size else np.nan
 
 
-def limit_of(name: str, scenario: Scenario) -> float | None:
-    """The limit that a scenario asks for a metric; None: none."""
-    asked = scenario.requirements.get(name)
-    return None if asked is None else asked.limit if isinstance(asked, Limit) else float(asked)
-
-
 def as_flown(scenario: Scenario) -> Scenario:
     """The scenario on the flight clock; a continuous loop as it is."""
     return replace(scenario, loop__clock="flight") if scenario.sampled else scenario

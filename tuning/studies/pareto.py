@@ -15,7 +15,7 @@ import numpy as np
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.montecarlo import Trials
 from ptsmc_jax.figures import study_plots, style
-from ptsmc_jax.scenario import cautions, own, parsing, study
+from ptsmc_jax.scenario import cautions, own, parsing, study, tables
 from ptsmc_jax.scenario import replace as changed
 from ptsmc_jax.scenario.errors import wrong
 from ptsmc_jax.scenario.tables import Scenario
@@ -186,7 +186,7 @@ def check_search(scenario: Scenario, against: str, why: str = "") -> None:
 
 def _limited(scenario: Scenario) -> tuple[Scenario, float | None]:
     """The scenario with a requirement on the peak torque, and its own limit, if there is one."""
-    own_limit = judging.limit_of(TORQUE, scenario)
+    own_limit = tables.limit_of(scenario, TORQUE)
     if own_limit is not None:
         return scenario, own_limit
     return changed(scenario, requirements={**parsing.dump(scenario).get("requirements", {}), TORQUE: OFF}), None
@@ -345,7 +345,7 @@ def write(folder: Path, scenario: Scenario, front: Front, figures: bool, known_b
     ]  # fmt: skip
     store.write_csv(folder / "front.csv", header, rows)
     if figures:
-        limit = judging.limit_of(TORQUE, scenario)
+        limit = tables.limit_of(scenario, TORQUE)
         units = tuple(catalogues.CATALOGUES[scenario.plant.kind][name].unit for name in ("window_error", TORQUE))
         others = {gains.paper_is(scenario) if name == "paper" else name: one for name, one in front.others.items()}
         figure = study_plots.front(front.points, others, limit, units, floor=front.floor)

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 from ptsmc_jax.campaigns import margin_verdicts, store
 from ptsmc_jax.figures import study_plots, style
-from ptsmc_jax.scenario import cautions, own, parsing, study
+from ptsmc_jax.scenario import cautions, own, parsing, study, tables
 from ptsmc_jax.scenario import replace as changed
 from ptsmc_jax.scenario.errors import wrong
 from ptsmc_jax.scenario.tables import Scenario
@@ -69,7 +69,7 @@ class Ladder:
 
 def usual_limits(scenario: Scenario) -> tuple[float, ...]:
     """Limits on the largest sensitivity, the scenario's own among them [dB]."""
-    own_limit = judging.limit_of(SENSITIVITY, scenario)
+    own_limit = tables.limit_of(scenario, SENSITIVITY)
     return tuple(sorted({*LIMITS, *([] if own_limit is None else [own_limit])}))
 
 
@@ -212,7 +212,7 @@ def _figure(scenario: Scenario, robust: Sequence[Robust]) -> Figure:
     titles = {"window_error": "RMS window error", pareto.TORQUE: "largest peak torque"}
     panels = {
         f"{titles.get(name, name.replace('_', ' '))} [{units[name]}]": (
-            np.where(np.isfinite(values), values, np.nan), judging.limit_of(name, scenario)
+            np.where(np.isfinite(values), values, np.nan), tables.limit_of(scenario, name)
         )
         for name, values in columns.items()
     }  # fmt: skip

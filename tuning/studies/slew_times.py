@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from ptsmc_jax import scenario as scenarios
 from ptsmc_jax.campaigns import montecarlo, store
 from ptsmc_jax.figures import study_plots, style
-from ptsmc_jax.scenario import cautions, free_gains, own, parsing, study
+from ptsmc_jax.scenario import cautions, free_gains, own, parsing, study, tables
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import catalogues
@@ -186,9 +186,9 @@ def write(folder: Path, scenario: Scenario, traced: Slews, figures: bool, known_
 def _figure(scenario: Scenario, slews: Sequence[Slew], costs: Sequence[str]) -> Figure:
     units = catalogues.units(scenario.plant.kind)
     error = f"RMS window error [{units['window_error']}]"
-    panels = {error: (np.asarray([slew.rms for slew in slews]), judging.limit_of("window_error", scenario))} | {
+    panels = {error: (np.asarray([slew.rms for slew in slews]), tables.limit_of(scenario, "window_error"))} | {
         f"largest {name.replace('_', ' ')} [{units[name]}]": (
-            np.asarray([slew.costs[name] for slew in slews]), judging.limit_of(name, scenario)
+            np.asarray([slew.costs[name] for slew in slews]), tables.limit_of(scenario, name)
         )
         for name in costs
     }  # fmt: skip

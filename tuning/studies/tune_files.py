@@ -10,7 +10,7 @@ import numpy as np
 
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.montecarlo import Trials
-from ptsmc_jax.scenario import cautions, free_gains, own, parsing
+from ptsmc_jax.scenario import cautions, free_gains, own, parsing, tables
 from ptsmc_jax.scenario.tables import LIMITS, T_F, Scenario, objective_name
 from ptsmc_jax.simulation import catalogues
 from tuning.search import gains as gain_names
@@ -235,7 +235,7 @@ def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
         if trials.finished.any()
     }  # fmt: skip
     if ended:
-        limit, floor = judging.limit_of("peak_torque", scenario), tuning.floors["tuned"]
+        limit, floor = tables.limit_of(scenario, "peak_torque"), tuning.floors["tuned"]
         figures["tradeoff"] = study_plots.tradeoff(ended, limit, kind, floor)
     if tuning.trust is not None and tuning.trust.sensitivities:  # none where no trial ends
         figures["sensitivities"] = study_plots.tornado(tuning.trust.sensitivities)
