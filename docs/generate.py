@@ -176,7 +176,7 @@ def _kinds(key: keys.Key, kinds: Kinds) -> Iterator[list[str]]:
 
 
 def _shown(key: keys.Key, struct: type[Table], fallback: Mapping[str, Any]) -> str:
-    """Return the default of a key; one that follows the mission as it is in the paper's case, with a mark."""
+    """Return the default of a key. A default that follows the mission has its value in the paper's case and a mark."""
     if key.name in struct.scaled and key.default is None:
         return f"{_default(struct.scaled[key.name].value)} *"
     return _default(fallback.get(key.name, key.default))

@@ -108,7 +108,8 @@ class PrescribedTimeLaw(Law):
     surface_rate: Leaf  # c, decay of the error on the surface after the hand-over; the paper's is 1 [1/s]
     # whether the held input is chosen for s at the end of the period, see `landing`, and not for its rate at the sample
     implicit: bool = field(default=False, metadata={"static": True}, kw_only=True)
-    layer_time: Leaf | np.float64 = field(default=np.float64(1.0), kw_only=True)  # see `layer` [s]
+    # before t_f - delta, the boundary layer of s is sign_width times this [s]
+    layer_time: Leaf | np.float64 = field(default=np.float64(1.0), kw_only=True)
     tunable: ClassVar[tuple[str, ...]] = ("eta", "delta", "k1", "sign_width", "surface_rate", "t_f")
     prescribed: ClassVar[bool] = True
 

@@ -84,7 +84,7 @@ class Start:
 
 
 class _FeasibleError(Exception):
-    """A point keeps every limit: what is minimised from there on is the objective."""
+    """A point keeps every limit. From there on the objective is minimised."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ def descend(
     limit. The objective is not minimised if the violation cannot be removed.
 
     Args:
-        slopes: measures the problem at a point (1, gains).
+        slopes: returns the measurement with gradients at a point (1, gains).
         best: is offered every point.
         start: the starting point and the scaling of the variables.
         steps: how many points may be measured.
@@ -191,7 +191,7 @@ class _Local:
         return np.clip(found.x, *np.transpose(self._bounds))
 
     def least_violation(self, scaled: np.ndarray, relaxed: Relaxed) -> np.ndarray:
-        """Minimise t subject to c <= t, and return the last point, or the first one that keeps every limit."""
+        """Minimise t subject to c <= t. Return the first point that keeps every limit, or else the last point."""
         rows, trials = self.at(scaled).c.shape[1:]
         if not rows:
             return scaled
@@ -236,7 +236,7 @@ class _Local:
 def _compressed(seen: Sloped) -> tuple[np.ndarray, np.ndarray]:
     """(limits,) ln(1 + c) for c above 0, else c, and its derivatives (limits, gains).
 
-    Far beyond a limit c spans orders of magnitude; its logarithm has the same sign and the same slope at 0.
+    Far beyond a limit c spans orders of magnitude; its logarithm has the same sign and the same derivative at 0.
     """
     c = ended(seen.c).reshape(-1)
     beyond = np.maximum(c, 0.0)

@@ -97,7 +97,7 @@ class Evaluator:
         flown = way(problem, share)
         if problem.margins is None:
             return flown
-        # slopes or not, by the one program: another takes longer to compile than most searches would save by it
+        # with gradients in either case: a second program takes longer to compile than most searches would save
         of_loop = margin_rows.of_points(problem.margins, self.bounds.scale, share)
         wide = max(flown["c"].shape[2], of_loop["c"].shape[2])
 
@@ -128,7 +128,7 @@ class Evaluator:
 
 
 def _with_margins(flown: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return F = ln of the largest metric over its limit with the rows of the margins among them, and its slopes."""
+    """Return F = ln of the largest metric over its limit with the rows of the margins among them, and its gradient."""
     c = ended(flown["c"]).reshape(len(flown["c"]), -1)
     at, points = c.argmax(axis=1), np.arange(len(c))
     largest = np.maximum(1.0 + c[points, at], LEAST)
