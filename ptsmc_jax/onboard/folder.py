@@ -138,7 +138,7 @@ def write_program(folder: Path, made: Controller, steepness: float = 0.0) -> Non
         "README.md": readme(code, about),
     }
     for name, text in texts.items():
-        store.write_text(folder / name, text)
+        store.write_text(folder / name, templates.prefixed(text, about.name))
     layout = {"name": about.name, "digest": about.digest, "period": made.period, "parts": made.board.parts}
     layout["columns"] = templates.columns(code)
     store.write_json(folder / LAYOUT, layout)

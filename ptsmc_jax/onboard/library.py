@@ -22,7 +22,7 @@ from ptsmc_jax.onboard import sources
 from ptsmc_jax.onboard.board import board, known
 from ptsmc_jax.onboard.generate import names_of
 from ptsmc_jax.onboard.parameters import COMPUTED, named, parameters
-from ptsmc_jax.onboard.templates import filled
+from ptsmc_jax.onboard.templates import filled, prefixed
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.computer import OURS, SAMPLES, Computer, Decision, Period, Software
@@ -97,7 +97,7 @@ class Library:
 
     def _compiled(self, place: Path, real: str, options: tuple[str, ...]) -> Path:
         glue, library = place / "glue.c", place / "controller.so"
-        glue.write_text(filled("in_the_loop.c", name=self.name), encoding="utf-8")
+        glue.write_text(prefixed(filled("in_the_loop.c", name=self.name), self.name), encoding="utf-8")
         alone = place / "controller"  # what a campaign keeps and knows of it: what lies elsewhere does not fly
         sources.copy(self.folder, alone)
         files = [str(alone / f"ptsmc_{self.name}{end}.c") for end in ("", "_parameters")]

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -37,6 +38,26 @@ class About(NamedTuple):
     wheels: bool
     delay: int
     steepness: float  # (t_f / time to go of the last sample before the hand-over)^2, by which gains grow, or more
+
+
+# public names of a controller: the templates have them after ptsmc_ and PTSMC_, exported files after ptsmc_NAME_
+_SYMBOLS = ("init", "step", "parameters")  # linked
+_TYPES = ("params", "in", "out", "state", "derived", "real", "status")
+_ROWS = ("in_from", "state_from", "params_from", "out_to", "state_to", "params_to")  # of the flat header
+_CONSTANTS = (*STATUS, "SCENARIO", *(f"{kind}_SIZE" for kind in ("IN", "OUT", "STATE", "PARAMS")))
+_PUBLIC = re.compile(
+    rf"\b(ptsmc_)({'|'.join((*_SYMBOLS, *_TYPES, *_ROWS))})\b(?!\.[ch]\b)|\b(PTSMC_)({'|'.join(_CONSTANTS)})\b"
+)
+
+
+def prefixed(text: str, name: str) -> str:
+    """Return a text with the controller's name in all public names, so that several controllers link together."""
+
+    def renamed(found: re.Match[str]) -> str:
+        lower, own, upper, constant = found.groups()
+        return f"{lower}{name}_{own}" if lower else f"{upper}{name.upper()}_{constant}"
+
+    return _PUBLIC.sub(renamed, text)
 
 
 def filled(file: str, **values: str) -> str:
@@ -96,6 +117,10 @@ def header(code: Code, about: About) -> str:
         "#ifdef __cplusplus\nextern \"C\" {\n#endif",
         "/* Numbers: double, or float with -DPTSMC_REAL=float. */\n#ifndef PTSMC_REAL\n#define PTSMC_REAL double\n"
         "#endif\ntypedef PTSMC_REAL ptsmc_real;",
+        "/* Symbols contain the precision, so files of different PTSMC_REAL don't link. */\n"
+        "#define PTSMC_SUFFIXED_(name, real) name##_##real\n"
+        "#define PTSMC_SUFFIXED(name, real) PTSMC_SUFFIXED_(name, real)\n"
+        + "\n".join(f"#define ptsmc_{name} PTSMC_SUFFIXED(ptsmc_{name}, PTSMC_REAL)" for name in _SYMBOLS),
         f'#define PTSMC_SCENARIO "{about.digest}"',
         "\n".join(["/* What ptsmc_step returns, the gravest last. */", "enum ptsmc_status {", *statuses, "};"]),
         struct("ptsmc_params", parameters, code.parameters),
@@ -137,6 +162,10 @@ def source(code: Code, about: About) -> str:
 #include "ptsmc_{about.name}.h"
 
 #include <math.h>
+
+#if defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__
+#error "inputs are checked for NaN and infinity: compile without -ffast-math, -Ofast and -ffinite-math-only"
+#endif
 
 typedef ptsmc_real real;
 
@@ -314,10 +343,10 @@ def flat(code: Code, about: About) -> str:
     lines += ["enum {", *(f"    PTSMC_{name.upper()}_SIZE = {len(found)}{',' if name != 'params' else ''}"
                           for name, found in lists.items()), "};", ""]  # fmt: skip
     for name in ("in", "state", "params"):
-        lines += [f"static inline void {name}_from(const double *v, ptsmc_{name} *x)", "{"]
+        lines += [f"static inline void ptsmc_{name}_from(const double *v, ptsmc_{name} *x)", "{"]
         lines += [f"    x->{column} = ({kind(column)})v[{k}];" for k, column in enumerate(lists[name])] + ["}", ""]
     for name in ("out", "state", "params"):
-        lines += [f"static inline void {name}_to(const ptsmc_{name} *x, double *v)", "{"]
+        lines += [f"static inline void ptsmc_{name}_to(const ptsmc_{name} *x, double *v)", "{"]
         lines += [f"    v[{k}] = (double)x->{column};" for k, column in enumerate(lists[name])] + ["}", ""]
     return "\n".join(lines)
 

@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+import subprocess
 
 import jax
 import pytest
@@ -11,7 +12,7 @@ from ptsmc_jax import scenario
 from ptsmc_jax.onboard import folder, sources
 from ptsmc_jax.onboard.library import InTheLoop, Library
 from ptsmc_jax.scenario.errors import ScenarioError
-from tests.onboard.compiled import CC, needs_compiler, program
+from tests.onboard.compiled import CC, STRICT, needs_compiler, program
 from tests.onboard.flights import FLIGHTS
 
 
@@ -72,7 +73,7 @@ def test_a_second_file_flies_where_it_is_included_and_is_asked_for_where_not(cha
     code = changed / "ptsmc_flight.c"
     (changed / "mine.c").write_text("double mine(double x) { return 2.0 * x; }\n")
     call = r"\1\n    if (mine(p->period) < 0.0) return 1;"
-    calls = re.sub(r"^(int ptsmc_step\([^{]*\{)", call, code.read_text(), flags=re.MULTILINE)
+    calls = re.sub(r"^(int ptsmc_flight_step\([^{]*\{)", call, code.read_text(), flags=re.MULTILINE)
     code.write_text(f"double mine(double x);\n{calls}")
     with pytest.raises(
         ScenarioError, match=r"^the controller in .* needs mine, which is neither in ptsmc_flight\.c nor"
@@ -116,3 +117,69 @@ def test_a_period_read_with_32_bits_is_the_same(chain):
         known = parts("chain")
         assert float(known.period) != library.period
         InTheLoop(library, known)
+
+
+def compiled(compiler, *arguments):
+    """The finished process of a compiler."""
+    return subprocess.run([compiler, *STRICT, *map(str, arguments)], capture_output=True, text=True, check=False)
+
+
+compilers = pytest.mark.parametrize("compiler", [name for name in ("gcc", "clang") if shutil.which(name)])
+
+
+@compilers
+@pytest.mark.parametrize("option", ["-ffast-math", "-Ofast", "-ffinite-math-only"])
+def test_code_that_needs_nan_does_not_compile_without_it(chain, compiler, option):
+    """A NaN at an input would pass every check: status 0, and an estimate that stays NaN."""
+    done = compiled(compiler, option, "-fsyntax-only", chain / "ptsmc_flight.c")
+    assert done.returncode != 0
+    assert "compile without -ffast-math" in done.stderr
+
+
+TWO = """
+#include <string.h>
+#include "ptsmc_flight_flat.h"
+#include "ptsmc_other_flat.h"
+
+int main(void)
+{
+    ptsmc_flight_state state;
+    ptsmc_other_state other;
+    ptsmc_flight_init(&ptsmc_flight_parameters, &state);
+    ptsmc_other_init(&ptsmc_other_parameters, &other);
+    return PTSMC_FLIGHT_OK + PTSMC_OTHER_OK;
+}
+"""
+
+
+@compilers
+def test_two_controllers_link_into_one_program(chain, tmp_path, compiler):
+    other = tmp_path / "other"
+    folder.export(scenario.from_tables(FLIGHTS["raw"]), other, name="other", trials=1)
+    (tmp_path / "main.c").write_text(TWO)
+    code = [place / f"ptsmc_{name}{end}.c" for place, name in ((chain, "flight"), (other, "other"))
+            for end in ("", "_parameters")]  # fmt: skip
+    program = tmp_path / "main"
+    done = compiled(compiler, f"-I{chain}", f"-I{other}", *code, tmp_path / "main.c", "-o", program, "-lm")
+    assert done.returncode == 0, done.stderr
+    assert subprocess.run([program], check=False).returncode == 0
+
+
+@compilers
+@pytest.mark.parametrize(("real", "of_check"), [("double", "float"), ("float", "double")])
+def test_files_of_different_precision_do_not_link(chain, tmp_path, compiler, real, of_check):
+    objects = []
+    for name, precision in (("ptsmc_flight", real), ("ptsmc_flight_parameters", real), ("check", of_check)):
+        objects.append(tmp_path / f"{name}.o")
+        done = compiled(compiler, f"-DPTSMC_REAL={precision}", "-c", chain / f"{name}.c", "-o", objects[-1])
+        assert done.returncode == 0, done.stderr
+    done = compiled(compiler, *objects, "-o", tmp_path / "check", "-lm")
+    assert done.returncode != 0
+    assert f"ptsmc_flight_init_{of_check}" in done.stderr
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", ["in", "init", "state", "parameters"])
+def test_a_controller_may_be_named_like_a_part_of_it(tmp_path, name):
+    folder.export(scenario.from_tables(FLIGHTS["chain"]), tmp_path / "out", name=name, trials=1)
+    assert Library(tmp_path / "out").name == name

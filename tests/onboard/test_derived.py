@@ -153,25 +153,25 @@ MAIN = """
 int main(void)
 {
     const double first[] = {@first@}, second[] = {@second@};
-    double row[PTSMC_STATE_SIZE];
-    ptsmc_params other = ptsmc_parameters;
-    ptsmc_state x, y;
-    ptsmc_in in;
-    ptsmc_out out, expected, before;
+    double row[PTSMC_FLIGHT_STATE_SIZE];
+    ptsmc_flight_params other = ptsmc_flight_parameters;
+    ptsmc_flight_state x, y;
+    ptsmc_flight_in in;
+    ptsmc_flight_out out, expected, before;
 
-    other.inertia[0][0] = (ptsmc_real)11;
-    other.observer_gain[1] = (ptsmc_real)7;
-    ptsmc_init(&ptsmc_parameters, &x);
-    in_from(first, &in);
-    ptsmc_step(&ptsmc_parameters, &x, &in, &out);
-    ptsmc_init(&other, &y);
-    state_to(&x, row);
-    state_from(row, &y);
-    in_from(second, &in);
-    ptsmc_step(&other, &y, &in, &expected);
+    other.inertia[0][0] = (ptsmc_flight_real)11;
+    other.observer_gain[1] = (ptsmc_flight_real)7;
+    ptsmc_flight_init(&ptsmc_flight_parameters, &x);
+    ptsmc_flight_in_from(first, &in);
+    ptsmc_flight_step(&ptsmc_flight_parameters, &x, &in, &out);
+    ptsmc_flight_init(&other, &y);
+    ptsmc_flight_state_to(&x, row);
+    ptsmc_flight_state_from(row, &y);
+    ptsmc_flight_in_from(second, &in);
+    ptsmc_flight_step(&other, &y, &in, &expected);
     y = x;
-    ptsmc_step(&ptsmc_parameters, &y, &in, &before);
-    ptsmc_step(&other, &x, &in, &out);
+    ptsmc_flight_step(&ptsmc_flight_parameters, &y, &in, &before);
+    ptsmc_flight_step(&other, &x, &in, &out);
     return memcmp(&out, &expected, sizeof out) != 0 || memcmp(&out, &before, sizeof out) == 0;
 }
 """

@@ -160,7 +160,7 @@ def test_the_stack_that_is_stated_has_the_tables_of_loops(tmp_path):
     folder.write_program(tmp_path, folder.Controller(of_own(Tabled), "law", "a scenario"))
     (stated,) = re.findall(r"At most (\d+) bytes of stack", (tmp_path / "README.md").read_text())
     counted = dict(re.findall(r":(\w+)\t(\d+)", make(tmp_path, "stack").stdout))
-    assert int(counted["ptsmc_step"]) + int(counted["command"]) <= int(stated) < 20_000
+    assert int(counted["ptsmc_law_step_double"]) + int(counted["command"]) <= int(stated) < 20_000
 
 
 class Halving(ptsmc.AccelerationLaw):

@@ -449,15 +449,6 @@ def test_single_precision_flies_as_well(exported, name):
 
 
 @needs_compiler
-def test_a_compiler_that_knows_no_nan_tells_parameters_apart(filtered):
-    """-ffast-math: NaN, for that of the folder, was taken for a parameter that was told."""
-    library, samples = filtered
-    statuses, outputs = flown(Library(library.folder, options=("-ffinite-math-only",)), samples)
-    assert not statuses.any()
-    np.testing.assert_allclose(outputs, flown(library, samples)[1], rtol=1e-9, atol=1e-12)
-
-
-@needs_compiler
 def test_of_many_parameters_that_c_has_otherwise_some_are_named_and_the_others_counted(exported):
     made, library = exported("chain")
     own = library.parameters.copy()

@@ -90,13 +90,13 @@ int main(int count, char **given)
         int status = 0;
         if (v[1] < 0.0) {
             ptsmc_init(&ptsmc_parameters, &state);
-            state_from(v + HEAD + PTSMC_IN_SIZE + PTSMC_OUT_SIZE, &state);
+            ptsmc_state_from(v + HEAD + PTSMC_IN_SIZE + PTSMC_OUT_SIZE, &state);
             continue;
         }
-        in_from(v + HEAD, &in);
+        ptsmc_in_from(v + HEAD, &in);
         status = ptsmc_step(&ptsmc_parameters, &state, &in, &out);
-        out_to(&out, found);
-        state_to(&state, found + PTSMC_OUT_SIZE);
+        ptsmc_out_to(&out, found);
+        ptsmc_state_to(&state, found + PTSMC_OUT_SIZE);
         statuses += status != (int)v[2];
         for (int k = 0; k < CHECKED; k++) {
             const double most = largest[checked[k].group];
@@ -106,7 +106,7 @@ int main(int count, char **given)
             }
         }
         /* from where the simulator was: the loop is open here, and would add up what rounding leaves of each sample */
-        state_from(v + HEAD + PTSMC_IN_SIZE + PTSMC_OUT_SIZE, &state);
+        ptsmc_state_from(v + HEAD + PTSMC_IN_SIZE + PTSMC_OUT_SIZE, &state);
         rows++;
     }
     fclose(file);

@@ -139,11 +139,11 @@ int main(int count, char **given)
             }
         }
 @flags@
-        in_from(v, &in);
-        state_to(&state, before);
+        ptsmc_in_from(v, &in);
+        ptsmc_state_to(&state, before);
         last = ptsmc_step(&ptsmc_parameters, &state, &in, &found);
-        out_to(&found, out);
-        state_to(&state, after);
+        ptsmc_out_to(&found, out);
+        ptsmc_state_to(&state, after);
         if (last < PTSMC_OK || last > PTSMC_OVERFLOW || !all_finite(out, PTSMC_OUT_SIZE) ||
             !all_finite(after, PTSMC_STATE_SIZE)) {
             printf("sample %ld: status %d, and not finite\n", k, last);

@@ -1,5 +1,5 @@
 /* A controller's steps, a row each, for a program that flies it in the loop, and for XLA. */
-#include <string.h>
+#include <math.h>
 
 #include "ptsmc_@name@_flat.h"
 #include "xla/ffi/api/c_api.h"
@@ -17,22 +17,14 @@ void ptsmc_first(double *state)
 {
     ptsmc_params p;
     ptsmc_state x;
-    params_from(ptsmc_given, &p);
+    ptsmc_params_from(ptsmc_given, &p);
     ptsmc_init(&p, &x);
-    state_to(&x, state);
+    ptsmc_state_to(&x, state);
 }
 
 void ptsmc_set(void)
 {
-    params_to(&ptsmc_parameters, ptsmc_given);
-}
-
-/* no NaN: by its bits, for with -ffast-math there are none to a compiler */
-static int is_told(const double *value)
-{
-    uint64_t bits;
-    memcpy(&bits, value, sizeof bits);
-    return bits << 1 <= UINT64_C(0x7ff0000000000000) << 1;
+    ptsmc_params_to(&ptsmc_parameters, ptsmc_given);
 }
 
 /* parameters (NaN: the given one), states, inputs -> states, outputs, statuses */
@@ -41,7 +33,7 @@ void ptsmc_many(long count, const double *params, const double *state, const dou
 {
     ptsmc_params own;
     ptsmc_state first; /* with what is derived, which is not among the columns */
-    params_from(ptsmc_given, &own);
+    ptsmc_params_from(ptsmc_given, &own);
     ptsmc_init(&own, &first);
     for (long k = 0; k < count; k++) {
         ptsmc_params p = own;
@@ -52,18 +44,18 @@ void ptsmc_many(long count, const double *params, const double *state, const dou
         int any = 0;
         for (long c = 0; c < PTSMC_PARAMS_SIZE; c++) {
             const double *const one = params + k * PTSMC_PARAMS_SIZE + c;
-            row[c] = is_told(one) ? *one : ptsmc_given[c];
-            any |= is_told(one);
+            row[c] = isnan(*one) ? ptsmc_given[c] : *one;
+            any |= !isnan(*one);
         }
         if (any) {
-            params_from(row, &p);
+            ptsmc_params_from(row, &p);
             ptsmc_init(&p, &x);
         }
-        state_from(state + k * PTSMC_STATE_SIZE, &x);
-        in_from(in + k * PTSMC_IN_SIZE, &given);
+        ptsmc_state_from(state + k * PTSMC_STATE_SIZE, &x);
+        ptsmc_in_from(in + k * PTSMC_IN_SIZE, &given);
         status[k] = ptsmc_step(&p, &x, &given, &found);
-        state_to(&x, after + k * PTSMC_STATE_SIZE);
-        out_to(&found, out + k * PTSMC_OUT_SIZE);
+        ptsmc_state_to(&x, after + k * PTSMC_STATE_SIZE);
+        ptsmc_out_to(&found, out + k * PTSMC_OUT_SIZE);
     }
 }
 
