@@ -32,7 +32,7 @@ flight = ptsmc.read("../scenarios/first_flight.toml")
 small = ptsmc.replace(flight, tune={"trials": 16, "starts": 3, "steps": 30})  # less than the default, for a quick look
 
 # %% [markdown]
-# `ptsmc tune scenarios/first_flight.toml` is this with 64 trials and 32 starts. The table sets the tuned gains beside the
+# `ptsmc tune scenarios/first_flight.toml` is this with 64 trials and 12 starts. The table sets the tuned gains beside the
 # paper's on 1 000 fresh trials. Below it stands what to know before one trusts them: the interval of the gain, the worst
 # case that a search inside the dispersions finds (a few percent beyond the limit, where no drawn trial was: tune with
 # `worst_case = true` if that must not be), and whether the slopes were right.

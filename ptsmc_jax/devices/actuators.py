@@ -193,38 +193,35 @@ class Actuators:
         v, c = drive.v, drive.c
         if v is None:
             return c, c * s, c * (s * s / 2)
-        gap = c - v
-        lag_gap = gap  # what the lag closes, after a ramp of this length and slope
-        ramp, slope = jnp.zeros_like(gap), jnp.zeros_like(gap)
+        # the ramp ends after a time that each channel has for itself; without a rate limit all times are shared
+        gap, span, torque, first, second = c - v, s, None, 0.0, 0.0
         if self.rate_limit is not None:
+            slope = self.rate_limit * jnp.sign(gap)
             by_lag = 0.0 * self.rate_limit if self.lag is None else self.rate_limit * self.lag
             lag_gap = jnp.clip(gap, -by_lag, by_lag)
             ramp = jnp.abs(gap - lag_gap) / self.rate_limit
-            slope = self.rate_limit * jnp.sign(gap)
-        ramping = s < ramp
-        after_ramp = jnp.maximum(s - ramp, 0.0)
-        left, area, twice = (jnp.zeros_like(gap),) * 3  # what the lag has not closed yet, and its two integrals
+            ramping, gap, span = s < ramp, lag_gap, jnp.maximum(s - ramp, 0.0)
+            on_ramp = jnp.where(ramping, s, ramp)
+            torque = jnp.where(ramping, v + slope * s, c)
+            first = on_ramp * (v + slope * on_ramp / 2)
+            second = on_ramp * on_ramp * (v / 2 + slope * on_ramp / 6)
+        left = area = twice = 0.0  # what the lag has not closed yet, and its two integrals
         if self.lag is not None:
-            left = lag_gap * jnp.exp(-after_ramp / self.lag)
-            area = lag_gap * self.lag * -jnp.expm1(-after_ramp / self.lag)
-            twice = self.lag * (lag_gap * after_ramp - area)
-        on_ramp = jnp.where(ramping, s, ramp)
-        torque = jnp.where(ramping, v + slope * s, c - left)
-        first = on_ramp * (v + slope * on_ramp / 2)
-        second = on_ramp * on_ramp * (v / 2 + slope * on_ramp / 6)
-        integral = first + c * after_ramp - area
-        return torque, integral, second + first * after_ramp + c * (after_ramp * after_ramp / 2) - twice
+            left = gap * jnp.exp(-span / self.lag)
+            area = gap * (self.lag * -jnp.expm1(-span / self.lag))
+            twice = self.lag * (gap * span - area)
+        torque = c - left if torque is None else jnp.where(ramping, torque, torque - left)
+        return torque, first + c * span - area, second + first * span + c * (span * span / 2) - twice
 
     def torque(self, drive: Drive, s: Scalar) -> Vector:
         """Torque on the body s [s] into the period [N m]."""
-        v, *_ = self.channels(drive, s)
-        return self.on_body(self.delivered(drive, v))
+        return self.on_body(self.at(drive, s)[0])
 
-    def wheels_at(self, drive: Drive, s: Scalar) -> tuple[Array, Array]:
-        """Momentum [N m s] and torque [N m] of each wheel s [s] into the period, (wheels,) each."""
-        assert drive.h is not None
+    def at(self, drive: Drive, s: Scalar) -> tuple[Array, Array | None]:
+        """True torque of each channel s [s] into the period [N m], and the momentum of each wheel [N m s] or None."""
         v, impulse, _ = self.channels(drive, s)
-        return drive.h - self.delivered(drive, impulse), self.delivered(drive, v)
+        momentum = None if drive.h is None else drive.h - self.delivered(drive, impulse)
+        return self.delivered(drive, v), momentum
 
     def over(self, drive: Drive, start: Scalar, dt: Scalar) -> AppliedTorque:
         """The torque over dt [s] from `start` in the period, whose impulse and first moment are exact.
@@ -232,13 +229,14 @@ class Actuators:
         So momentum is, and to leading order the attitude, whatever a lag or a rate limit does within a step.
         """
         v, slope, has_length = drive.c, None, dt > 0.0
+        _, first, second = self.channels(drive, start)
         if drive.v is not None:
-            (_, first, second), (_, first_next, second_next) = (self.channels(drive, s) for s in (start, start + dt))
+            _, first_next, second_next = self.channels(drive, start + dt)
             length = jnp.where(has_length, dt, 1.0)
             v = jnp.where(has_length, (first_next - first) / length, drive.v)
             moment = (first + first_next) / 2 * dt - (second_next - second)  # of the torque about the middle
             slope = jnp.where(has_length, 12.0 * moment / length**3, 0.0)
-        stored = None if self.wheels is None else self.on_body(self.wheels_at(drive, start)[0])
+        stored = None if drive.h is None else self.on_body(drive.h - self.delivered(drive, first))
         mean = self.on_body(self.delivered(drive, v))
         return AppliedTorque(mean, None if slope is None else self.on_body(self.delivered(drive, slope)), stored, dt)
 

@@ -115,7 +115,7 @@ class Tune(Table, frozen=True):
     worst_case: Truth = False
     # all trials are flown at once and held in memory
     trials: Annotated[int, Meta(ge=1, le=10**6, description="a whole number from 1 to 1000000")] = 256
-    starts: Annotated[int, Meta(ge=1, le=100, description="a whole number from 1 to 100")] = 32
+    starts: Annotated[int, Meta(ge=1, le=100, description="a whole number from 1 to 100")] = 12
     steps: Annotated[int, Meta(ge=1, le=10**5, description="a whole number from 1 to 100000")] = 40
 
     @property

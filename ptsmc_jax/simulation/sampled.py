@@ -41,6 +41,7 @@ class PeriodMotion(NamedTuple):
     x: Any  # true state then
     drive: Drive
     walk: Array | None  # disturbance besides, constant over the period, (m,) [N m]; None: no random walk
+    rolled: bool = False  # integrate by a loop over the stages: slower, but less to compile
 
     def at(self, time: Scalar) -> Any:
         """The state at a time [s] in the period."""
@@ -60,7 +61,7 @@ class PeriodMotion(NamedTuple):
                 torque = applied.at(time - start, parts.plant.velocity(y))
                 return parts.plant.rate(time, y, torque, d if walk is None else d + walk)
 
-            return integrators.rk4(rate, start, x, step, rolled=parts.plant.of_own_functions)
+            return integrators.rk4(rate, start, x, step, rolled=self.rolled or parts.plant.of_own_functions)
 
         if parts.substeps == 1:
             return parts.plant.normalise(substep(jnp.zeros_like(dt), self.x))
@@ -70,16 +71,19 @@ class PeriodMotion(NamedTuple):
 
 def period_torques(actuators: Actuators, drive: Drive, u: Array, dt: Scalar) -> Torques:
     """Commanded and delivered torques of a control period, and the momentum of the wheels in it."""
-    zero = jnp.zeros_like(dt)
-    weights, delivered, momentum, torque = (1.0,), (actuators.torque(drive, zero),), None, None
-    if actuators.moves:
-        weights = (1 / 6, 4 / 6, 1 / 6)
-        delivered = (*delivered, actuators.torque(drive, dt / 2), actuators.torque(drive, dt))
-    if actuators.wheels is not None:  # momentum in the middle too: a lag may turn the torque around within the period
-        momentum = jnp.stack([actuators.wheels_at(drive, time)[0] for time in (dt / 2, dt)])
-        # torque goes one way in between
-        torque = jnp.stack([actuators.wheels_at(drive, time)[1] for time in (jnp.zeros_like(dt), dt)])
-    return Torques((u,) * len(delivered), delivered, weights, drive.limited, momentum, torque)
+    ends = actuators.at(drive, jnp.zeros_like(dt)), actuators.at(drive, dt)
+    nodes, weights, momentum, torque = ends[:1], (1.0,), None, None
+    if actuators.moves or actuators.wheels is not None:
+        # momentum in the middle too: a lag may turn the torque around within the period
+        middle = actuators.at(drive, dt / 2)
+        if actuators.moves:
+            nodes, weights = (ends[0], middle, ends[1]), (1 / 6, 4 / 6, 1 / 6)
+        stored = [momentum for _, momentum in (middle, ends[1]) if momentum is not None]
+        if stored:
+            momentum = jnp.stack(stored)
+            torque = jnp.stack([ends[0][0], ends[1][0]])  # it goes one way in between
+    delivered = tuple(actuators.on_body(v) for v, _ in nodes)
+    return Torques((u,) * len(nodes), delivered, weights, drive.limited, momentum, torque)
 
 
 class _Equipment(NamedTuple):
@@ -139,12 +143,13 @@ class _Loop(NamedTuple):
         torques = period_torques(actuators, drive, decision.u, dt)
         row = None
         if self.run.record:
-            wheels = None if actuators.wheels is None else actuators.wheels_at(drive, jnp.zeros_like(dt))
+            wheels = None if actuators.wheels is None else (drive.h, actuators.at(drive, jnp.zeros_like(dt))[0])
             signals = decision.d_hat, torques.delivered[0], decision.u, decision.s
             row = run_state.row(self.run, now.t, state.x, target, signals, dt > 0.0, walk, wheels)
         motion = PeriodMotion(parts, now.t, state.x, drive, walk)
         seen = None if parts.sensors is None else computer.seen
-        flown = Flown(motion.at(now.t_next), motion.at, torques, dt / parts.substeps, seen)
+        at_t_f = motion._replace(rolled=True).at  # once in a run
+        flown = Flown(motion.at(now.t_next), at_t_f, torques, dt / parts.substeps, seen)
         state = run_state.advance(self.run, state, now, target, flown)
         applied = None if actuators.holds else assumed_torque(actuators, drive, nominal_dt)
         computer = computer._replace(applied=applied)

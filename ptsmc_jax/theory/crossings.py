@@ -18,6 +18,7 @@ NEAREST = 3  # crossings of a kind that are closed in on
 SPLIT = (2 * NEAREST, 3 * NEAREST)  # of the places looked for: L real, |L| = 1, L nearest to -1
 REAL = 1e-2  # share of the real part below which the imaginary one counts as none, at the ends of the grid
 EVEN = 1e-6  # share by which sizes of L may differ that are the same: of points of the grid that fall on each other
+CHUNK = 64  # points of the grid at which L is evaluated at once: their states stay in the processor's cache
 MOST = 100.0  # dB: no limit of the gain; of the sensitivity, that of an unstable loop
 
 
@@ -68,6 +69,12 @@ class Triangles(NamedTuple):
         """L [-] at many z and its derivative by z, (points, m, m) each."""
         x, y = self.halves(z)
         return -jnp.einsum("kn,nmp->pkm", self.opening.c, x), jnp.einsum("nkp,nmp->pkm", y, x)
+
+    def values(self, z: Complex[Array, " points"]) -> Complex[Array, "points m m"]:
+        """L [-] at any number of z, evaluated in chunks."""
+        chunks = jnp.resize(z, (-(-z.size // CHUNK), CHUNK))
+        each = jax.lax.map(lambda z: self.response(z)[0], chunks)
+        return each.reshape(-1, *each.shape[2:])[: z.size]
 
 
 def triangle(a: ArrayLike) -> tuple[Array, Array]:

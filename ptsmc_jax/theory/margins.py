@@ -112,7 +112,7 @@ def _spectrum(loop: Loop, opened: Callable[[Loop], Opening] = linear.at_input) -
     fixed, h = jax.lax.stop_gradient((opening, loop.period))
     poles = crossings.poles_of(fixed)
     quick, w = crossings.in_triangles(opening), crossings.grid(poles, h)
-    each = crossings.each_axis(quick.response(jnp.exp(1j * w * h))[0])
+    each = crossings.each_axis(quick.values(jnp.exp(1j * w * h)))
     stable = finite & (jnp.max(jnp.abs(poles[0])) < 1.0 + NEUTRAL)
     return _Spectrum(finite, loop, opening, quick, stable, w, each.T)
 

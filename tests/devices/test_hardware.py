@@ -180,7 +180,7 @@ def wheels_by_an_adaptive_integrator(inertia, axes, log, lag, limit, intervals):
 CHANNELS = [(None, np.inf), (0.2, np.inf), (0.05, np.inf), (0.1, 0.5)]
 
 
-MOST, SAMPLES = 53, 160  # integration steps a period and periods: one program for different momenta
+MOST, SAMPLES = 64, 160  # integration steps a period and periods: one program for different momenta
 
 
 def as_many(ready, substeps=MOST):
@@ -252,6 +252,19 @@ def test_more_steps_than_follow_the_nutation_change_nothing():
     np.testing.assert_allclose(ours.metrics["window_error"], theirs.metrics["window_error"], rtol=1e-6)
     off = Rotation.from_quat(ours.log.x.q[-1]).inv() * Rotation.from_quat(theirs.log.x.q[-1])
     assert off.magnitude() < 1e-9
+
+
+def test_most_gains_share_a_number_of_steps():
+    """Each number of steps is another program to compile: the tuned gains of a flexible body had 12, its own had 11."""
+    frequency = {"flexible": {"frequency": [4.5], "damping": [0.005], "coupling": [[0.02, 0.0, 0.0]]}}
+    tables = {**CUBESAT, **frequency, "loop": {**CUBESAT["loop"], "t_end": 60.0}}
+    each = {
+        scenario.study(
+            scenario.from_tables({**tables, "controller": {"t_f": 50.0, "delta": 2.0, "eta": eta}})
+        ).parts.substeps
+        for eta in np.linspace(2.5, 8.0, 6)
+    }
+    assert len(each) == 1
 
 
 def test_steps_follow_what_disturbances_leave_in_the_wheels():

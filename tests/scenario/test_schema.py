@@ -93,7 +93,7 @@ TUNE_DEFAULTS = {
     "torque_weight": 0.0,
     "worst_case": False,
     "trials": 256,
-    "starts": 32,
+    "starts": 12,
     "steps": 40,
 }
 

@@ -27,7 +27,7 @@ from tuning.search import gains as gain_names
 from tuning.search.gains import with_gains
 from tuning.search.shares import Bounds, Scale
 
-CASES = 2  # loops of drawn trials, those that come nearest to a limit
+CASES = 1  # drawn trials whose loops are constrained, those that come nearest to a limit
 WITHOUT = 2.0  # how near to its limit a loop without slopes comes: as one without any margin
 
 

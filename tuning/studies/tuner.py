@@ -26,7 +26,7 @@ from tuning.search.trust import Profile
 from tuning.studies import judging, posing, stability
 from tuning.studies.posing import Posed
 
-WIDENED, NEARBY = 3, 4  # searches in larger bounds, at most, and starting points of each
+WIDENED = 3  # searches in larger bounds, at most
 TRIES = 3  # searches at most, each of whose gains are judged on fresh trials of their own
 FARTHER = 1.02  # a further search keeps so much more from the limits than what fresh trials found too little
 SENSITIVE = ("window_error", "hold_error", "peak_torque", "effort", "chattering")  # metrics whose slopes are shown
@@ -226,7 +226,7 @@ def _in_larger_bounds(outcome: Search, posed: Posed, journal: Journal | None, re
         report(f"searching beyond the bounds of {', '.join(moved)}", 0, 0, outcome.value, outcome.over)
         larger = posing.pose(posing.with_bounds(scenario, moved), posed.seed, journal)
         larger.evaluate.count_on(posed.evaluate)
-        more = larger.search(larger.problem, outcome.gains, NEARBY, report=report)
+        more = larger.search(larger.problem, outcome.gains, 1, report=report)
         history = [*outcome.history, *_after(outcome.history, more.history)]
         better = (more.over, more.value) < (outcome.over, outcome.value * (1.0 - trust.FLAT))
         if not better:
