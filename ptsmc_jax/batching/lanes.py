@@ -314,17 +314,39 @@ class _Lanes:
         depends = [dependence(branch.jaxpr, _which(operands)) for branch in branches]
         differs = [either([*each, *_which([index])]) for each in zip(*depends, strict=True)]
         results = Packed(eqn.outvars, differs, self.leads)
-        cases = [lambda branch=branch: results.pack(self.inside().evaluate(branch, operands)) for branch in branches]
         if agree:
-            return results.unpack(lax.switch(plain(index), cases))
+            all_cases = [lambda one=one: results.pack(self.inside().evaluate(one, operands)) for one in branches]
+            return results.unpack(lax.switch(plain(index), all_cases))
         which = index.dense(self.leads[index.differs])
         which = which if which.dtype == bool else jnp.clip(which, 0, len(branches) - 1)
+
+        def case(k: int, branch: Any) -> tuple:
+            return results.pack(self.inside().evaluate(branch, self.shielded(eqn, operands, which == k)))
+
+        cases = [partial(case, k, branch) for k, branch in enumerate(branches)]
 
         def choice(differs: int, *case: Array) -> Array:
             return lax.select_n(jnp.broadcast_to(self._along(which, case[0], differs), case[0].shape), *case)
 
         outputs = zip(differs, *(case() for case in cases), strict=True)
         return results.unpack([jax.tree.map(partial(choice, over), *output) for over, *output in outputs])
+
+    def shielded(self, eqn: Any, operands: list, on: Array) -> list:
+        """Operands of a branch, whose derivatives are zero in the trials that do not take it.
+
+        There a derivative may be infinite, and reverse mode would multiply it by zero. `jax.vmap` does the same.
+        """
+        floats = [k for k, v in enumerate(eqn.invars[1:]) if jnp.issubdtype(v.aval.dtype, jnp.inexact)]
+        differs = [_which(operands)[k] | TRIAL for k in floats]
+        some = Packed([eqn.invars[1 + k] for k in floats], differs, self.leads)
+
+        def masked(over: int, leaf: Array) -> Array:
+            return jnp.where(self._along(on, leaf, over), leaf, lax.stop_gradient(leaf))
+
+        packed = some.pack([operands[k] for k in floats])
+        own = [jax.tree.map(partial(masked, over), leaf) for over, leaf in zip(differs, packed, strict=True)]
+        by_place = dict(zip(floats, some.unpack(own), strict=True))
+        return [by_place.get(k, operand) for k, operand in enumerate(operands)]
 
     def custom(self, eqn: Any, values: list) -> list:
         """A function with a derivative rule of its own (custom_jvp), which is kept."""

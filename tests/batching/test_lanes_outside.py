@@ -310,3 +310,19 @@ def test_whole_numbers_and_truths_have_no_slopes():
     agree(values, expected)
     agree(slopes[2][0], along[2])
     assert [(s.shape, s.dtype) for s in slopes[:2]] == [((2, *X.shape), jax.dtypes.float0)] * 2
+
+
+@pytest.mark.parametrize("values", [jnp.array([-1.0, 0.0, 4.0]), jnp.array([[-1.0, -0.0], [1.0, 4.0], [0.0, 2.0]])])
+def test_reverse_mode_passes_only_through_the_branch_that_a_trial_takes(values):
+    """The other branch has an infinite derivative there, which times zero was NaN."""
+
+    def root(v, factor):
+        return lax.cond(jnp.sum(v) > 0.0, lambda: jnp.sum(jnp.sqrt(factor * jnp.abs(v))), lambda: jnp.sum(factor * v))
+
+    def gradients(batched):
+        return jax.grad(lambda v, a: jnp.sum(batched(root, (0, None))(v, a)), argnums=(0, 1))(
+            values, 0.0 * values[0] + 1.0
+        )
+
+    for ours, jaxs in zip(gradients(lanes.vmap), gradients(jax.vmap), strict=True):
+        np.testing.assert_allclose(ours, jaxs, rtol=1e-14)
