@@ -12,8 +12,9 @@ import pytest
 
 import ptsmc_jax as ptsmc
 from ptsmc_jax import scenario
-from ptsmc_jax.campaigns import store
+from ptsmc_jax.campaigns import montecarlo, store
 from ptsmc_jax.laws.base import Sample
+from ptsmc_jax.onboard.board import board
 from ptsmc_jax.scenario import own, parsing, reading, systems
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import rollout
@@ -682,3 +683,27 @@ def test_a_gain_of_an_observer_may_begin_like_one_of_an_axis(here):
     assert gains.in_scenario(whole, {"observer_gain_low": 0.4}).observer.gain_low == 0.4
     assert gains.base("observer_gain_low") == "observer_gain_low"
     assert gains.base("observer_gain_2") == "observer_gain"
+
+
+DETUMBLING = """
+class Detumbling(ptsmc.AccelerationLaw):
+    '''A torque against the body rate, at any attitude.'''
+
+    k: float = ptsmc.gain(10.0, (1.0, 100.0), unit="N m s")
+
+    def command(self, memory, now, x, target, d_hat, k2):
+        return -self.k * x.w, x.w, memory
+"""
+
+
+def test_a_law_that_computes_its_own_torque_has_no_singularity(here):
+    """It was reported singular wherever the attitude error passed 180 deg, where only the inversion is singular."""
+    (here / "mine.py").write_text(HEAD + DETUMBLING)
+    law = {"kind": "own", "code": "mine.py:Detumbling", "t_f": 5.0}
+    tables = {"controller": law, "loop": SAMPLED, "initial": {"rotvec_deg": [0.0, 0.0, 150.0]}}
+    tables["dispersion"] = {"rate": {"kind": "normal", "std": 1.0}}
+    ready = scenario.study(scenario.from_tables(tables))
+    trials = montecarlo.run(ready.parts, ready.dispersion, 0, np.arange(20))
+    assert trials.counts()["singular"] == 0
+    assert trials.finished.all()
+    assert "clearance" not in board(ready.parts).state
