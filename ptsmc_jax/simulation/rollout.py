@@ -11,6 +11,7 @@ import jax.numpy as jnp
 
 from ptsmc_jax import programs
 from ptsmc_jax.devices.ticks import Ticks
+from ptsmc_jax.laws.base import Law
 from ptsmc_jax.numerics import guards
 from ptsmc_jax.numerics.draws import WholeNumber, check_fits
 from ptsmc_jax.numerics.pytrees import Scalar
@@ -83,6 +84,19 @@ def _check(parts: Parts) -> None:
         raise TypeError(f"the disturbance must be a function of (t, x), but is {parts.disturbance!r}")
     value = jax.eval_shape(lambda: parts.disturbance(jnp.zeros_like(parts.t_end), parts.initial))
     _check_shape("what the disturbance returns", value, [(parts.plant.inputs,), ()])
+    if not parts.clock.sampled:
+        _check_continuous(parts)
+
+
+def _check_continuous(parts: Parts) -> None:
+    """Raise TypeError if parts of a continuous loop contain what only the sampled loop simulates."""
+    sampled_only = ("sensors", "actuators", "walk_rate", "command_filter", "jitter")
+    found = next((name for name in sampled_only if getattr(parts, name) is not None), None)
+    if found is not None:
+        raise TypeError(f"{found} must be None in the continuous loop; allowed is a sampled clock")
+    if type(parts.controller).torque is Law.torque:
+        law = type(parts.controller).__name__
+        raise TypeError(f"the law {law} runs in the sampled loop only; allowed is a sampled clock")
 
 
 def _check_bits(time: Any) -> None:

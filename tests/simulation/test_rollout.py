@@ -7,6 +7,10 @@ import pytest
 
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import runs
+from ptsmc_jax.devices.actuators import Actuators
+from ptsmc_jax.laws.acceleration import law_on_error
+from ptsmc_jax.laws.error_motions import ErrorQuaternion
+from ptsmc_jax.laws.pd import PD
 from ptsmc_jax.observers import nonlinear
 from ptsmc_jax.plants import integrator_chain, rigid_body, second_order
 from ptsmc_jax.signals import disturbances, references
@@ -385,3 +389,25 @@ def test_a_run_to_be_looked_at_is_optimised_where_it_is_long(monkeypatch):
     assert rollout.looked_at(run) is once
     longer = replace(run, clock=clock.flight(1e-3, 31.0))
     assert rollout.looked_at(longer) is rollout.simulate_jit
+
+
+@pytest.mark.parametrize(
+    ("changes", "name"),
+    [
+        ({"actuators": Actuators(torque_limit=vector(1e-9))}, "actuators"),
+        ({"walk_rate": vector([1e-3] * 3)}, "walk_rate"),
+        ({"jitter": vector(0.1)}, "jitter"),
+    ],
+)
+def test_a_continuous_loop_refuses_parts_that_it_would_ignore(changes, name):
+    run = parts(20.0, 3.0, 2.0)
+    with pytest.raises(TypeError, match=f"^{name} must be None in the continuous loop"):
+        rollout.simulate_jit(replace(run, **changes))
+
+
+def test_a_continuous_loop_refuses_a_law_of_the_sampled_loop():
+    """It ended in NotImplementedError without a sentence."""
+    run = parts(20.0, 3.0, 2.0)
+    law = law_on_error(ErrorQuaternion, PD)(run.controller.model, vector(20.0), vector(2.0), vector(1.0), vector(2.0))
+    with pytest.raises(TypeError, match=r"^the law PD runs in the sampled loop only"):
+        rollout.simulate_jit(replace(run, controller=law))
