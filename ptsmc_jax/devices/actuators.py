@@ -194,7 +194,8 @@ class Actuators:
         if v is None:
             return c, c * s, c * (s * s / 2)
         # the ramp ends after a time that each channel has for itself; without a rate limit all times are shared
-        gap, span, torque, first, second = c - v, s, None, 0.0, 0.0
+        gap, span, first, second = c - v, s, 0.0, 0.0
+        ramping, torque_on_ramp = None, c
         if self.rate_limit is not None:
             slope = self.rate_limit * jnp.sign(gap)
             by_lag = 0.0 * self.rate_limit if self.lag is None else self.rate_limit * self.lag
@@ -202,7 +203,7 @@ class Actuators:
             ramp = jnp.abs(gap - lag_gap) / self.rate_limit
             ramping, gap, span = s < ramp, lag_gap, jnp.maximum(s - ramp, 0.0)
             on_ramp = jnp.where(ramping, s, ramp)
-            torque = jnp.where(ramping, v + slope * s, c)
+            torque_on_ramp = v + slope * s
             first = on_ramp * (v + slope * on_ramp / 2)
             second = on_ramp * on_ramp * (v / 2 + slope * on_ramp / 6)
         left = area = twice = 0.0  # what the lag has not closed yet, and its two integrals
@@ -210,7 +211,7 @@ class Actuators:
             left = gap * jnp.exp(-span / self.lag)
             area = gap * (self.lag * -jnp.expm1(-span / self.lag))
             twice = self.lag * (gap * span - area)
-        torque = c - left if torque is None else jnp.where(ramping, torque, torque - left)
+        torque = c - left if ramping is None else jnp.where(ramping, torque_on_ramp, c - left)
         return torque, first + c * span - area, second + first * span + c * (span * span / 2) - twice
 
     def torque(self, drive: Drive, s: Scalar) -> Vector:

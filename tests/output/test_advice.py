@@ -75,7 +75,8 @@ def test_margins_are_shares_of_their_limits_in_words_too():
     """How near a limit is come to was told as how many times it is reached: 4.8 dB of 6 as 1.2 times."""
     reached = summary(1.0)
     reached["search"] |= {"largest_over_limit": {"gain_margin": 1.2}, "earlier": [
-        {"margin": 0.03, "over": {"gain_margin": 1.1}, "fresh_seed": 7}]}  # fmt: skip
+        {"margins": {"gain_margin": 0.03}, "over": {"gain_margin": 1.1}, "fresh_seed": 7}],
+        "margins": {"gain_margin": 0.05}}  # fmt: skip
     _, compromise, on = search_sentences.search(reached)
     assert compromise.endswith("gain_margin reaches 0.8 times its limit on the training trials")
     assert on.startswith("gains that kept every limit in the search reached 0.9 times the limit of gain_margin on")

@@ -222,7 +222,7 @@ def test_a_global_search_is_judged_by_the_limits_themselves(monkeypatch, share, 
     bounds = Bounds(BOUNDS.names, (3.0, 0.5, 20.0), (3.0001, 0.5001, 20.0001))  # all gains ask for one torque
     evaluate = Evaluator(bounds)
     peak = float(evaluate.fly(moved_in_time(peak_torque=1.0), np.full((1, 3), 0.5)).beyond[0]) + 1.0
-    settings, limit = optimise.Settings(1, 2, 1, judged=False, margin=0.03), peak / share
+    settings, limit = optimise.Settings(1, 2, 1, judged=False, margins={"peak_torque": 0.03}), peak / share
     found = optimise.search(evaluate, moved_in_time(peak_torque=limit), (), np.array([3.0, 0.5, 20.0]), settings)
     assert bool(found.worst[0] <= 1.0) is kept
     assert global_check.check(evaluate, found, 0).kept is kept
@@ -263,7 +263,7 @@ def test_a_global_search_keeps_the_margin_that_the_search_keeps(monkeypatch):
     evaluate: Any = Steps(
         lambda problem, share: np.select([share < 0.3, share < 0.6], metric[:2], 0.8) / problem.limit - 1.0
     )
-    searched: Any = SimpleNamespace(problem=Told(), margin=0.1, share=np.array([0.8]))
+    searched: Any = SimpleNamespace(problem=Told(), margins={"peak_torque": 0.1}, share=np.array([0.8]))
     found = global_check.check(evaluate, searched, 1, sloped=False)
     assert found.kept
     assert 2.6 <= found.gains["eta"] < 2.6 + 10.0 * global_check.SPREAD  # at which the population's F ends to differ
@@ -286,7 +286,7 @@ def test_a_global_search_asks_for_margins_only_where_they_decide(monkeypatch):
         (Told(), lambda _, share: np.concatenate([0.2 - share, 0.6 - share], axis=1)),
     ):
         evaluate: Any = Steps(c)
-        searched: Any = SimpleNamespace(problem=told, margin=0.1, share=np.array([0.8]))
+        searched: Any = SimpleNamespace(problem=told, margins={"peak_torque": 0.1}, share=np.array([0.8]))
         ends[told.margins] = global_check.check(evaluate, searched, 1, sloped=False), evaluate
     (found, lazy), (eager, every) = ends["gain_margin"], ends[None]
     assert (found.gains, found.value) == (eager.gains, eager.value)

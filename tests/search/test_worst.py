@@ -251,7 +251,7 @@ def test_what_has_no_worst_case_to_look_for_keeps_the_whole_margin(monkeypatch):
     evaluate = Evaluator(Bounds(("eta", "delta"), (2.5, 0.3), (6.0, 4.0)))
     settings = optimise.Settings(1, 1, 0, robust=True)
     found = optimise.search(evaluate, problem, wanted, np.array([3.0, 1.0]), settings)
-    assert found.margin == rounds.MARGIN
+    assert {*found.margins.values()} == {rounds.MARGIN}
 
 
 def test_coordinates_given_are_flown_as_drawn_ones():
@@ -286,6 +286,34 @@ def test_trials_that_join_take_free_places_first_and_then_those_of_the_oldest():
         np.testing.assert_array_equal(problem.trials[:8], np.arange(8))
     own = objective.coordinates_of(problem.dispersion, 5, np.asarray(problem.trials))
     np.testing.assert_array_equal(problem.coordinates["initial_attitude"], own["initial_attitude"])
+
+
+def test_several_limits_on_shares_of_the_trials_keep_their_critical_trials():
+    """The trials of the last limit took the places of those of the limit before it."""
+    problem, wanted = posed(variation.Dispersion(attitudes.AxisAngle(vector(0.4), vector(2.0))))
+    wanted = [replace(wanted[0], quantile=0.9), replace(wanted[0], metric="effort", quantile=0.9)]
+    problem = objective.problem(
+        problem.parts, problem.dispersion, 5, np.arange(8), problem.names, wanted, may_break=(0, 0)
+    )
+    evaluate = Evaluator(Bounds(("eta", "delta"), (2.5, 0.3), (6.0, 4.0)))
+    search = rounds.Rounds(evaluate, problem, wanted, robust=False)
+    for row, first in enumerate((200, 300)):
+        search._join(rounds.Joining(first + np.arange(rounds.HARDEST), np.arange(2) == row))
+    trials = np.asarray(search.problem.trials)
+    for row, first in enumerate((200, 300)):
+        counted = trials[np.asarray(search.problem.counted)[row]]
+        assert {*range(first, first + rounds.HARDEST)} <= {*counted.tolist()}
+
+
+def test_a_limit_broken_on_other_trials_does_not_tighten_the_others(monkeypatch):
+    problem, wanted = swinging(1.0, [0.2, 0.1], 0.01)
+    small_search(monkeypatch)
+    evaluate = Evaluator(Bounds(("eta", "delta"), (2.5, 0.3), (6.0, 4.0)))
+    settings = optimise.Settings(1, 1, 0, margins={wanted[0].metric: 0.3})
+    found = optimise.search(evaluate, problem, wanted, np.array([3.0, 1.0]), settings)
+    assert found.margins == {**dict.fromkeys(problem.rows, rounds.MARGIN), wanted[0].metric: 0.3}
+    kept = np.asarray([*found.margins.values()])
+    np.testing.assert_allclose(problem.tightened(1.0 - kept).limits, problem.limits * (1.0 - kept), rtol=1e-15)
 
 
 def test_where_nothing_can_be_moved_the_hardest_drawn_one_is_the_worst():

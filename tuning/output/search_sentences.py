@@ -69,15 +69,18 @@ def _conflict(summary: Summary) -> Iterator[str]:
 def _went_on(record: Summary) -> Iterator[str]:
     """That gains broke a limit on fresh trials, and the search went on."""
     earlier = record.get("earlier", [])
-    next_margins = [*(search["margin"] for search in earlier[1:]), record.get("margin", 0.0)]
-    for search, margin in zip(earlier, next_margins, strict=False):
+    next_margins = [*(search["margins"] for search in earlier[1:]), record.get("margins", {})]
+    for search, margins in zip(earlier, next_margins, strict=False):
+        kept = " and ".join(
+            f"{100 * margins[metric]:.2g} % instead of {100 * search['margins'][metric]:.2g} % of the limit of {metric}"
+            for metric in search["over"]
+        )
         over = " and ".join(
             f"{_of_limit(metric, ratio):.4g} times the limit of {metric}" for metric, ratio in search["over"].items()
         )
         yield (
             f"gains that kept every limit in the search reached {over} on fresh trials (seed {search['fresh_seed']}): "
-            f"the search went on from them with {100 * margin:.2g} % kept from every limit instead of "
-            f"{100 * search['margin']:.2g} %, and what it found is judged on other trials"
+            f"the search continued from them with {kept} in reserve; its result is verified on other trials"
         )
 
 

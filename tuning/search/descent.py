@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.optimize import minimize, nnls
 
 from tuning.search.evaluate import Measured, Sloped
@@ -22,16 +23,21 @@ BOLD, CAREFUL = 1.0, 4.0
 STEEPEST = 30.0
 
 
-def largest(c: np.ndarray, margin: float) -> np.ndarray:
-    """(points, requirements) largest metric / limit of the trials that end, from c with limits tighter by a margin."""
-    return (ended(c).max(axis=2, initial=-1.0) + 1.0) * (1.0 - margin)
+def largest(c: np.ndarray, margin: ArrayLike) -> np.ndarray:
+    """Return (points, rows) the largest metric over limit of the trials that end.
+
+    Args:
+        c: (points, rows, trials) constraints whose limits are tighter by the margin.
+        margin: (rows,) or one number, share of each limit.
+    """
+    return (ended(c).max(axis=2, initial=-1.0) + 1.0) * (1.0 - np.asarray(margin))
 
 
 class Best:
     """The best point so far. The order is: fewest failed trials, then smallest violation, then smallest F."""
 
-    def __init__(self, share: np.ndarray, requirements: int, margin: float):
-        self.margin, self.share = margin, share.copy()  # (gains,) where nothing better is known
+    def __init__(self, share: np.ndarray, requirements: int, margin: ArrayLike):
+        self.margin, self.share = np.asarray(margin), share.copy()  # (gains,) where nothing better is known
         self.f = self.value = self.over = self.lost = np.inf
         self.worst = np.full(requirements, np.inf)  # largest metric / limit
 
@@ -58,7 +64,7 @@ class Best:
     def offer(self, share: np.ndarray, seen: Measured) -> None:
         """Keep the best of these points, (points, gains), if it is better; admissible is what keeps the margin."""
         worst = largest(seen.c, self.margin)
-        over = np.maximum(worst.max(axis=1, initial=0.0) - (1.0 - self.margin + SLACK), 0.0)
+        over = np.maximum((worst - (1.0 - self.margin)).max(axis=1, initial=-1.0) - SLACK, 0.0)
         lost = np.where(np.isfinite(seen.f), failures(seen.c), np.inf)
         over = over + BROKEN * lost
         first = int(np.lexsort((seen.f, over, lost))[0])

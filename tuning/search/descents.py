@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ptsmc_jax import configure
 from tuning.search import hand_overs
@@ -94,12 +95,13 @@ class Descents:
     def __init__(
         self,
         evaluate: Evaluator,
-        margin: float,
+        margin: ArrayLike,
         steps: int,
         rng: np.random.Generator,
         report: Report = lambda *_: None,
     ):
-        self._evaluate, self._margin, self._steps, self._rng, self._report = evaluate, margin, steps, rng, report
+        self._evaluate, self._steps, self._rng, self._report = evaluate, steps, rng, report
+        self._margin = np.asarray(margin)  # share kept from each limit, (rows,) or one number
         self._own: np.ndarray | None = None  # (gains,) to come back to where one makes no difference
         self.globally = False  # `search_globally` was called
         self._designs = np.zeros((0, 0))  # (designs, gains) shares
@@ -337,7 +339,8 @@ class Descents:
                 relaxed=Relaxed(rows=[int(row)], to_the_end=True),
             )
             kept = [own for rest, own in seen if rest <= 1.0 + 10.0 * SLACK]
-            found[problem.rows[row]] = (1.0 - self._margin) * min(kept) if kept else None
+            margin = float(np.broadcast_to(self._margin, worst.size)[row])
+            found[problem.rows[row]] = (1.0 - margin) * min(kept) if kept else None
         return found
 
     def _finish(self, problem: Problem) -> None:

@@ -37,7 +37,8 @@ def check(
 
     Then the same descent as in the search, where F has slopes: what is compared is the valley that each of them found.
     """
-    problem = searched.problem.tightened(1.0 - searched.margin)
+    margin = np.asarray([*searched.margins.values()])
+    problem = searched.problem.tightened(1.0 - margin)
     without = problem if problem.margins is None else replace(problem, margins=None)
     before, generation, replaced = evaluate.rollouts, 0, np.asarray(np.inf)
 
@@ -74,10 +75,10 @@ def check(
         init="sobol",
         callback=tell,
     )
-    best = Best(result.x, len(problem.rows), searched.margin)
+    best = Best(result.x, len(problem.rows), margin)
     best.offer(result.x[None], evaluate.fly(problem, result.x[None]))
     if sloped:  # near a limit evolution goes slowly: from where it ends, along it
-        run = Descents(evaluate, searched.margin, STEPS, np.random.default_rng(seed))
+        run = Descents(evaluate, margin, STEPS, np.random.default_rng(seed))
         run.descend(searched.problem, {0: result.x})
         best = run.best
     at_search, at_best = evaluate.fly(problem, searched.share[None]), evaluate.fly(problem, best.share[None])

@@ -45,8 +45,8 @@ class Asked:
     metrics: tuple[str, ...] = field(metadata={"static": True})
     names: tuple[str, ...] = field(metadata={"static": True})  # of the free gains
 
-    def tightened(self, factor: float) -> "Asked":
-        """With limits so many times as large."""
+    def tightened(self, factor: np.ndarray) -> "Asked":
+        """Return the same with every limit multiplied by its factor, (margins,) [-]."""
         return replace(self, limits=self.limits * factor)
 
 

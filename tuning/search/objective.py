@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
 
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.dispersions.base import Coordinates
@@ -86,10 +87,12 @@ class Problem(Rules):
         coordinates = coordinates_of(self.dispersion, int(self.seed), trials)
         return self.fleet._replace(trials=np.asarray(trials, dtype=np.uint32), coordinates=coordinates)
 
-    def tightened(self, factor: float) -> "Problem":
-        """The problem with limits so many times as large."""
-        margins = None if self.margins is None else self.margins.tightened(factor)
-        return replace(self, limits=self.limits * factor, margins=margins)
+    def tightened(self, factor: ArrayLike) -> "Problem":
+        """Return the problem with every limit multiplied by its factor, (rows,) or one number [-]."""
+        factors = np.broadcast_to(factor, len(self.rows))
+        of_metrics, of_margins = factors[: len(self.metrics)], factors[len(self.metrics) :]
+        margins = None if self.margins is None else self.margins.tightened(of_margins)
+        return replace(self, limits=self.limits * of_metrics, margins=margins)
 
 
 def problem(

@@ -4,7 +4,7 @@ A small sweep chooses the starts, and sequential quadratic programming on the sl
 on from each of them. Gains flown with the exact sign have no slopes: they are looked for by evolution instead.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -16,7 +16,7 @@ from tuning.search.descents import Descents, Step, planned
 from tuning.search.evaluate import Evaluator
 from tuning.search.objective import Problem
 from tuning.search.progress import Report
-from tuning.search.rounds import MARGIN, Rounds
+from tuning.search.rounds import Rounds
 from tuning.search.work import ROUND, Work
 from tuning.search.worst import Hardest
 
@@ -36,7 +36,8 @@ class Settings:
     sloped: bool = True  # F has slopes to go by
     robust: bool = False  # what joins is the worst case inside the dispersions' support
     judged: bool = True  # say how hard the worst case is
-    margin: float = 0.0  # to keep from the limits, where it is more than the search's own
+    # share to keep from the limit of each metric, if it is more than the search's own
+    margins: Mapping[str, float] = field(default_factory=dict)
     designs: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))  # (designs, gains) besides the scenario's
 
 
@@ -53,7 +54,7 @@ class Search:
     history: list[Step]  # in the order of the starts, and of each start's steps
     problem: Problem  # with the hardest trials
     rounds: int = 0  # searches again with harder trials
-    margin: float = MARGIN  # that was kept from the limits
+    margins: dict[str, float] = field(default_factory=dict)  # share that was kept from the limit of each metric
     over: float = 0.0  # how far the best point is beyond a limit less that margin, as progress tells it
     # if no gains meet every requirement: the limits that conflict, see `Descents.conflict`
     conflict: dict[str, float | None] = field(default_factory=dict)
@@ -90,9 +91,10 @@ def search(
     """
     sloped = settings.sloped
     rounds = Rounds(evaluate, problem, requirements, robust=settings.robust)
-    margin = max(settings.margin, rounds.margin)
+    margins = {row: max(settings.margins.get(row, 0.0), rounds.margin) for row in rounds.problem.rows}
     report = Work(report, evaluate, *planned(rounds.problem, settings.starts, settings.steps, sloped=sloped))
-    descents = Descents(evaluate, margin, settings.steps, np.random.default_rng(settings.seed), report)
+    kept = np.asarray([*margins.values()])
+    descents = Descents(evaluate, kept, settings.steps, np.random.default_rng(settings.seed), report)
     interrupted, conflict = False, dict[str, float | None]()
 
     def tell(what: str) -> None:
@@ -126,7 +128,7 @@ def search(
         history=descents.history,
         problem=descents.problem,
         rounds=rounds.count,
-        margin=margin,
+        margins=margins,
         over=best.over,
         conflict=conflict,
         globally=descents.globally,

@@ -49,8 +49,9 @@ class Rounds:
         self._shares = {k: r for k, r in enumerate(requirements) if r.quantile is not None and several}
         self._bands = [k for k in self._shares if not among[k].any()]
         self.margin = SURE_MARGIN if (robust and self._every) or not several else MARGIN
-        if self._every or self._shares:
-            problem = _with_room(problem, HARDEST + SPARE if self._every else SPARE)
+        limits = bool(self._every) + len(self._shares)  # each of which may add its hardest trials in a round
+        if limits:
+            problem = _with_room(problem, limits * HARDEST + SPARE)
         self._places = np.arange(problem.averaged, problem.trials.size)  # for those that join
         self.problem = _with_room(problem, len(self._bands) * BAND)
         self.count = 0  # rounds so far

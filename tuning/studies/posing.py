@@ -44,16 +44,18 @@ class Posed:
         asked: Sequence[Requirement] | None = None,
         *,
         judged: bool = True,
-        margin: float = 0.0,
+        margins: Mapping[str, float] | None = None,
         **callbacks: Callable,
     ) -> Search:
         """Look for the best gains of this problem from these gains, (gains,), and so many starts in all.
 
-        asked: requirements that are kept, where they are not the scenario's; judged, margin: see `Settings`;
+        asked: requirements that are kept, where they are not the scenario's; judged, margins: see `Settings`;
         callbacks: `report` and `prepare` of `search`.
         """
         table, asked = self.ready.scenario.search, self.asked if asked is None else asked
-        settings = Settings(starts, table.steps, self.seed, self.sloped, table.worst_case, judged, margin, self.designs)
+        settings = Settings(
+            starts, table.steps, self.seed, self.sloped, table.worst_case, judged, margins or {}, self.designs
+        )
         return search(self.evaluate, problem, asked, gains, settings, **callbacks)
 
     def named(self, share: np.ndarray) -> dict[str, float]:

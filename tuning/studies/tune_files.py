@@ -89,7 +89,7 @@ def summary(tuning: Tuning) -> dict[str, Any]:
             "starts": len({step.start for step in search.history}),
             "steps": len(search.history),
             "rounds_with_harder_trials": search.rounds,
-            "margin": search.margin,
+            "margins": search.margins,
             "earlier": [asdict(earlier) for earlier in tuning.earlier],
             "largest_over_limit": dict(zip(search.problem.rows, search.worst.tolist(), strict=True)),
             "conflict": search.conflict,

@@ -62,7 +62,7 @@ class Try:
 
     fresh_seed: int
     gains: dict[str, float]
-    margin: float  # that it kept from the limits
+    margins: dict[str, float]  # share that it kept from the limit of each metric
     over: dict[str, float]  # how many times its limit each metric reached on the fresh trials, as it is judged
 
 
@@ -205,10 +205,10 @@ def _search_and_judge(
         over = _over(outcome, judged.verdicts)
         if not over or outcome.interrupted or len(earlier) + 1 >= tries:
             return judged, earlier, posed
-        earlier.append(Try(judged.seed, judged.gains, outcome.margin, over))
+        earlier.append(Try(judged.seed, judged.gains, outcome.margins, over))
         reached = dict(zip(outcome.problem.rows, outcome.worst, strict=True))  # on the trials of the search
-        margin = 1.0 - min(float(reached[name]) / (FARTHER * over[name]) for name in over)
-        more = look(outcome.gains, starts, margin=margin)
+        margins = {name: 1.0 - float(reached[name]) / (FARTHER * over[name]) for name in over}
+        more = look(outcome.gains, starts, margins=outcome.margins | margins)
         outcome = replace(more, history=[*outcome.history, *_after(outcome.history, more.history)])
 
 
