@@ -20,7 +20,7 @@ OK, DIVERGED, TOO_FAST, SINGULAR, MISSED, UNBOUNDED, UNFINISHED = range(7)
 # code: (status, reason)
 STATUS = {
     OK: ("ok", ""),
-    DIVERGED: ("diverged", "the state is not finite"),
+    DIVERGED: ("diverged", "the state, the torque or the law's memory is not finite"),
     TOO_FAST: ("diverged", "the body turns more than 1 rad in an integration step"),
     SINGULAR: ("singular", "the law's singularity came nearer than 1e-3"),
     MISSED: ("missed", "at t_f more than 5 % of the initial error is left"),
@@ -100,6 +100,7 @@ class Flown(NamedTuple):
     torques: Torques
     step: Scalar  # longest integration step in it [s]
     seen: Any = None  # state as it was measured at its start; None: the true one
+    memory: Any = None  # of the law, after its command
 
 
 def begin(run: Run, wheel_momentum: Array | None = None) -> RunState:
@@ -142,7 +143,7 @@ def advance(run: Run, state: RunState, now: Ticks, target: Any, flown: Flown) ->
         snapshot=snapshot,
         running=metrics.update(state.running, interval, criteria),
     )
-    return _judged(run, state, target_next, now.t_next, flown.step, u_end)
+    return _judged(run, state, target_next, now.t_next, flown.step, u_end, flown.memory)
 
 
 def row(
@@ -200,10 +201,16 @@ def _snapshot(parts: Parts, target: Any, x: Any) -> Snapshot:
     return Snapshot(angle, plant.speed(x), guards.norm(plant.momentum(x)), plant.modal_amplitude(x))
 
 
-def _judged(run: Run, state: RunState, target: Any, t: Scalar, step: Scalar, u: Array) -> RunState:
-    """The state at t with its status and first bad time; the first thing that goes wrong stays."""
+def _judged(run: Run, state: RunState, target: Any, t: Scalar, step: Scalar, u: Array, memory: Any = None) -> RunState:
+    """Return the state at t with its status and first bad time; the first thing that goes wrong stays.
+
+    memory: of the law. The exported code refuses every later sample if it is not finite, so the run counts as diverged.
+    """
     law, plant = run.parts.controller, run.parts.plant
-    finite = jnp.isfinite(sum(jnp.sum(leaf) for leaf in jax.tree.leaves((state.x, u))))
+    numbers = [
+        leaf for leaf in jax.tree.leaves((state.x, u, memory)) if jnp.issubdtype(jnp.asarray(leaf).dtype, jnp.inexact)
+    ]
+    finite = jnp.isfinite(sum(jnp.sum(leaf) for leaf in numbers))
     fast = plant.too_fast(state.x, step)
     near = ~(law.clearance(state.x, target) / run.clearance_unit >= SINGULAR_CLEARANCE)
     code = jnp.where(~finite, DIVERGED, jnp.where(near, SINGULAR, jnp.where(fast, TOO_FAST, OK))).astype(jnp.int32)

@@ -149,7 +149,7 @@ class _Loop(NamedTuple):
         motion = PeriodMotion(parts, now.t, state.x, drive, walk)
         seen = None if parts.sensors is None else computer.seen
         at_t_f = motion._replace(rolled=True).at  # once in a run
-        flown = Flown(motion.at(now.t_next), at_t_f, torques, dt / parts.substeps, seen)
+        flown = Flown(motion.at(now.t_next), at_t_f, torques, dt / parts.substeps, seen, computer.law)
         state = run_state.advance(self.run, state, now, target, flown)
         applied = None if actuators.holds else assumed_torque(actuators, drive, nominal_dt)
         computer = computer._replace(applied=applied)

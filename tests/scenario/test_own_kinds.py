@@ -707,3 +707,22 @@ def test_a_law_that_computes_its_own_torque_has_no_singularity(here):
     assert trials.counts()["singular"] == 0
     assert trials.finished.all()
     assert "clearance" not in board(ready.parts).state
+
+
+def test_a_law_whose_memory_is_lost_has_diverged(here):
+    """Exported code refuses every sample after it. Simulated runs were called ok as long as the command was finite."""
+    forgetful = """
+class Forgetful(ptsmc.AccelerationLaw):
+    '''PD, which loses what it remembers after 2 s, and does not notice.'''
+
+    def begin(self):
+        return jnp.zeros(())
+
+    def step(self, memory, now, error, error_rate, bound):
+        return -error - 2.0 * error_rate, error, jnp.where(now.t > 2.0, jnp.nan, memory)
+"""
+    (here / "mine.py").write_text(HEAD + forgetful)
+    tables = {**CHAIN, "controller": {"kind": "own", "code": "mine.py:Forgetful", "t_f": 5.0}}
+    result = flown(tables, record=False)
+    assert rollout.STATUS[int(result.status)][0] == "diverged"
+    np.testing.assert_allclose(result.bad_time, 2.2, rtol=1e-12)  # the end of the first period after 2 s

@@ -226,7 +226,7 @@ def test_a_run_that_is_not_finite_leaves_no_margins_and_is_no_error(monkeypatch)
     for left, radius in run_margins.at_ends(lost.parts).values():
         assert np.isnan([radius, *left.gain_up, *left.delay]).all()
     monkeypatch.setattr(stability, "study", lambda _: lost)
-    with pytest.raises(ScenarioError, match="nominal run, which ends diverged: the state is not finite"):
+    with pytest.raises(ScenarioError, match="nominal run, which ends diverged: the state, the torque"):
         stability.find(lost.scenario)
 
 
