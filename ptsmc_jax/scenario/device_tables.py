@@ -97,7 +97,8 @@ class Hardware(Actuators, frozen=True):
         rate_noise: of the gyro, 1 sigma per axis and sample [rad/s]
         rate_noise_density: instead of rate_noise, which is then this / sqrt(period): the angle random walk, as in
             "0.02 deg/sqrt(h)" [rad/s/sqrt(Hz)]
-        rate_bias: of the gyro, 1 sigma per axis, constant over a run [rad/s]
+        rate_bias: of the gyro, 1 sigma per axis, constant over a run; without effect behind a [filter], which starts
+            in its steady state and knows a constant bias [rad/s]
         rate_bias_walk: random walk of that bias [rad/s/sqrt(s)]
         star_tracker_every: control periods between star tracker samples, with a filter
         star_tracker_period: instead of it, time between them, at least loop.period and not only whole periods [s]

@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ptsmc_jax import scenario
+from ptsmc_jax.campaigns import runs
 from ptsmc_jax.devices import attitude_filter, sensors, star_times
 from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.onboard import vectors
@@ -253,3 +254,9 @@ def test_linear_theory_has_a_star_tracker_at_every_sample_that_tells_as_much():
         np.testing.assert_allclose(noises / share, noise, rtol=1e-12)
     whole = of(star_tracker_every=2).parts.sensors
     assert whole.in_step() is whole
+
+
+def test_a_constant_bias_of_the_gyro_has_no_effect_behind_the_filter():
+    """The filter starts in its steady state: its error of the bias is the same, whatever the bias is."""
+    without, with_bias = (runs.fly(of(star_tracker_period=0.25, **bias), 3, 2) for bias in ({}, {"rate_bias": 1e-3}))
+    np.testing.assert_allclose(with_bias.metrics["window_error"], without.metrics["window_error"], rtol=1e-6)
