@@ -73,7 +73,7 @@ HOUSE = {
             build cautions own_checks reading
             flyable tuned
         """,
-        "campaigns": "montecarlo store | margin_verdicts plans rows | campaign runs | cluster",
+        "campaigns": "csv_tables montecarlo store | margin_verdicts plans rows | campaign runs | cluster",
         "onboard": """
             expressions sources
             control derived origins rules

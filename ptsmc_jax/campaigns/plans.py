@@ -15,6 +15,7 @@ import jax
 import numpy as np
 import polars as pl
 
+from ptsmc_jax.campaigns import csv_tables
 from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.dispersions.planned import OF_ROWS, SEED, TRIAL, Row
 from ptsmc_jax.dispersions.quantities import QUANTITIES, UnfitError
@@ -97,9 +98,9 @@ def read(path: Path) -> pl.DataFrame:
         raise RefusedError(f"--plan is {path}, but must be {ALLOWED}")
     try:
         if kinds == {".csv"}:
-            return pl.read_csv(path, infer_schema_length=None, glob=False)
+            return csv_tables.read(path)
         return pl.concat([pl.read_parquet(file, glob=False) for file in files])
-    except (OSError, pl.exceptions.PolarsError) as error:
+    except (OSError, ValueError, pl.exceptions.PolarsError) as error:
         first_line = (str(error).splitlines() or [type(error).__name__])[0]
         raise RefusedError(f"--plan is {path}, which cannot be read: {first_line}") from None
 

@@ -466,7 +466,7 @@ def test_a_plan_in_a_folder_whose_name_is_a_pattern_is_read(tmp_path, folder):
         rows.write_csv(tmp_path / name / "plan.csv")
         rows.write_parquet(tmp_path / name / "plan.parquet")
     for path in ("plan.csv", "plan.parquet"):
-        assert plans.read(tmp_path / folder / path)["trial"].to_list() == [4, 2]
+        assert plans.read(tmp_path / folder / path)["trial"].cast(int).to_list() == [4, 2]
 
 
 def test_files_that_are_no_plan_are_refused(tmp_path):

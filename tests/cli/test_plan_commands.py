@@ -95,3 +95,25 @@ def test_a_plan_that_cannot_be_flown_is_refused_and_nothing_is_written(command, 
     assert said in error
     assert error.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("table", "shown"),
+    [
+        ("initial_x1,initial_x2\n1.0,\x1b[31mred\n", r"initial_x2 \x1b[31mred in row 0"),
+        ('initial_x1,"initial\nx2\x07"\n1.0,2.0\n', r"column initial\nx2\x07"),
+        ("initial_x1;initial_x2\n1,5;0.2\n", "decimal commas and decimal points"),
+    ],
+)
+def test_a_refused_table_prints_one_line_without_control_characters(command, tmp_path, table, shown):
+    (tmp_path / "bad.csv").write_text(table)
+    code, out, error = command("montecarlo", "s.toml", "--plan", "bad.csv")
+    assert (code, out) == (2, "")
+    assert shown in error
+    assert error.removesuffix("\n").isprintable()
+
+
+def test_a_table_from_a_spreadsheet_with_decimal_commas_is_simulated(command, tmp_path):
+    (tmp_path / "sheet.csv").write_text(";initial_x1;initial_x2\n0;1,4;0,0\n1;1,0;0,02\n", encoding="utf-16")
+    assert command("montecarlo", "s.toml", "--plan", "sheet.csv", "--no-figures", "--quiet") == (0, "", "")
+    assert rows_of(tmp_path / "out" / "montecarlo-s-sheet")["initial_x2"].to_list() == [0.0, 0.02]

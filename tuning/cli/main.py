@@ -403,5 +403,7 @@ def _of_own_code(error: BaseException) -> str:
 
 
 def _fail(sentence: str) -> None:
-    print(f"ptsmc: {sentence}", file=sys.stderr)
+    """Print a sentence with control characters as escapes, and exit."""
+    shown = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in sentence)
+    print(f"ptsmc: {shown}", file=sys.stderr)
     sys.exit(2)
