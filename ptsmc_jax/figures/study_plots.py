@@ -16,7 +16,7 @@ from ptsmc_jax.scenario.gain_record import wide
 from ptsmc_jax.simulation.catalogues import CATALOGUES
 
 MARKERS = ("o", "^", "s", "D", "v")
-BEYOND = ("x", "+", "1", "2")  # of points that break a limit, by the limit
+BEYOND = ("x", "+", "1", "2", "3", "4")  # of points that break a limit, by the limit
 # of a pair of which a trial failed: seen on any colour
 LOST: Any = {"marker": "X", "color": "white", "mec": "black", "mew": 0.6, "ms": 6}
 WIDEST = 1e4  # times, that colours of a map span: what is farther off is no use to tell apart
@@ -131,7 +131,8 @@ def profiles(gains: Mapping[str, Profile], goal: str) -> Figure:
     """The goal along each gain, by its name; goal: what it is, with its unit."""
     broken_limits = dict.fromkeys(of for one in gains.values() for of in np.asarray(one.nearest)[one.over > 1.0])
     marks = {of: BEYOND[k % len(BEYOND)] for k, of in enumerate(broken_limits)}
-    figure = Figure(figsize=(8.0, 2.7 * len(gains)), layout="constrained")
+    legend_rows = -(-(3 + len(marks)) // 2)
+    figure = Figure(figsize=(8.0, 2.7 * len(gains) + 0.26 * legend_rows), layout="constrained")
     axes = figure.subplots(len(gains), 1, sharey=True, squeeze=False)[:, 0]
     for ax, (name, one) in zip(axes, gains.items(), strict=True):
         ax.update_datalim(np.stack([one.gain, one.gain], axis=1), updatey=False)  # where no trial has a goal, too
@@ -148,7 +149,7 @@ def profiles(gains: Mapping[str, Profile], goal: str) -> Figure:
         if wide(one.gain[0], one.gain[-1]):
             logarithmic(ax, "x")
         ax.set(xlabel=f"{name} [{one.unit}]", ylabel=goal)
-    axes[0].legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, fontsize=9)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper left", ncols=2, fontsize=9)
     return figure
 
 

@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from matplotlib.legend import Legend
 
 from ptsmc_jax.figures import run_plots, study_plots
 from ptsmc_jax.figures.style import figure_of
@@ -60,6 +61,30 @@ def test_profiles_name_the_limit_that_is_broken_and_their_numbers_do_not_overlap
     assert drawn["beyond the limit of peak_torque"] == [at[0], at[3]]
     assert drawn["beyond the limit of gain_margin"] == [at[2]]
     assert numbers_apart(axes) >= least
+
+
+@pytest.mark.parametrize(("count", "limits"), [(1, 0), (1, 6), (2, 3), (5, 4), (10, 6)])
+def test_the_legend_of_profiles_is_inside_the_figure_and_above_the_axes(count, limits):
+    metrics = (
+        "peak_torque",
+        "peak_torque_delivered",
+        "gain_margin",
+        "within_ape_boresight",
+        "phase_margin",
+        "saturated",
+    )
+    at, nearest = np.geomspace(1e-3, 1.0, 6), [metrics[k % max(limits, 1)] for k in range(6)]
+    one = study_plots.Profile("1/s", at, at, np.full(6, 1.5 if limits else 0.5), nearest, 0.1)
+    figure = study_plots.profiles({f"gain_{k}": one for k in range(count)}, "RMS of\nwindow error [-]")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        figure.draw_without_rendering()
+    (legend,) = figure.findobj(Legend)
+    assert isinstance(legend, Legend)
+    box, top = legend.get_window_extent(), figure.axes[0].get_window_extent().y1
+    assert 0.0 <= box.x0 < box.x1 <= figure.bbox.x1
+    assert top <= box.y0 < box.y1 <= figure.bbox.y1
+    assert len(legend.get_texts()) == 3 + limits
 
 
 @pytest.mark.parametrize("known", [0, 1])
