@@ -63,8 +63,9 @@ class _Asked:
 
     def __call__(self, method: str, function: Callable, *args: Any) -> Any:
         try:
-            returned = jax.tree.map(jnp.asarray, function(*args))
+            function(*args)
             _trace(function, args)
+            returned = jax.tree.map(jnp.asarray, function(*args))  # fails if it uses a number that the trace kept
             check_indices(function, *args)
             return returned
         except (Exception, SystemExit) as error:

@@ -521,7 +521,7 @@ def test_results_with_code_of_ones_own_ask_before_it_is_run(command, here):
 def test_what_fails_late_in_code_of_ones_own_is_one_sentence_too(command, here, monkeypatch):
     """A law that keeps a traced number in a list, found by JAX in the flight; and what an error came by."""
     monkeypatch.setattr(systems, "_files", set())
-    kept = LAW.replace("        left =", "        kept.append(error)\n        error = kept[-2:][0]\n        left =")
+    kept = LAW.replace("        left =", "        kept.append(error)\n        error = kept[-4:][0]\n        left =")
     (here / "mine.py").write_text(HEAD + "kept = []\n\n\ndef fails():\n    return 1 / 0\n" + kept)
     (here / "s.toml").write_text(SHORT_OWN)
     code, _, error = command("simulate", "s.toml", "--no-figures", "--quiet")
@@ -539,9 +539,19 @@ def test_what_fails_late_in_code_of_ones_own_is_one_sentence_too(command, here, 
     assert systems.at_fault(no_slopes.value) == str(here / "mine.py")
 
 
+def test_a_law_that_uses_a_number_of_its_last_call_is_refused(command, here):
+    """A run would use the number of the check at t = 0 in every sample."""
+    kept = LAW.replace("        left =", "        kept.append(error)\n        error = kept[-2:][0]\n        left =")
+    (here / "mine.py").write_text(HEAD + "kept = []\n\n\n" + kept)
+    (here / "s.toml").write_text(SHORT_OWN)
+    for asked in (["simulate", "s.toml"], ["montecarlo", "s.toml", "--trials", 2]):
+        code, _, error = command(*asked, "--no-figures", "--quiet")
+        assert (code, "its acceleration keeps a number of a run" in error) == (2, True)
+
+
 def test_code_of_ones_own_that_exits_late_is_bad_input(command, here):
     """It ended the command with its own status, 0: done and every requirement met."""
-    late = LAW.replace("        left =", "        asked.append(0)\n        if len(asked) > 2: exit(0)\n        left =")
+    late = LAW.replace("        left =", "        asked.append(0)\n        if len(asked) > 4: exit(0)\n        left =")
     (here / "mine.py").write_text(HEAD + "asked = []\n" + late)
     (here / "s.toml").write_text(SHORT_OWN)
     code, _, error = command("simulate", "s.toml", "--no-figures", "--quiet")
