@@ -35,7 +35,10 @@ MISSED_SETTLING_ANGLES = 10.0
 
 
 class Log(NamedTuple):
-    """History at the start of each interval and at t_end; arrays (time, component), time (time,)."""
+    """History at the start of each interval and at t_end; arrays (time, component), time (time,).
+
+    In the sampled loop the row at t_end has d_hat and s of a further sample, and the torques held until t_end.
+    """
 
     t: Array  # [s]
     x: Any  # true state

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ptsmc_jax.devices.actuators import Actuators, ActuatorState, Drive
-from ptsmc_jax.laws.base import Sample
+from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.numerics import draws, integrators, stacking
 from ptsmc_jax.numerics.draws import WholeNumber
 from ptsmc_jax.numerics.pytrees import Scalar
@@ -157,23 +157,28 @@ class _Loop(NamedTuple):
         star_x = star_state(parts, now, motion.at)
         return (state, _Equipment(computer, actuator_state, walk, star_x, next_offset)), row
 
-    def last_row(self, state: RunState, hardware: _Equipment) -> Log:
-        """The state at t_end, with the torque held until then."""
-        parts, t = self.run.parts, self.run.criteria.t_end
-        target, hold = parts.reference(t), t >= parts.controller.hand_over
-        d_hat = parts.observer.estimate(hardware.computer.observer)
-        k2, sample = self.k2(t), Sample(t, hold, parts.period)
-        _, s, _ = parts.controller.command(hardware.computer.law, sample, state.x, target, d_hat, k2)
+    def last_row(self, state: RunState, hardware: _Equipment, rows: Log) -> Log:
+        """Return the row at t_end: the estimate and s of a sample there, and the torque held until then."""
+        run, t = self.run, self.run.criteria.t_end
+        d_hat, s = (signal[jnp.argmax(rows.t >= t)] for signal in (rows.d_hat, rows.s))
         h, v = hardware.actuators.h, hardware.actuators.v
         signals, wheels = (d_hat, state.u, state.u, s), None if h is None else (h, v)
-        return run_state.row(self.run, t, state.x, target, signals, jnp.asarray(True), hardware.walk, wheels)
+        target, has_length = run.parts.reference(t), jnp.asarray(True)
+        return run_state.row(run, t, state.x, target, signals, has_length, hardware.walk, wheels)
+
+
+def _with_end(ticks: Ticks, t_end: Scalar) -> Ticks:
+    """Append a sample at t_end, whose period has no length and changes no metric."""
+    end = Ticks(t_end, t_end, jnp.asarray(True), ticks.sample[-1] + 1, jnp.ones_like(t_end), jnp.asarray(False))
+    return jax.tree.map(lambda many, one: jnp.append(many, one.astype(many.dtype)), ticks, end)
 
 
 def fly(run: Run, seed: WholeNumber, trial: WholeNumber, software: Software) -> Result:
     """A sampled run; see `rollout.simulate`."""
     parts, actuators = run.parts, run.parts.effective_actuators
     k2 = parts.observer.error_bound()
-    periods, period_of, first_period = schedule(parts, run.ticks)
+    ticks = _with_end(run.ticks, run.criteria.t_end) if run.record else run.ticks
+    periods, period_of, first_period = schedule(parts, ticks)
     walk_key = None if parts.walk_rate is None else walk_stream(seed, trial)
     jitter_key = None if parts.jitter is None else jitter_stream(seed, trial)
     loop = _Loop(run, software, actuators, k2, period_of, walk_key, jitter_key)
@@ -187,5 +192,7 @@ def fly(run: Run, seed: WholeNumber, trial: WholeNumber, software: Software) -> 
     offset = loop.offset(run.ticks.t[0], run.ticks.sample[0])
     hardware = _Equipment(computer, actuator_state, walk, star_state(parts, first_period, lambda t: run.x0), offset)
     (state, hardware), rows = stacking.scan(loop.fly, (state, hardware), periods)
-    log = None if rows is None else run_state.history(rows, loop.last_row(state, hardware))
+    log = None
+    if rows is not None:
+        log = run_state.history(jax.tree.map(lambda v: v[:-1], rows), loop.last_row(state, hardware, rows))
     return run_state.finish(run, first, state, log, hardware.actuators.h, software.statuses(hardware.computer))

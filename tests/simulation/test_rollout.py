@@ -216,6 +216,25 @@ def test_the_last_row_is_at_t_end_and_time_never_runs_backwards():
         assert np.all(np.diff(log.t) >= 0.0)
 
 
+@pytest.mark.parametrize("kind", ["anchored", "flight"])
+def test_the_last_row_has_the_estimate_and_s_of_a_sample_at_t_end(kind):
+    """Equal to the row at this time of a longer run, which takes a sample there; the torque is the one held before."""
+    noise = {"attitude_noise": 1e-5, "rate_noise": 1e-6}
+    loop = {"mode": "sampled", "period": 0.25, "window": 1.0, "clock": kind}
+
+    def history(t_end):
+        tables = {"controller": {"t_f": 3.0, "delta": 1.0}, "loop": {**loop, "t_end": t_end}, "hardware": noise}
+        return runs.fly(scenario.study(scenario.from_tables(tables))).log
+
+    log, longer = history(4.5), history(5.0)
+    end = log.t.size - 1
+    assert log.t[end] == longer.t[end] == 4.5
+    np.testing.assert_array_equal(log.d_hat[end], longer.d_hat[end])
+    np.testing.assert_array_equal(log.s[end], longer.s[end])
+    assert np.all(log.d_hat[end] != log.d_hat[end - 1])
+    np.testing.assert_array_equal(log.u[end], log.u[end - 1])
+
+
 @pytest.mark.parametrize("flight", [False, True])
 def test_metrics_at_t_f_are_taken_inside_the_period(flight):
     body = with_controller(at_20_hz(20.0, 3.0, 0.53), t_f=vector(20.02))  # t_f = t_s + 10.6 periods
