@@ -55,9 +55,25 @@ def _spans(code: Any) -> list[tuple[int, int, int, int]]:
 
 def line(calls: list[Frame]) -> str:
     """File and line as an error says them, the user's own where they are; empty where nothing is known."""
+    frame = _written(calls)
+    return "" if frame is None else f"{frame.file}:{frame.span[0]}"
+
+
+def function(calls: list[Frame]) -> str:
+    """Return the function that the source calls at this line, such as jnp.linalg.solve; empty if it is no call."""
+    frame = _written(calls)
+    tree = None if frame is None else _tree(frame.file)
+    if frame is None or tree is None:
+        return ""
+    found = (node.func for node in ast.walk(tree) if isinstance(node, ast.Call) and _span(node) == frame.span)
+    return next(map(ast.unparse, found), "")
+
+
+def _written(calls: list[Frame]) -> Frame | None:
+    """Return the call that an error names: the user's own if it is the innermost; None if nothing is known."""
     users = [frame for frame in calls if not Path(frame.file).is_relative_to(LIBRARY)]
     inside = users if users and calls[0] in users else calls  # who calls the library is not who is to blame
-    return f"{inside[0].file}:{inside[0].span[0]}" if inside else ""
+    return inside[0] if inside else None
 
 
 def section(found: list[Frame]) -> Section | None:

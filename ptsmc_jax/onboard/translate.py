@@ -16,6 +16,7 @@ from jax.extend import core
 from ptsmc_jax.batching import components
 from ptsmc_jax.batching.components import object_array
 from ptsmc_jax.batching.dependence import called, opened
+from ptsmc_jax.batching.lapack import COUNTED, SHARED
 from ptsmc_jax.numerics import elementary
 from ptsmc_jax.onboard import origins
 from ptsmc_jax.onboard.control import CONTROL
@@ -23,6 +24,11 @@ from ptsmc_jax.onboard.expressions import BOOL, Node, NoRuleError, Pool, Title, 
 from ptsmc_jax.onboard.rules import ELEMENTWISE, KNOWN_FUNCTIONS
 
 LARGEST = 4096  # components of an array
+LINEAR_ALGEBRA = COUNTED | SHARED
+PLAIN = (
+    "made of sums, products, quotients, powers, roots, elementary functions, comparisons, branches and loops of numbers"
+)
+SMALL_MATRICES = "plain arithmetic, or solve, determinant or smallest_eigenvalue of ptsmc_jax.numerics.matrices"
 
 
 class Translator:
@@ -116,12 +122,11 @@ class Translator:
         raise self.refused(eqn, where)
 
     def refused(self, eqn: Any, where: list[origins.Frame]) -> NoRuleError:
-        """There is no rule for this primitive."""
-        at = origins.line(where)
-        return NoRuleError(
-            f"`{eqn.primitive.name}`{f' ({at})' if at else ''} cannot be written in C, but must be made of sums, "
-            "products, quotients, powers, roots, elementary functions, comparisons, branches and loops of numbers"
-        )
+        """Return the error for a primitive without a rule: the function in the source, its line, what works instead."""
+        at, primitive = origins.line(where), eqn.primitive.name
+        allowed = SMALL_MATRICES if primitive in LINEAR_ALGEBRA else PLAIN
+        name = origins.function(where) or primitive
+        return NoRuleError(f"`{name}`{f' ({at})' if at else ''} cannot be written in C, but must be {allowed}")
 
     def _each(self, rule: Any, values: Sequence[np.ndarray], shape: tuple[int, ...]) -> np.ndarray:
         flat = [np.broadcast_to(v, shape).reshape(-1) for v in values]

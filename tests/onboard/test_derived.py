@@ -208,4 +208,4 @@ def test_what_c_cannot_derive_stays_a_parameter_and_is_said():
     assert [field.name for field in made.code.derived] == ["inertia_inverse"]
     said = readme(made.code, made.about)
     assert "| `bound_rate` | `inertia`, `observer_disturbance_bound` |" in said
-    assert "`eigh` (" in said
+    assert "`jnp.linalg.eigvalsh` (" in said

@@ -1,5 +1,7 @@
 """Functions of arrays in C compute what JAX computes; what C cannot say is refused by its line."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -247,25 +249,48 @@ def test_branches_are_branches_and_loops_loops():
 
 
 @pytest.mark.parametrize(
-    ("law", "primitive"),
+    ("law", "name"),
     [
-        (lambda x: jnp.linalg.eigvalsh(jnp.outer(x, x)), "eigh"),
-        (lambda x: x.astype(jnp.float32) + 1.0, "convert_element_type"),  # C went on with 64 bits, and was 3e-8 off
+        (lambda x: jnp.linalg.eigvalsh(jnp.outer(x, x)), "jnp.linalg.eigvalsh"),
+        (lambda x: x.astype(jnp.float32) + 1.0, "x.astype"),  # C went on with 64 bits, and was 3e-8 off
         # which wrap around: C gave 300 for 44
         (lambda x: (x[0] > 0.0).astype(jnp.uint8) * jnp.uint8(200) + jnp.uint8(100), "mul"),
-        (lambda x: jnp.int32(x[0]).astype(jnp.int8) * x, "convert_element_type"),
-        (lambda x: x + jax.random.normal(jax.random.key(jnp.int32(x[0]))), "random_seed"),
-        (lambda x: x + jax.random.normal(jax.random.PRNGKey(0)), "random_seed"),
-        (lambda x: jax.lax.reduce_precision(x, 8, 23), "reduce_precision"),  # C had all digits
-        (lambda x: jnp.bitwise_or.reduce(x.astype(jnp.int32)) * x, "reduce_or"),  # C had 1, or 0
-        (lambda x: jax.lax.while_loop(lambda c: c.real < 9.0, lambda c: c + 1.0, jax.lax.complex(x, x)[0]), "complex"),
+        (lambda x: jnp.int32(x[0]).astype(jnp.int8) * x, "jnp.int32(x[0]).astype"),
+        (lambda x: x + jax.random.normal(jax.random.key(jnp.int32(x[0]))), "jax.random.key"),
+        (lambda x: x + jax.random.normal(jax.random.PRNGKey(0)), "jax.random.PRNGKey"),
+        (lambda x: jax.lax.reduce_precision(x, 8, 23), "jax.lax.reduce_precision"),  # C had all digits
+        (lambda x: jnp.bitwise_or.reduce(x.astype(jnp.int32)) * x, "jnp.bitwise_or.reduce"),  # C had 1, or 0
+        (
+            lambda x: jax.lax.while_loop(lambda c: c.real < 9.0, lambda c: c + 1.0, jax.lax.complex(x, x)[0]),
+            "jax.lax.complex",
+        ),
     ],
 )
-def test_what_c_cannot_say_is_refused_by_its_line(law, primitive):
+def test_what_c_cannot_say_is_refused_by_its_name_and_line(law, name):
     line = law.__code__.co_firstlineno
-    said = rf"^`{primitive}` \(.*test_translate\.py:{line}\) cannot be written in C, but must"
+    said = rf"^`{re.escape(name)}` \(.*test_translate\.py:{line}\) cannot be written in C, but must"
     with pytest.raises(NoRuleError, match=said):
         body(law, X)
+
+
+@pytest.mark.parametrize("name", ["solve", "inv", "cholesky", "pinv", "qr"])
+def test_the_refusal_of_linear_algebra_names_functions_that_c_has(name):
+    """The refusal of `jnp.linalg.solve` named `lu`, which no user has written."""
+    calls = {
+        "solve": lambda x: jnp.linalg.solve(jnp.outer(x, x), x),
+        "inv": lambda x: jnp.linalg.inv(jnp.outer(x, x)),
+        "cholesky": lambda x: jnp.linalg.cholesky(jnp.outer(x, x)),
+        "pinv": lambda x: jnp.linalg.pinv(jnp.outer(x, x)),
+        "qr": lambda x: jnp.linalg.qr(jnp.outer(x, x))[0],
+    }
+    with pytest.raises(NoRuleError, match=rf"^`jnp\.linalg\.{name}` \(") as refused:
+        body(calls[name], X)
+    _, _, instead = str(refused.value).partition("but must be ")
+    named = [one for one in ("solve", "determinant", "smallest_eigenvalue") if re.search(rf"\b{one}\b", instead)]
+    assert "solve" in named
+    for one in named:
+        function = getattr(matrices, one)
+        body(lambda x, f=function: f(jnp.outer(x, x), x) if f is matrices.solve else f(jnp.outer(x, x)), X)
 
 
 def test_keys_of_random_numbers_are_refused_wherever_they_come_from():
