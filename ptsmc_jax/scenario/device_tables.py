@@ -93,7 +93,8 @@ class Hardware(Actuators, frozen=True):
     """Actuators, star tracker and gyro of the sampled loop; each device is off where it is absent.
 
     Attributes:
-        attitude_noise: of the star tracker, 1 sigma per axis and sample, a small rotation [rad]
+        attitude_noise: of the star tracker, 1 sigma per axis and sample, a small rotation; the largest of the axes if
+            they differ, or a custom sensor in [sensors] instead [rad]
         rate_noise: of the gyro, 1 sigma per axis and sample [rad/s]
         rate_noise_density: instead of rate_noise, which is then this / sqrt(period): the angle random walk, as in
             "0.02 deg/sqrt(h)" [rad/s/sqrt(Hz)]

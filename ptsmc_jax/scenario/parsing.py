@@ -15,7 +15,7 @@ from typing import Any
 
 import msgspec
 
-from ptsmc_jax.scenario import attitude_keys, disturbance_tables, keys, layouts, own, systems
+from ptsmc_jax.scenario import attitude_keys, device_tables, disturbance_tables, keys, layouts, own, systems
 from ptsmc_jax.scenario.attitude_keys import ATTITUDE_KEYS
 from ptsmc_jax.scenario.errors import MOST_BITS, ScenarioError, brief, show, wrong
 from ptsmc_jax.scenario.layouts import SCENARIOS, TABLES
@@ -298,16 +298,68 @@ def _limit(key: str, value: Any, metric: str, metrics: Mapping[str, Any]) -> flo
 def _in_unit(key: str, text: str, unit: str, allowed: str) -> float:
     """A number in words, "0.05 deg", in a unit."""
     units = catalogues.UNITS.get(unit, {})
-    found = re.fullmatch(r"([-+]?[\d.]+(?:[eE][-+]?\d+)?) ?(.*)", " ".join(text.split()))
-    number, name = found.groups() if found else ("", "")
-    try:
-        size = float(number)
-    except ValueError:
-        size = math.nan
+    size, name = _parts(text)
     if name not in units or not math.isfinite(size):
         example = f', or with a unit such as "0.05 {[*units][:2][-1]}", in {", ".join(units)}' if units else ""
         raise wrong(key, text, allowed + (f" [{unit}]" if unit != "-" else "") + example)
     return size * units[name]
+
+
+def _parts(text: str) -> tuple[float, str]:
+    """Return the number of a text such as "0.05 deg", NaN if there is none, and the name of its unit."""
+    found = re.fullmatch(r"([-+]?[\d.]+(?:[eE][-+]?\d+)?) ?(.*)", " ".join(text.split()))
+    number, name = found.groups() if found else ("", "")
+    try:
+        return float(number), name
+    except ValueError:
+        return math.nan, name
+
+
+def as_written(message: str, raw: Mapping[str, Any]) -> str:
+    """Return an error's message with its value as the raw tables write it, "8 arcsec", and in SI units beside it."""
+    key, _, rest = message.partition(" is ")
+    written = _at(raw, key)
+    many = written if isinstance(written, list | tuple) else [written]
+    if not any(map(_si_unit, many)):
+        return message
+    number = list(map(_in_si, many)) if many is written else _in_si(written)
+    for shown in (brief(number), brief(_floats(number))):
+        if rest.startswith((f"{shown},", f"{shown}:")):
+            unit = _si_unit(written)
+            beside = f" ({number:.6g} {unit})" if unit and number != _parts(many[0])[0] else ""
+            return f"{key} is {brief(written)}{beside}{rest.removeprefix(shown)}"
+    return message
+
+
+def _at(raw: Any, key: str) -> Any:
+    """Return the value of a key such as disturbance.terms[0].amplitude in raw tables; None if they do not have it."""
+    for part in re.findall(r"[^][.]+", key):
+        if isinstance(raw, list | tuple):
+            raw = raw[int(part)] if part.isdecimal() and int(part) < len(raw) else None
+        else:
+            raw = raw.get(part) if isinstance(raw, Mapping) else None
+    return raw
+
+
+def _in_si(value: Any) -> Any:
+    """Return a text such as "8 arcsec" as a number in SI units, and any other value as it is."""
+    unit = _si_unit(value)
+    if not unit:
+        return value
+    size, name = _parts(value)
+    return size * catalogues.UNITS[unit][name]
+
+
+def _si_unit(value: Any) -> str:
+    """Return the SI unit of a text such as "8 arcsec", rad; empty if it is no such text."""
+    name = _parts(value)[1] if isinstance(value, str) else ""
+    return next((unit for unit, names in catalogues.UNITS.items() if name in names), "")
+
+
+def _floats(value: Any) -> Any:
+    if isinstance(value, list):
+        return list(map(_floats, value))
+    return float(value) if isinstance(value, int) and value.bit_length() <= MOST_BITS else value
 
 
 def _in_words(name: str, value: Any, struct: type[Table], kind: Any) -> Any:
@@ -374,7 +426,15 @@ def _value(key: str, value: Any, kind: Any) -> Any:
     try:
         return msgspec.convert(value, kind, strict=True)
     except msgspec.ValidationError:
-        raise wrong(key, value, keys.allowed(kind)) from None
+        raise wrong(key, value, keys.allowed(kind) + _for_axes(key, value)) from None
+
+
+def _for_axes(key: str, value: Any) -> str:
+    """Return what to do if each axis has a noise of its own, which the tables of a star tracker and a gyro have not."""
+    table, _, name = key.partition(".")
+    if table != "hardware" or name not in device_tables.Hardware.noises or not isinstance(value, tuple):
+        return ""
+    return " for all axes: the largest one, or a custom sensor in [sensors] if they differ"
 
 
 def _plain(value: Any) -> Any:

@@ -7,6 +7,7 @@ from typing import Any
 import msgspec
 
 from ptsmc_jax.scenario import checks, free_gains, layouts, mission, own, parsing
+from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario, check_scenario
 from ptsmc_jax.scenario.values import Scaled, Table
 
@@ -35,6 +36,15 @@ def from_tables(raw: Mapping[str, Any], *, run: bool = False) -> Scenario:
     if not isinstance(raw, Mapping):
         found = f"this is a {type(raw).__name__}"
         raise TypeError(f'tables are needed, such as {{"controller": {{"t_f": 35.0}}}}, but {found}')
+    try:
+        return _checked(raw, run)
+    except ScenarioError as error:
+        message = parsing.as_written(str(error), raw)
+        raise error if message == str(error) else ScenarioError(message) from None
+
+
+def _checked(raw: Mapping[str, Any], run: bool) -> Scenario:
+    """Return the scenario of raw tables, with the defaults that depend on other keys."""
     scenario = resolve(parsing.parse(raw, run=run))
     checks.check(scenario)
     if scenario.tune is not None and not own.waits(scenario):
