@@ -83,7 +83,7 @@ def _separator(header: str) -> str:
 
 
 def _with_points(rows: list[list[str]]) -> list[list[str]]:
-    """Return the cells of a table with semicolons, in which all numbers have decimal commas or all have points."""
+    """Return the cells with decimal points; raise ValueError if some numbers have decimal commas and some points."""
     numbers = [cell for row in rows for cell in row if WITH_COMMA.fullmatch(cell)]
     if not numbers:
         return rows

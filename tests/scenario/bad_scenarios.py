@@ -474,7 +474,7 @@ BAD = [
         'requirements.hold_angle is "3 furlong"',
         "in rad, mrad, urad, deg",
     ),
-    # values with a unit, as they are written and in SI units
+    # values with a unit, quoted in that unit and in SI units
     ("hardware.attitude_noise = '-8 arcsec'", 'is "-8 arcsec" (-3.87851e-05 rad)', "at least 0"),
     ("loop.t_end = '0.2 min'", 'loop.t_end is "0.2 min" (12 s)', "at least controller.t_f + loop.window, 31.0"),
     ("loop.t_end = '12 s'", 'loop.t_end is "12 s"', "at least controller.t_f + loop.window, 31.0"),
