@@ -33,7 +33,7 @@ def nichols(L: np.ndarray, names: Sequence[str]) -> Figure:
     axes.plot(angle, _decibels(around), color="0.35", lw=1.0, label=f"sensitivity {MODULUS:g} dB")
     axes.plot(-180.0, 0.0, "+", color="0.0", ms=12, mew=1.6)
     axes.set(xlabel="phase of L [deg]", ylabel="|L| [dB]", ylim=(-DEEPEST, DEEPEST))
-    axes.set_title("Loop opened at the plant's input, in hold", loc="left")
+    axes.set_title("Nominal loop opened at the plant's input, hold phase", loc="left")
     axes.legend()
     return figure
 
@@ -51,7 +51,7 @@ def sensitivity(w: np.ndarray, L: np.ndarray, names: Sequence[str]) -> Figure:
             axes.semilogx(w[shown], size[shown], color=colour, ls=style, label=f"{letter} {name}")
     axes.axhline(MODULUS, color="0.35", lw=1.0, ls=":")
     axes.set(xlabel="frequency [rad/s]", ylabel="size [dB]", ylim=(-DEEPEST, 15.0))
-    axes.set_title("Sensitivity S and complementary sensitivity T, in hold", loc="left")
+    axes.set_title("Sensitivity S and complementary sensitivity T, nominal loop, hold phase", loc="left")
     axes.legend(ncols=len(names))
     return figure
 
@@ -68,7 +68,7 @@ def over_time(left: np.ndarray, before: Margins, hold: Margins) -> Figure:
             axes.semilogx(left, values, color=colour, ls=style, marker=".", label=name.replace("_", " "))
             worst = float(getattr(hold, name).min())
             if np.isfinite(worst):
-                axes.axhline(worst, color=colour, lw=1.0, ls=":", label=f"in hold: {worst:.3g}")
+                axes.axhline(worst, color=colour, lw=1.0, ls=":", label=f"hold phase: {worst:.3g}")
         limited = any(np.isfinite(getattr(margins, name)).any() for margins in (before, hold) for name in names)
         if not limited:
             axes.text(0.5, 0.5, "without a limit", transform=axes.transAxes, ha="center", va="center")
@@ -79,6 +79,6 @@ def over_time(left: np.ndarray, before: Margins, hold: Margins) -> Figure:
         axes.legend(fontsize=9, ncols=2)
     rows[-1].set_xlabel("time to t_f, before the hand-over [s]")
     plain_ticks(rows[-1].xaxis)
-    rows[0].set_title("Margins of the frozen loop, its worst axis", loc="left")
+    rows[0].set_title("Margins of the nominal loop with frozen gains, worst axis", loc="left")
     rows[0].invert_xaxis()
     return figure

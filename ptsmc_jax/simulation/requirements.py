@@ -133,7 +133,8 @@ class Verdict:
         elif math.isnan(worst):
             seen = "no value" if trials == 1 else "no worst value"
         else:
-            seen = ("worst " if trials > 1 else "") + f"{worst:.4g}" + _in_degrees(worst, self.unit)
+            of_loops = f"of {trials} dispersed loops " if each == "loops" else ""
+            seen = (f"worst {of_loops}" if trials > 1 else "") + f"{worst:.4g}" + _in_degrees(worst, self.unit)
         least = must_keep(trials, self.quantile, self.confidence)
         if least is None and self.quantile is not None and self.confidence is not None:
             few = fewest_trials(self.quantile, self.confidence)

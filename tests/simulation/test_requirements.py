@@ -44,6 +44,14 @@ def test_verdict_on_a_single_run(value, ok, met):
     assert (told.met, told.failures, told.trials) == (met, int(not met), 1)
 
 
+def test_a_verdict_over_many_loops_says_that_they_are_dispersed():
+    """One loop, of a run or without dispersions, has the value alone."""
+    required = Requirement("gain_margin", 6.0, "dB", at_least=True)
+    many, one = (required.verdict(np.asarray(v), np.ones(np.shape(v), bool)) for v in ([7.0, 6.2, 9.0], 6.2))
+    assert str(many) == "gain_margin at least 6 dB: worst of 3 dispersed loops 6.2: met"
+    assert str(one) == "gain_margin at least 6 dB: 6.2: met"
+
+
 @settings(max_examples=100, deadline=None, derandomize=True, database=None)
 @given(st.lists(st.tuples(st.floats(), st.booleans()), min_size=1, max_size=20))
 @example([(9e307, True)])  # beyond what a share of the limit can say

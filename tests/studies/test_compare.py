@@ -422,7 +422,7 @@ def test_margins_that_are_asked_for_stand_beside_what_is_flown(eight, tmp_path):
         assert table.head == ("", "gain [dB]", "delay [s]")
         assert table.rows == [("paper", "5.04", "unlimited"), ("prescribed time", "-", "0.2")]
         lines = list(law_sentences.lines(said))
-        assert "  gain_margin at least 6 dB: worst 5.04: NOT met in 1 of 2 loops" in lines
+        assert "  gain_margin at least 6 dB: worst of 2 dispersed loops 5.04: NOT met in 1 of 2 loops" in lines
         assert "  gain_margin at least 6 dB: no worst value: NOT met in 1 of 2 loops" in lines
         assert not [line for line in lines if "delay_margin" in line]
     assert "no law meets every requirement" in page.build(tmp_path / "out")

@@ -168,9 +168,11 @@ def margins(
     quiet: Quiet = False,
     figures: Figures = True,
 ) -> int:
-    """Find what gain, phase, delay and sensitivity the loop leaves: in hold, and frozen on the way to the hand-over.
+    """Print gain, phase, delay and sensitivity margins of the nominal loop: hold phase, and approach phase frozen.
 
-    Exit status: 0 done and stable in hold, 1 done but not stable, 2 bad input.
+    The nominal loop has no dispersions. `tune` and `montecarlo` judge required margins by the worst dispersed loop.
+
+    Exit status: 0 done and stable in the hold phase, 1 done but not stable, 2 bad input.
     """
     loaded, folder = prepare(scenario, "margins", out, trust=trust, force=force)
     from ptsmc_jax.campaigns import store

@@ -49,7 +49,7 @@ def _untold(name: str, change: str) -> Value:
 
 
 def _hold(name: str) -> Value:
-    """A margin in hold, of the worst axis; where it is asked for, the worst that was judged."""
+    """Return a margin of the nominal loop in the hold phase; if it is required, the worst of the dispersed loops."""
     unit = MARGINS[name].unit
 
     def of(law: Summary) -> float | None:
@@ -104,8 +104,9 @@ QUESTIONS = (
         1,
         logarithmic=False,
         limit="gain_margin",
-        note="The chart shows the gain margin of the worst axis in hold, or the worst judged where one is required. "
-        "Below 0 the loop is unstable; at 0 it swings by itself.",
+        note="Margins are those of the nominal loop in the hold phase, at its worst input. A required margin is the "
+        "worst of the dispersed loops, in the hold phase and the judged part of the approach phase. Below 0 the loop "
+        "is unstable; at 0 it swings by itself. The chart shows the gain margin.",
     ),
     Question(
         "What if the model is wrong?",

@@ -1,4 +1,4 @@
-"""Margins as a table and in words: those of `ptsmc margins`, and those that tuned gains leave."""
+"""Margins of the nominal loop as a table and in sentences, for `ptsmc margins` and for tuned gains."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -6,6 +6,7 @@ from typing import Any
 from ptsmc_jax.simulation.catalogues import MARGINS
 from tuning.output.cells import Summary, Table, digits
 
+HOLD, APPROACH = "nominal loop, hold phase", "nominal loop, approach phase"
 ENOUGH = {"gain_margin": 6.0, "phase_margin": 30.0}  # with less an engineer asks
 COLUMNS = {
     "gain_up": "gain up",
@@ -17,7 +18,7 @@ COLUMNS = {
 
 
 def table(summary: Summary) -> Table:
-    """Margins in hold: of each axis of the plant's input alone, of all at once, and of what each sensor sees."""
+    """Margins in the hold phase: at each input alone, at all inputs at once, and at each measured state."""
 
     def row(where: str, margins: Mapping[str, Any], none: str = "none") -> tuple[str, ...]:
         return where, *(digits(margins[name], ".3g", none) if name in margins else "-" for name in COLUMNS)
@@ -25,7 +26,7 @@ def table(summary: Summary) -> Table:
     rows = [row(f"input {name}", margins) for name, margins in summary["hold"].items()]
     rows.append(row("all inputs", summary["together"], "none" if summary["stable"] else "-"))
     rows += [row(name, margins) for name, margins in summary["sensors"].items()]
-    return Table(("in hold", *COLUMNS.values()), rows)
+    return Table((HOLD, *COLUMNS.values()), rows)
 
 
 def lines(summary: Summary, *, with_least: bool = True) -> Iterator[str]:
@@ -36,16 +37,21 @@ def lines(summary: Summary, *, with_least: bool = True) -> Iterator[str]:
     if "swing" in summary:
         yield _swings(summary["swing"])
     elif not summary["stable"]:
-        yield "the loop in hold is NOT stable"
+        yield "the nominal loop is NOT stable in the hold phase"
     elif not summary.get("open"):  # which is said below
-        yield "the loop in hold is stable"
+        yield "the nominal loop is stable in the hold phase"
     if "start_deg" in summary:
         yield (
             f"these margins are of the nominal run, which starts {summary['start_deg']:.4g} deg from the reference "
             "(another start: [initial])"
         )
     if summary.get("missed"):
-        yield "the nominal run misses t_f: margins in hold are those on its way there, not at the reference"
+        yield "the nominal run misses t_f: its loop in the hold phase is not at the reference"
+    if summary.get("dispersed"):
+        yield (
+            "the nominal loop has no dispersions: ptsmc tune and montecarlo judge required margins by the worst of "
+            f"{summary['dispersed']} dispersed loops"
+        )
     unstable = [loop for loop in summary["before"] if not loop["stable"]]
     for judged, caveat in (
         (True, ""), (False, ", where gains change too fast, or the loop is too slow, for that to say much"),
@@ -55,7 +61,7 @@ def lines(summary: Summary, *, with_least: bool = True) -> Iterator[str]:
             yield f"before the hand-over the loop with its gains frozen is unstable at {_span(times)}{caveat}"
     yield from _cut(summary)
     if summary["stable"] and with_least and not summary.get("open"):
-        yield f"the worst margins at one input, in hold and before the hand-over where judged: {left(summary)}"
+        yield f"nominal loop, least at any input in the hold phase and the judged approach phase: {left(summary)}"
     if summary["said"]:
         yield summary["said"]
 
@@ -84,7 +90,7 @@ def _opened(summary: Summary, by_limit: bool) -> dict[str, dict[str, None]]:
         cut = loop.get("cut", opened)
         return [name for name in opened if (name in cut) == by_limit]
 
-    found = {"in hold": dict.fromkeys(at(summary))}
+    found = {"in the hold phase": dict.fromkeys(at(summary))}
     loops = [loop for loop in summary["before"] if at(loop)]
     if loops:
         span = _span(sorted(loop["time_to_go"] for loop in loops))
@@ -109,7 +115,7 @@ def tuned(worst: Mapping[str, Any] | None, *, asked: bool = False) -> Iterator[s
     asked: a margin is among the requirements already.
     """
     short = False
-    for where, place in (("hold", "in hold"), ("before", "before the hand-over")):
+    for where, loop in (("hold", HOLD), ("before", APPROACH)):
         if worst is None or where not in worst:
             continue
         margins = worst[where]
@@ -119,9 +125,9 @@ def tuned(worst: Mapping[str, Any] | None, *, asked: bool = False) -> Iterator[s
             continue
         if not margins["stable"]:
             short = True
-            yield f"with the tuned gains the frozen loop is NOT stable {place}"
+            yield f"{loop}: NOT stable with tuned gains"
             continue
-        yield f"margins that the tuned gains leave {place}: {_shown(margins)}"
+        yield f"{loop}: margins with tuned gains are {_shown(margins)}"
         few = " and ".join(
             f"{enough:g} {MARGINS[name].unit} of {_short(name)}"
             for name, enough in ENOUGH.items()
@@ -129,7 +135,7 @@ def tuned(worst: Mapping[str, Any] | None, *, asked: bool = False) -> Iterator[s
         )
         if few:
             short = True
-            yield f"the loop has less than {few} {place}: what the model leaves out may cost the stability"
+            yield f"{loop}: less than {few}; errors of the model may make the loop unstable"
     if short and not asked:
         more = " and ".join(f"requirements.{name} = {enough:g}" for name, enough in ENOUGH.items())
         yield f"gains that keep more are found with {more}; what they cost, ptsmc pareto --against margins shows"
@@ -137,10 +143,10 @@ def tuned(worst: Mapping[str, Any] | None, *, asked: bool = False) -> Iterator[s
 
 def _swings(swing: Mapping[str, Any]) -> str:
     return (
-        f"the nominal run does NOT come to rest in hold: without noise and disturbance its command still swings by "
-        f"{swing['size']:.3g} {swing['unit']} every {swing['periods']:.3g} control periods, as with a smooth sign too "
-        "narrow for the period, or gains at the border of stability; a loop that swings by itself has no margins left, "
-        "and they count as zero"
+        "the nominal run does NOT come to rest in the hold phase: without noise and disturbance its command still "
+        f"swings by {swing['size']:.3g} {swing['unit']} every {swing['periods']:.3g} control periods, as with a smooth "
+        "sign too narrow for the period, or gains at the border of stability; a loop that swings by itself has no "
+        "margins left, and they count as zero"
     )
 
 

@@ -307,14 +307,16 @@ def _margins(result: Result) -> tuple[Heading, list[Section]]:
     lines = list(margin_sentences.lines(summary, with_least=False))
     if summary.get("open"):
         why = ": a limit of the actuators cuts the command" if summary.get("cut", True) else " in the sample looked at"
-        heading = Heading("bad", f"The loop in hold is open{why}", lines)
+        heading = Heading("bad", f"The nominal loop is open in the hold phase{why}", lines)
     elif summary["stable"] and any(loop["judged"] and not loop["stable"] for loop in summary["before"]):
-        said = "The loop is stable in hold, but before the hand-over, with its gains frozen, it is NOT"
+        said = (
+            "The nominal loop is stable in the hold phase, but in the approach phase, with its gains frozen, it is NOT"
+        )
         heading = Heading("bad", f"{said}: {margin_sentences.left(summary)}", lines)
     elif summary["stable"]:
-        heading = Heading("calm", f"The loop is stable: {margin_sentences.left(summary)}", lines)
+        heading = Heading("calm", f"The nominal loop is stable: {margin_sentences.left(summary)}", lines)
     else:
-        heading = Heading("bad", "The loop in hold is NOT stable", lines)
+        heading = Heading("bad", "The nominal loop is NOT stable in the hold phase", lines)
     return heading, [Section("Margins", [_table(margin_sentences.table(summary))])]
 
 

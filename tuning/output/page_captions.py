@@ -24,7 +24,7 @@ CAPTIONS = {
     "map": "Error and peak torque over the two keys, with the borders at which the loop loses its stability.",
     "nichols": "The loop opened at each axis of the plant's input, the others closed.",
     "sensitivity": "How disturbances (S) and noise (T) come through, over the frequency.",
-    "margins": "Margins of the frozen loop on the way to the hand-over.",
+    "margins": "Margins of the nominal loop in the approach phase, with its gains frozen.",
     "fan": "How the error goes with time: the share of trials inside each band.",
     "distributions": "The share of the trials up to each value; the scale stretches both ends.",
     "inputs": "What was drawn (across) against what came of it (up), a point a trial; a limit is dashed.",

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ptsmc_jax.campaigns import store
+from ptsmc_jax.campaigns import margin_verdicts, store
 from ptsmc_jax.numerics import attitude
 from ptsmc_jax.scenario import Study, errors, own, parsing, study
 from ptsmc_jax.scenario.errors import ScenarioError
@@ -90,7 +90,7 @@ def names(ready: Study) -> tuple[list[str], list[str]]:
 
 
 def summary(ready: Study, course: Course) -> dict[str, Any]:
-    """What `summary.json` says: [dB], [deg], [s]; null: no limit, or no value."""
+    """Return the margins for `summary.json`: [dB], [deg], [s]; null: no limit, or no value."""
     inputs, seen = names(ready)
     (_, hold), before = course.hold, course.before
 
@@ -123,6 +123,7 @@ def summary(ready: Study, course: Course) -> dict[str, Any]:
             for k, (t, counts) in enumerate(zip(course.t[:-1], course.judged, strict=False))
         ],
         **({"missed": True} if course.missed else {}),
+        **({"dispersed": margin_verdicts.TRIALS} if margin_verdicts.differ(ready.dispersion) else {}),
         "said": NO_SIGN if ready.scenario.exact_sign else None,
         **({"start_deg": _start(ready)} if ready.parts.plant.attitude else {}),
         **({} if course.swing is None else _swing(ready.scenario, course.swing)),
