@@ -11,13 +11,19 @@ import re
 import secrets
 import shutil
 import tempfile
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import tomli_w
 
 from ptsmc_jax.scenario import parsing
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
 
 JOURNAL = "journal.bin"  # of a run that is not finished
 SUMMARY = "summary.json"  # of one that is
@@ -34,6 +40,10 @@ PACKAGES = ("ptsmc-jax", "jax", "jaxlib", "numpy", "scipy", "optax", "cmaes")
 
 class RefusedError(ValueError):
     """A folder that must not be written to. Its text is one sentence."""
+
+
+class InUseError(RefusedError):
+    """Another process is writing into the folder."""
 
 
 def versions(command: str, seed: int | None, **others: Any) -> dict[str, Any]:
@@ -109,8 +119,11 @@ def _has(path: Path, mark: bytes) -> bool:
     """Whether it is a file with this near its beginning."""
     if not path.is_file():
         return False
-    with path.open("rb") as file:
-        return mark in file.read(1024)
+    try:
+        with path.open("rb") as file:
+            return mark in file.read(1024)
+    except FileNotFoundError:  # another shard has removed it
+        return False
 
 
 def _of_laws(folder: Path) -> list[Path]:
@@ -168,10 +181,83 @@ def check(folder: Path, force: bool) -> None:
     there = next(one for one in (folder, *folder.parents) if one.exists())
     if not _takes(there):
         raise RefusedError(f"--out is {folder}, but nothing may be written into {there}; allowed is a folder elsewhere")
-    if folder.is_dir() and any(folder.iterdir()) and not force:
+    if folder.is_dir() and not is_empty(folder) and not force:
         raise RefusedError(
             f"--out is {folder}, which holds something already; allowed is a new folder, or --force to write into it"
         )
+
+
+def is_empty(folder: Path) -> bool:
+    """Whether a folder holds nothing, except the lock file of `in_use`."""
+    return all(path.name == _lock_file(folder).name for path in folder.iterdir())
+
+
+@contextlib.contextmanager
+def in_use(folder: Path, *, force: bool = True, shared: bool = False) -> Iterator[None]:
+    """Lock a result folder while this process writes into it; the lock ends with the process, even if it is killed.
+
+    Platforms without `fcntl` and file systems without locks are not protected.
+
+    Args:
+        folder: the result folder, which need not exist yet.
+        force: the folder may hold something already.
+        shared: other processes that also share may write at the same time, such as the shards of a campaign.
+
+    Raises:
+        InUseError: another process writes into the folder.
+        RefusedError: see `check`.
+    """
+    check(folder, force=True)  # before anything is made
+    path = _lock_file(folder)
+    made = [parent for parent in path.parents if not parent.exists()]
+    lock = _locked(path, shared=shared)
+    if lock is None:
+        raise InUseError(f"{folder} is in use by another ptsmc process; wait for its end, or choose another folder")
+    try:
+        check(folder, force)
+        yield
+    finally:
+        with contextlib.suppress(OSError), lock:
+            _flock(lock, shared=False)  # fails if others share it
+            path.unlink()
+        for parent in made:
+            with contextlib.suppress(OSError):  # it is not empty
+                parent.rmdir()
+
+
+def _lock_file(folder: Path) -> Path:
+    folder = Path(os.path.realpath(folder))
+    return _beside(folder) / f".{folder.name}.lock"
+
+
+def _locked(path: Path, *, shared: bool) -> IO[str] | None:
+    """Open and lock a file; return None if another process holds the lock."""
+    for _ in range(30):  # another process may release or remove it at this moment
+        with contextlib.suppress(BlockingIOError, FileNotFoundError):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            file = path.open("a+")
+            try:
+                _flock(file, shared=shared)
+                if os.path.samestat(os.fstat(file.fileno()), path.stat()):
+                    return file
+            except BaseException:
+                file.close()
+                raise
+            file.close()
+        time.sleep(0.01)
+    return None
+
+
+def _flock(file: IO[str], *, shared: bool) -> None:
+    """Lock an open file. Raises BlockingIOError if another process holds the lock."""
+    if fcntl is None:
+        return
+    try:
+        fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise
+    except OSError:  # the file system has no locks
+        pass
 
 
 def _takes(folder: Path) -> bool:
@@ -203,8 +289,7 @@ def write(folder: Path, fill: Callable[[Path], None]) -> None:
     """
     asked, folder = folder, Path(os.path.realpath(folder))  # of a link, what it leads to
     folder.parent.mkdir(parents=True, exist_ok=True)
-    inside = folder.is_mount() or (folder.is_dir() and not os.access(folder.parent, os.W_OK))
-    making = (folder if inside else folder.parent) / f".{folder.name}-{secrets.token_hex(4)}"
+    making = _beside(folder) / f".{folder.name}-{secrets.token_hex(4)}"
     try:
         making.mkdir()
     except OSError as error:  # names a folder that nobody asked for
@@ -227,6 +312,15 @@ def write(folder: Path, fill: Callable[[Path], None]) -> None:
             os.replace(path, target)
     finally:
         shutil.rmtree(making, ignore_errors=True)
+
+
+def _beside(folder: Path) -> Path:
+    """Return the place for temporary files of a result folder: its parent if that is possible, otherwise itself.
+
+    folder: its path without links.
+    """
+    inside = folder.is_mount() or (folder.is_dir() and not os.access(folder.parent, os.W_OK))
+    return folder if inside else folder.parent
 
 
 def record(

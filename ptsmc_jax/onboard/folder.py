@@ -161,5 +161,6 @@ def export(
     known = what if isinstance(what, Scenario) else scenarios.read(what)
     source = "a scenario" if isinstance(what, Scenario) else Path(what).name
     made = Controller(known, identifier(name or ("flight" if isinstance(what, Scenario) else Path(what).stem)), source)
-    store.write(path, lambda making: write(making, made, seed, trials))
+    with store.in_use(path, force=force):
+        store.write(path, lambda making: write(making, made, seed, trials))
     return path

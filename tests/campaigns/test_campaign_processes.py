@@ -120,6 +120,32 @@ def test_killed_at_some_moments_it_ends_with_the_same_rows(folder, request, time
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("options", [((), ()), (("--shard", "1/2"), ("--shard", "2/2"))], ids=["same", "shards"])
+def test_two_processes_killed_in_one_folder_lose_no_row(folder, whole, options):
+    """Shards run at the same time; of two equal commands the later one is refused. Both are killed three times."""
+    rng, codes = np.random.default_rng(1), set()
+    for _ in range(3):
+        before = len(parts(folder))
+        runs = [started(folder, "--trials", str(TRIALS), *option, start_new_session=True) for option in options]
+        await_parts(folder, before + 1, runs[0])
+        time.sleep(rng.uniform(0.0, 0.06))
+        for run in runs:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(run.pid, signal.SIGKILL)
+        for run in runs:
+            code, error = ended(run)
+            codes.add(code)
+            assert not error or "is in use" in error
+        for name in parts(folder)[1:]:
+            (folder / "out/montecarlo-s/trials" / name).unlink()
+    assert -signal.SIGKILL in codes
+    for option in sorted(set(options)):
+        assert ended(started(folder, "--trials", str(TRIALS), *option)) == (0, "")
+    same(rows_of(folder), whole)
+    assert [path.name for path in (folder / "out").iterdir()] == ["montecarlo-s"]
+
+
+@pytest.mark.long
 def test_interrupted_it_keeps_what_is_flown(folder, whole):
     run = started(folder, "--trials", str(TRIALS))
     assert await_parts(folder, 2, run)

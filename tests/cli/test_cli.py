@@ -439,7 +439,7 @@ def test_an_interrupted_run_writes_nothing(command, tmp_path, monkeypatch):
     monkeypatch.setattr(single, "write", stop)
     status, out, err = command("simulate", "s.toml")
     assert (status, out, err) == (130, "", "ptsmc: interrupted; nothing was written\n")
-    assert list((tmp_path / "out").iterdir()) == []
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_defect_of_ours_is_not_called_bad_input(tmp_path, monkeypatch):

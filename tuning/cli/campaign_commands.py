@@ -1,6 +1,7 @@
 """The commands of a campaign: `ptsmc montecarlo`, `summarize`, `worst`, `replay`."""
 
 import contextlib
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -120,6 +121,7 @@ def montecarlo(
             raise UsageError(sentence)
     bits = 32 if precision == "32" else 64
     loaded, path = prepare(scenario, "montecarlo", out, device, bits, trust=trust)
+    from ptsmc_jax.campaigns import store
     from ptsmc_jax.simulation import catalogues
 
     if confident and set(loaded.requirements) <= set(catalogues.MARGINS):
@@ -149,7 +151,8 @@ def montecarlo(
         flight_commands.say_otherwise(folder.computer)
 
     def flown() -> int:
-        with _elsewhere(cluster, tls) as elsewhere:
+        one_of_several = share != (1, 1) and not dry_run
+        with store.in_use(folder.path, shared=one_of_several), _elsewhere(cluster, tls) as elsewhere:
             campaign_folder.begin(folder, force)
             with campaign_terminal.Progress(quiet) as report:
                 if dry_run:
@@ -157,8 +160,8 @@ def montecarlo(
                     done = folder
                 else:
                     done = _flown(folder, share, report, elsewhere, until_confident)
-        if not a_part:
-            return _summarised(done, quiet, figures)
+            if not a_part:
+                return _summarised(done, quiet, figures)
         if not quiet:
             campaign_terminal.share_done(done, share, planned=dry_run)
         return 0
@@ -206,9 +209,16 @@ def summarize(folder: CampaignFolder, /, *, quiet: Quiet = False, figures: Figur
     and margins judged yet, 2 bad input, among it rows that are damaged.
     """
     _configured(folder)
+    from ptsmc_jax.campaigns import store
     from tuning.studies import campaign_folder
 
-    return _summarised(campaign_folder.opened(folder), quiet, figures)
+    campaign = campaign_folder.opened(folder)
+    try:
+        with store.in_use(folder, shared=True):
+            return _summarised(campaign, quiet, figures)
+    except store.InUseError as error:
+        print(f"ptsmc: {error}; the summary is printed and not written", file=sys.stderr)
+        return _summarised(campaign, quiet, figures, write=False)
 
 
 def worst(
@@ -283,12 +293,13 @@ def replay(
     store.check(place, force or out is None)  # a replay of the same trial is the same
     own_parts.allow(opened.programs, folder, opened.identity, trust)
     opened = replace(opened, trusted=True)
-    again = campaign_summary.replay(opened, trial)
-    about = opened.scenario, again.run, opened.seed, trial, figures, opened.computer
-    # what simulate does not fly: a plan's row, numbers of 32 bits
-    from_here = opened.plan is not None or opened.bits != 64
-    replayed = {"campaign": str(folder.absolute()), "metrics": opened.own} if from_here else {}
-    store.write(place, lambda making: single.write(making, *about, replayed))
+    with store.in_use(place, force=force or out is None):
+        again = campaign_summary.replay(opened, trial)
+        about = opened.scenario, again.run, opened.seed, trial, figures, opened.computer
+        # what simulate does not fly: a plan's row, numbers of 32 bits
+        from_here = opened.plan is not None or opened.bits != 64
+        replayed = {"campaign": str(folder.absolute()), "metrics": opened.own} if from_here else {}
+        store.write(place, lambda making: single.write(making, *about, replayed))
     if not quiet:
         terminal.run(single.summary(again.run, opened.scenario, opened.computer), opened.scenario.plant.kind, place)
         campaign_terminal.replayed(again.off, again.rounding, campaign_summary.SAME)
@@ -303,13 +314,14 @@ def _configured(folder: Path) -> None:
     configure(keep_programs=True, device="cpu", bits=32 if store.read_versions(folder).get("precision") == 32 else 64)
 
 
-def _summarised(folder: "Folder", quiet: bool, figures: bool) -> int:
+def _summarised(folder: "Folder", quiet: bool, figures: bool, *, write: bool = True) -> int:
     from tuning.studies import campaign_summary
 
     with terminal.Progress(quiet) as report:
         report("summing up", 0, 0)
         summary = campaign_summary.summarise(folder)
-        campaign_summary.write_summary(folder, summary, figures)
+        if write:
+            campaign_summary.write_summary(folder, summary, figures)
     if not quiet:
         campaign_terminal.campaign(summary, folder.path)
     return 0 if summary["status"] == "met" else 1

@@ -47,7 +47,8 @@ def export(
     from ptsmc_jax.onboard import templates
 
     controller = controllers.Controller(loaded, controllers.identifier(name or scenario.stem), scenario.name)
-    store.write(folder, lambda making: controllers.write(making, controller, seed, trials))
+    with store.in_use(folder, force=force):
+        store.write(folder, lambda making: controllers.write(making, controller, seed, trials))
     if not quiet:
         costs = ", ".join(f"{n} {what}" for what, n in templates.operations(controller.code.counts).items() if n)
         check = f"make -C {shlex.quote(str(folder))} check"

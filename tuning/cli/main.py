@@ -83,8 +83,9 @@ def simulate(
     steps = timing.steps(ready.parts)
     if steps > LONG and not quiet:
         terminal.say(f"flying {steps} integration steps, with their history")
-    run = runs.fly(ready, seed, trial, OURS if computer is None else computer.software)
-    store.write(folder, lambda making: single.write(making, loaded, run, seed, trial, figures, computer))
+    with store.in_use(folder, force=force):
+        run = runs.fly(ready, seed, trial, OURS if computer is None else computer.software)
+        store.write(folder, lambda making: single.write(making, loaded, run, seed, trial, figures, computer))
     if not quiet:
         terminal.run(single.summary(run, loaded, computer), loaded.plant.kind, folder)
     return 0 if run.met else 1
@@ -105,10 +106,11 @@ def reproduce(*, out: Out = None, force: Force = False, quiet: Quiet = False, fi
     configure(keep_programs=True)
     from tuning.studies import reproduction
 
-    with terminal.Progress(quiet) as report:
-        report("flying the paper's figures", 0, 0)
-        reproduced = reproduction.reproduce()
-    store.write(folder, lambda making: reproduction.write(making, reproduced, figures))
+    with store.in_use(folder, force=force):
+        with terminal.Progress(quiet) as report:
+            report("flying the paper's figures", 0, 0)
+            reproduced = reproduction.reproduce()
+        store.write(folder, lambda making: reproduction.write(making, reproduced, figures))
     if not quiet:
         terminal.reproduction(reproduction.summary(reproduced), folder)
     return 0 if reproduced.ok else 1
@@ -149,9 +151,12 @@ def map_(
     up = mapping.axis(y or mapping.usual_deltas(loaded), "--y")
     if across.key == up.key:
         raise UsageError(f"--y is {up.text}, but must be another key than --x")
-    with terminal.Progress(quiet) as report:
-        flown = mapping.fly(loaded, across, up, seed, trials, lambda done, total: report("flying pairs", done, total))
-    store.write(folder, lambda making: mapping.write(making, flown, seed, figures))
+    with store.in_use(folder, force=force):
+        with terminal.Progress(quiet) as report:
+            flown = mapping.fly(
+                loaded, across, up, seed, trials, lambda done, total: report("flying pairs", done, total)
+            )
+        store.write(folder, lambda making: mapping.write(making, flown, seed, figures))
     if not quiet:
         terminal.grid(flown.cells, (across.key, up.key), loaded.plant.kind, folder)
     return 0
@@ -178,10 +183,11 @@ def margins(
     from ptsmc_jax.campaigns import store
     from tuning.studies import stability
 
-    with terminal.Progress(quiet) as report:
-        report("linearising the loop", 0, 0)
-        ready, course = stability.find(loaded)
-    store.write(folder, lambda making: stability.write(making, ready, course, figures))
+    with store.in_use(folder, force=force):
+        with terminal.Progress(quiet) as report:
+            report("linearising the loop", 0, 0)
+            ready, course = stability.find(loaded)
+        store.write(folder, lambda making: stability.write(making, ready, course, figures))
     summary = stability.summary(ready, course)
     if not quiet:
         terminal.margins(summary, folder)

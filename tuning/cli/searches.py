@@ -60,7 +60,7 @@ def with_tune(scenario: "Scenario") -> "Scenario":
 def run(search: LongSearch, loaded: "Scenario", folder: Path, *, force: bool, quiet: bool) -> int:
     """A long search: shown again if it was done before, gone on with if it was interrupted. Returns the exit status."""
     from ptsmc_jax.campaigns import store
-    from ptsmc_jax.scenario import parsing, study
+    from ptsmc_jax.scenario import parsing
 
     tables = parsing.dump(loaded)
     done = None if force else store.previous(folder, tables, search.known_by)
@@ -68,6 +68,16 @@ def run(search: LongSearch, loaded: "Scenario", folder: Path, *, force: bool, qu
         if not quiet:
             search.show(done, folder, "already done")
         return STATUS[done["status"]]
+    with store.in_use(folder):
+        return _run(search, loaded, folder, force=force, quiet=quiet)
+
+
+def _run(search: LongSearch, loaded: "Scenario", folder: Path, *, force: bool, quiet: bool) -> int:
+    """Begin or resume a search in a folder that this process has locked. Returns the exit status."""
+    from ptsmc_jax.campaigns import store
+    from ptsmc_jax.scenario import parsing, study
+
+    tables = parsing.dump(loaded)
     going_on = not force and store.begun(folder, tables, search.known_by)
     if not going_on:
         store.check(folder, force)

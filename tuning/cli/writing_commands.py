@@ -20,8 +20,10 @@ def report(
     from ptsmc_jax.campaigns import store
     from tuning.output import page
 
-    content = page.build(folder)
-    store.write(folder, lambda making: store.write_text(making / "report.html", content))
+    page.read(folder)  # refuses what is no result
+    with store.in_use(folder, shared=True):
+        content = page.build(folder)
+        store.write(folder, lambda making: store.write_text(making / "report.html", content))
     if not quiet:
         terminal.say(f"page in {folder / 'report.html'}")
     return 0

@@ -1,5 +1,6 @@
 """Campaign folders: begun, opened, flown, planned; what tells one campaign from another."""
 
+import contextlib
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -273,7 +274,7 @@ def _begun(wanted: Folder, tables: Mapping[str, Any]) -> bool:
     """Whether its folder holds this very campaign already; raises RefusedError where that may not become it."""
     path = wanted.path
     store.check(path, force=True)
-    if not path.is_dir() or not any(path.iterdir()):
+    if not path.is_dir() or store.is_empty(path):
         return False
     programs = [name for name in store.read_versions(path) if name == "metrics" or name.endswith("_sha256")]
     other = store.difference(path, tables, {**dict.fromkeys(programs), **wanted.identity, **store.packages()})
@@ -366,7 +367,8 @@ def fly(
     parts, broken = folder.rows.parts()
     for path in broken:
         aside = path.with_name(path.name + ".damaged")
-        os.replace(path, aside)
+        with contextlib.suppress(FileNotFoundError):  # another shard has set it aside
+            os.replace(path, aside)
         what = "is damaged and is flown again" if rows.named(path) else "is no part of a campaign"
         print(f"ptsmc: {path} {what}; it is kept as {aside.name}", file=sys.stderr)
     alone = shard == (1, 1) and elsewhere is None

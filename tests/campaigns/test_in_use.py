@@ -1,0 +1,145 @@
+"""One process at a time writes into a result folder."""
+
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from ptsmc_jax.campaigns import campaign, store
+from tests.helpers import ROOT, SHORT_CHAIN, tree
+
+
+def refused(folder, **options):
+    """Whether the folder is in use."""
+    try:
+        with store.in_use(folder, **options):
+            return False
+    except store.InUseError:
+        return True
+
+
+@pytest.mark.parametrize("first", [False, True])
+@pytest.mark.parametrize("second", [False, True])
+def test_a_folder_has_one_writer_or_several_that_share(tmp_path, first, second):
+    folder = tmp_path / "new" / "out"
+    with store.in_use(folder, shared=first):
+        assert refused(folder, shared=second) is not (first and second)
+        assert refused(tmp_path / "new" / "other") is False
+        (tmp_path / "link").symlink_to(folder)
+        assert refused(tmp_path / "link", shared=second) is not (first and second)
+        (tmp_path / "link").unlink()
+    assert refused(folder) is False
+    assert list(tmp_path.iterdir()) == []  # no lock file, no folder
+
+
+def test_the_last_of_several_writers_removes_the_lock_file(tmp_path):
+    with store.in_use(tmp_path / "out", shared=True):
+        with store.in_use(tmp_path / "out", shared=True):
+            pass
+        assert refused(tmp_path / "out")
+    assert list(tmp_path.iterdir()) == []
+
+
+HOLDING = """
+import sys, time
+from pathlib import Path
+from ptsmc_jax.campaigns import store
+with store.in_use(Path("out")):
+    print("locked", flush=True)
+    time.sleep(60.0)
+"""
+
+
+def test_the_lock_ends_with_a_killed_process(tmp_path):
+    environment = dict(os.environ, PYTHONPATH=str(ROOT))
+    call = [sys.executable, "-c", HOLDING]
+    with subprocess.Popen(call, cwd=tmp_path, env=environment, text=True, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "locked\n"
+        assert refused(tmp_path / "out")
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    assert not refused(tmp_path / "out")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_system_without_locks_is_written_to(tmp_path, monkeypatch):
+    def unsupported(*_):
+        raise OSError(95, "Operation not supported")
+
+    monkeypatch.setattr(store.fcntl, "flock", unsupported)
+    assert not refused(tmp_path / "out")
+    monkeypatch.setattr(store, "fcntl", None)  # Windows
+    assert not refused(tmp_path / "out")
+
+
+def test_a_lock_file_inside_the_folder_does_not_count_as_its_content(tmp_path, monkeypatch):
+    """The folder may be a mounted disk, with nothing beside it on the same disk."""
+    folder = tmp_path / "out"
+    folder.mkdir()
+    monkeypatch.setattr(type(tmp_path), "is_mount", lambda path: path == folder)
+    with store.in_use(folder, force=False):
+        assert len(list(folder.iterdir())) == 1
+        assert refused(folder)
+        store.check(folder, force=False)
+        assert store.is_empty(folder)
+        (folder / "a").touch()
+        assert not store.is_empty(folder)
+    assert [path.name for path in folder.iterdir()] == ["a"]
+    with pytest.raises(store.RefusedError, match="holds something already"), store.in_use(folder, force=False):
+        pass
+
+
+SCENARIO = ("s.toml", "--quiet", "--no-figures")
+
+
+@pytest.mark.parametrize(
+    "asked",
+    [
+        ("simulate", *SCENARIO),
+        ("map", *SCENARIO),
+        ("margins", *SCENARIO),
+        ("tune", *SCENARIO),
+        ("pareto", *SCENARIO),
+        ("montecarlo", *SCENARIO, "--trials", "10"),
+        ("montecarlo", *SCENARIO, "--trials", "10", "--shard", "1/2"),
+        ("montecarlo", *SCENARIO, "--trials", "10", "--dry-run"),
+        ("export", "s.toml", "--quiet"),
+        ("reproduce", "--quiet"),
+    ],
+    ids=" ".join,
+)
+def test_commands_do_not_write_into_a_folder_in_use(command, tmp_path, asked):
+    (tmp_path / "s.toml").write_text(SHORT_CHAIN)
+    before = tree(tmp_path)
+    with store.in_use(tmp_path / "out"):
+        code, said, error = command(*asked, "--out", "out")
+        assert (code, said, error.count("\n")) == (2, "", 1)
+        assert error.startswith("ptsmc: out is in use by another ptsmc process")
+    assert tree(tmp_path) == before
+
+
+def test_shards_of_one_folder_run_at_the_same_time(command, tmp_path, monkeypatch):
+    monkeypatch.setattr(campaign, "PART", 100)
+    (tmp_path / "s.toml").write_text(SHORT_CHAIN)
+    asked = ("montecarlo", *SCENARIO, "--trials", 110, "--out", "out")
+    with store.in_use(tmp_path / "out", shared=True):
+        assert command(*asked, "--shard", "1/2") == command(*asked, "--shard", "2/2") == (0, "", "")
+        assert command("summarize", "out", "--quiet", "--no-figures") == (0, "", "")
+        assert command(*asked)[0] == 2
+
+
+def test_a_campaign_in_use_is_summarised_without_writing(command, tmp_path):
+    (tmp_path / "s.toml").write_text(SHORT_CHAIN)
+    asked = ("montecarlo", *SCENARIO, "--trials", "10", "--out", "out")
+    assert command(*asked) == (0, "", "")
+    _, printed, _ = command("summarize", "out", "--no-figures")
+    (tmp_path / "out" / "summary.json").unlink()
+    before = tree(tmp_path / "out")
+    with store.in_use(tmp_path / "out"):
+        code, said, error = command("summarize", "out", "--no-figures")
+    assert (code, said) == (0, printed)
+    assert "is in use" in error
+    assert tree(tmp_path / "out") == before
