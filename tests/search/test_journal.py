@@ -66,3 +66,35 @@ def test_another_question_drops_what_follows(tmp_path):
     replayed.get(b"question 0", dict)
     np.testing.assert_array_equal(replayed.get(b"another", dict)["f"], np.ones(1))
     assert not replayed.replaying
+
+
+def test_reading_a_journal_changes_no_byte(tmp_path):
+    """Only the process that records the next evaluation cuts a record that a killed process left unfinished."""
+    ask(Journal(tmp_path / "j"), 3, [])
+    data = (tmp_path / "j").read_bytes()
+    (tmp_path / "j").write_bytes(data[:-5])
+    ask(Journal(tmp_path / "j"), 2, [])
+    assert (tmp_path / "j").read_bytes() == data[:-5]
+
+
+def test_a_killed_process_loses_no_record_of_other_questions_before_it_has_an_answer(tmp_path):
+    def killed():
+        raise KeyboardInterrupt
+
+    ask(Journal(tmp_path / "j"), 3, [])
+    data = (tmp_path / "j").read_bytes()
+    journal = Journal(tmp_path / "j")
+    with pytest.raises(KeyboardInterrupt):
+        journal.get(b"another", killed)
+    assert (tmp_path / "j").read_bytes() == data
+    assert not journal.replaying
+
+
+def test_a_record_that_an_interrupt_left_unfinished_is_replaced(tmp_path):
+    journal, asked = Journal(tmp_path / "j"), []
+    ask(journal, 1, [])
+    with (tmp_path / "j").open("ab") as file:
+        file.write(b"half a record")
+    journal.get(b"question 1", lambda: {"f": np.ones(1)})
+    ask(Journal(tmp_path / "j"), 2, asked)
+    assert asked == []

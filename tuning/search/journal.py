@@ -1,12 +1,13 @@
-"""A journal of what a long computation has evaluated: one that begins again reads it instead of computing anew.
+"""A journal of the evaluations of a long computation, from which an interrupted computation resumes.
 
-Records are appended to one file, each with its length and checksum, so what a kill leaves half written is cut off.
+Records are appended to one file, each with its length and checksum. One process writes at a time: see `store.in_use`.
 """
 
 import io
 import struct
 import zlib
-from collections.abc import Callable, Mapping
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -18,41 +19,36 @@ class Journal:
     """Evaluations in the order in which they are asked for; without a path, none is kept."""
 
     def __init__(self, path: Path | None = None):
-        self._path, self._records, self._next = path, [], 0
-        if path is not None and path.exists():
-            self._records, end = _read(path)
-            with path.open("r+b") as file:
-                file.truncate(end)
+        self._path = path
+        self._earlier = deque(_records(path.read_bytes()) if path is not None and path.exists() else ())
+        self._end = 0  # bytes of the file that hold the evaluations so far
 
     @property
     def replaying(self) -> bool:
-        """Whether there are evaluations from before that were not asked for yet."""
-        return self._next < len(self._records)
+        """Whether an earlier process left evaluations that were not asked for yet."""
+        return bool(self._earlier)
 
     def get(self, question: bytes, compute: Callable[[], Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
-        """What was written for this question, or what `compute` gives, which is then written.
+        """Return the recorded answer to a question, or compute and record it.
 
-        question: what the answer depends on. Another one than was asked here before: what follows is dropped.
+        Args:
+            question: everything that the answer depends on. If another question was recorded at this position, that
+                record and all later ones are replaced.
+            compute: returns the answer.
         """
         asked = np.frombuffer(struct.pack("<I", zlib.crc32(question)), dtype=np.uint8)
-        if self.replaying:
-            record = dict(self._records[self._next])
+        if self._earlier:
+            record, end = self._earlier.popleft()
             if np.array_equal(record.pop("question"), asked):
-                self._next += 1
+                self._end = end
                 return record
-            self._drop()
+            self._earlier.clear()
         answer = {name: np.asarray(value) for name, value in compute().items()}
         if self._path is not None:
             with self._path.open("ab") as file:
-                file.write(_packed({"question": asked, **answer}))
-            self._records.append({})  # read back by nobody in this run
-            self._next += 1
+                file.truncate(self._end)  # a record that a kill cut, or records of other questions
+                self._end += file.write(_packed({"question": asked, **answer}))
         return answer
-
-    def _drop(self) -> None:
-        assert self._path is not None
-        self._path.write_bytes(b"".join(_packed(record) for record in self._records[: self._next]))
-        del self._records[self._next :]
 
 
 def _packed(record: Mapping[str, np.ndarray]) -> bytes:
@@ -62,15 +58,15 @@ def _packed(record: Mapping[str, np.ndarray]) -> bytes:
     return _HEAD.pack(len(data), zlib.crc32(data)) + data
 
 
-def _read(path: Path) -> tuple[list[dict[str, np.ndarray]], int]:
-    """The records of a file, and where the last whole one ends."""
-    data, at, records = path.read_bytes(), 0, []
+def _records(data: bytes) -> Iterator[tuple[dict[str, np.ndarray], int]]:
+    """Yield the whole records, each with the position of its end; stop at a damaged record."""
+    at = 0
     while at + _HEAD.size <= len(data):
         length, checksum = _HEAD.unpack_from(data, at)
-        body = data[at + _HEAD.size : at + _HEAD.size + length]
+        at += _HEAD.size
+        body = data[at : at + length]
         if len(body) < length or zlib.crc32(body) != checksum:
-            break
+            return
+        at += length
         with np.load(io.BytesIO(body)) as loaded:
-            records.append({name: loaded[name] for name in loaded.files})
-        at += _HEAD.size + length
-    return records, at
+            yield dict(loaded), at
