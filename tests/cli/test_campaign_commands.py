@@ -11,7 +11,7 @@ import pytest
 
 from ptsmc_jax.campaigns import campaign, montecarlo, store
 from ptsmc_jax.simulation import rollout
-from tests.helpers import SHORT, SHORT_CHAIN, same, short
+from tests.helpers import SHORT, SHORT_CHAIN, same, short, tree
 from tests.output.pages import checked
 from tuning.output import campaign_terminal, progress_lines, sentences
 from tuning.studies import campaign_summary
@@ -189,7 +189,7 @@ def test_another_campaign_in_the_same_folder_is_refused(command, flown, tmp_path
         for name in mine:
             (flown / name).parent.mkdir(exist_ok=True)
             (flown / name).write_text("mine")
-        assert command(*again, "--shard", "1/2")[0] == 0
+        assert command(*again, "--dry-run")[0] == 0
         assert [(flown / name).read_text() for name in mine] == ["mine"] * 4
         assert not (flown / "summary.json").exists()  # that of the campaign before, which would pass for this one's
         (flown / "trials" / "mine.parquet").write_text("mine")
@@ -324,6 +324,16 @@ def test_shards_of_one_folder_or_several_make_the_campaign(command, flown, tmp_p
     for folder in ("one", "part1"):
         assert command("summarize", folder, "--no-figures", "--quiet") == (0, "", "")
         same(rows_of(tmp_path / folder), whole)
+
+
+def test_a_shard_does_not_delete_the_rows_of_other_shards(command, tmp_path):
+    options = "--trials", 250, "--seed", 3, "--no-figures", "--quiet", "--out", "one"
+    assert command("montecarlo", "s.toml", *options, "--shard", "1/2") == (0, "", "")
+    before = tree(tmp_path / "one")
+    code, _, error = command("montecarlo", "s.toml", *options, "--shard", "2/2", "--force")
+    assert (code, error.count("\n")) == (2, 1)
+    assert tree(tmp_path / "one") == before
+    assert command("montecarlo", "s.toml", *options, "--shard", "1/1", "--force") == (0, "", "")
 
 
 def test_damaged_rows_are_named_never_read_and_flown_again(command, flown):

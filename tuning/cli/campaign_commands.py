@@ -110,6 +110,11 @@ def montecarlo(
             "--until-confident looks at ever more trials drawn at random, and does not go with --plan",
         ),
         (clustered and a_part, "--cluster does not go with --shard or --dry-run"),
+        (
+            force and share != (1, 1),
+            "--force starts the whole campaign again, which would delete other shards' rows, and does not go with "
+            "--shard; remove the folder before the first shard starts, or choose another with --out",
+        ),
         (precision not in ("64", "32"), f"--precision is {precision}, but must be 64 or 32"),
         (
             clustered and (precision, device) != ("64", "cpu"),
