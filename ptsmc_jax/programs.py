@@ -31,7 +31,7 @@ import scipy
 from jax.core import Tracer
 from jax.experimental import serialize_executable
 
-from ptsmc_jax import configure
+from ptsmc_jax import configure, provenance
 
 KEPT = 400  # programs; those not used for longest make room
 # for what runs for a moment: optimising would take longer. The older emitters of fused loops and one part of the code
@@ -41,7 +41,7 @@ QUICKLY = {"xla_backend_optimization_level": 0, "xla_cpu_parallel_codegen_split_
 # for batches in `lanes`: with the pass that `configure` leaves out they compile in 0.7 to 0.9 of the time, and fly in
 # 0.88 to 0.97 of it. Loops in them write one array of each type of number, see `numerics.stacking`
 BATCHED = {"xla_disable_hlo_passes": ""}
-OURS = ("ptsmc_jax", "tuning")  # packages whose code is known by its files
+OURS = provenance.PACKAGES  # whose code is known by its files
 PLAIN = (int, float, str, bool, bytes, type(None))
 
 
@@ -282,16 +282,9 @@ def stop() -> None:
         _beside.cache_clear()
 
 
-@functools.cache
 def _code(package: str) -> str:
-    """Digest of a package's files, and of the library's."""
-    digest = hashlib.sha256()
-    for name in sorted({package, OURS[0]}):
-        folder = Path(str(sys.modules[name].__file__)).parent
-        for path in sorted(folder.rglob("*.py")):
-            digest.update(f"{path.relative_to(folder)} {path.stat().st_size}".encode())
-            digest.update(path.read_bytes())
-    return digest.hexdigest()
+    """Return the checksum of a package's files and of the library's."""
+    return provenance.code_checksum(*sorted({package, OURS[0]}))
 
 
 # settings that no program hangs on

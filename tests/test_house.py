@@ -19,7 +19,7 @@ from tests.tree import ROOT, modules
 # see each other. A file sees the rooms and floors below its own; "." is the package's own folder. A new file goes here.
 HOUSE = {
     "ptsmc_jax": {
-        ".": "configure formulas | programs",
+        ".": "configure formulas provenance | programs",
         "numerics": "elementary guards pytrees stacking statistics | attitude draws matrices | integrators",
         "batching": "components dependence lapack | choices packed | kernel | lanes",
         "plants": "base | integrator_chain rigid_body second_order | flexible_body",

@@ -9,7 +9,9 @@ import os
 import platform
 import re
 import secrets
+import shlex
 import shutil
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -18,6 +20,7 @@ from typing import IO, Any
 
 import tomli_w
 
+from ptsmc_jax import provenance
 from ptsmc_jax.scenario import parsing
 
 try:
@@ -35,6 +38,7 @@ MADE_OF_RESULTS = {  # they would pass for those of the next one; by what is nea
     "worst.csv": b"trial,status,reason,bad_time,",
     "why.csv": b"metric,trial,value,input,drawn,",
 }
+CODE, COMMAND_LINE = "code_checksum", "command_line"  # in `versions.json`
 PACKAGES = ("ptsmc-jax", "jax", "jaxlib", "numpy", "scipy", "optax", "cmaes")
 
 
@@ -48,20 +52,24 @@ class InUseError(RefusedError):
 
 def versions(command: str, seed: int | None, **others: Any) -> dict[str, Any]:
     """What made a result: command and seed (None: nothing is drawn), versions, machine."""
-    return {
-        "command": command,
-        "seed": seed,
-        **others,
-        "python": platform.python_version(),
-        **packages(),
-        "platform": platform.platform(),
-        "machine": platform.machine(),
-    }
+    return {"command": command, "seed": seed, **others, COMMAND_LINE: _command_line(), **_surroundings()}
+
+
+def _command_line() -> str:
+    """Return the command line of this process, without the folder of the program."""
+    return shlex.join([*(Path(program).name for program in sys.argv[:1]), *sys.argv[1:]])
+
+
+def _surroundings() -> dict[str, str]:
+    """Return the versions and the machine. An interrupted run resumes only with the same ones."""
+    machine = {"platform": platform.platform(), "machine": platform.machine()}
+    return {"python": platform.python_version(), **packages(), **machine}
 
 
 def packages() -> dict[str, str]:
-    """Versions of the packages that numbers depend on."""
-    return {name: importlib.metadata.version(name) for name in PACKAGES}
+    """Versions of the packages that numbers depend on, and a checksum of the source code of ptsmc."""
+    versions = {name: importlib.metadata.version(name) for name in PACKAGES}
+    return {**versions, CODE: provenance.code_checksum(*provenance.PACKAGES)[:16]}
 
 
 def read_versions(folder: Path) -> dict[str, Any]:
@@ -83,8 +91,23 @@ def previous(folder: Path, scenario: Mapping[str, Any], made_by: Mapping[str, An
 
 
 def begun(folder: Path, scenario: Mapping[str, Any], made_by: Mapping[str, Any]) -> bool:
-    """Whether the folder holds the beginning of the same run, by the same versions: see `begin`."""
-    return (folder / JOURNAL).exists() and _same(folder, scenario, versions(**made_by))
+    """Whether the folder holds the beginning of this run: see `begin`.
+
+    Raises RefusedError if it holds the beginning of another run, or if other versions began this one.
+    """
+    if not (folder / JOURNAL).exists():
+        return False
+    refuse_others(folder, scenario, {**made_by, **_surroundings()})
+    return True
+
+
+def refuse_others(folder: Path, scenario: Mapping[str, Any], made_by: Mapping[str, Any]) -> None:
+    """Raise RefusedError if the folder holds another run than this: see `difference`."""
+    other = difference(folder, scenario, made_by)
+    if other is not None:
+        raise RefusedError(
+            f"--out is {folder}, which holds {other}; allowed is a new folder, or --force to start again"
+        )
 
 
 def begin(folder: Path, scenario: Mapping[str, Any], made_by: Mapping[str, Any], *, fresh: bool) -> Path:
@@ -136,6 +159,10 @@ def _of_laws(folder: Path) -> list[Path]:
 
 
 def _alike(new: Path, old: Path) -> bool:
+    """Whether two files are the same, two `versions.json` but for the command line."""
+    if new.name == "versions.json":
+        made = [{**read_versions(path.parent), COMMAND_LINE: None} for path in (new, old)]
+        return made[0] == made[1]
     return old.exists() and new.read_bytes() == old.read_bytes()
 
 
@@ -160,6 +187,8 @@ def difference(folder: Path, scenario: Mapping[str, Any], made_by: Mapping[str, 
     new_tables = json.loads(json.dumps(_named(scenario)))
     for name, value in made_by.items():
         old = versions.get(name)
+        if name == CODE and old is not None and old != value:
+            return f"a run of another version of the source code (checksum {old}, not {value})"
         if old != value:
             here = "which is not asked for here" if value is None else f"not {value}"
             return f"a run without {name}" if old is None else f"a run with {name} {old}, {here}"

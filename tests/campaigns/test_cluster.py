@@ -69,7 +69,7 @@ def test_a_local_cluster_listens_on_the_loopback_only(monkeypatch):
 
 
 def test_receipts_become_parts(monkeypatch, tmp_path):
-    here = {name: store.versions("", 0)[name] for name in store.PACKAGES}
+    here = store.packages()
     (tmp_path / "p.parquet").write_bytes(b"")
     folder = flown_by(monkeypatch, tmp_path, lambda first, count: (first, count, "p.parquet", 7, here))
     found = list(cluster.connected("tcp://a:1", {})(folder, [(0, 10), (10, 5)]))
@@ -80,6 +80,7 @@ def test_receipts_become_parts(monkeypatch, tmp_path):
     ("change", "said"),
     [
         ({"jax": "0.0.1"}, "has jax 0.0.1, but here is"),
+        ({"code_checksum": "0a"}, "has code_checksum 0a, but here is"),
         (None, r"a worker wrote gone.parquet, which is not in .* here: it must be shared"),
         (ValueError("no\nroom"), "a worker of the cluster failed: no room"),
     ],
@@ -88,7 +89,7 @@ def test_what_cannot_be_trusted_is_refused(monkeypatch, tmp_path, change, said):
     def receipt(first, count):
         if isinstance(change, Exception):
             raise change
-        versions = {name: store.versions("", 0)[name] for name in store.PACKAGES} | (change or {})
+        versions = store.packages() | (change or {})
         return first, count, "gone.parquet", 0, versions
 
     folder = flown_by(monkeypatch, tmp_path, receipt)

@@ -2,6 +2,8 @@ import csv
 import json
 import math
 import os
+import re
+import sys
 import tomllib
 
 import jax.numpy as jnp
@@ -106,14 +108,15 @@ def test_a_result_without_a_summary_takes_the_place_of_another_one_too(tmp_path,
     """As a map does: the figures of what was there would stand on its page."""
 
     def a_map(folder, other=""):
-        (folder / "versions.json").write_text('{"command": "map"}' + (" " if other == "versions.json" else ""))
+        made = {"command": "map", "command_line": str(folder), **({"seed": 1} if other == "versions.json" else {})}
+        store.write_json(folder / "versions.json", made)
         (folder / "scenario.toml").write_text("# other" if other == "scenario.toml" else "")
 
     out = tmp_path / "out"
     (out / "figures").mkdir(parents=True)
     (out / "figures" / "map.png").write_bytes(store.MADE_OF_RESULTS["figures/*.png"])
     a_map(out)
-    store.write(out, a_map)  # the same one, without figures
+    store.write(out, a_map)  # the same one by another command line, without figures
     assert (out / "figures" / "map.png").exists()
     (out / "summary.json").write_text("{}")
     store.write(out, lambda folder: a_map(folder, changed))
@@ -414,8 +417,11 @@ def test_any_other_scenario_is_not_known(tmp_path, other):
     assert store.previous(tmp_path / "out", other, TOLD) is None
 
 
-def test_versions_name_what_made_a_result():
+def test_versions_name_what_made_a_result(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["/usr/bin/ptsmc", "simulate", "my file.toml", "--trial", "3"])
     made = store.versions("simulate", 7, trial=3)
+    assert made["command_line"] == "ptsmc simulate 'my file.toml' --trial 3"
+    assert re.fullmatch("[0-9a-f]{16}", made["code_checksum"])
     assert (made["command"], made["seed"], made["trial"]) == ("simulate", 7, 3)
     assert all(
         made[name].split(".")[0].isdigit() for name in ("python", "ptsmc-jax", "jax", "jaxlib", "numpy", "scipy")
@@ -439,9 +445,13 @@ def test_a_run_that_was_begun_is_gone_on_with_by_the_same_command_alone(tmp_path
     journal = store.begin(folder, tables, TOLD, fresh=True)
     journal.write_bytes(b"kept")
     assert store.begun(folder, tables, TOLD)
-    assert not store.begun(folder, tables, {**TOLD, "seed": 6})
-    assert not store.begun(folder, tables, {**TOLD, "command": "pareto"})
-    assert not store.begun(folder, {"controller": {"eta": 3.1}}, TOLD)
+    for other, asked, said in (
+        (tables, {**TOLD, "seed": 6}, "a run with seed 5, not 6"),
+        (tables, {**TOLD, "command": "pareto"}, "a run with command tune, not pareto"),
+        ({"controller": {"eta": 3.1}}, TOLD, "eta is 3.0 there, and 3.1 here"),
+    ):
+        with pytest.raises(store.RefusedError, match=said):
+            store.begun(folder, other, asked)
     assert store.previous(folder, tables, TOLD) is None
     assert store.begin(folder, tables, TOLD, fresh=False).read_bytes() == b"kept"
     (folder / "summary.json").write_text('{"status": "interrupted"}')
@@ -451,8 +461,12 @@ def test_a_run_that_was_begun_is_gone_on_with_by_the_same_command_alone(tmp_path
     assert store.begin(folder, tables, TOLD, fresh=True).read_bytes() == b""
     assert not (folder / "summary.json").exists()  # of another run, which a run that is stopped must not be taken for
     made = json.loads((folder / "versions.json").read_text())
-    (folder / "versions.json").write_text(json.dumps({**made, "jax": "0.0.1"}))
-    assert not store.begun(folder, tables, TOLD)  # other versions may round otherwise
+    for name, said in (("jax", "a run with jax other"), ("code_checksum", "another version of the source code")):
+        (folder / "versions.json").write_text(json.dumps({**made, name: "other"}))
+        with pytest.raises(store.RefusedError, match=said):  # other versions may round otherwise
+            store.begun(folder, tables, TOLD)
+    (folder / "versions.json").write_text(json.dumps({**made, "command_line": "other"}))
+    assert store.begun(folder, tables, TOLD)
     with pytest.raises(store.RefusedError):
         store.check(folder, force=False)
     store.end(folder)

@@ -119,6 +119,40 @@ def test_a_search_is_shown_as_it_is_when_it_is_read_again(tmp_path):
     assert shown == 2 * [{"status": "not met", "without": [None, 6.0], "slews": [{"rms": None}]}]
 
 
+@pytest.mark.parametrize("status", ["interrupted", "met"])
+def test_a_search_by_another_version_of_the_code_does_not_resume(tmp_path, capsys, status):
+    (tmp_path / "s.toml").write_text(SHORT_CHAIN)
+    loaded, folder, asked = scenario.read(tmp_path / "s.toml"), tmp_path / "out", []
+    search = searches.LongSearch(
+        {"command": "tune", "seed": 0},
+        "window error",
+        work=lambda report, journal: SimpleNamespace(status=asked.append(journal.replaying) or status),
+        write=lambda making, outcome: store.record(
+            making, parsing.dump(loaded), search.known_by, {"status": outcome.status}
+        ),
+        summary=lambda outcome: {"status": outcome.status},
+        show=lambda *_: None,
+    )
+
+    def run(**force):
+        return searches.run(search, loaded, folder, **{"force": False, "quiet": True, **force})
+
+    assert run() == searches.STATUS[status]
+    store.write_json(folder / "versions.json", store.read_versions(folder) | {"code_checksum": "before"})
+    before = tree(folder)
+    capsys.readouterr()
+    if status == "interrupted":
+        with pytest.raises(store.RefusedError, match="another version of the source code"):
+            run()
+    else:  # a finished result is shown, with a note
+        assert run() == 0
+        assert "another version of the source code" in capsys.readouterr().err
+    assert (len(asked), tree(folder)) == (1, before)
+    run(force=True)
+    assert len(asked) == 2
+    assert store.read_versions(folder)["code_checksum"] != "before"
+
+
 TWICE = """
 import builtins
 from tuning.cli import main

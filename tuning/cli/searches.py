@@ -65,6 +65,9 @@ def run(search: LongSearch, loaded: "Scenario", folder: Path, *, force: bool, qu
     tables = parsing.dump(loaded)
     done = None if force else store.previous(folder, tables, search.known_by)
     if done is not None and done["status"] != "interrupted":
+        other = store.difference(folder, tables, store.packages())
+        if other is not None:
+            print(f"ptsmc: {folder} holds {other}; --force runs it again", file=sys.stderr)
         if not quiet:
             search.show(done, folder, "already done")
         return STATUS[done["status"]]

@@ -277,9 +277,7 @@ def _begun(wanted: Folder, tables: Mapping[str, Any]) -> bool:
     if not path.is_dir() or store.is_empty(path):
         return False
     programs = [name for name in store.read_versions(path) if name == "metrics" or name.endswith("_sha256")]
-    other = store.difference(path, tables, {**dict.fromkeys(programs), **wanted.identity, **store.packages()})
-    if other is not None:
-        raise RefusedError(f"--out is {path}, which holds {other}; allowed is a new folder, or --force to begin anew")
+    store.refuse_others(path, tables, {**dict.fromkeys(programs), **wanted.identity, **store.packages()})
     before = opened(path)
     if before.trials > wanted.trials:
         raise RefusedError(

@@ -1,0 +1,19 @@
+"""The source code that made a result or a compiled program, known by its checksum."""
+
+import functools
+import hashlib
+from pathlib import Path
+
+PACKAGES = ("ptsmc_jax", "tuning")
+FOLDER = Path(__file__).parent.parent  # of the packages
+
+
+@functools.cache
+def code_checksum(*packages: str) -> str:
+    """Return the SHA-256 of the Python files of some of `PACKAGES`, read at the first call."""
+    digest = hashlib.sha256()
+    for package in packages:
+        for path in sorted((FOLDER / package).rglob("*.py")):
+            digest.update(f"{path.relative_to(FOLDER)} {path.stat().st_size}".encode())
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
