@@ -154,7 +154,7 @@ def test_a_spacecrafts_sensors_see_attitude_and_rate(command, here):
     np.testing.assert_allclose(2.0 * np.linalg.norm(turned[:3]), 2e-3, rtol=0.05)  # what the observer lags by is left
     assert run.run.floor is None
     status, _, error = command("simulate", "s.toml", "--no-figures", "--quiet")
-    assert (status, error) == (0, "")
+    assert (status, error) == (0, f"ptsmc: runs {here}/mine.py, which sensors.code of s.toml names\n")
     made = store.read_versions(here / "out" / "simulate-s")
     assert made["sensors_sha256"] == systems.digest("mine.py:Tilted")
     again = command("simulate", "out/simulate-s/scenario.toml", "--quiet", "--out", "new")

@@ -42,6 +42,11 @@ requirements = { window_error = 0.5 }
 FOLDER = "out/montecarlo-mine"
 
 
+def reported(place, by="mine.toml"):
+    """The line on the error stream that names the file that a command runs."""
+    return f"ptsmc: runs {place}/my.py, which plant.system of {by} names\n"
+
+
 @pytest.fixture(autouse=True)
 def fresh(monkeypatch):
     """A process that has run nothing yet."""
@@ -71,7 +76,7 @@ def home(command, places, monkeypatch):
         code, _, error = command(
             "montecarlo", "mine.toml", "--trials", 20, "--metrics", "my.py:farthest", "--no-figures", "--quiet"
         )
-        assert (code, error) == (0, "")  # what lies beside a scenario that its user names is run without a word
+        assert (code, error) == (0, reported(place))
         assert ran(place)
         systems._ran.clear()
         shutil.copytree(place, kept)
@@ -156,7 +161,7 @@ def test_the_same_campaign_goes_on_without_a_flag(command, flown, home):
     code, _, error = command(
         "montecarlo", "mine.toml", "--trials", 30, "--metrics", "my.py:farthest", "--no-figures", "--quiet"
     )
-    assert (code, error) == (0, "")
+    assert (code, error) == (0, reported(home))
     assert pl.read_parquet(flown / "trials").height == 30
     assert campaign_folder.opened(flown).own_names == ["farthest"]
 
@@ -164,10 +169,12 @@ def test_the_same_campaign_goes_on_without_a_flag(command, flown, home):
 def test_a_scenario_in_results_asks_wherever_its_program_lies(command, flown, home, capsys):
     shutil.copy(home / "my.py", flown)
     (flown / "evil.toml").write_text(SCENARIO)
-    (flown / "scenarios").mkdir()
+    (flown / "scenarios" / "deeper").mkdir(parents=True)
     (flown / "scenarios" / "law.toml").write_text(SCENARIO.replace("my.py", "../my.py"))
+    (flown / "scenarios" / "deeper" / "law.toml").write_text(SCENARIO.replace("my.py", "../../my.py"))
     (home / "link.toml").symlink_to(flown / "evil.toml")
-    for path in (f"{FOLDER}/scenario.toml", f"{FOLDER}/evil.toml", f"{FOLDER}/scenarios/law.toml", "link.toml"):
+    inside = ("scenario.toml", "evil.toml", "scenarios/law.toml", "scenarios/deeper/law.toml")
+    for path in (*(f"{FOLDER}/{name}" for name in inside), "link.toml"):
         for asked in ("simulate", "tune", "montecarlo", "map", "pareto"):
             code, out, error = command(asked, path, "--out", "new")
             assert (code, out) == (2, "")
@@ -176,22 +183,22 @@ def test_a_scenario_in_results_asks_wherever_its_program_lies(command, flown, ho
     assert not ran(home)
     loaded = scenario.read(flown / "evil.toml")
     own_parts.allow_scenario(flown / "evil.toml", loaded, True)
-    assert capsys.readouterr().err == f"ptsmc: runs {flown}/my.py, which plant.system of {flown}/evil.toml names\n"
+    assert capsys.readouterr().err == reported(flown, flown / "evil.toml")
 
 
 @pytest.mark.parametrize(
     ("system", "runs"),
     [
-        ("my.py:mine", None),
-        ("below/my.py:mine", None),
-        ("below/../my.py:mine", None),
+        ("my.py:mine", "{above}/home/my.py"),
+        ("below/my.py:mine", "{above}/home/below/my.py"),
+        ("below/../my.py:mine", "{above}/home/my.py"),
         ("../my.py:mine", "{above}/my.py"),
         ("link.py:mine", "{above}/my.py"),
         ("{above}/my.py:mine", "{above}/my.py"),
         ("package.module:mine", "the module package.module"),
     ],
 )
-def test_what_a_users_own_scenario_runs_is_said_where_it_does_not_lie_beside_it(tmp_path, capsys, system, runs):
+def test_every_program_of_a_users_scenario_is_reported(tmp_path, capsys, system, runs):
     home = tmp_path / "home"
     (home / "below").mkdir(parents=True)
     for folder in (tmp_path, home, home / "below"):
@@ -200,9 +207,8 @@ def test_what_a_users_own_scenario_runs_is_said_where_it_does_not_lie_beside_it(
     path = home / "mine.toml"
     path.write_text(SCENARIO.replace("my.py:mine", system.format(above=tmp_path)))
     own_parts.allow_scenario(path, scenario.read(path), False)
-    said = capsys.readouterr().err
-    wanted = "" if runs is None else f"ptsmc: runs {runs.format(above=tmp_path)}, which plant.system of {path} names\n"
-    assert said == wanted
+    told = f"ptsmc: runs {runs.format(above=tmp_path)}, which plant.system of {path} names\n"
+    assert capsys.readouterr().err == told
     assert not any(ran(folder) for folder in (tmp_path, home, home / "below"))
 
 

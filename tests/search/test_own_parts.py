@@ -5,13 +5,14 @@ from typing import Any
 import pytest
 
 from ptsmc_jax.campaigns.store import RefusedError
+from ptsmc_jax.scenario import own, systems
 from tuning.search import own_parts
 
 
 @pytest.mark.parametrize(("place", "inside"), [
-    ("tuned.toml", True), ("scenarios/pd.toml", True), ("figures/old/pd.toml", False), ("../mine.toml", False),
+    ("tuned.toml", True), ("scenarios/pd.toml", True), ("a/b/c/pd.toml", True), ("../mine.toml", False),
 ])  # fmt: skip
-def test_a_scenario_lies_in_results_or_in_a_folder_of_theirs(tmp_path, place, inside):
+def test_a_scenario_lies_in_results_at_any_depth(tmp_path, place, inside):
     results = tmp_path / "out" / "compare-x"
     results.mkdir(parents=True)
     (results / "versions.json").write_text("{}")
@@ -41,6 +42,20 @@ def test_a_file_that_several_keys_name_is_told_of_once(tmp_path, capsys):
     programs: Any = dict.fromkeys(("controller.code", "observer.code", "reference.code"), f"{law}:Mine")
     with pytest.raises(RefusedError, match=rf"own, {law} \(controller.code, observer.code, reference.code\), which"):
         own_parts.allow(programs, tmp_path, {}, trusted=False)
-    own_parts.allow(programs, tmp_path, {}, trusted=True)
+    digests = {own.digest_name(key): systems.digest(where) for key, where in programs.items()}
+    own_parts.allow(programs, tmp_path, digests, trusted=True)
     keys = "controller.code, observer.code and reference.code"
     assert capsys.readouterr().err == f"ptsmc: runs {law}, which {keys} of {tmp_path} name\n"
+
+
+def test_a_program_without_a_checksum_in_the_results_is_reported(tmp_path, capsys):
+    law, other = tmp_path / "mine.py", tmp_path / "other.py"
+    law.write_text("")
+    other.write_text("")
+    programs = {"controller.code": f"{law}:Mine", "observer.code": f"{other}:Mine"}
+    made = {"controller_sha256": systems.digest(f"{law}:Mine")}
+    assert own_parts.check_unchanged(programs, tmp_path, made) == ["observer.code"]
+    own_parts.allow(programs, tmp_path, made, trusted=True)
+    (said,) = [line for line in capsys.readouterr().err.splitlines() if "no checksum" in line]
+    assert str(other) in said
+    assert str(law) not in said

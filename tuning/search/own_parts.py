@@ -1,7 +1,8 @@
-"""Programs that scenarios name: parts and metrics of one's own, which flying runs and reading does not.
+"""Programs that scenarios name: custom parts and metrics, which flying runs and reading does not.
 
-A scenario that a user names is the user's own program. One that a ptsmc command left may come from anybody, with
-everything in its folder, the digests too: what it names is run with `--trust` only, and as it was when that was made.
+Commands report every file that they run for a scenario. If a scenario lies in results, its programs run only with
+`--trust`, and only as they were when the results were made. This is a reminder and no protection: whoever sends results
+can change or omit the file by which they are recognised, and the checksums too.
 """
 
 import ast
@@ -38,22 +39,25 @@ def digest(key: str, where: str) -> str | None:
 
 
 def allow_scenario(path: Path, scenario: Scenario, trusted: bool) -> None:
-    """Let a scenario file be flown: see `allow` where it lies in results; what stands elsewhere than beside it is said.
-
-    Raises RefusedError.
-    """
+    """Report the programs that a scenario file names, and let them run; in results see `allow`, and its errors."""
     programs, folder = named(scenario), results_of(path)
-    if folder is not None:
+    if folder is None:
+        _report(programs, path)
+    else:
         allow(programs, path, store.read_versions(folder), trusted)
-        return
-    beside = os.path.realpath(path.parent) + os.sep
-    _say({key: where for key, where in programs.items() if not location(key, where).startswith(beside)}, path)
 
 
 def allow(programs: Mapping[str, str], results: Path, made: Mapping[str, Any], trusted: bool) -> None:
-    """Let what results name be run, and say so; made: their `versions.json`.
+    """Report the programs that results name, and let them run.
 
-    Raises RefusedError without --trust, or where it is not what they were made with.
+    Args:
+        programs: see `named`.
+        results: the folder or the scenario file that names them.
+        made: its `versions.json`.
+        trusted: whether the user gave --trust.
+
+    Raises:
+        RefusedError: without --trust, or if a program is not the one that the results were made with.
     """
     if programs and not trusted:
         listed = " and ".join(f"{file} ({', '.join(keys)})" for file, keys in _by_file(programs).items())
@@ -61,20 +65,29 @@ def allow(programs: Mapping[str, str], results: Path, made: Mapping[str, Any], t
             f"{results} names code of its own, {listed}, which this command would run; "
             "allowed is --trust, for one who has read it"
         )
-    check_unchanged(programs, results, made)
-    _say(programs, results)
+    unknown = check_unchanged(programs, results, made)
+    _report(programs, results)
+    for file in _by_file({key: programs[key] for key in unknown}):
+        print(f"ptsmc: {results} has no checksum of {file}, which may have changed since", file=sys.stderr)
 
 
-def check_unchanged(programs: Mapping[str, str], results: Path, made: Mapping[str, Any]) -> None:
-    """Raise RefusedError where a program is not the one that results were made with."""
+def check_unchanged(programs: Mapping[str, str], results: Path, made: Mapping[str, Any]) -> list[str]:
+    """Raise RefusedError if a program is not the one that results were made with.
+
+    Returns the keys of the programs whose checksum the results do not have.
+    """
+    unknown = []
     for key, where in programs.items():
         known, now = _digests(made, key), digest(key, where)
-        if known and now is not None and now not in known:
+        if not known:
+            unknown.append(key)
+        elif now is not None and now not in known:
             then = " or ".join(was[:12] for was in known)
             raise RefusedError(
                 f"{results} was made with another {key} than {location(key, where)} is now "
                 f"(SHA-256 {then} then, {now[:12]} now); allowed is the file as it was"
             )
+    return unknown
 
 
 def _digests(made: Mapping[str, Any], key: str) -> list[str]:
@@ -115,7 +128,7 @@ def alone(file: Path) -> bool:
     return not asks and not any(one.is_dir() or one.with_suffix(".py").exists() for one in beside)
 
 
-def _say(programs: Mapping[str, str], where_named: Path) -> None:
+def _report(programs: Mapping[str, str], where_named: Path) -> None:
     for file, keys in _by_file(programs).items():
         *first, last = keys
         name = f"{', '.join(first)} and {last} of {where_named} name" if first else f"{last} of {where_named} names"
@@ -131,7 +144,7 @@ def _by_file(programs: Mapping[str, str]) -> dict[str, list[str]]:
 
 
 def results_of(scenario: Path) -> Path | None:
-    """The folder that a command left and a scenario file lies in, itself or in a folder of it; links count as both."""
+    """Return the nearest folder with results above a scenario file, links followed or not; None if there is none."""
     paths = Path(os.path.abspath(scenario)), Path(os.path.realpath(scenario))
-    folders = (folder for path in paths for folder in path.parents[:2])
+    folders = (folder for path in paths for folder in path.parents)
     return next((folder for folder in folders if (folder / "versions.json").exists()), None)
