@@ -1,5 +1,6 @@
 """`ptsmc report`: pages that need nothing else, say the verdict first and run nothing that a user typed."""
 
+import base64
 import json
 import os
 import re
@@ -159,6 +160,36 @@ def test_what_a_user_typed_is_text(flown):
     assert [tag for tag in plain if tag in ("script", "img")] == [t for t, _ in read.found if t in ("script", "img")]
     assert read.text.count("onerror=document.title=1") >= 4
     assert HOSTILE in [line["name"] for line in read.charts["history"]["data"]]
+
+
+def test_links_out_of_the_folder_and_other_files_than_pictures_are_not_embedded(command, flown, tmp_path):
+    """A page is made to be sent, and a folder may come from anybody."""
+    picture = page.PNG + b"secret"
+    (tmp_path / "elsewhere.png").write_bytes(picture)
+    (flown / "figures" / "outside.png").symlink_to(tmp_path / "elsewhere.png")
+    (flown / "figures" / "gone.png").symlink_to(tmp_path / "not-there.png")
+    (flown / "figures" / "loop.png").symlink_to("loop.png")
+    (flown / "figures" / "key.png").write_text("secret")
+    (flown / "inside.png").write_bytes(page.PNG + b"inside")
+    (flown / "figures" / "linked.png").symlink_to("../inside.png")
+    code, _, error = command("report", "run")
+    assert code == 0
+    omitted = [f"run/figures/{name}.png" for name in ("gone", "key", "loop", "outside")]
+    assert [line.split()[1] for line in error.splitlines()] == omitted
+    read = (flown / "report.html").read_text()
+    embedded = [base64.b64decode(data) for data in re.findall(r"data:image/png;base64,([^\"]*)", read)]
+    assert page.PNG + b"inside" in embedded
+    assert not any(b"secret" in content for content in embedded)
+
+
+@pytest.mark.parametrize("name", ["scenario.toml", "versions.json", "summary.json", "trajectory.csv"])
+def test_a_result_file_that_is_a_link_out_of_the_folder_is_refused(command, flown, tmp_path, name):
+    (flown / name).rename(tmp_path / name)
+    (flown / name).symlink_to(tmp_path / name)
+    code, out, error = command("report", "run")
+    assert (code, out, error.count("\n")) == (2, "", 1)
+    assert error.startswith(f"ptsmc: run/{name} is a link out of the folder")
+    assert not (flown / "report.html").exists()
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")

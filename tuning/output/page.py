@@ -8,6 +8,8 @@ import base64
 import csv
 import hashlib
 import json
+import os
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -36,12 +38,17 @@ from tuning.output import (
 from tuning.output.page_parts import Block, Heading, Result, Section
 
 HERE = Path(__file__).parent
+FILES = ("versions.json", store.SUMMARY, "scenario.toml", "trajectory.csv", "history.csv", "map.csv")  # that are read
+PNG = b"\x89PNG\r\n\x1a\n"  # how such a file begins
 
 
 def read(folder: Path) -> Result:
     """A result folder. Raises RefusedError where it holds no finished result."""
     if not folder.is_dir():
         raise RefusedError(f"{folder} is no folder; allowed is one that a ptsmc command left")
+    for name in FILES:
+        if _leads_out(folder, folder / name):
+            raise RefusedError(f"{folder / name} is a link out of the folder; allowed is a file in it")
     versions = store.read_versions(folder)
     command = versions.get("command")
     if str(command) not in SECTIONS:
@@ -55,6 +62,12 @@ def read(folder: Path) -> Result:
     except (ValueError, RecursionError) as error:
         raise RefusedError(f"{folder} holds a file that cannot be read: {error}") from None
     return Result(folder, versions, summary, scenario)
+
+
+def _leads_out(folder: Path, path: Path) -> bool:
+    """Whether a path of a result folder is, or lies behind, a link to a place outside the folder."""
+    # unlike Path.resolve it does not raise for a link to itself
+    return not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
 
 
 def _unfinished(folder: Path, versions: dict[str, Any]) -> RefusedError:
@@ -347,7 +360,13 @@ def _pictures(result: Result) -> Iterator[Section]:
     """The figures of the folder."""
     blocks = []
     for path in sorted((result.folder / "figures").glob("*.png")):
-        source = "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode("ascii")
+        out = _leads_out(result.folder, path)
+        content = path.read_bytes() if path.is_file() and not out else b""
+        if not content.startswith(PNG):
+            why = "is a link out of the folder" if out else "is no PNG file"
+            print(f"ptsmc: {path} {why}, and is not in the page", file=sys.stderr)
+            continue
+        source = "data:image/png;base64," + base64.b64encode(content).decode("ascii")
         name = path.stem.replace("_", " ")
         blocks.append(Block("picture", alt=name, source=source, caption=page_captions.CAPTIONS.get(path.stem, "")))
     if blocks:
