@@ -64,7 +64,7 @@ class AppliedTorque(NamedTuple):
 @pytree
 @dataclass(frozen=True)
 class Actuators:
-    """Delay, the limit per axis, then per axis or per wheel: quantisation, limits, rate limit and first-order lag."""
+    """The limit per axis, delay, then per axis or per wheel: quantisation, limits, rate limit and first-order lag."""
 
     torque_limit: Leaf | None = None  # per body axis [N m]
     rate_limit: Leaf | None = None  # [N m/s]
@@ -122,27 +122,43 @@ class Actuators:
     def command(
         self, state: ActuatorState, u: Vector, w: Vector, t: Scalar, dt: Scalar, weight: Scalar
     ) -> tuple[Drive, Array | None]:
-        """The drive of a control period, and the queue of commands after it.
+        """Return the drive of a control period, and the queue of commands after it.
 
         Args:
             state: at the start of the period.
-            u: command, (m,) [N m].
-            w: rate as it is measured, (m,) [rad/s]: the flight software adds w x A h, with the wheels' momentum h.
+            u: command of the law, (m,) [N m].
+            w: rate as it is measured, (m,) [rad/s].
             t: start of the period [s].
             dt: its length [s].
             weight: share that a partial first period is of a whole one; its command counts that much on its way
                 through the queue, so that nothing jumps where the period vanishes.
         """
-        queue, due = state.queue, u
+        sent, limited = self.send(state, u, w)
+        queue, due = state.queue, sent
         if queue is not None:
             due = queue[0]
-            advanced = jnp.concatenate([queue[1:], guards.lerp(weight, u, queue[-1])[None]])
+            advanced = jnp.concatenate([queue[1:], guards.lerp(weight, sent, queue[-1])[None]])
             queue = jnp.where(dt > 0.0, advanced, queue)
-        target = due if self.torque_limit is None else jnp.clip(due, -self.torque_limit, self.torque_limit)
-        limited = jnp.any(target != due)
+        drive = self.drive(state, due, t, dt)
+        return drive._replace(limited=limited | drive.limited), queue
+
+    def send(self, state: ActuatorState, u: Vector, w: Vector) -> tuple[Vector, Array]:
+        """Return what the flight computer sends at a sample, (m,) [N m], and whether the torque limit cuts it.
+
+        It adds w x A h, which compensates the wheels' momentum h by the measured rate w. All of it takes the delay.
+        """
+        sent = u if self.torque_limit is None else jnp.clip(u, -self.torque_limit, self.torque_limit)
+        limited = jnp.any(sent != u)
         if self.wheels is not None:
             assert state.h is not None
-            target = self._allocation(self.wheels, t) @ (target + attitude.cross(w, self.wheels.axes @ state.h))
+            sent = sent + attitude.cross(w, self.wheels.axes @ state.h)
+        return sent, limited
+
+    def drive(self, state: ActuatorState, due: Vector, t: Scalar, dt: Scalar) -> Drive:
+        """Return the drive of a control period by the command that arrives in it, (m,) [N m], see `send`."""
+        target = due
+        if self.wheels is not None:
+            target = self._allocation(self.wheels, t) @ target
         if self.step is not None:
             target = quantise(target, self.step)
             if self.torque_limit is not None and self.wheels is None:  # a step may lie beyond it
@@ -150,13 +166,13 @@ class Actuators:
         c = target
         if self.wheels is not None:
             c = self._within_wheels(self.wheels, target, state, dt)
-        limited = limited | jnp.any(c != target)
+        limited = jnp.any(c != target)
         if self.rate_limit is not None:
             assert state.v is not None
             farthest = self.rate_limit * (dt if self.lag is None else dt + self.lag)
             limited = limited | jnp.any(jnp.abs(c - state.v) > farthest)
         works = None if self.failure_times is None else t < self.failure_times
-        return Drive(state.v if self.moves else None, c, state.h, limited, works), queue
+        return Drive(state.v if self.moves else None, c, state.h, limited, works)
 
     def _allocation(self, device: Wheels, t: Scalar) -> Float[Array, "wheels 3"]:
         """The matrix that allots a torque to the wheels at t [s]: without a wheel that is known to have failed."""

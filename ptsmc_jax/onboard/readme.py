@@ -17,6 +17,11 @@ def readme(code: Code, about: About) -> str:
         f"by the command of {about.delay} sample{several} ago. Send those where this program is to make the delay, "
         "and `command` where computer and bus make it."
     )
+    if about.delay and about.wheels:
+        delay += (
+            " `command` does not contain the compensation of the wheels' momentum, w x A h. It is computed with the "
+            "command from the same sample and takes the same delay: a bus that makes the delay needs it added."
+        )
     motors = " and `ArrayMotorTorqueMsg` (the torque on a wheel is minus `wheel_torque`)"
     return filled(
         "README.md",

@@ -131,15 +131,17 @@ def _acted(
 ) -> tuple[Any, ActuatorState]:
     """What actuators and plant make of commands that arrive, each with its time and how long it acts [s].
 
-    pushed: a torque on the plant besides, (m,).
+    pushed: a torque on the plant besides, (m,). Commands that took a delay were limited and compensated as they were
+    sent; others are here.
     """
-    prompt = replace(parts.effective_actuators, delay=0)
+    actuators = parts.effective_actuators
 
     def span(state: tuple[Any, ActuatorState], arrived: tuple) -> tuple[tuple[Any, ActuatorState], None]:
         (x, acting), (command, t, length) = state, arrived
-        drive, _ = prompt.command(acting, command, w, t, length, period.now.noise_weight)
+        due = command if actuators.delay else actuators.send(acting, command, w)[0]
+        drive = actuators.drive(acting, due, t, length)
         x = PeriodMotion(parts, t, x, drive, pushed).after(length)
-        return (x, prompt.end(acting, drive, None, length)), None
+        return (x, actuators.end(acting, drive, None, length)), None
 
     if len(commands) == 1:
         return span((carry.x, carry.acting), commands[0])[0]
@@ -176,7 +178,10 @@ def opened(parts: Parts, during: Nominal, *, late: bool = True) -> Opened:
         seen = parts.observer.model.retract(plant.visible(before.x), seen)
         decision, computer, model = _computed(parts, k2, period, carry, seen)
         x, acting = _acted(parts, period, carry, decision.w, [(arriving, now.t, dt)])
-        return there.local_coordinates(Carry(x, acting, computer, model)), decision.u, decision.s
+        sent = decision.u
+        if parts.effective_actuators.delay:
+            sent, _ = parts.effective_actuators.send(carry.acting, decision.u, decision.w)
+        return there.local_coordinates(Carry(x, acting, computer, model)), sent, decision.s
 
     def pushed(part: Scalar) -> tuple[Array, Array, Array]:
         def ended(old: Array, new: Array, d: Array) -> Array:

@@ -518,3 +518,16 @@ def test_observer_invents_no_disturbance_from_the_wheels():
     log = fly(with_spinning(spinning)).log
     # the trapezium rule of w x A h over a period: h^2/12 w'' H, 0.05 rad/s^3 at the end of the slew
     assert np.abs(log.d_hat).max() < 1e-3
+
+
+def test_the_compensation_of_the_wheels_momentum_takes_the_delay_of_the_command():
+    """w x A h is computed with the command from the same sample, so it acts as late; it had no delay."""
+    momentum, rate = [0.3, -0.1, 0.2], vector([0.02, 0.05, -0.01])
+    device = actuators.Actuators(wheels=reaction_wheels.wheels(np.eye(3), momentum), delay=2)
+    state, applied = device.begin(3), []
+    for k, w in enumerate((rate, 0.0 * rate, 0.0 * rate)):
+        drive, queue = device.command(state, vector([0.0] * 3), w, vector(0.1 * k), vector(0.1), vector(1.0))
+        applied.append(np.asarray(drive.c))
+        state = device.end(state, drive, queue, vector(0.1))
+    np.testing.assert_array_equal(applied[:2], np.zeros((2, 3)))
+    np.testing.assert_allclose(applied[2], np.cross(rate, momentum), rtol=1e-14)
