@@ -159,7 +159,7 @@ def _of_laws(folder: Path) -> list[Path]:
 
 
 def _alike(new: Path, old: Path) -> bool:
-    """Whether two files are the same, two `versions.json` but for the command line."""
+    """Return whether two files are equal. The command line in `versions.json` is ignored."""
     if new.name == "versions.json":
         made = [{**read_versions(path.parent), COMMAND_LINE: None} for path in (new, old)]
         return made[0] == made[1]

@@ -209,19 +209,19 @@ class Actuators:
         v, c = drive.v, drive.c
         if v is None:
             return c, c * s, c * (s * s / 2)
-        # the ramp ends after a time that each channel has for itself; without a rate limit all times are shared
+        # with a rate limit each channel has a ramp of its own duration; without one all channels share their times
         gap, span, first, second = c - v, s, 0.0, 0.0
         ramping, torque_on_ramp = None, c
         if self.rate_limit is not None:
-            slope = self.rate_limit * jnp.sign(gap)
+            ramp_rate = self.rate_limit * jnp.sign(gap)
             by_lag = 0.0 * self.rate_limit if self.lag is None else self.rate_limit * self.lag
             lag_gap = jnp.clip(gap, -by_lag, by_lag)
             ramp = jnp.abs(gap - lag_gap) / self.rate_limit
             ramping, gap, span = s < ramp, lag_gap, jnp.maximum(s - ramp, 0.0)
             on_ramp = jnp.where(ramping, s, ramp)
-            torque_on_ramp = v + slope * s
-            first = on_ramp * (v + slope * on_ramp / 2)
-            second = on_ramp * on_ramp * (v / 2 + slope * on_ramp / 6)
+            torque_on_ramp = v + ramp_rate * s
+            first = on_ramp * (v + ramp_rate * on_ramp / 2)
+            second = on_ramp * on_ramp * (v / 2 + ramp_rate * on_ramp / 6)
         left = area = twice = 0.0  # what the lag has not closed yet, and its two integrals
         if self.lag is not None:
             left = gap * jnp.exp(-span / self.lag)

@@ -83,7 +83,7 @@ def law_on_error(motion: type[ErrorMotion], law: type[Law]) -> type[Law]:
 
     inside = {"__module__": law.__module__, "__doc__": law.__doc__, "__reduce__": reduced}
     if law.command is not AccelerationLaw.command and law.clearance is ErrorMotion.clearance:
-        # it computes the input itself, without the inversion of the error's motion that is singular
+        # a law with its own `command` does not invert the error kinematics, whose singularity does not apply to it
         inside["clearance"], inside["clearance_unit"] = ErrorMotion.clearance, ErrorMotion.clearance_unit
     inside["__qualname__"] = f"{law.__name__}On{motion.__name__}"  # which tells programs; errors name the law's class
     return pytree(dataclass(frozen=True)(type(law.__name__, (law, motion), inside)))

@@ -20,7 +20,8 @@ def readme(code: Code, about: About) -> str:
     if about.delay and about.wheels:
         delay += (
             " `command` does not contain the compensation of the wheels' momentum, w x A h. It is computed with the "
-            "command from the same sample and takes the same delay: a bus that makes the delay needs it added."
+            "command from the same sample and takes the same delay. If your bus causes the delay, add it to `command` "
+            "before you send it."
         )
     motors = " and `ArrayMotorTorqueMsg` (the torque on a wheel is minus `wheel_torque`)"
     return filled(

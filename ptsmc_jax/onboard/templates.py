@@ -17,7 +17,7 @@ from ptsmc_jax.onboard.printing import HELPERS, comment, declared, inside_commen
 
 STATUS = {
     "OK": "done",
-    "SATURATED": "done; a limit of the actuators cuts the command",
+    "SATURATED": "done; a limit of the actuators reduces the command",
     "MISSED": "done; the last sample is not one period ago, so the observer has left this one out",
     "SINGULAR": "the law is next to its singularity: its last good command",
     "INPUT": "an input that is not finite, beyond all measure, no rotation, or no later than the last: the last good "

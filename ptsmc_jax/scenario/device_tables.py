@@ -30,8 +30,8 @@ class Actuators(Table, frozen=True):
         torque_rate_limit: largest rate of the torque [N m/s]
         torque_lag: time constant of a first-order lag [s]
         torque_step: quantisation of the torque [N m]
-        delay: control periods from measuring to acting, the same for all sensors, and for the compensation of the
-            wheels' momentum; the observer is told the torque that acts, the law does not look ahead
+        delay: control periods from the measurement to the torque, the same for all sensors. It also delays the
+            compensation of the wheels' momentum. The observer uses the delayed torque. The law does not predict over it
     """
 
     command_filter: FirstOrderFilter | SecondOrderFilter | NotchFilter | None = None

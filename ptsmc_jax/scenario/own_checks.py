@@ -65,7 +65,9 @@ class _Asked:
         try:
             function(*args)
             _trace(function, args)
-            returned = jax.tree.map(jnp.asarray, function(*args))  # fails if it uses a number that the trace kept
+            returned = jax.tree.map(
+                jnp.asarray, function(*args)
+            )  # fails if the function stored a traced value in the first call
             check_indices(function, *args)
             return returned
         except (Exception, SystemExit) as error:

@@ -430,7 +430,7 @@ def _value(key: str, value: Any, kind: Any) -> Any:
 
 
 def _for_axes(key: str, value: Any) -> str:
-    """Return what to do if each axis has a noise of its own, which the tables of a star tracker and a gyro have not."""
+    """Return a hint if the value is one noise per axis. [hardware] allows one number for all axes."""
     table, _, name = key.partition(".")
     if table != "hardware" or name not in device_tables.Hardware.noises or not isinstance(value, tuple):
         return ""

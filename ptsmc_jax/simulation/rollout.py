@@ -93,10 +93,10 @@ def _check_continuous(parts: Parts) -> None:
     sampled_only = ("sensors", "actuators", "walk_rate", "command_filter", "jitter")
     found = next((name for name in sampled_only if getattr(parts, name) is not None), None)
     if found is not None:
-        raise TypeError(f"{found} must be None in the continuous loop; allowed is a sampled clock")
+        raise TypeError(f"the continuous loop cannot simulate {found}: set {found} to None, or use a sampled clock")
     if type(parts.controller).torque is Law.torque:
         law = type(parts.controller).__name__
-        raise TypeError(f"the law {law} runs in the sampled loop only; allowed is a sampled clock")
+        raise TypeError(f"the law {law} needs the sampled loop: use a sampled clock")
 
 
 def _check_bits(time: Any) -> None:

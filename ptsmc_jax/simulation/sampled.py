@@ -74,14 +74,14 @@ def period_torques(actuators: Actuators, drive: Drive, u: Array, dt: Scalar) -> 
     ends = actuators.at(drive, jnp.zeros_like(dt)), actuators.at(drive, dt)
     nodes, weights, momentum, torque = ends[:1], (1.0,), None, None
     if actuators.moves or actuators.wheels is not None:
-        # momentum in the middle too: a lag may turn the torque around within the period
+        # a lag may change the sign of the torque within the period, where the momentum may then peak
         middle = actuators.at(drive, dt / 2)
         if actuators.moves:
             nodes, weights = (ends[0], middle, ends[1]), (1 / 6, 4 / 6, 1 / 6)
         stored = [momentum for _, momentum in (middle, ends[1]) if momentum is not None]
         if stored:
             momentum = jnp.stack(stored)
-            torque = jnp.stack([ends[0][0], ends[1][0]])  # it goes one way in between
+            torque = jnp.stack([ends[0][0], ends[1][0]])  # it is monotonic in between, so its ends bound it
     delivered = tuple(actuators.on_body(v) for v, _ in nodes)
     return Torques((u,) * len(nodes), delivered, weights, drive.limited, momentum, torque)
 

@@ -131,8 +131,8 @@ def _acted(
 ) -> tuple[Any, ActuatorState]:
     """What actuators and plant make of commands that arrive, each with its time and how long it acts [s].
 
-    pushed: a torque on the plant besides, (m,). Commands that took a delay were limited and compensated as they were
-    sent; others are here.
+    pushed: additional torque on the plant, (m,). Delayed commands are already limited and compensated. Commands without
+    a delay are limited and compensated here.
     """
     actuators = parts.effective_actuators
 

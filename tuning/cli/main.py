@@ -177,7 +177,7 @@ def margins(
 
     The nominal loop has no dispersions. `tune` and `montecarlo` judge required margins by the worst dispersed loop.
 
-    Exit status: 0 done and stable in the hold phase, 1 done but not stable, 2 bad input.
+    Exit status: 0 done and stable in the hold phase, 1 not stable in the hold phase, 2 bad input.
     """
     loaded, folder = prepare(scenario, "margins", out, trust=trust, force=force)
     from ptsmc_jax.campaigns import store

@@ -24,7 +24,7 @@ STEEPEST = 30.0
 
 
 def largest(c: np.ndarray, margin: ArrayLike) -> np.ndarray:
-    """Return (points, rows) the largest metric over limit of the trials that end.
+    """Return the largest ratio of metric to limit over the completed trials, (points, rows).
 
     Args:
         c: (points, rows, trials) constraints whose limits are tighter by the margin.
@@ -37,7 +37,10 @@ class Best:
     """The best point so far. The order is: fewest failed trials, then smallest violation, then smallest F."""
 
     def __init__(self, share: np.ndarray, requirements: int, margin: ArrayLike):
-        self.margin, self.share = np.asarray(margin), share.copy()  # (gains,) where nothing better is known
+        self.margin, self.share = (
+            np.asarray(margin),
+            share.copy(),
+        )  # (gains,) the starting point, until a better one is offered
         self.f = self.value = self.over = self.lost = np.inf
         self.worst = np.full(requirements, np.inf)  # largest metric / limit
 

@@ -1,7 +1,7 @@
-"""Programs that scenarios name: custom parts and metrics, which flying runs and reading does not.
+"""Programs that scenarios name: custom parts and metrics. A simulation runs their code, reading a scenario does not.
 
 Commands report every file that they run for a scenario. If a scenario lies in results, its programs run only with
-`--trust`, and only as they were when the results were made. This is a reminder and no protection: whoever sends results
+`--trust`, and not if their recorded checksum has changed. This is a reminder and no protection: whoever sends results
 can change or omit the file by which they are recognised, and the checksums too.
 """
 
