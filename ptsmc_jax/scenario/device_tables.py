@@ -291,7 +291,9 @@ class SteadyStateFilter(FilterTable, frozen=True):
         return msgspec.structs.replace(self, bandwidth=self.width(scenario)) if noisy else self
 
     def passes(self, scenario: Any) -> float:
-        """Return the attitude gain of a correction, see `devices.attitude_filter.filter_gains`."""
+        """Return the attitude gain of a correction, see `devices.attitude_filter.filter_gains`; 1 if `check` fails."""
+        if self.bandwidth is None and not self._noisy(scenario.devices):
+            return 1.0
         return -math.expm1(-2.0 * self.width(scenario) * scenario.devices.interval(scenario.loop.period))
 
     def check(self, scenario: Any) -> None:

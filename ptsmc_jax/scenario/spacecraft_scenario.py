@@ -206,6 +206,7 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
         limits = [self.devices.torque_limit, tables.limit_of(self, "peak_torque")]
         found += [limit / np.diag(inertia).max() for limit in limits if limit is not None]
         if self.wheels is not None:
+            self.wheels.check()  # defaults are filled in before the scenario is checked
             spread = np.linalg.pinv(formulas.wheel_axes(self.wheels.spin_axes()).T)
             asked = np.abs(spread @ inertia).max()  # torque of one wheel for a unit acceleration about one axis
             limits = [self.wheels.torque_limit, tables.limit_of(self, "peak_wheel_torque")]

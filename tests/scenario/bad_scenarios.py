@@ -307,6 +307,18 @@ BAD = [
         "wheels.axes is [[1.0, 0.0, 0.0]",
         "must span all three directions",
     ),
+    # the same where gains are designed for the mission, for which defaults are filled in before anything is checked
+    (
+        SAMPLED
+        + "controller.t_f = 60\nwheels = { kind = 'axes', torque_limit = 1, axes = [[1, 0, 0], [0, 1, 0], [1, 1, 0]] }",
+        "wheels.axes is [[1.0, 0.0, 0.0]",
+        "must span all three directions",
+    ),
+    (
+        SAMPLED + "controller.t_f = 60\nhardware.torque_limit = 1\nfilter.kind = 'steady_state'",
+        "filter.bandwidth is absent",
+        "must be given",
+    ),
     (SAMPLED + "requirements.peak_wheel_momentum = 1", "requirements.peak_wheel_momentum needs", "no [wheels] table"),
     ("requirements.residual_modal = 1", "requirements.residual_modal needs [flexible]", "no [flexible] table"),
     ("flexible.frequency = [0.0]", "flexible.frequency is [0.0]", "numbers greater than 0, one for each mode"),
