@@ -314,21 +314,20 @@ class _Lanes:
         depends = [dependence(branch.jaxpr, _which(operands)) for branch in branches]
         differs = [either([*each, *_which([index])]) for each in zip(*depends, strict=True)]
         results = Packed(eqn.outvars, differs, self.leads)
+
+        def case(branch: Any, operands: list) -> tuple:
+            return results.pack(self.inside().evaluate(branch, operands))
+
         if agree:
-            all_cases = [lambda one=one: results.pack(self.inside().evaluate(one, operands)) for one in branches]
-            return results.unpack(lax.switch(plain(index), all_cases))
+            return results.unpack(lax.switch(plain(index), [partial(case, branch, operands) for branch in branches]))
         which = index.dense(self.leads[index.differs])
         which = which if which.dtype == bool else jnp.clip(which, 0, len(branches) - 1)
-
-        def case(k: int, branch: Any) -> tuple:
-            return results.pack(self.inside().evaluate(branch, self.shielded(eqn, operands, which == k)))
-
-        cases = [partial(case, k, branch) for k, branch in enumerate(branches)]
 
         def choice(differs: int, *case: Array) -> Array:
             return lax.select_n(jnp.broadcast_to(self._along(which, case[0], differs), case[0].shape), *case)
 
-        outputs = zip(differs, *(case() for case in cases), strict=True)
+        cases = [case(branch, self.shielded(eqn, operands, which == k)) for k, branch in enumerate(branches)]
+        outputs = zip(differs, *cases, strict=True)
         return results.unpack([jax.tree.map(partial(choice, over), *output) for over, *output in outputs])
 
     def shielded(self, eqn: Any, operands: list, on: Array) -> list:
@@ -337,7 +336,7 @@ class _Lanes:
         There a derivative may be infinite, and reverse mode would multiply it by zero. `jax.vmap` does the same.
         """
         floats = [k for k, v in enumerate(eqn.invars[1:]) if jnp.issubdtype(v.aval.dtype, jnp.inexact)]
-        differs = [_which(operands)[k] | TRIAL for k in floats]
+        differs = [own | TRIAL for own in _which([operands[k] for k in floats])]
         some = Packed([eqn.invars[1 + k] for k in floats], differs, self.leads)
 
         def masked(over: int, leaf: Array) -> Array:

@@ -127,7 +127,7 @@ class Actuators:
         Args:
             state: at the start of the period.
             u: command of the law, (m,) [N m].
-            w: rate as it is measured, (m,) [rad/s].
+            w: measured rate, (m,) [rad/s].
             t: start of the period [s].
             dt: its length [s].
             weight: share that a partial first period is of a whole one; its command counts that much on its way
@@ -222,7 +222,7 @@ class Actuators:
             torque_on_ramp = v + ramp_rate * s
             first = on_ramp * (v + ramp_rate * on_ramp / 2)
             second = on_ramp * on_ramp * (v / 2 + ramp_rate * on_ramp / 6)
-        left = area = twice = 0.0  # what the lag has not closed yet, and its two integrals
+        left = area = twice = 0.0  # the gap that the lag leaves, and its two integrals
         if self.lag is not None:
             left = gap * jnp.exp(-span / self.lag)
             area = gap * (self.lag * -jnp.expm1(-span / self.lag))

@@ -342,7 +342,7 @@ def _at(raw: Any, key: str) -> Any:
 
 
 def _in_si(value: Any) -> Any:
-    """Return a text such as "8 arcsec" as a number in SI units, and any other value as it is."""
+    """Return a text such as "8 arcsec" as a number in SI units, and any other value unchanged."""
     unit = _si_unit(value)
     if not unit:
         return value

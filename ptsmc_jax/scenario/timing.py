@@ -152,7 +152,8 @@ def _substeps(scenario: Scenario, period: float, frequencies: Mapping[str, float
         asks = f"loop.period = {period} would take more than {MOST_SUBSTEPS} integration steps a period"
         raise _lower(scenario, max(frequencies, key=lambda key: frequencies[key]), asks)
     steps = max(MOVING if scenario.devices.moving else 1, math.ceil(needed))
-    power = 2 ** (steps.bit_length() - 1)  # 1, 2, 3, 4, 6, 8, 12, ..: nearly all gains then share one compiled program
+    # round up to a power of 2 or 1.5 times one: nearly all gains then share one compiled program
+    power = 2 ** (steps.bit_length() - 1)
     return next(allowed for allowed in (power, power + power // 2, 2 * power) if allowed >= steps)
 
 

@@ -207,7 +207,7 @@ def _snapshot(parts: Parts, target: Any, x: Any) -> Snapshot:
 def _judged(run: Run, state: RunState, target: Any, t: Scalar, step: Scalar, u: Array, memory: Any = None) -> RunState:
     """Return the state at t with its status and first bad time; the first thing that goes wrong stays.
 
-    memory: of the law. Exported code does not keep one that is not finite, so the simulated run counts as diverged.
+    memory: of the law. Exported code rejects a memory that is not finite, so the simulated run counts as diverged.
     """
     law, plant = run.parts.controller, run.parts.plant
     numbers = [

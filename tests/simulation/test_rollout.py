@@ -426,7 +426,7 @@ def test_a_continuous_loop_refuses_parts_that_it_would_ignore(changes, name):
 
 
 def test_a_continuous_loop_refuses_a_law_of_the_sampled_loop():
-    """It ended in NotImplementedError without a sentence."""
+    """The run ended in NotImplementedError without a sentence."""
     run = parts(20.0, 3.0, 2.0)
     kind: Any = law_on_error(ErrorQuaternion, PD)
     law = kind(run.controller.model, vector(20.0), vector(2.0), vector(1.0), vector(2.0))
