@@ -84,7 +84,7 @@ class Reading(NamedTuple):
 class Memory(NamedTuple):
     """Memory of `Sensors` between samples."""
 
-    keys: tuple[draws.Key, draws.Key, draws.Key]  # see `Sensors.keys`
+    keys: tuple[draws.Key, draws.Key, draws.Key] | None  # see `Sensors.keys`; None: without noise
     noise: tuple[Array, Array]  # of the next sample
     bias: Any  # (3,) of the gyro [rad/s]; None without one
     estimate: Any  # Estimate; None without a filter
@@ -111,6 +111,7 @@ class Sensors(Sensor):
     rate_scale: Leaf | None = None  # (3,) reading of the gyro over the true rate [-]
     outage: Leaf | None = None  # (2,) start and end of the time without star tracker samples [s]; with a filter
     own_times: StarTimes | None = None  # of the star tracker where `every` is no whole number, with a filter
+    noise_free: bool = field(default=False, metadata={"static": True})  # no random number is computed, see `quiet`
 
     def star_attitude(self, q: Float[Array, "4"]) -> Float[Array, "4"]:
         """The attitude (4,) of the star tracker, a unit quaternion, for that of the body."""
@@ -133,13 +134,17 @@ class Sensors(Sensor):
         interval = period * self.every if self.own_times is None else self.own_times.interval
         return -0.5 * jnp.log1p(-self.filter.attitude_gain) / interval
 
-    def keys(self, seed: WholeNumber, trial: WholeNumber) -> tuple[draws.Key, draws.Key, draws.Key]:
-        """Keys of a trial's noise: attitude, rate, change of the bias."""
+    def keys(self, seed: WholeNumber, trial: WholeNumber) -> tuple[draws.Key, draws.Key, draws.Key] | None:
+        """Keys of a trial's noise: attitude, rate, change of the bias; None without noise."""
+        if self.noise_free:
+            return None
         attitude, rate, walk = draws.streams(seed, trial, (ATTITUDE_NOISE, RATE_NOISE, BIAS_WALK))
         return attitude, rate, walk
 
-    def noise(self, keys: tuple, sample: Int[Array, ""]) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+    def noise(self, keys: tuple | None, sample: Int[Array, ""]) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
         """Attitude [rad] and rate [rad/s] noise of one sample, (3,) each."""
+        if keys is None:
+            return jnp.zeros(3), jnp.zeros(3)
         return (
             self.attitude_noise * draws.normals(keys[0], 3, sample),
             self.rate_noise * draws.normals(keys[1], 3, sample),
@@ -159,7 +164,8 @@ class Sensors(Sensor):
         if any(source is not None for source in (self.rate_bias, self.bias_rate, self.given_bias)):
             bias = self.first_bias(seed, trial)
         if self.filter is not None:
-            normals = draws.normals(draws.stream(seed, trial, FILTER_START), 6)
+            drawn = not self.noise_free
+            normals = draws.normals(draws.stream(seed, trial, FILTER_START), 6) if drawn else jnp.zeros(6)
             true_bias = jnp.zeros(3) if bias is None else bias
             estimate = self.filter.begin(self.star_attitude(x0.q), true_bias, normals, now.sample, now.noise_weight)
         return Memory(keys, self.noise(keys, now.sample), bias, estimate, None if estimate is None else x0.w)
@@ -171,13 +177,14 @@ class Sensors(Sensor):
         noise_next = self.noise(memory.keys, now.sample + 1)
         turn, shift = guards.lerp(now.noise_weight, memory.noise, noise_next)
         bias = memory.bias
-        if self.bias_rate is not None:
+        if self.bias_rate is not None and memory.keys is not None:
             bias = bias + self.bias_rate * dt * draws.normals(memory.keys[2], 3, now.sample)
         w = jnp.add(x.w if self.rate_scale is None else self.rate_scale * x.w, shift)
         if bias is not None:
             w = w + bias
         q = self.star_attitude(x.q if star_x is None else star_x.q)
-        q = attitude.multiply(q, attitude.from_rotation_vector(turn))
+        if not self.noise_free:
+            q = attitude.multiply(q, attitude.from_rotation_vector(turn))
         return AttitudeState(q, w), memory._replace(noise=noise_next, bias=bias)
 
     def star_weight(self, now: Ticks) -> Scalar:
@@ -217,7 +224,7 @@ class Sensors(Sensor):
         """The sensors without noise and bias; the filter keeps its gains."""
         exact = self.filter and replace(self.filter, spread=0.0 * self.filter.spread)
         zero = jnp.zeros_like(jnp.asarray(self.attitude_noise))
-        quiet = replace(self, attitude_noise=zero, rate_noise=zero, filter=exact)
+        quiet = replace(self, attitude_noise=zero, rate_noise=zero, filter=exact, noise_free=True)
         return replace(quiet, rate_bias=None, bias_rate=None, given_bias=None)
 
     def drawn(self, seed: WholeNumber, trial: WholeNumber) -> dict[str, Array]:

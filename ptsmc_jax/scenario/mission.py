@@ -133,8 +133,8 @@ def designs(scenario: Any) -> list[Design]:
     """Return starting points of a search: slow to fast hold phases, slow and fast observers, the default first."""
     limits, eta, stable = _limits(scenario), _eta(scenario), STABLE / dead_time(scenario)
     rates = [limits.accurate, limits.most, math.sqrt(limits.least * limits.most), limits.least]
-    rates = [*dict.fromkeys([*rates, stable, math.sqrt(limits.most * stable)])]
-    rates = [max(rate, limits.least) for rate in rates]
+    rates += [max(rate, limits.least) for rate in (stable, math.sqrt(limits.most * stable))]
+    rates = [*dict.fromkeys(rates)]
     found = [_design(scenario, rate, eta, observer) for observer in (OBSERVER, 0.1) for rate in rates]
     return [*found, _design(scenario, limits.accurate, _least_eta(scenario), 0.3)]
 

@@ -66,6 +66,7 @@ CATALOGUE = {
         for name in AT_A_TIME
     },
 }
+POINTING = tuple(name for name, entry in CATALOGUE.items() if entry.table == "pointing")
 # The same for other plants, whose x_1 is the error, in the states' own units; what they lack is left out.
 STATE_CATALOGUE = {
     "terminal_error": Entry("x1", "|x_1| at t_f"),

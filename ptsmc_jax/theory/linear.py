@@ -173,30 +173,29 @@ def opened(parts: Parts, during: Nominal, *, late: bool = True) -> Opened:
     z0, x0, known, u0 = (jnp.zeros(n) for n in (sum(here.sizes), *here.sizes[:2], plant.inputs))
     target = parts.reference(now.t)
 
-    def flown(z: Array, seen: Array) -> tuple[Array, Array, Array]:
+    def flown(z: Array, seen: Array, new: Array, d: Array) -> tuple[Array, Array, Array]:
         carry = here.retract(z)
         seen = parts.observer.model.retract(plant.visible(before.x), seen)
         decision, computer, model = _computed(parts, k2, period, carry, seen)
-        x, acting = _acted(parts, period, carry, decision.w, [(arriving, now.t, dt)])
+        x, acting = _acted(parts, period, carry, decision.w, [(arriving + new, now.t, dt)], d)
         sent = decision.u
         if parts.effective_actuators.delay:
             sent, _ = parts.effective_actuators.send(carry.acting, decision.u, decision.w)
         return there.local_coordinates(Carry(x, acting, computer, model)), sent, decision.s
 
-    def pushed(part: Scalar) -> tuple[Array, Array, Array]:
-        def ended(old: Array, new: Array, d: Array) -> Array:
-            commands = [(arriving + new, now.t, dt)]
-            if late:
-                from_then_on = (arriving + new, now.t + part * dt, (1.0 - part) * dt)
-                commands = [(arriving + old, now.t, part * dt), from_then_on]
-            x, acting = _acted(parts, period, before, plant.velocity(after.computer.seen), commands, d)
+    def pushed(part: Scalar) -> tuple[Array, Array]:
+        def ended(old: Array, new: Array) -> Array:
+            from_then_on = (arriving + new, now.t + part * dt, (1.0 - part) * dt)
+            commands = [(arriving + old, now.t, part * dt), from_then_on]
+            x, acting = _acted(parts, period, before, plant.velocity(after.computer.seen), commands)
             return there.local_coordinates(after._replace(x=x, acting=acting))
 
-        return jax.jacfwd(ended, argnums=(0, 1, 2))(u0, u0, u0)
+        return jax.jacfwd(ended, argnums=(0, 1))(u0, u0)
 
-    (a, seen), (command, direct), (s_command, s_direct) = jax.jacfwd(flown, argnums=(0, 1))(z0, known)
-    old, new, disturbed = lapack.vmap(pushed)(jnp.asarray(NODES if late else NODES[:1]))
-    loop = Loop(a, seen, new, old, command, direct, disturbed[0], dt, delay=parts.effective_actuators.delay)
+    by_all = jax.jacfwd(flown, argnums=(0, 1, 2, 3))(z0, known, u0, u0)
+    (a, seen, new, disturbed), (command, direct, *_), (s_command, s_direct, *_) = by_all
+    old, new = lapack.vmap(pushed)(jnp.asarray(NODES)) if late else (jnp.zeros_like(new)[None], new[None])
+    loop = Loop(a, seen, new, old, command, direct, disturbed, dt, delay=parts.effective_actuators.delay)
     error, error_rate = jax.jacfwd(lambda by: law.errors(plant.retract(before.x, by), target))(x0)
     return Opened(loop, error, error_rate, s_command, s_direct)
 

@@ -15,7 +15,7 @@ from ptsmc_jax import formulas
 from ptsmc_jax.devices import attitude_filter, sensors, ticks
 from ptsmc_jax.numerics import attitude, draws
 from ptsmc_jax.plants import rigid_body
-from tests.helpers import vector
+from tests.helpers import equations, vector
 
 EPS = np.finfo(float).eps
 SIGMAS = -stats.norm.ppf(0.5e-6)  # with other seeds a check would fail once in a million; they are fixed
@@ -54,6 +54,17 @@ def test_noise_has_the_stated_size_about_every_body_axis(errors):
         assert np.all(np.abs((error**2).mean(axis=0) - 1) < SIGMAS * math.sqrt(2 / n))
         for axis in error.T:
             assert stats.kstest(axis, "norm").pvalue > 1e-6
+
+
+@pytest.mark.parametrize("filtered", [False, True])
+def test_sensors_without_noise_measure_the_true_state_and_draw_no_numbers(filtered):
+    noisy = sensors.Sensors(vector(SIZES[0]), vector(SIZES[1]), rate_bias=vector(1e-6), bias_rate=vector(1e-8))
+    quiet = (noisy.with_bandwidth(0.2, 0.05) if filtered else noisy).quiet()
+    measured = seen_by(quiet, STATE, 3, 4, 5)
+    np.testing.assert_allclose(measured.q, STATE.q, rtol=4 * EPS)
+    np.testing.assert_array_equal(measured.w, STATE.w)
+    trace = jax.make_jaxpr(lambda seed: seen_by(quiet, STATE, seed, 4, 5))(jnp.uint32(3))
+    assert not any(primitive.name == "shift_left" for primitive in (one.primitive for one in equations(trace)))
 
 
 def test_noise_is_independent_of_axis_and_sensor(errors):

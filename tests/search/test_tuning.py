@@ -445,7 +445,7 @@ def test_search_finds_the_constrained_optimum(monkeypatch):
     assert c.max() <= 0.0
 
 
-@pytest.mark.parametrize("second", ["better", "worse"])
+@pytest.mark.parametrize("second", ["better", "worse", "better, then Ctrl-C"])
 def test_a_global_search_follows_if_harder_trials_lead_beyond_a_limit(monkeypatch, second):
     """The search with harder trials is made to end at gains that break the limit.
 
@@ -471,6 +471,8 @@ def test_a_global_search_follows_if_harder_trials_lead_beyond_a_limit(monkeypatc
         own(run, harder, shares)
         if second == "worse" and seeds:
             run._best.over = np.inf
+        if "Ctrl-C" in second and seeds:
+            raise KeyboardInterrupt
 
     joins = iter([True])  # once, nothing in fact
     monkeypatch.setattr(rounds.Rounds, "harder", lambda self, *_: next(joins, False) and not vars(self).update(count=1))
@@ -479,7 +481,8 @@ def test_a_global_search_follows_if_harder_trials_lead_beyond_a_limit(monkeypatc
     monkeypatch.setattr(descents.Descents, "descend", descend)
     found = optimise.search(evaluate, some, wanted, np.array([3.0, 0.5]), optimise.Settings(2, 10, 1))
     assert seeds == [2]
-    assert bool(found.worst[0] <= 1.0) is (second == "better")
+    assert found.interrupted is ("Ctrl-C" in second)
+    assert bool(found.worst[0] <= 1.0) is (second != "worse")
     assert np.array_equal(found.share, lost[0]) is (second == "worse")
 
 

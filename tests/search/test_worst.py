@@ -7,9 +7,10 @@ import jax
 import numpy as np
 import pytest
 
+from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.dispersions import attitudes, inertias, misfits, numbers, variation
 from ptsmc_jax.signals import disturbances
-from ptsmc_jax.simulation import clock
+from ptsmc_jax.simulation import clock, pointing
 from ptsmc_jax.simulation.requirements import Requirement
 from tests.helpers import chain_parts, parts, short, small_search, vector
 from tuning.search import flights, objective, optimise, rounds, worst
@@ -44,6 +45,19 @@ def sine(amplitude):
 def first_torque(inertia, theta, eta=ETA):
     """Largest torque at t = 0 from rest over all axes: 2 eta^2 max |J n| tan(theta/2) / t_f^2 (theory 3.3)."""
     return 2 * eta**2 * np.linalg.norm(inertia, axis=1).max() * np.tan(theta / 2) / T_F**2
+
+
+def test_a_search_computes_only_the_pointing_metrics_that_its_problem_needs():
+    observed = pointing.Pointing(vector(*pointing.across([0.0, 0.0, 1.0])), vector(0.1), vector(0.4))
+    spread = variation.Dispersion(attitudes.AxisAngle(vector(0.1), vector(2.0)))
+    problem, _ = posed(spread, Requirement("ape_z", 1e-3))
+    problem = replace(problem, parts=replace(problem.parts, pointing=observed))
+    gains = np.array([ETA, 1.0])
+    found = flights.trials(problem.others(np.arange(8)), gains).metrics
+    every = montecarlo.run(problem.parts, spread, 5, np.arange(8)).metrics
+    np.testing.assert_allclose(found.ape_z, every.ape_z, rtol=1e-12)
+    np.testing.assert_allclose(found.hold_error, every.hold_error, rtol=1e-12)
+    assert np.all(np.isnan(found.rpe_z) & np.isfinite(every.rpe_z))
 
 
 @pytest.fixture(autouse=True)

@@ -270,14 +270,13 @@ class Descents:
     def search_globally(self, problem: Problem, starts: int, seed: int) -> None:
         """Search from the best of many points of the whole box, and keep the earlier result if it is better."""
         self.globally = True
-        found, better = (self.best, self._problem, self._from, self._ends), False
+        found = self.best, self._problem, self._from, self._ends
         try:
             few = _few_trials(problem)
             first = spread_widely(self._evaluate, self.tightened(few), starts, seed, self._report)
             self.descend(problem, self._promising(few, first, 1 + max(self._history, default=-1)))
-            better = self.best.rank < found[0].rank
         finally:  # interrupted too
-            if not better:
+            if found[0].rank <= self.best.rank:
                 self._best, self._problem, self._from, self._ends = found
 
     def _instead(self, problem: Problem, ends: Sequence[tuple[int, np.ndarray]]) -> None:

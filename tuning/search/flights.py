@@ -18,6 +18,7 @@ from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.campaigns.montecarlo import Flown, Trials
 from ptsmc_jax.dispersions.base import INERTIA, Coordinates
 from ptsmc_jax.dispersions.variation import Dispersion
+from ptsmc_jax.simulation.catalogues import POINTING
 from ptsmc_jax.simulation.rollout import Parts
 from tuning.search.gains import with_gains
 
@@ -34,6 +35,7 @@ class Fleet(NamedTuple):
     names: tuple[str, ...]  # of the gains
     trials: np.ndarray  # (trials,) that name the noise
     coordinates: Mapping[str, np.ndarray]  # of what is drawn, arrays over the trials first
+    pointing: tuple[str, ...] = ()  # the pointing metrics that are computed, the others are NaN; see `_fly`
 
     @property
     def by_trial(self) -> dict[str, Any]:
@@ -64,7 +66,7 @@ def fly(fleet: Fleet, gains: np.ndarray) -> Flown:
     rows = _Rows(len(gains), len(fleet.trials), ROWS)
 
     def call(some: dict[str, Any], needed: np.int32) -> Flown:
-        return _fly(*fleet.shared, some, needed, fleet.names, rows.devices)
+        return _fly(*fleet.shared, some, needed, fleet.names, fleet.pointing, rows.devices)
 
     return rows.flown(call, {"gains": gains}, fleet.by_trial)
 
@@ -108,7 +110,7 @@ def prepare(fleet: Fleet) -> None:
     """Begin to compile what `fly` needs, beside what is being done."""
     rows = _Rows(1, len(fleet.trials), ROWS)
     some, _ = rows.some(0, {"gains": np.zeros((1, len(fleet.names)))}, fleet.by_trial)
-    _fly.prepare(*fleet.shared, some, np.int32(0), fleet.names, rows.devices)
+    _fly.prepare(*fleet.shared, some, np.int32(0), fleet.names, fleet.pointing, rows.devices)
 
 
 class _Rows:
@@ -147,7 +149,7 @@ class _Rows:
         return jax.tree.map(joined, *calls)
 
 
-@programs.jit(static_argnames=("names", "devices"), compiler_options=programs.BATCHED, batch=True)
+@programs.jit(static_argnames=("names", "pointing", "devices"), compiler_options=programs.BATCHED, batch=True)
 def _fly(
     parts: Parts,
     dispersion: Dispersion,
@@ -155,13 +157,20 @@ def _fly(
     rows: dict[str, Any],
     needed: jax.Array,
     names: tuple[str, ...],
+    pointing: tuple[str, ...],
     devices: int,
 ) -> Flown:
-    """Results of (devices, rows, trials); rows from `needed` on are left zero."""
+    """Results of (devices, rows, trials); rows from `needed` on are left zero.
+
+    The 52 pointing metrics make up half of the program, so only those that the problem needs are compiled.
+    """
+    skipped = [name for name in POINTING if name not in pointing]
 
     def one(gains: jax.Array, trial: jax.Array, coordinates: Coordinates) -> Flown:
         moved = with_gains(parts, dict(zip(names, gains, strict=True)))
-        return montecarlo.one(moved, dispersion, seed, trial, coordinates)
+        flown = montecarlo.one(moved, dispersion, seed, trial, coordinates)
+        not_computed = jnp.full_like(flown.bad_time, jnp.nan)
+        return flown._replace(metrics=flown.metrics._replace(**dict.fromkeys(skipped, not_computed)))
 
     def flown(row: dict[str, Any]) -> Flown:
         return lanes.vmap(one, (None, 0, 0), whole=montecarlo.by_kernel())(

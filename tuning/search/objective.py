@@ -18,6 +18,7 @@ from ptsmc_jax.numerics.pytrees import Leaf, pytree
 from ptsmc_jax.scenario.tables import LIMITS as LIMITS
 from ptsmc_jax.scenario.tables import T_F as T_F
 from ptsmc_jax.simulation import rollout
+from ptsmc_jax.simulation.catalogues import POINTING
 from ptsmc_jax.simulation.requirements import Requirement
 from ptsmc_jax.simulation.requirements import over as near
 from ptsmc_jax.simulation.rollout import Parts
@@ -80,7 +81,8 @@ class Problem(Rules):
     def fleet(self) -> Fleet:
         """What is flown of it."""
         trials, coordinates = np.asarray(self.trials), jax.tree.map(np.asarray, self.coordinates)
-        return Fleet(self.parts, self.dispersion, self.seed, self.names, trials, coordinates)
+        pointing = tuple(name for name in POINTING if name in watched(self))
+        return Fleet(self.parts, self.dispersion, self.seed, self.names, trials, coordinates, pointing)
 
     def others(self, trials: np.ndarray) -> Fleet:
         """What is flown with other trials of its seed."""
