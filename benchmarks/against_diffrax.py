@@ -13,6 +13,7 @@ from common import machine, medians, row, say, steps, study  # noqa: E402
 
 from ptsmc_jax.campaigns import montecarlo  # noqa: E402
 from ptsmc_jax.devices.ticks import Ticks  # noqa: E402
+from ptsmc_jax.laws.base import Sample  # noqa: E402
 from ptsmc_jax.plants.rigid_body import AttitudeState  # noqa: E402
 
 TRIALS = 1024
@@ -47,7 +48,7 @@ def loop(parts, x0):
         impulse = watch.model.unexplained_impulse(now.t, seen, x, u, dt_before)
         updated = watch.update(matrix, d_hat, impulse, now.t, dt_before)
         d_hat = jnp.where(dt_before > 0.0, updated, d_hat)
-        u, _ = law.torque(now.t, now.hold, x, parts.reference(now.t), d_hat, k2(now.t))
+        u, *_ = law(Sample(now.t, now.hold, parts.period), x, parts.reference(now.t), d_hat, k2(now.t))
         state = solver.init(term, now.t, now.t_next, x, u)
         x_next, *_ = solver.step(term, now.t, now.t_next, x, u, state, made_jump=False)
         dt = now.t_next - now.t
@@ -64,7 +65,7 @@ def main() -> None:
     ready = study()
     numbers = np.arange(TRIALS)
     flown = montecarlo.run(ready.parts, ready.dispersion, 0, numbers)
-    aligned = jax.vmap(lambda x: ready.parts.controller.align(x, ready.parts.reference(jnp.zeros(()))))(
+    aligned = jax.vmap(lambda x: ready.parts.controller.kinematics.align(x, ready.parts.reference(jnp.zeros(()))))(
         AttitudeState(jnp.asarray(flown.vectors("initial_q")), jnp.asarray(flown.vectors("initial_w")))
     )
     by_diffrax = jax.jit(lambda x0: jax.vmap(lambda x: loop(ready.parts, x))(x0))

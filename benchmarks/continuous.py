@@ -19,6 +19,7 @@ from scipy.integrate import solve_ivp  # noqa: E402
 
 from ptsmc_jax import scenario  # noqa: E402
 from ptsmc_jax.campaigns import montecarlo  # noqa: E402
+from ptsmc_jax.laws.base import Sample  # noqa: E402
 from ptsmc_jax.simulation import rollout  # noqa: E402
 
 ERROR = 1e-9  # wanted in the attitude error vector at t_f
@@ -64,7 +65,7 @@ def main() -> None:
     t_f, t_s = float(parts.controller.t_f), float(parts.controller.hand_over)
     t_end = float(parts.t_end)
     rate = numpy_loop(parts)
-    x0 = parts.controller.align(parts.initial, parts.reference(jnp.zeros(())))
+    x0 = parts.controller.kinematics.align(parts.initial, parts.reference(jnp.zeros(())))
     y0 = np.concatenate([x0.q, x0.w, np.zeros(3)])
 
     def by_scipy(tolerance, method):
@@ -79,7 +80,7 @@ def main() -> None:
 
     def closed(t, y, hold):
         x, d_hat = y
-        u, _ = law.torque(t, hold, x, parts.reference(t), d_hat, k2(t))
+        u, *_ = law(Sample(t, hold, jnp.zeros(())), x, parts.reference(t), d_hat, k2(t))
         x_dot = plant.rate(t, x, u, parts.disturbance(t, x))
         seen = watch.model.unexplained(t, x, x_dot, u)
         return x_dot, watch.forcing(t, (t, t), d_hat, seen) - watch.decay_matrix(t, t) @ d_hat

@@ -22,7 +22,7 @@ _EXPORTS = {
     "Target": "signals.references",
     "Chain": "plants.integrator_chain",
     "chain": "plants.integrator_chain",
-    "AccelerationLaw": "laws.acceleration",
+    "AccelerationLaw": "laws.base",
     "SampledObserver": "observers.base",
     "SampledSensor": "devices.own_sensors",
     "Draw": "dispersions.base",
@@ -50,8 +50,10 @@ _EXPORTS = {
     "Requirement": "simulation.requirements",
     "Scenario": "scenario.tables",
     "ScenarioError": "scenario.errors",
-    "PrescribedTimeMultiplicative": "laws.prescribed_time",
-    "PrescribedTimeSystem": "laws.prescribed_time",
+    "AdditiveKinematics": "laws.kinematics",
+    "ChainKinematics": "laws.kinematics",
+    "MultiplicativeKinematics": "laws.kinematics",
+    "SecondOrderKinematics": "laws.kinematics",
     "FiniteTimeObserver": "observers.finite_time",
     "PrescribedTimeObserver": "observers.prescribed_time",
     "System": "plants.second_order",
@@ -80,11 +82,13 @@ if TYPE_CHECKING:
     from ptsmc_jax.explore import trials as trials
     from ptsmc_jax.explore import verdicts as verdicts
     from ptsmc_jax.explore import write as write
-    from ptsmc_jax.laws.acceleration import AccelerationLaw as AccelerationLaw
+    from ptsmc_jax.laws.base import AccelerationLaw as AccelerationLaw
+    from ptsmc_jax.laws.kinematics import AdditiveKinematics as AdditiveKinematics
+    from ptsmc_jax.laws.kinematics import ChainKinematics as ChainKinematics
+    from ptsmc_jax.laws.kinematics import MultiplicativeKinematics as MultiplicativeKinematics
+    from ptsmc_jax.laws.kinematics import SecondOrderKinematics as SecondOrderKinematics
     from ptsmc_jax.laws.prescribed_time import PrescribedTime as PrescribedTime
     from ptsmc_jax.laws.prescribed_time import PrescribedTimeChain as PrescribedTimeChain
-    from ptsmc_jax.laws.prescribed_time import PrescribedTimeMultiplicative as PrescribedTimeMultiplicative
-    from ptsmc_jax.laws.prescribed_time import PrescribedTimeSystem as PrescribedTimeSystem
     from ptsmc_jax.numerics.pytrees import gain as gain
     from ptsmc_jax.observers.base import SampledObserver as SampledObserver
     from ptsmc_jax.observers.finite_time import FiniteTimeObserver as FiniteTimeObserver

@@ -18,13 +18,15 @@ from polars.testing import assert_frame_equal
 
 from ptsmc_jax import configure, programs
 from ptsmc_jax.devices import sensors
-from ptsmc_jax.laws import prescribed_time
+from ptsmc_jax.laws.base import Sample
+from ptsmc_jax.laws.kinematics import AdditiveKinematics, ChainKinematics
+from ptsmc_jax.laws.prescribed_time import PrescribedTime, PrescribedTimeChain
 from ptsmc_jax.observers import none, nonlinear
 from ptsmc_jax.plants import integrator_chain, rigid_body
 from ptsmc_jax.signals import disturbances, references
 from ptsmc_jax.simulation import clock, rollout
 from ptsmc_jax.simulation.rollout import Parts
-from ptsmc_jax.theory import solutions
+from ptsmc_jax.theory import rates, solutions
 from tests.tree import QUICKLY as QUICKLY
 from tests.tree import ROOT as ROOT
 
@@ -154,7 +156,7 @@ def parts(
     surface_rate=1.0,
     saves: Any = (),
     reach: tuple[float, float] | None = None,
-    law: Any = prescribed_time.PrescribedTime,
+    kinematics: Any = AdditiveKinematics,
 ) -> Parts:
     """Parts of the paper's Case I with changes; continuous unless a period is given; reach: largest (t_f, delta)."""
     body = rigid_body.spacecraft(inertia)
@@ -173,7 +175,9 @@ def parts(
         disturbance=disturbance
         or disturbances.Sinusoid(vector([0.01] * 3), vector([0.1] * 3), vector([0.0] * 3), vector([0.0] * 3)),
         reference=reference or references.Fixed(vector([0.0, 0.0, 0.0, 1.0])),
-        controller=law(body, *(vector(v) for v in (t_f, eta, delta, k1, sign_width, surface_rate))),
+        controller=PrescribedTime(
+            kinematics(body), *(vector(v) for v in (t_f, eta, delta, k1, sign_width, surface_rate))
+        ),
         observer=nonlinear.NonlinearObserver(body, vector([gain] * 3), vector(rate_bound), vector(0.0)),
         sensors=None if noise is None else sensors.Sensors(*(vector(v) for v in noise)),
         clock=timing,
@@ -182,6 +186,12 @@ def parts(
         window=vector(1.0),
         settling_angle=vector(1e-3),
     )
+
+
+def commanded(law: Any, t: Any, hold: Any, x: Any, target: Any, d_hat: Any, k2: Any) -> Any:
+    """Input and sliding variable of a law without a memory at t [s]."""
+    u, s, _ = law(Sample(t, hold, vector(0.1)), x, target, d_hat, k2)
+    return u, s
 
 
 def chain_parts(
@@ -209,14 +219,15 @@ def chain_parts(
     eta = n + 1.0 if eta is None else eta
     a = [float(math.comb(n - 1, i)) for i in range(n - 1)] if a is None else a
     gains = tuple(vector(v) for v in (t_f, eta, delta, k1, sign_width, surface_rate))
-    law = prescribed_time.PrescribedTimeChain(model, *gains, a=vector(a))
+    law = PrescribedTimeChain(ChainKinematics(model), *gains, a=vector(a))
     if period is not None:
         timing: Any = roomy(clock.anchored(period, t_end, t_f, 2.0 + delta))
     elif steps is not None:
         largest = vector(1.5 * t_f / steps[0])
         timing = clock.Graded(vector(t_end), vector(1.0), largest, jnp.zeros(0), *steps)
     else:
-        timing = roomy(clock.graded(t_f, delta, t_end, 1.0, max(law.hold_rates().values()), 0.0, (0.0, 0.0), (), n))
+        pace = max(rates.hold_rates(law).values())
+        timing = roomy(clock.graded(t_f, delta, t_end, 1.0, pace, 0.0, (0.0, 0.0), (), n))
     return Parts(
         plant=model,
         disturbance=disturbance or disturbances.Constant(jnp.zeros(1)),

@@ -18,6 +18,7 @@ from ptsmc_jax import configure, programs, scenario
 from ptsmc_jax.batching import lanes
 from ptsmc_jax.campaigns import montecarlo, runs
 from ptsmc_jax.dispersions import variation
+from ptsmc_jax.laws.kinematics import ChainKinematics
 from ptsmc_jax.plants import integrator_chain, rigid_body
 from ptsmc_jax.scenario.disturbance_tables import DISTURBANCES
 from ptsmc_jax.scenario.law_tables import LAWS
@@ -388,5 +389,6 @@ def test_lanes_equal_vmap_for_a_plant_from_python():
     row = {name: table for name, table in ROWS["sampled chain with noise"].items() if name != "hardware"}
     ready = scenario.study(scenario.from_tables(row))
     model = integrator_chain.chain(2, f, g)
-    parts = replace(ready.parts, plant=model, controller=replace(ready.parts.controller, model=model))
+    law = replace(ready.parts.controller, kinematics=ChainKinematics(model))
+    parts = replace(ready.parts, plant=model, controller=law)
     compare(parts, ready.dispersion, "own plant", False)

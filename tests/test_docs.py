@@ -206,7 +206,7 @@ PHYSICS += [
     f"ptsmc_jax.{name}"
     for name in """
     numerics.attitude numerics.draws simulation.clock theory.hold theory.linear theory.solutions theory.rules
-    theory.envelopes scenario.scales""".split()
+    theory.closed_forms theory.envelopes theory.exact_motion theory.rates scenario.scales""".split()
 ]
 ARRAYS = re.compile(r"\b(Array|Float|Int|Bool|UInt32|ndarray|ArrayLike|Leaf)\b")
 UNIT = re.compile(

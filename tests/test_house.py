@@ -25,10 +25,9 @@ HOUSE = {
         "plants": "base | integrator_chain rigid_body second_order | flexible_body",
         "signals": "disturbances references",
         "laws": """
-            closed_forms error_motions
+            kinematics
             base
-            acceleration prescribed_time
-            fixed_time pd predefined_time scaling super_twisting terminal time_base
+            baselines prescribed_time time_base
         """,
         "observers": "base | finite_time none nonlinear prescribed_time",
         "devices": """
@@ -48,7 +47,9 @@ HOUSE = {
         """,
         "dispersions": "base | attitudes inertias misfits numbers | quantities | variation | planned",
         "theory": """
-            borders carries error_floor rules solutions
+            borders carries closed_forms error_floor rates rules
+            exact_motion
+            solutions
             envelopes linear
             covariance crossings
             rest

@@ -151,7 +151,7 @@ class Dispersion:
         By the columns of `quantities`, numbers each: attitudes (q1 to q4) [-], rates [rad/s], inertia [kg m^2], phases
         [rad], torques [N m], noises [rad, rad/s].
         """
-        angle = parts.controller.angle(parts.initial, parts.reference(jnp.zeros_like(parts.t_end)))
+        angle = parts.controller.kinematics.angle(parts.initial, parts.reference(jnp.zeros_like(parts.t_end)))
         names = {INITIAL_ATTITUDE, INITIAL_RATE, INITIAL_STATE, *self.kinds, *given}
         return {"initial_angle": angle, **quantities.read_columns(parts, names)}
 

@@ -238,7 +238,7 @@ def _names(parts: Parts) -> tuple[str, str, str]:
     """Labels of the error and the input, and the input's unit behind a number."""
     if not parts.plant.attitude:
         return "$|x_1|$", "input u", ""
-    return "|$\\varepsilon_1$| [-]" if parts.controller.additive else "|v| [-]", "torque [N m]", " N m"
+    return "|$\\varepsilon_1$| [-]" if parts.controller.kinematics.additive else "|v| [-]", "torque [N m]", " N m"
 
 
 def _components(axes: Axes, t: ArrayLike, values: ArrayLike, symbol: str, **kwargs: Any) -> None:

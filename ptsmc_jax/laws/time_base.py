@@ -6,17 +6,16 @@ from typing import ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from ptsmc_jax.laws.acceleration import AccelerationLaw
-from ptsmc_jax.laws.base import Sample
+from ptsmc_jax.laws.base import AccelerationLaw, Sample
 from ptsmc_jax.numerics import guards
-from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector
+from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector, pytree
 
 
 class Start(NamedTuple):
     """Where a profile begins."""
 
     measured: Scalar  # 1.0 from the first sample on, before it 0.0
-    error: Vector  # the first error, in its `ErrorMotion.straight_coordinates`
+    error: Vector  # the first error, in its `Kinematics.straight_coordinates`
     rate: Vector  # and its derivative [1/s]
 
 
@@ -51,7 +50,7 @@ class TimeBase(AccelerationLaw):
             x = jnp.minimum(t / self.t_f, 1.0)
             of_error = 1.0 + x**3 * (-10.0 + x * (15.0 - 6.0 * x))
             of_rate = x * (1.0 + x**2 * (-6.0 + x * (8.0 - 3.0 * x)))
-            return self.from_straight_coordinates(of_error * start.error + self.t_f * of_rate * start.rate)
+            return self.kinematics.from_straight_coordinates(of_error * start.error + self.t_f * of_rate * start.rate)
 
         def rates(t: Scalar) -> tuple[Vector, Vector]:
             return jax.jvp(error, (t,), (jnp.ones_like(t),))
@@ -62,21 +61,22 @@ class TimeBase(AccelerationLaw):
     def feedback(self, deviation: Vector, rate: Vector, bound: Scalar) -> tuple[Vector, Vector]:
         """Acceleration that brings the deviation E from the profile to zero, and the sliding variable, (m,) each.
 
-        rate: E' [1/s], (m,); bound: as in `AccelerationLaw`.
+        rate: E' [1/s], (m,); bound: as in `Law.acceleration`.
         """
         raise NotImplementedError
 
-    def step(
-        self, memory: Start, now: Sample, error: Vector, error_rate: Vector, bound: Scalar
+    def acceleration(
+        self, now: Sample, error: Vector, error_rate: Vector, bound: Scalar
     ) -> tuple[Vector, Vector, Start]:
-        """Acceleration of the profile with the feedback, and s, (m,) each; remembers where the profile began."""
-        straight, rate = jax.jvp(self.straight_coordinates, (error,), (error_rate,))
-        start = guards.select(memory.measured > 0.5, memory, Start(jnp.ones_like(now.t), straight, rate))
+        """Return the acceleration of the profile with the feedback, s, (m,) each, and where the profile began."""
+        straight, rate = jax.jvp(self.kinematics.straight_coordinates, (error,), (error_rate,))
+        start = guards.select(now.memory.measured > 0.5, now.memory, Start(jnp.ones_like(now.t), straight, rate))
         profile = self.profile(start, now.t)
         a, s = self.feedback(error - profile.error, error_rate - profile.rate, bound)
         return profile.acceleration + a, s, start
 
 
+@pytree
 @dataclass(frozen=True)
 class TimeBasePD(TimeBase):
     """a = r'' - k_d E' - k_p E with E = eps - r; its s is E' + (k_p/k_d) E."""
@@ -86,10 +86,11 @@ class TimeBasePD(TimeBase):
     tunable: ClassVar[tuple[str, ...]] = ("k_p", "k_d", "t_f")
 
     def feedback(self, deviation: Vector, rate: Vector, bound: Scalar) -> tuple[Vector, Vector]:
-        """As the class says, (m,) each."""
+        """Return a - r'' and s, (m,) each."""
         return -self.k_d * rate - self.k_p * deviation, rate + self.k_p / self.k_d * deviation
 
 
+@pytree
 @dataclass(frozen=True)
 class TimeBaseSliding(TimeBase):
     """s = E' + c E with E = eps - r, a = r'' - c E' - k s - K sign(s)."""
@@ -100,6 +101,6 @@ class TimeBaseSliding(TimeBase):
     tunable: ClassVar[tuple[str, ...]] = ("surface_rate", "k", "sign_width", "t_f")
 
     def feedback(self, deviation: Vector, rate: Vector, bound: Scalar) -> tuple[Vector, Vector]:
-        """As the class says, (m,) each."""
+        """Return a - r'' and s, (m,) each."""
         s = rate + self.surface_rate * deviation
         return -self.surface_rate * rate - self.k * s - bound * guards.smooth_sign(s, self.sign_width), s

@@ -178,7 +178,7 @@ def _unit(q: Any) -> Any:
 def _signed(law: Law, target: Any, q: Any, w: Any, before: Any, tracking: Any) -> Any:
     """The nearer of q and -q, which are one attitude, to the last sample's; at the start the law's choice."""
     going_on = jnp.where(jnp.dot(q, before) < 0.0, -q, q)
-    return jnp.where(tracking != 0, going_on, law.align(AttitudeState(q, w), target).q)
+    return jnp.where(tracking != 0, going_on, law.kinematics.align(AttitudeState(q, w), target).q)
 
 
 def _tracking(computer: Board) -> None:
@@ -292,8 +292,8 @@ def _commanding(computer: Board, law: Law, observer: Observer, command_filter: C
     target = jax.eval_shape(computer.parameters["reference"], real())
 
     def once(law: Law, x: Any, target: Any) -> Any:
-        return law.command(memory, Sample(jnp.zeros(()), jnp.zeros((), bool), jnp.ones(())), x, target, jnp.zeros(m),
-                           jnp.zeros(()))[1]  # fmt: skip
+        now = Sample(jnp.zeros(()), jnp.zeros((), bool), jnp.ones(()), memory)
+        return law(now, x, target, jnp.zeros(m), jnp.zeros(()))[1]
 
     computer.state["law"] = shapes(memory)
     computer.outputs |= {"command": real(m), "s": real(*jax.eval_shape(once, law, x, target).shape)}
@@ -326,8 +326,8 @@ def _commanding(computer: Board, law: Law, observer: Observer, command_filter: C
         hold = t >= known.hand_over - guards.rounding(period, known.hand_over)  # as the clock has it
 
         def decided() -> tuple[Any, Any, dict[str, Any]]:
-            sample, d_hat, k2 = Sample(t, hold, period), given["out.d_hat"], parameters["bound"](t)
-            u, s, law = known.command(last["law"], sample, now, reference, d_hat, k2)
+            sample, d_hat, k2 = Sample(t, hold, period, last["law"]), given["out.d_hat"], parameters["bound"](t)
+            u, s, law = known(sample, now, reference, d_hat, k2)
             u, s = (jnp.asarray(v, jnp.result_type(float)) for v in (u, s))  # a law of one's own may say whole numbers
             if command_filter is None:
                 return u, s, {"law": law}
@@ -337,7 +337,9 @@ def _commanding(computer: Board, law: Law, observer: Observer, command_filter: C
 
         if singular:
             distance = known.clearance(now, reference)
-            unit = jnp.where(given["tracking"] != 0, given["before.clearance_unit"], known.clearance_unit(distance))
+            unit = jnp.where(
+                given["tracking"] != 0, given["before.clearance_unit"], known.kinematics.clearance_unit(distance)
+            )
             clearance, stays = distance / unit, (given["last.command"], given["last.s"], last)
             u, s, kept = jax.lax.cond(clearance >= SINGULAR_CLEARANCE, decided, lambda: stays)
             kept |= {"clearance": clearance, "clearance_unit": unit}
@@ -346,7 +348,7 @@ def _commanding(computer: Board, law: Law, observer: Observer, command_filter: C
         return {"out.command": u, "out.s": s} | {f"now.{name}": value for name, value in kept.items()}
 
     about = f"The law: the input for the state as it is seen{filtered}; the last one where the law is singular."
-    computer.stages.append(Stage("command", about, reads, command, (law, *shaped)))
+    computer.stages.append(Stage("command", about, reads, command, (law, law.kinematics, *shaped)))
 
 
 def _begin(parameters: Any, m: int) -> dict[str, Any]:

@@ -37,8 +37,9 @@ def _inverse(model: Any) -> Any:
 
 
 def _inverses(given: Given) -> Given:
-    known = {name: given[name] for name in ("law", "observer")}
-    return given | {name: replace(part, model=_inverse(part.model)) for name, part in known.items()}
+    law, observer = given["law"], given["observer"]
+    law = replace(law, kinematics=replace(law.kinematics, model=_inverse(law.model)))
+    return given | {"law": law, "observer": replace(observer, model=_inverse(observer.model))}
 
 
 def _estimation(given: Given) -> Given:

@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ptsmc_jax.laws.base import Law
-from ptsmc_jax.laws.error_motions import ErrorMotion
+from ptsmc_jax.laws.base import AccelerationLaw, Law
+from ptsmc_jax.laws.kinematics import AttitudeKinematics, Kinematics
 from ptsmc_jax.observers.base import Observer
 from ptsmc_jax.onboard import origins, parameters, printing
 from ptsmc_jax.onboard.board import SCALARS, Board, Stage
@@ -23,7 +23,7 @@ POINTERS = {"p": "const ptsmc_params *p", "d": "const ptsmc_derived *d", "in": "
             "before": "const ptsmc_state *before", "now": "ptsmc_state *now", "out": "ptsmc_out *out"}  # fmt: skip
 PASSED = {"d": "&state->derived", "before": "state", "now": "&now", "out": "&found"}  # what a step has of these names
 ARGUMENTS = {"t": "real t", "dt": "real dt", "regular": "int regular", "tracking": "int tracking"}
-COMMON = (object, Law, ErrorMotion, Observer)  # what of a part's classes says nothing about it
+COMMON = (object, Law, AccelerationLaw, Kinematics, AttitudeKinematics, Observer)  # not described in the C
 
 
 @dataclass

@@ -56,7 +56,7 @@ def fly(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Samples:
     ticks = parts.clock.ticks(parts.controller.t_f, parts.controller.delta)
     law, actuators = parts.controller, parts.effective_actuators
     target = parts.reference(jnp.zeros_like(parts.t_end))
-    x0 = law.align(parts.initial, target)
+    x0 = law.kinematics.align(parts.initial, target)
     k2 = parts.observer.error_bound()
     listed, period_of, started = schedule(parts, ticks)
     walk_key = walk_stream(seed, trial)
@@ -80,7 +80,7 @@ def fly(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Samples:
         x_next, next_star_x = motion.at(now.t_next), star_state(parts, now, motion.at)
         brought = (drive.c, None) if actuators.holds else assumed_torque(actuators, drive, dt)
         distance = law.clearance(computer.seen, target)
-        unit = jnp.where(jnp.isnan(unit), law.clearance_unit(distance), unit)
+        unit = jnp.where(jnp.isnan(unit), law.kinematics.clearance_unit(distance), unit)
         row = Samples(
             t=now.t, flown=dt > 0.0, measured=measured,
             valid=None if before is None or sensors is None else sensors.star_weight(now) > 0.0,
@@ -89,7 +89,7 @@ def fly(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Samples:
             gyro=getattr(computer.sensors, "rate", None),
             applied=applied, acting=acting.v, momentum=acting.h, seen=computer.seen, observer=computer.observer,
             law=computer.law, command_filter=computer.command_filter, queue=queue, d_hat=d_hat, command=u, s=s,
-            error=law.errors(computer.seen, target)[0],
+            error=law.kinematics.errors(computer.seen, target)[0],
             torque=drive.c if wheels is None else wheels.axes @ drive.c,
             wheel_torque=None if wheels is None else drive.c, limited=drive.limited,
             clearance=distance / unit, clearance_unit=unit,

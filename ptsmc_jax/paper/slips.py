@@ -11,7 +11,8 @@ from scipy.linalg import expm
 
 from ptsmc_jax.campaigns import runs
 from ptsmc_jax.campaigns.runs import Run
-from ptsmc_jax.laws import closed_forms, prescribed_time
+from ptsmc_jax.laws.kinematics import AdditiveKinematics
+from ptsmc_jax.laws.prescribed_time import PrescribedTime, expansion
 from ptsmc_jax.numerics import attitude
 from ptsmc_jax.numerics.pytrees import pytree
 from ptsmc_jax.observers import nonlinear
@@ -61,7 +62,7 @@ def _expansion() -> Slip:
         for n in (2, 3, 4, 5):
             derivative, x_derivative = jax.grad(derivative), jax.grad(x_derivative)
             states.append(x_derivative(t))
-            c = closed_forms.expansion(jnp.asarray(eta), n)
+            c = expansion(jnp.asarray(eta), n)
             s = sum(c[i] * tau**i * states[i] for i in range(n))
             found.append(derivative(t) * tau ** (eta + n - 1) / s - 1.0)
         return jnp.abs(jnp.stack(found))
@@ -190,8 +191,8 @@ def _effective_gain() -> Slip:
 
 @pytree
 @dataclass(frozen=True)
-class _Unaligned(prescribed_time.PrescribedTime):
-    """The law as printed, for any sign of q."""
+class _Unaligned(AdditiveKinematics):
+    """The error as printed, for any sign of q."""
 
     def align(self, x: rigid_body.AttitudeState, target: Any) -> rigid_body.AttitudeState:
         return x
@@ -209,9 +210,9 @@ def _sign_of_q4() -> Slip:
     }
     ready = study(from_tables(tables))
     law = ready.parts.controller
-    printed = _Unaligned(law.model, law.t_f, law.eta, law.delta, law.k1, law.sign_width, law.surface_rate)
+    printed = replace(law, kinematics=_Unaligned(law.model))
 
-    def at_t_f(controller: prescribed_time.PrescribedTime) -> tuple[float, float]:
+    def at_t_f(controller: PrescribedTime) -> tuple[float, float]:
         """Size of eps_1 and angle to the reference [deg]."""
         run = runs.fly(replace(ready, parts=replace(ready.parts, controller=controller)))
         k = int(np.flatnonzero(run.log.t <= float(law.t_f))[-1])

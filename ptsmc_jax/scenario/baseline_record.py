@@ -24,27 +24,6 @@ class BaselineTable(LawTable, frozen=True):
     disturbance_bound: NotNegative | None = None
     initial_estimate_error: NotNegative = 0.0
 
-    def law(self) -> Any:
-        """The law of eps'' = a + d, a class of `laws` with a field for each gain."""
-        raise NotImplementedError
-
-    def error_motion(self, motion: str) -> Any:
-        """The error that it drives to zero."""
-        from ptsmc_jax.laws import error_motions
-
-        errors: dict[str, type[error_motions.ErrorMotion]] = {
-            "spacecraft": error_motions.ErrorQuaternion,
-            "chain": error_motions.ErrorOfChain,
-            "system": error_motions.ErrorOfSystem,
-        }
-        return errors[motion]
-
-    def physics(self, motion: str) -> Any:
-        """The law on the error of this kind of plant."""
-        from ptsmc_jax.laws.acceleration import law_on_error
-
-        return law_on_error(self.error_motion(motion), self.law())
-
     def check(self, scenario: Any) -> None:
         """These laws are of second order, and so must the plant be."""
         order = scenario.order

@@ -37,17 +37,11 @@ class PDController(BaselineTable, frozen=True):
     }
     free_by_default: ClassVar[tuple[str, ...]] = ("k_p", "k_d")
 
-    def law(self) -> Any:
-        """`laws.pd`."""
-        from ptsmc_jax.laws.pd import PD
-
-        return PD
-
     def physics(self, motion: str) -> Any:
-        """That of a spacecraft turns the body, not the error vector."""
-        from ptsmc_jax.laws.pd import QuaternionPD
+        """Return the class; the law of a spacecraft turns the body, not the error vector."""
+        from ptsmc_jax.laws.baselines import PD, QuaternionPD
 
-        return QuaternionPD if motion == "spacecraft" else super().physics(motion)
+        return QuaternionPD if motion == "spacecraft" else PD
 
     def turning(self, t_f: float) -> tuple[str, float]:
         """The rate at the goal if all of its spring's potential energy had become motion."""
@@ -86,9 +80,9 @@ class TerminalController(BaselineTable, frozen=True):
     free_by_default: ClassVar[tuple[str, ...]] = ("p", "b", "k")
     free_if_sampled: ClassVar[tuple[str, ...]] = ("sign_width",)
 
-    def law(self) -> Any:
-        """`laws.terminal`."""
-        from ptsmc_jax.laws.terminal import Terminal
+    def physics(self, motion: str) -> Any:
+        """Return the class of `laws`, for every motion."""
+        from ptsmc_jax.laws.baselines import Terminal
 
         return Terminal
 
@@ -169,9 +163,9 @@ class FixedTimeController(BaselineTable, frozen=True):
     free_by_default: ClassVar[tuple[str, ...]] = ("a1", "b1", "a2", "b2", "p", "gamma", "m", "n")
     free_if_sampled: ClassVar[tuple[str, ...]] = ("sign_width",)
 
-    def law(self) -> Any:
-        """`laws.fixed_time`."""
-        from ptsmc_jax.laws.fixed_time import FixedTime
+    def physics(self, motion: str) -> Any:
+        """Return the class of `laws`, for every motion."""
+        from ptsmc_jax.laws.baselines import FixedTime
 
         return FixedTime
 
@@ -219,8 +213,8 @@ class TimeBasePDController(BaselineTable, frozen=True):
         """Return both poles of the tracking loop at the design's."""
         return {"k_p": design.pole**2, "k_d": 2.0 * design.pole}
 
-    def law(self) -> Any:
-        """`laws.time_base`."""
+    def physics(self, motion: str) -> Any:
+        """Return the class of `laws`, for every motion."""
         from ptsmc_jax.laws.time_base import TimeBasePD
 
         return TimeBasePD
@@ -266,8 +260,8 @@ class TimeBaseSlidingController(BaselineTable, frozen=True):
         """Return both poles of the tracking loop at the design's."""
         return {"surface_rate": design.pole, "k": design.pole, "sign_width": design.width}
 
-    def law(self) -> Any:
-        """`laws.time_base`."""
+    def physics(self, motion: str) -> Any:
+        """Return the class of `laws`, for every motion."""
         from ptsmc_jax.laws.time_base import TimeBaseSliding
 
         return TimeBaseSliding
@@ -312,9 +306,9 @@ class ScalingController(BaselineTable, frozen=True):
         """Return the hold phase's poles at the design's, and a hand-over where the approach is as fast."""
         return {**super().gains_of(design, scenario), "delta": design.delta, "k1": design.pole}
 
-    def law(self) -> Any:
-        """`laws.scaling`."""
-        from ptsmc_jax.laws.scaling import Scaling
+    def physics(self, motion: str) -> Any:
+        """Return the class of `laws`, for every motion."""
+        from ptsmc_jax.laws.baselines import Scaling
 
         return Scaling
 
@@ -353,9 +347,9 @@ class PredefinedTimeController(BaselineTable, frozen=True):
         """Return none: its gains follow from t_f, in the sampled loop too."""
         return {}
 
-    def law(self) -> Any:
-        """`laws.predefined_time`."""
-        from ptsmc_jax.laws.predefined_time import PredefinedTime
+    def physics(self, motion: str) -> Any:
+        """Return the class of `laws`, for every motion."""
+        from ptsmc_jax.laws.baselines import PredefinedTime
 
         return PredefinedTime
 
@@ -397,9 +391,9 @@ class SuperTwistingController(BaselineTable, frozen=True):
         """Return published gains within the bandwidth, and a boundary layer thicker than the noise."""
         return {**super().gains_of(design, scenario), "sign_width": design.width}
 
-    def law(self) -> Any:
-        """`laws.super_twisting`."""
-        from ptsmc_jax.laws.super_twisting import SuperTwisting
+    def physics(self, motion: str) -> Any:
+        """Return the class of `laws`, for every motion."""
+        from ptsmc_jax.laws.baselines import SuperTwisting
 
         return SuperTwisting
 

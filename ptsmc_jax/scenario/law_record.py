@@ -25,8 +25,17 @@ class LawTable(Kind, frozen=True):
     prescribed: ClassVar[bool] = False  # hands over at t_f - delta, and flies in either loop; others when sampled only
 
     def physics(self, motion: str) -> Any:
-        """What flies on plants of this `Scenario.motion`: a class of `laws`, its fields named as the keys."""
+        """Return the class of `laws` for plants of this `Scenario.motion`; its fields are named as the keys."""
         raise NotImplementedError
+
+    def kinematics(self, motion: str) -> Any:
+        """Return the class of the error kinematics for plants of this `Scenario.motion`."""
+        from ptsmc_jax.laws import kinematics
+
+        if motion == "spacecraft":
+            additive = getattr(self, "error", "multiplicative") == "additive"
+            return kinematics.AdditiveKinematics if additive else kinematics.MultiplicativeKinematics
+        return {"chain": kinematics.ChainKinematics, "system": kinematics.SecondOrderKinematics}[motion]
 
     def free(self, *, sampled: bool) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Its gains that are free where a scenario does not say, those before and those after the observer's."""
@@ -79,9 +88,9 @@ class LawTable(Kind, frozen=True):
         from ptsmc_jax.numerics.pytrees import vector
 
         made = self.physics(scenario.motion)
-        names = [f.name for f in dataclasses.fields(made) if f.name != "model" and not f.metadata.get("static")]
+        names = [f.name for f in dataclasses.fields(made) if f.name != "kinematics" and not f.metadata.get("static")]
         own = {name: gain_bounds.hand_over(scenario) if name == "delta" else getattr(self, name) for name in names}
-        return made(model, **{name: vector(value) for name, value in own.items()})
+        return made(self.kinematics(scenario.motion)(model), **{name: vector(value) for name, value in own.items()})
 
 
 def common_keys(law: LawTable) -> dict[str, Any]:

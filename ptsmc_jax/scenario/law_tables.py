@@ -70,6 +70,12 @@ class PrescribedTable(LawTable, frozen=True):
             "surface_rate": design.pole,
         }
 
+    def physics(self, motion: str) -> Any:
+        """Return `laws.prescribed_time.PrescribedTime`, for every motion but a chain."""
+        from ptsmc_jax.laws.prescribed_time import PrescribedTime
+
+        return PrescribedTime
+
     def build(self, scenario: Any, model: Any) -> Any:
         """The law of a plant's model."""
         return dataclasses.replace(super().build(scenario, model), implicit=self.implicit)
@@ -113,12 +119,6 @@ class SpacecraftController(PrescribedTable, frozen=True):
     disturbance_bound: NotNegative | None = None
     initial_estimate_error: NotNegative = 0.0
 
-    def physics(self, motion: str) -> Any:
-        """The paper's law on the error that the key `error` names."""
-        from ptsmc_jax.laws.prescribed_time import PrescribedTime, PrescribedTimeMultiplicative
-
-        return PrescribedTimeMultiplicative if self.error == "multiplicative" else PrescribedTime
-
 
 class SystemController(PrescribedTable, frozen=True):
     """The paper's law (29) for a second-order system, with (57)'s gains.
@@ -152,12 +152,6 @@ class SystemController(PrescribedTable, frozen=True):
     disturbance_bound: NotNegative | None = None
     initial_estimate_error: NotNegative = 0.0
 
-    def physics(self, motion: str) -> Any:
-        """`laws.prescribed_time`."""
-        from ptsmc_jax.laws.prescribed_time import PrescribedTimeSystem
-
-        return PrescribedTimeSystem
-
 
 class ChainController(SystemController, frozen=True):
     """The paper's law (52) for an integrator chain; without an observer (36) to (40).
@@ -178,7 +172,7 @@ class ChainController(SystemController, frozen=True):
     }
 
     def physics(self, motion: str) -> Any:
-        """`laws.prescribed_time`."""
+        """Return `laws.prescribed_time.PrescribedTimeChain`."""
         from ptsmc_jax.laws.prescribed_time import PrescribedTimeChain
 
         return PrescribedTimeChain

@@ -213,7 +213,7 @@ def build(table: Any, **common: Any) -> Any:
     from ptsmc_jax.numerics.pytrees import vector
 
     fields = [field.name for field in dataclasses.fields(table.made) if field.name not in common]
-    return _registered(table.made)(**common, **{name: vector(getattr(table, name)) for name in fields})
+    return registered(table.made)(**common, **{name: vector(getattr(table, name)) for name in fields})
 
 
 def fastest(table: Any, name: str, part: Any) -> float:
@@ -234,7 +234,8 @@ def fastest(table: Any, name: str, part: Any) -> float:
 
 
 @functools.cache
-def _registered(made: type) -> type:
+def registered(made: type) -> type:
+    """Return a class that code names, registered as a pytree."""
     from ptsmc_jax.numerics.pytrees import pytree
 
     try:

@@ -11,8 +11,7 @@ import numpy as np
 
 from ptsmc_jax.dispersions.planned import OF_ROWS
 from ptsmc_jax.dispersions.variation import Dispersion
-from ptsmc_jax.laws.acceleration import AccelerationLaw
-from ptsmc_jax.laws.base import Sample
+from ptsmc_jax.laws.base import Law, Sample
 from ptsmc_jax.observers.base import Bound
 from ptsmc_jax.plants.base import check_indices
 from ptsmc_jax.plants.second_order import INSTEAD, TRACED
@@ -150,7 +149,7 @@ def _reference(parts: Parts, ask: _Asked) -> None:
 
 def _sensors(parts: Parts, ask: _Asked) -> None:
     own, zero = parts.sensors.own, jnp.zeros(())
-    x = parts.controller.align(parts.plant.visible(parts.initial), parts.reference(zero))
+    x = parts.controller.kinematics.align(parts.plant.visible(parts.initial), parts.reference(zero))
     memory = ask("begin", own.begin, x)
     period = jnp.asarray(parts.period)
     returned = ask("see", own.see, memory, x, jnp.zeros(own.draws), zero, period)
@@ -209,25 +208,20 @@ def _law(parts: Parts, ask: _Asked) -> None:
     law: Any = parts.controller
     zero, m = jnp.zeros_like(parts.t_end), parts.plant.inputs
     target = parts.reference(zero)
-    x = law.align(parts.plant.visible(parts.initial), target)
-    now = Sample(zero, jnp.asarray(False), jnp.asarray(parts.period))
+    x = law.kinematics.align(parts.plant.visible(parts.initial), target)
     k2, memory = parts.observer.error_bound()(zero), ask("begin", law.begin)
-    methods = {
-        "command": (law.command, (memory, now, x, target, jnp.zeros(m), k2)),
-        "step": (law.step, (memory, now, *law.errors(x, target), k2)),
-        "acceleration": (law.acceleration, (now, *law.errors(x, target), k2)),
-    }
-    own = type(law).__mro__[1]  # the class that the code names
-    method = next(name for name in methods if getattr(own, name) is not getattr(AccelerationLaw, name))
-    function, arguments = methods[method]
+    now = Sample(zero, jnp.asarray(False), jnp.asarray(parts.period), memory)
+    expected = ("an acceleration", "a sliding variable", *(() if memory is None else ("its memory",)))
+    method, function, arguments = "acceleration", law.acceleration, (now, *law.kinematics.errors(x, target), k2)
+    if type(law).__call__ is not Law.__call__:
+        expected = ("an input", "a sliding variable", "its memory")
+        method, function, arguments = "__call__", law.__call__, (now, x, target, jnp.zeros(m), k2)
     returned = ask(method, function, *arguments)
-    expected = ("an input" if method == "command" else "an acceleration", "a sliding variable", "its memory")
-    expected = expected[: 2 if method == "acceleration" else 3]
     if not isinstance(returned, tuple) or len(returned) != len(expected):
         raise ask.refused(method, _described(returned), ", ".join(expected) + ", in parentheses")
     ask.check(method, expected[0], returned[0], (m,))
     ask.check(method, expected[1], returned[1], (m,))
-    if method != "acceleration":
+    if len(expected) == 3:
         ask.same_memory(method, memory, returned[2])
 
 

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Literal
 from ptsmc_jax.scenario import gain_bounds
 from ptsmc_jax.scenario.baseline_record import BaselineTable
 from ptsmc_jax.scenario.gain_record import GainBounds
-from ptsmc_jax.scenario.own import Code, Own
+from ptsmc_jax.scenario.own import Code, Own, registered
 from ptsmc_jax.scenario.values import Positive
 
 
@@ -20,25 +20,21 @@ class OwnLaw(Own, BaselineTable, kw_only=True, frozen=True):
 
     kind: Literal["own"] = "own"
     code: Code
-    needs: ClassVar[tuple[str, ...]] = ("acceleration", "step", "command")
+    needs: ClassVar[tuple[str, ...]] = ("acceleration", "__call__")
     tuned: ClassVar[bool] = True
     delta: Positive | None = None
     gains: ClassVar[Mapping[str, GainBounds]] = {"delta": gain_bounds.DELTA, "t_f": gain_bounds.T_F}
 
     @classmethod
     def base(cls) -> type:
-        """`laws.acceleration.AccelerationLaw`."""
-        from ptsmc_jax.laws.acceleration import AccelerationLaw
+        """`laws.base.AccelerationLaw`."""
+        from ptsmc_jax.laws.base import AccelerationLaw
 
         return AccelerationLaw
 
-    def law(self) -> Any:
-        """The class that the code names, with what tuning may move."""
-        return self.made
-
     def physics(self, motion: str) -> Any:
-        """The law that the code names, on the error of this kind of plant, with the gains that tuning may move."""
-        made = super().physics(motion)
+        """Return the class that the code names, with the gains that tuning may move."""
+        made = registered(self.made)
         made.tunable = tuple(self.gains)
         return made
 
@@ -55,9 +51,3 @@ class OwnAttitudeLaw(OwnLaw, frozen=True):
     """
 
     error: Literal["multiplicative", "additive"] = "multiplicative"
-
-    def error_motion(self, motion: str) -> Any:
-        """The error that the key `error` names."""
-        from ptsmc_jax.laws.error_motions import ErrorVector
-
-        return ErrorVector if self.error == "additive" else super().error_motion(motion)

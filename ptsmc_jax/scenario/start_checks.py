@@ -55,7 +55,7 @@ _OPPOSITE = "q_e4 = 0 (180 degrees from the reference), at which the law is sing
 
 def reference(scenario: Any, parts: Parts) -> None:
     """Refuse a reference on which the additive law meets its singularity."""
-    if not parts.controller.additive:
+    if not parts.controller.kinematics.additive:
         return
     grid = np.linspace(0.0, float(parts.t_end), 4001)
     held = np.asarray(_scalar_part(parts.reference, grid))
@@ -85,14 +85,15 @@ def _scalar_part(reference: Any, times: Array) -> Array:
 def attitude(scenario: Any, parts: Parts) -> None:
     """Refuse an initial attitude from which the law meets its singularity on the way."""
     law = parts.controller
-    singular, name = (_SINGULAR, "|q4|") if law.additive else (_OPPOSITE, "|q_e4|")
+    singular, name = (_SINGULAR, "|q4|") if law.kinematics.additive else (_OPPOSITE, "|q_e4|")
     key, value = attitude_keys.attitude_key(scenario.initial)
     said = f"initial.{key} is {errors.brief(value)}"
     if law.prescribed:
         times, _, square = (np.asarray(v) for v in solutions.exact_path(parts))
     else:  # of the others only the start is known
         target = parts.reference(jnp.zeros_like(parts.t_end))
-        times, square = np.zeros(1), np.square([float(law.clearance(law.align(parts.initial, target), target))])
+        first = law.clearance(law.kinematics.align(parts.initial, target), target)
+        times, square = np.zeros(1), np.square([float(first)])
     if square[0] < SINGULAR_CLEARANCE**2:
         raise ScenarioError(f"{said}, but lies at {singular}; allowed is {name} of at least {SINGULAR_CLEARANCE}")
     if square.min() < SINGULAR_CLEARANCE**2:

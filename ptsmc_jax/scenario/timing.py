@@ -14,7 +14,7 @@ import numpy as np
 
 from ptsmc_jax import programs
 from ptsmc_jax.batching import lapack
-from ptsmc_jax.laws.prescribed_time import PrescribedTimeSystem
+from ptsmc_jax.laws.prescribed_time import PrescribedTime
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.plants.second_order import System
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
@@ -23,7 +23,8 @@ from ptsmc_jax.scenario.tables import Scenario, check_scenario
 from ptsmc_jax.scenario.values import MOST_STEPS
 from ptsmc_jax.simulation import clock
 from ptsmc_jax.simulation.assembly import Parts, Setup
-from ptsmc_jax.theory import solutions
+from ptsmc_jax.theory import rates, solutions
+from ptsmc_jax.theory.exact_motion import plant_motion
 
 MOST_SUBSTEPS = 200  # a period: one that needs more is far too long for what happens in it
 MOVING = 4  # steps a period at least where the torque changes within it
@@ -179,7 +180,7 @@ def _lower(scenario: Scenario, key: str, asks: str) -> ScenarioError:
 @programs.jit  # one program, where each of its operations would be one
 def _boundary_layer(controller: Any, observer: Any, visited: Any) -> tuple:
     """Fastest rates of the smooth sign's boundary layer before and after the hand-over [1/s]."""
-    return controller.boundary_layer(observer.error_bound().largest, visited)
+    return rates.boundary_layer(controller, observer.error_bound().largest, visited)
 
 
 def _with_papers_law(setup: Setup) -> Setup:
@@ -188,21 +189,21 @@ def _with_papers_law(setup: Setup) -> Setup:
     if law.prescribed:
         return setup
     gains = (vector(v) for v in (3.0, law.delta, 1.0, 1e-3, 1.0))  # eta, delta, K1, width of the sign, surface rate
-    return dataclasses.replace(setup, controller=PrescribedTimeSystem(law.model, law.t_f, *gains))
+    return dataclasses.replace(setup, controller=PrescribedTime(law.kinematics, law.t_f, *gains))
 
 
 @programs.jit
 def _rates_of_system(setup: Setup, visited: tuple) -> tuple:
     """Jacobians of the motion along a run, and how a steady run on the target accelerates and changes that."""
-    plant, law = typing.cast(System, setup.plant), setup.controller
+    plant, kinematics = typing.cast(System, setup.plant), setup.controller.kinematics
     none = jnp.zeros(plant.inputs)
 
     def jacobian(t: Any, x: Any) -> Any:
-        u = law.invert(x, t, none, none)
+        u = kinematics.invert(x, t, none, none)
         return plant.jacobian(t, plant.with_hidden_at_rest(x), u)
 
     def along(t: Any) -> Any:
-        return law.motion(t, setup.initial, none, none, none).w_dot
+        return plant_motion(kinematics, t, setup.initial, (none, none, none)).w_dot
 
     times = setup.t_end * jnp.linspace(0.0, 1.0, 509)  # a prime of intervals, which meets no period often
     steady = lapack.vmap(lambda t: jax.jvp(along, (t,), (jnp.ones_like(t),)))(times)
@@ -245,18 +246,18 @@ def _grid(
     names = ("t_f", "k1", "sign_width", "surface_rate")
     widest = dataclasses.replace(setup.controller, **{name: vector(getattr(reach, name)) for name in names})
     layer = _fastest_layer(reach, widest, setup.observer, visited)
-    rates, frequency, order = widest.hold_rates(), _fastest(frequencies), scenario.grid_order
+    decays, frequency, order = rates.hold_rates(widest), _fastest(frequencies), scenario.grid_order
 
     def steps(frequency: float = 0.0, layer: tuple[float, float] = (0.0, 0.0), rate: float = 0.0) -> float:
         taken = sum(clock.graded_steps(reach.t_f, reach.smallest_delta, t_end, rate, frequency, layer, order))
         return taken if taken == taken else math.inf
 
-    rate = max(rates.values())
+    rate = max(decays.values())
     needed = steps(frequency, layer, rate)
     if not needed <= MOST_STEPS:
         asks = f"the continuous loop would need {needed:.6g} steps, and at most {MOST_STEPS} are allowed"
         by_key = {key: steps(value) for key, value in frequencies.items()}
-        by_key |= {f"controller.{key}": steps(rate=value) for key, value in rates.items()}
+        by_key |= {f"controller.{key}": steps(rate=value) for key, value in decays.items()}
         by_key["controller.sign_width"] = steps(layer=layer)
         worst = max(by_key, key=lambda key: by_key[key])
         if not by_key["disturbance.frequency"] <= MOST_STEPS:  # whose rate the switching follows too

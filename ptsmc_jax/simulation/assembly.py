@@ -70,10 +70,12 @@ class Setup:
 
         acting = disturbances.on_body(self.disturbance, body.inertia)
         changes = {"plant": changed(self.plant, "plant"), "disturbance": acting}
-        for name in ("controller", "observer") if known else ():
-            part = getattr(self, name)
-            if hasattr(part, "model"):
-                changes[name] = replace(part, model=changed(part.model, f"model of the {name}"))
+        if known:
+            law, observer = self.controller, self.observer
+            kinematics = replace(law.kinematics, model=changed(law.model, "model of the controller"))
+            changes["controller"] = replace(law, kinematics=kinematics)
+            if hasattr(observer, "model"):
+                changes["observer"] = replace(observer, model=changed(observer.model, "model of the observer"))
         return replace(self, **changes)
 
     @property

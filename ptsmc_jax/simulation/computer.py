@@ -133,8 +133,8 @@ def command(
     """The law's torque (m,) [N m], its sliding variable and its memory."""
     now, has_length = period.now, period.length > 0.0
     # a length that one may divide by, also in a period that has none
-    sample = Sample(now.t, now.hold, jnp.where(has_length, period.assumed_length, period.full_length))
-    u, s, memory = parts.controller.command(computer.law, sample, seen, target, d_hat, k2(now.t))
+    length = jnp.where(has_length, period.assumed_length, period.full_length)
+    u, s, memory = parts.controller(Sample(now.t, now.hold, length, computer.law), seen, target, d_hat, k2(now.t))
     return u, s, guards.select(has_length, memory, computer.law)
 
 

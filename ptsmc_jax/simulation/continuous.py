@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from ptsmc_jax.laws.base import Sample
 from ptsmc_jax.numerics import integrators, matrices, stacking
 from ptsmc_jax.numerics.pytrees import Scalar
 from ptsmc_jax.observers.base import Observer
@@ -30,7 +31,8 @@ def fly(run: Run) -> Result:
         dt, target = now.t_next - now.t, parts.reference(now.t)
 
         def rate(t: Scalar, x: Any, memory: Array) -> tuple[Any, Array, tuple[Array, Array]]:
-            u, s = controller.torque(t, now.hold, x, parts.reference(t), observer.estimate(memory), k2(t))
+            sample = Sample(t, now.hold, dt)
+            u, s, _ = controller(sample, x, parts.reference(t), observer.estimate(memory), k2(t))
             x_dot = parts.plant.rate(t, x, u, parts.disturbance(t, x))
             d_eff = model.unexplained(t, x, x_dot, u)
             return x_dot, observer.forcing(t, (now.t, now.t_next), memory, d_eff), (u, s)
@@ -53,7 +55,7 @@ def fly(run: Run) -> Result:
     if rows is not None:
         t = run.criteria.t_end
         target, hold, d_hat = parts.reference(t), t >= controller.hand_over, observer.estimate(memory)
-        u, s = controller.torque(t, hold, state.x, target, d_hat, k2(t))
+        u, s, _ = controller(Sample(t, hold, jnp.zeros_like(t)), state.x, target, d_hat, k2(t))
         last = run_state.row(run, t, state.x, target, (d_hat, u, u, s), jnp.asarray(True))
         log = run_state.history(rows, last)
     return run_state.finish(run, first, state, log)

@@ -11,7 +11,6 @@ import jax.numpy as jnp
 
 from ptsmc_jax import programs
 from ptsmc_jax.devices.ticks import Ticks
-from ptsmc_jax.laws.base import Law
 from ptsmc_jax.numerics import guards
 from ptsmc_jax.numerics.draws import WholeNumber, check_fits
 from ptsmc_jax.numerics.pytrees import Scalar
@@ -64,8 +63,8 @@ def simulate(
     criteria = Criteria(parts.controller.t_f, parts.t_end, parts.window, parts.settling_angle, pointing)
     target = parts.reference(jnp.zeros_like(parts.t_end))
     # whole numbers and single precision in a start are numbers of the run, as they are in any other part
-    x0 = jax.tree.map(lambda v: jnp.asarray(v, float), parts.controller.align(parts.initial, target))
-    unit = parts.controller.clearance_unit(parts.controller.clearance(x0, target))
+    x0 = jax.tree.map(lambda v: jnp.asarray(v, float), parts.controller.kinematics.align(parts.initial, target))
+    unit = parts.controller.kinematics.clearance_unit(parts.controller.clearance(x0, target))
     target_t_f = parts.reference(criteria.t_f)
     unit, gap = jax.lax.stop_gradient(unit), _first_missing(parts, ticks)
     run = Run(parts, ticks, criteria, x0, target, target_t_f, unit, gap, record)
@@ -94,7 +93,7 @@ def _check_continuous(parts: Parts) -> None:
     found = next((name for name in sampled_only if getattr(parts, name) is not None), None)
     if found is not None:
         raise TypeError(f"the continuous loop cannot simulate {found}: set {found} to None, or use a sampled clock")
-    if type(parts.controller).torque is Law.torque:
+    if not parts.controller.continuous:
         law = type(parts.controller).__name__
         raise TypeError(f"the law {law} needs the sampled loop: use a sampled clock")
 

@@ -117,16 +117,16 @@ def begin(run: Run, wheel_momentum: Array | None = None) -> RunState:
 
 def advance(run: Run, state: RunState, now: Ticks, target: Any, flown: Flown) -> RunState:
     """The state after an interval: metrics and status; target: of the reference at its start."""
-    law, criteria = run.parts.controller, run.criteria
+    kinematics, criteria = run.parts.controller.kinematics, run.criteria
     target_next = run.parts.reference(now.t_next)
     snapshot = _snapshot(run.parts, target_next, flown.x)
 
     def errors() -> Errors:
-        return Errors(*law.errors(state.x, target), *law.errors(flown.x, target_next))
+        return Errors(*kinematics.errors(state.x, target), *kinematics.errors(flown.x, target_next))
 
     def arrival() -> Arrival:
         x = flown.x_at(criteria.t_f)
-        return Arrival(law.errors(x, run.target_t_f)[0], law.angle(x, run.target_t_f))
+        return Arrival(kinematics.errors(x, run.target_t_f)[0], kinematics.angle(x, run.target_t_f))
 
     attitude_error = knowledge_error = None
     begun, ended, length = (state.x, target), (flown.x, target_next), now.t_next - now.t
@@ -135,8 +135,9 @@ def advance(run: Run, state: RunState, now: Ticks, target: Any, flown: Flown) ->
         attitude_error = partial(pointing.error_path, begun, ended, frame, length)
         if flown.seen is not None:
             knowledge_error = partial(pointing.constant_path, flown.seen.q, state.x.q, frame, length)
+    middle_angle = partial(kinematics.middle_angle, begun, ended, length)
     interval = Interval(
-        now.t, now.t_next, state.snapshot, snapshot, errors, partial(law.middle_angle, begun, ended, length), arrival,
+        now.t, now.t_next, state.snapshot, snapshot, errors, middle_angle, arrival,
         state.u, flown.torques, attitude_error, knowledge_error,
     )  # fmt: skip
     u_end = flown.torques.delivered[-1]
@@ -158,7 +159,7 @@ def row(
     """
     d_hat, u, commanded, s = signals
     d = run.parts.disturbance(t, x)
-    error, _ = run.parts.controller.errors(x, target)
+    error, _ = run.parts.controller.kinematics.errors(x, target)
     return Log(t, x, d_hat, u, commanded, s, d if walk is None else d + walk, target, error, wheels, has_length)
 
 
@@ -199,7 +200,7 @@ def _start(parts: Parts, snapshot: Snapshot, wheel_momentum: Array | None) -> St
 
 
 def _snapshot(parts: Parts, target: Any, x: Any) -> Snapshot:
-    angle = parts.controller.angle(x, target)
+    angle = parts.controller.kinematics.angle(x, target)
     plant = parts.plant
     return Snapshot(angle, plant.speed(x), guards.norm(plant.momentum(x)), plant.modal_amplitude(x))
 

@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike
 from ptsmc_jax import programs
 from ptsmc_jax.numerics.pytrees import Scalar
 from ptsmc_jax.simulation.rollout import Parts
+from ptsmc_jax.theory import rates
+from ptsmc_jax.theory.exact_motion import exact
 from ptsmc_jax.theory.solutions import starts, state_envelope, visited
 
 Vector = Float[Array, " n"]
@@ -33,7 +35,7 @@ def sliding_envelope(parts: Parts) -> tuple[float, float]:
 @programs.jit
 def _outset(parts: Parts) -> Array:
     """What s is at t = 0, (m,)."""
-    return parts.controller.exact(jnp.zeros_like(parts.t_end), starts(parts))[1]
+    return exact(parts.controller, jnp.zeros_like(parts.t_end), starts(parts))[1]
 
 
 def switching_rate(parts: Parts) -> float:
@@ -46,7 +48,7 @@ def _switching_rates(parts: Parts) -> tuple[Scalar, Scalar]:
     """The largest factor under the largest K2, and under the K2 that is left when the observer has settled."""
     law, bound = parts.controller, parts.observer.error_bound()
     seen = visited(parts) if parts.plant.of_own_functions else None
-    return law.switching_rate(bound.largest, seen), law.switching_rate(bound(parts.t_end), seen)
+    return rates.switching_rate(law, bound.largest, seen), rates.switching_rate(law, bound(parts.t_end), seen)
 
 
 def narrowest_sign(parts: Parts, period: float) -> float:

@@ -272,7 +272,7 @@ class _Linear(NamedTuple):
 @programs.jit(compiler_options=programs.QUICKLY)
 def _linear(parts: Parts, log: Log, ticks: Ticks) -> _Linear:
     """Every period of a run linearised, by the code that flies it."""
-    actuators, law, plant = parts.effective_actuators, parts.controller, parts.plant
+    actuators, kinematics, plant = parts.effective_actuators, parts.controller.kinematics, parts.plant
     before, after = (jax.tree.map(lambda v, k=k: v[k : v.shape[0] - 1 + k], log.x) for k in (0, 1))
 
     def acted(state: Any, now: tuple) -> tuple:
@@ -296,7 +296,7 @@ def _linear(parts: Parts, log: Log, ticks: Ticks) -> _Linear:
             near = plant.retract(x, z)
             moving, early = motion(near, push), jnp.zeros(0)
             near_next = moving.after(dt)
-            (start, rate), (end, rate_next) = law.errors(near, target), law.errors(near_next, target_next)
+            (start, rate), (end, rate_next) = kinematics.errors(near, target), kinematics.errors(near_next, target_next)
             middle = integrators.hermite_middle(start, rate, end, rate_next, dt)
             if taken is not None:
                 early = parts.observer.model.local_coordinates(taken, star_state(parts, tick, moving.at))

@@ -13,11 +13,11 @@ from numpy.typing import ArrayLike
 
 from ptsmc_jax import programs
 from ptsmc_jax.formulas import surface_roots
-from ptsmc_jax.laws.closed_forms import ChainMotion
 from ptsmc_jax.numerics import guards, integrators
 from ptsmc_jax.numerics.pytrees import Scalar
 from ptsmc_jax.simulation.rollout import Parts
 from ptsmc_jax.theory import envelopes, solutions
+from ptsmc_jax.theory.closed_forms import ChainMotion
 
 Vector = Float[Array, " n"]
 
@@ -61,7 +61,7 @@ def sliding_bound(parts: Parts, t: ArrayLike) -> np.ndarray:
     it is at most there follows from `solutions.state_envelope`. (23) and (51) are beta = 0, the exact sign.
     """
     law, (_, _, s, floor) = parts.controller, _at_hand_over(parts)
-    fallen = np.exp(-2.0 * float(law.reaching_rate()) * (np.asarray(t) - float(law.hand_over)))[:, None]
+    fallen = np.exp(-2.0 * float(law.reaching_rate) * (np.asarray(t) - float(law.hand_over)))[:, None]
     return np.sqrt(np.sum(np.asarray(s) ** 2 * fallen + float(floor) ** 2 * (1.0 - fallen), axis=1))
 
 
@@ -88,7 +88,7 @@ class _HandOver(NamedTuple):
 def _at_hand_over(parts: Parts) -> _HandOver:
     law = parts.controller
     beta = envelopes.switching_rate(parts) * envelopes.GIVEN_AWAY * float(law.sign_width)
-    floor = np.sqrt(beta / float(law.reaching_rate()))
+    floor = np.sqrt(beta / float(law.reaching_rate))
     return _handed(parts, *(jnp.asarray(v) for v in (*envelopes.sliding_envelope(parts), floor)))
 
 
@@ -107,7 +107,7 @@ def _handed(parts: Parts, s0: Scalar, floor_before: Scalar, floor: Scalar) -> _H
 @programs.jit
 def _error_bound(parts: Parts, known: _HandOver, lags: Vector, t: Array) -> Array:
     law, n = parts.controller, parts.controller.order
-    surface, rate = law.surface(), law.reaching_rate()
+    surface, rate = law.surface(), law.reaching_rate
     on_it = jnp.eye(n, n - 1).at[-1].set(-surface)  # s = 0: x_n follows from the others
     off_it = jnp.eye(n)[-1]  # s = 1, nothing else
 

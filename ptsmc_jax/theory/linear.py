@@ -88,7 +88,7 @@ def nominal(parts: Parts) -> Nominal:
     ticks = parts.clock.ticks(parts.controller.t_f, parts.controller.delta)
     listed, period_of, started = schedule(parts, ticks)
     k2, actuators = parts.observer.error_bound(), parts.effective_actuators
-    x0 = parts.controller.align(parts.initial, parts.reference(jnp.zeros_like(parts.t_end)))
+    x0 = parts.controller.kinematics.align(parts.initial, parts.reference(jnp.zeros_like(parts.t_end)))
     model = actuators.begin(parts.plant.inputs)
     computer = boot(parts, np.uint32(0), np.uint32(0), parts.plant.visible(x0), started)
 
@@ -168,7 +168,7 @@ def opened(parts: Parts, during: Nominal, *, late: bool = True) -> Opened:
     parts = quiet(parts)
     period, before, after, arriving = during
     period = _whole(period)
-    k2, plant, law = parts.observer.error_bound(), parts.plant, parts.controller
+    k2, plant, kinematics = parts.observer.error_bound(), parts.plant, parts.controller.kinematics
     here, there, now, dt = Local(parts, before), Local(parts, after), period.now, period.length
     z0, x0, known, u0 = (jnp.zeros(n) for n in (sum(here.sizes), *here.sizes[:2], plant.inputs))
     target = parts.reference(now.t)
@@ -196,7 +196,7 @@ def opened(parts: Parts, during: Nominal, *, late: bool = True) -> Opened:
     (a, seen, new, disturbed), (command, direct, *_), (s_command, s_direct, *_) = by_all
     old, new = lapack.vmap(pushed)(jnp.asarray(NODES)) if late else (jnp.zeros_like(new)[None], new[None])
     loop = Loop(a, seen, new, old, command, direct, disturbed, dt, delay=parts.effective_actuators.delay)
-    error, error_rate = jax.jacfwd(lambda by: law.errors(plant.retract(before.x, by), target))(x0)
+    error, error_rate = jax.jacfwd(lambda by: kinematics.errors(plant.retract(before.x, by), target))(x0)
     return Opened(loop, error, error_rate, s_command, s_direct)
 
 

@@ -108,14 +108,14 @@ def _stays(u: np.ndarray) -> np.ndarray:
 def _unexplained(parts: Parts, run: linear.Nominal) -> tuple[Array, Array]:
     """What slopes leave of the command's way to where the error is zero, see above, and all of it, (periods, m)."""
     parts = linear.quiet(parts)
-    k2, law, model = parts.observer.error_bound(), parts.controller, parts.observer.model
+    k2, kinematics, model = parts.observer.error_bound(), parts.controller.kinematics, parts.observer.model
 
     def one(period: computer.Period, before: computer.Computer, seen: Any) -> tuple[Array, Array]:
         target = parts.reference(period.now.t)
         d_hat, _ = computer.estimate(parts, period, before, seen)
 
         def error(by: Array) -> Array:
-            return law.derivatives(model.retract(seen, by), target).reshape(-1)
+            return kinematics.derivatives(model.retract(seen, by), target).reshape(-1)
 
         def commanded(by: Array) -> Array:
             return computer.command(parts, k2, period, before, model.retract(seen, by), target, d_hat)[0]

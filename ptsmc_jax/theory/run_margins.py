@@ -71,7 +71,7 @@ def moments(parts: Parts, run: linear.Nominal, times: Array) -> Array:
     """
     ticks, law = run.period.now, parts.controller
     full = linear.is_full(ticks, parts.period)
-    off = lapack.vmap(lambda x, t: law.errors(x, parts.reference(t))[0])(run.carry.x, ticks.t)
+    off = lapack.vmap(lambda x, t: law.kinematics.errors(x, parts.reference(t))[0])(run.carry.x, ticks.t)
     size, hold = jnp.linalg.norm(off, axis=1), full & ticks.hold
     first = jnp.argmax(hold)
     near = hold & (size <= 2.0 * size[first])
@@ -157,10 +157,10 @@ def _along(parts: Parts, run: linear.Nominal, times: int) -> tuple[Array, Histor
     law = parts.controller
     besides = jnp.geomspace(parts.period, law.t_f, times)
     clear = lapack.vmap(lambda x, t: law.clearance(x, parts.reference(t)))(run.carry.x, run.period.now.t)
-    nearest = jnp.min(clear / law.clearance_unit(clear[0]))
+    nearest = jnp.min(clear / law.kinematics.clearance_unit(clear[0]))
     t = run.period.now.t
     first, arrived = (
-        law.angle(jax.tree.map(lambda v, k=k: v[k], run.carry.x), parts.reference(t[k]))
+        law.kinematics.angle(jax.tree.map(lambda v, k=k: v[k], run.carry.x), parts.reference(t[k]))
         for k in (0, jnp.argmax(t >= law.t_f))
     )
     missed = run_state.misses(arrived, first, parts.settling_angle)

@@ -11,12 +11,13 @@ from numpy.typing import ArrayLike
 
 from ptsmc_jax import programs
 from ptsmc_jax.batching import lapack
-from ptsmc_jax.laws.closed_forms import exact_chain as exact_chain
-from ptsmc_jax.laws.closed_forms import exact_error as exact_error
-from ptsmc_jax.laws.closed_forms import from_modes, modes
 from ptsmc_jax.numerics import guards
 from ptsmc_jax.numerics.pytrees import Scalar
 from ptsmc_jax.simulation.assembly import Setup
+from ptsmc_jax.theory.closed_forms import exact_chain as exact_chain
+from ptsmc_jax.theory.closed_forms import exact_error as exact_error
+from ptsmc_jax.theory.closed_forms import from_modes, modes
+from ptsmc_jax.theory.exact_motion import exact, exact_motion, plant_motion
 
 Vector = Float[Array, " n"]
 
@@ -52,8 +53,8 @@ def bare(parts: Setup) -> Setup:
 
 def starts(parts: Setup) -> Float[Array, "m n"]:
     """Each component of the error and its derivatives at t = 0, in the states' own units: x_1 .. x_n = x_1^(n-1)."""
-    law, target = parts.controller, parts.reference(jnp.zeros_like(parts.t_end))
-    return law.derivatives(law.align(parts.initial, target), target)
+    kinematics, target = parts.controller.kinematics, parts.reference(jnp.zeros_like(parts.t_end))
+    return kinematics.derivatives(kinematics.align(parts.initial, target), target)
 
 
 def exact_sizes(parts: Setup, t: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
@@ -65,7 +66,7 @@ def exact_sizes(parts: Setup, t: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
 @programs.jit
 def _exact_sizes(parts: Setup, t: Array) -> tuple[Array, Array]:
     def sizes(time: Scalar) -> tuple[Scalar, Scalar]:
-        error, s = parts.controller.exact(time, starts(parts))
+        error, s = exact(parts.controller, time, starts(parts))
         return guards.norm(error), guards.norm(s)
 
     return jax.vmap(sizes)(t)
@@ -76,7 +77,7 @@ def exact_input(parts: Setup, t: Scalar) -> tuple[Array, Scalar]:
 
     For attitudes 1 - |v|^2, the square of the scalar part, stands for the clearance; at or below 0 there is no path.
     """
-    motion = parts.controller.exact_motion(t, parts.reference(t), parts.initial, starts(parts))
+    motion = exact_motion(parts.controller, t, parts.reference(t), parts.initial, starts(parts))
     d = parts.disturbance(t, parts.plant.with_hidden_at_rest(motion.x))
     plant = parts.plant.to_plan_by(parts.controller.model)
     return plant.input_for(t, motion.x, motion.w_dot, d), motion.clearance
@@ -93,15 +94,15 @@ def visited(parts: Setup) -> tuple[Array, Any]:
 @programs.jit
 def _visited(parts: Setup) -> tuple[Array, Any]:
     law, share = parts.controller, jnp.linspace(0.0, 1.0, VISITED)
-    none = jnp.zeros(parts.plant.inputs)
+    none = (jnp.zeros(parts.plant.inputs),) * 3
 
     def on_the_way(t: Scalar) -> tuple[Any, Any]:
         target = parts.reference(t)
-        return target, law.exact_motion(t, target, parts.initial, starts(parts)).x
+        return target, exact_motion(law, t, target, parts.initial, starts(parts)).x
 
     def at_rest(t: Scalar) -> tuple[Any, Any]:
         target = parts.reference(t)
-        return target, law.motion(target, parts.initial, none, none, none).x
+        return target, plant_motion(law.kinematics, target, parts.initial, none).x
 
     early = lapack.vmap(on_the_way)(law.t_f - law.t_f * (law.delta / law.t_f) ** share)
     late = lapack.vmap(at_rest)(parts.t_end * share)

@@ -11,10 +11,9 @@ from scipy.integrate import quad, solve_ivp
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
-from ptsmc_jax.laws import fixed_time, pd, terminal
-from ptsmc_jax.laws.acceleration import law_on_error
+from ptsmc_jax.laws import baselines
 from ptsmc_jax.laws.base import Sample
-from ptsmc_jax.laws.error_motions import ErrorQuaternion
+from ptsmc_jax.laws.kinematics import MultiplicativeKinematics
 from ptsmc_jax.numerics import attitude, guards
 from ptsmc_jax.plants import rigid_body
 from ptsmc_jax.scenario import baseline_tables
@@ -24,19 +23,14 @@ from tests import helpers
 from tests.helpers import FULL_INERTIA, fly, short, vector
 
 BODY = rigid_body.spacecraft(FULL_INERTIA)
-COMMON = {"model": BODY, "t_f": vector(10.0), "delta": vector(0.01)}
-
-
-def of_attitudes(law) -> Any:
-    return law_on_error(ErrorQuaternion, law)
-
+COMMON: dict[str, Any] = {"kinematics": MultiplicativeKinematics(BODY), "t_f": vector(10.0), "delta": vector(0.01)}
 
 LAWS: dict[str, Any] = {
-    "pd": pd.QuaternionPD(**COMMON, k_p=vector(0.4), k_d=vector(0.9)),
-    "terminal": of_attitudes(terminal.Terminal)(
+    "pd": baselines.QuaternionPD(**COMMON, k_p=vector(0.4), k_d=vector(0.9)),
+    "terminal": baselines.Terminal(
         **COMMON, p=vector(1.3), b=vector(0.6), k=vector(0.5), sign_width=vector(1e-3)
     ),
-    "fixed_time": of_attitudes(fixed_time.FixedTime)(
+    "fixed_time": baselines.FixedTime(
         **COMMON, a1=vector(0.3), b1=vector(0.5), a2=vector(1.2), b2=vector(0.7), p=vector(1.25), gamma=vector(2.0),
         m=vector(1.5), n=vector(0.5), sign_width=vector(1e-3),
     ),
@@ -49,16 +43,21 @@ D = vector([0.02, -0.01, 0.015])
 NOW = Sample(T, jnp.asarray(False), vector(0.1))
 
 
+def surface(law, v, v_dot):
+    """The sliding variable at an error and its rate."""
+    return law.acceleration(NOW, v, v_dot, vector(0.0))[1]
+
+
 def accelerated(law, k2=0.0):
     """V'' of the error quaternion under the law, with d known exactly, by the plant's own equations."""
-    u, s, _ = law.command(None, NOW, X, TARGET, D, vector(k2))
+    u, s, _ = law(NOW, X, TARGET, D, vector(k2))
     motion = BODY.rate(T, X, u, D)
 
     def v_dot(t):  # along the motion, to first order in t; the reference moves on too
         later = jax.tree.map(lambda x, rate: x + t * rate, X, motion)
         rate = TARGET.w
         q = TARGET.q + t * 0.5 * attitude.multiply(TARGET.q, jnp.concatenate([rate, jnp.zeros(1)]))
-        return law.errors(later, references.Target(q, rate + t * TARGET.w_dot, TARGET.w_dot))[1]
+        return law.kinematics.errors(later, references.Target(q, rate + t * TARGET.w_dot, TARGET.w_dot))[1]
 
     return jax.jvp(v_dot, (vector(0.0),), (vector(1.0),))[1], s
 
@@ -66,19 +65,19 @@ def accelerated(law, k2=0.0):
 @pytest.mark.parametrize("name", SLIDING)
 def test_the_torque_gives_the_error_the_acceleration_that_the_law_asks_for(name):
     law = LAWS[name]
-    v, v_dot = law.errors(X, TARGET)
-    _, wanted = law.surface(v, v_dot)
+    v, v_dot = law.kinematics.errors(X, TARGET)
+    wanted, _ = law.acceleration(NOW, v, v_dot, vector(0.0))
     np.testing.assert_allclose(accelerated(law)[0], wanted, rtol=1e-12, atol=1e-14)
     # with a bound on the estimation error it also switches, by |T J^-1| K2 / 2
     got, s = accelerated(law, k2=0.03)
-    switching = 0.5 * law.influence(X, TARGET) * 0.03 * np.tanh(s / 1e-3)
+    switching = law.kinematics.influence(X, TARGET) * 0.03 * np.tanh(s / 1e-3)
     np.testing.assert_allclose(got, wanted - switching, rtol=1e-9)
 
 
 def test_pd_turns_the_body_as_its_formula_says():
     """w_e' = -k_p v - k_d w_e, whatever the inertia, the reference's motion and a known disturbance."""
     law = LAWS["pd"]
-    u, _ = law.torque(T, jnp.asarray(False), X, TARGET, D, vector(0.7))
+    u, _ = helpers.commanded(law, T, jnp.asarray(False), X, TARGET, D, vector(0.7))
     w_dot = BODY.rate(T, X, u, D).w
     q_e = Rotation.from_quat(np.array(TARGET.q)).inv() * Rotation.from_quat(np.array(X.q))
     v = np.asarray(q_e.as_quat(canonical=True))[:3]
@@ -95,8 +94,8 @@ def test_the_surfaces_draw_near_as_their_papers_say(name, trial):
     law = LAWS[name]
     rng = np.random.default_rng(trial)
     v, v_dot = vector(rng.uniform(-0.8, 0.8, 3)), vector(rng.uniform(-0.3, 0.3, 3))
-    s, alpha = law.surface(v, v_dot)
-    s_dot = jax.jvp(lambda v, v_dot: law.surface(v, v_dot)[0], (v, v_dot), (v_dot, alpha))[1]
+    alpha, s = law.acceleration(NOW, v, v_dot, vector(0.0))
+    s_dot = jax.jvp(lambda v, v_dot: surface(law, v, v_dot), (v, v_dot), (v_dot, alpha))[1]
     if name == "terminal":
         wanted = -(1.3 / 0.6) * np.abs(v_dot) ** 0.3 * 0.5 * np.asarray(s)
     else:
@@ -109,7 +108,7 @@ def flown(law, angle, rate, t_end, period=0.005):
     """History of the angle about the z axis of a body with no disturbance, sampled quickly."""
     q = Rotation.from_rotvec([0.0, 0.0, angle]).as_quat()
     body = rigid_body.spacecraft((10.0, 12.0, 14.0))
-    law = replace(law, model=body, t_f=vector(t_end - 1.0), delta=vector(period))
+    law = replace(law, kinematics=MultiplicativeKinematics(body), t_f=vector(t_end - 1.0), delta=vector(period))
     run = helpers.parts(t_end - 1.0, 3.0, period, inertia=(10.0, 12.0, 14.0), q=q, rate=(0.0, 0.0, rate), period=period,
                         t_end=t_end, disturbance=disturbances.Constant(jnp.zeros(3)))  # fmt: skip
     log = fly(replace(run, controller=law, clock=clock.anchored(period, t_end, t_end - 1.0, 1.0 + period))).log
@@ -165,8 +164,8 @@ def test_signed_powers():
 
 def test_pd_tells_what_it_drives_to_zero_and_knows_no_singularity():
     law, half = LAWS["pd"], attitude.multiply(TARGET.q, vector([0.0, 0.0, 1.0, 0.0]))
-    q_e, w_e, *_ = law.relative(X, TARGET)
-    s = law.torque(T, jnp.asarray(False), X, TARGET, D, vector(0.7))[1]
+    q_e, w_e, *_ = law.kinematics.relative(X, TARGET)
+    s = helpers.commanded(law, T, jnp.asarray(False), X, TARGET, D, vector(0.7))[1]
     np.testing.assert_allclose(s, q_e[:3] + 0.9 / 0.4 * w_e, rtol=1e-12)
     turned = rigid_body.AttitudeState(half, X.w)
     assert law.clearance(turned, TARGET) == 1.0
@@ -176,10 +175,12 @@ def test_pd_tells_what_it_drives_to_zero_and_knows_no_singularity():
 
 @pytest.mark.parametrize("name", SLIDING)
 def test_the_sign_is_as_wide_as_it_is_told_and_exact_at_zero(name):
-    s = vector([1e-9, -2e-9, 0.0])
-    np.testing.assert_array_equal(replace(LAWS[name], sign_width=vector(0.0)).sign(s), [1.0, -1.0, 0.0])
-    np.testing.assert_allclose(replace(LAWS[name], sign_width=vector(0.5)).sign(vector([0.1, -1.0, 0.0])),
-                               np.tanh([0.2, -2.0, 0.0]), rtol=1e-14)  # fmt: skip
+    law, v, v_dot = LAWS[name], vector([0.1, -0.2, 0.0]), vector([0.05, -0.1, 0.0])
+    quiet, s = law.acceleration(NOW, v, v_dot, vector(0.0))
+    for width, sign in ((0.0, np.sign(s)), (0.5, np.tanh(np.asarray(s) / 0.5))):
+        switched, _ = replace(law, sign_width=vector(width)).acceleration(NOW, v, v_dot, vector(0.3))
+        np.testing.assert_allclose(quiet - switched, 0.3 * sign, rtol=1e-12)
+    assert s[2] == 0.0
 
 
 @pytest.mark.parametrize("name", SLIDING)
@@ -188,7 +189,7 @@ def test_how_fast_a_law_turns_the_body_is_what_its_surface_asks_for_at_half_a_tu
     law = LAWS[name]
     tables = {"terminal": baseline_tables.TerminalController, "fixed_time": baseline_tables.FixedTimeController}
     gains = {gain: float(getattr(law, gain)) for gain in law.tunable if gain != "t_f"}
-    rate: Any = brentq(lambda v_dot: float(law.surface(vector([1.0]), vector([v_dot]))[0][0]), -10.0, -1e-3, xtol=1e-12)
+    rate: Any = brentq(lambda v_dot: float(surface(law, vector([1.0]), vector([v_dot]))[0]), -10.0, -1e-3, xtol=1e-12)
     assert tables[name](**gains).turning(10.0)[1] == pytest.approx(-2.0 * rate, rel=1e-9)
 
 

@@ -12,15 +12,15 @@ from scipy.integrate import solve_ivp
 
 from ptsmc_jax import formulas
 from ptsmc_jax.batching import lanes
-from ptsmc_jax.laws import closed_forms
+from ptsmc_jax.laws.prescribed_time import expansion
 from ptsmc_jax.observers import nonlinear
 from ptsmc_jax.plants import integrator_chain
 from ptsmc_jax.signals import disturbances
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.theory import envelopes, hold, solutions
-from tests.helpers import chain_parts, drawn, fly, short, vector, with_controller
+from tests.helpers import chain_parts, commanded, drawn, fly, short, vector, with_controller
 
-torque = jax.jit(lambda law, *at: law.torque(*at))
+torque = jax.jit(commanded)
 HOLD, BEFORE = jnp.asarray(True), jnp.asarray(False)
 
 
@@ -69,8 +69,8 @@ def test_surface_is_the_derivative_that_defines_it(n):
     at = jnp.stack([state(t) for state in states])
     _, s = torque(law, vector(t), BEFORE, at, None, jnp.zeros(1), vector(0.0))
     np.testing.assert_allclose(s[0], derivative(t) * (t_f - t) ** (eta + n - 1), rtol=1e-11)
-    assert [float(c) for c in closed_forms.expansion(vector(3.0), 2)] == [3.0, 1.0]  # (7)
-    assert [float(c) for c in closed_forms.expansion(vector(4.0), 3)] == [20.0, 8.0, 1.0]
+    assert [float(c) for c in expansion(vector(3.0), 2)] == [3.0, 1.0]  # (7)
+    assert [float(c) for c in expansion(vector(4.0), 3)] == [20.0, 8.0, 1.0]
 
 
 @pytest.mark.parametrize("n", [2, 3, 4, 5])
@@ -324,7 +324,7 @@ def test_input_and_surface_have_slopes_in_every_gain(hold):
     @jax.jit
     def given(point):
         law = with_controller(run, **dict(zip(gains, point, strict=True))).controller
-        return jnp.stack(law.torque(vector(3.1), jnp.asarray(hold), run.initial, None, jnp.zeros(1), vector(0.4)))
+        return jnp.stack(commanded(law, vector(3.1), jnp.asarray(hold), run.initial, None, jnp.zeros(1), vector(0.4)))
 
     steps = 1e-6 * np.eye(5)
     differences = np.stack([(given(point + h) - given(point - h)) / 2e-6 for h in steps], axis=-1)

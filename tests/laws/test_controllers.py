@@ -6,15 +6,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ptsmc_jax.laws import prescribed_time
+from ptsmc_jax.laws.kinematics import AdditiveKinematics, MultiplicativeKinematics
 from ptsmc_jax.numerics import attitude
 from ptsmc_jax.plants import rigid_body
 from ptsmc_jax.plants.rigid_body import AttitudeState
 from ptsmc_jax.signals import disturbances, references
 from ptsmc_jax.simulation import rollout
+from ptsmc_jax.theory.rates import switching_rate
 from tests.helpers import (
     FULL_INERTIA,
     REFERENCE,
+    commanded,
     errors_along,
     finer,
     fly,
@@ -28,7 +30,7 @@ from tests.helpers import (
 SWING = references.Swing(
     vector(0.5, -0.2, 0.4, np.sqrt(1 - 0.45)), vector(0.3, -0.5, 0.2), vector(0.2, 0.1, 0.3), vector(0.1, 0.5, 0.2)
 )
-LAWS = [prescribed_time.PrescribedTime, prescribed_time.PrescribedTimeMultiplicative]
+KINEMATICS = [AdditiveKinematics, MultiplicativeKinematics]
 SPIN = references.Spin(vector(0.1, -0.2, 0.1, np.sqrt(1 - 0.06)), vector(0.02, -0.05, 0.03))
 
 
@@ -39,28 +41,36 @@ def state(seed: int) -> AttitudeState:
     return AttitudeState(vector(q / np.linalg.norm(q)), vector(0.1 * rng.normal(size=3)))
 
 
-@pytest.mark.parametrize("kind", LAWS)
+@pytest.mark.parametrize("kind", KINEMATICS)
 @pytest.mark.parametrize("hold", [False, True])
 @pytest.mark.parametrize("seed", short([1, 2, 3], [1]))
 def test_closed_loop_error_obeys_the_equation_that_the_law_is_made_from(kind, hold, seed):
     """s' with the true dynamics, by automatic differentiation along the motion, against (31) and (34) by hand."""
-    moving = SWING if kind is LAWS[1] else SPIN  # w_f' counts too
+    moving = SWING if kind is KINEMATICS[1] else SPIN  # w_f' counts too
     run = parts(
-        20.0, 3.5, 0.5, inertia=FULL_INERTIA, reference=moving, k1=1.7, sign_width=0.1, law=kind, surface_rate=1.3
+        20.0,
+        3.5,
+        0.5,
+        inertia=FULL_INERTIA,
+        reference=moving,
+        k1=1.7,
+        sign_width=0.1,
+        kinematics=kind,
+        surface_rate=1.3,
     )
     law, x, t = run.controller, state(seed), vector(4.0)
     d, d_hat, k2 = vector(0.3, -0.1, 0.2), vector(0.1, 0.1, -0.2), vector(0.05)
-    u, s = law.torque(t, jnp.asarray(hold), x, moving(t), d_hat, k2)
+    u, s = commanded(law, t, jnp.asarray(hold), x, moving(t), d_hat, k2)
 
     def surface(time, y):
-        return law.torque(time, jnp.asarray(hold), y, moving(time), d_hat, k2)[1]
+        return commanded(law, time, jnp.asarray(hold), y, moving(time), d_hat, k2)[1]
 
     _, s_dot = jax.jvp(surface, (t, x), (jnp.ones_like(t), run.plant.rate(t, x, u, d)))
-    error, error_rate = law.errors(x, moving(t))
+    error, error_rate = law.kinematics.errors(x, moving(t))
     tau, tanh = 16.0, np.tanh(np.asarray(s) / 0.1)
     inverse = np.linalg.inv(np.asarray(FULL_INERTIA))
     q_e = attitude.multiply(attitude.conjugate(moving(t).q), x.q)
-    push = np.asarray(attitude.t_matrix(q_e if kind is LAWS[1] else x.q)) @ inverse
+    push = np.asarray(attitude.t_matrix(q_e if kind is KINEMATICS[1] else x.q)) @ inverse
     switching = np.linalg.norm(push) * 0.05  # Frobenius
     unseen = push @ np.asarray(d - d_hat)
     if hold:
@@ -78,7 +88,7 @@ def test_first_torque_of_the_reference_data_and_its_closed_form(case):
     first = case["trajectory"][0]
     x = AttitudeState(vector(first["q"]), vector(first["omega"]))
     zero = jnp.zeros(3)
-    u, s = run.controller.torque(vector(0.0), jnp.asarray(False), x, run.reference(vector(0.0)), zero, vector(0.0))
+    u, s = commanded(run.controller, vector(0.0), jnp.asarray(False), x, run.reference(vector(0.0)), zero, vector(0.0))
     np.testing.assert_allclose(u, first["torque"], rtol=1e-13)
     np.testing.assert_allclose(s, first["s"], rtol=1e-13)
 
@@ -86,11 +96,23 @@ def test_first_torque_of_the_reference_data_and_its_closed_form(case):
 def test_smooth_sign_width_zero_is_the_exact_sign():
     run = parts(20.0, 3.0, 0.5)
     x, target, d_hat = state(5), run.reference(vector(0.0)), jnp.zeros(3)
-    exact, s = with_controller(run, sign_width=vector(0.0)).controller.torque(
-        vector(1.0), jnp.asarray(False), x, target, d_hat, vector(0.3)
+    exact, s = commanded(
+        with_controller(run, sign_width=vector(0.0)).controller,
+        vector(1.0),
+        jnp.asarray(False),
+        x,
+        target,
+        d_hat,
+        vector(0.3),
     )
-    sharp, _ = with_controller(run, sign_width=vector(1e-12)).controller.torque(
-        vector(1.0), jnp.asarray(False), x, target, d_hat, vector(0.3)
+    sharp, _ = commanded(
+        with_controller(run, sign_width=vector(1e-12)).controller,
+        vector(1.0),
+        jnp.asarray(False),
+        x,
+        target,
+        d_hat,
+        vector(0.3),
     )
     assert np.all(np.abs(s) > 1e-6)
     np.testing.assert_array_equal(exact, sharp)
@@ -102,7 +124,7 @@ def test_align_chooses_the_sign_of_the_reference_and_clearance_counts_from_its_s
     for flip_x in (1.0, -1.0):
         for flip_f in (1.0, -1.0):
             target = references.Fixed(flip_f * vector(0.0, 0.6, 0.0, 0.8))(vector(0.0))
-            aligned = law.align(AttitudeState(flip_x * x.q, x.w), target)
+            aligned = law.kinematics.align(AttitudeState(flip_x * x.q, x.w), target)
             assert float(aligned.q[3] * target.q[3]) > 0
             np.testing.assert_allclose(law.clearance(aligned, target), x.q[3])
             assert float(law.clearance(AttitudeState(-aligned.q, x.w), target)) < 0
@@ -115,7 +137,7 @@ def test_gradients_are_finite_at_the_awkward_points(hold):
 
     def u(law, t, width):
         law = with_controller(run, sign_width=width).controller if law is None else law
-        return law.torque(t, jnp.asarray(hold), rest, run.reference(t), jnp.zeros(3), vector(0.1))[0]
+        return commanded(law, t, jnp.asarray(hold), rest, run.reference(t), jnp.zeros(3), vector(0.1))[0]
 
     for width in (0.0, 1e-3):
         sharp = with_controller(run, sign_width=vector(width)).controller
@@ -132,17 +154,17 @@ def test_the_norm_in_the_switching_term_is_not_below_the_spectral_one():
 
 
 def test_multiplicative_error_is_the_vector_part_of_the_error_quaternion_and_its_rate():
-    law = parts(law=LAWS[1]).controller
+    law = parts(kinematics=KINEMATICS[1]).controller
     for seed in range(5):
         x, t = state(seed), vector(3.0 + seed)
-        error, error_rate = law.errors(x, SWING(t))
+        error, error_rate = law.kinematics.errors(x, SWING(t))
         found = Rotation.from_quat(np.asarray(SWING(t).q)).inv() * Rotation.from_quat(np.asarray(x.q))
         q_e = found.as_quat()
         np.testing.assert_allclose(error * np.sign(law.clearance(x, SWING(t))), q_e[:3] * np.sign(q_e[3]), atol=1e-15)
 
         def along(time, x=x, t=t):
             body = AttitudeState(x.q + (time - t) * attitude.derivative(x.q, x.w), x.w)
-            return law.errors(body, SWING(time))[0]
+            return law.kinematics.errors(body, SWING(time))[0]
 
         np.testing.assert_allclose(jax.jvp(along, (t,), (jnp.ones_like(t),))[1], error_rate, atol=1e-14)
 
@@ -151,9 +173,9 @@ def flown(law, reference, start, rate=(0.0, 0.0, 0.0), quiet=True, **others):
     """A run with the default disturbance, or by the same program without; of the multiplicative law finely stepped."""
     none = {"disturbance": disturbances.Sinusoid(*[jnp.zeros(3)] * 4), "rate_bound": 0.0} if quiet else {}
     run = parts(
-        20.0, 3.5, 0.1, inertia=FULL_INERTIA, q=start, rate=rate, reference=reference, law=law, **none, **others
+        20.0, 3.5, 0.1, inertia=FULL_INERTIA, q=start, rate=rate, reference=reference, kinematics=law, **none, **others
     )
-    return finer(run, 2) if law is LAWS[1] else run
+    return finer(run, 2) if law is KINEMATICS[1] else run
 
 
 def fixed(q):
@@ -167,13 +189,13 @@ AWAY = vector((Rotation.from_rotvec([2.9, 0.2, 0.1]) * Rotation.from_rotvec([0.5
 
 
 def test_vector_part_moves_as_solution_1_says_while_the_reference_crosses_the_additive_laws_singularity():
-    run = flown(LAWS[1], CROSSING, AWAY, (0.03, 0.0, -0.02))
+    run = flown(KINEMATICS[1], CROSSING, AWAY, (0.03, 0.0, -0.02))
     result = fly(run)
     before = result.log.t < 19.89
     assert result.status == rollout.OK
     assert np.ptp(np.sign(result.log.reference.q[before, 3])) == 2  # it does cross
     target = run.reference(vector(0.0))
-    start = run.controller.errors(run.controller.align(run.initial, target), target)
+    start = run.controller.kinematics.errors(run.controller.kinematics.align(run.initial, target), target)
     exact = errors_along(result.log.t, vector(20.0), vector(3.5), *start)
     np.testing.assert_allclose(result.log.error[before], exact.error[before], rtol=0, atol=1e-10)
     # the torque of the exact motion, from the inverse map of `theory`, is the one that was flown
@@ -184,7 +206,7 @@ def test_vector_part_moves_as_solution_1_says_while_the_reference_crosses_the_ad
 
 @pytest.mark.long  # each of both is seen by itself: `test_align_chooses..`, and the test above
 def test_a_slew_on_which_the_additive_law_fails_and_the_multiplicative_one_does_not():
-    additive, other = (fly(flown(law, CROSSING, AWAY, quiet=False)) for law in LAWS)
+    additive, other = (fly(flown(law, CROSSING, AWAY, quiet=False)) for law in KINEMATICS)
     assert additive.status == rollout.SINGULAR
     assert 0.0 < additive.bad_time < 20.0
     assert other.status == rollout.OK
@@ -194,7 +216,7 @@ def test_a_slew_on_which_the_additive_law_fails_and_the_multiplicative_one_does_
 @pytest.mark.parametrize("seed", [1, 2])
 def test_multiplicative_loop_does_not_depend_on_the_inertial_frame(seed):
     turn = vector(Rotation.random(rng=np.random.default_rng(seed)).as_quat())
-    run = flown(LAWS[1], CROSSING, AWAY, (0.01, 0.02, 0.0), quiet=False)
+    run = flown(KINEMATICS[1], CROSSING, AWAY, (0.01, 0.02, 0.0), quiet=False)
     turned = replace(
         run,
         initial=AttitudeState(attitude.multiply(turn, run.initial.q), run.initial.w),
@@ -210,7 +232,7 @@ def test_multiplicative_loop_does_not_depend_on_the_inertial_frame(seed):
     signs = np.sign(np.sum(expected * other.log.x.q, axis=1, keepdims=True))
     np.testing.assert_allclose(other.log.x.q * signs, expected, rtol=0, atol=1e-12)
     # the additive law's motion does depend on it
-    additive = flown(LAWS[0], CROSSING, AWAY, (0.01, 0.02, 0.0), quiet=False)
+    additive = flown(KINEMATICS[0], CROSSING, AWAY, (0.01, 0.02, 0.0), quiet=False)
     a, b = (fly(replace(additive, initial=r.initial, reference=r.reference)) for r in (run, turned))
     assert np.abs(a.log.x.w[: len(a.log.t) // 4] - b.log.x.w[: len(b.log.t) // 4]).max() > 1e-3
 
@@ -220,32 +242,32 @@ def test_signs_and_ways_round():
     about = np.array([0.6, 0.0, 0.8])
     start, end = (vector(Rotation.from_rotvec(np.deg2rad(a) * about).as_quat()) for a in (150.0, 210.0))
     turned = {}
-    for law in LAWS:
+    for law in KINEMATICS:
         for sign in (1.0, -1.0):
             result = fly(flown(law, fixed(end), sign * start))
             assert result.status == rollout.OK
             assert result.metrics.terminal_angle < 1e-4
             speed = np.linalg.norm(result.log.x.w, axis=1)
             turned[law, sign] = np.rad2deg(np.trapezoid(speed, result.log.t))
-    near, far = turned[LAWS[1], 1.0], turned[LAWS[0], 1.0]
+    near, far = turned[KINEMATICS[1], 1.0], turned[KINEMATICS[0], 1.0]
     assert near == pytest.approx(60.0, abs=0.1)
     assert far == pytest.approx(300.0, abs=0.5)
-    assert turned[LAWS[1], -1.0] == pytest.approx(near, abs=1e-9)
-    assert turned[LAWS[0], -1.0] == pytest.approx(far, abs=1e-9)
+    assert turned[KINEMATICS[1], -1.0] == pytest.approx(near, abs=1e-9)
+    assert turned[KINEMATICS[0], -1.0] == pytest.approx(far, abs=1e-9)
 
 
 def test_multiplicative_law_is_singular_at_a_true_error_of_180_degrees_only():
-    law = parts(law=LAWS[1]).controller
+    law = parts(kinematics=KINEMATICS[1]).controller
     opposite = references.Fixed(vector(Rotation.from_rotvec([0.0, np.pi, 0.0]).as_quat()))(vector(0.0))
     near = Rotation.from_rotvec([0.0, 1e-3, 0.0])
     x = AttitudeState(vector(near.as_quat()), jnp.zeros(3))
     assert abs(float(law.clearance(x, opposite))) == pytest.approx(np.sin(5e-4), rel=1e-9)
     # too fast a start away from the reference: |v| passes 1, at a node of the grid or between two of them
-    run = flown(LAWS[1], fixed([0.0, 0.0, 0.0, 1.0]), vector(0.0, 0.6, 0.0, 0.8), (0.0, 0.9, 0.0))
+    run = flown(KINEMATICS[1], fixed([0.0, 0.0, 0.0, 1.0]), vector(0.0, 0.6, 0.0, 0.8), (0.0, 0.9, 0.0))
     assert fly(run).status in (rollout.SINGULAR, rollout.TOO_FAST)
     # |v(0)| + t_f |v'(0)| / (e eta) < 1 is enough
-    calm = flown(LAWS[1], fixed([0.0, 0.0, 0.0, 1.0]), vector(0.0, 0.6, 0.0, 0.8), (0.0, 0.45, 0.0))
-    error, error_rate = calm.controller.errors(calm.initial, calm.reference(vector(0.0)))
+    calm = flown(KINEMATICS[1], fixed([0.0, 0.0, 0.0, 1.0]), vector(0.0, 0.6, 0.0, 0.8), (0.0, 0.45, 0.0))
+    error, error_rate = calm.controller.kinematics.errors(calm.initial, calm.reference(vector(0.0)))
     assert np.linalg.norm(error) + 20.0 * np.linalg.norm(error_rate) / (np.e * 3.5) < 1.0
     assert fly(calm).status == rollout.OK
 
@@ -253,10 +275,12 @@ def test_multiplicative_law_is_singular_at_a_true_error_of_180_degrees_only():
 @pytest.mark.parametrize("hold", [False, True])
 def test_the_switching_rate_is_what_the_sign_does_to_s_at_the_reference(hold):
     """K2 takes s' down by tau times it before the hand-over, by it after; at T = I, where |T J^-1| is largest."""
-    run = parts(20.0, 3.5, 0.5, inertia=FULL_INERTIA, law=LAWS[1], sign_width=1e-6)
+    run = parts(20.0, 3.5, 0.5, inertia=FULL_INERTIA, kinematics=KINEMATICS[1], sign_width=1e-6)
     law, t = run.controller, vector(4.0)
     x = AttitudeState(vector([0.0, 0.0, 0.0, 1.0]), vector([0.3, 0.2, 0.1]))
     target = references.Fixed(vector([0.0, 0.0, 0.0, 1.0]))(t)
-    quiet, switched = (law.torque(t, jnp.asarray(hold), x, target, jnp.zeros(3), vector(k2))[0] for k2 in (0.0, 0.05))
+    quiet, switched = (
+        commanded(law, t, jnp.asarray(hold), x, target, jnp.zeros(3), vector(k2))[0] for k2 in (0.0, 0.05)
+    )
     acceleration = 0.5 * run.plant.inertia_inverse @ (switched - quiet)
-    np.testing.assert_allclose(acceleration, np.full(3, -law.switching_rate(vector(0.05))), rtol=1e-12)
+    np.testing.assert_allclose(acceleration, np.full(3, -switching_rate(law, vector(0.05))), rtol=1e-12)

@@ -15,10 +15,9 @@ from scipy.integrate import quad, solve_ivp
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
-from ptsmc_jax.laws import pd, predefined_time, scaling, super_twisting, time_base
-from ptsmc_jax.laws.acceleration import law_on_error
+from ptsmc_jax.laws import baselines, time_base
 from ptsmc_jax.laws.base import Sample
-from ptsmc_jax.laws.error_motions import ErrorOfChain, ErrorOfSystem, ErrorQuaternion
+from ptsmc_jax.laws.kinematics import ChainKinematics, MultiplicativeKinematics, SecondOrderKinematics
 from ptsmc_jax.numerics import attitude
 from ptsmc_jax.observers import none
 from ptsmc_jax.plants import integrator_chain, rigid_body
@@ -38,32 +37,33 @@ GAINS: dict[str, dict[str, float]] = {
     "super_twisting": {"surface_rate": 0.8, "lipschitz": 0.3, "sign_width": 0.02},
 }
 CLASSES: dict[str, Any] = {
-    "pd": pd.PD,
+    "pd": baselines.PD,
     "time_base_pd": time_base.TimeBasePD,
     "time_base_sliding": time_base.TimeBaseSliding,
-    "scaling": scaling.Scaling,
-    "predefined_time": predefined_time.PredefinedTime,
-    "super_twisting": super_twisting.SuperTwisting,
+    "scaling": baselines.Scaling,
+    "predefined_time": baselines.PredefinedTime,
+    "super_twisting": baselines.SuperTwisting,
 }
 BODY, CHAIN = rigid_body.spacecraft(FULL_INERTIA), integrator_chain.chain(2)
 NEVER = jnp.asarray(False)
 
 
-def made(name, error: Any = ErrorOfChain, model: Any = CHAIN, t_f=T_F, delta=DELTA, **changes) -> Any:
+def made(name, error: Any = ChainKinematics, model: Any = CHAIN, t_f=T_F, delta=DELTA, **changes) -> Any:
     """The law by its name in scenario files, with the gains above."""
     gains = {key: vector(value) for key, value in {**GAINS[name], **changes}.items()}
-    law: Any = law_on_error(error, CLASSES[name])
-    return law(model=model, t_f=vector(t_f), delta=vector(delta), **gains)
+    return CLASSES[name](kinematics=error(model), t_f=vector(t_f), delta=vector(delta), **gains)
 
 
 @jax.jit
 def stepped(law, memory, now, error, rate, bound):
-    return law.step(memory, now, error, rate, bound)
+    """Acceleration, sliding variable and the next memory."""
+    a, s, *memories = law.acceleration(now._replace(memory=memory), error, rate, bound)
+    return a, s, memories[0] if memories else memory
 
 
 @pytest.mark.parametrize("name", CLASSES)
-def test_a_law_on_an_error_is_pickled_and_copied(name):
-    law = made(name, ErrorQuaternion, BODY)
+def test_a_law_is_pickled_and_copied(name):
+    law = made(name, MultiplicativeKinematics, BODY)
     for other in (pickle.loads(pickle.dumps(law)), copy.deepcopy(law)):
         assert jax.tree.structure(other) == jax.tree.structure(law)
         assert jax.tree.leaves(jax.tree.map(np.array_equal, other, law)) == [True] * len(jax.tree.leaves(law))
@@ -148,13 +148,13 @@ K2 = 0.06
 # error, plant, reference, state, disturbance, where a profile began: in straight coordinates, and its rate
 PLANTS: dict[str, Any] = {
     "attitude": (
-        ErrorQuaternion, BODY, SPIN,
+        MultiplicativeKinematics, BODY, SPIN,
         rigid_body.AttitudeState(vector(Rotation.from_rotvec([1.1, 0.4, -0.8]).as_quat()), vector([0.05, -0.11, 0.07])),
         vector([0.02, -0.01, 0.015]), np.array([1.2, 0.9, -1.4]), np.array([0.1, -0.2, 0.05]),
     ),
-    "chain": (ErrorOfChain, integrator_chain.chain(2, lambda x: -0.8 * jnp.sin(x[0]), lambda x: 2.0 + x[0] ** 2),
+    "chain": (ChainKinematics, integrator_chain.chain(2, lambda x: -0.8 * jnp.sin(x[0]), lambda x: 2.0 + x[0] ** 2),
               references.Origin(), vector([0.7, -0.4]), vector([0.1]), np.array([1.1]), np.array([-0.3])),
-    "arm": (ErrorOfSystem, ARM, references.CurrentTime(), vector([0.4, -0.3, 0.5, -0.2]), vector([0.2, -0.1]),
+    "arm": (SecondOrderKinematics, ARM, references.CurrentTime(), vector([0.4, -0.3, 0.5, -0.2]), vector([0.2, -0.1]),
             np.array([0.8, -0.5]), np.array([0.3, 0.1])),
 }  # fmt: skip
 
@@ -165,7 +165,7 @@ def becomes(law, reference, t, x, u, d):
     motion = law.model.rate(t, x, u, d)
 
     def at(passed):  # along the motion, to first order; the reference moves on by itself
-        return law.errors(jax.tree.map(lambda x, rate: x + passed * rate, x, motion), reference(t + passed))
+        return law.kinematics.errors(jax.tree.map(lambda x, rate: x + passed * rate, x, motion), reference(t + passed))
 
     (error, rate), (also, acceleration) = jax.jvp(at, (vector(0.0),), (vector(1.0),))
     return error, rate, also, acceleration
@@ -209,7 +209,7 @@ def test_the_input_gives_the_error_the_acceleration_that_the_paper_asks_for(plan
         profile = swung(start, rate, T) if plant == "attitude" else None
     elif name == "super_twisting":
         memory = known = vector(start)
-    u, s, kept = law.command(memory, NOW, x, reference(vector(T)), d, vector(K2))
+    u, s, kept = law(NOW._replace(memory=memory), x, reference(vector(T)), d, vector(K2))
     found, found_rate, also, acceleration = becomes(law, reference, vector(T), x, u, d)
     a, surface, remembered = wanted(name, GAINS[name], (T, False, 0.1), e, w, bound, known, profile)
     # rounding; differences of the profile leave h^4 and 1e-16 / h^2, times gains and the sign's 1 / sign_width
@@ -238,7 +238,7 @@ def test_slopes_by_gains_errors_and_memory_are_those_of_differences(name):
 
     @jax.jit
     def value(gains, memory, e, w):
-        a, s, memory = replace(law, **gains).step(memory, now, e, w, vector(0.05))
+        a, s, memory = stepped(replace(law, **gains), memory, now, e, w, vector(0.05))
         return jnp.concatenate([a, s]), memory
 
     flat, unravel = ravel_pytree(inputs)
@@ -254,9 +254,9 @@ def test_values_and_slopes_are_finite_wherever_a_norm_a_root_or_a_time_to_go_van
     @jax.jit
     def all_of(law, t, hold, e, w):
         return jax.jacrev(
-            lambda law, t, e, w: law.step(law.begin(), Sample(t, hold, vector(0.1)), e, w, vector(0.05)),
+            lambda law, t, e, w: stepped(law, law.begin(), Sample(t, hold, vector(0.1)), e, w, vector(0.05)),
             argnums=(0, 1, 2, 3),
-        )(law, t, e, w), law.step(law.begin(), Sample(t, hold, vector(0.1)), e, w, vector(0.05))
+        )(law, t, e, w), stepped(law, law.begin(), Sample(t, hold, vector(0.1)), e, w, vector(0.05))
 
     widths = ({"sign_width": 0.0}, {"sign_width": 0.02}) if "sign_width" in GAINS[name] else ({},)
     for changes in widths:
@@ -367,7 +367,7 @@ def test_the_profile_is_the_quintic_that_begins_as_measured_and_ends_at_rest():
 
 def test_a_profile_of_attitudes_turns_about_the_eigenaxis():
     axis = np.array([0.6, 0.0, -0.8])
-    profile = jax.jit(made("time_base_pd", ErrorQuaternion, BODY).profile)
+    profile = jax.jit(made("time_base_pd", MultiplicativeKinematics, BODY).profile)
     for turn, rate in ((2.4, 0.0), (1.0, 0.3), (0.0, 0.0)):
         start = time_base.Start(jnp.ones(()), vector(turn * axis), vector(rate * axis))
         for t in (0.0, 1.7, 4.6, T_F, 5.5):
@@ -422,7 +422,7 @@ def test_a_profile_begins_with_the_first_measured_error_and_stays(soft):
 def test_a_body_at_rest_turns_about_its_eigenaxis_by_the_quintic():
     axis, turn = np.array([2.0, -1.0, 2.0]) / 3.0, 2.2
     q = Rotation.from_rotvec(turn * axis).as_quat()
-    law = made("time_base_pd", ErrorQuaternion, BODY)
+    law = made("time_base_pd", MultiplicativeKinematics, BODY)
     apart = []
     for period in (0.02, 0.01):
         run = helpers.parts(T_F, 3.0, DELTA, inertia=FULL_INERTIA, q=q, period=0.01, t_end=T_F + 1.0,
@@ -499,7 +499,7 @@ MEASURED = {1e-3: 0.051, 1.0: 0.308, 1e3: 0.553}  # share of T_1 + T_2 that it n
 def test_what_pulls_is_at_zero_when_its_closed_form_says(x):
     """T 2/pi atan(|x|^q), below T wherever it starts; integrated over y = x^q, without the singularity at zero."""
     q, settling = 0.3, 4.0
-    phi = jax.jit(lambda x: predefined_time.phi(x, vector(q), vector(settling)))
+    phi = jax.jit(lambda x: baselines.phi(x, vector(q), vector(settling)))
 
     def passing(y):
         return y ** (1.0 / q - 1.0) / q / float(phi(vector([y ** (1.0 / q)]))[0])

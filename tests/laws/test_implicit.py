@@ -9,8 +9,8 @@ import pytest
 
 from ptsmc_jax import scenario
 from ptsmc_jax.laws.base import Sample
-from ptsmc_jax.laws.closed_forms import expansion
-from ptsmc_jax.laws.prescribed_time import PrescribedTimeChain, PrescribedTimeMultiplicative, PrescribedTimeSystem
+from ptsmc_jax.laws.kinematics import ChainKinematics, MultiplicativeKinematics, SecondOrderKinematics
+from ptsmc_jax.laws.prescribed_time import PrescribedTime, PrescribedTimeChain, expansion
 from ptsmc_jax.numerics import integrators
 from ptsmc_jax.plants import integrator_chain, rigid_body, system
 from ptsmc_jax.scenario.errors import ScenarioError
@@ -137,9 +137,7 @@ def test_frozen_gains_are_those_of_the_law_and_have_no_border(eta):
     law = parts.controller
     for tau in (2.1, 3.5, 20.0):
         now = Sample(vector(T_F - tau * H), jnp.asarray(False), vector(H))
-        by = jax.jit(jax.jacfwd(lambda x, now=now: law.command(None, now, x, None, jnp.zeros(1), vector(0.0))[0]))(
-            jnp.zeros(2)
-        )
+        by = jax.jit(jax.jacfwd(lambda x, now=now: law(now, x, None, jnp.zeros(1), vector(0.0))[0]))(jnp.zeros(2))
         kp, kd = borders.implicit_gains(eta, tau)
         np.testing.assert_allclose(by, [[-kp / H**2, -kd / H]], rtol=1e-12)
         assert borders.radius(kp, kd, 1.0) < 1.0
@@ -189,10 +187,10 @@ def test_a_hand_over_a_period_before_t_f_turns_no_noise_of_position_into_a_rate(
 def test_a_second_order_systems_s_lands_exactly_where_its_input_is_an_acceleration(hold):
     plant = system(1, lambda t, a, b: b, lambda t, a, b: 0.0 * a, lambda t, a, b: 2.0 * jnp.eye(1))
     gains = (vector(v) for v in (30.0, 3.0, 2.0, 1.5, 1e-3, 1.2))
-    law = PrescribedTimeSystem(plant, *gains, implicit=True)
+    law = PrescribedTime(SecondOrderKinematics(plant), *gains, implicit=True)
     e, rate, h, left = 0.3, -0.04, 0.2, 2.0 if hold else 18.0
     now = Sample(vector(30.0 - left), jnp.asarray(hold), vector(h))
-    u, s, _ = law.command(None, now, vector([e, rate]), now.t, jnp.zeros(1), vector(0.0))
+    u, s, _ = law(now, vector([e, rate]), now.t, jnp.zeros(1), vector(0.0))
     e, rate = e + h * rate + h**2 * float(u[0]), rate + 2.0 * h * float(u[0])
     after = rate + 1.2 * e if hold else (left - h) * rate + 3.0 * e
     share = np.exp(-1.5 * h) if hold else ((left - h) / left) ** 3
@@ -220,8 +218,15 @@ def test_the_stable_region_extends_past_the_border_of_explicit_sampling(clock):
 def test_a_spacecrafts_s_lands_but_for_what_turns_within_the_period(hold):
     """The torque that lands s for a constant eps'' is held while T(q) turns: off by O(h^2), a quarter for half of h."""
     body = rigid_body.spacecraft(FULL_INERTIA)
-    law = PrescribedTimeMultiplicative(
-        body, vector(30.0), vector(3.0), vector(2.0), vector(1.5), vector(1e-3), vector(1.2), implicit=True
+    law = PrescribedTime(
+        MultiplicativeKinematics(body),
+        vector(30.0),
+        vector(3.0),
+        vector(2.0),
+        vector(1.5),
+        vector(1e-3),
+        vector(1.2),
+        implicit=True,
     )
     q = np.array([0.3, -0.2, 0.4, 0.0])
     x = rigid_body.AttitudeState(vector(np.append(q[:3], np.sqrt(1 - q @ q))), vector([0.05, -0.02, 0.04]))
@@ -229,11 +234,11 @@ def test_a_spacecrafts_s_lands_but_for_what_turns_within_the_period(hold):
     t = vector(29.0 if hold else 12.0)
     off = []
     for h in (0.04, 0.02, 0.01):
-        u, s, _ = law.command(None, Sample(t, jnp.asarray(hold), vector(h)), x, target, jnp.zeros(3), vector(0.0))
+        u, s, _ = law(Sample(t, jnp.asarray(hold), vector(h)), x, target, jnp.zeros(3), vector(0.0))
         end = x
         for k in range(8):
             end = integrators.rk4(lambda t, y, u=u: body.rate(t, y, u, jnp.zeros(3)), t + k * h / 8, end, vector(h / 8))
-        e, rate = law.errors(end, target)
+        e, rate = law.kinematics.errors(end, target)
         after = rate + 1.2 * e if hold else (18.0 - h) * rate + 3.0 * e
         wanted = np.exp(-0.5 * 1.5 * h) * s if hold else ((18.0 - h) / 18.0) ** 3 * s
         off.append(float(jnp.abs(after - wanted).max()))
@@ -276,11 +281,11 @@ def test_a_double_integrator_is_given_the_same_input_as_a_system_and_as_a_chain(
         "t_f": vector(T_F), "eta": vector(2.7), "delta": vector(0.4), "k1": vector(1.3), "sign_width": vector(1e-3),
         "surface_rate": vector(1.7),
     }  # fmt: skip
-    chain = PrescribedTimeChain(integrator_chain.chain(2), a=vector([1.0]), **gains, implicit=True)
+    chain = PrescribedTimeChain(ChainKinematics(integrator_chain.chain(2)), a=vector([1.0]), **gains, implicit=True)
     now = Sample(vector(T_F - left), jnp.asarray(left < 0.4), vector(H))
     (u, s, _), (other, other_s, _) = (
-        law.command(None, now, vector([0.3, -0.4]), now.t, jnp.zeros(1), vector(0.0))
-        for law in (PrescribedTimeSystem(double, **gains, implicit=True), chain)
+        law(now, vector([0.3, -0.4]), now.t, jnp.zeros(1), vector(0.0))
+        for law in (PrescribedTime(SecondOrderKinematics(double), **gains, implicit=True), chain)
     )
     np.testing.assert_allclose(u, other, rtol=1e-12)
     np.testing.assert_allclose(s, other_s, rtol=1e-12)

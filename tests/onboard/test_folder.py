@@ -99,8 +99,9 @@ class Odd(ptsmc.AccelerationLaw):
         """The memory, of [-] all."""
         return {"none": jnp.zeros(0), "I": jnp.zeros(3), "i": jnp.zeros((2, 3), int), "a b": jnp.zeros(()), "a-b": 0.0}
 
-    def step(self, memory: Any, now: Any, error: Any, error_rate: Any, bound: Any) -> Any:
+    def acceleration(self, now: Any, error: Any, error_rate: Any, bound: Any) -> Any:
         """PD, the sliding variable by its sign."""
+        memory = now.memory
         whole = jnp.sign(error).astype(int)
         kept = {**memory, "I": memory["I"] + error, "i": jnp.stack([memory["i"][1] - 1, memory["i"].sum() % 3 - whole])}
         return -error - 2.0 * error_rate - 0.1 * kept["I"] + 1e-3 * kept["i"][0], whole, kept
@@ -111,11 +112,11 @@ class Named(ptsmc.AccelerationLaw):
 
     k: float = ptsmc.gain(1.0, (0.1, 10.0), meaning="of v, */ and of /* v", unit="1/s^2")
 
-    def command(self, memory: Any, now: Any, x: Any, target: Any, d_hat: Any, k2: Any) -> Any:
+    def __call__(self, now: Any, x: Any, target: Any, d_hat: Any, k2: Any) -> Any:
         """What the function has as a pointer, and what it is given by it: the inverse of the inertia."""
         d = jnp.sum(x.w * x.w)
         damped = self.model.inertia_inverse @ (-self.k * x.q[:3] - 2.0 * x.w) / (1.0 + d)
-        return self.model.inertia @ self.model.inertia @ damped * (1.0 + d), x.w, memory
+        return self.model.inertia @ self.model.inertia @ damped * (1.0 + d), x.w, now.memory
 
 
 def of_own(law):
@@ -185,9 +186,9 @@ class Unsigned(Odd):
         """The memory [-]."""
         return jnp.zeros(1, jnp.uint64)
 
-    def step(self, memory: Any, now: Any, error: Any, error_rate: Any, bound: Any) -> Any:
+    def acceleration(self, now: Any, error: Any, error_rate: Any, bound: Any) -> Any:
         """PD, which counts."""
-        return -error - 2.0 * error_rate, error, memory + jnp.uint64(1)
+        return -error - 2.0 * error_rate, error, now.memory + jnp.uint64(1)
 
 
 class Lost(ptsmc.AccelerationLaw):
@@ -314,10 +315,10 @@ def test_other_gains_are_other_parameters_and_the_same_code(exported, tmp_path):
 
 def test_the_law_stands_in_it_with_its_names_and_equations(exported):
     text = (exported / "ptsmc_short.c").read_text()
-    assert "(56), (57) before and (59), (60) after the hand-over." in text.replace("\n * ", " ")
+    assert "(56) and (57) before and (59) and (60) after the hand-over." in text.replace("\n * ", " ")
     for line in (
         "const real error_1 = attitude[0] - p->reference_q[0];",
-        "const real twice_acceleration_3 = -switching_3",
+        "const real acceleration_3 = -switching_3",
     ):
         assert line in text
     assert "eta > 2" in (exported / "ptsmc_short.h").read_text()

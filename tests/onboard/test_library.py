@@ -423,9 +423,12 @@ class Apart(ptsmc.Draw):
         part, factor = getattr(parts, self.where or "controller"), 1.0 + 0.1 * c[0]
         changed = {"inertia": part.model.inertia * factor} if self.where else {}
         model = replace(part.model, inertia_inverse=part.model.inertia_inverse / factor, **changed)
-        if not self.where:
-            return replace(parts, controller=replace(part, model=model), observer=replace(parts.observer, model=model))
-        return replace(parts, **{self.where: replace(part, model=model)})
+        law = parts.controller
+        law = replace(law, kinematics=replace(law.kinematics, model=model))
+        if self.where == "controller":
+            return replace(parts, controller=law)
+        observer = replace(parts.observer, model=model)
+        return replace(parts, observer=observer, **({} if self.where else {"controller": law}))
 
 
 @needs_compiler

@@ -13,7 +13,8 @@ import pytest
 
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import store
-from ptsmc_jax.laws import prescribed_time
+from ptsmc_jax.laws.kinematics import SecondOrderKinematics
+from ptsmc_jax.laws.prescribed_time import PrescribedTime
 from ptsmc_jax.numerics import attitude
 from ptsmc_jax.observers import none
 from ptsmc_jax.plants import second_order
@@ -23,7 +24,8 @@ from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.signals import references
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.theory import envelopes, solutions
-from tests.helpers import FULL_INERTIA, ROOT, errors_along, finer, fly, inputs_along, parts, short, vector
+from ptsmc_jax.theory.exact_motion import plant_motion
+from tests.helpers import FULL_INERTIA, ROOT, commanded, errors_along, finer, fly, inputs_along, parts, short, vector
 from tuning.studies import posing
 
 ARM = str(ROOT / "scenarios" / "two_link_arm.py") + ":arm"
@@ -53,12 +55,12 @@ def spacecraft_as_system(reference, inertia=FULL_INERTIA):
 def as_system(run, reference):
     """The same run with the spacecraft written as a system: K1 of (29) is half of (60)'s."""
     model, law = spacecraft_as_system(reference), run.controller
-    error, _ = law.errors(run.initial, reference(vector(0.0)))
+    error, _ = law.kinematics.errors(run.initial, reference(vector(0.0)))
     return replace(
         run,
         plant=model,
-        controller=prescribed_time.PrescribedTimeSystem(
-            model, law.t_f, law.eta, law.delta, law.k1 / 2, law.sign_width, law.surface_rate
+        controller=PrescribedTime(
+            SecondOrderKinematics(model), law.t_f, law.eta, law.delta, law.k1 / 2, law.sign_width, law.surface_rate
         ),
         observer=replace(run.observer, model=model),
         reference=references.CurrentTime(),
@@ -66,7 +68,7 @@ def as_system(run, reference):
     )
 
 
-torque = jax.jit(lambda law, *at: law.torque(*at))
+torque = jax.jit(commanded)
 
 
 @jax.jit
@@ -139,7 +141,7 @@ def test_arm_follows_the_exact_solution_without_a_disturbance():
     ready = scenario.study(scenario.from_tables({**tables, "disturbance": {"kind": "none"}}))
     result = fly(ready.parts)
     before = result.log.t < 2.949
-    start = ready.parts.controller.errors(ready.parts.initial, vector(0.0))
+    start = ready.parts.controller.kinematics.errors(ready.parts.initial, vector(0.0))
     exact = errors_along(result.log.t, vector(3.0), vector(3.0), *start)
     np.testing.assert_allclose(result.log.error[before], exact.error[before], rtol=0, atol=1e-8)  # of the default grid
     # and the torque of the exact motion is the one flown, down to the feedback gain times that
@@ -224,9 +226,9 @@ AT_FIRST = (0.4, -0.2, 0.3, 0.1)
 
 def test_newton_finds_x_2_where_x_1_dot_is_no_linear_function_of_it():
     """And the law, there, asks for the input that keeps it on the exact motion."""
-    law = prescribed_time.PrescribedTimeSystem(CURVED, *(vector(v) for v in (5.0, 3.0, 0.1, 1.0, 1e-3, 1.0)))
+    law = PrescribedTime(SecondOrderKinematics(CURVED), *(vector(v) for v in (5.0, 3.0, 0.1, 1.0, 1e-3, 1.0)))
     start, none_known = vector(AT_FIRST), jnp.zeros(2)
-    begun = law.errors(start, vector(0.0))
+    begun = law.kinematics.errors(start, vector(0.0))
 
     @jax.jit
     @jax.vmap
@@ -235,7 +237,8 @@ def test_newton_finds_x_2_where_x_1_dot_is_no_linear_function_of_it():
             return solutions.exact_error(t, law.t_f, law.eta, *begun).error_rate
 
         error, rate = solutions.exact_error(t, law.t_f, law.eta, *begun).error, exact(t)
-        motion = law.motion(t, start, error, rate, jax.jvp(exact, (t,), (jnp.ones_like(t),))[1])
+        acceleration = jax.jvp(exact, (t,), (jnp.ones_like(t),))[1]
+        motion = plant_motion(law.kinematics, t, start, (error, rate, acceleration))
         u, _ = torque(law, t, jnp.asarray(False), motion.x, t, none_known, vector(0.0))
         return motion.x, error, rate, CURVED.input_for(t, motion.x, motion.w_dot, none_known), u
 

@@ -310,7 +310,7 @@ def test_a_reference_of_ones_own_has_exact_rates(here):
 
 
 REMEMBERS = LAW.replace(
-    "def acceleration(self, now,", "def begin(self):\n        return jnp.zeros(1)\n\n    def step(self, memory, now,"
+    "def acceleration(self, now,", "def begin(self):\n        return jnp.zeros(1)\n\n    def acceleration(self, now,"
 )
 
 
@@ -344,7 +344,7 @@ BAD = [
         changed("return 0.5 * wanted", "return self.width_ * wanted"), {},
         "acceleration fails: AttributeError: 'Mine' object has no attribute 'width_'", "line 19 of mine.py",
     ),
-    (changed("def acceleration", "def accelerate"), {}, "the class Mine has no method", "acceleration or step"),
+    (changed("def acceleration", "def accelerate"), {}, "the class Mine has no method", "acceleration or __call__"),
     (changed("return 0.5 * wanted, s", "return 1 / 0 * wanted, s"), {}, "acceleration fails", "line 19 of mine.py"),
     (changed("return 0.5 * wanted", "exit(0)"), {}, "acceleration fails: SystemExit", "line 19 of mine.py"),
     (
@@ -383,7 +383,7 @@ BAD = [
     (changed("width: float", "code: float"), {}, "a field of the class Mine is called code", "has its meaning"),
     (changed("width: float", "check: float"), {}, "a field of the class Mine is called check", "has its meaning"),
     (changed("width: float", "order: float"), {}, "a field of the class Mine is called order", "has its meaning"),
-    (changed("width: float", "errors: float"), {}, "a field of the class Mine is called errors", "another name"),
+    (changed("width: float", "kinematics: float"), {}, "of the class Mine is called kinematics", "another name"),
     (changed("width: float = 1e-3", "t_f: float = 1.0"), {}, "a field of the class Mine is called t_f", "another name"),
     (changed("return 0.5 * wanted", "return 1j * wanted"), {}, "returns an acceleration [", "real ones"),
     (LAW, {"eta": float("nan")}, "controller.eta is nan", "finite numbers"),
@@ -396,8 +396,8 @@ BAD = [
     (LAW, {"code": "gone.py:Mine"}, "the file gone.py is not there", "gone.py"),
     (LAW, {"code": "mine"}, 'controller.code is "mine"', "FILE.py:NAME"),
     (LAW, {"code": None}, "controller.code is absent", "FILE.py:NAME"),
-    (REMEMBERS, {}, "step returns 2 values", "a sliding variable, its memory"),
-    (REMEMBERS.replace("wanted, s", "wanted, s, jnp.zeros(2)"), {}, "step returns a memory f64(2,)", "f64(1,)"),
+    (REMEMBERS, {}, "acceleration returns 2 values", "a sliding variable, its memory"),
+    (REMEMBERS.replace("wanted, s", "wanted, s, jnp.zeros(2)"), {}, "acceleration returns a memory f64(2,)", "f64(1,)"),
 ]
 # fmt: on
 
@@ -595,8 +595,8 @@ def test_the_command_tunes_it(command, here, monkeypatch):
     assert error == f"ptsmc: runs {here}/sent/mine.py, which controller.code of sent/tuned.toml names\n"
 
 
-def test_a_law_flies_what_its_step_remembers():
-    """An integrator of the error by `step` against the same sum by hand."""
+def test_a_law_integrates_the_error_in_its_memory():
+    """Against the same sum by hand."""
 
     class Integral(ptsmc.AccelerationLaw):
         k: float = ptsmc.gain(0.3, (0.01, 1.0))
@@ -604,8 +604,8 @@ def test_a_law_flies_what_its_step_remembers():
         def begin(self):
             return jnp.zeros(self.model.inputs)
 
-        def step(self, memory, now, error, error_rate, bound):
-            memory = memory + now.dt * error
+        def acceleration(self, now, error, error_rate, bound):
+            memory = now.memory + now.dt * error
             return -2.0 * error - 2.0 * error_rate - self.k * memory, error, memory
 
     tables = {**CHAIN, "controller": {"kind": "own", "code": Integral, "t_f": 5.0}}
@@ -627,8 +627,8 @@ def test_a_law_finds_the_first_error_in_its_first_sample(clock):
         def begin(self):
             return jnp.full(self.model.inputs, jnp.nan)
 
-        def step(self, memory, now, error, error_rate, bound):
-            start = jnp.where(now.t == 0.0, error, memory)
+        def acceleration(self, now, error, error_rate, bound):
+            start = jnp.where(now.t == 0.0, error, now.memory)
             return -self.k * error - 2.0 * error_rate, start, start
 
     table = {"kind": "own", "code": First, "t_f": 5.03, "delta": 0.5}  # no whole number of periods
@@ -704,8 +704,8 @@ class Detumbling(ptsmc.AccelerationLaw):
 
     k: float = ptsmc.gain(10.0, (1.0, 100.0), unit="N m s")
 
-    def command(self, memory, now, x, target, d_hat, k2):
-        return -self.k * x.w, x.w, memory
+    def __call__(self, now, x, target, d_hat, k2):
+        return -self.k * x.w, x.w, now.memory
 """
 
 
@@ -731,8 +731,8 @@ class Forgetful(ptsmc.AccelerationLaw):
     def begin(self):
         return jnp.zeros(())
 
-    def step(self, memory, now, error, error_rate, bound):
-        return -error - 2.0 * error_rate, error, jnp.where(now.t > 2.0, jnp.nan, memory)
+    def acceleration(self, now, error, error_rate, bound):
+        return -error - 2.0 * error_rate, error, jnp.where(now.t > 2.0, jnp.nan, now.memory)
 """
     (here / "mine.py").write_text(HEAD + forgetful)
     tables = {**CHAIN, "controller": {"kind": "own", "code": "mine.py:Forgetful", "t_f": 5.0}}

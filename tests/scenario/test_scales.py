@@ -15,7 +15,7 @@ from ptsmc_jax.plants.rigid_body import AttitudeState
 from ptsmc_jax.scenario import scales
 from ptsmc_jax.signals.references import Target
 from ptsmc_jax.theory import borders
-from tests.helpers import FIRST_FLIGHT, FULL_INERTIA, parts, vector
+from tests.helpers import FIRST_FLIGHT, FULL_INERTIA, commanded, parts, vector
 
 ARM = {"plant": {"kind": "system", "system": second_order.system(
     1, F=lambda t, x, v: v, H=lambda t, x, v: 0.0 * x, G=lambda t, x, v: jnp.eye(1)), "x0": [1.0, 0.0]}}  # fmt: skip
@@ -89,7 +89,7 @@ def test_noise_of_s_is_that_of_drawn_samples(rate):
     def s(n):
         q = attitude.multiply(rest.q, attitude.from_rotation_vector(2e-5 * n[:3]))
         seen = AttitudeState(q, 1e-5 * n[3:])
-        return law.torque(vector(25.0), jnp.asarray(True), seen, rest, jnp.zeros(3), vector(0.0))[1]
+        return commanded(law, vector(25.0), jnp.asarray(True), seen, rest, jnp.zeros(3), vector(0.0))[1]
 
     found = np.std(np.asarray(jax.jit(jax.vmap(s))(vector(normals))), axis=0)
     np.testing.assert_allclose(found, noise_of_s(table), rtol=0.015)

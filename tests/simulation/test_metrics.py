@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicHermiteSpline
 
-from ptsmc_jax.laws import prescribed_time
+from ptsmc_jax.laws.kinematics import AdditiveKinematics, MultiplicativeKinematics
 from ptsmc_jax.numerics import attitude
 from ptsmc_jax.plants.rigid_body import AttitudeState
 from ptsmc_jax.signals import disturbances, references
@@ -39,7 +39,7 @@ def run(request):
 
 def test_window_metrics_are_integrals_of_the_squared_error_and_of_the_squared_angle(run):
     parts, found, log = run
-    rates = jax.jit(jax.vmap(lambda t, x: parts.controller.errors(x, parts.reference(t))[1]))
+    rates = jax.jit(jax.vmap(lambda t, x: parts.controller.kinematics.errors(x, parts.reference(t))[1]))
     slope = rates(jnp.asarray(log.t), jax.tree.map(jnp.asarray, log.x))
     spline = CubicHermiteSpline(log.t, log.error, slope)
     t = np.linspace(20.0, 21.0, 20001)
@@ -50,8 +50,8 @@ def test_window_metrics_are_integrals_of_the_squared_error_and_of_the_squared_an
     np.testing.assert_allclose([found.window_error, found.window_angle], expected, rtol=1e-5)
 
 
-@pytest.mark.parametrize("law", [prescribed_time.PrescribedTime, prescribed_time.PrescribedTimeMultiplicative])
-def test_the_angle_in_the_middle_is_that_of_a_turn_which_passes_the_reference(law):
+@pytest.mark.parametrize("kinematics", [AdditiveKinematics, MultiplicativeKinematics])
+def test_the_angle_in_the_middle_is_that_of_a_turn_which_passes_the_reference(kinematics):
     """From -0.1 to 0.3 rad about a reference that turns itself: 0.1 rad, where the mean of both ends is 0.2 rad."""
     axis = np.array([0.6, 0.0, 0.8])
     first = attitude.from_rotation_vector(vector([0.2, -0.3, 0.1]))
@@ -62,7 +62,9 @@ def test_the_angle_in_the_middle_is_that_of_a_turn_which_passes_the_reference(la
         body = AttitudeState(attitude.multiply(q_f, beyond), vector((0.7 + 4.0) * axis))
         return body, references.Target(q_f, vector(0.7 * axis), jnp.zeros(3))
 
-    middle = parts(law=law).controller.middle_angle(state(0.0, -0.1), state(0.1, 0.3), vector(0.1))
+    middle = parts(kinematics=kinematics).controller.kinematics.middle_angle(
+        state(0.0, -0.1), state(0.1, 0.3), vector(0.1)
+    )
     np.testing.assert_allclose(middle, 0.1, rtol=1e-4)
 
 

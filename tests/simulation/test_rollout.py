@@ -1,5 +1,4 @@
 from dataclasses import replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,9 +8,8 @@ import pytest
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import runs
 from ptsmc_jax.devices.actuators import Actuators
-from ptsmc_jax.laws.acceleration import law_on_error
-from ptsmc_jax.laws.error_motions import ErrorQuaternion
-from ptsmc_jax.laws.pd import PD
+from ptsmc_jax.laws.baselines import PD
+from ptsmc_jax.laws.kinematics import MultiplicativeKinematics
 from ptsmc_jax.observers import nonlinear
 from ptsmc_jax.plants import integrator_chain, rigid_body, second_order
 from ptsmc_jax.signals import disturbances, references
@@ -87,7 +85,7 @@ def test_perfect_estimate_gives_the_exact_solution(eta, rate):
     run = finer(perfect(parts(30.0, eta, 0.05, inertia=FULL_INERTIA, rate=rate)), 2)
     log = fly(run).log
     before = log.t < 29.949
-    error, error_rate = run.controller.errors(run.initial, run.reference(vector(0.0)))
+    error, error_rate = run.controller.kinematics.errors(run.initial, run.reference(vector(0.0)))
     exact = errors_along(log.t, vector(30.0), vector(eta), error, error_rate)
     # the default grid leaves up to 1e-9, twice its steps a sixteenth; s is tau times a rate, tau up to 30 s
     np.testing.assert_allclose(log.error[before], exact.error[before], rtol=0, atol=1e-10)
@@ -109,7 +107,7 @@ def test_exact_solution_for_a_moving_reference(kind):
     run = finer(perfect(parts(20.0, 3.5, 0.1, inertia=FULL_INERTIA, reference=moving, rate=(0.01, 0.0, -0.01))), 2)
     log = fly(run).log
     before = log.t < 19.89
-    error, error_rate = run.controller.errors(run.initial, run.reference(vector(0.0)))
+    error, error_rate = run.controller.kinematics.errors(run.initial, run.reference(vector(0.0)))
     exact = errors_along(log.t, vector(20.0), vector(3.5), error, error_rate)
     np.testing.assert_allclose(log.error[before], exact.error[before], rtol=0, atol=1e-10)
 
@@ -118,7 +116,7 @@ def test_exact_solution_for_a_moving_reference(kind):
 def test_derivatives_of_the_whole_rollout_are_those_of_the_exact_solution(plant):
     run = perfect(parts(30.0, 3.0, 0.5)) if plant == "spacecraft" else chain_parts([0.6, 0.0], 30.0, 3.0, 0.5)
     run = finer(run, 4)  # 3e-8 relative on the default grid, 1/256 of it here
-    error, error_rate = run.controller.errors(run.initial, run.reference(vector(0.0)))
+    error, error_rate = run.controller.kinematics.errors(run.initial, run.reference(vector(0.0)))
     start = error + 0 * error_rate
 
     def at_hand_over(eta, delta):
@@ -257,7 +255,7 @@ def test_metrics_at_t_f_are_taken_inside_the_period(flight):
             x,
             vector(step),
         )
-    error, _ = run.controller.errors(x, run.reference(vector(t_f)))
+    error, _ = run.controller.kinematics.errors(x, run.reference(vector(t_f)))
     np.testing.assert_allclose(result.metrics.terminal_error, np.linalg.norm(error), rtol=1e-8)
 
 
@@ -428,7 +426,9 @@ def test_a_continuous_loop_refuses_parts_that_it_would_ignore(changes, name):
 def test_a_continuous_loop_refuses_a_law_of_the_sampled_loop():
     """The run ended in NotImplementedError without a sentence."""
     run = parts(20.0, 3.0, 2.0)
-    kind: Any = law_on_error(ErrorQuaternion, PD)
-    law = kind(run.controller.model, vector(20.0), vector(2.0), vector(1.0), vector(2.0))
+    law = PD(MultiplicativeKinematics(run.controller.model), vector(20.0), vector(2.0), vector(1.0), vector(2.0))
     with pytest.raises(TypeError, match=r"^the law PD needs the sampled loop"):
         rollout.simulate_jit(replace(run, controller=law))
+    # implicit sampling, which the continuous loop ignored
+    with pytest.raises(TypeError, match=r"^the law PrescribedTime needs the sampled loop"):
+        rollout.simulate_jit(replace(run, controller=replace(run.controller, implicit=True)))

@@ -7,7 +7,7 @@ import pytest
 
 from ptsmc_jax.plants.rigid_body import AttitudeState
 from ptsmc_jax.theory import borders
-from tests.helpers import parts, vector
+from tests.helpers import commanded, parts, vector
 
 
 @pytest.mark.parametrize("t", [3.0, 18.9, 19.6])
@@ -19,7 +19,7 @@ def test_gains_are_the_slopes_of_the_law(t):
 
     def acceleration(eps, rate):
         x = AttitudeState(jnp.append(eps, jnp.sqrt(1 - jnp.dot(eps, eps))), 2 * rate)
-        u, _ = law.torque(vector(t), hold, x, run.reference(vector(t)), jnp.zeros(3), k2)
+        u, _ = commanded(law, vector(t), hold, x, run.reference(vector(t)), jnp.zeros(3), k2)
         return run.plant.rate(vector(t), x, u, jnp.zeros(3)).w / 2
 
     by_error, by_rate = jax.jacfwd(acceleration, (0, 1))(jnp.zeros(3), jnp.zeros(3))

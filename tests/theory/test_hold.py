@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from ptsmc_jax import formulas
-from ptsmc_jax.laws import prescribed_time
+from ptsmc_jax.laws.kinematics import AdditiveKinematics, MultiplicativeKinematics
 from ptsmc_jax.signals import disturbances, references
 from ptsmc_jax.simulation import clock, rollout
-from ptsmc_jax.theory import hold, solutions
+from ptsmc_jax.theory import hold, rates, solutions
 from tests.helpers import FULL_INERTIA, chain_parts, fly, parts, short, vector
 
 QUIET = disturbances.Sinusoid(*[jnp.zeros(3)] * 4)
@@ -31,7 +31,7 @@ def flown(law, c, k):
     else:  # K1/2 is what acts; as `finer` runs have them: by one program with those of laws/test_controllers.py
         grid = replace(grid, before=1024, after=1024, max_step=vector(1.5 * 10.0 / 1024))
         run = parts(10.0, 3.0, 2.0, inertia=FULL_INERTIA, q=AWAY, reference=SPIN, disturbance=QUIET, rate_bound=0.0,
-                    k1=2 * k, surface_rate=c, law=law, t_end=t_end)  # fmt: skip
+                    k1=2 * k, surface_rate=c, kinematics=law, t_end=t_end)  # fmt: skip
     return replace(run, clock=grid)
 
 
@@ -42,15 +42,15 @@ def exact(run, t):
 
     def component(x0):
         at = solutions.exact_chain(law.hand_over, law.t_f, law.eta, x0).x
-        moved = jax.vmap(lambda time: hold.exact_hold(time, law.surface(), law.reaching_rate(), at))(t - law.hand_over)
+        moved = jax.vmap(lambda time: hold.exact_hold(time, law.surface(), law.reaching_rate, at))(t - law.hand_over)
         return moved.x[:, 0], moved.s, moved.acceleration
 
     return jax.vmap(component, out_axes=1)(solutions.starts(run))
 
 
 LAWS = {
-    "additive": prescribed_time.PrescribedTime,
-    "multiplicative": prescribed_time.PrescribedTimeMultiplicative,
+    "additive": AdditiveKinematics,
+    "multiplicative": MultiplicativeKinematics,
     "chain of order 2": 2,
     "chain of order 3": 3,
 }
@@ -93,7 +93,7 @@ def test_surface_of_a_chain_at_another_rate_has_its_poles_times_that():
     found = np.sort_complex(formulas.surface_roots(law.surface()))
     np.testing.assert_allclose(found, np.sort_complex(2.5 * formulas.surface_roots(a)), rtol=1e-12)
     np.testing.assert_array_equal(chain_parts([1.0] * 4, a=a).controller.surface(), a)  # the paper's, to the last bit
-    assert law.hold_rates()["surface_rate"] == pytest.approx(np.abs(found).max())
+    assert rates.hold_rates(law)["surface_rate"] == pytest.approx(np.abs(found).max())
 
 
 def test_slopes_along_the_surfaces_rate_are_those_of_the_closed_form():

@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from ptsmc_jax.observers import none
 from ptsmc_jax.signals import disturbances, references
 from ptsmc_jax.simulation import clock, rollout
-from ptsmc_jax.theory import envelopes, hold, rules, solutions
+from ptsmc_jax.theory import envelopes, hold, rates, rules, solutions
 from tests.helpers import (
     FULL_INERTIA,
     PAPER_ATTITUDE,
@@ -90,7 +90,7 @@ def test_sliding_variable_stays_inside_its_envelope(eta, width):
 def test_the_narrowest_sign_is_reached_through_in_one_period():
     run = parts(30.0, 3.0, 0.05, inertia=FULL_INERTIA)
     width = envelopes.narrowest_sign(run, 0.05)
-    before, _ = run.controller.boundary_layer(run.observer.error_bound().largest)
+    before, _ = rates.boundary_layer(run.controller, run.observer.error_bound().largest)
     # its layer's rate times the period, from the law's own rate at its own width
     np.testing.assert_allclose(float(before) * float(run.controller.sign_width) * 0.05, width, rtol=1e-12)
     np.testing.assert_allclose(envelopes.narrowest_sign(run, 0.1), 2.0 * width, rtol=1e-12)
@@ -160,7 +160,7 @@ def stays_inside_the_corrected_bounds(case):
     )
     bound = observer.error_bound()
     # the boundary layer's rate times the largest step stays below 1.4
-    layer = float(run.controller.switching_rate(jnp.maximum(bound.start, bound.floor))) * t_f
+    layer = float(rates.switching_rate(run.controller, jnp.maximum(bound.start, bound.floor))) * t_f
     width = max(layer * 1.5 * t_f / 512 / 1.4 / case["sharp"], 1e-9)
     law = {"sign_width": vector(width), "k1": vector(case["k1"]), "surface_rate": vector(case["surface_rate"])}
     run = dataclasses.replace(with_controller(run, **law), observer=observer, clock=grid(t_f))

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ptsmc_jax.laws.prescribed_time import expansion, rising_factorials
 from ptsmc_jax.numerics.pytrees import Scalar
 
 Vector = Float[Array, " n"]
@@ -65,7 +66,7 @@ def surface_at_start(t_f: Scalar, eta: Scalar, x: Vector) -> Scalar:
 def modes(t: Scalar, t_f: Scalar, eta: Scalar, x0: Vector) -> tuple[list[Scalar], list[Scalar]]:
     """y, y', .. y^(n) of y = x_1 / r^eta at t [s]: what the initial state (n,) gives, and what s(0) = 1 adds."""
     n, tau = x0.shape[0], t_f - t
-    rising = _rising_factorials(eta, n)
+    rising = rising_factorials(eta, n)
     start = [
         sum((math.comb(k, j) * x0[j] * rising[k - j] * t_f ** (j - k) for j in range(k + 1)), jnp.zeros_like(t))
         for k in range(n - 1)
@@ -98,20 +99,3 @@ def from_modes(t: Scalar, t_f: Scalar, eta: Scalar, y: list[Scalar], size=lambda
     return [
         sum((math.comb(k, j) * slopes[k - j] * y[j] for j in range(k + 1)), jnp.zeros_like(r)) for k in range(len(y))
     ]
-
-
-def expansion(eta: Scalar, order: int) -> list[Scalar]:
-    """c_0 .. c_(n-1) of (37) for order n, c_i = C(n-1, i) eta (eta+1) .. (eta+n-2-i) [-].
-
-    The paper only calls them expansion parameters (and says "expand (35)" for (36)). Order 2: (eta, 1), which is (7).
-    """
-    rising = _rising_factorials(eta, order - 1)
-    return [math.comb(order - 1, i) * rising[order - 1 - i] for i in range(order)]
-
-
-def _rising_factorials(eta: Scalar, largest: int) -> list[Scalar]:
-    """1, eta, eta (eta+1), .. eta (eta+1) .. (eta+largest-1)."""
-    rising = [jnp.ones_like(eta)]
-    for k in range(largest):
-        rising.append(rising[-1] * (eta + k))
-    return rising

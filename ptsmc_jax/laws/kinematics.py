@@ -1,8 +1,9 @@
-"""The errors that laws drive to zero, each with how inputs and disturbances move it: eps'' = .. + (gain) u + .. d.
+"""Error kinematics: the error eps that a law drives to zero, and how the plant's input moves it.
 
-A law has one of them as a base, which turns the eps'' that it asks for into the plant's input.
+A law has one of them as its field `kinematics`. It turns the acceleration eps'' of the law into the plant's input.
 """
 
+from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import jax
@@ -10,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ptsmc_jax.numerics import attitude, guards, integrators, matrices
-from ptsmc_jax.numerics.pytrees import Scalar, Vector
+from ptsmc_jax.numerics.pytrees import Scalar, Vector, pytree
 from ptsmc_jax.plants.integrator_chain import Chain
 from ptsmc_jax.plants.rigid_body import AttitudeState, Spacecraft
 from ptsmc_jax.plants.second_order import System
@@ -19,26 +20,34 @@ from ptsmc_jax.signals.references import Target
 State = Float[Array, " states"]
 
 
-class ErrorMotion:
-    """The error eps of a plant that a law drives to zero, and how the input moves it.
+@dataclass(frozen=True)
+class Kinematics:
+    """The error eps of a plant that a law drives to zero, and how the input moves it: eps'' = .. + (gain) u + .. d.
 
     Errors, inputs and disturbances are (m,): of a spacecraft [-], [N m], [N m]; of chains and systems in their states'
-    and inputs' own units. It is singular where the input has no say in the error, T(q) in (57) or dF/dx2 G in (29).
+    and inputs' own units. The kinematics are singular where the input does not act on the error: T(q) in (57) or
+    dF/dx2 G in (29) has no inverse there.
     """
 
     model: Any  # the nominal plant
     additive: ClassVar[bool] = False  # the paper's q_1 - q_1f, singular where the body is, wherever the reference is
+    reaching_factor: ClassVar[float] = 1.0  # rate of s after the hand-over, in units of K1: 1 in (29)
+
+    @property
+    def order(self) -> int:
+        """Order n of the error's differential equation: 2, or the order of a chain."""
+        return 2
 
     def align(self, x: Any, target: Any) -> Any:
         """The initial state in the form that the law can bring to the target, such as the sign of a quaternion."""
         return x
 
     def clearance(self, x: Any, target: Any) -> Scalar:
-        """How far the law is from a singularity of its own: 0 on it, of either sign beside it; 1 where it has none."""
+        """Distance to the singularity, of either sign beside it: 0 on it; 1 if there is none."""
         return jnp.ones(())
 
     def clearance_unit(self, first: Scalar) -> Scalar:
-        """The unit of a run's clearances, from that of its initial state: its sign, so that they begin above 0."""
+        """Unit of a run's clearances, from the `first` one: its sign, so that they begin above 0."""
         return jnp.where(first < 0.0, -1.0, 1.0)
 
     def errors(self, x: Any, target: Any) -> tuple[Vector, Vector]:
@@ -58,11 +67,11 @@ class ErrorMotion:
         return guards.norm(integrators.hermite_middle(*self.errors(*start), *self.errors(*end), dt))
 
     def influence(self, x: Any, target: Any) -> Scalar:
-        """The factor N: how much a unit of disturbance changes 2 eps'' at most."""
+        """Largest change of eps'' by a unit of disturbance, half of the paper's factor N."""
         raise NotImplementedError
 
-    def invert(self, x: Any, target: Any, twice_acceleration: Vector, d_hat: Vector) -> Vector:
-        """Input (m,) for which 2 eps'' is `twice_acceleration`, (m,), if the disturbance is d_hat, (m,)."""
+    def invert(self, x: Any, target: Any, acceleration: Vector, d_hat: Vector) -> Vector:
+        """Input (m,) that gives eps'' = acceleration, (m,), if the disturbance is d_hat, (m,)."""
         raise NotImplementedError
 
     def straight_coordinates(self, error: Vector) -> Vector:
@@ -74,10 +83,12 @@ class ErrorMotion:
         return straight
 
 
-class AttitudeMotion(ErrorMotion):
-    """Base of a spacecraft's errors: their angle."""
+@dataclass(frozen=True)
+class AttitudeKinematics(Kinematics):
+    """Base of the attitude errors of a spacecraft: their angle."""
 
     model: Spacecraft
+    reaching_factor: ClassVar[float] = 0.5  # (60)
 
     def angle(self, x: AttitudeState, target: Target) -> Scalar:
         """Angle between the attitude and its reference [rad]."""
@@ -93,8 +104,16 @@ class AttitudeMotion(ErrorMotion):
         return attitude.rotation_angle(integrators.hermite_middle(*turned(*start), *turned(*end), dt))
 
 
-class ErrorVector(AttitudeMotion):
-    """The paper's eps_1 = q_1 - q_1f (4); singular at q4 = 0, see `prescribed_time.PrescribedTime`."""
+@pytree
+@dataclass(frozen=True)
+class AdditiveKinematics(AttitudeKinematics):
+    """The paper's eps_1 = q_1 - q_1f (4), singular at q4 = 0.
+
+    That is 180 degrees from the inertial frame's identity, wherever the reference is. A law that inverts the kinematics
+    cannot cross it: `align` chooses the sign of q, `clearance` is the distance to the singularity. So "bounded control"
+    is not global: the bound grows like 1/q4. Between attitudes on either side of the identity the path may be the long
+    way round. From 150 to -150 degrees about an axis the body turns by 300 degrees.
+    """
 
     additive: ClassVar[bool] = True
 
@@ -114,14 +133,14 @@ class ErrorVector(AttitudeMotion):
         return x.q[:3] - target.q[:3], v_dot - reference_rate
 
     def influence(self, x: AttitudeState, target: Target) -> Scalar:
-        """|T J^-1| of (57) [1/(kg m^2)]."""
-        return guards.norm(attitude.t_matrix(x.q) @ self.model.inertia_inverse)
+        """|T J^-1| / 2 with the norm of (57) [1/(kg m^2)]."""
+        return 0.5 * guards.norm(attitude.t_matrix(x.q) @ self.model.inertia_inverse)
 
-    def invert(self, x: AttitudeState, target: Target, twice_acceleration: Vector, d_hat: Vector) -> Vector:
-        """Torque [N m] for 2 eps_1'' = `twice_acceleration`: w x J w - d_hat + J T^-1 (2 eps_1'' + 2 q_1f'' - T' w)."""
+    def invert(self, x: AttitudeState, target: Target, acceleration: Vector, d_hat: Vector) -> Vector:
+        """Torque [N m] for this eps_1'': w x J w - d_hat + J T^-1 (2 eps_1'' + 2 q_1f'' - T' w)."""
         _, reference_acceleration = target.vector_rates()
         t_dot_w = -0.5 * jnp.dot(x.w, x.w) * x.q[:3]  # T'(q) w of (58)
-        w_dot = attitude.t_inverse_times(x.q, twice_acceleration + 2.0 * reference_acceleration - t_dot_w)
+        w_dot = attitude.t_inverse_times(x.q, 2.0 * acceleration + 2.0 * reference_acceleration - t_dot_w)
         return self.model.gyroscopic(x.w) - d_hat + self.model.inertia @ w_dot
 
 
@@ -133,10 +152,18 @@ class RelativeMotion(NamedTuple):
     feedforward: Array  # (3,) (R w_f)' = R w_f' - w_e x R w_f [rad/s^2]
 
 
-class ErrorQuaternion(AttitudeMotion):
+@pytree
+@dataclass(frozen=True)
+class MultiplicativeKinematics(AttitudeKinematics):
     """The vector part v of the error quaternion q_e = q_f* q, whatever the inertial frame.
 
-    With R the rotation from the reference's axes to the body's and w_e = w - R w_f: v' = T(q_e) w_e / 2.
+    With R the rotation from the reference's axes to the body's and w_e = w - R w_f: v' = T(q_e) w_e / 2, and
+
+        u = w x J w - d_hat + J (R w_f' - w_e x R w_f) + J T(q_e)^-1 (2 v'' + |w_e|^2 v / 2).
+
+    Singular only at q_e4 = 0, a true error of 180 degrees. Under the prescribed-time law a run from rest below that
+    never meets it; with an initial rate |v(0)| + t_f |v'(0)| / (e eta) < 1 is enough. `align` makes q_e4 positive at
+    t = 0, and it stays so: v and -v lead along the same path, the short way round.
     """
 
     def align(self, x: AttitudeState, target: Target) -> AttitudeState:
@@ -163,14 +190,14 @@ class ErrorQuaternion(AttitudeMotion):
         return q_e[:3], v_dot
 
     def influence(self, x: AttitudeState, target: Target) -> Scalar:
-        """|T(q_e) J^-1| [1/(kg m^2)]."""
+        """|T(q_e) J^-1| / 2 [1/(kg m^2)]."""
         q_e, *_ = self.relative(x, target)
-        return guards.norm(attitude.t_matrix(q_e) @ self.model.inertia_inverse)
+        return 0.5 * guards.norm(attitude.t_matrix(q_e) @ self.model.inertia_inverse)
 
-    def invert(self, x: AttitudeState, target: Target, twice_acceleration: Vector, d_hat: Vector) -> Vector:
-        """Torque [N m] for 2 v'' = `twice_acceleration` [1/s^2]; see `PrescribedTimeMultiplicative`."""
+    def invert(self, x: AttitudeState, target: Target, acceleration: Vector, d_hat: Vector) -> Vector:
+        """Torque [N m] for this v'' [1/s^2], by the equation above."""
         q_e, w_e, feedforward = self.relative(x, target)
-        w_e_dot = attitude.t_inverse_times(q_e, twice_acceleration + 0.5 * jnp.dot(w_e, w_e) * q_e[:3])
+        w_e_dot = attitude.t_inverse_times(q_e, 2.0 * acceleration + 0.5 * jnp.dot(w_e, w_e) * q_e[:3])
         return self.model.gyroscopic(x.w) - d_hat + self.model.inertia @ (feedforward + w_e_dot)
 
     def straight_coordinates(self, error: Vector) -> Vector:
@@ -182,8 +209,14 @@ class ErrorQuaternion(AttitudeMotion):
         return attitude.from_rotation_vector(straight)[:3]
 
 
-class ErrorOfSystem(ErrorMotion):
-    """x_1 of a second-order system (25) of one's own; the Jacobians of F and dF/dt by automatic differentiation."""
+@pytree
+@dataclass(frozen=True)
+class SecondOrderKinematics(Kinematics):
+    """x_1 of a custom second-order system (25); the Jacobians of F and dF/dt by automatic differentiation.
+
+    F may depend on time: a moving reference is part of it. dF/dx2 G must be invertible along the run. F(t, 0, x_2) = 0
+    must hold for one x_2 only. The state x_2 goes there.
+    """
 
     model: System
 
@@ -205,23 +238,30 @@ class ErrorOfSystem(ErrorMotion):
         return guards.norm(self.model.position(x))
 
     def influence(self, x: State, target: Scalar) -> Scalar:
-        """2 |dF/dx2 D|."""
-        return 2.0 * guards.norm(self.model.slope(target, x) @ self.model.disturbance_gain(target, x))
+        """|dF/dx2 D|."""
+        return guards.norm(self.model.slope(target, x) @ self.model.disturbance_gain(target, x))
 
-    def invert(self, x: State, target: Scalar, twice_acceleration: Vector, d_hat: Vector) -> Vector:
+    def invert(self, x: State, target: Scalar, acceleration: Vector, d_hat: Vector) -> Vector:
         """Input (n,) for this x_1'': (dF/dx2 G)^-1 (x_1'' - dF/dt - dF/dx1 F - dF/dx2 (H + D d_hat))."""
         slope, gain = self.model.slope(target, x), self.model.input_gain(target, x)
         without_input = self.model.drift(target, x) + self.model.disturbance_gain(target, x) @ d_hat
         return matrices.solve(
             slope @ gain,
-            0.5 * twice_acceleration - self.model.coasting_acceleration(target, x) - slope @ without_input,
+            acceleration - self.model.coasting_acceleration(target, x) - slope @ without_input,
         )
 
 
-class ErrorOfChain(ErrorMotion):
-    """x_1 of the integrator chain (35); it can be inverted for order 2, (6)."""
+@pytree
+@dataclass(frozen=True)
+class ChainKinematics(Kinematics):
+    """x_1 of the integrator chain (35)."""
 
     model: Chain
+
+    @property
+    def order(self) -> int:
+        """Order n of the chain."""
+        return self.model.order
 
     def errors(self, x: State, target: Any) -> tuple[Float[Array, "1"], Float[Array, "1"]]:
         """x_1 and x_2, (1,) each: the origin is the target."""
@@ -236,9 +276,9 @@ class ErrorOfChain(ErrorMotion):
         return jnp.abs(x[0])
 
     def influence(self, x: State, target: Any) -> Scalar:
-        """2."""
-        return 2.0 * jnp.ones(())
+        """1."""
+        return jnp.ones(())
 
-    def invert(self, x: State, target: Any, twice_acceleration: Vector, d_hat: Vector) -> Vector:
-        """Input (1,) for this x_1'': (x_1'' - f(x) - d_hat) / g(x)."""
-        return (0.5 * twice_acceleration - self.model.drift(x) - d_hat) / self.model.input_gain(x)
+    def invert(self, x: State, target: Any, acceleration: Vector, d_hat: Vector) -> Vector:
+        """Input (1,) that gives x_n' = acceleration: (x_n' - f(x) - d_hat) / g(x)."""
+        return (acceleration - self.model.drift(x) - d_hat) / self.model.input_gain(x)

@@ -1,0 +1,55 @@
+"""Rates of a prescribed-time law: of its switching term, of its boundary layer and after the hand-over."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ptsmc_jax import formulas, programs
+from ptsmc_jax.batching import lapack
+from ptsmc_jax.laws.kinematics import AttitudeKinematics, SecondOrderKinematics
+from ptsmc_jax.laws.prescribed_time import PrescribedTimeLaw
+from ptsmc_jax.numerics import guards
+from ptsmc_jax.numerics.pytrees import Scalar
+
+
+def switching_rate(law: PrescribedTimeLaw, k2: Scalar, visited: tuple[Any, Any] | None = None) -> Scalar:
+    """Return the factor of -tau^(n-1) sign(s) in s' before the hand-over, and of -sign(s) after it, for K2 up to k2.
+
+    For an attitude it is at most |T J^-1| K2 / 2 [1/s^2], |T|_2 = 1. For a second-order system it is the largest
+    |dF/dx2 D| K2 over the states of a run.
+
+    Args:
+        law: the prescribed-time law.
+        k2: bound on the 2-norm of the estimation error.
+        visited: targets (points,) and states (points, ..) of a run, for a second-order system.
+    """
+    kinematics = law.kinematics
+    if isinstance(kinematics, AttitudeKinematics):
+        return 0.5 * guards.norm(kinematics.model.inertia_inverse) * k2
+    if isinstance(kinematics, SecondOrderKinematics):
+        assert visited is not None
+        times, states = visited
+        return jnp.max(lapack.vmap(kinematics.influence)(states, times)) * k2
+    return k2
+
+
+def boundary_layer(law: PrescribedTimeLaw, k2: Scalar, visited: tuple[Any, Any] | None = None) -> tuple[Scalar, Scalar]:
+    """Return the fastest rates of the boundary layer before and after the hand-over [1/s], for K2 up to k2.
+
+    s' = -c sign(s) with the sign tanh(s / width) has the rate c / width, c by `switching_rate`.
+    """
+    after = switching_rate(law, k2, visited) / law.sign_width
+    return (law.t_f / law.layer_time) ** (law.order - 1) * after, after
+
+
+def hold_rates(law: PrescribedTimeLaw) -> dict[str, float]:
+    """Return the fastest decay after the hand-over [1/s], by the gain that sets it: toward the surface, and on it."""
+    reaching, surface = _rates_of_hold(law)
+    return {"k1": float(reaching), "surface_rate": float(np.max(np.abs(formulas.surface_roots(surface))))}
+
+
+@programs.jit  # one program, where each of its operations would be one
+def _rates_of_hold(law: PrescribedTimeLaw) -> tuple[Scalar, Float[Array, " roots"]]:
+    return law.reaching_rate, law.surface()
