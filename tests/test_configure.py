@@ -1,4 +1,4 @@
-"""Compiler options are tried out before they are used; what is refused is left out with a warning."""
+"""`configure`: compiler options, the folder of the compile cache, and calls that are repeated or come too late."""
 
 import json
 import os
@@ -14,21 +14,6 @@ import pytest
 from ptsmc_jax import configure as setup
 from ptsmc_jax import programs
 from tests.helpers import ROOT
-
-GOOD = setup._OPTIONS
-
-
-@pytest.fixture
-def tried(monkeypatch):
-    """Which sets of options were tried; those with "bad" in a name are refused."""
-    seen = []
-
-    def try_out(options):
-        seen.append(options)
-        return not any("bad" in option for option in options)
-
-    monkeypatch.setattr(setup, "_tried", try_out)
-    return seen
 
 
 @pytest.mark.parametrize(
@@ -48,11 +33,6 @@ def test_other_bits_and_devices_are_refused(asked):
     (name,) = asked
     with pytest.raises(ValueError, match=f"^{name} is .*, but must be"):
         setup.configure(**asked)
-
-
-def test_options_are_written_as_xla_reads_them():
-    assert setup._flags(("a=1", "--b=2", "-c=3")) == "--xla_backend_extra_options=a=1,-c=3 --b=2"
-    assert setup._flags(()) == ""
 
 
 @pytest.mark.parametrize("said", ["", "elsewhere"])
@@ -76,97 +56,151 @@ def test_a_user_without_a_home_has_no_cache(monkeypatch):
     assert setup._cache_folder() is None
 
 
-def test_the_verdict_is_kept_and_not_asked_for_again(tried, tmp_path):
-    assert setup._accepted(tmp_path) == GOOD
-    assert setup._accepted(tmp_path) == GOOD
-    assert len(tried) == 1
-    (kept,) = tmp_path.glob("options-*.json")
-    for text in ("", "[]", json.dumps({"tried": ["other"], "accepted": []})):  # cut short, foreign, of another version
-        kept.write_text(text)
-        assert setup._accepted(tmp_path) == GOOD
-    assert len(tried) == 4
+ALL, EXTRA = setup._options("cpu"), "--xla_backend_extra_options"
+LEVEL = "--xla_backend_optimization_level"
 
 
-def test_refused_options_are_left_out_with_a_warning(tried, tmp_path, monkeypatch):
-    monkeypatch.setattr(setup, "_OPTIONS", (*GOOD[:2], "bad=1", GOOD[3]))
-    with pytest.warns(RuntimeWarning, match="refuses bad=1: runs will be slower"):
-        assert setup._accepted(tmp_path) == (*GOOD[:2], GOOD[3])
+@pytest.mark.parametrize(
+    ("jaxlib", "machine", "device", "included", "excluded"),
+    [
+        ("0.10", "x86_64", "cpu", ["-x86-machine-combiner=false", "--xla_cpu_use_fusion_emitters=false"], []),
+        ("0.11", "x86_64", "cpu", ["-x86-machine-combiner=false"], ["--xla_cpu_use_fusion_emitters=false"]),
+        ("0.10", "aarch64", "cpu", ["-unroll-runtime=false"], ["-x86-machine-combiner=false"]),
+        ("0.10", "x86_64", "gpu", ["--xla_cpu_prefer_vector_width=512"], ["-unroll-runtime=false", f"{LEVEL}=1"]),
+    ],
+)
+def test_options_go_by_version_machine_and_device(monkeypatch, jaxlib, machine, device, included, excluded):
+    monkeypatch.setattr(setup, "JAXLIB", jaxlib)
+    monkeypatch.setattr(setup, "MACHINE", machine)
+    options = setup._options(device)
+    assert set(included) <= set(options)
+    assert not set(excluded) & set(options)
 
 
-def test_options_that_only_fail_together_are_all_left_out(monkeypatch):
-    monkeypatch.setattr(setup, "_tried", lambda options: len(options) == 1)
-    with pytest.warns(RuntimeWarning, match=f"refuses {GOOD[0]}, {GOOD[1]}"):
-        assert setup._accepted(None) == ()
+@pytest.mark.parametrize("plug_in", [None, "a plug-in"])
+def test_a_gpu_may_be_used_if_a_plug_in_is_installed(monkeypatch, plug_in):
+    monkeypatch.setattr(setup.importlib.util, "find_spec", lambda name: plug_in)
+    assert setup._options(None) == setup._options("gpu" if plug_in else "cpu")
 
 
-@pytest.mark.parametrize("found", [None, "a plug-in"])
-def test_what_makes_a_processors_programs_sooner_is_left_out_where_a_gpu_may_fly(tried, tmp_path, monkeypatch, found):
-    """Its compiler would unroll no loops either, of which nobody knows what they take there."""
-    monkeypatch.setattr(setup.importlib.util, "find_spec", lambda name: found)
-    assert setup._options(tmp_path, "cpu") == GOOD
-    assert setup._options(tmp_path, "gpu") == setup._FASTER
-    assert setup._options(tmp_path, None) == (GOOD if found is None else setup._FASTER)
-    assert len(tried) == 1
+def test_an_unknown_machine_gets_no_options_and_a_warning(monkeypatch):
+    monkeypatch.setattr(setup, "MACHINE", "riscv64")
+    with pytest.warns(RuntimeWarning, match="no compiler options are known for jaxlib .* on riscv64"):
+        assert setup._options("cpu") == ()
 
 
-def test_an_option_that_the_user_has_set_stays(tried, monkeypatch):
-    """XLA takes the last of two."""
-    monkeypatch.setattr(setup, "_has_started", lambda: False)
-    monkeypatch.setattr(setup, "_added", "nothing yet")
-    monkeypatch.setenv("XLA_FLAGS", "--xla_backend_optimization_level=3")
-    setup._set_compiler_options(fast=True, folder=None, device="cpu")
-    others = tuple(option for option in GOOD if "optimization_level" not in option)
-    assert os.environ["XLA_FLAGS"] == f"--xla_backend_optimization_level=3 {setup._flags(others)}"
-    for added in (setup._added, setup._flags(GOOD)):  # here, and in a process that this one begins
-        monkeypatch.setattr(setup, "_added", added)
-        monkeypatch.setenv("XLA_FLAGS", f"--xla_backend_optimization_level=3 {setup._flags(others)}")
-        setup._set_compiler_options(fast=False, folder=None, device="cpu")
-        assert os.environ["XLA_FLAGS"] == "--xla_backend_optimization_level=3"
+def test_options_are_written_as_xla_reads_them():
+    assert setup._flags("", ("a=1", "--b=2", "-c=3")) == f"{EXTRA}=a=1,-c=3 --b=2"
+    assert setup._flags("", ()) == ""
 
 
-@pytest.mark.parametrize("fast", [True, False])
-def test_options_that_the_user_has_in_a_file_stay(tried, tmp_path, monkeypatch, fast):
-    """XLA took the file's name with ours behind it for the name of another one, and ended the process."""
-    file = tmp_path / "options"
-    file.write_text("# of all\n--xla_backend_optimization_level=3\n --xla_cpu_enable_fast_math=false\n")
-    monkeypatch.setattr(setup, "_has_started", lambda: not fast)
-    monkeypatch.setattr(setup, "_added", "nothing yet")
-    monkeypatch.setenv("XLA_FLAGS", str(file))
-    setup._set_compiler_options(fast=fast, folder=None, device="cpu")
-    theirs = "--xla_backend_optimization_level=3 --xla_cpu_enable_fast_math=false"
-    others = tuple(option for option in GOOD if "optimization_level" not in option)
-    assert os.environ["XLA_FLAGS"] == (f"{theirs} {setup._flags(others)}" if fast else str(file))
+@pytest.mark.parametrize(
+    "user",
+    ["", f"{LEVEL}=3", "--xla_cpu_enable_fast_math=false", f"{EXTRA}=x=1", "--xla_disable_hlo_passes=", "a/file"],
+)
+def test_options_of_the_user_stay(user):
+    """XLA takes the last of two; two options decide on all others, and a file of options cannot be extended."""
+    flags = setup._flags(user, ALL)
+    assert flags.startswith(user)
+    assert (flags == user) == user.startswith((EXTRA, "--xla_disable_hlo_passes", "a/file"))
+    assert flags.count(f"{LEVEL}=") <= 1
+    assert setup._flags(flags, ALL) == flags  # a second call, or a process that this one begins
+    assert setup._flags(flags, ()) == user
+    assert setup._flags(setup._flags(user, setup._options("gpu")), ALL) == flags
 
 
-def test_a_cache_that_cannot_be_written_is_none(tried, tmp_path):
-    (tmp_path / "file").write_text("")
-    assert setup._accepted(tmp_path / "file") == GOOD
+@pytest.mark.parametrize("mode", [0o700, 0o770, 0o702])
+def test_a_cache_that_others_may_write_is_not_used(tmp_path, mode):
+    """Loading an entry runs machine code."""
+    folder = tmp_path / "cache"
+    folder.mkdir()
+    folder.chmod(mode)
+    if mode == 0o700:
+        assert setup._usable(folder) == folder
+    else:
+        with pytest.warns(RuntimeWarning, match="is not used: it must be a folder that belongs to you"):
+            assert setup._usable(folder) is None
 
 
-def test_a_cache_of_somebody_else_that_cannot_be_read_is_none(tried, tmp_path, monkeypatch):
-    """As in a container that runs as a user whose HOME is root's."""
+@pytest.mark.parametrize("case", ["of somebody else", "a link", "a file", "closed"])
+def test_a_cache_that_is_no_folder_of_the_user_is_not_used(tmp_path, monkeypatch, case):
+    folder = tmp_path / "cache"
+    (tmp_path / "elsewhere").mkdir(mode=0o700)
+    if case == "of somebody else":
+        monkeypatch.setattr(setup.os, "geteuid", lambda: -1)
+    elif case == "a link":
+        folder.symlink_to(tmp_path / "elsewhere")
+    elif case == "a file":
+        folder.write_text("")
+    else:  # as in a container that runs as a user whose HOME is root's
 
-    def closed(self, *args, **kwargs):
-        raise PermissionError(13, "Permission denied", str(self))
+        def refused(self, *args, **kwargs):
+            raise PermissionError(13, "Permission denied", str(self))
 
-    monkeypatch.setattr(setup, "version", lambda package: "0.10.2")  # read from a file, too
-    for name in ("stat", "read_text", "write_text", "mkdir"):
-        monkeypatch.setattr(setup.Path, name, closed)
-    assert setup._accepted(tmp_path / "closed") == GOOD
-
-
-def test_the_trial_run_accepts_these_options_and_refuses_unknown_ones(monkeypatch):
-    """In processes of their own, as a user's first call: an unknown flag ends the process, wrong numbers too."""
-    monkeypatch.setenv("JAX_NUMPY_DTYPE_PROMOTION", "strict")  # of a user's own code: no word on the options
-    assert setup._tried(GOOD)
-    assert not setup._tried((*GOOD, "--xla_no_such_flag=true"))
+        monkeypatch.setattr(setup.Path, "mkdir", refused)
+    with pytest.warns(RuntimeWarning, match="is not used"):
+        assert setup._usable(folder) is None
 
 
-def test_the_trial_run_refuses_other_numbers():
-    """In this process: how one of its own ends is told above."""
-    exec(setup._TRIAL, {})
-    with pytest.raises(SystemExit, match="1"):
-        exec(setup._TRIAL.replace("scan, x, 100)", "scan, 1.000001 * x, 100)"), {})
+def test_a_new_cache_is_closed_to_others(tmp_path):
+    assert setup._usable(tmp_path / "a" / "cache") == tmp_path / "a" / "cache"
+    assert (tmp_path / "a" / "cache").stat().st_mode & 0o777 == 0o700
+
+
+def test_a_cache_that_takes_no_entries_is_read_with_one_warning(tmp_path, monkeypatch):
+    """JAX would warn of each entry."""
+    monkeypatch.setattr(setup.os, "access", lambda *_: False)
+    with warnings.catch_warnings(record=True) as shown:
+        warnings.simplefilter("default")
+        assert setup._usable(tmp_path) == tmp_path
+        for k in range(3):
+            warnings.warn(f"Error writing persistent compilation cache entry for 'jit_{k}': why", stacklevel=1)
+        warnings.warn("something else", stacklevel=1)
+    assert [str(one.message).endswith("takes no new entries") for one in shown] == [True, False]
+
+
+def test_the_options_of_this_version_and_machine_change_no_result():
+    """In a process of its own, which XLA ends if it does not know an option."""
+
+    def tried(options):
+        environment = {**os.environ, "JAX_PLATFORMS": "cpu", "XLA_FLAGS": setup._flags("", options)}
+        return subprocess.run([sys.executable, "-c", _TRIAL], env=environment, capture_output=True, check=False)
+
+    assert tried(ALL).returncode == 0
+    assert tried((*ALL, "--xla_no_such_flag=true")).returncode != 0
+
+
+# 64 damped pendulums side by side, with a branch and a scalar clock, as in a simulation; also with options of batches
+_TRIAL = """
+import sys
+import jax
+import numpy as np
+jax.config.update("jax_enable_x64", True)
+import jax.numpy as jnp
+
+def run(module, cond, loop, x, steps):
+    def step(carry, k):
+        x, v, most = carry
+        d = module.sin(0.1 * k)
+        a = d - module.sin(x) - 0.1 * v * module.sqrt(1.0 + v * v)
+        v = v + 0.05 * a
+        x = x + 0.05 * v
+        late = cond(k > 50, lambda: module.maximum(most, module.abs(a)), lambda: most)
+        return (x, v, late), None
+    return loop(step, (x, 0.0 * x, 0.0 * x), module.arange(steps) * 1.0)[0]
+
+def plain(step, carry, ks):
+    for k in ks:
+        carry, _ = step(carry, k)
+    return carry, None
+
+x = np.linspace(-3.0, 3.0, 64)
+expected = run(np, lambda test, yes, no: yes() if test else no(), plain, x, 100)
+for options in (None, {"xla_disable_hlo_passes": ""}):
+    flown = jax.jit(lambda x: run(jnp, jax.lax.cond, jax.lax.scan, x, 100), compiler_options=options)
+    if any(np.max(np.abs(np.asarray(a) - b)) > 1e-12 for a, b in zip(flown(jnp.asarray(x)), expected)):
+        sys.exit(1)
+"""
 
 
 @pytest.mark.skipif(shutil.which("nvidia-smi") is not None, reason="there is a GPU")
@@ -212,6 +246,12 @@ f = jax.jit(lambda x: 3.0 * x + 1.0)
 told["found"] = [float(f(2.0))]
 told["set"] = [str(jax.numpy.zeros(1).dtype), jax.config.jax_platforms, jax.config.jax_numpy_dtype_promotion]
 configure(1, cache, device="cpu", bits=32)
+import warnings
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 7.0)  # as set by the user since
+before = warnings.showwarning, list(warnings.filters)
+configure(1, cache, device="cpu", bits=32)
+unchanged = before == (warnings.showwarning, warnings.filters)
+told["second"] = [unchanged, jax.config.jax_persistent_cache_min_compile_time_secs]
 told["flags"].append(os.environ["XLA_FLAGS"])
 try:
     configure(1, cache, fast=False, device="cpu", bits=32)
@@ -231,13 +271,15 @@ def told(tmp_path_factory):
     """What a process says that calls `configure` several times, before anything runs on JAX and after."""
     environment = {name: value for name, value in os.environ.items() if name != "TF_CPP_MIN_LOG_LEVEL"}
     environment["JAX_NUMPY_DTYPE_PROMOTION"] = "strict"  # of a user's own code: not of what is kept
-    cache, ours = tmp_path_factory.mktemp("cache"), setup._cache_folder()
-    for verdict in ours.glob("options-*.json") if ours else ():
-        shutil.copy(verdict, cache)
+    cache = tmp_path_factory.mktemp("cache")
     call = [sys.executable, "-c", IN_TURN, str(cache)]
     done = subprocess.run(call, cwd=ROOT, env=environment, capture_output=True, text=True, check=True)
     assert done.stderr == ""
     return json.loads(done.stdout)
+
+
+def test_a_second_call_with_the_same_arguments_does_nothing(told):
+    assert told["second"] == [True, 7.0]
 
 
 def test_bits_and_device_are_set_and_the_compiler_is_silent(told):
@@ -253,26 +295,8 @@ def test_other_compiler_options_are_set_before_anything_runs_or_refused(told):
 
 
 def test_programs_that_are_cut_short_in_the_cache_are_compiled_again(told):
-    """As another process sees them that starts at the same time: nothing is said of the first ones."""
+    """As another process sees them that starts at the same time, without a warning."""
     assert (told["found"], told["cut"]) == ([7.0, 7.0], True)
-
-
-@pytest.mark.parametrize(
-    ("does", "said"), [("reading", "rejects its own entries"), ("writing", "takes no new entries")]
-)
-def test_a_cache_that_rejects_its_own_entries_or_takes_none_is_told_of_once(capsys, tmp_path, does, said):
-    """Of the first ones nothing: another process may be writing them. Other warnings are shown as ever."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("default")
-        warnings.showwarning = lambda message, *where, **more: print(message, file=sys.stderr)
-        setup._tell_of_rejected_once(tmp_path)
-        for k in range(10):
-            told = capsys.readouterr().err
-            assert (said in told) == (k == setup.SEVERAL)
-            assert bool(told) == (k == setup.SEVERAL)
-            warnings.warn(f"Error {does} persistent compilation cache entry for 'jit_{k}': why", stacklevel=1)
-        warnings.warn("something else", stacklevel=1)
-    assert "something else" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("options", [None, programs.QUICKLY], ids=["as usual", "quickly"])
