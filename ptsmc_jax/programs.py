@@ -1,25 +1,25 @@
-"""`jax.jit`, with compiled programs that outlive the process: loading one takes a tenth of tracing and lowering it.
+"""`jax.jit` whose traced programs are stored on disk, so that later processes trace and lower them no more.
 
-Kept beside the compile cache where `configure(keep_programs=True)` asks for it, as the `ptsmc` command does. A session
-in which code may be patched should not ask: a program is told from another by the files of its code alone. Any doubt, a
-file cut short among them, falls back to compiling.
+Tracing and lowering a large program takes 2 to 18 s. If `configure(keep_programs=True)` was called, as the `ptsmc`
+command does, the first process stores the StableHLO of a program by `jax.export`. Later processes read it, and find its
+executable in JAX's compile cache. The name of a file is a checksum of all that the program depends on. Source code
+counts by its files, so a process that patches code must not store programs. A program that cannot be identified with
+certainty, for example because a class of the user takes part, is traced in every process.
 """
 
+import ast
 import contextlib
 import functools
 import hashlib
 import inspect
+import itertools
+import logging
 import os
-import pickle
-import re
-import secrets
-import stat
 import sys
-import tempfile
-from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from dataclasses import fields, is_dataclass
-from enum import Enum
 from pathlib import Path
 from typing import Any
 
@@ -28,32 +28,41 @@ import jax.numpy as jnp
 import jaxlib.version
 import numpy as np
 import scipy
+from jax import export
 from jax.core import Tracer
-from jax.experimental import serialize_executable
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from ptsmc_jax import configure, provenance
 
-KEPT = 400  # programs; those not used for longest make room
-# for what runs for a moment: optimising would take longer. The older emitters of fused loops and one part of the code
-# compile in half the time besides, and run faster, at this level
+LIMIT = 400  # stored programs; the least recently used are deleted
+# compiler options of programs that run for a moment: optimising them would take longer than it saves
 _OLDER = {"xla_cpu_use_fusion_emitters": False} if configure.OLDER_EMITTERS else {}
 QUICKLY = {"xla_backend_optimization_level": 0, "xla_cpu_parallel_codegen_split_count": 1, **_OLDER}
-# for batches in `lanes`: with the pass that `configure` leaves out they compile in 0.7 to 0.9 of the time, and fly in
-# 0.88 to 0.97 of it. Loops in them write one array of each type of number, see `numerics.stacking`
+# compiler options of batches in `lanes`: with the pass that `configure` disables they compile in 0.7 to 0.9 of the time
+# and run in 0.88 to 0.97 of it. Loops in them write one array of each type of number, see `numerics.stacking`
 BATCHED = {"xla_disable_hlo_passes": ""}
-OURS = provenance.PACKAGES  # whose code is known by its files
+OURS = provenance.PACKAGES  # packages whose code is identified by its files
 PLAIN = (int, float, str, bool, bytes, type(None))
+VERSIONS = (sys.version, jax.__version__, jaxlib.version.__version__, np.__version__, scipy.__version__)
+# settings of JAX that change a traced program: `jax.NAME` sets one in a thread, `jax.config.jax_NAME` reads it
+SETTINGS = """default_device enable_x64 debug_nans debug_infs default_matmul_precision default_prng_impl
+    numpy_dtype_promotion numpy_rank_promotion threefry_partitionable""".split()
+GLOBAL_SETTINGS = ["random_seed_offset", "use_shardy_partitioner"]  # the same in all threads
+# a stored program runs with the version of JAX that made it, so its custom calls need not be stable
+_CHECKS = [export.DisabledSafetyCheck.custom_call("__gpu$xla.gpu.triton")]
+BACKGROUND = "compiling"  # name of the threads that compile what was prepared
+_logger = logging.getLogger(__name__)
 
 
-class _UnknownError(Exception):
-    """What a program hangs on cannot be told from its name."""
+class NotStorableError(Exception):
+    """A program that another process could not identify with certainty."""
 
 
 class Program:
-    """A function compiled once for each structure of its arguments, here or by an earlier process.
+    """A jitted function whose programs are stored if `configure` asks for it.
 
-    It runs on a processor, also where JAX has a GPU, which knows no Schur decomposition and takes a single run in many
-    launches; a batch runs where JAX would run it.
+    It runs on the CPU even if JAX has a GPU: a GPU has no Schur decomposition, and takes many launches for a single
+    run. A batch runs on JAX's default device.
     """
 
     def __init__(
@@ -65,106 +74,121 @@ class Program:
         batch: bool = False,
     ):
         functools.update_wrapper(self, function)
-        self._function, self._static, self._options, self._batch = function, static, options, batch
+        self._function, self._static, self._signature = function, static, inspect.signature(function)
+        self._batch = batch
         self._jitted = jax.jit(function, static_argnames=static, compiler_options=options)
-        self._signature = inspect.signature(function)
-        self._ready: dict[Any, Any] = {}  # programs, or futures of them
+        self._stored = jax.jit(self._restored(), static_argnames=static, compiler_options=options)
+        self._prepared: list[Future] = []
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._jitted, name)  # lower, trace, clear_cache
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """Call it as the jitted function is called."""
-        return self._placed(self._called, args, kwargs)
-
-    def _called(self, *args: Any, **kwargs: Any) -> Any:
-        known = self._known(args, kwargs)
-        if known is None:
-            return self._jitted(*args, **kwargs)
-        key, said, given = known
-        ready = self._ready.get(key)
-        if isinstance(ready, Future) and ready.cancelled():  # by `stop`
-            ready = None
-        if ready is None or isinstance(ready, Future):
-            ready, loaded = (ready or _apart(self._begun, key, said, given)).result()
-            if loaded:
-                try:
-                    result = jax.block_until_ready(ready(given))
-                except Exception:  # it was whole, and yet does not run here
-                    with contextlib.suppress(OSError):
-                        _path(said).unlink(missing_ok=True)
-                    ready = _apart(self._compiled, key, said, given).result()
-                else:
-                    self._ready[key] = ready
-                    return result
-            self._ready[key] = ready
-        return ready(given)
+        return self._run(*args, **kwargs) if self._batch else call_on_cpu(self._run, *args, **kwargs)
 
     def prepare(self, *args: Any, **kwargs: Any) -> None:
-        """Begin to load or compile what such a call will need, beside what is done; nothing where nothing is kept."""
-        self._placed(self._prepared, args, kwargs)
+        """Begin to compile for such a call in a background thread; do nothing if programs are not stored."""
+        if _stores() and self._batch:
+            self._prepare(*args, **kwargs)
+        elif _stores():
+            call_on_cpu(self._prepare, *args, **kwargs)
 
-    def _prepared(self, *args: Any, **kwargs: Any) -> None:
-        known = self._known(args, kwargs)
-        if known is not None and known[0] not in self._ready:
-            self._ready[known[0]] = _beside().submit(_as_here(self._begun), *known)
+    def _run(self, *args: Any, **kwargs: Any) -> Any:
+        if not _stores() or _is_traced(args, kwargs):
+            return self._jitted(*args, **kwargs)
+        thread = threading.current_thread()
+        if not thread.name.startswith(BACKGROUND):  # what waits there would keep what it waits for from its turn
+            for future in self._prepared:
+                with contextlib.suppress(CancelledError):  # by `stop`
+                    future.exception()  # an error comes again from the call itself
+        if thread is not threading.main_thread():
+            return self._call_stored(*args, **kwargs)
+        return _caller().submit(_with_settings(self._call_stored), *args, **kwargs).result()
 
-    def _placed(self, method: Callable, args: tuple, kwargs: dict) -> Any:
-        """What the method returns, on the processor, where JAX would run something else that is not a batch."""
-        elsewhere = not self._batch and configure.backend() != "cpu"
-        if not elsewhere or any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((args, kwargs))):
-            return method(*args, **kwargs)
-        args, kwargs = [jax.tree.map(_brought, given) for given in (args, kwargs)]
-        with jax.default_device(configure.processors()[0]):
-            return method(*args, **kwargs)
+    def _call_stored(self, *args: Any, **kwargs: Any) -> Any:
+        args, kwargs = _uncommitted(args, kwargs)
+        return self._stored(*args, **kwargs)
 
-    def _begun(self, key: tuple, said: str, given: dict) -> tuple[Callable, bool]:
-        """The program, and whether it was loaded."""
-        found = _read(_path(said), said, jax.tree.structure(((given,), {})))
-        return (self._compiled(key, said, given), False) if found is None else (found, True)
+    def _prepare(self, *args: Any, **kwargs: Any) -> None:
+        args, kwargs = _uncommitted(args, kwargs)
 
-    def _known(self, args: tuple, kwargs: dict) -> tuple[tuple, str, dict] | None:
-        """What a program is known by here, in words too until it is ready, and the arguments that are not static.
+        def compiled() -> None:
+            self._stored.lower(*args, **kwargs).compile()
 
-        None: it cannot be kept.
+        self._prepared.append(_background().submit(_with_settings(compiled)))
+
+    def _restored(self) -> Callable:
+        """Return the function that JAX traces in place of ours: it calls the stored program, or stores it first."""
+
+        @functools.wraps(self._function)
+        def restored(*args: Any, **kwargs: Any) -> Any:
+            try:
+                path = self.path(*args, **kwargs)
+                content = _read(path)
+                if content is None:
+                    content = self._export(*args, **kwargs)
+                    _write(path, content)
+            except (NotStorableError, TypeError, ValueError, NotImplementedError) as error:
+                _logger.info("%s is not stored: %r", self._function.__qualname__, error)
+                return self._function(*args, **kwargs)  # raises what is wrong with the function itself
+            described, _, program = content.partition(b"\n")
+            exported = export.deserialize(bytearray(program))
+            leaves = [jnp.atleast_1d(leaf) for leaf in jax.tree.leaves(self._split(args, kwargs)[0])]
+            if exported.nr_devices > 1:
+                mesh = Mesh(np.asarray(configure.devices()[: exported.nr_devices]), ("device",))
+                leaves = jax.lax.with_sharding_constraint(leaves, NamedSharding(mesh, PartitionSpec()))
+            return _build(ast.literal_eval(described.decode()), iter(exported.call(*leaves)))
+
+        return restored
+
+    def _split(self, args: tuple, kwargs: dict) -> tuple[dict, dict]:
+        """Return the traced and the static arguments by name, without defaults: these are part of the code."""
+        given = self._signature.bind(*args, **kwargs).arguments
+        traced = {name: value for name, value in given.items() if name not in self._static}
+        return traced, {name: value for name, value in given.items() if name in self._static}
+
+    def _export(self, *args: Any, **kwargs: Any) -> bytes:
+        """Return a line that describes the structure of the results, then the serialised program of flat arrays."""
+        traced, static = self._split(args, kwargs)
+        leaves, structure = jax.tree.flatten(traced)
+        found = []
+
+        def flat(*rows: Any) -> list:
+            leaves = [jnp.reshape(row, t.shape) for row, t in zip(rows, types, strict=True)]
+            outputs, of_outputs = jax.tree.flatten(self._function(**jax.tree.unflatten(structure, leaves), **static))
+            found.append(of_outputs)
+            return outputs
+
+        types: list[Any] = [jax.typeof(leaf) for leaf in leaves]
+        # JAX gives scalars of programs for several devices a sharding that only its Shardy partitioner can lower
+        shapes = [jax.ShapeDtypeStruct(t.shape or (1,), t.dtype, weak_type=t.weak_type) for t in types]
+        platforms = ["cpu"] if configure.backend() == "cpu" else None
+        exported = export.export(jax.jit(flat), platforms=platforms, disabled_checks=_CHECKS)(*shapes)
+        described = _describe_tree(found[0])
+        if jax.tree.structure(_build(described, itertools.repeat(0))) != found[0]:
+            raise NotStorableError(found[0])
+        return repr(described).encode() + b"\n" + exported.serialize()
+
+    def path(self, *args: Any, **kwargs: Any) -> Path:
+        """Return the file of the program for such a call, named by a checksum that is the same in every process.
+
+        Raises:
+            NotStorableError: the program cannot be identified with certainty.
         """
-        if configure.programs is None or jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
-            return None
-        bound = self._signature.bind(*args, **kwargs)  # without defaults: they are constants of the function
-        given = {name: v for name, v in bound.arguments.items() if name not in self._static}
-        fixed = tuple((name, v) for name, v in bound.arguments.items() if name in self._static)
-        leaves, structure = jax.tree.flatten(given)
-        try:
-            key = (structure, tuple(_shape(leaf) for leaf in leaves), fixed, _bits())
-            known = self._ready.get(key)
-            said = self._said(key) if known is None or isinstance(known, Future) else ""
-        except (_UnknownError, TypeError):  # traced, spread over devices, of a user's own class, not hashable
-            return None
-        return key, said, given
-
-    def _said(self, key: tuple) -> str:
-        """All that the program hangs on, in words that mean the same in every process."""
-        structure, shapes, fixed, _ = key  # bits are among the surroundings
-        return repr((self._origin(), _structure(structure), shapes, _plain(fixed), self._options, _surroundings()))
-
-    def _compiled(self, key: tuple, said: str, given: dict) -> Callable:
-        fixed = dict(key[2])
-
-        def function(given: dict) -> Any:
-            return self._function(**given, **fixed)
-
-        # a name that the compile cache does not know: what it gives back cannot be written again, its copy would lack
-        # its functions
-        function.__name__ = f"{self._function.__name__}_{secrets.token_hex(4)}"
-        compiled = jax.jit(function, compiler_options=self._options).lower(given).compile()
-        _write(_path(said), said, compiled)
-        return compiled
-
-    def _origin(self) -> tuple[str, str, str]:
-        package = self._function.__module__.split(".")[0]
-        if package not in OURS or "<locals>" in self._function.__qualname__ or not inspect.isfunction(self._function):
-            raise _UnknownError
-        return self._function.__module__, self._function.__qualname__, _code(package)
+        module, name = self._function.__module__, self._function.__qualname__
+        package = module.split(".")[0]
+        if package not in OURS or "<locals>" in name or not inspect.isfunction(self._function):
+            raise NotStorableError(name)
+        traced, static = self._split(args, kwargs)
+        leaves, structure = jax.tree.flatten(traced)
+        devices = [f"{device.platform} {device.device_kind}" for device in configure.devices()]  # of the default device
+        settings = _settings()[1:] + [getattr(jax.config, f"jax_{name}") for name in GLOBAL_SETTINGS]
+        code, arguments = provenance.code_checksum(*sorted({package, OURS[0]})), _describe(static)
+        known = module, name, code, arguments, _describe_tree(structure), [_type(leaf) for leaf in leaves]
+        checksum = hashlib.sha256(repr((known, VERSIONS, devices, settings)).encode()).hexdigest()
+        assert configure.programs is not None
+        return configure.programs / f"{checksum}.stablehlo"
 
 
 def jit(
@@ -174,7 +198,14 @@ def jit(
     compiler_options: dict | None = None,
     batch: bool = False,
 ) -> Any:
-    """`jax.jit` of a function at the top of a module of this project, see above; batch: see `Program`."""
+    """Return the `Program` of a function, or a decorator that does.
+
+    Args:
+        function: a function at the top of a module of this project; others are compiled, but never stored.
+        static_argnames: names of the arguments that are constants of the program.
+        compiler_options: as of `jax.jit`.
+        batch: run on JAX's default device instead of the CPU.
+    """
     if function is None:
         options = {"static_argnames": static_argnames, "compiler_options": compiler_options, "batch": batch}
         return functools.partial(jit, **options)
@@ -182,182 +213,171 @@ def jit(
     return Program(function, static, compiler_options, batch=batch)
 
 
-def _brought(leaf: Any) -> Any:
-    """An array of a device's as one that any other takes."""
-    kept = not isinstance(leaf, jax.Array) or jnp.issubdtype(leaf.dtype, jax.dtypes.extended)
-    return leaf if kept else np.asarray(leaf)
+def call_on_cpu(function: Callable, /, *args: Any, **kwargs: Any) -> Any:
+    """Call a function on the CPU, also if JAX's default device is a GPU; part of a traced program stays where it is."""
+    if configure.backend() == "cpu" or _is_traced(args, kwargs):
+        return function(*args, **kwargs)
+    args, kwargs = jax.tree.map(_to_host, (args, kwargs))
+    with jax.default_device(configure.processors()[0]):
+        return function(*args, **kwargs)
 
 
-def _shape(leaf: Any) -> tuple:
-    """What of an array a program is compiled for."""
-    if isinstance(leaf, Tracer):
-        raise _UnknownError
-    if isinstance(leaf, jax.Array):
-        if leaf.devices() != {configure.devices()[0]}:
-            raise _UnknownError
-        return leaf.shape, leaf.dtype.name, leaf.weak_type
-    if isinstance(leaf, np.ndarray | np.generic):
-        return leaf.shape, leaf.dtype.name, False
-    if type(leaf) in (bool, int, float):
-        return (), type(leaf).__name__, True
-    raise _UnknownError
+def _to_host(leaf: Any) -> Any:
+    """Return an array of a device as one that every device takes."""
+    unchanged = not isinstance(leaf, jax.Array) or jnp.issubdtype(leaf.dtype, jax.dtypes.extended)
+    return leaf if unchanged else np.asarray(leaf)
 
 
-def _structure(structure: Any) -> Any:
-    """A tree's structure in words that mean the same in every process."""
+def _stores() -> bool:
+    """Return whether programs are stored; a function that is not to be compiled has none."""
+    return configure.programs is not None and not jax.config.jax_disable_jit  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _is_traced(args: tuple, kwargs: dict) -> bool:
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((args, kwargs)))
+
+
+def _uncommitted(args: tuple, kwargs: dict) -> tuple[tuple, dict]:
+    """Return the arguments without arrays that are tied to the first device, as results of stored programs are.
+
+    A program for several devices would refuse them.
+    """
+    devices = configure.devices()
+    if len(devices) == 1:
+        return args, kwargs
+
+    def free(leaf: Any) -> Any:
+        is_tied = isinstance(leaf, jax.Array) and leaf.committed and leaf.devices() == {devices[0]}
+        return _to_host(leaf) if is_tied else leaf
+
+    return jax.tree.map(free, (args, kwargs))
+
+
+def _type(leaf: Any) -> tuple:
+    """Return what a program is compiled for: shape, name of the dtype, and whether the dtype is weak."""
+    found: Any = jax.typeof(leaf)
+    if jnp.issubdtype(found.dtype, jax.dtypes.extended):  # as of keys
+        raise NotStorableError(found.dtype)
+    return found.shape, found.dtype.name, found.weak_type
+
+
+def _describe_tree(structure: Any) -> Any:
+    """Return the structure of a tree as literals that mean the same in every process; see `_build`."""
     data = structure.node_data()
-    if data is None:  # a leaf
-        return "*"
-    kind, fixed = data
-    return _plain(kind), _plain(fixed), [_structure(child) for child in structure.children()]
+    if data is None:
+        return "leaf"
+    if data[0] is type(None):
+        return None
+    return _describe(data[0]), _describe(data[1]), [_describe_tree(child) for child in structure.children()]
 
 
-def _plain(value: Any) -> Any:
-    """What is fixed in a program, in such words."""
+def _build(described: Any, leaves: Iterator) -> Any:
+    """Return the tree whose structure `_describe_tree` described, with these leaves."""
+    if not isinstance(described, tuple):
+        return next(leaves) if described == "leaf" else None
+    (_, module, name), fixed, children = described
+    kind: Any = _named(module, name)
+    values = [_build(child, leaves) for child in children]
+    if kind in (tuple, list):
+        return kind(values)
+    if kind is dict:
+        return dict(zip(fixed[2], values, strict=True))
+    if not hasattr(kind, "__dataclass_fields__"):
+        return kind(*values)  # a named tuple
+    names = sorted(kind.__dataclass_fields__.values(), key=lambda f: bool(f.metadata.get("static")))
+    return kind(**{f.name: value for f, value in zip(names, [*values, *fixed[2]], strict=True)})  # `pytrees.pytree`
+
+
+def _describe(value: Any) -> Any:
+    """Return a static value as literals that mean the same in every process."""
     if type(value) in PLAIN:
         return value
+    if isinstance(value, type) or inspect.isfunction(value):
+        module, name = str(value.__module__), value.__qualname__
+        ours = module.split(".")[0] in (*OURS, "builtins", "collections") and "<locals>" not in name
+        # a type's name may be set by the function that makes it, a function's by `functools.wraps` on another
+        if not ours or (inspect.isfunction(value) and _named(module, name) is not value):
+            raise NotStorableError(value)
+        return "name", module, name
     if isinstance(value, tuple | list):
-        return [_plain(v) for v in value]
-    if isinstance(value, dict):
-        return [(_plain(k), _plain(v)) for k, v in value.items()]
-    kind = value if isinstance(value, type) or inspect.isfunction(value) else type(value)
-    where = str(kind.__module__), kind.__qualname__  # None: of code that was run by itself
-    if where[0].split(".")[0] not in (*OURS, "builtins", "collections") or "<locals>" in where[1]:
-        raise _UnknownError
-    if inspect.isfunction(value) and not _stands(value):  # what functools.wraps has given its name
-        raise _UnknownError
-    if kind is value:
-        return where
-    if isinstance(value, Enum):
-        return where, value.name
-    if is_dataclass(value):
-        return where, [(f.name, _plain(getattr(value, f.name))) for f in fields(value)]
-    raise _UnknownError
+        parts = list(value)
+    elif isinstance(value, dict):
+        parts = list(value.items())
+    elif is_dataclass(value):
+        parts = [(f.name, getattr(value, f.name)) for f in fields(value)]
+    else:
+        raise NotStorableError(value)
+    return "value", _describe(type(value)), [_describe(part) for part in parts]
 
 
-def _stands(value: Any) -> bool:
-    """Whether a function, or a type, is what its module has under its name."""
-    module, names = sys.modules.get(value.__module__), value.__qualname__.split(".")
-    return functools.reduce(lambda of, name: getattr(of, name, None), names, module) is value
+def _named(module: str, name: str) -> Any:
+    """Return what a module has under a dotted name, or None."""
+    return functools.reduce(lambda owner, part: getattr(owner, part, None), name.split("."), sys.modules.get(module))
 
 
 @functools.cache
-def _beside() -> ThreadPoolExecutor:
-    """Threads that compile beside the one that goes on."""
-    return ThreadPoolExecutor(max(1, len(configure.processors()) - 1), "compiling")
+def _background() -> ThreadPoolExecutor:
+    """Return the threads that compile what was prepared."""
+    return ThreadPoolExecutor(max(1, len(configure.processors()) - 1), BACKGROUND)
 
 
-def _apart(function: Callable, *args: Any) -> Future:
-    """What a function returns, called in a thread of its own, which no Ctrl-C interrupts.
+@functools.cache
+def _caller() -> ThreadPoolExecutor:
+    """Return the thread that runs the main thread's calls, which no Ctrl-C interrupts.
 
-    Where one ends the waiting for a program, XLA goes on compiling it, for a client that may be gone by then: a
-    segmentation fault. An exit waits for threads.
+    If an interrupt ended the waiting for XLA, it would go on compiling for a client that the exit deletes, and the
+    process would end by a segmentation fault. An exit waits for threads.
     """
-    alone = ThreadPoolExecutor(1, "compiling")
-    future = alone.submit(_as_here(function), *args)
-    alone.shutdown(wait=False)
-    return future
+    return ThreadPoolExecutor(1, "running")
 
 
-def _as_here(function: Callable) -> Callable:
-    """The function as it runs in another thread, with what this one has as default device and bits."""
-    device, bits = configure.default_device(), _bits()
+def _with_settings(function: Callable) -> Callable:
+    """Return the function as it runs in another thread with this thread's settings of JAX."""
+    settings = _settings()
 
-    def called(*args: Any) -> Any:
-        with jax.default_device(device), jax.enable_x64(bits):
-            return function(*args)
+    def called(*args: Any, **kwargs: Any) -> Any:
+        with contextlib.ExitStack() as stack:
+            for name, value in zip(SETTINGS, settings, strict=True):
+                stack.enter_context(getattr(jax, name)(value))
+            return function(*args, **kwargs)
 
     return called
 
 
-def _bits() -> bool:
-    """Whether numbers have 64 of them, in this thread."""
-    return bool(jax.config.jax_enable_x64)  # pyright: ignore[reportAttributeAccessIssue]
+def _settings() -> list:
+    return [getattr(jax.config, f"jax_{name}") for name in SETTINGS]
 
 
 def stop() -> None:
-    """Compile nothing more beside: what has not begun is not needed any more."""
-    if _beside.cache_info().currsize:
-        _beside().shutdown(wait=False, cancel_futures=True)
-        _beside.cache_clear()
+    """Cancel what was prepared and has not begun."""
+    if _background.cache_info().currsize:
+        _background().shutdown(wait=False, cancel_futures=True)
+        _background.cache_clear()
 
 
-def _code(package: str) -> str:
-    """Return the checksum of a package's files and of the library's."""
-    return provenance.code_checksum(*sorted({package, OURS[0]}))
-
-
-# settings that no program hangs on
-_ELSEWHERE = ("cache", "log", "dump", "profil", "traceback", "compil", "distributed", "coordination", "explain")
-
-
-def _surroundings() -> tuple:
-    """What else a program hangs on; the cache's folder is one processor's own."""
-    settings = {k: repr(v) for k, v in jax.config.values.items() if not any(word in k for word in _ELSEWHERE)}
-    versions = jax.__version__, jaxlib.version.__version__, np.__version__, scipy.__version__
-    devices = [f"{d.platform} {d.device_kind} {d.id}" for d in configure.devices()]
-    return versions, devices, os.environ.get("XLA_FLAGS", ""), sorted(settings.items())
-
-
-def _path(said: str) -> Path:
-    assert configure.programs is not None
-    return configure.programs / (hashlib.sha256(said.encode()).hexdigest() + ".program")
-
-
-def _read(path: Path, said: str, inside: Any) -> Callable | None:
-    """The program in a file, if it is ours, whole, and the one that is asked for."""
+def _read(path: Path) -> bytes | None:
+    """Return the content of a stored program, or None if it is missing or damaged."""
     try:
-        for place in (path.parent, path):
-            status = place.lstat()
-            ours = status.st_uid == os.geteuid() and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
-            if stat.S_ISLNK(status.st_mode) or not ours:
-                return None
         content = path.read_bytes()
-        digest, body = content[:32], content[32:]
-        if digest != hashlib.sha256(said.encode() + body).digest():
-            return None
-        payload, skeleton, count = pickle.loads(body)
-        if _LAPACK.search(payload):
-            _lapack()
-        program = serialize_executable.deserialize_and_load(
-            payload, inside, jax.tree.structure(skeleton), execution_devices=configure.devices()[:count]
-        )
-        with contextlib.suppress(OSError):  # where nothing can be written, it stays as it is
-            os.utime(path)  # used
-    except Exception:  # whatever is wrong with it, it can be compiled again
+    except OSError:
         return None
-    return program
+    with contextlib.suppress(OSError):  # a folder that cannot be written
+        os.utime(path)  # see LIMIT
+    return content[32:] if content[:32] == _checksum(path, content[32:]) else None
 
 
-def _write(path: Path, said: str, compiled: Any) -> None:
-    """Keep a program; nothing is said where that does not work."""
+def _checksum(path: Path, content: bytes) -> bytes:
+    return hashlib.sha256(path.name.encode() + content).digest()
+
+
+def _write(path: Path, content: bytes) -> None:
+    """Store a program; other processes see none or all of it."""
+    temporary = path.with_suffix(f".{os.getpid()}-{threading.get_ident()}")
     try:
-        payload, _, outside = serialize_executable.serialize(compiled)
-        devices = {device for way in jax.tree.leaves(compiled.output_shardings) for device in way.device_set}
-        body = pickle.dumps((payload, jax.tree.unflatten(outside, range(outside.num_leaves)), len(devices)))
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=path.parent)
-        try:
-            with open(handle, "wb") as file:
-                file.write(hashlib.sha256(said.encode() + body).digest() + body)
-            os.replace(temporary, path)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
-            raise
-        programs = sorted(path.parent.glob("*.program"), key=lambda p: p.stat().st_mtime)
-        for old in programs[:-KEPT]:
+        temporary.write_bytes(_checksum(path, content) + content)
+        os.replace(temporary, path)
+        for old in sorted(path.parent.iterdir(), key=lambda p: p.stat().st_mtime)[:-LIMIT]:
             old.unlink(missing_ok=True)
-    except Exception:
-        pass
-
-
-# what jaxlib's own calls are named; a program has the names of files and functions in it, too, as of `batching.lapack`
-_LAPACK = re.compile(rb"lapack_[a-z0-9]+_ffi")
-
-
-@functools.cache
-def _lapack() -> None:
-    """A loaded program calls LAPACK through pointers that tracing would have set."""
-    from jaxlib.cpu import _lapack
-
-    _lapack.initialize()
+    except OSError as error:  # a full disk, a folder that cannot be written
+        _logger.info("%s is not stored: %s", path, error)

@@ -26,8 +26,6 @@ from jaxlib.mlir import ir  # noqa: E402
 jax.devices()  # reads the flags
 os.environ["XLA_FLAGS"] = os.environ["XLA_FLAGS"].replace(QUICKLY, "").strip()
 
-from tests import kept  # noqa: E402
-
 jax.config.update("jax_numpy_rank_promotion", "raise")
 # modules that name shapes: a function inside another is decorated anew whenever that one is called. Not folders, whose
 # names would stand for all modules in them
@@ -104,12 +102,6 @@ def pytest_xdist_make_scheduler(config, log):
 @pytest.fixture(autouse=True, scope="module")
 def _shapes_are_checked_where_a_thing_is_tested_by_itself(request):
     jaxtyping.config.update("jaxtyping_disable", request.path.parent.name in CALLERS)
-    kept.keep()
-
-
-@pytest.fixture(autouse=True)
-def _programs_are_kept():
-    kept.keep()
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -119,7 +111,6 @@ def _room_for_compiled_programs():
     maps = Path("/proc/self/maps")
     if maps.exists() and maps.read_bytes().count(b"\n") > MANY:
         jax.clear_caches()
-        kept.forget()
         gc.unfreeze()
         gc.collect()
     gc.freeze()  # programs live on: no collection is to walk through them again

@@ -4,9 +4,9 @@ Each row is a scenario; together they hold every part that a scenario or Python 
 another new part joins one here.
 """
 
+import contextlib
 from dataclasses import replace
 from functools import partial
-from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -358,20 +358,23 @@ def test_carries_keep_their_shapes_whatever_is_batched(name):
 
 
 @pytest.mark.parametrize("name", ROWS)
-def test_what_flies_parts_of_ours_is_kept_for_the_next_command(name, tmp_path, monkeypatch):
-    """Whatever is fixed in them, flight software too, is told from files: alone and in a batch; one's own code never.
+def test_programs_of_parts_of_ours_are_stored_for_the_next_command(name, tmp_path, monkeypatch):
+    """All static values, flight software too, can be identified, alone and in a batch, but never custom code.
 
-    What cannot be told is compiled in every process, and nothing but its time shows.
+    A program that cannot be identified is traced in every process, and only its time shows it.
     """
     monkeypatch.setattr(configure, "programs", tmp_path)
-    asked: list[Any] = []
-    monkeypatch.setattr(programs, "_beside", lambda: SimpleNamespace(submit=lambda *known: asked.append(known)))
-    for program in (rollout.simulate_jit, montecarlo._fly):  # whatever was flown before
-        monkeypatch.setattr(program, "_ready", {})
+    stored: list[Any] = []
+
+    def prepare(program, *args, **kwargs):
+        with contextlib.suppress(programs.NotStorableError):
+            stored.append(program.path(*args, **kwargs))
+
+    monkeypatch.setattr(programs.Program, "prepare", prepare)
     ready = scenario.study(scenario.from_tables(ROWS[name]))
     runs.prepare(ready)
     montecarlo.prepare(ready.parts, ready.dispersion, len(NUMBERS))
-    assert len(asked) == (0 if ARM in str(ROWS[name]) or OWN in str(ROWS[name]) else 2)
+    assert len(stored) == (0 if ARM in str(ROWS[name]) or OWN in str(ROWS[name]) else 2)
 
 
 def test_lanes_equal_vmap_for_a_plant_from_python():

@@ -23,7 +23,6 @@ import ptsmc_jax
 from ptsmc_jax import scenario
 from ptsmc_jax.scenario import from_tables, layouts
 from ptsmc_jax.simulation import catalogues
-from tests import kept
 from tests.helpers import SHORT
 from tests.scenario.test_schema import COMPLETE
 from tests.tree import ROOT, modules
@@ -176,7 +175,6 @@ def test_code_in_the_text_runs(path, small, monkeypatch, tmp_path, capsys, reque
     if small:  # flown by programs of other tests, as rooms of callers have them
         request.addfinalizer(lambda: jaxtyping.config.update("jaxtyping_disable", False))
         jaxtyping.config.update("jaxtyping_disable", True)
-        kept.keep()
         monkeypatch.setattr("ptsmc_jax.read", lambda name: scenario.read(name) and from_tables(tomllib.loads(SHORT)))
     if path.name == "export.md":  # the page does so by the command
         ptsmc_jax.export("scenarios/first_flight.toml", "out/controller")

@@ -334,11 +334,9 @@ def test_the_program_that_is_compiled_beside_is_the_one_that_the_search_asks_for
     monkeypatch.setattr(margin_rows, "hardest", lambda asked, _: (asked, 0.0))
     bounds = posed.evaluate.bounds
     margin_rows.ask(posed.ready, bounds, 3)
-    known = [
-        (jax.tree.structure(given), [programs._shape(leaf) for leaf in jax.tree.leaves(given)]) for given in prepared
-    ]
+    known = [(jax.tree.structure(given), [jax.typeof(leaf) for leaf in jax.tree.leaves(given)]) for given in prepared]
     asked = (posed.problem.margins, bounds.scale, np.stack([bounds.share(posed.own)] * len(jax.local_devices())))
-    assert known == [(jax.tree.structure(asked), [programs._shape(leaf) for leaf in jax.tree.leaves(asked)])]
+    assert known == [(jax.tree.structure(asked), [jax.typeof(leaf) for leaf in jax.tree.leaves(asked)])]
 
 
 class _AskedError(Exception):
@@ -358,7 +356,7 @@ def test_what_a_campaign_prepares_is_what_its_theory_asks_for(drawn, monkeypatch
     known = []
 
     def heard(*given, **fixed):
-        known.append((jax.tree.structure(given), [programs._shape(leaf) for leaf in jax.tree.leaves(given)], fixed))
+        known.append((jax.tree.structure(given), [jax.typeof(leaf) for leaf in jax.tree.leaves(given)], fixed))
 
     def called(*given, **fixed):
         heard(*given, **fixed)

@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from ptsmc_jax import programs, scenario
+from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.dispersions import attitudes, variation
 from ptsmc_jax.simulation import rollout
@@ -70,7 +70,7 @@ def test_what_is_prepared_for_so_many_trials_is_what_flies_them(chain, count, mo
 
     def heard(parts, dispersion, *numbers_and_fixed):
         *numbers, devices, own, kernel, software = numbers_and_fixed
-        known.append(([programs._shape(v) for v in numbers], devices, own, kernel, software))
+        known.append(([jax.typeof(v) for v in numbers], devices, own, kernel, software))
 
     def called(*given):
         heard(*given)
