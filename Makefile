@@ -15,6 +15,7 @@ tune: $(VENV)/.installed
 test: $(VENV)/.installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports --no-logo --no-cache
 	$(MAKE) --jobs 2 types suite
 
 types: $(VENV)/.types
@@ -25,11 +26,11 @@ $(VENV)/.types: $(VENV)/.installed-dev $(shell find $(TYPED) -mindepth 1 -name '
 	@touch $@
 
 suite:
-	$(BIN)/python -m pytest -n 2 --no-loadscope-reorder
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 # what `test` leaves out: more cases of each kind, and what takes minutes
 test-long: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -n 2 --no-loadscope-reorder -m long
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m long
 
 table: $(VENV)/.installed
 	$(BIN)/python -m tuning.studies.table

@@ -4,7 +4,6 @@ import gc
 import os
 import re
 import sys
-import threading
 from pathlib import Path
 
 import jaxtyping
@@ -20,8 +19,6 @@ configure(devices=2)
 
 import jax  # noqa: E402
 import matplotlib  # noqa: E402
-from jax._src.interpreters import mlir  # noqa: E402
-from jaxlib.mlir import ir  # noqa: E402
 
 jax.devices()  # reads the flags
 os.environ["XLA_FLAGS"] = os.environ["XLA_FLAGS"].replace(QUICKLY, "").strip()
@@ -44,22 +41,6 @@ matplotlib.rcParams["savefig.dpi"] = 30  # what figures show, tests ask of these
 # tracing makes objects by the million, and hardly any in cycles: looking for these took a fifth of its time
 gc.set_threshold(200_000, 10, 10)
 
-# JAX lowers every program in a context of its own: making it takes longer than lowering what most tests compile
-_context, _new_context = threading.local(), mlir.make_ir_context
-
-
-def _context_of_many():
-    """This thread's; begun anew now and then, for it keeps what every program in it has named."""
-    if ir.Context.current is not None:  # amid the lowering of another, it would be put into that one
-        return _new_context()
-    _context.programs = getattr(_context, "programs", -1) + 1
-    if _context.programs % 200 == 0:
-        _context.made = _new_context()
-    return _context.made
-
-
-mlir.make_ir_context = _context_of_many
-
 MANY = 25_000  # mappings of memory; Linux allows a process 65 530: with these a worker comes to 3 GB
 
 
@@ -73,30 +54,13 @@ LONGEST = """
     studies/test_tuner observers/test_observers_others campaigns/test_campaign paper/test_paper
     studies/test_stability theory/test_theory dispersions/test_dispersions
 """.split()
-TOGETHER = {"cli/test_cli", "studies/test_compare", "studies/test_pareto"}  # fly by the same programs, in one worker
-assert all((ROOT / "tests" / f"{name}.py").exists() for name in {*LONGEST, *TOGETHER})
+assert all((ROOT / "tests" / f"{name}.py").exists() for name in LONGEST)
 
 
 def pytest_collection_modifyitems(items):
     """Files in the order of `LONGEST`, then the others."""
     names = {item: item.path.relative_to(ROOT / "tests").with_suffix("").as_posix() for item in items}
     items.sort(key=lambda item: LONGEST.index(names[item]) if names[item] in LONGEST else len(LONGEST))
-
-
-@pytest.hookimpl(optionalhook=True)
-def pytest_xdist_make_scheduler(config, log):
-    """A worker for each file, or for those of `TOGETHER`: what it has compiled, and its fixtures, serve all its tests.
-
-    Not by marks of groups: of these xdist 3.8 writes into what pytest 9.2 does not read any more.
-    """
-    from xdist.scheduler import LoadScopeScheduling
-
-    class Files(LoadScopeScheduling):
-        def _split_scope(self, nodeid):
-            name = nodeid.split("::")[0].removeprefix("tests/").removesuffix(".py")
-            return "commands" if name in TOGETHER else name
-
-    return Files(config, log)
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -1,0 +1,93 @@
+"""Imports: neither the package nor the command imports JAX or changes its settings, and every public name resolves."""
+
+import ast
+import importlib
+import inspect
+import json
+import subprocess
+import sys
+
+import pytest
+
+from tests.tree import ROOT, modules
+
+
+def python(code):
+    """Last line that a fresh interpreter prints, read as JSON."""
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def test_importing_the_package_and_the_command_does_not_import_jax():
+    loaded = python("import ptsmc_jax, tuning.cli.main, json, sys; print(json.dumps(sorted(sys.modules)))")
+    assert "tuning.cli.main" in loaded
+    assert not {"jax", "jaxlib", "numpy", "scipy", "matplotlib", "optax"} & set(loaded)
+
+
+def test_importing_the_library_changes_nothing_of_jax_or_the_environment():
+    """So that `configure` can still be called: who forgets it is warned by a study, and told when it comes too late."""
+    names = list(modules())
+    changed, started, looked, warned, late = python(f"""
+import importlib, json, os, warnings
+import jax, polars  # which sets a variable of its allocator's own
+def state():
+    return {{**jax.config.values, "flags": os.environ.get("XLA_FLAGS"), "environment": dict(os.environ)}}
+before, filters = state(), list(warnings.filters)
+for name in {names}:
+    importlib.import_module(name)
+after = state()
+changed = [key for key in after if after[key] is not before.get(key) and after[key] != before.get(key)]
+started = bool(jax._src.xla_bridge._backends)
+
+from ptsmc_jax import configure, scenario, study
+warnings.simplefilter("error")  # which stops it there
+try:
+    study(scenario.from_tables({{}}))
+except RuntimeWarning as warning:
+    warned = str(warning)
+jax.numpy.zeros(3)
+try:
+    configure.configure(devices=2, cache=None, fast=False)
+except RuntimeError as error:
+    late = str(error)
+print(json.dumps([changed, started, len(before), warned, late]))
+""")
+    assert changed == []
+    assert started is False
+    assert looked > 50  # it did look
+    assert warned.startswith("JAX computes with 32 bits here")
+    assert late.startswith("configure() comes too late")
+
+
+@pytest.mark.parametrize("package", ["ptsmc_jax", "ptsmc_jax.scenario"])
+def test_every_export_resolves(package):
+    offering = importlib.import_module(package)
+    assert offering._EXPORTS
+    for name, module in offering._EXPORTS.items():
+        assert getattr(offering, name) is getattr(importlib.import_module(f"{package}.{module}"), name)
+    assert set(offering._EXPORTS) <= set(dir(offering))
+    with pytest.raises(AttributeError, match="no_such_name"):
+        offering.no_such_name  # noqa: B018
+
+
+@pytest.mark.parametrize("package", ["ptsmc_jax", "ptsmc_jax.scenario"])
+def test_type_checkers_see_the_same_exports(package):
+    tree = ast.parse(modules()[package].read_text())
+    (block,) = [node for node in tree.body if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"]
+    seen = {}
+    for node in block.body:
+        assert isinstance(node, ast.ImportFrom)
+        for alias in node.names:
+            assert alias.asname == alias.name  # marks a re-export
+            seen[alias.name] = str(node.module).removeprefix(f"{package}.")
+    assert seen == importlib.import_module(package)._EXPORTS
+
+
+@pytest.mark.parametrize("package", ["ptsmc_jax", "ptsmc_jax.scenario"])
+def test_type_checkers_know_every_argument_of_the_functions_offered(package):
+    offering = importlib.import_module(package)
+    functions = [item for item in map(offering.__getattr__, offering._EXPORTS) if inspect.isfunction(item)]
+    assert len(functions) > 3  # it did look
+    for function in functions:
+        assert set(inspect.signature(function).parameters) <= set(function.__annotations__), function.__name__
