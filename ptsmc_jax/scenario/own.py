@@ -271,11 +271,11 @@ def _plain(value: object) -> typing.TypeGuard[float]:
 
 def _gain(table: Any, found: Any, field: dataclasses.Field, gain: Any) -> GainBounds:
     """The bounds of a field that is a gain. Raises ValueError where it cannot be one of such a table."""
-    from ptsmc_jax.simulation.gains import of_law
+    from ptsmc_jax.simulation.gains import is_reserved
 
     if not table.tuned:
         raise ValueError(f"its field {field.name} is a gain, but of such a part none is tuned; allowed is a number")
-    if not table.prefix and not of_law({field.name: gain}):
+    if not table.prefix and is_reserved(field.name):
         raise ValueError(f"the name of its gain {field.name} stands for one of another part")
     bounds = _bounds(gain, f"gain {field.name} of the class {found.__name__}")
     _inside(field, gain.usual)

@@ -1,109 +1,100 @@
-"""The gains of parts by name: read, and set in parts, under any transformation.
+"""The gains of parts: a table from the name of each gain to its path, and how gains are read and set.
 
 A gain that has a number for each axis may be named axis by axis, `observer_gain_1` and so on.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jax import core
 from jaxtyping import Array
 
+from ptsmc_jax.numerics import paths
 from ptsmc_jax.simulation.assembly import Parts, check_parts
 
-AXIS = "observer_gain_"
+WHOLE, AXIS = "observer_gain", "observer_gain_"
+BANDWIDTH, T_F = "sensors.filter.bandwidth", "controller.t_f"  # both change more than one field of the parts
+LAST = ("k1", "sign_width", "surface_rate", "t_f")  # gains of a law that reports list after those of the observer
 MADE_ANEW = "make the parts for them, with ptsmc_jax.replace or with the reach of scenario.study"
-SENSORS = "sensors_"  # prefix of the gains that sensors of one's own have
-
-
-class _Device(NamedTuple):
-    """The gain of a device between the law and the plant."""
-
-    there: Callable[[Parts], bool]
-    read: Callable[[Parts], Any]
-    write: Callable[[Parts, Any], Parts]
-
-
-_DEVICES = {
-    "filter_bandwidth": _Device(
-        lambda parts: getattr(parts.sensors, "filter", None) is not None,
-        lambda parts: parts.sensors.bandwidth(parts.period),
-        lambda parts, value: replace(parts, sensors=parts.sensors.with_bandwidth(value, parts.period)),
-    ),
-    "command_corner": _Device(
-        lambda parts: parts.command_filter is not None,
-        lambda parts: parts.command_filter.corner,
-        lambda parts, value: replace(parts, command_filter=replace(parts.command_filter, corner=value)),
-    ),
-}
 
 
 def base(name: str) -> str:
-    """The gain that a name stands for: `observer_gain` for `observer_gain_2`."""
-    of_axis = name.startswith(AXIS) and name.removeprefix(AXIS).isdecimal()  # not one that a part of one's own has
-    return "observer_gain" if of_axis else name
+    """Return the gain that a name belongs to: `observer_gain` for `observer_gain_2`."""
+    return WHOLE if name.startswith(AXIS) and name.removeprefix(AXIS).isdecimal() else name
 
 
-def of_observer(gains: Mapping[str, Any]) -> dict[str, Any]:
-    """Gains of an observer of one's own, by its fields."""
-    return {
-        name.removeprefix("observer_"): value
-        for name, value in gains.items()
-        if name.startswith("observer_") and base(name) != "observer_gain"
-    }
+def is_reserved(name: str) -> bool:
+    """Whether a name belongs to a gain of the observer, the sensors or a filter, so that no law may use it."""
+    return name.startswith(("observer_", "sensors_")) or name in ("filter_bandwidth", "command_corner")
 
 
-def of_sensors(gains: Mapping[str, Any]) -> dict[str, Any]:
-    """Gains of sensors of one's own, by their fields."""
-    return {name.removeprefix(SENSORS): v for name, v in gains.items() if name.startswith(SENSORS)}
+def paths_of(parts: Parts) -> dict[str, str]:
+    """Return the path of every gain by its name, such as `{"eta": "controller.eta"}`, in the order of reports.
+
+    Raises ValueError if the law and another part have a gain of the same name.
+    """
+    law = {name: f"controller.{name}" for name in parts.controller.tunable}
+    axes = {f"{AXIS}{k + 1}": f"observer.gain[{k}]" for k in range(len(getattr(parts.observer, "gain", ())))}
+    observer = {WHOLE: "observer.gain"} if axes else {}
+    observer |= {f"observer_{name}": f"observer.{name}" for name in parts.observer.tunable}
+    own_sensors = getattr(parts.sensors, "own", None)
+    devices = {f"sensors_{name}": f"sensors.own.{name}" for name in getattr(own_sensors, "tunable", ())}
+    if getattr(parts.sensors, "filter", None) is not None:
+        devices["filter_bandwidth"] = BANDWIDTH
+    if parts.command_filter is not None:
+        devices["command_corner"] = "command_filter.corner"
+    for name in law.keys() & (observer | devices | axes).keys():
+        raise ValueError(f"{name} is a gain of the law and of another part; rename the gain of the law")
+    last = {name: law.pop(name) for name in parts.controller.tunable if name in LAST}
+    return {**law, **observer, **last, **devices, **axes}
 
 
-def of_law(gains: Mapping[str, Any]) -> dict[str, Any]:
-    """Gains of the law."""
-    return {k: v for k, v in gains.items() if not k.startswith(("observer_", SENSORS)) and k not in _DEVICES}
+def _get(parts: Parts, path: str) -> Any:
+    return parts.sensors.bandwidth(parts.period) if path == BANDWIDTH else paths.get(parts, path)
+
+
+def _put(parts: Parts, path: str, value: Any) -> Parts:
+    if path == BANDWIDTH:
+        return replace(parts, sensors=parts.sensors.with_bandwidth(value, parts.period))
+    if path == T_F:
+        return parts.with_t_f(value)
+    if path == "observer.gain":
+        value = jnp.stack([value] * len(parts.observer.gain))
+    return paths.put(parts, path, value)
 
 
 def with_gains(parts: Parts, gains: Mapping[str, Array | float]) -> Parts:
-    """The parts with other gains, by name; `observer_gain` is set on all axes, and with t_f the time after it kept.
+    """Return the parts with other gains. `observer_gain` sets all axes; `t_f` moves the end of the run with it.
 
-    Which numbers a law has theorems for is not asked here, as eta > 2; scenarios ask it, see `in_scenario`.
+    The conditions of a law's theorems, such as eta > 2, are not checked here. Scenarios check them, see `in_scenario`.
 
-    Raises ValueError where there is no such gain, where one is no finite number, and where the parts' anchored clock
-    has too few samples for them, or a continuous loop too few steps before the hand-over, as far as they are known:
-    under a transformation such a run comes back as `unfinished`; TypeError where there are no parts.
+    Args:
+        parts: the parts that have these gains.
+        gains: scalars by name [units as in the scenario].
+
+    Raises:
+        ValueError: a name is unknown, a value is no finite number, or the clock of the parts has too few samples or
+            steps for the new times. Under a transformation such a run comes back as `unfinished` instead.
+        TypeError: `parts` are no parts.
     """
     check_parts(parts)
-    _check_names(parts, gains)
-    gains = {name: _number(name, value) for name, value in gains.items()}
-    for name, value in gains.items():
-        if value.ndim and name == "observer_gain":
-            raise ValueError(f"the observer's gain must be a number; {AXIS}1 and so on name those of its axes")
-        if value.ndim:
-            raise ValueError(f"{name} must be a number, but has shape {value.shape}; jax.vmap takes one at a time")
-    if "t_f" in gains:
-        parts = parts.with_t_f(gains["t_f"])
-    law = {name: value for name, value in of_law(gains).items() if name != "t_f"}
-    parts = replace(parts, controller=replace(parts.controller, **law))
-    if of_observer(gains):
-        parts = replace(parts, observer=replace(parts.observer, **of_observer(gains)))
-    axes = on_every_axis(gains, list(getattr(parts.observer, "gain", ())))
-    if axes is not None:
-        parts = replace(parts, observer=replace(parts.observer, gain=jnp.stack(axes)))
-    if of_sensors(gains):
-        own_sensors = replace(parts.sensors.own, **of_sensors(gains))
-        parts = replace(parts, sensors=replace(parts.sensors, own=own_sensors))
-    for name, device in _DEVICES.items():
-        if name in gains:
-            parts = device.write(parts, gains[name])
+    known = {"t_f": T_F, **paths_of(parts)}
+    for name in gains:
+        if name not in known:
+            raise ValueError(f"{name} is no gain of these parts; allowed are {', '.join(sorted(known))}")
+    numbers = {name: _number(name, value) for name, value in gains.items()}
+    for name, path in known.items():  # in this order: the gain of a single axis wins over that of all axes
+        if name in numbers:
+            parts = _put(parts, path, numbers[name])
     _check_clock(parts)
     return parts
 
 
 def _number(name: str, value: Any) -> Array:
-    """A gain as an array. Raises ValueError where it is known to be none: JAX reads words as numbers, too."""
+    """Return a gain as an array. Raises ValueError if it is no finite scalar: JAX reads words as numbers, too."""
     try:
         if isinstance(value, str | bytes | bool) or value is None:
             raise TypeError
@@ -112,29 +103,14 @@ def _number(name: str, value: Any) -> Array:
         raise ValueError(f"{name} is {value!r}, but must be a number") from None
     if not (isinstance(number, core.Tracer) or np.isfinite(number).all()):
         raise ValueError(f"{name} is {value!r}, but must be a finite number")
+    if number.ndim:
+        instead = f"{AXIS}1, {AXIS}2, .. set single axes" if name == WHOLE else "jax.vmap takes one at a time"
+        raise ValueError(f"{name} must be a number, but has shape {number.shape}; {instead}")
     return number
 
 
-def _check_names(parts: Parts, names: Iterable[str]) -> None:
-    """Raises ValueError where one of these is no gain of the parts."""
-    axes = len(getattr(parts.observer, "gain", ()))
-    allowed = {"t_f", *parts.controller.tunable, *(f"observer_{name}" for name in parts.observer.tunable)}
-    if axes:
-        allowed |= {"observer_gain", *(f"{AXIS}{k + 1}" for k in range(axes))}
-    allowed |= {SENSORS + name for name in _tunable_of_sensors(parts)}
-    allowed |= {name for name, device in _DEVICES.items() if device.there(parts)}
-    for name in names:
-        if name not in allowed:
-            raise ValueError(f"{name} is no gain of these parts; allowed are {', '.join(sorted(allowed))}")
-
-
-def _tunable_of_sensors(parts: Parts) -> tuple[str, ...]:
-    """Gains of sensors of one's own, by their fields."""
-    return getattr(getattr(parts.sensors, "own", None), "tunable", ())
-
-
 def _check_clock(parts: Parts) -> None:
-    """Raises ValueError where a clock has too few samples or steps for t_f and delta, as far as these are known."""
+    """Raise ValueError if a clock has too few samples or steps for t_f and delta, as far as these are known."""
     clock: Any = parts.clock
     law = parts.controller
     longest = clock.period if clock.sampled else clock.max_step  # step
@@ -142,7 +118,7 @@ def _check_clock(parts: Parts) -> None:
     if any(isinstance(v, core.Tracer) or np.ndim(v) > 0 for v in times):
         return
     t_f, delta, t_end, longest = map(float, times)
-    # by plain numbers: where another gain is traced, JAX's would be too
+    # by plain numbers: if another gain is traced, JAX's would be too
     if not clock.sampled and replace(clock, max_step=longest).too_coarse(t_f, delta, np):
         raise ValueError(
             f"t_f = {t_f:g} s with delta = {delta:g} s needs more than the {clock.before} steps that the parts' "
@@ -159,32 +135,27 @@ def _check_clock(parts: Parts) -> None:
             )
 
 
+def own(parts: Parts, names: Iterable[str]) -> list[float]:
+    """Return the present values of these gains; that of `observer_gain` is the mean of its axes."""
+    known, values = paths_of(parts), list[float]()
+    for name in names:
+        value = np.ravel(_get(parts, known[name])).tolist()
+        values.append(sum(value) / len(value))
+    return values
+
+
 def gains_of(parts: Parts) -> dict[str, float]:
-    """Every gain of the parts by name; the observer's also axis by axis, `observer_gain` then being their mean."""
+    """Return every gain of the parts by name. Those of single axes are listed if they differ."""
     check_parts(parts)
-    controller = parts.controller
-    law = [name for name in controller.tunable if name not in ("k1", "sign_width", "surface_rate", "t_f")]
-    gains = {name: float(getattr(controller, name)) for name in law}
-    axes = [float(v) for v in getattr(parts.observer, "gain", ())]
-    if axes:
-        gains["observer_gain"] = sum(axes) / len(axes)
-    gains |= {f"observer_{name}": float(getattr(parts.observer, name)) for name in parts.observer.tunable}
-    gains |= {name: float(getattr(controller, name)) for name in controller.tunable if name not in law}
-    for name in _tunable_of_sensors(parts):
-        gains[SENSORS + name] = float(getattr(parts.sensors.own, name))
-    gains |= {name: float(device.read(parts)) for name, device in _DEVICES.items() if device.there(parts)}
-    return {**gains, **{f"{AXIS}{k + 1}": v for k, v in enumerate(axes) if len(set(axes)) > 1}}
-
-
-def own(parts: Parts, names: tuple[str, ...]) -> list[float]:
-    """The parts' own values of these gains."""
-    gains = gains_of(parts)
-    axes = {f"{AXIS}{k + 1}": float(value) for k, value in enumerate(getattr(parts.observer, "gain", ()))}
-    return [(axes if base(name) != name else gains)[name] for name in names]
+    names = [*paths_of(parts)]
+    gains = dict(zip(names, own(parts, names), strict=True))
+    axes = [name for name in names if base(name) != name]
+    alike = len({gains[name] for name in axes}) <= 1
+    return {name: value for name, value in gains.items() if not (alike and name in axes)}
 
 
 def on_every_axis(gains: Mapping[str, Any], own: list[Any]) -> list[Any] | None:
-    """The observer's gain on every axis, where these gains name one; own: its values without them."""
-    if not any(base(name) == "observer_gain" for name in gains):
+    """Return the observer gain of every axis, or None if `gains` name none; own: the values without them."""
+    if not any(base(name) == WHOLE for name in gains):
         return None
-    return [gains.get(f"{AXIS}{k + 1}", gains.get("observer_gain", value)) for k, value in enumerate(own)]
+    return [gains.get(f"{AXIS}{k + 1}", gains.get(WHOLE, value)) for k, value in enumerate(own)]

@@ -1,7 +1,8 @@
 """Gains by name: moved in parts as in the scenario, axis by axis, the time after t_f kept."""
 
 import tomllib
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +11,8 @@ import pytest
 
 from ptsmc_jax import scenario
 from ptsmc_jax.devices import attitude_filter
+from ptsmc_jax.laws import prescribed_time
+from ptsmc_jax.numerics.pytrees import pytree
 from ptsmc_jax.scenario import free_gains, from_tables, study, timing
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.gain_record import Choice
@@ -182,7 +185,10 @@ def test_a_scenario_is_given_no_filter_that_it_does_not_have(tables, name):
 def test_an_observers_gain_is_a_number_on_every_axis_or_one_for_each():
     """A list, as in a scenario, made a matrix of three, and a scan of which JAX said that its carry did not fit."""
     parts = study(from_tables(BASE)).parts
-    with pytest.raises(ValueError, match="must be a number; observer_gain_1 and so on name those of its axes"):
+    with pytest.raises(
+        ValueError,
+        match=r"must be a number, but has shape \(3,\); observer_gain_1, observer_gain_2, .. set single axes",
+    ):
         gains.with_gains(parts, {"observer_gain": vector(10.0, 10.0, 10.0)})
     many = jax.vmap(lambda gain: gains.with_gains(parts, {"observer_gain": gain}).observer.gain)(vector(3.0, 4.0))
     np.testing.assert_array_equal(many, [[3.0] * 3, [4.0] * 3])
@@ -448,3 +454,33 @@ def test_the_published_gains_scale_with_the_mission_and_follow_the_order_of_a_ch
     of_chain = gains.of_paper(from_tables({**tables, "plant": {"kind": "chain", "order": order}}))
     assert of_chain == {name: known[name] for name in of_chain}
     assert {"eta", "delta", "k1"} <= set(of_chain)
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class Shared(prescribed_time.PrescribedTime):
+    """A custom law whose gain has a name that begins like those of an observer."""
+
+    observer_share: float = 0.5
+    tunable: ClassVar[tuple[str, ...]] = (*prescribed_time.PrescribedTime.tunable, "observer_share")
+
+
+def shared(parts):
+    law = parts.controller
+    return replace(parts, controller=Shared(**{f.name: getattr(law, f.name) for f in fields(law)}))
+
+
+def test_a_gain_of_a_custom_law_is_set_in_the_law_whatever_its_name_begins_with():
+    parts = shared(study(from_tables(BASE)).parts)
+    moved = gains.with_gains(parts, {"observer_share": 0.25, "observer_gain": 4.0})
+    assert (float(moved.controller.observer_share), gains.gains_of(moved)["observer_share"]) == (0.25, 0.25)
+    np.testing.assert_array_equal(moved.observer.gain, [4.0] * 3)
+
+
+def test_a_name_of_two_gains_is_refused():
+    """The gain `share` of an observer has the name `observer_share`, too."""
+    parts = shared(study(from_tables(BASE)).parts)
+    observer = replace(parts.observer)
+    object.__setattr__(observer, "tunable", ("share",))
+    with pytest.raises(ValueError, match="observer_share is a gain of the law and of another part"):
+        gains.with_gains(replace(parts, observer=observer), {"eta": 3.0})

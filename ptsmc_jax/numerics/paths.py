@@ -1,0 +1,47 @@
+"""Values inside nested parts, by their paths: `observer.gain[1]` is element 1 of the field `gain` of `observer`."""
+
+import re
+from dataclasses import replace
+from typing import Any
+
+import jax.numpy as jnp
+
+
+def _steps(path: str) -> list[str | int]:
+    return [int(step) if step.isdecimal() else step for step in re.findall(r"\w+", path)]
+
+
+def get(tree: Any, path: str) -> Any:
+    """Return the value at a path; raises AttributeError if there is none."""
+    for step in _steps(path):
+        tree = tree[step] if isinstance(step, int) else getattr(tree, step)
+    return tree
+
+
+def exists(tree: Any, path: str) -> bool:
+    """Whether every field on the path exists, with a value or None at its end."""
+    *owners, last = _steps(path)
+    for step in owners:
+        tree = getattr(tree, str(step), None)
+    return hasattr(tree, str(last))
+
+
+def put(tree: Any, path: str, value: Any) -> Any:
+    """Return a copy of nested dataclasses, named tuples and arrays with another value at a path.
+
+    Args:
+        tree: the outermost dataclass, named tuple or array; it stays as it is.
+        path: fields and indices from the tree to the value.
+        value: the new value.
+    """
+    return _put(tree, _steps(path), value)
+
+
+def _put(tree: Any, steps: list[str | int], value: Any) -> Any:
+    if not steps:
+        return value
+    step, *rest = steps
+    if isinstance(step, int):
+        return jnp.stack([_put(tree[k], rest, value) if k == step else tree[k] for k in range(len(tree))])
+    new = {step: _put(getattr(tree, step), rest, value)}
+    return tree._replace(**new) if hasattr(tree, "_replace") else replace(tree, **new)
