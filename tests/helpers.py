@@ -18,6 +18,8 @@ from polars.testing import assert_frame_equal
 
 from ptsmc_jax import configure, programs
 from ptsmc_jax.devices import sensors
+from ptsmc_jax.dispersions import numbers
+from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.laws.base import Sample
 from ptsmc_jax.laws.kinematics import AdditiveKinematics, ChainKinematics
 from ptsmc_jax.laws.prescribed_time import PrescribedTime, PrescribedTimeChain
@@ -133,6 +135,11 @@ errors_along = jax.jit(jax.vmap(solutions.exact_error, (0, None, None, None, Non
 def vector(*values: Any) -> Any:
     """A float64 array."""
     return jnp.asarray(np.asarray(values[0] if len(values) == 1 else values, dtype=float), dtype=float)
+
+
+def random_turns(smallest, largest):
+    """Return the dispersion that turns the start from the reference by an angle between these [rad]."""
+    return Dispersion({"initial_attitude": numbers.axis_angle(smallest, largest)})
 
 
 def parts(

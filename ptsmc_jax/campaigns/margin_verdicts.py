@@ -13,8 +13,8 @@ from ptsmc_jax.batching import lapack
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.dispersions import planned
 from ptsmc_jax.dispersions.base import INERTIA, INITIAL_ATTITUDE, INITIAL_RATE, INITIAL_STATE, OWN, REFERENCE
-from ptsmc_jax.dispersions.misfits import OF_MISFITS
 from ptsmc_jax.dispersions.planned import Row
+from ptsmc_jax.dispersions.quantities import QUANTITIES
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.scenario import Study
 from ptsmc_jax.simulation.assembly import Parts
@@ -23,8 +23,9 @@ from ptsmc_jax.simulation.requirements import Requirement, Verdict
 from ptsmc_jax.theory import linear, margins, rest, run_margins
 
 TRIALS = 256  # whose loops are looked at, where they differ
-# what a loop hangs on besides misfits: body, and where on its way it is
+# quantities that change the linearised loop: hardware errors, the body, and the trajectory
 OF_LOOPS = {INERTIA, OWN, INITIAL_ATTITUDE, INITIAL_RATE, INITIAL_STATE, REFERENCE}
+OF_LOOPS |= {name for name, quantity in QUANTITIES.items() if quantity.hardware}
 CALL = 32  # of them that are flown and linearised at once
 JUDGED = 16  # loops judged in full at a time
 DELAY = "delay_margin"  # the one margin that commands late within a period are looked at for
@@ -72,7 +73,7 @@ def prepare(ready: Study, rows: np.ndarray | Row | None = None) -> None:
 
 def _whose_loops_differ(ready: Study, rows: np.ndarray | Row | None) -> np.ndarray | Row | None:
     """The trials that margins are asked of; None: of the nominal loop, which is that of all, or none is asked for."""
-    planned_loops = isinstance(rows, Row) and not rows.given.keys().isdisjoint({*OF_LOOPS, *OF_MISFITS})
+    planned_loops = isinstance(rows, Row) and not OF_LOOPS.isdisjoint(rows.given)
     if not ready.margins or not (planned_loops or differ(ready.dispersion)):
         return None
     return np.arange(TRIALS) if rows is None else rows
@@ -86,7 +87,7 @@ def _verdicts(asked: Sequence[Requirement], by_name: Mapping[str, Any]) -> list[
 
 def differ(dispersion: Dispersion) -> bool:
     """Whether loops differ from trial to trial."""
-    return not OF_LOOPS.isdisjoint(dispersion.kinds) or bool(dispersion.misfits)
+    return not OF_LOOPS.isdisjoint(dispersion.kinds)
 
 
 def nearness(value: Any, limit: Any, name: str) -> Any:

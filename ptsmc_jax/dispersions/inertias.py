@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ptsmc_jax.dispersions.base import FARTHEST, Drawn
-from ptsmc_jax.numerics import attitude, guards
+from ptsmc_jax.dispersions.numbers import FARTHEST
+from ptsmc_jax.numerics import attitude, draws, guards
 from ptsmc_jax.numerics.pytrees import Leaf, pytree
 
 CANDIDATES, SLENDER = 16, 4  # bodies drawn for one that is physical, and if none is, in another way
@@ -31,7 +31,7 @@ class RelativeInertia:
     axes: Leaf  # (3, 3) their axes in columns
     std: Leaf  # of a moment, relative [-], at most 0.3
     turn: Leaf  # of the axes, per axis [rad]
-    drawn: ClassVar[Drawn] = "normal"
+    drawn: ClassVar[draws.Distribution] = "normal"
     count: ClassVar[int] = 3 * CANDIDATES + 3 + 4 * SLENDER
 
     def at(self, c: Float[Array, " n"]) -> tuple[Float[Array, "3 3"], Float[Array, "3 3"]]:

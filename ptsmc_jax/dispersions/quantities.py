@@ -1,7 +1,7 @@
-"""What a trial flies with, by the names of its columns in rows and plans: read from the parts, and set in them.
+"""The table of all quantities that may differ from trial to trial.
 
-A quantity is a row of `QUANTITIES`, by the name of the stream that it is drawn from: what is drawn of it is told in
-these columns, and a plan may give it there.
+Each has a name, which is also that of the stream of its random numbers, and the columns in which rows list it and plans
+give it.
 """
 
 from collections.abc import Iterable
@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from ptsmc_jax import formulas
 from ptsmc_jax.devices.sensors import RATE_BIAS
@@ -22,42 +22,46 @@ from ptsmc_jax.dispersions.base import (
     INITIAL_ATTITUDE,
     INITIAL_RATE,
     INITIAL_STATE,
-    NEAR,
-    PAIRS,
     REFERENCE,
-    Numbers,
+    Given,
     Quantity,
     UnfitError,
+    at_path,
+    fitting,
     not_negative,
     numbered,
-    of_field,
-    plant_of,
     positive,
     reason,
-    tensors,
 )
-from ptsmc_jax.dispersions.misfits import OF_MISFITS, check_inertia
-from ptsmc_jax.numerics import matrices
+from ptsmc_jax.dispersions.numbers import (
+    Numbers,
+    Random,
+    replaced,
+    scaled,
+    turned,
+    turned_about_axis,
+    turned_from_reference,
+)
+from ptsmc_jax.numerics import attitude, matrices, paths
 from ptsmc_jax.plants.rigid_body import Spacecraft
 from ptsmc_jax.signals import disturbances
 from ptsmc_jax.simulation.rollout import Parts
 
-# of what a trial may have more or less, by one factor: name -> where in the parts it stands, and its unit
-LEVELS = {
-    "attitude_noise": ("sensors", "attitude_noise", "rad"),
-    "rate_noise": ("sensors", "rate_noise", "rad/s"),
-    "state_noise": ("sensors", "sigma", ""),
-    "torque_limit": ("actuators", "torque_limit", "N m"),
-}
+NEAR = 1e-6  # relative: largest error of the norm of a unit vector or quaternion in a plan
+PAIRS = [(i, j) for i in range(3) for j in range(i, 3)]  # the upper triangle, in the order of the inertia's columns
+LEVELS = ("attitude_noise", "rate_noise", "state_noise", "torque_limit")  # are dispersed by one factor
 
 
 def level(name: str) -> str:
-    """The stream that a factor of `LEVELS` is drawn from."""
+    """Return the name of the quantity that one of `LEVELS` is."""
     return f"{name}_level"
 
 
+# --- attitudes and inertia ---
+
+
 def _unit(q: np.ndarray) -> np.ndarray:
-    """Unit quaternions (rows, 4); those that are unit ones but for rounding stay to the last digit."""
+    """Return unit quaternions (rows, 4); norms of 1 up to rounding leave every digit unchanged."""
     norm = np.linalg.norm(q, axis=1)
     UnfitError.check(np.abs(norm - 1.0) <= NEAR, lambda k: f"a unit quaternion (its norm is {norm[k]:.9g})")
     rounding = np.abs(norm - 1.0) < 1e-14
@@ -65,25 +69,56 @@ def _unit(q: np.ndarray) -> np.ndarray:
 
 
 def with_body(parts: Parts, body: Spacecraft) -> Parts:
-    """The parts with another true body, on which the disturbance acts."""
+    """Return the parts with another true body, on which the disturbance acts."""
     return replace(parts, plant=body, disturbance=disturbances.on_body(parts.disturbance, body.inertia))
 
 
 def _with_inertia(parts: Parts, entries: Numbers) -> Parts:
     named = {pair: entries[k] for k, pair in enumerate(PAIRS)}
     inertia = jnp.stack([jnp.stack([named[min(i, j), max(i, j)] for j in range(3)]) for i in range(3)])
-    return with_body(parts, plant_of(parts).with_inertia(inertia, matrices.solve(inertia, jnp.eye(3))))
+    return with_body(parts, paths.get(parts, "plant").with_inertia(inertia, matrices.solve(inertia, jnp.eye(3))))
+
+
+def _tensors(rows: np.ndarray) -> np.ndarray:
+    """Return the symmetric tensors (rows, 3, 3) of upper triangles (rows, 6), see `PAIRS` [kg m^2]."""
+    full = np.zeros((len(rows), 3, 3))
+    for k, (i, j) in enumerate(PAIRS):
+        full[:, i, j] = full[:, j, i] = rows[:, k]
+    return full
 
 
 def _inertia_checked(rows: np.ndarray) -> np.ndarray:
-    full = tensors(rows)
+    full = _tensors(rows)
     UnfitError.check(
         formulas.bodies(full), lambda k: f"a rigid body's inertia ({reason(formulas.check_inertia, full[k])})"
     )
     return rows
 
 
-def _of_disturbance(name: str, what: Literal["phase", "amplitude"], unit: str) -> Quantity:
+def _modes(parts: Parts) -> int:
+    """Return how many flexible modes the true plant has."""
+    return getattr(parts.plant, "frequency", np.zeros(0)).shape[-1]
+
+
+def _check_flexible_body(given: Given, parts: Parts) -> None:
+    """Check that a flexible body can have the inertia and the coupling of each row, or else the nominal ones."""
+    if not _modes(parts):
+        return
+    body, count = paths.get(parts, "plant"), len(next(iter(given.values())))
+    inertia = _tensors(given[INERTIA]) if INERTIA in given else np.broadcast_to(body.inertia, (count, 3, 3))
+    what, coupling = "inertia", np.broadcast_to(body.coupling, (count, *body.coupling.shape))
+    if "mode_coupling" in given:
+        what, coupling = "coupling", given["mode_coupling"].reshape(coupling.shape)
+    UnfitError.check(
+        formulas.flexible_bodies(inertia, coupling),
+        lambda k: f"a flexible body's {what} ({reason(formulas.rest_inertia, inertia[k], coupling[k])})",
+    )
+
+
+# --- disturbance ---
+
+
+def _of_disturbance(name: str, what: Literal["phase", "amplitude"], **others: Any) -> Quantity:
     def read(parts: Parts) -> Numbers:
         return disturbances.values(parts.disturbance, what)
 
@@ -91,80 +126,209 @@ def _of_disturbance(name: str, what: Literal["phase", "amplitude"], unit: str) -
         lambda parts: numbered(f"{name}_", read(parts).size),
         read,
         lambda parts, new: replace(parts, disturbance=disturbances.with_values(parts.disturbance, what, new)),
-        unit=unit,
+        **others,
     )
 
 
-def _level(name: str) -> Quantity:
-    part, key, unit = LEVELS[name]
+# --- actuators and samples ---
 
-    def value_in(parts: Parts) -> Any:
-        return getattr(getattr(parts, part), key, None)
 
-    def columns(parts: Parts) -> list[str]:
-        value = value_in(parts)
-        if value is None:
-            return []
-        return [name] if value.ndim == 0 else numbered(f"{name}_", value.shape[0])
+def channels(parts: Parts) -> Float[Array, "m channels"]:
+    """Return the directions (m, channels) [-] of body axes, or wheels, that flight software assumes."""
+    wheels = parts.effective_actuators.wheels
+    return jnp.eye(parts.plant.inputs) if wheels is None else wheels.axes
 
-    def write(parts: Parts, new: Numbers) -> Parts:
-        device = getattr(parts, part)
-        return replace(parts, **{part: replace(device, **{key: new.reshape(value_in(parts).shape)})})
 
-    checked = positive if name == "torque_limit" else not_negative
-    return Quantity(columns, lambda parts: jnp.ravel(value_in(parts)), write, checked, unit=unit)
+def _size(parts: Parts) -> int:
+    return channels(parts).shape[1] if parts.clock.sampled else 0
 
+
+def _with_actuators(parts: Parts, **changes: Any) -> Parts:
+    return replace(parts, actuators=replace(parts.effective_actuators, **changes))
+
+
+def _scale(parts: Parts) -> Numbers:
+    scale = parts.effective_actuators.scale
+    return jnp.ones(_size(parts)) if scale is None else scale
+
+
+def _directions(parts: Parts) -> Numbers:
+    """Return the true directions of the channels, one after the other, (3 channels,) [-]."""
+    directions = parts.effective_actuators.directions
+    return jnp.ravel((channels(parts) if directions is None else directions).T)
+
+
+def _turned_channels(random: Random, nominal: Numbers, parts: Parts) -> Numbers:
+    """Return the assumed directions, one after the other (3 channels,) [-], each turned by a rotation vector [rad]."""
+    turns, axes = random.reshape(-1, 3), channels(parts)
+    each = [attitude.rotate(attitude.from_rotation_vector(turns[k]), axes[:, k]) for k in range(axes.shape[1])]
+    return jnp.concatenate(each)
+
+
+def _failure(parts: Parts) -> Numbers:
+    """Return the time when a wheel fails [s] and its number from 1 on, (2,); infinite and 0: none does."""
+    fails = parts.effective_actuators.failure_times
+    if fails is None:
+        return jnp.array([jnp.inf, 0.0])
+    wheel = jnp.argmin(fails).astype(float) + 1.0
+    return jnp.stack([jnp.min(fails), jnp.where(jnp.any(jnp.isfinite(fails)), wheel, 0.0)])
+
+
+def _with_failure(parts: Parts, failure: Numbers) -> Parts:
+    wheel = jnp.arange(channels(parts).shape[1]).astype(float) + 1.0
+    return _with_actuators(parts, failure_times=jnp.where(wheel == failure[1], failure[0], jnp.inf))
+
+
+def _any_wheel(random: Random, nominal: Numbers, parts: Parts) -> Numbers:
+    """Return a time [s] and the number of a wheel, from the time and a number on (0, 1)."""
+    return jnp.stack([random[0], 1.0 + jnp.floor(random[1] * channels(parts).shape[1])])
+
+
+def _check_wheel(given: Given, parts: Parts) -> None:
+    wheel, last = given["wheel_failure"][:, 1], channels(parts).shape[1]
+    fit = (wheel == np.round(wheel)) & (wheel >= 0.0) & (wheel <= last)
+    UnfitError.check(fit, lambda row: f"a time and the number of a wheel, from 1 to {last}, or 0 for none")
+
+
+def _check_jitter(given: Given, parts: Parts) -> None:
+    """Check that no control period is longer than the window over which pointing is averaged."""
+    if parts.pointing is not None:
+        most = 0.5 * (float(parts.pointing.window) / float(parts.period) - 1.0)
+        fit = given["timing_jitter"][:, 0] <= most + 1e-9
+        UnfitError.check(fit, lambda row: f"at most {most:.6g}, by which no control period exceeds pointing.window")
+
+
+def _paired(name: str, count: int) -> list[str]:
+    """Return names of vectors of three: number of the vector, then of the component."""
+    return [f"{name}_{k + 1}{i + 1}" for k in range(count) for i in range(3)]
+
+
+_OUTAGE = ("star_tracker_outage_begin", "star_tracker_outage_end")
+_FAILURE = ("wheel_failure_time", "wheel_failure_wheel")
 
 # in the order of their columns
 QUANTITIES: dict[str, Quantity] = {
-    INITIAL_ATTITUDE: Quantity(
-        lambda parts: numbered("initial_q", 4) if parts.plant.attitude else [],
-        lambda parts: parts.initial.q,
-        lambda parts, q: replace(parts, initial=parts.initial._replace(q=q)),
-        _unit,
+    INITIAL_ATTITUDE: at_path(
+        "initial.q",
+        "initial_q",
+        combine={"normal": turned, "axis_angle": turned_from_reference, "any_attitude": replaced},
+        checked=_unit,
     ),
-    INITIAL_RATE: Quantity(
-        lambda parts: numbered("initial_w", 3) if parts.plant.attitude else [],
-        lambda parts: parts.initial.w,
-        lambda parts, w: replace(parts, initial=parts.initial._replace(w=w)),
-        unit="rad/s",
-    ),
+    INITIAL_RATE: at_path("initial.w", "initial_w", unit="rad/s"),
     INITIAL_STATE: Quantity(
         lambda parts: [] if parts.plant.attitude else numbered("initial_x", parts.plant.visible(parts.initial).size),
         lambda parts: parts.plant.visible(parts.initial),
         lambda parts, x: replace(parts, initial=parts.plant.with_hidden_at_rest(x)),
         unit="",
     ),
-    REFERENCE: of_field("reference", "q", numbered("reference_q", 4), checked=_unit),
-    INERTIA: Quantity(
-        lambda parts: [f"{INERTIA}_{i + 1}{j + 1}" for i, j in PAIRS] if parts.plant.attitude else [],
-        lambda parts: jnp.stack([plant_of(parts).inertia[i, j] for i, j in PAIRS]),
-        _with_inertia,
-        _inertia_checked,
-        check_inertia,
-        unit="kg m^2",
+    REFERENCE: at_path(
+        "reference.q",
+        "reference_q",
+        combine={"normal": turned, "axis_angle": turned_about_axis, "any_attitude": replaced},
+        checked=_unit,
     ),
-    DISTURBANCE_PHASE: _of_disturbance(DISTURBANCE_PHASE, "phase", "rad"),
-    DISTURBANCE_AMPLITUDE: _of_disturbance(DISTURBANCE_AMPLITUDE, "amplitude", "N m"),
+    INERTIA: Quantity(  # its random numbers: `RelativeInertia`
+        lambda parts: [f"{INERTIA}_{i + 1}{j + 1}" for i, j in PAIRS] if parts.plant.attitude else [],
+        lambda parts: jnp.stack([paths.get(parts, "plant.inertia")[i, j] for i, j in PAIRS]),
+        _with_inertia,
+        unit="kg m^2",
+        checked=_inertia_checked,
+        check_with=lambda given, parts: None if "mode_coupling" in given else _check_flexible_body(given, parts),
+    ),
+    DISTURBANCE_PHASE: _of_disturbance(DISTURBANCE_PHASE, "phase", unit="rad"),
+    DISTURBANCE_AMPLITUDE: _of_disturbance(DISTURBANCE_AMPLITUDE, "amplitude", combine=scaled, unit="N m"),
     DISTURBANCE_BIAS: Quantity(
         lambda parts: numbered(f"{DISTURBANCE_BIAS}_", parts.plant.inputs),
         lambda parts: disturbances.bias(parts.disturbance, parts.plant.inputs),
         lambda parts, bias: replace(parts, disturbance=disturbances.with_bias(parts.disturbance, bias)),
+        replaced,
         unit="N m",
     ),
-    **{level(name): _level(name) for name in LEVELS},
-    # the gyro's at the first sample, which a sensor draws for itself where none is given: it is read there
-    RATE_BIAS: of_field("sensors", "given_bias", numbered(f"{RATE_BIAS}_", 3), [0.0] * 3, unit="rad/s"),
-    **OF_MISFITS,
+    **{
+        level(name): at_path(path, f"{name}_", combine=scaled, size=lambda parts: 1, unit=unit, checked=checked)
+        for name, path, unit, checked in (
+            ("attitude_noise", "sensors.attitude_noise", "rad", not_negative),
+            ("rate_noise", "sensors.rate_noise", "rad/s", not_negative),
+            ("state_noise", "sensors.sigma", "", not_negative),
+            ("torque_limit", "actuators.torque_limit", "N m", positive),
+        )
+    },
+    # of the gyro at the first sample; the sensors have random ones of their own if a plan gives none
+    RATE_BIAS: at_path("sensors.given_bias", f"{RATE_BIAS}_", np.zeros(3), unit="rad/s"),
+    "actuator_scale": Quantity(
+        lambda parts: numbered("actuator_scale_", _size(parts)),
+        _scale,
+        lambda parts, scale: _with_actuators(parts, scale=scale),
+        scaled,
+        hardware=True,
+    ),
+    "actuator_misalignment": Quantity(
+        lambda parts: _paired("actuator_misalignment", _size(parts)),
+        _directions,
+        lambda parts, listed: _with_actuators(parts, directions=listed.reshape(-1, 3).T),
+        _turned_channels,
+        checked=fitting(
+            lambda rows: np.abs(np.linalg.norm(rows.reshape(len(rows), -1, 3), axis=2) - 1.0) <= NEAR,
+            "unit vectors, three numbers for each channel",
+        ),
+        hardware=True,
+    ),
+    "star_tracker_misalignment": at_path(
+        "sensors.misalignment", "star_tracker_misalignment_", np.zeros(3), unit="rad", hardware=True
+    ),
+    "gyro_scale": at_path("sensors.rate_scale", "gyro_scale_", np.ones(3), combine=scaled, hardware=True),
+    "star_tracker_outage": at_path(
+        "sensors.outage",
+        _OUTAGE,
+        np.full(2, np.inf),
+        combine=lambda random, nominal, parts: jnp.stack([random[0], random[0] + random[1]]),  # begin and duration
+        unit="s",
+        checked=fitting(lambda rows: rows[:, 0] <= rows[:, 1], "a begin and an end that is not before it"),
+        hardware=True,
+    )._replace(columns=lambda parts: [] if getattr(parts.sensors, "filter", None) is None else list(_OUTAGE)),
+    "wheel_failure": Quantity(
+        lambda parts: [] if parts.effective_actuators.wheels is None else list(_FAILURE),
+        _failure,
+        _with_failure,
+        _any_wheel,
+        unit=("s", "-"),
+        check_with=_check_wheel,
+        categories=_FAILURE[1:],
+        hardware=True,
+    ),
+    "timing_jitter": at_path(
+        "jitter",
+        "timing_jitter",
+        0.0,
+        combine=replaced,
+        checked=fitting(lambda rows: (rows >= 0.0) & (rows < 0.5), "a share of the control period from 0 to below 0.5"),
+        check_with=_check_jitter,
+        hardware=True,
+    )._replace(columns=lambda parts: ["timing_jitter"] if parts.clock.sampled else []),
+    "mode_frequency": at_path(
+        "plant.frequency", "mode_frequency_", combine=scaled, unit="rad/s", checked=positive, hardware=True
+    ),
+    "mode_coupling": Quantity(
+        lambda parts: _paired("mode_coupling", _modes(parts)),
+        lambda parts: jnp.ravel(paths.get(parts, "plant.coupling")),
+        lambda parts, rows: replace(
+            parts, plant=paths.put(parts.plant, "coupling", rows.reshape(-1, 3)).with_rest_inverse()
+        ),
+        scaled,
+        _modes,
+        unit="sqrt(kg) m",
+        check_with=_check_flexible_body,
+        hardware=True,
+    ),
 }
 
 
-# columns that say which of several things, such as the number of a wheel
+# columns that number several things, such as wheels
 CATEGORIES = tuple(column for quantity in QUANTITIES.values() for column in quantity.categories)
 
 
 def read_columns(parts: Parts, names: Iterable[str]) -> dict[str, Array]:
-    """The numbers of these quantities by their columns, [rad], [rad/s], [kg m^2] or [N m]: `write` of them = parts."""
+    """Return the numbers of these quantities by column, [rad], [rad/s], [kg m^2] or [N m]."""
     by_column = {}
     for name, quantity in QUANTITIES.items():
         columns = quantity.columns(parts) if name in names else []
@@ -175,15 +339,15 @@ def read_columns(parts: Parts, names: Iterable[str]) -> dict[str, Array]:
 
 
 def units(parts: Parts) -> dict[str, str]:
-    """Units, "rad" or "-" say, by column of all that these parts fly with, `initial_angle` with it.
+    """Return the units, such as "rad" or "-", of all columns of these parts, and of `initial_angle`.
 
-    Empty where another plant than a spacecraft has units of its own.
+    A unit is empty if a plant that is no spacecraft has its own.
     """
-    attitude = parts.plant.attitude
-    named = {"initial_angle": "rad" if attitude else "x1"}
+    is_body = parts.plant.attitude
+    named = {"initial_angle": "rad" if is_body else "x1"}
     for quantity in QUANTITIES.values():
         columns, unit = quantity.columns(parts), quantity.unit
         each = (unit,) * len(columns) if isinstance(unit, str) else unit[: len(columns)]
-        known = [one if attitude or one in ("rad", "s", "-") else "" for one in each]
+        known = [one if is_body or one in ("rad", "s", "-") else "" for one in each]
         named |= dict(zip(columns, known, strict=True))
     return named

@@ -9,6 +9,8 @@ from jaxtyping import Array
 
 from ptsmc_jax import programs
 from ptsmc_jax.batching import lapack
+from ptsmc_jax.dispersions.base import REFERENCE
+from ptsmc_jax.dispersions.quantities import level
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.numerics import draws, stacking
 from ptsmc_jax.onboard.board import Board
@@ -113,9 +115,8 @@ def fly_many(parts: Parts, dispersion: Dispersion, seed: Array, trials: Array) -
 
 
 def known_alike(dispersion: Dispersion) -> Dispersion:
-    """A dispersion without what the flight computer knows: its reference and its torque limit are those told."""
-    levels = {name: level for name, level in dispersion.levels.items() if name != "torque_limit"}
-    return Dispersion(**{**vars(dispersion), "reference": None, "levels": levels})
+    """Return the dispersion without reference and torque limit: the flight computer knows only the nominal ones."""
+    return dispersion.without((REFERENCE, level("torque_limit")))
 
 
 def usable(samples: Samples) -> bool:

@@ -6,9 +6,9 @@ from typing import Any
 import jax.numpy as jnp
 
 from ptsmc_jax.devices import reaction_wheels
-from ptsmc_jax.dispersions import numbers, variation
-from ptsmc_jax.dispersions.misfits import MISFITS
-from ptsmc_jax.dispersions.quantities import LEVELS
+from ptsmc_jax.dispersions.base import INITIAL_ATTITUDE, INITIAL_RATE, INITIAL_STATE
+from ptsmc_jax.dispersions.quantities import LEVELS, QUANTITIES, level
+from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.plants.base import Plant
 from ptsmc_jax.scenario.tables import Scenario
@@ -58,30 +58,28 @@ def disturbance(scenario: Scenario, plant: Plant) -> tuple[Any, Any]:
     return (signal[0] if signal else disturbances.Constant(jnp.zeros(plant.inputs))), walk
 
 
-def dispersion(scenario: Scenario, parts: Parts) -> variation.Dispersion:
-    """What is drawn for each trial, about these parts."""
+# names of quantities by keys of [dispersion], where they differ
+_NAMES = {
+    "attitude": INITIAL_ATTITUDE,
+    "rate": INITIAL_RATE,
+    "x0": INITIAL_STATE,
+    **{key: level(key) for key in LEVELS},
+}
+
+
+def dispersion(scenario: Scenario, parts: Parts) -> Dispersion:
+    """Return the random quantities of each trial, about these nominal parts."""
     table = scenario.dispersion
     if table is None:
-        return variation.Dispersion()
-    phases, amplitudes = (disturbances.count(parts.disturbance, what) for what in ("phase", "amplitude"))
-
-    def drawn(key: str, *how: Any) -> Any:
-        kind = getattr(table, key, None)
-        return None if kind is None else kind.build(*how)
-
-    levels = {key: drawn(key) for key in LEVELS}
-    misfits = {key: getattr(table, key, None) for key in MISFITS}
-    return variation.Dispersion(
-        **scenario.spread(parts),
-        phase=None if table.disturbance_phase is None else numbers.UniformPhase(phases),
-        amplitude=drawn("disturbance_amplitude", amplitudes),
-        bias=drawn("disturbance_bias", parts.plant.inputs),
-        own=drawn("own"),
-        levels={key: level for key, level in levels.items() if level is not None},
-        # one of no width is none, so that the program is the same, and every digit
-        misfits={
-            key: MISFITS[key](how, parts)
-            for key, how in misfits.items()
-            if how is not None and not getattr(how, "nothing", False)
+        return Dispersion()
+    keys: tuple[str, ...] = table.__struct_fields__
+    tables: dict[str, Any] = {_NAMES.get(key, key): getattr(table, key) for key in keys if key != "own"}
+    return Dispersion(
+        {
+            name: one.build(parts, QUANTITIES[name].count(parts))
+            for name, one in tables.items()
+            # hardware errors of zero size are left out, so that the program, and every digit, are the same
+            if one is not None and not (QUANTITIES[name].hardware and getattr(one, "nothing", False))
         },
+        own=None if table.own is None else table.own.build(),
     )

@@ -1,5 +1,6 @@
-"""The tables of a scenario file that say what is drawn for each trial."""
+"""The tables of a scenario file that define the random quantities of each trial."""
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -10,8 +11,9 @@ from ptsmc_jax.scenario.values import NotNegative, NotNegatives, Positive, Scale
 
 
 class Numbers(Table, frozen=True):
-    """How numbers are drawn, about what the scenario says."""
+    """Random numbers about those of the scenario."""
 
+    distribution: ClassVar[str] = "normal"  # of `dispersions.numbers.RandomNumbers`
     width: ClassVar[str] = "std"  # the key that holds the spread
     degrees: ClassVar[bool] = False  # it is in degrees
     widest: ClassVar[float] = 0.0  # size that vectors of three stay below, all but one in 10 000, over the spread
@@ -27,15 +29,12 @@ class Numbers(Table, frozen=True):
         """Whether it leaves everything as it is."""
         return not np.any(self.of())
 
-    def physics(self) -> Any:
-        """A class of `dispersions.numbers`."""
-        raise NotImplementedError
-
-    def build(self, count: int = 1) -> Any:
-        """The class above, for so many numbers."""
+    def build(self, parts: Any, count: int) -> Any:
+        """Return `dispersions.numbers.RandomNumbers` with so many numbers."""
+        from ptsmc_jax.dispersions.numbers import RandomNumbers
         from ptsmc_jax.numerics.pytrees import vector
 
-        return self.physics()(vector(self.of(count)))
+        return RandomNumbers(self.distribution, vector(self.of(count)))
 
 
 class Normal(Numbers, frozen=True):
@@ -43,25 +42,14 @@ class Normal(Numbers, frozen=True):
 
     widest: ClassVar[float] = 4.6
 
-    def physics(self) -> Any:
-        """`numbers.Normal`."""
-        from ptsmc_jax.dispersions.numbers import Normal as Physics
-
-        return Physics
-
 
 class Uniform(Numbers, frozen=True):
     """Uniform, as far on either side."""
 
+    distribution: ClassVar[str] = "uniform"
     width: ClassVar[str] = "half_width"
     widest: ClassVar[float] = float(np.sqrt(3.0))
     farthest: ClassVar[float] = 1.0
-
-    def physics(self) -> Any:
-        """`numbers.Uniform`."""
-        from ptsmc_jax.dispersions.numbers import Uniform as Physics
-
-        return Physics
 
 
 class UniformAttitude(Table, frozen=True):
@@ -73,11 +61,11 @@ class UniformAttitude(Table, frozen=True):
         """Return the largest angle [rad] of an attitude drawn about one at this angle."""
         return np.pi
 
-    def build(self) -> Any:
-        """`attitudes.UniformAttitude`."""
-        from ptsmc_jax.dispersions.attitudes import UniformAttitude as Physics
+    def build(self, parts: Any, count: int) -> Any:
+        """Return `dispersions.numbers.RandomNumbers`."""
+        from ptsmc_jax.dispersions.numbers import any_attitude
 
-        return Physics()
+        return any_attitude()
 
 
 class AxisAngle(Table, frozen=True):
@@ -96,12 +84,11 @@ class AxisAngle(Table, frozen=True):
         """Return the largest angle [rad] of an attitude drawn about one at this angle."""
         return float(np.deg2rad(self.max_deg))
 
-    def build(self) -> Any:
-        """`attitudes.AxisAngle`."""
-        from ptsmc_jax.dispersions.attitudes import AxisAngle as Physics
-        from ptsmc_jax.numerics.pytrees import vector
+    def build(self, parts: Any, count: int) -> Any:
+        """Return `dispersions.numbers.RandomNumbers`."""
+        from ptsmc_jax.dispersions.numbers import axis_angle
 
-        return Physics(*(vector(np.deg2rad(angle)) for angle in (self.min_deg, self.max_deg)))
+        return axis_angle(np.deg2rad(self.min_deg), np.deg2rad(self.max_deg))
 
 
 class NormalAttitude(Table, frozen=True):
@@ -118,12 +105,12 @@ class NormalAttitude(Table, frozen=True):
         """Return the angle [rad] that all but one of 10 000 attitudes drawn about one at this angle stay below."""
         return min(angle + 4.6 * float(np.deg2rad(self.std_deg)), np.pi)
 
-    def build(self) -> Any:
-        """`attitudes.NormalAttitude`."""
-        from ptsmc_jax.dispersions.attitudes import NormalAttitude as Physics
+    def build(self, parts: Any, count: int) -> Any:
+        """Return `dispersions.numbers.RandomNumbers`, a rotation vector."""
+        from ptsmc_jax.dispersions.numbers import RandomNumbers
         from ptsmc_jax.numerics.pytrees import vector
 
-        return Physics(vector(np.deg2rad(self.std_deg)))
+        return RandomNumbers("normal", vector(np.full(3, np.deg2rad(self.std_deg))))
 
 
 class NormalRate(Normal, frozen=True):
@@ -163,12 +150,12 @@ class RelativeInertia(Table, frozen=True):
     std: Annotated[float, Meta(ge=0, le=0.3, description="a number from 0 to 0.3")] = 0.05
     axes_deg: NotNegative = 0.0
 
-    def build(self, inertia: Any) -> Any:
-        """`inertias.RelativeInertia`, about the inertia (3, 3) of the true body [kg m^2]."""
+    def build(self, parts: Any, count: int) -> Any:
+        """Return `dispersions.inertias.RelativeInertia` about the inertia of the true body."""
         from ptsmc_jax.dispersions.inertias import RelativeInertia as Physics
         from ptsmc_jax.numerics.pytrees import vector
 
-        moments, axes = np.linalg.eigh(np.asarray(inertia))
+        moments, axes = np.linalg.eigh(np.asarray(parts.plant.inertia))
         return Physics(*(vector(value) for value in (moments, axes, self.std, np.deg2rad(self.axes_deg))))
 
 
@@ -176,6 +163,13 @@ class UniformPhase(Table, frozen=True):
     """Uniform over the circle."""
 
     kind: Literal["uniform"] = "uniform"
+
+    def build(self, parts: Any, count: int) -> Any:
+        """Return `dispersions.numbers.RandomNumbers`."""
+        from ptsmc_jax.dispersions.numbers import RandomNumbers
+        from ptsmc_jax.numerics.pytrees import vector
+
+        return RandomNumbers("interval", vector(np.full(count, 2.0 * np.pi)))
 
 
 class RelativeNormal(Numbers, frozen=True):
@@ -185,15 +179,10 @@ class RelativeNormal(Numbers, frozen=True):
         std: 1 sigma of the share
     """
 
+    distribution: ClassVar[str] = "truncated_normal"
     widest: ClassVar[float] = 3.0
     kind: Literal["relative_normal"] = "relative_normal"
     std: Annotated[float, Meta(ge=0, le=0.3, description="a number from 0 to 0.3")] = 0.1
-
-    def physics(self) -> Any:
-        """`numbers.TruncatedNormal`."""
-        from ptsmc_jax.dispersions.numbers import TruncatedNormal
-
-        return TruncatedNormal
 
 
 class RelativeUniform(Uniform, frozen=True):
@@ -233,6 +222,11 @@ class UniformTurn(Uniform, frozen=True):
     degrees: ClassVar[bool] = True
 
 
+def _interval(table: Any, parts: Any) -> tuple[float, float]:
+    """Return `earliest` and `latest` of a table [s]; by default until the end of the run."""
+    return table.earliest, float(parts.t_end) if table.latest is None else table.latest
+
+
 class Outage(Table, frozen=True):
     """Begins at any time between two, uniformly.
 
@@ -248,6 +242,13 @@ class Outage(Table, frozen=True):
     earliest: NotNegative = 0.0
     latest: NotNegative | None = None
 
+    def build(self, parts: Any, count: int) -> Any:
+        """Return `dispersions.numbers.RandomNumbers`: the random begin, and the duration."""
+        from ptsmc_jax.dispersions.numbers import interval
+
+        begin, end = _interval(self, parts)
+        return dataclasses.replace(interval([begin, self.duration], [end, self.duration]), common=True)
+
 
 class Jitter(Table, frozen=True):
     """Of each trial its own, between two, uniformly; each sample then comes early or late by up to it, uniformly.
@@ -260,6 +261,12 @@ class Jitter(Table, frozen=True):
     kind: Literal["uniform"] = "uniform"
     largest: Positive = 0.1
     smallest: NotNegative = 0.0
+
+    def build(self, parts: Any, count: int) -> Any:
+        """Return `dispersions.numbers.RandomNumbers`."""
+        from ptsmc_jax.dispersions.numbers import interval
+
+        return interval([self.smallest], [self.largest])
 
 
 class Failure(Table, frozen=True):
@@ -275,6 +282,13 @@ class Failure(Table, frozen=True):
     earliest: NotNegative = 0.0
     latest: NotNegative | None = None
     known: Truth = False
+
+    def build(self, parts: Any, count: int) -> Any:
+        """Return `dispersions.numbers.RandomNumbers`: the time, and a number on (0, 1) that chooses the wheel."""
+        from ptsmc_jax.dispersions.numbers import interval
+
+        begin, end = _interval(self, parts)
+        return interval([begin, 0.0], [end, 1.0])
 
 
 class NormalBias(Normal, frozen=True):

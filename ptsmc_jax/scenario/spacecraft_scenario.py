@@ -358,14 +358,9 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
 
     def check_start(self, parts: Any, dispersion: Any, *, drawn: bool) -> None:
         """The law's singularity on the reference, and on the way to it; a drawn trial that meets it is marked."""
+        from ptsmc_jax.dispersions.base import INITIAL_ATTITUDE, REFERENCE
         from ptsmc_jax.scenario import start_checks
 
         start_checks.reference(self, parts)
-        if not drawn or (dispersion.attitude is None and dispersion.reference is None):
+        if not drawn or dispersion.kinds.keys().isdisjoint((INITIAL_ATTITUDE, REFERENCE)):
             start_checks.attitude(self, parts)
-
-    def spread(self, parts: Any) -> dict[str, Any]:
-        """Attitude, rate and inertia, and the reference."""
-        how = {"attitude": (), "rate": (3,), "inertia": (parts.plant.inertia,), "reference": ()}
-        asked = {key: getattr(self.dispersion, key) for key in how}
-        return {key: None if table is None else table.build(*how[key]) for key, table in asked.items()}

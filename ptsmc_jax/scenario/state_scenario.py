@@ -119,11 +119,6 @@ class StateScenario(Scenario, frozen=True, kw_only=True):
 
         return vector(self.plant.x0)
 
-    def spread(self, parts: Any) -> dict[str, Any]:
-        """The initial state."""
-        drawn = self.dispersion.x0
-        return {"state": None if drawn is None else drawn.build(len(self.plant.x0))}
-
 
 class ChainScenario(StateScenario, frozen=True, kw_only=True):
     """A scenario of an integrator chain."""

@@ -358,10 +358,6 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
     def check_start(self, parts: Any, dispersion: Any, *, drawn: bool) -> None:
         """Raise ScenarioError where the law meets its singularity, see `flyable.study`."""
 
-    def spread(self, parts: Any) -> dict[str, Any]:
-        """What the plant has drawn for each trial, a part of `dispersions` each, by what `Dispersion` calls it."""
-        raise NotImplementedError
-
     def __eq__(self, other: object) -> bool:
         """Two scenarios are equal where their values are, whether a file says them or not."""
         names = [name for name in self.__struct_fields__ if name != "defaulted"]

@@ -1,14 +1,11 @@
-from dataclasses import replace
-
 import jax
 import numpy as np
 import pytest
 
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo
-from ptsmc_jax.dispersions import attitudes, variation
 from ptsmc_jax.simulation import rollout
-from tests.helpers import FIRST_FLIGHT, SHORT_CHAIN, short, untuned, vector
+from tests.helpers import FIRST_FLIGHT, SHORT_CHAIN, random_turns, short, untuned
 
 # eta, delta [s], observer gain: RMS window error and mean peak torque [N m], without and with noise (theory notes, 6)
 TABLE = (
@@ -18,7 +15,7 @@ TABLE = (
     (5.0, 0.5, 10.0, (2.7e-5, 0.45), (4.3e-5, 0.45)),
     (4.0, 1.0, 40.0, (1.3e-5, 0.29), (1.5e-5, 0.29)),
 )
-SPREAD = variation.Dispersion(attitudes.AxisAngle(vector(np.deg2rad(20.0)), vector(np.deg2rad(140.0))))
+SPREAD = random_turns(np.deg2rad(20.0), np.deg2rad(140.0))
 
 
 # on the flight clock one program flies all gains
@@ -134,8 +131,8 @@ def test_failed_trials_are_counted_and_leave_the_others_alone():
     """Spacecraft, as many at least as the program of many trials flies."""
     run = scenario.study(FIRST).parts
     trials = montecarlo.run(run, SPREAD, 5, np.arange(256))
-    wide = replace(SPREAD, attitude=attitudes.AxisAngle(vector(np.deg2rad(20.0)), vector(np.pi)))
-    near = replace(wide, attitude=attitudes.AxisAngle(vector(np.pi - 1e-4), vector(np.pi)))
+    wide = random_turns(np.deg2rad(20.0), np.pi)
+    near = random_turns(np.pi - 1e-4, np.pi)
     failed = montecarlo.run(run, near, 5, np.arange(montecarlo.FEW))
     assert failed.counts() == {"ok": 0, "diverged": 0, "singular": montecarlo.FEW, "missed": 0, "unfinished": 0}
     assert np.all(failed.bad_time >= 0.0)

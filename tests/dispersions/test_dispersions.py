@@ -12,7 +12,9 @@ from scipy.spatial.transform import Rotation
 from ptsmc_jax import scenario
 from ptsmc_jax.batching import lanes
 from ptsmc_jax.devices import actuators
-from ptsmc_jax.dispersions import attitudes, base, inertias, numbers, quantities, variation
+from ptsmc_jax.dispersions import base, inertias, numbers, quantities
+from ptsmc_jax.dispersions.numbers import RandomNumbers
+from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.signals import disturbances, references
 from tests import helpers
 from tests.helpers import chain_parts, short, vector
@@ -28,14 +30,14 @@ PARTS = helpers.parts(
     reference=references.Spin(vector(REFERENCE.as_quat()), vector([0.1, 0.0, 0.2])),
 )
 KINDS = {
-    "uniform": attitudes.UniformAttitude(),
-    "axis_angle": attitudes.AxisAngle(vector(np.radians(20.0)), vector(np.radians(140.0))),
-    "normal": attitudes.NormalAttitude(vector(0.1)),
+    "uniform": numbers.any_attitude(),
+    "axis_angle": numbers.axis_angle(np.radians(20.0), np.radians(140.0)),
+    "normal": RandomNumbers("normal", vector([0.1] * 3)),
 }
 
 
 def one(kind, seed, trial):
-    return variation.Dispersion(kind).apply(PARTS, seed, trial).initial.q
+    return Dispersion({"initial_attitude": kind}).apply(PARTS, seed, trial).initial.q
 
 
 many = jax.jit(jax.vmap(one, (None, None, 0)))
@@ -57,12 +59,12 @@ def is_on_the_sphere(directions):
 
 
 def test_nothing_drawn_leaves_the_parts():
-    assert variation.Dispersion().apply(PARTS, 1, 2) is PARTS
+    assert Dispersion().apply(PARTS, 1, 2) is PARTS
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_only_the_initial_attitude_is_drawn(kind):
-    got = variation.Dispersion(KINDS[kind]).apply(PARTS, 1, 2)
+    got = Dispersion({"initial_attitude": KINDS[kind]}).apply(PARTS, 1, 2)
     before, after = (dict(jax.tree_util.tree_leaves_with_path(parts)) for parts in (PARTS, got))
     changed = [path for path in before if before[path] is not after[path]]
     assert before.keys() == after.keys()
@@ -86,8 +88,7 @@ def test_axis_angle_turns_away_from_the_reference_at_the_start():
 
 
 def test_axis_angle_of_one_angle_keeps_it():
-    angle = vector(0.7)
-    q = many(attitudes.AxisAngle(angle, angle), 5, jnp.arange(64, dtype=jnp.uint32))
+    q = many(numbers.axis_angle(0.7, 0.7), 5, jnp.arange(64, dtype=jnp.uint32))
     turn = REFERENCE.inv() * Rotation.from_quat(np.asarray(q))
     np.testing.assert_allclose(turn.magnitude(), 0.7, rtol=20 * EPS)
 
@@ -138,7 +139,7 @@ def test_the_draw_belongs_to_its_own_stream(kind):
     other = helpers.parts(
         q=NOMINAL.as_quat(), reference=references.Fixed(vector(REFERENCE.as_quat())), period=0.05, noise=(1e-5, 1e-6)
     )
-    got = variation.Dispersion(KINDS[kind]).apply(other, 3, 4).initial.q
+    got = Dispersion({"initial_attitude": KINDS[kind]}).apply(other, 3, 4).initial.q
     np.testing.assert_array_equal(got, one(KINDS[kind], 3, 4))
 
 
@@ -147,21 +148,25 @@ def test_initial_states_of_a_chain_are_drawn_about_the_nominal_one():
     width = vector([1.0, 0.5, 0.0])
     trials = jnp.arange(TRIALS, dtype=jnp.uint32)
     drawn_states = {}
-    for spread in (numbers.Uniform(width), numbers.Normal(width)):
-        whole = variation.Dispersion(state=spread)
+    for name in ("uniform", "normal"):
+        whole = Dispersion({"initial_state": RandomNumbers(name, width)})
         assert whole.varies
         x0 = np.asarray(jax.jit(jax.vmap(lambda k, whole=whole: whole.apply(run, 3, k).initial))(trials))
         np.testing.assert_array_equal(x0[:, 2], 2.0)
-        drawn_states[type(spread)] = (x0[:, :2] - [5.0, 3.0]) / [1.0, 0.5]
+        drawn_states[name] = (x0[:, :2] - [5.0, 3.0]) / [1.0, 0.5]
         np.testing.assert_array_equal(whole.apply(run, 3, 7).initial, x0[7])
-    uniform, normal = drawn_states[numbers.Uniform], drawn_states[numbers.Normal]
+    uniform, normal = drawn_states["uniform"], drawn_states["normal"]
     assert np.abs(uniform).max() <= 1.0
     for k in range(2):
         assert stats.kstest(uniform[:, k], "uniform", (-1.0, 2.0)).pvalue > ALARM
         assert stats.kstest(normal[:, k], "norm").pvalue > ALARM
     limit = -stats.norm.ppf(ALARM / 2) / math.sqrt(TRIALS)
     assert abs(np.corrcoef(uniform.T)[0, 1]) < limit
-    assert not variation.Dispersion().varies
+    assert not Dispersion().varies
+
+
+def phases(count):
+    return RandomNumbers("interval", vector(np.full(count, 2.0 * np.pi)))
 
 
 def many_drawn(whole, run=PARTS, count=TRIALS, seed=4):
@@ -171,11 +176,8 @@ def many_drawn(whole, run=PARTS, count=TRIALS, seed=4):
 
 def test_initial_rates_are_drawn_about_the_nominal_one():
     nominal, laws = np.array([0.01, -0.02, 0.03]), {"uniform": ("uniform", (-1, 2)), "normal": ("norm", ())}
-    for name, spread in {
-        "uniform": numbers.Uniform(vector([0.02, 0.02, 0.02])),
-        "normal": numbers.Normal(vector([0.02, 0.02, 0.02])),
-    }.items():
-        got = many_drawn(variation.Dispersion(rate=spread))
+    for name in laws:
+        got = many_drawn(Dispersion({"initial_rate": RandomNumbers(name, vector([0.02] * 3))}))
         np.testing.assert_array_equal(got.initial.q, np.broadcast_to(PARTS.initial.q, (TRIALS, 4)))
         shares = (np.asarray(got.initial.w) - nominal) / 0.02
         for axis in shares.T:
@@ -187,7 +189,7 @@ def test_initial_rates_are_drawn_about_the_nominal_one():
 def bodies(moments, std, turn=0.0, axes=None):
     axes = np.eye(3) if axes is None else axes
     kind = inertias.RelativeInertia(vector(moments), vector(axes), vector(std), vector(turn))
-    plant = plants_of(variation.Dispersion(inertia=kind), jnp.arange(TRIALS, dtype=jnp.uint32))
+    plant = plants_of(Dispersion({"inertia": kind}), jnp.arange(TRIALS, dtype=jnp.uint32))
     return np.asarray(plant.inertia), np.asarray(plant.inertia_inverse)
 
 
@@ -234,7 +236,7 @@ def test_slender_bodies_keep_the_stated_law(moments, std):
     found = np.diagonal(inertia, axis1=1, axis2=2)[:, np.argsort(moments)]
     assert np.all(2.0 * found.max(axis=1) <= found.sum(axis=1))
     c, a, b = ((found / np.sort(moments) - 1.0) / std).T
-    assert np.abs([a, b, c]).max() <= base.FARTHEST * (1 + 1e-9)
+    assert np.abs([a, b, c]).max() <= numbers.FARTHEST * (1 + 1e-9)
 
     def cdf(s):
         def whole(s):  # integral of (1 + std s) times the normal density
@@ -268,7 +270,7 @@ def test_what_is_drawn_where_no_candidate_is_a_body_has_their_law(moments, std):
     shares = rng.standard_normal((1 << 19, 3))
     wanted = np.array(moments) * (1.0 + std * shares)
     is_one = (2.0 * wanted.max(axis=1) <= wanted.sum(axis=1)) & (wanted.min(axis=1) > 0.0)
-    wanted = wanted[is_one & (np.abs(shares).max(axis=1) <= base.FARTHEST)]
+    wanted = wanted[is_one & (np.abs(shares).max(axis=1) <= numbers.FARTHEST)]
     assert len(wanted) > 1 << 15
     for weights in ([1, 0, 0], [0, 1, 0], [0, 0, 1], [1, -1, 0], [0, 1, -1], [1, 1, -1], [1, 1, 1]):
         one, other = found @ np.array(weights), wanted @ np.array(weights)
@@ -283,7 +285,7 @@ def test_the_first_candidate_that_is_a_body_is_drawn():
     found = np.diagonal(np.asarray(drawn_bodies(kind, vector(c))), axis1=1, axis2=2)
     shares = c[:, : 3 * inertias.CANDIDATES].reshape(len(c), -1, 3)
     drawn = moments * (1.0 + std * shares)
-    fits = (2.0 * drawn.max(axis=2) <= drawn.sum(axis=2)) & (np.abs(shares).max(axis=2) <= base.FARTHEST)
+    fits = (2.0 * drawn.max(axis=2) <= drawn.sum(axis=2)) & (np.abs(shares).max(axis=2) <= numbers.FARTHEST)
     some, first = fits.any(axis=1), fits.argmax(axis=1)
     assert {0, 1, 2, 3} <= set(first[some])
     np.testing.assert_allclose(found[some], drawn[some, first[some]], rtol=1e-14)
@@ -320,7 +322,7 @@ ORBIT = disturbances.GravityGradient(PARTS.plant.inertia, vector([0.0, 0.0, 0.0,
 def test_every_phase_is_drawn_uniformly_and_on_its_own():
     still = disturbances.Constant(vector([0.1, 0.2, 0.3]))
     run = replace(PARTS, disturbance=disturbances.Sum((SINE, still, ORBIT, SINE)))
-    got = many_drawn(variation.Dispersion(phase=numbers.UniformPhase(7)), run).disturbance.terms
+    got = many_drawn(Dispersion({"disturbance_phase": phases(7)}), run).disturbance.terms
     np.testing.assert_array_equal(got[1].value, np.broadcast_to(still.value, (TRIALS, 3)))
     turns = np.column_stack(
         [
@@ -339,7 +341,7 @@ def test_every_phase_is_drawn_uniformly_and_on_its_own():
 def test_a_drawn_body_meets_its_own_gravity_gradient():
     kind = inertias.RelativeInertia(vector([10.0, 12.0, 14.0]), vector(np.eye(3)), vector(0.05), vector(0.0))
     run = replace(PARTS, disturbance=disturbances.Sum((ORBIT, SINE)))
-    got = jax.jit(lambda: variation.Dispersion(inertia=kind).apply(run, 1, 2))()
+    got = jax.jit(lambda: Dispersion({"inertia": kind}).apply(run, 1, 2))()
     np.testing.assert_array_equal(got.disturbance.terms[0].inertia, got.plant.inertia)
     assert np.abs(got.plant.inertia - PARTS.plant.inertia).max() > 0.01
     np.testing.assert_array_equal(got.controller.model.inertia, PARTS.controller.model.inertia)  # the law's is nominal
@@ -350,13 +352,13 @@ NOISY = helpers.parts(
     disturbance=SINE,
 )  # fmt: skip
 LIMITED = replace(NOISY, actuators=actuators.Actuators(torque_limit=vector(0.5)))
-TENTH = numbers.TruncatedNormal(vector([0.1]))
-WIDE = numbers.Uniform(vector([0.5]))
+TENTH = RandomNumbers("truncated_normal", vector([0.1]))
+WIDE = RandomNumbers("uniform", vector([0.5]))
 
 
 def test_relative_numbers_are_truncated_not_clipped():
     """The factor on a level follows the truncated normal law, or the uniform one, and no two trials sit at an end."""
-    got = many_drawn(variation.Dispersion(levels={"torque_limit": TENTH, "attitude_noise": WIDE}), LIMITED)
+    got = many_drawn(Dispersion({"torque_limit_level": TENTH, "attitude_noise_level": WIDE}), LIMITED)
     normal = (np.asarray(got.actuators.torque_limit) / 0.5 - 1.0) / 0.1
     uniform = np.asarray(got.sensors.attitude_noise) / 1e-5
     assert stats.kstest(normal, stats.truncnorm(-3, 3).cdf).pvalue > ALARM
@@ -371,7 +373,9 @@ def test_relative_numbers_are_truncated_not_clipped():
 def test_amplitudes_are_scaled_each_on_its_own_and_a_bias_is_added():
     still = disturbances.Constant(vector([0.1, 0.2, 0.3]))
     run = replace(PARTS, disturbance=disturbances.Sum((SINE, ORBIT, still)))
-    spread = variation.Dispersion(amplitude=numbers.Uniform(vector([0.5] * 6)), bias=numbers.Normal(vector([0.01] * 3)))
+    added = RandomNumbers("normal", vector([0.01] * 3))
+    factors = RandomNumbers("uniform", vector([0.5] * 6))
+    spread = Dispersion({"disturbance_bias": added, "disturbance_amplitude": factors})
     sine, orbit, constant, bias = many_drawn(spread, run).disturbance.terms
     factors = np.column_stack([np.asarray(sine.amplitude) / 0.1, np.asarray(constant.value) / [0.1, 0.2, 0.3]])
     for column in factors.T:
@@ -382,14 +386,15 @@ def test_amplitudes_are_scaled_each_on_its_own_and_a_bias_is_added():
     limit = -stats.norm.ppf(ALARM / 2) / math.sqrt(TRIALS)
     assert np.abs(np.corrcoef(every.T) - np.eye(9)).max() < limit
     np.testing.assert_array_equal(orbit.phase, np.full(TRIALS, 0.25))
-    alone = variation.Dispersion(bias=spread.bias).apply(replace(PARTS, disturbance=SINE), 4, 9).disturbance
+    alone = Dispersion({"disturbance_bias": added}).apply(replace(PARTS, disturbance=SINE), 4, 9).disturbance
     np.testing.assert_array_equal(alone.terms[-1].value, bias.value[9])
     t = vector(3.7)
     np.testing.assert_allclose(alone(t, PARTS.initial), SINE(t) + bias.value[9], rtol=1e-14)
 
 
 def test_a_drawn_reference_takes_the_start_with_it():
-    turned = variation.Dispersion(KINDS["axis_angle"], reference=attitudes.NormalAttitude(vector(0.05)))
+    spread = RandomNumbers("normal", vector([0.05] * 3))
+    turned = Dispersion({"initial_attitude": KINDS["axis_angle"], "reference": spread})
     got = many_drawn(turned)
     q_f = Rotation.from_quat(np.asarray(got.reference.q))
     for axis in ((REFERENCE.inv() * q_f).as_rotvec() / 0.05).T:
@@ -402,34 +407,31 @@ def test_a_drawn_reference_takes_the_start_with_it():
 
 def test_one_more_thing_drawn_changes_no_other_draw():
     inertia = inertias.RelativeInertia(vector([10.0, 12.0, 14.0]), vector(np.eye(3)), vector(0.05), vector(0.1))
+    tenths = RandomNumbers("uniform", vector([0.5] * 3))
     kinds = {
-        "attitude": (KINDS["normal"], lambda p: p.initial.q),
-        "rate": (numbers.Normal(vector([0.01, 0.01, 0.01])), lambda p: p.initial.w),
+        "initial_attitude": (KINDS["normal"], lambda p: p.initial.q),
+        "initial_rate": (RandomNumbers("normal", vector([0.01] * 3)), lambda p: p.initial.w),
         "inertia": (inertia, lambda p: p.plant.inertia),
-        "phase": (numbers.UniformPhase(3), lambda p: disturbances.values(p.disturbance, "phase")),
-        "amplitude": (
-            numbers.Uniform(vector([0.5] * 3)),
-            lambda p: disturbances.values(p.disturbance, "amplitude")[:3],
-        ),
-        "bias": (numbers.Uniform(vector([0.5] * 3)), lambda p: p.disturbance.terms[-1].value),
+        "disturbance_phase": (phases(3), lambda p: disturbances.values(p.disturbance, "phase")),
+        "disturbance_amplitude": (tenths, lambda p: disturbances.values(p.disturbance, "amplitude")[:3]),
+        "disturbance_bias": (tenths, lambda p: p.disturbance.terms[-1].value),
         "reference": (KINDS["uniform"], lambda p: p.reference.q),
-        "levels": (
-            {"torque_limit": TENTH, "rate_noise": WIDE},
-            lambda p: (p.actuators.torque_limit, p.sensors.rate_noise),
-        ),
+        "torque_limit_level": (TENTH, lambda p: p.actuators.torque_limit),
+        "rate_noise_level": (WIDE, lambda p: p.sensors.rate_noise),
     }
-    whole = variation.Dispersion(**{name: kind for name, (kind, _) in kinds.items()})
+    whole = Dispersion({name: kind for name, (kind, _) in kinds.items()})
     got = whole.apply(LIMITED, 7, 8)
     for name, (kind, seen) in kinds.items():
-        alone = variation.Dispersion(**{name: kind}).apply(LIMITED, 7, 8)
+        alone = Dispersion({name: kind}).apply(LIMITED, 7, 8)
         np.testing.assert_array_equal(seen(got), seen(alone), err_msg=name)
-        assert not np.array_equal(seen(alone), seen(variation.Dispersion(bias=kinds["bias"][0]).apply(LIMITED, 1, 1)))
+        assert not np.array_equal(seen(alone), seen(Dispersion({"disturbance_bias": tenths}).apply(LIMITED, 1, 1)))
     c = whole.coordinates(7, 8)
     assert len({float(v[0]) for v in c.values()}) == len(c) == 9
 
 
 def test_the_parts_of_coordinates_are_those_of_the_trial_that_has_them():
-    whole = variation.Dispersion(KINDS["axis_angle"], rate=numbers.Normal(vector([0.01, 0.01, 0.01])))
+    rates = RandomNumbers("normal", vector([0.01] * 3))
+    whole = Dispersion({"initial_attitude": KINDS["axis_angle"], "initial_rate": rates})
     at = whole.at(PARTS, whole.coordinates(3, 9))
     drawn_parts = whole.apply(PARTS, 3, 9)
     jax.tree.map(np.testing.assert_array_equal, at.initial, drawn_parts.initial)

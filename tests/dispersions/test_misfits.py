@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 from ptsmc_jax import formulas, scenario
 from ptsmc_jax.campaigns import montecarlo, runs
 from ptsmc_jax.devices import actuators, reaction_wheels
-from ptsmc_jax.dispersions import misfits
-from ptsmc_jax.dispersions.base import FARTHEST, plant_of
-from ptsmc_jax.numerics import draws
+from ptsmc_jax.dispersions.numbers import FARTHEST
+from ptsmc_jax.dispersions.quantities import QUANTITIES, read_columns
+from ptsmc_jax.numerics import draws, paths
 from ptsmc_jax.plants import flexible_body
 from ptsmc_jax.simulation import sampled
 from tests.helpers import fly, short, vector
@@ -43,11 +43,8 @@ def roomy(parts):
 @pytest.fixture(scope="module")
 def drawn():
     ready = scenario.study(scenario.from_tables({**FLIGHT, "dispersion": DRAWN}))
-    assert set(ready.dispersion.misfits) == set(misfits.MISFITS) - {
-        "star_tracker_outage",
-        "wheel_failure",
-        "timing_jitter",
-    }
+    hardware = {name for name, quantity in QUANTITIES.items() if quantity.hardware}
+    assert set(ready.dispersion.kinds) == hardware - {"star_tracker_outage", "wheel_failure", "timing_jitter"}
     return replace(ready, parts=roomy(ready.parts))
 
 
@@ -218,12 +215,15 @@ def test_any_wheel_fails_as_often_known_or_not_and_times_that_are_not_given_end_
     parts = scenario.study(scenario.from_tables({**WHEELED, "dispersion": known})).parts
     assert parts.effective_actuators.spare_allocations is not None
     ready = scenario.study(scenario.from_tables({**WHEELED, "dispersion": drawn}))
-    failure, outage = (ready.dispersion.misfits[name] for name in drawn)
     assert ready.parts.effective_actuators.spare_allocations is None  # the others do not take over
     for k in range(4):
         for share in (0.01, 0.99):
-            np.testing.assert_allclose(failure.at(vector([1.0, (k + share) / 4]), ready.parts), [7.0, k + 1.0])
-    np.testing.assert_allclose(outage.at(vector([1.0]), ready.parts), [7.0, 7.5])
+            c = {"wheel_failure": vector([1.0, (k + share) / 4]), "star_tracker_outage": vector([1.0])}
+            row = read_columns(ready.dispersion.at(ready.parts, c), drawn)
+            assert {name: float(v) for name, v in row.items()} == {
+                "star_tracker_outage_begin": 7.0, "star_tracker_outage_end": 7.5,
+                "wheel_failure_time": 7.0, "wheel_failure_wheel": k + 1.0,
+            }  # fmt: skip
 
 
 def test_an_outage_of_the_whole_run_is_a_filter_that_corrects_nothing():
@@ -322,7 +322,7 @@ def test_the_widest_couplings_that_are_allowed_leave_a_body_at_their_farthest(co
               "flexible": {"frequency": [6.0], "coupling": [[3.0, 0.0, 0.0]]}, "dispersion": drawn}  # fmt: skip
     ready = scenario.study(scenario.from_tables(tables))
     ends = {"mode_coupling": vector([1.0]), "inertia": jnp.zeros(67).at[:3].set(-FARTHEST)}
-    plant = plant_of(ready.dispersion.at(ready.parts, ends))
+    plant = paths.get(ready.dispersion.at(ready.parts, ends), "plant")
     left = np.linalg.eigvalsh(plant.rest_inertia)[0]
     assert 0.0 < left < 0.05
     np.testing.assert_allclose(plant.rest_inertia @ plant.rest_inverse, np.eye(3), rtol=0, atol=1e-9)

@@ -13,8 +13,8 @@ import ptsmc_jax as ptsmc
 from ptsmc_jax import configure, scenario
 from ptsmc_jax.campaigns import runs
 from ptsmc_jax.devices.attitude_filter import filter_gains
-from ptsmc_jax.dispersions.base import plant_of
 from ptsmc_jax.dispersions.variation import Dispersion
+from ptsmc_jax.numerics import paths
 from ptsmc_jax.numerics.pytrees import pytree
 from ptsmc_jax.onboard import folder
 from ptsmc_jax.onboard.generate import names_of
@@ -378,7 +378,7 @@ class Measured(ptsmc.Draw):
     def at(self, c, parts):
         """The parts with what was measured."""
         factor = 1.0 + 0.05 * c[0]
-        parts = parts.with_inertia(factor * plant_of(parts).inertia)
+        parts = parts.with_inertia(factor * paths.get(parts, "plant.inertia"))
         law = replace(parts.controller, eta=factor * parts.controller.eta)
         observer = replace(parts.observer, gain=parts.observer.gain / factor)
         sensors = parts.sensors

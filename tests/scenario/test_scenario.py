@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.devices import sensors
-from ptsmc_jax.dispersions import attitudes
 from ptsmc_jax.scenario import from_tables, parsing, read, reference_tables, replace, study, timing
 from ptsmc_jax.scenario.attitude_keys import quaternion
 from ptsmc_jax.scenario.errors import ScenarioError
@@ -283,9 +282,10 @@ def test_every_key_reaches_its_part():
     assert (float(parts.sensors.attitude_noise), float(parts.sensors.rate_noise)) == (2e-5, 1e-6)
     assert isinstance(parts.clock, clock.Anchored)
     assert (float(parts.clock.period), float(parts.clock.t_end)) == (0.25, 33.0)
-    assert isinstance(ready.dispersion.attitude, attitudes.AxisAngle)
-    np.testing.assert_allclose(ready.dispersion.attitude.smallest, np.pi / 2, rtol=ROUNDING)
-    np.testing.assert_allclose(ready.dispersion.attitude.largest, np.pi, rtol=ROUNDING)
+    angle: Any = ready.dispersion.numbers["initial_attitude"]
+    assert angle.distribution == "axis_angle"
+    np.testing.assert_allclose(angle.at(vector([0.5, 0.5, 0.0]))[2], np.pi / 2, rtol=ROUNDING)
+    np.testing.assert_allclose(angle.at(vector([0.5, 0.5, 1.0]))[2], np.pi, rtol=ROUNDING)
     assert [(r.metric, r.limit) for r in ready.requirements] == [("effort", 6.0), ("peak_torque", 0.5)]
 
 
@@ -307,14 +307,14 @@ def test_kinds_choose_parts():
 
 
 def test_kinds_of_dispersion():
-    def drawn(text):
-        return study(from_tables(tomllib.loads(text))).dispersion.attitude
+    def drawn(text) -> Any:
+        return study(from_tables(tomllib.loads(text))).dispersion.numbers.get("initial_attitude")
 
     assert drawn("") is None
-    assert isinstance(drawn("dispersion.attitude.kind = 'uniform'"), attitudes.UniformAttitude)
+    assert drawn("dispersion.attitude.kind = 'uniform'").distribution == "any_attitude"
     normal = drawn("dispersion.attitude = { kind = 'normal', std_deg = 90.0 }")
-    assert isinstance(normal, attitudes.NormalAttitude)
-    np.testing.assert_allclose(normal.std, np.pi / 2, rtol=ROUNDING)
+    assert normal.distribution == "normal"
+    np.testing.assert_allclose(normal.spread, [np.pi / 2] * 3, rtol=ROUNDING)
 
 
 @pytest.mark.parametrize("mode", ["anchored", "flight"])

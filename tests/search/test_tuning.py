@@ -10,7 +10,8 @@ import pytest
 from ptsmc_jax import programs, scenario
 from ptsmc_jax.batching import lanes
 from ptsmc_jax.campaigns import montecarlo
-from ptsmc_jax.dispersions import attitudes, numbers, variation
+from ptsmc_jax.dispersions import variation
+from ptsmc_jax.dispersions.numbers import RandomNumbers
 from ptsmc_jax.observers import nonlinear
 from ptsmc_jax.plants import integrator_chain
 from ptsmc_jax.signals import disturbances
@@ -18,7 +19,7 @@ from ptsmc_jax.simulation import catalogues, clock, rollout
 from ptsmc_jax.simulation.requirements import Requirement
 from ptsmc_jax.theory import envelopes
 from tests import helpers
-from tests.helpers import chain_parts, parts, vector
+from tests.helpers import chain_parts, parts, random_turns, vector
 from tuning.output import search_sentences
 from tuning.search import (
     cma_es,
@@ -38,8 +39,8 @@ from tuning.search import (
 from tuning.search.evaluate import Evaluator, Measured, Sloped
 from tuning.studies import posing, tune_files
 
-TURNED = variation.Dispersion(attitudes.AxisAngle(vector(np.deg2rad(20.0)), vector(np.deg2rad(140.0))))
-SPREAD = variation.Dispersion(state=numbers.Uniform(vector([20.0, 0.0])))
+TURNED = random_turns(np.deg2rad(20.0), np.deg2rad(140.0))
+SPREAD = variation.Dispersion({"initial_state": RandomNumbers("uniform", vector([20.0, 0.0]))})
 
 
 @pytest.fixture(autouse=True)
@@ -191,7 +192,7 @@ def problem(count=8, dispersion=SPREAD, may_break=None, **limits):
 
     Limits that are not asked for are far off, so that one program serves all.
     """
-    if dispersion.attitude is None:
+    if "initial_attitude" not in dispersion.kinds:
         run = chain_parts([25.0, 0.0], 20.0, 3.0, 0.5, period=0.2, noise=[5e-4, 2.5e-5])
     else:
         run = parts(20.0, 3.0, 0.5, period=0.2, noise=(2e-5, 1e-6), t_end=21.0)
@@ -306,8 +307,10 @@ def test_requirements_and_statistic_of_a_scenario_reach_the_problem():
         assert posing._tail(table, 64) == tail
 
 
-NEAR = variation.Dispersion(attitudes.AxisAngle(vector(np.pi - 1e-5), vector(np.pi)))  # the law's singularity
-FAR = variation.Dispersion(state=numbers.Uniform(vector([1e308, 0.0])))  # no square of it is finite
+NEAR = random_turns(np.pi - 1e-5, np.pi)  # the law's singularity
+FAR = variation.Dispersion(
+    {"initial_state": RandomNumbers("uniform", vector([1e308, 0.0]))}
+)  # no square of it is finite
 
 
 @pytest.mark.parametrize("lost", helpers.short([FAR, NEAR], [FAR]), ids=["far", "near"])
@@ -384,7 +387,7 @@ def test_a_failed_trial_is_worse_than_any_that_ends_however_far_beyond_its_limit
 @pytest.mark.parametrize("tail", [None, 3])
 def test_a_trial_that_fails_whatever_the_gains_hides_nothing_of_the_others(tail):
     """One that starts in the law's singularity: F is that of the others, and what a failure costs, to 14 digits."""
-    turned = variation.Dispersion(attitudes.AxisAngle(vector(0.4), vector(np.pi)))
+    turned = random_turns(0.4, np.pi)
     eight = replace(problem(8, turned, peak_torque=0.7), tail=tail)
     ((name, drawn),) = eight.coordinates.items()
     lost = 0.9 * drawn

@@ -1,18 +1,18 @@
 """The worst trial inside what the dispersions can draw, against closed forms."""
 
 from dataclasses import replace
-from typing import Any
 
 import jax
 import numpy as np
 import pytest
 
 from ptsmc_jax.campaigns import montecarlo
-from ptsmc_jax.dispersions import attitudes, inertias, misfits, numbers, variation
+from ptsmc_jax.dispersions import inertias, numbers, variation
+from ptsmc_jax.dispersions.numbers import RandomNumbers
 from ptsmc_jax.signals import disturbances
 from ptsmc_jax.simulation import clock, pointing
 from ptsmc_jax.simulation.requirements import Requirement
-from tests.helpers import chain_parts, parts, short, small_search, vector
+from tests.helpers import chain_parts, parts, random_turns, short, small_search, vector
 from tuning.search import flights, objective, optimise, rounds, worst
 from tuning.search.evaluate import Evaluator
 from tuning.search.shares import Bounds
@@ -49,7 +49,7 @@ def first_torque(inertia, theta, eta=ETA):
 
 def test_a_search_computes_only_the_pointing_metrics_that_its_problem_needs():
     observed = pointing.Pointing(vector(*pointing.across([0.0, 0.0, 1.0])), vector(0.1), vector(0.4))
-    spread = variation.Dispersion(attitudes.AxisAngle(vector(0.1), vector(2.0)))
+    spread = random_turns(0.1, 2.0)
     problem, _ = posed(spread, Requirement("ape_z", 1e-3))
     problem = replace(problem, parts=replace(problem.parts, pointing=observed))
     gains = np.array([ETA, 1.0])
@@ -71,7 +71,7 @@ def few_screened(monkeypatch):
 def test_the_worst_attitude_is_the_one_theory_names(inertia):
     """For a torque component i, |(J n)_i| is largest along row i of J: the worst axis is that of the longest row."""
     smallest, largest = np.deg2rad(20.0), np.deg2rad(140.0)
-    spread = variation.Dispersion(attitudes.AxisAngle(vector(smallest), vector(largest)))
+    spread = random_turns(smallest, largest)
     problem, wanted = posed(spread, inertia=inertia)
     found = worst.hardest(problem, wanted, np.array([ETA, 1.0]))
     tensor = np.diag(inertia) if np.ndim(inertia) == 1 else np.asarray(inertia)
@@ -90,16 +90,15 @@ def test_the_worst_attitude_is_the_one_theory_names(inertia):
 
 
 @pytest.mark.long  # beyond all numbers: below
-@pytest.mark.parametrize("kind", [attitudes.UniformAttitude(), attitudes.AxisAngle(vector(np.pi / 2), vector(np.pi))])
+@pytest.mark.parametrize("kind", [numbers.any_attitude(), numbers.axis_angle(np.pi / 2, np.pi)])
 def test_attitudes_up_to_180_degrees_have_no_worst_case(kind):
-    problem, wanted = posed(variation.Dispersion(kind))
+    problem, wanted = posed(variation.Dispersion({"initial_attitude": kind}))
     assert worst.hardest(problem, wanted, np.array([ETA, 1.0])).unbounded
 
 
 def test_turns_have_slopes_by_what_they_are_drawn_from():
     """Against central differences, as the ascent moves them; at the ends of the angles too, where reals turn back."""
-    kind = attitudes.AxisAngle(vector(0.4), vector(2.0))
-    name, spread, step = "initial_attitude", variation.Dispersion(kind), 1e-6
+    name, spread, step = "initial_attitude", random_turns(0.4, 2.0), 1e-6
     problem, _ = posed(spread)
     y = np.array([[0.3, 0.6, 0.2], [0.7, 0.9, 1.0]])
 
@@ -134,11 +133,12 @@ def swinging(x0, std, amplitude, settling_angle=1e9, **limits):
     run = chain_parts([x0, 0.0], T_F, ETA, 1.0, period=0.2, disturbance=acting)
     run = replace(run, clock=clock.anchored(0.2, 21.0, T_F, 5.0), t_end=vector(21.0))
     run = replace(run, settling_angle=vector(settling_angle))
-    drawn: dict[str, Any] = {
-        "actuator_scale": misfits.Factors(numbers.Uniform(vector([EDGE]))),
-        "timing_jitter": misfits.Jitter(vector(0.0), vector(0.3)),
-    }
-    spread = variation.Dispersion(state=numbers.Normal(vector(std)), phase=numbers.UniformPhase(1), misfits=drawn)
+    spread = variation.Dispersion({
+        "initial_state": RandomNumbers("normal", vector(std)),
+        "disturbance_phase": numbers.interval([0.0], [2.0 * np.pi]),
+        "actuator_scale": RandomNumbers("uniform", vector([EDGE])),
+        "timing_jitter": numbers.interval([0.0], [0.3]),
+    })  # fmt: skip
     asked = dict.fromkeys(("peak_rate", "effort", "peak_torque_delivered", "settling_time"), 1e9) | limits
     wanted = [Requirement(metric, limit) for metric, limit in asked.items()]
     return objective.problem(run, spread, 5, np.arange(8), ("eta", "delta"), wanted), wanted
@@ -186,17 +186,16 @@ def test_the_worst_turn_of_a_star_tracker_is_found_by_its_slopes():
     The gyro's factor and late samples move the error of a body at rest by nothing, and slopes must say so.
     """
     edge, limit = 0.02, 0.01
-    drawn: dict[str, Any] = {
-        "star_tracker_misalignment": misfits.Turn(numbers.Uniform(vector([edge] * 3))),
-        "gyro_scale": misfits.Factors(numbers.Uniform(vector([0.05] * 3))),
-        "timing_jitter": misfits.Jitter(vector(0.0), vector(0.3)),
-    }
-    spread = variation.Dispersion(misfits=drawn)
+    spread = variation.Dispersion({
+        "star_tracker_misalignment": RandomNumbers("uniform", vector([edge] * 3)),
+        "gyro_scale": RandomNumbers("uniform", vector([0.05] * 3)),
+        "timing_jitter": numbers.interval([0.0], [0.3]),
+    })  # fmt: skip
     problem, wanted = posed(
         spread, Requirement("window_error", limit), q=[0.0, 0.0, 0.0, 1.0], noise=(0.0, 0.0), k1=4.0, surface_rate=2.0
     )
     found = worst.hardest(problem, wanted, np.array([ETA, 4.0]))
-    assert set(found.moved) == set(spread.misfits)
+    assert set(found.moved) == set(spread.kinds)
     np.testing.assert_allclose(found.ratio, np.sin(edge * np.sqrt(3.0) / 2.0) / limit, rtol=1e-3)
     assert found.screened < found.ratio
     turn = [found.start[f"star_tracker_misalignment_{k}"] for k in (1, 2, 3)]
@@ -209,7 +208,7 @@ MOVED = ["attitudes", "normal starts, a phase and misfits"]
 @pytest.mark.parametrize("what", short(MOVED, MOVED[1:]))
 def test_slopes_of_the_ascent_agree_with_central_differences(what):
     if what == "attitudes":
-        problem, _ = posed(variation.Dispersion(attitudes.AxisAngle(vector(0.4), vector(2.0))))
+        problem, _ = posed(random_turns(0.4, 2.0))
         limits = {"peak_torque": 0.5, "effort": 3.0}
     else:
         limits = {"effort": 3.0, "peak_rate": 0.05}
@@ -237,7 +236,7 @@ def test_a_robust_search_keeps_the_limit_in_the_worst_case(monkeypatch, plant):
     monkeypatch.setattr(worst, "STEPS", steps)  # all of the ascent, which is what finds it
     if plant == "spacecraft":
         largest, limit = np.deg2rad(140.0), 1.9
-        spread = variation.Dispersion(attitudes.AxisAngle(vector(np.deg2rad(20.0)), vector(largest)))
+        spread = random_turns(np.deg2rad(20.0), largest)
         problem, wanted = posed(spread, Requirement("peak_torque", limit))
         eta = np.sqrt(limit / first_torque(np.diag([10.0, 12.0, 14.0]), largest, 1.0))
     else:
@@ -287,7 +286,7 @@ def test_coordinates_given_are_flown_as_drawn_ones():
 
 
 def test_trials_that_join_take_free_places_first_and_then_those_of_the_oldest():
-    problem, wanted = posed(variation.Dispersion(attitudes.AxisAngle(vector(0.4), vector(2.0))))
+    problem, wanted = posed(random_turns(0.4, 2.0))
     evaluate = Evaluator(Bounds(("eta", "delta"), (2.5, 0.3), (6.0, 4.0)))
     search, joined = rounds.Rounds(evaluate, problem, wanted, robust=False), 0
     for count in (8, 8, 3, 8, 1):
@@ -304,7 +303,7 @@ def test_trials_that_join_take_free_places_first_and_then_those_of_the_oldest():
 
 def test_several_limits_on_shares_of_the_trials_keep_their_critical_trials():
     """The trials of the last limit took the places of those of the limit before it."""
-    problem, wanted = posed(variation.Dispersion(attitudes.AxisAngle(vector(0.4), vector(2.0))))
+    problem, wanted = posed(random_turns(0.4, 2.0))
     wanted = [replace(wanted[0], quantile=0.9), replace(wanted[0], metric="effort", quantile=0.9)]
     problem = objective.problem(
         problem.parts, problem.dispersion, 5, np.arange(8), problem.names, wanted, may_break=(0, 0)
@@ -333,7 +332,9 @@ def test_a_limit_broken_on_other_trials_does_not_tighten_the_others(monkeypatch)
 def test_where_nothing_can_be_moved_the_hardest_drawn_one_is_the_worst():
     """Only the true inertia is drawn, or, of a chain, noise alone."""
     body = vector([10.0, 12.0, 14.0]), vector(np.eye(3)), vector(0.05), vector(0.0)
-    spread = variation.Dispersion(attitudes.UniformAttitude(), inertia=inertias.RelativeInertia(*body))
+    spread = variation.Dispersion(
+        {"initial_attitude": numbers.any_attitude(), "inertia": inertias.RelativeInertia(*body)}
+    )
     assert flights.movable(spread) == ("initial_attitude",)
     run = chain_parts([1.0, 0.0], T_F, ETA, 1.0, period=0.2, noise=[1e-2, 1e-3])
     run = replace(run, clock=clock.anchored(0.2, 21.0, T_F, 5.0), t_end=vector(21.0))
@@ -358,7 +359,7 @@ def test_where_nothing_can_be_moved_the_hardest_drawn_one_is_the_worst():
 def test_a_trial_without_a_value_is_the_hardest(plant):
     """Nearer ones settle, farther ones not before the end."""
     if plant == "spacecraft":
-        spread = variation.Dispersion(attitudes.AxisAngle(vector(0.01), vector(2.0)))
+        spread = random_turns(0.01, 2.0)
         problem, wanted = posed(spread, Requirement("settling_time", 19.0), settling_angle=1e-4)
     else:
         problem, wanted = swinging(1.0, [2.0, 0.0], 0.0, settling_angle=1e-4, settling_time=19.0)

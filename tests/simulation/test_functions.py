@@ -12,7 +12,7 @@ import pytest
 
 import ptsmc_jax as ptsmc
 from ptsmc_jax import scenario
-from ptsmc_jax.dispersions import numbers
+from ptsmc_jax.dispersions.numbers import RandomNumbers
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.numerics import draws
 from ptsmc_jax.numerics.pytrees import vector
@@ -214,7 +214,9 @@ REFUSED = {
         r"a seed or trial is of shape \(2,\), but must be one number; jax.vmap takes one at a time",
     ),
     "the draws of several trials at once": (
-        lambda: API.one(RUN, Dispersion(rate=numbers.Normal(vector([0.1, 0.1, 0.1]))), 0, jnp.arange(3)),
+        lambda: API.one(
+            RUN, Dispersion({"initial_rate": RandomNumbers("normal", vector([0.1] * 3))}), 0, jnp.arange(3)
+        ),
         r"a seed or trial is of shape \(3,\), but must be one number",
     ),
     "half a seed": (
