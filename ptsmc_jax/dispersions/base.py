@@ -1,4 +1,4 @@
-"""What a quantity of a trial is, how plans check its numbers, and the base class of custom draws."""
+"""Quantities of a trial, checks of their numbers in plans, and the base class of custom draws."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ DISTURBANCE_BIAS = "disturbance_bias"
 
 
 class UnfitError(ValueError):
-    """Numbers of a plan that cannot be simulated: in which row, and what is allowed there."""
+    """Numbers of a plan that cannot be simulated; `row` is the first such row, and the message the allowed values."""
 
     def __init__(self, row: int, allowed: str):
         super().__init__(allowed)
@@ -34,7 +34,7 @@ class UnfitError(ValueError):
 
         Args:
             fit: whether each row is fit, (rows,).
-            allowed: returns what a row must have, in words, for the index of the row.
+            allowed: returns the allowed values in words, for the index of the row.
         """
         if not fit.all():
             row = int(np.argmin(fit))
@@ -49,13 +49,13 @@ class Quantity(NamedTuple):
     """Numbers (n,) of a trial that may differ from the nominal ones.
 
     Attributes:
-        columns: names of their columns in rows and plans; none if these parts have no such quantity.
-        read: the numbers of these parts.
-        write: the parts with other numbers.
-        combine: the numbers of a trial from random and nominal ones; a mapping has a function for each distribution.
-        size: how many random numbers there are; None: as many as columns.
+        columns: returns the names of their columns in rows and plans; empty if the parts have no such quantity.
+        read: returns the numbers of the parts.
+        write: returns the parts with other numbers.
+        combine: returns the numbers of a trial; a mapping has one such function for each distribution.
+        size: returns the count of random numbers; None: there is one for each column.
         unit: a spacecraft's, of all numbers or of each.
-        checked: numbers (rows, n) of a plan as they are simulated; raises UnfitError.
+        checked: returns the simulated numbers for those of a plan, (rows, n) each; raises UnfitError.
         check_with: raises UnfitError if other quantities of the plan, or the parts, forbid the numbers.
         categories: columns that number several things, such as wheels, so that their order means nothing.
         hardware: whether it is an error of the hardware, or of the modes, that flight software does not know.
@@ -77,7 +77,13 @@ class Quantity(NamedTuple):
         return len(self.columns(parts)) if self.size is None else self.size(parts)
 
     def dispersed(self, parts: Parts, random: Random, distribution: str) -> Parts:
-        """Return the parts with the quantity combined of its nominal and these random numbers (count,)."""
+        """Return the parts with this quantity dispersed.
+
+        Args:
+            parts: nominal parts.
+            random: random numbers of the quantity, (count,).
+            distribution: of the random numbers.
+        """
         combine = self.combine if callable(self.combine) else self.combine[distribution]
         return self.write(parts, combine(random, self.read(parts), parts))
 
@@ -115,7 +121,7 @@ def fitting(fits: Callable[[np.ndarray], np.ndarray], allowed: str) -> Checked:
 
     Args:
         fits: (rows, n) -> (rows, ..) bool, all true for a row that is fit.
-        allowed: what a row must have, in words.
+        allowed: the allowed values, in words.
     """
 
     def checked(rows: np.ndarray) -> np.ndarray:

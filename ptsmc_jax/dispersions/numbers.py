@@ -36,7 +36,7 @@ _STANDARD = {
     "truncated_normal": _Standard("uniform", lambda c: jax.lax.erf_inv((2.0 * c - 1.0) * _ENDS), math.sqrt(2.0)),
     "uniform": _Standard("uniform", lambda c: 2.0 * c - 1.0),  # on (-1, 1)
     "interval": _Standard("uniform", lambda c: c),  # on (0, 1)
-    "axis_angle": _Standard("uniform", lambda c: c),  # height and azimuth of a point on the unit sphere, and angle
+    "axis_angle": _Standard("uniform", lambda c: c),  # height and azimuth of the axis, and angle
     "any_attitude": _Standard("normal", attitude.normalise),  # uniform on SO(3) (Muller, 1959)
 }
 
@@ -105,7 +105,7 @@ def added(random: Random, nominal: Numbers, parts: Any) -> Numbers:
 
 
 def scaled(random: Random, nominal: Numbers, parts: Any) -> Numbers:
-    """Return nominal numbers times 1 + a random number, of which each belongs to as many successive numbers."""
+    """Return nominal numbers times 1 + a random number, which equal groups of successive numbers have in common."""
     groups = nominal.reshape(random.size, nominal.size // max(random.size, 1))
     return jnp.ravel(groups * (1.0 + random)[:, None])
 
@@ -124,5 +124,5 @@ def turned_about_axis(random: Random, nominal: Numbers, parts: Any) -> Numbers:
 
 
 def turned_from_reference(random: Random, nominal: Numbers, parts: Any) -> Numbers:
-    """Return the attitude of the reference at t = 0 (4,), turned likewise."""
+    """Return the attitude of the reference at t = 0 (4,) turned about an axis, see `turned_about_axis`."""
     return turned_about_axis(random, parts.reference(jnp.zeros_like(parts.t_end)).q, parts)

@@ -1,7 +1,6 @@
 """The table of all quantities that may differ from trial to trial.
 
-Each has a name, which is also that of the stream of its random numbers, and the columns in which rows list it and plans
-give it.
+The name of a quantity is also the name of the stream of its random numbers. Rows and plans have the same columns.
 """
 
 from collections.abc import Iterable
@@ -49,11 +48,10 @@ from ptsmc_jax.simulation.rollout import Parts
 
 NEAR = 1e-6  # relative: largest error of the norm of a unit vector or quaternion in a plan
 PAIRS = [(i, j) for i in range(3) for j in range(i, 3)]  # the upper triangle, in the order of the inertia's columns
-LEVELS = ("attitude_noise", "rate_noise", "state_noise", "torque_limit")  # are dispersed by one factor
 
 
 def level(name: str) -> str:
-    """Return the name of the quantity that one of `LEVELS` is."""
+    """Return the name of a quantity that one common factor disperses, such as `torque_limit`."""
     return f"{name}_level"
 
 
@@ -69,7 +67,7 @@ def _unit(q: np.ndarray) -> np.ndarray:
 
 
 def with_body(parts: Parts, body: Spacecraft) -> Parts:
-    """Return the parts with another true body, on which the disturbance acts."""
+    """Return the parts with another true body; a gravity gradient acts on that body, too."""
     return replace(parts, plant=body, disturbance=disturbances.on_body(parts.disturbance, body.inertia))
 
 

@@ -30,7 +30,7 @@ def put(tree: Any, path: str, value: Any) -> Any:
     """Return a copy of nested dataclasses, named tuples and arrays with another value at a path.
 
     Args:
-        tree: the outermost dataclass, named tuple or array; it stays as it is.
+        tree: the outermost dataclass, named tuple or array.
         path: fields and indices from the tree to the value.
         value: the new value.
     """

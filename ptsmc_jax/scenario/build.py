@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from ptsmc_jax.devices import reaction_wheels
 from ptsmc_jax.dispersions.base import INITIAL_ATTITUDE, INITIAL_RATE, INITIAL_STATE
-from ptsmc_jax.dispersions.quantities import LEVELS, QUANTITIES, level
+from ptsmc_jax.dispersions.quantities import QUANTITIES, level
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.plants.base import Plant
@@ -58,13 +58,10 @@ def disturbance(scenario: Scenario, plant: Plant) -> tuple[Any, Any]:
     return (signal[0] if signal else disturbances.Constant(jnp.zeros(plant.inputs))), walk
 
 
-# names of quantities by keys of [dispersion], where they differ
-_NAMES = {
-    "attitude": INITIAL_ATTITUDE,
-    "rate": INITIAL_RATE,
-    "x0": INITIAL_STATE,
-    **{key: level(key) for key in LEVELS},
-}
+def _quantity_of(key: str) -> str:
+    """Return the name of the quantity that a key of [dispersion] disperses."""
+    initial = {"attitude": INITIAL_ATTITUDE, "rate": INITIAL_RATE, "x0": INITIAL_STATE}
+    return initial.get(key, level(key) if level(key) in QUANTITIES else key)
 
 
 def dispersion(scenario: Scenario, parts: Parts) -> Dispersion:
@@ -73,7 +70,7 @@ def dispersion(scenario: Scenario, parts: Parts) -> Dispersion:
     if table is None:
         return Dispersion()
     keys: tuple[str, ...] = table.__struct_fields__
-    tables: dict[str, Any] = {_NAMES.get(key, key): getattr(table, key) for key in keys if key != "own"}
+    tables: dict[str, Any] = {_quantity_of(key): getattr(table, key) for key in keys if key != "own"}
     return Dispersion(
         {
             name: one.build(parts, QUANTITIES[name].count(parts))

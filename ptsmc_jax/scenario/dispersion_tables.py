@@ -30,7 +30,7 @@ class Numbers(Table, frozen=True):
         return not np.any(self.of())
 
     def build(self, parts: Any, count: int) -> Any:
-        """Return `dispersions.numbers.RandomNumbers` with so many numbers."""
+        """Return `dispersions.numbers.RandomNumbers`, (count,)."""
         from ptsmc_jax.dispersions.numbers import RandomNumbers
         from ptsmc_jax.numerics.pytrees import vector
 
