@@ -1,4 +1,7 @@
-"""Quantities of a trial, checks of their numbers in plans, and the base class of custom draws."""
+"""Quantities of a trial, checks of their numbers in plans, and the base class of custom draws.
+
+A number of a trial = combine(random number, nominal number), in the unit of its quantity.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -81,7 +84,7 @@ class Quantity(NamedTuple):
 
         Args:
             parts: nominal parts.
-            random: random numbers of the quantity, (count,).
+            random: random numbers of the quantity, (count,) [SI units or -].
             distribution: of the random numbers.
         """
         combine = self.combine if callable(self.combine) else self.combine[distribution]
@@ -120,11 +123,12 @@ def fitting(fits: Callable[[np.ndarray], np.ndarray], allowed: str) -> Checked:
     """Return a check of rows (rows, n) that raises UnfitError for the first row that is not fit.
 
     Args:
-        fits: (rows, n) -> (rows, ..) bool, all true for a row that is fit.
+        fits: (rows, n) -> (rows, ..) bool, all true for a row that is fit [SI units].
         allowed: the allowed values, in words.
     """
 
     def checked(rows: np.ndarray) -> np.ndarray:
+        """Return these rows (rows, n) [SI units] unchanged; raise UnfitError if a row is not fit."""
         UnfitError.check(np.asarray(fits(rows).reshape(len(rows), -1).all(axis=1)), lambda row: allowed)
         return rows
 

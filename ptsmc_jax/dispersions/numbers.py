@@ -95,17 +95,17 @@ Combine = Callable[[Random, Numbers, Any], Numbers]
 
 
 def replaced(random: Random, nominal: Numbers, parts: Any) -> Random:
-    """Return the random numbers alone."""
+    """Return the random numbers alone (n,) [SI units]."""
     return random
 
 
 def added(random: Random, nominal: Numbers, parts: Any) -> Numbers:
-    """Return the sums."""
+    """Return the sums (n,) [SI units]."""
     return nominal + random
 
 
 def scaled(random: Random, nominal: Numbers, parts: Any) -> Numbers:
-    """Return nominal numbers times 1 + a random number, which equal groups of successive numbers have in common."""
+    """Return nominal numbers (n,) [SI units] times 1 + a random number [-] of each group of n / count numbers."""
     groups = nominal.reshape(random.size, nominal.size // max(random.size, 1))
     return jnp.ravel(groups * (1.0 + random)[:, None])
 
@@ -124,5 +124,5 @@ def turned_about_axis(random: Random, nominal: Numbers, parts: Any) -> Numbers:
 
 
 def turned_from_reference(random: Random, nominal: Numbers, parts: Any) -> Numbers:
-    """Return the attitude of the reference at t = 0 (4,) turned about an axis, see `turned_about_axis`."""
+    """Return the attitude [-] of the reference at t = 0 (4,) turned about an axis, see `turned_about_axis`."""
     return turned_about_axis(random, parts.reference(jnp.zeros_like(parts.t_end)).q, parts)

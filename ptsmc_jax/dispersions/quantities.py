@@ -1,6 +1,7 @@
 """The table of all quantities that may differ from trial to trial.
 
 The name of a quantity is also the name of the stream of its random numbers. Rows and plans have the same columns.
+A number of a trial = combine(random number, nominal number).
 """
 
 from collections.abc import Iterable

@@ -1,4 +1,4 @@
-"""The parts of a trial, a pure function of the nominal parts, the seed and the number of the trial."""
+"""The parts of a trial = at(nominal parts, coordinates(seed, trial)), a pure function."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -57,7 +57,7 @@ class Dispersion:
         return kinds if self.own is None else {**kinds, OWN: self.own}
 
     def coordinates(self, seed: WholeNumber, trial: WholeNumber) -> Coordinates:
-        """Return the coordinates of a trial; the stream of each quantity is independent of all other quantities."""
+        """Return the coordinates [-] of a trial; the stream of each quantity is independent of all other quantities."""
         kinds, coordinates = self.kinds, {}
         for distribution in draws.DISTRIBUTIONS:
             counts = {name: kind.count for name, kind in kinds.items() if kind.drawn == distribution}
@@ -65,7 +65,7 @@ class Dispersion:
         return {name: coordinates[name] for name in kinds}
 
     def at(self, parts: Parts, coordinates: Coordinates) -> Parts:
-        """Return the parts of the trial that has these coordinates."""
+        """Return the parts of the trial that has these coordinates [-]."""
         # the reference first: initial attitudes may be turned away from it
         for name in sorted(self.kinds, key=lambda name: name != REFERENCE):
             c, kind = coordinates[name], self.kinds[name]
@@ -79,7 +79,7 @@ class Dispersion:
         return parts
 
     def apply(self, parts: Parts, seed: WholeNumber, trial: WholeNumber) -> Parts:
-        """Return the parts of one trial: a pure function of the nominal parts, the seed and the trial's number."""
+        """Return the parts of one trial: a pure function of the nominal parts, the seed and the trial's number [-]."""
         return self.at(parts, self.coordinates(seed, trial))
 
     def values(self, parts: Parts, given: Iterable[str] = ()) -> dict[str, Array]:
