@@ -1,4 +1,12 @@
-"""The sampled loop of 16 384 trials, and of one, against the same loop by hand in C (`loop.c`)."""
+"""Compare the sampled loop with the same loop written by hand in C.
+
+    python benchmarks/against_c.py [first_flight] [cubesat]
+
+`loop.c` is the first flight without noise: 16 384 trials, and one. `cubesat.c` is the CubeSat with its noise: 4 096
+trials, with pointing metrics and without. Each C program must return the library's metrics.
+"""
+
+import sys
 
 import jax
 import numpy as np
@@ -9,13 +17,36 @@ configure()
 
 from functools import partial  # noqa: E402
 
-from common import C_METRICS, Program, machine, medians, row, say, steps, study  # noqa: E402
+from common import (  # noqa: E402
+    C_METRICS,
+    CUBESAT,
+    CUBESAT_METRICS,
+    POINTING_METRICS,
+    CubesatProgram,
+    Program,
+    machine,
+    medians,
+    row,
+    say,
+    steps,
+    study,
+)
 
+from ptsmc_jax import scenario  # noqa: E402
 from ptsmc_jax.campaigns import montecarlo  # noqa: E402
 from ptsmc_jax.programs import BATCHED  # noqa: E402
 from ptsmc_jax.simulation import rollout  # noqa: E402
 
 TRIALS = 16384
+
+
+def check_same(name: str, out: np.ndarray, trials: montecarlo.Trials, metrics: list[str]) -> None:
+    """Print how far the metrics of a C program are from the library's; raise AssertionError if it is too far."""
+    expected = [np.asarray(getattr(trials.metrics, metric)) for metric in metrics]
+    largest = [max(np.nanmax(np.abs(e)), 1e-300) for e in expected]
+    off = [np.nanmax(np.abs(out[:, k] - e)) / most for k, (e, most) in enumerate(zip(expected, largest, strict=True))]
+    say(f"{name}: metrics differ from the library's by at most {max(off):.1e} of the largest")
+    assert max(off) < 1e-9, "not the same loop"
 
 
 def batch(metrics: bool) -> None:
@@ -27,11 +58,7 @@ def batch(metrics: bool) -> None:
     fly = {name: program.prepare(quiet.parts, flown.vectors("initial_q")) for name, program in programs.items()}
     if metrics:
         for name, run in fly.items():
-            out = run()
-            expected = [getattr(flown.metrics, name) for name in C_METRICS]
-            off = [np.nanmax(np.abs(out[:, k] - e)) / np.nanmax(np.abs(e)) for k, e in enumerate(expected)]
-            say(f"{name}: metrics differ from the library's by at most {max(off):.1e} of the largest")
-            assert max(off) < 1e-9, "not the same loop"
+            check_same(name, run(), flown, C_METRICS)
 
     @partial(jax.jit, static_argnames=("devices",), compiler_options=BATCHED)
     def peaks(parts, dispersion, trials, devices):
@@ -68,8 +95,35 @@ def single() -> None:
         f"{each['ptsmc_jax'] / each['scalar C']:.2f} times")  # fmt: skip
 
 
+def cubesat(pointing: bool) -> None:
+    """Many trials of the CubeSat: rates and ratios."""
+    scene = scenario.read(CUBESAT)
+    if not pointing:
+        scene = scenario.replace(scene, pointing=None, requirements__ape_boresight=None)
+    ready, numbers = scenario.study(scene), np.arange(TRIALS // 4)
+    programs = {
+        "CubeSat in C, any inertia": CubesatProgram(pointing=pointing),
+        "CubeSat in C, principal axes": CubesatProgram(pointing=pointing, full=False),
+    }
+    fly = {name: program.prepare(ready, numbers) for name, program in programs.items()}
+    trials = montecarlo.run(ready.parts, ready.dispersion, 0, numbers)
+    assert trials.ok.all()
+    for name, run in fly.items():
+        check_same(name, run(), trials, CUBESAT_METRICS + (POINTING_METRICS if pointing else []))
+    seconds = medians({**fly, "ptsmc_jax": lambda: montecarlo.run(ready.parts, ready.dispersion, 0, numbers).metrics})
+    total, what = numbers.size * steps(ready.parts), f"pointing metrics {'on' if pointing else 'off'}"
+    say(f"\n{numbers.size} trials of {steps(ready.parts)} periods, {what}")
+    for name in fly:
+        row(f"{name}, {what}", total / seconds[name] / 1e6, total / seconds["ptsmc_jax"] / 1e6)
+
+
 if __name__ == "__main__":
     say(machine())
+    asked = sys.argv[1:] or ["first_flight", "cubesat"]
     for everything in (True, False):
-        batch(everything)
-    single()
+        if "first_flight" in asked:
+            batch(everything)
+        if "cubesat" in asked:
+            cubesat(everything)
+    if "first_flight" in asked:
+        single()

@@ -21,16 +21,23 @@ from ptsmc_jax import scenario
 from ptsmc_jax.batching import kernel, lanes
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.scenario import Study
+from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.clock import Anchored
 from ptsmc_jax.simulation.rollout import Parts
 
 HERE = Path(__file__).parent
 SCENARIO = HERE.parent / "scenarios" / "first_flight.toml"
+CUBESAT = HERE.parent / "scenarios" / "cubesat.toml"
 MOVES = {"broadcast_in_dim", "convert_element_type", "get", "pjit", "jit"}  # equations that compute nothing
 C_METRICS = (
     "peak_torque terminal_error terminal_angle window_error hold_error effort settling_time chattering peak_rate "
     "peak_momentum"
 ).split()
+CUBESAT_METRICS = (
+    "terminal_error terminal_angle window_error hold_error window_angle hold_angle peak_torque peak_torque_delivered "
+    "saturated effort settling_time chattering peak_rate peak_momentum peak_wheel_momentum peak_wheel_torque"
+).split()
+POINTING_METRICS = [f"{index}_{axis}" for index in catalogues.INDICES for axis in catalogues.AXES]
 
 
 def study(noise: bool = False, **changes) -> Study:
@@ -113,6 +120,25 @@ def peak_rate(interpret: bool = False, rounds: int = 4096, blocks: int = 16_384)
     return 2.0 * x.size * chains * unrolled * rounds / medians({"": lambda: run(x)}, repeats=5)[""]
 
 
+def compiled(source: str, options: list[str]) -> ctypes.CDLL:
+    """Return a C source of this folder, compiled with these options."""
+    flags = "-O3 -march=native -ffast-math -fopenmp -shared -fPIC".split()
+    with tempfile.TemporaryDirectory() as folder:
+        library = Path(folder) / "loop.so"
+        subprocess.run(["gcc", *flags, *options, str(HERE / source), "-o", str(library), "-lm"], check=True)
+        return ctypes.CDLL(str(library))
+
+
+def at(array: np.ndarray) -> ctypes.c_void_p:
+    """Return the address of an array, for a C function."""
+    return ctypes.c_void_p(array.ctypes.data)
+
+
+def flat(values: list) -> np.ndarray:
+    """Return the numbers of these arrays, one after the other in memory."""
+    return np.concatenate([np.ravel(np.asarray(v, dtype=float)) for v in values])
+
+
 @dataclass
 class Program:
     """`loop.c`, compiled with these settings."""
@@ -122,12 +148,8 @@ class Program:
     full: bool = True
 
     def __post_init__(self):
-        self.folder = tempfile.TemporaryDirectory()
-        library = Path(self.folder.name) / "loop.so"
         options = [f"-DLANES={self.lanes}", f"-DMETRICS={int(self.metrics)}", f"-DFULL={int(self.full)}"]
-        flags = f"-O3 -march=native -ffast-math -shared -fPIC {'-fopenmp' if self.lanes > 1 else ''}".split()
-        subprocess.run(["gcc", *flags, *options, str(HERE / "loop.c"), "-o", str(library), "-lm"], check=True)
-        self.library = ctypes.CDLL(str(library))
+        self.library = compiled("loop.c", options if self.lanes > 1 else [*options, "-fno-openmp"])
 
     def prepare(self, parts: Parts, q0: np.ndarray) -> Callable[[], np.ndarray]:
         """What flies these initial attitudes (trials, 4) with the constants of these parts: () -> (trials, columns)."""
@@ -144,18 +166,71 @@ class Program:
             d.amplitude, d.frequency, d.phase, clock.period, parts.t_end, parts.window, parts.settling_angle,
             watch.update_matrix(clock.period), watch.update_matrix(first),
         ]  # fmt: skip
-        constants = np.concatenate([np.ravel(np.asarray(v, dtype=float)) for v in values])
+        constants = flat(values)
         aligned = np.ascontiguousarray(np.where((q0[:, 3] * target[3] < 0)[:, None], -q0, q0))
         out = np.zeros((len(q0), len(C_METRICS) + 2 if self.metrics else 1))
-
-        def at(array: np.ndarray) -> ctypes.c_void_p:
-            return ctypes.c_void_p(array.ctypes.data)
 
         def fly() -> np.ndarray:
             self.library.fly(at(constants), at(nodes), len(nodes) - 1, at(aligned), len(q0), at(out))
             return out
 
         return fly
+
+
+@dataclass
+class CubesatProgram:
+    """`cubesat.c`, compiled with these settings; full: any inertia and wheel axes of the model."""
+
+    pointing: bool = True
+    full: bool = True
+
+    def __post_init__(self):
+        options = ["-DLANES=16", f"-DPOINTING={int(self.pointing)}", f"-DFULL={int(self.full)}"]
+        self.library = compiled("cubesat.c", options)
+
+    def prepare(self, ready: Study, trials: np.ndarray) -> Callable[[], np.ndarray]:
+        """Return a function () -> (trials, columns) that simulates these trials of a scenario, seed 0."""
+        parts = ready.parts
+        clock, law, watch, sensors = parts.clock, parts.controller, parts.observer, parts.sensors
+        actuators, d = parts.actuators, parts.disturbance
+        assert isinstance(clock, Anchored) and actuators is not None and actuators.wheels is not None
+        ticks, k2, device = clock.ticks(law.t_f, law.delta), watch.error_bound(), actuators.wheels
+        frame = (np.eye(3), 0.0, 1.0)
+        if parts.pointing is not None:
+            frame = parts.pointing.frame, parts.pointing.after, parts.pointing.window
+        first = jnp.sum(jnp.where(ticks.partial, ticks.t_next - ticks.t, 0.0))
+        start = jax.tree.map(lambda v: v[jnp.argmax(ticks.t_next > ticks.t)], ticks)
+        constants = flat([
+            law.model.inertia, law.model.inertia_inverse, parts.reference(jnp.zeros(())).q,
+            law.t_f, law.eta, law.k1, law.surface_rate, law.sign_width, law.layer_time, k2.rate, k2.start, k2.floor,
+            d.amplitude, d.frequency, d.bias, clock.period, parts.t_end, parts.window, parts.settling_angle,
+            watch.update_matrix(clock.period), watch.update_matrix(first),
+            sensors.attitude_noise, sensors.rate_noise, sensors.bias_rate,
+            sensors.filter.attitude_gain, sensors.filter.bias_gain,
+            actuators.lag, device.axes, device.allocation, device.torque_limit, device.momentum_limit, *frame,
+        ])  # fmt: skip
+        rows = np.stack([np.asarray(v, float) for v in (*ticks[:5], ticks.partial)], axis=1)
+
+        def begun(trial: jax.Array) -> tuple[jax.Array, jax.Array]:
+            drawn = ready.dispersion.apply(parts, np.uint32(0), trial)
+            x0 = drawn.controller.align(drawn.initial, drawn.reference(jnp.zeros(())))
+            memory = drawn.sensors.begin(np.uint32(0), trial, x0, start)
+            values = [
+                x0.q, x0.w, drawn.plant.inertia, drawn.plant.inertia_inverse, drawn.disturbance.phase, memory.bias,
+                *memory.estimate,
+            ]  # fmt: skip
+            keys = jnp.stack([word for key in memory.keys for word in key])
+            return jnp.concatenate([jnp.ravel(v) for v in values]), keys
+
+        drawn, keys = (np.ascontiguousarray(v) for v in jax.jit(jax.vmap(begun))(trials.astype(np.uint32)))
+        rows = np.ascontiguousarray(rows)
+        out = np.zeros((len(trials), len(CUBESAT_METRICS) + self.pointing * len(POINTING_METRICS)))
+
+        def simulate() -> np.ndarray:
+            self.library.fly_cubesat(at(constants), at(rows), len(rows), at(drawn), at(keys), len(trials), at(out))
+            return out
+
+        return simulate
 
 
 def row(other: str, theirs: float, ours: float) -> None:
