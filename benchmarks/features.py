@@ -3,8 +3,9 @@
     python benchmarks/features.py [WORD ...] [--trials 2048] [--pairs 5]
 
 The plain scenario is `scenarios/filtered_flight.toml`. Each row changes one thing in it. The rows come from the tables
-and kinds that scenario files have, so a new kind or key adds its row. Given words select the rows that contain one of
-them. A row runs by turns with the scenario that it is compared with, and the ratio is the median over these pairs.
+and kinds that scenario files have, so a new kind or key adds its row. The last rows are the packaged scenarios, beside
+the first flight. Given words select the rows that contain one of them. A row runs by turns with the scenario that it is
+compared with, and the ratio is the median over these pairs.
 """
 
 import argparse
@@ -20,11 +21,11 @@ from ptsmc_jax.configure import configure
 configure()
 
 import jax  # noqa: E402
-from common import HERE, machine, say  # noqa: E402
+from common import HERE, SCENARIO, machine, say  # noqa: E402
 
 from ptsmc_jax import scenario  # noqa: E402
 from ptsmc_jax.campaigns import montecarlo  # noqa: E402
-from ptsmc_jax.scenario import layouts, parsing  # noqa: E402
+from ptsmc_jax.scenario import layouts  # noqa: E402
 from ptsmc_jax.scenario.errors import ScenarioError  # noqa: E402
 from ptsmc_jax.scenario.tables import Scenario  # noqa: E402
 
@@ -95,7 +96,7 @@ def changes() -> Iterator[tuple[str, dict[str, Any]]]:
                 yield from of_kinds(f"{table}.{key}", f"{table}__{key}", name_kinds, None)
             elif getattr(getattr(PLAIN, table), key) is None or f"{table}.{key}" in VALUES:
                 yield f"{table}.{key}", {}
-    for key in PLAIN.TABLES["dispersion"].__struct_fields__:
+    for key in type(PLAIN.dispersion).__struct_fields__:
         drawn = getattr(PLAIN.dispersion, key)
         yield from of_kinds(f"dispersion.{key}", f"dispersion__{key}", layouts.DISPERSIONS[key], drawn and drawn.kind)
 
@@ -133,7 +134,10 @@ def scenarios() -> dict[str, tuple[str, Callable[[], Scenario]]]:
     for name, default in changes():
         base = next((base for prefix, base in BASES.items() if name.startswith(prefix)), "plain")
         found[name] = base, lambda name=name, base=base, default=default: changed(found[base][1](), name, default)
-    return found | {name: ("plain", made) for name, made in plants()}
+    found |= {name: ("plain", made) for name, made in plants()}
+    files = sorted(SCENARIOS.glob("*.toml"))
+    first = f"scenario {SCENARIO.stem}"
+    return found | {f"scenario {file.stem}": (first, lambda file=file: scenario.read(file)) for file in files}
 
 
 def changed(base: Scenario, name: str, default: dict[str, Any]) -> Scenario:
