@@ -194,8 +194,8 @@ class Actuators:
             if self.lag is not None and state.v is not None:
                 a = self.lag * -jnp.expm1(-dt / self.lag)
                 h = h - a * state.v
-            span = jnp.where(dt > a, dt - a, 1.0)
-            v = jnp.clip(v, (h - device.momentum_limit) / span, (h + device.momentum_limit) / span)
+            per_span = 1.0 / jnp.where(dt > a, dt - a, 1.0)  # one division, which all trials and wheels share
+            v = jnp.clip(v, per_span * (h - device.momentum_limit), per_span * (h + device.momentum_limit))
         if device.torque_limit is not None:
             v = jnp.clip(v, -device.torque_limit, device.torque_limit)
         return v
@@ -246,13 +246,21 @@ class Actuators:
         So momentum is, and to leading order the attitude, whatever a lag or a rate limit does within a step.
         """
         v, slope, has_length = drive.c, None, dt > 0.0
-        _, first, second = self.channels(drive, start)
+        _, first, _ = self.channels(drive, start)
         if drive.v is not None:
-            _, first_next, second_next = self.channels(drive, start + dt)
-            length = jnp.where(has_length, dt, 1.0)
-            v = jnp.where(has_length, (first_next - first) / length, drive.v)
-            moment = (first + first_next) / 2 * dt - (second_next - second)  # of the torque about the middle
-            slope = jnp.where(has_length, 12.0 * moment / length**3, 0.0)
+            # with a lag alone all channels move alike: by their gap times the motion of one from 1 to 0
+            gap, moving = drive.v - drive.c, drive
+            if self.rate_limit is None:
+                moving = drive._replace(v=jnp.ones_like(dt), c=jnp.zeros_like(dt))
+            _, begun, begun_twice = self.channels(moving, start)
+            _, ended, ended_twice = self.channels(moving, start + dt)
+            per_length = 1.0 / jnp.where(has_length, dt, 1.0)
+            mean = (ended - begun) * per_length
+            moment = (begun + ended) / 2 * dt - (ended_twice - begun_twice)  # of the torque about the middle
+            tilt = jnp.where(has_length, 12.0 * moment * per_length**3, 0.0)
+            if self.rate_limit is None:
+                mean, tilt = drive.c + gap * mean, gap * tilt
+            v, slope = jnp.where(has_length, mean, drive.v), tilt
         stored = None if drive.h is None else self.on_body(drive.h - self.delivered(drive, first))
         mean = self.on_body(self.delivered(drive, v))
         return AppliedTorque(mean, None if slope is None else self.on_body(self.delivered(drive, slope)), stored, dt)

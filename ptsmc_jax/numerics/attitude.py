@@ -131,7 +131,7 @@ def rotation_vector(v: Vector) -> Vector:
     size = jnp.sqrt(jnp.where(small, 0.25, square))
     scalar = jnp.sqrt(jnp.maximum(1.0 - square, 1e-12))
     series = 2.0 + square / 3 + 3 * square**2 / 20 + 5 * square**3 / 56
-    return v * jnp.where(small, series, 2.0 * jnp.arctan2(size, jnp.where(small, 0.5, scalar)) / size)
+    return v * jnp.where(small, series, 2.0 * elementary.arctan2(size, scalar) / size)
 
 
 @jax.jit
