@@ -1,15 +1,13 @@
 """Where the project's files lie, and what its modules are called; imports none of them."""
 
 from functools import cache
-from importlib.metadata import version
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
 PACKAGES = ("ptsmc_jax", "tuning")
-_OLDER = "--xla_cpu_use_fusion_emitters=false " if version("jaxlib").startswith("0.10.") else ""
 # what compiles in half the time and flies at a third of the speed: for programs that fly once
 QUICKLY = (
-    f"--xla_backend_optimization_level=0 {_OLDER}--xla_cpu_parallel_codegen_split_count=1 "
+    "--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1 "
     "--xla_llvm_enable_alias_scope_metadata=false --xla_llvm_enable_noalias_metadata=false"
 )
 
