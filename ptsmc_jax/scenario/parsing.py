@@ -11,7 +11,7 @@ import tomllib
 import typing
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -28,6 +28,13 @@ LONGEST_KEY = 100  # characters
 _TOO_DEEP = f"but at most {DEEPEST} levels are allowed"
 # a dotted key without end, for which the parser would take memory by the square of its length
 _DOTTED = re.compile(r"""(?<![\w-])(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){20}""")
+
+
+class Context(NamedTuple):
+    """What reading a table needs to know of the whole scenario."""
+
+    plant: type[Scenario]  # one of `layouts.SCENARIOS`
+    run: bool = False  # whether code that the scenario names may be run
 
 
 def toml(text: str, name: str) -> dict[str, Any]:
@@ -80,11 +87,12 @@ def parse(raw: Mapping[str, Any], *, run: bool = False) -> Scenario:
     for name, table in raw.items():
         if name not in layout and name != "requirements":
             raise _unknown(name, table, kind)
-    plant = typing.cast(Any, _fields("plant", raw.get("plant", {}), typing.cast(type[Table], layout["plant"])))
+    context = Context(kind_of_scenario, run)
+    plant = typing.cast(Any, _table("plant", raw.get("plant", {}), layout["plant"], context))
     law = raw.get("controller", {}).get("kind", next(iter(typing.cast(Kinds, layout["controller"]))))
     fallback = kind_of_scenario.fallback(plant, raw.get("plant", {}).keys(), law)
     tables: dict[str, Any] = {
-        name: _table(name, _with_defaults(raw.get(name, {}), fallback.get(name, {})), kinds, run)
+        name: _table(name, _with_defaults(raw.get(name, {}), fallback.get(name, {})), kinds, context)
         for name, kinds in layout.items()
         if name in raw or name not in layouts.OPTIONAL
     }
@@ -93,7 +101,7 @@ def parse(raw: Mapping[str, Any], *, run: bool = False) -> Scenario:
             attitude_keys.at_most_one(name, tables[name])
     # plain limits first, as TOML writes them: verdicts come in the same order when a result's own scenario is read
     asked = sorted(raw.get("requirements", {}).items(), key=lambda one: isinstance(one[1], Mapping))
-    tables["requirements"] = {key: _requirement(key, value, kind_of_scenario.metrics) for key, value in asked}
+    tables["requirements"] = {key: _requirement(key, value, context) for key, value in asked}
     return kind_of_scenario(**tables)
 
 
@@ -217,22 +225,24 @@ def like(name: str, known: Iterable[str], all_of_them: str) -> str:
     return f"the nearest of {len(known)} known ones are {', '.join(close)}; {all_of_them}"
 
 
-def _table(name: str, raw: Mapping[str, Any], kinds: type[Table] | Kinds, run: bool = False) -> Table:
+def _table(name: str, raw: Mapping[str, Any], kinds: type[Table] | Kinds, context: Context) -> Table:
     if name == "dispersion":
-        return _dispersion(raw, typing.cast(type[Table], kinds), run)
+        return _dispersion(raw, typing.cast(type[Table], kinds), context)
     if not isinstance(kinds, Mapping):
-        return _fields(name, raw, kinds)
+        return _fields(name, raw, kinds, context)
     kind = raw.get("kind", next(iter(kinds)))
     if not isinstance(kind, str) or kind not in kinds:
         known = list(map(show, kinds))
         raise wrong(f"{name}.kind", kind, " or ".join(known) if len(known) < 8 else f"one of {', '.join(known)}")
     struct = kinds[kind]
     if struct is disturbance_tables.SumDisturbance:
-        return _sum(name, raw, kinds, run)
-    return _own(name, raw, struct, run) if issubclass(struct, own.Own) else _fields(name, raw, struct, kinds)
+        return _sum(name, raw, kinds, context)
+    if issubclass(struct, own.Own):
+        return _own(name, raw, struct, context)
+    return _fields(name, raw, struct, context, kinds)
 
 
-def _own(name: str, raw: Mapping[str, Any], struct: Any, run: bool) -> Table:
+def _own(name: str, raw: Mapping[str, Any], struct: Any, context: Context) -> Table:
     """A table of one's own: with the keys of the class that it names, if that may be run or is there already."""
     code = raw.get("code")
     if code is None:
@@ -242,39 +252,40 @@ def _own(name: str, raw: Mapping[str, Any], struct: Any, run: bool) -> Table:
             systems.named(code, systems.WHERE)
         except ValueError as error:
             raise ScenarioError(f"{name}.code is {brief(code)}: {error}") from None
-    if run or not isinstance(code, str):
-        return _fields(name, raw, own.read(struct, name, code))
+    if context.run or not isinstance(code, str):
+        return _fields(name, raw, own.read(struct, name, code), context)
     own_keys = {key: value for key, value in raw.items() if key in struct.__struct_fields__}
     rest = {key: value for key, value in raw.items() if key not in own_keys}
     for key in (key for key, value in rest.items() if _not_finite(value) is not None):
         raise wrong(f"{name}.{key}", rest[key], "made of finite numbers")
-    return _fields(name, {**own_keys, "rest": rest}, own.waiting(struct))
+    return _fields(name, {**own_keys, "rest": rest}, own.waiting(struct), context)
 
 
-def _sum(name: str, raw: Mapping[str, Any], kinds: Kinds, run: bool) -> Table:
+def _sum(name: str, raw: Mapping[str, Any], kinds: Kinds, context: Context) -> Table:
     """A table whose `terms` are tables of the other kinds."""
-    _fields(name, {key: value for key, value in raw.items() if key != "terms"}, disturbance_tables.SumDisturbance)
+    others = {key: value for key, value in raw.items() if key != "terms"}
+    _fields(name, others, disturbance_tables.SumDisturbance, context)
     terms = raw.get("terms", ())
     if not isinstance(terms, list | tuple) or not terms or not all(isinstance(term, Mapping) for term in terms):
         raise wrong(f"{name}.terms", terms, disturbance_tables.TERMS)
     single = {kind: struct for kind, struct in kinds.items() if struct is not disturbance_tables.SumDisturbance}
-    found = tuple(_table(f"{name}.terms[{k}]", term, single, run) for k, term in enumerate(terms))
+    found = tuple(_table(f"{name}.terms[{k}]", term, single, context) for k, term in enumerate(terms))
     return disturbance_tables.SumDisturbance(terms=found)
 
 
-def _dispersion(raw: Mapping[str, Any], struct: type[Table], run: bool) -> Table:
+def _dispersion(raw: Mapping[str, Any], struct: type[Table], context: Context) -> Table:
     """The table whose keys are tables of one of several kinds each."""
     tables = {}
     for key, table in raw.items():
-        _check_known("dispersion", key, struct)
+        _check_known("dispersion", key, struct, context)
         if not isinstance(table, Mapping):
             raise wrong(f"dispersion.{key}", table, 'an inline table such as { kind = "uniform" }')
-        tables[key] = _table(f"dispersion.{key}", table, layouts.DISPERSIONS[key], run)
+        tables[key] = _table(f"dispersion.{key}", table, layouts.DISPERSIONS[key], context)
     return struct(**tables)
 
 
-def _requirement(metric: str, value: Any, metrics: Mapping[str, Any]) -> float | Limit:
-    key = f"requirements.{metric}"
+def _requirement(metric: str, value: Any, context: Context) -> float | Limit:
+    key, metrics = f"requirements.{metric}", context.plant.metrics
     if metric not in metrics and metric not in catalogues.MARGINS:
         raise ScenarioError(f"{key} is not a known metric; {nearest(metric, (*metrics, *catalogues.MARGINS))}")
     if isinstance(value, Mapping):
@@ -283,7 +294,7 @@ def _requirement(metric: str, value: Any, metrics: Mapping[str, Any]) -> float |
         if "limit" not in value:
             raise wrong(key, value, "a number greater than 0 or a table with `limit`")
         value = {**value, "limit": _limit(f"{key}.limit", value["limit"], metric, metrics)}
-        return typing.cast(Limit, _fields(key, value, Limit))
+        return typing.cast(Limit, _fields(key, value, Limit, context))
     return _limit(key, value, metric, metrics)
 
 
@@ -385,23 +396,25 @@ def _fits(value: Any, kind: Any) -> bool:
     return True
 
 
-def _fields(name: str, raw: Mapping[str, Any], struct: type[Table], kinds: Kinds | None = None) -> Table:
+def _fields(
+    name: str, raw: Mapping[str, Any], struct: type[Table], context: Context, kinds: Kinds | None = None
+) -> Table:
     hints = typing.get_type_hints(struct, include_extras=True)
     for key in raw:
-        _check_known(name, key, struct, kinds)
+        _check_known(name, key, struct, context, kinds)
     said = {key: _in_words(f"{name}.{key}", value, struct, hints[key]) for key, value in raw.items()}
-    return struct(**{key: _key(f"{name}.{key}", value, hints[key]) for key, value in said.items()})
+    return struct(**{key: _key(f"{name}.{key}", value, hints[key], context) for key, value in said.items()})
 
 
-def _check_known(name: str, key: str, struct: type[Table], kinds: Kinds | None = None) -> None:
-    """Raise ScenarioError where the table of this name, of one of these kinds, has no such key."""
+def _check_known(name: str, key: str, struct: type[Table], context: Context, kinds: Kinds | None = None) -> None:
+    """Raise ScenarioError if the table of this name, of one of these kinds, has no such key."""
     if key not in (known := struct.__struct_fields__):
         of_others = keys.kinds_with(name, key, struct, kinds or {})
-        hint = keys.elsewhere(name, key, TABLES["spacecraft"]) or nearest(key, known, f"{name}.{{}}")
+        hint = keys.elsewhere(name, key, context.plant.TABLES) or nearest(key, known, f"{name}.{{}}")
         raise ScenarioError(f"{name}.{key} is not a known key{of_others}; {hint}")
 
 
-def _key(key: str, value: Any, kind: Any) -> Any:
+def _key(key: str, value: Any, kind: Any, context: Context) -> Any:
     """A value, or a table of one of several kinds."""
     kinds = layouts.KINDS.get(key)
     if kinds is None:
@@ -410,7 +423,7 @@ def _key(key: str, value: Any, kind: Any) -> Any:
         return value
     if not isinstance(value, Mapping):
         raise wrong(key, value, f"an inline table such as {{ kind = {show(next(iter(kinds)))} }}")
-    return _table(key, value, kinds)
+    return _table(key, value, kinds, context)
 
 
 def _value(key: str, value: Any, kind: Any) -> Any:

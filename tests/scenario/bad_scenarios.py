@@ -200,6 +200,9 @@ BAD = [
     (CHAIN + "controller.a = [0]", "controller.a is [0.0]", "are stable (39)"),
     (CHAIN + "plant.order = 4\ncontroller.a = [2, 1, 1]", "controller.a is [2.0, 1.0, 1.0]", "are stable (39)"),
     (CHAIN + "controller.error = 'additive'", "controller.error is not a known key", "controller."),
+    # hints name keys of the chain's own tables only
+    (CHAIN + "loop.boresight = [0, 0, 1]", "loop.boresight is not a known key", "; known are loop.mode, "),
+    (CHAIN + "loop.x0 = [1, 0]", "loop.x0 is not a known key", "; plant.x0, dispersion.x0 are"),
     (CHAIN + "[spacecraft]", "[spacecraft] goes with plant.kind", 'is "chain"'),
     (CHAIN + "initial.rate = [0, 0, 0]", "[initial] goes with plant.kind", 'is "chain"'),
     ("plant.order = 3", "plant.order is not a known key", "plant.kind"),
