@@ -135,7 +135,7 @@ def commands() -> str:
 def _keys(table: str, struct: type[Table], plant: str) -> Iterator[str]:
     """The keys of a table as a table."""
     if table == "dispersion":
-        yield from _dispersion(struct)
+        yield from _dispersion(struct, layouts.SCENARIOS[plant].unit_of_d)
         return
     borrowed = issubclass(struct, Attitude) and table != "initial"
     fallback = _case_i(plant).get(table, {}) if table == "initial" else {}
@@ -160,16 +160,16 @@ def _case_i(plant: str) -> Mapping[str, Mapping[str, Any]]:
     return made.fallback(typing.cast(type[Table], made.TABLES["plant"])(), (), "prescribed_time")
 
 
-def _dispersion(struct: type[Table]) -> Iterator[str]:
-    rows = [row for key in keys.of(struct) for row in _kinds(key, layouts.DISPERSIONS[key.name])]
+def _dispersion(struct: type[Table], unit_of_d: str) -> Iterator[str]:
+    rows = [row for key in keys.of(struct) for row in _kinds(key, layouts.DISPERSIONS[key.name], unit_of_d)]
     yield _grid("key what given how", rows)
 
 
-def _kinds(key: keys.Key, kinds: Kinds) -> Iterator[list[str]]:
-    """A row for each kind of an inline table."""
+def _kinds(key: keys.Key, kinds: Kinds, unit_of_d: str = keys.UNIT_OF_D) -> Iterator[list[str]]:
+    """Yield a row for each kind of an inline table."""
     for kind, struct in kinds.items():
         given = [f'`kind = "{kind}"`']
-        for k in keys.of(struct):
+        for k in keys.of(struct, unit_of_d):
             said = [f"default {shown}" if (shown := _default(k.default)) else "", k.text]
             given.append(f"`{k.name}`: {', '.join(filter(None, said))}")
         yield [f"`{key.name}`", key.meaning, "; ".join(given), keys.about(struct)]

@@ -295,7 +295,7 @@ class NormalBias(Normal, frozen=True):
     """Normal about what [disturbance] says.
 
     Attributes:
-        std: 1 sigma of each component; default: 1e-3, scaled to the mission [N m, or unit of d]
+        std: 1 sigma of each component; default: 1e-3, scaled to the mission [unit of d]
     """
 
     kind: Literal["normal"] = "normal"
@@ -307,7 +307,7 @@ class UniformBias(Uniform, frozen=True):
     """Uniform about what [disturbance] says.
 
     Attributes:
-        half_width: largest deviation of each component; default: 1e-3, scaled to the mission [N m, or unit of d]
+        half_width: largest deviation of each component; default: 1e-3, scaled to the mission [unit of d]
     """
 
     kind: Literal["uniform"] = "uniform"

@@ -15,6 +15,8 @@ import msgspec
 
 from ptsmc_jax.scenario.values import Kinds, Table
 
+UNIT_OF_D = "unit of d"  # in docstrings: the unit of the plant's disturbance
+
 
 class Key(NamedTuple):
     """One key of a table."""
@@ -31,10 +33,14 @@ class Key(NamedTuple):
         return self.meaning + (f" [{self.unit}]" if self.unit else "")
 
 
-def of(struct: type[Table]) -> list[Key]:
-    """The keys of a table, `kind` apart, in the order of the struct; a base's docstring speaks for what it declares.
+def of(struct: type[Table], unit_of_d: str = UNIT_OF_D) -> list[Key]:
+    """Return the keys of a table, without `kind`, in the order of the struct; a base's docstring counts too.
 
-    Of a kind of one's own those that every such table has: what its code takes besides, in `rest`, is not known here.
+    The keys of a custom kind are those that every such table has. The keys of its class, in `rest`, are not known here.
+
+    Args:
+        struct: the table.
+        unit_of_d: the unit of the plant's disturbance, for the keys whose docstring has [unit of d].
     """
     meanings: dict[str, str] = {}
     for base in reversed(struct.__mro__):
@@ -48,7 +54,8 @@ def of(struct: type[Table]) -> list[Key]:
             meaning, unit = parts.groups()
             factory = field.default_factory
             default = field.default if factory is msgspec.NODEFAULT else factory()
-            keys.append(Key(field.name, meaning, unit or "", allowed(hints[field.name]), default))
+            unit = unit_of_d if unit == UNIT_OF_D else unit or ""
+            keys.append(Key(field.name, meaning, unit, allowed(hints[field.name]), default))
     return keys
 
 

@@ -373,12 +373,13 @@ def _floats(value: Any) -> Any:
     return float(value) if isinstance(value, int) and value.bit_length() <= MOST_BITS else value
 
 
-def _in_words(name: str, value: Any, struct: type[Table], kind: Any) -> Any:
+def _in_words(name: str, value: Any, struct: type[Table], kind: Any, context: Context) -> Any:
     """The value of a key, or the numbers of one, where it is in words and the key has a unit that has others."""
     said = isinstance(value, str) or (isinstance(value, list) and any(isinstance(one, str) for one in value))
     if not said or name in layouts.KINDS or _fits(value, kind):
         return value
-    unit = next((one.unit for one in keys.of(struct) if one.name == name.rpartition(".")[2]), "")
+    key = name.rpartition(".")[2]
+    unit = next((one.unit for one in keys.of(struct, context.plant.unit_of_d) if one.name == key), "")
     if unit not in catalogues.UNITS:
         return value
 
@@ -402,7 +403,7 @@ def _fields(
     hints = typing.get_type_hints(struct, include_extras=True)
     for key in raw:
         _check_known(name, key, struct, context, kinds)
-    said = {key: _in_words(f"{name}.{key}", value, struct, hints[key]) for key, value in raw.items()}
+    said = {key: _in_words(f"{name}.{key}", value, struct, hints[key], context) for key, value in raw.items()}
     return struct(**{key: _key(f"{name}.{key}", value, hints[key], context) for key, value in said.items()})
 
 

@@ -146,6 +146,7 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
         "dispersion": dispersion_tables.Dispersion,
         "tune": Tune,
     }
+    unit_of_d: ClassVar[str] = "N m"
     metrics: ClassVar[Any] = CATALOGUE
     motion: ClassVar[str] = "spacecraft"
     reaching: ClassVar[float] = 2.0

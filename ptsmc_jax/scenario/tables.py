@@ -10,6 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import msgspec
 from msgspec import Meta
 
+from ptsmc_jax.scenario import keys
 from ptsmc_jax.scenario.device_tables import NoFilter
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.gain_record import GainBounds
@@ -164,6 +165,7 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
     tune: Tune | None = None
 
     TABLES: ClassVar[Mapping[str, type[Table] | Kinds]] = {}  # a table, or one for each kind, the default first
+    unit_of_d: ClassVar[str] = keys.UNIT_OF_D
     metrics: ClassVar[Mapping[str, Entry]] = {}
     motion: ClassVar[str] = ""  # what the laws drive to zero: "spacecraft", "chain" or "system"
     reaching: ClassVar[float] = 1.0  # K1 over the rate at which s decays after the hand-over: 2 where (60) halves it

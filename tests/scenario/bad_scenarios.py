@@ -203,6 +203,7 @@ BAD = [
     # hints name keys of the chain's own tables only
     (CHAIN + "loop.boresight = [0, 0, 1]", "loop.boresight is not a known key", "; known are loop.mode, "),
     (CHAIN + "loop.x0 = [1, 0]", "loop.x0 is not a known key", "; plant.x0, dispersion.x0 are"),
+    (CHAIN + "dispersion.disturbance_bias.std = '1 mN m'", 'disturbance_bias.std is "1 mN m"', "a number, at least 0"),
     (CHAIN + "[spacecraft]", "[spacecraft] goes with plant.kind", 'is "chain"'),
     (CHAIN + "initial.rate = [0, 0, 0]", "[initial] goes with plant.kind", 'is "chain"'),
     ("plant.order = 3", "plant.order is not a known key", "plant.kind"),

@@ -66,6 +66,12 @@ def test_a_number_may_have_its_unit(table, key, said, value):
     assert getattr(getattr(other, table), key) == getattr(getattr(read, table), key)
 
 
+@pytest.mark.parametrize(("kind", "key"), [("normal", "std"), ("uniform", "half_width")])
+def test_the_spread_of_the_disturbance_may_have_a_unit_of_torque(kind, key):
+    read = scenario.from_tables({"dispersion": {"disturbance_bias": {"kind": kind, key: "2 mN m"}}})
+    assert getattr(read.dispersion.disturbance_bias, key) == 2e-3
+
+
 def test_a_limit_of_zero_is_kept_by_zero_alone():
     tables = {"plant": {"kind": "chain"}, "requirements": {"saturated": 0}, "loop": SAMPLED}
     ready = scenario.study(scenario.from_tables(tables))
