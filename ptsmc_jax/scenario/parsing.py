@@ -374,8 +374,9 @@ def _floats(value: Any) -> Any:
 
 
 def _in_words(name: str, value: Any, struct: type[Table], kind: Any, context: Context) -> Any:
-    """The value of a key, or the numbers of one, where it is in words and the key has a unit that has others."""
-    said = isinstance(value, str) or (isinstance(value, list) and any(isinstance(one, str) for one in value))
+    """Return the value of a key as a number or numbers if it has its unit, "1 mN m", and the key's unit has others."""
+    several = isinstance(value, list | tuple)
+    said = isinstance(value, str) or (several and any(isinstance(one, str) for one in value))
     if not said or name in layouts.KINDS or _fits(value, kind):
         return value
     key = name.rpartition(".")[2]
@@ -386,7 +387,7 @@ def _in_words(name: str, value: Any, struct: type[Table], kind: Any, context: Co
     def number(one: Any) -> Any:
         return _in_unit(name, one, unit, keys.allowed(kind)) if isinstance(one, str) else one
 
-    return [number(one) for one in value] if isinstance(value, list) else number(value)
+    return [number(one) for one in value] if several else number(value)
 
 
 def _fits(value: Any, kind: Any) -> bool:

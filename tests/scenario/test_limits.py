@@ -53,6 +53,7 @@ def test_every_unit_of_a_spacecrafts_metrics_has_words():
         ("controller", "t_f", "1 min", 60.0),
         ("loop", "period", "50 ms", 0.05),
         ("disturbance", "amplitude", ["1 mN m", 0.0, "20 uN m"], (1e-3, 0.0, 2e-5)),
+        ("disturbance", "amplitude", ("1 mN m", 0.0, "20 uN m"), (1e-3, 0.0, 2e-5)),
     ],
 )
 def test_a_number_may_have_its_unit(table, key, said, value):
