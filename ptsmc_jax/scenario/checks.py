@@ -149,12 +149,14 @@ def _check_periods(scenario: Scenario) -> None:
 
 def _check_dispersion(scenario: Scenario) -> None:
     dispersion = scenario.dispersion
-    for what, allowed in (("phase", "a sinusoid, or gravity_gradient"), ("amplitude", "a sinusoid, or constant")):
+    for article, what in (("a", "phase"), ("an", "amplitude")):
         asked = getattr(dispersion, f"disturbance_{what}", None) is not None
         if asked and not any(_has(term, what) for term in scenario.terms):
+            kinds: Any = scenario.TABLES["disturbance"]
+            allowed = " or ".join(errors.show(kind) for kind, one in kinds.items() if what in one.__struct_fields__)
             raise ScenarioError(
-                f"dispersion.disturbance_{what} needs a disturbance that has {'a' if what == 'phase' else 'an'} {what},"
-                f" but disturbance.kind is {errors.show(scenario.disturbance.kind)}; allowed is {allowed}"
+                f"dispersion.disturbance_{what} needs a disturbance that has {article} {what}, but disturbance.kind is "
+                f"{errors.show(scenario.disturbance.kind)}; allowed is {allowed}"
             )
     for key, given_by in scenario.devices.levels.items():
         given = any(getattr(scenario.devices, one) is not None for one in given_by)

@@ -653,12 +653,12 @@ BAD = [
     (
         "disturbance.kind = 'constant'\ndispersion.disturbance_phase = {}",
         "dispersion.disturbance_phase needs a disturbance that has a phase",
-        'disturbance.kind is "constant"; allowed is a sinusoid',
+        'disturbance.kind is "constant"; allowed is "sinusoid" or "gravity_gradient"',
     ),
     (
         "disturbance.kind = 'none'\ndispersion.disturbance_amplitude = {}",
         "dispersion.disturbance_amplitude needs a disturbance that has an amplitude",
-        'disturbance.kind is "none"; allowed is a sinusoid, or constant',
+        'disturbance.kind is "none"; allowed is "sinusoid" or "constant"',
     ),
     ("dispersion.torque_limit = {}", "dispersion.torque_limit needs hardware.torque_limit", "absent"),
     ("dispersion.rate_noise = {}", "dispersion.rate_noise needs hardware.rate_noise", "absent"),

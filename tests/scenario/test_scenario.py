@@ -44,6 +44,12 @@ def test_what_is_nested_deeper_than_the_parser_goes_is_refused_as_well(tmp_path,
     check_sentence(str(caught.value), "tables or arrays in each other", "at most 8 levels are allowed")
 
 
+def test_a_chain_is_not_offered_disturbances_of_a_spacecraft():
+    text = "plant.kind = 'chain'\ndisturbance.kind = 'constant'\ndispersion.disturbance_phase = {}"
+    with pytest.raises(ScenarioError, match=r'allowed is "sinusoid"$'):
+        from_tables(tomllib.loads(text))
+
+
 def test_disturbance_too_fast_for_the_sampled_loop_is_refused():
     # 1e6 rad/s in a period of 0.05 s would need 500 000 substeps, and each is compiled
     with pytest.raises(ScenarioError, match=r"disturbance\.frequency|loop\.period"):
