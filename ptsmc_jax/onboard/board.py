@@ -24,8 +24,8 @@ from ptsmc_jax.numerics import guards
 from ptsmc_jax.observers.base import Observer
 from ptsmc_jax.onboard import derived
 from ptsmc_jax.plants.rigid_body import AttitudeState
+from ptsmc_jax.simulation import run_state
 from ptsmc_jax.simulation.assembly import Parts
-from ptsmc_jax.simulation.rollout import SINGULAR_CLEARANCE
 
 UNIT = 1e-12  # a quaternion whose square is off by less is taken as it is
 KNOWN = 0.25  # |q|^2 of an attitude that has been set
@@ -341,7 +341,7 @@ def _commanding(computer: Board, law: Law, observer: Observer, command_filter: C
                 given["tracking"] != 0, given["before.clearance_unit"], known.kinematics.clearance_unit(distance)
             )
             clearance, stays = distance / unit, (given["last.command"], given["last.s"], last)
-            u, s, kept = jax.lax.cond(clearance >= SINGULAR_CLEARANCE, decided, lambda: stays)
+            u, s, kept = jax.lax.cond(clearance >= run_state.SINGULAR_CLEARANCE, decided, lambda: stays)
             kept |= {"clearance": clearance, "clearance_unit": unit}
         else:
             u, s, kept = decided()

@@ -14,6 +14,7 @@ from ptsmc_jax.onboard.expressions import REAL
 from ptsmc_jax.onboard.fields import Field
 from ptsmc_jax.onboard.generate import Code
 from ptsmc_jax.onboard.printing import HELPERS, comment, declared, inside_comment, number
+from ptsmc_jax.simulation import run_state
 
 STATUS = {
     "OK": "done",
@@ -304,7 +305,8 @@ def _step(code: Code, about: About) -> list[str]:
         "    }",
     ]
     if singular:
-        lines += ["    now.tracking = now.clearance >= R(0.001);", "    if (!now.tracking) {",
+        least = number(run_state.SINGULAR_CLEARANCE, REAL)
+        lines += [f"    now.tracking = now.clearance >= {least};", "    if (!now.tracking) {",
                   "        status = PTSMC_SINGULAR;", "    }"]  # fmt: skip
     else:
         lines += ["    now.tracking = 1;"]

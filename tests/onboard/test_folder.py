@@ -16,11 +16,12 @@ import pytest
 import ptsmc_jax as ptsmc
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns.store import RefusedError
-from ptsmc_jax.onboard import folder
+from ptsmc_jax.onboard import folder, templates
 from ptsmc_jax.onboard.board import board
 from ptsmc_jax.onboard.library import compiler
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.law_tables import LAWS
+from ptsmc_jax.simulation import run_state
 from tests.helpers import SHORT, fly, short
 from tests.onboard.compiled import CC, STRICT, needs_compiler
 from tests.onboard.flights import FILTER, FLIGHTS, flight
@@ -322,6 +323,13 @@ def test_the_law_stands_in_it_with_its_names_and_equations(exported):
     ):
         assert line in text
     assert "eta > 2" in (exported / "ptsmc_short.h").read_text()
+
+
+def test_the_limit_of_the_singularity_is_that_of_the_simulator(monkeypatch):
+    monkeypatch.setattr(run_state, "SINGULAR_CLEARANCE", 0.0125)
+    made = folder.Controller(scenario.from_tables(flight()), "short", "a scenario")
+    limits = re.findall(r"clearance >= R\((.*?)\)", templates.source(made.code, made.about))
+    assert limits == ["0.0125", "0.0125"]
 
 
 def test_a_continuous_loop_and_a_full_folder_are_refused(exported, tmp_path):
