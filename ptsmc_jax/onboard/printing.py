@@ -80,7 +80,8 @@ def number(value: Any, kind: str) -> str:
         return "R(NAN)"
     if value in (float("inf"), float("-inf")):
         return "R(INFINITY)" if value > 0 else "R(-INFINITY)"
-    short = str(int(value)) if value == int(value) and abs(value) < 1e15 else repr(value)
+    whole = value == int(value) and abs(value) < 1e15 and str(value) != "-0.0"
+    short = str(int(value)) if whole else repr(value)
     return f"R({short})"
 
 
