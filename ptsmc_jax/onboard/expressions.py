@@ -1,7 +1,7 @@
 """Scalar expressions: what a trace becomes before it is C. Equal ones are one, constants are folded.
 
 A node is an operation on other nodes. `Pool` makes them: it finds the one that is there already (common
-subexpressions), computes what is known, and leaves out what changes nothing (x + 0, 1 x, 0 x).
+subexpressions), computes what is known, and leaves out what changes nothing (x + 0, 1 x, 0 x of a finite x).
 """
 
 import math
@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+PASSING = ("neg", "abs", "max", "min", "sign", "sin", "cos", "tanh", "atan", "select")  # finite for finite operands
 REAL, BOOL = "real", "bool"  # kinds of numbers; the others are C's names of whole ones
 
 
@@ -27,16 +28,31 @@ class Title:
 class Node:
     """A scalar: an operation and its operands, a constant, or a place that C reads."""
 
-    __slots__ = ("args", "block", "kind", "op", "part", "section", "serial", "title", "value")
+    __slots__ = ("args", "block", "finite", "kind", "op", "part", "section", "serial", "title", "value")
     made: ClassVar[int] = 0
 
     def __init__(self, op: str, args: tuple["Node", ...], kind: str, value: Any, block: "Block"):
         Node.made += 1
         self.serial = Node.made  # operands come before what is made of them
         self.op, self.args, self.kind, self.value, self.block = op, args, kind, value, block
+        self.finite = self._is_finite()
         self.title: Title | None = None  # by what name the source knows it
         self.part = ""  # which component of that it is
         self.section: Any = None  # the function of the source that it is computed in
+
+    def _is_finite(self) -> bool:
+        """Return whether the value is finite for certain, so that 0 times it is 0 and not NaN.
+
+        C checks that its inputs and its state are finite. Parameters are finite, since a scenario has no others.
+        """
+        if self.kind != REAL:
+            return True
+        if self.op == "constant":
+            return math.isfinite(self.value)
+        if self.op == "place":
+            return not self.value.startswith("d->")  # derived numbers may overflow
+        known = self.op in PASSING or (self.op == "convert" and self.args[0].kind != REAL)
+        return known and all(arg.finite for arg in self.args)
 
 
 class Block:
@@ -174,7 +190,7 @@ class Pool:
             return yes if yes is no else None
         if op in ("lt", "ge") and known[1] and args[0].kind.startswith("u") and args[1].value == 0:
             return self.constant(op == "ge", BOOL)  # of which compilers warn
-        if not any(known) and not (op == "sub" and args[0] is args[1]):
+        if not any(known):
             return args[0].args[0] if op in ("neg", "not") and args[0].op == op else None
         if op in ("add", "sub", "mul", "div") and len(args) == 2:
             return self._arithmetic(op, args[0], args[1], kind)
@@ -198,15 +214,12 @@ class Pool:
             half, other = (a, b) if a.op == "constant" else (b, a)
             if half.value == 0.5 and half.op == "constant" and other.op == "add" and other.args[0] is other.args[1]:
                 return other.args[0]  # exact
-            if holds(a, 0) or holds(b, 0):
+            if (holds(a, 0) and b.finite) or (holds(b, 0) and a.finite):
                 return self.constant(0, kind)
             if holds(a, 1) or holds(b, 1):
                 return b if holds(a, 1) else a
             if holds(a, -1) or holds(b, -1):
                 return self.make("neg", b if holds(a, -1) else a, kind=kind)
-        if op == "div":
-            if holds(b, 1):
-                return a
-            if holds(a, 0) and kind == REAL:
-                return self.constant(0, kind)
+        if op == "div" and holds(b, 1):
+            return a
         return None

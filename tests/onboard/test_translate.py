@@ -64,6 +64,7 @@ FUNCTIONS = {
     ),
     "signs": (lambda x: (jnp.sign(x), jnp.abs(x), jnp.floor(x), jnp.ceil(x), jnp.round(2.0 * x), -x), X),
     "negative zeros": (lambda x: (1.0 / jnp.where(x > 0.0, -0.0, 0.0), x + -0.0), X),
+    "zero times infinity": (lambda x: (0.0 * jnp.exp(x), 0.0 * x, 0.0 / (x - 1.0), x * 0.0), np.array([1.0, 800.0])),
     "powers": (lambda x: (x**2, x**3, x**5, x**-1, x**-2, 1.0 / x, x**7), X),
     "limits": (lambda x: (jnp.clip(x, -0.5, 0.5), jnp.maximum(x, 0.1), jnp.minimum(x, x[::-1])), X),
     "comparisons": (lambda x: jnp.where((x > 0.0) & ~(x == 0.7) | (x < -1.0), x, 2.0 * x), X),
