@@ -4,11 +4,13 @@ A part holds the trials from its first to its last. The digest is keyed by what 
 another campaign, a cut one and a changed one are all told from a whole one, and a part needs no second file beside it.
 """
 
+import functools
 import hashlib
 import io
 import json
 import os
 import re
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +21,7 @@ import polars as pl
 from ptsmc_jax.campaigns import store
 
 FOLDER = "trials"
+RECENT = 1_000_000_000  # ns after a change in which the file could change again with the same time of change
 _NAME = re.compile(r"(\d{10})-(\d{10})-([0-9a-f]{32})\.parquet")
 
 
@@ -68,7 +71,7 @@ class Rows:
         for path in sorted(self.folder.glob("*.parquet")):
             name = _NAME.fullmatch(path.name)
             first, count = (int(name[1]), int(name[2]) - int(name[1]) + 1) if name else (0, 0)
-            if name is not None and self._digest(first, count, path.read_bytes()) == name[3]:
+            if name is not None and self._digest_of(path, first, count) == name[3]:
                 whole.append(Part(first, count, path))
             else:
                 broken.append(path)
@@ -87,10 +90,23 @@ class Rows:
             if path not in whole and named(path):
                 path.unlink(missing_ok=True)
 
+    def _digest_of(self, path: Path, first: int, count: int) -> str:
+        """Return the digest of a file's content; a file that has not changed since the last call is not read again."""
+        about = path.stat()
+        if time.time_ns() - about.st_mtime_ns < RECENT:
+            return self._digest(first, count, path.read_bytes())
+        return _digest_of_version(self, path, (about.st_ino, about.st_size, about.st_mtime_ns), first, count)
+
     def _digest(self, first: int, count: int, content: bytes) -> str:
         digest = hashlib.blake2b(content, digest_size=16, key=self.key)
         digest.update(f"{first}+{count}".encode())
         return digest.hexdigest()
+
+
+@functools.cache
+def _digest_of_version(rows: Rows, path: Path, version: tuple[int, int, int], first: int, count: int) -> str:
+    """Return the digest of a file's content; version: inode, size and time of the last change [ns]."""
+    return rows._digest(first, count, path.read_bytes())
 
 
 def key_of(scenario: Mapping[str, Any], made_by: Mapping[str, Any]) -> bytes:

@@ -1,3 +1,6 @@
+import os
+from pathlib import Path
+
 import numpy as np
 import polars as pl
 import pytest
@@ -44,6 +47,19 @@ def test_a_damaged_part_is_told_from_a_whole_one(kept, harm):
     parts, broken = kept.parts()
     assert parts == [whole]
     assert len(broken) == 1
+
+
+def test_a_part_is_read_once_until_it_changes(kept, monkeypatch):
+    part = kept.write(0, frame(0, 50))
+    os.utime(part.path, (1e9, 1e9))
+    content, read, reads = part.path.read_bytes(), Path.read_bytes, []
+    monkeypatch.setattr(Path, "read_bytes", lambda path: (reads.append(path), read(path))[1])
+    assert kept.parts() == kept.parts() == ([part], [])
+    assert reads == [part.path]
+    part.path.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))  # of the same size
+    assert kept.parts() == kept.parts() == ([], [part.path])
+    os.utime(part.path, (1e9 + 1, 1e9 + 1))
+    assert kept.parts() == kept.parts() == ([], [part.path])
 
 
 def test_a_longer_part_takes_the_place_of_a_shorter_one(kept):
