@@ -103,12 +103,11 @@ HOUSE = {
             global_check
         """,
         "studies": """
-            campaign_folder judging mapping reproduction single stability table
+            campaign_folder front judging mapping reproduction single stability table
             campaign_figures campaign_theory posing
             campaign_summary tuner
-            compare pareto reasons tune_files
-            robustness slew_times
-            fronts
+            compare reasons trades tune_files
+            pareto
         """,
         "output": """
             cells made_again page_captions page_charts progress_lines

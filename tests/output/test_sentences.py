@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tuning.output import front_sentences, law_sentences, pointing_sentences, sentences
+from tuning.output import law_sentences, pointing_sentences, sentences
 
 
 @pytest.mark.parametrize(
@@ -31,8 +31,3 @@ def test_the_floor_of_several_laws_is_what_none_of_them_can_beat():
     assert law_sentences._marks(torque, laws) == {}
     asked = {"verdicts": [{"metric": "peak_torque", "limit": 0.5}]}
     assert law_sentences._marks(torque, [*laws, asked]) == {"limit": 0.5}
-
-
-def test_an_interval_is_told_by_half_of_it_as_a_share_of_the_error():
-    assert front_sentences._spread({"rms": 2e-6, "interval": [1.9e-6, 2.1e-6]}) == "5.0 %"
-    assert front_sentences._spread({"rms": 2e-6, "interval": None}) == "-"

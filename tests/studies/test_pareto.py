@@ -16,10 +16,10 @@ from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.metrics import Metrics
 from tests.helpers import SHORT, SHORT_CHAIN, short, small_search, tree
 from tests.output.pages import checked
-from tuning.output import front_sentences, terminal
+from tuning.output import terminal
 from tuning.search import descent, descents
 from tuning.search.evaluate import Measured
-from tuning.studies import judging, pareto, posing
+from tuning.studies import front, judging, pareto, posing, trades
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e-6])
@@ -41,16 +41,7 @@ def test_the_share_that_a_torque_stays_below_is_one_of_all_trials(lost, largest)
 
 
 def point(peak, rms, **others):
-    made = {
-        "limit": peak,
-        "gains": {},
-        "trained": rms,
-        "interval": None,
-        "mean_peak": peak,
-        "failures": 0,
-        "meets": True,
-    }
-    return pareto.Point(rms=rms, peak=peak, **{**made, **others})
+    return front.Point(peak, {}, rms=rms, costs={"peak_torque": peak}, **others)
 
 
 def trials(errors):
@@ -64,11 +55,11 @@ def test_only_what_is_beaten_beyond_its_interval_is_dominated():
     rng = np.random.default_rng(0)
     common = rng.lognormal(0.0, 0.5, 400)
     sizes = {0.2: 4.0, 0.3: 2.0, 0.4: 2.5, 0.5: 1.0, 0.6: 1.0005}  # by peak torque
-    judged = {}
+    judged = []
     for peak, size in sizes.items():
         errors = size * common * rng.normal(1.0, 0.05, 400)
-        judged[peak] = point(peak, float(np.sqrt(np.mean(errors**2)))), trials(errors)
-    marked = pareto._marked(judged)
+        judged.append((point(peak, float(np.sqrt(np.mean(errors**2)))), trials(errors)))
+    marked = pareto.marked(judged)
     assert [p.peak for p in marked] == sorted(sizes)
     # 0.4 is worse than 0.3 by a quarter; 0.6 than 0.5 by less than chance
     assert {p.peak for p in marked if p.dominated} == {0.4}
@@ -79,8 +70,8 @@ def test_only_what_is_beaten_beyond_its_interval_is_dominated():
 def test_gains_without_an_error_or_without_a_trial_that_ends_are_no_knee_of_a_front():
     """Their logarithms are no numbers, and one such made itself the knee."""
     sizes = {0.2: 4.0, 0.3: 2.0, 0.5: 1.6, 0.6: 0.0, np.nan: np.nan}
-    judged = {peak: (point(peak, size), trials([size])) for peak, size in sizes.items()}
-    assert [p.peak for p in pareto._marked(judged) if p.knee] == [0.3]
+    judged = [(point(peak, size), trials([size])) for peak, size in sizes.items()]
+    assert [p.peak for p in pareto.marked(judged) if p.knee] == [0.3]
 
 
 def test_more_failures_or_too_few_trials_beat_nothing():
@@ -89,34 +80,16 @@ def test_more_failures_or_too_few_trials_beat_nothing():
     errors = rng.lognormal(0.0, 0.5, 400)
     better = point(0.2, 0.5), trials(0.5 * errors * rng.normal(1.0, 0.05, 400))
     worse = point(0.3, 1.0), trials(errors)
-    assert pareto._beats(better, worse)
-    assert not pareto._beats((point(0.2, 0.5, failures=1), better[1]), worse)
-    assert pareto._beats((point(0.2, 0.5, failures=1), better[1]), (point(0.3, 1.0, failures=2), worse[1]))
-    for count, beats in ((5, False), (1, True)):
+
+    def dominated(*judged):
+        return [one.peak for one in pareto.marked(judged) if one.dominated]
+
+    failed, failed_more = (point(0.2, 0.5, failures=1), better[1]), (point(0.3, 1.0, failures=2), worse[1])
+    assert dominated(better, worse) == dominated(failed, failed_more) == [0.3]
+    assert dominated(failed, worse) == []
+    for count, beaten in ((5, []), (1, [0.3])):
         few = [(one[0], trials(np.asarray(one[1].metrics.window_error)[:count])) for one in (better, worse)]
-        assert pareto._beats(few[0], few[1]) == beats
-
-
-def test_a_front_with_gains_that_never_fly_can_be_told():
-    lost = {"gains": {"eta": 3.0}, "peak": None, "mean_peak": None, "rms": None, "interval": None, "failures": 9,
-            "knee": False, "meets": False, "dominated": False}  # fmt: skip
-    summary = {"plant": "spacecraft", "points": [lost], "requirements": [], "paper": lost, "paper_refused": None}
-    assert front_sentences.front(summary).rows == [
-        ("", "-", "-", "-", "-", "3", "9 failed or missed"),
-        ("paper", "-", "-", "-", "-", "3", "9 failed or missed"),
-    ]
-    assert not any("without a point" in line for line in front_sentences.front_lines({**summary, "steps": 1}))
-    assert any(
-        "without a point of their own: 2," in line for line in front_sentences.front_lines({**summary, "steps": 3})
-    )
-
-
-def test_gains_of_each_axis_stand_beside_a_law_with_one_gain_for_all_or_none():
-    each = {"gains": {"observer_gain_1": 5.0, "observer_gain_2": 6.0}, "peak": 0.3, "mean_peak": 0.2, "rms": 1e-5,
-            "interval": None, "failures": 0, "knee": False, "meets": True, "dominated": False}  # fmt: skip
-    others = {"paper": {**each, "gains": {"observer_gain": 10.0}}, "before": {**each, "gains": {}}}
-    rows = front_sentences.front({"plant": "spacecraft", "points": [each], "requirements": [], **others}).rows
-    assert [row[5:7] for row in rows] == [("5", "6"), ("10", "10"), ("-", "-")]
+        assert dominated(*few) == beaten
 
 
 CHAIN = SHORT_CHAIN.replace("peak_torque = 3.0", "peak_torque = 0.55")
@@ -129,17 +102,17 @@ SPACECRAFT = SHORT.replace("peak_torque = 30.0", "peak_torque = 8.0")
 def test_a_front_from_start_to_end(command, tmp_path, monkeypatch, text, limit):
     small_search(monkeypatch, 60)
     (tmp_path / "s.toml").write_text(text.replace("steps = 4", "steps = 6"))
-    climbed, search, begun, searched = pareto.climbed, posing.Posed.search, [], []
+    refined, search, begun, searched = pareto.refined, posing.Posed.search, [], []
 
-    def spied(ladder, known, posed, tell):
-        begun.append((dict(ladder), np.asarray(known), posed.evaluate))
-        return climbed(ladder, known, posed, tell)
+    def spied(targets, known, posed, tell):
+        begun.append(({one.value: one.problem for one in targets}, np.asarray(known), posed.evaluate))
+        return refined(targets, known, posed, tell)
 
     def searching(posed, problem, *args, **options):
         searched.append(problem.limits[problem.metrics.index("peak_torque")])
         return search(posed, problem, *args, **options)
 
-    monkeypatch.setattr(pareto, "climbed", spied)
+    monkeypatch.setattr(pareto, "refined", spied)
     monkeypatch.setattr(posing.Posed, "search", searching)
     status, told, _ = command("pareto", "s.toml", "--points", 4, "--out", "p")
     assert set(tree(tmp_path / "p")) == {
@@ -154,10 +127,10 @@ def test_a_front_from_start_to_end(command, tmp_path, monkeypatch, text, limit):
     assert sum(row["knee"] == "1" for row in rows) == 1
     peaks = [float(row["peak_torque"]) for row in rows]
     assert peaks == sorted(peaks)
-    # the scenario's own limit is one of the rungs, and as accurate as what a search for it alone found
+    # the scenario's own limit is one of the targets, and as accurate as the gains that a search for it alone found
     (own,) = [float(row["trained_goal"]) for row in rows if float(row["limit"]) == limit]
-    ((rungs, known, evaluate),) = begun
-    flown = evaluate.fly(rungs[f"peak torque {limit:g}"].tightened(1.0 - pareto.MARGIN), known)
+    ((problems, known, evaluate),) = begun
+    flown = evaluate.fly(problems[limit].tightened(1.0 - pareto.MARGIN), known)
     assert len(known) > len(searched)  # other valleys that the searches found among them
     assert searched.count(limit) == 1
     assert own <= np.exp(flown.value[flown.beyond <= descent.SLACK].min()) * (1.0 + 1e-9)
@@ -171,11 +144,11 @@ def test_a_front_from_start_to_end(command, tmp_path, monkeypatch, text, limit):
         flown = judging.judge(made, summary["seed"])
         np.testing.assert_allclose(np.sqrt(np.mean(flown.metrics.window_error**2)), float(row["rms_window_error"]))
         np.testing.assert_allclose(flown.metrics.peak_torque.max(), float(row["peak_torque"]))
-    assert f"{len(kept)} points, each judged on 60 fresh trials" in told
+    assert f"{len(kept)} points, each judged on 60 held-out trials" in told
     read = checked(tmp_path / "p")
     assert set(read.charts) == {"front"}
     assert all(float(row["rms_window_error"]) > summary["floor"] > 0.0 for row in rows)
-    assert f"the floor is {summary['floor']:.2e}: no controller" in told
+    assert "lower bound on the RMS error with these sensors" in told
     drawn = read.charts["front"]["layout"]["shapes"][-1]
     assert drawn["y0"] == drawn["y1"] == summary["floor"]
     assert f"{sum(not point['dominated'] for point in summary['points'])} points, each judged on" in read.text
@@ -207,37 +180,31 @@ def test_a_number_of_points_out_of_range_is_refused(command, points):
 
 def test_a_scenario_without_a_limit_on_the_torque_has_a_front_too():
     made = scenario.from_tables({"requirements": {"effort": 9.0}, "tune": {}})
-    limited, own = pareto._limited(made)
-    assert own is None
-    assert limited.requirements == {"effort": 9.0, "peak_torque": pareto.OFF}
-    share = scenario.replace(made, requirements={"peak_torque": {"limit": 0.5, "quantile": 0.9}})
-    assert pareto._limited(share) == (share, 0.5)
+    assert trades.Torque(made).base.requirements == {"effort": 9.0, "peak_torque": trades.OFF}
+    quantile = scenario.replace(made, requirements={"peak_torque": {"limit": 0.5, "quantile": 0.9}})
+    assert trades.Torque(quantile).base is quantile
     with pytest.raises(ScenarioError, match="for a front of the window error"):
-        pareto.check(replace_tune(share, torque_weight=1.0))
-
-
-def replace_tune(made, **changes):
-    return scenario.replace(made, tune={**changes})
+        trades.Torque(scenario.replace(quantile, tune={"torque_weight": 1.0})).check()
 
 
 @pytest.mark.parametrize("own", [None, 0.5, 1.001, 1.4, 1.5, 3.0, 5.0, 6.0, 15.9, 16.0])
 def test_a_limit_of_ones_own_takes_the_place_of_the_nearest_rung(own):
     """By logarithms; the ends stay, which are known to be kept."""
     usual = np.array([1.0, 2.0, 4.0, 8.0, 16.0])
-    ladder, middle = pareto.ladder_between(1.0, 16.0, 5, own)
+    ladder, middle = trades.limits_between(1.0, 16.0, 5, own)
     rungs = {1.001: 1, 1.4: 1, 1.5: 1, 3.0: 2, 5.0: 2, 6.0: 3, 15.9: 3}  # from 2 sqrt(2) on 4 is nearer than 2
     assert middle == rungs.get(own, 2)
     np.testing.assert_allclose(np.delete(ladder, middle), np.delete(usual, middle), rtol=1e-14)
     assert ladder[middle] == (own if own in rungs else pytest.approx(4.0, rel=1e-14))
 
 
-def test_the_ladder_says_which_rung_it_is_on(monkeypatch):
+def test_refining_reports_its_target(monkeypatch):
     told = []
-    monkeypatch.setattr(pareto, "_step", lambda *_: None)
+    monkeypatch.setattr(pareto, "_refined", lambda *_: None)
     problem: Any = None
-    rungs = [("peak torque 0.2", problem), ("peak torque 0.4", problem)]
-    assert pareto.climbed(rungs, [np.zeros(1)], problem, lambda what, *_: told.append(what)) == {}
-    assert told == [f"ladder, peak torque {limit}" for limit in (0.4, 0.2, 0.2, 0.4)]
+    targets = [trades.Target(limit, f"peak torque {limit}", problem) for limit in (0.2, 0.4)]
+    assert pareto.refined(targets, [np.zeros(1)], problem, lambda what, *_: told.append(what)) == {}
+    assert told == [f"refining, peak torque {limit}" for limit in (0.4, 0.2, 0.2, 0.4)]
 
 
 @pytest.mark.parametrize(("found", "best"), [(None, 2.0), (3.0, 2.0), (1.5, 1.5)])
@@ -260,10 +227,10 @@ def test_a_rung_is_as_good_as_the_gains_known_to_keep_it(monkeypatch, found, bes
     monkeypatch.setattr(pareto, "Descents", Found)
     posed: Any = SimpleNamespace(evaluate=SimpleNamespace(fly=measured), sloped=True)
     problem: Any = SimpleNamespace(rows=["peak_torque"])
-    step = pareto._step(posed, problem, np.asarray([[1.0], [2.0], [4.0]]))
+    step = pareto._refined(posed, problem, np.asarray([[1.0], [2.0], [4.0]]))
     assert step is not None
     assert (step.f, step.over) == (best, 0.0)
-    assert pareto._step(posed, problem, np.asarray([[1.0]])) is None or found is not None
+    assert pareto._refined(posed, problem, np.asarray([[1.0]])) is None or found is not None
 
 
 @pytest.mark.parametrize(("least", "limits"), [(9.0, [5.0]), (2.0, [5.0, 0.25]), (1e-9, [5.0, 0.25, 0.0125])])
@@ -275,13 +242,13 @@ def test_the_least_torque_is_looked_for_under_a_limit_that_no_gains_keep(least, 
         asked.append(limit)
         return len(asked), max(0.97 * limit, least)
 
-    found, peak = pareto.least_torque(asking_for, 100.0)
+    found, peak = trades.least_torque(asking_for, 100.0)
     np.testing.assert_allclose(asked, limits)
     assert (found, peak) == (len(limits), max(0.97 * limits[-1], least))
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("stage", ["least torque: searching", "ladder"])
+@pytest.mark.parametrize("stage", ["least torque: searching", "refining"])
 def test_an_interrupted_front_goes_on(command, tmp_path, monkeypatch, stage):
     """The front is that of a run without it."""
     small_search(monkeypatch, 60)

@@ -16,7 +16,7 @@ from ptsmc_jax.simulation import clock, rollout
 from ptsmc_jax.theory import error_floor
 from ptsmc_jax.theory.error_floor import Model
 from tests.helpers import chain_parts, parts, vector
-from tuning.output import campaign_sentences, front_sentences, sentences
+from tuning.output import campaign_sentences, sentences
 
 PERIOD = 0.125  # a power of two: t_f and the window lie on samples exactly
 
@@ -312,18 +312,11 @@ def test_a_filter_with_the_kalman_filters_gains_is_at_the_floor():
 @pytest.mark.parametrize("least", [None, 0.0])
 def test_where_there_is_no_floor_nothing_is_said(least):
     """Without noise, where no run flies, and in results of earlier versions, which have no such key."""
-    point = {"gains": {"eta": 3.0}, "rms": 1e-5, "interval": None, "peak": 0.2, "mean_peak": 0.1, "failures": 0,
-             "knee": False, "meets": True, "dominated": False}  # fmt: skip
-    front = {"plant": "spacecraft", "points": [point], "requirements": [], "paper_refused": None}
     run = {"status": "ok", "reason": "", "bad_time": None, "window_error": 1e-5}
     flown = {"quantiles": {"window_error": {"rms": 1e-5}}}
     for known in ({}, {"floor": least}):
         assert sentences.run_lines({**run, **known}) == ["status: ok", "window error 1.000e-05"]
         assert list(campaign_sentences.error({**flown, **known})) == []
-        assert list(front_sentences.front_lines({**front, **known})) == []
-        assert "times the floor" not in front_sentences.front({**front, **known}).head
-    assert front_sentences.front({**front, "floor": 5e-6}).head[5] == "times the floor"
-    assert front_sentences.front({**front, "floor": 5e-6}).rows[0][5] == "2"
 
 
 def test_a_floor_is_shown_by_its_number_and_not_by_its_course():

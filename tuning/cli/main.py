@@ -261,17 +261,17 @@ def pareto(
     """
     listed = listed_against(against, points, times, limits)
     loaded, folder = prepare(scenario, "pareto", out, device, trust=trust)
-    from tuning.studies import fronts
+    from tuning.studies import pareto as fronts
+    from tuning.studies import trades
 
-    loaded = searches.with_tune(loaded)
-    study, asked = fronts.study_of(against, loaded, points, listed)
-    known_by = study.identity(loaded, seed, asked)
+    trade = trades.of(against, searches.with_tune(loaded), points, listed)
+    loaded, known_by = trade.scenario, trade.identity(seed)
     search = searches.LongSearch(
         known_by,
         "window error",
-        work=lambda report, journal: study.trace(loaded, seed, asked, report, journal),
-        write=lambda making, traced: study.write(making, loaded, traced, figures, known_by),
-        summary=lambda traced: study.summary(traced, loaded),
+        work=lambda report, journal: fronts.trace(trade, seed, report, journal),
+        write=lambda making, front: fronts.write(making, trade, front, figures, known_by),
+        summary=lambda front: front.summary(),
         show=terminal.front,
     )
     return searches.run(search, loaded, folder, force=force, quiet=quiet)

@@ -1,199 +1,168 @@
-"""What the fronts of `ptsmc pareto` say: accuracy against torque, against margins, and against the prescribed time."""
+"""Tables and sentences of a Pareto front, for the terminal and the page."""
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Sequence
 
-from ptsmc_jax.simulation.catalogues import CATALOGUES, MARGINS
 from tuning.output import margin_sentences, sentences
-from tuning.output.cells import Summary, Table, digits, valued
+from tuning.output.cells import Table, digits, valued
+from tuning.output.pointing_sentences import error
+from tuning.studies.front import KINDS, Front, Point, titled, unit_of
 
-HEADS = {
-    "gain_margin": "gain margin", "phase_margin": "phase margin", "delay_margin": "delay margin",
-    "modulus_margin": "largest |S|",
-}  # fmt: skip
-
-
-def front(summary: Summary) -> Table:
-    """Points that no other one beats, and the paper's and the scenario's own gains."""
-    from tuning.search.gains import base
-
-    units = CATALOGUES[summary["plant"]]
-    points = [("", point) for point in summary["points"] if not point["dominated"]]
-    names = list(points[0][1]["gains"]) if points else []
-    others = {"paper": summary.get("paper_is", "paper"), "before": "before"}
-    points += [(label, summary[name]) for name, label in others.items() if name in summary]
-    rows: list[tuple[str, ...]] = []
-    for name, point in points:
-        gains = [point["gains"].get(gain, point["gains"].get(base(gain))) for gain in names]
-        cells = [digits(value, ".4g") for value in gains]
-        if summary.get("floor"):
-            cells.insert(0, sentences.ratio(sentences.over_floor(point["rms"], summary["floor"])))
-        numbers = (digits(point["peak"], ".4g"), digits(point["mean_peak"], ".4g"), digits(point["rms"], ".3e"))
-        rows.append((name, *numbers, _spread(point), *cells, _marks(point)))
-    torque, beside = units["peak_torque"].unit, ("times the floor",) if summary.get("floor") else ()
-    head = f"largest peak [{torque}]", f"mean peak [{torque}]", f"RMS error [{units['window_error'].unit}]", "+-"
-    return Table(("", *head, *beside, *_in_units(summary, names), ""), rows)
+USUAL = margin_sentences.ENOUGH["gain_margin"]  # limit on |S| that the summary states first [dB]
 
 
-def _in_units(summary: Summary, names: list[str]) -> list[str]:
-    """Headings of columns of gains."""
-    from tuning.search.gains import base
-
-    known = summary.get("gain_units", {})  # not yet said in earlier results
-    unit_of = {name: known.get(base(name), "-") for name in names}
-    return [name if unit == "-" else f"{name} [{unit}]" for name, unit in unit_of.items()]
+def heading(front: Front) -> str:
+    """Return the number of points and of held-out trials."""
+    return f"{_many(len(front.kept), 'point')}, each judged on {_many(front.trials, 'held-out trial')}"
 
 
-def _spread(point: Summary) -> str:
-    """Half the interval of a point's RMS error, as a share of that error."""
-    if not point["interval"]:
-        return "-"
-    low, high = point["interval"]
-    return f"{50 * (high - low) / point['rms']:.1f} %"
-
-
-def _marks(point: Summary) -> str:
-    """What is worth knowing of a point besides its numbers."""
-    marks = [word for word in ("knee", "meets") if point.get(word)]
-    return ", ".join(marks + ([f"{point['failures']} failed or missed"] if point["failures"] else []))
-
-
-def front_lines(summary: Summary) -> Iterator[str]:
-    """What is left out of a front, and whether anything on it will do."""
-    yield from sentences.paper_refused(summary)
-    if summary.get("floor"):
-        yield f"the floor is {summary['floor']:.2e}: no controller can be more accurate, whatever its torque"
-    kept = [point for point in summary["points"] if not point["dominated"]]
-    found = len(summary["points"])
-    without = summary.get("steps", found) - found
-    if without:
-        yield f"limits without a point of their own: {without}, which no gains keep, or the same gains as at another"
-    lost = found - len(kept)
-    if lost:
-        yield f"points left out: {lost}, each beaten by another in error and torque by more than its interval"
-    if summary["requirements"] and not any(point["meets"] for point in kept):
-        yield "no gains on the front meet every requirement"
-
-
-def front_heading(summary: Summary) -> str:
-    """How many points, and on what they were judged."""
-    kept = sum(not point["dominated"] for point in summary["points"])
-    return f"{kept} points, each judged on {sentences.fresh_trials(summary['trials'])}"
-
-
-def slew_times(summary: Summary) -> Table:
-    """Each prescribed time: the error, what it costs, its gains."""
-    units, slews = CATALOGUES[summary["plant"]], summary["slews"]
-    costs, names = (list(slews[0][key]) if slews else [] for key in ("costs", "gains"))
-    rows: list[tuple[str, ...]] = []
-    for slew in slews:
-        numbers = (f"{slew['t_f']:g}", digits(slew["rms"], ".3e"), _spread(slew))
-        cells = [digits(slew["costs"][name], ".4g") for name in costs] + [f"{slew['gains'][n]:.4g}" for n in names]
-        rows.append((*numbers, *cells, _marks(slew)))
-    head = [f"{name.replace('_', ' ')} [{units[name].unit}]" for name in costs] + _in_units(summary, names)
-    return Table(("t_f [s]", f"RMS error [{units['window_error'].unit}]", "+-", *head, ""), rows)
-
-
-def slew_times_lines(summary: Summary) -> Iterator[str]:
-    """What the fastest slew costs beside the slowest, and which times have no gains."""
-    units, slews = CATALOGUES[summary["plant"]], summary["slews"]
-    if len(slews) > 1:
-        fast, slow = slews[0], slews[-1]
-        for name in fast["costs"]:
-            one, other = fast["costs"][name], slow["costs"][name]
-            if one and other:
-                yield (f"{name.replace('_', ' ')}: {one:.4g} {units[name].unit} at t_f = {fast['t_f']:g} s, "
-                       f"{one / other:.3g} times that at {slow['t_f']:g} s")  # fmt: skip
-        if fast["rms"] and slow["rms"]:
-            error = valued(fast["rms"], "window_error", summary["plant"])
-            times = sentences.ratio(fast["rms"] / slow["rms"])
-            yield f"RMS window error: {error} at t_f = {fast['t_f']:g} s, {times} times that at {slow['t_f']:g} s"
-    for t_f in summary["without"]:
-        yield f"no gains keep the limits on the training trials at t_f = {t_f:g} s"
-    if summary["requirements"] and not any(slew["meets"] for slew in slews):
-        yield "at none of these times do gains meet every requirement on the fresh trials"
-
-
-def slew_times_heading(summary: Summary) -> str:
-    """How many times, and on what they were judged."""
-    return _tuned_for(summary, "slews", "prescribed time")
-
-
-def _tuned_for(summary: Summary, points: str, what: str, of: str = "") -> str:
-    """How many points of such a name there are, what each is tuned for, and on what they were judged."""
-    count = len(summary[points])
-    many, each = ("s", "each ") if count != 1 else ("", "")
-    return f"gains tuned for {count} {what}{many}{of}, {each}judged on {sentences.fresh_trials(summary['trials'])}"
-
-
-def robust(summary: Summary) -> Table:
-    """Each limit on the largest sensitivity: the error, the torque, the margins that are left."""
-    units, floor = CATALOGUES[summary["plant"]], summary["floor"]
-    rows: list[tuple[str, ...]] = []
-    for one in summary["robust"]:
-        over = [sentences.ratio(sentences.over_floor(one["rms"], floor))] if floor else []
-        margins = [digits(one["margins"][name], ".3g", "none") for name in MARGINS]
-        rows.append((_limit(one), digits(one["rms"], ".3e"), _spread(one), *over, *margins, digits(one["peak"], ".4g"),
-                     _marks(one)))  # fmt: skip
-    beside = ("times the floor",) if floor else ()
-    head = "|S| at most [dB]", f"RMS error [{units['window_error'].unit}]", "+-", *beside
-    left = (f"{HEADS[name]} [{margin.unit}]" for name, margin in MARGINS.items())
-    return Table((*head, *left, f"largest peak [{units['peak_torque'].unit}]", ""), rows)
-
-
-def robust_gains(summary: Summary) -> Table:
-    """The gains of each of them."""
-    names = list(summary["robust"][0]["gains"]) if summary["robust"] else []
-    rows = [(_limit(one), *(f"{one['gains'][name]:.4g}" for name in names)) for one in summary["robust"]]
-    return Table(("|S| at most [dB]", *_in_units(summary, names)), rows)
-
-
-def _limit(one: Summary) -> str:
-    """A limit on the largest sensitivity, null for none."""
-    return digits(one["limit"], "g", "none")
-
-
-def robust_lines(summary: Summary) -> Iterator[str]:
-    """What margins cost beside none, and which limits have no gains of their own."""
-    found = summary["robust"]
-    loose = next((one for one in found if one["limit"] is None), None)
-    if loose is not None and loose["margins"]["gain_margin"] is not None and loose["margins"]["gain_margin"] <= 0.0:
-        yield "without a limit on |S| not every loop is stable: the best error lies beyond the border of stability"
-    limits = [one for one in found if one["limit"] is not None]
-    limited = [one for one in limits if one["rms"] and _keeps(one)]
-    if limited and loose is not None and loose["rms"]:
-        usual = min(limited, key=lambda one: abs(one["limit"] - margin_sentences.ENOUGH["gain_margin"]))
-        error = valued(usual["rms"], "window_error", summary["plant"])
-        yield (
-            f"with |S| at most {usual['limit']:g} dB the RMS window error is {error}, "
-            f"{sentences.ratio(usual['rms'] / loose['rms'])} times that without a limit"
+def results(front: Front) -> Table:
+    """Return the table of errors and costs."""
+    rows, plant = _rows(front), front.plant
+    costs = list(rows[0][1].costs) if rows else []
+    vector = [f"RMS error vector [{unit_of('window_error', plant)}]"] if plant == "spacecraft" else []
+    bound = ["times the lower bound"] if front.floor else []
+    heads = [titled(name, plant) for name in costs]
+    cells = [
+        (
+            label,
+            error(point.rms, plant),
+            spread(point),
+            *(digits(point.rms, ".3e") for _ in vector),
+            *(sentences.ratio(sentences.over_floor(point.rms, front.floor)) for _ in bound),
+            *(digits(point.costs[name], ".4g", "none" if name.endswith("margin") else "-") for name in costs),
+            _marks(point),
         )
-    for one in limits:
-        if not _keeps(one):
-            yield (
-                f"the gains found for |S| at most {one['limit']:g} dB do not keep it on the fresh trials: "
-                f"{digits(one['margins']['modulus_margin'], '.3g', 'no value')} dB"
-            )
-    if summary["idle"]:
-        yield f"the gains found for a looser limit keep {_listed(summary['idle'])} dB too"
-    if None in summary["without"]:
-        yield "no gains found keep the limits on the training trials, whatever margins they leave"
-    elif summary["without"]:
-        yield f"no gains found keep |S| at most {_listed(summary['without'])} dB on the training trials"
-    if summary["requirements"] and not any(one["meets"] for one in found):
-        yield "for none of these limits do gains meet every requirement on the fresh trials"
+        for label, point in rows
+    ]
+    return Table((KINDS[front.against].label(plant), "RMS error", "+-", *vector, *bound, *heads, ""), cells)
 
 
-def _keeps(one: Summary) -> bool:
-    """Whether the fresh trials' loops keep the limit that gains were found for, within 1 %."""
-    left = one["margins"]["modulus_margin"]
-    return left is not None and left <= 1.01 * one["limit"]
+def gains(front: Front) -> Table:
+    """Return the table of gains."""
+    from ptsmc_jax.simulation.gains import base
+
+    rows = _rows(front)
+    names = list(rows[0][1].gains) if rows else []
+    units = [front.gain_units.get(base(name), "-") for name in names]
+    heads = [name if unit == "-" else f"{name} [{unit}]" for name, unit in zip(names, units, strict=True)]
+    cells = [
+        (label, *(digits(point.gains.get(name, point.gains.get(base(name))), ".4g") for name in names))
+        for label, point in rows
+    ]
+    return Table((KINDS[front.against].label(front.plant), *heads), cells)
 
 
-def _listed(limits: list[float]) -> str:
-    *first, last = (f"{limit:g}" for limit in limits)
-    return f"{', '.join(first)} and {last}" if first else last
+def spread(point: Point) -> str:
+    """Return half the interval of a point's RMS error in per cent of this error.
+
+    >>> spread(Point(6.0, {}, rms=2e-6, interval=(1.9e-6, 2.1e-6))), spread(Point(6.0, {}, rms=2e-6))
+    ('5.0 %', '-')
+    """
+    if not point.interval:
+        return "-"
+    low, high = point.interval
+    return f"{50 * (high - low) / point.rms:.1f} %"
 
 
-def robust_heading(summary: Summary) -> str:
-    """How many limits, and on what they were judged."""
-    return _tuned_for(summary, "robust", "limit", " on |S|")
+def answers(front: Front) -> Iterator[str]:
+    """Return the errors that a user chooses between, and their costs."""
+    yield from {"torque": _of_torque, "margins": _of_margins, "t_f": _of_times}[front.against](front)
+
+
+def remarks(front: Front) -> Iterator[str]:
+    """Return the lower bound, the missing points, and a warning if no point meets every requirement."""
+    kind = KINDS[front.against]
+    if front.floor:
+        yield f"lower bound on the RMS error with these sensors: {error(front.floor, front.plant)}, whatever the torque"
+    if front.idle:
+        yield f"no separate point for {kind.quantity}: {_listed(front, front.idle)}; another point has the same gains"
+    if front.without:
+        yield (
+            f"no gains found keep all limits on the training trials for {kind.quantity}: "
+            f"{_listed(front, front.without)}"
+        )
+    dominated = len(front.points) - len(front.kept)
+    if dominated:
+        yield f"omitted: {_many(dominated, 'point')} with more torque and a larger error, beyond its interval"
+    if front.requirements and front.status != "met":
+        yield "no point meets every requirement on the held-out trials"
+    if front.paper_refused:
+        yield f"the published gains cannot be simulated in this scenario: {front.paper_refused}"
+
+
+def _of_torque(front: Front) -> Iterator[str]:
+    """Return the most accurate point, the knee and the point with the least torque."""
+    kept = sorted((point for point in front.kept if point.rms > 0.0), key=lambda point: point.peak)
+    labelled = {id(point): "knee" for point in kept if point.knee}
+    if len(kept) > 1:
+        labelled |= {id(kept[0]): "least torque", id(kept[-1]): "most torque"}
+    for point in reversed(kept):
+        if id(point) in labelled:
+            found, peak = error(point.rms, front.plant), valued(point.peak, "peak_torque", front.plant)
+            yield f"RMS error {found} at a largest peak torque of {peak} ({labelled[id(point)]})"
+
+
+def _of_margins(front: Front) -> Iterator[str]:
+    """Return the cost of the usual limit on |S|, and the limits that the held-out trials exceed."""
+    loose = next((point for point in front.points if not math.isfinite(point.value)), None)
+    limited = [point for point in front.points if math.isfinite(point.value)]
+    keeping = [point for point in limited if point.rms > 0.0 and _keeps(point)]
+    if keeping and loose is not None and loose.rms > 0.0:
+        usual = min(keeping, key=lambda point: abs(point.value - USUAL))
+        times = sentences.ratio(usual.rms / loose.rms)
+        yield (
+            f"RMS error {error(usual.rms, front.plant)} with |S| at most {usual.value:g} dB, "
+            f"{times} times the error without a limit"
+        )
+    if loose is not None and loose.costs["gain_margin"] <= 0.0:
+        yield "without a limit on |S| some loops of the held-out trials are unstable"
+    for point in limited:
+        if not _keeps(point):
+            found = digits(point.costs["modulus_margin"], ".3g", "no value")
+            yield f"the gains found for |S| at most {point.value:g} dB exceed it on the held-out trials: {found} dB"
+
+
+def _of_times(front: Front) -> Iterator[str]:
+    """Return the shortest time that meets every requirement, and the cost of the fastest slew."""
+    shortest = min((point for point in front.points if point.meets), key=lambda point: point.value, default=None)
+    if shortest is not None and front.requirements:
+        found = error(shortest.rms, front.plant)
+        yield f"RMS error {found} at t_f = {shortest.value:g} s, the shortest time that meets every requirement"
+    if len(front.points) < 2:
+        return
+    fast, slow = front.points[0], front.points[-1]
+    where, than = f"at t_f = {fast.value:g} s", f"times the value at {slow.value:g} s"
+    if fast.rms > 0.0 and slow.rms > 0.0:
+        yield f"RMS error {error(fast.rms, front.plant)} {where}, {sentences.ratio(fast.rms / slow.rms)} {than}"
+    for name, cost in fast.costs.items():
+        if cost > 0.0 and slow.costs[name] > 0.0:
+            unit = unit_of(name, front.plant)
+            yield f"{name.replace('_', ' ')} {cost:.4g} {unit} {where}, {cost / slow.costs[name]:.3g} {than}"
+
+
+def _keeps(point: Point) -> bool:
+    """Return whether the loops of the held-out trials keep the limit on |S| within 1 %."""
+    return point.costs["modulus_margin"] <= 1.01 * point.value
+
+
+def _rows(front: Front) -> list[tuple[str, Point]]:
+    """Return the labels and points of the tables."""
+    return [*((_value(point.value), point) for point in front.kept), *front.labelled().items()]
+
+
+def _value(value: float) -> str:
+    return f"{value:.4g}" if math.isfinite(value) else "none"
+
+
+def _listed(front: Front, values: Sequence[float]) -> str:
+    return f"{', '.join(map(_value, values))} {KINDS[front.against].unit_for(front.plant)}"
+
+
+def _marks(point: Point) -> str:
+    words = [word for word, is_so in (("knee", point.knee), ("meets", point.meets)) if is_so]
+    return ", ".join([*words, *([f"{point.failures} failed or missed"] if point.failures else [])])
+
+
+def _many(count: int, thing: str) -> str:
+    return f"{count} {thing}{'' if count == 1 else 's'}"

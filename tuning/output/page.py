@@ -20,7 +20,6 @@ import numpy as np
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.scenario import parsing
-from ptsmc_jax.simulation import catalogues
 from tuning.errors import UsageError
 from tuning.output import (
     campaign_sentences,
@@ -36,6 +35,7 @@ from tuning.output import (
     sentences,
 )
 from tuning.output.page_parts import Block, Heading, Result, Section
+from tuning.studies import front
 
 HERE = Path(__file__).parent
 FILES = ("versions.json", store.SUMMARY, "scenario.toml", "trajectory.csv", "history.csv", "map.csv")  # that are read
@@ -218,47 +218,20 @@ def _distance(verdict: dict[str, Any]) -> str:
 
 
 def _pareto(result: Result) -> tuple[Heading, list[Section]]:
-    if "slews" in result.summary:
-        return _slew_times(result)
-    if "robust" in result.summary:
-        return _robust(result)
-    summary, units = result.summary, catalogues.units(result.kind)
-    requirement = result.scenario.get("requirements", {}).get("peak_torque")
-    limit = requirement.get("limit") if isinstance(requirement, dict) else requirement
-    caption = "Smaller is better in both. Hover over a point for its gains; bars are 95 % intervals, dashed a limit."
-    sections = [
-        Section("Front", [result.chart("front", page_charts.front(summary, units, limit), caption)]),
-        Section("Points", [_table(front_sentences.front(summary)), _text(front_sentences.front_lines(summary))]),
-    ]
-    gains = "Gains" if summary["status"] == "met" else "No gains"
-    lines = [*search_sentences.along_the_front(summary), front_sentences.front_heading(summary)]
-    return _with_headline(summary, lines, f"{gains} on the front meet every requirement"), sections
-
-
-def _slew_times(result: Result) -> tuple[Heading, list[Section]]:
-    summary = result.summary
-    blocks = [_table(front_sentences.slew_times(summary)), _text(front_sentences.slew_times_lines(summary))]
-    met, times = sum(slew["meets"] for slew in summary["slews"]), len(summary["slews"]) + len(summary["without"])
-    headline = f"At {met} of {times} prescribed times gains meet every requirement"
-    lines = [*search_sentences.fastest(summary), front_sentences.slew_times_heading(summary)]
-    return _with_headline(summary, lines, headline), [Section("What a faster slew costs", blocks)]
-
-
-def _robust(result: Result) -> tuple[Heading, list[Section]]:
-    summary = result.summary
-    blocks = [_table(front_sentences.robust(summary)), _text(front_sentences.robust_lines(summary)),
-              _table(front_sentences.robust_gains(summary))]  # fmt: skip
-    met, found = sum(one["meets"] for one in summary["robust"]), len(summary["robust"])
-    headline = f"Under {met} of {found} limits on |S| gains meet every requirement"
-    lines = [front_sentences.robust_heading(summary)]
-    return _with_headline(summary, lines, headline), [Section("What margins cost", blocks)]
-
-
-def _with_headline(summary: dict[str, Any], lines: list[str], headline: str) -> Heading:
-    """What a front says first, with this headline where requirements are asked for."""
-    asked = bool(summary["requirements"])
-    heading = _verdict(summary, lines, asked)
-    return replace(heading, headline=headline) if asked else heading
+    found = front.read(result.summary)
+    blocks = [_table(front_sentences.results(found)), _text(front_sentences.remarks(found)),
+              _table(front_sentences.gains(found))]  # fmt: skip
+    if found.against == "torque":
+        caption = "Hover over a point for its gains. Bars are 95 % intervals; the dashed line is the required limit."
+        requirement = result.scenario.get("requirements", {}).get("peak_torque")
+        limit = requirement.get("limit") if isinstance(requirement, dict) else requirement
+        blocks.insert(0, result.chart("front", page_charts.front(found, limit), caption))
+    lines = [*front_sentences.answers(found), front_sentences.heading(found)]
+    heading = _verdict(result.summary, lines, bool(found.requirements))
+    if found.requirements:
+        met, points = sum(point.meets for point in found.kept), len(found.kept)
+        heading = replace(heading, headline=f"{met} of {points} points meet every requirement")
+    return heading, [Section(front.KINDS[found.against].title, blocks)]
 
 
 def _compare(result: Result) -> tuple[Heading, list[Section]]:

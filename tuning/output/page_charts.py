@@ -9,6 +9,7 @@ import numpy as np
 
 from ptsmc_jax.figures import animation
 from ptsmc_jax.figures.style import STYLES
+from tuning.studies.front import Front, Point, unit_of
 
 Chart = dict[str, Any]
 
@@ -120,46 +121,46 @@ def _line(points: np.ndarray, name: str, colour: str, width: int, dash: str = "s
             "line": {"color": colour, "width": width, "dash": dash}}  # fmt: skip
 
 
-def front(summary: dict[str, Any], units: Mapping[str, str], limit: float | None) -> Chart:
-    """Error against peak torque: the front, what is beaten, and the paper's and the scenario's own gains."""
-    points = summary["points"]
-    on_front = [p for p in points if not p["dominated"]]
-    groups = [
-        ("front", on_front, {"mode": "lines+markers", "marker": {"size": 8}, "line": {"shape": "hv"}}),
-        ("knee", [p for p in on_front if p["knee"]], {"mode": "markers", "marker": {"size": 15, "symbol": "star"}}),
-        ("beaten by others", [p for p in points if p["dominated"]], {"mode": "markers", "marker": {"symbol": "x"}}),
-        *((label, [summary[name]], {"mode": "markers", "marker": {"size": 12, "symbol": "diamond"}})
-          for name, label in (("paper", summary.get("paper_is", "paper")), ("before", "before")) if name in summary),
+def front(found: Front, limit: float | None) -> Chart:
+    """Return the chart of error over peak torque: the front, dominated points, and the reference gains.
+
+    Args:
+        found: the front of error against torque.
+        limit: the required largest peak torque [N m].
+    """
+    groups: list[tuple[str, list[Point], Chart]] = [
+        ("front", found.kept, {"mode": "lines+markers", "marker": {"size": 8}, "line": {"shape": "hv"}}),
+        ("knee", [p for p in found.kept if p.knee], {"mode": "markers", "marker": {"size": 15, "symbol": "star"}}),
+        ("dominated", [p for p in found.points if p.dominated], {"mode": "markers", "marker": {"symbol": "x"}}),
+        *((label, [point], {"mode": "markers", "marker": {"size": 12, "symbol": "diamond"}})
+          for label, point in found.labelled().items()),
     ]  # fmt: skip
     data = []
-    for k, (name, points_of, style) in enumerate(groups):
-        group = [p for p in points_of if p["rms"] is not None]  # none where no fresh trial is flown to the end
+    for k, (name, points, style) in enumerate(groups):
+        group = [p for p in points if p.rms >= 0.0]  # NaN if no trial was simulated to its end
         if group:
+            intervals = [p.interval or (p.rms, p.rms) for p in group]
+            bars = {
+                "type": "data", "symmetric": False, "visible": True, "thickness": 1,
+                "array": [high - p.rms for p, (_, high) in zip(group, intervals, strict=True)],
+                "arrayminus": [p.rms - low for p, (low, _) in zip(group, intervals, strict=True)],
+            }  # fmt: skip
             data.append({
-                "type": "scatter", "name": name, "x": [p["peak"] for p in group], "y": [p["rms"] for p in group],
-                "text": [", ".join(f"{g} {v:.4g}" for g, v in p["gains"].items()) for p in group],
+                "type": "scatter", "name": name, "x": [p.peak for p in group], "y": [p.rms for p in group],
+                "text": [", ".join(f"{g} {v:.4g}" for g, v in p.gains.items()) for p in group],
                 "hovertemplate": "%{text}<br>error %{y:.3e}, peak %{x:.4g}<extra>" + name + "</extra>",
-                "error_y": _bars(group), **style, "marker": {**style["marker"], "color": COLOURS[k % len(COLOURS)]},
+                "error_y": bars, **style, "marker": {**style["marker"], "color": COLOURS[k % len(COLOURS)]},
             })  # fmt: skip
-    along = {"title": {"text": f"peak torque [{units['peak_torque']}]"}, "type": "log"}
-    up = {"title": {"text": f"RMS window error [{units['window_error']}]"}, **_DECADES}
+    along = {"title": {"text": f"peak torque [{unit_of('peak_torque', found.plant)}]"}, "type": "log"}
+    up = {"title": {"text": f"RMS window error [{unit_of('window_error', found.plant)}]"}, **_DECADES}
     shapes = [] if limit is None else [_upright(limit, dash="dash")]
     notes = []
-    if summary.get("floor"):
-        level = {"y0": summary["floor"], "y1": summary["floor"], "xref": "paper", "x0": 0, "x1": 1}
+    if found.floor:
+        level = {"y0": found.floor, "y1": found.floor, "xref": "paper", "x0": 0, "x1": 1}
         shapes.append({"type": "line", **level, "line": {"dash": "dot"}})
-        notes.append({"text": "floor", "xref": "paper", "x": 1, "xanchor": "right", "y": np.log10(summary["floor"]),
+        notes.append({"text": "lower bound", "xref": "paper", "x": 1, "xanchor": "right", "y": np.log10(found.floor),
                       "yanchor": "bottom", "showarrow": False})  # fmt: skip
     return {"data": data, "layout": _layout(xaxis=along, yaxis=up, shapes=shapes, annotations=notes)}
-
-
-def _bars(points: Sequence[dict[str, Any]]) -> Chart:
-    intervals = [p["interval"] or (p["rms"], p["rms"]) for p in points]
-    return {
-        "type": "data", "symmetric": False, "visible": True, "thickness": 1,
-        "array": [high - p["rms"] for p, (_, high) in zip(points, intervals, strict=True)],
-        "arrayminus": [p["rms"] - low for p, (low, _) in zip(points, intervals, strict=True)],
-    }  # fmt: skip
 
 
 def laws(

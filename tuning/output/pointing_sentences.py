@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterator
 
 from ptsmc_jax.simulation.catalogues import AXES, INDICES, percent
-from tuning.output.cells import Summary, Table
+from tuning.output.cells import Summary, Table, valued
 
 USUAL = (0.9, 0.95)  # confidences that reviews ask for
 
@@ -22,6 +22,17 @@ def angle(value: float | None) -> str:
         return f"{degrees:.3g} deg"
     seconds = 3600.0 * degrees
     return f"{seconds:.0f} arcsec" if abs(seconds) >= 999.5 else f"{seconds:.3g} arcsec"
+
+
+def error(rms: float, plant: str) -> str:
+    """Return an RMS window error as a pointing angle, or in the unit of the state of a plant that is no spacecraft.
+
+    >>> error(1e-6, "spacecraft"), error(1e-6, "chain"), error(float("nan"), "chain")
+    ('0.413 arcsec', '1e-06 x1', '-')
+    """
+    if math.isnan(rms):
+        return "-"
+    return angle(2.0 * math.asin(min(rms, 1.0))) if plant == "spacecraft" else valued(rms, "window_error", plant)
 
 
 def tables(summary: Summary) -> list[Table]:

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 from ptsmc_jax.simulation.catalogues import MARGINS, NO_SIGN, percent
 from tuning.output import margin_sentences
-from tuning.output.cells import Summary, lost, valued
+from tuning.output.cells import Summary, lost
 
 AGREE = 0.01  # slopes off from differences by more than this share say little
 
@@ -233,26 +233,3 @@ def shortest(summary: Summary) -> Iterator[str]:
     # the theory knows no noise: without a simulation that keeps the limit its t_f would contradict the verdict
     if times is not None and (times["simulated"] is not None or times["theory"] is None):
         yield str(design.ShortestTime(**times))
-
-
-def along_the_front(summary: Summary) -> Iterator[str]:
-    """What the least torque, the most, and the knee give."""
-
-    def said(point: Summary) -> str:
-        rms, peak = (valued(point[key], name, summary["plant"])
-                     for key, name in (("rms", "window_error"), ("peak", "peak_torque")))  # fmt: skip
-        return f"{rms} at {peak}"
-
-    kept = sorted((p for p in summary["points"] if not p["dominated"] and p["rms"]), key=lambda p: p["peak"])
-    if len(kept) > 1:
-        ends = map(said, (kept[0], kept[-1]))
-        knee = next((f"; the knee is {said(p)}" for p in kept if p["knee"]), "")
-        yield f"from an RMS window error of {' to '.join(ends)} of largest peak torque{knee}"
-
-
-def fastest(summary: Summary) -> Iterator[str]:
-    """The shortest of the prescribed times whose gains meet every requirement."""
-    shortest = min((slew for slew in summary["slews"] if slew["meets"]), key=lambda slew: slew["t_f"], default=None)
-    if shortest is not None and summary["requirements"]:
-        error = valued(shortest["rms"], "window_error", summary["plant"])
-        yield f"the shortest of them is t_f = {shortest['t_f']:g} s, with an RMS window error of {error}"

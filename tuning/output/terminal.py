@@ -93,20 +93,14 @@ def comparison(summary: dict[str, Any], folder: Path, how: str) -> None:
 
 
 def front(summary: dict[str, Any], folder: Path, how: str) -> None:
-    """A front of accuracy against torque, against margins, or against t_f, as its `summary.json` says."""
-    if "robust" in summary:
-        say(f"{how}: {front_sentences.robust_heading(summary)}")
-        table(front_sentences.robust(summary))
-        table(front_sentences.robust_gains(summary))
-        say(*front_sentences.robust_lines(summary))
-    elif "slews" in summary:
-        say(f"{how}: {front_sentences.slew_times_heading(summary)}")
-        table(front_sentences.slew_times(summary))
-        say(*front_sentences.slew_times_lines(summary))
-    else:
-        say(f"front {how}: {front_sentences.front_heading(summary)}")
-        table(front_sentences.front(summary))
-        say(*front_sentences.front_lines(summary))
+    """Print a Pareto front from its `summary.json`."""
+    from tuning.studies.front import read
+
+    found = read(summary)
+    say(f"front {how}: {front_sentences.heading(found)}", *front_sentences.answers(found))
+    table(front_sentences.results(found))
+    table(front_sentences.gains(found))
+    say(*front_sentences.remarks(found))
     say(*sentences.cautions(summary), f"results in {folder}")
 
 

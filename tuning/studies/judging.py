@@ -11,6 +11,7 @@ from ptsmc_jax.numerics import draws, statistics
 from ptsmc_jax.scenario import Study, replace, study
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Limit, Scenario
+from ptsmc_jax.scenario.timing import Reach
 from ptsmc_jax.simulation import requirements
 from ptsmc_jax.simulation.requirements import Verdict
 from tuning.search import confirm, gains, trust
@@ -46,9 +47,15 @@ def beside(scenario: Scenario) -> tuple[dict[str, Scenario], str | None]:
     return {"paper": paper} | ({"before": scenario} if gains.differ(scenario, paper) else {}), None
 
 
-def judge(scenario: Scenario, fresh_seed: int) -> Trials:
-    """A scenario's gains on fresh trials, as flown; see `fresh_trials`."""
-    flown = study(as_flown(scenario))
+def judge(scenario: Scenario, fresh_seed: int, reach: Reach | None = None) -> Trials:
+    """Simulate a scenario on its held-out trials, on the flight clock.
+
+    Args:
+        scenario: with the gains.
+        fresh_seed: of the held-out trials.
+        reach: ranges of the gains that share a compiled program; None: those of the scenario.
+    """
+    flown = study(as_flown(scenario), reach=reach)
     return montecarlo.run(flown.parts, flown.dispersion, fresh_seed, np.arange(fresh_trials(flown)))
 
 

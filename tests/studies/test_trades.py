@@ -1,0 +1,277 @@
+"""The quantities that the window error is traded against: margins and prescribed times."""
+
+import csv
+import json
+import re
+import tomllib
+
+import numpy as np
+import pytest
+
+from ptsmc_jax import scenario
+from ptsmc_jax.campaigns.montecarlo import Trials
+from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.simulation import catalogues
+from ptsmc_jax.simulation.metrics import Metrics
+from tests.helpers import SHORT_CHAIN, small_search
+from tests.output.pages import checked
+from tuning.search import gains
+from tuning.studies import judging, pareto, posing, stability, trades
+
+MARGINS = ("gain_margin", "phase_margin", "delay_margin", "modulus_margin")
+
+
+def test_more_margin_costs_accuracy(command, tmp_path, monkeypatch):
+    """Every row is what flying and linearising its gains gives; the limits are kept, and each costs more than none."""
+    small_search(monkeypatch, 60)
+    (tmp_path / "c.toml").write_text(
+        re.sub(r"\[dispersion\]\n.*\n", "", SHORT_CHAIN)  # one loop
+        .replace("peak_torque = 3.0", "peak_torque = 3.0\nphase_margin = 45.0")
+        .replace('free = ["eta", "delta"]', 'free = ["k1", "sign_width"]')
+        .replace("eta = [2.6, 3.05], delta = [0.1, 2.0]", "k1 = [0.5, 12.0], sign_width = [1e-3, 0.1]")
+        .replace("starts = 2\nsteps = 4", "starts = 1\nsteps = 8")
+    )
+    status, out, _ = command("pareto", "c.toml", "--against", "margins", "--limits", "4,60,6", "--out", "cost")
+    told = json.loads((tmp_path / "cost" / "summary.json").read_text())
+    with (tmp_path / "cost" / "robustness.csv").open() as file:
+        rows = [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
+    assert [row["limit"] for row in rows] == [np.inf, 6.0, 4.0]
+    assert [one["value"] for one in told["points"]] == [None, 6.0, 4.0]
+    assert told["idle"] == [60.0]
+    assert rows[0]["rms_window_error"] < rows[1]["rms_window_error"] < rows[2]["rms_window_error"]
+    assert rows[0]["modulus_margin"] > 6.0
+    known = scenario.read(tmp_path / "c.toml")
+    for row in rows:
+        flown = scenario.replace(known, controller__k1=row["k1"], controller__sign_width=row["sign_width"])
+        trials = judging.judge(flown, told["seed"])
+        errors = trials.metrics.window_error[:60]
+        np.testing.assert_allclose(row["rms_window_error"], np.sqrt(np.mean(errors**2)), rtol=1e-9)
+        np.testing.assert_allclose(row["peak_torque"], np.max(trials.metrics.peak_torque[:60]), rtol=1e-9)
+        by_place = stability.worst(scenario.study(judging.as_flown(flown))) or {}
+        for name in MARGINS:
+            worst = max if name == "modulus_margin" else min
+            limited = [place[name] for place in by_place.values() if place[name] is not None]
+            np.testing.assert_allclose(row[name], worst(limited), rtol=1e-9, err_msg=name)
+        # the limit stands for the phase margin asked for in the search, and not in the verdict
+        assert row["modulus_margin"] <= row["limit"]
+        assert row["meets"] == (row["phase_margin"] >= 45.0 and row["peak_torque"] <= 3.0 and row["failures"] == 0)
+        sensitivity = 10.0 ** (row["modulus_margin"] / 20.0)
+        assert row["phase_margin"] >= np.rad2deg(2.0 * np.arcsin(0.5 / sensitivity)) * (1 - 1e-6)
+        assert 10.0 ** (row["gain_margin"] / 20.0) >= (1.0 + 1.0 / sensitivity) * (1 - 1e-6)
+    assert status == (0 if any(row["meets"] for row in rows) else 1)
+    loose, usual = (row["rms_window_error"] for row in rows[:2])
+    assert f"RMS error {usual:.3g} x1 with |S| at most 6 dB, {usual / loose:.3g} times the error" in out
+    assert "no separate point for limit on |S|: 60 dB" in out
+    page = checked(tmp_path / "cost")
+    assert "Cost of stability margins" in page.text
+    assert "--against margins --limits 60,6,4" in page.text
+    assert (tmp_path / "cost" / "figures" / "robustness.png").exists()
+    again = command("pareto", "c.toml", "--against", "margins", "--limits", "6,4,60", "--out", "cost")
+    assert again == (status, out.replace("front done", "front already done"), "")
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--limits", "4,6"), "--limits is 4,6, but must be absent without --against margins"),
+        (("--against", "margins", "--points", "4"), "--points is 4, but must be absent with --against margins"),
+        (("--against", "margins", "--times", "4,8"), "--times is 4,8, but must be absent without --against t_f"),
+        *(
+            (("--against", "margins", "--limits", limits), f"--limits is {limits}, but must be limits in dB")
+            for limits in ("4,x", "4,4", "0,3", "-6", "3,inf", "nan", "")
+        ),
+        (("--against", "margins"), 'loop.mode is "continuous", but must be "sampled"'),
+    ],
+)
+def test_limits_that_are_refused_in_one_sentence(command, tmp_path, options, said):
+    (tmp_path / "s.toml").write_text("[controller]\neta = 3.0\n")
+    status, out, err = command("pareto", "s.toml", *options)
+    assert (status, out) == (2, "")
+    assert said in err
+    assert len(err.strip().splitlines()) == 1
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("tune", "said"),
+    [
+        ({"minimise": "t_f", "free": ["t_f"]}, 'tune.minimise is "t_f"'),
+        ({"worst_case": True}, "tune.worst_case is true, but must be false to ask what margins cost"),
+    ],
+)
+def test_scenarios_without_a_cost_of_margins(tune, said):
+    known = scenario.from_tables({**tomllib.loads(SHORT_CHAIN), "tune": tune})
+    with pytest.raises(ScenarioError, match=said):
+        trades.Margins(known).check()
+
+
+def test_the_scenarios_own_limit_is_one_of_the_usual_ones():
+    tables = tomllib.loads(SHORT_CHAIN)
+    usual = [np.inf, 12.0, 8.0, 6.0, 5.0, 4.0, 3.0]
+    assert trades.Margins(scenario.from_tables(tables)).values == usual
+    asked = scenario.from_tables({**tables, "requirements": {"modulus_margin": 5.5}})
+    assert trades.Margins(asked).values == sorted([*usual, 5.5], reverse=True)
+
+
+def test_a_limit_stands_for_the_margins_that_it_bounds():
+    asked = {"peak_torque": 3.0, "gain_margin": 8.0, "phase_margin": 45.0, "delay_margin": 0.02, "modulus_margin": 5.0}
+    known = scenario.from_tables({**tomllib.loads(SHORT_CHAIN), "requirements": asked})
+    limited = trades.Margins(known, (6.0, 4.0)).base
+    assert limited.requirements == {"peak_torque": 3.0, "delay_margin": 0.02, "modulus_margin": 4.0}
+
+
+def test_a_faster_slew_costs_torque_and_accuracy(command, tmp_path, monkeypatch):
+    """Two times, few steps: the peak torque of a slew goes with 1 / t_f^2, the rate with 1 / t_f."""
+    small_search(monkeypatch, 60)
+    # no longer than the scenario's own time: on the clock of other searches, whose programs fly this one too
+    (tmp_path / "c.toml").write_text(SHORT_CHAIN.replace("[2e-5, 1e-5]", "[2e-3, 1e-3]"))
+    status, out, err = command("pareto", "c.toml", "--against", "t_f", "--times", "2.5,5", "--out", "cost")
+    assert status == 0, err
+    assert "2 points, each judged on 60 held-out trials" in out
+    with (tmp_path / "cost" / "slew_times.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    fast, slow = ({key: float(value) for key, value in row.items()} for row in rows)
+    assert (fast["t_f"], slow["t_f"]) == (2.5, 5.0)
+    assert fast["peak_rate"] / slow["peak_rate"] == pytest.approx(2.0, rel=0.3)
+    assert 2.5 < fast["peak_torque"] / slow["peak_torque"] < 6.5
+    # each time's gains are at least as good at it as the other time's, on the very trials
+    for own, other in ((fast, slow), (slow, fast)):
+        untuned = scenario.replace(scenario.read(tmp_path / "c.toml"), tune=None)
+        errors = []
+        for found in (own, other):  # all other gains stay those of t_f = 5 s
+            known = gains.in_scenario(untuned, {"t_f": own["t_f"], "eta": found["eta"], "delta": found["delta"]})
+            trials = judging.judge(known, judging.seed_of_judge(0))
+            errors.append(np.sqrt(np.mean(trials.metrics.window_error[:60] ** 2)))
+        np.testing.assert_allclose(own["rms_window_error"], errors[0], rtol=1e-9)
+        assert errors[0] < errors[1]
+    told = json.loads((tmp_path / "cost" / "summary.json").read_text())
+    assert [slew["value"] for slew in told["points"]] == [2.5, 5.0]
+    assert told["points"][0]["rms"] == fast["rms_window_error"]
+    assert "times the value at 5 s" in out
+    page = checked(tmp_path / "cost")
+    assert "Cost of a faster slew" in page.text
+    met = sum(slew["meets"] for slew in told["points"])
+    assert f"{met} of 2 points meet every requirement" in page.text
+    assert "--against t_f --times 2.5,5" in page.text
+    assert (tmp_path / "cost" / "figures" / "slew_times.png").exists()
+    assert "already done" in command("pareto", "c.toml", "--against", "t_f", "--times", "5,2.5", "--out", "cost")[1]
+
+
+def test_each_time_is_searched_for_itself(monkeypatch):
+    """Not from the gains of others alone, which may lie in another valley; hard trials of the first two join all."""
+    small_search(monkeypatch, 8)
+    searched, flown, joined, search = [], [], [], posing.Posed.search
+
+    def note(posed, problem, own, starts, *asked, **told):
+        searched.append((float(problem.parts.controller.t_f), starts > 1))
+        flown.append(np.asarray(problem.trials).tolist())
+        outcome = search(posed, problem, own, starts, *asked, **told)
+        joined.append(np.asarray(outcome.problem.trials).tolist())
+        return outcome
+
+    monkeypatch.setattr(posing.Posed, "search", note)
+    usual = SHORT_CHAIN.replace(", delta = [0.1, 2.0]", "")  # to 2.55 s, where t_f is 5
+    pareto.trace(trades.SlewTime(scenario.from_tables(tomllib.loads(usual)), (3.9, 4.5, 5.0)), 0)
+    assert searched == [(5.0, True), (3.9, True), (4.5, True)]
+    assert set(joined[0]) > set(flown[0])
+    assert flown[1:] == joined[:2]
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--against", "speed"), "--against is speed, but must be torque, margins or t_f"),
+        (("--times", "4,8"), "--times is 4,8, but must be absent without --against t_f"),
+        (("--against", "t_f", "--points", "4"), "--points is 4, but must be absent with --against t_f"),
+        *(
+            (("--against", "t_f", "--times", times), f"--times is {times}, but must be two times or more in s")
+            for times in ("4", "4,x", "4,4", "0,3", "3,inf", "")
+        ),
+        (
+            ("--against", "t_f", "--times", "0.2,5"),
+            "controller.delta is 0.5, but must be less than controller.t_f, 0.2",
+        ),
+    ],
+)
+def test_times_that_are_refused_in_one_sentence(command, tmp_path, options, said):
+    status, out, err = command("pareto", "s.toml", *options)
+    assert (status, out) == (2, "")
+    assert said in err
+    assert len(err.strip().splitlines()) == 1
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        (
+            {"controller": {"kind": "pd", "t_f": 5.0}, "tune": {}},
+            'controller.kind is "pd", but must be prescribed_time',
+        ),
+        ({"tune": {"free": ["eta", "t_f"]}}, "but must be without t_f to ask what a faster slew costs"),
+        (
+            {"tune": {"minimise": "t_f", "free": ["t_f"]}, "requirements": {"window_error": 1e-3}},
+            'tune.minimise is "t_f"',
+        ),
+        ({"tune": {"worst_case": True}}, "tune.worst_case is true, but must be false"),
+        ({"requirements": {"gain_margin": 6.0}, "tune": {}}, "requirements.gain_margin is asked of one loop"),
+        (  # every time was flown with a third of the scenario's own t_f, which another t_f would not have had
+            {"observer": {"kind": "prescribed_time"}, "tune": {}},
+            "observer.t_o is absent and would follow t_f; allowed is one that is given",
+        ),
+    ],
+)
+def test_scenarios_without_a_cost_of_a_faster_slew(changes, said):
+    known = scenario.from_tables({"loop": {"mode": "sampled"}, "controller": {"t_f": 20.0}, **changes})
+    with pytest.raises(ScenarioError, match=said.replace("(", r"\(")):
+        trades.SlewTime(known, (20.0, 30.0)).check()
+
+
+def test_an_observer_with_a_time_of_its_own_is_asked():
+    known = {"observer": {"kind": "prescribed_time", "t_o": 4.0}, "tune": {}, "loop": {"mode": "sampled"}}
+    trades.SlewTime(scenario.from_tables({"controller": {"t_f": 20.0}, **known}), (20.0, 30.0)).check()
+
+
+def test_usual_times_go_from_half_to_twice_the_scenarios():
+    assert trades.SlewTime(scenario.from_tables({})).values == [15.0, 21.0, 30.0, 42.0, 60.0]
+
+
+def test_a_study_is_known_by_all_digits_of_its_times():
+    """Of six digits, others' results were shown as already done."""
+    known = scenario.from_tables({})
+    listed = [
+        trades.SlewTime(known, times).identity(0)["times"] for times in ((100.0001, 20), (20.0, 100.0002), (20, 30))
+    ]
+    assert listed == ["20,100.0001", "20,100.0002", "20,30"]
+
+
+def test_slew_costs_are_the_metrics_of_the_scenario():
+    trials = Trials(np.arange(1), Metrics(*[np.ones(1)] * len(Metrics._fields)), np.zeros(1, int), np.zeros(1), {})
+
+    def costs(**tables):
+        made = scenario.from_tables(tables)
+        return list(trades.SlewTime(made).costs(made, trials, 0))
+
+    assert costs() == ["peak_torque", "peak_momentum", "peak_rate", "effort"]
+    assert set(trades.SLEW_COSTS) == set(costs(loop={"mode": "sampled"}, wheels={}))
+    assert costs(plant={"kind": "chain"}) == ["peak_torque", "peak_rate", "effort"]
+    assert set(trades.SLEW_COSTS) <= set(catalogues.CATALOGUES["spacecraft"])
+
+
+def test_default_bounds_of_delta_follow_the_shortest_time():
+    """The default bounds of t_f = 8 s reach to 2 s, which a prescribed time of 1.9 s does not allow."""
+    tables = {
+        "plant": {"kind": "chain", "x0": [1.0, 0.0]},
+        "controller": {"t_f": 8.0, "delta": 0.5},
+        "loop": {"mode": "sampled", "period": 0.05},
+    }
+    known = scenario.from_tables({**tables, "tune": {}})
+    assert known.search.bounds["delta"] == (0.05, 2.0)
+    trades.SlewTime(known, (1.9, 8.0)).check()
+    given = scenario.from_tables({**tables, "tune": {"bounds": {"delta": [0.05, 1.95]}}})
+    with pytest.raises(ScenarioError, match=r"tune\.bounds\.delta is \[0\.05, 1\.95\]"):
+        trades.SlewTime(given, (1.9, 8.0)).check()
+    # so do the default bounds that include a longer delta of the scenario
+    reaching = scenario.from_tables({**tables, "controller": {"t_f": 8.0, "delta": 6.0}, "tune": {}})
+    assert reaching.search.bounds["delta"] == (0.05, 7.0)
+    trades.SlewTime(reaching, (6.5, 8.0)).check()

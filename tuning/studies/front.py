@@ -1,0 +1,138 @@
+"""A Pareto front as data: the window error against peak torque, stability margins or t_f.
+
+`pareto` finds a front. The terminal, the page and `summary.json` show it.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields
+from typing import Any, NamedTuple
+
+from ptsmc_jax.simulation.catalogues import CATALOGUES, MARGINS
+
+
+class Kind(NamedTuple):
+    """The traded quantity of a front, in files and texts."""
+
+    title: str
+    quantity: str
+    unit: str  # a unit, or the metric that has the unit
+    file: str  # name of the CSV file and the figure
+    column: str  # of the quantity in the CSV file
+
+    def label(self, plant: str) -> str:
+        """Return the quantity with its unit for this kind of plant."""
+        return f"{self.quantity} [{self.unit_for(plant)}]"
+
+    def unit_for(self, plant: str) -> str:
+        """Return the unit of the quantity for this kind of plant."""
+        return unit_of(self.unit, plant) if self.unit in CATALOGUES[plant] else self.unit
+
+
+KINDS = {
+    "torque": Kind("Accuracy against peak torque", "limit on the peak torque", "peak_torque", "front", "limit"),
+    "margins": Kind("Cost of stability margins", "limit on |S|", "dB", "robustness", "limit"),
+    "t_f": Kind("Cost of a faster slew", "t_f", "s", "slew_times", "t_f"),
+}
+
+
+def unit_of(name: str, plant: str) -> str:
+    """Return the unit of a metric, a margin or "mean_peak_torque" for this kind of plant."""
+    return {**MARGINS, **CATALOGUES[plant]}[name.removeprefix("mean_")].unit
+
+
+def titled(name: str, plant: str) -> str:
+    """Return the heading of a metric or margin over trials, with its unit for this kind of plant.
+
+    >>> titled("peak_torque", "chain"), titled("delay_margin", "chain"), titled("modulus_margin", "chain")
+    ('largest peak torque [u]', 'delay margin [s]', 'largest |S| [dB]')
+    """
+    words = name.replace("_", " ")
+    if name == "modulus_margin":
+        words = "largest |S|"
+    elif name == "window_error":
+        words = f"RMS {words}"
+    elif name not in MARGINS and not name.startswith("mean_"):
+        words = f"largest {words}"
+    return f"{words} [{unit_of(name, plant)}]"
+
+
+@dataclass(frozen=True)
+class Point:
+    """Gains of a front, judged on held-out trials. A number that does not exist is NaN, null in `summary.json`."""
+
+    value: float  # largest peak torque [N m], largest |S| [dB] (infinite: no limit) or t_f [s] that they are tuned for
+    gains: dict[str, float]
+    rms: float = math.nan  # window error
+    interval: tuple[float, float] | None = None  # of rms
+    costs: dict[str, float] = field(default_factory=dict)  # other metrics by name, see `trades`
+    failures: int = 0  # trials that failed or missed t_f
+    meets: bool = False  # every requirement
+    trained: float = math.nan  # objective over the training trials
+    dominated: bool = False  # by another point, beyond the interval of the ratio of their errors
+    knee: bool = False
+
+    @property
+    def peak(self) -> float:
+        """Return the peak torque that the required fraction of the trials stays below [N m]."""
+        return self.costs["peak_torque"]
+
+
+@dataclass(frozen=True)
+class Front:
+    """The points of a front in the order of the traded quantity, as `summary.json` has them."""
+
+    against: str  # the traded quantity, a key of `KINDS`
+    plant: str  # kind of the plant
+    points: list[Point]
+    idle: list[float]  # values whose gains are those of another value
+    without: list[float]  # values for which no gains keep the limits on the training trials
+    trials: int  # held-out trials
+    seed: int  # of these trials
+    interval_confidence: float
+    floor: float | None  # lower bound on the RMS window error
+    rollouts: int
+    gradients: int
+    requirements: list[str]
+    gain_units: dict[str, str]
+    cautions: list[str]
+    paper_is: str  # label of the published gains
+    paper_refused: str | None = None  # reason why the published gains cannot be simulated
+    others: dict[str, Point] = field(default_factory=dict)  # "paper": published gains; "before": the scenario's gains
+
+    @property
+    def kept(self) -> list[Point]:
+        """Return the points that no other point dominates."""
+        return [point for point in self.points if not point.dominated]
+
+    @property
+    def status(self) -> str:
+        """Return "met" if some gains of the front meet every requirement on the held-out trials, else "not met"."""
+        return "met" if any(point.meets for point in self.kept) else "not met"
+
+    def labelled(self) -> dict[str, Point]:
+        """Return the points of `others` by the labels that tables and figures show."""
+        return {self.paper_is if name == "paper" else name: point for name, point in self.others.items()}
+
+    def summary(self) -> dict[str, Any]:
+        """Return the content of `summary.json`."""
+        return {"status": self.status, **asdict(self)}
+
+
+def read(summary: Mapping[str, Any]) -> Front:
+    """Return the front of a `summary.json`. Raises KeyError if a field is missing."""
+    known = {one.name: summary[one.name] for one in fields(Front)}
+    points = [_point(one) for one in known["points"]]
+    others = {name: _point(one) for name, one in known["others"].items()}
+    listed = {name: [_number(value) for value in known[name]] for name in ("idle", "without")}
+    return Front(**{**known, **listed, "points": points, "others": others})
+
+
+def _point(stored: Mapping[str, Any]) -> Point:
+    known = {one.name: stored[one.name] for one in fields(Point)}
+    numbers = {name: _number(known[name]) for name in ("value", "rms", "trained")}
+    return Point(**{**known, **numbers, "costs": {name: _number(value) for name, value in known["costs"].items()}})
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else value

@@ -1,0 +1,388 @@
+"""The quantities that the window error is traded against: peak torque, stability margins and t_f.
+
+A trade states the tuning problem for each value of its quantity. `pareto` solves these problems.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, ClassVar
+
+import numpy as np
+
+from ptsmc_jax import scenario as scenarios
+from ptsmc_jax.campaigns import margin_verdicts
+from ptsmc_jax.campaigns.montecarlo import Trials
+from ptsmc_jax.scenario import free_gains, own, parsing, study, tables
+from ptsmc_jax.scenario.errors import ScenarioError, wrong
+from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.simulation.catalogues import MARGINS
+from tuning.search import gains
+from tuning.search.objective import T_F, Problem, replaced
+from tuning.search.optimise import Search
+from tuning.search.progress import Report, headed
+from tuning.search.rounds import MARGIN
+from tuning.studies import judging
+from tuning.studies.posing import Posed
+
+TORQUE, SENSITIVITY = "peak_torque", "modulus_margin"
+POINTS = 20  # default number of limits on the peak torque
+OFF = 1e9  # a limit on the peak torque that no gains reach
+HARDLY = 0.05  # fraction of the largest useful peak torque that hardly any gains keep
+TIGHTER = 3  # largest number of searches for the least peak torque
+FEWER = 4  # starting points of a search whose gains are refined later
+LIMITS = (3.0, 4.0, 5.0, 6.0, 8.0, 12.0)  # default limits on the largest sensitivity [dB]
+BOUNDED = ("gain_margin", "phase_margin", SENSITIVITY)  # margins that a limit on the sensitivity bounds
+SPAN = (0.5, 0.7, 1.0, 1.4, 2.0)  # default prescribed times, relative to the scenario's t_f
+# metrics that a faster slew may increase
+SLEW_COSTS = ("peak_torque", "peak_momentum", "peak_wheel_torque", "peak_wheel_momentum", "peak_rate", "effort")
+
+
+@dataclass(frozen=True)
+class Target:
+    """A value of the traded quantity, and the tuning problem for it."""
+
+    value: float
+    name: str  # in progress reports
+    problem: Problem
+
+
+@dataclass(frozen=True)
+class Trade(ABC):
+    """A scenario whose window error is traded against a quantity."""
+
+    scenario: Scenario
+
+    against: ClassVar[str]  # value of the option --against
+    purpose: ClassVar[str]  # end of error messages
+    merged: ClassVar[bool] = True  # values with the same gains share a point
+    compared: ClassVar[bool] = False  # mark dominated points and the knee, and judge the published gains too
+
+    def check(self) -> None:
+        """Raise ScenarioError if the study does not apply to the scenario."""
+        search = self.scenario.search
+        if search.minimise != "window_error":
+            raise wrong("tune.minimise", search.minimise, f'"window_error" {self.purpose}')
+        if search.worst_case:
+            raise wrong("tune.worst_case", True, f"false {self.purpose}")
+
+    @cached_property
+    def base(self) -> Scenario:
+        """Return the scenario of the tuning problem, which has the traded quantity among its requirements."""
+        return self.scenario
+
+    @property
+    def farther(self) -> dict[str, float]:
+        """Return the fields of `Reach` that the targets need beyond the bounds of the free gains."""
+        return {}
+
+    @abstractmethod
+    def targets(self, posed: Posed, tell: Report) -> tuple[list[Target], list[np.ndarray]]:
+        """Search from scratch. Raises KeyboardInterrupt on Ctrl-C.
+
+        Returns:
+            The targets, and the gains that these searches found, (gains,) each, as fractions of the bounds' intervals.
+        """
+
+    def tuned(self, value: float, found: dict[str, float]) -> Scenario:
+        """Return the scenario with the gains found for a value of the traded quantity."""
+        return gains.in_scenario(self.scenario, found)
+
+    @abstractmethod
+    def costs(self, tuned: Scenario, trials: Trials, seed: int) -> dict[str, float]:
+        """Return the costs of gains by name, from the held-out trials of this seed."""
+
+    @abstractmethod
+    def options(self) -> dict[str, Any]:
+        """Return the options of the command that asks for these values."""
+
+    def identity(self, seed: int) -> dict[str, Any]:
+        """Return the entries of `versions.json` that identify a finished or interrupted front."""
+        return {"command": "pareto", "seed": seed, **self.options(), **own.digests(self.scenario)}
+
+
+@dataclass(frozen=True)
+class Torque(Trade):
+    """Limits on the peak torque, from the least that any gains need to the most that improves the accuracy.
+
+    The limits are spaced evenly in their logarithms (epsilon-constraint method: Haimes, Lasdon and Wismer, IEEE Trans.
+    SMC 1(3), 1971).
+    """
+
+    points: int = POINTS
+
+    against = "torque"
+    purpose = "for a front of the window error"
+    compared = True
+
+    def check(self) -> None:
+        """Raise ScenarioError if the study does not apply to the scenario."""
+        super().check()
+        weight = self.scenario.search.torque_weight
+        if weight:
+            raise wrong("tune.torque_weight", weight, f"absent {self.purpose} against the torque")
+
+    @cached_property
+    def base(self) -> Scenario:
+        """Return the scenario with a requirement on the peak torque."""
+        limited = tables.limit_of(self.scenario, TORQUE) is not None
+        return self.scenario if limited else _requiring(self.scenario, {TORQUE: OFF})
+
+    def targets(self, posed: Posed, tell: Report) -> tuple[list[Target], list[np.ndarray]]:
+        """Search without a limit, for the least torque, and for a limit between these."""
+        at = posed.problem.metrics.index(TORQUE)
+
+        def under(limit: float, joined: Problem = posed.problem) -> Problem:
+            return replace(joined, limits=replaced(posed.problem.limits, at, limit))
+
+        loose = [replace(one, limit=OFF) if one.metric == TORQUE else one for one in posed.asked]
+        free = _found(posed, under(OFF), headed(tell, "most torque"), asked=loose)
+        highest = free.ended[at] * OFF
+
+        def search(limit: float) -> tuple[Search, float]:
+            report = headed(tell, "least torque")
+            found = _found(posed, under(limit, free.problem), report, FEWER, asked=())
+            return found, found.ended[at] * limit
+
+        least, lowest = least_torque(search, highest)
+        own_limit = tables.limit_of(self.scenario, TORQUE)
+        limits, middle = limits_between(lowest / (1.0 - MARGIN), highest / (1.0 - MARGIN), self.points, own_limit)
+        targets = [Target(float(one), f"peak torque {one:.3g}", under(one, free.problem)) for one in limits]
+        # the best local minimum between the ends may differ from those at the ends
+        between = _found(posed, targets[middle].problem, headed(tell, targets[middle].name), asked=())
+        return targets, [share for found in (free, least, between) for share in (found.share, *found.ends)]
+
+    def costs(self, tuned: Scenario, trials: Trials, seed: int) -> dict[str, float]:
+        """Return the largest and the mean peak torque [N m]."""
+        peaks = np.asarray(trials.metrics.peak_torque)[trials.finished]
+        mean = float(np.mean(peaks)) if peaks.size else np.nan
+        return {TORQUE: judging.largest(TORQUE, tuned, trials), "mean_peak_torque": mean}
+
+    def options(self) -> dict[str, Any]:
+        """Return the option --points."""
+        return {"points": self.points}
+
+
+@dataclass(frozen=True)
+class Margins(Trade):
+    """Limits on the largest sensitivity max |S| = M, which bounds the other margins.
+
+    The gain may grow by M / (M - 1) or shrink by M / (M + 1), and the phase may change by 2 asin(1 / (2 M)) (Skogestad
+    and Postlethwaite, Multivariable Feedback Control, 2005, 2.4.3). A limit of 6 dB keeps 6 dB upwards, 3.5 dB
+    downwards and 29 deg.
+    """
+
+    limits: tuple[float, ...] = ()  # [dB]; empty: `LIMITS`, and the scenario's limit
+
+    against = "margins"
+    purpose = "to ask what margins cost"
+
+    def check(self) -> None:
+        """Raise ScenarioError if the study does not apply to the scenario."""
+        if not self.scenario.sampled:
+            raise wrong("loop.mode", self.scenario.loop.mode, f'"sampled" {self.purpose}')
+        super().check()
+
+    @cached_property
+    def values(self) -> list[float]:
+        """Return the limits, loosest first [dB]; infinite: no limit."""
+        own_limit = tables.limit_of(self.scenario, SENSITIVITY)
+        usual = {*LIMITS, *([] if own_limit is None else [own_limit])}
+        return [np.inf, *sorted(self.limits or usual, reverse=True)]
+
+    @cached_property
+    def base(self) -> Scenario:
+        """Return the scenario with the tightest limit instead of the margins that it bounds."""
+        return _requiring(self.scenario, {SENSITIVITY: self.values[-1]}, without=BOUNDED)
+
+    def targets(self, posed: Posed, tell: Report) -> tuple[list[Target], list[np.ndarray]]:
+        """Search for each limit."""
+        asked = posed.problem.margins
+        assert asked is not None
+        at, targets, known = asked.metrics.index(SENSITIVITY), [], []
+        for value in self.values:
+            name = f"|S| at most {value:g} dB" if value < np.inf else "no limit on |S|"
+            limited = replace(posed.problem, margins=replace(asked, wanted=replaced(asked.wanted, at, value)))
+            found = _found(posed, limited, headed(tell, name), FEWER if targets else None)
+            targets.append(Target(value, name, found.problem))
+            known.append(found.share)
+        return targets, known
+
+    def costs(self, tuned: Scenario, trials: Trials, seed: int) -> dict[str, float]:
+        """Return the largest peak torque [N m], and the worst margins of the held-out trials' loops."""
+        asked = scenarios.replace(tuned, requirements=dict.fromkeys(MARGINS, 1.0))
+        verdicts = margin_verdicts.over_trials(study(judging.as_flown(asked)), seed)
+        return {TORQUE: judging.largest(TORQUE, tuned, trials)} | {one.metric: one.worst for one in verdicts}
+
+    def options(self) -> dict[str, Any]:
+        """Return the options --against and --limits."""
+        return {"against": self.against, "limits": _listed(self.values[1:])}
+
+
+@dataclass(frozen=True)
+class SlewTime(Trade):
+    """Prescribed times t_f. One compiled program simulates all of them."""
+
+    times: tuple[float, ...] = ()  # [s]; empty: from half to twice the scenario's t_f
+
+    against = "t_f"
+    purpose = "to ask what a faster slew costs"
+    merged = False
+
+    def check(self) -> None:
+        """Raise ScenarioError if the study does not apply to the scenario, or a time cannot be simulated."""
+        scenario = self.scenario
+        if not scenario.controller.prescribed:
+            raise wrong("controller.kind", scenario.controller.kind, f"prescribed_time {self.purpose}")
+        super().check()
+        if T_F in scenario.search.gains:
+            raise wrong("tune.free", list(scenario.search.gains), f"without t_f {self.purpose}")
+        if free_gains.observer_follows(scenario):
+            raise ScenarioError(
+                f"observer.t_o is absent and would follow t_f; allowed is one that is given {self.purpose}"
+            )
+        for key in scenario.requirements:
+            if key in MARGINS:
+                raise ScenarioError(
+                    f"requirements.{key} is asked of one loop, not of several times; allowed is none {self.purpose}"
+                )
+        for t_f in self.values:
+            self._at(t_f)
+
+    @cached_property
+    def values(self) -> list[float]:
+        """Return the prescribed times in ascending order [s]."""
+        usual = (float(f"{part * self.scenario.controller.t_f:.3g}") for part in SPAN)
+        return sorted(self.times or usual)
+
+    @cached_property
+    def base(self) -> Scenario:
+        """Return the scenario with the shortest time."""
+        return self._at(self.values[0])
+
+    @property
+    def farther(self) -> dict[str, float]:
+        """Return the longest time."""
+        return {"t_f": self.values[-1]}
+
+    def _at(self, t_f: float) -> Scenario:
+        """Return the scenario with this prescribed time [s], and default bounds of delta that follow it."""
+        tune = self.scenario.search
+        bounds = {name: both for name, both in tune.bounds.items() if name != "delta"}
+        if tune.bounds.get("delta") not in (None, free_gains.by_default(self.scenario, "delta")):
+            bounds["delta"] = tune.bounds["delta"]
+        timed = gains.in_scenario(scenarios.replace(self.scenario, tune=None), {"t_f": t_f})
+        return scenarios.replace(timed, tune={**parsing.plain(tune), "bounds": bounds})
+
+    def targets(self, posed: Posed, tell: Report) -> tuple[list[Target], list[np.ndarray]]:
+        """Search for the longest time, the shortest, and the others. Trials that join these two join all."""
+        joined, last, known = posed.problem, len(self.values) - 1, []
+        parts = [gains.with_gains(joined.parts, {"t_f": t_f}) for t_f in self.values]
+        for k in (last, 0, *range(last - 1, 0, -1)):
+            name = {last: "longest time", 0: "shortest time"}.get(k, f"{self.values[k]:g} s")
+            starts, asked = None if k == last else FEWER, None if k in (0, last) else ()
+            found = _found(posed, replace(joined, parts=parts[k]), headed(tell, name), starts, asked)
+            known.append(found.share)
+            joined = found.problem if k in (0, last) else joined
+        problems = [replace(joined, parts=one) for one in parts]
+        targets = [Target(t_f, f"{t_f:g} s", one) for t_f, one in zip(self.values, problems, strict=True)]
+        return targets, known
+
+    def tuned(self, value: float, found: dict[str, float]) -> Scenario:
+        """Return the scenario with this prescribed time [s] and these gains."""
+        return gains.in_scenario(self._at(value), found)
+
+    def costs(self, tuned: Scenario, trials: Trials, seed: int) -> dict[str, float]:
+        """Return the metrics of `SLEW_COSTS` that the scenario's runs have."""
+        needed = {name: tuned.metrics[name].table for name in SLEW_COSTS if name in tuned.metrics}
+        has = [name for name, table in needed.items() if table is None or getattr(tuned, table, None) is not None]
+        return {name: judging.largest(name, tuned, trials) for name in has}
+
+    def options(self) -> dict[str, Any]:
+        """Return the options --against and --times."""
+        return {"against": self.against, "times": _listed(self.values)}
+
+
+def of(against: str, scenario: Scenario, points: int | None, listed: tuple[float, ...]) -> Trade:
+    """Return the trade that the options of `ptsmc pareto` ask for.
+
+    Args:
+        against: "torque", "margins" or "t_f".
+        scenario: with free gains.
+        points: number of limits on the torque; None: `POINTS`.
+        listed: prescribed times [s], or limits on the largest sensitivity [dB]; empty: the defaults.
+
+    Raises:
+        ScenarioError: the study does not apply to the scenario, or a time cannot be simulated.
+    """
+    each: tuple[Trade, ...] = (
+        Torque(scenario, points or POINTS),
+        Margins(scenario, listed),
+        SlewTime(scenario, listed),
+    )
+    trade = next(one for one in each if one.against == against)
+    trade.check()
+    return trade
+
+
+def limits_between(lowest: float, highest: float, points: int, own: float | None) -> tuple[np.ndarray, int]:
+    """Return limits on the peak torque that are evenly spaced in their logarithms.
+
+    Args:
+        lowest: first limit [N m].
+        highest: last limit [N m].
+        points: number of limits.
+        own: the scenario's limit [N m]. It replaces the nearest limit if it is between the ends.
+
+    Returns:
+        The limits (points,) [N m], and the index of the scenario's limit, or of the middle one.
+    """
+    limits, middle = np.geomspace(lowest, highest, points), points // 2
+    if own is not None and lowest < own < highest:
+        middle = 1 + int(np.argmin(np.abs(np.log(limits[1:-1] / own))))
+        limits[middle] = own
+    return limits, middle
+
+
+def least_torque(
+    search: Callable[[float], tuple[Any, float]], highest: float, tighter: int = TIGHTER
+) -> tuple[Any, float]:
+    """Search for the gains with the least peak torque.
+
+    Gains that keep a limit are the most accurate ones, not those with the least torque. The limit is therefore lowered
+    until no gains keep it.
+
+    Args:
+        search: returns the outcome for a limit [N m], and its peak torque [N m].
+        highest: the largest peak torque that improves the accuracy [N m].
+        tighter: largest number of limits.
+
+    Returns:
+        The last outcome, and its peak torque [N m].
+    """
+    limit = HARDLY * highest
+    found, peak = search(limit)
+    return (found, peak) if peak > limit or tighter == 1 else least_torque(search, limit, tighter - 1)
+
+
+def _found(
+    posed: Posed, problem: Problem, report: Report, starts: int | None = None, asked: Sequence[Any] | None = None
+) -> Search:
+    """Search from the scenario's gains, and raise KeyboardInterrupt if the search was interrupted."""
+    starts = posed.ready.scenario.search.starts if starts is None else starts
+    found = posed.search(problem, posed.own, starts, asked, judged=False, report=report)
+    if found.interrupted:
+        raise KeyboardInterrupt
+    return found
+
+
+def _requiring(scenario: Scenario, limits: dict[str, float], without: Sequence[str] = ()) -> Scenario:
+    """Return the scenario with further requirements, and without some of its own."""
+    stated = parsing.dump(scenario).get("requirements", {})
+    kept = {name: one for name, one in stated.items() if name not in without}
+    return scenarios.replace(scenario, requirements={**kept, **limits})
+
+
+def _listed(values: Sequence[float]) -> str:
+    return ",".join(str(float(value)).removesuffix(".0") for value in values)
