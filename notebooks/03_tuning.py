@@ -26,7 +26,7 @@ from ptsmc_jax.explore import Figures
 from ptsmc_jax.figures import study_plots
 from tuning.output import terminal
 from tuning.search import gains
-from tuning.studies import pareto, stability, tune_files, tuner
+from tuning.studies import pareto, stability, trades, tune_files, tuner
 
 flight = ptsmc.read("../scenarios/first_flight.toml")
 small = ptsmc.replace(flight, tune={"trials": 16, "starts": 3, "steps": 30})  # less than the default, for a quick look
@@ -70,8 +70,8 @@ Figures({"tradeoff": made["tradeoff"]})
 # better in both. The knee is where the front bends most; `ptsmc pareto` draws it with twenty points.
 
 # %%
-front = pareto.trace(small, 0, 4)
-Figures({"front": study_plots.front(front.points, front.others, 0.5, ("-", "N m"))})
+front = pareto.trace(trades.Torque(small, points=4), 0)
+Figures({"front": study_plots.front(front.points, front.labelled(), 0.5, ("-", "N m"))})
 
 # %% [markdown]
 # Click a point: its gains, its margins in hold and before the hand-over, and one flight with it. What stands below is the knee; the

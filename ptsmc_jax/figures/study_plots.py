@@ -216,7 +216,7 @@ def front(
     """Window error against peak torque of the points of a front, with their intervals.
 
     Args:
-        points: those of a `pareto.Front`, with rms, interval, peak, dominated and knee.
+        points: those of a `front.Front`, with rms, interval, peak, dominated and knee.
         others: by label, such points that are no part of it.
         limit: of the torque, if one is asked for.
         units: of error and torque.

@@ -52,7 +52,7 @@ def test_more_margin_costs_accuracy(command, tmp_path, monkeypatch):
             worst = max if name == "modulus_margin" else min
             limited = [place[name] for place in by_place.values() if place[name] is not None]
             np.testing.assert_allclose(row[name], worst(limited), rtol=1e-9, err_msg=name)
-        # the limit stands for the phase margin asked for in the search, and not in the verdict
+        # the limit replaces the required phase margin in the search, not in the verdict
         assert row["modulus_margin"] <= row["limit"]
         assert row["meets"] == (row["phase_margin"] >= 45.0 and row["peak_torque"] <= 3.0 and row["failures"] == 0)
         sensitivity = 10.0 ** (row["modulus_margin"] / 20.0)
@@ -158,7 +158,7 @@ def test_a_faster_slew_costs_torque_and_accuracy(command, tmp_path, monkeypatch)
 
 
 def test_each_time_is_searched_for_itself(monkeypatch):
-    """Not from the gains of others alone, which may lie in another valley; hard trials of the first two join all."""
+    """The gains of other times may lead to another local minimum. Hard trials of the first two times join all."""
     small_search(monkeypatch, 8)
     searched, flown, joined, search = [], [], [], posing.Posed.search
 
@@ -215,7 +215,7 @@ def test_times_that_are_refused_in_one_sentence(command, tmp_path, options, said
         ),
         ({"tune": {"worst_case": True}}, "tune.worst_case is true, but must be false"),
         ({"requirements": {"gain_margin": 6.0}, "tune": {}}, "requirements.gain_margin is asked of one loop"),
-        (  # every time was flown with a third of the scenario's own t_f, which another t_f would not have had
+        (  # t_o would stay a third of the scenario's t_f at every time
             {"observer": {"kind": "prescribed_time"}, "tune": {}},
             "observer.t_o is absent and would follow t_f; allowed is one that is given",
         ),
@@ -237,7 +237,7 @@ def test_usual_times_go_from_half_to_twice_the_scenarios():
 
 
 def test_a_study_is_known_by_all_digits_of_its_times():
-    """Of six digits, others' results were shown as already done."""
+    """With six digits, the results of other times were shown as already done."""
     known = scenario.from_tables({})
     listed = [
         trades.SlewTime(known, times).identity(0)["times"] for times in ((100.0001, 20), (20.0, 100.0002), (20, 30))

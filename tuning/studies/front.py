@@ -85,8 +85,8 @@ class Front:
     against: str  # the traded quantity, a key of `KINDS`
     plant: str  # kind of the plant
     points: list[Point]
-    idle: list[float]  # values whose gains are those of another value
-    without: list[float]  # values for which no gains keep the limits on the training trials
+    idle: list[float]  # values that have the same gains as another value
+    without: list[float]  # values for which the search found no gains
     trials: int  # held-out trials
     seed: int  # of these trials
     interval_confidence: float

@@ -43,7 +43,7 @@ def trace(trade: Trade, seed: int, tell: Report = lambda *_: None, journal: Jour
         trade: the scenario, and the quantity that its window error is traded against.
         seed: of the search. The seed of the held-out trials follows from it.
         tell: called with the progress after every step.
-        journal: of evaluations, from which an interrupted search resumes.
+        journal: evaluations of an interrupted search, which then resumes.
     """
     posed = posing.pose(trade.base, seed, journal, **trade.farther)
     targets, known = trade.targets(posed, tell)
@@ -137,7 +137,7 @@ def marked(judged: Sequence[Judged]) -> list[Point]:
     """Return the points in order of peak torque, with dominated points and the knee marked."""
     pairs = sorted(judged, key=lambda pair: pair[0].peak)
     points = [replace(pair[0], dominated=any(_dominates(other, pair) for other in pairs)) for pair in pairs]
-    # the knee needs logarithms, and gains with which a trial ends
+    # logarithms need positive numbers, which exist if a trial ends
     front = [k for k, p in enumerate(points) if not p.dominated and p.peak > 0.0 and p.rms > 0.0]
     if len(front) > 2:
         knee = front[knee_of(np.asarray([[points[k].peak, points[k].rms] for k in front]))]

@@ -168,9 +168,8 @@ class Torque(Trade):
 class Margins(Trade):
     """Limits on the largest sensitivity max |S| = M, which bounds the other margins.
 
-    The gain may grow by M / (M - 1) or shrink by M / (M + 1), and the phase may change by 2 asin(1 / (2 M)) (Skogestad
-    and Postlethwaite, Multivariable Feedback Control, 2005, 2.4.3). A limit of 6 dB keeps 6 dB upwards, 3.5 dB
-    downwards and 29 deg.
+    The loop tolerates a gain between the factors M / (M + 1) and M / (M - 1), and a phase error of 2 asin(1 / (2 M)).
+    Source: Skogestad and Postlethwaite, Multivariable Feedback Control, 2005, 2.4.3.
     """
 
     limits: tuple[float, ...] = ()  # [dB]; empty: `LIMITS`, and the scenario's limit
@@ -348,10 +347,9 @@ def limits_between(lowest: float, highest: float, points: int, own: float | None
 def least_torque(
     search: Callable[[float], tuple[Any, float]], highest: float, tighter: int = TIGHTER
 ) -> tuple[Any, float]:
-    """Search for the gains with the least peak torque.
+    """Search for the gains that need the least peak torque.
 
-    Gains that keep a limit are the most accurate ones, not those with the least torque. The limit is therefore lowered
-    until no gains keep it.
+    A search returns the most accurate gains that keep a limit. The limit is therefore lowered until no gains keep it.
 
     Args:
         search: returns the outcome for a limit [N m], and its peak torque [N m].
