@@ -33,7 +33,7 @@ test-long: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m long
 
 table: $(VENV)/.installed
-	$(BIN)/python -m tuning.studies.table
+	$(BIN)/python benchmarks/observer_table.py
 
 notebooks: $(VENV)/.installed-notebooks
 	$(BIN)/jupyter lab notebooks

@@ -103,14 +103,14 @@ HOUSE = {
             global_check
         """,
         "studies": """
-            campaign_folder front judging mapping reproduction single stability table
+            campaign_folder front judging mapping reproduction single stability
             campaign_figures campaign_theory posing
             campaign_summary tuner
             compare reasons trades tune_files
             pareto
         """,
         "output": """
-            cells made_again page_captions page_charts progress_lines
+            cells page_captions page_charts progress_lines
             margin_sentences page_parts pointing_sentences
             search_sentences sentences
             campaign_sentences front_sentences law_sentences

@@ -76,7 +76,7 @@ def test_a_campaign_leaves_rows_summary_and_figures(command, tmp_path, monkeypat
     assert all(mark in (folder / "figures" / name).read_bytes()[:1024] for name in figures)
     read = checked(folder)
     assert "Every requirement is met 250 trials of seed 3: 250 ok" in read.text
-    assert "ptsmc montecarlo scenario.toml --trials 250 --seed 3" in read.text
+    assert "ptsmc montecarlo s.toml --trials 250 --seed 3" in read.text
     found, rows = summary(folder), rows_of(folder)
     assert (found["status"], found["flown"], found["counts"]["ok"]) == ("met", 250, 250)
     errors = rows["window_error"].to_numpy()

@@ -618,7 +618,7 @@ def test_map_leaves_what_the_contract_says(command, tmp_path):
     assert status == 0
     assert "4 of 4 pairs flown" in out
     assert set(tree(tmp_path / "out" / "map-c")) == {"map.csv", "scenario.toml", "versions.json", "figures/map.png"}
-    again = "ptsmc map scenario.toml --x controller.eta=2.7:2.9:2 --y controller.k1=0.8:1.6:2 --trials 2 --seed 0"
+    again = "ptsmc map c.toml --x controller.eta=2.7:2.9:2 --y controller.k1=0.8:1.6:2 --trials 2"
     read = checked(tmp_path / "out" / "map-c")
     assert again in read.text
     assert "linear_torque [u]" in read.text

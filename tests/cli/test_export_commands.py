@@ -10,7 +10,6 @@ import pytest
 from ptsmc_jax.onboard import folder
 from tests.helpers import SHORT, SHORT_CHAIN, tree
 from tests.onboard.compiled import needs_compiler
-from tuning.output import made_again
 
 CONTINUOUS = SHORT.replace('"sampled"', '"continuous"').split("[hardware]")[0]
 
@@ -61,7 +60,6 @@ def test_what_the_controller_has_otherwise_is_said(command, tmp_path, exported):
     assert (status, err) == (0, f"ptsmc: {said}\n")
     (place,) = (tmp_path / "out").iterdir()
     assert json.loads((place / "summary.json").read_text())["cautions"] == [said]
-    assert again(place) == f"ptsmc simulate scenario.toml --controller {exported} --seed 0"
 
 
 @needs_compiler
@@ -91,7 +89,6 @@ def test_a_campaign_flies_the_controller_and_keeps_it(command, tmp_path):
     assert kept == {"controller.json", ".c", ".h", "_flat.h", "_parameters.c"}
     told = json.loads((tmp_path / "r" / "summary.json").read_text())
     assert "law_eta = 3 instead of 2.9" in told["cautions"][0]
-    assert again(tmp_path / "r") == "ptsmc montecarlo scenario.toml --trials 40 --controller controller --seed 1000"
     samples = told["controller_samples"]
     assert samples["ok"] == {"samples": 40 * 65, "trials": 40}
     assert samples["singular"] == {"samples": 0, "trials": 0}
@@ -111,18 +108,12 @@ def test_a_campaign_flies_the_controller_and_keeps_it(command, tmp_path):
     replayed = tmp_path / "r" / "replay" / "7"
     assert json.loads((replayed / "summary.json").read_text())["cautions"] == told["cautions"][:1]
     kept = tmp_path / "r" / "controller"
-    assert again(replayed) == f"ptsmc simulate scenario.toml --trial 7 --controller {kept} --seed 1000"
     before = tree(kept)
     with (kept / "ptsmc_of_c.c").open("a") as file:
         file.write("/* changed */\n")
     assert "was made with another --controller" in refused(command, tmp_path, *replay, "--trust")
     assert command(*flight, "--controller", "c", "--out", "r")[:2] == (0, "")  # which has it again
     assert tree(kept) == before
-
-
-def again(place):
-    """The call that a page of these results says to make them again."""
-    return made_again.call(json.loads((place / "versions.json").read_text()), {"loop": {}})
 
 
 def refused(command, tmp_path, *args):

@@ -15,7 +15,7 @@ from ptsmc_jax.campaigns import store
 from ptsmc_jax.simulation import catalogues
 from tests.helpers import SHORT_CHAIN, short, tree
 from tests.output.pages import Page, checked
-from tuning.output import made_again, page, page_charts, search_sentences
+from tuning.output import page, page_charts, search_sentences
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 HOSTILE = "<img src=x onerror=document.title=1>\"'&</script><script>alert(1)</script>"
@@ -63,7 +63,7 @@ def test_a_run_becomes_a_page(command, flown):
         assert f"{summary[name]:.5g}" in read.text
     assert summary["settling_time"] is None
     assert "settling_time never s" in read.text
-    assert "ptsmc simulate scenario.toml --trial 3 --seed 5" in read.text
+    assert "ptsmc simulate s.toml --trial 3 --seed 5" in read.text
     assert (flown / "scenario.toml").read_text().split("\n")[0] in read.text
     rows = np.genfromtxt(flown / "trajectory.csv", delimiter=",", names=True)
     history = {line["name"]: line for line in read.charts["history"]["data"]}
@@ -315,21 +315,6 @@ def test_other_plants_have_pages_too(command, tmp_path):
     summary = json.loads((folder / "summary.json").read_text())
     assert set(catalogues.STATE_CATALOGUE) <= set(summary)
     assert not {"peak_momentum", "terminal_angle"} & set(summary)
-
-
-def test_a_comparison_is_made_again_with_its_laws():
-    mine = {"laws": ["prescribed_time", "pd", "Growing"], "own_laws": {"/at/mine.py:Growing": "1f"}, "seed": 2}
-    for laws, said in ((mine, "--seed 2 --against pd --law /at/mine.py:Growing"), ({"seed": 2}, "--seed 2")):
-        assert made_again.call({"command": "compare", **laws}, {"loop": {}}) == f"ptsmc compare scenario.toml {said}"
-    own = {"controller": {"kind": "own", "code": "/at/mine.py:Growing"}}
-    assert made_again.call({"command": "margins"}, own) == "ptsmc margins scenario.toml --trust"
-    bits = {"command": "montecarlo", "precision": 32}
-    assert made_again.call(bits, {"loop": {}}) == "ptsmc montecarlo scenario.toml --precision 32"
-    assert made_again.call({"command": "reproduce", "seed": None}, {}) == "ptsmc reproduce"
-    trial = {"command": "simulate", "seed": 1000, "trial": 7, "campaign": "of mine", "metrics": None}
-    assert made_again.call(trial, {"loop": {}}) == "ptsmc replay 'of mine' --trial 7"
-    for key in ("metrics", "controller"):
-        assert made_again.call({**trial, key: "x"}, {"loop": {}}) == "ptsmc replay 'of mine' --trial 7 --trust"
 
 
 @pytest.mark.parametrize(("values", "kind"), [([2.7, 3.05], None), ([1e-6, 4e-4], "log"), ([0.0, 5.0], None)])

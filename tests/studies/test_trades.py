@@ -64,7 +64,7 @@ def test_more_margin_costs_accuracy(command, tmp_path, monkeypatch):
     assert "no separate point for limit on |S|: 60 dB" in out
     page = checked(tmp_path / "cost")
     assert "Cost of stability margins" in page.text
-    assert "--against margins --limits 60,6,4" in page.text
+    assert "--against margins --limits 4,60,6" in page.text
     assert (tmp_path / "cost" / "figures" / "robustness.png").exists()
     again = command("pareto", "c.toml", "--against", "margins", "--limits", "6,4,60", "--out", "cost")
     assert again == (status, out.replace("front done", "front already done"), "")

@@ -26,7 +26,6 @@ from tuning.output import (
     cells,
     front_sentences,
     law_sentences,
-    made_again,
     margin_sentences,
     page_captions,
     page_charts,
@@ -353,7 +352,7 @@ def _origin(result: Result) -> Iterator[Section]:
     if path.exists():
         note = page_captions.SCENARIO.get(versions["command"], "")
         yield Section("Scenario", [Block("code", text=path.read_text(encoding="utf-8"), note=note)])
-    note = "Where the scenario above is the file scenario.toml." if path.exists() else ""
-    yield Section("How to make this again", [Block("code", text=made_again.call(versions, result.scenario), note=note)])
+    call = versions.get(store.COMMAND_LINE, "")
+    yield Section("How to make this again", [Block("code", text=call, note="In the folder where it was called.")])
     rows = [(name, json.dumps(value) if not isinstance(value, str) else value) for name, value in versions.items()]
     yield Section("Made by", [_table(cells.Table(("", "version"), rows))])

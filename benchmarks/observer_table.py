@@ -1,4 +1,4 @@
-"""What sampling, noise and an attitude filter do to fixed gains: `python -m tuning.studies.table`."""
+"""What sampling, noise and an attitude filter do to fixed gains: `make table`."""
 
 import numpy as np
 from rich.console import Console
