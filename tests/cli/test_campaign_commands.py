@@ -559,8 +559,8 @@ def test_single_precision_is_another_campaign_whose_rows_are_nearly_the_same(com
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--device", "tpu"], "--device is tpu, but must be cpu or gpu"),
-        (["--precision", "16"], "--precision is 16, but must be 64 or 32"),
+        (["--device", "tpu"], 'Invalid value "tpu" for --device. Choose from: "cpu", "gpu".'),
+        (["--precision", "16"], 'Invalid value "16" for --precision. Choose from: "64", "32".'),
         (["--precision", "32", "--cluster", "local:2"], "--cluster flies on its workers' processors with 64 bits"),
     ],
 )

@@ -655,7 +655,7 @@ done
         assert "convert-attitude" in command("completion", shell)[1]
     assert command("completion", "tcsh")[::2] == (
         2,
-        "ptsmc: the shell is tcsh, but must be bash, zsh, fish or powershell\n",
+        'ptsmc: Invalid value "tcsh" for SHELL. Choose from: "bash", "zsh", "fish", "powershell".\n',
     )
 
 

@@ -74,7 +74,7 @@ def test_more_margin_costs_accuracy(command, tmp_path, monkeypatch):
     ("options", "said"),
     [
         (("--limits", "4,6"), "--limits is 4,6, but must be absent without --against margins"),
-        (("--against", "margins", "--points", "4"), "--points is 4, but must be absent with --against margins"),
+        (("--against", "margins", "--points", "4"), "--points is 4, but must be absent without --against torque"),
         (("--against", "margins", "--times", "4,8"), "--times is 4,8, but must be absent without --against t_f"),
         *(
             (("--against", "margins", "--limits", limits), f"--limits is {limits}, but must be limits in dB")
@@ -180,9 +180,9 @@ def test_each_time_is_searched_for_itself(monkeypatch):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (("--against", "speed"), "--against is speed, but must be torque, margins or t_f"),
+        (("--against", "speed"), 'Invalid value "speed" for --against. Choose from: "torque", "margins", "t_f".'),
         (("--times", "4,8"), "--times is 4,8, but must be absent without --against t_f"),
-        (("--against", "t_f", "--points", "4"), "--points is 4, but must be absent with --against t_f"),
+        (("--against", "t_f", "--points", "4"), "--points is 4, but must be absent without --against torque"),
         *(
             (("--against", "t_f", "--times", times), f"--times is {times}, but must be two times or more in s")
             for times in ("4", "4,x", "4,4", "0,3", "3,inf", "")

@@ -4,7 +4,7 @@ import contextlib
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
@@ -77,7 +77,8 @@ def montecarlo(
     tls_key: Annotated[Path | None, Parameter(help="TLS: this client's private key.")] = None,
     device: Device = "cpu",
     precision: Annotated[
-        str, Parameter(help="Bits of every number, 64 or 32; what 32 put out of reach stands in docs/python.md.")
+        Literal["64", "32"],
+        Parameter(help="Bits of every number; docs/python.md lists the limits of 32 bits."),
     ] = "64",
     dry_run: Annotated[
         bool, Parameter(negative="", help="Write what each trial would fly with into DIR/plan, and fly nothing.")
@@ -115,7 +116,6 @@ def montecarlo(
             "--force starts the whole campaign again, which would delete other shards' rows, and does not go with "
             "--shard; remove the folder before the first shard starts, or choose another with --out",
         ),
-        (precision not in ("64", "32"), f"--precision is {precision}, but must be 64 or 32"),
         (
             clustered and (precision, device) != ("64", "cpu"),
             "--cluster flies on its workers' processors with 64 bits, and goes with no other",

@@ -8,7 +8,7 @@ import signal
 import sys
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from cyclopts import App, CycloptsError, Parameter
 from cyclopts.exceptions import UnusedCliTokensError
@@ -322,13 +322,14 @@ def compare(
 
 
 @app.command
-def completion(shell: Annotated[str, Parameter(name="SHELL", help="bash, zsh, fish or powershell.")], /) -> int:
+def completion(
+    shell: Annotated[Literal["bash", "zsh", "fish", "powershell"], Parameter(name="SHELL", help="Name of the shell.")],
+    /,
+) -> int:
     """Print the script that completes commands and options in a shell: source <(ptsmc completion bash).
 
     Exit status: 0 done, 2 bad input.
     """
-    if shell not in ("bash", "zsh", "fish", "powershell"):
-        raise UsageError(f"the shell is {shell}, but must be bash, zsh, fish or powershell")
     terminal.say(app.generate_completion(shell=shell))
     return 0
 

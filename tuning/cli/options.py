@@ -74,7 +74,7 @@ Against = Annotated[
 Laws = Annotated[
     tuple[str, ...], Parameter(negative="", help="FILE.py:NAME of a law of your own beside them, several times.")
 ]
-Device = Annotated[str, Parameter(help="What batches are flown on: cpu or gpu.")]
+Device = Annotated[Literal["cpu", "gpu"], Parameter(help="Hardware that batches run on.")]
 Trust = Annotated[
     bool,
     Parameter(
@@ -83,7 +83,9 @@ Trust = Annotated[
     ),
 ]
 
-FrontAgainst = Annotated[str, Parameter(help="What the accuracy is set against: torque, margins or t_f.")]
+FrontAgainst = Annotated[
+    Literal["torque", "margins", "t_f"], Parameter(help="Quantity that the accuracy is traded against.")
+]
 Points = Annotated[
     int | None, whole_number("--points", "Limits on the torque to tune for, from 3 to 100; none: 20.", 3, 100)
 ]
@@ -128,20 +130,18 @@ def answered(work: Callable[[], Any], answer: Callable[[], int]) -> Any:
         return answer()
 
 
-LISTED = {"t_f": "--times", "margins": "--limits"}  # what says where a front's points lie, by what it is against
+VALUES = {"torque": "--points", "t_f": "--times", "margins": "--limits"}  # option for the values of each quantity
 
 
 def listed_against(against: str, points: int | None, times: str | None, limits: str | None) -> tuple[float, ...]:
-    """The times of --times [s], or the limits of --limits [dB]; none without. Raises UsageError where none fit."""
-    if against not in ("torque", *LISTED):
-        raise UsageError(f"--against is {against}, but must be torque, margins or t_f")
-    if against in LISTED and points is not None:
-        raise UsageError(
-            f"--points is {points}, but must be absent with --against {against}, which takes {LISTED[against]}"
-        )
-    for kind, text in (("t_f", times), ("margins", limits)):
-        if text is not None and against != kind:
-            raise UsageError(f"{LISTED[kind]} is {text}, but must be absent without --against {kind}")
+    """Return the times of --times [s] or the limits of --limits [dB], empty without them.
+
+    Raises:
+        UsageError: an option does not belong to this quantity, or its values are not allowed.
+    """
+    for (kind, option), value in zip(VALUES.items(), (points, times, limits), strict=True):
+        if value is not None and against != kind:
+            raise UsageError(f"{option} is {value}, but must be absent without --against {kind}")
     if times is not None:
         return _numbers("--times", times, 2, "two times or more in s, all different, such as 20,30,45")
     if limits is not None:
@@ -164,7 +164,7 @@ def prepare(
     scenario: Path | None,
     command: str,
     out: Path | None,
-    device: str = "cpu",
+    device: Literal["cpu", "gpu"] = "cpu",
     bits: Literal[32, 64] = 64,
     *,
     trust: bool,
@@ -183,8 +183,6 @@ def prepare(
 
     Raises ScenarioError, RefusedError or UsageError where one of these cannot be followed.
     """
-    if device != "cpu" and device != "gpu":
-        raise UsageError(f"--device is {device}, but must be cpu or gpu")
     from ptsmc_jax.scenario import reading
 
     loaded = reading.from_tables({}) if scenario is None else reading.read(scenario)
