@@ -15,28 +15,6 @@ from ptsmc_jax.scenario import parsing
 from tests.helpers import ROOT, SHORT_CHAIN, tree
 from tuning.cli import options, searches
 
-SWALLOWED = """
-import sys, time
-from tuning.cli import main
-
-class Garbage:
-    def __del__(self):
-        raise KeyboardInterrupt  # as where JAX is called while garbage is collected
-
-def working(*_, **__):
-    Garbage()
-    time.sleep(60.0)
-
-main.app = working
-main.main()
-"""
-
-
-def test_a_ctrl_c_that_comes_while_garbage_is_collected_ends_the_command():
-    done = subprocess.run([sys.executable, "-c", SWALLOWED], capture_output=True, text=True, cwd=ROOT, check=False)
-    assert (done.returncode, done.stderr) == (130, "ptsmc: interrupted; nothing was written\n")
-
-
 IMPORTING = """
 import sys
 

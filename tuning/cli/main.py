@@ -1,12 +1,8 @@
 """The `ptsmc` command. JAX is loaded by the commands that compute, after what they are given was looked at."""
 
-import _thread
 import functools
 import io
-import os
-import signal
 import sys
-import time
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -343,7 +339,6 @@ def main() -> None:
     status: object = None
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
         sys.stdout.reconfigure(errors="backslashreplace")  # as the error stream's are: names have any letters
-    unraisable, sys.unraisablehook = sys.unraisablehook, _once_more
     try:
         status = answered(_asked, _nothing_written)
     except UnusedCliTokensError as error:
@@ -359,7 +354,6 @@ def main() -> None:
     except (Exception, SystemExit) as error:  # code of one's own may exit
         _fail(_of_own_code(error))
     finally:
-        sys.unraisablehook = unraisable
         if (programs := sys.modules.get("ptsmc_jax.programs")) is not None:
             programs.stop()  # exiting waits for what is being compiled
     sys.exit(status if isinstance(status, int) else 0)
@@ -372,19 +366,6 @@ def _asked() -> object:
 def _nothing_written() -> int:
     print("ptsmc: interrupted; nothing was written", file=sys.stderr)
     return INTERRUPTED
-
-
-def _once_more(unraisable: "sys.UnraisableHookArgs") -> None:
-    """Let a Ctrl-C come again that came where nothing can be raised: while garbage is collected, JAX is called."""
-
-    def interrupt() -> None:
-        time.sleep(0.01)
-        os.kill(os.getpid(), signal.SIGINT)
-
-    if issubclass(unraisable.exc_type, KeyboardInterrupt):
-        _thread.start_new_thread(interrupt, ())  # which takes no lock that may be held here
-    else:
-        sys.__unraisablehook__(unraisable)
 
 
 def _too_many(error: UnusedCliTokensError) -> str:

@@ -4,23 +4,31 @@ import contextlib
 import sys
 import threading
 import time
-from collections.abc import Callable
 from typing import Self
 
 EVERY = 10.0  # seconds
 
 
-class Lines:
-    """Prints what is being done every ten seconds, within `with` also while nothing new is said, as in compiling.
+def line(what: str, done: int, total: int, seconds: float) -> str:
+    """Return a line of progress. A total of 100 is a percentage; 0: unknown.
 
-    Nothing where it is silent: quiet, or with a bar.
+    >>> line("searching", 7, 100, 99.0), line("compiling", 0, 0, 10.2)
+    ('ptsmc: searching, 7 %, 99 s', 'ptsmc: compiling, 10 s')
+    """
+    fraction = "" if not total else f", {done} %" if total == 100 else f", {done} of {total}"
+    return f"ptsmc: {what}{fraction}, {seconds:.0f} s"
+
+
+class Lines:
+    """Prints the latest progress every ten seconds within `with`, also during long compilations.
+
+    Args:
+        silent: print nothing.
     """
 
-    def __init__(self, *, silent: bool, clock: Callable[[], float] = time.monotonic):
-        self._silent, self._clock = silent, clock
-        self._begun = self._last = clock()
-        self._doing = ("compiling", 0, 0)
-        self._lock, self._ended = threading.Lock(), threading.Event()
+    def __init__(self, *, silent: bool):
+        self._silent, self._begun = silent, time.monotonic()
+        self._doing, self._ended = ("compiling", 0, 0), threading.Event()
 
     def __enter__(self) -> "Lines":
         if not self._silent:
@@ -31,25 +39,13 @@ class Lines:
         self._ended.set()
 
     def __call__(self, what: str, done: int, total: int) -> None:
-        """What is being done, so many of all."""
+        """Report the current step, and the number of steps done and in all."""
         self._doing = (what, done, total)
-        self._print_if_due()
 
     def _watch(self) -> None:
-        while not self._ended.wait(EVERY / 20.0):
-            self._print_if_due()
-
-    def _print_if_due(self) -> None:
-        with self._lock:
-            now = self._clock()
-            if self._silent or now - self._last < EVERY:
-                return
-            self._last = now
-            what, done, total = self._doing
-            # so many of a hundred are a percentage, as searches report
-            share = "" if not total else f", {done} %" if total == 100 else f", {done} of {total}"
-            with contextlib.suppress(OSError):  # nobody reads them any more, or a disk is full: no reason to stop
-                print(f"ptsmc: {what}{share}, {now - self._begun:.0f} s", file=sys.stderr, flush=True)
+        while not self._ended.wait(EVERY):
+            with contextlib.suppress(OSError):  # a closed pipe or a full disk is no reason to stop
+                print(line(*self._doing, time.monotonic() - self._begun), file=sys.stderr, flush=True)
 
 
 class Bar:
