@@ -103,10 +103,19 @@ def gravity_gradient(scenario: Any, orbit_rate: float) -> Bounds:
 
 
 def along_the_run(scenario: Any, signal: Any, fastest: float = 0.0) -> Bounds:
-    """Largest size and rate of a disturbance of one's own d(t, x) on the way from the start to the target.
+    """Return the largest size and rate of a custom disturbance d(t, x) on the nominal path to the target.
 
-    The way is the nominal one: the error falls like (t_f - t)^3 until t_f, then the target is followed. fastest: how
-    fast the disturbance says that it changes [rad/s]. What is drawn of it counts as `_as_drawn`.
+    On that path the error falls like (t_f - t)^3 until t_f, then the state follows the target. Amplitudes and phases
+    that the dispersions can draw are included, see `_as_drawn`. The bounds of a disturbance that fails, or is not
+    finite at t = 0, are zero: `own_checks` refuses it before a run.
+
+    Args:
+        scenario: a scenario whose reference is known.
+        signal: the disturbance, a function of t [s] and the plant's state.
+        fastest: how fast the disturbance changes [rad/s].
+
+    Raises:
+        ScenarioError: the disturbance is finite at t = 0 and not finite later on the path.
     """
     import jax
     import jax.numpy as jnp
@@ -123,8 +132,15 @@ def along_the_run(scenario: Any, signal: Any, fastest: float = 0.0) -> Bounds:
             acting = np.asarray(lapack.vmap(drawn)(jnp.asarray(t), jax.tree.map(jnp.asarray, states)))
         except Exception:  # which `own_checks` refuses before a flight, in one sentence
             acting = np.zeros(0)
-        if acting.shape != (t.size, scenario.inputs) or not np.all(np.isfinite(acting)):
+        bad = np.flatnonzero(~np.isfinite(acting).all(axis=1)) if acting.shape == (t.size, scenario.inputs) else [0]
+        if len(bad) and bad[0] == 0:
             return Bounds(*np.zeros_like(largest))
+        if len(bad):
+            raise ScenarioError(
+                f"disturbance.code names a class {type(signal).__name__} whose __call__ returns "
+                f"{acting[bad[0]].tolist()} at t = {t[bad[0]]:.6g} s on the way to the target, but must return finite "
+                "numbers"
+            )
         sizes = (np.max(np.abs(d), axis=0) for d in (acting, np.gradient(acting, t, axis=0)))
         largest = np.maximum(largest, [*sizes])
     return Bounds(*largest)

@@ -160,6 +160,19 @@ def test_ones_own_is_looked_at_along_the_nominal_run():
     )
 
 
+class BreaksOff(Disturbance):
+    """A disturbance without a value after 10 s."""
+
+    def __call__(self, t, x):
+        """Torque (3,) [N m]."""
+        return jnp.where(t > 10.0, jnp.nan, 0.01) * jnp.ones(3)
+
+
+def test_a_custom_disturbance_that_breaks_off_during_the_run_is_refused():
+    with pytest.raises(ScenarioError, match=r"class BreaksOff .* \[nan, nan, nan\] at t = 10\.02 s .* finite numbers"):
+        bounds(disturbance={"kind": "own", "code": BreaksOff})
+
+
 def test_the_observers_gain_follows_body_and_period():
     def gain(**tables):
         (value,) = set(scenario.from_tables(tables).observer.gain)
