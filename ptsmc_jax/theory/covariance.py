@@ -8,7 +8,7 @@ import numpy as np
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.theory import error_floor, linear
 
-ROUNDS = 8  # at most, in which the mean slope of a sign is found where s is not zero in the quiet run
+ROUNDS = 8  # largest number of rounds that find the mean slope of a sign if s is not zero in the quiet run
 BEYOND = 1e60  # stands for a size of s that is no number any more
 FLAT = 1e30  # width of a sign without slope
 _AT = np.linspace(-20.0, 20.0, 401)
@@ -21,6 +21,7 @@ class Noise(NamedTuple):
     window_error: float  # RMS over the window of the error's 2-norm, in the unit of the metric
     torque: float  # largest over time and axes of the command [N m]
     s: float  # of the sliding variable, RMS over the window and its components
+    converged: bool = True  # whether the mean slope of the sign converged within `ROUNDS` rounds, see `noise`
 
 
 def predicts(parts: Parts) -> bool:
@@ -38,7 +39,8 @@ def noise(parts: Parts) -> Noise:
 
     Behind an attitude filter its steady state is known at t = 0. The smooth sign counts in each period with the mean
     slope that it has under the noise of s there, E[sech^2(s / width)] / width (statistical linearisation), which the
-    noise before it makes.
+    noise before it makes. The iteration repeats until the widths of two rounds agree to 1 %. After `ROUNDS` rounds it
+    stops, and the result has `converged` = False.
     """
     run = linear.nominal_jit(parts)
     ticks = jax.tree.map(np.asarray, run.period.now)
@@ -54,15 +56,16 @@ def noise(parts: Parts) -> Noise:
         units[~ticks.hold] = float(parts.controller.layer_time) ** (parts.controller.order - 1)
     sigmas = [float(np.sqrt(np.sum(by**2) / len(by))) / unit for by, unit in zip(own, units, strict=True)]
     found = np.asarray([_mean_width(float(flown), sigma) for sigma in sigmas])
-    sizes, widths = None, np.zeros(lasting.size)
+    sizes, converged = None, False
     for _ in range(ROUNDS):
-        if sizes is not None and np.allclose(found, widths, rtol=0.01, atol=0.0):
-            break
         widths = found
         sign = _Sign(linear.opened_in(parts, run, lasting, widths, late=False).loop, widths, float(flown), units)
         sizes, found = _covariance(parts, ticks, flat, sign)
+        converged = bool(np.allclose(found, widths, rtol=0.01, atol=0.0))
+        if converged:
+            break
     assert sizes is not None
-    return sizes
+    return sizes._replace(converged=converged)
 
 
 class _Sign(NamedTuple):

@@ -92,6 +92,20 @@ def flown_chain(**changes):
 _fly = jax.jit(jax.vmap(lambda parts, k: rollout.simulate(parts, np.uint32(1), k), (None, 0)))
 
 
+@pytest.mark.parametrize(("rounds", "converged"), [(1, False), (covariance.ROUNDS, True)])
+def test_a_mean_slope_that_has_not_converged_is_reported(monkeypatch, rounds, converged):
+    """The noise makes s as large as the width of the sign, so one round is not enough."""
+    tables = {
+        "plant": {"kind": "chain", "x0": [0.0, 0.0]},
+        "controller": {"t_f": 4.0, "delta": 2.0, "k1": 0.5, "sign_width": 1e-3},
+        "disturbance": {"kind": "none"},
+        "loop": {"mode": "sampled", "clock": "flight", "period": 0.5, "t_end": 5.0, "window": 0.5},
+        "hardware": {"state_noise": [1e-3, 1e-3]},
+    }
+    monkeypatch.setattr(covariance, "ROUNDS", rounds)
+    assert covariance.noise(scenario.study(scenario.from_tables(tables)).parts).converged is converged
+
+
 def test_the_error_between_samples_counts_where_few_of_them_are_in_the_window():
     """One, 0.49 s after t_f and 0.11 s before the window's end."""
     parts, flown = flown_chain(

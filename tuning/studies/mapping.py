@@ -57,7 +57,7 @@ class Cell:
     window_error: float = np.nan  # RMS over the trials
     peak_torque: float = np.nan  # mean over the trials [N m]
     largest_peak_torque: float = np.nan
-    linear_window_error: float = np.nan  # of the noise alone, by linear covariance
+    linear_window_error: float = np.nan  # of the noise alone, by linear covariance; NaN if it does not converge
     linear_torque: float = np.nan
     radius: float = np.nan  # of the frozen loop's poles at the hand-over
     gain_margin: float = np.nan
@@ -223,7 +223,8 @@ def _cell(x: float, y: float, ready: Study, common: Callable[[Parts], Parts], se
         # of other laws it has not been set beside flown trials
         if parts.controller.prescribed and covariance.predicts(parts) and figures["radius"] < 1.0 + margins.NEUTRAL:
             expected = covariance.noise(parts)
-            figures |= {"linear_window_error": expected.window_error, "linear_torque": expected.torque}
+            if expected.converged:
+                figures |= {"linear_window_error": expected.window_error, "linear_torque": expected.torque}
     return Cell(x, y, "flown", count, int(np.sum(~done)), counts["missed"], **figures)
 
 
