@@ -147,10 +147,9 @@ class Hardware(Actuators, frozen=True):
             raise wrong("hardware.star_tracker_period", own, f"at least loop.period, {period}")
         if self.periods_apart(period) != 1 and not scenario.estimator.on:
             key, value, one = ("every", every, 1) if own is None else ("period", own, period)
-            raise ScenarioError(
-                f"hardware.star_tracker_{key} is {value}, but without a filter the law needs a "
-                f'sample every period; allowed is {one}, or [filter] with kind = "steady_state"'
-            )
+            allowed = f'{one}, or [filter] with kind = "steady_state"'
+            reason = f", but without a filter the law needs a sample every period; allowed is {allowed}"
+            raise errors.refused(f"hardware.star_tracker_{key}", value, reason, allowed)
 
     def noise_of_error(self, scenario: Any) -> tuple[float, float]:
         """Return half of both noises: the error is half an angle.

@@ -10,7 +10,23 @@ MOST_BITS = 1023  # of a whole number, beyond which it is no finite float
 
 
 class ScenarioError(ValueError):
-    """A scenario that cannot be run. Its text is one sentence that names the key, the value and what is allowed."""
+    """A scenario that cannot be run. Its text is one sentence that names the key, the value and what is allowed.
+
+    Attributes:
+        key: the key whose value is refused, such as "controller.eta"; empty if the error is about no single key.
+        value: the value of that key, as read.
+        reason: the text after the value.
+        allowed: what is allowed, in words; empty if `reason` does not say it as "but must be ..".
+    """
+
+    def __init__(self, text: str, *, key: str = "", value: Any = None, reason: str = "", allowed: str = ""):
+        super().__init__(text)
+        self.key, self.value, self.reason, self.allowed = key, value, reason, allowed
+
+    def quoting(self, value: str) -> "ScenarioError":
+        """Return the error with this text in place of the value."""
+        text = f"{self.key} is {value}{self.reason}"
+        return ScenarioError(text, key=self.key, value=self.value, reason=self.reason, allowed=self.allowed)
 
     def _render_traceback_(self) -> list[str]:
         """In a notebook that sentence, and nothing of how it came about: IPython asks for this."""
@@ -18,8 +34,27 @@ class ScenarioError(ValueError):
 
 
 def wrong(key: str, value: Any, allowed: str) -> ScenarioError:
-    """The error for a key whose value is not allowed."""
-    return ScenarioError(f"{key} is {brief(value)}, but must be {allowed}")
+    """Return the error for a key whose value is not allowed.
+
+    Args:
+        key: the key, such as "controller.eta".
+        value: its value.
+        allowed: what is allowed, in words.
+    """
+    return refused(key, value, f", but must be {allowed}", allowed)
+
+
+def refused(key: str, value: Any, reason: str, allowed: str = "") -> ScenarioError:
+    """Return the error for the value of a key.
+
+    Args:
+        key: the key, such as "controller.eta".
+        value: its value.
+        reason: the text after the value, with the punctuation before it.
+        allowed: what is allowed, in words; empty if the reason says it in another way.
+    """
+    error = ScenarioError("", key=key, value=value, reason=reason, allowed=allowed)
+    return error.quoting(brief(value))
 
 
 def brief(value: Any) -> str:

@@ -48,7 +48,8 @@ class Scales(NamedTuple):
         if not 0.0 < factor < math.inf:
             raise ScenarioError(
                 f"controller.t_f is {self.time:g} times and the body's inertia {self.inertia:g} times the published "
-                "one, so default gains overflow or underflow; allowed are numbers nearer to the published ones"
+                "one, so default gains overflow or underflow; allowed are numbers nearer to the published ones",
+                key="controller.t_f",
             )
         return _times((scaled.value,) * self.inputs if scaled.each else scaled.value, factor)
 

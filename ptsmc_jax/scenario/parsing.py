@@ -326,20 +326,18 @@ def _parts(text: str) -> tuple[float, str]:
         return math.nan, name
 
 
-def as_written(message: str, raw: Mapping[str, Any]) -> str:
-    """Return an error's message with its value as the raw tables write it, "8 arcsec", and in SI units beside it."""
-    key, _, rest = message.partition(" is ")
-    written = _at(raw, key)
-    many = written if isinstance(written, list | tuple) else [written]
-    if not any(map(_si_unit, many)):
-        return message
-    number = list(map(_in_si, many)) if many is written else _in_si(written)
-    for shown in (brief(number), brief(_floats(number))):
-        if rest.startswith((f"{shown},", f"{shown}:")):
-            unit = _si_unit(written)
-            beside = f" ({number:.6g} {unit})" if unit and number != _parts(many[0])[0] else ""
-            return f"{key} is {brief(written)}{beside}{rest.removeprefix(shown)}"
-    return message
+def as_written(error: ScenarioError, raw: Mapping[str, Any]) -> ScenarioError:
+    """Return an error with its value as the raw tables write it, "8 arcsec", and in SI units beside it."""
+    written = _at(raw, error.key)
+    several = isinstance(written, list | tuple)
+    if not any(map(_si_unit, written if several else [written])):
+        return error
+    number = list(map(_in_si, written)) if several else _in_si(written)
+    if number != (list(error.value) if isinstance(error.value, tuple) else error.value):
+        return error
+    unit = _si_unit(written)
+    beside = f" ({number:.6g} {unit})" if unit and number != _parts(written)[0] else ""
+    return error.quoting(f"{brief(written)}{beside}")
 
 
 def _at(raw: Any, key: str) -> Any:
@@ -365,12 +363,6 @@ def _si_unit(value: Any) -> str:
     """Return the SI unit of a text such as "8 arcsec", rad; empty if it is no such text."""
     name = _parts(value)[1] if isinstance(value, str) else ""
     return next((unit for unit, names in catalogues.UNITS.items() if name in names), "")
-
-
-def _floats(value: Any) -> Any:
-    if isinstance(value, list):
-        return list(map(_floats, value))
-    return float(value) if isinstance(value, int) and value.bit_length() <= MOST_BITS else value
 
 
 def _in_words(name: str, value: Any, struct: type[Table], kind: Any, context: Context) -> Any:

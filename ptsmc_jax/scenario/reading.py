@@ -39,8 +39,7 @@ def from_tables(raw: Mapping[str, Any], *, run: bool = False) -> Scenario:
     try:
         return _checked(raw, run)
     except ScenarioError as error:
-        message = parsing.as_written(str(error), raw)
-        raise error if message == str(error) else ScenarioError(message) from None
+        raise parsing.as_written(error, raw) from None
 
 
 def _checked(raw: Mapping[str, Any], run: bool) -> Scenario:

@@ -87,7 +87,6 @@ def attitude(scenario: Any, parts: Parts) -> None:
     law = parts.controller
     singular, name = (_SINGULAR, "|q4|") if law.kinematics.additive else (_OPPOSITE, "|q_e4|")
     key, value = attitude_keys.attitude_key(scenario.initial)
-    said = f"initial.{key} is {errors.brief(value)}"
     if law.prescribed:
         times, _, square = (np.asarray(v) for v in solutions.exact_path(parts))
     else:  # of the others only the start is known
@@ -95,11 +94,13 @@ def attitude(scenario: Any, parts: Parts) -> None:
         first = law.clearance(law.kinematics.align(parts.initial, target), target)
         times, square = np.zeros(1), np.square([float(first)])
     if square[0] < SINGULAR_CLEARANCE**2:
-        raise ScenarioError(f"{said}, but lies at {singular}; allowed is {name} of at least {SINGULAR_CLEARANCE}")
+        allowed = f"{name} of at least {SINGULAR_CLEARANCE}"
+        raise errors.refused(f"initial.{key}", value, f", but lies at {singular}; allowed is {allowed}", allowed)
     if square.min() < SINGULAR_CLEARANCE**2:
         when = float(times[int(np.argmin(square))])
-        raise ScenarioError(
-            f"{said} with initial.rate = {errors.brief(scenario.initial.rate)}, but from there the path to the "
-            f"reference meets {singular}, at t = {when:.4g} s; allowed is a start whose path keeps {name} above "
-            f"{SINGULAR_CLEARANCE}"
+        allowed = f"a start whose path keeps {name} above {SINGULAR_CLEARANCE}"
+        reason = (
+            f" with initial.rate = {errors.brief(scenario.initial.rate)}, but from there the path to the reference "
+            f"meets {singular}, at t = {when:.4g} s; allowed is {allowed}"
         )
+        raise errors.refused(f"initial.{key}", value, reason, allowed)

@@ -41,9 +41,8 @@ def in_scenario(scenario: Scenario, gains: Mapping[str, Any]) -> Scenario:
     try:
         return reading.replace(reading.settled(scenario), **changes)
     except ScenarioError as error:
-        keys = (key.replace("__", ".") for key in changes if key != "loop__t_end")  # that are given, to be blamed
-        given = (f"{key}{'.' if key.endswith('command_filter') else ' is'}" for key in keys)
-        if "t_f" not in gains or str(error).startswith(("observer.", *given)):
+        given = {key.replace("__", ".") for key in changes if key != "loop__t_end"}
+        if "t_f" not in gains or error.key in given or error.key.startswith(("observer.", "hardware.command_filter.")):
             raise
         raise ScenarioError(
             f"t_f is {gains['t_f']}, but must go with the rest of the scenario, whose defaults stay (by replace they "

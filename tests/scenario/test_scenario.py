@@ -1,5 +1,6 @@
 import contextlib
 import copy
+import pickle
 import re
 import tomllib
 from typing import Any
@@ -42,6 +43,16 @@ def test_what_is_nested_deeper_than_the_parser_goes_is_refused_as_well(tmp_path,
     with pytest.raises(ScenarioError) as caught:
         read(path)
     check_sentence(str(caught.value), "tables or arrays in each other", "at most 8 levels are allowed")
+
+
+def test_an_error_has_the_key_the_value_and_what_is_allowed():
+    with pytest.raises(ScenarioError) as caught:
+        from_tables({"hardware": {"attitude_noise": "-8 arcsec"}, "loop": {"mode": "sampled"}})
+    error = pickle.loads(pickle.dumps(caught.value))  # as a cluster sends it
+    assert error.key == "hardware.attitude_noise"
+    assert error.value == pytest.approx(-np.deg2rad(8.0 / 3600.0), rel=1e-15)
+    assert error.allowed.startswith("a number, at least 0")
+    assert str(error).startswith('hardware.attitude_noise is "-8 arcsec" (-3.87851e-05 rad), but must be a number')
 
 
 def test_a_chain_is_not_offered_disturbances_of_a_spacecraft():
