@@ -1,4 +1,4 @@
-"""What sampling, noise and an attitude filter do to fixed gains: `make table`."""
+"""Effect of sampling, noise and an attitude filter with fixed gains, a table of docs/results.md: `make table`."""
 
 import numpy as np
 from rich.console import Console
