@@ -48,7 +48,7 @@ def slopes(ready, trials: int):
         return montecarlo.one(with_gains(ready.parts, {"eta": eta}), ready.dispersion, jnp.uint32(0), trial).metrics
 
     def flight(whole: bool):
-        both = jax.jit(lanes.jvp(one, (None, 0), whole=whole))
+        both = jax.jit(lanes.jvp(one, (None, 0), kernel=whole))
         return lambda: both((ready.parts.controller.eta, jnp.arange(trials, dtype=jnp.uint32)), (jnp.ones(1), None))
 
     return {"scan": flight(False), "kernel": flight(True)}

@@ -98,7 +98,7 @@ def step_operations(ready: Study) -> int:
     def fly(trial):
         return montecarlo.one(ready.parts, ready.dispersion, jnp.uint32(0), trial).metrics
 
-    traced = jax.make_jaxpr(lanes.vmap(fly, whole=True))(jnp.arange(kernel.BLOCK, dtype=jnp.uint32))
+    traced = jax.make_jaxpr(lanes.vmap(fly, kernel=True))(jnp.arange(kernel.BLOCK, dtype=jnp.uint32))
     (body,) = loops(traced.jaxpr)
     return count(body)
 

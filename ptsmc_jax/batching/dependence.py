@@ -1,9 +1,13 @@
-"""What the values of a trace differ over, and which of them count, without evaluating it: for `lanes` and `kernel`."""
+"""Evaluation of jaxprs, their control flow, and the inputs that each output of a jaxpr depends on.
+
+Dependence is propagated as flags: an integer for each value, one bit for each input or batch axis. `lanes` and `kernel`
+use it for the batch axes of a value, `onboard` for the parameters of an expression.
+"""
 
 import operator
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import reduce
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import jax
 from jax import lax
@@ -15,132 +19,145 @@ _CALLS = set("jit pjit closed_call core_call remat remat2 checkpoint".split())
 
 
 def called(eqn: Any) -> Any:
-    """The trace that a call stands for; None where an equation is no call."""
+    """Return the jaxpr that an equation calls, or None if its primitive is no call."""
     params = eqn.params
     return params.get("jaxpr", params.get("call_jaxpr")) if eqn.primitive.name in _CALLS else None
 
 
 def opened(closed: Any) -> tuple[core.Jaxpr, Sequence]:
-    """A trace and its constants; a call's may stand without any."""
+    """Return a jaxpr and its constants. A call may hold a jaxpr without constants."""
     return (closed.jaxpr, closed.consts) if isinstance(closed, core.ClosedJaxpr) else (closed, ())
 
 
-def place(eqn: Any) -> str:
-    """Where in the user's files an equation stands, as far as JAX knows."""
+def source_location(eqn: Any) -> str:
+    """Return " (file:line)" of the user's code that an equation was traced from, or "" if JAX does not know it."""
     trace = eqn.source_info.traceback
     frames = [] if trace is None else [f for f in trace.frames if "/jax/" not in f.file_name]
     return f" ({frames[0].file_name}:{frames[0].line_num})" if frames else ""
 
 
+def eliminate_dead_code(closed: core.ClosedJaxpr) -> core.ClosedJaxpr:
+    """Return the jaxpr without the equations that no output depends on."""
+    jaxpr, _ = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars), instantiate=True)
+    return core.ClosedJaxpr(jaxpr, closed.consts)
+
+
+def interpret(
+    jaxpr: core.Jaxpr, consts: Sequence, arguments: Sequence[T], constant: Callable[[Any], T], apply: Callable[..., Any]
+) -> list[T]:
+    """Evaluate a jaxpr on values of any type.
+
+    Args:
+        jaxpr: the jaxpr.
+        consts: its constants.
+        arguments: values of its inputs.
+        constant: (constant or literal) -> value.
+        apply: (equation, values of its operands) -> values of its results.
+
+    Returns:
+        The values of its outputs.
+    """
+    values = dict(zip(jaxpr.constvars, map(constant, consts), strict=True))
+    values |= zip(jaxpr.invars, arguments, strict=True)
+
+    def read(atom: Any) -> T:
+        return constant(atom.val) if isinstance(atom, core.Literal) else values[atom]
+
+    for eqn in jaxpr.eqns:
+        values |= zip(eqn.outvars, apply(eqn, [read(atom) for atom in eqn.invars]), strict=True)
+    return [read(atom) for atom in jaxpr.outvars]
+
+
 def of_scan(params: Mapping[str, Any], operands: Sequence[T]) -> tuple[Sequence[T], Sequence[T], Sequence[T]]:
-    """The operands of a `lax.scan`, or its body's inputs: constants, carries, and what it goes through."""
+    """Split the operands of a `lax.scan`, or the inputs of its body, into constants, carries and xs."""
     if "num_consts" in params:
-        fixed, carried = params["num_consts"], params["num_carry"]
+        consts, carries = params["num_consts"], params["num_carry"]
     else:  # from jax 0.11 on: three branches of a tree
-        fixed, carried, _ = (len(branch) for branch in params["ft_in"].unpack())
-    return operands[:fixed], operands[fixed : fixed + carried], operands[fixed + carried :]
+        consts, carries, _ = (len(branch) for branch in params["ft_in"].unpack())
+    return operands[:consts], operands[consts : consts + carries], operands[consts + carries :]
 
 
 def of_while(params: Mapping[str, Any], operands: Sequence[T]) -> tuple[Sequence[T], Sequence[T], Sequence[T]]:
-    """The operands of a `lax.while_loop`: constants of its test, constants of its body, and carries."""
+    """Split the operands of a `lax.while_loop` into constants of its test, constants of its body, and carries."""
     first, second = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
     return operands[:first], operands[first:second], operands[second:]
 
 
-class Loop(NamedTuple):
-    """A `lax.while_loop`: the traces of its test, which is one truth, and of its body, and their operands."""
+def loop_of(eqn: Any, operands: Sequence[T]) -> tuple[Any, Any, Sequence[T], Sequence[T], Sequence[T]]:
+    """Return the test (a scalar) and the body of a `while` equation, constants of each, and the initial carries.
 
-    test: core.ClosedJaxpr
-    body: core.ClosedJaxpr
-    test_consts: Sequence
-    body_consts: Sequence
-    init: Sequence
-
-
-def loop_of(eqn: Any, operands: Sequence) -> Loop:
-    """The loop that an equation stands for.
-
-    `jax.vmap` in what a user wrote makes loops whose test has a truth for each row of the carries: they go on while it
-    holds for one of these, and rows for which it does not stay as they are.
+    `jax.vmap` in user code makes loops whose test has a truth value for each row of the carries. Such a loop runs while
+    any row is true. Rows that are false keep their carries.
     """
     test, body = eqn.params["cond_jaxpr"], eqn.params["body_jaxpr"]
     test_consts, body_consts, init = of_while(eqn.params, operands)
-    (truth,) = test.out_avals
-    if not truth.shape:
-        return Loop(test, body, test_consts, body_consts, init)
+    (rows_axes,) = (range(len(aval.shape)) for aval in test.out_avals)
+    if not rows_axes:
+        return test, body, test_consts, body_consts, init
+    run_test, run_body = core.jaxpr_as_fun(test), core.jaxpr_as_fun(body)
 
-    def going(*inside: Any) -> Any:
-        (on,) = core.jaxpr_as_fun(test)(*inside)
-        return on
-
-    def one_going(*inside: Any) -> Any:
-        return lax.reduce_or(going(*inside), range(len(truth.shape)))
+    def any_row(*inside: Any) -> Any:
+        return lax.reduce_or(run_test(*inside)[0], rows_axes)
 
     def step(*inside: Any) -> list:
-        tested, fixed, carried = of_while(eqn.params, inside)
-        on = going(*tested, *carried)
-        after = core.jaxpr_as_fun(body)(*fixed, *carried)
-        rows = (lax.broadcast_in_dim(on, new.shape, range(on.ndim)) for new in after)
-        return [lax.select(row, new, old) for row, new, old in zip(rows, after, carried, strict=True)]
+        of_test, of_body, carries = of_while(eqn.params, inside)
+        (running,) = run_test(*of_test, *carries)
+        after = run_body(*of_body, *carries)
+        masks = (lax.broadcast_in_dim(running, new.shape, rows_axes) for new in after)
+        return [lax.select(mask, new, old) for mask, new, old in zip(masks, after, carries, strict=True)]
 
-    tested, _, carried = of_while(eqn.params, [v.aval for v in eqn.invars])
-    kept = jax.make_jaxpr(step)(*(v.aval for v in eqn.invars))
-    return Loop(jax.make_jaxpr(one_going)(*tested, *carried), kept, test_consts, [*test_consts, *body_consts], init)
-
-
-def either(differs: Sequence[int]) -> int:
-    """What at least one of them differs over."""
-    return reduce(operator.or_, differs, 0)
+    avals = [v.aval for v in eqn.invars]
+    of_test, _, carries = of_while(eqn.params, avals)
+    masked = jax.make_jaxpr(step)(*avals)
+    return jax.make_jaxpr(any_row)(*of_test, *carries), masked, test_consts, [*test_consts, *body_consts], init
 
 
-def settle(jaxpr: core.Jaxpr, before: Sequence[int], carried: Sequence[int], after: Sequence[int]) -> list[int]:
-    """What the carries of a loop differ over: what they do at its start, and what its body makes them differ over.
-
-    before, after: the same for what stands before and after the carries among the body's inputs.
-    """
-    carried = list(carried)
-    while True:
-        outputs = dependence(jaxpr, [*before, *carried, *after])
-        wider = [a | b for a, b in zip(carried, outputs, strict=False)]
-        if wider == carried:
-            return carried
-        carried = wider
+def union(flags: Sequence[int]) -> int:
+    """Return the flags that at least one value has."""
+    return reduce(operator.or_, flags, 0)
 
 
 def dependence(jaxpr: core.Jaxpr, inputs: Sequence[int]) -> list[int]:
-    """What the outputs of a trace differ over, given what its inputs do: all that any operand differs over."""
-    known = dict(zip(jaxpr.invars, inputs, strict=True))
-
-    def read(atom: Any) -> int:
-        return 0 if isinstance(atom, core.Literal) else known.get(atom, 0)
-
-    for eqn in jaxpr.eqns:
-        depends = [read(atom) for atom in eqn.invars]
-        known.update(zip(eqn.outvars, _dependence_through(eqn, depends), strict=True))
-    return [read(atom) for atom in jaxpr.outvars]
+    """Return the flags of a jaxpr's outputs, given the flags of its inputs: the union of all that they depend on."""
+    return interpret(jaxpr, [0] * len(jaxpr.constvars), inputs, lambda _: 0, _propagate)
 
 
-def _dependence_through(eqn: Any, depends: list[int]) -> list[int]:
-    """What the results of one equation differ over; of calls, branches and loops result by result."""
-    inner, name, params, every = called(eqn), eqn.primitive.name, eqn.params, either(depends)
+def scan_dependence(body: core.Jaxpr, consts: Sequence[int], init: Sequence[int], xs: Sequence[int]) -> list[int]:
+    """Return the flags of the carries and of the stacked outputs of a scan: the fixed point over its steps."""
+    carries = list(init)
+    while True:
+        outputs = dependence(body, [*consts, *carries, *xs])
+        wider = [a | b for a, b in zip(carries, outputs, strict=False)]
+        if wider == carries:
+            return [*carries, *outputs[len(carries) :]]
+        carries = wider
+
+
+def while_dependence(
+    test: Any, body: Any, test_consts: Sequence[int], body_consts: Sequence[int], init: Sequence[int]
+) -> tuple[list[int], int]:
+    """Return the flags of the carries of a loop, see `loop_of`, and the flags of its test."""
+    carries = scan_dependence(body.jaxpr, body_consts, init, [])
+    (running,) = dependence(test.jaxpr, [*test_consts, *carries])
+    return [own | running for own in carries], running
+
+
+def branch_dependence(branches: Sequence, index: int, operands: Sequence[int]) -> list[int]:
+    """Return the flags of the outputs of a `cond` or `switch`."""
+    outputs = (dependence(branch.jaxpr, operands) for branch in branches)
+    return [union(each) | index for each in zip(*outputs, strict=True)]
+
+
+def _propagate(eqn: Any, flags: list[int]) -> list[int]:
+    """Return the flags of the results of one equation. Calls, branches and loops are evaluated result by result."""
+    inner, every = called(eqn), union(flags)
     if every and inner is not None:
-        return dependence(getattr(inner, "jaxpr", inner), depends)
-    if every and name == "cond":
-        found = [dependence(branch.jaxpr, depends[1:]) for branch in params["branches"]]
-        return [either(some) | depends[0] for some in zip(*found, strict=True)]
-    if every and name == "scan":
-        body, (fixed, begun, rowed) = params["jaxpr"].jaxpr, of_scan(params, depends)
-        settled = settle(body, fixed, begun, rowed)
-        return [*settled, *dependence(body, [*fixed, *settled, *rowed])[len(begun) :]]
-    if every and name == "while":
-        tested, fixed, begun = of_while(params, depends)
-        settled = settle(params["body_jaxpr"].jaxpr, fixed, begun, [])
-        (each,) = dependence(params["cond_jaxpr"].jaxpr, [*tested, *settled])
-        return [own | each for own in settled]
+        return dependence(opened(inner)[0], flags)
+    match eqn.primitive.name if every else "":
+        case "cond":
+            return branch_dependence(eqn.params["branches"], flags[0], flags[1:])
+        case "scan":
+            return scan_dependence(eqn.params["jaxpr"].jaxpr, *of_scan(eqn.params, flags))
+        case "while":
+            return while_dependence(*loop_of(eqn, flags))[0]
     return [every] * len(eqn.outvars)
-
-
-def used(closed: core.ClosedJaxpr) -> core.ClosedJaxpr:
-    """The trace without what no output hangs on."""
-    used, _ = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars), instantiate=True)
-    return core.ClosedJaxpr(used, closed.consts)

@@ -1,9 +1,16 @@
-"""One trajectory, traced, evaluated component by component over many trials.
+"""`jax.vmap` and `jax.jvp` in structure-of-arrays form: a jaxpr is evaluated component by component over a batch.
 
-`lanes.vmap` computes what `jax.vmap` does. It traces the function for one trial and evaluates the trace with every
-small array replaced by its components, each a vector over the trials: XLA's CPU backend vectorises arrays (trial,)
-but not arrays (trial, 3). Reshapes and slices become permutations, small contractions become sums, and whatever does
-not depend on the trial stays as it is: its loops keep a scalar, its branches stay branches.
+XLA's CPU backend vectorises arrays (trials,), but not arrays (trials, 3). So `lanes.vmap` traces a function for one
+trial and interprets its jaxpr with every small array replaced by its components, each an array (trials,):
+
+- Elementwise primitives are applied to each component. Reshapes and slices permute components. Small contractions
+  become sums of products. `components` has these rules.
+- Values that do not depend on the trial stay unbatched: their loops carry scalars, their branches stay branches.
+- Loops, branches and functions with custom derivative rules are traced again, with components as operands.
+- Large arrays, and primitives without a rule, go through `jax.vmap`.
+
+`lanes.jvp` differentiates the jaxpr of one trial. So tangents have a second batch axis, the direction, and a value is
+batched over trials, over directions, over both or not at all (`BatchedArray.axes`).
 """
 
 import warnings
@@ -15,28 +22,37 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.extend import core
 from jaxtyping import Array
 
 from ptsmc_jax import configure
-from ptsmc_jax.batching import components, lapack
-from ptsmc_jax.batching.components import DIRECTION, TRIAL, Lane, Shared, dense_of, object_array, plain
-from ptsmc_jax.batching.dependence import called, dependence, either, loop_of, of_scan, opened, place, settle, used
-from ptsmc_jax.batching.packed import Packed
+from ptsmc_jax.batching import components, dependence, lapack
+from ptsmc_jax.batching.components import DIRECTION, TRIAL, BatchedArray
+from ptsmc_jax.batching.dependence import union
 from ptsmc_jax.numerics import stacking
 
 
 class LanesWarning(UserWarning):
-    """A primitive without a rule went through `jax.vmap`, or a loop was flown step by step: right, but slower."""
+    """A primitive without a rule was evaluated by `jax.vmap`, or a kernel became a scan: correct, but slower."""
 
 
-def vmap(function: Callable, in_axes: Any = 0, *, strict: bool = False, whole: bool = False) -> Callable:
-    """`jax.vmap(function, in_axes)` for axes 0 and None, evaluated by components; the outputs' trial axis is 0.
+def vmap(function: Callable, in_axes: Any = 0, *, strict: bool = False, kernel: bool = False) -> Callable:
+    """Vectorise a function over trials, like `jax.vmap(function, in_axes)`, in structure-of-arrays form.
 
-    Composes with jit, vmap, jvp and grad from outside. A primitive without a rule here goes through `jax.vmap` on its
-    own, with one warning. whole: a long loop is one kernel of an accelerator where it can be, see `kernel`, and has no
-    derivative from outside then. Raises ValueError where nothing is mapped, with strict=True NotImplementedError at
-    such a primitive.
+    The result composes with jit, vmap, jvp and grad from outside.
+
+    Args:
+        function: a function of arrays in pytrees.
+        in_axes: 0, None or a tuple of pytree prefixes of these, one for each argument.
+        strict: refuse primitives without a rule. Otherwise `jax.vmap` evaluates them, with a `LanesWarning`.
+        kernel: run long loops as one kernel of an accelerator where possible, see `kernel`. Such a loop has no
+            derivative from outside.
+
+    Returns:
+        The function of batched arguments. Its outputs have the trials as first axis.
+
+    Raises:
+        ValueError: No argument is mapped, or the numbers of trials differ.
+        NotImplementedError: strict, and a primitive has no rule.
 
     >>> crosses = vmap(lambda a: jnp.cross(a, jnp.array([0.0, 0.0, 1.0])))
     >>> crosses(jnp.array([[1.0, 0.0, 0.0], [0.0, 2.0, 0.0]])).tolist()
@@ -44,20 +60,31 @@ def vmap(function: Callable, in_axes: Any = 0, *, strict: bool = False, whole: b
     """
 
     def mapped(*args: Any) -> Any:
-        trials, one, values = _mapped(args, in_axes)
+        trials, one, values = _batched_arguments(args, in_axes)
         closed, out = jax.make_jaxpr(function, return_shape=True)(*one)
-        results = _Lanes(trials, strict, whole=whole).evaluate(used(closed), values)
-        return jax.tree.unflatten(jax.tree.structure(out), [dense_of(value, (trials,)) for value in results])
+        results = _Interpreter(trials, strict, use_kernel=kernel).evaluate(
+            dependence.eliminate_dead_code(closed), values
+        )
+        return jax.tree.unflatten(jax.tree.structure(out), [value.to_array((trials,)) for value in results])
 
     return mapped
 
 
-def jvp(function: Callable, in_axes: Any = 0, *, strict: bool = False, whole: bool = False) -> Callable:
-    """(arguments, directions) -> (values, slopes): `vmap(function)`, and its derivatives along several directions.
+def jvp(function: Callable, in_axes: Any = 0, *, strict: bool = False, kernel: bool = False) -> Callable:
+    """Vectorise a function over trials, together with its derivatives along several directions.
 
-    directions: a tree like each argument, or None for one that stays, its leaves with an axis over the directions
-    before all others. The slopes have that axis first, then that of the trials. The derivative is taken of the trace
-    of one trial, which is many times shorter than that of its components, and what no output hangs on is left out.
+    The derivative is taken of the jaxpr of one trial, which is many times shorter than the jaxpr of its components.
+
+    Args:
+        function: a function of arrays in pytrees.
+        in_axes: see `vmap`.
+        strict: see `vmap`.
+        kernel: see `vmap`.
+
+    Returns:
+        (arguments, directions) -> (values, tangents). Both parameters are tuples. A direction is a pytree like its
+        argument, with leaves (directions, ...) or (directions, trials, ...), or None for a constant argument. The
+        values are (trials, ...), the tangents (directions, trials, ...).
 
     >>> square, slope = jvp(lambda x: x**2)((jnp.array([3.0, 4.0]),), (jnp.ones((1, 2)),))
     >>> square.tolist(), slope.tolist()
@@ -65,331 +92,328 @@ def jvp(function: Callable, in_axes: Any = 0, *, strict: bool = False, whole: bo
     """
 
     def mapped(args: tuple, directions: tuple) -> tuple[Any, Any]:
-        trials, one, values = _mapped(args, in_axes)
-        moves = [k for k, along in enumerate(directions) if along is not None]
-        if not moves or len(directions) > len(args):
-            raise ValueError(f"directions must be of some of the {len(args)} arguments, found {len(moves)}")
+        trials, one, values = _batched_arguments(args, in_axes)
+        moving = [k for k, along in enumerate(directions) if along is not None]
+        if not moving or len(directions) > len(args):
+            raise ValueError(f"directions must be of some of the {len(args)} arguments, found {len(moving)}")
 
-        def both(one: tuple, slopes: tuple) -> tuple[Any, Any]:
-            def of(*some: Any) -> Any:
-                every = dict(enumerate(one)) | dict(zip(moves, some, strict=True))
-                return function(*every.values())
+        def value_and_tangent(one: tuple, tangents: tuple) -> tuple[Any, Any]:
+            def of_moving(*some: Any) -> Any:
+                return function(*(dict(enumerate(one)) | dict(zip(moving, some, strict=True))).values())
 
-            return jax.jvp(of, tuple(one[k] for k in moves), slopes)
+            return jax.jvp(of_moving, tuple(one[k] for k in moving), tangents)
 
-        along = [jnp.asarray(leaf) for leaf in jax.tree.leaves(tuple(directions[k] for k in moves))]
-        closed, out = jax.make_jaxpr(both, return_shape=True)(one, tuple(one[k] for k in moves))
-        # an argument that stays has a place among the values, but none here
-        inner = [v.aval.shape for v in closed.jaxpr.invars[len(values) :]]
+        along = [jnp.asarray(leaf) for leaf in jax.tree.leaves(directions)]
+        closed, out = jax.make_jaxpr(value_and_tangent, return_shape=True)(one, tuple(one[k] for k in moving))
+        shapes = [v.aval.shape for v in closed.jaxpr.invars[len(values) :]]
         count = along[0].shape[0] if along[0].ndim else 0
-        slopes = [_slope(leaf, shape, count, trials) for leaf, shape in zip(along, inner, strict=True)]
-        lanes = _Lanes(trials, strict, count, whole)
-        results = lanes.evaluate(used(closed), [*values, *slopes])
+        values += [_tangent(leaf, shape, count, trials) for leaf, shape in zip(along, shapes, strict=True)]
+        results = _Interpreter(trials, strict, count, kernel).evaluate(dependence.eliminate_dead_code(closed), values)
         half = len(results) // 2
-        leads = [(trials,)] * half + [(lanes.directions, trials)] * half
-        return jax.tree.unflatten(jax.tree.structure(out), [*map(dense_of, results, leads)])
+        batches = [(trials,)] * half + [(count, trials)] * half
+        return jax.tree.unflatten(jax.tree.structure(out), list(map(BatchedArray.to_array, results, batches)))
 
     return mapped
 
 
-def _mapped(args: tuple, in_axes: Any) -> tuple[int, tuple, list]:
-    """How many trials there are; the arguments of one, as shapes; and their leaves as values."""
+def _batched_arguments(args: tuple, in_axes: Any) -> tuple[int, tuple, list[BatchedArray]]:
+    """Return the number of trials, the arguments of one trial as shapes, and the batched leaves."""
     axes = (in_axes,) * len(args) if in_axes is None or isinstance(in_axes, int) else tuple(in_axes)
-    over = jax.tree.leaves(
-        jax.tree.map(_spread, axes, args, is_leaf=lambda axis: axis is None or isinstance(axis, int))
-    )
+    mapped = jax.tree.map(_is_mapped, axes, is_leaf=lambda axis: axis is None)
     leaves, tree = jax.tree.flatten(args)
-    leaves = [jnp.asarray(leaf) for leaf in leaves]
-    if any(on and not leaf.shape for leaf, on in zip(leaves, over, strict=True)):
+    is_mapped = jax.tree.leaves(jax.tree.broadcast(mapped, args))
+    leaves = [(jnp.asarray(leaf), on) for leaf, on in zip(leaves, is_mapped, strict=True)]
+    if any(on and not leaf.shape for leaf, on in leaves):
         raise ValueError("a number has no axis to map over")
-    sizes = {leaf.shape[0] for leaf, on in zip(leaves, over, strict=True) if on}
+    sizes = {leaf.shape[0] for leaf, on in leaves if on}
     if len(sizes) != 1:
         raise ValueError(f"the mapped arguments must share one number of trials, found {sorted(sizes)}")
-    one = [
-        jax.ShapeDtypeStruct(leaf.shape[1:] if on else leaf.shape, leaf.dtype, weak_type=leaf.weak_type)
-        for leaf, on in zip(leaves, over, strict=True)
-    ]
-    values = [Lane(v.shape[1:], dense=v).apart() if on else v for v, on in zip(leaves, over, strict=True)]
+    one = [jax.ShapeDtypeStruct(v.shape[on:], v.dtype, weak_type=jax.typeof(v).weak_type) for v, on in leaves]
+    values = [BatchedArray(v.shape[1:], array=v).split() if on else BatchedArray.unbatched(v) for v, on in leaves]
     return sizes.pop(), jax.tree.unflatten(tree, one), values
 
 
-def _slope(along: Array, shape: tuple[int, ...], count: int, trials: int) -> Lane:
-    """Directions of a value of this shape, (directions, [trials,] *shape)."""
-    equal = along.shape == (count, *shape)  # in all trials
-    if not equal and along.shape != (count, trials, *shape):
-        raise ValueError(f"{count} directions of {shape} in {trials} trials cannot be of shape {along.shape}")
-    dense, differs = (along[:, None], DIRECTION) if equal else (along, TRIAL | DIRECTION)
-    return Lane(shape, dense=dense, differs=differs).apart()
-
-
-def _spread(axis: int | None, tree: Any) -> Any:
-    """Whether each leaf under one entry of in_axes is mapped over."""
+def _is_mapped(axis: int | None) -> bool:
     if axis not in (None, 0):
         raise ValueError(f"in_axes may hold 0 and None only, found {axis}")
-    return jax.tree.map(lambda _: axis == 0, tree)
+    return axis == 0
 
 
-class _Lanes:
-    """Evaluation of traces for so many trials; with slopes, along so many directions."""
+def _tangent(along: Array, shape: tuple[int, ...], count: int, trials: int) -> BatchedArray:
+    """Return directions (count, *shape) or (count, trials, *shape) of a value of this shape."""
+    if along.shape == (count, *shape):
+        return BatchedArray(shape, array=along[:, None], axes=DIRECTION).split()
+    if along.shape == (count, trials, *shape):
+        return BatchedArray(shape, array=along, axes=TRIAL | DIRECTION).split()
+    raise ValueError(f"{count} directions of {shape} in {trials} trials cannot be of shape {along.shape}")
 
-    def __init__(self, trials: int, strict: bool, directions: int = 0, whole: bool = False):
-        self.trials, self.directions, self.strict, self.whole = trials, directions, strict, whole
-        self.leads = ((), (trials,), (directions, 1), (directions, trials))  # by what differs
-        self.alike = components.Alike()
 
-    def inside(self) -> "_Lanes":
-        """The same in a function that JAX traces by itself: what is computed there belongs to it alone, also a loop."""
-        return _Lanes(self.trials, self.strict, self.directions)
+class _Interpreter:
+    """Evaluates jaxprs on batched arrays.
 
-    def evaluate(self, closed: Any, args: Sequence) -> list:
-        """Values of the outputs of a trace, for arguments that are lanes or equal in all trials."""
-        jaxpr, consts = opened(closed)
-        values_of: dict = {}
+    Args:
+        trials: size of the batch.
+        strict: see `vmap`.
+        directions: number of directions of tangents, 0 without tangents.
+        use_kernel: run long scans as a kernel.
+    """
 
-        def write(variables: Sequence, values: Sequence) -> None:
-            for variable, value in zip(variables, values, strict=True):
-                empty = isinstance(value, Lane) and 0 in value.shape  # nothing in it that could differ
-                values_of[variable] = jnp.zeros(value.shape, variable.aval.dtype) if empty else value
+    def __init__(self, trials: int, strict: bool, directions: int = 0, use_kernel: bool = False):
+        self.trials, self.directions, self.strict, self.use_kernel = trials, directions, strict, use_kernel
+        self.batch_shapes = ((), (trials,), (directions, 1), (directions, trials))  # by batch axes
+        self.rules = components.ComponentRules()
 
-        def read(atom: Any) -> Any:
-            return atom.val if isinstance(atom, core.Literal) else values_of[atom]
+    def evaluate(self, closed: Any, arguments: Sequence[BatchedArray]) -> list[BatchedArray]:
+        """Return the outputs of a jaxpr."""
+        jaxpr, consts = dependence.opened(closed)
+        arguments = _unbatch_empty(arguments, jaxpr.invars)
+        return dependence.interpret(jaxpr, consts, arguments, BatchedArray.unbatched, self.apply)
 
-        write([*jaxpr.constvars, *jaxpr.invars], [*consts, *args])
-        for eqn in jaxpr.eqns:
-            values = [read(atom) for atom in eqn.invars]
-            laned = any(isinstance(value, Lane) for value in values)
-            if laned:
-                results = self.apply(eqn, values)
-            else:
-                results = components.known(eqn) if self.directions else None
-                results = components.bind(eqn, values) if results is None else results
-            write(eqn.outvars, results)
-        return [read(atom) for atom in jaxpr.outvars]
+    def evaluate_inside(self, closed: Any, arguments: Sequence[BatchedArray]) -> list[BatchedArray]:
+        """Return the outputs of a jaxpr inside a function that JAX traces: no array of its trace leaves it."""
+        return _Interpreter(self.trials, self.strict, self.directions).evaluate(closed, arguments)
 
-    def apply(self, eqn: Any, values: list) -> Sequence:
-        """One primitive with at least one lane among its operands."""
-        name, inner = eqn.primitive.name, called(eqn)
+    def apply(self, eqn: Any, values: list[BatchedArray]) -> list[BatchedArray]:
+        """Return the results of one equation."""
+        if union(_axes(values)):
+            return _unbatch_empty(self.apply_batched(eqn, values), eqn.outvars)
+        zeros = components.zero_tangent(eqn) if self.directions else None
+        results = components.bind(eqn, [value.array for value in values]) if zeros is None else [zeros]
+        return list(map(BatchedArray.unbatched, results))
+
+    def apply_batched(self, eqn: Any, values: list[BatchedArray]) -> list[BatchedArray]:
+        name, inner, axes = eqn.primitive.name, dependence.called(eqn), union(_axes(values))
         if inner is not None:
             return self.evaluate(inner, values)
-        differs = _which(values)
-        every = either(differs)
-        if name in _CONTROL:
-            return _CONTROL[name](self, eqn, values)
-        if every == DIRECTION:  # equal in all trials: there is nothing to gain by components
-            return self.densely(eqn, values)
-        if components.covers(name):
-            results = components.apply(eqn, values, self.alike)
-            if results is not None:
-                for lane in results:
-                    lane.differs = every
-                return results
-        else:
-            self.without_rule(eqn)
-        return self.densely(eqn, values)
+        if name in _CONTROL_FLOW:
+            return _CONTROL_FLOW[name](self, eqn, values)
+        if axes == DIRECTION:  # one array for all trials: components would not be faster
+            return self.apply_to_arrays(eqn, values)
+        if not components.has_rule(name):
+            message = f"lanes have no rule for the primitive `{name}`{dependence.source_location(eqn)}"
+            if self.strict:
+                raise NotImplementedError(f"{message}; use other primitives, or strict=False")
+            warnings.warn(f"{message}: jax.vmap evaluates it, which may be slow", LanesWarning, stacklevel=2)
+        results = self.rules.apply(eqn, values)
+        if results is None:
+            return self.apply_to_arrays(eqn, values)
+        return [BatchedArray.of_components(parts, axes) for parts in results]
 
-    def densely(self, eqn: Any, values: list) -> list[Lane]:
-        """One primitive by `jax.vmap`, or one after the other, see `lapack`."""
-        differs = _which(values)
-        operands, every = [self._dense(*pair) for pair in zip(values, differs, strict=True)], either(differs)
+    def apply_to_arrays(self, eqn: Any, values: list[BatchedArray]) -> list[BatchedArray]:
+        """Return the results of one equation by `jax.vmap`, or see `lapack`."""
+        axes = union(_axes(values))
 
-        def one(*operands: Any) -> Any:
+        def operand(value: BatchedArray) -> Any:
+            array = value.to_array(self.batch_shapes[value.axes]) if value.axes else value.array
+            return array[:, 0] if value.axes == DIRECTION else array
+
+        def function(*operands: Any) -> Any:
             return components.bind(eqn, operands)
 
-        count = (self.trials if every & TRIAL else 1) * (self.directions if every & DIRECTION else 1)
-        function, over = one, lapack.over(eqn, count)
+        size = (self.trials if axes & TRIAL else 1) * (self.directions if axes & DIRECTION else 1)
+        transform = lapack.choose_vmap([eqn], size)
         for axis in (TRIAL, DIRECTION):
-            if every & axis:
-                function = over(function, [0 if on & axis else None for on in differs])
-        dense = [out[:, None] if every == DIRECTION else out for out in function(*operands)]
-        return [Lane(out.shape[len(self.leads[every]) :], dense=out, differs=every) for out in dense]
+            if axes & axis:
+                function = transform(function, [0 if value.axes & axis else None for value in values])
+        arrays = [out[:, None] if axes == DIRECTION else out for out in function(*map(operand, values))]
+        return [BatchedArray(out.shape[len(self.batch_shapes[axes]) :], array=out, axes=axes) for out in arrays]
 
-    def _dense(self, value: Any, differs: int) -> Array:
-        """An array with an axis for each of what a value differs over, first the directions."""
-        if not differs:
-            return plain(value)
-        dense = value.dense(self.leads[differs])
-        return dense[:, 0] if differs == DIRECTION else dense
+    def align(self, values: Sequence[BatchedArray], axes: Sequence[int]) -> list[BatchedArray]:
+        """Return values as loops and branches carry them: equal shapes and axes give equal leaves.
 
-    def without_rule(self, eqn: Any) -> None:
-        told = f"lanes have no rule for the primitive `{eqn.primitive.name}`{place(eqn)}"
-        if self.strict:
-            raise NotImplementedError(f"{told}; write it with others, or leave strict mode")
-        warnings.warn(f"{told}: jax.vmap evaluates it, which may be slow", LanesWarning, stacklevel=2)
-
-    def scan(self, eqn: Any, values: list) -> list:
-        params, body = eqn.params, eqn.params["jaxpr"]
-        consts, init, xs = of_scan(params, values)
-        _, carried_in, gone_through = of_scan(params, body.jaxpr.invars)
-        consts, carried = [_apart(value) for value in consts], len(init)
-        fixed, rowed = _which(consts), _which(xs)
-        differs = settle(body.jaxpr, fixed, _which(init), rowed)
-        state = Packed(carried_in, differs, self.leads)
-        whole = self.in_one_kernel(params, [*consts, *map(_apart, init), *xs], state) if self.whole else None
-        if whole is not None:
-            return whole
-        outputs = dependence(body.jaxpr, [*fixed, *differs, *rowed])[carried:]
-        row = Packed(gone_through, rowed, self.leads)
-        out = Packed(body.jaxpr.outvars[carried:], outputs, self.leads)
-
-        def rows(value: Any, shape: tuple[int, ...], differs: int) -> Any:
-            if not isinstance(value, Lane):
-                return plain(value)
-            lead = self.leads[differs]
-            dense = jnp.moveaxis(value.dense(lead), len(lead), 0)  # (time, *lead, *shape)
-            if not row.apart(shape, differs):
-                return dense
-            return tuple(components.entries(dense, 1 + len(lead)).flat)
-
-        def step(carry: tuple, x: tuple) -> tuple[tuple, tuple]:
-            results = self.inside().evaluate(body, [*consts, *state.unpack(carry), *row.unpack(x)])
-            return state.pack(results[:carried]), out.pack(results[carried:])
-
-        packed_xs = tuple(rows(*item) for item in zip(xs, row.shapes, rowed, strict=True))
-        as_asked = {name: params[name] for name in ("length", "reverse", "unroll")}
-        last, ys = stacking.scan(step, state.pack(init), packed_xs, **as_asked)
-        stacked = [self._stacked(*item, params["length"]) for item in zip(ys, out.shapes, outputs, strict=True)]
-        return [*state.unpack(last), *stacked]
-
-    def in_one_kernel(self, params: Any, values: list, state: Packed) -> list | None:
-        """The last carries of a scan by `kernel.scan`; None: it is no kernel, or cannot be one, which is told."""
-        from ptsmc_jax.batching import kernel  # which takes a while to import, and is for accelerators
-
-        lead = self.leads[TRIAL | DIRECTION if self.directions else TRIAL]
-        varies, interpret = [own & TRIAL for own in state.differs], configure.backend() == "cpu"
-        try:
-            last = kernel.scan(params, values, varies, lead, interpret)
-        except NotImplementedError as error:
-            warnings.warn(f"a loop is flown step by step, which may be slow: {error}", LanesWarning, stacklevel=2)
-            return None
-        return last and state.unpack([state.of_all(k, parts) for k, parts in enumerate(last)])
-
-    def _stacked(self, y: Any, shape: tuple[int, ...], differs: int, length: int) -> Any:
-        """What a scan stacks, components of (time, *lead), or (time, *lead, *shape): a lane of (time, *shape)."""
-        if not differs:
-            return y
-        whole, lead, apart = (length, *shape), self.leads[differs], Packed.apart(shape, differs)
-        if 0 in whole:
-            return Lane(whole, np.empty(whole, dtype=object), differs=differs)
-        if apart and components.small(whole):
-            rows = (lax.index_in_dim(part, k, 0, keepdims=False) for k in range(length) for part in y)
-            return Lane(whole, object_array(whole, rows), differs=differs)
-        dense = jnp.stack(y, axis=-1) if apart else y
-        return Lane(whole, dense=jnp.moveaxis(dense, 0, len(lead)).reshape((*lead, *whole)), differs=differs)
-
-    def loop(self, eqn: Any, values: list) -> list:
-        """lax.while_loop; where the trials end at different times each stays as it is from its end on."""
-        test, body, *consts, init = loop_of(eqn, values)
-        test_consts, body_consts = ([_apart(value) for value in some] for some in consts)
-        differs = settle(body.jaxpr, _which(body_consts), _which(init), [])
-        (each,) = dependence(test.jaxpr, [*_which(test_consts), *differs])
-        differs = [own | each for own in differs]
-        state = Packed(body.jaxpr.outvars, differs, self.leads)
-
-        def going(carry: tuple) -> Any:
-            (test_value,) = self.inside().evaluate(test, [*test_consts, *state.unpack(carry)])
-            return dense_of(test_value, self.leads[each]) if each else test_value
-
-        def step(carry: tuple) -> tuple:
-            after = state.pack(self.inside().evaluate(body, [*body_consts, *state.unpack(carry)]))
-            if not each:
-                return after
-            on = going(carry)
-            return tuple(
-                jax.tree.map(lambda new, old, own=own: jnp.where(self._along(on, new, own), new, old), *both)
-                for *both, own in zip(after, carry, differs, strict=True)
-            )
-
-        proceed = (lambda carry: jnp.any(going(carry))) if each else going
-        return state.unpack(lax.while_loop(proceed, step, state.pack(init)))
-
-    def _along(self, on: Array, value: Array, differs: int) -> Array:
-        """A condition (trials,) or (directions, trials) shaped for an array whose leading axes are of `differs`."""
-        return on.reshape(on.shape + (1,) * (value.ndim - len(self.leads[differs])))
-
-    def branch(self, eqn: Any, values: list) -> list:
-        """lax.cond and lax.switch: a branch where all trials agree, else all of them and a choice for each trial."""
-        index, *operands = values
-        agree, branches = not isinstance(index, Lane), eqn.params["branches"]
-        operands = [_apart(value) for value in operands] if agree else operands
-        depends = [dependence(branch.jaxpr, _which(operands)) for branch in branches]
-        differs = [either([*each, *_which([index])]) for each in zip(*depends, strict=True)]
-        results = Packed(eqn.outvars, differs, self.leads)
-
-        def case(branch: Any, operands: list) -> tuple:
-            return results.pack(self.inside().evaluate(branch, operands))
-
-        if agree:
-            return results.unpack(lax.switch(plain(index), [partial(case, branch, operands) for branch in branches]))
-        which = index.dense(self.leads[index.differs])
-        which = which if which.dtype == bool else jnp.clip(which, 0, len(branches) - 1)
-
-        def choice(differs: int, *case: Array) -> Array:
-            return lax.select_n(jnp.broadcast_to(self._along(which, case[0], differs), case[0].shape), *case)
-
-        cases = [case(branch, self.shielded(eqn, operands, which == k)) for k, branch in enumerate(branches)]
-        outputs = zip(differs, *cases, strict=True)
-        return results.unpack([jax.tree.map(partial(choice, over), *output) for over, *output in outputs])
-
-    def shielded(self, eqn: Any, operands: list, on: Array) -> list:
-        """Operands of a branch, whose derivatives are zero in the trials that do not take it.
-
-        There a derivative may be infinite, and reverse mode would multiply it by zero. `jax.vmap` does the same.
+        Small arrays become components, each broadcast to the batch. Large ones, and those that are equal in all trials,
+        become arrays.
         """
-        floats = [k for k, v in enumerate(eqn.invars[1:]) if jnp.issubdtype(v.aval.dtype, jnp.inexact)]
-        differs = [own | TRIAL for own in _which([operands[k] for k in floats])]
-        some = Packed([eqn.invars[1 + k] for k in floats], differs, self.leads)
+        return [self._aligned(*item) for item in zip(values, axes, strict=True)]
 
-        def masked(over: int, leaf: Array) -> Array:
-            return jnp.where(self._along(on, leaf, over), leaf, lax.stop_gradient(leaf))
+    def _aligned(self, value: BatchedArray, axes: int) -> BatchedArray:
+        if not axes and value.array is not None:
+            return BatchedArray(value.shape, array=value.array, axes=0)
+        batch = self.batch_shapes[axes]
+        if not _carried_as_components(value.shape, axes):
+            return BatchedArray(value.shape, array=value.to_array(batch), axes=axes)
+        parts = tuple(jnp.broadcast_to(part, batch) for part in value.components.flat)
+        return BatchedArray(value.shape, parts, axes=axes)
 
-        packed = some.pack([operands[k] for k in floats])
-        own = [jax.tree.map(partial(masked, over), leaf) for over, leaf in zip(differs, packed, strict=True)]
-        by_place = dict(zip(floats, some.unpack(own), strict=True))
-        return [by_place.get(k, operand) for k, operand in enumerate(operands)]
+    def scan(self, eqn: Any, values: list[BatchedArray]) -> list[BatchedArray]:
+        """Return the results of `lax.scan`."""
+        params, body = eqn.params, eqn.params["jaxpr"]
+        consts, init, xs = dependence.of_scan(params, values)
+        consts, count = _split(consts), len(init)
+        axes = dependence.scan_dependence(body.jaxpr, *map(_axes, (consts, init, xs)))
+        if self.use_kernel:
+            last = self.scan_in_kernel(params, [*consts, *_split(init), *xs], axes[:count])
+            if last is not None:
+                return last
 
-    def custom(self, eqn: Any, values: list) -> list:
-        """A function with a derivative rule of its own (custom_jvp), which is kept."""
+        def step(carry: list, x: list) -> tuple[list, list]:
+            results = self.align(self.evaluate_inside(body, [*consts, *carry, *x]), axes)
+            return results[:count], results[count:]
+
+        rows = [self.rows(x) for x in xs]
+        options = {name: params[name] for name in ("length", "reverse", "unroll")}
+        last, outputs = stacking.scan(step, self.align(init, axes[:count]), rows, **options)
+        return [*last, *(self.stacked(value, params["length"]) for value in outputs)]
+
+    def rows(self, value: BatchedArray) -> BatchedArray:
+        """Return the rows that a scan iterates over: arrays of value.shape[1:], whose leaves have the time first."""
+        shape, batch = value.shape[1:], self.batch_shapes[value.axes]
+        if not value.axes:
+            return BatchedArray(shape, array=value.array, axes=0)
+        array = jnp.moveaxis(value.to_array(batch), len(batch), 0)  # (time, *batch, *shape)
+        if not _carried_as_components(shape, value.axes):
+            return BatchedArray(shape, array=array, axes=value.axes)
+        return BatchedArray.of_components(components.entries(array, 1 + len(batch)), value.axes)
+
+    def stacked(self, value: BatchedArray, length: int) -> BatchedArray:
+        """Return the array (length, *value.shape) of rows, whose leaves have the time first."""
+        shape, batch, axes = (length, *value.shape), self.batch_shapes[value.axes], value.axes
+        if not axes:
+            return BatchedArray.unbatched(value.array)
+        if 0 in shape:
+            return BatchedArray(shape, (), axes=axes)
+        split = _carried_as_components(value.shape, axes)
+        if split and components.is_small(shape):
+            rows = (lax.index_in_dim(part, k, 0, keepdims=False) for k in range(length) for part in value.parts or ())
+            return BatchedArray(shape, tuple(rows), axes=axes)
+        array = jnp.stack(value.parts or (), axis=-1) if split else value.array
+        return BatchedArray(shape, array=jnp.moveaxis(array, 0, len(batch)).reshape((*batch, *shape)), axes=axes)
+
+    def scan_in_kernel(self, params: Any, values: list[BatchedArray], axes: Sequence[int]) -> list | None:
+        """Return the last carries of a scan by `kernel.scan`, or None if it stays a scan."""
+        from ptsmc_jax.batching import kernel  # imported on demand: Pallas takes a while
+
+        batch = self.batch_shapes[TRIAL | DIRECTION if self.directions else TRIAL]
+        try:
+            last = kernel.scan(params, values, [own & TRIAL for own in axes], batch, configure.backend() == "cpu")
+        except NotImplementedError as error:
+            warnings.warn(f"a loop runs step by step, which may be slow: {error}", LanesWarning, stacklevel=2)
+            return None
+
+        def of_carry(parts: np.ndarray, axes: int) -> BatchedArray:
+            """Return a carry with its batch axes: the kernel computes each for each direction and trial."""
+
+            def of_batch(part: Array) -> Array:
+                part = part if axes & DIRECTION or part.ndim == 1 else part[0]
+                return part if axes & TRIAL else part[..., :1] if axes else part[0]
+
+            axes = axes if parts.size else TRIAL
+            return self._aligned(jax.tree.map(of_batch, BatchedArray.of_components(parts, axes)), axes)
+
+        return last and list(map(of_carry, last, axes))
+
+    def while_loop(self, eqn: Any, values: list[BatchedArray]) -> list[BatchedArray]:
+        """Return the results of `lax.while_loop`. A trial whose test is false keeps its carries."""
+        test, body, test_consts, body_consts, init = dependence.loop_of(eqn, values)
+        test_consts, body_consts = _split(test_consts), _split(body_consts)
+        axes, test_axes = dependence.while_dependence(test, body, *map(_axes, (test_consts, body_consts, init)))
+
+        def running(carry: list) -> Any:
+            (value,) = self.evaluate_inside(test, [*test_consts, *carry])
+            return value.to_array(self.batch_shapes[test_axes]) if test_axes else value.array
+
+        def step(carry: list) -> list:
+            after = self.align(self.evaluate_inside(body, [*body_consts, *carry]), axes)
+            if not test_axes:
+                return after
+            on = running(carry)
+            return [self._map_leaves(jnp.where, on, new, old) for new, old in zip(after, carry, strict=True)]
+
+        proceed = (lambda carry: jnp.any(running(carry))) if test_axes else running
+        return lax.while_loop(proceed, step, self.align(init, axes))
+
+    def _map_leaves(self, function: Callable, condition: Array, *values: BatchedArray) -> BatchedArray:
+        """Return function(condition, *leaves) of each leaf of values with equal axes. condition: over the batch."""
+        batch_axes = len(self.batch_shapes[values[0].axes])
+
+        def of_leaf(*leaves: Array) -> Array:
+            return function(condition.reshape(condition.shape + (1,) * (leaves[0].ndim - batch_axes)), *leaves)
+
+        return jax.tree.map(of_leaf, *values)
+
+    def cond(self, eqn: Any, values: list[BatchedArray]) -> list[BatchedArray]:
+        """Return the results of `lax.cond` and `lax.switch`: of all branches if trials differ in the index."""
+        index, *operands = values
+        branches = eqn.params["branches"]
+        operands = operands if index.axes else _split(operands)
+        axes = dependence.branch_dependence(branches, index.axes, _axes(operands))
+
+        def case(branch: Any, operands: Sequence[BatchedArray]) -> list[BatchedArray]:
+            return self.align(self.evaluate_inside(branch, operands), axes)
+
+        if not index.axes:
+            return lax.switch(index.array, [partial(case, branch, operands) for branch in branches])
+        which = index.to_array(self.batch_shapes[index.axes])
+        which = which if which.dtype == bool else jnp.clip(which, 0, len(branches) - 1)
+        cases = [case(branch, self._stop_gradients(eqn, operands, which == k)) for k, branch in enumerate(branches)]
+
+        def choose(which: Array, *leaves: Array) -> Array:
+            return lax.select_n(jnp.broadcast_to(which, leaves[0].shape), *leaves)
+
+        return [self._map_leaves(choose, which, *results) for results in zip(*cases, strict=True)]
+
+    def _stop_gradients(self, eqn: Any, operands: Sequence[BatchedArray], selected: Array) -> list[BatchedArray]:
+        """Return operands of a branch without gradients in the trials that do not select it.
+
+        A derivative may be infinite there, and reverse mode would multiply it by zero. `jax.vmap` does the same.
+        """
+        inexact = [jnp.issubdtype(v.aval.dtype, jnp.inexact) for v in eqn.invars[1:]]
+        aligned = [self._aligned(v, v.axes | TRIAL) if on else v for v, on in zip(operands, inexact, strict=True)]
+
+        def masked(selected: Array, leaf: Array) -> Array:
+            return jnp.where(selected, leaf, lax.stop_gradient(leaf))
+
+        return [self._map_leaves(masked, selected, v) if on else v for v, on in zip(aligned, inexact, strict=True)]
+
+    def custom_jvp(self, eqn: Any, values: list[BatchedArray]) -> list[BatchedArray]:
+        """Return the results of a function with a custom derivative rule (`jax.custom_jvp`), and preserve the rule."""
         avals = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in eqn.invars]
-        smooth = [k for k, aval in enumerate(avals) if jnp.issubdtype(aval.dtype, jnp.inexact)]
-        takes = Packed(eqn.invars, _which(values), self.leads)
-        gives = Packed(eqn.outvars, [either(takes.differs)] * len(eqn.outvars), self.leads)
+        inexact = [k for k, aval in enumerate(avals) if jnp.issubdtype(aval.dtype, jnp.inexact)]
+        axes = [union(_axes(values))] * len(eqn.outvars)
+
+        def value_and_tangent(primals: list, tangents: list) -> tuple:
+            def of_inexact(some: list) -> Sequence:
+                operands = dict(enumerate(primals)) | dict(zip(inexact, some, strict=True))
+                return components.bind(eqn, list(operands.values()))
+
+            return jax.jvp(of_inexact, ([primals[k] for k in inexact],), (tangents,))
 
         @jax.custom_jvp
-        def function(packed: tuple) -> tuple:
-            return gives.pack(self.inside().evaluate(eqn.params["call_jaxpr"], takes.unpack(packed)))
+        def function(operands: list) -> list:
+            return self.align(self.evaluate_inside(eqn.params["call_jaxpr"], operands), axes)
 
         @function.defjvp
         def derivative(primals: tuple, tangents: tuple) -> tuple:
-            def both(x: list, slopes: list) -> tuple:
-                def of(varied: list) -> Sequence:
-                    every = dict(enumerate(x)) | dict(zip(smooth, varied, strict=True))
-                    return components.bind(eqn, list(every.values()))
+            traced = jax.make_jaxpr(value_and_tangent)(avals, [avals[k] for k in inexact])
+            results = self.evaluate_inside(traced, [*primals[0], *(tangents[0][k] for k in inexact)])
+            return self.align(results[: len(axes)], axes), self.align(results[len(axes) :], axes)
 
-                return jax.jvp(of, ([x[k] for k in smooth],), (slopes,))
-
-            traced = jax.make_jaxpr(both)(avals, [avals[k] for k in smooth])
-            slopes = takes.unpack(tangents[0])
-            results = self.inside().evaluate(traced, [*takes.unpack(primals[0]), *(slopes[k] for k in smooth)])
-            half = len(results) // 2
-            return gives.pack(results[:half]), gives.pack(results[half:])
-
-        return gives.unpack(function(takes.pack(values)))
+        return function(self.align(values, _axes(values)))
 
 
-_CONTROL = {"scan": _Lanes.scan, "while": _Lanes.loop, "cond": _Lanes.branch, "custom_jvp_call": _Lanes.custom}
+_CONTROL_FLOW = {
+    "scan": _Interpreter.scan, "while": _Interpreter.while_loop, "cond": _Interpreter.cond,
+    "custom_jvp_call": _Interpreter.custom_jvp,
+}  # fmt: skip
 
 
-def _which(values: Sequence) -> list[int]:
-    """What each value differs over."""
-    return [value.differs if isinstance(value, Lane) else 0 for value in values]
+def _axes(values: Sequence[BatchedArray]) -> list[int]:
+    return [value.axes for value in values]
 
 
-def _apart(value: Any) -> Any:
-    """A value taken apart before the loop or the branch that uses it, if it is small."""
-    if isinstance(value, Lane) and value.differs == DIRECTION:
-        return value
-    if isinstance(value, Lane):
-        return value.apart()
-    if isinstance(value, Shared) or np.ndim(value) == 0 or not components.small(np.shape(value)):
-        return value
-    return Shared(jnp.asarray(value))
+def _split(values: Sequence[BatchedArray]) -> list[BatchedArray]:
+    """Return operands of a loop or branch, split into components outside of it."""
+    return [value if value.axes == DIRECTION else value.split() for value in values]
+
+
+def _carried_as_components(shape: tuple[int, ...], axes: int) -> bool:
+    """Return whether loops and branches carry an array as components."""
+    return bool(axes & TRIAL) and components.is_small(shape)
+
+
+def _unbatch_empty(values: Sequence[BatchedArray], variables: Sequence) -> list[BatchedArray]:
+    """Return values of variables, the empty ones as unbatched: they have no entry that could differ."""
+    return [
+        BatchedArray.unbatched(jnp.zeros(v.shape, variable.aval.dtype)) if v.axes and 0 in v.shape else v
+        for v, variable in zip(values, variables, strict=True)
+    ]

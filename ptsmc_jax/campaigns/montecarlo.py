@@ -259,7 +259,7 @@ def _fly(
 
     result = jax.eval_shape(fly, jax.tree.map(lambda v: v[0, 0, 0], trials))
     width = jax.tree.leaves(trials)[0].shape[2]
-    return row_by_row(lanes.vmap(fly, whole=kernel), result, width, trials, needed, devices)
+    return row_by_row(lanes.vmap(fly, kernel=kernel), result, width, trials, needed, devices)
 
 
 def row_by_row(flown: Callable, result: Any, width: int, rows: Any, needed: jax.Array, devices: int) -> Any:

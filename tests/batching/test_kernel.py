@@ -87,7 +87,7 @@ def kernels(monkeypatch):
 
 def both(function, options=None):
     """A kernel's results and those of the scan."""
-    mapped = lanes.vmap(function, whole=True), lanes.vmap(function)
+    mapped = lanes.vmap(function, kernel=True), lanes.vmap(function)
     return [jax.jit(one, compiler_options=options)(NUMBERS) for one in mapped]
 
 
@@ -134,7 +134,7 @@ def test_slopes_along_several_directions_are_those_of_the_scan(kernels):
     gains, x0 = jnp.array([law.eta, law.delta]), jnp.linspace(0.5, 1.0, 12).reshape(6, 2)
     along = jnp.eye(3, 2), None, jnp.stack([0.0 * x0, 0.0 * x0, x0])
     got, wanted = (
-        jax.jit(lanes.jvp(of, (None, 0, 0), whole=whole))((gains, NUMBERS, x0), along) for whole in (True, False)
+        jax.jit(lanes.jvp(of, (None, 0, 0), kernel=whole))((gains, NUMBERS, x0), along) for whole in (True, False)
     )
     assert len(kernels) == 1
     for name, value in wanted[1]._asdict().items():
@@ -163,7 +163,7 @@ def lowered(function, arguments, monkeypatch):
     monkeypatch.setattr(configure, "devices", gpus)
     monkeypatch.setattr(kernel, "BLOCK", 128)
     with on_a_gpu():
-        trace = jax.jit(lanes.vmap(function, whole=True)).trace(arguments)
+        trace = jax.jit(lanes.vmap(function, kernel=True)).trace(arguments)
         return trace, trace.lower(lowering_platforms=("cuda",)).as_text()
 
 
@@ -213,7 +213,7 @@ def test_extremes_keep_what_is_not_a_number(kernels, monkeypatch):
             0
         ]
 
-    same(jax.jit(lanes.vmap(function, whole=True))(NUMBERS), jax.jit(jax.vmap(function))(NUMBERS))
+    same(jax.jit(lanes.vmap(function, kernel=True))(NUMBERS), jax.jit(jax.vmap(function))(NUMBERS))
     trace, text = lowered(function, NUMBERS, monkeypatch)
     (flown,) = (eqn for eqn in equations(trace) if eqn.primitive.name == "pallas_call")
     used = {eqn.primitive.name for eqn in equations(flown.params["jaxpr"])}
@@ -258,7 +258,7 @@ def test_what_is_written_out_and_what_is_looped(kernels):
         return {**single, "last": last, "pairs": pairs, "own": own, "nested": nested, "flags": flags}
 
     arguments = NUMBERS, np.linspace(0.5, 1.5, 6)
-    got = jax.jit(lanes.vmap(function, whole=True))(*arguments)
+    got = jax.jit(lanes.vmap(function, kernel=True))(*arguments)
     wanted = jax.jit(jax.vmap(function))(*arguments)
     assert sorted(kernels) == [15, 20, 50, 100]
     same(got, wanted)
@@ -299,7 +299,7 @@ def beside(*values):
     ids="carried reduced mapped".split(),
 )
 def test_arrays_without_entries_are_carried_and_summed(function, kernels):
-    same(jax.jit(lanes.vmap(function, whole=True))(NUMBERS), jax.jit(jax.vmap(function))(NUMBERS))
+    same(jax.jit(lanes.vmap(function, kernel=True))(NUMBERS), jax.jit(jax.vmap(function))(NUMBERS))
     assert set(kernels) == {9}
 
 
@@ -315,13 +315,13 @@ def test_arrays_without_entries_are_carried_and_summed(function, kernels):
     ids="short stacked backward through alike".split(),
 )
 def test_what_is_no_work_for_a_kernel_stays_a_scan(function, kernels):
-    np.testing.assert_allclose(lanes.vmap(function, whole=True)(NUMBERS), jax.vmap(function)(NUMBERS), rtol=1e-14)
+    np.testing.assert_allclose(lanes.vmap(function, kernel=True)(NUMBERS), jax.vmap(function)(NUMBERS), rtol=1e-14)
     assert kernels == []
 
 
 def test_a_loop_of_no_trials_stays_a_scan(kernels):
     function = forward(lambda c, n: 0.5 * c + n)
-    same(lanes.vmap(function, whole=True)(NUMBERS[:0]), jax.vmap(function)(NUMBERS[:0]))
+    same(lanes.vmap(function, kernel=True)(NUMBERS[:0]), jax.vmap(function)(NUMBERS[:0]))
     assert kernels == []
 
 
@@ -342,7 +342,7 @@ def test_a_loop_of_no_trials_stays_a_scan(kernels):
 @pytest.mark.filterwarnings("ignore:The Pallas Triton backend is deprecated:DeprecationWarning")
 def test_what_has_another_form_for_its_compiler(step, kernels, monkeypatch):
     function = forward(step)
-    same(jax.jit(lanes.vmap(function, whole=True))(NUMBERS), jax.jit(jax.vmap(function))(NUMBERS))
+    same(jax.jit(lanes.vmap(function, kernel=True))(NUMBERS), jax.jit(jax.vmap(function))(NUMBERS))
     assert "triton" in lowered(function, NUMBERS, monkeypatch)[1]
     assert kernels == [9, 9]
 
@@ -367,6 +367,6 @@ def test_what_a_kernel_cannot_do_is_told_and_flown_step_by_step(step, said, kern
     monkeypatch.setattr(configure, "devices", gpus)  # interpreted there would be an error function
     function = forward(step)
     with pytest.warns(lanes.LanesWarning, match=f"step by step, which may be slow: .*{said}"):
-        got = lanes.vmap(function, whole=True)(NUMBERS)
+        got = lanes.vmap(function, kernel=True)(NUMBERS)
     np.testing.assert_allclose(got, jax.vmap(function)(NUMBERS), rtol=1e-14)
     assert kernels == []

@@ -173,7 +173,7 @@ def _fly(
         return flown._replace(metrics=flown.metrics._replace(**dict.fromkeys(skipped, not_computed)))
 
     def flown(row: dict[str, Any]) -> Flown:
-        return lanes.vmap(one, (None, 0, 0), whole=montecarlo.by_kernel())(
+        return lanes.vmap(one, (None, 0, 0), kernel=montecarlo.by_kernel())(
             row["gains"], row["trial"], row["coordinates"]
         )
 
@@ -204,7 +204,7 @@ def _sloped(
         shifts = jax.tree.map(lambda v: jnp.moveaxis(v, 1, 0), row["shifts"])
         fixed = {name: v for name, v in row["coordinates"].items() if name not in shifts}
         free = {name: row["coordinates"][name] for name in shifts}
-        values, slopes = lanes.jvp(one, (None, 0, 0, 0), whole=montecarlo.by_kernel())(
+        values, slopes = lanes.jvp(one, (None, 0, 0, 0), kernel=montecarlo.by_kernel())(
             (row["gains"], row["trial"], fixed, free), (row["directions"], None, None, shifts)
         )
         return values, jnp.moveaxis(slopes, 0, 1)
