@@ -280,8 +280,8 @@ def _build(described: Any, leaves: Iterator) -> Any:
     values = [_build(child, leaves) for child in children]
     if kind in (tuple, list):
         return kind(values)
-    if kind is dict:
-        return dict(zip(fixed[2], values, strict=True))
+    if issubclass(kind, dict):
+        return kind(zip(fixed[2], values, strict=True))
     if not hasattr(kind, "__dataclass_fields__"):
         return kind(*values)  # a named tuple
     names = sorted(kind.__dataclass_fields__.values(), key=lambda f: bool(f.metadata.get("static")))

@@ -249,9 +249,9 @@ def batch(parts, still, dispersion, in_lanes, sloped):
 
     if not sloped:
         metrics, status, bad = fly(gains)
-        return metrics._asdict(), status, bad, {}
+        return dict(metrics), status, bad, {}
     (metrics, status, bad), slopes = jax.jvp(fly, (gains,), (jax.tree.map(jnp.ones_like, gains),))
-    return metrics._asdict(), status, bad, slopes[0]._asdict()
+    return dict(metrics), status, bad, dict(slopes[0])
 
 
 def at_rest_on_the_target(parts):
@@ -288,7 +288,7 @@ def one_by_one(parts, still, dispersion, sloped):
         width = still.controller.sign_width
         begun[-1] = replace(begun[-1], controller=replace(begun[-1].controller, sign_width=width))
     flown = [rollout.simulate_jit(run, SEED, np.uint32(trial)) for trial, run in enumerate(begun)]
-    each = [(one.metrics._asdict(), one.status, one.bad_time, {}) for one in flown]
+    each = [(dict(one.metrics), one.status, one.bad_time, {}) for one in flown]
     return jax.tree.map(lambda *v: np.stack(v), *each)
 
 
@@ -332,7 +332,7 @@ def test_every_part_is_the_same_in_lanes_under_vmap_and_in_a_loop_with_finite_sl
 def test_uncompiled_it_is_the_same(name):
     ready = scenario.study(scenario.from_tables(ROWS[name]))
     run = ready.dispersion.apply(ready.parts, SEED, NUMBERS[0])
-    one, other = (fly(run, SEED, NUMBERS[0]).metrics._asdict() for fly in (rollout.simulate, rollout.simulate_jit))
+    one, other = (dict(fly(run, SEED, NUMBERS[0]).metrics) for fly in (rollout.simulate, rollout.simulate_jit))
     agree(jax.tree.map(np.asarray, one), other, 1e-12, name)
 
 

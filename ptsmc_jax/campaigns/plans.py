@@ -21,13 +21,13 @@ from ptsmc_jax.dispersions.planned import OF_ROWS, SEED, TRIAL, Row
 from ptsmc_jax.dispersions.quantities import QUANTITIES, UnfitError
 from ptsmc_jax.scenario import parsing
 from ptsmc_jax.simulation import computer
-from ptsmc_jax.simulation.metrics import Metrics
+from ptsmc_jax.simulation.catalogues import CATALOGUE
 from ptsmc_jax.simulation.rollout import Parts
 
 ALLOWED = "a .csv or .parquet file with a row for each trial, or a folder of such .parquet files"
 ANGLE = "initial_angle"  # follows from others
 HEADING = ("status", "reason", "bad_time")  # of a row
-RESULTS = {*HEADING, *Metrics._fields}
+RESULTS = {*HEADING, *CATALOGUE}
 COUNTED = "controller_"  # and how samples of exported C end: how many of them
 SAMPLES = tuple(f"{COUNTED}{ended}" for ended in computer.SAMPLES)
 MOST = 2**32  # of trials and seeds

@@ -34,7 +34,7 @@ def listing(self: Any, indent: str = "") -> str:
         items = {f.name: getattr(self, f.name) for f in fields(self)}
     elif type(self).__base__ is tuple and hasattr(self, "_asdict"):  # a named one, shown in no way of its own
         items = self._asdict()
-    elif isinstance(self, dict):
+    elif type(self) is dict:
         items = self
     else:
         return _shown(self, indent)

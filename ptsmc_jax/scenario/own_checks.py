@@ -20,7 +20,7 @@ from ptsmc_jax.scenario.errors import ScenarioError, brief
 from ptsmc_jax.scenario.own import Own
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.signals.disturbances import Sum
-from ptsmc_jax.simulation.metrics import Metrics
+from ptsmc_jax.simulation.catalogues import CATALOGUE
 from ptsmc_jax.simulation.rollout import Parts
 
 
@@ -167,7 +167,7 @@ def _sensors(parts: Parts, ask: _Asked) -> None:
 
 def _draw(parts: Parts, dispersion: Dispersion, ask: _Asked) -> None:
     own: Any = dispersion.own
-    taken = {"status", "reason", "bad_time", *OF_ROWS, *OF_ROWS.values(), *Metrics._fields, *dispersion.values(parts)}
+    taken = {"status", "reason", "bad_time", *OF_ROWS, *OF_ROWS.values(), *CATALOGUE, *dispersion.values(parts)}
     c = jnp.full(own.count, 0.5)
     drawn = ask("at", own.at, c, parts)
     was, now = (jax.tree.map(lambda v: _kind(jnp.asarray(v)), one) for one in (parts, drawn))

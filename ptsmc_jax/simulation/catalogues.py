@@ -1,10 +1,12 @@
-"""The metrics of a run by name, a row each for every kind of plant that has it: what `[requirements]` may ask for.
+"""The metrics of a run by name, with unit and meaning: the names that `[requirements]` may limit.
 
-How each is computed is in `metric_rows`; this file needs no JAX.
+They are the `metric_table` and the pointing error indices. Nothing here imports JAX, so reading a scenario is fast.
 """
 
 import math
 from typing import NamedTuple
+
+from ptsmc_jax.simulation.metric_table import METRICS
 
 
 class Entry(NamedTuple):
@@ -34,28 +36,7 @@ WITHIN = "within_"  # prefix of the metric that is the share of the time in whic
 KNOWLEDGE = tuple(f"{prefix}{index}" for prefix in ("", WITHIN) for index in ("ake", "mke", "rke"))
 
 CATALOGUE = {
-    "terminal_error": Entry("-", "2-norm of the attitude error vector at t_f"),
-    "terminal_angle": Entry("rad", "angle to the reference attitude at t_f"),
-    "window_error": Entry("-", "RMS of the attitude error vector's 2-norm over the window after t_f"),
-    "hold_error": Entry("-", "largest 2-norm of the attitude error vector from t_f to t_end, at ends of periods"),
-    "window_angle": Entry("rad", "RMS of the angle to the reference attitude over the window after t_f"),
-    "hold_angle": Entry("rad", "largest angle to the reference attitude from t_f to t_end, at ends of periods"),
-    "peak_torque": Entry("N m", "largest commanded torque about one axis, before the actuator"),
-    "peak_torque_delivered": Entry("N m", "largest delivered torque about one axis"),
-    "saturated": Entry("-", "fraction of the time in which a limit of the actuators cuts the command"),
-    "effort": Entry("N m s", "integral of the 1-norm of the delivered torque"),
-    "settling_time": Entry(
-        "s", "time from which the angle stays below settling_angle, interpolated between ends of periods"
-    ),
-    "chattering": Entry("N m/s", "total variation of the delivered torque per second after t_f, largest axis"),
-    "peak_rate": Entry("rad/s", "largest 2-norm of the body rate"),
-    "peak_momentum": Entry("N m s", "largest 2-norm of the body's angular momentum"),
-    "peak_wheel_momentum": Entry("N m s", "largest momentum stored in one reaction wheel", "wheels"),
-    "peak_wheel_torque": Entry("N m", "largest torque of one reaction wheel", "wheels"),
-    "peak_modal": Entry(
-        "sqrt(kg) m", "largest size of the flexible modes' motion, (sum of e^2 + (e'/W)^2)^1/2", "flexible"
-    ),
-    "residual_modal": Entry("sqrt(kg) m", "the same from t_f to t_end", "flexible"),
+    **{name: Entry(metric.unit, metric.meaning, metric.table) for name, metric in METRICS.items()},
     **{
         f"{index}_{axis}": Entry("rad", f"{what}, {where}: largest in the observation", "pointing")
         for index, what in INDICES.items()
@@ -67,21 +48,8 @@ CATALOGUE = {
     },
 }
 POINTING = tuple(name for name, entry in CATALOGUE.items() if entry.table == "pointing")
-# The same for other plants, whose x_1 is the error, in the states' own units; what they lack is left out.
-STATE_CATALOGUE = {
-    "terminal_error": Entry("x1", "|x_1| at t_f"),
-    "window_error": Entry("x1", "RMS of |x_1| over the window after t_f"),
-    "hold_error": Entry("x1", "largest |x_1| from t_f to t_end, at ends of periods"),
-    "peak_torque": Entry("u", "largest commanded component of the input, before the actuator"),
-    "peak_torque_delivered": Entry("u", "largest delivered component of the input"),
-    "saturated": Entry("-", "fraction of the time in which a limit of the actuators cuts the command"),
-    "effort": Entry("u s", "integral of the 1-norm of the delivered input"),
-    "settling_time": Entry(
-        "s", "time from which |x_1| stays below settling_angle, interpolated between ends of periods"
-    ),
-    "chattering": Entry("u/s", "total variation of the delivered input per second after t_f, largest component"),
-    "peak_rate": Entry("x2", "largest |x_2|"),
-}
+# metrics of other plants, whose x_1 is the error, in the units of their states and inputs
+STATE_CATALOGUE = {name: Entry(*metric.of_states) for name, metric in METRICS.items() if metric.of_states is not None}
 MAY_BE_ZERO = ("saturated",)  # a limit of zero on these can be kept
 LARGER_IS_BETTER = tuple(f"{WITHIN}{name}" for name in AT_A_TIME)  # a run that failed has 0; of others less is better
 # units that a limit may be stated in, by the unit of its metric or key: name -> value in that unit

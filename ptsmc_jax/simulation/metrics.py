@@ -1,7 +1,10 @@
-"""The metrics of a run, accumulated interval by interval inside the rollout: loops over the rows of `METRICS`."""
+"""The metrics of a run, accumulated interval by interval inside the simulation.
 
-from collections import namedtuple
-from typing import Any
+How a metric is computed is in `metric_table`, and in `pointing_report` for the pointing errors.
+"""
+
+from collections.abc import Iterable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,86 +13,95 @@ from jax import core
 from jaxtyping import Array
 
 from ptsmc_jax.numerics import guards
+from ptsmc_jax.simulation import pointing_report
+from ptsmc_jax.simulation.catalogues import CATALOGUE
 from ptsmc_jax.simulation.interval import Arrival, Criteria, Interval, Start
-from ptsmc_jax.simulation.metric_rows import METRICS, Running
+from ptsmc_jax.simulation.metric_table import METRICS
+from ptsmc_jax.simulation.pointing_report import PointingErrors
 
 
-class Metrics(namedtuple("Metrics", METRICS)):
-    """Metrics of a run by name, scalars; units and meaning in `catalogues`. NaN: a metric that this run lacks."""
+@jax.tree_util.register_pytree_with_keys_class
+class Metrics(dict[str, Any]):
+    """The metrics that a run has, scalars by name; units and meanings are in `catalogues`.
 
-    __slots__ = ()
+    Each is an attribute, too. An attribute is NaN if it names a metric that the run lacks.
+    """
+
+    def __getattr__(self, name: str) -> Any:
+        if name not in CATALOGUE:
+            raise AttributeError(f"there is no metric {name!r}")
+        return self[name] if name in self else np.nan * next(iter(self.values()))
+
+    def tree_flatten_with_keys(self) -> tuple[Iterable, tuple[str, ...]]:
+        """Return the values with their keys, and the names."""
+        return [(jax.tree_util.DictKey(name), value) for name, value in self.items()], tuple(self)
+
+    @classmethod
+    def tree_unflatten(cls, names: tuple[str, ...], values: Iterable) -> "Metrics":
+        """Return the metrics of these names and values."""
+        return cls(zip(names, values, strict=True))
 
     def __repr__(self) -> str:
-        """The metrics that the run has, a line each; of many runs, or traced ones, their type and shape."""
-        present = {name: value for name, value in self._asdict().items() if not _lacks(name, value)}
-        return "\n".join(f"{name:24s} {_shown(value)}" for name, value in present.items())
-
-
-def _lacks(name: str, value: Any) -> bool:
-    """Whether no run has the metric; one that never settles has that one."""
-    return name != "settling_time" and _are_numbers(value) and bool(np.all(np.isnan(value)))
-
-
-def _are_numbers(value: Any) -> bool:
-    """Whether they are known: under transformations tracers, shapes, axes stand in their places."""
-    return isinstance(value, jax.Array | np.ndarray | np.number | float) and not isinstance(value, core.Tracer)
+        """The metrics, a line each; of many runs, or under transformations, type and shape of each."""
+        return "\n".join(f"{name:24s} {_shown(value)}" for name, value in self.items())
 
 
 def _shown(value: Any) -> str:
-    if not (_are_numbers(value) or isinstance(value, core.Tracer)):
-        return repr(value)
+    if not isinstance(value, jax.Array | np.ndarray | np.number | float):
+        return repr(value)  # under transformations also shapes and axes
     several = isinstance(value, core.Tracer) or np.ndim(value) > 0
     return f"{type(value).__name__} {np.shape(value)}" if several else f"{float(value):.6g}"
 
 
+class Running(NamedTuple):
+    """The metrics of a run so far."""
+
+    arrival: Arrival
+    memories: dict[str, Any]  # of the metrics that the run has, by name
+    pointing: PointingErrors | None  # None: no pointing is observed
+
+
 def begin(start: Start, criteria: Criteria) -> Running:
-    """The metrics at t = 0."""
+    """Return the metrics at t = 0."""
     arrival = Arrival(jnp.zeros(start.inputs), jnp.zeros_like(criteria.t_f))
-    return Running(arrival, {name: metric.begin(start, criteria) for name, metric in METRICS.items()})
+    memories = {name: metric.init(start, criteria) for name, metric in METRICS.items()}
+    present = {name: memory for name, memory in memories.items() if memory is not None}
+    return Running(arrival, present, pointing_report.begin(criteria, measured=start.measured))
 
 
 def update(running: Running, interval: Interval, criteria: Criteria) -> Running:
-    """The metrics after one interval; one of length zero changes nothing."""
-    has_length = interval.length > 0.0
-    old = running.memories
-    new = {
-        name: old[name] if metric.update is None else metric.update(old[name], interval, criteria)
-        for name, metric in METRICS.items()
-        if metric.update_after_t_f is None
-    }
-    after_t_f = {name: old[name] for name, metric in METRICS.items() if metric.update_after_t_f is not None}
-    arrival, after_t_f = jax.lax.cond(
+    """Return the metrics after one interval; an interval of length zero changes nothing."""
+    has_length, old = interval.length > 0.0, running.memories
+    new = {name: m.update(old[name], interval, criteria) for name, m in METRICS.items() if name in old and m.update}
+    late = {name: old[name] for name, metric in METRICS.items() if name in old and metric.update_after_t_f}
+    arrival, late, pointing = jax.lax.cond(
         has_length & (interval.t_next >= criteria.t_f),
-        lambda: _update_after_t_f(running.arrival, after_t_f, interval, criteria),
-        lambda: (running.arrival, after_t_f),
+        lambda: _update_after_t_f(Running(running.arrival, late, running.pointing), interval, criteria),
+        lambda: Running(running.arrival, late, running.pointing),
     )
-    return Running(arrival, {**guards.select(has_length, new, {name: old[name] for name in new}), **after_t_f})
+    new = guards.select(has_length, new, {name: old[name] for name in new})
+    return Running(arrival, {**old, **new, **late}, pointing)
 
 
-def _update_after_t_f(arrival: Arrival, memories: dict, interval: Interval, criteria: Criteria) -> tuple[Arrival, dict]:
-    """The memories that begin at t_f, after an interval that reaches t_f."""
+def _update_after_t_f(running: Running, interval: Interval, criteria: Criteria) -> Running:
+    """Return what changes after an interval that reaches t_f: of the memories those with `update_after_t_f`."""
     errors = interval.errors()
-    arrival = jax.lax.cond(interval.t < criteria.t_f, interval.arrival, lambda: arrival)
-    updates = {name: METRICS[name].update_after_t_f for name in memories}
-    return arrival, {
-        name: update(memories[name], interval, errors, criteria) for name, update in updates.items() if update
+    arrival = jax.lax.cond(interval.t < criteria.t_f, interval.arrival, lambda: running.arrival)
+    updates = {name: METRICS[name].update_after_t_f for name in running.memories}
+    memories = {
+        name: update(running.memories[name], interval, errors, criteria) for name, update in updates.items() if update
     }
+    return Running(arrival, memories, pointing_report.update(running.pointing, interval, criteria))
 
 
 def finish(running: Running, criteria: Criteria) -> Metrics:
-    """The metrics at t_end."""
-    return Metrics(*(metric.value(running.memories[name], running, criteria) for name, metric in METRICS.items()))
+    """Return the metrics at t_end."""
+    memories = running.memories
+    values = {name: m.value(memories[name], running, criteria) for name, m in METRICS.items() if name in memories}
+    return Metrics(values | pointing_report.values(running.pointing, criteria))
 
 
-def unbounded(values: Metrics, begun: Running) -> Array:
-    """Whether a metric ends infinite or NaN, such as the square of a number beyond the square root of the largest one.
-
-    begun: the metrics at t = 0, which are NaN where the run lacks one.
-    """
-
-    def any_nan(memory: Any) -> Array:
-        return jnp.any(jnp.isnan(jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(memory)])))
-
-    ends = {name: value for name, value in values._asdict().items() if not METRICS[name].may_lack}
-    end, lacking = jnp.stack(list(ends.values())), jnp.stack([any_nan(begun.memories[name]) for name in ends])
-    return jnp.any(jnp.isinf(end) | (jnp.isnan(end) & ~lacking))
+def unbounded(values: Metrics) -> Array:
+    """Return whether a metric is infinite or NaN, such as the square of a number that is too large."""
+    finite = [value for name, value in values.items() if name in METRICS and not METRICS[name].may_be_nan]
+    return ~jnp.all(jnp.isfinite(jnp.stack(finite)))

@@ -14,7 +14,6 @@ from ptsmc_jax.numerics.pytrees import Scalar, listing
 from ptsmc_jax.simulation import metrics, pointing
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.interval import Arrival, Criteria, Errors, Interval, Snapshot, Start, Torques
-from ptsmc_jax.simulation.metric_rows import Running
 
 OK, DIVERGED, TOO_FAST, SINGULAR, MISSED, UNBOUNDED, UNFINISHED = range(7)
 # code: (status, reason)
@@ -90,7 +89,7 @@ class RunState(NamedTuple):
     x: Any  # true state
     u: Array  # torque delivered at the end of the last interval, (m,) [N m]
     snapshot: Snapshot
-    running: Running
+    running: metrics.Running
     status: Array
     bad_time: Array
 
@@ -110,7 +109,9 @@ def begin(run: Run, wheel_momentum: Array | None = None) -> RunState:
     """The state at t = 0; wheel_momentum: (wheels,) [N m s]."""
     zero, no_torque = jnp.zeros_like(run.criteria.t_f), jnp.zeros(run.parts.plant.inputs)
     snapshot = _snapshot(run.parts, run.target_0, run.x0)
-    running = metrics.begin(_start(run.parts, snapshot, wheel_momentum), run.criteria)
+    measured = run.parts.sensors is not None
+    start = Start(snapshot, run.parts.plant.inputs, wheel_momentum, measured=measured)
+    running = metrics.begin(start, run.criteria)
     state = RunState(run.x0, no_torque, snapshot, running, jnp.int32(OK), jnp.full_like(zero, jnp.nan))
     return _judged(run, state, run.target_0, zero, zero, no_torque)
 
@@ -169,18 +170,12 @@ def history(rows: Log, last: Log) -> Log:
 
 
 def finish(
-    run: Run,
-    first: Snapshot,
-    state: RunState,
-    log: Log | None,
-    wheel_momentum: Array | None = None,
-    samples: dict[str, Array] | None = None,
+    run: Run, first: Snapshot, state: RunState, log: Log | None, samples: dict[str, Array] | None = None
 ) -> Result:
     """The result of a run in its state at t_end; first: at t = 0; samples: see `Result`."""
     criteria, angle_at_t_f = run.criteria, state.running.arrival.angle
     values = metrics.finish(state.running, criteria)
-    start = _start(run.parts, first, wheel_momentum)
-    unbounded = (state.status == OK) & metrics.unbounded(values, metrics.begin(start, criteria))
+    unbounded = (state.status == OK) & metrics.unbounded(values)
     missed = (state.status == OK) & misses(angle_at_t_f, first.angle, criteria.settling_angle)
     cut = ~jnp.isnan(run.gap) & ~(state.bad_time < run.gap)  # what went wrong without samples means nothing
     status = jnp.where(unbounded, UNBOUNDED, jnp.where(missed, MISSED, state.status))
@@ -193,10 +188,6 @@ def finish(
 def misses(angle_at_t_f: Scalar, first: Scalar, settling_angle: Scalar) -> Array:
     """Whether a run that is flown to its end has missed t_f, by its angles then and at the start [rad]."""
     return angle_at_t_f > jnp.maximum(MISSED_SHARE * first, MISSED_SETTLING_ANGLES * settling_angle)
-
-
-def _start(parts: Parts, snapshot: Snapshot, wheel_momentum: Array | None) -> Start:
-    return Start(snapshot, parts.plant.inputs, wheel_momentum, measured=parts.sensors is not None)
 
 
 def _snapshot(parts: Parts, target: Any, x: Any) -> Snapshot:

@@ -195,4 +195,4 @@ def fly(run: Run, seed: WholeNumber, trial: WholeNumber, software: Software) -> 
     log = None
     if rows is not None:
         log = run_state.history(jax.tree.map(lambda v: v[:-1], rows), loop.last_row(state, hardware, rows))
-    return run_state.finish(run, first, state, log, hardware.actuators.h, software.statuses(hardware.computer))
+    return run_state.finish(run, first, state, log, software.statuses(hardware.computer))

@@ -258,7 +258,7 @@ class _Linear(NamedTuple):
     """Derivatives of a period by the plant's local coordinates z at its start and by a torque p held through it.
 
     seen: of the error at the start, in the middle and at the end, one after the other; in the middle it is that of the
-    cubic that `metric_rows` draws. early: of what sensors can see at the time of `star_state`.
+    cubic that `window_error` uses. early: of what sensors can see at the time of `star_state`.
     """
 
     move: Array  # (periods, n, n)

@@ -137,7 +137,7 @@ def test_slopes_along_several_directions_are_those_of_the_scan(kernels):
         jax.jit(lanes.jvp(of, (None, 0, 0), kernel=whole))((gains, NUMBERS, x0), along) for whole in (True, False)
     )
     assert len(kernels) == 1
-    for name, value in wanted[1]._asdict().items():
+    for name, value in wanted[1].items():
         known = np.isfinite(value)
         found = np.asarray(getattr(got[1], name))
         np.testing.assert_array_equal(np.isfinite(found), known, err_msg=name)
@@ -150,7 +150,7 @@ def test_slopes_along_several_directions_are_those_of_the_scan(kernels):
 def test_in_single_precision_it_is_the_scan_of_single_precision():
     """To 1e-6 of what is rounded, states of 5 and the largest input; errors are small differences of these."""
     with jax.enable_x64(False):
-        got, wanted = (flown.metrics._asdict() for flown in both(primal(CHAIN)))
+        got, wanted = (flown.metrics for flown in both(primal(CHAIN)))
     peak = float(wanted["peak_torque"].max())
     for name in catalogues.STATE_CATALOGUE:
         assert got[name].dtype == jnp.float32
@@ -188,7 +188,7 @@ def test_a_batch_flown_by_kernel_is_the_batch():
     ready = scenario.study(scenario.from_tables(CHAIN))
     usual, own = (montecarlo.run(ready.parts, ready.dispersion, SEED, np.arange(10), kernel=k) for k in (False, True))
     np.testing.assert_array_equal(usual.status, own.status)
-    for name, values in usual.metrics._asdict().items():
+    for name, values in usual.metrics.items():
         np.testing.assert_allclose(getattr(own.metrics, name), values, rtol=1e-9, atol=1e-15, err_msg=name)
     for name, values in usual.drawn.items():
         np.testing.assert_array_equal(own.drawn[name], values)

@@ -12,6 +12,7 @@ import pytest
 
 from ptsmc_jax import configure, scenario
 from ptsmc_jax.campaigns import campaign, montecarlo, rows, runs
+from ptsmc_jax.simulation.metrics import Metrics
 from tests.helpers import SHORT, SHORT_CHAIN, same, short, untuned
 
 
@@ -227,7 +228,7 @@ def test_histories_are_those_of_the_runs(flown):
 def test_what_a_trial_lacks_is_null_whatever_the_precision(monkeypatch, kind):
     made = of_scenario(tomllib.loads(SHORT_CHAIN), 3)
     flown = montecarlo.run(made.ready.parts, made.ready.dispersion, 3, np.arange(montecarlo.FEW))
-    lacking = flown.metrics._replace(settling_time=np.full(montecarlo.FEW, np.nan))
+    lacking = Metrics({**flown.metrics, "settling_time": np.full(montecarlo.FEW, np.nan)})
     as_kind = replace(
         flown,
         metrics=jax.tree.map(lambda v: np.asarray(v, kind), lacking),

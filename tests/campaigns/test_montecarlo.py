@@ -41,8 +41,8 @@ def test_256_trials_equal_the_loop_over_them(chain, flown):
         alone = rollout.simulate_jit(drawn, np.uint32(5), np.uint32(k), record=True)
         assert int(alone.status) == flown.status[k]
         np.testing.assert_allclose(drawn.initial, flown.vectors("initial_x")[k], atol=1e-15)
-        for name in alone.metrics._fields:
-            a, b = float(getattr(alone.metrics, name)), float(getattr(flown.metrics, name)[k])
+        for name in alone.metrics:
+            a, b = float(alone.metrics[name]), float(flown.metrics[name][k])
             assert a == pytest.approx(b, rel=1e-12, abs=1e-12, nan_ok=True), (k, name)
 
 
@@ -113,8 +113,8 @@ def test_trials_equal_plain_vmap():
     trials = montecarlo.run(run, SPREAD, 5, np.arange(256))
     plain = jax.jit(jax.vmap(lambda trial: montecarlo.one(run, SPREAD, np.uint32(5), trial)))
     metrics, *_ = plain(np.arange(256, dtype=np.uint32))
-    for name in metrics._fields:
-        a, b = getattr(metrics, name), getattr(trials.metrics, name)
+    for name in metrics:
+        a, b = metrics[name], trials.metrics[name]
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12, err_msg=name)
 
 

@@ -601,7 +601,7 @@ def cells(request, monkeypatch):
     """Of `map`, made up: `tests/studies/test_mapping.py` flies them and opens their loops."""
     if request.param == "flown":
         return
-    metrics = Metrics(*(np.full(2, 1e-3) for _ in Metrics._fields))
+    metrics = Metrics(dict.fromkeys(catalogues.CATALOGUE, np.full(2, 1e-3)))
     trials = montecarlo.Trials(np.arange(2), metrics, np.full(2, rollout.OK), np.full(2, np.nan), {})
     ones: dict[str, Any] = dict.fromkeys(margins.Margins._fields, np.ones(1))
     left = margins.Margins(**ones)

@@ -303,7 +303,7 @@ IN_TIME = [
 def test_samples_that_are_in_time_change_no_digit(tables):
     parts = scenario.study(scenario.from_tables({**tables, "dispersion": {}})).parts
     one, other = (fly(p, 5, 1) for p in (parts, replace(parts, jitter=vector(0.0))))
-    for name, value in one.metrics._asdict().items():
+    for name, value in one.metrics.items():
         np.testing.assert_array_equal(value, getattr(other.metrics, name), err_msg=name)
 
 

@@ -557,7 +557,7 @@ def test_statistics_count_failures_and_average_the_rest(monkeypatch):
     trials = flights.trials(problem().others(np.arange(8)), np.array([3.0, 0.5]))
     lost = np.array([1, 4, 6])
     trials.status[lost] = rollout.SINGULAR
-    for values in trials.metrics:
+    for values in trials.metrics.values():
         values[lost] = np.nan
     told = tune_files.statistics(trials, "chain")
     assert told["trials"] == 8

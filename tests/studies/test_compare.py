@@ -20,6 +20,7 @@ from ptsmc_jax.scenario import systems
 from ptsmc_jax.scenario.baseline_tables import BASELINES
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import rollout
+from ptsmc_jax.simulation.metrics import Metrics
 from ptsmc_jax.simulation.requirements import Requirement
 from tests.helpers import FIRST_FLIGHT, ROOT, SHORT, short, small_search
 from tests.output.pages import checked
@@ -317,7 +318,7 @@ def contender(trials, **changes):
 
 def changed(trials, status, **metrics):
     numbers = {name: np.asarray(value, dtype=float) for name, value in metrics.items()}
-    return replace(trials, status=np.asarray(status, dtype=np.int32), metrics=trials.metrics._replace(**numbers))
+    return replace(trials, status=np.asarray(status, dtype=np.int32), metrics=Metrics({**trials.metrics, **numbers}))
 
 
 def test_a_contender_is_summed_up_over_what_it_flew(eight):

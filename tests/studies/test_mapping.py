@@ -15,6 +15,7 @@ from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import rollout
+from ptsmc_jax.simulation.catalogues import CATALOGUE
 from ptsmc_jax.simulation.metrics import Metrics
 from ptsmc_jax.theory import linear, margins, run_margins
 from tests.helpers import ROOT
@@ -173,7 +174,7 @@ def test_margins_of_the_worst_axis_stand_in_the_map(mapped, monkeypatch):
 @pytest.fixture
 def unflown(monkeypatch):
     """Cells of whose trials nothing is looked at: what flies them takes the longest to compile."""
-    zeros = Metrics(*(np.zeros(1) for _ in Metrics._fields))
+    zeros = Metrics(dict.fromkeys(CATALOGUE, np.zeros(1)))
     trials = montecarlo.Trials(np.arange(1), zeros, np.full(1, rollout.OK), np.full(1, np.nan), {})
     monkeypatch.setattr(montecarlo, "run", lambda *_: trials)
 

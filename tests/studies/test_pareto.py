@@ -13,6 +13,7 @@ from ptsmc_jax import scenario
 from ptsmc_jax.campaigns.montecarlo import Trials
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import rollout
+from ptsmc_jax.simulation.catalogues import CATALOGUE
 from ptsmc_jax.simulation.metrics import Metrics
 from tests.helpers import SHORT, SHORT_CHAIN, short, small_search, tree
 from tests.output.pages import checked
@@ -36,7 +37,7 @@ def test_the_share_that_a_torque_stays_below_is_one_of_all_trials(lost, largest)
     asked = scenario.from_tables({"requirements": {"peak_torque": {"limit": 1.0, "quantile": 0.9}}})
     peaks, status = np.arange(1.0, 101.0), np.full(100, rollout.OK)
     status[100 - lost :] = rollout.DIVERGED
-    metrics = Metrics(*(peaks if name == "peak_torque" else None for name in Metrics._fields))
+    metrics = Metrics({"peak_torque": peaks})
     assert judging.largest("peak_torque", asked, Trials(np.arange(100), metrics, status, peaks, {})) == largest
 
 
@@ -47,7 +48,7 @@ def point(peak, rms, **others):
 def trials(errors):
     """Trials with these window errors; nothing else of them is looked at."""
     ok = np.zeros(len(errors), dtype=np.int32)
-    metrics = Metrics(**dict.fromkeys(Metrics._fields, jnp.asarray(errors)))
+    metrics = Metrics(dict.fromkeys(CATALOGUE, jnp.asarray(errors)))
     return Trials(np.arange(len(errors)), metrics, ok, np.full(len(errors), np.nan), {})
 
 

@@ -19,6 +19,7 @@ from ptsmc_jax.campaigns.montecarlo import Flown, Trials
 from ptsmc_jax.dispersions.base import INERTIA, Coordinates
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.simulation.catalogues import POINTING
+from ptsmc_jax.simulation.metrics import Metrics
 from ptsmc_jax.simulation.rollout import Parts
 from tuning.search.gains import with_gains
 
@@ -164,13 +165,13 @@ def _fly(
 
     The 52 pointing metrics make up half of the program, so only those that the problem needs are compiled.
     """
-    skipped = [name for name in POINTING if name not in pointing]
+    skipped = {*POINTING} - {*pointing}
 
     def one(gains: jax.Array, trial: jax.Array, coordinates: Coordinates) -> Flown:
         moved = with_gains(parts, dict(zip(names, gains, strict=True)))
         flown = montecarlo.one(moved, dispersion, seed, trial, coordinates)
-        not_computed = jnp.full_like(flown.bad_time, jnp.nan)
-        return flown._replace(metrics=flown.metrics._replace(**dict.fromkeys(skipped, not_computed)))
+        metrics = Metrics({name: value for name, value in flown.metrics.items() if name not in skipped})
+        return flown._replace(metrics=metrics)
 
     def flown(row: dict[str, Any]) -> Flown:
         return lanes.vmap(one, (None, 0, 0), kernel=montecarlo.by_kernel())(

@@ -1,0 +1,225 @@
+"""The metrics of a run, a row each: name, unit, meaning, and how it is computed.
+
+Reading a scenario needs the names, units and meanings only, so JAX is imported when a metric is first computed. The
+pointing errors, which share one accumulator, are in `pointing_report`.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import jax.numpy as jnp
+    from jaxtyping import Array
+
+    from ptsmc_jax.numerics import guards, integrators
+    from ptsmc_jax.simulation import interval as intervals
+    from ptsmc_jax.simulation.interval import Arrival, Criteria, Errors, Interval, Snapshot, Start
+    from ptsmc_jax.simulation.metrics import Running
+else:
+
+    class _Deferred:
+        """A module that is imported when something of it is first used."""
+
+        def __init__(self, name: str):
+            self._name = name
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(importlib.import_module(self._name), name)
+
+    jnp, guards = _Deferred("jax.numpy"), _Deferred("ptsmc_jax.numerics.guards")
+    integrators, intervals = _Deferred("ptsmc_jax.numerics.integrators"), _Deferred("ptsmc_jax.simulation.interval")
+
+
+def _zero(start: Start, criteria: Criteria) -> Array:
+    return jnp.zeros_like(criteria.t_f)
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A metric of a run.
+
+    The memory that `init` returns changes after every interval of positive length by `update`. If the metric has
+    `update_after_t_f` instead, the memory changes after every interval that reaches t_f or begins after it; this
+    function also gets the errors at the interval's ends. `value` returns the metric at t_end.
+    """
+
+    unit: str
+    meaning: str
+    of_states: tuple[str, str] | None = None  # unit and meaning for chains and systems; None: they lack the metric
+    table: str | None = None  # table of the scenario without which a run lacks the metric
+    init: Callable[[Start, Criteria], Any] = _zero  # returns None if the run lacks the metric
+    update: Callable[[Any, Interval, Criteria], Any] | None = None
+    update_after_t_f: Callable[[Any, Interval, Errors, Criteria], Any] | None = None
+    value: Callable[[Any, Running, Criteria], Array] = lambda memory, running, criteria: memory
+    may_be_nan: bool = False  # also at the end of a run that is finite
+
+
+def _peak(during: Callable[[Interval], Any], init: Callable[[Start, Criteria], Any] = _zero) -> dict[str, Any]:
+    """Return the functions of the largest value at t = 0, by default 0, and in every interval."""
+    return {"init": init, "update": lambda memory, interval, criteria: jnp.maximum(memory, during(interval))}
+
+
+def _hold_peak(at_end: Callable[[Interval, Errors], Array], at_t_f: Callable[[Arrival], Array]) -> dict[str, Any]:
+    """Return the functions of the largest value at t_f and at the ends of intervals after it."""
+
+    def update(memory: Array, interval: Interval, errors: Errors, criteria: Criteria) -> Array:
+        return jnp.where(interval.t_next > criteria.t_f, jnp.maximum(memory, at_end(interval, errors)), memory)
+
+    def value(memory: Array, running: Running, criteria: Criteria) -> Array:
+        return jnp.maximum(memory, at_t_f(running.arrival))
+
+    return {"update_after_t_f": update, "value": value}
+
+
+def _window_rms(squares: Callable[[Interval, Errors], tuple[Array, Array, Array]]) -> dict[str, Any]:
+    """Return the functions of the RMS over the window after t_f.
+
+    The memory is the integral of the parabola through the squares at the start, the middle and the end of each
+    interval. It is of fourth order and once differentiable in t_f.
+    """
+
+    def update(memory: Array, interval: Interval, errors: Errors, criteria: Criteria) -> Array:
+        some = squares(interval, errors)
+        return memory + intervals.integral_in_window(interval.t, interval.t_next, some, criteria)
+
+    def value(memory: Array, running: Running, criteria: Criteria) -> Array:
+        return guards.sqrt(memory / criteria.window)
+
+    return {"update_after_t_f": update, "value": value}
+
+
+def _squared_errors(interval: Interval, errors: Errors) -> tuple[Array, Array, Array]:
+    """Return |error|^2. The error in the middle is that of the cubic through both ends and their rates (Hermite)."""
+    middle = integrators.hermite_middle(*errors, interval.length)
+    g0, g1, g2 = (jnp.sum(e * e) for e in (errors.start, middle, errors.end))
+    return g0, g1, g2
+
+
+def _squared_angles(interval: Interval, errors: Errors) -> tuple[Array, Array, Array]:
+    """Return angle^2. An angle has a kink at zero, so the angle in the middle comes from the cubic of the error."""
+    start, middle, end = interval.start.angle, interval.middle_angle(), interval.end.angle
+    return start * start, middle * middle, end * end
+
+
+def _largest(torques: tuple[Array, ...]) -> Array:
+    return jnp.max(jnp.stack([jnp.max(jnp.abs(u)) for u in torques]))
+
+
+def _size(of_wheels: Any) -> Array:
+    return jnp.max(jnp.abs(of_wheels))
+
+
+def _limited_fraction(memory: Array, running: Running, criteria: Criteria) -> Array:
+    """Return NaN if a delivered torque was NaN, because the limits then mean nothing."""
+    return jnp.where(jnp.isnan(running.memories["effort"]), jnp.nan, memory / criteria.t_end)
+
+
+def _effort(memory: Array, interval: Interval, criteria: Criteria) -> Array:
+    torques = interval.torques
+    norms = (w * jnp.sum(jnp.abs(u)) for w, u in zip(torques.weights, torques.delivered, strict=True))
+    return memory + interval.length * sum(norms)
+
+
+def _unsettled(snapshot: Snapshot, criteria: Criteria) -> Array:
+    return ~(snapshot.angle < criteria.settling_angle)  # also if the angle is NaN
+
+
+def _settled_at(memory: Array, interval: Interval, criteria: Criteria) -> Array:
+    """Return the end of the last time above the settling angle [s], interpolated; infinite while above it."""
+    start, end = interval.start, interval.end
+    above, above_next = _unsettled(start, criteria), _unsettled(end, criteria)
+    drop = jnp.where(above & ~above_next, start.angle - end.angle, 1.0)
+    crossing = interval.t + interval.length * (start.angle - criteria.settling_angle) / drop
+    return jnp.where(above_next, jnp.inf, jnp.where(above, crossing, memory))
+
+
+def _variation(memory: Array, interval: Interval, errors: Errors, criteria: Criteria) -> Array:
+    """Return the total variation of the torque delivered from t_f on, (m,) [N m]."""
+    delivered = interval.torques.delivered
+    by_rounding = guards.rounding(interval.length, criteria.t_f)  # the jump of a sample at t_f must not count
+    jump = jnp.where(interval.t > criteria.t_f + by_rounding, jnp.abs(delivered[0] - interval.last_torque), 0.0)
+    inside = sum((jnp.abs(v - u) for u, v in pairwise(delivered)), start=jnp.zeros_like(jump))
+    return memory + jump + jnp.where(interval.t >= criteria.t_f - by_rounding, inside, 0.0)
+
+
+def _chattering(memory: Array, running: Running, criteria: Criteria) -> Array:
+    length = criteria.t_end - criteria.t_f
+    return jnp.max(memory) / jnp.where(length > 0.0, length, 1.0)
+
+
+def _residual(memory: Array, interval: Interval, criteria: Criteria) -> Array:
+    """Return the largest amplitude at the ends of intervals from t_f on; the first of them replaces the memory."""
+    amplitude, early = interval.end.modal_amplitude, interval.t < criteria.t_f
+    reached = interval.t_next >= criteria.t_f
+    return jnp.where(reached, jnp.where(early, amplitude, jnp.maximum(memory, amplitude)), memory)
+
+
+METRICS = {
+    "terminal_error": Metric(
+        "-", "2-norm of the attitude error vector at t_f", ("x1", "|x_1| at t_f"),
+        value=lambda memory, running, criteria: guards.norm(running.arrival.error)),
+    "terminal_angle": Metric(
+        "rad", "angle to the reference attitude at t_f", value=lambda memory, running, criteria: running.arrival.angle),
+    "window_error": Metric(
+        "-", "RMS of the attitude error vector's 2-norm over the window after t_f",
+        ("x1", "RMS of |x_1| over the window after t_f"), **_window_rms(_squared_errors)),
+    "hold_error": Metric(
+        "-", "largest 2-norm of the attitude error vector from t_f to t_end, at ends of periods",
+        ("x1", "largest |x_1| from t_f to t_end, at ends of periods"),
+        **_hold_peak(lambda interval, errors: guards.norm(errors.end), lambda arrival: guards.norm(arrival.error))),
+    "window_angle": Metric(
+        "rad", "RMS of the angle to the reference attitude over the window after t_f", **_window_rms(_squared_angles)),
+    "hold_angle": Metric(
+        "rad", "largest angle to the reference attitude from t_f to t_end, at ends of periods",
+        **_hold_peak(lambda interval, errors: interval.end.angle, lambda arrival: arrival.angle)),
+    "peak_torque": Metric(
+        "N m", "largest commanded torque about one axis, before the actuator",
+        ("u", "largest commanded component of the input, before the actuator"),
+        **_peak(lambda interval: _largest(interval.torques.commanded))),
+    "peak_torque_delivered": Metric(
+        "N m", "largest delivered torque about one axis", ("u", "largest delivered component of the input"),
+        **_peak(lambda interval: _largest(interval.torques.delivered))),
+    "saturated": Metric(
+        "-", "fraction of the time in which a limit of the actuators cuts the command",
+        ("-", "fraction of the time in which a limit of the actuators cuts the command"),
+        update=lambda memory, interval, criteria: memory + jnp.where(interval.torques.limited, interval.length, 0.0),
+        value=_limited_fraction),
+    "effort": Metric(
+        "N m s", "integral of the 1-norm of the delivered torque",
+        ("u s", "integral of the 1-norm of the delivered input"), update=_effort),
+    "settling_time": Metric(
+        "s", "time from which the angle stays below settling_angle, interpolated between ends of periods",
+        ("s", "time from which |x_1| stays below settling_angle, interpolated between ends of periods"),
+        init=lambda start, criteria: jnp.where(_unsettled(start.snapshot, criteria), jnp.inf, 0.0),
+        update=_settled_at,
+        value=lambda memory, running, criteria: jnp.where(jnp.isfinite(memory), memory, jnp.nan), may_be_nan=True),
+    "chattering": Metric(
+        "N m/s", "total variation of the delivered torque per second after t_f, largest axis",
+        ("u/s", "total variation of the delivered input per second after t_f, largest component"),
+        init=lambda start, criteria: jnp.zeros(start.inputs), update_after_t_f=_variation, value=_chattering),
+    "peak_rate": Metric(
+        "rad/s", "largest 2-norm of the body rate", ("x2", "largest |x_2|"),
+        **_peak(lambda interval: interval.end.rate, lambda start, criteria: start.snapshot.rate)),
+    "peak_momentum": Metric(
+        "N m s", "largest 2-norm of the body's angular momentum",
+        **_peak(lambda interval: interval.end.momentum, lambda start, criteria: start.snapshot.momentum)),
+    "peak_wheel_momentum": Metric(
+        "N m s", "largest momentum stored in one reaction wheel", table="wheels",
+        **_peak(lambda interval: _size(interval.torques.wheel_momentum),
+                lambda start, criteria: None if start.wheel_momentum is None else _size(start.wheel_momentum))),
+    "peak_wheel_torque": Metric(
+        "N m", "largest torque of one reaction wheel", table="wheels",
+        **_peak(lambda interval: _size(interval.torques.wheel_torque),
+                lambda start, criteria: None if start.wheel_momentum is None else _zero(start, criteria))),
+    "peak_modal": Metric(
+        "sqrt(kg) m", "largest size of the flexible modes' motion, (sum of e^2 + (e'/W)^2)^1/2", table="flexible",
+        **_peak(lambda interval: interval.end.modal_amplitude, lambda start, criteria: start.snapshot.modal_amplitude)),
+    "residual_modal": Metric(
+        "sqrt(kg) m", "the same from t_f to t_end", table="flexible",
+        init=lambda start, criteria: start.snapshot.modal_amplitude, update=_residual),
+}  # fmt: skip
