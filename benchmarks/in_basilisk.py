@@ -155,13 +155,13 @@ def main() -> None:
     from ptsmc_jax.campaigns import montecarlo, store
     from ptsmc_jax.onboard import folder
     from ptsmc_jax.onboard.library import Library
-    from ptsmc_jax.simulation.computer import schedule
+    from ptsmc_jax.simulation.control_period import first_period
 
     class Controller(folder.Controller):
         """With what a trial begins, and what disturbs it."""
 
         def first(self, parts: Any) -> Any:
-            return schedule(parts, parts.clock.ticks(parts.controller.t_f, parts.controller.delta))[2]
+            return first_period(parts.clock.ticks(parts.controller.t_f, parts.controller.delta))
 
         def disturbance(self, parts: Any, t: float) -> Any:
             return parts.disturbance(jnp.asarray(t), parts.initial)

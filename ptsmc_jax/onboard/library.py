@@ -244,13 +244,13 @@ class InTheLoop:
         return computer._replace(sensors=(computer.sensors, state, jnp.zeros(len(SAMPLES), jnp.int32)))
 
     def decide(
-        self, parts: Parts, k2: Any, period: Period, computer: Computer, x: Any, acting: ActuatorState
+        self, parts: Parts, k2: Any, period: Period, computer: Computer, x: Any, star_x: Any, acting: ActuatorState
     ) -> tuple[Decision, Computer]:
         """A period by `ptsmc_step`; k2 is C's own."""
         (now, dt_before, *_), (sensing, state, counts) = period, computer.sensors
         read, sensors = x, parts.sensors
         if sensors is not None:
-            read, sensing = sensors.sample(sensing, x, now, dt_before, period.star_x)
+            read, sensing = sensors.sample(sensing, x, now, dt_before, star_x)
         inputs = {"x": read, "wheel_momentum": acting.h, "acting": acting.v}
         if computer.applied is not None:
             inputs["applied"] = computer.applied[0]

@@ -1,5 +1,6 @@
 """What a flight computer is given and gives, sample by sample, as the simulator flies it: what C is checked by."""
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
@@ -12,12 +13,11 @@ from ptsmc_jax.batching import lapack
 from ptsmc_jax.dispersions.base import REFERENCE
 from ptsmc_jax.dispersions.quantities import level
 from ptsmc_jax.dispersions.variation import Dispersion
-from ptsmc_jax.numerics import draws, stacking
+from ptsmc_jax.numerics import stacking
 from ptsmc_jax.onboard.board import Board
 from ptsmc_jax.simulation.assembly import Parts
-from ptsmc_jax.simulation.computer import assumed_torque, boot, decide, schedule, star_state
+from ptsmc_jax.simulation.control_period import State, Tick, control_period, schedule, start
 from ptsmc_jax.simulation.run_state import SINGULAR_CLEARANCE
-from ptsmc_jax.simulation.sampled import PeriodMotion, walk_stream
 
 ROUNDED = 4.0  # times: 1.5 were seen
 
@@ -53,59 +53,41 @@ class Samples(NamedTuple):
 
 
 def fly(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Samples:
-    """A trial by samples: the sampled loop of `rollout` without its metrics."""
-    parts = dispersion.apply(parts, seed, trial)
+    """Return a trial by samples, at their nominal times."""
+    parts = replace(dispersion.apply(parts, seed, trial), jitter=None)
     ticks = parts.clock.ticks(parts.controller.t_f, parts.controller.delta)
-    law, actuators = parts.controller, parts.effective_actuators
-    target = parts.reference(jnp.zeros_like(parts.t_end))
-    x0 = law.kinematics.align(parts.initial, target)
-    k2 = parts.observer.error_bound()
-    listed, period_of, started = schedule(parts, ticks)
-    walk_key = walk_stream(seed, trial)
-    sensors, wheels = parts.sensors, actuators.wheels
+    law, sensors, wheels = parts.controller, parts.sensors, parts.effective_actuators.wheels
+    x0 = law.kinematics.align(parts.initial, parts.reference(jnp.zeros_like(parts.t_end)))
+    vehicle, first = start(parts, ticks, x0, seed, trial)
 
-    def flown(carry: tuple, tick: tuple) -> tuple[tuple, Samples]:
-        (now, dt_before, *_), (x, computer, acting, walk, unit, star_x) = tick, carry
-        dt = now.t_next - now.t
-        there, sensing = parts.plant.visible(x), computer.sensors
-        measured = there
+    def step(carry: tuple[State, Array], tick: Tick) -> tuple[tuple[State, Array], Samples]:
+        state, unit = carry
+        after, record = control_period(vehicle, state, tick)
+        now, drive, computer, target = record.now, record.drive, after.computer, record.target
+        assert drive is not None
+        measured, sensing = parts.plant.visible(state.x), state.computer.sensors
         if sensors is not None:
-            measured, _ = sensors.sample(sensing, there, now, dt_before, star_x)
+            measured, _ = sensors.sample(sensing, measured, now, tick.dt_before, state.star_x)
         before = getattr(sensing, "estimate", None)
-        applied = computer.applied[0]
-        period = period_of(tick)._replace(star_x=star_x)
-        (target, d_hat, u, s, w, _), computer = decide(parts, k2, period, computer, there)
-        drive, queue = actuators.command(acting, u, w, now.t, period.assumed_length, now.noise_weight)
-        if walk is not None:
-            walk = walk + parts.walk_rate * dt * draws.normals(walk_key, parts.plant.inputs, now.sample)
-        motion = PeriodMotion(parts, now.t, x, drive, walk)
-        x_next, next_star_x = motion.at(now.t_next), star_state(parts, now, motion.at)
-        brought = (drive.c, None) if actuators.holds else assumed_torque(actuators, drive, dt)
         distance = law.clearance(computer.seen, target)
         unit = jnp.where(jnp.isnan(unit), law.kinematics.clearance_unit(distance), unit)
         row = Samples(
-            t=now.t, flown=dt > 0.0, measured=measured,
+            t=now.t, flown=now.t_next > now.t, measured=measured,
             valid=None if before is None or sensors is None else sensors.star_weight(now) > 0.0,
-            age=None if star_x is None or sensors is None else sensors.star_age(now.sample, dt_before),
+            age=None if state.star_x is None or sensors is None else sensors.star_age(now.sample, tick.dt_before),
             before=before, estimate=getattr(computer.sensors, "estimate", None),
             gyro=getattr(computer.sensors, "rate", None),
-            applied=applied, acting=acting.v, momentum=acting.h, seen=computer.seen, observer=computer.observer,
-            law=computer.law, command_filter=computer.command_filter, queue=queue, d_hat=d_hat, command=u, s=s,
-            error=law.kinematics.errors(computer.seen, target)[0],
+            applied=state.applied[0], acting=state.actuators.v, momentum=state.actuators.h,
+            seen=computer.seen, observer=computer.observer,
+            law=computer.law, command_filter=computer.command_filter, queue=after.actuators.queue,
+            d_hat=record.d_hat, command=record.u, s=record.s, error=law.kinematics.errors(computer.seen, target)[0],
             torque=drive.c if wheels is None else wheels.axes @ drive.c,
             wheel_torque=None if wheels is None else drive.c, limited=drive.limited,
             clearance=distance / unit, clearance_unit=unit,
         )  # fmt: skip
-        computer, acting = computer._replace(applied=brought), actuators.end(acting, drive, queue, dt)
-        return (x_next, computer, acting, walk, unit, next_star_x), row
+        return (after, unit), row
 
-    computer = boot(parts, seed, trial, parts.plant.visible(x0), started)
-    if actuators.holds:
-        computer = computer._replace(applied=(jnp.zeros(parts.plant.inputs), None))
-    walk = None if parts.walk_rate is None else jnp.zeros(parts.plant.inputs)
-    unknown, star_x = jnp.full_like(parts.t_end, jnp.nan), star_state(parts, started, lambda t: x0)
-    start = x0, computer, actuators.begin(parts.plant.inputs), walk, unknown, star_x
-    return stacking.scan(flown, start, listed)[1]
+    return stacking.scan(step, (first, jnp.full_like(parts.t_end, jnp.nan)), schedule(ticks))[1]
 
 
 @programs.jit(compiler_options=programs.QUICKLY)

@@ -68,7 +68,7 @@ def simulate(
     target_t_f = parts.reference(criteria.t_f)
     unit, gap = jax.lax.stop_gradient(unit), _first_missing(parts, ticks)
     run = Run(parts, ticks, criteria, x0, target, target_t_f, unit, gap, record)
-    return sampled.fly(run, seed, trial, software) if parts.clock.sampled else continuous.fly(run)
+    return sampled.simulate(run, seed, trial, software) if parts.clock.sampled else continuous.simulate(run)
 
 
 def _check(parts: Parts) -> None:

@@ -1,6 +1,5 @@
-"""A run as both loops fly it: what they carry from interval to interval, how intervals are judged, and its result."""
+"""Metrics, status and history of a run, in either loop."""
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -13,7 +12,8 @@ from ptsmc_jax.numerics import guards
 from ptsmc_jax.numerics.pytrees import Scalar, listing
 from ptsmc_jax.simulation import metrics, pointing
 from ptsmc_jax.simulation.assembly import Parts
-from ptsmc_jax.simulation.interval import Arrival, Criteria, Errors, Interval, Snapshot, Start, Torques
+from ptsmc_jax.simulation.control_period import Record
+from ptsmc_jax.simulation.interval import Arrival, Criteria, Errors, Interval, Snapshot, Start
 
 OK, DIVERGED, TOO_FAST, SINGULAR, MISSED, UNBOUNDED, UNFINISHED = range(7)
 # code: (status, reason)
@@ -83,80 +83,78 @@ class Run(NamedTuple):
     record: bool  # the history is asked for
 
 
-class RunState(NamedTuple):
-    """The state of a run between two intervals, in either loop."""
+class Score(NamedTuple):
+    """Metrics and status of a run so far."""
 
-    x: Any  # true state
-    u: Array  # torque delivered at the end of the last interval, (m,) [N m]
     snapshot: Snapshot
     running: metrics.Running
     status: Array
     bad_time: Array
 
 
-class Flown(NamedTuple):
-    """An interval that has been flown."""
-
-    x: Any  # true state at its end
-    x_at: Callable[[Scalar], Any]  # time in it [s] -> true state then
-    torques: Torques
-    step: Scalar  # longest integration step in it [s]
-    seen: Any = None  # state as it was measured at its start; None: the true one
-    memory: Any = None  # of the law, after its command
-
-
-def begin(run: Run, wheel_momentum: Array | None = None) -> RunState:
-    """The state at t = 0; wheel_momentum: (wheels,) [N m s]."""
+def begin(run: Run, wheel_momentum: Array | None = None) -> Score:
+    """Return the score at t = 0; wheel_momentum: (wheels,) [N m s]."""
     zero, no_torque = jnp.zeros_like(run.criteria.t_f), jnp.zeros(run.parts.plant.inputs)
     snapshot = _snapshot(run.parts, run.target_0, run.x0)
     measured = run.parts.sensors is not None
     start = Start(snapshot, run.parts.plant.inputs, wheel_momentum, measured=measured)
-    running = metrics.begin(start, run.criteria)
-    state = RunState(run.x0, no_torque, snapshot, running, jnp.int32(OK), jnp.full_like(zero, jnp.nan))
-    return _judged(run, state, run.target_0, zero, zero, no_torque)
+    score = Score(snapshot, metrics.begin(start, run.criteria), jnp.int32(OK), jnp.full_like(zero, jnp.nan))
+    return _judged(run, score, run.x0, run.target_0, zero, zero, no_torque)
 
 
-def advance(run: Run, state: RunState, now: Ticks, target: Any, flown: Flown) -> RunState:
-    """The state after an interval: metrics and status; target: of the reference at its start."""
-    kinematics, criteria = run.parts.controller.kinematics, run.criteria
+def advance(run: Run, score: Score, record: Record) -> Score:
+    """Return metrics and status after a control period, or after a step of the continuous loop."""
+    kinematics, criteria, now = run.parts.controller.kinematics, run.criteria, record.now
     target_next = run.parts.reference(now.t_next)
-    snapshot = _snapshot(run.parts, target_next, flown.x)
+    snapshot = _snapshot(run.parts, target_next, record.x_next)
+    begun, ended, length = (record.x, record.target), (record.x_next, target_next), now.t_next - now.t
 
     def errors() -> Errors:
-        return Errors(*kinematics.errors(state.x, target), *kinematics.errors(flown.x, target_next))
+        return Errors(*kinematics.errors(*begun), *kinematics.errors(*ended))
 
     def arrival() -> Arrival:
-        x = flown.x_at(criteria.t_f)
+        x = record.x_at(criteria.t_f)
         return Arrival(kinematics.errors(x, run.target_t_f)[0], kinematics.angle(x, run.target_t_f))
 
     attitude_error = knowledge_error = None
-    begun, ended, length = (state.x, target), (flown.x, target_next), now.t_next - now.t
     if criteria.pointing is not None:
         frame = criteria.pointing.frame
         attitude_error = partial(pointing.error_path, begun, ended, frame, length)
-        if flown.seen is not None:
-            knowledge_error = partial(pointing.constant_path, flown.seen.q, state.x.q, frame, length)
-    middle_angle = partial(kinematics.middle_angle, begun, ended, length)
+        if record.computer is not None:
+            knowledge_error = partial(pointing.constant_path, record.computer.seen.q, record.x.q, frame, length)
     interval = Interval(
-        now.t, now.t_next, state.snapshot, snapshot, errors, middle_angle, arrival,
-        state.u, flown.torques, attitude_error, knowledge_error,
+        now.t, now.t_next, score.snapshot, snapshot, errors, partial(kinematics.middle_angle, begun, ended, length),
+        arrival, record.last_torque, record.torques, attitude_error, knowledge_error,
     )  # fmt: skip
-    u_end = flown.torques.delivered[-1]
-    state = state._replace(
-        x=flown.x,
-        u=jnp.where(now.t_next > now.t, u_end, state.u),
-        snapshot=snapshot,
-        running=metrics.update(state.running, interval, criteria),
-    )
-    return _judged(run, state, target_next, now.t_next, flown.step, u_end, flown.memory)
+    score = score._replace(snapshot=snapshot, running=metrics.update(score.running, interval, criteria))
+    memory = None if record.computer is None else record.computer.law
+    u_end = record.torques.delivered[-1]
+    return _judged(run, score, record.x_next, target_next, now.t_next, record.step, u_end, memory)
 
 
-def row(
+def row(run: Run, record: Record) -> Log:
+    """Return the row of the history at the start of a control period, or of a step of the continuous loop."""
+    now, drive, wheels = record.now, record.drive, None
+    if drive is not None and drive.h is not None:
+        wheels = drive.h, run.parts.effective_actuators.at(drive, jnp.zeros_like(now.t))[0]
+    signals = record.d_hat, record.torques.delivered[0], record.u, record.s
+    return row_at(run, now.t, record.x, record.target, signals, now.t_next > now.t, record.walk, wheels)
+
+
+def row_at(
     run: Run, t: Scalar, x: Any, target: Any, signals: tuple, has_length: Array, walk: Any = None, wheels: Any = None
 ) -> Log:
-    """A row of the history at t [s].
+    """Return a row of the history.
 
-    signals: d_hat, u, commanded and s of `Log`; walk: random walk of the disturbance, (m,) [N m].
+    Args:
+        run: the constants of the run.
+        t: time [s].
+        x: true state.
+        target: of the reference.
+        signals: d_hat, u, commanded and s of `Log`.
+        has_length: see `Log`.
+        walk: random walk of the disturbance, (m,) [N m], or None.
+        wheels: momentum [N m s] and torque [N m] of the reaction wheels, or None.
     """
     d_hat, u, commanded, s = signals
     d = run.parts.disturbance(t, x)
@@ -170,17 +168,17 @@ def history(rows: Log, last: Log) -> Log:
 
 
 def finish(
-    run: Run, first: Snapshot, state: RunState, log: Log | None, samples: dict[str, Array] | None = None
+    run: Run, first: Snapshot, score: Score, log: Log | None, samples: dict[str, Array] | None = None
 ) -> Result:
-    """The result of a run in its state at t_end; first: at t = 0; samples: see `Result`."""
-    criteria, angle_at_t_f = run.criteria, state.running.arrival.angle
-    values = metrics.finish(state.running, criteria)
-    unbounded = (state.status == OK) & metrics.unbounded(values)
-    missed = (state.status == OK) & misses(angle_at_t_f, first.angle, criteria.settling_angle)
-    cut = ~jnp.isnan(run.gap) & ~(state.bad_time < run.gap)  # what went wrong without samples means nothing
-    status = jnp.where(unbounded, UNBOUNDED, jnp.where(missed, MISSED, state.status))
+    """Return the result of a run by its score at t_end; first: the snapshot at t = 0; samples: see `Result`."""
+    criteria, angle_at_t_f = run.criteria, score.running.arrival.angle
+    values = metrics.finish(score.running, criteria)
+    unbounded = (score.status == OK) & metrics.unbounded(values)
+    missed = (score.status == OK) & misses(angle_at_t_f, first.angle, criteria.settling_angle)
+    cut = ~jnp.isnan(run.gap) & ~(score.bad_time < run.gap)  # what went wrong without samples means nothing
+    status = jnp.where(unbounded, UNBOUNDED, jnp.where(missed, MISSED, score.status))
     status = jnp.where(cut, UNFINISHED, status).astype(jnp.int32)
-    bad_time = jnp.where(unbounded, criteria.t_end, jnp.where(missed, criteria.t_f, state.bad_time))
+    bad_time = jnp.where(unbounded, criteria.t_end, jnp.where(missed, criteria.t_f, score.bad_time))
     bad_time = jnp.where(cut, run.gap, bad_time)
     return Result(values, status, bad_time, log, samples or {})
 
@@ -196,18 +194,19 @@ def _snapshot(parts: Parts, target: Any, x: Any) -> Snapshot:
     return Snapshot(angle, plant.speed(x), guards.norm(plant.momentum(x)), plant.modal_amplitude(x))
 
 
-def _judged(run: Run, state: RunState, target: Any, t: Scalar, step: Scalar, u: Array, memory: Any = None) -> RunState:
-    """Return the state at t with its status and first bad time; the first thing that goes wrong stays.
+def _judged(
+    run: Run, score: Score, x: Any, target: Any, t: Scalar, step: Scalar, u: Array, memory: Any = None
+) -> Score:
+    """Return the score with its status and first bad time at t; the first thing that goes wrong stays.
 
-    memory: of the law. Exported code rejects a memory that is not finite, so the simulated run counts as diverged.
+    x: true state. memory: of the law. Exported code rejects a memory that is not finite, so the simulated run counts as
+    diverged.
     """
     law, plant = run.parts.controller, run.parts.plant
-    numbers = [
-        leaf for leaf in jax.tree.leaves((state.x, u, memory)) if jnp.issubdtype(jnp.asarray(leaf).dtype, jnp.inexact)
-    ]
+    numbers = [leaf for leaf in jax.tree.leaves((x, u, memory)) if jnp.issubdtype(jnp.asarray(leaf).dtype, jnp.inexact)]
     finite = jnp.isfinite(sum(jnp.sum(leaf) for leaf in numbers))
-    fast = plant.too_fast(state.x, step)
-    near = ~(law.clearance(state.x, target) / run.clearance_unit >= SINGULAR_CLEARANCE)
+    fast = plant.too_fast(x, step)
+    near = ~(law.clearance(x, target) / run.clearance_unit >= SINGULAR_CLEARANCE)
     code = jnp.where(~finite, DIVERGED, jnp.where(near, SINGULAR, jnp.where(fast, TOO_FAST, OK))).astype(jnp.int32)
-    first = (state.status == OK) & (code != OK)
-    return state._replace(status=jnp.where(first, code, state.status), bad_time=jnp.where(first, t, state.bad_time))
+    first = (score.status == OK) & (code != OK)
+    return score._replace(status=jnp.where(first, code, score.status), bad_time=jnp.where(first, t, score.bad_time))

@@ -12,6 +12,7 @@ from ptsmc_jax.devices.actuators import ActuatorState
 from ptsmc_jax.numerics import attitude, matrices
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.computer import Computer
+from ptsmc_jax.simulation.control_period import State
 
 
 class Carry(NamedTuple):
@@ -21,6 +22,12 @@ class Carry(NamedTuple):
     acting: ActuatorState  # true state of the actuators, without commands on their way
     computer: Computer
     model: ActuatorState  # the flight computer's own of its actuators, with them; momentum it measures
+
+    @classmethod
+    def of(cls, state: State) -> "Carry":
+        """Return the carry of a state of the sampled loop, whose actuators are as the flight computer knows them."""
+        actuators, computer = state.actuators, state.computer._replace(applied=state.applied)
+        return cls(state.x, actuators._replace(queue=None), computer, actuators._replace(h=None))
 
 
 class _Stored:

@@ -29,10 +29,9 @@ from ptsmc_jax.batching import lapack
 from ptsmc_jax.devices.sensors import Reading
 from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.numerics import integrators, stacking
-from ptsmc_jax.simulation.computer import star_state
+from ptsmc_jax.simulation.control_period import PeriodMotion, star_state
 from ptsmc_jax.simulation.interval import Criteria, integral_in_window
 from ptsmc_jax.simulation.rollout import Log, Parts
-from ptsmc_jax.simulation.sampled import PeriodMotion
 
 UNKNOWN = 1e5  # 1 sigma of a state at t = 0, in those of its sensor: of no weight beside the first sample
 EXACT = 1e-10  # 1 sigma of a sensor without noise, in those of what is read before the first sample

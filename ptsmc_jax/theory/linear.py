@@ -1,8 +1,8 @@
 """The sampled loop linearised by the code that flies it, and opened: at the plant's input and at the sensors.
 
-A control period takes z, local coordinates of all that the loop carries, to z' (`jax.jacfwd` of `computer.decide` and
-`sampled.PeriodMotion`): the true state x, the state of the actuators, and what the flight computer keeps, its own model
-of the actuators among it. Closed are
+A control period takes z, local coordinates of all that the loop carries, to z' (`jax.jacfwd` of the steps of
+`control_period`): the true state x, the state of the actuators, and what the flight computer keeps, its own model of
+the actuators among it. Closed are
 
     z' = A z + B x_seen + N u_new + O u_old + E d,    u = C z + D x_seen,
 
@@ -30,8 +30,16 @@ from ptsmc_jax.numerics import stacking
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
 from ptsmc_jax.simulation import clock
 from ptsmc_jax.simulation.assembly import Parts
-from ptsmc_jax.simulation.computer import Computer, Decision, Period, assumed_torque, boot, decide, schedule
-from ptsmc_jax.simulation.sampled import PeriodMotion
+from ptsmc_jax.simulation.computer import Computer, Decision, Period, decide
+from ptsmc_jax.simulation.control_period import (
+    PeriodMotion,
+    State,
+    Tick,
+    assumed_torque,
+    control_period,
+    schedule,
+    start,
+)
 from ptsmc_jax.theory.carries import Carry, Local
 
 NODES = 0.5 - 0.5 * np.cos(np.pi * np.arange(13) / 12)  # of a period: Chebyshev's, for what acts late within one
@@ -71,10 +79,10 @@ class Nominal(NamedTuple):
 
 
 def quiet(parts: Parts) -> Parts:
-    """The parts without noise and disturbance."""
+    """The parts without noise, disturbance and timing jitter."""
     sensors = None if parts.sensors is None else parts.sensors.in_step().quiet()
     nothing = jax.tree_util.Partial(_nothing, jnp.zeros(parts.plant.inputs))
-    return replace(parts, sensors=sensors, disturbance=nothing, walk_rate=None)
+    return replace(parts, sensors=sensors, disturbance=nothing, walk_rate=None, jitter=None)
 
 
 def _nothing(zero: Array, t: Scalar, x: Any) -> Array:
@@ -86,22 +94,15 @@ def nominal(parts: Parts) -> Nominal:
     assert parts.clock.sampled
     parts = quiet(parts)
     ticks = parts.clock.ticks(parts.controller.t_f, parts.controller.delta)
-    listed, period_of, started = schedule(parts, ticks)
-    k2, actuators = parts.observer.error_bound(), parts.effective_actuators
     x0 = parts.controller.kinematics.align(parts.initial, parts.reference(jnp.zeros_like(parts.t_end)))
-    model = actuators.begin(parts.plant.inputs)
-    computer = boot(parts, np.uint32(0), np.uint32(0), parts.plant.visible(x0), started)
+    vehicle, first = start(parts, ticks, x0, np.uint32(0), np.uint32(0))
 
-    def step(carry: Carry, tick: tuple) -> tuple[Carry, Nominal]:
-        period = period_of(tick)
-        decision, computer, model = _computed(parts, k2, period, carry, parts.plant.visible(carry.x))
-        wanted = decision.u if carry.model.queue is None else carry.model.queue[0]
-        x, acting = _acted(parts, period, carry, decision.w, [(wanted, period.now.t, period.length)])
-        after = Carry(x, acting, computer, model)
-        return after, Nominal(period, carry, after, wanted)
+    def step(state: State, tick: Tick) -> tuple[State, Nominal]:
+        after, record = control_period(vehicle, state, tick)
+        arriving = record.u if state.actuators.queue is None else state.actuators.queue[0]
+        return after, Nominal(vehicle.period(tick), Carry.of(state), Carry.of(after), arriving)
 
-    first = Carry(x0, model._replace(queue=None), computer, model._replace(h=None))
-    return stacking.scan(step, first, listed)[1]
+    return stacking.scan(step, first, schedule(ticks))[1]
 
 
 nominal_jit = programs.jit(nominal, compiler_options=programs.QUICKLY)
@@ -110,7 +111,10 @@ nominal_jit = programs.jit(nominal, compiler_options=programs.QUICKLY)
 def _computed(
     parts: Parts, k2: Any, period: Period, carry: Carry, seen: Any
 ) -> tuple[Decision, Computer, ActuatorState]:
-    """The flight computer's part of a period; seen: the state as the sensors see it."""
+    """Return what the flight software decides and remembers, by its own model of the actuators.
+
+    seen: the true state, as far as sensors see it.
+    """
     actuators, dt = parts.effective_actuators, period.length
     decision, computer = decide(parts, k2, period, carry.computer, seen)
     model = carry.model._replace(h=carry.acting.h)

@@ -18,7 +18,7 @@ from ptsmc_jax.numerics import draws
 from ptsmc_jax.plants.rigid_body import AttitudeState
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.signals import disturbances
-from ptsmc_jax.simulation import catalogues, rollout, sampled
+from ptsmc_jax.simulation import catalogues, control_period, rollout
 from tests.helpers import FULL_INERTIA, fly, parts, short, ticks_of, vector, with_controller
 
 PYRAMID = formulas.pyramid()
@@ -95,7 +95,7 @@ def test_effort_follows_what_a_lag_delivers_within_the_period(share):
     lag, v, c, u = 0.2, vector([0.1, -0.4, 0.0]), vector([0.5, -0.2, 0.3]), vector([0.0] * 3)
     dt = share * lag
     device = actuators.Actuators(lag=vector(lag))
-    torques = sampled.period_torques(device, actuators.Drive(v, c, None, jnp.asarray(False)), u, vector(dt))
+    torques = control_period.period_torques(device, actuators.Drive(v, c, None, jnp.asarray(False)), u, vector(dt))
     got = dt * sum(w * np.sum(np.abs(at)) for w, at in zip(torques.weights, torques.delivered, strict=True))
     exact = float(np.sum(np.abs(c * dt + (c - v) * lag * np.expm1(-share))))
     assert 0.0 < abs(got - exact) < dt**5 / 2880 * float(np.sum(np.abs(c - v))) / lag**4

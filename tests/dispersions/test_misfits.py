@@ -15,7 +15,7 @@ from ptsmc_jax.dispersions.numbers import FARTHEST
 from ptsmc_jax.dispersions.quantities import QUANTITIES, read_columns
 from ptsmc_jax.numerics import draws, paths
 from ptsmc_jax.plants import flexible_body
-from ptsmc_jax.simulation import sampled
+from ptsmc_jax.simulation import control_period
 from tests.helpers import fly, short, vector
 
 FLIGHT = {
@@ -260,7 +260,7 @@ def test_samples_that_come_early_or_late_by_hand():
     run = runs.fly(ready, 3, 2)
     jitter = float(ready.dispersion.values(run.parts)["timing_jitter"])
     assert 0.2 <= jitter <= 0.4
-    key, h, x = sampled.jitter_stream(3, 2), 0.1, np.array([1.0, -0.3])
+    key, h, x = control_period.jitter_stream(3, 2), 0.1, np.array([1.0, -0.3])
     nodes = np.maximum(4.55 + h * np.arange(-46, 26), 0.0).clip(max=7.0)
     most = np.minimum(jitter * h, np.minimum(nodes, 7.0 - nodes) / 2.0)
     number = np.arange(-46, 26)

@@ -13,7 +13,7 @@ from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import runs
 from ptsmc_jax.numerics import integrators
 from ptsmc_jax.plants import flexible_body, rigid_body
-from ptsmc_jax.simulation import sampled
+from ptsmc_jax.simulation import control_period
 from tests.helpers import fly, vector
 
 FINE = 40  # steps a period
@@ -97,7 +97,7 @@ def test_the_steps_that_a_study_takes_keep_the_modes_to_a_millionth(flown):
         def period(x, now):
             t, t_next, u = now
             drive, _ = actuators.command(actuators.begin(3), u, x.w, t, t_next - t, jnp.ones(()))
-            x = sampled.PeriodMotion(made, t, x, drive, None).at(t_next)
+            x = control_period.PeriodMotion(made, t, x, drive, None).at(t_next)
             return x, x
 
         return jax.lax.scan(period, x, (t[:-1], t[1:], u[:-1]))[1]

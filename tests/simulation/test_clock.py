@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from ptsmc_jax import scenario
 from ptsmc_jax.simulation import clock, rollout
-from ptsmc_jax.simulation.computer import schedule
+from ptsmc_jax.simulation.control_period import schedule, start
 from tests.helpers import ticks_of, vector
 
 
@@ -103,9 +103,10 @@ def test_what_is_computed_in_a_first_period_that_is_a_whole_one_has_the_slopes_o
 
     @jax.jit
     def computed(delta):
-        listed, period_of, _ = schedule(parts, parts.clock.ticks(parts.controller.t_f, delta))
-        first, second = (jax.tree.map(lambda v, k=k: v[k], listed) for k in starts)
-        return period_of(first).assumed_length, period_of(second).matrix
+        ticks = parts.clock.ticks(parts.controller.t_f, delta)
+        vehicle, _ = start(parts, ticks, parts.initial, 0, 0)
+        first, second = (jax.tree.map(lambda v, k=k: v[k], schedule(ticks)) for k in starts)
+        return vehicle.period(first).assumed_length, vehicle.period(second).matrix
 
     at = vector(delta)
     starts = np.flatnonzero(np.asarray(ticks_of(parts.clock, vector(t_f), at).t_next) > 0.0)[:2]

@@ -1,0 +1,296 @@
+"""One control period of the sampled loop. `control_period` shows all of it, in the order in which it happens.
+
+The sampled loop, the linearisation of `theory.linear` and the test vectors of the C export call it.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from ptsmc_jax.devices.actuators import Actuators, ActuatorState, Drive
+from ptsmc_jax.devices.ticks import Ticks
+from ptsmc_jax.numerics import draws, integrators
+from ptsmc_jax.numerics.draws import WholeNumber
+from ptsmc_jax.numerics.pytrees import Scalar
+from ptsmc_jax.observers.base import Bound
+from ptsmc_jax.simulation.assembly import Parts
+from ptsmc_jax.simulation.computer import OURS, Computer, Period, Software
+from ptsmc_jax.simulation.interval import Torques
+
+DISTURBANCE_WALK = "disturbance_walk"
+SAMPLE_TIMES = "timing_jitter_samples"
+
+
+class Tick(NamedTuple):
+    """A control period at its nominal times, or all those of a run."""
+
+    now: Ticks
+    dt_before: Array  # length of the period before [s]
+    partial_before: Array  # bool: that one is the partial first one, see `Ticks.partial`
+
+
+class State(NamedTuple):
+    """The state of the sampled loop between two control periods."""
+
+    x: Any  # true state of the plant
+    torque: Array  # (m,) delivered at the end of the last period [N m]
+    computer: Computer  # memory of the flight software; its `applied` is None if the actuators hold `torque`
+    actuators: ActuatorState
+    walk: Array | None  # (m,) random walk of the disturbance [N m]; None: there is none
+    star_x: Any  # `star_state` of the last period
+    offset: Array | None  # delay of the next sample after its nominal time [s]; None: no timing jitter
+
+    @property
+    def applied(self) -> tuple[Array, Array | None]:
+        """Mean torque [N m] and wheel momentum [N m s] in the last period, as the flight software knows them."""
+        return (self.torque, None) if self.computer.applied is None else self.computer.applied
+
+
+class Record(NamedTuple):
+    """What happened in a control period, or in an integration step of the continuous loop."""
+
+    now: Ticks  # true times
+    x: Any  # true state at the start
+    target: Any  # of the reference at the start
+    d_hat: Array  # (m,) estimated disturbance [N m]
+    u: Array  # (m,) commanded torque [N m]
+    s: Array  # (m,) sliding variable
+    last_torque: Array  # (m,) delivered at the end of the interval before [N m]
+    torques: Torques
+    x_next: Any  # true state at the end
+    x_at: Callable[[Scalar], Any]  # time in the interval [s] -> true state then
+    step: Scalar  # longest integration step [s]
+    computer: Computer | None = None  # memory of the flight software after its sample
+    drive: Drive | None = None
+    walk: Array | None = None  # (m,) random walk of the disturbance [N m]
+
+
+class Vehicle(NamedTuple):
+    """The constants of a sampled run."""
+
+    parts: Parts
+    software: Software
+    k2: Bound  # on the error of the estimated disturbance
+    matrix: Array  # `Observer.update_matrix` of a whole period
+    first_matrix: Array  # of the partial first period
+    walk_key: draws.Key | None  # None: no random walk of the disturbance
+    jitter_key: draws.Key | None  # None: samples come at their nominal times
+
+    def period(self, tick: Tick) -> Period:
+        """Return the control period of a tick, at its nominal times."""
+        matrix = jnp.where(tick.partial_before, self.first_matrix, self.matrix)
+        return Period(tick.now, tick.dt_before, matrix, self.parts.period)
+
+    def offset(self, t: Scalar, sample: Array) -> Array | None:
+        """Return the delay [s] of a sample after its nominal time t [s]; zero at both ends of the run."""
+        if self.jitter_key is None:
+            return None
+        parts = self.parts
+        largest = jnp.minimum(parts.jitter * parts.period, jnp.minimum(t, parts.t_end - t) / 2.0)
+        return largest * (2.0 * draws.uniforms(self.jitter_key, 1, sample)[0] - 1.0)
+
+    def walked(self, walk: Array | None, dt: Scalar, sample: Array) -> Array | None:
+        """Return the random walk of the disturbance, (m,) [N m], in a period of dt [s]."""
+        if walk is None or self.walk_key is None:
+            return None
+        return walk + self.parts.walk_rate * dt * draws.normals(self.walk_key, walk.size, sample)
+
+
+def control_period(vehicle: Vehicle, state: State, tick: Tick) -> tuple[State, Record]:
+    """Simulate one control period: measure, estimate, command, limit, delay, allocate, act, integrate.
+
+    Args:
+        vehicle: the constants of the run.
+        state: at the sample that begins the period.
+        tick: the period.
+
+    Returns:
+        The state at the next sample, and what happened until then. Metrics and history are made of the latter.
+    """
+    parts, actuators, plant = vehicle.parts, vehicle.parts.effective_actuators, vehicle.parts.plant
+    period = vehicle.period(tick)
+
+    # with timing jitter, samples come early or late; flight software assumes the nominal times of `period`
+    now, next_offset = period.now, vehicle.offset(period.now.t_next, period.now.sample + 1)
+    if next_offset is not None:
+        now = now._replace(t=now.t + state.offset, t_next=now.t_next + next_offset)
+    dt = now.t_next - now.t
+
+    # flight software: measure, estimate the disturbance, command a torque, filter it
+    memory = state.computer._replace(applied=state.applied)
+    decision, computer = vehicle.software.decide(
+        parts, vehicle.k2, period, memory, plant.visible(state.x), state.star_x, state.actuators
+    )
+
+    # actuators: limit, delay, allocate to the channels, quantise, limit the channels
+    drive, queue = actuators.command(
+        state.actuators, decision.u, decision.w, now.t, period.assumed_length, now.noise_weight
+    )
+    if decision.channels is not None:
+        drive = drive._replace(c=decision.channels)
+    torques = period_torques(actuators, drive, decision.u, dt)
+
+    # true plant: integrate under the torques and the disturbance
+    walk = vehicle.walked(state.walk, dt, now.sample)
+    applied = None if actuators.holds else assumed_torque(actuators, drive, period.length)
+    motion = PeriodMotion(parts, now.t, state.x, drive, walk)
+    after = State(
+        x=motion.at(now.t_next),
+        torque=jnp.where(now.t_next > now.t, torques.delivered[-1], state.torque),
+        computer=computer._replace(applied=applied),
+        actuators=actuators.end(state.actuators, drive, queue, dt),
+        walk=walk,
+        star_x=star_state(parts, now, motion.at),
+        offset=next_offset,
+    )
+    record = Record(
+        now=now,
+        x=state.x,
+        target=decision.target if next_offset is None else parts.reference(now.t),  # of the true time
+        d_hat=decision.d_hat,
+        u=decision.u,
+        s=decision.s,
+        last_torque=state.torque,
+        torques=torques,
+        x_next=after.x,
+        x_at=motion._replace(rolled=True).at,  # called once in a run
+        step=dt / parts.substeps,
+        computer=computer,
+        drive=drive,
+        walk=walk,
+    )
+    return after, record
+
+
+def start(
+    parts: Parts, ticks: Ticks, x0: Any, seed: WholeNumber, trial: WholeNumber, software: Software = OURS
+) -> tuple[Vehicle, State]:
+    """Return the constants of a sampled run, and its state before the first control period.
+
+    Args:
+        parts: of the run.
+        ticks: control periods of the run.
+        x0: true state at t = 0.
+        seed: names the random numbers, together with `trial`.
+        trial: number of the trial.
+        software: the flight software.
+    """
+    lengths, actuators, inputs = ticks.t_next - ticks.t, parts.effective_actuators, parts.plant.inputs
+    # both matrices outside the loop, by one piece of code
+    first_length = jnp.sum(jnp.where(ticks.partial, lengths, 0.0))
+    matrices = jax.lax.map(parts.observer.update_matrix, jnp.stack([parts.period, first_length]))
+    walk_key = None if parts.walk_rate is None else walk_stream(seed, trial)
+    jitter_key = None if parts.jitter is None else jitter_stream(seed, trial)
+    vehicle = Vehicle(parts, software, parts.observer.error_bound(), *matrices, walk_key, jitter_key)
+
+    first = first_period(ticks)
+    computer = software.boot(parts, seed, trial, parts.plant.visible(x0), first)
+    state = State(
+        x=x0,
+        torque=jnp.zeros(inputs),
+        computer=computer._replace(applied=None) if actuators.holds else computer,
+        actuators=actuators.begin(inputs),
+        walk=None if walk_key is None else jnp.zeros(inputs),
+        star_x=star_state(parts, first, lambda t: x0),
+        offset=vehicle.offset(ticks.t[0], ticks.sample[0]),
+    )
+    return vehicle, state
+
+
+def schedule(ticks: Ticks) -> Tick:
+    """Return the control periods of a run, for a scan over `control_period`; times in [s]."""
+    lengths = ticks.t_next - ticks.t
+    length_before = jnp.concatenate([jnp.zeros(1), lengths[:-1]])
+    return Tick(ticks, length_before, jnp.concatenate([jnp.ones(1, bool), ticks.partial[:-1]]))
+
+
+def first_period(ticks: Ticks) -> Ticks:
+    """Return the first control period that has a length."""
+    return jax.tree.map(lambda v: v[jnp.argmax(ticks.t_next > ticks.t)], ticks)
+
+
+class PeriodMotion(NamedTuple):
+    """The motion of the true plant in a control period, under the drive of its actuators and the disturbance."""
+
+    parts: Parts
+    t: Scalar  # start of the period [s]
+    x: Any  # true state then
+    drive: Drive
+    walk: Array | None  # additional disturbance, constant over the period, (m,) [N m]; None: there is none
+    rolled: bool = False  # integrate by a loop over the stages: slower, but less to compile
+
+    def at(self, time: Scalar) -> Any:
+        """Return the state at a time [s] in the period."""
+        return self.after(time - self.t)
+
+    def after(self, dt: Scalar) -> Any:
+        """Return the state dt [s] into the period."""
+        parts, drive, walk = self.parts, self.drive, self.walk
+        actuators = parts.effective_actuators
+        step = dt / parts.substeps
+
+        def substep(k: Scalar, x: Any) -> Any:
+            start, applied = self.t + k * step, actuators.over(drive, k * step, step)
+
+            def rate(time: Scalar, y: Any) -> Any:
+                d = parts.disturbance(time, y)
+                torque = applied.at(time - start, parts.plant.velocity(y))
+                return parts.plant.rate(time, y, torque, d if walk is None else d + walk)
+
+            return integrators.rk4(rate, start, x, step, rolled=self.rolled or parts.plant.of_own_functions)
+
+        if parts.substeps == 1:
+            return parts.plant.normalise(substep(jnp.zeros_like(dt), self.x))
+        starts = jnp.arange(parts.substeps, dtype=dt.dtype)
+        return parts.plant.normalise(jax.lax.scan(lambda x, k: (substep(k, x), None), self.x, starts)[0])
+
+
+def star_state(parts: Parts, now: Ticks, x_at: Callable[[Scalar], Any]) -> Any:
+    """Return the true state when a star tracker with its own sample times samples in a period, or None.
+
+    The flight software uses it at the next sample.
+
+    Args:
+        parts: of the run.
+        now: the period.
+        x_at: time in the period [s] -> the true state then.
+    """
+    if getattr(parts.sensors, "own_times", None) is None:
+        return None
+    return parts.plant.visible(x_at(now.t_next - parts.sensors.star_age(now.sample + 1, now.t_next - now.t)))
+
+
+def assumed_torque(actuators: Actuators, drive: Drive, dt: Scalar) -> tuple[Array, Array | None]:
+    """Return `Computer.applied` of a period of dt [s]: what the flight software knows of the torque in it."""
+    torque = actuators.assumed(drive, dt)
+    return torque.mean, torque.middle
+
+
+def period_torques(actuators: Actuators, drive: Drive, u: Array, dt: Scalar) -> Torques:
+    """Return commanded and delivered torques of a control period of dt [s], and the momentum of the wheels in it."""
+    ends = actuators.at(drive, jnp.zeros_like(dt)), actuators.at(drive, dt)
+    nodes, weights, momentum, torque = ends[:1], (1.0,), None, None
+    if actuators.moves or actuators.wheels is not None:
+        # a lag may change the sign of the torque within the period, where the momentum may then peak
+        middle = actuators.at(drive, dt / 2)
+        if actuators.moves:
+            nodes, weights = (ends[0], middle, ends[1]), (1 / 6, 4 / 6, 1 / 6)
+        stored = [momentum for _, momentum in (middle, ends[1]) if momentum is not None]
+        if stored:
+            momentum = jnp.stack(stored)
+            torque = jnp.stack([ends[0][0], ends[1][0]])  # it is monotonic in between, so its ends bound it
+    delivered = tuple(actuators.on_body(v) for v, _ in nodes)
+    return Torques((u,) * len(nodes), delivered, weights, drive.limited, momentum, torque)
+
+
+def walk_stream(seed: WholeNumber, trial: WholeNumber) -> draws.Key:
+    """Return the key of a trial's random walk of the disturbance."""
+    return draws.stream(seed, trial, DISTURBANCE_WALK)
+
+
+def jitter_stream(seed: WholeNumber, trial: WholeNumber) -> draws.Key:
+    """Return the key of the deviations of a trial's samples from their nominal times."""
+    return draws.stream(seed, trial, SAMPLE_TIMES)
