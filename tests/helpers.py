@@ -186,7 +186,7 @@ def parts(
             kinematics(body), *(vector(v) for v in (t_f, eta, delta, k1, sign_width, surface_rate))
         ),
         observer=nonlinear.NonlinearObserver(body, vector([gain] * 3), vector(rate_bound), vector(0.0)),
-        sensors=None if noise is None else sensors.Sensors(*(vector(v) for v in noise)),
+        sensors=sensors.PerfectSensors() if noise is None else sensors.Sensors(*(vector(v) for v in noise)),
         clock=timing,
         initial=rigid_body.AttitudeState(vector(q), vector(rate)),
         t_end=vector(t_end),
@@ -241,7 +241,7 @@ def chain_parts(
         reference=references.Origin(),
         controller=law,
         observer=observer or none.NoObserver(model, vector(bound)),
-        sensors=None if noise is None else sensors.StateSensor(vector(noise)),
+        sensors=sensors.PerfectSensors() if noise is None else sensors.StateSensor(vector(noise)),
         clock=timing,
         initial=vector(x0),
         t_end=vector(t_end),

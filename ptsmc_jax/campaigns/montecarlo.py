@@ -139,7 +139,7 @@ def _values(
     by_column = dispersion.values(drawn, set(about.given) - {RATE_BIAS})
     if dispersion.own is not None:
         by_column |= dispersion.own.values(coordinates[OWN])
-    return by_column if drawn.sensors is None else by_column | drawn.sensors.drawn(about.seed, about.trial)
+    return by_column | drawn.sensors.drawn(about.seed, about.trial)
 
 
 def run(

@@ -60,7 +60,7 @@ class Run:
     @property
     def has_floor(self) -> bool:
         """Whether there is a `floor`."""
-        known = self.parts.sensors is None or hasattr(self.parts.sensors, "reading")
+        known = self.parts.sensors.perfect or hasattr(self.parts.sensors, "reading")
         return known and self.status in montecarlo.FINISHED
 
     def columns(self) -> dict[str, np.ndarray]:

@@ -4,7 +4,7 @@ Each device is off where it is None. A channel is what makes torque: a body axis
 derivative of its command.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import NamedTuple
 
 import jax
@@ -55,11 +55,6 @@ class AppliedTorque(NamedTuple):
             impulse = impulse + self.slope * (s * (s - self.dt) / 2)
         return u if self.stored is None else u - attitude.cross(w, self.stored - impulse)
 
-    @property
-    def middle(self) -> Array | None:
-        """Mean of the momentum A h at both ends [N m s]; None without wheels."""
-        return None if self.stored is None else self.stored - self.mean * self.dt / 2
-
 
 @pytree
 @dataclass(frozen=True)
@@ -79,15 +74,24 @@ class Actuators:
     spare_allocations: Leaf | None = None  # (wheels, wheels, 3) without each wheel, where failures are known
 
     @property
+    def ideal(self) -> bool:
+        """Whether they deliver every command at once and exactly."""
+        return not self.delay and all(getattr(self, one.name) is None for one in fields(self) if one.name != "delay")
+
+    @property
     def nominal(self) -> "Actuators":
         """The actuators as the flight software knows them: without their misfits."""
         return replace(self, scale=None, directions=None, failure_times=None)
 
-    def assumed(self, drive: Drive, dt: Scalar) -> AppliedTorque:
-        """The torque of a period dt [s] as far as the flight software knows: `over` of `nominal`."""
+    def assumed(self, drive: Drive, dt: Scalar) -> tuple[Vector, Vector | None]:
+        """Return what the flight software knows of a period of dt [s].
+
+        That is the mean torque (m,) [N m], and the wheels' momentum in its middle (m,) [N m s] or None.
+        """
         if self.spare_allocations is None:  # then it does not know of failures
             drive = drive._replace(works=None)
-        return self.nominal.over(drive, jnp.zeros_like(dt), dt)
+        torque = self.nominal.over(drive, jnp.zeros_like(dt), dt)
+        return torque.mean, None if torque.stored is None else torque.stored - torque.mean * dt / 2
 
     def delivered(self, drive: Drive, v: Array) -> Array:
         """True torques of the channels for nominal ones [N m], or of anything linear in them, (channels,)."""
@@ -229,10 +233,6 @@ class Actuators:
             twice = self.lag * (gap * span - area)
         torque = c - left if ramping is None else jnp.where(ramping, torque_on_ramp, c - left)
         return torque, first + c * span - area, second + first * span + c * (span * span / 2) - twice
-
-    def torque(self, drive: Drive, s: Scalar) -> Vector:
-        """Torque on the body s [s] into the period [N m]."""
-        return self.on_body(self.at(drive, s)[0])
 
     def at(self, drive: Drive, s: Scalar) -> tuple[Array, Array | None]:
         """True torque of each channel s [s] into the period [N m], and the momentum of each wheel [N m s] or None."""

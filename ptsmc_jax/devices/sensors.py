@@ -8,7 +8,7 @@ are weighted by the period's share, so that nothing jumps where that period vani
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -32,6 +32,8 @@ class Sensor(ABC):
 
     A true state x is what sensors can see of it, `Plant.visible`.
     """
+
+    perfect: ClassVar[bool] = False  # the law sees the true state
 
     @abstractmethod
     def begin(self, seed: WholeNumber, trial: WholeNumber, x0: Any, now: Ticks) -> Any:
@@ -64,6 +66,25 @@ class Sensor(ABC):
     def drawn(self, seed: WholeNumber, trial: WholeNumber) -> dict[str, Array]:
         """Numbers that the sensor draws once a trial, such as a bias [rad/s], by the names of a row's columns."""
         return {}
+
+
+@pytree
+@dataclass(frozen=True)
+class PerfectSensors(Sensor):
+    """No sensors: the law sees the true state."""
+
+    perfect: ClassVar[bool] = True
+
+    def begin(self, seed: WholeNumber, trial: WholeNumber, x0: Any, now: Ticks) -> None:
+        """No memory."""
+
+    def measure(self, memory: None, x: Any, now: Ticks, dt: Scalar, star_x: None = None) -> tuple[Any, None]:
+        """Return the true state; dt in [s]."""
+        return x, None
+
+    def quiet(self) -> "PerfectSensors":
+        """Return the same."""
+        return self
 
 
 class Reading(NamedTuple):

@@ -134,7 +134,7 @@ def _of_disturbance(name: str, what: Literal["phase", "amplitude"], **others: An
 
 def channels(parts: Parts) -> Float[Array, "m channels"]:
     """Return the directions (m, channels) [-] of body axes, or wheels, that flight software assumes."""
-    wheels = parts.effective_actuators.wheels
+    wheels = parts.actuators.wheels
     return jnp.eye(parts.plant.inputs) if wheels is None else wheels.axes
 
 
@@ -143,17 +143,17 @@ def _size(parts: Parts) -> int:
 
 
 def _with_actuators(parts: Parts, **changes: Any) -> Parts:
-    return replace(parts, actuators=replace(parts.effective_actuators, **changes))
+    return replace(parts, actuators=replace(parts.actuators, **changes))
 
 
 def _scale(parts: Parts) -> Numbers:
-    scale = parts.effective_actuators.scale
+    scale = parts.actuators.scale
     return jnp.ones(_size(parts)) if scale is None else scale
 
 
 def _directions(parts: Parts) -> Numbers:
     """Return the true directions of the channels, one after the other, (3 channels,) [-]."""
-    directions = parts.effective_actuators.directions
+    directions = parts.actuators.directions
     return jnp.ravel((channels(parts) if directions is None else directions).T)
 
 
@@ -166,7 +166,7 @@ def _turned_channels(random: Random, nominal: Numbers, parts: Parts) -> Numbers:
 
 def _failure(parts: Parts) -> Numbers:
     """Return the time when a wheel fails [s] and its number from 1 on, (2,); infinite and 0: none does."""
-    fails = parts.effective_actuators.failure_times
+    fails = parts.actuators.failure_times
     if fails is None:
         return jnp.array([jnp.inf, 0.0])
     wheel = jnp.argmin(fails).astype(float) + 1.0
@@ -286,7 +286,7 @@ QUANTITIES: dict[str, Quantity] = {
         hardware=True,
     )._replace(columns=lambda parts: [] if getattr(parts.sensors, "filter", None) is None else list(_OUTAGE)),
     "wheel_failure": Quantity(
-        lambda parts: [] if parts.effective_actuators.wheels is None else list(_FAILURE),
+        lambda parts: [] if parts.actuators.wheels is None else list(_FAILURE),
         _failure,
         _with_failure,
         _any_wheel,

@@ -130,7 +130,6 @@ def wheel_torque(parts: Parts, log: Log) -> Figure:
 def _of_wheels(parts: Parts, log: Log, which: int, title: str, quantity: str, unit: str) -> Figure:
     """A quantity of each wheel over time, the first or second of `log.wheels`, with its limit, a field of `Wheels`."""
     assert log.wheels is not None
-    assert parts.actuators is not None
     figure, axes = figure_of(title, f"{quantity} [{unit}]")
     _components(axes, log.t, log.wheels[which], "hv"[which])
     limit = getattr(parts.actuators.wheels, f"{quantity}_limit", None)

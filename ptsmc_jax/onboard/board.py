@@ -102,7 +102,8 @@ def shapes(tree: Any) -> Any:
 
 def board(parts: Parts) -> Board:
     """The flight computer of parts whose loop is sampled."""
-    observer, law, device = parts.observer, parts.controller, parts.actuators
+    observer, law = parts.observer, parts.controller
+    device = None if parts.actuators.ideal else parts.actuators
     parameters, inputs = known(parts), observer.model.inputs
     computer = Board(parameters, observer.model.attitude, rules=derived.rules(parts))
     if parameters["filter"] is not None:
@@ -269,9 +270,9 @@ def _observing(computer: Board, observer: Observer, device: Actuators | None) ->
             if measured:
                 h, *v = read[2 * size + 1 :][: len(measured)]
                 drive = Drive(v[0] if v else None, applied, h, jnp.zeros((), bool))
-                torque = parameters["actuators"].assumed(drive, dt)
+                torque, stored = parameters["actuators"].assumed(drive, dt)
                 turning = (model.velocity(before) + model.velocity(now)) / 2
-                applied = torque.mean - jnp.cross(turning, torque.middle)
+                applied = torque - jnp.cross(turning, stored)
             impulse = model.unexplained_impulse(t, before, now, applied, dt)
             return known.update(parameters["observer_matrix"], memory, impulse, t, dt)
 

@@ -21,10 +21,9 @@ Rule = Callable[[Given], Given]  # of all parameters: all of them, those that fo
 def rules(parts: Parts) -> list[Rule]:
     """The rules for the flight computer of these parts, each for what the ones before it give."""
     found: list[Rule] = [_inverses, _estimation]
-    device = parts.actuators
     if getattr(parts.sensors, "filter", None) is not None:
         found.append(_filtering(parts.sensors))
-    if device is not None and device.wheels is not None:
+    if parts.actuators.wheels is not None:
         found.append(_allocation)
     return found
 

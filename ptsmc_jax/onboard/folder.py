@@ -40,8 +40,8 @@ class Controller:
         law, device = self.ready.parts.controller, self.ready.parts.actuators
         self.about = About(
             name, source, digest(self.scenario), type(law).__qualname__, self.board.parameters["filter"] is not None,
-            self.board.spacecraft, device is not None and device.wheels is not None,
-            0 if device is None else device.delay, float((law.t_f / self.last) ** 2),
+            self.board.spacecraft, device.wheels is not None,
+            device.delay, float((law.t_f / self.last) ** 2),
         )  # fmt: skip
 
     @property

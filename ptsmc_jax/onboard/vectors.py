@@ -56,31 +56,31 @@ def fly(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Samples:
     """Return a trial by samples, at their nominal times."""
     parts = replace(dispersion.apply(parts, seed, trial), jitter=None)
     ticks = parts.clock.ticks(parts.controller.t_f, parts.controller.delta)
-    law, sensors, wheels = parts.controller, parts.sensors, parts.effective_actuators.wheels
+    law, sensors, wheels = parts.controller, parts.sensors, parts.actuators.wheels
     x0 = law.kinematics.align(parts.initial, parts.reference(jnp.zeros_like(parts.t_end)))
     vehicle, first = start(parts, ticks, x0, seed, trial)
 
     def step(carry: tuple[State, Array], tick: Tick) -> tuple[tuple[State, Array], Samples]:
         state, unit = carry
         after, record = control_period(vehicle, state, tick)
-        now, drive, computer, target = record.now, record.drive, after.computer, record.target
+        now, drive, computer = record.now, record.drive, after.computer
+        target, d_hat, u, s, *_ = record.decision
         assert drive is not None
-        measured, sensing = parts.plant.visible(state.x), state.computer.sensors
-        if sensors is not None:
-            measured, _ = sensors.sample(sensing, measured, now, tick.dt_before, state.star_x)
+        visible, sensing = parts.plant.visible(state.x), state.computer.sensors
+        measured, _ = sensors.sample(sensing, visible, now, tick.dt_before, state.star_x)
         before = getattr(sensing, "estimate", None)
         distance = law.clearance(computer.seen, target)
         unit = jnp.where(jnp.isnan(unit), law.kinematics.clearance_unit(distance), unit)
         row = Samples(
             t=now.t, flown=now.t_next > now.t, measured=measured,
-            valid=None if before is None or sensors is None else sensors.star_weight(now) > 0.0,
-            age=None if state.star_x is None or sensors is None else sensors.star_age(now.sample, tick.dt_before),
+            valid=None if before is None else sensors.star_weight(now) > 0.0,
+            age=None if state.star_x is None else sensors.star_age(now.sample, tick.dt_before),
             before=before, estimate=getattr(computer.sensors, "estimate", None),
             gyro=getattr(computer.sensors, "rate", None),
             applied=state.applied[0], acting=state.actuators.v, momentum=state.actuators.h,
             seen=computer.seen, observer=computer.observer,
             law=computer.law, command_filter=computer.command_filter, queue=after.actuators.queue,
-            d_hat=record.d_hat, command=record.u, s=record.s, error=law.kinematics.errors(computer.seen, target)[0],
+            d_hat=d_hat, command=u, s=s, error=law.kinematics.errors(computer.seen, target)[0],
             torque=drive.c if wheels is None else wheels.axes @ drive.c,
             wheel_torque=None if wheels is None else drive.c, limited=drive.limited,
             clearance=distance / unit, clearance_unit=unit,

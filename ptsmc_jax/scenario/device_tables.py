@@ -74,17 +74,15 @@ class Actuators(Table, frozen=True):
         return scenario.controller.noise_of_s(*self.noise_of_error(scenario))
 
     def sensors(self, scenario: Any) -> Any:
-        """Parts of `devices.sensors`; None: the law sees the true state."""
+        """Parts of `devices.sensors`."""
         raise NotImplementedError
 
     def actuators(self, wheels: Any) -> Any:
-        """Limits, lag, delay and wheels (None: none); None where the torque is the commanded one."""
+        """Limits, lag, delay and wheels (None: none)."""
         from ptsmc_jax.devices.actuators import Actuators as Physics
         from ptsmc_jax.numerics.pytrees import vector
 
         values = (self.torque_limit, self.torque_rate_limit, self.torque_lag, self.torque_step)
-        if wheels is None and self.delay_periods == 0 and all(value is None for value in values):
-            return None
         limit, rate_limit, lag, step = (None if v is None else vector(v) for v in values)
         return Physics(limit, rate_limit, lag, step, wheels, self.delay_periods)
 
@@ -160,11 +158,11 @@ class Hardware(Actuators, frozen=True):
 
     def sensors(self, scenario: Any) -> Any:
         """Star tracker, gyro and filter."""
-        from ptsmc_jax.devices.sensors import Sensors
+        from ptsmc_jax.devices.sensors import PerfectSensors, Sensors
         from ptsmc_jax.numerics.pytrees import vector
 
         if not scenario.measured:
-            return None
+            return PerfectSensors()
         period, walk = scenario.loop.period, self.rate_bias_walk
         return Sensors(
             vector(self.attitude_noise or 0.0),
@@ -224,10 +222,10 @@ class StateHardware(Actuators, frozen=True):
 
     def sensors(self, scenario: Any) -> Any:
         """`sensors.StateSensor`."""
-        from ptsmc_jax.devices.sensors import StateSensor
+        from ptsmc_jax.devices.sensors import PerfectSensors, StateSensor
         from ptsmc_jax.numerics.pytrees import vector
 
-        return None if self.state_noise is None else StateSensor(vector(self.state_noise))
+        return PerfectSensors() if self.state_noise is None else StateSensor(vector(self.state_noise))
 
 
 class FilterTable(Kind, frozen=True):

@@ -30,7 +30,7 @@ class Study:
     @property
     def drawn(self) -> bool:
         """Whether anything differs from trial to trial."""
-        return self.dispersion.varies or self.parts.sensors is not None or self.parts.walk_rate is not None
+        return self.dispersion.varies or not self.parts.sensors.perfect or self.parts.walk_rate is not None
 
     @property
     def catalogue(self) -> dict[str, catalogues.Entry]:

@@ -7,6 +7,7 @@ from jax.tree_util import Partial, all_leaves
 
 from ptsmc_jax.devices.actuators import Actuators
 from ptsmc_jax.devices.command_filter import CommandFilter
+from ptsmc_jax.devices.sensors import PerfectSensors
 from ptsmc_jax.numerics.pytrees import Function, Leaf, pytree
 from ptsmc_jax.plants.base import Plant
 from ptsmc_jax.plants.rigid_body import spacecraft
@@ -28,12 +29,12 @@ class Setup:
     reference: Any  # callable: t [s] -> the target of the law, a `references.Target` for spacecraft
     controller: Any  # laws.base.Law
     observer: Any  # observers.base.Observer
-    sensors: Any  # sensors.Sensor, or None: the law sees the true state
+    sensors: Any = field(default_factory=PerfectSensors)  # sensors.Sensor
     initial: Any  # state of the plant
     t_end: Leaf  # [s]
     window: Leaf  # after t_f, for window_error [s]
     settling_angle: Leaf  # [rad]
-    actuators: Actuators | None = None  # None: the torque is the commanded one, held over a period
+    actuators: Actuators = field(default_factory=Actuators)  # by default they hold the commanded torque over a period
     walk_rate: Leaf | None = None  # (m,) 1 sigma of a random walk's change per second of a period [N m/s]
     command_filter: CommandFilter | None = None  # between the law and the actuators
     jitter: Leaf | None = None  # by how much a sample comes early or late at most, as a share of the control period [-]
@@ -77,11 +78,6 @@ class Setup:
             if hasattr(observer, "model"):
                 changes["observer"] = replace(observer, model=changed(observer.model, "model of the observer"))
         return replace(self, **changes)
-
-    @property
-    def effective_actuators(self) -> Actuators:
-        """The actuators; perfect ones where there are none."""
-        return Actuators() if self.actuators is None else self.actuators
 
     def timed(self, clock: Anchored | Flight | Graded, substeps: int) -> "Parts":
         """The parts of a run by this clock."""

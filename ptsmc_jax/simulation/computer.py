@@ -69,16 +69,16 @@ class Software(NamedTuple):
     boot: Callable[[Parts, WholeNumber, WholeNumber, Any, Ticks], Computer]
     # parts, k2, period, memory, visible and star tracker's state, actuators
     decide: Callable[[Parts, Bound, Period, Computer, Any, Any, ActuatorState], tuple[Decision, Computer]]
-    statuses: Callable[[Computer], dict[str, Array]]  # of a run: how many samples ended with each; ours has none
+    # number of samples of a run that ended with each status, by its name
+    statuses: Callable[[Computer], dict[str, Array]] = lambda computer: {}
     on_processor: bool = False  # it runs nowhere else
 
 
 def boot(parts: Parts, seed: WholeNumber, trial: WholeNumber, x0: Any, first: Ticks) -> Computer:
     """Return the memory before the first sample; x0: true state, as far as sensors see it."""
-    sensors = None if parts.sensors is None else parts.sensors.begin(seed, trial, x0, first)
+    sensors = parts.sensors.begin(seed, trial, x0, first)
     zero = jnp.zeros(parts.plant.inputs)
-    wheels = parts.actuators is not None and parts.actuators.wheels is not None
-    applied = zero, zero if wheels else None
+    applied = zero, None if parts.actuators.wheels is None else zero
     command_filter = None if parts.command_filter is None else parts.command_filter.begin(parts.plant.inputs)
     return Computer(sensors, x0, parts.observer.begin(), parts.controller.begin(), applied, command_filter)
 
@@ -130,9 +130,8 @@ def decide(
     Returns:
         The decision and the new memory, except for `applied`, which is that of the last period.
     """
-    target, seen, sensors = parts.reference(period.now.t), x, None
-    if parts.sensors is not None:
-        seen, sensors = parts.sensors.measure(computer.sensors, x, period.now, period.dt_before, star_x)
+    target = parts.reference(period.now.t)
+    seen, sensors = parts.sensors.measure(computer.sensors, x, period.now, period.dt_before, star_x)
     d_hat, observer = estimate(parts, period, computer, seen)
     u, s, law = command(parts, k2, period, computer, seen, target, d_hat)
     command_filter = computer.command_filter
@@ -143,9 +142,4 @@ def decide(
     return decision, Computer(sensors, seen, observer, law, computer.applied, command_filter)
 
 
-def statuses(computer: Computer) -> dict[str, Array]:
-    """How many samples ended with each status: ours have none."""
-    return {}
-
-
-OURS = Software(boot, decide, statuses)
+OURS = Software(boot, decide)

@@ -11,11 +11,10 @@ from ptsmc_jax.numerics import integrators, matrices, stacking
 from ptsmc_jax.numerics.pytrees import Scalar
 from ptsmc_jax.observers.base import Observer
 from ptsmc_jax.simulation import run_state
-from ptsmc_jax.simulation.control_period import Record
+from ptsmc_jax.simulation.computer import Computer, Decision
+from ptsmc_jax.simulation.control_period import Record, State
 from ptsmc_jax.simulation.interval import Torques
 from ptsmc_jax.simulation.run_state import Log, Result, Run, Score
-
-Carry = tuple[Any, Array, Array, Score]  # true state, memory of the observer, torque at the end of the last step, score
 
 
 def simulate(run: Run) -> Result:
@@ -29,8 +28,9 @@ def simulate(run: Run) -> Result:
     largest = jnp.max(jax.vmap(lambda a, dt: matrices.row_norm(a) * dt)(slopes, lengths))
     decays = jax.vmap(lambda a, dt: integrators.decay(a, dt, largest))(slopes, lengths)
 
-    def step(carry: Carry, tick: tuple) -> tuple[Carry, Log | None]:
-        (now, linear), (x, memory, last_torque, score) = tick, carry
+    def step(carry: tuple[State, Score], tick: tuple) -> tuple[tuple[State, Score], Log | None]:
+        (now, linear), (state, score) = tick, carry
+        x, memory = state.x, state.computer.observer
         dt, target = now.t_next - now.t, parts.reference(now.t)
 
         def rate(t: Scalar, x: Any, memory: Array) -> tuple[Any, Array, tuple[Array, Array]]:
@@ -45,21 +45,23 @@ def simulate(run: Run) -> Result:
         _, _, (u_end, _) = rate(now.t_next, x_next, memory_next)
         u_nodes = u, u_end  # not that of a stage in the middle, which a narrow sign makes zigzag from step to step
         torques = Torques(u_nodes, u_nodes, (1 / 2, 1 / 2), jnp.asarray(False), None)
-        d_hat = observer.estimate(memory)
-        record = Record(now, x, target, d_hat, u, s, last_torque, torques, x_next, lambda t: x_next, dt)
-        row = run_state.row(run, record) if run.record else None
-        torque = jnp.where(now.t_next > now.t, u_end, last_torque)
-        return (x_next, memory_next, torque, run_state.advance(run, score, record)), row
+        decision = Decision(target, observer.estimate(memory), u, s, parts.plant.velocity(x))
+        record = Record(now, decision, torques, lambda t: x_next, dt)
+        torque = jnp.where(now.t_next > now.t, u_end, state.torque)
+        after = State(x_next, torque, state.computer._replace(observer=memory_next))
+        row = run_state.row(run, state, after, record) if run.record else None
+        return (after, run_state.advance(run, score, state, after, record)), row
 
-    score = run_state.begin(run)
-    first = score.snapshot
-    begun = run.x0, observer.begin(), jnp.zeros(parts.plant.inputs), score
-    (x, memory, _, score), rows = stacking.scan(step, begun, (ticks, decays))
+    first = run_state.begin(run)
+    begun = State(run.x0, jnp.zeros(parts.plant.inputs), Computer(None, None, observer.begin(), None, None))
+    (state, score), rows = stacking.scan(step, (begun, first), (ticks, decays))
     log = None
     if rows is not None:
         t = run.criteria.t_end
-        target, hold, d_hat = parts.reference(t), t >= controller.hand_over, observer.estimate(memory)
+        x, d_hat = state.x, observer.estimate(state.computer.observer)
+        target, hold = parts.reference(t), t >= controller.hand_over
         u, s, _ = controller(Sample(t, hold, jnp.zeros_like(t)), x, target, d_hat, k2(t))
-        last = run_state.row_at(run, t, x, target, (d_hat, u, u, s), jnp.asarray(True))
+        decision = Decision(target, d_hat, u, s, parts.plant.velocity(x))
+        last = run_state.row_at(run, t, x, decision, u, jnp.asarray(True))
         log = run_state.history(rows, last)
     return run_state.finish(run, first, score, log)

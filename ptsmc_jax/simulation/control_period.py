@@ -17,7 +17,7 @@ from ptsmc_jax.numerics.draws import WholeNumber
 from ptsmc_jax.numerics.pytrees import Scalar
 from ptsmc_jax.observers.base import Bound
 from ptsmc_jax.simulation.assembly import Parts
-from ptsmc_jax.simulation.computer import OURS, Computer, Period, Software
+from ptsmc_jax.simulation.computer import OURS, Computer, Decision, Period, Software
 from ptsmc_jax.simulation.interval import Torques
 
 DISTURBANCE_WALK = "disturbance_walk"
@@ -33,15 +33,15 @@ class Tick(NamedTuple):
 
 
 class State(NamedTuple):
-    """The state of the sampled loop between two control periods."""
+    """The state of a loop between two control periods. The continuous loop has the first three fields only."""
 
     x: Any  # true state of the plant
     torque: Array  # (m,) delivered at the end of the last period [N m]
     computer: Computer  # memory of the flight software; its `applied` is None if the actuators hold `torque`
-    actuators: ActuatorState
-    walk: Array | None  # (m,) random walk of the disturbance [N m]; None: there is none
-    star_x: Any  # `star_state` of the last period
-    offset: Array | None  # delay of the next sample after its nominal time [s]; None: no timing jitter
+    actuators: ActuatorState = ActuatorState(None, None, None)
+    walk: Array | None = None  # (m,) random walk of the disturbance [N m]; None: there is none
+    star_x: Any = None  # `star_state` of the last period
+    offset: Array | None = None  # delay of the next sample after its nominal time [s]; None: no timing jitter
 
     @property
     def applied(self) -> tuple[Array, Array | None]:
@@ -53,19 +53,11 @@ class Record(NamedTuple):
     """What happened in a control period, or in an integration step of the continuous loop."""
 
     now: Ticks  # true times
-    x: Any  # true state at the start
-    target: Any  # of the reference at the start
-    d_hat: Array  # (m,) estimated disturbance [N m]
-    u: Array  # (m,) commanded torque [N m]
-    s: Array  # (m,) sliding variable
-    last_torque: Array  # (m,) delivered at the end of the interval before [N m]
+    decision: Decision  # of the controller; its target is the reference at the true time
     torques: Torques
-    x_next: Any  # true state at the end
     x_at: Callable[[Scalar], Any]  # time in the interval [s] -> true state then
     step: Scalar  # longest integration step [s]
-    computer: Computer | None = None  # memory of the flight software after its sample
-    drive: Drive | None = None
-    walk: Array | None = None  # (m,) random walk of the disturbance [N m]
+    drive: Drive | None = None  # of the actuators
 
 
 class Vehicle(NamedTuple):
@@ -110,7 +102,7 @@ def control_period(vehicle: Vehicle, state: State, tick: Tick) -> tuple[State, R
     Returns:
         The state at the next sample, and what happened until then. Metrics and history are made of the latter.
     """
-    parts, actuators, plant = vehicle.parts, vehicle.parts.effective_actuators, vehicle.parts.plant
+    parts, actuators, plant = vehicle.parts, vehicle.parts.actuators, vehicle.parts.plant
     period = vehicle.period(tick)
 
     # with timing jitter, samples come early or late; flight software assumes the nominal times of `period`
@@ -135,7 +127,7 @@ def control_period(vehicle: Vehicle, state: State, tick: Tick) -> tuple[State, R
 
     # true plant: integrate under the torques and the disturbance
     walk = vehicle.walked(state.walk, dt, now.sample)
-    applied = None if actuators.holds else assumed_torque(actuators, drive, period.length)
+    applied = None if actuators.holds else actuators.assumed(drive, period.length)
     motion = PeriodMotion(parts, now.t, state.x, drive, walk)
     after = State(
         x=motion.at(now.t_next),
@@ -146,23 +138,10 @@ def control_period(vehicle: Vehicle, state: State, tick: Tick) -> tuple[State, R
         star_x=star_state(parts, now, motion.at),
         offset=next_offset,
     )
-    record = Record(
-        now=now,
-        x=state.x,
-        target=decision.target if next_offset is None else parts.reference(now.t),  # of the true time
-        d_hat=decision.d_hat,
-        u=decision.u,
-        s=decision.s,
-        last_torque=state.torque,
-        torques=torques,
-        x_next=after.x,
-        x_at=motion._replace(rolled=True).at,  # called once in a run
-        step=dt / parts.substeps,
-        computer=computer,
-        drive=drive,
-        walk=walk,
-    )
-    return after, record
+    if next_offset is not None:
+        decision = decision._replace(target=parts.reference(now.t))
+    x_at = motion._replace(rolled=True).at  # called once in a run
+    return after, Record(now, decision, torques, x_at, dt / parts.substeps, drive)
 
 
 def start(
@@ -178,12 +157,12 @@ def start(
         trial: number of the trial.
         software: the flight software.
     """
-    lengths, actuators, inputs = ticks.t_next - ticks.t, parts.effective_actuators, parts.plant.inputs
+    lengths, actuators, inputs = ticks.t_next - ticks.t, parts.actuators, parts.plant.inputs
     # both matrices outside the loop, by one piece of code
     first_length = jnp.sum(jnp.where(ticks.partial, lengths, 0.0))
     matrices = jax.lax.map(parts.observer.update_matrix, jnp.stack([parts.period, first_length]))
-    walk_key = None if parts.walk_rate is None else walk_stream(seed, trial)
-    jitter_key = None if parts.jitter is None else jitter_stream(seed, trial)
+    walk_key = None if parts.walk_rate is None else draws.stream(seed, trial, DISTURBANCE_WALK)
+    jitter_key = None if parts.jitter is None else draws.stream(seed, trial, SAMPLE_TIMES)
     vehicle = Vehicle(parts, software, parts.observer.error_bound(), *matrices, walk_key, jitter_key)
 
     first = first_period(ticks)
@@ -228,8 +207,7 @@ class PeriodMotion(NamedTuple):
 
     def after(self, dt: Scalar) -> Any:
         """Return the state dt [s] into the period."""
-        parts, drive, walk = self.parts, self.drive, self.walk
-        actuators = parts.effective_actuators
+        parts, drive, walk, actuators = self.parts, self.drive, self.walk, self.parts.actuators
         step = dt / parts.substeps
 
         def substep(k: Scalar, x: Any) -> Any:
@@ -263,34 +241,14 @@ def star_state(parts: Parts, now: Ticks, x_at: Callable[[Scalar], Any]) -> Any:
     return parts.plant.visible(x_at(now.t_next - parts.sensors.star_age(now.sample + 1, now.t_next - now.t)))
 
 
-def assumed_torque(actuators: Actuators, drive: Drive, dt: Scalar) -> tuple[Array, Array | None]:
-    """Return `Computer.applied` of a period of dt [s]: what the flight software knows of the torque in it."""
-    torque = actuators.assumed(drive, dt)
-    return torque.mean, torque.middle
-
-
 def period_torques(actuators: Actuators, drive: Drive, u: Array, dt: Scalar) -> Torques:
     """Return commanded and delivered torques of a control period of dt [s], and the momentum of the wheels in it."""
-    ends = actuators.at(drive, jnp.zeros_like(dt)), actuators.at(drive, dt)
-    nodes, weights, momentum, torque = ends[:1], (1.0,), None, None
-    if actuators.moves or actuators.wheels is not None:
-        # a lag may change the sign of the torque within the period, where the momentum may then peak
-        middle = actuators.at(drive, dt / 2)
-        if actuators.moves:
-            nodes, weights = (ends[0], middle, ends[1]), (1 / 6, 4 / 6, 1 / 6)
-        stored = [momentum for _, momentum in (middle, ends[1]) if momentum is not None]
-        if stored:
-            momentum = jnp.stack(stored)
-            torque = jnp.stack([ends[0][0], ends[1][0]])  # it is monotonic in between, so its ends bound it
-    delivered = tuple(actuators.on_body(v) for v, _ in nodes)
-    return Torques((u,) * len(nodes), delivered, weights, drive.limited, momentum, torque)
-
-
-def walk_stream(seed: WholeNumber, trial: WholeNumber) -> draws.Key:
-    """Return the key of a trial's random walk of the disturbance."""
-    return draws.stream(seed, trial, DISTURBANCE_WALK)
-
-
-def jitter_stream(seed: WholeNumber, trial: WholeNumber) -> draws.Key:
-    """Return the key of the deviations of a trial's samples from their nominal times."""
-    return draws.stream(seed, trial, SAMPLE_TIMES)
+    wheels = actuators.wheels is not None
+    # with a lag the torque may change its sign within the period, where the wheels' momentum may then peak
+    times = (jnp.zeros_like(dt), dt / 2, dt) if actuators.moves or wheels else (jnp.zeros_like(dt),)
+    torques, momenta = zip(*(actuators.at(drive, time) for time in times), strict=True)
+    weights = (1 / 6, 4 / 6, 1 / 6) if actuators.moves else (1.0,)
+    delivered = tuple(actuators.on_body(v) for v in torques[: len(weights)])
+    stored = jnp.stack(momenta[1:]) if wheels else None
+    of_wheels = jnp.stack([torques[0], torques[-1]]) if wheels else None  # monotonic in between, so its ends bound it
+    return Torques((u,) * len(weights), delivered, weights, drive.limited, stored, of_wheels)

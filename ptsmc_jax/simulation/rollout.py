@@ -89,10 +89,10 @@ def _check(parts: Parts) -> None:
 
 def _check_continuous(parts: Parts) -> None:
     """Raise TypeError if parts of a continuous loop contain what only the sampled loop simulates."""
-    sampled_only = ("sensors", "actuators", "walk_rate", "command_filter", "jitter")
-    found = next((name for name in sampled_only if getattr(parts, name) is not None), None)
-    if found is not None:
-        raise TypeError(f"the continuous loop cannot simulate {found}: set {found} to None, or use a sampled clock")
+    optional = [name for name in ("walk_rate", "command_filter", "jitter") if getattr(parts, name) is not None]
+    present = {"sensors": not parts.sensors.perfect, "actuators": not parts.actuators.ideal}
+    for name in (*(name for name, there in present.items() if there), *optional):
+        raise TypeError(f"the continuous loop cannot simulate {name}: remove {name}, or use a sampled clock")
     if not parts.controller.continuous:
         law = type(parts.controller).__name__
         raise TypeError(f"the law {law} needs the sampled loop: use a sampled clock")

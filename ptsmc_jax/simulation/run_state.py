@@ -12,7 +12,8 @@ from ptsmc_jax.numerics import guards
 from ptsmc_jax.numerics.pytrees import Scalar, listing
 from ptsmc_jax.simulation import metrics, pointing
 from ptsmc_jax.simulation.assembly import Parts
-from ptsmc_jax.simulation.control_period import Record
+from ptsmc_jax.simulation.computer import Decision
+from ptsmc_jax.simulation.control_period import Record, State
 from ptsmc_jax.simulation.interval import Arrival, Criteria, Errors, Interval, Snapshot, Start
 
 OK, DIVERGED, TOO_FAST, SINGULAR, MISSED, UNBOUNDED, UNFINISHED = range(7)
@@ -94,20 +95,28 @@ class Score(NamedTuple):
 
 def begin(run: Run, wheel_momentum: Array | None = None) -> Score:
     """Return the score at t = 0; wheel_momentum: (wheels,) [N m s]."""
-    zero, no_torque = jnp.zeros_like(run.criteria.t_f), jnp.zeros(run.parts.plant.inputs)
-    snapshot = _snapshot(run.parts, run.target_0, run.x0)
-    measured = run.parts.sensors is not None
-    start = Start(snapshot, run.parts.plant.inputs, wheel_momentum, measured=measured)
-    score = Score(snapshot, metrics.begin(start, run.criteria), jnp.int32(OK), jnp.full_like(zero, jnp.nan))
+    parts, zero, no_torque = run.parts, jnp.zeros_like(run.criteria.t_f), jnp.zeros(run.parts.plant.inputs)
+    snapshot = _snapshot(parts, run.target_0, run.x0)
+    start = Start(snapshot, parts.plant.inputs, wheel_momentum, measured=not parts.sensors.perfect)
+    running = metrics.begin(start, run.criteria)
+    score = Score(snapshot, running, jnp.int32(OK), jnp.full_like(zero, jnp.nan))
     return _judged(run, score, run.x0, run.target_0, zero, zero, no_torque)
 
 
-def advance(run: Run, score: Score, record: Record) -> Score:
-    """Return metrics and status after a control period, or after a step of the continuous loop."""
+def advance(run: Run, score: Score, before: State, after: State, record: Record) -> Score:
+    """Return metrics and status after a control period, or after a step of the continuous loop.
+
+    Args:
+        run: the constants of the run.
+        score: metrics and status before the period.
+        before: state at its start.
+        after: state at its end.
+        record: what happened in it.
+    """
     kinematics, criteria, now = run.parts.controller.kinematics, run.criteria, record.now
     target_next = run.parts.reference(now.t_next)
-    snapshot = _snapshot(run.parts, target_next, record.x_next)
-    begun, ended, length = (record.x, record.target), (record.x_next, target_next), now.t_next - now.t
+    snapshot = _snapshot(run.parts, target_next, after.x)
+    begun, ended, length = (before.x, record.decision.target), (after.x, target_next), now.t_next - now.t
 
     def errors() -> Errors:
         return Errors(*kinematics.errors(*begun), *kinematics.errors(*ended))
@@ -120,29 +129,31 @@ def advance(run: Run, score: Score, record: Record) -> Score:
     if criteria.pointing is not None:
         frame = criteria.pointing.frame
         attitude_error = partial(pointing.error_path, begun, ended, frame, length)
-        if record.computer is not None:
-            knowledge_error = partial(pointing.constant_path, record.computer.seen.q, record.x.q, frame, length)
+        if after.computer.seen is not None:
+            knowledge_error = partial(pointing.constant_path, after.computer.seen.q, before.x.q, frame, length)
     interval = Interval(
         now.t, now.t_next, score.snapshot, snapshot, errors, partial(kinematics.middle_angle, begun, ended, length),
-        arrival, record.last_torque, record.torques, attitude_error, knowledge_error,
+        arrival, before.torque, record.torques, attitude_error, knowledge_error,
     )  # fmt: skip
     score = score._replace(snapshot=snapshot, running=metrics.update(score.running, interval, criteria))
-    memory = None if record.computer is None else record.computer.law
     u_end = record.torques.delivered[-1]
-    return _judged(run, score, record.x_next, target_next, now.t_next, record.step, u_end, memory)
+    return _judged(run, score, after.x, target_next, now.t_next, record.step, u_end, after.computer.law)
 
 
-def row(run: Run, record: Record) -> Log:
-    """Return the row of the history at the start of a control period, or of a step of the continuous loop."""
-    now, drive, wheels = record.now, record.drive, None
+def row(run: Run, before: State, after: State, record: Record) -> Log:
+    """Return the row of the history at the start of a control period, or of a step of the continuous loop.
+
+    Arguments as in `advance`.
+    """
+    now, drive, decision, wheels = record.now, record.drive, record.decision, None
     if drive is not None and drive.h is not None:
-        wheels = drive.h, run.parts.effective_actuators.at(drive, jnp.zeros_like(now.t))[0]
-    signals = record.d_hat, record.torques.delivered[0], record.u, record.s
-    return row_at(run, now.t, record.x, record.target, signals, now.t_next > now.t, record.walk, wheels)
+        wheels = drive.h, run.parts.actuators.at(drive, jnp.zeros_like(now.t))[0]
+    u, has_length = record.torques.delivered[0], now.t_next > now.t
+    return row_at(run, now.t, before.x, decision, u, has_length, after.walk, wheels)
 
 
 def row_at(
-    run: Run, t: Scalar, x: Any, target: Any, signals: tuple, has_length: Array, walk: Any = None, wheels: Any = None
+    run: Run, t: Scalar, x: Any, decision: Decision, u: Array, has_length: Array, walk: Any = None, wheels: Any = None
 ) -> Log:
     """Return a row of the history.
 
@@ -150,13 +161,13 @@ def row_at(
         run: the constants of the run.
         t: time [s].
         x: true state.
-        target: of the reference.
-        signals: d_hat, u, commanded and s of `Log`.
+        decision: of the controller.
+        u: delivered torque, (m,) [N m].
         has_length: see `Log`.
         walk: random walk of the disturbance, (m,) [N m], or None.
         wheels: momentum [N m s] and torque [N m] of the reaction wheels, or None.
     """
-    d_hat, u, commanded, s = signals
+    target, d_hat, commanded, s, *_ = decision
     d = run.parts.disturbance(t, x)
     error, _ = run.parts.controller.kinematics.errors(x, target)
     return Log(t, x, d_hat, u, commanded, s, d if walk is None else d + walk, target, error, wheels, has_length)
@@ -167,14 +178,12 @@ def history(rows: Log, last: Log) -> Log:
     return jax.tree.map(lambda many, one: jnp.concatenate([many, jnp.asarray(one)[None]]), rows, last)
 
 
-def finish(
-    run: Run, first: Snapshot, score: Score, log: Log | None, samples: dict[str, Array] | None = None
-) -> Result:
-    """Return the result of a run by its score at t_end; first: the snapshot at t = 0; samples: see `Result`."""
+def finish(run: Run, first: Score, score: Score, log: Log | None, samples: dict[str, Array] | None = None) -> Result:
+    """Return the result of a run by its scores at t = 0 and at t_end; samples: see `Result`."""
     criteria, angle_at_t_f = run.criteria, score.running.arrival.angle
     values = metrics.finish(score.running, criteria)
     unbounded = (score.status == OK) & metrics.unbounded(values)
-    missed = (score.status == OK) & misses(angle_at_t_f, first.angle, criteria.settling_angle)
+    missed = (score.status == OK) & misses(angle_at_t_f, first.snapshot.angle, criteria.settling_angle)
     cut = ~jnp.isnan(run.gap) & ~(score.bad_time < run.gap)  # what went wrong without samples means nothing
     status = jnp.where(unbounded, UNBOUNDED, jnp.where(missed, MISSED, score.status))
     status = jnp.where(cut, UNFINISHED, status).astype(jnp.int32)

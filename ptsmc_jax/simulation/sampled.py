@@ -8,7 +8,7 @@ from ptsmc_jax.numerics import stacking
 from ptsmc_jax.numerics.draws import WholeNumber
 from ptsmc_jax.numerics.pytrees import Scalar
 from ptsmc_jax.simulation import run_state
-from ptsmc_jax.simulation.computer import Software
+from ptsmc_jax.simulation.computer import Decision, Software
 from ptsmc_jax.simulation.control_period import State, Tick, control_period, schedule, start
 from ptsmc_jax.simulation.run_state import Log, Result, Run, Score
 
@@ -19,13 +19,13 @@ def simulate(run: Run, seed: WholeNumber, trial: WholeNumber, software: Software
     vehicle, state = start(run.parts, ticks, run.x0, seed, trial, software)
 
     def step(carry: tuple[State, Score], tick: Tick) -> tuple[tuple[State, Score], Log | None]:
-        state, record = control_period(vehicle, carry[0], tick)
-        row = run_state.row(run, record) if run.record else None
-        return (state, run_state.advance(run, carry[1], record)), row
+        state, score = carry
+        after, record = control_period(vehicle, state, tick)
+        row = run_state.row(run, state, after, record) if run.record else None
+        return (after, run_state.advance(run, score, state, after, record)), row
 
-    score = run_state.begin(run, state.actuators.h)
-    first = score.snapshot
-    (state, score), rows = stacking.scan(step, (state, score), schedule(ticks))
+    first = run_state.begin(run, state.actuators.h)
+    (state, score), rows = stacking.scan(step, (state, first), schedule(ticks))
     log = None
     if rows is not None:
         log = run_state.history(jax.tree.map(lambda v: v[:-1], rows), _last_row(run, state, rows))
@@ -34,11 +34,11 @@ def simulate(run: Run, seed: WholeNumber, trial: WholeNumber, software: Software
 
 def _last_row(run: Run, state: State, rows: Log) -> Log:
     """Return the row at t_end: the estimate and s of a sample there, and the torque held until then."""
-    t = run.criteria.t_end
+    parts, t, x, torque = run.parts, run.criteria.t_end, state.x, state.torque
     d_hat, s = (signal[jnp.argmax(rows.t >= t)] for signal in (rows.d_hat, rows.s))
-    h, v = state.actuators.h, state.actuators.v
-    signals, wheels = (d_hat, state.torque, state.torque, s), None if h is None else (h, v)
-    return run_state.row_at(run, t, state.x, run.parts.reference(t), signals, jnp.asarray(True), state.walk, wheels)
+    decision = Decision(parts.reference(t), d_hat, torque, s, parts.plant.velocity(x))
+    wheels = None if state.actuators.h is None else (state.actuators.h, state.actuators.v)
+    return run_state.row_at(run, t, x, decision, torque, jnp.asarray(True), state.walk, wheels)
 
 
 def _with_end(ticks: Ticks, t_end: Scalar) -> Ticks:

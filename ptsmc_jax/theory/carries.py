@@ -38,7 +38,7 @@ class _Stored:
     """
 
     def __init__(self, parts: Parts, x: Any, h: Array):
-        self._plant, self._h, self._on_body = parts.plant, h, parts.effective_actuators.on_body
+        self._plant, self._h, self._on_body = parts.plant, h, parts.actuators.on_body
         self._total_there = self._total(x, h)
 
     def _inverse(self, momentum: Array) -> Array:

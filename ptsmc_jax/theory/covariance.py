@@ -30,7 +30,7 @@ def predicts(parts: Parts) -> bool:
     Not of implicit sampling: s lands at once where the noise is within what switching reaches in a period, and hardly
     beyond; which of these rules, no slope about the quiet run tells.
     """
-    readable = parts.sensors is not None and hasattr(parts.sensors, "reading")
+    readable = hasattr(parts.sensors, "reading")
     return readable and parts.observer.linear and not getattr(parts.controller, "implicit", False)
 
 
@@ -117,7 +117,7 @@ class _State:
         loop: Any = opened.loop
         self._n, self._m, k = loop.a.shape[1], loop.command.shape[1], loop.seen.shape[2]
         self.plant = slice(0, opened.error.shape[2])
-        sensors = None if parts.sensors is None else parts.sensors.in_step()
+        sensors = parts.sensors.in_step()
         self._reading = reading = error_floor.reading_of(sensors, k, ticks)
         self._waiting = loop.delay * self._m
         before = self._n + self._waiting

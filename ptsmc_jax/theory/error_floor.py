@@ -71,9 +71,9 @@ def along_each(runs: Sequence[tuple[Parts, Log]]) -> list[Floor]:
     lasting = [(parts, *_lasting(parts, log)) for parts, log in runs]
     alike = dict[tuple, dict[int, Model]]()  # by the samples and the delay
     for k, (parts, ticks, log) in enumerate(lasting):
-        if parts.clock.sampled and (parts.sensors is not None or parts.walk_rate is not None):  # something is unknown
+        if parts.clock.sampled and (not parts.sensors.perfect or parts.walk_rate is not None):  # something is unknown
             model = _model(parts, log, ticks)
-            delay = parts.effective_actuators.delay
+            delay = parts.actuators.delay
             alike.setdefault((delay, np.isfinite(model.noise).tobytes(), *map(np.shape, model)), {})[k] = model
     squares = [np.zeros((len(ticks.t), 3)) for _, ticks, _ in lasting]
     for (delay, *_), models in alike.items():
@@ -227,7 +227,7 @@ def _model(parts: Parts, log: Log, ticks: Ticks) -> Model:
         by_state = reading.rows[early, : linear.early.shape[1]]
         move[:, taken], read[early] = 0.0, np.eye(size)[taken]
         move[:, taken, :n], move[:, taken, torque] = by_state @ linear.early, by_state @ linear.early_push
-    there = np.ones((periods, len(read)), bool) if parts.sensors is None else parts.sensors.available(ticks)
+    there = np.ones((periods, len(read)), bool) if parts.sensors.perfect else parts.sensors.available(ticks)
     return Model(
         start=start,
         rows=np.broadcast_to(read, (periods, *read.shape)),
@@ -243,7 +243,7 @@ def reading_of(sensors: Any, size: int, ticks: Ticks) -> Reading:
 
     ticks: periods that have a length, of which the first is asked for what is known then.
     """
-    if sensors is None:
+    if sensors.perfect:
         return Reading(np.eye(size), np.zeros(size), np.zeros(0), np.zeros(0))
     return sensors.reading(int(ticks.sample[0]), float(ticks.noise_weight[0]))
 
@@ -271,7 +271,7 @@ class _Linear(NamedTuple):
 @programs.jit(compiler_options=programs.QUICKLY)
 def _linear(parts: Parts, log: Log, ticks: Ticks) -> _Linear:
     """Every period of a run linearised, by the code that flies it."""
-    actuators, kinematics, plant = parts.effective_actuators, parts.controller.kinematics, parts.plant
+    actuators, kinematics, plant = parts.actuators, parts.controller.kinematics, parts.plant
     before, after = (jax.tree.map(lambda v, k=k: v[k : v.shape[0] - 1 + k], log.x) for k in (0, 1))
 
     def acted(state: Any, now: tuple) -> tuple:

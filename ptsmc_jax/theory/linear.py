@@ -31,15 +31,7 @@ from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
 from ptsmc_jax.simulation import clock
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.computer import Computer, Decision, Period, decide
-from ptsmc_jax.simulation.control_period import (
-    PeriodMotion,
-    State,
-    Tick,
-    assumed_torque,
-    control_period,
-    schedule,
-    start,
-)
+from ptsmc_jax.simulation.control_period import PeriodMotion, State, Tick, control_period, schedule, start
 from ptsmc_jax.theory.carries import Carry, Local
 
 NODES = 0.5 - 0.5 * np.cos(np.pi * np.arange(13) / 12)  # of a period: Chebyshev's, for what acts late within one
@@ -80,9 +72,8 @@ class Nominal(NamedTuple):
 
 def quiet(parts: Parts) -> Parts:
     """The parts without noise, disturbance and timing jitter."""
-    sensors = None if parts.sensors is None else parts.sensors.in_step().quiet()
     nothing = jax.tree_util.Partial(_nothing, jnp.zeros(parts.plant.inputs))
-    return replace(parts, sensors=sensors, disturbance=nothing, walk_rate=None, jitter=None)
+    return replace(parts, sensors=parts.sensors.in_step().quiet(), disturbance=nothing, walk_rate=None, jitter=None)
 
 
 def _nothing(zero: Array, t: Scalar, x: Any) -> Array:
@@ -99,7 +90,7 @@ def nominal(parts: Parts) -> Nominal:
 
     def step(state: State, tick: Tick) -> tuple[State, Nominal]:
         after, record = control_period(vehicle, state, tick)
-        arriving = record.u if state.actuators.queue is None else state.actuators.queue[0]
+        arriving = record.decision.u if state.actuators.queue is None else state.actuators.queue[0]
         return after, Nominal(vehicle.period(tick), Carry.of(state), Carry.of(after), arriving)
 
     return stacking.scan(step, first, schedule(ticks))[1]
@@ -115,13 +106,13 @@ def _computed(
 
     seen: the true state, as far as sensors see it.
     """
-    actuators, dt = parts.effective_actuators, period.length
+    actuators, dt = parts.actuators, period.length
     decision, computer = decide(parts, k2, period, carry.computer, seen)
     model = carry.model._replace(h=carry.acting.h)
     drive, queue = actuators.command(
         model, decision.u, decision.w, period.now.t, period.assumed_length, period.now.noise_weight
     )
-    computer = computer._replace(applied=assumed_torque(actuators, drive, dt))
+    computer = computer._replace(applied=actuators.assumed(drive, dt))
     return decision, computer, actuators.end(model, drive, queue, dt)._replace(h=None)
 
 
@@ -138,7 +129,7 @@ def _acted(
     pushed: additional torque on the plant, (m,). Delayed commands are already limited and compensated. Commands without
     a delay are limited and compensated here.
     """
-    actuators = parts.effective_actuators
+    actuators = parts.actuators
 
     def span(state: tuple[Any, ActuatorState], arrived: tuple) -> tuple[tuple[Any, ActuatorState], None]:
         (x, acting), (command, t, length) = state, arrived
@@ -183,8 +174,8 @@ def opened(parts: Parts, during: Nominal, *, late: bool = True) -> Opened:
         decision, computer, model = _computed(parts, k2, period, carry, seen)
         x, acting = _acted(parts, period, carry, decision.w, [(arriving + new, now.t, dt)], d)
         sent = decision.u
-        if parts.effective_actuators.delay:
-            sent, _ = parts.effective_actuators.send(carry.acting, decision.u, decision.w)
+        if parts.actuators.delay:
+            sent, _ = parts.actuators.send(carry.acting, decision.u, decision.w)
         return there.local_coordinates(Carry(x, acting, computer, model)), sent, decision.s
 
     def pushed(part: Scalar) -> tuple[Array, Array]:
@@ -199,7 +190,7 @@ def opened(parts: Parts, during: Nominal, *, late: bool = True) -> Opened:
     by_all = jax.jacfwd(flown, argnums=(0, 1, 2, 3))(z0, known, u0, u0)
     (a, seen, new, disturbed), (command, direct, *_), (s_command, s_direct, *_) = by_all
     old, new = lapack.vmap(pushed)(jnp.asarray(NODES)) if late else (jnp.zeros_like(new)[None], new[None])
-    loop = Loop(a, seen, new, old, command, direct, disturbed, dt, delay=parts.effective_actuators.delay)
+    loop = Loop(a, seen, new, old, command, direct, disturbed, dt, delay=parts.actuators.delay)
     error, error_rate = jax.jacfwd(lambda by: kinematics.errors(plant.retract(before.x, by), target))(x0)
     return Opened(loop, error, error_rate, s_command, s_direct)
 

@@ -48,7 +48,7 @@ def state_envelope(t: Scalar, t_f: Scalar, eta: Scalar, x0: Vector, s0: Scalar, 
 def bare(parts: Setup) -> Setup:
     """The parts without what the exact motion does not hang on: one program is for all clocks and devices."""
     names = "plant", "disturbance", "reference", "controller", "initial", "t_end", "window", "settling_angle"
-    return Setup(**{name: getattr(parts, name) for name in names}, observer=None, sensors=None)
+    return Setup(**{name: getattr(parts, name) for name in names}, observer=None)
 
 
 def starts(parts: Setup) -> Float[Array, "m n"]:

@@ -324,7 +324,7 @@ def test_a_wheel_fails_at_its_time_for_the_wheels_and_for_their_allocation_alike
     drive, _ = failing.command(failing.begin(3), u, vector(np.zeros(3)), at, one, one)
     assert drive.works is not None
     assert drive.works.tolist() == [early, True, True, True]
-    np.testing.assert_allclose(failing.torque(drive, vector(0.5)), u, atol=1e-15)
+    np.testing.assert_allclose(failing.on_body(failing.at(drive, vector(0.5))[0]), u, atol=1e-15)
     assert (abs(float(drive.c[0])) > 1e-3) is early
 
 
@@ -474,7 +474,7 @@ def test_gradients_are_finite_at_the_corners():
         state = actuators.ActuatorState(u[None], v, h)
         drive, queue = device.command(state, u, vector([0.0] * 3), vector(0.0), dt, vector(1.0))
         end = device.end(state, drive, queue, dt)
-        return device.torque(drive, dt), device.over(drive, 0.0 * dt, dt), end.v, end.h
+        return device.on_body(device.at(drive, dt)[0]), device.over(drive, 0.0 * dt, dt), end.v, end.h
 
     slopes_of = jax.jit(jax.jacfwd(outcome, (0, 1, 2, 3)))
     zero, full = vector([0.0] * 4), vector([0.5] * 4)

@@ -149,12 +149,12 @@ def test_wheels_that_are_scaled_and_turned_give_and_store_along_their_true_axes(
     applied = device.over(drive, vector(0.2), vector(0.1))
     np.testing.assert_allclose(applied.mean, turned @ torque, rtol=1e-13)
     np.testing.assert_allclose(np.asarray(applied.stored), turned @ (stored - 0.2 * torque), rtol=1e-13)
-    np.testing.assert_allclose(device.torque(drive, dt), turned @ torque, rtol=1e-13)
+    np.testing.assert_allclose(device.on_body(device.at(drive, dt)[0]), turned @ torque, rtol=1e-13)
     np.testing.assert_allclose(np.asarray(device.end(start, drive, queue, dt).h), stored - 0.5 * torque, rtol=1e-13)
     failing = replace(device, failure_times=vector([np.inf, 0.0, np.inf, np.inf]))  # which no one knows of
     drive, queue = failing.command(start, asked, vector(np.zeros(3)), vector(0.0), dt, vector(1.0))
     torque[1] = 0.0
-    np.testing.assert_allclose(failing.torque(drive, dt), turned @ torque, rtol=1e-13)
+    np.testing.assert_allclose(failing.on_body(failing.at(drive, dt)[0]), turned @ torque, rtol=1e-13)
     np.testing.assert_allclose(np.asarray(failing.end(start, drive, queue, dt).h), stored - 0.5 * torque, rtol=1e-13)
 
 
@@ -202,7 +202,7 @@ def test_a_wheel_fails_and_the_others_take_over_where_it_is_known(known):
     assert np.all(np.abs(log.wheels[1][~after][:, wheel]) > 0.0)
     assert np.ptp(log.wheels[0][after][:, wheel]) == 0.0
     # the torque on the body is what was asked for, w x A h besides, as long as all wheels work or the loss is known
-    stored = log.wheels[0] @ np.asarray(run.parts.actuators.wheels.axes).T  # pyright: ignore[reportOptionalMemberAccess]
+    stored = log.wheels[0] @ np.asarray(run.parts.actuators.wheels.axes).T
     asked = log.commanded + np.cross(log.x.w, stored)  # at the true rate; flight software takes that of the gyro
     off = np.linalg.norm(log.u - asked, axis=1)[:-1]
     assert np.all(off[~after[:-1]] < 1e-5)
@@ -213,9 +213,9 @@ def test_any_wheel_fails_as_often_known_or_not_and_times_that_are_not_given_end_
     drawn = {"wheel_failure": {"kind": "uniform"}, "star_tracker_outage": {"kind": "uniform", "duration": 0.5}}
     known = {"wheel_failure": {"kind": "uniform", "known": True}}
     parts = scenario.study(scenario.from_tables({**WHEELED, "dispersion": known})).parts
-    assert parts.effective_actuators.spare_allocations is not None
+    assert parts.actuators.spare_allocations is not None
     ready = scenario.study(scenario.from_tables({**WHEELED, "dispersion": drawn}))
-    assert ready.parts.effective_actuators.spare_allocations is None  # the others do not take over
+    assert ready.parts.actuators.spare_allocations is None  # the others do not take over
     for k in range(4):
         for share in (0.01, 0.99):
             c = {"wheel_failure": vector([1.0, (k + share) / 4]), "star_tracker_outage": vector([1.0])}
@@ -260,7 +260,7 @@ def test_samples_that_come_early_or_late_by_hand():
     run = runs.fly(ready, 3, 2)
     jitter = float(ready.dispersion.values(run.parts)["timing_jitter"])
     assert 0.2 <= jitter <= 0.4
-    key, h, x = control_period.jitter_stream(3, 2), 0.1, np.array([1.0, -0.3])
+    key, h, x = draws.stream(3, 2, control_period.SAMPLE_TIMES), 0.1, np.array([1.0, -0.3])
     nodes = np.maximum(4.55 + h * np.arange(-46, 26), 0.0).clip(max=7.0)
     most = np.minimum(jitter * h, np.minimum(nodes, 7.0 - nodes) / 2.0)
     number = np.arange(-46, 26)

@@ -89,7 +89,7 @@ def test_a_run_is_that_of_an_independent_integration(flown):
 def test_the_steps_that_a_study_takes_keep_the_modes_to_a_millionth(flown):
     """The torques that were flown, by a study's steps; what these leave of the loop's motion: below."""
     made, log = scenario.study(scenario.from_tables(SATELLITE)).parts, flown.log
-    actuators = made.effective_actuators
+    actuators = made.actuators
     assert 1 < made.substeps < 20
 
     @jax.jit

@@ -313,7 +313,7 @@ def test_kinds_choose_parts():
     assert isinstance(parts_of("").clock, clock.Graded)
     assert isinstance(parts_of(SAMPLED + "loop.clock = 'flight'").clock, clock.Flight)
     assert isinstance(parts_of("").reference, references.Fixed)
-    assert parts_of(SAMPLED).sensors is None
+    assert parts_of(SAMPLED).sensors.perfect
     steady = parts_of("disturbance = { kind = 'constant', amplitude = [1.0, 2.0, 3.0] }")
     np.testing.assert_array_equal(steady.disturbance(steady.t_end), [1.0, 2.0, 3.0])
     still = parts_of("disturbance.kind = 'none'")

@@ -13,7 +13,7 @@ from ptsmc_jax.laws.kinematics import MultiplicativeKinematics
 from ptsmc_jax.observers import nonlinear
 from ptsmc_jax.plants import integrator_chain, rigid_body, second_order
 from ptsmc_jax.signals import disturbances, references
-from ptsmc_jax.simulation import clock, rollout, sampled
+from ptsmc_jax.simulation import clock, control_period, rollout, sampled
 from ptsmc_jax.simulation.gains import with_gains
 from tests.helpers import (
     FULL_INERTIA,
@@ -347,6 +347,26 @@ def test_another_number_is_the_same_program(monkeypatch):
         run = replace(run, clock=replace(TIGHT, period=vector(0.25 + 0.01 * k), t_end=vector(30.0 - k)))
         fly(run, k, k)
     assert len(traced) <= 1  # none where another test has flown it
+
+
+def test_a_run_is_its_control_periods_one_after_the_other():
+    run = parts(5.0, 3.0, 0.5, period=0.5, noise=(2e-5, 1e-6), t_end=6.0)
+    log = fly(run, 1, 2).log
+    ticks = run.clock.ticks(run.controller.t_f, run.controller.delta)
+    start = jax.tree.map(lambda rows: rows[0], log.x)
+    vehicle, state = control_period.start(run, ticks, start, np.uint32(1), np.uint32(2))
+
+    @jax.jit
+    def step(state, tick):
+        after, record = control_period.control_period(vehicle, state, tick)
+        return after, record.decision.u
+
+    for k in range(ticks.t.size):
+        state, command = step(state, jax.tree.map(lambda rows, k=k: rows[k], control_period.schedule(ticks)))
+        if ticks.t_next[k] > ticks.t[k]:
+            row = int(np.argmin(np.abs(np.asarray(log.t) - ticks.t[k])))
+            np.testing.assert_allclose(command, log.commanded[row], rtol=1e-9)
+    np.testing.assert_allclose(state.x.q, log.x.q[-1], rtol=1e-10, atol=1e-12)
 
 
 @pytest.mark.long

@@ -11,6 +11,7 @@ import pytest
 
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo
+from ptsmc_jax.devices.sensors import PerfectSensors
 from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.theory import covariance, linear
@@ -205,7 +206,7 @@ def test_implicit_sampling_is_not_predicted():
     parts = scenario.study(scenario.from_tables({"loop": {"mode": "sampled"}, "hardware": {"rate_noise": 1e-6}})).parts
     assert covariance.predicts(parts)
     assert not covariance.predicts(replace(parts, controller=replace(parts.controller, implicit=True)))
-    assert not covariance.predicts(replace(parts, sensors=None))
+    assert not covariance.predicts(replace(parts, sensors=PerfectSensors()))
 
 
 @pytest.mark.parametrize("width", [1e-4, 0.02, 0.1, 0.3, 2.0, 30.0])

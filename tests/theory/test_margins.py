@@ -188,8 +188,7 @@ def flown(parts, run, index, gain, late):
 def _flown(parts, run, index, gain, late):
     period, carry_0, _, base = jax.tree.map(lambda v: v[index], run)
     k2 = parts.observer.error_bound()
-    actuators = parts.actuators
-    delay = 0 if actuators is None else actuators.delay
+    delay = parts.actuators.delay
     axes, now, dt = jnp.arange(base.size), period.now, period.length
     still = jnp.zeros_like(parts.plant.local_coordinates(carry_0.x, carry_0.x))
     begun = carry_0._replace(x=parts.plant.retract(carry_0.x, still.at[: base.size].set(1e-5)))
