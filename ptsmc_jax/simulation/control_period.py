@@ -81,6 +81,7 @@ class Vehicle(NamedTuple):
         if self.jitter_key is None:
             return None
         parts = self.parts
+        assert parts.jitter is not None
         largest = jnp.minimum(parts.jitter * parts.period, jnp.minimum(t, parts.t_end - t) / 2.0)
         return largest * (2.0 * draws.uniforms(self.jitter_key, 1, sample)[0] - 1.0)
 
@@ -107,7 +108,7 @@ def control_period(vehicle: Vehicle, state: State, tick: Tick) -> tuple[State, R
 
     # with timing jitter, samples come early or late; flight software assumes the nominal times of `period`
     now, next_offset = period.now, vehicle.offset(period.now.t_next, period.now.sample + 1)
-    if next_offset is not None:
+    if next_offset is not None and state.offset is not None:
         now = now._replace(t=now.t + state.offset, t_next=now.t_next + next_offset)
     dt = now.t_next - now.t
 
@@ -163,7 +164,7 @@ def start(
     matrices = jax.lax.map(parts.observer.update_matrix, jnp.stack([parts.period, first_length]))
     walk_key = None if parts.walk_rate is None else draws.stream(seed, trial, DISTURBANCE_WALK)
     jitter_key = None if parts.jitter is None else draws.stream(seed, trial, SAMPLE_TIMES)
-    vehicle = Vehicle(parts, software, parts.observer.error_bound(), *matrices, walk_key, jitter_key)
+    vehicle = Vehicle(parts, software, parts.observer.error_bound(), matrices[0], matrices[1], walk_key, jitter_key)
 
     first = first_period(ticks)
     computer = software.boot(parts, seed, trial, parts.plant.visible(x0), first)

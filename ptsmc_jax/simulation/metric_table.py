@@ -154,7 +154,8 @@ def _chattering(memory: Array, running: Running, criteria: Criteria) -> Array:
 
 def _residual(memory: Array, interval: Interval, criteria: Criteria) -> Array:
     """Return the largest amplitude at the ends of intervals from t_f on; the first of them replaces the memory."""
-    amplitude: Any = interval.end.modal_amplitude
+    amplitude = interval.end.modal_amplitude
+    assert amplitude is not None
     early, reached = interval.t < criteria.t_f, interval.t_next >= criteria.t_f
     return jnp.where(reached, jnp.where(early, amplitude, jnp.maximum(memory, amplitude)), memory)
 

@@ -182,7 +182,7 @@ def finish(run: Run, first: Score, score: Score, log: Log | None, samples: dict[
     """Return the result of a run by its scores at t = 0 and at t_end; samples: see `Result`."""
     criteria, angle_at_t_f = run.criteria, score.running.arrival.angle
     values = metrics.finish(score.running, criteria)
-    unbounded = (score.status == OK) & metrics.unbounded(values)
+    unbounded = (score.status == OK) & metrics.unbounded(values, first.running)
     missed = (score.status == OK) & misses(angle_at_t_f, first.snapshot.angle, criteria.settling_angle)
     cut = ~jnp.isnan(run.gap) & ~(score.bad_time < run.gap)  # what went wrong without samples means nothing
     status = jnp.where(unbounded, UNBOUNDED, jnp.where(missed, MISSED, score.status))

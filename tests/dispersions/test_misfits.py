@@ -202,7 +202,9 @@ def test_a_wheel_fails_and_the_others_take_over_where_it_is_known(known):
     assert np.all(np.abs(log.wheels[1][~after][:, wheel]) > 0.0)
     assert np.ptp(log.wheels[0][after][:, wheel]) == 0.0
     # the torque on the body is what was asked for, w x A h besides, as long as all wheels work or the loss is known
-    stored = log.wheels[0] @ np.asarray(run.parts.actuators.wheels.axes).T
+    wheels = run.parts.actuators.wheels
+    assert wheels is not None
+    stored = log.wheels[0] @ np.asarray(wheels.axes).T
     asked = log.commanded + np.cross(log.x.w, stored)  # at the true rate; flight software takes that of the gyro
     off = np.linalg.norm(log.u - asked, axis=1)[:-1]
     assert np.all(off[~after[:-1]] < 1e-5)

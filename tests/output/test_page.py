@@ -15,7 +15,7 @@ from ptsmc_jax.campaigns import store
 from ptsmc_jax.simulation import catalogues
 from tests.helpers import SHORT_CHAIN, short, tree
 from tests.output.pages import Page, checked
-from tuning.output import page, page_charts, search_sentences
+from tuning.output import page, page_charts
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 HOSTILE = "<img src=x onerror=document.title=1>\"'&</script><script>alert(1)</script>"
@@ -111,22 +111,6 @@ def test_the_verdict_comes_first(flown, status, mood, said):
     summary["verdicts"]["peak_torque"] = {"limit": 0.01, "margin": None, "met": False}
     (flown / "summary.json").write_text(json.dumps(summary))
     assert [attrs["class"] for tag, attrs in checked(flown).found if tag == "header"] == ["bad"]
-
-
-def test_a_front_says_its_ends_and_a_faster_slew_the_shortest_that_will_do():
-    points = [{"rms": 1e-3, "peak": 0.2, "knee": False, "dominated": False},
-              {"rms": 5e-4, "peak": 0.3, "knee": True, "dominated": False},
-              {"rms": 9e-4, "peak": 0.4, "knee": False, "dominated": True},
-              {"rms": 4e-4, "peak": 0.5, "knee": False, "dominated": False}]  # fmt: skip
-    (said,) = search_sentences.along_the_front({"points": points, "plant": "spacecraft"})
-    assert said == (
-        "from an RMS window error of 0.001 at 0.2 N m to 0.0004 at 0.5 N m of largest peak torque; "
-        "the knee is 0.0005 at 0.3 N m"
-    )
-    slews = [{"t_f": t_f, "rms": 1e-3 / t_f, "meets": t_f > 4.0} for t_f in (4.0, 5.0, 8.0)]
-    (said,) = search_sentences.fastest({"slews": slews, "requirements": ["peak_torque"], "plant": "chain"})
-    assert said == "the shortest of them is t_f = 5 s, with an RMS window error of 0.0002 x1"
-    assert not list(search_sentences.fastest({"slews": slews[:1], "requirements": ["peak_torque"], "plant": "chain"}))
 
 
 @pytest.mark.parametrize(("status", "asked", "mood"), [
@@ -270,26 +254,6 @@ def test_without_plotly_it_says_how_to_install_it(command, flown, monkeypatch):
     code, _, error = command("report", "run")
     assert code == 2
     assert error == "ptsmc: the page needs plotly.offline: pip install 'ptsmc-jax[report]'\n"
-
-
-def test_a_front_has_its_intervals_and_its_knee_and_not_what_no_trial_ends_with():
-    def point(peak, rms, **marks):
-        own = {"gains": {"eta": 3.0}, "interval": [0.9 * rms, 1.2 * rms], "knee": False, "dominated": False}
-        return {"peak": peak, "rms": rms, **own, **marks}
-
-    summary = {"points": [point(1.0, 4e-5, knee=True), point(2.0, 1e-5), point(3.0, 2e-5, dominated=True)],
-               "paper": point(5.0, 1e-4, interval=None),
-               "before": {**point(1.0, 1.0), "peak": None, "rms": None, "interval": None}}  # fmt: skip
-    drawn = page_charts.front(summary, {"peak_torque": "N m", "window_error": "-"}, 1.5)
-    named = {trace["name"]: trace for trace in drawn["data"]}
-    assert {name: trace["x"] for name, trace in named.items()} == {
-        "front": [1.0, 2.0], "knee": [1.0], "beaten by others": [3.0], "paper": [5.0],
-    }  # fmt: skip
-    np.testing.assert_allclose(named["front"]["error_y"]["array"], [0.8e-5, 0.2e-5])
-    np.testing.assert_allclose(named["front"]["error_y"]["arrayminus"], [0.4e-5, 0.1e-5])
-    assert named["paper"]["error_y"]["array"] == [0.0]
-    assert drawn["layout"]["shapes"][0]["x0"] == 1.5
-    assert "peak torque [N m]" in json.dumps(drawn["layout"])
 
 
 def test_a_long_history_is_thinned_and_what_is_not_finite_is_a_gap():

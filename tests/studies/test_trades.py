@@ -12,6 +12,7 @@ from ptsmc_jax import scenario
 from ptsmc_jax.campaigns.montecarlo import Trials
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import catalogues
+from ptsmc_jax.simulation.metric_table import METRICS
 from ptsmc_jax.simulation.metrics import Metrics
 from tests.helpers import SHORT_CHAIN, small_search
 from tests.output.pages import checked
@@ -246,7 +247,7 @@ def test_a_study_is_known_by_all_digits_of_its_times():
 
 
 def test_slew_costs_are_the_metrics_of_the_scenario():
-    trials = Trials(np.arange(1), Metrics(*[np.ones(1)] * len(Metrics._fields)), np.zeros(1, int), np.zeros(1), {})
+    trials = Trials(np.arange(1), Metrics(dict.fromkeys(METRICS, np.ones(1))), np.zeros(1, int), np.zeros(1), {})
 
     def costs(**tables):
         made = scenario.from_tables(tables)
