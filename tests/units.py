@@ -49,7 +49,8 @@ def in_units(tables: Mapping[str, Any], inertia: float, time: float) -> dict[str
     def of(table: dict[str, Any], struct: Any) -> None:
         for key in keys.of(struct):
             if key.name in table and key.unit and not isinstance(table[key.name], dict):
-                table[key.name] = times(table[key.name], key.unit.split(",")[0])
+                unit = key.unit.replace("unit of d", catalogues.CATALOGUE["peak_torque"].unit).split(",")[0]
+                table[key.name] = times(table[key.name], unit)
 
     for name, table in scaled.items():
         kinds = layout.get(name)

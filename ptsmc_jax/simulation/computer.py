@@ -63,6 +63,11 @@ class Period(NamedTuple):
 SAMPLES = ("ok", "saturated", "missed", "singular", "input", "overflow", "other")
 
 
+def no_statuses(computer: Computer) -> dict[str, Array]:
+    """Return no statuses of samples: only exported code has them."""
+    return {}
+
+
 class Software(NamedTuple):
     """The flight software of a run: `boot` and `decide` of this module, or exported C in their place."""
 
@@ -70,7 +75,7 @@ class Software(NamedTuple):
     # parts, k2, period, memory, visible and star tracker's state, actuators
     decide: Callable[[Parts, Bound, Period, Computer, Any, Any, ActuatorState], tuple[Decision, Computer]]
     # number of samples of a run that ended with each status, by its name
-    statuses: Callable[[Computer], dict[str, Array]] = lambda computer: {}
+    statuses: Callable[[Computer], dict[str, Array]] = no_statuses
     on_processor: bool = False  # it runs nowhere else
 
 

@@ -114,7 +114,7 @@ def test_summarize_worst_and_report_run_nothing_that_a_folder_names(command, flo
     assert not ran(home)
     page = (flown / "report.html").read_text()
     assert "farthest" in page
-    assert "--metrics my.py:farthest --seed 1000 --trust" in page
+    assert "--metrics my.py:farthest" in page
 
 
 def test_rows_are_read_where_the_program_is_not(command, flown, home):
