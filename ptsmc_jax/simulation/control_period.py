@@ -87,7 +87,7 @@ class Vehicle(NamedTuple):
 
     def walked(self, walk: Array | None, dt: Scalar, sample: Array) -> Array | None:
         """Return the random walk of the disturbance, (m,) [N m], in a period of dt [s]."""
-        if walk is None or self.walk_key is None:
+        if walk is None or self.walk_key is None or self.parts.walk_rate is None:
             return None
         return walk + self.parts.walk_rate * dt * draws.normals(self.walk_key, walk.size, sample)
 
