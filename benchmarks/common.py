@@ -23,6 +23,7 @@ from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.scenario import Study
 from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.clock import Anchored
+from ptsmc_jax.simulation.control_period import first_period
 from ptsmc_jax.simulation.rollout import Parts
 
 HERE = Path(__file__).parent
@@ -58,7 +59,7 @@ def machine() -> str:
 def medians(
     runs: dict[str, Callable], repeats: int = 7, clock: Callable[[], float] = time.perf_counter
 ) -> dict[str, float]:
-    """Seconds of each run, the median over rounds in which all take turns; a first round is not counted.
+    """Return the seconds of each run: the median over rounds, without the first. In a round all runs take turns.
 
     clock: `time.process_time` counts CPU time, of all threads, which other work on the machine disturbs less.
     """
@@ -199,14 +200,13 @@ class CubesatProgram:
         clock, law, watch, sensors = parts.clock, parts.controller, parts.observer, parts.sensors
         actuators, d = parts.actuators, parts.disturbance
         assert isinstance(clock, Anchored)
-        assert actuators is not None
         assert actuators.wheels is not None
         ticks, k2, device = clock.ticks(law.t_f, law.delta), watch.error_bound(), actuators.wheels
         frame = (np.eye(3), 0.0, 1.0)
         if parts.pointing is not None:
             frame = parts.pointing.frame, parts.pointing.after, parts.pointing.window
         first = jnp.sum(jnp.where(ticks.partial, ticks.t_next - ticks.t, 0.0))
-        start = jax.tree.map(lambda v: v[jnp.argmax(ticks.t_next > ticks.t)], ticks)
+        start = first_period(ticks)
         constants = flat([
             law.model.inertia, law.model.inertia_inverse, parts.reference(jnp.zeros(())).q,
             law.t_f, law.eta, law.k1, law.surface_rate, law.sign_width, law.layer_time, k2.rate, k2.start, k2.floor,
@@ -216,11 +216,11 @@ class CubesatProgram:
             sensors.filter.attitude_gain, sensors.filter.bias_gain,
             actuators.lag, device.axes, device.allocation, device.torque_limit, device.momentum_limit, *frame,
         ])  # fmt: skip
-        rows = np.stack([np.asarray(v, float) for v in (*ticks[:5], ticks.partial)], axis=1)
+        rows = np.ascontiguousarray(np.stack([np.asarray(v, float) for v in (*ticks[:5], ticks.partial)], axis=1))
 
         def begun(trial: jax.Array) -> tuple[jax.Array, jax.Array]:
             drawn = ready.dispersion.apply(parts, np.uint32(0), trial)
-            x0 = drawn.controller.align(drawn.initial, drawn.reference(jnp.zeros(())))
+            x0 = drawn.aligned_initial
             memory = drawn.sensors.begin(np.uint32(0), trial, x0, start)
             values = [
                 x0.q, x0.w, drawn.plant.inertia, drawn.plant.inertia_inverse, drawn.disturbance.phase, memory.bias,
@@ -230,7 +230,6 @@ class CubesatProgram:
             return jnp.concatenate([jnp.ravel(v) for v in values]), keys
 
         drawn, keys = (np.ascontiguousarray(v) for v in jax.jit(jax.vmap(begun))(trials.astype(np.uint32)))
-        rows = np.ascontiguousarray(rows)
         out = np.zeros((len(trials), len(CUBESAT_METRICS) + self.pointing * len(POINTING_METRICS)))
 
         def simulate() -> np.ndarray:

@@ -9,10 +9,10 @@
 # %% [markdown]
 # # From requirements to gains
 #
-# An engineer says what must hold, here no torque above 0.5 N m in any trial, from attitudes 20 to 140 degrees away, and
-# asks for the smallest error after t_f. The search differentiates through the flown trials, by every gain of the law: K1
-# and the width of the smooth sign too, so what is differentiated is what flies. The proof is on *fresh* trials,
-# which the search never saw, on the *flight clock*: samples at whole periods, wherever t_f and the hand-over fall.
+# An engineer states what must hold: here no torque above 0.5 N m in any trial, from attitudes 20 to 140 degrees away. The
+# objective is the smallest error after t_f. The search differentiates the simulated trials by every gain of the law,
+# including K1 and the thickness of the boundary layer. The result is verified on *held-out* trials that the search has
+# not used. They run on the *flight clock*: samples at whole periods, wherever t_f and the hand-over are.
 
 # %%
 from ptsmc_jax.configure import configure
@@ -32,50 +32,52 @@ flight = ptsmc.read("../scenarios/first_flight.toml")
 small = ptsmc.replace(flight, tune={"trials": 16, "starts": 3, "steps": 30})  # less than the default, for a quick look
 
 # %% [markdown]
-# `ptsmc tune scenarios/first_flight.toml` is this with 64 trials and 12 starts. The table sets the tuned gains beside the
-# paper's on 1 000 fresh trials. Below it stands what to know before one trusts them: the interval of the gain, the worst
-# case that a search inside the dispersions finds (a few percent beyond the limit, where no drawn trial was: tune with
-# `worst_case = true` if that must not be), and whether the slopes were right.
+# `ptsmc tune scenarios/first_flight.toml` does the same with 64 trials and 12 starting points. The table compares the tuned
+# gains with the published gains on 1 000 held-out trials. Read three lines below it before you trust the gains:
+#
+# - the interval of the accuracy gain,
+# - the worst case that a search inside the dispersions finds (`worst_case = true` tunes for it),
+# - the error of the gradients.
 
 # %%
 tuned = tuner.tune(small, seed=0)
 terminal.tuning(tune_files.summary(tuned), "out/tune-first_flight", "done")
 
 # %% [markdown]
-# Each line is a start on its way to the optimum next to it. Grey is beyond a limit, blue keeps it; the gains below the
-# goal show into which valley each start went. From the best end the search goes on to more digits.
+# Each line is one local search from its starting point. Grey points exceed a limit, blue points meet it. The gains below the
+# objective show which local minimum each search found. The search then continues from the best end.
 
 # %%
 made = tune_files.figures_of(small, tuned)
 Figures({"history": made["history"]})
 
 # %% [markdown]
-# What each gain does: by how many percent a metric changes for one percent of the gain. One percent of η costs two
-# percent of torque and buys some of the error: nothing but the limit on the torque stops it. The others are different:
-# one percent of them changes the error by less than a hundredth of a percent. The best values of delta, l and K1 lie
-# inside the bounds; the sign's width ended on its lower one, where it hardly counts.
+# The sensitivities state by how many percent a metric changes for one percent of a gain. One percent of η costs two percent
+# of torque and reduces the error, until the torque limit stops it. One percent of any other gain changes the error by
+# less than a hundredth of a percent. The best values of delta, l and K1 are inside the bounds. The boundary layer ended on
+# its lower bound, where its thickness hardly matters.
 
 # %%
 Figures({"sensitivities": made["sensitivities"]})
 
 # %% [markdown]
-# Every fresh trial is a point. With the paper's gains many trials ask for more than the limit, 0.58 N m in the mean, and
-# their errors are the large ones; with the tuned gains all of them stay below it.
+# Every held-out trial is a point. With the published gains many trials exceed the limit: their mean is 0.58 N m, and their
+# errors are the large ones. With the tuned gains every trial stays below the limit.
 
 # %%
 Figures({"tradeoff": made["tradeoff"]})
 
 # %% [markdown]
-# How much accuracy does torque buy? The front, here of few points, each judged on fresh trials: nothing that was found is
-# better in both. The knee is where the front bends most; `ptsmc pareto` draws it with twenty points.
+# The Pareto front shows how much accuracy more torque gives, here with few points on held-out trials. No point that was
+# found is better in both. The knee is the point where the front bends most. `ptsmc pareto` draws twenty points.
 
 # %%
 front = pareto.trace(trades.Torque(small, points=4), 0)
 Figures({"front": study_plots.front(front.points, front.labelled(), 0.5, ("-", "N m"))})
 
 # %% [markdown]
-# Click a point: its gains, its margins in hold and before the hand-over, and one flight with it. What stands below is the knee; the
-# front that can be clicked follows where `ipywidgets`, `plotly` and `anywidget` are installed.
+# Click a point to see its gains, its margins before the hand-over and in the hold phase, and one run with them. The output
+# below shows the knee. The clickable front needs `ipywidgets`, `plotly` and `anywidget`.
 
 
 # %%

@@ -35,8 +35,8 @@ OPTIONS = (
     _Option("xla_cpu_small_while_loop_byte_threshold=100000000"),
     _Option("-vectorize-memory-check-threshold=100000"),
     _Option("--xla_cpu_prefer_vector_width=512"),
-    # without this pass, which the first option adds: it copies arrays that a loop writes, as in reverse mode, whole in
-    # every step, and aborts on some code. `programs.BATCHED` enables it
+    # The first option adds this pass, and this option disables it again. In every step the pass copies whole arrays
+    # that a loop writes, as in reverse mode. It also aborts on some code. `programs.BATCHED` enables it
     _Option("--xla_disable_hlo_passes=cpu_multi_output_fusion"),
     # these compile in a quarter to a half less time, and run as fast
     _Option("-unroll-runtime=false", on_gpu=False),
@@ -110,7 +110,7 @@ def configure(
         jax.config.update("jax_debug_infs", False)
         jax.config.update("jax_numpy_dtype_promotion", "standard")
         jax.config.update("jax_transfer_guard", "allow")
-    if device is not None:  # "gpu" would require one of every maker: JAX by itself finds the one that is there
+    if device is not None:  # "gpu" would require a GPU of every maker; JAX itself finds the GPU of this machine
         jax.config.update("jax_platforms", "cpu" if device == "cpu" else None)
     try:
         jax.config.update("jax_num_cpu_devices", devices or _cores())
@@ -134,7 +134,7 @@ def _set_compiler_options(fast: bool, device: str | None) -> None:
     """Set XLA_FLAGS; raise RuntimeError if JAX has already started with others."""
     before = os.environ.get("XLA_FLAGS", "")
     wanted = _flags(before, _options(device) if fast else ())
-    if wanted == before:
+    if sorted(wanted.split()) == sorted(before.split()):
         return
     if _has_started():
         raise RuntimeError(
@@ -146,11 +146,16 @@ def _set_compiler_options(fast: bool, device: str | None) -> None:
 
 def _options(device: str | None) -> tuple[str, ...]:
     """Return the options for this version, machine and device; None: a GPU may be used if a plug-in is installed."""
-    known = [option for option in OPTIONS if JAXLIB in option.jaxlib and MACHINE in option.machines]
-    if not known:
+    options = _known_options(device == "cpu" or (device is None and importlib.util.find_spec("jax_plugins") is None))
+    if not options:
         message = f"no compiler options are known for jaxlib {JAXLIB} on {MACHINE}: runs will be slower"
         warnings.warn(message, RuntimeWarning, stacklevel=4)
-    on_cpu = device == "cpu" or (device is None and importlib.util.find_spec("jax_plugins") is None)
+    return options
+
+
+def _known_options(on_cpu: bool) -> tuple[str, ...]:
+    """Return the options for this version and machine; on_cpu: only the CPU is used."""
+    known = [option for option in OPTIONS if JAXLIB in option.jaxlib and MACHINE in option.machines]
     return tuple(option.text for option in known if on_cpu or option.on_gpu)
 
 
@@ -161,7 +166,7 @@ def _flags(before: str, options: tuple[str, ...]) -> str:
     """
     if before.strip() and not before.lstrip().startswith("-"):
         return before
-    flags, ours = before.split(), {flag for device in ("cpu", "gpu") for flag in _as_flags(_options(device))}
+    flags, ours = before.split(), {flag for on_cpu in (True, False) for flag in _as_flags(_known_options(on_cpu))}
     if any(flag in ours for flag in flags if flag.startswith(_DECISIVE[0])):  # unique: ours have been added
         flags = [flag for flag in flags if flag not in ours]
     names = {flag.split("=")[0] for flag in flags}
@@ -212,7 +217,7 @@ def _usable(cache: str | Path | None) -> Path | None:
         return None
     if not os.access(folder, os.W_OK):
         warnings.warn(f"the compile cache {folder} takes no new entries", RuntimeWarning, stacklevel=3)
-    # JAX warns of each entry that it cannot write, and of those that another process is writing; it compiles them anew
+    # JAX warns of each entry that it cannot write, or that another process is writing, and compiles it again
     warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache")
     return folder
 

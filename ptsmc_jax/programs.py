@@ -85,20 +85,22 @@ class Program:
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """Call it as the jitted function is called."""
-        return self._run(*args, **kwargs) if self._batch else call_on_cpu(self._run, *args, **kwargs)
+        return self._on_device(self._run, *args, **kwargs)
 
     def prepare(self, *args: Any, **kwargs: Any) -> None:
         """Begin to compile for such a call in a background thread; do nothing if programs are not stored."""
-        if _stores() and self._batch:
-            self._prepare(*args, **kwargs)
-        elif _stores():
-            call_on_cpu(self._prepare, *args, **kwargs)
+        if _stores():
+            self._on_device(self._prepare, *args, **kwargs)
+
+    def _on_device(self, method: Callable, *args: Any, **kwargs: Any) -> Any:
+        return method(*args, **kwargs) if self._batch else call_on_cpu(method, *args, **kwargs)
 
     def _run(self, *args: Any, **kwargs: Any) -> Any:
         if not _stores() or _is_traced(args, kwargs):
             return self._jitted(*args, **kwargs)
         thread = threading.current_thread()
-        if not thread.name.startswith(BACKGROUND):  # what waits there would keep what it waits for from its turn
+        # a background thread must not wait for prepared programs: it would occupy the thread that compiles them
+        if not thread.name.startswith(BACKGROUND):
             for future in self._prepared:
                 with contextlib.suppress(CancelledError):  # by `stop`
                     future.exception()  # an error comes again from the call itself
@@ -284,7 +286,7 @@ def _build(described: Any, leaves: Iterator) -> Any:
         return kind(zip(fixed[2], values, strict=True))
     if not hasattr(kind, "__dataclass_fields__"):
         return kind(*values)  # a named tuple
-    names = sorted(kind.__dataclass_fields__.values(), key=lambda f: bool(f.metadata.get("static")))
+    names = sorted(fields(kind), key=lambda f: bool(f.metadata.get("static")))
     return kind(**{f.name: value for f, value in zip(names, [*values, *fixed[2]], strict=True)})  # `pytrees.pytree`
 
 

@@ -288,6 +288,16 @@ def tree(folder):
     return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
+def refused(command, tmp_path, *args):
+    """The one sentence of a command that writes nothing."""
+    before = tree(tmp_path)
+    status, out, err = command(*args)
+    assert (status, out) == (2, "")
+    assert tree(tmp_path) == before
+    (line,) = err.strip().splitlines()
+    return line
+
+
 def small_search(monkeypatch, fresh=40):
     """A search that looks at a few points only, judged on so many trials; rows hold little more than its few trials."""
     from tuning.search import cma_es, confirm, descents, flights, starts, worst

@@ -158,16 +158,14 @@ class ComponentRules:
     def _elementwise(self, eqn: Any, values: Sequence[BatchedArray]) -> list[np.ndarray]:
         name, shape = eqn.primitive.name, eqn.outvars[0].aval.shape
         operation = partial(eqn.primitive.bind, **eqn.primitive.get_bind_params(eqn.params))
-        replacement, of_zero = self.replacements.get(name), _OF_ZERO.get(name) if _has_tangent(values) else None
+        of_zero = _OF_ZERO.get(name) if _has_tangent(values) else None
 
         def component(*operands: Any) -> Any:
-            if replacement is not None:
-                return replacement(*operands)
             result = None if of_zero is None else of_zero(*operands)
             return operation(*self.broadcast(operands)) if result is None else result
 
         operands = [np.broadcast_to(value.components, shape).flat for value in values]
-        return [object_array(shape, map(component, *operands))]
+        return [object_array(shape, map(self.replacements.get(name, component), *operands))]
 
     def _bitcast(self, eqn: Any, values: Sequence[BatchedArray]) -> list[np.ndarray] | None:
         same_size = eqn.invars[0].aval.dtype.itemsize == eqn.outvars[0].aval.dtype.itemsize

@@ -25,8 +25,8 @@ from ptsmc_jax.batching.components import TRIAL, BatchedArray
 from ptsmc_jax.batching.dependence import of_scan
 
 BLOCK = 128  # trials in a block: a power of two
-UNROLLED = 8  # loops of at most this length are unrolled
-MAPPED = 256  # the same for loops without carries, whose results are stacked
+UNROLLED = 8  # longest loop that is unrolled
+MAPPED = 256  # longest loop without carries that is unrolled; its results are stacked
 MAX_COMPONENTS = 1024  # entries of an array: all are split into components
 
 _CUSTOM_CALLS = ("custom_jvp_call", "custom_vjp_call")  # derivatives are taken before
@@ -306,8 +306,8 @@ class _Interpreter:
     def scan(self, params: Any, values: list) -> list[BatchedArray]:
         """Return the results of a loop, unrolled if it is short."""
         body, length = params["jaxpr"], params["length"]
-        operands = of_scan(params, values)
-        (consts, state), xs, count = map(_loaded, operands[:2]), operands[2], len(operands[1])
+        consts, init, xs = of_scan(params, values)
+        consts, state, count = _loaded(consts), _loaded(init), len(init)
         if params["reverse"]:
             raise NotImplementedError("a kernel's loops run forward")
         if length <= UNROLLED or (count == 0 and length <= MAPPED):
@@ -320,6 +320,7 @@ class _Interpreter:
             return [*state, *(BatchedArray(shape, tuple(itertools.chain(*parts))) for shape, parts in rows)]
         if len(body.jaxpr.outvars) > count:
             raise NotImplementedError(f"a kernel stacks no results of {length} steps")
+        operands = consts, state, xs
         return self.loop(body, length, operands, dependence.scan_dependence(body.jaxpr, *map(_varies, operands)))
 
     def loop(self, body: Any, length: int, operands: Sequence[Sequence], varies: Sequence[int]) -> list[BatchedArray]:

@@ -70,7 +70,7 @@ def vmap(function: Callable, in_axes: Any = 0, *, strict: bool = False, kernel: 
     return mapped
 
 
-def jvp(function: Callable, in_axes: Any = 0, *, strict: bool = False, kernel: bool = False) -> Callable:
+def jvp(function: Callable, in_axes: Any = 0, *, kernel: bool = False) -> Callable:
     """Vectorise a function over trials, together with its derivatives along several directions.
 
     The derivative is taken of the jaxpr of one trial, which is many times shorter than the jaxpr of its components.
@@ -78,7 +78,6 @@ def jvp(function: Callable, in_axes: Any = 0, *, strict: bool = False, kernel: b
     Args:
         function: a function of arrays in pytrees.
         in_axes: see `vmap`.
-        strict: see `vmap`.
         kernel: see `vmap`.
 
     Returns:
@@ -108,7 +107,7 @@ def jvp(function: Callable, in_axes: Any = 0, *, strict: bool = False, kernel: b
         shapes = [v.aval.shape for v in closed.jaxpr.invars[len(values) :]]
         count = along[0].shape[0] if along[0].ndim else 0
         values += [_tangent(leaf, shape, count, trials) for leaf, shape in zip(along, shapes, strict=True)]
-        results = _Interpreter(trials, strict, count, kernel).evaluate(dependence.eliminate_dead_code(closed), values)
+        results = _Interpreter(trials, False, count, kernel).evaluate(dependence.eliminate_dead_code(closed), values)
         half = len(results) // 2
         batches = [(trials,)] * half + [(count, trials)] * half
         return jax.tree.unflatten(jax.tree.structure(out), list(map(BatchedArray.to_array, results, batches)))
@@ -357,13 +356,16 @@ class _Interpreter:
 
         A derivative may be infinite there, and reverse mode would multiply it by zero. `jax.vmap` does the same.
         """
-        inexact = [jnp.issubdtype(v.aval.dtype, jnp.inexact) for v in eqn.invars[1:]]
-        aligned = [self._aligned(v, v.axes | TRIAL) if on else v for v, on in zip(operands, inexact, strict=True)]
 
         def masked(selected: Array, leaf: Array) -> Array:
             return jnp.where(selected, leaf, lax.stop_gradient(leaf))
 
-        return [self._map_leaves(masked, selected, v) if on else v for v, on in zip(aligned, inexact, strict=True)]
+        def stopped(value: BatchedArray, variable: Any) -> BatchedArray:
+            if not jnp.issubdtype(variable.aval.dtype, jnp.inexact):
+                return value
+            return self._map_leaves(masked, selected, self._aligned(value, value.axes | TRIAL))
+
+        return list(map(stopped, operands, eqn.invars[1:]))
 
     def custom_jvp(self, eqn: Any, values: list[BatchedArray]) -> list[BatchedArray]:
         """Return the results of a function with a custom derivative rule (`jax.custom_jvp`), and preserve the rule."""

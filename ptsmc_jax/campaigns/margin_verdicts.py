@@ -72,7 +72,7 @@ def prepare(ready: Study, rows: np.ndarray | Row | None = None) -> None:
 
 
 def _whose_loops_differ(ready: Study, rows: np.ndarray | Row | None) -> np.ndarray | Row | None:
-    """The trials that margins are asked of; None: of the nominal loop, which is that of all, or none is asked for."""
+    """Return the trials whose margins are required; None: only the nominal loop, or no margin is required."""
     planned_loops = isinstance(rows, Row) and not OF_LOOPS.isdisjoint(rows.given)
     if not ready.margins or not (planned_loops or differ(ready.dispersion)):
         return None

@@ -21,7 +21,7 @@ import polars as pl
 from ptsmc_jax.campaigns import store
 
 FOLDER = "trials"
-RECENT = 1_000_000_000  # ns after a change in which the file could change again with the same time of change
+RECENT = 1_000_000_000  # ns; a file changed so recently may change again with the same time of change
 _NAME = re.compile(r"(\d{10})-(\d{10})-([0-9a-f]{32})\.parquet")
 
 

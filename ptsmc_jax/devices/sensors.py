@@ -99,7 +99,7 @@ class Reading(NamedTuple):
     own_drift: np.ndarray  # (own,) 1 sigma of their change in a control period, per second
     # rows (k, n + own) of what is known at t = 0, and a factor (k, k) of its covariance
     start: tuple[np.ndarray, np.ndarray] | None = None
-    early: np.ndarray | None = None  # (m,) bool: of the state at the time of `control_period.star_state`; None: none is
+    early: np.ndarray | None = None  # (m,) bool: readings at the time of `control_period.star_state`; None: no reading
 
 
 class Memory(NamedTuple):

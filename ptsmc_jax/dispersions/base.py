@@ -91,13 +91,20 @@ class Quantity(NamedTuple):
         return self.write(parts, combine(random, self.read(parts), parts))
 
 
-def at_path(path: str, names: str | Sequence[str], default: object = None, **others: Any) -> Quantity:
+def at_path(
+    path: str,
+    names: str | Sequence[str],
+    default: object = None,
+    present: Callable[[Parts], bool] = lambda parts: True,
+    **others: Any,
+) -> Quantity:
     """Return the quantity at one path of the parts, such as `sensors.rate_noise`.
 
     Args:
         path: fields from the parts to a number or a vector. Parts without one of the fields have no such quantity.
         names: names of the columns, or the beginning of their numbered names; a single number has no number.
         default: the value if the field is None; None: there is no such quantity.
+        present: returns whether parts that have the fields have the quantity.
         others: further fields of `Quantity`.
     """
 
@@ -108,9 +115,11 @@ def at_path(path: str, names: str | Sequence[str], default: object = None, **oth
         return default if found is None else found
 
     def columns(parts: Parts) -> list[str]:
-        found = value(parts)
-        if found is None or not isinstance(names, str):
-            return [] if found is None else list(names)
+        found = value(parts) if present(parts) else None
+        if found is None:
+            return []
+        if not isinstance(names, str):
+            return list(names)
         return numbered(names, np.size(found)) if np.ndim(found) else [names.rstrip("_")]
 
     def write(parts: Parts, new: Numbers) -> Parts:

@@ -19,12 +19,12 @@ CANDIDATES, SLENDER = 16, 4  # bodies drawn for one that is physical, and if non
 @pytree
 @dataclass(frozen=True)
 class RelativeInertia:
-    """True inertia whose principal moments are each off by a normal share, and whose axes are turned.
+    """True inertia with random principal moments and axes.
 
-    Truncated, not clipped: no moment is more than `FARTHEST` standard deviations off, and each is at most the sum of
-    the other two. That is the law of the first of `CANDIDATES` draws that is such a body, and where none is, which
-    happens to slender bodies, of the first of `SLENDER` draws by `_slender`, which leave out what is no body
-    beforehand. (All of them fail less than once in 1e10 trials, which are then nominal.)
+    Each moment has a relative error from a truncated normal distribution, which ends at `FARTHEST` standard deviations.
+    Each moment is at most the sum of the other two. The first valid one of `CANDIDATES` samples is used. If none is
+    valid, as for slender bodies, the first valid one of `SLENDER` samples of `_slender` is used. If none of these is
+    valid either, less than once in 1e10 trials, the trial is nominal.
     """
 
     moments: Leaf  # (3,) nominal principal moments [kg m^2]

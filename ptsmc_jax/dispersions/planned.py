@@ -1,4 +1,4 @@
-"""A row of a plan in place of a trial's number: what it gives is flown, and the rest is drawn as for its trial."""
+"""Rows of a plan: the given quantities are simulated, all others are random as for the row's trial."""
 
 from typing import Any, NamedTuple
 
@@ -12,32 +12,32 @@ OF_ROWS = {TRIAL: "plan_trial", SEED: "plan_seed"}  # what rows call them, where
 
 
 class Row(NamedTuple):
-    """What a plan says of a trial; of many, with a leading axis over them."""
+    """A row of a plan; many rows have a leading axis."""
 
-    seed: Any  # whole number: whose draws and noise it has, together with the trial's
+    seed: Any  # whole number that names the random numbers, together with `trial`
     trial: Any
     given: dict[str, Any]  # numbers (n,) by the names of `QUANTITIES`
 
 
 class About(NamedTuple):
-    """What a trial is drawn from."""
+    """The nominal parts, the dispersion and the random stream of a trial."""
 
-    parts: Parts  # about which it is drawn
-    dispersion: Dispersion  # what is drawn
+    parts: Parts  # nominal
+    dispersion: Dispersion
     seed: WholeNumber
     trial: Any
-    given: tuple[str, ...]  # quantities that are not drawn
+    given: tuple[str, ...]  # quantities that are not random
 
     @property
     def drawn(self) -> Parts:
-        """The parts that the trial flies with."""
+        """The parts that the trial simulates."""
         return self.dispersion.apply(self.parts, self.seed, self.trial)
 
 
 def about(parts: Parts, dispersion: Dispersion, seed: WholeNumber, trial: WholeNumber | Row) -> About:
-    """What a trial is drawn from: given quantities [SI units] = the nominal ones of its row, which are not drawn.
+    """Return the basis of a trial. Quantities [SI units] that its row gives are nominal and not random.
 
-    A stream of draws is one quantity's own, so that the others are what they would be without it.
+    Each quantity has its own stream of random numbers, so the others do not depend on the given ones.
     """
     if not isinstance(trial, Row):
         return About(parts, dispersion, seed, trial, ())

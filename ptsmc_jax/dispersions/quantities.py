@@ -49,6 +49,8 @@ from ptsmc_jax.simulation.rollout import Parts
 
 NEAR = 1e-6  # relative: largest error of the norm of a unit vector or quaternion in a plan
 PAIRS = [(i, j) for i in range(3) for j in range(i, 3)]  # the upper triangle, in the order of the inertia's columns
+# for each entry of a symmetric tensor its index in PAIRS
+_PLACES = [[PAIRS.index((min(i, j), max(i, j))) for j in range(3)] for i in range(3)]
 
 
 def level(name: str) -> str:
@@ -73,17 +75,13 @@ def with_body(parts: Parts, body: Spacecraft) -> Parts:
 
 
 def _with_inertia(parts: Parts, entries: Numbers) -> Parts:
-    named = {pair: entries[k] for k, pair in enumerate(PAIRS)}
-    inertia = jnp.stack([jnp.stack([named[min(i, j), max(i, j)] for j in range(3)]) for i in range(3)])
+    inertia = jnp.stack([jnp.stack([entries[k] for k in row]) for row in _PLACES])
     return with_body(parts, paths.get(parts, "plant").with_inertia(inertia, matrices.solve(inertia, jnp.eye(3))))
 
 
 def _tensors(rows: np.ndarray) -> np.ndarray:
     """Return the symmetric tensors (rows, 3, 3) of upper triangles (rows, 6), see `PAIRS` [kg m^2]."""
-    full = np.zeros((len(rows), 3, 3))
-    for k, (i, j) in enumerate(PAIRS):
-        full[:, i, j] = full[:, j, i] = rows[:, k]
-    return full
+    return rows[:, _PLACES]
 
 
 def _inertia_checked(rows: np.ndarray) -> np.ndarray:
@@ -202,7 +200,6 @@ def _paired(name: str, count: int) -> list[str]:
     return [f"{name}_{k + 1}{i + 1}" for k in range(count) for i in range(3)]
 
 
-_OUTAGE = ("star_tracker_outage_begin", "star_tracker_outage_end")
 _FAILURE = ("wheel_failure_time", "wheel_failure_wheel")
 
 # in the order of their columns
@@ -278,13 +275,14 @@ QUANTITIES: dict[str, Quantity] = {
     "gyro_scale": at_path("sensors.rate_scale", "gyro_scale_", np.ones(3), combine=scaled, hardware=True),
     "star_tracker_outage": at_path(
         "sensors.outage",
-        _OUTAGE,
+        ("star_tracker_outage_begin", "star_tracker_outage_end"),
         np.full(2, np.inf),
+        lambda parts: getattr(parts.sensors, "filter", None) is not None,
         combine=lambda random, nominal, parts: jnp.stack([random[0], random[0] + random[1]]),  # begin and duration
         unit="s",
         checked=fitting(lambda rows: rows[:, 0] <= rows[:, 1], "a begin and an end that is not before it"),
         hardware=True,
-    )._replace(columns=lambda parts: [] if getattr(parts.sensors, "filter", None) is None else list(_OUTAGE)),
+    ),
     "wheel_failure": Quantity(
         lambda parts: [] if parts.actuators.wheels is None else list(_FAILURE),
         _failure,
@@ -299,11 +297,12 @@ QUANTITIES: dict[str, Quantity] = {
         "jitter",
         "timing_jitter",
         0.0,
+        lambda parts: parts.clock.sampled,
         combine=replaced,
         checked=fitting(lambda rows: (rows >= 0.0) & (rows < 0.5), "a share of the control period from 0 to below 0.5"),
         check_with=_check_jitter,
         hardware=True,
-    )._replace(columns=lambda parts: ["timing_jitter"] if parts.clock.sampled else []),
+    ),
     "mode_frequency": at_path(
         "plant.frequency", "mode_frequency_", combine=scaled, unit="rad/s", checked=positive, hardware=True
     ),

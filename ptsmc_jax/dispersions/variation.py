@@ -67,8 +67,8 @@ class Dispersion:
     def at(self, parts: Parts, coordinates: Coordinates) -> Parts:
         """Return the parts of the trial that has these coordinates [-]."""
         # the reference first: initial attitudes may be turned away from it
-        for name in sorted(self.kinds, key=lambda name: name != REFERENCE):
-            c, kind = coordinates[name], self.kinds[name]
+        for name, kind in sorted(self.kinds.items(), key=lambda item: item[0] != REFERENCE):
+            c = coordinates[name]
             if isinstance(kind, RandomNumbers):
                 parts = QUANTITIES[name].dispersed(parts, kind.at(c), kind.distribution)
             elif isinstance(kind, RelativeInertia):  # with its inverse, which `write` would have to solve for

@@ -43,11 +43,11 @@ class Kinematics:
         return x
 
     def clearance(self, x: Any, target: Any) -> Scalar:
-        """Distance to the singularity, of either sign beside it: 0 on it; 1 if there is none."""
+        """Distance to the singularity, 0 on it. The sign differs on its two sides. 1: there is no singularity."""
         return jnp.ones(())
 
     def clearance_unit(self, first: Scalar) -> Scalar:
-        """Unit of a run's clearances, from the `first` one: its sign, so that they begin above 0."""
+        """Return the divisor of a run's clearances that makes them start positive; first: clearance at t = 0."""
         return jnp.where(first < 0.0, -1.0, 1.0)
 
     def errors(self, x: Any, target: Any) -> tuple[Vector, Vector]:
@@ -79,7 +79,7 @@ class Kinematics:
         return error
 
     def from_straight_coordinates(self, straight: Vector) -> Vector:
-        """The error (m,) where those coordinates are these."""
+        """Return the error (m,) for these straight coordinates, the inverse of `straight_coordinates`."""
         return straight
 
 

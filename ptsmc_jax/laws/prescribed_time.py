@@ -93,12 +93,16 @@ class PrescribedTimeLaw(Law):
         by_rounding = guards.rounding(t_next - t, t_next)  # which must not cost a period
         return hold | (t_next > self.hand_over - by_rounding)
 
-    def remaining_share(self, now: Sample) -> Scalar:
-        """Share r of the time to t_f that is left at the end of the period that begins [-]; 1 in hold.
+    def time_left(self, t: Scalar, hold: Bool[Array, ""]) -> Scalar:
+        """Return t_f - t [s] before the hand-over, and 1 after it, where t_f - t may be 0."""
+        return jnp.where(hold, 1.0, self.t_f - t)
 
-        At least 1e-9 of a period is left: powers of r, and what is divided by them, stay finite.
+    def remaining_share(self, now: Sample) -> Scalar:
+        """Return the fraction r of the time to t_f that remains at the end of this period [-]; 1 in the hold phase.
+
+        At least 1e-9 of a period remains, so powers of r and quotients by them stay finite.
         """
-        left = jnp.where(now.hold, 1.0, self.t_f - now.t)
+        left = self.time_left(now.t, now.hold)
         return jnp.where(now.hold, 1.0, jnp.maximum(left - now.dt, 1e-9 * now.dt) / left)
 
 
@@ -138,7 +142,7 @@ class PrescribedTime(PrescribedTimeLaw):
 
     def gains(self, t: Scalar, hold: Bool[Array, ""]) -> SurfaceGains:
         """Gains of the surfaces and of the law at t [s]; `hold`: after the hand-over."""
-        tau = jnp.where(hold, 1.0, self.t_f - t)  # guarded: t_f - t may be 0 in hold
+        tau = self.time_left(t, hold)
         return SurfaceGains(
             c=tau,
             e=jnp.where(hold, self.surface_rate, self.eta),
@@ -198,7 +202,7 @@ class PrescribedTimeChain(PrescribedTimeLaw):
             d_hat: estimated disturbance, (1,).
             k2: bound on the error of d_hat, K if nothing is estimated.
         """
-        tau = jnp.where(now.hold, 1.0, self.t_f - now.t)  # guarded: t_f - t may be 0 in hold
+        tau = self.time_left(now.t, now.hold)
         c, a = expansion(self.eta, self.order), self.surface()
         s = jnp.reshape(jnp.dot(_surface_weights(c, [*a, 1.0], tau, now.hold), x), 1)
         x_n_dot = self._landing_rate(now, x, s, k2) if self.implicit else self._rate(now, x, s, k2)
@@ -207,7 +211,7 @@ class PrescribedTimeChain(PrescribedTimeLaw):
     def _rate(self, now: Sample, x: Float[Array, " n"], s: Vector, k2: Scalar) -> Vector:
         """x_n' by the first branch of (52) before and the second after the hand-over."""
         n, c, a = self.order, expansion(self.eta, self.order), self.surface()
-        tau = jnp.where(now.hold, 1.0, self.t_f - now.t)
+        tau = self.time_left(now.t, now.hold)
         rates = [jnp.where(now.hold, a[i], (c[i] - (i + 1) * c[i + 1]) * tau ** (i - n + 1)) for i in range(n - 1)]
         reaching = jnp.where(now.hold, self.k1, (self.eta + n - 2) / tau**n)
         equivalent = jnp.dot(jnp.stack(rates), x[1:]) + reaching * s
@@ -219,7 +223,7 @@ class PrescribedTimeChain(PrescribedTimeLaw):
         # the states at the end of the period are drifted + x_n' pushed: Taylor's series of a chain
         drifted = [sum(h ** (j - i) / math.factorial(j - i) * x[j] for j in range(i, n)) for i in range(n)]
         pushed = jnp.stack([h ** (n - i) / math.factorial(n - i) for i in range(n)])
-        a, left = [*self.surface(), 1.0], jnp.where(now.hold, 1.0, self.t_f - now.t)
+        a, left = [*self.surface(), 1.0], self.time_left(now.t, now.hold)
         weights_end = _surface_weights(c, a, r * left, self.in_hold(now.t, now.t + h, now.hold))
         # before the hand-over s = 0 lets x_1 fall like r^eta
         at_hand_over = jnp.reshape(sum(a[i] * r ** (self.eta - i) * x[i] for i in range(n)), 1)

@@ -103,7 +103,7 @@ def shapes(tree: Any) -> Any:
 def board(parts: Parts) -> Board:
     """The flight computer of parts whose loop is sampled."""
     observer, law = parts.observer, parts.controller
-    device = None if parts.actuators.ideal else parts.actuators
+    device = parts.actuators
     parameters, inputs = known(parts), observer.model.inputs
     computer = Board(parameters, observer.model.attitude, rules=derived.rules(parts))
     if parameters["filter"] is not None:
@@ -119,7 +119,7 @@ def board(parts: Parts) -> Board:
     _observing(computer, observer, device)
     _commanding(computer, law, observer, parts.command_filter)
     computer.stages.append(Stage("begin", "What is remembered before the first sample.", (), partial(_begin, m=inputs)))
-    if device is not None:
+    if not device.ideal:
         _acting(computer, device, inputs)
     return computer
 
@@ -238,9 +238,9 @@ def _filtering(computer: Board, filter_: Any, *, aged: bool) -> None:
     computer.stages.append(Stage("sense", about, reads, sense, (filter_,)))
 
 
-def _observing(computer: Board, observer: Observer, device: Actuators | None) -> None:
+def _observing(computer: Board, observer: Observer, device: Actuators) -> None:
     """The disturbance by what the last period's motion shows."""
-    m, wheels = observer.model.inputs, None if device is None else device.wheels
+    m, wheels = observer.model.inputs, device.wheels
     computer.state["observer"] = shapes(observer.begin())
     computer.outputs["d_hat"] = real(m)
     computer.about |= {"observer": "memory of the observer, which begins with the estimate",
@@ -249,17 +249,17 @@ def _observing(computer: Board, observer: Observer, device: Actuators | None) ->
     if wheels is not None:
         each = real(*np.shape(wheels.initial))
         computer.about["wheel_momentum"] = "of each wheel: spin inertia times (wheel speed + axis . body rate) [N m s]"
-        measured = {"wheel_momentum": each, **({"acting": each} if device is not None and device.moves else {})}
+        measured = {"wheel_momentum": each, **({"acting": each} if device.moves else {})}
         computer.inputs |= measured
         computer.state |= measured
         names = [f"{when}.{name}" for when in ("before", "in") for name in measured]
         acted = ("last.wheel_torque", *names)
-    elif device is not None and device.moves:
+    elif device.moves:
         computer.inputs["applied"] = real(m)
         computer.about["applied"] = "mean torque on the body over the last period, from telemetry [N m]"
         acted = ("in.applied",)
     else:
-        acted = ("last.command",) if device is None else ("last.torque",)
+        acted = ("last.command",) if device.ideal else ("last.torque",)
 
     def observe(parameters: Any, t: Any, dt: Any, regular: Any, memory: Any, *read: Any) -> dict[str, Any]:
         known, size = parameters["observer"], len(computer.seen)

@@ -57,8 +57,7 @@ def fly(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Samples:
     parts = replace(dispersion.apply(parts, seed, trial), jitter=None)
     ticks = parts.clock.ticks(parts.controller.t_f, parts.controller.delta)
     law, sensors, wheels = parts.controller, parts.sensors, parts.actuators.wheels
-    x0 = law.kinematics.align(parts.initial, parts.reference(jnp.zeros_like(parts.t_end)))
-    vehicle, first = start(parts, ticks, x0, seed, trial)
+    vehicle, first = start(parts, ticks, parts.aligned_initial, seed, trial)
 
     def step(carry: tuple[State, Array], tick: Tick) -> tuple[tuple[State, Array], Samples]:
         state, unit = carry

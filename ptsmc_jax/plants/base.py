@@ -100,9 +100,9 @@ class Plant(ABC):
     def speed(self, x: Any) -> Scalar:
         """The scalar speed, whose largest value is the metric peak_rate."""
 
-    def momentum(self, x: Any) -> Float[Array, " m"]:
-        """The momentum, whose largest 2-norm is the metric peak_momentum; NaN where a plant has none."""
-        return jnp.full_like(self.velocity(x), jnp.nan)
+    def momentum(self, x: Any) -> Float[Array, " m"] | None:
+        """Return the momentum, whose largest 2-norm is the metric peak_momentum; None: the plant has none."""
+        return None
 
     def too_fast(self, x: Any, dt: Scalar) -> Array:
         """Whether the state changes more in an integration step of dt [s] than the step can follow."""

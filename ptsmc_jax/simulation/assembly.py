@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, TypeVar
 
+import jax.numpy as jnp
 from jax.tree_util import Partial, all_leaves
 
 from ptsmc_jax.devices.actuators import Actuators
@@ -50,6 +51,11 @@ class Setup:
             value = getattr(self, name)
             if _is_function(value):
                 object.__setattr__(self, name, Function(value))
+
+    @property
+    def aligned_initial(self) -> Any:
+        """The initial state in the form that the law can bring to the reference, see `Kinematics.align`."""
+        return self.controller.kinematics.align(self.initial, self.reference(jnp.zeros_like(self.t_end)))
 
     def with_t_f(self: _Setup, t_f: Leaf) -> _Setup:
         """The parts with another prescribed time [s]; the time after it is kept."""

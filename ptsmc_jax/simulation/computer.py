@@ -22,8 +22,8 @@ class Computer(NamedTuple):
     sensors: Any  # memory of the sensors
     seen: Any  # state as it was measured at the last sample
     observer: Any  # memory of the observer
-    law: Any  # memory of the law; None where it has none
-    # what its actuators did in the last period: mean torque [N m], and momentum of the wheels in it [N m s]
+    law: Any  # memory of the law; None: it has no memory
+    # of the last period: mean torque [N m] and wheel momentum [N m s], as the flight software assumes them
     applied: tuple[Array, Array | None] | None  # None: see `control_period.State`
     command_filter: Any = None  # memory of the command's filter; None without one
 
@@ -35,8 +35,8 @@ class Decision(NamedTuple):
     d_hat: Array  # (m,) [N m]
     u: Array  # (m,) commanded torque, behind its filter [N m]
     s: Array  # sliding variable
-    w: Array  # (m,) velocity as it is measured [rad/s]
-    channels: Array | None = None  # (channels,) torque that software with limits and wheels of its own allots [N m]
+    w: Any = None  # (m,) measured velocity [rad/s]; None in the continuous loop and in the row at t_end
+    channels: Array | None = None  # (channels,) torque, if the flight software itself limits and allocates it [N m]
 
 
 class Period(NamedTuple):
@@ -59,7 +59,7 @@ class Period(NamedTuple):
         return jnp.where(self.length > 0.0, starts, 0.0)
 
 
-# how samples by exported C end, the gravest of its statuses last; other: with one that an export has not
+# statuses of samples of exported C, the most severe last; other: unknown to this version
 SAMPLES = ("ok", "saturated", "missed", "singular", "input", "overflow", "other")
 
 

@@ -45,7 +45,7 @@ def simulate(run: Run) -> Result:
         _, _, (u_end, _) = rate(now.t_next, x_next, memory_next)
         u_nodes = u, u_end  # not that of a stage in the middle, which a narrow sign makes zigzag from step to step
         torques = Torques(u_nodes, u_nodes, (1 / 2, 1 / 2), jnp.asarray(False), None)
-        decision = Decision(target, observer.estimate(memory), u, s, parts.plant.velocity(x))
+        decision = Decision(target, observer.estimate(memory), u, s)
         record = Record(now, decision, torques, lambda t: x_next, dt)
         torque = jnp.where(now.t_next > now.t, u_end, state.torque)
         after = State(x_next, torque, state.computer._replace(observer=memory_next))
@@ -61,7 +61,7 @@ def simulate(run: Run) -> Result:
         x, d_hat = state.x, observer.estimate(state.computer.observer)
         target, hold = parts.reference(t), t >= controller.hand_over
         u, s, _ = controller(Sample(t, hold, jnp.zeros_like(t)), x, target, d_hat, k2(t))
-        decision = Decision(target, d_hat, u, s, parts.plant.velocity(x))
+        decision = Decision(target, d_hat, u, s)
         last = run_state.row_at(run, t, x, decision, u, jnp.asarray(True))
         log = run_state.history(rows, last)
     return run_state.finish(run, first, score, log)

@@ -25,7 +25,7 @@ class Snapshot(NamedTuple):
 
     angle: Array  # to the reference [rad]; for other plants |x_1|
     rate: Array  # `Plant.speed`, |w| [rad/s]
-    momentum: Array  # |J w| [N m s]
+    momentum: Array | None  # |J w| [N m s]; None: the plant has no momentum
     modal_amplitude: Array | None = None  # `Plant.modal_amplitude`, of a flexible body [sqrt(kg) m]
 
 

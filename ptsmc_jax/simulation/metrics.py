@@ -101,15 +101,7 @@ def finish(running: Running, criteria: Criteria) -> Metrics:
     return Metrics(values | pointing_report.values(running.pointing, criteria))
 
 
-def unbounded(values: Metrics, begun: Running) -> Array:
-    """Return whether a metric is infinite or NaN, such as the square of a number that is too large.
-
-    begun: the metrics at t = 0. A metric that is NaN there does not exist for the plant, such as a chain's momentum.
-    """
-
-    def exists(memory: Any) -> Array:
-        return ~jnp.any(jnp.isnan(jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(memory)])))
-
-    checked = [name for name in begun.memories if not METRICS[name].may_be_nan]
-    finite = jnp.isfinite(jnp.stack([values[name] for name in checked]))
-    return jnp.any(~finite & jnp.stack([exists(begun.memories[name]) for name in checked]))
+def unbounded(values: Metrics) -> Array:
+    """Return whether a metric is infinite or NaN, such as the square of a number that is too large."""
+    checked = [values[name] for name in METRICS if name in values and not METRICS[name].may_be_nan]
+    return ~jnp.all(jnp.isfinite(jnp.stack(checked)))

@@ -63,7 +63,7 @@ def simulate(
     criteria = Criteria(parts.controller.t_f, parts.t_end, parts.window, parts.settling_angle, pointing)
     target = parts.reference(jnp.zeros_like(parts.t_end))
     # whole numbers and single precision in a start are numbers of the run, as they are in any other part
-    x0 = jax.tree.map(lambda v: jnp.asarray(v, float), parts.controller.kinematics.align(parts.initial, target))
+    x0 = jax.tree.map(lambda v: jnp.asarray(v, float), parts.aligned_initial)
     unit = parts.controller.kinematics.clearance_unit(parts.controller.clearance(x0, target))
     target_t_f = parts.reference(criteria.t_f)
     unit, gap = jax.lax.stop_gradient(unit), _first_missing(parts, ticks)

@@ -58,7 +58,7 @@ class Log(NamedTuple):
 class Result(NamedTuple):
     """A run's metrics, its status code (see `STATUS`) with the first bad time, NaN if none [s], and its history.
 
-    samples: how many of them flight software that is not ours ended with which status of its own.
+    samples: number of samples by status, as exported C reports them; empty for our own flight software.
     """
 
     metrics: metrics.Metrics
@@ -93,11 +93,12 @@ class Score(NamedTuple):
     bad_time: Array
 
 
-def begin(run: Run, wheel_momentum: Array | None = None) -> Score:
-    """Return the score at t = 0; wheel_momentum: (wheels,) [N m s]."""
+def begin(run: Run) -> Score:
+    """Return the score at t = 0."""
     parts, zero, no_torque = run.parts, jnp.zeros_like(run.criteria.t_f), jnp.zeros(run.parts.plant.inputs)
     snapshot = _snapshot(parts, run.target_0, run.x0)
-    start = Start(snapshot, parts.plant.inputs, wheel_momentum, measured=not parts.sensors.perfect)
+    momentum = None if parts.actuators.wheels is None else parts.actuators.wheels.initial
+    start = Start(snapshot, parts.plant.inputs, momentum, measured=not parts.sensors.perfect)
     running = metrics.begin(start, run.criteria)
     score = Score(snapshot, running, jnp.int32(OK), jnp.full_like(zero, jnp.nan))
     return _judged(run, score, run.x0, run.target_0, zero, zero, no_torque)
@@ -146,8 +147,8 @@ def row(run: Run, before: State, after: State, record: Record) -> Log:
     Arguments as in `advance`.
     """
     now, drive, decision, wheels = record.now, record.drive, record.decision, None
-    if drive is not None and drive.h is not None:
-        wheels = drive.h, run.parts.actuators.at(drive, jnp.zeros_like(now.t))[0]
+    if drive is not None and record.torques.wheel_torque is not None:
+        wheels = drive.h, record.torques.wheel_torque[0]
     u, has_length = record.torques.delivered[0], now.t_next > now.t
     return row_at(run, now.t, before.x, decision, u, has_length, after.walk, wheels)
 
@@ -182,7 +183,7 @@ def finish(run: Run, first: Score, score: Score, log: Log | None, samples: dict[
     """Return the result of a run by its scores at t = 0 and at t_end; samples: see `Result`."""
     criteria, angle_at_t_f = run.criteria, score.running.arrival.angle
     values = metrics.finish(score.running, criteria)
-    unbounded = (score.status == OK) & metrics.unbounded(values, first.running)
+    unbounded = (score.status == OK) & metrics.unbounded(values)
     missed = (score.status == OK) & misses(angle_at_t_f, first.snapshot.angle, criteria.settling_angle)
     cut = ~jnp.isnan(run.gap) & ~(score.bad_time < run.gap)  # what went wrong without samples means nothing
     status = jnp.where(unbounded, UNBOUNDED, jnp.where(missed, MISSED, score.status))
@@ -198,9 +199,10 @@ def misses(angle_at_t_f: Scalar, first: Scalar, settling_angle: Scalar) -> Array
 
 
 def _snapshot(parts: Parts, target: Any, x: Any) -> Snapshot:
-    angle = parts.controller.kinematics.angle(x, target)
-    plant = parts.plant
-    return Snapshot(angle, plant.speed(x), guards.norm(plant.momentum(x)), plant.modal_amplitude(x))
+    angle, plant = parts.controller.kinematics.angle(x, target), parts.plant
+    momentum = plant.momentum(x)
+    size = None if momentum is None else guards.norm(momentum)
+    return Snapshot(angle, plant.speed(x), size, plant.modal_amplitude(x))
 
 
 def _judged(

@@ -24,7 +24,7 @@ def simulate(run: Run, seed: WholeNumber, trial: WholeNumber, software: Software
         row = run_state.row(run, state, after, record) if run.record else None
         return (after, run_state.advance(run, score, state, after, record)), row
 
-    first = run_state.begin(run, state.actuators.h)
+    first = run_state.begin(run)
     (state, score), rows = stacking.scan(step, (state, first), schedule(ticks))
     log = None
     if rows is not None:
@@ -36,7 +36,7 @@ def _last_row(run: Run, state: State, rows: Log) -> Log:
     """Return the row at t_end: the estimate and s of a sample there, and the torque held until then."""
     parts, t, x, torque = run.parts, run.criteria.t_end, state.x, state.torque
     d_hat, s = (signal[jnp.argmax(rows.t >= t)] for signal in (rows.d_hat, rows.s))
-    decision = Decision(parts.reference(t), d_hat, torque, s, parts.plant.velocity(x))
+    decision = Decision(parts.reference(t), d_hat, torque, s)
     wheels = None if state.actuators.h is None else (state.actuators.h, state.actuators.v)
     return run_state.row_at(run, t, x, decision, torque, jnp.asarray(True), state.walk, wheels)
 

@@ -38,7 +38,8 @@ class _Stored:
     """
 
     def __init__(self, parts: Parts, x: Any, h: Array):
-        self._plant, self._h, self._on_body = parts.plant, h, parts.actuators.on_body
+        self._h, self._on_body = h, parts.actuators.on_body
+        self._plant: Any = parts.plant  # a spacecraft, which has a momentum
         self._total_there = self._total(x, h)
 
     def _inverse(self, momentum: Array) -> Array:

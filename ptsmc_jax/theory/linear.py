@@ -85,7 +85,7 @@ def nominal(parts: Parts) -> Nominal:
     assert parts.clock.sampled
     parts = quiet(parts)
     ticks = parts.clock.ticks(parts.controller.t_f, parts.controller.delta)
-    x0 = parts.controller.kinematics.align(parts.initial, parts.reference(jnp.zeros_like(parts.t_end)))
+    x0 = parts.aligned_initial
     vehicle, first = start(parts, ticks, x0, np.uint32(0), np.uint32(0))
 
     def step(state: State, tick: Tick) -> tuple[State, Nominal]:

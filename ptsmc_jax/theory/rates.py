@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from ptsmc_jax import formulas, programs
 from ptsmc_jax.batching import lapack
-from ptsmc_jax.laws.kinematics import AttitudeKinematics, SecondOrderKinematics
+from ptsmc_jax.laws.kinematics import AttitudeKinematics, ChainKinematics, SecondOrderKinematics
 from ptsmc_jax.laws.prescribed_time import PrescribedTimeLaw
 from ptsmc_jax.numerics import guards
 from ptsmc_jax.numerics.pytrees import Scalar
@@ -32,7 +32,9 @@ def switching_rate(law: PrescribedTimeLaw, k2: Scalar, visited: tuple[Any, Any] 
         assert visited is not None
         times, states = visited
         return jnp.max(lapack.vmap(kinematics.influence)(states, times)) * k2
-    return k2
+    if isinstance(kinematics, ChainKinematics):
+        return k2
+    raise TypeError(f"the switching rate of {type(kinematics).__name__} is not known")
 
 
 def boundary_layer(law: PrescribedTimeLaw, k2: Scalar, visited: tuple[Any, Any] | None = None) -> tuple[Scalar, Scalar]:

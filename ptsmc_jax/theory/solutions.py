@@ -46,7 +46,7 @@ def state_envelope(t: Scalar, t_f: Scalar, eta: Scalar, x0: Vector, s0: Scalar, 
 
 
 def bare(parts: Setup) -> Setup:
-    """The parts without what the exact motion does not hang on: one program is for all clocks and devices."""
+    """Return the parts without clock and devices, on which the exact motion does not depend; one program serves all."""
     names = "plant", "disturbance", "reference", "controller", "initial", "t_end", "window", "settling_angle"
     return Setup(**{name: getattr(parts, name) for name in names}, observer=None)
 
@@ -54,7 +54,7 @@ def bare(parts: Setup) -> Setup:
 def starts(parts: Setup) -> Float[Array, "m n"]:
     """Each component of the error and its derivatives at t = 0, in the states' own units: x_1 .. x_n = x_1^(n-1)."""
     kinematics, target = parts.controller.kinematics, parts.reference(jnp.zeros_like(parts.t_end))
-    return kinematics.derivatives(kinematics.align(parts.initial, target), target)
+    return kinematics.derivatives(parts.aligned_initial, target)
 
 
 def exact_sizes(parts: Setup, t: ArrayLike) -> tuple[np.ndarray, np.ndarray]:

@@ -8,7 +8,7 @@ import polars as pl
 import pytest
 
 from ptsmc_jax.onboard import folder
-from tests.helpers import SHORT, SHORT_CHAIN, tree
+from tests.helpers import SHORT, SHORT_CHAIN, refused, tree
 from tests.onboard.compiled import needs_compiler
 
 CONTINUOUS = SHORT.replace('"sampled"', '"continuous"').split("[hardware]")[0]
@@ -114,16 +114,6 @@ def test_a_campaign_flies_the_controller_and_keeps_it(command, tmp_path):
     assert "was made with another --controller" in refused(command, tmp_path, *replay, "--trust")
     assert command(*flight, "--controller", "c", "--out", "r")[:2] == (0, "")  # which has it again
     assert tree(kept) == before
-
-
-def refused(command, tmp_path, *args):
-    """The one sentence of a command that writes nothing."""
-    before = tree(tmp_path)
-    status, out, err = command(*args)
-    assert (status, out) == (2, "")
-    assert tree(tmp_path) == before
-    (line,) = err.strip().splitlines()
-    return line
 
 
 @pytest.mark.parametrize(

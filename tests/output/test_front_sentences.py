@@ -1,7 +1,9 @@
 """Tables and sentences of a Pareto front."""
 
+import json
 import math
 
+import numpy as np
 import pytest
 
 from ptsmc_jax.campaigns.store import plain
@@ -137,3 +139,21 @@ def test_summary_round_trip_keeps_missing_numbers():
     assert math.isnan(made.points[0].rms)
     assert made.points[1].costs["gain_margin"] == 6.1
     assert (made.without, made.status) == ([3.0], "met")
+
+
+def test_chart_of_a_front_has_intervals_knee_limit_and_no_point_without_an_error():
+    def point(peak, rms, **changes):
+        return torque(peak, peak, rms, **{"interval": (0.9 * rms, 1.2 * rms), **changes})
+
+    others = {"paper": point(5.0, 1e-4, interval=None), "before": torque(1.0, math.nan, math.nan)}
+    points = [point(1.0, 4e-5, knee=True), point(2.0, 1e-5), point(3.0, 2e-5, dominated=True)]
+    drawn = page_charts.front(front(*points, others=others), 1.5)
+    named = {trace["name"]: trace for trace in drawn["data"]}
+    assert {name: trace["x"] for name, trace in named.items()} == {
+        "front": [1.0, 2.0], "knee": [1.0], "dominated": [3.0], "paper": [5.0],
+    }  # fmt: skip
+    np.testing.assert_allclose(named["front"]["error_y"]["array"], [0.8e-5, 0.2e-5])
+    np.testing.assert_allclose(named["front"]["error_y"]["arrayminus"], [0.4e-5, 0.1e-5])
+    assert named["paper"]["error_y"]["array"] == [0.0]
+    assert drawn["layout"]["shapes"][0]["x0"] == 1.5
+    assert "peak torque [N m]" in json.dumps(drawn["layout"])

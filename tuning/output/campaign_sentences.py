@@ -5,7 +5,7 @@ from typing import Any
 
 from ptsmc_jax.simulation import catalogues
 from tuning.output import pointing_sentences, sentences
-from tuning.output.cells import Summary, Table, digits
+from tuning.output.cells import Summary, Table, digits, many
 
 WEAK = 0.05  # rank correlation or share of the variance below which an input is not named
 
@@ -42,10 +42,6 @@ def _number(value: float | None) -> str:
     return "none" if value in (float("inf"), float("-inf")) else digits(value, ".3g")
 
 
-def _trials(count: int) -> str:
-    return f"{count} trial{'s' if count != 1 else ''}"
-
-
 def counts(summary: Summary) -> Iterator[str]:
     """How the trials ended, and why."""
     if summary["flown"] < summary["trials"]:
@@ -54,13 +50,13 @@ def counts(summary: Summary) -> Iterator[str]:
         yield f"NOT finished: {name} is asked for and not judged yet; the same `ptsmc montecarlo` again judges it"
     ends = ", ".join(f"{count} {status}" for status, count in summary["counts"].items() if count)
     of = f"the plan {summary['plan']} and seed" if summary.get("plan") else "seed"
-    yield f"{_trials(summary['flown'])} of {of} {summary['seed']}: {ends}"
+    yield f"{many(summary['flown'], 'trial')} of {of} {summary['seed']}: {ends}"
     for reason in summary["reasons"]:
         first = "" if reason["first_bad_time"] is None else f", the first at {reason['first_bad_time']:.4g} s"
         yield f"  {reason['trials']} {reason['status']}: {reason['reason']}{first}"
     ended = {status: told for status, told in summary.get("controller_samples", {}).items() if told["samples"]}
     if ended:
-        each = (f"{told['samples']} {status} in {_trials(told['trials'])}" for status, told in ended.items())
+        each = (f"{told['samples']} {status} in {many(told['trials'], 'trial')}" for status, told in ended.items())
         yield f"samples of the controller: {', '.join(each)}"
     if summary.get("plan"):
         yield "shares, quantiles and intervals hold for trials drawn at random: of the plan as far as its rows are"

@@ -58,3 +58,12 @@ def short(cell: str) -> str:
     """A cell of a CSV file, its number in four digits."""
     value = number(cell)
     return cell if isinstance(value, str) or not cell else f"{value:.4g}"
+
+
+def many(count: int, thing: str) -> str:
+    """Return a count and its noun.
+
+    >>> many(1, "trial"), many(0, "trial")
+    ('1 trial', '0 trials')
+    """
+    return f"{count} {thing}{'' if count == 1 else 's'}"

@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterator, Sequence
 
 from tuning.output import margin_sentences, sentences
-from tuning.output.cells import Table, digits, valued
+from tuning.output.cells import Table, digits, many, valued
 from tuning.output.pointing_sentences import error
 from tuning.studies.front import KINDS, Front, Point, titled, unit_of
 
@@ -13,7 +13,7 @@ USUAL = margin_sentences.ENOUGH["gain_margin"]  # limit on |S| that the summary 
 
 def heading(front: Front) -> str:
     """Return the number of points and of held-out trials."""
-    return f"{_many(len(front.kept), 'point')}, each judged on {_many(front.trials, 'held-out trial')}"
+    return f"{many(len(front.kept), 'point')}, each judged on {many(front.trials, 'held-out trial')}"
 
 
 def results(front: Front) -> Table:
@@ -84,7 +84,7 @@ def remarks(front: Front) -> Iterator[str]:
         )
     dominated = len(front.points) - len(front.kept)
     if dominated:
-        yield f"omitted: {_many(dominated, 'point')} with more torque and a larger error, beyond its interval"
+        yield f"omitted: {many(dominated, 'point')} with more torque and a larger error, beyond its interval"
     if front.requirements and front.status != "met":
         yield "no point meets every requirement on the held-out trials"
     if front.paper_refused:
@@ -162,7 +162,3 @@ def _listed(front: Front, values: Sequence[float]) -> str:
 def _marks(point: Point) -> str:
     words = [word for word, is_so in (("knee", point.knee), ("meets", point.meets)) if is_so]
     return ", ".join([*words, *([f"{point.failures} failed or missed"] if point.failures else [])])
-
-
-def _many(count: int, thing: str) -> str:
-    return f"{count} {thing}{'' if count == 1 else 's'}"

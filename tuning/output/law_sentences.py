@@ -8,7 +8,7 @@ from typing import Any
 
 from ptsmc_jax.simulation.catalogues import MARGINS
 from tuning.output import page_charts, sentences
-from tuning.output.cells import Summary, Table, digits, lost
+from tuning.output.cells import Summary, Table, digits, lost, many
 
 
 @dataclass(frozen=True)
@@ -224,7 +224,7 @@ WORDS = {
 def alike(summary: Summary) -> str:
     """How the laws were tuned and judged."""
     tuned = "each law is tuned alike in all of its gains, the scenario's own in those of tune.free where that is given"
-    return f"{tuned}, and judged on {sentences.fresh_trials(summary['trials'])}, {summary['judged_on']}"
+    return f"{tuned}, and judged on {many(summary['trials'], 'fresh trial')}, {summary['judged_on']}"
 
 
 def winner(summary: Summary) -> str:

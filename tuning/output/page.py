@@ -117,7 +117,8 @@ def _digest(script: str) -> str:
 
 
 def _table(table: cells.Table, note: str = "") -> Block:
-    numbers = all(row[-1][:1] in "-0123456789" for row in table.rows)  # the last column, which else is words or a unit
+    # the last column contains numbers, or words, units or marks; marks have no heading
+    numbers = bool(table.head[-1]) and all(row[-1][:1] in "-0123456789" for row in table.rows)
     return Block("table", head=table.head, rows=table.rows, note=note, shape="numbers" if numbers else "")
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.catalogues import CATALOGUES, MARGINS, percent
-from tuning.output.cells import Summary, Table, digits, lost, valued
+from tuning.output.cells import Summary, Table, digits, lost, many, valued
 
 
 def verdict(entry: Summary) -> str:
@@ -131,7 +131,7 @@ def tuning(summary: Summary) -> Table:
 def tuning_heading(summary: Summary) -> str:
     """What the gains were judged on."""
     judged = summary.get("judged_on", "flight clock")
-    return f"the gains are judged on {fresh_trials(summary['fresh']['trials'])} ({judged})"
+    return f"the gains are judged on {many(summary['fresh']['trials'], 'fresh trial')} ({judged})"
 
 
 PAPER = {  # columns of the paper's gains in words
@@ -195,11 +195,6 @@ def floor(error: float | None, least: float | None) -> str:
 def ratio(times: float | None) -> str:
     """How many times, in three digits, without an exponent below a million; - where there is no number."""
     return digits(times, ".0f" if times is not None and 999.5 <= times < 1e6 else ".3g")
-
-
-def fresh_trials(count: int) -> str:
-    """So many of them: one, where nothing is drawn."""
-    return f"{count} fresh trial{'s' if count != 1 else ''}"
 
 
 def over_floor(error: float | None, least: float | None) -> float | None:

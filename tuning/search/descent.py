@@ -37,10 +37,8 @@ class Best:
     """The best point so far. The order is: fewest failed trials, then smallest violation, then smallest F."""
 
     def __init__(self, share: np.ndarray, requirements: int, margin: ArrayLike):
-        self.margin, self.share = (
-            np.asarray(margin),
-            share.copy(),
-        )  # (gains,) the starting point, until a better one is offered
+        self.margin = np.asarray(margin)
+        self.share = share.copy()  # (gains,) the starting point, until a better one is offered
         self.f = self.value = self.over = self.lost = np.inf
         self.worst = np.full(requirements, np.inf)  # largest metric / limit
 

@@ -36,7 +36,7 @@ class Fleet(NamedTuple):
     names: tuple[str, ...]  # of the gains
     trials: np.ndarray  # (trials,) that name the noise
     coordinates: Mapping[str, np.ndarray]  # of what is drawn, arrays over the trials first
-    pointing: tuple[str, ...] = ()  # the pointing metrics that are computed, the others are NaN; see `_fly`
+    pointing: tuple[str, ...]  # pointing metrics to compute; the results lack the others, see `_fly`
 
     @property
     def by_trial(self) -> dict[str, Any]:

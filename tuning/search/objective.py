@@ -81,7 +81,8 @@ class Problem(Rules):
     def fleet(self) -> Fleet:
         """What is flown of it."""
         trials, coordinates = np.asarray(self.trials), jax.tree.map(np.asarray, self.coordinates)
-        pointing = tuple(name for name in POINTING if name in watched(self))
+        names = watched(self)
+        pointing = tuple(name for name in POINTING if name in names)
         return Fleet(self.parts, self.dispersion, self.seed, self.names, trials, coordinates, pointing)
 
     def others(self, trials: np.ndarray) -> Fleet:

@@ -16,6 +16,7 @@ from ptsmc_jax.campaigns.montecarlo import Trials
 from ptsmc_jax.figures import study_plots, style
 from ptsmc_jax.scenario import cautions, parsing, study, tables
 from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.scenario.timing import Reach
 from tuning.search import gains, trust
 from tuning.search.cma_es import NEARBY
 from tuning.search.descent import Best
@@ -46,6 +47,7 @@ def trace(trade: Trade, seed: int, tell: Report = lambda *_: None, journal: Jour
         journal: evaluations of an interrupted search, which then resumes.
     """
     posed = posing.pose(trade.base, seed, journal, **trade.farther)
+    reach = posing.reach(trade.base, trade.base.search, **trade.farther) if trade.farther else None
     targets, known = trade.targets(posed, tell)
     best = refined(targets, known, posed, tell)
     chosen, fresh_seed, judged = apart(best) if trade.merged else best, judging.seed_of_judge(seed), []
@@ -53,10 +55,13 @@ def trace(trade: Trade, seed: int, tell: Report = lambda *_: None, journal: Jour
         tell("judging on held-out trials", done, len(chosen), np.nan, 0.0)
         found, value = posed.named(chosen[k].share), targets[k].value
         tuned = trade.tuned(value, found)
-        judged.append(_judged(trade, Point(value, found, trained=chosen[k].value), tuned, fresh_seed))
+        judged.append(_judged(trade, Point(value, found, trained=chosen[k].value), tuned, fresh_seed, reach))
     others, refused = judging.beside(trade.scenario) if trade.compared else ({}, None)
-    beside = {name: Point(np.nan, gains.gains_of(study(one).parts)) for name, one in others.items()}
     scenario = trade.scenario
+
+    def reference(one: Scenario) -> Point:
+        return _judged(trade, Point(np.nan, gains.gains_of(study(one).parts)), one, fresh_seed, reach)[0]
+
     return Front(
         against=trade.against,
         plant=scenario.plant.kind,
@@ -74,13 +79,12 @@ def trace(trade: Trade, seed: int, tell: Report = lambda *_: None, journal: Jour
         cautions=cautions.of(scenario),
         paper_is=gains.paper_is(scenario),
         paper_refused=refused,
-        others={name: _judged(trade, beside[name], one, fresh_seed)[0] for name, one in others.items()},
+        others={name: reference(one) for name, one in others.items()},
     )
 
 
-def _judged(trade: Trade, point: Point, tuned: Scenario, seed: int) -> Judged:
+def _judged(trade: Trade, point: Point, tuned: Scenario, seed: int, reach: Reach | None) -> Judged:
     """Return a point with its results on the held-out trials of this seed, and these trials."""
-    reach = posing.reach(trade.base, trade.base.search, **trade.farther) if trade.farther else None
     trials = judging.judge(tuned, seed, reach)
     costs = trade.costs(tuned, trials, seed)
     return replace(point, costs=costs, **judging.figures(tuned, trials, seed)), trials
