@@ -99,7 +99,7 @@ def single() -> None:
     """One run, on one core."""
     quiet = study()
     fly = Program(lanes=1).prepare(quiet.parts, np.asarray(quiet.parts.initial.q)[None])
-    run = partial(rollout.simulate_jit, quiet.parts, np.uint32(0), np.uint32(0))
+    run = partial(rollout.simulate_parts, quiet.parts, np.uint32(0), np.uint32(0))
     seconds = medians({"scalar C": fly, "ptsmc_jax": lambda: run().metrics.peak_torque}, 51)
     each = {name: s / steps(quiet.parts) * 1e9 for name, s in seconds.items()}
     say(f"\none run: {each['ptsmc_jax']:.0f} ns a step, scalar C {each['scalar C']:.0f} ns: "

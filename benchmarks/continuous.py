@@ -97,7 +97,7 @@ def main() -> None:
             reached.append(state[0].q[:3])
         return reached[1], reached[2]
 
-    ours = partial(rollout.simulate_jit, parts)
+    ours = partial(rollout.simulate_parts, parts)
     best, _ = by_scipy(1e-13, "DOP853")
     target = np.asarray(parts.reference(jnp.zeros(())).q)[:3]
     exact = np.linalg.norm(best - target)

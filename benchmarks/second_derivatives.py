@@ -27,7 +27,7 @@ def main() -> None:
 
     def loss(values: jax.Array) -> jax.Array:
         flown = ptsmc.with_gains(parts, dict(zip(GAINS, values, strict=True)))
-        return jnp.log(ptsmc.simulate_jit(flown, np.uint32(0), np.uint32(0)).metrics.window_error)
+        return jnp.log(ptsmc.simulate_parts(flown, np.uint32(0), np.uint32(0)).metrics.window_error)
 
     def ready(function: Callable) -> tuple[Callable, float]:
         start = time.perf_counter()

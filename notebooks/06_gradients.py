@@ -41,7 +41,7 @@ parts = ptsmc.study(flight, reach=ptsmc.reach_of(flight, delta=3.0)).parts  # a 
 # %%
 def fly(parts, q, trial):
     initial = parts.initial._replace(q=q)
-    return ptsmc.simulate_jit(dataclasses.replace(parts, initial=initial), 0, trial)
+    return ptsmc.simulate_parts(dataclasses.replace(parts, initial=initial), 0, trial)
 
 
 def turned(key, angle):
@@ -71,7 +71,7 @@ _ = axes.legend()
 # %%
 @jax.jit
 def outcome(gains):
-    run = ptsmc.simulate_jit(ptsmc.with_gains(parts, gains), 0, 1).metrics
+    run = ptsmc.simulate_parts(ptsmc.with_gains(parts, gains), 0, 1).metrics
     return {"window error": jnp.log(run.window_error), "peak torque": jnp.log(run.peak_torque)}
 
 

@@ -44,7 +44,7 @@ _EXPORTS = {
     "export": "onboard.folder",
     "read": "scenario",
     "replace": "scenario",
-    "simulate_jit": "simulation.rollout",
+    "simulate_parts": "simulation.rollout",
     "Metrics": "simulation.metrics",
     "Dispersion": "dispersions.variation",
     "Requirement": "simulation.requirements",
@@ -128,7 +128,7 @@ if TYPE_CHECKING:
     from ptsmc_jax.simulation.rollout import STATUS as STATUS
     from ptsmc_jax.simulation.rollout import Parts as Parts
     from ptsmc_jax.simulation.rollout import Result as Result
-    from ptsmc_jax.simulation.rollout import simulate_jit as simulate_jit
+    from ptsmc_jax.simulation.rollout import simulate_parts as simulate_parts
 
 
 def __getattr__(name: str) -> Any:

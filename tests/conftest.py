@@ -32,7 +32,7 @@ hook = jaxtyping.install_import_hook(checked, "beartype.beartype")
 
 from ptsmc_jax.simulation import rollout  # noqa: E402
 
-rollout.simulate_once = rollout.simulate_jit  # all programs are compiled quickly here: not the same one twice
+rollout.simulate_once = rollout.simulate_parts  # all programs are compiled quickly here: not the same one twice
 # rooms of tests whose commands and campaigns call what other rooms test by itself, with its shapes
 CALLERS = ("campaigns", "cli", "onboard", "output", "paper", "scenario", "studies")
 

@@ -118,7 +118,7 @@ def roomy(timing: Any) -> Any:
 def fly(run: Parts, seed: int = 0, trial: int = 0) -> Any:
     """A run with its history, all of it NumPy's, so that one program flies all parts of a structure."""
     numbers = jax.tree.map(np.asarray, run)  # whose types are never weak, as Python's numbers are
-    flown = rollout.simulate_jit(numbers, np.uint32(seed), np.uint32(trial), record=True, software=rollout.OURS)
+    flown = rollout.simulate_parts(numbers, np.uint32(seed), np.uint32(trial), record=True, software=rollout.OURS)
     return jax.tree.map(np.asarray, flown)
 
 

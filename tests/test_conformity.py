@@ -287,7 +287,7 @@ def one_by_one(parts, still, dispersion, sloped):
     if hasattr(still.controller, "sign_width"):
         width = still.controller.sign_width
         begun[-1] = replace(begun[-1], controller=replace(begun[-1].controller, sign_width=width))
-    flown = [rollout.simulate_jit(run, SEED, np.uint32(trial)) for trial, run in enumerate(begun)]
+    flown = [rollout.simulate_parts(run, SEED, np.uint32(trial)) for trial, run in enumerate(begun)]
     each = [(dict(one.metrics), one.status, one.bad_time, {}) for one in flown]
     return jax.tree.map(lambda *v: np.stack(v), *each)
 
@@ -332,7 +332,7 @@ def test_every_part_is_the_same_in_lanes_under_vmap_and_in_a_loop_with_finite_sl
 def test_uncompiled_it_is_the_same(name):
     ready = scenario.study(scenario.from_tables(ROWS[name]))
     run = ready.dispersion.apply(ready.parts, SEED, NUMBERS[0])
-    one, other = (dict(fly(run, SEED, NUMBERS[0]).metrics) for fly in (rollout.simulate, rollout.simulate_jit))
+    one, other = (dict(fly(run, SEED, NUMBERS[0]).metrics) for fly in (rollout.simulate, rollout.simulate_parts))
     agree(jax.tree.map(np.asarray, one), other, 1e-12, name)
 
 

@@ -95,7 +95,9 @@ def _fly(ready: Study, seed: int, trial: int | Row | None, software: Software = 
     key, number = np.uint32(row.seed), np.uint32(row.trial)
     about = trial if isinstance(trial, Row) else number
     parts = ready.parts if trial is None else _drawn(ready.dispersion, ready.parts, key, about)
-    result = jax.tree.map(np.asarray, rollout.looked_at(parts)(parts, key, number, record=True, software=software))
+    result = jax.tree.map(
+        np.asarray, rollout.single_run_program(parts)(parts, key, number, record=True, software=software)
+    )
     assert result.log is not None
     has_length = result.log.has_length
     log = jax.tree.map(lambda rows: rows[has_length], result.log)
@@ -110,7 +112,7 @@ def _fly(ready: Study, seed: int, trial: int | Row | None, software: Software = 
 def prepare(ready: Study) -> None:
     """Begin to compile what flies one run of such a study, beside what is being done."""
     number = np.uint32(0)
-    rollout.looked_at(ready.parts).prepare(ready.parts, number, number, record=True, software=OURS)
+    rollout.single_run_program(ready.parts).prepare(ready.parts, number, number, record=True, software=OURS)
 
 
 @programs.jit

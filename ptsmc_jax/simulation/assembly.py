@@ -23,29 +23,29 @@ _Setup = TypeVar("_Setup", bound="Setup")
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class Setup:
-    """The parts of a run but for its clock. `plant` is the truth; controller and observer hold a nominal model."""
+    """The parts of a run without its clock. `plant` is the true plant; law and observer have the design model."""
 
     plant: Plant
-    disturbance: Any  # callable: t [s], true state -> (m,) [N m]
-    reference: Any  # callable: t [s] -> the target of the law, a `references.Target` for spacecraft
+    disturbance: Any  # function: t [s], true state -> (m,) [N m]
+    reference: Any  # function: t [s] -> target of the law, a `references.Target` for spacecraft
     controller: Any  # laws.base.Law
     observer: Any  # observers.base.Observer
     sensors: Any = field(default_factory=PerfectSensors)  # sensors.Sensor
     initial: Any  # state of the plant
     t_end: Leaf  # [s]
-    window: Leaf  # after t_f, for window_error [s]
+    window: Leaf  # length of the window after t_f, for window_error [s]
     settling_angle: Leaf  # [rad]
     actuators: Actuators = field(default_factory=Actuators)  # by default they hold the commanded torque over a period
-    walk_rate: Leaf | None = None  # (m,) 1 sigma of a random walk's change per second of a period [N m/s]
+    walk_rate: Leaf | None = None  # (m,) 1 sigma of the step of a random walk, over the length of the period [N m/s]
     command_filter: CommandFilter | None = None  # between the law and the actuators
-    jitter: Leaf | None = None  # by how much a sample comes early or late at most, as a share of the control period [-]
-    pointing: Pointing | None = None  # which pointing errors are observed
+    jitter: Leaf | None = None  # largest error of a sample time, as a fraction of the control period [-]
+    pointing: Pointing | None = None  # None: pointing errors are not observed
 
     def __post_init__(self) -> None:
-        """Wraps functions as reference of an attitude, which may give a quaternion, and plain ones as any signal."""
+        """Wrap plain functions as signals. A function as reference of an attitude may return a quaternion."""
         path = self.reference
         if (isinstance(path, Partial) or _is_function(path)) and self.plant.attitude:
-            whole = path if isinstance(path, Partial) else Partial(path)  # one of another has no leaves
+            whole = path if isinstance(path, Partial) else Partial(path)
             object.__setattr__(self, "reference", TurningFunction(whole))
         for name in ("disturbance", "reference"):
             value = getattr(self, name)
@@ -58,15 +58,19 @@ class Setup:
         return self.controller.kinematics.align(self.initial, self.reference(jnp.zeros_like(self.t_end)))
 
     def with_t_f(self: _Setup, t_f: Leaf) -> _Setup:
-        """The parts with another prescribed time [s]; the time after it is kept."""
+        """Return the parts with another prescribed time [s]. The time from t_f to t_end stays the same."""
         t_end = t_f + (self.t_end - self.controller.t_f)
         return replace(self, controller=replace(self.controller, t_f=t_f), t_end=t_end)
 
     def with_inertia(self: _Setup, inertia: Any, *, known: bool = True) -> _Setup:
-        """The parts of a spacecraft with another inertia [kg m^2], see `spacecraft`; traced ones too.
+        """Return the parts of a spacecraft with another inertia, for the true body and its gravity gradient.
 
-        On that body a gravity gradient acts, too. known: the law and the observer know it; else it is that of the truth
-        alone. Raises ValueError where a plant has none.
+        Args:
+            inertia: [kg m^2], see `spacecraft`; it may be traced.
+            known: whether the design model of the law and the observer gets the inertia, too.
+
+        Raises:
+            ValueError: a plant has no inertia.
         """
         body = spacecraft(inertia)
 
@@ -86,17 +90,17 @@ class Setup:
         return replace(self, **changes)
 
     def timed(self, clock: Anchored | Flight | Graded, substeps: int) -> "Parts":
-        """The parts of a run by this clock."""
+        """Return the parts of a run with this clock and number of integration steps in a control period."""
         return Parts(clock=clock, substeps=substeps, **{f.name: getattr(self, f.name) for f in fields(self)})
 
 
 def _is_function(value: Any) -> bool:
-    """Whether it is called and JAX would take it for a number: a plain function, a jitted one, a bound method."""
+    """Return whether a value is a plain or jitted function or a bound method, which JAX would treat as a leaf."""
     return callable(value) and all_leaves([value])
 
 
 def check_parts(what: object) -> None:
-    """Raise TypeError, with one sentence, where something else is in the place of parts."""
+    """Raise TypeError if the argument is not the parts of a run."""
     if not isinstance(what, Setup):
         raise TypeError(f"parts are needed, such as study(scenario).parts, but this is a {type(what).__name__}")
 
@@ -106,8 +110,8 @@ def check_parts(what: object) -> None:
 class Parts(Setup):
     """Everything a run is made of."""
 
-    clock: Anchored | Flight | Graded  # Graded: continuous loop; the others: sampled
-    substeps: int = field(default=1, metadata={"static": True})  # RK4 steps of the plant a control period
+    clock: Anchored | Flight | Graded  # Graded: continuous loop; the others: sampled loop
+    substeps: int = field(default=1, metadata={"static": True})  # RK4 steps of the plant in a control period
 
     @property
     def period(self) -> Any:
@@ -116,6 +120,6 @@ class Parts(Setup):
         return clock.period
 
     def with_t_f(self, t_f: Leaf) -> "Parts":
-        """The parts with another prescribed time [s]; the time after it is kept."""
+        """Return the parts with another prescribed time [s]. The time from t_f to t_end stays the same."""
         parts = super().with_t_f(t_f)
         return replace(parts, clock=replace(self.clock, t_end=parts.t_end))

@@ -1,6 +1,6 @@
-"""The metrics of a run by name, with unit and meaning: the names that `[requirements]` may limit.
+"""The metrics and margins by name, with unit and meaning. `[requirements]` may limit each of them.
 
-They are the `metric_table` and the pointing error indices. Nothing here imports JAX, so reading a scenario is fast.
+The metrics are in `metric_table`; the pointing error indices are added here. This module does not import JAX.
 """
 
 import math
@@ -14,10 +14,10 @@ class Entry(NamedTuple):
 
     unit: str
     meaning: str
-    table: str | None = None  # table of the scenario without which a run lacks the metric
+    table: str | None = None  # table of the scenario that a run needs to have the metric; None: every run has it
 
 
-# pointing error indices (ECSS-E-ST-60-10C), see `pointing`; each metric is the largest in the observation
+# pointing error indices (ECSS-E-ST-60-10C), see `pointing`; each metric is the largest value in the observation
 INDICES = {
     "ape": "APE, the error",
     "mpe": "MPE, the error's mean over a window",
@@ -28,11 +28,11 @@ INDICES = {
     "rke": "RKE, the error of the attitude that the law is given less its window's mean",
 }
 AXES = {"x": "about x", "y": "about y", "z": "about z", "boresight": "half-cone of the boresight"}
-TIMED = ("ape", "mpe", "rpe", "ake", "mke", "rke")  # those with a share of time
-RELATIVE = ("rpe", "rke")  # among them those that need the samples of a window
+TIMED = ("ape", "mpe", "rpe", "ake", "mke", "rke")  # indices that a limit on a fraction of the time may use
+RELATIVE = ("rpe", "rke")  # indices that need the samples of a window for it
 AT_A_TIME = tuple(f"{index}_{axis}" for index in TIMED for axis in AXES)
-WITHIN = "within_"  # prefix of the metric that is the share of the time in which a run keeps a limit
-# prefixes of metrics that a run without noise lacks
+WITHIN = "within_"  # prefix of the metric that is the fraction of the time within the limit of another metric
+# prefixes of metrics that only a run with measurement noise has
 KNOWLEDGE = tuple(f"{prefix}{index}" for prefix in ("", WITHIN) for index in ("ake", "mke", "rke"))
 
 CATALOGUE = {
@@ -51,7 +51,7 @@ POINTING = tuple(name for name, entry in CATALOGUE.items() if entry.table == "po
 # metrics of other plants, whose x_1 is the error, in the units of their states and inputs
 STATE_CATALOGUE = {name: Entry(*metric.of_states) for name, metric in METRICS.items() if metric.of_states is not None}
 MAY_BE_ZERO = ("saturated",)  # a limit of zero on these can be kept
-LARGER_IS_BETTER = tuple(f"{WITHIN}{name}" for name in AT_A_TIME)  # a run that failed has 0; of others less is better
+LARGER_IS_BETTER = tuple(f"{WITHIN}{name}" for name in AT_A_TIME)  # all other metrics are better if smaller
 # units that a limit may be stated in, by the unit of its metric or key: name -> value in that unit
 UNITS: dict[str, dict[str, float]] = {
     "rad": {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "deg": math.pi / 180, "arcmin": math.pi / 10_800,
@@ -73,7 +73,7 @@ class Margin(NamedTuple):
 
     unit: str
     meaning: str
-    at_least: bool = True  # a requirement is the least that is allowed
+    at_least: bool = True  # the limit of a requirement is the smallest allowed value
 
 
 MARGINS = {
@@ -86,12 +86,12 @@ NO_SIGN = "the exact sign has no slope: margins are those of the loop without it
 
 
 def units(kind: str) -> dict[str, str]:
-    """The unit of each metric of this kind of plant."""
+    """Return the unit of each metric for this kind of plant."""
     return {name: entry.unit for name, entry in CATALOGUES[kind].items()}
 
 
 def percent(share: float) -> str:
-    """A share in per cent, in three digits of it or of what is left to 100 %: how near that is, is what is asked.
+    """Return a fraction in per cent, with three digits of it or of its difference to 100 %.
 
     >>> percent(59 / 60), percent(0.99973), percent(1.0), percent(0.000412), percent(0.5)
     ('98.33', '99.973', '100', '0.0412', '50')

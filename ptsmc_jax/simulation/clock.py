@@ -1,7 +1,7 @@
-"""The times at which things happen: graded grid (continuous loop), anchored and flight clock (sampled loop).
+"""Clocks: the sample times of the sampled loop (`Anchored`, `Flight`) and the steps of the continuous loop (`Graded`).
 
-Each clock turns t_f and delta into `Ticks`, intervals in order of time. Their number is fixed when the clock is built;
-intervals that lie before t = 0 or after t_end have length zero and count for nothing.
+Each clock turns t_f and delta into `Ticks`, which are intervals in order of time. Their number is fixed when the clock
+is built. Intervals before t = 0 or after t_end have length zero and change nothing.
 """
 
 import math
@@ -18,16 +18,16 @@ from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.numerics import guards
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree, vector
 
-COARSEST = 0.25  # of the time to go that a step before the hand-over may be: the window error is then 5e-4 off
+COARSEST = 0.25  # longest step before the hand-over over the time to go; the window error is then 5e-4 off
 
 
 def _not_above(t: Array, limit: Scalar, rounding: Scalar | float = 0.0) -> Array:
-    """min(t, limit), with the derivative of `limit` where they are equal; rounding: what counts as equal."""
+    """Return min(t, limit), with the derivative of `limit` if they are equal within `rounding`."""
     return jnp.where(t < limit - rounding, t, limit)
 
 
-def _whole(t: Array, t_next: Array, hold: Array) -> Ticks:
-    """Intervals counted from the first, none of them a partial one."""
+def _complete(t: Array, t_next: Array, hold: Array) -> Ticks:
+    """Return intervals that are numbered from 0, none of which is partial."""
     return Ticks(t, t_next, hold, jnp.arange(t.size, dtype=jnp.int32), jnp.ones_like(t), jnp.zeros_like(hold))
 
 
@@ -36,9 +36,10 @@ def _whole(t: Array, t_next: Array, hold: Array) -> Ticks:
 class Anchored:
     """Control clock with a sample at the hand-over t_s: t_k = t_s + (k - before) period.
 
-    Everything, the noise too, moves with t_s, so a run depends smoothly on delta and t_f. The first period, from t = 0,
-    is a partial one; its noise is blended with the next sample's so that no state jumps where it vanishes. There slopes
-    by delta and t_f are one-sided, and what is summed over samples, the chattering, jumps by one sample's share.
+    All samples and their noise move with t_s, so a run depends smoothly on delta and t_f. The first period, from t = 0,
+    is partial. Its noise is blended with the noise of the next sample, so that no state jumps when the partial period
+    vanishes. At that point derivatives by delta and t_f are one-sided, and the chattering jumps by the contribution of
+    one sample.
     """
 
     period: Leaf  # h [s]
@@ -50,23 +51,23 @@ class Anchored:
 
     @property
     def count(self) -> int:
-        """How many samples there are."""
+        """The number of samples."""
         return self.before + self.after
 
     def long_enough_for(self, others: Sequence[Any]) -> "Anchored":
-        """The clock with as many samples on either side of the hand-over as the longest of these clocks."""
+        """Return the clock with as many samples before and after the hand-over as the longest of these clocks."""
         return replace(self, before=max(one.before for one in others), after=max(one.after for one in others))
 
     def ticks(self, t_f: Scalar, delta: Scalar) -> Ticks:
         """Control periods for this prescribed time and delta [s]."""
         sample = jnp.arange(-self.before, self.after, dtype=jnp.int32)
-        # one array of nodes, so that one interval ends where, to the last bit, the next begins
+        # one array of nodes, so that each interval ends exactly where the next begins
         nominal = (t_f - delta) + jnp.arange(-self.before, self.after + 1).astype(float) * self.period
-        # a sample that rounding alone puts after t = 0 is the one there: else two of them, and slopes between their two
+        # rounding may put the sample at t = 0 slightly after it; then there would be two samples
         begun = nominal > guards.rounding(self.period, t_f)
         nodes = _not_above(jnp.where(begun, nominal, 0.0), self.t_end, guards.rounding(self.period, self.t_end))
         t, t_next = nodes[:-1], nodes[1:]
-        # told by where it starts: its share of a whole one may be 1 or more by rounding, and has slopes there, too
+        # decided by the start of the period: by rounding its fraction of a complete period may be 1 or more
         partial = ~begun[:-1]
         share = jnp.where(partial, (t_next - t) / self.period, 1.0)
         return Ticks(t, t_next, sample >= 0, sample, share, partial)
@@ -75,7 +76,7 @@ class Anchored:
 @pytree
 @dataclass(frozen=True)
 class Flight:
-    """Control clock as flown: samples at k period from t = 0, the hand-over at the first one not before t_s."""
+    """Control clock of flight software: samples at k period from t = 0, hand-over at the first sample from t_s on."""
 
     period: Leaf  # h [s]
     t_end: Leaf  # [s]
@@ -84,7 +85,7 @@ class Flight:
     anchored: ClassVar[bool] = False
 
     def long_enough_for(self, others: Sequence[Any]) -> "Flight":
-        """The clock with as many samples as the longest of these clocks."""
+        """Return the clock with as many samples as the longest of these clocks."""
         return replace(self, count=max(one.count for one in others))
 
     def ticks(self, t_f: Scalar, delta: Scalar) -> Ticks:
@@ -92,8 +93,8 @@ class Flight:
         nominal = jnp.arange(self.count + 1).astype(float) * self.period
         nodes = _not_above(nominal, self.t_end, guards.rounding(self.period, self.t_end))
         t, t_next = nodes[:-1], nodes[1:]
-        hold = t >= t_f - delta - guards.rounding(self.period, t_f)  # which must not cost a period
-        return _whole(t, t_next, hold)
+        hold = t >= t_f - delta - guards.rounding(self.period, t_f)  # rounding must not delay the hand-over
+        return _complete(t, t_next, hold)
 
 
 @pytree
@@ -115,11 +116,11 @@ class Graded:
 
     @property
     def count(self) -> int:
-        """How many steps there are."""
+        """The number of steps."""
         return self.before + self.after
 
     def long_enough_for(self, others: Sequence[Any]) -> "Graded":
-        """The clock itself: its number of steps follows from its own accuracy."""
+        """Return the clock itself, because its number of steps follows from its accuracy."""
         return self
 
     def ticks(self, t_f: Scalar, delta: Scalar) -> Ticks:
@@ -133,39 +134,41 @@ class Graded:
         late = jnp.sort(jnp.concatenate([late, extra, jnp.clip(self.saves, t_s, self.t_end)]))
         t, t_next = jnp.concatenate([early[:-1], late[:-1]]), jnp.concatenate([early[1:], late[1:]])
         hold = jnp.arange(t.size) >= early.size - 1
-        return _whole(t, t_next, hold)
+        return _complete(t, t_next, hold)
 
     def too_coarse(self, t_f: Any, delta: Any, xp: Any = jnp) -> Any:
-        """Whether steps are beyond `COARSEST`, as where t_f is twice that which the grid was made for; times in [s]."""
+        """Return whether steps are longer than `COARSEST` allows, as for twice the t_f of the grid. Times in [s]."""
         return self._grading(t_f, delta, xp) < 1.0 / COARSEST
 
     def _grading(self, t_f: Any, delta: Any, xp: Any = jnp) -> Any:
-        """The weight a of ln(tau): how many steps there are while the time to go falls to 1/e, but for `max_step`."""
+        """Return the weight a of ln(tau): without `max_step`, the number of steps in which tau falls to 1/e."""
         return (self.before - (t_f - delta) / self.max_step) / xp.log(t_f / delta)
 
     def _graded(self, t_f: Scalar, delta: Scalar) -> Float[Array, " nodes"]:
-        """Nodes from 0 to the hand-over [s]."""
+        """Return the nodes from 0 to the hand-over [s]."""
         a = self._grading(t_f, delta)
         start, end = a * jnp.log(t_f) + t_f / self.max_step, a * jnp.log(delta) + delta / self.max_step
         level = start + (end - start) * jnp.arange(self.before + 1).astype(float) / self.before
 
-        def newton(u: Array) -> Array:  # on a u + e^u / max_step = level, u = ln tau: convex, so from above it is safe
-            slope = a + jnp.exp(u) / self.max_step
-            return u - (a * u + jnp.exp(u) / self.max_step - level) / slope
+        def newton(
+            u: Array,
+        ) -> Array:  # solves a u + e^u / max_step = level, u = ln tau; convex, so it converges from above
+            derivative = a + jnp.exp(u) / self.max_step
+            return u - (a * u + jnp.exp(u) / self.max_step - level) / derivative
 
         u = jax.lax.fori_loop(0, 40, lambda _, u: newton(u), jnp.full_like(level, jnp.log(t_f)))
-        u = newton(jax.lax.stop_gradient(u))  # one step from the root has the root's exact derivative
+        u = newton(jax.lax.stop_gradient(u))  # one step from the root gives its exact derivative
         return (t_f - jnp.exp(u)).at[0].set(0.0).at[-1].set(t_f - delta)
 
 
 def anchored(period: float, t_end: float, t_f_max: float, longest_after: float) -> Anchored:
-    """Anchored clock for any t_f up to t_f_max and any hand-over at most longest_after before t_end; all in s."""
+    """Return the anchored clock for t_f up to `t_f_max` and a hand-over at most `longest_after` before t_end, in s."""
     before, after = math.ceil(t_f_max / period), math.ceil(longest_after / period) + 1
     return Anchored(vector(period), vector(t_end), before, after)
 
 
 def flight(period: float, t_end: float) -> Flight:
-    """Flight clock; period and t_end in s."""
+    """Return the flight clock; period and t_end in s."""
     return Flight(vector(period), vector(t_end), math.ceil(t_end / period))
 
 
@@ -180,23 +183,23 @@ def graded(
     saves: object = (),
     order: int = 1,
 ) -> Graded:
-    """Grid of the continuous loop.
+    """Return the integration grid of the continuous loop.
 
-    200 graded steps and at most t_f/200 each leave 1e-8 in the states of the paper's cases, and the error falls with
-    the fourth power. Chains take 3 n - 4 times as many, which leaves 1e-9 of the largest state up to order 5 before the
-    hand-over. Explicit steps must resolve the smooth sign: where s enters a layer of width 0.02 after the hand-over,
-    under a disturbance that no observer takes off, 3e-5 are left in the last state and 3e-6 in x_1 (of 1).
+    It has 200 graded steps, each at most t_f/200. The error in the states is then about 1e-8 in the cases of the paper,
+    and falls with the fourth power of the step. Chains of order n have 3 n - 4 times as many steps, for an error of
+    1e-9 of the largest state. The explicit steps must also resolve the boundary layer of the smooth sign. The
+    largest error was 3e-5 in the last state, for a layer of width 0.02 and a disturbance without observer.
 
     Args:
         t_f: prescribed time [s].
-        delta: the hand-over is so long before it [s].
+        delta: time from the hand-over to t_f [s].
         t_end: end of the run [s].
-        window: after t_f, a node at its end [s].
+        window: length of the window after t_f, which ends at a node [s].
         hold_rate: fastest decay after the hand-over [1/s].
         frequency: fastest angular frequency [rad/s].
-        layer: fastest rates of the smooth sign's boundary layer before and after the hand-over [1/s].
+        layer: fastest rates in the boundary layer before and after the hand-over [1/s].
         saves: further nodes [s].
-        order: of a chain, 1 otherwise.
+        order: order of a chain, otherwise 1.
     """
     before, after = (math.ceil(steps) for steps in graded_steps(t_f, delta, t_end, hold_rate, frequency, layer, order))
     times = np.asarray(saves, dtype=float).reshape(-1)
@@ -214,7 +217,7 @@ def graded_steps(
     layer: tuple[float, float],
     order: int,
 ) -> tuple[float, float]:
-    """How many steps `graded` takes before and after the hand-over, before rounding up; may be infinite."""
+    """Return the number of steps of `graded` before and after the hand-over, not rounded up; may be infinite."""
     before, after = _largest_steps(t_f, hold_rate, frequency, layer, order)
     with np.errstate(divide="ignore"):
         uniform = float(np.divide(t_f - delta, before))
@@ -222,14 +225,14 @@ def graded_steps(
 
 
 def _refinement(order: int) -> int:
-    """How many times as many steps a chain takes as a second-order motion."""
+    """Return the number of steps of a chain over the number of steps of a second-order motion."""
     return max(1, 3 * order - 4)
 
 
 def _largest_steps(
     t_f: float, hold_rate: float, frequency: float, layer: tuple[float, float], order: int
 ) -> tuple[float, float]:
-    """Largest steps before and after the hand-over [s]."""
+    """Return the largest steps before and after the hand-over [s]."""
     rapid = 0.3 / max(frequency, 1e-12)
     before = min(t_f / 200.0 / _refinement(order), rapid, 1.5 / max(layer[0], 1e-12))
     return before, min(t_f / 50.0, 0.1 / max(hold_rate, 1e-300), rapid, 1.5 / max(layer[1], 1e-12))

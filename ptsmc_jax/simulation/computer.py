@@ -20,32 +20,32 @@ class Computer(NamedTuple):
     """The memory of the flight software between two samples."""
 
     sensors: Any  # memory of the sensors
-    seen: Any  # state as it was measured at the last sample
+    seen: Any  # state that the sensors measured at the last sample
     observer: Any  # memory of the observer
     law: Any  # memory of the law; None: it has no memory
     # of the last period: mean torque [N m] and wheel momentum [N m s], as the flight software assumes them
     applied: tuple[Array, Array | None] | None  # None: see `control_period.State`
-    command_filter: Any = None  # memory of the command's filter; None without one
+    command_filter: Any = None  # memory of the command filter; None: there is no filter
 
 
 class Decision(NamedTuple):
     """The output of a flight computer at a sample."""
 
-    target: Any  # of the reference at the sample
+    target: Any  # reference at the sample
     d_hat: Array  # (m,) [N m]
-    u: Array  # (m,) commanded torque, behind its filter [N m]
+    u: Array  # (m,) commanded torque, after the command filter [N m]
     s: Array  # sliding variable
     w: Any = None  # (m,) measured velocity [rad/s]; None in the continuous loop and in the row at t_end
     channels: Array | None = None  # (channels,) torque, if the flight software itself limits and allocates it [N m]
 
 
 class Period(NamedTuple):
-    """A control period at its nominal times, which flight software assumes."""
+    """A control period at its nominal times, which the flight software assumes."""
 
     now: Ticks
-    dt_before: Scalar  # length of the one before [s]
+    dt_before: Scalar  # length of the period before [s]
     matrix: Array  # `Observer.update_matrix` of that length
-    full_length: Scalar  # of a whole one [s]
+    full_length: Scalar  # length of a complete period [s]
 
     @property
     def length(self) -> Scalar:
@@ -54,33 +54,33 @@ class Period(NamedTuple):
 
     @property
     def assumed_length(self) -> Scalar:
-        """The length that flight software assumes [s]: it does not know that the run ends within its last period."""
+        """The length that the flight software assumes [s]. It does not know that the run ends in its last period."""
         starts = jnp.where(self.now.partial, self.length, self.full_length)
         return jnp.where(self.length > 0.0, starts, 0.0)
 
 
-# statuses of samples of exported C, the most severe last; other: unknown to this version
+# statuses that exported C reports for a sample, the most severe last; other: not known to this version
 SAMPLES = ("ok", "saturated", "missed", "singular", "input", "overflow", "other")
 
 
 def no_statuses(computer: Computer) -> dict[str, Array]:
-    """Return no statuses of samples: only exported code has them."""
+    """Return an empty count of sample statuses. Only exported code reports them."""
     return {}
 
 
 class Software(NamedTuple):
-    """The flight software of a run: `boot` and `decide` of this module, or exported C in their place."""
+    """The flight software of a run: `boot` and `decide` of this module, or exported C instead of them."""
 
     boot: Callable[[Parts, WholeNumber, WholeNumber, Any, Ticks], Computer]
     # parts, k2, period, memory, visible and star tracker's state, actuators
     decide: Callable[[Parts, Bound, Period, Computer, Any, Any, ActuatorState], tuple[Decision, Computer]]
     # number of samples of a run that ended with each status, by its name
     statuses: Callable[[Computer], dict[str, Array]] = no_statuses
-    on_processor: bool = False  # it runs nowhere else
+    on_processor: bool = False  # it runs on the host processor only
 
 
 def boot(parts: Parts, seed: WholeNumber, trial: WholeNumber, x0: Any, first: Ticks) -> Computer:
-    """Return the memory before the first sample; x0: true state, as far as sensors see it."""
+    """Return the memory before the first sample. x0 is the true initial state, as far as sensors can measure it."""
     sensors = parts.sensors.begin(seed, trial, x0, first)
     zero = jnp.zeros(parts.plant.inputs)
     applied = zero, None if parts.actuators.wheels is None else zero
@@ -89,7 +89,7 @@ def boot(parts: Parts, seed: WholeNumber, trial: WholeNumber, x0: Any, first: Ti
 
 
 def estimate(parts: Parts, period: Period, computer: Computer, seen: Any) -> tuple[Array, Any]:
-    """Return the disturbance (m,) [N m], estimated from the state's change in the last period, and the memory."""
+    """Return the disturbance (m,) [N m], estimated from the change of the state in the last period, and the memory."""
     observer, model, dt = parts.observer, parts.observer.model, period.dt_before
     assert computer.applied is not None
     torque, stored = computer.applied
@@ -106,7 +106,7 @@ def command(
 ) -> tuple[Array, Array, Any]:
     """Return the law's torque (m,) [N m], its sliding variable and its memory."""
     now, has_length = period.now, period.length > 0.0
-    # a length that one may divide by, also in a period that has none
+    # a period without length gets the full length, so that the law can divide by it
     length = jnp.where(has_length, period.assumed_length, period.full_length)
     u, s, memory = parts.controller(Sample(now.t, now.hold, length, computer.law), seen, target, d_hat, k2(now.t))
     return u, s, guards.select(has_length, memory, computer.law)
@@ -121,19 +121,19 @@ def decide(
     star_x: Any = None,
     actuator_state: ActuatorState | None = None,
 ) -> tuple[Decision, Computer]:
-    """Run the flight software at a sample: sensors, observer, law, filter of the command.
+    """Run the flight software at a sample: sensors, observer, law, command filter.
 
     Args:
-        parts: of the run.
+        parts: parts of the run.
         k2: bound K2(t) on the error of the estimated disturbance.
         period: the control period that begins.
         computer: memory of the flight software.
-        x: true state without noise, as far as sensors see it, `Plant.visible`.
+        x: true state without noise, as far as sensors can measure it, see `Plant.visible`.
         star_x: `control_period.star_state` of the period before.
         actuator_state: not used; other flight software may measure it.
 
     Returns:
-        The decision and the new memory, except for `applied`, which is that of the last period.
+        The decision and the new memory. Its field `applied` is still the one of the last period.
     """
     target = parts.reference(period.now.t)
     seen, sensors = parts.sensors.measure(computer.sensors, x, period.now, period.dt_before, star_x)

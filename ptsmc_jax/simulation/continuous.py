@@ -1,4 +1,4 @@
-"""The continuous loop: law and observer inside the integrator's stages, the observer's linear part stepped exactly."""
+"""The continuous loop. Law and observer are integrated with the plant; the observer's linear part is exact (ETDRK4)."""
 
 from typing import Any
 
@@ -24,9 +24,9 @@ def simulate(run: Run) -> Result:
     model = observer.model
     k2 = observer.error_bound()
     lengths = ticks.t_next - ticks.t
-    slopes = jax.vmap(observer.decay_matrix)(ticks.t, ticks.t_next)
-    largest = jnp.max(jax.vmap(lambda a, dt: matrices.row_norm(a) * dt)(slopes, lengths))
-    decays = jax.vmap(lambda a, dt: integrators.decay(a, dt, largest))(slopes, lengths)
+    rates = jax.vmap(observer.decay_matrix)(ticks.t, ticks.t_next)
+    largest = jnp.max(jax.vmap(lambda a, dt: matrices.row_norm(a) * dt)(rates, lengths))
+    decays = jax.vmap(lambda a, dt: integrators.decay(a, dt, largest))(rates, lengths)
 
     def step(carry: tuple[State, Score], tick: tuple) -> tuple[tuple[State, Score], Log | None]:
         (now, linear), (state, score) = tick, carry
@@ -43,7 +43,7 @@ def simulate(run: Run) -> Result:
         x_next, memory_next, (u, s) = integrators.etdrk4(rate, linear, now.t, x, memory, dt)
         x_next = parts.plant.normalise(x_next)
         _, _, (u_end, _) = rate(now.t_next, x_next, memory_next)
-        u_nodes = u, u_end  # not that of a stage in the middle, which a narrow sign makes zigzag from step to step
+        u_nodes = u, u_end  # without the middle stage, whose torque oscillates from step to step in a thin layer
         torques = Torques(u_nodes, u_nodes, (1 / 2, 1 / 2), jnp.asarray(False), None)
         decision = Decision(target, observer.estimate(memory), u, s)
         record = Record(now, decision, torques, lambda t: x_next, dt)

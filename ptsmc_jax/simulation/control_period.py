@@ -1,4 +1,4 @@
-"""One control period of the sampled loop. `control_period` shows all of it, in the order in which it happens.
+"""One control period of the sampled loop. Read `control_period` first: it has all events of a period in their order.
 
 The sampled loop, the linearisation of `theory.linear` and the test vectors of the C export call it.
 """
@@ -25,11 +25,11 @@ SAMPLE_TIMES = "timing_jitter_samples"
 
 
 class Tick(NamedTuple):
-    """A control period at its nominal times, or all those of a run."""
+    """A control period at its nominal times. For a whole run the fields are arrays over the periods."""
 
     now: Ticks
     dt_before: Array  # length of the period before [s]
-    partial_before: Array  # bool: that one is the partial first one, see `Ticks.partial`
+    partial_before: Array  # bool: the period before is the partial first period, see `Ticks.partial`
 
 
 class State(NamedTuple):
@@ -50,10 +50,10 @@ class State(NamedTuple):
 
 
 class Record(NamedTuple):
-    """What happened in a control period, or in an integration step of the continuous loop."""
+    """The events of a control period, or of an integration step of the continuous loop."""
 
     now: Ticks  # true times
-    decision: Decision  # of the controller; its target is the reference at the true time
+    decision: Decision  # of the flight software; its target is the reference at the true time
     torques: Torques
     x_at: Callable[[Scalar], Any]  # time in the interval [s] -> true state then
     step: Scalar  # longest integration step [s]
@@ -76,8 +76,8 @@ class Vehicle(NamedTuple):
         matrix = jnp.where(tick.partial_before, self.first_matrix, self.matrix)
         return Period(tick.now, tick.dt_before, matrix, self.parts.period)
 
-    def offset(self, t: Scalar, sample: Array) -> Array | None:
-        """Return the delay [s] of a sample after its nominal time t [s]; zero at both ends of the run."""
+    def draw_offset(self, t: Scalar, sample: Array) -> Array | None:
+        """Return the random delay [s] of a sample after its nominal time t [s]; zero at both ends of the run."""
         if self.jitter_key is None:
             return None
         parts = self.parts
@@ -85,8 +85,8 @@ class Vehicle(NamedTuple):
         largest = jnp.minimum(parts.jitter * parts.period, jnp.minimum(t, parts.t_end - t) / 2.0)
         return largest * (2.0 * draws.uniforms(self.jitter_key, 1, sample)[0] - 1.0)
 
-    def walked(self, walk: Array | None, dt: Scalar, sample: Array) -> Array | None:
-        """Return the random walk of the disturbance, (m,) [N m], in a period of dt [s]."""
+    def advance_walk(self, walk: Array | None, dt: Scalar, sample: Array) -> Array | None:
+        """Return the random walk of the disturbance, (m,) [N m], after a further step over a period of dt [s]."""
         if walk is None or self.walk_key is None or self.parts.walk_rate is None:
             return None
         return walk + self.parts.walk_rate * dt * draws.normals(self.walk_key, walk.size, sample)
@@ -101,13 +101,13 @@ def control_period(vehicle: Vehicle, state: State, tick: Tick) -> tuple[State, R
         tick: the period.
 
     Returns:
-        The state at the next sample, and what happened until then. Metrics and history are made of the latter.
+        The state at the next sample, and the record of the period, from which metrics and history are computed.
     """
     parts, actuators, plant = vehicle.parts, vehicle.parts.actuators, vehicle.parts.plant
     period = vehicle.period(tick)
 
     # with timing jitter, samples come early or late; flight software assumes the nominal times of `period`
-    now, next_offset = period.now, vehicle.offset(period.now.t_next, period.now.sample + 1)
+    now, next_offset = period.now, vehicle.draw_offset(period.now.t_next, period.now.sample + 1)
     if next_offset is not None and state.offset is not None:
         now = now._replace(t=now.t + state.offset, t_next=now.t_next + next_offset)
     dt = now.t_next - now.t
@@ -127,7 +127,7 @@ def control_period(vehicle: Vehicle, state: State, tick: Tick) -> tuple[State, R
     torques = period_torques(actuators, drive, decision.u, dt)
 
     # true plant: integrate under the torques and the disturbance
-    walk = vehicle.walked(state.walk, dt, now.sample)
+    walk = vehicle.advance_walk(state.walk, dt, now.sample)
     applied = None if actuators.holds else actuators.assumed(drive, period.length)
     motion = PeriodMotion(parts, now.t, state.x, drive, walk)
     after = State(
@@ -151,15 +151,15 @@ def start(
     """Return the constants of a sampled run, and its state before the first control period.
 
     Args:
-        parts: of the run.
+        parts: parts of the run.
         ticks: control periods of the run.
         x0: true state at t = 0.
-        seed: names the random numbers, together with `trial`.
+        seed: whole number that selects the random numbers, together with `trial`.
         trial: number of the trial.
         software: the flight software.
     """
     lengths, actuators, inputs = ticks.t_next - ticks.t, parts.actuators, parts.plant.inputs
-    # both matrices outside the loop, by one piece of code
+    # both matrices are computed outside the loop, by one compiled function
     first_length = jnp.sum(jnp.where(ticks.partial, lengths, 0.0))
     matrices = jax.lax.map(parts.observer.update_matrix, jnp.stack([parts.period, first_length]))
     walk_key = None if parts.walk_rate is None else draws.stream(seed, trial, DISTURBANCE_WALK)
@@ -175,7 +175,7 @@ def start(
         actuators=actuators.begin(inputs),
         walk=None if walk_key is None else jnp.zeros(inputs),
         star_x=star_state(parts, first, lambda t: x0),
-        offset=vehicle.offset(ticks.t[0], ticks.sample[0]),
+        offset=vehicle.draw_offset(ticks.t[0], ticks.sample[0]),
     )
     return vehicle, state
 
@@ -200,7 +200,7 @@ class PeriodMotion(NamedTuple):
     x: Any  # true state then
     drive: Drive
     walk: Array | None  # additional disturbance, constant over the period, (m,) [N m]; None: there is none
-    rolled: bool = False  # integrate by a loop over the stages: slower, but less to compile
+    rolled: bool = False  # integrate by a loop over the stages, which is slower but compiles faster
 
     def at(self, time: Scalar) -> Any:
         """Return the state at a time [s] in the period."""
@@ -233,9 +233,9 @@ def star_state(parts: Parts, now: Ticks, x_at: Callable[[Scalar], Any]) -> Any:
     The flight software uses it at the next sample.
 
     Args:
-        parts: of the run.
+        parts: parts of the run.
         now: the period.
-        x_at: time in the period [s] -> the true state then.
+        x_at: function from a time in the period [s] to the true state.
     """
     if getattr(parts.sensors, "own_times", None) is None:
         return None
@@ -251,5 +251,5 @@ def period_torques(actuators: Actuators, drive: Drive, u: Array, dt: Scalar) -> 
     weights = (1 / 6, 4 / 6, 1 / 6) if actuators.moves else (1.0,)
     delivered = tuple(actuators.on_body(v) for v in torques[: len(weights)])
     stored = jnp.stack(momenta[1:]) if wheels else None
-    of_wheels = jnp.stack([torques[0], torques[-1]]) if wheels else None  # monotonic in between, so its ends bound it
+    of_wheels = jnp.stack([torques[0], torques[-1]]) if wheels else None  # monotonic in between: the ends bound it
     return Torques((u,) * len(weights), delivered, weights, drive.limited, stored, of_wheels)

@@ -1,6 +1,6 @@
-"""The gains of parts: a table from the name of each gain to its path, and how gains are read and set.
+"""Read and set the gains of parts by name, with a table of the path of each gain. Start with `with_gains`.
 
-A gain that has a number for each axis may be named axis by axis, `observer_gain_1` and so on.
+The observer gain has a value for each axis: `observer_gain_1` is its first one, and `observer_gain` sets all of them.
 """
 
 from collections.abc import Iterable, Mapping
@@ -18,7 +18,7 @@ from ptsmc_jax.simulation.assembly import Parts, check_parts
 WHOLE, AXIS = "observer_gain", "observer_gain_"
 BANDWIDTH, T_F = "sensors.filter.bandwidth", "controller.t_f"  # both change more than one field of the parts
 LAST = ("k1", "sign_width", "surface_rate", "t_f")  # gains of a law that reports list after those of the observer
-MADE_ANEW = "make the parts for them, with ptsmc_jax.replace or with the reach of scenario.study"
+MADE_ANEW = "build the parts for them, with ptsmc_jax.replace or with the argument reach of scenario.study"
 
 
 def base(name: str) -> str:
@@ -34,7 +34,8 @@ def is_reserved(name: str) -> bool:
 def paths_of(parts: Parts) -> dict[str, str]:
     """Return the path of every gain by its name, such as `{"eta": "controller.eta"}`, in the order of reports.
 
-    Raises ValueError if the law and another part have a gain of the same name.
+    Raises:
+        ValueError: the law and another part have a gain of the same name.
     """
     law = {name: f"controller.{name}" for name in parts.controller.tunable}
     axes = {f"{AXIS}{k + 1}": f"observer.gain[{k}]" for k in range(len(getattr(parts.observer, "gain", ())))}
@@ -77,8 +78,8 @@ def with_gains(parts: Parts, gains: Mapping[str, Array | float]) -> Parts:
 
     Raises:
         ValueError: a name is unknown, a value is no finite number, or the clock of the parts has too few samples or
-            steps for the new times. Under a transformation such a run comes back as `unfinished` instead.
-        TypeError: `parts` are no parts.
+            steps for the new times. Under a JAX transformation the run has the status `unfinished` instead.
+        TypeError: the first argument is not the parts of a run.
     """
     check_parts(parts)
     known = {"t_f": T_F, **paths_of(parts)}
@@ -86,7 +87,7 @@ def with_gains(parts: Parts, gains: Mapping[str, Array | float]) -> Parts:
         if name not in known:
             raise ValueError(f"{name} is no gain of these parts; allowed are {', '.join(sorted(known))}")
     numbers = {name: _number(name, value) for name, value in gains.items()}
-    for name, path in known.items():  # in this order: the gain of a single axis wins over that of all axes
+    for name, path in known.items():  # in this order: a gain of a single axis overrides the gain of all axes
         if name in numbers:
             parts = _put(parts, path, numbers[name])
     _check_clock(parts)
@@ -94,7 +95,7 @@ def with_gains(parts: Parts, gains: Mapping[str, Array | float]) -> Parts:
 
 
 def _number(name: str, value: Any) -> Array:
-    """Return a gain as an array. Raises ValueError if it is no finite scalar: JAX reads words as numbers, too."""
+    """Return a gain as an array. Raises ValueError if it is not a finite scalar. JAX would accept strings, too."""
     try:
         if isinstance(value, str | bytes | bool) or value is None:
             raise TypeError
@@ -110,7 +111,7 @@ def _number(name: str, value: Any) -> Array:
 
 
 def _check_clock(parts: Parts) -> None:
-    """Raise ValueError if a clock has too few samples or steps for t_f and delta, as far as these are known."""
+    """Raise ValueError if a clock has too few samples or steps for t_f and delta. Traced values are not checked."""
     clock: Any = parts.clock
     law = parts.controller
     longest = clock.period if clock.sampled else clock.max_step  # step
@@ -118,7 +119,7 @@ def _check_clock(parts: Parts) -> None:
     if any(isinstance(v, core.Tracer) or np.ndim(v) > 0 for v in times):
         return
     t_f, delta, t_end, longest = map(float, times)
-    # by plain numbers: if another gain is traced, JAX's would be too
+    # with plain numbers: if another gain is traced, arrays of JAX would be traced, too
     if not clock.sampled and replace(clock, max_step=longest).too_coarse(t_f, delta, np):
         raise ValueError(
             f"t_f = {t_f:g} s with delta = {delta:g} s needs more than the {clock.before} steps that the parts' "
@@ -136,7 +137,7 @@ def _check_clock(parts: Parts) -> None:
 
 
 def own(parts: Parts, names: Iterable[str]) -> list[float]:
-    """Return the present values of these gains; that of `observer_gain` is the mean of its axes."""
+    """Return the present values of these gains. For `observer_gain` it is the mean of the axes."""
     known, values = paths_of(parts), list[float]()
     for name in names:
         value = np.ravel(_get(parts, known[name])).tolist()
@@ -145,7 +146,7 @@ def own(parts: Parts, names: Iterable[str]) -> list[float]:
 
 
 def gains_of(parts: Parts) -> dict[str, float]:
-    """Return every gain of the parts by name. Those of single axes are listed if they differ."""
+    """Return every gain of the parts by name. Gains of single axes are listed if they differ."""
     check_parts(parts)
     names = [*paths_of(parts)]
     gains = dict(zip(names, own(parts, names), strict=True))
@@ -155,7 +156,12 @@ def gains_of(parts: Parts) -> dict[str, float]:
 
 
 def on_every_axis(gains: Mapping[str, Any], own: list[Any]) -> list[Any] | None:
-    """Return the observer gain of every axis, or None if `gains` name none; own: the values without them."""
+    """Return the observer gain of every axis, or None if `gains` has no observer gain.
+
+    Args:
+        gains: new values by name.
+        own: present value of each axis, used for an axis without a new value.
+    """
     if not any(base(name) == WHOLE for name in gains):
         return None
     return [gains.get(f"{AXIS}{k + 1}", gains.get(WHOLE, value)) for k, value in enumerate(own)]

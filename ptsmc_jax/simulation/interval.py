@@ -1,4 +1,4 @@
-"""One interval of a run as its metrics see it: both ends, the torques in between, and the criteria of the run."""
+"""The data of one interval of a run from which metrics are computed: both ends, the torques, and the criteria."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -11,7 +11,7 @@ from ptsmc_jax.simulation.pointing import ConstantPath, ErrorPath, Pointing
 
 
 class Criteria(NamedTuple):
-    """Times that the metrics refer to [s], the settling angle [rad], and what pointing is observed."""
+    """Times that the metrics refer to [s], the settling angle [rad], and the observation of pointing errors."""
 
     t_f: Array
     t_end: Array
@@ -35,13 +35,13 @@ class Start(NamedTuple):
     snapshot: Snapshot
     inputs: int  # of the plant
     wheel_momentum: Array | None  # (wheels,) [N m s]; None: no wheels
-    measured: bool = False  # the law sees what sensors measure, not the true state
+    measured: bool = False  # the law gets the measured state, not the true one
 
 
 class Arrival(NamedTuple):
     """The true state at t_f; zero before."""
 
-    error: Array  # (m,) that the law drives to zero [-], for other plants x_1
+    error: Array  # (m,) error that the law drives to zero [-]; for other plants x_1
     angle: Array  # to the reference [rad]
 
 
@@ -55,11 +55,11 @@ class Errors(NamedTuple):
 
 
 class Torques(NamedTuple):
-    """Torques of an interval at the nodes of `weights`: one where they are held, else its ends, or also its middle."""
+    """Torques of an interval at its quadrature nodes: the start, or both ends, or both ends and the middle."""
 
     commanded: tuple[Array, ...]  # (m,) each [N m]
     delivered: tuple[Array, ...]  # (m,) each [N m]
-    weights: tuple[float, ...]  # sum to 1
+    weights: tuple[float, ...]  # quadrature weights of the nodes; they sum to 1
     limited: Array  # bool: a limit of the actuators cuts the command
     wheel_momentum: Array | None  # (times, wheels) in the middle and at the end [N m s]
     wheel_torque: Array | None = None  # (times, wheels) at both ends [N m]
@@ -72,13 +72,15 @@ class Interval(NamedTuple):
     t_next: Array  # [s]
     start: Snapshot
     end: Snapshot
-    errors: Callable[[], Errors]  # called from t_f on only
-    middle_angle: Callable[[], Array]  # angle in the middle, by the error's cubic [rad]; called from t_f on only
-    arrival: Callable[[], Arrival]  # called in the interval that t_f lies in only
-    last_torque: Array  # (m,) delivered at the end of the interval before [N m]
+    errors: Callable[[], Errors]  # called only from t_f on
+    middle_angle: Callable[[], Array]  # angle in the middle, from the cubic of the error [rad]; called only from t_f on
+    arrival: Callable[[], Arrival]  # called only in the interval that contains t_f
+    last_torque: Array  # (m,) torque delivered at the end of the previous interval [N m]
     torques: Torques
-    attitude_error: Callable[[], ErrorPath] | None = None  # where pointing is observed
-    knowledge_error: Callable[[], ConstantPath] | None = None  # of the attitude measured at the start, where it is
+    attitude_error: Callable[[], ErrorPath] | None = None  # None: pointing is not observed
+    knowledge_error: Callable[[], ConstantPath] | None = (
+        None  # of the attitude measured at the start; None: not measured
+    )
 
     @property
     def length(self) -> Array:
@@ -87,10 +89,20 @@ class Interval(NamedTuple):
 
 
 def integral_in_window(t: Any, t_next: Any, squares: tuple[Any, Any, Any], criteria: Criteria) -> Any:
-    """Integral over the part of an interval inside the window of the parabola through its start, middle and end [s].
+    """Integrate a squared error over the part of an interval that is inside the window after t_f.
 
-    Of JAX's arrays or NumPy's. The parabola may fall below zero in between, where squares do not: a share L of the
-    interval has at least L^3 / 4 of the whole, as of an error that moves along a line through zero in its midst.
+    The squared error is replaced by the parabola through its values at the start, the middle and the end. The parabola
+    may become negative in between, which a square cannot. The integral over a fraction L of the interval is therefore
+    at least L^3 / 4 of the whole integral, as for an error that passes linearly through zero.
+
+    Args:
+        t: start of the interval [s], an array of JAX or NumPy.
+        t_next: end of the interval [s].
+        squares: squared error at the start, in the middle and at the end.
+        criteria: of the run, with t_f and the window [s].
+
+    Returns:
+        The integral [unit of the squares times s].
     """
     dt, (g0, g1, g2) = t_next - t, squares
 
@@ -104,4 +116,4 @@ def integral_in_window(t: Any, t_next: Any, squares: tuple[Any, Any, Any], crite
     least = (end - begin) ** 3 / 4 * (g0 + 4 * g1 + g2) / 6
     part = primitive(end) - primitive(begin)
     xp: Any = np if isinstance(part, np.ndarray) else jnp
-    return dt * xp.where(part < least, least, part)  # no maximum: at the window's ends both are zero, with other slopes
+    return dt * xp.where(part < least, least, part)  # `maximum` has another gradient if both are zero, at the ends

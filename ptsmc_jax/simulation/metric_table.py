@@ -1,7 +1,7 @@
-"""The metrics of a run, a row each: name, unit, meaning, and how it is computed.
+"""The table of metrics of a run: name, unit, meaning and functions that compute it. `METRICS` is the table.
 
-Reading a scenario needs the names, units and meanings only, so JAX is imported when a metric is first computed. The
-pointing errors, which share one accumulator, are in `pointing_report`.
+Reading a scenario needs only names, units and meanings, so JAX is imported when a metric is first computed. Pointing
+errors share one accumulator, see `pointing_report`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 else:
 
     class _Deferred:
-        """A module that is imported when something of it is first used."""
+        """A module that is imported at its first use."""
 
         def __init__(self, name: str):
             self._name = name
@@ -51,7 +51,7 @@ class Metric:
     unit: str
     meaning: str
     of_states: tuple[str, str] | None = None  # unit and meaning for chains and systems; None: they lack the metric
-    table: str | None = None  # table of the scenario without which a run lacks the metric
+    table: str | None = None  # table of the scenario that a run needs to have the metric; None: every run has it
     init: Callable[[Start, Criteria], Any] = _zero  # returns None if the run lacks the metric
     update: Callable[[Any, Interval, Criteria], Any] | None = None
     update_after_t_f: Callable[[Any, Interval, Errors, Criteria], Any] | None = None

@@ -1,6 +1,6 @@
-"""The metrics of a run, accumulated interval by interval inside the simulation.
+"""Accumulate the metrics of a run interval by interval inside the simulation: `begin`, `update`, `finish`.
 
-How a metric is computed is in `metric_table`, and in `pointing_report` for the pointing errors.
+The functions of each metric are in `metric_table`, and in `pointing_report` for the pointing errors.
 """
 
 from collections.abc import Iterable
@@ -24,7 +24,7 @@ from ptsmc_jax.simulation.pointing_report import PointingErrors
 class Metrics(dict[str, Any]):
     """The metrics that a run has, scalars by name; units and meanings are in `catalogues`.
 
-    Each is an attribute, too. An attribute is NaN if it names a metric that the run lacks.
+    Each is an attribute, too. The attribute of a metric that the run lacks is NaN.
     """
 
     def __getattr__(self, name: str) -> Any:
@@ -42,13 +42,13 @@ class Metrics(dict[str, Any]):
         return cls(zip(names, values, strict=True))
 
     def __repr__(self) -> str:
-        """The metrics, a line each; of many runs, or under transformations, type and shape of each."""
+        """Return a line for each metric: its value, or type and shape for many runs or under a transformation."""
         return "\n".join(f"{name:24s} {_shown(value)}" for name, value in self.items())
 
 
 def _shown(value: Any) -> str:
     if not isinstance(value, jax.Array | np.ndarray | np.number | float):
-        return repr(value)  # under transformations also shapes and axes
+        return repr(value)  # under transformations a leaf may be a shape or an axis
     several = isinstance(value, core.Tracer) or np.ndim(value) > 0
     return f"{type(value).__name__} {np.shape(value)}" if several else f"{float(value):.6g}"
 
@@ -84,7 +84,7 @@ def update(running: Running, interval: Interval, criteria: Criteria) -> Running:
 
 
 def _update_after_t_f(running: Running, interval: Interval, criteria: Criteria) -> Running:
-    """Return what changes after an interval that reaches t_f: of the memories those with `update_after_t_f`."""
+    """Return the values that change after an interval that reaches t_f; `memories` has only these, too."""
     errors = interval.errors()
     arrival = jax.lax.cond(interval.t < criteria.t_f, interval.arrival, lambda: running.arrival)
     updates = {name: METRICS[name].update_after_t_f for name in running.memories}

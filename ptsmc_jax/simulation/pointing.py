@@ -1,10 +1,15 @@
 """Pointing error indices (ECSS-E-ST-60-10C), accumulated interval by interval.
 
-Of an error e(t), over an observation of consecutive windows of length D: the absolute error |e(t)|, its mean over a
-window, the relative error |e(t) - mean of the window that t lies in|, and the drift, the difference between the means
-of two windows. Each is reported by its largest value in the observation: about each axis, and as the half-cone of the
-boresight. The error is that of the attitude (APE, MPE, RPE, PDE), or of its measurement (AKE, MKE, RKE). No history is
-kept but that of the present window, and that only where a limit asks for the time in which the relative error keeps it.
+An observation consists of consecutive windows of length D. The indices of an error e(t) are:
+
+- the absolute error |e(t)| (APE; AKE for the error of the measured attitude),
+- its mean over a window (MPE, MKE),
+- the relative error |e(t) - mean of the window that contains t| (RPE, RKE),
+- the drift, which is the difference between the means of two windows (PDE).
+
+Each metric is the largest value in the observation, about each axis and as the half-cone of the boresight. Only the
+history of the present window is stored, and only if a requirement limits the relative error for a fraction of the time.
+Start with `update`.
 """
 
 from dataclasses import dataclass, field, replace
@@ -20,8 +25,8 @@ from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
 
 Vector = Float[Array, "3"]
 
-# Directions across the boresight, over half a turn, into which an error is projected. The largest projection gives a
-# half-cone to within 1/cos(pi/32) - 1 = 0.5 %, and is enlarged by as much.
+# Directions across the boresight, over half a turn, onto which an error is projected. The largest projection is at most
+# 1/cos(pi/32) - 1 = 0.5 % smaller than the half-cone, and is enlarged by this factor.
 DIRECTIONS = 16
 ALONG = np.pi * np.arange(DIRECTIONS) / DIRECTIONS
 
@@ -29,29 +34,30 @@ ALONG = np.pi * np.arange(DIRECTIONS) / DIRECTIONS
 @pytree
 @dataclass(frozen=True)
 class Pointing:
-    """Which pointing errors are observed, and when."""
+    """The observation of pointing errors."""
 
     frame: Leaf  # (3, 3) rows: the boresight, and two directions across it, in body axes
-    after: Leaf  # of t_f, when the observation begins [s]
-    window: Leaf  # D [s]
-    limits: dict[str, Leaf] = field(default_factory=dict)  # [rad] by metric, whose share of time within them is asked
-    samples: int = field(default=0, metadata={"static": True})  # most in a window; 0: as many as the run has
+    after: Leaf  # time from t_f to the start of the observation [s]
+    window: Leaf  # length D of a window [s]
+    # limits [rad] by metric, for requirements on the fraction of the time within a limit
+    limits: dict[str, Leaf] = field(default_factory=dict)
+    samples: int = field(default=0, metadata={"static": True})  # largest number in a window; 0: all samples of the run
 
     def of_run(self, steps: int) -> "Pointing":
-        """The same for a run of so many steps."""
+        """Return the observation for a run with this number of steps."""
         return self if self.samples else replace(self, samples=steps)
 
     def segments(self, index: str) -> int:
-        """How many segments of a window are kept for shares of time of a relative index; 0: no limit asks for them.
+        """Return the number of segments of a window that are stored for a relative index, or 0 without such limits.
 
-        Samples divide a window into one more than there are of them; one more has no length where the window before
-        ended with a sample.
+        n samples divide a window into n + 1 segments. A further segment, without length, is needed if the previous
+        window ended at a sample.
         """
         return self.samples + 2 if any(name.startswith(index) for name in self.limits) else 0
 
 
 def across(boresight: Any) -> np.ndarray:
-    """The frame of a boresight (3,) of any length but 0: rows are it and two directions across it."""
+    """Return the frame of a boresight (3,), which need not be a unit vector: rows are it and two directions across."""
     b = np.asarray(boresight, dtype=float)
     b = b / np.linalg.norm(b)
     first = np.cross(b, np.eye(3)[np.argmin(np.abs(b))])
@@ -60,9 +66,15 @@ def across(boresight: Any) -> np.ndarray:
 
 
 def attitude_error(q: Float[Array, "4"], target: Float[Array, "4"], frame: Float[Array, "3 3"]) -> Float[Array, "5"]:
-    """An attitude's error from a target's: rotation vector in body axes (3,), then across the boresight (2,) [rad].
+    """Return the error of an attitude [rad]: the rotation vector in body axes (3,), then the boresight error (2,).
 
-    The latter is the angle by which the boresight points off, in its direction; frame: see `Pointing`.
+    Args:
+        q: quaternion of the attitude.
+        target: quaternion of the reference.
+        frame: see `Pointing`.
+
+    Returns:
+        (5,) The last two entries are the angle of the boresight error times its direction across the boresight.
     """
     error = attitude.multiply(attitude.conjugate(target), q)
     error = jnp.where(error[3] < 0.0, -error, error)
@@ -70,18 +82,18 @@ def attitude_error(q: Float[Array, "4"], target: Float[Array, "4"], frame: Float
 
 
 def _cone(pointed: Vector, frame: Float[Array, "3 3"]) -> Float[Array, "2"]:
-    """The angle from the boresight to a unit vector, and its direction: an arc on the sphere, laid flat [rad]."""
+    """Return the angle from the boresight to a unit vector times the direction of the error across it [rad]."""
     side, ahead = frame[1:] @ pointed, jnp.dot(frame[0], pointed)
     square = jnp.sum(side * side)
-    small = square < 1e-12  # the angle is then its sine to a part in 1e12
+    small = square < 1e-12  # then the angle is equal to its sine to 1e-12 relative
     size = jnp.sqrt(jnp.where(small, 1.0, square))
     turned = elementary.arctan2(size, jnp.abs(ahead))
     arc = side * jnp.where(small, 1.0 + square / 6.0, jnp.where(ahead < 0.0, np.pi - turned, turned) / size)
-    return jnp.where(small & (ahead < 0.0), np.pi * jnp.eye(2)[0], arc)  # straight back: by any direction
+    return jnp.where(small & (ahead < 0.0), np.pi * jnp.eye(2)[0], arc)  # exactly backwards: any direction
 
 
 class ErrorPath(NamedTuple):
-    """An `attitude_error` (5,) over an interval: start + x rise + x (1 - x) ((1 - x) a + x b) at a share x of it."""
+    """An `attitude_error` (5,) over an interval: start + x rise + x (1 - x) ((1 - x) a + x b), x from 0 to 1."""
 
     start: Array  # [rad]
     end: Array
@@ -91,11 +103,11 @@ class ErrorPath(NamedTuple):
     length: Scalar  # of the interval [s]
 
     def at(self, x: Scalar) -> Array:
-        """The error where a share x of the interval has passed."""
+        """Return the error at the fraction x of the interval."""
         return self.start + x * self.rise + x * (1.0 - x) * ((1.0 - x) * self.a + x * self.b)
 
     def integral(self, x: Scalar) -> Array:
-        """Its integral from the start until then [rad s]."""
+        """Return the integral of the error from the start to the fraction x of the interval [rad s]."""
         square = x * x
         first = square * (0.5 - x * (2.0 / 3.0 - x / 4.0))
         second = square * x * (1.0 / 3.0 - x / 4.0)
@@ -103,28 +115,28 @@ class ErrorPath(NamedTuple):
 
 
 class ConstantPath(NamedTuple):
-    """An `attitude_error` (5,) that stays as it is over an interval."""
+    """An `attitude_error` (5,) that is constant over an interval."""
 
     end: Array  # [rad]
     length: Scalar  # of the interval [s]
 
     def at(self, x: Scalar) -> Array:
-        """The error."""
+        """Return the error."""
         return self.end
 
     def integral(self, x: Scalar) -> Array:
-        """Its integral until a share x of the interval has passed [rad s]."""
+        """Return the integral of the error from the start to the fraction x of the interval [rad s]."""
         return self.length * (x * self.end)
 
 
 def hermite(start: Array, start_rate: Array, end: Array, end_rate: Array, length: Scalar) -> ErrorPath:
-    """The cubic through both ends (5,) [rad] with these slopes [rad/s], over an interval [s]."""
+    """Return the cubic Hermite path between two errors (5,) [rad] with these rates [rad/s], over a length [s]."""
     rise = end - start
     return ErrorPath(start, end, rise, length * start_rate - rise, rise - length * end_rate, length)
 
 
 def error_path(start: tuple, end: tuple, frame: Float[Array, "3 3"], length: Scalar) -> ErrorPath:
-    """The error of an attitude between two (state, target)."""
+    """Return the path of the attitude error between two pairs (state, target), over an interval of a length [s]."""
 
     def with_rate(x: Any, target: Any) -> tuple[Array, Array]:
         rates = attitude.derivative(x.q, x.w), attitude.derivative(target.q, target.w)
@@ -136,19 +148,19 @@ def error_path(start: tuple, end: tuple, frame: Float[Array, "3 3"], length: Sca
 def constant_path(
     q: Float[Array, "4"], true: Float[Array, "4"], frame: Float[Array, "3 3"], length: Scalar
 ) -> ConstantPath:
-    """The error of a measured attitude from the true one at its sample, which is known until the next one."""
+    """Return the error of a measured quaternion from the true one. It is constant until the next sample."""
     return ConstantPath(attitude_error(q, true, frame), length)
 
 
 class Segments(NamedTuple):
-    """The error in the present window, segment by segment: its mean is known at its end only."""
+    """The segments of the error in the present window. They are needed because the mean is known only at its end."""
 
     ends: Array  # (segments, 2, 5) at the start and the end of each [rad]
-    lengths: Array  # (segments,) [s], 0 of those to come
-    filled: Array  # how many there are
+    lengths: Array  # (segments,) [s]; 0: not filled yet
+    filled: Array  # number of filled segments
 
     def added(self, start: Array, end: Array, length: Scalar) -> "Segments":
-        """With one segment more; beyond the last there is no room, which `filled` shows."""
+        """Return the segments with a further one. Without free space it is dropped, and `filled` exceeds the size."""
         return Segments(
             self.ends.at[self.filled].set(jnp.stack([start, end])),
             self.lengths.at[self.filled].set(length),
@@ -156,11 +168,11 @@ class Segments(NamedTuple):
         )
 
     def emptied(self) -> "Segments":
-        """Without segments."""
+        """Return no segments."""
         return Segments(self.ends, jnp.zeros_like(self.lengths), jnp.zeros_like(self.filled))
 
     def time_beyond(self, mean: Array, limits: Float[Array, "4"]) -> Float[Array, "4"]:
-        """How long the error less its mean is beyond limits [s]; NaN where there was no room for all of it."""
+        """Return the time in which the error minus its mean is beyond limits [s]; NaN if a segment was dropped."""
 
         def of_segment(ends: Array, length: Scalar) -> Array:
             return length * _share_beyond(_sizes(ends[0] - mean), _sizes(ends[1] - mean), limits)
@@ -173,33 +185,39 @@ class Window(NamedTuple):
     """The present window so far."""
 
     integral: Array  # (5,) of the error [rad s]
-    high: Array  # (3 + DIRECTIONS,) largest of the error's projections [rad]
-    low: Array  # (3 + DIRECTIONS,) smallest of them [rad]
-    segments: Segments | None  # None: no limit is on the relative error
+    high: Array  # (3 + DIRECTIONS,) largest projections of the error [rad]
+    low: Array  # (3 + DIRECTIONS,) smallest projections [rad]
+    segments: Segments | None  # None: no limit on the relative error needs them
 
     def including(self, error: Array) -> "Window":
-        """With one more value (5,) of the error among the largest and smallest."""
+        """Return the window with a further value (5,) of the error in its extremes."""
         projections = _projections(error)
         return self._replace(high=jnp.maximum(self.high, projections), low=jnp.minimum(self.low, projections))
 
 
 class Tally(NamedTuple):
-    """The indices of one error so far: about each axis, and of the half-cone, (4,) each [rad]."""
+    """The indices of one error so far, about each axis and of the half-cone, (4,) each [rad]."""
 
     largest: Array  # of the error
     mean: Array  # largest mean of a window
     relative: Array  # largest relative error
     window: Window
-    means_high: Array  # (3 + DIRECTIONS,) of the windows so far
-    means_low: Array
-    windows: Scalar  # how many are closed
-    beyond: Array  # time beyond the limits [s]: exactly 0 of a run that keeps them, which a sum of times within is not
-    means_beyond: Array  # time in windows whose means are beyond theirs [s]
-    relative_beyond: Array  # time in closed windows in which the relative error is beyond its limits [s]
+    means_high: Array  # (3 + DIRECTIONS,) largest means of complete windows
+    means_low: Array  # smallest means
+    windows: Scalar  # number of complete windows
+    # times beyond limits are exactly 0 in a run that keeps them; times within would have rounding errors
+    beyond: Array  # time in which the error is beyond its limits [s]
+    means_beyond: Array  # length of the complete windows whose mean is beyond its limits [s]
+    relative_beyond: Array  # time in complete windows in which the relative error is beyond its limits [s]
 
 
 def begin(zero: Scalar, segments: int = 0) -> Tally:
-    """Before the observation; zero: of the run's numbers; segments: of a window that are kept, see `Pointing`."""
+    """Return the tally before the observation.
+
+    Args:
+        zero: a zero with the type of the numbers of the run.
+        segments: see `Pointing.segments`.
+    """
     four, many = jnp.zeros(4) + zero, jnp.zeros(3 + DIRECTIONS) + zero
     kept = Segments(jnp.zeros((segments, 2, 5)) + zero, jnp.zeros(segments) + zero, jnp.int32(0)) if segments else None
     window = Window(jnp.zeros(5) + zero, many - jnp.inf, many + jnp.inf, kept)
@@ -215,26 +233,26 @@ def update(
     window: Scalar,
     limits: Float[Array, "3 4"],
 ) -> Tally:
-    """The tally after an interval.
+    """Return the tally after an interval, which is at most as long as a window.
 
     Args:
-        tally: before it.
-        error: over the interval.
+        tally: tally before the interval.
+        error: error over the interval.
         t: start of the interval [s].
-        t_next: its end [s]; it is no longer than a window.
-        begins: when the observation does [s].
+        t_next: end of the interval [s].
+        begins: start of the observation [s].
         window: length D of a window [s].
         limits: on the error, on its means and on the relative error, about each axis and of the half-cone [rad].
     """
     length = error.length
-    share = jnp.clip((begins - t) / length, 0.0, 1.0)  # of the interval that lies before the observation
+    share = jnp.clip((begins - t) / length, 0.0, 1.0)  # fraction of the interval before the observation
     window_end = begins + (tally.windows + 1.0) * window
     until = jnp.clip((window_end - t) / length, share, 1.0)  # where the window ends in the interval
     by_rounding = guards.rounding(window, t_next)
     observed = t_next > begins + by_rounding
     closes = observed & (window_end <= t_next + by_rounding)
     first, last = error.at(share), error.at(until)
-    # the observation's first moment counts; later intervals begin where the ones before have ended
+    # the start of the observation counts; later intervals begin at the end of the one before
     opens = t <= begins + guards.rounding(window, t)
     opened = guards.select(opens, tally.window.including(first), tally.window)
     largest = jnp.where(opens, jnp.maximum(tally.largest, _sizes(first)), tally.largest)
@@ -261,7 +279,7 @@ def update(
             segments = segments.emptied().added(last, error.end, length * (1.0 - until))
         projections = _projections(last)
         new = Window(rest, projections, projections, segments).including(error.end)
-        if isinstance(error, ConstantPath):  # which leaps from here: what ends with a window is none of the next one's
+        if isinstance(error, ConstantPath):  # it jumps here: the value that ends with a window is not in the next one
             lasts = t_next > window_end + by_rounding
             high, low = jnp.where(lasts, new.high, -jnp.inf), jnp.where(lasts, new.low, jnp.inf)
             new = new._replace(high=high, low=low)
@@ -281,27 +299,27 @@ def update(
 
 
 def drift(tally: Tally) -> Float[Array, "4"]:
-    """Largest difference between the means of two windows [rad]."""
+    """Return the largest difference between the means of two windows, (4,) [rad]."""
     return _sizes_of(tally.means_high - tally.means_low)
 
 
 def _projections(error: Array) -> Array:
-    """The error about each axis, and across the boresight in each of the directions, (3 + DIRECTIONS,) [rad]."""
+    """Return the error about each axis and along each direction across the boresight, (3 + DIRECTIONS,) [rad]."""
     return jnp.concatenate([error[:3], np.cos(ALONG) * error[3] + np.sin(ALONG) * error[4]])
 
 
 def _sizes(error: Array) -> Array:
-    """Sizes of an error (5,): about each axis and of the half-cone, (4,) [rad]."""
+    """Return the sizes of an error (5,) about each axis and of the half-cone, (4,) [rad]."""
     return jnp.append(jnp.abs(error[:3]), guards.norm(error[3:]))
 
 
 def _sizes_of(projections: Array) -> Array:
-    """Sizes about each axis and of the half-cone, (4,), from the largest projections, see `DIRECTIONS`."""
+    """Return the sizes about each axis and of the half-cone, (4,), from the largest projections, see `DIRECTIONS`."""
     return jnp.append(projections[:3], jnp.max(projections[3:]) / np.cos(0.5 * np.pi / DIRECTIONS))
 
 
 def _share_beyond(start: Array, end: Array, limits: Array) -> Array:
-    """Share of an interval in which sizes are beyond limits, as if they went straight from start to end."""
+    """Return the fraction of an interval in which sizes are beyond limits, if they are linear between its ends."""
     within, within_next = start <= limits, end <= limits
     uncrossed = jnp.where(within & within_next, 0.0, 1.0)
     crosses = within != within_next

@@ -1,6 +1,6 @@
-"""Requirements: "peak_torque at most 0.5 N m in 99 % of trials", one declaration for verdict and loss.
+"""Requirements such as "peak_torque at most 0.5 N m in 99 % of trials", and verdicts on them. Start with `Requirement`.
 
-They limit metrics of runs from above, and margins of the loop mostly from below.
+They limit metrics of runs from above, and most margins of the loop from below.
 """
 
 import bisect
@@ -15,10 +15,15 @@ from ptsmc_jax.simulation.catalogues import CATALOGUE, MARGINS, WITHIN, percent
 
 
 def must_keep(trials: int, quantile: float | None, confidence: float | None) -> int | None:
-    """How many of so many trials must keep a limit; None: so few trials cannot show it.
+    """Return the number of trials that must keep a limit, or None if there are too few trials to verify it.
 
-    All of them where no quantile is asked for; with a confidence, the least number with which the one-sided lower bound
-    on the share of all trials, `statistics.share_bound`, reaches the quantile.
+    Without a quantile all trials must keep it. With a confidence, it is the smallest number for which the one-sided
+    lower bound on the probability, `statistics.share_bound`, reaches the quantile.
+
+    Args:
+        trials: number of trials.
+        quantile: fraction of all possible trials that must keep the limit, or None.
+        confidence: confidence of the statement, or None.
     """
     if quantile is None:
         return trials
@@ -31,12 +36,12 @@ def must_keep(trials: int, quantile: float | None, confidence: float | None) -> 
     def shown(within: int) -> bool:
         return share_bound(within, trials, confidence) >= quantile
 
-    # the bound rises with the count, and `trials` are enough for all of them to show it, whatever rounding says
+    # the bound increases with the count, and reaches the quantile if all `trials` keep the limit
     return 1 + bisect.bisect_left(range(1, trials), True, key=shown)
 
 
 def fewest_trials(quantile: float, confidence: float) -> int:
-    """Trials with which a quantile can be shown at all: quantile^n <= 1 - confidence.
+    """Return the smallest number n of trials that can verify a quantile: quantile^n <= 1 - confidence.
 
     >>> fewest_trials(quantile=0.9973, confidence=0.9)
     852
@@ -45,10 +50,10 @@ def fewest_trials(quantile: float, confidence: float) -> int:
 
 
 def over(values: Any, limit: Any, *, at_least: bool) -> Any:
-    """Arrays, NumPy's or JAX's, as shares of a limit: 1 is at the limit, less is within it, more is beyond it.
+    """Return values over a limit, as arrays of NumPy or JAX. The ratio is 1 at the limit and larger beyond it.
 
-    Where values must be at least the limit, it is 2 - value / limit, and 0 for an infinite value. Of a limit of zero it
-    is 0 where the limit is kept, and above 1 where it is not.
+    If values must be at least the limit, the ratio is 2 - value / limit, and 0 for an infinite value. For a limit of
+    zero it is 0 if the limit is kept, and above 1 otherwise.
     """
     zero = limit == 0.0
     with np.errstate(over="ignore"):
@@ -56,7 +61,7 @@ def over(values: Any, limit: Any, *, at_least: bool) -> Any:
     return 2.0 - share.clip(max=2.0) if at_least else share
 
 
-# interpretations of a probability (ECSS-E-ST-60-10C): that of ...
+# interpretations of a probability (ECSS-E-ST-60-10C): the quantile is a fraction of ...
 INTERPRETATIONS = {
     "ensemble": "runs that keep the limit at all times",
     "temporal": "the time, in every run",
@@ -66,26 +71,26 @@ INTERPRETATIONS = {
 
 @dataclass(frozen=True)
 class Verdict:
-    """How a requirement fared over some trials."""
+    """The result of checking a requirement on some trials."""
 
     metric: str
     limit: float
     unit: str
     worst: float  # largest value, NaN if a trial failed
-    margin: float  # how near it comes to the limit, see `over`: met up to 1; NaN or infinite: never
+    margin: float  # deciding value over the limit, see `over`: met up to 1; NaN or infinite: not met
     failures: int  # trials beyond the limit or without a value
     trials: int
-    quantile: float | None = None  # share of trials that must keep the limit; None: every one
-    confidence: float | None = None  # with which that is shown for all trials there could be
-    at_least: bool = False  # the limit is the smallest value allowed, and `worst` the smallest there is
+    quantile: float | None = None  # fraction of trials that must keep the limit; None: all of them
+    confidence: float | None = None  # confidence that the fraction of all possible trials is at least the quantile
+    at_least: bool = False  # the limit is the smallest allowed value, and `worst` is the smallest value
     interpretation: str = "ensemble"
-    # share of the time within the limit: the least of a run, or, mixed, the mean over runs, and what is shown of it
+    # fraction of the time within the limit: the smallest of all runs, or, mixed, the mean over the runs
     share_of_time: float | None = None
-    shown: float | None = None
+    shown: float | None = None  # its lower bound with the confidence
 
     @property
     def met(self) -> bool:
-        """Whether as many trials keep the limit as are asked for, or for as much of the time."""
+        """Whether enough trials keep the limit, or all trials for enough of the time."""
         if self.interpretation == "mixed" and self.shown is not None:
             return self.quantile is not None and self.shown >= self.quantile
         if self.interpretation == "temporal":
@@ -95,12 +100,12 @@ class Verdict:
 
     @classmethod
     def read(cls, entry: Mapping[str, Any]) -> "Verdict":
-        """A verdict from its entry in `summary.json`, where null stands for a number that is not finite."""
+        """Return the verdict of an entry in `summary.json`. A null there is a number that is not finite."""
         present = {field.name: entry[field.name] for field in fields(cls) if entry.get(field.name) is not None}
         return cls(**{"worst": math.nan, "margin": math.nan, **present})
 
     def in_summary(self) -> dict[str, Any]:
-        """The verdict as `summary.json` has it, see `read`."""
+        """Return the entry of the verdict in `summary.json`, see `read`."""
         return {**asdict(self), "met": self.met}
 
     def __str__(self) -> str:
@@ -122,14 +127,14 @@ class Verdict:
 
     def _of_trials(self) -> str:
         failures, trials, worst = self.failures, self.trials, self.worst
-        each = "loops" if self.metric in MARGINS else "trials"  # of which more may be looked at than are flown
+        each = "loops" if self.metric in MARGINS else "trials"  # margins may be computed for more loops than trials
         wanted = f"{self.metric} at {'least' if self.at_least else 'most'} {self.limit:g} {self.unit}".rstrip(" -")
         wanted += _in_degrees(self.limit, self.unit)
         if self.quantile is not None:
             wanted += f" in {100 * self.quantile:g} % of trials"
             wanted += f" with {100 * self.confidence:g} % confidence" if self.confidence is not None else ""
         if self.at_least and not failures and not math.isfinite(worst):
-            seen = "unlimited"  # an infinite margin, which JSON has no number for
+            seen = "unlimited"  # an infinite margin, which JSON cannot store
         elif math.isnan(worst):
             seen = "no value" if trials == 1 else "no worst value"
         else:
@@ -146,13 +151,13 @@ class Verdict:
 
 
 def _in_degrees(value: float, unit: str) -> str:
-    """An angle or a rate in degrees, in parentheses; nothing for other units."""
+    """Return an angle or a rate in degrees, in parentheses, and an empty text for other units."""
     return f" ({math.degrees(value):.4g} {unit.replace('rad', 'deg')})" if unit in ("rad", "rad/s") else ""
 
 
 @dataclass(frozen=True)
 class Requirement:
-    """metric <= limit in every trial, or in a share of them; or metric >= limit.
+    """A limit on a metric in every trial, or in a fraction of the trials or of the time.
 
     >>> limit = Requirement("peak_torque", 0.5, quantile=0.75)
     >>> print(limit.verdict(np.array([0.3, 0.4, 0.45, 0.7]), np.array([True, True, True, True])))
@@ -161,33 +166,35 @@ class Requirement:
 
     metric: str
     limit: float
-    unit: str | None = None  # of the metric; None: as for a spacecraft
-    quantile: float | None = None  # share of the runs, or of the time: see `INTERPRETATIONS`
+    unit: str | None = None  # of the metric; None: the unit that a spacecraft has
+    quantile: float | None = None  # fraction of the runs or of the time, see `INTERPRETATIONS`
     confidence: float | None = None
     at_least: bool = False
     interpretation: str = "ensemble"
 
     @property
     def stated_unit(self) -> str:
-        """The metric's unit, as the requirement states it or as a spacecraft's is."""
+        """The unit of the limit."""
         return CATALOGUE[self.metric].unit if self.unit is None else self.unit
 
     @property
     def timed(self) -> str | None:
-        """The metric of the share of the time in which a run keeps the limit; None where no share is asked for."""
+        """The metric that is the fraction of the time within the limit; None if the requirement is on runs."""
         return None if self.interpretation == "ensemble" else f"{WITHIN}{self.metric}"
 
     @property
     def implied_by(self) -> "Requirement":
-        """The ensemble requirement that implies this one, for a search: shares of time have no slopes."""
+        """The ensemble requirement that implies this one. A search uses it, as fractions of time have no gradients."""
         quantile = None if self.interpretation == "temporal" else self.quantile
         return replace(self, interpretation="ensemble", quantile=quantile)
 
     def verdict(self, values: np.ndarray, ok: np.ndarray, within: np.ndarray | None = None) -> Verdict:
-        """Verdict from (trials,) values and status flags; a trial that failed or has no value breaks the limit.
+        """Return the verdict on trials. A trial that failed or has no value breaks the limit.
 
-        A single run, numbers (), is judged by the limit alone, or by its share of the time. within: shares of the time
-        in which each run keeps the limit, needed where these are asked for.
+        Args:
+            values: of the metric, (trials,) in its unit, or () for a single run, to which no quantile applies.
+            ok: whether each trial has finished, bool of the same shape.
+            within: fraction of the time within the limit, same shape; needed if the requirement is on the time.
         """
         single = np.ndim(values) == 0
         values, ok = np.atleast_1d(np.asarray(values)), np.atleast_1d(np.asarray(ok))
@@ -207,7 +214,7 @@ class Requirement:
         )  # fmt: skip
 
     def _of_time(self, values: np.ndarray, ok: np.ndarray, within: np.ndarray, *, single: bool) -> Verdict:
-        """The verdict on a share of the time; a run that failed keeps the limit at no time."""
+        """Return the verdict on a fraction of the time. A run that failed never keeps the limit."""
         assert self.quantile is not None
         beyond = np.where(ok & ~np.isnan(within), 1.0 - within, 1.0)
         confidence = None if single else self.confidence
@@ -228,8 +235,11 @@ class Requirement:
 
 
 def verdicts(requirements: Iterable[Requirement], values: Callable[[str], Any], finished: Any) -> list[Verdict]:
-    """A verdict for each requirement on metrics.
+    """Return a verdict for each requirement.
 
-    values: metric's name -> its values of one run, or of many (trials,); finished: which of these runs ended, likewise.
+    Args:
+        requirements: on metrics.
+        values: function from the name of a metric to its values, (trials,), or () for a single run.
+        finished: whether each run has finished, bool of the same shape.
     """
     return [r.verdict(values(r.metric), finished, None if r.timed is None else values(r.timed)) for r in requirements]

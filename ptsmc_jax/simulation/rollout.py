@@ -1,7 +1,7 @@
-"""A run: parts in, metrics, status and (if asked for) the history out. It knows no law and no plant.
+"""Simulate one run: from its parts to metrics, status and history.
 
-`simulate` is pure and composes with jit, vmap, grad and jvp; every number in `Parts` is a leaf, so another gain,
-inertia or noise is the same compiled program.
+`simulate` is a pure function. It composes with jit, vmap, grad and jvp. Every number in `Parts` is a leaf of a pytree,
+so other gains, inertias or noises reuse the compiled program. `simulate_parts` is the compiled function.
 """
 
 from typing import Any
@@ -36,33 +36,34 @@ from ptsmc_jax.simulation.run_state import (
 
 __all__ = [
     "DIVERGED", "FINISHED", "MISSED", "OK", "SINGULAR", "SINGULAR_CLEARANCE", "STATUS", "TOO_FAST", "UNBOUNDED",
-    "UNFINISHED", "Log", "Parts", "Result", "simulate", "simulate_jit",
+    "UNFINISHED", "Log", "Parts", "Result", "simulate", "simulate_parts",
 ]  # fmt: skip
 
 
 def simulate(
     parts: Parts, seed: WholeNumber = 0, trial: WholeNumber = 0, record: bool = False, software: Software = OURS
 ) -> Result:
-    """One closed-loop run, which never raises: where it goes wrong, its status says so, with the first bad time.
+    """Simulate one closed-loop run. A run that diverges raises nothing: its status reports it.
 
     Args:
-        parts: of the run.
-        seed: whole number below 2^32 that names the noise, together with `trial`.
+        parts: parts of the run.
+        seed: whole number below 2^32 that selects the random numbers, together with `trial`.
         trial: whole number below 2^32.
-        record: return the history, too.
-        software: the flight computer of a sampled loop, where it is not our own.
+        record: whether to return the history.
+        software: flight software of a sampled loop; by default the law and observer of `parts`.
 
     Returns:
-        Metrics, as they came out whatever the status, status, first bad time and history.
+        Metrics, status, first bad time and history. The metrics of a diverged run are returned as computed.
 
-    Raises TypeError, with one sentence, where parts changed by hand do not fit each other.
+    Raises:
+        TypeError: the parts do not fit together.
     """
     _check(parts)
     ticks = parts.clock.ticks(parts.controller.t_f, parts.controller.delta)
     pointing = None if parts.pointing is None else parts.pointing.of_run(ticks.t.size)
     criteria = Criteria(parts.controller.t_f, parts.t_end, parts.window, parts.settling_angle, pointing)
     target = parts.reference(jnp.zeros_like(parts.t_end))
-    # whole numbers and single precision in a start are numbers of the run, as they are in any other part
+    # the initial state may have integers or single precision; the run uses the precision of JAX
     x0 = jax.tree.map(lambda v: jnp.asarray(v, float), parts.aligned_initial)
     unit = parts.controller.kinematics.clearance_unit(parts.controller.clearance(x0, target))
     target_t_f = parts.reference(criteria.t_f)
@@ -72,7 +73,7 @@ def simulate(
 
 
 def _check(parts: Parts) -> None:
-    """Raise TypeError where parts do not fit each other, or JAX as it is set: JAX would from deep inside."""
+    """Raise TypeError if the parts do not fit together or do not have the precision of JAX."""
     check_parts(parts)
     _check_bits(parts.t_end)
     for name, size in (("q", 4), ("w", 3)) if parts.plant.attitude else ():
@@ -82,7 +83,7 @@ def _check(parts: Parts) -> None:
     if not callable(parts.disturbance):
         raise TypeError(f"the disturbance must be a function of (t, x), but is {parts.disturbance!r}")
     value = jax.eval_shape(lambda: parts.disturbance(jnp.zeros_like(parts.t_end), parts.initial))
-    _check_shape("what the disturbance returns", value, [(parts.plant.inputs,), ()])
+    _check_shape("the disturbance's value", value, [(parts.plant.inputs,), ()])
     if not parts.clock.sampled:
         _check_continuous(parts)
 
@@ -99,12 +100,12 @@ def _check_continuous(parts: Parts) -> None:
 
 
 def _check_bits(time: Any) -> None:
-    """Raise TypeError where parts were made before JAX was set to compute with other bits, as their times show."""
+    """Raise TypeError if the parts were built while JAX had another precision."""
     real = jnp.result_type(float)
     if isinstance(time, jax.Array) and jnp.issubdtype(time.dtype, jnp.floating) and time.dtype != real:
         had, has = (jnp.finfo(kind).bits for kind in (time.dtype, real))
-        made = f"the parts have numbers of {had} bits, but JAX computes with {has} now"
-        raise TypeError(f"{made}: make them anew, by study")
+        built = f"the parts were built in {had}-bit precision, but JAX now uses {has}-bit"
+        raise TypeError(f"{built}; build them again with study")
 
 
 def _check_shape(name: str, value: Any, allowed: list[tuple[int, ...]]) -> None:
@@ -115,39 +116,39 @@ def _check_shape(name: str, value: Any, allowed: list[tuple[int, ...]]) -> None:
 
 
 def _gap(ticks: Ticks, t_end: Scalar) -> Scalar:
-    """First time without samples [s], where the clock was made for shorter t_f or delta than it got; NaN: none."""
+    """Return the first time without samples [s], or NaN. A clock built for a shorter t_f or delta has too few."""
     first, last = ticks.t[0], ticks.t_next[-1]
     ends = jnp.where(last < t_end - guards.rounding(t_end, t_end), last, jnp.nan)
     return jax.lax.stop_gradient(jnp.where(first > 0.0, 0.0, ends))
 
 
 def _first_missing(parts: Parts, ticks: Ticks) -> Scalar:
-    """The `_gap` [s]; of a continuous loop whose steps are too coarse for t_f and delta 0."""
+    """Return the first time without samples [s], or NaN; 0 if the steps of a continuous loop are too coarse."""
     clock: Any = parts.clock
     gap = _gap(ticks, parts.t_end)
     law = parts.controller
     return gap if clock.sampled else jnp.where(clock.too_coarse(law.t_f, law.delta), 0.0, gap)
 
 
-class _Flights(programs.Program):
-    """`simulate` compiled: what is no parts, seed or trial is refused before JAX is given arrays made of it."""
+class _SimulateProgram(programs.Program):
+    """Compiled `simulate`. It checks the types of parts, seed and trial before JAX converts them to arrays."""
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        """Call it as `simulate` is called."""
-        given = dict(zip(("parts", "seed", "trial"), args, strict=False)) | kwargs
-        check_parts(given.get("parts"))
+        """Check the arguments and call the program with the arguments of `simulate`."""
+        arguments = dict(zip(("parts", "seed", "trial"), args, strict=False)) | kwargs
+        check_parts(arguments.get("parts"))
         for name in ("seed", "trial"):
-            check_fits(name, given.get(name))
+            check_fits(name, arguments.get(name))
         return super().__call__(*args, **kwargs)
 
 
-# One compiled program for all parts of the same structure.
-simulate_jit = _Flights(simulate, ("record", "software"))
-# The same for a run that is flown to be looked at: compiled in half to a tenth of the time, flown in 3 to 8 times of it
-simulate_once = _Flights(simulate, ("record", "software"), programs.QUICKLY)
-LONG = 20_000  # periods from which on that loses more than it saves
+# one compiled program for all parts of the same structure
+simulate_parts = _SimulateProgram(simulate, ("record", "software"))
+# for a single run: compiles in half to a tenth of the time, and runs 3 to 8 times as long
+simulate_once = _SimulateProgram(simulate, ("record", "software"), programs.QUICKLY)
+LONG = 20_000  # periods of a run from which fast compilation no longer pays
 
 
-def looked_at(parts: Parts) -> programs.Program:
-    """`simulate` compiled for one run of such parts, by the host."""
-    return simulate_jit if parts.clock.count > LONG else simulate_once
+def single_run_program(parts: Parts) -> programs.Program:
+    """Return the compiled `simulate` that is fastest for a single run, compilation included."""
+    return simulate_parts if parts.clock.count > LONG else simulate_once

@@ -27,10 +27,11 @@ STATUS = {
     UNBOUNDED: ("diverged", "a metric is not finite"),
     UNFINISHED: ("unfinished", "the clock was made for other gains, and has too few samples or steps for these"),
 }
-FINISHED = (OK, MISSED)  # flown to t_end: the metrics are those of the run
-SINGULAR_CLEARANCE = 1e-3  # there the law's gain, which grows like 1 / clearance, is a thousand times as large
-# a run has missed t_f where its angle then is larger than both of these
-MISSED_SHARE = 0.05  # of the initial angle
+FINISHED = (OK, MISSED)  # statuses of runs that were simulated to t_end
+# clearance from the singularity of the law; its gain grows like 1 / clearance and is 1000 times as large here
+SINGULAR_CLEARANCE = 1e-3
+# a run has not converged if its angle at t_f is larger than both of these
+MISSED_SHARE = 0.05  # fraction of the initial angle
 MISSED_SETTLING_ANGLES = 10.0
 
 
@@ -43,29 +44,26 @@ class Log(NamedTuple):
     t: Array  # [s]
     x: Any  # true state
     d_hat: Array  # estimated disturbance [N m]
-    u: Array  # delivered torque, from this time on [N m]
+    u: Array  # torque delivered from this time on [N m]
     commanded: Array  # [N m]
     s: Array  # sliding variable that the law used
     disturbance: Array  # true disturbance [N m]
     reference: Any  # target of the reference
-    error: Array  # that the law drives to zero: the attitude error vector [-], for a chain x_1
+    error: Array  # error that the law drives to zero: the attitude error vector [-]; for a chain x_1
     wheels: tuple[Array, Array] | None  # momentum of each reaction wheel [N m s], and its torque [N m]
-    has_length: Array  # bool: the row starts an interval of positive length, or is the last
+    has_length: Array  # bool: the interval of this row has a positive length, or the row is the last
 
     __repr__ = listing
 
 
 class Result(NamedTuple):
-    """A run's metrics, its status code (see `STATUS`) with the first bad time, NaN if none [s], and its history.
-
-    samples: number of samples by status, as exported C reports them; empty for our own flight software.
-    """
+    """The result of a run."""
 
     metrics: metrics.Metrics
-    status: Array
-    bad_time: Array
-    log: Log | None
-    samples: dict[str, Array]
+    status: Array  # code, see `STATUS`
+    bad_time: Array  # time at which the status became other than ok [s]; NaN: it is ok
+    log: Log | None  # history; None: not recorded
+    samples: dict[str, Array]  # number of samples by the status that exported C reports; empty for simulated software
 
     __repr__ = listing
 
@@ -77,11 +75,11 @@ class Run(NamedTuple):
     ticks: Ticks
     criteria: Criteria
     x0: Any
-    target_0: Any  # of the reference at t = 0
-    target_t_f: Any  # of the reference at t_f
-    clearance_unit: Array  # that the run's clearances from the law's singularity are divided by
-    gap: Array  # first time that the clock has no samples for [s]; NaN: it has them from t = 0 to t_end
-    record: bool  # the history is asked for
+    target_0: Any  # reference at t = 0
+    target_t_f: Any  # reference at t_f
+    clearance_unit: Array  # unit of the distance to the singularity of the law
+    gap: Array  # first time without samples of the clock [s]; NaN: there are samples from t = 0 to t_end
+    record: bool  # whether the history is recorded
 
 
 class Score(NamedTuple):
@@ -108,11 +106,11 @@ def advance(run: Run, score: Score, before: State, after: State, record: Record)
     """Return metrics and status after a control period, or after a step of the continuous loop.
 
     Args:
-        run: the constants of the run.
+        run: constants of the run.
         score: metrics and status before the period.
-        before: state at its start.
+        before: state at the start of the period.
         after: state at its end.
-        record: what happened in it.
+        record: record of the period.
     """
     kinematics, criteria, now = run.parts.controller.kinematics, run.criteria, record.now
     target_next = run.parts.reference(now.t_next)
@@ -142,9 +140,9 @@ def advance(run: Run, score: Score, before: State, after: State, record: Record)
 
 
 def row(run: Run, before: State, after: State, record: Record) -> Log:
-    """Return the row of the history at the start of a control period, or of a step of the continuous loop.
+    """Return the row of the history at the start of a control period or of a step of the continuous loop.
 
-    Arguments as in `advance`.
+    The arguments are as in `advance`.
     """
     now, drive, decision, wheels = record.now, record.drive, record.decision, None
     if drive is not None and record.torques.wheel_torque is not None:
@@ -159,10 +157,10 @@ def row_at(
     """Return a row of the history.
 
     Args:
-        run: the constants of the run.
+        run: constants of the run.
         t: time [s].
         x: true state.
-        decision: of the controller.
+        decision: of the flight software.
         u: delivered torque, (m,) [N m].
         has_length: see `Log`.
         walk: random walk of the disturbance, (m,) [N m], or None.
@@ -175,17 +173,25 @@ def row_at(
 
 
 def history(rows: Log, last: Log) -> Log:
-    """The rows (time, ..) with the last one."""
+    """Append the last row to the rows of the history, arrays (time, ...)."""
     return jax.tree.map(lambda many, one: jnp.concatenate([many, jnp.asarray(one)[None]]), rows, last)
 
 
 def finish(run: Run, first: Score, score: Score, log: Log | None, samples: dict[str, Array] | None = None) -> Result:
-    """Return the result of a run by its scores at t = 0 and at t_end; samples: see `Result`."""
+    """Return the result of a run.
+
+    Args:
+        run: constants of the run.
+        first: score at t = 0.
+        score: score at t_end.
+        log: history, or None.
+        samples: see `Result`.
+    """
     criteria, angle_at_t_f = run.criteria, score.running.arrival.angle
     values = metrics.finish(score.running, criteria)
     unbounded = (score.status == OK) & metrics.unbounded(values)
     missed = (score.status == OK) & misses(angle_at_t_f, first.snapshot.angle, criteria.settling_angle)
-    cut = ~jnp.isnan(run.gap) & ~(score.bad_time < run.gap)  # what went wrong without samples means nothing
+    cut = ~jnp.isnan(run.gap) & ~(score.bad_time < run.gap)  # later statuses mean nothing without samples
     status = jnp.where(unbounded, UNBOUNDED, jnp.where(missed, MISSED, score.status))
     status = jnp.where(cut, UNFINISHED, status).astype(jnp.int32)
     bad_time = jnp.where(unbounded, criteria.t_end, jnp.where(missed, criteria.t_f, score.bad_time))
@@ -194,7 +200,13 @@ def finish(run: Run, first: Score, score: Score, log: Log | None, samples: dict[
 
 
 def misses(angle_at_t_f: Scalar, first: Scalar, settling_angle: Scalar) -> Array:
-    """Whether a run that is flown to its end has missed t_f, by its angles then and at the start [rad]."""
+    """Return whether a completed run has not converged at t_f.
+
+    Args:
+        angle_at_t_f: angle to the reference at t_f [rad].
+        first: angle to the reference at t = 0 [rad].
+        settling_angle: of the scenario [rad].
+    """
     return angle_at_t_f > jnp.maximum(MISSED_SHARE * first, MISSED_SETTLING_ANGLES * settling_angle)
 
 
@@ -208,10 +220,9 @@ def _snapshot(parts: Parts, target: Any, x: Any) -> Snapshot:
 def _judged(
     run: Run, score: Score, x: Any, target: Any, t: Scalar, step: Scalar, u: Array, memory: Any = None
 ) -> Score:
-    """Return the score with its status and first bad time at t; the first thing that goes wrong stays.
+    """Return the score with status and first bad time after a check of the state at t. The first failure is kept.
 
-    x: true state. memory: of the law. Exported code rejects a memory that is not finite, so the simulated run counts as
-    diverged.
+    Exported code rejects a memory of the law that is not finite, so the simulated run counts as diverged, too.
     """
     law, plant = run.parts.controller, run.parts.plant
     numbers = [leaf for leaf in jax.tree.leaves((x, u, memory)) if jnp.issubdtype(jnp.asarray(leaf).dtype, jnp.inexact)]

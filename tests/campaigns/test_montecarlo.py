@@ -38,7 +38,7 @@ def test_256_trials_equal_the_loop_over_them(chain, flown):
     draw = jax.jit(lambda trial: chain.dispersion.apply(chain.parts, np.uint32(5), trial))
     for k in {*range(0, 256, 5), 127, 128, 255}:
         drawn = draw(np.uint32(k))
-        alone = rollout.simulate_jit(drawn, np.uint32(5), np.uint32(k), record=True)
+        alone = rollout.simulate_parts(drawn, np.uint32(5), np.uint32(k), record=True)
         assert int(alone.status) == flown.status[k]
         np.testing.assert_allclose(drawn.initial, flown.vectors("initial_x")[k], atol=1e-15)
         for name in alone.metrics:

@@ -211,7 +211,7 @@ def test_what_stands_in_a_row_is_what_is_flown(everything, corners, kind):
     for row in rows.iter_rows(named=True):
         by_hand = set_by_hand(made.ready.parts, row)
         seed, trial = row.get("plan_seed", SEED), row.get("plan_trial", row["trial"])
-        run = rollout.simulate_jit(by_hand, jnp.uint32(seed), jnp.uint32(trial))
+        run = rollout.simulate_parts(by_hand, jnp.uint32(seed), jnp.uint32(trial))
         assert rollout.STATUS[int(run.status)][0] == row["status"]
         for name in made.ready.catalogue:
             value = float(getattr(run.metrics, name))
@@ -318,7 +318,7 @@ def test_a_chain_flies_a_plan():
         assert [row[name] for name in states] == [values[k] for values in states.values()]
         drawn = known.dispersion.apply(known.parts, *at)
         start = vector([row[name] for name in states])
-        run = rollout.simulate_jit(dataclasses.replace(drawn, initial=start), *at)
+        run = rollout.simulate_parts(dataclasses.replace(drawn, initial=start), *at)
         np.testing.assert_allclose(row["state_noise_1"], drawn.sensors.sigma[0], rtol=1e-12)
         for name in ("terminal_error", "peak_torque", "window_error"):
             np.testing.assert_allclose(row[name], getattr(run.metrics, name), rtol=1e-9)

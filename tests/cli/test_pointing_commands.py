@@ -39,7 +39,7 @@ def one_by_one():
 
     def one(parts, dispersion, seed, trial):
         at = np.uint32(seed), np.uint32(trial)
-        run = rollout.simulate_jit(drawn(parts, dispersion, *at), *at, record=True, software=rollout.OURS)
+        run = rollout.simulate_parts(drawn(parts, dispersion, *at), *at, record=True, software=rollout.OURS)
         flown = values(parts, dispersion, *at)
         return jax.tree.map(np.asarray, (run.metrics, run.status, run.bad_time, flown, {}, run.samples))
 

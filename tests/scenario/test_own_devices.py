@@ -97,7 +97,7 @@ def parts_of(**tables):
 def test_sensors_do_what_they_say_with_noise_of_the_trial():
     """u = -2 x_1 - 2 x_2 of what is seen: x_1 of the sample before, and the noise of (seed, trial, sample)."""
     parts = parts_of(sensors={**NOISY, "sigma": [0.02, 0.03]}, disturbance={"kind": "none"})
-    log = rollout.simulate_jit(parts, 3, 7, record=True).log
+    log = rollout.simulate_parts(parts, 3, 7, record=True).log
     kept = np.asarray(log.has_length)
     t, x, u = (np.asarray(v)[kept] for v in (log.t, log.x, log.u))
     ticks = ticks_of(parts.clock, parts.controller.t_f, parts.controller.delta)
@@ -107,8 +107,8 @@ def test_sensors_do_what_they_say_with_noise_of_the_trial():
     seen = x[1:-1] + np.array([0.02, 0.03]) * noise
     wanted = -2.0 * seen[:-1, 0] - 2.0 * seen[1:, 1]  # its first one lies a sample back
     np.testing.assert_allclose(u[2:-1, 0], wanted, rtol=0.0, atol=1e-13)
-    other = rollout.simulate_jit(parts, 3, 8)
-    assert float(other.metrics.window_error) != float(rollout.simulate_jit(parts, 3, 7).metrics.window_error)
+    other = rollout.simulate_parts(parts, 3, 8)
+    assert float(other.metrics.window_error) != float(rollout.simulate_parts(parts, 3, 7).metrics.window_error)
     assert linear.quiet(parts).sensors.noise_scale == 0.0
     assert t.size > 60
 
@@ -130,8 +130,8 @@ def test_a_sensor_that_sees_the_state_flies_as_none_does():
         def see(self, memory, x, noise, t, dt):
             return x, memory
 
-    with_it = rollout.simulate_jit(parts_of(sensors={"kind": "own", "code": Clear}))
-    without = rollout.simulate_jit(parts_of())
+    with_it = rollout.simulate_parts(parts_of(sensors={"kind": "own", "code": Clear}))
+    without = rollout.simulate_parts(parts_of())
     for one, other in zip(*map(jax.tree.leaves, (with_it.metrics, without.metrics)), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-12)  # two programs
 
@@ -317,10 +317,10 @@ def test_gains_of_sensors_of_ones_own_are_tuned_and_stand_in_the_file():
     assert other.sensors.share == 0.3
     assert gains.differ(loaded, other)
     one, two = (
-        rollout.simulate_jit(p, 1, 2).metrics.window_error
+        rollout.simulate_parts(p, 1, 2).metrics.window_error
         for p in (gains.with_gains(parts, {"sensors_share": 0.3}), scenario.study(other).parts)
     )
-    assert float(one) == float(two) != float(rollout.simulate_jit(parts, 1, 2).metrics.window_error)
+    assert float(one) == float(two) != float(rollout.simulate_parts(parts, 1, 2).metrics.window_error)
 
     def error(share):
         return rollout.simulate(gains.with_gains(parts, {"sensors_share": share}), 1, 2).metrics.window_error

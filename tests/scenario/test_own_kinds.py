@@ -64,7 +64,7 @@ def made(file, name) -> Any:
 
 
 def flown(tables, record=True):
-    return rollout.simulate_jit(scenario.study(scenario.from_tables(tables)).parts, record=record)
+    return rollout.simulate_parts(scenario.study(scenario.from_tables(tables)).parts, record=record)
 
 
 @pytest.mark.parametrize("plant", short(["chain", "spacecraft"], ["chain"]))

@@ -52,7 +52,7 @@ def test_the_truth_flies_under_a_law_that_knows_the_model():
     RK4 leaves h^5 / 120 = 8e-8 of its fifth derivative a period, of the order 1, which the loop forgets within ten.
     """
     parts = scenario.study(scenario.from_tables(TABLES)).parts
-    log = rollout.simulate_jit(parts, record=True).log
+    log = rollout.simulate_parts(parts, record=True).log
     kept = np.asarray(log.has_length)
     x, u = np.asarray(log.x)[kept], np.asarray(log.u)[kept]
     block = expm(PERIOD * np.array([[0.0, 1.0, 0.0], [-0.5, -0.3, 1.2], [0.0, 0.0, 0.0]]))
@@ -104,7 +104,7 @@ def test_trials_of_a_truth_with_hidden_states():
     flown = montecarlo.run(ready.parts, ready.dispersion, 0, np.arange(3))
     assert [name for name in flown.drawn if name.startswith("initial_x")] == ["initial_x1", "initial_x2"]
     by_hand = replace(ready.parts, initial=jnp.array([flown.drawn["initial_x1"][2], -0.2, 0.1]))
-    again = rollout.simulate_jit(by_hand, 0, 2).metrics
+    again = rollout.simulate_parts(by_hand, 0, 2).metrics
     np.testing.assert_allclose(flown.metrics.window_error[2], again.window_error, rtol=1e-12)
 
 
@@ -143,7 +143,7 @@ def test_hidden_states_that_cannot_be(changes, said):
 def test_the_observer_sees_what_the_model_leaves_out():
     """At rest off the origin the truth pulls by -0.5 x_1: what an observer that knows 1/s^2 takes for a disturbance."""
     tables = {**TABLES, "observer": {"kind": "nonlinear", "gain": [5.0]}}
-    log = rollout.simulate_jit(scenario.study(scenario.from_tables(tables)).parts, record=True).log
+    log = rollout.simulate_parts(scenario.study(scenario.from_tables(tables)).parts, record=True).log
     kept = np.asarray(log.has_length)
     x, u, seen = (np.asarray(v)[kept] for v in (log.x, log.u, log.d_hat))
     left_out = -0.5 * x[:, 0] - 0.3 * x[:, 1] + 0.2 * u[:, 0]
@@ -156,11 +156,13 @@ def test_the_observer_sees_what_the_model_leaves_out():
 def test_the_same_system_as_truth_changes_nothing():
     same = {**TABLES, "plant": {**TABLES["plant"], "truth": "my.py:known"}}
     none = {**TABLES, "plant": {key: value for key, value in TABLES["plant"].items() if key != "truth"}}
-    both = [rollout.simulate_jit(scenario.study(scenario.from_tables(t)).parts, record=True).log for t in (same, none)]
+    both = [
+        rollout.simulate_parts(scenario.study(scenario.from_tables(t)).parts, record=True).log for t in (same, none)
+    ]
     np.testing.assert_array_equal(both[0].x, both[1].x)
     made = system(1, lambda t, a, b: b, lambda t, a, b: -0.5 * a - 0.3 * b, lambda t, a, b: 1.2 * jnp.eye(1))
     from_python = {**TABLES, "plant": {**TABLES["plant"], "truth": made}}
-    found = [rollout.simulate_jit(scenario.study(scenario.from_tables(t)).parts) for t in (from_python, TABLES)]
+    found = [rollout.simulate_parts(scenario.study(scenario.from_tables(t)).parts) for t in (from_python, TABLES)]
     assert float(found[0].metrics.window_error) == float(found[1].metrics.window_error)
 
 
@@ -168,7 +170,7 @@ def test_the_same_system_as_truth_changes_nothing():
 def test_laws_to_compare_with_fly_a_system_by_its_scenario(kind):
     """How fast a system is along its run is asked of the paper's way, whatever law flies."""
     tables = {**TABLES, "controller": {"kind": kind, "t_f": 5.0}}
-    run = rollout.simulate_jit(scenario.study(scenario.from_tables(tables)).parts)
+    run = rollout.simulate_parts(scenario.study(scenario.from_tables(tables)).parts)
     assert int(run.status) in rollout.FINISHED
 
 

@@ -87,7 +87,7 @@ def test_gains_moved_in_the_parts_fly_as_in_the_scenario(name):
     scenario, ready = wide()
     moved = gains.with_gains(ready.parts, OTHERS[name])
     changed = study(gains.in_scenario(scenario, OTHERS[name]))
-    one, other = (rollout.simulate_jit(parts, np.uint32(3), np.uint32(1)).metrics for parts in (moved, changed.parts))
+    one, other = (rollout.simulate_parts(parts, np.uint32(3), np.uint32(1)).metrics for parts in (moved, changed.parts))
     for metric in ("window_error", "peak_torque", "effort", "hold_error"):
         np.testing.assert_allclose(getattr(one, metric), getattr(other, metric), rtol=1e-9, err_msg=metric)
     for parts in (moved, changed.parts):
@@ -209,7 +209,7 @@ def test_a_chain_and_its_observer_gain_move_too(kind):
     moved = gains.with_gains(ready.parts, wanted)
     changed = study(gains.in_scenario(scenario, wanted))
     # two grids: both refined four times, which leaves 4^-4 of the 2e-3 that the smooth sign's layer costs
-    one, other = (rollout.simulate_jit(finer(p, 4)).metrics for p in (moved, changed.parts))
+    one, other = (rollout.simulate_parts(finer(p, 4)).metrics for p in (moved, changed.parts))
     np.testing.assert_allclose(one.peak_torque, other.peak_torque, rtol=1e-6)
     np.testing.assert_allclose(one.window_error, other.window_error, rtol=1e-4)
 

@@ -35,7 +35,7 @@ def test_a_lambda_is_a_disturbance_and_a_function_a_reference_under_jit():
     wave = parts(8.0, 3.0, 0.5, disturbance=WAVE, period=0.1, flight=True)
     plain = parts(8.0, 3.0, 0.5, disturbance=lambda t, x: 0.01 * jnp.sin(0.1 * t) * jnp.ones(3), reference=reference,
                   period=0.1, flight=True)  # fmt: skip
-    expected, found = (ptsmc.simulate_jit(run, np.uint32(0), np.uint32(0)).metrics for run in (wave, plain))
+    expected, found = (ptsmc.simulate_parts(run, np.uint32(0), np.uint32(0)).metrics for run in (wave, plain))
     np.testing.assert_allclose(found.window_error, expected.window_error, rtol=1e-9)
 
 
@@ -114,43 +114,43 @@ FLIGHT = scenario.from_tables({})
 API: Any = ptsmc  # whose types say already what does not fit
 REFUSED = {
     "a start of another shape": (
-        lambda: ptsmc.simulate_jit(replace(RUN, initial=RUN.initial._replace(w=jnp.zeros(4)))),
+        lambda: ptsmc.simulate_parts(replace(RUN, initial=RUN.initial._replace(w=jnp.zeros(4)))),
         r"initial.w must be an array \(3,\), but is one of shape \(4,\)",
     ),
     "a list among the parts": (
-        lambda: ptsmc.simulate_jit(replace(RUN, initial=RUN.initial._replace(q=[0.0, 0.0, 0.0, 1.0]))),
+        lambda: ptsmc.simulate_parts(replace(RUN, initial=RUN.initial._replace(q=[0.0, 0.0, 0.0, 1.0]))),
         r"initial.q must be an array \(4,\), but is of type list",
     ),
     "a start with more states than a chain has": (
-        lambda: ptsmc.simulate_jit(replace(CHAIN, initial=jnp.zeros(3))),
+        lambda: ptsmc.simulate_parts(replace(CHAIN, initial=jnp.zeros(3))),
         r"initial must be an array \(2,\), but is one of shape \(3,\)",
     ),
     "a start of a system without its hidden states": (
-        lambda: ptsmc.simulate_jit(replace(CHAIN, plant=LATE)),
+        lambda: ptsmc.simulate_parts(replace(CHAIN, plant=LATE)),
         r"initial must be an array \(3,\), but is one of shape \(2,\)",
     ),
     "a disturbance of another shape": (
-        lambda: ptsmc.simulate_jit(replace(RUN, disturbance=lambda t, x: jnp.zeros(4))),
-        r"what the disturbance returns must be an array \(3,\), but is one of shape \(4,\)",
+        lambda: ptsmc.simulate_parts(replace(RUN, disturbance=lambda t, x: jnp.zeros(4))),
+        r"the disturbance.s value must be an array \(3,\), but is one of shape \(4,\)",
     ),
     "no disturbance": (
-        lambda: ptsmc.simulate_jit(replace(RUN, disturbance=None)),
+        lambda: ptsmc.simulate_parts(replace(RUN, disturbance=None)),
         r"the disturbance must be a function of \(t, x\), but is None",
     ),
     "parts from before JAX had 64 bits": (
-        lambda: ptsmc.simulate_jit(jax.tree.map(lambda leaf: leaf.astype(jnp.float32), RUN)),
-        "the parts have numbers of 32 bits, but JAX computes with 64 now: make them anew, by study",
+        lambda: ptsmc.simulate_parts(jax.tree.map(lambda leaf: leaf.astype(jnp.float32), RUN)),
+        "the parts were built in 32-bit precision, but JAX now uses 64-bit",
     ),
     "a trial of 40 bits": (  # it was trial 0
-        lambda: ptsmc.simulate_jit(RUN, 0, trial=2**40),
+        lambda: ptsmc.simulate_parts(RUN, 0, trial=2**40),
         "trial is 1099511627776, but must be a whole number below 2.32 = 4294967296",
     ),
-    "a seed of 70 bits, by position": (lambda: ptsmc.simulate_jit(RUN, 2**70), "seed is 11805916207.* below 2.32"),
+    "a seed of 70 bits, by position": (lambda: ptsmc.simulate_parts(RUN, 2**70), "seed is 11805916207.* below 2.32"),
     "a draw of a trial of 33 bits": (
         lambda: draws.stream(0, np.int64(2**32), "rate"),
         "a seed, trial or sample is 4294967296, but must be a whole number below 2.32",
     ),
-    "a scenario for parts": (lambda: ptsmc.simulate_jit(FLIGHT), "parts are needed, such as study"),
+    "a scenario for parts": (lambda: ptsmc.simulate_parts(FLIGHT), "parts are needed, such as study"),
     "a scenario's gains": (lambda: API.gains_of(FLIGHT), "parts are needed, such as study"),
     "gains in a scenario": (lambda: API.with_gains(FLIGHT, {"eta": 3.0}), "parts are needed, such as study"),
     "trials of a scenario": (lambda: API.run(FLIGHT, None, 0, [1]), "parts are needed, such as study"),
@@ -244,7 +244,7 @@ def test_a_start_of_whole_numbers_or_in_single_precision_flies():
     q, w = jnp.asarray([0, 0, 1, 0]), RUN.initial.w.astype(jnp.float32)
     run = replace(RUN, initial=RUN.initial._replace(q=q, w=w))
     for record in (False, True):
-        shapes = jax.eval_shape(lambda run, record=record: ptsmc.simulate_jit(run, record=record), run)
+        shapes = jax.eval_shape(lambda run, record=record: ptsmc.simulate_parts(run, record=record), run)
         assert shapes.metrics.window_error.dtype == float
     assert shapes.log.x.q.dtype == float
 
@@ -257,7 +257,7 @@ def test_a_study_and_other_values_are_made_of_a_file_too(tmp_path):
 
 def test_metrics_show_what_a_run_has():
     run = parts(8.0, 3.0, 0.5, disturbance=WAVE, period=0.1, flight=True)
-    found = ptsmc.simulate_jit(run, np.uint32(0), np.uint32(0)).metrics
+    found = ptsmc.simulate_parts(run, np.uint32(0), np.uint32(0)).metrics
     shown = dict(line.split() for line in repr(found).splitlines())
     assert set(shown) == set(catalogues.CATALOGUES["spacecraft"]) & set(shown)
     assert {"window_error", "settling_time", "peak_momentum"} <= set(shown)
@@ -277,7 +277,7 @@ def test_parts_and_results_are_shown_in_lines_that_can_be_read():
     assert not any(": None" in line for line in shown)
     many = repr(jax.tree.map(lambda v: jnp.stack([v] * 4), RUN)).splitlines()
     assert {"    inertia: float64 (4, 3, 3)", "    delta: [0.5, 0.5, 0.5, 0.5]"} <= set(many)
-    shapes = jax.eval_shape(lambda run: ptsmc.simulate_jit(run, record=True), RUN)
+    shapes = jax.eval_shape(lambda run: ptsmc.simulate_parts(run, record=True), RUN)
     assert re.search(r"    window_error +ShapeDtypeStruct\(shape=\(\), dtype=float64\)\n", repr(shapes))
     assert "  metrics:\n    terminal_error " in repr(shapes)
     log = jax.tree.map(lambda v: np.zeros(v.shape, v.dtype), shapes.log)

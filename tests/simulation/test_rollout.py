@@ -422,12 +422,12 @@ def test_a_t_f_that_the_steps_of_a_continuous_loop_are_too_coarse_for_is_said():
     assert float(jax.jit(lambda eta: with_gains(run, {"eta": eta}).controller.eta)(3.5)) == 3.5
 
 
-def test_a_run_to_be_looked_at_is_optimised_where_it_is_long(monkeypatch):
+def test_a_single_run_is_compiled_with_optimisation_only_if_it_is_long(monkeypatch):
     monkeypatch.setattr(rollout, "simulate_once", once := object())
     run = parts(30.0, period=0.01, t_end=31.0)
-    assert rollout.looked_at(run) is once
+    assert rollout.single_run_program(run) is once
     longer = replace(run, clock=clock.flight(1e-3, 31.0))
-    assert rollout.looked_at(longer) is rollout.simulate_jit
+    assert rollout.single_run_program(longer) is rollout.simulate_parts
 
 
 @pytest.mark.parametrize(
@@ -441,7 +441,7 @@ def test_a_run_to_be_looked_at_is_optimised_where_it_is_long(monkeypatch):
 def test_a_continuous_loop_refuses_parts_that_it_would_ignore(changes, name):
     run = parts(20.0, 3.0, 2.0)
     with pytest.raises(TypeError, match=f"^the continuous loop cannot simulate {name}"):
-        rollout.simulate_jit(replace(run, **changes))
+        rollout.simulate_parts(replace(run, **changes))
 
 
 def test_a_continuous_loop_refuses_a_law_of_the_sampled_loop():
@@ -449,7 +449,7 @@ def test_a_continuous_loop_refuses_a_law_of_the_sampled_loop():
     run = parts(20.0, 3.0, 2.0)
     law = PD(MultiplicativeKinematics(run.controller.model), vector(20.0), vector(2.0), vector(1.0), vector(2.0))
     with pytest.raises(TypeError, match=r"^the law PD needs the sampled loop"):
-        rollout.simulate_jit(replace(run, controller=law))
+        rollout.simulate_parts(replace(run, controller=law))
     # implicit sampling, which the continuous loop ignored
     with pytest.raises(TypeError, match=r"^the law PrescribedTime needs the sampled loop"):
-        rollout.simulate_jit(replace(run, controller=replace(run.controller, implicit=True)))
+        rollout.simulate_parts(replace(run, controller=replace(run.controller, implicit=True)))

@@ -34,7 +34,7 @@ def find(scenario: Scenario) -> tuple[Study, Course]:
     if course.clearance < rollout.SINGULAR_CLEARANCE:
         code = rollout.SINGULAR
     elif without_slopes:
-        code = int(rollout.simulate_jit(ready.parts, np.uint32(0), np.uint32(0)).status)
+        code = int(rollout.simulate_parts(ready.parts, np.uint32(0), np.uint32(0)).status)
     if code not in rollout.FINISHED:
         status, why = rollout.STATUS[code]
         raise ScenarioError(f"margins are those about the nominal run, which ends {status}: {why}")
