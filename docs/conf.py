@@ -21,6 +21,7 @@ myst_heading_anchors = 3
 html_theme = "furo"
 html_title = f"ptsmc-jax {version}"
 html_math_renderer = "mathml"
+napoleon_use_ivar = True  # an "Attributes:" section does not describe a field twice
 autodoc_default_options = {"members": True, "undoc-members": False, "member-order": "bysource"}
 autodoc_typehints = "signature"
 autodoc_typehints_format = "short"

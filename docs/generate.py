@@ -23,7 +23,7 @@ PLANTS = {"spacecraft": "A spacecraft", "chain": "An integrator chain", "system"
 SCENARIOS = """\
 A scenario is a TOML file of tables; every table and every key is optional. A key that is left out has its default.
 Defaults marked with * are those of the paper's case. They [follow the
-mission](method.md#gains-that-follow-from-the-mission) for any other body or t_f, and gains are designed for the sampled
+mission](theory/default_gains.md) for any other body or t_f, and gains are designed for the sampled
 loop. `flexible`, `hardware`, `sensors`, `wheels`, `filter`, `pointing`, `dispersion`, `requirements` and `tune` are off
 if they are absent. A key that is misspelt, of the wrong type, out of range or not finite is refused by name.
 `ptsmc new` writes all this into a file for you to change.
@@ -35,13 +35,16 @@ A table with a `kind` has the keys of that kind. Commands that fly leave the sce
 filled in, as `scenario.toml` beside their results. What follows from several keys together, such as `delta` of at
 least one control period, is said when a scenario is refused."""
 METRICS = """\
-What a run is judged by: in `summary.json`, in the rows of a campaign and in `[requirements]`. Over trials
-`window_error` pools as RMS and stands beside its `floor`, what no controller can beat ([the
-method](method.md#the-floor) says what that takes as known); of the others mean, largest and quantiles are given. A run
-that never settles has no `settling_time` (null). A trial that diverged or met a singularity has a status, a reason and
-its first bad time, and breaks every requirement; so does one that never settles a limit on `settling_time`. A run that
-ends with another metric infinite or without a value (an error whose square no number holds) counts as diverged at
-t_end. One that is `missed`, far from the reference at t_f, counts with its metrics."""
+Metrics are in `summary.json`, in the rows of a campaign and in `[requirements]`. For many trials the summary lists
+mean, largest value and quantiles. For `window_error` it lists the RMS and `floor`, the [lower
+bound](theory/lower_bound.md).
+
+| run | in the summary |
+| --- | --- |
+| it never settles | `settling_time` is null, and a limit on `settling_time` is violated |
+| it diverged or met the singularity of the law | it has a status, a reason and a time, and violates every requirement |
+| another metric is infinite or has no value | it counts as diverged at t_end |
+| it is `missed`: at t_f it is far from the reference | its metrics count |"""
 ERRORS = """\
 The attitude error vector is eps_1 = q_1 - q_1f, as in the paper, with `controller.error = "additive"`, and the vector
 part of q_f* q with `"multiplicative"` and for the laws to compare with. x1, x2 and u stand for the units of states and

@@ -123,4 +123,4 @@ _ = axes.set(xlabel="step of Adam", ylabel="ln error + 0.5 effort/(N m s)")
 
 # %% [markdown]
 # Derivatives go forward, in the few gains; a long run differentiated backward would keep all of its samples. What the
-# commands make of them stands in [the method](../docs/method.md) and in the notebook on tuning.
+# commands make of them stands in [the method](../docs/theory/index.md) and in the notebook on tuning.

@@ -30,7 +30,7 @@ from tuning.cli.main import app
 DOCS = ROOT / "docs"
 GENERATE = runpy.run_path(str(DOCS / "generate.py"))
 MADE, TITLES = GENERATE["PAGES"], GENERATE["PLANTS"]
-WRITTEN = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.glob("*.md"))]
+WRITTEN = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
 page_name = operator.attrgetter("name")
 FENCE = re.compile(r"^( *)```(\w*)\n(.*?)^\1```", re.M | re.S)
 
@@ -187,12 +187,12 @@ def test_the_pages_build_without_a_warning_and_need_nothing_from_elsewhere(tmp_p
     building = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html", str(DOCS), str(tmp_path)]
     done = subprocess.run(building, capture_output=True, text=True, cwd=ROOT, check=False)
     assert (done.returncode, done.stderr) == (0, "")
-    pages = sorted(tmp_path.glob("*.html"))
-    assert {page.stem for page in pages} >= {path.stem for path in DOCS.glob("*.md")}
+    pages = sorted(tmp_path.rglob("*.html"))
+    assert {page.stem for page in pages} >= {path.stem for path in DOCS.rglob("*.md")}
     for page in pages:
         loaded = re.findall(r"<(?:script|img|link|iframe)\b[^>]*?(?:src|href)=\"(https?:)?//[^\"]*", page.read_text())
         assert not loaded, page.name
-    assert (tmp_path / "method.html").read_text().count("<math") > 50
+    assert (tmp_path / "theory" / "law.html").read_text().count("<math") > 50
 
 
 # --- docstrings ---
