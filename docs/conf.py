@@ -16,7 +16,7 @@ project = "ptsmc-jax"
 author = "the ptsmc-jax developers"
 release = version = ptsmc_jax.__version__
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
-myst_enable_extensions = ["dollarmath"]
+myst_enable_extensions = ["dollarmath", "deflist"]
 myst_heading_anchors = 3
 html_theme = "furo"
 html_title = f"ptsmc-jax {version}"
