@@ -61,7 +61,7 @@ class Dispersion:
         kinds, coordinates = self.kinds, {}
         for distribution in draws.DISTRIBUTIONS:
             counts = {name: kind.count for name, kind in kinds.items() if kind.drawn == distribution}
-            coordinates |= draws.several(seed, trial, distribution, counts) if counts else {}
+            coordinates |= draws.draw_streams(seed, trial, distribution, counts) if counts else {}
         return {name: coordinates[name] for name in kinds}
 
     def at(self, parts: Parts, coordinates: Coordinates) -> Parts:

@@ -1,1 +1,1 @@
-"""Numerical pieces that the equations are written with: they know nothing of control."""
+"""Numerical building blocks of the equations: quaternions, integrators, random numbers, guarded functions."""

@@ -1,9 +1,13 @@
-"""Random numbers as a pure function of (seed, trial, name, sample): same values whatever the batch or the device.
+"""Random numbers as a pure function of seed, trial, stream name and sample index.
 
-Threefry-2x32 with 20 rounds (Salmon, Moraes, Dror, Shaw, SC11, 2011) on plain uint32. The rule, fixed for good:
+The numbers do not depend on the batch, the device or the order of evaluation. Read `stream` first, which returns the
+key of a stream, then `uniforms` and `normals`. The generator is Threefry-2x32 with 20 rounds (Salmon, Moraes, Dror,
+Shaw, SC11, 2011) on uint32 words. The following rule must never change, because results depend on it:
+
     key   = threefry(key=(seed, 0), counter=(trial, crc32(name)))
-    words = threefry(key, counter=(sample, block)), two a block
-    uniform u = (word + 1/2) / 2^32; normals in pairs by Box-Muller, r cos(a) and r sin(a), r from the first word.
+    words = threefry(key, counter=(sample, block)), two words for each block
+    uniform numbers: u = (word + 1/2) / 2^32
+    normal numbers: pairs r cos(a) and r sin(a) by Box-Muller, r from the first word, a from the second
 """
 
 import zlib
@@ -21,51 +25,61 @@ from ptsmc_jax.numerics import elementary
 _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
 
 Word = UInt32[Array, "..."]
-WholeNumber = int | np.integer | Array  # negative ones wrap to 32 bits
+WholeNumber = int | np.integer | Array  # a negative number wraps to 32 bits
 
 
 class Key(NamedTuple):
-    """Key of one stream of one trial: two 32-bit words."""
+    """Key of one random stream of one trial: two 32-bit words."""
 
     a: Array
     b: Array
 
 
-def _word(value: WholeNumber) -> Array:
+def _to_word(value: WholeNumber) -> Array:
     check_fits("a seed, trial or sample", value)
     if isinstance(value, int):
         return jnp.asarray(np.uint32(value & 0xFFFFFFFF), dtype=jnp.uint32)
     number = jnp.asarray(value)
-    if not jnp.issubdtype(number.dtype, jnp.integer):  # a cast would cut fractions off
+    if not jnp.issubdtype(number.dtype, jnp.integer):  # a cast would truncate fractions
         raise ValueError(f"a seed, trial or sample is of type {number.dtype}, but must be a whole number")
     return number.astype(jnp.uint32)
 
 
-def _one(value: WholeNumber) -> Array:
-    """A seed or trial as a word. Raises ValueError for several, whose streams would be mixed, sample by sample."""
-    word = _word(value)
+def _to_scalar_word(value: WholeNumber) -> Array:
+    """Return a seed or trial as a scalar word. An array is refused: its streams would be mixed sample by sample."""
+    word = _to_word(value)
     if word.ndim:
-        several = f"a seed or trial is of shape {word.shape}, but must be one number"
-        raise ValueError(f"{several}; jax.vmap takes one at a time")
+        raise ValueError(f"a seed or trial is of shape {word.shape}, but must be one number; use jax.vmap for several")
     return word
 
 
 def check_whole_number(name: str, value: object, least: int = 0) -> None:
-    """Raise ValueError where JAX would overflow, cut a fraction off, or count backwards; value: a known one."""
+    """Raise ValueError unless a concrete value is a scalar integer from `least` to 2^32 - 1.
+
+    JAX itself would let it overflow, truncate a fraction, or count backwards.
+
+    Args:
+        name: name of the value in the message.
+        value: the value, not traced.
+        least: smallest allowed value.
+
+    Raises:
+        ValueError: The value is not such an integer.
+    """
     number = np.asarray(value)
     if number.ndim or not np.issubdtype(number.dtype, np.integer) or not least <= number < 2**32:
         raise ValueError(f"{name} is {value!r}, but must be a whole number from {least} to {2**32 - 1}")
 
 
 def check_fits(name: str, value: object) -> None:
-    """Raise ValueError where a known whole number has more than 32 bits: its stream would be that of another one."""
+    """Raise ValueError if a concrete integer has more than 32 bits. Its stream would equal that of another integer."""
     if isinstance(value, int | np.integer) and not -(2**31) <= value < 2**32:
         raise ValueError(f"{name} is {value}, but must be a whole number below 2^32 = {2**32}")
 
 
 @jax.jit
 def threefry(key: Key, counter: tuple[Word, Word]) -> tuple[Word, Word]:
-    """The two words [-] of Threefry-2x32-20 for a key and a counter (broadcast against each other)."""
+    """Return the two words [-] of Threefry-2x32-20 for a key and a counter, which broadcast against each other."""
     schedule = (key.a, key.b, key.a ^ key.b ^ jnp.uint32(0x1BD11BDA))
     x, y = counter[0] + schedule[0], counter[1] + schedule[1]
     for group in range(5):
@@ -74,115 +88,151 @@ def threefry(key: Key, counter: tuple[Word, Word]) -> tuple[Word, Word]:
             y = ((y << r) | (y >> (32 - r))) ^ x
         x = x + schedule[(group + 1) % 3]
         y = y + schedule[(group + 2) % 3] + jnp.uint32(group + 1)
-    if jnp.result_type(float) != jnp.float64:  # without 64 bits there is no such number
+    if jnp.result_type(float) != jnp.float64:  # uint64 does not exist without 64 bits
         return x, y
-    # packed into one number on the way: XLA then makes one kernel of all rounds, not one of each
+    # Both words are packed into one number for a moment. XLA then fuses all rounds into one kernel.
     both = (x.astype(jnp.uint64) << 32) | y.astype(jnp.uint64)
     return (both >> 32).astype(jnp.uint32), both.astype(jnp.uint32)
 
 
 def stream(seed: WholeNumber, trial: WholeNumber, name: str) -> Key:
-    """Key [-] of the stream `name` of a trial; seed and trial are whole numbers from 0 to 2^32 - 1."""
-    return _key(seed, trial, jnp.uint32(_label(name)))
+    """Return the key of a random stream of a trial.
+
+    Args:
+        seed: integer from 0 to 2^32 - 1 [-].
+        trial: number of the trial, from 0 to 2^32 - 1 [-].
+        name: name of the stream, such as "rate_noise".
+
+    Raises:
+        ValueError: The seed or the trial is no scalar integer of 32 bits.
+    """
+    return _stream_key(seed, trial, jnp.uint32(_hash_name(name)))
 
 
 def streams(seed: WholeNumber, trial: WholeNumber, names: Sequence[str]) -> list[Key]:
-    """Keys [-] of several streams of a trial, each as `stream` gives it: less code to compile than one by one."""
-    seed, trial = _word(seed), _word(trial)
-    keys = jax.lax.map(lambda label: _key(seed, trial, label), np.array([_label(name) for name in names], np.uint32))
+    """Return the keys of several random streams of a trial, with less code to compile than calls of `stream`.
+
+    Args:
+        seed: see `stream` [-].
+        trial: see `stream` [-].
+        names: names of the streams.
+    """
+    seed, trial = _to_word(seed), _to_word(trial)
+    hashes = np.array([_hash_name(name) for name in names], np.uint32)
+    keys = jax.lax.map(lambda name_hash: _stream_key(seed, trial, name_hash), hashes)
     return [Key(keys.a[k], keys.b[k]) for k in range(len(names))]
 
 
-def _label(name: str) -> int:
+def _hash_name(name: str) -> int:
     return zlib.crc32(name.encode())
 
 
-def _key(seed: WholeNumber, trial: WholeNumber, label: Word) -> Key:
-    return Key(*threefry(Key(_one(seed), jnp.uint32(0)), (_one(trial), label)))
+def _stream_key(seed: WholeNumber, trial: WholeNumber, name_hash: Word) -> Key:
+    return Key(*threefry(Key(_to_scalar_word(seed), jnp.uint32(0)), (_to_scalar_word(trial), name_hash)))
 
 
 def derive(seed: int, name: str) -> int:
-    """Another seed, from 0 to 2^32 - 1, that follows from this one and a name (concrete, for whole studies)."""
+    """Derive another seed, from 0 to 2^32 - 1 [-], from a seed and a name, for example for held-out trials."""
     return int(stream(seed, 0, name).a)
 
 
 @jax.jit
-def _unit(word: Array) -> Array:
-    """The number between 0 and 1 that a word stands for."""
-    kind = jnp.result_type(float)
-    below_one = np.nextafter(kind.type(1.0), kind.type(0.0))  # float32 would round the largest words up to 1
-    return jnp.minimum((word.astype(kind) + kind.type(0.5)) * kind.type(2.0**-32), below_one)
+def _to_unit_interval(word: Array) -> Array:
+    """Return (word + 1/2) / 2^32, which is inside (0, 1)."""
+    dtype = jnp.result_type(float)
+    below_one = np.nextafter(dtype.type(1.0), dtype.type(0.0))  # float32 would round the largest words up to 1
+    return jnp.minimum((word.astype(dtype) + dtype.type(0.5)) * dtype.type(2.0**-32), below_one)
 
 
-def _uniform(a: Word, b: Word) -> tuple[Array, Array]:
-    """The two uniform numbers of two words."""
-    return _unit(a), _unit(b)
+def _uniform_pair(a: Word, b: Word) -> tuple[Array, Array]:
+    """Return two uniform numbers from two words."""
+    return _to_unit_interval(a), _to_unit_interval(b)
 
 
 @jax.jit
-def _normal(a: Word, b: Word) -> tuple[Array, Array]:
-    """The two standard normal numbers of two words."""
-    radius = jnp.sqrt(-2.0 * elementary.log(_unit(a)))
-    cosine, sine = elementary.cos_sin_turns(_unit(b))
+def _normal_pair(a: Word, b: Word) -> tuple[Array, Array]:
+    """Return two standard normal numbers from two words."""
+    radius = jnp.sqrt(-2.0 * elementary.log(_to_unit_interval(a)))
+    cosine, sine = elementary.cos_sin_turns(_to_unit_interval(b))
     return radius * cosine, radius * sine
 
 
 Distribution = Literal["uniform", "normal"]
-DISTRIBUTIONS: dict[Distribution, Callable] = {"uniform": _uniform, "normal": _normal}  # of two words
+# functions (word, word) -> two numbers
+DISTRIBUTIONS: dict[Distribution, Callable] = {"uniform": _uniform_pair, "normal": _normal_pair}
 
 
-def _interleaved(pairs: tuple[Array, Array], count: int) -> Array:
-    """The first `count` numbers of pairs (blocks,) each, pair after pair."""
+def _interleave(pairs: tuple[Array, Array], count: int) -> Array:
+    """Return the first `count` numbers of pairs: two arrays (blocks,) become a_0, b_0, a_1, b_1, ..."""
     return jnp.stack(pairs, axis=1).reshape(-1)[:count]
 
 
 @partial(jax.jit, static_argnames=("distribution", "count"))
-def _numbers(distribution: Distribution, key: Key, sample: Word, count: int) -> Array:
-    """`count` numbers of a stream's sample, by a loop over blocks of two: the same work, but less code to compile."""
+def _draw(distribution: Distribution, key: Key, sample: Word, count: int) -> Array:
+    """Return `count` numbers of one sample of a stream. A loop over blocks of two numbers has less code to compile."""
     blocks = np.arange((count + 1) // 2, dtype=np.uint32)
     words = jax.lax.map(lambda block: threefry(key, (sample, block)), blocks)
-    return _interleaved(DISTRIBUTIONS[distribution](*words), count)
+    return _interleave(DISTRIBUTIONS[distribution](*words), count)
 
 
 def uniforms(key: Key, count: int, sample: WholeNumber = 0) -> Float[Array, " {count}"]:
-    """(count,) numbers uniform on (0, 1) [-]; `sample` may be negative (it wraps to 32 bits).
+    """Return (count,) numbers that are uniform on (0, 1) [-].
+
+    Args:
+        key: key of the stream.
+        count: how many numbers.
+        sample: index of the sample; a negative index wraps to 32 bits.
 
     >>> key = stream(seed=0, trial=7, name="attitude_noise")
     >>> bool((uniforms(key, 3, sample=5) == uniforms(stream(0, 7, "attitude_noise"), 3, sample=5)).all())
     True
     """
-    return _numbers("uniform", key, _word(sample), count)
+    return _draw("uniform", key, _to_word(sample), count)
 
 
 def normals(key: Key, count: int, sample: WholeNumber = 0) -> Float[Array, " {count}"]:
-    """(count,) standard normal numbers [-] (Box and Muller, Ann. Math. Stat. 29, 1958); |n| stays below 6.77."""
-    return _numbers("normal", key, _word(sample), count)
+    """Return (count,) standard normal numbers [-] (Box and Muller, Ann. Math. Stat. 29, 1958). All are below 6.77.
+
+    Args:
+        key: key of the stream.
+        count: how many numbers.
+        sample: index of the sample; a negative index wraps to 32 bits.
+    """
+    return _draw("normal", key, _to_word(sample), count)
 
 
-def several(
+def draw_streams(
     seed: WholeNumber, trial: WholeNumber, distribution: Distribution, counts: dict[str, int]
 ) -> dict[str, Array]:
-    """The numbers (count,) [-] of several streams of a trial, as `uniforms` or `normals` give them for each.
+    """Return the numbers of several streams of a trial, equal to separate calls of `uniforms` or `normals`.
 
-    counts: how many, by the stream's name. All of them by one loop, over blocks of two numbers: the same work, but a
-    fraction of the code to compile.
+    One loop computes all numbers. It takes a fraction of the code that separate calls compile.
+
+    Args:
+        seed: see `stream` [-].
+        trial: see `stream` [-].
+        distribution: of the numbers.
+        counts: how many numbers, by the name of the stream.
+
+    Returns:
+        The numbers (count,) [-], by the name of the stream.
     """
-    return _several(_word(seed), _word(trial), distribution, tuple(counts.items()))
+    return _draw_streams(_to_word(seed), _to_word(trial), distribution, tuple(counts.items()))
 
 
 @partial(jax.jit, static_argnames=("distribution", "counts"))
-def _several(
+def _draw_streams(
     seed: Word, trial: Word, distribution: Distribution, counts: tuple[tuple[str, int], ...]
 ) -> dict[str, Array]:
-    blocks = [(_label(name), block) for name, count in counts for block in range((count + 1) // 2)]
+    blocks = [(_hash_name(name), block) for name, count in counts for block in range((count + 1) // 2)]
 
     def pair(row: Word) -> tuple[Array, Array]:
-        return DISTRIBUTIONS[distribution](*threefry(_key(seed, trial, row[0]), (jnp.uint32(0), row[1])))
+        return DISTRIBUTIONS[distribution](*threefry(_stream_key(seed, trial, row[0]), (jnp.uint32(0), row[1])))
 
     first, second = jax.lax.map(pair, jnp.asarray(blocks, dtype=jnp.uint32).reshape(-1, 2))
     numbers, start = {}, 0
     for name, count in counts:
         end = start + (count + 1) // 2
-        numbers[name] = _interleaved((first[start:end], second[start:end]), count)
+        numbers[name] = _interleave((first[start:end], second[start:end]), count)
         start = end
     return numbers

@@ -1,8 +1,9 @@
-"""Logarithm, sine, cosine and arctangent as plain arithmetic, good to a few 1e-16.
+"""Logarithm, sine, cosine and arctangent in vectorisable arithmetic, with errors of a few 1e-16.
 
-XLA's CPU backend (jax 0.10.2) calls the C library once per number for those of float64: 5 to 12 ns each, where the
-whole loop takes 50 ns a step. Written out they become vectors, six times as fast. The coefficients are
-those of fdlibm (Sun Microsystems, 1993: e_log.c, k_sin.c, k_cos.c) and Cephes (Moshier, 1989: atan.c).
+For float64, XLA's CPU backend (jax 0.10.2) calls the C library once for each number, which takes 5 to 12 ns. A whole
+step of the simulation takes 50 ns. The functions of this module compile to vector instructions and are six times as
+fast. The coefficients are from fdlibm (Sun Microsystems, 1993: e_log.c, k_sin.c, k_cos.c) and Cephes (Moshier, 1989:
+atan.c).
 """
 
 import jax
@@ -35,7 +36,7 @@ _ATAN_Q = (
 
 
 def _polynomial(x: Array, coefficients: tuple[float, ...]) -> Array:
-    """Sum of coefficients[k] x^k, by Horner's rule."""
+    """Return the sum of coefficients[k] x^k, by Horner's rule."""
     total = jnp.full_like(x, coefficients[-1])
     for c in coefficients[-2::-1]:
         total = total * x + c
@@ -44,11 +45,11 @@ def _polynomial(x: Array, coefficients: tuple[float, ...]) -> Array:
 
 @jax.custom_jvp
 def log(x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Natural logarithm of normal positive numbers; XLA's own in float32, which is a vector already."""
+    """Natural logarithm of positive numbers that are not subnormal. For float32 it is `jnp.log`."""
     if x.dtype != jnp.float64:
         return jnp.log(x)
     bits = lax.bitcast_convert_type(x, jnp.int64)
-    shifted = bits - np.int64(0x3FE6A09E667F3BCD)  # sqrt(1/2): the mantissa then lies within sqrt(1/2) .. sqrt(2)
+    shifted = bits - np.int64(0x3FE6A09E667F3BCD)  # sqrt(1/2), so that the mantissa is from sqrt(1/2) to sqrt(2)
     exponent = lax.shift_right_arithmetic(shifted, np.int64(52))
     f = lax.bitcast_convert_type(bits - lax.shift_left(exponent, np.int64(52)), jnp.float64) - 1.0
     k = exponent.astype(jnp.float64)
@@ -65,12 +66,12 @@ def _log_jvp(primals: tuple, tangents: tuple) -> tuple:
 
 @jax.jit
 def cos_sin_turns(u: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """cos(2 pi u) and sin(2 pi u) for u from 0 to 1; XLA's own in float32."""
+    """Return cos(2 pi u) and sin(2 pi u) for u from 0 to 1. For float32 they are `jnp.cos` and `jnp.sin`."""
     if u.dtype != jnp.float64:
         angle = u.dtype.type(2.0 * np.pi) * u
         return jnp.cos(angle), jnp.sin(angle)
     quarter = jnp.floor(4.0 * u + 0.5)
-    x = (u - 0.25 * quarter) * (2.0 * np.pi)  # within an eighth of a turn, and the difference is exact
+    x = (u - 0.25 * quarter) * (2.0 * np.pi)  # at most an eighth of a turn; the difference has no rounding error
     z = x * x
     s = x + x * z * _polynomial(z, _SIN)
     c = 1.0 - (0.5 * z - z * z * _polynomial(z, _COS))
@@ -84,10 +85,10 @@ def cos_sin_turns(u: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Ar
 
 @jax.custom_jvp
 def arctan2(y: Float[Array, "..."], x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Angle [rad] of the point (x, y), both at least 0; at the origin 0, with derivative 0."""
+    """Angle [rad] of the point (x, y) in the first quadrant. At the origin the angle and its derivatives are 0."""
     if y.dtype != jnp.float64:
         return jnp.arctan2(y, x)
-    flat, steep = y <= 0.4142135623730950 * x, y > 2.414213562373095 * x  # tan of 1/16 and 3/16 of a turn
+    flat, steep = y <= 0.4142135623730950 * x, y > 2.414213562373095 * x  # tan of pi/8 and 3 pi/8
     top = jnp.where(flat, y, jnp.where(steep, -x, y - x))
     bottom = jnp.where(flat, x, jnp.where(steep, y, y + x))
     w = top / jnp.where(bottom == 0.0, 1.0, bottom)
@@ -101,5 +102,5 @@ def _arctan2_jvp(primals: tuple, tangents: tuple) -> tuple:
     (y, x), (dy, dx) = primals, tangents
     square = x * x + y * y
     at_zero = square == 0.0
-    slope = (x * dy - y * dx) / jnp.where(at_zero, 1.0, square)
-    return arctan2(y, x), jnp.where(at_zero, 0.0, slope)
+    derivative = (x * dy - y * dx) / jnp.where(at_zero, 1.0, square)
+    return arctan2(y, x), jnp.where(at_zero, 0.0, derivative)

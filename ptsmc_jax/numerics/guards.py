@@ -1,6 +1,7 @@
-"""Functions with a derivative where the plain ones have none: smooth sign, guarded norm, signed powers.
+"""Smooth or guarded versions of functions that have no finite derivative at some points.
 
-And by how much times may differ that count as equal.
+`smooth_sign` is the boundary-layer form of sign(s). `norm`, `signed_root` and `signed_power` have derivatives that are
+finite everywhere. `rounding` is the tolerance for comparisons of times.
 """
 
 from typing import Any
@@ -14,18 +15,21 @@ Scalar = Float[Array, ""]
 
 @jax.jit
 def smooth_sign(s: Float[Array, "..."], width: Float[Array, ""]) -> Float[Array, "..."]:
-    """tanh(s / width), the boundary-layer form of sign(s) [-]; where width is 0, the exact sign.
+    """Return tanh(s / width) [-], the boundary-layer form of sign(s).
 
-    s: any shape; width: scalar in the units of s, at least 0. The slope at s = 0 is 1/width, and 0 for the exact sign.
+    Args:
+        s: sliding variable, of any shape.
+        width: thickness of the boundary layer, at least 0, in the units of s. If it is 0, the sign is discontinuous and
+            its derivative is 0.
     """
-    exact = width <= 0.0
-    steepness = 1.0 / jnp.where(exact, 1.0, width)
-    return jnp.where(exact, jnp.sign(s), jnp.tanh(s * steepness))
+    discontinuous = width <= 0.0
+    steepness = 1.0 / jnp.where(discontinuous, 1.0, width)
+    return jnp.where(discontinuous, jnp.sign(s), jnp.tanh(s * steepness))
 
 
 @jax.custom_jvp
 def sqrt(square: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Square root whose derivative at 0 is set to 0, where that of a norm has no value."""
+    """Square root whose derivative at 0, which is infinite, is replaced by 0."""
     return jnp.sqrt(square)
 
 
@@ -38,15 +42,15 @@ def _sqrt_jvp(primals: tuple, tangents: tuple) -> tuple:
 
 @jax.jit
 def norm(x: Float[Array, "..."]) -> Float[Array, ""]:
-    """2-norm over all entries (Frobenius norm of a matrix), in the units of x; its gradient at x = 0 is set to 0."""
+    """2-norm over all entries (Frobenius norm of a matrix), in the units of x. Its gradient at x = 0 is set to 0."""
     return sqrt(jnp.sum(x * x))
 
 
 @jax.jit
 def signed_root(x: Float[Array, "..."], width: Scalar) -> Float[Array, "..."]:
-    """sign(x) |x|^(1/2) as x / (x^2 + width^2)^(1/4), whose slope at 0 is width^(-1/2); where width is 0, exact.
+    """Return the smooth signed root x / (x^2 + width^2)^(1/4) of x.
 
-    The exact root's slope at 0, which has no value, is set to 0.
+    If the width is 0, it equals sign(x) |x|^(1/2), whose derivative at 0 is infinite and is replaced by 0.
     """
     square = x * x + width * width
     at_zero = square == 0.0
@@ -55,31 +59,35 @@ def signed_root(x: Float[Array, "..."], width: Scalar) -> Float[Array, "..."]:
 
 @jax.jit
 def signed_power(x: Float[Array, "..."], power: Scalar) -> Float[Array, "..."]:
-    """sign(x) |x|^power, power > 0; its slopes at 0, infinite for a power below 1, are set to 0."""
+    """Return sign(x) |x|^power for power > 0. The derivatives at 0, which may be infinite, are replaced by 0."""
     at_zero = x == 0.0
     size = jnp.where(at_zero, 1.0, jnp.abs(x))
     return jnp.where(at_zero, 0.0, jnp.sign(x) * size**power)
 
 
 def lerp(weight: Scalar, a: Any, b: Any) -> Any:
-    """Leaf by leaf b + weight (a - b): a at weight 1, b at weight 0."""
+    """Interpolate linearly between two pytrees: b at weight 0, a at weight 1."""
     return jax.tree.map(lambda x, y: y + weight * (x - y), a, b)
 
 
 def select(condition: Array, a: Any, b: Any) -> Any:
-    """Leaf by leaf a where the scalar condition holds, b elsewhere; the side not taken leaks no tangent."""
+    """Return the pytree a if the scalar condition holds, otherwise b. The other one has no influence on tangents."""
     return jax.tree.map(lambda x, y: jnp.where(condition, x, y), a, b)
 
 
 def rounding(period: Any, t: Any) -> Any:
-    """By how much times about t [s] may differ and still count as equal [s]: 1e-9 of a period, and what numbers lose.
+    """Return the tolerance for comparisons of times near t [s].
 
-    With 64 bits the latter is less; with 32 a period of 0.01 s is known to 4e-5 of it after half a minute. Times may be
-    negative, of samples that are counted from the hand-over.
+    It is the sum of 1e-9 periods and the rounding error of t. With 64 bits the rounding error is the smaller term. With
+    32 bits it is 4e-5 periods of 0.01 s after half a minute.
+
+    Args:
+        period: control period [s].
+        t: time [s]; negative if it is counted from the hand-over.
     """
     return 1e-9 * period + resolution() * jnp.abs(t)
 
 
 def resolution() -> float:
-    """By how much numbers of the type in use may be off in a few operations, relative [-]: 4 eps."""
+    """Return the relative rounding error [-] of a few operations, 4 eps of the floating-point type in use."""
     return 4.0 * float(jnp.finfo(jnp.result_type(float)).eps)

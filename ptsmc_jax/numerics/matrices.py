@@ -1,4 +1,4 @@
-"""Small matrices by plain arithmetic, which traces to plain primitives."""
+"""Linear algebra of small matrices by elementwise arithmetic, for use inside loops, where LAPACK calls are slow."""
 
 from itertools import combinations
 
@@ -10,22 +10,22 @@ from ptsmc_jax.numerics.guards import norm
 
 
 def solve(a: Float[Array, "n n"], b: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
-    """a^-1 b for a small matrix, b (n,) or (n, columns), written out: Gauss-Jordan elimination, the larger pivot first.
+    """Solve a x = b by Gauss-Jordan elimination with partial pivoting; b is (n,) or (n, columns).
 
-    For the inside of a loop, where LAPACK has no place. A singular matrix gives numbers that are not finite.
+    If the matrix is singular, the result is not finite.
     """
-    return _eliminated(a, b)[0]
+    return _eliminate(a, b)[0]
 
 
 def determinant(a: Float[Array, "n n"]) -> Float[Array, ""]:
-    """Determinant of a small matrix, written out."""
-    _, product = _eliminated(a, jnp.zeros_like(a[:, 0]))
-    return jnp.where(jnp.isfinite(product), product, 0.0)  # a column without a pivot
+    """Return the determinant by Gauss-Jordan elimination."""
+    _, product = _eliminate(a, jnp.zeros_like(a[:, 0]))
+    return jnp.where(jnp.isfinite(product), product, 0.0)  # not finite if a column has no pivot
 
 
 @jax.jit
-def _eliminated(a: Array, b: Array) -> tuple[Array, Array]:
-    """a^-1 b, and the determinant of a."""
+def _eliminate(a: Array, b: Array) -> tuple[Array, Array]:
+    """Return a^-1 b and the determinant of a."""
     n = a.shape[0]
     sizes = [jnp.where(size > 0.0, size, 1.0) for size in map(norm, a)]
     scales = [1.0 / size for size in sizes]
@@ -33,7 +33,7 @@ def _eliminated(a: Array, b: Array) -> tuple[Array, Array]:
     right = [b[i] * scales[i] for i in range(n)]
     determinant = jnp.prod(jnp.stack(sizes))
     for k in range(n):
-        for i in range(k + 1, n):  # the largest entry of the column rises to row k
+        for i in range(k + 1, n):  # move the row with the largest entry of column k to row k
             larger = jnp.abs(rows[i][k]) > jnp.abs(rows[k][k])
             rows[k], rows[i] = jnp.where(larger, rows[i], rows[k]), jnp.where(larger, rows[k], rows[i])
             right[k], right[i] = jnp.where(larger, right[i], right[k]), jnp.where(larger, right[k], right[i])
@@ -48,27 +48,27 @@ def _eliminated(a: Array, b: Array) -> tuple[Array, Array]:
     return jnp.stack(right), determinant
 
 
-SWEEPS = 8  # over all pairs of axes: they converge quadratically, to all digits in 5 or 6
+SWEEPS = 8  # over all pairs of axes; 5 or 6 reach full precision, because the convergence is quadratic
 
 
 @jax.jit
 def smallest_eigenvalue(a: Float[Array, "n n"]) -> Float[Array, ""]:
-    """Smallest eigenvalue of a small symmetric matrix, in its unit, by Jacobi's rotations.
+    """Return the smallest eigenvalue of a symmetric matrix by Jacobi rotations, in the units of the matrix.
 
-    Each rotation makes one pair of entries beside the diagonal zero (Golub and Van Loan, Matrix Computations, 2013,
-    8.5). Good to all digits where eigenvalues fall together, too, which the closed form for three of them is not.
+    Each rotation makes one pair of off-diagonal entries zero (Golub and Van Loan, Matrix Computations, 2013, 8.5).
+    Unlike the closed form for 3 x 3 matrices, the method is accurate for equal eigenvalues.
     """
 
-    def sweep(_: Array | int, a: Array) -> Array:  # a whole number where nothing is compiled
+    def sweep(_: Array | int, a: Array) -> Array:  # an int under `jax.disable_jit`
         for p, q in combinations(range(a.shape[0]), 2):
-            a = _rotated(a, p, q)
+            a = _rotate_pair(a, p, q)
         return a
 
     return jnp.min(jnp.diagonal(jax.lax.fori_loop(0, SWEEPS, sweep, a)))
 
 
-def _rotated(a: Array, p: int, q: int) -> Array:
-    """R' a R with the rotation R in the plane of p and q, by less than 45 degrees, that makes a_pq zero."""
+def _rotate_pair(a: Array, p: int, q: int) -> Array:
+    """Return R' a R, where R rotates axes p and q by at most 45 degrees so that entry (p, q) becomes zero."""
     gap, off = a[q, q] - a[p, p], 2.0 * a[p, q]
     size = norm(jnp.stack([gap, off]))
     tangent = jnp.where(gap < 0.0, -off, off) / jnp.where(size > 0.0, jnp.abs(gap) + size, 1.0)
@@ -82,5 +82,5 @@ def _rotated(a: Array, p: int, q: int) -> Array:
 
 
 def row_norm(x: Float[Array, "n n"]) -> Float[Array, ""]:
-    """Largest sum of magnitudes in a row."""
+    """Return the infinity norm, the largest sum of magnitudes in a row."""
     return jnp.max(jnp.sum(jnp.abs(x), axis=1))

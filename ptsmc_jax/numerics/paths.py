@@ -1,4 +1,4 @@
-"""Values inside nested parts, by their paths: `observer.gain[1]` is element 1 of the field `gain` of `observer`."""
+"""Read and replace values inside nested dataclasses by their path, such as `observer.gain[1]`."""
 
 import re
 from dataclasses import replace
@@ -7,20 +7,20 @@ from typing import Any
 import jax.numpy as jnp
 
 
-def _steps(path: str) -> list[str | int]:
+def _split_path(path: str) -> list[str | int]:
     return [int(step) if step.isdecimal() else step for step in re.findall(r"\w+", path)]
 
 
 def get(tree: Any, path: str) -> Any:
-    """Return the value at a path; raises AttributeError if there is none."""
-    for step in _steps(path):
+    """Return the value at a path. Raise AttributeError if it does not exist."""
+    for step in _split_path(path):
         tree = tree[step] if isinstance(step, int) else getattr(tree, step)
     return tree
 
 
 def exists(tree: Any, path: str) -> bool:
-    """Whether every field on the path exists, with a value or None at its end."""
-    *owners, last = _steps(path)
+    """Return whether every field of the path exists. The value at its end may be None."""
+    *owners, last = _split_path(path)
     for step in owners:
         tree = getattr(tree, str(step), None)
     return hasattr(tree, str(last))
@@ -34,7 +34,7 @@ def put(tree: Any, path: str, value: Any) -> Any:
         path: fields and indices from the tree to the value.
         value: the new value.
     """
-    return _put(tree, _steps(path), value)
+    return _put(tree, _split_path(path), value)
 
 
 def _put(tree: Any, steps: list[str | int], value: Any) -> Any:

@@ -1,4 +1,7 @@
-"""Parts as pytrees: the decorator of a part's class, the types of its numbers, and gains among them."""
+"""Dataclasses as pytrees: the decorator `pytree`, the types of their fields, and `gain` for fields that are tuned.
+
+The parts of a run (plant, law, observer, sensors and so on) are dataclasses with this decorator.
+"""
 
 import math
 import textwrap
@@ -12,41 +15,41 @@ import numpy as np
 from jax import core
 from jaxtyping import Array, Float
 
-# Type of a part's numbers: an array, alone or with batch axes; at run time anything, since JAX rebuilds pytrees
-# around placeholders and a check of the type would refuse them.
+# Type of the numeric fields of a part: an array, with or without batch axes. At run time it is Any, because JAX
+# rebuilds pytrees with placeholders that a type check would refuse.
 if TYPE_CHECKING:
     Leaf = Array
 else:
     Leaf = Any
 
 Scalar = Float[Array, ""]
-Vector = Float[Array, " m"]  # a number for each input of the plant
+Vector = Float[Array, " m"]  # one number for each input of the plant
 
 _Class = TypeVar("_Class", bound=type)
 
 
-FEW = 9  # numbers of an array that are shown
+MAX_SHOWN = 9  # entries of the largest array that `listing` prints in full
 
 
 def listing(self: Any, indent: str = "") -> str:
-    """A part in lines, its fields by name, absent ones left out; of arrays with many numbers their type and shape."""
+    """Format a part with one field on each line. None is left out, and large arrays are shown as dtype and shape."""
     if is_dataclass(self):
         items = {f.name: getattr(self, f.name) for f in fields(self)}
-    elif type(self).__base__ is tuple and hasattr(self, "_asdict"):  # a named one, shown in no way of its own
+    elif type(self).__base__ is tuple and hasattr(self, "_asdict"):  # a named tuple without its own __repr__
         items = self._asdict()
     elif type(self) is dict:
         items = self
     else:
-        return _shown(self, indent)
+        return _format_value(self, indent)
     inside = f"{indent}  "
     lines = [f"\n{inside}{name}: {listing(item, inside)}" for name, item in items.items() if item is not None]
     return type(self).__name__ + "".join(lines).replace(": \n", ":\n")
 
 
-def _shown(value: Any, indent: str) -> str:
+def _format_value(value: Any, indent: str) -> str:
     if isinstance(value, jax.Array | np.ndarray) and not isinstance(value, core.Tracer):
-        gone = isinstance(value, jax.Array) and value.is_deleted()  # as one that was donated
-        if gone or value.size > FEW or not jnp.issubdtype(value.dtype, np.number):
+        is_deleted = isinstance(value, jax.Array) and value.is_deleted()  # its buffer was donated
+        if is_deleted or value.size > MAX_SHOWN or not jnp.issubdtype(value.dtype, np.number):
             return f"{value.dtype} {value.shape}"
         return " ".join(np.array2string(np.asarray(value), separator=", ").split())
     text = repr(value)
@@ -54,11 +57,11 @@ def _shown(value: Any, indent: str) -> str:
 
 
 def pytree(cls: _Class) -> _Class:
-    """Registers a dataclass with JAX: its fields are children, those with the metadata `static` part of the structure.
+    """Register a dataclass as a pytree: fields are children, but fields with the metadata `static` are structure.
 
-    As `jax.tree_util.register_dataclass` does, which must not be used: up to jaxlib 0.10.2 two such classes whose
-    fields have the same structure compare equal, so that where their hashes fall together, about once in thirty
-    processes, `jit` runs the program compiled for the one on the numbers of the other. It is shown as a `listing`.
+    `jax.tree_util.register_dataclass` must not be used instead. Up to jaxlib 0.10.2, two of its classes compare equal
+    if their fields have the same structure. In about one process of thirty their hashes are equal as well, and `jit`
+    then runs the program of one class for the other. The decorator also sets `__repr__` to `listing`.
     """
     static = tuple(f.name for f in fields(cls) if f.metadata.get("static"))
     names = tuple(f.name for f in fields(cls) if f.name not in static)
@@ -75,24 +78,24 @@ def pytree(cls: _Class) -> _Class:
         return cls(**dict(zip(names, children, strict=True)), **dict(zip(static, fixed, strict=True)))
 
     jax.tree_util.register_pytree_with_keys(cls, with_keys, unflatten, flatten)
-    setattr(cls, "__repr__", listing)  # noqa: B010, by its name pyright asks for a bound one
+    setattr(cls, "__repr__", listing)  # noqa: B010, pyright refuses an assignment of an unbound function
     return cls
 
 
 @pytree
 @dataclass(frozen=True)
 class Function:
-    """A plain function among parts, which are pytrees: it has no numbers that could be traced."""
+    """A plain function as a pytree without leaves, so that a part can hold it."""
 
     function: Callable = field(metadata={"static": True})
 
     def __call__(self, *args: Any) -> Any:
-        """The value of the function."""
+        """Call the function."""
         return self.function(*args)
 
 
 class Gain(NamedTuple):
-    """A gain of one's own, as its class declares it; see `gain`."""
+    """Metadata of a field that `gain` declares; see its arguments."""
 
     usual: tuple[float, float] | Callable | None
     above: float
@@ -110,15 +113,23 @@ def gain(
     unit: str = "",
     meaning: str = "",
 ) -> Any:
-    """A field of a part of one's own that tuning may move: `k1: float = gain(1.0, (0.1, 10.0), unit="1/s")`.
+    """Declare a field of a custom part that tuning may change: `k1: float = gain(1.0, (0.1, 10.0), unit="1/s")`.
 
-    usual: the bounds of a search where a scenario gives none, two numbers or a function of t_f and the period [s];
-    where they are positive and more than a factor of 10 apart it is searched on a log scale. above, below: what it must
-    lie between.
+    Args:
+        default: value if a scenario gives none.
+        usual: bounds of the search if a scenario gives none: two numbers, or a function of t_f [s] and the control
+            period [s]. Positive bounds with a ratio above 10 are searched on a logarithmic scale.
+        above: the value must be greater than this.
+        below: the value must be less than this.
+        unit: unit of the value.
+        meaning: description for messages and the documentation.
     """
     return field(default=default, metadata={"gain": Gain(usual, above, below, unit, meaning)})
 
 
 def vector(values: Any) -> Array:
-    """Numbers, of any shape, as a leaf of the parts; with its type said, no program is compiled to copy it."""
+    """Convert numbers of any shape to an array of floats, a leaf of the parts.
+
+    The explicit dtype avoids that JAX compiles a program for the conversion.
+    """
     return jnp.asarray(np.asarray(values, dtype=float), dtype=float)

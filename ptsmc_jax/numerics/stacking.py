@@ -1,4 +1,4 @@
-"""Loops that record many things in each step."""
+"""A `lax.scan` for loops that record many arrays in each step, such as a simulation with its history."""
 
 from collections.abc import Callable
 from typing import Any
@@ -10,37 +10,47 @@ from jax import lax
 
 
 def scan(step: Callable[[Any, Any], tuple[Any, Any]], init: Any, xs: Any, **options: Any) -> tuple[Any, Any]:
-    """`jax.lax.scan` of these arguments, with what a step records written as one row for each type of number.
+    """Run `jax.lax.scan` with all outputs of a step concatenated into one row for each dtype.
 
-    Arrays that a loop writes into are updated in place, but for those that XLA writes by one fusion of several outputs
-    (`programs.BATCHED`): they are copied whole in every step, so that the time of a run would grow with the square of
-    its length. Under `jax.disable_jit` it is that of JAX: nothing is compiled, and steps may differ in types.
+    XLA usually updates the output arrays of a loop in place. But if one fusion writes several output arrays, XLA copies
+    all of them in every step (see `programs.BATCHED`). The time of a run would then grow with the square of its length.
+    Under `jax.disable_jit` the function is `jax.lax.scan` itself.
+
+    Args:
+        step: (carry, x) -> (carry, outputs).
+        init: initial carry.
+        xs: arrays that the loop iterates over, in a pytree.
+        **options: options of `jax.lax.scan`.
+
+    Returns:
+        The last carry and the stacked outputs, as `jax.lax.scan` does.
     """
     if jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
         return lax.scan(step, init, xs, **options)
-    recorded: list[Any] = []  # the structure of what one step records, and the types of its arrays
+    recorded: list[Any] = []  # structure of the outputs of one step, and their abstract values
 
-    def packed(carry: Any, x: Any) -> tuple[Any, dict[str, Any]]:
+    def step_packed(carry: Any, x: Any) -> tuple[Any, dict[str, Any]]:
         carry, y = step(carry, x)
         leaves, structure = jax.tree.flatten(jax.tree.map(jnp.asarray, y))
-        recorded[:] = structure, [jax.typeof(leaf) for leaf in leaves]  # tracers must not get out
+        recorded[:] = structure, [jax.typeof(leaf) for leaf in leaves]  # no tracers, which must not leave the trace
         return carry, {
-            kind: lax.concatenate([jnp.ravel(leaves[k]) for k in of], 0) for kind, of in _kinds(leaves).items()
+            dtype: lax.concatenate([jnp.ravel(leaves[k]) for k in indices], 0)
+            for dtype, indices in _group_by_dtype(leaves).items()
         }
 
-    last, rows = lax.scan(packed, init, xs, **options)
+    last, rows = lax.scan(step_packed, init, xs, **options)
     structure, leaves = recorded
     stacked: list[Any] = [None] * len(leaves)
-    for kind, of in _kinds(leaves).items():
-        ends = np.cumsum([leaves[k].size for k in of])[:-1]
-        for k, part in zip(of, jnp.split(rows[kind], ends, axis=1), strict=True):
+    for dtype, indices in _group_by_dtype(leaves).items():
+        ends = np.cumsum([leaves[k].size for k in indices])[:-1]
+        for k, part in zip(indices, jnp.split(rows[dtype], ends, axis=1), strict=True):
             stacked[k] = jnp.reshape(part, (part.shape[0], *leaves[k].shape))
     return last, jax.tree.unflatten(structure, stacked)
 
 
-def _kinds(leaves: list[Any]) -> dict[str, list[int]]:
-    """The types of the numbers in these arrays, and the places of those of each."""
-    kinds: dict[str, list[int]] = {}
+def _group_by_dtype(leaves: list[Any]) -> dict[str, list[int]]:
+    """Return the indices of the arrays of each dtype; weakly typed arrays form groups of their own."""
+    groups: dict[str, list[int]] = {}
     for k, leaf in enumerate(leaves):
-        kinds.setdefault(f"{leaf.dtype} {leaf.weak_type}", []).append(k)
-    return kinds
+        groups.setdefault(f"{leaf.dtype} {leaf.weak_type}", []).append(k)
+    return groups

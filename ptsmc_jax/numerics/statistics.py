@@ -1,43 +1,65 @@
-"""Statistics of a campaign: shares and quantiles with intervals, and which inputs drive a metric."""
+"""Statistics of a campaign: confidence intervals of fractions, means and quantiles, and sensitivities to inputs.
+
+A fraction is a binomial proportion, for example the fraction of trials that meet a requirement. Start with
+`share_interval`, `quantile_interval` and `drivers`, the sensitivity of a metric to each dispersed input.
+"""
 
 import bisect
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from scipy import special  # `scipy.stats` takes half a second to import
+from scipy import special  # instead of `scipy.stats`, whose import takes half a second
 
-STEEPEST = 60.0  # tilt of a mean towards its largest values or its smallest, at which nothing else is left
-SOBOL_BINS = 32  # of an input, with equally many trials each
-SAME_INPUT = 0.9999  # rank correlation above which two inputs count as one
-BY_CHANCE = 0.0027  # probability of what is taken for chance in a category: that of a normal number beyond three sigma
-ROUNDING = 1e-12  # of the largest value: by how much values may differ that are one number
+MAX_TILT = 60.0  # largest exponential tilt of `_tilted_mean`; the mean then equals the largest or smallest value
+SOBOL_BINS = 32  # bins of an input with equal numbers of trials
+DUPLICATE_CORRELATION = 0.9999  # rank correlation above which two inputs are duplicates
+SIGNIFICANCE = 0.0027  # probability of a normal number beyond three sigma, the level of the test of categories
+ROUNDING = 1e-12  # relative to the largest value: smaller differences between values are rounding errors
 
 
 def share_interval(successes: int, trials: int, confidence: float) -> tuple[float, float]:
-    """Two-sided interval of a share: Clopper and Pearson, Biometrika 26 (1934); at least as likely as `confidence`.
+    """Return the two-sided confidence interval of a fraction (Clopper and Pearson, Biometrika 26, 1934).
+
+    Args:
+        successes: number of trials that succeed.
+        trials: number of trials.
+        confidence: smallest coverage probability of the interval [-].
+
+    Returns:
+        Lower and upper bound [-].
 
     >>> low, high = share_interval(successes=997, trials=1000, confidence=0.95)
     >>> f"{low:.4f} {high:.4f}"
     '0.9913 0.9994'
     """
-    each = (1.0 + confidence) / 2.0
-    return share_bound(successes, trials, each), 1.0 - share_bound(trials - successes, trials, each)
+    one_sided = (1.0 + confidence) / 2.0
+    return share_bound(successes, trials, one_sided), 1.0 - share_bound(trials - successes, trials, one_sided)
 
 
 def share_bound(successes: int, trials: int, confidence: float) -> float:
-    """One-sided lower bound of a share, beta(1 - confidence; k, trials - k + 1): Clopper and Pearson."""
+    """Return the one-sided lower confidence bound of a fraction (Clopper and Pearson).
+
+    It is the quantile 1 - confidence of the beta distribution with the parameters k and trials - k + 1.
+
+    Args:
+        successes: number k of trials that succeed.
+        trials: number of trials.
+        confidence: smallest coverage probability of the bound [-].
+    """
     return float(special.betaincinv(successes, trials - successes + 1, 1.0 - confidence)) if successes > 0 else 0.0
 
 
 def mean_bound(shares: np.ndarray, confidence: float) -> float:
-    """One-sided upper bound of the mean of shares, (n,) independent numbers from 0 to 1.
+    """Return the one-sided upper confidence bound of the mean of independent numbers (n,) from 0 to 1.
 
-    Gaffke's (2005), which has never been seen to cover less than it says: the quantile of sum D_i x_i + D_(n+1), D
-    uniform on the simplex (Learned-Miller, Thomas, A New Confidence Interval for the Mean of a Bounded Random Variable,
-    arXiv:1905.06208). Of zeros and ones it is Clopper and Pearson's. A run that fails counts as 1, however short the
-    others are beyond their limit, and 3/n of such runs may stay unseen: the bound lies about as much above the mean
-    even where all shares are small, which no bound avoids that covers rare failures.
+    The bound is Gaffke's (2005): the quantile of sum_i D_i x_i + D_(n+1), with D uniform on the simplex
+    (Learned-Miller, Thomas, A New Confidence Interval for the Mean of a Bounded Random Variable, arXiv:1905.06208). Its
+    coverage is not proven, but no violation is known. If all numbers are 0 or 1, it is the bound of Clopper and
+    Pearson.
+
+    The bound is at least about 3/n above the mean at 95 %, even if all numbers are small. Failures, which count as 1,
+    may have a probability of 3/n without any of them among n runs, and a valid bound must allow for that.
 
     >>> f"{mean_bound(np.zeros(852), confidence=0.9):.6f} {1 - 0.1 ** (1 / 852):.6f}"
     '0.002699 0.002699'
@@ -46,24 +68,32 @@ def mean_bound(shares: np.ndarray, confidence: float) -> float:
     """
     from scipy import optimize
 
-    shares = np.clip(shares, 0.0, 1.0)  # a share of time may be a rounding error off
+    shares = np.clip(shares, 0.0, 1.0)  # rounding errors may put a fraction of time outside
     low = float(shares.min())
     if low == 1.0:
         return 1.0
-    # measured from the smallest, which the quantile of a weighted mean allows: zero and one are always among them
+    # Shifted and scaled so that 0 and 1 are always among the numbers. The quantile of a weighted mean scales with them.
     x, counts = np.unique(np.append((shares - low) / (1.0 - low), 1.0), return_counts=True)
     if x.size == 2:
         return low + (1.0 - low) * (1.0 - share_bound(int(counts[0]), shares.size, confidence))
-    tilt: Any = optimize.brentq(lambda tilt: _tilted(x, counts, tilt)[0] - confidence, -STEEPEST, STEEPEST, xtol=1e-10)
-    return low + (1.0 - low) * _tilted(x, counts, tilt)[1]
+    tilt: Any = optimize.brentq(
+        lambda tilt: _tilted_mean(x, counts, tilt)[0] - confidence, -MAX_TILT, MAX_TILT, xtol=1e-10
+    )
+    return low + (1.0 - low) * _tilted_mean(x, counts, tilt)[1]
 
 
-def _tilted(x: np.ndarray, counts: np.ndarray, tilt: float) -> tuple[float, float]:
-    """Chance that sum D_i x_i is below a mean X, and this mean: of x, weighted by 1 / (1 - t x), t = 1 - exp(-tilt).
+def _tilted_mean(x: np.ndarray, counts: np.ndarray, tilt: float) -> tuple[float, float]:
+    """Return the probability that sum_i D_i x_i is below the tilted mean X, and X.
 
-    x, counts: (values,) from 0 to 1, and how often each is there. The D are exponential numbers over their sum: it is
-    the chance that their sum with weights x - X is negative, by the saddlepoint formula of Lugannani and Rice (Adv.
-    Appl. Prob. 12, 1980). Its saddlepoint has this X in closed form. It puts the bound at most 0.5 % too high.
+    X is the mean of x with the weights 1 / (1 - t x), where t = 1 - exp(-tilt). The D_i are exponential random numbers
+    divided by their sum. So the probability is that of a negative sum of exponential numbers with the weights x - X. It
+    is computed by the saddlepoint formula of Lugannani and Rice (Adv. Appl. Prob. 12, 1980), whose saddlepoint is known
+    in closed form for this X. The approximation makes `mean_bound` at most 0.5 % too high.
+
+    Args:
+        x: distinct values, (values,), from 0 to 1.
+        counts: how often each value occurs, (values,).
+        tilt: 0 for the plain mean; positive tilts move X towards the largest value.
     """
     t, scale = -np.expm1(-tilt), (1.0 - x) + x * np.exp(-tilt)  # 1 - t x
     total = np.sum(counts / scale)
@@ -72,14 +102,16 @@ def _tilted(x: np.ndarray, counts: np.ndarray, tilt: float) -> tuple[float, floa
     variance = np.sum(counts * weights**2)
     u = t * np.sqrt(variance)
     w = np.sign(t) * np.sqrt(max(0.0, 2.0 * np.sum(counts * np.log(scale * total / counts.sum()))))
-    # at the mean, where both terms grow without end, their difference is a sixth of the skewness
-    between = 1.0 / w - 1.0 / u if abs(u) > 0.01 else np.sum(counts * weights**3) / variance**1.5 / 3.0
+    # Near the plain mean both terms tend to infinity. Their difference tends to a sixth of the skewness.
+    correction = 1.0 / w - 1.0 / u if abs(u) > 0.01 else np.sum(counts * weights**3) / variance**1.5 / 3.0
     density = np.exp(-0.5 * w**2) / np.sqrt(2.0 * np.pi)
-    return float(special.ndtr(w) + density * between), float(1.0 - rest)
+    return float(special.ndtr(w) + density * correction), float(1.0 - rest)
 
 
 def percentile(values: np.ndarray, value: float) -> float:
-    """Where a value stands among all [%], among equal ones in their middle: what most rows of a plan say is no extreme.
+    """Return the percentile rank of a value among all values (n,) [%]; equal values have their mean rank.
+
+    With the mean rank, the nominal value that most rows of a run table have is no extreme.
 
     >>> percentile(np.array([1.0, 2.0, 3.0, 4.0]), 4.0), percentile(np.array([10.0, 10.0, 10.0, 10.0, 20.0]), 10.0)
     (100.0, 50.0)
@@ -89,11 +121,18 @@ def percentile(values: np.ndarray, value: float) -> float:
 
 
 def quantile_interval(ordered: np.ndarray, quantile: float, confidence: float) -> tuple[float, float]:
-    """Two-sided interval of a quantile between two order statistics, whatever the distribution.
+    """Return the two-sided, distribution-free confidence interval of a quantile between two order statistics.
 
-    ordered: (n,) ascending, infinite where a trial has no value. The count of values below the quantile is binomial:
-    the l-th smallest lies above it with a probability of P(B < l) (David and Nagaraja, Order Statistics, 2003, 7.1).
-    Infinite ends where so few trials bound it on that side by nothing.
+    The number B of values below the quantile is binomial. So the l-th smallest value is above the quantile with the
+    probability P(B < l) (David and Nagaraja, Order Statistics, 2003, 7.1).
+
+    Args:
+        ordered: values (n,), ascending; infinite if a trial has no value.
+        quantile: which quantile, from 0 to 1.
+        confidence: smallest coverage probability of the interval [-].
+
+    Returns:
+        Lower and upper bound in the unit of the values. A bound is infinite if there are too few trials for it.
     """
     n, outside = ordered.size, (1.0 - confidence) / 2.0
     # the largest l with P(B < l) < outside, and the smallest u with P(B >= u) <= outside
@@ -104,7 +143,11 @@ def quantile_interval(ordered: np.ndarray, quantile: float, confidence: float) -
 
 
 def value_at(ordered: np.ndarray, quantile: float) -> float:
-    """The quantile of a sample, ordered (n,): the smallest value that this share of it does not exceed.
+    """Return a quantile of a sample: the smallest of its values that at least this fraction of it does not exceed.
+
+    Args:
+        ordered: values (n,), ascending.
+        quantile: which quantile, from 0 to 1.
 
     >>> value_at(np.array([1.0, 2.0, 3.0, 4.0]), quantile=0.5)
     2.0
@@ -118,23 +161,25 @@ def drivers(
     ranked: dict[str, tuple] | None = None,
     categories: Collection[str] = (),
 ) -> dict[str, dict[str, Any]]:
-    """How each input drives a metric: Spearman's rank correlation, and the first-order share of its ranks' variance.
+    """Return the sensitivity of a metric to each input: the rank correlation and the first-order Sobol index.
 
-    The latter, a Sobol index estimated from the trials as they are (Plischke, Borgonovo, Smith, European J. Operational
-    Research 226, 2013): the variance of the metric's mean over `SOBOL_BINS` bins of the input with equally many trials,
-    over its variance, less what bins of unrelated numbers would show. Of ranks, so that a long tail does not decide.
+    The rank correlation is Spearman's. The Sobol index is the fraction of the metric's variance that one input
+    explains. It is estimated from the given trials (Plischke, Borgonovo, Smith, European J. Operational Research 226,
+    2013): the variance of the metric's mean over `SOBOL_BINS` bins of the input, divided by the metric's variance,
+    minus the expected value for an unrelated input. Both use the ranks of the metric, so that a long tail does not
+    dominate.
 
     Args:
-        inputs: (trials,) each, by name. Of inputs that rank the trials alike, such as an angle and the scalar part of
-            its quaternion, the first one speaks for all.
-        metric: (trials,).
-        ranked: what the inputs are ranked to, kept here for other metrics of the same trials.
-        categories: names of inputs that say which of several things. They have no rank, and instead of bins their
-            trials with the same number; their share is 0 where unrelated ones would show as much.
+        inputs: values (trials,) by the name of the input. If several inputs order the trials equally, such as an angle
+            and the scalar part of its quaternion, only the first one gets an entry.
+        metric: values (trials,).
+        ranked: cache of the ranks of the inputs; pass the same dict for other metrics of the same trials.
+        categories: names of inputs without an order, such as the number of a wheel. The bins of such an input are its
+            distinct values. Its Sobol index is 0 if it is not significant.
 
     Returns:
-        {"rank_correlation", "first_order"} by the input's name, the first None of a category; empty where the metric or
-        every input has one value.
+        {"rank_correlation": .., "first_order": ..} by the name of the input. The rank correlation of a category is
+        None. The result is empty if the metric, or every input, is constant.
     """
     ranked = {} if ranked is None else ranked
     if metric.size < 4 * SOBOL_BINS or not vary(metric):
@@ -144,30 +189,34 @@ def drivers(
         if not vary(values):
             continue
         if name in categories:
-            bins = [metric_ranks[values == one] for one in np.unique(values)]
-            chance = special.chdtrc(len(bins) - 1, metric.size * _between(bins, metric.size))
-            share = _first_order(bins, metric.size) if chance < BY_CHANCE else 0.0
-            effects[name] = {"rank_correlation": None, "first_order": share}
+            bins = [metric_ranks[values == category] for category in np.unique(values)]
+            p_value = special.chdtrc(len(bins) - 1, metric.size * _variance_between(bins, metric.size))
+            index = _first_order_index(bins, metric.size) if p_value < SIGNIFICANCE else 0.0
+            effects[name] = {"rank_correlation": None, "first_order": index}
             continue
         if name not in ranked:
             ranks = _ranks(values)
-            duplicate = any(abs(np.mean(ranks * other)) > SAME_INPUT for other, _ in filter(None, ranked.values()))
-            ranked[name] = () if duplicate else (ranks, np.argsort(ranks, kind="stable"))
+            is_duplicate = any(
+                abs(np.mean(ranks * other)) > DUPLICATE_CORRELATION for other, _ in filter(None, ranked.values())
+            )
+            ranked[name] = () if is_duplicate else (ranks, np.argsort(ranks, kind="stable"))
         if not ranked[name]:
             continue
         ranks, order = ranked[name]
         bins = np.array_split(metric_ranks[order], SOBOL_BINS)
         effects[name] = {
             "rank_correlation": float(np.mean(ranks * metric_ranks)),
-            "first_order": _first_order(bins, metric.size),
+            "first_order": _first_order_index(bins, metric.size),
         }
     return effects
 
 
 def beyond_chance(driver: Mapping[str, float | None], trials: int) -> bool:
-    """Whether one of `drivers` says more than unrelated numbers do among so many trials, by three sigma.
+    """Return whether a sensitivity is significant: beyond three sigma of the sensitivity to an unrelated input.
 
-    A category, which has no rank correlation, has no share either where it does not.
+    Args:
+        driver: one entry of the result of `drivers`. The index of a category is 0 if it is not significant.
+        trials: number of trials.
 
     >>> weak = {"rank_correlation": 0.1, "first_order": 0.01}
     >>> beyond_chance(weak, 300), beyond_chance(weak, 3000)
@@ -175,32 +224,37 @@ def beyond_chance(driver: Mapping[str, float | None], trials: int) -> bool:
     """
     if driver["rank_correlation"] is None:
         return bool(driver["first_order"])
-    by_chance = {"rank_correlation": 1.0 / np.sqrt(trials), "first_order": np.sqrt(2.0 * (SOBOL_BINS - 1)) / trials}
-    shown = ((driver[name], sigma) for name, sigma in by_chance.items())
-    return any(value is not None and abs(value) > 3.0 * sigma for value, sigma in shown)
+    sigmas = {"rank_correlation": 1.0 / np.sqrt(trials), "first_order": np.sqrt(2.0 * (SOBOL_BINS - 1)) / trials}
+    pairs = ((driver[name], sigma) for name, sigma in sigmas.items())
+    return any(value is not None and abs(value) > 3.0 * sigma for value, sigma in pairs)
 
 
-def _first_order(bins: Sequence[np.ndarray], count: int) -> float:
-    """The share of the variance of `count` ranks that is one of the means over bins, less what chance would show."""
-    between = _between(bins, count)
-    by_chance = (len(bins) - 1) / max(1, count - len(bins)) * (1.0 - between)
-    return max(0.0, float(between - by_chance))
+def _first_order_index(bins: Sequence[np.ndarray], count: int) -> float:
+    """Return the variance between bins of `count` ranks, minus its expected value for unrelated bins."""
+    between = _variance_between(bins, count)
+    expected = (len(bins) - 1) / max(1, count - len(bins)) * (1.0 - between)
+    return max(0.0, float(between - expected))
 
 
-def _between(bins: Sequence[np.ndarray], count: int) -> float:
-    """The variance of the means of `count` ranks over bins; times `count` chi-squared where bins say nothing."""
+def _variance_between(bins: Sequence[np.ndarray], count: int) -> float:
+    """Return the variance of the means of bins of `count` ranks.
+
+    For unrelated bins, `count` times it is chi-squared.
+    """
     return float(sum(part.size * part.mean() ** 2 for part in bins) / count)
 
 
 def _ranks(values: np.ndarray) -> np.ndarray:
-    """Ranks of values (trials,), of mean 0 and variance 1: the mean of their products is Spearman's correlation."""
-    _, which, counts = np.unique(values, return_inverse=True, return_counts=True)
-    rank = (np.cumsum(counts) - (counts - 1) / 2)[which]  # of equal ones the mean of theirs
+    """Return ranks (trials,) with mean 0 and variance 1. The mean of products of two is Spearman's correlation."""
+    _, indices, counts = np.unique(values, return_inverse=True, return_counts=True)
+    rank = (np.cumsum(counts) - (counts - 1) / 2)[indices]  # equal values have their mean rank
     return (rank - rank.mean()) / rank.std()
 
 
 def vary(values: np.ndarray) -> bool:
-    """Whether values (trials,) differ by more than their rounding, as angles do not that are drawn from 100 to 100 deg.
+    """Return whether values (trials,) differ by more than rounding errors.
+
+    Angles with a dispersion from 100 to 100 deg, for example, differ by rounding errors only.
 
     >>> vary(np.array([1.7453292519943295, 1.7453292519943298])), vary(np.array([1.7453, 1.7454]))
     (False, True)
@@ -209,7 +263,12 @@ def vary(values: np.ndarray) -> bool:
 
 
 def distinct(inputs: Mapping[str, np.ndarray]) -> list[str]:
-    """Names of inputs (trials,) each, but for those that rank the trials as one before them does, or its reverse.
+    """Return the names of inputs without duplicates.
+
+    An input is a duplicate if it orders the trials as an earlier input does, or in reverse order.
+
+    Args:
+        inputs: values (trials,) by the name of the input.
 
     >>> angle = np.array([0.1, 0.7, 0.4])
     >>> distinct({"initial_angle": angle, "initial_q4": np.cos(angle / 2), "initial_w1": np.array([2.0, 1.0, 3.0])})
@@ -218,31 +277,40 @@ def distinct(inputs: Mapping[str, np.ndarray]) -> list[str]:
     distinct_ranks: dict[str, np.ndarray] = {}
     for name, values in inputs.items():
         ranks = _ranks(values)
-        if all(abs(np.mean(ranks * other)) <= SAME_INPUT for other in distinct_ranks.values()):
+        if all(abs(np.mean(ranks * other)) <= DUPLICATE_CORRELATION for other in distinct_ranks.values()):
             distinct_ranks[name] = ranks
     return list(distinct_ranks)
 
 
 def fewest_for(failures: int, quantile: float, confidence: float) -> int:
-    """The fewest trials that show a quantile with this one-sided confidence although `failures` of them fail.
+    """Return the smallest number of trials that verifies a quantile requirement despite some failures.
+
+    Args:
+        failures: number of trials that fail.
+        quantile: required fraction of successes, from 0 to 1.
+        confidence: one-sided confidence of the verification [-].
 
     >>> [fewest_for(failures, quantile=0.9973, confidence=0.9) for failures in (0, 1, 2)]
     [852, 1440, 1970]
     """
 
-    def shown(trials: int) -> bool:
+    def is_verified(trials: int) -> bool:
         return share_bound(trials - failures, trials, confidence) >= quantile
 
     enough = failures + 1
-    while not shown(enough):
+    while not is_verified(enough):
         enough *= 2
-    return failures + 1 + bisect.bisect_left(range(failures + 1, enough), True, key=shown)
+    return failures + 1 + bisect.bisect_left(range(failures + 1, enough), True, key=is_verified)
 
 
 def most_extreme(values: np.ndarray, failed: np.ndarray, count: int, *, larger_is_better: bool = False) -> np.ndarray:
-    """Indices of the worst trials: failed ones first, then those without a value, then by value, largest first.
+    """Return the indices of the worst trials: failed trials, then trials without a value, then by value.
 
-    Smallest first where larger is better.
+    Args:
+        values: values of a metric (trials,); NaN if a trial has no value.
+        failed: whether each trial failed, (trials,).
+        count: how many indices.
+        larger_is_better: sort the smallest values first instead of the largest.
     """
     badness = values if larger_is_better else -values
     return np.lexsort((badness, ~np.isnan(values), ~failed))[:count]

@@ -1,3 +1,5 @@
+"""Random streams against the documented rule, published test vectors and statistical tests."""
+
 import ast
 import importlib
 import math
@@ -15,12 +17,12 @@ from ptsmc_jax.batching import lanes
 from ptsmc_jax.numerics import draws
 from tests.tree import modules
 
-# False alarms: with other seeds a check would fail once in a million; they are fixed, so it either does or not.
+# Probability of a false alarm of one statistical check. The seeds are fixed, so the result never changes.
 ALARM = 1e-6
 SIGMAS = -stats.norm.ppf(ALARM / 2)
 
 
-# the rule, in whole numbers
+# the rule in Python integers
 
 
 def threefry(key, counter):
@@ -60,12 +62,12 @@ def words(*values):
         ((0x13198A2E, 0x03707344), (0x243F6A88, 0x85A308D3), (0xC4923A9C, 0x483DF7A0)),
     ],
 )
-def test_threefry_gives_the_published_answers(key, counter, output):
-    assert threefry(key, counter) == output  # the oracle of this file is right too
+def test_threefry_reproduces_the_published_test_vectors(key, counter, output):
+    assert threefry(key, counter) == output  # checks the reference implementation of this file
     assert tuple(int(w) for w in draws.threefry(draws.Key(*words(*key)), tuple(words(*counter)))) == output
 
 
-def test_threefry_is_that_of_jax():
+def test_threefry_equals_jax():
     rng = np.random.default_rng(3)
     counters = jnp.asarray(rng.integers(0, 2**32, size=(2, 500), dtype=np.uint32))
     for key in rng.integers(0, 2**32, size=(4, 2), dtype=np.uint32):
@@ -88,21 +90,21 @@ def test_numbers_follow_the_documented_rule(case):
     assert (int(key.a), int(key.b)) == threefry((seed, 0), (trial, zlib.crc32(name.encode())))
     uniforms, normals = expected(*case)
     np.testing.assert_array_equal(draws.uniforms(key, count, sample), uniforms)  # exact in 64 bits
-    # log, cos and sin within an ulp or two of numbers below 7; 2 pi v is rounded at 6
+    # log, cos and sin have errors of one or two ulp of numbers below 7; 2 pi v has a rounding error at 6
     np.testing.assert_allclose(draws.normals(key, count, sample), normals, rtol=0, atol=1e-14)
 
 
-def test_several_streams_at_once_are_each_of_them():
+def test_streams_that_are_drawn_together_equal_single_streams():
     names, counts = ["rate_noise", "", "attitude_noise"], [1, 5, 4]
     keys = draws.streams(2**32 - 1, 7, names)
     assert keys == [draws.stream(2**32 - 1, 7, name) for name in names]
-    for k, law in enumerate(draws.DISTRIBUTIONS):
-        found = draws.several(2**32 - 1, 7, law, dict(zip(names, counts, strict=True)))
+    for k, distribution in enumerate(draws.DISTRIBUTIONS):
+        found = draws.draw_streams(2**32 - 1, 7, distribution, dict(zip(names, counts, strict=True)))
         for name, count in zip(names, counts, strict=True):
             np.testing.assert_allclose(found[name], expected(2**32 - 1, 7, name, 0, count)[k], rtol=0, atol=1e-14)
 
 
-def test_a_derived_seed_is_the_first_word_of_a_stream():
+def test_derived_seed_is_the_first_word_of_a_stream():
     for seed, name in ((0, "fresh trials"), (2**32 - 1, "x")):
         got = draws.derive(seed, name)
         assert got == threefry((seed, 0), (0, zlib.crc32(name.encode())))[0]
@@ -110,19 +112,19 @@ def test_a_derived_seed_is_the_first_word_of_a_stream():
 
 
 @pytest.mark.parametrize("kind", [int, np.int64, np.int32, jnp.int32, jnp.int64])
-def test_negative_samples_wrap(kind):
+def test_negative_sample_indices_wrap_to_32_bits(kind):
     key = draws.stream(5, 6, "name")
     for sample in (-1, -2, -(2**31)):
         np.testing.assert_array_equal(draws.normals(key, 3, kind(sample)), draws.normals(key, 3, sample % 2**32))
 
 
-def test_seed_and_trial_may_be_of_any_integer_type():
-    plain = draws.stream(2**32 - 5, 2**31 + 1, "name")
+def test_seed_and_trial_may_have_any_integer_dtype():
+    expected_key = draws.stream(2**32 - 5, 2**31 + 1, "name")
     for kind in (np.uint32, np.int64, jnp.uint32, jnp.int64):
-        assert draws.stream(kind(2**32 - 5), kind(2**31 + 1), "name") == plain
+        assert draws.stream(kind(2**32 - 5), kind(2**31 + 1), "name") == expected_key
 
 
-def test_one_number_whatever_the_batch():
+def test_numbers_do_not_depend_on_the_batch():
     def one(trial, sample):
         key = draws.stream(11, trial, "rate_noise")
         return draws.uniforms(key, 3, sample), draws.normals(key, 5, sample)
@@ -131,14 +133,14 @@ def test_one_number_whatever_the_batch():
     trials, samples = jnp.asarray(trials.ravel()), jnp.asarray(samples.ravel())
     alone = [one(int(t), int(s)) for t, s in zip(trials, samples, strict=True)]
     alone = [np.stack(rows) for rows in zip(*alone, strict=True)]
-    for form in (jax.jit(jax.vmap(one)), jax.jit(lanes.vmap(one))):
-        uniforms, normals = form(trials, samples)
+    for batched in (jax.jit(jax.vmap(one)), jax.jit(lanes.vmap(one))):
+        uniforms, normals = batched(trials, samples)
         np.testing.assert_array_equal(uniforms, alone[0])
-        np.testing.assert_allclose(normals, alone[1], rtol=0, atol=1e-14)  # as above
+        np.testing.assert_allclose(normals, alone[1], rtol=0, atol=1e-14)  # tolerance as above
 
 
-def test_uniforms_stay_inside_the_interval_and_normals_finite_in_32_bits():
-    # a sample whose first word rounds up to 2^32 in float32, found by search
+def test_uniforms_are_below_1_and_normals_finite_in_single_precision():
+    # this sample, found by a search, has a first word that float32 rounds up to 2^32
     sample = 26567072
     assert threefry(threefry((0, 0), (0, zlib.crc32(b"any"))), (sample, 0))[0] == 0xFFFFFF81
     with jax.enable_x64(False):
@@ -149,11 +151,11 @@ def test_uniforms_stay_inside_the_interval_and_normals_finite_in_32_bits():
         assert np.all((np.asarray(u) > 0) & (np.asarray(u) < 1))
 
 
-DRAWING = {f"draws.{name}" for name in ("stream", "streams", "several", "derive")}
+DRAWING = {f"draws.{name}" for name in ("stream", "streams", "draw_streams", "derive")}
 
 
 def stream_names():
-    """Names given to `stream` and `derive` anywhere in the source, constants of the module looked up."""
+    """Return the stream names that the source passes to functions of `draws`; constants of a module are resolved."""
     names = []
     for module, path in modules().items():
         source = path.read_text()
@@ -170,15 +172,15 @@ def stream_names():
                     names.append(name.value)
                 elif ast.unparse(name) in constants:
                     names.append(constants[ast.unparse(name)])
-                else:  # of all the names that the file has
+                else:  # a variable: any constant of the module may be meant
                     names += [value for value in constants.values() if isinstance(value, str)]
     return names
 
 
-def test_names_of_streams_do_not_collide():
+def test_stream_names_are_unique_and_their_hashes_differ():
     names = stream_names()
     assert {"attitude_noise", "rate_noise", "initial_attitude"} <= set(names)
-    assert len(names) == len(set(names))  # two uses of one name would share their numbers
+    assert len(names) == len(set(names))  # two uses of one name would have equal random numbers
     assert len({zlib.crc32(name.encode()) for name in names}) == len(names)
 
 
@@ -187,7 +189,7 @@ def test_names_of_streams_do_not_collide():
 
 @pytest.fixture(scope="module")
 def sheet():
-    """(sample, stream) normal numbers: 16 trials, two names, four numbers a sample."""
+    """Normal numbers (samples, 128): 16 trials, two stream names and four numbers in each sample."""
 
     @jax.jit
     def rows(samples):
@@ -201,38 +203,39 @@ def sheet():
     return np.asarray(rows(jnp.arange(-8192, 8192)))
 
 
-def test_moments_are_those_of_the_normal_distribution(sheet):
+def test_moments_equal_the_moments_of_the_normal_distribution(sheet):
     n = sheet.size
     for power, moment, variance in ((1, 0, 1), (2, 1, 2), (3, 0, 15), (4, 3, 96), (6, 15, 10395 - 225)):
         assert abs(np.mean(sheet**power) - moment) <= SIGMAS * math.sqrt(variance / n)
 
 
-def test_the_distribution_is_normal(sheet):
+def test_normals_pass_the_kolmogorov_smirnov_test(sheet):
     assert stats.kstest(sheet.ravel(), "norm").pvalue > ALARM
 
 
-def test_tails_are_right_up_to_five_sigma():
+def test_normals_have_the_right_tails_up_to_five_sigma():
     key, batches, batch = draws.stream(4, 5, "tails"), 8, 2**19
     limits = range(1, 6)
 
-    @partial(jax.jit, compiler_options={"xla_backend_optimization_level": 3})  # `conftest` lowers it
+    @partial(jax.jit, compiler_options={"xla_backend_optimization_level": 3})  # `conftest` sets a lower level
     def count(first):
         n = jax.vmap(partial(draws.normals, key, 4))(first + jnp.arange(batch, dtype=jnp.uint32))
         beyond = [jnp.stack([jnp.sum(n > limit), jnp.sum(n < -limit)]) for limit in limits]
         return jnp.stack(beyond), jnp.max(jnp.abs(n))
 
     counted = [count(jnp.uint32(k * batch)) for k in range(batches)]
-    beyond, total = np.sum([c[0] for c in counted], axis=0), batches * batch * 4  # 16.8 million; 10 beyond 5 sigma
+    beyond = np.sum([c[0] for c in counted], axis=0)
+    total = batches * batch * 4  # 16.8 million, of which 10 exceed 5 sigma
     for limit, sides in zip(limits, beyond, strict=True):
-        for count_, share in ((sides[0], 1), (sides[1], 1), (sides.sum(), 2)):
-            assert stats.binomtest(int(count_), total, share * float(stats.norm.sf(limit))).pvalue > ALARM
+        for count_, tails in ((sides[0], 1), (sides[1], 1), (sides.sum(), 2)):
+            assert stats.binomtest(int(count_), total, tails * float(stats.norm.sf(limit))).pvalue > ALARM
     assert max(float(c[1]) for c in counted) < 6.77
 
 
-def test_uniforms_fill_the_interval_in_high_and_low_bits():
+def test_all_bits_of_uniforms_are_uniform():
     rows = jax.jit(jax.vmap(partial(draws.uniforms, draws.stream(6, 7, "bits"), 4)))(jnp.arange(2**18))
     numbers = np.asarray(rows) * 2.0**32 - 0.5
-    assert np.all(numbers == np.floor(numbers))  # the words themselves
+    assert np.all(numbers == np.floor(numbers))  # the 32-bit words
     assert numbers.min() >= 0
     assert numbers.max() < 2**32
     for shift in (0, 8, 16, 24):
@@ -240,21 +243,21 @@ def test_uniforms_fill_the_interval_in_high_and_low_bits():
         assert stats.chisquare(cells).pvalue > ALARM
 
 
-def test_streams_are_uncorrelated_across_trial_name_and_axis(sheet):
-    # 128 columns, 8128 pairs: each may be off by what happens once in 8128e6
+def test_streams_are_uncorrelated_across_trials_names_and_components(sheet):
+    # 128 columns have 8128 pairs: a pair has a false alarm with a probability of 1e-6 / 8128
     limit = -stats.norm.ppf(ALARM / 2 / 8128) / math.sqrt(len(sheet))
     for values in (sheet, sheet**2, np.sign(sheet), np.abs(sheet)):
         correlations = np.corrcoef(values.T) - np.eye(sheet.shape[1])
         assert np.abs(correlations).max() < limit
 
 
-def test_samples_are_uncorrelated(sheet):
+def test_successive_samples_are_uncorrelated(sheet):
     limit = -stats.norm.ppf(ALARM / 2 / (50 * sheet.shape[1])) / math.sqrt(len(sheet))
     for values in (sheet, sheet**2):
         values = (values - values.mean(axis=0)) / values.std(axis=0)
         for lag in range(1, 51):
             assert np.abs(np.mean(values[lag:] * values[:-lag], axis=0)).max() < limit
-        # and no column with another's next sample: 128^2 pairs
+        # columns are also uncorrelated with the next sample of other columns: 128^2 pairs
         crossed = values[1:].T @ values[:-1] / len(values)
         assert np.abs(crossed).max() < -stats.norm.ppf(ALARM / 2 / crossed.size) / math.sqrt(len(sheet))
 

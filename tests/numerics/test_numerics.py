@@ -1,3 +1,5 @@
+"""Pytrees, guarded functions, integrators, phi functions and small matrices against exact or independent results."""
+
 import math
 from dataclasses import dataclass, field
 from decimal import Decimal, localcontext
@@ -28,16 +30,16 @@ class _Law:
 
 
 class _Other(_Law):
-    """Another law with the same numbers."""
+    """Another class with the same fields."""
 
 
-def test_two_classes_with_the_same_fields_are_two_structures():
-    """What `jit` goes by, and where `jax.tree_util.register_dataclass` of jaxlib 0.10.2 takes one for the other."""
+def test_classes_with_the_same_fields_have_different_tree_structures():
+    """`jit` identifies classes by their structure. `register_dataclass` of jaxlib 0.10.2 confuses them."""
     kinds = [pytrees.pytree(kind) for kind in (_Law, _Other)]
     one, other = (jax.tree.structure(kind(1.0, {"inertia": 2.0}, 3)) for kind in kinds)
     assert one != other
     assert one == jax.tree.structure(_Law(5.0, {"inertia": 6.0}, 3))
-    assert one != jax.tree.structure(_Law(1.0, {"inertia": 2.0}, 4))  # its metadata says: part of the structure
+    assert one != jax.tree.structure(_Law(1.0, {"inertia": 2.0}, 4))  # static fields belong to the structure
     doubled = jax.tree.map(lambda x: 2.0 * x, _Other(1.0, {"inertia": 2.0}, 3))
     assert doubled == _Other(2.0, {"inertia": 4.0}, 3)
     paths = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_flatten_with_path(doubled)[0]]
@@ -47,30 +49,30 @@ def test_two_classes_with_the_same_fields_are_two_structures():
 # smooth sign
 
 
-def test_smooth_sign_is_tanh_and_tends_to_the_sign():
+def test_smooth_sign_equals_tanh_and_approaches_the_sign():
     s = np.array([-2.0, -0.3, -1e-4, 0.0, 1e-7, 0.01, 5.0])
     for width in (1e-5, 1e-3, 0.7):
         got = np.asarray(guards.smooth_sign(vector(s), vector(width)))
-        # s / width and tanh round once each: 2 eps relative, with a factor of 2 for the compiled tanh
+        # one rounding error each of s / width and tanh: 2 eps, with a factor of 2 for the compiled tanh
         np.testing.assert_allclose(got, [math.tanh(x / width) for x in s], rtol=4 * EPS, atol=0)
         # 1 - tanh(x) <= 2 exp(-2 x)
         assert np.all(np.abs(got - np.sign(s)) <= 2 * np.exp(-2 * np.abs(s) / width) + 4 * EPS)
 
 
-def test_width_zero_is_the_exact_sign():
+def test_smooth_sign_of_width_zero_is_discontinuous():
     s = np.array([-1e300, -1e-300, -0.0, 0.0, 1e-300, 1e-9, 3.0])
     np.testing.assert_array_equal(guards.smooth_sign(vector(s), vector(0.0)), np.sign(s))
 
 
 @pytest.mark.parametrize(("s", "width"), [(0.0, 0.0), (0.3, 0.0), (0.0, 1e-3), (2e-3, 1e-3), (1.0, 1e-9)])
-def test_slopes_of_smooth_sign(s, width):
+def test_derivatives_of_smooth_sign_equal_closed_forms(s, width):
     value, ratio = guards.smooth_sign, s / width if width else math.inf
     cosh = math.cosh(ratio) if ratio < 300 else math.inf
     expected = (0.0, 0.0) if width == 0 else (1 / (width * cosh**2), -ratio / (width * cosh**2))
     point = (vector(s), vector(width))
     backward = jax.grad(value, argnums=(0, 1))(*point)
     forward = [jax.jvp(value, point, (vector(a), vector(b)))[1] for a, b in ((1.0, 0.0), (0.0, 1.0))]
-    # 1 - tanh^2 cancels: its error is a few eps over a slope of 1/width
+    # 1 - tanh^2 has cancellation: its error is a few eps times 1/width
     for got in (backward, forward):
         np.testing.assert_allclose(got, expected, rtol=1e-14, atol=10 * EPS * max(1, ratio) / width if width else 0)
 
@@ -79,11 +81,11 @@ def test_slopes_of_smooth_sign(s, width):
 
 
 @pytest.mark.parametrize("size", [1.0, 5e-9, 1e-150, 1e150])
-def test_norm_and_its_gradient_are_those_of_the_2_norm(size):
+def test_norm_and_its_gradient_are_accurate_at_all_sizes(size):
     direction = np.array([[0.6, -1.2, 0.3], [0.1, 0.0, 2.0]])
     direction /= math.sqrt(math.fsum(v * v for v in direction.flat))
     x = vector(size * direction)
-    np.testing.assert_allclose(guards.norm(x), size, rtol=8 * EPS)  # six squares, a root
+    np.testing.assert_allclose(guards.norm(x), size, rtol=8 * EPS)  # rounding: six squares and a root
     np.testing.assert_allclose(jax.grad(guards.norm)(x), direction, rtol=16 * EPS, atol=0)
 
 
@@ -95,41 +97,41 @@ def test_norm_at_zero_has_gradient_zero():
         np.testing.assert_array_equal(jax.jvp(guards.norm, (zero,), (jnp.ones(shape),))[1], 0.0)
 
 
-# blends
+# interpolation and selection
 
 
-def test_lerp_goes_from_b_to_a():
+def test_lerp_interpolates_from_b_to_a():
     a, b = {"x": vector(2.0), "y": vector([1.0, -1.0])}, {"x": vector(4.0), "y": vector([5.0, 7.0])}
     got = guards.lerp(vector(0.25), a, b)
     assert got["x"] == 3.5
     np.testing.assert_array_equal(got["y"], [4.0, 5.0])
 
 
-def test_select_takes_one_side_and_no_tangent_of_the_other():
-    def f(x, side):
-        return guards.select(side, {"v": 3.0 * x}, {"v": jnp.sqrt(x)})["v"]  # sqrt has an infinite slope at 0
+def test_select_ignores_the_tangent_of_the_other_value():
+    def f(x, condition):
+        return guards.select(condition, {"v": 3.0 * x}, {"v": jnp.sqrt(x)})["v"]  # sqrt has an infinite derivative at 0
 
-    for side, value, slope in ((True, 0.0, 3.0), (False, 0.0, math.inf)):
-        assert jax.jvp(partial(f, side=jnp.asarray(side)), (vector(0.0),), (vector(1.0),)) == (value, slope)
+    for condition, value, derivative in ((True, 0.0, 3.0), (False, 0.0, math.inf)):
+        found = jax.jvp(partial(f, condition=jnp.asarray(condition)), (vector(0.0),), (vector(1.0),))
+        assert found == (value, derivative)
 
 
 # integrators
 
 
-def orders(errors):
+def convergence_orders(errors):
     return np.log2(np.asarray(errors)[:-1] / np.asarray(errors)[1:])
 
 
 @partial(jax.jit, static_argnames=("step", "count"))
-def march(step, y, end, count):
+def integrate(step, y, end, count):
     def advance(y, k):
         return step(k * (end / count), y, end / count), None
 
     return lax.scan(advance, y, jnp.arange(count))[0]
 
 
-def test_stages_in_a_loop_are_the_same_step():
-    """To rounding, of a state of several parts, with the same slopes forward and in reverse."""
+def test_rolled_rk4_equals_unrolled_rk4_and_has_the_same_jacobian():
 
     def rate(t, y):
         a, b = y
@@ -140,16 +142,15 @@ def test_stages_in_a_loop_are_the_same_step():
         return jnp.concatenate(integrators.rk4(rate, vector(0.4), y, dt, rolled=rolled))
 
     @partial(jax.jit, static_argnums=1)
-    def found(at, rolled):
-        return [of(lambda dt: step(dt, rolled))(at) for of in (lambda f: f, jax.jacfwd, jax.jacrev)]
+    def value_and_jacobians(dt, rolled):
+        return [of(lambda dt: step(dt, rolled))(dt) for of in (lambda f: f, jax.jacfwd, jax.jacrev)]
 
-    eps = np.finfo(float).eps
-    for written, looped in zip(*(found(vector(0.3), rolled) for rolled in (False, True)), strict=True):
-        np.testing.assert_allclose(looped, written, rtol=0.0, atol=16 * eps)  # some ten operations on numbers below 2
+    for unrolled, looped in zip(*(value_and_jacobians(vector(0.3), rolled) for rolled in (False, True)), strict=True):
+        np.testing.assert_allclose(looped, unrolled, rtol=0.0, atol=16 * EPS)  # about ten operations on numbers below 2
 
 
-def test_rk4_is_of_order_4():
-    # growth' = growth cos t and turning at the rate 2 t: exp(sin t) and the angle t^2
+def test_rk4_converges_with_order_4():
+    # exact solution of growth' = growth cos t: exp(sin t); of a rotation at the rate 2 t: the angle t^2
     def rate(t, y):
         x, z = y["turn"]
         return {"growth": y["growth"] * jnp.cos(t), "turn": 2 * t * jnp.stack([-z, x])}
@@ -157,18 +158,18 @@ def test_rk4_is_of_order_4():
     start = {"growth": vector(1.0), "turn": vector([1.0, 0.0])}
     step, errors = partial(integrators.rk4, rate), []
     for count in (40, 80, 160, 320):
-        got = march(step, start, 2.0, count)
+        got = integrate(step, start, 2.0, count)
         turn = np.linalg.norm(got["turn"] - np.array([math.cos(4.0), math.sin(4.0)]))
         errors.append([abs(got["growth"] - math.exp(math.sin(2.0))), turn])
-    assert np.min(errors) > 1e4 * EPS  # still truncation
-    # the next term of the error is smaller by a factor of order h, so the slope misses 4 by a few h
-    np.testing.assert_allclose(orders(errors)[1:], 4.0, atol=0.1)
+    assert np.min(errors) > 1e4 * EPS  # truncation error, above rounding
+    # the next term of the error is smaller by a factor h, so the order differs from 4 by a few h
+    np.testing.assert_allclose(convergence_orders(errors)[1:], 4.0, atol=0.1)
 
 
-def phi_exact(x, order, slope=False):
-    """phi_order of a number, or its derivative, in 100 digits: phi_k' = (phi_(k-1)' - phi_k) / x."""
+def phi_exact(x, order, differentiate=False):
+    """Return phi_order of a number, or its derivative, with 100 digits: phi_k' = (phi_(k-1)' - phi_k) / x."""
     if x == 0.0:
-        return 1 / math.factorial(order + slope)
+        return 1 / math.factorial(order + differentiate)
     with localcontext() as context:
         context.prec = 100
         z = Decimal(float(x))
@@ -176,11 +177,11 @@ def phi_exact(x, order, slope=False):
         for k in range(1, order + 1):
             value = (value - Decimal(1) / math.factorial(k - 1)) / z
             derivative = (derivative - value) / z
-        return float(derivative if slope else value)
+        return float(derivative if differentiate else value)
 
 
 def phi_series(x, order):
-    """phi_k of a matrix, sum of x^j / (j + k)!, in whole numbers: nothing is rounded (SciPy is 1e-12 off at norm 9)."""
+    """Return phi_k of a matrix, the sum of x^j / (j + k)!, in exact integer arithmetic."""
     exact = np.array([[Fraction(float(v)) for v in row] for row in x])
     unit = max(v.denominator for v in exact.flat)  # a power of two
     whole = np.array([[int(v * unit) for v in row] for row in exact], object)
@@ -193,8 +194,8 @@ def phi_series(x, order):
     return np.array([[float(Fraction(int(v), scale)) for v in row] for row in total])
 
 
-three_phis = jax.jit(lambda x: integrators.phi_functions(x, 3))
-slopes = jax.jit(jax.jacrev(lambda x: sum(jnp.sum(phi) for phi in integrators.phi_functions(x, 3))))
+phi_0_to_3 = jax.jit(lambda x: integrators.phi_functions(x, 3))
+phi_gradients = jax.jit(jax.jacrev(lambda x: sum(jnp.sum(phi) for phi in integrators.phi_functions(x, 3))))
 BASIS = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
 
 
@@ -212,49 +213,49 @@ BASIS = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
         (1e6, 1e6, 3e6),
     ],
 )
-def test_phi_functions_of_decaying_matrices(rates):
+def test_phi_functions_of_symmetric_matrices_are_accurate(rates):
     x = -BASIS @ np.diag(rates) @ BASIS.T
     x = (x + x.T) / 2
-    # eps |x| is what one rounding of x costs
+    # one rounding error of x changes the result by eps |x|
     tolerance = 20 * EPS * (1 + np.abs(x).sum(axis=0).max())
-    for order, got in enumerate(three_phis(vector(x))):
+    for order, got in enumerate(phi_0_to_3(vector(x))):
         exact = BASIS @ np.diag([phi_exact(-rate, order) for rate in rates]) @ BASIS.T
         np.testing.assert_allclose(got, exact, rtol=0, atol=tolerance)
-    assert np.all(np.isfinite(slopes(vector(x))))
+    assert np.all(np.isfinite(phi_gradients(vector(x))))
 
 
 @pytest.mark.parametrize("size", [0.3, 3.0, 8.0, 9.5, 20.0])
-def test_phi_functions_of_any_matrix(size):
+def test_phi_functions_of_general_matrices_are_accurate(size):
     shear = np.array([[-1.0, 1.0, 0.0], [0.0, -1.0, 1.0], [0.0, 0.0, -1.0]])  # not diagonalisable
     turn = np.array([[0.0, 0.7, -0.1], [-0.7, 0.0, 0.7], [0.1, -0.7, 0.0]])
     growth = np.diag([1.0, 0.5, -1.0]) + 0.1
     for x in (shear, turn, growth):
         x = size * x / np.abs(x).sum(axis=0).max()
-        for order, got in enumerate(three_phis(vector(x))):
+        for order, got in enumerate(phi_0_to_3(vector(x))):
             exact = phi_series(x, order)
             # as above, relative to the largest entry
             tolerance = 20 * EPS * (1 + size) * max(1.0, np.abs(exact).max())
             np.testing.assert_allclose(got, exact, rtol=0, atol=tolerance)
 
 
-def phi_corners(rate):
+def phi_entries(rate):
     return jnp.stack([phi[0, 0] for phi in integrators.phi_functions(-rate * jnp.eye(2), 3)])
 
 
-phi_jacobians = [jax.jit(jacobian(phi_corners)) for jacobian in (jax.jacfwd, jax.jacrev)]
+phi_jacobians = [jax.jit(jacobian(phi_entries)) for jacobian in (jax.jacfwd, jax.jacrev)]
 
 
 @pytest.mark.parametrize("rate", [0.0, 1e-9, 1e-3, 0.8, 4.0, 40.0, 1e4, 1e6])
-def test_gradients_of_phi_functions(rate):
-    expected = [-phi_exact(-rate, order, slope=True) for order in range(4)]
-    # a few eps for each of up to 40 doublings, relative to the largest slope
+def test_derivatives_of_phi_functions_equal_exact_ones(rate):
+    expected = [-phi_exact(-rate, order, differentiate=True) for order in range(4)]
+    # a few eps for each of up to 40 doublings, relative to the largest derivative
     tolerance = 200 * EPS * np.abs(expected).max()
     for jacobian in phi_jacobians:
         got = np.asarray(jacobian(vector(rate)))
         assert np.all(np.abs(got - expected) <= tolerance)
 
 
-def test_etdrk4_without_linear_part_is_rk4():
+def test_etdrk4_without_linear_part_equals_rk4():
     a, b = vector([[0.3, -1.0], [0.8, 0.1]]), vector([0.5, -0.2])
     dt, t = vector(0.3), vector(1.7)
 
@@ -269,17 +270,17 @@ def test_etdrk4_without_linear_part_is_rk4():
     linear = integrators.decay(jnp.zeros((3, 3)), dt)
     y_next, m_next, _ = integrators.etdrk4(rate, linear, t, y, m, dt)
     expected = integrators.rk4(joined, t, jnp.concatenate([y, m]), dt)
-    # phi_k(0) = 1/k! to an eps; the weights of m are sums of three of them
+    # phi_k(0) = 1/k! has an error of eps; the weights of m are sums of three phi functions
     np.testing.assert_allclose(jnp.concatenate([y_next, m_next]), expected, rtol=0, atol=50 * EPS)
 
 
-def test_etdrk4_is_of_order_4_where_both_parts_are_coupled():
+def test_etdrk4_converges_with_order_4_for_coupled_parts():
     matrix = vector(BASIS @ np.diag([0.5, 1.0, 3.0]) @ BASIS.T)
 
     def exact(t):
         return jnp.stack([jnp.sin(t), jnp.exp(-t)]), jnp.stack([jnp.cos(t), t * t, jnp.sin(2 * t)])
 
-    def rate(t, y, m):  # vanishes off the exact solution only where y and m are right: nonlinear, both ways
+    def rate(t, y, m):  # nonlinear coupling in both directions that vanishes on the exact solution
         (y0, m0), (y1, m1) = jax.jvp(exact, (t,), (jnp.ones_like(t),))
         coupling = jnp.sin(y[0] * m[1]) - jnp.sin(y0[0] * m0[1])
         forcing = m1 + matrix @ m0 + jnp.sum(y * y) * m - jnp.sum(y0 * y0) * m0
@@ -292,10 +293,10 @@ def test_etdrk4_is_of_order_4_where_both_parts_are_coupled():
         def step(t, y, dt, linear=linear):
             return integrators.etdrk4(rate, linear, t, y[0], y[1], dt)[:2]
 
-        end = march(step, exact(vector(0.0)), vector(1.5), count)
+        end = integrate(step, exact(vector(0.0)), vector(1.5), count)
         errors.append(max(np.abs(a - b).max() for a, b in zip(end, exact(1.5), strict=True)))
     assert errors[-1] > 1e4 * EPS
-    np.testing.assert_allclose(orders(errors)[1:], 4.0, atol=0.2)
+    np.testing.assert_allclose(convergence_orders(errors)[1:], 4.0, atol=0.2)
 
 
 RATES = 10.0 ** np.arange(-6, 7)
@@ -303,50 +304,51 @@ decay = jax.jit(integrators.decay)
 
 
 @jax.jit
-def forced(linear, m, g, dt):
-    """A step under a constant forcing g."""
+def step_with_constant_forcing(linear, m, g, dt):
+    """Return y and m after a step with the constant forcing g."""
     return integrators.etdrk4(lambda t, y, m: (jnp.zeros(1), g, None), linear, jnp.zeros(()), jnp.zeros(1), m, dt)[:2]
 
 
-def waving(t, y, dt):
-    """A step under the forcing cos t; the coefficients travel with the state."""
+def step_with_cosine_forcing(t, y, dt):
+    """Return y and m after a step with the forcing cos t; the coefficients are part of the state."""
     y, m, linear = y
     step = integrators.etdrk4(lambda t, y, m: (jnp.zeros(1), jnp.cos(t)[None], None), linear, t, y, m, dt)
     return *step[:2], linear
 
 
 @pytest.mark.parametrize("rate", RATES)
-def test_etdrk4_is_exact_for_a_constant_forcing_however_stiff(rate):
+def test_etdrk4_is_exact_for_constant_forcing_at_any_stiffness(rate):
     rates, dt = rate * np.array([1.0, 1.5, 3.0]), 0.05
     m, g = np.array([1.0, -2.0, 0.5]), np.array([0.3, 0.1, -0.7])
-    y, got = forced(decay(vector(np.diag(rates)), vector(dt)), vector(m), vector(g), vector(dt))
+    y, got = step_with_constant_forcing(decay(vector(np.diag(rates)), vector(dt)), vector(m), vector(g), vector(dt))
     decayed, gained = np.exp(-rates * dt) * m, -np.expm1(-rates * dt) / rates * g
-    # relative to what came in, a few eps; to what has decayed, an eps of the exponent too
+    # a few eps of the forced part, and of the decayed part an eps of the exponent as well
     tolerance = 20 * EPS * ((1 + rates * dt) * np.abs(decayed) + np.abs(gained))
     assert np.all(np.abs(got - decayed - gained) <= tolerance)
     assert y == 0.0
 
 
 @pytest.mark.parametrize("rate", [1e-6, 1.0, 1e3, 1e6])
-def test_etdrk4_follows_a_smooth_forcing_however_stiff(rate):
+def test_etdrk4_is_accurate_for_smooth_forcing_at_any_stiffness(rate):
     # m' = -rate m + cos t; the step integrates the quadratic through the forcing at its start, middle and end
     start = (jnp.zeros(1), vector([rate / (1 + rate**2)]), decay(vector([[rate]]), vector(0.05)))
-    end = march(waving, start, vector(5.0), 100)[1][0]
+    end = integrate(step_with_cosine_forcing, start, vector(5.0), 100)[1][0]
     exact = (rate * math.cos(5.0) + math.sin(5.0)) / (1 + rate**2)
     # |(s)(s-h/2)(s-h)|/3! <= h^3/124.7, weighed by (1 - exp(-rate T)) / rate <= min(1/rate, T)
     assert abs(end - exact) <= 0.05**3 / 124 * min(1 / rate, 5.0) + 200 * EPS * min(1 / rate, 5.0)
 
 
-def test_etdrk4_hands_out_what_its_first_stage_does():
-    at, linear = (vector(0.7), vector([0.3, -1.1]), vector([0.2])), integrators.decay(vector([[0.5]]), vector(0.4))
-    *_, aux = integrators.etdrk4(lambda t, y, m: (y - t, m * m, (t, y, m)), linear, *at, vector(0.4))
-    for found, given in zip(aux, at, strict=True):
-        np.testing.assert_array_equal(found, given)
+def test_etdrk4_returns_aux_of_its_first_stage():
+    arguments = vector(0.7), vector([0.3, -1.1]), vector([0.2])
+    linear = integrators.decay(vector([[0.5]]), vector(0.4))
+    *_, aux = integrators.etdrk4(lambda t, y, m: (y - t, m * m, (t, y, m)), linear, *arguments, vector(0.4))
+    for found, argument in zip(aux, arguments, strict=True):
+        np.testing.assert_array_equal(found, argument)
 
 
 @jax.jit
 @partial(jax.grad, argnums=(0, 1))
-def step_slopes(rate, dt):
+def step_derivatives(rate, dt):
     linear = integrators.decay(rate * jnp.eye(2), dt)
     return integrators.etdrk4(
         lambda t, y, m: (m, vector([0.3, -0.4]), None), linear, vector(0.0), jnp.zeros(2), vector([1.0, 2.0]), dt
@@ -354,93 +356,93 @@ def step_slopes(rate, dt):
 
 
 @pytest.mark.parametrize("rate", [0.0, *RATES])
-def test_gradients_of_a_step_in_the_rate_and_the_length(rate):
+def test_derivatives_of_etdrk4_by_rate_and_step_length_equal_closed_forms(rate):
     dt = 0.05
-    got = step_slopes(vector(rate), vector(dt))
+    got = step_derivatives(vector(rate), vector(dt))
     x = -rate * dt
-    in_rate = -dt * math.exp(x) - 0.3 * dt * dt * phi_exact(x, 1, slope=True)
-    in_dt = (0.3 - rate) * math.exp(x)
-    # as above, relative to the terms: e^x with an eps of the exponent, what came in with a few of its own
+    by_rate = -dt * math.exp(x) - 0.3 * dt * dt * phi_exact(x, 1, differentiate=True)
+    by_dt = (0.3 - rate) * math.exp(x)
+    # as above: an eps of the exponent in the decayed part, a few eps of the forced part
     decayed = (1 - x) * math.exp(x) * np.array([dt, 0.3 + rate])
-    gained = 0.3 * np.array([dt * dt * phi_exact(x, 1, slope=True), phi_exact(x, 1)])
-    assert np.all(np.abs(np.array(got) - [in_rate, in_dt]) <= 200 * EPS * (decayed + gained))
+    gained = 0.3 * np.array([dt * dt * phi_exact(x, 1, differentiate=True), phi_exact(x, 1)])
+    assert np.all(np.abs(np.array(got) - [by_rate, by_dt]) <= 200 * EPS * (decayed + gained))
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 5])
-def test_solve_and_determinant_are_lapacks(n):
+def test_solve_and_determinant_equal_lapack(n):
     rng = np.random.default_rng(n)
     for k in range(20):
         a, b = rng.normal(size=(n, n)), rng.normal(size=(n, 2))
         if k % 2 and n > 1:
-            a[0, 0] = 0.0  # the first pivot must come from elsewhere
+            a[0, 0] = 0.0  # requires pivoting
         a *= 10.0 ** rng.uniform(-6, 6, size=(n, 1))  # rows in different units
         b *= np.abs(a).max(axis=1, keepdims=True)
         expected = np.linalg.solve(a, b)
-        lost = 100 * EPS * np.linalg.cond(a / np.linalg.norm(a, axis=1, keepdims=True))
+        tolerance = 100 * EPS * np.linalg.cond(a / np.linalg.norm(a, axis=1, keepdims=True))
         np.testing.assert_allclose(
-            matrices.solve(vector(a), vector(b)), expected, rtol=0, atol=lost * np.abs(expected).max()
+            matrices.solve(vector(a), vector(b)), expected, rtol=0, atol=tolerance * np.abs(expected).max()
         )
         np.testing.assert_allclose(
-            matrices.solve(vector(a), vector(b[:, 0])), expected[:, 0], rtol=0, atol=lost * np.abs(expected).max()
+            matrices.solve(vector(a), vector(b[:, 0])), expected[:, 0], rtol=0, atol=tolerance * np.abs(expected).max()
         )
         rows = a / np.linalg.norm(a, axis=1, keepdims=True)
-        whole = np.prod(np.linalg.norm(a, axis=1))
+        scale = np.prod(np.linalg.norm(a, axis=1))
         np.testing.assert_allclose(
-            matrices.determinant(vector(a)) / whole, np.linalg.det(rows), rtol=0, atol=20 * n * EPS
+            matrices.determinant(vector(a)) / scale, np.linalg.det(rows), rtol=0, atol=20 * n * EPS
         )
 
 
-def test_determinant_of_a_singular_matrix_is_zero_and_solve_says_so_with_numbers_that_are_not_finite():
+def test_singular_matrix_has_determinant_zero_and_no_finite_solution():
     for a in ([[0.0]], [[1.0, 2.0], [2.0, 4.0]], [[0.0, 1.0], [0.0, 2.0]], [[0.0, 0.0], [1.0, 2.0]], np.zeros((3, 3))):
         matrix = vector(np.asarray(a))
         assert float(matrices.determinant(matrix)) == 0.0
         assert not np.all(np.isfinite(matrices.solve(matrix, jnp.ones(len(a)))))
 
 
-def test_slope_of_solve_is_that_of_the_inverse():
+def test_derivative_of_solve_equals_closed_form():
     rng = np.random.default_rng(4)
     a, b, da = (vector(rng.normal(size=shape)) for shape in ((3, 3), (3,), (3, 3)))
-    x, slope = jax.jvp(lambda a: matrices.solve(a, b), (a,), (da,))
-    np.testing.assert_allclose(slope, -np.linalg.solve(a, da @ x), rtol=1e-10)
+    x, tangent = jax.jvp(lambda a: matrices.solve(a, b), (a,), (da,))
+    np.testing.assert_allclose(tangent, -np.linalg.solve(a, da @ x), rtol=1e-10)
 
 
 @pytest.mark.parametrize("width", [0.0, 1e-3])
-def test_signed_root(width):
+def test_signed_root_and_its_derivative_at_zero(width):
     x = vector(np.array([-4.0, -1e-3, 0.0, 1e-9, 0.25]))
     got = guards.signed_root(x, vector(width))
     exact = np.asarray(x) / np.where(np.asarray(x) == 0, 1.0, (np.asarray(x) ** 2 + width**2) ** 0.25)
     np.testing.assert_allclose(got, exact, rtol=4 * EPS, atol=0)
     if width == 0.0:
         np.testing.assert_allclose(got, np.sign(x) * np.sqrt(np.abs(x)), rtol=4 * EPS)
-    slope = jax.vmap(jax.grad(lambda v: guards.signed_root(v, vector(width))))(x)
-    assert np.all(np.isfinite(slope))
-    np.testing.assert_allclose(slope[2], 0.0 if width == 0.0 else width**-0.5, rtol=4 * EPS)
+    derivative = jax.vmap(jax.grad(lambda v: guards.signed_root(v, vector(width))))(x)
+    assert np.all(np.isfinite(derivative))
+    np.testing.assert_allclose(derivative[2], 0.0 if width == 0.0 else width**-0.5, rtol=4 * EPS)
 
 
 smallest_eigenvalue = jax.jit(jax.value_and_grad(matrices.smallest_eigenvalue))
-TURN = np.linalg.qr(np.random.default_rng(8).normal(size=(3, 3)))[0]
+ROTATION = np.linalg.qr(np.random.default_rng(8).normal(size=(3, 3)))[0]
 
 
 @pytest.mark.parametrize(
     "a",
     [
         np.diag([3.0, 1.0, 2.0]),
-        TURN @ np.diag([1.0, 1.0, 3.0]) @ TURN.T,
-        TURN @ np.diag([2.0, 2.0 + 1e-9, 2.0 - 1e-9]) @ TURN.T,
-        TURN @ np.diag([1e-6, 1.0, 1e6]) @ TURN.T,
+        ROTATION @ np.diag([1.0, 1.0, 3.0]) @ ROTATION.T,
+        ROTATION @ np.diag([2.0, 2.0 + 1e-9, 2.0 - 1e-9]) @ ROTATION.T,
+        ROTATION @ np.diag([1e-6, 1.0, 1e6]) @ ROTATION.T,
         2.0 * np.eye(3),
         np.array([[2.0, -1.0], [-1.0, 2.0]]),
         np.array([[0.7]]),
         np.cov(np.random.default_rng(9).normal(size=(4, 40))),
     ],
 )
-def test_the_smallest_eigenvalue_is_lapacks(a):
-    """To eps of the largest: what the entries are known to, and both add up about n products of them, n^2 times."""
+def test_smallest_eigenvalue_and_its_gradient_equal_lapack(a):
     a = (a + a.T) / 2
     expected, vectors = np.linalg.eigh(a)
-    found, slope = smallest_eigenvalue(vector(a))
+    found, gradient = smallest_eigenvalue(vector(a))
+    # rounding errors of the entries, relative to the largest eigenvalue; both methods add about n products n^2 times
     np.testing.assert_allclose(found, expected[0], rtol=0, atol=4 * len(a) ** 2 * EPS * expected[-1])
     gap = expected[1] - expected[0] if len(a) > 1 else 1.0
-    if gap > 1e-6 * expected[-1]:  # else it has no slope, or none that the entries tell
-        exact, slope = np.outer(vectors[:, 0], vectors[:, 0]), np.asarray(slope)
-        np.testing.assert_allclose((slope + slope.T) / 2, exact, atol=1e3 * EPS * expected[-1] / gap + 1e-9)
+    if gap > 1e-6 * expected[-1]:  # otherwise the gradient does not exist, or rounding errors dominate it
+        exact, gradient = np.outer(vectors[:, 0], vectors[:, 0]), np.asarray(gradient)
+        np.testing.assert_allclose((gradient + gradient.T) / 2, exact, atol=1e3 * EPS * expected[-1] / gap + 1e-9)

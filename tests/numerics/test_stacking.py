@@ -1,4 +1,4 @@
-"""Loops that record many things are those of JAX, and write one array for each type of number."""
+"""`stacking.scan` has the results of `lax.scan` and writes one array for each dtype."""
 
 import jax
 import jax.numpy as jnp
@@ -17,21 +17,21 @@ OUTER = {"state": (X0, jnp.asarray(0.5))}
 
 
 def pendulum(carry, t):
-    """Records numbers of every type and shape, some of them Python's, none at all, and empty ones."""
+    """A step with outputs of several dtypes and shapes, a Python number, None and an empty array."""
     x, v = carry["state"]
     v = v - 0.1 * jnp.sin(x[0]) + 0.01 * t
     count = t.astype(jnp.int32)
-    seen = {
+    outputs = {
         "x": x,
         "outer": jnp.outer(x, x),
         "late": t > 3.0,
         "count": (count, count.astype(jnp.uint32) + 4_000_000_000),
     }
-    return {"state": (x + 0.1 * v, v)}, (seen, None, jnp.zeros((2, 0)), 2.5)
+    return {"state": (x + 0.1 * v, v)}, (outputs, None, jnp.zeros((2, 0)), 2.5)
 
 
 @pytest.mark.parametrize("options", [{}, {"reverse": True}, {"length": 7, "unroll": 2}])
-def test_what_is_recorded_is_what_jax_records(options):
+def test_outputs_equal_lax_scan(options):
     ours, theirs = stacking.scan(pendulum, OUTER, TIMES, **options), jax.lax.scan(pendulum, OUTER, TIMES, **options)
     assert jax.tree.structure(ours) == jax.tree.structure(theirs)
     for one, other in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
@@ -39,15 +39,15 @@ def test_what_is_recorded_is_what_jax_records(options):
         np.testing.assert_array_equal(one, other)
 
 
-def test_no_steps_and_nothing_recorded():
-    (seen, *_), length = stacking.scan(pendulum, OUTER, TIMES[:0])[1], len(TIMES)
-    assert seen["outer"].shape == (0, 3, 3)
+def test_scan_without_steps_or_without_outputs():
+    (outputs, *_), length = stacking.scan(pendulum, OUTER, TIMES[:0])[1], len(TIMES)
+    assert outputs["outer"].shape == (0, 3, 3)
     last, nothing = stacking.scan(lambda x, _: (2.0 * x, None), 1.0, None, length=length)
     assert (last, nothing) == (2.0**length, None)
 
 
-def test_step_by_step_in_python_it_is_that_of_jax():
-    """A number that is weakly typed in the first step and not later, and keys, ended in errors on pytrees."""
+def test_disable_jit_falls_back_to_lax_scan():
+    """Regression: outputs whose weak type changes after the first step, and random keys, raised errors."""
 
     def step(c, t):
         return c + t, (c, jax.random.key(0), t > 1.0, 2.0 * t)
@@ -58,23 +58,23 @@ def test_step_by_step_in_python_it_is_that_of_jax():
     np.testing.assert_array_equal(ours[1][0], theirs[1][0])
 
 
-def slopes_of(scan):
+def gradients_of(scan):
     def error(gain):
-        (_, (seen, *_)) = scan(lambda c, t: pendulum(c, gain * t), OUTER, TIMES)
-        return jnp.sum(seen["outer"] ** 2)
+        (_, (outputs, *_)) = scan(lambda c, t: pendulum(c, gain * t), OUTER, TIMES)
+        return jnp.sum(outputs["outer"] ** 2)
 
     return jnp.stack([jax.grad(error)(1.3), jax.jacfwd(error)(1.3), *jax.vmap(error)(TIMES)])
 
 
-def test_it_composes_with_transformations():
-    found, wanted = jax.jit(lambda: (slopes_of(stacking.scan), slopes_of(jax.lax.scan)))()
-    np.testing.assert_allclose(found, wanted, rtol=1e-12)
+def test_scan_composes_with_grad_jacfwd_and_vmap():
+    found, expected = jax.jit(lambda: (gradients_of(stacking.scan), gradients_of(jax.lax.scan)))()
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
     with jax.checking_leaks():
         jax.jit(stacking.scan, static_argnums=0)(pendulum, OUTER, TIMES)
 
 
-def arrays_written(trace):
-    """The types of the arrays that each of its loops writes."""
+def output_dtypes(trace):
+    """Yield the dtypes of the output arrays of each scan in a trace."""
     for eqn in equations(trace):
         if eqn.primitive.name == "scan":
             _, carried, _ = of_scan(eqn.params, eqn.invars)
@@ -93,9 +93,9 @@ RUNS = {
 
 
 @pytest.mark.parametrize("name", RUNS)
-def test_a_loop_of_a_run_writes_one_array_of_each_type(name):
-    """XLA copies several, all of them in every step: a run's time would grow with the square of its length."""
-    written = list(arrays_written(RUNS[name]()))
-    assert any(written)
-    for types in written:
-        assert len(types) == len(set(types))
+def test_loops_of_a_simulation_write_one_array_for_each_dtype(name):
+    """XLA would copy several output arrays in every step, and the run time would grow with the square of the length."""
+    dtypes_of_loops = list(output_dtypes(RUNS[name]()))
+    assert any(dtypes_of_loops)
+    for dtypes in dtypes_of_loops:
+        assert len(dtypes) == len(set(dtypes))

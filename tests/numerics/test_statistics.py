@@ -1,3 +1,5 @@
+"""Confidence intervals and sensitivities against SciPy, closed forms and simulated coverage."""
+
 import math
 
 import numpy as np
@@ -10,7 +12,7 @@ from ptsmc_jax.simulation.requirements import fewest_trials, must_keep
 
 @pytest.mark.parametrize(("successes", "trials"), [(0, 20), (3, 20), (20, 20), (2398, 2400), (999_999, 1_000_000)])
 @pytest.mark.parametrize("confidence", [0.9, 0.95])
-def test_share_intervals_are_those_of_the_exact_binomial_test(successes, trials, confidence):
+def test_fraction_interval_and_bound_equal_exact_binomial_test(successes, trials, confidence):
     low, high = statistics.share_interval(successes, trials, confidence)
     exact = stats.binomtest(successes, trials).proportion_ci(confidence, "exact")
     np.testing.assert_allclose((low, high), (exact.low, exact.high), rtol=1e-9)
@@ -18,8 +20,8 @@ def test_share_intervals_are_those_of_the_exact_binomial_test(successes, trials,
     np.testing.assert_allclose(statistics.share_bound(successes, trials, confidence), bound.low, rtol=1e-9)
 
 
-def test_the_fewest_trials_are_those_of_the_tables():
-    """99.73 % at 90 %: 852 trials without a failure, 1 440 with one, 1 970 with two; and one fewer would not do."""
+def test_fewest_trials_equal_published_tables_and_one_fewer_is_not_enough():
+    """The published numbers are for the quantile 99.73 % with 90 % confidence and 0, 1 and 2 failures."""
     assert [statistics.fewest_for(k, 0.9973, 0.9) for k in range(3)] == [852, 1440, 1970]
     for quantile, confidence in ((0.9973, 0.9), (0.9, 0.95), (0.5, 0.5)):
         assert statistics.fewest_for(0, quantile, confidence) == fewest_trials(quantile, confidence)
@@ -32,21 +34,21 @@ def test_the_fewest_trials_are_those_of_the_tables():
 
 @pytest.mark.parametrize("quantile", [0.5, 0.9, 0.9973])
 @pytest.mark.parametrize("n", [5, 100, 1000, 4000])
-def test_quantile_intervals_cover_as_they_say_and_no_narrower_ones_would(n, quantile):
-    """Of the ranks themselves: P(l-th smallest <= quantile <= u-th), exactly, from the binomial law."""
+def test_quantile_interval_has_its_coverage_and_a_narrower_one_has_not(n, quantile):
+    """With the ranks as values, the exact coverage of order statistics follows from the binomial distribution."""
     ranks = np.arange(1, n + 1, dtype=float)
     low, high = statistics.quantile_interval(ranks, quantile, 0.95)
-    below = 0.0 if low == -np.inf else stats.binom.cdf(low - 1, n, quantile)  # the l-th lies above the quantile
-    above = 0.0 if high == np.inf else stats.binom.sf(high - 1, n, quantile)  # the u-th lies below it
+    below = 0.0 if low == -np.inf else stats.binom.cdf(low - 1, n, quantile)  # P(lower bound above the quantile)
+    above = 0.0 if high == np.inf else stats.binom.sf(high - 1, n, quantile)  # P(upper bound below it)
     assert below <= 0.025 + 1e-12
     assert above <= 0.025 + 1e-12
-    assert stats.binom.cdf((0 if low == -np.inf else low), n, quantile) > 0.025 - 1e-12  # one rank on, too often
+    assert stats.binom.cdf((0 if low == -np.inf else low), n, quantile) > 0.025 - 1e-12  # one rank further is too much
     assert high == np.inf or stats.binom.sf(high - 2, n, quantile) > 0.025 - 1e-12
     if n == 100 and quantile == 0.9973:
-        assert high == np.inf  # so few trials bound it on no side
+        assert high == np.inf  # too few trials for an upper bound
 
 
-def test_quantiles_are_observed_values():
+def test_sample_quantile_is_an_observed_value():
     ordered = np.arange(1.0, 11.0)
     assert [statistics.value_at(ordered, q) for q in (0.05, 0.1, 0.11, 0.5, 0.9, 0.9973, 1.0)] == [
         1,
@@ -57,86 +59,87 @@ def test_quantiles_are_observed_values():
         10,
         10,
     ]
-    assert statistics.value_at(np.array([1.0, np.inf]), 0.9) == np.inf  # a trial without a value is beyond all
+    assert statistics.value_at(np.array([1.0, np.inf]), 0.9) == np.inf  # a trial without a value is infinite
 
 
-def test_drivers_are_found_and_shared_out():
-    """Ranks of a sum of normal numbers: first-order shares of its variance close to the squared correlations."""
+def test_sensitivities_of_a_linear_metric_equal_closed_forms():
+    """For a sum of normal inputs, the first-order Sobol indices are close to the squared correlations."""
     rng, n = np.random.default_rng(1), 60_000
     x, y, z = rng.normal(size=(3, n))
     found = statistics.drivers({"x": x, "y": y, "z": z, "same": np.ones(n)}, 3.0 * x + y)
     assert list(found) == ["x", "y", "z"]
-    # of ranks: 6/pi asin(rho/2), Pearson (1907); sampling errors below 1/sqrt(n) = 0.004
+    # rank correlation: 6/pi asin(rho/2), Pearson (1907); sampling errors are below 1/sqrt(n) = 0.004
     for name, rho in (("x", 3 / math.sqrt(10)), ("y", 1 / math.sqrt(10)), ("z", 0.0)):
         assert found[name]["rank_correlation"] == pytest.approx(6 / math.pi * math.asin(rho / 2), abs=0.016)
     assert found["x"]["first_order"] == pytest.approx(0.89, abs=0.02)
     assert found["y"]["first_order"] == pytest.approx(0.09, abs=0.02)
-    assert found["z"]["first_order"] < 0.004  # chance alone would show 31 of 60 000 bins' worth, which is taken off
-    # with few trials a bin chance alone would show 31/1280 = 0.024 of the variance, on average
-    chance = statistics.drivers({str(k): rng.normal(size=1280) for k in range(40)}, rng.normal(size=1280))
-    assert np.mean([one["first_order"] for one in chance.values()]) < 0.01
+    assert found["z"]["first_order"] < 0.004  # the expected value for an unrelated input, 31/60000, is subtracted
+    # for 1280 trials that value is 31/1280 = 0.024
+    unrelated = statistics.drivers({str(k): rng.normal(size=1280) for k in range(40)}, rng.normal(size=1280))
+    assert np.mean([one["first_order"] for one in unrelated.values()]) < 0.01
     even = statistics.drivers({"x": x}, x**2)
-    assert abs(even["x"]["rank_correlation"]) < 0.02  # it sees no direction
-    assert even["x"]["first_order"] > 0.98  # but nothing else drives it
+    assert abs(even["x"]["rank_correlation"]) < 0.02  # the metric is an even function of x
+    assert even["x"]["first_order"] > 0.98  # and of nothing else
     assert statistics.drivers({"x": x}, np.ones(n)) == {}
 
 
-def test_the_worst_come_first_failed_ones_before_all():
+def test_most_extreme_lists_failed_trials_first_then_the_worst_values():
     values = np.array([1.0, np.nan, 5.0, 3.0, 9.0])
     failed = np.array([False, False, False, True, False])
     assert statistics.most_extreme(values, failed, 4).tolist() == [3, 1, 4, 2]
     assert statistics.most_extreme(values, failed, 4, larger_is_better=True).tolist() == [3, 1, 0, 2]
 
 
-def test_the_bound_of_a_mean_of_shares_is_a_share():
-    """And never below the mean, though nearly all of them are one, or off one or zero by rounding."""
+def test_mean_bound_is_between_the_mean_and_1():
+    """This also holds if nearly all numbers are 1, or differ from 0 or 1 by rounding errors."""
     few, off = np.append(np.ones(40), [0.5, 0.9]), np.append(np.ones(9), 1.0 + 2e-16)
     for shares in (few, off, np.append(-1e-17, np.zeros(3)), np.full(9, 1.0 - 1e-13), np.ones(4), np.array([0.3])):
         for confidence in (0.5, 0.95, 0.999999):
             assert shares.mean() <= statistics.mean_bound(shares, confidence) <= 1.0 + 1e-15
 
 
-def test_the_bound_of_a_mean_is_clopper_and_pearsons_of_zeros_and_ones():
+def test_mean_bound_of_zeros_and_ones_equals_clopper_pearson():
     for ones, n, confidence in ((0, 852, 0.9), (0, 1109, 0.95), (3, 1000, 0.95), (60, 1000, 0.9)):
         shares = np.zeros(n)
         shares[:ones] = 1.0
         exact = stats.binomtest(n - ones, n, alternative="greater").proportion_ci(confidence, "exact").low
         np.testing.assert_allclose(statistics.mean_bound(shares, confidence), 1.0 - exact, rtol=1e-9)
-        near = statistics.mean_bound(shares * (1.0 - 1e-9), confidence)  # by the saddlepoint formula
+        near = statistics.mean_bound(shares * (1.0 - 1e-9), confidence)  # computed by the saddlepoint formula
         assert near == pytest.approx(1.0 - exact, rel=4e-3)
 
 
-def test_the_bound_of_a_mean_is_the_quantile_that_it_says():
-    """Gaffke's against a hundred thousand draws of its weights."""
+def test_mean_bound_equals_gaffke_quantile_of_random_weights():
+    """The reference has a hundred thousand random samples of the weights."""
     rng, n = np.random.default_rng(4), 1000
     some = rng.uniform(size=8) ** 2
     weights, rest = rng.exponential(size=(100_000, 9)), rng.gamma(n - 8, size=100_000)
     drawn = weights @ np.append(some, 1.0) / (weights.sum(axis=1) + rest)
     found = statistics.mean_bound(np.append(np.zeros(n - 8), some), 0.95)
-    assert 0.948 < np.mean(drawn <= found) < 0.953  # sampling: 0.0007
+    assert 0.948 < np.mean(drawn <= found) < 0.953  # the sampling error is 0.0007
 
 
 @pytest.mark.parametrize(("runs", "part", "small", "fails"), [
     (1000, 0.2, 0.01, 0.001), (1000, 0.05, 0.005, 0.002), (300, 1.0, 0.01, 0.003), (5000, 0.2, 0.005, 0.0002),
 ])  # fmt: skip
-def test_bounds_of_a_mean_cover_runs_that_fail_rarely_among_many_short_excursions(runs, part, small, fails):
-    """A part of the runs is beyond its limit for a share of up to 2 `small`; few fail, which counts as all the time.
+def test_mean_bound_covers_rare_failures_among_many_short_excursions(runs, part, small, fails):
+    """A fraction `part` of the runs exceeds the limit for a fraction of up to 2 `small` of the time. Few runs fail.
 
-    How many fail is binomial: what covers is added up. The short shares, whose mean varies by a tenth of what the
-    failures' does, are at their quantiles. Hall's bound for a skew mean, 30 being positive, covers 59 to 86 %.
+    A failure counts as 1. The number of failures is binomial, so that the coverage is a sum over its probabilities. The
+    short excursions are set to their quantiles, because their mean varies ten times less than the failures. Hall's
+    bound for a skewed mean covers only 59 to 86 % of such cases.
     """
     mean = (1.0 - fails) * part * small + fails
     short = np.zeros(runs)
     many = round(part * runs)
     short[-many:] = 2.0 * small * (np.arange(many) + 0.5) / many
     counts = np.arange(20)
-    covers = [statistics.mean_bound(np.append(np.ones(k), short[k:]), 0.95) >= mean for k in counts]
-    assert stats.binom.pmf(counts, runs, fails)[covers].sum() >= 0.95
+    is_covered = [statistics.mean_bound(np.append(np.ones(k), short[k:]), 0.95) >= mean for k in counts]
+    assert stats.binom.pmf(counts, runs, fails)[is_covered].sum() >= 0.95
 
 
-SETS = 300  # of which 95 % have a standard error of 1.3 %
-# how many runs, how long each is beyond its limit, and the mean of that; of 10 000 sets of each the bound from above
-# covers (in order) 96.7, 97.6, 100, 100, 95.5, 97.5 %, and that from below 95.7, 95.7, 96.9, 97.5, 95.6, 96.7 %
+SETS = 300  # the standard error of a coverage of 95 % is 1.3 %
+# number of runs, random fractions of time beyond the limit, and their mean. The measured coverage with 10 000 sets is
+# 95.5 to 100 % for the upper bound and 95.6 to 97.5 % for the lower bound
 MEANS = {
     "a tenth of the runs, for any share": (600, lambda rng, n: (rng.random(n) < 0.1) * rng.random(n), 0.05),
     "few runs, for long": (1000, lambda rng, n: (rng.random(n) < 0.05) * rng.random(n) ** 3, 0.0125),
@@ -148,8 +151,8 @@ MEANS = {
 
 
 @pytest.mark.parametrize("case", MEANS)
-def test_bounds_of_a_mean_cover_at_least_as_often_as_they_say(case):
-    """What `mixed` requirements are shown with, from above and from below: runs are independent, moments are not."""
+def test_upper_and_lower_mean_bounds_have_their_coverage(case):
+    """`mixed` requirements are verified by these bounds. Runs are independent; instants of one run are not."""
     runs, beyond, mean = MEANS[case]
     rng = np.random.default_rng(5)
     sets = [beyond(rng, runs) for _ in range(SETS)]
@@ -157,8 +160,8 @@ def test_bounds_of_a_mean_cover_at_least_as_often_as_they_say(case):
     assert np.mean([mean >= 1.0 - statistics.mean_bound(1.0 - x, 0.95) for x in sets]) > 0.92
 
 
-def test_bounds_of_a_mean_are_as_tight_as_failures_that_stay_unseen_allow():
-    """Above Student's by no more than 3/n, which is what n runs without a failure leave open at 95 %."""
+def test_mean_bound_exceeds_the_student_bound_by_at_most_3_over_n():
+    """After n runs without a failure, a failure probability of 3/n is still possible at 95 % confidence."""
     rng = np.random.default_rng(6)
     for runs in (300, 10_000):
         for shares in (rng.beta(2.0, 2.0, runs), np.minimum(1.0, rng.exponential(0.01, runs))):
@@ -167,14 +170,14 @@ def test_bounds_of_a_mean_are_as_tight_as_failures_that_stay_unseen_allow():
 
 
 @pytest.mark.parametrize("quantile", [0.5, 0.9])
-def test_intervals_of_shares_and_quantiles_cover_as_often_as_they_say(quantile):
-    """What `ensemble` requirements are shown with, of 2 000 runs: never less, and hardly more, for counts are whole.
+def test_intervals_of_fractions_and_quantiles_have_a_coverage_of_95_to_96_percent(quantile):
+    """`ensemble` requirements are verified by these intervals.
 
-    How many runs keep a limit is binomial: what covers is added up, whatever a generator draws.
+    The number of successes is binomial, so that the exact coverage is a sum over its probabilities.
     """
     n = 2000
     chance = stats.binom.pmf(np.arange(n + 1), n, quantile)
-    likely = [k for k in range(n + 1) if chance[k] > 1e-12]  # the others have less than 1e-8 together
+    likely = [k for k in range(n + 1) if chance[k] > 1e-12]  # the sum of the others is below 1e-8
     intervals = {k: statistics.share_interval(k, n, 0.95) for k in likely}
     assert 0.95 <= sum(chance[k] for k in likely if intervals[k][0] <= quantile <= intervals[k][1]) < 0.96
     assert 0.95 <= sum(chance[k] for k in likely if statistics.share_bound(k, n, 0.95) <= quantile) < 0.96
@@ -182,15 +185,14 @@ def test_intervals_of_shares_and_quantiles_cover_as_often_as_they_say(quantile):
     assert 0.95 <= chance[int(low) : int(high)].sum() < 0.96
 
 
-def test_one_of_equal_numbers_stands_in_their_middle():
-    """In a plan that says 10 in nearly each row, 10 was named as the reason, "at 80 %"."""
+def test_percentile_of_equal_values_is_their_mean_rank():
+    """Regression: a value that nearly all rows of a run table had was reported as extreme, "at 80 %"."""
     assert statistics.percentile(np.array([1.0, 2.0, 3.0, 4.0]), 4.0) == 100.0
     assert statistics.percentile(np.array([10.0, 10.0, 10.0, 10.0, np.inf]), 10.0) == 50.0
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_they_are_those_of_scipys_statistics(seed):
-    """Which take half a second to import."""
+def test_statistics_equal_scipy_stats(seed):
     rng = np.random.default_rng(seed)
     n = int(rng.integers(1, 3000))
     k, quantile, confidence = int(rng.integers(1, n + 1)), rng.uniform(), rng.uniform(0.5, 0.9999)
@@ -210,28 +212,28 @@ def test_they_are_those_of_scipys_statistics(seed):
         np.testing.assert_allclose(statistics._ranks(values), stats.zscore(stats.rankdata(values)), atol=1e-12)
 
 
-def test_a_share_of_the_variance_is_beyond_chance_from_three_sigma_of_unrelated_inputs_on():
-    """Their spread over 2000 shuffles is known to 2 %."""
+def test_sobol_index_is_significant_beyond_three_sigma_of_unrelated_inputs():
+    """The standard deviation over 2000 permutations has an error of 2 %."""
     n, rng = 3200, np.random.default_rng(5)
     ranks = statistics._ranks(np.arange(float(n)))
     orders = (rng.permutation(ranks).reshape(statistics.SOBOL_BINS, -1) for _ in range(2000))
     sigma = np.std([np.mean(bins.mean(axis=1) ** 2) for bins in orders])
-    for times, told in ((2.75, False), (3.25, True)):
+    for times, significant in ((2.75, False), (3.25, True)):
         driver = {"rank_correlation": 0.0, "first_order": times * sigma}
-        assert statistics.beyond_chance(driver, n) == told
+        assert statistics.beyond_chance(driver, n) == significant
 
 
 @pytest.mark.parametrize("values", [2, 4])
-def test_a_category_that_moves_a_metric_is_told_among_few_trials_and_an_unrelated_one_is_not(values):
-    """By 1.2 times what it spreads by itself; with the chance of 32 bins every second one of 4 was missed."""
-    rng, told, false = np.random.default_rng(1), 0, 0
+def test_influential_category_is_detected_with_few_trials_and_an_unrelated_one_is_not(values):
+    """The category shifts the metric by 1.2 standard deviations."""
+    rng, detected, false = np.random.default_rng(1), 0, 0
     for _ in range(300):
         which, noise = rng.integers(0, values, 128).astype(float), rng.normal(size=128)
         moved, unrelated = (
             statistics.drivers({"which": which}, metric, categories=["which"])["which"]
             for metric in (noise + 1.2 * (which == 0.0), noise)
         )
-        told += statistics.beyond_chance(moved, 128)
+        detected += statistics.beyond_chance(moved, 128)
         false += statistics.beyond_chance(unrelated, 128)
-    assert told > 0.95 * 300
-    assert false <= 4  # 0.8 are to be expected
+    assert detected > 0.95 * 300
+    assert false <= 4  # 0.8 are expected

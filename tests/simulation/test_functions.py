@@ -211,7 +211,7 @@ REFUSED = {
     ),
     "several trials at once": (
         lambda: jax.eval_shape(lambda trial: draws.stream(0, trial, "noise"), jnp.arange(2)),
-        r"a seed or trial is of shape \(2,\), but must be one number; jax.vmap takes one at a time",
+        r"a seed or trial is of shape \(2,\), but must be one number; use jax.vmap for several",
     ),
     "the draws of several trials at once": (
         lambda: API.one(
