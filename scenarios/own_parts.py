@@ -29,9 +29,9 @@ class LowPass(ptsmc.SampledObserver):
 
     rate: float = ptsmc.gain(1.0, lambda t_f, h: (1.0 / t_f, 1.0 / h), unit="1/s", meaning="bandwidth")
 
-    def step(self, memory, seen, t, dt):
+    def step(self, memory, d_mean, t, dt):
         """The estimate (3,) [N m] at the end of a period."""
-        return seen + jnp.exp(-self.rate * dt) * (memory - seen)
+        return d_mean + jnp.exp(-self.rate * dt) * (memory - d_mean)
 
 
 class SolarPressure(ptsmc.Disturbance):

@@ -1,1 +1,1 @@
-"""Control laws: the paper's for every kind of plant, and those to compare with."""
+"""Control laws: the prescribed-time laws of the paper, and laws from the literature for comparison."""

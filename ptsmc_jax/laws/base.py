@@ -1,4 +1,8 @@
-"""The base of all control laws, and the base of laws to compare with and of custom laws."""
+"""Base classes of the control laws.
+
+Read `Law` first. Most laws override `Law.acceleration` only. `AccelerationLaw` is the base of the laws for comparison
+and of custom laws.
+"""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
@@ -11,31 +15,32 @@ from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector
 
 
 class Sample(NamedTuple):
-    """A sample at which a law is evaluated."""
+    """A sample time at which a law is evaluated."""
 
     t: Scalar  # [s]
-    hold: Bool[Array, ""]  # after the hand-over
-    dt: Scalar  # length of the control period that begins, over which the input is held [s]
-    memory: Any = None  # the law's, from the sample before; from `Law.begin` at the first sample
+    hold: Bool[Array, ""]  # whether the sample is in the hold phase, at or after the hand-over
+    dt: Scalar  # length of the control period that begins here; the input is constant in it [s]
+    memory: Any = None  # memory of the law from the previous sample; at the first sample from `Law.begin`
 
 
 class Law:
-    """A control law: gains, and one call. Its error and the plant's model are in the field `kinematics`.
+    """A control law: its gains, and a function from the measured state to the input.
 
-    Most laws define `acceleration`, the eps'' that they command. Others override `__call__`. Errors, accelerations and
-    inputs are (m,), in the units of the kinematics: for a spacecraft [-], [1/s^2] and [N m]. Some laws use other gains
-    from the hand-over at t_f - delta on (Remark 1).
+    The field `kinematics` defines the error eps and holds the design model of the plant. Most laws define
+    `acceleration`, the commanded eps''. Others override `__call__`. Errors, accelerations and inputs are (m,), in the
+    units of the kinematics: for a spacecraft [-], [1/s^2] and [N m]. At the hand-over time t_f - delta the approach
+    phase ends and the hold phase begins, in which some laws use other gains (Remark 1).
     """
 
     kinematics: Kinematics  # of the error that the law drives to zero
-    t_f: Leaf  # prescribed time, or when the error is judged [s]
-    delta: Leaf  # hand-over this long before t_f [s]
-    tunable: ClassVar[tuple[str, ...]] = ()  # gains that tuning may move
-    prescribed: ClassVar[bool] = False  # one of the paper's: its exact solution and its bounds are known
+    t_f: Leaf  # prescribed time, at which the error is evaluated [s]
+    delta: Leaf  # time from the hand-over to t_f [s]
+    tunable: ClassVar[tuple[str, ...]] = ()  # names of the gains that tuning may change
+    prescribed: ClassVar[bool] = False  # whether it is a law of the paper, with known exact solution and bounds
 
     @property
     def model(self) -> Any:
-        """The nominal plant."""
+        """Design model of the plant."""
         return self.kinematics.model
 
     @property
@@ -45,41 +50,45 @@ class Law:
 
     @property
     def hand_over(self) -> Scalar:
-        """t_s = t_f - delta [s]."""
+        """Hand-over time t_f - delta [s]."""
         return self.t_f - self.delta
 
     @property
     def continuous(self) -> bool:
-        """Whether the continuous loop can simulate the law: it has no memory and does not use `Sample.dt`."""
+        """Whether the continuous loop can simulate the law, which needs no memory and no `Sample.dt`."""
         return False
 
     def begin(self) -> Any:
-        """Return the law's memory before its first sample, a pytree of arrays; None: the law has no memory."""
+        """Return the memory of the law before its first sample, a pytree of arrays. None: the law has no memory."""
         return None
 
     def acceleration(self, now: Sample, error: Vector, error_rate: Vector, bound: Scalar) -> tuple[Any, ...]:
-        """Return the acceleration a of eps'' = a + d, and the sliding variable; a law with a memory also returns that.
+        """Return the commanded acceleration a, with which the error obeys eps'' = a + d, and the sliding variable.
 
         Args:
-            now: the sample; `now.t` [s], `now.hold`, `now.dt` [s], `now.memory`.
+            now: the sample.
             error: eps, (m,).
             error_rate: eps' [1/s], (m,).
-            bound: on the 2-norm of the disturbance d that is not estimated, in the units of a.
+            bound: bound on the 2-norm of d, the part of the disturbance that is not estimated, in the units of a.
 
         Returns:
-            a (m,), s (m,), and the memory for the next sample if `begin` returns one, of the same shapes and types.
+            a (m,) and the sliding variable s (m,). If `begin` returns a memory, also the memory for the next sample,
+            with the same shapes and dtypes.
         """
         raise NotImplementedError
 
     def __call__(self, now: Sample, x: Any, target: Any, d_hat: Vector, k2: Scalar) -> tuple[Vector, Vector, Any]:
-        """Return the commanded input (m,), the sliding variable (m,) and the memory for the next sample.
+        """Return the input for a measured state.
 
         Args:
-            now: the sample, with the law's memory.
+            now: the sample, with the memory of the law.
             x: measured state.
-            target: of the reference at `now.t`.
+            target: target of the reference at `now.t`.
             d_hat: estimated disturbance, (m,).
-            k2: K2, bound on the 2-norm of its error.
+            k2: K2, bound on the 2-norm of the estimation error.
+
+        Returns:
+            Commanded input (m,), sliding variable (m,), and the memory for the next sample.
         """
         error, error_rate = self.kinematics.errors(x, target)
         bound = self.kinematics.influence(x, target) * k2
@@ -88,23 +97,26 @@ class Law:
         return u, s, memory[0] if memory else now.memory
 
     def clearance(self, x: Any, target: Any) -> Scalar:
-        """Distance to the law's singularity: the clearance of its kinematics, or 1 if it does not invert them."""
+        """Return the distance to the singularity of the kinematics, or 1 if the law does not invert them."""
         if type(self).__call__ is not Law.__call__:
             return jnp.ones(())
         return self.kinematics.clearance(x, target)
 
     def in_hold(self, t: Array, t_next: Array, hold: Bool[Array, "..."]) -> Bool[Array, "..."]:
-        """Return which periods, from t to t_next [s], use the gains of the hold phase.
+        """Return which periods use the gains of the hold phase.
 
-        hold: which periods begin after the hand-over.
+        Args:
+            t: times at which the periods begin [s].
+            t_next: times at which they end [s].
+            hold: whether each period begins in the hold phase.
         """
         return hold
 
 
 @dataclass(frozen=True)
 class AccelerationLaw(Law):
-    """The base of laws to compare with and of custom laws, for any kinematics of order 2 and the sampled loop only."""
+    """Base of the laws for comparison and of custom laws. It is for kinematics of order 2 and the sampled loop."""
 
     kinematics: Kinematics
-    t_f: Leaf  # prescribed time, or when the error is judged [s]
-    delta: Leaf  # a sample of the anchored clock falls on t_f - delta [s]
+    t_f: Leaf  # prescribed time, at which the error is evaluated [s]
+    delta: Leaf  # the anchored clock has a sample at t_f - delta [s]

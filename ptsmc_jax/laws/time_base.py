@@ -1,4 +1,7 @@
-"""Time-base generators: a profile from the first error to zero at t_f, and a law that follows it."""
+"""Laws that track a time-base generator: a profile of the error from its first value to zero at t_f.
+
+`TimeBase` defines the profile. `TimeBasePD` and `TimeBaseSliding` differ in the feedback of the deviation from it.
+"""
 
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
@@ -12,45 +15,50 @@ from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector, pytree
 
 
 class Start(NamedTuple):
-    """Where a profile begins."""
+    """Initial values of a profile, the memory of the law."""
 
-    measured: Scalar  # 1.0 from the first sample on, before it 0.0
-    error: Vector  # the first error, in its `Kinematics.straight_coordinates`
-    rate: Vector  # and its derivative [1/s]
+    measured: Scalar  # 0.0 before the first sample, then 1.0
+    error: Vector  # error at the first sample, in `Kinematics.straight_coordinates`
+    rate: Vector  # its time derivative [1/s]
 
 
 class Profile(NamedTuple):
-    """The error that is to be followed, with its derivatives, (m,) each."""
+    """Desired error and its time derivatives, (m,) each."""
 
     error: Vector
-    rate: Vector
-    acceleration: Vector
+    rate: Vector  # [1/s]
+    acceleration: Vector  # [1/s^2]
 
 
 @dataclass(frozen=True)
 class TimeBase(AccelerationLaw):
-    """Follows r(x) = e0 (1 - 10 x^3 + 15 x^4 - 6 x^5) + e0' t_f (x - 6 x^3 + 8 x^4 - 3 x^5), x = t/t_f, then 0.
+    """Base of the laws that track the profile r of a time-base generator.
 
-    The quintic that begins with the first error and its rate, as they are measured, and is at rest at zero at t_f, in
-    coordinates in which straight lines are plain: a spacecraft at rest turns about the eigenaxis. Becerra, Vazquez,
-    Arechavaleta, Delfin, Predefined-time convergence control for high-order integrator systems using time base
-    generators, IEEE Trans. Control Systems Technology 26(5), 2018. From rest it asks for 10/sqrt(3) e0/t_f^2 at most,
-    the paper's law at the start for eta^2 e0/t_f^2, bang-bang for 4.
+    The profile is the quintic that starts at the measured error e0 with its rate e0' and is at rest at zero at t_f:
+
+        r(x) = e0 (1 - 10 x^3 + 15 x^4 - 6 x^5) + e0' t_f (x - 6 x^3 + 8 x^4 - 3 x^5),  x = t/t_f,
+
+    and zero after t_f. It is computed in `Kinematics.straight_coordinates`, so that a spacecraft at rest rotates about
+    the eigenaxis. Becerra, Vazquez, Arechavaleta, Delfin, Predefined-time convergence control for high-order integrator
+    systems using time base generators, IEEE Trans. Control Systems Technology 26(5), 2018. From rest, the largest
+    acceleration is 10/sqrt(3) e0/t_f^2. For comparison, the law of the paper starts with eta^2 e0/t_f^2, and bang-bang
+    control needs 4 e0/t_f^2.
     """
 
     def begin(self) -> Start:
-        """Before the first sample the profile is not known."""
+        """Return the memory before the first sample, when the profile is not defined yet."""
         zero = jnp.zeros(self.model.inputs)
         return Start(jnp.zeros(()), zero, zero)
 
     def profile(self, start: Start, t: Scalar) -> Profile:
-        """The profile at t [s]."""
+        """Return the profile at the time t [s], for initial values `start`, with rates [1/s] and [1/s^2]."""
 
         def error(t: Scalar) -> Vector:
             x = jnp.minimum(t / self.t_f, 1.0)
-            of_error = 1.0 + x**3 * (-10.0 + x * (15.0 - 6.0 * x))
-            of_rate = x * (1.0 + x**2 * (-6.0 + x * (8.0 - 3.0 * x)))
-            return self.kinematics.from_straight_coordinates(of_error * start.error + self.t_f * of_rate * start.rate)
+            from_error = 1.0 + x**3 * (-10.0 + x * (15.0 - 6.0 * x))
+            from_rate = x * (1.0 + x**2 * (-6.0 + x * (8.0 - 3.0 * x)))
+            straight = from_error * start.error + self.t_f * from_rate * start.rate
+            return self.kinematics.from_straight_coordinates(straight)
 
         def rates(t: Scalar) -> tuple[Vector, Vector]:
             return jax.jvp(error, (t,), (jnp.ones_like(t),))
@@ -59,16 +67,22 @@ class TimeBase(AccelerationLaw):
         return Profile(r, rate, acceleration)
 
     def feedback(self, deviation: Vector, rate: Vector, bound: Scalar) -> tuple[Vector, Vector]:
-        """Acceleration that brings the deviation E from the profile to zero, and the sliding variable, (m,) each.
+        """Return the acceleration that drives the deviation from the profile to zero, and the sliding variable.
 
-        rate: E' [1/s], (m,); bound: as in `Law.acceleration`.
+        Args:
+            deviation: E = eps - r, (m,).
+            rate: E' [1/s], (m,).
+            bound: see `Law.acceleration`.
+
+        Returns:
+            a - r'' and s, (m,) each.
         """
         raise NotImplementedError
 
     def acceleration(
         self, now: Sample, error: Vector, error_rate: Vector, bound: Scalar
     ) -> tuple[Vector, Vector, Start]:
-        """Return the acceleration of the profile with the feedback, s, (m,) each, and where the profile began."""
+        """Return a, s, (m,) each, and the initial values of the profile; see `Law.acceleration`."""
         straight, rate = jax.jvp(self.kinematics.straight_coordinates, (error,), (error_rate,))
         start = guards.select(now.memory.measured > 0.5, now.memory, Start(jnp.ones_like(now.t), straight, rate))
         profile = self.profile(start, now.t)
@@ -79,28 +93,26 @@ class TimeBase(AccelerationLaw):
 @pytree
 @dataclass(frozen=True)
 class TimeBasePD(TimeBase):
-    """a = r'' - k_d E' - k_p E with E = eps - r; its s is E' + (k_p/k_d) E."""
+    """PD feedback a = r'' - k_d E' - k_p E with E = eps - r, and s = E' + (k_p/k_d) E."""
 
     k_p: Leaf  # [1/s^2]
     k_d: Leaf  # [1/s]
     tunable: ClassVar[tuple[str, ...]] = ("k_p", "k_d", "t_f")
 
     def feedback(self, deviation: Vector, rate: Vector, bound: Scalar) -> tuple[Vector, Vector]:
-        """Return a - r'' and s, (m,) each."""
         return -self.k_d * rate - self.k_p * deviation, rate + self.k_p / self.k_d * deviation
 
 
 @pytree
 @dataclass(frozen=True)
 class TimeBaseSliding(TimeBase):
-    """s = E' + c E with E = eps - r, a = r'' - c E' - k s - K sign(s)."""
+    """Sliding mode feedback a = r'' - c E' - k s - K sign(s), with E = eps - r and s = E' + c E."""
 
     surface_rate: Leaf  # c [1/s]
     k: Leaf  # [1/s]
-    sign_width: Leaf  # in the units of s
+    sign_width: Leaf  # thickness of the boundary layer, in the units of s
     tunable: ClassVar[tuple[str, ...]] = ("surface_rate", "k", "sign_width", "t_f")
 
     def feedback(self, deviation: Vector, rate: Vector, bound: Scalar) -> tuple[Vector, Vector]:
-        """Return a - r'' and s, (m,) each."""
         s = rate + self.surface_rate * deviation
         return -self.surface_rate * rate - self.k * s - bound * guards.smooth_sign(s, self.sign_width), s

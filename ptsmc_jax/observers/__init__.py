@@ -1,1 +1,1 @@
-"""Disturbance observers, each in a continuous and a digital form and with the bound K2 on its error (Remark 2)."""
+"""Disturbance observers (Remark 2 of the paper), with continuous and digital forms and bounds on their errors."""

@@ -1,8 +1,9 @@
-"""Disturbance observers, each in a continuous and a digital form and with the bound K2 on its error (Remark 2).
+"""Base classes of the disturbance observers (Remark 2), and the bound K2 on their estimation error.
 
-All estimate d in M w' = f(t, x, u) + d (`base.Plant`). Continuous: m' = -A m + forcing, with the memory m, which
-begins with d_hat, and d_eff = M w' - known the disturbance that the nominal model sees; the rollout steps A exactly.
-Digital: one update a period from the impulse that the model leaves unexplained, the integral of d_eff over it.
+Read `Observer` first; custom observers derive from `SampledObserver`. An observer estimates d in M w' = f(t, x, u) + d
+(see `plants.base.Plant`). The measured disturbance d_eff = M w' - f of the design model includes model errors. Every
+observer has two forms with a memory m that begins with d_hat. The continuous form is m' = -A m + forcing, where the
+simulation integrates A exactly. The digital form updates m once in each control period from the integral of d_eff.
 """
 
 from abc import ABC, abstractmethod
@@ -22,140 +23,156 @@ Matrix = Float[Array, "k k"]
 
 @runtime_checkable
 class Bound(Protocol):
-    """K2(t), a bound on the 2-norm of an observer's error [N m]."""
+    """K2(t), a bound on the 2-norm of the estimation error of an observer [N m]."""
 
     @property
     def largest(self) -> Scalar:
-        """The largest value of K2 at any time [N m]."""
+        """Largest value of K2 at any time [N m]."""
         ...
 
     def __call__(self, t: Scalar) -> Scalar:
-        """K2 at t [s], in N m."""
+        """Return K2 at the time t [s], in N m."""
         ...
 
 
 class ErrorBound(NamedTuple):
-    """K2(t) >= |d_hat - d|_2, the right-hand side of (55) corrected: e^(-rate t) start + (1 - e^(-rate t)) floor."""
+    """The bound K2(t) = e^(-rate t) start + (1 - e^(-rate t)) floor, the corrected form of (55)."""
 
     rate: Array  # l_m [1/s]
     start: Array  # bound at t = 0 [N m]
-    floor: Array  # bound as t grows [N m]
+    floor: Array  # bound for large t [N m]
 
     @property
     def largest(self) -> Scalar:
-        """Its largest value [N m]."""
+        """Largest value of K2 at any time [N m]."""
         return jnp.maximum(self.start, self.floor)
 
     def __call__(self, t: Scalar) -> Scalar:
-        """K2 at t [s], in N m."""
+        """Return K2 at the time t [s], in N m."""
         remaining = jnp.exp(-self.rate * t)
         return self.floor + remaining * (self.start - self.floor)
 
 
 def constant_bound(component_bound: Scalar, components: int) -> ErrorBound:
-    """K2 at all times where each component of the error is bounded [N m]: the 2-norm by sqrt(m) times as much."""
+    """Return the constant bound K2 = sqrt(m) times a bound on each of m components of the error [N m]."""
     bound = jnp.sqrt(float(components)) * component_bound
     return ErrorBound(jnp.zeros_like(bound), bound, bound)
 
 
 @dataclass(frozen=True)
 class Observer(ABC):
-    """A disturbance observer, as the rollout asks for it."""
+    """A disturbance observer: the interface that the simulation uses."""
 
-    model: Plant  # the nominal plant
-    tunable: ClassVar[tuple[str, ...]] = ()  # fields that tuning may move, besides `gain`
-    estimates: ClassVar[bool] = True  # False: d_hat is always 0
-    linear: ClassVar[bool] = False  # the estimate is linear in what is measured, and its bound inverse to the gain
+    model: Plant  # design model of the plant
+    tunable: ClassVar[tuple[str, ...]] = ()  # names of the fields that tuning may change, besides `gain`
+    estimates: ClassVar[bool] = True  # False if d_hat is always 0
+    # whether d_hat is linear in the measurements; K2 is then inversely proportional to the gain
+    linear: ClassVar[bool] = False
 
     def begin(self) -> Memory:
-        """Memory at t = 0: d_hat = 0 [N m]."""
+        """Return the memory at t = 0, with d_hat = 0 [N m]."""
         return jnp.zeros(self.model.inputs)
 
     def estimate(self, memory: Memory) -> Vector:
-        """d_hat [N m]."""
+        """Return the estimate d_hat (m,) [N m] from the memory."""
         return memory[: self.model.inputs]
 
     @abstractmethod
     def error_bound(self) -> Bound:
-        """K2(t), the bound on the 2-norm of the estimation error."""
+        """Return K2(t), the bound on the 2-norm of the estimation error."""
 
     def decay_matrix(self, t: Scalar, t_next: Scalar) -> Matrix:
-        """The mean of A [1/s] over a step from t to t_next [s] of the continuous loop."""
+        """Return the mean of A [1/s] over a step of the continuous loop from t to t_next [s]."""
         raise NotImplementedError
 
     def forcing(self, t: Scalar, span: tuple[Scalar, Scalar], memory: Memory, d_eff: Vector) -> Memory:
-        """The forcing m' + A m at t in the step `span` [s], with A the `decay_matrix` of that step; d_eff [N m]."""
+        """Return the forcing m' + A m of the continuous form, where A is the `decay_matrix` of the step.
+
+        Args:
+            t: time [s].
+            span: begin and end of the step [s].
+            memory: the memory m.
+            d_eff: disturbance of the design model, (m,) [N m].
+        """
         raise NotImplementedError
 
     def update_matrix(self, dt: Scalar) -> Matrix:
-        """The matrix that `update` takes for a period dt [s], computed once, outside the loop; empty: it needs none."""
+        """Return the matrix that `update` needs for a period dt [s]. It is computed once before the loop."""
         return jnp.zeros((0, 0))
 
     @abstractmethod
     def update(self, matrix: Matrix, memory: Memory, impulse: Vector, t: Scalar, dt: Scalar) -> Memory:
-        """Memory at the end of a period.
+        """Return the memory at the end of a control period.
 
         Args:
             matrix: `update_matrix(dt)`.
-            memory: at its start.
-            impulse: `Plant.unexplained_impulse` of the period, (m,) [N m s].
+            memory: memory at the start of the period.
+            impulse: integral of d_eff over the period, from `Plant.unexplained_impulse`, (m,) [N m s].
             t: end of the period [s].
-            dt: its length [s], which may be 0.
+            dt: length of the period [s], which may be 0.
         """
 
     def fastest(self) -> float:
-        """Rate that explicit steps of the continuous loop must resolve [1/s]: that of a smooth sign of its own."""
+        """Return the fastest rate that the steps of the continuous loop must resolve [1/s]; 0 if there is none."""
         return 0.0
 
     def nodes(self) -> tuple[float, ...]:
-        """Times that the continuous loop must step on [s]."""
+        """Return times that must be nodes of the time grid of the continuous loop [s]."""
         return ()
 
 
 @dataclass(frozen=True)
 class SampledObserver(Observer):
-    """The base of an observer of one's own; it flies in the sampled loop.
+    """Base of custom observers, for the sampled loop. They define `step`.
 
-    Its memory is any pytree of arrays; `begin`'s default is an estimate of zero.
+    The memory may be any pytree of arrays. By default `begin` returns an estimate of zero.
     """
 
     disturbance_bound: Leaf  # K of Assumption 1, bound on each component of d [N m]
 
-    def step(self, memory: Any, seen: Vector, t: Scalar, dt: Scalar) -> Any:
-        """The memory at t [s] from that a period dt [s] earlier; seen: the mean disturbance in it, (m,) [N m].
+    def step(self, memory: Any, d_mean: Vector, t: Scalar, dt: Scalar) -> Any:
+        """Return the memory at the end of a control period.
 
-        It is what the nominal model leaves unexplained of the motion between two samples, with their noise.
+        Args:
+            memory: memory at the start of the period.
+            d_mean: mean measured disturbance in the period, (m,) [N m]. It includes model errors and sensor noise.
+            t: end of the period [s].
+            dt: length of the period [s].
         """
         raise NotImplementedError
 
     def error_bound(self) -> ErrorBound:
-        """K2, which the law switches against; by default sqrt(m) K, as without an observer."""
+        """Return K2; by default sqrt(m) K, the bound without an observer."""
         return constant_bound(self.disturbance_bound, self.model.inputs)
 
     def update(self, matrix: Matrix, memory: Any, impulse: Vector, t: Scalar, dt: Scalar) -> Any:
-        """`step` over periods that have a length, of the mean impulse / dt [N m]."""
+        """Call `step` with the mean disturbance impulse / dt [N m]."""
         length = jnp.where(dt > 0.0, dt, 1.0)
         return self.step(memory, impulse / length, t, length)
 
 
 @dataclass(frozen=True)
 class Linear(Observer):
-    """Base of observers whose gain has a constant part l = diag(gain)."""
+    """Base of the observers with a constant gain l = diag(gain)."""
 
-    gain: Leaf  # (m,) diagonal of l [N m s, so that l J^-1 is in 1/s]
+    gain: Leaf  # (m,) diagonal of l [N m s]; l J^-1 is in 1/s
     disturbance_rate_bound: Leaf  # c of Assumption 1, bound on each component of d' [N m/s]
-    initial_error: Leaf  # bound on |d_hat(0) - d(0)| [N m]; the paper's (57) needs it and gives none
+    initial_error: Leaf  # bound on |d_hat(0) - d(0)| [N m]; (57) of the paper needs it but states no value
     linear: ClassVar[bool] = True
 
     def decay_matrix(self, t: Scalar, t_next: Scalar) -> Matrix:
-        """The constant part of A, l J^-1 [1/s]."""
+        return self._constant_decay()
+
+    def _constant_decay(self) -> Matrix:
+        """Return the constant part l J^-1 of A [1/s]."""
         return self.gain[:, None] * self.model.inertia_inverse
 
     def _bound(self) -> ErrorBound:
-        """(55) as it must read: sqrt(m) c, since c bounds each component of d' but K2 the 2-norm of the error.
+        """Return the corrected form of (55).
 
-        l_m is the smallest eigenvalue of l^1/2 J^-1 l^1/2 and the bound carries sqrt(cond(l)); for a diagonal J and
-        equal gains that is the paper's smallest diagonal element of l J^-1.
+        (55) needs sqrt(m) c instead of c, since c bounds each component of d' and K2 bounds the 2-norm of the error.
+        l_m is the smallest eigenvalue of l^1/2 J^-1 l^1/2, and the bound has the factor sqrt(cond(l)). For a diagonal J
+        and equal gains, l_m is the smallest diagonal element of l J^-1, as in the paper, and the factor is 1.
         """
         root = jnp.sqrt(self.gain)
         scaled = root[:, None] * self.model.inertia_inverse * root[None, :]
@@ -165,7 +182,7 @@ class Linear(Observer):
         return ErrorBound(slowest, factor * self.initial_error, floor)
 
     def update_matrix(self, dt: Scalar) -> Matrix:
-        """(I - e^(-A dt)) / dt = A phi_1(-A dt) [1/s]: smooth in dt down to 0, where it is A."""
-        a = Linear.decay_matrix(self, dt, dt)
+        """Return (I - e^(-A dt)) / dt = A phi_1(-A dt) [1/s], with A = l J^-1. It is smooth in dt, also at dt = 0."""
+        a = self._constant_decay()
         _, phi = integrators.phi_functions(-a * dt, 1)
         return a @ phi

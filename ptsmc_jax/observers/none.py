@@ -1,4 +1,4 @@
-"""No observer: the estimate is zero, and K switches against the whole disturbance."""
+"""The law without an observer: the estimate is zero, and the switching gain covers the whole disturbance."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -12,31 +12,27 @@ from ptsmc_jax.observers.base import ErrorBound, Matrix, Memory, Observer, const
 @pytree
 @dataclass(frozen=True)
 class NoObserver(Observer):
-    """No estimate: d_hat = 0, and the switching gain must cover the disturbance itself, as in (10), (29) and (40).
+    """No observer: d_hat = 0, and the switching gain must cover the disturbance itself, as in (10), (29) and (40).
 
-    K of Assumption 1 bounds each component of d; the law scales the 2-norm of what it does not know, so K2 = sqrt(m) K.
+    K of Assumption 1 bounds each component of d. The law uses a bound on the 2-norm, so K2 = sqrt(m) K.
     """
 
-    disturbance_bound: Leaf  # K of Assumption 1 [N m]
+    disturbance_bound: Leaf  # K of Assumption 1, bound on each component of d [N m]
     estimates: ClassVar[bool] = False
     linear: ClassVar[bool] = True
 
     def error_bound(self) -> ErrorBound:
-        """sqrt(m) K at all times."""
+        """Return sqrt(m) K at all times."""
         return constant_bound(self.disturbance_bound, self.model.inputs)
 
     def decay_matrix(self, t: Scalar, t_next: Scalar) -> Matrix:
-        """Zero."""
         return jnp.zeros((self.model.inputs, self.model.inputs))
 
     def forcing(self, t: Scalar, span: tuple[Scalar, Scalar], memory: Memory, d_eff: Vector) -> Memory:
-        """Zero."""
         return jnp.zeros_like(memory)
 
     def update_matrix(self, dt: Scalar) -> Matrix:
-        """Zero."""
         return jnp.zeros((self.model.inputs, self.model.inputs))
 
     def update(self, matrix: Matrix, memory: Memory, impulse: Vector, t: Scalar, dt: Scalar) -> Memory:
-        """The estimate stays what it is."""
         return memory

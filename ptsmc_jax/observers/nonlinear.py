@@ -1,4 +1,4 @@
-"""The paper's nonlinear disturbance observer (53)."""
+"""The nonlinear disturbance observer (53) of the paper."""
 
 from dataclasses import dataclass
 
@@ -9,19 +9,22 @@ from ptsmc_jax.observers.base import ErrorBound, Linear, Matrix, Memory
 @pytree
 @dataclass(frozen=True)
 class NonlinearObserver(Linear):
-    """Nonlinear disturbance observer (53) with constant l(w) = diag(gain), so lambda(w) = gain w.
+    """Nonlinear disturbance observer (53) with the constant gain l(w) = diag(gain), so that lambda(w) = l w.
 
-    The paper's z is d_hat - l w. Its error obeys (54): e' = -l M^-1 e - d', with M the inertia J of a spacecraft.
+    The memory is d_hat instead of z = d_hat - l w of the paper. The estimation error e = d_hat - d obeys (54),
+    e' = -l M^-1 e - d', where M is the inertia J for a spacecraft.
     """
 
     def error_bound(self) -> ErrorBound:
-        """(55) corrected."""
+        """Return the corrected form of (55)."""
         return self._bound()
 
     def forcing(self, t: Scalar, span: tuple[Scalar, Scalar], memory: Memory, d_eff: Vector) -> Memory:
-        """A d_eff [N m/s]."""
         return self.gain * (self.model.inertia_inverse @ d_eff)
 
     def update(self, matrix: Matrix, memory: Memory, impulse: Vector, t: Scalar, dt: Scalar) -> Memory:
-        """d_hat+ = E d_hat + (I - E) impulse / dt, E = e^(-A dt): unbiased, a contraction for any gain and period."""
+        """Return d_hat+ = E d_hat + (I - E) impulse / dt with E = e^(-A dt); see `Observer.update`.
+
+        The update is unbiased for a constant disturbance and stable for any gain and period.
+        """
         return memory + matrix @ (impulse - dt * memory)

@@ -1,1 +1,1 @@
-"""Signals from outside the loop: reference attitudes and disturbance torques."""
+"""Inputs of the simulation that do not depend on the controller: reference attitudes and disturbances."""

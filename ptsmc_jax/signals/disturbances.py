@@ -1,4 +1,7 @@
-"""Disturbances d(t, x) of (2) and (25), alone or summed."""
+"""Disturbances d(t, x) of (2) and (25), and functions that read or replace their phases, amplitudes and biases.
+
+Read `Disturbance` first, the base of all disturbances and of custom ones. `Sum` adds several of them.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -17,48 +20,49 @@ Time = Float[Array, ""]
 
 @dataclass(frozen=True)
 class Disturbance:
-    """The base of a disturbance of one's own: a function of time and of the true state."""
+    """Base of the disturbances, and of custom ones: a function of time and of the state of the true plant."""
 
     def __call__(self, t: Time, x: Any) -> Float[Array, " m"]:
-        """Disturbance at t [s] in the state x, (m,) [N m]."""
+        """Return the disturbance (m,) [N m] at the time t [s] in the state x."""
         raise NotImplementedError
 
-    drawn: ClassVar[Mapping[str, str]] = {}  # "phase", "amplitude" -> the field that holds what a dispersion draws
+    # for "phase" and "amplitude", the name of the field that a dispersion of this quantity changes
+    drawn: ClassVar[Mapping[str, str]] = {}
 
     def fastest(self) -> float:
-        """Its largest angular frequency [rad/s], which the integration steps follow; 0: slower than all else."""
+        """Return the largest angular frequency [rad/s], for the choice of the integration step. 0: no limit."""
         return 0.0
 
     def on_body(self, inertia: Float[Array, "3 3"]) -> Any:
-        """The disturbance as it acts on a body of this inertia [kg m^2]."""
+        """Return the disturbance of a body with this inertia [kg m^2]."""
         return self
 
 
 @pytree
 @dataclass(frozen=True)
 class Constant(Disturbance):
-    """A constant disturbance; zero serves as none."""
+    """A constant disturbance. The value zero means no disturbance."""
 
     value: Leaf  # (m,) [N m]
     drawn: ClassVar[Mapping[str, str]] = {"amplitude": "value"}
 
     def __call__(self, t: Time, x: Any = None) -> Float[Array, " m"]:
-        """Disturbance at t [s], (m,) [N m]."""
         return self.value
 
 
 @pytree
 @dataclass(frozen=True)
 class Bias(Constant):
-    """A constant that is added to the disturbance of a scenario, see `with_bias`; it is not among the amplitudes."""
+    """A constant that `with_bias` adds to the disturbance of a scenario. Dispersions of amplitudes do not change it."""
 
     drawn: ClassVar[Mapping[str, str]] = {}
 
 
-def _shifted(angle: Array, phase: Any) -> tuple[Array, Array]:
-    """Return sin and cos of angle + phase.
+def _sin_cos_of_sum(angle: Array, phase: Any) -> tuple[Array, Array]:
+    """Return sin and cos of angle + phase by the addition theorems.
 
-    In a batch of trials with drawn phases, sin and cos of the angle are shared, and those of the phase are constant.
+    If phases differ by trial, all trials of a batch use the same sin and cos of the angle, and the sin and cos of the
+    phases are computed only once.
     """
     sine, cosine = jnp.sin(angle), jnp.cos(angle)
     sine_0, cosine_0 = jnp.sin(phase), jnp.cos(phase)
@@ -68,7 +72,7 @@ def _shifted(angle: Array, phase: Any) -> tuple[Array, Array]:
 @pytree
 @dataclass(frozen=True)
 class Sinusoid(Disturbance):
-    """bias + amplitude sin(frequency t + phase), per axis."""
+    """A sinusoid for each axis: bias + amplitude sin(frequency t + phase)."""
 
     amplitude: Leaf  # (m,) [N m]
     frequency: Leaf  # (m,) [rad/s]
@@ -77,34 +81,32 @@ class Sinusoid(Disturbance):
     drawn: ClassVar[Mapping[str, str]] = {"phase": "phase", "amplitude": "amplitude"}
 
     def __call__(self, t: Time, x: Any = None) -> Float[Array, " m"]:
-        """Disturbance at t [s], (m,) [N m]."""
-        swing, _ = _shifted(self.frequency * t, self.phase)
-        return self.bias + self.amplitude * swing
+        sine, _ = _sin_cos_of_sum(self.frequency * t, self.phase)
+        return self.bias + self.amplitude * sine
 
 
 @pytree
 @dataclass(frozen=True)
 class GravityGradient(Disturbance):
-    """Gravity-gradient torque on a circular orbit, 3 n^2 c x J c, c the unit vector to the planet in body axes.
+    """Gravity-gradient torque 3 n^2 c x J c on a circular orbit.
 
-    Wie, Space Vehicle Dynamics and Control (2008), eq. (6.128). It depends on the true attitude.
+    c is the unit vector to the planet in body axes, which depends on the true attitude. Wie, Space Vehicle Dynamics and
+    Control (2008), eq. (6.128).
     """
 
-    inertia: Leaf  # (3, 3) of the true body [kg m^2]
-    orbit: Leaf  # (4,) quaternion of the orbit's frame: z along its normal, x to where the phase counts from
-    rate: Leaf  # n [rad/s]
-    phase: Leaf  # of the body at t = 0 [rad]
+    inertia: Leaf  # (3, 3) inertia J of the true body [kg m^2]
+    orbit: Leaf  # (4,) quaternion of the orbit frame: z is the orbit normal, x the direction of phase 0 [-]
+    rate: Leaf  # orbital rate n [rad/s]
+    phase: Leaf  # orbital phase at t = 0 [rad]
     drawn: ClassVar[Mapping[str, str]] = {"phase": "phase"}
 
     def __call__(self, t: Time, x: AttitudeState) -> Float[Array, "3"]:
-        """Torque at t [s] in the state x, (3,) [N m]."""
-        sine, cosine = _shifted(self.rate * t, self.phase)
+        sine, cosine = _sin_cos_of_sum(self.rate * t, self.phase)
         radial = jnp.stack([cosine, sine, jnp.zeros_like(sine)])
         c = attitude.rotate(attitude.multiply(attitude.conjugate(x.q), self.orbit), radial)
         return 3.0 * self.rate**2 * attitude.cross(c, self.inertia @ c)
 
     def on_body(self, inertia: Float[Array, "3 3"]) -> Any:
-        """The gravity gradient on another body [kg m^2]."""
         return replace(self, inertia=inertia)
 
 
@@ -116,48 +118,52 @@ class Sum(Disturbance):
     terms: tuple[Any, ...]
 
     def __call__(self, t: Time, x: Any) -> Float[Array, " m"]:
-        """Disturbance at t [s] in the state x, (m,) [N m]."""
         total = self.terms[0](t, x)
         for term in self.terms[1:]:
             total = total + term(t, x)
         return total
 
     def on_body(self, inertia: Float[Array, "3 3"]) -> Any:
-        """Each term on that body [kg m^2]."""
         return Sum(tuple(on_body(term, inertia) for term in self.terms))
 
 
 def terms(disturbance: Any) -> tuple[Any, ...]:
-    """The terms of a sum of disturbances; of another disturbance itself alone."""
+    """Return the terms of a sum, or the disturbance itself as the only term."""
     return getattr(disturbance, "terms", (disturbance,))
 
 
-def _drawn_field(term: Any, what: str) -> str | None:
-    """The field of a term that holds its phase or amplitude; None where it has none, or is a plain function."""
-    return getattr(term, "drawn", {}).get(what)
+def _field_name(term: Any, quantity: str) -> str | None:
+    """Return the name of the field with the phase or amplitude, or None. A plain function has no such field."""
+    return getattr(term, "drawn", {}).get(quantity)
 
 
-def _drawn(disturbance: Any, what: str) -> list[Any]:
-    """The phases or amplitudes of each term that has some."""
-    fields = ((term, _drawn_field(term, what)) for term in terms(disturbance))
+def _field_values(disturbance: Any, quantity: str) -> list[Any]:
+    """Return the phases or amplitudes of each term that has them."""
+    fields = ((term, _field_name(term, quantity)) for term in terms(disturbance))
     return [getattr(term, field) for term, field in fields if field is not None]
 
 
-def count(disturbance: Any, what: Literal["phase", "amplitude"]) -> int:
-    """How many phases or amplitudes a disturbance has."""
-    return sum(map(np.size, _drawn(disturbance, what)))
+def count(disturbance: Any, quantity: Literal["phase", "amplitude"]) -> int:
+    """Return the number of phases or amplitudes of a disturbance."""
+    return sum(map(np.size, _field_values(disturbance, quantity)))
 
 
-def values(disturbance: Any, what: Literal["phase", "amplitude"]) -> Float[Array, " count"]:
-    """Every phase [rad] or amplitude [N m] of a disturbance, (count,): term after term, input after input."""
-    return jnp.concatenate([jnp.zeros(0), *map(jnp.ravel, _drawn(disturbance, what))])
+def values(disturbance: Any, quantity: Literal["phase", "amplitude"]) -> Float[Array, " count"]:
+    """Return all phases [rad] or amplitudes [N m] of a disturbance, (count,), in the order of terms and inputs."""
+    return jnp.concatenate([jnp.zeros(0), *map(jnp.ravel, _field_values(disturbance, quantity))])
 
 
-def with_values(disturbance: Any, what: Literal["phase", "amplitude"], new: Float[Array, " count"]) -> Any:
-    """The disturbance with these phases [rad] or amplitudes [N m], as `values` gives them; what has none stays."""
+def with_values(disturbance: Any, quantity: Literal["phase", "amplitude"], new: Float[Array, " count"]) -> Any:
+    """Return the disturbance with other phases or amplitudes. Terms without them are not changed.
+
+    Args:
+        disturbance: the disturbance.
+        quantity: which values to replace.
+        new: new phases [rad] or amplitudes [N m], (count,), in the order of `values`.
+    """
     changed, used = [], 0
     for term in terms(disturbance):
-        field = _drawn_field(term, what)
+        field = _field_name(term, quantity)
         if field is not None:
             old = jnp.asarray(getattr(term, field))
             term = replace(term, **{field: new[used : used + old.size].reshape(old.shape)})
@@ -167,16 +173,16 @@ def with_values(disturbance: Any, what: Literal["phase", "amplitude"], new: Floa
 
 
 def bias(disturbance: Any, inputs: int) -> Float[Array, " m"]:
-    """The `Bias` of a disturbance, (m,) [N m]; zero where it has none."""
+    """Return the `Bias` of a disturbance, (inputs,) [N m]; zeros if it has none."""
     last = terms(disturbance)[-1]
     return last.value if isinstance(last, Bias) else jnp.zeros(inputs)
 
 
 def with_bias(disturbance: Any, value: Float[Array, " m"]) -> Sum:
-    """The disturbance with this `Bias` added, (m,) [N m], in place of the one before."""
+    """Return the disturbance with this `Bias` (m,) [N m] instead of its previous one."""
     return Sum((*(term for term in terms(disturbance) if not isinstance(term, Bias)), Bias(value)))
 
 
 def on_body(disturbance: Any, inertia: Float[Array, "3 3"]) -> Any:
-    """The disturbance as it acts on a body of this inertia [kg m^2]; a plain function acts alike on all."""
+    """Return the disturbance of a body with this inertia [kg m^2]. A plain function does not depend on the body."""
     return disturbance.on_body(inertia) if hasattr(disturbance, "on_body") else disturbance

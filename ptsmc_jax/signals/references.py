@@ -1,4 +1,7 @@
-"""Reference attitudes with their derivatives, and the origin of other plants."""
+"""Reference attitudes with their rates, and the references of plants that are no spacecraft.
+
+A reference is a function from the time to a `Target`. `Reference` is the base of custom reference attitudes.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,14 +18,14 @@ Time = Float[Array, ""]
 
 
 class Target(NamedTuple):
-    """Reference attitude and its motion at one time."""
+    """Reference attitude, rate and acceleration at one time."""
 
-    q: Array  # (4,) q_f, reference axes relative to inertial [-]
-    w: Array  # (3,) w_f, rate of the reference in its own axes [rad/s]
-    w_dot: Array  # (3,) [rad/s^2]
+    q: Array  # (4,) q_f, rotation from reference axes to inertial axes [-]
+    w: Array  # (3,) w_f, rate of the reference in reference axes [rad/s]
+    w_dot: Array  # (3,) time derivative of w [rad/s^2]
 
     def vector_rates(self) -> tuple[Array, Array]:
-        """q_1f' and q_1f'' of (57), (3,) each [1/s, 1/s^2]."""
+        """Return q_1f' [1/s] and q_1f'' [1/s^2] of (57), (3,) each."""
         return attitude.vector_rates(self.q, self.w, self.w_dot)
 
 
@@ -34,28 +37,29 @@ class Fixed:
     q: Leaf  # (4,) unit quaternion
 
     def __call__(self, t: Time) -> Target:
-        """Target at t [s]."""
+        """Return the target at the time t [s]."""
         return Target(self.q, jnp.zeros(3), jnp.zeros(3))
 
 
 @pytree
 @dataclass(frozen=True)
 class Spin:
-    """A reference that turns at a constant rate: q_f(t) = q(0) exp(w t)."""
+    """A reference that rotates at a constant rate: q_f(t) = q(0) exp(w t)."""
 
-    q: Leaf  # (4,) attitude at t = 0
-    rate: Leaf  # (3,) [rad/s], in the reference's axes
+    q: Leaf  # (4,) attitude at t = 0 [-]
+    rate: Leaf  # (3,) rate in reference axes [rad/s]
 
     def __call__(self, t: Time) -> Target:
-        """Target at t [s]."""
-        turned = attitude.multiply(self.q, attitude.from_rotation_vector(self.rate * t))
-        return Target(turned, self.rate, jnp.zeros(3))
+        """Return the target at the time t [s]."""
+        q = attitude.multiply(self.q, attitude.from_rotation_vector(self.rate * t))
+        return Target(q, self.rate, jnp.zeros(3))
 
 
 def target_of(path: Callable[[Time], Float[Array, "4"]], t: Time) -> Target:
-    """Target at t [s] of an attitude path, a unit quaternion as a function of time; its derivatives are exact.
+    """Return the target at the time t [s] for a path, a function from the time to a unit quaternion.
 
-    w = 2 vec(q* q') and w' = 2 vec(q* q''), since q*' q' = |q'|^2 has no vector part.
+    Rates are exact, by automatic differentiation: w = 2 vec(q* q') and w' = 2 vec(q* q''), because the product
+    q*' q' = |q'|^2 has no vector part.
     """
     q = path(t)
     q_dot, q_ddot = time_derivative(path, t), time_derivative(lambda t: time_derivative(path, t), t)
@@ -66,12 +70,16 @@ def target_of(path: Callable[[Time], Float[Array, "4"]], t: Time) -> Target:
 @pytree
 @dataclass(frozen=True)
 class TurningFunction(Function):
-    """A function of time [s] as a reference attitude: of a `Target`, or of a quaternion (4,) of any length."""
+    """A custom function of time [s] as a reference. It returns a `Target`, or a quaternion (4,) of any norm [-]."""
 
-    function: Callable  # a pytree, as `jax.tree_util.Partial` is: its numbers are leaves
+    function: Callable  # a pytree such as `jax.tree_util.Partial`, whose numbers are leaves
 
     def __call__(self, t: Time) -> Target:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Target at t [s]; a quaternion's rates are its derivatives. Raises TypeError where it is neither."""
+        """Return the target at the time t [s]. The rates of a quaternion are its derivatives.
+
+        Raises:
+            TypeError: The function returns neither a `Target` nor a quaternion.
+        """
         value = self.function(t)
         if isinstance(value, Target):
             return value
@@ -85,53 +93,51 @@ class TurningFunction(Function):
 
 @dataclass(frozen=True)
 class Reference:
-    """A reference given by an attitude as a function of time, q_f(t) = q attitude(t); the base of one's own, too."""
+    """Base of references that define an attitude as a function of time, also of custom ones: q_f(t) = q attitude(t)."""
 
-    q: Leaf  # (4,) the attitude that it turns from
+    q: Leaf  # (4,) constant attitude that the motion starts from [-]
 
     def attitude(self, t: Time) -> Float[Array, "4"]:
-        """Unit quaternion at t [s], twice differentiable: the rates that the law needs are its derivatives."""
+        """Return the unit quaternion (4,) [-] at the time t [s]. It must be twice differentiable for the rates."""
         raise NotImplementedError
 
     def fastest(self) -> float:
-        """How fast it turns and changes at most [rad/s], which the integration steps follow."""
+        """Return the largest rate or angular frequency [rad/s], for the choice of the integration step. 0: no limit."""
         return 0.0
 
     def __call__(self, t: Time) -> Target:
-        """Target at t [s]."""
+        """Return the target at the time t [s]."""
         return target_of(lambda t: attitude.multiply(self.q, self.attitude(t)), t)
 
 
 @pytree
 @dataclass(frozen=True)
 class Swing(Reference):
-    """A reference that swings about an attitude: q_f(t) = q exp(r(t)), r = amplitude sin(frequency t + phase)."""
+    """A reference that oscillates about an attitude: q_f(t) = q exp(r(t)), r = amplitude sin(frequency t + phase)."""
 
-    amplitude: Leaf  # (3,) of the rotation vector r, per axis [rad]
+    amplitude: Leaf  # (3,) amplitude of the rotation vector r for each axis [rad]
     frequency: Leaf  # (3,) [rad/s]
     phase: Leaf  # (3,) [rad]
 
     def attitude(self, t: Time) -> Float[Array, "4"]:
-        """The unit quaternion exp(r(t)) at t [s]."""
         return attitude.from_rotation_vector(self.amplitude * jnp.sin(self.frequency * t + self.phase))
 
 
 @pytree
 @dataclass(frozen=True)
 class Slew(Reference):
-    """A reference that turns about a fixed axis from rest to rest: q_f(t) = q exp(share(t / duration) turn).
+    """A rotation about a fixed axis from rest to rest: q_f(t) = q exp(f(t / duration) turn).
 
-    share(x) = 10 x^3 - 15 x^4 + 6 x^5, 0 before and 1 after: its first two derivatives vanish at both ends.
+    The fraction f(x) = 10 x^3 - 15 x^4 + 6 x^5 rises from 0 to 1, with zero first and second derivatives at both ends.
     """
 
-    turn: Leaf  # (3,) rotation vector from the attitude at t = 0 to that from t = duration on [rad]
+    turn: Leaf  # (3,) rotation vector of the whole slew [rad]
     duration: Leaf  # [s]
 
     def attitude(self, t: Time) -> Float[Array, "4"]:
-        """The unit quaternion exp(share turn) at t [s]."""
         x = jnp.clip(t / self.duration, 0.0, 1.0)
-        share = x * x * x * (10.0 + x * (6.0 * x - 15.0))
-        return attitude.from_rotation_vector(share * self.turn)
+        fraction = x * x * x * (10.0 + x * (6.0 * x - 15.0))
+        return attitude.from_rotation_vector(fraction * self.turn)
 
 
 @pytree
@@ -140,20 +146,20 @@ class Origin:
     """The reference of an integrator chain: the origin."""
 
     def __call__(self, t: Time) -> None:
-        """None: the origin needs no numbers."""
+        """Return None, because the origin needs no numbers."""
 
 
 @pytree
 @dataclass(frozen=True)
 class CurrentTime:
-    """The reference of a system of one's own: the time itself, since F says how far from its target the system is."""
+    """The reference of a custom second-order system: the time itself, because F(t, x) defines the error."""
 
     def __call__(self, t: Time) -> Time:
-        """The time t itself [s]."""
+        """Return t [s]."""
         return t
 
 
 def time_derivative(signal: Callable, t: Time) -> Array:
-    """The derivative of a signal at t [s], (its shape), per second; exact, by automatic differentiation."""
+    """Return the time derivative [1/s] of a signal at the time t [s], (its shape), by automatic differentiation."""
     t = jnp.asarray(t, jnp.result_type(float))
     return jax.jvp(signal, (t,), (jnp.ones_like(t),))[1]

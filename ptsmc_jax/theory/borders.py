@@ -81,7 +81,7 @@ def _last(stable: Callable[[float], bool], low: float, high: float) -> float:
 def implicit_gains(eta: float, tau: float) -> tuple[float, float]:
     """Gains kp, kd before the hand-over with implicit sampling and no switching term; tau: time to go in periods.
 
-    From (1 - 1/tau)^eta s = s_0 + g a, see `laws.prescribed_time.PrescribedTimeLaw.landing`: eta (1 - share) / g and
+    From (1 - 1/tau)^eta s = s_0 + g a, see `laws.prescribed_time.PrescribedTimeLaw.next_s`: eta (1 - share) / g and
     (tau - 1 + eta - share tau) / g, g = tau - 1 + eta/2. On s = 0 the error falls by
     (1 - eta/(2 tau)) / (1 + eta/(2 (tau - 1))) in a period, below 1 in size for every tau >= 1.
     """

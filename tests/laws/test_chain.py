@@ -1,4 +1,4 @@
-"""The second-order system (6) and the integrator chain (35): laws (10), (24), (40), (52), surfaces (37), (39)."""
+"""The law for the integrator chain (35) and the second-order system (6): law (52), surfaces (37) and (39)."""
 
 import math
 from dataclasses import replace
@@ -25,8 +25,8 @@ HOLD, BEFORE = jnp.asarray(True), jnp.asarray(False)
 
 
 @pytest.mark.parametrize(("eta", "t"), [(2.5, 0.0), (3.0, 3.1), (6.0, 4.9)])
-def test_order_two_is_the_law_of_the_second_order_system(eta, t):
-    """(7), (9), (10), (24) by hand, with f and g."""
+def test_chain_of_order_2_has_the_law_of_the_second_order_system(eta, t):
+    """The expected values are (7), (9), (10) and (24), written out for given f and g."""
     x = np.array([1.3, -0.4])
 
     def f(x):
@@ -51,8 +51,8 @@ def test_order_two_is_the_law_of_the_second_order_system(eta, t):
 
 
 @pytest.mark.parametrize("n", short([2, 3, 4, 5, 6], [2, 5]))
-def test_surface_is_the_derivative_that_defines_it(n):
-    """(37) with the c_i against (36) by nested automatic differentiation."""
+def test_surface_37_equals_its_definition_36(n):
+    """(36) is computed by nested automatic differentiation."""
     t_f, eta, t = 4.0, n + 0.7, 1.3
 
     def x(time):
@@ -75,8 +75,8 @@ def test_surface_is_the_derivative_that_defines_it(n):
 
 @pytest.mark.parametrize("n", [2, 3, 4, 5])
 @pytest.mark.parametrize("hold", [False, True])
-def test_sliding_variable_obeys_the_equation_that_the_law_is_made_from(n, hold):
-    """s' along the true motion, by automatic differentiation, against (42) and (51) by hand."""
+def test_sliding_variable_obeys_its_reaching_law(n, hold):
+    """s' along the motion of the plant, by automatic differentiation, equals (42) or (51)."""
     eta, tau = n + 0.6, 2.2
     a = [0.7, 2.1, 3.0, 2.5][: n - 1]
     run = chain_parts([1.0] * n, 5.0, eta, k1=1.4, surface_rate=1.3, a=a, sign_width=0.5)
@@ -89,13 +89,17 @@ def test_sliding_variable_obeys_the_equation_that_the_law_is_made_from(n, hold):
         return torque(law, time, phase, state, None, d_hat, k2)[1]
 
     _, s_dot = jax.jvp(surface, (t, x), (jnp.ones_like(t), run.plant.rate(t, x, u, d)))
-    push = 0.2 - 0.4 * np.tanh(np.asarray(s) / 0.5)
-    expected = push - 1.4 * np.asarray(s) if hold else tau ** (n - 1) * push - (eta + n - 2) / tau * np.asarray(s)
+    disturbance = 0.2 - 0.4 * np.tanh(np.asarray(s) / 0.5)
+    expected = (
+        disturbance - 1.4 * np.asarray(s)
+        if hold
+        else tau ** (n - 1) * disturbance - (eta + n - 2) / tau * np.asarray(s)
+    )
     np.testing.assert_allclose(s_dot, expected, rtol=1e-11)
 
 
 @pytest.mark.parametrize("n", [2, 3, 4, 5])
-def test_motion_on_the_surface_is_stable_as_its_matrix_is(n):
+def test_hurwitz_check_agrees_with_eigenvalues(n):
     rng = np.random.default_rng(n)
     for _ in range(50):
         a = rng.normal(size=n - 1) + 1.0
@@ -110,47 +114,47 @@ EXACT = [(2, 5.0), (3, 30.0), (5, 0.7), (3, 5.0), (4, 5.0), (5, 5.0)]
 
 
 @pytest.mark.parametrize(("n", "t_f"), short(EXACT, EXACT[2:3]))
-def test_chain_meets_the_exact_solution(n, t_f):
-    """Exact solution 2 to 1e-9 of the largest state: what the default grid promises."""
+def test_continuous_chain_equals_exact_solution_2(n, t_f):
+    """The tolerance, 1e-9 of the largest state, is the accuracy of the default time grid."""
     rng = np.random.default_rng(n)
     for eta in (n + 0.1, n + 1.0, n + 3.5):
         x0 = rng.normal(size=n)
         run = chain_parts(x0, t_f, eta, 0.01 * t_f)
         log = fly(run).log
         before = log.t < 0.99 * t_f * (1 - 1e-12)
-        exact = motion(run, log.t[before])
+        exact = exact_motion(run, log.t[before])
         largest = np.abs(exact.x).max()
         np.testing.assert_allclose(log.x[before], exact.x, rtol=0, atol=1e-9 * largest)
         np.testing.assert_allclose(log.s[before, 0], exact.s, rtol=0, atol=1e-9 * np.abs(exact.s).max())
 
 
 @jax.jit
-def motion(run, t):
+def exact_motion(run, t):
     law = run.controller
     return jax.vmap(lambda time: solutions.exact_chain(time, law.t_f, law.eta, run.initial))(t)
 
 
 @pytest.mark.parametrize("n", short([2, 3, 4], [3]))
-def test_slopes_are_those_of_theory(n):
-    """Noise-free: s falls with slope eta + n - 2 in the time to go, the error with eta, its logarithm taken out."""
+def test_s_and_error_decay_with_the_powers_of_theory(n):
+    """Without noise, s decays with the power eta + n - 2 of the time to t_f, and the error with eta and a logarithm."""
     eta, t_f, delta = n + 1.2, 5.0, 5e-4
     run = chain_parts([2.0, -1.0, 0.5, 0.3][:n], t_f, eta, delta)
     log = fly(run).log
     before = (log.t > 0.0) & (log.t < t_f - delta * 1.0001)
     tau = t_f - log.t[before]
 
-    def slope(values, some):
+    def exponent(values, some):
         return np.polyfit(np.log(tau[some]), np.log(np.abs(values[some])), 1)[0]
 
     everywhere, late = np.full(tau.size, True), tau < 0.02 * t_f
-    # s is r^(n-2) of what it is summed from: below r = 0.02 that is what integration leaves
-    np.testing.assert_allclose(slope(log.s[before, 0], ~late), eta + n - 2, rtol=1e-2)
+    # s is smaller than its terms by r^(n-2): below r = 0.02 the integration error dominates
+    np.testing.assert_allclose(exponent(log.s[before, 0], ~late), eta + n - 2, rtol=1e-2)
     x = log.x[before, 0]
-    if n == 2:  # x_1 = r^eta (x(0) + s(0) L): the factor in brackets is known
+    if n == 2:  # x_1 = r^eta (x(0) + s(0) L), and the factor in brackets is known
         s0 = t_f * -1.0 + eta * 2.0
-        np.testing.assert_allclose(slope(x / (2.0 + s0 * np.log(t_f / tau)), everywhere), eta, rtol=1e-2)
-    else:  # y = x_1 / r^eta goes to a constant
-        np.testing.assert_allclose(slope(x, late), eta, rtol=1e-2)
+        np.testing.assert_allclose(exponent(x / (2.0 + s0 * np.log(t_f / tau)), everywhere), eta, rtol=1e-2)
+    else:  # x_1 / r^eta approaches a constant
+        np.testing.assert_allclose(exponent(x, late), eta, rtol=1e-2)
 
 
 SCENARIO = st.fixed_dictionaries(
@@ -161,7 +165,7 @@ SCENARIO = st.fixed_dictionaries(
         "delta": st.floats(0.005, 0.2),
         "bound": st.floats(0.0, 1.0),
         "layer": st.floats(0.01, 1.0),
-        "share": st.floats(-1.0, 1.0),
+        "fraction": st.floats(-1.0, 1.0),
         "frequency": st.floats(0.0, 3.0),
         "phase": st.floats(-3.0, 3.0),
         "k1": st.floats(0.2, 4.0),
@@ -171,23 +175,26 @@ SCENARIO = st.fixed_dictionaries(
 )
 
 
-# a_1 .. a_(n-1) for a pair of poles of this damping at 1 1/s, and a third one at -1
+# a_1 .. a_(n-1) for a pair of poles with the damping z and the frequency 1 rad/s, and for n = 4 a third pole at -1
 SURFACES = {2: lambda z: [1.0], 3: lambda z: [1.0, 2 * z], 4: lambda z: [1.0, 1 + 2 * z, 1 + 2 * z]}
 
 
-def stays_inside_the_corrected_envelopes(n, case):
-    """|s| and every state, for disturbances up to K and a smooth sign as sharp as 800 steps can follow."""
+def check_envelopes(n, case):
+    """Check that |s| and all states are inside the corrected envelopes, for disturbances up to K.
+
+    The boundary layer is as thin as 800 steps can resolve.
+    """
     t_f, bound = case["t_f"], case["bound"]
-    # the boundary layer's rate, tau^(n-1) K / width, times the largest step stays below 1.2
+    # the rate tau^(n-1) K / width of the boundary layer times the largest step is below 1.2
     width = max(bound * t_f ** (n - 1) * 1.5 * t_f / 800 / 1.2 / case["layer"], 1e-9)
-    sine = (case["share"] * bound, case["frequency"] / t_f, case["phase"], 0.0)
+    sine = (case["fraction"] * bound, case["frequency"] / t_f, case["phase"], 0.0)
     wave = disturbances.Sinusoid(*(vector([v]) for v in sine))
     run = chain_parts(
         case["x0"][:n], t_f, n + case["above"], case["delta"] * t_f, bound=bound, sign_width=width, disturbance=wave,
         k1=case["k1"], surface_rate=case["surface_rate"], a=SURFACES[n](case["damping"]), steps=(800, 1200),
     )  # fmt: skip
     result = fly(run)
-    assert int(result.status) in rollout.FINISHED  # pushed off the origin it started from: missed
+    assert int(result.status) in rollout.FINISHED  # the disturbance may move it away from the origin
     log = result.log
     before = np.flatnonzero(log.t < float(run.controller.hand_over))
     t = log.t[: before[-1] + 1]
@@ -202,9 +209,9 @@ def stays_inside_the_corrected_envelopes(n, case):
     assert np.all(np.abs(log.x[-t.size :, 0]) <= hold.error_bound(run, t) * (1 + 1e-6) + largest[0])
 
 
-test_chain_stays_inside = drawn(stays_inside_the_corrected_envelopes, 15, n=st.just(3), case=SCENARIO)
-test_many_stay_inside = pytest.mark.long(
-    drawn(stays_inside_the_corrected_envelopes, 400, n=st.integers(2, 4), case=SCENARIO)
+test_chain_of_order_3_is_inside_its_envelopes = drawn(check_envelopes, 15, n=st.just(3), case=SCENARIO)
+test_many_chains_are_inside_their_envelopes = pytest.mark.long(
+    drawn(check_envelopes, 400, n=st.integers(2, 4), case=SCENARIO)
 )
 
 
@@ -214,27 +221,27 @@ def envelope(run, t, s0, floor):
     return jax.vmap(lambda time: solutions.state_envelope(time, law.t_f, law.eta, run.initial, s0, floor))(t)
 
 
-def test_envelopes_are_not_empty():
-    """Without a residual |s| is its envelope, and x_1 comes near its own."""
+def test_envelopes_are_tight():
+    """Without an estimation error |s| equals its envelope, and x_1 comes within 1 % of its envelope."""
     run = chain_parts([1.0, 0.5, 0.0], 5.0, 4.0, bound=0.0)
     log = fly(run).log
     before = log.t < 4.9
     t = log.t[before]
     np.testing.assert_allclose(np.abs(log.s[before, 0]), envelopes.sliding_bound(run, t), rtol=1e-5)
-    flown = envelopes.error_bound(run, t)
-    assert np.all(np.abs(log.x[before, 0]) <= flown * (1 + 1e-6))
-    assert np.max(np.abs(log.x[before, 0]) / flown) > 0.99
+    bound = envelopes.error_bound(run, t)
+    assert np.all(np.abs(log.x[before, 0]) <= bound * (1 + 1e-6))
+    assert np.max(np.abs(log.x[before, 0]) / bound) > 0.99
 
 
-def test_the_bound_on_s_is_a_number_where_its_square_is_none():
-    """Without a residual it is |s(0)| (tau / t_f)^(eta + n - 2), and s(0) is linear in the start."""
+def test_bound_on_s_does_not_overflow_if_its_square_would():
+    """Without an estimation error it is |s(0)| (tau / t_f)^(eta + n - 2), and s(0) is linear in the initial state."""
     t = np.linspace(0.0, 5.0, 6)
     one, far = (envelopes.sliding_bound(chain_parts([x, 0.0, 0.0], eta=4.0), t) for x in (1.0, 1e153))
     assert far[0] > np.sqrt(np.finfo(float).max)
     np.testing.assert_allclose(far, 1e153 * one, rtol=1e-12)
 
 
-def test_exact_chain_of_order_two_is_the_exact_error():
+def test_exact_chain_of_order_2_equals_exact_error():
     for t in (0.0, 1.0, 6.9):
         both = solutions.exact_error(vector(t), vector(7.0), vector(2.7), vector([0.7]), vector([-0.3]))
         chain = solutions.exact_chain(vector(t), vector(7.0), vector(2.7), vector([0.7, -0.3]))
@@ -243,21 +250,21 @@ def test_exact_chain_of_order_two_is_the_exact_error():
 
 
 @pytest.mark.parametrize("n", [2, 3, 4, 5])
-def test_exact_chain_is_a_motion_of_the_chain(n):
-    """Its derivative is the next state, and the input that the law gives there."""
+def test_exact_chain_solves_the_equations_of_chain_and_law(n):
+    """The derivative of each state is the next state, and the last one is the input of the law."""
     run = chain_parts(np.random.default_rng(n).normal(size=n), 7.0, n + 0.8)
     law = run.controller
     for t in (0.0, 2.0, 6.5):
-        at, slope = jax.jvp(
+        at, tangent = jax.jvp(
             lambda time: solutions.exact_chain(time, law.t_f, law.eta, run.initial), (vector(t),), (vector(1.0),)
         )
         size = np.abs(np.append(at.x, at.acceleration)).max()
-        np.testing.assert_allclose(slope.x, np.append(at.x[1:], at.acceleration), rtol=0, atol=1e-11 * size)
+        np.testing.assert_allclose(tangent.x, np.append(at.x[1:], at.acceleration), rtol=0, atol=1e-11 * size)
         u, s = torque(law, vector(t), BEFORE, at.x, None, jnp.zeros(1), vector(0.0))
         np.testing.assert_allclose((u[0], s[0]), (at.acceleration, at.s), rtol=1e-8, atol=1e-11 * size)
 
 
-def test_exact_chain_of_order_three_against_an_adaptive_integrator():
+def test_exact_chain_of_order_3_equals_adaptive_integration():
     eta, t_f = 3.4, 6.0
     c = (eta * (eta + 1), 2 * eta)
 
@@ -275,7 +282,7 @@ def test_exact_chain_of_order_three_against_an_adaptive_integrator():
 
 
 @pytest.mark.parametrize("x0", short([[5.0, 3.0], [5.0, 3.0, 2.0]], [[5.0, 3.0, 2.0]]))
-def test_sampled_chain_converges_to_the_continuous_one(x0):
+def test_sampled_chain_converges_to_the_continuous_chain_with_order_1(x0):
     wave = disturbances.Sinusoid(*(vector([v]) for v in (0.01, 1.0, 0.0, 0.0)))
     changes = {"bound": 0.01, "disturbance": wave, "delta": 0.5, "sign_width": 0.05}
     truth = fly(chain_parts(x0, **changes, steps=(4000, 200))).metrics.window_error
@@ -284,24 +291,24 @@ def test_sampled_chain_converges_to_the_continuous_one(x0):
     sampled = [replace(run, clock=run.clock.long_enough_for(clocks)) for run in sampled]
     gaps = [abs(float(fly(run).metrics.window_error / truth) - 1.0) for run in sampled]
     ratios = np.array(gaps[:-1]) / np.array(gaps[1:])
-    assert np.all((ratios > 1.7) & (ratios < 2.3))  # zero-order hold: first order
+    assert np.all((ratios > 1.7) & (ratios < 2.3))  # a zero-order hold has an error of order 1
 
 
-def test_observer_on_a_chain_finds_the_disturbance_within_its_bound():
+def test_observer_error_on_a_chain_is_within_its_bound():
     wave = disturbances.Sinusoid(*(vector([v]) for v in (0.05, 1.0, 0.0, 0.02)))
     model = integrator_chain.chain(3)
     observer = nonlinear.NonlinearObserver(model, vector([20.0]), vector(0.05), vector(0.02))
     for period in (None, 0.02):
-        seen = chain_parts([1.0, 0.0, 0.0], disturbance=wave, observer=observer, period=period, delta=0.3)
-        log = fly(seen).log
+        run = chain_parts([1.0, 0.0, 0.0], disturbance=wave, observer=observer, period=period, delta=0.3)
+        log = fly(run).log
         off = np.abs(log.d_hat - log.disturbance)[:, 0]
         bound = np.asarray(jax.vmap(observer.error_bound())(log.t))
-        # sampled: the estimate is that of the period before
+        # a sampled estimate is one period old
         assert np.all(off <= bound * (1 + 1e-6) + (0.0 if period is None else 0.05 * period))
 
 
-def test_plant_with_drift_and_gain_is_linearised_exactly():
-    """A perfect model cancels f and g: the motion is that of the bare chain."""
+def test_law_cancels_known_drift_and_gain_exactly():
+    """With a perfect model of f and g the motion equals the motion of the chain without them."""
 
     def f(x):
         return -jnp.sin(x[0]) + x[1] * x[2]
@@ -310,31 +317,31 @@ def test_plant_with_drift_and_gain_is_linearised_exactly():
         return 1.5 + 0.5 * jnp.cos(x[0])
 
     bare = fly(chain_parts([0.5, -0.2, 0.1])).log
-    bent = fly(chain_parts([0.5, -0.2, 0.1], f=f, g=g)).log
-    np.testing.assert_allclose(bent.x, bare.x, rtol=0, atol=1e-10)
-    assert np.abs(bent.u - bare.u).max() > 0.1
+    nonlinear_chain = fly(chain_parts([0.5, -0.2, 0.1], f=f, g=g)).log
+    np.testing.assert_allclose(nonlinear_chain.x, bare.x, rtol=0, atol=1e-10)
+    assert np.abs(nonlinear_chain.u - bare.u).max() > 0.1
 
 
 @pytest.mark.parametrize("hold", [False, True])
-def test_input_and_surface_have_slopes_in_every_gain(hold):
+def test_derivatives_of_input_and_s_by_gains_equal_finite_differences(hold):
     run = chain_parts([0.1, -0.02, 0.03])
     gains = ("t_f", "eta", "k1", "surface_rate", "sign_width")
     point = vector([5.0, 4.5, 1.2, 1.7, 0.5])
 
     @jax.jit
-    def given(point):
+    def input_and_s(point):
         law = with_controller(run, **dict(zip(gains, point, strict=True))).controller
         return jnp.stack(commanded(law, vector(3.1), jnp.asarray(hold), run.initial, None, jnp.zeros(1), vector(0.4)))
 
     steps = 1e-6 * np.eye(5)
-    differences = np.stack([(given(point + h) - given(point - h)) / 2e-6 for h in steps], axis=-1)
-    np.testing.assert_allclose(jax.jacfwd(given)(point), differences, rtol=1e-6, atol=1e-6)
-    assert np.count_nonzero(np.abs(differences[0]) > 1e-4) == 3  # each phase has gains of its own, and the sign's width
+    differences = np.stack([(input_and_s(point + h) - input_and_s(point - h)) / 2e-6 for h in steps], axis=-1)
+    np.testing.assert_allclose(jax.jacfwd(input_and_s)(point), differences, rtol=1e-6, atol=1e-6)
+    assert np.count_nonzero(np.abs(differences[0]) > 1e-4) == 3  # two gains of the phase, and sign_width
 
 
-# lanes: `test_conformity.py`; slopes of the law: the test above; of sampled flights: `test_implicit.py`
+# short tests: `lanes` in `test_conformity.py`, derivatives of the law above, of sampled runs in `test_implicit.py`
 @pytest.mark.long
-def test_batches_of_chains_and_their_gradients():
+def test_batch_of_chains_equals_jax_vmap_and_gradients_equal_finite_differences():
     run = chain_parts([5.0, 3.0, 2.0], delta=0.5, period=0.05, noise=[1e-4, 1e-4, 1e-4], bound=0.01)
 
     def error(gains, trial):
@@ -348,16 +355,16 @@ def test_batches_of_chains_and_their_gradients():
     assert np.std(one) > 0.0
 
     @jax.jit
-    def sloped(gains, along):
+    def value_and_derivative(gains, along):
         return jax.jvp(lambda gains: error(gains, trials[0]), (gains,), (along,))
 
     for along in np.eye(4):
         h = 1e-6
-        up, down = (sloped(point + s * h * along, along)[0] for s in (1, -1))
-        np.testing.assert_allclose(sloped(point, along)[1], (up - down) / (2 * h), rtol=1e-4)
+        up, down = (value_and_derivative(point + s * h * along, along)[0] for s in (1, -1))
+        np.testing.assert_allclose(value_and_derivative(point, along)[1], (up - down) / (2 * h), rtol=1e-4)
 
 
-def test_chain_is_built_with_an_order_and_functions():
+def test_chain_validates_its_order_and_functions():
     with pytest.raises(ValueError, match="order is 1, but must be a whole number of at least 2"):
         integrator_chain.chain(1)
     with pytest.raises(ValueError, match=r"^g\(x\) fails for x of shape \(3,\): index 3 is out of bounds"):
@@ -365,17 +372,17 @@ def test_chain_is_built_with_an_order_and_functions():
     stiff = jax.tree_util.Partial(lambda k, x: -k * x[0], vector(2.0))
     found = integrator_chain.chain(3, stiff)
     assert found.f is stiff
-    assert len(jax.tree.leaves(found)) == 1  # its parameter is a leaf: it can be traced
+    assert len(jax.tree.leaves(found)) == 1  # the parameter of a Partial is a leaf
     x = vector([0.5, 0.0, 1.0])
     np.testing.assert_array_equal(found.rate(vector(0.0), x, vector([3.0]), vector([0.5])), [0.0, 1.0, 2.5])
 
 
-def test_what_a_chain_lacks_has_no_value():
+def test_metrics_that_a_chain_lacks_are_nan():
     result = fly(chain_parts([1.0, 0.0]))
     assert np.isnan(float(result.metrics.peak_momentum))
     assert float(result.metrics.peak_rate) == pytest.approx(np.abs(result.log.x[:, 1]).max())
     assert float(result.metrics.terminal_angle) == float(result.metrics.terminal_error)
 
 
-def test_the_rate_of_a_chain_is_that_of_its_first_state_whatever_its_order():
+def test_speed_of_a_chain_is_the_magnitude_of_x_2():
     assert float(integrator_chain.chain(3).speed(vector([0.5, -2.0, 7.0]))) == 2.0

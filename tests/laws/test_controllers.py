@@ -1,3 +1,5 @@
+"""The law of the paper for a spacecraft, with the additive and the multiplicative attitude error."""
+
 from dataclasses import replace
 
 import jax
@@ -44,9 +46,9 @@ def state(seed: int) -> AttitudeState:
 @pytest.mark.parametrize("kind", KINEMATICS)
 @pytest.mark.parametrize("hold", [False, True])
 @pytest.mark.parametrize("seed", short([1, 2, 3], [1]))
-def test_closed_loop_error_obeys_the_equation_that_the_law_is_made_from(kind, hold, seed):
-    """s' with the true dynamics, by automatic differentiation along the motion, against (31) and (34) by hand."""
-    moving = SWING if kind is KINEMATICS[1] else SPIN  # w_f' counts too
+def test_sliding_variable_obeys_its_reaching_law(kind, hold, seed):
+    """s' along the motion of the plant, by automatic differentiation, equals (31) or (34)."""
+    moving = SWING if kind is KINEMATICS[1] else SPIN  # with w_f' for the multiplicative error
     run = parts(
         20.0,
         3.5,
@@ -70,20 +72,20 @@ def test_closed_loop_error_obeys_the_equation_that_the_law_is_made_from(kind, ho
     tau, tanh = 16.0, np.tanh(np.asarray(s) / 0.1)
     inverse = np.linalg.inv(np.asarray(FULL_INERTIA))
     q_e = attitude.multiply(attitude.conjugate(moving(t).q), x.q)
-    push = np.asarray(attitude.t_matrix(q_e if kind is KINEMATICS[1] else x.q)) @ inverse
-    switching = np.linalg.norm(push) * 0.05  # Frobenius
-    unseen = push @ np.asarray(d - d_hat)
+    gain = np.asarray(attitude.t_matrix(q_e if kind is KINEMATICS[1] else x.q)) @ inverse
+    switching = np.linalg.norm(gain) * 0.05  # Frobenius
+    estimation_error = gain @ np.asarray(d - d_hat)
     if hold:
         np.testing.assert_allclose(s, error_rate + 1.3 * error, atol=1e-14)
-        expected = 0.5 * (unseen - switching * tanh - 1.7 * np.asarray(s))  # the effective gain is K1/2
+        expected = 0.5 * (estimation_error - switching * tanh - 1.7 * np.asarray(s))  # the effective gain is K1/2
     else:
         np.testing.assert_allclose(s, tau * error_rate + 3.5 * error, atol=1e-13)
-        expected = -3.5 / tau * np.asarray(s) + tau / 2 * (unseen - switching * tanh)
-    np.testing.assert_allclose(s_dot, expected, atol=1e-12)  # sums of terms up to 1, rounding
+        expected = -3.5 / tau * np.asarray(s) + tau / 2 * (estimation_error - switching * tanh)
+    np.testing.assert_allclose(s_dot, expected, atol=1e-12)  # rounding errors of terms up to 1
 
 
 @pytest.mark.parametrize("case", REFERENCE["cases"], ids=lambda case: case["name"])
-def test_first_torque_of_the_reference_data_and_its_closed_form(case):
+def test_first_torque_and_s_equal_the_reference_data(case):
     run = parts(case["t_f"], case["eta"], case["delta"])
     first = case["trajectory"][0]
     x = AttitudeState(vector(first["q"]), vector(first["omega"]))
@@ -93,10 +95,10 @@ def test_first_torque_of_the_reference_data_and_its_closed_form(case):
     np.testing.assert_allclose(s, first["s"], rtol=1e-13)
 
 
-def test_smooth_sign_width_zero_is_the_exact_sign():
+def test_sign_width_0_is_the_discontinuous_sign():
     run = parts(20.0, 3.0, 0.5)
     x, target, d_hat = state(5), run.reference(vector(0.0)), jnp.zeros(3)
-    exact, s = commanded(
+    discontinuous, s = commanded(
         with_controller(run, sign_width=vector(0.0)).controller,
         vector(1.0),
         jnp.asarray(False),
@@ -105,7 +107,7 @@ def test_smooth_sign_width_zero_is_the_exact_sign():
         d_hat,
         vector(0.3),
     )
-    sharp, _ = commanded(
+    thin_layer, _ = commanded(
         with_controller(run, sign_width=vector(1e-12)).controller,
         vector(1.0),
         jnp.asarray(False),
@@ -115,10 +117,10 @@ def test_smooth_sign_width_zero_is_the_exact_sign():
         vector(0.3),
     )
     assert np.all(np.abs(s) > 1e-6)
-    np.testing.assert_array_equal(exact, sharp)
+    np.testing.assert_array_equal(discontinuous, thin_layer)
 
 
-def test_align_chooses_the_sign_of_the_reference_and_clearance_counts_from_its_side():
+def test_align_chooses_the_sign_of_the_reference_and_clearance_is_positive_there():
     law = parts().controller
     x = state(4)
     for flip_x in (1.0, -1.0):
@@ -131,7 +133,7 @@ def test_align_chooses_the_sign_of_the_reference_and_clearance_counts_from_its_s
 
 
 @pytest.mark.parametrize("hold", [False, True])
-def test_gradients_are_finite_at_the_awkward_points(hold):
+def test_gradients_are_finite_at_zero_error_and_rate(hold):
     run = parts(20.0, 3.0, 0.5)
     rest = AttitudeState(vector(0.0, 0.0, 0.0, 1.0), jnp.zeros(3))  # s = 0, no error, no rate
 
@@ -140,20 +142,20 @@ def test_gradients_are_finite_at_the_awkward_points(hold):
         return commanded(law, t, jnp.asarray(hold), rest, run.reference(t), jnp.zeros(3), vector(0.1))[0]
 
     for width in (0.0, 1e-3):
-        sharp = with_controller(run, sign_width=vector(width)).controller
+        law = with_controller(run, sign_width=vector(width)).controller
         for t in (0.0, 19.5, 20.0, 25.0) if hold else (0.0, 19.5):
-            slopes = jax.jacfwd(u)(sharp, vector(t), None)
-            assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(slopes))
+            gradients = jax.jacfwd(u)(law, vector(t), None)
+            assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(gradients))
 
 
-def test_the_norm_in_the_switching_term_is_not_below_the_spectral_one():
+def test_norm_in_the_switching_term_is_at_least_the_spectral_norm():
     body = rigid_body.spacecraft(FULL_INERTIA)
     for seed in range(20):
         matrix = np.asarray(attitude.t_matrix(state(seed).q) @ body.inertia_inverse)
         assert np.linalg.norm(matrix) >= np.linalg.norm(matrix, 2)
 
 
-def test_multiplicative_error_is_the_vector_part_of_the_error_quaternion_and_its_rate():
+def test_multiplicative_error_and_rate_equal_vector_part_of_scipy_error_quaternion():
     law = parts(kinematics=KINEMATICS[1]).controller
     for seed in range(5):
         x, t = state(seed), vector(3.0 + seed)
@@ -162,61 +164,74 @@ def test_multiplicative_error_is_the_vector_part_of_the_error_quaternion_and_its
         q_e = found.as_quat()
         np.testing.assert_allclose(error * np.sign(law.clearance(x, SWING(t))), q_e[:3] * np.sign(q_e[3]), atol=1e-15)
 
-        def along(time, x=x, t=t):
+        def error_at(time, x=x, t=t):
             body = AttitudeState(x.q + (time - t) * attitude.derivative(x.q, x.w), x.w)
             return law.kinematics.errors(body, SWING(time))[0]
 
-        np.testing.assert_allclose(jax.jvp(along, (t,), (jnp.ones_like(t),))[1], error_rate, atol=1e-14)
+        np.testing.assert_allclose(jax.jvp(error_at, (t,), (jnp.ones_like(t),))[1], error_rate, atol=1e-14)
 
 
-def flown(law, reference, start, rate=(0.0, 0.0, 0.0), quiet=True, **others):
-    """A run with the default disturbance, or by the same program without; of the multiplicative law finely stepped."""
-    none = {"disturbance": disturbances.Sinusoid(*[jnp.zeros(3)] * 4), "rate_bound": 0.0} if quiet else {}
+def slew(kinematics, reference, start, rate=(0.0, 0.0, 0.0), undisturbed=True, **others):
+    """Return the parts of a run to a reference, without a disturbance or with the default one.
+
+    The disturbance of zero has the same type as the default one, so that both runs use one compiled program. With the
+    multiplicative error the time steps are halved.
+    """
+    none = {"disturbance": disturbances.Sinusoid(*[jnp.zeros(3)] * 4), "rate_bound": 0.0} if undisturbed else {}
     run = parts(
-        20.0, 3.5, 0.1, inertia=FULL_INERTIA, q=start, rate=rate, reference=reference, kinematics=law, **none, **others
+        20.0,
+        3.5,
+        0.1,
+        inertia=FULL_INERTIA,
+        q=start,
+        rate=rate,
+        reference=reference,
+        kinematics=kinematics,
+        **none,
+        **others,
     )
-    return finer(run, 2) if law is KINEMATICS[1] else run
+    return finer(run, 2) if kinematics is KINEMATICS[1] else run
 
 
 def fixed(q):
-    """By the program of those that spin."""
+    """Return a reference at rest, of the type of rotating ones, so that both use one compiled program."""
     return references.Spin(vector(q), jnp.zeros(3))
 
 
-# through 180 degrees from the inertial identity, where q_f4 changes its sign
+# this reference passes 180 degrees from the inertial frame, where q_f4 changes its sign
 CROSSING = references.Spin(vector(Rotation.from_rotvec([2.9, 0.2, 0.1]).as_quat()), vector(0.04, 0.01, -0.02))
 AWAY = vector((Rotation.from_rotvec([2.9, 0.2, 0.1]) * Rotation.from_rotvec([0.5, -1.2, 0.8])).as_quat())
 
 
-def test_vector_part_moves_as_solution_1_says_while_the_reference_crosses_the_additive_laws_singularity():
-    run = flown(KINEMATICS[1], CROSSING, AWAY, (0.03, 0.0, -0.02))
+def test_multiplicative_error_follows_exact_solution_1_while_reference_crosses_additive_singularity():
+    run = slew(KINEMATICS[1], CROSSING, AWAY, (0.03, 0.0, -0.02))
     result = fly(run)
     before = result.log.t < 19.89
     assert result.status == rollout.OK
-    assert np.ptp(np.sign(result.log.reference.q[before, 3])) == 2  # it does cross
+    assert np.ptp(np.sign(result.log.reference.q[before, 3])) == 2  # the reference crosses the singularity
     target = run.reference(vector(0.0))
     start = run.controller.kinematics.errors(run.controller.kinematics.align(run.initial, target), target)
     exact = errors_along(result.log.t, vector(20.0), vector(3.5), *start)
     np.testing.assert_allclose(result.log.error[before], exact.error[before], rtol=0, atol=1e-10)
-    # the torque of the exact motion, from the inverse map of `theory`, is the one that was flown
+    # the simulated torque equals the torque of the exact motion, from the inverse dynamics of `theory`
     u = inputs_along(run, result.log.t)[before]
-    feedback = 2 * 14 * 3.5**2 / (20.0 - result.log.t[before]) ** 2  # what an error of 1e-10 costs in torque
+    feedback = 2 * 14 * 3.5**2 / (20.0 - result.log.t[before]) ** 2  # torque for an error of 1e-10 is 1e-10 times this
     assert np.all(np.abs(u - result.log.u[before]).max(axis=1) < 1e-9 * np.maximum(feedback, 1.0))
 
 
-@pytest.mark.long  # each of both is seen by itself: `test_align_chooses..`, and the test above
-def test_a_slew_on_which_the_additive_law_fails_and_the_multiplicative_one_does_not():
-    additive, other = (fly(flown(law, CROSSING, AWAY, quiet=False)) for law in KINEMATICS)
+@pytest.mark.long  # short tests of both: `test_align_chooses..`, and the test above
+def test_additive_error_is_singular_on_a_slew_on_which_the_multiplicative_error_is_not():
+    additive, multiplicative = (fly(slew(kind, CROSSING, AWAY, undisturbed=False)) for kind in KINEMATICS)
     assert additive.status == rollout.SINGULAR
     assert 0.0 < additive.bad_time < 20.0
-    assert other.status == rollout.OK
-    assert other.metrics.terminal_angle < 1e-3
+    assert multiplicative.status == rollout.OK
+    assert multiplicative.metrics.terminal_angle < 1e-3
 
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_multiplicative_loop_does_not_depend_on_the_inertial_frame(seed):
     turn = vector(Rotation.random(rng=np.random.default_rng(seed)).as_quat())
-    run = flown(KINEMATICS[1], CROSSING, AWAY, (0.01, 0.02, 0.0), quiet=False)
+    run = slew(KINEMATICS[1], CROSSING, AWAY, (0.01, 0.02, 0.0), undisturbed=False)
     turned = replace(
         run,
         initial=AttitudeState(attitude.multiply(turn, run.initial.q), run.initial.w),
@@ -226,29 +241,29 @@ def test_multiplicative_loop_does_not_depend_on_the_inertial_frame(seed):
     for name in ("w", "error", "d_hat"):
         a, b = (getattr(r.log.x if name == "w" else r.log, name) for r in (one, other))
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-12, err_msg=name)
-    early = one.log.t < 19.0  # nearer to t_f the feedback gain multiplies rounding by 2 J eta^2 / tau^2, over 300
+    early = one.log.t < 19.0  # later the feedback gain 2 J eta^2 / tau^2 amplifies rounding errors by more than 300
     np.testing.assert_allclose(one.log.u[early], other.log.u[early], rtol=0, atol=1e-12)
     expected = np.asarray(jax.jit(jax.vmap(lambda q: attitude.multiply(turn, q)))(jnp.asarray(one.log.x.q)))
     signs = np.sign(np.sum(expected * other.log.x.q, axis=1, keepdims=True))
     np.testing.assert_allclose(other.log.x.q * signs, expected, rtol=0, atol=1e-12)
-    # the additive law's motion does depend on it
-    additive = flown(KINEMATICS[0], CROSSING, AWAY, (0.01, 0.02, 0.0), quiet=False)
+    # with the additive error the motion depends on the frame
+    additive = slew(KINEMATICS[0], CROSSING, AWAY, (0.01, 0.02, 0.0), undisturbed=False)
     a, b = (fly(replace(additive, initial=r.initial, reference=r.reference)) for r in (run, turned))
     assert np.abs(a.log.x.w[: len(a.log.t) // 4] - b.log.x.w[: len(b.log.t) // 4]).max() > 1e-3
 
 
-def test_signs_and_ways_round():
-    """Either sign of q flies the same path; the additive law's path leads past the identity, the long way round."""
-    about = np.array([0.6, 0.0, 0.8])
-    start, end = (vector(Rotation.from_rotvec(np.deg2rad(a) * about).as_quat()) for a in (150.0, 210.0))
+def test_sign_of_q_does_not_change_the_path_and_additive_error_takes_the_longer_one():
+    """With the additive error the path passes the inertial frame, here the longer way."""
+    axis = np.array([0.6, 0.0, 0.8])
+    start, end = (vector(Rotation.from_rotvec(np.deg2rad(a) * axis).as_quat()) for a in (150.0, 210.0))
     turned = {}
-    for law in KINEMATICS:
+    for kind in KINEMATICS:
         for sign in (1.0, -1.0):
-            result = fly(flown(law, fixed(end), sign * start))
+            result = fly(slew(kind, fixed(end), sign * start))
             assert result.status == rollout.OK
             assert result.metrics.terminal_angle < 1e-4
             speed = np.linalg.norm(result.log.x.w, axis=1)
-            turned[law, sign] = np.rad2deg(np.trapezoid(speed, result.log.t))
+            turned[kind, sign] = np.rad2deg(np.trapezoid(speed, result.log.t))
     near, far = turned[KINEMATICS[1], 1.0], turned[KINEMATICS[0], 1.0]
     assert near == pytest.approx(60.0, abs=0.1)
     assert far == pytest.approx(300.0, abs=0.5)
@@ -256,31 +271,31 @@ def test_signs_and_ways_round():
     assert turned[KINEMATICS[0], -1.0] == pytest.approx(far, abs=1e-9)
 
 
-def test_multiplicative_law_is_singular_at_a_true_error_of_180_degrees_only():
+def test_multiplicative_error_is_singular_at_180_degrees_only():
     law = parts(kinematics=KINEMATICS[1]).controller
     opposite = references.Fixed(vector(Rotation.from_rotvec([0.0, np.pi, 0.0]).as_quat()))(vector(0.0))
     near = Rotation.from_rotvec([0.0, 1e-3, 0.0])
     x = AttitudeState(vector(near.as_quat()), jnp.zeros(3))
     assert abs(float(law.clearance(x, opposite))) == pytest.approx(np.sin(5e-4), rel=1e-9)
-    # too fast a start away from the reference: |v| passes 1, at a node of the grid or between two of them
-    run = flown(KINEMATICS[1], fixed([0.0, 0.0, 0.0, 1.0]), vector(0.0, 0.6, 0.0, 0.8), (0.0, 0.9, 0.0))
+    # a fast initial rate away from the reference: |v| exceeds 1, at a node of the time grid or between two nodes
+    run = slew(KINEMATICS[1], fixed([0.0, 0.0, 0.0, 1.0]), vector(0.0, 0.6, 0.0, 0.8), (0.0, 0.9, 0.0))
     assert fly(run).status in (rollout.SINGULAR, rollout.TOO_FAST)
-    # |v(0)| + t_f |v'(0)| / (e eta) < 1 is enough
-    calm = flown(KINEMATICS[1], fixed([0.0, 0.0, 0.0, 1.0]), vector(0.0, 0.6, 0.0, 0.8), (0.0, 0.45, 0.0))
-    error, error_rate = calm.controller.kinematics.errors(calm.initial, calm.reference(vector(0.0)))
+    # |v(0)| + t_f |v'(0)| / (e eta) < 1 is sufficient
+    slow = slew(KINEMATICS[1], fixed([0.0, 0.0, 0.0, 1.0]), vector(0.0, 0.6, 0.0, 0.8), (0.0, 0.45, 0.0))
+    error, error_rate = slow.controller.kinematics.errors(slow.initial, slow.reference(vector(0.0)))
     assert np.linalg.norm(error) + 20.0 * np.linalg.norm(error_rate) / (np.e * 3.5) < 1.0
-    assert fly(calm).status == rollout.OK
+    assert fly(slow).status == rollout.OK
 
 
 @pytest.mark.parametrize("hold", [False, True])
-def test_the_switching_rate_is_what_the_sign_does_to_s_at_the_reference(hold):
-    """K2 takes s' down by tau times it before the hand-over, by it after; at T = I, where |T J^-1| is largest."""
+def test_switching_rate_equals_the_change_of_acceleration_by_k2_at_the_reference(hold):
+    """At the reference T(q) = I, for which |T J^-1| is largest."""
     run = parts(20.0, 3.5, 0.5, inertia=FULL_INERTIA, kinematics=KINEMATICS[1], sign_width=1e-6)
     law, t = run.controller, vector(4.0)
     x = AttitudeState(vector([0.0, 0.0, 0.0, 1.0]), vector([0.3, 0.2, 0.1]))
     target = references.Fixed(vector([0.0, 0.0, 0.0, 1.0]))(t)
-    quiet, switched = (
+    unswitched, switched = (
         commanded(law, t, jnp.asarray(hold), x, target, jnp.zeros(3), vector(k2))[0] for k2 in (0.0, 0.05)
     )
-    acceleration = 0.5 * run.plant.inertia_inverse @ (switched - quiet)
+    acceleration = 0.5 * run.plant.inertia_inverse @ (switched - unswitched)
     np.testing.assert_allclose(acceleration, np.full(3, -switching_rate(law, vector(0.05))), rtol=1e-12)

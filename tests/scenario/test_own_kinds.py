@@ -191,8 +191,8 @@ class Filtered(ptsmc.SampledObserver):
     def begin(self):
         return {"last": jnp.zeros(1), "estimate": jnp.zeros(1)}
 
-    def step(self, memory, seen, t, dt):
-        return {"last": seen, "estimate": self.share * seen + (1.0 - self.share) * memory["last"]}
+    def step(self, memory, d_mean, t, dt):
+        return {"last": d_mean, "estimate": self.share * d_mean + (1.0 - self.share) * memory["last"]}
 
     def estimate(self, memory):
         return memory["estimate"]
