@@ -1,3 +1,6 @@
+"""The nonlinear disturbance observer: digital and continuous form against closed forms, and its error bound."""
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -15,20 +18,20 @@ def observer(inertia=FULL_INERTIA, gain=(10.0, 4.0, 25.0), c=1e-3, start=0.0):
 
 
 @pytest.mark.parametrize("dt", [0.0, 1e-9, 0.05, 1.0, 1e3])
-def test_update_matrix_is_one_minus_the_exponential_over_dt(dt):
+def test_update_matrix_equals_its_closed_form(dt):
     found = observer()
     a = np.diag([10.0, 4.0, 25.0]) @ np.linalg.inv(FULL_INERTIA)
     expected = a if dt == 0.0 else (np.eye(3) - expm(-a * dt)) / dt
-    rounding = 1e-6 if dt == 1e-9 else 1e-14  # the oracle loses 1e-16/(a dt) to cancellation
+    rounding = 1e-6 if dt == 1e-9 else 1e-14  # the expected value has a cancellation error of 1e-16/(a dt)
     np.testing.assert_allclose(found.update_matrix(vector(dt)), expected, rtol=1e-12, atol=rounding)
 
 
-def body(w):
+def body_state(w):
     return rigid_body.AttitudeState(vector(0.0, 0.0, 0.0, 1.0), vector(w))
 
 
 def held_motion(inertia, torque, seconds, steps=2000):
-    """Rates at both ends of a period of held torque, by numpy RK4 in many steps."""
+    """Return the rates at both ends of a period with constant torque, by RK4 in NumPy with many steps."""
     inverse = np.linalg.inv(inertia)
     w = np.array([0.05, -0.1, 0.08])
     start, h = w, seconds / steps
@@ -50,15 +53,15 @@ def test_digital_estimate_of_a_constant_disturbance_is_unbiased(gain):
     d, u, h = np.array([0.02, -0.03, 0.01]), np.array([0.1, 0.3, -0.2]), 0.05
     w, w_next = held_motion(np.asarray(FULL_INERTIA), u + d, h)
     matrix = found.update_matrix(vector(h))
-    impulse = found.model.unexplained_impulse(vector(h), body(w), body(w_next), vector(u), vector(h))
+    impulse = found.model.unexplained_impulse(vector(h), body_state(w), body_state(w_next), vector(u), vector(h))
     d_hat = found.update(matrix, vector(d), impulse, vector(h), vector(h))
-    # what is right stays; the mean of both gyroscopic torques is the trapezium rule: h^2/12 (d^2/dt^2 of 0.01 N m)
+    # the correct estimate does not change; the trapezoidal rule for the gyroscopic torque has an error of order h^2/12
     np.testing.assert_allclose(d_hat, d, atol=1e-6)
 
 
 @pytest.mark.parametrize("inertia", [PAPER_INERTIA, FULL_INERTIA, (1e-3, 1.2e-3, 1.5e-3)])
 @pytest.mark.parametrize("dt", [1e-3, 0.05, 10.0])
-def test_digital_update_contracts_for_any_gain_and_period(inertia, dt):
+def test_digital_update_is_stable_for_any_gain_and_period(inertia, dt):
     for gain in (0.5, 10.0, 300.0):
         found = observer(inertia, (gain,) * 3)
         matrix = np.asarray(found.update_matrix(vector(dt)))
@@ -66,36 +69,36 @@ def test_digital_update_contracts_for_any_gain_and_period(inertia, dt):
         assert np.all((modes >= -1e-12) & (modes < 1.0))
 
 
-def test_continuous_error_obeys_its_equation():
-    """(54) with the true motion: d_hat' = forcing - A d_hat must be -A (d_hat - d)."""
+def test_continuous_estimation_error_obeys_54():
+    """For the motion of the plant, d_hat' = forcing - A d_hat equals -A (d_hat - d)."""
     found = observer()
     w, u, d, d_hat = (vector(np.random.default_rng(k).normal(size=3)) for k in range(4))
-    x_dot = rigid_body.spacecraft(FULL_INERTIA).rate(NOW, body(w), u, d)
+    x_dot = rigid_body.spacecraft(FULL_INERTIA).rate(NOW, body_state(w), u, d)
     a = np.diag([10.0, 4.0, 25.0]) @ np.linalg.inv(FULL_INERTIA)
     np.testing.assert_allclose(found.decay_matrix(NOW, NOW), a, rtol=1e-12)
     found_rate = (
-        found.forcing(NOW, (NOW, NOW), d_hat, found.model.unexplained(NOW, body(w), x_dot, u))
+        found.forcing(NOW, (NOW, NOW), d_hat, found.model.unexplained(NOW, body_state(w), x_dot, u))
         - found.decay_matrix(NOW, NOW) @ d_hat
     )
     np.testing.assert_allclose(found_rate, -a @ np.asarray(d_hat - d), atol=1e-12)
 
 
-def test_bound_is_the_corrected_one():
+def test_error_bound_equals_the_corrected_form_of_55():
     bound = observer(PAPER_INERTIA, (10.0,) * 3).error_bound()
     rate = 10.0 / 14.0
     for t in (0.0, 0.7, 5.0, 100.0):
-        expected = np.sqrt(3) * 1e-3 / rate * (1 - np.exp(-rate * t))  # with sqrt(3), against the paper's (55)
+        expected = np.sqrt(3) * 1e-3 / rate * (1 - np.exp(-rate * t))  # (55) lacks the factor sqrt(3)
         np.testing.assert_allclose(bound(vector(t)), expected, atol=1e-17)
 
 
 def worst_error(a, sign_pattern, c, seconds, steps=20000):
-    """Estimation error for d' = +-c held in a fixed sign pattern along the slowest mode, exactly: -A^-1 (I - E) c."""
+    """Return the exact estimation error for constant d' = +-c with this sign pattern: A^-1 (I - E) c."""
     return np.linalg.solve(a, (np.eye(3) - expm(-a * seconds)) @ (c * sign_pattern))
 
 
 @pytest.mark.parametrize("inertia", [PAPER_INERTIA, FULL_INERTIA])
 @pytest.mark.parametrize("gain", [(10.0, 10.0, 10.0), (30.0, 3.0, 10.0)])
-def test_error_stays_inside_the_bound_and_can_come_near_it(inertia, gain):
+def test_worst_error_is_within_the_bound_and_above_a_quarter_of_it(inertia, gain):
     found = observer(inertia, gain)
     bound, a = found.error_bound(), np.asarray(found.decay_matrix(NOW, NOW))
     signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
@@ -105,40 +108,38 @@ def test_error_stays_inside_the_bound_and_can_come_near_it(inertia, gain):
         for sign in signs
     ]
     assert max(ratios) <= 1.0 + 1e-12
-    assert max(ratios) > 0.25  # no empty bound
+    assert max(ratios) > 0.25  # the bound is not too large
     initial = observer(inertia, gain, c=0.0, start=0.05).error_bound()
     for t in (0.0, 0.5, 3.0):
-        gone = np.linalg.norm(expm(-a * t) @ np.eye(3), axis=0).max() * 0.05
-        assert gone <= float(initial(vector(t))) * (1 + 1e-12)
+        largest = np.linalg.norm(expm(-a * t) @ np.eye(3), axis=0).max() * 0.05
+        assert largest <= float(initial(vector(t))) * (1 + 1e-12)
 
 
-def test_the_bound_of_gains_that_differ_carries_the_root_of_their_condition():
-    """Where J is not diagonal the smallest eigenvalue alone, with the sqrt(3), is less than what a ramp leaves."""
+def test_bound_for_unequal_gains_has_the_factor_root_of_their_condition_number():
+    """If J is not diagonal, the bound without this factor is less than the error for a ramp disturbance."""
     inertia, gain = np.array([[0.5, 1.0, 0.0], [1.0, 6.5, 0.0], [0.0, 0.0, 6.9]]), np.array([10.0, 5e3, 1e4])
     found = observer(inertia, gain)
-    left = np.linalg.norm(worst_error(np.asarray(found.decay_matrix(NOW, NOW)), np.ones(3), 1e-3, 100.0))
+    error = np.linalg.norm(worst_error(np.asarray(found.decay_matrix(NOW, NOW)), np.ones(3), 1e-3, 100.0))
     slowest = np.linalg.eigvalsh(np.linalg.inv(inertia) * np.sqrt(np.outer(gain, gain))).min()
-    alone = np.sqrt(3.0) * 1e-3 / slowest
-    assert left > 1.25 * alone
+    without_factor = np.sqrt(3.0) * 1e-3 / slowest
+    assert error > 1.25 * without_factor
     bound = found.error_bound()
-    np.testing.assert_allclose(bound.floor, np.sqrt(1e3) * alone, rtol=1e-12)
+    np.testing.assert_allclose(bound.floor, np.sqrt(1e3) * without_factor, rtol=1e-12)
     np.testing.assert_allclose(observer(inertia, gain, start=0.2).error_bound().start, np.sqrt(1e3) * 0.2, rtol=1e-12)
-    assert left < float(bound(vector(100.0)))
+    assert error < float(bound(vector(100.0)))
 
 
-def test_paper_bound_is_violated_in_its_own_case():
-    """c/l_m, without the sqrt(3), is below the error that d' = (c, c, c) leaves with a diagonal J."""
+def test_bound_of_the_paper_is_violated_for_its_own_parameters():
+    """c/l_m without the factor sqrt(3) is less than the error for d' = (c, c, c) and a diagonal J."""
     a = np.diag(10.0 / np.array(PAPER_INERTIA))
     error = np.linalg.norm(worst_error(a, np.ones(3), 1e-3, 100.0))
     assert error > 1e-3 / (10.0 / 14.0)
     assert error < float(observer(PAPER_INERTIA, (10.0,) * 3).error_bound()(vector(100.0)))
 
 
-def test_finite_derivative_for_equal_moments():
-    import jax
-
+def test_derivative_of_the_bound_is_finite_for_equal_moments_of_inertia():
     def floor(gain):
         return observer((5.0, 5.0, 5.0), jnp.full(3, gain)).error_bound().floor
 
-    slope = jax.jit(jax.jacfwd(floor))(vector(10.0))
-    np.testing.assert_allclose(slope, -np.sqrt(3) * 1e-3 * 5.0 / 100.0, rtol=1e-10)
+    derivative = jax.jit(jax.jacfwd(floor))(vector(10.0))
+    np.testing.assert_allclose(derivative, -np.sqrt(3) * 1e-3 * 5.0 / 100.0, rtol=1e-10)

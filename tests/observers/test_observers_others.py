@@ -1,4 +1,4 @@
-"""Prescribed-time and finite-time observers: closed forms, bounds, digital forms; all observers on all plants."""
+"""Prescribed-time and finite-time observers against closed forms and bounds, and all observers on all plants."""
 
 import itertools
 from dataclasses import replace
@@ -30,21 +30,21 @@ def finite(model: base.Plant = MASS, gain=1.0, c=0.0, start=0.0, width=0.0):
     return finite_time.FiniteTimeObserver(model, vector([gain] * model.inputs), vector(c), vector(start), vector(width))
 
 
-def kept(t, gain=GAIN, mu=MU):
-    """Share of an initial error that is left: e^(-l t) rho^mu, then e^(-l t) on top."""
+def remaining_fraction(t, gain=GAIN, mu=MU):
+    """Return e(t) / e(0) for a constant disturbance: e^(-l t) rho^mu, where rho is constant after T_o - delta_o."""
     return np.exp(-gain * t) * (max(T_O - t, DELTA_O) / T_O) ** mu
 
 
 @pytest.mark.parametrize("h", [0.05, 0.3])
-def test_digital_prescribed_time_observer_forgets_as_its_closed_form_says(h):
+def test_digital_prescribed_time_observer_error_equals_closed_form(h):
     found, d = prescribed(), 0.4
     matrix, memory = found.update_matrix(vector(h)), found.begin()
     for k in range(1, 30):
-        memory = found.update(matrix, memory, vector([d * h]), vector(k * h), vector(h))  # impulse of a constant d
-        np.testing.assert_allclose(found.estimate(memory) - d, [-d * kept(k * h)], rtol=1e-12, atol=1e-16)
+        memory = found.update(matrix, memory, vector([d * h]), vector(k * h), vector(h))  # the impulse of a constant d
+        np.testing.assert_allclose(found.estimate(memory) - d, [-d * remaining_fraction(k * h)], rtol=1e-12, atol=1e-16)
 
 
-def test_prescribed_time_update_for_a_full_inertia_is_the_matrix_exponential():
+def test_prescribed_time_update_for_a_full_inertia_equals_matrix_exponential():
     found = prescribed(rigid_body.spacecraft(FULL_INERTIA), gain=10.0)
     t, h = 3.0, 0.5
     a = 10.0 * np.linalg.inv(FULL_INERTIA)
@@ -54,57 +54,62 @@ def test_prescribed_time_update_for_a_full_inertia_is_the_matrix_exponential():
     np.testing.assert_allclose(got, factor @ d_hat + (np.eye(3) - factor) @ impulse / h, rtol=1e-12)
 
 
-def test_updates_of_length_zero_change_nothing_and_have_finite_slopes():
+def test_updates_of_length_zero_change_nothing_and_have_finite_derivatives():
     for found in (prescribed(), finite()):
 
-        def moved(dt, found=found):
+        def updated(dt, found=found):
             memory = found.begin() + 0.1
             return found.update(found.update_matrix(dt), memory, vector([0.02]) * dt, vector(1.0), dt)
 
-        slope = jax.jit(jax.jacfwd(moved))(vector(0.0))
-        assert np.all(np.isfinite(slope))
+        derivative = jax.jit(jax.jacfwd(updated))(vector(0.0))
+        assert np.all(np.isfinite(derivative))
         if isinstance(found, prescribed_time.PrescribedTimeObserver):
-            np.testing.assert_allclose(moved(vector(0.0)), 0.1)
+            np.testing.assert_allclose(updated(vector(0.0)), 0.1)
 
 
-def continuous(observer, disturbance, t_f=6.0, steps=400):
-    """A chain at rest under law and observer in the continuous loop, its log."""
+def simulate_continuous(observer, disturbance, t_f=6.0, steps=400):
+    """Return the history of a chain with this observer in the continuous loop."""
     run = chain_parts([0.3, 0.0], t_f, 3.0, 0.1, observer=observer, disturbance=disturbance, bound=0.0)
     nodes = vector(observer.nodes())
     timing = replace(run.clock, saves=nodes, before=steps, after=steps, max_step=vector(3.0 * t_f / steps))
     return fly(replace(run, clock=timing)).log
 
 
-def test_continuous_prescribed_time_observer_forgets_as_its_closed_form_says():
+def test_continuous_prescribed_time_observer_error_equals_closed_form():
     d = 0.4
-    log = continuous(prescribed(), disturbances.Constant(vector([d])))
-    expected = np.array([-d * kept(t) for t in log.t])
-    # order 4 on nodes a tenth nearer each: 1e-7; it is what is left of d that counts
+    log = simulate_continuous(prescribed(), disturbances.Constant(vector([d])))
+    expected = np.array([-d * remaining_fraction(t) for t in log.t])
+    # integration error of order 4 with the nodes of the observer: 1e-7
     np.testing.assert_allclose(log.d_hat[:, 0] - d, expected, rtol=0, atol=1e-6 * d)
 
 
 @pytest.mark.parametrize("gain", [0.05, 0.7, 5.0])
-def test_prescribed_time_bound_holds_against_the_worst_disturbance_and_is_no_empty_one(gain):
+def test_prescribed_time_bound_is_between_1_and_2_times_the_worst_error(gain):
     c, start = 0.3, 0.4
     bound = prescribed(gain=gain, c=c, start=start).error_bound()
     for t in (0.0, 0.5, 2.0, 3.5, 3.8, 4.5, 9.0):
         # e' = -(l + mu/(T_o - t)) e + c from the largest start: the integral of its propagator
-        gathered = quad(lambda u, t=t: kept(t, gain) / kept(u, gain), 0.0, t, points=[3.8] if t > 3.8 else None)[0]
-        worst = start * kept(t, gain) + c * gathered
+        integral = quad(
+            lambda u, t=t: remaining_fraction(t, gain) / remaining_fraction(u, gain),
+            0.0,
+            t,
+            points=[3.8] if t > 3.8 else None,
+        )[0]
+        worst = start * remaining_fraction(t, gain) + c * integral
         assert worst <= float(bound(vector(t))) * (1 + 1e-9)
         assert float(bound(vector(t))) < 2.0 * worst
     assert float(jax.vmap(bound)(jnp.linspace(0.0, 20.0, 500)).max()) <= float(bound.largest)
-    # without l the bound is the exact one of the theory notes
-    bare = prescribed(gain=1e-9, c=c, start=start).error_bound()
+    # for l = 0 the bound is the exact solution
+    without_gain = prescribed(gain=1e-9, c=c, start=start).error_bound()
     rho = (T_O - 2.0) / T_O
     exact = rho**MU * start + c * 2.0 * (1 - rho ** (MU - 1)) / (MU - 1)
-    np.testing.assert_allclose(bare(vector(2.0)), exact, rtol=1e-6)
+    np.testing.assert_allclose(without_gain(vector(2.0)), exact, rtol=1e-6)
 
 
-@pytest.mark.long  # its motion and its bound by closed forms: the tests above; of every plant: below
+@pytest.mark.long  # short tests: closed forms above, all plants below
 @pytest.mark.parametrize("mode", ["continuous", "sampled"])
-def test_prescribed_time_observer_is_inside_its_bound_at_its_own_time(mode):
-    """For a spacecraft with a full inertia under a sinusoid, in the whole loop."""
+def test_prescribed_time_observer_of_a_spacecraft_is_within_its_bound(mode):
+    """The simulation has a full inertia matrix and a sinusoidal disturbance."""
     tables = {
         "spacecraft": {"inertia": FULL_INERTIA},
         "observer": {"kind": "prescribed_time", "t_o": 6.0, "mu": 3.0},
@@ -115,13 +120,13 @@ def test_prescribed_time_observer_is_inside_its_bound_at_its_own_time(mode):
     log, bound = fly(ready.parts).log, ready.parts.observer.error_bound()
     limit = np.asarray(jax.vmap(bound)(vector(log.t)))
     size = np.linalg.norm(log.d_hat - log.disturbance, axis=1)
-    late = 0.002 if mode == "sampled" else 1e-9  # a sampled estimate is half a period old: c sqrt(3) h / 2, and more
-    assert np.all(size <= limit + late)
+    delay = 0.002 if mode == "sampled" else 1e-9  # a sampled estimate is at least half a period old: c sqrt(3) h / 2
+    assert np.all(size <= limit + delay)
     assert size[np.searchsorted(log.t, 5.95)] < 0.15 * size[0]
 
 
 def super_twisting(gain, d, seconds, start=0.0):
-    """The error e = d_hat - d(t) of the exact-sign observer, by SciPy in tiny steps: (times, errors)."""
+    """Return times and errors d_hat - d of the observer with a discontinuous sign, integrated by SciPy."""
     width = 1e-9
 
     def rate(t, y):
@@ -135,78 +140,78 @@ def super_twisting(gain, d, seconds, start=0.0):
     return found.t, found.y[1] - np.array([d(t) for t in found.t])
 
 
-@pytest.mark.parametrize(("share", "constant"), [(0.0, 1.2519), (0.5, 3.1), (1.0, 33.3)])
-def test_finite_time_bound_is_the_geometric_series_of_its_overshoots(share, constant):
-    bound = finite(gain=2.0, c=2.0 * share, start=0.6).error_bound()
+@pytest.mark.parametrize(("ratio", "constant"), [(0.0, 1.2519), (0.5, 3.1), (1.0, 33.3)])
+def test_settling_time_of_the_finite_time_bound_equals_its_geometric_series(ratio, constant):
+    bound = finite(gain=2.0, c=2.0 * ratio, start=0.6).error_bound()
     np.testing.assert_allclose(bound.settled, constant * 0.6 / 2.0, rtol=0.01)
     assert float(bound(bound.settled * 0.99)) == pytest.approx(0.6)
     assert float(bound(bound.settled * 1.01)) == 0.0
 
 
-@pytest.mark.parametrize("share", [0.0, 0.3, 0.6, 0.9])
-def test_no_disturbance_that_keeps_to_its_rate_beats_the_overshoots_of_the_finite_time_bound(share):
-    """Half a cycle, e0 from 0 to 0, with d' = +-share c switched on the lines e = k sqrt(e0): the worst of many."""
-    limit = np.interp(share, np.linspace(0, 1, 11), finite_time._OVERSHOOT)
+@pytest.mark.parametrize("ratio", [0.0, 0.3, 0.6, 0.9])
+def test_no_disturbance_within_its_rate_bound_exceeds_the_overshoot_of_the_finite_time_bound(ratio):
+    """e0 moves from 0 to 0 while d' = +-ratio c changes its sign on a line e = k sqrt(e0); the worst of several k."""
+    limit = np.interp(ratio, np.linspace(0, 1, 11), finite_time._OVERSHOOT)
     worst, h = 0.0, 5e-4
     for switch in (-9.0, 0.0, 0.5, 1.0, 1.5, 2.0, 9.0):
-        root, error = 1e-6, 1.0  # root of e0, which moves smoothly through the start
-        while root > 0.0 and root + abs(error) > 1e-4:  # a slow enough e comes to rest without another cycle
-            rate = 1.1 - share if error > switch * root else 1.1 + share
-            # e0' = e - 1.5 root: in s with dt = 2 root ds both are smooth
+        root, error = 1e-6, 1.0  # root = sqrt(e0), which is smooth at the start
+        while root > 0.0 and root + abs(error) > 1e-4:  # a small e settles without another cycle
+            rate = 1.1 - ratio if error > switch * root else 1.1 + ratio
+            # e0' = e - 1.5 root; with a new time s, dt = 2 root ds, both equations are smooth
             root, error = root + h * (error - 1.5 * root), error - 2.0 * root * h * rate
         worst = max(worst, -error)
     assert limit - 0.01 < worst <= limit + 0.002
 
 
 @pytest.mark.parametrize("h", short([0.002, 0.02], [0.02]))
-def test_digital_finite_time_observer_finds_a_constant_within_its_time_and_rests_there(h):
+def test_digital_finite_time_observer_is_exact_after_its_settling_time(h):
     found, d = finite(gain=0.5, start=0.4), 0.4
     memory, settled = found.begin(), None
     for k in range(1, int(4.0 / h)):
         memory = found.update(found.update_matrix(vector(h)), memory, vector([d * h]), vector(k * h), vector(h))
         if k * h > float(found.error_bound().settled) + 3 * h:
-            np.testing.assert_allclose(found.estimate(memory), [d], atol=1e-12)  # exactly: it does not chatter
+            np.testing.assert_allclose(found.estimate(memory), [d], atol=1e-12)  # exact, without chattering
             settled = k * h
     assert settled is not None
 
 
-def test_digital_finite_time_observer_follows_the_equations_with_order_1():
-    found, slope = finite(gain=0.5), 0.3
-    t, expected = super_twisting(0.5, lambda t: 0.4 + slope * np.sin(t), 3.0)
-    update, off = jax.jit(lambda memory, *now: found.update(found.update_matrix(now[-1]), memory, *now)), []
+def test_digital_finite_time_observer_converges_to_the_continuous_one_with_order_1():
+    found, amplitude = finite(gain=0.5), 0.3
+    t, expected = super_twisting(0.5, lambda t: 0.4 + amplitude * np.sin(t), 3.0)
+    update, deviations = jax.jit(lambda memory, *now: found.update(found.update_matrix(now[-1]), memory, *now)), []
     for h in (0.02, 0.01, 0.005):
         memory, errors = found.begin(), []
         for k in range(1, round(3.0 / h) + 1):
-            gained = 0.4 * h + slope * (np.cos((k - 1) * h) - np.cos(k * h))
-            memory = update(memory, np.array([gained]), np.array(k * h), np.array(h))
-            errors.append(float(memory[0]) - 0.4 - slope * np.sin(k * h))
-        off.append(np.abs(errors - np.interp(h * np.arange(1, len(errors) + 1), t, expected)).max())
-    assert off[0] < 0.02
-    assert off[2] < 0.5 * off[0]
+            impulse = 0.4 * h + amplitude * (np.cos((k - 1) * h) - np.cos(k * h))
+            memory = update(memory, np.array([impulse]), np.array(k * h), np.array(h))
+            errors.append(float(memory[0]) - 0.4 - amplitude * np.sin(k * h))
+        deviations.append(np.abs(errors - np.interp(h * np.arange(1, len(errors) + 1), t, expected)).max())
+    assert deviations[0] < 0.02
+    assert deviations[2] < 0.5 * deviations[0]
 
 
-def test_continuous_finite_time_observer_finds_a_constant_within_its_time():
+def test_continuous_finite_time_observer_settles_within_its_time():
     d = 0.4
-    log = continuous(finite(gain=0.5, start=d, width=1e-5), disturbances.Constant(vector([d])), steps=3000)
+    log = simulate_continuous(finite(gain=0.5, start=d, width=1e-5), disturbances.Constant(vector([d])), steps=3000)
     settled = 1.2519 * d / 0.5
     assert np.abs(log.d_hat[log.t < 0.5 * settled, 0] - d).max() == pytest.approx(d)
-    # inside the layer e0 holds +-width at most: 1.5 sqrt(c width) is left of the error
+    # inside the boundary layer |e0| <= width, so that the error is at most 1.5 sqrt(c width)
     assert np.abs(log.d_hat[log.t > settled + 0.05, 0] - d).max() < 1.5 * np.sqrt(0.5 * 1e-5)
 
 
 KINDS = ("none", "nonlinear", "finite_time", "prescribed_time")
-SERVED = list(itertools.product(("spacecraft", "chain", "system"), ("continuous", "sampled"), KINDS))
-# each plant and each kind
-KEPT = [
+COMBINATIONS = list(itertools.product(("spacecraft", "chain", "system"), ("continuous", "sampled"), KINDS))
+# each plant and each kind of observer at least once
+SHORT_COMBINATIONS = [
     ("spacecraft", "sampled", "nonlinear"),
     ("chain", "continuous", "finite_time"),
     ("system", "sampled", "prescribed_time"),
 ]
 
 
-@pytest.mark.parametrize(("plant", "mode", "kind"), short(SERVED, KEPT))
-def test_every_observer_serves_every_plant_and_keeps_its_bound(plant, mode, kind):
-    """In the whole loop, where the disturbance keeps to its own bounds; the estimate is never further off."""
+@pytest.mark.parametrize(("plant", "mode", "kind"), short(COMBINATIONS, SHORT_COMBINATIONS))
+def test_every_observer_is_within_its_bound_on_every_plant(plant, mode, kind):
+    """The simulation has a disturbance within its bounds."""
     controller = {"t_f": 8.0, "delta": 0.4, "disturbance_rate_bound": 0.011, "disturbance_bound": 0.0101}
     tables = {
         "spacecraft": {"spacecraft": {"inertia": [1.0, 1.2, 1.4]}},
@@ -231,10 +236,12 @@ def test_every_observer_serves_every_plant_and_keeps_its_bound(plant, mode, kind
     log, bound = result.log, ready.parts.observer.error_bound()
     limit = np.asarray(jax.vmap(bound)(vector(log.t)))
     size = np.linalg.norm(log.d_hat - log.disturbance, axis=1)
-    # a sampled estimate is that of the period before: half of it and the hold, 1.5 h |d'|; in the smooth sign's layer
-    # of the continuous finite-time observer 1.5 sqrt(c width) is left, in each component
-    late = 1.5 * 0.02 * 0.01 if mode == "sampled" else 1.5 * np.sqrt(0.05 * 1e-5) if kind == "finite_time" else 1e-9
-    assert np.all(size <= limit + np.sqrt(inputs) * late), (size - limit).max()
+    # a sampled estimate is up to 1.5 periods old, 1.5 h |d'|; the boundary layer of the continuous finite-time observer
+    # has an error of 1.5 sqrt(c width) in each component
+    tolerance = (
+        1.5 * 0.02 * 0.01 if mode == "sampled" else 1.5 * np.sqrt(0.05 * 1e-5) if kind == "finite_time" else 1e-9
+    )
+    assert np.all(size <= limit + np.sqrt(inputs) * tolerance), (size - limit).max()
     assert size[-1] < 2.0 * limit.max()
 
 
@@ -254,15 +261,15 @@ def _pendulums():
 PENDULUMS = _pendulums()
 
 
-def test_parts_of_a_run_without_a_rate_bound_have_no_empty_gradient():
+def test_gradients_by_observer_gain_are_finite_and_not_zero_without_a_rate_bound():
     wave = disturbances.Sinusoid(*(vector([v]) for v in (0.01, 0.1, 0.0, 0.0)))
     run = chain_parts([1.0, 0.0], 6.0, 3.0, 0.3, period=0.25, disturbance=wave)
     for found in (prescribed(run.plant, gain=10.0), finite(run.plant, gain=0.1)):
 
         def error(gain, found=found):
-            watched = replace(run, observer=replace(found, gain=gain[None]))
-            return rollout.simulate(watched).metrics.window_error
+            changed = replace(run, observer=replace(found, gain=gain[None]))
+            return rollout.simulate(changed).metrics.window_error
 
-        _, slope = jax.jit(lambda gain: jax.jvp(error, (gain,), (jnp.ones_like(gain),)))(found.gain[0])
-        assert np.isfinite(slope)
-        assert slope != 0.0
+        _, derivative = jax.jit(lambda gain: jax.jvp(error, (gain,), (jnp.ones_like(gain),)))(found.gain[0])
+        assert np.isfinite(derivative)
+        assert derivative != 0.0

@@ -1,3 +1,5 @@
+"""Reference attitudes and disturbances against SciPy and closed forms."""
+
 import dataclasses
 import math
 
@@ -29,7 +31,7 @@ position_and_rates = jax.jit(
 )
 
 
-def test_fixed_does_not_move():
+def test_fixed_reference_has_no_rates():
     q = START.as_quat()
     for t in TIMES:
         got = target(references.Fixed(vector(q)), vector(t))
@@ -39,37 +41,37 @@ def test_fixed_does_not_move():
 
 
 @pytest.mark.parametrize("rate", RATES)
-def test_spin_turns_about_its_own_axes(rate):
+def test_spin_rotates_about_body_fixed_axes(rate):
     spin = references.Spin(vector(START.as_quat()), vector(rate))
     for t in TIMES:
         got = target(spin, vector(t))
         exact = (START * Rotation.from_rotvec(np.array(rate) * t)).as_matrix()
-        # the angle |w| t is rounded relatively
+        # rounding error of the angle |w| t
         tolerance = 20 * EPS * (1 + np.linalg.norm(rate) * t)
         np.testing.assert_allclose(Rotation.from_quat(np.asarray(got.q)).as_matrix(), exact, rtol=0, atol=tolerance)
-        assert abs(np.linalg.norm(got.q) - 1) <= 4 * EPS  # it stays unit: no integration
+        assert abs(np.linalg.norm(got.q) - 1) <= 4 * EPS  # closed form, without integration errors
         np.testing.assert_array_equal(got.w, rate)
         np.testing.assert_array_equal(got.w_dot, np.zeros(3))
 
 
 @pytest.mark.parametrize("rate", RATES)
-def test_spin_solves_the_kinematics_and_vector_rates_are_its_derivatives(rate):
+def test_spin_satisfies_the_kinematics_and_vector_rates_are_its_derivatives(rate):
     spin, size = references.Spin(vector(START.as_quat()), vector(rate)), np.linalg.norm(rate)
     for t in TIMES:
         _, first, second, kinematics, (v_dot, v_ddot) = position_and_rates(spin, vector(t))
-        # w times numbers up to 1 whose angle |w| t is rounded relatively
+        # w times numbers up to 1 with the rounding error of the angle |w| t
         tolerance = 20 * EPS * size * (1 + size * t)
         np.testing.assert_allclose(first, kinematics, rtol=0, atol=tolerance)
         np.testing.assert_allclose(first[:3], v_dot, rtol=0, atol=tolerance)
-        # twice through sin(a/2)/a: terms 1/a^2 above the result near the end of the series, a = 1e-3, cancel
+        # second derivative of sin(a/2)/a: terms larger than the result by 1/a^2 cancel, a >= 1e-3
         angle = max(size * t, 1e-3)
         np.testing.assert_allclose(second[:3], v_ddot, rtol=0, atol=20 * EPS * size**2 * (1 + size * t + 1 / angle**2))
         # for a constant rate q'' = -|w|^2 q / 4
         np.testing.assert_allclose(v_ddot, -(size**2) / 4 * spin(vector(t)).q[:3], rtol=0, atol=20 * EPS * size**2)
 
 
-def test_vector_rates_of_a_target_with_acceleration():
-    # a turn by the angle a(t) about a fixed axis n: v = n sin(a/2) from identity
+def test_vector_rates_of_a_target_with_acceleration_equal_closed_forms():
+    # rotation by the angle a(t) about a fixed axis n: v = n sin(a/2)
     axis = np.array([2, -1, 2]) / 3
     a, a_dot, a_ddot = 1.3, 0.4, -0.2
     q = vector([*axis * math.sin(a / 2), math.cos(a / 2)])
@@ -79,27 +81,29 @@ def test_vector_rates_of_a_target_with_acceleration():
     np.testing.assert_allclose(second, exact, rtol=0, atol=8 * EPS)
 
 
-def test_sinusoid_and_its_time_derivative():
+def test_sinusoid_and_its_time_derivative_equal_closed_forms():
     amplitude, frequency = np.array([0.01, -0.02, 0.0]), np.array([0.1, 3.0, 7.0])
     phase, bias = np.array([0.0, 1.0, -2.0]), np.array([1e-3, 0.0, -5e-3])
     signal = disturbances.Sinusoid(vector(amplitude), vector(frequency), vector(phase), vector(bias))
     for t in (0.0, 0.7, 40.0):
         x = [f * t + p for f, p in zip(frequency, phase, strict=True)]
-        # the argument is rounded relatively
+        # rounding error of the argument
         tolerance = 4 * EPS * (1 + np.abs(x).max())
         value = [b + a * math.sin(y) for a, y, b in zip(amplitude, x, bias, strict=True)]
         np.testing.assert_allclose(signal(vector(t)), value, rtol=0, atol=0.02 * tolerance)
-        slope = [a * f * math.cos(y) for a, f, y in zip(amplitude, frequency, x, strict=True)]
-        np.testing.assert_allclose(references.time_derivative(signal, vector(t)), slope, rtol=0, atol=0.06 * tolerance)
+        derivative = [a * f * math.cos(y) for a, f, y in zip(amplitude, frequency, x, strict=True)]
+        np.testing.assert_allclose(
+            references.time_derivative(signal, vector(t)), derivative, rtol=0, atol=0.06 * tolerance
+        )
 
 
-def test_constant_has_no_derivative():
+def test_constant_disturbance_has_derivative_zero():
     signal = disturbances.Constant(vector([0.1, -0.2, 0.3]))
     np.testing.assert_array_equal(signal(vector(5.0)), [0.1, -0.2, 0.3])
     np.testing.assert_array_equal(references.time_derivative(signal, vector(5.0)), np.zeros(3))
 
 
-def test_time_derivative_takes_whole_numbers_too():
+def test_time_derivative_accepts_concrete_times():
     signal = disturbances.Sinusoid(*(vector([x] * 3) for x in (1.0, 1.0, 0.0, 0.0)))
     np.testing.assert_allclose(references.time_derivative(signal, jnp.asarray(2.0)), [math.cos(2)] * 3, rtol=4 * EPS)
 
@@ -113,18 +117,18 @@ def test_time_derivative_takes_whole_numbers_too():
         (disturbances.Sinusoid(*[jnp.ones(3)] * 4), 4),
     ],
 )
-def test_signals_are_frozen_pytrees_and_every_number_is_a_leaf(signal, leaves):
+def test_signals_are_frozen_pytrees_with_their_numbers_as_leaves(signal, leaves):
     assert len(jax.tree.leaves(signal)) == leaves
     name = dataclasses.fields(signal)[0].name
     with pytest.raises(dataclasses.FrozenInstanceError):
         setattr(signal, name, jnp.zeros(3))
 
 
-# references that swing and slew
+# oscillating references and slews
 
 
 def body_rate(r, r_dot):
-    """Rate of exp(r) in the axes it leads to: the right Jacobian of SO(3) times r' (Chirikjian 2011, eq. 10.86)."""
+    """Return the body rate of exp(r): the right Jacobian of SO(3) times r' (Chirikjian 2011, eq. 10.86)."""
     zero = jnp.zeros(())
     x = jnp.stack([jnp.stack(row) for row in ([zero, -r[2], r[1]], [r[2], zero, -r[0]], [-r[1], r[0], zero])])
     angle = jnp.sqrt(r @ r)
@@ -138,7 +142,7 @@ SWING = references.Swing(
 
 
 @pytest.mark.parametrize("t", [0.0, 3.0, 41.0])
-def test_swing_against_the_jacobian_of_the_rotation_vector(t):
+def test_swing_rates_equal_jacobian_of_the_rotation_vector(t):
     def vector_at(t):
         return SWING.amplitude * jnp.sin(SWING.frequency * t + SWING.phase)
 
@@ -150,10 +154,10 @@ def test_swing_against_the_jacobian_of_the_rotation_vector(t):
     np.testing.assert_allclose(Rotation.from_quat(np.asarray(got.q)).as_matrix(), exact, rtol=0, atol=20 * EPS)
     np.testing.assert_allclose(got.w, rate_at(t), rtol=0, atol=1e-14)
     _, w_dot = jax.jvp(rate_at, (vector(t),), (vector(1.0),))
-    np.testing.assert_allclose(got.w_dot, w_dot, rtol=0, atol=1e-13)  # rates of 0.1 rad/s, polynomials twice derived
+    np.testing.assert_allclose(got.w_dot, w_dot, rtol=0, atol=1e-13)
 
 
-def test_swing_about_one_axis_is_a_pendulum():
+def test_swing_about_one_axis_has_a_sinusoidal_angle():
     swing = references.Swing(
         vector(START.as_quat()), vector(0.0, 0.5, 0.0), vector(1.0, 0.2, 1.0), vector(0.0, 0.3, 0.0)
     )
@@ -164,23 +168,25 @@ def test_swing_about_one_axis_is_a_pendulum():
         np.testing.assert_allclose(got.w_dot, [0.0, -0.02 * np.sin(phase), 0.0], rtol=0, atol=1e-13)
 
 
-TURN = np.array([0.5, -1.5, 2.0])
+ROTATION_VECTOR = np.array([0.5, -1.5, 2.0])
 
 
 @pytest.mark.parametrize("t", [-5.0, 0.0, 0.02, 7.0, 20.0, 39.9, 40.0, 60.0])
-def test_slew_is_a_quintic_about_a_fixed_axis(t):
-    slew = references.Slew(vector(START.as_quat()), vector(TURN), vector(40.0))
+def test_slew_is_a_quintic_rotation_about_a_fixed_axis(t):
+    slew = references.Slew(vector(START.as_quat()), vector(ROTATION_VECTOR), vector(40.0))
     got, x = target(slew, vector(t)), np.clip(t / 40.0, 0.0, 1.0)
-    share, rate = x**3 * (10 - 15 * x + 6 * x**2), 30 * x**2 * (1 - x) ** 2 / 40.0
+    fraction, rate = x**3 * (10 - 15 * x + 6 * x**2), 30 * x**2 * (1 - x) ** 2 / 40.0
     second = 60 * x * (1 - x) * (1 - 2 * x) / 40.0**2
-    exact = (START * Rotation.from_rotvec(share * TURN)).as_matrix()
+    exact = (START * Rotation.from_rotvec(fraction * ROTATION_VECTOR)).as_matrix()
     np.testing.assert_allclose(Rotation.from_quat(np.asarray(got.q)).as_matrix(), exact, rtol=0, atol=20 * EPS)
-    np.testing.assert_allclose(got.w, rate * TURN, rtol=0, atol=1e-14)
-    np.testing.assert_allclose(got.w_dot, second * TURN, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(got.w, rate * ROTATION_VECTOR, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(got.w_dot, second * ROTATION_VECTOR, rtol=0, atol=1e-13)
 
 
-@pytest.mark.parametrize("signal", [SWING, references.Slew(vector(START.as_quat()), vector(TURN), vector(40.0))])
-def test_moving_references_solve_the_kinematics(signal):
+@pytest.mark.parametrize(
+    "signal", [SWING, references.Slew(vector(START.as_quat()), vector(ROTATION_VECTOR), vector(40.0))]
+)
+def test_moving_references_satisfy_the_kinematics(signal):
     for t in (0.5, 11.0, 39.0):
         _, first, second, kinematics, (v_dot, v_ddot) = position_and_rates(signal, vector(t))
         np.testing.assert_allclose(first, kinematics, rtol=0, atol=1e-14)
@@ -188,19 +194,19 @@ def test_moving_references_solve_the_kinematics(signal):
         np.testing.assert_allclose(v_ddot, second[:3], rtol=0, atol=1e-13)
 
 
-def test_moving_references_are_built_as_their_tables_say():
+def test_moving_references_are_built_from_their_tables():
     swing = scenario.study(scenario.from_tables({"reference": {"kind": "sinusoid", "mrp": [0.1, 0.0, 0.0]}}))
     half = 4 * np.arctan(0.1) / 2
     np.testing.assert_allclose(swing.parts.reference.q, [np.sin(half), 0.0, 0.0, np.cos(half)], atol=1e-15)
     np.testing.assert_array_equal(swing.parts.reference.amplitude, [0.1] * 3)
     table = {"kind": "slew", "quat_xyzw": [0.6, 0.0, 0.0, 0.8], "to_quat_xyzw": [0.0, 0.0, 0.0, -1.0], "duration": 20.0}
     slew = scenario.study(scenario.from_tables({"reference": table})).parts.reference
-    np.testing.assert_allclose(slew.turn, [-2 * np.arcsin(0.6), 0.0, 0.0], atol=1e-15)  # the short way
+    np.testing.assert_allclose(slew.turn, [-2 * np.arcsin(0.6), 0.0, 0.0], atol=1e-15)  # the shorter rotation
     end = slew(jnp.asarray(20.0)).q
     np.testing.assert_allclose(end * np.sign(end[3]), [0.0, 0.0, 0.0, 1.0], atol=1e-15)
 
 
-def test_a_slew_may_go_the_long_way_round():
+def test_slew_can_take_the_longer_rotation():
     table = {"kind": "slew", "quat_xyzw": [0.6, 0.0, 0.0, 0.8], "to_quat_xyzw": [0.0, 0.0, 0.0, -1.0], "duration": 20.0}
     ways = [scenario.study(scenario.from_tables({"reference": {**table, "way": way}, **MULTIPLICATIVE})).parts.reference
             for way in ("short", "long")]  # fmt: skip
@@ -214,12 +220,12 @@ def test_a_slew_may_go_the_long_way_round():
 MULTIPLICATIVE = {"controller": {"error": "multiplicative"}}
 
 
-def test_a_bias_takes_the_place_of_the_one_before():
-    """As a plan gives it to parts that have one."""
-    still = disturbances.Constant(vector([0.1, -0.2, 0.3]))
-    biased = still
+def test_with_bias_replaces_the_previous_bias():
+    """A row of a run table may give a bias to parts that have one already."""
+    constant = disturbances.Constant(vector([0.1, -0.2, 0.3]))
+    biased = constant
     for value in ([0.01, 0.02, 0.03], [1e-3, 0.0, -1e-3]):
         biased = disturbances.with_bias(biased, vector(value))
         np.testing.assert_array_equal(disturbances.bias(biased, 3), value)
         np.testing.assert_allclose(biased(vector(2.0), None), np.add([0.1, -0.2, 0.3], value), rtol=1e-15)
-    np.testing.assert_array_equal(disturbances.bias(still, 3), np.zeros(3))
+    np.testing.assert_array_equal(disturbances.bias(constant, 3), np.zeros(3))
