@@ -1,1 +1,1 @@
-"""What varies from trial to trial, and how it is drawn."""
+"""Dispersions: which quantities differ from trial to trial, and their distributions."""

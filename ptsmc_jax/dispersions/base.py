@@ -1,6 +1,7 @@
-"""Quantities of a trial, checks of their numbers in plans, and the base class of custom draws.
+"""The type of a dispersed quantity, validation of its values in run tables, and the base class of custom dispersions.
 
-A number of a trial = combine(random number, nominal number), in the unit of its quantity.
+Read `Quantity` first. In a trial, each number of a quantity is combine(random number, nominal number), in the unit of
+the quantity. A run table gives the values of quantities for each trial instead.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -15,9 +16,9 @@ from ptsmc_jax.dispersions.numbers import Combine, Numbers, Random, added
 from ptsmc_jax.numerics import draws, paths
 from ptsmc_jax.simulation.rollout import Parts
 
-Coordinates = dict[str, Array]  # of a trial, by the name of the quantity
+Coordinates = dict[str, Array]  # standard random numbers of a trial, by the name of the quantity
 
-# names of quantities, and of the streams of their random numbers
+# names of quantities, which are also the names of their random streams
 INITIAL_ATTITUDE, INITIAL_STATE, INITIAL_RATE = "initial_attitude", "initial_state", "initial_rate"
 INERTIA, REFERENCE, OWN = "inertia", "reference", "own"
 DISTURBANCE_PHASE, DISTURBANCE_AMPLITUDE = "disturbance_phase", "disturbance_amplitude"
@@ -25,43 +26,49 @@ DISTURBANCE_BIAS = "disturbance_bias"
 
 
 class UnfitError(ValueError):
-    """Numbers of a plan that cannot be simulated; `row` is the first such row, and the message the allowed values."""
+    """Raised for values of a run table that cannot be simulated.
+
+    The message states the allowed values. `row` is the index of the first invalid row.
+    """
 
     def __init__(self, row: int, allowed: str):
         super().__init__(allowed)
         self.row = row
 
     @staticmethod
-    def check(fit: np.ndarray, allowed: Callable[[int], str]) -> None:
-        """Raise it for the first row that is not fit.
+    def check(is_valid: np.ndarray, allowed: Callable[[int], str]) -> None:
+        """Raise UnfitError for the first invalid row.
 
         Args:
-            fit: whether each row is fit, (rows,).
-            allowed: returns the allowed values in words, for the index of the row.
+            is_valid: whether each row is valid, (rows,).
+            allowed: (index of the row) -> allowed values in words.
         """
-        if not fit.all():
-            row = int(np.argmin(fit))
+        if not is_valid.all():
+            row = int(np.argmin(is_valid))
             raise UnfitError(row, allowed(row))
 
 
 Checked = Callable[[np.ndarray], np.ndarray]
-Given = Mapping[str, np.ndarray]  # numbers (rows, n) of a plan, by the names of quantities
+Given = Mapping[str, np.ndarray]  # values (rows, n) of a run table, by the name of the quantity
 
 
 class Quantity(NamedTuple):
-    """Numbers (n,) of a trial that may differ from the nominal ones.
+    """A quantity of n numbers that can differ from trial to trial, such as the initial attitude or the wheel torque.
 
     Attributes:
-        columns: returns the names of their columns in rows and plans; empty if the parts have no such quantity.
-        read: returns the numbers of the parts.
-        write: returns the parts with other numbers.
-        combine: returns the numbers of a trial; a mapping has one such function for each distribution.
-        size: returns the count of random numbers; None: there is one for each column.
-        unit: a spacecraft's, of all numbers or of each.
-        checked: returns the simulated numbers for those of a plan, (rows, n) each; raises UnfitError.
-        check_with: raises UnfitError if other quantities of the plan, or the parts, forbid the numbers.
-        categories: columns that number several things, such as wheels, so that their order means nothing.
-        hardware: whether it is an error of the hardware, or of the modes, that flight software does not know.
+        columns: (parts) -> names of its columns in result files and run tables. Empty if the parts have no such
+            quantity.
+        read: (parts) -> numbers (n,).
+        write: (parts, numbers) -> parts with these numbers.
+        combine: (random numbers, nominal numbers, parts) -> numbers of the trial, or one such function by distribution.
+        size: (parts) -> number of random numbers. None: one for each column.
+        unit: unit for a spacecraft, of all numbers or of each number.
+        checked: (values of a run table (rows, n)) -> values to simulate (rows, n). It raises UnfitError for invalid
+            ones.
+        check_with: (all values of a run table, parts) -> None. It raises UnfitError if values do not fit each other.
+        categories: columns without an order, such as the number of a wheel.
+        hardware: whether it is an error of the hardware or of the flexible modes that the flight software does not
+            know.
     """
 
     columns: Callable[[Parts], list[str]]
@@ -76,16 +83,16 @@ class Quantity(NamedTuple):
     hardware: bool = False
 
     def count(self, parts: Parts) -> int:
-        """Return how many random numbers the quantity has in these parts."""
+        """Return the number of random numbers of the quantity."""
         return len(self.columns(parts)) if self.size is None else self.size(parts)
 
-    def dispersed(self, parts: Parts, random: Random, distribution: str) -> Parts:
-        """Return the parts with this quantity dispersed.
+    def disperse(self, parts: Parts, random: Random, distribution: str) -> Parts:
+        """Return the parts with the quantity of a trial.
 
         Args:
             parts: nominal parts.
             random: random numbers of the quantity, (count,) [SI units or -].
-            distribution: of the random numbers.
+            distribution: name of the distribution of the random numbers.
         """
         combine = self.combine if callable(self.combine) else self.combine[distribution]
         return self.write(parts, combine(random, self.read(parts), parts))
@@ -98,29 +105,29 @@ def at_path(
     present: Callable[[Parts], bool] = lambda parts: True,
     **others: Any,
 ) -> Quantity:
-    """Return the quantity at one path of the parts, such as `sensors.rate_noise`.
+    """Return the quantity whose numbers are a field of the parts, such as `sensors.rate_noise`.
 
     Args:
-        path: fields from the parts to a number or a vector. Parts without one of the fields have no such quantity.
-        names: names of the columns, or the beginning of their numbered names; a single number has no number.
-        default: the value if the field is None; None: there is no such quantity.
-        present: returns whether parts that have the fields have the quantity.
-        others: further fields of `Quantity`.
+        path: path from the parts to a number or an array. If it does not exist, the parts have no such quantity.
+        names: names of the columns, or a prefix for numbered names. A scalar has the prefix as its name.
+        default: value if the field is None. None: the parts then have no such quantity.
+        present: (parts) -> whether parts with this field have the quantity.
+        **others: further fields of `Quantity`.
     """
 
     def value(parts: Parts) -> Any:
         if not paths.exists(parts, path):
             return None
-        found = paths.get(parts, path)
-        return default if found is None else found
+        stored = paths.get(parts, path)
+        return default if stored is None else stored
 
     def columns(parts: Parts) -> list[str]:
-        found = value(parts) if present(parts) else None
-        if found is None:
+        current = value(parts) if present(parts) else None
+        if current is None:
             return []
         if not isinstance(names, str):
             return list(names)
-        return numbered(names, np.size(found)) if np.ndim(found) else [names.rstrip("_")]
+        return numbered(names, np.size(current)) if np.ndim(current) else [names.rstrip("_")]
 
     def write(parts: Parts, new: Numbers) -> Parts:
         return paths.put(parts, path, new.reshape(np.shape(value(parts))))
@@ -128,17 +135,17 @@ def at_path(
     return Quantity(columns, lambda parts: jnp.ravel(jnp.asarray(value(parts))), write, **others)
 
 
-def fitting(fits: Callable[[np.ndarray], np.ndarray], allowed: str) -> Checked:
-    """Return a check of rows (rows, n) that raises UnfitError for the first row that is not fit.
+def fitting(is_valid: Callable[[np.ndarray], np.ndarray], allowed: str) -> Checked:
+    """Return a validator for `Quantity.checked` that raises UnfitError for the first invalid row.
 
     Args:
-        fits: (rows, n) -> (rows, ..) bool, all true for a row that is fit [SI units].
+        is_valid: (rows, n) [SI units] -> (rows, ..) bool, all true for a valid row.
         allowed: the allowed values, in words.
     """
 
     def checked(rows: np.ndarray) -> np.ndarray:
-        """Return these rows (rows, n) [SI units] unchanged; raise UnfitError if a row is not fit."""
-        UnfitError.check(np.asarray(fits(rows).reshape(len(rows), -1).all(axis=1)), lambda row: allowed)
+        """Return the rows (rows, n) [SI units] unchanged. Raise UnfitError if a row is invalid."""
+        UnfitError.check(np.asarray(is_valid(rows).reshape(len(rows), -1).all(axis=1)), lambda row: allowed)
         return rows
 
     return checked
@@ -149,7 +156,7 @@ positive = fitting(lambda numbers: numbers > 0.0, "a number greater than 0")
 
 
 def reason(check: Callable[..., Any], *values: Any) -> str:
-    """Return the message of the ValueError that a check raises for these values; empty if it raises none."""
+    """Return the message of the ValueError that a check raises for these values, or "" if it raises none."""
     try:
         check(*values)
     except ValueError as error:
@@ -158,24 +165,21 @@ def reason(check: Callable[..., Any], *values: Any) -> str:
 
 
 def numbered(name: str, count: int) -> list[str]:
-    """Return names that are numbered from 1."""
+    """Return names with numbers from 1 to count."""
     return [f"{name}{k + 1}" for k in range(count)]
 
 
 @dataclass(frozen=True)
 class Draw:
-    """Base class of custom draws: they make the parts of a trial from `count` random numbers.
+    """Base class of custom dispersions, which compute the parts of a trial from random numbers."""
 
-    drawn: "normal", standard normal numbers, or "uniform", on (0, 1).
-    """
-
-    count: ClassVar[int] = 1
-    drawn: ClassVar[draws.Distribution] = "normal"
+    count: ClassVar[int] = 1  # how many random numbers
+    drawn: ClassVar[draws.Distribution] = "normal"  # their distribution: standard "normal", or "uniform" on (0, 1)
 
     def at(self, c: Float[Array, " count"], parts: Any) -> Any:
-        """Return the parts as these numbers (count,) [-] change them, by `dataclasses.replace`; shapes stay."""
+        """Return the parts of a trial for random numbers c (count,) [-]. Shapes and dtypes must not change."""
         raise NotImplementedError
 
     def values(self, c: Float[Array, " count"]) -> dict[str, Array]:
-        """Return the numbers of a trial's row by name; by default the random numbers [-], own_1 and so on."""
+        """Return numbers for the result file by column; by default the random numbers [-] as own_1, own_2."""
         return {f"{OWN}_{k + 1}": c[k] for k in range(self.count)}

@@ -1,4 +1,7 @@
-"""Rows of a plan: the given quantities are simulated, all others are random as for the row's trial."""
+"""Trials of a run table: the quantities of its columns have given values, and all others are random.
+
+`about` combines a row of the table with the dispersion of the campaign.
+"""
 
 from typing import Any, NamedTuple
 
@@ -7,37 +10,44 @@ from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.numerics.draws import WholeNumber
 from ptsmc_jax.simulation.rollout import Parts
 
-TRIAL, SEED = "trial", "seed"  # columns that say whose draws a row of a plan has
-OF_ROWS = {TRIAL: "plan_trial", SEED: "plan_seed"}  # what rows call them, where `trial` is the row's own number
+TRIAL, SEED = "trial", "seed"  # columns of a run table that select the random numbers of a row
+# names of these columns in result files, where `trial` is the number of the row
+OF_ROWS = {TRIAL: "plan_trial", SEED: "plan_seed"}
 
 
 class Row(NamedTuple):
-    """A row of a plan; many rows have a leading axis."""
+    """A row of a run table, or several rows with a leading axis."""
 
-    seed: Any  # whole number that names the random numbers, together with `trial`
-    trial: Any
-    given: dict[str, Any]  # numbers (n,) by the names of `QUANTITIES`
+    seed: Any  # integer that selects the random numbers, together with `trial`
+    trial: Any  # integer
+    given: dict[str, Any]  # given values (n,) by the name of the quantity, see `QUANTITIES`
 
 
 class About(NamedTuple):
-    """The nominal parts, the dispersion and the random stream of a trial."""
+    """Everything that determines the parts of a trial."""
 
-    parts: Parts  # nominal
-    dispersion: Dispersion
+    parts: Parts  # nominal parts, with the given values of the row
+    dispersion: Dispersion  # of the quantities that are not given
     seed: WholeNumber
     trial: Any
-    given: tuple[str, ...]  # quantities that are not random
+    given: tuple[str, ...]  # names of the quantities with given values
 
     @property
     def drawn(self) -> Parts:
-        """The parts that the trial simulates."""
+        """Parts of the trial, with random and given values."""
         return self.dispersion.apply(self.parts, self.seed, self.trial)
 
 
 def about(parts: Parts, dispersion: Dispersion, seed: WholeNumber, trial: WholeNumber | Row) -> About:
-    """Return the basis of a trial. Quantities [SI units] that its row gives are nominal and not random.
+    """Write the given values of a row into the parts, and remove these quantities from the dispersion.
 
-    Each quantity has its own stream of random numbers, so the others do not depend on the given ones.
+    Each quantity has its own random stream. So the random quantities do not depend on the given ones.
+
+    Args:
+        parts: nominal parts.
+        dispersion: dispersion of the campaign.
+        seed: seed of the campaign [-]; a row has its own seed.
+        trial: number of the trial [-], or a row of a run table with values in SI units.
     """
     if not isinstance(trial, Row):
         return About(parts, dispersion, seed, trial, ())

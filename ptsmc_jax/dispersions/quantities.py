@@ -1,7 +1,7 @@
-"""The table of all quantities that may differ from trial to trial.
+"""The table `QUANTITIES` of all quantities that can differ from trial to trial, with functions that read them.
 
-The name of a quantity is also the name of the stream of its random numbers. Rows and plans have the same columns.
-A number of a trial = combine(random number, nominal number).
+The name of a quantity is also the name of its random stream. Result files and run tables have the same columns. See
+`base.Quantity` for the entries of the table.
 """
 
 from collections.abc import Iterable
@@ -47,96 +47,97 @@ from ptsmc_jax.plants.rigid_body import Spacecraft
 from ptsmc_jax.signals import disturbances
 from ptsmc_jax.simulation.rollout import Parts
 
-NEAR = 1e-6  # relative: largest error of the norm of a unit vector or quaternion in a plan
+NEAR = 1e-6  # largest error of the norm of a unit vector or quaternion in a run table
 PAIRS = [(i, j) for i in range(3) for j in range(i, 3)]  # the upper triangle, in the order of the inertia's columns
-# for each entry of a symmetric tensor its index in PAIRS
-_PLACES = [[PAIRS.index((min(i, j), max(i, j))) for j in range(3)] for i in range(3)]
+# index in PAIRS for each entry of a symmetric matrix
+_PAIR_INDICES = [[PAIRS.index((min(i, j), max(i, j))) for j in range(3)] for i in range(3)]
 
 
 def level(name: str) -> str:
-    """Return the name of a quantity that one common factor disperses, such as `torque_limit`."""
+    """Return the name of a quantity with one common random factor for all its components, such as `torque_limit`."""
     return f"{name}_level"
 
 
 # --- attitudes and inertia ---
 
 
-def _unit(q: np.ndarray) -> np.ndarray:
-    """Return unit quaternions (rows, 4); norms of 1 up to rounding leave every digit unchanged."""
+def _normalise(q: np.ndarray) -> np.ndarray:
+    """Return unit quaternions (rows, 4). Quaternions with a norm of 1 up to rounding errors are not changed."""
     norm = np.linalg.norm(q, axis=1)
     UnfitError.check(np.abs(norm - 1.0) <= NEAR, lambda k: f"a unit quaternion (its norm is {norm[k]:.9g})")
-    rounding = np.abs(norm - 1.0) < 1e-14
-    return np.where(rounding[:, None], q, q / norm[:, None])
+    is_normalised = np.abs(norm - 1.0) < 1e-14
+    return np.where(is_normalised[:, None], q, q / norm[:, None])
 
 
 def with_body(parts: Parts, body: Spacecraft) -> Parts:
-    """Return the parts with another true body; a gravity gradient acts on that body, too."""
+    """Return the parts with another true body. A gravity-gradient torque also acts on that body."""
     return replace(parts, plant=body, disturbance=disturbances.on_body(parts.disturbance, body.inertia))
 
 
 def _with_inertia(parts: Parts, entries: Numbers) -> Parts:
-    inertia = jnp.stack([jnp.stack([entries[k] for k in row]) for row in _PLACES])
+    inertia = jnp.stack([jnp.stack([entries[k] for k in row]) for row in _PAIR_INDICES])
     return with_body(parts, paths.get(parts, "plant").with_inertia(inertia, matrices.solve(inertia, jnp.eye(3))))
 
 
-def _tensors(rows: np.ndarray) -> np.ndarray:
-    """Return the symmetric tensors (rows, 3, 3) of upper triangles (rows, 6), see `PAIRS` [kg m^2]."""
-    return rows[:, _PLACES]
+def _to_matrices(rows: np.ndarray) -> np.ndarray:
+    """Return symmetric matrices (rows, 3, 3) from upper triangles (rows, 6) in the order of `PAIRS` [kg m^2]."""
+    return rows[:, _PAIR_INDICES]
 
 
-def _inertia_checked(rows: np.ndarray) -> np.ndarray:
-    full = _tensors(rows)
+def _check_inertia(rows: np.ndarray) -> np.ndarray:
+    full = _to_matrices(rows)
     UnfitError.check(
         formulas.bodies(full), lambda k: f"a rigid body's inertia ({reason(formulas.check_inertia, full[k])})"
     )
     return rows
 
 
-def _modes(parts: Parts) -> int:
-    """Return how many flexible modes the true plant has."""
+def _count_modes(parts: Parts) -> int:
+    """Return the number of flexible modes of the true plant."""
     return getattr(parts.plant, "frequency", np.zeros(0)).shape[-1]
 
 
 def _check_flexible_body(given: Given, parts: Parts) -> None:
-    """Check that a flexible body can have the inertia and the coupling of each row, or else the nominal ones."""
-    if not _modes(parts):
+    """Check that inertia and coupling of each row, or the nominal ones, belong to a physical flexible body."""
+    if not _count_modes(parts):
         return
     body, count = paths.get(parts, "plant"), len(next(iter(given.values())))
-    inertia = _tensors(given[INERTIA]) if INERTIA in given else np.broadcast_to(body.inertia, (count, 3, 3))
-    what, coupling = "inertia", np.broadcast_to(body.coupling, (count, *body.coupling.shape))
+    inertia = _to_matrices(given[INERTIA]) if INERTIA in given else np.broadcast_to(body.inertia, (count, 3, 3))
+    changed, coupling = "inertia", np.broadcast_to(body.coupling, (count, *body.coupling.shape))
     if "mode_coupling" in given:
-        what, coupling = "coupling", given["mode_coupling"].reshape(coupling.shape)
+        changed, coupling = "coupling", given["mode_coupling"].reshape(coupling.shape)
     UnfitError.check(
         formulas.flexible_bodies(inertia, coupling),
-        lambda k: f"a flexible body's {what} ({reason(formulas.rest_inertia, inertia[k], coupling[k])})",
+        lambda k: f"a flexible body's {changed} ({reason(formulas.rest_inertia, inertia[k], coupling[k])})",
     )
 
 
 # --- disturbance ---
 
 
-def _of_disturbance(name: str, what: Literal["phase", "amplitude"], **others: Any) -> Quantity:
+def _disturbance_quantity(name: str, field: Literal["phase", "amplitude"], **others: Any) -> Quantity:
     def read(parts: Parts) -> Numbers:
-        return disturbances.values(parts.disturbance, what)
+        return disturbances.values(parts.disturbance, field)
 
     return Quantity(
         lambda parts: numbered(f"{name}_", read(parts).size),
         read,
-        lambda parts, new: replace(parts, disturbance=disturbances.with_values(parts.disturbance, what, new)),
+        lambda parts, new: replace(parts, disturbance=disturbances.with_values(parts.disturbance, field, new)),
         **others,
     )
 
 
-# --- actuators and samples ---
+# --- actuators and sample times ---
 
 
 def channels(parts: Parts) -> Float[Array, "m channels"]:
-    """Return the directions (m, channels) [-] of body axes, or wheels, that flight software assumes."""
+    """Return the directions (m, channels) [-] of the actuators in the design model: body axes, or wheel axes."""
     wheels = parts.actuators.wheels
     return jnp.eye(parts.plant.inputs) if wheels is None else wheels.axes
 
 
-def _size(parts: Parts) -> int:
+def _count_channels(parts: Parts) -> int:
+    """Return the number of actuator channels, 0 in the continuous loop."""
     return channels(parts).shape[1] if parts.clock.sampled else 0
 
 
@@ -144,31 +145,31 @@ def _with_actuators(parts: Parts, **changes: Any) -> Parts:
     return replace(parts, actuators=replace(parts.actuators, **changes))
 
 
-def _scale(parts: Parts) -> Numbers:
+def _read_scale(parts: Parts) -> Numbers:
     scale = parts.actuators.scale
-    return jnp.ones(_size(parts)) if scale is None else scale
+    return jnp.ones(_count_channels(parts)) if scale is None else scale
 
 
-def _directions(parts: Parts) -> Numbers:
-    """Return the true directions of the channels, one after the other, (3 channels,) [-]."""
+def _read_directions(parts: Parts) -> Numbers:
+    """Return the true directions of the channels, one after another, (3 channels,) [-]."""
     directions = parts.actuators.directions
     return jnp.ravel((channels(parts) if directions is None else directions).T)
 
 
-def _turned_channels(random: Random, nominal: Numbers, parts: Parts) -> Numbers:
-    """Return the assumed directions, one after the other (3 channels,) [-], each turned by a rotation vector [rad]."""
+def _rotate_channels(random: Random, nominal: Numbers, parts: Parts) -> Numbers:
+    """Return the directions (3 channels,) [-] of the design model, each rotated by its rotation vector [rad]."""
     turns, axes = random.reshape(-1, 3), channels(parts)
-    each = [attitude.rotate(attitude.from_rotation_vector(turns[k]), axes[:, k]) for k in range(axes.shape[1])]
-    return jnp.concatenate(each)
+    rotated = [attitude.rotate(attitude.from_rotation_vector(turns[k]), axes[:, k]) for k in range(axes.shape[1])]
+    return jnp.concatenate(rotated)
 
 
-def _failure(parts: Parts) -> Numbers:
-    """Return the time when a wheel fails [s] and its number from 1 on, (2,); infinite and 0: none does."""
-    fails = parts.actuators.failure_times
-    if fails is None:
+def _read_failure(parts: Parts) -> Numbers:
+    """Return the failure time [s] and the number of the wheel, from 1, (2,). Without a failure: infinity and 0."""
+    times = parts.actuators.failure_times
+    if times is None:
         return jnp.array([jnp.inf, 0.0])
-    wheel = jnp.argmin(fails).astype(float) + 1.0
-    return jnp.stack([jnp.min(fails), jnp.where(jnp.any(jnp.isfinite(fails)), wheel, 0.0)])
+    wheel = jnp.argmin(times).astype(float) + 1.0
+    return jnp.stack([jnp.min(times), jnp.where(jnp.any(jnp.isfinite(times)), wheel, 0.0)])
 
 
 def _with_failure(parts: Parts, failure: Numbers) -> Parts:
@@ -176,39 +177,39 @@ def _with_failure(parts: Parts, failure: Numbers) -> Parts:
     return _with_actuators(parts, failure_times=jnp.where(wheel == failure[1], failure[0], jnp.inf))
 
 
-def _any_wheel(random: Random, nominal: Numbers, parts: Parts) -> Numbers:
-    """Return a time [s] and the number of a wheel, from the time and a number on (0, 1)."""
+def _choose_wheel(random: Random, nominal: Numbers, parts: Parts) -> Numbers:
+    """Return the failure time [s] and the number of the wheel, from a random time and a random number on (0, 1)."""
     return jnp.stack([random[0], 1.0 + jnp.floor(random[1] * channels(parts).shape[1])])
 
 
 def _check_wheel(given: Given, parts: Parts) -> None:
     wheel, last = given["wheel_failure"][:, 1], channels(parts).shape[1]
-    fit = (wheel == np.round(wheel)) & (wheel >= 0.0) & (wheel <= last)
-    UnfitError.check(fit, lambda row: f"a time and the number of a wheel, from 1 to {last}, or 0 for none")
+    is_valid = (wheel == np.round(wheel)) & (wheel >= 0.0) & (wheel <= last)
+    UnfitError.check(is_valid, lambda row: f"a time and the number of a wheel, from 1 to {last}, or 0 for none")
 
 
 def _check_jitter(given: Given, parts: Parts) -> None:
-    """Check that no control period is longer than the window over which pointing is averaged."""
+    """Check that no control period is longer than the averaging window of the pointing metrics."""
     if parts.pointing is not None:
-        most = 0.5 * (float(parts.pointing.window) / float(parts.period) - 1.0)
-        fit = given["timing_jitter"][:, 0] <= most + 1e-9
-        UnfitError.check(fit, lambda row: f"at most {most:.6g}, by which no control period exceeds pointing.window")
+        largest = 0.5 * (float(parts.pointing.window) / float(parts.period) - 1.0)
+        message = f"at most {largest:.6g}, so that no period is longer than pointing.window"
+        UnfitError.check(given["timing_jitter"][:, 0] <= largest + 1e-9, lambda row: message)
 
 
-def _paired(name: str, count: int) -> list[str]:
-    """Return names of vectors of three: number of the vector, then of the component."""
+def _vector_columns(name: str, count: int) -> list[str]:
+    """Return the columns of `count` vectors (3,), such as name_23 for component 3 of vector 2."""
     return [f"{name}_{k + 1}{i + 1}" for k in range(count) for i in range(3)]
 
 
-_FAILURE = ("wheel_failure_time", "wheel_failure_wheel")
+_FAILURE_COLUMNS = ("wheel_failure_time", "wheel_failure_wheel")
 
-# in the order of their columns
+# the order is the order of the columns
 QUANTITIES: dict[str, Quantity] = {
     INITIAL_ATTITUDE: at_path(
         "initial.q",
         "initial_q",
         combine={"normal": turned, "axis_angle": turned_from_reference, "any_attitude": replaced},
-        checked=_unit,
+        checked=_normalise,
     ),
     INITIAL_RATE: at_path("initial.w", "initial_w", unit="rad/s"),
     INITIAL_STATE: Quantity(
@@ -221,18 +222,18 @@ QUANTITIES: dict[str, Quantity] = {
         "reference.q",
         "reference_q",
         combine={"normal": turned, "axis_angle": turned_about_axis, "any_attitude": replaced},
-        checked=_unit,
+        checked=_normalise,
     ),
-    INERTIA: Quantity(  # its random numbers: `RelativeInertia`
+    INERTIA: Quantity(  # with random numbers from `RelativeInertia`
         lambda parts: [f"{INERTIA}_{i + 1}{j + 1}" for i, j in PAIRS] if parts.plant.attitude else [],
         lambda parts: jnp.stack([paths.get(parts, "plant.inertia")[i, j] for i, j in PAIRS]),
         _with_inertia,
         unit="kg m^2",
-        checked=_inertia_checked,
+        checked=_check_inertia,
         check_with=lambda given, parts: None if "mode_coupling" in given else _check_flexible_body(given, parts),
     ),
-    DISTURBANCE_PHASE: _of_disturbance(DISTURBANCE_PHASE, "phase", unit="rad"),
-    DISTURBANCE_AMPLITUDE: _of_disturbance(DISTURBANCE_AMPLITUDE, "amplitude", combine=scaled, unit="N m"),
+    DISTURBANCE_PHASE: _disturbance_quantity(DISTURBANCE_PHASE, "phase", unit="rad"),
+    DISTURBANCE_AMPLITUDE: _disturbance_quantity(DISTURBANCE_AMPLITUDE, "amplitude", combine=scaled, unit="N m"),
     DISTURBANCE_BIAS: Quantity(
         lambda parts: numbered(f"{DISTURBANCE_BIAS}_", parts.plant.inputs),
         lambda parts: disturbances.bias(parts.disturbance, parts.plant.inputs),
@@ -249,20 +250,20 @@ QUANTITIES: dict[str, Quantity] = {
             ("torque_limit", "actuators.torque_limit", "N m", positive),
         )
     },
-    # of the gyro at the first sample; the sensors have random ones of their own if a plan gives none
+    # gyro bias at the first sample; without a value in a run table, the sensors have a random bias
     RATE_BIAS: at_path("sensors.given_bias", f"{RATE_BIAS}_", np.zeros(3), unit="rad/s"),
     "actuator_scale": Quantity(
-        lambda parts: numbered("actuator_scale_", _size(parts)),
-        _scale,
+        lambda parts: numbered("actuator_scale_", _count_channels(parts)),
+        _read_scale,
         lambda parts, scale: _with_actuators(parts, scale=scale),
         scaled,
         hardware=True,
     ),
     "actuator_misalignment": Quantity(
-        lambda parts: _paired("actuator_misalignment", _size(parts)),
-        _directions,
-        lambda parts, listed: _with_actuators(parts, directions=listed.reshape(-1, 3).T),
-        _turned_channels,
+        lambda parts: _vector_columns("actuator_misalignment", _count_channels(parts)),
+        _read_directions,
+        lambda parts, directions: _with_actuators(parts, directions=directions.reshape(-1, 3).T),
+        _rotate_channels,
         checked=fitting(
             lambda rows: np.abs(np.linalg.norm(rows.reshape(len(rows), -1, 3), axis=2) - 1.0) <= NEAR,
             "unit vectors, three numbers for each channel",
@@ -278,19 +279,19 @@ QUANTITIES: dict[str, Quantity] = {
         ("star_tracker_outage_begin", "star_tracker_outage_end"),
         np.full(2, np.inf),
         lambda parts: getattr(parts.sensors, "filter", None) is not None,
-        combine=lambda random, nominal, parts: jnp.stack([random[0], random[0] + random[1]]),  # begin and duration
+        combine=lambda random, nominal, parts: jnp.stack([random[0], random[0] + random[1]]),  # from begin and duration
         unit="s",
         checked=fitting(lambda rows: rows[:, 0] <= rows[:, 1], "a begin and an end that is not before it"),
         hardware=True,
     ),
     "wheel_failure": Quantity(
-        lambda parts: [] if parts.actuators.wheels is None else list(_FAILURE),
-        _failure,
+        lambda parts: [] if parts.actuators.wheels is None else list(_FAILURE_COLUMNS),
+        _read_failure,
         _with_failure,
-        _any_wheel,
+        _choose_wheel,
         unit=("s", "-"),
         check_with=_check_wheel,
-        categories=_FAILURE[1:],
+        categories=_FAILURE_COLUMNS[1:],
         hardware=True,
     ),
     "timing_jitter": at_path(
@@ -299,7 +300,9 @@ QUANTITIES: dict[str, Quantity] = {
         0.0,
         lambda parts: parts.clock.sampled,
         combine=replaced,
-        checked=fitting(lambda rows: (rows >= 0.0) & (rows < 0.5), "a share of the control period from 0 to below 0.5"),
+        checked=fitting(
+            lambda rows: (rows >= 0.0) & (rows < 0.5), "a fraction of the control period from 0 to below 0.5"
+        ),
         check_with=_check_jitter,
         hardware=True,
     ),
@@ -307,13 +310,13 @@ QUANTITIES: dict[str, Quantity] = {
         "plant.frequency", "mode_frequency_", combine=scaled, unit="rad/s", checked=positive, hardware=True
     ),
     "mode_coupling": Quantity(
-        lambda parts: _paired("mode_coupling", _modes(parts)),
+        lambda parts: _vector_columns("mode_coupling", _count_modes(parts)),
         lambda parts: jnp.ravel(paths.get(parts, "plant.coupling")),
         lambda parts, rows: replace(
             parts, plant=paths.put(parts.plant, "coupling", rows.reshape(-1, 3)).with_rest_inverse()
         ),
         scaled,
-        _modes,
+        _count_modes,
         unit="sqrt(kg) m",
         check_with=_check_flexible_body,
         hardware=True,
@@ -321,12 +324,12 @@ QUANTITIES: dict[str, Quantity] = {
 }
 
 
-# columns that number several things, such as wheels
+# columns without an order, such as the number of a wheel
 CATEGORIES = tuple(column for quantity in QUANTITIES.values() for column in quantity.categories)
 
 
 def read_columns(parts: Parts, names: Iterable[str]) -> dict[str, Array]:
-    """Return the numbers of these quantities by column, [rad], [rad/s], [kg m^2] or [N m]."""
+    """Return the numbers of these quantities by column, in SI units [rad, rad/s, kg m^2, N m]."""
     by_column = {}
     for name, quantity in QUANTITIES.items():
         columns = quantity.columns(parts) if name in names else []
@@ -339,7 +342,7 @@ def read_columns(parts: Parts, names: Iterable[str]) -> dict[str, Array]:
 def units(parts: Parts) -> dict[str, str]:
     """Return the units, such as "rad" or "-", of all columns of these parts, and of `initial_angle`.
 
-    A unit is empty if a plant that is no spacecraft has its own.
+    For plants other than a spacecraft, units that depend on the plant are "".
     """
     is_body = parts.plant.attitude
     named = {"initial_angle": "rad" if is_body else "x1"}

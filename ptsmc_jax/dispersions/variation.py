@@ -1,4 +1,7 @@
-"""The parts of a trial = at(nominal parts, coordinates(seed, trial)), a pure function."""
+"""The dispersion of a campaign: parts of a trial as a pure function of nominal parts, seed and trial number.
+
+Read `Dispersion.apply` first.
+"""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -18,21 +21,21 @@ from ptsmc_jax.numerics.pytrees import pytree
 from ptsmc_jax.simulation.rollout import Parts
 
 
-def check_dispersion(what: object) -> None:
-    """Raise TypeError, with one sentence, if this is no dispersion."""
-    if not isinstance(what, Dispersion):
-        found = type(what).__name__
+def check_dispersion(value: object) -> None:
+    """Raise TypeError if a value is no `Dispersion`."""
+    if not isinstance(value, Dispersion):
+        found = type(value).__name__
         raise TypeError(f"a dispersion is needed, such as study(scenario).dispersion, but this is a {found}")
 
 
 @pytree
 @dataclass(frozen=True)
 class Dispersion:
-    """All random quantities of a trial; every other quantity is nominal.
+    """The random quantities of a campaign. All other quantities are nominal.
 
     Attributes:
-        numbers: random numbers by the name of their quantity, see `quantities.QUANTITIES`.
-        own: a custom draw, which is applied after all others.
+        numbers: random numbers by the name of the quantity, see `quantities.QUANTITIES`.
+        own: a custom dispersion, which is applied last.
     """
 
     numbers: dict[str, RandomNumbers | RelativeInertia] = field(default_factory=dict)
@@ -40,11 +43,11 @@ class Dispersion:
 
     @property
     def varies(self) -> bool:
-        """Whether anything differs from trial to trial."""
+        """Whether any quantity is random."""
         return bool(self.kinds)
 
     def own_names(self) -> tuple[str, ...]:
-        """Return the names of the numbers that a custom draw adds to the row of a trial."""
+        """Return the names of the columns that a custom dispersion adds to result files."""
         if self.own is None:
             return ()
         numbers = jax.ShapeDtypeStruct((self.own.count,), jnp.result_type(float))
@@ -52,12 +55,17 @@ class Dispersion:
 
     @property
     def kinds(self) -> Mapping[str, RandomNumbers | RelativeInertia | Draw]:
-        """All random quantities by the names of their streams, in the order of `QUANTITIES`, the custom draw last."""
+        """Random quantities by the name of their stream, in the order of `QUANTITIES`, the custom dispersion last."""
         kinds = {name: self.numbers[name] for name in QUANTITIES if name in self.numbers}
         return kinds if self.own is None else {**kinds, OWN: self.own}
 
     def coordinates(self, seed: WholeNumber, trial: WholeNumber) -> Coordinates:
-        """Return the coordinates [-] of a trial; the stream of each quantity is independent of all other quantities."""
+        """Return the coordinates [-] of a trial. Each quantity has its own stream, independent of the others.
+
+        Args:
+            seed: seed of the campaign [-].
+            trial: number of the trial [-].
+        """
         kinds, coordinates = self.kinds, {}
         for distribution in draws.DISTRIBUTIONS:
             counts = {name: kind.count for name, kind in kinds.items() if kind.drawn == distribution}
@@ -66,12 +74,14 @@ class Dispersion:
 
     def at(self, parts: Parts, coordinates: Coordinates) -> Parts:
         """Return the parts of the trial that has these coordinates [-]."""
-        # the reference first: initial attitudes may be turned away from it
+        # the reference first, because initial attitudes may be relative to it
         for name, kind in sorted(self.kinds.items(), key=lambda item: item[0] != REFERENCE):
             c = coordinates[name]
             if isinstance(kind, RandomNumbers):
-                parts = QUANTITIES[name].dispersed(parts, kind.at(c), kind.distribution)
-            elif isinstance(kind, RelativeInertia):  # with its inverse, which `write` would have to solve for
+                parts = QUANTITIES[name].disperse(parts, kind.at(c), kind.distribution)
+            elif isinstance(
+                kind, RelativeInertia
+            ):  # it returns the inverse as well, which `write` would have to compute
                 body = paths.get(parts, "plant").with_inertia(*kind.at(c))
                 parts = quantities.with_body(parts, body)
             else:
@@ -79,19 +89,28 @@ class Dispersion:
         return parts
 
     def apply(self, parts: Parts, seed: WholeNumber, trial: WholeNumber) -> Parts:
-        """Return the parts of one trial: a pure function of the nominal parts, the seed and the trial's number [-]."""
+        """Return the parts of a trial, a pure function of its arguments.
+
+        Args:
+            parts: nominal parts.
+            seed: seed of the campaign [-].
+            trial: number of the trial [-].
+        """
         return self.at(parts, self.coordinates(seed, trial))
 
     def values(self, parts: Parts, given: Iterable[str] = ()) -> dict[str, Array]:
-        """Return the initial state, and every quantity that is random or given, of the parts of a trial.
+        """Return the initial state and all random or given quantities of a trial, by column, in SI units.
 
-        By the columns of `quantities`, numbers each: attitudes (q1 to q4) [-], rates [rad/s], inertia [kg m^2], phases
-        [rad], torques [N m], noises [rad, rad/s].
+        The angle between initial attitude and reference is the column `initial_angle` [rad].
+
+        Args:
+            parts: parts of the trial.
+            given: names of the quantities with given values.
         """
         angle = parts.controller.kinematics.angle(parts.initial, parts.reference(jnp.zeros_like(parts.t_end)))
         names = {INITIAL_ATTITUDE, INITIAL_RATE, INITIAL_STATE, *self.kinds, *given}
         return {"initial_angle": angle, **quantities.read_columns(parts, names)}
 
     def without(self, names: Iterable[str]) -> "Dispersion":
-        """Return the dispersion without these quantities; the random numbers of all others stay the same."""
+        """Return the dispersion without these quantities. The random numbers of all others do not change."""
         return replace(self, numbers={name: kind for name, kind in self.numbers.items() if name not in names})

@@ -388,7 +388,7 @@ MISFIT = [
     (FAILURE, [(2.0, 0.0), (2.0, -3.0)], f"= 2, -3 in row 1, {ONE_WHEEL}"),
     (FAILURE, [(2.0, 1.0), (2.0, 1.5)], f"= 2, 1.5 in row 1, {ONE_WHEEL}"),
     (["timing_jitter"], [(0.3,), (0.31,)],
-     "timing_jitter 0.31 in row 1, but must have at most 0.3, by which no control period exceeds pointing.window"),
+     "timing_jitter 0.31 in row 1, but must have at most 0.3, so that no period is longer than pointing.window"),
     (COUPLING, [(1.5, 0.0, 0.0), (5.0, 0.0, 0.0)],
      f"mode_coupling_11 to mode_coupling_13 = 5, 0, 0 in row 1, {NO_BODY}positive definite (its smallest "
      "principal moment is -15 kg m^2))"),

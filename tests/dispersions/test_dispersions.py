@@ -1,3 +1,5 @@
+"""Distributions of dispersed quantities by statistical tests, and the independence of their random streams."""
+
 import itertools
 import math
 from dataclasses import replace
@@ -19,7 +21,7 @@ from ptsmc_jax.signals import disturbances, references
 from tests import helpers
 from tests.helpers import chain_parts, short, vector
 
-ALARM = 1e-6  # with other seeds a check would fail once in a million; they are fixed
+ALARM = 1e-6  # probability of a false alarm of one statistical check; the seeds are fixed
 EPS = np.finfo(float).eps
 TRIALS = 2**14
 REFERENCE = Rotation.from_rotvec([1.0, 2.0, -0.5])
@@ -36,16 +38,16 @@ KINDS = {
 }
 
 
-def one(kind, seed, trial):
+def initial_attitude(kind, seed, trial):
     return Dispersion({"initial_attitude": kind}).apply(PARTS, seed, trial).initial.q
 
 
-many = jax.jit(jax.vmap(one, (None, None, 0)))
-single = jax.jit(one)
+initial_attitudes = jax.jit(jax.vmap(initial_attitude, (None, None, 0)))
+initial_attitude_jit = jax.jit(initial_attitude)
 
 
-def drawn(kind, seed=1):
-    return Rotation.from_quat(np.asarray(many(KINDS[kind], seed, jnp.arange(TRIALS, dtype=jnp.uint32))))
+def sample_rotations(kind, seed=1):
+    return Rotation.from_quat(np.asarray(initial_attitudes(KINDS[kind], seed, jnp.arange(TRIALS, dtype=jnp.uint32))))
 
 
 def is_uniform(values, low, high):
@@ -53,17 +55,17 @@ def is_uniform(values, low, high):
 
 
 def is_on_the_sphere(directions):
-    """Uniform directions: heights above three planes uniform (Archimedes), and the azimuth."""
-    heights = [is_uniform(heights, -1, 1) for heights in directions.T]
-    return all(heights) and is_uniform(np.arctan2(directions[:, 1], directions[:, 0]), -math.pi, math.pi)
+    """Return whether directions are uniform: by their components (Archimedes) and the azimuth."""
+    components = [is_uniform(component, -1, 1) for component in directions.T]
+    return all(components) and is_uniform(np.arctan2(directions[:, 1], directions[:, 0]), -math.pi, math.pi)
 
 
-def test_nothing_drawn_leaves_the_parts():
+def test_empty_dispersion_returns_the_same_parts():
     assert Dispersion().apply(PARTS, 1, 2) is PARTS
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_only_the_initial_attitude_is_drawn(kind):
+def test_dispersion_of_the_initial_attitude_changes_nothing_else(kind):
     got = Dispersion({"initial_attitude": KINDS[kind]}).apply(PARTS, 1, 2)
     before, after = (dict(jax.tree_util.tree_leaves_with_path(parts)) for parts in (PARTS, got))
     changed = [path for path in before if before[path] is not after[path]]
@@ -72,39 +74,39 @@ def test_only_the_initial_attitude_is_drawn(kind):
     assert abs(np.linalg.norm(got.initial.q) - 1) < 8 * EPS
 
 
-def test_axis_angle_turns_away_from_the_reference_at_the_start():
-    turn = REFERENCE.inv() * drawn("axis_angle")
+def test_axis_angle_attitudes_are_relative_to_the_reference():
+    turn = REFERENCE.inv() * sample_rotations("axis_angle")
     angles, low, high = turn.magnitude(), math.radians(20), math.radians(140)
     assert low - 8 * EPS <= angles.min()
     assert angles.max() <= high + 8 * EPS
     assert is_uniform(angles, low, high)
     axes = turn.as_rotvec() / angles[:, None]
     assert is_on_the_sphere(axes)
-    # the axis tells nothing about the angle: six correlations
+    # axis and angle are independent: six correlations
     limit = -stats.norm.ppf(ALARM / 2 / 6) / math.sqrt(TRIALS)
     for axis in axes.T:
         assert abs(np.corrcoef(axis, angles)[0, 1]) < limit
         assert abs(np.corrcoef(axis**2, angles)[0, 1]) < limit
 
 
-def test_axis_angle_of_one_angle_keeps_it():
-    q = many(numbers.axis_angle(0.7, 0.7), 5, jnp.arange(64, dtype=jnp.uint32))
+def test_axis_angle_with_equal_limits_has_a_constant_angle():
+    q = initial_attitudes(numbers.axis_angle(0.7, 0.7), 5, jnp.arange(64, dtype=jnp.uint32))
     turn = REFERENCE.inv() * Rotation.from_quat(np.asarray(q))
     np.testing.assert_allclose(turn.magnitude(), 0.7, rtol=20 * EPS)
 
 
-def test_uniform_attitudes_have_haar_measure():
-    attitudes = drawn("uniform")
+def test_uniform_attitudes_are_uniform_on_so3():
+    attitudes = sample_rotations("uniform")
     left, right = Rotation.from_rotvec([0.3, 1.0, -2.0]), Rotation.from_rotvec([2.0, 0.1, 0.7])
-    for seen in (attitudes, left * attitudes, attitudes * right, attitudes.inv(), REFERENCE.inv() * attitudes):
-        # density (1 - cos a)/pi of the angle
-        assert stats.kstest(seen.magnitude(), lambda a: (a - np.sin(a)) / np.pi).pvalue > ALARM
+    for rotated in (attitudes, left * attitudes, attitudes * right, attitudes.inv(), REFERENCE.inv() * attitudes):
+        # the angle has the density (1 - cos a)/pi
+        assert stats.kstest(rotated.magnitude(), lambda a: (a - np.sin(a)) / np.pi).pvalue > ALARM
         for vector_ in ([0, 0, 1], [0.6, -0.8, 0]):
-            assert is_on_the_sphere(seen.apply(vector_))
+            assert is_on_the_sphere(rotated.apply(vector_))
 
 
-def test_normal_attitudes_are_turned_from_the_nominal_one():
-    r = (NOMINAL.inv() * drawn("normal")).as_rotvec() / 0.1  # 10 sigma short of wrapping
+def test_normal_attitudes_have_a_normal_rotation_vector_from_the_nominal_attitude():
+    r = (NOMINAL.inv() * sample_rotations("normal")).as_rotvec() / 0.1  # 180 degrees is more than 10 sigma
     for axis in r.T:
         assert stats.kstest(axis, "norm").pvalue > ALARM
     sigmas = -stats.norm.ppf(ALARM / 2)
@@ -114,48 +116,48 @@ def test_normal_attitudes_are_turned_from_the_nominal_one():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_trial_is_the_same_alone_and_in_any_batch(kind):
+def test_trial_does_not_depend_on_the_batch(kind):
     trials = jnp.asarray([0, 1, 5, 2**32 - 1], dtype=jnp.uint32)
-    alone = np.stack([single(KINDS[kind], 9, trial) for trial in trials])
+    alone = np.stack([initial_attitude_jit(KINDS[kind], 9, trial) for trial in trials])
     for batch in (
-        np.stack([one(KINDS[kind], 9, 0), *alone[1:]]),  # without jit, a whole number
-        many(KINDS[kind], 9, trials[::-1])[::-1],
-        jax.jit(lanes.vmap(lambda k: one(KINDS[kind], 9, k)))(trials),
+        np.stack([initial_attitude(KINDS[kind], 9, 0), *alone[1:]]),  # without jit, with an int
+        initial_attitudes(KINDS[kind], 9, trials[::-1])[::-1],
+        jax.jit(lanes.vmap(lambda k: initial_attitude(KINDS[kind], 9, k)))(trials),
     ):
         np.testing.assert_allclose(batch, alone, rtol=0, atol=10 * EPS)  # products of sines up to 1
-    assert np.abs(np.diff(alone, axis=0)).min() > 1e-6  # and no two are equal
+    assert np.abs(np.diff(alone, axis=0)).min() > 1e-6  # no two trials are equal
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_another_seed_draws_other_attitudes(kind):
+def test_another_seed_has_other_attitudes(kind):
     trials = jnp.arange(64, dtype=jnp.uint32)
-    first, second = (np.asarray(many(KINDS[kind], seed, trials)) for seed in (1, 2))
+    first, second = (np.asarray(initial_attitudes(KINDS[kind], seed, trials)) for seed in (1, 2))
     assert np.abs(first - second).max(axis=1).min() > 1e-6
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_draw_belongs_to_its_own_stream(kind):
-    """Trial and seed name it, and nothing of the nominal run does: same numbers with another loop and law."""
+def test_random_numbers_depend_only_on_seed_trial_and_quantity(kind):
+    """Parts with another loop and other sensors have the same random numbers."""
     other = helpers.parts(
         q=NOMINAL.as_quat(), reference=references.Fixed(vector(REFERENCE.as_quat())), period=0.05, noise=(1e-5, 1e-6)
     )
     got = Dispersion({"initial_attitude": KINDS[kind]}).apply(other, 3, 4).initial.q
-    np.testing.assert_array_equal(got, one(KINDS[kind], 3, 4))
+    np.testing.assert_array_equal(got, initial_attitude(KINDS[kind], 3, 4))
 
 
-def test_initial_states_of_a_chain_are_drawn_about_the_nominal_one():
+def test_initial_states_of_a_chain_have_their_distribution():
     run = chain_parts([5.0, 3.0, 2.0])
     width = vector([1.0, 0.5, 0.0])
     trials = jnp.arange(TRIALS, dtype=jnp.uint32)
-    drawn_states = {}
+    samples = {}
     for name in ("uniform", "normal"):
-        whole = Dispersion({"initial_state": RandomNumbers(name, width)})
-        assert whole.varies
-        x0 = np.asarray(jax.jit(jax.vmap(lambda k, whole=whole: whole.apply(run, 3, k).initial))(trials))
+        dispersion = Dispersion({"initial_state": RandomNumbers(name, width)})
+        assert dispersion.varies
+        x0 = np.asarray(jax.jit(jax.vmap(lambda k, dispersion=dispersion: dispersion.apply(run, 3, k).initial))(trials))
         np.testing.assert_array_equal(x0[:, 2], 2.0)
-        drawn_states[name] = (x0[:, :2] - [5.0, 3.0]) / [1.0, 0.5]
-        np.testing.assert_array_equal(whole.apply(run, 3, 7).initial, x0[7])
-    uniform, normal = drawn_states["uniform"], drawn_states["normal"]
+        samples[name] = (x0[:, :2] - [5.0, 3.0]) / [1.0, 0.5]
+        np.testing.assert_array_equal(dispersion.apply(run, 3, 7).initial, x0[7])
+    uniform, normal = samples["uniform"], samples["normal"]
     assert np.abs(uniform).max() <= 1.0
     for k in range(2):
         assert stats.kstest(uniform[:, k], "uniform", (-1.0, 2.0)).pvalue > ALARM
@@ -169,24 +171,24 @@ def phases(count):
     return RandomNumbers("interval", vector(np.full(count, 2.0 * np.pi)))
 
 
-def many_drawn(whole, run=PARTS, count=TRIALS, seed=4):
-    """(trials, ...) parts of many trials."""
-    return jax.jit(jax.vmap(lambda k: whole.apply(run, seed, k)))(jnp.arange(count, dtype=jnp.uint32))
+def parts_of_trials(dispersion, run=PARTS, count=TRIALS, seed=4):
+    """Return the parts of many trials, with a leading axis."""
+    return jax.jit(jax.vmap(lambda k: dispersion.apply(run, seed, k)))(jnp.arange(count, dtype=jnp.uint32))
 
 
-def test_initial_rates_are_drawn_about_the_nominal_one():
-    nominal, laws = np.array([0.01, -0.02, 0.03]), {"uniform": ("uniform", (-1, 2)), "normal": ("norm", ())}
-    for name in laws:
-        got = many_drawn(Dispersion({"initial_rate": RandomNumbers(name, vector([0.02] * 3))}))
+def test_initial_rates_have_their_distribution():
+    nominal, distributions = np.array([0.01, -0.02, 0.03]), {"uniform": ("uniform", (-1, 2)), "normal": ("norm", ())}
+    for name in distributions:
+        got = parts_of_trials(Dispersion({"initial_rate": RandomNumbers(name, vector([0.02] * 3))}))
         np.testing.assert_array_equal(got.initial.q, np.broadcast_to(PARTS.initial.q, (TRIALS, 4)))
-        shares = (np.asarray(got.initial.w) - nominal) / 0.02
-        for axis in shares.T:
-            assert stats.kstest(axis, laws[name][0], laws[name][1]).pvalue > ALARM
+        standard = (np.asarray(got.initial.w) - nominal) / 0.02
+        for axis in standard.T:
+            assert stats.kstest(axis, distributions[name][0], distributions[name][1]).pvalue > ALARM
         limit = -stats.norm.ppf(ALARM / 2) / math.sqrt(TRIALS)
-        assert np.abs(np.corrcoef(shares.T) - np.eye(3)).max() < limit
+        assert np.abs(np.corrcoef(standard.T) - np.eye(3)).max() < limit
 
 
-def bodies(moments, std, turn=0.0, axes=None):
+def sample_inertias(moments, std, turn=0.0, axes=None):
     axes = np.eye(3) if axes is None else axes
     kind = inertias.RelativeInertia(vector(moments), vector(axes), vector(std), vector(turn))
     plant = plants_of(Dispersion({"inertia": kind}), jnp.arange(TRIALS, dtype=jnp.uint32))
@@ -197,52 +199,51 @@ plants_of = jax.jit(jax.vmap(lambda whole, k: whole.apply(PARTS, 4, k).plant, (N
 
 
 def test_principal_moments_are_truncated_normal():
-    """Where every draw within three sigma is a body, each moment alone follows the truncated normal law."""
-    inertia, inverse = bodies([10.0, 12.0, 14.0], 0.05)
+    """For these moments, every sample within three sigma is physical, so that no sample is rejected."""
+    inertia, inverse = sample_inertias([10.0, 12.0, 14.0], 0.05)
     assert np.abs(inertia - inertia * np.eye(3)).max() == 0.0
     np.testing.assert_allclose(inertia @ inverse, np.broadcast_to(np.eye(3), inertia.shape), atol=1e-14)
-    shares = (np.diagonal(inertia, axis1=1, axis2=2) / [10.0, 12.0, 14.0] - 1.0) / 0.05
-    assert 2.9 < np.abs(shares).max() <= 3.0 + 1e-9  # 44 of 16 384 would lie farther out
-    for axis in shares.T:
+    standard = (np.diagonal(inertia, axis1=1, axis2=2) / [10.0, 12.0, 14.0] - 1.0) / 0.05
+    assert 2.9 < np.abs(standard).max() <= 3.0 + 1e-9  # without truncation 44 of 16 384 samples would exceed it
+    for axis in standard.T:
         assert stats.kstest(axis, stats.truncnorm(-3, 3).cdf).pvalue > ALARM
     limit = -stats.norm.ppf(ALARM / 2) / math.sqrt(TRIALS)
-    assert np.abs(np.corrcoef(shares.T) - np.eye(3)).max() < limit
+    assert np.abs(np.corrcoef(standard.T) - np.eye(3)).max() < limit
 
 
 @pytest.mark.parametrize("moments", [[1.0, 1.0, 2.0], [5.0, 9.0, 13.9], [10.0, 12.0, 14.0]])
-def test_every_drawn_body_is_physical(moments):
-    """The flat body (1, 1, 2) is on the edge: half of what is drawn for it is none, and is drawn again, not clipped."""
+def test_every_sampled_inertia_is_physical(moments):
+    """For the flat body (1, 1, 2) half of the samples are unphysical. They are rejected, not clipped."""
     rotation = Rotation.from_rotvec([0.3, -0.2, 0.9]).as_matrix()
-    inertia, inverse = bodies(moments, 0.2, turn=0.1, axes=rotation)
+    inertia, inverse = sample_inertias(moments, 0.2, turn=0.1, axes=rotation)
     np.testing.assert_allclose(inertia, inertia.swapaxes(1, 2), atol=1e-14 * max(moments))
     np.testing.assert_allclose(inertia @ inverse, np.broadcast_to(np.eye(3), inertia.shape), atol=1e-13)
     found = np.linalg.eigvalsh(inertia)
     assert found.min() > 0.0
     assert np.all(found[:, 2] <= (found[:, 0] + found[:, 1]) * (1 + 1e-12))
     on_the_edge = np.mean(found[:, 2] > (found[:, 0] + found[:, 1]) * (1 - 1e-9))
-    assert on_the_edge < 1e-3  # the nominal body once in 2^16 draws; clipping would put half of them here
+    assert on_the_edge < 1e-3  # clipping would put half of the samples on the limit
 
 
 @pytest.mark.parametrize("std", [0.05, 0.2])
 @pytest.mark.parametrize("moments", [[20.0, 0.02, 20.0], [10.0, 10.0, 0.1], [1e-4, 100.0, 100.0]])
-def test_slender_bodies_keep_the_stated_law(moments, std):
-    """Two large moments may differ by the small one, c, at most: hardly any of all draws is such a body.
+def test_slender_bodies_have_the_stated_distribution(moments, std):
+    """The two large moments a and b may differ by at most the small one, c, which few samples satisfy.
 
-    Beside the spread of the large ones that is nothing, so that, of their differences, all are as likely: (a - b) / c
-    is uniform, c has its normal density times c itself, and the mean of a and b is normal. That leaves out the square
-    of c over the spread of a - b, 0.3 % at most here, where the test sees 2 %.
+    c is small compared with the spread of a - b. So (a - b) / c is nearly uniform, c has its normal density times c,
+    and the mean of a and b is normal. The relative error of this approximation is at most 0.3 %. The test detects 2 %.
     """
-    inertia, _ = bodies(moments, std)
+    inertia, _ = sample_inertias(moments, std)
     found = np.diagonal(inertia, axis1=1, axis2=2)[:, np.argsort(moments)]
     assert np.all(2.0 * found.max(axis=1) <= found.sum(axis=1))
     c, a, b = ((found / np.sort(moments) - 1.0) / std).T
     assert np.abs([a, b, c]).max() <= numbers.FARTHEST * (1 + 1e-9)
 
     def cdf(s):
-        def whole(s):  # integral of (1 + std s) times the normal density
+        def antiderivative(s):  # integral of (1 + std s) times the normal density
             return stats.norm.cdf(s) - std * stats.norm.pdf(s)
 
-        return (whole(s) - whole(-3.0)) / (whole(3.0) - whole(-3.0))
+        return (antiderivative(s) - antiderivative(-3.0)) / (antiderivative(3.0) - antiderivative(-3.0))
 
     difference = (found[:, 1] - found[:, 2]) / found[:, 0]
     assert stats.kstest(c, cdf).pvalue > ALARM
@@ -252,7 +253,7 @@ def test_slender_bodies_keep_the_stated_law(moments, std):
     assert np.abs(np.corrcoef([c, a + b, difference]) - np.eye(3)).max() < limit
 
 
-drawn_bodies = jax.jit(jax.vmap(lambda kind, c: kind.at(c)[0], (None, 0)))
+inertia_of = jax.jit(jax.vmap(lambda kind, c: kind.at(c)[0], (None, 0)))
 
 
 MOMENTS = ([10.0, 10.0, 20.0], [20.0, 19.5, 1.0], [2.0, 20.0, 20.0], [10.0, 12.0, 14.0])
@@ -260,58 +261,59 @@ BODIES = list(itertools.product(MOMENTS, (0.05, 0.3)))
 
 
 @pytest.mark.parametrize(("moments", "std"), short(BODIES, [BODIES[0], BODIES[4], BODIES[7]]))
-def test_what_is_drawn_where_no_candidate_is_a_body_has_their_law(moments, std):
-    """All sixteen beyond three sigma: what is drawn instead has the law of candidates that are drawn until one is."""
+def test_fallback_samples_have_the_distribution_of_repeated_rejection(moments, std):
+    """All candidates are set beyond three sigma, so that only the fallback for slender bodies is used."""
     rng = np.random.default_rng(1)
     kind = inertias.RelativeInertia(vector(moments), vector(np.eye(3)), vector(std), vector(0.0))
     c = rng.standard_normal((1 << 15, kind.count))
     c[:, : 3 * inertias.CANDIDATES] = 9.0
-    found = np.diagonal(np.asarray(drawn_bodies(kind, vector(c))), axis1=1, axis2=2)
-    shares = rng.standard_normal((1 << 19, 3))
-    wanted = np.array(moments) * (1.0 + std * shares)
-    is_one = (2.0 * wanted.max(axis=1) <= wanted.sum(axis=1)) & (wanted.min(axis=1) > 0.0)
-    wanted = wanted[is_one & (np.abs(shares).max(axis=1) <= numbers.FARTHEST)]
-    assert len(wanted) > 1 << 15
+    found = np.diagonal(np.asarray(inertia_of(kind, vector(c))), axis1=1, axis2=2)
+    standard = rng.standard_normal((1 << 19, 3))
+    expected = np.array(moments) * (1.0 + std * standard)
+    is_physical = (2.0 * expected.max(axis=1) <= expected.sum(axis=1)) & (expected.min(axis=1) > 0.0)
+    expected = expected[is_physical & (np.abs(standard).max(axis=1) <= numbers.FARTHEST)]
+    assert len(expected) > 1 << 15
     for weights in ([1, 0, 0], [0, 1, 0], [0, 0, 1], [1, -1, 0], [0, 1, -1], [1, 1, -1], [1, 1, 1]):
-        one, other = found @ np.array(weights), wanted @ np.array(weights)
+        one, other = found @ np.array(weights), expected @ np.array(weights)
         assert np.asarray(stats.ks_2samp(one, other))[1] > ALARM, weights
     assert not np.any(np.all(found == moments, axis=1))
 
 
-def test_the_first_candidate_that_is_a_body_is_drawn():
+def test_first_physical_candidate_is_used():
     rng, moments, std = np.random.default_rng(2), np.array([10.0, 12.0, 20.0]), 0.2
     kind = inertias.RelativeInertia(vector(moments), vector(np.eye(3)), vector(std), vector(0.0))
     c = rng.standard_normal((1 << 15, kind.count))
-    found = np.diagonal(np.asarray(drawn_bodies(kind, vector(c))), axis1=1, axis2=2)
-    shares = c[:, : 3 * inertias.CANDIDATES].reshape(len(c), -1, 3)
-    drawn = moments * (1.0 + std * shares)
-    fits = (2.0 * drawn.max(axis=2) <= drawn.sum(axis=2)) & (np.abs(shares).max(axis=2) <= numbers.FARTHEST)
-    some, first = fits.any(axis=1), fits.argmax(axis=1)
+    found = np.diagonal(np.asarray(inertia_of(kind, vector(c))), axis1=1, axis2=2)
+    standard = c[:, : 3 * inertias.CANDIDATES].reshape(len(c), -1, 3)
+    candidates = moments * (1.0 + std * standard)
+    is_valid = 2.0 * candidates.max(axis=2) <= candidates.sum(axis=2)
+    is_valid &= np.abs(standard).max(axis=2) <= numbers.FARTHEST
+    some, first = is_valid.any(axis=1), is_valid.argmax(axis=1)
     assert {0, 1, 2, 3} <= set(first[some])
-    np.testing.assert_allclose(found[some], drawn[some, first[some]], rtol=1e-14)
+    np.testing.assert_allclose(found[some], candidates[some, first[some]], rtol=1e-14)
 
 
-body_slopes = jax.jit(jax.jacfwd(lambda kind, c: kind.at(c), (0, 1)))
+inertia_jacobians = jax.jit(jax.jacfwd(lambda kind, c: kind.at(c), (0, 1)))
 
 
 @pytest.mark.parametrize("moments", [[20.0, 20.0, 0.02], [10.0, 12.0, 14.0], [1.0, 1.0, 2.0]])
-def test_drawn_bodies_have_slopes_in_every_number(moments):
-    """At no spread at all too, and for coordinates at the far end of what is drawn."""
+def test_sampled_inertias_have_finite_derivatives(moments):
+    """This includes a standard deviation of zero and extreme random numbers."""
     for std, first in itertools.product((0.0, 0.05), (0.5, 9.0)):
         for size in (0.3, 6.7):
             kind = inertias.RelativeInertia(vector(moments), vector(np.eye(3)), vector(std), vector(0.1))
             c = jnp.full(kind.count, size).at[: 3 * inertias.CANDIDATES].set(first)
-            assert all(np.all(np.isfinite(slope)) for slope in jax.tree.leaves(body_slopes(kind, c)))
+            assert all(np.all(np.isfinite(jacobian)) for jacobian in jax.tree.leaves(inertia_jacobians(kind, c)))
 
 
-def test_principal_axes_are_turned_by_a_normal_rotation_vector():
+def test_principal_axes_are_rotated_by_a_normal_rotation_vector():
     rotation = Rotation.from_rotvec([0.3, -0.2, 0.9])
-    inertia, _ = bodies([5.0, 10.0, 14.0], 0.0, turn=0.01, axes=rotation.as_matrix())
+    inertia, _ = sample_inertias([5.0, 10.0, 14.0], 0.0, turn=0.01, axes=rotation.as_matrix())
     # to first order J' = A (D + [r]x D - D [r]x) A': off-diagonal (i, j) of A' J' A is r_k (D_i - D_j), up to sign
     inner = rotation.as_matrix().T @ inertia @ rotation.as_matrix()
     for i, j in ((0, 1), (0, 2), (1, 2)):
         turn = inner[:, i, j] / ([5.0, 10.0, 14.0][j] - [5.0, 10.0, 14.0][i]) / 0.01
-        assert abs(np.std(turn) - 1.0) < 0.04  # a sampling error of 0.006 and 0.01 of second order
+        assert abs(np.std(turn) - 1.0) < 0.04  # sampling error 0.006, second order 0.01
     np.testing.assert_allclose(np.linalg.eigvalsh(inertia), [[5.0, 10.0, 14.0]] * TRIALS, rtol=1e-12)
 
 
@@ -319,10 +321,10 @@ SINE = disturbances.Sinusoid(*(vector(v) for v in ([0.1] * 3, [0.2] * 3, [0.0, 0
 ORBIT = disturbances.GravityGradient(PARTS.plant.inertia, vector([0.0, 0.0, 0.0, 1.0]), vector(1e-3), vector(0.25))
 
 
-def test_every_phase_is_drawn_uniformly_and_on_its_own():
+def test_phases_are_uniform_and_independent():
     still = disturbances.Constant(vector([0.1, 0.2, 0.3]))
     run = replace(PARTS, disturbance=disturbances.Sum((SINE, still, ORBIT, SINE)))
-    got = many_drawn(Dispersion({"disturbance_phase": phases(7)}), run).disturbance.terms
+    got = parts_of_trials(Dispersion({"disturbance_phase": phases(7)}), run).disturbance.terms
     np.testing.assert_array_equal(got[1].value, np.broadcast_to(still.value, (TRIALS, 3)))
     turns = np.column_stack(
         [
@@ -338,13 +340,13 @@ def test_every_phase_is_drawn_uniformly_and_on_its_own():
     assert np.abs(np.corrcoef(turns.T) - np.eye(7)).max() < limit
 
 
-def test_a_drawn_body_meets_its_own_gravity_gradient():
+def test_gravity_gradient_acts_on_the_sampled_inertia():
     kind = inertias.RelativeInertia(vector([10.0, 12.0, 14.0]), vector(np.eye(3)), vector(0.05), vector(0.0))
     run = replace(PARTS, disturbance=disturbances.Sum((ORBIT, SINE)))
     got = jax.jit(lambda: Dispersion({"inertia": kind}).apply(run, 1, 2))()
     np.testing.assert_array_equal(got.disturbance.terms[0].inertia, got.plant.inertia)
     assert np.abs(got.plant.inertia - PARTS.plant.inertia).max() > 0.01
-    np.testing.assert_array_equal(got.controller.model.inertia, PARTS.controller.model.inertia)  # the law's is nominal
+    np.testing.assert_array_equal(got.controller.model.inertia, PARTS.controller.model.inertia)  # nominal
 
 
 NOISY = helpers.parts(
@@ -356,9 +358,9 @@ TENTH = RandomNumbers("truncated_normal", vector([0.1]))
 WIDE = RandomNumbers("uniform", vector([0.5]))
 
 
-def test_relative_numbers_are_truncated_not_clipped():
-    """The factor on a level follows the truncated normal law, or the uniform one, and no two trials sit at an end."""
-    got = many_drawn(Dispersion({"torque_limit_level": TENTH, "attitude_noise_level": WIDE}), LIMITED)
+def test_relative_dispersions_are_truncated_not_clipped():
+    """The factors have the truncated normal or the uniform distribution, without repeated values at the ends."""
+    got = parts_of_trials(Dispersion({"torque_limit_level": TENTH, "attitude_noise_level": WIDE}), LIMITED)
     normal = (np.asarray(got.actuators.torque_limit) / 0.5 - 1.0) / 0.1
     uniform = np.asarray(got.sensors.attitude_noise) / 1e-5
     assert stats.kstest(normal, stats.truncnorm(-3, 3).cdf).pvalue > ALARM
@@ -370,21 +372,21 @@ def test_relative_numbers_are_truncated_not_clipped():
     assert abs(np.corrcoef(normal, uniform)[0, 1]) < limit
 
 
-def test_amplitudes_are_scaled_each_on_its_own_and_a_bias_is_added():
+def test_amplitudes_are_scaled_independently_and_a_bias_is_added():
     still = disturbances.Constant(vector([0.1, 0.2, 0.3]))
     run = replace(PARTS, disturbance=disturbances.Sum((SINE, ORBIT, still)))
     added = RandomNumbers("normal", vector([0.01] * 3))
     factors = RandomNumbers("uniform", vector([0.5] * 6))
-    spread = Dispersion({"disturbance_bias": added, "disturbance_amplitude": factors})
-    sine, orbit, constant, bias = many_drawn(spread, run).disturbance.terms
+    dispersion = Dispersion({"disturbance_bias": added, "disturbance_amplitude": factors})
+    sine, orbit, constant, bias = parts_of_trials(dispersion, run).disturbance.terms
     factors = np.column_stack([np.asarray(sine.amplitude) / 0.1, np.asarray(constant.value) / [0.1, 0.2, 0.3]])
     for column in factors.T:
         assert is_uniform(column, 0.5, 1.5)
     for column in np.asarray(bias.value).T:
         assert stats.kstest(column / 0.01, "norm").pvalue > ALARM
-    every = np.column_stack([factors, np.asarray(bias.value)])
+    columns = np.column_stack([factors, np.asarray(bias.value)])
     limit = -stats.norm.ppf(ALARM / 2) / math.sqrt(TRIALS)
-    assert np.abs(np.corrcoef(every.T) - np.eye(9)).max() < limit
+    assert np.abs(np.corrcoef(columns.T) - np.eye(9)).max() < limit
     np.testing.assert_array_equal(orbit.phase, np.full(TRIALS, 0.25))
     alone = Dispersion({"disturbance_bias": added}).apply(replace(PARTS, disturbance=SINE), 4, 9).disturbance
     np.testing.assert_array_equal(alone.terms[-1].value, bias.value[9])
@@ -392,20 +394,20 @@ def test_amplitudes_are_scaled_each_on_its_own_and_a_bias_is_added():
     np.testing.assert_allclose(alone(t, PARTS.initial), SINE(t) + bias.value[9], rtol=1e-14)
 
 
-def test_a_drawn_reference_takes_the_start_with_it():
+def test_initial_attitude_is_relative_to_the_random_reference():
     spread = RandomNumbers("normal", vector([0.05] * 3))
-    turned = Dispersion({"initial_attitude": KINDS["axis_angle"], "reference": spread})
-    got = many_drawn(turned)
+    dispersion = Dispersion({"initial_attitude": KINDS["axis_angle"], "reference": spread})
+    got = parts_of_trials(dispersion)
     q_f = Rotation.from_quat(np.asarray(got.reference.q))
     for axis in ((REFERENCE.inv() * q_f).as_rotvec() / 0.05).T:
         assert stats.kstest(axis, "norm").pvalue > ALARM
-    same = drawn("axis_angle", seed=4)  # the turn from the reference is the one drawn without it
+    same = sample_rotations("axis_angle", seed=4)  # the rotation from the reference does not depend on the reference
     turn = (q_f.inv() * Rotation.from_quat(np.asarray(got.initial.q))).as_quat(canonical=True)
     np.testing.assert_allclose(turn, (REFERENCE.inv() * same).as_quat(canonical=True), atol=1e-14)
     np.testing.assert_array_equal(got.reference.rate, np.broadcast_to([0.1, 0.0, 0.2], (TRIALS, 3)))
 
 
-def test_one_more_thing_drawn_changes_no_other_draw():
+def test_random_numbers_of_a_quantity_do_not_depend_on_other_quantities():
     inertia = inertias.RelativeInertia(vector([10.0, 12.0, 14.0]), vector(np.eye(3)), vector(0.05), vector(0.1))
     tenths = RandomNumbers("uniform", vector([0.5] * 3))
     kinds = {
@@ -419,34 +421,36 @@ def test_one_more_thing_drawn_changes_no_other_draw():
         "torque_limit_level": (TENTH, lambda p: p.actuators.torque_limit),
         "rate_noise_level": (WIDE, lambda p: p.sensors.rate_noise),
     }
-    whole = Dispersion({name: kind for name, (kind, _) in kinds.items()})
-    got = whole.apply(LIMITED, 7, 8)
-    for name, (kind, seen) in kinds.items():
+    dispersion = Dispersion({name: kind for name, (kind, _) in kinds.items()})
+    got = dispersion.apply(LIMITED, 7, 8)
+    for name, (kind, read) in kinds.items():
         alone = Dispersion({name: kind}).apply(LIMITED, 7, 8)
-        np.testing.assert_array_equal(seen(got), seen(alone), err_msg=name)
-        assert not np.array_equal(seen(alone), seen(Dispersion({"disturbance_bias": tenths}).apply(LIMITED, 1, 1)))
-    c = whole.coordinates(7, 8)
+        np.testing.assert_array_equal(read(got), read(alone), err_msg=name)
+        assert not np.array_equal(read(alone), read(Dispersion({"disturbance_bias": tenths}).apply(LIMITED, 1, 1)))
+    c = dispersion.coordinates(7, 8)
     assert len({float(v[0]) for v in c.values()}) == len(c) == 9
 
 
-def test_the_parts_of_coordinates_are_those_of_the_trial_that_has_them():
+def test_at_with_the_coordinates_of_a_trial_equals_apply():
     rates = RandomNumbers("normal", vector([0.01] * 3))
-    whole = Dispersion({"initial_attitude": KINDS["axis_angle"], "initial_rate": rates})
-    at = whole.at(PARTS, whole.coordinates(3, 9))
-    drawn_parts = whole.apply(PARTS, 3, 9)
-    jax.tree.map(np.testing.assert_array_equal, at.initial, drawn_parts.initial)
-    middle = whole.at(PARTS, {"initial_attitude": vector([0.5, 0.0, 1.0]), "initial_rate": vector([0.0, 1.0, 0.0])})
+    dispersion = Dispersion({"initial_attitude": KINDS["axis_angle"], "initial_rate": rates})
+    at = dispersion.at(PARTS, dispersion.coordinates(3, 9))
+    applied = dispersion.apply(PARTS, 3, 9)
+    jax.tree.map(np.testing.assert_array_equal, at.initial, applied.initial)
+    middle = dispersion.at(
+        PARTS, {"initial_attitude": vector([0.5, 0.0, 1.0]), "initial_rate": vector([0.0, 1.0, 0.0])}
+    )
     turn = (REFERENCE.inv() * Rotation.from_quat(np.asarray(middle.initial.q))).as_rotvec()
     np.testing.assert_allclose(turn, [math.radians(140.0), 0.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(middle.initial.w, PARTS.initial.w + np.array([0.0, 0.01, 0.0]), rtol=1e-15)
 
 
-def test_what_trials_fly_with_has_the_units_of_each_column():
-    flight = {
+def test_columns_of_quantities_have_units():
+    tables = {
         "flexible": {"frequency": [3.0], "damping": [0.01], "coupling": [[0.5, 0.0, 0.0]]},
         "loop": {"mode": "sampled"}, "hardware": {"attitude_noise": 1e-5, "torque_limit": 1.0}, "wheels": {},
     }  # fmt: skip
-    named = quantities.units(scenario.study(scenario.from_tables(flight)).parts)
+    named = quantities.units(scenario.study(scenario.from_tables(tables)).parts)
     for column, unit in {
         "initial_angle": "rad", "initial_q4": "-", "initial_w1": "rad/s", "inertia_12": "kg m^2",
         "disturbance_bias_3": "N m", "attitude_noise": "rad", "wheel_failure_time": "s", "wheel_failure_wheel": "-",
@@ -457,14 +461,14 @@ def test_what_trials_fly_with_has_the_units_of_each_column():
     assert (chain["initial_angle"], chain["initial_x2"], chain["disturbance_bias_1"]) == ("x1", "", "")
 
 
-def test_quaternions_of_a_table_are_made_unit_ones_and_those_that_are_stay_to_the_last_digit():
-    """As far as digits that a table leaves out may put their norm off; a norm of 1 but for rounding is 1."""
+def test_quaternions_of_a_run_table_are_normalised_and_unit_quaternions_are_not_changed():
+    """The norm may differ from 1 by the rounding of decimal digits in a table, up to 1e-6."""
     q = REFERENCE.as_quat()
     rounded = np.nextafter(q, 1.0)
     rows = np.stack([rounded, (1.0 + 5e-8) * q, (1.0 - 9e-7) * q])
-    made = quantities._unit(rows)
-    np.testing.assert_array_equal(made[0], rounded)
-    np.testing.assert_allclose(made[1:], [q, q], rtol=0, atol=4 * EPS)
+    found = quantities._normalise(rows)
+    np.testing.assert_array_equal(found[0], rounded)
+    np.testing.assert_allclose(found[1:], [q, q], rtol=0, atol=4 * EPS)
     with pytest.raises(base.UnfitError, match="a unit quaternion") as refused:
-        quantities._unit(np.stack([q, (1.0 + 1.1e-6) * q]))
+        quantities._normalise(np.stack([q, (1.0 + 1.1e-6) * q]))
     assert refused.value.row == 1

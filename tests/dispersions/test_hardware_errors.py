@@ -1,4 +1,4 @@
-"""Misfits of the hardware: each trial against a run by hand from its row, and what each of them does to a flight."""
+"""Hardware errors that the flight software does not know: simulated trials against independently built parts."""
 
 from dataclasses import replace
 
@@ -25,7 +25,7 @@ FLIGHT = {
     "loop": {"mode": "sampled", "period": 0.25, "t_end": 7.0},
     "hardware": {"attitude_noise": 1e-5, "rate_noise": 1e-6},
 }
-DRAWN = {
+DISPERSION = {
     "actuator_scale": {"kind": "relative_normal", "std": 0.05},
     "actuator_misalignment": {"kind": "normal", "std_deg": 1.0},
     "star_tracker_misalignment": {"kind": "uniform", "half_width_deg": 0.5},
@@ -35,27 +35,27 @@ DRAWN = {
 }
 
 
-def roomy(parts):
-    """With samples and steps for a longer run, and faster modes, so that one program flies both."""
+def enlarged(parts):
+    """Return parts with more periods and integration steps, so that several runs use one compiled program."""
     return replace(parts, clock=replace(parts.clock, after=64), substeps=30)
 
 
 @pytest.fixture(scope="module")
-def drawn():
-    ready = scenario.study(scenario.from_tables({**FLIGHT, "dispersion": DRAWN}))
+def dispersed():
+    ready = scenario.study(scenario.from_tables({**FLIGHT, "dispersion": DISPERSION}))
     hardware = {name for name, quantity in QUANTITIES.items() if quantity.hardware}
     assert set(ready.dispersion.kinds) == hardware - {"star_tracker_outage", "wheel_failure", "timing_jitter"}
-    return replace(ready, parts=roomy(ready.parts))
+    return replace(ready, parts=enlarged(ready.parts))
 
 
 def numbers(row, name, *shape):
-    """The columns of a trial's row that begin with a name, in their order."""
-    kept = [v for key, v in row.items() if key.rpartition("_")[0] == name]
-    return vector(np.array(kept).reshape(shape))
+    """Return the numbers of a quantity from the columns of a trial."""
+    values = [v for key, v in row.items() if key.rpartition("_")[0] == name]
+    return vector(np.array(values).reshape(shape))
 
 
-def misfitted(parts, frequency, coupling, device, sensors):
-    """The flexible spacecraft with these misfits."""
+def with_hardware_errors(parts, frequency, coupling, device, sensors):
+    """Return the parts of the flexible spacecraft with these hardware errors."""
     body = parts.plant
     plant = flexible_body.flexible(body.inertia, frequency, body.damping, coupling).with_rest_inverse()
     device, sensors = actuators.Actuators(**device), replace(parts.sensors, **sensors)
@@ -65,12 +65,12 @@ def misfitted(parts, frequency, coupling, device, sensors):
 METRICS = ("window_error", "peak_torque", "effort", "residual_modal", "peak_torque_delivered")
 
 
-def test_every_trial_is_the_run_by_hand_of_its_row(drawn):
-    flown = [runs.fly(drawn, 5, trial) for trial in range(3)]
-    for trial, run in enumerate(flown):
-        row = drawn.dispersion.values(run.parts)
-        by_hand = misfitted(
-            drawn.parts,
+def test_every_trial_equals_a_run_that_is_built_from_its_columns(dispersed):
+    trials = [runs.fly(dispersed, 5, trial) for trial in range(3)]
+    for trial, run in enumerate(trials):
+        row = dispersed.dispersion.values(run.parts)
+        rebuilt = with_hardware_errors(
+            dispersed.parts,
             numbers(row, "mode_frequency", 2),
             numbers(row, "mode_coupling", 2, 3),
             {"scale": numbers(row, "actuator_scale", 3),
@@ -78,38 +78,37 @@ def test_every_trial_is_the_run_by_hand_of_its_row(drawn):
             {"misalignment": numbers(row, "star_tracker_misalignment", 3),
              "rate_scale": numbers(row, "gyro_scale", 3)},
         )  # fmt: skip
-        found = fly(by_hand, 5, trial).metrics
+        found = fly(rebuilt, 5, trial).metrics
         for name in METRICS:
             np.testing.assert_allclose(run.metrics[name], getattr(found, name), rtol=1e-11, err_msg=name)
-    assert np.ptp([run.metrics["window_error"] for run in flown]) > 1e-5
+    assert np.ptp([run.metrics["window_error"] for run in trials]) > 1e-5
 
 
-@pytest.mark.long  # batches: `test_conformity.py`; what is drawn in them: `test_dispersions.py`
-def test_trials_of_a_batch_are_flown_with_their_misfits(drawn):
-    batch = montecarlo.run(drawn.parts, drawn.dispersion, 5, np.arange(3))
+@pytest.mark.long  # short tests: batches in `test_conformity.py`, dispersions in `test_dispersions.py`
+def test_trials_of_a_batch_have_their_hardware_errors(dispersed):
+    batch = montecarlo.run(dispersed.parts, dispersed.dispersion, 5, np.arange(3))
     for trial in range(3):
-        run = runs.fly(drawn, 5, trial)
-        for name in METRICS:  # by another program: roundings differ
+        run = runs.fly(dispersed, 5, trial)
+        for name in METRICS:  # rounding errors of two programs differ
             np.testing.assert_allclose(getattr(batch.metrics, name)[trial], run.metrics[name], rtol=1e-11, err_msg=name)
-        for name, value in drawn.dispersion.values(run.parts).items():
+        for name, value in dispersed.dispersion.values(run.parts).items():
             np.testing.assert_allclose(batch.drawn[name][trial], value, rtol=1e-11, err_msg=name)
 
 
-def test_the_body_gets_what_scaled_and_turned_actuators_give_and_flight_software_knows_nothing_of_it(drawn):
-    run = runs.fly(drawn, 5, 1)
+def test_torque_on_the_body_has_scale_and_misalignment_that_the_flight_software_does_not_know(dispersed):
+    run = runs.fly(dispersed, 5, 1)
     device = run.parts.actuators
     assert device is not None
-    given = run.log.commanded[:-1] * np.asarray(device.scale)
-    np.testing.assert_allclose(run.log.u[:-1], given @ np.asarray(device.directions).T, rtol=0, atol=1e-14)
-    turned = np.asarray(device.directions)
-    np.testing.assert_allclose(np.linalg.norm(turned, axis=0), 1.0, rtol=1e-14)
-    assert 1e-3 < np.abs(turned - np.eye(3)).max() < 0.1
+    delivered = run.log.commanded[:-1] * np.asarray(device.scale)
+    np.testing.assert_allclose(run.log.u[:-1], delivered @ np.asarray(device.directions).T, rtol=0, atol=1e-14)
+    directions = np.asarray(device.directions)
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=0), 1.0, rtol=1e-14)
+    assert 1e-3 < np.abs(directions - np.eye(3)).max() < 0.1
     assert device.nominal == actuators.Actuators()
 
 
-def test_a_misfit_of_nothing_changes_no_digit():
-    """What flies is the same program with the same numbers; a row of ones among others is flown like the others."""
-    none = {key: {"kind": v["kind"], **{k: 0.0 for k in v if k != "kind"}} for key, v in DRAWN.items()}
+def test_dispersions_of_width_zero_do_not_change_the_parts():
+    none = {key: {"kind": v["kind"], **{k: 0.0 for k in v if k != "kind"}} for key, v in DISPERSION.items()}
     plain = scenario.study(scenario.from_tables(FLIGHT))
     zero = scenario.study(scenario.from_tables({**FLIGHT, "dispersion": none}))
     assert not zero.dispersion.varies
@@ -118,8 +117,8 @@ def test_a_misfit_of_nothing_changes_no_digit():
         np.testing.assert_array_equal(one, other)
 
 
-def test_a_turned_star_tracker_turns_the_body_the_other_way_by_half_the_angle_in_the_error():
-    """No noise, no disturbance, no modes, rest: the law brings what it sees to the target."""
+def test_star_tracker_misalignment_rotates_the_final_attitude_by_its_opposite():
+    """Without noise, disturbance and flexible modes, the law brings the measured attitude to the target."""
     tables = {
         **FLIGHT,
         "controller": {"t_f": 5.0, "delta": 0.5, "error": "multiplicative", "k1": 4.0, "surface_rate": 2.0},
@@ -132,18 +131,18 @@ def test_a_turned_star_tracker_turns_the_body_the_other_way_by_half_the_angle_in
     turn, rigid = np.array([1e-3, -2e-3, 5e-4]), vector(np.zeros((2, 3)))
     device = {"scale": vector(np.ones(3)), "directions": vector(np.eye(3))}
     sensors = {"misalignment": vector(turn), "rate_scale": vector(np.ones(3))}
-    log = fly(misfitted(roomy(parts), vector([3.0, 5.0]), rigid, device, sensors)).log
+    log = fly(with_hardware_errors(enlarged(parts), vector([3.0, 5.0]), rigid, device, sensors)).log
     np.testing.assert_allclose(Rotation.from_quat(log.x.q[-1]).as_rotvec(), -turn, rtol=0, atol=1e-9)
 
 
-def test_wheels_that_are_scaled_and_turned_give_and_store_along_their_true_axes():
+def test_wheels_with_scale_and_misalignment_deliver_and_store_momentum_along_their_true_axes():
     wheels = reaction_wheels.wheels(formulas.pyramid(), [0.5, -0.2, 0.1, 0.3])
     turned = np.array(wheels.axes) + 0.02 * np.random.default_rng(0).normal(size=(3, 4))
-    scale, asked = np.array([1.1, 0.9, 1.05, 0.95]), vector([0.13, -0.2, 0.25])
+    scale, command = np.array([1.1, 0.9, 1.05, 0.95]), vector([0.13, -0.2, 0.25])
     device = actuators.Actuators(wheels=wheels, scale=vector(scale), directions=vector(turned))
     start, dt = device.begin(3), vector(0.5)
-    drive, queue = device.command(start, asked, vector(np.zeros(3)), vector(0.0), dt, vector(1.0))
-    torque = scale * (np.linalg.pinv(np.array(wheels.axes)) @ np.array(asked))
+    drive, queue = device.command(start, command, vector(np.zeros(3)), vector(0.0), dt, vector(1.0))
+    torque = scale * (np.linalg.pinv(np.array(wheels.axes)) @ np.array(command))
     assert np.abs(torque).min() > 1e-2
     stored = np.array([0.5, -0.2, 0.1, 0.3])
     applied = device.over(drive, vector(0.2), vector(0.1))
@@ -151,20 +150,20 @@ def test_wheels_that_are_scaled_and_turned_give_and_store_along_their_true_axes(
     np.testing.assert_allclose(np.asarray(applied.stored), turned @ (stored - 0.2 * torque), rtol=1e-13)
     np.testing.assert_allclose(device.on_body(device.at(drive, dt)[0]), turned @ torque, rtol=1e-13)
     np.testing.assert_allclose(np.asarray(device.end(start, drive, queue, dt).h), stored - 0.5 * torque, rtol=1e-13)
-    failing = replace(device, failure_times=vector([np.inf, 0.0, np.inf, np.inf]))  # which no one knows of
-    drive, queue = failing.command(start, asked, vector(np.zeros(3)), vector(0.0), dt, vector(1.0))
+    failing = replace(device, failure_times=vector([np.inf, 0.0, np.inf, np.inf]))  # unknown to the flight software
+    drive, queue = failing.command(start, command, vector(np.zeros(3)), vector(0.0), dt, vector(1.0))
     torque[1] = 0.0
     np.testing.assert_allclose(failing.on_body(failing.at(drive, dt)[0]), turned @ torque, rtol=1e-13)
     np.testing.assert_allclose(np.asarray(failing.end(start, drive, queue, dt).h), stored - 0.5 * torque, rtol=1e-13)
 
 
-@pytest.mark.long  # torque and momentum of a period: the test above; their flights: `test_hardware.py`
-def test_wheels_that_are_scaled_and_turned_keep_the_total_momentum():
+@pytest.mark.long  # short tests: one period above, runs in `test_hardware.py`
+def test_wheels_with_scale_and_misalignment_conserve_total_momentum():
     tables = {
         **{key: FLIGHT[key] for key in ("controller", "initial", "loop")},
         "disturbance": {"kind": "none"},
         "wheels": {"momentum": [0.5, -0.2, 0.1, 0.3]},
-        "dispersion": {key: DRAWN[key] for key in ("actuator_scale", "actuator_misalignment")},
+        "dispersion": {key: DISPERSION[key] for key in ("actuator_scale", "actuator_misalignment")},
     }
     ready = scenario.study(scenario.from_tables(tables))
     run = runs.fly(replace(ready, parts=replace(ready.parts, substeps=8)), 0, 1)
@@ -175,7 +174,9 @@ def test_wheels_that_are_scaled_and_turned_keep_the_total_momentum():
     assert log.wheels is not None
     body = np.asarray(log.x.w) @ np.asarray(run.parts.plant.inertia).T + log.wheels[0] @ np.asarray(device.directions).T
     total = Rotation.from_quat(np.asarray(log.x.q)).apply(body)
-    np.testing.assert_allclose(total, np.broadcast_to(total[0], total.shape), rtol=0, atol=1e-8)  # steps of RK4
+    np.testing.assert_allclose(
+        total, np.broadcast_to(total[0], total.shape), rtol=0, atol=1e-8
+    )  # integration error of RK4
     assert np.abs(log.wheels[0] - log.wheels[0][0]).max() > 0.1
 
 
@@ -187,10 +188,10 @@ WHEELED = {
 
 
 @pytest.mark.parametrize("known", short([False, True], [True]))
-def test_a_wheel_fails_and_the_others_take_over_where_it_is_known(known):
-    failing = {"kind": "uniform", "earliest": 1.0, "latest": 3.0, "known": known}
-    drawn = {"wheel_failure": failing, "star_tracker_outage": {"kind": "uniform", "duration": 0.5, "latest": 3.0}}
-    ready = scenario.study(scenario.from_tables({**WHEELED, "dispersion": drawn}))
+def test_other_wheels_take_over_a_failure_if_it_is_known(known):
+    failure = {"kind": "uniform", "earliest": 1.0, "latest": 3.0, "known": known}
+    dispersion = {"wheel_failure": failure, "star_tracker_outage": {"kind": "uniform", "duration": 0.5, "latest": 3.0}}
+    ready = scenario.study(scenario.from_tables({**WHEELED, "dispersion": dispersion}))
     run = runs.fly(ready, 0, 2)
     row = {key: float(v) for key, v in ready.dispersion.values(run.parts).items() if key.startswith("wheel_")}
     when, wheel = row["wheel_failure_time"], round(row["wheel_failure_wheel"]) - 1
@@ -201,49 +202,49 @@ def test_a_wheel_fails_and_the_others_take_over_where_it_is_known(known):
     assert np.all(log.wheels[1][after][:-1, wheel] == 0.0)
     assert np.all(np.abs(log.wheels[1][~after][:, wheel]) > 0.0)
     assert np.ptp(log.wheels[0][after][:, wheel]) == 0.0
-    # the torque on the body is what was asked for, w x A h besides, as long as all wheels work or the loss is known
+    # the torque on the body equals the command plus w x A h as long as all wheels work or the failure is known
     wheels = run.parts.actuators.wheels
     assert wheels is not None
     stored = log.wheels[0] @ np.asarray(wheels.axes).T
-    asked = log.commanded + np.cross(log.x.w, stored)  # at the true rate; flight software takes that of the gyro
-    off = np.linalg.norm(log.u - asked, axis=1)[:-1]
-    assert np.all(off[~after[:-1]] < 1e-5)
-    assert np.all(off[after[:-1]] < 1e-5) == known
+    expected = log.commanded + np.cross(log.x.w, stored)  # at the true rate; the flight software uses the gyro rate
+    deviation = np.linalg.norm(log.u - expected, axis=1)[:-1]
+    assert np.all(deviation[~after[:-1]] < 1e-5)
+    assert np.all(deviation[after[:-1]] < 1e-5) == known
 
 
-def test_any_wheel_fails_as_often_known_or_not_and_times_that_are_not_given_end_with_the_run():
-    drawn = {"wheel_failure": {"kind": "uniform"}, "star_tracker_outage": {"kind": "uniform", "duration": 0.5}}
+def test_all_wheels_fail_with_equal_probability_and_default_times_extend_to_the_end_of_the_run():
+    dispersion = {"wheel_failure": {"kind": "uniform"}, "star_tracker_outage": {"kind": "uniform", "duration": 0.5}}
     known = {"wheel_failure": {"kind": "uniform", "known": True}}
     parts = scenario.study(scenario.from_tables({**WHEELED, "dispersion": known})).parts
     assert parts.actuators.spare_allocations is not None
-    ready = scenario.study(scenario.from_tables({**WHEELED, "dispersion": drawn}))
-    assert ready.parts.actuators.spare_allocations is None  # the others do not take over
+    ready = scenario.study(scenario.from_tables({**WHEELED, "dispersion": dispersion}))
+    assert ready.parts.actuators.spare_allocations is None  # the other wheels do not take over
     for k in range(4):
-        for share in (0.01, 0.99):
-            c = {"wheel_failure": vector([1.0, (k + share) / 4]), "star_tracker_outage": vector([1.0])}
-            row = read_columns(ready.dispersion.at(ready.parts, c), drawn)
+        for fraction in (0.01, 0.99):
+            c = {"wheel_failure": vector([1.0, (k + fraction) / 4]), "star_tracker_outage": vector([1.0])}
+            row = read_columns(ready.dispersion.at(ready.parts, c), dispersion)
             assert {name: float(v) for name, v in row.items()} == {
                 "star_tracker_outage_begin": 7.0, "star_tracker_outage_end": 7.5,
                 "wheel_failure_time": 7.0, "wheel_failure_wheel": k + 1.0,
             }  # fmt: skip
 
 
-def test_an_outage_of_the_whole_run_is_a_filter_that_corrects_nothing():
-    """With wheels of which one would fail after the end: the program of wheels that fail."""
+def test_outage_of_the_whole_run_equals_a_filter_without_corrections():
+    """One wheel would fail after the end of the run, so that the program includes wheel failures."""
     lasting = {"kind": "uniform", "duration": 100.0, "latest": 0.0}
     after_end = {"kind": "uniform", "earliest": 50.0, "latest": 60.0, "known": True}
-    drawn = {"star_tracker_outage": lasting, "wheel_failure": after_end}
-    ready = scenario.study(scenario.from_tables({**WHEELED, "dispersion": drawn}))
+    dispersion = {"star_tracker_outage": lasting, "wheel_failure": after_end}
+    ready = scenario.study(scenario.from_tables({**WHEELED, "dispersion": dispersion}))
     run = runs.fly(ready, 0, 0)
     assert {key: float(v) for key, v in ready.dispersion.values(run.parts).items()}["star_tracker_outage_begin"] == 0.0
-    whole = replace(run.parts.sensors, outage=vector([50.0, 60.0]))  # after the end, too
-    assert whole.filter is not None
-    idle = replace(whole.filter, attitude_gain=0.0 * whole.filter.attitude_gain,
-                   bias_gain=0.0 * whole.filter.bias_gain)  # fmt: skip
-    other = fly(replace(run.parts, sensors=replace(whole, filter=idle)))
+    no_outage = replace(run.parts.sensors, outage=vector([50.0, 60.0]))  # after the end
+    assert no_outage.filter is not None
+    idle = replace(no_outage.filter, attitude_gain=0.0 * no_outage.filter.attitude_gain,
+                   bias_gain=0.0 * no_outage.filter.bias_gain)  # fmt: skip
+    other = fly(replace(run.parts, sensors=replace(no_outage, filter=idle)))
     np.testing.assert_allclose(run.metrics["window_error"], other.metrics.window_error, rtol=1e-12)
-    whole = fly(replace(run.parts, sensors=whole))
-    assert abs(float(whole.metrics.window_error) / run.metrics["window_error"] - 1.0) > 1e-6
+    corrected = fly(replace(run.parts, sensors=no_outage))
+    assert abs(float(corrected.metrics.window_error) / run.metrics["window_error"] - 1.0) > 1e-6
 
 
 CHAIN = {
@@ -256,18 +257,18 @@ CHAIN = {
 }
 
 
-def test_samples_that_come_early_or_late_by_hand():
-    """A double integrator, its motion exact over every period as long as it is; the law counts on whole periods."""
+def test_timing_jitter_equals_an_independent_loop():
+    """The motion of the double integrator is exact over periods of any length. The law assumes nominal periods."""
     ready = scenario.study(scenario.from_tables(CHAIN))
     run = runs.fly(ready, 3, 2)
     jitter = float(ready.dispersion.values(run.parts)["timing_jitter"])
     assert 0.2 <= jitter <= 0.4
     key, h, x = draws.stream(3, 2, control_period.SAMPLE_TIMES), 0.1, np.array([1.0, -0.3])
     nodes = np.maximum(4.55 + h * np.arange(-46, 26), 0.0).clip(max=7.0)
-    most = np.minimum(jitter * h, np.minimum(nodes, 7.0 - nodes) / 2.0)
+    largest = np.minimum(jitter * h, np.minimum(nodes, 7.0 - nodes) / 2.0)
     number = np.arange(-46, 26)
-    off = np.array([float(draws.uniforms(key, 1, int(k))[0]) for k in number])
-    true = nodes + most * (2.0 * off - 1.0)
+    uniform = np.array([float(draws.uniforms(key, 1, int(k))[0]) for k in number])
+    true = nodes + largest * (2.0 * uniform - 1.0)
     kept = np.flatnonzero(np.diff(nodes) > 0.0)
     times, states = [], []
     for k in kept:
@@ -283,8 +284,8 @@ def test_samples_that_come_early_or_late_by_hand():
     assert np.abs(np.diff(times) / h - 1.0).max() > 0.2
 
 
-def test_a_late_sample_is_judged_by_where_the_reference_is():
-    """Flight software takes the reference of the nominal time; the error is to that of the true one."""
+def test_error_with_timing_jitter_is_relative_to_the_reference_at_the_true_time():
+    """The flight software uses the reference at the nominal time."""
     tables = {key: FLIGHT[key] for key in ("controller", "initial", "loop")}
     spin = {"kind": "spin", "rate": [0.0, 0.0, 0.2]}
     tables |= {"reference": spin, "dispersion": CHAIN["dispersion"]}
@@ -295,14 +296,14 @@ def test_a_late_sample_is_judged_by_where_the_reference_is():
     np.testing.assert_allclose(run.metrics["hold_error"], max(later, run.metrics["terminal_error"]), rtol=1e-12)
 
 
-IN_TIME = [
+JITTER_CASES = [
     pytest.param({**CHAIN, "hardware": {"state_noise": [1e-4, 1e-4]}}, id="chain with noise"),
     pytest.param(FLIGHT, id="flexible spacecraft with noise", marks=pytest.mark.long),
 ]
 
 
-@pytest.mark.parametrize("tables", IN_TIME)
-def test_samples_that_are_in_time_change_no_digit(tables):
+@pytest.mark.parametrize("tables", JITTER_CASES)
+def test_jitter_of_zero_changes_no_digit(tables):
     parts = scenario.study(scenario.from_tables({**tables, "dispersion": {}})).parts
     one, other = (fly(p, 5, 1) for p in (parts, replace(parts, jitter=vector(0.0))))
     for name, value in one.metrics.items():
@@ -317,39 +318,39 @@ def test_samples_that_are_in_time_change_no_digit(tables):
         ({"kind": "relative_uniform", "half_width": 0.021}, {"kind": "relative_normal", "std": 0.02}),
     ],
 )
-def test_the_widest_couplings_that_are_allowed_leave_a_body_at_their_farthest(coupling, inertia):
-    """Rows as long and moments as small as can be drawn, and a tenth of the width more is refused."""
-    drawn = {"mode_coupling": coupling, **({"inertia": inertia} if inertia else {})}
+def test_widest_allowed_coupling_is_physical_at_its_extreme_and_a_wider_one_is_refused(coupling, inertia):
+    """The extreme has the longest coupling rows and the smallest moments. A width larger by a tenth is refused."""
+    dispersion = {"mode_coupling": coupling, **({"inertia": inertia} if inertia else {})}
     tables = {**FLIGHT, "spacecraft": {"inertia": [10.0, 12.0, 14.0]},
-              "flexible": {"frequency": [6.0], "coupling": [[3.0, 0.0, 0.0]]}, "dispersion": drawn}  # fmt: skip
+              "flexible": {"frequency": [6.0], "coupling": [[3.0, 0.0, 0.0]]}, "dispersion": dispersion}  # fmt: skip
     ready = scenario.study(scenario.from_tables(tables))
     ends = {"mode_coupling": vector([1.0]), "inertia": jnp.zeros(67).at[:3].set(-FARTHEST)}
     plant = paths.get(ready.dispersion.at(ready.parts, ends), "plant")
-    left = np.linalg.eigvalsh(plant.rest_inertia)[0]
-    assert 0.0 < left < 0.05
+    smallest = np.linalg.eigvalsh(plant.rest_inertia)[0]
+    assert 0.0 < smallest < 0.05
     np.testing.assert_allclose(plant.rest_inertia @ plant.rest_inverse, np.eye(3), rtol=0, atol=1e-9)
     wider = {key: value * 1.1 if key != "kind" else value for key, value in coupling.items()}
     with pytest.raises(scenario.ScenarioError, match="must be positive definite"):
-        scenario.from_tables({**tables, "dispersion": {**drawn, "mode_coupling": wider}})
+        scenario.from_tables({**tables, "dispersion": {**dispersion, "mode_coupling": wider}})
 
 
-def test_streams_of_their_own():
-    """What is drawn of one name does not depend on what else is drawn."""
+def test_hardware_errors_have_independent_streams():
+    """The random numbers of one error do not depend on other dispersed errors."""
     ready = [
         scenario.study(scenario.from_tables({**FLIGHT, "dispersion": some})).dispersion
-        for some in (DRAWN, {"gyro_scale": DRAWN["gyro_scale"]})
+        for some in (DISPERSION, {"gyro_scale": DISPERSION["gyro_scale"]})
     ]
     one, other = (dispersion.coordinates(jnp.uint32(5), jnp.uint32(2))["gyro_scale"] for dispersion in ready)
     np.testing.assert_array_equal(one, other)
 
 
 @pytest.mark.parametrize(
-    ("drawn", "most"),
+    ("frequency", "largest"),
     [({"kind": "relative_uniform", "half_width": 0.4}, 1.4), ({"kind": "relative_normal", "std": 0.1}, 1.3)],
 )
-def test_steps_follow_modes_as_fast_as_they_are_drawn(drawn, most):
+def test_integration_steps_resolve_the_fastest_dispersed_mode(frequency, largest):
     found = []
-    for dispersion in ({}, {"mode_frequency": drawn}):
+    for dispersion in ({}, {"mode_frequency": frequency}):
         known = scenario.from_tables({**FLIGHT, "dispersion": dispersion})
         found.append(known.frequencies(scenario.study(known).parts, 5.0)["flexible.frequency"])
-    assert found[1] / found[0] == pytest.approx(most)
+    assert found[1] / found[0] == pytest.approx(largest)
