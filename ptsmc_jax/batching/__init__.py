@@ -1,1 +1,1 @@
-"""One trajectory, traced, evaluated over many trials at once."""
+"""Batched evaluation of a function of one trial over many trials: `lanes.vmap` on CPUs, and a GPU kernel for loops."""

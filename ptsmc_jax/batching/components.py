@@ -130,7 +130,8 @@ class ComponentRules:
 
     def __init__(self, limit: int = MAX_COMPONENTS, replacements: dict[str, Callable] | None = None):
         self.limit, self.replacements = limit, replacements or {}
-        # broadcast components by shape and component, which is stored so that its identity stays its own
+        # (component, broadcast component) by shape and identity of the component. Storing the component itself prevents
+        # that another object gets the same identity.
         self._broadcasts: dict[Any, tuple[Any, Any]] = {}
 
     def apply(self, eqn: Any, values: Sequence[BatchedArray]) -> list[np.ndarray] | None:
@@ -146,7 +147,7 @@ class ComponentRules:
         if len(set(shapes)) == 1:
             return parts
         shape = np.broadcast_shapes(*shapes)
-        return [part if own == shape else self._broadcast(part, shape) for part, own in zip(parts, shapes, strict=True)]
+        return [part if old == shape else self._broadcast(part, shape) for part, old in zip(parts, shapes, strict=True)]
 
     def _broadcast(self, part: Any, shape: tuple[int, ...]) -> Any:
         key = shape, _identity(part)
@@ -158,10 +159,10 @@ class ComponentRules:
     def _elementwise(self, eqn: Any, values: Sequence[BatchedArray]) -> list[np.ndarray]:
         name, shape = eqn.primitive.name, eqn.outvars[0].aval.shape
         operation = partial(eqn.primitive.bind, **eqn.primitive.get_bind_params(eqn.params))
-        of_zero = _OF_ZERO.get(name) if _has_tangent(values) else None
+        simplify = _ZERO_RULES.get(name) if _has_tangent(values) else None
 
         def component(*operands: Any) -> Any:
-            result = None if of_zero is None else of_zero(*operands)
+            result = None if simplify is None else simplify(*operands)
             return operation(*self.broadcast(operands)) if result is None else result
 
         operands = [np.broadcast_to(value.components, shape).flat for value in values]
@@ -213,7 +214,7 @@ def _identity(part: Any) -> Any:
 
 
 def _has_tangent(values: Sequence[BatchedArray]) -> bool:
-    """Return whether there is a tangent among the values: its components may be known zeros, which are left out."""
+    """Return whether a value is a tangent. Components of tangents may be constant zeros, which are skipped."""
     return any(value.axes & DIRECTION for value in values)
 
 
@@ -226,8 +227,8 @@ def _sum_with_zero(a: Any, b: Any) -> Any:
     return b if _is_zero(a) else a if _is_zero(b) else None
 
 
-# results of operations with a constant zero; None if there is none among the operands
-_OF_ZERO: dict[str, Callable] = {
+# simplified results of operations with a constant zero; None if no operand is a constant zero
+_ZERO_RULES: dict[str, Callable] = {
     "mul": lambda a, b: a if _is_zero(a) else b if _is_zero(b) else None,
     "add": _sum_with_zero,
     "add_any": _sum_with_zero,
@@ -273,7 +274,13 @@ def _picked_by_index(eqn: Any, arrays: Sequence[np.ndarray]) -> list[np.ndarray]
 
 
 def reduced(eqn: Any, array: np.ndarray, fold: Callable[[np.ndarray], Any]) -> np.ndarray:
-    """Return the result of a reduction on an object array. fold: entries (n,) -> their sum, product or extreme."""
+    """Return the result of a reduction on an object array.
+
+    Args:
+        eqn: the equation.
+        array: its operand.
+        fold: entries (n,) -> their sum, product or extreme.
+    """
     axes = eqn.params["axes"]
     kept = [a for a in range(array.ndim) if a not in axes]
     shape = tuple(array.shape[a] for a in kept)
@@ -282,7 +289,14 @@ def reduced(eqn: Any, array: np.ndarray, fold: Callable[[np.ndarray], Any]) -> n
 
 
 def contracted(eqn: Any, left: np.ndarray, right: np.ndarray, inner: Callable[..., Any]) -> np.ndarray:
-    """Return the result of a `dot_general` on object arrays. inner: (row (n,), column (n,)) -> their product."""
+    """Return the result of a `dot_general` on object arrays.
+
+    Args:
+        eqn: the equation.
+        left: its first operand.
+        right: its second operand.
+        inner: (row (n,), column (n,)) -> their scalar product.
+    """
 
     def rows(array: np.ndarray, axes: Sequence[int], batch: Sequence[int]) -> np.ndarray:
         """Return the array as (batch, kept, contracted)."""
@@ -296,12 +310,18 @@ def contracted(eqn: Any, left: np.ndarray, right: np.ndarray, inner: Callable[..
 
 
 def cumulated(eqn: Any, array: np.ndarray, operation: Callable[[Any, Any], Any]) -> np.ndarray:
-    """Return a cumulative sum, product or extreme of an object array. operation: (result before, entry) -> result."""
-    found = np.moveaxis(array.copy(), eqn.params["axis"], 0)
-    for before, k in itertools.pairwise(range(len(found))[:: -1 if eqn.params["reverse"] else 1]):
-        for i in np.ndindex(*found.shape[1:]):
-            found[(k, *i)] = operation(found[(before, *i)], found[(k, *i)])
-    return np.moveaxis(found, 0, eqn.params["axis"])
+    """Return a cumulative sum, product or extreme of an object array.
+
+    Args:
+        eqn: the equation.
+        array: its operand.
+        operation: (previous result, entry) -> result.
+    """
+    results = np.moveaxis(array.copy(), eqn.params["axis"], 0)
+    for previous, k in itertools.pairwise(range(len(results))[:: -1 if eqn.params["reverse"] else 1]):
+        for i in np.ndindex(*results.shape[1:]):
+            results[(k, *i)] = operation(results[(previous, *i)], results[(k, *i)])
+    return np.moveaxis(results, 0, eqn.params["axis"])
 
 
 # primitive -> function of jax.lax on two components

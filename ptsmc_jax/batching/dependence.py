@@ -1,7 +1,8 @@
-"""Evaluation of jaxprs, their control flow, and the inputs that each output of a jaxpr depends on.
+"""Evaluation of jaxprs and their control flow, and the inputs that each output of a jaxpr depends on.
 
-Dependence is propagated as flags: an integer for each value, one bit for each input or batch axis. `lanes` and `kernel`
-use it for the batch axes of a value, `onboard` for the parameters of an expression.
+`interpret` evaluates a jaxpr on values of any type. `dependence` propagates flags through a jaxpr: an integer for each
+value, with one bit for each input or batch axis. `lanes` and `kernel` use the flags for the batch axes of a value,
+`onboard` for the parameters of an expression.
 """
 
 import operator
@@ -123,7 +124,14 @@ def dependence(jaxpr: core.Jaxpr, inputs: Sequence[int]) -> list[int]:
 
 
 def scan_dependence(body: core.Jaxpr, consts: Sequence[int], init: Sequence[int], xs: Sequence[int]) -> list[int]:
-    """Return the flags of the carries and of the stacked outputs of a scan: the fixed point over its steps."""
+    """Return the flags of the carries and of the stacked outputs of a scan, the fixed point over its steps.
+
+    Args:
+        body: jaxpr of a step.
+        consts: flags of its constants.
+        init: flags of the initial carries.
+        xs: flags of the arrays that it iterates over.
+    """
     carries = list(init)
     while True:
         outputs = dependence(body, [*consts, *carries, *xs])
@@ -136,14 +144,28 @@ def scan_dependence(body: core.Jaxpr, consts: Sequence[int], init: Sequence[int]
 def while_dependence(
     test: Any, body: Any, test_consts: Sequence[int], body_consts: Sequence[int], init: Sequence[int]
 ) -> tuple[list[int], int]:
-    """Return the flags of the carries of a loop, see `loop_of`, and the flags of its test."""
+    """Return the flags of the carries of a `while` loop and the flags of its test.
+
+    Args:
+        test: closed jaxpr of the test, see `loop_of`.
+        body: closed jaxpr of the body.
+        test_consts: flags of the constants of the test.
+        body_consts: flags of the constants of the body.
+        init: flags of the initial carries.
+    """
     carries = scan_dependence(body.jaxpr, body_consts, init, [])
     (running,) = dependence(test.jaxpr, [*test_consts, *carries])
-    return [own | running for own in carries], running
+    return [carry | running for carry in carries], running
 
 
 def branch_dependence(branches: Sequence, index: int, operands: Sequence[int]) -> list[int]:
-    """Return the flags of the outputs of a `cond` or `switch`."""
+    """Return the flags of the outputs of a `cond` or `switch`.
+
+    Args:
+        branches: closed jaxprs of the branches.
+        index: flags of the index.
+        operands: flags of the operands.
+    """
     outputs = (dependence(branch.jaxpr, operands) for branch in branches)
     return [union(each) | index for each in zip(*outputs, strict=True)]
 

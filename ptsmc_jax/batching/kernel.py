@@ -1,4 +1,4 @@
-"""A scan over time as one Pallas kernel of an accelerator, over all trials of a batch: for `lanes`.
+"""A scan over time as one Pallas kernel for a GPU, over all trials of a batch. `lanes.vmap` uses it.
 
 Under `lax.scan` an accelerator needs several launches in each step. Below a million trials they take longer than the
 step itself. Here one Pallas kernel runs the whole loop: each block of trials keeps its carries in registers, and only
@@ -24,12 +24,12 @@ from ptsmc_jax.batching import components, dependence
 from ptsmc_jax.batching.components import TRIAL, BatchedArray
 from ptsmc_jax.batching.dependence import of_scan
 
-BLOCK = 128  # trials in a block: a power of two
-UNROLLED = 8  # longest loop that is unrolled
-MAPPED = 256  # longest loop without carries that is unrolled; its results are stacked
-MAX_COMPONENTS = 1024  # entries of an array: all are split into components
+BLOCK = 128  # trials in a block, a power of two
+UNROLLED = 8  # length of the longest loop that is unrolled
+MAPPED = 256  # length of the longest loop without carries that is unrolled; its results are stacked
+MAX_COMPONENTS = 1024  # entries of the largest array; all arrays are split into components
 
-_CUSTOM_CALLS = ("custom_jvp_call", "custom_vjp_call")  # derivatives are taken before
+_CUSTOM_CALLS = ("custom_jvp_call", "custom_vjp_call")  # functions are differentiated before the kernel is built
 # primitives that `components` has a rule for, and Triton has no lowering for
 _NOT_LOWERED = set(
     """complex conj copy copy_p digamma eq_to erf erf_inv erfc imag le_to lgamma lt_to real reduce_precision
@@ -67,8 +67,8 @@ def scan(
     blocks, count = -(-trials // BLOCK), math.prod(directions)
     numbers, rows, ends = _Tables(), _Tables(), _Tables()
     operand_slots = [
-        rows.add_rows(v, of.aval.dtype) if v.axes & TRIAL else numbers.add_numbers(v, of.aval.dtype, count)
-        for v, of in zip(values, inputs, strict=True)
+        rows.add_rows(v, variable.aval.dtype) if v.axes & TRIAL else numbers.add_numbers(v, variable.aval.dtype, count)
+        for v, variable in zip(values, inputs, strict=True)
     ]
     end_slots = [ends.add([], v.aval.size, v.aval.shape, v.aval.dtype) for v in carries]
 
@@ -236,7 +236,7 @@ def _choose(k: Any, *values: Any) -> Any:
     return reduce(lambda found, i: jnp.where(k == np.int32(i), values[i], found), range(1, len(values)), values[0])
 
 
-# Triton's own maximum of NaN and a number is the number: a torque limit would hide that a trial diverged.
+# The maximum of NaN and a number is the number in Triton, so that a torque limit would hide a diverged trial.
 
 
 def _maximum(a: Any, b: Any) -> Any:
@@ -346,7 +346,7 @@ class _Interpreter:
         """Return values as loops and branches carry them: vectors if they differ by trial, otherwise scalars."""
 
         def aligned(value: BatchedArray, each: int) -> BatchedArray:
-            def component(part: Any) -> Any:  # select makes a scalar of a constant, which Triton does not return
+            def component(part: Any) -> Any:  # Triton cannot return constants; select makes a scalar of them
                 return jnp.broadcast_to(part, (BLOCK,)) if each else lax.select(True, part, part)
 
             return BatchedArray(value.shape, tuple(map(component, value.components.flat)))

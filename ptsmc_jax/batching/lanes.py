@@ -85,8 +85,8 @@ def jvp(function: Callable, in_axes: Any = 0, *, kernel: bool = False) -> Callab
         argument, with leaves (directions, ...) or (directions, trials, ...), or None for a constant argument. The
         values are (trials, ...), the tangents (directions, trials, ...).
 
-    >>> square, slope = jvp(lambda x: x**2)((jnp.array([3.0, 4.0]),), (jnp.ones((1, 2)),))
-    >>> square.tolist(), slope.tolist()
+    >>> square, tangent = jvp(lambda x: x**2)((jnp.array([3.0, 4.0]),), (jnp.ones((1, 2)),))
+    >>> square.tolist(), tangent.tolist()
     ([9.0, 16.0], [[6.0, 8.0]])
     """
 
@@ -181,6 +181,7 @@ class _Interpreter:
         return list(map(BatchedArray.unbatched, results))
 
     def apply_batched(self, eqn: Any, values: list[BatchedArray]) -> list[BatchedArray]:
+        """Return the results of one equation with at least one batched operand."""
         name, inner, axes = eqn.primitive.name, dependence.called(eqn), union(_axes(values))
         if inner is not None:
             return self.evaluate(inner, values)
@@ -199,7 +200,7 @@ class _Interpreter:
         return [BatchedArray.of_components(parts, axes) for parts in results]
 
     def apply_to_arrays(self, eqn: Any, values: list[BatchedArray]) -> list[BatchedArray]:
-        """Return the results of one equation by `jax.vmap`, or see `lapack`."""
+        """Return the results of one equation by `jax.vmap`, or by a sequential map, see `lapack`."""
         axes = union(_axes(values))
 
         def operand(value: BatchedArray) -> Any:
@@ -284,7 +285,7 @@ class _Interpreter:
 
         batch = self.batch_shapes[TRIAL | DIRECTION if self.directions else TRIAL]
         try:
-            last = kernel.scan(params, values, [own & TRIAL for own in axes], batch, configure.backend() == "cpu")
+            last = kernel.scan(params, values, [flags & TRIAL for flags in axes], batch, configure.backend() == "cpu")
         except NotImplementedError as error:
             warnings.warn(f"a loop runs step by step, which may be slow: {error}", LanesWarning, stacklevel=2)
             return None
@@ -322,7 +323,13 @@ class _Interpreter:
         return lax.while_loop(proceed, step, self.align(init, axes))
 
     def _map_leaves(self, function: Callable, condition: Array, *values: BatchedArray) -> BatchedArray:
-        """Return function(condition, *leaves) of each leaf of values with equal axes. condition: over the batch."""
+        """Return function(condition, *leaves) for the leaves of values with equal axes.
+
+        Args:
+            function: (condition, *leaves) -> leaf.
+            condition: array over the batch.
+            *values: values with equal batch axes and shapes.
+        """
         batch_axes = len(self.batch_shapes[values[0].axes])
 
         def of_leaf(*leaves: Array) -> Array:

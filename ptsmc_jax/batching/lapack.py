@@ -48,7 +48,7 @@ def choose_vmap(equations: Sequence, size: int) -> Callable:
 
 
 def sequential_map(function: Callable, in_axes: Sequence[int | None]) -> Callable:
-    """Return `jax.vmap(function, in_axes)` of arrays, for axes 0 and None, evaluated one after the other."""
+    """Return `jax.vmap(function, in_axes)` as a loop over the elements of the batch. Axes are 0 or None."""
 
     def mapped(*args: Any) -> Any:
         def one(row: list) -> Any:
@@ -61,7 +61,7 @@ def sequential_map(function: Callable, in_axes: Sequence[int | None]) -> Callabl
 
 
 def _operations(equations: Sequence) -> float:
-    """Return the operations of the largest LAPACK call among equations, infinite if it may never be batched."""
+    """Return the number of operations of the largest LAPACK call; infinity if a call must never be batched."""
 
     def of_one(eqn: Any) -> float:
         name, shapes = eqn.primitive.name, [v.aval.shape for v in eqn.invars]

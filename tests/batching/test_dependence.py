@@ -1,4 +1,4 @@
-"""What the results of a trace differ over, each written down by hand."""
+"""Dependence of the outputs of a jaxpr on its inputs, against flags that are written by hand."""
 
 import jax
 import jax.numpy as jnp
@@ -6,11 +6,11 @@ import pytest
 
 from ptsmc_jax.batching import dependence
 
-TEST, ONE, OTHER = 1, 2, 4  # the three inputs, a bit each
+TEST, ONE, OTHER = 1, 2, 4  # one bit for each of the three inputs
 
 
 def chosen(test, one, other):
-    """Which of two comes out hangs on the test."""
+    """Both outputs depend on the test, which selects the branch."""
     return jax.lax.cond(test > 0.0, lambda: (one, other), lambda: (other, -other))
 
 
@@ -18,8 +18,8 @@ def called(test, one, other):
     return jax.jit(lambda a, b: (a + b, 2.0 * b))(one, other)
 
 
-def summed(test, one, other):
-    """The first carry takes up the second, and that one the rows, in the next turn."""
+def shifted(test, one, other):
+    """The first carry depends on the second one, which depends on the rows, one step later."""
 
     def step(carry, row):
         a, b = carry
@@ -30,7 +30,7 @@ def summed(test, one, other):
 
 
 def repeated(test, one, other):
-    """How often hangs on the test, and so does all that comes out."""
+    """All outputs depend on the test, which determines the number of steps."""
     return jax.lax.while_loop(
         lambda carry: carry[0] < test, lambda carry: (carry[0] + 1.0, 2.0 * carry[1]), (one, other)
     )
@@ -39,10 +39,10 @@ def repeated(test, one, other):
 @pytest.mark.parametrize(("function", "expected"), [
     (chosen, [TEST | ONE | OTHER, TEST | OTHER]),
     (called, [ONE | OTHER, OTHER]),
-    (summed, [TEST | ONE | OTHER, TEST | OTHER, TEST | ONE | OTHER]),
+    (shifted, [TEST | ONE | OTHER, TEST | OTHER, TEST | ONE | OTHER]),
     (repeated, [TEST | ONE, TEST | ONE | OTHER]),
 ])  # fmt: skip
-def test_results_differ_over_what_they_are_made_of_and_over_what_chooses(function, expected):
+def test_outputs_depend_on_their_operands_and_on_conditions(function, expected):
     closed = jax.make_jaxpr(function)(1.0, 2.0, 3.0)
     assert dependence.dependence(closed.jaxpr, [TEST, ONE, OTHER]) == expected
     assert dependence.dependence(closed.jaxpr, [0, 0, 0]) == [0] * len(expected)

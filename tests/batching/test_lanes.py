@@ -1,4 +1,4 @@
-"""`lanes.vmap` and `lanes.jvp` against JAX, over a table of functions: a row for each kind of them."""
+"""`lanes.vmap` and `lanes.jvp` against `jax.vmap` and `jax.jvp`, for a table of functions."""
 
 from contextlib import nullcontext
 from functools import cache, partial
@@ -20,19 +20,19 @@ einsum, tensordot, dot_general = jnp.einsum, jnp.tensordot, lax.dot_general
 
 
 def draw(*shape, low=-2.0, high=2.0, seed=0, trials=TRIALS):
-    """(trials, *shape) numbers; no two alike, so no component can stand in for another."""
+    """Return different random numbers (trials, *shape), so that exchanged components are detected."""
     return jnp.asarray(np.random.default_rng([seed, *shape]).uniform(low, high, (trials, *shape)))
 
 
-def whole(*shape, low=-9, high=10, dtype: Any = jnp.int64, seed=0):
+def integers(*shape, low=-9, high=10, dtype: Any = jnp.int64, seed=0):
     return jnp.asarray(np.random.default_rng([seed, *shape]).integers(low, high, (TRIALS, *shape)), dtype)
 
 
 def agree(got, expected):
-    """Same structure, shapes and types; integers equal, numbers within 1e-14 of the largest of the array.
+    """Check that structure, shapes and dtypes are equal, and numbers are equal up to rounding errors.
 
-    Both do the same operations on the same numbers: sums in another order, multiply-adds and vectorised elementary
-    functions make a few eps of the largest term. NaN and infinities must coincide.
+    The tolerance is 1e-14 of the largest number of an array. Sums in another order, multiply-adds and vectorised
+    functions differ by a few eps. NaN and infinities must be at the same places.
     """
     assert jax.tree.structure(got) == jax.tree.structure(expected)
     for a, b in zip(jax.tree.leaves(got), jax.tree.leaves(expected), strict=True):
@@ -43,14 +43,14 @@ def agree(got, expected):
             continue
         finite = np.isfinite(b)
         np.testing.assert_array_equal(np.where(finite, 0, a), np.where(finite, 0, b))
-        unit = 1e-14 if b.dtype in (np.float64, np.complex128) else 1e-6
+        tolerance = 1e-14 if b.dtype in (np.float64, np.complex128) else 1e-6
         scale = np.abs(b[finite]).max(initial=0.0)
-        assert np.abs(a[finite] - b[finite]).max(initial=0.0) <= unit * scale
+        assert np.abs(a[finite] - b[finite]).max(initial=0.0) <= tolerance * scale
 
 
 def check(function, *args, in_axes: Any = 0, strict=False):
     mapped = lanes.vmap(function, in_axes, strict=strict), jax.vmap(function, in_axes)
-    agree(*jax.jit(lambda *args: [one(*args) for one in mapped])(*args))  # one program: half of what two take
+    agree(*jax.jit(lambda *args: [one(*args) for one in mapped])(*args))  # one program compiles faster than two
 
 
 TABLE = jnp.linspace(-1, 1, 12).reshape(3, 4)
@@ -59,10 +59,10 @@ X, Y, S, POSITIVE = draw(3), draw(3, seed=1), draw(), draw(3, low=0.1, high=0.9)
 M, N = draw(3, 3), draw(3, 2)
 MESH = jax.sharding.Mesh(np.asarray(jax.devices()[:1]), ("device",), axis_types=(jax.sharding.AxisType.Explicit,))
 ALONE = jax.NamedSharding(MESH, jax.P())
-K, J = whole(3), whole(3, low=1, seed=1)
-U = whole(3, low=0, high=2**32, dtype=jnp.uint32)
+K, J = integers(3), integers(3, low=1, seed=1)
+U = integers(3, low=0, high=2**32, dtype=jnp.uint32)
 F = X.astype(jnp.float32)
-BYTES = whole(3, low=-128, high=128, dtype=jnp.int8)
+BYTES = integers(3, low=-128, high=128, dtype=jnp.int8)
 CUBE = draw(2, 3, 4)
 Q = draw(4)
 
@@ -91,7 +91,7 @@ ELEMENTWISE: dict[str, tuple] = {
     "where": (lambda x, y, s: (jnp.where(x > y, x, y), jnp.where(s > 0, x, y), jnp.where(x > 0, x, 0.0)), X, Y, S),
     "where on a table": (lambda x: jnp.where(jnp.asarray([True, False, True]), x, FIXED), X),
     "select_n of three": (lambda x, y: lax.select_n(jnp.asarray([0, 1, 2]), x, y, x * y), X, Y),
-    "select_n by the trial": (lambda i, x, y: lax.select_n(i % 3, x, y, FIXED), whole(3, dtype=jnp.int32), X, Y),
+    "select_n by the trial": (lambda i, x, y: lax.select_n(i % 3, x, y, FIXED), integers(3, dtype=jnp.int32), X, Y),
     "clip": (lambda x, s: (jnp.clip(x, -0.5, 0.5), jnp.clip(x, -abs(s), abs(s)), lax.clamp(-1.0, x, 0.0)), X, S),
     "clamp between arrays": (lambda x, y: lax.clamp(-jnp.abs(y), x, jnp.abs(y)), X, Y),
     "conversions": (lambda x, i: (x.astype(int), i.astype(float), x.astype(jnp.float32), (x > 0).astype(int)), X, K),
@@ -114,7 +114,7 @@ INTEGERS: dict[str, tuple] = {
     "shifts by the trial": (lambda u, i: u >> i.astype(jnp.uint32), U, jnp.abs(K)),
     "bitcast": (lambda u, x: (lax.bitcast_convert_type(u, jnp.int32), lax.bitcast_convert_type(x, jnp.int64)), U, X),
     "bitcast to smaller": (lambda x: lax.bitcast_convert_type(x, jnp.uint32), X),
-    "bitcast to larger": (lambda u: lax.bitcast_convert_type(u, jnp.uint64), whole(3, 2, low=0, dtype=jnp.uint32)),
+    "bitcast to larger": (lambda u: lax.bitcast_convert_type(u, jnp.uint64), integers(3, 2, low=0, dtype=jnp.uint32)),
     "bitcast of a pair": (lambda x: lax.bitcast_convert_type(x, jnp.uint32), draw(2)),
 }
 
@@ -208,13 +208,13 @@ def nested(x, m):
 
 
 def late(s):
-    """Four carries that hand the trial on to each other: the last depends on it from the fourth step on."""
+    """Carries that depend on each other in a chain: the last one depends on the trial from the fourth step on."""
     one = jnp.ones(())
     return scan(lambda c, k: ((s, c[0], c[1] * 2, c[2] + k, c[4] + 1), c), (one, one, one, one, 0), jnp.arange(8))
 
 
 def time_and_state(s):
-    """A clock that no trial touches, beside a state that each has."""
+    """The time does not depend on the trial, but the state does."""
 
     def step(carry, _):
         t, x = carry
@@ -224,7 +224,7 @@ def time_and_state(s):
 
 
 def late_in_call(x):
-    """The dependence enters through a jitted function and a remat."""
+    """The dependence on the trial passes through a jitted function and a checkpoint."""
     double = jax.jit(lambda a, b: (a * 2, b + 1))
     halve = jax.checkpoint(lambda a: jnp.sin(a) / 2)
     return scan(lambda c, _: (double(*(halve(c[0]), c[1])), c), (x, jnp.zeros(3)), None, 3)
@@ -240,7 +240,7 @@ def used_in_a_loop_and_after(x, m):
 
 
 def made_used_in_a_loop_and_after(x, y):
-    made = x * y  # known by its components; sort wants the array
+    made = x * y  # computed as components, but sort needs the array
     total = fori_loop(0, 3, lambda k, t: t + jnp.sort(made), x)
     return total, jnp.sort(made) * made
 
@@ -259,7 +259,7 @@ def used_in_an_inner_loop_and_after(x, m):
 
 
 def stepping(a, s):
-    """How far numbers go until their sum is beyond 3, in how many steps."""
+    """Increase numbers until their sum exceeds a limit, and count the steps."""
     return while_loop(
         lambda c: jnp.sum(c[0]) < 3 + jnp.sin(s), lambda c: (c[0] + 0.7 * jnp.abs(s) + 0.1, c[1] + 1), (a, 0)
     )
@@ -281,7 +281,7 @@ LOOPS: dict[str, tuple] = {
     "scan, late dependence": (late, S),
     "scan, swapped carries": (swap, X),
     "scan, late dependence in a call": (late_in_call, X),
-    "scan with a clock of its own": (time_and_state, S),
+    "scan with a time that is shared": (time_and_state, S),
     "scan, output of the constant only": (lambda s: scan(lambda c, k: (c, (k * 2, s)), 0, jnp.arange(4)), S),
     "scan of matrices": (lambda m: scan(lambda c, _: (c @ m / 3, c.T), m, None, 4), M),
     "scan of integers and booleans": (lambda i: scan(lambda c, _: ((c[0] + 1, ~c[1]), c), (i, i > 0), None, 3), K),
@@ -291,12 +291,12 @@ LOOPS: dict[str, tuple] = {
     "map": (lambda x: lax.map(lambda r: jnp.sin(r) * x, x), X),
     "associative_scan": (lambda x: lax.associative_scan(jnp.multiply, x), X),
     "fori_loop": (lambda x: fori_loop(0, 5, lambda k, x: jnp.cos(x) + k, x), X),
-    "fori_loop up to the trial's": (lambda x, i: fori_loop(0, jnp.abs(i), lambda k, x: jnp.cos(x) + k, x), X, whole()),
+    "fori_loop by trial": (lambda x, i: fori_loop(0, jnp.abs(i), lambda k, x: jnp.cos(x) + k, x), X, integers()),
     "while, uniform": (lambda x: while_loop(lambda c: c[0] < 4, lambda c: (c[0] + 1, jnp.sin(c[1])), (0, x)), X),
-    "while, each to its end": (lambda s: while_loop(lambda c: c[1] < 3, lambda c: (c[0] + 1, c[1] + 0.7), (0, s)), S),
-    "while, each row to its end": (jax.vmap(stepping, (0, None)), X, S),
-    "while, each row of a table to its end": (lambda s: jax.vmap(stepping, (0, None))(TABLE, s), S),
-    "while, each row to its end, alike": (lambda x: x * jnp.sum(jax.vmap(stepping, (0, None))(FIXED, 0.5)[1]), X),
+    "while, by trial": (lambda s: while_loop(lambda c: c[1] < 3, lambda c: (c[0] + 1, c[1] + 0.7), (0, s)), S),
+    "while, by row": (jax.vmap(stepping, (0, None)), X, S),
+    "while, by row of a table": (lambda s: jax.vmap(stepping, (0, None))(TABLE, s), S),
+    "while, by row, shared": (lambda x: x * jnp.sum(jax.vmap(stepping, (0, None))(FIXED, 0.5)[1]), X),
     "while in a scan": (lambda s: scan(lambda c, _: (while_loop(lambda v: v > 1, jnp.sin, c * 3), c), s, None, 5), S),
 }  # fmt: skip
 
@@ -304,7 +304,7 @@ BRANCHES: dict[str, tuple] = {
     "cond, uniform": (lambda x: cond(FIXED[0] > 0, jnp.sin, jnp.cos, x), X),
     "cond, by the trial": (lambda x, s: cond(s > 0, lambda x: (jnp.sin(x), x[0]), lambda x: (x * 2, s), x), X, S),
     "switch, uniform": (lambda x: lax.switch(jnp.int32(1), [jnp.sin, jnp.cos, jnp.tan], x), X),
-    "switch, by the trial": (lambda x, i: lax.switch(i, [jnp.sin, jnp.cos, jnp.exp], x), X, whole(low=-1, high=4)),
+    "switch, by the trial": (lambda x, i: lax.switch(i, [jnp.sin, jnp.cos, jnp.exp], x), X, integers(low=-1, high=4)),
     "cond in a scan by its counter": (lambda x: scan(lambda c, k: (cond(k > 0, jnp.sin, jnp.exp, c), c), x, FIXED), X),
     "cond in a scan by trial": (lambda x: scan(lambda c, _: (cond(c[0] > 0, jnp.sin, jnp.exp, c), c), x, None, 4), X),
     "scan in a cond": (lambda s: cond(s > 0, lambda s: fori_loop(0, 3, lambda k, v: v * s, s), jnp.cos, s), S),
@@ -319,7 +319,7 @@ def cubed(x):
 
 @cubed.defjvp
 def _cubed_jvp(primals, tangents):
-    return cubed(*primals), 100.0 * tangents[0] * primals[0]  # not the true slope, so that it shows
+    return cubed(*primals), 100.0 * tangents[0] * primals[0]  # a wrong derivative on purpose, to detect its use
 
 
 @jax.custom_vjp
@@ -342,14 +342,14 @@ OTHERS: dict[str, tuple] = {
     "custom_jvp": (lambda x: (cubed(x), jax.jacfwd(cubed)(x), jax.nn.relu(x), jax.nn.softplus(x)), X),
     "custom_vjp": (lambda x: (squared(x), jax.grad(lambda a: squared(a).sum())(x)), X),
     "logsumexp and softmax": (lambda x: (jax.nn.logsumexp(x), jax.nn.softmax(x)), X),
-    "gather": (lambda x, i: (x[i % 3], TABLE[i % 3], x[jnp.asarray([2, 0])], jnp.take(x, 1)), X, whole()),
+    "gather": (lambda x, i: (x[i % 3], TABLE[i % 3], x[jnp.asarray([2, 0])], jnp.take(x, 1)), X, integers()),
     "gather of a constant": (lambda i: TABLE[i % 3, 1], K),
-    "dynamic_slice": (lambda x, i: [lax.dynamic_slice(v, (i % 2,), (2,)) for v in (x, FIXED)], X, whole()),
+    "dynamic_slice": (lambda x, i: [lax.dynamic_slice(v, (i % 2,), (2,)) for v in (x, FIXED)], X, integers()),
     "dynamic_slice at a constant": (lambda x: lax.dynamic_slice(x, (jnp.int32(1),), (2,)), X),
-    "scatter": (lambda x, i, s: x.at[i % 3].set(s), X, whole(), S),
+    "scatter": (lambda x, i, s: x.at[i % 3].set(s), X, integers(), S),
     "scatter to a constant place": (lambda x, s: x.at[0].add(s), X, S),
     "scatter over a slice": (lambda x: x.at[1:].multiply(2), X),
-    "scatter into a constant": (lambda i, s: FIXED.at[i % 3].set(s), whole(), S),
+    "scatter into a constant": (lambda i, s: FIXED.at[i % 3].set(s), integers(), S),
     "sort": (lambda x, n: (jnp.sort(x), jnp.argsort(x), jnp.sort(n, axis=0), jnp.median(x), lax.top_k(x, 2)), X, N),
     "sort of pairs": (lambda x, y: lax.sort((x, y), num_keys=1), X, Y),
     "searchsorted and interp": (lambda s: (jnp.searchsorted(FIXED[::-1], s), jnp.interp(s, jnp.arange(3.0), FIXED)), S),
@@ -365,11 +365,11 @@ OTHERS: dict[str, tuple] = {
     "large table made small": (lambda s: (s * jnp.arange(100.0))[::40], S),
     "large carry": (lambda t: scan(lambda c, _: (jnp.sin(c), c[0]), t, None, 3), draw(70)),
     "large table, small state": (lambda x: (jnp.ones((100, 3)) @ x, jnp.concatenate([jnp.zeros(80), x])), X),
-    "random numbers": (lambda i: jax.random.normal(jax.random.key(i), (3,)), whole(low=0)),
+    "random numbers": (lambda i: jax.random.normal(jax.random.key(i), (3,)), integers(low=0)),
 }  # fmt: skip
 
 OUTPUTS: dict[str, tuple] = {
-    "outputs that no trial touches": (lambda x: (1.0, FIXED, jnp.arange(3), x[0]), X),
+    "outputs that do not depend on the trial": (lambda x: (1.0, FIXED, jnp.arange(3), x[0]), X),
     "Python numbers": (lambda x: (1, 2.5, True, np.float32(3), x), X),
     "the input itself": (lambda x: x, X),
     "the same output twice": (lambda x: (x * 2, x * 2, [x, x]), X),
@@ -389,7 +389,7 @@ CASES = {
 }  # fmt: skip
 
 
-# what has no rule of its own
+# functions with primitives without a rule
 WITHOUT_RULE = {
     f"others: {name}"
     for name in (
@@ -401,42 +401,42 @@ WITHOUT_RULE = {
 
 @cache
 def mapped(group):
-    """What lanes and `jax.vmap` make of each row of a group, by name and by one program, which takes less than many."""
+    """Return the results of lanes and `jax.vmap` for each row of a group; one program compiles faster than many."""
     rows = {name: row for name, row in CASES.items() if name.startswith(f"{group}: ")}
 
     @jax.jit
     def both(args):
         found = {}
         for name, (function, *_) in rows.items():
-            bare = name in WITHOUT_RULE
-            with pytest.warns(lanes.LanesWarning, match="no rule") if bare else nullcontext():
-                found[name] = [one(*args[name]) for one in (lanes.vmap(function, strict=not bare), jax.vmap(function))]
+            has_rules = name not in WITHOUT_RULE
+            with pytest.warns(lanes.LanesWarning, match="no rule") if not has_rules else nullcontext():
+                found[name] = [one(*args[name]) for one in (lanes.vmap(function, strict=has_rules), jax.vmap(function))]
         return found
 
     return both({name: tuple(args) for name, (_, *args) in rows.items()})
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_lanes_compute_what_vmap_does(name):
-    """Strictly, where they have a rule for all there is."""
+def test_lanes_vmap_equals_jax_vmap(name):
+    """Functions with rules for all primitives are evaluated with strict=True."""
     agree(*mapped(name.split(":")[0])[name])
 
 
-def smooth(tree):
+def is_floating(tree):
     return all(jnp.issubdtype(jnp.result_type(leaf), jnp.floating) for leaf in jax.tree.leaves(tree))
 
 
-# Every argument of a row moves on its own in each trial; the second time the first argument is one for all trials, and
-# so are its directions: what hangs on it alone differs from direction to direction only.
-SLOPED = [
+# The directions of all arguments differ by trial. In a second case the first argument and its directions are shared by
+# all trials, so that some tangents differ by direction only.
+DIFFERENTIABLE = [
     name
     for name, (_, *args) in CASES.items()
-    if any(map(smooth, args)) and not any(none in name for none in ("vjp", "nextafter"))
+    if any(map(is_floating, args)) and not any(none in name for none in ("vjp", "nextafter"))
 ]
-SHARED = [name for name in SLOPED if len(CASES[name]) > 2 and smooth(CASES[name][1])]
-MOVED = [(name, shared) for shared, names in ((False, SLOPED), (True, SHARED)) for name in names]
-# Slopes are of the trace, by JAX, and evaluated by the rules that have been seen without: one row for each kind of rule
-FEW = {
+SHARED = [name for name in DIFFERENTIABLE if len(CASES[name]) > 2 and is_floating(CASES[name][1])]
+JVP_CASES = [(name, shared) for shared, names in ((False, DIFFERENTIABLE), (True, SHARED)) for name in names]
+# Derivatives use the same rules as values, so that the short tests have one row for each kind of rule.
+SHORT_ROWS = {
     "elementwise": (
         "arithmetic with constants", "matrix and scalar", "powers", "where", "select_n by the trial", "clip",
         "NaN and infinity", "single precision", "stop_gradient and copy",
@@ -448,73 +448,78 @@ FEW = {
         "large table made small", "random numbers",
     ),
 }  # fmt: skip
-ALIKE = ("scan backwards", "scan unrolled", "scan of length 0", "argument used in two loops")  # with one for all trials
+SHARED_LONG = (
+    "scan backwards",
+    "scan unrolled",
+    "scan of length 0",
+    "argument used in two loops",
+)  # long tests if shared
 
 
-def kept(name, shared):
+def is_short(name, shared):
     group, _, row = name.partition(": ")
-    once = not shared or (group in ("loops", "branches", "contractions") and row not in ALIKE)
-    return once and row in FEW.get(group, (row,))
+    is_included = not shared or (group in ("loops", "branches", "contractions") and row not in SHARED_LONG)
+    return is_included and row in SHORT_ROWS.get(group, (row,))
 
 
-def with_slopes(name, shared):
-    """A function that gives slopes along two directions by lanes and by JAX, and its arguments."""
+def jvp_by_lanes_and_jax(name, shared):
+    """Return a function with the tangents along two directions by lanes and by JAX, and its arguments."""
     function, *args = CASES[name]
     args = [jax.tree.map(lambda v: v[0], args[0]), *args[1:]] if shared else args
     axes = (None, *(0 for _ in args[1:])) if shared else tuple(0 for _ in args)
 
     def numbers(*args):
-        return [leaf for leaf in jax.tree.leaves(function(*args)) if smooth(leaf)]
+        return [leaf for leaf in jax.tree.leaves(function(*args)) if is_floating(leaf)]
 
     def direction(leaf):
         rng = np.random.default_rng([3, *leaf.shape])
         return jnp.asarray(rng.uniform(-1, 1, (2, *leaf.shape)), leaf.dtype)
 
-    directions = tuple(jax.tree.map(direction, arg) if smooth(arg) else None for arg in args)
-    moves = [k for k, along in enumerate(directions) if along is not None]
+    directions = tuple(jax.tree.map(direction, arg) if is_floating(arg) else None for arg in args)
+    moving = [k for k, along in enumerate(directions) if along is not None]
 
     def one(along, *one):
-        def of(*some):
-            return numbers(*(dict(enumerate(one)) | dict(zip(moves, some, strict=True))).values())
+        def of_moving(*some):
+            return numbers(*(dict(enumerate(one)) | dict(zip(moving, some, strict=True))).values())
 
-        return jax.jvp(of, tuple(one[k] for k in moves), along)
+        return jax.jvp(of_moving, tuple(one[k] for k in moving), along)
 
-    some = tuple(directions[k] for k in moves)
-    over = (tuple(None if shared and k == 0 else 0 for k in moves), *axes)
+    some = tuple(directions[k] for k in moving)
+    in_axes = (tuple(None if shared and k == 0 else 0 for k in moving), *axes)
 
     def both(args, directions, some):
-        wanted = jax.vmap(lambda along: jax.vmap(one, over)(along, *args), out_axes=(None, 0))(some)
-        return lanes.jvp(numbers, axes)(args, directions), wanted
+        expected = jax.vmap(lambda along: jax.vmap(one, in_axes)(along, *args), out_axes=(None, 0))(some)
+        return lanes.jvp(numbers, axes)(args, directions), expected
 
     return both, (tuple(args), directions, some)
 
 
 @cache
-def sloped(group, shared, few):
-    """What comes of each row of a group, of those kept or of the others, by name and by one program."""
-    names = [name for name in CASES if name.startswith(f"{group}: ") and kept(name, shared) == few]
-    names = [name for name in names if (name, shared) in MOVED]
-    made = {name: with_slopes(name, shared) for name in names}
-    return jax.jit(lambda args: {name: both(*args[name]) for name, (both, _) in made.items()})(
-        {name: args for name, (_, args) in made.items()}
+def tangents(group, shared, short_rows):
+    """Return the tangents of the short or the other rows of a group, by name, from one program."""
+    names = [name for name in CASES if name.startswith(f"{group}: ") and is_short(name, shared) == short_rows]
+    names = [name for name in names if (name, shared) in JVP_CASES]
+    cases = {name: jvp_by_lanes_and_jax(name, shared) for name in names}
+    return jax.jit(lambda args: {name: both(*args[name]) for name, (both, _) in cases.items()})(
+        {name: args for name, (_, args) in cases.items()}
     )
 
 
-@pytest.mark.parametrize(("name", "shared"), short(MOVED, [case for case in MOVED if kept(*case)]))
+@pytest.mark.parametrize(("name", "shared"), short(JVP_CASES, [case for case in JVP_CASES if is_short(*case)]))
 @pytest.mark.filterwarnings("ignore::ptsmc_jax.batching.lanes.LanesWarning")
-def test_slopes_by_lanes_are_those_that_jax_finds(name, shared):
-    """To 1e-12 of the largest: both differentiate the same operations, and add up in another order."""
-    got, expected = sloped(name.split(":")[0], shared, kept(name, shared))[name]
+def test_lanes_jvp_equals_jax_jvp(name, shared):
+    """The tolerance is 1e-12 of the largest number, since the order of sums differs."""
+    got, expected = tangents(name.split(":")[0], shared, is_short(name, shared))[name]
     for a, b in zip(jax.tree.leaves(got), jax.tree.leaves(expected), strict=True):
         assert (a.shape, a.dtype) == (b.shape, b.dtype)
-        unit = 1e-12 if b.dtype == np.float64 else 1e-5
+        tolerance = 1e-12 if b.dtype == np.float64 else 1e-5
         np.testing.assert_allclose(
-            a, b, rtol=0, atol=unit * np.abs(np.nan_to_num(np.asarray(b), posinf=0, neginf=0)).max(initial=0)
+            a, b, rtol=0, atol=tolerance * np.abs(np.nan_to_num(np.asarray(b), posinf=0, neginf=0)).max(initial=0)
         )
 
 
 @pytest.mark.parametrize("name", sorted(WITHOUT_RULE))
-def test_strict_lanes_refuse_what_has_no_rule(name):
+def test_strict_lanes_refuse_primitives_without_a_rule(name):
     function, *args = CASES[name]
     with pytest.raises(NotImplementedError, match="lanes have no rule for the primitive `"):
         jax.eval_shape(lanes.vmap(function, strict=True), *args)

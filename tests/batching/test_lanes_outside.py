@@ -1,4 +1,4 @@
-"""`lanes.vmap` under transformations from outside, with every form of in_axes, and what its loops run on."""
+"""`lanes.vmap` under outer transformations, with all forms of in_axes, and the shapes inside its loops."""
 
 from functools import partial
 
@@ -30,11 +30,11 @@ from tests.batching.test_lanes import (
 )
 from tests.helpers import equations
 
-# transformations from outside
+# outer transformations
 
 
 def law(x, m, s):
-    """A bit of everything that a rollout has."""
+    """A loop with the kinds of operations of a simulation."""
 
     def step(c, k):
         force = jnp.cross(c, m @ c) - s * jnp.where(jnp.abs(c) > 0.5, jnp.sign(c), 2 * c)
@@ -44,8 +44,8 @@ def law(x, m, s):
     return jnp.linalg.norm(end), jnp.max(peaks) + jnp.sum(cubed(end))
 
 
-def lite(x, m, s):
-    """Less of it, for what is compiled many times."""
+def short_law(x, m, s):
+    """A smaller loop, for tests that compile many programs."""
     return lax.scan(lambda c, _: (jnp.tanh(s * c + m @ x), c[0]), x, None, 3)
 
 
@@ -57,7 +57,7 @@ def loss(vmap, x, m, s, function=law):
     return jnp.sqrt(jnp.mean(end**2)) + jnp.mean(peaks)
 
 
-def along(vmap, *args):
+def derivative_along_cosines(vmap, *args):
     return jax.jvp(vmap(law), args, tuple(jnp.cos(a) for a in args))
 
 
@@ -68,26 +68,26 @@ def gradients(vmap, *args):
 GAIN = jnp.asarray(0.3)
 PAIR = draw(TRIALS, 3, trials=2, seed=3)
 
-# name: what is done with a vmap and (x, m, s) of TRIALS trials
+# name: transformation of a vmap, called with (x, m, s) of TRIALS trials
 OUTSIDE = {
     "jit": lambda vmap, *args: vmap(law)(*args),
-    "jvp": along,
+    "jvp": derivative_along_cosines,
     "grad": gradients,
-    "jacfwd": lambda vmap, x, m, s: jax.jacfwd(lambda s: loss(vmap, x, m, s, lite))(s),
-    "jacfwd of a shared gain": lambda vmap, x, m, _: jax.jacfwd(lambda g: vmap(lite, (0, 0, None))(x, m, g))(GAIN),
-    "jacrev of a shared gain": lambda vmap, x, m, _: jax.jacrev(lambda g: vmap(lite, (0, 0, None))(x, m, g))(GAIN),
+    "jacfwd": lambda vmap, x, m, s: jax.jacfwd(lambda s: loss(vmap, x, m, s, short_law))(s),
+    "jacfwd of a shared gain": lambda vmap, x, m, _: jax.jacfwd(lambda g: vmap(short_law, (0, 0, None))(x, m, g))(GAIN),
+    "jacrev of a shared gain": lambda vmap, x, m, _: jax.jacrev(lambda g: vmap(short_law, (0, 0, None))(x, m, g))(GAIN),
     "captured gain": lambda vmap, x, m, _: jax.jacrev(lambda g: vmap(lambda x: jnp.sin(g * x) @ x)(x))(GAIN),
     "second derivative": lambda vmap, x, m, _: jax.hessian(lambda g: vmap(lambda x: jnp.sin(g * x) @ x)(x))(GAIN),
-    "vmap": lambda vmap, x, m, s: jax.vmap(vmap(lite), (0, None, None))(PAIR, m, s),
-    "vmap of a shared gain": lambda vmap, x, m, _: jax.vmap(lambda g: vmap(lite, (0, 0, None))(x, m, g))(FIXED),
-    "scan": lambda vmap, x, m, s: lax.scan(lambda c, g: (vmap(lite, (0, 0, None))(c, m, g)[0], c), x, FIXED),
-    "map over blocks": lambda vmap, x, m, s: lax.map(lambda x: vmap(lite, (0, None, None))(x, m[0], s[0]), PAIR),
-    "itself": lambda vmap, *args: vmap(lambda x, m, g: vmap(lite, (None, 0, None))(x, m, g), (0, None, 0))(*args),
+    "vmap": lambda vmap, x, m, s: jax.vmap(vmap(short_law), (0, None, None))(PAIR, m, s),
+    "vmap of a shared gain": lambda vmap, x, m, _: jax.vmap(lambda g: vmap(short_law, (0, 0, None))(x, m, g))(FIXED),
+    "scan": lambda vmap, x, m, s: lax.scan(lambda c, g: (vmap(short_law, (0, 0, None))(c, m, g)[0], c), x, FIXED),
+    "map over blocks": lambda vmap, x, m, s: lax.map(lambda x: vmap(short_law, (0, None, None))(x, m[0], s[0]), PAIR),
+    "itself": lambda vmap, *args: vmap(lambda x, m, g: vmap(short_law, (None, 0, None))(x, m, g), (0, None, 0))(*args),
     "itself, both mapped": lambda vmap, x, m, s: vmap(vmap(lambda a: (jnp.cumsum(a), a @ a)))(m),
     "jax.vmap inside": lambda vmap, x, m, s: vmap(jax.vmap(lambda a: a * jnp.sum(a)))(m),
-    "checkpoint": lambda vmap, *args: jax.grad(jax.checkpoint(partial(loss, vmap, function=lite)))(*args),
+    "checkpoint": lambda vmap, *args: jax.grad(jax.checkpoint(partial(loss, vmap, function=short_law)))(*args),
     "custom_vjp": lambda vmap, x, m, s: jax.grad(lambda x: vmap(squared)(x).sum())(x),
-    "what goes through jax.vmap": lambda vmap, x, m, s: jax.grad(
+    "primitive without a rule": lambda vmap, x, m, s: jax.grad(
         lambda m: vmap(lambda m: jnp.sum(jnp.linalg.inv(SYMMETRIC(m)) ** 2))(m).sum()
     )(m),
 }  # fmt: skip
@@ -95,19 +95,21 @@ OUTSIDE = {
 
 @pytest.mark.filterwarnings("ignore::ptsmc_jax.batching.lanes.LanesWarning")
 @pytest.mark.parametrize("name", OUTSIDE)
-def test_lanes_compose_with_transformations_from_outside(name):
+def test_lanes_compose_with_outer_transformations(name):
     got, expected = (jax.jit(partial(OUTSIDE[name], vmap))(*ARGS) for vmap in (lanes.vmap, jax.vmap))
     agree(got, expected)
 
 
-def test_lanes_need_no_jit():
+def test_lanes_work_without_jit():
     agree(lanes.vmap(law)(*ARGS), jax.vmap(law)(*ARGS))
-    agree(*(jax.grad(partial(loss, vmap, function=lite), argnums=(0, 1))(*ARGS) for vmap in (lanes.vmap, jax.vmap)))
+    agree(
+        *(jax.grad(partial(loss, vmap, function=short_law), argnums=(0, 1))(*ARGS) for vmap in (lanes.vmap, jax.vmap))
+    )
 
 
-def test_custom_derivatives_survive():
-    slope = jax.jvp(lanes.vmap(cubed), (X,), (jnp.ones_like(X),))[1]
-    np.testing.assert_allclose(slope, 100 * X, rtol=1e-15)
+def test_custom_derivatives_are_preserved():
+    derivative = jax.jvp(lanes.vmap(cubed), (X,), (jnp.ones_like(X),))[1]
+    np.testing.assert_allclose(derivative, 100 * X, rtol=1e-15)
 
 
 # arguments
@@ -133,26 +135,26 @@ ROWS = [
 
 @pytest.mark.filterwarnings("ignore::ptsmc_jax.batching.lanes.LanesWarning")
 @pytest.mark.parametrize(("function", "args", "in_axes"), [row[1:] for row in ROWS], ids=[row[0] for row in ROWS])
-def test_arguments_mapped_and_shared(function, args, in_axes):
+def test_mapped_and_shared_arguments_equal_jax_vmap(function, args, in_axes):
     check(function, *args, in_axes=in_axes)
 
 
-def test_default_axes_map_everything():
+def test_default_in_axes_map_all_arguments():
     agree(lanes.vmap(jnp.multiply)(X, Y), X * Y)
 
 
-def test_registered_dataclasses_may_hold_axes():
+def test_in_axes_may_be_a_named_tuple():
     state = AttitudeState(Q, FIXED)
     check(lambda x: x.q[:3] * x.w, state, in_axes=(AttitudeState(0, None),))  # pyright: ignore[reportArgumentType]
 
 
-def test_single_precision_without_64_bits():
+def test_lanes_equal_jax_vmap_in_single_precision():
     with jax.enable_x64(False):
         args = [jnp.asarray(np.asarray(a), jnp.float32) for a in ARGS]
         got, expected = (jax.jit(vmap(law))(*args) for vmap in (lanes.vmap, jax.vmap))
         assert {a.dtype for a in got} == {jnp.dtype("float32")}
         for a, b in zip(got, expected, strict=True):
-            np.testing.assert_allclose(a, b, rtol=0, atol=1e-5)  # eps 1e-7, a hundred operations
+            np.testing.assert_allclose(a, b, rtol=0, atol=1e-5)  # a hundred rounding errors of 1e-7
 
 
 ERRORS = [
@@ -169,12 +171,12 @@ ERRORS = [
 
 
 @pytest.mark.parametrize(("args", "in_axes"), [row[1:] for row in ERRORS], ids=[row[0] for row in ERRORS])
-def test_arguments_that_cannot_be_mapped_raise(args, in_axes):
+def test_invalid_in_axes_raise(args, in_axes):
     with pytest.raises(ValueError):  # noqa: PT011
         lanes.vmap(lambda *a: a, in_axes)(*args)
 
 
-def test_the_error_names_what_was_found():
+def test_error_message_names_the_invalid_value():
     with pytest.raises(ValueError, match=r"one number of trials, found \[3, 5\]"):
         lanes.vmap(jnp.multiply)(X, Y[:3])
     with pytest.raises(ValueError, match="0 and None only, found 1"):
@@ -182,22 +184,22 @@ def test_the_error_names_what_was_found():
 
 
 @pytest.mark.parametrize(
-    ("directions", "said"),
+    ("directions", "message"),
     [
         ((None,), "directions must be of some of the 1 arguments, found 0"),
         ((X[None], X[None]), "directions must be of some of the 1 arguments, found 2"),
         ((X[0],), r"3 directions of \(3,\) in 5 trials cannot be of shape \(3,\)"),
         ((X[None, :4],), r"1 directions of \(3,\) in 5 trials cannot be of shape \(1, 4, 3\)"),
     ],
-    ids=["none", "of more", "without their axis", "in fewer trials"],
+    ids=["none", "too many", "without direction axis", "fewer trials"],
 )
-def test_directions_that_do_not_fit_raise(directions, said):
-    """A vector was taken for as many directions of a number, and slopes came out of it."""
-    with pytest.raises(ValueError, match=said):
+def test_directions_of_the_wrong_shape_raise(directions, message):
+    """Regression: a vector was treated as several directions of a scalar."""
+    with pytest.raises(ValueError, match=message):
         lanes.jvp(lambda x: x**2)((X,), directions)
 
 
-# what it is for
+# structure of the result
 
 
 def shapes_in_loops(jaxpr, inside=False):
@@ -209,7 +211,7 @@ def shapes_in_loops(jaxpr, inside=False):
             yield from shapes_in_loops(inner, loop)
 
 
-def test_loops_run_on_vectors_over_the_trials():
+def test_loops_carry_vectors_over_the_trials():
     traced = jax.make_jaxpr(lanes.vmap(lambda x, m, s: law(x, m, s)[0]))(*ARGS)
     assert set(shapes_in_loops(traced.jaxpr)) == {(), (TRIALS,)}
 
@@ -220,7 +222,7 @@ def time_and_state_in_a_call(s):
 
 
 @pytest.mark.parametrize("run", [time_and_state, time_and_state_in_a_call])
-def test_what_no_trial_touches_is_computed_once(run):
+def test_values_that_do_not_depend_on_the_trial_are_computed_once(run):
     traced = jax.make_jaxpr(lanes.vmap(run))(S)
     (scan,) = [eqn for eqn in traced.jaxpr.eqns if eqn.primitive.name == "scan"]
     exponentials = [eqn for eqn in scan.params["jaxpr"].jaxpr.eqns if eqn.primitive.name == "exp"]
@@ -229,10 +231,10 @@ def test_what_no_trial_touches_is_computed_once(run):
     assert (times.shape, states.shape) == ((TRIALS, 6), (TRIALS, 6))
 
 
-def test_a_branch_on_the_time_stays_a_branch():
+def test_branch_on_the_time_remains_a_branch():
     def run(s):
-        late = lambda c, k: lax.cond(k > 3, lambda: jnp.exp(c), lambda: c)  # noqa: E731
-        return lax.scan(lambda c, k: (late(c, k), None), s, jnp.arange(6))[0]
+        step = lambda c, k: lax.cond(k > 3, lambda: jnp.exp(c), lambda: c)  # noqa: E731
+        return lax.scan(lambda c, k: (step(c, k), None), s, jnp.arange(6))[0]
 
     def by_trial(s):
         return lax.cond(s > 0, lambda: jnp.exp(s), lambda: s)
@@ -243,7 +245,7 @@ def test_a_branch_on_the_time_stays_a_branch():
     assert not [eqn for eqn in selected if eqn.primitive.name == "cond"]
 
 
-def test_a_loop_that_all_trials_leave_at_once_tests_one_number():
+def test_while_loop_with_a_shared_condition_tests_a_scalar():
     def run(s):
         return lax.while_loop(lambda c: c[0] < 3, lambda c: (c[0] + 1, jnp.sin(c[1])), (0, s))
 
@@ -251,7 +253,7 @@ def test_a_loop_that_all_trials_leave_at_once_tests_one_number():
     assert sorted(v.aval.shape for v in loop.outvars) == [(), (TRIALS,)]
 
 
-def test_custom_derivatives_are_evaluated_by_components():
+def test_custom_derivatives_are_evaluated_on_components():
     traced = jax.make_jaxpr(lambda x: jax.jvp(lanes.vmap(cubed), (x,), (x,)))(X)
     shapes = {v.aval.shape for eqn in equations(traced) for v in eqn.outvars if eqn.primitive.name == "mul"}
     assert shapes == {(TRIALS,)}
@@ -264,11 +266,11 @@ def scaled(n, x):
 
 @scaled.defjvp
 def _scaled_jvp(primals, tangents):
-    return scaled(*primals), 7.0 * primals[0] * tangents[1]  # not the true slope, so that it shows
+    return scaled(*primals), 7.0 * primals[0] * tangents[1]  # a wrong derivative on purpose, to detect its use
 
 
 @pytest.mark.parametrize("in_axes", [(0, 0), (None, 0), (0, None)])
-def test_custom_derivatives_beside_whole_numbers_survive(in_axes):
+def test_custom_derivatives_with_integer_arguments_are_preserved(in_axes):
     n, x = (jnp.arange(TRIALS), jnp.arange(TRIALS) * 0.5)
     n, x = (v if axis == 0 else v[3] for v, axis in zip((n, x), in_axes, strict=True))
     got, expected = (
@@ -278,14 +280,14 @@ def test_custom_derivatives_beside_whole_numbers_survive(in_axes):
     agree(got, expected)
 
 
-def test_a_large_carry_is_carried_whole():
+def test_large_carry_is_not_split_into_components():
     big = draw(70)
     traced = jax.make_jaxpr(lanes.vmap(lambda t: lax.scan(lambda c, _: (2 * c, None), t, None, 3)[0]))(big)
     (loop,) = [eqn for eqn in equations(traced) if eqn.primitive.name == "scan"]
     assert [v.aval.shape for v in loop.outvars] == [(TRIALS, 70)]
 
 
-def test_the_warning_and_the_error_name_the_primitive_and_the_place():
+def test_warning_and_error_name_the_primitive_and_the_source_line():
     matrices = jnp.stack([jnp.eye(3), 2 * jnp.eye(3)])
     with pytest.warns(lanes.LanesWarning, match="`cholesky`.*jax.vmap evaluates it, which may be slow"):
         lanes.vmap(jnp.linalg.cholesky)(matrices)
@@ -293,28 +295,28 @@ def test_the_warning_and_the_error_name_the_primitive_and_the_place():
         lanes.vmap(lambda i: jax.random.key(i), strict=True)(jnp.arange(3))
 
 
-def test_large_arrays_are_not_taken_apart():
+def test_large_arrays_are_not_split_into_components():
     few, many = (len(jax.make_jaxpr(lanes.vmap(lambda t: 2 * t + 1))(draw(n)).eqns) for n in (65, 64))
     assert few < 5
     assert many >= 2 * 64
 
 
-def test_whole_numbers_and_truths_have_no_slopes():
-    """As JAX says by its type float0; an array of it ended in NumPy, which compares it with nothing."""
+def test_integer_and_boolean_outputs_have_float0_tangents():
+    """Regression: NumPy arrays of float0 raised an error in a comparison."""
 
     def function(x):
         return jnp.argsort(x), x > 0.5, x**2
 
-    values, slopes = lanes.jvp(function)((X,), (jnp.ones((2, *X.shape)),))
-    expected, along = jax.jvp(jax.vmap(function), (X,), (jnp.ones_like(X),))
+    values, tangents = lanes.jvp(function)((X,), (jnp.ones((2, *X.shape)),))
+    expected, expected_tangents = jax.jvp(jax.vmap(function), (X,), (jnp.ones_like(X),))
     agree(values, expected)
-    agree(slopes[2][0], along[2])
-    assert [(s.shape, s.dtype) for s in slopes[:2]] == [((2, *X.shape), jax.dtypes.float0)] * 2
+    agree(tangents[2][0], expected_tangents[2])
+    assert [(t.shape, t.dtype) for t in tangents[:2]] == [((2, *X.shape), jax.dtypes.float0)] * 2
 
 
 @pytest.mark.parametrize("values", [jnp.array([-1.0, 0.0, 4.0]), jnp.array([[-1.0, -0.0], [1.0, 4.0], [0.0, 2.0]])])
-def test_reverse_mode_passes_only_through_the_branch_that_a_trial_takes(values):
-    """The other branch has an infinite derivative there, which times zero was NaN."""
+def test_reverse_mode_ignores_branches_that_a_trial_does_not_take(values):
+    """Regression: an infinite derivative of the other branch times zero gave NaN."""
 
     def root(v, factor):
         return lax.cond(jnp.sum(v) > 0.0, lambda: jnp.sum(jnp.sqrt(factor * jnp.abs(v))), lambda: jnp.sum(factor * v))
@@ -324,5 +326,5 @@ def test_reverse_mode_passes_only_through_the_branch_that_a_trial_takes(values):
             values, 0.0 * values[0] + 1.0
         )
 
-    for ours, jaxs in zip(gradients(lanes.vmap), gradients(jax.vmap), strict=True):
-        np.testing.assert_allclose(ours, jaxs, rtol=1e-14)
+    for found, expected in zip(gradients(lanes.vmap), gradients(jax.vmap), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-14)
