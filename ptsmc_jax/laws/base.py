@@ -29,10 +29,10 @@ class Law:
     The field `kinematics` defines the error eps and holds the design model of the plant. Most laws define
     `acceleration`, the commanded eps''. Others override `__call__`. Errors, accelerations and inputs are (m,), in the
     units of the kinematics: for a spacecraft [-], [1/s^2] and [N m]. At the hand-over time t_f - delta the approach
-    phase ends and the hold phase begins, in which some laws use other gains (Remark 1).
+    phase ends and the hold phase begins. Some laws use other gains in the hold phase (Remark 1).
     """
 
-    kinematics: Kinematics  # of the error that the law drives to zero
+    kinematics: Kinematics  # defines the error that the law drives to zero
     t_f: Leaf  # prescribed time, at which the error is evaluated [s]
     delta: Leaf  # time from the hand-over to t_f [s]
     tunable: ClassVar[tuple[str, ...]] = ()  # names of the gains that tuning may change
@@ -63,7 +63,7 @@ class Law:
         return None
 
     def acceleration(self, now: Sample, error: Vector, error_rate: Vector, bound: Scalar) -> tuple[Any, ...]:
-        """Return the commanded acceleration a, with which the error obeys eps'' = a + d, and the sliding variable.
+        """Return the commanded acceleration a, and the sliding variable. The error obeys eps'' = a + d.
 
         Args:
             now: the sample.

@@ -146,7 +146,7 @@ class Scaling(AccelerationLaw):
     so that z' = mu (-k z + d). Then |z| is at most the larger of |d|/k and its initial value, and eps decays like r^p.
     Song, Wang, Holloway, Krstic, Time-varying feedback for regulation of normal-form nonlinear systems in prescribed
     finite time, Automatica 83, 2017. The gains grow without bound towards t_f. So r is held at delta in the hold phase,
-    in which the law is a PD law.
+    where the law is a PD law.
     """
 
     m: Leaf  # >= 1 [-]

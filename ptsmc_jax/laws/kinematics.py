@@ -82,7 +82,7 @@ class Kinematics:
         raise NotImplementedError
 
     def invert(self, x: Any, target: Any, acceleration: Vector, d_hat: Vector) -> Vector:
-        """Return the input (m,) for which eps'' equals a commanded acceleration.
+        """Return the input (m,) that makes eps'' equal to a commanded acceleration.
 
         Args:
             x: state.

@@ -263,7 +263,7 @@ class PrescribedTimeChain(PrescribedTimeLaw):
         return (s_end - s_0) / g
 
     def surface(self) -> Float[Array, " roots"]:
-        """Return a_i c^(n-i) [1/s^(n-i)], for which the motion on the surface is c times as fast."""
+        """Return a_i c^(n-i) [1/s^(n-i)], which makes the motion on the surface c times as fast."""
         n = self.order
         return jnp.stack([self.a[i] * self.surface_rate ** (n - 1 - i) for i in range(n - 1)])
 

@@ -170,7 +170,7 @@ class Linear(Observer):
     def _bound(self) -> ErrorBound:
         """Return the corrected form of (55).
 
-        (55) needs sqrt(m) c instead of c, since c bounds each component of d' and K2 bounds the 2-norm of the error.
+        (55) needs sqrt(m) c instead of c, because c bounds each component of d' and K2 bounds the 2-norm of the error.
         l_m is the smallest eigenvalue of l^1/2 J^-1 l^1/2, and the bound has the factor sqrt(cond(l)). For a diagonal J
         and equal gains, l_m is the smallest diagonal element of l J^-1, as in the paper, and the factor is 1.
         """

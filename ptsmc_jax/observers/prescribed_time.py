@@ -16,9 +16,9 @@ class PrescribedTimeBound(NamedTuple):
     Until T_o - delta_o it bounds the solution of K2' = -(l_m + mu/(T_o - t)) K2 + sqrt(m) c, and then it is (55). With
     rho = (T_o - t)/T_o and c' = sqrt(m) c the solution is at most
 
-        rho^mu e^(-l_m t) K2(0) + c' min(a, b)
-        a = (T_o - t)(1 - rho^(mu-1))/(mu-1), the exact integral for l_m = 0
-        b = (1 - e^(-l_m t))/l_m, the exact integral for mu = 0.
+        rho^mu e^(-l_m t) K2(0) + c' min(a, b).
+
+    a = (T_o - t)(1 - rho^(mu-1))/(mu-1) is the exact integral for l_m = 0, and b = (1 - e^(-l_m t))/l_m for mu = 0.
     """
 
     base: ErrorBound  # bound of the observer without the time-varying gain
