@@ -173,7 +173,7 @@ class ComponentRules:
         return self._elementwise(eqn, values) if same_size else None
 
     def _structural(self, eqn: Any, values: Sequence[BatchedArray]) -> list[np.ndarray]:
-        return picked(eqn, [value.components for value in values])
+        return pick_entries(eqn, [value.components for value in values])
 
     def _fold(self, name: str, *items: Any) -> Any:
         if name in self.replacements:
@@ -182,10 +182,10 @@ class ComponentRules:
 
     def _reduction(self, eqn: Any, values: Sequence[BatchedArray]) -> list[np.ndarray]:
         operation = _REDUCTIONS[eqn.primitive.name]
-        return [reduced(eqn, values[0].components, lambda row: self._fold(operation, *row))]
+        return [reduce_entries(eqn, values[0].components, lambda row: self._fold(operation, *row))]
 
     def _cumulative(self, eqn: Any, values: Sequence[BatchedArray]) -> list[np.ndarray]:
-        return [cumulated(eqn, values[0].components, partial(self._fold, _CUMULATIVE[eqn.primitive.name]))]
+        return [accumulate_entries(eqn, values[0].components, partial(self._fold, _CUMULATIVE[eqn.primitive.name]))]
 
     def _contraction(self, eqn: Any, values: Sequence[BatchedArray]) -> list[np.ndarray] | None:
         dtype, skip_zeros = eqn.outvars[0].aval.dtype, _has_tangent(values)
@@ -204,7 +204,7 @@ class ComponentRules:
             return self._fold("add", *products) if products else dtype.type(0)
 
         left, right = map(converted, values, eqn.invars)
-        return [contracted(eqn, left, right, inner)]
+        return [contract_entries(eqn, left, right, inner)]
 
 
 def _identity(part: Any) -> Any:
@@ -237,7 +237,7 @@ _ZERO_RULES: dict[str, Callable] = {
 }
 
 
-def picked(eqn: Any, arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
+def pick_entries(eqn: Any, arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Return the results of a primitive that only moves entries, on object arrays."""
     shape, params, first = eqn.outvars[0].aval.shape, eqn.params, arrays[0]
     match eqn.primitive.name:
@@ -259,10 +259,10 @@ def picked(eqn: Any, arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
             return [np.stack(arrays, params["axis"])]
         case "transpose":
             return [first.transpose(params["permutation"])]
-    return _picked_by_index(eqn, arrays)
+    return _pick_by_index(eqn, arrays)
 
 
-def _picked_by_index(eqn: Any, arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
+def _pick_by_index(eqn: Any, arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Return the results of a primitive that only moves entries: it is applied to the entries' indices."""
     pool = [entry for array in arrays for entry in array.flat]
     ends = itertools.accumulate(array.size for array in arrays)
@@ -273,7 +273,7 @@ def _picked_by_index(eqn: Any, arrays: Sequence[np.ndarray]) -> list[np.ndarray]
     return [object_array(out.shape, (pool[k] for k in out.flat)) for out in moved]
 
 
-def reduced(eqn: Any, array: np.ndarray, fold: Callable[[np.ndarray], Any]) -> np.ndarray:
+def reduce_entries(eqn: Any, array: np.ndarray, fold: Callable[[np.ndarray], Any]) -> np.ndarray:
     """Return the result of a reduction on an object array.
 
     Args:
@@ -288,7 +288,7 @@ def reduced(eqn: Any, array: np.ndarray, fold: Callable[[np.ndarray], Any]) -> n
     return object_array(shape, (fold(rows[i]) for i in np.ndindex(*shape)))
 
 
-def contracted(eqn: Any, left: np.ndarray, right: np.ndarray, inner: Callable[..., Any]) -> np.ndarray:
+def contract_entries(eqn: Any, left: np.ndarray, right: np.ndarray, inner: Callable[..., Any]) -> np.ndarray:
     """Return the result of a `dot_general` on object arrays.
 
     Args:
@@ -309,7 +309,7 @@ def contracted(eqn: Any, left: np.ndarray, right: np.ndarray, inner: Callable[..
     return object_array(eqn.outvars[0].aval.shape, (inner(a[k, i], b[k, j]) for k, i, j in every))
 
 
-def cumulated(eqn: Any, array: np.ndarray, operation: Callable[[Any, Any], Any]) -> np.ndarray:
+def accumulate_entries(eqn: Any, array: np.ndarray, operation: Callable[[Any, Any], Any]) -> np.ndarray:
     """Return a cumulative sum, product or extreme of an object array.
 
     Args:

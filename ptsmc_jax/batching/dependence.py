@@ -19,13 +19,13 @@ T = TypeVar("T")
 _CALLS = set("jit pjit closed_call core_call remat remat2 checkpoint".split())
 
 
-def called(eqn: Any) -> Any:
+def called_jaxpr(eqn: Any) -> Any:
     """Return the jaxpr that an equation calls, or None if its primitive is no call."""
     params = eqn.params
     return params.get("jaxpr", params.get("call_jaxpr")) if eqn.primitive.name in _CALLS else None
 
 
-def opened(closed: Any) -> tuple[core.Jaxpr, Sequence]:
+def open_jaxpr(closed: Any) -> tuple[core.Jaxpr, Sequence]:
     """Return a jaxpr and its constants. A call may hold a jaxpr without constants."""
     return (closed.jaxpr, closed.consts) if isinstance(closed, core.ClosedJaxpr) else (closed, ())
 
@@ -69,7 +69,9 @@ def interpret(
     return [read(atom) for atom in jaxpr.outvars]
 
 
-def of_scan(params: Mapping[str, Any], operands: Sequence[T]) -> tuple[Sequence[T], Sequence[T], Sequence[T]]:
+def split_scan_operands(
+    params: Mapping[str, Any], operands: Sequence[T]
+) -> tuple[Sequence[T], Sequence[T], Sequence[T]]:
     """Split the operands of a `lax.scan`, or the inputs of its body, into constants, carries and xs."""
     if "num_consts" in params:
         consts, carries = params["num_consts"], params["num_carry"]
@@ -78,20 +80,22 @@ def of_scan(params: Mapping[str, Any], operands: Sequence[T]) -> tuple[Sequence[
     return operands[:consts], operands[consts : consts + carries], operands[consts + carries :]
 
 
-def of_while(params: Mapping[str, Any], operands: Sequence[T]) -> tuple[Sequence[T], Sequence[T], Sequence[T]]:
+def split_while_operands(
+    params: Mapping[str, Any], operands: Sequence[T]
+) -> tuple[Sequence[T], Sequence[T], Sequence[T]]:
     """Split the operands of a `lax.while_loop` into constants of its test, constants of its body, and carries."""
     first, second = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
     return operands[:first], operands[first:second], operands[second:]
 
 
-def loop_of(eqn: Any, operands: Sequence[T]) -> tuple[Any, Any, Sequence[T], Sequence[T], Sequence[T]]:
+def unpack_while(eqn: Any, operands: Sequence[T]) -> tuple[Any, Any, Sequence[T], Sequence[T], Sequence[T]]:
     """Return the test (a scalar) and the body of a `while` equation, constants of each, and the initial carries.
 
     `jax.vmap` in user code makes loops whose test has a truth value for each row of the carries. Such a loop runs while
     any row is true. Rows that are false keep their carries.
     """
     test, body = eqn.params["cond_jaxpr"], eqn.params["body_jaxpr"]
-    test_consts, body_consts, init = of_while(eqn.params, operands)
+    test_consts, body_consts, init = split_while_operands(eqn.params, operands)
     (rows_axes,) = (range(len(aval.shape)) for aval in test.out_avals)
     if not rows_axes:
         return test, body, test_consts, body_consts, init
@@ -101,14 +105,14 @@ def loop_of(eqn: Any, operands: Sequence[T]) -> tuple[Any, Any, Sequence[T], Seq
         return lax.reduce_or(run_test(*inside)[0], rows_axes)
 
     def step(*inside: Any) -> list:
-        of_test, of_body, carries = of_while(eqn.params, inside)
+        of_test, of_body, carries = split_while_operands(eqn.params, inside)
         (running,) = run_test(*of_test, *carries)
         after = run_body(*of_body, *carries)
         masks = (lax.broadcast_in_dim(running, new.shape, rows_axes) for new in after)
         return [lax.select(mask, new, old) for mask, new, old in zip(masks, after, carries, strict=True)]
 
     avals = [v.aval for v in eqn.invars]
-    of_test, _, carries = of_while(eqn.params, avals)
+    of_test, _, carries = split_while_operands(eqn.params, avals)
     masked = jax.make_jaxpr(step)(*avals)
     return jax.make_jaxpr(any_row)(*of_test, *carries), masked, test_consts, [*test_consts, *body_consts], init
 
@@ -147,7 +151,7 @@ def while_dependence(
     """Return the flags of the carries of a `while` loop and the flags of its test.
 
     Args:
-        test: closed jaxpr of the test, see `loop_of`.
+        test: closed jaxpr of the test, see `unpack_while`.
         body: closed jaxpr of the body.
         test_consts: flags of the constants of the test.
         body_consts: flags of the constants of the body.
@@ -172,14 +176,14 @@ def branch_dependence(branches: Sequence, index: int, operands: Sequence[int]) -
 
 def _propagate(eqn: Any, flags: list[int]) -> list[int]:
     """Return the flags of the results of one equation. Calls, branches and loops are evaluated result by result."""
-    inner, every = called(eqn), union(flags)
+    inner, every = called_jaxpr(eqn), union(flags)
     if every and inner is not None:
-        return dependence(opened(inner)[0], flags)
+        return dependence(open_jaxpr(inner)[0], flags)
     match eqn.primitive.name if every else "":
         case "cond":
             return branch_dependence(eqn.params["branches"], flags[0], flags[1:])
         case "scan":
-            return scan_dependence(eqn.params["jaxpr"].jaxpr, *of_scan(eqn.params, flags))
+            return scan_dependence(eqn.params["jaxpr"].jaxpr, *split_scan_operands(eqn.params, flags))
         case "while":
-            return while_dependence(*loop_of(eqn, flags))[0]
+            return while_dependence(*unpack_while(eqn, flags))[0]
     return [every] * len(eqn.outvars)

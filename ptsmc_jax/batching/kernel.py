@@ -22,7 +22,7 @@ from jaxtyping import Array
 
 from ptsmc_jax.batching import components, dependence
 from ptsmc_jax.batching.components import TRIAL, BatchedArray
-from ptsmc_jax.batching.dependence import of_scan
+from ptsmc_jax.batching.dependence import split_scan_operands
 
 BLOCK = 128  # trials in a block, a power of two
 UNROLLED = 8  # length of the longest loop that is unrolled
@@ -59,7 +59,7 @@ def scan(
             `MAX_COMPONENTS` entries, loops of unknown length, or long loops that stack results or run backward.
     """
     body, length, inputs = params["jaxpr"], params["length"], params["jaxpr"].jaxpr.invars
-    carries, xs = of_scan(params, inputs)[1], of_scan(params, values)[2]
+    carries, xs = split_scan_operands(params, inputs)[1], split_scan_operands(params, values)[2]
     unsuitable = length <= UNROLLED or params["reverse"] or len(body.jaxpr.outvars) > len(carries) or not any(varies)
     if unsuitable or 0 in batch or any(x.axes & TRIAL for x in xs):
         return None
@@ -81,7 +81,7 @@ def scan(
             return stored.open(vectors).load() if value.axes & TRIAL else stored.open(number_refs)
 
         operands = list(map(operand, values, operand_slots))
-        last = _Interpreter(interpreted).loop(body, length, of_scan(params, operands), varies)
+        last = _Interpreter(interpreted).loop(body, length, split_scan_operands(params, operands), varies)
         written: dict[str, list] = {}
         for value, stored in zip(last, end_slots, strict=True):
             parts = (jnp.broadcast_to(jnp.asarray(part, stored.kind), (BLOCK,)) for part in value.components.flat)
@@ -89,17 +89,19 @@ def scan(
         for kind, ref in end_refs.items():
             _store_rows(ref, written[kind])
 
-    def blocks_of(tables: _Tables) -> list:
-        heights = map(_padded, tables.sizes.values())
+    def block_specs(tables: _Tables) -> list:
+        heights = map(_next_power_of_two, tables.sizes.values())
         return [pl.BlockSpec((height, BLOCK), lambda block, direction: (direction, block)) for height in heights]
 
     flat, width = numbers.number_arrays(), blocks * BLOCK
     found = pl.pallas_call(
         run,
-        out_shape=[jax.ShapeDtypeStruct((count * _padded(size), width), kind) for kind, size in ends.sizes.items()],
+        out_shape=[
+            jax.ShapeDtypeStruct((count * _next_power_of_two(size), width), kind) for kind, size in ends.sizes.items()
+        ],
         grid=(blocks, count),
-        in_specs=[*(pl.BlockSpec(v.shape, lambda block, direction: (0,)) for v in flat), *blocks_of(rows)],
-        out_specs=blocks_of(ends),
+        in_specs=[*(pl.BlockSpec(v.shape, lambda block, direction: (0,)) for v in flat), *block_specs(rows)],
+        out_specs=block_specs(ends),
         interpret=interpreted,
         compiler_params=triton.CompilerParams(num_warps=BLOCK // 32),
     )(*flat, *rows.row_arrays(batch, width))
@@ -110,7 +112,7 @@ def scan(
     return [stored.open(by_row).load().components for stored in end_slots]
 
 
-def _padded(length: int) -> int:
+def _next_power_of_two(length: int) -> int:
     """Return the next power of two, which Triton requires of shapes."""
     return 1 << (length - 1).bit_length()
 
@@ -195,14 +197,17 @@ class _Tables:
     def number_arrays(self) -> list[Array]:
         """Return a table (length,) for each dtype."""
         whole = [jnp.concatenate(parts) for parts in self.parts.values()]
-        return [jnp.pad(v, (0, max(16, _padded(v.size)) - v.size)) for v in whole]
+        return [jnp.pad(v, (0, max(16, _next_power_of_two(v.size)) - v.size)) for v in whole]
 
     def row_arrays(self, batch: tuple[int, ...], width: int) -> list[Array]:
         """Return a table (directions * height, width) for each dtype."""
         arrays = []
         for kind, parts in self.parts.items():
             stacked = jnp.stack([jnp.broadcast_to(part, batch).astype(kind) for part in parts], axis=-2)
-            padding = [(0, 0)] * len(batch[:-1]) + [(0, _padded(len(parts)) - len(parts)), (0, width - batch[-1])]
+            padding = [(0, 0)] * len(batch[:-1]) + [
+                (0, _next_power_of_two(len(parts)) - len(parts)),
+                (0, width - batch[-1]),
+            ]
             arrays.append(jnp.pad(stacked, padding, mode="edge").reshape(-1, width))
         return arrays
 
@@ -267,21 +272,21 @@ class _Interpreter:
 
     def evaluate(self, closed: Any, arguments: Sequence) -> list:
         """Return the outputs of a jaxpr."""
-        return dependence.interpret(*dependence.opened(closed), arguments, _constant, self.apply)
+        return dependence.interpret(*dependence.open_jaxpr(closed), arguments, _to_constant, self.apply)
 
     def apply(self, eqn: Any, values: list) -> Sequence:
         """Return the results of one equation."""
         name, params = eqn.primitive.name, eqn.params
         if name == "scan":
             return self.scan(params, values)
-        values = _loaded(values)
+        values = _load_all(values)
         for variable in eqn.outvars:
             _table_dtype(variable.aval.dtype)
         if name in _NOT_LOWERED and not self.interpreted:
             raise NotImplementedError(
                 f"a kernel's compiler lacks the primitive `{name}`{dependence.source_location(eqn)}"
             )
-        inner = params["call_jaxpr"] if name in _CUSTOM_CALLS else dependence.called(eqn)
+        inner = params["call_jaxpr"] if name in _CUSTOM_CALLS else dependence.called_jaxpr(eqn)
         if inner is not None:
             return self.evaluate(inner, values)
         if name == "cond":
@@ -292,7 +297,7 @@ class _Interpreter:
                 for v, variable in zip(values, eqn.invars, strict=True)
             ]
             with jax.ensure_compile_time_eval():
-                return [_constant(out) for out in components.bind(eqn, arrays)]
+                return [_to_constant(out) for out in components.bind(eqn, arrays)]
         # new rules for each equation: an array that was broadcast inside a branch or loop must not leave it
         two_cases = name == "select_n" and len(values) == 3
         rules = components.ComponentRules(MAX_COMPONENTS, {} if two_cases else _REPLACEMENTS)
@@ -306,14 +311,14 @@ class _Interpreter:
     def scan(self, params: Any, values: list) -> list[BatchedArray]:
         """Return the results of a loop, unrolled if it is short."""
         body, length = params["jaxpr"], params["length"]
-        consts, init, xs = of_scan(params, values)
-        consts, state, count = _loaded(consts), _loaded(init), len(init)
+        consts, init, xs = split_scan_operands(params, values)
+        consts, state, count = _load_all(consts), _load_all(init), len(init)
         if params["reverse"]:
             raise NotImplementedError("a kernel's loops run forward")
         if length <= UNROLLED or (count == 0 and length <= MAPPED):
             steps: list[list] = []
             for k in range(length):
-                steps.append(self.evaluate(body, [*consts, *state, *(_row(x, k) for x in xs)]))
+                steps.append(self.evaluate(body, [*consts, *state, *(_take_row(x, k) for x in xs)]))
                 state = steps[k][:count]
             outputs = enumerate(body.jaxpr.outvars[count:], count)
             rows = (((length, *v.aval.shape), [step[j].parts for step in steps]) for j, v in outputs)
@@ -325,10 +330,10 @@ class _Interpreter:
 
     def loop(self, body: Any, length: int, operands: Sequence[Sequence], varies: Sequence[int]) -> list[BatchedArray]:
         """Return the last carries of a loop. operands: constants, carries and xs."""
-        (consts, init), xs = map(_loaded, operands[:2]), operands[2]
+        (consts, init), xs = map(_load_all, operands[:2]), operands[2]
 
         def step(k: Any, state: list) -> list:
-            return self.align(self.evaluate(body, [*consts, *state, *(_row(x, k) for x in xs)]), varies)
+            return self.align(self.evaluate(body, [*consts, *state, *(_take_row(x, k) for x in xs)]), varies)
 
         return lax.fori_loop(np.int32(0), np.int32(length), step, self.align(init, varies))
 
@@ -345,16 +350,16 @@ class _Interpreter:
     def align(self, values: Sequence[BatchedArray], varies: Sequence[int]) -> list[BatchedArray]:
         """Return values as loops and branches carry them: vectors if they differ by trial, otherwise scalars."""
 
-        def aligned(value: BatchedArray, each: int) -> BatchedArray:
+        def align_one(value: BatchedArray, each: int) -> BatchedArray:
             def component(part: Any) -> Any:  # Triton cannot return constants; select makes a scalar of them
                 return jnp.broadcast_to(part, (BLOCK,)) if each else lax.select(True, part, part)
 
             return BatchedArray(value.shape, tuple(map(component, value.components.flat)))
 
-        return [aligned(*item) for item in zip(values, varies, strict=False)]
+        return [align_one(*item) for item in zip(values, varies, strict=False)]
 
 
-def _constant(value: Any) -> BatchedArray:
+def _to_constant(value: Any) -> BatchedArray:
     return BatchedArray.of_components(components.entries(np.asarray(value)))
 
 
@@ -363,11 +368,11 @@ def _is_constant(value: BatchedArray) -> bool:
     return all(isinstance(part, np.ndarray | np.generic) for part in value.components.flat)
 
 
-def _loaded(values: Sequence) -> list[BatchedArray]:
+def _load_all(values: Sequence) -> list[BatchedArray]:
     return [value.load() if isinstance(value, _Stored) else value for value in values]
 
 
-def _row(value: Any, k: Any) -> BatchedArray:
+def _take_row(value: Any, k: Any) -> BatchedArray:
     """Return the row of xs that step k of a loop takes."""
     if isinstance(value, _Stored):
         return value.row(k)

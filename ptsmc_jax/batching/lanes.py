@@ -164,7 +164,7 @@ class _Interpreter:
 
     def evaluate(self, closed: Any, arguments: Sequence[BatchedArray]) -> list[BatchedArray]:
         """Return the outputs of a jaxpr."""
-        jaxpr, consts = dependence.opened(closed)
+        jaxpr, consts = dependence.open_jaxpr(closed)
         arguments = _unbatch_empty(arguments, jaxpr.invars)
         return dependence.interpret(jaxpr, consts, arguments, BatchedArray.unbatched, self.apply)
 
@@ -182,7 +182,7 @@ class _Interpreter:
 
     def apply_batched(self, eqn: Any, values: list[BatchedArray]) -> list[BatchedArray]:
         """Return the results of one equation with at least one batched operand."""
-        name, inner, axes = eqn.primitive.name, dependence.called(eqn), union(_axes(values))
+        name, inner, axes = eqn.primitive.name, dependence.called_jaxpr(eqn), union(_axes(values))
         if inner is not None:
             return self.evaluate(inner, values)
         if name in _CONTROL_FLOW:
@@ -224,9 +224,9 @@ class _Interpreter:
         Small arrays become components, each broadcast to the batch. Large ones, and those that are equal in all trials,
         become arrays.
         """
-        return [self._aligned(*item) for item in zip(values, axes, strict=True)]
+        return [self._align_one(*item) for item in zip(values, axes, strict=True)]
 
-    def _aligned(self, value: BatchedArray, axes: int) -> BatchedArray:
+    def _align_one(self, value: BatchedArray, axes: int) -> BatchedArray:
         if not axes and value.array is not None:
             return BatchedArray(value.shape, array=value.array, axes=0)
         batch = self.batch_shapes[axes]
@@ -238,7 +238,7 @@ class _Interpreter:
     def scan(self, eqn: Any, values: list[BatchedArray]) -> list[BatchedArray]:
         """Return the results of `lax.scan`."""
         params, body = eqn.params, eqn.params["jaxpr"]
-        consts, init, xs = dependence.of_scan(params, values)
+        consts, init, xs = dependence.split_scan_operands(params, values)
         consts, count = _split(consts), len(init)
         axes = dependence.scan_dependence(body.jaxpr, *map(_axes, (consts, init, xs)))
         if self.use_kernel:
@@ -253,7 +253,7 @@ class _Interpreter:
         rows = [self.rows(x) for x in xs]
         options = {name: params[name] for name in ("length", "reverse", "unroll")}
         last, outputs = stacking.scan(step, self.align(init, axes[:count]), rows, **options)
-        return [*last, *(self.stacked(value, params["length"]) for value in outputs)]
+        return [*last, *(self.stack_rows(value, params["length"]) for value in outputs)]
 
     def rows(self, value: BatchedArray) -> BatchedArray:
         """Return the rows that a scan iterates over: arrays of value.shape[1:], whose leaves have the time first."""
@@ -265,7 +265,7 @@ class _Interpreter:
             return BatchedArray(shape, array=array, axes=value.axes)
         return BatchedArray.of_components(components.entries(array, 1 + len(batch)), value.axes)
 
-    def stacked(self, value: BatchedArray, length: int) -> BatchedArray:
+    def stack_rows(self, value: BatchedArray, length: int) -> BatchedArray:
         """Return the array (length, *value.shape) of rows, whose leaves have the time first."""
         shape, batch, axes = (length, *value.shape), self.batch_shapes[value.axes], value.axes
         if not axes:
@@ -298,17 +298,17 @@ class _Interpreter:
                 return part if axes & TRIAL else part[..., :1] if axes else part[0]
 
             axes = axes if parts.size else TRIAL
-            return self._aligned(jax.tree.map(of_batch, BatchedArray.of_components(parts, axes)), axes)
+            return self._align_one(jax.tree.map(of_batch, BatchedArray.of_components(parts, axes)), axes)
 
         return last and list(map(of_carry, last, axes))
 
     def while_loop(self, eqn: Any, values: list[BatchedArray]) -> list[BatchedArray]:
         """Return the results of `lax.while_loop`. A trial whose test is false keeps its carries."""
-        test, body, test_consts, body_consts, init = dependence.loop_of(eqn, values)
+        test, body, test_consts, body_consts, init = dependence.unpack_while(eqn, values)
         test_consts, body_consts = _split(test_consts), _split(body_consts)
         axes, test_axes = dependence.while_dependence(test, body, *map(_axes, (test_consts, body_consts, init)))
 
-        def running(carry: list) -> Any:
+        def is_running(carry: list) -> Any:
             (value,) = self.evaluate_inside(test, [*test_consts, *carry])
             return value.to_array(self.batch_shapes[test_axes]) if test_axes else value.array
 
@@ -316,10 +316,10 @@ class _Interpreter:
             after = self.align(self.evaluate_inside(body, [*body_consts, *carry]), axes)
             if not test_axes:
                 return after
-            on = running(carry)
+            on = is_running(carry)
             return [self._map_leaves(jnp.where, on, new, old) for new, old in zip(after, carry, strict=True)]
 
-        proceed = (lambda carry: jnp.any(running(carry))) if test_axes else running
+        proceed = (lambda carry: jnp.any(is_running(carry))) if test_axes else is_running
         return lax.while_loop(proceed, step, self.align(init, axes))
 
     def _map_leaves(self, function: Callable, condition: Array, *values: BatchedArray) -> BatchedArray:
@@ -364,15 +364,15 @@ class _Interpreter:
         A derivative may be infinite there, and reverse mode would multiply it by zero. `jax.vmap` does the same.
         """
 
-        def masked(selected: Array, leaf: Array) -> Array:
+        def mask(selected: Array, leaf: Array) -> Array:
             return jnp.where(selected, leaf, lax.stop_gradient(leaf))
 
-        def stopped(value: BatchedArray, variable: Any) -> BatchedArray:
+        def stop_gradient(value: BatchedArray, variable: Any) -> BatchedArray:
             if not jnp.issubdtype(variable.aval.dtype, jnp.inexact):
                 return value
-            return self._map_leaves(masked, selected, self._aligned(value, value.axes | TRIAL))
+            return self._map_leaves(mask, selected, self._align_one(value, value.axes | TRIAL))
 
-        return list(map(stopped, operands, eqn.invars[1:]))
+        return list(map(stop_gradient, operands, eqn.invars[1:]))
 
     def custom_jvp(self, eqn: Any, values: list[BatchedArray]) -> list[BatchedArray]:
         """Return the results of a function with a custom derivative rule (`jax.custom_jvp`), and preserve the rule."""

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ptsmc_jax.dispersions.numbers import Combine, Numbers, Random, added
+from ptsmc_jax.dispersions.numbers import Combine, Numbers, Random, add_to_nominal
 from ptsmc_jax.numerics import draws, paths
 from ptsmc_jax.simulation.rollout import Parts
 
@@ -53,7 +53,7 @@ Given = Mapping[str, np.ndarray]  # values (rows, n) of a run table, by the name
 
 
 class Quantity(NamedTuple):
-    """A quantity of n numbers that can differ from trial to trial, such as the initial attitude or the wheel torque.
+    """A quantity of n numbers that can differ from trial to trial, such as the initial attitude or the torque limits.
 
     Attributes:
         columns: (parts) -> names of its columns in result files and run tables. Empty if the parts have no such
@@ -74,7 +74,7 @@ class Quantity(NamedTuple):
     columns: Callable[[Parts], list[str]]
     read: Callable[[Parts], Numbers]
     write: Callable[[Parts, Numbers], Parts]
-    combine: Combine | Mapping[str, Combine] = added
+    combine: Combine | Mapping[str, Combine] = add_to_nominal
     size: Callable[[Parts], int] | None = None
     unit: str | tuple[str, ...] = "-"
     checked: Checked = lambda rows: rows
@@ -98,7 +98,7 @@ class Quantity(NamedTuple):
         return self.write(parts, combine(random, self.read(parts), parts))
 
 
-def at_path(
+def field_quantity(
     path: str,
     names: str | Sequence[str],
     default: object = None,
@@ -127,7 +127,7 @@ def at_path(
             return []
         if not isinstance(names, str):
             return list(names)
-        return numbered(names, np.size(current)) if np.ndim(current) else [names.rstrip("_")]
+        return number_names(names, np.size(current)) if np.ndim(current) else [names.rstrip("_")]
 
     def write(parts: Parts, new: Numbers) -> Parts:
         return paths.put(parts, path, new.reshape(np.shape(value(parts))))
@@ -135,7 +135,7 @@ def at_path(
     return Quantity(columns, lambda parts: jnp.ravel(jnp.asarray(value(parts))), write, **others)
 
 
-def fitting(is_valid: Callable[[np.ndarray], np.ndarray], allowed: str) -> Checked:
+def validator(is_valid: Callable[[np.ndarray], np.ndarray], allowed: str) -> Checked:
     """Return a validator for `Quantity.checked` that raises UnfitError for the first invalid row.
 
     Args:
@@ -151,11 +151,11 @@ def fitting(is_valid: Callable[[np.ndarray], np.ndarray], allowed: str) -> Check
     return checked
 
 
-not_negative = fitting(lambda numbers: numbers >= 0.0, "numbers of at least 0")
-positive = fitting(lambda numbers: numbers > 0.0, "a number greater than 0")
+not_negative = validator(lambda numbers: numbers >= 0.0, "numbers of at least 0")
+positive = validator(lambda numbers: numbers > 0.0, "a number greater than 0")
 
 
-def reason(check: Callable[..., Any], *values: Any) -> str:
+def error_message(check: Callable[..., Any], *values: Any) -> str:
     """Return the message of the ValueError that a check raises for these values, or "" if it raises none."""
     try:
         check(*values)
@@ -164,7 +164,7 @@ def reason(check: Callable[..., Any], *values: Any) -> str:
     return ""
 
 
-def numbered(name: str, count: int) -> list[str]:
+def number_names(name: str, count: int) -> list[str]:
     """Return names with numbers from 1 to count."""
     return [f"{name}{k + 1}" for k in range(count)]
 

@@ -97,17 +97,17 @@ def any_attitude() -> RandomNumbers:
 Combine = Callable[[Random, Numbers, Any], Numbers]
 
 
-def replaced(random: Random, nominal: Numbers, parts: Any) -> Random:
+def replace_nominal(random: Random, nominal: Numbers, parts: Any) -> Random:
     """Return the random numbers (n,) [SI units], without the nominal ones."""
     return random
 
 
-def added(random: Random, nominal: Numbers, parts: Any) -> Numbers:
+def add_to_nominal(random: Random, nominal: Numbers, parts: Any) -> Numbers:
     """Return nominal numbers plus random numbers (n,) [SI units]."""
     return nominal + random
 
 
-def scaled(random: Random, nominal: Numbers, parts: Any) -> Numbers:
+def scale_nominal(random: Random, nominal: Numbers, parts: Any) -> Numbers:
     """Return nominal numbers (n,) [SI units] times 1 + random number [-].
 
     Each random number scales a group of n / count successive numbers.
@@ -116,19 +116,19 @@ def scaled(random: Random, nominal: Numbers, parts: Any) -> Numbers:
     return jnp.ravel(groups * (1.0 + random)[:, None])
 
 
-def turned(random: Random, nominal: Numbers, parts: Any) -> Numbers:
+def rotate_nominal(random: Random, nominal: Numbers, parts: Any) -> Numbers:
     """Return the nominal attitude (4,) rotated by a random rotation vector (3,) [rad]."""
     return attitude.multiply(nominal, attitude.from_rotation_vector(random))
 
 
-def turned_about_axis(random: Random, nominal: Numbers, parts: Any) -> Numbers:
+def rotate_about_axis(random: Random, nominal: Numbers, parts: Any) -> Numbers:
     """Return the nominal attitude (4,) rotated about a random axis; see `axis_angle` for the numbers [-, rad, rad]."""
     z, azimuth, angle = random[0], random[1], random[2]
     radius = jnp.sqrt(1.0 - z * z)
     axis = jnp.stack([radius * jnp.cos(azimuth), radius * jnp.sin(azimuth), z])
-    return turned(angle * axis, nominal, parts)
+    return rotate_nominal(angle * axis, nominal, parts)
 
 
-def turned_from_reference(random: Random, nominal: Numbers, parts: Any) -> Numbers:
-    """Return the attitude (4,) [-] of the reference at t = 0, rotated as by `turned_about_axis`."""
-    return turned_about_axis(random, parts.reference(jnp.zeros_like(parts.t_end)).q, parts)
+def rotate_from_reference(random: Random, nominal: Numbers, parts: Any) -> Numbers:
+    """Return the attitude (4,) [-] of the reference at t = 0, rotated as by `rotate_about_axis`."""
+    return rotate_about_axis(random, parts.reference(jnp.zeros_like(parts.t_end)).q, parts)

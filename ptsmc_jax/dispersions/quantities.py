@@ -26,21 +26,21 @@ from ptsmc_jax.dispersions.base import (
     Given,
     Quantity,
     UnfitError,
-    at_path,
-    fitting,
+    error_message,
+    field_quantity,
     not_negative,
-    numbered,
+    number_names,
     positive,
-    reason,
+    validator,
 )
 from ptsmc_jax.dispersions.numbers import (
     Numbers,
     Random,
-    replaced,
-    scaled,
-    turned,
-    turned_about_axis,
-    turned_from_reference,
+    replace_nominal,
+    rotate_about_axis,
+    rotate_from_reference,
+    rotate_nominal,
+    scale_nominal,
 )
 from ptsmc_jax.numerics import attitude, matrices, paths
 from ptsmc_jax.plants.rigid_body import Spacecraft
@@ -53,7 +53,7 @@ PAIRS = [(i, j) for i in range(3) for j in range(i, 3)]  # the upper triangle, i
 _PAIR_INDICES = [[PAIRS.index((min(i, j), max(i, j))) for j in range(3)] for i in range(3)]
 
 
-def level(name: str) -> str:
+def level_name(name: str) -> str:
     """Return the name of a quantity with one common random factor for all its components, such as `torque_limit`."""
     return f"{name}_level"
 
@@ -87,7 +87,7 @@ def _to_matrices(rows: np.ndarray) -> np.ndarray:
 def _check_inertia(rows: np.ndarray) -> np.ndarray:
     full = _to_matrices(rows)
     UnfitError.check(
-        formulas.bodies(full), lambda k: f"a rigid body's inertia ({reason(formulas.check_inertia, full[k])})"
+        formulas.bodies(full), lambda k: f"a rigid body's inertia ({error_message(formulas.check_inertia, full[k])})"
     )
     return rows
 
@@ -108,7 +108,7 @@ def _check_flexible_body(given: Given, parts: Parts) -> None:
         changed, coupling = "coupling", given["mode_coupling"].reshape(coupling.shape)
     UnfitError.check(
         formulas.flexible_bodies(inertia, coupling),
-        lambda k: f"a flexible body's {changed} ({reason(formulas.rest_inertia, inertia[k], coupling[k])})",
+        lambda k: f"a flexible body's {changed} ({error_message(formulas.rest_inertia, inertia[k], coupling[k])})",
     )
 
 
@@ -120,7 +120,7 @@ def _disturbance_quantity(name: str, field: Literal["phase", "amplitude"], **oth
         return disturbances.values(parts.disturbance, field)
 
     return Quantity(
-        lambda parts: numbered(f"{name}_", read(parts).size),
+        lambda parts: number_names(f"{name}_", read(parts).size),
         read,
         lambda parts, new: replace(parts, disturbance=disturbances.with_values(parts.disturbance, field, new)),
         **others,
@@ -205,23 +205,25 @@ _FAILURE_COLUMNS = ("wheel_failure_time", "wheel_failure_wheel")
 
 # the order is the order of the columns
 QUANTITIES: dict[str, Quantity] = {
-    INITIAL_ATTITUDE: at_path(
+    INITIAL_ATTITUDE: field_quantity(
         "initial.q",
         "initial_q",
-        combine={"normal": turned, "axis_angle": turned_from_reference, "any_attitude": replaced},
+        combine={"normal": rotate_nominal, "axis_angle": rotate_from_reference, "any_attitude": replace_nominal},
         checked=_normalise,
     ),
-    INITIAL_RATE: at_path("initial.w", "initial_w", unit="rad/s"),
+    INITIAL_RATE: field_quantity("initial.w", "initial_w", unit="rad/s"),
     INITIAL_STATE: Quantity(
-        lambda parts: [] if parts.plant.attitude else numbered("initial_x", parts.plant.visible(parts.initial).size),
+        lambda parts: (
+            [] if parts.plant.attitude else number_names("initial_x", parts.plant.visible(parts.initial).size)
+        ),
         lambda parts: parts.plant.visible(parts.initial),
         lambda parts, x: replace(parts, initial=parts.plant.with_hidden_at_rest(x)),
         unit="",
     ),
-    REFERENCE: at_path(
+    REFERENCE: field_quantity(
         "reference.q",
         "reference_q",
-        combine={"normal": turned, "axis_angle": turned_about_axis, "any_attitude": replaced},
+        combine={"normal": rotate_nominal, "axis_angle": rotate_about_axis, "any_attitude": replace_nominal},
         checked=_normalise,
     ),
     INERTIA: Quantity(  # with random numbers from `RelativeInertia`
@@ -233,16 +235,18 @@ QUANTITIES: dict[str, Quantity] = {
         check_with=lambda given, parts: None if "mode_coupling" in given else _check_flexible_body(given, parts),
     ),
     DISTURBANCE_PHASE: _disturbance_quantity(DISTURBANCE_PHASE, "phase", unit="rad"),
-    DISTURBANCE_AMPLITUDE: _disturbance_quantity(DISTURBANCE_AMPLITUDE, "amplitude", combine=scaled, unit="N m"),
+    DISTURBANCE_AMPLITUDE: _disturbance_quantity(DISTURBANCE_AMPLITUDE, "amplitude", combine=scale_nominal, unit="N m"),
     DISTURBANCE_BIAS: Quantity(
-        lambda parts: numbered(f"{DISTURBANCE_BIAS}_", parts.plant.inputs),
+        lambda parts: number_names(f"{DISTURBANCE_BIAS}_", parts.plant.inputs),
         lambda parts: disturbances.bias(parts.disturbance, parts.plant.inputs),
         lambda parts, bias: replace(parts, disturbance=disturbances.with_bias(parts.disturbance, bias)),
-        replaced,
+        replace_nominal,
         unit="N m",
     ),
     **{
-        level(name): at_path(path, f"{name}_", combine=scaled, size=lambda parts: 1, unit=unit, checked=checked)
+        level_name(name): field_quantity(
+            path, f"{name}_", combine=scale_nominal, size=lambda parts: 1, unit=unit, checked=checked
+        )
         for name, path, unit, checked in (
             ("attitude_noise", "sensors.attitude_noise", "rad", not_negative),
             ("rate_noise", "sensors.rate_noise", "rad/s", not_negative),
@@ -251,12 +255,12 @@ QUANTITIES: dict[str, Quantity] = {
         )
     },
     # gyro bias at the first sample; without a value in a run table, the sensors have a random bias
-    RATE_BIAS: at_path("sensors.given_bias", f"{RATE_BIAS}_", np.zeros(3), unit="rad/s"),
+    RATE_BIAS: field_quantity("sensors.given_bias", f"{RATE_BIAS}_", np.zeros(3), unit="rad/s"),
     "actuator_scale": Quantity(
-        lambda parts: numbered("actuator_scale_", _count_channels(parts)),
+        lambda parts: number_names("actuator_scale_", _count_channels(parts)),
         _read_scale,
         lambda parts, scale: _with_actuators(parts, scale=scale),
-        scaled,
+        scale_nominal,
         hardware=True,
     ),
     "actuator_misalignment": Quantity(
@@ -264,24 +268,24 @@ QUANTITIES: dict[str, Quantity] = {
         _read_directions,
         lambda parts, directions: _with_actuators(parts, directions=directions.reshape(-1, 3).T),
         _rotate_channels,
-        checked=fitting(
+        checked=validator(
             lambda rows: np.abs(np.linalg.norm(rows.reshape(len(rows), -1, 3), axis=2) - 1.0) <= NEAR,
             "unit vectors, three numbers for each channel",
         ),
         hardware=True,
     ),
-    "star_tracker_misalignment": at_path(
+    "star_tracker_misalignment": field_quantity(
         "sensors.misalignment", "star_tracker_misalignment_", np.zeros(3), unit="rad", hardware=True
     ),
-    "gyro_scale": at_path("sensors.rate_scale", "gyro_scale_", np.ones(3), combine=scaled, hardware=True),
-    "star_tracker_outage": at_path(
+    "gyro_scale": field_quantity("sensors.rate_scale", "gyro_scale_", np.ones(3), combine=scale_nominal, hardware=True),
+    "star_tracker_outage": field_quantity(
         "sensors.outage",
         ("star_tracker_outage_begin", "star_tracker_outage_end"),
         np.full(2, np.inf),
         lambda parts: getattr(parts.sensors, "filter", None) is not None,
         combine=lambda random, nominal, parts: jnp.stack([random[0], random[0] + random[1]]),  # from begin and duration
         unit="s",
-        checked=fitting(lambda rows: rows[:, 0] <= rows[:, 1], "a begin and an end that is not before it"),
+        checked=validator(lambda rows: rows[:, 0] <= rows[:, 1], "a begin and an end that is not before it"),
         hardware=True,
     ),
     "wheel_failure": Quantity(
@@ -294,20 +298,20 @@ QUANTITIES: dict[str, Quantity] = {
         categories=_FAILURE_COLUMNS[1:],
         hardware=True,
     ),
-    "timing_jitter": at_path(
+    "timing_jitter": field_quantity(
         "jitter",
         "timing_jitter",
         0.0,
         lambda parts: parts.clock.sampled,
-        combine=replaced,
-        checked=fitting(
+        combine=replace_nominal,
+        checked=validator(
             lambda rows: (rows >= 0.0) & (rows < 0.5), "a fraction of the control period from 0 to below 0.5"
         ),
         check_with=_check_jitter,
         hardware=True,
     ),
-    "mode_frequency": at_path(
-        "plant.frequency", "mode_frequency_", combine=scaled, unit="rad/s", checked=positive, hardware=True
+    "mode_frequency": field_quantity(
+        "plant.frequency", "mode_frequency_", combine=scale_nominal, unit="rad/s", checked=positive, hardware=True
     ),
     "mode_coupling": Quantity(
         lambda parts: _vector_columns("mode_coupling", _count_modes(parts)),
@@ -315,7 +319,7 @@ QUANTITIES: dict[str, Quantity] = {
         lambda parts, rows: replace(
             parts, plant=paths.put(parts.plant, "coupling", rows.reshape(-1, 3)).with_rest_inverse()
         ),
-        scaled,
+        scale_nominal,
         _count_modes,
         unit="sqrt(kg) m",
         check_with=_check_flexible_body,

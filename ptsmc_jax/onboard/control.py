@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ptsmc_jax.batching.components import object_array
-from ptsmc_jax.batching.dependence import loop_of, of_scan
+from ptsmc_jax.batching.dependence import split_scan_operands, unpack_while
 from ptsmc_jax.onboard.expressions import BOOL, Block, Node, Region, kind_of
 
 UNROLLED = 8  # passes of a loop that are written out, and
@@ -75,7 +75,7 @@ def _switch(to: Any, eqn: Any, test: Node, branches: Sequence[Any], operands: li
 
 def loop(to: Any, eqn: Any, values: list[np.ndarray]) -> list[np.ndarray]:
     """lax.while_loop."""
-    test, body, test_consts, body_consts, init = loop_of(eqn, values)
+    test, body, test_consts, body_consts, init = unpack_while(eqn, values)
     region = Region("while")
     carry = _carry(to, region, init, eqn.outvars)
     _inside(to, region, lambda: to.evaluate(test, [*test_consts, *carry]))
@@ -94,7 +94,7 @@ def scan(to: Any, eqn: Any, values: list[np.ndarray]) -> list[np.ndarray]:
     """lax.scan and fori_loop of a fixed length: written out where it is short, else a loop in C."""
     params = eqn.params
     body, length = params["jaxpr"], params["length"]
-    consts, init, xs = of_scan(params, values)
+    consts, init, xs = split_scan_operands(params, values)
     carried = len(init)
     order = range(length)[:: -1 if params["reverse"] else 1]
     if length <= 1 or (length <= UNROLLED and length * len(body.jaxpr.eqns) <= WRITTEN):

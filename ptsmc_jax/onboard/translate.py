@@ -15,7 +15,7 @@ from jax.extend import core
 
 from ptsmc_jax.batching import components
 from ptsmc_jax.batching.components import object_array
-from ptsmc_jax.batching.dependence import called, opened
+from ptsmc_jax.batching.dependence import called_jaxpr, open_jaxpr
 from ptsmc_jax.batching.lapack import COUNTED, SHARED
 from ptsmc_jax.numerics import elementary
 from ptsmc_jax.onboard import origins
@@ -52,7 +52,7 @@ class Translator:
 
     def evaluate(self, closed: Any, args: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Components of a trace's outputs."""
-        jaxpr, consts = opened(closed)
+        jaxpr, consts = open_jaxpr(closed)
         known: dict[Any, np.ndarray] = dict(zip(jaxpr.constvars, map(self.constant, consts), strict=True))
         known |= dict(zip(jaxpr.invars, args, strict=True))
         spans = [() if self.held else tuple(origins.frames(eqn)[:1]) for eqn in jaxpr.eqns]
@@ -79,7 +79,7 @@ class Translator:
 
     def apply(self, eqn: Any, values: list[np.ndarray], where: list[origins.Frame]) -> list[np.ndarray]:
         """Components of one equation's outputs."""
-        name, inner = eqn.primitive.name, called(eqn)
+        name, inner = eqn.primitive.name, called_jaxpr(eqn)
         if name == "custom_jvp_call" or name == "custom_vjp_call":
             inner = eqn.params.get("call_jaxpr", eqn.params.get("fun_jaxpr"))
             debug_info = getattr(getattr(inner, "jaxpr", inner), "debug_info", None)
@@ -143,7 +143,7 @@ class Translator:
 
     def _reduction(self, eqn: Any, value: np.ndarray) -> np.ndarray:
         op, kind = _FOLDS[eqn.primitive.name], kind_of(eqn.outvars[0].aval.dtype)
-        return components.reduced(eqn, value, lambda row: self._fold(op, kind, row))
+        return components.reduce_entries(eqn, value, lambda row: self._fold(op, kind, row))
 
     def _fold(self, op: str, kind: str, items: Any) -> Node:
         items = list(items)
@@ -161,11 +161,11 @@ class Translator:
                 total, kind, (self.pool.make(product, *p, kind=kind) for p in zip(row, column, strict=True))
             )
 
-        return components.contracted(eqn, left, right, inner)
+        return components.contract_entries(eqn, left, right, inner)
 
     def _cumulative(self, eqn: Any, value: np.ndarray) -> np.ndarray:
         op, kind = _SCANS[eqn.primitive.name], kind_of(eqn.outvars[0].aval.dtype)
-        return components.cumulated(eqn, value, lambda *pair: self.pool.make(op, *pair, kind=kind))
+        return components.accumulate_entries(eqn, value, lambda *pair: self.pool.make(op, *pair, kind=kind))
 
     def _place_of_extreme(self, eqn: Any, value: np.ndarray) -> np.ndarray:
         (axis,), kind = eqn.params["axes"], kind_of(eqn.outvars[0].aval.dtype)
@@ -192,7 +192,7 @@ class Translator:
             case "gather" | "scatter" | "scatter-add" | "scatter-sub":
                 arrays, places = values[::2], values[1:2]
             case _:
-                return components.picked(eqn, values)
+                return components.pick_entries(eqn, values)
         return self._indexed(eqn, values, arrays, places)
 
     def _indexed(

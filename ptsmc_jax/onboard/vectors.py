@@ -11,7 +11,7 @@ from jaxtyping import Array
 from ptsmc_jax import programs
 from ptsmc_jax.batching import lapack
 from ptsmc_jax.dispersions.base import REFERENCE
-from ptsmc_jax.dispersions.quantities import level
+from ptsmc_jax.dispersions.quantities import level_name
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.numerics import stacking
 from ptsmc_jax.onboard.board import Board
@@ -97,7 +97,7 @@ def fly_many(parts: Parts, dispersion: Dispersion, seed: Array, trials: Array) -
 
 def known_alike(dispersion: Dispersion) -> Dispersion:
     """Return the dispersion without reference and torque limit: the flight computer knows only the nominal ones."""
-    return dispersion.without((REFERENCE, level("torque_limit")))
+    return dispersion.without((REFERENCE, level_name("torque_limit")))
 
 
 def usable(samples: Samples) -> bool:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from ptsmc_jax.devices import reaction_wheels
 from ptsmc_jax.dispersions.base import INITIAL_ATTITUDE, INITIAL_RATE, INITIAL_STATE
-from ptsmc_jax.dispersions.quantities import QUANTITIES, level
+from ptsmc_jax.dispersions.quantities import QUANTITIES, level_name
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.plants.base import Plant
@@ -61,7 +61,7 @@ def disturbance(scenario: Scenario, plant: Plant) -> tuple[Any, Any]:
 def _quantity_of(key: str) -> str:
     """Return the name of the quantity that a key of [dispersion] disperses."""
     initial = {"attitude": INITIAL_ATTITUDE, "rate": INITIAL_RATE, "x0": INITIAL_STATE}
-    return initial.get(key, level(key) if level(key) in QUANTITIES else key)
+    return initial.get(key, level_name(key) if level_name(key) in QUANTITIES else key)
 
 
 def dispersion(scenario: Scenario, parts: Parts) -> Dispersion:

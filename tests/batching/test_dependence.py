@@ -14,7 +14,7 @@ def chosen(test, one, other):
     return jax.lax.cond(test > 0.0, lambda: (one, other), lambda: (other, -other))
 
 
-def called(test, one, other):
+def jitted(test, one, other):
     return jax.jit(lambda a, b: (a + b, 2.0 * b))(one, other)
 
 
@@ -38,7 +38,7 @@ def repeated(test, one, other):
 
 @pytest.mark.parametrize(("function", "expected"), [
     (chosen, [TEST | ONE | OTHER, TEST | OTHER]),
-    (called, [ONE | OTHER, OTHER]),
+    (jitted, [ONE | OTHER, OTHER]),
     (shifted, [TEST | ONE | OTHER, TEST | OTHER, TEST | ONE | OTHER]),
     (repeated, [TEST | ONE, TEST | ONE | OTHER]),
 ])  # fmt: skip

@@ -80,11 +80,11 @@ def test_derivative_equals_finite_differences_of_a_rotating_body():
     h = 1e-3
     for q, w in zip(P, W, strict=True):
 
-        def turned(t, q=q, w=w):
+        def rotated(t, q=q, w=w):
             out = (Rotation.from_quat(q) * Rotation.from_rotvec(w * t)).as_quat()
             return out * np.sign(out @ q)
 
-        near, far = (turned(h) - turned(-h)) / (2 * h), (turned(2 * h) - turned(-2 * h)) / (4 * h)
+        near, far = (rotated(h) - rotated(-h)) / (2 * h), (rotated(2 * h) - rotated(-2 * h)) / (4 * h)
         np.testing.assert_allclose(attitude.derivative(vector(q), vector(w)), (4 * near - far) / 3, rtol=0, atol=1e-11)
 
 
@@ -198,12 +198,12 @@ def test_angle_is_accurate_from_0_to_pi(size):
 
 def test_gradient_of_the_angle_is_the_rotation_axis():
     # a small rotation dr of q in body axes changes the angle by n . dr, with the rotation axis n
-    def turned(r, size, axis):
+    def angle_after(r, size, axis):
         q = attitude.multiply(attitude.from_rotation_vector(size * axis), attitude.from_rotation_vector(r))
         return attitude.angle(attitude.multiply(vector(P[0]), q), vector(P[0]))
 
     axis = vector([2 / 3, -1 / 3, 2 / 3])
-    gradient = jax.jit(jax.grad(turned))
+    gradient = jax.jit(jax.grad(angle_after))
     for size in (1e-3, 1.0, 3.0, -1.0):
         # a rounding error eps of q rotates the axis by eps / size
         tolerance = 20 * EPS * (1 + 1 / abs(size))

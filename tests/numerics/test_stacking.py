@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ptsmc_jax.batching import lanes
-from ptsmc_jax.batching.dependence import of_scan
+from ptsmc_jax.batching.dependence import split_scan_operands
 from ptsmc_jax.numerics import stacking
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.theory import linear
@@ -77,7 +77,7 @@ def output_dtypes(trace):
     """Yield the dtypes of the output arrays of each scan in a trace."""
     for eqn in equations(trace):
         if eqn.primitive.name == "scan":
-            _, carried, _ = of_scan(eqn.params, eqn.invars)
+            _, carried, _ = split_scan_operands(eqn.params, eqn.invars)
             yield [v.aval.dtype for v in eqn.outvars[len(carried) :]]
 
 

@@ -143,14 +143,16 @@ SWING = references.Swing(
 
 @pytest.mark.parametrize("t", [0.0, 3.0, 41.0])
 def test_swing_rates_equal_jacobian_of_the_rotation_vector(t):
-    def vector_at(t):
+    def rotation_vector_at(t):
         return SWING.amplitude * jnp.sin(SWING.frequency * t + SWING.phase)
 
     def rate_at(t):
-        return body_rate(vector_at(t), SWING.amplitude * SWING.frequency * jnp.cos(SWING.frequency * t + SWING.phase))
+        return body_rate(
+            rotation_vector_at(t), SWING.amplitude * SWING.frequency * jnp.cos(SWING.frequency * t + SWING.phase)
+        )
 
     got = target(SWING, vector(t))
-    exact = (START * Rotation.from_rotvec(np.array(vector_at(t)))).as_matrix()
+    exact = (START * Rotation.from_rotvec(np.array(rotation_vector_at(t)))).as_matrix()
     np.testing.assert_allclose(Rotation.from_quat(np.asarray(got.q)).as_matrix(), exact, rtol=0, atol=20 * EPS)
     np.testing.assert_allclose(got.w, rate_at(t), rtol=0, atol=1e-14)
     _, w_dot = jax.jvp(rate_at, (vector(t),), (vector(1.0),))
