@@ -192,7 +192,7 @@ class ComponentRules:
         if jnp.issubdtype(dtype, bool):
             return None
 
-        def converted(value: BatchedArray, variable: Any) -> np.ndarray:
+        def convert(value: BatchedArray, variable: Any) -> np.ndarray:
             parts = value.components
             if variable.aval.dtype == dtype:
                 return parts
@@ -203,7 +203,7 @@ class ComponentRules:
             products = [lax.mul(*self.broadcast(pair)) for pair in pairs]
             return self._fold("add", *products) if products else dtype.type(0)
 
-        left, right = map(converted, values, eqn.invars)
+        left, right = map(convert, values, eqn.invars)
         return [contract_entries(eqn, left, right, inner)]
 
 

@@ -326,7 +326,7 @@ class _Interpreter:
         if len(body.jaxpr.outvars) > count:
             raise NotImplementedError(f"a kernel stacks no results of {length} steps")
         operands = consts, state, xs
-        return self.loop(body, length, operands, dependence.scan_dependence(body.jaxpr, *map(_varies, operands)))
+        return self.loop(body, length, operands, dependence.scan_dependence(body.jaxpr, *map(_vary_by_trial, operands)))
 
     def loop(self, body: Any, length: int, operands: Sequence[Sequence], varies: Sequence[int]) -> list[BatchedArray]:
         """Return the last carries of a loop. operands: constants, carries and xs."""
@@ -340,7 +340,7 @@ class _Interpreter:
     def cond(self, branches: Sequence, values: list[BatchedArray]) -> list[BatchedArray]:
         """Return the results of a branch. If trials differ in the index, all branches are evaluated."""
         (index,), operands = values[0].components.reshape(1), values[1:]
-        varies = dependence.branch_dependence(branches, np.ndim(index) > 0, _varies(operands))
+        varies = dependence.branch_dependence(branches, np.ndim(index) > 0, _vary_by_trial(operands))
         cases = [lambda branch=branch: self.align(self.evaluate(branch, operands), varies) for branch in branches]
         if np.ndim(index) == 0:
             return lax.cond(index, cases[1], cases[0]) if index.dtype == bool else lax.switch(index, cases)
@@ -381,6 +381,6 @@ def _take_row(value: Any, k: Any) -> BatchedArray:
     return BatchedArray(shape, tuple(parts))
 
 
-def _varies(values: Sequence) -> list[bool]:
+def _vary_by_trial(values: Sequence) -> list[bool]:
     """Return whether each value differs by trial."""
     return [isinstance(v, BatchedArray) and any(np.ndim(part) for part in v.components.flat) for v in values]

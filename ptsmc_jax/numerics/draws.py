@@ -226,10 +226,10 @@ def _draw_streams(
 ) -> dict[str, Array]:
     blocks = [(_hash_name(name), block) for name, count in counts for block in range((count + 1) // 2)]
 
-    def pair(row: Word) -> tuple[Array, Array]:
+    def draw_pair(row: Word) -> tuple[Array, Array]:
         return DISTRIBUTIONS[distribution](*threefry(_stream_key(seed, trial, row[0]), (jnp.uint32(0), row[1])))
 
-    first, second = jax.lax.map(pair, jnp.asarray(blocks, dtype=jnp.uint32).reshape(-1, 2))
+    first, second = jax.lax.map(draw_pair, jnp.asarray(blocks, dtype=jnp.uint32).reshape(-1, 2))
     numbers, start = {}, 0
     for name, count in counts:
         end = start + (count + 1) // 2

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-Scalar = Float[Array, ""]
+from ptsmc_jax.numerics.pytrees import Scalar
 
 
 @jax.jit

@@ -12,17 +12,15 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ptsmc_jax.numerics import attitude
-from ptsmc_jax.numerics.pytrees import Leaf, pytree
+from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
 from ptsmc_jax.plants.rigid_body import AttitudeState
-
-Time = Float[Array, ""]
 
 
 @dataclass(frozen=True)
 class Disturbance:
     """Base of the disturbances, and of custom ones: a function of time and of the state of the true plant."""
 
-    def __call__(self, t: Time, x: Any) -> Float[Array, " m"]:
+    def __call__(self, t: Scalar, x: Any) -> Float[Array, " m"]:
         """Return the disturbance (m,) [N m] at the time t [s] in the state x."""
         raise NotImplementedError
 
@@ -46,7 +44,7 @@ class Constant(Disturbance):
     value: Leaf  # (m,) [N m]
     drawn: ClassVar[Mapping[str, str]] = {"amplitude": "value"}
 
-    def __call__(self, t: Time, x: Any = None) -> Float[Array, " m"]:
+    def __call__(self, t: Scalar, x: Any = None) -> Float[Array, " m"]:
         return self.value
 
 
@@ -80,7 +78,7 @@ class Sinusoid(Disturbance):
     bias: Leaf  # (m,) [N m]
     drawn: ClassVar[Mapping[str, str]] = {"phase": "phase", "amplitude": "amplitude"}
 
-    def __call__(self, t: Time, x: Any = None) -> Float[Array, " m"]:
+    def __call__(self, t: Scalar, x: Any = None) -> Float[Array, " m"]:
         sine, _ = _sin_cos_of_sum(self.frequency * t, self.phase)
         return self.bias + self.amplitude * sine
 
@@ -100,7 +98,7 @@ class GravityGradient(Disturbance):
     phase: Leaf  # orbital phase at t = 0 [rad]
     drawn: ClassVar[Mapping[str, str]] = {"phase": "phase"}
 
-    def __call__(self, t: Time, x: AttitudeState) -> Float[Array, "3"]:
+    def __call__(self, t: Scalar, x: AttitudeState) -> Float[Array, "3"]:
         sine, cosine = _sin_cos_of_sum(self.rate * t, self.phase)
         radial = jnp.stack([cosine, sine, jnp.zeros_like(sine)])
         c = attitude.rotate(attitude.multiply(attitude.conjugate(x.q), self.orbit), radial)
@@ -117,7 +115,7 @@ class Sum(Disturbance):
 
     terms: tuple[Any, ...]
 
-    def __call__(self, t: Time, x: Any) -> Float[Array, " m"]:
+    def __call__(self, t: Scalar, x: Any) -> Float[Array, " m"]:
         total = self.terms[0](t, x)
         for term in self.terms[1:]:
             total = total + term(t, x)

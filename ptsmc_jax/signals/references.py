@@ -12,9 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ptsmc_jax.numerics import attitude
-from ptsmc_jax.numerics.pytrees import Function, Leaf, pytree
-
-Time = Float[Array, ""]
+from ptsmc_jax.numerics.pytrees import Function, Leaf, Scalar, pytree
 
 
 class Target(NamedTuple):
@@ -36,7 +34,7 @@ class Fixed:
 
     q: Leaf  # (4,) unit quaternion
 
-    def __call__(self, t: Time) -> Target:
+    def __call__(self, t: Scalar) -> Target:
         """Return the target at the time t [s]."""
         return Target(self.q, jnp.zeros(3), jnp.zeros(3))
 
@@ -49,13 +47,13 @@ class Spin:
     q: Leaf  # (4,) attitude at t = 0 [-]
     rate: Leaf  # (3,) rate in reference axes [rad/s]
 
-    def __call__(self, t: Time) -> Target:
+    def __call__(self, t: Scalar) -> Target:
         """Return the target at the time t [s]."""
         q = attitude.multiply(self.q, attitude.from_rotation_vector(self.rate * t))
         return Target(q, self.rate, jnp.zeros(3))
 
 
-def target_of(path: Callable[[Time], Float[Array, "4"]], t: Time) -> Target:
+def target_of(path: Callable[[Scalar], Float[Array, "4"]], t: Scalar) -> Target:
     """Return the target at the time t [s] for a path, a function from the time to a unit quaternion.
 
     Rates are exact, by automatic differentiation: w = 2 vec(q* q') and w' = 2 vec(q* q''), because the product
@@ -74,7 +72,7 @@ class TurningFunction(Function):
 
     function: Callable  # a pytree such as `jax.tree_util.Partial`, whose numbers are leaves
 
-    def __call__(self, t: Time) -> Target:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def __call__(self, t: Scalar) -> Target:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Return the target at the time t [s]. The rates of a quaternion are its derivatives.
 
         Raises:
@@ -97,7 +95,7 @@ class Reference:
 
     q: Leaf  # (4,) constant attitude that the motion starts from [-]
 
-    def attitude(self, t: Time) -> Float[Array, "4"]:
+    def attitude(self, t: Scalar) -> Float[Array, "4"]:
         """Return the unit quaternion (4,) [-] at the time t [s]. It must be twice differentiable for the rates."""
         raise NotImplementedError
 
@@ -105,7 +103,7 @@ class Reference:
         """Return the largest rate or angular frequency [rad/s], for the choice of the integration step. 0: no limit."""
         return 0.0
 
-    def __call__(self, t: Time) -> Target:
+    def __call__(self, t: Scalar) -> Target:
         """Return the target at the time t [s]."""
         return target_of(lambda t: attitude.multiply(self.q, self.attitude(t)), t)
 
@@ -119,7 +117,7 @@ class Swing(Reference):
     frequency: Leaf  # (3,) [rad/s]
     phase: Leaf  # (3,) [rad]
 
-    def attitude(self, t: Time) -> Float[Array, "4"]:
+    def attitude(self, t: Scalar) -> Float[Array, "4"]:
         return attitude.from_rotation_vector(self.amplitude * jnp.sin(self.frequency * t + self.phase))
 
 
@@ -134,7 +132,7 @@ class Slew(Reference):
     turn: Leaf  # (3,) rotation vector of the whole slew [rad]
     duration: Leaf  # [s]
 
-    def attitude(self, t: Time) -> Float[Array, "4"]:
+    def attitude(self, t: Scalar) -> Float[Array, "4"]:
         x = jnp.clip(t / self.duration, 0.0, 1.0)
         fraction = x * x * x * (10.0 + x * (6.0 * x - 15.0))
         return attitude.from_rotation_vector(fraction * self.turn)
@@ -145,7 +143,7 @@ class Slew(Reference):
 class Origin:
     """The reference of an integrator chain: the origin."""
 
-    def __call__(self, t: Time) -> None:
+    def __call__(self, t: Scalar) -> None:
         """Return None, because the origin needs no numbers."""
 
 
@@ -154,12 +152,12 @@ class Origin:
 class CurrentTime:
     """The reference of a custom second-order system: the time itself, because F(t, x) defines the error."""
 
-    def __call__(self, t: Time) -> Time:
+    def __call__(self, t: Scalar) -> Scalar:
         """Return t [s]."""
         return t
 
 
-def time_derivative(signal: Callable, t: Time) -> Array:
+def time_derivative(signal: Callable, t: Scalar) -> Array:
     """Return the time derivative [1/s] of a signal at the time t [s], (its shape), by automatic differentiation."""
     t = jnp.asarray(t, jnp.result_type(float))
     return jax.jvp(signal, (t,), (jnp.ones_like(t),))[1]

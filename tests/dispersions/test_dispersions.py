@@ -167,7 +167,7 @@ def test_initial_states_of_a_chain_have_their_distribution():
     assert not Dispersion().varies
 
 
-def phases(count):
+def uniform_phases(count):
     return RandomNumbers("interval", vector(np.full(count, 2.0 * np.pi)))
 
 
@@ -324,7 +324,7 @@ ORBIT = disturbances.GravityGradient(PARTS.plant.inertia, vector([0.0, 0.0, 0.0,
 def test_phases_are_uniform_and_independent():
     still = disturbances.Constant(vector([0.1, 0.2, 0.3]))
     run = replace(PARTS, disturbance=disturbances.Sum((SINE, still, ORBIT, SINE)))
-    got = parts_of_trials(Dispersion({"disturbance_phase": phases(7)}), run).disturbance.terms
+    got = parts_of_trials(Dispersion({"disturbance_phase": uniform_phases(7)}), run).disturbance.terms
     np.testing.assert_array_equal(got[1].value, np.broadcast_to(still.value, (TRIALS, 3)))
     turns = np.column_stack(
         [
@@ -414,7 +414,7 @@ def test_random_numbers_of_a_quantity_do_not_depend_on_other_quantities():
         "initial_attitude": (KINDS["normal"], lambda p: p.initial.q),
         "initial_rate": (RandomNumbers("normal", vector([0.01] * 3)), lambda p: p.initial.w),
         "inertia": (inertia, lambda p: p.plant.inertia),
-        "disturbance_phase": (phases(3), lambda p: disturbances.values(p.disturbance, "phase")),
+        "disturbance_phase": (uniform_phases(3), lambda p: disturbances.values(p.disturbance, "phase")),
         "disturbance_amplitude": (tenths, lambda p: disturbances.values(p.disturbance, "amplitude")[:3]),
         "disturbance_bias": (tenths, lambda p: p.disturbance.terms[-1].value),
         "reference": (KINDS["uniform"], lambda p: p.reference.q),

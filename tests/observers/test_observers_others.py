@@ -21,12 +21,12 @@ MASS: base.Plant = integrator_chain.chain(2)  # one input, M = 1
 GAIN, T_O, DELTA_O, MU = 0.7, 4.0, 0.2, 2.5
 
 
-def prescribed(model: base.Plant = MASS, gain=GAIN, c=0.0, start=0.0, mu=MU, t_o=T_O, delta_o=DELTA_O):
+def prescribed_time_observer(model: base.Plant = MASS, gain=GAIN, c=0.0, start=0.0, mu=MU, t_o=T_O, delta_o=DELTA_O):
     values = (vector([gain] * model.inputs), *(vector(v) for v in (c, start, mu, t_o, delta_o)))
     return prescribed_time.PrescribedTimeObserver(model, *values)
 
 
-def finite(model: base.Plant = MASS, gain=1.0, c=0.0, start=0.0, width=0.0):
+def finite_time_observer(model: base.Plant = MASS, gain=1.0, c=0.0, start=0.0, width=0.0):
     return finite_time.FiniteTimeObserver(model, vector([gain] * model.inputs), vector(c), vector(start), vector(width))
 
 
@@ -37,7 +37,7 @@ def remaining_fraction(t, gain=GAIN, mu=MU):
 
 @pytest.mark.parametrize("h", [0.05, 0.3])
 def test_digital_prescribed_time_observer_error_equals_closed_form(h):
-    found, d = prescribed(), 0.4
+    found, d = prescribed_time_observer(), 0.4
     matrix, memory = found.update_matrix(vector(h)), found.begin()
     for k in range(1, 30):
         memory = found.update(matrix, memory, vector([d * h]), vector(k * h), vector(h))  # the impulse of a constant d
@@ -45,7 +45,7 @@ def test_digital_prescribed_time_observer_error_equals_closed_form(h):
 
 
 def test_prescribed_time_update_for_a_full_inertia_equals_matrix_exponential():
-    found = prescribed(rigid_body.spacecraft(FULL_INERTIA), gain=10.0)
+    found = prescribed_time_observer(rigid_body.spacecraft(FULL_INERTIA), gain=10.0)
     t, h = 3.0, 0.5
     a = 10.0 * np.linalg.inv(FULL_INERTIA)
     factor = expm(-a * h) * ((T_O - t) / (T_O - t + h)) ** MU
@@ -55,7 +55,7 @@ def test_prescribed_time_update_for_a_full_inertia_equals_matrix_exponential():
 
 
 def test_updates_of_length_zero_change_nothing_and_have_finite_derivatives():
-    for found in (prescribed(), finite()):
+    for found in (prescribed_time_observer(), finite_time_observer()):
 
         def updated(dt, found=found):
             memory = found.begin() + 0.1
@@ -77,7 +77,7 @@ def simulate_continuous(observer, disturbance, t_f=6.0, steps=400):
 
 def test_continuous_prescribed_time_observer_error_equals_closed_form():
     d = 0.4
-    log = simulate_continuous(prescribed(), disturbances.Constant(vector([d])))
+    log = simulate_continuous(prescribed_time_observer(), disturbances.Constant(vector([d])))
     expected = np.array([-d * remaining_fraction(t) for t in log.t])
     # integration error of order 4 with the nodes of the observer: 1e-7
     np.testing.assert_allclose(log.d_hat[:, 0] - d, expected, rtol=0, atol=1e-6 * d)
@@ -86,7 +86,7 @@ def test_continuous_prescribed_time_observer_error_equals_closed_form():
 @pytest.mark.parametrize("gain", [0.05, 0.7, 5.0])
 def test_prescribed_time_bound_is_between_1_and_2_times_the_worst_error(gain):
     c, start = 0.3, 0.4
-    bound = prescribed(gain=gain, c=c, start=start).error_bound()
+    bound = prescribed_time_observer(gain=gain, c=c, start=start).error_bound()
     for t in (0.0, 0.5, 2.0, 3.5, 3.8, 4.5, 9.0):
         # e' = -(l + mu/(T_o - t)) e + c from the largest start: the integral of its propagator
         integral = quad(
@@ -100,7 +100,7 @@ def test_prescribed_time_bound_is_between_1_and_2_times_the_worst_error(gain):
         assert float(bound(vector(t))) < 2.0 * worst
     assert float(jax.vmap(bound)(jnp.linspace(0.0, 20.0, 500)).max()) <= float(bound.largest)
     # for l = 0 the bound is the exact solution
-    without_gain = prescribed(gain=1e-9, c=c, start=start).error_bound()
+    without_gain = prescribed_time_observer(gain=1e-9, c=c, start=start).error_bound()
     rho = (T_O - 2.0) / T_O
     exact = rho**MU * start + c * 2.0 * (1 - rho ** (MU - 1)) / (MU - 1)
     np.testing.assert_allclose(without_gain(vector(2.0)), exact, rtol=1e-6)
@@ -142,7 +142,7 @@ def super_twisting(gain, d, seconds, start=0.0):
 
 @pytest.mark.parametrize(("ratio", "constant"), [(0.0, 1.2519), (0.5, 3.1), (1.0, 33.3)])
 def test_settling_time_of_the_finite_time_bound_equals_its_geometric_series(ratio, constant):
-    bound = finite(gain=2.0, c=2.0 * ratio, start=0.6).error_bound()
+    bound = finite_time_observer(gain=2.0, c=2.0 * ratio, start=0.6).error_bound()
     np.testing.assert_allclose(bound.settled, constant * 0.6 / 2.0, rtol=0.01)
     assert float(bound(bound.settled * 0.99)) == pytest.approx(0.6)
     assert float(bound(bound.settled * 1.01)) == 0.0
@@ -165,7 +165,7 @@ def test_no_disturbance_within_its_rate_bound_exceeds_the_overshoot_of_the_finit
 
 @pytest.mark.parametrize("h", short([0.002, 0.02], [0.02]))
 def test_digital_finite_time_observer_is_exact_after_its_settling_time(h):
-    found, d = finite(gain=0.5, start=0.4), 0.4
+    found, d = finite_time_observer(gain=0.5, start=0.4), 0.4
     memory, settled = found.begin(), None
     for k in range(1, int(4.0 / h)):
         memory = found.update(found.update_matrix(vector(h)), memory, vector([d * h]), vector(k * h), vector(h))
@@ -176,7 +176,7 @@ def test_digital_finite_time_observer_is_exact_after_its_settling_time(h):
 
 
 def test_digital_finite_time_observer_converges_to_the_continuous_one_with_order_1():
-    found, amplitude = finite(gain=0.5), 0.3
+    found, amplitude = finite_time_observer(gain=0.5), 0.3
     t, expected = super_twisting(0.5, lambda t: 0.4 + amplitude * np.sin(t), 3.0)
     update, deviations = jax.jit(lambda memory, *now: found.update(found.update_matrix(now[-1]), memory, *now)), []
     for h in (0.02, 0.01, 0.005):
@@ -192,7 +192,9 @@ def test_digital_finite_time_observer_converges_to_the_continuous_one_with_order
 
 def test_continuous_finite_time_observer_settles_within_its_time():
     d = 0.4
-    log = simulate_continuous(finite(gain=0.5, start=d, width=1e-5), disturbances.Constant(vector([d])), steps=3000)
+    log = simulate_continuous(
+        finite_time_observer(gain=0.5, start=d, width=1e-5), disturbances.Constant(vector([d])), steps=3000
+    )
     settled = 1.2519 * d / 0.5
     assert np.abs(log.d_hat[log.t < 0.5 * settled, 0] - d).max() == pytest.approx(d)
     # inside the boundary layer |e0| <= width, so that the error is at most 1.5 sqrt(c width)
@@ -264,7 +266,7 @@ PENDULUMS = _pendulums()
 def test_gradients_by_observer_gain_are_finite_and_not_zero_without_a_rate_bound():
     wave = disturbances.Sinusoid(*(vector([v]) for v in (0.01, 0.1, 0.0, 0.0)))
     run = chain_parts([1.0, 0.0], 6.0, 3.0, 0.3, period=0.25, disturbance=wave)
-    for found in (prescribed(run.plant, gain=10.0), finite(run.plant, gain=0.1)):
+    for found in (prescribed_time_observer(run.plant, gain=10.0), finite_time_observer(run.plant, gain=0.1)):
 
         def error(gain, found=found):
             changed = replace(run, observer=replace(found, gain=gain[None]))
