@@ -93,7 +93,8 @@ def any_attitude() -> RandomNumbers:
     return RandomNumbers("any_attitude", vector(np.ones(4)))
 
 
-# (random numbers (count,), nominal numbers (n,), nominal parts) -> numbers of the trial (n,)
+# Type of the functions below: (random numbers (count,), nominal numbers (n,), nominal parts) -> numbers of the trial
+# (n,)
 Combine = Callable[[Random, Numbers, Any], Numbers]
 
 

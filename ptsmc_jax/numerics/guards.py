@@ -66,12 +66,24 @@ def signed_power(x: Float[Array, "..."], power: Scalar) -> Float[Array, "..."]:
 
 
 def lerp(weight: Scalar, a: Any, b: Any) -> Any:
-    """Interpolate linearly between two pytrees: b at weight 0, a at weight 1."""
+    """Interpolate linearly between two pytrees.
+
+    Args:
+        weight: scalar; 1 returns a, 0 returns b.
+        a: pytree of arrays.
+        b: pytree like a.
+    """
     return jax.tree.map(lambda x, y: y + weight * (x - y), a, b)
 
 
 def select(condition: Array, a: Any, b: Any) -> Any:
-    """Return the pytree a if the scalar condition holds, otherwise b. The other one has no influence on tangents."""
+    """Return one of two pytrees. The other one has no influence on tangents.
+
+    Args:
+        condition: scalar; True selects a, False selects b.
+        a: pytree of arrays.
+        b: pytree like a.
+    """
     return jax.tree.map(lambda x, y: jnp.where(condition, x, y), a, b)
 
 
