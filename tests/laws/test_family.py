@@ -285,7 +285,7 @@ def chain_run(law, x0, period=0.01, noise=0.0, disturbance=(0.0, 1.0, 0.0, 0.0),
 
 def simulate(run, trial=0, status=rollout.OK) -> Any:
     """Return the history of a run, without the periods of no length."""
-    found = rollout.simulate_jit(run, trial=np.uint32(trial), record=True)
+    found = rollout.simulate_parts(run, trial=np.uint32(trial), record=True)
     assert found.status == status
     log = jax.tree.map(np.asarray, found.log)
     return jax.tree.map(lambda v: v[log.has_length] if v.ndim else v, log)
