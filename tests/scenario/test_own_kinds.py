@@ -417,7 +417,7 @@ def test_what_is_wrong_with_ones_own_law_is_one_sentence(here, law, keys, of_wha
 @pytest.mark.parametrize(
     ("name", "old", "new", "of_what"),
     [
-        ("observer", 'return {"last": seen,', 'return {"last": jnp.zeros(3),', "observer.code is"),
+        ("observer", 'return {"last": d_mean,', 'return {"last": jnp.zeros(3),', "observer.code is"),
         ("observer", "def step", "def stop", "has no method step"),
         ("observer", "share: float", "gain: float", "another than gain"),
         ("observer", "    share: float", "    gain: float = 0.5\n    share: float", "another than gain"),
