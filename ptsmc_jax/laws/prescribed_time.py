@@ -52,9 +52,9 @@ class PrescribedTimeLaw(Law):
         return self.kinematics.reaching_factor * self.k1
 
     def surface(self) -> Float[Array, " roots"]:
-        """Return a_1 ..
+        """Return the coefficients of the surface of the hold phase.
 
-        a_(n-1) [1/s^(n-i)] of the surface s = x_n + a_(n-1) x_(n-1) + .. + a_1 x_1 of the hold phase.
+        They are a_1 to a_(n-1) [1/s^(n-i)] of s = x_n + a_(n-1) x_(n-1) + .. + a_1 x_1.
         """
         raise NotImplementedError
 

@@ -50,7 +50,7 @@ def share_bound(successes: int, trials: int, confidence: float) -> float:
     return float(special.betaincinv(successes, trials - successes + 1, 1.0 - confidence)) if successes > 0 else 0.0
 
 
-def mean_bound(shares: np.ndarray, confidence: float) -> float:
+def mean_bound(fractions: np.ndarray, confidence: float) -> float:
     """Return the one-sided upper confidence bound of the mean of independent numbers (n,) from 0 to 1.
 
     The bound is Gaffke's (2005): the quantile of sum_i D_i x_i + D_(n+1), with D uniform on the simplex
@@ -68,14 +68,14 @@ def mean_bound(shares: np.ndarray, confidence: float) -> float:
     """
     from scipy import optimize
 
-    shares = np.clip(shares, 0.0, 1.0)  # rounding errors may put a fraction of time outside
-    low = float(shares.min())
+    fractions = np.clip(fractions, 0.0, 1.0)  # rounding errors may put a fraction of time outside
+    low = float(fractions.min())
     if low == 1.0:
         return 1.0
     # Shifted and scaled so that 0 and 1 are always among the numbers. The quantile of a weighted mean scales with them.
-    x, counts = np.unique(np.append((shares - low) / (1.0 - low), 1.0), return_counts=True)
+    x, counts = np.unique(np.append((fractions - low) / (1.0 - low), 1.0), return_counts=True)
     if x.size == 2:
-        return low + (1.0 - low) * (1.0 - share_bound(int(counts[0]), shares.size, confidence))
+        return low + (1.0 - low) * (1.0 - share_bound(int(counts[0]), fractions.size, confidence))
     tilt: Any = optimize.brentq(
         lambda tilt: _tilted_mean(x, counts, tilt)[0] - confidence, -MAX_TILT, MAX_TILT, xtol=1e-10
     )

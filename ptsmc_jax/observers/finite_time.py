@@ -11,8 +11,7 @@ from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector, pytree
 from ptsmc_jax.observers.base import Matrix, Memory, Observer
 
 # Largest ratio of |e| at successive zeros of e0, for |d'| <= k c with k = 0, 0.1 .. 1. The worst d' decelerates e while
-# |e0| grows and accelerates it while |e0| decreases. The numbers are from integration; a test in tests/observers
-# checks.
+# |e0| grows and accelerates it while |e0| decreases. The numbers come from numerical integration.
 _OVERSHOOT = (0.159, 0.185, 0.212, 0.240, 0.270, 0.301, 0.336, 0.374, 0.417, 0.470, 0.538)
 
 
@@ -67,9 +66,8 @@ class FiniteTimeObserver(Observer):
         """
         c = jnp.min(self.gain)
         k = jnp.clip(self.disturbance_rate_bound / c, 0.0, 1.0)
-        q = jnp.interp(
-            k, jnp.linspace(0.0, 1.0, len(_OVERSHOOT)), jnp.asarray(_OVERSHOOT)
-        )  # an upper bound, because q(k) is convex
+        # linear interpolation is an upper bound, because q(k) is convex
+        q = jnp.interp(k, jnp.linspace(0.0, 1.0, len(_OVERSHOOT)), jnp.asarray(_OVERSHOOT))
         settled = (1.0 + q) / ((1.0 - q) * (1.1 - k)) * self.initial_error / c
         ratios = jnp.clip(self.disturbance_rate_bound / self.gain, 0.0, 1.0)
         e0 = self.sign_width * jnp.arctanh(ratios / 1.1)

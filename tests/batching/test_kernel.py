@@ -249,9 +249,8 @@ def test_kernel_supports_nested_loops_branches_and_shared_values(kernels):
 
         last, _ = jax.lax.scan(step, x, table)
         pairs, _ = jax.lax.scan(lambda c, row: (0.9 * c + row[1] * x - row[0], None), x, table.reshape(50, 2))
-        batched_rows, _ = jax.lax.scan(
-            lambda c, row: (c * 0.5 + row, None), jnp.zeros(()), x * table[:20]
-        )  # not run as a kernel
+        # not run as a kernel
+        batched_rows, _ = jax.lax.scan(lambda c, row: (c * 0.5 + row, None), jnp.zeros(()), x * table[:20])
 
         def outer(carry, row):
             within = jax.lax.scan(lambda c, r: (c + jnp.sin(r * x) * row, None), carry, table[:12])[0]

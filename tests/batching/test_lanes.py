@@ -448,12 +448,13 @@ SHORT_ROWS = {
         "large table made small", "random numbers",
     ),
 }  # fmt: skip
+# long tests if shared
 SHARED_LONG = (
     "scan backwards",
     "scan unrolled",
     "scan of length 0",
     "argument used in two loops",
-)  # long tests if shared
+)
 
 
 def is_short(name, shared):

@@ -174,9 +174,8 @@ def test_wheels_with_scale_and_misalignment_conserve_total_momentum():
     assert log.wheels is not None
     body = np.asarray(log.x.w) @ np.asarray(run.parts.plant.inertia).T + log.wheels[0] @ np.asarray(device.directions).T
     total = Rotation.from_quat(np.asarray(log.x.q)).apply(body)
-    np.testing.assert_allclose(
-        total, np.broadcast_to(total[0], total.shape), rtol=0, atol=1e-8
-    )  # integration error of RK4
+    # integration error of RK4
+    np.testing.assert_allclose(total, np.broadcast_to(total[0], total.shape), rtol=0, atol=1e-8)
     assert np.abs(log.wheels[0] - log.wheels[0][0]).max() > 0.1
 
 

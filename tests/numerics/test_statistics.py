@@ -93,18 +93,18 @@ def test_most_extreme_lists_failed_trials_first_then_the_worst_values():
 def test_mean_bound_is_between_the_mean_and_1():
     """This also holds if nearly all numbers are 1, or differ from 0 or 1 by rounding errors."""
     few, off = np.append(np.ones(40), [0.5, 0.9]), np.append(np.ones(9), 1.0 + 2e-16)
-    for shares in (few, off, np.append(-1e-17, np.zeros(3)), np.full(9, 1.0 - 1e-13), np.ones(4), np.array([0.3])):
+    for fractions in (few, off, np.append(-1e-17, np.zeros(3)), np.full(9, 1.0 - 1e-13), np.ones(4), np.array([0.3])):
         for confidence in (0.5, 0.95, 0.999999):
-            assert shares.mean() <= statistics.mean_bound(shares, confidence) <= 1.0 + 1e-15
+            assert fractions.mean() <= statistics.mean_bound(fractions, confidence) <= 1.0 + 1e-15
 
 
 def test_mean_bound_of_zeros_and_ones_equals_clopper_pearson():
     for ones, n, confidence in ((0, 852, 0.9), (0, 1109, 0.95), (3, 1000, 0.95), (60, 1000, 0.9)):
-        shares = np.zeros(n)
-        shares[:ones] = 1.0
+        fractions = np.zeros(n)
+        fractions[:ones] = 1.0
         exact = stats.binomtest(n - ones, n, alternative="greater").proportion_ci(confidence, "exact").low
-        np.testing.assert_allclose(statistics.mean_bound(shares, confidence), 1.0 - exact, rtol=1e-9)
-        near = statistics.mean_bound(shares * (1.0 - 1e-9), confidence)  # computed by the saddlepoint formula
+        np.testing.assert_allclose(statistics.mean_bound(fractions, confidence), 1.0 - exact, rtol=1e-9)
+        near = statistics.mean_bound(fractions * (1.0 - 1e-9), confidence)  # computed by the saddlepoint formula
         assert near == pytest.approx(1.0 - exact, rel=4e-3)
 
 
@@ -141,7 +141,7 @@ SETS = 300  # the standard error of a coverage of 95 % is 1.3 %
 # number of runs, random fractions of time beyond the limit, and their mean. The measured coverage with 10 000 sets is
 # 95.5 to 100 % for the upper bound and 95.6 to 97.5 % for the lower bound
 MEANS = {
-    "a tenth of the runs, for any share": (600, lambda rng, n: (rng.random(n) < 0.1) * rng.random(n), 0.05),
+    "a tenth of the runs, for any fraction of time": (600, lambda rng, n: (rng.random(n) < 0.1) * rng.random(n), 0.05),
     "few runs, for long": (1000, lambda rng, n: (rng.random(n) < 0.05) * rng.random(n) ** 3, 0.0125),
     "hardly any": (400, lambda rng, n: (rng.random(n) < 0.01) * rng.random(n), 0.005),
     "most for nearly nothing": (30, lambda rng, n: rng.beta(0.05, 2.0, n), 0.05 / 2.05),
@@ -164,9 +164,9 @@ def test_mean_bound_exceeds_the_student_bound_by_at_most_3_over_n():
     """After n runs without a failure, a failure probability of 3/n is still possible at 95 % confidence."""
     rng = np.random.default_rng(6)
     for runs in (300, 10_000):
-        for shares in (rng.beta(2.0, 2.0, runs), np.minimum(1.0, rng.exponential(0.01, runs))):
-            students = shares.mean() + stats.t.ppf(0.95, runs - 1) * shares.std(ddof=1) / math.sqrt(runs)
-            assert students < statistics.mean_bound(shares, 0.95) < students + 3.0 / runs
+        for fractions in (rng.beta(2.0, 2.0, runs), np.minimum(1.0, rng.exponential(0.01, runs))):
+            students = fractions.mean() + stats.t.ppf(0.95, runs - 1) * fractions.std(ddof=1) / math.sqrt(runs)
+            assert students < statistics.mean_bound(fractions, 0.95) < students + 3.0 / runs
 
 
 @pytest.mark.parametrize("quantile", [0.5, 0.9])
