@@ -141,10 +141,10 @@ def _keys(table: str, struct: type[Table], plant: str) -> Iterator[str]:
         yield from _dispersion(struct, layouts.SCENARIOS[plant].unit_of_d)
         return
     borrowed = issubclass(struct, Attitude) and table != "initial"
-    fallback = _case_i(plant).get(table, {}) if table == "initial" else {}
+    fallback = _case_i(plant).get(table, {}) if table in ("initial", "controller") else {}
     rows = [
         [f"`{key.name}`", key.allowed, _shown(key, struct, fallback), key.unit, key.meaning]
-        for key in keys.of(struct)
+        for key in keys.of(struct, layouts.SCENARIOS[plant].unit_of_d)
         if not (borrowed and key.name in Attitude.__struct_fields__)
     ]
     if rows:

@@ -28,7 +28,8 @@ _EXPORTS = {
     "Draw": "dispersions.base",
     "Disturbance": "signals.disturbances",
     "Reference": "signals.references",
-    "gain": "numerics.pytrees",
+    "gain": "declare",
+    "number": "declare",
     "PrescribedTime": "laws.prescribed_time",
     "PrescribedTimeChain": "laws.prescribed_time",
     "NoObserver": "observers.none",
@@ -73,6 +74,8 @@ _EXPORTS = {
 if TYPE_CHECKING:
     from ptsmc_jax.campaigns.montecarlo import one as one
     from ptsmc_jax.campaigns.montecarlo import run as run
+    from ptsmc_jax.declare import gain as gain
+    from ptsmc_jax.declare import number as number
     from ptsmc_jax.devices.own_sensors import SampledSensor as SampledSensor
     from ptsmc_jax.devices.sensors import Sensors as Sensors
     from ptsmc_jax.dispersions.base import Draw as Draw
@@ -89,7 +92,6 @@ if TYPE_CHECKING:
     from ptsmc_jax.laws.kinematics import SecondOrderKinematics as SecondOrderKinematics
     from ptsmc_jax.laws.prescribed_time import PrescribedTime as PrescribedTime
     from ptsmc_jax.laws.prescribed_time import PrescribedTimeChain as PrescribedTimeChain
-    from ptsmc_jax.numerics.pytrees import gain as gain
     from ptsmc_jax.observers.base import SampledObserver as SampledObserver
     from ptsmc_jax.observers.finite_time import FiniteTimeObserver as FiniteTimeObserver
     from ptsmc_jax.observers.none import NoObserver as NoObserver

@@ -133,7 +133,7 @@ ROWS: dict[str, dict] = {
             "dispersion": SPREAD,
         }
         for kind, law in LAWS["spacecraft"].items()
-        if not law.prescribed and kind != "own"
+        if kind != "own" and not law.made.prescribed
     },
     "system": {
         "plant": {"kind": "system", "system": ARM, "x0": [0.4, -0.3, 0.0, 0.0]},

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from ptsmc_jax import declare
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector, pytree
 
 
@@ -23,10 +24,20 @@ class FilterState(NamedTuple):
 
 
 @dataclass(frozen=True)
-class CommandFilter:
+class CommandFilter(declare.Tunable):
     """A filter of the flight computer's command."""
 
-    corner: Leaf  # W [rad/s]
+    corner: Leaf = declare.gain(
+        1.0,
+        "corner",
+        unit="rad/s",
+        meaning="W, its corner frequency, which tuning may move as command_corner",
+        free=True,
+    )
+
+    def dead_time(self) -> Scalar | float:
+        """Return its delay at low frequencies, the derivative of its phase [s]."""
+        raise NotImplementedError
 
     def begin(self, inputs: int) -> Any:
         """At rest."""
@@ -47,7 +58,14 @@ class CommandFilter:
 @pytree
 @dataclass(frozen=True)
 class FirstOrder(CommandFilter):
-    """Roll-off W / (s + W): 3 dB and 45 degrees at the corner, then 20 dB a decade."""
+    """Roll-off of first order, W / (s + W).
+
+    3 dB and 45 degrees at the corner, then 20 dB a decade.
+    """
+
+    def dead_time(self) -> Scalar | float:
+        """1 / W [s]."""
+        return 1.0 / self.corner
 
     def begin(self, inputs: int) -> Vector:
         """At rest: its one integrator (m,) [N m], between samples too advanced by half of the next period."""
@@ -64,7 +82,11 @@ class FirstOrder(CommandFilter):
 class _Second(CommandFilter):
     """Two integrators: b' = W h, l' = W b, h = u - 2 z b - l, as one of all second-order filters has them."""
 
-    damping: Leaf  # z [-]
+    damping: Leaf = declare.number(0.7, above=0.0, meaning="z, its damping ratio")
+
+    def dead_time(self) -> Scalar | float:
+        """2 z / W [s]."""
+        return 2.0 * self.damping / self.corner
 
     def begin(self, inputs: int) -> FilterState:
         """At rest."""
@@ -84,7 +106,10 @@ class _Second(CommandFilter):
 @pytree
 @dataclass(frozen=True)
 class SecondOrder(_Second):
-    """Roll-off W^2 / (s^2 + 2 z W s + W^2): 90 degrees at the corner, then 40 dB a decade."""
+    """Roll-off of second order, W^2 / (s^2 + 2 z W s + W^2).
+
+    90 degrees at the corner, then 40 dB a decade.
+    """
 
     def step(self, state: FilterState, u: Vector, before: Scalar, dt: Scalar) -> tuple[Vector, FilterState]:
         """The low pass."""
@@ -95,7 +120,12 @@ class SecondOrder(_Second):
 @pytree
 @dataclass(frozen=True)
 class Notch(_Second):
-    """Notch (s^2 + W^2) / (s^2 + 2 z W s + W^2): nothing passes at its corner; its width grows with z."""
+    """Notch, (s^2 + W^2) / (s^2 + 2 z W s + W^2).
+
+    Nothing passes at its corner, and its width grows with z.
+    """
+
+    damping: Leaf = declare.number(0.5, above=0.0, meaning="z, how wide it is")
 
     def step(self, state: FilterState, u: Vector, before: Scalar, dt: Scalar) -> tuple[Vector, FilterState]:
         """The command without the band, u - 2 z b."""

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from ptsmc_jax import declare
 from ptsmc_jax.devices.sensors import Sensor
 from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.numerics import draws, guards
@@ -19,7 +20,7 @@ OWN_NOISE = "own_noise"
 
 
 @dataclass(frozen=True)
-class SampledSensor:
+class SampledSensor(declare.Tunable):
     """The base of sensors of one's own; they fly in the sampled loop.
 
     `draws` standard normal numbers are drawn for each sample, [-]. Their memory is any pytree of arrays; `begin`'s
@@ -27,7 +28,6 @@ class SampledSensor:
     """
 
     draws: ClassVar[int] = 0
-    tunable: ClassVar[tuple[str, ...]] = ()  # gains that tuning may move
     model: Any  # the plant as law and observer know it
 
     def begin(self, x: Any) -> Any:

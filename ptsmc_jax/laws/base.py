@@ -4,12 +4,15 @@ Read `Law` first. Most laws override `Law.acceleration` only. `AccelerationLaw` 
 and of custom laws.
 """
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
+from ptsmc_jax import declare
 from ptsmc_jax.laws.kinematics import Kinematics
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector
 
@@ -23,8 +26,8 @@ class Sample(NamedTuple):
     memory: Any = None  # memory of the law from the previous sample; at the first sample from `Law.begin`
 
 
-class Law:
-    """A control law: its gains, and a function from the measured state to the input.
+class Law(declare.Tunable):
+    """A control law: gains, and one call. Its error and the plant's model are in the field `kinematics`.
 
     The field `kinematics` defines the error eps and holds the design model of the plant. Most laws define
     `acceleration`, the commanded eps''. Others override `__call__`. Errors, accelerations and inputs are (m,), in the
@@ -32,11 +35,12 @@ class Law:
     phase ends and the hold phase begins. Some laws use other gains in the hold phase (Remark 1).
     """
 
-    kinematics: Kinematics  # defines the error that the law drives to zero
-    t_f: Leaf  # prescribed time, at which the error is evaluated [s]
-    delta: Leaf  # time from the hand-over to t_f [s]
-    tunable: ClassVar[tuple[str, ...]] = ()  # names of the gains that tuning may change
-    prescribed: ClassVar[bool] = False  # whether it is a law of the paper, with known exact solution and bounds
+    kinematics: Kinematics  # of the error that the law drives to zero
+    t_f: Leaf  # prescribed time, or when the error is judged [s]
+    delta: Leaf  # hand-over this long before t_f [s]
+    tunable: ClassVar[tuple[str, ...]] = ("t_f",)  # gains that tuning may move
+    prescribed: ClassVar[bool] = False  # one of the paper's: its exact solution and its bounds are known
+    switches: ClassVar[bool] = True  # against the bound on the disturbance that is not estimated
 
     @property
     def model(self) -> Any:
@@ -112,11 +116,49 @@ class Law:
         """
         return hold
 
+    # The methods below use the numbers of the fields only: scenarios call them with a table that has the same numbers
+
+    def turning(self, t_f: float) -> tuple[str, Scalar | float]:
+        """Return the field that sets how fast the law turns a body, and that rate for a t_f [s], at most [rad/s].
+
+        The default is twice the mean rate of half a turn, since nothing is known of the law.
+        """
+        return "t_f", 2.0 * math.pi / t_f
+
+    def noise_of_s(self, position: float, velocity: float) -> float:
+        """Return the noise of the sliding variable (1 sigma) for noise of the error [-] and of its rate [1/s].
+
+        The default is that of s = eps' + c eps, with c = 1 / t_f if the law has no `surface_rate`.
+        """
+        return math.hypot(velocity, (getattr(self, "surface_rate", None) or 1.0 / float(self.t_f)) * position)
+
+    @staticmethod
+    def designed(design: Any, published: Mapping[str, float]) -> Mapping[str, float]:
+        """Return gains for a design of the sampled loop, by field.
+
+        Args:
+            design: a `scenario.mission.Design`, with rates in [1/s].
+            published: the published gains, within the bandwidth of the design.
+        """
+        return published
+
+    def refusal(self, order: int) -> tuple[str, str] | None:
+        """Return a field whose value no plant of this order allows, and what is allowed; None: there is none."""
+        return None
+
 
 @dataclass(frozen=True)
 class AccelerationLaw(Law):
     """Base of the laws for comparison and of custom laws. It is for kinematics of order 2 and the sampled loop."""
 
     kinematics: Kinematics
-    t_f: Leaf  # prescribed time, at which the error is evaluated [s]
-    delta: Leaf  # the anchored clock has a sample at t_f - delta [s]
+    t_f: Leaf  # prescribed time, or when the error is judged [s]
+    delta: Leaf  # a sample of the anchored clock falls on t_f - delta [s]
+    tunable: ClassVar[tuple[str, ...]] = ("delta", "t_f")
+
+
+@dataclass(frozen=True)
+class ComparisonLaw(AccelerationLaw):
+    """The base of the laws to compare with. They do not hand over, unless they declare `delta`."""
+
+    tunable: ClassVar[tuple[str, ...]] = ("t_f",)

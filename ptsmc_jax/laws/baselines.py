@@ -3,12 +3,15 @@
 Each class docstring has the law, its source and what it guarantees. sig^a(x) is sign(x) |x|^a.
 """
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 
-from ptsmc_jax.laws.base import AccelerationLaw, Sample
+from ptsmc_jax.declare import Rates, Scaled, gain
+from ptsmc_jax.laws.base import ComparisonLaw, Sample
 from ptsmc_jax.laws.kinematics import MultiplicativeKinematics
 from ptsmc_jax.numerics import guards
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector, pytree
@@ -18,21 +21,35 @@ from ptsmc_jax.signals.references import Target
 
 @pytree
 @dataclass(frozen=True)
-class PD(AccelerationLaw):
-    """PD law a = -k_p eps - k_d eps', with s = eps + (k_d/k_p) eps'."""
+class PD(ComparisonLaw):
+    """PD on the error and its rate (Wie, Weiss, Arapostathis 1989).
 
-    k_p: Leaf  # [1/s^2]
-    k_d: Leaf  # [1/s]
-    tunable: ClassVar[tuple[str, ...]] = ("k_p", "k_d", "t_f")
+    a = -k_p eps - k_d eps'; its s is eps + (k_d/k_p) eps'.
+    """
+
+    k_p: Leaf = gain(
+        Scaled(0.2, time=-2),
+        Rates(2.0, 2000.0, 2),
+        unit="1/s^2",
+        meaning="gain on the vector part of the error quaternion",
+    )
+    k_d: Leaf = gain(Scaled(0.6, time=-1), Rates(0.3, 100.0), unit="1/s", meaning="gain on the rate error")
+    switches: ClassVar[bool] = False
 
     def acceleration(self, now: Sample, error: Vector, error_rate: Vector, bound: Scalar) -> tuple[Vector, Vector]:
         return -self.k_p * error - self.k_d * error_rate, error + self.k_d / self.k_p * error_rate
 
+    def turning(self, t_f: float) -> tuple[str, Scalar | float]:
+        """The rate at the target [rad/s] if all of its spring's potential energy had become motion."""
+        return "k_p", 2.0 * math.sqrt(self.k_p)
+
 
 @pytree
 @dataclass(frozen=True)
-class QuaternionPD(AccelerationLaw):
-    """Quaternion feedback u = w x J w - d_hat + J (R w_f' - w_e x R w_f) - k_p J v - k_d J w_e.
+class QuaternionPD(PD):
+    """Quaternion PD with the reference's motion fed forward (Wie, Weiss, Arapostathis 1989).
+
+    u = w x J w - d_hat + J (R w_f' - w_e x R w_f) - k_p J v - k_d J w_e.
 
     Wie, Weiss, Arapostathis, Quaternion feedback regulator for spacecraft eigenaxis rotations, J. Guidance, Control,
     and Dynamics 12(3), 1989. The motion of the reference is fed forward. The law has no singularity and no switching
@@ -41,9 +58,6 @@ class QuaternionPD(AccelerationLaw):
     """
 
     kinematics: MultiplicativeKinematics
-    k_p: Leaf  # [1/s^2]
-    k_d: Leaf  # [1/s]
-    tunable: ClassVar[tuple[str, ...]] = ("k_p", "k_d", "t_f")
 
     @property
     def continuous(self) -> bool:
@@ -70,34 +84,48 @@ class QuaternionPD(AccelerationLaw):
 
 @pytree
 @dataclass(frozen=True)
-class Terminal(AccelerationLaw):
-    """Non-singular terminal sliding mode control.
+class Terminal(ComparisonLaw):
+    """Nonsingular terminal sliding mode, s = v + sig^p(v') / b (Feng, Yu, Man 2002).
 
-    The law for the error v and 1 < p < 2 is
-
-        s = v + sig^p(v') / b
-        a = -(b/p) sig^(2-p)(v') - k s - K sign(s).
+    s = v + sig^p(v')/b, alpha = -(b/p) sig^(2-p)(v') - k s - K sign(s), with sig^a(x) = sign(x) |x|^a, 1 < p < 2.
 
     Feng, Yu, Man, Non-singular terminal sliding mode control of rigid manipulators, Automatica 38(12), 2002. On s = 0 a
     component of v reaches zero after the time |v|^(1 - 1/p) p / ((p - 1) b^(1/p)), which grows with the initial error.
     """
 
-    p: Leaf  # [-]
-    b: Leaf  # [1/s^p]
-    k: Leaf  # [1/s^2]
-    sign_width: Leaf  # thickness of the boundary layer, in the units of s
-    tunable: ClassVar[tuple[str, ...]] = ("p", "b", "k", "sign_width", "t_f")
+    p: Leaf = gain(1.3, (1.05, 1.95), above=1.0, below=2.0, meaning="power of the surface")
+    b: Leaf = gain(
+        Scaled(0.1, time=lambda table: -table.p), "terminal_surface", unit="1/s^p", meaning="scale of the surface"
+    )
+    k: Leaf = gain(Scaled(0.1, time=-2), Rates(2.0, 2000.0, 2), unit="1/s^2", meaning="reaching gain")
+    sign_width: Leaf = gain(
+        1e-3,
+        "sign_width",
+        at_least=0.0,
+        free="sampled",
+        meaning="thickness of the boundary layer; 0 is the discontinuous sign",
+    )
 
     def acceleration(self, now: Sample, error: Vector, error_rate: Vector, bound: Scalar) -> tuple[Vector, Vector]:
         s = error + guards.signed_power(error_rate, self.p) / self.b
         equivalent = -self.b / self.p * guards.signed_power(error_rate, 2.0 - self.p) - self.k * s
         return equivalent - bound * guards.smooth_sign(s, self.sign_width), s
 
+    def noise_of_s(self, position: float, velocity: float) -> float:
+        """Return the noise of s = v + sig^p(v') / b [-]."""
+        return math.hypot(position, velocity**self.p / self.b)
+
+    def turning(self, t_f: float) -> tuple[str, Scalar | float]:
+        """On its surface, at |v| = 1 [rad/s]."""
+        return "b", 2.0 * self.b ** (1.0 / self.p)
+
 
 @pytree
 @dataclass(frozen=True)
-class FixedTime(AccelerationLaw):
-    """Fixed-time terminal sliding mode control.
+class FixedTime(ComparisonLaw):
+    """Fixed-time sliding mode (Zuo 2015; Jiang, Hu, Friswell 2016), gamma - 1/p > 1.
+
+    s = v + sig^p(v'/kappa), kappa = a1 |v|^(gamma-1/p) + b1; 1 < p < 2, gamma - 1/p > 1, m > 1 > n > 0.
 
     The law for the error v, with 1 < p < 2, gamma - 1/p > 1 and m > 1 > n > 0, is
 
@@ -110,16 +138,34 @@ class FixedTime(AccelerationLaw):
     the time 1/(a1 (gamma-1)) + p/(b1 (p-1)) from any initial error.
     """
 
-    a1: Leaf  # [1/s]
-    b1: Leaf  # [1/s]
-    a2: Leaf  # [1/s^(2-p)]
-    b2: Leaf  # [1/s^(2-p)]
-    p: Leaf  # [-]
-    gamma: Leaf  # [-]
-    m: Leaf  # [-]
-    n: Leaf  # [-]
-    sign_width: Leaf  # thickness of the boundary layer, in the units of s
-    tunable: ClassVar[tuple[str, ...]] = ("a1", "b1", "a2", "b2", "p", "gamma", "m", "n", "sign_width", "t_f")
+    a1: Leaf = gain(
+        Scaled(0.1, time=-1),
+        Rates(0.01, 100.0),
+        unit="1/s",
+        meaning="surface, weight of |v|^gamma, far from the target",
+    )
+    b1: Leaf = gain(
+        Scaled(0.2, time=-1), Rates(0.01, 100.0), unit="1/s", meaning="surface, weight of |v|^(1/p), near the target"
+    )
+    a2: Leaf = gain(
+        Scaled(1.0, time=lambda table: table.p - 2.0), "fixed_time_reaching", unit="1/s^(2-p)",
+        meaning="reaching law, weight of |s|^m, far from the surface",
+    )  # fmt: skip
+    b2: Leaf = gain(
+        Scaled(1.0, time=lambda table: table.p - 2.0), "fixed_time_reaching", unit="1/s^(2-p)",
+        meaning="reaching law, weight of |s|^n, near the surface",
+    )  # fmt: skip
+    p: Leaf = gain(1.25, "fixed_time_p", above=1.0, below=2.0, meaning="power of the surface")
+    gamma: Leaf = gain(2.0, "fixed_time_gamma", above=1.0, meaning="power of the surface")
+    m: Leaf = gain(1.5, (1.05, 3.0), above=1.0, meaning="power of the reaching law")
+    n: Leaf = gain(0.5, (0.05, 0.95), below=1.0, meaning="power of the reaching law")
+    sign_width: Leaf = gain(
+        1e-3,
+        "sign_width",
+        at_least=0.0,
+        free="sampled",
+        meaning="thickness of the boundary layer; 0 is the discontinuous sign",
+    )
 
     def acceleration(self, now: Sample, error: Vector, error_rate: Vector, bound: Scalar) -> tuple[Vector, Vector]:
         exponent = self.gamma - 1.0 / self.p
@@ -132,11 +178,26 @@ class FixedTime(AccelerationLaw):
         equivalent = curvature - guards.signed_power(kappa, self.p) / self.p * reaching
         return equivalent - bound * guards.smooth_sign(s, self.sign_width), s
 
+    def turning(self, t_f: float) -> tuple[str, Scalar | float]:
+        """On its surface, at |v| = 1 [rad/s]."""
+        return "a1", 2.0 * (self.a1 + self.b1)
+
+    def noise_of_s(self, position: float, velocity: float) -> float:
+        """Return the noise of s = v + sig^p(v' / b1) near the reference [-]."""
+        return math.hypot(position, (velocity / self.b1) ** self.p)
+
+    def refusal(self, order: int) -> tuple[str, str] | None:
+        """Its surface is nonsingular for gamma - 1/p > 1 only."""
+        fits = self.gamma - 1.0 / self.p > 1.0
+        return None if fits else ("gamma", f"greater than 1 + 1/p, {1.0 + 1.0 / self.p:.6g}")
+
 
 @pytree
 @dataclass(frozen=True)
-class Scaling(AccelerationLaw):
-    """Prescribed-time control by scaling of the error.
+class Scaling(ComparisonLaw):
+    """Prescribed time by scaling with (t_f/(t_f - t))^(2+m) (Song, Wang, Holloway, Krstic 2017).
+
+    a = -2 p eps'/r - p (p+1) eps/r^2 - k1 (eps' + p eps/r) - k z, p = 2 + m, r = t_f - t, from r = delta on held.
 
     The scaled error is xi = mu eps with mu = (t_f/r)^p, p = 2 + m and r = t_f - t. The law is
 
@@ -149,10 +210,15 @@ class Scaling(AccelerationLaw):
     where the law is a PD law.
     """
 
-    m: Leaf  # >= 1 [-]
-    k1: Leaf  # [1/s]
-    k: Leaf  # [1/s]
-    tunable: ClassVar[tuple[str, ...]] = ("m", "k1", "k", "delta", "t_f")
+    delta: Leaf = gain(
+        Scaled(2.0, time=1), "delta", unit="s", meaning="time before t_f at which the gains become constant"
+    )
+    m: Leaf = gain(1.0, (1.0, 5.0), at_least=1.0, meaning="excess of the power of the scaling")
+    k1: Leaf = gain(Scaled(1.0, time=-1), Rates(0.3, 0.5, sampled=True), unit="1/s", meaning="rate of the scaled error")
+    k: Leaf = gain(
+        Scaled(1e-3, time=-1), Rates(1e-5, 10.0), unit="1/s", meaning="rate of its surface, while the scaling is 1"
+    )
+    switches: ClassVar[bool] = False
 
     def acceleration(self, now: Sample, error: Vector, error_rate: Vector, bound: Scalar) -> tuple[Vector, Vector]:
         """Return a and the sliding variable z / mu [1/s], (m,) each; see `Law.acceleration`."""
@@ -160,6 +226,15 @@ class Scaling(AccelerationLaw):
         s = error_rate + (p / r + self.k1) * error
         linear = 2.0 * p / r * error_rate + p * (p + 1.0) / r**2 * error + self.k1 * (error_rate + p / r * error)
         return -linear - self.k * (self.t_f / r) ** p * s, s
+
+    @staticmethod
+    def designed(design: Any, published: Mapping[str, float]) -> Mapping[str, float]:
+        """Return the hold phase's poles [1/s] at the design's, and a hand-over where the approach is as fast."""
+        return {**published, "delta": design.delta, "k1": design.pole}
+
+    def turning(self, t_f: float) -> tuple[str, Scalar | float]:
+        """At the start [rad/s]."""
+        return "m", 2.0 * (2.0 + self.m) / t_f
 
 
 def phi(x: Vector, q: Scalar, settling: Scalar) -> Vector:
@@ -175,8 +250,10 @@ def phi(x: Vector, q: Scalar, settling: Scalar) -> Vector:
 
 @pytree
 @dataclass(frozen=True)
-class PredefinedTime(AccelerationLaw):
-    """Predefined-time sliding mode control.
+class PredefinedTime(ComparisonLaw):
+    """Predefined-time sliding mode (Sanchez-Torres and others 2018; Jimenez-Rodriguez and others 2020).
+
+    s = eps' + sig^(1/2)(sig^2(eps') + 2 sig^2(Phi_1(eps))), a = -Phi_2(s) - (K + 2 Phi_1 Phi_1'(eps)) sign(s).
 
     The law, with Phi_i the function `phi` with q_i and T_i, is
 
@@ -190,11 +267,20 @@ class PredefinedTime(AccelerationLaw):
     Lyapunov-like characterization of predefined-time stability, IEEE Trans. Automatic Control 65(11), 2020.
     """
 
-    share: Leaf  # fraction T_1 / t_f [-]
-    q1: Leaf  # 0 < q1 <= 1/2 [-]
-    q2: Leaf  # 0 < q2 < 1 [-]
-    sign_width: Leaf  # thickness of the boundary layer [1/s]
-    tunable: ClassVar[tuple[str, ...]] = ("share", "q1", "q2", "sign_width", "t_f")
+    share: Leaf = gain(
+        0.6, (0.05, 0.95), below=1.0,
+        meaning="fraction of t_f in which the error settles on the surface; the surface is reached before",
+    )  # fmt: skip
+    q1: Leaf = gain(0.3, (0.05, 0.49), at_most=0.5, meaning="power of the surface")
+    q2: Leaf = gain(0.3, (0.05, 0.95), below=1.0, meaning="power of the reaching law")
+    sign_width: Leaf = gain(
+        Scaled(1e-2, time=-1),
+        "sign_width",
+        at_least=0.0,
+        free="sampled",
+        unit="1/s",
+        meaning="thickness of the boundary layer; 0 is the discontinuous sign",
+    )
 
     def acceleration(self, now: Sample, error: Vector, error_rate: Vector, bound: Scalar) -> tuple[Vector, Vector]:
         first, second = self.share * self.t_f, (1.0 - self.share) * self.t_f
@@ -211,11 +297,22 @@ class PredefinedTime(AccelerationLaw):
         switching = (bound + 2.0 * phi_product) * guards.smooth_sign(s, self.sign_width)
         return -phi(s, self.q2, second) - switching, s
 
+    @staticmethod
+    def designed(design: Any, published: Mapping[str, float]) -> Mapping[str, float]:
+        """Return none: its gains follow from t_f [s], in the sampled loop too."""
+        return {}
+
+    def turning(self, t_f: float) -> tuple[str, Scalar | float]:
+        """On its surface, at |v| = 1 [rad/s]."""
+        return "q1", 2.0 * math.pi / (self.q1 * self.share * t_f)
+
 
 @pytree
 @dataclass(frozen=True)
-class SuperTwisting(AccelerationLaw):
-    """Super-twisting sliding mode control.
+class SuperTwisting(ComparisonLaw):
+    """Super-twisting, s = eps' + c eps (Levant 1998; Moreno, Osorio 2012).
+
+    s = eps' + c eps, a = -c eps' - 1.5 sqrt(L) sig^(1/2)(s) + v, v' = -1.1 L sign(s).
 
     The law is
 
@@ -229,10 +326,22 @@ class SuperTwisting(AccelerationLaw):
     time. v is integrated by one Euler step in each period.
     """
 
-    surface_rate: Leaf  # c [1/s]
-    lipschitz: Leaf  # bound L on each component of d' [1/s^3]
-    sign_width: Leaf  # thickness of the boundary layer [1/s]
-    tunable: ClassVar[tuple[str, ...]] = ("surface_rate", "lipschitz", "sign_width", "t_f")
+    surface_rate: Leaf = gain(
+        Scaled(0.4, time=-1), Rates(3.0, 0.2, sampled=True), unit="1/s", meaning="c, rate of the error on the surface"
+    )
+    lipschitz: Leaf = gain(
+        Scaled(0.01, time=-3), Rates(0.1, 1e4, 3), unit="1/s^3",
+        meaning="L, bound on each component of the derivative of eps'' that the disturbance makes",
+    )  # fmt: skip
+    sign_width: Leaf = gain(
+        Scaled(1e-3, time=-1),
+        "sign_width",
+        at_least=0.0,
+        free="sampled",
+        unit="1/s",
+        meaning="thickness of the boundary layer; 0 is the discontinuous sign",
+    )
+    switches: ClassVar[bool] = False
 
     def begin(self) -> Vector:
         """Return the initial value of v, zero, (m,) [1/s^2]."""
@@ -249,3 +358,12 @@ class SuperTwisting(AccelerationLaw):
         root = 1.5 * jnp.sqrt(self.lipschitz) * guards.signed_root(s, self.sign_width)
         a = now.memory - self.surface_rate * error_rate - root
         return a, s, now.memory - now.dt * 1.1 * self.lipschitz * guards.smooth_sign(s, self.sign_width)
+
+    @staticmethod
+    def designed(design: Any, published: Mapping[str, float]) -> Mapping[str, float]:
+        """Return published gains within the bandwidth, and a boundary layer [1/s] thicker than the noise."""
+        return {**published, "sign_width": design.width}
+
+    def turning(self, t_f: float) -> tuple[str, Scalar | float]:
+        """On its surface, at |v| = 1 [rad/s]."""
+        return "surface_rate", 2.0 * self.surface_rate

@@ -6,13 +6,15 @@ is the law for an integrator chain, (52). A chain of order 2 is the system (6) w
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from ptsmc_jax import declare, formulas
+from ptsmc_jax.declare import Scaled, gain
 from ptsmc_jax.laws.base import Law, Sample
 from ptsmc_jax.laws.kinematics import ChainKinematics, Kinematics
 from ptsmc_jax.numerics import guards
@@ -29,17 +31,45 @@ class PrescribedTimeLaw(Law):
 
     kinematics: Kinematics
     t_f: Leaf
-    eta: Leaf  # exponent of the decay, greater than 2 and than the order of a chain [-]
-    delta: Leaf
-    k1: Leaf  # K1 of (10), (29), (40) and (60) [1/s]
-    sign_width: Leaf  # thickness of the boundary layer in the hold phase, in the units of s in that phase
-    surface_rate: Leaf  # c, decay rate of the error on the surface of the hold phase; 1 in the paper [1/s]
-    # whether to use implicit sampling: the input is chosen for s at the end of the period, see `next_s`
+    eta: Leaf = gain(
+        Scaled(3.0), "eta", above=2.0, allowed="a number greater than 2 (Theorem 2)",
+        meaning="power of the approach: the error falls like (t_f - t)^eta, up to a logarithm; 3 in the paper",
+    )  # fmt: skip
+    delta: Leaf = gain(
+        Scaled(0.05, time=1), "delta", unit="s",
+        meaning="time before t_f at which the gains become constant (Remark 1); 0.05 in the paper",
+    )  # fmt: skip
+    k1: Leaf = gain(
+        Scaled(1.0, time=-1), "k1", unit="1/s", free="sampled",
+        meaning="K1, rate of s from the hand-over on, halved by (60) for a spacecraft; 1 in the paper",
+    )  # fmt: skip
+    sign_width: Leaf = gain(
+        Scaled(1e-3, time=-1), "sign_width", at_least=0.0, unit=("1/s", "unit of s"), free="sampled",
+        meaning="thickness of the boundary layer, tanh(s / sign_width); 0 is the discontinuous sign",
+    )  # fmt: skip
+    surface_rate: Leaf = gain(
+        Scaled(1.0, time=-1), "surface_rate", unit="1/s", free="sampled",
+        meaning="c of s = eps' + c eps, the error's rate on the surface from the hand-over on; 1 in the paper",
+    )  # fmt: skip
+    # whether the held input is chosen for s at the end of the period, see `landing`, and not for its rate at the sample
     implicit: bool = field(default=False, metadata={"static": True}, kw_only=True)
-    # in the approach phase, the thickness of the boundary layer is sign_width times this for order 2 [s]
-    layer_time: Leaf | np.float64 = field(default=np.float64(1.0), kw_only=True)
-    tunable: ClassVar[tuple[str, ...]] = ("eta", "delta", "k1", "sign_width", "surface_rate", "t_f")
+    layer_time: Leaf = declare.number(
+        Scaled(1.0, time=1), above=0.0, unit="s", kw_only=True,
+        meaning="time that converts the thickness of the boundary layer into the units of s before the hand-over; "
+        "1 in the paper",
+    )  # fmt: skip
     prescribed: ClassVar[bool] = True
+
+    @staticmethod
+    def designed(design: Any, published: Mapping[str, float]) -> Mapping[str, float]:
+        """Return both hold poles [1/s] at the design's, with `reaching` the factor of K1 in (60)."""
+        pole = design.pole
+        gains = {"k1": design.reaching * pole, "sign_width": design.width, "surface_rate": pole}
+        return {"eta": design.eta, "delta": design.delta, **gains}
+
+    def turning(self, t_f: float) -> tuple[str, Scalar | float]:
+        """On its surface, at the start [rad/s]."""
+        return "eta", 2.0 * self.eta / t_f
 
     @property
     def continuous(self) -> bool:
@@ -127,7 +157,9 @@ class SurfaceGains(NamedTuple):
 @pytree
 @dataclass(frozen=True)
 class PrescribedTime(PrescribedTimeLaw):
-    """The law for an error vector eps of order 2: (57) and (60) for a spacecraft, (29) for a second-order system.
+    """The paper's law: (56) and (57) for a spacecraft before the hand-over, (59) and (60) after it; (29) for a system.
+
+    The law of an error vector eps whose second derivative the input sets: (29), with the cases (57) and (60).
 
     In the approach phase (26), with tau = t_f - t:
 
@@ -199,7 +231,9 @@ class PrescribedTime(PrescribedTimeLaw):
 @pytree
 @dataclass(frozen=True)
 class PrescribedTimeChain(PrescribedTimeLaw):
-    """Law (52) for the integrator chain (35), with the surface (37) in the approach phase and (39) in the hold phase.
+    """The paper's law (52) for an integrator chain; without an observer (36) to (40).
+
+    Law (52) for the integrator chain (35), with the surfaces (37) before and (39) after the hand-over.
 
     For order 2 it is the law (24) for the system (6). `surface_rate` c multiplies the poles of (39), because a_i is
     replaced by a_i c^(n-i). The paper has c = 1.
@@ -215,7 +249,27 @@ class PrescribedTimeChain(PrescribedTimeLaw):
     """
 
     kinematics: ChainKinematics
-    a: Leaf  # (n-1,) a_1 .. a_(n-1) of (39), with a Hurwitz matrix A [1/s^(n-i)]
+    eta: Leaf = gain(
+        Scaled(3.0), "eta", allowed="a number greater than the order (Theorems 1 and 3)",
+        meaning="power of the approach; default: order + 1",
+    )  # fmt: skip
+    sign_width: Leaf = gain(
+        Scaled(1e-3, time=1, order=-1), "sign_width", at_least=0.0, unit="unit of s", free="sampled",
+        meaning="thickness of the boundary layer, tanh(s / sign_width); 0 is the discontinuous sign",
+    )  # fmt: skip
+    a: Leaf = declare.number(
+        (1.0,), any_length=True, allowed="a list of numbers, a_1 to a_(order-1) of (39)",
+        meaning="a_1 to a_(order-1) of the surface (39), stable; default: all poles at -1",
+    )  # fmt: skip
+
+    def refusal(self, order: int) -> tuple[str, str] | None:
+        """Theorems 1 and 3, and a surface (39) that is stable."""
+        if not self.eta > order:
+            return "eta", f"greater than plant.order, {order} ({'Theorem 1' if order == 2 else 'Theorem 3'})"
+        if len(self.a) != order - 1:
+            return "a", f"a list of plant.order - 1 = {order - 1} numbers"
+        stable = "such that all roots of p^(n-1) + a_(n-1) p^(n-2) + .. + a_1 are stable (39)"
+        return None if formulas.hurwitz(self.a) else ("a", stable)
 
     def __call__(
         self, now: Sample, x: Float[Array, " n"], target: Any, d_hat: Vector, k2: Scalar

@@ -3,13 +3,16 @@
 `TimeBase` defines the profile. `TimeBasePD` and `TimeBaseSliding` differ in the feedback of the deviation from it.
 """
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from ptsmc_jax.laws.base import AccelerationLaw, Sample
+from ptsmc_jax.declare import Rates, Scaled, gain
+from ptsmc_jax.laws.base import ComparisonLaw, Sample
 from ptsmc_jax.numerics import guards
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector, pytree
 
@@ -31,8 +34,8 @@ class Profile(NamedTuple):
 
 
 @dataclass(frozen=True)
-class TimeBase(AccelerationLaw):
-    """Base of the laws that track the profile r of a time-base generator.
+class TimeBase(ComparisonLaw):
+    """Follows r(x) = e0 (1 - 10 x^3 + 15 x^4 - 6 x^5) + e0' t_f (x - 6 x^3 + 8 x^4 - 3 x^5), x = t/t_f, then 0.
 
     The profile is the quintic that starts at the measured error e0 with its rate e0' and is at rest at zero at t_f:
 
@@ -89,30 +92,63 @@ class TimeBase(AccelerationLaw):
         a, s = self.feedback(error - profile.error, error_rate - profile.rate, bound)
         return profile.acceleration + a, s, start
 
+    def turning(self, t_f: float) -> tuple[str, Scalar | float]:
+        """In the middle of half a turn [rad/s]."""
+        return "t_f", 15.0 / 8.0 * math.pi / t_f
+
 
 @pytree
 @dataclass(frozen=True)
 class TimeBasePD(TimeBase):
-    """PD feedback a = r'' - k_d E' - k_p E with E = eps - r, and s = E' + (k_p/k_d) E."""
+    """A profile from the first error to zero at t_f, a quintic about the eigenaxis, under PD (Becerra and others 2018).
 
-    k_p: Leaf  # [1/s^2]
-    k_d: Leaf  # [1/s]
-    tunable: ClassVar[tuple[str, ...]] = ("k_p", "k_d", "t_f")
+    a = r'' - k_d E' - k_p E with E = eps - r; its s is E' + (k_p/k_d) E.
+    """
+
+    k_p: Leaf = gain(
+        Scaled(1.0, time=-2), Rates(2.0, 0.25, 2, sampled=True), unit="1/s^2",
+        meaning="gain on the deviation of the error from its profile",
+    )  # fmt: skip
+    k_d: Leaf = gain(
+        Scaled(2.0, time=-1), Rates(0.3, 1.0, sampled=True), unit="1/s", meaning="gain on the rate of that deviation"
+    )
+    switches: ClassVar[bool] = False
 
     def feedback(self, deviation: Vector, rate: Vector, bound: Scalar) -> tuple[Vector, Vector]:
         return -self.k_d * rate - self.k_p * deviation, rate + self.k_p / self.k_d * deviation
+
+    @staticmethod
+    def designed(design: Any, published: Mapping[str, float]) -> Mapping[str, float]:
+        """Return both poles of the tracking loop [1/s] at the design's."""
+        return {"k_p": design.pole**2, "k_d": 2.0 * design.pole}
 
 
 @pytree
 @dataclass(frozen=True)
 class TimeBaseSliding(TimeBase):
-    """Sliding mode feedback a = r'' - c E' - k s - K sign(s), with E = eps - r and s = E' + c E."""
+    """The same profile under a sliding mode, s = E' + c E (Becerra and others 2018).
 
-    surface_rate: Leaf  # c [1/s]
-    k: Leaf  # [1/s]
-    sign_width: Leaf  # thickness of the boundary layer, in the units of s
-    tunable: ClassVar[tuple[str, ...]] = ("surface_rate", "k", "sign_width", "t_f")
+    s = E' + c E with E = eps - r, a = r'' - c E' - k s - K sign(s).
+    """
+
+    surface_rate: Leaf = gain(
+        Scaled(1.0, time=-1), Rates(0.3, 1.0, sampled=True), unit="1/s", meaning="c, rate on the surface"
+    )
+    k: Leaf = gain(Scaled(1.0, time=-1), Rates(0.3, 1.0, sampled=True), unit="1/s", meaning="rate of s")
+    sign_width: Leaf = gain(
+        Scaled(1e-3, time=-1),
+        "sign_width",
+        at_least=0.0,
+        free="sampled",
+        unit="1/s",
+        meaning="thickness of the boundary layer; 0 is the discontinuous sign",
+    )
 
     def feedback(self, deviation: Vector, rate: Vector, bound: Scalar) -> tuple[Vector, Vector]:
         s = rate + self.surface_rate * deviation
         return -self.surface_rate * rate - self.k * s - bound * guards.smooth_sign(s, self.sign_width), s
+
+    @staticmethod
+    def designed(design: Any, published: Mapping[str, float]) -> Mapping[str, float]:
+        """Return both poles of the tracking loop [1/s] at the design's."""
+        return {"surface_rate": design.pole, "k": design.pole, "sign_width": design.width}

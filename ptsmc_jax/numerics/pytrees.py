@@ -1,13 +1,9 @@
-"""Dataclasses as pytrees: the decorator `pytree`, the types of their fields, and `gain` for fields that are tuned.
+"""Parts as pytrees: the decorator of a part's class, and the types of its numbers."""
 
-The parts of a run (plant, law, observer, sensors and so on) are dataclasses with this decorator.
-"""
-
-import math
 import textwrap
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, fields, is_dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -92,39 +88,6 @@ class Function:
     def __call__(self, *args: Any) -> Any:
         """Call the function."""
         return self.function(*args)
-
-
-class Gain(NamedTuple):
-    """Metadata of a field that `gain` declares; see its arguments."""
-
-    usual: tuple[float, float] | Callable | None
-    above: float
-    below: float
-    unit: str
-    meaning: str
-
-
-def gain(
-    default: float,
-    usual: tuple[float, float] | Callable[[float, float], tuple[float, float]] | None = None,
-    *,
-    above: float = 0.0,
-    below: float = math.inf,
-    unit: str = "",
-    meaning: str = "",
-) -> Any:
-    """Declare a field of a custom part that tuning may change: `k1: float = gain(1.0, (0.1, 10.0), unit="1/s")`.
-
-    Args:
-        default: value if a scenario gives none.
-        usual: bounds of the search if a scenario gives none: two numbers, or a function of t_f [s] and the control
-            period [s]. Positive bounds with a ratio above 10 are searched on a logarithmic scale.
-        above: the value must be greater than this.
-        below: the value must be less than this.
-        unit: unit of the value.
-        meaning: description for messages and the documentation.
-    """
-    return field(default=default, metadata={"gain": Gain(usual, above, below, unit, meaning)})
 
 
 def vector(values: Any) -> Array:

@@ -13,6 +13,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ptsmc_jax import declare
 from ptsmc_jax.numerics import integrators, matrices
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector
 from ptsmc_jax.plants.base import Plant
@@ -60,14 +61,12 @@ def constant_bound(component_bound: Scalar, components: int) -> ErrorBound:
 
 
 @dataclass(frozen=True)
-class Observer(ABC):
-    """A disturbance observer: the interface that the simulation uses."""
+class Observer(declare.Tunable, ABC):
+    """A disturbance observer, as the rollout asks for it."""
 
-    model: Plant  # design model of the plant
-    tunable: ClassVar[tuple[str, ...]] = ()  # names of the fields that tuning may change, besides `gain`
-    estimates: ClassVar[bool] = True  # False if d_hat is always 0
-    # whether d_hat is linear in the measurements; K2 is then inversely proportional to the gain
-    linear: ClassVar[bool] = False
+    model: Plant  # the nominal plant
+    estimates: ClassVar[bool] = True  # False: d_hat is always 0
+    linear: ClassVar[bool] = False  # the estimate is linear in what is measured, and its bound inverse to the gain
 
     def begin(self) -> Memory:
         """Return the memory at t = 0, with d_hat = 0 [N m]."""
@@ -155,9 +154,13 @@ class SampledObserver(Observer):
 class Linear(Observer):
     """Base of the observers with a constant gain l = diag(gain)."""
 
-    gain: Leaf  # (m,) diagonal of l [N m s]; l J^-1 is in 1/s
-    disturbance_rate_bound: Leaf  # c of Assumption 1, bound on each component of d' [N m/s]
-    initial_error: Leaf  # bound on |d_hat(0) - d(0)| [N m]; (57) of the paper needs it but states no value
+    gain: Leaf = declare.gain(  # (m,), so that l J^-1 is in 1/s
+        None, "dead_beat", each=True, unit=("N m s", "1/s"),
+        meaning="diagonal of l(w), or of its constant part; 10 in the paper; default: as fast as the hold phase if "
+        "sampled",
+    )  # fmt: skip
+    disturbance_rate_bound: Leaf  # pyright: ignore[reportGeneralTypeIssues]  # c of Assumption 1, bound on each component of d' [N m/s]
+    initial_error: Leaf  # pyright: ignore[reportGeneralTypeIssues]  # bound on |d_hat(0) - d(0)| [N m]; the paper's (57) needs it and gives none
     linear: ClassVar[bool] = True
 
     def decay_matrix(self, t: Scalar, t_next: Scalar) -> Matrix:

@@ -6,6 +6,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from ptsmc_jax import declare
+from ptsmc_jax.declare import Scaled
 from ptsmc_jax.numerics import guards
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector, pytree
 from ptsmc_jax.observers.base import Matrix, Memory, Observer
@@ -35,7 +37,9 @@ class FiniteTimeBound(NamedTuple):
 @pytree
 @dataclass(frozen=True)
 class FiniteTimeObserver(Observer):
-    """Super-twisting observer of the momentum H = M w, for each component (Levant, Automatica 34, 1998).
+    """A super-twisting observer, exact after a finite time (Levant 1998).
+
+    Super-twisting observer on H = M w, per component (Levant, Automatica 34, 1998; order 1, full M allowed).
 
     With e0 = z0 - H, where z0 is the estimate of H and e0(0) = 0, the equations are
 
@@ -47,10 +51,16 @@ class FiniteTimeObserver(Observer):
     matrix.
     """
 
-    gain: Leaf  # (m,) c [N m/s]
-    disturbance_rate_bound: Leaf  # bound on each component of d' [N m/s], at most `gain`
-    initial_error: Leaf  # bound on |d_hat(0) - d(0)| [N m]
-    sign_width: Leaf  # thickness of the boundary layer in the continuous loop; the digital form has none [N m s]
+    gain: Leaf = declare.gain(  # (m,)
+        None, "finite_time", each=True, unit="unit of d/s",
+        meaning="c, at least controller.disturbance_rate_bound; default: 20 times that",
+    )  # fmt: skip
+    disturbance_rate_bound: Leaf  # pyright: ignore[reportGeneralTypeIssues]  # bound on each component of d' [N m/s], at most `gain`
+    initial_error: Leaf  # pyright: ignore[reportGeneralTypeIssues]  # bound on |d_hat(0) - d(0)| [N m]
+    sign_width: Leaf = declare.number(
+        Scaled(1e-5, inertia=1, time=1, order=-1), at_least=0.0, unit=("N m s", ""),
+        meaning="thickness of its boundary layer in the continuous loop; the digital form needs none",
+    )  # fmt: skip
 
     def begin(self) -> Memory:
         """Return d_hat = 0 [N m] and e0 = 0 [N m s], (2 m,)."""

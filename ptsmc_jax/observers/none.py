@@ -12,7 +12,9 @@ from ptsmc_jax.observers.base import ErrorBound, Matrix, Memory, Observer, const
 @pytree
 @dataclass(frozen=True)
 class NoObserver(Observer):
-    """No observer: d_hat = 0, and the switching gain must cover the disturbance itself, as in (10), (29) and (40).
+    """None: d_hat = 0, and K switches against the whole disturbance.
+
+    No estimate: d_hat = 0, and the switching gain must cover the disturbance itself, as in (10), (29) and (40).
 
     K of Assumption 1 bounds each component of d. The law uses a bound on the 2-norm, so K2 = sqrt(m) K.
     """

@@ -9,7 +9,9 @@ from ptsmc_jax.observers.base import ErrorBound, Linear, Matrix, Memory
 @pytree
 @dataclass(frozen=True)
 class NonlinearObserver(Linear):
-    """Nonlinear disturbance observer (53) with the constant gain l(w) = diag(gain), so that lambda(w) = l w.
+    """The paper's nonlinear disturbance observer (53), its estimate zero at t = 0.
+
+    Nonlinear disturbance observer (53) with constant l(w) = diag(gain), so lambda(w) = gain w.
 
     The memory is d_hat instead of z = d_hat - l w of the paper. The estimation error e = d_hat - d obeys (54),
     e' = -l M^-1 e - d', where M is the inertia J for a spacecraft.

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from ptsmc_jax import declare
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector, pytree
 from ptsmc_jax.observers.base import ErrorBound, Linear, Matrix, Memory
 
@@ -48,15 +49,25 @@ class PrescribedTimeBound(NamedTuple):
 @pytree
 @dataclass(frozen=True)
 class PrescribedTimeObserver(Linear):
-    """The nonlinear observer with the time-varying gain diag(gain) + mu M/(T_o - t) until T_o - delta_o.
+    """An observer that has converged by t_o, the nonlinear one from then on.
+
+    The nonlinear observer with l = diag(gain) + mu M/(T_o - t) until T_o - delta_o: its error is gone by T_o.
 
     The error obeys e' = -(l M^-1 + mu/(T_o - t)) e - d' with l = diag(gain). So for a constant disturbance |e| decays
     like (T_o - t)^mu. From T_o - delta_o on it is the nonlinear observer. d_hat is continuous at the change.
     """
 
-    mu: Leaf  # exponent of the decay of the error, > 1 [-]
-    t_o: Leaf  # T_o, the prescribed time of convergence [s]
-    delta_o: Leaf  # time from the change to the nonlinear observer to T_o [s]
+    mu: Leaf = declare.number(
+        2.0, above=1.0,
+        meaning="the error at t = 0 falls like (t_o - t)^mu; what a moving disturbance adds, like c (t_o - t)/(mu - 1)",
+    )  # fmt: skip
+    t_o: Leaf = declare.number(
+        None, above=0.0, unit="s", meaning="prescribed time of convergence; default: a third of t_f", kw_only=True
+    )
+    delta_o: Leaf = declare.number(
+        None, above=0.0, unit="s", kw_only=True,
+        meaning="time before t_o at which mu/(t_o - t) is switched off; default: t_f / 600, or a period, at most t_o/4",
+    )  # fmt: skip
 
     def _time_left(self, t: Scalar) -> Scalar:
         """Return the time to T_o [s], at least delta_o."""

@@ -81,7 +81,7 @@ def spoken(path: Any, tree: Any) -> tuple[list[str], str]:
     for key in path:
         attribute = getattr(key, "name", None)
         if attribute is not None and not isinstance(at, dict):
-            meaning = comments(type(at)).get(attribute, "") or gain_of(at, attribute)
+            meaning = declared_of(at, attribute) or comments(type(at)).get(attribute, "")
             names.append(attribute)
             at = getattr(at, attribute)
         else:
@@ -91,13 +91,14 @@ def spoken(path: Any, tree: Any) -> tuple[list[str], str]:
     return names, meaning
 
 
-def gain_of(part: Any, name: str) -> str:
-    """What a gain of one's own says of itself."""
-    declared = getattr(type(part), "__dataclass_fields__", {}).get(name)
-    gain = None if declared is None else declared.metadata.get("gain")
-    if gain is None:
+def declared_of(part: Any, name: str) -> str:
+    """Return meaning and unit of a field of a part, empty if its class does not declare them."""
+    field = getattr(type(part), "__dataclass_fields__", {}).get(name)
+    declared = None if field is None else field.metadata.get("declared")
+    if declared is None:
         return ""
-    return f"{gain.meaning or name.replace('_', ' ')} [{gain.unit or '-'}]"
+    unit = declared.unit if isinstance(declared.unit, str) else declared.unit[0]
+    return f"{declared.meaning or name.replace('_', ' ')} [{unit.replace('unit of d', 'N m') or '-'}]"
 
 
 def _within(at: Any, what: Any) -> Any:

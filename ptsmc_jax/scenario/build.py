@@ -39,7 +39,7 @@ def setup(scenario: Scenario) -> Setup:
         settling_angle=vector(scenario.loop.settling_angle),
         actuators=devices,
         walk_rate=walk,
-        command_filter=None if filtering is None else filtering.build(),
+        command_filter=None if filtering is None else filtering.part(),
         pointing=scenario.observation(),
     )
 

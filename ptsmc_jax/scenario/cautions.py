@@ -77,7 +77,7 @@ def _perfect_rate(scenario: Scenario) -> list[str]:
 
 def _far_off(scenario: Scenario, largest: float, fastest: float) -> list[str]:
     """Stated bounds that are more than ten times off what the disturbance reaches; only that which the law uses."""
-    if not scenario.controller.switches:
+    if not scenario.controller.law.switches:
         return []
     name, follows = ("disturbance_rate_bound", fastest)
     if scenario.observer.kind in ("none", "own"):

@@ -91,7 +91,7 @@ def _check_sensors(scenario: Scenario) -> None:
 def _check_loop(scenario: Scenario) -> None:
     controller, loop = scenario.controller, scenario.loop
     t_f, delta, window = controller.t_f, hand_over(scenario), scenario.window
-    if not controller.prescribed:
+    if not controller.law.prescribed:
         scenario.need_samples(f"controller.kind = {errors.show(controller.kind)}")
     controller.check(scenario)
     if scenario.sampled and t_f <= loop.period:  # whatever delta is, which has at least a period

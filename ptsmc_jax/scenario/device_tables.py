@@ -12,13 +12,32 @@ import numpy as np
 from msgspec import Meta
 
 from ptsmc_jax import formulas
+from ptsmc_jax.devices import command_filter
 from ptsmc_jax.scenario import errors
-from ptsmc_jax.scenario.command_filter_tables import FirstOrderFilter, NotchFilter, SecondOrderFilter
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
-from ptsmc_jax.scenario.gain_record import Choice, GainBounds
-from ptsmc_jax.scenario.values import Count, Kind, Kinds, NotNegative, NotNegatives, Positive, Table, Three
+from ptsmc_jax.scenario.gain_bounds import BOUNDS
+from ptsmc_jax.scenario.gain_record import GainBounds
+from ptsmc_jax.scenario.schema import PartTable, table
+from ptsmc_jax.scenario.values import Count, Kinds, NotNegative, NotNegatives, Positive, Table, Three
 
 SAME = 1e-9  # of a number of periods, which is whole then
+
+
+class CommandFilterTable(PartTable, frozen=True):
+    """A filter between the law and the actuators, in the flight computer."""
+
+    prefix: ClassVar[str] = "command_"
+
+    def dead_time(self) -> float:
+        """Return its delay at low frequencies, the derivative of its phase [s]."""
+        return self.made.dead_time(self)
+
+
+COMMAND_FILTERS: Kinds = {
+    "first_order": table(CommandFilterTable, command_filter.FirstOrder, "first_order"),
+    "second_order": table(CommandFilterTable, command_filter.SecondOrder, "second_order"),
+    "notch": table(CommandFilterTable, command_filter.Notch, "notch"),
+}
 
 
 class Actuators(Table, frozen=True):
@@ -34,7 +53,7 @@ class Actuators(Table, frozen=True):
             compensation of the wheels' momentum. The observer uses the delayed torque. The law does not predict over it
     """
 
-    command_filter: FirstOrderFilter | SecondOrderFilter | NotchFilter | None = None
+    command_filter: CommandFilterTable | None = None
     torque_limit: Positive | None = None
     torque_rate_limit: Positive | None = None
     torque_lag: Positive | None = None
@@ -228,12 +247,11 @@ class StateHardware(Actuators, frozen=True):
         return PerfectSensors() if self.state_noise is None else StateSensor(vector(self.state_noise))
 
 
-class FilterTable(Kind, frozen=True):
+class FilterTable(PartTable, frozen=True):
     """An attitude filter, or none."""
 
     on: ClassVar[bool] = True
     prefix: ClassVar[str] = "filter_"
-    gains: ClassVar[Mapping[str, GainBounds]] = {}
 
     def passes(self, scenario: Any) -> float:
         """Return the fraction of a star tracker sample's noise that reaches the law at once."""
@@ -253,12 +271,6 @@ class NoFilter(FilterTable, frozen=True):
     on: ClassVar[bool] = False
 
 
-def _usual_bandwidth(choice: Choice) -> tuple[float, float]:
-    scenario = choice.scenario
-    width = scenario.estimator.width(scenario)
-    return 0.1 * width, min(10.0 * width, max(2.0 * width, 1.0 / scenario.devices.interval(scenario.loop.period)))
-
-
 class SteadyStateFilter(FilterTable, frozen=True):
     """A steady-state attitude filter, propagated by the gyro, corrected by the star tracker.
 
@@ -268,7 +280,7 @@ class SteadyStateFilter(FilterTable, frozen=True):
 
     kind: Literal["steady_state"] = "steady_state"
     bandwidth: Positive | None = None
-    gains: ClassVar[Mapping[str, GainBounds]] = {"filter_bandwidth": GainBounds(_usual_bandwidth)}
+    gains: ClassVar[Mapping[str, GainBounds]] = {"filter_bandwidth": BOUNDS["bandwidth"]}
 
     @staticmethod
     def _noisy(table: Hardware) -> bool:

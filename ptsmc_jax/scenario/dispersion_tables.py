@@ -7,7 +7,8 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from msgspec import Meta
 
-from ptsmc_jax.scenario.values import NotNegative, NotNegatives, Positive, Scaled, Table, Truth
+from ptsmc_jax.declare import Scaled
+from ptsmc_jax.scenario.values import NotNegative, NotNegatives, Positive, Table, Truth
 
 
 class Numbers(Table, frozen=True):

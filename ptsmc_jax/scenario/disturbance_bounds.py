@@ -9,9 +9,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ptsmc_jax.declare import Scaled
 from ptsmc_jax.scenario import mission
 from ptsmc_jax.scenario.errors import ScenarioError
-from ptsmc_jax.scenario.values import MOST_STEPS, Scaled
+from ptsmc_jax.scenario.values import MOST_STEPS
 
 RATE = 10.0 / 12.0  # l / J of the paper's observer, 10 N m s on its mean moment of 12 kg m^2 [1/s]
 SIGMAS = 3.0  # of what is normal, and has no largest value
@@ -35,10 +36,11 @@ def of(scenario: Any) -> tuple[float, float] | None:
     inputs = scenario.inputs
     with np.errstate(over="ignore"):
         found = [term.bounds(scenario) for term in scenario.terms]
-        if any(one is None or one.size.shape != (inputs,) for one in found):  # of another length: `checks` refuses it
+        known = [one for one in found if one is not None]
+        if len(known) < len(found):
             return None
-        largest = sum((one.size for one in found), np.zeros(inputs)) + _drawn_bias(scenario)
-        fastest = sum((one.rate for one in found), np.zeros(inputs))
+        largest = sum((one.size for one in known), np.zeros(inputs)) + _drawn_bias(scenario)
+        fastest = sum((one.rate for one in known), np.zeros(inputs))
     if not np.all(np.isfinite([largest, fastest])):
         raise ScenarioError("disturbance is larger or faster than any number; allowed are smaller numbers in it")
     return float(np.max(largest)), float(np.max(fastest))

@@ -1,9 +1,12 @@
-"""The bounds of gains that several laws have; each law and observer names its own beside its keys."""
+"""The usual bounds of gains by the names that declarations use, and the bounds that a declaration itself has."""
 
 import math
+from collections.abc import Callable
 from typing import Any
 
+from ptsmc_jax.declare import Declaration
 from ptsmc_jax.scenario import mission, scales
+from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.gain_record import Allowed, Choice, GainBounds, Interval
 from ptsmc_jax.scenario.values import MOST_STEPS
 
@@ -13,6 +16,38 @@ SLOWEST_DECAY = 3.5  # t_f times the least K1
 def hand_over(scenario: Any) -> float:
     """How long before t_f the law hands over [s]; a period for a law that does not."""
     return getattr(scenario.controller, "delta", None) or scenario.loop.period
+
+
+def of(declared: Declaration, called: str) -> GainBounds:
+    """Return the bounds of a gain.
+
+    Args:
+        declared: the declaration of the gain.
+        called: what errors call it.
+    """
+    limits, usual = declared.limits, declared.usual
+    allowed = Allowed(
+        max(limits.above, limits.at_least), min(limits.below, limits.at_most), limits.at_least > limits.above
+    )
+    if isinstance(usual, str):
+        return BOUNDS[usual]
+    bounds_of: Any = usual if callable(usual) else lambda t_f, period: usual
+
+    def interval(choice: Choice) -> Interval:
+        try:
+            low, high = (float(v) for v in bounds_of(choice.t_f, choice.scenario.loop.period))
+        except (Exception, SystemExit) as error:
+            said = f"{type(error).__name__}: {error}"
+            raise ScenarioError(f"the usual bounds of the {called} fail: {said}") from None
+        if not (limits.above < low < high < limits.below and limits.at_least <= low and high <= limits.at_most):
+            raise ScenarioError(
+                f"the usual bounds of the {called} are [{low:g}, {high:g}], but must be two "
+                f"numbers{limits.words(several=True)}, the lower one first"
+            )
+        return low, high
+
+    near_border = "so large that the sampled loop comes near its border of stability"
+    return GainBounds(interval, lambda _: allowed, above=near_border if getattr(usual, "sampled", False) else None)
 
 
 def _converged(scenario: Any) -> float:
@@ -65,24 +100,87 @@ def _usual_eta(choice: Choice) -> Interval:
     return choice.scenario.least_eta + 0.05, choice.scenario.least_eta + 6.0
 
 
-ETA = GainBounds(_usual_eta, lambda choice: Allowed(choice.scenario.least_eta, math.inf))
-T_F = GainBounds(_usual_t_f, _allowed_t_f)
-DELTA = GainBounds(
-    _usual_delta,
-    lambda choice: Allowed(choice.shortest_delta, choice.smallest("t_f"), choice.shortest_delta > 0.0),
-    below="one period, the shortest hand-over that there is",
-)
-SIGN_WIDTH = GainBounds(
-    _usual_width,
-    below="a narrower one is lost in the noise, or hops from side to side",
-    above="so wide that hardly a switching term is left",
-)
-K1 = GainBounds(_usual_k1, above="the stability border of the sampled loop")
-SURFACE_RATE = GainBounds(_usual_rate, above="half of the stability limit of the sampled hold phase")
+def _in_mission(low: float, high: float, power: Callable[[Any], float]) -> Callable[[Choice], Interval]:
+    """Return bounds in the units of a mission; power: of time in them, from the law."""
+
+    def interval(choice: Choice) -> Interval:
+        unit = mission.scales(choice.scenario).time ** power(choice.law)
+        return low * unit, high * unit
+
+    return interval
 
 
-def dead_beat(choice: Choice) -> Interval:
+def _usual_p(choice: Choice) -> Interval:
+    least = _allowed_p(choice)[0]
+    return least + 0.05 * (2.0 - least), 2.0 - 0.05 * (2.0 - least)
+
+
+def _allowed_p(choice: Choice) -> Allowed:
+    """For gamma - 1/p > 1; if gamma is free too, it follows p."""
+    return Allowed(1.0 if "gamma" in choice.free else max(1.0, 1.0 / (choice.law.gamma - 1.0)), 2.0)
+
+
+def _usual_gamma(choice: Choice) -> Interval:
+    least = _allowed_gamma(choice)[0]
+    return least + 0.05, least + 2.0
+
+
+def _allowed_gamma(choice: Choice) -> Allowed:
+    """Gamma - 1/p > 1, for every p."""
+    return Allowed(1.0 + 1.0 / choice.smallest("p"), math.inf)
+
+
+def _dead_beat(choice: Choice) -> Interval:
     """An observer's gain: from l / J = 1.5 / t_f up to that of a deadbeat one."""
     least = mission.SLOWEST_OBSERVER / choice.t_f * choice.scenario.mean_inertia
     high = scales.dead_beat_gain(choice.scenario) if choice.sampled else 0.0
     return least, high if high > least else 600.0 * least
+
+
+def _usual_bound(choice: Choice) -> Interval:
+    """C of a finite-time observer, a bound on the disturbance's rate."""
+    own = choice.scenario.observer.gain
+    return max(choice.law.disturbance_rate_bound, 0.05 * min(own)), 50.0 * max(own)
+
+
+def _allowed_bound(choice: Choice) -> Allowed:
+    least = choice.law.disturbance_rate_bound
+    return Allowed(least, math.inf, least > 0.0)
+
+
+def _usual_corner(choice: Choice) -> Interval:
+    """A decade either way, but half of the Nyquist frequency."""
+    corner = choice.scenario.devices.command_filter.corner
+    return 0.1 * corner, min(10.0 * corner, max(0.5 * math.pi / choice.scenario.loop.period, 0.5 * corner))
+
+
+def _usual_bandwidth(choice: Choice) -> Interval:
+    scenario = choice.scenario
+    width = scenario.estimator.width(scenario)
+    return 0.1 * width, min(10.0 * width, max(2.0 * width, 1.0 / scenario.devices.interval(scenario.loop.period)))
+
+
+BOUNDS = {
+    "eta": GainBounds(_usual_eta, lambda choice: Allowed(choice.scenario.least_eta, math.inf)),
+    "t_f": GainBounds(_usual_t_f, _allowed_t_f),
+    "delta": GainBounds(
+        _usual_delta,
+        lambda choice: Allowed(choice.shortest_delta, choice.smallest("t_f"), choice.shortest_delta > 0.0),
+        below="one period, the shortest hand-over that there is",
+    ),
+    "sign_width": GainBounds(
+        _usual_width,
+        below="a narrower one is lost in the noise, or hops from side to side",
+        above="so wide that hardly a switching term is left",
+    ),
+    "k1": GainBounds(_usual_k1, above="the stability border of the sampled loop"),
+    "surface_rate": GainBounds(_usual_rate, above="half of the stability limit of the sampled hold phase"),
+    "dead_beat": GainBounds(_dead_beat, above="a dead-beat observer: nothing of its error is left after a period"),
+    "finite_time": GainBounds(_usual_bound, _allowed_bound),
+    "terminal_surface": GainBounds(_in_mission(3e-4, 3.0, lambda law: -law.p)),
+    "fixed_time_reaching": GainBounds(_in_mission(1e-4, 10.0, lambda law: law.p - 2.0)),
+    "fixed_time_p": GainBounds(_usual_p, _allowed_p),
+    "fixed_time_gamma": GainBounds(_usual_gamma, _allowed_gamma),
+    "corner": GainBounds(_usual_corner, lambda choice: Allowed(0.0, math.pi / choice.scenario.loop.period)),
+    "bandwidth": GainBounds(_usual_bandwidth),
+}

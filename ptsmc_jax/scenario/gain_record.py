@@ -64,11 +64,7 @@ class GainBounds(NamedTuple):
     """The bounds of a gain, as functions of a `Choice`."""
 
     usual: Callable[[Choice], Interval]  # where a scenario gives none
+    # None of them contains zero, since the discontinuous sign has no gradient
     allowed: Callable[[Choice], Allowed] = _positive
     below: str | None = None  # what lies below the usual lower bound in the sampled loop, in words
     above: str | None = None  # and above the upper one
-
-
-def between(least: float, most: float) -> Callable[[Choice], Allowed]:
-    """Bounds that lie between two numbers."""
-    return lambda _: Allowed(least, most)

@@ -47,14 +47,20 @@ def of(struct: type[Table], unit_of_d: str = UNIT_OF_D) -> list[Key]:
         meanings |= _attributes(_docstring(base))
     hints = typing.get_type_hints(struct, include_extras=True)
     keys = []
+    declared = getattr(struct, "declared", {})
     for field in msgspec.structs.fields(struct):
-        if field.name not in ("kind", "rest"):
+        if field.name in declared:
+            one, body = declared[field.name], struct.body  # pyright: ignore[reportAttributeAccessIssue]
+            unit = one.unit if isinstance(one.unit, str) else one.unit[not body]
+            unit = unit.replace(UNIT_OF_D, "N m" if body else unit_of_d)
+            keys.append(Key(field.name, one.meaning, unit, allowed(hints[field.name]), field.default))
+        elif field.name not in ("kind", "rest"):
             parts = re.fullmatch(r"(.*?)(?: \[([^][]*)\])?", meanings[field.name])
             assert parts is not None
             meaning, unit = parts.groups()
             factory = field.default_factory
             default = field.default if factory is msgspec.NODEFAULT else factory()
-            unit = unit_of_d if unit == UNIT_OF_D else unit or ""
+            unit = (unit or "").replace(UNIT_OF_D, unit_of_d)
             keys.append(Key(field.name, meaning, unit, allowed(hints[field.name]), default))
     return keys
 

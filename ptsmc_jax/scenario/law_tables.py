@@ -1,203 +1,199 @@
-"""The paper's laws of a scenario file: each a table with its keys, its gains, what it is refused for, how it is built.
-
-A law is its physics in a file of `laws`, a table, and a row: here, or among those to compare with.
-"""
+"""The laws of scenario files: the keys that they have besides their own numbers, and the classes by kind."""
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
-from msgspec import Meta
+import msgspec
 
-from ptsmc_jax import formulas
-from ptsmc_jax.scenario import gain_bounds
-from ptsmc_jax.scenario.baseline_tables import BASELINES
-from ptsmc_jax.scenario.errors import wrong
+from ptsmc_jax.laws import baselines, kinematics, prescribed_time, time_base
+from ptsmc_jax.laws.base import AccelerationLaw
+from ptsmc_jax.numerics.pytrees import vector
+from ptsmc_jax.scenario import disturbance_bounds, mission
+from ptsmc_jax.scenario.errors import show, wrong
+from ptsmc_jax.scenario.gain_bounds import BOUNDS, hand_over
 from ptsmc_jax.scenario.gain_record import GainBounds
-from ptsmc_jax.scenario.law_record import LawTable
-from ptsmc_jax.scenario.mission import Design
-from ptsmc_jax.scenario.own_laws import OwnAttitudeLaw, OwnLaw
-from ptsmc_jax.scenario.values import ABSENT, NotNegative, Positive, ResolvedNotNegative, ResolvedPositive, Scaled
+from ptsmc_jax.scenario.own import own_kind
+from ptsmc_jax.scenario.schema import PartTable, table
+from ptsmc_jax.scenario.values import NotNegative, Positive
 
-Eta = Annotated[float, Meta(gt=2, description="a number greater than 2 (Theorem 2)")]
+KINEMATICS = {"chain": kinematics.ChainKinematics, "system": kinematics.SecondOrderKinematics}
 
 
-class PrescribedTable(LawTable, frozen=True):
-    """The paper's gains, whatever the plant."""
+class LawTable(PartTable, frozen=True):
+    """A law, whatever it is for.
 
-    prescribed: ClassVar[bool] = True
-    gains: ClassVar[Mapping[str, GainBounds]] = {
-        "eta": gain_bounds.ETA,
-        "delta": gain_bounds.DELTA,
-        "k1": gain_bounds.K1,
-        "sign_width": gain_bounds.SIGN_WIDTH,
-        "surface_rate": gain_bounds.SURFACE_RATE,
-        "t_f": gain_bounds.T_F,
-    }
-    free_by_default: ClassVar[tuple[str, ...]] = ("eta", "delta")
-    free_if_sampled: ClassVar[tuple[str, ...]] = ("k1", "sign_width", "surface_rate")
-    scaled: ClassVar[Mapping[str, Scaled]] = {
-        "eta": Scaled(3.0),
-        "delta": Scaled(0.05, time=1),
-        "k1": Scaled(1.0, time=-1),
-        "sign_width": Scaled(1e-3, time=-1),
-        "surface_rate": Scaled(1.0, time=-1),
-        "layer_time": Scaled(1.0, time=1),
-    }
+    Attributes:
+        t_f: the prescribed time, or when the error is judged [s]
+        disturbance_rate_bound: c of Assumption 1, on each component of d'; default: by [disturbance] as drawn
+            [unit of d/s]
+        disturbance_bound: K of Assumption 1, on each component of d, used without an observer; default: by
+            [disturbance] as drawn [unit of d]
+        initial_estimate_error: bound on the observer's error at t = 0 [unit of d]
+    """
+
+    t_f: Positive = 30.0
+    disturbance_rate_bound: NotNegative | None = None
+    disturbance_bound: NotNegative | None = None
+    initial_estimate_error: NotNegative = 0.0
+    gains: ClassVar[Mapping[str, GainBounds]] = {"t_f": BOUNDS["t_f"]}
 
     @property
     def implicit(self) -> bool:
         """Whether the held input is chosen for the end of its period."""
-        return self.sampling == "implicit"  # pyright: ignore[reportAttributeAccessIssue]
+        return getattr(self, "sampling", None) == "implicit"
+
+    @property
+    def law(self) -> Any:
+        """The class of the law; `AccelerationLaw` stands for a custom one whose code was not run yet."""
+        return self.made or AccelerationLaw
+
+    def kinematics(self, motion: str) -> Any:
+        """Return the class of the error kinematics for plants of this `Scenario.motion`."""
+        if motion != "spacecraft":
+            return KINEMATICS[motion]
+        additive = getattr(self, "error", "multiplicative") == "additive"
+        return kinematics.AdditiveKinematics if additive else kinematics.MultiplicativeKinematics
 
     def free(self, *, sampled: bool) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """With implicit sampling there is no boundary layer."""
-        first, rest = super().free(sampled=sampled)
-        return first, tuple(name for name in rest if not (self.implicit and name == "sign_width"))
+        """Its gains that are free where a scenario does not say, those before and those after the observer's."""
+        rest = self.free_if_sampled if sampled else ()  # implicit sampling has no boundary layer
+        return self.free_by_default, tuple(name for name in rest if not (self.implicit and name == "sign_width"))
+
+    def filled(self, scenario: Any) -> Any:
+        """Fill absent bounds of Assumption 1 from the disturbance, then absent gains by `designed`."""
+        found = disturbance_bounds.of(scenario)
+        if found is not None:
+            self = self._with(dict(zip(("disturbance_bound", "disturbance_rate_bound"), found, strict=True)))
+        made = self._with(self.designed(msgspec.structs.replace(scenario, controller=self)))
+        made = made._with(made.published_in(mission.scales(scenario)))
+        delta, by_default = getattr(made, "delta", None), getattr(self, "delta", 0.0) is None
+        if scenario.sampled and by_default and delta is not None:
+            made = msgspec.structs.replace(made, delta=max(delta, scenario.loop.period))
+        return made
+
+    def _with(self, follows: Mapping[str, Any]) -> Any:
+        """Return the table with these values for its absent keys."""
+        return msgspec.structs.replace(self, **{k: v for k, v in follows.items() if getattr(self, k) is None})
+
+    def designed(self, scenario: Any) -> Mapping[str, float]:
+        """Return the gains that the mission suggests; none if those of the paper's case stay, scaled or not."""
+        if not scenario.sampled or mission.published(scenario):
+            return {}
+        return self.gains_of(mission.design(scenario), scenario)
+
+    def published_in(self, units: mission.Scales) -> dict[str, Any]:
+        """Return the gains of the paper's case, by key, in the units of a mission."""
+        return {key: units.of(scaled, self) for key, scaled in self.scaled.items()}
+
+    def gains_of(self, design: mission.Design, scenario: Any) -> Mapping[str, float]:
+        """Return this law's gains for a design of the sampled loop, by key: published ones within the bandwidth."""
+        published = self.published_in(mission.scales(scenario)._replace(time=1.0 / design.rate))
+        return self.law.designed(design, published)
+
+    def noise_of_s(self, position: float, velocity: float) -> float:
+        """Return the noise of the sliding variable (1 sigma) for noise of the error and of its rate [1/s]."""
+        return self.law.noise_of_s(self, position, velocity)
+
+    def turning(self, t_f: float) -> tuple[str, float]:
+        """Return the key that says how fast the law turns the body, and that rate [rad/s], at most."""
+        key, rate = self.law.turning(self, t_f)
+        return f"controller.{key}", rate
 
     def check(self, scenario: Any) -> None:
-        """Implicit sampling needs samples."""
+        """Raise ScenarioError if keys contradict each other, or the scenario's."""
+        if not self.law.prescribed and scenario.order != 2:
+            needed = f"2 with controller.kind = {show(scenario.controller.kind)}, a law of second order"
+            raise wrong("plant.order", scenario.order, needed)
+        found: tuple[str, str] | None = self.law.refusal(self, scenario.order)
+        if found is not None:
+            raise wrong(f"controller.{found[0]}", getattr(self, found[0]), found[1])
         if self.implicit:
             scenario.need_samples('controller.sampling = "implicit"')
 
-    def gains_of(self, design: Design, scenario: Any) -> dict[str, float]:
-        """Return both hold poles at the design's, with `reaching` the factor of K1 in (60)."""
-        return {
-            "eta": design.eta,
-            "delta": design.delta,
-            "k1": scenario.reaching * design.pole,
-            "sign_width": design.width,
-            "surface_rate": design.pole,
-        }
-
-    def physics(self, motion: str) -> Any:
-        """Return `laws.prescribed_time.PrescribedTime`, for every motion but a chain."""
-        from ptsmc_jax.laws.prescribed_time import PrescribedTime
-
-        return PrescribedTime
-
     def build(self, scenario: Any, model: Any) -> Any:
-        """The law of a plant's model."""
-        return dataclasses.replace(super().build(scenario, model), implicit=self.implicit)
-
-    def turning(self, t_f: float) -> tuple[str, float]:
-        """On its surface, at the start."""
-        return "controller.eta", 2.0 * self.eta / t_f  # pyright: ignore[reportAttributeAccessIssue]
+        """Return the law for a plant's model."""
+        law = self.part(kinematics=self.kinematics(scenario.motion)(model), delta=vector(hand_over(scenario)))
+        return dataclasses.replace(law, implicit=True) if self.implicit else law
 
 
-class SpacecraftController(PrescribedTable, frozen=True):
-    """The paper's law for a spacecraft: (56) and (57) before the hand-over, (59) and (60) after it.
+class PrescribedTable(LawTable, frozen=True):
+    """The paper's law.
+
+    Attributes:
+        sampling: held input by s at the sample, or by where s is to land at the period's end, which needs no sign_width
+    """
+
+    sampling: Literal["explicit", "implicit"] = "explicit"
+
+
+class AttitudeTable(PrescribedTable, frozen=True):
+    """The paper's law for a spacecraft.
 
     Attributes:
         error: the paper's q_1 - q_1f, or the vector part of q_f* q, singular 180 degrees from the reference only
-        t_f: the prescribed time [s]
-        eta: power of the approach: the error falls like (t_f - t)^eta, up to a logarithm; 3 in the paper
-        delta: time before t_f at which the gains become constant (Remark 1); 0.05 in the paper [s]
-        k1: K1, rate of s from the hand-over on, halved by (60); 1 in the paper [1/s]
-        sign_width: thickness of the boundary layer, tanh(s / sign_width); 0 is the discontinuous sign [1/s]
-        surface_rate: c of s = eps' + c eps, the error's rate on the surface from the hand-over on; 1 in the paper [1/s]
-        layer_time: time that converts the thickness of the boundary layer into the units of s before the hand-over;
-            1 in the paper [s]
-        sampling: held input by s at the sample, or by where s is to land at the period's end, which needs no sign_width
-        disturbance_rate_bound: c of Assumption 1, on each component of d'; default: by [disturbance] as drawn [N m/s]
-        disturbance_bound: K of Assumption 1, on each component of d, used without an observer; default: by
-            [disturbance] as drawn [N m]
-        initial_estimate_error: bound on the observer's error at t = 0 [N m]
     """
 
-    kind: Literal["prescribed_time"] = "prescribed_time"
     error: Literal["additive", "multiplicative"] = "additive"
-    t_f: Positive = 30.0
-    eta: Eta | None = None
-    delta: ResolvedPositive = ABSENT
-    k1: ResolvedPositive = ABSENT
-    sign_width: ResolvedNotNegative = ABSENT
-    surface_rate: ResolvedPositive = ABSENT
-    layer_time: ResolvedPositive = ABSENT
-    sampling: Literal["explicit", "implicit"] = "explicit"
-    disturbance_rate_bound: NotNegative | None = None
-    disturbance_bound: NotNegative | None = None
-    initial_estimate_error: NotNegative = 0.0
 
 
-class SystemController(PrescribedTable, frozen=True):
-    """The paper's law (29) for a second-order system, with (57)'s gains.
+class OwnTable(LawTable, frozen=True):
+    """A custom law.
 
     Attributes:
-        t_f: the prescribed time [s]
-        eta: power of the approach: the error falls like (t_f - t)^eta, up to a logarithm; 3 in the paper
-        delta: time before t_f at which the gains become constant (Remark 1); 0.05 in the paper [s]
-        k1: K1, rate of s from the hand-over on; 1 in the paper [1/s]
-        sign_width: thickness of the boundary layer, tanh(s / sign_width); 0 is the discontinuous sign [unit of s]
-        surface_rate: c of s = eps' + c eps, the error's rate on the surface from the hand-over on; 1 in the paper [1/s]
-        layer_time: time that converts the thickness of the boundary layer into the units of s before the hand-over;
-            1 in the paper [s]
-        sampling: held input by s at the sample, or by where s is to land at the period's end, which needs no sign_width
-        disturbance_rate_bound: c of Assumption 1, on each component of d'; default: by [disturbance] [unit of d/s]
-        disturbance_bound: K of Assumption 1, on each component of d, used without an observer; default: by
-            [disturbance] [unit of d]
-        initial_estimate_error: bound on the observer's error at t = 0 [unit of d]
+        delta: time from the hand-over to t_f, if the law hands over; default: one control period [s]
     """
 
-    kind: Literal["prescribed_time"] = "prescribed_time"
-    t_f: Positive = 5.0
-    eta: Eta | None = None
-    delta: ResolvedPositive = ABSENT
-    k1: ResolvedPositive = ABSENT
-    sign_width: ResolvedNotNegative = ABSENT
-    surface_rate: ResolvedPositive = ABSENT
-    layer_time: ResolvedPositive = ABSENT
-    sampling: Literal["explicit", "implicit"] = "explicit"
-    disturbance_rate_bound: NotNegative | None = None
-    disturbance_bound: NotNegative | None = None
-    initial_estimate_error: NotNegative = 0.0
+    delta: Positive | None = None
+    gains: ClassVar[Mapping[str, GainBounds]] = {"delta": BOUNDS["delta"], "t_f": BOUNDS["t_f"]}
 
 
-class ChainController(SystemController, frozen=True):
-    """The paper's law (52) for an integrator chain; without an observer (36) to (40).
+class OwnAttitudeTable(OwnTable, frozen=True):
+    """A custom law for a spacecraft.
 
     Attributes:
-        eta: power of the approach; default: order + 1
-        a: a_1 to a_(order-1) of the surface (39), stable; default: all poles at -1
-        surface_rate: the poles of (39) are this times those of a; 1 in the paper [1/s]
+        error: what it drives to zero: the vector part of q_f* q, or the paper's q_1 - q_1f
     """
 
-    eta: Annotated[float, Meta(gt=0, description="a number greater than the order (Theorems 1 and 3)")] | None = None
-    a: Annotated[tuple[float, ...], Meta(min_length=1, description="a list of numbers, a_1 to a_(order-1) of (39)")] = (
-        1.0,
-    )
-    scaled: ClassVar[Mapping[str, Scaled]] = {
-        **PrescribedTable.scaled,
-        "sign_width": Scaled(1e-3, time=1, order=-1),
-    }
-
-    def physics(self, motion: str) -> Any:
-        """Return `laws.prescribed_time.PrescribedTimeChain`."""
-        from ptsmc_jax.laws.prescribed_time import PrescribedTimeChain
-
-        return PrescribedTimeChain
-
-    def check(self, scenario: Any) -> None:
-        """Theorems 1 and 3, and a surface (39) that is stable."""
-        super().check(scenario)
-        n = scenario.order
-        if not self.eta > n:
-            theorem = "Theorem 1" if n == 2 else "Theorem 3"
-            raise wrong("controller.eta", self.eta, f"greater than plant.order, {n} ({theorem})")
-        if len(self.a) != n - 1:
-            raise wrong("controller.a", self.a, f"a list of plant.order - 1 = {n - 1} numbers")
-        if not formulas.hurwitz(self.a):
-            stable = "such that all roots of p^(n-1) + a_(n-1) p^(n-2) + .. + a_1 are stable (39)"
-            raise wrong("controller.a", self.a, stable)
+    error: Literal["multiplicative", "additive"] = "multiplicative"
 
 
+def common_keys(law: LawTable) -> dict[str, Any]:
+    """The keys that every law has, with this one's values."""
+    names = ("t_f", "disturbance_rate_bound", "disturbance_bound", "initial_estimate_error")
+    return {name: getattr(law, name) for name in names}
+
+
+COMPARISON = {
+    "pd": baselines.PD,
+    "terminal": baselines.Terminal,
+    "fixed_time": baselines.FixedTime,
+    "time_base_pd": time_base.TimeBasePD,
+    "time_base_sliding": time_base.TimeBaseSliding,
+    "scaling": baselines.Scaling,
+    "predefined_time": baselines.PredefinedTime,
+    "super_twisting": baselines.SuperTwisting,
+}
+BASELINES = {kind: table(LawTable, made, kind) for kind, made in COMPARISON.items()}
+_SUMMARY = "A custom law, a class derived from ptsmc_jax.AccelerationLaw; its fields are further keys."
+_NEEDS = ("acceleration", "__call__")
 # by the kind of the plant and the kind of the law, the default first
 LAWS: dict[str, Mapping[str, type[LawTable]]] = {
     "spacecraft": {
-        "prescribed_time": SpacecraftController,
+        "prescribed_time": table(AttitudeTable, prescribed_time.PrescribedTime, "prescribed_time"),
         **BASELINES,
-        "own": OwnAttitudeLaw,
+        "pd": table(LawTable, baselines.QuaternionPD, "pd"),
+        "own": own_kind(OwnAttitudeTable, AccelerationLaw, _NEEDS, _SUMMARY, tuned=True),
     },
-    "chain": {"prescribed_time": ChainController, **BASELINES, "own": OwnLaw},
-    "system": {"prescribed_time": SystemController, **BASELINES, "own": OwnLaw},
+    **{
+        plant: {
+            "prescribed_time": table(PrescribedTable, made, "prescribed_time", body=False),
+            **BASELINES,
+            "own": own_kind(OwnTable, AccelerationLaw, _NEEDS, _SUMMARY, tuned=True),
+        }
+        for plant, made in (
+            ("chain", prescribed_time.PrescribedTimeChain),
+            ("system", prescribed_time.PrescribedTime),
+        )
+    },
 }

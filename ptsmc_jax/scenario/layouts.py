@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 from ptsmc_jax.scenario import dispersion_tables as dt
 from ptsmc_jax.scenario import own_devices
-from ptsmc_jax.scenario.command_filter_tables import COMMAND_FILTERS
+from ptsmc_jax.scenario.device_tables import COMMAND_FILTERS
 from ptsmc_jax.scenario.spacecraft_scenario import SpacecraftScenario
 from ptsmc_jax.scenario.state_scenario import ChainScenario, SystemScenario
 from ptsmc_jax.scenario.tables import Scenario
@@ -45,6 +45,6 @@ DISPERSIONS: dict[str, Kinds] = {
     "star_tracker_outage": {"uniform": dt.Outage},
     "wheel_failure": {"uniform": dt.Failure},
     "timing_jitter": {"uniform": dt.Jitter},
-    "own": {"own": own_devices.OwnDraw},
+    "own": {"own": own_devices.OWN_DRAW},
     "x0": {"uniform": dt.UniformState, "normal": dt.NormalState},
 }

@@ -11,8 +11,9 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
+from ptsmc_jax.declare import Scaled
 from ptsmc_jax.scenario.errors import ScenarioError
-from ptsmc_jax.scenario.values import Scaled, Table
+from ptsmc_jax.scenario.values import Table
 
 PAPER_INERTIA = (10.0, 12.0, 14.0)  # of the paper's spacecraft [kg m^2]
 PAPER_TIMES = (30.0, 40.0)  # range of t_f in the paper's cases of a spacecraft [s]
@@ -40,10 +41,11 @@ class Scales(NamedTuple):
     order: int = 2  # of the plant
     inputs: int = 3
 
-    def of(self, scaled: Scaled) -> Any:
-        """Return a number of the paper's case, or a tuple of numbers, in these units."""
+    def of(self, scaled: Scaled, table: Any = None) -> Any:
+        """Return a number of the paper's case, or a tuple of numbers, in these units; table: its power follows from."""
+        power = scaled.time(table) if callable(scaled.time) else scaled.time
         with np.errstate(all="ignore"):
-            time = np.float64(self.time) ** (scaled.time + scaled.order * self.order)
+            time = np.float64(self.time) ** (power + scaled.order * self.order)
             factor = float(np.float64(self.inertia) ** scaled.inertia * time)
         if not 0.0 < factor < math.inf:
             raise ScenarioError(
@@ -85,7 +87,7 @@ def with_defaults(table: Any, units: Scales) -> Any:
     for key in table.__struct_fields__:
         value = getattr(table, key)
         if value is None and key in table.scaled:
-            changes[key] = units.of(table.scaled[key])
+            changes[key] = units.of(table.scaled[key], table)
         elif isinstance(value, Table):
             changes[key] = with_defaults(value, units)
         elif isinstance(value, tuple) and value and isinstance(value[0], Table):
@@ -104,6 +106,7 @@ class Design(NamedTuple):
     pole: float  # p [1/s]
     observer: float  # l [N m s], or l [1/s] without a body
     width: float  # of the boundary layer, in units of s
+    reaching: float  # K1 over the pole, see `Scenario.reaching`
     time: float  # t_f in the units of the paper's case, see `Scales`
 
     @property
@@ -163,7 +166,7 @@ def _design(scenario: Any, pole: float, eta: float, observer: float) -> Design:
     # on three axes N K2 / 2 = 3 residual: the boundary layer adds a quarter to the gain p; it is thicker than the noise
     residual = change / rate
     width = max(12.0 * residual / pole, 2.0 * math.hypot(velocity, pole * position)) or 1e-3 * pole
-    return Design(eta, pole, rate * scenario.mean_inertia, width, scales(scenario).time)
+    return Design(eta, pole, rate * scenario.mean_inertia, width, scenario.reaching, scales(scenario).time)
 
 
 def _limits(scenario: Any) -> _Limits:

@@ -1,64 +1,35 @@
-"""The tables of a scenario file for sensors, and for draws, of one's own."""
+"""The tables of scenario files for custom sensors and draws."""
 
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
+from ptsmc_jax.devices import own_sensors
+from ptsmc_jax.dispersions.base import Draw
+from ptsmc_jax.numerics.draws import DISTRIBUTIONS
+from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.scenario.errors import ScenarioError, show
-from ptsmc_jax.scenario.own import Code, Own, build
-from ptsmc_jax.scenario.values import Kinds, Table
+from ptsmc_jax.scenario.own import own_kind
+from ptsmc_jax.scenario.schema import PartTable
+from ptsmc_jax.scenario.values import Kinds
 
 
-class OwnSensors(Own, Table, kw_only=True, frozen=True):
-    """Sensors of one's own, a class derived from ptsmc_jax.SampledSensor; its fields are further keys.
+class SensorTable(PartTable, frozen=True):
+    """Custom sensors. They take the place of what [hardware] says of noise, and of [filter]."""
 
-    They take the place of what [hardware] says of noise, and of [filter].
-    """
-
-    kind: Literal["own"] = "own"
-    code: Code
-    needs: ClassVar[tuple[str, ...]] = ("see",)
-    tuned: ClassVar[bool] = True
     prefix: ClassVar[str] = "sensors_"
 
-    @classmethod
-    def base(cls) -> type:
-        """`devices.own_sensors.SampledSensor`."""
-        from ptsmc_jax.devices.own_sensors import SampledSensor
-
-        return SampledSensor
-
     def build(self, model: Any) -> Any:
-        """What the code names, as the rollout asks for it."""
-        from ptsmc_jax.devices.own_sensors import OwnSensors as Physics
-        from ptsmc_jax.numerics.pytrees import vector
-
-        made = build(self, model=model)
+        """Return the sensors as the rollout asks for them."""
+        made = self.part(model=model)
         _check_count(made, "sensors", "draws", 0)
-        type(made).tunable = tuple(name.removeprefix(self.prefix) for name in self.gains)
-        return Physics(made, vector(1.0))
+        return own_sensors.OwnSensors(made, vector(1.0))
 
 
-SENSORS: Kinds = {"own": OwnSensors}  # those that are built in are keys of [hardware] and [filter]
-
-
-class OwnDraw(Own, Table, kw_only=True, frozen=True):
-    """Anything of one's own, a class derived from ptsmc_jax.Draw; its fields are further keys."""
-
-    kind: Literal["own"] = "own"
-    code: Code
-    needs: ClassVar[tuple[str, ...]] = ("at",)
-
-    @classmethod
-    def base(cls) -> type:
-        """`dispersions.base.Draw`."""
-        from ptsmc_jax.dispersions.base import Draw
-
-        return Draw
+class DrawTable(PartTable, frozen=True):
+    """Custom random quantities."""
 
     def build(self) -> Any:
-        """What the code names."""
-        from ptsmc_jax.numerics.draws import DISTRIBUTIONS
-
-        made = build(self)
+        """Return the draw."""
+        made = self.part()
         _check_count(made, "dispersion.own", "count", 1)
         if made.drawn not in DISTRIBUTIONS:
             raise _unfit(made, "dispersion.own", "drawn", '"normal" or "uniform"')
@@ -75,3 +46,15 @@ def _check_count(made: Any, table: str, field: str, least: int) -> None:
 def _unfit(made: Any, table: str, field: str, must: str) -> ScenarioError:
     names = f"{table}.code names a class whose {field} is {show(getattr(made, field))}"
     return ScenarioError(f"{names}, but must be {must}")
+
+
+SENSORS: Kinds = {  # those that are built in are keys of [hardware] and [filter]
+    "own": own_kind(
+        SensorTable, own_sensors.SampledSensor, ("see",), tuned=True,
+        summary="Custom sensors, a class derived from ptsmc_jax.SampledSensor; its fields are further keys. They take "
+        "the place of what [hardware] says of noise, and of [filter].",
+    )
+}  # fmt: skip
+OWN_DRAW: Any = own_kind(
+    DrawTable, Draw, ("at",), "Any custom draw, a class derived from ptsmc_jax.Draw; its fields are further keys."
+)

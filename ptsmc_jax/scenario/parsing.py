@@ -254,11 +254,11 @@ def _own(name: str, raw: Mapping[str, Any], struct: Any, context: Context) -> Ta
             raise ScenarioError(f"{name}.code is {brief(code)}: {error}") from None
     if context.run or not isinstance(code, str):
         return _fields(name, raw, own.read(struct, name, code), context)
-    own_keys = {key: value for key, value in raw.items() if key in struct.__struct_fields__}
+    own_keys = {key: value for key, value in raw.items() if key in struct.__struct_fields__ and key != "rest"}
     rest = {key: value for key, value in raw.items() if key not in own_keys}
     for key in (key for key, value in rest.items() if _not_finite(value) is not None):
         raise wrong(f"{name}.{key}", rest[key], "made of finite numbers")
-    return _fields(name, {**own_keys, "rest": rest}, own.waiting(struct), context)
+    return msgspec.structs.replace(_fields(name, own_keys, struct, context), rest=rest)
 
 
 def _sum(name: str, raw: Mapping[str, Any], kinds: Kinds, context: Context) -> Table:

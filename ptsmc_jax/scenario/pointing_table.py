@@ -6,8 +6,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from ptsmc_jax.declare import Scaled
 from ptsmc_jax.scenario.errors import wrong
-from ptsmc_jax.scenario.values import ABSENT, NotNegative, ResolvedPositive, Scaled, Table, Three
+from ptsmc_jax.scenario.values import ABSENT, NotNegative, ResolvedPositive, Table, Three
 from ptsmc_jax.simulation import catalogues
 
 LONGEST_STEP = 0.02  # of the continuous loop after the hand-over, over t_f, see `clock`

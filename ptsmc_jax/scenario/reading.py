@@ -6,10 +6,11 @@ from typing import Any
 
 import msgspec
 
+from ptsmc_jax.declare import Scaled
 from ptsmc_jax.scenario import checks, free_gains, layouts, mission, own, parsing
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario, check_scenario
-from ptsmc_jax.scenario.values import Scaled, Table
+from ptsmc_jax.scenario.values import Table
 
 AFTER = Scaled(10.0, time=1)  # from t_f to the end of a run [s]
 
@@ -69,7 +70,7 @@ def resolve(scenario: Scenario) -> Scenario:
     if loop.t_end is None:
         loop = msgspec.structs.replace(loop, t_end=law.t_f + max(units.of(AFTER), loop.window))
     scenario = msgspec.structs.replace(scenario, **{**filled, "loop": loop})
-    scenario.check_modes()
+    scenario.check_shapes()
     if loop.settling_angle is None:
         loop = msgspec.structs.replace(loop, settling_angle=scenario.usual_settling())
         scenario = msgspec.structs.replace(scenario, loop=loop)

@@ -8,8 +8,8 @@ coordinates; their ends are here.
 import math
 from typing import Any
 
+from ptsmc_jax.declare import Scaled
 from ptsmc_jax.scenario import mission
-from ptsmc_jax.scenario.values import Scaled
 from ptsmc_jax.theory import borders
 
 LEFT = 5e-5  # share of the observer's error that a dead-beat one leaves after a period
@@ -62,7 +62,7 @@ def largest_rate(scenario: Any) -> float:
 
 def quiet(scenario: Any) -> tuple[float, float]:
     """Return widths of the boundary layer to search without noise, in the units of s."""
-    width = mission.scales(scenario).of(type(scenario.controller).scaled.get("sign_width", Scaled(1e-3)))
+    width = mission.scales(scenario).of(scenario.controller.scaled.get("sign_width", Scaled(1e-3)))
     return QUIET[0] * width, QUIET[1] * width
 
 

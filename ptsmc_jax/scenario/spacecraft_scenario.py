@@ -9,6 +9,7 @@ import numpy as np
 from msgspec import Meta
 
 from ptsmc_jax import formulas
+from ptsmc_jax.declare import Scaled
 from ptsmc_jax.scenario import attitude_keys, dispersion_tables, errors, tables
 from ptsmc_jax.scenario.device_tables import FILTERS, WHEELS, FilterTable, Hardware, NoFilter, WheelLimits
 from ptsmc_jax.scenario.disturbance_tables import DISTURBANCES
@@ -19,7 +20,7 @@ from ptsmc_jax.scenario.own_devices import SENSORS
 from ptsmc_jax.scenario.pointing_table import Pointing
 from ptsmc_jax.scenario.reference_tables import REFERENCES, Initial
 from ptsmc_jax.scenario.tables import Loop, Scenario, Tune
-from ptsmc_jax.scenario.values import Inertia, Kinds, NotNegative, Positive, Scaled, Table, Three
+from ptsmc_jax.scenario.values import Inertia, Kinds, NotNegative, Positive, Table, Three
 from ptsmc_jax.simulation.catalogues import CATALOGUE
 
 # of a law to compare with, at most so many steps of 0.025 rad in two periods: a run that turns faster is marked
@@ -256,7 +257,7 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
                 except ValueError as error:
                     raise ScenarioError(f"spacecraft.{key} is {errors.brief(value)}: {error}") from None
 
-    def check_modes(self) -> None:
+    def check_shapes(self) -> None:
         """Modes that a body can have."""
         if self.flexible is not None:
             self.flexible.check(self.true_inertia)
@@ -327,7 +328,7 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
         """How fast start, reference, law, wheels and flexible modes move the body [rad/s], by key."""
         found = {**self._turning, **self.reference.frequencies()}
         key, rate = self.controller.turning(t_f)
-        if not self.controller.prescribed:
+        if not self.controller.law.prescribed:
             rate = min(rate, 0.5 * BASELINES * 0.025 / self.loop.period)
         found[key] = rate
         for key, rate in self._nutation(setup).items():

@@ -14,7 +14,7 @@ from ptsmc_jax.scenario.law_tables import LAWS
 from ptsmc_jax.scenario.observer_tables import OBSERVERS
 from ptsmc_jax.scenario.own_devices import SENSORS
 from ptsmc_jax.scenario.tables import Loop, Scenario, Tune
-from ptsmc_jax.scenario.values import Kind, Kinds, Numbers, Table
+from ptsmc_jax.scenario.values import Kinds, Numbers, Table
 from ptsmc_jax.simulation.catalogues import STATE_CATALOGUE
 
 _PAPERS = "prescribed_time"
@@ -100,18 +100,18 @@ class StateScenario(Scenario, frozen=True, kw_only=True):
         noises = getattr(self.hardware, "state_noise", None) or (0.0,)
         return max(2e-4 * (self.start_size() or 5.0), 5.0 * max(noises[: self.inputs]))
 
-    def check_plant(self) -> None:
-        """Refuse lists that are not as long as there are inputs, or states."""
-        for place, table in {**self.placed_terms, "observer": self.observer}.items():
-            self._check_each(place, table)
-        self.devices.check(self)
-
-    def _check_each(self, name: str, table: Kind) -> None:
+    def check_shapes(self) -> None:
+        """Refuse lists that are not as long as there are inputs."""
         m = self.inputs
-        for key in (*(key for key, default in table.scaled.items() if default.each), *table.lists):
-            value = getattr(table, key)
-            if len(value) != m:
-                raise wrong(f"{name}.{key}", value, f"a list of {m} number{'s' * (m > 1)}, one for each input")
+        for place, table in {**self.placed_terms, "observer": self.observer}.items():
+            for key in table.each:
+                value = getattr(table, key)
+                if value is not None and len(value) != m:
+                    raise wrong(f"{place}.{key}", value, f"a list of {m} number{'s' * (m > 1)}, one for each input")
+
+    def check_plant(self) -> None:
+        """Refuse lists that are not as long as there are states."""
+        self.devices.check(self)
 
     def start(self) -> Any:
         """The state x0."""
@@ -137,8 +137,8 @@ class ChainScenario(StateScenario, frozen=True, kw_only=True):
             raise wrong("plant.x0", plant.x0, "a list of at least 2 numbers")
         x0 = [*(5.0, 3.0, 2.0)[:order], *[0.0] * (order - 3)]
         poles_at_minus_one = [float(math.comb(order - 1, i)) for i in range(order - 1)]  # (p + 1)^(n-1); order 2: (9)
-        papers = {"eta": order + 1.0, "a": poles_at_minus_one}
-        return {"plant": {"x0": x0, "order": order}, "controller": papers if law == _PAPERS else {"t_f": 5.0}}
+        papers = {"eta": order + 1.0, "a": poles_at_minus_one} if law == _PAPERS else {}
+        return {"plant": {"x0": x0, "order": order}, "controller": {"t_f": 5.0, **papers}}
 
     @property
     def inputs(self) -> int:
@@ -178,10 +178,10 @@ class SystemScenario(StateScenario, frozen=True, kw_only=True):
 
     @classmethod
     def fallback(cls, plant: Any, given: Collection[str], law: object) -> dict[str, Mapping[str, Any]]:
-        """The paper's t_f of a chain, for every law but the paper's. Raises ScenarioError where x0 has no halves."""
+        """The paper's t_f of a chain. Raises ScenarioError where x0 has no halves."""
         if len(plant.x0) % 2:
             raise wrong("plant.x0", plant.x0, "a list of x_1 followed by x_2, as many numbers each")
-        return {"controller": {} if law == _PAPERS else {"t_f": 5.0}}
+        return {"controller": {"t_f": 5.0}}
 
     @property
     def inputs(self) -> int:

@@ -10,6 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import msgspec
 from msgspec import Meta
 
+from ptsmc_jax.declare import Scaled
 from ptsmc_jax.scenario import keys
 from ptsmc_jax.scenario.device_tables import NoFilter
 from ptsmc_jax.scenario.errors import ScenarioError
@@ -23,7 +24,6 @@ from ptsmc_jax.scenario.values import (
     Positive,
     Quantile,
     ResolvedPositive,
-    Scaled,
     Table,
     Truth,
 )
@@ -330,8 +330,8 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
     def check_body(self) -> None:
         """Raise ScenarioError if there is no such body: before defaults follow from its inertia."""
 
-    def check_modes(self) -> None:
-        """Raise ScenarioError if no body has such modes: before gains are designed for them."""
+    def check_shapes(self) -> None:
+        """Raise ScenarioError if lists have other lengths than the plant needs: before defaults follow from them."""
 
     def check_plant(self) -> None:
         """Raise ScenarioError where keys of the plant contradict each other."""

@@ -1,10 +1,12 @@
 """What a scenario file is made of: the table, and types of values with their ranges and what is allowed in words."""
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import msgspec
 from msgspec import Meta
+
+from ptsmc_jax.declare import Scaled
 
 Number = Annotated[float, Meta(description="a number")]
 Positive = Annotated[float, Meta(gt=0, description="a number greater than 0")]
@@ -45,19 +47,6 @@ else:
 MOST_STEPS = 200_000  # of a run
 
 
-class Scaled(NamedTuple):
-    """A default in the paper's case, with the powers of inertia and time in its unit; see `mission`.
-
-    The unit of a disturbance on a chain of order n has the power -n of time, which is `order` = -1.
-    """
-
-    value: Any
-    inertia: float = 0.0
-    time: float = 0.0
-    order: float = 0.0
-    each: bool = False  # one number for each input
-
-
 class Table(msgspec.Struct, kw_only=True, frozen=True, omit_defaults=False):
     """A table of a scenario file."""
 
@@ -66,20 +55,6 @@ class Table(msgspec.Struct, kw_only=True, frozen=True, omit_defaults=False):
     def __repr__(self) -> str:
         keys = {key: getattr(self, key) for key in self.__struct_fields__}
         return f"{type(self).__name__}({', '.join(f'{key}={v!r}' for key, v in keys.items() if v is not None)})"
-
-
-class Kind(Table, frozen=True):
-    """A kind of a table, which may have lists of one number for each input of the plant."""
-
-    def written(self, scenario: Any) -> Any:
-        """With its keys that follow from others of a checked scenario."""
-        return self
-
-    lists: ClassVar[tuple[str, ...]] = ()  # keys with one number for each input, besides those in `scaled`
-
-    def filled(self, scenario: Any) -> Any:
-        """Return the table with the defaults that follow from other keys, besides those in `scaled`."""
-        return self
 
 
 Kinds = Mapping[str, type[Table]]  # of a table by name, the default first

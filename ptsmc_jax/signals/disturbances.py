@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ptsmc_jax.declare import Scaled, number
 from ptsmc_jax.numerics import attitude
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
 from ptsmc_jax.plants.rigid_body import AttitudeState
@@ -31,6 +32,14 @@ class Disturbance:
         """Return the largest angular frequency [rad/s], for the choice of the integration step. 0: no limit."""
         return 0.0
 
+    def impulse(self, end: float) -> float:
+        """Return a bound on its integral until `end` [s], in N m s; 0: it stays small however long it acts."""
+        return 0.0
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return the largest size and rate of each component (m,) [N m, N m/s]; None: they are not known."""
+        return None
+
     def on_body(self, inertia: Float[Array, "3 3"]) -> Any:
         """Return the disturbance of a body with this inertia [kg m^2]."""
         return self
@@ -41,11 +50,24 @@ class Disturbance:
 class Constant(Disturbance):
     """A constant disturbance. The value zero means no disturbance."""
 
-    value: Leaf  # (m,) [N m]
-    drawn: ClassVar[Mapping[str, str]] = {"amplitude": "value"}
+    amplitude: Leaf = number(
+        Scaled(0.01, inertia=1, order=-1, each=True), unit="unit of d", each=True,
+        meaning="of each component; default: 0.01 each, scaled to the mission",
+    )  # fmt: skip
+    drawn: ClassVar[Mapping[str, str]] = {"amplitude": "amplitude"}
 
-    def __call__(self, t: Scalar, x: Any = None) -> Float[Array, " m"]:
-        return self.value
+    def __call__(self, t: Time, x: Any = None) -> Float[Array, " m"]:
+        """Disturbance at t [s], (m,) [N m]."""
+        return self.amplitude
+
+    def impulse(self, end: float) -> float:
+        """It acts all the time [N m s]."""
+        return float(np.linalg.norm(np.abs(self.amplitude) * end))
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Its size (m,) [N m]; it does not change."""
+        size = np.abs(self.amplitude)
+        return size, np.zeros_like(size)
 
 
 @pytree
@@ -70,42 +92,76 @@ def _sin_cos_of_sum(angle: Array, phase: Any) -> tuple[Array, Array]:
 @pytree
 @dataclass(frozen=True)
 class Sinusoid(Disturbance):
-    """A sinusoid for each axis: bias + amplitude sin(frequency t + phase)."""
+    """The disturbance bias + amplitude sin(frequency t + phase), component by component."""
 
-    amplitude: Leaf  # (m,) [N m]
-    frequency: Leaf  # (m,) [rad/s]
-    phase: Leaf  # (m,) [rad]
-    bias: Leaf  # (m,) [N m]
+    amplitude: Leaf = number(
+        Scaled(0.01, inertia=1, order=-1, each=True), unit="unit of d", each=True,
+        meaning="of each component; default: 0.01 each, scaled to the mission",
+    )  # fmt: skip
+    frequency: Leaf = number(
+        Scaled(0.1, time=-1, each=True), unit="rad/s", each=True,
+        meaning="of each component; default: scaled to the mission",
+    )  # fmt: skip
+    phase: Leaf = number(Scaled(0.0, each=True), unit="rad", each=True, meaning="of each component")
+    bias: Leaf = number(Scaled(0.0, each=True), unit="unit of d", each=True, meaning="constant part of each component")
     drawn: ClassVar[Mapping[str, str]] = {"phase": "phase", "amplitude": "amplitude"}
 
     def __call__(self, t: Scalar, x: Any = None) -> Float[Array, " m"]:
         sine, _ = _sin_cos_of_sum(self.frequency * t, self.phase)
         return self.bias + self.amplitude * sine
 
+    def fastest(self) -> float:
+        """Its fastest component [rad/s]."""
+        return float(np.max(np.abs(self.frequency)))
+
+    def impulse(self, end: float) -> float:
+        """Half a period at most, and the constant part [N m s]."""
+        lasting = np.minimum(end, 2.0 / np.maximum(np.abs(self.frequency), 1e-12))
+        return float(np.linalg.norm(np.abs(self.amplitude) * lasting) + np.linalg.norm(self.bias) * end)
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """|bias| + |amplitude| and |amplitude frequency| of each component (m,) [N m, N m/s], at any phase."""
+        size = np.abs(self.amplitude)
+        return np.abs(self.bias) + size, size * np.abs(self.frequency)
+
 
 @pytree
 @dataclass(frozen=True)
 class GravityGradient(Disturbance):
-    """Gravity-gradient torque 3 n^2 c x J c on a circular orbit.
+    """The gravity gradient of a circular orbit, on the true body; the attitude key is that of the orbit's frame.
+
+    The frame's z is along the orbit's normal, its x points to where the phase counts from. The torque is 3 n^2 c x J c,
+    c the unit vector to the planet in body axes.
 
     c is the unit vector to the planet in body axes, which depends on the true attitude. Wie, Space Vehicle Dynamics and
     Control (2008), eq. (6.128).
     """
 
-    inertia: Leaf  # (3, 3) inertia J of the true body [kg m^2]
-    orbit: Leaf  # (4,) quaternion of the orbit frame: z is the orbit normal, x the direction of phase 0 [-]
-    rate: Leaf  # orbital rate n [rad/s]
-    phase: Leaf  # orbital phase at t = 0 [rad]
+    inertia: Leaf  # (3, 3) of the true body [kg m^2]
+    orbit: Leaf  # (4,) quaternion of the orbit's frame: z along its normal, x to where the phase counts from
+    orbit_rate: Leaf = number(1.1e-3, above=0.0, at_most=1.0, unit="rad/s", meaning="mean motion n")
+    phase: Leaf = number(0.0, unit="rad", meaning="where on the orbit the run starts")
     drawn: ClassVar[Mapping[str, str]] = {"phase": "phase"}
 
-    def __call__(self, t: Scalar, x: AttitudeState) -> Float[Array, "3"]:
-        sine, cosine = _sin_cos_of_sum(self.rate * t, self.phase)
+    def __call__(self, t: Time, x: AttitudeState) -> Float[Array, "3"]:
+        """Torque at t [s] in the state x, (3,) [N m]."""
+        sine, cosine = _shifted(self.orbit_rate * t, self.phase)
         radial = jnp.stack([cosine, sine, jnp.zeros_like(sine)])
         c = attitude.rotate(attitude.multiply(attitude.conjugate(x.q), self.orbit), radial)
-        return 3.0 * self.rate**2 * attitude.cross(c, self.inertia @ c)
+        return 3.0 * self.orbit_rate**2 * attitude.cross(c, self.inertia @ c)
 
     def on_body(self, inertia: Float[Array, "3 3"]) -> Any:
         return replace(self, inertia=inertia)
+
+
+@dataclass(frozen=True)
+class RandomWalk(Disturbance):
+    """A disturbance that wanders from zero, a new step each period; sampled loop only."""
+
+    density: Leaf = number(
+        Scaled(1e-4, inertia=1, time=-0.5, order=-1, each=True), at_least=0.0, unit="unit of d/sqrt(s)", each=True,
+        meaning="of the walk's white noise, for each component; default: 1e-4 each, scaled to the mission",
+    )  # fmt: skip
 
 
 @pytree
@@ -173,7 +229,7 @@ def with_values(disturbance: Any, quantity: Literal["phase", "amplitude"], new: 
 def bias(disturbance: Any, inputs: int) -> Float[Array, " m"]:
     """Return the `Bias` of a disturbance, (inputs,) [N m]; zeros if it has none."""
     last = terms(disturbance)[-1]
-    return last.value if isinstance(last, Bias) else jnp.zeros(inputs)
+    return last.amplitude if isinstance(last, Bias) else jnp.zeros(inputs)
 
 
 def with_bias(disturbance: Any, value: Float[Array, " m"]) -> Sum:

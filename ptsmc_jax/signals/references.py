@@ -5,12 +5,14 @@ A reference is a function from the time to a `Target`. `Reference` is the base o
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from ptsmc_jax.declare import Scaled, number
 from ptsmc_jax.numerics import attitude
 from ptsmc_jax.numerics.pytrees import Function, Leaf, Scalar, pytree
 
@@ -27,34 +29,8 @@ class Target(NamedTuple):
         return attitude.vector_rates(self.q, self.w, self.w_dot)
 
 
-@pytree
-@dataclass(frozen=True)
-class Fixed:
-    """A constant reference attitude."""
-
-    q: Leaf  # (4,) unit quaternion
-
-    def __call__(self, t: Scalar) -> Target:
-        """Return the target at the time t [s]."""
-        return Target(self.q, jnp.zeros(3), jnp.zeros(3))
-
-
-@pytree
-@dataclass(frozen=True)
-class Spin:
-    """A reference that rotates at a constant rate: q_f(t) = q(0) exp(w t)."""
-
-    q: Leaf  # (4,) attitude at t = 0 [-]
-    rate: Leaf  # (3,) rate in reference axes [rad/s]
-
-    def __call__(self, t: Scalar) -> Target:
-        """Return the target at the time t [s]."""
-        q = attitude.multiply(self.q, attitude.from_rotation_vector(self.rate * t))
-        return Target(q, self.rate, jnp.zeros(3))
-
-
-def target_of(path: Callable[[Scalar], Float[Array, "4"]], t: Scalar) -> Target:
-    """Return the target at the time t [s] for a path, a function from the time to a unit quaternion.
+def target_of(path: Callable[[Time], Float[Array, "4"]], t: Time) -> Target:
+    """Target at t [s] of an attitude path, a unit quaternion as a function of time; its derivatives are exact.
 
     Rates are exact, by automatic differentiation: w = 2 vec(q* q') and w' = 2 vec(q* q''), because the product
     q*' q' = |q'|^2 has no vector part.
@@ -93,7 +69,8 @@ class TurningFunction(Function):
 class Reference:
     """Base of references that define an attitude as a function of time, also of custom ones: q_f(t) = q attitude(t)."""
 
-    q: Leaf  # (4,) constant attitude that the motion starts from [-]
+    q: Leaf  # (4,) the attitude that it turns from
+    paced_by: ClassVar[str] = "code"  # the key that says how fast it turns and changes
 
     def attitude(self, t: Scalar) -> Float[Array, "4"]:
         """Return the unit quaternion (4,) [-] at the time t [s]. It must be twice differentiable for the rates."""
@@ -110,12 +87,51 @@ class Reference:
 
 @pytree
 @dataclass(frozen=True)
-class Swing(Reference):
-    """A reference that oscillates about an attitude: q_f(t) = q exp(r(t)), r = amplitude sin(frequency t + phase)."""
+class Fixed(Reference):
+    """An attitude to be held."""
 
-    amplitude: Leaf  # (3,) amplitude of the rotation vector r for each axis [rad]
-    frequency: Leaf  # (3,) [rad/s]
-    phase: Leaf  # (3,) [rad]
+    def __call__(self, t: Time) -> Target:
+        """Target at t [s]."""
+        return Target(self.q, jnp.zeros(3), jnp.zeros(3))
+
+
+@pytree
+@dataclass(frozen=True)
+class Spin(Reference):
+    """The attitude at t = 0, turning from then on at a constant body rate: q_f(t) = q(0) exp(w t)."""
+
+    rate: Leaf = number((0.0, 0.0, 0.0), unit="rad/s", meaning="of the reference, its own axes")
+    paced_by: ClassVar[str] = "rate"
+
+    def __call__(self, t: Time) -> Target:
+        """Target at t [s]."""
+        turned = attitude.multiply(self.q, attitude.from_rotation_vector(self.rate * t))
+        return Target(turned, self.rate, jnp.zeros(3))
+
+    def fastest(self) -> float:
+        """Its rate [rad/s]."""
+        return float(np.linalg.norm(self.rate))
+
+
+@pytree
+@dataclass(frozen=True)
+class Swing(Reference):
+    """On top of the attitude, the rotation vector r = amplitude sin(frequency t + phase), axis by axis.
+
+    q_f(t) = q exp(r(t)).
+    """
+
+    amplitude: Leaf = number((0.1, 0.1, 0.1), unit="rad", meaning="of the rotation vector, per axis")
+    frequency: Leaf = number(
+        Scaled((0.1, 0.1, 0.1), time=-1), unit="rad/s", meaning="per axis; default: 0.1 each, scaled to the mission"
+    )
+    phase: Leaf = number((0.0, 0.0, 0.0), unit="rad", meaning="per axis")
+    paced_by: ClassVar[str] = "frequency"
+
+    def fastest(self) -> float:
+        """Its largest rate, and the fastest axis [rad/s]."""
+        turning = float(np.linalg.norm(np.multiply(self.amplitude, self.frequency)))
+        return turning + float(np.max(np.abs(self.frequency)))
 
     def attitude(self, t: Scalar) -> Float[Array, "4"]:
         return attitude.from_rotation_vector(self.amplitude * jnp.sin(self.frequency * t + self.phase))
@@ -124,13 +140,21 @@ class Swing(Reference):
 @pytree
 @dataclass(frozen=True)
 class Slew(Reference):
-    """A rotation about a fixed axis from rest to rest: q_f(t) = q exp(f(t / duration) turn).
+    """From the attitude, at rest, to another one, at rest, about one axis: q_f(t) = q exp(share(t / duration) turn).
 
     The fraction f(x) = 10 x^3 - 15 x^4 + 6 x^5 rises from 0 to 1, with zero first and second derivatives at both ends.
     """
 
-    turn: Leaf  # (3,) rotation vector of the whole slew [rad]
-    duration: Leaf  # [s]
+    turn: Leaf  # (3,) rotation vector from the attitude at t = 0 to that from t = duration on [rad]
+    duration: Leaf = number(
+        Scaled(30.0, time=1), above=0.0, unit="s", meaning="how long it takes; default: 30, scaled to the mission"
+    )
+    paced_by: ClassVar[str] = "duration"
+
+    def fastest(self) -> float:
+        """The largest rate of the quintic, and the motion's own time [rad/s]."""
+        turning = 1.875 * float(np.linalg.norm(self.turn))
+        return (turning + 2.0 * np.pi) / float(self.duration)
 
     def attitude(self, t: Scalar) -> Float[Array, "4"]:
         x = jnp.clip(t / self.duration, 0.0, 1.0)

@@ -324,8 +324,8 @@ ORBIT = disturbances.GravityGradient(PARTS.plant.inertia, vector([0.0, 0.0, 0.0,
 def test_phases_are_uniform_and_independent():
     still = disturbances.Constant(vector([0.1, 0.2, 0.3]))
     run = replace(PARTS, disturbance=disturbances.Sum((SINE, still, ORBIT, SINE)))
-    got = parts_of_trials(Dispersion({"disturbance_phase": uniform_phases(7)}), run).disturbance.terms
-    np.testing.assert_array_equal(got[1].value, np.broadcast_to(still.value, (TRIALS, 3)))
+    got = many_drawn(Dispersion({"disturbance_phase": phases(7)}), run).disturbance.terms
+    np.testing.assert_array_equal(got[1].value, np.broadcast_to(still.amplitude, (TRIALS, 3)))
     turns = np.column_stack(
         [
             np.asarray(got[0].phase) - np.asarray(SINE.phase),

@@ -11,12 +11,11 @@ from scipy.integrate import quad, solve_ivp
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
-from ptsmc_jax.laws import baselines
+from ptsmc_jax.laws import baselines, time_base
 from ptsmc_jax.laws.base import Sample
 from ptsmc_jax.laws.kinematics import MultiplicativeKinematics
 from ptsmc_jax.numerics import attitude, guards
 from ptsmc_jax.plants import rigid_body
-from ptsmc_jax.scenario import baseline_tables
 from ptsmc_jax.signals import disturbances, references
 from ptsmc_jax.simulation import clock
 from tests import helpers
@@ -192,16 +191,14 @@ def test_sign_width_is_the_boundary_layer_and_0_the_discontinuous_sign(name):
 def test_largest_body_rate_of_a_sliding_law_is_its_surface_rate_at_180_degrees(name):
     """At |v| = 1 the body rotates at the rate 2 |v'|."""
     law = LAWS[name]
-    tables = {"terminal": baseline_tables.TerminalController, "fixed_time": baseline_tables.FixedTimeController}
-    gains = {gain: float(getattr(law, gain)) for gain in law.tunable if gain != "t_f"}
     rate: Any = brentq(lambda v_dot: float(surface(law, vector([1.0]), vector([v_dot]))[0]), -10.0, -1e-3, xtol=1e-12)
-    assert tables[name](**gains).turning(10.0)[1] == pytest.approx(-2.0 * rate, rel=1e-9)
+    assert law.turning(10.0)[1] == pytest.approx(-2.0 * rate, rel=1e-9)
 
 
 def test_largest_body_rates_of_pd_and_time_base_laws_equal_closed_forms():
     """For PD by energy, theta'^2 / 2 = k_p (integral of sin(theta / 2)); for a time base by the rate of the quintic."""
     energy = 0.4 * quad(lambda angle: np.sin(angle / 2.0), 0.0, np.pi)[0]
-    assert baseline_tables.PDController(k_p=0.4).turning(7.0)[1] == pytest.approx(np.sqrt(2.0 * energy), rel=1e-12)
-    largest = np.polynomial.Polynomial([0.0, 0.0, 0.0, 10.0, -15.0, 6.0]).deriv()(np.linspace(0.0, 1.0, 1001)).max()
-    for table in (baseline_tables.TimeBasePDController(), baseline_tables.TimeBaseSlidingController()):
-        assert table.turning(7.0) == ("controller.t_f", pytest.approx(largest * np.pi / 7.0, rel=1e-12))
+    assert baselines.PD(**COMMON, k_p=vector(0.4)).turning(7.0)[1] == pytest.approx(np.sqrt(2.0 * energy), rel=1e-12)
+    slope = np.polynomial.Polynomial([0.0, 0.0, 0.0, 10.0, -15.0, 6.0]).deriv()(np.linspace(0.0, 1.0, 1001)).max()
+    for law in (time_base.TimeBasePD(**COMMON), time_base.TimeBaseSliding(**COMMON)):
+        assert law.turning(7.0) == ("t_f", pytest.approx(slope * np.pi / 7.0, rel=1e-12))

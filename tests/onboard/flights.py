@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from ptsmc_jax.scenario.baseline_tables import BASELINES
+from ptsmc_jax.scenario.law_tables import BASELINES
 from tests.tree import ROOT
 
 LOOP = {"mode": "sampled", "period": 0.1, "t_end": 6.5}

@@ -1,21 +1,18 @@
 import copy
 import math
 import re
+from collections.abc import Mapping
 
 import pytest
 
-from ptsmc_jax.scenario import errors, from_tables, parsing
+from ptsmc_jax.scenario import errors, from_tables, layouts, parsing
 from ptsmc_jax.scenario.attitude_keys import Attitude
-from ptsmc_jax.scenario.baseline_record import BaselineTable
-from ptsmc_jax.scenario.command_filter_tables import CommandFilter
-from ptsmc_jax.scenario.device_tables import Actuators, AxesWheels, PyramidWheels, WheelLimits
-from ptsmc_jax.scenario.dispersion_tables import Dispersion, StateDispersion
-from ptsmc_jax.scenario.disturbance_tables import GravityGradient, SumDisturbance
+from ptsmc_jax.scenario.device_tables import AxesWheels, PyramidWheels
+from ptsmc_jax.scenario.disturbance_tables import GravityTable, SumDisturbance
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.own import Own
-from ptsmc_jax.scenario.reference_tables import ReferenceTable
-from ptsmc_jax.scenario.state_scenario import ChainPlant, StateScenario
-from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.scenario.state_scenario import ChainPlant
+from ptsmc_jax.scenario.tables import Limit, Scenario
 from ptsmc_jax.scenario.values import Table
 from ptsmc_jax.simulation.catalogues import CATALOGUE, STATE_CATALOGUE
 from tests.helpers import ROOT
@@ -228,6 +225,7 @@ COMPLETE = [
         {"plant": {"kind": "chain", "order": 3, "x0": [5.0, 3.0, 2.0]}, **tables}
         for tables in (
             CHAIN_DEFAULTS,
+            {"controller": {"kind": "pd", **BASELINES["pd"], **BASELINE}},
             {"disturbance": {"kind": "constant", "amplitude": [0.01]}},
             {"disturbance": {"kind": "random_walk", "density": [1e-4]}},
             {"observer": {"kind": "nonlinear", "gain": [10.0]}},
@@ -339,46 +337,35 @@ def test_off_when_absent():
     assert scenario.requirements == {}
 
 
+def every_kind():
+    """Every table of a scenario file by kind, but for custom parts, see test_own_kinds, and a sum of others."""
+    tables = [kinds for layout in layouts.TABLES.values() for kinds in layout.values()]
+    tables += [*layouts.DISPERSIONS.values(), *layouts.KINDS.values(), Limit]
+    found = {one for kinds in tables for one in (kinds.values() if isinstance(kinds, Mapping) else [kinds])}
+    return {one for one in found if not issubclass(one, Own | SumDisturbance)}
+
+
 def test_tables_of_these_tests_name_every_key_there_is():
-    named = {struct: set() for struct in every_struct(Table)}
+    named = {struct: set() for struct in every_kind()}
 
     def visit(parsed, raw):
         if isinstance(raw, dict):
-            if isinstance(parsed, Table):
+            if isinstance(parsed, Table) and not isinstance(parsed, Scenario):
                 named[type(parsed)] |= set(raw)
             for key, value in raw.items():
                 visit(getattr(parsed, key) if isinstance(parsed, Table) else parsed[key], value)
 
     for tables in COMPLETE:
         visit(parsing.parse(tables), tables)
-    for base in (StateScenario, Attitude):  # bases of others
-        named.pop(base)
-    scenarios = [struct for struct in named if issubclass(struct, Scenario)]
-    seen = {table for scenario in scenarios for table in named.pop(scenario)}
-    assert seen == {table for scenario in scenarios for table in scenario.__struct_fields__} - {
-        "defaulted",
-        "sensors",  # see test_own_devices
-    }
-    named.pop(Actuators)
-    named.pop(WheelLimits)
-    named.pop(CommandFilter)
-    named.pop(ReferenceTable)
-    named.pop(BaselineTable)
-    for table in [table for table in named if issubclass(table, Own)]:  # see test_own_kinds
-        named.pop(table)
-    named.pop(SumDisturbance)  # of tables that are looked at like any other
     named[AxesWheels].add("axes")  # rows of numbers, looked at where they are checked
     for wheels in (PyramidWheels, AxesWheels):
         named[wheels] |= {"momentum", "torque_limit", "momentum_limit"}
-    named[GravityGradient] |= set(Attitude.__struct_fields__)  # as in [initial]
-    for drawn in (Dispersion, StateDispersion):
-        named[drawn].add("own")  # see test_own_devices
+    for struct, keys in named.items():
+        if issubclass(struct, GravityTable):
+            keys |= set(Attitude.__struct_fields__)  # as in [initial]
+        if "own" in struct.__struct_fields__:
+            keys.add("own")  # see test_own_devices
     assert named == {struct: set(struct.__struct_fields__) for struct in named}
-
-
-def every_struct(base):
-    for struct in base.__subclasses__():
-        yield from (struct, *every_struct(struct))
 
 
 @each_number

@@ -405,7 +405,7 @@ def test_gains_are_compared_with_the_published_ones_only_if_these_can_be_simulat
 )
 def test_a_laws_table_has_bounds_for_what_its_physics_lets_tuning_move(plant, kind):
     table = LAWS[plant][kind]
-    assert set(table.gains) == set(table().physics(plant).tunable)
+    assert set(table.gains) == set(table.made.tunable)
     assert {*table.free_by_default, *table.free_if_sampled} <= set(table.gains)
     assert set(table.gains) <= set(gains.units(plant))
 

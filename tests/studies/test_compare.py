@@ -17,8 +17,8 @@ from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.figures import study_plots
 from ptsmc_jax.scenario import systems
-from ptsmc_jax.scenario.baseline_tables import BASELINES
 from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.scenario.law_tables import BASELINES
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.metrics import Metrics
 from ptsmc_jax.simulation.requirements import Requirement

@@ -9,10 +9,11 @@ import msgspec
 from ptsmc_jax import scenario
 from ptsmc_jax.scenario import errors, free_gains, keys, layouts, mission, parsing, reading
 from ptsmc_jax.scenario.attitude_keys import Attitude
-from ptsmc_jax.scenario.law_record import LawTable
+from ptsmc_jax.scenario.law_tables import LawTable
 from ptsmc_jax.scenario.own import Own
+from ptsmc_jax.scenario.schema import PartTable
 from ptsmc_jax.scenario.tables import Scenario, Tune
-from ptsmc_jax.scenario.values import Kind, Table
+from ptsmc_jax.scenario.values import Table
 from ptsmc_jax.simulation import catalogues
 from tuning.errors import UsageError
 
@@ -100,7 +101,7 @@ class _File:
             yield from _line(live is None, "kind", kind, keys.about(struct))
         values = {**self.defaults(name, struct), **values}
         borrowed = Attitude.__struct_fields__ if name != "initial" else ()  # which [initial] explains
-        for key in keys.of(struct):
+        for key in keys.of(struct, self.resolved.unit_of_d):
             off = live is None or key.name not in live
             if f"{name}.{key.name}" in layouts.KINDS:
                 yield from self.inline(name, key, (live or {}).get(key.name, {}), layouts.KINDS[f"{name}.{key.name}"])
@@ -119,7 +120,7 @@ class _File:
                 yield ""
                 yield from _line(True, "kind", other, keys.about(alternative))
                 defaults = self.defaults(name, alternative)
-                for key in keys.of(alternative):
+                for key in keys.of(alternative, self.resolved.unit_of_d):
                     if key.name not in borrowed:
                         value = defaults[key.name] if key.name in defaults else self.example(name, other, key)
                         yield from _line(True, key.name, value, _meaning(key))
@@ -130,7 +131,7 @@ class _File:
         assert isinstance(struct, type)
         yield from _prose(keys.about(struct))
         yield f"{'#' if live is None else ''}[dispersion]"
-        for key in keys.of(struct):
+        for key in keys.of(struct, self.resolved.unit_of_d):
             chosen = (live or {}).get(key.name, {})
             yield from self.inline("dispersion", key, chosen, layouts.DISPERSIONS[key.name])
 
@@ -139,7 +140,7 @@ class _File:
         yield from _prose(f"{key.meaning}:")
         for kind, struct in kinds.items():
             scaled = {key: mission.scales(self.resolved).of(one) for key, one in struct.scaled.items()}
-            others = (k for k in keys.of(struct) if k.name not in scaled)
+            others = (k for k in keys.of(struct, self.resolved.unit_of_d) if k.name not in scaled)
             table = {"kind": kind, **scaled, **{k.name: self.example(name, kind, k) for k in others}}
             mine = chosen.get("kind") == kind
             yield from _line(not mine, key.name, chosen if mine else table, keys.about(struct))
@@ -166,9 +167,9 @@ class _File:
         needed = {"code": EXAMPLES[f"{name}.code"]} if issubclass(struct, Own) else {}
         needed |= {"t_f": self.resolved.controller.t_f} if issubclass(struct, LawTable) else {}
         table: Any = struct(**needed)
-        table = table.filled(self.resolved) if isinstance(table, Kind) else table
+        table = table.filled(self.resolved) if isinstance(table, PartTable) else table
         table = mission.with_defaults(table, mission.scales(self.resolved))
-        table = table.written(self.resolved) if isinstance(table, Kind) else table
+        table = table.written(self.resolved) if isinstance(table, PartTable) else table
         return {key: value for key, value in parsing.plain(table).items() if value not in ([], {})}
 
     def example(self, table: str, kind: str | None, key: keys.Key) -> Any:

@@ -8,10 +8,8 @@ from typing import Any
 
 from ptsmc_jax import scenario as scenarios
 from ptsmc_jax.scenario import disturbance_bounds, keys, mission
-from ptsmc_jax.scenario.command_filter_tables import CommandFilter
-from ptsmc_jax.scenario.device_tables import FILTERS
-from ptsmc_jax.scenario.law_record import common_keys
-from ptsmc_jax.scenario.law_tables import LAWS
+from ptsmc_jax.scenario.device_tables import COMMAND_FILTERS, FILTERS
+from ptsmc_jax.scenario.law_tables import LAWS, common_keys
 from ptsmc_jax.scenario.layouts import SCENARIOS
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.scenario.tuned import in_scenario as in_scenario
@@ -28,7 +26,9 @@ AS_PUBLISHED = 0.05  # delta in the paper [s]
 def units(plant: str) -> dict[str, str]:
     """The unit of each gain that a plant of this kind may have, from what its keys mean; "-" for none."""
     tables: Any = SCENARIOS[plant].TABLES
-    return _units((*tables["controller"].values(), *tables["observer"].values(), *FILTERS.values(), CommandFilter))
+    return _units(
+        (*tables["controller"].values(), *tables["observer"].values(), *FILTERS.values(), *COMMAND_FILTERS.values())
+    )
 
 
 def units_of(scenario: Scenario) -> dict[str, str]:
@@ -87,7 +87,7 @@ def of_designs(scenario: Scenario, parts: Parts, names: tuple[str, ...]) -> list
 def papers(scenario: Scenario) -> Scenario:
     """The scenario under the paper's law with the paper's gains for its plant."""
     table, own = scenario.controller, of_paper(scenario)
-    if not table.prescribed:
+    if not table.law.prescribed:
         error = {"error": "multiplicative"} if scenario.motion == "spacecraft" else {}
         law = {"kind": "prescribed_time", **error, **common_keys(table), "delta": own["delta"]}
         scenario = scenarios.replace(scenario, tune=None, controller=law)
@@ -96,7 +96,7 @@ def papers(scenario: Scenario) -> Scenario:
 
 def paper_is(scenario: Scenario) -> str:
     """What the paper's gains are for a scenario: its own, scaled to another body or period, or those of its law."""
-    if not scenario.controller.prescribed:
+    if not scenario.controller.law.prescribed:
         return "paper's law"
     as_published = mission.published(scenario) and of_paper(scenario)["delta"] == AS_PUBLISHED
     return "paper" if as_published else "paper, scaled"

@@ -17,8 +17,7 @@ from ptsmc_jax.figures import study_plots, style
 from ptsmc_jax.numerics.statistics import value_at, vary
 from ptsmc_jax.scenario import cautions, errors, free_gains, own, parsing, replace, study, systems, tables
 from ptsmc_jax.scenario.errors import ScenarioError
-from ptsmc_jax.scenario.law_record import common_keys
-from ptsmc_jax.scenario.law_tables import LAWS
+from ptsmc_jax.scenario.law_tables import LAWS, common_keys
 from ptsmc_jax.scenario.spacecraft_scenario import SpacecraftScenario
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import catalogues
@@ -96,7 +95,7 @@ def check(scenario: Scenario) -> None:
 
 def laws() -> list[str]:
     """The kinds of laws that are compared, the paper's first."""
-    return [OURS, *(kind for kind, law in LAWS["spacecraft"].items() if not law.prescribed and kind != "own")]
+    return [OURS, *(kind for kind, law in LAWS["spacecraft"].items() if kind != "prescribed_time" and kind != "own")]
 
 
 @dataclass(frozen=True)

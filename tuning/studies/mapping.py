@@ -230,7 +230,7 @@ def _cell(x: float, y: float, ready: Study, common: Callable[[Parts], Parts], se
 
 def lines(scenario: Scenario, x: Axis, y: Axis) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Where the frozen loop loses its stability at the hand-over, over period and delta: label -> (x, y)."""
-    papers_loop = scenario.sampled and scenario.controller.prescribed and scenario.order == 2
+    papers_loop = scenario.sampled and scenario.controller.law.prescribed and scenario.order == 2
     if {x.key, y.key} != {PERIOD, DELTA} or not papers_loop:
         return {}
     eta, delay = scenario.controller.eta, scenario.devices.delay_periods

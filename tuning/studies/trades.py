@@ -232,7 +232,7 @@ class SlewTime(Trade):
     def check(self) -> None:
         """Raise ScenarioError if the study does not apply to the scenario, or a time cannot be simulated."""
         scenario = self.scenario
-        if not scenario.controller.prescribed:
+        if not scenario.controller.law.prescribed:
             raise wrong("controller.kind", scenario.controller.kind, f"prescribed_time {self.purpose}")
         super().check()
         if T_F in scenario.search.gains:

@@ -260,7 +260,7 @@ def _judge(scenario: Scenario, posed: Posed, outcome: Search, fresh_seed: int) -
 def _shortest(posed: Posed, judged: _Judged) -> ShortestTime | None:
     """The shortest t_f that the limit on the torque would allow; None without one, or where t_f itself is tuned."""
     asked = next((one for one in posed.ready.requirements if one.metric == "peak_torque"), None)
-    if asked is None or T_F in posed.problem.names or not judged.scenario.controller.prescribed:
+    if asked is None or T_F in posed.problem.names or not judged.scenario.controller.law.prescribed:
         return None
     return shortest_time(judged.scenario, asked, judged.seed, judged.trials.trial)
 

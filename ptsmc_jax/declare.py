@@ -1,0 +1,206 @@
+"""How the class of a part declares its numbers: default, unit, meaning, allowed values, and usual bounds of a gain.
+
+The keys of scenario files, their checks, `ptsmc new`, the reference pages, the tuner's bounds, the comments of exported
+C and the JSON Schema are all made from these declarations. Built-in and custom parts use the same ones.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterable
+from typing import Annotated, Any, ClassVar, NamedTuple
+
+import numpy as np
+from msgspec import Meta
+
+Usual = tuple[float, float] | str | Callable[[float, float], tuple[float, float]] | None
+
+
+class Scaled(NamedTuple):
+    """A default in the published case, with the powers of inertia and time in its unit.
+
+    The unit of a disturbance on a chain of order n has the power -n of time, which is `order` = -1. A power of time may
+    follow from other keys: then it is a function of the table.
+    """
+
+    value: Any
+    inertia: float = 0.0
+    time: float | Callable[[Any], float] = 0.0
+    order: float = 0.0
+    each: bool = False  # one number for each input
+
+
+class Limits(NamedTuple):
+    """Between which values a number must lie."""
+
+    above: float = -math.inf
+    below: float = math.inf
+    at_least: float = -math.inf
+    at_most: float = math.inf
+
+    def meta(self, description: str) -> Meta:
+        """Return the limits for `msgspec`."""
+        named = zip(("gt", "lt", "ge", "le"), self, strict=True)
+        limits: dict[str, Any] = {name: limit for name, limit in named if math.isfinite(limit)}
+        return Meta(description=description, **limits)
+
+    def words(self, *, several: bool = False) -> str:
+        """Return the limits in words that follow "a number" or "three numbers", empty if there are none."""
+        above, below, at_least, at_most = (f"{limit:g}" if math.isfinite(limit) else "" for limit in self)
+        if above and below:
+            return f" between {above} and {below}"
+        if above and at_most:
+            return f" greater than {above} and at most {at_most}"
+        if at_least and (below or at_most):
+            return f" from {at_least} to {at_most or f'below {below}'}"
+        said = [f"greater than {above}"] * bool(above) + [f"of at least {at_least}"] * bool(at_least)
+        said += [f"below {below}"] * bool(below) + [f"of at most {at_most}"] * bool(at_most)
+        if said == [f"of at least {at_least}"] and not several:
+            return f", at least {at_least}"
+        return " " + " and ".join(said) if said else ""
+
+
+class Declaration(NamedTuple):
+    """A number of a part as a key of scenario files; see `number` and `gain`."""
+
+    default: Any  # a number, numbers, a `Scaled`, or None if it follows from other keys
+    meaning: str
+    unit: str | tuple[str, str]  # two: of a spacecraft, and of a plant without a body
+    limits: Limits
+    each: bool = False
+    any_length: bool = False
+    allowed: str = ""  # in place of the limits in words
+    gain: bool = False
+    usual: Usual = None
+    free: bool | str = False  # whether tuning moves it by default; "sampled": in the sampled loop only
+
+    def type(self, body: bool) -> Any:
+        """Return the type that `msgspec` checks; body: the plant is a spacecraft, with three inputs."""
+        one = Annotated[float, self.limits.meta(self.allowed or f"a number{self.limits.words()}")]
+        value = self.default.value if isinstance(self.default, Scaled) else self.default
+        if not self.each and not isinstance(value, tuple):
+            return one
+        words = self.limits.words(several=True)
+        if self.any_length:
+            return Annotated[tuple[one, ...], Meta(description=self.allowed, min_length=1)]
+        if not self.each:
+            size = len(value)
+            said = f"{'three' if size == 3 else f'a list of {size}'} numbers{words}"
+            return Annotated[tuple[one, ...], Meta(description=said, min_length=size, max_length=size)]
+        if body:
+            return Annotated[tuple[one, one, one], Meta(description=f"three numbers{words}")]
+        return Annotated[tuple[one, ...], Meta(description=f"a list of numbers{words}, one for each input")]
+
+
+def number(
+    default: Any,
+    *,
+    above: float = -math.inf,
+    below: float = math.inf,
+    at_least: float = -math.inf,
+    at_most: float = math.inf,
+    unit: str | tuple[str, str] = "",
+    meaning: str = "",
+    each: bool = False,
+    any_length: bool = False,
+    allowed: str = "",
+    kw_only: bool = False,
+) -> Any:
+    """Declare a field of a part as a key of scenario files: `phase: float = number(0.0, unit="rad", meaning="..")`.
+
+    Args:
+        default: its value if the file gives none: a number, numbers, a `Scaled`, or None if it follows from other keys.
+        above: the number is greater than this.
+        below: it is less than this.
+        at_least: it is not less than this.
+        at_most: it is not greater than this.
+        unit: of the number; two units: of a spacecraft, and of a plant without a body.
+        meaning: what it is.
+        each: there is one number for each input of the plant.
+        any_length: it is a list of numbers, of a length that is checked later.
+        allowed: the allowed values in words, in place of those made from the limits.
+        kw_only: as for `dataclasses.field`.
+    """
+    limits = Limits(above, below, at_least, at_most)
+    return _field(Declaration(default, meaning, unit, limits, each, any_length, allowed), kw_only=kw_only)
+
+
+def gain(
+    default: Any,
+    usual: Usual = None,
+    *,
+    above: float = 0.0,
+    below: float = math.inf,
+    at_least: float = -math.inf,
+    at_most: float = math.inf,
+    unit: str | tuple[str, str] = "",
+    meaning: str = "",
+    each: bool = False,
+    allowed: str = "",
+    free: bool | str = True,
+) -> Any:
+    """Declare a field that tuning may move: `k1: float = gain(1.0, (0.1, 10.0), unit="1/s", meaning="..")`.
+
+    A gain is searched on a log scale if its bounds are positive and more than a factor of 10 apart.
+
+    Args:
+        default: as for `number`.
+        usual: bounds of a search if a scenario gives none: two numbers, a function of t_f and the control period [s],
+            or the name of bounds in `scenario.gain_bounds`.
+        above: the gain is greater than this.
+        below: it is less than this.
+        at_least: it is not less than this.
+        at_most: it is not greater than this.
+        unit: as for `number`.
+        meaning: what it is.
+        each: there is one number for each input of the plant; tuning moves them together, or each alone.
+        allowed: as for `number`.
+        free: whether tuning moves it by default; "sampled": in the sampled loop only.
+    """
+    limits = Limits(-math.inf if math.isfinite(at_least) else above, below, at_least, at_most)
+    return _field(Declaration(default, meaning, unit, limits, each, False, allowed, True, usual, free))
+
+
+def _field(declared: Declaration, **options: Any) -> Any:
+    """Return the dataclass field. It has a default if that is a number or numbers, in the published case."""
+    value = declared.default.value if isinstance(declared.default, Scaled) else declared.default
+    options["metadata"] = {"declared": declared}
+    if value is not None:  # a number is as strongly typed as an array
+        options["default"] = np.float64(value) if isinstance(value, int | float) else value
+    return dataclasses.field(**options)
+
+
+def declared(cls: type) -> dict[str, Declaration]:
+    """Return what a class declares of its fields, by their names."""
+    found = {field.name: field.metadata.get("declared") for field in dataclasses.fields(cls)}
+    return {name: one for name, one in found.items() if one is not None}
+
+
+class Tunable:
+    """The base of parts that may have gains: their names are known from the declarations."""
+
+    tunable: ClassVar[tuple[str, ...]] = ()  # gains that tuning may move
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Add the gains that this class declares to those of its bases."""
+        super().__init_subclass__(**options)
+        if "tunable" not in vars(cls):
+            cls.tunable = tuple(dict.fromkeys((*cls.tunable, *_gains(vars(cls).items()))))
+
+
+def _gains(members: Iterable[tuple[str, Any]]) -> Iterable[str]:
+    for name, field in members:
+        if isinstance(field, dataclasses.Field) and getattr(field.metadata.get("declared"), "gain", False):
+            yield name
+
+
+class Rates(NamedTuple):
+    """Usual bounds low / t_f^power and high / t_f^power, or high / h^power for a control period h."""
+
+    low: float
+    high: float
+    power: int = 1
+    sampled: bool = False  # the upper bound follows the control period
+
+    def __call__(self, t_f: float, period: float) -> tuple[float, float]:
+        """Return the bounds for a t_f and a control period [s]."""
+        return self.low / t_f**self.power, self.high / (period if self.sampled else t_f) ** self.power
