@@ -47,10 +47,9 @@ def in_units(tables: Mapping[str, Any], inertia: float, time: float) -> dict[str
         return value * inertia**mass * time**second
 
     def of(table: dict[str, Any], struct: Any) -> None:
-        for key in keys.of(struct):
+        for key in keys.of(struct, catalogues.CATALOGUE["peak_torque"].unit):
             if key.name in table and key.unit and not isinstance(table[key.name], dict):
-                unit = key.unit.replace("unit of d", catalogues.CATALOGUE["peak_torque"].unit).split(",")[0]
-                table[key.name] = times(table[key.name], unit)
+                table[key.name] = times(table[key.name], key.unit)
 
     for name, table in scaled.items():
         kinds = layout.get(name)

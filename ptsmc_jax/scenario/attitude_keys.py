@@ -7,29 +7,24 @@ from msgspec import Meta
 
 from ptsmc_jax.scenario import errors
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
-from ptsmc_jax.scenario.values import Four, Matrix, Table, Three
+from ptsmc_jax.scenario.values import Four, Matrix, Meaning, Table, Three
 
 
 class Attitude(Table, frozen=True):
-    """Exactly one of the attitude keys, of the body relative to the inertial frame; `sequence` goes with `euler_deg`.
+    """Exactly one attitude key, of the body relative to the inertial frame; `sequence` goes with `euler_deg`."""
 
-    Attributes:
-        quat_xyzw: unit quaternion, scalar last
-        quat_wxyz: unit quaternion, scalar first
-        rotvec_deg: rotation vector [deg]
-        mrp: modified Rodrigues parameters
-        dcm_body_to_inertial: rotation matrix, by rows, that takes body components to inertial ones
-        euler_deg: three angles of the axes in `sequence` [deg]
-        sequence: three axes; capitals: intrinsic, about the body's; small letters: extrinsic
-    """
-
-    quat_xyzw: Four | None = None
-    quat_wxyz: Four | None = None
-    rotvec_deg: Three | None = None
-    mrp: Three | None = None
-    dcm_body_to_inertial: Matrix | None = None
-    euler_deg: Three | None = None
-    sequence: Annotated[str, Meta(description='three axes in SciPy\'s notation, such as "ZYX" or "zyx"')] | None = None
+    quat_xyzw: Annotated[Four | None, Meaning("unit quaternion, scalar last")] = None
+    quat_wxyz: Annotated[Four | None, Meaning("unit quaternion, scalar first")] = None
+    rotvec_deg: Annotated[Three | None, Meaning("rotation vector", "deg")] = None
+    mrp: Annotated[Three | None, Meaning("modified Rodrigues parameters")] = None
+    dcm_body_to_inertial: Annotated[
+        Matrix | None, Meaning("rotation matrix, by rows, that takes body components to inertial ones")
+    ] = None
+    euler_deg: Annotated[Three | None, Meaning("three angles of the axes in `sequence`", "deg")] = None
+    sequence: Annotated[
+        Annotated[str, Meta(description='three axes in SciPy\'s notation, such as "ZYX" or "zyx"')] | None,
+        Meaning("three axes; capitals: intrinsic, about the body's; small letters: extrinsic"),
+    ] = None
 
 
 ATTITUDE_KEYS = ("quat_xyzw", "quat_wxyz", "rotvec_deg", "mrp", "dcm_body_to_inertial", "euler_deg")

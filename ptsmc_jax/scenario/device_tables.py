@@ -13,12 +13,18 @@ from msgspec import Meta
 
 from ptsmc_jax import formulas
 from ptsmc_jax.devices import command_filter
+from ptsmc_jax.devices.actuators import Actuators as ActuatorsPart
+from ptsmc_jax.devices.attitude_filter import attitude_filter
+from ptsmc_jax.devices.reaction_wheels import wheels
+from ptsmc_jax.devices.sensors import PerfectSensors, Sensors, StateSensor
+from ptsmc_jax.devices.star_times import filter_between, star_times
+from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.scenario import errors
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.gain_bounds import BOUNDS
 from ptsmc_jax.scenario.gain_record import GainBounds
 from ptsmc_jax.scenario.schema import PartTable, table
-from ptsmc_jax.scenario.values import Count, Kinds, NotNegative, NotNegatives, Positive, Table, Three
+from ptsmc_jax.scenario.values import Count, Kinds, Meaning, NotNegative, NotNegatives, Positive, Table, Three
 
 SAME = 1e-9  # of a number of periods, which is whole then
 
@@ -41,24 +47,25 @@ COMMAND_FILTERS: Kinds = {
 
 
 class Actuators(Table, frozen=True):
-    """Between the command and the plant; each device is off where it is absent.
+    """Between the command and the plant; each device is off where it is absent."""
 
-    Attributes:
-        command_filter: between the law and all that follows, an inline table with a kind
-        torque_limit: largest torque per body axis [N m]
-        torque_rate_limit: largest rate of the torque [N m/s]
-        torque_lag: time constant of a first-order lag [s]
-        torque_step: quantisation of the torque [N m]
-        delay: control periods from the measurement to the torque, the same for all sensors. It also delays the
-            compensation of the wheels' momentum. The observer uses the delayed torque. The law does not predict over it
-    """
-
-    command_filter: CommandFilterTable | None = None
-    torque_limit: Positive | None = None
-    torque_rate_limit: Positive | None = None
-    torque_lag: Positive | None = None
-    torque_step: Positive | None = None
-    delay: Annotated[int, Meta(ge=0, description="a whole number, at least 0")] | None = None
+    command_filter: Annotated[
+        CommandFilterTable | None, Meaning("between the law and all that follows, an inline table with a kind")
+    ] = None
+    torque_limit: Annotated[Positive | None, Meaning("largest torque about an axis, or largest input", "unit of u")] = (
+        None
+    )
+    torque_rate_limit: Annotated[Positive | None, Meaning("largest rate of torque or input", "unit of u/s")] = None
+    torque_lag: Annotated[Positive | None, Meaning("time constant of a first-order lag", "s")] = None
+    torque_step: Annotated[Positive | None, Meaning("quantisation of torque or input", "unit of u")] = None
+    delay: Annotated[
+        Annotated[int, Meta(ge=0, description="a whole number, at least 0")] | None,
+        Meaning(
+            "control periods from the measurement to the torque, the same for all sensors. It also delays"
+            " the compensation of the wheels' momentum. The observer uses the delayed torque. The law "
+            "does not predict over it"
+        ),
+    ] = None
     levels: ClassVar[Mapping[str, tuple[str, ...]]] = {}  # that can be drawn: the keys, any of which gives it
     noises: ClassVar[tuple[str, ...]] = ()  # keys of what the sensors are off by
 
@@ -98,37 +105,46 @@ class Actuators(Table, frozen=True):
 
     def actuators(self, wheels: Any) -> Any:
         """Limits, lag, delay and wheels (None: none)."""
-        from ptsmc_jax.devices.actuators import Actuators as Physics
-        from ptsmc_jax.numerics.pytrees import vector
-
         values = (self.torque_limit, self.torque_rate_limit, self.torque_lag, self.torque_step)
         limit, rate_limit, lag, step = (None if v is None else vector(v) for v in values)
-        return Physics(limit, rate_limit, lag, step, wheels, self.delay_periods)
+        return ActuatorsPart(limit, rate_limit, lag, step, wheels, self.delay_periods)
 
 
 class Hardware(Actuators, frozen=True):
-    """Actuators, star tracker and gyro of the sampled loop; each device is off where it is absent.
+    """Actuators, star tracker and gyro of the sampled loop; each device is off where it is absent."""
 
-    Attributes:
-        attitude_noise: of the star tracker, 1 sigma per axis and sample, a small rotation; the largest of the axes if
-            they differ, or a custom sensor in [sensors] instead [rad]
-        rate_noise: of the gyro, 1 sigma per axis and sample [rad/s]
-        rate_noise_density: instead of rate_noise, which is then this / sqrt(period): the angle random walk, as in
-            "0.02 deg/sqrt(h)" [rad/s/sqrt(Hz)]
-        rate_bias: of the gyro, 1 sigma per axis, constant over a run; without effect behind a [filter], which starts
-            in its steady state and knows a constant bias [rad/s]
-        rate_bias_walk: random walk of that bias [rad/s/sqrt(s)]
-        star_tracker_every: control periods between star tracker samples, with a filter
-        star_tracker_period: instead of it, time between them, at least loop.period and not only whole periods [s]
-    """
-
-    attitude_noise: NotNegative | None = None
-    rate_noise: NotNegative | None = None
-    rate_noise_density: NotNegative | None = None
-    rate_bias: NotNegative | None = None
-    rate_bias_walk: NotNegative | None = None
-    star_tracker_every: Count | None = None
-    star_tracker_period: Positive | None = None
+    attitude_noise: Annotated[
+        NotNegative | None,
+        Meaning(
+            "of the star tracker, 1 sigma per axis and sample, a small rotation; the largest of the axes "
+            "if they differ, or a custom sensor in [sensors] instead",
+            "rad",
+        ),
+    ] = None
+    rate_noise: Annotated[NotNegative | None, Meaning("of the gyro, 1 sigma per axis and sample", "rad/s")] = None
+    rate_noise_density: Annotated[
+        NotNegative | None,
+        Meaning(
+            'instead of rate_noise, which is then this / sqrt(period): the angle random walk, as in "0.02 deg/sqrt(h)"',
+            "rad/s/sqrt(Hz)",
+        ),
+    ] = None
+    rate_bias: Annotated[
+        NotNegative | None,
+        Meaning(
+            "of the gyro, 1 sigma per axis, constant over a run; without effect behind a [filter], which "
+            "starts in its steady state and knows a constant bias",
+            "rad/s",
+        ),
+    ] = None
+    rate_bias_walk: Annotated[NotNegative | None, Meaning("random walk of that bias", "rad/s/sqrt(s)")] = None
+    star_tracker_every: Annotated[
+        Count | None, Meaning("control periods between star tracker samples, with a filter")
+    ] = None
+    star_tracker_period: Annotated[
+        Positive | None,
+        Meaning("instead of it, time between them, at least loop.period and not only whole periods", "s"),
+    ] = None
     levels: ClassVar[Mapping[str, tuple[str, ...]]] = {
         "attitude_noise": ("attitude_noise",),
         "rate_noise": ("rate_noise", "rate_noise_density"),
@@ -177,9 +193,6 @@ class Hardware(Actuators, frozen=True):
 
     def sensors(self, scenario: Any) -> Any:
         """Star tracker, gyro and filter."""
-        from ptsmc_jax.devices.sensors import PerfectSensors, Sensors
-        from ptsmc_jax.numerics.pytrees import vector
-
         if not scenario.measured:
             return PerfectSensors()
         period, walk = scenario.loop.period, self.rate_bias_walk
@@ -195,22 +208,13 @@ class Hardware(Actuators, frozen=True):
 
     def star_times(self, period: float) -> Any:
         """`devices.star_times`; None where the star tracker goes with the control periods [s]."""
-        from ptsmc_jax.devices.star_times import star_times
-
         return star_times(self.interval(period), period) if self.periods_apart(period) is None else None
 
 
 class StateHardware(Actuators, frozen=True):
-    """Actuators and noise of the sampled loop; each device is off where it is absent.
+    """Actuators and noise of the sampled loop; each device is off where it is absent."""
 
-    Attributes:
-        torque_limit: largest input [unit of u]
-        torque_rate_limit: largest rate of the input [unit of u/s]
-        torque_step: quantisation of the input [unit of u]
-        state_noise: 1 sigma per sample, one number for each state
-    """
-
-    state_noise: NotNegatives | None = None
+    state_noise: Annotated[NotNegatives | None, Meaning("1 sigma per sample, one number for each state")] = None
     levels: ClassVar[Mapping[str, tuple[str, ...]]] = {
         "state_noise": ("state_noise",),
         "torque_limit": ("torque_limit",),
@@ -241,9 +245,6 @@ class StateHardware(Actuators, frozen=True):
 
     def sensors(self, scenario: Any) -> Any:
         """`sensors.StateSensor`."""
-        from ptsmc_jax.devices.sensors import PerfectSensors, StateSensor
-        from ptsmc_jax.numerics.pytrees import vector
-
         return PerfectSensors() if self.state_noise is None else StateSensor(vector(self.state_noise))
 
 
@@ -272,14 +273,13 @@ class NoFilter(FilterTable, frozen=True):
 
 
 class SteadyStateFilter(FilterTable, frozen=True):
-    """A steady-state attitude filter, propagated by the gyro, corrected by the star tracker.
-
-    Attributes:
-        bandwidth: of the corrections; default: where star tracker and gyro noise weigh the same [rad/s]
-    """
+    """A steady-state attitude filter, propagated by the gyro, corrected by the star tracker."""
 
     kind: Literal["steady_state"] = "steady_state"
-    bandwidth: Positive | None = None
+    bandwidth: Annotated[
+        Positive | None,
+        Meaning("of the corrections; default: where star tracker and gyro noise weigh the same", "rad/s"),
+    ] = None
     gains: ClassVar[Mapping[str, GainBounds]] = {"filter_bandwidth": BOUNDS["bandwidth"]}
 
     @staticmethod
@@ -314,10 +314,6 @@ class SteadyStateFilter(FilterTable, frozen=True):
 
     def build(self, scenario: Any) -> Any:
         """`devices.attitude_filter`."""
-        from ptsmc_jax.devices.attitude_filter import attitude_filter
-        from ptsmc_jax.devices.star_times import filter_between
-        from ptsmc_jax.numerics.pytrees import vector
-
         table, period = scenario.devices, scenario.loop.period
         star, gyro, walk = table.attitude_noise or 0.0, table.gyro_noise(period), table.rate_bias_walk or 0.0
         known = tuple(vector(v) for v in (self.width(scenario), star, gyro, walk, period))
@@ -328,18 +324,18 @@ class SteadyStateFilter(FilterTable, frozen=True):
 
 
 class WheelLimits(Table, frozen=True):
-    """What reaction wheels have besides their axes; lag, step and rate limit of [hardware] are then theirs.
+    """What reaction wheels have besides their axes; lag, step and rate limit of [hardware] are then theirs."""
 
-    Attributes:
-        torque_limit: of each wheel [N m]
-        momentum_limit: of each wheel [N m s]
-        momentum: at t = 0, one number for each wheel, absolute: spin inertia times the sum of wheel speed and body rate
-            about its axis; default: 0 each [N m s]
-    """
-
-    torque_limit: Positive | None = None
-    momentum_limit: Positive | None = None
-    momentum: Annotated[tuple[float, ...], Meta(description="a list of numbers, one for each wheel")] | None = None
+    torque_limit: Annotated[Positive | None, Meaning("of each wheel", "N m")] = None
+    momentum_limit: Annotated[Positive | None, Meaning("of each wheel", "N m s")] = None
+    momentum: Annotated[
+        Annotated[tuple[float, ...], Meta(description="a list of numbers, one for each wheel")] | None,
+        Meaning(
+            "at t = 0, one number for each wheel, absolute: spin inertia times the sum of wheel speed and"
+            " body rate about its axis; default: 0 each",
+            "N m s",
+        ),
+    ] = None
 
     def spin_axes(self) -> Any:
         """The spin axis of each wheel in body axes, (wheels, 3)."""
@@ -364,20 +360,17 @@ class WheelLimits(Table, frozen=True):
 
     def build(self) -> Any:
         """`devices.reaction_wheels`."""
-        from ptsmc_jax.devices.reaction_wheels import wheels
-
         return wheels(self.spin_axes(), self.momentum, self.torque_limit, self.momentum_limit)
 
 
 class PyramidWheels(WheelLimits, frozen=True):
-    """Four reaction wheels at 45, 135, 225 and 315 degrees about z; lag, step and rate limit of [hardware] are theirs.
-
-    Attributes:
-        cant_deg: by which their axes are tilted toward +z; by default equally strong about all axes [deg]
-    """
+    """Four reaction wheels at 45, 135, 225 and 315 degrees about z; lag, step and rate limit as in [hardware]."""
 
     kind: Literal["pyramid"] = "pyramid"
-    cant_deg: Annotated[float, Meta(gt=0, lt=90, description="an angle between 0 and 90 degrees")] = 35.264389682754654
+    cant_deg: Annotated[
+        Annotated[float, Meta(gt=0, lt=90, description="an angle between 0 and 90 degrees")],
+        Meaning("by which their axes are tilted toward +z; by default equally strong about all axes", "deg"),
+    ] = 35.264389682754654
 
     def spin_axes(self) -> Any:
         """The axes of four wheels, tilted toward +z."""
@@ -390,14 +383,13 @@ class PyramidWheels(WheelLimits, frozen=True):
 
 
 class AxesWheels(WheelLimits, frozen=True):
-    """Any number of reaction wheels; lag, step and rate limit of [hardware] are theirs.
-
-    Attributes:
-        axes: spin axes in body axes, three numbers each, of any length
-    """
+    """Any number of reaction wheels; lag, step and rate limit of [hardware] are theirs."""
 
     kind: Literal["axes"] = "axes"
-    axes: Annotated[tuple[Three, ...], Meta(description="a list of spin axes, three numbers each")] = (
+    axes: Annotated[
+        Annotated[tuple[Three, ...], Meta(description="a list of spin axes, three numbers each")],
+        Meaning("spin axes in body axes, three numbers each, of any length"),
+    ] = (
         (1.0, 0.0, 0.0),
         (0.0, 1.0, 0.0),
         (0.0, 0.0, 1.0),

@@ -7,12 +7,18 @@ K bounds each component of d, c each component of d'. The paper's own, 0.01 N m 
 import math
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
+from ptsmc_jax.batching import lapack
 from ptsmc_jax.declare import Scaled
-from ptsmc_jax.scenario import mission
+from ptsmc_jax.numerics import attitude
+from ptsmc_jax.plants.rigid_body import AttitudeState
+from ptsmc_jax.scenario import attitude_keys, mission
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.values import MOST_STEPS
+from ptsmc_jax.signals import disturbances
 
 RATE = 10.0 / 12.0  # l / J of the paper's observer, 10 N m s on its mean moment of 12 kg m^2 [1/s]
 SIGMAS = 3.0  # of what is normal, and has no largest value
@@ -119,11 +125,6 @@ def along_the_run(scenario: Any, signal: Any, fastest: float = 0.0) -> Bounds:
     Raises:
         ScenarioError: the disturbance is finite at t = 0 and not finite later on the path.
     """
-    import jax
-    import jax.numpy as jnp
-
-    from ptsmc_jax.batching import lapack
-
     needed = min(float(scenario.loop.t_end) * fastest / FINE, MOST_STEPS)
     t = np.linspace(0.0, float(scenario.loop.t_end), max(POINTS, math.ceil(needed) + 1))
     left = np.clip(1.0 - t / scenario.controller.t_f, 0.0, 1.0) ** 3
@@ -150,8 +151,6 @@ def along_the_run(scenario: Any, signal: Any, fastest: float = 0.0) -> Bounds:
 
 def _as_drawn(scenario: Any, signal: Any) -> list[Any]:
     """A disturbance of one's own with the smallest and the largest amplitudes that are drawn, at phases all around."""
-    from ptsmc_jax.signals import disturbances
-
     found, most = [signal], drawn_factor(scenario)
     if most != 1.0 and disturbances.count(signal, "amplitude"):
         amplitudes = disturbances.values(signal, "amplitude")
@@ -164,14 +163,6 @@ def _as_drawn(scenario: Any, signal: Any) -> list[Any]:
 
 def _attitudes(scenario: Any, t: np.ndarray, left: np.ndarray) -> Any:
     """States of the body on that way."""
-    import jax
-    import jax.numpy as jnp
-
-    from ptsmc_jax.batching import lapack
-    from ptsmc_jax.numerics import attitude
-    from ptsmc_jax.plants.rigid_body import AttitudeState
-    from ptsmc_jax.scenario import attitude_keys
-
     reference = scenario.reference.build()
     target = lapack.vmap(lambda time: reference(time).q)(jnp.asarray(t))
     start = jnp.asarray(attitude_keys.quaternion(scenario.initial, "initial"))

@@ -16,7 +16,7 @@ from ptsmc_jax.scenario.disturbance_bounds import Bounds
 from ptsmc_jax.scenario.errors import ScenarioError, brief
 from ptsmc_jax.scenario.own import Own, fastest, own_kind
 from ptsmc_jax.scenario.schema import PartTable, table
-from ptsmc_jax.scenario.values import Table
+from ptsmc_jax.scenario.values import Meaning, Table
 from ptsmc_jax.signals import disturbances
 
 
@@ -138,14 +138,13 @@ TERMS = 'a list of tables such as [{ kind = "constant" }]'
 
 
 class SumDisturbance(Table, frozen=True):
-    """Several disturbances at once.
-
-    Attributes:
-        terms: the disturbances, each an inline table with a kind of its own; needed
-    """
+    """Several disturbances at once."""
 
     kind: Literal["sum"] = "sum"
-    terms: Annotated[tuple[Any, ...], Meta(description=TERMS)] = ()
+    terms: Annotated[
+        Annotated[tuple[Any, ...], Meta(description=TERMS)],
+        Meaning("the disturbances, each an inline table with a kind of its own; needed"),
+    ] = ()
 
     def filled(self, scenario: Any) -> Any:
         """Return the table itself."""

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import msgspec
 
@@ -15,27 +15,27 @@ from ptsmc_jax.scenario.gain_bounds import BOUNDS, hand_over
 from ptsmc_jax.scenario.gain_record import GainBounds
 from ptsmc_jax.scenario.own import own_kind
 from ptsmc_jax.scenario.schema import PartTable, table
-from ptsmc_jax.scenario.values import NotNegative, Positive
+from ptsmc_jax.scenario.values import Meaning, NotNegative, Positive
 
 KINEMATICS = {"chain": kinematics.ChainKinematics, "system": kinematics.SecondOrderKinematics}
 
 
 class LawTable(PartTable, frozen=True):
-    """A law, whatever it is for.
+    """A law, whatever it is for."""
 
-    Attributes:
-        t_f: the prescribed time, or when the error is judged [s]
-        disturbance_rate_bound: c of Assumption 1, on each component of d'; default: by [disturbance] as drawn
-            [unit of d/s]
-        disturbance_bound: K of Assumption 1, on each component of d, used without an observer; default: by
-            [disturbance] as drawn [unit of d]
-        initial_estimate_error: bound on the observer's error at t = 0 [unit of d]
-    """
-
-    t_f: Positive = 30.0
-    disturbance_rate_bound: NotNegative | None = None
-    disturbance_bound: NotNegative | None = None
-    initial_estimate_error: NotNegative = 0.0
+    t_f: Annotated[Positive, Meaning("the prescribed time, or when the error is judged", "s")] = 30.0
+    disturbance_rate_bound: Annotated[
+        NotNegative | None,
+        Meaning("c of Assumption 1, on each component of d'; default: by [disturbance] as drawn", "unit of d/s"),
+    ] = None
+    disturbance_bound: Annotated[
+        NotNegative | None,
+        Meaning(
+            "K of Assumption 1, on each component of d, used without an observer; default: by [disturbance] as drawn",
+            "unit of d",
+        ),
+    ] = None
+    initial_estimate_error: Annotated[NotNegative, Meaning("bound on the observer's error at t = 0", "unit of d")] = 0.0
     gains: ClassVar[Mapping[str, GainBounds]] = {"t_f": BOUNDS["t_f"]}
 
     @property
@@ -118,44 +118,42 @@ class LawTable(PartTable, frozen=True):
 
 
 class PrescribedTable(LawTable, frozen=True):
-    """The paper's law.
+    """The paper's law."""
 
-    Attributes:
-        sampling: held input by s at the sample, or by where s is to land at the period's end, which needs no sign_width
-    """
-
-    sampling: Literal["explicit", "implicit"] = "explicit"
+    sampling: Annotated[
+        Literal["explicit", "implicit"],
+        Meaning(
+            "held input by s at the sample, or by where s is to land at the period's end, which needs no sign_width"
+        ),
+    ] = "explicit"
 
 
 class AttitudeTable(PrescribedTable, frozen=True):
-    """The paper's law for a spacecraft.
+    """The paper's law for a spacecraft."""
 
-    Attributes:
-        error: the paper's q_1 - q_1f, or the vector part of q_f* q, singular 180 degrees from the reference only
-    """
-
-    error: Literal["additive", "multiplicative"] = "additive"
+    error: Annotated[
+        Literal["additive", "multiplicative"],
+        Meaning("the paper's q_1 - q_1f, or the vector part of q_f* q, singular 180 degrees from the reference only"),
+    ] = "additive"
 
 
 class OwnTable(LawTable, frozen=True):
-    """A custom law.
+    """A custom law."""
 
-    Attributes:
-        delta: time from the hand-over to t_f, if the law hands over; default: one control period [s]
-    """
-
-    delta: Positive | None = None
+    delta: Annotated[
+        Positive | None,
+        Meaning("time from the hand-over to t_f, if the law hands over; default: one control period", "s"),
+    ] = None
     gains: ClassVar[Mapping[str, GainBounds]] = {"delta": BOUNDS["delta"], "t_f": BOUNDS["t_f"]}
 
 
 class OwnAttitudeTable(OwnTable, frozen=True):
-    """A custom law for a spacecraft.
+    """A custom law for a spacecraft."""
 
-    Attributes:
-        error: what it drives to zero: the vector part of q_f* q, or the paper's q_1 - q_1f
-    """
-
-    error: Literal["multiplicative", "additive"] = "multiplicative"
+    error: Annotated[
+        Literal["multiplicative", "additive"],
+        Meaning("what it drives to zero: the vector part of q_f* q, or the paper's q_1 - q_1f"),
+    ] = "multiplicative"
 
 
 def common_keys(law: LawTable) -> dict[str, Any]:

@@ -18,12 +18,13 @@ from msgspec import Meta
 from ptsmc_jax.declare import Declaration, Limits
 from ptsmc_jax.scenario import schema, systems
 from ptsmc_jax.scenario.errors import ScenarioError, brief, show
-from ptsmc_jax.scenario.values import Table
+from ptsmc_jax.scenario.values import Meaning, Table
+from ptsmc_jax.simulation.gains import is_reserved
 
 KEYS = ("system", "truth", "code")  # that name code, in any table
 CONTROLLER = "--controller"  # an option that names code: C that export left, not `controller.code`
 DECLARED = "delta"  # what a law's class may declare anew, as a gain
-Code = Annotated[Any, Meta(description=systems.WHERE)]
+Code = Annotated[Any, Meta(description=systems.WHERE), Meaning('the class, "FILE.py:NAME" or "package.module:NAME"')]
 
 
 class Own:
@@ -51,14 +52,13 @@ def own_kind(table: Any, base: type, needs: tuple[str, ...], summary: str, tuned
         summary: what the kind is.
         tuned: whether it may have gains.
     """
-    doc = f'{summary}\n\nAttributes:\n    code: the class, "FILE.py:NAME" or "package.module:NAME"'
-    return _own_kind(table, base, needs, doc, tuned)
+    return _own_kind(table, base, needs, summary, tuned)
 
 
 @functools.cache
-def _own_kind(table: Any, base: type, needs: tuple[str, ...], doc: str, tuned: bool) -> Any:
-    space = {"__doc__": doc, "base": base, "needs": needs, "tuned": tuned, "__module__": __name__}
-    space["remake"] = (_own_kind, table, base, needs, doc, tuned)
+def _own_kind(table: Any, base: type, needs: tuple[str, ...], summary: str, tuned: bool) -> Any:
+    space = {"__doc__": summary, "base": base, "needs": needs, "tuned": tuned, "__module__": __name__}
+    space["remake"] = (_own_kind, table, base, needs, summary, tuned)
     rest = ("rest", dict[str, Any], msgspec.field(default_factory=dict))
     fields = [("kind", Literal["own"], "own"), ("code", Code), rest]
     return msgspec.defstruct("Own", fields, bases=(Own, table), frozen=True, kw_only=True, namespace=space)
@@ -246,8 +246,6 @@ def _plain(value: object) -> typing.TypeGuard[float]:
 
 def _check_gain(table: Any, found: Any, name: str, gain: Declaration) -> None:
     """Raise ValueError if a field that is a gain cannot be one of such a table, or has no sensible bounds."""
-    from ptsmc_jax.simulation.gains import is_reserved
-
     if not table.tuned:
         raise ValueError(f"its field {name} is a gain, but of such a part none is tuned; allowed is a number")
     if not table.prefix and is_reserved(name):

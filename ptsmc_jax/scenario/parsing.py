@@ -20,7 +20,7 @@ from ptsmc_jax.scenario.attitude_keys import ATTITUDE_KEYS
 from ptsmc_jax.scenario.errors import MOST_BITS, ScenarioError, brief, show, wrong
 from ptsmc_jax.scenario.layouts import SCENARIOS, TABLES
 from ptsmc_jax.scenario.tables import Limit, Scenario
-from ptsmc_jax.scenario.values import Kinds, NotNegative, Positive, Table, Truth
+from ptsmc_jax.scenario.values import Kinds, NotNegative, Positive, Table
 from ptsmc_jax.simulation import catalogues
 
 DEEPEST = 8  # tables and arrays in each other; a rotation matrix of a disturbance in a sum is at 6
@@ -428,7 +428,7 @@ def _value(key: str, value: Any, kind: Any) -> Any:
     bad = _not_finite(value)
     if bad is not None:
         raise wrong(key, value, f"{keys.allowed(kind)}, and {show(bad)} is no finite number")
-    if _holds_truth(value) and kind is not Truth:  # numpy, which reads the inertia, takes true for 1
+    if _holds_truth(value) and keys.bare(kind) is not bool:  # numpy, which reads the inertia, takes true for 1
         raise wrong(key, value, keys.allowed(kind))
     try:
         return msgspec.convert(value, kind, strict=True)

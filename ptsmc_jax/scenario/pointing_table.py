@@ -2,30 +2,33 @@
 
 import math
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
 from ptsmc_jax.declare import Scaled
+from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.scenario.errors import wrong
-from ptsmc_jax.scenario.values import ABSENT, NotNegative, ResolvedPositive, Table, Three
+from ptsmc_jax.scenario.values import ABSENT, Meaning, NotNegative, ResolvedPositive, Table, Three
 from ptsmc_jax.simulation import catalogues
+from ptsmc_jax.simulation.pointing import Pointing as PointingPart
+from ptsmc_jax.simulation.pointing import across
 
 LONGEST_STEP = 0.02  # of the continuous loop after the hand-over, over t_f, see `clock`
 
 
 class Pointing(Table, frozen=True):
-    """What pointing error indices (ECSS-E-ST-60-10C) are taken of: from `after` t_f to t_end, in windows.
+    """What pointing error indices (ECSS-E-ST-60-10C) are taken of: from `after` t_f to t_end, in windows."""
 
-    Attributes:
-        boresight: direction of an instrument in body axes, of any length; its half-cones are given beside the axes
-        window: time over which means are taken (MPE, RPE, PDE), one window after the other; default: t_f / 30 [s]
-        after: from t_f to when the observation begins [s]
-    """
-
-    boresight: Three = (0.0, 0.0, 1.0)
-    window: ResolvedPositive = ABSENT
-    after: NotNegative = 0.0
+    boresight: Annotated[
+        Three,
+        Meaning("direction of an instrument in body axes, of any length; its half-cones are given beside the axes"),
+    ] = (0.0, 0.0, 1.0)
+    window: Annotated[
+        ResolvedPositive,
+        Meaning("time over which means are taken (MPE, RPE, PDE), one window after the other; default: t_f / 30", "s"),
+    ] = ABSENT
+    after: Annotated[NotNegative, Meaning("from t_f to when the observation begins", "s")] = 0.0
     scaled: ClassVar[Mapping[str, Scaled]] = {"window": Scaled(1.0, time=1)}
 
     def check(self, scenario: Any) -> None:
@@ -49,10 +52,6 @@ class Pointing(Table, frozen=True):
 
     def build(self, scenario: Any) -> Any:
         """`pointing.Pointing`, with the limits of which shares of time are asked for."""
-        from ptsmc_jax.numerics.pytrees import vector
-        from ptsmc_jax.simulation.pointing import Pointing as Physics
-        from ptsmc_jax.simulation.pointing import across
-
         timed = {
             name: vector(limit.limit)
             for name, limit in scenario.requirements.items()
@@ -62,4 +61,4 @@ class Pointing(Table, frozen=True):
         kept = scenario.sampled and any(name.startswith(catalogues.RELATIVE) for name in timed)
         # both ends of a window may be samples, and since each may be off by half a period, one more may lie in it
         samples = math.ceil(self.window / scenario.loop.period) + 2 if kept else 0
-        return Physics(vector(across(self.boresight)), vector(self.after), vector(self.window), timed, samples)
+        return PointingPart(vector(across(self.boresight)), vector(self.after), vector(self.window), timed, samples)

@@ -1,6 +1,6 @@
 """Start of a spacecraft, and references: their keys besides the numbers that their classes declare, and the classes."""
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
@@ -9,18 +9,14 @@ from ptsmc_jax.scenario import attitude_keys
 from ptsmc_jax.scenario.attitude_keys import Attitude
 from ptsmc_jax.scenario.own import Own, fastest, own_kind
 from ptsmc_jax.scenario.schema import PartTable, table
-from ptsmc_jax.scenario.values import Four, Kinds, Three
+from ptsmc_jax.scenario.values import Four, Kinds, Meaning, Three
 from ptsmc_jax.signals import references
 
 
 class Initial(Attitude, frozen=True):
-    """Where the spacecraft starts: one attitude key and the body rate.
+    """Where the spacecraft starts: one attitude key and the body rate."""
 
-    Attributes:
-        rate: body rate at t = 0, body axes [rad/s]
-    """
-
-    rate: Three = (0.0, 0.0, 0.0)
+    rate: Annotated[Three, Meaning("body rate at t = 0, body axes", "rad/s")] = (0.0, 0.0, 0.0)
 
 
 class ReferenceTable(Attitude, PartTable, frozen=True):
@@ -41,15 +37,15 @@ class ReferenceTable(Attitude, PartTable, frozen=True):
 
 
 class SlewTable(ReferenceTable, frozen=True):
-    """A turn to another attitude.
+    """A turn to another attitude."""
 
-    Attributes:
-        to_quat_xyzw: the attitude at the end, unit quaternion, scalar last
-        way: the short way, or the long way round
-    """
-
-    to_quat_xyzw: Four = (0.0, 0.0, 0.0, 1.0)
-    way: Literal["short", "long"] = "short"
+    to_quat_xyzw: Annotated[Four, Meaning("the attitude at the end, unit quaternion, scalar last")] = (
+        0.0,
+        0.0,
+        0.0,
+        1.0,
+    )
+    way: Annotated[Literal["short", "long"], Meaning("the short way, or the long way round")] = "short"
 
     @property
     def turn(self) -> np.ndarray:

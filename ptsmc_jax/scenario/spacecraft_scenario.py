@@ -10,7 +10,11 @@ from msgspec import Meta
 
 from ptsmc_jax import formulas
 from ptsmc_jax.declare import Scaled
-from ptsmc_jax.scenario import attitude_keys, dispersion_tables, errors, tables
+from ptsmc_jax.dispersions.base import INITIAL_ATTITUDE, REFERENCE
+from ptsmc_jax.numerics.pytrees import vector
+from ptsmc_jax.plants.flexible_body import flexible
+from ptsmc_jax.plants.rigid_body import AttitudeState, spacecraft
+from ptsmc_jax.scenario import attitude_keys, dispersion_tables, errors, start_checks, tables
 from ptsmc_jax.scenario.device_tables import FILTERS, WHEELS, FilterTable, Hardware, NoFilter, WheelLimits
 from ptsmc_jax.scenario.disturbance_tables import DISTURBANCES
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
@@ -20,7 +24,7 @@ from ptsmc_jax.scenario.own_devices import SENSORS
 from ptsmc_jax.scenario.pointing_table import Pointing
 from ptsmc_jax.scenario.reference_tables import REFERENCES, Initial
 from ptsmc_jax.scenario.tables import Loop, Scenario, Tune
-from ptsmc_jax.scenario.values import Inertia, Kinds, NotNegative, Positive, Table, Three
+from ptsmc_jax.scenario.values import Inertia, Kinds, Meaning, NotNegative, Positive, Table, Three
 from ptsmc_jax.simulation.catalogues import CATALOGUE
 
 # of a law to compare with, at most so many steps of 0.025 rad in two periods: a run that turns faster is marked
@@ -38,17 +42,20 @@ class SpacecraftPlant(Table, frozen=True):
 
 
 class Spacecraft(Table, frozen=True):
-    """The rigid body.
+    """The rigid body."""
 
-    Attributes:
-        inertia: three principal moments, or a full symmetric 3x3 tensor, off its diagonal -sum m x y (products of
-            inertia with their sign changed, where these are +sum m x y); with [wheels] of the whole spacecraft less
-            each wheel's spin inertia about its axis [kg m^2]
-        true_inertia: of the body that flies; default: inertia, which the law knows [kg m^2]
-    """
-
-    inertia: Inertia = (10.0, 12.0, 14.0)
-    true_inertia: Inertia | None = None
+    inertia: Annotated[
+        Inertia,
+        Meaning(
+            "three principal moments, or a full symmetric 3x3 tensor, off its diagonal -sum m x y "
+            "(products of inertia with their sign changed, where these are +sum m x y); with [wheels] of "
+            "the whole spacecraft less each wheel's spin inertia about its axis",
+            "kg m^2",
+        ),
+    ] = (10.0, 12.0, 14.0)
+    true_inertia: Annotated[
+        Inertia | None, Meaning("of the body that flies; default: inertia, which the law knows", "kg m^2")
+    ] = None
 
 
 class Flexible(Table, frozen=True):
@@ -56,26 +63,30 @@ class Flexible(Table, frozen=True):
 
     J w' + D' e'' = -w x (J w + D' e') + u + d, e'' + 2 z W e' + W^2 e = -D w', with the modes e at rest at t = 0, J the
     inertia of the whole body and D the rows of `coupling`.
-
-    Attributes:
-        frequency: W of each mode, the body held; default: 6, scaled to the mission [rad/s]
-        damping: damping ratio z of each mode
-        coupling: D, a row for each mode: how much it turns the body about each axis; default: 0.8 about x, scaled to
-            the mission [sqrt(kg) m]
     """
 
-    frequency: (
+    frequency: Annotated[
         Annotated[
             tuple[Positive, ...], Meta(min_length=1, description="a list of numbers greater than 0, one for each mode")
         ]
-        | None
-    ) = None
+        | None,
+        Meaning("W of each mode, the body held; default: 6, scaled to the mission", "rad/s"),
+    ] = None
     damping: Annotated[
-        tuple[NotNegative, ...], Meta(min_length=1, description="a list of numbers of at least 0, one for each mode")
+        Annotated[
+            tuple[NotNegative, ...],
+            Meta(min_length=1, description="a list of numbers of at least 0, one for each mode"),
+        ],
+        Meaning("damping ratio z of each mode"),
     ] = (0.005,)
-    coupling: Annotated[tuple[Three, ...], Meta(min_length=1, description="a list of rows of three numbers")] | None = (
-        None
-    )
+    coupling: Annotated[
+        Annotated[tuple[Three, ...], Meta(min_length=1, description="a list of rows of three numbers")] | None,
+        Meaning(
+            "D, a row for each mode: how much it turns the body about each axis; default: 0.8 about x, "
+            "scaled to the mission",
+            "sqrt(kg) m",
+        ),
+    ] = None
     scaled: ClassVar[Mapping[str, Scaled]] = {
         "frequency": Scaled((6.0,), time=-1),
         "coupling": Scaled(((0.8, 0.0, 0.0),), inertia=0.5),
@@ -286,15 +297,10 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
 
     def model(self) -> Any:
         """The body that the law knows."""
-        from ptsmc_jax.plants.rigid_body import spacecraft
-
         return spacecraft(self.spacecraft.inertia)
 
     def truth(self, model: Any) -> Any:
         """The body with its true inertia, where the scenario gives one, and its flexible modes."""
-        from ptsmc_jax.plants.flexible_body import flexible
-        from ptsmc_jax.plants.rigid_body import spacecraft
-
         modes = self.flexible
         if modes is None:
             return spacecraft(self.true_inertia)
@@ -302,9 +308,6 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
 
     def start(self) -> Any:
         """Attitude and rate at t = 0."""
-        from ptsmc_jax.numerics.pytrees import vector
-        from ptsmc_jax.plants.rigid_body import AttitudeState
-
         q = vector(attitude_keys.quaternion(self.initial, "initial"))
         return AttitudeState(q, vector(self.initial.rate))
 
@@ -360,9 +363,6 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
 
     def check_start(self, parts: Any, dispersion: Any, *, drawn: bool) -> None:
         """The law's singularity on the reference, and on the way to it; a drawn trial that meets it is marked."""
-        from ptsmc_jax.dispersions.base import INITIAL_ATTITUDE, REFERENCE
-        from ptsmc_jax.scenario import start_checks
-
         start_checks.reference(self, parts)
         if not drawn or dispersion.kinds.keys().isdisjoint((INITIAL_ATTITUDE, REFERENCE)):
             start_checks.attitude(self, parts)

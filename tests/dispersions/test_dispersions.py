@@ -325,7 +325,7 @@ def test_phases_are_uniform_and_independent():
     still = disturbances.Constant(vector([0.1, 0.2, 0.3]))
     run = replace(PARTS, disturbance=disturbances.Sum((SINE, still, ORBIT, SINE)))
     got = many_drawn(Dispersion({"disturbance_phase": phases(7)}), run).disturbance.terms
-    np.testing.assert_array_equal(got[1].value, np.broadcast_to(still.amplitude, (TRIALS, 3)))
+    np.testing.assert_array_equal(got[1].amplitude, np.broadcast_to(still.amplitude, (TRIALS, 3)))
     turns = np.column_stack(
         [
             np.asarray(got[0].phase) - np.asarray(SINE.phase),
@@ -377,9 +377,9 @@ def test_amplitudes_are_scaled_independently_and_a_bias_is_added():
     run = replace(PARTS, disturbance=disturbances.Sum((SINE, ORBIT, still)))
     added = RandomNumbers("normal", vector([0.01] * 3))
     factors = RandomNumbers("uniform", vector([0.5] * 6))
-    dispersion = Dispersion({"disturbance_bias": added, "disturbance_amplitude": factors})
-    sine, orbit, constant, bias = parts_of_trials(dispersion, run).disturbance.terms
-    factors = np.column_stack([np.asarray(sine.amplitude) / 0.1, np.asarray(constant.value) / [0.1, 0.2, 0.3]])
+    spread = Dispersion({"disturbance_bias": added, "disturbance_amplitude": factors})
+    sine, orbit, constant, bias = many_drawn(spread, run).disturbance.terms
+    factors = np.column_stack([np.asarray(sine.amplitude) / 0.1, np.asarray(constant.amplitude) / [0.1, 0.2, 0.3]])
     for column in factors.T:
         assert is_uniform(column, 0.5, 1.5)
     for column in np.asarray(bias.value).T:
@@ -389,7 +389,7 @@ def test_amplitudes_are_scaled_independently_and_a_bias_is_added():
     assert np.abs(np.corrcoef(columns.T) - np.eye(9)).max() < limit
     np.testing.assert_array_equal(orbit.phase, np.full(TRIALS, 0.25))
     alone = Dispersion({"disturbance_bias": added}).apply(replace(PARTS, disturbance=SINE), 4, 9).disturbance
-    np.testing.assert_array_equal(alone.terms[-1].value, bias.value[9])
+    np.testing.assert_array_equal(alone.terms[-1].amplitude, bias.value[9])
     t = vector(3.7)
     np.testing.assert_allclose(alone(t, PARTS.initial), SINE(t) + bias.value[9], rtol=1e-14)
 
@@ -416,7 +416,7 @@ def test_random_numbers_of_a_quantity_do_not_depend_on_other_quantities():
         "inertia": (inertia, lambda p: p.plant.inertia),
         "disturbance_phase": (uniform_phases(3), lambda p: disturbances.values(p.disturbance, "phase")),
         "disturbance_amplitude": (tenths, lambda p: disturbances.values(p.disturbance, "amplitude")[:3]),
-        "disturbance_bias": (tenths, lambda p: p.disturbance.terms[-1].value),
+        "disturbance_bias": (tenths, lambda p: p.disturbance.terms[-1].amplitude),
         "reference": (KINDS["uniform"], lambda p: p.reference.q),
         "torque_limit_level": (TENTH, lambda p: p.actuators.torque_limit),
         "rate_noise_level": (WIDE, lambda p: p.sensors.rate_noise),
