@@ -1,6 +1,7 @@
 """What `ptsmc new` writes: the scenario asked for, every key of its plant, and what is off is allowed as it stands."""
 
 import io
+import json
 import os
 import re
 import subprocess
@@ -63,6 +64,14 @@ def test_what_is_written_is_the_default_scenario(plant):
     written = tomllib.loads(new.text(plant, {}))
     assert parsing.dump(from_tables(written)) == parsing.dump(from_tables({"plant": {"kind": plant}}))
     assert len(written) > 4  # and says so key by key
+
+
+def test_the_schema_is_a_file_that_is_not_written_over(command, tmp_path):
+    code, said, _ = command("schema")
+    assert (code, "anyOf" in json.loads((tmp_path / "scenario.schema.json").read_text())) == (0, True)
+    assert "#:schema scenario.schema.json" in said
+    assert command("schema")[0] == 2
+    assert command("schema", "--force", "--quiet") == (0, "", "")
 
 
 def test_it_is_written_without_docstrings_too():

@@ -1,5 +1,6 @@
 """The commands that fly nothing: a page from results, scenario files to begin with, an attitude in every form."""
 
+import json
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated
@@ -53,6 +54,27 @@ def new(
     store.write_text(file, templates.text(plant, raw))
     if not quiet:
         terminal.say(f"scenario in {file}")
+    return 0
+
+
+def schema(
+    file: Annotated[Path, Parameter(name="FILE", help="JSON Schema to write.")] = Path("scenario.schema.json"),
+    /,
+    *,
+    force: Annotated[bool, Parameter(negative="", help="Write over a file that is there already.")] = False,
+    quiet: Quiet = False,
+) -> int:
+    """Write the JSON Schema of scenario files, with which editors complete keys and check values.
+
+    Exit status: 0 done, 2 bad input.
+    """
+    from ptsmc_jax.campaigns import store
+    from ptsmc_jax.scenario.json_schema import json_schema
+
+    store.check_file(file, force)
+    store.write_text(file, json.dumps(json_schema(), indent=1) + "\n")
+    if not quiet:
+        terminal.say(f"JSON Schema in {file}; in a scenario file: #:schema {file}")
     return 0
 
 
@@ -122,4 +144,4 @@ def convert_attitude(
     return 0
 
 
-COMMANDS = (report, new, examples, convert_attitude)
+COMMANDS = (report, new, schema, examples, convert_attitude)

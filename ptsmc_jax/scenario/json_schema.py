@@ -1,0 +1,85 @@
+"""The JSON Schema of scenario files, with which editors complete and check them."""
+
+import typing
+from collections.abc import Mapping
+from typing import Any
+
+import msgspec
+
+from ptsmc_jax.scenario import keys, layouts
+from ptsmc_jax.scenario.own import Own
+from ptsmc_jax.scenario.tables import Limit, Scenario
+from ptsmc_jax.scenario.values import Kinds, NotNegative, Table
+from ptsmc_jax.simulation import catalogues
+
+Schema = dict[str, Any]
+
+
+def json_schema() -> Schema:
+    """Return the JSON Schema (draft 2020-12) of scenario files: the tables of a spacecraft, a chain or a system."""
+    plants = [_plant(kind, made) for kind, made in layouts.SCENARIOS.items()]
+    dialect = "https://json-schema.org/draft/2020-12/schema"
+    return {"$schema": dialect, "title": "Scenario of ptsmc", "anyOf": plants}
+
+
+def _plant(kind: str, made: type[Scenario]) -> Schema:
+    tables = {name: _kinds(name, kinds, made.unit_of_d) for name, kinds in made.TABLES.items()}
+    tables["plant"]["required"] = ["kind"]
+    tables["plant"]["properties"]["kind"] = {"const": kind}
+    limit = _with_unit(_leaf(NotNegative), {})
+    full = _struct(Limit, made.unit_of_d)
+    full["properties"]["limit"] = limit
+    limits = {"anyOf": [limit, full | {"required": ["limit"]}]}
+    metrics = {**made.metrics, **catalogues.MARGINS}
+    named = {name: limits | {"description": f"{one.meaning} [{one.unit}]"} for name, one in metrics.items()}
+    tables["requirements"] = _object("Largest values that are allowed.", named)
+    required = [] if kind == next(iter(layouts.SCENARIOS)) else ["plant"]
+    return _object(f"Scenario of a {kind}.", tables) | {"required": required}
+
+
+def _kinds(name: str, kinds: type[Table] | Kinds, unit_of_d: str) -> Schema:
+    """Return the schema of a table: one object for each kind, the default one without the key `kind` too."""
+    if not isinstance(kinds, Mapping):
+        return _struct(kinds, unit_of_d, name)
+    first, found = next(iter(kinds)), []
+    for kind, struct in kinds.items():
+        one = _struct(struct, unit_of_d, name)
+        one["properties"] = {"kind": {"const": kind}, **one["properties"]}
+        found.append(one if kind == first else one | {"required": ["kind"]})
+    return {"anyOf": found}
+
+
+def _struct(struct: type[Table], unit_of_d: str, name: str = "") -> Schema:
+    """Return the schema of a table of one kind; name: of the table, for its inline tables."""
+    hints, properties = typing.get_type_hints(struct, include_extras=True), {}
+    for key in keys.of(struct, unit_of_d):
+        inline = layouts.DISPERSIONS.get(key.name) if name == "dispersion" else layouts.KINDS.get(f"{name}.{key.name}")
+        one = _leaf(hints[key.name]) if inline is None else _kinds("", inline, unit_of_d)
+        if key.unit in catalogues.UNITS:
+            one = _with_unit(one, one.pop("items", {}))
+        if isinstance(key.default, bool | int | float | str):
+            one["default"] = key.default
+        properties[key.name] = one | {"description": key.text if inline else f"{key.text}: {key.allowed}"}
+    return _object(keys.about(struct), properties, more=issubclass(struct, Own))
+
+
+def _object(description: str, properties: Schema, *, more: bool = False) -> Schema:
+    said = {"type": "object", "description": description}
+    return {**said, "properties": properties, "additionalProperties": more}
+
+
+def _leaf(hint: Any) -> Schema:
+    """Return the schema of a value, without what only a default of None allows."""
+    found: Schema = msgspec.json.schema(hint)
+    some = [one for one in found.get("anyOf", []) if one.get("type") != "null"]
+    one = {**(some[0] if len(some) == 1 else found)}
+    if "prefixItems" in one:  # numbers of one kind
+        one["items"] = one.pop("prefixItems")[0]
+    return one
+
+
+def _with_unit(number: Schema, items: Schema) -> Schema:
+    """Return the schema of a number, or a list of numbers, each of which may be text with a unit."""
+    if items:
+        return {**number, "items": {"anyOf": [items, {"type": "string"}]}}
+    return {"anyOf": [number, {"type": "string"}]}
