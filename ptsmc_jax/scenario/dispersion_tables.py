@@ -1,32 +1,39 @@
-"""The tables of a scenario file that define the random quantities of each trial."""
+"""The random quantities of each trial in scenario files: the kinds of their tables, and what they apply to."""
 
 import dataclasses
+import typing
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
+import msgspec
 import numpy as np
 from msgspec import Meta
 
 from ptsmc_jax.declare import Scaled
-from ptsmc_jax.dispersions.inertias import RelativeInertia as RelativeInertiaPart
+from ptsmc_jax.dispersions import inertias
 from ptsmc_jax.dispersions.numbers import RandomNumbers, any_attitude, axis_angle, interval
 from ptsmc_jax.numerics.pytrees import vector
-from ptsmc_jax.scenario.values import Meaning, NotNegative, NotNegatives, Positive, Table, Truth
+from ptsmc_jax.scenario.own_devices import OWN_DRAW
+from ptsmc_jax.scenario.values import Kinds, Meaning, NotNegative, NotNegatives, Positive, Table, Truth
+
+Angle = Annotated[float, Meta(ge=0, le=180, description="an angle from 0 to 180 degrees")]
+Share = Annotated[float, Meta(ge=0, le=0.3, description="a number from 0 to 0.3")]
+BelowOne = Annotated[float, Meta(ge=0, lt=1, description="a number from 0 to below 1")]
 
 
 class Numbers(Table, frozen=True):
     """Random numbers about those of the scenario."""
 
+    name: ClassVar[str] = "normal"  # of the kind
     distribution: ClassVar[str] = "normal"  # of `dispersions.numbers.RandomNumbers`
-    width: ClassVar[str] = "std"  # the key that holds the spread
-    degrees: ClassVar[bool] = False  # it is in degrees
-    widest: ClassVar[float] = 0.0  # size that vectors of three stay below, all but one in 10 000, over the spread
+    width: ClassVar[str] = "std"  # the key that holds the spread; it is in degrees if its name ends with _deg
+    widest: ClassVar[float] = 4.6  # size that vectors of three stay below, all but one in 10 000, over the spread
     farthest: ClassVar[float] = 3.0  # largest deviation that bounds allow for, over the spread: three sigma
 
     def of(self, count: int = 1) -> np.ndarray:
-        """The width of so many numbers, of which a single one of the table stands for all; in rad for degrees."""
+        """Return the widths of so many numbers, of which one of the table stands for all; in rad for degrees."""
         width = np.ones(count) * getattr(self, self.width)
-        return np.deg2rad(width) if self.degrees else width
+        return np.deg2rad(width) if self.width.endswith("_deg") else width
 
     @property
     def nothing(self) -> bool:
@@ -38,19 +45,103 @@ class Numbers(Table, frozen=True):
         return RandomNumbers(self.distribution, vector(self.of(count)))
 
 
-class Normal(Numbers, frozen=True):
-    """Normal, not truncated."""
-
-    widest: ClassVar[float] = 4.6
-
-
 class Uniform(Numbers, frozen=True):
-    """Uniform, as far on either side."""
+    """Random numbers that are uniform, as far on either side."""
 
+    name: ClassVar[str] = "uniform"
     distribution: ClassVar[str] = "uniform"
     width: ClassVar[str] = "half_width"
     widest: ClassVar[float] = float(np.sqrt(3.0))
     farthest: ClassVar[float] = 1.0
+
+
+class Relative(Numbers, frozen=True):
+    """Factors 1 + a normal number, truncated at three sigma."""
+
+    name: ClassVar[str] = "relative_normal"
+    distribution: ClassVar[str] = "truncated_normal"
+    widest: ClassVar[float] = 3.0
+
+
+class RelativeUniform(Uniform, frozen=True):
+    """Factors 1 + a uniform number."""
+
+    name: ClassVar[str] = "relative_uniform"
+
+
+def _numbers(
+    name: str,
+    base: type[Numbers],
+    about: str,
+    meaning: str,
+    unit: str,
+    default: Any,
+    type_: Any = NotNegative,
+    *,
+    deg: bool = False,
+) -> Any:
+    """Return the table of a kind, which has the width of `base` as its only key.
+
+    Args:
+        name: of the class.
+        base: the distribution.
+        about: what the kind is.
+        meaning: of the width.
+        unit: of the width.
+        default: of the width; a `Scaled` one follows the mission.
+        type_: of the width.
+        deg: the width is in degrees, and its name says so.
+    """
+    width, follows = base.width + ("_deg" if deg else ""), isinstance(default, Scaled)
+    key = (width, Annotated[type_ | None if follows else type_, Meaning(meaning, unit)], None if follows else default)
+    space = {"__doc__": about, "__module__": __name__, "width": width, "scaled": {width: default} if follows else {}}
+    kind = ("kind", Literal[base.name], base.name)
+    return msgspec.defstruct(name, [kind, key], bases=(base,), frozen=True, kw_only=True, namespace=space)
+
+
+_RATE, _BIAS = ("rad/s", Scaled(0.01, time=-1)), ("unit of d", Scaled(1e-3, inertia=1, order=-1))
+_BY_RATE, _BY_BIAS = "; default: 0.01, scaled to the mission", "; default: 1e-3, scaled to the mission"
+_ONE_EACH = ", one number for each state; default: 1 each"
+# the names are those of the classes, by which they are pickled
+NormalRate = _numbers(
+    "NormalRate", Numbers, "Each axis normal about initial.rate.", "1 sigma per axis" + _BY_RATE, *_RATE
+)
+UniformRate = _numbers(
+    "UniformRate", Uniform, "Each axis uniform about initial.rate.", "largest deviation per axis" + _BY_RATE, *_RATE
+)
+NormalBias = _numbers(
+    "NormalBias", Numbers, "Normal about what [disturbance] says.", "1 sigma of each component" + _BY_BIAS, *_BIAS
+)
+UniformBias = _numbers(
+    "UniformBias", Uniform, "Uniform about what [disturbance] says.", "largest deviation of each component" + _BY_BIAS,
+    *_BIAS,
+)  # fmt: skip
+UniformState = _numbers(
+    "UniformState", Uniform, "Every state uniform about x0.", "largest deviation" + _ONE_EACH, "", (), NotNegatives
+)
+NormalState = _numbers(
+    "NormalState", Numbers, "Every state normal about x0.", "1 sigma" + _ONE_EACH, "", (), NotNegatives
+)
+NormalFactor = _numbers(
+    "NormalFactor",
+    Relative,
+    "Times 1 + a normal number, truncated at three sigma.",
+    "1 sigma of the share",
+    "",
+    0.1,
+    Share,
+)
+UniformFactor = _numbers(
+    "UniformFactor", RelativeUniform, "Times 1 + a uniform number.", "largest share", "", 0.2, BelowOne
+)
+NormalTurn = _numbers(
+    "NormalTurn", Numbers, "Turned by a normal rotation vector.", "1 sigma per component", "deg", 0.1, deg=True
+)
+UniformTurn = _numbers(
+    "UniformTurn", Uniform, "Turned by a rotation vector whose components are uniform.", "largest size of a component",
+    "deg", 0.1, deg=True,
+)  # fmt: skip
+FACTORS, TURNS = (NormalFactor, UniformFactor), (NormalTurn, UniformTurn)
 
 
 class UniformAttitude(Table, frozen=True):
@@ -71,14 +162,8 @@ class AxisAngle(Table, frozen=True):
     """A uniform angle about any axis: a body's from the reference at t = 0, a reference's from its own attitude."""
 
     kind: Literal["axis_angle"] = "axis_angle"
-    min_deg: Annotated[
-        Annotated[float, Meta(ge=0, le=180, description="an angle from 0 to 180 degrees")],
-        Meaning("smallest angle", "deg"),
-    ] = 20.0
-    max_deg: Annotated[
-        Annotated[float, Meta(ge=0, le=180, description="an angle from 0 to 180 degrees")],
-        Meaning("largest angle", "deg"),
-    ] = 140.0
+    min_deg: Annotated[Angle, Meaning("smallest angle", "deg")] = 20.0
+    max_deg: Annotated[Angle, Meaning("largest angle", "deg")] = 140.0
 
     def largest_angle(self, angle: float) -> float:
         """Return the largest angle [rad] of an attitude drawn about one at this angle."""
@@ -104,40 +189,18 @@ class NormalAttitude(Table, frozen=True):
         return RandomNumbers("normal", vector(np.full(3, np.deg2rad(self.std_deg))))
 
 
-class NormalRate(Normal, frozen=True):
-    """Each axis normal about initial.rate."""
-
-    kind: Literal["normal"] = "normal"
-    std: Annotated[NotNegative | None, Meaning("1 sigma per axis; default: 0.01, scaled to the mission", "rad/s")] = (
-        None
-    )
-    scaled: ClassVar[Mapping[str, Scaled]] = {"std": Scaled(0.01, time=-1)}
-
-
-class UniformRate(Uniform, frozen=True):
-    """Each axis uniform about initial.rate."""
-
-    kind: Literal["uniform"] = "uniform"
-    half_width: Annotated[
-        NotNegative | None, Meaning("largest deviation per axis; default: 0.01, scaled to the mission", "rad/s")
-    ] = None
-    scaled: ClassVar[Mapping[str, Scaled]] = {"half_width": Scaled(0.01, time=-1)}
-
-
 class RelativeInertia(Table, frozen=True):
     """The true body's principal moments off by a normal share, truncated at three sigma and to what a body can have."""
 
     farthest: ClassVar[float] = 3.0  # how far a moment goes, in times std
     kind: Literal["relative_normal"] = "relative_normal"
-    std: Annotated[
-        Annotated[float, Meta(ge=0, le=0.3, description="a number from 0 to 0.3")], Meaning("1 sigma of the share")
-    ] = 0.05
+    std: Annotated[Share, Meaning("1 sigma of the share")] = 0.05
     axes_deg: Annotated[NotNegative, Meaning("1 sigma of the small rotation of the principal axes", "deg")] = 0.0
 
     def build(self, parts: Any, count: int) -> Any:
         """Return `dispersions.inertias.RelativeInertia` about the inertia of the true body."""
         moments, axes = np.linalg.eigh(np.asarray(parts.plant.inertia))
-        return RelativeInertiaPart(*(vector(value) for value in (moments, axes, self.std, np.deg2rad(self.axes_deg))))
+        return inertias.RelativeInertia(*map(vector, (moments, axes, self.std, np.deg2rad(self.axes_deg))))
 
 
 class UniformPhase(Table, frozen=True):
@@ -150,62 +213,42 @@ class UniformPhase(Table, frozen=True):
         return RandomNumbers("interval", vector(np.full(count, 2.0 * np.pi)))
 
 
-class RelativeNormal(Numbers, frozen=True):
-    """Times 1 + a normal number, truncated at three sigma."""
+class Interval(Table, frozen=True):
+    """A time between two, uniformly."""
 
-    distribution: ClassVar[str] = "truncated_normal"
-    widest: ClassVar[float] = 3.0
-    kind: Literal["relative_normal"] = "relative_normal"
-    std: Annotated[
-        Annotated[float, Meta(ge=0, le=0.3, description="a number from 0 to 0.3")], Meaning("1 sigma of the share")
-    ] = 0.1
+    earliest: Annotated[NotNegative, Meaning("from when on it may be", "s")] = 0.0
+    latest: Annotated[NotNegative | None, Meaning("until when; default: loop.t_end", "s")] = None
 
-
-class RelativeUniform(Uniform, frozen=True):
-    """Times 1 + a uniform number."""
-
-    kind: Literal["relative_uniform"] = "relative_uniform"
-    half_width: Annotated[
-        Annotated[float, Meta(ge=0, lt=1, description="a number from 0 to below 1")], Meaning("largest share")
-    ] = 0.2
+    def numbers(self, parts: Any, low: float, high: float) -> RandomNumbers:
+        """Return the random time [s], until the end of the run by default, and a number between two."""
+        end = float(parts.t_end) if self.latest is None else self.latest
+        return interval([self.earliest, low], [end, high])
 
 
-class NormalTurn(Normal, frozen=True):
-    """Turned by a normal rotation vector."""
-
-    width: ClassVar[str] = "std_deg"
-    kind: Literal["normal"] = "normal"
-    std_deg: Annotated[NotNegative, Meaning("1 sigma per component", "deg")] = 0.1
-    degrees: ClassVar[bool] = True
-
-
-class UniformTurn(Uniform, frozen=True):
-    """Turned by a rotation vector whose components are uniform."""
-
-    width: ClassVar[str] = "half_width_deg"
-    kind: Literal["uniform"] = "uniform"
-    half_width_deg: Annotated[NotNegative, Meaning("largest size of a component", "deg")] = 0.1
-    degrees: ClassVar[bool] = True
-
-
-def _interval(table: Any, parts: Any) -> tuple[float, float]:
-    """Return `earliest` and `latest` of a table [s]; by default until the end of the run."""
-    return table.earliest, float(parts.t_end) if table.latest is None else table.latest
-
-
-class Outage(Table, frozen=True):
+class Outage(Interval, frozen=True):
     """Begins at any time between two, uniformly."""
 
     kind: Literal["uniform"] = "uniform"
-    duration: Annotated[Positive | None, Meaning("how long it lasts; default: 10, scaled to the mission", "s")] = None
+    duration: Annotated[
+        Positive | None, Meaning("how long it lasts; default: 10, scaled to the mission", "s")
+    ] = None  # fmt: skip
     scaled: ClassVar[Mapping[str, Scaled]] = {"duration": Scaled(10.0, time=1)}
-    earliest: Annotated[NotNegative, Meaning("from when on it may begin", "s")] = 0.0
-    latest: Annotated[NotNegative | None, Meaning("until when; default: loop.t_end", "s")] = None
 
     def build(self, parts: Any, count: int) -> Any:
         """Return `dispersions.numbers.RandomNumbers`: the random begin, and the duration."""
-        begin, end = _interval(self, parts)
-        return dataclasses.replace(interval([begin, self.duration], [end, self.duration]), common=True)
+        assert self.duration is not None  # a default is filled in
+        return dataclasses.replace(self.numbers(parts, self.duration, self.duration), common=True)
+
+
+class Failure(Interval, frozen=True):
+    """Of any one wheel, at any time between two, uniformly."""
+
+    kind: Literal["uniform"] = "uniform"
+    known: Annotated[Truth, Meaning("the torque is given to the other wheels from then on")] = False
+
+    def build(self, parts: Any, count: int) -> Any:
+        """Return `dispersions.numbers.RandomNumbers`: the time, and a number on (0, 1) that chooses the wheel."""
+        return self.numbers(parts, 0.0, 1.0)
 
 
 class Jitter(Table, frozen=True):
@@ -214,7 +257,7 @@ class Jitter(Table, frozen=True):
     kind: Literal["uniform"] = "uniform"
     largest: Annotated[
         Positive, Meaning("share of loop.period by which a sample may come early or late, below a half")
-    ] = 0.1
+    ] = 0.1  # fmt: skip
     smallest: Annotated[NotNegative, Meaning("likewise")] = 0.0
 
     def build(self, parts: Any, count: int) -> Any:
@@ -222,126 +265,55 @@ class Jitter(Table, frozen=True):
         return interval([self.smallest], [self.largest])
 
 
-class Failure(Table, frozen=True):
-    """Of any one wheel, at any time between two, uniformly."""
-
-    kind: Literal["uniform"] = "uniform"
-    earliest: Annotated[NotNegative, Meaning("from when on it may be", "s")] = 0.0
-    latest: Annotated[NotNegative | None, Meaning("until when; default: loop.t_end", "s")] = None
-    known: Annotated[Truth, Meaning("the torque is given to the other wheels from then on")] = False
-
-    def build(self, parts: Any, count: int) -> Any:
-        """Return `dispersions.numbers.RandomNumbers`: the time, and a number on (0, 1) that chooses the wheel."""
-        begin, end = _interval(self, parts)
-        return interval([begin, 0.0], [end, 1.0])
-
-
-class NormalBias(Normal, frozen=True):
-    """Normal about what [disturbance] says."""
-
-    kind: Literal["normal"] = "normal"
-    std: Annotated[
-        NotNegative | None, Meaning("1 sigma of each component; default: 1e-3, scaled to the mission", "unit of d")
-    ] = None
-    scaled: ClassVar[Mapping[str, Scaled]] = {"std": Scaled(1e-3, inertia=1, order=-1)}
-
-
-class UniformBias(Uniform, frozen=True):
-    """Uniform about what [disturbance] says."""
-
-    kind: Literal["uniform"] = "uniform"
-    half_width: Annotated[
-        NotNegative | None,
-        Meaning("largest deviation of each component; default: 1e-3, scaled to the mission", "unit of d"),
-    ] = None
-    scaled: ClassVar[Mapping[str, Scaled]] = {"half_width": Scaled(1e-3, inertia=1, order=-1)}
-
-
-class UniformState(Uniform, frozen=True):
-    """Every state uniform about x0."""
-
-    kind: Literal["uniform"] = "uniform"
-    half_width: Annotated[NotNegatives, Meaning("largest deviation, one number for each state; default: 1 each")] = ()
+# by key: what is random, and the kinds, the default first
+_DISTURBANCE: dict[str, tuple[str, tuple[Any, ...]]] = {
+    "disturbance_phase": ("of every sinusoid, and of the orbit", (UniformPhase,)),
+    "disturbance_amplitude": ("of each sinusoid and constant, an independent factor on each component", FACTORS),
+    "disturbance_bias": ("a constant disturbance, added", (NormalBias, UniformBias)),
+}
+_ANY: dict[str, tuple[str, tuple[Any, ...]]] = {
+    "torque_limit": ("factor on hardware.torque_limit", FACTORS),
+    "timing_jitter": (
+        "share of loop.period by which samples come early or late, of which flight software knows nothing", (Jitter,),
+    ),
+    "own": ("what custom code makes of random numbers", (OWN_DRAW,)),
+}  # fmt: skip
+_SPACECRAFT: dict[str, tuple[str, tuple[Any, ...]]] = {
+    "attitude": ("of the body at t = 0", (AxisAngle, UniformAttitude, NormalAttitude)),
+    "rate": ("of the body at t = 0", (NormalRate, UniformRate)),
+    "inertia": ("of the true body, about true_inertia; the law keeps spacecraft.inertia", (RelativeInertia,)),
+    "reference": ("the whole reference turned", (NormalAttitude, UniformAttitude, AxisAngle)),
+    **_DISTURBANCE,
+    "attitude_noise": ("factor on hardware.attitude_noise", FACTORS),
+    "rate_noise": ("factor on hardware.rate_noise", FACTORS),
+    "actuator_scale": ("factor on the torque of each axis, or wheel, that flight software does not know", FACTORS),
+    "actuator_misalignment": ("each axis, or wheel, turned from where flight software takes it to be", TURNS),
+    "star_tracker_misalignment": ("the star tracker turned in the body", TURNS),
+    "gyro_scale": ("factor on the rate that the gyro reads about each axis", FACTORS),
+    "star_tracker_outage": ("an interval without samples of the star tracker, with a filter", (Outage,)),
+    "wheel_failure": ("a wheel that gives no torque any more", (Failure,)),
+    "mode_frequency": ("factor on each of flexible.frequency", FACTORS),
+    "mode_coupling": ("factor on each row of flexible.coupling", FACTORS),
+    **_ANY,
+}
+_STATE = {
+    "x0": ("initial state", (UniformState, NormalState)),
+    **_DISTURBANCE,
+    "state_noise": ("factor on hardware.state_noise", FACTORS),
+    **_ANY,
+}
 
 
-class NormalState(Normal, frozen=True):
-    """Every state normal about x0."""
-
-    kind: Literal["normal"] = "normal"
-    std: Annotated[NotNegatives, Meaning("1 sigma, one number for each state; default: 1 each")] = ()
-
-
-class Dispersion(Table, frozen=True):
-    """What differs from trial to trial, each an inline table with a kind; what is absent stays as the scenario says."""
-
-    attitude: Annotated[UniformAttitude | AxisAngle | NormalAttitude | None, Meaning("of the body at t = 0")] = None
-    rate: Annotated[NormalRate | UniformRate | None, Meaning("of the body at t = 0")] = None
-    inertia: Annotated[
-        RelativeInertia | None, Meaning("of the true body, about true_inertia; the law keeps spacecraft.inertia")
-    ] = None
-    reference: Annotated[UniformAttitude | AxisAngle | NormalAttitude | None, Meaning("the whole reference turned")] = (
-        None
-    )
-    disturbance_phase: Annotated[UniformPhase | None, Meaning("of every sinusoid, and of the orbit")] = None
-    disturbance_amplitude: Annotated[
-        RelativeNormal | RelativeUniform | None,
-        Meaning("of each sinusoid and constant, an independent factor on each component"),
-    ] = None
-    disturbance_bias: Annotated[NormalBias | UniformBias | None, Meaning("a constant torque, added")] = None
-    attitude_noise: Annotated[RelativeNormal | RelativeUniform | None, Meaning("factor on hardware.attitude_noise")] = (
-        None
-    )
-    rate_noise: Annotated[RelativeNormal | RelativeUniform | None, Meaning("factor on hardware.rate_noise")] = None
-    torque_limit: Annotated[RelativeNormal | RelativeUniform | None, Meaning("factor on hardware.torque_limit")] = None
-    actuator_scale: Annotated[
-        RelativeNormal | RelativeUniform | None,
-        Meaning("factor on the torque of each axis, or wheel, that flight software does not know"),
-    ] = None
-    actuator_misalignment: Annotated[
-        NormalTurn | UniformTurn | None,
-        Meaning("each axis, or wheel, turned from where flight software takes it to be"),
-    ] = None
-    star_tracker_misalignment: Annotated[
-        NormalTurn | UniformTurn | None, Meaning("the star tracker turned in the body")
-    ] = None
-    gyro_scale: Annotated[
-        RelativeNormal | RelativeUniform | None, Meaning("factor on the rate that the gyro reads about each axis")
-    ] = None
-    star_tracker_outage: Annotated[
-        Outage | None, Meaning("an interval without samples of the star tracker, with a filter")
-    ] = None
-    wheel_failure: Annotated[Failure | None, Meaning("a wheel that gives no torque any more")] = None
-    timing_jitter: Annotated[
-        Jitter | None,
-        Meaning("share of loop.period by which samples come early or late, of which flight software knows nothing"),
-    ] = None
-    mode_frequency: Annotated[
-        RelativeNormal | RelativeUniform | None, Meaning("factor on each of flexible.frequency")
-    ] = None
-    mode_coupling: Annotated[
-        RelativeNormal | RelativeUniform | None, Meaning("factor on each row of flexible.coupling")
-    ] = None
-    own: Annotated[Any, Meaning("what code of one's own makes of numbers that are drawn")] = (
-        None  # `own_devices.OwnDraw`
-    )
+def _dispersion(name: str, rows: Mapping[str, tuple[str, tuple[Any, ...]]]) -> Any:
+    about = "What differs from trial to trial, each an inline table with a kind; what is absent stays nominal."
+    keys = [(key, Annotated[Table | None, Meaning(meaning)], None) for key, (meaning, _) in rows.items()]
+    space = {"__doc__": about, "__module__": __name__}
+    return msgspec.defstruct(name, keys, bases=(Table,), frozen=True, kw_only=True, namespace=space)
 
 
-class StateDispersion(Table, frozen=True):
-    """What differs from trial to trial, each an inline table with a kind; what is absent stays as the scenario says."""
+def _by_kind(kinds: tuple[Any, ...]) -> Kinds:
+    return {typing.get_args(typing.get_type_hints(one)["kind"])[0]: one for one in kinds}
 
-    x0: Annotated[UniformState | NormalState | None, Meaning("initial state")] = None
-    disturbance_phase: Annotated[UniformPhase | None, Meaning("of every sinusoid")] = None
-    disturbance_amplitude: Annotated[
-        RelativeNormal | RelativeUniform | None,
-        Meaning("of each sinusoid and constant, an independent factor on each component"),
-    ] = None
-    disturbance_bias: Annotated[NormalBias | UniformBias | None, Meaning("a constant, added")] = None
-    state_noise: Annotated[RelativeNormal | RelativeUniform | None, Meaning("factor on hardware.state_noise")] = None
-    torque_limit: Annotated[RelativeNormal | RelativeUniform | None, Meaning("factor on hardware.torque_limit")] = None
-    timing_jitter: Annotated[
-        Jitter | None,
-        Meaning("share of loop.period by which samples come early or late, of which flight software knows nothing"),
-    ] = None
-    own: Annotated[Any, Meaning("what code of one's own makes of numbers that are drawn")] = (
-        None  # `own_devices.OwnDraw`
-    )
+
+Dispersion, StateDispersion = _dispersion("Dispersion", _SPACECRAFT), _dispersion("StateDispersion", _STATE)
+DISPERSIONS: dict[str, Kinds] = {key: _by_kind(kinds) for key, (_, kinds) in {**_SPACECRAFT, **_STATE}.items()}

@@ -32,7 +32,7 @@ class PartTable(Table, frozen=True):
 
     def __reduce__(self) -> tuple:
         """Pickle by the arguments that this type is made from, since no module has its name."""
-        return _restored, (self.remake, {name: getattr(self, name) for name in self.__struct_fields__})
+        return _restored, (self.remake or type(self), {name: getattr(self, name) for name in self.__struct_fields__})
 
     def part(self, **known: Any) -> Any:
         """Return the part: its fields are those known, and else the numbers of the keys with their names."""
@@ -54,9 +54,8 @@ class PartTable(Table, frozen=True):
         return tuple(name for name, one in self.declared.items() if one.each)
 
 
-def _restored(remake: tuple, values: dict[str, Any]) -> Any:
-    make, *arguments = remake
-    return make(*arguments)(**values)
+def _restored(remake: Any, values: dict[str, Any]) -> Any:
+    return (remake[0](*remake[1:]) if isinstance(remake, tuple) else remake)(**values)
 
 
 @functools.cache

@@ -104,7 +104,7 @@ class Flexible(Table, frozen=True):
         except ValueError as error:
             raise ScenarioError(f"flexible.coupling is {errors.brief(self.coupling)}: {error}") from None
 
-    def check_drawn(self, inertia: Any, drawn: dispersion_tables.Dispersion | None) -> None:
+    def check_drawn(self, inertia: Any, drawn: Any) -> None:
         """Refuse draws of couplings and inertias that no body can have; inertia: of the body that flies [kg m^2].
 
         Rows are at most f times as long and moments at least s times as large, so that every draw leaves at least

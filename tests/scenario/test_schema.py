@@ -1,5 +1,6 @@
 import copy
 import math
+import pickle
 import re
 from collections.abc import Mapping
 
@@ -466,3 +467,9 @@ def test_a_file_that_is_not_there_is_named(tmp_path):
     with pytest.raises(ScenarioError) as caught:
         parsing.load(tmp_path / "none.toml")
     assert str(caught.value) == f"the scenario file {tmp_path / 'none.toml'} is not there"
+
+
+def test_every_kind_of_a_table_is_pickled():
+    for tables in COMPLETE:
+        parsed = parsing.parse(tables)
+        assert pickle.loads(pickle.dumps(parsed)) == parsed, tables
