@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from ptsmc_jax.figures.style import FLOOR, LIMIT, STYLES, figure_of, logarithmic, plain_ticks, styled
-from ptsmc_jax.scenario.gain_record import wide
+from ptsmc_jax.scenario.gain_bounds import wide
 from ptsmc_jax.simulation.catalogues import CATALOGUES
 
 MARKERS = ("o", "^", "s", "D", "v")

@@ -5,7 +5,6 @@ from typing import Any
 
 from ptsmc_jax.scenario import errors, own, tables
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
-from ptsmc_jax.scenario.gain_bounds import hand_over
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.scenario.values import MOST_STEPS
 from ptsmc_jax.simulation import catalogues
@@ -16,7 +15,6 @@ SHORTEST_WINDOW = 1e-5  # of t_f, continuous loop: 80 times what 32 bits tell ap
 
 def check(scenario: Scenario) -> None:
     """Raise ScenarioError where keys contradict each other or ask for what the project cannot do yet."""
-    _check_sensors(scenario)
     scenario.check_plant()
     _check_requirements(scenario)
     scenario.observer.check(scenario)
@@ -68,7 +66,7 @@ def _check_limit(metric: str, limit: tables.Limit) -> None:
         )
 
 
-def _check_sensors(scenario: Scenario) -> None:
+def check_sensors(scenario: Scenario) -> None:
     """Sensors of one's own are all that there are, and sample."""
     if scenario.sensors is None:
         return
@@ -90,7 +88,7 @@ def _check_sensors(scenario: Scenario) -> None:
 
 def _check_loop(scenario: Scenario) -> None:
     controller, loop = scenario.controller, scenario.loop
-    t_f, delta, window = controller.t_f, hand_over(scenario), scenario.window
+    t_f, delta, window = controller.t_f, scenario.hand_over, scenario.window
     if not controller.law.prescribed:
         scenario.need_samples(f"controller.kind = {errors.show(controller.kind)}")
     controller.check(scenario)
@@ -122,7 +120,7 @@ def _check_loop(scenario: Scenario) -> None:
 def _check_periods(scenario: Scenario) -> None:
     """What is counted in periods, or holds some, against the period and the run."""
     loop, window, filtering = scenario.loop, scenario.window, scenario.devices.command_filter
-    delta = hand_over(scenario)
+    delta = scenario.hand_over
     if delta < loop.period * (1 - 1e-9):
         raise wrong("controller.delta", delta, f"at least one control period, loop.period = {loop.period}")
     if scenario.end / loop.period > MOST_STEPS:

@@ -21,8 +21,6 @@ from ptsmc_jax.devices.star_times import filter_between, star_times
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.scenario import errors
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
-from ptsmc_jax.scenario.gain_bounds import BOUNDS
-from ptsmc_jax.scenario.gain_record import GainBounds
 from ptsmc_jax.scenario.schema import PartTable, table
 from ptsmc_jax.scenario.values import Count, Kinds, Meaning, NotNegative, NotNegatives, Positive, Table, Three
 
@@ -231,7 +229,7 @@ class StateHardware(Actuators, frozen=True):
     def noise_of_error(self, scenario: Any) -> tuple[float, float]:
         """Return the noise of the first state and of its derivative; of a system, of its noisiest components."""
         inputs = scenario.inputs  # a system's positions, then its rates
-        noises = (*(self.state_noise or ()), *(0.0,) * (2 * inputs))  # `check` refuses lists of another length
+        noises = self.state_noise or (0.0,) * (2 * inputs)
         return max(noises[:inputs]), max(noises[inputs : 2 * inputs])
 
     def noise_of_s(self, scenario: Any) -> float:
@@ -280,7 +278,8 @@ class SteadyStateFilter(FilterTable, frozen=True):
         Positive | None,
         Meaning("of the corrections; default: where star tracker and gyro noise weigh the same", "rad/s"),
     ] = None
-    gains: ClassVar[Mapping[str, GainBounds]] = {"filter_bandwidth": BOUNDS["bandwidth"]}
+    gains: ClassVar[tuple[str, ...]] = ("filter_bandwidth",)
+    usual: ClassVar[Mapping[str, str]] = {"bandwidth": "bandwidth"}
 
     @staticmethod
     def _noisy(table: Hardware) -> bool:
@@ -300,9 +299,7 @@ class SteadyStateFilter(FilterTable, frozen=True):
         return msgspec.structs.replace(self, bandwidth=self.width(scenario)) if noisy else self
 
     def passes(self, scenario: Any) -> float:
-        """Return the attitude gain of a correction, see `devices.attitude_filter.filter_gains`; 1 if `check` fails."""
-        if self.bandwidth is None and not self._noisy(scenario.devices):
-            return 1.0
+        """Return the attitude gain of a correction, see `devices.attitude_filter.filter_gains`."""
         return -math.expm1(-2.0 * self.width(scenario) * scenario.devices.interval(scenario.loop.period))
 
     def check(self, scenario: Any) -> None:

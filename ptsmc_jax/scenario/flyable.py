@@ -7,7 +7,7 @@ from pathlib import Path
 from ptsmc_jax import configure
 from ptsmc_jax.dispersions import variation
 from ptsmc_jax.numerics.pytrees import listing
-from ptsmc_jax.scenario import build, own_checks, reading, timing
+from ptsmc_jax.scenario import build, own_checks, reading, start_checks, timing
 from ptsmc_jax.scenario import tables as t
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import catalogues
@@ -98,5 +98,5 @@ def study(
     parts = setup.timed(*timing.timing(scenario, setup, reach or timing.reach_of(scenario), saves))
     dispersion = build.dispersion(scenario, parts)
     own_checks.check(parts, dispersion, scenario)
-    scenario.check_start(parts, dispersion, drawn=drawn)
+    start_checks.check(scenario, parts, dispersion, drawn=drawn)
     return Study(scenario, parts, dispersion, requirements(scenario), margin_requirements(scenario))

@@ -5,9 +5,9 @@ from collections.abc import Container, Mapping
 
 import msgspec
 
-from ptsmc_jax.scenario import errors, parsing, tables
+from ptsmc_jax.scenario import errors, gain_bounds, parsing, tables
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
-from ptsmc_jax.scenario.gain_record import Choice, wide
+from ptsmc_jax.scenario.gain_bounds import Choice, wide
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import catalogues
 
@@ -126,7 +126,7 @@ def _check_bounds(choice: Choice, name: str) -> None:
         raise ScenarioError(f"{key} is not a known gain; {parsing.nearest(name, known)}")
     if name not in choice.free:
         raise ScenarioError(f"{key} bounds a gain that is not free; tune.free is {errors.brief(choice.free)}")
-    least, most, closed = choice.scenario.gains[name].allowed(choice)
+    least, most, closed = gain_bounds.of(choice.scenario, name).allowed(choice)
     if not (least <= lower if closed else least < lower) or not upper < most:
         allowed = f"two numbers {'from' if closed else 'above'} {least}"
         raise wrong(key, [lower, upper], allowed + (f" and below {most}" if math.isfinite(most) else ""))
@@ -139,7 +139,7 @@ def _default(choice: Choice, name: str) -> tuple[float, float]:
 
     Then to half the distance, or twice the distance, that it keeps from the least that is allowed.
     """
-    gain = choice.scenario.gains[name]
+    gain = gain_bounds.of(choice.scenario, name)
     (low, high), own = gain.usual(choice), _own(choice.scenario, name)
     if own:
         least, most, closed = gain.allowed(choice)
@@ -169,7 +169,7 @@ def border(scenario: Scenario, name: str, side: str, bound: float) -> str | None
     tune = scenario.tune
     if not scenario.sampled or tune is None:
         return None
-    gain = scenario.gains[name]
+    gain = gain_bounds.of(scenario, name)
     words = gain.below if side == "lower" else gain.above
     if words is None:
         return None
@@ -187,7 +187,7 @@ def beyond(scenario: Scenario, name: str, side: str) -> float | None:
     low, high = tune.bounds[name]
     if border(scenario, name, side, low if side == "lower" else high) is not None:
         return None
-    least, most, _ = scenario.gains[name].allowed(Choice(scenario, tune.gains, tune.bounds))
+    least, most, _ = gain_bounds.of(scenario, name).allowed(Choice(scenario, tune.gains, tune.bounds))
     if wide(low, high):
         step = (high / low) ** 0.1
         value = low / step if side == "lower" else high * step
@@ -217,7 +217,7 @@ def widened(
         by_default = ("tune", "bounds", name) in defaulted
         if not by_default or border(scenario, name, side, low if side == "lower" else high) is not None:
             continue
-        least, most, _ = scenario.gains[name].allowed(Choice(scenario, tune.gains, tune.bounds))
+        least, most, _ = gain_bounds.of(scenario, name).allowed(Choice(scenario, tune.gains, tune.bounds))
         if name == "delta":  # the upper bound stays: the clock has samples for it only
             most = high
         if side == "lower" and wide(low, high) and math.isfinite(least):
@@ -234,7 +234,7 @@ def widened(
 def usual(scenario: Scenario, name: str) -> tuple[float, float]:
     """The default bounds of a free gain, before they reach out to the scenario's own."""
     tune = scenario.search
-    return scenario.gains[name].usual(Choice(scenario, tune.gains, tune.bounds))
+    return gain_bounds.of(scenario, name).usual(Choice(scenario, tune.gains, tune.bounds))
 
 
 def by_default(scenario: Scenario, name: str) -> tuple[float, float]:

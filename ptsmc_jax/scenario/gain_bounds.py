@@ -1,41 +1,102 @@
 """The usual bounds of gains by the names that declarations use, and the bounds that a declaration itself has."""
 
 import math
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
 from ptsmc_jax.declare import Declaration
 from ptsmc_jax.scenario import mission, scales
 from ptsmc_jax.scenario.errors import ScenarioError
-from ptsmc_jax.scenario.gain_record import Allowed, Choice, GainBounds, Interval
 from ptsmc_jax.scenario.values import MOST_STEPS
 
+Interval = tuple[float, float]
 SLOWEST_DECAY = 3.5  # t_f times the least K1
 
 
-def hand_over(scenario: Any) -> float:
-    """How long before t_f the law hands over [s]; a period for a law that does not."""
-    return getattr(scenario.controller, "delta", None) or scenario.loop.period
+def wide(low: Any, high: Any) -> Any:
+    """Whether an interval, or each of many, is searched on a log scale: above zero, its ends more than tenfold apart.
 
-
-def of(declared: Declaration, called: str) -> GainBounds:
-    """Return the bounds of a gain.
-
-    Args:
-        declared: the declaration of the gain.
-        called: what errors call it.
+    >>> wide(0.1, 2.0), wide(0.5, 2.0), wide(-1.0, 2.0)
+    (True, False, False)
     """
-    limits, usual = declared.limits, declared.usual
-    allowed = Allowed(
-        max(limits.above, limits.at_least), min(limits.below, limits.at_most), limits.at_least > limits.above
-    )
-    if isinstance(usual, str):
-        return BOUNDS[usual]
-    bounds_of: Any = usual if callable(usual) else lambda t_f, period: usual
+    return (low > 0.0) & (high > 10.0 * low)
+
+
+class Choice(NamedTuple):
+    """What bounds of a gain follow from: the scenario, the gains that are free, and bounds that are known already."""
+
+    scenario: Any
+    free: tuple[str, ...]
+    bounds: Mapping[str, Interval]
+
+    @property
+    def law(self) -> Any:
+        """The table of the scenario's law."""
+        return self.scenario.controller
+
+    @property
+    def t_f(self) -> float:
+        """The prescribed time of the scenario [s]."""
+        return self.law.t_f
+
+    @property
+    def sampled(self) -> bool:
+        """Whether the loop is sampled."""
+        return self.scenario.sampled
+
+    @property
+    def shortest_delta(self) -> float:
+        """The shortest delta [s]: a period, if there is one."""
+        return self.scenario.loop.period if self.sampled else 0.0
+
+    def smallest(self, name: str) -> float:
+        """What one of the law's gains is at least: its lower bound, or its own value where it is not free."""
+        return self.bounds[name][0] if name in self.bounds else getattr(self.law, name)
+
+
+class Allowed(NamedTuple):
+    """Between which numbers bounds of a gain may be set, the upper one excluded."""
+
+    lower: float
+    upper: float
+    lower_included: bool = False
+
+
+def _positive(_: Choice) -> Allowed:
+    return Allowed(0.0, math.inf)
+
+
+class GainBounds(NamedTuple):
+    """The bounds of a gain, as functions of a `Choice`."""
+
+    usual: Callable[[Choice], Interval]  # where a scenario gives none
+    # None of them contains zero, since the discontinuous sign has no gradient
+    allowed: Callable[[Choice], Allowed] = _positive
+    below: str | None = None  # what lies below the usual lower bound in the sampled loop, in words
+    above: str | None = None  # and above the upper one
+
+
+def of(scenario: Any, name: str) -> GainBounds:
+    """Return the bounds of a gain of a scenario, by its name."""
+    table = next(table for table in scenario.tuned_tables.values() if name in table.gains)
+    key = name.removeprefix(table.prefix)
+    declared = table.declared.get(key)
+    if declared is None or isinstance(declared.usual, str):
+        return BOUNDS[table.usual[key] if declared is None else declared.usual]
+    return _declared(declared, f"gain {key} of the class {table.made.__name__}")
+
+
+def _declared(declared: Declaration, called: str) -> GainBounds:
+    """Return the bounds that a declaration gives as numbers, or as a function; called: its name in errors."""
+    limits = declared.limits
+    usual: Any = declared.usual
+    lower, upper = max(limits.above, limits.at_least), min(limits.below, limits.at_most)
+    allowed = Allowed(lower, upper, limits.at_least > limits.above)
 
     def interval(choice: Choice) -> Interval:
         try:
-            low, high = (float(v) for v in bounds_of(choice.t_f, choice.scenario.loop.period))
+            ends: Any = usual(choice.t_f, choice.scenario.loop.period) if callable(usual) else usual
+            low, high = (float(end) for end in ends)
         except (Exception, SystemExit) as error:
             said = f"{type(error).__name__}: {error}"
             raise ScenarioError(f"the usual bounds of the {called} fail: {said}") from None
@@ -56,13 +117,13 @@ def _converged(scenario: Any) -> float:
 
 
 def _usual_t_f(choice: Choice) -> Interval:
-    shortest = 4.0 * choice.shortest_delta if "delta" in choice.free else hand_over(choice.scenario)
+    shortest = 4.0 * choice.shortest_delta if "delta" in choice.free else choice.scenario.hand_over
     return max(0.5 * choice.t_f, 1.05 * shortest, 1.05 * _converged(choice.scenario)), 2.0 * choice.t_f
 
 
 def _allowed_t_f(choice: Choice) -> Allowed:
     loop, shortest = choice.scenario.loop, choice.shortest_delta
-    least = max(shortest if "delta" in choice.free else hand_over(choice.scenario), _converged(choice.scenario))
+    least = max(shortest if "delta" in choice.free else choice.scenario.hand_over, _converged(choice.scenario))
     hold = loop.t_end - choice.t_f
     return Allowed(least, MOST_STEPS * loop.period - hold if choice.sampled else math.inf)
 

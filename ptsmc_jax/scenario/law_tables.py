@@ -11,8 +11,6 @@ from ptsmc_jax.laws.base import AccelerationLaw
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.scenario import disturbance_bounds, mission
 from ptsmc_jax.scenario.errors import show, wrong
-from ptsmc_jax.scenario.gain_bounds import BOUNDS, hand_over
-from ptsmc_jax.scenario.gain_record import GainBounds
 from ptsmc_jax.scenario.own import own_kind
 from ptsmc_jax.scenario.schema import PartTable, table
 from ptsmc_jax.scenario.values import Meaning, NotNegative, Positive
@@ -36,7 +34,8 @@ class LawTable(PartTable, frozen=True):
         ),
     ] = None
     initial_estimate_error: Annotated[NotNegative, Meaning("bound on the observer's error at t = 0", "unit of d")] = 0.0
-    gains: ClassVar[Mapping[str, GainBounds]] = {"t_f": BOUNDS["t_f"]}
+    gains: ClassVar[tuple[str, ...]] = ("t_f",)
+    usual: ClassVar[Mapping[str, str]] = {"t_f": "t_f", "delta": "delta"}
 
     @property
     def implicit(self) -> bool:
@@ -113,7 +112,7 @@ class LawTable(PartTable, frozen=True):
 
     def build(self, scenario: Any, model: Any) -> Any:
         """Return the law for a plant's model."""
-        law = self.part(kinematics=self.kinematics(scenario.motion)(model), delta=vector(hand_over(scenario)))
+        law = self.part(kinematics=self.kinematics(scenario.motion)(model), delta=vector(scenario.hand_over))
         return dataclasses.replace(law, implicit=True) if self.implicit else law
 
 
@@ -144,7 +143,7 @@ class OwnTable(LawTable, frozen=True):
         Positive | None,
         Meaning("time from the hand-over to t_f, if the law hands over; default: one control period", "s"),
     ] = None
-    gains: ClassVar[Mapping[str, GainBounds]] = {"delta": BOUNDS["delta"], "t_f": BOUNDS["t_f"]}
+    gains: ClassVar[tuple[str, ...]] = ("delta", "t_f")
 
 
 class OwnAttitudeTable(OwnTable, frozen=True):

@@ -70,7 +70,8 @@ def resolve(scenario: Scenario) -> Scenario:
     if loop.t_end is None:
         loop = msgspec.structs.replace(loop, t_end=law.t_f + max(units.of(AFTER), loop.window))
     scenario = msgspec.structs.replace(scenario, **{**filled, "loop": loop})
-    scenario.check_shapes()
+    checks.check_sensors(scenario)
+    scenario.check_devices()
     if loop.settling_angle is None:
         loop = msgspec.structs.replace(loop, settling_angle=scenario.usual_settling())
         scenario = msgspec.structs.replace(scenario, loop=loop)

@@ -11,8 +11,6 @@ import msgspec
 from ptsmc_jax import declare
 from ptsmc_jax.declare import Declaration, Scaled
 from ptsmc_jax.numerics.pytrees import pytree, vector
-from ptsmc_jax.scenario import gain_bounds
-from ptsmc_jax.scenario.gain_record import GainBounds
 from ptsmc_jax.scenario.values import Table
 
 
@@ -23,7 +21,8 @@ class PartTable(Table, frozen=True):
     declared: ClassVar[Mapping[str, Declaration]] = {}  # its numbers
     body: ClassVar[bool] = True  # the plant is a spacecraft
     prefix: ClassVar[str] = ""  # with the key it makes the name of a gain
-    gains: ClassVar[Mapping[str, GainBounds]] = {}  # all that tuning may move
+    gains: ClassVar[tuple[str, ...]] = ()  # names of all that tuning may move
+    usual: ClassVar[Mapping[str, str]] = {}  # names of the usual bounds of gains that the table itself declares
     # gains that are free if a scenario does not say; the second ones in the sampled loop only, since without samples a
     # larger K1 and a thinner boundary layer cost nothing but steps
     free_by_default: ClassVar[tuple[str, ...]] = ()
@@ -95,15 +94,13 @@ def extended(base: Any, made: Any, kind: str, declared: Mapping[str, Declaration
         type_ = one.type(body)
         fields.append((name, type_ | None if scaled else type_, None if scaled else one.default))
     named = {base.prefix + name: one for name, one in declared.items() if one.gain}
-    bounds = {name: gain_bounds.of(one, f"gain {name.removeprefix(base.prefix)} of the class {made.__name__}")
-              for name, one in named.items()}  # fmt: skip
     space = {
         "__doc__": inspect.cleandoc(made.__doc__ or "").split("\n\n")[0],
         "__module__": made.__module__,
         "made": made,
         "declared": declared,
         "scaled": {name: one.default for name, one in declared.items() if isinstance(one.default, Scaled)},
-        "gains": bounds | {name: one for name, one in base.gains.items() if name not in bounds},
+        "gains": tuple(dict.fromkeys((*named, *base.gains))),
         "free_by_default": tuple(name for name, one in named.items() if one.free is True),
         "free_if_sampled": tuple(name for name, one in named.items() if one.free == "sampled"),
         **space,

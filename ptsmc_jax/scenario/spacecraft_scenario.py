@@ -10,11 +10,10 @@ from msgspec import Meta
 
 from ptsmc_jax import formulas
 from ptsmc_jax.declare import Scaled
-from ptsmc_jax.dispersions.base import INITIAL_ATTITUDE, REFERENCE
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.plants.flexible_body import flexible
 from ptsmc_jax.plants.rigid_body import AttitudeState, spacecraft
-from ptsmc_jax.scenario import attitude_keys, dispersion_tables, errors, start_checks, tables
+from ptsmc_jax.scenario import attitude_keys, dispersion_tables, errors, tables
 from ptsmc_jax.scenario.device_tables import FILTERS, WHEELS, FilterTable, Hardware, NoFilter, WheelLimits
 from ptsmc_jax.scenario.disturbance_tables import DISTURBANCES
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
@@ -219,7 +218,6 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
         limits = [self.devices.torque_limit, tables.limit_of(self, "peak_torque")]
         found += [limit / np.diag(inertia).max() for limit in limits if limit is not None]
         if self.wheels is not None:
-            self.wheels.check()  # defaults are filled in before the scenario is checked
             spread = np.linalg.pinv(formulas.wheel_axes(self.wheels.spin_axes()).T)
             asked = np.abs(spread @ inertia).max()  # torque of one wheel for a unit acceleration about one axis
             limits = [self.wheels.torque_limit, tables.limit_of(self, "peak_wheel_torque")]
@@ -268,10 +266,14 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
                 except ValueError as error:
                     raise ScenarioError(f"spacecraft.{key} is {errors.brief(value)}: {error}") from None
 
-    def check_shapes(self) -> None:
-        """Modes that a body can have."""
+    def check_devices(self) -> None:
+        """Modes that a body can have, and devices that fit."""
         if self.flexible is not None:
             self.flexible.check(self.true_inertia)
+        self.devices.check(self)
+        self.estimator.check(self)
+        if self.wheels is not None:
+            self.wheels.check()
 
     def check_plant(self) -> None:
         """Attitudes that are given once, devices that fit, and modes that a body can have however they are drawn."""
@@ -282,10 +284,6 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
         self.reference.check()
         for place, term in self.placed_terms.items():
             term.check(place)
-        self.devices.check(self)
-        self.estimator.check(self)
-        if self.wheels is not None:
-            self.wheels.check()
         if self.pointing is not None:
             self.pointing.check(self)
         if self.flexible is not None:
@@ -360,9 +358,3 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
             "disturbance.amplitude": sum(term.impulse(self.end) for term in self.terms),
         }
         return {key: float(share) / math.sqrt(least * middle) for key, share in shares.items()}
-
-    def check_start(self, parts: Any, dispersion: Any, *, drawn: bool) -> None:
-        """The law's singularity on the reference, and on the way to it; a drawn trial that meets it is marked."""
-        start_checks.reference(self, parts)
-        if not drawn or dispersion.kinds.keys().isdisjoint((INITIAL_ATTITUDE, REFERENCE)):
-            start_checks.attitude(self, parts)

@@ -9,6 +9,7 @@ from jaxtyping import Array
 
 from ptsmc_jax import programs
 from ptsmc_jax.batching import lapack
+from ptsmc_jax.dispersions.base import INITIAL_ATTITUDE, REFERENCE
 from ptsmc_jax.plants.second_order import System
 from ptsmc_jax.scenario import attitude_keys, errors
 from ptsmc_jax.scenario.errors import ScenarioError
@@ -16,6 +17,20 @@ from ptsmc_jax.simulation.rollout import SINGULAR_CLEARANCE, Parts
 from ptsmc_jax.theory import solutions
 
 SINGULAR_CONDITION = 1e14  # of a matrix in double precision
+
+
+def check(scenario: Any, parts: Parts, dispersion: Any, *, drawn: bool) -> None:
+    """Raise ScenarioError if the law meets its singularity on the reference or on the way to it, or cannot be inverted.
+
+    A trial with a random attitude that meets the singularity is marked instead; drawn: the attitude is random if a
+    dispersion says so.
+    """
+    if scenario.motion == "system":
+        system(scenario, parts)
+    if scenario.motion == "spacecraft":
+        reference(scenario, parts)
+        if not drawn or dispersion.kinds.keys().isdisjoint((INITIAL_ATTITUDE, REFERENCE)):
+            attitude(scenario, parts)
 
 
 def system(scenario: Any, parts: Parts) -> None:

@@ -9,7 +9,7 @@ from msgspec import Meta
 
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.plants.integrator_chain import chain
-from ptsmc_jax.scenario import device_tables, dispersion_tables, errors, start_checks, systems, tables
+from ptsmc_jax.scenario import device_tables, dispersion_tables, errors, systems, tables
 from ptsmc_jax.scenario.disturbance_tables import DISTURBANCES
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.law_tables import LAWS
@@ -104,18 +104,15 @@ class StateScenario(Scenario, frozen=True, kw_only=True):
         noises = getattr(self.hardware, "state_noise", None) or (0.0,)
         return max(2e-4 * (self.start_size() or 5.0), 5.0 * max(noises[: self.inputs]))
 
-    def check_shapes(self) -> None:
-        """Refuse lists that are not as long as there are inputs."""
+    def check_devices(self) -> None:
+        """Refuse lists that are not as long as there are inputs, or states."""
+        self.devices.check(self)
         m = self.inputs
         for place, table in {**self.placed_terms, "observer": self.observer}.items():
             for key in table.each:
                 value = getattr(table, key)
                 if value is not None and len(value) != m:
                     raise wrong(f"{place}.{key}", value, f"a list of {m} number{'s' * (m > 1)}, one for each input")
-
-    def check_plant(self) -> None:
-        """Refuse lists that are not as long as there are states."""
-        self.devices.check(self)
 
     def start(self) -> Any:
         """The state x0."""
@@ -152,12 +149,11 @@ class ChainScenario(StateScenario, frozen=True, kw_only=True):
         """The number of states."""
         return self.plant.order
 
-    def check_plant(self) -> None:
+    def check_body(self) -> None:
         """Refuse an initial state of another length than the chain's order."""
         n = self.plant.order
         if len(self.plant.x0) != n:
             raise wrong("plant.x0", self.plant.x0, f"a list of plant.order = {n} numbers")
-        super().check_plant()
 
     def model(self) -> Any:
         """The chain."""
@@ -199,7 +195,6 @@ class SystemScenario(StateScenario, frozen=True, kw_only=True):
                     raise ScenarioError(f"plant.{key} is {errors.brief(value)}: {error}") from None
             elif value is not None:
                 self._loaded(key)
-        super().check_plant()
 
     def model(self) -> Any:
         """The system that law and observer know. Raises ScenarioError where there is none."""
@@ -232,7 +227,3 @@ class SystemScenario(StateScenario, frozen=True, kw_only=True):
     def target(self) -> Any:
         """Time: the reference is in x_1, an error already."""
         return CurrentTime()
-
-    def check_start(self, parts: Any, dispersion: Any, *, drawn: bool) -> None:
-        """What the law, or the observer, must invert where it starts."""
-        start_checks.system(self, parts)

@@ -14,7 +14,6 @@ from ptsmc_jax.declare import Scaled
 from ptsmc_jax.scenario import keys
 from ptsmc_jax.scenario.device_tables import NoFilter
 from ptsmc_jax.scenario.errors import ScenarioError
-from ptsmc_jax.scenario.gain_record import GainBounds
 from ptsmc_jax.scenario.law_tables import LAWS
 from ptsmc_jax.scenario.values import (
     ABSENT,
@@ -325,9 +324,14 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
         return {where: table for where, table in tables.items() if table is not None}
 
     @property
-    def gains(self) -> dict[str, GainBounds]:
-        """The gains that it has for tuning to move, with their bounds."""
-        return {name: bounds for table in self.tuned_tables.values() for name, bounds in table.gains.items()}
+    def gains(self) -> tuple[str, ...]:
+        """The names of the gains that it has for tuning to move."""
+        return tuple(name for table in self.tuned_tables.values() for name in table.gains)
+
+    @property
+    def hand_over(self) -> float:
+        """How long before t_f the law hands over [s]; a period for a law that does not."""
+        return getattr(self.controller, "delta", None) or self.loop.period
 
     @property
     def measured(self) -> bool:
@@ -367,12 +371,11 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
     def check_body(self) -> None:
         """Raise ScenarioError if there is no such body: before defaults follow from its inertia."""
 
-    def check_shapes(self) -> None:
-        """Raise ScenarioError if lists have other lengths than the plant needs: before defaults follow from them."""
+    def check_devices(self) -> None:
+        """Raise ScenarioError if devices contradict each other or have lists of another length, before gains follow."""
 
     def check_plant(self) -> None:
         """Raise ScenarioError where keys of the plant contradict each other."""
-        raise NotImplementedError
 
     def model(self) -> Any:
         """The plant as the law knows it, a part of `plants`."""
@@ -393,9 +396,6 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
     def frequencies(self, setup: Any, t_f: float) -> dict[str, float]:
         """How fast the plant moves and turns [rad/s], by the key that says so, on the way to the shortest t_f [s]."""
         return {}
-
-    def check_start(self, parts: Any, dispersion: Any, *, drawn: bool) -> None:
-        """Raise ScenarioError where the law meets its singularity, see `flyable.study`."""
 
     def __eq__(self, other: object) -> bool:
         """Two scenarios are equal where their values are, whether a file says them or not."""

@@ -18,7 +18,6 @@ from ptsmc_jax.laws.prescribed_time import PrescribedTime
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.plants.second_order import System
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
-from ptsmc_jax.scenario.gain_bounds import hand_over
 from ptsmc_jax.scenario.tables import Scenario, check_scenario
 from ptsmc_jax.scenario.values import MOST_STEPS
 from ptsmc_jax.simulation import clock
@@ -76,7 +75,7 @@ def reach_of(scenario: Scenario, **farther: float) -> Reach:
         if name in _ABOVE_ZERO and value == 0.0:
             raise ValueError(f"{name} is {value!r}, but must be greater than 0")
     table = scenario.controller
-    gains, delta = getattr(scenario.observer, "gain", (0.0,)), hand_over(scenario)
+    gains, delta = getattr(scenario.observer, "gain", (0.0,)), scenario.hand_over
     k1, width, rate = getattr(table, "k1", 1.0), getattr(table, "sign_width", 0.0), getattr(table, "surface_rate", 1.0)
     period = scenario.loop.period
     own = Reach(table.t_f, table.t_f, delta, delta, min(gains), max(gains), k1, width, rate, period, period)

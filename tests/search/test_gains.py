@@ -13,9 +13,9 @@ from ptsmc_jax import scenario
 from ptsmc_jax.devices import attitude_filter
 from ptsmc_jax.laws import prescribed_time
 from ptsmc_jax.numerics.pytrees import pytree
-from ptsmc_jax.scenario import free_gains, from_tables, study, timing
+from ptsmc_jax.scenario import free_gains, from_tables, gain_bounds, study, timing
 from ptsmc_jax.scenario.errors import ScenarioError
-from ptsmc_jax.scenario.gain_record import Choice
+from ptsmc_jax.scenario.gain_bounds import Choice
 from ptsmc_jax.scenario.law_tables import LAWS
 from ptsmc_jax.scenario.observer_tables import OBSERVERS
 from ptsmc_jax.simulation import rollout
@@ -435,7 +435,10 @@ def test_usual_bounds_of_every_gain_are_allowed_and_hold_the_own_one(plant, tabl
         loaded = from_tables({**tables, "tune": {"free": free}})
         choice = Choice(loaded, loaded.search.gains, loaded.search.bounds)
         for name in free:
-            (low, high), (least, most, closed) = loaded.search.bounds[name], loaded.gains[name].allowed(choice)
+            (low, high), (least, most, closed) = (
+                loaded.search.bounds[name],
+                gain_bounds.of(loaded, name).allowed(choice),
+            )
             assert least <= low if closed else least < low, name
             assert low < high < most, name
             own = free_gains._own(loaded, name)

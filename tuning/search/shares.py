@@ -7,7 +7,7 @@ import numpy as np
 
 from ptsmc_jax.numerics.pytrees import Leaf, pytree
 from ptsmc_jax.scenario import free_gains
-from ptsmc_jax.scenario.gain_record import wide
+from ptsmc_jax.scenario.gain_bounds import wide
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation.rollout import Parts
 from ptsmc_jax.theory import envelopes

@@ -13,7 +13,6 @@ from ptsmc_jax.figures import study_plots, style
 from ptsmc_jax.scenario import Study, errors, keys, own, parsing, study
 from ptsmc_jax.scenario import replace as changed
 from ptsmc_jax.scenario.errors import ScenarioError
-from ptsmc_jax.scenario.gain_bounds import hand_over
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation.rollout import Parts
 from ptsmc_jax.theory import borders, covariance, margins, run_margins
@@ -116,7 +115,7 @@ def usual_periods(scenario: Scenario) -> str:
 
 def usual_deltas(scenario: Scenario) -> str:
     """Return the default axis up: hand-over times from a period to a seventh of t_f, the scenario's own among them."""
-    delta, shortest = hand_over(scenario), scenario.loop.period
+    delta, shortest = scenario.hand_over, scenario.loop.period
     longest = max(scenario.controller.t_f / 7.0, 2.0 * delta)
     return f"{DELTA}={min(delta, shortest):.4g}:{longest:.4g}:9"
 
