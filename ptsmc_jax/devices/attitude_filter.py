@@ -57,8 +57,7 @@ class AttitudeFilter:
 
     def propagate(self, old: Estimate, w: Float[Array, "3"], w_next: Float[Array, "3"], dt: Scalar) -> Estimate:
         """The estimate dt [s] later, from the rates measured at both ends [rad/s], coning to second order included."""
-        a, b = w - old.bias, w_next - old.bias  # rates of the body
-        turn = dt / 2 * (a + b) + dt * dt / 12 * attitude.cross(a, b)
+        turn = rotation_over(w - old.bias, w_next - old.bias, dt)
         return Estimate(attitude.multiply(old.q, attitude.from_rotation_vector(turn)), old.bias)
 
     def correct(self, old: Estimate, measured: Float[Array, "4"], weight: Scalar) -> Estimate:
@@ -87,6 +86,11 @@ class AttitudeFilter:
         w_at_sample = w + share * (w_next - w)
         corrected = self.correct(self.propagate(old, w, w_at_sample, dt - age), measured, weight)
         return self.propagate(corrected, w_at_sample, w_next, age)
+
+
+def rotation_over(a: Float[Array, "3"], b: Float[Array, "3"], dt: Scalar) -> Float[Array, "3"]:
+    """Return the rotation vector (3,) [rad] of a body in dt [s] whose rate goes from a to b [rad/s], with coning."""
+    return dt / 2 * (a + b) + dt * dt / 12 * attitude.cross(a, b)
 
 
 def filter_gains(bandwidth: Any, interval: Any) -> tuple[Any, Any]:

@@ -55,6 +55,15 @@ class Sensor(ABC):
         """The state as it is read before any filter, and the memory; arguments as in `measure`, dt in [s]."""
         return self.measure(memory, x, now, dt)
 
+    def inputs(self, memory: Any, x: Any, now: Ticks, dt: Scalar, star_x: Any = None) -> tuple[dict[str, Array], Any]:
+        """Return what exported C gets from the sensors at a sample, by the names of its inputs, and the memory.
+
+        Arguments are those of `measure`.
+        """
+        read, memory = self.sample(memory, x, now, dt, star_x)
+        named = {"attitude": read.q, "rate": read.w} if isinstance(read, AttitudeState) else {"x": read}
+        return named, memory
+
     @abstractmethod
     def quiet(self) -> Any:
         """The sensor without noise."""
@@ -62,6 +71,19 @@ class Sensor(ABC):
     def in_step(self) -> Any:
         """The sensor as if all its samples were taken at control samples, for linear theory; see `Sensors`."""
         return self
+
+    def taken_ago(self, sample: Array, dt: Scalar) -> Any:
+        """Return how long before a control sample sensors with their own clock took their newest reading [s].
+
+        Args:
+            sample: number of the control sample.
+            dt: length of the control period before it [s], the largest value.
+
+        Returns:
+            A pytree of times. `measure` gets the true states at these times, in the same pytree, as `star_x`. None: all
+            sensors read at control samples.
+        """
+        return None
 
     def drawn(self, seed: WholeNumber, trial: WholeNumber) -> dict[str, Array]:
         """Numbers that the sensor draws once a trial, such as a bias [rad/s], by the names of a row's columns."""
@@ -218,12 +240,23 @@ class Sensors(Sensor):
             weight = jnp.where((t >= self.outage[0]) & (t < self.outage[1]), 0.0, weight)
         return weight
 
-    def star_age(self, sample: Int[Array, ""], dt: Scalar) -> Scalar:
-        """Age of the star tracker's measurement at a sample [s]; dt: length of the period before the sample [s].
+    def taken_ago(self, sample: Int[Array, ""], dt: Scalar) -> Scalar | None:
+        """Return the age of the star tracker's measurement at a sample [s]; dt: length of the period before it [s].
 
-        Older ones, from before t = 0 or used already, count as old as the period.
+        Older ones, from before t = 0 or used already, count as old as the period. None: it has no times of its own.
         """
-        return jnp.zeros_like(dt) if self.own_times is None else jnp.minimum(self.own_times.age(sample), dt)
+        return None if self.own_times is None else jnp.minimum(self.own_times.age(sample), dt)
+
+    def inputs(
+        self, memory: Memory, x: AttitudeState, now: Ticks, dt: Scalar, star_x: AttitudeState | None = None
+    ) -> tuple[dict[str, Array], Memory]:
+        """Return the inputs of exported C, with whether there is an attitude, and its age [s], for the filter."""
+        named, memory = super().inputs(memory, x, now, dt, star_x)
+        if self.filter is not None:
+            age = self.taken_ago(now.sample, dt)
+            named["attitude_valid"] = (self.star_weight(now) > 0.0).astype(float)
+            named |= {} if age is None else {"attitude_age": age}
+        return named, memory
 
     def measure(
         self, memory: Memory, x: AttitudeState, now: Ticks, dt: Scalar, star_x: AttitudeState | None = None
@@ -237,7 +270,7 @@ class Sensors(Sensor):
             estimate = self.filter.correct(self.filter.propagate(old, rate, read.w, dt), read.q, weight)
         else:
             # where there is none, all of the period lies behind it, as the C has it
-            age = jnp.where(weight > 0.0, self.star_age(now.sample, dt), dt)
+            age = jnp.where(weight > 0.0, jnp.minimum(self.own_times.age(now.sample), dt), dt)
             estimate = self.filter.correct_between(old, rate, read.w, dt, read.q, age, weight)
         return AttitudeState(estimate.q, read.w - estimate.bias), memory_next._replace(estimate=estimate, rate=read.w)
 

@@ -248,16 +248,10 @@ class InTheLoop:
     ) -> tuple[Decision, Computer]:
         """A period by `ptsmc_step`; k2 is C's own."""
         (now, dt_before, *_), (sensing, state, counts) = period, computer.sensors
-        sensors = parts.sensors
-        read, sensing = sensors.sample(sensing, x, now, dt_before, star_x)
-        inputs = {"x": read, "wheel_momentum": acting.h, "acting": acting.v}
+        inputs, sensing = parts.sensors.inputs(sensing, x, now, dt_before, star_x)
+        inputs |= {"wheel_momentum": acting.h, "acting": acting.v}
         if computer.applied is not None:
             inputs["applied"] = computer.applied[0]
-        if self.board.spacecraft:
-            inputs |= {"attitude": read.q, "rate": read.w}
-        if hasattr(sensors, "star_weight"):
-            inputs["attitude_age"] = sensors.star_age(now.sample, dt_before)
-            inputs["attitude_valid"] = (sensors.star_weight(now) > 0.0).astype(float)
         row = jnp.concatenate([now.t[None], *(jnp.ravel(inputs[name]) for name in self.board.inputs)])
         after, out, status = self.library.called(state, row, self._told(parts))
         has_length = period.length > 0.0

@@ -27,12 +27,9 @@ class Samples(NamedTuple):
 
     t: Array  # [s]
     flown: Array  # bool: its period has a length
-    measured: Any  # state as the sensors say it
-    valid: Array | None  # bool: the star tracker has an attitude
-    age: Array | None  # how old it is, of a star tracker with times of its own [s]
+    inputs: dict[str, Array]  # what the sensors deliver, see `Sensor.inputs`
     before: Any  # Estimate of the attitude filter before the sample
     estimate: Any  # and after it
-    gyro: Array | None  # rate as measured [rad/s]
     applied: Array  # mean torque over the last period [N m]
     acting: Array | None  # torque of the channels [N m]
     momentum: Array | None  # of the wheels [N m s]
@@ -66,16 +63,12 @@ def fly(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Samples:
         target, d_hat, u, s, *_ = record.decision
         assert drive is not None
         visible, sensing = parts.plant.visible(state.x), state.computer.sensors
-        measured, _ = sensors.sample(sensing, visible, now, tick.dt_before, state.star_x)
-        before = getattr(sensing, "estimate", None)
+        inputs, _ = sensors.inputs(sensing, visible, now, tick.dt_before, state.star_x)
         distance = law.clearance(computer.seen, target)
         unit = jnp.where(jnp.isnan(unit), law.kinematics.clearance_unit(distance), unit)
         row = Samples(
-            t=now.t, flown=now.t_next > now.t, measured=measured,
-            valid=None if before is None else sensors.star_weight(now) > 0.0,
-            age=None if state.star_x is None else sensors.star_age(now.sample, tick.dt_before),
-            before=before, estimate=getattr(computer.sensors, "estimate", None),
-            gyro=getattr(computer.sensors, "rate", None),
+            t=now.t, flown=now.t_next > now.t, inputs=inputs,
+            before=getattr(sensing, "estimate", None), estimate=getattr(computer.sensors, "estimate", None),
             applied=state.applied[0], acting=state.actuators.v, momentum=state.actuators.h,
             seen=computer.seen, observer=computer.observer,
             law=computer.law, command_filter=computer.command_filter, queue=after.actuators.queue,
@@ -128,17 +121,15 @@ def one(samples: Samples, trial: int) -> Samples:
 
 def rows(board: Board, samples: Samples) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Inputs, outputs and state of one trial, (samples, columns) each, in the order of `templates.columns`."""
-    inputs = {"x": samples.measured, "wheel_momentum": samples.momentum, "applied": samples.applied,
-             "acting": samples.acting, "attitude_valid": samples.valid, "attitude_age": samples.age}  # fmt: skip
+    inputs = samples.inputs | {"wheel_momentum": samples.momentum, "applied": samples.applied, "acting": samples.acting}
     state_by_name = {"x": samples.seen, "observer": samples.observer, "law": samples.law, "queue": samples.queue,
             "command_filter": samples.command_filter,
             "wheel_momentum": samples.momentum, "acting": samples.acting, "clearance": samples.clearance,
             "clearance_unit": samples.clearance_unit}  # fmt: skip
     if board.spacecraft:
-        inputs |= {"attitude": samples.measured.q, "rate": samples.measured.w}
         state_by_name |= {"attitude": samples.seen.q, "rate": samples.seen.w}
     if samples.estimate is not None:
-        state_by_name |= {"bias": samples.estimate.bias, "gyro": samples.gyro}
+        state_by_name |= {"bias": samples.estimate.bias, "gyro": samples.inputs["rate"]}
     outputs_by_name = {name: getattr(samples, name) for name in ("d_hat", "command", "s", "torque", "wheel_torque")}
     one = np.ones_like(samples.t)
     outputs = _columns(board.outputs, outputs_by_name)

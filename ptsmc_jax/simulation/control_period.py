@@ -228,18 +228,17 @@ class PeriodMotion(NamedTuple):
 
 
 def star_state(parts: Parts, now: Ticks, x_at: Callable[[Scalar], Any]) -> Any:
-    """Return the true state when a star tracker with its own sample times samples in a period, or None.
+    """Return the true states when sensors with their own sample times take readings in a period, or None.
 
-    The flight software uses it at the next sample.
+    The flight software gets these readings at the next sample or later.
 
     Args:
         parts: parts of the run.
         now: the period.
         x_at: function from a time in the period [s] to the true state.
     """
-    if getattr(parts.sensors, "own_times", None) is None:
-        return None
-    return parts.plant.visible(x_at(now.t_next - parts.sensors.star_age(now.sample + 1, now.t_next - now.t)))
+    ages = parts.sensors.taken_ago(now.sample + 1, now.t_next - now.t)
+    return jax.tree.map(lambda age: parts.plant.visible(x_at(now.t_next - age)), ages)
 
 
 def period_torques(actuators: Actuators, drive: Drive, u: Array, dt: Scalar) -> Torques:

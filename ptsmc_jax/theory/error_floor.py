@@ -194,48 +194,74 @@ def _sizes(rows: np.ndarray) -> np.ndarray:
 def _model(parts: Parts, log: Log, ticks: Ticks) -> Model:
     """What a run's samples say, and its error, of these states.
 
-    The plant's local coordinates, the sensor's, the walk's torque, and readings that were taken before the sample.
+    The plant's local coordinates, the sensor's, the walk's torque, and readings that wait until they are used.
     """
     linear: Any = jax.tree.map(np.asarray, _linear(parts, log, ticks))
     periods, n, m = linear.push.shape
     reading = reading_of(parts.sensors, n, ticks)
-    early = np.flatnonzero(np.zeros(0) if reading.early is None else reading.early)
-    before = n + reading.own.size + m
-    size, torque, taken = before + early.size, slice(before - m, before), slice(before, before + early.size)
+    own, count = reading.own.size, reading.noise.size
+    lag = parts.sensors.lag(ticks) if hasattr(parts.sensors, "lag") else np.zeros((periods, count), int)
+    early = np.zeros(count, bool) if reading.early is None else reading.early
+    places = _places(lag, early, n + own + m)
+    size, torque = n + own + m + len(places), slice(n + own, n + own + m)
 
     def wide(rows: np.ndarray) -> np.ndarray:
-        seen = rows.shape[-1] - reading.own.size  # what no sensor reads, the modes of a flexible body, comes after it
+        seen = rows.shape[-1] - own  # what no sensor reads, the modes of a flexible body, comes after it
         rows = np.insert(rows, [seen] * (n - seen), 0.0, axis=-1)
         return np.pad(rows, [*[(0, 0)] * (rows.ndim - 1), (0, size - rows.shape[-1])])
 
+    # derivatives of each reading by the state at the start of a period: as it is then, and as it is when it is taken
+    now, suite = np.tile(wide(reading.rows), (periods, 1, 1)), linear.now.shape[1] > 0
+    if suite:
+        now[:, :, :n] = linear.now
+    taken = now.copy()
+    if np.any(early):
+        by_seen = np.eye(count) if suite else reading.rows[:, : linear.early.shape[1]]
+        taken[:, early, :n] = by_seen[early] @ linear.early
+        taken[:, early, torque] = by_seen[early] @ linear.early_push
+
     # how far a reading may be off tells what "unknown" is in its unit; a state read without noise is known
-    read = wide(reading.rows)
-    off = np.hypot(reading.noise, np.linalg.norm(read[:, n : n + reading.own.size] * reading.own, axis=1))
-    unknown = UNKNOWN * np.max(np.abs(read[:, :n]) * off[:, None], axis=0)
-    start = np.diag(np.concatenate([unknown, reading.own, np.zeros(m + early.size)]))
-    start[taken] = read[early] @ start  # the first sample's readings are of its own time
-    if reading.start is not None:
-        rows, factor = reading.start
-        start = _corrected(start, wide(rows) @ start, factor)
+    off = np.hypot(reading.noise, np.linalg.norm(now[0, :, n : n + own] * reading.own, axis=1))
+    unknown = UNKNOWN * np.max(np.abs(now[0, :, :n]) * off[:, None], axis=0)
+    start = np.diag(np.concatenate([unknown, reading.own, np.zeros(size - n - own)]))
     lengths = np.asarray(ticks.t_next - ticks.t)
-    drift = np.diag(np.concatenate([np.zeros(n), reading.own_drift, walk_of(parts), np.zeros(early.size)]))
+    drift = np.diag(np.concatenate([np.zeros(n), reading.own_drift, walk_of(parts), np.zeros(len(places))]))
     move = np.tile(np.eye(size), (periods, 1, 1))
     move[:, :n, :n], move[:, :n, torque] = linear.move, linear.push
     output = np.zeros((periods, linear.seen.shape[1], size))
     output[:, :, :n], output[:, :, torque] = linear.seen, linear.seen_push
-    if early.size:
-        by_state = reading.rows[early, : linear.early.shape[1]]
-        move[:, taken], read[early] = 0.0, np.eye(size)[taken]
-        move[:, taken, :n], move[:, taken, torque] = by_state @ linear.early, by_state @ linear.early_push
-    there = np.ones((periods, len(read)), bool) if parts.sensors.perfect else parts.sensors.available(ticks)
+    # a reading that is not of the sample at which it is used waits in states of its own, moved on at every sample
+    rows = now.copy()
+    for (k, number), place in places.items():
+        move[:, place] = taken[:, k] if number == 1 else np.eye(size)[places[k, number - 1]]
+        if number == 1 and early[k]:
+            start[place] = now[0, k] @ start  # the first sample's readings are of its own time
+        rows[lag[:, k] + early[k] == number, k] = np.eye(size)[place]
+    if reading.start is not None:
+        known, factor = reading.start
+        start = _corrected(start, wide(known) @ start, factor)
+    there = np.ones((periods, count), bool) if parts.sensors.perfect else parts.sensors.available(ticks)
     return Model(
         start=start,
-        rows=np.broadcast_to(read, (periods, *read.shape)),
+        rows=rows,
         noise=np.where(there, reading.noise, np.inf),
-        kick=lengths[:, None, None] * drift[:, n:before],
+        kick=lengths[:, None, None] * drift[:, n : n + own + m],
         move=move,
         output=output,
     )
+
+
+def _places(lag: np.ndarray, early: np.ndarray, first: int) -> dict[tuple[int, int], int]:
+    """Return the places, from `first` on, of the states in which readings wait, by (reading, number).
+
+    Args:
+        lag: whole control samples between a reading, or the sample after it, and its use, (periods, readings).
+        early: whether readings are taken between control samples (readings,).
+        first: place of the first one.
+    """
+    numbers = np.max(lag, axis=0) + early
+    waiting = [(k, number) for k, depth in enumerate(numbers) for number in range(1, depth + 1)]
+    return {one: first + k for k, one in enumerate(waiting)}
 
 
 def reading_of(sensors: Any, size: int, ticks: Ticks) -> Reading:
@@ -257,7 +283,8 @@ class _Linear(NamedTuple):
     """Derivatives of a period by the plant's local coordinates z at its start and by a torque p held through it.
 
     seen: of the error at the start, in the middle and at the end, one after the other; in the middle it is that of the
-    cubic that `window_error` uses. early: of what sensors can see at the time of `star_state`.
+    cubic that `window_error` uses. early: of what sensors can see at the times of `star_state`; of a sensor suite the
+    readings that are taken then. now: of a sensor suite all readings, if they are taken at the start of the period.
     """
 
     move: Array  # (periods, n, n)
@@ -266,6 +293,7 @@ class _Linear(NamedTuple):
     seen_push: Array  # (periods, 3 m, m)
     early: Array  # (periods, k, n); of no rows where there is no such time
     early_push: Array  # (periods, k, m)
+    now: Array  # (periods, readings, n); of no rows without a sensor suite
 
 
 @programs.jit(compiler_options=programs.QUICKLY)
@@ -290,19 +318,25 @@ def _linear(parts: Parts, log: Log, ticks: Ticks) -> _Linear:
             return PeriodMotion(parts, tick.t, x, drive, pushed + push)
 
         taken = star_state(parts, tick, motion(x, jnp.zeros_like(pushed)).at)
+        change = getattr(parts.sensors, "change", None)
 
-        def flown(z: Float[Array, " n"], push: Float[Array, " m"]) -> tuple[Array, Array, Array]:
+        def flown(z: Float[Array, " n"], push: Float[Array, " m"]) -> tuple[Array, Array, Array, Array]:
             near = plant.retract(x, z)
-            moving, early = motion(near, push), jnp.zeros(0)
+            moving, early, now = motion(near, push), jnp.zeros(0), jnp.zeros(0)
             near_next = moving.after(dt)
             (start, rate), (end, rate_next) = kinematics.errors(near, target), kinematics.errors(near_next, target_next)
             middle = integrators.hermite_middle(start, rate, end, rate_next, dt)
-            if taken is not None:
-                early = parts.observer.model.local_coordinates(taken, star_state(parts, tick, moving.at))
-            return plant.local_coordinates(x_next, near_next), jnp.concatenate([start, middle, end]), early
+            near_taken = star_state(parts, tick, moving.at)
+            if change is not None:
+                seen, near_seen = plant.visible(x), plant.visible(near)
+                early, now = change(seen, near_seen, taken, near_taken), change(seen, near_seen)
+            elif taken is not None:
+                early = parts.observer.model.local_coordinates(taken, near_taken)
+            return plant.local_coordinates(x_next, near_next), jnp.concatenate([start, middle, end]), early, now
 
         still = jnp.zeros_like(plant.local_coordinates(x, x))
         by = jax.jacfwd(flown, argnums=(0, 1))(still, jnp.zeros(plant.inputs))
-        return _Linear(*by[0], *by[1], *by[2])
+        (move, push), (seen, seen_push), (early, early_push), (now, _) = by
+        return _Linear(move, push, seen, seen_push, early, early_push, now)
 
     return lapack.vmap(period)(ticks, before, after, drives, log.disturbance[:-1])

@@ -62,7 +62,8 @@ def by_hand(parts, flown):
     known = parts.sensors.filter
     k1, k2 = float(known.attitude_gain), float(known.bias_gain)
     said = [(Rotation.from_quat(flown.before.q[0]), flown.before.bias[0])]
-    rates = np.concatenate([flown.gyro[:1], flown.gyro])  # of the sample before, at the first its own
+    gyro = flown.inputs["rate"]
+    rates = np.concatenate([gyro[:1], gyro])  # of the sample before, at the first its own
     moments = np.concatenate([flown.t[:1], flown.t])
     for k in range(len(flown.t)):
         q, bias = said[-1]
@@ -76,7 +77,7 @@ def by_hand(parts, flown):
             q = q * Rotation.from_rotvec(h / 2 * (a + b) + h * h / 12 * np.cross(a, b))
             at, w = stop, there
             if star:
-                residual = 2 * (q.inv() * Rotation.from_quat(flown.measured.q[k])).as_quat()
+                residual = 2 * (q.inv() * Rotation.from_quat(flown.inputs["attitude"][k])).as_quat()
                 residual = residual[:3] * np.sign(residual[3])
                 q, bias = q * Rotation.from_rotvec(k1 * residual), bias - k2 * residual
         said.append((q, bias))
@@ -94,8 +95,9 @@ def run():
 
 def test_the_filter_says_what_is_computed_by_hand(run):
     parts, flown = run
-    assert np.flatnonzero(flown.valid[:12]).tolist() == [0, 3, 5, 8, 10]
-    np.testing.assert_allclose(flown.age[flown.valid][:4], [0.0, 0.05, 0.0, 0.05], atol=1e-12)
+    valid = flown.inputs["attitude_valid"] > 0.0
+    assert np.flatnonzero(valid[:12]).tolist() == [0, 3, 5, 8, 10]
+    np.testing.assert_allclose(flown.inputs["attitude_age"][valid][:4], [0.0, 0.05, 0.0, 0.05], atol=1e-12)
     said = by_hand(parts, flown)
     for k, (q, bias) in enumerate(said):
         off = (q.inv() * Rotation.from_quat(flown.estimate.q[k])).magnitude()
@@ -129,12 +131,12 @@ def test_it_sees_the_body_at_its_own_time(run):
     for k in range(30):
         if k > 0:
             t, u, h = flown.t[k - 1], flown.torque[k - 1], flown.t[k] - flown.t[k - 1]
-            there = moved(t, x, u, h - flown.age[k])
+            there = moved(t, x, u, h - flown.inputs["attitude_age"][k])
             x = moved(t, x, u, h)
-            if flown.valid[k]:
+            if flown.inputs["attitude_valid"][k]:
                 noise, _ = parts.sensors.noise(keys, jnp.asarray(k))
                 off = Rotation.from_quat(there[:4]) * Rotation.from_rotvec(np.array(noise))
-                off = off.inv() * Rotation.from_quat(flown.measured.q[k])
+                off = off.inv() * Rotation.from_quat(flown.inputs["attitude"][k])
                 assert off.magnitude() < 1e-12, k
                 looked_at += 1
     assert looked_at == 11  # 0.25 to 2.75 s

@@ -1,0 +1,207 @@
+"""Sensors of the attitude: star trackers and others, each with its mounting, noise per axis, sample times and latency.
+
+A sensor takes a reading at its own times, and the flight software has it a latency later. A reading is compared with
+the attitude at the time at which it was taken, see `kalman_filter`.
+"""
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ptsmc_jax.devices.star_times import pattern
+from ptsmc_jax.numerics import attitude, guards
+from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
+
+TOLERANCE = 1e-9  # relative: a number of periods this close to a whole one is whole
+
+
+@pytree
+@dataclass(frozen=True)
+class SampleTimes:
+    """The times at which a sensor takes readings, and those at which the flight software uses them.
+
+    Readings are `interval` apart, one of them at control sample 0 (t = 0, or the hand-over). The flight software uses a
+    reading at the first control sample that is not earlier than the reading plus `latency`. Build it with
+    `sample_times`.
+    """
+
+    interval: Leaf  # between readings, at least a control period [s]
+    latency: Leaf  # from a reading until the flight software has it [s]
+    period: Leaf  # of control [s]
+    every: int | None = field(metadata={"static": True})  # control periods between readings; None: not a whole number
+    wait: int = field(metadata={"static": True})  # control samples between a reading and its use, or one more
+    split: bool = field(metadata={"static": True})  # `wait` or one more, depending on the time of the reading
+
+    @property
+    def queue(self) -> int:
+        """Return the largest number of control samples that a reading waits for."""
+        return self.wait + self.split
+
+    @property
+    def past(self) -> int:
+        """Return how many past control samples the filter needs to know the attitude at a reading."""
+        return self.queue + (self.every is None)
+
+    @property
+    def cycle(self) -> int:
+        """Return the number of control periods after which the times repeat, exactly or nearly."""
+        return pattern(float(self.interval / self.period))[0] if self.every is None else self.every
+
+    def taken(self, sample: Any) -> Any:
+        """Return whether a reading was taken since the control sample before this one."""
+        if self.every is not None:
+            return sample % self.every == 0
+        return self._count(sample) > self._count(sample - 1)
+
+    def taken_ago(self, sample: Any, dt: Scalar) -> Any:
+        """Return the time since the newest reading [s], at most the length dt [s] of the period before the sample."""
+        age = self._time(sample) - self._count(sample) * self.interval
+        return jnp.minimum(jnp.maximum(age, 0.0), dt)
+
+    def due(self, sample: Any) -> Any:
+        """Return whether the flight software gets a reading at a control sample."""
+        if self.every is not None:
+            return (sample - self.wait) % self.every == 0
+        return self._count(sample, self.latency) > self._count(sample - 1, self.latency)
+
+    def age(self, sample: Any) -> Any:
+        """Return the age of the newest reading that the flight software has at a control sample [s]."""
+        if self.every is not None:
+            return self.wait * self.period
+        return jnp.maximum(self._time(sample) - self._count(sample, self.latency) * self.interval, self.latency)
+
+    def place(self, age: Any) -> tuple[Any, Any]:
+        """Return where a reading of this age [s] lies: whole control periods back, and the rest of the age [s].
+
+        The number of periods is an int if it is the same for all readings.
+        """
+        if self.every is not None:
+            return self.wait, jnp.zeros_like(jnp.asarray(age, float))
+        whole = self.wait
+        if self.split:
+            whole = jnp.where(age >= (self.wait + 1) * self.period - self._rounding, self.wait + 1, self.wait)
+        return whole, jnp.clip(age - whole * self.period, 0.0, self.period)
+
+    def in_step(self) -> "SampleTimes":
+        """Return times at which a reading is taken at every control sample, for a sensor with its own clock."""
+        if self.every is not None:
+            return self
+        return replace(self, interval=self.period, every=1, wait=self.queue, split=False)
+
+    @property
+    def _rounding(self) -> Any:
+        return guards.rounding(self.period, self.period)
+
+    def _time(self, sample: Any) -> Any:
+        return jnp.asarray(sample, float) * self.period
+
+    def _count(self, sample: Any, latency: Any = 0.0) -> Any:
+        """Return the number of the newest reading that is at least a latency [s] old at a control sample."""
+        t = self._time(sample)
+        return jnp.floor((t - latency + guards.rounding(self.period, t)) / self.interval)
+
+
+def sample_times(interval: float, latency: float, period: float) -> SampleTimes:
+    """Return the sample times of a sensor.
+
+    Args:
+        interval: between readings, at least a control period [s].
+        latency: from a reading until the flight software has it [s].
+        period: of control [s].
+    """
+    ratio, late = interval / period, latency / period
+    every = round(ratio) if abs(ratio - round(ratio)) < TOLERANCE * ratio else None
+    whole = abs(late - round(late)) < TOLERANCE * max(late, 1.0)
+    wait = round(late) if whole else math.ceil(late) if every is not None else math.floor(late)
+    apart, age, control = (jnp.asarray(float(v)) for v in (interval, latency, period))
+    return SampleTimes(apart, age, control, every, wait, split=every is None and not whole)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AttitudeSensor:
+    """A sensor whose reading depends on the attitude alone. Derived classes define `read`.
+
+    Its axes follow from the body axes by the rotation `mounting`: a vector with components y in sensor axes has the
+    components R(mounting) y in body axes. The reading is an array with additive noise, independent for each component.
+    """
+
+    name: str = field(metadata={"static": True})  # also of its random numbers, and of its input in exported C
+    noise: Leaf  # (m,) 1 sigma of each component of a reading
+    mounting: Leaf  # (4,) unit quaternion
+    times: SampleTimes
+
+    def read(self, q: Float[Array, "4"]) -> Float[Array, " size"]:
+        """Return the reading without noise at a body attitude q, a unit quaternion (4,)."""
+        raise NotImplementedError
+
+    def changed(self, reading: Float[Array, " size"], change: Float[Array, " m"]) -> Float[Array, " size"]:
+        """Return a reading that differs by these components (m,), such as noise."""
+        return reading + change
+
+    def change(self, reading: Float[Array, " size"], other: Float[Array, " size"]) -> Float[Array, " m"]:
+        """Return the components (m,) by which another reading differs from a reading."""
+        return other - reading
+
+    def sensitivity(self, q: Float[Array, "4"]) -> Float[Array, "m 3"]:
+        """Return the derivative (m, 3) of a reading by a small rotation [rad] about the body axes at attitude q."""
+
+        def turned(turn: Array) -> Array:
+            return self.change(self.read(q), self.read(attitude.multiply(q, attitude.from_rotation_vector(turn))))
+
+        return jax.jacfwd(turned)(jnp.zeros(3))
+
+    def axes(self) -> Float[Array, "3 3"]:
+        """Return the sensor's axes in body axes, one a row (3, 3)."""
+        return jax.vmap(lambda axis: attitude.rotate(self.mounting, axis))(jnp.eye(3))
+
+    def in_step(self) -> "AttitudeSensor":
+        """Return a sensor with equally much information that reads at every control sample, if it has its own clock."""
+        if self.times.every is not None:
+            return self
+        fraction = self.times.period / self.times.interval
+        return replace(self, noise=self.noise / jnp.sqrt(fraction), times=self.times.in_step())
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class StarTracker(AttitudeSensor):
+    """A star tracker: its reading is its own attitude, a unit quaternion (4,).
+
+    The noise is a small rotation about its own axes [rad]. z is its boresight, about which the noise is largest.
+    """
+
+    def read(self, q: Float[Array, "4"]) -> Float[Array, "4"]:
+        """Return the attitude of the tracker's axes (4,)."""
+        return attitude.multiply(q, self.mounting)
+
+    def changed(self, reading: Float[Array, "4"], change: Float[Array, "3"]) -> Float[Array, "4"]:
+        """Return an attitude turned by a small rotation (3,) [rad] about the tracker's axes."""
+        return attitude.multiply(reading, attitude.from_rotation_vector(change))
+
+    def change(self, reading: Float[Array, "4"], other: Float[Array, "4"]) -> Float[Array, "3"]:
+        """Return the small rotation (3,) [rad] about the tracker's axes from one attitude to another."""
+        error = attitude.multiply(attitude.conjugate(reading), other)
+        return jnp.where(error[3] < 0.0, -2.0, 2.0) * error[:3]
+
+    def sensitivity(self, q: Float[Array, "4"]) -> Float[Array, "3 3"]:
+        """Return the tracker's axes in body axes (3, 3): components about them, of a rotation about body axes."""
+        return self.axes()
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class VectorSensor(AttitudeSensor):
+    """A sun sensor or magnetometer: its reading is a known inertial direction in its own axes (3,) [-].
+
+    It says nothing of the rotation about that direction.
+    """
+
+    direction: Leaf  # (3,) unit vector in inertial axes
+
+    def read(self, q: Float[Array, "4"]) -> Float[Array, "3"]:
+        """Return the direction in the sensor's axes (3,)."""
+        return attitude.rotate(attitude.conjugate(attitude.multiply(q, self.mounting)), self.direction)

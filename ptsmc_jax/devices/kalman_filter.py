@@ -1,0 +1,330 @@
+"""A multiplicative extended Kalman filter of the attitude: any number of attitude sensors, and a gyro.
+
+The estimation error is e = (a, b, n) and past attitude errors: a is a small rotation about body axes [rad], b the error
+of the gyro bias [rad/s], n the noise of the newest gyro sample [rad/s]. Over a control period h, with the rotation R of
+the body in it and the trapezoidal rule for the rate,
+
+    a+ = R' (a - h/2 (b + n)) - h/2 (b+ + n+),    b+ = b + drift,    n+ = noise of the next gyro sample
+
+(Lefferts, Markley, Shuster, JGCD 5(5), 1982; n is a state since each gyro sample acts in two periods). A reading of age
+L is compared with the attitude that the filter estimated for that time. The filter therefore keeps the attitude of the
+last control samples and their errors as further states, which every correction corrects too: stochastic cloning
+(Roumeliotis and Burdick, ICRA 2002), exact for a linear system, unlike a reading that is moved to the present by the
+gyro, since it takes account of the gyro noise that has come since. Components of a reading are processed one by one
+(Bierman, Factorization Methods for Discrete Sequential Estimation, 1977), so no matrix is inverted.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ptsmc_jax.devices.attitude_filter import rotation_over
+from ptsmc_jax.devices.attitude_sensors import AttitudeSensor
+from ptsmc_jax.numerics import attitude, guards
+from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
+
+LONGEST = 1000  # control periods of a cycle at most; of a longer one, only the first are in `first`
+DOUBLINGS = 60  # of the number of cycles, until the steady state
+TURN, BIAS, NOISE = slice(0, 3), slice(3, 6), slice(6, 9)
+
+
+class Track(NamedTuple):
+    """The state of the filter."""
+
+    q: Array  # (4,) attitude
+    bias: Array  # (3,) of the gyro [rad/s]
+    rate: Array  # (3,) last gyro sample, less its estimated noise [rad/s]
+    past_q: Any  # (past, 4) attitudes at the last control samples, the newest first; None: no sensor needs them
+    past_w: Any  # (past, 3) body rates then [rad/s]; None: no sensor reads between control samples
+    covariance: Array  # (9 + 3 past, 9 + 3 past) of the errors (a, b, n, past a ..) [rad, rad/s]
+
+    @property
+    def w(self) -> Array:
+        """Return the estimated body rate (3,) [rad/s]."""
+        return self.rate - self.bias
+
+
+@pytree
+@dataclass(frozen=True)
+class KalmanFilter:
+    """The filter, with the sensors as the flight software knows them. Build it with `kalman_filter`."""
+
+    sensors: tuple[AttitudeSensor, ...]
+    rate_noise: Leaf  # (3,) 1 sigma of a gyro sample [rad/s]
+    drift: Leaf  # (3,) 1 sigma of the change of the bias per second of a period [rad/s^2]
+    period: Leaf  # of control [s]
+    # (cycle, 6, 6) factors of the covariance of (a, b) in the steady state at rest, just before a control sample
+    first: Leaf
+
+    @property
+    def past(self) -> int:
+        """Return the number of past control samples that the filter keeps."""
+        return max((sensor.times.past for sensor in self.sensors), default=0)
+
+    @property
+    def between(self) -> bool:
+        """Return whether a sensor reads between control samples."""
+        return any(sensor.times.every is None for sensor in self.sensors)
+
+    def first_factor(self, sample: Any, weight: Any) -> Float[Array, "6 6"]:
+        """Return a factor (6, 6) of the covariance of (a, b) that `begin` starts from; arguments as there."""
+        count = len(self.first)
+        return guards.lerp(jnp.asarray(weight), self.first[sample % count], self.first[(sample + 1) % count])
+
+    def begin(
+        self, q: Float[Array, "4"], bias: Float[Array, "3"], w: Float[Array, "3"], normals: Float[Array, "6"],
+        sample: Array, weight: Scalar,
+    ) -> Track:  # fmt: skip
+        """Return the state of a filter that has run before the slew: its errors are those of the steady state at rest.
+
+        Args:
+            q: true attitude, a unit quaternion (4,).
+            bias: true bias of the gyro (3,) [rad/s].
+            w: true body rate (3,) [rad/s].
+            normals: standard normal numbers (6,) from which the errors are made.
+            sample: number of the first control sample; the state is the one just before it.
+            weight: of this sample, below 1 in a partial first period.
+        """
+        factor, past = self.first_factor(sample, weight), self.past
+        error = factor @ normals
+        q = attitude.multiply(q, attitude.from_rotation_vector(error[TURN]))
+        bias = bias + error[BIAS]
+        covariance = jnp.zeros((9 + 3 * past, 9 + 3 * past)).at[:6, :6].set(factor @ factor.T)
+        past_q = jnp.tile(q, (past, 1)) if past else None
+        past_w = jnp.tile(w, (past, 1)) if self.between else None
+        return Track(q, bias, w + bias, past_q, past_w, covariance)
+
+    def propagate(self, old: Track, gyro: Float[Array, "3"], dt: Scalar) -> Track:
+        """Return the state a control period later.
+
+        Args:
+            old: state at the control sample before.
+            gyro: gyro sample at the end of the period (3,) [rad/s].
+            dt: length of the period [s].
+        """
+        turn = attitude.from_rotation_vector(rotation_over(old.w, gyro - old.bias, dt))
+        past_q, past_w = old.past_q, old.past_w
+        if past_q is not None:
+            past_q = jnp.concatenate([old.q[None], past_q[:-1]])
+        if past_w is not None:
+            past_w = jnp.concatenate([old.w[None], past_w[:-1]])
+        covariance = self._propagated(old.covariance, turn, dt)
+        return Track(attitude.multiply(old.q, turn), old.bias, gyro, past_q, past_w, covariance)
+
+    def _propagated(self, p: Array, turn: Array, dt: Scalar) -> Array:
+        """Return the covariance a control period later; turn: rotation of the body in it."""
+        half, zero = dt / 2, jnp.zeros((3, 3))
+        back = jax.vmap(partial(attitude.rotate, turn))(jnp.eye(3))  # R'
+        fresh, drift = jnp.diag(self.rate_noise**2), jnp.diag((self.drift * dt) ** 2)
+
+        def moved(rows: Array) -> Array:
+            """Return the rows of a+, without new noise, from the rows of all errors."""
+            return back @ (rows[TURN] - half * (rows[BIAS] + rows[NOISE])) - half * rows[BIAS]
+
+        by_old = moved(p)  # covariance of a+ and the old errors
+        turn_turn = moved(by_old.T) + half**2 * (fresh + drift)
+        turn_bias, turn_noise = by_old[:, BIAS] - half * drift, -half * fresh
+        rows = [
+            [turn_turn, turn_bias, turn_noise],
+            [turn_bias.T, p[BIAS, BIAS] + drift, zero],
+            [turn_noise, zero, fresh],
+        ]
+        if not self.past:
+            return jnp.block(rows)
+        kept = np.r_[0:3, 9 : 6 + 3 * self.past]  # the error at the last sample becomes a past one, the oldest goes
+        by_past = [by_old[:, kept], p[BIAS, kept], jnp.zeros((3, len(kept)))]
+        rows = [[*row, last] for row, last in zip(rows, by_past, strict=True)]
+        return jnp.block([*rows, [*(last.T for last in by_past), p[kept][:, kept]]])
+
+    def correct(self, old: Track, k: int, reading: Array, age: Scalar, weight: Scalar) -> Track:
+        """Return the state after a reading.
+
+        Args:
+            old: state at this control sample.
+            k: index of the sensor.
+            reading: of the sensor (size,).
+            age: time since the reading was taken [s].
+            weight: 1: the reading counts; 0: there is none. Between them the noise is larger, by 1/sqrt(weight).
+        """
+        sensor = self.sensors[k]
+        q, picked, fraction = self._when_taken(old, sensor, age)
+        rows, residual = sensor.sensitivity(q), sensor.change(sensor.read(q), reading)
+        # between control samples the errors are nearly a straight line; the rest is gyro noise of this size
+        lost = (self.period * fraction * (1.0 - fraction)) ** 2 / 2 if sensor.times.every is None else 0.0
+        p, change = old.covariance, jnp.zeros(len(old.covariance))
+        for row, difference, noise in zip(rows, residual, sensor.noise, strict=True):
+            by_all = row @ picked(p)
+            variance = noise**2 + lost * jnp.sum((row * self.rate_noise) ** 2)
+            gain = weight / (weight * (row @ picked(by_all)) + variance)
+            change = change + gain * (difference - row @ picked(change)) * by_all
+            p = p - gain * jnp.outer(by_all, by_all)
+        return self._moved(old, change)._replace(covariance=p)
+
+    def _when_taken(self, old: Track, sensor: AttitudeSensor, age: Scalar) -> tuple[Array, Any, Scalar]:
+        """Return the attitude when a reading of this age was taken, and its error as a part of all errors.
+
+        The error is a function of an array (errors, ..) to (3, ..); the third value is the fraction of a control period
+        between the reading and the control sample after it.
+        """
+        whole, rest = sensor.times.place(age)
+        fraction = rest / self.period
+
+        def at(values: Array, number: Any, first: Array | None = None) -> Array:
+            """Return the entry `number` control samples back; the present one is the first value, or `first`."""
+            if first is not None:
+                values = jnp.concatenate([first[None], values])
+            if isinstance(number, int):
+                return values[number]
+            low = sensor.times.wait + (number is not whole)
+            return jnp.where(number == low, values[low], values[low + 1])
+
+        def picked(values: Array) -> Array:
+            blocks = jnp.concatenate([values[TURN], values[9:]]).reshape(self.past + 1, 3, *values.shape[1:])
+            here = at(blocks, whole)
+            return here if sensor.times.every is not None else here + fraction * (at(blocks, whole + 1) - here)
+
+        q = old.q if self.past == 0 else at(old.past_q, whole, old.q)
+        if sensor.times.every is None:
+            here, before = at(old.past_w, whole, old.w), at(old.past_w, whole + 1, old.w)
+            turn = rest * here - rest * fraction / 2 * (here - before)
+            q = attitude.multiply(q, attitude.from_rotation_vector(-turn))
+        return q, picked, fraction
+
+    @staticmethod
+    def _moved(old: Track, change: Array) -> Track:
+        """Return the state with its estimate changed by estimated errors (errors,)."""
+
+        def turned(q: Array, turn: Array) -> Array:
+            return attitude.normalise(attitude.multiply(q, attitude.from_rotation_vector(turn)))
+
+        past_q = old.past_q
+        if past_q is not None:
+            past_q = jax.vmap(turned)(past_q, change[9:].reshape(-1, 3))
+        return old._replace(
+            q=turned(old.q, change[TURN]),
+            bias=old.bias + change[BIAS],
+            rate=old.rate - change[NOISE],
+            past_q=past_q,
+        )
+
+    def in_step(self) -> "KalmanFilter":
+        """Return the filter for sensors that all read at control samples, for linear theory."""
+        return replace(self, sensors=tuple(sensor.in_step() for sensor in self.sensors))
+
+    def retract(self, track: Track, by: Float[Array, " n"]) -> Track:
+        """Return the state near another one at local coordinates (9 + 3 past,): estimates, not the covariance."""
+        return self._moved(track, by)
+
+    def local_coordinates(self, track: Track, other: Track) -> Float[Array, " n"]:
+        """Return local coordinates (9 + 3 past,) [rad, rad/s] of a state near another one, to first order."""
+
+        def turn(q: Array, near: Array) -> Array:
+            return 2.0 * attitude.multiply(attitude.conjugate(q), near)[:3]
+
+        past = [] if track.past_q is None else [jax.vmap(turn)(track.past_q, other.past_q).reshape(-1)]
+        return jnp.concatenate([turn(track.q, other.q), other.bias - track.bias, track.rate - other.rate, *past])
+
+
+def kalman_filter(sensors: Sequence[AttitudeSensor], rate_noise: Any, drift: Any, period: float) -> KalmanFilter:
+    """Return a filter that starts in its steady state at rest.
+
+    Args:
+        sensors: attitude sensors.
+        rate_noise: 1 sigma of a gyro sample (3,) [rad/s].
+        drift: 1 sigma of the change of the bias per second of a period (3,) [rad/s^2].
+        period: of control [s].
+
+    Raises:
+        ValueError: a sensor has no noise, or the sensors together do not determine the attitude.
+    """
+    if any(np.any(np.asarray(sensor.noise) <= 0.0) for sensor in sensors):
+        raise ValueError("every attitude sensor must have noise greater than 0")
+    gyro, change = (jnp.broadcast_to(jnp.asarray(v, float), (3,)) for v in (rate_noise, drift))
+    found = KalmanFilter(tuple(sensors), gyro, change, jnp.asarray(float(period)), jnp.zeros((1, 6, 6)))
+    return replace(found, first=jnp.asarray(_steady_state(found)))
+
+
+class _Element(NamedTuple):
+    """The change of a covariance p over some steps, a p (1 + c p)^-1 a' + b.
+
+    Source: Särkkä and García-Fernández, IEEE Trans. Automatic Control 66(1), 2021.
+    """
+
+    a: np.ndarray
+    b: np.ndarray
+    c: np.ndarray
+
+    def then(self, other: "_Element") -> "_Element":
+        """Return the map of these steps and then others."""
+        left = other.a @ np.linalg.inv(np.eye(len(self.a)) + self.b @ other.c)
+        right = self.a.T @ np.linalg.inv(np.eye(len(self.a)) + other.c @ self.b)
+        return _Element(left @ self.a, left @ self.b @ other.a.T + other.b, right @ other.c @ self.a + self.c)
+
+
+def _steady_state(found: KalmanFilter) -> np.ndarray:
+    """Return factors (cycle, 6, 6) of the covariance of (a, b) just before each control sample of a cycle, at rest.
+
+    The number of cycles is doubled until nothing changes (Anderson and Moore, Optimal Filtering, 1979, section 6.7).
+    """
+    count = min(math.lcm(*(sensor.times.cycle for sensor in found.sensors)), LONGEST)
+    size, one = 9 + 3 * found.past, np.eye(9 + 3 * found.past)
+    step = jax.jit(lambda p: found._propagated(p, jnp.array([0.0, 0.0, 0.0, 1.0]), found.period))
+    grown = np.asarray(step(jnp.zeros((size, size))))
+    half = float(found.period) / 2
+    move = np.zeros((size, size))
+    move[TURN, :9] = np.hstack([np.eye(3), -2 * half * np.eye(3), -half * np.eye(3)])
+    move[BIAS, BIAS] = np.eye(3)
+    if found.past:
+        move[9:12, TURN] = np.eye(3)
+        move[12:, 9:-3] = np.eye(size - 12)
+    predicted = _Element(move, grown, np.zeros((size, size)))
+    corrected = [list(_corrections(found, number)) for number in range(1, count + 1)]
+    cycle = _Element(one, np.zeros((size, size)), np.zeros((size, size)))
+    for updates in corrected:
+        cycle = cycle.then(predicted)
+        for rows in updates:
+            cycle = cycle.then(_Element(one, np.zeros((size, size)), rows))
+    for _ in range(DOUBLINGS):
+        cycle, before = cycle.then(cycle), cycle
+        if np.allclose(cycle.b, before.b, rtol=1e-12, atol=0.0):
+            break
+    p, factors = cycle.b, np.zeros((count, 6, 6))
+    for number, updates in enumerate(corrected, start=1):
+        p = move @ p @ move.T + grown
+        factors[number % count] = _factor(p[:6, :6])
+        for rows in updates:
+            p = p @ np.linalg.inv(one + rows @ p)
+    return factors
+
+
+def _corrections(found: KalmanFilter, number: int) -> Iterator[np.ndarray]:
+    """Yield the information (errors, errors) of each reading that is due at a control sample, at rest at q = 1."""
+    sample, size = jnp.asarray(number), 9 + 3 * found.past
+    q = jnp.array([0.0, 0.0, 0.0, 1.0])
+    for sensor in found.sensors:
+        if not bool(sensor.times.due(sample)):
+            continue
+        whole, rest = sensor.times.place(jnp.asarray(sensor.times.age(sample)))
+        fraction = float(rest / found.period)
+        rows = np.zeros((len(sensor.noise), size))
+        axes, places = np.asarray(sensor.sensitivity(q)), [TURN, *(slice(k, k + 3) for k in range(9, size, 3))]
+        rows[:, places[int(whole)]] = (1.0 - fraction) * axes
+        if fraction > 0.0:
+            rows[:, places[int(whole) + 1]] = fraction * axes
+        lost = (float(found.period) * fraction * (1.0 - fraction)) ** 2 / 2
+        variance = np.asarray(sensor.noise) ** 2 + lost * np.sum((axes * np.asarray(found.rate_noise)) ** 2, axis=1)
+        yield rows.T @ (rows / variance[:, None])
+
+
+def _factor(covariance: np.ndarray) -> np.ndarray:
+    """Return a square root (n, n) of a positive semidefinite covariance; eigenvalues below zero are rounding."""
+    scale = np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny))
+    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    return scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))

@@ -1,0 +1,277 @@
+"""A sensor suite: any number of attitude sensors and a gyro, behind a Kalman filter of the attitude."""
+
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ptsmc_jax.devices.attitude_sensors import AttitudeSensor
+from ptsmc_jax.devices.kalman_filter import KalmanFilter, Track
+from ptsmc_jax.devices.sensors import BIAS_WALK, FILTER_START, RATE_BIAS, RATE_NOISE, Reading, Sensor
+from ptsmc_jax.devices.ticks import Ticks
+from ptsmc_jax.numerics import draws, guards
+from ptsmc_jax.numerics.draws import WholeNumber
+from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
+from ptsmc_jax.plants.rigid_body import AttitudeState
+
+
+class Delivery(NamedTuple):
+    """What a sensor delivers to the flight software at a control sample."""
+
+    reading: Array  # (size,)
+    weight: Scalar  # 1; 0: there is no reading; between them in a partial first period, see `KalmanFilter.correct`
+
+
+class Readings(NamedTuple):
+    """What all sensors deliver at a control sample."""
+
+    delivered: tuple[Delivery, ...]  # of each attitude sensor
+    ages: tuple[Array, ...]  # of these readings [s]
+    rate: Array  # (3,) of the gyro [rad/s]
+
+
+class SuiteMemory(NamedTuple):
+    """Memory of a `SensorSuite` between control samples."""
+
+    keys: Any  # of the noise of each attitude sensor, of the gyro and of its drift; None: no random numbers
+    noise: tuple[Array, ...]  # of the next sample: of each attitude sensor (m,), of the gyro (3,) [rad/s]
+    bias: Array  # (3,) of the gyro [rad/s]
+    waiting: tuple[Any, ...]  # of each attitude sensor: `Delivery` (queue, ..) of the last samples, the newest first
+    estimate: Track
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class SensorSuite(Sensor):
+    """Attitude sensors and a gyro. The law sees the attitude and the rate that the filter estimates."""
+
+    sensors: tuple[AttitudeSensor, ...]
+    rate_noise: Leaf  # (3,) 1 sigma of a gyro sample about each body axis [rad/s]
+    rate_bias: Leaf  # (3,) 1 sigma of the gyro bias at the first sample [rad/s]
+    bias_rate: Leaf  # (3,) 1 sigma of the change of the bias per second of a period: walk / sqrt(period) [rad/s^2]
+    filter: KalmanFilter
+    given_bias: Leaf | None = None  # (3,) at the first sample, if it is not random [rad/s]
+    rate_scale: Leaf | None = None  # (3,) gyro reading over true rate [-]
+    outage: Leaf | None = None  # (2,) start and end of the time without readings of the first attitude sensor [s]
+    noise_free: bool = field(default=False, metadata={"static": True})  # no random number is computed, see `quiet`
+
+    @property
+    def every(self) -> int:
+        """Return the number of control periods after which the sample times repeat, for means in linear theory."""
+        return int(np.lcm.reduce([sensor.times.every or 1 for sensor in self.sensors]))
+
+    def taken_ago(self, sample: Array, dt: Scalar) -> Any:
+        """Return the age [s] of the newest reading of each sensor with its own clock, None for others; see `Sensor`."""
+        if not self.filter.between:
+            return None
+        clocks = (None if sensor.times.every is not None else sensor.times for sensor in self.sensors)
+        return tuple(None if times is None else times.taken_ago(sample, dt) for times in clocks)
+
+    def keys(self, seed: WholeNumber, trial: WholeNumber) -> Any:
+        """Return the keys of a trial's noise: of each attitude sensor, of the gyro and of its drift."""
+        if self.noise_free:
+            return None
+        names = [f"{sensor.name}_noise" for sensor in self.sensors]
+        return tuple(draws.streams(seed, trial, [*names, RATE_NOISE, BIAS_WALK]))
+
+    def noise(self, keys: Any, sample: Array) -> tuple[Array, ...]:
+        """Return the noise of one sample: of each attitude sensor (m,), of the gyro (3,) [rad/s]."""
+        sigmas = (*(sensor.noise for sensor in self.sensors), self.rate_noise)
+        if keys is None:
+            return tuple(map(jnp.zeros_like, sigmas))
+        return tuple(s * draws.normals(key, s.shape[-1], sample) for s, key in zip(sigmas, keys, strict=False))
+
+    def first_bias(self, seed: WholeNumber, trial: WholeNumber) -> Float[Array, "3"]:
+        """Return the bias of the gyro at the first sample (3,) [rad/s]."""
+        if self.given_bias is not None:
+            return self.given_bias
+        return self.rate_bias * draws.normals(draws.stream(seed, trial, RATE_BIAS), 3)
+
+    def drawn(self, seed: WholeNumber, trial: WholeNumber) -> dict[str, Array]:
+        """Return the bias of the gyro at the first sample [rad/s]."""
+        bias = self.first_bias(seed, trial)
+        return {f"{RATE_BIAS}_{k + 1}": bias[k] for k in range(3)}
+
+    def begin(self, seed: WholeNumber, trial: WholeNumber, x0: AttitudeState, now: Ticks) -> SuiteMemory:
+        """Return the memory before the first sample of positive length, which is now. No reading is on its way."""
+        keys = self.keys(seed, trial)
+        bias = jnp.zeros(3) if self.noise_free else self.first_bias(seed, trial)
+        normals = jnp.zeros(6) if self.noise_free else draws.normals(draws.stream(seed, trial, FILTER_START), 6)
+        estimate = self.filter.begin(x0.q, bias, x0.w, normals, now.sample, now.noise_weight)
+        waiting = []
+        for sensor in self.sensors:
+            count, reading = sensor.times.queue, sensor.read(x0.q)
+            waiting.append(Delivery(jnp.tile(reading, (count, 1)), jnp.zeros(count)) if count else None)
+        return SuiteMemory(keys, self.noise(keys, now.sample), bias, tuple(waiting), estimate)
+
+    def readings(
+        self, memory: SuiteMemory, x: AttitudeState, now: Ticks, dt: Scalar, star_x: Any = None
+    ) -> tuple[Readings, SuiteMemory]:
+        """Return what the sensors deliver at a sample, and the memory; arguments as in `Sensor.measure`."""
+        noise_next = self.noise(memory.keys, now.sample + 1)
+        *noises, shift = guards.lerp(now.noise_weight, memory.noise, noise_next)
+        bias = memory.bias
+        if memory.keys is not None:
+            bias = bias + self.bias_rate * dt * draws.normals(memory.keys[-1], 3, now.sample)
+        rate = (x.w if self.rate_scale is None else self.rate_scale * x.w) + shift + bias
+        delivered, ages, waiting = [], [], []
+        for k, (sensor, noise) in enumerate(zip(self.sensors, noises, strict=True)):
+            seen = x if star_x is None or star_x[k] is None else star_x[k]
+            weight = jnp.where(sensor.times.taken(now.sample), now.noise_weight, 0.0)
+            if k == 0 and self.outage is not None:
+                t = now.t if sensor.times.every is not None else now.t - sensor.times.taken_ago(now.sample, dt)
+                weight = jnp.where((t >= self.outage[0]) & (t < self.outage[1]), 0.0, weight)
+            age = jnp.asarray(sensor.times.age(now.sample), float)
+            new, queue = _passed(
+                Delivery(sensor.changed(sensor.read(seen.q), noise), weight), memory.waiting[k], sensor, now, age
+            )
+            delivered.append(new)
+            ages.append(age)
+            waiting.append(queue)
+        found = Readings(tuple(delivered), tuple(ages), rate)
+        return found, memory._replace(noise=noise_next, bias=bias, waiting=tuple(waiting))
+
+    def inputs(
+        self, memory: SuiteMemory, x: AttitudeState, now: Ticks, dt: Scalar, star_x: Any = None
+    ) -> tuple[dict[str, Array], SuiteMemory]:
+        """Return the inputs of exported C at a sample, by name, and the memory; see `Sensor.inputs`."""
+        found, memory = self.readings(memory, x, now, dt, star_x)
+        named: dict[str, Array] = {"rate": found.rate}
+        for sensor, (reading, weight), age in zip(self.sensors, found.delivered, found.ages, strict=True):
+            named[sensor.name] = reading
+            named[f"{sensor.name}_valid"] = (weight > 0.0).astype(float)
+            named[f"{sensor.name}_age"] = age
+        return named, memory
+
+    def measure(
+        self, memory: SuiteMemory, x: AttitudeState, now: Ticks, dt: Scalar, star_x: Any = None
+    ) -> tuple[AttitudeState, SuiteMemory]:
+        """Return attitude and rate as the filter estimates them, and the memory."""
+        found, memory_next = self.readings(memory, x, now, dt, star_x)
+        estimate = self.filter.propagate(memory.estimate, found.rate, dt)
+        for k, ((reading, weight), age) in enumerate(zip(found.delivered, found.ages, strict=True)):
+            estimate = self.filter.correct(estimate, k, reading, age, weight)
+        return AttitudeState(estimate.q, estimate.w), memory_next._replace(estimate=estimate)
+
+    def quiet(self) -> "SensorSuite":
+        """Return the suite without noise and bias; the filter keeps its covariance."""
+        return replace(self, noise_free=True, given_bias=None)
+
+    def in_step(self) -> "SensorSuite":
+        """Return a suite of sensors with equally much information that all read at control samples."""
+        sensors = tuple(sensor.in_step() for sensor in self.sensors)
+        return replace(self, sensors=sensors, filter=self.filter.in_step())
+
+    def reading(self, sample: int = 0, share: float = 1.0) -> Reading:
+        """Return the readings of the attitude sensors and the gyro to first order, and the gyro bias.
+
+        Args:
+            sample: number of the first control sample.
+            share: its weight, see `KalmanFilter.begin`.
+        """
+        one, zero, still = np.eye(3), np.zeros((3, 3)), jnp.array([0.0, 0.0, 0.0, 1.0])
+        scale = one if self.rate_scale is None else np.diag(np.asarray(self.rate_scale))
+        axes = [np.asarray(sensor.sensitivity(still)) for sensor in self.sensors]
+        rows = np.vstack([*(np.hstack([v, np.zeros((len(v), 6))]) for v in axes), np.hstack([zero, scale, one])])
+        noise = np.concatenate([np.asarray(sigma) for sigma in (*(s.noise for s in self.sensors), self.rate_noise)])
+        early = self._each([sensor.times.every is None for sensor in self.sensors], False)
+        start = np.block([[one, zero, zero], [zero, zero, one]]), np.asarray(self.filter.first_factor(sample, share))
+        return Reading(rows, noise, np.asarray(self.rate_bias), np.asarray(self.bias_rate), start, early)
+
+    def change(self, x: AttitudeState, near: AttitudeState, taken: Any = None, near_taken: Any = None) -> Array:
+        """Return how much all readings (m,) differ between two true states.
+
+        Args:
+            x: true state at the control sample.
+            near: another one.
+            taken: true states at the times of `taken_ago`; None: all readings are taken at the control sample.
+            near_taken: other ones.
+        """
+        changes = []
+        for k, sensor in enumerate(self.sensors):
+            here, there = (x, near) if taken is None or taken[k] is None else (taken[k], near_taken[k])
+            changes.append(sensor.change(sensor.read(here.q), sensor.read(there.q)))
+        return jnp.concatenate([*changes, (near.w - x.w) * (1.0 if self.rate_scale is None else self.rate_scale)])
+
+    def lag(self, now: Ticks) -> np.ndarray:
+        """Return how many control samples ago each reading was taken, (N, m); between samples, before the later one."""
+        whole = [np.broadcast_to(sensor.times.place(sensor.times.age(now.sample))[0], now.sample.shape)
+                 for sensor in self.sensors]  # fmt: skip
+        return self._each(whole, np.zeros(now.sample.shape, int)).T
+
+    def available(self, now: Ticks) -> np.ndarray:
+        """Return whether there is each reading at control samples, (N, m) bool."""
+        there = []
+        for k, sensor in enumerate(self.sensors):
+            times = sensor.times
+            fresh = np.asarray(now.sample) - np.asarray(times.place(times.age(now.sample))[0]) >= int(now.sample[0])
+            due = np.asarray(times.due(now.sample)) & fresh
+            if k == 0 and self.outage is not None:
+                t, (begin, end) = np.asarray(now.t - times.age(now.sample)), np.asarray(self.outage)
+                due &= ~((t >= begin) & (t < end))
+            there.append(due)
+        return self._each(there, np.ones(now.sample.shape, bool)).T
+
+    def _each(self, values: list[Any], of_gyro: Any) -> np.ndarray:
+        """Return values of the attitude sensors, and one of the gyro, repeated for each component (m, ..)."""
+        sizes = [sensor.noise.shape[-1] for sensor in self.sensors]
+        return np.repeat(np.stack([*values, of_gyro]), [*sizes, 3], axis=0)
+
+    @property
+    def _queues(self) -> list[int]:
+        """The numbers of coordinates of the readings on their way, of each sensor."""
+        return [sensor.times.queue * sensor.noise.shape[-1] for sensor in self.sensors]
+
+    @property
+    def noise_size(self) -> int:
+        """Return the number of components of all readings; they are the last coordinates of a memory."""
+        return sum(sensor.noise.shape[-1] for sensor in self.sensors) + 3
+
+    def retract(self, memory: SuiteMemory, by: Float[Array, " n"]) -> SuiteMemory:
+        """Return the memory near another one at local coordinates.
+
+        Args:
+            memory: the other one.
+            by: coordinates (n,) of the filter [rad, rad/s], of the readings on their way, of the next sample's noise.
+        """
+        size = 9 + 3 * self.filter.past
+        own, *waiting, noise = jnp.split(by, np.cumsum([size, *self._queues]))
+        near = []
+        for sensor, queue, shift in zip(self.sensors, memory.waiting, waiting, strict=True):
+            shifts = shift.reshape(sensor.times.queue, -1)
+            near.append(queue and queue._replace(reading=jax.vmap(sensor.changed)(queue.reading, shifts)))
+        changes = jnp.split(noise, np.cumsum([v.shape[-1] for v in memory.noise])[:-1])
+        noise = tuple(jnp.add(v, change) for v, change in zip(memory.noise, changes, strict=True))
+        estimate = self.filter.retract(memory.estimate, own)
+        return memory._replace(estimate=estimate, waiting=tuple(near), noise=noise)
+
+    def local_coordinates(self, memory: SuiteMemory, other: SuiteMemory) -> Float[Array, " n"]:
+        """Return the local coordinates (n,) of a memory near another one, to first order; see `retract`."""
+        shifts = [
+            jax.vmap(sensor.change)(mine.reading, theirs.reading).reshape(-1)
+            for sensor, mine, theirs in zip(self.sensors, memory.waiting, other.waiting, strict=True)
+            if mine is not None
+        ]
+        noise = [theirs - mine for mine, theirs in zip(memory.noise, other.noise, strict=True)]
+        own = self.filter.local_coordinates(memory.estimate, other.estimate)
+        return jnp.concatenate([own, *shifts, *noise])
+
+
+def _passed(
+    new: Delivery, waiting: Delivery | None, sensor: AttitudeSensor, now: Ticks, age: Scalar
+) -> tuple[Delivery, Delivery | None]:
+    """Return what a sensor delivers at a sample, from its newest reading and those on their way, and the new queue."""
+    times = sensor.times
+    if waiting is None:
+        return new, None
+    line = jax.tree.map(lambda one, queue: jnp.concatenate([one[None], queue]), new, waiting)
+    out = jax.tree.map(lambda v: v[times.wait], line)
+    if times.split:
+        later = jax.tree.map(lambda v: v[times.wait + 1], line)
+        out = guards.select(times.place(age)[0] == times.wait, out, later)
+    if times.every is None:
+        out = out._replace(weight=jnp.where(times.due(now.sample), out.weight, 0.0))
+    return out, jax.tree.map(lambda v: v[:-1], line)
