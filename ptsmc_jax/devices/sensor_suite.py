@@ -226,9 +226,10 @@ class SensorSuite(Sensor):
         return [sensor.times.queue * sensor.noise.shape[-1] for sensor in self.sensors]
 
     @property
-    def noise_size(self) -> int:
-        """Return the number of components of all readings; they are the last coordinates of a memory."""
-        return sum(sensor.noise.shape[-1] for sensor in self.sensors) + 3
+    def noise_place(self) -> slice:
+        """Return where the coordinates of a memory have the noise of the next sample, see `retract`."""
+        first = 9 + 3 * self.filter.past + sum(self._queues)
+        return slice(first, first + sum(sensor.noise.shape[-1] for sensor in self.sensors) + 3)
 
     def retract(self, memory: SuiteMemory, by: Float[Array, " n"]) -> SuiteMemory:
         """Return the memory near another one at local coordinates.
@@ -241,8 +242,10 @@ class SensorSuite(Sensor):
         own, *waiting, noise = jnp.split(by, np.cumsum([size, *self._queues]))
         near = []
         for sensor, queue, shift in zip(self.sensors, memory.waiting, waiting, strict=True):
-            shifts = shift.reshape(sensor.times.queue, -1)
-            near.append(queue and queue._replace(reading=jax.vmap(sensor.changed)(queue.reading, shifts)))
+            if queue is not None:
+                shifts = shift.reshape(sensor.times.queue, -1)
+                queue = queue._replace(reading=jax.vmap(sensor.changed)(queue.reading, shifts))
+            near.append(queue)
         changes = jnp.split(noise, np.cumsum([v.shape[-1] for v in memory.noise])[:-1])
         noise = tuple(jnp.add(v, change) for v, change in zip(memory.noise, changes, strict=True))
         estimate = self.filter.retract(memory.estimate, own)

@@ -123,11 +123,12 @@ class _State:
         before = self._n + self._waiting
         self._own = slice(before, before + reading.own.size)
         self.size = before + reading.own.size + self._m
-        # what the computer sees, by the state and by the noise
-        from_readings = np.linalg.pinv(reading.rows[:, :k])
-        self._seen = _Rows(np.zeros((k, self.size)), from_readings * reading.noise)
-        self._seen.state[:, :k] = np.eye(k)
-        self._seen.state[:, self._own] = from_readings @ reading.rows[:, k:]
+        # errors of the readings: of a suite the noise of the next sample is among the coordinates of its memory, other
+        # sensors have as many readings as the computer sees states
+        self._seen, self.memory = k, self.plant.stop + k  # the memory of the sensors follows x and what was seen of it
+        place = getattr(sensors, "noise_place", None)
+        self._noise = None if place is None else slice(self.memory + place.start, self.memory + place.stop)
+        self._from_readings = None if place is not None else np.linalg.pinv(reading.rows[:, :k])
         # by how much the state moves by itself in a second, 1 sigma: the random walk as a period begins, in which it
         # acts, the sensors' own states after its sample
         self.walk = np.concatenate([np.zeros(self.size - self._m), error_floor.walk_of(parts)])
@@ -140,16 +141,22 @@ class _State:
         factor[self._own] = np.diag(reading.own)
         if reading.start is not None:  # the filter's errors: of its attitude, and of its bias beside the gyro's
             start = np.zeros((self.size, 6))
-            first = self.plant.stop + len(self._seen.state)  # after x and what the computer saw of it
-            start[first : first + 6] = reading.start[1]
-            factor[first + 3 : first + 6] = np.diag(reading.own)
+            start[self.memory : self.memory + 6] = reading.start[1]
+            factor[self.memory + 3 : self.memory + 6] = np.diag(reading.own)
             factor = np.hstack([factor, start])
         return factor @ factor.T
 
     def rows(self, by_z: Any, by_seen: Any) -> _Rows:
         """Rows of something by z and by what the computer sees, of NumPy; in each period where these are so."""
-        padded = np.pad(by_z, [(0, 0)] * (by_z.ndim - 1) + [(0, self.size - self._n)])
-        return _Rows(padded + by_seen @ self._seen.state, by_seen @ self._seen.noise)
+        by_state = np.pad(by_z, [(0, 0)] * (by_z.ndim - 1) + [(0, self.size - self._n)])
+        if self._noise is not None:
+            by_errors = by_state[..., self._noise].copy()
+            by_state[..., self._noise] = 0.0
+        else:
+            by_errors = by_seen @ self._from_readings
+        by_state[..., : self._seen] += by_seen
+        by_state[..., self._own] = by_errors @ self._reading.rows[:, self._seen :]
+        return _Rows(by_state, by_errors * self._reading.noise)
 
     def moved(self, loops: Any) -> tuple[_Rows, _Rows]:
         """The command, and the whole state a period later, in each period; loops: a `linear.Loop` of numpy arrays."""

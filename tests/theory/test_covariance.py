@@ -171,7 +171,7 @@ def test_a_filters_errors_stay_in_the_steady_state_that_they_start_in():
     ticks = jax.tree.map(lambda v: np.asarray(v)[periods], run.period.now)
     state = covariance._State(parts, ticks, opened)
     _, moved = state.moved(opened.loop)
-    first = state.plant.stop + len(state._seen.state)
+    first = state.memory
     known = np.eye(state.size)[first : first + 6]  # the filter's attitude and bias
     known[:3, :3] -= np.eye(3)
     known[3:, state._own] -= np.eye(3)
