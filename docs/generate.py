@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-from ptsmc_jax.scenario import errors, keys, layouts
+from ptsmc_jax.scenario import errors, keys, layouts, sensor_tables
 from ptsmc_jax.scenario.attitude_keys import Attitude
 from ptsmc_jax.scenario.tables import Limit
 from ptsmc_jax.scenario.values import Kinds, Table
@@ -69,6 +69,12 @@ margin, a number: `gain_margin` [dB], `phase_margin` [deg] and `delay_margin` [s
 `modulus_margin` [dB] is the largest peak of the sensitivity. The keys of a table:"""
 
 
+SUITE = """\
+Any number of sensors, a table each: at least one gyro, and attitude sensors that determine the attitude together. A
+[Kalman filter](method.md#sensor-suites) combines them. These tables replace the noise in `[hardware]` and `[filter]`,
+which are the short form for one star tracker and one gyro."""
+
+
 def scenarios() -> str:
     """Reference of scenario files, for each kind of plant what it does not share with those before."""
     parts = ["# Scenario files", MADE, SCENARIOS]
@@ -100,6 +106,10 @@ def scenarios() -> str:
                 for other, named in known.items()
             ]
             seen = dict.fromkeys(kinds.values(), lower) | seen
+            if name == "sensors" and plant == "spacecraft":
+                parts += ["### [[sensors]]", SUITE]
+                for kind, struct in sensor_tables.SENSORS.items():
+                    parts += [f'`kind = "{kind}"`: {keys.about(struct)}', *_keys(name, struct, plant)]
         if plant == "spacecraft":
             parts += ["### [requirements]", REQUIREMENTS, *_keys("requirements", Limit, plant)]
         else:

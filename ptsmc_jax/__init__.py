@@ -25,6 +25,7 @@ _EXPORTS = {
     "AccelerationLaw": "laws.base",
     "SampledObserver": "observers.base",
     "SampledSensor": "devices.own_sensors",
+    "AttitudeSensor": "devices.attitude_sensors",
     "Draw": "dispersions.base",
     "Disturbance": "signals.disturbances",
     "Reference": "signals.references",
@@ -76,6 +77,7 @@ if TYPE_CHECKING:
     from ptsmc_jax.campaigns.montecarlo import run as run
     from ptsmc_jax.declare import gain as gain
     from ptsmc_jax.declare import number as number
+    from ptsmc_jax.devices.attitude_sensors import AttitudeSensor as AttitudeSensor
     from ptsmc_jax.devices.own_sensors import SampledSensor as SampledSensor
     from ptsmc_jax.devices.sensors import Sensors as Sensors
     from ptsmc_jax.dispersions.base import Draw as Draw

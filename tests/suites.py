@@ -23,7 +23,7 @@ def star_tracker(k, interval, latency, period):
 def suite(sensors, period, gyro=(1e-5, 2e-5, 1e-5), bias=1e-4, walk=1e-7):
     """A suite of attitude sensors and a gyro; walk: random walk of its bias [rad/s/sqrt(s)]."""
     drift = jnp.full(3, walk / np.sqrt(period))
-    found = kalman_filter.kalman_filter(sensors, gyro, drift, period)
+    found = kalman_filter.kalman_filter(sensors, gyro, drift, bias, period)
     return sensor_suite.SensorSuite(
         sensors=tuple(sensors), rate_noise=vector(gyro), rate_bias=jnp.full(3, bias), bias_rate=drift, filter=found
     )

@@ -126,7 +126,8 @@ class AttitudeSensor:
     """A sensor whose reading depends on the attitude alone. Derived classes define `read`.
 
     Its axes follow from the body axes by the rotation `mounting`: a vector with components y in sensor axes has the
-    components R(mounting) y in body axes. The reading is an array with additive noise, independent for each component.
+    components R(mounting) y in body axes. A reading is an array [-]. Its noise is a small rotation about the sensor's
+    axes [rad], or additive, and its components are independent.
     """
 
     name: str = field(metadata={"static": True})  # also of its random numbers, and of its input in exported C
@@ -169,7 +170,7 @@ class AttitudeSensor:
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class StarTracker(AttitudeSensor):
-    """A star tracker: its reading is its own attitude, a unit quaternion (4,).
+    """Star tracker: its reading is its own attitude relative to inertial axes, a unit quaternion, scalar last.
 
     The noise is a small rotation about its own axes [rad]. z is its boresight, about which the noise is largest.
     """
@@ -177,6 +178,10 @@ class StarTracker(AttitudeSensor):
     def read(self, q: Float[Array, "4"]) -> Float[Array, "4"]:
         """Return the attitude of the tracker's axes (4,)."""
         return attitude.multiply(q, self.mounting)
+
+    def body(self, reading: Float[Array, "4"]) -> Float[Array, "4"]:
+        """Return the attitude of the body (4,) for a reading."""
+        return attitude.multiply(reading, attitude.conjugate(self.mounting))
 
     def changed(self, reading: Float[Array, "4"], change: Float[Array, "3"]) -> Float[Array, "4"]:
         """Return an attitude turned by a small rotation (3,) [rad] about the tracker's axes."""
@@ -195,7 +200,7 @@ class StarTracker(AttitudeSensor):
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class VectorSensor(AttitudeSensor):
-    """A sun sensor or magnetometer: its reading is a known inertial direction in its own axes (3,) [-].
+    """Sun sensor or magnetometer: its reading is a known inertial direction, a unit vector in its own axes.
 
     It says nothing of the rotation about that direction.
     """

@@ -32,6 +32,7 @@ from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
 
 LONGEST = 1000  # control periods of a cycle at most; of a longer one, only the first are in `first`
 DOUBLINGS = 60  # of the number of cycles, until the steady state
+SWITCHED_ON = 0.1  # 1 sigma of the attitude if the first reading is that of a body that turned in its latency [rad]
 TURN, BIAS, NOISE = slice(0, 3), slice(3, 6), slice(6, 9)
 
 
@@ -54,11 +55,15 @@ class Track(NamedTuple):
 @pytree
 @dataclass(frozen=True)
 class KalmanFilter:
-    """The filter, with the sensors as the flight software knows them. Build it with `kalman_filter`."""
+    """The filter, with the sensors as the flight software knows them. Build it with `kalman_filter`.
+
+    Its errors are those of attitude [rad], gyro bias [rad/s], last gyro sample [rad/s] and past attitudes [rad].
+    """
 
     sensors: tuple[AttitudeSensor, ...]
     rate_noise: Leaf  # (3,) 1 sigma of a gyro sample [rad/s]
     drift: Leaf  # (3,) 1 sigma of the change of the bias per second of a period [rad/s^2]
+    rate_bias: Leaf  # (3,) 1 sigma of the bias of a gyro that was just switched on [rad/s]
     period: Leaf  # of control [s]
     # (cycle, 6, 6) factors of the covariance of (a, b) in the steady state at rest, just before a control sample
     first: Leaf
@@ -96,10 +101,23 @@ class KalmanFilter:
         error = factor @ normals
         q = attitude.multiply(q, attitude.from_rotation_vector(error[TURN]))
         bias = bias + error[BIAS]
-        covariance = jnp.zeros((9 + 3 * past, 9 + 3 * past)).at[:6, :6].set(factor @ factor.T)
         past_q = jnp.tile(q, (past, 1)) if past else None
         past_w = jnp.tile(w, (past, 1)) if self.between else None
-        return Track(q, bias, w + bias, past_q, past_w, covariance)
+        return Track(q, bias, w + bias, past_q, past_w, self.covariance(factor))
+
+    def covariance(self, factor: Float[Array, "6 6"]) -> Float[Array, "n n"]:
+        """Return the covariance (n, n) of all errors from a factor (6, 6) of the covariance of (a, b)."""
+        more = 3 + 3 * self.past
+        return jnp.pad(factor @ factor.T, ((0, more), (0, more)))
+
+    def unknown(self) -> Float[Array, "n n"]:
+        """Return the covariance (n, n) of all errors before the first reading, of a body that hardly turned before."""
+        covariance = self.covariance(self.first[0])
+        attitudes = np.r_[0:3, 9 : 9 + 3 * self.past]
+        same = np.zeros(covariance.shape)
+        same[np.ix_(attitudes, attitudes)] = SWITCHED_ON**2 * np.tile(np.eye(3), (1 + self.past,) * 2)
+        bias = jnp.pad(self.rate_bias**2, (3, 3 + 3 * self.past))
+        return covariance + jnp.asarray(same) + jnp.diag(bias)
 
     def propagate(self, old: Track, gyro: Float[Array, "3"], dt: Scalar) -> Track:
         """Return the state a control period later.
@@ -232,13 +250,16 @@ class KalmanFilter:
         return jnp.concatenate([turn(track.q, other.q), other.bias - track.bias, track.rate - other.rate, *past])
 
 
-def kalman_filter(sensors: Sequence[AttitudeSensor], rate_noise: Any, drift: Any, period: float) -> KalmanFilter:
+def kalman_filter(
+    sensors: Sequence[AttitudeSensor], rate_noise: Any, drift: Any, rate_bias: Any, period: float
+) -> KalmanFilter:
     """Return a filter that starts in its steady state at rest.
 
     Args:
         sensors: attitude sensors.
         rate_noise: 1 sigma of a gyro sample (3,) [rad/s].
         drift: 1 sigma of the change of the bias per second of a period (3,) [rad/s^2].
+        rate_bias: 1 sigma of the bias of a gyro that was just switched on (3,) [rad/s].
         period: of control [s].
 
     Raises:
@@ -246,8 +267,9 @@ def kalman_filter(sensors: Sequence[AttitudeSensor], rate_noise: Any, drift: Any
     """
     if any(np.any(np.asarray(sensor.noise) <= 0.0) for sensor in sensors):
         raise ValueError("every attitude sensor must have noise greater than 0")
-    gyro, change = (jnp.broadcast_to(jnp.asarray(v, float), (3,)) for v in (rate_noise, drift))
-    found = KalmanFilter(tuple(sensors), gyro, change, jnp.asarray(float(period)), jnp.zeros((1, 6, 6)))
+    each = (rate_noise, drift, rate_bias)
+    gyro, change, bias = (jnp.broadcast_to(jnp.asarray(v, float), (3,)) for v in each)
+    found = KalmanFilter(tuple(sensors), gyro, change, bias, jnp.asarray(float(period)), jnp.zeros((1, 6, 6)))
     return replace(found, first=jnp.asarray(_steady_state(found)))
 
 

@@ -46,7 +46,7 @@ class SuiteMemory(NamedTuple):
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class SensorSuite(Sensor):
-    """Attitude sensors and a gyro. The law sees the attitude and the rate that the filter estimates."""
+    """Attitude sensors and a gyro. The law sees the attitude [-] and the rate [rad/s] that the filter estimates."""
 
     sensors: tuple[AttitudeSensor, ...]
     rate_noise: Leaf  # (3,) 1 sigma of a gyro sample about each body axis [rad/s]
@@ -145,6 +145,13 @@ class SensorSuite(Sensor):
             named[f"{sensor.name}_valid"] = (weight > 0.0).astype(float)
             named[f"{sensor.name}_age"] = age
         return named, memory
+
+    def remembered(self, memory: SuiteMemory) -> dict[str, Array]:
+        """Return the state of the filter as exported C has it, by name."""
+        track = memory.estimate
+        named = {"attitude": track.q, "bias": track.bias, "gyro": track.rate, "covariance": track.covariance}
+        past = {"past_attitude": track.past_q, "past_rate": track.past_w}
+        return named | {name: value for name, value in past.items() if value is not None}
 
     def measure(
         self, memory: SuiteMemory, x: AttitudeState, now: Ticks, dt: Scalar, star_x: Any = None

@@ -28,7 +28,7 @@ RATE_BIAS, BIAS_WALK, FILTER_START = "rate_bias", "rate_bias_walk", "filter_star
 
 
 class Sensor(ABC):
-    """A sensor, as the rollout, linear theory and campaigns ask for it.
+    """A sensor, as the rollout, linear theory and campaigns ask for it; all numbers in SI units [rad, rad/s].
 
     A true state x is what sensors can see of it, `Plant.visible`.
     """
@@ -63,6 +63,10 @@ class Sensor(ABC):
         read, memory = self.sample(memory, x, now, dt, star_x)
         named = {"attitude": read.q, "rate": read.w} if isinstance(read, AttitudeState) else {"x": read}
         return named, memory
+
+    def remembered(self, memory: Any) -> dict[str, Array]:
+        """Return the estimates of a filter as exported C remembers them, by the names of its state."""
+        return {}
 
     @abstractmethod
     def quiet(self) -> Any:
@@ -257,6 +261,12 @@ class Sensors(Sensor):
             named["attitude_valid"] = (self.star_weight(now) > 0.0).astype(float)
             named |= {} if age is None else {"attitude_age": age}
         return named, memory
+
+    def remembered(self, memory: Memory) -> dict[str, Array]:
+        """Return attitude and bias by the filter, and the last gyro sample [rad/s], as exported C has them."""
+        if memory.estimate is None:
+            return {}
+        return {"attitude": memory.estimate.q, "bias": memory.estimate.bias, "gyro": memory.rate}
 
     def measure(
         self, memory: Memory, x: AttitudeState, now: Ticks, dt: Scalar, star_x: AttitudeState | None = None

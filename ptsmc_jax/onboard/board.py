@@ -18,7 +18,9 @@ import numpy as np
 from ptsmc_jax.batching.dependence import dependence
 from ptsmc_jax.devices.actuators import Actuators, ActuatorState, Drive
 from ptsmc_jax.devices.attitude_filter import Estimate
+from ptsmc_jax.devices.attitude_sensors import SampleTimes, StarTracker
 from ptsmc_jax.devices.command_filter import CommandFilter
+from ptsmc_jax.devices.kalman_filter import KalmanFilter, Track
 from ptsmc_jax.laws.base import Law, Sample
 from ptsmc_jax.numerics import guards
 from ptsmc_jax.observers.base import Observer
@@ -77,9 +79,17 @@ class Board:
 
 
 def _kind(part: Any) -> str:
-    fixed = [entry.name for entry in dataclasses.fields(part) if entry.metadata.get("static")]
-    said = ", ".join(f"{name}={getattr(part, name)!r}" for name in fixed)
-    return type(part).__qualname__ + (f"({said})" if said else "")
+    """Return the type of a part and what is fixed in it, and in the parts that it has a list of."""
+    said = []
+    for entry in dataclasses.fields(part):
+        value = getattr(part, entry.name)
+        if entry.metadata.get("static"):
+            said.append(f"{entry.name}={value!r}")
+        elif isinstance(value, tuple) and all(map(dataclasses.is_dataclass, value)):
+            said += [f"{entry.name}[{k}]={_kind(one)}" for k, one in enumerate(value)]
+        elif isinstance(value, SampleTimes):
+            said.append(f"{entry.name}={_kind(value)}")
+    return type(part).__qualname__ + (f"({', '.join(said)})" if said else "")
 
 
 SCALARS = ("t", "dt", "regular", "tracking")  # arguments of C's functions
@@ -106,7 +116,7 @@ def board(parts: Parts) -> Board:
     device = parts.actuators
     parameters, inputs = known(parts), observer.model.inputs
     computer = Board(parameters, observer.model.attitude, rules=derived.rules(parts))
-    if parameters["filter"] is not None:
+    if "filter_bandwidth" in parameters:
         _filter_parameters(computer, parts.sensors, parts.period)
     computer.about["period"] = "of the control loop [s]"
     computer.about["observer_matrix"] = _said(type(observer).update_matrix)
@@ -114,6 +124,8 @@ def board(parts: Parts) -> Board:
         _reading(computer, parts)
     elif parameters["filter"] is None:
         _tracking(computer)
+    elif isinstance(parameters["filter"], KalmanFilter):
+        _estimating(computer, parameters["filter"])
     else:
         _filtering(computer, parameters["filter"], aged=getattr(parts.sensors, "own_times", None) is not None)
     _observing(computer, observer, device)
@@ -138,7 +150,9 @@ def known(parts: Parts) -> dict[str, Any]:
         "command_filter": parts.command_filter,
         "period": period,
     }
-    if parameters["filter"] is not None:  # what its gains follow from
+    if isinstance(parameters["filter"], KalmanFilter):  # C starts at control sample 0
+        parameters["filter"] = dataclasses.replace(parameters["filter"], first=parameters["filter"].first[:1])
+    elif parameters["filter"] is not None:  # what its gains follow from
         parameters["filter_bandwidth"] = sensors.bandwidth(period)
         if sensors.own_times is not None:
             parameters["star_tracker_interval"] = sensors.own_times.interval
@@ -236,6 +250,75 @@ def _filtering(computer: Board, filter_: Any, *, aged: bool) -> None:
     reads = ("in.attitude", "in.attitude_valid", "in.rate", "before.attitude", "before.bias", "before.gyro", "dt",
              "tracking", "t", *(("in.attitude_age",) if age else ()))  # fmt: skip
     computer.stages.append(Stage("sense", about, reads, sense, (filter_,)))
+
+
+def _estimating(computer: Board, estimator: KalmanFilter) -> None:
+    """Add a gyro and attitude sensors, through a Kalman filter of the attitude."""
+    computer.inputs["rate"] = real(3)
+    computer.about["rate"] = _MEASURED["rate"]
+    for sensor in estimator.sensors:
+        name, kind = sensor.name, type(sensor).__doc__ or ""
+        computer.inputs |= {name: shapes(sensor.read(jnp.array([0.0, 0.0, 0.0, 1.0]))), f"{name}_valid": integer()}
+        computer.about[name] = " ".join(kind.split("\n\n")[0].split())
+        computer.about[f"{name}_valid"] = f"whether {name} has a reading at this sample: 0 or 1"
+        if sensor.times.every is None:
+            computer.inputs[f"{name}_age"] = real()
+            computer.about[f"{name}_age"] = f"how long before this sample the reading of {name} was taken [s]"
+    past, size = estimator.past, 9 + 3 * estimator.past
+    computer.state |= {"attitude": real(4), "rate": real(3), "bias": real(3), "gyro": real(3)}
+    computer.state |= {"past_attitude": real(past, 4)} if past else {}
+    computer.state |= {"past_rate": real(past, 3)} if estimator.between else {}
+    computer.state["covariance"] = real(size, size)
+    computer.about |= {
+        "bias": "of the gyro, estimated [rad/s]",
+        "gyro": "rate as the gyro measured it last, less its estimated noise [rad/s]",
+        "past_attitude": "estimates at the last samples, the newest first",
+        "past_rate": "estimated body rates then [rad/s]",
+        "covariance": "of the errors of attitude [rad], bias [rad/s], last gyro sample [rad/s], past attitudes [rad]",
+    }
+    states = [name for name in computer.state if name != "rate"]
+    reads = (*(f"in.{name}" for name in computer.inputs), *(f"before.{name}" for name in states), "dt", "tracking", "t")
+
+    def sense(parameters: Any, *read: Any) -> dict[str, Any]:
+        given, known = dict(zip(reads, read, strict=True)), parameters["filter"]
+        before, one = given["before.attitude"], jnp.ones_like(given["dt"])
+        start, readings = before, []
+        for sensor in known.sensors:  # if the attitude is not known yet, it is that of a star tracker
+            valid = given[f"in.{sensor.name}_valid"] != 0
+            reading = jnp.where(valid, given[f"in.{sensor.name}"], sensor.read(start))
+            if isinstance(sensor, StarTracker):
+                reading = _unit(reading)
+                unknown = valid & (jnp.dot(start, start) <= KNOWN)
+                start = jnp.where(unknown, sensor.body(reading), start)
+            readings.append((valid, reading))
+        past = given.get("before.past_attitude")
+        if past is not None:
+            past = jax.vmap(lambda q: jnp.where(jnp.dot(q, q) > KNOWN, q, start))(past)
+        covariance = jax.lax.cond(
+            jnp.dot(before, before) > KNOWN, lambda: given["before.covariance"], lambda: known.unknown()
+        )
+        estimates = (given["before.bias"], given["before.gyro"], past, given.get("before.past_rate"))
+        track = known.propagate(Track(start, *estimates, covariance), given["in.rate"], given["dt"])
+        for k, (sensor, (valid, reading)) in enumerate(zip(known.sensors, readings, strict=True)):
+            age = given.get(f"in.{sensor.name}_age", sensor.times.wait * known.period)
+            corrected = partial(known.correct, track, k, reading, age, one)
+            track = jax.lax.cond(valid, corrected, lambda track=track: track)
+        attitude = _signed(
+            parameters["law"], parameters["reference"](given["t"]), track.q, track.w, start, given["tracking"]
+        )
+        now = {
+            "attitude": attitude,
+            "rate": track.w,
+            "bias": track.bias,
+            "gyro": track.rate,
+            "past_attitude": track.past_q,
+            "past_rate": track.past_w,
+            "covariance": track.covariance,
+        }
+        return {f"now.{name}": value for name, value in now.items() if value is not None}
+
+    about = "Attitude and rate as the law sees them: the gyro carries the attitude, the attitude sensors correct it."
+    computer.stages.append(Stage("sense", about, reads, sense, (estimator,)))
 
 
 def _observing(computer: Board, observer: Observer, device: Actuators) -> None:
@@ -355,6 +438,9 @@ def _commanding(computer: Board, law: Law, observer: Observer, command_filter: C
 def _begin(parameters: Any, m: int) -> dict[str, Any]:
     filtering = parameters["command_filter"]
     begun = {} if filtering is None else {"now.command_filter": filtering.begin(m)}
+    estimator = parameters["filter"]
+    if isinstance(estimator, KalmanFilter):
+        begun["now.covariance"] = estimator.covariance(estimator.first[0])
     return {"now.observer": parameters["observer"].begin(), "now.law": parameters["law"].begin(), **begun}
 
 

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ptsmc_jax.devices.attitude_filter import filter_gains
+from ptsmc_jax.devices.kalman_filter import KalmanFilter
 from ptsmc_jax.numerics import matrices
 from ptsmc_jax.simulation.assembly import Parts
 
@@ -21,7 +22,10 @@ Rule = Callable[[Given], Given]  # of all parameters: all of them, those that fo
 def rules(parts: Parts) -> list[Rule]:
     """The rules for the flight computer of these parts, each for what the ones before it give."""
     found: list[Rule] = [_inverses, _estimation]
-    if getattr(parts.sensors, "filter", None) is not None:
+    estimator = getattr(parts.sensors, "filter", None)
+    if isinstance(estimator, KalmanFilter):
+        found.append(_clocks)
+    elif estimator is not None:
         found.append(_filtering(parts.sensors))
     if parts.actuators.wheels is not None:
         found.append(_allocation)
@@ -45,6 +49,13 @@ def _estimation(given: Given) -> Given:
     """The observer's matrix for a period, and K2, the bound on its error."""
     observer = given["observer"]
     return given | {"observer_matrix": observer.update_matrix(given["period"]), "bound": observer.error_bound()}
+
+
+def _clocks(given: Given) -> Given:
+    """The control period, which a Kalman filter and its sensors have too."""
+    estimator, period = given["filter"], given["period"]
+    sensors = (replace(sensor, times=replace(sensor.times, period=period)) for sensor in estimator.sensors)
+    return given | {"filter": replace(estimator, sensors=tuple(sensors), period=period)}
 
 
 def _filtering(sensors: Any) -> Rule:

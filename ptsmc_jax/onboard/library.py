@@ -238,9 +238,8 @@ class InTheLoop:
         """Before the first sample: the state of `ptsmc_init`, an attitude filter as it has run before."""
         computer = OURS.boot(parts, seed, trial, x0, first)
         state = jnp.asarray(self.library.first())
-        estimate = getattr(computer.sensors, "estimate", None)
-        if estimate is not None:
-            state = self._with(self._with(state, "attitude", estimate.q), "bias", estimate.bias)
+        for name, value in parts.sensors.remembered(computer.sensors).items():
+            state = self._with(state, name, value)
         return computer._replace(sensors=(computer.sensors, state, jnp.zeros(len(SAMPLES), jnp.int32)))
 
     def decide(
@@ -282,8 +281,8 @@ class InTheLoop:
         return told
 
     def _with(self, state: Any, name: str, value: Any) -> Any:
-        at = self.library.columns["state"].index(f"{name}[0]")
-        return state.at[at : at + value.size].set(value)
+        at = self.library.columns["state"].index(name + "[0]" * value.ndim)
+        return state.at[at : at + value.size].set(jnp.ravel(value))
 
     def _trees(self, shapes: dict[str, Any], row: Any, at: int) -> dict[str, Any]:
         """Named trees from a row of numbers, from a place on."""

@@ -220,24 +220,27 @@ def _checks(code: Code, about: About) -> list[str]:
              "observer for long. */",
              "static int within(const real *v, int count)", "{", "    for (int k = 0; k < count; k++) {",
              f"        if (!(M(fabs)(v[k]) <= R({'1e6' if about.spacecraft else '1e12'}))) {{",
-             "            return 0;", "        }", "    }", "    return 1;", "}", "",
-             "/* Whether an input can be used. */"]  # fmt: skip
+             "            return 0;", "        }", "    }", "    return 1;", "}", ""]  # fmt: skip
+    if about.spacecraft:
+        lines += ["/* Whether a quaternion is that of a rotation, nearly. */",
+                  "static int rotation(const real *q)", "{",
+                  "    const real square = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3];", "",
+                  "    return isfinite(square) && square > R(0.25) && square < R(4);", "}", ""]  # fmt: skip
+    lines += ["/* Whether an input can be used. */"]
     parameters = "const ptsmc_params *p, " if about.spacecraft else ""
     lines += [f"static int usable({parameters}const ptsmc_state *state, const ptsmc_in *in)", "{"]
-    of_star = ("attitude", "attitude_age") if about.filtered else ()
-    required = [field for field in reals if field.name not in of_star]
-    aged = any(field.name == "attitude_age" for field in reals)
+    names = {field.name for field in code.inputs}
+    sensors = [field for field in reals if f"{field.name}_valid" in names]
+    required = [field for field in reals if field not in sensors and not field.name.endswith("_age")]
+    told = [f"(in->{field.name}_valid == 0 || isfinite(in->{field.name}_age))"
+            for field in sensors if f"{field.name}_age" in names]  # fmt: skip
     if about.spacecraft:
-        known = "in->attitude_valid == 0 ? state->attitude : " if about.filtered else ""
         lines += [
-            f"    const real *const q = {known}in->attitude;",
             "    const real *const w = in->rate;",
-            "    const real square = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3];",
             "    const real turn = (w[0] * w[0] + w[1] * w[1] + w[2] * w[2]) * p->period * p->period; /* [rad^2] */",
-            "    const int rotation = isfinite(square) && square > R(0.25) && square < R(4);",
-        ]  # fmt: skip
-        told = ["(in->attitude_valid == 0 || isfinite(in->attitude_age))"] if aged else []
-        turned = ["rotation", *told, "turn < R(1)"]
+        ]
+        attitudes = _attitudes(sensors) if sensors or "attitude" not in names else ["rotation(in->attitude)"]
+        turned = [*attitudes, *told, "turn < R(1)"]
     else:
         turned = []
     terms = ["isfinite(in->t)", "(!state->started || in->t > state->t)",
@@ -247,6 +250,16 @@ def _checks(code: Code, about: About) -> list[str]:
     kept = [_finite(field, "now->") for field in code.state if field.kind == REAL]
     lines += [*_all([*kept, *(_finite(field, "out->") for field in code.outputs)], "        "), "}"]
     return [*lines, *_current(code)] if code.derived else lines
+
+
+def _attitudes(sensors: Sequence[Field]) -> list[str]:
+    """Conditions on the readings of attitude sensors: each is usable or not valid, and an attitude is known."""
+    star_trackers = [made for made in sensors if made.name.startswith(("attitude", "star_tracker_"))]
+    others = [made for made in sensors if made not in star_trackers]
+    known = ["rotation(state->attitude)", *(f"in->{made.name}_valid != 0" for made in star_trackers)]
+    return [f"({' || '.join(known)})",
+            *(f"(in->{made.name}_valid == 0 || rotation(in->{made.name}))" for made in star_trackers),
+            *(f"(in->{made.name}_valid == 0 || {_within(made, 'in->')})" for made in others)]  # fmt: skip
 
 
 def _current(code: Code) -> list[str]:

@@ -28,8 +28,8 @@ class Samples(NamedTuple):
     t: Array  # [s]
     flown: Array  # bool: its period has a length
     inputs: dict[str, Array]  # what the sensors deliver, see `Sensor.inputs`
-    before: Any  # Estimate of the attitude filter before the sample
-    estimate: Any  # and after it
+    before: dict[str, Array]  # of an attitude filter before the sample, see `Sensor.remembered`
+    after: dict[str, Array]  # and after it
     applied: Array  # mean torque over the last period [N m]
     acting: Array | None  # torque of the channels [N m]
     momentum: Array | None  # of the wheels [N m s]
@@ -68,7 +68,7 @@ def fly(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Samples:
         unit = jnp.where(jnp.isnan(unit), law.kinematics.clearance_unit(distance), unit)
         row = Samples(
             t=now.t, flown=now.t_next > now.t, inputs=inputs,
-            before=getattr(sensing, "estimate", None), estimate=getattr(computer.sensors, "estimate", None),
+            before=sensors.remembered(sensing), after=sensors.remembered(computer.sensors),
             applied=state.applied[0], acting=state.actuators.v, momentum=state.actuators.h,
             seen=computer.seen, observer=computer.observer,
             law=computer.law, command_filter=computer.command_filter, queue=after.actuators.queue,
@@ -122,14 +122,13 @@ def one(samples: Samples, trial: int) -> Samples:
 def rows(board: Board, samples: Samples) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Inputs, outputs and state of one trial, (samples, columns) each, in the order of `templates.columns`."""
     inputs = samples.inputs | {"wheel_momentum": samples.momentum, "applied": samples.applied, "acting": samples.acting}
-    state_by_name = {"x": samples.seen, "observer": samples.observer, "law": samples.law, "queue": samples.queue,
+    state_by_name = samples.after | {
+            "x": samples.seen, "observer": samples.observer, "law": samples.law, "queue": samples.queue,
             "command_filter": samples.command_filter,
             "wheel_momentum": samples.momentum, "acting": samples.acting, "clearance": samples.clearance,
             "clearance_unit": samples.clearance_unit}  # fmt: skip
     if board.spacecraft:
         state_by_name |= {"attitude": samples.seen.q, "rate": samples.seen.w}
-    if samples.estimate is not None:
-        state_by_name |= {"bias": samples.estimate.bias, "gyro": samples.inputs["rate"]}
     outputs_by_name = {name: getattr(samples, name) for name in ("d_hat", "command", "s", "torque", "wheel_torque")}
     one = np.ones_like(samples.t)
     outputs = _columns(board.outputs, outputs_by_name)
@@ -142,8 +141,7 @@ def first_state(board: Board, samples: Samples) -> np.ndarray:
     law, observer = (board.parameters[name].begin() for name in ("law", "observer"))
     kept = {"law": jax.tree.map(lambda v: np.asarray(v)[None], law),
             "observer": jax.tree.map(lambda v: np.asarray(v)[None], observer)}  # fmt: skip
-    if samples.before is not None:
-        kept |= {"attitude": samples.before.q[:1], "bias": samples.before.bias[:1]}
+    kept |= {name: value[:1] for name, value in samples.before.items()}
     empty = np.zeros((1, sum(int(np.prod(leaf.shape, dtype=int)) for leaf in jax.tree.leaves(board.outputs))))
     return np.column_stack([np.zeros((1, 3)), _columns(board.state, kept), empty])[0]
 

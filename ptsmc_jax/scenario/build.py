@@ -32,7 +32,7 @@ def setup(scenario: Scenario) -> Setup:
         reference=scenario.target(),
         controller=scenario.controller.build(scenario, model),
         observer=scenario.observer.build(scenario, model),
-        sensors=scenario.devices.sensors(scenario) if scenario.sensors is None else scenario.sensors.build(model),
+        sensors=_sensors(scenario, model),
         initial=plant.with_hidden_at_rest(scenario.start()),
         t_end=vector(scenario.end),
         window=vector(scenario.window),
@@ -42,6 +42,13 @@ def setup(scenario: Scenario) -> Setup:
         command_filter=None if filtering is None else filtering.part(),
         pointing=scenario.observation(),
     )
+
+
+def _sensors(scenario: Scenario, model: Any) -> Any:
+    """The sensors of [sensors] or [[sensors]], else of [hardware]."""
+    if scenario.sensors is None:
+        return scenario.devices.sensors(scenario)
+    return scenario.sensors.build(model, scenario.loop.period)
 
 
 def disturbance(scenario: Scenario, plant: Plant) -> tuple[Any, Any]:

@@ -75,7 +75,7 @@ def check_sensors(scenario: Scenario) -> None:
         value = getattr(scenario.hardware, key, None)
         if value is not None:
             raise wrong(f"hardware.{key}", value, "absent where [sensors] says what is seen")
-    if scenario.estimator.kind != "none":
+    if getattr(getattr(scenario, "filter", None), "on", False):
         raise ScenarioError('filter.kind is "steady_state", but must be absent where [sensors] says what is seen')
     noises = (key for key, given_by in scenario.devices.levels.items() if set(given_by) <= {*scenario.devices.noises})
     for key in (*noises, *OF_SENSORS):

@@ -6,7 +6,7 @@ from typing import Any
 
 import msgspec
 
-from ptsmc_jax.scenario import keys, layouts
+from ptsmc_jax.scenario import keys, layouts, sensor_tables
 from ptsmc_jax.scenario.own import Own
 from ptsmc_jax.scenario.tables import Limit, Scenario
 from ptsmc_jax.scenario.values import Kinds, NotNegative, Table
@@ -24,6 +24,9 @@ def json_schema() -> Schema:
 
 def _plant(kind: str, made: type[Scenario]) -> Schema:
     tables = {name: _kinds(name, kinds, made.unit_of_d) for name, kinds in made.TABLES.items()}
+    if kind == "spacecraft":
+        each = {"type": "array", "items": _kinds("sensors", sensor_tables.SENSORS, made.unit_of_d)}
+        tables["sensors"] = {"anyOf": [tables["sensors"], each]}
     tables["plant"]["required"] = ["kind"]
     tables["plant"]["properties"]["kind"] = {"const": kind}
     limit = _with_unit(_leaf(NotNegative), {})

@@ -94,7 +94,7 @@ def _places(scenario: Table) -> Iterator[tuple[str, Any]]:
     """The tables that may name code, by where they stand: also those of a sum, and of what is drawn."""
     for name in scenario.__struct_fields__:
         table = getattr(scenario, name)
-        if name == "disturbance":
+        if hasattr(table, "placed"):
             yield from table.placed(name).items()
         elif name == "dispersion" and table is not None:
             yield "dispersion.own", table.own

@@ -17,7 +17,7 @@ class SensorTable(PartTable, frozen=True):
 
     prefix: ClassVar[str] = "sensors_"
 
-    def build(self, model: Any) -> Any:
+    def build(self, model: Any, period: float) -> Any:
         """Return the sensors as the rollout asks for them."""
         made = self.part(model=model)
         _check_count(made, "sensors", "draws", 0)

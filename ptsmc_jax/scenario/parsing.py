@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from ptsmc_jax.scenario import attitude_keys, device_tables, disturbance_tables, keys, layouts, own, systems
+from ptsmc_jax.scenario import sensor_tables as sensing
 from ptsmc_jax.scenario.attitude_keys import ATTITUDE_KEYS
 from ptsmc_jax.scenario.errors import MOST_BITS, ScenarioError, brief, show, wrong
 from ptsmc_jax.scenario.layouts import SCENARIOS, TABLES
@@ -78,6 +79,9 @@ def parse(raw: Mapping[str, Any], *, run: bool = False) -> Scenario:
     run: code of one's own may be run, for its keys.
     """
     _check_shape(raw)
+    suite = raw.get("sensors")
+    if isinstance(suite, list | tuple):
+        raw = {name: table for name, table in raw.items() if name != "sensors"}
     known = {"requirements", *(key for layout in TABLES.values() for key in layout)}
     for name, table in raw.items():
         if name in known and not isinstance(table, Mapping):
@@ -99,6 +103,8 @@ def parse(raw: Mapping[str, Any], *, run: bool = False) -> Scenario:
     for name in ("initial", "reference"):
         if name in tables:
             attitude_keys.at_most_one(name, tables[name])
+    if isinstance(suite, list | tuple):
+        tables["sensors"] = _suite(suite, context)
     # plain limits first, as TOML writes them: verdicts come in the same order when a result's own scenario is read
     asked = sorted(raw.get("requirements", {}).items(), key=lambda one: isinstance(one[1], Mapping))
     tables["requirements"] = {key: _requirement(key, value, context) for key, value in asked}
@@ -162,6 +168,8 @@ def dump(scenario: Scenario) -> dict[str, Any]:
 def as_parsed(scenario: Scenario) -> dict[str, Any]:
     """Tables that `parse` reads back to the same scenario; what is None is left out."""
     written = plain(scenario)
+    if "each" in written.get("sensors", {}):
+        written["sensors"] = written["sensors"]["each"]
     tables = [name for name in TABLES[scenario.plant.kind] if name != "tune"]
     return {name: written[name] for name in (*tables, "requirements", "tune") if name in written}
 
@@ -271,6 +279,21 @@ def _sum(name: str, raw: Mapping[str, Any], kinds: Kinds, context: Context) -> T
     single = {kind: struct for kind, struct in kinds.items() if struct is not disturbance_tables.SumDisturbance}
     found = tuple(_table(f"{name}.terms[{k}]", term, single, context) for k, term in enumerate(terms))
     return disturbance_tables.SumDisturbance(terms=found)
+
+
+def _suite(each: Any, context: Context) -> Table:
+    """Return the table of [[sensors]]."""
+    if context.plant.motion != "spacecraft":
+        raise ScenarioError(
+            '[[sensors]] goes with plant.kind = "spacecraft" only; allowed is [sensors] with kind = "own"'
+        )
+    if not each or not all(isinstance(one, Mapping) for one in each):
+        raise wrong("sensors", each, "tables with a kind, [[sensors]] for each sensor")
+    made = sensing.SensorSuite(
+        each=tuple(_table(f"sensors[{k}]", one, sensing.SENSORS, context) for k, one in enumerate(each))
+    )
+    made.check_alone()
+    return made
 
 
 def _dispersion(raw: Mapping[str, Any], struct: type[Table], context: Context) -> Table:

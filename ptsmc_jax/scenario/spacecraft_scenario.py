@@ -22,6 +22,7 @@ from ptsmc_jax.scenario.observer_tables import OBSERVERS
 from ptsmc_jax.scenario.own_devices import SENSORS
 from ptsmc_jax.scenario.pointing_table import Pointing
 from ptsmc_jax.scenario.reference_tables import REFERENCES, Initial
+from ptsmc_jax.scenario.sensor_tables import KalmanFilter, SensorSuite
 from ptsmc_jax.scenario.tables import Loop, Scenario, Tune
 from ptsmc_jax.scenario.values import Inertia, Kinds, Meaning, NotNegative, Positive, Table, Three
 from ptsmc_jax.simulation.catalogues import CATALOGUE
@@ -179,8 +180,16 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
 
     @property
     def estimator(self) -> Any:
-        """The table [filter], `NoFilter` where it is absent."""
+        """The table [filter], `NoFilter` where it is absent; of [[sensors]] their Kalman filter."""
+        if isinstance(self.sensors, SensorSuite):
+            return KalmanFilter()
         return NoFilter() if self.filter is None else self.filter
+
+    @property
+    def devices(self) -> Any:
+        """The table [hardware], with the noise of [[sensors]] as one star tracker and gyro have it."""
+        table = super().devices
+        return self.sensors.short_form(table, self.loop.period) if isinstance(self.sensors, SensorSuite) else table
 
     @property
     def reaction_wheels(self) -> Any:
@@ -242,7 +251,7 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
 
     def usual_settling(self) -> float:
         """Return the default of `loop.settling_angle` [rad]."""
-        noise = getattr(self.hardware, "attitude_noise", None) or 0.0
+        noise = self.devices.attitude_noise or 0.0
         return max(1e-3 * min(1.0, self.start_angle() or 1.0), min(5.0 * noise, 1.0))
 
     def written(self) -> Any:
@@ -270,6 +279,8 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
         """Modes that a body can have, and devices that fit."""
         if self.flexible is not None:
             self.flexible.check(self.true_inertia)
+        if isinstance(self.sensors, SensorSuite):
+            self.sensors.check(self)
         self.devices.check(self)
         self.estimator.check(self)
         if self.wheels is not None:

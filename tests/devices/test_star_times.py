@@ -61,7 +61,7 @@ def by_hand(parts, flown):
     """What the filter says at each sample (attitude as a rotation, bias), in plain NumPy and SciPy."""
     known = parts.sensors.filter
     k1, k2 = float(known.attitude_gain), float(known.bias_gain)
-    said = [(Rotation.from_quat(flown.before.q[0]), flown.before.bias[0])]
+    said = [(Rotation.from_quat(flown.before["attitude"][0]), flown.before["bias"][0])]
     gyro = flown.inputs["rate"]
     rates = np.concatenate([gyro[:1], gyro])  # of the sample before, at the first its own
     moments = np.concatenate([flown.t[:1], flown.t])
@@ -100,9 +100,9 @@ def test_the_filter_says_what_is_computed_by_hand(run):
     np.testing.assert_allclose(flown.inputs["attitude_age"][valid][:4], [0.0, 0.05, 0.0, 0.05], atol=1e-12)
     said = by_hand(parts, flown)
     for k, (q, bias) in enumerate(said):
-        off = (q.inv() * Rotation.from_quat(flown.estimate.q[k])).magnitude()
+        off = (q.inv() * Rotation.from_quat(flown.after["attitude"][k])).magnitude()
         assert off < 1e-12, k
-        np.testing.assert_allclose(flown.estimate.bias[k], bias, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(flown.after["bias"][k], bias, rtol=0, atol=1e-12)
 
 
 def test_it_sees_the_body_at_its_own_time(run):

@@ -1,0 +1,333 @@
+"""The tables of [[sensors]]: any number of star trackers, vector sensors and gyros, which a Kalman filter combines."""
+
+import math
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Literal
+
+import jax.numpy as jnp
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from ptsmc_jax import formulas
+from ptsmc_jax.devices import attitude_sensors, kalman_filter, sensor_suite
+from ptsmc_jax.numerics.pytrees import vector
+from ptsmc_jax.scenario.device_tables import FilterTable, Hardware
+from ptsmc_jax.scenario.errors import ScenarioError, wrong
+from ptsmc_jax.scenario.own import own_kind
+from ptsmc_jax.scenario.schema import PartTable
+from ptsmc_jax.scenario.values import Kinds, Meaning, NotNegative, Positive, Table, Three
+
+SAME = 1e-9  # relative
+LATEST = 8  # control periods until a reading is used; the filter keeps an attitude for each
+Size = Annotated[float, Meta(ge=1e-15, le=1e3, description="a number from 1e-15 to 1000")]
+Noise = Size | None
+Bias = Annotated[float, Meta(ge=0, le=1e3, description="a number from 0 to 1000")]
+
+
+class SensorTable(PartTable, frozen=True):
+    """A sensor."""
+
+    required: ClassVar[tuple[str, ...]] = ()  # keys without a default
+
+    def check_alone(self, place: str) -> None:
+        """Raise ScenarioError if a key is missing, or its keys contradict each other."""
+        for key in self.required:
+            if getattr(self, key) is None:
+                raise ScenarioError(f"{place}.{key} is absent, but must be given")
+
+    def check(self, place: str, scenario: Any) -> None:
+        """Raise ScenarioError if its keys contradict those of the scenario."""
+
+
+class AttitudeSensorTable(SensorTable, frozen=True):
+    """A sensor of the attitude, whose z axis is its boresight."""
+
+    boresight: Annotated[Three | None, Meaning("direction of its boresight in body axes; default: the z axis")] = None
+    rotvec_deg: Annotated[
+        Three | None, Meaning("instead of boresight, rotation vector from body axes to its axes", "deg")
+    ] = None
+    period: Annotated[
+        Positive | None, Meaning("time between readings, at least loop.period, which is the default", "s")
+    ] = None
+    latency: Annotated[NotNegative, Meaning("time from a reading until the flight software has it", "s")] = 0.0
+
+    def check_alone(self, place: str) -> None:
+        """Raise ScenarioError for two mountings, or a boresight without a direction, too."""
+        super().check_alone(place)
+        if self.boresight is not None and self.rotvec_deg is not None:
+            raise wrong(f"{place}.rotvec_deg", self.rotvec_deg, "absent if boresight is given")
+        _check_direction(f"{place}.boresight", self.boresight or (0.0, 0.0, 1.0))
+
+    def check(self, place: str, scenario: Any) -> None:
+        """Raise ScenarioError for a sensor that is faster than the loop, slower than the run, or very late."""
+        control = scenario.loop.period
+        if self.period is not None and self.period < control * (1.0 - SAME):
+            raise wrong(f"{place}.period", self.period, f"at least loop.period, {control}")
+        if self.period is not None and self.period > scenario.end:
+            raise wrong(f"{place}.period", self.period, f"at most loop.t_end, {scenario.end}")
+        if self.latency > LATEST * control:
+            raise wrong(f"{place}.latency", self.latency, f"at most {LATEST} control periods, {LATEST * control:.6g} s")
+
+    def mounting(self) -> np.ndarray:
+        """Return the unit quaternion (4,) of the rotation from body axes to its axes."""
+        from scipy.spatial.transform import Rotation
+
+        if self.rotvec_deg is not None:
+            return Rotation.from_rotvec(np.array(self.rotvec_deg), degrees=True).as_quat(canonical=True)
+        z = np.array(self.boresight or (0.0, 0.0, 1.0), dtype=float)
+        x, y, along = z / np.linalg.norm(z)
+        if along < -1.0 + 1e-12:
+            return np.array([1.0, 0.0, 0.0, 0.0])
+        turn = np.array([-y, x, 0.0, 1.0 + along])  # the shortest rotation of the z axis
+        return turn / np.linalg.norm(turn)
+
+    def interval(self, period: float) -> float:
+        """Return the time between readings [s]; period: of control [s]."""
+        return period if self.period is None else self.period
+
+    def sigmas(self) -> tuple[float, ...]:
+        """Return the noise of a reading, 1 sigma of each component."""
+        raise NotImplementedError
+
+    def information(self) -> np.ndarray:
+        """Return the information (3, 3) of a reading about a small rotation about body axes [1/rad^2]."""
+        raise NotImplementedError
+
+    def build(self, name: str, period: float) -> Any:
+        """Return the part of `devices.attitude_sensors`; period: of control [s]."""
+        raise NotImplementedError
+
+    def common(self, name: str, period: float) -> dict[str, Any]:
+        """Return the fields that all attitude sensors have."""
+        return {
+            "name": name,
+            "noise": vector(self.sigmas()),
+            "mounting": vector(self.mounting()),
+            "times": attitude_sensors.sample_times(self.interval(period), self.latency, period),
+        }
+
+
+class StarTracker(AttitudeSensorTable, frozen=True):
+    """A star tracker."""
+
+    kind: Literal["star_tracker"] = "star_tracker"
+    noise_across: Annotated[Noise, Meaning("1 sigma of a reading about each axis across the boresight", "rad")] = None
+    noise_about: Annotated[Noise, Meaning("about the boresight; default: noise_across", "rad")] = None
+    required: ClassVar[tuple[str, ...]] = ("noise_across",)
+
+    def sigmas(self) -> tuple[float, ...]:
+        """Return the noise about its x, y and z axis [rad]."""
+        across = self.noise_across or 0.0  # `check_alone` refuses 0
+        return across, across, self.noise_about or across
+
+    def information(self) -> np.ndarray:
+        """Return the information (3, 3) of a reading [1/rad^2]."""
+        from scipy.spatial.transform import Rotation
+
+        axes = Rotation.from_quat(self.mounting()).as_matrix()
+        return axes @ np.diag(np.array(self.sigmas()) ** -2.0) @ axes.T
+
+    def build(self, name: str, period: float) -> Any:
+        """Return `attitude_sensors.StarTracker`."""
+        return attitude_sensors.StarTracker(**self.common(name, period))
+
+
+class VectorSensor(AttitudeSensorTable, frozen=True):
+    """A sun sensor or magnetometer: it measures a direction that is known in inertial axes."""
+
+    kind: Literal["vector_sensor"] = "vector_sensor"
+    direction: Annotated[Three | None, Meaning("in inertial axes")] = None
+    noise: Annotated[Noise, Meaning("1 sigma of each component of the direction, in its own axes", "rad")] = None
+    required: ClassVar[tuple[str, ...]] = ("direction", "noise")
+
+    def check_alone(self, place: str) -> None:
+        """Raise ScenarioError for a direction without a length, too."""
+        super().check_alone(place)
+        _check_direction(f"{place}.direction", self.direction)
+
+    def sigmas(self) -> tuple[float, ...]:
+        """Return the noise of each component [rad]."""
+        return (self.noise or 0.0,) * 3
+
+    def information(self) -> np.ndarray:
+        """Return the information (3, 3) of a reading at a body attitude along inertial axes [1/rad^2]."""
+        return (np.eye(3) - np.outer(self.along, self.along)) / self.sigmas()[0] ** 2
+
+    @property
+    def along(self) -> np.ndarray:
+        """Return the direction as a unit vector (3,)."""
+        direction = np.array(self.direction, dtype=float)
+        return direction / np.linalg.norm(direction)
+
+    def build(self, name: str, period: float) -> Any:
+        """Return `attitude_sensors.VectorSensor`."""
+        return attitude_sensors.VectorSensor(**self.common(name, period), direction=vector(self.along))
+
+
+class CustomTable(AttitudeSensorTable, frozen=True):
+    """A custom sensor of the attitude."""
+
+    noise: Annotated[tuple[Size, ...] | None, Meaning("1 sigma of each component of a reading, a list of numbers")] = (
+        None
+    )
+    required: ClassVar[tuple[str, ...]] = ("noise",)
+
+    def sigmas(self) -> tuple[float, ...]:
+        """Return the noise of each component."""
+        return self.noise or ()
+
+    def information(self) -> np.ndarray:
+        """Return the information (3, 3) of a reading at a body attitude along inertial axes [1/rad^2].
+
+        Before the code is run it is that of a sensor that measures the attitude.
+        """
+        if self.made is None:
+            return np.eye(3) / max(self.sigmas(), default=1.0) ** 2
+        rows = np.asarray(self.build("own", 1.0).sensitivity(jnp.array([0.0, 0.0, 0.0, 1.0])))
+        return rows.T @ (rows / np.array(self.sigmas())[:, None] ** 2)
+
+    def build(self, name: str, period: float) -> Any:
+        """Return the sensor; raise ScenarioError if it has another number of components than noises."""
+        made = self.part(**self.common(name, period))
+        reading = made.read(jnp.array([0.0, 0.0, 0.0, 1.0]))
+        components = np.size(made.change(reading, reading))
+        if components != len(self.sigmas()):
+            raise wrong("sensors.noise", self.noise, f"a list of {components} numbers, one for each component")
+        return made
+
+
+class Gyro(SensorTable, frozen=True):
+    """A gyro of three axes that samples in each control period. Several count as their mean, weighted by 1/noise^2."""
+
+    kind: Literal["gyro"] = "gyro"
+    rate_noise: Annotated[Noise, Meaning("1 sigma per axis and sample", "rad/s")] = None
+    rate_noise_density: Annotated[
+        Noise, Meaning('instead of rate_noise, the angle random walk, as in "0.02 deg/sqrt(h)"', "rad/s/sqrt(Hz)")
+    ] = None
+    rate_bias: Annotated[
+        Bias, Meaning("1 sigma per axis, at t = 0; the filter starts in its steady state, whatever it is", "rad/s")
+    ] = 0.0
+    rate_bias_walk: Annotated[Bias, Meaning("random walk of that bias", "rad/s/sqrt(s)")] = 0.0
+
+    def check_alone(self, place: str) -> None:
+        """Raise ScenarioError unless exactly one noise is given."""
+        if self.rate_noise is None and self.rate_noise_density is None:
+            raise ScenarioError(f"{place}.rate_noise is absent, but must be given, or rate_noise_density")
+        if self.rate_noise is not None and self.rate_noise_density is not None:
+            raise wrong(f"{place}.rate_noise_density", self.rate_noise_density, "absent if rate_noise is given")
+
+    def noise(self, period: float) -> float:
+        """Return the noise of a sample [rad/s]; period: of control [s]."""
+        return self.rate_noise or formulas.per_sample(self.rate_noise_density or 0.0, period)
+
+
+SENSORS: Kinds = {
+    "star_tracker": StarTracker,
+    "vector_sensor": VectorSensor,
+    "gyro": Gyro,
+    "own": own_kind(
+        CustomTable, attitude_sensors.AttitudeSensor, ("read",),
+        "A custom sensor, a class derived from ptsmc_jax.AttitudeSensor; its fields are further keys.",
+    ),
+}  # fmt: skip
+
+
+class KalmanFilter(FilterTable, frozen=True):
+    """The filter of [[sensors]], which has no keys: it follows from the sensors."""
+
+    kind: Literal["kalman"] = "kalman"
+
+    def passes(self, scenario: Any) -> float:
+        """Return the fraction of a reading's noise that reaches the law at once, about."""
+        table, period = scenario.devices, scenario.loop.period
+        width = formulas.best_bandwidth(table.attitude_noise, table.gyro_noise(period), period, table.interval(period))
+        return -math.expm1(-2.0 * width * table.interval(period))
+
+
+class SensorSuite(Table, frozen=True):
+    """The tables of [[sensors]]."""
+
+    each: tuple[Any, ...]
+    gains: ClassVar[Mapping[str, Any]] = {}
+
+    def placed(self, name: str) -> dict[str, SensorTable]:
+        """Return the tables by their place in a file, such as sensors[0]; name: of the list."""
+        return {f"{name}[{k}]": table for k, table in enumerate(self.each)}
+
+    @property
+    def gyros(self) -> list[Gyro]:
+        """Return the gyros."""
+        return [table for table in self.each if isinstance(table, Gyro)]
+
+    @property
+    def attitude(self) -> dict[str, AttitudeSensorTable]:
+        """Return the attitude sensors by name, such as star_tracker_1, which is that of their input in exported C."""
+        found, counts = dict[str, Any](), dict[str, int]()
+        for table in self.each:
+            kind = table.kind
+            counts[kind] = counts.get(kind, 0) + 1
+            if isinstance(table, AttitudeSensorTable):
+                found[f"{kind}_{counts[kind]}"] = table
+        return found
+
+    def check_alone(self) -> None:
+        """Raise ScenarioError if a sensor is wrong, or the sensors together do not determine the attitude."""
+        for place, table in self.placed("sensors").items():
+            table.check_alone(place)
+        if not self.gyros:
+            raise ScenarioError(
+                "[[sensors]] has no gyro, but must have one, by which the filter propagates the attitude"
+            )
+        values = np.linalg.eigvalsh(sum((table.information() for table in self.attitude.values()), np.zeros((3, 3))))
+        if not values[0] > 1e-9 * values[-1]:
+            raise ScenarioError(
+                "[[sensors]] does not determine the attitude, but must have a star tracker, or two vector sensors with "
+                "different directions"
+            )
+
+    def check(self, scenario: Any) -> None:
+        """Raise ScenarioError if keys contradict those of the scenario."""
+        for place, table in self.placed("sensors").items():
+            table.check(place, scenario)
+
+    def gyro(self, period: float) -> tuple[float, float, float]:
+        """Return noise [rad/s], bias [rad/s] and random walk of the bias [rad/s/sqrt(s)] of the mean of all gyros."""
+        information = np.array([one.noise(period) ** -2.0 for one in self.gyros])
+        weights = information / np.sum(information)
+        each = [[one.noise(period), one.rate_bias, one.rate_bias_walk] for one in self.gyros]
+        noise, bias, walk = (float(np.linalg.norm(weights * values)) for values in zip(*each, strict=True))
+        return noise, bias, walk
+
+    def short_form(self, table: Hardware, period: float | None) -> Hardware:
+        """Return [hardware] with one star tracker and gyro that say about as much, for defaults and bounds.
+
+        Args:
+            table: [hardware] of the scenario.
+            period: of control [s]; None: not known yet.
+        """
+        if period is None:  # of a loop without samples, or not known yet
+            return table
+        interval = min(one.interval(period) for one in self.attitude.values())
+        rate = sum(one.information() / one.interval(period) for one in self.attitude.values())
+        sigma = float(1.0 / np.sqrt(max(np.linalg.eigvalsh(rate)[0], 1e-30) * interval))
+        noise, bias, walk = self.gyro(period)
+        return msgspec.structs.replace(
+            table, attitude_noise=sigma, rate_noise=noise, rate_bias=bias, rate_bias_walk=walk,
+            star_tracker_period=max(interval, period),
+        )  # fmt: skip
+
+    def build(self, model: Any, period: float) -> Any:
+        """Return `devices.sensor_suite`."""
+        sensors = [table.build(name, period) for name, table in self.attitude.items()]
+        noise, bias, walk = self.gyro(period)
+        gyro, drift = jnp.full(3, noise), jnp.full(3, formulas.per_sample(walk, period))
+        made = kalman_filter.kalman_filter(sensors, gyro, drift, bias, period)
+        return sensor_suite.SensorSuite(
+            sensors=tuple(sensors), rate_noise=gyro, rate_bias=jnp.full(3, bias), bias_rate=drift, filter=made
+        )
+
+
+def _check_direction(key: str, value: Any) -> None:
+    if not 1e-100 < max(map(abs, value)) < 1e100:
+        raise wrong(key, value, "a direction, three numbers that are not all 0")

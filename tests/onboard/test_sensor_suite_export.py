@@ -1,0 +1,124 @@
+"""Exported C with a sensor suite: it replays the simulator, and treats missing and bad readings as it should."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import ptsmc_jax as ptsmc
+from ptsmc_jax import scenario
+from ptsmc_jax.campaigns import store
+from ptsmc_jax.numerics import attitude
+from ptsmc_jax.onboard import folder, vectors
+from ptsmc_jax.onboard.library import Library
+from ptsmc_jax.simulation.computer import SAMPLES
+from tests.onboard.compiled import needs_compiler
+from tests.onboard.flights import LAW, LOOP, SPREAD
+
+
+class Horizon(ptsmc.AttitudeSensor):
+    """A custom sensor: the elevation of its boresight over a plane, and of its x axis, both scaled."""
+
+    scale: float = ptsmc.number(1.0, above=0.0, meaning="of both", unit="-")
+
+    def read(self, q):
+        """Two components [-] of the sensor's axes along inertial z."""
+        axes = attitude.multiply(q, self.mounting)
+        along = [attitude.rotate(axes, jnp.eye(3)[k])[2] for k in (2, 0)]
+        return self.scale * jnp.stack(along)
+
+
+TRACKER = {"kind": "star_tracker", "noise_across": "8 arcsec", "noise_about": "40 arcsec"}
+TABLES = {
+    "loop": LOOP,
+    "controller": LAW,
+    "dispersion": SPREAD,
+    "sensors": [
+        {**TRACKER, "boresight": [0.0, 1.0, 1.0], "period": 0.2, "latency": 0.1},
+        {**TRACKER, "rotvec_deg": [20.0, 60.0, -30.0], "period": 0.25, "latency": 0.07},
+        {"kind": "vector_sensor", "direction": [0.0, 0.6, 0.8], "noise": 1e-3, "period": 0.3},
+        {"kind": "own", "code": f"{__file__}:Horizon", "noise": [1e-3, 2e-3], "scale": 2.0, "latency": 0.1},
+        {"kind": "gyro", "rate_noise": 1e-6, "rate_bias": 1e-5, "rate_bias_walk": 1e-8},
+    ],
+}
+INPUT = SAMPLES.index("input")
+
+pytestmark = needs_compiler
+
+
+@pytest.fixture(scope="module")
+def suite(tmp_path_factory):
+    """The controller, compiled, and the inputs, outputs and states of a simulated trial, the first state before it."""
+    place = tmp_path_factory.mktemp("suite") / "controller"
+    made = folder.Controller(scenario.reading.complete(scenario.from_tables(TABLES)), "flight", "suite")
+    store.write(place, lambda making: folder.write_program(making, made))
+    samples = folder.fly(made, 3, 1)[0]
+    given, out, states = vectors.rows(made.board, samples)
+    return Library(place), given, out, np.vstack([vectors.first_state(made.board, samples), states])
+
+
+def replayed(library, given, state):
+    """Statuses, outputs and states of samples one after the other."""
+    statuses, outputs, states = [], [], []
+    for row in given:
+        state, out, status = library.many(state, row)
+        statuses.append(int(status))
+        outputs.append(out)
+        states.append(state)
+    return np.array(statuses), np.array(outputs), np.array(states)
+
+
+def columns(library, name):
+    return [k for k, column in enumerate(library.columns["in"]) if column.partition("[")[0] == name]
+
+
+def test_it_replays_the_simulator(suite):
+    """Each sample from the state before it: all outputs and states to 1e-12 of their peak."""
+    library, given, out, states = suite
+    after, outputs, statuses = library.many(states[:-1], given)
+    assert not statuses.any()
+    for kind, found, wanted in (("out", outputs, out), ("state", after, states[1:])):
+        names = [column.partition("[")[0] for column in library.columns[kind]]
+        for name in dict.fromkeys(names):
+            places = [k for k, other in enumerate(names) if other == name]
+            peak = np.abs(wanted[:, places]).max()
+            np.testing.assert_allclose(
+                found[:, places], wanted[:, places], rtol=0, atol=1e-12 * peak, err_msg=f"{kind}.{name}"
+            )
+    assert 0.0 < given[:, columns(library, "star_tracker_2_valid")].mean() < 1.0
+
+
+def test_a_reading_that_is_not_valid_is_not_looked_at(suite):
+    library, given, _, states = suite
+    _, outputs, _ = replayed(library, given, states[0])
+    missing, at = given.copy(), int(np.flatnonzero(given[:, columns(library, "star_tracker_2_valid")[0]] == 0.0)[3])
+    for name in ("star_tracker_2", "star_tracker_2_age"):
+        missing[at, columns(library, name)] = np.nan
+    statuses, others, _ = replayed(library, missing, states[0])
+    assert not statuses.any()
+    np.testing.assert_array_equal(others, outputs)
+
+
+@pytest.mark.parametrize("name", ["star_tracker_1", "star_tracker_2", "star_tracker_2_age", "vector_sensor_1", "own_1"])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_valid_reading_that_is_not_finite_is_refused(suite, name, value):
+    library, given, _, states = suite
+    bad, valid = given.copy(), name.removesuffix("_age") + "_valid"
+    at = int(np.flatnonzero(given[:, columns(library, valid)[0]])[5])
+    bad[at, columns(library, name)] = value
+    assert replayed(library, bad[: at + 1], states[0])[0][at] == INPUT
+
+
+def test_an_unknown_attitude_is_that_of_the_first_star_tracker(suite):
+    """Without a star tracker there is no attitude to start from, whatever the vector sensor says."""
+    library, given, _, states = suite
+    begin = int(np.flatnonzero(given[:, columns(library, "star_tracker_2_valid")[0]])[0])
+    none = given[: begin + 1].copy()
+    none[:, [columns(library, name)[0] for name in ("star_tracker_1_valid", "star_tracker_2_valid")]] = 0.0
+    assert np.all(replayed(library, none, library.first())[0] == INPUT)
+    statuses, _, found = replayed(library, given[begin:], library.first())
+    assert not statuses.any()
+    at = library.columns["state"].index("attitude[0]")
+    off = Rotation.from_quat(states[1 + begin :, at : at + 4]).inv() * Rotation.from_quat(found[:, at : at + 4])
+    assert off.magnitude()[0] > 2e-3  # the body turns, and the first reading is old
+    assert np.all(off.magnitude()[10:] < 6e-4)  # three times the noise about the boresight
