@@ -149,11 +149,7 @@ class _State:
     def rows(self, by_z: Any, by_seen: Any) -> _Rows:
         """Rows of something by z and by what the computer sees, of NumPy; in each period where these are so."""
         by_state = np.pad(by_z, [(0, 0)] * (by_z.ndim - 1) + [(0, self.size - self._n)])
-        if self._noise is not None:
-            by_errors = by_state[..., self._noise].copy()
-            by_state[..., self._noise] = 0.0
-        else:
-            by_errors = by_seen @ self._from_readings
+        by_errors = by_seen @ self._from_readings if self._noise is None else by_z[..., self._noise]
         by_state[..., : self._seen] += by_seen
         by_state[..., self._own] = by_errors @ self._reading.rows[:, self._seen :]
         return _Rows(by_state, by_errors * self._reading.noise)

@@ -181,6 +181,28 @@ def test_a_reading_that_is_late_is_that_of_its_own_time():
         np.testing.assert_allclose(seen.w, RATE, rtol=0, atol=1e-13)
 
 
+@pytest.mark.parametrize("case", ["latency", "own clocks", "outage"])
+def test_theory_knows_which_readings_the_simulation_delivers_and_their_age(case):
+    suite, count = CASES[case]().quiet(), 40
+    ticks = jax.vmap(tick)(jnp.arange(count))
+    available, lag = suite.available(ticks), suite.lag(ticks)
+    memory = suite.begin(0, 0, state(0.0), tick(0))
+    for k in range(count):
+        dt = vector(H if k else 0.0)
+        star_x = jax.tree.map(lambda age, k=k: state(k * H - age), suite.taken_ago(jnp.asarray(k), dt))
+        found, memory = suite.inputs(memory, state(vector(k * H)), tick(k), dt, star_x)
+        for j, sensor in enumerate(suite.sensors):
+            valid = bool(found[f"{sensor.name}_valid"] > 0.0)
+            np.testing.assert_array_equal(available[k, 3 * j : 3 * j + 3], valid)
+            if valid:
+                np.testing.assert_array_equal(lag[k, 3 * j : 3 * j + 3], int(found[f"{sensor.name}_age"] / H + 1e-9))
+    assert np.all(available[:, 6:])
+    if case == "outage":  # from 1 s to 3 s, and a period of latency later
+        first, second = available[:, 0], available[:, 3]
+        np.testing.assert_array_equal(np.flatnonzero(~first), [0, *range(11, 31)])
+        np.testing.assert_array_equal(np.flatnonzero(second), range(0, count, 8))
+
+
 def test_without_noise_no_number_is_drawn():
     quiet = suites.two_star_trackers(H).quiet()
     trace = jax.make_jaxpr(lambda seed: quiet.begin(seed, 0, state(0.0), tick(0)))(jnp.uint32(3))
