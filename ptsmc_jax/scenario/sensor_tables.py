@@ -308,13 +308,14 @@ class SensorSuite(Table, frozen=True):
         """
         if period is None:  # of a loop without samples, or not known yet
             return table
-        interval = min(one.interval(period) for one in self.attitude.values())
-        rate = sum(one.information() / one.interval(period) for one in self.attitude.values())
+        intervals = {name: max(one.interval(period), period) for name, one in self.attitude.items()}
+        interval = min(intervals.values())
+        rate = sum(one.information() / intervals[name] for name, one in self.attitude.items())
         sigma = float(1.0 / np.sqrt(max(np.linalg.eigvalsh(rate)[0], 1e-30) * interval))
         noise, bias, walk = self.gyro(period)
         return msgspec.structs.replace(
             table, attitude_noise=sigma, rate_noise=noise, rate_bias=bias, rate_bias_walk=walk,
-            star_tracker_period=max(interval, period),
+            star_tracker_period=interval,
         )  # fmt: skip
 
     def build(self, model: Any, period: float) -> Any:
