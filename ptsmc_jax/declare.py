@@ -68,14 +68,19 @@ class Declaration(NamedTuple):
     limits: Limits
     each: bool = False
     any_length: bool = False
-    allowed: str = ""  # in place of the limits in words
+    allowed: str = ""  # if not empty, it replaces the limits in words
     gain: bool = False
     usual: Usual = None
     free: bool | str = False  # whether tuning moves it by default; "sampled": in the sampled loop only
 
+    @property
+    def words(self) -> str:
+        """The allowed values of a single number, in words."""
+        return self.allowed or f"a number{self.limits.words()}"
+
     def type(self, body: bool) -> Any:
         """Return the type that `msgspec` checks; body: the plant is a spacecraft, with three inputs."""
-        one = Annotated[float, self.limits.meta(self.allowed or f"a number{self.limits.words()}")]
+        one = Annotated[float, self.limits.meta(self.words)]
         value = self.default.value if isinstance(self.default, Scaled) else self.default
         if not self.each and not isinstance(value, tuple):
             return one
@@ -114,10 +119,10 @@ def number(
         at_least: it is not less than this.
         at_most: it is not greater than this.
         unit: of the number; two units: of a spacecraft, and of a plant without a body.
-        meaning: what it is.
+        meaning: meaning of the number.
         each: there is one number for each input of the plant.
         any_length: it is a list of numbers, of a length that is checked later.
-        allowed: the allowed values in words, in place of those made from the limits.
+        allowed: the allowed values in words; by default they are made from the limits.
         kw_only: as for `dataclasses.field`.
     """
     limits = Limits(above, below, at_least, at_most)
@@ -151,7 +156,7 @@ def gain(
         at_least: it is not less than this.
         at_most: it is not greater than this.
         unit: as for `number`.
-        meaning: what it is.
+        meaning: meaning of the number.
         each: there is one number for each input of the plant; tuning moves them together, or each alone.
         allowed: as for `number`.
         free: whether tuning moves it by default; "sampled": in the sampled loop only.
@@ -181,7 +186,7 @@ class Tunable:
     tunable: ClassVar[tuple[str, ...]] = ()  # gains that tuning may move
 
     def __init_subclass__(cls, **options: Any) -> None:
-        """Add the gains that this class declares to those of its bases."""
+        """Add the gains that this class declares to the gains of its bases."""
         super().__init_subclass__(**options)
         if "tunable" not in vars(cls):
             cls.tunable = tuple(dict.fromkeys((*cls.tunable, *_gains(vars(cls).items()))))

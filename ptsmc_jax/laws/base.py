@@ -143,7 +143,7 @@ class Law(declare.Tunable):
         return published
 
     def refusal(self, order: int) -> tuple[str, str] | None:
-        """Return a field whose value no plant of this order allows, and what is allowed; None: there is none."""
+        """Return a field whose value is refused for a plant of this order, and the allowed values, or None."""
         return None
 
 

@@ -92,13 +92,14 @@ def spoken(path: Any, tree: Any) -> tuple[list[str], str]:
 
 
 def declared_of(part: Any, name: str) -> str:
-    """Return meaning and unit of a field of a part, empty if its class does not declare them."""
+    """Return meaning, unit and allowed values of a field of a part, empty if its class does not declare them."""
     field = getattr(type(part), "__dataclass_fields__", {}).get(name)
     declared = None if field is None else field.metadata.get("declared")
     if declared is None:
         return ""
     unit = declared.unit if isinstance(declared.unit, str) else declared.unit[0]
-    return f"{declared.meaning or name.replace('_', ' ')} [{unit.replace('unit of d', 'N m') or '-'}]"
+    meaning = f"{declared.meaning or name.replace('_', ' ')} [{unit.replace('unit of d', 'N m') or '-'}]"
+    return f"{meaning}: {declared.words}"
 
 
 def _within(at: Any, what: Any) -> Any:

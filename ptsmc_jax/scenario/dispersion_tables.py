@@ -305,7 +305,7 @@ _STATE = {
 
 
 def _dispersion(name: str, rows: Mapping[str, tuple[str, tuple[Any, ...]]]) -> Any:
-    about = "What differs from trial to trial, each an inline table with a kind; what is absent stays nominal."
+    about = "Random quantities of each trial, each an inline table with a kind; the others stay nominal."
     keys = [(key, Annotated[Table | None, Meaning(meaning)], None) for key, (meaning, _) in rows.items()]
     space = {"__doc__": about, "__module__": __name__}
     return msgspec.defstruct(name, keys, bases=(Table,), frozen=True, kw_only=True, namespace=space)

@@ -382,16 +382,16 @@ def test_amplitudes_are_scaled_independently_and_a_bias_is_added():
     factors = np.column_stack([np.asarray(sine.amplitude) / 0.1, np.asarray(constant.amplitude) / [0.1, 0.2, 0.3]])
     for column in factors.T:
         assert is_uniform(column, 0.5, 1.5)
-    for column in np.asarray(bias.value).T:
+    for column in np.asarray(bias.amplitude).T:
         assert stats.kstest(column / 0.01, "norm").pvalue > ALARM
-    columns = np.column_stack([factors, np.asarray(bias.value)])
+    every = np.column_stack([factors, np.asarray(bias.amplitude)])
     limit = -stats.norm.ppf(ALARM / 2) / math.sqrt(TRIALS)
     assert np.abs(np.corrcoef(columns.T) - np.eye(9)).max() < limit
     np.testing.assert_array_equal(orbit.phase, np.full(TRIALS, 0.25))
     alone = Dispersion({"disturbance_bias": added}).apply(replace(PARTS, disturbance=SINE), 4, 9).disturbance
-    np.testing.assert_array_equal(alone.terms[-1].amplitude, bias.value[9])
+    np.testing.assert_array_equal(alone.terms[-1].amplitude, bias.amplitude[9])
     t = vector(3.7)
-    np.testing.assert_allclose(alone(t, PARTS.initial), SINE(t) + bias.value[9], rtol=1e-14)
+    np.testing.assert_allclose(alone(t, PARTS.initial), SINE(t) + bias.amplitude[9], rtol=1e-14)
 
 
 def test_initial_attitude_is_relative_to_the_random_reference():

@@ -322,7 +322,7 @@ def test_the_law_stands_in_it_with_its_names_and_equations(exported):
         "const real acceleration_3 = -switching_3",
     ):
         assert line in text
-    assert "eta > 2" in (exported / "ptsmc_short.h").read_text()
+    assert "(Theorem 2)" in (exported / "ptsmc_short.h").read_text()
 
 
 def test_the_limit_of_the_singularity_is_that_of_the_simulator(monkeypatch):

@@ -118,6 +118,18 @@ def test_reading_runs_nothing_and_completing_finds_keys_gains_and_bounds():
     assert reading.complete(scenario.from_tables(parsing.dump(whole))) == whole
 
 
+def test_a_number_has_a_unit_and_a_gain_the_bounds_of_built_in_ones(here):
+    declared = LAW.replace("width: float = 1e-3", 'width: float = ptsmc.number(1e-3, above=0.0, unit="s", meaning="w")')
+    declared = declared.replace("(2.1, 6.0), above=2.0", '"eta", above=2.0')
+    (here / "mine.py").write_text(HEAD + declared)
+    tables = {**CHAIN, "controller": {**MINE, "width": "2 ms"}, "tune": {"free": ["eta"]}}
+    found = reading.complete(scenario.from_tables(tables))
+    assert found.controller.width == 2e-3
+    assert found.search.bounds["eta"] == (2.05, 8.0)  # as the paper's law has them for order 2
+    with pytest.raises(ScenarioError, match=r"controller\.width is 0\.0, but must be a number greater than 0"):
+        reading.complete(scenario.from_tables({**tables, "controller": {**MINE, "width": 0.0}}))
+
+
 def test_a_scenario_with_code_of_ones_own_is_pickled_run_or_not(here):
     (here / "mine.toml").write_text('controller = { kind = "own", code = "mine.py:Mine" }\nloop.mode = "sampled"\n')
     waits = ptsmc.read("mine.toml")
