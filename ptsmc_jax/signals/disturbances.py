@@ -56,7 +56,7 @@ class Constant(Disturbance):
     )  # fmt: skip
     drawn: ClassVar[Mapping[str, str]] = {"amplitude": "amplitude"}
 
-    def __call__(self, t: Time, x: Any = None) -> Float[Array, " m"]:
+    def __call__(self, t: Scalar, x: Any = None) -> Float[Array, " m"]:
         """Disturbance at t [s], (m,) [N m]."""
         return self.amplitude
 
@@ -143,9 +143,9 @@ class GravityGradient(Disturbance):
     phase: Leaf = number(0.0, unit="rad", meaning="where on the orbit the run starts")
     drawn: ClassVar[Mapping[str, str]] = {"phase": "phase"}
 
-    def __call__(self, t: Time, x: AttitudeState) -> Float[Array, "3"]:
+    def __call__(self, t: Scalar, x: AttitudeState) -> Float[Array, "3"]:
         """Torque at t [s] in the state x, (3,) [N m]."""
-        sine, cosine = _shifted(self.orbit_rate * t, self.phase)
+        sine, cosine = _sin_cos_of_sum(self.orbit_rate * t, self.phase)
         radial = jnp.stack([cosine, sine, jnp.zeros_like(sine)])
         c = attitude.rotate(attitude.multiply(attitude.conjugate(x.q), self.orbit), radial)
         return 3.0 * self.orbit_rate**2 * attitude.cross(c, self.inertia @ c)

@@ -29,7 +29,7 @@ class Target(NamedTuple):
         return attitude.vector_rates(self.q, self.w, self.w_dot)
 
 
-def target_of(path: Callable[[Time], Float[Array, "4"]], t: Time) -> Target:
+def target_of(path: Callable[[Scalar], Float[Array, "4"]], t: Scalar) -> Target:
     """Target at t [s] of an attitude path, a unit quaternion as a function of time; its derivatives are exact.
 
     Rates are exact, by automatic differentiation: w = 2 vec(q* q') and w' = 2 vec(q* q''), because the product
@@ -90,7 +90,7 @@ class Reference:
 class Fixed(Reference):
     """An attitude to be held."""
 
-    def __call__(self, t: Time) -> Target:
+    def __call__(self, t: Scalar) -> Target:
         """Target at t [s]."""
         return Target(self.q, jnp.zeros(3), jnp.zeros(3))
 
@@ -103,7 +103,7 @@ class Spin(Reference):
     rate: Leaf = number((0.0, 0.0, 0.0), unit="rad/s", meaning="of the reference, its own axes")
     paced_by: ClassVar[str] = "rate"
 
-    def __call__(self, t: Time) -> Target:
+    def __call__(self, t: Scalar) -> Target:
         """Target at t [s]."""
         turned = attitude.multiply(self.q, attitude.from_rotation_vector(self.rate * t))
         return Target(turned, self.rate, jnp.zeros(3))

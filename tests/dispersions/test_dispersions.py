@@ -324,7 +324,7 @@ ORBIT = disturbances.GravityGradient(PARTS.plant.inertia, vector([0.0, 0.0, 0.0,
 def test_phases_are_uniform_and_independent():
     still = disturbances.Constant(vector([0.1, 0.2, 0.3]))
     run = replace(PARTS, disturbance=disturbances.Sum((SINE, still, ORBIT, SINE)))
-    got = many_drawn(Dispersion({"disturbance_phase": phases(7)}), run).disturbance.terms
+    got = parts_of_trials(Dispersion({"disturbance_phase": uniform_phases(7)}), run).disturbance.terms
     np.testing.assert_array_equal(got[1].amplitude, np.broadcast_to(still.amplitude, (TRIALS, 3)))
     turns = np.column_stack(
         [
@@ -378,13 +378,13 @@ def test_amplitudes_are_scaled_independently_and_a_bias_is_added():
     added = RandomNumbers("normal", vector([0.01] * 3))
     factors = RandomNumbers("uniform", vector([0.5] * 6))
     spread = Dispersion({"disturbance_bias": added, "disturbance_amplitude": factors})
-    sine, orbit, constant, bias = many_drawn(spread, run).disturbance.terms
+    sine, orbit, constant, bias = parts_of_trials(spread, run).disturbance.terms
     factors = np.column_stack([np.asarray(sine.amplitude) / 0.1, np.asarray(constant.amplitude) / [0.1, 0.2, 0.3]])
     for column in factors.T:
         assert is_uniform(column, 0.5, 1.5)
     for column in np.asarray(bias.amplitude).T:
         assert stats.kstest(column / 0.01, "norm").pvalue > ALARM
-    every = np.column_stack([factors, np.asarray(bias.amplitude)])
+    columns = np.column_stack([factors, np.asarray(bias.amplitude)])
     limit = -stats.norm.ppf(ALARM / 2) / math.sqrt(TRIALS)
     assert np.abs(np.corrcoef(columns.T) - np.eye(9)).max() < limit
     np.testing.assert_array_equal(orbit.phase, np.full(TRIALS, 0.25))

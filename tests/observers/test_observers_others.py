@@ -21,7 +21,7 @@ MASS: base.Plant = integrator_chain.chain(2)  # one input, M = 1
 GAIN, T_O, DELTA_O, MU = 0.7, 4.0, 0.2, 2.5
 
 
-def prescribed(model: base.Plant = MASS, gain=GAIN, c=0.0, start=0.0, mu=MU, t_o=T_O, delta_o=DELTA_O):
+def prescribed_time_observer(model: base.Plant = MASS, gain=GAIN, c=0.0, start=0.0, mu=MU, t_o=T_O, delta_o=DELTA_O):
     values = (vector([gain] * model.inputs), *map(vector, (c, start, mu)))
     return prescribed_time.PrescribedTimeObserver(model, *values, t_o=vector(t_o), delta_o=vector(delta_o))
 
