@@ -1,11 +1,10 @@
-"""A Monte Carlo campaign: trials flown part by part, each part written as it is done; what is there is not flown again.
+"""Monte Carlo campaigns: trials are simulated in parts; each part is written at once and not simulated again.
 
-What a trial is does not depend on the parts, so that shards, clusters and interrupted runs give the same rows.
+A trial does not depend on the parts, so shards, clusters and interrupted runs give the same rows.
 """
 
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,33 +32,32 @@ from ptsmc_jax.simulation.requirements import Requirement, Verdict
 from ptsmc_jax.simulation.rollout import Parts
 
 PART = 4096  # trials in one part
-WAITING = 2  # parts that may wait to be written while the next one is flown
 
 Wanted = tuple[int, int]  # first trial and count of a part to fly
 
 
 @dataclass(frozen=True)
 class Campaign:
-    """What is flown: a scenario's trials under one seed."""
+    """The trials of a scenario under one seed."""
 
     ready: Study
     seed: int
-    own: OwnMetrics | None = None  # metrics of one's own
-    plan: Plan | None = None  # whose rows are flown, a trial each
-    software: Software = OURS  # the flight computer, where it is not the parts' own code
+    own: OwnMetrics | None = None  # custom metrics
+    plan: Plan | None = None  # run table with a row for each trial
+    software: Software = OURS  # the flight computer
 
     @property
     def plan_given(self) -> bool:
-        """Whether a plan gives anything that would not be drawn."""
+        """Whether a run table sets anything."""
         return self.plan is not None and bool(self.plan.given)
 
     def rows(self, trials: np.ndarray) -> np.ndarray | Row:
-        """What is flown as these trials: their numbers, or their rows in the plan."""
+        """Return the numbers of these trials, or their rows in the run table."""
         return trials if self.plan is None else self.plan.rows(trials, self.seed)
 
     def fly(self, trials: Sequence[int] | np.ndarray) -> pl.DataFrame:
-        """Rows of these trials."""
-        # never so few that another program flies them: rows are then the same to the last digit
+        """Simulate these trials; return their rows."""
+        # at least as many as the usual program simulates, so that rows are equal to the last digit
         wanted = np.resize(np.asarray(trials, dtype=np.uint32), max(len(trials), montecarlo.FEW))
         parts, rows = self.ready.parts, self.rows(wanted)
         flown = montecarlo.run(parts, self.ready.dispersion, self.seed, rows, own=self.own, software=self.software)
@@ -78,7 +76,7 @@ class Campaign:
         return frame.head(len(trials)).with_columns(pl.col(pl.Float64, pl.Float32).fill_nan(None))
 
     def draw(self, trials: Sequence[int] | np.ndarray) -> pl.DataFrame:
-        """What these trials would fly with."""
+        """Return the dispersed quantities of these trials, without simulating them."""
         wanted = np.asarray(trials, dtype=np.uint32)
         padded = np.resize(wanted, -(-wanted.size // PART) * PART)
         drawn = _draw(self.ready.parts, self.ready.dispersion, jnp.uint32(self.seed), self.rows(padded))
@@ -89,12 +87,12 @@ class Campaign:
         return {} if self.plan is None else self.plan.origin(trials)
 
     def own_names(self) -> list[str]:
-        """Names of the metrics of one's own; raises ValueError where they fail, or are none that a row can hold."""
+        """Return the names of the custom metrics. Raises ValueError if they fail or a row cannot hold them."""
         made = self.own
         if made is None:
             return []
 
-        def asked(result: Any, parts: Any) -> Any:
+        def asked(result: rollout.Result, parts: Parts) -> dict[str, jax.Array]:
             try:
                 returned: Any = made(result, parts)
             except (Exception, SystemExit) as error:
@@ -121,32 +119,33 @@ class Campaign:
 
 
 def _counted(samples: dict[str, Any]) -> dict[str, Any]:
-    """How the samples of trials ended, by the columns of their rows."""
+    """Return the numbers of samples by status, by column."""
     return {f"{plans.COUNTED}{status}": count for status, count in samples.items()}
 
 
 def of_plan(ready: Study, seed: int, plan: Plan, own: OwnMetrics | None = None, where: str = "the plan") -> Campaign:
-    """The campaign that flies a plan.
+    """Return the campaign of a run table.
 
-    What it says of a quantity in every row as it is drawn anyway, as `--dry-run` writes it, is left to be drawn: the
-    very program of the campaign that was planned then flies it, to the last digit.
+    A quantity that the table sets to its dispersed values, as `--dry-run` writes them, is dispersed instead. The trials
+    then run in the program of the original campaign and are equal to the last digit.
 
     Args:
-        ready: the scenario, ready to fly.
-        seed: of rows that do not say theirs.
-        plan: its rows.
-        own: metrics of one's own.
-        where: what errors call the plan.
+        ready: the scenario, ready to simulate.
+        seed: of rows without a seed.
+        plan: the run table.
+        own: custom metrics.
+        where: the name of the table in errors.
 
-    Raises RefusedError where initial angles, or numbers of draws of one's own, are not those that follow or are drawn.
+    Raises:
+        RefusedError: initial angles or numbers of custom dispersions are not those of the trials.
     """
     kinds = {*ready.dispersion.kinds, RATE_BIAS}
-    same = []  # quantities that the plan gives as they would be without it
-    drawn = None  # what its trials would fly with then
+    same = []  # quantities that the table sets to the values that they have without it
+    drawn = None  # the quantities of its trials without it
     for name, values in plan.given.items():
         quantity = QUANTITIES[name]
         columns, usual = quantity.columns(ready.parts), np.asarray(quantity.read(ready.parts))[None]
-        if not kinds.isdisjoint({name, OWN}):  # a draw of one's own may change any
+        if not kinds.isdisjoint({name, OWN}):  # a custom dispersion may change any
             if drawn is None:
                 drawn = Campaign(ready, seed, own, plan.without(plan.given)).draw(range(plan.count))
             if set(columns) <= set(drawn.columns):
@@ -170,22 +169,28 @@ def _draw(parts: Parts, dispersion: Dispersion, seed: jax.Array, trials: jax.Arr
 
 
 def missing(parts: Iterable[Part], trials: int, shard: tuple[int, int] = (1, 1)) -> list[Wanted]:
-    """Parts that are not there yet, of a campaign of so many trials; shard (i, n): of every n-th part from the i-th."""
-    flown = {part.first: part.count for part in parts}
+    """Return the parts that a campaign still needs.
+
+    Args:
+        parts: parts on disk.
+        trials: number of trials of the campaign.
+        shard: (i, n) selects every n-th part, from the i-th.
+    """
+    there = {part.first: part.count for part in parts}
     every = [(first, min(PART, trials - first)) for first in range(0, trials, PART)]
     number, shards = shard
-    return [(first, count) for first, count in every[number - 1 :: shards] if flown.get(first, 0) < count]
+    return [(first, count) for first, count in every[number - 1 :: shards] if there.get(first, 0) < count]
 
 
 def staying(parts: Iterable[Part], wanted: Iterable[Wanted]) -> list[Part]:
-    """The parts that are not flown anew: one that is to have more trials is, and none of its own are done yet."""
-    anew = {first for first, _ in wanted}
-    return [part for part in parts if part.first not in anew]
+    """Return the parts on disk that are not simulated again."""
+    again = {first for first, _ in wanted}
+    return [part for part in parts if part.first not in again]
 
 
 @dataclass
 class Tally:
-    """Where a campaign stands."""
+    """The progress of a campaign."""
 
     done: int  # trials
     total: int
@@ -193,72 +198,61 @@ class Tally:
 
 
 def tally(parts: list[Part], total: int) -> Tally:
-    """Where a campaign with these parts stands."""
+    """Return the progress of a campaign with these parts."""
     failed = sum(failures(read([part], ["status"])) for part in parts)
     return Tally(sum(part.count for part in parts), total, failed)
 
 
 def failures(frame: pl.DataFrame) -> int:
-    """How many of these rows did not end well."""
+    """Return the number of failed trials in these rows."""
     return int((frame["status"] != "ok").sum())
 
 
 def finished(frame: pl.DataFrame) -> np.ndarray:
-    """Which of these rows were flown to the end, (trials,) bool: their metrics are those of the run."""
+    """Return which trials reached the end, (trials,) bool; the metrics of the others are not those of a whole run."""
     return frame["status"].is_in(montecarlo.FINISHED).to_numpy()
 
 
 def verdicts(asked: Iterable[Requirement], frame: pl.DataFrame) -> list[Verdict]:
-    """One for each requirement over these rows; a failed trial breaks every one."""
+    """Return the verdict of each requirement over these rows; a failed trial violates all requirements."""
     return requirements.verdicts(asked, lambda name: frame[name].to_numpy().astype(float), finished(frame))
 
 
 def here(make: Callable[[np.ndarray], pl.DataFrame], rows: Rows, wanted: list[Wanted]) -> Iterator[tuple[Part, int]]:
-    """Make the wanted parts on this machine, and write each while the next one is made.
+    """Make the wanted parts on this machine and write them. Accelerators make several parts at a time.
 
-    Yields each part that is on the disk, and how many of its trials did not end well. make: numbers of trials -> rows.
-    Accelerators, which fly more than a part at a time, make several in one go.
+    Args:
+        make: returns the rows of trials, by their numbers.
+        rows: the place for the parts.
+        wanted: the parts, in order.
+
+    Yields:
+        Each part that is written, and its number of failed trials.
     """
     together = max(1, montecarlo.block_size() * len(configure.devices()) // PART)
-    writing: deque[tuple[Future[Part], int]] = deque()
-    with ThreadPoolExecutor(1) as writer:
-        for group, frame in _frames(make, [wanted[k : k + together] for k in range(0, len(wanted), together)]):
-            begin = 0
-            for first, count in group:
-                part = frame.slice(begin, count)
-                begin += count
-                bad = failures(part) if "status" in part.columns else 0
-                writing.append((writer.submit(rows.write, first, part), bad))
-            while writing and (len(writing) > WAITING or writing[0][0].done()):
-                part_on_disk, bad = writing.popleft()
-                yield part_on_disk.result(), bad
-        for part_on_disk, bad in writing:
-            yield part_on_disk.result(), bad
+    groups = [wanted[k : k + together] for k in range(0, len(wanted), together)]
 
+    def made(group: list[Wanted]) -> list[tuple[Part, int]]:
+        frame = make(np.concatenate([np.arange(first, first + count) for first, count in group]))
+        parts, begin = [], 0
+        for first, count in group:
+            part = frame.slice(begin, count)
+            begin += count
+            parts.append((rows.write(first, part), failures(part) if "status" in part.columns else 0))
+        return parts
 
-def _frames(
-    make: Callable[[np.ndarray], pl.DataFrame], groups: Sequence[list[Wanted]]
-) -> Iterator[tuple[list[Wanted], pl.DataFrame]]:
-    """The rows of each group of parts, in order; two at a time, so that one is flown while rows are made of another."""
-
-    def of(group: list[Wanted]) -> pl.DataFrame:
-        return make(np.concatenate([np.arange(first, first + count) for first, count in group]))
-
-    for group in groups[:1]:
-        yield group, of(group)  # alone: it compiles
-    flying: deque[tuple[list[Wanted], Future[pl.DataFrame]]] = deque()
-    with ThreadPoolExecutor(2) as makers:
-        for group in groups[1:]:
-            flying.append((group, makers.submit(of, group)))
-            if len(flying) == 2:
-                first, frame = flying.popleft()
-                yield first, frame.result()
-        for group, frame in flying:
-            yield group, frame.result()
+    workers = ThreadPoolExecutor(2)  # one simulates while the other makes and writes rows
+    try:
+        for group in groups[:1]:
+            yield from made(group)  # alone, since it compiles
+        for parts in workers.map(made, groups[1:]):
+            yield from parts
+    finally:
+        workers.shutdown(cancel_futures=True)
 
 
 def follow(parts: Iterable[tuple[Part, int]], standing: Tally, report: Callable[[Tally], None]) -> None:
-    """Tell of each part as it lands."""
+    """Report the progress after each part."""
     report(standing)
     for part, failed in parts:
         standing.done += part.count
@@ -267,7 +261,7 @@ def follow(parts: Iterable[tuple[Part, int]], standing: Tally, report: Callable[
 
 
 def history(campaign: Campaign, trials: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Times (time,) [s] and what the law drives to zero, its 2-norm (trials, time) [-], of these trials' histories."""
+    """Return the times (time,) [s] and the error's 2-norm (trials, time) [-] of these trials."""
     ready = campaign.ready
     rows = jax.tree.map(jnp.asarray, campaign.rows(trials))
     about = ready.parts, ready.dispersion, jnp.uint32(campaign.seed), rows, campaign.software

@@ -1,6 +1,6 @@
-"""Campaigns on a Dask cluster: workers fly parts and write them into the shared folder; only receipts travel back.
+"""Campaigns on a Dask cluster: workers simulate parts and write them into a shared folder; they return receipts.
 
-A worker that is lost has its parts flown again by another; a part is the same whoever flies it.
+If a worker is lost, another worker simulates its parts again, with equal results.
 """
 
 import contextlib
@@ -15,21 +15,28 @@ from ptsmc_jax.campaigns.campaign import Campaign, Wanted, failures
 from ptsmc_jax.campaigns.rows import Part, Rows
 from ptsmc_jax.campaigns.store import RefusedError
 
-LOST = 5  # workers that may be lost with a part before it is given up
-_one_at_a_time = threading.Lock()  # a part takes all devices of its process
+LOST = 5  # workers that may be lost with a part before the campaign fails
+_one_at_a_time = threading.Lock()  # a part uses all devices of its process
 
 
 class Cluster:
-    """A connection; call it with a folder and the wanted parts."""
+    """A connection to a cluster; call it with a folder and the wanted parts."""
 
     def __init__(self, client: Any, local: Any = None):
         self._client, self._local = client, local
 
     def __call__(self, folder: Any, wanted: list[Wanted]) -> Iterator[tuple[Part, int]]:
-        """Have the wanted parts flown; yields each part that is there, and how many of its trials did not end well.
+        """Have the wanted parts simulated.
 
-        folder: a campaign's, with `recipe()`, which all workers see under the same path. Raises RefusedError where
-        they do not, where their versions differ from those here, or where a part is lost with too many workers.
+        Args:
+            folder: the campaign's folder, with `recipe()`; all workers need it at the same path.
+            wanted: the parts.
+
+        Yields:
+            Each part on disk, and its number of failed trials.
+
+        Raises:
+            RefusedError: a worker does not share the folder, has other versions, or was lost too often.
         """
         from distributed import as_completed
 
@@ -52,17 +59,25 @@ class Cluster:
             self._client.cancel(futures)
 
     def close(self) -> None:
-        """Let the cluster go; one that was started here ends."""
+        """Close the connection; a local cluster ends."""
         self._client.close()
         if self._local is not None:
             self._local.close()
 
 
 def connected(address: str, tls: Mapping[str, str]) -> Cluster:
-    """A cluster by its address (tcp://host:port, tls://host:port), scheduler file (.json), or "local:N".
+    """Connect to a cluster.
 
-    "local:N" starts N processes on this machine that listen on the loopback only. tls: `distributed.Security`'s
-    options. Raises RefusedError where there is no such cluster, or Dask is not installed.
+    Args:
+        address: tcp://host:port, tls://host:port, a scheduler file (.json), or "local:N", which starts N processes on
+            this machine that listen on the loopback interface only.
+        tls: options of `distributed.Security`.
+
+    Returns:
+        The connection.
+
+    Raises:
+        RefusedError: there is no such cluster, or Dask is not installed.
     """
     try:
         from dask import config
@@ -104,7 +119,7 @@ def _campaign(make: Callable[..., tuple[Campaign, Rows]], arguments: tuple) -> t
 
 
 def _fly(recipe: tuple[Callable, tuple], first: int, count: int) -> tuple:
-    """On a worker: fly a part and write it. Returns its receipt: first trial, count, file, failures, versions."""
+    """On a worker: simulate and write a part. Return first trial, count, file name, failures and versions."""
     with _one_at_a_time:
         campaign, rows = _campaign(*recipe)
         frame = campaign.fly(range(first, first + count))

@@ -1,4 +1,4 @@
-"""Whether loops have the margins that a scenario asks for: nominal, or over what is drawn and changes them."""
+"""Verdicts on required margins: of the nominal loop, or over the trials if dispersions change the loop."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
+from numpy.typing import ArrayLike
 
 from ptsmc_jax import configure, programs
 from ptsmc_jax.batching import lapack
@@ -22,23 +23,23 @@ from ptsmc_jax.simulation.catalogues import MARGINS
 from ptsmc_jax.simulation.requirements import Requirement, Verdict
 from ptsmc_jax.theory import linear, margins, rest, run_margins
 
-TRIALS = 256  # whose loops are looked at, where they differ
+TRIALS = 256  # number of trials whose loops are judged if they differ
 # quantities that change the linearised loop: hardware errors, the body, and the trajectory
 OF_LOOPS = {INERTIA, OWN, INITIAL_ATTITUDE, INITIAL_RATE, INITIAL_STATE, REFERENCE}
 OF_LOOPS |= {name for name, quantity in QUANTITIES.items() if quantity.hardware}
-CALL = 32  # of them that are flown and linearised at once
-JUDGED = 16  # loops judged in full at a time
-DELAY = "delay_margin"  # the one margin that commands late within a period are looked at for
-# how far off what `margins.roughly` reads is taken to be at first: in dB, deg, periods, dB; see `worst`
+CALL = 32  # loops that are simulated and linearised at once
+JUDGED = 16  # loops whose exact margins are computed at a time
+DELAY = "delay_margin"  # the only margin that needs commands late within a period
+# first guess for the error of `margins.roughly`, in dB, deg, periods, dB; see `worst`
 OFF = {"gain_margin": 0.06, "phase_margin": 0.12, "delay_margin": 0.2, "modulus_margin": 0.01}
-# values that are not read between frequencies: of an unstable loop, or of one that no gain or phase makes unstable
+# values that are not interpolated: of unstable loops, and of loops that no gain or phase makes unstable
 BOUNDS = (0.0, margins.MOST, -margins.MOST, 180.0, -180.0)
 
 
 def of_loop(parts: Parts, asked: Sequence[Requirement]) -> list[Verdict]:
-    """One for each margin that is asked of the loop of these parts, see `run_margins.judged`.
+    """Return the verdict on each required margin of the loop of these parts, see `run_margins.judged`.
 
-    None is left where the nominal run does not come to rest, see `rest`.
+    There are no margins if the nominal run does not come to rest, see `rest`.
     """
     if not asked:
         return []
@@ -49,10 +50,15 @@ def of_loop(parts: Parts, asked: Sequence[Requirement]) -> list[Verdict]:
 
 
 def over_trials(ready: Study, seed: int, rows: np.ndarray | Row | None = None) -> list[Verdict]:
-    """One for each margin that is asked for: of the nominal loop, or the worst of the first `TRIALS` trials' loops.
+    """Return the verdict on each required margin: of the nominal loop, or the worst of the first `TRIALS` trials.
 
-    rows: those of a plan, in place of the first trials. Whether runs come to rest is seen from the nominal one, which
-    is none of those that the trials' loops are linearised about.
+    Args:
+        ready: the scenario, ready to simulate.
+        seed: of the dispersions.
+        rows: rows of a run table, instead of the first trials.
+
+    Returns:
+        The verdicts. The nominal run decides whether runs come to rest.
     """
     trials = _whose_loops_differ(ready, rows)
     if trials is None or rest.swing(ready.parts) is not None:
@@ -62,7 +68,7 @@ def over_trials(ready: Study, seed: int, rows: np.ndarray | Row | None = None) -
 
 
 def prepare(ready: Study, rows: np.ndarray | Row | None = None) -> None:
-    """Begin to compile what `over_trials` needs, beside what is being done."""
+    """Start to compile the programs of `over_trials` in the background."""
     trials = _whose_loops_differ(ready, rows)
     if trials is not None:
         late = any(requirement.metric == DELAY for requirement in ready.margins)
@@ -79,19 +85,19 @@ def _whose_loops_differ(ready: Study, rows: np.ndarray | Row | None) -> np.ndarr
     return np.arange(TRIALS) if rows is None else rows
 
 
-def _verdicts(asked: Sequence[Requirement], by_name: Mapping[str, Any]) -> list[Verdict]:
-    """A verdict for each margin that is asked for, from its values by name, of one loop or of many."""
+def _verdicts(asked: Sequence[Requirement], by_name: Mapping[str, ArrayLike]) -> list[Verdict]:
+    """Return the verdict on each required margin, from the values of one or many loops by name."""
     values = [np.asarray(by_name[requirement.metric]) for requirement in asked]
     return [r.verdict(value, np.asarray(~np.isnan(value))) for r, value in zip(asked, values, strict=True)]
 
 
 def differ(dispersion: Dispersion) -> bool:
-    """Whether loops differ from trial to trial."""
+    """Return whether the loops differ from trial to trial."""
     return not OF_LOOPS.isdisjoint(dispersion.kinds)
 
 
 def nearness(value: Any, limit: Any, name: str) -> Any:
-    """As `requirements.over`, but negative values stay: margins far from their limit can be put in order, too."""
+    """Return the violation ratio, as `requirements.over`, but with negative values: all margins have an order."""
     return 2.0 - value / limit if MARGINS[name].at_least else value / limit
 
 
@@ -103,25 +109,27 @@ def worst(
     limits: Mapping[str, float],
     places: int = 1,
 ) -> dict[str, np.ndarray]:
-    """Margins of each trial, (trials,), those that have a limit; the worst over its axes and times; NaN without slopes.
+    """Return the worst margins of each trial over its axes and times, (trials,), by name; NaN without derivatives.
 
-    Exact are the worst of each margin, and the margins of the `places` trials that come nearest to a limit. All others
-    are rough: farther from their limits than these, and on the right side of them, as far as the error is known.
+    The worst value of each margin is exact, and so are the margins of the `places` trials nearest to a limit. The other
+    margins are interpolated: they are farther from their limits, and on the right side, as far as the error is known.
+
+    First, the margins of every loop are interpolated between the frequencies of the exact search (`margins.roughly`).
+    Then exact margins are computed, nearest to a limit first, until an error of `OFF` in the other loops can neither
+    change the worst loop nor move a loop across a limit. Each exact margin shows the error of the interpolation. If it
+    exceeds half of `OFF`, the assumed error becomes twice the observed error. Exact margins of all loops take about
+    five times as long.
 
     Args:
-        parts: the nominal ones.
-        dispersion: what is drawn about them.
-        seed: of the draws.
-        trials: their numbers, or rows of a plan.
-        limits: of each margin that is wanted, by its name.
-        places: how many trials nearest to a limit are to be exact.
+        parts: the nominal parts.
+        dispersion: the dispersions.
+        seed: of the dispersions.
+        trials: their numbers, or rows of a run table.
+        limits: of each required margin, by name.
+        places: number of trials nearest to a limit that are exact.
 
-    First the margins of every loop are read roughly, by straight lines between the frequencies that exact margins are
-    found by. Then loops are judged exactly, the nearest first, as long as an error of `OFF` could make one of the
-    others count, or could move it across a limit. Each exact margin also shows how large the error of the lines was:
-    where it is more than half of `OFF`, twice as much is reckoned with from then on. No bound holds for all loops: of
-    the tests' rigid bodies the error is below half of `OFF`; of a flexible one, and of two inputs, with gains at random
-    it was up to 0.8 deg, 0.4 periods and 0.02 dB of the sensitivity, and 10 dB of one gain, far from any limit.
+    Returns:
+        The margins by name.
     """
     names, count = tuple(limits), jax.tree.leaves(trials)[0].shape[0]
     late = DELAY in names
@@ -152,11 +160,11 @@ def worst(
 
 
 def _looked_at(parts: Parts, dispersion: Dispersion, seed: int, trials: np.ndarray | Row, late: bool) -> tuple:
-    """What `_look` is called with: the trials, and some of them again, as many as whole calls on every device take."""
+    """Return the arguments of `_look`; trials are repeated to fill the last call on every device."""
     devices = len(configure.processors())
     together = CALL * devices
 
-    def padded(v: Any) -> Array:
+    def padded(v: np.ndarray) -> Array:
         return jnp.asarray(np.resize(v, (-(-v.shape[0] // together) * together, *v.shape[1:])))
 
     some = jax.tree.map(padded, trials if isinstance(trials, Row) else np.asarray(trials, dtype=np.uint32))
@@ -164,13 +172,13 @@ def _looked_at(parts: Parts, dispersion: Dispersion, seed: int, trials: np.ndarr
 
 
 def _nearness(values: np.ndarray, limit: np.ndarray, names: Sequence[str]) -> np.ndarray:
-    """`nearness` of each margin, arrays over them first; a loop without a value counts as behind all others."""
+    """Return the `nearness` of each margin, (margins, loops); a loop without a value comes last."""
     near = np.stack([nearness(v, one, name) for v, one, name in zip(values, limit, names, strict=True)])
     return np.where(np.isnan(near), -np.inf, near)
 
 
 def _over(name: str, values: Any) -> Any:
-    """The worst along the last axis."""
+    """Return the worst value along the last axis."""
     return values.min(axis=-1) if MARGINS[name].at_least else values.max(axis=-1)
 
 
@@ -178,7 +186,7 @@ def _over(name: str, values: Any) -> Any:
 def _look(
     parts: Parts, dispersion: Dispersion, seed: Array, trials: Array | Row, devices: int, late: bool
 ) -> tuple[linear.Loop, dict[str, Array]]:
-    """Loops of each trial, (trials, times, ..), and what is roughly their margins, the worst over the axes.
+    """Return the loops of each trial, (trials, times, ..), and their interpolated margins, the worst over the axes.
 
     late: see `linear.opened`.
     """

@@ -2,13 +2,14 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
+from numpy.typing import ArrayLike
 
 from ptsmc_jax import configure, programs
 from ptsmc_jax.batching import lanes
@@ -24,11 +25,11 @@ from ptsmc_jax.simulation.assembly import Parts, check_parts
 from ptsmc_jax.simulation.computer import OURS, Software
 from ptsmc_jax.simulation.metrics import Metrics
 
-FEW = 64  # fewer trials are flown at once, by a program for this many: a step of one costs nearly as much
+FEW = 64  # fewer trials run in a program for this many: a step of one trial costs nearly as much
 CAPACITY = 4096  # trials in one call
-BLOCK = 128  # trials in one block: what a step works on stays in the cache (benchmarks/README.md)
-BLOCK_ON_GPU = 65_536  # the same on an accelerator, where a step costs launches whatever it works on
-FINISHED = tuple(rollout.STATUS[code][0] for code in rollout.FINISHED)  # statuses of runs that were flown to the end
+BLOCK = 128  # trials in one block: their states stay in the cache (benchmarks/README.md)
+BLOCK_ON_GPU = 65_536  # on an accelerator, where launches dominate the cost of a step
+FINISHED = tuple(rollout.STATUS[code][0] for code in rollout.FINISHED)  # statuses of runs that reached the end
 
 
 @dataclass(frozen=True)
@@ -39,41 +40,41 @@ class Trials:
     metrics: Metrics  # of arrays
     status: np.ndarray  # codes, see rollout.STATUS
     bad_time: np.ndarray  # first bad time [s], NaN if none
-    drawn: dict[str, np.ndarray]  # what each flew with, by name, see `values`
-    own: dict[str, np.ndarray] = field(default_factory=dict)  # metrics of one's own
-    samples: dict[str, np.ndarray] = field(default_factory=dict)  # of each, see `rollout.Result`
+    drawn: dict[str, np.ndarray]  # dispersed quantities by name, see `values`
+    own: dict[str, np.ndarray] = field(default_factory=dict)  # custom metrics
+    samples: dict[str, np.ndarray] = field(default_factory=dict)  # see `rollout.Result`
 
     __repr__ = listing
 
     @property
     def ok(self) -> np.ndarray:
-        """Which trials ended well."""
+        """Which trials succeeded."""
         return self.status == rollout.OK
 
     @property
     def finished(self) -> np.ndarray:
-        """Which trials were flown to the end, whether or not t_f was met: their metrics are averaged."""
+        """Which trials reached the end, converged at t_f or not: their metrics are averaged."""
         return np.isin(self.status, rollout.FINISHED)
 
     def vectors(self, name: str) -> np.ndarray:
-        """What is drawn by this name and a number, `initial_q1` to `initial_q4` for `initial_q`, (trials, numbers)."""
+        """Return a dispersed vector (trials, components): `initial_q1` to `initial_q4` for the name `initial_q`."""
         numbers = [v for key, v in self.drawn.items() if key.startswith(name) and key[len(name) :].isdigit()]
         return np.stack(numbers, axis=1)
 
     def counts(self) -> dict[str, int]:
-        """How many trials ended with each status."""
+        """Return the number of trials with each status."""
         counts = dict.fromkeys((status for status, _ in rollout.STATUS.values()), 0)
         for code, (status, _) in rollout.STATUS.items():
             counts[status] += int(np.sum(self.status == code))
         return counts
 
 
-# a metric of one's own: the run with its history, and the parts that flew it -> named numbers
+# a custom metric: (run with its history, its parts) -> named numbers
 OwnMetrics = Callable[[rollout.Result, Parts], dict[str, jax.Array]]
 
 
 class Flown(NamedTuple):
-    """What is known of one trial, see `Trials`."""
+    """The result of one trial, see `Trials`."""
 
     metrics: Metrics
     status: jax.Array
@@ -94,18 +95,22 @@ def one(
     own: OwnMetrics | None = None,
     software: Software = OURS,
 ) -> Flown:
-    """Fly one trial: pure, for any transformation.
+    """Simulate one trial: a pure function, for any transformation.
 
     Args:
-        parts: the nominal ones.
-        dispersion: what is drawn about them.
-        seed: of the draws and the noise, a whole number.
-        trial: its number, or a `Row` of a plan, which brings its own seed.
-        coordinates: of what is drawn, where they are not those of the trial, which then names its noise alone.
-        own: metrics besides the usual ones, for which the run's history is recorded.
-        software: the flight computer, where it is not the parts' own code.
+        parts: the nominal parts.
+        dispersion: the dispersions.
+        seed: of the dispersions and the noise, a whole number.
+        trial: its number, or a `Row` of a run table with a seed of its own.
+        coordinates: random numbers of the dispersions; None: those of the trial. The noise is always the trial's.
+        own: custom metrics; the run's history is recorded for them.
+        software: the flight computer.
 
-    Raises TypeError where there are no parts, or no dispersion.
+    Returns:
+        Metrics, status and dispersed quantities.
+
+    Raises:
+        TypeError: `parts` or `dispersion` is something else.
     """
     check_parts(parts)
     check_dispersion(dispersion)
@@ -121,12 +126,12 @@ def one(
 
 @programs.jit
 def coordinates(dispersion: Dispersion, seed: jax.Array, trials: jax.Array) -> Coordinates:
-    """Coordinates [-] of what is drawn for these trials (trials,), arrays over the trials first."""
+    """Return the random numbers of the dispersions [-] for these trials (trials,), with a leading axis over trials."""
     return jax.vmap(lambda trial: dispersion.coordinates(seed, trial))(trials)
 
 
 def values(parts: Parts, dispersion: Dispersion, seed: WholeNumber, trial: WholeNumber | Row) -> dict[str, jax.Array]:
-    """What a trial flies with, by name, without flying it; trial: see `one`."""
+    """Return the dispersed quantities of a trial by name, without simulating it; arguments as for `one`."""
     about = planned.about(parts, dispersion, seed, trial)
     coordinates = about.dispersion.coordinates(about.seed, about.trial)
     return _values(dispersion, about.dispersion.at(about.parts, coordinates), about, coordinates)
@@ -135,7 +140,7 @@ def values(parts: Parts, dispersion: Dispersion, seed: WholeNumber, trial: Whole
 def _values(
     dispersion: Dispersion, drawn: Parts, about: planned.About, coordinates: Coordinates
 ) -> dict[str, jax.Array]:
-    """Read from the parts of a trial, the gyro's bias from its sensors, and what draws of one's own say of theirs."""
+    """Read the quantities from the parts of a trial; add the gyro's bias and numbers of custom dispersions."""
     by_column = dispersion.values(drawn, set(about.given) - {RATE_BIAS})
     if dispersion.own is not None:
         by_column |= dispersion.own.values(coordinates[OWN])
@@ -152,23 +157,28 @@ def run(
     kernel: bool | None = None,
     software: Software = OURS,
 ) -> Trials:
-    """Fly these trials, or rows of a plan: the same whatever the blocks, the devices and the order.
+    """Simulate these trials, or rows of a run table. Results do not depend on blocks, devices and order.
 
-    A trial that fails is marked by its status and kept. One program flies any number of trials below `FEW`, another any
-    number from there on.
+    A trial that fails is marked by its status and kept. One program simulates any number of trials below `FEW`, another
+    any larger number.
 
     Args:
-        parts: the nominal ones.
-        dispersion: what is drawn about them.
-        seed: of the draws and the noise.
-        trials: their numbers, whole ones below 2^32, or rows of a plan.
-        block: trials that a device flies at a time; None: `block_size()`.
-        own: see `one`.
-        kernel: the loop over time as one kernel, see `batching.kernel`; None: `by_kernel()`. On a processor it is
-            interpreted, slowly.
-        software: see `one`.
+        parts: the nominal parts.
+        dispersion: the dispersions.
+        seed: of the dispersions and the noise.
+        trials: their numbers, whole numbers below 2^32, or rows of a run table.
+        block: trials that a device simulates at a time; None: `block_size()`.
+        own: custom metrics, see `one`.
+        kernel: whether the loop over time is one kernel, see `batching.kernel`; None: `by_kernel()`. A processor
+            interprets the kernel, slowly.
+        software: the flight computer.
 
-    Raises ValueError where seed or trials are no such numbers, TypeError where there are no parts, or no dispersion.
+    Returns:
+        The results, arrays (trials,).
+
+    Raises:
+        ValueError: seed or trials are not such numbers.
+        TypeError: `parts` or `dispersion` is something else.
     """
     if software.on_processor and configure.backend() != "cpu":
         with jax.default_device(configure.processors()[0]):
@@ -195,8 +205,8 @@ def run(
     return Trials(number, *jax.tree.map(lambda *many: np.concatenate(many), *calls))
 
 
-def _numbers(trials: Any) -> np.ndarray:
-    """Numbers of trials, checked: a cast would cut fractions off, count backwards, and fly something else."""
+def _numbers(trials: ArrayLike) -> np.ndarray:
+    """Return checked numbers of trials. A cast alone would accept fractions and negative numbers."""
     numbers = np.asarray(trials)
     if numbers.ndim != 1 or not numbers.size:
         raise ValueError(f"trials is of shape {numbers.shape}, but must be the numbers of one trial or more, (N,)")
@@ -208,9 +218,15 @@ def _numbers(trials: Any) -> np.ndarray:
 
 
 def shared_out(count: int, devices: int, slots: int) -> tuple[np.ndarray, int]:
-    """Which of so many items the slots of each device hold, (devices, slots), and how many each device has in all.
+    """Distribute items over devices.
 
-    Beyond these, and where they do not come out even, items stand twice; `gathered` leaves these out at its end.
+    Args:
+        count: number of items.
+        devices: number of devices.
+        slots: number of slots of a device.
+
+    Returns:
+        The item in each slot, (devices, slots), and the number of used slots of a device. Other slots repeat items.
     """
     share = -(-count // devices)
     places = np.zeros((devices, slots), int)
@@ -219,13 +235,13 @@ def shared_out(count: int, devices: int, slots: int) -> tuple[np.ndarray, int]:
 
 
 def gathered(results: np.ndarray, share: int) -> np.ndarray:
-    """Results of items that were `shared_out`, (devices, slots, ..) -> (devices * share, ..), in the items' order."""
+    """Return the results of `shared_out` items in their order, (devices, slots, ..) -> (devices * share, ..)."""
     own = np.asarray(results)[:, :share]
     return own.reshape(-1, *own.shape[2:])
 
 
 def _slots(count: int, block: int | None = None) -> tuple[int, int, int]:
-    """For how many trials the program is made that flies so many: devices, rows and block, see `_fly`."""
+    """Return the shape (devices, rows, block) of the program that simulates `count` trials, see `_fly`."""
     devices = len(configure.devices())
     if count < FEW:
         return devices, 1, -(-FEW // devices)
@@ -234,7 +250,7 @@ def _slots(count: int, block: int | None = None) -> tuple[int, int, int]:
 
 
 def prepare(parts: Parts, dispersion: Dispersion, count: int) -> None:
-    """Begin to compile what flies so many trials of such parts, beside what is being done."""
+    """Start to compile the program for `count` trials of such parts in the background."""
     slots = _slots(count)
     numbers = np.zeros(slots, dtype=np.uint32)
     _fly.prepare(parts, dispersion, jnp.uint32(0), numbers, jnp.int32(0), slots[0], None, by_kernel(), OURS)
@@ -252,7 +268,7 @@ def _fly(
     kernel: bool,
     software: Software,
 ) -> Flown:
-    """Results of (devices, rows, block) trials; rows from `needed` on are left zero."""
+    """Return the results of (devices, rows, block) trials; rows from `needed` on are zero."""
 
     def fly(trial: jax.Array | Row) -> Flown:
         return one(parts, dispersion, seed, trial, own=own, software=software)
@@ -262,24 +278,27 @@ def _fly(
     return row_by_row(lanes.vmap(fly, kernel=kernel), result, width, trials, needed, devices)
 
 
-def row_by_row(flown: Callable, result: Any, width: int, rows: Any, needed: jax.Array, devices: int) -> Any:
-    """`flown` of one row after the other, on each of the devices.
+def row_by_row(flown: Callable, result: PyTree, width: int, rows: PyTree, needed: jax.Array, devices: int) -> PyTree:
+    """Evaluate one row after the other on each device.
 
     Args:
-        flown: what is done with a row of trials.
-        result: shapes and types of what comes out for one trial: to trace a whole row for them takes long.
+        flown: the function of a row of trials.
+        result: shapes and types of the result of one trial; tracing a whole row for them takes long.
         width: trials in a row.
         rows: arrays (devices, rows, ..).
-        needed: how many rows each device has to do; what those beyond them leave is zero.
-        devices: how many there are.
+        needed: number of rows to evaluate on each device.
+        devices: number of devices.
+
+    Returns:
+        The results, (devices, rows, width, ..); rows from `needed` on are zero.
     """
 
-    def on_device(rows: Any) -> Any:
+    def on_device(rows: PyTree) -> PyTree:
         own = jax.tree.map(lambda v: v[0], rows)
         count = jax.tree.leaves(own)[0].shape[0]
         empty = jax.tree.map(lambda v: jnp.zeros((count, width, *v.shape), v.dtype), result)
 
-        def step(k: jax.Array, done: Any) -> Any:
+        def step(k: jax.Array, done: PyTree) -> PyTree:
             row = flown(jax.tree.map(lambda v: v[k], own))
             return jax.tree.map(lambda into, v: into.at[k].set(v), done, row)
 
@@ -289,19 +308,19 @@ def row_by_row(flown: Callable, result: Any, width: int, rows: Any, needed: jax.
 
 
 def block_size() -> int:
-    """How many trials a device flies at a time, where a caller does not say."""
+    """Return the default number of trials that a device simulates at a time."""
     return BLOCK if configure.backend() == "cpu" else BLOCK_ON_GPU
 
 
 def by_kernel() -> bool:
-    """Whether loops over time are flown as one kernel each: on a GPU, where every step would cost launches."""
+    """Return whether the loop over time is one kernel: on a GPU, where each step would cost launches."""
     return configure.backend() == "gpu"
 
 
-def blocks(fly: Callable, trials: Any) -> Any:
-    """`lanes.vmap(fly)(trials)`, evaluated in blocks of equal size, of at most `block_size()` trials each.
+def blocks(fly: Callable, trials: PyTree) -> PyTree:
+    """Return `lanes.vmap(fly)(trials)`, evaluated in blocks of equal size of at most `block_size()` trials.
 
-    trials: what `fly` takes, a number or a tree of arrays, with a leading axis over the trials.
+    trials: arguments of `fly`, with a leading axis over trials.
     """
     count = jax.tree.leaves(trials)[0].shape[0]
     rows = max(1, -(-count // block_size()))
@@ -316,8 +335,8 @@ def blocks(fly: Callable, trials: Any) -> Any:
     return jax.tree.map(lambda v: v.reshape(rows * size, *v.shape[2:])[:count], results)
 
 
-def spread(function: Callable, shared: Any, devices: int) -> Any:
-    """function(shared) with the first axes of `shared`, and of the results, shared out over that many devices."""
+def spread(function: Callable, shared: PyTree, devices: int) -> PyTree:
+    """Return function(shared), with the first axes of argument and results distributed over the devices."""
     if devices == 1:
         return function(shared)
     mesh = Mesh(np.asarray(configure.devices()[:devices]), ("device",))

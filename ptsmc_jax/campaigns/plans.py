@@ -1,13 +1,12 @@
-"""A plan: trials from a table, one in each row, what it gives flown in place of what is drawn.
+"""Run tables ("plans"): a table with a row for each trial, which sets quantities instead of dispersing them.
 
-A column is one that rows and `--dry-run` have, see `quantities`; numbers of one vector come together. `trial` and
-`seed` say whose draws and noise a row has: those of its own number and of the campaign's seed where they are absent.
-What is neither given nor drawn is nominal. Results (status, metrics) may stand beside, and count for nothing.
+The columns are those of a campaign's rows and of `--dry-run`, see `quantities`; the numbers of a vector come together.
+`trial` and `seed` name the random numbers of a row; by default the row's number and the campaign's seed. A quantity
+that is neither set nor dispersed is nominal. Columns with results (status, metrics) are ignored.
 """
 
 import hashlib
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -35,18 +34,18 @@ MOST = 2**32  # of trials and seeds
 
 @dataclass(frozen=True)
 class Plan:
-    """A plan that was looked at, see `checked`."""
+    """A checked run table, see `checked`."""
 
     given: dict[str, np.ndarray]  # numbers (rows, n) by the names of `QUANTITIES`
-    trial: np.ndarray | None  # (rows,) as the table says them
-    seed: np.ndarray | None
-    angle: np.ndarray | None  # (rows,) initial angle that the table says
+    trial: np.ndarray | None  # (rows,) of the table
+    seed: np.ndarray | None  # (rows,)
+    angle: np.ndarray | None  # (rows,) initial angle of the table [rad]
     count: int  # rows
-    own: dict[str, np.ndarray] = field(default_factory=dict)  # (rows,) numbers of draws of one's own that it says
+    own: dict[str, np.ndarray] = field(default_factory=dict)  # (rows,) numbers of custom dispersions, by name
 
     @property
     def digest(self) -> str:
-        """SHA-256 of what it says: two tables that fly the same trials have the same one."""
+        """SHA-256 of its trials: tables with the same trials have the same checksum."""
         digest = hashlib.sha256(str(self.count).encode())
         for name, values in [*sorted(self.given.items()), *self._whose_draws.items()]:
             plain = np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<"))
@@ -55,11 +54,11 @@ class Plan:
 
     @property
     def _whose_draws(self) -> dict[str, np.ndarray]:
-        """The columns that say whose draws and noise a row has, as far as there are such."""
+        """The columns that name the random numbers of the rows, if any."""
         return {name: values for name, values in ((TRIAL, self.trial), (SEED, self.seed)) if values is not None}
 
     def rows(self, numbers: np.ndarray, seed: int) -> np.ndarray | Row:
-        """These rows, (rows,) numbers from 0 on; trials' numbers where nothing else is said. seed: the campaign's."""
+        """Return these rows, or numbers of trials if the table sets nothing; numbers: (rows,) from 0; seed: default."""
         numbers = np.asarray(numbers, dtype=np.uint32)
         trial = numbers if self.trial is None else self.trial[numbers]
         if not self.given and self.seed is None:
@@ -68,20 +67,20 @@ class Plan:
         return Row(seeds, trial, {name: values[numbers] for name, values in self.given.items()})
 
     def row(self, number: int, seed: int) -> int | Row:
-        """One row, as `rows` gives many."""
+        """Return one row, see `rows`."""
         many = self.rows(np.asarray([number]), seed)
         return jax.tree.map(lambda v: v[0], many) if isinstance(many, Row) else int(many[0])
 
     def without(self, same: Iterable[str]) -> "Plan":
-        """The plan without these quantities, which it gives as they would be drawn anyway."""
+        """Return the table without these quantities."""
         return replace(self, given={name: values for name, values in self.given.items() if name not in same})
 
     def origin(self, numbers: np.ndarray) -> dict[str, np.ndarray]:
-        """Whose draws these rows have, as rows tell it."""
+        """Return the columns of a campaign's rows that name the random numbers of these rows."""
         return {OF_ROWS[name]: values[numbers] for name, values in self._whose_draws.items()}
 
     def frame(self, parts: Parts) -> pl.DataFrame:
-        """The plan as a table, in one form for all that say the same."""
+        """Return the table as a data frame, in one form for equal run tables."""
         columns = self._whose_draws
         for name, values in self.given.items():
             columns |= dict(zip(QUANTITIES[name].columns(parts), values.T, strict=True))
@@ -89,7 +88,7 @@ class Plan:
 
 
 def read(path: Path) -> pl.DataFrame:
-    """The table of a file, or of the files in a folder that `--dry-run` left; raises RefusedError where it is none."""
+    """Return the table of a file, or of a folder that `--dry-run` wrote. Raises RefusedError if it is not a table."""
     if not path.exists():
         raise RefusedError(f"--plan is {path}, which is not there; allowed is {ALLOWED}")
     files = sorted(path.glob("*.parquet")) if path.is_dir() else [path]
@@ -108,127 +107,117 @@ def read(path: Path) -> pl.DataFrame:
 def checked(
     table: pl.DataFrame, parts: Parts, where: str = "the plan", own: Iterable[str] = (), drawn: Iterable[str] = ()
 ) -> Plan:
-    """The plan that a table says.
+    """Return the run table of a data frame.
 
     Args:
         table: a row for each trial.
-        parts: the nominal ones, that say which quantities there are.
-        where: what errors call the plan.
-        own: names of metrics of one's own, which may stand beside.
-        drawn: names of the numbers that draws of one's own say, see `check_drawn`.
+        parts: the nominal parts; the quantities depend on them.
+        where: the name of the table in errors.
+        own: names of custom metrics, which are allowed as columns.
+        drawn: names of the numbers of custom dispersions, see `check_drawn`.
 
-    Raises RefusedError, in one sentence with column and row (counted from 0, as trials are), where a column is not
-    known or comes without the others of its vector, a cell is empty or no finite number, or a value is none that can be
-    flown.
+    Returns:
+        The checked run table.
+
+    Raises:
+        RefusedError: a column is unknown or lacks the others of its vector, a cell is empty or not a finite number, or
+            a value cannot be simulated. The sentence names column and row, counted from 0.
     """
-    if table.height == 0:
-        raise RefusedError(f"{where} has no rows, but must have one for each trial")
-    if table.height > MOST:
-        raise RefusedError(f"{where} has {table.height} rows, but at most {MOST} are allowed")
+    if not 1 <= table.height <= MOST:
+        count = "no rows" if not table.height else f"{table.height} rows"
+        limit = "must have one for each trial" if not table.height else f"at most {MOST} are allowed"
+        raise RefusedError(f"{where} has {count}, but {limit}")
     columns_of = {name: quantity.columns(parts) for name, quantity in QUANTITIES.items()}
     quantity_of = {column: name for name, columns in columns_of.items() for column in columns}
-    whose = [*OF_ROWS, *OF_ROWS.values()]
     for column in table.columns:
-        if column not in (*quantity_of, *whose, ANGLE, *RESULTS, *SAMPLES, *own, *drawn):
+        if column not in (*quantity_of, *OF_ROWS, *OF_ROWS.values(), ANGLE, *RESULTS, *SAMPLES, *own, *drawn):
             close = parsing.nearest(column, (*quantity_of, *OF_ROWS))
-            raise RefusedError(f"{where} has the column {column}, with which no trial of this scenario flies; {close}")
-    given = {}
-    for name in dict.fromkeys(quantity_of[column] for column in table.columns if column in quantity_of):
-        absent = [column for column in columns_of[name] if column not in table.columns]
-        if absent:
-            present = next(column for column in table.columns if quantity_of.get(column) == name)
-            raise RefusedError(
-                f"{where} has the column {present}, but not {absent[0]}: {_all(columns_of[name])} come together"
-            )
-        values = np.stack([_numbers(table, column, where) for column in columns_of[name]], axis=1)
-        with _refusing(values, columns_of[name], where):
+            raise RefusedError(f"{where} has the column {column}, which no trial of this scenario has; {close}")
+    given: dict[str, np.ndarray] = {}
+    for column in table.columns:
+        columns = columns_of.get(quantity_of.get(column, ""), [])
+        absent = next((one for one in columns if one not in table.columns), None)
+        if absent is not None:
+            raise RefusedError(f"{where} has the column {column}, but not {absent}: {_all(columns)} come together")
+        if columns and quantity_of[column] not in given:
+            given[quantity_of[column]] = np.stack([_numbers(table, one, where) for one in columns], axis=1)
+    name = ""
+    try:
+        for name, values in given.items():
             given[name] = QUANTITIES[name].checked(values)
-    for name, values in given.items():
-        with _refusing(values, columns_of[name], where):
+        for name in given:
             QUANTITIES[name].check_with(given, parts)
-    whose_draws = {}
-    for name, other in OF_ROWS.items():  # of rows that are flown again, `trial` is but their number
+    except UnfitError as error:
+        row, columns = ", ".join(f"{v:.9g}" for v in given[name][error.row]), columns_of[name]
+        heading = columns[0] if len(columns) == 1 else f"{_all(columns)} ="
+        raise _refusal(where, heading, error.row, row, str(error)) from None
+    whose = {}
+    for name, other in OF_ROWS.items():  # rows of a campaign name the trial in the other column
         column = other if other in table.columns else name
-        whose_draws[name] = _whole_numbers(table, column, where) if column in table.columns else None
-    if whose_draws[TRIAL] is not None and np.array_equal(whose_draws[TRIAL], np.arange(table.height)):
-        whose_draws[TRIAL] = None  # their own numbers
+        whose[name] = _whole_numbers(table, column, where) if column in table.columns else None
+    if whose[TRIAL] is not None and np.array_equal(whose[TRIAL], np.arange(table.height)):
+        whose[TRIAL] = None  # their own numbers
     angle = _numbers(table, ANGLE, where) if ANGLE in table.columns else None
-    said = {name: _cells(table[name]) for name in drawn if name in table.columns}
-    return Plan(given, whose_draws[TRIAL], whose_draws[SEED], angle, table.height, said)
+    stated = {name: _cells(table[name]) for name in drawn if name in table.columns}
+    return Plan(given, whose[TRIAL], whose[SEED], angle, table.height, stated)
 
 
-def check_angle(said: np.ndarray, flown: np.ndarray, where: str) -> None:
-    """Raise RefusedError where the initial angles (rows,) that a plan says are not those that follow from the rest."""
-    off = np.abs(flown - said) > 1e-5 * np.maximum(1.0, np.abs(said))
-    _refuse_said(off, ANGLE, said, flown, where, "follows from the rest, or no such column")
+def check_angle(stated: np.ndarray, simulated: np.ndarray, where: str) -> None:
+    """Raise RefusedError if the table's initial angles (rows,) do not follow from its other columns."""
+    off = np.abs(simulated - stated) > 1e-5 * np.maximum(1.0, np.abs(stated))
+    why = "follows from the rest, or no such column"
+    _refuse(off, where, ANGLE, stated, lambda row: f"{simulated[row]:.9g} there, which {why}")
 
 
-def check_drawn(said: dict[str, np.ndarray], rows: pl.DataFrame, where: str) -> None:
-    """Raise RefusedError where numbers of draws of one's own, (rows,) by name, are not those that are drawn.
+def check_drawn(stated: dict[str, np.ndarray], rows: pl.DataFrame, where: str) -> None:
+    """Raise RefusedError if the table has other numbers of custom dispersions, (rows,) by name, than the trials.
 
-    A plan cannot give them: only `Draw.at` knows what follows from them.
+    A table cannot set them, since only `Draw.at` knows the parts that follow from them.
     """
-    for name, values in said.items():
-        flown = _cells(rows[name])
-        near = 1e-5 * np.max(np.abs(flown), initial=0.0, where=np.isfinite(flown))
-        same = (np.abs(flown - values) <= near) | (np.isnan(flown) & np.isnan(values))
-        _refuse_said(~same, name, values, flown, where, "is drawn for its trial and seed, or no such column: what a "
-                     "draw of one's own draws, no plan gives")  # fmt: skip
-
-
-def _refuse_said(off: np.ndarray, column: str, said: np.ndarray, flown: np.ndarray, where: str, why: str) -> None:
-    """Raise RefusedError for the first row in which a column says another number than is flown."""
-    if off.any():
-        k = int(np.argmax(off))
-        raise RefusedError(
-            f"{where} has {column} {said[k]:g} in row {k}, but must have {flown[k]:.9g} there, which {why}"
-        )
+    why = "is the number of its trial and seed, or no such column: a run table cannot set custom dispersions"
+    for name, values in stated.items():
+        numbers = _cells(rows[name])
+        near = 1e-5 * np.max(np.abs(numbers), initial=0.0, where=np.isfinite(numbers))
+        same = (np.abs(numbers - values) <= near) | (np.isnan(numbers) & np.isnan(values))
+        _refuse(~same, where, name, values, lambda row, numbers=numbers: f"{numbers[row]:.9g} there, which {why}")
 
 
 def _all(columns: list[str]) -> str:
     return " to ".join((columns[0], columns[-1]))
 
 
-def _refused(where: str, column: str, row: int, value: object, allowed: str) -> RefusedError:
-    shown = "empty" if value is None else value.to_list() if isinstance(value, pl.Series) else value
+def _refusal(where: str, column: str, row: int, value: object, allowed: str) -> RefusedError:
+    value = value.to_list() if isinstance(value, pl.Series) else f"{value:.10g}" if isinstance(value, float) else value
+    shown = "empty" if value is None else value
     return RefusedError(f"{where} has {column} {shown} in row {row}, but must have {allowed}")
 
 
-def _refuse(bad: np.ndarray, table: pl.DataFrame, column: str, where: str, allowed: str) -> None:
-    """Raise RefusedError of the first bad row of a column, if there is one; bad: (rows,) bool."""
+def _refuse(
+    bad: np.ndarray, where: str, column: str, values: pl.Series | np.ndarray, allowed: Callable[[int], str]
+) -> None:
+    """Raise RefusedError for the first bad row (rows,) of a column, if any; allowed: words for the row."""
     if bad.any():
         row = int(np.argmax(bad))
-        raise _refused(where, column, row, table[column][row], allowed)
+        raise _refusal(where, column, row, values[row], allowed(row))
 
 
 def _numbers(table: pl.DataFrame, column: str, where: str) -> np.ndarray:
-    """A column of finite numbers."""
+    """Return a column of finite numbers."""
     numbers = _cells(table[column])
-    _refuse(~np.isfinite(numbers), table, column, where, "a finite number")
+    _refuse(~np.isfinite(numbers), where, column, table[column], lambda _: "a finite number")
     return numbers
 
 
 def _cells(values: pl.Series) -> np.ndarray:
-    """The numbers of a column; what is none, or empty, is NaN."""
+    """Return the numbers of a column; an empty cell or text is NaN."""
     if values.dtype.is_numeric() or values.dtype == pl.String:
         return values.cast(pl.Float64, strict=False).to_numpy().astype(float)
     return np.full(values.len(), np.nan)
 
 
 def _whole_numbers(table: pl.DataFrame, column: str, where: str) -> np.ndarray:
-    """A column of whole numbers below 2^32."""
+    """Return a column of whole numbers below 2^32."""
     values = _numbers(table, column, where)
     bad = (values != np.floor(values)) | (values < 0) | (values >= MOST)
-    _refuse(bad, table, column, where, f"a whole number from 0 to {MOST - 1}")
+    _refuse(bad, where, column, table[column], lambda _: f"a whole number from 0 to {MOST - 1}")
     return values.astype(np.uint32)
-
-
-@contextmanager
-def _refusing(values: np.ndarray, columns: list[str], where: str) -> Iterator[None]:
-    """Raise RefusedError of the row of a quantity's numbers (rows, n) that a check in here finds unfit."""
-    try:
-        yield
-    except UnfitError as error:
-        row = ", ".join(f"{v:.9g}" for v in values[error.row])
-        heading = columns[0] if len(columns) == 1 else f"{_all(columns)} ="
-        raise _refused(where, heading, error.row, row, str(error)) from None

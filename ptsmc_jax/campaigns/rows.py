@@ -1,7 +1,7 @@
-"""The rows of a campaign: Parquet parts that are whole or not there, each known by the digest in its name.
+"""The rows of a campaign: Parquet files ("parts") that are complete or absent, each with a checksum in its name.
 
-A part holds the trials from its first to its last. The digest is keyed by what the campaign is, so that a part of
-another campaign, a cut one and a changed one are all told from a whole one, and a part needs no second file beside it.
+A part contains the trials from its first to its last. The checksum is keyed by the campaign, so it detects parts that
+are truncated, changed or of another campaign. A part needs no second file.
 """
 
 import functools
@@ -11,10 +11,9 @@ import json
 import os
 import re
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import polars as pl
 
@@ -26,13 +25,13 @@ _NAME = re.compile(r"(\d{10})-(\d{10})-([0-9a-f]{32})\.parquet")
 
 
 def named(path: Path) -> bool:
-    """Whether a file has the name of a part, of this campaign or of another."""
+    """Return whether a file has the name of a part, of any campaign."""
     return _NAME.fullmatch(path.name) is not None
 
 
 @dataclass(frozen=True, order=True)
 class Part:
-    """A part of a campaign's rows, whole and on the disk."""
+    """A complete part on disk."""
 
     first: int  # trial
     count: int
@@ -40,7 +39,7 @@ class Part:
 
     @property
     def end(self) -> int:
-        """The first trial beyond it."""
+        """The first trial after the part."""
         return self.first + self.count
 
 
@@ -52,11 +51,11 @@ class Rows:
     key: bytes  # see `key_of`
 
     def write(self, first: int, frame: pl.DataFrame) -> Part:
-        """Write a part as a whole: into a file beside it, which is moved into place when it is on the disk."""
+        """Write a part: first a temporary file, which is renamed when it is on disk."""
         return self.put(first, frame.height, encoded(frame))
 
     def put(self, first: int, count: int, content: bytes) -> Part:
-        """Write a part from a file's content; raises OSError where it does not fit on the disk."""
+        """Write a part with this content. Raises OSError if the disk is full."""
         self.folder.mkdir(parents=True, exist_ok=True)
         path = self.folder / f"{first:010d}-{first + count - 1:010d}-{self._digest(first, count, content)}.parquet"
         with store.whole(path) as making, making.open("xb") as file:
@@ -66,7 +65,7 @@ class Rows:
         return Part(first, count, path)
 
     def parts(self) -> tuple[list[Part], list[Path]]:
-        """Whole parts in order, none of them inside another; and files that are damaged or of another campaign."""
+        """Return the parts in order, without overlaps, and files that are damaged or of another campaign."""
         whole, broken = [], []
         for path in sorted(self.folder.glob("*.parquet")):
             name = _NAME.fullmatch(path.name)
@@ -82,7 +81,7 @@ class Rows:
         return parts, broken
 
     def tidy(self, parts: Iterable[Part]) -> None:
-        """Remove what a killed process left unfinished, and all parts but these, which `parts` found whole."""
+        """Remove temporary files of killed processes, and all parts except these."""
         for path in self.folder.glob(f"{store.MAKING}*"):
             path.unlink(missing_ok=True)
         whole = {part.path for part in parts}
@@ -109,27 +108,27 @@ def _digest_of_version(rows: Rows, path: Path, version: tuple[int, int, int], fi
     return rows._digest(first, count, path.read_bytes())
 
 
-def key_of(scenario: Mapping[str, Any], made_by: Mapping[str, Any]) -> bytes:
-    """What tells one campaign's parts from another's: scenario, seed and what else its rows depend on."""
+def key_of(scenario: store.Tables, made_by: store.Tables) -> bytes:
+    """Return the key of a campaign's checksums, from its scenario, seed and other inputs of its rows."""
     text = json.dumps([scenario, made_by], sort_keys=True, default=lambda value: f"<{type(value).__name__}>")
     return hashlib.sha256(text.encode()).digest()
 
 
 def encoded(frame: pl.DataFrame) -> bytes:
-    """A table as the content of a Parquet file."""
+    """Return a table as the content of a Parquet file."""
     buffer = io.BytesIO()
     frame.write_parquet(buffer, compression="zstd", compression_level=1)
     return buffer.getvalue()
 
 
 def read(parts: Sequence[Part], columns: Iterable[str] | None = None) -> pl.DataFrame:
-    """The rows of these parts, in order; columns: those wanted, all if None."""
+    """Return the rows of these parts, in order; columns: names, None for all."""
     wanted = None if columns is None else list(columns)
-    # without globbing: a folder called runs[1], or runs*, is no pattern
+    # a folder with the name runs[1] or runs* is not a pattern
     return pl.read_parquet([part.path for part in parts], columns=wanted, glob=False).rechunk()
 
 
 def columns_of(part: Part) -> list[str]:
-    """The names of the columns of a part, in order."""
+    """Return the names of the columns of a part, in order."""
     with part.path.open("rb") as file:  # a path would be taken as a pattern
         return list(pl.read_parquet_schema(file))

@@ -1,4 +1,4 @@
-"""One run: a scenario flown once, with its history, metrics and verdicts as plain numbers."""
+"""One run of a scenario, with its history, metrics and verdicts as plain numbers."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -22,49 +22,49 @@ from ptsmc_jax.simulation.rollout import Log, Parts
 from ptsmc_jax.theory import error_floor
 from ptsmc_jax.theory.error_floor import Floor
 
-FLOORS = 4  # trials whose floors are pooled: they differ by a few per cent
+FLOORS = 4  # trials whose lower bounds are pooled: they differ by a few per cent
 
 
 @dataclass(frozen=True)
 class Run:
     """A finished run."""
 
-    parts: Parts  # as flown
+    parts: Parts  # with their dispersions
     log: Log  # numpy arrays (time, component), intervals of length zero left out
     metrics: dict[str, float]
-    catalogue: dict[str, Entry]  # what those are
+    catalogue: dict[str, Entry]  # units and meanings of the metrics
     status: str
     reason: str
     bad_time: float  # [s], NaN if none
     verdicts: list[Verdict]
-    samples: dict[str, int]  # by the status that flight software of another make ended them with
+    samples: dict[str, int]  # numbers of samples by the status of exported flight software
 
     @property
     def met(self) -> bool:
-        """The run ended well and met every requirement."""
+        """Whether the run succeeded and met every requirement."""
         return self.status == "ok" and all(v.met for v in self.verdicts)
 
     @property
     def torque_limit(self) -> float | None:
-        """What the scenario allows of the torque; None: it does not say."""
+        """The scenario's limit on the torque; None if it has no limit."""
         return next((v.limit for v in self.verdicts if v.metric.startswith("peak_torque")), None)
 
     @cached_property
     def floor(self) -> Floor | None:
-        """What no controller can beat along this run, see `error_floor`.
+        """The lower bound of the error along this run, see `error_floor`.
 
-        None: it was not flown to the end, or with sensors of one's own, of which it is not known what they say.
+        None: the run did not reach the end, or its sensors are custom and have no linear model.
         """
         return error_floor.along(self.parts, self.log) if self.has_floor else None
 
     @property
     def has_floor(self) -> bool:
-        """Whether there is a `floor`."""
+        """Whether the run has a lower bound, see `floor`."""
         known = self.parts.sensors.perfect or hasattr(self.parts.sensors, "reading")
         return known and self.status in montecarlo.FINISHED
 
     def columns(self) -> dict[str, np.ndarray]:
-        """The history by column, (time,) each: t [s], state, estimate, delivered torque, s, wheels, flexible modes."""
+        """Return the history by column, (time,) each: t [s], state, estimate, delivered torque, s, wheels, modes."""
         log = self.log
         blocks = {**self.parts.plant.columns(log.x), "d_hat": log.d_hat, "u": log.u, "s": log.s}
         if log.wheels is not None:
@@ -77,14 +77,22 @@ class Run:
 
 
 def numbered(name: str, block: ArrayLike) -> dict[str, np.ndarray]:
-    """The columns of a (time, component) array, by its name and a number from 1 on."""
+    """Return the columns of a (time, component) array, named by a number from 1."""
     return {f"{name}{k + 1}": column for k, column in enumerate(np.asarray(block).T)}
 
 
 def fly(ready: Study, seed: int = 0, trial: int | Row | None = None, software: Software = OURS) -> Run:
-    """Fly one run: nominal with the noise of trial 0, or a trial, or a plan's row, with its dispersions and noise.
+    """Simulate one run.
 
-    software: the flight computer, where it is not the parts' own code.
+    Args:
+        ready: the scenario, ready to simulate.
+        seed: of dispersions and noise.
+        trial: the number of a trial, or a row of a run table, with its dispersions and noise. None: the nominal run
+            with the noise of trial 0.
+        software: the flight computer.
+
+    Returns:
+        The run with its verdicts.
     """
     run = _fly(ready, seed, trial, software)
     return replace(run, verdicts=[*run.verdicts, *margin_verdicts.of_loop(run.parts, ready.margins)])
@@ -110,7 +118,7 @@ def _fly(ready: Study, seed: int, trial: int | Row | None, software: Software = 
 
 
 def prepare(ready: Study) -> None:
-    """Begin to compile what flies one run of such a study, beside what is being done."""
+    """Start to compile the program for one run of such a study in the background."""
     number = np.uint32(0)
     rollout.single_run_program(ready.parts).prepare(ready.parts, number, number, record=True, software=OURS)
 
@@ -121,10 +129,16 @@ def _drawn(dispersion: Dispersion, parts: Parts, seed: jax.Array, trial: jax.Arr
 
 
 def floor(ready: Study, seed: int = 0, rows: Sequence[int | Row] = ()) -> float | None:
-    """RMS window error that no controller can beat, in its unit, see `error_floor`; 0: nothing is unknown.
+    """Return the lower bound of the RMS window error, in its unit, see `error_floor`; 0 if nothing is unknown.
 
-    Along the nominal run, or, where something is drawn, pooled over the first `FLOORS` trials, of a plan over these
-    rows. None: none of these has a `Run.floor`.
+    Args:
+        ready: the scenario, ready to simulate.
+        seed: of dispersions and noise.
+        rows: rows of a run table. By default the bound is that of the nominal run, or pooled over the first `FLOORS`
+            trials if the scenario has dispersions.
+
+    Returns:
+        The bound, or None if no run has one.
     """
     trials = rows or (range(FLOORS) if ready.dispersion.varies else (None,))
     runs = [_fly(ready, seed, trial) for trial in trials]

@@ -1,4 +1,4 @@
-"""Result folders: which are refused, and their files, written so that a folder is complete or not there."""
+"""Result folders: checks before writing, and files that are complete or absent."""
 
 import contextlib
 import csv
@@ -12,7 +12,6 @@ import secrets
 import shlex
 import shutil
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -28,17 +27,18 @@ try:
 except ImportError:  # Windows
     fcntl = None
 
-JOURNAL = "journal.bin"  # of a run that is not finished
-SUMMARY = "summary.json"  # of one that is
-WHOSE = (SUMMARY, "versions.json", "scenario.toml")  # tell a result from the one before: a map has the last two
-MAKING = ".making-"  # how the name of a file begins that is being written
-MADE_OF_RESULTS = {  # they would pass for those of the next one; by what is near its beginning each is known as ours
-    "figures/*.png": b"Creator\0ptsmc",  # see `style.save`
+JOURNAL = "journal.bin"  # of an unfinished run
+SUMMARY = "summary.json"  # of a finished run
+IDENTITY = (SUMMARY, "versions.json", "scenario.toml")  # files that differ between results
+MAKING = ".making-"  # prefix of temporary files
+MADE_OF_RESULTS = {  # files made from a result, with a mark near the beginning: files of the user stay
+    "figures/*.png": b"Creator\0ptsmc",  # written by `style.save`
     "report.html": b'<meta name="generator" content="ptsmc">',
     "worst.csv": b"trial,status,reason,bad_time,",
     "why.csv": b"metric,trial,value,input,drawn,",
 }
 CODE, COMMAND_LINE = "code_checksum", "command_line"  # in `versions.json`
+Tables = Mapping[str, Any]  # of a scenario, or of versions.json
 PACKAGES = ("ptsmc-jax", "jax", "jaxlib", "numpy", "scipy", "optax", "cmaes")
 
 
@@ -50,8 +50,8 @@ class InUseError(RefusedError):
     """Another process is writing into the folder."""
 
 
-def versions(command: str, seed: int | None, **others: Any) -> dict[str, Any]:
-    """What made a result: command and seed (None: nothing is drawn), versions, machine."""
+def versions(command: str, seed: int | None, **others: object) -> dict[str, Any]:
+    """Return the content of versions.json: command, seed (None: no random numbers), versions, machine."""
     return {"command": command, "seed": seed, **others, COMMAND_LINE: _command_line(), **_surroundings()}
 
 
@@ -73,27 +73,29 @@ def packages() -> dict[str, str]:
 
 
 def read_versions(folder: Path) -> dict[str, Any]:
-    """What `versions` said when the results in a folder were made; empty where it cannot be read."""
+    """Return the content of a result's versions.json; empty if it cannot be read."""
+    return _read_json(folder / "versions.json")
+
+
+def _read_json(path: Path) -> dict[str, Any]:
     try:
-        made_by = json.loads((folder / "versions.json").read_text(encoding="utf-8"))
+        content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
         return {}
-    return made_by if isinstance(made_by, dict) else {}
+    return content if isinstance(content, dict) else {}
 
 
-def previous(folder: Path, scenario: Mapping[str, Any], made_by: Mapping[str, Any]) -> dict[str, Any] | None:
-    """The summary of the same scenario with the same command, seed and what else made it (`versions`); None: none."""
-    try:
-        summary = json.loads((folder / SUMMARY).read_text()) if _same(folder, scenario, made_by) else None
-    except (OSError, ValueError, RecursionError):
-        return None
-    return summary if isinstance(summary, dict) and "status" in summary else None
+def previous(folder: Path, scenario: Tables, made_by: Tables) -> dict[str, Any] | None:
+    """Return the summary of the same scenario, command, seed and other inputs (`versions`); None if there is none."""
+    summary = {} if difference(folder, scenario, made_by) else _read_json(folder / SUMMARY)
+    return summary if "status" in summary else None
 
 
-def begun(folder: Path, scenario: Mapping[str, Any], made_by: Mapping[str, Any]) -> bool:
-    """Whether the folder holds the beginning of this run: see `begin`.
+def begun(folder: Path, scenario: Tables, made_by: Tables) -> bool:
+    """Return whether the folder contains this run, unfinished, see `begin`.
 
-    Raises RefusedError if it holds the beginning of another run, or if other versions began this one.
+    Raises:
+        RefusedError: it contains another unfinished run, or one of other versions.
     """
     if not (folder / JOURNAL).exists():
         return False
@@ -101,7 +103,7 @@ def begun(folder: Path, scenario: Mapping[str, Any], made_by: Mapping[str, Any])
     return True
 
 
-def refuse_others(folder: Path, scenario: Mapping[str, Any], made_by: Mapping[str, Any]) -> None:
+def refuse_others(folder: Path, scenario: Tables, made_by: Tables) -> None:
     """Raise RefusedError if the folder holds another run than this: see `difference`."""
     other = difference(folder, scenario, made_by)
     if other is not None:
@@ -110,10 +112,14 @@ def refuse_others(folder: Path, scenario: Mapping[str, Any], made_by: Mapping[st
         )
 
 
-def begin(folder: Path, scenario: Mapping[str, Any], made_by: Mapping[str, Any], *, fresh: bool) -> Path:
-    """Make the folder of a run that can go on where it was interrupted; returns the path of its journal.
+def begin(folder: Path, scenario: Tables, made_by: Tables, *, fresh: bool) -> Path:
+    """Make the folder of a run that can be resumed; return the path of its journal.
 
-    fresh: forget what the folder's journal holds, and the summary of what was there.
+    Args:
+        folder: the result folder.
+        scenario: tables of the scenario.
+        made_by: see `versions`.
+        fresh: start again: empty the journal and remove the summary.
     """
 
     def fill(making: Path) -> None:
@@ -127,35 +133,15 @@ def begin(folder: Path, scenario: Mapping[str, Any], made_by: Mapping[str, Any],
 
 
 def forget(folder: Path) -> None:
-    """Remove the summary of a result folder, and what was made of that result: they would pass for the next one's.
-
-    Only what came from here, and nothing where no result is.
-    """
+    """Remove the summary of a result and the files made from it, so that they do not pass for the next result's."""
     if not ((folder / SUMMARY).exists() or "command" in read_versions(folder)):
         return
-    made = (path for name, mark in MADE_OF_RESULTS.items() for path in folder.glob(name) if _has(path, mark))
-    for path in (folder / SUMMARY, *made, *_of_laws(folder)):
-        path.unlink(missing_ok=True)
-
-
-def _has(path: Path, mark: bytes) -> bool:
-    """Whether it is a file with this near its beginning."""
-    if not path.is_file():
-        return False
-    try:
-        with path.open("rb") as file:
-            return mark in file.read(1024)
-    except FileNotFoundError:  # another shard has removed it
-        return False
-
-
-def _of_laws(folder: Path) -> list[Path]:
-    """The scenarios of the laws of a comparison, which its summary names: others beside them may be a user's own."""
-    try:
-        laws = json.loads((folder / SUMMARY).read_text())["laws"]
-        return [path for path in folder.glob("scenarios/*.toml") if path.stem in laws]
-    except (OSError, ValueError, RecursionError, KeyError, TypeError):
-        return []
+    for pattern, mark in MADE_OF_RESULTS.items():
+        for path in folder.glob(pattern):
+            with contextlib.suppress(FileNotFoundError, IsADirectoryError):  # another shard may remove it, too
+                if mark in path.read_bytes()[:1024]:
+                    path.unlink()
+    (folder / SUMMARY).unlink(missing_ok=True)
 
 
 def _alike(new: Path, old: Path) -> bool:
@@ -167,16 +153,12 @@ def _alike(new: Path, old: Path) -> bool:
 
 
 def end(folder: Path) -> None:
-    """Forget the journal of a run that is done."""
+    """Remove the journal of a finished run."""
     (folder / JOURNAL).unlink(missing_ok=True)
 
 
-def _same(folder: Path, scenario: Mapping[str, Any], made_by: Mapping[str, Any]) -> bool:
-    return difference(folder, scenario, made_by) is None
-
-
-def difference(folder: Path, scenario: Mapping[str, Any], made_by: Mapping[str, Any]) -> str | None:
-    """What tells the run in the folder from this one, in words; None: nothing does."""
+def difference(folder: Path, scenario: Tables, made_by: Tables) -> str | None:
+    """Return in words how the run in the folder differs from this run; None if it does not."""
     versions = read_versions(folder)
     try:
         old_tables = parsing.toml((folder / "scenario.toml").read_text(encoding="utf-8"), "scenario.toml")
@@ -201,23 +183,21 @@ def difference(folder: Path, scenario: Mapping[str, Any], made_by: Mapping[str, 
 
 
 def check(folder: Path, force: bool) -> None:
-    """Raise RefusedError where this folder must not be written to."""
-    above = next((parent for parent in folder.parents if parent.exists() and not parent.is_dir()), None)
-    if above is not None:
-        raise RefusedError(f"--out is {folder}, which lies below the file {above}; allowed is a new folder")
-    if folder.exists() and not folder.is_dir():
-        raise RefusedError(f"--out is {folder}, which is a file; allowed is a new folder")
-    there = next(one for one in (folder, *folder.parents) if one.exists())
-    if not _takes(there):
+    """Raise RefusedError if this folder must not be written to; force: it may have content."""
+    there = next(path for path in (folder, *folder.parents) if path.exists())
+    if not there.is_dir():
+        which = "which" if there == folder else f"but {there}"
+        raise RefusedError(f"--out is {folder}, {which} is a file; allowed is a new folder")
+    if not os.access(there, os.W_OK):
         raise RefusedError(f"--out is {folder}, but nothing may be written into {there}; allowed is a folder elsewhere")
-    if folder.is_dir() and not is_empty(folder) and not force:
+    if there == folder and not force and not is_empty(folder):
         raise RefusedError(
             f"--out is {folder}, which holds something already; allowed is a new folder, or --force to write into it"
         )
 
 
 def is_empty(folder: Path) -> bool:
-    """Whether a folder holds nothing, except the lock file of `in_use`."""
+    """Return whether a folder is empty, except for the lock file of `in_use`."""
     return all(path.name == _lock_file(folder).name for path in folder.iterdir())
 
 
@@ -289,19 +269,8 @@ def _flock(file: IO[str], *, shared: bool) -> None:
         pass
 
 
-def _takes(folder: Path) -> bool:
-    """Whether a folder can be made in it: /proc says that it may be written to, to one who may all, and takes none."""
-    try:
-        if os.access(folder, os.W_OK):
-            Path(tempfile.mkdtemp(prefix=MAKING, dir=folder)).rmdir()
-            return True
-    except (FileNotFoundError, PermissionError):
-        pass
-    return False
-
-
 def check_file(file: Path, force: bool, way: str = "--force") -> None:
-    """Raise RefusedError where this file must not be written; way: how `force` is said."""
+    """Raise RefusedError if this file must not be written; way: the option for `force`."""
     if not file.parent.is_dir():
         raise RefusedError(f"the file is {file}, but {file.parent} is no folder; allowed is one that exists")
     if file.is_dir() or (file.exists() and not force):
@@ -310,30 +279,24 @@ def check_file(file: Path, force: bool, way: str = "--force") -> None:
 
 
 def write(folder: Path, fill: Callable[[Path], None]) -> None:
-    """Make a result folder: `fill` writes into a new one beside it, whose files are then moved into place.
+    """Write a result folder: `fill` writes into a temporary folder, whose files are then moved.
 
-    Where nothing may stand beside it, or on another disk only, the new one is inside it. Of another result that was
-    there, see `WHOSE`, summary, figures and tables go; what says whose the files are is moved first, the new summary
-    last, since it says that the result is whole.
+    If the folder contains another result, see `IDENTITY`, its summary, figures and tables are removed. versions.json is
+    moved first and the summary last: a folder with a summary is complete.
     """
-    asked, folder = folder, Path(os.path.realpath(folder))  # of a link, what it leads to
+    folder = Path(os.path.realpath(folder))
     folder.parent.mkdir(parents=True, exist_ok=True)
     making = _beside(folder) / f".{folder.name}-{secrets.token_hex(4)}"
-    try:
-        making.mkdir()
-    except OSError as error:  # names a folder that nobody asked for
-        raise OSError(error.errno, error.strerror, str(asked)) from None
+    making.mkdir()
     try:
         fill(making)
         if not folder.exists():
-            try:
+            with contextlib.suppress(OSError):  # another shard was first
                 making.rename(folder)
                 return
-            except OSError:  # another process was first, with the same run: shards begin at once
-                pass
         order = {"versions.json": -1, SUMMARY: 1}
         files = (path for path in making.rglob("*") if path.is_file())
-        if any((making / name).exists() and not _alike(making / name, folder / name) for name in WHOSE):
+        if any((making / name).exists() and not _alike(making / name, folder / name) for name in IDENTITY):
             forget(folder)
         for path in sorted(files, key=lambda path: order.get(path.name, 0)):
             target = folder / path.relative_to(making)
@@ -352,37 +315,35 @@ def _beside(folder: Path) -> Path:
     return folder if inside else folder.parent
 
 
-def record(
-    folder: Path, scenario: Mapping[str, Any], made_by: Mapping[str, Any], summary: Mapping[str, Any] | None = None
-) -> None:
-    """Write what every result folder has: the scenario's tables, what made it (`versions`), and its summary if any."""
+def record(folder: Path, scenario: Tables, made_by: Tables, summary: Tables | None = None) -> None:
+    """Write the files of every result folder: scenario.toml, versions.json, and the summary if there is one."""
     write_toml(folder / "scenario.toml", scenario)
     write_json(folder / "versions.json", versions(**made_by))
     if summary is not None:
         write_json(folder / SUMMARY, summary)
 
 
-def write_toml(path: Path, tables: Mapping[str, Any]) -> None:
-    """A TOML file, arrays on one line."""
+def write_toml(path: Path, tables: Tables) -> None:
+    """Write a TOML file, with arrays on one line."""
     text, before = tomli_w.dumps(_named(tables)), ""
     while text != before:  # innermost arrays first
         text, before = re.sub(r"\[\n((?: +[^\]\s][^\n]*,\n)+) *\]", _one_line, text), text
     write_text(path, text)
 
 
-def write_json(path: Path, value: Any) -> None:
-    """A JSON file; numbers that are not finite become null."""
+def write_json(path: Path, value: object) -> None:
+    """Write a JSON file; numbers that are not finite become null."""
     write_text(path, json.dumps(plain(value), indent=2, allow_nan=False) + "\n")
 
 
 def write_text(path: Path, text: str) -> None:
-    """A text file that is whole or not there; bytes of a file's name that are no UTF-8 become escapes."""
+    """Write a text file as a whole; bytes that are not UTF-8, from names of files, become escapes."""
     with whole(path) as making:
         making.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """A CSV file that is whole or not there; numbers with as many digits as it takes to read them back exactly."""
+    """Write a CSV file as a whole; numbers have enough digits to be read back exactly."""
     with whole(path) as making, making.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(header)
@@ -391,14 +352,14 @@ def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) 
 
 @contextlib.contextmanager
 def whole(path: Path) -> Iterator[Path]:
-    """The file beside it that is written first, and then moved into place, or is gone where that fails."""
+    """Yield a temporary file beside it, which is then moved into place, or removed after an error."""
     making = path.with_name(f"{MAKING}{secrets.token_hex(8)}")
     try:
         yield making
         os.replace(making, path)
     except OSError as error:
         if error.filename is not None:
-            error.filename = str(path)  # instead of one that nobody asked for
+            error.filename = str(path)  # not the temporary file
         raise
     finally:
         with contextlib.suppress(OSError):
@@ -410,7 +371,7 @@ def _one_line(array: re.Match[str]) -> str:
 
 
 def plain(value: Any) -> Any:
-    """A value as a JSON file has it: numbers, lists, dicts; None for a number that is not finite."""
+    """Return a value for a JSON file: numbers, lists, dicts; None for a number that is not finite."""
     if isinstance(value, Mapping):
         return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
@@ -423,7 +384,7 @@ def plain(value: Any) -> Any:
 
 
 def _named(value: Any) -> Any:
-    """Tables whose objects made in Python, which no file can hold, are named; reading refuses such a name."""
+    """Return tables with names instead of objects made in Python; reading refuses such a name."""
     if isinstance(value, Mapping):
         return {k: _named(v) for k, v in value.items()}
     if isinstance(value, list | tuple):

@@ -214,7 +214,7 @@ QUANTITIES: dict[str, Quantity] = {
     INITIAL_RATE: field_quantity("initial.w", "initial_w", unit="rad/s"),
     INITIAL_STATE: Quantity(
         lambda parts: (
-            [] if parts.plant.attitude else number_names("initial_x", parts.plant.visible(parts.initial).size)
+            numbered("initial_x", parts.plant.visible(parts.initial).size) if "x" in parts.plant.signals else []
         ),
         lambda parts: parts.plant.visible(parts.initial),
         lambda parts, x: replace(parts, initial=parts.plant.with_hidden_at_rest(x)),
@@ -226,8 +226,8 @@ QUANTITIES: dict[str, Quantity] = {
         combine={"normal": rotate_nominal, "axis_angle": rotate_about_axis, "any_attitude": replace_nominal},
         checked=_normalise,
     ),
-    INERTIA: Quantity(  # with random numbers from `RelativeInertia`
-        lambda parts: [f"{INERTIA}_{i + 1}{j + 1}" for i, j in PAIRS] if parts.plant.attitude else [],
+    INERTIA: Quantity(  # its random numbers: `RelativeInertia`
+        lambda parts: [f"{INERTIA}_{i + 1}{j + 1}" for i, j in PAIRS] if hasattr(parts.plant, "with_inertia") else [],
         lambda parts: jnp.stack([paths.get(parts, "plant.inertia")[i, j] for i, j in PAIRS]),
         _with_inertia,
         unit="kg m^2",
@@ -346,13 +346,12 @@ def read_columns(parts: Parts, names: Iterable[str]) -> dict[str, Array]:
 def units(parts: Parts) -> dict[str, str]:
     """Return the units, such as "rad" or "-", of all columns of these parts, and of `initial_angle`.
 
-    For plants other than a spacecraft, units that depend on the plant are "".
+    A unit is empty if the plant has units of its own.
     """
-    is_body = parts.plant.attitude
-    named = {"initial_angle": "rad" if is_body else "x1"}
+    named = {"initial_angle": parts.controller.kinematics.angle_unit}
     for quantity in QUANTITIES.values():
         columns, unit = quantity.columns(parts), quantity.unit
         each = (unit,) * len(columns) if isinstance(unit, str) else unit[: len(columns)]
-        known = [one if is_body or one in ("rad", "s", "-") else "" for one in each]
+        known = [one if parts.plant.input_unit or one in ("rad", "s", "-") else "" for one in each]
         named |= dict(zip(columns, known, strict=True))
     return named

@@ -1,4 +1,4 @@
-"""A body turning in three dimensions, as frames with controls in one piece of HTML: works offline."""
+"""Animation of a turning body: frames with controls in one HTML page that works offline."""
 
 import re
 from itertools import combinations, product
@@ -12,13 +12,13 @@ from matplotlib.figure import Figure
 from ptsmc_jax.figures.style import RC, STYLES
 from ptsmc_jax.simulation.rollout import Log, Parts
 
-SIDES = (0.5, 0.35, 0.25)  # half edges of the box that is drawn; shapes say nothing of the inertia
+SIDES = (0.5, 0.35, 0.25)  # half edges of the drawn box, independent of the inertia
 _CORNERS = np.array(list(product((-1.0, 1.0), repeat=3))) * SIDES
 _EDGES = np.array([(i, j) for i, j in combinations(range(8), 2) if np.sum(_CORNERS[i] != _CORNERS[j]) == 1])
 
 
 class Animation:
-    """Shown in a notebook; `save` writes it as a page of its own."""
+    """An animation that notebooks show; `save` writes it as a page."""
 
     def __init__(self, content: str):
         self._content = content
@@ -27,29 +27,38 @@ class Animation:
         return self._content
 
     def save(self, path: str | Path) -> None:
-        """Write an HTML page that needs nothing else."""
+        """Write a self-contained HTML page."""
         page = f'<!doctype html><html><head><meta charset="utf-8"></head><body>{self._content}</body></html>'
         Path(path).write_text(page, encoding="utf-8")
 
 
 def turned(q: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Vectors (n, 3) in body axes, in inertial axes; q (4,) scalar last, body relative to inertial."""
+    """Return vectors (n, 3) of the body in inertial axes; q (4,) scalar last, body relative to inertial."""
     v, scalar = q[:3], q[3]
     return vectors + 2.0 * np.cross(v, np.cross(v, vectors) + scalar * vectors)
 
 
 def body(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The edges of the box (12, 2, 3) and the body's axes (3, 2, 3), from end to end in inertial axes; q (4,)."""
+    """Return the edges of the box (12, 2, 3) and the body axes (3, 2, 3), both ends, in inertial axes; q (4,)."""
     tips = turned(q, np.eye(3))
     return turned(q, _CORNERS)[_EDGES], np.stack([np.zeros_like(tips), tips], axis=1)
 
 
 def of_run(parts: Parts, log: Log, frames: int = 40) -> Animation:
-    """The body of a run with its axes, and the reference's axes dashed; log with numpy arrays (time, component).
+    """Animate the body of a run with its axes; the axes of the reference are dashed.
 
-    Frames are evenly spread over the run. Raises ValueError where the plant is no spacecraft, or for fewer than two.
+    Args:
+        parts: of the run.
+        log: numpy arrays (time, component).
+        frames: number of frames, evenly spread over the run.
+
+    Returns:
+        The animation.
+
+    Raises:
+        ValueError: the plant has no attitude, or there are fewer than two frames.
     """
-    if not parts.plant.attitude:
+    if not hasattr(log.x, "q"):
         raise ValueError("only a spacecraft can be animated; look at a run's plot() instead")
     if frames < 2:
         raise ValueError(f"frames is {frames}, but must be at least 2")
@@ -78,7 +87,7 @@ def of_run(parts: Parts, log: Log, frames: int = 40) -> Animation:
     return Animation(_alone(content))
 
 
-# the controls' icons come from a font on the internet; these are characters
+# matplotlib's icons come from a font on the internet; these characters replace them
 _ICONS = {
     "fa-minus": "&minus;", "fa-fast-backward": "&#124;&#9664;", "fa-step-backward": "&#9664;&#124;",
     "fa-play fa-flip-horizontal": "&#9664;", "fa-pause": "&#10073;&#10073;", "fa-play": "&#9654;",
@@ -87,7 +96,7 @@ _ICONS = {
 
 
 def _alone(content: str) -> str:
-    """The page without anything that is fetched from elsewhere."""
+    """Return the page without parts that are loaded from the internet."""
     for name, icon in _ICONS.items():
         content = content.replace(f'<i class="fa {name}"></i>', icon)
     return re.sub(r"<link[^>]*>", "", content)

@@ -1,4 +1,4 @@
-"""Campaigns as matplotlib figures: the fan of the error, distributions, points by status; each returns a Figure."""
+"""Campaigns as matplotlib figures: bands of the error, distributions, points by status."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -8,11 +8,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from ptsmc_jax.figures.style import LIMIT, STYLES, figure_of, logarithmic, styled
+from ptsmc_jax.figures.style import LIMIT, STYLES, figure_of, logarithmic, styled, with_unit
 from ptsmc_jax.simulation.catalogues import CATALOGUES, percent
 
-BANDS = ((99.7, "0.85"), (90.0, "0.68"), (50.0, "0.45"))  # central share of the trials [%], grey
-# flown to the end, but beyond a limit: of a requirement on shares of time, which may hold all the same, or on trials
+BANDS = ((99.7, "0.85"), (90.0, "0.68"), (50.0, "0.45"))  # central fraction of the trials [%], grey
+# runs to the end that violate a limit on fractions of time, which may be met all the same, or on trials
 AT_TIMES = "beyond a limit that may be left at times"
 BEYOND = "beyond a limit"
 FLOWN = ("ok", AT_TIMES, BEYOND, "missed")  # to the end
@@ -29,19 +29,19 @@ MARKS = {
 
 
 class Column(NamedTuple):
-    """A metric of many trials, or what was drawn for them."""
+    """A metric or a dispersed quantity of many trials."""
 
-    unit: str  # empty: it has none
-    values: np.ndarray  # (trials,), NaN where a trial has none
-    limit: float | None = None  # that is asked for
-    of_time: str = ""  # where it is asked for in a share of the time: this share, and what is seen of it
+    unit: str  # empty: no unit
+    values: np.ndarray  # (trials,), NaN if a trial has no value
+    limit: float | None = None  # required
+    of_time: str = ""  # of a requirement on a fraction of time: required and observed fraction
 
     def label(self, name: str) -> str:
-        """This name with its unit."""
-        return f"{name} [{self.unit}]" if self.unit else name
+        """Return the name with the unit."""
+        return with_unit(name, self.unit)
 
     def within(self) -> str:
-        """The limit, and how many trials keep it."""
+        """Return a text with the limit and the fraction of trials within."""
         limit, within = f"limit {self.limit:g} {self.unit}".rstrip(" -"), np.mean(self.values <= self.limit)
         if not self.of_time:
             return f"{limit}: {percent(float(within))} % within"
@@ -49,14 +49,14 @@ class Column(NamedTuple):
 
 
 def fan(t: np.ndarray, errors: np.ndarray, worst: tuple[int, np.ndarray], t_f: float, kind: str) -> Figure:
-    """Error over time of many trials: central bands, the median, the worst run.
+    """Plot the error of many trials over time: central bands, median, worst run.
 
     Args:
         t: (time,) [s].
         errors: (trials, time) in the unit of this kind of plant.
         worst: the trial of the largest window error, and its errors (time,).
         t_f: the prescribed time [s].
-        kind: of the plant.
+        kind: of the plant; it determines the unit.
     """
     unit = CATALOGUES[kind]["terminal_error"].unit
     trials = f"{len(errors)} trial{'s' if len(errors) != 1 else ''}"
@@ -77,17 +77,17 @@ def fan(t: np.ndarray, errors: np.ndarray, worst: tuple[int, np.ndarray], t_f: f
 
 @styled
 def distributions(metrics: Mapping[str, Column]) -> Figure:
-    """Share of the trials up to each value of each metric, with the limits.
+    """Plot the distribution function of each metric, with the limits.
 
-    A trial without a value (NaN) counts as beyond all. The scale of the shares is that of their odds, so that 99.9 %
-    is as far from 99 % as 1 % from 10 %.
+    A trial without a value (NaN) counts as larger than all values. The scale is logit: 99.9 % is as far from 99 % as
+    1 % from 10 %.
     """
     figure = Figure(figsize=(8.0, 3.0 * len(metrics)), layout="constrained")
     rows = figure.subplots(len(metrics), 1, squeeze=False)[:, 0]
     for axes, (name, column) in zip(rows, metrics.items(), strict=True):
         ordered = np.sort(column.values)  # NaN last
         n, known = ordered.size, int(np.isfinite(ordered).sum())
-        # every rank near both ends, and as many between as can be seen
+        # all ranks near both ends, fewer between
         ranks = np.unique(np.concatenate([np.geomspace(1, n, 600), n + 1 - np.geomspace(1, n, 600)]).astype(int))
         ranks = ranks[ranks <= known]
         share = (ranks - 0.5) / n
@@ -108,8 +108,8 @@ def distributions(metrics: Mapping[str, Column]) -> Figure:
 
 
 def _free(axes: Axes, limit: float, ordered: np.ndarray) -> str:
-    """Where neither shares, which rise from the lower left to the upper right, nor the limit's line are in the way."""
-    axes.autoscale_view()  # which waits for drawing
+    """Return a place for the legend that covers neither the rising curve nor the line of the limit."""
+    axes.autoscale_view()  # matplotlib would do it when it draws
     place = axes.transData + axes.transAxes.inverted()
     at, *ends = (place.transform((x, 0.5))[0] for x in (limit, *ordered[:1], *ordered[-1:]))
     if at > 0.5:
@@ -118,30 +118,27 @@ def _free(axes: Axes, limit: float, ordered: np.ndarray) -> str:
 
 
 def torque_by_angle(
-    angle: np.ndarray,
-    torque: np.ndarray,
+    start: Column,
+    torque: Column,
     outcome: np.ndarray,
     totals: Mapping[str, int],
-    limit: float | None,
-    kind: str = "spacecraft",
 ) -> Figure:
-    """Peak torque against the initial error, a point a trial.
+    """Plot peak torque against the initial error, a point a trial.
 
     Args:
-        angle: initial error of each trial, (trials,) [rad].
-        torque: its peak torque, (trials,) [N m].
+        start: initial error of each trial; an angle [rad] is drawn in degrees.
+        torque: peak torque of each trial.
         outcome: one of `MARKS` for each, (trials,).
         totals: how many trials of the whole campaign have each outcome.
-        limit: of the torque [N m], if one is asked for.
-        kind: of the plant, whose units are those of its metrics.
     """
-    unit, attitude = CATALOGUES[kind]["peak_torque"].unit, kind == "spacecraft"
-    figure, axes = figure_of("Peak torque by how far the trial starts", f"peak torque [{unit}]")
-    _points(axes, np.degrees(angle) if attitude else angle, torque, outcome, totals)
-    axes.set_xlabel("initial angle [deg]" if attitude else "initial |x_1| [x1]")
+    figure, axes = figure_of("Peak torque by initial error", torque.label("peak torque"))
+    in_degrees = start.unit == "rad"
+    _points(axes, np.degrees(start.values) if in_degrees else start.values, torque.values, outcome, totals)
+    axes.set_xlabel("initial angle [deg]" if in_degrees else start.label("initial error"))
+    limit = torque.limit
     if limit is not None:
-        axes.axhline(limit, **LIMIT, label=f"limit {limit:g} {unit}")
-    finished = torque[np.isin(outcome, FLOWN) & np.isfinite(torque)]
+        axes.axhline(limit, **LIMIT, label=f"limit {limit:g} {torque.unit}")
+    finished = torque.values[np.isin(outcome, FLOWN) & np.isfinite(torque.values)]
     if finished.size and finished.min() > 0.0:
         shown = [*finished, limit] if limit else finished
         logarithmic(axes, "y")
@@ -157,7 +154,7 @@ def inputs(
     outcome: np.ndarray,
     totals: Mapping[str, int],
 ) -> Figure:
-    """What was drawn, a column each, against metrics, a row each; a point a trial, see `torque_by_angle`."""
+    """Plot metrics (rows) against dispersed quantities (columns), a point a trial, see `torque_by_angle`."""
     rows, columns = len(metrics), len(drawn)
     figure = Figure(figsize=(2.9 * columns + 0.8, 2.4 * rows + 0.7), layout="constrained")
     grid = figure.subplots(rows, columns, sharex="col", sharey="row", squeeze=False)
@@ -169,7 +166,7 @@ def inputs(
                 axes.axhline(column.limit, **LIMIT)
             if known.size and known.min() > 0.0 and known.max() > 10.0 * known.min():
                 logarithmic(axes, "y")
-        line[0].set_ylabel(column.label(metric).replace(" [", "\n["))  # longer than a row is high
+        line[0].set_ylabel(column.label(metric).replace(" [", "\n["))  # too long for one line
     for axes, (name, x) in zip(grid[-1], drawn.items(), strict=True):
         axes.set_xlabel(x.label(name))
         axes.xaxis.set_major_locator(MaxNLocator(4))
@@ -183,5 +180,5 @@ def _points(axes: Axes, x: np.ndarray, y: np.ndarray, outcome: np.ndarray, total
         those = outcome == name
         if np.any(those):
             label = f"{name}: {totals[name]}"
-            width = 1.2 if marker in ("x", "+") else 0.0  # these are lines, and nothing without a width
+            width = 1.2 if marker in ("x", "+") else 0.0  # line markers are invisible without a width
             axes.scatter(x[those], y[those], s=size, c=colour, marker=marker, alpha=0.6, label=label, linewidths=width)

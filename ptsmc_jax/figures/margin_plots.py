@@ -1,4 +1,4 @@
-"""The opened loop as figures: Nichols chart, sensitivity, margins against the time to go."""
+"""The open loop as figures: Nichols chart, sensitivity, margins against time to go."""
 
 from collections.abc import Sequence
 
@@ -8,23 +8,23 @@ from matplotlib.figure import Figure
 from ptsmc_jax.figures.style import STYLES, plain_ticks, styled
 from ptsmc_jax.theory.margins import Margins
 
-MODULUS = 6.0  # dB, of the contour that is drawn
-DEEPEST = 40.0  # dB of |L| that are shown, either way
+MODULUS = 6.0  # sensitivity of the contour [dB]
+DEEPEST = 40.0  # largest and smallest |L| that is drawn [dB]
 
 
 def _decibels(seen: np.ndarray) -> np.ndarray:
-    """Sizes [dB], far below what is shown where there is nothing, as of a command that a limit cuts."""
+    """Return sizes [dB], far below the axis for 0, as of a saturated command."""
     return 20.0 * np.log10(np.maximum(np.abs(seen), 1e-9))
 
 
 @styled
 def nichols(L: np.ndarray, names: Sequence[str]) -> Figure:
-    """|L| over its phase, (points, axes), around the point -1 and what keeps `MODULUS` from it."""
+    """Plot |L| over its phase (points, axes), with the point -1 and the contour of the sensitivity `MODULUS`."""
     figure = Figure(figsize=(8.0, 5.5), layout="constrained")
     axes = figure.subplots()
     for k, name in enumerate(names):
         size, phase = _decibels(L[:, k]), np.rad2deg(np.unwrap(np.angle(L[:, k])))
-        near = np.argmin(np.abs(size))  # the branch on which it crosses 0 dB nearest to -180 degrees
+        near = np.argmin(np.abs(size))  # choose the branch with the crossing of 0 dB nearest to -180 degrees
         phase = phase - 360.0 * np.round((phase[near] + 180.0) / 360.0)
         colour, style = STYLES[k % len(STYLES)]
         axes.plot(phase, size, color=colour, ls=style, label=name)
@@ -33,14 +33,14 @@ def nichols(L: np.ndarray, names: Sequence[str]) -> Figure:
     axes.plot(angle, _decibels(around), color="0.35", lw=1.0, label=f"sensitivity {MODULUS:g} dB")
     axes.plot(-180.0, 0.0, "+", color="0.0", ms=12, mew=1.6)
     axes.set(xlabel="phase of L [deg]", ylabel="|L| [dB]", ylim=(-DEEPEST, DEEPEST))
-    axes.set_title("Nominal loop opened at the plant's input, hold phase", loc="left")
+    axes.set_title("Nominal loop, opened at the plant's input, hold phase", loc="left")
     axes.legend()
     return figure
 
 
 @styled
 def sensitivity(w: np.ndarray, L: np.ndarray, names: Sequence[str]) -> Figure:
-    """|S| = |1 / (1 + L)| and |T| = |L / (1 + L)| over the frequency; L (points, axes)."""
+    """Plot |S| = |1 / (1 + L)| and |T| = |L / (1 + L)| over the frequency w [rad/s]; L (points, axes)."""
     figure = Figure(figsize=(8.0, 4.5), layout="constrained")
     axes = figure.subplots()
     shown = w > w[-1] * 1e-4
@@ -58,7 +58,7 @@ def sensitivity(w: np.ndarray, L: np.ndarray, names: Sequence[str]) -> Figure:
 
 @styled
 def over_time(left: np.ndarray, before: Margins, hold: Margins) -> Figure:
-    """The worst axis's margins against the time to go (times,) [s] before the hand-over, and in hold (lines)."""
+    """Plot the margins of the worst axis against time to go (times,) [s], and of the hold phase as lines."""
     figure = Figure(figsize=(8.0, 6.5), layout="constrained")
     rows = figure.subplots(3, 1, sharex=True)
     panels = (("gain [dB]", "gain_up", "gain_down"), ("phase [deg]", "phase"), ("delay [s]", "delay"))

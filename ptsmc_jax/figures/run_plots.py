@@ -1,6 +1,5 @@
-"""Histories of runs as matplotlib figures, axes labelled with units; each function returns a Figure."""
+"""Histories of runs as matplotlib figures with units. Each function returns a Figure."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -9,24 +8,24 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-from ptsmc_jax.figures.style import LIMIT, STYLES, TIME, figure_of, plain_ticks, styled
-from ptsmc_jax.paper.remark_2 import Measured
+from ptsmc_jax.figures.style import LIMIT, STYLES, figure_of, plain_ticks, with_unit
+from ptsmc_jax.plants.base import Chart
 from ptsmc_jax.simulation.rollout import Log, Parts
 from ptsmc_jax.theory import envelopes, solutions
 from ptsmc_jax.theory.error_floor import Floor
 
-FAR_OFF = 3.0  # times what is drawn, from which on a limit, or a command that is not delivered, is not drawn
-SMALLEST, LARGEST = 1e-16, 1e100  # of errors and s that are shown; of all that a run that diverges leaves
-MANY_POINTS = 200_000  # of curves, from which on a place for the legend takes as long to find as they take to draw
-EXACT: Any = {"color": "0.25", "lw": 0.9, "ls": (0, (1, 1.5))}  # how the exact motion is drawn, and a bound
+FAR_OFF = 3.0  # a limit or command beyond this multiple of the curves is only named in the legend
+SMALLEST, LARGEST = 1e-16, 1e100  # smallest error and s, and largest number, that are drawn
+MANY_POINTS = 200_000  # with more points, the search of a place for the legend takes as long as drawing
+EXACT: Any = {"color": "0.25", "lw": 0.9, "ls": (0, (1, 1.5))}  # line of the exact motion
 BOUND: Any = {"color": "0.35", "lw": 1.0, "ls": "--", "label": "bound, no noise"}
 
 
 def run_figures(parts: Parts, log: Log, limit: float | None, floor: Floor | None) -> dict[str, Figure]:
-    """Figures of one run by name; log with numpy arrays (time, component); limit: largest torque allowed [N m]."""
+    """Return the figures of one run by name; log: numpy arrays (time, component); limit: of the torque [N m]."""
     log = jax.tree.map(lambda v: np.where(np.abs(v) < LARGEST, v, np.nan), log)
     figures = {"torque": torque(parts, log, limit)}
-    if np.any(log.error):  # else there is nothing that log axes show
+    if np.any(log.error):  # log axes cannot show zeros
         figures = {"error": error(parts, log, floor), "sliding": sliding(parts, log), **figures}
         if parts.controller.prescribed and any(map(np.any, solutions.exact_sizes(parts, log.t[:1]))):
             figures["convergence"] = convergence(parts, log)
@@ -35,43 +34,32 @@ def run_figures(parts: Parts, log: Log, limit: float | None, floor: Floor | None
     if log.wheels is not None:
         figures["wheels"] = wheels(parts, log)
         figures["wheel_torque"] = wheel_torque(parts, log)
-    if parts.plant.attitude:
-        return {"attitude": attitude(parts, log), "rate": rate(parts, log), **figures}
-    return {"states": states(parts, log), **figures}
+    return {**{chart.name: state(parts, log, chart) for chart in parts.plant.charts}, **figures}
 
 
-def attitude(parts: Parts, log: Log, title: str = "Attitude") -> Figure:
-    """Quaternion and its reference over time."""
-    figure, axes = figure_of(title, "quaternion component [-]")
-    _components(axes, log.t, log.x.q, "q")
-    axes.plot(log.t, log.reference.q, color="0.6", lw=1.0, zorder=1)
-    axes.plot([], [], color="0.6", lw=1.0, label="reference")
-    _mark(axes, parts)
-    _legend(axes, ncols=3)
-    return figure
-
-
-def states(parts: Parts, log: Log, title: str = "States") -> Figure:
-    """States of a chain or a system over time."""
-    figure, axes = figure_of(title, "state")
-    _components(axes, log.t, log.x, "x")
+def state(parts: Parts, log: Log, chart: Chart, title: str | None = None) -> Figure:
+    """Plot components of the plant's state over time, and the reference if the chart has one."""
+    figure, axes = figure_of(title or chart.title, chart.label)
+    _components(axes, log.t, parts.plant.columns(log.x)[chart.column], chart.column)
+    if chart.with_reference:
+        axes.plot(log.t, getattr(log.reference, chart.column), color="0.6", lw=1.0, zorder=1)
+        axes.plot([], [], color="0.6", lw=1.0, label="reference")
     _mark(axes, parts)
     _legend(axes, ncols=2)
     return figure
 
 
 def error(parts: Parts, log: Log, floor: Floor | None = None) -> Figure:
-    """2-norm of the error on a log scale with its bound and floor, and the window in which it is judged."""
-    symbol, _, _ = _names(parts)
-    figure, axes = figure_of("Error", symbol)
+    """Plot the error's 2-norm on a log scale, with its upper bound, lower bound, and the window of window_error."""
+    figure, axes = figure_of("Error", _error_label(parts))
     size = np.linalg.norm(log.error, axis=1)
-    axes.semilogy(log.t, _positive(size), color=STYLES[0][0], label="flown")
+    axes.semilogy(log.t, _positive(size), color=STYLES[0][0], label="simulated")
     if parts.controller.prescribed:
         before = log.t[log.t < float(parts.controller.hand_over)]
         axes.plot(before, envelopes.error_bound(parts, before), **BOUND)
     if floor is not None and floor.window_error > 0.0:
-        known = (floor.error > 0.0) & (floor.error < size.max())  # before the first samples nothing is
-        axes.plot(floor.t[known], floor.error[known], color=STYLES[2][0], lw=1.2, label="floor: no controller beats it")
+        known = (floor.error > 0.0) & (floor.error < size.max())  # nothing is known before the first samples
+        axes.plot(floor.t[known], floor.error[known], color=STYLES[2][0], lw=1.2, label="lower bound")
     t_f = float(parts.controller.t_f)
     axes.axvspan(t_f, t_f + float(parts.window), color="0.85", label="window of window_error")
     _above_smallest(axes)
@@ -80,21 +68,12 @@ def error(parts: Parts, log: Log, floor: Floor | None = None) -> Figure:
     return figure
 
 
-def rate(parts: Parts, log: Log) -> Figure:
-    """Body rate over time."""
-    figure, axes = figure_of("Body rate", "rate [rad/s]")
-    _components(axes, log.t, log.x.w, "w")
-    _mark(axes, parts)
-    _legend(axes)
-    return figure
-
-
 def torque(parts: Parts, log: Log, limit: float | None = None, title: str | None = None) -> Figure:
-    """Delivered torque or input over time, its largest value marked, the limit drawn where one is given."""
-    _, ylabel, unit = _names(parts)
-    figure, axes = figure_of(title or ("Control torque" if unit else "Control"), ylabel)
+    """Plot the delivered input over time, with its largest value and the limit if there is one."""
+    unit = f" {parts.plant.input_unit}".rstrip()
+    figure, axes = figure_of(title or "Control", with_unit(parts.plant.input_name, parts.plant.input_unit))
     _components(axes, log.t, log.u, "u", drawstyle="steps-post" if parts.clock.sampled else "default")
-    reach = FAR_OFF * np.nanmax(np.abs(log.u)) or np.inf  # what is asked for beyond it would make the curves flat
+    reach = FAR_OFF * np.nanmax(np.abs(log.u)) or np.inf  # larger commands would flatten the curves
     if parts.controller.prescribed:
         t, u, _ = (np.asarray(v) for v in solutions.exact_path(parts))
         axes.plot(t, u, **EXACT)
@@ -103,7 +82,7 @@ def torque(parts: Parts, log: Log, limit: float | None = None, title: str | None
             axes.set_ylim(-reach, reach)
     row, column = np.unravel_index(np.argmax(np.nan_to_num(np.abs(log.commanded))), log.commanded.shape)
     peak = log.commanded[row, column]
-    delivered = np.array_equal(log.u, log.commanded, equal_nan=True)  # else it lies off the curves
+    delivered = np.array_equal(log.u, log.commanded, equal_nan=True)  # otherwise the peak is not on the curves
     of = "peak" if delivered else "peak of the command"
     label = f"{of} {abs(peak):.3g}{unit} at {log.t[row]:.4g} s"
     if abs(peak) > reach:
@@ -118,17 +97,17 @@ def torque(parts: Parts, log: Log, limit: float | None = None, title: str | None
 
 
 def wheels(parts: Parts, log: Log) -> Figure:
-    """Momentum of the reaction wheels over time, and its limit."""
+    """Plot the momentum of the reaction wheels over time, and its limit."""
     return _of_wheels(parts, log, 0, "Reaction wheels", "momentum", "N m s")
 
 
 def wheel_torque(parts: Parts, log: Log) -> Figure:
-    """Torque of the reaction wheels over time, and its limit."""
+    """Plot the torque of the reaction wheels over time, and its limit."""
     return _of_wheels(parts, log, 1, "Torque of the reaction wheels", "torque", "N m")
 
 
 def _of_wheels(parts: Parts, log: Log, which: int, title: str, quantity: str, unit: str) -> Figure:
-    """A quantity of each wheel over time, the first or second of `log.wheels`, with its limit, a field of `Wheels`."""
+    """Plot a quantity of each wheel over time, `log.wheels[which]`, with its limit, a field of `Wheels`."""
     assert log.wheels is not None
     figure, axes = figure_of(title, f"{quantity} [{unit}]")
     _components(axes, log.t, log.wheels[which], "hv"[which])
@@ -141,8 +120,8 @@ def _of_wheels(parts: Parts, log: Log, which: int, title: str, quantity: str, un
 
 
 def sliding(parts: Parts, log: Log) -> Figure:
-    """Sliding variable on a log scale with its envelope before the hand-over (continuous loop, no noise)."""
-    figure, axes = figure_of("Sliding variable", "|s|" + (" [-]" if _names(parts)[2] else ""))
+    """Plot the sliding variable on a log scale, with its envelope before the hand-over (continuous loop, no noise)."""
+    figure, axes = figure_of("Sliding variable", with_unit("|s|", parts.controller.kinematics.error_unit))
     _components(axes, log.t, _positive(np.abs(log.s)), "s")
     if parts.controller.prescribed:
         before = log.t[log.t < float(parts.controller.hand_over)]
@@ -154,25 +133,25 @@ def sliding(parts: Parts, log: Log) -> Figure:
     return figure
 
 
-def convergence(parts: Parts, log: Log, title: str = "Convergence as theory sees it") -> Figure:
-    """Error and s against the time to go, both on log axes, with the exact motion and the slopes of theory."""
-    symbol, _, unit = _names(parts)
+def convergence(parts: Parts, log: Log, title: str = "Convergence") -> Figure:
+    """Plot error and s against time to go on log axes, with the exact motion and the slopes of the theory."""
+    symbol = parts.controller.kinematics.symbol
     law, n = parts.controller, parts.controller.order
     t_f, eta, delta = float(law.t_f), float(law.eta), float(law.delta)
-    figure, axes = figure_of(title, f"{symbol} and |s|" if unit else "$|x_1|$ and |s|")
+    figure, axes = figure_of(title, f"{_error_label(parts)} and |s|")
     before = log.t < float(law.hand_over) * (1 - 1e-12)
     t = np.asarray(log.t)[before]
     tau = t_f - t
     flown = {
-        symbol.split(" [")[0]: (np.linalg.norm(log.error, axis=1)[before], eta, STYLES[0]),
+        symbol: (np.linalg.norm(log.error, axis=1)[before], eta, STYLES[0]),
         "|s|": (np.linalg.norm(log.s, axis=1)[before], eta + n - 2, STYLES[1]),
     }
     exact = solutions.exact_sizes(parts, t)
     bottom = min(np.min(size[size > 0], initial=1.0) for size, _, _ in flown.values())
     for (name, (size, _, (colour, style))), ideal in zip(flown.items(), exact, strict=True):
-        axes.loglog(tau, size, color=colour, ls=style, label=f"{name}, flown")
+        axes.loglog(tau, size, color=colour, ls=style, label=f"{name}, simulated")
         axes.loglog(tau, ideal, **EXACT)
-    # slopes of theory as short lines over the error and, where it differs, under s
+    # short lines with the slopes of the theory, above the error and, if it differs, below s
     span = t_f * np.array([0.3, max(0.03, delta / t_f)])
     above = 6.0 * float(np.interp(-span[0], -tau, np.maximum(*exact)))
     guides = [(above, eta, "$\\eta$", 6)]
@@ -195,8 +174,8 @@ def convergence(parts: Parts, log: Log, title: str = "Convergence as theory sees
 
 
 def disturbance(parts: Parts, log: Log) -> Figure:
-    """Estimated and true disturbance over time; the true one lies on top, where a noisy estimate would cover it."""
-    figure, axes = figure_of("Disturbance and its estimate", _names(parts)[1].replace("input", "disturbance"))
+    """Plot estimated and true disturbance over time; the true one on top, so that noise does not cover it."""
+    figure, axes = figure_of("Disturbance and its estimate", with_unit("disturbance", parts.plant.input_unit))
     _components(axes, log.t, log.d_hat, "\\hat d", alpha=0.7)
     axes.plot(log.t, log.disturbance, color="white", lw=2.6, zorder=4)
     axes.plot(log.t, log.disturbance, color="black", lw=1.2, ls=(0, (5, 2)), zorder=5)
@@ -206,43 +185,13 @@ def disturbance(parts: Parts, log: Log) -> Figure:
     return figure
 
 
-@styled
-def observers(measured: Sequence[Measured]) -> Figure:
-    """What each observer makes of the disturbance, and the chattering it leaves under both signs (Remark 2)."""
-    runs = {(run.observer, run.sign): run for run in measured}
-    kinds = list(dict.fromkeys(run.observer for run in measured))
-    figure = Figure(figsize=(10.0, 4.5), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    for kind, (colour, style) in zip(kinds, STYLES, strict=False):
-        run = runs[kind, "smooth"]
-        left.semilogy(run.t, np.maximum(run.off, 1e-6), color=colour, ls=style, label=kind)
-    left.set(xlabel=TIME, ylabel="estimation error $|\\hat d - d|$ [N m]", xlim=(0.0, 10.0), ylim=(1e-5, 1.0))
-    left.legend(ncols=2)
-    for k, sign in enumerate(dict.fromkeys(run.sign for run in measured)):
-        heights = [runs[kind, sign].chattering for kind in kinds]
-        colour, hatch = STYLES[k][0], ("", "//")[k % 2]
-        at = np.arange(len(kinds)) + 0.38 * (k - 0.5)
-        bars = right.bar(at, heights, 0.36, color=colour, hatch=hatch, ec="white", label=f"{sign} sign")
-        right.bar_label(bars, fmt="%.0e", fontsize=8)
-    right.set_yscale("log")
-    right.set_axisbelow(True)
-    right.set_xticks(range(len(kinds)), [kind.replace("_", "\n") for kind in kinds])
-    right.set(ylabel="chattering after $t_f$ [N m/s]")
-    right.set_ylim(top=8.0 * right.get_ylim()[1])
-    right.legend(ncols=2)
-    return figure
-
-
-def _names(parts: Parts) -> tuple[str, str, str]:
-    """Labels of the error and the input, and the input's unit behind a number."""
-    if not parts.plant.attitude:
-        return "$|x_1|$", "input u", ""
-    return "|$\\varepsilon_1$| [-]" if parts.controller.kinematics.additive else "|v| [-]", "torque [N m]", " N m"
+def _error_label(parts: Parts) -> str:
+    return with_unit(parts.controller.kinematics.symbol, parts.controller.kinematics.error_unit)
 
 
 def _components(axes: Axes, t: ArrayLike, values: ArrayLike, symbol: str, **kwargs: Any) -> None:
     values = np.asarray(values)
-    for k in range(values.shape[1]):  # beyond as many as there are styles, the same in thin lines, then both paler
+    for k in range(values.shape[1]):  # more components than styles: thin lines, then pale lines
         colour, style = STYLES[k % len(STYLES)]
         turn = k // len(STYLES)
         width = {"lw": 0.8} if turn % 2 else {}
@@ -252,24 +201,24 @@ def _components(axes: Axes, t: ArrayLike, values: ArrayLike, symbol: str, **kwar
 
 
 def _positive(sizes: np.ndarray) -> np.ndarray:
-    """Sizes as a log axis shows them: none where they are 0."""
+    """Return sizes for a log axis, NaN for 0."""
     return np.where(sizes > 0.0, sizes, np.nan)
 
 
 def _above_smallest(axes: Axes) -> None:
-    """What is below `SMALLEST`, of whatever is drawn, leaves the axis."""
+    """Cut the axis at `SMALLEST`."""
     low, high = axes.get_ylim()
     axes.set_ylim(bottom=SMALLEST if low < SMALLEST < high else low)
 
 
 def _legend(axes: Axes, ncols: int = 1) -> None:
-    """The legend where it covers least of the curves; at a corner where these have too many points to look for that."""
+    """Add the legend where it covers the curves least; in a corner if they have too many points for the search."""
     points = sum(np.size(line.get_xdata()) for line in axes.lines)
     axes.legend(ncols=ncols, loc="best" if points < MANY_POINTS else "upper right")
 
 
 def _limit(axes: Axes, limit: float, unit: str) -> None:
-    """Lines at plus and minus a limit; where the curves would be flat beside it, its number alone."""
+    """Draw lines at plus and minus a limit; only name it in the legend if it would flatten the curves."""
     largest = max((np.nanmax(np.abs(line.get_ydata()), initial=0.0) for line in axes.lines), default=0.0)
     if limit > FAR_OFF * largest > 0.0:
         axes.plot([], [], color="none", label=f"limit {limit:g}{unit}, beyond this axis")
@@ -280,7 +229,7 @@ def _limit(axes: Axes, limit: float, unit: str) -> None:
 
 
 def _mark(axes: Axes, parts: Parts) -> None:
-    """A line at the prescribed time."""
+    """Draw a line at the prescribed time."""
     t_f = float(parts.controller.t_f)
     axes.axvline(t_f, color="0.3", lw=0.9, ls=":")
     axes.annotate(

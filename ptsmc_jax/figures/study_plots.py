@@ -1,4 +1,4 @@
-"""Studies of many runs as matplotlib figures: tuning, trade-offs, maps; each function returns a Figure."""
+"""Studies of many runs as matplotlib figures: tuning, trade-offs, maps. Each function returns a Figure."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -16,25 +16,25 @@ from ptsmc_jax.scenario.gain_bounds import wide
 from ptsmc_jax.simulation.catalogues import CATALOGUES
 
 MARKERS = ("o", "^", "s", "D", "v")
-BEYOND = ("x", "+", "1", "2", "3", "4")  # of points that break a limit, by the limit
-# of a pair of which a trial failed: seen on any colour
+BEYOND = ("x", "+", "1", "2", "3", "4")  # of points that violate a limit, one for each limit
+# marker of a pair with a failed trial, visible on any colour
 LOST: Any = {"marker": "X", "color": "white", "mec": "black", "mew": 0.6, "ms": 6}
-WIDEST = 1e4  # times, that colours of a map span: what is farther off is no use to tell apart
+WIDEST = 1e4  # largest ratio of the values that the colours of a map span
 
 
 class Profile(NamedTuple):
-    """The goal along one gain, the others as tuned."""
+    """The objective along one gain; the other gains are the tuned ones."""
 
     unit: str
     gain: np.ndarray  # (points,)
-    goal: np.ndarray  # (points,), NaN where there is none
+    goal: np.ndarray  # (points,) objective, NaN if there is none
     over: np.ndarray  # (points,) largest metric / limit
-    nearest: Sequence[str]  # (points,) whose that is
-    tuned: float  # the gain that was found
+    nearest: Sequence[str]  # (points,) name of that metric
+    tuned: float  # the tuned gain
 
 
 class MapAxis(NamedTuple):
-    """One of the two keys of a map, and the values that it takes."""
+    """One of the two keys of a map, with its values."""
 
     label: str  # the key and its unit
     values: Sequence[float]
@@ -42,24 +42,24 @@ class MapAxis(NamedTuple):
 
     @property
     def edges(self) -> np.ndarray:
-        """Borders of the cells around the values, half way to the next one on the axis as it is drawn."""
+        """Edges of the cells, in the middle between neighbouring values on the drawn axis."""
         middle = np.log(self.values) if self.logarithmic else np.asarray(self.values)
         between = (middle[:-1] + middle[1:]) / 2
         edges = np.concatenate([[2 * middle[0] - between[0]], between, [2 * middle[-1] - between[-1]]])
         return np.exp(edges) if self.logarithmic else edges
 
 
-class Ladder(NamedTuple):
-    """What some points were looked for at."""
+class Sweep(NamedTuple):
+    """The values at which the points of a front were searched."""
 
     title: str
-    label: str  # what it is, and its unit
+    label: str  # of the axis, with the unit
     values: Sequence[float]
-    ticks: Sequence[str] | None = None  # what is written at them; None: the numbers
+    ticks: Sequence[str] | None = None  # texts at the values; None: the numbers
 
 
 def _looks(count: int) -> list[tuple[str, str]]:
-    """A colour and a marker for each of many sets, no two alike up to 25."""
+    """Return a colour and a marker for each set, all different up to 25."""
     size = len(STYLES)
     return [(STYLES[k % size][0], MARKERS[(k + k // size) % len(MARKERS)]) for k in range(count)]
 
@@ -72,14 +72,14 @@ def tuning_history(
     goal: str,
     judged: tuple[float, Mapping[str, float]],
 ) -> Figure:
-    """Search of all starts: the goal and the gains over the steps, and what came of it.
+    """Plot the objective and the gains of all starting points over the steps, and the final result.
 
     Args:
-        gains: by name the unit, and (steps, starts).
-        values: (steps, starts) of the goal, NaN from where a start was left behind.
-        admissible: (steps, starts) bool, every requirement met.
-        goal: what the values are, with their unit.
-        judged: the goal and the gains, by name, that were found and judged.
+        gains: unit and values (steps, starts) by name.
+        values: (steps, starts) of the objective; NaN after a starting point was given up.
+        admissible: (steps, starts) bool, every requirement is met.
+        goal: name and unit of the objective.
+        judged: objective and gains of the result, on held-out trials.
     """
     figure = Figure(figsize=(8.0, 2.2 * (len(gains) + 1)), layout="constrained")
     axes = figure.subplots(len(gains) + 1, 1, sharex=True)
@@ -92,7 +92,7 @@ def tuning_history(
     axes[0].plot([], [], color="0.75", label="beyond a limit")
     judged_goal, judged_gains = judged
     for ax, value in zip(axes, (judged_goal, *(judged_gains[name] for name in gains)), strict=True):
-        ax.axhline(value, color="black", lw=1.0, ls=":", zorder=3, label="found, and judged on fresh trials")
+        ax.axhline(value, color="black", lw=1.0, ls=":", zorder=3, label="result on held-out trials")
     axes[0].set_ylabel(goal)
     figure.suptitle("Tuning, all starts")
     axes[0].legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, fontsize=9)
@@ -108,7 +108,7 @@ def tuning_history(
 
 @styled
 def tornado(sensitivities: Mapping[str, Mapping[str, float]]) -> Figure:
-    """How much each metric moves with each gain: metric -> gain -> percent by percent, the largest on top."""
+    """Plot the sensitivity of each metric to each gain [% per %], the largest on top; metric -> gain -> sensitivity."""
     rows = sum(len(by_gain) + 1 for by_gain in sensitivities.values())
     figure = Figure(figsize=(8.0, 1.0 + 0.3 * rows), layout="constrained")
     axes = figure.subplots(len(sensitivities), 1, sharex=True, squeeze=False)[:, 0]
@@ -128,7 +128,7 @@ def tornado(sensitivities: Mapping[str, Mapping[str, float]]) -> Figure:
 
 @styled
 def profiles(gains: Mapping[str, Profile], goal: str) -> Figure:
-    """The goal along each gain, by its name; goal: what it is, with its unit."""
+    """Plot the objective along each gain, by name; goal: name and unit of the objective."""
     broken_limits = dict.fromkeys(of for one in gains.values() for of in np.asarray(one.nearest)[one.over > 1.0])
     marks = {of: BEYOND[k % len(BEYOND)] for k, of in enumerate(broken_limits)}
     legend_rows = -(-(3 + len(marks)) // 2)
@@ -159,16 +159,16 @@ def tradeoff(
     kind: str = "spacecraft",
     floor: float | None = None,
 ) -> Figure:
-    """Accuracy against torque, a point a trial.
+    """Plot accuracy against torque, a point a trial.
 
     Args:
-        sets: by label, window errors (trials,) [-] and peak torques (trials,) [N m].
+        sets: window errors (trials,) [-] and peak torques (trials,) [N m] by label.
         limit: of the torque.
-        kind: of the plant, whose units are those of its metrics.
-        floor: RMS error that no controller can beat.
+        kind: of the plant; it determines the units.
+        floor: lower bound of the RMS error.
     """
     error_unit, unit = (CATALOGUES[kind][name].unit for name in ("window_error", "peak_torque"))
-    figure, axes = figure_of("Accuracy against torque, fresh trials", f"peak torque [{unit}]")
+    figure, axes = figure_of("Accuracy against torque, held-out trials", f"peak torque [{unit}]")
     arrays = {label: (np.asarray(e), np.asarray(u)) for label, (e, u) in sets.items()}
     for (label, (errors, torques)), (colour, marker) in zip(arrays.items(), _looks(len(arrays)), strict=True):
         rms, mean = np.sqrt(np.nanmean(errors**2)), np.nanmean(torques)
@@ -185,14 +185,14 @@ def tradeoff(
 
 
 def _legend_below(figure: Figure, entries: int, columns: int) -> None:
-    """A legend outside of the axes, and room for it."""
+    """Add a legend outside of the axes and enlarge the figure for it."""
     rows = -(-entries // columns)
     figure.set_size_inches(8.0, 4.5 + 0.26 * rows)
     figure.legend(loc="outside lower left", ncols=columns, fontsize=9, markerscale=1.0)
 
 
 def settling_by_angle(sets: Mapping[str, tuple[np.ndarray, np.ndarray]], t_f: float) -> Figure:
-    """When each trial settles against where it starts; label -> (initial angles [deg], settling times, NaN: never)."""
+    """Plot settling time against initial angle; label -> (initial angles [deg], settling times [s], NaN: never)."""
     figure, axes = figure_of("When it settles, by where it starts", "settling time [s]")
     for (label, (angle, time)), (colour, marker) in zip(sets.items(), _looks(len(sets)), strict=True):
         settled, name = np.isfinite(time), label.replace("_", " ")
@@ -213,16 +213,16 @@ def front(
     units: tuple[str, ...],
     floor: float | None = None,
 ) -> Figure:
-    """Window error against peak torque of the points of a front, with their intervals.
+    """Plot window error against peak torque of a Pareto front, with intervals.
 
     Args:
-        points: those of a `front.Front`, with rms, interval, peak, dominated and knee.
-        others: by label, such points that are no part of it.
-        limit: of the torque, if one is asked for.
+        points: of a `front.Front`, with rms, interval, peak, dominated and knee.
+        others: further points by label.
+        limit: required limit of the torque, if any.
         units: of error and torque.
-        floor: the error that no controller can beat.
+        floor: lower bound of the error.
     """
-    figure, axes = figure_of("Accuracy against torque: the front, fresh trials", f"RMS window error [{units[0]}]")
+    figure, axes = figure_of("Accuracy against torque: Pareto front, held-out trials", f"RMS window error [{units[0]}]")
     on_front, dominated = ([p for p in points if p.dominated == is_so] for is_so in (False, True))
     axes.loglog([p.peak for p in on_front], [p.rms for p in on_front], color=STYLES[0][0], lw=1.2)
     for group, colour, label in ((on_front, STYLES[0][0], "front"), (dominated, "0.6", "dominated")):
@@ -247,44 +247,43 @@ def front(
 
 
 @styled
-def costs(points: Sequence[Any], ladder: Ladder, panels: Mapping[str, tuple[np.ndarray, float | None]]) -> Figure:
-    """Error, and what it costs, along a ladder, a panel each; dashed: what the scenario allows.
+def costs(points: Sequence[Any], sweep: Sweep, panels: Mapping[str, tuple[np.ndarray, float | None]]) -> Figure:
+    """Plot the error and other metrics along a sweep, a panel each; dashed lines are the scenario's limits.
 
     Args:
-        points: on the ladder, with rms, interval and meets.
-        ladder: where they stand.
-        panels: values of each point, NaN where it has none, and what is allowed of them, if anything; by their titles,
-            that of the error first.
+        points: of the sweep, with rms, interval and meets.
+        sweep: the values of the points.
+        panels: values of each point, NaN if it has none, and the limit if there is one, by title; the error first.
     """
     columns = 3
     figure = Figure(figsize=(10.5, 3.0 * -(-len(panels) // columns)), layout="constrained")
-    figure.suptitle(ladder.title)
+    figure.suptitle(sweep.title)
     for k, (title, (values, limit)) in enumerate(panels.items()):
         axes = figure.add_subplot(-(-len(panels) // columns), columns, k + 1)
-        axes.plot(ladder.values, values, "-", color=STYLES[0][0], lw=1.2)
+        axes.plot(sweep.values, values, "-", color=STYLES[0][0], lw=1.2)
         for met, fill, label in ((True, STYLES[0][0], "meets every requirement"), (False, "white", "does not")):
             some = [k for k, point in enumerate(points) if point.meets == met]
             if some:
-                x, y = ([numbers[k] for k in some] for numbers in (ladder.values, values))
+                x, y = ([numbers[k] for k in some] for numbers in (sweep.values, values))
                 axes.plot(x, y, "o", ms=5, mfc=fill, mec=STYLES[0][0], label=label)
         if not k:
             low, high = zip(*(point.interval or (point.rms, point.rms) for point in points), strict=True)
-            axes.fill_between(ladder.values, low, high, color=STYLES[0][0], alpha=0.2, lw=0)
+            axes.fill_between(sweep.values, low, high, color=STYLES[0][0], alpha=0.2, lw=0)
             axes.legend(fontsize=8)
         known = values[np.isfinite(values)]
         if known.size and np.all(known > 0.0):
             logarithmic(axes, "y")
         if limit is not None:
             axes.axhline(limit, **LIMIT)
-        if ladder.ticks is not None:
-            axes.set_xticks(ladder.values, ladder.ticks)
+        if sweep.ticks is not None:
+            axes.set_xticks(sweep.values, sweep.ticks)
         axes.set_title(title, fontsize=10)
-        axes.set_xlabel(ladder.label, fontsize=10)
+        axes.set_xlabel(sweep.label, fontsize=10)
     return figure
 
 
 def _coloured(axes: Any, x: MapAxis, y: MapAxis, grid: np.ndarray, alike: Sequence[np.ndarray]) -> None:
-    """The numbers of a grid (y, x) as colours; alike: the grids that share its scale, itself among them."""
+    """Draw a grid (y, x) as colours; alike: all grids with this scale."""
     known = np.concatenate([one.ravel() for one in alike])
     known = known[np.isfinite(known) & (known > 0)]
     low, high = (known.min(), min(known.max(), known.min() * WIDEST)) if known.size else (1e-12, 1.0)
@@ -295,8 +294,8 @@ def _coloured(axes: Any, x: MapAxis, y: MapAxis, grid: np.ndarray, alike: Sequen
         logarithmic(axes, "y")
     for line, one in ((axes.xaxis, x), (axes.yaxis, y)):
         if not one.logarithmic and all(float(value).is_integer() for value in one.values):
-            line.set_major_locator(matplotlib.ticker.MaxNLocator(integer=True))  # a delay has no halves of a period
-    axes.set_facecolor("0.9")  # of pairs without a number: no colour of the map
+            line.set_major_locator(matplotlib.ticker.MaxNLocator(integer=True))  # a delay is a whole number of periods
+    axes.set_facecolor("0.9")  # of pairs without a number; not a colour of the map
     mesh = axes.pcolormesh(x.edges, y.edges, np.ma.masked_invalid(grid), norm=norm, cmap="cividis")
     bar = axes.figure.colorbar(mesh, ax=axes, extend="max" if known.size and known.max() > high else "neither")
     plain_ticks(bar.ax.yaxis)
@@ -311,15 +310,15 @@ def accuracy_map(
     borders: Mapping[str, tuple[np.ndarray, np.ndarray]],
     kind: str = "spacecraft",
 ) -> Figure:
-    """Window error as flown and by linear theory, and peak torques, over two keys.
+    """Plot simulated window error, window error by linear theory, and peak torques over two keys.
 
     Args:
-        x: the key across.
-        y: the key up.
-        grids: by name, (y, x); one without a finite number is left out.
-        lost: (y, x) bool, a trial failed or missed t_f.
-        borders: lines to draw, by label: (x, y).
-        kind: of the plant, whose units are those of its metrics.
+        x: the horizontal key.
+        y: the vertical key.
+        grids: (y, x) by name; grids without finite numbers are not drawn.
+        lost: (y, x) bool, a trial failed or did not converge at t_f.
+        borders: lines (x, y) by label.
+        kind: of the plant; it determines the units.
     """
     error_unit, unit = (CATALOGUES[kind][name].unit for name in ("window_error", "peak_torque"))
     titles = {

@@ -1,4 +1,4 @@
-"""The common look of all figures, and how they are written."""
+"""The common style of all figures, and their files."""
 
 import math
 from collections.abc import Mapping
@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis, XAxis
 from matplotlib.figure import Figure
 
-# Okabe and Ito's colours, told apart by the colour-blind; line styles tell them apart in grey
+# colours of Okabe and Ito, distinct for the colour-blind; line styles are distinct in grey
 STYLES = (("#0072B2", "-"), ("#D55E00", "--"), ("#009E73", "-."), ("#000000", ":"), ("#CC79A7", (0, (5, 1, 1, 1))))
 TIME = "time [s]"
 RC: Any = {
@@ -23,14 +23,14 @@ RC: Any = {
     "lines.linewidth": 1.6,
     "legend.frameon": False,
 }
-styled = matplotlib.rc_context(RC)  # decorates functions that draw in this look
-LIMIT: Any = {"color": "0.3", "lw": 1.0, "ls": (0, (6, 3))}  # how the line of a limit is drawn, and of the floor
+styled = matplotlib.rc_context(RC)  # decorator of functions that draw in this style
+LIMIT: Any = {"color": "0.3", "lw": 1.0, "ls": (0, (6, 3))}  # line of a limit; `FLOOR`: of a lower bound
 FLOOR: Any = {"color": "0.3", "lw": 1.0, "ls": ":"}
-MANY = 1e4  # times, that an axis spans, from which on the numbers between its powers of ten would overlap
+MANY = 1e4  # ratio of an axis's ends above which numbers between powers of ten would overlap
 
 
 def save(figures: Mapping[str, Figure], folder: Path) -> list[Path]:
-    """Write NAME.png for each figure into a folder, known as ours, see `store.forget`."""
+    """Write NAME.png for each figure into a folder, with a mark for `store.forget`; return the paths."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, figure in figures.items():
         figure.savefig(folder / f"{name}.png", metadata={"Creator": "ptsmc"})
@@ -39,7 +39,7 @@ def save(figures: Mapping[str, Figure], folder: Path) -> list[Path]:
 
 @styled
 def figure_of(title: str, ylabel: str) -> tuple[Figure, Axes]:
-    """A figure of one plot over time."""
+    """Return a figure with one plot over time."""
     figure = Figure(figsize=(8.0, 4.5), layout="constrained")
     axes = figure.subplots()
     axes.set(xlabel=TIME, ylabel=ylabel)
@@ -47,17 +47,22 @@ def figure_of(title: str, ylabel: str) -> tuple[Figure, Axes]:
     return figure, axes
 
 
+def with_unit(name: str, unit: str) -> str:
+    """Return a label; the unit is empty if the plant has units of its own."""
+    return f"{name} [{unit}]" if unit else name
+
+
 class _Decades(matplotlib.ticker.LogLocator):
-    """1, 2 and 5 times each power of ten; the powers alone where there are more than four, or too little room."""
+    """1, 2 and 5 times each power of ten; only the powers if there are more than four or they would overlap."""
 
     def tick_values(self, vmin: float, vmax: float) -> Any:
-        vmin, vmax = sorted((vmin, vmax))  # of an axis that runs the other way, too
+        vmin, vmax = sorted((vmin, vmax))  # the axis may be inverted
         room = MANY if self.axis is None else 10.0 ** (self.axis.get_tick_space() / self._space(vmin, vmax))
         self.set_params(subs=(1.0,) if vmax > min(MANY, room) * vmin else (1.0, 2.0, 5.0))
         return super().tick_values(vmin, vmax)
 
     def _space(self, vmin: float, vmax: float) -> float:
-        """Of a power of ten with its three numbers, in what Matplotlib counts as a tick's: the longer, the more."""
+        """Return the space of a power of ten with its three numbers, in units of Matplotlib's space of a tick."""
         if vmin <= 0.0 or not isinstance(self.axis, XAxis):
             return 3.0
         powers = range(math.floor(math.log10(vmin)), math.ceil(math.log10(vmax)) + 1)
@@ -65,13 +70,13 @@ class _Decades(matplotlib.ticker.LogLocator):
 
 
 def plain_ticks(line: Axis) -> None:
-    """Numbers such as 0.05 on a log axis."""
+    """Use numbers such as 0.05 on a log axis."""
     line.set_major_locator(_Decades())
     line.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
     line.set_minor_formatter(matplotlib.ticker.NullFormatter())
 
 
 def logarithmic(axes: Axes, which: Literal["x", "y"]) -> None:
-    """One of the axes on a log scale, with plain numbers."""
+    """Set one of the axes to a log scale with plain numbers."""
     axes.set(**{f"{which}scale": "log"})
     plain_ticks(getattr(axes, f"{which}axis"))

@@ -9,14 +9,15 @@ from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.tree_util import Partial
 from jaxtyping import Array, Float
 
 from ptsmc_jax.numerics import attitude, guards, integrators, matrices
-from ptsmc_jax.numerics.pytrees import Scalar, Vector, pytree
+from ptsmc_jax.numerics.pytrees import Function, Scalar, Vector, is_function, pytree
 from ptsmc_jax.plants.integrator_chain import Chain
 from ptsmc_jax.plants.rigid_body import AttitudeState, Spacecraft
 from ptsmc_jax.plants.second_order import System
-from ptsmc_jax.signals.references import Target
+from ptsmc_jax.signals.references import Target, TurningFunction
 
 State = Float[Array, " states"]
 
@@ -30,14 +31,21 @@ class Kinematics:
     T(q) in (57) or dF/dx2 G in (29) has no inverse.
     """
 
-    model: Any  # design model of the plant
-    additive: ClassVar[bool] = False  # whether it is the error q_1 - q_1f of the paper, singular at q4 = 0 of the body
-    reaching_factor: ClassVar[float] = 1.0  # decay rate of s in the hold phase divided by K1: 1 in (29)
+    model: Any  # the nominal plant
+    additive: ClassVar[bool] = False  # the paper's q_1 - q_1f, singular where the body is, wherever the reference is
+    symbol: ClassVar[str] = "$|x_1|$"  # of the error's norm, in figures
+    error_unit: ClassVar[str] = ""  # of error and sliding variable; empty: the plant has units of its own
+    angle_unit: ClassVar[str] = "x1"
+    reaching_factor: ClassVar[float] = 1.0  # rate of s after the hand-over, in units of K1: 1 in (29)
 
     @property
     def order(self) -> int:
         """Order n of the error's differential equation: 2, or the order of a chain."""
         return 2
+
+    def reference_from(self, function: Any) -> Any:
+        """Return a reference, a pytree, from a function of time; a reference is returned as it is."""
+        return Function(function) if is_function(function) else function
 
     def align(self, x: Any, target: Any) -> Any:
         """Return the same initial state in the representation that the law needs, such as the other sign of q."""
@@ -107,6 +115,13 @@ class AttitudeKinematics(Kinematics):
 
     model: Spacecraft
     reaching_factor: ClassVar[float] = 0.5  # (60)
+    symbol: ClassVar[str] = "|v|"
+    error_unit: ClassVar[str] = "-"
+    angle_unit: ClassVar[str] = "rad"
+
+    def reference_from(self, function: Any) -> Any:
+        """Return a reference from a function of time that gives a quaternion or a `Target`."""
+        return TurningFunction(function if isinstance(function, Partial) else Partial(function))
 
     def angle(self, x: AttitudeState, target: Target) -> Scalar:
         """Return the angle between the attitude and the reference [rad]."""
@@ -136,6 +151,7 @@ class AdditiveKinematics(AttitudeKinematics):
     """
 
     additive: ClassVar[bool] = True
+    symbol: ClassVar[str] = r"|$\varepsilon_1$|"
 
     def align(self, x: AttitudeState, target: Target) -> AttitudeState:
         """Return the same attitude with the sign of q that makes q4 q_f4 >= 0, since the law cannot cross q4 = 0."""

@@ -47,6 +47,12 @@ def normalise(q: Quaternion) -> Quaternion:
     return q * (1.0 / jnp.sqrt(jnp.dot(q, q)))  # one division, not four
 
 
+def unit(q: Quaternion) -> Quaternion:
+    """Return a measured quaternion with |q| = 1 [-]; q itself if it has that length to rounding."""
+    square = jnp.dot(q, q)
+    return jnp.where(jnp.abs(square - 1.0) > 1e-12, q / jnp.sqrt(square), q)
+
+
 @jax.jit
 def rotate(q: Quaternion, y: Vector) -> Vector:
     """Rotate a vector from body axes to inertial axes: R(q) y, in the units of y."""

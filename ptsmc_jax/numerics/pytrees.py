@@ -90,6 +90,11 @@ class Function:
         return self.function(*args)
 
 
+def is_function(value: Any) -> bool:
+    """Return whether JAX would take a callable for a number: a plain function, a jitted one, a bound method."""
+    return callable(value) and jax.tree_util.all_leaves([value])
+
+
 def vector(values: Any) -> Array:
     """Convert numbers of any shape to an array of floats, a leaf of the parts.
 

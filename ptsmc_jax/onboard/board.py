@@ -22,15 +22,18 @@ from ptsmc_jax.devices.attitude_sensors import SampleTimes, StarTracker
 from ptsmc_jax.devices.command_filter import CommandFilter
 from ptsmc_jax.devices.kalman_filter import KalmanFilter, Track
 from ptsmc_jax.laws.base import Law, Sample
-from ptsmc_jax.numerics import guards
+from ptsmc_jax.numerics import attitude, guards
 from ptsmc_jax.observers.base import Observer
 from ptsmc_jax.onboard import derived
+from ptsmc_jax.plants.base import Plant, State
 from ptsmc_jax.plants.rigid_body import AttitudeState
 from ptsmc_jax.simulation import run_state
 from ptsmc_jax.simulation.assembly import Parts
 
-UNIT = 1e-12  # a quaternion whose square is off by less is taken as it is
 KNOWN = 0.25  # |q|^2 of an attitude that has been set
+
+
+Given = dict[str, Any]  # values by name
 
 
 @dataclass(frozen=True)
@@ -40,7 +43,7 @@ class Stage:
     name: str
     about: str
     reads: tuple[str, ...]
-    run: Callable[..., dict[str, Any]]  # of the parameters and of what it reads: what it writes, by name
+    run: Callable[[Given, Given], Given]  # (parameters, values that it reads) -> values that it writes, by name
     parts: tuple[Any, ...] = ()  # whose docstrings say what it does
 
 
@@ -48,8 +51,8 @@ class Stage:
 class Board:
     """The flight computer of some parts: shapes by name, and what each is."""
 
+    model: Plant  # the plant as the flight computer knows it
     parameters: dict[str, Any]
-    spacecraft: bool
     inputs: dict[str, Any] = field(default_factory=dict)
     state: dict[str, Any] = field(default_factory=dict)
     outputs: dict[str, Any] = field(default_factory=dict)
@@ -60,16 +63,15 @@ class Board:
     @property
     def unit(self) -> str:
         """The unit of inputs and disturbances, in brackets."""
-        return " [N m]" if self.spacecraft else ""
+        return f" [{self.model.input_unit}]" if self.model.input_unit else ""
 
-    @property
-    def seen(self) -> tuple[str, ...]:
-        """The names of what the law sees of the state."""
-        return ("attitude", "rate") if self.spacecraft else ("x",)
+    def names(self, when: str) -> tuple[str, ...]:
+        """Return the names of the measured signals with a prefix, "in", "before" or "now"."""
+        return tuple(f"{when}.{name}" for name in self.model.signals)
 
-    def state_of(self, values: tuple[Any, ...]) -> Any:
-        """The state that the law sees, from these values of `seen`."""
-        return AttitudeState(*values) if self.spacecraft else values[0]
+    def seen(self, given: Given, when: str) -> State:
+        """Return the measured state from values by these names."""
+        return self.model.state_of({name: given[f"{when}.{name}"] for name in self.model.signals})
 
     @property
     def parts(self) -> dict[str, str]:
@@ -80,34 +82,29 @@ class Board:
 
 def _kind(part: Any) -> str:
     """Return the type of a part and what is fixed in it, and in the parts that it has a list of."""
-    said = []
+    fixed = []
     for entry in dataclasses.fields(part):
         value = getattr(part, entry.name)
         if entry.metadata.get("static"):
-            said.append(f"{entry.name}={value!r}")
+            fixed.append(f"{entry.name}={value!r}")
         elif isinstance(value, tuple) and all(map(dataclasses.is_dataclass, value)):
-            said += [f"{entry.name}[{k}]={_kind(one)}" for k, one in enumerate(value)]
+            fixed += [f"{entry.name}[{k}]={_kind(one)}" for k, one in enumerate(value)]
         elif isinstance(value, SampleTimes):
-            said.append(f"{entry.name}={_kind(value)}")
-    return type(part).__qualname__ + (f"({', '.join(said)})" if said else "")
-
-
-SCALARS = ("t", "dt", "regular", "tracking")  # arguments of C's functions
+            fixed.append(f"{entry.name}={_kind(value)}")
+    return type(part).__qualname__ + (f"({', '.join(fixed)})" if fixed else "")
 
 
 def real(*shape: int) -> jax.ShapeDtypeStruct:
-    """The shape of real numbers."""
+    """Return the shape of real numbers."""
     return jax.ShapeDtypeStruct(shape, jnp.result_type(float))
 
 
 def integer() -> jax.ShapeDtypeStruct:
-    """The shape of a yes or no."""
+    """Return the shape of a flag."""
     return jax.ShapeDtypeStruct((), jnp.int32)
 
 
-def shapes(tree: Any) -> Any:
-    """The shapes of a tree of arrays."""
-    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(np.shape(leaf), jnp.asarray(leaf).dtype), tree)
+SCALARS = {"t": real, "dt": real, "regular": integer, "tracking": integer}  # arguments of C's functions
 
 
 def board(parts: Parts) -> Board:
@@ -115,22 +112,20 @@ def board(parts: Parts) -> Board:
     observer, law = parts.observer, parts.controller
     device = parts.actuators
     parameters, inputs = known(parts), observer.model.inputs
-    computer = Board(parameters, observer.model.attitude, rules=derived.rules(parts))
+    computer = Board(observer.model, parameters, rules=derived.rules(parts))
     if "filter_bandwidth" in parameters:
         _filter_parameters(computer, parts.sensors, parts.period)
     computer.about["period"] = "of the control loop [s]"
     computer.about["observer_matrix"] = _said(type(observer).update_matrix)
-    if not computer.spacecraft:
+    if parameters["filter"] is None:
         _reading(computer, parts)
-    elif parameters["filter"] is None:
-        _tracking(computer)
     elif isinstance(parameters["filter"], KalmanFilter):
         _estimating(computer, parameters["filter"])
     else:
         _filtering(computer, parameters["filter"], aged=getattr(parts.sensors, "own_times", None) is not None)
     _observing(computer, observer, device)
     _commanding(computer, law, observer, parts.command_filter)
-    computer.stages.append(Stage("begin", "What is remembered before the first sample.", (), partial(_begin, m=inputs)))
+    computer.stages.append(Stage("begin", "What is remembered before the first sample.", (), begin))
     if not device.ideal:
         _acting(computer, device, inputs)
     return computer
@@ -171,43 +166,27 @@ def _said(function: Any) -> str:
     return " ".join((function.__doc__ or "").strip().split("\n\n")[0].split()).rstrip(".")
 
 
+def _continued(parameters: Given, given: Given, x: State, before: State) -> State:
+    """Return the form of a state, such as the sign of q: that of the last sample; at the start the law chooses."""
+    law, target = parameters["law"], parameters["reference"](given["t"])
+    near, first = law.model.nearest(x, before), law.kinematics.align(x, target)
+    return jax.tree.map(lambda *forms: jnp.where(given["tracking"] != 0, *forms), near, first)
+
+
 def _reading(computer: Board, parts: Parts) -> None:
-    """The states of a chain or a system as they are measured."""
-    computer.inputs["x"] = computer.state["x"] = real(*np.shape(parts.plant.visible(parts.initial)))
-    computer.about["x"] = "the state as it is measured, in its own units"
-    computer.stages.append(Stage("sense", "The state as the law sees it.", ("in.x",), lambda given, x: {"now.x": x}))
+    """Add a stage that reads sensors without a filter."""
+    model = computer.model
+    signals = jax.eval_shape(model.signals_of, parts.plant.visible(parts.initial))
+    computer.inputs |= signals
+    computer.state |= signals
+    computer.about |= model.signals
 
+    def sense(parameters: Given, given: Given) -> Given:
+        x = _continued(parameters, given, model.accepted(computer.seen(given, "in")), computer.seen(given, "before"))
+        return {f"now.{name}": value for name, value in model.signals_of(x).items()}
 
-_MEASURED = {
-    "attitude": "unit quaternion, scalar last, body relative to inertial [-]",
-    "rate": "of the body in body axes [rad/s]",
-}
-
-
-def _unit(q: Any) -> Any:
-    """A measured quaternion of length 1."""
-    square = jnp.dot(q, q)
-    return jnp.where(jnp.abs(square - 1.0) > UNIT, q / jnp.sqrt(square), q)
-
-
-def _signed(law: Law, target: Any, q: Any, w: Any, before: Any, tracking: Any) -> Any:
-    """The nearer of q and -q, which are one attitude, to the last sample's; at the start the law's choice."""
-    going_on = jnp.where(jnp.dot(q, before) < 0.0, -q, q)
-    return jnp.where(tracking != 0, going_on, law.kinematics.align(AttitudeState(q, w), target).q)
-
-
-def _tracking(computer: Board) -> None:
-    """Star tracker and gyro as they are."""
-    computer.inputs |= {"attitude": real(4), "rate": real(3)}
-    computer.state |= {"attitude": real(4), "rate": real(3)}
-    computer.about |= _MEASURED
-
-    def sense(parameters: Any, measured: Any, rate: Any, before: Any, tracking: Any, t: Any) -> dict[str, Any]:
-        attitude = _signed(parameters["law"], parameters["reference"](t), _unit(measured), rate, before, tracking)
-        return {"now.attitude": attitude, "now.rate": rate}
-
-    reads = ("in.attitude", "in.rate", "before.attitude", "tracking", "t")
-    computer.stages.append(Stage("sense", "Attitude and rate as the law sees them: as measured.", reads, sense))
+    reads = ("tracking", "t", *computer.names("in"), *computer.names("before"))
+    computer.stages.append(Stage("sense", "The state for the law: as measured.", reads, sense))
 
 
 def _filtering(computer: Board, filter_: Any, *, aged: bool) -> None:
@@ -215,36 +194,35 @@ def _filtering(computer: Board, filter_: Any, *, aged: bool) -> None:
     age = {"attitude_age": real()} if aged else {}
     computer.inputs |= {"attitude": real(4), "attitude_valid": integer(), **age, "rate": real(3)}
     computer.state |= {"attitude": real(4), "rate": real(3), "bias": real(3), "gyro": real(3)}
-    computer.about |= _MEASURED | {
+    computer.about |= computer.model.signals | {
         "attitude_valid": "whether the star tracker has an attitude at this sample: 0 or 1",
         "attitude_age": "how long before this sample that attitude was taken, from 0 to the time since the last [s]",
         "bias": "of the gyro, estimated [rad/s]",
         "gyro": "rate as the gyro measured it last [rad/s]",
     }
 
-    def sense(
-        parameters: Any, star: Any, valid: Any, gyro: Any, before: Any, bias: Any, gyro_before: Any, dt: Any,
-        tracking: Any, t: Any, *aged: Any,
-    ) -> dict[str, Any]:  # fmt: skip
-        attitude_filter, one = parameters["filter"], jnp.ones_like(dt)
-        measured = _unit(jnp.where(valid != 0, star, before))  # where there is none, whatever stands there is not read
+    def sense(parameters: Given, given: Given) -> Given:
+        attitude_filter, dt, one = parameters["filter"], given["dt"], jnp.ones_like(given["dt"])
+        before, gyro, gyro_before = given["before.attitude"], given["in.rate"], given["before.gyro"]
+        valid = given["in.attitude_valid"] != 0
+        measured = attitude.unit(jnp.where(valid, given["in.attitude"], before))  # an invalid input is not used
         start = jnp.where(jnp.dot(before, before) > KNOWN, before, measured)
-        old = Estimate(start, bias)
+        old = Estimate(start, given["before.bias"])
         if aged:
             estimate = jax.lax.cond(
-                valid != 0,
+                valid,
                 lambda age: attitude_filter.correct_between(
                     old, gyro_before, gyro, dt, measured, jnp.clip(age, 0.0, dt), one
                 ),
                 lambda _: attitude_filter.propagate(old, gyro_before, gyro, dt),
-                aged[0],
+                given["in.attitude_age"],
             )
         else:
             ahead = attitude_filter.propagate(old, gyro_before, gyro, dt)
-            estimate = jax.lax.cond(valid != 0, lambda: attitude_filter.correct(ahead, measured, one), lambda: ahead)
+            estimate = jax.lax.cond(valid, lambda: attitude_filter.correct(ahead, measured, one), lambda: ahead)
         rate = gyro - estimate.bias
-        attitude = _signed(parameters["law"], parameters["reference"](t), estimate.q, rate, start, tracking)
-        return {"now.attitude": attitude, "now.rate": rate, "now.bias": estimate.bias, "now.gyro": gyro}
+        x = _continued(parameters, given, AttitudeState(estimate.q, rate), AttitudeState(start, rate))
+        return {"now.attitude": x.q, "now.rate": rate, "now.bias": estimate.bias, "now.gyro": gyro}
 
     about = "Attitude and rate as the law sees them: the gyro carries the attitude, the star tracker corrects it."
     reads = ("in.attitude", "in.attitude_valid", "in.rate", "before.attitude", "before.bias", "before.gyro", "dt",
@@ -255,10 +233,10 @@ def _filtering(computer: Board, filter_: Any, *, aged: bool) -> None:
 def _estimating(computer: Board, estimator: KalmanFilter) -> None:
     """Add a gyro and attitude sensors, through a Kalman filter of the attitude."""
     computer.inputs["rate"] = real(3)
-    computer.about["rate"] = _MEASURED["rate"]
+    computer.about["rate"] = computer.model.signals["rate"]
     for sensor in estimator.sensors:
-        name, kind = sensor.name, type(sensor).__doc__ or ""
-        computer.inputs |= {name: shapes(sensor.read(jnp.array([0.0, 0.0, 0.0, 1.0]))), f"{name}_valid": integer()}
+        name, kind, forward = sensor.name, type(sensor).__doc__ or "", jnp.array([0.0, 0.0, 0.0, 1.0])
+        computer.inputs |= {name: jax.eval_shape(sensor.read, forward), f"{name}_valid": integer()}
         computer.about[name] = " ".join(kind.split("\n\n")[0].split())
         computer.about[f"{name}_valid"] = f"whether {name} has a reading at this sample: 0 or 1"
         if sensor.times.every is None:
@@ -279,15 +257,14 @@ def _estimating(computer: Board, estimator: KalmanFilter) -> None:
     states = [name for name in computer.state if name != "rate"]
     reads = (*(f"in.{name}" for name in computer.inputs), *(f"before.{name}" for name in states), "dt", "tracking", "t")
 
-    def sense(parameters: Any, *read: Any) -> dict[str, Any]:
-        given, known = dict(zip(reads, read, strict=True)), parameters["filter"]
-        before, one = given["before.attitude"], jnp.ones_like(given["dt"])
+    def sense(parameters: Given, given: Given) -> Given:
+        known, before, one = parameters["filter"], given["before.attitude"], jnp.ones_like(given["dt"])
         start, readings = before, []
         for sensor in known.sensors:  # if the attitude is not known yet, it is that of a star tracker
             valid = given[f"in.{sensor.name}_valid"] != 0
             reading = jnp.where(valid, given[f"in.{sensor.name}"], sensor.read(start))
             if isinstance(sensor, StarTracker):
-                reading = _unit(reading)
+                reading = attitude.unit(reading)
                 unknown = valid & (jnp.dot(start, start) <= KNOWN)
                 start = jnp.where(unknown, sensor.body(reading), start)
             readings.append((valid, reading))
@@ -303,11 +280,9 @@ def _estimating(computer: Board, estimator: KalmanFilter) -> None:
             age = given.get(f"in.{sensor.name}_age", sensor.times.wait * known.period)
             corrected = partial(known.correct, track, k, reading, age, one)
             track = jax.lax.cond(valid, corrected, lambda track=track: track)
-        attitude = _signed(
-            parameters["law"], parameters["reference"](given["t"]), track.q, track.w, start, given["tracking"]
-        )
+        x = _continued(parameters, given, AttitudeState(track.q, track.w), AttitudeState(start, track.w))
         now = {
-            "attitude": attitude,
+            "attitude": x.q,
             "rate": track.w,
             "bias": track.bias,
             "gyro": track.rate,
@@ -324,7 +299,7 @@ def _estimating(computer: Board, estimator: KalmanFilter) -> None:
 def _observing(computer: Board, observer: Observer, device: Actuators) -> None:
     """The disturbance by what the last period's motion shows."""
     m, wheels = observer.model.inputs, device.wheels
-    computer.state["observer"] = shapes(observer.begin())
+    computer.state["observer"] = jax.eval_shape(observer.begin)
     computer.outputs["d_hat"] = real(m)
     computer.about |= {"observer": "memory of the observer, which begins with the estimate",
                    "d_hat": f"estimated disturbance{computer.unit}"}  # fmt: skip
@@ -335,36 +310,35 @@ def _observing(computer: Board, observer: Observer, device: Actuators) -> None:
         measured = {"wheel_momentum": each, **({"acting": each} if device.moves else {})}
         computer.inputs |= measured
         computer.state |= measured
-        names = [f"{when}.{name}" for when in ("before", "in") for name in measured]
-        acted = ("last.wheel_torque", *names)
+        acted = "last.wheel_torque"
     elif device.moves:
         computer.inputs["applied"] = real(m)
         computer.about["applied"] = "mean torque on the body over the last period, from telemetry [N m]"
-        acted = ("in.applied",)
+        acted = "in.applied"
     else:
-        acted = ("last.command",) if device.ideal else ("last.torque",)
+        acted = "last.command" if device.ideal else "last.torque"
 
-    def observe(parameters: Any, t: Any, dt: Any, regular: Any, memory: Any, *read: Any) -> dict[str, Any]:
-        known, size = parameters["observer"], len(computer.seen)
-        model, before, now = known.model, computer.state_of(read[:size]), computer.state_of(read[size : 2 * size])
+    def observe(parameters: Given, given: Given) -> Given:
+        known, t, dt, memory = parameters["observer"], given["t"], given["dt"], given["before.observer"]
+        model, before, now = known.model, computer.seen(given, "before"), computer.seen(given, "now")
 
         def updated() -> Any:
-            applied = read[2 * size]
+            applied = given[acted]
             if measured:
-                h, *v = read[2 * size + 1 :][: len(measured)]
-                drive = Drive(v[0] if v else None, applied, h, jnp.zeros((), bool))
+                drive = Drive(given.get("before.acting"), applied, given["before.wheel_momentum"], jnp.zeros((), bool))
                 torque, stored = parameters["actuators"].assumed(drive, dt)
                 turning = (model.velocity(before) + model.velocity(now)) / 2
                 applied = torque - jnp.cross(turning, stored)
             impulse = model.unexplained_impulse(t, before, now, applied, dt)
             return known.update(parameters["observer_matrix"], memory, impulse, t, dt)
 
-        memory = jax.lax.cond(regular != 0, updated, lambda: memory)
+        memory = jax.lax.cond(given["regular"] != 0, updated, lambda: memory)
         written = {"now.observer": memory, "out.d_hat": known.estimate(memory)}
-        return written | {f"now.{name}": read[k - len(measured)] for k, name in enumerate(measured)}
+        return written | {f"now.{name}": given[f"in.{name}"] for name in measured}
 
-    states = [f"{when}.{name}" for when in ("before", "now") for name in computer.seen]
-    reads = ("t", "dt", "regular", "before.observer", *states, *acted)
+    telemetry = [f"{when}.{name}" for when in ("before", "in") for name in measured]
+    states = (*computer.names("before"), *computer.names("now"))
+    reads = ("t", "dt", "regular", "before.observer", *states, acted, *telemetry)
     about = "The disturbance that explains the motion since the last sample, through the observer."
     computer.stages.append(Stage("observe", about, reads, observe, (observer,)))
 
@@ -372,14 +346,14 @@ def _observing(computer: Board, observer: Observer, device: Actuators) -> None:
 def _commanding(computer: Board, law: Law, observer: Observer, command_filter: CommandFilter | None) -> None:
     """The law, before and after its hand-over, and the filter of its command."""
     m, memory = observer.model.inputs, law.begin()
-    x = computer.state_of(tuple(computer.state[name] for name in computer.seen))
+    x = computer.model.state_of(computer.state)
     target = jax.eval_shape(computer.parameters["reference"], real())
 
     def once(law: Law, x: Any, target: Any) -> Any:
         now = Sample(jnp.zeros(()), jnp.zeros((), bool), jnp.ones(()), memory)
         return law(now, x, target, jnp.zeros(m), jnp.zeros(()))[1]
 
-    computer.state["law"] = shapes(memory)
+    computer.state["law"] = jax.eval_shape(law.begin)
     computer.outputs |= {"command": real(m), "s": real(*jax.eval_shape(once, law, x, target).shape)}
     filtered = "" if command_filter is None else " behind the filter of its command"
     computer.about |= {
@@ -389,7 +363,7 @@ def _commanding(computer: Board, law: Law, observer: Observer, command_filter: C
     }
     memories, shaped = ["law"], ()
     if command_filter is not None:
-        computer.state["command_filter"] = shapes(command_filter.begin(m))
+        computer.state["command_filter"] = jax.eval_shape(lambda: command_filter.begin(m))
         computer.about["command_filter"] = "integrators of the command's filter, advanced by half a period"
         memories, shaped = ["law", "command_filter"], (command_filter,)
     singular = any(_depends(law.clearance, x, target))
@@ -398,15 +372,14 @@ def _commanding(computer: Board, law: Law, observer: Observer, command_filter: C
         computer.about |= {"clearance": "distance from the law's singularity, by `clearance_unit` [-]",
                        "clearance_unit": "what that is counted in"}  # fmt: skip
 
-    seen = [f"now.{name}" for name in computer.seen]
-    reads = ("t", "tracking", "out.d_hat", *(f"before.{name}" for name in memories), *seen,
+    reads = ("t", "tracking", "out.d_hat", *(f"before.{name}" for name in memories), *computer.names("now"),
              *(("dt",) if shaped else ()),
              *(("before.clearance_unit", "last.command", "last.s") if singular else ()))  # fmt: skip
 
-    def command(parameters: Any, *read: Any) -> dict[str, Any]:
-        given, known, period = dict(zip(reads, read, strict=True)), parameters["law"], parameters["period"]
-        t, last = given["t"], {name: given[f"before.{name}"] for name in memories}
-        now, reference = computer.state_of(tuple(given[name] for name in seen)), parameters["reference"](t)
+    def command(parameters: Given, given: Given) -> Given:
+        known, period, t = parameters["law"], parameters["period"], given["t"]
+        last = {name: given[f"before.{name}"] for name in memories}
+        now, reference = computer.seen(given, "now"), parameters["reference"](t)
         hold = t >= known.hand_over - guards.rounding(period, known.hand_over)  # as the clock has it
 
         def decided() -> tuple[Any, Any, dict[str, Any]]:
@@ -435,8 +408,9 @@ def _commanding(computer: Board, law: Law, observer: Observer, command_filter: C
     computer.stages.append(Stage("command", about, reads, command, (law, law.kinematics, *shaped)))
 
 
-def _begin(parameters: Any, m: int) -> dict[str, Any]:
-    filtering = parameters["command_filter"]
+def begin(parameters: Given, given: Given) -> Given:
+    """Return the memory before the first sample."""
+    filtering, m = parameters["command_filter"], parameters["observer"].model.inputs
     begun = {} if filtering is None else {"now.command_filter": filtering.begin(m)}
     estimator = parameters["filter"]
     if isinstance(estimator, KalmanFilter):
@@ -452,33 +426,31 @@ def _depends(function: Callable, *args: Any) -> list[bool]:
 
 def _acting(computer: Board, device: Actuators, m: int) -> None:
     """What of the command acts on the body: delay, limits, allocation to wheels."""
-    wheels, reads, names = device.wheels, ["out.command"], []
+    wheels, reads = device.wheels, ["out.command"]
     if device.delay:
         computer.state["queue"] = real(device.delay, m)
         computer.about["queue"] = "commands on their way, the oldest first [N m]"
-        names.append("before.queue")
+        reads.append("before.queue")
     if device.moves:
         computer.inputs.setdefault("acting", real(m))
         computer.about["acting"] = "torque of each axis, or wheel, at this sample, from telemetry [N m]"
-        names.append("in.acting")
+        reads.append("in.acting")
     computer.outputs["torque"] = real(m)
     computer.about["torque"] = "on the body from this sample on, as far as it is known [N m]"
     if wheels is not None:
         computer.outputs["wheel_torque"] = real(*np.shape(wheels.initial))
         computer.about["wheel_torque"] = "of each wheel on the body, about its axis, from this sample on [N m]"
-        names += ["in.wheel_momentum", "now.rate"]
+        reads += ["in.wheel_momentum", "now.rate"]
 
-    def act(parameters: Any, u: Any, *read: Any) -> dict[str, Any]:
-        values, actuators = dict(zip(names, read, strict=True)), parameters["actuators"]
-        state = ActuatorState(values.get("before.queue"), values.get("in.acting"), values.get("in.wheel_momentum"))
-        rate = values.get("now.rate", jnp.zeros_like(u))
+    def act(parameters: Given, given: Given) -> Given:
+        actuators, u = parameters["actuators"], given["out.command"]
+        state = ActuatorState(given.get("before.queue"), given.get("in.acting"), given.get("in.wheel_momentum"))
+        rate = given.get("now.rate", jnp.zeros_like(u))
         drive, queue = actuators.command(state, u, rate, jnp.zeros(()), parameters["period"], jnp.ones(()))
-        written = {"limited": drive.limited}
-        if queue is not None:
-            written["now.queue"] = queue
+        written = {"limited": drive.limited} | ({} if queue is None else {"now.queue": queue})
         if wheels is None:
             return {**written, "out.torque": drive.c}
         return {**written, "out.torque": actuators.wheels.axes @ drive.c, "out.wheel_torque": drive.c}
 
     what = "What of the command acts on the body: limits, delay, wheels."
-    computer.stages.append(Stage("act", what, (*reads, *names), act, (device,)))
+    computer.stages.append(Stage("act", what, tuple(reads), act, (device,)))

@@ -1,4 +1,4 @@
-"""Branches and loops of a trace as regions of C; short loops with a fixed length are written out."""
+"""Branches and loops of a trace as regions of C; short loops of fixed length are unrolled."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -10,12 +10,12 @@ from ptsmc_jax.batching.components import object_array
 from ptsmc_jax.batching.dependence import split_scan_operands, unpack_while
 from ptsmc_jax.onboard.expressions import BOOL, Block, Node, Region, kind_of
 
-UNROLLED = 8  # passes of a loop that are written out, and
-WRITTEN = 200  # operations that they may have together
+UNROLLED = 8  # largest number of passes of an unrolled loop
+WRITTEN = 200  # largest number of their operations
 
 
 def _inside(to: Any, region: Region, made: Callable[[], list[np.ndarray]]) -> None:
-    """A block of its own in a region, and what comes out of it: the components that are made there."""
+    """Add a block to a region; `made` makes its components, which are its outputs."""
     outer = to.pool.block
     to.pool.block = Block(outer)
     region.outputs.append(_flat(made()))
@@ -28,14 +28,14 @@ def _flat(arrays: Sequence[np.ndarray]) -> list[Node]:
 
 
 def _variables(to: Any, like: Sequence[Any]) -> list[np.ndarray]:
-    """Variables that a branch or a loop sets, as many as these of its trace have components."""
+    """Return variables for the components of these variables of the trace."""
     shapes, kinds = [v.aval.shape for v in like], [kind_of(v.aval.dtype) for v in like]
     return [object_array(shape, [to.pool.fresh(kind) for _ in range(math.prod(shape))])
             for shape, kind in zip(shapes, kinds, strict=True)]  # fmt: skip
 
 
 def _region(to: Any, region: Region, like: Sequence[Any]) -> list[np.ndarray]:
-    """Ends a region: variables that hold its results."""
+    """End a region; return the variables of its results."""
     found = _variables(to, like)
     region.results += _flat(found)
     statement = Node("region", (), "", region, to.pool.block)
@@ -47,7 +47,7 @@ def _region(to: Any, region: Region, like: Sequence[Any]) -> list[np.ndarray]:
 
 
 def branch(to: Any, eqn: Any, values: list[np.ndarray]) -> list[np.ndarray]:
-    """lax.cond and lax.switch: as many branches, of which C runs one."""
+    """Translate lax.cond and lax.switch: C runs one of the branches."""
     index, *operands = values
     branches, test = eqn.params["branches"], index.item()
     if test.op == "constant":
@@ -56,7 +56,7 @@ def branch(to: Any, eqn: Any, values: list[np.ndarray]) -> list[np.ndarray]:
 
 
 def _switch(to: Any, eqn: Any, test: Node, branches: Sequence[Any], operands: list[np.ndarray]) -> list[np.ndarray]:
-    """The last branch where `test` says so, else one of those before."""
+    """Translate a choice between the last branch and the branches before it."""
     last = len(branches) - 1
     if test.kind == BOOL:
         on = test
@@ -74,8 +74,8 @@ def _switch(to: Any, eqn: Any, test: Node, branches: Sequence[Any], operands: li
 
 
 def loop(to: Any, eqn: Any, values: list[np.ndarray]) -> list[np.ndarray]:
-    """lax.while_loop."""
-    test, body, test_consts, body_consts, init = unpack_while(eqn, values)
+    """Translate lax.while_loop."""
+    test, body, test_consts, body_consts, init = loop_of(eqn, values)
     region = Region("while")
     carry = _carry(to, region, init, eqn.outvars)
     _inside(to, region, lambda: to.evaluate(test, [*test_consts, *carry]))
@@ -84,14 +84,14 @@ def loop(to: Any, eqn: Any, values: list[np.ndarray]) -> list[np.ndarray]:
 
 
 def _carry(to: Any, region: Region, init: Sequence[np.ndarray], like: Sequence[Any]) -> list[np.ndarray]:
-    """Variables that a loop carries, which begin with these components."""
+    """Return the variables of a loop's state, with these initial components."""
     region.initial, found = _flat(init), _variables(to, like)
     region.carried = _flat(found)
     return found
 
 
 def scan(to: Any, eqn: Any, values: list[np.ndarray]) -> list[np.ndarray]:
-    """lax.scan and fori_loop of a fixed length: written out where it is short, else a loop in C."""
+    """Translate lax.scan and fori_loop of fixed length: unrolled if short, otherwise a loop in C."""
     params = eqn.params
     body, length = params["jaxpr"], params["length"]
     consts, init, xs = split_scan_operands(params, values)
@@ -123,7 +123,7 @@ def scan(to: Any, eqn: Any, values: list[np.ndarray]) -> list[np.ndarray]:
 
 
 def _entries(to: Any, region: Region, x: np.ndarray) -> np.ndarray:
-    """What a pass of a counted loop has of x (passes, ..), each component of which becomes a table over the passes."""
+    """Return the entries of x (passes, ..) in one pass of a counted loop; each component becomes a table."""
     nodes = []
     for column in x.reshape(len(x), -1).T:
         table = to.pool.fresh(column[0].kind, "table")
@@ -133,7 +133,7 @@ def _entries(to: Any, region: Region, x: np.ndarray) -> np.ndarray:
 
 
 def _filled(to: Any, region: Region, aval: Any, order: range) -> np.ndarray:
-    """What a counted loop stacks of one of its outputs, behind its state, (passes, ..): tables that it fills."""
+    """Return a stacked output (passes, ..) of a counted loop: tables that the loop fills."""
     kind, columns = kind_of(aval.dtype), []
     for _ in range(math.prod(aval.shape)):
         table = to.pool.fresh(kind, "table")

@@ -1,7 +1,7 @@
-"""Scalar expressions: what a trace becomes before it is C. Equal ones are one, constants are folded.
+"""Scalar expressions, between a trace and C.
 
-A node is an operation on other nodes. `Pool` makes them: it finds the one that is there already (common
-subexpressions), computes what is known, and leaves out what changes nothing (x + 0, 1 x, 0 x of a finite x).
+A node is an operation on other nodes. `Pool` makes nodes: it reuses equal nodes (common subexpressions), folds
+constants, and simplifies x + 0, 1 x and, for finite x, 0 x.
 """
 
 import math
@@ -15,30 +15,30 @@ REAL, BOOL = "real", "bool"  # kinds of numbers; the others are C's names of who
 
 
 class NoRuleError(ValueError):
-    """What cannot be written in C. Its text is one sentence that names it, and the line it stands in."""
+    """C has no counterpart. The message is one sentence with the operation and its line."""
 
 
 class Title:
-    """A name that the source gives to a value, of which a node is a component."""
+    """The name of a value in the source; a node is one of its components."""
 
     def __init__(self, name: str):
         self.name = name
 
 
 class Node:
-    """A scalar: an operation and its operands, a constant, or a place that C reads."""
+    """A scalar: an operation and its operands, a constant, or a place in memory."""
 
     __slots__ = ("args", "block", "finite", "kind", "op", "part", "section", "serial", "title", "value")
     made: ClassVar[int] = 0
 
     def __init__(self, op: str, args: tuple["Node", ...], kind: str, value: Any, block: "Block"):
         Node.made += 1
-        self.serial = Node.made  # operands come before what is made of them
+        self.serial = Node.made  # operands have smaller numbers
         self.op, self.args, self.kind, self.value, self.block = op, args, kind, value, block
         self.finite = self._is_finite()
-        self.title: Title | None = None  # by what name the source knows it
-        self.part = ""  # which component of that it is
-        self.section: Any = None  # the function of the source that it is computed in
+        self.title: Title | None = None  # its name in the source
+        self.part = ""  # its component of the named value
+        self.section: Any = None  # the function of the source that computes it
 
     def _is_finite(self) -> bool:
         """Return whether the value is finite for certain, so that 0 times it is 0 and not NaN.
@@ -56,14 +56,14 @@ class Node:
 
 
 class Block:
-    """What is computed one after the other: a function's body, one side of a branch, a loop's body."""
+    """Statements in order: the body of a function or a loop, or one side of a branch."""
 
     def __init__(self, outer: "Block | None" = None):
         self.outer, self.nodes = outer, []
         self.known: dict[Any, Node] = {}
 
     def find(self, key: Any) -> Node | None:
-        """A node that is computed here, or further out."""
+        """Return the node with this key, from here or an enclosing block."""
         block: Block | None = self
         while block is not None:
             if key in block.known:
@@ -73,19 +73,19 @@ class Block:
 
 
 class Region:
-    """A branch or a loop: blocks, and the values that come out of it."""
+    """A branch or a loop: its blocks and results."""
 
     def __init__(self, kind: str, test: Node | None = None):
         self.kind, self.test = kind, test  # "branch", "while" or "count"
         self.blocks: list[Block] = []
         self.outputs: list[list[Node]] = []  # of each block
-        self.results: list[Node] = []  # what stands for them outside
-        self.carried: list[Node] = []  # of a loop: what stands for its state inside
+        self.results: list[Node] = []  # the outputs, as variables outside
+        self.carried: list[Node] = []  # of a loop: its state, as variables inside
         self.initial: list[Node] = []
         self.length = 0  # of a counted loop
         self.index: Node | None = None
-        self.tables: list[tuple[Node, list[Node]]] = []  # what a counted loop goes through: name, entries
-        self.rows: list[tuple[Node, int]] = []  # arrays that it fills: name, which output
+        self.tables: list[tuple[Node, list[Node]]] = []  # tables that a counted loop reads: name, entries
+        self.rows: list[tuple[Node, int]] = []  # arrays that it fills: name, index of the output
 
 
 # op: its value for known operands
@@ -115,7 +115,7 @@ FOLDED: dict[str, Callable] = {
 
 
 def kind_of(dtype: Any) -> str:
-    """The kind of C's number for a type of JAX's; raises KeyError where there is none."""
+    """Return the kind of C's number for a type of JAX. Raises KeyError if there is none."""
     if not isinstance(dtype, type | np.dtype):  # a type of JAX's own, of keys of random numbers
         raise KeyError(dtype)
     dtype = np.dtype(dtype)
@@ -128,26 +128,26 @@ def kind_of(dtype: Any) -> str:
 
 
 class Pool:
-    """Makes nodes, in the block that is being filled."""
+    """Makes nodes in the current block."""
 
     def __init__(self) -> None:
         self.block = Block()
         self.section: Any = None
 
     def constant(self, value: Any, kind: str) -> Node:
-        """A number that is known."""
+        """Return the node of a constant."""
         value = bool(value) if kind == BOOL else float(value) if kind == REAL else int(value)
         # 0.0 and -0.0 are equal, but not the same; nan is not equal to itself
         key = ("constant", kind, math.copysign(1.0, value) if value == 0 else 0, "nan" if value != value else value)
         return self.block.find(key) or self._put(key, Node("constant", (), kind, value, self._outermost()))
 
     def place(self, name: str, kind: str) -> Node:
-        """What C reads by this name."""
+        """Return the node of a place in memory."""
         key = ("place", name)
         return self.block.find(key) or self._put(key, Node("place", (), kind, name, self._outermost()))
 
     def fresh(self, kind: str, what: str = "variable") -> Node:
-        """A variable that a loop or a branch sets."""
+        """Return a new variable of a loop or a branch."""
         node = Node(what, (), kind, None, self.block)
         node.section = self.section
         return node
@@ -163,7 +163,7 @@ class Pool:
         return node
 
     def make(self, op: str, *args: Node, kind: str = REAL, value: Any = None) -> Node:
-        """A node of this operation; the same one for the same operands."""
+        """Return the node of an operation; equal operations give the same node."""
         simple = self._simplified(op, args, kind)
         if simple is not None:
             return simple

@@ -1,7 +1,8 @@
-"""The fields of the C structs: pytrees taken apart, with names, shapes and what the source says of them."""
+"""Fields of C structs: pytrees taken apart, each leaf with its name, shape and meaning."""
 
 import re
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -23,60 +24,51 @@ class Field:
 
     @property
     def size(self) -> int:
-        """How many numbers it is."""
+        """The number of its elements."""
         return int(np.prod(self.shape, dtype=int))
 
-    def element(self, index: tuple[int, ...]) -> str:
-        """One of its numbers, as C has it."""
-        return self.name + "".join(f"[{i}]" for i in index)
-
     def elements(self) -> list[str]:
-        """All its numbers, as C has them, row by row."""
-        return [self.element(index) for index in np.ndindex(*self.shape)]
+        """Return the names of its elements in C, row by row."""
+        return [self.name + "".join(f"[{i}]" for i in index) for index in np.ndindex(*self.shape)]
+
+    def nodes(self, pool: Pool, owner: str) -> np.ndarray:
+        """Return its elements as nodes, an array of its shape; owner: the text before its name, such as "in->"."""
+        return object_array(self.shape, (pool.place(owner + element, self.kind) for element in self.elements()))
 
 
-@dataclass
-class Struct:
-    """A struct that is being filled: its fields in order, and for each leaf that C reads its place."""
+def struct(trees: Mapping[str, Any], about: Mapping[str, str]) -> dict[str, list[Field]]:
+    """Return the fields of a struct, in order.
 
-    pointer: str  # by what name C's functions have it
-    fields: dict[str, Field] = field(default_factory=dict)
+    Args:
+        trees: shapes, or trees of shapes, by name.
+        about: the meaning of single shapes, by name.
 
-    def add(self, name: str, tree: Any, about: str = "") -> Any:
-        """Fields for the leaves of a tree of arrays, or of shapes; returns the tree with names in place of leaves."""
+    Returns:
+        A field for each leaf, by the name of the tree.
 
-        def one(path: Any, leaf: Any) -> str:
+    Raises:
+        NoRuleError: C has no numbers of a leaf's type.
+    """
+    found: dict[str, list[Field]] = {}
+    taken: set[str] = set()
+    for name, tree in trees.items():
+        found[name] = []
+        for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
             parts, meaning = spoken(path, tree)
-            full = "_".join([name, *parts]) if name else "_".join(parts)
-            full = re.sub(r"\W+", "_", full).strip("_").lower() or "x"
-            while full in self.fields:  # keys of a memory may differ in capitals, or in what no name has
+            full = re.sub(r"\W+", "_", "_".join([name, *parts])).strip("_").lower() or "x"
+            while full in taken:  # keys of a memory may differ only in capitals or punctuation
                 full += "_"
+            taken.add(full)
             try:
                 kind = kind_of(leaf.dtype)
             except KeyError:
                 raise NoRuleError(f"{full} holds {leaf.dtype}, which C has no number for here") from None
-            self.fields[full] = Field(full, tuple(np.shape(leaf)), kind, meaning or about)
-            return full
-
-        return jax.tree_util.tree_map_with_path(one, tree)
-
-    def listed(self) -> list[Field]:
-        """Its fields as C declares them, which knows no array of no numbers."""
-        return [made for made in self.fields.values() if made.size]
-
-    def nodes(self, pool: Pool, tree: Any) -> Any:
-        """The tree of names with arrays of what C reads there."""
-
-        def one(name: str) -> np.ndarray:
-            made = self.fields[name]
-            places = (pool.place(f"{self.pointer}->{element}", made.kind) for element in made.elements())
-            return object_array(made.shape, places)
-
-        return jax.tree.map(one, tree)
+            found[name].append(Field(full, tuple(leaf.shape), kind, meaning or ("" if path else about.get(name, ""))))
+    return found
 
 
 def spoken(path: Any, tree: Any) -> tuple[list[str], str]:
-    """How a leaf is called, by the attributes that lead to it, and the comment beside its field in the source."""
+    """Return the attributes that lead to a leaf, and the comment beside its field in the source."""
     names, meaning, at = [], "", tree
     for key in path:
         attribute = getattr(key, "name", None)

@@ -1,4 +1,4 @@
-"""A controller's folder: C, vectors, what checks them, and what it all is."""
+"""The folder of an exported controller: C, test vectors, programs that check them, README."""
 
 import hashlib
 import json
@@ -29,7 +29,7 @@ class Controller:
     """The flight computer of a scenario, in C."""
 
     def __init__(self, scenario: Scenario, name: str, source: str):
-        """Traces and writes it; raises ScenarioError where it cannot be."""
+        """Trace the flight computer. Raises ScenarioError if it cannot be written in C."""
         self.scenario = flown(scenario)
         self.ready: Study = scenarios.study(self.scenario)
         self.board: Board = board(self.ready.parts)
@@ -40,7 +40,7 @@ class Controller:
         law, device = self.ready.parts.controller, self.ready.parts.actuators
         self.about = About(
             name, source, digest(self.scenario), type(law).__qualname__, self.board.parameters["filter"] is not None,
-            self.board.spacecraft, device.wheels is not None,
+            self.board.model.largest_measurement, device.wheels is not None,
             device.delay, float((law.t_f / self.last) ** 2),
         )  # fmt: skip
 
@@ -51,14 +51,15 @@ class Controller:
 
     @property
     def last(self) -> float:
-        """How long before t_f the last sample before the hand-over may be [s]."""
+        """Smallest time to go of the last sample before the hand-over [s]."""
         return float(self.ready.parts.controller.delta) + self.period
 
 
 def flown(scenario: Scenario) -> Scenario:
-    """The scenario as a flight computer has it, on the flight clock.
+    """Return the scenario of a flight computer, with the flight clock.
 
-    Raises ScenarioError of a continuous loop, and of failures that it would be told of.
+    Raises:
+        ScenarioError: the loop is continuous, or the flight computer knows of wheel failures.
     """
     if not scenario.sampled:
         raise wrong("loop.mode", scenario.loop.mode, '"sampled" to be exported: a flight computer has samples')
@@ -69,19 +70,19 @@ def flown(scenario: Scenario) -> Scenario:
 
 
 def digest(scenario: Scenario) -> str:
-    """SHA-256 of a scenario's tables, every default filled in, and of the files that it names."""
+    """Return the SHA-256 of a scenario's tables with all defaults, and of the files that it names."""
     said = json.dumps([parsing.dump(scenario), own.digests(scenario)], sort_keys=True, default=str)
     return hashlib.sha256(said.encode()).hexdigest()
 
 
 def identifier(text: str) -> str:
-    """A name that C takes."""
+    """Return a valid C identifier."""
     plain = re.sub(r"\W+", "_", text, flags=re.ASCII).strip("_").lower()
     return plain if plain and not plain[0].isdigit() else f"c_{plain}".rstrip("_")
 
 
 def fly(made: Controller, seed: int, trials: int) -> dict[int, vectors.Samples]:
-    """Those of so many trials that are usable, by their number."""
+    """Simulate trials; return those that can be used as test vectors, by number."""
     dispersion = vectors.known_alike(made.ready.dispersion)
     numbers = np.arange(trials, dtype=np.uint32)
     flown = vectors.fly_many(made.ready.parts, dispersion, jnp.uint32(seed), jnp.asarray(numbers))
@@ -95,8 +96,8 @@ def fly(made: Controller, seed: int, trials: int) -> dict[int, vectors.Samples]:
 
 
 def table(made: Controller, flown: dict[int, vectors.Samples]) -> tuple[list[str], list[list[Any]]]:
-    """Header and rows of vectors.csv."""
-    lists = templates.columns(made.code)
+    """Return the header and the rows of vectors.csv."""
+    lists = made.code.columns
     header = [
         "trial",
         "sample",
@@ -114,10 +115,11 @@ def table(made: Controller, flown: dict[int, vectors.Samples]) -> tuple[list[str
 
 
 def write(folder: Path, made: Controller, seed: int, trials: int) -> None:
-    """Fills a folder that is there."""
+    """Write all files into an existing folder."""
     flown, t_f = fly(made, seed, trials), float(made.ready.parts.controller.t_f)
+    rounding = made.board.model.error_rounding
     header, rows = table(made, flown)
-    steepness = min(vectors.steepness(one, t_f, made.last) for one in flown.values()) if made.board.spacecraft else 0.0
+    steepness = min(vectors.steepness(one, rounding, t_f, made.last) for one in flown.values())
     write_program(folder, made, steepness)
     store.write_csv(folder / "vectors.csv", header, rows)
     made_by = {"command": "export", "seed": seed, **own.digests(made.scenario)}
@@ -125,22 +127,13 @@ def write(folder: Path, made: Controller, seed: int, trials: int) -> None:
 
 
 def write_program(folder: Path, made: Controller, steepness: float = 0.0) -> None:
-    """The files without any trial's numbers; steepness: check.c is to allow for at least this one, see `About`."""
+    """Write the files that do not need trials; steepness: at least that of check.c, see `About`."""
     code, about = made.code, made.about._replace(steepness=max(made.about.steepness, steepness))
-    texts = {
-        f"ptsmc_{about.name}.h": templates.header(code, about),
-        f"ptsmc_{about.name}.c": templates.source(code, about),
-        f"ptsmc_{about.name}_parameters.c": templates.values(code, about),
-        f"ptsmc_{about.name}_flat.h": templates.flat(code, about),
-        "check.c": templates.check(code, about),
-        "fuzz.c": templates.fuzz(code, about),
-        "Makefile": templates.makefile(about),
-        "README.md": readme(code, about),
-    }
+    texts = {**templates.texts(code, about), "README.md": readme(code, about)}
     for name, text in texts.items():
         store.write_text(folder / name, templates.prefixed(text, about.name))
     layout = {"name": about.name, "digest": about.digest, "period": made.period, "parts": made.board.parts}
-    layout["columns"] = templates.columns(code)
+    layout["columns"] = code.columns
     store.write_json(folder / LAYOUT, layout)
 
 
@@ -148,11 +141,23 @@ def export(
     what: Scenario | str | Path, folder: str | Path, *, name: str | None = None, trials: int = 3, seed: int = 0,
     force: bool = False,
 ) -> Path:  # fmt: skip
-    """Writes a scenario's flight computer as C99 into a folder, with vectors of so many trials that check it.
+    """Write a scenario's flight computer as C99 into a folder, with test vectors.
 
-    name: of its files, by default the scenario's file. Raises ScenarioError where it cannot be written in C, or its
-    loop is continuous; RefusedError where the folder holds something and force is not said; ValueError where trials or
-    seed are no such numbers.
+    Args:
+        what: the scenario or its file.
+        folder: the new folder.
+        name: of the files; by default that of the scenario's file.
+        trials: number of trials in the test vectors.
+        seed: of the trials.
+        force: write into a folder that has content.
+
+    Returns:
+        The folder.
+
+    Raises:
+        ScenarioError: the loop is continuous, or C cannot express a part.
+        RefusedError: the folder has content, and `force` is not set.
+        ValueError: `trials` or `seed` is not such a number.
     """
     path = Path(folder)
     draws.check_whole_number("trials", trials, 1)

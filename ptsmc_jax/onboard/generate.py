@@ -1,24 +1,24 @@
-"""The C functions and structs of a flight computer."""
+"""The C functions and structs of a flight computer, generated from its stages."""
 
-import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
+from ptsmc_jax.batching.components import object_array
 from ptsmc_jax.laws.base import AccelerationLaw, Law
 from ptsmc_jax.laws.kinematics import AttitudeKinematics, Kinematics
 from ptsmc_jax.observers.base import Observer
 from ptsmc_jax.onboard import origins, parameters, printing
 from ptsmc_jax.onboard.board import SCALARS, Board, Stage
-from ptsmc_jax.onboard.expressions import REAL, Node, Pool, Title
-from ptsmc_jax.onboard.fields import Field, Struct
+from ptsmc_jax.onboard.expressions import Node, Pool, Title, kind_of
+from ptsmc_jax.onboard.fields import Field, struct
 from ptsmc_jax.onboard.translate import Translator
 
+Struct = dict[str, list[Field]]  # the fields of each named tree
 POINTERS = {"p": "const ptsmc_params *p", "d": "const ptsmc_derived *d", "in": "const ptsmc_in *in",
             "before": "const ptsmc_state *before", "now": "ptsmc_state *now", "out": "ptsmc_out *out"}  # fmt: skip
 PASSED = {"d": "&state->derived", "before": "state", "now": "&now", "out": "&found"}  # what a step has of these names
@@ -28,7 +28,7 @@ COMMON = (object, Law, AccelerationLaw, Kinematics, AttitudeKinematics, Observer
 
 @dataclass
 class Code:
-    """The C of a flight computer."""
+    """The generated C of a flight computer."""
 
     parameters: list[Field]
     values: dict[str, np.ndarray]  # of the parameters
@@ -37,26 +37,32 @@ class Code:
     outputs: list[Field]
     functions: list[str] = field(default_factory=list)  # their text
     calls: dict[str, str] = field(default_factory=dict)  # by stage
-    about: dict[str, str] = field(default_factory=dict)  # what each stage does, of those of a sample
-    counts: Counter[str] = field(default_factory=Counter)  # operations of a step at most
-    open: bool = False  # whether the passes of a loop are not known, of which one is counted
-    derived: list[Field] = field(default_factory=list)  # what follows from parameters
-    basis: list[Field] = field(default_factory=list)  # the parameters that it follows from
-    derivation: str = ""  # the text of the function that does
-    follows: dict[str, list[str]] = field(default_factory=dict)  # of each the names of those
-    fixed: dict[str, str] = field(default_factory=dict)  # parameters that follow from others, but not in C: why
-    deriving: dict[str, int] = field(default_factory=dict)  # operations of that
-    variables: int = 0  # at most, of all functions together
+    about: dict[str, str] = field(default_factory=dict)  # description of each stage of a sample
+    counts: Counter[str] = field(default_factory=Counter)  # largest number of operations of a step
+    open: bool = False  # a loop has an unknown number of passes; one is counted
+    derived: list[Field] = field(default_factory=list)  # numbers that follow from parameters
+    basis: list[Field] = field(default_factory=list)  # the parameters that they follow from
+    derivation: str = ""  # text of the function that derives them
+    follows: dict[str, list[str]] = field(default_factory=dict)  # derived name: names of its parameters
+    fixed: dict[str, str] = field(default_factory=dict)  # parameters that C cannot derive: reason
+    deriving: dict[str, int] = field(default_factory=dict)  # operations of the derivation
+    variables: int = 0  # largest number in a function
+
+    @property
+    def columns(self) -> dict[str, list[str]]:
+        """The elements of the structs, by struct, see `columns`."""
+        params = [element for made in self.parameters for element in made.elements()]
+        return {**columns(self.inputs, self.state, self.outputs), "params": params}
 
 
 def generate(board: Board) -> Code:
-    """The C of a flight computer; raises NoRuleError where something in it has no rule."""
-    known = parameters.parameters(board)
-    structs, trees = _structs(board)
+    """Return the C of a flight computer. Raises NoRuleError if an operation has no counterpart in C."""
+    known, structs = parameters.parameters(board), _structs(board)
     known.used.add("period")
-    code = Code([], {}, structs["in"].listed(), structs["before"].listed(), structs["out"].listed())
+    inputs, state, outputs = map(_listed, structs.values())
+    code = Code([], {}, inputs, state, outputs)
     for stage in board.stages:
-        _function(code, board, stage, structs, trees, known)
+        _function(code, board, stage, structs, known)
     _derivation(code, known)
     code.parameters = known.listed("p")
     code.values = {made.name: known.values[made.name] for made in code.parameters}
@@ -64,7 +70,7 @@ def generate(board: Board) -> Code:
 
 
 def _derivation(code: Code, known: parameters.Parameters) -> None:
-    """The function that computes what follows from parameters, of what is used."""
+    """Add the function that derives numbers from parameters."""
     code.derived = known.listed("d")
     follows = {made.name: known.origins[made.name] for made in code.derived}
     code.fixed = {name: why for name, why in known.fixed.items() if name in known.used}
@@ -81,24 +87,23 @@ def _derivation(code: Code, known: parameters.Parameters) -> None:
     copies = [f"    d->of_{element} = p->{element};" for made in code.basis for element in made.elements()]
     about = printing.comment("What follows from the parameters, and the parameters that it follows from.")
     head = [*about, "static void derive(const ptsmc_params *p, ptsmc_derived *d)", "{"]
-    code.derivation = "\n".join([*head, *_shortened(body, {}), "", *copies, "}"])
+    code.derivation = "\n".join([*head, *body, "", *copies, "}"])
     code.deriving = dict(printer.counts)
     code.variables = max(code.variables, printer.variables)
 
 
-def _structs(board: Board) -> tuple[dict[str, Struct], dict[str, Any]]:
-    """The structs, and for each named tree its leaves' fields."""
-    structs = {"in": Struct("in"), "before": Struct("before"), "out": Struct("out")}
-    trees: dict[str, Any] = {}
-    for prefix, shapes in (("in", board.inputs), ("before", board.state), ("out", board.outputs)):
-        for name, shape in shapes.items():
-            plain = isinstance(shape, jax.ShapeDtypeStruct)
-            trees[f"{prefix}.{name}"] = structs[prefix].add(name, shape, board.about.get(name, "") if plain else "")
-    return structs, trees
+def _structs(board: Board) -> dict[str, Struct]:
+    shapes = {"in": board.inputs, "before": board.state, "out": board.outputs}
+    return {name: struct(trees, board.about) for name, trees in shapes.items()}
+
+
+def _listed(made: Struct) -> list[Field]:
+    """Return the fields that C declares: it has no arrays without elements."""
+    return [one for group in made.values() for one in group if one.size]
 
 
 def columns(inputs: Sequence[Field], state: Sequence[Field], outputs: Sequence[Field]) -> dict[str, list[str]]:
-    """The columns of vectors.csv that are inputs, outputs and state, as C has them, in order."""
+    """Return the columns of inputs, outputs and state in vectors.csv, named as in C."""
 
     def all_of(members: Sequence[Field], owner: str = "") -> list[str]:
         return [owner + element for made in members for element in made.elements()]
@@ -111,65 +116,54 @@ def columns(inputs: Sequence[Field], state: Sequence[Field], outputs: Sequence[F
 
 
 def names_of(board: Board) -> dict[str, list[str]]:
-    """The columns of a flight computer, without its C."""
-    structs, _ = _structs(board)
-    return columns(*(structs[name].listed() for name in ("in", "before", "out")))
+    """Return the columns of a flight computer without generating its C."""
+    return columns(*map(_listed, _structs(board).values()))
 
 
-# of what a stage reads and writes, by the first part of its name: its struct, and what C has before the field's name
+# by the prefix of a name that a stage reads or writes: the struct, and the text before the field in C
 STRUCTS = {"in": "in", "before": "before", "now": "before", "last": "out", "out": "out"}
 PLACES = {"in": "in->", "before": "before->", "now": "now->", "last": "before->last.", "out": "out->"}
 
 
-def _function(
-    code: Code, board: Board, stage: Stage, structs: dict[str, Struct], trees: dict[str, Any],
-    known: parameters.Parameters,
-) -> None:  # fmt: skip
-    """Adds the function of a stage to the code."""
+def _function(code: Code, board: Board, stage: Stage, structs: dict[str, Struct], known: parameters.Parameters) -> None:
+    """Add the function of a stage to the code."""
 
     def fields_of(name: str) -> list[Field]:
         prefix, _, key = name.partition(".")
-        made = structs[STRUCTS[prefix]].fields
-        return [made[leaf] for leaf in jax.tree.leaves(trees[f"{STRUCTS[prefix]}.{key}"])]
+        return structs[STRUCTS[prefix]][key]
 
     def run(leaves: list[Any], read: list[Any]) -> dict[str, Any]:
-        return stage.run(known.tree(leaves), *read)
+        return stage.run(known.tree(leaves), dict(zip(stage.reads, read, strict=True)))
 
-    pool, places = Pool(), dict[str, str]()  # places: of what C reads, the pointer or argument
-    closed, shape = jax.make_jaxpr(run, return_shape=True)(known.leaves, [_shape_of(board, n) for n in stage.reads])
-    args = known.nodes(pool, places)
-    for name in stage.reads:
+    pool, args = Pool(), list[np.ndarray]()
+    shapes = [_shape_of(board, name) for name in stage.reads]
+    closed, written = jax.make_jaxpr(run, return_shape=True)(known.leaves, shapes)
+    for name, shape in zip(stage.reads, shapes, strict=True):
         if name in SCALARS:
-            node = pool.place(name, "int32_t" if name in ("regular", "tracking") else "real")
-            places[name] = name
-            args.append(np.array(node, dtype=object).reshape(()))
-            continue
-        prefix = name.partition(".")[0]
-        pointer = "before" if prefix == "last" else prefix
-        args += [parameters.nodes_of(pool, PLACES[prefix], made, places, pointer) for made in fields_of(name)]
-    results = iter(Translator(pool).evaluate(closed, args))
-    ends, returned, writes = list[tuple[str, Node]](), list[tuple[str, Node]](), set[str]()
-    for name in sorted(shape):  # JAX's order of a dict
+            args.append(object_array((), [pool.place(name, kind_of(shape.dtype))]))
+        else:
+            args += [made.nodes(pool, PLACES[name.partition(".")[0]]) for made in fields_of(name)]
+    results = iter(Translator(pool).evaluate(closed, [*known.nodes(pool), *args]))
+    ends, returned, needed = list[tuple[str, Node]](), None, set[str]()
+    for name in sorted(written):  # JAX's order of a dict
         if name == "limited":
-            returned.append(("return", next(results).item()))
+            returned = next(results).item()
             continue
         prefix = name.partition(".")[0]
-        writes.add(prefix)
-        for made, result in zip(fields_of(name), results, strict=False):  # as many as it has
+        needed.add(prefix)
+        for made in fields_of(name):
+            result = next(results)
             _titled(result, made.name)
-            ends += [
-                (PLACES[prefix] + element, node) for element, node in zip(made.elements(), result.flat, strict=True)
-            ]
-    kinds = {place + made.name: made.kind for prefix, place in PLACES.items()
-             for made in structs[STRUCTS[prefix]].fields.values()}  # fmt: skip
+            places = (PLACES[prefix] + element for element in made.elements())
+            ends += zip(places, result.flat, strict=True)
     printer = printing.Printer(ARGUMENTS)
-    body = [line.replace("return = ", "return ") for line in printer.body(pool.block, [*ends, *returned])]
-    needed = {places[node.value] for node in printer.nodes.values() if node.op == "place"} | writes
+    body = printer.body(pool.block, ends, returned=returned)
+    needed |= {node.value.partition("->")[0] for node in printer.nodes.values() if node.op == "place"}
     known.use(printer)
     arguments = {name: text for name, text in (POINTERS | ARGUMENTS).items() if name in needed}
-    kind = "int" if returned else "void"
+    kind = "void" if returned is None else "int"
     head = printing.wrapped(f"static {kind} {stage.name}({', '.join(arguments.values())})", "")
-    code.functions.append("\n".join([*_documents(stage), *head, "{", *_shortened(body, kinds), "}"]))
+    code.functions.append("\n".join([*_documents(stage), *head, "{", *body, "}"]))
     if stage.name != "begin":
         code.about[stage.name] = stage.about
     code.calls[stage.name] = f"{stage.name}({', '.join(PASSED.get(name, name) for name in arguments)})"
@@ -178,37 +172,16 @@ def _function(
     code.variables = max(code.variables, printer.variables)
 
 
-def _shortened(body: list[str], kinds: dict[str, str]) -> list[str]:
-    """Lines in which an array of a struct that is read often has a name of its own; kinds: of arrays, by place."""
-    text = "\n".join(body)
-    reads = Counter(re.findall(r"(?<![\w>])((?:in|before|now|out)->(?:last\.)?\w+)\[(?!\d+\](?: =(?!=)|\[))", text))
-    short_names, taken = {}, set(re.findall(r"(?<![\w>.])[A-Za-z_]\w*", text))
-    for place, count in sorted(reads.items(), key=lambda item: (item[0].startswith("before"), item[0])):
-        name = re.split(r"->|\.", place)[-1]
-        name = f"{name}_before" if place.startswith("before") else name
-        name = f"{name}_now" if name in taken else name
-        if count >= 4 and name not in taken:
-            taken.add(name)
-            short_names[place] = name
-    for place, name in short_names.items():
-        body = [re.sub(rf"(?<![\w>]){re.escape(place)}\[(?!\d+\] =(?!=))", f"{name}[", line) for line in body]
-    heads = [
-        f"    const {printing.declared(kinds.get(place, REAL))} *const {name} = {place};"
-        for place, name in sorted(short_names.items())
-    ]
-    return [*heads, *body]
-
-
 def _shape_of(board: Board, name: str) -> Any:
     prefix, _, key = name.partition(".")
     if name in SCALARS:
-        return jax.ShapeDtypeStruct((), jnp.int32 if name in ("regular", "tracking") else jnp.result_type(float))
+        return SCALARS[name]()
     return {"in": board.inputs, "before": board.state, "now": board.state, "last": board.outputs,
             "out": board.outputs}[prefix][key]  # fmt: skip
 
 
 def _titled(result: np.ndarray, name: str) -> None:
-    """Gives variables of branches and loops that have no name of their own that of the field which they are for."""
+    """Name variables of branches and loops after the field that they are written to, if they have no name."""
     title = Title(name)
     for index, node in np.ndenumerate(result):
         if node.op == "variable" and node.title is None:

@@ -1,4 +1,4 @@
-"""A controller's folder compiled, and flown in the loop: `ptsmc_step` decides where else the parts' own code does."""
+"""Exported controllers, compiled, as the flight computer of a simulation."""
 
 import ctypes
 import itertools
@@ -27,15 +27,15 @@ from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.computer import OURS, SAMPLES, Computer, Decision, Period, Software
 
-# XLA's headers as the system's: what CC has compilers warn of is said of our code alone
+# XLA's headers are system headers, so that compilers warn of our code only
 OPTIONS = ("-std=c99", "-O2", "-shared", "-fPIC", "-isystem", jax.ffi.include_dir())
-SAME = 1e-6  # of a parameter's largest element: what differs by less may have been read with 32 bits
-NAMED = 4  # parameters that a sentence names
+SAME = 1e-6  # relative to the largest element; smaller differences come from 32 bits
+NAMED = 4  # largest number of parameters in a message
 _loaded = itertools.count()
 
 
 def compiler() -> list[str]:
-    """The command that compiles C; raises ScenarioError where there is none."""
+    """Return the command of the C compiler. Raises ScenarioError if there is none."""
     said = os.environ.get("CC", "")
     try:
         named = shlex.split(said)
@@ -50,55 +50,51 @@ def compiler() -> list[str]:
 
 
 class Library:
-    """A controller's folder, compiled; `parameters` are those of the folder, and may be set otherwise."""
+    """A compiled controller; `parameters` are those of its folder and may be changed."""
 
     def __init__(self, folder: str | Path, real: str = "double", options: tuple[str, ...] = ()):
-        """Compiles it; raises ScenarioError where it is no controller, or does not compile."""
+        """Compile a folder. Raises ScenarioError if it is not a controller or does not compile."""
         self.folder = Path(folder)
         none = ScenarioError(f"the controller is {self.folder}, but must be a folder that ptsmc export has written")
         try:
             layout = json.loads((self.folder / sources.LAYOUT).read_text(encoding="utf-8"))
             self.name, self.digest, self.columns = layout["name"], layout["digest"], layout["columns"]
             self.period = float(layout["period"])  # [s]
-            self.parts = dict(layout.get("parts", {}))  # as `Board.parts`; none of an export by an earlier version
+            self.parts = dict(layout.get("parts", {}))  # as `Board.parts`; empty in earlier versions
             sizes = [len(self.columns[kind]) for kind in ("in", "out", "state", "params")]
             if not re.fullmatch(r"\w+", self.name, re.ASCII):
                 raise none
         except (OSError, ValueError, RecursionError, OverflowError, KeyError, TypeError):
             raise none from None
-        with tempfile.TemporaryDirectory(prefix="ptsmc-") as place:  # what is loaded stays when its file is gone
+        with tempfile.TemporaryDirectory(prefix="ptsmc-") as place:  # a loaded library remains without its file
             made = self._compiled(Path(place), real, options)
             try:
                 self._made = ctypes.CDLL(str(made))
                 self._made.ptsmc_set()
-            except (OSError, AttributeError) as error:  # of another processor, or of another language
+            except (OSError, AttributeError) as error:  # another processor, another language, a missing function
                 reason = str(error).removeprefix(f"{made}: ")
-                missing = re.search(r"undefined symbol: (\w+)", reason)
-                if missing:
-                    raise ScenarioError(
-                        f"the controller in {self.folder} needs {missing[1]}, which is neither in ptsmc_{self.name}.c "
-                        f"nor in ptsmc_{self.name}_parameters.c, the files that are compiled; allowed is to #include "
-                        "there the one that has it"
-                    ) from None
                 raise ScenarioError(
-                    f"the controller in {self.folder} does not load as {shlex.join(compiler())} compiles it, which "
-                    f"must be a C compiler for this machine: {reason}"
+                    f"the controller in {self.folder} does not load as {shlex.join(compiler())} compiles it: {reason}; "
+                    f"allowed is a C compiler for this machine, and code that ptsmc_{self.name}.c and "
+                    f"ptsmc_{self.name}_parameters.c contain or #include"
                 ) from None
-        if sizes != list((ctypes.c_long * 4).in_dll(self._made, "ptsmc_sizes")):  # C of another controller.json
+        if sizes != list(
+            (ctypes.c_long * 4).in_dll(self._made, "ptsmc_sizes")
+        ):  # the C belongs to another controller.json
             raise none
         self._given = np.ctypeslib.as_array((ctypes.c_double * sizes[-1]).in_dll(self._made, "ptsmc_given"))
-        self.target = f"ptsmc_{self.name}_{self.digest}_{real}_{next(_loaded)}"  # what XLA knows it by
+        self.target = f"ptsmc_{self.name}_{self.digest}_{real}_{next(_loaded)}"  # its name in XLA
         jax.ffi.register_ffi_target(self.target, jax.ffi.pycapsule(self._made.ptsmc_called), platform="cpu")
 
     @property
     def parameters(self) -> np.ndarray:
-        """What C flies with, (columns,) in the order of columns["params"]: its own memory."""
+        """The parameters in C, (columns,) in the order of columns["params"]; changes act on C."""
         return self._given
 
     def _compiled(self, place: Path, real: str, options: tuple[str, ...]) -> Path:
         glue, library = place / "glue.c", place / "controller.so"
         glue.write_text(prefixed(filled("in_the_loop.c", name=self.name), self.name), encoding="utf-8")
-        alone = place / "controller"  # what a campaign keeps and knows of it: what lies elsewhere does not fly
+        alone = place / "controller"  # only the files that campaigns keep and check
         sources.copy(self.folder, alone)
         files = [str(alone / f"ptsmc_{self.name}{end}.c") for end in ("", "_parameters")]
         command = [*compiler(), *OPTIONS, *options, f"-DPTSMC_REAL={real}", f"-I{alone}", *files]
@@ -107,7 +103,7 @@ class Library:
         )
         if compiled.returncode:
             said = compiled.stderr.replace(str(alone), str(self.folder))
-            lines = said.strip().splitlines() or ["for no reason told"]
+            lines = said.strip().splitlines() or ["without a message"]
             errors = [line for line in lines if "error: " in line and not line.startswith("collect2: ")]
             raise ScenarioError(
                 f"the controller in {self.folder} does not compile from the *.c and *.h in it: {(errors or lines)[0]}"
@@ -115,16 +111,16 @@ class Library:
         return library
 
     def first(self) -> np.ndarray:
-        """The state that `ptsmc_init` leaves."""
+        """Return the state after `ptsmc_init`."""
         state = np.zeros(len(self.columns["state"]))
         self._made.ptsmc_first(_at(state))
         return state
 
     def many(self, state: Any, given: Any, parameters: Any = np.nan) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """A step of each row (.., columns): states after it, outputs, statuses; parameters: where NaN, `parameters`."""
+        """Step each row (.., columns); return new states, outputs and statuses. NaN in parameters: `parameters`."""
         shape = np.shape(state)[:-1]
         state, given = (
-            np.ascontiguousarray(v, dtype=float).reshape(*shape, len(self.columns[kind]))  # C reads no less
+            np.ascontiguousarray(v, dtype=float).reshape(*shape, len(self.columns[kind]))  # C reads doubles
             for v, kind in ((state, "state"), (given, "in"))
         )
         each = np.ascontiguousarray(np.broadcast_to(np.asarray(parameters, float), (*shape, self.parameters.size)))
@@ -135,9 +131,9 @@ class Library:
         return after, out, status
 
     def called(self, state: jax.Array, given: jax.Array, parameters: jax.Array) -> tuple[jax.Array, ...]:
-        """`many` of one row, in a program of JAX: state after it, outputs, status; under vmap of many rows.
+        """Step one row in a JAX program, or many rows under vmap; return new state, outputs and status.
 
-        In the state's precision: C reads and writes arrays of 32 or 64 bits, and of these sizes.
+        The numbers have the state's precision, 32 or 64 bits.
         """
         real = jnp.promote_types(jnp.result_type(state, float), jnp.float32)
         state, given, parameters = (
@@ -147,7 +143,7 @@ class Library:
         out = jax.ShapeDtypeStruct((len(self.columns["out"]),), real)
         results = jax.ShapeDtypeStruct(state.shape, real), out, jax.ShapeDtypeStruct((), jnp.int32)
 
-        # no callback, which waits for arrays that a CPU's threads copy: with one on each device none is left that could
+        # a callback would deadlock: it waits for a thread that copies arrays, and each device may block one
         how: Any = jax.ffi.ffi_call(self.target, results, vmap_method="broadcast_all")
         return tuple(how(state, given, parameters))
 
@@ -157,14 +153,13 @@ def _at(array: np.ndarray) -> ctypes.c_void_p:
 
 
 class InTheLoop:
-    """A library as the flight computer of a rollout.
+    """A compiled controller as the flight computer of a simulation.
 
-    The true sensors, their noise and the actuators stay the simulator's; what they say goes through C, and what C
-    makes of it is what acts.
+    The simulator has the true sensors, their noise and the actuators. C reads the measurements and gives the commands.
     """
 
     def __init__(self, library: Library, parts: Parts, dispersion: Dispersion | None = None):
-        """Raises ScenarioError where the controller is one of other parts, or cannot have what is drawn of them."""
+        """Check the controller. Raises ScenarioError if it has other parts, or cannot have the dispersions."""
         self.library, self.board, self.nominal = library, board(parts), parts
         mine = names_of(self.board)
         for kind, said in (("in", "inputs"), ("out", "outputs"), ("state", "state")):
@@ -180,20 +175,20 @@ class InTheLoop:
                 f"the controller in {library.folder} has the {other} {theirs.get(other, 'none')}, "
                 f"but must have that of the scenario, {ours.get(other, 'none')}"
             )
-        period, wanted = np.float32(parts.period), np.float32(library.period)  # either may have been read with 32 bits
+        period, wanted = np.float32(parts.period), np.float32(library.period)  # both may have 32 bits
         if period != wanted:
             raise ScenarioError(
                 f"loop.period is {period!s} s, but must be {wanted!s} s, that of the controller in {library.folder}"
             )
         columns, paths = library.columns["params"], jax.tree_util.tree_leaves_with_path(self.board.parameters)
         firsts = zip(paths, (made.elements()[:1] for made in named(self.board).fields), strict=True)
-        # of the parameters that C has, by their paths: the first column
+        # the first column of each parameter in C, by its path
         self._columns = {path: columns.index(*first) for (path, _), first in firsts if first and first[0] in columns}
         if dispersion is not None and dispersion.own is not None:
             self._check_draw(Dispersion(own=dispersion.own))
 
     def _check_draw(self, dispersion: Dispersion) -> None:
-        """Raise ScenarioError where draws of one's own tell apart what C has as one parameter, or derives from it."""
+        """Raise ScenarioError if a custom dispersion changes only one of several parameters that are one in C."""
         made, numbers = parameters(self.board), (jnp.uint32(0), jnp.uint32(0))
         drawn = had = known(dispersion.apply(self.nominal, *numbers))
         for rule in made.rules:
@@ -216,7 +211,7 @@ class InTheLoop:
 
     @property
     def otherwise(self) -> str:
-        """One sentence that names the parameters that C has otherwise than the parts; empty where there are none."""
+        """A sentence with the parameters of C that differ from the parts; empty if there are none."""
         flown, made = dict(zip(self.library.columns["params"], self.library.parameters, strict=True)), named(self.board)
         fields, differing = {field.name: field.elements() for field in made.fields}, list[str]()
         for name, values in made.values.items():
@@ -231,7 +226,7 @@ class InTheLoop:
 
     @property
     def software(self) -> Software:
-        """What the rollout takes."""
+        """The software for a simulation."""
         return Software(self.boot, self.decide, self.statuses, on_processor=True)
 
     def boot(self, parts: Parts, seed: Any, trial: Any, x0: Any, first: Any) -> Computer:
@@ -261,18 +256,18 @@ class InTheLoop:
         outputs = self._trees(self.board.outputs, out, 0)
         memory = self._trees(self.board.state, after, 3)
         channels = outputs.get("wheel_torque", outputs.get("torque"))
-        seen = self.board.state_of(tuple(memory[name] for name in self.board.seen))
+        seen = self.board.model.state_of(memory)
         decision = Decision(parts.reference(now.t), outputs["d_hat"], outputs["command"], outputs["s"],
                             parts.plant.velocity(seen), channels)  # fmt: skip
         kept = memory["observer"], memory["law"], computer.applied, memory.get("command_filter")
         return decision, Computer((sensing, after, counts), seen, *kept)
 
     def statuses(self, computer: Computer) -> dict[str, Any]:
-        """How many samples of a run ended with each status."""
+        """Return the number of samples of a run with each status."""
         return dict(zip(SAMPLES, computer.sensors[2], strict=True))
 
     def _told(self, parts: Parts) -> Any:
-        """The parameters (columns,) that a trial gives its flight computer otherwise; NaN of those of the folder."""
+        """Return the parameters (columns,) that a trial changes; NaN for unchanged ones."""
         told = jnp.full(len(self.library.columns["params"]), jnp.nan)
         drawn, nominal = (dict(jax.tree_util.tree_leaves_with_path(known(of))) for of in (parts, self.nominal))
         for path, at in self._columns.items():
@@ -285,7 +280,7 @@ class InTheLoop:
         return state.at[at : at + value.size].set(jnp.ravel(value))
 
     def _trees(self, shapes: dict[str, Any], row: Any, at: int) -> dict[str, Any]:
-        """Named trees from a row of numbers, from a place on."""
+        """Return named trees from the numbers of a row, starting at an index."""
         trees = {}
         for name, shape in shapes.items():
             leaves, tree = jax.tree.flatten(shape)

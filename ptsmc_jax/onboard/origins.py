@@ -1,4 +1,4 @@
-"""Where in the source a traced equation stands: the function that it is in, and the name that its value has there."""
+"""The origin of a traced equation in the source: its function, and the name of its value."""
 
 import ast
 import functools
@@ -11,21 +11,21 @@ from typing import Any, NamedTuple
 import jax
 
 JAX = Path(jax.__file__).parent
-FOREIGN = ("jaxtyping", "beartype", "<")  # between the caller and the called, and none of either
+FOREIGN = ("jaxtyping", "beartype", "<")  # wrappers between caller and function
 LIBRARY = Path(__file__).parents[1]
-HELPERS = ("numerics/", "onboard/")  # files whose functions are no sections of their own
+HELPERS = ("numerics/", "onboard/")  # files whose functions are not sections of the C
 
 
 class Section(NamedTuple):
     """A function of the source."""
 
     name: str
-    place: str  # its file, as a reader finds it
+    place: str  # its file
     about: str  # the first sentence of its docstring
 
 
 class Frame(NamedTuple):
-    """A call that is going on."""
+    """A frame of the call stack."""
 
     file: str
     name: str
@@ -33,7 +33,7 @@ class Frame(NamedTuple):
 
 
 def frames(eqn: Any) -> list[Frame]:
-    """The calls that led to an equation, the innermost first, without JAX's own."""
+    """Return the frames of an equation, the innermost first, without those of JAX."""
     trace = eqn.source_info.traceback
     codes, at = ((), ()) if trace is None else trace.raw_frames()
     calls = []
@@ -54,7 +54,7 @@ def _spans(code: Any) -> list[tuple[int, int, int, int]]:
 
 
 def line(calls: list[Frame]) -> str:
-    """File and line as an error says them, the user's own where they are; empty where nothing is known."""
+    """Return file and line for an error, if possible in the user's code; empty if unknown."""
     frame = _written(calls)
     return "" if frame is None else f"{frame.file}:{frame.span[0]}"
 
@@ -72,12 +72,12 @@ def function(calls: list[Frame]) -> str:
 def _written(calls: list[Frame]) -> Frame | None:
     """Return the call that an error names: the user's own if it is the innermost; None if nothing is known."""
     users = [frame for frame in calls if not Path(frame.file).is_relative_to(LIBRARY)]
-    inside = users if users and calls[0] in users else calls  # who calls the library is not who is to blame
+    inside = users if users and calls[0] in users else calls  # a user's call of the library is not the cause
     return inside[0] if inside else None
 
 
 def section(found: list[Frame]) -> Section | None:
-    """The function that an equation belongs to: the innermost one that is more than a helper."""
+    """Return the function of an equation: the innermost function that is not a helper."""
     for frame in found:
         place, name = _place(frame.file), _name(frame.name)
         if place and name:
@@ -87,7 +87,7 @@ def section(found: list[Frame]) -> Section | None:
 
 @functools.cache
 def _place(file: str) -> str:
-    """A file as a reader finds it; empty where its functions are no sections."""
+    """Return the path of a file for a heading; empty if its functions are helpers."""
     path = Path(file)
     if not path.is_relative_to(LIBRARY):
         return path.name
@@ -96,7 +96,7 @@ def _place(file: str) -> str:
 
 
 def title(found: list[Frame]) -> str:
-    """The name that the value of an equation's expression is given in the source; empty where it has none."""
+    """Return the name of an equation's value in the source; empty if it has none."""
     which: int | None = None
     for frame in found:
         where = _values(frame.file).get(frame.span)
@@ -124,7 +124,7 @@ def _tree(file: str) -> ast.Module | None:
 
 @functools.cache
 def _values(file: str) -> dict[tuple[int, int, int, int], tuple[str, tuple[str, ...], int | None]]:
-    """What happens to the value of an expression: by its position ("assign" or "return", names, which of several)."""
+    """Return the use of each expression by its position: ("assign" or "return", names, index in a tuple)."""
     uses: dict[tuple[int, int, int, int], tuple[str, tuple[str, ...], int | None]] = {}
     tree = _tree(file)
     for node in ast.walk(tree) if tree is not None else ():
@@ -167,7 +167,7 @@ def _about(file: str, at: int) -> str:
 
 
 def documents(part: Any, until: tuple[type, ...]) -> list[tuple[str, str]]:
-    """(class, docstring) of a part's class and of those it is derived from, up to the common ones."""
+    """Return (class, docstring) of a part's class and its base classes, up to the common ones."""
     texts = []
     for cls in type(part).__mro__:
         if cls in until or cls.__module__ in ("builtins", "abc", "typing"):
@@ -180,7 +180,7 @@ def documents(part: Any, until: tuple[type, ...]) -> list[tuple[str, str]]:
 
 @functools.cache
 def comments(cls: type) -> dict[str, str]:
-    """What stands beside each field of a class in the source: meaning and unit."""
+    """Return the comment beside each field of a class: meaning and unit."""
     meanings: dict[str, str] = {}
     for base in reversed(cls.__mro__):
         try:

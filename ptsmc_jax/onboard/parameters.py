@@ -1,4 +1,4 @@
-"""The parameters of a flight computer as fields of C: what is set, and what C derives from that."""
+"""The parameters of a flight computer as fields of C: parameters that are set, and numbers derived from them."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -19,44 +19,44 @@ from ptsmc_jax.onboard.translate import NoRuleError, Translator
 
 @dataclass
 class Parameters:
-    """Leaves of the parameters, for each its field, and by which pointer C has it: "p" as it is set, "d" derived."""
+    """The leaves of the parameters and their fields in C, in the struct "p" (set) or "d" (derived)."""
 
     structure: Any
     leaves: list[Any]
-    fields: list[Field]  # of each leaf; what is shared is one
+    fields: list[Field]  # of each leaf; leaves that are one array share a field
     values: dict[str, np.ndarray]  # by name
     derived: set[str] = field(default_factory=set)  # names
-    origins: dict[str, list[str]] = field(default_factory=dict)  # of what follows from others: the names of those
-    fixed: dict[str, str] = field(default_factory=dict)  # what does, but not in C: why
-    rules: list[Rule] = field(default_factory=list)  # that C has
-    used: set[str] = field(default_factory=set)  # names
+    origins: dict[str, list[str]] = field(default_factory=dict)  # derived name: names that it follows from
+    fixed: dict[str, str] = field(default_factory=dict)  # name that C cannot derive: reason
+    rules: list[Rule] = field(default_factory=list)  # rules in C
+    used: set[str] = field(default_factory=set)  # names that C reads
 
     def tree(self, leaves: Any) -> Any:
-        """The parameters of leaves."""
+        """Return the parameters with these leaves."""
         return jax.tree.unflatten(self.structure, leaves)
 
     def pointer(self, made: Field) -> str:
-        """The name of the pointer by which C has a field."""
+        """Return the name of the pointer to the struct that contains a field."""
         return "d" if made.name in self.derived else "p"
 
     def listed(self, pointer: str) -> list[Field]:
-        """The fields that are used and that C has by this pointer."""
+        """Return the fields of this struct that C reads."""
         once = {made.name: made for made in self.fields if self.pointer(made) == pointer and made.name in self.used}
         return list(once.values())
 
-    def nodes(self, pool: Pool, places: dict[str, str]) -> list[np.ndarray]:
-        """What C reads for each leaf."""
-        return [nodes_of(pool, f"{self.pointer(made)}->", made, places, self.pointer(made)) for made in self.fields]
+    def nodes(self, pool: Pool) -> list[np.ndarray]:
+        """Return the nodes that C reads, an array for each leaf."""
+        return [made.nodes(pool, f"{self.pointer(made)}->") for made in self.fields]
 
     def use(self, printer: printing.Printer) -> None:
-        """Marks what a function reads."""
+        """Mark the fields that a function reads."""
         read = {node.value.partition("[")[0] for node in printer.nodes.values() if node.op == "place"}
         self.used |= {made.name for made in self.fields if f"{self.pointer(made)}->{made.name}" in read}
 
     def derivation(self) -> tuple[Block, dict[str, np.ndarray]]:
-        """What the rules compute: a block, and by name what it gives."""
+        """Return the block that evaluates the rules, and the derived numbers by name."""
         pool = Pool()
-        results = Translator(pool).evaluate(_traced(self, self.rules), self.nodes(pool, {}))
+        results = Translator(pool).evaluate(_traced(self, self.rules), self.nodes(pool))
         derived: dict[str, np.ndarray] = {}
         for made, result in zip(self.fields, results, strict=True):
             if made.name in self.derived:
@@ -64,29 +64,19 @@ class Parameters:
         return pool.block, derived
 
 
-def nodes_of(pool: Pool, text: str, made: Field, places: dict[str, str], pointer: str) -> np.ndarray:
-    """What C reads of a field; places: is told by which pointer."""
-    array = np.empty(made.shape, dtype=object)
-    for index in np.ndindex(*made.shape):
-        place = f"{text}{made.element(index)}"
-        places[place] = pointer
-        array[index] = pool.place(place, made.kind)
-    return array
-
-
 def parameters(board: Board) -> Parameters:
-    """The parameters of a flight computer, and which of them C derives."""
+    """Return the parameters of a flight computer, with the derived ones marked."""
     made = named(board)
     for rule in board.rules:
         _follow(made, rule)
     return made
 
 
-COMPUTED = ("bound", "observer_matrix")  # what is shared with these has the other's name
+COMPUTED = ("bound", "observer_matrix")  # a leaf shared with these gets the name of the other parameter
 
 
 def named(board: Board) -> Parameters:
-    """The parameters of a flight computer by their names, of which none is derived yet."""
+    """Return the parameters of a flight computer by name, before any is derived."""
     found: dict[int, Field] = {}
     listed = jax.tree_util.tree_flatten_with_path(board.parameters)[0]
     leaves = [leaf for _, leaf in listed]
@@ -119,7 +109,7 @@ def _traced(made: Parameters, rules: Iterable[Rule]) -> Any:
 
 
 def _follow(made: Parameters, rule: Rule) -> None:
-    """Marks what a rule gives as derived, or as fixed where C cannot say it."""
+    """Mark the results of a rule as derived, or as fixed if C cannot compute them."""
     closed = _traced(made, [*made.rules, rule])
     jaxpr, gives = closed.jaxpr, {}
     places = {variable: k for k, variable in enumerate(jaxpr.invars)}
@@ -127,12 +117,12 @@ def _follow(made: Parameters, rule: Rule) -> None:
     for k, variable in enumerate(jaxpr.outvars):
         name = made.fields[k].name
         if not isinstance(variable, core.Literal) and variable in places:
-            made.fields[k] = made.fields[places[variable]]  # another one as it is
+            made.fields[k] = made.fields[places[variable]]  # equal to another parameter
         elif name not in made.derived:
             gives[name] = [other.name for j, other in enumerate(made.fields) if of[k] >> j & 1]
     try:
         pool = Pool()
-        Translator(pool).evaluate(closed, made.nodes(pool, {}))
+        Translator(pool).evaluate(closed, made.nodes(pool))
     except NoRuleError as error:
         made.fixed |= {name: str(error) for name in gives}
     else:

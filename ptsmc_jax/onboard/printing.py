@@ -1,30 +1,33 @@
-"""Expressions as the body of a C function: named variables in the order of the source, its functions as sections."""
+"""Expressions as the body of a C function, with variables and sections named as in the source."""
 
 import re
 import textwrap
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from pathlib import Path
+from string import Template
 from typing import Any
 
 from ptsmc_jax.numerics import guards
 from ptsmc_jax.onboard.expressions import BOOL, REAL, Block, Node, Region
 
+FILES = Path(__file__).parent / "files"
 WIDTH = 110  # of a line
-LONGEST = 90  # characters of an expression that is written inside another one
+LONGEST = 90  # characters of an expression inside another expression
 RESERVED = set(
     "auto break case char const continue default do double else enum extern float for goto if inline int long register "
     "restrict return short signed sizeof static struct switch typedef union unsigned void volatile while real R in p d "
     "out before now y0 y1 yn j0 j1 jn gamma main index div abs larger smaller sign_of resolution NAN INFINITY".split()
 )
-# of math.h: a variable of such a name would hide the function that is called beside it
+# of math.h: a variable of this name would hide the function
 MATH = ("acos acosh asin asinh atan atan2 atanh cbrt ceil cos cosh erf erfc exp exp2 expm1 fabs floor fmod lgamma log "
         "log1p nextafter pow rint round sin sinh sqrt tan tanh")  # fmt: skip
 RESERVED |= {name + end for name in MATH.split() for end in ("", "f")}
 INFIX = {"add": ("+", 12), "sub": ("-", 12), "mul": ("*", 13), "div": ("/", 13), "rem": ("%", 13), "lt": ("<", 10),
          "le": ("<=", 10), "gt": (">", 10), "ge": (">=", 10), "eq": ("==", 9), "ne": ("!=", 9), "and": ("&&", 5),
          "or": ("||", 4)}  # fmt: skip
-PLAIN = {"max": "larger", "min": "smaller", "sign": "sign_of"}  # functions of the file's own, by operation
-# of whole numbers by type: how they are written, and what of a real one is beyond them
+PLAIN = {"max": "larger", "min": "smaller", "sign": "sign_of"}  # helper functions in C, by operation
+# integer types: format of a constant, and the least real number that is too large
 WHOLE = {"int32_t": ("{}", "2147483648"), "int64_t": ("{}", "9223372036854775808.0"),
          "uint32_t": ("{}u", "4294967296")}  # fmt: skip
 ATOMS = ("constant", "place", "variable", "index", "table")
@@ -32,45 +35,34 @@ ATOM, UNARY, CHOICE = 20, 14, 3  # precedences
 
 
 def _ends(kind: str) -> tuple[str, str]:
-    """The least and the largest whole number of a type, as C has them."""
+    """Return C's names of the least and the largest integer of a type."""
     name = kind.removesuffix("_t").upper()
     return "0" if kind.startswith("u") else f"{name}_MIN", f"{name}_MAX"
 
 
-def _of_whole(kind: str) -> dict[str, str]:
-    """Functions of whole numbers of a type, by name."""
-    (low, high), end = _ends(kind), _whole(kind)
-    sign = "x > 0" if low == "0" else "(x > 0) - (x < 0)"
-    return {
-        f"larger{end}": f"static {kind} larger{end}({kind} a, {kind} b)\n{{\n    return a > b ? a : b;\n}}\n",
-        f"smaller{end}": f"static {kind} smaller{end}({kind} a, {kind} b)\n{{\n    return a < b ? a : b;\n}}\n",
-        f"sign_of{end}": f"static {kind} sign_of{end}({kind} x)\n{{\n    return {sign};\n}}\n",
-        f"whole{end}": "/* A real number without what is behind its point; the nearest there is, 0 of NaN. */\n"
-        f"static {kind} whole{end}(real x)\n{{\n    if (isnan(x)) {{\n        return 0;\n    }}\n"
-        f"    return x >= R({WHOLE[kind][1]}) ? {high} : (x <= R({low}) ? {low} : ({kind})x);\n}}\n",
-    }
-
-
-def _whole(kind: str) -> str:
-    """How the names of functions end that are of these whole numbers; of real ones they have no end."""
+def _suffix(kind: str) -> str:
+    """Return the suffix of the C helper functions for a type; empty for reals."""
     return {REAL: "", BOOL: "_int32"}.get(kind, f"_{kind.removesuffix('_t')}")
 
 
-# of the file's own, by name: what it calls of them stands in it
-HELPERS = {
-    "larger": "/* Of two numbers; NaN where either is. */\nstatic real larger(real a, real b)\n{\n"
-    "    return a > b || isnan(a) ? a : b;\n}\n",
-    "smaller": "/* Likewise. */\nstatic real smaller(real a, real b)\n{\n    return a < b || isnan(a) ? a : b;\n}\n",
-    "resolution": "/* By how much numbers of the type in use may be off, relative: four times what 1 and the next are\n"
-    "   apart. */\nstatic real resolution(void)\n{\n"
-    "    return sizeof(real) < sizeof(double) ? R(4.76837158203125e-07) : R(8.881784197001252e-16);\n}\n",
-    "sign_of": "static real sign_of(real x)\n{\n    return x > R(0) ? R(1) : (x < R(0) ? R(-1) : x);\n}\n",
-    **{name: text for kind in WHOLE for name, text in _of_whole(kind).items()},
-}
+def _helpers() -> dict[str, str]:
+    """Return the C helper functions by name; an exported file contains those that it calls."""
+    text = [(FILES / "helpers.c").read_text(encoding="utf-8")]
+    integers = Template((FILES / "integers.c").read_text(encoding="utf-8"))
+    for kind, (_, beyond) in WHOLE.items():
+        low, high = _ends(kind)
+        sign = "x > 0" if low == "0" else "(x > 0) - (x < 0)"
+        values = {"kind": kind, "suffix": _suffix(kind), "sign": sign, "low": low, "high": high, "beyond": beyond}
+        text.append(integers.substitute(values))
+    functions = "\n".join(text).split("\n\n")
+    return {re.findall(r"^static \w+ (\w+)\(", one, re.MULTILINE)[0]: f"{one.rstrip()}\n" for one in functions}
+
+
+HELPERS = _helpers()
 
 
 def number(value: Any, kind: str) -> str:
-    """A constant as C has it."""
+    """Return a constant in C."""
     if kind == BOOL:
         return "1" if value else "0"
     if kind != REAL:
@@ -86,7 +78,7 @@ def number(value: Any, kind: str) -> str:
 
 
 def declared(kind: str) -> str:
-    """C's type."""
+    """Return the type in C."""
     return {REAL: "real", BOOL: "int"}.get(kind, kind)
 
 
@@ -105,16 +97,18 @@ class Printer:
         self.section: Any = None
         self.count = 0
         self.entries = 0  # of the tables of its loops
-        self.open = False  # whether it has a loop until something is so, of which one pass is counted
+        self.open = False  # it has a loop with an unknown number of passes; one is counted
 
     @property
     def variables(self) -> int:
-        """How many numbers the function holds at most, the entries of its tables among them."""
+        """Largest number of variables, including the entries of tables."""
         return len(self.names) + self.entries
 
-    def body(self, block: Block, outputs: Sequence[tuple[str, Node]], indent: str = "    ") -> list[str]:
-        """Lines of a block that sets these places."""
-        for _, node in outputs:
+    def body(
+        self, block: Block, outputs: Sequence[tuple[str, Node]], indent: str = "    ", returned: Node | None = None
+    ) -> list[str]:
+        """Return the lines of a block that sets these places and returns a number, if any."""
+        for node in [*(node for _, node in outputs), *([] if returned is None else [returned])]:
             self._use(node)
         for node in sorted(self.nodes.values(), key=lambda node: node.serial):
             self.lengths[id(node)] = 8 if node.op in ATOMS else 3 + sum(self.lengths[id(arg)] for arg in node.args)
@@ -125,9 +119,9 @@ class Printer:
         if outputs and self.section is not None:
             lines.append("")
         lines += [line for place, node in outputs for line in wrapped(f"{place} = {self.text(node)};", indent)]
-        return lines
+        return lines if returned is None else [*lines, *wrapped(f"return {self.text(returned)};", indent)]
 
-    # which nodes are needed, and which have a variable of their own
+    # nodes that are needed, and nodes that get a variable
 
     def _use(self, node: Node, times: int = 1) -> None:
         first = id(node) not in self.nodes
@@ -141,7 +135,7 @@ class Printer:
             self._use_region(node.value)
 
     def _use_region(self, region: Region) -> None:
-        again = 1 if region.kind == "branch" else 2  # what a loop computes with is computed before it
+        again = 1 if region.kind == "branch" else 2  # the inputs of a loop are computed before it
         if region.test is not None:
             self._use(region.test)
         for node in (*region.initial, *(entry for _, entries in region.tables for entry in entries)):
@@ -278,12 +272,12 @@ class Printer:
     # expressions
 
     def text(self, node: Node, inside: bool = False) -> str:
-        """An expression; inside: its own, not the variable that it has."""
+        """Return the text of a node: its variable if it has one, or its expression (`inside`)."""
         return self._text(node, inside)[0]
 
     def _text(self, node: Node, inside: bool = False) -> tuple[str, int]:
         if node.op == "constant":
-            own = node.kind == REAL and node.value == guards.resolution()  # of the type that C is compiled with
+            own = node.kind == REAL and node.value == guards.resolution()  # of the type in C
             return "resolution()" if own else number(node.value, node.kind), ATOM
         if node.op == "place":
             return node.value, ATOM
@@ -298,20 +292,20 @@ class Printer:
             return ("-" if node.op == "neg" else "!") + self._at_least(node.args[0], UNARY + 1), UNARY
         if node.op == "select":
             test, yes, no = (self._at_least(arg, CHOICE + 1) for arg in node.args)
-            if node.kind == "int64_t":  # beside nothing of that type small constants have another
+            if node.kind == "int64_t":  # two small constants would be int
                 yes, no = (f"INT64_C({text})" if re.fullmatch(r"-?\d+", text) else text for text in (yes, no))
             return f"{test} ? {yes} : {no}", CHOICE
-        if node.op == "convert" and node.args[0].kind == REAL:  # what C casts must lie within its type
-            return f"whole{_whole(node.kind)}({self.text(node.args[0])})", ATOM
+        if node.op == "convert" and node.args[0].kind == REAL:  # a cast in C must be in the range of its type
+            return f"whole{_suffix(node.kind)}({self.text(node.args[0])})", ATOM
         if node.op == "convert":
             return f"({declared(node.kind)}){self._at_least(node.args[0], UNARY + 1)}", UNARY
         if node.op == "entry":
             return f"{self._name(node.args[0])}[{self.text(node.args[1])}]", ATOM
         listed = ", ".join(self.text(arg) for arg in node.args)
         if node.op in PLAIN:
-            return f"{PLAIN[node.op]}{_whole(node.kind)}({listed})", ATOM
+            return f"{PLAIN[node.op]}{_suffix(node.kind)}({listed})", ATOM
         if node.op == "abs" and node.kind != REAL:
-            return f"larger{_whole(node.kind)}({listed}, -{self._at_least(node.args[0], UNARY + 1)})", ATOM
+            return f"larger{_suffix(node.kind)}({listed}, -{self._at_least(node.args[0], UNARY + 1)})", ATOM
         if node.op == "isfinite":
             return f"isfinite({listed})", ATOM
         return f"M({'fabs' if node.op == 'abs' else node.op})({listed})", ATOM
@@ -330,18 +324,18 @@ class Printer:
 
 
 def wrapped(text: str, indent: str) -> list[str]:
-    """A statement on as many lines as it takes."""
+    """Return the lines of a statement."""
     return textwrap.wrap(text, WIDTH, initial_indent=indent, subsequent_indent=indent + "    ",
                          break_long_words=False, break_on_hyphens=False)  # fmt: skip
 
 
 def inside_comment(text: str) -> str:
-    """The text without what begins or ends a comment of C."""
+    """Return the text without beginnings and ends of C comments."""
     return text.replace("*/", "* /").replace("/*", "/ *")
 
 
 def comment(text: str, indent: str = "") -> list[str]:
-    """A comment of C, a paragraph a line of the text, wrapped."""
+    """Return a C comment, wrapped; a line of the text is a paragraph."""
     lines = [line for paragraph in inside_comment(text).splitlines()
              for line in textwrap.wrap(paragraph, WIDTH - len(indent) - 6, break_long_words=False,
                                        break_on_hyphens=False)]  # fmt: skip

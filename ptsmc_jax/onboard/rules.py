@@ -1,4 +1,4 @@
-"""What each elementwise primitive is in C."""
+"""The counterpart of each elementwise primitive in C."""
 
 import math
 from collections.abc import Callable
@@ -8,12 +8,12 @@ import jax.numpy as jnp
 
 from ptsmc_jax.onboard.expressions import BOOL, REAL, Node, Pool
 
-# functions of `numerics.elementary` that are written out for XLA: C has them
+# functions of `numerics.elementary`, which XLA evaluates by arithmetic; C has them in math.h
 KNOWN_FUNCTIONS = {"log": "log", "arctan2": "atan2"}
 
 
 def power(pool: Pool, x: Node, exponent: int) -> Node:
-    """x^exponent by squaring, as XLA does it."""
+    """Return x^exponent by squaring, as XLA does."""
     left, found, square = abs(exponent), None, x
     while left:
         if left & 1:
@@ -27,7 +27,7 @@ def power(pool: Pool, x: Node, exponent: int) -> Node:
 
 
 def convert(pool: Pool, kind: str, x: Node) -> Node:
-    """A number of another kind."""
+    """Convert a number to another kind."""
     if x.kind == kind:
         return x
     if x.op == "constant" and (kind == REAL or 0 <= x.value < 2**31):  # others as C has them beyond its types
@@ -41,7 +41,7 @@ def convert(pool: Pool, kind: str, x: Node) -> Node:
 
 
 def _wide(dtype: Any, kind: str) -> str:
-    """The kind of numbers of this type; raises KeyError for real ones of fewer digits than C's are computed with."""
+    """Return the kind. Raises KeyError for a real type with fewer digits than C's."""
     if kind == REAL and jnp.finfo(dtype).bits < jnp.finfo(jnp.result_type(float)).bits:
         raise KeyError(dtype)
     return kind
@@ -94,7 +94,7 @@ def _integer_pow(pool: Pool, params: Any, kind: str, x: Node) -> Node:
 
 
 def _divided(op: str) -> Callable:
-    """A quotient, or what is left; of whole numbers by 0 what XLA gives, -1 and the number: C's program ends there."""
+    """Return the rule of a quotient or remainder. Integers divided by 0 give -1 and the dividend, as in XLA."""
 
     def rule(pool: Pool, params: Any, kind: str, a: Node, b: Node) -> Node:
         if kind == REAL:

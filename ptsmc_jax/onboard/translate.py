@@ -1,7 +1,8 @@
-"""A trace becomes scalar expressions: each array is taken apart, each primitive has a rule, or is refused by name.
+"""Translation of a trace (jaxpr) into scalar expressions.
 
-As `batching.lanes` does it: reshapes and slices move components, small products are sums. Branches and loops become
-regions; short loops with a fixed length are written out.
+As in `batching.lanes`, arrays are split into components: reshapes and slices move components, and small products are
+sums. Branches and loops become regions; short loops of fixed length are unrolled. A primitive without a rule is an
+error.
 """
 
 import math
@@ -36,10 +37,10 @@ class Translator:
 
     def __init__(self, pool: Pool):
         self.pool = pool
-        self.held: list[origins.Frame] | None = None  # where a call stands: what is inside belongs there
+        self.held: list[origins.Frame] | None = None  # frames of the call that is being translated
 
     def constant(self, array: Any) -> np.ndarray:
-        """An array that is known, taken apart."""
+        """Return the components of a constant array."""
         if jnp.issubdtype(jnp.result_type(array), jax.dtypes.extended):
             raise NoRuleError(f"{array.dtype} cannot be written in C, but must be numbers: C has no random ones here")
         array = np.asarray(array)
@@ -51,8 +52,8 @@ class Translator:
         return object_array(array.shape, (self.pool.constant(v, kind) for v in array.reshape(-1)))
 
     def evaluate(self, closed: Any, args: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Components of a trace's outputs."""
-        jaxpr, consts = open_jaxpr(closed)
+        """Return the components of a trace's outputs, for these components of its inputs."""
+        jaxpr, consts = opened(closed)
         known: dict[Any, np.ndarray] = dict(zip(jaxpr.constvars, map(self.constant, consts), strict=True))
         known |= dict(zip(jaxpr.invars, args, strict=True))
         spans = [() if self.held else tuple(origins.frames(eqn)[:1]) for eqn in jaxpr.eqns]
@@ -78,13 +79,13 @@ class Translator:
                 node.title, node.part = group, "".join(str(i + 1) for i in index)
 
     def apply(self, eqn: Any, values: list[np.ndarray], where: list[origins.Frame]) -> list[np.ndarray]:
-        """Components of one equation's outputs."""
-        name, inner = eqn.primitive.name, called_jaxpr(eqn)
+        """Return the components of one equation's outputs."""
+        name, inner = eqn.primitive.name, called(eqn)
         if name == "custom_jvp_call" or name == "custom_vjp_call":
             inner = eqn.params.get("call_jaxpr", eqn.params.get("fun_jaxpr"))
             debug_info = getattr(getattr(inner, "jaxpr", inner), "debug_info", None)
             known = KNOWN_FUNCTIONS.get(getattr(debug_info, "func_name", ""))
-            # one of one's own may have its name
+            # a user's function may have the same name
             ours = getattr(debug_info, "func_filename", None) == elementary.__file__
             if known is not None and ours and len(eqn.outvars) == 1:
                 return [self._each(lambda *entry: self.pool.make(known, *entry), values, eqn.outvars[0].aval.shape)]
@@ -183,7 +184,7 @@ class Translator:
         return object_array(parts.shape[:-1], (one(parts[i]) for i in np.ndindex(*parts.shape[:-1])))
 
     def _moved(self, eqn: Any, values: Sequence[np.ndarray]) -> list[np.ndarray] | None:
-        """Components moved as the primitive moves entries; by places that are known, or chosen among them."""
+        """Return the components as the primitive moves them, by constant or computed indices."""
         match eqn.primitive.name:
             case "dynamic_slice":
                 arrays, places = values[:1], values[1:]
@@ -198,7 +199,7 @@ class Translator:
     def _indexed(
         self, eqn: Any, values: Sequence[np.ndarray], arrays: Sequence[np.ndarray], places: Sequence[np.ndarray]
     ) -> list[np.ndarray] | None:
-        """Entries of arrays at places among the values, which are computed: chosen among all that there may be."""
+        """Return the entries of arrays at computed indices: a choice among all possible indices."""
         flat = [node for place in places for node in place.flat]
         open_places = [node for node in flat if node.op != "constant"]
         if len({id(node) for node in open_places}) > 1:
@@ -224,7 +225,7 @@ class Translator:
     def _at(
         self, eqn: Any, values: Sequence[np.ndarray], arrays: Sequence[np.ndarray], chosen: Node | None, k: int
     ) -> np.ndarray:
-        """What is moved where the place that is computed, `chosen`, is k."""
+        """Return the moved components if the computed index `chosen` is k."""
         if eqn.primitive.name in _ADDS:
             array, at, more = values
             return self._added(eqn, array, at, more, chosen, k)
@@ -249,7 +250,7 @@ class Translator:
     def _added(
         self, eqn: Any, array: np.ndarray, places: np.ndarray, more: np.ndarray, chosen: Node | None, k: int
     ) -> np.ndarray:
-        """An array with more, or less, at places in turn, where the place that is computed, `chosen`, is k."""
+        """Return an array with additions or subtractions at indices, if the computed index `chosen` is k."""
         known = np.asarray([k if node is chosen else node.value for node in places.flat]).reshape(places.shape)
         types = [variable.aval.dtype for variable in eqn.invars]
         total = array.copy()
@@ -268,12 +269,12 @@ class Translator:
 
 
 def _numbering(eqn: Any) -> Any:
-    """The equation as it moves the entries' numbers, with -1 for what lies in none of them."""
+    """Return the equation that moves the numbers of entries, with -1 outside of the array."""
     return eqn.replace(params={**eqn.params, "fill_value": -1}) if "fill_value" in eqn.params else eqn
 
 
 def _filling(pool: Pool, eqn: Any) -> Node:
-    """What a gather that fills has where a place lies beyond the array: NaN, or another extreme, if it does not say."""
+    """Return the fill value of a gather outside of the array; by default NaN, or an extreme of the integer type."""
     dtype, value = eqn.outvars[0].aval.dtype, eqn.params.get("fill_value")
     if value is None and jnp.issubdtype(dtype, jnp.integer):
         limits = jnp.iinfo(dtype)
@@ -284,13 +285,13 @@ def _filling(pool: Pool, eqn: Any) -> Node:
 
 
 def _wraps(eqn: Any) -> bool:
-    """Whether it computes whole numbers of 8 or 16 bits, which wrap around where C's, of 32, go on."""
+    """Return whether the equation computes integers of 8 or 16 bits, which wrap around unlike C's of 32 bits."""
     narrow = any(jnp.issubdtype(v.aval.dtype, jnp.integer) and v.aval.dtype.itemsize < 4 for v in eqn.outvars)
     return narrow and eqn.primitive.name not in _KEPT and any(v.aval.dtype != bool for v in eqn.invars)
 
 
 def _has_kind(dtype: Any) -> bool:
-    """Whether C has numbers for a type of JAX's."""
+    """Return whether C has numbers of a type of JAX."""
     try:
         return bool(kind_of(dtype))
     except KeyError:
@@ -298,7 +299,7 @@ def _has_kind(dtype: Any) -> bool:
 
 
 def _known(value: np.ndarray) -> np.ndarray:
-    """An array of nodes that are all known."""
+    """Return the values of constant nodes."""
     return np.asarray([node.value for node in value.flat]).reshape(value.shape)
 
 
@@ -311,7 +312,7 @@ _MOVES = set(
     "dynamic_slice dynamic_update_slice gather scatter".split()
 )
 _ADDS = {"scatter-add": "add", "scatter-sub": "sub"}
-# what gives numbers that it is given
+# primitives whose results are among their inputs
 _KEPT = {
     *_MOVES,
     *"clamp copy copy_p max min optimization_barrier reduce_max reduce_min select_n stop_gradient".split(),

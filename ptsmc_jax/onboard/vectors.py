@@ -19,8 +19,6 @@ from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.control_period import State, Tick, control_period, schedule, start
 from ptsmc_jax.simulation.run_state import SINGULAR_CLEARANCE
 
-ROUNDED = 4.0  # times: 1.5 were seen
-
 
 class Samples(NamedTuple):
     """A run by samples, arrays (samples, ..); what there is none of is None."""
@@ -99,18 +97,23 @@ def usable(samples: Samples) -> bool:
     return finite and bool(np.min(samples.clearance) >= SINGULAR_CLEARANCE)
 
 
-def steepness(samples: Samples, t_f: float, last: float) -> float:
-    """How much larger the gains before the hand-over are than what the largest command of a trial is due to.
+def steepness(samples: Samples, rounding: float, t_f: float, last: float) -> float:
+    """Return the rounding error of a trial's commands, relative to the largest command, in units of the resolution.
 
-    Gains grow like 1 / (t_f - t)^2 until `last` [s] before t_f, and the law's command is about the error that it sees
-    times those of its moment: a small slew asks for little, beside which rounding of its attitude is the larger. That
-    of a quaternion beside another one is up to `ROUNDED` times that of one near the identity.
+    Gains grow like 1 / (t_f - t)^2 until `last` [s] before t_f, and a command is about the measured error times the
+    gain of its time. A small slew needs small commands, so the rounding error of its attitude counts more.
+
+    Args:
+        samples: the trial.
+        rounding: of the measured error, see `Plant.error_rounding`.
+        t_f: the prescribed time [s].
+        last: time to go of the last sample before the hand-over [s].
     """
     left = t_f - samples.t
     before = left >= last * (1.0 - 1e-9)
     command = np.linalg.norm(samples.error[before], axis=1) * (last / left[before]) ** 2
     largest = float(command.max(initial=0.0))
-    return ROUNDED / largest if largest else 0.0
+    return rounding / largest if largest else 0.0
 
 
 def one(samples: Samples, trial: int) -> Samples:
@@ -122,13 +125,10 @@ def one(samples: Samples, trial: int) -> Samples:
 def rows(board: Board, samples: Samples) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Inputs, outputs and state of one trial, (samples, columns) each, in the order of `templates.columns`."""
     inputs = samples.inputs | {"wheel_momentum": samples.momentum, "applied": samples.applied, "acting": samples.acting}
-    state_by_name = samples.after | {
-            "x": samples.seen, "observer": samples.observer, "law": samples.law, "queue": samples.queue,
-            "command_filter": samples.command_filter,
-            "wheel_momentum": samples.momentum, "acting": samples.acting, "clearance": samples.clearance,
-            "clearance_unit": samples.clearance_unit}  # fmt: skip
-    if board.spacecraft:
-        state_by_name |= {"attitude": samples.seen.q, "rate": samples.seen.w}
+    state_by_name = {**samples.after, **board.model.signals_of(samples.seen), "observer": samples.observer,
+                     "law": samples.law, "queue": samples.queue, "command_filter": samples.command_filter,
+                     "wheel_momentum": samples.momentum, "acting": samples.acting, "clearance": samples.clearance,
+                     "clearance_unit": samples.clearance_unit}  # fmt: skip
     outputs_by_name = {name: getattr(samples, name) for name in ("d_hat", "command", "s", "torque", "wheel_torque")}
     one = np.ones_like(samples.t)
     outputs = _columns(board.outputs, outputs_by_name)

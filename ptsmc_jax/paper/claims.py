@@ -67,8 +67,8 @@ def claims(cases: dict[str, Run]) -> list[Claim]:
 
 def _size(run: Run) -> np.ndarray:
     """Norm of the state of a chain, or largest component of the attitude error vector, over time."""
-    attitude = run.parts.plant.attitude
-    return np.abs(run.log.error).max(axis=1) if attitude else np.linalg.norm(run.log.x, axis=1)
+    one_array = isinstance(run.log.x, np.ndarray)
+    return np.linalg.norm(run.log.x, axis=1) if one_array else np.abs(run.log.error).max(axis=1)
 
 
 def _at_and_after(run: Run) -> tuple[float, float]:

@@ -32,8 +32,8 @@ class Measured:
     settling_time: float  # of the attitude, NaN if never [s]
     window_error: float  # [-]
     peak_torque: float  # [N m]
-    t: Any  # (time,) [s]
-    off: Any  # (time,) |d_hat - d|_2 [N m]
+    t: np.ndarray  # (time,) [s]
+    off: np.ndarray  # (time,) |d_hat - d|_2 [N m]
 
 
 def measure() -> list[Measured]:
@@ -45,7 +45,7 @@ def _measured(observer: str, sign: str) -> Measured:
     table = {"kind": observer, "t_o": 1.0} if observer == "prescribed_time" else {"kind": observer}
     controller = {**_TABLES["controller"], "sign_width": SIGNS[sign]}
     run = runs.fly(study(from_tables({**_TABLES, "observer": table, "controller": controller})))
-    t, off = run.log.t, np.linalg.norm(run.log.d_hat - run.log.disturbance, axis=1)
+    t, off = np.asarray(run.log.t), np.linalg.norm(run.log.d_hat - run.log.disturbance, axis=1)
     unsettled = np.flatnonzero(off > SETTLED * np.linalg.norm(run.log.disturbance, axis=1).max())
     settled = float("nan") if unsettled[-1] + 1 >= len(off) else float(t[unsettled[-1] + 1])
     error = float(off[t >= float(run.parts.controller.t_f)].max())

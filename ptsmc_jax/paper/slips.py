@@ -1,7 +1,6 @@
 """The paper's slips that a number can show; the others are named in the docstrings of the laws that they touch."""
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +18,7 @@ from ptsmc_jax.observers import nonlinear
 from ptsmc_jax.paper import claims
 from ptsmc_jax.plants import rigid_body
 from ptsmc_jax.scenario import from_tables, study
+from ptsmc_jax.signals.references import Target
 from ptsmc_jax.theory import rules
 
 
@@ -52,11 +52,11 @@ def _expansion() -> Slip:
     """(36) by automatic differentiation against (37) with the c_i."""
     t_f, eta, t = 5.0, 4.3, 1.7
 
-    def x(time: Any) -> Any:
+    def x(time: jax.Array) -> jax.Array:
         return 2.0 - 0.7 * time + 0.3 * time**2 - 0.1 * time**3
 
     @jax.jit
-    def off(t: Any) -> Any:
+    def off(t: jax.Array) -> jax.Array:
         derivative, x_derivative, states, found = (lambda time: x(time) / (t_f - time) ** eta), x, [x(t)], []
         tau = t_f - t
         for n in (2, 3, 4, 5):
@@ -194,10 +194,10 @@ def _effective_gain() -> Slip:
 class _Unaligned(AdditiveKinematics):
     """The error as printed, for any sign of q."""
 
-    def align(self, x: rigid_body.AttitudeState, target: Any) -> rigid_body.AttitudeState:
+    def align(self, x: rigid_body.AttitudeState, target: Target) -> rigid_body.AttitudeState:
         return x
 
-    def clearance(self, x: rigid_body.AttitudeState, target: Any) -> Any:
+    def clearance(self, x: rigid_body.AttitudeState, target: Target) -> jax.Array:
         return jnp.abs(x.q[3])
 
 

@@ -1,4 +1,4 @@
-"""Plants: rigid and flexible spacecraft, chains of integrators, second-order systems of one's own."""
+"""Plants: rigid and flexible spacecraft, chains of integrators, custom second-order systems."""
 
 from ptsmc_jax.plants.flexible_body import FlexibleSpacecraft, Modes, flexible
 from ptsmc_jax.plants.integrator_chain import Chain, chain

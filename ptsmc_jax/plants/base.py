@@ -1,143 +1,184 @@
 """The base of every plant."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from typing import Any, ClassVar
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, PyTree
 
 from ptsmc_jax.numerics.pytrees import Scalar
 
+State = PyTree  # of a plant, or its derivative
+
+
+class Chart(NamedTuple):
+    """A figure of a run's state over time."""
+
+    name: str
+    title: str
+    label: str  # of the axis, with the unit
+    column: str  # of `Plant.columns`
+    with_reference: bool = False  # the target has a field of this name
+
 
 class Plant(ABC):
-    """A plant whose velocity w, the state that input u and disturbance d act on, obeys M w' = f(t, x, u) + d.
+    """A plant with the equation of motion M w' = f(t, x, u) + d for its velocity w.
 
-    u, d and w are (m,), of a spacecraft in N m and rad/s, of others in the states' own units. M is (m, m) and, unless
-    `mass` says otherwise, the constant `inertia`, against which observers read their gains. A time t is in s; a state x
-    is a pytree of the plant's own kind, and so is its derivative. The rollout, the observers and the metrics need no
-    more.
+    Input u, disturbance d and velocity w are (m,): for a spacecraft in N m and rad/s, for other plants in the units of
+    their states. M is (m, m), by default the constant `inertia`; observers scale their gains by `inertia`. Times are in
+    s. A state x is a pytree, and so is its derivative. The simulation, observers, metrics and figures use a plant by
+    these methods and fields only.
     """
 
     inertia: Any  # (m, m)
     inertia_inverse: Any  # (m, m)
-    of_own_functions: ClassVar[bool] = False  # how large they are is not known, and only a run shows how fast it is
-    attitude: ClassVar[bool] = False  # its state holds a quaternion q and a body rate w
+    of_own_functions: ClassVar[bool] = False  # its rates are unknown before a run
+    input_name: ClassVar[str] = "control"
+    input_unit: ClassVar[str] = ""  # of inputs and disturbances; empty: the plant has units of its own
+    # what sensors measure of a state: names and meanings
+    signals: ClassVar[dict[str, str]] = {"x": "the measured state, in its own units"}
+    largest_measurement: ClassVar[float] = 1e12  # exported flight software refuses larger numbers
+    # rounding error of an error near zero, which is a difference of measured numbers, in units of the resolution
+    error_rounding: ClassVar[float] = 0.0
+    charts: ClassVar[tuple[Chart, ...]] = (Chart("states", "States", "state", "x"),)
 
     @property
     def inputs(self) -> int:
-        """How many inputs m there are."""
+        """The number of inputs m."""
         return self.inertia.shape[-1]
 
     @property
-    def states(self) -> int | None:
-        """How many numbers its state has; None: it is no single array."""
-        return None
+    def input_labels(self) -> list[str]:
+        """The name of each input."""
+        return [f"u{k + 1}" for k in range(self.inputs)]
+
+    def signal_labels(self, x: State) -> list[str]:
+        """Return the name of each local coordinate of a visible state."""
+        return [f"x{k + 1}" for k in range(np.size(x))]
+
+    @property
+    @abstractmethod
+    def state_shapes(self) -> dict[str, tuple[int, ...]]:
+        """The shapes of the arrays in a state, by field; the name of a state that is one array is empty."""
 
     @abstractmethod
-    def velocity(self, x: Any) -> Float[Array, " m"]:
-        """The velocity w of a state; of a state's derivative, w'."""
+    def velocity(self, x: State) -> Float[Array, " m"]:
+        """Return the velocity w of a state, or w' of a state's derivative."""
 
-    def mass(self, t: Scalar, x: Any) -> Float[Array, "m m"]:
-        """The matrix M."""
+    def mass(self, t: Scalar, x: State) -> Float[Array, "m m"]:
+        """Return the matrix M."""
         return self.inertia
 
     @abstractmethod
-    def generalised_force(self, t: Scalar, x: Any, u: Float[Array, " m"]) -> Float[Array, " m"]:
-        """The force f(t, x, u) that drives w besides the disturbance."""
+    def generalised_force(self, t: Scalar, x: State, u: Float[Array, " m"]) -> Float[Array, " m"]:
+        """Return the force f(t, x, u)."""
 
     @abstractmethod
-    def rate(self, t: Scalar, x: Any, u: Float[Array, " m"], disturbance: Float[Array, " m"]) -> Any:
-        """Time derivative of the state."""
+    def rate(self, t: Scalar, x: State, u: Float[Array, " m"], disturbance: Float[Array, " m"]) -> State:
+        """Return the time derivative of the state."""
 
     @abstractmethod
-    def input_for(self, t: Scalar, x: Any, w_dot: Float[Array, " m"], d: Float[Array, " m"]) -> Float[Array, " m"]:
-        """The input with which w' is this under a disturbance d."""
+    def input_for(self, t: Scalar, x: State, w_dot: Float[Array, " m"], d: Float[Array, " m"]) -> Float[Array, " m"]:
+        """Return the input for this w' and disturbance d."""
 
-    def unexplained(self, t: Scalar, x: Any, x_dot: Any, u: Float[Array, " m"]) -> Float[Array, " m"]:
-        """The disturbance that explains the motion, M w' - f(t, x, u)."""
+    def unexplained(self, t: Scalar, x: State, x_dot: State, u: Float[Array, " m"]) -> Float[Array, " m"]:
+        """Return the disturbance M w' - f(t, x, u) of a motion."""
         return self.mass(t, x) @ self.velocity(x_dot) - self.generalised_force(t, x, u)
 
     def unexplained_impulse(
-        self, t: Scalar, x: Any, x_next: Any, u: Float[Array, " m"], dt: Scalar
+        self, t: Scalar, x: State, x_next: State, u: Float[Array, " m"], dt: Scalar
     ) -> Float[Array, " m"]:
-        """Its integral over a period dt [s] that ends at t, by the trapezium rule from the states at both ends."""
+        """Return the integral of `unexplained` over a period dt [s] that ends at t, by the trapezium rule."""
         before = t - dt
         force = 0.5 * (self.generalised_force(before, x, u) + self.generalised_force(t, x_next, u))
         mass = 0.5 * (self.mass(before, x) + self.mass(t, x_next))
         return mass @ (self.velocity(x_next) - self.velocity(x)) - dt * force
 
-    def normalise(self, x: Any) -> Any:
-        """The state with its constraints met exactly, such as |q| = 1, which integration meets to its error."""
+    def normalise(self, x: State) -> State:
+        """Return the state with its constraints met exactly, such as |q| = 1, after an integration step."""
         return x
 
-    def visible(self, x: Any) -> Any:
-        """The part of a state that sensors can see: the state of the nominal model, of most plants all of it."""
+    def signals_of(self, x: State) -> dict[str, PyTree]:
+        """Return the visible part of a state by the names of `signals`."""
+        return {"x": x}
+
+    def state_of(self, signals: Mapping[str, PyTree]) -> State:
+        """Return the visible state from its signals, the inverse of `signals_of`."""
+        return signals["x"]
+
+    def accepted(self, measured: State) -> State:
+        """Return a measured state with its constraints met; a state that meets them to rounding is not changed."""
+        return measured
+
+    def nearest(self, x: State, other: State) -> State:
+        """Return the form of a state that is nearest to another state: q and -q are one attitude."""
         return x
 
-    def to_plan_by(self, model: Any) -> Any:
-        """The plant by whose input a motion is planned: the law's model where states that it does not know act."""
+    def visible(self, x: State) -> State:
+        """Return the part of a state that sensors measure, which is the state of the design model."""
+        return x
+
+    def to_plan_by(self, model: "Plant") -> "Plant":
+        """Return the plant for planning a motion: `model`, the law's, if the input acts through hidden states."""
         return self
 
-    def with_hidden_at_rest(self, visible: Any) -> Any:
-        """The state with this visible part, and the rest of it at rest."""
+    def with_hidden_at_rest(self, visible: State) -> State:
+        """Return the state with this visible part and hidden states at rest."""
         return visible
 
-    def retract(self, x: Any, by: Float[Array, " n"]) -> Any:
-        """The state near x at local coordinates (n,), as many as x has degrees of freedom.
-
-        Those of what sensors see come first.
-        """
+    def retract(self, x: State, by: Float[Array, " n"]) -> State:
+        """Return the state near x at local coordinates (n,), one for each degree of freedom, visible ones first."""
         return x + by
 
-    def local_coordinates(self, x: Any, other: Any) -> Float[Array, " n"]:
-        """Local coordinates (n,) of a state near x, to first order: the inverse of `retract`."""
+    def local_coordinates(self, x: State, other: State) -> Float[Array, " n"]:
+        """Return the local coordinates (n,) of a state near x, to first order: the inverse of `retract`."""
         return other - x
 
     @abstractmethod
-    def speed(self, x: Any) -> Scalar:
-        """The scalar speed, whose largest value is the metric peak_rate."""
+    def speed(self, x: State) -> Scalar:
+        """Return the scalar speed; its largest value is the metric peak_rate."""
 
-    def momentum(self, x: Any) -> Float[Array, " m"] | None:
-        """Return the momentum, whose largest 2-norm is the metric peak_momentum; None: the plant has none."""
+    def momentum(self, x: State) -> Float[Array, " m"] | None:
+        """Return the momentum, or None; its largest 2-norm is the metric peak_momentum."""
         return None
 
-    def too_fast(self, x: Any, dt: Scalar) -> Array:
-        """Whether the state changes more in an integration step of dt [s] than the step can follow."""
+    def too_fast(self, x: State, dt: Scalar) -> Array:
+        """Return whether the state changes too much for an integration step of dt [s]."""
         return jnp.zeros_like(dt, dtype=bool)
 
-    def modal_amplitude(self, x: Any) -> Scalar | None:
-        """Size of the modes' motion, for the metrics peak_modal and residual_modal; None without modes."""
+    def modal_amplitude(self, x: State) -> Scalar | None:
+        """Return the amplitude of the modes for the metrics peak_modal and residual_modal; None without modes."""
         return None
 
     @abstractmethod
-    def columns(self, x: Any) -> dict[str, Any]:
-        """A history of states (time, ..) as columns of a table: name -> (time, components)."""
+    def columns(self, x: State) -> dict[str, ArrayLike]:
+        """Return the columns of a history of states (time, ..): name -> (time, components)."""
 
-    def hidden_columns(self, x: Any) -> dict[str, Any]:
-        """The columns of the part that sensors do not see, such as flexible modes."""
+    def hidden_columns(self, x: State) -> dict[str, ArrayLike]:
+        """Return the columns of the hidden states, such as flexible modes."""
         return {}
 
 
 def as_pytree(function: Callable | None) -> Any:
-    """A callable that may be a field of a plant: a plain function is wrapped, a pytree and None are that already."""
+    """Return a function as a pytree, for a field of a plant; pytrees and None are returned unchanged."""
     plain = function is not None and jax.tree.leaves(function) == [function]
     return jax.tree_util.Partial(function) if plain else function
 
 
 def check_indices(function: Callable, *arguments: Any) -> None:
-    """Raise IndexError where a function of one's own takes an element that none of its arguments has.
+    """Raise IndexError if a custom function takes an element that its arguments do not have.
 
-    JAX would take the last one in its place, and say nothing. arguments: pytrees of arrays, or of their shapes, and of
-    plain numbers.
+    JAX would silently take the last element. arguments: pytrees of arrays, of their shapes, or of plain numbers.
     """
     try:
-        # NumPy looks
+        # NumPy checks indices
         known = jax.tree.map(lambda v: np.zeros(v.shape, v.dtype) if hasattr(v, "shape") else v, arguments)
         jax.eval_shape(lambda: function(*known))
     except IndexError:
         raise
-    except (Exception, SystemExit):  # what works with JAX's arrays alone
+    except (Exception, SystemExit):  # the function works with JAX's arrays only
         return

@@ -1,10 +1,11 @@
-"""A spacecraft with flexible appendages, or sloshing liquid: a truth, of which law and observer know the rigid body."""
+"""A true plant with flexible appendages or sloshing liquid; law and observer know the rigid body only."""
 
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from ptsmc_jax import formulas
@@ -108,19 +109,25 @@ class FlexibleSpacecraft(Spacecraft):
         definite = jnp.all(jnp.stack(minors) > 0.0)
         return replace(self, rest_inverse=jnp.where(definite, matrices.solve(rest, jnp.eye(3)), jnp.nan))
 
-    def hidden_columns(self, x: AttitudeState) -> dict[str, Any]:
+    def hidden_columns(self, x: AttitudeState) -> dict[str, ArrayLike]:
         """Modal coordinates e1.. [sqrt(kg) m] and their rates e_dot1.. [sqrt(kg) m/s]."""
         return {"e": x.modes.e, "e_dot": x.modes.rate}
 
 
 def flexible(inertia: object, frequency: object, damping: object, coupling: object) -> FlexibleSpacecraft:
-    """Flexible spacecraft from its inertia and its modes. Raises ValueError where no body can have them.
+    """Return a flexible spacecraft from its inertia and its modes.
 
     Args:
         inertia: of the whole body with its modes at rest, as `rigid_body.spacecraft` takes it [kg m^2].
         frequency: (n,) of each mode with the body held [rad/s].
         damping: (n,) [-].
         coupling: (n, 3) [sqrt(kg) m].
+
+    Returns:
+        The spacecraft.
+
+    Raises:
+        ValueError: no body can have this inertia and coupling.
     """
     tensor = formulas.check_inertia(inertia)
     rest = formulas.rest_inertia(tensor, coupling)

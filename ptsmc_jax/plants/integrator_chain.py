@@ -6,6 +6,8 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from ptsmc_jax.numerics.pytrees import Scalar, pytree
@@ -33,9 +35,9 @@ class Chain(Plant):
     inertia_inverse = inertia
 
     @property
-    def states(self) -> int:
-        """The order n."""
-        return self.order
+    def state_shapes(self) -> dict[str, tuple[int, ...]]:
+        """One array (n,)."""
+        return {"": (self.order,)}
 
     def drift(self, x: Float[Array, " n"]) -> Float[Array, "1"]:
         """f(x), (1,)."""
@@ -69,7 +71,7 @@ class Chain(Plant):
         """|x_2| = |x_1'|."""
         return jnp.abs(x[1])
 
-    def columns(self, x: Any) -> dict[str, Any]:
+    def columns(self, x: Array | np.ndarray) -> dict[str, ArrayLike]:
         """The states x1..xn."""
         return {"x": x}
 

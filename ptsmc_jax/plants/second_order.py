@@ -1,4 +1,4 @@
-"""Second-order systems (25) of one's own."""
+"""Custom second-order systems (25)."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from ptsmc_jax.numerics import guards, matrices
@@ -17,10 +18,10 @@ from ptsmc_jax.plants.base import Plant, as_pytree, check_indices
 @pytree
 @dataclass(frozen=True)
 class System(Plant):
-    """Second-order system (25) of one's own: x_1' = F, x_2' = H + G u + D d; all are functions of (t, x_1, x_2).
+    """Custom second-order system (25): x_1' = F, x_2' = H + G u + D d, with functions of (t, x_1, x_2).
 
-    x_1, x_2, u and d are (n,), the state (2n,) is x_1 followed by x_2. Time is an argument, since x_1 is an error:
-    where the reference moves, F knows it. Its M is D^-1. Build it with `system`.
+    x_1, x_2, u and d are (n,). The state (2n,) is x_1 followed by x_2. F depends on time if the reference moves, since
+    x_1 is an error. M is D^-1. Build it with `system`.
     """
 
     F: Any  # -> (n,)
@@ -28,13 +29,13 @@ class System(Plant):
     G: Any  # -> (n, n)
     D: Any  # -> (n, n), or None for the identity
     of_own_functions: ClassVar[bool] = True
-    inertia: Leaf  # (n, n) that observers read their gains against, the identity if nothing else is said
+    inertia: Leaf  # (n, n) scale of observer gains, by default the identity
     inertia_inverse: Leaf  # (n, n)
 
     @property
-    def states(self) -> int:
-        """The length of x_1 and x_2 together."""
-        return 2 * self.inputs
+    def state_shapes(self) -> dict[str, tuple[int, ...]]:
+        """One array (2n,)."""
+        return {"": (2 * self.inputs,)}
 
     def split(self, x: Float[Array, " twice"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
         """x_1 and x_2."""
@@ -58,7 +59,7 @@ class System(Plant):
         return jax.jacfwd(self.F, argnums=2)(t, *self.split(x))
 
     def coasting_acceleration(self, t: Scalar, x: Float[Array, " twice"]) -> Float[Array, " n"]:
-        """The x_1'' where x_2' = 0: dF/dt + dF/dx1 F."""
+        """The x_1'' for x_2' = 0: dF/dt + dF/dx1 F."""
         x_1, x_2 = self.split(x)
         rates = (jnp.ones_like(t), self.F(t, x_1, x_2))
         return jax.jvp(lambda t, x_1: self.F(t, x_1, x_2), (t, x_1), rates)[1]
@@ -112,10 +113,10 @@ class System(Plant):
         return guards.norm(self.velocity(x))
 
     def jacobian(self, t: Scalar, x: Float[Array, " twice"], u: Float[Array, " n"]) -> Float[Array, "twice twice"]:
-        """The matrix dx'/dx at an input that is held: its eigenvalues are what integration steps must follow [1/s]."""
+        """The matrix dx'/dx at a constant input; integration steps must resolve its eigenvalues [1/s]."""
         return jax.jacfwd(lambda x: self.rate(t, x, u, jnp.zeros(self.inputs)))(x)
 
-    def columns(self, x: Any) -> dict[str, Any]:
+    def columns(self, x: Array | np.ndarray) -> dict[str, ArrayLike]:
         """The states x_1 and x_2, one after the other."""
         return {"x": x[..., : 2 * self.inputs]}
 
@@ -123,19 +124,19 @@ class System(Plant):
 @pytree
 @dataclass(frozen=True)
 class HiddenSystem(System):
-    """A truth with states z (k,) that no sensor sees and no law knows: a lag, a tank, a mode. Build it with `system`.
+    """A true plant with hidden states z (k,), such as a lag, a tank or a mode. Build it with `system`.
 
-    x_1' = F, x_2' = H(t, x_1, x_2, z) + G u + D d and z' = Z(t, x_1, x_2, z, u); F, G and D as of any system. The state
-    (2n + k,) is x_1, x_2, z; z is z0 at t = 0.
+    x_1' = F, x_2' = H(t, x_1, x_2, z) + G u + D d and z' = Z(t, x_1, x_2, z, u), with F, G and D as in `System`. The
+    state (2n + k,) is x_1, x_2, z. At t = 0 z is z0.
     """
 
     Z: Any  # -> (k,)
     z0: Leaf  # (k,)
 
     @property
-    def states(self) -> int:
-        """The length of x_1, x_2 and z together."""
-        return 2 * self.inputs + self.z0.shape[-1]
+    def state_shapes(self) -> dict[str, tuple[int, ...]]:
+        """One array (2n + k,)."""
+        return {"": (2 * self.inputs + self.z0.shape[-1],)}
 
     def drift(self, t: Scalar, x: Float[Array, " whole"]) -> Float[Array, " n"]:
         """H."""
@@ -149,15 +150,15 @@ class HiddenSystem(System):
         """x_1 and x_2."""
         return x[: 2 * self.inputs]
 
-    def to_plan_by(self, model: Any) -> Any:
-        """The model: an input that acts through z alone is none for x_2' at once."""
+    def to_plan_by(self, model: Plant) -> Plant:
+        """The model: an input that acts only through z does not change x_2' at once."""
         return model
 
     def with_hidden_at_rest(self, visible: Float[Array, " twice"]) -> Float[Array, " whole"]:
         """The state of these x_1 and x_2, with z at z0."""
         return jnp.append(visible, self.z0)
 
-    def hidden_columns(self, x: Any) -> dict[str, Any]:
+    def hidden_columns(self, x: Array | np.ndarray) -> dict[str, ArrayLike]:
         """The states z."""
         return {"z": x[..., 2 * self.inputs :]}
 
@@ -181,9 +182,9 @@ def system(
         H: x_2' without input and disturbance, (n,); with Z it takes the hidden states z as a fourth argument.
         G: input matrix, (n, n).
         D: the disturbance's input matrix, (n, n), which must be invertible for any observer; None: the identity.
-        inertia: (n, n), symmetric and positive definite, that observers read their gains against, A = l inertia^-1;
-            None: the identity, gains are then in 1/s.
-        Z: derivative of hidden states z (k,), of (t, x_1, x_2, z, u): a truth to fly, see `HiddenSystem`.
+        inertia: (n, n), symmetric and positive definite, scale of observer gains, A = l inertia^-1; None: the identity,
+            with gains in 1/s.
+        Z: derivative of hidden states z (k,), of (t, x_1, x_2, z, u), for a true plant, see `HiddenSystem`.
         z0: z at t = 0, (k,).
 
     Raises:
@@ -215,13 +216,13 @@ def system(
     return System(*fields) if Z is None else HiddenSystem(*fields, as_pytree(Z), z)
 
 
-# what JAX raises where a traced number is asked for its value, and what stands in place of that
+# errors of JAX for the value of a traced number, and the advice
 TRACED = (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError)
 INSTEAD = "allowed are jax.numpy.where in place of if, and jax.numpy in place of numpy and float()"
 
 
 def _check(name: str, function: Callable, arguments: tuple, shape: tuple[int, ...]) -> None:
-    """Raise ValueError where a function fails, has no slopes, or returns what is no array of this shape and type."""
+    """Raise ValueError if a function fails, has no derivative, or returns another shape or type."""
     n, exact = arguments[1].shape[0], arguments[0].dtype
 
     def traced(what: str, of: Callable) -> Any:
@@ -245,7 +246,7 @@ def _check(name: str, function: Callable, arguments: tuple, shape: tuple[int, ..
 
 
 def _hidden(z0: object, Z: Callable | None) -> Float[Array, " k"]:
-    """The initial hidden states (k,). Raises ValueError where they are no list of numbers, or Z is missing."""
+    """Return the initial hidden states (k,). Raises ValueError if they are not a list of numbers, or Z is missing."""
     try:
         z = np.atleast_1d(np.asarray(z0, dtype=float))
     except (TypeError, ValueError):

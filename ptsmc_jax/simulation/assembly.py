@@ -4,16 +4,15 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any, TypeVar
 
 import jax.numpy as jnp
-from jax.tree_util import Partial, all_leaves
+from jax.tree_util import Partial
 
 from ptsmc_jax.devices.actuators import Actuators
 from ptsmc_jax.devices.command_filter import CommandFilter
 from ptsmc_jax.devices.sensors import PerfectSensors
-from ptsmc_jax.numerics.pytrees import Function, Leaf, pytree
+from ptsmc_jax.numerics.pytrees import Function, Leaf, is_function, pytree
 from ptsmc_jax.plants.base import Plant
 from ptsmc_jax.plants.rigid_body import spacecraft
 from ptsmc_jax.signals import disturbances
-from ptsmc_jax.signals.references import TurningFunction
 from ptsmc_jax.simulation.clock import Anchored, Flight, Graded
 from ptsmc_jax.simulation.pointing import Pointing
 
@@ -42,15 +41,11 @@ class Setup:
     pointing: Pointing | None = None  # None: pointing errors are not observed
 
     def __post_init__(self) -> None:
-        """Wrap plain functions as signals. A function as reference of an attitude may return a quaternion."""
-        path = self.reference
-        if (isinstance(path, Partial) or _is_function(path)) and self.plant.attitude:
-            whole = path if isinstance(path, Partial) else Partial(path)
-            object.__setattr__(self, "reference", TurningFunction(whole))
-        for name in ("disturbance", "reference"):
-            value = getattr(self, name)
-            if _is_function(value):
-                object.__setattr__(self, name, Function(value))
+        """Wrap functions of time as pytrees."""
+        if isinstance(self.reference, Partial) or is_function(self.reference):
+            object.__setattr__(self, "reference", self.controller.kinematics.reference_from(self.reference))
+        if is_function(self.disturbance):
+            object.__setattr__(self, "disturbance", Function(self.disturbance))
 
     @property
     def aligned_initial(self) -> Any:
@@ -92,11 +87,6 @@ class Setup:
     def timed(self, clock: Anchored | Flight | Graded, substeps: int) -> "Parts":
         """Return the parts of a run with this clock and number of integration steps in a control period."""
         return Parts(clock=clock, substeps=substeps, **{f.name: getattr(self, f.name) for f in fields(self)})
-
-
-def _is_function(value: Any) -> bool:
-    """Return whether a value is a plain or jitted function or a bound method, which JAX would treat as a leaf."""
-    return callable(value) and all_leaves([value])
 
 
 def check_parts(what: object) -> None:

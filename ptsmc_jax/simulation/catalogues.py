@@ -66,6 +66,7 @@ UNITS: dict[str, dict[str, float]] = {
     "sqrt(kg) m": {"sqrt(kg) m": 1.0},
 }  # fmt: skip
 CATALOGUES = {"spacecraft": CATALOGUE, "chain": STATE_CATALOGUE, "system": STATE_CATALOGUE}  # by the kind of the plant
+ANGLE_UNITS = {"spacecraft": "rad", "chain": "x1", "system": "x1"}  # of the column `initial_angle`
 
 
 class Margin(NamedTuple):
@@ -86,8 +87,8 @@ NO_SIGN = "the exact sign has no slope: margins are those of the loop without it
 
 
 def units(kind: str) -> dict[str, str]:
-    """Return the unit of each metric for this kind of plant."""
-    return {name: entry.unit for name, entry in CATALOGUES[kind].items()}
+    """Return the unit of each metric, and of `initial_angle`, for this kind of plant."""
+    return {name: entry.unit for name, entry in CATALOGUES[kind].items()} | {"initial_angle": ANGLE_UNITS[kind]}
 
 
 def percent(share: float) -> str:

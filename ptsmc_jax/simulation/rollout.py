@@ -76,10 +76,9 @@ def _check(parts: Parts) -> None:
     """Raise TypeError if the parts do not fit together or do not have the precision of JAX."""
     check_parts(parts)
     _check_bits(parts.t_end)
-    for name, size in (("q", 4), ("w", 3)) if parts.plant.attitude else ():
-        _check_shape(f"initial.{name}", getattr(parts.initial, name, None), [(size,)])
-    if parts.plant.states is not None:
-        _check_shape("initial", parts.initial, [(parts.plant.states,)])
+    for name, shape in parts.plant.state_shapes.items():
+        value = getattr(parts.initial, name, None) if name else parts.initial
+        _check_shape(f"initial.{name}".rstrip("."), value, [shape])
     if not callable(parts.disturbance):
         raise TypeError(f"the disturbance must be a function of (t, x), but is {parts.disturbance!r}")
     value = jax.eval_shape(lambda: parts.disturbance(jnp.zeros_like(parts.t_end), parts.initial))

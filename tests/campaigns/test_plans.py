@@ -328,11 +328,11 @@ Q = {f"initial_q{k}": [0.0, 0.0] for k in (1, 2, 3)}
 J = {f"inertia_{i}{j}": {1: 10.0, 2: 12.0, 3: 14.0}[i] * (i == j) for i in (1, 2, 3) for j in range(i, 4)}
 BAD = [
     ({}, "the plan has no rows, but must have one for each trial"),
-    ({"inital_w1": [0.0]}, "the plan has the column inital_w1, with which no trial of this scenario flies; the nearest "
+    ({"inital_w1": [0.0]}, "the plan has the column inital_w1, which no trial of this scenario has; the nearest "
      "known one is initial_w1"),
     ({"controller_ok": [65], "controller_eta": [3.0]},  # of a row by exported C, and what no C has said
-     "the plan has the column controller_eta, with which no trial of this scenario flies"),
-    ({"initial_x1": [0.0]}, "the column initial_x1, with which no trial of this scenario flies"),
+     "the plan has the column controller_eta, which no trial of this scenario has"),
+    ({"initial_x1": [0.0]}, "the column initial_x1, which no trial of this scenario has"),
     ({"initial_w1": [0.0], "initial_w2": [0.0]},
      "has the column initial_w1, but not initial_w3: initial_w1 to initial_w3 come together"),
     ({"initial_w1": [0.0, 0.0], "initial_w2": [0.0, np.nan], "initial_w3": [0.0, 0.0]},
@@ -352,7 +352,7 @@ BAD = [
     ({"trial": [0.5]}, "has trial 0.5 in row 0, but must have a whole number"),
     ({"seed": [2**32]}, "has seed 4294967296 in row 0, but must have a whole number"),
     ({"star_tracker_outage_begin": [3.0], "star_tracker_outage_end": [17.0]},  # there is no filter that lacks anything
-     "has the column star_tracker_outage_begin, with which no trial of this scenario flies"),
+     "has the column star_tracker_outage_begin, which no trial of this scenario has"),
 ]  # fmt: skip
 
 

@@ -44,7 +44,8 @@ def test_the_line_of_a_limit_does_not_run_through_its_label(limit, spread):
 def test_each_outcome_is_counted_and_drawn():
     outcome = np.array(list(campaign_plots.MARKS), dtype=object)
     x, totals = 1.0 + np.arange(outcome.size), dict.fromkeys(campaign_plots.MARKS, 7)
-    (axes,) = campaign_plots.torque_by_angle(x, x, outcome, totals, None).axes
+    start, torque = campaign_plots.Column("rad", x), campaign_plots.Column("N m", x)
+    (axes,) = campaign_plots.torque_by_angle(start, torque, outcome, totals).axes
     assert axes.get_legend_handles_labels()[1] == [f"{name}: 7" for name in outcome]
     for points, marker in zip(
         axes.collections, (marker for _, marker, _ in campaign_plots.MARKS.values()), strict=True
@@ -59,7 +60,8 @@ def test_each_outcome_is_counted_and_drawn():
 def test_a_limit_in_the_legend_is_on_the_axis(limit):
     """Far below torques of 10 kN m, which no wheel gave, the line of 0.5 N m was not."""
     x, outcome = np.arange(1.0, 4.0), np.full(3, "missed", dtype=object)
-    (axes,) = campaign_plots.torque_by_angle(x, x, outcome, {"missed": 3}, limit).axes
+    start, torque = campaign_plots.Column("rad", x), campaign_plots.Column("N m", x, limit)
+    (axes,) = campaign_plots.torque_by_angle(start, torque, outcome, {"missed": 3}).axes
     low, high = axes.get_ylim()
     assert low < limit < high
 
@@ -88,9 +90,10 @@ def test_a_metric_over_what_was_drawn_has_plain_numbers():
     assert not any("10^" in label for label in labels)
 
 
-@pytest.mark.parametrize(("kind", "unit", "factor"), [("spacecraft", "[deg]", 180.0 / np.pi), ("chain", "[x1]", 1.0)])
-def test_initial_angles_are_drawn_in_the_unit_of_their_axis(kind, unit, factor):
+@pytest.mark.parametrize(("unit", "shown", "factor"), [("rad", "[deg]", 180.0 / np.pi), ("x1", "[x1]", 1.0)])
+def test_initial_angles_are_drawn_in_the_unit_of_their_axis(unit, shown, factor):
     angle, outcome = np.array([0.5, 1.0, 2.0]), np.full(3, "ok", dtype=object)
-    (axes,) = campaign_plots.torque_by_angle(angle, angle, outcome, {"ok": 3}, None, kind).axes
-    assert axes.get_xlabel().endswith(unit)
+    start, torque = campaign_plots.Column(unit, angle), campaign_plots.Column("N m", angle)
+    (axes,) = campaign_plots.torque_by_angle(start, torque, outcome, {"ok": 3}).axes
+    assert axes.get_xlabel().endswith(shown)
     np.testing.assert_allclose(np.asarray(axes.collections[0].get_offsets())[:, 0], factor * angle)

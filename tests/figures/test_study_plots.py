@@ -30,7 +30,7 @@ def test_the_search_is_coloured_where_the_requirements_are_met():
     judged = 0.9, {"eta": 3.1}
     figure = study_plots.tuning_history({"eta": ("-", np.full((3, 2), 3.0))}, values, met, "window error", judged)
     for axes, value in zip(figure.axes, (0.9, 3.1), strict=True):  # whatever the last step of a start was
-        (line,) = [line for line in axes.lines if str(line.get_label()).startswith("found")]
+        (line,) = [line for line in axes.lines if str(line.get_label()).startswith("result")]
         assert set(np.asarray(line.get_ydata()).tolist()) == {value}
     drawn = [np.asarray(line.get_ydata(), dtype=float) for line in figure.axes[0].lines[:4]]
     for start in range(2):

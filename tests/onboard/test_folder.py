@@ -318,17 +318,17 @@ def test_the_law_stands_in_it_with_its_names_and_equations(exported):
     text = (exported / "ptsmc_short.c").read_text()
     assert "(56) and (57) before and (59) and (60) after the hand-over." in text.replace("\n * ", " ")
     for line in (
-        "const real error_1 = attitude[0] - p->reference_q[0];",
+        "const real error_1 = now->attitude[0] - p->reference_q[0];",
         "const real acceleration_3 = -switching_3",
     ):
         assert line in text
-    assert "(Theorem 2)" in (exported / "ptsmc_short.h").read_text()
+    assert "power of the approach" in (exported / "ptsmc_short.h").read_text()
 
 
 def test_the_limit_of_the_singularity_is_that_of_the_simulator(monkeypatch):
     monkeypatch.setattr(run_state, "SINGULAR_CLEARANCE", 0.0125)
     made = folder.Controller(scenario.from_tables(flight()), "short", "a scenario")
-    limits = re.findall(r"clearance >= R\((.*?)\)", templates.source(made.code, made.about))
+    limits = re.findall(r"clearance >= R\((.*?)\)", templates.texts(made.code, made.about)["ptsmc_short.c"])
     assert limits == ["0.0125", "0.0125"]
 
 
@@ -351,8 +351,8 @@ def test_a_filter_of_the_command_goes_on_by_a_whole_period_wherever_samples_are_
     def commanded(flown, gap):
         made = board(flown)
         (stage,) = (one for one in made.stages if one.name == "command")
-        read = [jax.tree.map(jnp.asarray, (known | {"dt": gap})[name]) for name in stage.reads]
-        return np.asarray(stage.run(made.parameters, *read)["out.command"])
+        read = {name: jax.tree.map(jnp.asarray, (known | {"dt": gap})[name]) for name in stage.reads}
+        return np.asarray(stage.run(made.parameters, read)["out.command"])
 
     period = float(parts.period)
     g = np.tan(0.5 * float(parts.command_filter.corner) * period)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ptsmc_jax.numerics import attitude, elementary, guards, matrices
-from ptsmc_jax.onboard.fields import Struct
+from ptsmc_jax.onboard.fields import struct
 from ptsmc_jax.onboard.translate import NoRuleError
 from tests.onboard.compiled import body, both, needs_compiler
 
@@ -301,7 +301,7 @@ def test_keys_of_random_numbers_are_refused_wherever_they_come_from():
     with pytest.raises(NoRuleError, match=r"^key<fry> cannot be written in C, but must be numbers"):
         body(lambda x: x + jax.random.normal(key), X)
     with pytest.raises(NoRuleError, match=r"^law holds key<fry>, which C has no number for here$"):
-        Struct("before").add("law", jax.ShapeDtypeStruct((), key.dtype))
+        struct({"law": jax.ShapeDtypeStruct((), key.dtype)}, {})
 
 
 @pytest.mark.parametrize("known", [jnp.asarray([1.0 + 2.0j, 2.0, 3.0]), jnp.asarray([1, 2, 3], jnp.uint64)])

@@ -9,6 +9,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from ptsmc_jax.paper import claims, slips
+from ptsmc_jax.plants import Chain, Spacecraft
 from ptsmc_jax.scenario import read
 from tests.helpers import REFERENCE, tree
 from tests.output.pages import checked
@@ -98,13 +99,13 @@ def test_slips_show_what_they_say(made):
 
 def test_each_figure_of_the_paper_has_its_number_and_shows_what_it_shows_there(monkeypatch):
     """Of a chain (a) its states and (b) its control; of a spacecraft the first its attitude, the last its torque."""
-    for name in ("attitude", "torque", "states"):
-        monkeypatch.setattr(reproduction.run_plots, name, lambda run, log, title, name=name: (name, log, title))
+    monkeypatch.setattr(reproduction.run_plots, "torque", lambda run, log, title: ("torque", log, title))
+    monkeypatch.setattr(reproduction.run_plots, "state", lambda run, log, chart, title: (chart.name, log, title))
     monkeypatch.setattr(reproduction.run_plots, "convergence", lambda run, log, title: ("convergence", log, title))
-    monkeypatch.setattr(reproduction.run_plots, "observers", lambda measured: "observers")
+    monkeypatch.setattr(reproduction, "_observers", lambda measured: "observers")
 
     def run(name: str) -> Any:
-        plant = SimpleNamespace(attitude=name.startswith("case"))
+        plant = Spacecraft if name.startswith("case") else Chain
         return SimpleNamespace(parts=SimpleNamespace(plant=plant), log=name)
 
     cases = {name: run(name) for name in claims.CASES}

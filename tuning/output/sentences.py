@@ -46,8 +46,7 @@ def with_unit(name: str, kind: str) -> str:
     ('initial_angle [rad]', 'initial_angle [x1]')
     """
     units = catalogues.units(kind)
-    start = "rad" if kind == "spacecraft" else units["window_error"]  # of others |x_1| stands in that column
-    units |= {"torque": units["peak_torque"], "delay_margin": "s", "initial_angle": start}
+    units |= {"torque": units["peak_torque"], "delay_margin": "s"}
     unit = units.get(re.sub("^(linear|largest|hold)_(?=torque|peak|window|delay)", "", name), "-")
     return name if unit == "-" else f"{name} [{unit}]"
 

@@ -21,7 +21,7 @@ POINTS = 5000  # trials in a figure of points
 
 def of(folder: Folder, summary: dict[str, Any]) -> dict[str, Figure]:
     """Figures of a campaign by name."""
-    parts, kind = folder.whole_parts(), folder.scenario.plant.kind
+    parts = folder.whole_parts()
     wanted = scenario.requirements(folder.scenario)
     limits = {r.metric: r.limit for r in wanted}
     names = list(dict.fromkeys((*limits, "window_error", "peak_torque")))
@@ -48,9 +48,8 @@ def of(folder: Folder, summary: dict[str, Any]) -> dict[str, Figure]:
     some = np.concatenate([good[: POINTS - bad.size], bad])  # what went wrong, however rare, on top
     angle, torque = (frame[name].to_numpy().astype(float)[some] for name in ("initial_angle", "peak_torque"))
     if np.isfinite(torque).any():
-        figures["torque_by_angle"] = plots.torque_by_angle(
-            angle, torque, outcome[some], totals, limits.get("peak_torque"), kind
-        )
+        starts, torques = column("initial_angle", angle), column("peak_torque", torque)
+        figures["torque_by_angle"] = plots.torque_by_angle(starts, torques, outcome[some], totals)
     drivers = summary["drivers"].get("window_error", {})
     strongest = sorted(drivers, key=lambda name: -drivers[name]["first_order"])[:4]
     if strongest:

@@ -214,4 +214,4 @@ def _figure(trade: Trade, front: Front) -> Figure:
     ticks = [f"{value:g}" if np.isfinite(value) else "none" for value in values] if len(finite) < len(values) else None
     places = [value if np.isfinite(value) else beyond for value in values]
     title = f"{kind.title}, held-out trials"
-    return study_plots.costs(front.points, study_plots.Ladder(title, kind.label(front.plant), places, ticks), panels)
+    return study_plots.costs(front.points, study_plots.Sweep(title, kind.label(front.plant), places, ticks), panels)

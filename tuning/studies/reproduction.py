@@ -4,6 +4,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
 
 from ptsmc_jax.campaigns import store
@@ -70,16 +71,44 @@ def _figures(reproduction: Reproduction) -> dict[str, Figure]:
     for name, run in reproduction.cases.items():
         numbers, title, _ = claims.CASES[name]
         first, last = numbers.split(", ")[0], numbers.split(", ")[-1]
-        if run.parts.plant.attitude:
-            drawn = (first, "", "attitude", run_plots.attitude), (last, "", "torque", run_plots.torque)
-        else:
-            drawn = (first, "a", "states", run_plots.states), (last, "b", "control", run_plots.torque)
-        for number, letter, label, draw in drawn:
-            heading = f"Fig. {number}{f' ({letter})' if letter else ''}: {title}"
-            figures[f"fig_{int(number):02}{letter}_{label}"] = draw(run.parts, run.log, title=heading)
+        plant, letters = run.parts.plant, ("a", "b") if first == last else ("", "")
+        headings = [f"Fig. {number}{f' ({letter})' if letter else ''}: {title}"
+                    for number, letter in zip((first, last), letters, strict=True)]  # fmt: skip
+        state, torque = plant.charts[0].name, plant.input_name
+        figures[f"fig_{int(first):02}{letters[0]}_{state}"] = run_plots.state(
+            run.parts, run.log, plant.charts[0], headings[0]
+        )
+        figures[f"fig_{int(last):02}{letters[1]}_{torque}"] = run_plots.torque(run.parts, run.log, title=headings[1])
         figures[f"convergence_{name}"] = run_plots.convergence(run.parts, run.log, f"Convergence: {title}")
-    figures["remark_2_observers"] = run_plots.observers(reproduction.observers)
+    figures["remark_2_observers"] = _observers(reproduction.observers)
     return figures
+
+
+@style.styled
+def _observers(measured: list[remark_2.Measured]) -> Figure:
+    """Plot each observer's estimation error, and the chattering under both signs (Remark 2)."""
+    runs = {(run.observer, run.sign): run for run in measured}
+    kinds = list(dict.fromkeys(run.observer for run in measured))
+    figure = Figure(figsize=(10.0, 4.5), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    for kind, (colour, line) in zip(kinds, style.STYLES, strict=False):
+        run = runs[kind, "smooth"]
+        left.semilogy(run.t, np.maximum(run.off, 1e-6), color=colour, ls=line, label=kind)
+    left.set(xlabel=style.TIME, ylabel="estimation error $|\\hat d - d|$ [N m]", xlim=(0.0, 10.0), ylim=(1e-5, 1.0))
+    left.legend(ncols=2)
+    for k, sign in enumerate(dict.fromkeys(run.sign for run in measured)):
+        heights = [runs[kind, sign].chattering for kind in kinds]
+        colour, hatch = style.STYLES[k][0], ("", "//")[k % 2]
+        at = np.arange(len(kinds)) + 0.38 * (k - 0.5)
+        bars = right.bar(at, heights, 0.36, color=colour, hatch=hatch, ec="white", label=f"{sign} sign")
+        right.bar_label(bars, fmt="%.0e", fontsize=8)
+    right.set_yscale("log")
+    right.set_axisbelow(True)
+    right.set_xticks(range(len(kinds)), [kind.replace("_", "\n") for kind in kinds])
+    right.set(ylabel="chattering after $t_f$ [N m/s]")
+    right.set_ylim(top=8.0 * right.get_ylim()[1])
+    right.legend(ncols=2)
+    return figure
 
 
 def _markdown(reproduction: Reproduction) -> str:

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from ptsmc_jax.campaigns import margin_verdicts, store
-from ptsmc_jax.numerics import attitude
 from ptsmc_jax.scenario import Study, errors, own, parsing, study
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
@@ -83,10 +82,7 @@ def _number(value: Any) -> float | None:
 def names(ready: Study) -> tuple[list[str], list[str]]:
     """The names of the inputs, and of what the sensors see."""
     plant = ready.parts.plant
-    if plant.attitude:
-        return list("xyz"), [f"{what} {axis}" for what in ("attitude", "rate") for axis in "xyz"]
-    size = np.asarray(plant.visible(ready.parts.initial)).size
-    return [f"u{k + 1}" for k in range(plant.inputs)], [f"x{k + 1}" for k in range(size)]
+    return plant.input_labels, plant.signal_labels(plant.visible(ready.parts.initial))
 
 
 def summary(ready: Study, course: Course) -> dict[str, Any]:
@@ -125,7 +121,7 @@ def summary(ready: Study, course: Course) -> dict[str, Any]:
         **({"missed": True} if course.missed else {}),
         **({"dispersed": margin_verdicts.TRIALS} if margin_verdicts.differ(ready.dispersion) else {}),
         "said": NO_SIGN if ready.scenario.exact_sign else None,
-        **({"start_deg": _start(ready)} if ready.parts.plant.attitude else {}),
+        **_start(ready),
         **({} if course.swing is None else _swing(ready.scenario, course.swing)),
     }
 
@@ -140,9 +136,12 @@ def _open(left: margins.Margins) -> np.ndarray:
     return unlimited & (np.abs(left.modulus) < 1e-9) & np.isnan(left.crossover)
 
 
-def _start(ready: Study) -> float:
-    """How far the nominal run starts from its reference [deg]."""
-    return float(np.rad2deg(attitude.angle(ready.parts.initial.q, ready.parts.reference(jnp.zeros(())).q)))
+def _start(ready: Study) -> dict[str, float]:
+    """Return the angle between initial attitude and reference in the nominal run [deg]; nothing for other plants."""
+    parts, kinematics = ready.parts, ready.parts.controller.kinematics
+    if kinematics.angle_unit != "rad":
+        return {}
+    return {"start_deg": float(np.rad2deg(kinematics.angle(parts.initial, parts.reference(jnp.zeros(())))))}
 
 
 def write(folder: Path, ready: Study, course: Course, figures: bool) -> None:

@@ -10,7 +10,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "ptsmc_@name@_flat.h"
+#include "ptsmc_${name}_flat.h"
 
 enum {
     HEAD = 3,
@@ -23,7 +23,7 @@ static const struct {
     const char *name;
     int group;
 } checked[CHECKED] = {
-@listed@
+${compared}
 };
 
 /* A row of numbers; 0 at the end of the file, -1 where it is no row. */
@@ -59,7 +59,7 @@ int main(int count, char **given)
 {
     const int single = sizeof(ptsmc_real) == 4;
     /* what rounding of an attitude, times the gains just before the hand-over, is beside the largest torque */
-    const double rounding = (single ? 4.8e-7 : 8.9e-16) * @steepness@;
+    const double rounding = (single ? 4.8e-7 : 8.9e-16) * ${steepness};
     const double tolerance = count > 2 ? strtod(given[2], NULL) : fmax(single ? 1e-3 : 1e-12, fmin(rounding, 0.1));
     static double v[COLUMNS], largest[CHECKED], off[CHECKED], found[CHECKED];
     FILE *const file = fopen(count > 1 ? given[1] : "vectors.csv", "r");

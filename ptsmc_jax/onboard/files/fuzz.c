@@ -7,7 +7,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "ptsmc_@name@_flat.h"
+#include "ptsmc_${name}_flat.h"
 
 enum {
     HEAD = 3,
@@ -138,7 +138,7 @@ int main(int count, char **given)
                 v[1 + bits() % (PTSMC_IN_SIZE - 1)] = anything();
             }
         }
-@flags@
+${flags}
         ptsmc_in_from(v, &in);
         ptsmc_state_to(&state, before);
         last = ptsmc_step(&ptsmc_parameters, &state, &in, &found);

@@ -1,7 +1,7 @@
 /* A controller's steps, a row each, for a program that flies it in the loop, and for XLA. */
 #include <math.h>
 
-#include "ptsmc_@name@_flat.h"
+#include "ptsmc_${name}_flat.h"
 #include "xla/ffi/api/c_api.h"
 
 const long ptsmc_sizes[4] = {PTSMC_IN_SIZE, PTSMC_OUT_SIZE, PTSMC_STATE_SIZE, PTSMC_PARAMS_SIZE};

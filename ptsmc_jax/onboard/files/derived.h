@@ -1,0 +1,7 @@
+/* Numbers that follow from the parameters, and copies of these parameters. ptsmc_init computes them, and ptsmc_step
+ * computes them again after a parameter has changed.
+ */
+typedef struct {
+${derived_members}
+} ptsmc_derived;
+

@@ -1,0 +1,8 @@
+/* The parameters of ${scenario} (SHA-256 ${digest}). */
+#include "ptsmc_${name}.h"
+
+#define R(x) ((ptsmc_real)(x))
+
+const ptsmc_params ptsmc_parameters = {
+${parameter_values}
+};
