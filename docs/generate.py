@@ -71,7 +71,7 @@ margin, a number: `gain_margin` [dB], `phase_margin` [deg] and `delay_margin` [s
 
 SUITE = """\
 Any number of sensors, a table each: at least one gyro, and attitude sensors that determine the attitude together. A
-[Kalman filter](method.md#sensor-suites) combines them. These tables replace the noise in `[hardware]` and `[filter]`,
+[Kalman filter](theory/sensor_suites.md) combines them. These tables replace the noise in `[hardware]` and `[filter]`,
 which are the short form for one star tracker and one gyro."""
 
 

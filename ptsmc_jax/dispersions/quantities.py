@@ -214,7 +214,7 @@ QUANTITIES: dict[str, Quantity] = {
     INITIAL_RATE: field_quantity("initial.w", "initial_w", unit="rad/s"),
     INITIAL_STATE: Quantity(
         lambda parts: (
-            numbered("initial_x", parts.plant.visible(parts.initial).size) if "x" in parts.plant.signals else []
+            number_names("initial_x", parts.plant.visible(parts.initial).size) if "x" in parts.plant.signals else []
         ),
         lambda parts: parts.plant.visible(parts.initial),
         lambda parts, x: replace(parts, initial=parts.plant.with_hidden_at_rest(x)),

@@ -75,7 +75,7 @@ def _switch(to: Any, eqn: Any, test: Node, branches: Sequence[Any], operands: li
 
 def loop(to: Any, eqn: Any, values: list[np.ndarray]) -> list[np.ndarray]:
     """Translate lax.while_loop."""
-    test, body, test_consts, body_consts, init = loop_of(eqn, values)
+    test, body, test_consts, body_consts, init = unpack_while(eqn, values)
     region = Region("while")
     carry = _carry(to, region, init, eqn.outvars)
     _inside(to, region, lambda: to.evaluate(test, [*test_consts, *carry]))

@@ -53,7 +53,7 @@ class Translator:
 
     def evaluate(self, closed: Any, args: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Return the components of a trace's outputs, for these components of its inputs."""
-        jaxpr, consts = opened(closed)
+        jaxpr, consts = open_jaxpr(closed)
         known: dict[Any, np.ndarray] = dict(zip(jaxpr.constvars, map(self.constant, consts), strict=True))
         known |= dict(zip(jaxpr.invars, args, strict=True))
         spans = [() if self.held else tuple(origins.frames(eqn)[:1]) for eqn in jaxpr.eqns]
@@ -80,7 +80,7 @@ class Translator:
 
     def apply(self, eqn: Any, values: list[np.ndarray], where: list[origins.Frame]) -> list[np.ndarray]:
         """Return the components of one equation's outputs."""
-        name, inner = eqn.primitive.name, called(eqn)
+        name, inner = eqn.primitive.name, called_jaxpr(eqn)
         if name == "custom_jvp_call" or name == "custom_vjp_call":
             inner = eqn.params.get("call_jaxpr", eqn.params.get("fun_jaxpr"))
             debug_info = getattr(getattr(inner, "jaxpr", inner), "debug_info", None)

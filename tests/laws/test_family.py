@@ -498,7 +498,7 @@ def test_scaling_law_has_constant_gains_in_the_hold_phase():
 
 # ---- predefined time
 
-# settling time from rest as a fraction of T_1 + T_2, by initial error; the numbers are quoted in docs/method.md
+# settling time from rest as a fraction of T_1 + T_2, by initial error, as in docs/theory/comparison_laws.md
 MEASURED = {1e-3: 0.051, 1.0: 0.308, 1e3: 0.553}
 
 
