@@ -24,7 +24,7 @@ from IPython.display import display
 import ptsmc_jax as ptsmc
 from ptsmc_jax.explore import Figures
 from ptsmc_jax.figures import study_plots
-from tuning.output import terminal
+from tuning.output import summaries, terminal, tune_report
 from tuning.search import gains
 from tuning.studies import pareto, stability, trades, tune_files, tuner
 
@@ -41,7 +41,8 @@ small = ptsmc.replace(flight, tune={"trials": 16, "starts": 3, "steps": 30})  # 
 
 # %%
 tuned = tuner.tune(small, seed=0)
-terminal.tuning(tune_files.summary(tuned), "out/tune-first_flight", "done")
+report = tune_report.of(summaries.tune(tune_files.summary(tuned)))
+terminal.show(report, "out/tune-first_flight")
 
 # %% [markdown]
 # Each line is one local search from its starting point. Grey points exceed a limit, blue points meet it. The gains below the

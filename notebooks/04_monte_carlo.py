@@ -21,7 +21,7 @@ import tempfile
 from pathlib import Path
 
 import ptsmc_jax as ptsmc
-from tuning.output import campaign_terminal
+from tuning.output import campaign_report, summaries, terminal
 from tuning.studies import campaign_figures, campaign_folder, campaign_summary
 
 # %% [markdown]
@@ -62,7 +62,7 @@ folder = campaign_folder.Folder(place, flight, seed=1, trials=20_000)
 campaign_folder.begin(folder, force=False)
 campaign_folder.fly(folder, (1, 1), lambda standing: None)
 found = campaign_summary.summarise(folder)
-campaign_terminal.campaign(found, Path("campaign"))
+terminal.show(campaign_report.of(summaries.read(summaries.Campaign, found)), Path("campaign"))
 
 # %% [markdown]
 # The fan shows where 50, 90 and 99.7 % of a thousand trials lie at each time, with the run of the largest window error;

@@ -152,7 +152,7 @@ def test_interrupted_it_keeps_what_is_flown(folder, whole):
     run.send_signal(signal.SIGINT)
     code, error = ended(run)
     assert code == 130
-    assert "interrupted; the same command goes on from here" in error
+    assert "interrupted; the same command resumes it" in error
     assert "Traceback" not in error
     done = parts(folder)
     assert 2 <= len(done) < PARTS

@@ -493,7 +493,7 @@ def test_a_campaign_is_not_finished_before_its_margins_are_judged(command, tmp_p
     (folder / "floor.json").unlink() if left is None else (folder / "floor.json").write_text(left)
     code, said, _ = command("summarize", folder, "--no-figures")
     assert code == 1
-    assert said.startswith("NOT finished: gain_margin is asked for and not judged yet; ")
+    assert "NOT finished: gain_margin is required and not judged yet; " in said
     assert json.loads((folder / "summary.json").read_text())["status"] == "unfinished"
     assert command(*again, "--quiet") == (0, "", "")
     assert (folder / "floor.json").read_text() == whole

@@ -12,7 +12,8 @@ from ptsmc_jax import scenario as scenarios
 from ptsmc_jax.campaigns import campaign, plans
 from ptsmc_jax.dispersions.quantities import CATEGORIES
 from ptsmc_jax.numerics import statistics
-from tuning.output import campaign_sentences, campaign_terminal
+from tests.output import examples
+from tuning.output import campaign_report, trials_report
 from tuning.studies import campaign_folder, campaign_summary, reasons
 
 
@@ -30,7 +31,7 @@ class Rows:
         return [self]
 
 
-def test_each_input_of_a_worst_trial_is_a_percentile_beside_the_median(monkeypatch, capsys):
+def test_each_input_of_a_worst_trial_is_a_percentile_beside_the_median(monkeypatch):
     angle = np.linspace(0.0, 2.0, 401)
     rate = np.random.default_rng(0).permutation(401) / 400.0
     table = pl.DataFrame({
@@ -47,14 +48,13 @@ def test_each_input_of_a_worst_trial_is_a_percentile_beside_the_median(monkeypat
                        "rank_correlation": pytest.approx(1.0, rel=1e-12),
                        "first_order": pytest.approx(1.0, abs=0.05), "trials": 401}  # fmt: skip
     assert told[1]["percentile"] == 100.0 * np.mean(rate <= rate[400])
-    campaign_terminal.why(told, "spacecraft")
-    (said,) = capsys.readouterr().out.splitlines()
+    (said,) = trials_report.why(told, "spacecraft")
     assert (
         said == "peak_torque 4 N m in trial 400: initial_angle 2 rad at 100.0 % (median 1)"
     )  # the rate is drawn apart from it
     table = table.with_columns(peak_torque=np.random.default_rng(5).permutation(401) / 50.0)
-    campaign_terminal.why(why(Rows(), ["peak_torque"], 1), "spacecraft")
-    assert "goes with nothing that was drawn" in capsys.readouterr().out
+    (said,) = trials_report.why(why(Rows(), ["peak_torque"], 1), "spacecraft")
+    assert said.endswith("no sampled input explains it; sensor noise remains")
     # of the number of a wheel none is more: what fails is one of four, here the second, whose number is no middle
     wheel = np.arange(401) % 4 + 1.0
     table = table.with_columns(peak_torque=(wheel == 2.0) + 1e-3 * rate, wheel_failure_wheel=wheel)
@@ -63,17 +63,16 @@ def test_each_input_of_a_worst_trial_is_a_percentile_beside_the_median(monkeypat
     assert (one["percentile"], one["median"], one["share"]) == (None, None, pytest.approx(100 / 401))
     assert one["rank_correlation"] is None
     assert one["first_order"] > 0.5
-    campaign_terminal.why(told, "spacecraft")
-    assert "wheel_failure_wheel 2 as in 24.9 % of the trials" in capsys.readouterr().out
+    assert "wheel_failure_wheel 2 as in 24.9 % of the trials" in "".join(trials_report.why(told, "spacecraft"))
     drivers = {"peak_torque": statistics.drivers({"wheel_failure_wheel": wheel, "initial_w1": rate},
                                                  table["peak_torque"].to_numpy(), categories=CATEGORIES)}  # fmt: skip
-    summary = {"verdicts": [{"metric": "peak_torque"}], "drivers": drivers, "flown": 401}
-    (said,) = campaign_sentences.drivers(summary)
-    assert ", wheel_failure_wheel (56 %): rank correlation" in said
+    found = examples.campaign(verdicts=[examples.torque(0.9)], drivers=drivers, driver_trials={"peak_torque": 401})
+    (said,) = campaign_report.drivers(found)
+    assert "wheel_failure_wheel (56 % of the variance of the ranks)" in said
     table = table.with_columns(status=pl.Series(["diverged"] + ["ok"] * 400))
     told = why(Rows(), ["peak_torque"], 1)
-    campaign_terminal.why(told, "spacecraft")  # of one that failed: what is unusual in it
-    assert "wheel_failure_wheel 1 as in 25.2 % of the trials" in capsys.readouterr().out
+    # the unusual inputs of a trial that failed
+    assert "wheel_failure_wheel 1 as in 25.2 % of the trials" in "".join(trials_report.why(told, "spacecraft"))
     # a run that failed has metrics until then, which say nothing of what drives those of a whole run
     cut = np.where(np.arange(401) % 3 == 0, 1e3 * (1.0 - rate), table["peak_torque"].to_numpy())
     table = table.with_columns(
@@ -103,16 +102,16 @@ def test_whatever_is_drawn_may_be_a_reason(monkeypatch):
     assert inspect.unwrap(campaign_summary.drawn_columns)(folder, [None]) == columns
 
 
-def test_what_chance_shows_among_the_few_trials_that_have_a_metric_is_no_reason(capsys):
+def test_what_chance_shows_among_the_few_trials_that_have_a_metric_is_no_reason():
     """A correlation of 0.15 is nothing among 200 of 10 000 trials, as many as settle, say."""
     told = [{"metric": "settling_time", "trial": 3, "value": 1.0, "input": "initial_w1", "drawn": 2.0, "unit": "rad/s",
              "percentile": 70.0, "median": 1.0, "share": None, "rank_correlation": 0.15, "first_order": 0.06,
              "trials": 200}]  # fmt: skip
-    campaign_terminal.why(told, "spacecraft")
-    assert "goes with nothing that was drawn" in capsys.readouterr().out
+    (said,) = trials_report.why(told, "spacecraft")
+    assert said.endswith("no sampled input explains it; sensor noise remains")
 
 
-def test_of_a_trial_that_failed_the_four_most_unusual_inputs_are_told(capsys):
+def test_of_a_trial_that_failed_the_four_most_unusual_inputs_are_told():
     """By how many percent of the trials they are from the middle, or half of the share that has another number."""
     alike: dict[str, Any] = {"metric": "effort", "trial": 3, "value": None, "drawn": 2.0, "unit": "",
                              "rank_correlation": None, "first_order": None}  # fmt: skip
@@ -122,8 +121,7 @@ def test_of_a_trial_that_failed_the_four_most_unusual_inputs_are_told(capsys):
         *({**alike, "input": name, "percentile": at, "median": 1.0, "share": None} for name, at in ranked.items()),
         *({**alike, "input": name, "percentile": None, "median": None, "share": at} for name, at in shared.items()),
     ]
-    campaign_terminal.why(told, "spacecraft")
-    (said,) = capsys.readouterr().out.splitlines()
+    (said,) = trials_report.why(told, "spacecraft")
     assert said.startswith("no effort in trial 3: ")
     named = [part.split()[0] for part in said.split(": ")[1].split(", ")]
     assert named == ["initial_w2", "wheel_failure_wheel", "initial_angle", "own_1"]

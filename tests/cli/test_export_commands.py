@@ -101,7 +101,7 @@ def test_a_campaign_flies_the_controller_and_keeps_it(command, tmp_path):
         command, tmp_path, *replay
     )
     code, out, err = command(*replay, "--trust")
-    assert (code, "equal to its row, to the last digit" in out, "same flight to round-off" in out) == (0, True, True)
+    assert (code, "equals its row to the last digit" in out, "same run up to round-off" in out) == (0, True, True)
     assert err == f"ptsmc: runs {tmp_path / 'r' / 'controller'}, which --controller of r names\n"
     assert command("summarize", "r", "--no-figures", "--quiet")[0] == 0  # runs nothing, and knows it still
     assert json.loads((tmp_path / "r" / "summary.json").read_text()) == told
@@ -122,9 +122,9 @@ def test_a_campaign_flies_the_controller_and_keeps_it(command, tmp_path):
         (CONTINUOUS, (), "loop.mode is \"continuous\", but must be"),
         (SHORT + "[wheels]\n[dispersion.wheel_failure]\nkind = 'uniform'\nlatest = 3.0\nknown = true\n", (),
          "dispersion.wheel_failure.known is true, but must be false to be exported"),
-        (SHORT, ("--trials", "0"), "--trials is 0, but must be a whole number from 1 to 100"),
-        (SHORT, ("--trials", "101"), "--trials is 101, but must be a whole number from 1 to 100"),
-        (SHORT, ("--seed", "-1"), "--seed is -1, but must be a whole number"),
+        (SHORT, ("--trials", "0"), 'Invalid value "0" for --trials. Must be >= 1.'),
+        (SHORT, ("--trials", "101"), 'Invalid value "101" for --trials. Must be <= 100.'),
+        (SHORT, ("--seed", "-1"), 'Invalid value "-1" for --seed. Must be >= 0.'),
     ],
 )  # fmt: skip
 def test_export_refuses_in_one_sentence(command, tmp_path, text, args, said):

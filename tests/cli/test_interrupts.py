@@ -1,7 +1,7 @@
-"""Ctrl-C where it came to nothing, or was told wrongly."""
+"""Ctrl-C: one ends a command cleanly and loses nothing, a second one kills it."""
 
-import importlib
 import math
+import signal
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -13,8 +13,10 @@ from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.scenario import parsing
 from tests.helpers import ROOT, SHORT_CHAIN, tree
-from tuning.cli import options, searches
+from tuning.cli import searches
+from tuning.output.report import Report
 
+EMPTY = Report("", "calm", [])
 IMPORTING = """
 import sys
 
@@ -26,15 +28,41 @@ sys.meta_path.insert(0, Interrupted())
 from tuning.cli import command
 command()
 """
+WORKING = """
+import os, signal
+from tuning.cli import command, main
+
+def working(*_, **__):
+    try:
+        os.kill(os.getpid(), signal.SIGINT)
+    finally:
+        print("saved", flush=True)
+        if TWICE:
+            os.kill(os.getpid(), signal.SIGINT)
+        print("done", flush=True)
+
+main.app = working
+command()
+"""
 
 
-def test_a_ctrl_c_while_a_command_imports_what_it_needs_ends_it_in_one_sentence():
+def test_ctrl_c_during_imports_ends_the_command_in_one_sentence():
     done = subprocess.run([sys.executable, "-c", IMPORTING], capture_output=True, text=True, cwd=ROOT, check=False)
-    assert (done.returncode, done.stderr) == (130, "ptsmc: interrupted; nothing was written\n")
+    assert (done.returncode, done.stderr) == (130, "ptsmc: interrupted\n")
+
+
+@pytest.mark.parametrize(("twice", "status", "out", "error"), [
+    (False, 130, "saved\ndone\n", "ptsmc: interrupted; nothing was written\n"),
+    (True, -signal.SIGINT, "saved\n", ""),
+])  # fmt: skip
+def test_first_ctrl_c_ends_the_command_and_a_second_kills_it(twice, status, out, error):
+    program = WORKING.replace("TWICE", str(twice))
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=ROOT, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (status, out, error)
 
 
 @pytest.mark.parametrize(("force", "same"), [(False, "the same command"), (True, "the same command without --force")])
-def test_a_search_interrupted_while_its_results_are_written_goes_on(tmp_path, capsys, force, same):
+def test_a_search_interrupted_while_its_results_are_written_goes_on(tmp_path, force, same):
     def stopped(making, outcome):
         (making / "summary.json").write_text(outcome.status)
         raise KeyboardInterrupt
@@ -46,19 +74,17 @@ def test_a_search_interrupted_while_its_results_are_written_goes_on(tmp_path, ca
         work=lambda report, journal: SimpleNamespace(status=journal.get(b"asked", lambda: {}) or "met"),
         write=stopped,
         summary=lambda _: {},
-        show=lambda *_: pytest.fail("there is nothing to show"),
+        report=lambda _: pytest.fail("there is nothing to show"),
     )
     loaded = scenario.read(tmp_path / "s.toml")
-    assert searches.run(search, loaded, tmp_path / "out", force=force, quiet=True) == 130
-    assert capsys.readouterr().err == f"ptsmc: interrupted; {same} goes on from here\n"
+    with pytest.raises(KeyboardInterrupt, match=f"^{same} resumes it$"):
+        searches.run(search, loaded, tmp_path / "out", force=force, quiet=True)
     assert set(tree(tmp_path / "out")) == {"journal.bin", "scenario.toml", "versions.json"}
 
 
-@pytest.mark.parametrize(
-    ("force", "told"), [(False, ""), (True, "ptsmc: interrupted; the same command without --force")]
-)
-def test_a_search_that_leaves_its_best_where_it_is_interrupted_goes_on_without_force(tmp_path, capsys, force, told):
-    """What is shown says that the same command goes on, which with --force would begin anew."""
+@pytest.mark.parametrize(("force", "same"), [(False, "the same command"), (True, "the same command without --force")])
+def test_interrupted_search_that_wrote_its_best_gains_resumes_without_force(tmp_path, capsys, force, same):
+    """With --force, the same command would start again."""
     (tmp_path / "s.toml").write_text(SHORT_CHAIN)
     shown = []
 
@@ -71,11 +97,11 @@ def test_a_search_that_leaves_its_best_where_it_is_interrupted_goes_on_without_f
         work=lambda report, journal: SimpleNamespace(status="interrupted"),
         write=write,
         summary=lambda outcome: {"status": outcome.status},
-        show=lambda summary, folder, how: shown.append((summary["status"], how)),
+        report=lambda summary: shown.append(summary["status"]) or EMPTY,
     )
     assert searches.run(search, scenario.read(tmp_path / "s.toml"), tmp_path / "out", force=force, quiet=False) == 130
-    assert shown == [("interrupted", "interrupted")]
-    assert capsys.readouterr().err == (f"{told} goes on from here\n" if told else "")
+    assert shown == ["interrupted"]
+    assert capsys.readouterr().err == f"ptsmc: interrupted; {same} resumes it\n"
     assert {"journal.bin", "summary.json"} <= set(tree(tmp_path / "out"))
 
 
@@ -90,7 +116,7 @@ def test_a_search_is_shown_as_it_is_when_it_is_read_again(tmp_path):
         work=lambda report, journal: SimpleNamespace(status="not met"),
         write=lambda making, _: store.record(making, parsing.dump(loaded), search.known_by, said),
         summary=lambda _: said,
-        show=lambda summary, folder, how: shown.append(summary),
+        report=lambda summary: shown.append(summary) or EMPTY,
     )
     for _ in range(2):
         assert searches.run(search, loaded, tmp_path / "out", force=False, quiet=False) == 1
@@ -109,7 +135,7 @@ def test_a_search_by_another_version_of_the_code_does_not_resume(tmp_path, capsy
             making, parsing.dump(loaded), search.known_by, {"status": outcome.status}
         ),
         summary=lambda outcome: {"status": outcome.status},
-        show=lambda *_: None,
+        report=lambda _: EMPTY,
     )
 
     def run(**force):
@@ -129,53 +155,3 @@ def test_a_search_by_another_version_of_the_code_does_not_resume(tmp_path, capsy
     run(force=True)
     assert len(asked) == 2
     assert store.read_versions(folder)["code_checksum"] != "before"
-
-
-TWICE = """
-import builtins
-from tuning.cli import main
-
-told = builtins.print
-
-def first(*_, **__):
-    builtins.print = told
-    raise KeyboardInterrupt
-
-def working(*_, **__):
-    builtins.print = first  # polars raises a Ctrl-C, and Python the same one once more in what answers it
-    raise KeyboardInterrupt
-
-main.app = working
-main.main()
-"""
-WHILE_IMPORTED = """
-from tuning.cli import main
-
-def working(*_, **__):
-    raise ImportError("initialization failed") from KeyboardInterrupt()  # as pybind11 does
-
-main.app = working
-main.main()
-"""
-
-
-@pytest.mark.parametrize("program", [TWICE, WHILE_IMPORTED])
-def test_a_ctrl_c_that_comes_twice_or_as_another_error_ends_the_command_in_one_sentence(program):
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=ROOT, check=False)
-    assert (done.returncode, done.stderr) == (130, "ptsmc: interrupted; nothing was written\n")
-
-
-def test_a_ctrl_c_that_comes_once_more_while_it_is_answered_is_answered():
-    times = iter([KeyboardInterrupt])
-
-    def answer():
-        for error in times:
-            raise error
-        return 130
-
-    def work():
-        raise KeyboardInterrupt
-
-    assert options.answered(work, answer) == 130
-    with pytest.raises(ImportError, match="no such"):
-        options.answered(lambda: importlib.import_module("no such"), answer)

@@ -12,8 +12,9 @@ from ptsmc_jax.numerics import statistics
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.catalogues import percent
 from tests.helpers import short
+from tests.output import examples
 from tests.output.pages import checked
-from tuning.output import pointing_sentences
+from tuning.output import formats, pointing_report, summaries
 
 ASKED = """
 [pointing]
@@ -92,19 +93,19 @@ def test_pointing_is_asked_for_shown_and_told(flown, tmp_path):
     assert set(budget) == {"ape", "mpe", "rpe", "pde", "ake", "mke", "rke"}
     assert budget["ape"]["x"] is None  # 150 runs show nothing of 99.73 %
     for place in (said, checked(tmp_path / FOLDER).text):
-        assert "pointing from 0.5 s after t_f to t_end, boresight 1, 0, 0" in place
-        assert "1109 runs without a failure show a value, and 852 with 90 % confidence" in place
+        assert "from 0.5 s after t_f to t_end, with 95 % confidence; boresight 1, 0, 0" in place
+        assert "an angle is - without 1109 runs that all reach their end (852 for 90 % confidence)" in place
         assert "ape_boresight at most 0.01 rad (0.573 deg) in 50 % of the time of all runs" in place
-    table = pointing_sentences.compliance(found)
+    table = pointing_report.compliance(summaries.read(summaries.Campaign, found))
     assert table is not None
     assert [row[:7] for row in table.rows] == [
         ("RPE", "half-cone", "1.15 deg", "90 %", "ensemble", "90 %",
-         pointing_sentences.angle(ensemble["margin"] * 0.02)),
+         formats.angle(ensemble["margin"] * 0.02)),
         ("APE", "half-cone", "2063 arcsec", "50 %", "mixed", "90 %", f"{percent(mixed['shown'])} % of the time"),
-        ("AKE", "x", "20.6 arcsec", "99.73 %", "temporal", "none asked",
+        ("AKE", "x", "20.6 arcsec", "99.73 %", "temporal", "not required",
          f"{percent(temporal['shown'])} % of the time"),
     ]  # fmt: skip
-    assert [row[9] for row in table.rows] == ["22", "4", "every run flown"]  # 0.9^22 <= 0.1
+    assert [row[9] for row in table.rows] == ["22", "4", "every run"]  # 0.9^22 <= 0.1
 
 
 def test_the_worst_share_of_time_is_the_smallest(command, flown, tmp_path):
@@ -118,7 +119,7 @@ def test_the_worst_share_of_time_is_the_smallest(command, flown, tmp_path):
     assert "0.9973" not in told
     assert "within_ape_boresight" not in said.split("99.73 % reach")[0]  # but below it, beside the smallest
     assert f"{ordered[0]:.3g}" in said.split("99.73 % reach")[1]
-    assert "Shares of time within a limit, of which more is better" in checked(tmp_path / FOLDER).text
+    assert "Fractions of the time within a limit, larger is better" in checked(tmp_path / FOLDER).text
 
     assert command("worst", FOLDER, "--by", "within_ape_boresight", "-n", 3, "--why")[0] == 0
     assert pl.read_csv(tmp_path / FOLDER / "worst.csv")["within_ape_boresight"].to_list() == list(ordered[:3])
@@ -141,22 +142,22 @@ def test_a_budget_is_the_order_statistic_that_shows_it(monkeypatch, flown):
     ordered = np.sort(rows["mpe_y"].to_numpy())
     least = next(k for k in range(1, 151) if statistics.share_bound(k, 150, 0.95) >= 0.9)
     assert again["mpe"]["y"] == ordered[least - 1]
-    assert pointing_sentences.angle(again["mpe"]["y"]) in str(
-        pointing_sentences.budget({**found, "pointing": {**found["pointing"], "budget": again}})
-    )
+    read = summaries.read(summaries.Campaign, {**found, "pointing": {**found["pointing"], "budget": again}})
+    assert formats.angle(again["mpe"]["y"]) in str(pointing_report.budget(read))
 
 
 @pytest.mark.parametrize(("flown", "ok", "missed", "said"), [
-    (2000, 2000, 0, "1109 runs without a failure show a value, and 852 with 90 % confidence"),
-    (1108, 1098, 0, "1109 runs without a failure show a value"),  # too few for 95 %, whether or not some fail
-    (1109, 1099, 0, "10 runs that were not flown to the end are beyond every angle"),
-    (1109, 1049, 50, "10 runs that were not flown to the end are beyond every angle"),  # who misses has angles
+    (2000, 2000, 0, "without 1109 runs that all reach their end (852 for 90 % confidence)"),
+    (1108, 1098, 0, "without 1109 runs that all reach their end"),  # too few for 95 %, whether or not some fail
+    (1109, 1099, 0, "because 10 runs did not reach their end"),
+    (1109, 1049, 50, "because 10 runs did not reach their end"),  # a run that misses t_f has angles
 ])  # fmt: skip
 def test_why_a_budget_has_no_value_is_said(flown, ok, missed, said):
-    told = {"after": 0.0, "boresight": [1.0, 0.0, 0.0], "probability": 0.9973, "confidence": 0.95,
+    told = {"after": 0.0, "boresight": [1.0, 0.0, 0.0], "probability": 0.9973, "confidence": 0.95, "window": 1.0,
             "budget": {"ape": {"x": None}}}  # fmt: skip
-    *_, last = pointing_sentences.heading({"pointing": told, "flown": flown, "counts": {"ok": ok, "missed": missed}})
-    assert last.startswith(f"where the budget has -, {said}")
+    found = examples.campaign(pointing=told, flown=flown, counts={"ok": ok, "missed": missed})
+    *_, last = pointing_report.heading(found)
+    assert last.startswith(f"an angle is - {said}")
 
 
 def test_a_single_run_knows_the_indices(command, flown, tmp_path):

@@ -13,9 +13,11 @@ import pytest
 
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.simulation import catalogues
+from ptsmc_jax.simulation.requirements import Requirement
 from tests.helpers import SHORT_CHAIN, short, tree
+from tests.output import examples
 from tests.output.pages import Page, checked
-from tuning.output import page, page_charts
+from tuning.output import page, page_charts, report
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 HOSTILE = "<img src=x onerror=document.title=1>\"'&</script><script>alert(1)</script>"
@@ -93,13 +95,14 @@ def test_the_body_turns_as_it_flew(flown):
 
 
 @pytest.mark.parametrize(("status", "mood", "said"), [
-    ("ok", "good", "Every requirement is met"),
-    ("missed", "bad", "The run failed: missed"),
-    ("diverged", "bad", "The run failed: diverged"),
+    ("ok", "good", "every requirement is met"),
+    ("missed", "bad", "the run failed: missed"),
+    ("diverged", "bad", "the run failed: diverged"),
 ])  # fmt: skip
 def test_the_verdict_comes_first(flown, status, mood, said):
     summary = json.loads((flown / "summary.json").read_text())
-    summary.update(status=status, reason="", verdicts={"peak_torque": {"limit": 30.0, "margin": 0.5, "met": True}})
+    verdict = {**summary["verdicts"]["peak_torque"], "limit": 30.0, "margin": 0.5, "met": True}
+    summary.update(status=status, reason="", verdicts={"peak_torque": verdict})
     (flown / "summary.json").write_text(json.dumps(summary))
     read = checked(flown)
     (header,) = [attrs for tag, attrs in read.found if tag == "header"]
@@ -108,7 +111,7 @@ def test_the_verdict_comes_first(flown, status, mood, said):
     (bar,) = [float(attrs["width"]) for tag, attrs in read.found if tag == "rect" and attrs["class"] != "all"]
     assert bar == 150.0  # of a limit at 300
     assert "50 % of the limit" in read.text
-    summary["verdicts"]["peak_torque"] = {"limit": 0.01, "margin": None, "met": False}
+    summary["verdicts"]["peak_torque"] |= {"limit": 0.01, "margin": None, "met": False}
     (flown / "summary.json").write_text(json.dumps(summary))
     assert [attrs["class"] for tag, attrs in checked(flown).found if tag == "header"] == ["bad"]
 
@@ -118,7 +121,8 @@ def test_the_verdict_comes_first(flown, status, mood, said):
     ("diverged", False, "bad"), ("not met", False, "bad"), ("interrupted", True, "bad"),
 ])  # fmt: skip
 def test_what_failed_looks_bad_whether_or_not_anything_was_asked(status, asked, mood):
-    assert page._verdict({"status": status}, [], asked).mood == mood
+    verdicts = [examples.entry(Requirement("peak_torque", 0.5).verdict(np.zeros(2), np.ones(2, bool)))]
+    assert report.headline(status, verdicts if asked else [])[1] == mood
 
 
 def hostile_folder(flown):
@@ -228,8 +232,10 @@ def test_what_is_no_result_is_refused(command, flown, tmp_path):
     for name, content, said in (
         ("summary.json", None, "run holds a simulate that is not finished; run the same command to its end"),
         ("summary.json", "{", "run holds a file that cannot be read: "),
-        ("summary.json", "{}", "run lacks 'verdicts', as results of another version do (0.1.0); make it again"),
-        ("versions.json", "[]", "run holds no result; allowed is a folder that a ptsmc command left"),
+        ("summary.json", "{}", "run holds a summary of another version (0.1.0): 'verdicts'; make it again"),
+        ("summary.json", '{"verdicts": 1}', "run holds a summary of another version (0.1.0): "),
+        ("summary.json", '{"verdicts": {}}', "run holds a summary of another version (0.1.0): "),
+        ("versions.json", "[]", "run holds no result; allowed is a folder that a ptsmc command wrote"),
         ("versions.json", '{"command": ["x"]}', "run holds no result"),
         ("scenario.toml", "a = [", "run holds a file that cannot be read: "),
         ("trajectory.csv", None, "run holds a simulate that is not finished"),

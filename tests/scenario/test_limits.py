@@ -12,7 +12,8 @@ from ptsmc_jax.scenario import parsing
 from ptsmc_jax.scenario.tables import Limit
 from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.requirements import Requirement, over
-from tuning.output import page
+from tests.output import examples
+from tuning.output import report
 from tuning.search import objective
 
 SAMPLED = {"mode": "sampled"}
@@ -88,15 +89,16 @@ def test_a_limit_of_zero_is_kept_by_zero_alone():
     np.testing.assert_array_equal(c, [[-1.0, -1.0]])  # no limit of the actuators: nothing saturates
 
 
-def test_a_page_says_the_share_of_what_decides():
-    """Of a share of the trials the one that decides, not the worst: of 0.3, 0.4, 0.45 and 0.7 the third."""
+def test_report_states_the_deciding_value_relative_to_the_limit():
+    """For a fraction of the trials this is not the worst one: of 0.3, 0.4, 0.45 and 0.7 the third."""
     values = np.array([0.3, 0.4, 0.45, 0.7])
 
     def told(quantile):
         one = Requirement("peak_torque", 0.5, quantile=quantile).verdict(values, np.ones(4, bool))
-        return page._distance({name: getattr(one, name) for name in one.__dataclass_fields__})
+        return report.distance(examples.entry(one))
 
-    assert told(0.75) == "; the trial that decides is at 0.45, 90 % of the limit"
-    assert told(None) == "; the worst is 140 % of the limit"
-    of_time = {"margin": 0.2, "limit": 0.02, "quantile": 0.9, "trials": 50, "share_of_time": 0.98}
-    assert page._distance(of_time) == "; beyond the limit for 20 % of the time that it may be"
+    assert told(0.75) == "; 90 % of the limit"
+    assert told(None) == "; 140 % of the limit"
+    timed = Requirement("ape_x", 0.02, quantile=0.9, interpretation="temporal")
+    of_time = timed.verdict(np.full(50, 0.03), np.ones(50, bool), np.full(50, 0.98))
+    assert report.distance(examples.entry(of_time)) == "; 20 % of the time allowed beyond the limit"

@@ -132,7 +132,7 @@ def test_replay_says_what_it_would_run_and_runs_it_with_trust_only(command, flow
     assert not ran(home)
     assert not (flown / "replay").exists()
     code, out, error = command("replay", FOLDER, "--trial", 3, "--no-figures", "--trust")
-    assert (code, "equal to its row" in out) == (0, True)
+    assert (code, "equals its row" in out) == (0, True)
     assert f"ptsmc: runs {home}/my.py, which plant.system and --metrics of {FOLDER} name\n" in error
     assert ran(home)
 

@@ -20,7 +20,6 @@ from ptsmc_jax.simulation.requirements import Requirement
 from ptsmc_jax.theory import envelopes
 from tests import helpers
 from tests.helpers import chain_parts, parts, random_turns, vector
-from tuning.output import search_sentences
 from tuning.search import (
     cma_es,
     confirm,
@@ -619,53 +618,3 @@ def test_the_shortest_t_f_for_a_torque_limit_is_the_one_theory_names(plant, monk
     np.testing.assert_allclose(found.gains[0], expected * (1 + rounds.SURE_MARGIN / 2), rtol=2e-4)
     np.testing.assert_allclose(found.value, found.gains[0], rtol=1e-9)
     assert found.worst[0] <= 1.0
-
-
-@pytest.mark.parametrize(
-    ("ratio", "said"),
-    [
-        (1.234, "with the best compromise effort reaches 1.23 times its limit"),
-        (None, "with the best compromise 2 of 8 training trials do not arrive (2 diverged), and so keep no limit"),
-        (np.inf, "with the best compromise 2 of 8 training trials do not arrive"),
-    ],
-)
-def test_a_sentence_says_by_how_much_the_best_gains_break_a_limit(ratio, said):
-    """A failed trial is infinite in a result, and absent from the file that it is read from."""
-    found = {"largest_over_limit": {"peak_torque": 0.97, "effort": ratio}, "worst_case": False}
-    training = {"trials": 8, "counts": {"ok": 6, "diverged": 2}}
-    first, second = search_sentences.search({"search": found, "verdicts": [], "training": training})
-    assert first == "the search found no gains that meet every requirement"
-    assert said in second
-
-
-TORQUE = {"metric": "peak_torque", "limit": 0.5, "unit": "N m"}
-MARGIN = {"metric": "gain_margin", "limit": 6.0, "unit": "dB", "at_least": True}
-
-
-@pytest.mark.parametrize(
-    ("conflict", "lines"),
-    [
-        ({"peak_torque": 1.3}, ["if peak_torque alone gives way, its limit must be 0.65 N m instead of 0.5"]),
-        ({"gain_margin": 1.25}, ["if gain_margin alone gives way, its limit must be 4.5 dB instead of 6"]),
-        ({"gain_margin": 2.5}, ["gain_margin alone cannot give way far enough: the loop would be unstable"]),
-        ({"peak_torque": 0.98}, ["peak_torque can be met, but only if another requirement gives way"]),
-        (
-            {"peak_torque": 1.3, "gain_margin": None},
-            [
-                "peak_torque and gain_margin conflict: the gains that improve one of them worsen another",
-                "if peak_torque alone gives way, its limit must be 0.65 N m instead of 0.5",
-                "no value of gain_margin alone resolves the conflict: the other requirements cannot be met either",
-                "if all of them give way together, each must by 12 % of its limit",
-            ],
-        ),
-    ],
-)
-def test_sentences_name_the_conflicting_limits_and_the_values_that_resolve_the_conflict(conflict, lines):
-    found = {
-        "largest_over_limit": {"peak_torque": 1.12, "gain_margin": 1.119},
-        "conflict": conflict,
-        "searched_globally": True,
-    }
-    told = [*search_sentences.search({"search": found, "verdicts": [TORQUE, MARGIN], "training": {}})]
-    assert told[0] == "the search found no gains that meet every requirement, nor did a global search"
-    assert told[3:] == lines

@@ -23,10 +23,12 @@ from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.metrics import Metrics
 from ptsmc_jax.simulation.requirements import Requirement
 from tests.helpers import FIRST_FLIGHT, ROOT, SHORT, short, small_search
+from tests.output import examples
 from tests.output.pages import checked
 from tuning.cli import options
 from tuning.errors import UsageError
-from tuning.output import law_sentences, page
+from tuning.output import compare_report, page, summaries
+from tuning.output.formats import ratio
 from tuning.search import gains, own_parts
 from tuning.studies import compare, judging, stability, tuner
 
@@ -182,18 +184,19 @@ def test_the_command(command, tmp_path, monkeypatch, others):
                 assert getattr(again.controller, name) == pytest.approx(value, rel=1e-9)
     read = checked(folder)
     assert read.text.startswith("ptsmc compare: compare-s")
-    assert f"{found['laws'][laws[-1]]['window_error']:.2e}" in read.text
+    error = found["laws"][laws[-1]]["window_error"]
+    assert ratio(np.degrees(2 * np.arcsin(error)) * 3600) in read.text
     code, again, _ = command("compare", "s.toml")
-    assert "already done" in again
+    assert "from an earlier run" in again
     assert command("compare", "s.toml", "--seed", "x")[0] == 2
 
 
-@pytest.mark.parametrize(("least", "said"), [(2e-6, "2 times that"), (0.0, "4.00e-06")])
+@pytest.mark.parametrize(("least", "said"), [(2e-6, "2 times as much"), (0.0, "1.65 arcsec")])
 def test_how_far_the_papers_law_is_behind_one_that_leaves_no_error_is_said_by_its_own(least, said):
     """A quotient by zero broke off after all laws were tuned."""
-    laws = {"pd": {"window_error": least, "met": True}, "prescribed_time": {"window_error": 4e-6, "met": True}}
-    assert law_sentences.winner({"laws": laws}).endswith(f"; prescribed time has {said}")
-    assert law_sentences.alike({"trials": 1, "judged_on": "flight clock"}).endswith("on 1 fresh trial, flight clock")
+    errors = {"pd": least, "prescribed_time": 4e-6}
+    laws = examples.compare({name: examples.law(window_error=error) for name, error in errors.items()}).laws
+    assert compare_report.winner(laws).endswith(f"; prescribed time has {said}")
 
 
 def test_laws_are_flown_once_more_with_what_they_are_not_told_of(eight):
@@ -238,17 +241,18 @@ def test_every_law_has_a_row_an_interval_and_a_point_of_its_own(eight, tmp_path)
         assert (float(row["window_error_low"]), float(row["window_error_high"])) == (low, high)
         assert (row["gain_margin"], row["delay_margin"], row["window_error_later"]) == ("7.5", "", "")
         assert row["window_error_heavier"] == row["window_error"]
-    answers = law_sentences.answers(said)
-    assert len(answers) == len(law_sentences.QUESTIONS)
+    laws = summaries.read(summaries.Compare, said).laws
+    answers = [(question, compare_report.table(question, laws)) for question in compare_report.QUESTIONS]
     read = checked(tmp_path / "out")
     # of the scenario's own law all gains were said to be free, whatever tune.free says
-    assert "alike in all of its gains, the scenario's own in those of tune.free where that is given," in read.text
-    for k, answer in enumerate(answers):
-        assert [row[0] for row in answer.table.rows] == [name.replace("_", " ") for name in names]
-        assert answer.title in read.text
+    assert "tuned each law in all of its gains, the scenario's own law in those of tune.free" in read.text
+    for k, (question, table) in enumerate(answers):
+        assert [row[0] for row in table.rows] == [name.replace("_", " ") for name in names]
+        assert question.title in read.text
         for series in read.charts[f"question_{k}"]["data"]:
             assert series["y"] == [name.replace("_", " ") for name in names]
-    assert answers[0].table.rows[3][2] == f"{low:.2e} to {high:.2e}"
+    arcsec = [ratio(np.degrees(2 * np.arcsin(bound)) * 3600) for bound in (low, high)]
+    assert answers[0][1].rows[3][2] == f"{arcsec[0]} to {arcsec[1]}"
     figures = dict(compare._figures(found))
     drawn = [line for line in figures["settling"].axes[0].lines if line.get_marker() in study_plots.MARKERS]
     looks = {(line.get_color(), line.get_marker()) for line in drawn}
@@ -392,12 +396,16 @@ def test_what_a_rival_cannot_fly_is_refused_before_any_search(monkeypatch, eight
     assert not asked
 
 
+def lines_of(summary):
+    return list(compare_report.lines(summaries.read(summaries.Compare, summary)))
+
+
 @pytest.mark.parametrize(("period", "scaled"), [(0.05, False), (0.2, True)])
 def test_gains_that_the_paper_does_not_give_are_said_to_be_scaled(eight, period, scaled):
     """Its delta of 0.05 s is shorter than a period of 0.2 s."""
     flown = gains.papers(scenario.from_tables({"loop": {"mode": "sampled", "period": period}}))
     made = {compare.PAPER: replace(contender(eight), flown=flown), compare.OURS: contender(eight)}
-    lines = list(law_sentences.lines(compare.summary(compare.Comparison(made, 0, False))))
+    lines = lines_of(compare.summary(compare.Comparison(made, 0, False)))
     assert any(line.startswith("gains of paper, scaled to this body and period: ") for line in lines) == scaled
     assert any(line.startswith("gains of paper: ") for line in lines) != scaled
 
@@ -419,17 +427,18 @@ def test_margins_that_are_asked_for_stand_beside_what_is_flown(eight, tmp_path):
     assert [row["gain_margin"] for row in rows] == ["5.04", "nan"]
     assert [row["delay_margin"] for row in rows] == ["inf", "0.2"]
     for said in (compare.summary(found), json.loads((tmp_path / "out" / "summary.json").read_text())):
-        (table,) = [one.table for one in law_sentences.answers(said) if "margins" in one.title]
+        (question,) = [one for one in compare_report.QUESTIONS if "margins" in one.title]
+        table = compare_report.table(question, summaries.read(summaries.Compare, said).laws)
         assert table.head == ("", "gain [dB]", "delay [s]")
         assert table.rows == [("paper", "5.04", "unlimited"), ("prescribed time", "-", "0.2")]
-        lines = list(law_sentences.lines(said))
+        lines = lines_of(said)
         assert "  gain_margin at least 6 dB: worst of 2 dispersed loops 5.04: NOT met in 1 of 2 loops" in lines
         assert "  gain_margin at least 6 dB: no worst value: NOT met in 1 of 2 loops" in lines
         assert not [line for line in lines if "delay_margin" in line]
     assert "no law meets every requirement" in page.build(tmp_path / "out")
-    assert not [line for line in law_sentences.lines(compare.summary(found)) if "interrupted" in line]
+    assert not [line for line in lines_of(compare.summary(found)) if "interrupted" in line]
     cut_short = compare.summary(replace(found, interrupted=True))
-    assert next(law_sentences.lines(cut_short)).startswith("interrupted while prescribed time was tuned")
+    assert lines_of(cut_short)[0].startswith("interrupted while prescribed time was tuned")
 
 
 def test_a_law_of_ones_own_that_cannot_fly_leaves_no_folder(command, tmp_path):

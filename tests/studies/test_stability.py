@@ -4,7 +4,6 @@ import csv
 import dataclasses
 import json
 import tomllib
-from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -17,7 +16,7 @@ from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.theory import linear, margins, rest, run_margins
 from tests.helpers import SHORT, SHORT_CHAIN, short, untuned
 from tests.theory.loops import held
-from tuning.output import margin_sentences, page
+from tuning.output import margins_report, page, summaries
 from tuning.studies import stability
 
 # on the clock of what is tuned, whose loop is judged by the same program
@@ -40,8 +39,7 @@ def test_margins_leaves_its_table_figures_and_page(command, tmp_path, plant):
     folder = tmp_path / "out" / "margins-s"
     assert status == 0
     assert "gain up  down [dB]" in out
-    assert "the nominal loop is stable in the hold phase" in out
-    assert out.startswith("nominal loop, hold phase")
+    assert out.startswith("The nominal loop is stable: gain ")
     assert {p.name for p in (folder / "figures").iterdir()} == {"nichols.png", "sensitivity.png", "margins.png"}
     found = json.loads((folder / "summary.json").read_text())
     of_axes(tables(folder / "margins.csv"), found, names, seen)
@@ -153,27 +151,24 @@ def test_an_unstable_hold_is_said_and_has_negative_margins(command, tmp_path):
     assert found["worst"]["gain_margin"] < 0.0
 
 
-@pytest.mark.parametrize(("judged", "mood", "said"), [
-    (True, "bad",
-     "The nominal loop is stable in the hold phase, but in the approach phase, with its gains frozen, it is NOT: gain "
-     "-1.9 dB"),
+@pytest.mark.parametrize(("judged", "mood", "headline"), [
+    (True, "bad", "Stable in the hold phase, NOT stable in the approach phase: gain -1.9 dB"),
     (False, "calm", "The nominal loop is stable: gain -1.9 dB"),  # there its margins do not count
 ])  # fmt: skip
-def test_a_loop_that_is_unstable_before_the_hand_over_is_not_called_stable(tmp_path, judged, mood, said):
-    """With a period of half of t_f the page opened with a stable loop of -1.9 dB and -180 deg."""
+def test_loop_that_is_unstable_in_the_approach_phase_is_not_called_stable(judged, mood, headline):
+    """With a period of half of t_f the page began with a stable loop of -1.9 dB and -180 deg."""
     left = dict.fromkeys(("gain_up", "gain_down", "phase", "delay", "modulus"), 6.0)
     summary = {
-        "stable": True, "open": [], "said": None, "hold": {"u1": left}, "together": left, "sensors": {},
-        "before": [{"time_to_go": 1.0, "judged": judged, "stable": False, "open": []}],
+        "stable": True, "open": [], "cut": [], "said": None, "hold": {"u1": left}, "together": left, "sensors": {},
+        "before": [{"time_to_go": 1.0, "judged": judged, "stable": False, "open": [], "cut": []}],
         "worst": {"gain_margin": -1.9, "phase_margin": None, "delay_margin": None, "modulus_margin": None},
     }  # fmt: skip
-    heading, _ = page._margins(page.Result(tmp_path, {}, summary, {}))
-    assert (heading.mood, heading.headline) == (mood, said)
+    report = reported(summary)
+    assert (report.mood, report.headline) == (mood, headline)
 
 
-def test_the_page_opens_with_what_is_left():
-    known = {"gain_margin": 6.1, "phase_margin": 40.0, "delay_margin": 0.05, "modulus_margin": 5.0}
-    assert margin_sentences.left({"worst": known}) == "gain 6.1 dB, phase 40 deg, delay 0.05 s, modulus 5 dB"
+def reported(summary):
+    return margins_report.of(summaries.read(summaries.Margins, summary))
 
 
 def test_margins_need_the_sampled_loop(command, tmp_path):
@@ -187,31 +182,6 @@ def test_margins_need_the_sampled_loop(command, tmp_path):
 def test_inputs_and_sensors_of_other_plants_have_names():
     loaded = scenario.from_tables({"plant": {"kind": "chain", "order": 3}, "loop": {"mode": "sampled"}})
     assert stability.names(scenario.study(loaded)) == (["u1"], ["x1", "x2", "x3"])
-
-
-def test_few_margins_are_warned_of():
-    enough = {"gain_margin": 6.0, "phase_margin": 30.0, "delay_margin": 0.1, "modulus_margin": 5.0, "stable": True}
-    unlimited = {**dict.fromkeys(enough), "phase_margin": 61.0, "modulus_margin": 1.0, "stable": True}
-    few = {**enough, "gain_margin": 5.9, "phase_margin": 0.0, "modulus_margin": 7.0}
-
-    assert not [line for line in margin_sentences.tuned({"hold": enough, "before": unlimited}) if "less than" in line]
-    lines = list(margin_sentences.tuned({"hold": few, "before": enough}))
-    assert lines[:2] == [
-        "nominal loop, hold phase: margins with tuned gains are gain 5.9 dB, phase 0 deg, delay 0.1 s, modulus 7 dB",
-        "nominal loop, hold phase: less than 6 dB of gain and 30 deg of phase; errors of the model may make the loop "
-        "unstable",
-    ]
-    said = list(margin_sentences.tuned({"hold": enough, "before": few}))
-    assert any(line.startswith("nominal loop, approach phase: less than 6 dB of gain") for line in said)
-    lost = {**few, "gain_margin": -1.2, "stable": False}
-    assert "nominal loop, hold phase: NOT stable" in next(margin_sentences.tuned({"hold": lost}))
-    asked = "gains that keep more are found with requirements.gain_margin = 6 and requirements.phase_margin = 30; "
-    for worst in ({"hold": few}, {"hold": enough, "before": few}, {"hold": lost}):
-        *_, last = margin_sentences.tuned(worst)
-        assert last == asked + "what they cost, ptsmc pareto --against margins shows"
-        *_, last = margin_sentences.tuned(worst, asked=True)
-        assert "requirements" not in last
-    assert not any("requirements" in line for line in margin_sentences.tuned({"hold": enough, "before": unlimited}))
 
 
 def at_hand_over(period):
@@ -276,24 +246,21 @@ def test_where_a_limit_cuts_the_command_the_loop_is_said_to_be_open():
     cut = [one for one in found["before"] if one["open"]]
     assert cut
     assert all((one["open"], one["gain_up"], one["delay"]) == (["u1"], None, None) for one in cut)
-    held, before = (line for line in margin_sentences.lines(found) if "limit of the actuators" in line)
-    assert "cuts the nominal run's command at input u1 in the hold phase: the loop is open there" in held
-    assert "cuts the nominal run's command at input u1 before the hand-over, at " in before
-    assert not any("stable" in line or "least at any input" in line for line in margin_sentences.lines(found))
+    report = reported(found)
+    held, before = (line for line in report.lines if "limit of the actuators" in line)
+    assert held.startswith("the loop is open at input u1 in the hold phase: a limit of the actuators cuts")
+    assert before.startswith("the loop is open at input u1 in the approach phase, at ")
+    assert not any("smallest margins" in line for line in report.lines)
     assert found["missed"]  # in 3 s it comes from 1 to 1 - 0.02 3^2 / 2 = 0.91 at best
-    assert any(line.startswith("the nominal run misses t_f") for line in margin_sentences.lines(found))
-    result: Any = SimpleNamespace(summary=found)
-    heading, _ = page._margins(result)
-    assert heading.headline.startswith("The nominal loop is open in the hold phase")
+    assert any(line.startswith("the nominal run misses t_f") for line in report.lines)
+    assert report.headline == "The nominal loop is open in the hold phase"
     found = stability.summary(*stability.find(limited_to(50.0)))
     assert not any(one["open"] for one in (found, *found["before"]))
     assert "missed" not in found
-    assert not any("dispersed" in line for line in margin_sentences.lines(found))
-    assert not any("misses" in line or "limit of the actuators" in line for line in margin_sentences.lines(found))
-    # not those of all inputs at once and of the sensors, which the table has beside them and which may be less
-    assert any(
-        line.startswith("nominal loop, least at any input in the hold") for line in margin_sentences.lines(found)
-    )
+    lines = reported(found).lines
+    assert not any(word in line for line in lines for word in ("dispersed", "misses", "limit of the actuators"))
+    # not the margins at all inputs at once and at the sensors, which are in the table and may be smaller
+    assert any(line.startswith("these are the smallest margins at any input") for line in lines)
     # as of one axis of several, of which another makes the loop unstable
     least = np.full_like(course.at_input.modulus, -100.0)
     lost = {"gain_up": least, "gain_down": least, "modulus": np.copysign(0.0, least), "stable": least > 0.0}
@@ -306,12 +273,10 @@ def blamed_on_no_limit(found, first, limited):
     """Checks what is said of a sample of which the law makes nothing, in a run that a limit cuts elsewhere or not."""
     assert (first["open"], first["cut"]) == (["u1"], [])
     assert any(loop["cut"] for loop in (found, *found["before"])) == limited
-    lines, left = list(margin_sentences.lines(found)), f"{first['time_to_go']:.3g} s to go"
-    assert sum(f"make nothing of the state at input u1 before the hand-over, at {left}" in line for line in lines) == 1
+    lines, left = reported(found).lines, f"{first['time_to_go']:.3g} s to go"
+    place = f"at input u1 in the approach phase, at {left}: the controller does not react to the state"
+    assert sum(place in line for line in lines) == 1
     assert any("limit of the actuators" in line for line in lines) == limited
-    itself: Any = SimpleNamespace(summary=found | {"open": ["u1"], "cut": []})
-    heading, _ = page._margins(itself)
-    assert "limit" not in heading.headline
 
 
 @pytest.mark.parametrize("limit", [50.0, 0.5])

@@ -16,7 +16,7 @@ from ptsmc_jax.simulation import clock, rollout
 from ptsmc_jax.theory import error_floor
 from ptsmc_jax.theory.error_floor import Model
 from tests.helpers import chain_parts, parts, vector
-from tuning.output import campaign_sentences, sentences
+from tuning.output import run_report, summaries
 
 PERIOD = 0.125  # a power of two: t_f and the window lie on samples exactly
 
@@ -310,13 +310,12 @@ def test_a_filter_with_the_kalman_filters_gains_is_at_the_floor():
 
 
 @pytest.mark.parametrize("least", [None, 0.0])
-def test_where_there_is_no_floor_nothing_is_said(least):
-    """Without noise, where no run flies, and in results of earlier versions, which have no such key."""
-    run = {"status": "ok", "reason": "", "bad_time": None, "window_error": 1e-5}
-    flown = {"quantiles": {"window_error": {"rms": 1e-5}}}
-    for known in ({}, {"floor": least}):
-        assert sentences.run_lines({**run, **known}) == ["status: ok", "window error 1.000e-05"]
-        assert list(campaign_sentences.error({**flown, **known})) == []
+def test_run_without_a_lower_bound_has_no_ratio_to_it(least):
+    """Without noise, and if no run reaches its end."""
+    run = {"status": "ok", "reason": "", "bad_time": None, "window_error": 1e-5, "verdicts": {}, "cautions": []}
+    report = run_report.of(summaries.run({**run, "floor": least}, "spacecraft"), "spacecraft")
+    assert report.headline == "pointing error 4.13 arcsec: the run reached its end"
+    assert report.lines == []
 
 
 def test_a_floor_is_shown_by_its_number_and_not_by_its_course():

@@ -6,7 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from cyclopts import Parameter
+from cyclopts import Group, Parameter
+from cyclopts.validators import MutuallyExclusive, Number
 
 from tuning.cli import flight_commands, searches
 from tuning.cli.options import (
@@ -18,14 +19,13 @@ from tuning.cli.options import (
     ScenarioFile,
     Seed,
     Trust,
-    answered,
-    fraction,
-    interrupted,
     prepare,
-    whole_number,
+    resumable,
+    whole,
 )
 from tuning.errors import UsageError
-from tuning.output import campaign_terminal, terminal
+from tuning.output import terminal, trials_report
+from tuning.output.progress import CampaignProgress, Progress
 
 if TYPE_CHECKING:
     from ptsmc_jax.campaigns.cluster import Cluster
@@ -33,6 +33,10 @@ if TYPE_CHECKING:
 
 CAMPAIGN_SEED = 1000  # not that of a search: a proof does without the trials that gains were tuned on
 MOST = 2**32  # trials: their numbers have 32 bits
+
+SHOWN = Group.create_default_parameters()  # in the help
+# options of a group exclude each other
+TRIALS, CONFIDENT, PARTS, PLACES = (Group(show=False, validator=MutuallyExclusive()) for _ in range(4))
 
 CampaignFolder = Annotated[Path, Parameter(name="DIR", help="Folder of a campaign, made by `ptsmc montecarlo`.")]
 
@@ -42,35 +46,43 @@ def montecarlo(
     /,
     *,
     trials: Annotated[
-        int | None,
-        whole_number(
-            "--trials", "Trials, a whole number from 1 to 4294967296; none: 10000, or a plan's rows.", 1, MOST
-        ),
+        int | None, whole("Trials, 1 to 4294967296; none: 10000.", 1, MOST, group=(SHOWN, TRIALS))
     ] = None,
     plan: Annotated[
         Path | None,
         Parameter(
-            help="Fly the rows of a table, .csv or .parquet, or of DIR/plan as --dry-run leaves it: its columns are as "
-            "there, what none says is drawn; `trial` and `seed` say whose draws and noise a row has."
+            group=(SHOWN, TRIALS, CONFIDENT),
+            help="Run table, .csv or .parquet, or DIR/plan of --dry-run: each row is a trial. Its columns are named as "
+            "in the rows of a campaign; quantities without a column are random, with the random numbers of the columns "
+            "`trial` and `seed`.",
         ),
     ] = None,
     seed: Seed = CAMPAIGN_SEED,
     out: Out = None,
     until_confident: Annotated[
         float | None,
-        fraction(
-            "--until-confident",
-            "Stop once every requirement's share is known to within this width, a number between 0 and 1.",
+        Parameter(
+            validator=Number(gt=0, lt=1),
+            group=(SHOWN, CONFIDENT, PARTS),
+            help="Stop when the fraction of trials within every limit is known to within this width, between 0 and 1.",
         ),
     ] = None,
     metrics: Annotated[
         str | None, Parameter(help="FILE.py:NAME of a function that adds metrics of your own to the rows.")
     ] = None,
     shard: Annotated[
-        str, Parameter(help="I/N: fly the I-th of N shares only, for batch queues; they may share a folder.")
+        str,
+        Parameter(
+            group=(SHOWN, PARTS, PLACES),
+            help="I/N: simulate the I-th of N shards only, for batch queues; shards may share a folder.",
+        ),
     ] = "1/1",
     cluster: Annotated[
-        str | None, Parameter(help="Fly on a Dask cluster: address or scheduler file; or local:N, N processes here.")
+        str | None,
+        Parameter(
+            group=(SHOWN, PLACES),
+            help="Simulate on a Dask cluster: address or scheduler file; or local:N, N processes here.",
+        ),
     ] = None,
     tls_ca: Annotated[Path | None, Parameter(help="TLS: certificate authority's file.")] = None,
     tls_cert: Annotated[Path | None, Parameter(help="TLS: this client's certificate.")] = None,
@@ -81,7 +93,12 @@ def montecarlo(
         Parameter(help="Bits of every number; docs/python.md lists the limits of 32 bits."),
     ] = "64",
     dry_run: Annotated[
-        bool, Parameter(negative="", help="Write what each trial would fly with into DIR/plan, and fly nothing.")
+        bool,
+        Parameter(
+            group=(SHOWN, PARTS, PLACES),
+            negative="",
+            help="Write the run table of the trials into DIR/plan, and simulate nothing.",
+        ),
     ] = False,
     controller: flight_commands.ControllerFolder = None,
     trust: Trust = False,
@@ -103,24 +120,17 @@ def montecarlo(
     tls = {name: str(path) for name, path in tls_files.items() if path is not None}
     confident, clustered, a_part = until_confident is not None, cluster is not None, share != (1, 1) or dry_run
     for refused, sentence in (
-        (tls and not clustered, "--tls-ca, --tls-cert and --tls-key go with --cluster only"),
-        (confident and a_part, "--until-confident looks at all rows, and does not go with --shard or --dry-run"),
-        (plan and trials is not None, "--trials does not go with --plan, each row of which is a trial"),
-        (
-            plan and confident,
-            "--until-confident looks at ever more trials drawn at random, and does not go with --plan",
-        ),
-        (clustered and a_part, "--cluster does not go with --shard or --dry-run"),
+        (tls and not clustered, "--tls-ca, --tls-cert and --tls-key need --cluster"),
         (
             force and share != (1, 1),
-            "--force starts the whole campaign again, which would delete other shards' rows, and does not go with "
-            "--shard; remove the folder before the first shard starts, or choose another with --out",
+            "--force starts the whole campaign again, which would delete the rows of other shards, and does not go "
+            "with --shard; remove the folder before the first shard starts, or choose another with --out",
         ),
         (
             clustered and (precision, device) != ("64", "cpu"),
-            "--cluster flies on its workers' processors with 64 bits, and goes with no other",
+            "--cluster simulates on the workers' processors with 64 bits; allowed are --device cpu and --precision 64",
         ),
-        (controller and device != "cpu", "--controller flies on processors, and goes with no other --device"),
+        (controller and device != "cpu", f"--device is {device}, but must be cpu with --controller"),
     ):
         if refused:
             raise UsageError(sentence)
@@ -155,23 +165,32 @@ def montecarlo(
     if folder.computer is not None:
         flight_commands.say_otherwise(folder.computer)
 
-    def flown() -> int:
-        one_of_several = share != (1, 1) and not dry_run
-        with store.in_use(folder.path, shared=one_of_several), _elsewhere(cluster, tls) as elsewhere:
-            campaign_folder.begin(folder, force)
-            with campaign_terminal.Progress(quiet) as report:
-                if dry_run:
-                    campaign_folder.write_plan(folder, report)
-                    done = folder
-                else:
-                    done = _flown(folder, share, report, elsewhere, until_confident)
-            if not a_part:
-                return _summarised(done, quiet, figures)
-        if not quiet:
-            campaign_terminal.share_done(done, share, planned=dry_run)
-        return 0
+    shared = share != (1, 1) and not dry_run
+    with resumable(force), store.in_use(folder.path, shared=shared), _elsewhere(cluster, tls) as elsewhere:
+        campaign_folder.begin(folder, force)
+        with CampaignProgress(quiet) as report:
+            if dry_run:
+                campaign_folder.write_plan(folder, report)
+                done = folder
+            else:
+                done = _flown(folder, share, report, elsewhere, until_confident)
+        if not a_part:
+            return _summarised(done, quiet, figures)
+    if not quiet:
+        _say_share(done, share, planned=dry_run)
+    return 0
 
-    return answered(flown, lambda: interrupted(force))
+
+def _say_share(folder: "Folder", share: tuple[int, int], *, planned: bool) -> None:
+    """Print that a shard of a campaign, or its run table, is done."""
+    if planned:
+        terminal.say(f"run table of {folder.trials} trials in {folder.dry.folder}; nothing was simulated")
+        return
+    there = sum(part.count for part in folder.rows.parts()[0])
+    terminal.say(
+        f"shard {share[0]}/{share[1]} done: {there} of {folder.trials} trials are in {folder.path}",
+        "when all are there, in this folder or gathered into one: ptsmc summarize DIR",
+    )
 
 
 def _elsewhere(cluster: str | None, tls: dict[str, str]) -> "contextlib.AbstractContextManager[Cluster | None]":
@@ -186,7 +205,7 @@ def _elsewhere(cluster: str | None, tls: dict[str, str]) -> "contextlib.Abstract
 def _flown(
     folder: "Folder",
     share: tuple[int, int],
-    report: campaign_terminal.Progress,
+    report: CampaignProgress,
     elsewhere: "Cluster | None",
     width: float | None,
 ) -> "Folder":
@@ -236,9 +255,7 @@ def worst(
             help="A column of the rows: the largest are the worst, of `within_*` and `controller_ok` the smallest."
         ),
     ] = "window_error",
-    n: Annotated[
-        int, whole_number("--n", "Trials, a whole number from 1 to 10000.", 1, 10_000, names=("--n", "-n"))
-    ] = 5,
+    n: Annotated[int, whole("Number of trials, 1 to 10000.", 1, 10_000, name=("--n", "-n"))] = 5,
     why: Annotated[
         bool,
         Parameter(
@@ -266,8 +283,10 @@ def worst(
         inputs = reasons.why(opened, list(dict.fromkeys((by, *required))), n)
         store.write_csv(folder / "why.csv", list(inputs[0]) if inputs else [], [list(row.values()) for row in inputs])
     if not quiet:
-        campaign_terminal.worst(frame, by, folder, opened.scenario.plant.kind, own_code=bool(opened.programs))
-        campaign_terminal.why(inputs, opened.scenario.plant.kind)
+        plant = opened.scenario.plant.kind
+        terminal.table(trials_report.worst(frame, by, plant))
+        terminal.say(trials_report.how_to_replay(frame, folder, custom=bool(opened.programs)))
+        terminal.say(*trials_report.why(inputs, plant))
     return 0
 
 
@@ -275,7 +294,7 @@ def replay(
     folder: CampaignFolder,
     /,
     *,
-    trial: Annotated[int, whole_number("--trial", "Number of the trial.")],
+    trial: Annotated[int, whole("Number of the trial.")],
     out: Annotated[Path | None, Parameter(help="Folder for the results; by default DIR/replay/TRIAL.")] = None,
     trust: Trust = False,
     force: Force = False,
@@ -306,8 +325,12 @@ def replay(
         replayed = {"campaign": str(folder.absolute()), "metrics": opened.own} if from_here else {}
         store.write(place, lambda making: single.write(making, *about, replayed))
     if not quiet:
-        terminal.run(single.summary(again.run, opened.scenario, opened.computer), opened.scenario.plant.kind, place)
-        campaign_terminal.replayed(again.off, again.rounding, campaign_summary.SAME)
+        from tuning.output import run_report, summaries
+
+        plant = opened.scenario.plant.kind
+        summary = summaries.run(single.summary(again.run, opened.scenario, opened.computer), plant)
+        terminal.show(run_report.of(summary, plant), place)
+        terminal.say(*trials_report.replayed(again.off, again.rounding, campaign_summary.SAME))
     return 0 if again.off is None or again.off <= campaign_summary.SAME else 1
 
 
@@ -322,13 +345,15 @@ def _configured(folder: Path) -> None:
 def _summarised(folder: "Folder", quiet: bool, figures: bool, *, write: bool = True) -> int:
     from tuning.studies import campaign_summary
 
-    with terminal.Progress(quiet) as report:
+    with Progress(quiet) as report:
         report("summing up", 0, 0)
         summary = campaign_summary.summarise(folder)
         if write:
             campaign_summary.write_summary(folder, summary, figures)
     if not quiet:
-        campaign_terminal.campaign(summary, folder.path)
+        from tuning.output import campaign_report, summaries
+
+        terminal.show(campaign_report.of(summaries.read(summaries.Campaign, summary)), folder.path)
     return 0 if summary["status"] == "met" else 1
 
 

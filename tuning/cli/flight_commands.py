@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from tuning.cli.options import Force, Out, Quiet, Seed, Trust, prepare, whole_number
+from tuning.cli.options import Force, Out, Quiet, Seed, Trust, prepare, whole
 from tuning.output import terminal
 
 if TYPE_CHECKING:
@@ -29,9 +29,7 @@ def export(
     *,
     out: Out = None,
     name: Annotated[str | None, Parameter(help="Name of the C files; by default the scenario file's.")] = None,
-    trials: Annotated[
-        int, whole_number("--trials", "Trials in vectors.csv, a whole number from 1 to 100.", 1, 100)
-    ] = 3,
+    trials: Annotated[int, whole("Trials in vectors.csv, 1 to 100.", 1, 100)] = 3,
     seed: Seed = 0,
     trust: Trust = False,
     force: Force = False,

@@ -1,5 +1,6 @@
 """The `ptsmc` command. JAX is loaded by the commands that compute, after what they are given was looked at."""
 
+import dataclasses
 import functools
 import io
 import sys
@@ -10,9 +11,8 @@ from cyclopts import App, CycloptsError, Parameter
 from cyclopts.exceptions import UnusedCliTokensError
 
 import ptsmc_jax
-from tuning.cli import campaign_commands, flight_commands, searches, writing_commands
+from tuning.cli import INTERRUPTED, campaign_commands, flight_commands, searches, writing_commands
 from tuning.cli.options import (
-    INTERRUPTED,
     Against,
     Device,
     Figures,
@@ -28,13 +28,12 @@ from tuning.cli.options import (
     SensitivityLimits,
     Times,
     Trust,
-    answered,
     listed_against,
     prepare,
-    whole_number,
+    whole,
 )
 from tuning.errors import UsageError
-from tuning.output import terminal
+from tuning.output import progress, summaries, terminal
 
 app = App(
     name="ptsmc",
@@ -55,7 +54,7 @@ def simulate(
     out: Out = None,
     seed: Seed = 0,
     trial: Annotated[
-        int | None, whole_number("--trial", "Draw this trial's dispersions; without it nominal, with trial 0's noise.")
+        int | None, whole("Simulate this trial's dispersions; none: nominal, with trial 0's noise.")
     ] = None,
     controller: flight_commands.ControllerFolder = None,
     trust: Trust = False,
@@ -83,7 +82,10 @@ def simulate(
         run = runs.fly(ready, seed, trial, OURS if computer is None else computer.software)
         store.write(folder, lambda making: single.write(making, loaded, run, seed, trial, figures, computer))
     if not quiet:
-        terminal.run(single.summary(run, loaded, computer), loaded.plant.kind, folder)
+        from tuning.output import run_report
+
+        summary = summaries.run(single.summary(run, loaded, computer), loaded.plant.kind)
+        terminal.show(run_report.of(summary, loaded.plant.kind), folder)
     return 0 if run.met else 1
 
 
@@ -103,12 +105,15 @@ def reproduce(*, out: Out = None, force: Force = False, quiet: Quiet = False, fi
     from tuning.studies import reproduction
 
     with store.in_use(folder, force=force):
-        with terminal.Progress(quiet) as report:
+        with progress.Progress(quiet) as report:
             report("flying the paper's figures", 0, 0)
             reproduced = reproduction.reproduce()
         store.write(folder, lambda making: reproduction.write(making, reproduced, figures))
     if not quiet:
-        terminal.reproduction(reproduction.summary(reproduced), folder)
+        from tuning.output import paper_report
+
+        summary = summaries.read(summaries.Paper, reproduction.summary(reproduced))
+        terminal.show(paper_report.of(summary), folder)
     return 0 if reproduced.ok else 1
 
 
@@ -124,9 +129,7 @@ def map_(
     y: Annotated[
         str | None, Parameter(help="KEY=LOW:HIGH:COUNT; by default controller.delta, from a period to t_f / 7 or more.")
     ] = None,
-    trials: Annotated[
-        int, whole_number("--trials", "Trials of each pair, a whole number from 1 to 1000000.", 1, 1_000_000)
-    ] = 32,
+    trials: Annotated[int, whole("Trials of each pair, 1 to 1000000.", 1, 1_000_000)] = 32,
     out: Out = None,
     seed: Seed = 0,
     device: Device = "cpu",
@@ -148,13 +151,16 @@ def map_(
     if across.key == up.key:
         raise UsageError(f"--y is {up.text}, but must be another key than --x")
     with store.in_use(folder, force=force):
-        with terminal.Progress(quiet) as report:
+        with progress.Progress(quiet) as report:
             flown = mapping.fly(
                 loaded, across, up, seed, trials, lambda done, total: report("flying pairs", done, total)
             )
         store.write(folder, lambda making: mapping.write(making, flown, seed, figures))
     if not quiet:
-        terminal.grid(flown.cells, (across.key, up.key), loaded.plant.kind, folder)
+        from tuning.output import map_report
+
+        pairs = [dataclasses.asdict(cell) for cell in flown.cells]
+        terminal.say(*map_report.lines(pairs, (across.key, up.key), loaded.plant.kind), f"results in {folder}")
     return 0
 
 
@@ -180,13 +186,15 @@ def margins(
     from tuning.studies import stability
 
     with store.in_use(folder, force=force):
-        with terminal.Progress(quiet) as report:
+        with progress.Progress(quiet) as report:
             report("linearising the loop", 0, 0)
             ready, course = stability.find(loaded)
         store.write(folder, lambda making: stability.write(making, ready, course, figures))
     summary = stability.summary(ready, course)
     if not quiet:
-        terminal.margins(summary, folder)
+        from tuning.output import margins_report
+
+        terminal.show(margins_report.of(summaries.read(summaries.Margins, summary)), folder)
     return 0 if summary["stable"] else 1
 
 
@@ -215,6 +223,7 @@ def tune(
     """
     loaded, folder = prepare(scenario, "tune", out, device, trust=trust)
     from ptsmc_jax.scenario.tables import objective_name
+    from tuning.output import tune_report
     from tuning.studies import tune_files, tuner
 
     loaded = searches.with_tune(loaded)
@@ -225,7 +234,7 @@ def tune(
         work=lambda report, journal: tuner.tune(loaded, seed, report, journal, globally=global_check),
         write=lambda making, tuning: tune_files.write(making, loaded, tuning, figures, known_by),
         summary=tune_files.summary,
-        show=terminal.tuning,
+        report=lambda summary: tune_report.of(summaries.tune(summary)),
         needs=("scipy.stats", *(["ptsmc_jax.figures.study_plots"] if figures else [])),
     )
     return searches.run(search, loaded, folder, force=force, quiet=quiet)
@@ -257,8 +266,9 @@ def pareto(
     """
     listed = listed_against(against, points, times, limits)
     loaded, folder = prepare(scenario, "pareto", out, device, trust=trust)
+    from tuning.output import front_report
+    from tuning.studies import front, trades
     from tuning.studies import pareto as fronts
-    from tuning.studies import trades
 
     trade = trades.of(against, searches.with_tune(loaded), points, listed)
     loaded, known_by = trade.scenario, trade.identity(seed)
@@ -266,9 +276,9 @@ def pareto(
         known_by,
         "window error",
         work=lambda report, journal: fronts.trace(trade, seed, report, journal),
-        write=lambda making, front: fronts.write(making, trade, front, figures, known_by),
-        summary=lambda front: front.summary(),
-        show=terminal.front,
+        write=lambda making, found: fronts.write(making, trade, found, figures, known_by),
+        summary=lambda found: found.summary(),
+        report=lambda summary: front_report.of(front.read(summary)),
     )
     return searches.run(search, loaded, folder, force=force, quiet=quiet)
 
@@ -297,6 +307,7 @@ def compare(
     """
     loaded, folder = prepare(scenario, "compare", out, device, trust=trust)
     from ptsmc_jax.scenario.tables import objective_name
+    from tuning.output import compare_report
     from tuning.studies import compare as comparing
 
     rivals = comparing.Rivals(against, law)
@@ -311,7 +322,7 @@ def compare(
         work=lambda report, journal: comparing.compare(loaded, seed, report, journal, posed()),
         write=lambda making, comparison: comparing.write(making, loaded, comparison, figures, known_by),
         summary=comparing.summary,
-        show=terminal.comparison,
+        report=lambda summary: compare_report.of(summaries.read(summaries.Compare, summary)),
         check=posed,
     )
     return searches.run(search, loaded, folder, force=force, quiet=quiet)
@@ -340,7 +351,10 @@ def main() -> None:
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
         sys.stdout.reconfigure(errors="backslashreplace")  # as the error stream's are: names have any letters
     try:
-        status = answered(_asked, _nothing_written)
+        status = app(sys.argv[1:], exit_on_error=False, print_error=False, result_action="return_value")
+    except KeyboardInterrupt as error:
+        print(f"ptsmc: interrupted; {error if error.args else 'nothing was written'}", file=sys.stderr)
+        status = INTERRUPTED
     except UnusedCliTokensError as error:
         _fail(_too_many(error))
     except CycloptsError as error:
@@ -357,15 +371,6 @@ def main() -> None:
         if (programs := sys.modules.get("ptsmc_jax.programs")) is not None:
             programs.stop()  # exiting waits for what is being compiled
     sys.exit(status if isinstance(status, int) else 0)
-
-
-def _asked() -> object:
-    return app(sys.argv[1:], exit_on_error=False, print_error=False, result_action="return_value")
-
-
-def _nothing_written() -> int:
-    print("ptsmc: interrupted; nothing was written", file=sys.stderr)
-    return INTERRUPTED
 
 
 def _too_many(error: UnusedCliTokensError) -> str:

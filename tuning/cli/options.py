@@ -1,11 +1,13 @@
 """What the commands share: their options, and how these are read. A value that cannot be followed is a `UsageError`."""
 
+import contextlib
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter, Token
+from cyclopts.validators import Number
 
 from tuning.errors import UsageError
 
@@ -13,42 +15,16 @@ if TYPE_CHECKING:
     from ptsmc_jax.scenario.tables import Scenario
 
 
-def whole_number(
-    option: str, text: str, least: int = 0, most: int = 2**32 - 1, names: tuple[str, ...] = ()
-) -> Parameter:
-    """An option that is a whole number.
-
-    Args:
-        option: its name in refusals, a `UsageError` that `main` prints.
-        text: its help.
-        least: the smallest number allowed.
-        most: the largest one.
-        names: what it is called on the command line, where that is not its parameter's name.
-    """
-
-    def read(_: Any, tokens: Sequence[Token]) -> int:
-        value = tokens[0].value
-        if not (value.isascii() and value.isdigit() and len(value) <= 10 and least <= int(value) <= most):
-            raise UsageError(f"{option} is {value}, but must be a whole number from {least} to {most}")
-        return int(value)
-
-    return Parameter(name=names or None, converter=read, help=text)
+def _integer(_: object, tokens: Sequence[Token]) -> int:
+    text = tokens[0].value
+    if not text.removeprefix("-").isdecimal():  # cyclopts would round 2.5
+        raise ValueError(f"{text} is no whole number")
+    return int(text)
 
 
-def fraction(option: str, text: str) -> Parameter:
-    """An option that is a number between 0 and 1; see `whole_number`."""
-
-    def read(_: Any, tokens: Sequence[Token]) -> float:
-        value = tokens[0].value
-        try:
-            number = float(value)
-        except ValueError:
-            number = float("nan")
-        if not 0.0 < number < 1.0:
-            raise UsageError(f"{option} is {value}, but must be a number between 0 and 1")
-        return number
-
-    return Parameter(converter=read, help=text)
+def whole(text: str, least: int = 0, most: int = 2**32 - 1, **others: Any) -> Parameter:
+    """Return an option that is a whole number from least to most; text: its help; others: see `Parameter`."""
+    return Parameter(converter=_integer, validator=Number(gte=least, lte=most), help=text, **others)
 
 
 ScenarioFile = Annotated[
@@ -58,7 +34,7 @@ SampledFile = Annotated[
     Path | None, Parameter(name="SCENARIO", help='Scenario file (TOML) with loop.mode = "sampled".')
 ]
 Out = Annotated[Path | None, Parameter(help="Folder for the results; by default out/COMMAND-NAME, the file's name.")]
-Seed = Annotated[int, whole_number("--seed", "Seed of every draw, a whole number from 0 to 4294967295.")]
+Seed = Annotated[int, whole("Seed of all random numbers, 0 to 4294967295.")]
 Force = Annotated[bool, Parameter(negative="", help="Write into a folder that holds something already.")]
 Quiet = Annotated[bool, Parameter(negative="", help="Print nothing but errors.")]
 Figures = Annotated[bool, Parameter(negative="--no-figures", help="Draw figures.")]
@@ -86,9 +62,7 @@ Trust = Annotated[
 FrontAgainst = Annotated[
     Literal["torque", "margins", "t_f"], Parameter(help="Quantity that the accuracy is traded against.")
 ]
-Points = Annotated[
-    int | None, whole_number("--points", "Limits on the torque to tune for, from 3 to 100; none: 20.", 3, 100)
-]
+Points = Annotated[int | None, whole("Number of limits on the torque to tune for, 3 to 100; none: 20.", 3, 100)]
 Times = Annotated[
     str | None,
     Parameter(help="Prescribed times to tune for, with --against t_f [s], such as 20,30,45; none: half to twice t_f."),
@@ -101,33 +75,19 @@ SensitivityLimits = Annotated[
     ),
 ]
 
-INTERRUPTED = 130  # exit status
 
-
-def interrupted(force: bool) -> int:
-    """Say how to go on with what was interrupted, where --force would begin it anew; returns the exit status."""
-    same = "the same command without --force" if force else "the same command"
-    print(f"ptsmc: interrupted; {same} goes on from here", file=sys.stderr)
-    return INTERRUPTED
-
-
-def answered(work: Callable[[], Any], answer: Callable[[], int]) -> Any:
-    """What work() returns, or answer() where a Ctrl-C ends it.
-
-    Polars raises a Ctrl-C itself, and Python the same one once more right behind it, in what answers the first. A
-    compiled module (pybind11) that is being imported makes an ImportError of one.
-    """
+@contextlib.contextmanager
+def resumable(force: bool) -> Iterator[None]:
+    """Let a Ctrl-C report that the same command resumes this work; force: the command had --force."""
     try:
-        try:
-            return work()
-        except KeyboardInterrupt:
-            return answer()
-        except ImportError as error:
-            if not isinstance(error.__cause__, KeyboardInterrupt):
-                raise
-            return answer()
+        yield
     except KeyboardInterrupt:
-        return answer()
+        raise KeyboardInterrupt(resume_by(force)) from None
+
+
+def resume_by(force: bool) -> str:
+    """Return how to resume interrupted work; force: the command had --force, which would start again."""
+    return f"the same command{' without --force' if force else ''} resumes it"
 
 
 VALUES = {"torque": "--points", "t_f": "--times", "margins": "--limits"}  # option for the values of each quantity

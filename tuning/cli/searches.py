@@ -8,11 +8,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tuning.cli.options import INTERRUPTED, answered, interrupted
+from tuning.cli import INTERRUPTED
+from tuning.cli.options import resumable, resume_by
 from tuning.output import terminal
+from tuning.output.progress import Progress
 
 if TYPE_CHECKING:
     from ptsmc_jax.scenario.tables import Scenario
+    from tuning.output.report import Report
     from tuning.search.journal import Journal
 
 COMMANDS = ("tune", "pareto", "compare")
@@ -25,10 +28,10 @@ class LongSearch:
 
     known_by: dict[str, Any]  # what tells it from others in a folder, see `store.begin`
     goal: str  # what the progress says is minimised
-    work: Callable[[terminal.Progress, "Journal"], Any]  # searches; what it returns has a `status`
+    work: Callable[[Progress, "Journal"], Any]  # searches; what it returns has a `status`
     write: Callable[[Path, Any], None]  # fills a result folder with that outcome
     summary: Callable[[Any], dict[str, Any]]  # what `summary.json` says of it
-    show: Callable[[dict[str, Any], Path, str], None]  # prints such a summary, the folder, and how it came about
+    report: Callable[[dict[str, Any]], "Report"]  # of such a summary
     check: Callable[[], Any] = lambda: None  # raises what is refused besides the scenario, before a folder is begun
     needs: tuple[str, ...] = ()  # modules that take long to import, and only what follows the first steps needs
 
@@ -69,7 +72,7 @@ def run(search: LongSearch, loaded: "Scenario", folder: Path, *, force: bool, qu
         if other is not None:
             print(f"ptsmc: {folder} holds {other}; --force runs it again", file=sys.stderr)
         if not quiet:
-            search.show(done, folder, "already done")
+            terminal.show(search.report(done), folder, "already done")
         return STATUS[done["status"]]
     with store.in_use(folder):
         return _run(search, loaded, folder, force=force, quiet=quiet)
@@ -90,21 +93,16 @@ def _run(search: LongSearch, loaded: "Scenario", folder: Path, *, force: bool, q
 
     journal = Journal(store.begin(folder, tables, search.known_by, fresh=not going_on))
 
-    def searched() -> Any:
+    with resumable(force):
         threading.Thread(target=lambda: [*map(importlib.import_module, search.needs)], daemon=True).start()
-        with terminal.Progress(quiet, search.goal) as report:
+        with Progress(quiet, search.goal) as report:
             outcome = search.work(report, journal)
         store.write(folder, lambda making: search.write(making, outcome))
-        return outcome
-
-    outcome = answered(searched, lambda: interrupted(force))
-    if outcome == INTERRUPTED:
-        return INTERRUPTED
     if outcome.status != "interrupted":
         store.end(folder)
-    elif force:
-        interrupted(force)
+    else:
+        print(f"ptsmc: interrupted; {resume_by(force)}", file=sys.stderr)
     if not quiet:
-        said = store.plain(search.summary(outcome))  # as it is read when it is shown again
-        search.show(said, folder, "interrupted" if outcome.status == "interrupted" else "done")
+        summary = store.plain(search.summary(outcome))  # as it is read when it is shown again
+        terminal.show(search.report(summary), folder)
     return STATUS[outcome.status]

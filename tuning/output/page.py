@@ -1,6 +1,6 @@
-"""`ptsmc report`: a result folder as one page of HTML that needs nothing else and runs nothing that a user typed.
+"""`ptsmc report`: a result folder as one page of HTML that needs no other file and runs no foreign code.
 
-Made from the files in the folder alone. The page's policy allows its own two scripts, known by their digests, and
+The page is made from the files in the folder. Its policy allows its own two scripts, known by their checksums, and
 nothing from elsewhere; every text is escaped.
 """
 
@@ -10,11 +10,12 @@ import hashlib
 import json
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from ptsmc_jax.campaigns import store
@@ -22,18 +23,19 @@ from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.scenario import parsing
 from tuning.errors import UsageError
 from tuning.output import (
-    campaign_sentences,
-    cells,
-    front_sentences,
-    law_sentences,
-    margin_sentences,
+    campaign_report,
+    compare_report,
+    front_report,
+    map_report,
+    margins_report,
     page_captions,
     page_charts,
-    pointing_sentences,
-    search_sentences,
-    sentences,
+    paper_report,
+    run_report,
+    summaries,
+    tune_report,
 )
-from tuning.output.page_parts import Block, Heading, Result, Section
+from tuning.output.report import Chart, Code, Picture, Report, Section, Table
 from tuning.studies import front
 
 HERE = Path(__file__).parent
@@ -41,17 +43,37 @@ FILES = ("versions.json", store.SUMMARY, "scenario.toml", "trajectory.csv", "his
 PNG = b"\x89PNG\r\n\x1a\n"  # how such a file begins
 
 
+@dataclass(frozen=True)
+class Result:
+    """The content of a result folder."""
+
+    folder: Path
+    versions: dict[str, Any]
+    summary: dict[str, Any]
+    scenario: dict[str, Any]  # its tables; empty without a scenario
+
+    @property
+    def plant(self) -> str:
+        """Return the kind of the plant."""
+        return self.scenario.get("plant", {}).get("kind", "spacecraft")
+
+    def rows(self, name: str) -> list[list[str]]:
+        """Return the rows of a CSV file with its head."""
+        with (self.folder / name).open(newline="", encoding="utf-8") as file:
+            return list(csv.reader(file))
+
+
 def read(folder: Path) -> Result:
-    """A result folder. Raises RefusedError where it holds no finished result."""
+    """Read a result folder. Raises RefusedError if it holds no finished result."""
     if not folder.is_dir():
-        raise RefusedError(f"{folder} is no folder; allowed is one that a ptsmc command left")
+        raise RefusedError(f"{folder} is no folder; allowed is a folder that a ptsmc command wrote")
     for name in FILES:
         if _leads_out(folder, folder / name):
             raise RefusedError(f"{folder / name} is a link out of the folder; allowed is a file in it")
     versions = store.read_versions(folder)
     command = versions.get("command")
-    if str(command) not in SECTIONS:
-        raise RefusedError(f"{folder} holds no result; allowed is a folder that a ptsmc command left")
+    if str(command) not in REPORTS:
+        raise RefusedError(f"{folder} holds no result; allowed is a folder that a ptsmc command wrote")
     try:
         summary = json.loads((folder / store.SUMMARY).read_text(encoding="utf-8")) if command != "map" else {}
         path = folder / "scenario.toml"
@@ -64,18 +86,23 @@ def read(folder: Path) -> Result:
 
 
 def _leads_out(folder: Path, path: Path) -> bool:
-    """Whether a path of a result folder is, or lies behind, a link to a place outside the folder."""
+    """Return whether a path of a result folder is, or lies behind, a link to a place outside the folder."""
     # unlike Path.resolve it does not raise for a link to itself
     return not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
 
 
 def _unfinished(folder: Path, versions: dict[str, Any]) -> RefusedError:
-    said = f"{folder} holds a {versions['command']} that is not finished"
-    return RefusedError(f"{said}; run the same command to its end")
+    unfinished = f"{folder} holds a {versions['command']} that is not finished"
+    return RefusedError(f"{unfinished}; run the same command to its end")
 
 
 def build(folder: Path) -> str:
-    """The page of a result folder. Raises RefusedError where there is none, UsageError without plotly or jinja2."""
+    """Return the page of a result folder.
+
+    Raises:
+        RefusedError: the folder holds no finished result, or files that cannot be read.
+        UsageError: plotly or jinja2 is not installed.
+    """
     result = read(folder)
     try:
         from jinja2 import Environment
@@ -84,254 +111,107 @@ def build(folder: Path) -> str:
     except ImportError as error:
         raise UsageError(f"the page needs {error.name}: pip install 'ptsmc-jax[report]'") from None
     try:
-        heading, sections = SECTIONS[result.versions["command"]](result)
+        report = REPORTS[result.versions["command"]](result)
     except FileNotFoundError:
         raise _unfinished(folder, result.versions) from None
-    except KeyError as error:
+    except (msgspec.ValidationError, KeyError, AttributeError, TypeError) as error:
         by = result.versions.get("ptsmc-jax")
-        raise RefusedError(f"{folder} lacks {error}, as results of another version do ({by}); make it again") from None
+        raise RefusedError(f"{folder} holds a summary of another version ({by}): {error}; make it again") from None
     except (csv.Error, IndexError, ValueError) as error:  # a table that is cut
         raise RefusedError(f"{folder} holds a file that cannot be read: {error}") from None
-    sections = [*sections, *_pictures(result), *_origin(result)]
+    sections = [*report.sections, *_pictures(result), *_origin(result)]
+    drawn = {block.name: block.figure for section in sections for block in section.blocks if isinstance(block, Chart)}
     drawing = (HERE / "page.js").read_text(encoding="utf-8")
-    library = get_plotlyjs() if result.charts else ""
-    scripts = " ".join(f"'sha256-{_digest(script)}'" for script in (library, drawing)) if result.charts else "'none'"
+    library = get_plotlyjs() if drawn else ""
+    scripts = " ".join(f"'sha256-{_checksum(script)}'" for script in (library, drawing)) if drawn else "'none'"
     # no < in the data: nothing in it can end its element
-    charts = json.dumps(result.charts, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+    charts = json.dumps(drawn, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
     environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     template = environment.from_string((HERE / "page.html").read_text(encoding="utf-8"))
     return template.render(
         title=f"ptsmc {result.versions['command']}: {folder.resolve().name}",
-        verdict=heading,
+        report=report,
         sections=sections,
         policy=Markup(f"default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; script-src {scripts}"),
         style=Markup((HERE / "page.css").read_text(encoding="utf-8")),
-        charts=Markup(charts) if result.charts else "",
+        charts=Markup(charts) if drawn else "",
         library=Markup(library),
         drawing=Markup(drawing),
     )
 
 
-def _digest(script: str) -> str:
+def _checksum(script: str) -> str:
     return base64.b64encode(hashlib.sha256(script.encode("utf-8")).digest()).decode("ascii")
 
 
-def _table(table: cells.Table, note: str = "") -> Block:
-    # the last column contains numbers, or words, units or marks; marks have no heading
-    numbers = bool(table.head[-1]) and all(row[-1][:1] in "-0123456789" for row in table.rows)
-    return Block("table", head=table.head, rows=table.rows, note=note, shape="numbers" if numbers else "")
+def _with(report: Report, *sections: Section) -> Report:
+    """Return a report with further sections."""
+    return replace(report, sections=[*report.sections, *sections])
 
 
-def _text(lines: Iterable[str]) -> Block:
-    return Block("text", lines=[line.strip() for line in lines])
-
-
-def _limits(verdicts: list[dict[str, Any]]) -> list[Section]:
-    """Each requirement as a bar on its limit, and in words."""
-    if not verdicts:
-        return []
-    bars = []
-    for verdict in verdicts:
-        bars.append({
-            "label": verdict["metric"].replace("_", " "), "text": sentences.verdict(verdict) + _distance(verdict),
-            "met": verdict["met"], "limit": 300, "width": round(min(400.0, 300.0 * _nearness(verdict)), 1),
-        })  # fmt: skip
-    note = "The line is the limit; a bar that ends before it keeps the limit."
-    return [Section("Requirements", [Block("bars", bars=bars, note=note)])]
-
-
-def _verdict(summary: dict[str, Any], lines: Iterable[str], requirements: bool) -> Heading:
-    status = summary["status"]
-    headline = {
-        "met": "Every requirement is met" if requirements else "Every trial ended well; nothing was required",
-        "not met": "NOT every requirement is met" if requirements else "NOT every trial ended well",
-        "interrupted": "Interrupted: the best so far",
-        "unfinished": "NOT finished",
-        "ok": "The run ended well; nothing was required",
-    }.get(status, f"The run failed: {status}")
-    lines = [*lines, *sentences.cautions(summary)]
-    mood = {"met": "good", "ok": "calm"}.get(status, "bad")
-    return Heading(mood if requirements or mood == "bad" else "calm", headline, lines)
-
-
-def _simulate(result: Result) -> tuple[Heading, list[Section]]:
-    summary, spacecraft = result.summary, result.kind == "spacecraft"
-    verdicts = sentences.run_verdicts(summary, result.kind)
-    if summary["status"] == "ok" and verdicts:
-        summary = {**summary, "status": "met" if all(v["met"] for v in verdicts) else "not met"}
-    lines = [*sentences.run_lines(result.summary), *map(sentences.verdict, verdicts)]
+def _simulate(result: Result) -> Report:
     columns = page_charts.read(result.folder / "trajectory.csv")
     law = result.scenario["controller"]
     marks = {"t_f": law["t_f"], **({"t_f - delta": law["t_f"] - law["delta"]} if "delta" in law else {})}
-    if "delta" in law and law["delta"] < 0.05 * columns["t"][-1]:  # the labels would lie on each other
+    if "delta" in law and law["delta"] < 0.05 * columns["t"][-1]:  # the labels would overlap
         del marks["t_f - delta"]
-    drawn = page_charts.history(columns, spacecraft, marks)
-    caption = "Drag to zoom, double-click to see all; dotted are the hand-over and t_f."
-    charts = [result.chart("history", drawn, caption, "tall")]
+    spacecraft = result.plant == "spacecraft"
+    caption = "Drag to zoom, double-click to see all; the dotted lines are the hand-over and t_f."
+    charts = [Chart("history", page_charts.history(columns, spacecraft, marks), caption, "tall")]
     if spacecraft:
         q = np.stack([columns[f"q{k + 1}"] for k in range(4)], axis=1)
-        caption = "The body with its axes as it turns; dashed: the inertial axes. Drag to look from elsewhere."
-        charts.append(result.chart("attitude", page_charts.attitude(columns["t"], q), caption, "square"))
-    sections = [*_limits(verdicts), Section("Metrics", [_table(sentences.run(result.summary, result.kind))])]
-    return _verdict(summary, lines, bool(verdicts)), [*sections, Section("History", charts)]
+        caption = "The body and its axes over time; dashed: the inertial axes. Drag to turn the view."
+        charts.append(Chart("attitude", page_charts.attitude(columns["t"], q), caption, "square"))
+    report = run_report.of(summaries.run(result.summary, result.plant), result.plant)
+    return _with(report, Section("History", [*charts]))
 
 
-def _tune(result: Result) -> tuple[Heading, list[Section]]:
-    summary = result.summary
-    gains = ", ".join(f"{name} {value:.6g}" for name, value in summary["gains"].items())
-    farthest = max(summary["verdicts"], key=_nearness, default=None)
-    lines = [f"tuned gains: {gains}", *sentences.accuracy(summary)]
-    if farthest is not None:
-        lines.insert(1, sentences.verdict(farthest) + _distance(farthest))
-    with (result.folder / "history.csv").open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    goal = list(rows[0])[2]
-    caption = "The way of every start to the optimum next to it, by slopes; a hollow point breaks a limit."
-    said_of = (search_sentences.advice, search_sentences.search, search_sentences.trust, search_sentences.shortest)
-    trust = _text(line for lines_of in said_of for line in lines_of(summary))
-    sections = [
-        *_limits(summary["verdicts"]),
-        Section("Gains", [_table(sentences.tuning(summary), sentences.tuning_heading(summary).capitalize() + ".")]),
-        Section("Can the result be trusted?", [trust]),
-        Section("Search", [result.chart("search", page_charts.search(rows, goal), caption)]),
-    ]
-    return _verdict(summary, lines, bool(summary["verdicts"])), sections
+def _tune(result: Result) -> Report:
+    head, *rows = result.rows("history.csv")
+    points = [dict(zip(head, row, strict=True)) for row in rows]
+    caption = "The objective along the local search from each starting point; a hollow point breaks a limit."
+    chart = Chart("search", page_charts.search(points, head[2]), caption)
+    return _with(tune_report.of(summaries.tune(result.summary)), Section("Search", [chart]))
 
 
-def _nearness(verdict: dict[str, Any]) -> float:
-    """How near a verdict comes to its limit, 1 at it; infinite where a trial has no value."""
-    margin = verdict["margin"]
-    return float("inf") if margin is None or margin != margin else margin
-
-
-def _distance(verdict: dict[str, Any]) -> str:
-    """How far what decides a verdict is from its limit: the largest value, or that of the share that is asked for."""
-    margin = verdict["margin"]
-    if margin is None or margin != margin or verdict.get("at_least") or verdict["limit"] == 0.0:
-        return ""
-    if verdict.get("share_of_time") is not None:
-        return f"; beyond the limit for {sentences.ratio(100 * margin)} % of the time that it may be"
-    share = f"{sentences.ratio(100 * margin)} % of the limit"
-    if verdict.get("quantile") is None or verdict["trials"] == 1:
-        return f"; {'the worst' if verdict['trials'] > 1 else 'that'} is {share}"
-    return f"; the trial that decides is at {margin * verdict['limit']:.4g}, {share}"
-
-
-def _pareto(result: Result) -> tuple[Heading, list[Section]]:
+def _pareto(result: Result) -> Report:
     found = front.read(result.summary)
-    blocks = [_table(front_sentences.results(found)), _text(front_sentences.remarks(found)),
-              _table(front_sentences.gains(found))]  # fmt: skip
-    if found.against == "torque":
-        caption = "Hover over a point for its gains. Bars are 95 % intervals; the dashed line is the required limit."
-        requirement = result.scenario.get("requirements", {}).get("peak_torque")
-        limit = requirement.get("limit") if isinstance(requirement, dict) else requirement
-        blocks.insert(0, result.chart("front", page_charts.front(found, limit), caption))
-    lines = [*front_sentences.answers(found), front_sentences.heading(found)]
-    heading = _verdict(result.summary, lines, bool(found.requirements))
-    if found.requirements:
-        met, points = sum(point.meets for point in found.kept), len(found.kept)
-        heading = replace(heading, headline=f"{met} of {points} points meet every requirement")
-    return heading, [Section(front.KINDS[found.against].title, blocks)]
+    report = front_report.of(found)
+    if found.against != "torque":
+        return report
+    caption = "Hover over a point for its gains. Bars are 95 % intervals; the dashed line is the required limit."
+    requirement = result.scenario.get("requirements", {}).get("peak_torque")
+    limit = requirement.get("limit") if isinstance(requirement, dict) else requirement
+    (section,) = report.sections
+    chart = Chart("front", page_charts.front(found, limit), caption)
+    return replace(report, sections=[replace(section, blocks=[chart, *section.blocks])])
 
 
-def _compare(result: Result) -> tuple[Heading, list[Section]]:
-    summary = result.summary
-    lines = [
-        law_sentences.alike(summary),
-        law_sentences.winner(summary),
-        *sentences.cautions(summary),
-    ]
-    headline = {
-        "met": "The paper's law, tuned, meets every requirement",
-        "not met": "The paper's law, tuned, does NOT meet every requirement",
-    }.get(summary["status"], "Interrupted: the best so far")
-    sections = [
-        Section(answer.title, [result.chart(f"question_{k}", answer.chart, answer.note), _table(answer.table)])
-        for k, answer in enumerate(law_sentences.answers(summary))
-    ]
-    sections.append(Section("Gains", [_text(law_sentences.lines(summary))]))
-    return Heading("good" if summary["status"] == "met" else "bad", headline, lines), sections
+def _montecarlo(result: Result) -> Report:
+    report = campaign_report.of(summaries.read(summaries.Campaign, result.summary))
+    return _with(report, Section("Gains", [campaign_report.gains(result.scenario, result.plant)]))
 
 
-def _montecarlo(result: Result) -> tuple[Heading, list[Section]]:
-    summary = result.summary
-    note = (
-        "Quantiles lie between order statistics, with 95 % intervals (-: beyond every trial, since so many fail or "
-        "never settle, or so few are flown); a failed trial is beyond every quantile."
-    )
-    larger = (
-        "Shares of time within a limit, of which more is better: what 99.73 % of the trials reach, and the smallest. A "
-        "failed trial counts as 0."
-    )
-    tables = campaign_sentences.quantiles(summary)
-    quantiles = [_table(table, said) for table, said in zip(tables, (note, larger), strict=False)]
-    sections = [
-        *_limits(summary["verdicts"]),
-        Section("Metrics", [*quantiles, _text(campaign_sentences.drivers(summary))]),
-        Section("Gains", [_table(campaign_sentences.flown_gains(result.scenario, result.kind))]),
-    ]
-    pointing = [_table(table) for table in pointing_sentences.tables(summary)]
-    if pointing:
-        sections.insert(-1, Section("Pointing", [_text(pointing_sentences.heading(summary)), *pointing]))
-    lines = [*campaign_sentences.counts(summary), *campaign_sentences.error(summary)]
-    return _verdict(summary, lines, bool(summary["verdicts"])), sections
+def _map(result: Result) -> Report:
+    head, *rows = result.rows("map.csv")
+    return map_report.of(head, rows, result.plant)
 
 
-def _map(result: Result) -> tuple[Heading, list[Section]]:
-    with (result.folder / "map.csv").open(newline="", encoding="utf-8") as file:
-        rows = list(csv.reader(file))
-    head = tuple(sentences.with_unit(name, result.kind) for name in rows[0])
-    table = cells.Table(head, [tuple(map(cells.short, row)) for row in rows[1:]])
-    pairs = [dict(zip(("x", "y", *rows[0][2:]), map(cells.number, row), strict=True)) for row in rows[1:]]
-    first, *others = sentences.grid(pairs, (rows[0][0], rows[0][1]), result.kind)
-    heading = Heading("calm", first[0].upper() + first[1:], others)
-    return heading, [Section("Pairs", [_table(table, page_captions.MAP)])]
-
-
-def _margins(result: Result) -> tuple[Heading, list[Section]]:
-    summary = result.summary
-    lines = list(margin_sentences.lines(summary, with_least=False))
-    if summary.get("open"):
-        why = ": a limit of the actuators cuts the command" if summary.get("cut", True) else " in the sample looked at"
-        heading = Heading("bad", f"The nominal loop is open in the hold phase{why}", lines)
-    elif summary["stable"] and any(loop["judged"] and not loop["stable"] for loop in summary["before"]):
-        said = (
-            "The nominal loop is stable in the hold phase, but in the approach phase, with its gains frozen, it is NOT"
-        )
-        heading = Heading("bad", f"{said}: {margin_sentences.left(summary)}", lines)
-    elif summary["stable"]:
-        heading = Heading("calm", f"The nominal loop is stable: {margin_sentences.left(summary)}", lines)
-    else:
-        heading = Heading("bad", "The nominal loop is NOT stable in the hold phase", lines)
-    return heading, [Section("Margins", [_table(margin_sentences.table(summary))])]
-
-
-def _reproduce(result: Result) -> tuple[Heading, list[Section]]:
-    summary = result.summary
-    counted = ", ".join(f"{count}: {word}" for word, count in summary["verdicts"].items())
-    sections = [
-        Section("Claims of the paper", [_table(sentences.claims(summary))]),
-        Section("Slips of the paper, and what shows them", [_table(sentences.slips(summary))]),
-    ]
-    held, claims = summary["verdicts"].get("holds", 0), len(summary["claims"])
-    return Heading("calm", f"{held} of {claims} claims of the paper hold as they are written", [counted]), sections
-
-
-SECTIONS: dict[str, Callable[[Result], tuple[Heading, list[Section]]]] = {
+REPORTS: dict[str, Callable[[Result], Report]] = {
     "simulate": _simulate,
     "tune": _tune,
     "pareto": _pareto,
-    "compare": _compare,
+    "compare": lambda result: compare_report.of(summaries.read(summaries.Compare, result.summary)),
     "montecarlo": _montecarlo,
     "map": _map,
-    "margins": _margins,
-    "reproduce": _reproduce,
+    "margins": lambda result: margins_report.of(summaries.read(summaries.Margins, result.summary)),
+    "reproduce": lambda result: paper_report.of(summaries.read(summaries.Paper, result.summary)),
 }
 
 
 def _pictures(result: Result) -> Iterator[Section]:
-    """The figures of the folder."""
-    blocks = []
+    """Return the section of the figures in the folder."""
+    pictures = []
     for path in sorted((result.folder / "figures").glob("*.png")):
         out = _leads_out(result.folder, path)
         content = path.read_bytes() if path.is_file() and not out else b""
@@ -340,20 +220,19 @@ def _pictures(result: Result) -> Iterator[Section]:
             print(f"ptsmc: {path} {why}, and is not in the page", file=sys.stderr)
             continue
         source = "data:image/png;base64," + base64.b64encode(content).decode("ascii")
-        name = path.stem.replace("_", " ")
-        blocks.append(Block("picture", alt=name, source=source, caption=page_captions.CAPTIONS.get(path.stem, "")))
-    if blocks:
-        yield Section("Figures", blocks)
+        pictures.append(Picture(path.stem.replace("_", " "), source, page_captions.CAPTIONS.get(path.stem, "")))
+    if pictures:
+        yield Section("Figures", pictures)
 
 
 def _origin(result: Result) -> Iterator[Section]:
-    """The scenario, how to make the result again, and what made it."""
+    """Return the scenario, the command line, and the versions."""
     versions = result.versions
     path = result.folder / "scenario.toml"
     if path.exists():
         note = page_captions.SCENARIO.get(versions["command"], "")
-        yield Section("Scenario", [Block("code", text=path.read_text(encoding="utf-8"), note=note)])
+        yield Section("Scenario", [Code(path.read_text(encoding="utf-8"), note)])
     call = versions.get(store.COMMAND_LINE, "")
-    yield Section("How to make this again", [Block("code", text=call, note="In the folder where it was called.")])
+    yield Section("How to make this again", [Code(call, "In the folder where it was called.")])
     rows = [(name, json.dumps(value) if not isinstance(value, str) else value) for name, value in versions.items()]
-    yield Section("Made by", [_table(cells.Table(("", "version"), rows))])
+    yield Section("Made by", [Table(("", "version"), rows)])

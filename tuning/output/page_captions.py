@@ -1,41 +1,37 @@
-"""What stands under each figure on a page."""
+"""Captions of the figures on a page."""
 
-MAP = (
-    "linear_window_error and linear_torque are what linear theory predicts of the noise alone, where sampling is "
-    "explicit; radius, gain_margin (a factor up to which the loop is stable; below 1 it is not, and its nearest border "
-    "is a factor so far from 1, less gain or more) and delay_margin [s] are those of the frozen loop at the hand-over, "
-    "stable where the radius of its poles is not above 1, and hold_radius, .. those in hold."
-)
-# under the scenario, by the command: whose gains it has
+# under the scenario, by command: whose gains it has
 SCENARIO = {
-    "tune": "Its gains are those before the search; the same scenario with the tuned ones is the file tuned.toml.",
-    "pareto": "Its gains are those before the search; those of each point stand in the table above.",
-    "compare": "Its gains are those before the search; those of each law stand above.",
+    "tune": "These are the gains before the search; tuned.toml is the same scenario with the tuned gains.",
+    "pareto": "These are the gains before the search; the table above has the gains of each point.",
+    "compare": "These are the gains before the search; the gains of each law are listed above.",
 }
 CAPTIONS = {
-    "history": "Gains and goal of every start over the steps of the descent.",
-    "tradeoff": "Each fresh trial by its peak torque and its error after t_f.",
-    "sensitivities": "Percent by which each metric moves for a percent of each gain.",
-    "profiles": "The goal along each gain between its bounds, the other gains as found; what breaks a limit is marked.",
+    "history": "Gains and objective of every starting point over the steps of the local search.",
+    "tradeoff": "Peak torque and error after t_f of each held-out trial.",
+    "sensitivities": "Change of each metric in per cent for one per cent of each gain.",
+    "profiles": "The objective along each gain between its bounds, with the other gains as found; marked points break "
+    "a limit.",
     "front": "The front of accuracy against peak torque.",
-    "slew_times": "The error, and what the slew costs, over the prescribed time; open points break a requirement.",
-    "robustness": "The error, the torque and the margins left, over the limit on the largest sensitivity; open points "
-    "break a requirement.",
-    "map": "Error and peak torque over the two keys, with the borders at which the loop loses its stability.",
-    "nichols": "The loop opened at each axis of the plant's input, the others closed.",
-    "sensitivity": "How disturbances (S) and noise (T) come through, over the frequency.",
+    "slew_times": "The error and the costs of the slew over the prescribed time; open points break a requirement.",
+    "robustness": "The error, the torque and the margins over the limit on the largest sensitivity; open points break "
+    "a requirement.",
+    "map": "Error and peak torque over the two keys, with the stability limits of the loop.",
+    "nichols": "The open loop at each axis of the plant's input, the others closed.",
+    "sensitivity": "Transfer of disturbances (S) and noise (T) over the frequency.",
     "margins": "Margins of the nominal loop in the approach phase, with its gains frozen.",
-    "fan": "How the error goes with time: the share of trials inside each band.",
-    "distributions": "The share of the trials up to each value; the scale stretches both ends.",
-    "inputs": "What was drawn (across) against what came of it (up), a point a trial; a limit is dashed.",
+    "fan": "The error over time: the fraction of trials inside each band.",
+    "distributions": "The fraction of the trials up to each value; the scale stretches both ends.",
+    "inputs": "Metrics (up) over the sampled inputs (across), a point for each trial; limits are dashed.",
     "wheels": "Momentum of each reaction wheel over time.",
     "wheel_torque": "Torque of each reaction wheel over time.",
     "disturbance": "The disturbance as the observer estimates it; the true one is dashed in black.",
-    "torque_by_angle": "Peak torque by how far from the target a trial starts.",
-    "settling": "Time to settle by the angle that a trial starts from.",
+    "torque_by_angle": "Peak torque over the initial angle from the reference.",
+    "settling": "Settling time over the initial angle from the reference.",
     "error": "Attitude error, or the first state, over time.",
     "sliding": "Sliding variable over time.",
-    "convergence": "Error and sliding variable over the time to go, the exact motion dotted, theory's slopes black.",
+    "convergence": "Error and sliding variable over the time to go; dotted: the exact motion; black: the slopes of the "
+    "theory.",
     "torque": "Delivered torque over time.",
     "attitude": "Attitude over time.",
     "rate": "Body rate over time.",

@@ -1,144 +1,70 @@
-"""What the commands print: progress while they work, results when they are done."""
+"""Prints reports, tables and lines on the terminal."""
 
 import contextlib
-from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from tuning.output import front_sentences, margin_sentences, search_sentences, sentences
-from tuning.output.progress_lines import Bar
+from tuning.output.report import Bars, Report, Table, Text
 
-if TYPE_CHECKING:
-    from tuning.output.cells import Table as Content
-    from tuning.studies.mapping import Cell
-
-WIDE = 1000  # columns of what is no terminal
-UNBROKEN = 24  # columns that a cell may have and stay in one piece
+WIDE = 1000  # columns of a file or a pipe
+UNBROKEN = 24  # largest number of columns of a cell that is never broken
 
 
-class Progress(Bar):
-    """A progress bar with the best so far."""
+def show(report: Report, folder: Path | str, how: str = "done") -> None:
+    """Print a report without its charts and pictures.
 
-    def __init__(self, quiet: bool, goal: str = ""):
-        super().__init__(quiet, counted=True)
-        self._goal, self._total = goal, 0
-
-    def __call__(self, what: str, done: int, total: int, value: float = float("nan"), over: float = 0.0) -> None:
-        """What is being done, steps done and in all; the best goal so far, how far it is beyond a limit."""
-        if total != self._total:
-            self._total = total
-            self._bar.reset(self._task, total=total or None)
-        limits = "limits met" if over == 0.0 else f"{sentences.ratio(100.0 * over)} % beyond a limit"
-        best = f": {self._goal} {value:.4g}, {limits}" if value == value else ""
-        self._bar.update(self._task, completed=done, total=total or None, description=what + best)
-        self._lines(what + best, done, total)
-
-
-def reproduction(summary: dict[str, Any], folder: Path) -> None:
-    """Claims and slips of the paper."""
-    from rich.box import SIMPLE
-
-    box: Any = {"box": SIMPLE, "title_justify": "left"}
-    table(sentences.claims(summary), title="Claims", **box)
-    table(sentences.slips(summary), title="Slips", **box)
-    say("claims.md says why, and gives the slips as printed", f"results in {folder}")
-
-
-def grid(cells: "list[Cell]", keys: tuple[str, str], kind: str, folder: Path) -> None:
-    """What was flown over two keys, across and up; kind: of the plant."""
-    say(*sentences.grid([asdict(cell) for cell in cells], keys, kind), f"results in {folder}")
-
-
-def margins(summary: dict[str, Any], folder: Path) -> None:
-    """Margins of a loop, as their `summary.json` says."""
-    table(margin_sentences.table(summary))
-    say(*margin_sentences.lines(summary), f"results in {folder}")
-
-
-def run(summary: dict[str, Any], kind: str, folder: Path) -> None:
-    """Metrics and verdicts of one run, as its `summary.json` says; kind: of its plant."""
-    say(*sentences.run_lines(summary))
-    table(sentences.run(summary, kind))
-    say(
-        *map(sentences.verdict, sentences.run_verdicts(summary, kind)),
-        *sentences.cautions(summary),
-        f"results in {folder}",
-    )
-
-
-def tuning(summary: dict[str, Any], folder: Path, how: str) -> None:
-    """What a tuning run found, as its `summary.json` says."""
-    say(f"tuning {how}; {sentences.tuning_heading(summary)}:")
-    table(sentences.tuning(summary))
-    say(*sentences.accuracy(summary), *search_sentences.search(summary), *search_sentences.trust(summary))
-    say(
-        *map(sentences.verdict, summary["verdicts"]),
-        *search_sentences.advice(summary),
-        *search_sentences.shortest(summary),
-    )
-    if summary["status"] == "interrupted":
-        say("interrupted: these are the best gains so far; the same command goes on from here")
-    say(*sentences.cautions(summary), f"results in {folder}")
-
-
-def comparison(summary: dict[str, Any], folder: Path, how: str) -> None:
-    """Laws side by side, as `summary.json` says."""
-    from tuning.output import law_sentences, sentences
-
-    say(f"comparison {how}: {law_sentences.alike(summary)}")
-    for answer in law_sentences.answers(summary):
-        table(answer.table, title=answer.title, title_justify="left")
-    say(law_sentences.winner(summary), *law_sentences.lines(summary))
-    say(*sentences.cautions(summary), f"results in {folder}")
-
-
-def front(summary: dict[str, Any], folder: Path, how: str) -> None:
-    """Print a Pareto front from its `summary.json`."""
-    from tuning.studies.front import read
-
-    found = read(summary)
-    say(f"front {how}: {front_sentences.heading(found)}", *front_sentences.answers(found))
-    table(front_sentences.results(found))
-    table(front_sentences.gains(found))
-    say(*front_sentences.remarks(found))
-    say(*sentences.cautions(summary), f"results in {folder}")
+    Args:
+        report: of a result.
+        folder: of the result.
+        how: "done", "interrupted" or "already done".
+    """
+    say(report.headline, *report.lines)
+    for section in report.sections:
+        for k, block in enumerate(block for block in section.blocks if isinstance(block, Table | Text | Bars)):
+            if k == 0:
+                say("", section.title)
+            if isinstance(block, Table):
+                table(block)
+            else:
+                say(*(block.texts if isinstance(block, Bars) else block.lines))
+    say("", f"results in {folder}" + (" (from an earlier run)" if how == "already done" else ""))
 
 
 def say(*lines: str) -> None:
-    """Print lines that the terminal breaks, not we."""
+    """Print lines; the terminal breaks them."""
     for line in lines:
         _print(line, soft_wrap=True, markup=False)
 
 
-def _narrowest(cell: str) -> int:
-    """Into how many columns a cell fits: a number, a name or a unit is in one piece, a sentence breaks at its words."""
-    return len(cell) if len(cell) <= UNBROKEN else max(map(len, cell.split()))
-
-
-def table(content: "Content", **style: Any) -> None:
+def table(content: Table, **style: Any) -> None:
     """Print a table; style: of rich's `Table`."""
     from rich.console import Console
     from rich.markup import escape
     from rich.measure import Measurement
-    from rich.table import Table
-    from rich.text import Text
+    from rich.table import Table as RichTable
+    from rich.text import Text as RichText
 
-    printed = Table(pad_edge=False, **{"box": None, **style})
+    printed = RichTable(pad_edge=False, **{"box": None, **style})
     for k, name in enumerate(content.head):
         printed.add_column(escape(name), min_width=max((_narrowest(row[k]) for row in content.rows), default=1))
     for row in content.rows:
-        printed.add_row(*map(Text, row))
-    # a file or a pipe has no width; numbers that do not fit into a terminal's would be cut, so it breaks the lines
-    width, here = WIDE, Console()
-    if here.is_terminal:
+        printed.add_row(*map(RichText, row))
+    # a file or a pipe has no width; a terminal that is too narrow for the numbers breaks the lines itself
+    width, console = WIDE, Console()
+    if console.is_terminal:
         wide = Console(width=WIDE)
-        width = max(here.width, Measurement.get(wide, wide.options, printed).minimum)
+        width = max(console.width, Measurement.get(wide, wide.options, printed).minimum)
     _print(printed, width, crop=False)
 
 
+def _narrowest(cell: str) -> int:
+    """Return the smallest width of a cell: numbers, names and units are not broken, sentences at their words."""
+    return len(cell) if len(cell) <= UNBROKEN else max(map(len, cell.split()))
+
+
 def _print(content: Any, width: int | None = None, **how: Any) -> None:
-    """Print for who reads; where they have read enough, as `head` has, what a command returns is told all the same."""
+    """Print; a reader that closes the pipe, such as `head`, changes neither the work nor the exit status."""
     from rich.console import Console
 
-    with contextlib.suppress(SystemExit):  # rich's way of ending then; from there on it prints into nothing
-        Console(highlight=False, width=width).print(content, **how)
+    with contextlib.suppress(SystemExit):  # raised by rich for a closed pipe; it prints into nothing afterwards
+        Console(highlight=False, emoji=False, width=width).print(content, **how)

@@ -1,14 +1,27 @@
-"""Tables and sentences of a Pareto front, for the terminal and the page."""
+"""The report of a Pareto front."""
 
 import math
 from collections.abc import Iterator, Sequence
 
-from tuning.output import margin_sentences, sentences
-from tuning.output.cells import Table, digits, many, valued
-from tuning.output.pointing_sentences import error
+from tuning.output import margins_report
+from tuning.output.formats import digits, error, many, over_bound, ratio, valued
+from tuning.output.report import Report, Section, Table, Text
+from tuning.output.run_report import cautions
 from tuning.studies.front import KINDS, Front, Point, titled, unit_of
 
-USUAL = margin_sentences.ENOUGH["gain_margin"]  # limit on |S| that the summary states first [dB]
+USUAL = margins_report.ENOUGH["gain_margin"]  # limit on |S| that the summary states first [dB]
+
+
+def of(front: Front) -> Report:
+    """Return the report of a front."""
+    if front.requirements:
+        met, points = sum(point.meets for point in front.kept), len(front.kept)
+        headline, mood = f"{met} of {many(points, 'point')} meet every requirement", "good" if met else "bad"
+    else:
+        headline, mood = heading(front), "calm"
+    blocks = [results(front), Text(list(remarks(front))), gains(front)]
+    lines = [*answers(front), *([heading(front)] if front.requirements else []), *cautions(front.cautions)]
+    return Report(headline, mood, lines, [Section(KINDS[front.against].title, blocks)])
 
 
 def heading(front: Front) -> str:
@@ -29,7 +42,7 @@ def results(front: Front) -> Table:
             error(point.rms, plant),
             spread(point),
             *(digits(point.rms, ".3e") for _ in vector),
-            *(sentences.ratio(sentences.over_floor(point.rms, front.floor)) for _ in bound),
+            *(ratio(over_bound(point.rms, front.floor)) for _ in bound),
             *(digits(point.costs[name], ".4g", "none" if name.endswith("margin") else "-") for name in costs),
             _marks(point),
         )
@@ -110,7 +123,7 @@ def _of_margins(front: Front) -> Iterator[str]:
     keeping = [point for point in limited if point.rms > 0.0 and _keeps(point)]
     if keeping and loose is not None and loose.rms > 0.0:
         usual = min(keeping, key=lambda point: abs(point.value - USUAL))
-        times = sentences.ratio(usual.rms / loose.rms)
+        times = ratio(usual.rms / loose.rms)
         yield (
             f"RMS error {error(usual.rms, front.plant)} with |S| at most {usual.value:g} dB, "
             f"{times} times the error without a limit"
@@ -134,7 +147,7 @@ def _of_times(front: Front) -> Iterator[str]:
     fast, slow = front.points[0], front.points[-1]
     where, than = f"at t_f = {fast.value:g} s", f"times the value at {slow.value:g} s"
     if fast.rms > 0.0 and slow.rms > 0.0:
-        yield f"RMS error {error(fast.rms, front.plant)} {where}, {sentences.ratio(fast.rms / slow.rms)} {than}"
+        yield f"RMS error {error(fast.rms, front.plant)} {where}, {ratio(fast.rms / slow.rms)} {than}"
     for name, cost in fast.costs.items():
         if cost > 0.0 and slow.costs[name] > 0.0:
             unit = unit_of(name, front.plant)

@@ -1,10 +1,15 @@
-"""Progress on the error stream: a bar where that is a terminal, else a line every ten seconds."""
+"""Progress on the error stream: a bar on a terminal, else a line every ten seconds."""
 
 import contextlib
 import sys
 import threading
 import time
-from typing import Self
+from typing import TYPE_CHECKING, Self
+
+from tuning.output.formats import ratio
+
+if TYPE_CHECKING:
+    from ptsmc_jax.campaigns.campaign import Tally
 
 EVERY = 10.0  # seconds
 
@@ -30,7 +35,7 @@ class Lines:
         self._silent, self._begun = silent, time.monotonic()
         self._doing, self._ended = ("compiling", 0, 0), threading.Event()
 
-    def __enter__(self) -> "Lines":
+    def __enter__(self) -> Self:
         if not self._silent:
             threading.Thread(target=self._watch, daemon=True).start()
         return self
@@ -49,9 +54,11 @@ class Lines:
 
 
 class Bar:
-    """A progress bar with the time left, within `with`; `Lines` where nobody looks at a terminal; silent if told to be.
+    """A progress bar with the time left, within `with`; `Lines` if the error stream is no terminal.
 
-    counted: with how many are done of all.
+    Args:
+        quiet: print nothing.
+        counted: show the numbers of steps too.
     """
 
     def __init__(self, quiet: bool, *, counted: bool = False):
@@ -80,3 +87,45 @@ class Bar:
     def __exit__(self, *_: object) -> None:
         self._bar.stop()
         self._lines.__exit__()
+
+
+class Progress(Bar):
+    """The progress of a search or a study with the best objective so far."""
+
+    def __init__(self, quiet: bool, objective: str = ""):
+        super().__init__(quiet, counted=True)
+        self._objective, self._total = objective, 0
+
+    def __call__(self, what: str, done: int, total: int, value: float = float("nan"), over: float = 0.0) -> None:
+        """Report the current step, the number of steps done and in all, the best objective, and its violation."""
+        if total != self._total:
+            self._total = total
+            self._bar.reset(self._task, total=total or None)
+        limits = "limits met" if over == 0.0 else f"{ratio(100.0 * over)} % beyond a limit"
+        best = f": {self._objective} {value:.4g}, {limits}" if value == value else ""
+        self._bar.update(self._task, completed=done, total=total or None, description=what + best)
+        self._lines(what + best, done, total)
+
+
+class CampaignProgress(Bar):
+    """The progress of a campaign: trials, trials a second, and failures so far."""
+
+    def __init__(self, quiet: bool):
+        super().__init__(quiet)
+        self._started: tuple[float, int] | None = None
+
+    def __call__(self, tally: "Tally") -> None:
+        """Report the trials so far."""
+        now = time.monotonic()
+        if self._started is None:
+            self._started = now, tally.done
+        since, before = self._started
+        rate = (tally.done - before) / (now - since) if tally.done > before else 0.0
+        text = f"{tally.done} of {tally.total} trials"
+        if rate:
+            text += f", {rate:,.0f} a second" if rate >= 1.0 else f", {rate:.1g} a second"
+        elif tally.done < tally.total:
+            text += ", compiling"
+        text += f", {tally.failed} failed or missed" if tally.failed else ""
+        self._bar.update(self._task, completed=tally.done, total=tally.total, description=text)
+        self._lines(text, 0, 0)

@@ -1,0 +1,68 @@
+"""Summaries with changes, as the commands write them."""
+
+from typing import Any
+
+from ptsmc_jax.simulation.requirements import Requirement, Verdict
+from tuning.output import summaries
+
+METRIC = {"rms": 1.0, "mean": 1.0, "max": 1.0}
+
+
+def entry(verdict: Verdict, **changes: Any) -> summaries.Entry:
+    """Return a verdict as it is read from a summary."""
+    return summaries.read(summaries.Entry, {**verdict.in_summary(), **changes})
+
+
+def group(**changes: Any) -> dict[str, Any]:
+    """Return gains and the statistics of their trials."""
+    return {"gains": {}, "floor": None, "trials": 64, "counts": {"ok": 64}, **changes}
+
+
+def tune(search: dict[str, Any] | None = None, trust: dict[str, Any] | None = None, **changes: Any) -> summaries.Tune:
+    """Return the summary of a tuning without requirements; search, trust: changes in these tables."""
+    record = {
+        "largest_over_limit": {}, "conflict": None, "searched_globally": False, "margins": {}, "earlier": [],
+        "confirmed": [], "hardest": None, "worst_case": False, "averaged": 256, "rollouts": 1, "gradients": 1,
+        "seconds": 1.0, "seconds_by_step": {},
+    }  # fmt: skip
+    known = {"influence": {}, "margins": None, "slopes_off_central_differences": {"start": 1e-9, "end": 1e-9}}
+    summary = {
+        "status": "met", "plant": "spacecraft", "gain_units": {}, "gains": {}, "at_bound": {},
+        "accuracy_gain_over_paper": None, "accuracy_gain_interval": None, "training": group(), "fresh": group(),
+        "paper_refused": None, "paper_is": "paper", "shortest_t_f": None, "broken_by": {}, "verdicts": [],
+        "judged_on": "flight clock", "cautions": [], "differential_evolution": None,
+    }  # fmt: skip
+    trusted = None if trust is None else {**known, **trust}
+    return summaries.tune({**summary, "search": {**record, **(search or {})}, "trust": trusted, **changes})
+
+
+def torque(times: float | None, failures: int = 0, trials: int = 64) -> dict[str, Any]:
+    """Return the verdict on a peak torque of at most 0.5 N m that reaches so many times the limit."""
+    verdict = Requirement("peak_torque", 0.5).verdict
+    import numpy as np
+
+    peak = np.nan if times is None else 0.5 * times
+    return verdict(np.full(trials, peak), np.arange(trials) >= failures).in_summary()
+
+
+def law(**changes: Any) -> dict[str, Any]:
+    """Return a law of a comparison without numbers."""
+    numbers = ("window_error", "window_error_interval", "floor", "peak_torque", "largest_peak_torque", "effort",
+               "chattering", "settling_time", "settling_near_far", "margins")  # fmt: skip
+    return {**dict.fromkeys(numbers), "gains": {}, "at_bound": {}, "met": True, "counts": {"ok": 8}, "unsettled": 0,
+            "untold": {}, "verdicts": [], **changes}  # fmt: skip
+
+
+def compare(laws: dict[str, Any], **changes: Any) -> summaries.Compare:
+    """Return the summary of a comparison."""
+    summary = {"status": "met", "trials": 8, "paper_refused": None, "paper_is": None, "judged_on": "flight clock",
+               "settling_angle": 1e-3, "cautions": []}  # fmt: skip
+    return summaries.read(summaries.Compare, {**summary, "laws": laws, **changes})
+
+
+def campaign(**changes: Any) -> summaries.Campaign:
+    """Return the summary of a campaign."""
+    summary = {"status": "met", "plant": "spacecraft", "seed": 1, "plan": None, "trials": 8, "flown": 8,
+               "unjudged": [], "counts": {"ok": 8}, "reasons": [], "floor": None, "verdicts": [], "quantiles": {},
+               "drivers": {}, "driver_trials": {}, "cautions": []}  # fmt: skip
+    return summaries.read(summaries.Campaign, {**summary, **changes})

@@ -1,0 +1,145 @@
+"""The report of a campaign, and single trials in words."""
+
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+
+from ptsmc_jax.numerics import statistics
+from ptsmc_jax.simulation.requirements import Requirement
+from tests.output import examples
+from tuning.output import campaign_report, map_report, trials_report
+
+
+def test_fractions_have_the_digits_that_matter():
+    """59 of 60 trials were 98.3333 %; near all of them the missing ones count."""
+    asked = Requirement("peak_torque", 0.5, quantile=0.95)
+    verdict = asked.verdict(np.r_[np.zeros(59), 1.0], np.ones(60, bool))
+    found = examples.entry(verdict, share=59 / 60, share_interval=[0.91056, 0.99957], share_bound=0.92333)
+    text = campaign_report.verdict(found)
+    assert "98.33 % of trials keep the limit (95 %: 91.06 to 99.957 %)" in text
+    wide = Requirement("ape_x", 1.0, quantile=0.9, interpretation="mixed")
+    seen = wide.verdict(np.ones(3), np.ones(3, bool), np.array([1.0, 0.95, 1.0]))
+    assert str(examples.entry(seen)).endswith("98.33 %: met")
+
+
+@pytest.mark.parametrize(("failures", "end"), [
+    (0, "; 299 trials with no failure are enough"), (9, "; 1568 trials with as many failures are enough"), (10, ""),
+])  # fmt: skip
+def test_number_of_trials_that_is_enough(failures, end):
+    """Of 1 000 trials 10 are the fraction that is allowed: more trials would have as many more of them."""
+    asked = Requirement("peak_torque", 0.5, quantile=0.99, confidence=0.95)
+    verdict = asked.verdict(np.r_[np.zeros(1000 - failures), np.ones(failures)], np.ones(1000, bool))
+    more = {"share": 1.0 - failures / 1000, "share_interval": [0.9, 1.0], "share_bound": 0.985,
+            "fewest_trials": statistics.fewest_for(failures, 0.99, 0.95)}  # fmt: skip
+    text = campaign_report.verdict(examples.entry(verdict, **more))
+    assert text.endswith(f"at least 98.5 % at 95 % one-sided confidence{end}")
+
+
+@pytest.mark.parametrize(("without", "largest"), [(1, "57.2"), (2, "none")])
+def test_no_largest_settling_time_if_a_run_that_ended_never_settled(without, largest):
+    """Trials that failed have none either, but they are counted above the table."""
+    at = {"value": 56.0, "low": 55.0, "high": 57.0}
+    settling = {"without_value": without, "max": 57.2, "0.5": at, "0.9973": at}
+    found = examples.campaign(counts={"ok": 58, "missed": 1, "diverged": 1}, quantiles={"settling_time": settling})
+    (table,) = campaign_report.quantiles(found)
+    assert table.rows == [("settling_time", "56", "56", "55..57", largest, "s")]
+
+
+@pytest.mark.parametrize("floor", [None, 0.0])
+def test_no_lower_bound_without_noise(floor):
+    at = {"value": 1e-5, "low": 1e-5, "high": 1e-5}
+    error = {"without_value": 0, "rms": 1e-5, "max": 1e-5, "0.5": at, "0.9973": at}
+    report = campaign_report.of(examples.campaign(quantiles={"window_error": error}, floor=floor))
+    assert report.headline == "RMS pointing error 4.13 arcsec: every trial reached its end"
+    assert report.lines == ["8 trials of seed 1: 8 ok"]
+
+
+def test_gains_of_a_campaign_have_their_units():
+    tables = {
+        "controller": {"kind": "prescribed_time", "eta": 3.0},
+        "observer": {"kind": "nonlinear", "gain": [1.0, 2.0, 3.0]},
+    }
+    assert campaign_report.gains(tables, "spacecraft").rows == [
+        ("controller.kind", "prescribed_time", ""),
+        ("controller.eta", "3", ""),
+        ("observer.kind", "nonlinear", ""),
+        ("observer.gain", "1, 2, 3", "N m s"),
+    ]
+    bounds = {
+        "controller": {"kind": "pd", "disturbance_bound": 0.1},
+        "observer": {"kind": "finite_time", "gain": [0.02]},
+    }
+    assert campaign_report.gains(bounds, "spacecraft").rows[1::2] == [
+        ("controller.disturbance_bound", "0.1", "N m"),
+        ("observer.gain", "0.02", "N m/s"),  # the nonlinear observer's is in N m s
+    ]
+    custom = {"controller": {"kind": "own", "t_f": 30.0, "k": 2.0}}  # its class may have another unit than a built-in k
+    assert campaign_report.gains(custom, "spacecraft").rows[1:] == [
+        ("controller.t_f", "30", "s"),
+        ("controller.k", "2", ""),
+    ]
+
+
+def test_inputs_that_rank_the_trials_alike_are_one_driver():
+    rng = np.random.default_rng(0)
+    angle, other = rng.uniform(0.3, 2.4, 1000), rng.normal(size=1000)
+    inputs = {"initial_angle": angle, "initial_q4": np.cos(angle / 2), "other": other}
+    assert list(statistics.drivers(inputs, angle + other)) == ["initial_angle", "other"]
+
+
+def test_chance_is_no_driver():
+    """Of twenty inputs without an influence, some had a correlation of 0.1, and were named."""
+    rng = np.random.default_rng(0)
+    inputs, metric = {f"x{k}": rng.normal(size=300) for k in range(20)}, rng.normal(size=300)
+    drivers = statistics.drivers(inputs, metric)
+    assert max(abs(one["rank_correlation"]) for one in drivers.values()) > 0.1
+
+    def driven(drivers):
+        found = {"drivers": {"window_error": drivers}, "driver_trials": {"window_error": 300}}
+        return list(campaign_report.drivers(examples.campaign(flown=10_000, trials=10_000, **found)))
+
+    assert driven(drivers) == []
+    (line,) = driven(statistics.drivers({"y": metric + rng.normal(size=300)}, metric))
+    assert line.startswith("window_error is driven by y (rank correlation +0.")
+
+
+@pytest.mark.parametrize(
+    ("off", "rounding", "texts", "absent"),
+    [
+        (0.0, 0.0, ["equals its row to the last digit", "same run up to round-off"], "NOT"),
+        (7e-16, 3e-15, ["equals its row up to round-off: largest relative difference 7.0e-16", "3e-15"], "NOT"),
+        (2e-3, 3e-15, ["NOT equal its row: largest relative difference 2.0e-03", "versions.json"], "its row up to"),
+        (np.inf, 0.1, ["NOT equal its row: it ends with another status", "1.0e-01; a loop that chatters"], "inf"),
+        (None, 0.0, ["no row of this trial yet"], "NOT"),
+    ],
+)
+def test_round_off_of_a_replay_is_no_difference(off, rounding, texts, absent):
+    text = " ".join(trials_report.replayed(off, rounding, 1e-12))
+    assert all(words in text for words in texts)
+    assert absent not in text
+
+
+def test_command_that_replays_the_worst_trial_can_be_pasted_into_a_shell():
+    rows = pl.DataFrame({"trial": [7], "window_error": [0.1]})
+    text = trials_report.how_to_replay(rows, Path("my out"), custom=True)
+    assert text.endswith("ptsmc replay 'my out' --trial 7 --trust")
+
+
+def test_best_pair_of_a_map_has_the_fewest_failed_trials():
+    pair = {"status": "flown", "failures": 0.0, "missed": 0.0, "window_error": 2e-6, "peak_torque": 0.3}
+    pairs = [
+        {**pair, "x": 1.0, "y": 1.0, "failures": 3.0, "window_error": 1e-6},
+        {**pair, "x": 1.0, "y": 2.0},
+        {**pair, "x": 2.0, "y": 1.0, "missed": 2.0, "window_error": 1e-6},
+        {**pair, "x": 2.0, "y": 2.0, "status": "not allowed", "window_error": float("nan")},
+    ]
+    keys = "loop.period", "controller.delta"
+    assert list(map_report.lines(pairs, keys, "spacecraft")) == [
+        "the smallest RMS error is 0.825 arcsec at loop.period = 1 and controller.delta = 2, with a mean peak torque "
+        "of 0.3 N m",
+        "3 of 4 pairs simulated, 2 of them with trials that failed or missed t_f",
+    ]
+    best, _ = map_report.lines(pairs[:1], keys, "spacecraft")
+    assert best.endswith("of 0.3 N m; 3 of its trials failed or missed t_f")

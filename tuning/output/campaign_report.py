@@ -1,0 +1,144 @@
+"""The report of a campaign: error, requirements, quantiles, and the inputs that drive the metrics."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import msgspec
+
+from ptsmc_jax.numerics import statistics
+from ptsmc_jax.simulation import catalogues
+from ptsmc_jax.simulation.catalogues import percent
+from tuning.output import pointing_report, report
+from tuning.output.formats import digits, error, listed, many, over_bound, ratio
+from tuning.output.report import Block, Report, Section, Table, Text
+from tuning.output.run_report import cautions
+from tuning.output.summaries import Campaign, Entry, Quantile
+
+WEAK = 0.05  # rank correlation or fraction of the variance below which an input is not named
+NOTES = {
+    "max": "Quantiles with 95 % intervals; a failed trial is beyond every quantile. -: so many trials fail or never "
+    "settle, or so few were simulated, that there is no value.",
+    "min": "Fractions of the time within a limit, larger is better: the value that 99.73 % of the trials reach, and "
+    "the smallest. A failed trial counts as 0.",
+}
+
+
+def of(summary: Campaign) -> Report:
+    """Return the report of a campaign."""
+    spacecraft = summary.plant == "spacecraft"
+    found = error(summary.quantiles["window_error"].rms, summary.plant)
+    first = "" if found == "-" else f"RMS {'pointing error' if spacecraft else 'error'} {found}"
+    headline, mood = report.headline(summary.status, summary.verdicts, first)
+    driven = list(drivers(summary))
+    blocks: list[Block] = [*quantiles(summary), *([Text(driven)] if driven else [])]
+    sections = [
+        *report.requirements(summary.verdicts, [f"{verdict(one)}{report.distance(one)}" for one in summary.verdicts]),
+        Section("Metrics", blocks),
+        *pointing_report.sections(summary),
+    ]
+    return Report(headline, mood, [*_bound(summary), *counts(summary), *cautions(summary.cautions)], sections)
+
+
+def verdict(entry: Entry) -> str:
+    """Return a verdict with the fraction of trials within the limit."""
+    text = str(entry)
+    if entry.share_of_time is not None or entry.share is None or entry.share_interval is None:
+        return text
+    low, high = entry.share_interval
+    text += f"; {percent(entry.share)} % of trials keep the limit (95 %: {percent(low)} to {percent(high)} %)"
+    if entry.quantile is not None and entry.confidence is not None and entry.share_bound is not None:
+        text += f", at least {percent(entry.share_bound)} % at {100 * entry.confidence:g} % one-sided confidence"
+        if entry.share > entry.quantile:
+            failures = "as many failures" if entry.failures else "no failure"
+            text += f"; {entry.fewest_trials} trials with {failures} are enough"
+    return text
+
+
+def _bound(summary: Campaign) -> Iterator[str]:
+    times = over_bound(summary.quantiles["window_error"].rms, summary.floor)
+    if times is not None:
+        yield f"{ratio(times)} times the lower bound of {error(summary.floor, summary.plant)} with these sensors"
+
+
+def counts(summary: Campaign) -> Iterator[str]:
+    """Return how the trials ended, and the reasons of failures."""
+    if summary.flown < summary.trials:
+        yield f"NOT finished: {summary.flown} of {summary.trials} trials are simulated"
+    for name in summary.unjudged:
+        yield f"NOT finished: {name} is required and not judged yet; run the same `ptsmc montecarlo` again"
+    source = f"the run table {summary.plan} and seed" if summary.plan else "seed"
+    yield f"{many(summary.flown, 'trial')} of {source} {summary.seed}: {listed(summary.counts)}"
+    for reason in summary.reasons:
+        first = "" if reason.first_bad_time is None else f", the first at {reason.first_bad_time:.4g} s"
+        yield f"  {reason.trials} {reason.status}: {reason.reason}{first}"
+    ended = {status: one for status, one in summary.controller_samples.items() if one.samples}
+    if ended:
+        each = (f"{one.samples} {status} in {many(one.trials, 'trial')}" for status, one in ended.items())
+        yield f"samples of the controller: {', '.join(each)}"
+    if summary.plan:
+        yield "fractions, quantiles and intervals assume random trials; they hold as far as the run table is random"
+
+
+def quantiles(summary: Campaign) -> list[Table]:
+    """Return the quantiles of every metric; metrics that are better when larger have a table of their own."""
+    heads = {"max": ("", "median", "99.73 %", "its 95 % interval", "largest", "unit"),
+             "min": ("", "median", "99.73 % reach", "its 95 % interval", "smallest", "unit")}  # fmt: skip
+    tables = [Table(head, _rows(summary, extreme), NOTES[extreme]) for extreme, head in heads.items()]
+    return [table for table in tables if table.rows]
+
+
+def _rows(summary: Campaign, extreme: str) -> list[tuple[str, ...]]:
+    """Return the rows of the metrics whose bad end is "max" or "min"."""
+    rows: list[tuple[str, ...]] = []
+    units = catalogues.units(summary.plant)
+    failed = sum(count for status, count in summary.counts.items() if status not in ("ok", "missed"))
+    for name, found in summary.quantiles.items():
+        far: Quantile | None = found.high if extreme == "max" else found.low
+        if pointing_report.is_index(name) or far is None:
+            continue
+        never = found.without_value > failed  # such as runs that end but never settle
+        largest = "none" if never else digits(getattr(found, extreme), ".3g")
+        between = f"{digits(far.low, '.3g')}..{digits(far.high, '.3g')}"
+        values = (digits(found.median.value, ".3g"), digits(far.value, ".3g"))
+        rows.append((name, *values, between, largest, units.get(name, "")))
+    return rows
+
+
+def drivers(summary: Campaign) -> Iterator[str]:
+    """Return the inputs that drive the error and the required metrics by more than chance."""
+    for name in dict.fromkeys(("window_error", *(one.metric for one in summary.verdicts))):
+        known = summary.drivers.get(name, {})
+        strength: dict[str, float] = {}
+        for key, driver in known.items():
+            entries = msgspec.structs.asdict(driver)
+            if statistics.beyond_chance(entries, summary.driver_trials[name]):
+                strength[key] = max(abs(v) for v in entries.values() if v is not None)
+        strongest = sorted((key for key in strength if strength[key] >= WEAK), key=lambda key: -strength[key])[:3]
+        texts = []
+        for key in strongest:
+            rank, explained = known[key].rank_correlation, known[key].first_order or 0.0
+            correlation = "" if rank is None else f"rank correlation {rank:+.2f}, "  # none for the number of a wheel
+            texts.append(f"{key} ({correlation}{100 * explained:.0f} % of the variance of the ranks)")
+        if texts:
+            yield f"{name} is driven by {', '.join(texts)}"
+
+
+def gains(scenario: dict[str, Any], plant: str) -> Table:
+    """Return the law, observer and filter of a scenario's tables with their gains; plant: its kind."""
+    from ptsmc_jax.scenario import keys
+    from ptsmc_jax.scenario.layouts import SCENARIOS
+
+    rows: list[tuple[str, ...]] = []
+    for table in ("controller", "observer", "filter", "sensors"):
+        given = scenario.get(table, {})
+        custom = given.get("kind") == "own"  # its class, which reading does not run, has the units
+        kinds: Any = SCENARIOS[plant].TABLES.get(table, {})
+        struct = kinds.get(given.get("kind"))
+        units = {key.name: key.unit for key in keys.of(struct)} if struct else {}
+        for key, value in given.items():
+            numbers = value if isinstance(value, list) else [value]
+            each = [f"{one:.6g}" if isinstance(one, float | int) else str(one) for one in numbers]
+            text = f"{each[0]} each" if len(each) > 1 and len(set(each)) == 1 else ", ".join(each)
+            unit = "" if custom and key not in ("t_f", "delta") else (units.get(key) or "").replace("-", "")
+            rows.append((f"{table}.{key}", text, unit))
+    return Table(("key", "value", "unit"), rows)

@@ -1,0 +1,260 @@
+"""The report of a comparison of laws: a table and a chart for each question."""
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+from ptsmc_jax.simulation.catalogues import MARGINS
+from tuning.output import page_charts
+from tuning.output.formats import digits, failed, listed, many, over_bound, pointing, ratio
+from tuning.output.report import Chart, Report, Section, Table, Text
+from tuning.output.run_report import cautions
+from tuning.output.summaries import Compare, Entry, Interval, Law, Number
+
+ARCSEC = math.degrees(1.0) * 3600.0
+
+
+@dataclass(frozen=True)
+class Value:
+    """One number of each law: a column of a table, a series of a chart."""
+
+    name: str
+    unit: str
+    of: Callable[[Law], Number]
+    digits: str = ".3g"
+    interval: Callable[[Law], Interval] = lambda law: None  # 95 %
+
+
+@dataclass(frozen=True)
+class Question:
+    """A question to all laws, and the numbers that answer it."""
+
+    title: str
+    values: tuple[Value, ...]
+    drawn: int  # number of values in the chart, all in one unit
+    logarithmic: bool = True
+    note: str = ""
+    judged: bool = False  # the table has the requirements too
+    what: str = ""  # label of the chart's axis if it shows several values
+    limit: str = ""  # metric whose limit the chart shows
+
+
+def _angle(error: Number) -> Number:
+    """Return a window error |v| as an angle [arcsec]."""
+    return None if error is None else ARCSEC * pointing(error)
+
+
+def _angles(bounds: Interval) -> Interval:
+    return None if bounds is None else (ARCSEC * pointing(bounds[0]), ARCSEC * pointing(bounds[1]))
+
+
+def _untold(name: str, change: str) -> Value:
+    """Return the error with a change that the law does not know, a key of `CHANGES`."""
+    return Value(
+        name,
+        "arcsec",
+        lambda law: _angle(law.untold[change].window_error) if change in law.untold else None,
+        interval=lambda law: _angles(law.untold[change].window_error_interval) if change in law.untold else None,
+    )
+
+
+def _hold(name: str) -> Value:
+    """Return a margin of the nominal loop in the hold phase; if it is required, the worst of the dispersed loops."""
+
+    def of(law: Law) -> Number:
+        verdict = next((one for one in law.verdicts if one.metric == name), None)
+        if verdict is not None:
+            return math.inf if verdict.worst is None and not verdict.failures else verdict.worst
+        if law.margins is None or "hold" not in law.margins:
+            return None
+        left = law.margins["hold"].numbers[name]
+        return math.inf if left is None else left  # null is unlimited
+
+    return Value(name.removesuffix("_margin"), MARGINS[name].unit, of)
+
+
+ERROR = Value(
+    "RMS pointing error", "arcsec", lambda law: _angle(law.window_error),
+    interval=lambda law: _angles(law.window_error_interval),
+)  # fmt: skip
+BOUND = Value("ratio to the lower bound", "", lambda law: over_bound(law.window_error, law.floor))
+CHANGES = {
+    "heavier": "an inertia 10 % larger than the law knows",
+    "lighter": "an inertia 10 % smaller than the law knows",
+    "later": "one more control period of delay than the law knows",
+}
+QUESTIONS = (
+    Question(
+        "How accurate?", (ERROR, BOUND), 1, judged=True,
+        note="Bars are 95 % intervals; the dotted line is the lower bound.",
+    ),
+    Question(
+        "How much torque?",
+        (
+            Value("mean peak", "N m", lambda law: law.peak_torque),
+            Value("largest", "N m", lambda law: law.largest_peak_torque),
+        ),
+        2,
+        what="peak torque",
+        limit="peak_torque",
+    ),
+    Question("How much is spent?", (Value("mean effort", "N m s", lambda law: law.effort),), 1),
+    Question("How much does it chatter?", (Value("mean chattering", "N m/s", lambda law: law.chattering),), 1),
+    Question(
+        "When has it settled?",
+        (
+            Value("median", "s", lambda law: (law.settling_time or {}).get("0.5"), ".1f"),
+            Value("nearest fifth", "s", lambda law: (law.settling_near_far or (None, None))[0], ".1f"),
+            Value("farthest fifth", "s", lambda law: (law.settling_near_far or (None, None))[1], ".1f"),
+            Value("never", "trials", lambda law: law.unsettled, "d"),
+        ),
+        3,
+        logarithmic=False,
+        what="settling time",
+        note="Medians over all trials, and over the fifths of the trials that start nearest to and farthest from the "
+        "reference.",
+    ),
+    Question(
+        "What margins are left?",
+        tuple(_hold(name) for name in MARGINS),
+        1,
+        logarithmic=False,
+        limit="gain_margin",
+        note="Margins of the nominal loop in the hold phase, at its worst input. A required margin is the worst of the "
+        "dispersed loops, in the hold phase and the judged part of the approach phase. Below 0 the loop is unstable. "
+        "The chart shows the gain margin.",
+    ),
+    Question(
+        "What if the model is wrong?",
+        (
+            dataclasses.replace(ERROR, name="as modelled"),
+            _untold("inertia + 10 %", "heavier"),
+            _untold("inertia - 10 %", "lighter"),
+            _untold("a period later", "later"),
+        ),
+        4,
+        what="RMS pointing error",
+        note="The same gains and trials, with another inertia or delay than the law knows. Bars are 95 % intervals.",
+    ),
+)  # fmt: skip
+
+
+def of(summary: Compare) -> Report:
+    """Return the report of a comparison; it has the charts that the page draws."""
+    headline = {
+        "met": "The tuned law of the paper meets every requirement",
+        "not met": "The tuned law of the paper does NOT meet every requirement",
+    }.get(summary.status, "Interrupted: the best result so far")
+    sections = [
+        Section(question.title, [_chart(question, summary.laws, k), table(question, summary.laws)])
+        for k, question in enumerate(QUESTIONS)
+        if any(value.of(law) is not None for value in question.values for law in summary.laws.values())
+    ]
+    how = (
+        "the same search tuned each law in all of its gains, the scenario's own law in those of tune.free; results on "
+        f"{many(summary.trials, 'held-out trial')}, {summary.judged_on}"
+    )
+    sections.append(Section("Gains", [Text(list(lines(summary)))]))
+    mood = "good" if summary.status == "met" else "bad"
+    return Report(headline, mood, [winner(summary.laws), how, *cautions(summary.cautions)], sections)
+
+
+def _chart(question: Question, laws: dict[str, Law], k: int) -> Chart:
+    shown = question.values[: question.drawn]
+    series = {
+        value.name: ([value.of(law) for law in laws.values()], [value.interval(law) for law in laws.values()])
+        for value in shown
+    }
+    axis = f"{question.what or shown[0].name} [{shown[0].unit}]"
+    figure = page_charts.laws(list(laws), series, axis, marks(question, list(laws.values())), question.logarithmic)
+    return Chart(f"question_{k}", figure, question.note)
+
+
+def marks(question: Question, laws: list[Law]) -> dict[str, float]:
+    """Return the lines of a chart: the smallest lower bound of the laws, or a required limit."""
+    if question.judged:
+        bounds = [bound for law in laws if (bound := _angle(law.floor))]
+        return {"lower bound": min(bounds)} if bounds else {}
+    limits = {verdict.metric: verdict.limit for law in laws for verdict in law.verdicts}
+    return {"limit": limits[question.limit]} if question.limit in limits else {}
+
+
+def table(question: Question, laws: dict[str, Law]) -> Table:
+    """Return the answers to a question, a law each row."""
+    columns = [value for value in question.values if any(value.of(law) is not None for law in laws.values())]
+    first = columns[0]
+    head = [f"{value.name} [{value.unit}]" if value.unit else value.name for value in columns]
+    with_interval = question.judged and any(first.interval(law) for law in laws.values())
+    required = list(dict.fromkeys(verdict.metric for law in laws.values() for verdict in law.verdicts))
+    rows = []
+    for name, law in laws.items():
+        cells = [cell(value, law) for value in columns]
+        if with_interval:
+            bounds = first.interval(law)
+            cells.insert(1, "-" if bounds is None else f"{ratio(bounds[0])} to {ratio(bounds[1])}")
+        if question.judged:
+            beyond = {verdict.metric: _beyond(verdict) for verdict in law.verdicts}
+            cells += [*(beyond.get(metric, "-") for metric in required), "yes" if law.met else "no"]
+        rows.append((_name(name), *cells))
+    if with_interval:
+        head.insert(1, "95 % interval")
+    if question.judged:
+        head += [*(f"trials beyond {metric}" for metric in required), "all limits met"]
+    return Table(("", *head), rows)
+
+
+def _beyond(verdict: Entry) -> str:
+    return f"{verdict.failures} of {verdict.trials}" + ("" if verdict.met else ": NOT met")
+
+
+def cell(value: Value, law: Law) -> str:
+    """Return the number of a law as text."""
+    number = value.of(law)
+    if number is not None and math.isinf(number):
+        return "unlimited"
+    return ratio(number) if value.digits == ".3g" else digits(number, value.digits)
+
+
+def lines(summary: Compare) -> Iterator[str]:
+    """Return the gains of each law, its failed trials, and the limits that it breaks."""
+    if summary.status == "interrupted":
+        yield (
+            f"interrupted while {_name(list(summary.laws)[-1])} was tuned: its gains are the best so far, and the "
+            "other laws are missing; the same command resumes the search"
+        )
+    if summary.paper_refused:
+        yield f"the published gains cannot be simulated in this scenario: {summary.paper_refused}"
+    for name, law in summary.laws.items():
+        gains = ", ".join(f"{gain} {value:.4g}" for gain, value in law.gains.items())
+        bound = "".join(f"; {gain} on its {side} bound" for gain, side in law.at_bound.items())
+        scaled = ", scaled to this body and period" if (name, summary.paper_is) == ("paper", "paper, scaled") else ""
+        yield f"gains of {_name(name)}{scaled}: {gains}{bound}"
+        lost = failed(law.counts)
+        if lost:
+            yield f"  {sum(lost.values())} of {summary.trials} trials fail: {listed(lost)}"
+        yield from (f"  {verdict}" for verdict in law.verdicts if not verdict.met)
+        for change, results in law.untold.items():
+            if results.lost:
+                yield f"  {results.lost} of {summary.trials} trials fail with {CHANGES[change]}"
+    yield f"a trial has settled when its angle stays below {summary.settling_angle:g} rad"
+
+
+def winner(laws: dict[str, Law]) -> str:
+    """Return the most accurate law that meets every requirement, and the ratio of the paper's law to it."""
+    errors = {name: error for name, law in laws.items() if law.met and (error := _angle(law.window_error)) is not None}
+    if not errors:
+        return "no law meets every requirement"
+    best, ours = min(errors, key=errors.__getitem__), "prescribed_time"
+    behind = ""
+    if ours in errors and best != ours:
+        theirs = f"{errors[ours] / errors[best]:.3g} times as much" if errors[best] else f"{errors[ours]:.3g} arcsec"
+        behind = f"; {_name(ours)} has {theirs}"
+    return (
+        f"{_name(best)} has the smallest RMS pointing error of the laws that meet every requirement, "
+        f"{errors[best]:.3g} arcsec{behind}"
+    )
+
+
+def _name(law: str) -> str:
+    return law.replace("_", " ")

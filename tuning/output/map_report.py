@@ -1,0 +1,55 @@
+"""The report of a map over two keys of a scenario."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from tuning.output.formats import digits, error, number, valued, with_unit
+from tuning.output.report import Report, Section, Table
+
+NOTE = (
+    "linear_window_error and linear_torque are predictions of linear theory for the noise alone, with explicit "
+    "sampling. radius, gain_margin and delay_margin belong to the loop at the hand-over with frozen gains, hold_radius "
+    "and the others with hold_ to the hold phase. The loop is stable up to a radius of 1. gain_margin is the factor on "
+    "the gain up to which the loop is stable; below 1 it is unstable."
+)
+
+
+def of(head: Sequence[str], rows: Sequence[Sequence[str]], plant: str) -> Report:
+    """Return the report of a map.csv for this kind of plant; the first two columns are the keys."""
+    pairs = [dict(zip(("x", "y", *head[2:]), map(number, row), strict=True)) for row in rows]
+    first, *others = lines(pairs, (head[0], head[1]), plant)
+    cells = [tuple(_short(cell) for cell in row) for row in rows]
+    table = Table(tuple(with_unit(name, plant) for name in head), cells, NOTE)
+    return Report(first[0].upper() + first[1:], "calm", others, [Section("Pairs", [table])])
+
+
+def lines(pairs: Sequence[Mapping[str, Any]], keys: tuple[str, str], plant: str) -> Iterator[str]:
+    """Return the best pair and the number of pairs that were simulated.
+
+    Args:
+        pairs: the rows of a map by column; x and y are the values of the keys.
+        keys: across and up.
+        plant: its kind.
+    """
+    simulated = [pair for pair in pairs if pair["status"] == "flown"]
+    with_error = [pair for pair in simulated if pair["window_error"] == pair["window_error"]]  # not NaN
+    if with_error:
+        best = min(with_error, key=lambda pair: (_lost(pair), pair["window_error"]))
+        failed = f"; {_lost(best):.0f} of its trials failed or missed t_f" if _lost(best) else ""
+        peak = valued(best["peak_torque"], "peak_torque", plant)
+        yield (
+            f"the smallest RMS error is {error(best['window_error'], plant)} at {keys[0]} = {best['x']:.4g} and "
+            f"{keys[1]} = {best['y']:.4g}, with a mean peak torque of {peak}{failed}"
+        )
+    lost = sum(_lost(pair) > 0 for pair in simulated)
+    yield f"{len(simulated)} of {len(pairs)} pairs simulated, {lost} of them with trials that failed or missed t_f"
+
+
+def _lost(pair: Mapping[str, Any]) -> float:
+    """Return the number of trials of a pair that failed or missed t_f."""
+    return pair["failures"] + pair["missed"]
+
+
+def _short(cell: str) -> str:
+    value = number(cell)
+    return cell if isinstance(value, str) or not cell else digits(value, ".4g", "")

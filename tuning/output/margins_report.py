@@ -1,0 +1,152 @@
+"""The report of the margins of the nominal loop, also for tuned gains."""
+
+from collections.abc import Iterator, Mapping
+
+from ptsmc_jax.simulation.catalogues import MARGINS
+from tuning.output.formats import digits
+from tuning.output.report import Report, Section, Table
+from tuning.output.summaries import Left, Margins, Numbers, Swing
+
+ENOUGH = {"gain_margin": 6.0, "phase_margin": 30.0}  # usual requirements
+PHASES = {"hold": "hold phase", "before": "approach phase"}
+COLUMNS = {
+    "gain_up": "gain up",
+    "gain_down": "down [dB]",
+    "phase": "phase [deg]",
+    "delay": "delay [s]",
+    "modulus": "|S| [dB]",
+}
+
+
+def of(summary: Margins) -> Report:
+    """Return the report of `ptsmc margins`."""
+    unstable = any(loop.judged and not loop.stable for loop in summary.before)
+    if summary.open:
+        headline, mood = "The nominal loop is open in the hold phase", "bad"
+    elif not summary.stable:
+        headline, mood = "The nominal loop is NOT stable in the hold phase", "bad"
+    elif unstable:
+        headline, mood = f"Stable in the hold phase, NOT stable in the approach phase: {shown(summary.worst)}", "bad"
+    else:
+        headline, mood = f"The nominal loop is stable: {shown(summary.worst)}", "calm"
+    return Report(headline, mood, list(_lines(summary)), [Section("Margins in the hold phase", [table(summary)])])
+
+
+def table(summary: Margins) -> Table:
+    """Return the margins in the hold phase at each input alone, at all inputs, and at each measured state."""
+
+    def row(where: str, margins: Numbers, none: str = "none") -> tuple[str, ...]:
+        return where, *(digits(margins[name], ".3g", none) if name in margins else "-" for name in COLUMNS)
+
+    rows = [row(f"input {name}", margins) for name, margins in summary.hold.items()]
+    rows.append(row("all inputs", summary.together, "none" if summary.stable else "-"))
+    rows += [row(name, margins) for name, margins in summary.sensors.items()]
+    return Table(("loop opened at", *COLUMNS.values()), rows, "none: the margin is unlimited.")
+
+
+def _lines(summary: Margins) -> Iterator[str]:
+    """Return what limits the meaning of the margins."""
+    if summary.stable and not summary.open:
+        yield "these are the smallest margins at any input, in the hold phase and the judged approach phase"
+    if summary.swing is not None:
+        yield swinging(summary.swing)
+    if summary.start_deg is not None:
+        yield f"the nominal run starts {summary.start_deg:.4g} deg from the reference; change [initial] for another"
+    if summary.missed:
+        yield "the nominal run misses t_f, so its loop in the hold phase is not at the reference"
+    if summary.dispersed is not None:
+        yield (
+            "the nominal loop has no dispersions; ptsmc tune and montecarlo judge required margins by the worst of "
+            f"{summary.dispersed} dispersed loops"
+        )
+    for judged, caveat in (
+        (True, ""), (False, "; there the gains change too fast for frozen gains to mean much"),
+    ):  # fmt: skip
+        times = sorted(loop.time_to_go for loop in summary.before if not loop.stable and loop.judged == judged)
+        if times:
+            yield f"in the approach phase, the loop with frozen gains is unstable at {_span(times)}{caveat}"
+    yield from _openings(summary)
+    if summary.said:
+        yield summary.said
+
+
+def _openings(summary: Margins) -> Iterator[str]:
+    """Return the inputs at which the loop is open, and the reason."""
+    for by_limit, reason in (
+        (True, "a limit of the actuators cuts the command of the nominal run"),
+        (False, "the controller does not react to the state at this sample"),
+    ):
+
+        def opened(names: list[str], cut: list[str], by_limit: bool = by_limit) -> list[str]:
+            return [name for name in names if (name in cut) == by_limit]
+
+        inputs = opened(summary.open, summary.cut)
+        places = {"in the hold phase": inputs}
+        loops = {loop.time_to_go: opened(loop.open, loop.cut) for loop in summary.before}
+        times = sorted(time for time, names in loops.items() if names)
+        if times:
+            inputs = list(dict.fromkeys(name for names in loops.values() for name in names))
+            places[f"in the approach phase, at {_span(times)}"] = inputs
+        for where, names in places.items():
+            if names:
+                yield (
+                    f"the loop is open at input {', '.join(names)} {where}: {reason}; unlimited margins do not apply "
+                    "to the neighbouring samples"
+                )
+
+
+def _span(times: list[float]) -> str:
+    """Return times to go [s], in ascending order, as text."""
+    span = f"{times[0]:.3g}" if len(times) == 1 else f"{len(times)} samples from {times[0]:.3g} to {times[-1]:.3g}"
+    return f"{span} s to go"
+
+
+def tuned(margins: Mapping[str, Left] | None, *, required: bool) -> Iterator[str]:
+    """Return the margins of tuned gains, and a warning if they are smaller than usual.
+
+    Args:
+        margins: the smallest of each phase, see `stability.worst`.
+        required: a margin is among the requirements.
+    """
+    short = False
+    for where, phase in PHASES.items():
+        left = (margins or {}).get(where)
+        if left is None:
+            continue
+        if left.swing is not None or not left.stable:
+            short = True
+            yield f"the nominal loop is NOT stable in the {phase}" if left.swing is None else swinging(left.swing)
+            continue
+        yield f"margins of the nominal loop in the {phase}: {shown(left.numbers)}"
+        few = [
+            f"{enough:g} {MARGINS[name].unit} of {_short(name)}"
+            for name, enough in ENOUGH.items()
+            if (value := left.numbers[name]) is not None and value < enough
+        ]
+        if few:
+            short = True
+            yield f"less than {' and '.join(few)} in the {phase}: errors of the model may make the loop unstable"
+    if short and not required:
+        more = " and ".join(f"requirements.{name} = {enough:g}" for name, enough in ENOUGH.items())
+        yield f"for larger margins, tune with {more}; ptsmc pareto --against margins shows their cost"
+
+
+def swinging(swing: Swing) -> str:
+    """Return the description of a limit cycle in the hold phase."""
+    return (
+        "the nominal run does NOT come to rest in the hold phase, so its margins count as zero: without noise and "
+        f"disturbance its command oscillates by {swing.size:.3g} {swing.unit} every {swing.periods:.3g} control "
+        "periods; the boundary layer is too thin for the period, or the gains are at the stability limit"
+    )
+
+
+def shown(margins: Numbers) -> str:
+    """Return the margins that are limited as text."""
+    limited = {name: margins.get(name) for name in MARGINS}
+    return ", ".join(
+        f"{_short(name)} {value:.3g} {MARGINS[name].unit}" for name, value in limited.items() if value is not None
+    )
+
+
+def _short(name: str) -> str:
+    return "max |S|" if name == "modulus_margin" else name.removesuffix("_margin")

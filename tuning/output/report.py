@@ -1,0 +1,152 @@
+"""The content of a result for its readers: a headline, lines, and sections. The terminal and the page render it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+from tuning.output.formats import ratio
+from tuning.output.summaries import Entry
+
+
+@dataclass(frozen=True)
+class Table:
+    """Cells as text. The first column names the row."""
+
+    head: tuple[str, ...]
+    rows: list[tuple[str, ...]]
+    note: str = ""
+
+    kind: ClassVar[str] = "table"
+
+    @property
+    def shape(self) -> str:
+        """Return "numbers" if the last column contains numbers; columns of marks have no heading."""
+        numbers = bool(self.head[-1]) and all(row[-1][:1] and row[-1][:1] in "-0123456789" for row in self.rows)
+        return "numbers" if numbers else ""
+
+
+@dataclass(frozen=True)
+class Text:
+    """Lines of text."""
+
+    lines: list[str]
+
+    kind: ClassVar[str] = "text"
+
+
+@dataclass(frozen=True)
+class Bars:
+    """Requirements, each with a bar relative to its limit."""
+
+    verdicts: list[Entry]
+    texts: list[str]
+    note: str = "The line is the limit; a bar that ends before it keeps the limit."
+
+    kind: ClassVar[str] = "bars"
+
+    @property
+    def bars(self) -> list[dict[str, Any]]:
+        """Return labels, texts and widths; the limit is at 300 of 400."""
+        return [
+            {"label": entry.metric.replace("_", " "), "text": text, "met": entry.met, "limit": 300,
+             "width": round(min(400.0, 300.0 * nearness(entry)), 1)}
+            for entry, text in zip(self.verdicts, self.texts, strict=True)
+        ]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A chart of the page, as Plotly's JSON."""
+
+    name: str
+    figure: dict[str, Any]
+    caption: str
+    shape: str = ""
+
+    kind: ClassVar[str] = "chart"
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure of the result folder."""
+
+    alt: str
+    source: str
+    caption: str
+
+    kind: ClassVar[str] = "picture"
+
+
+@dataclass(frozen=True)
+class Code:
+    """Text that is printed as it is."""
+
+    text: str
+    note: str = ""
+
+    kind: ClassVar[str] = "code"
+
+
+Block = Table | Text | Bars | Chart | Picture | Code
+
+
+@dataclass(frozen=True)
+class Section:
+    """A heading and its blocks."""
+
+    title: str
+    blocks: list[Block]
+
+
+@dataclass(frozen=True)
+class Report:
+    """A result: what decides first, then its sections."""
+
+    headline: str
+    mood: str  # good, bad or calm
+    lines: list[str]
+    sections: list[Section] = field(default_factory=list)
+
+
+HEADLINES = {
+    "met": "every requirement is met",
+    "not met": "NOT every requirement is met",
+    "interrupted": "interrupted: the best result so far",
+    "unfinished": "NOT finished",
+    "ok": "the run reached its end",
+}
+
+
+def headline(status: str, verdicts: Sequence[Entry], first: str = "") -> tuple[str, str]:
+    """Return the headline and its mood.
+
+    Args:
+        status: of the summary.
+        verdicts: on the requirements.
+        first: the number that the user decides by, with its name; empty: there is none.
+    """
+    text = HEADLINES.get(status, f"the run failed: {status}")
+    if not verdicts and status in ("met", "not met"):
+        text = "every trial reached its end" if status == "met" else "NOT every trial reached its end"
+    mood = {"met": "good", "ok": "calm"}.get(status, "bad")
+    mood = "calm" if mood == "good" and not verdicts else mood
+    return f"{first}: {text}" if first else text[0].upper() + text[1:], mood
+
+
+def requirements(verdicts: Sequence[Entry], texts: Sequence[str]) -> list[Section]:
+    """Return the section of the requirements, none without any; texts: the verdicts in words."""
+    return [Section("Requirements", [Bars(list(verdicts), list(texts))])] if verdicts else []
+
+
+def nearness(entry: Entry) -> float:
+    """Return the deciding value relative to the limit; infinite if a trial has no value."""
+    return float("inf") if entry.margin is None else entry.margin
+
+
+def distance(entry: Entry) -> str:
+    """Return the deciding value in per cent of the limit; empty if there is none."""
+    if entry.margin is None or entry.at_least or entry.limit == 0.0:
+        return ""
+    if entry.share_of_time is not None:
+        return f"; {ratio(100 * entry.margin)} % of the time allowed beyond the limit"
+    return f"; {ratio(100 * entry.margin)} % of the limit"

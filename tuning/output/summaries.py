@@ -1,0 +1,397 @@
+"""Typed views of `summary.json`: the fields that the terminal and the page show, by command.
+
+A number that does not exist or is not finite is None, null in the file.
+"""
+
+from collections.abc import Mapping
+from typing import Any, TypeVar
+
+import msgspec
+
+from ptsmc_jax.campaigns import store
+from ptsmc_jax.simulation.catalogues import CATALOGUE, CATALOGUES, MARGINS
+from ptsmc_jax.simulation.requirements import Verdict
+
+Number = float | None
+Numbers = dict[str, Number]
+Interval = tuple[float, float] | None
+T = TypeVar("T")
+
+
+class Entry(msgspec.Struct, frozen=True):
+    """The verdict on a requirement over some trials, see `requirements.Verdict`."""
+
+    metric: str
+    limit: float
+    unit: str
+    worst: Number
+    margin: Number
+    failures: int
+    trials: int
+    met: bool
+    quantile: Number = None
+    confidence: Number = None
+    at_least: bool = False
+    interpretation: str = "ensemble"
+    share_of_time: Number = None
+    shown: Number = None
+    # of a campaign: the fraction of trials within the limit, its interval, its lower bound, and enough trials
+    share: Number = None
+    share_interval: Interval = None
+    share_bound: Number = None
+    fewest_trials: int | None = None
+
+    def __str__(self) -> str:
+        """Return the verdict in one line."""
+        return str(Verdict.read(msgspec.structs.asdict(self)))
+
+
+class Run(msgspec.Struct, frozen=True, kw_only=True):
+    """The summary of `ptsmc simulate`."""
+
+    status: str
+    reason: str
+    bad_time: Number
+    floor: Number
+    metrics: Numbers
+    verdicts: list[Entry]
+    cautions: list[str]
+    controller_statuses: dict[str, int] = {}
+
+
+class Statistics(msgspec.Struct, frozen=True):
+    """A metric over the trials that ended."""
+
+    mean: Number
+    rms: Number
+    max: Number
+    rms_interval: Interval = None
+
+
+class Group(msgspec.Struct, frozen=True):
+    """Some gains and their trials."""
+
+    trials: int
+    counts: dict[str, int]
+    metrics: dict[str, Statistics | None]
+    gains: dict[str, float] = {}
+    floor: Number = None
+
+    def number(self, metric: str, statistic: str) -> Number:
+        """Return a statistic of a metric; None without trials that have it."""
+        found = self.metrics.get(metric)
+        return None if found is None else getattr(found, statistic)
+
+
+class Earlier(msgspec.Struct, frozen=True):
+    """A search whose gains broke a limit on held-out trials."""
+
+    fresh_seed: int
+    margins: dict[str, float]
+    over: dict[str, float]
+
+
+class Confirmed(msgspec.Struct, frozen=True):
+    """The confirmation of a requirement on a fraction of the trials."""
+
+    metric: str
+    held: bool
+    trials: int
+    beyond: int
+    allowed: int | None
+    probability: float
+
+
+class Hardest(msgspec.Struct, frozen=True):
+    """The worst case found inside the dispersions."""
+
+    metric: str
+    ratio: Number
+    unbounded: bool
+    beyond: bool
+    moved: list[str]
+    status: str
+
+
+class Search(msgspec.Struct, frozen=True, kw_only=True):
+    """The record of a search."""
+
+    largest_over_limit: Numbers
+    conflict: Numbers | None
+    searched_globally: bool
+    margins: dict[str, float]
+    earlier: list[Earlier]
+    confirmed: list[Confirmed]
+    hardest: Hardest | None
+    worst_case: bool
+    averaged: int
+    rollouts: int
+    gradients: int
+    seconds: float
+    seconds_by_step: dict[str, float]
+
+
+class Swing(msgspec.Struct, frozen=True):
+    """A limit cycle in the hold phase."""
+
+    size: float
+    unit: str
+    periods: float
+
+
+class Left(msgspec.Struct, frozen=True):
+    """The smallest margins of a phase of the nominal loop; None: unlimited."""
+
+    stable: bool
+    gain_margin: Number
+    phase_margin: Number
+    delay_margin: Number
+    modulus_margin: Number
+    swing: Swing | None = None
+
+    @property
+    def numbers(self) -> Numbers:
+        """Return the margins by name."""
+        return {name: getattr(self, name) for name in MARGINS}
+
+
+class Trust(msgspec.Struct, frozen=True):
+    """The diagnostics of a tuning result."""
+
+    influence: dict[str, str]
+    margins: dict[str, Left] | None
+    slopes_off_central_differences: Numbers | None
+
+
+class Check(msgspec.Struct, frozen=True):
+    """The result of differential evolution."""
+
+    value: float
+    distance: float
+    kept: bool
+    rollouts: int
+
+
+class Tune(msgspec.Struct, frozen=True, kw_only=True):
+    """The summary of `ptsmc tune`."""
+
+    status: str
+    plant: str
+    gain_units: dict[str, str]
+    gains: dict[str, float]
+    at_bound: dict[str, str]
+    accuracy_gain_over_paper: Number
+    accuracy_gain_interval: Interval
+    training: Group
+    fresh: Group
+    paper: Group | None = None
+    before: Group | None = None
+    paper_refused: str | None
+    paper_is: str
+    shortest_t_f: dict[str, Any] | None
+    broken_by: dict[str, list[str]]
+    verdicts: list[Entry]
+    judged_on: str
+    cautions: list[str]
+    search: Search
+    trust: Trust | None
+    differential_evolution: Check | None
+
+
+class Changed(msgspec.Struct, frozen=True):
+    """A law with an inertia or a delay that it does not know."""
+
+    window_error: Number
+    window_error_interval: Interval
+    lost: int
+
+
+class Law(msgspec.Struct, frozen=True, kw_only=True):
+    """A law of a comparison."""
+
+    gains: dict[str, float]
+    at_bound: dict[str, str]
+    met: bool
+    counts: dict[str, int]
+    window_error: Number
+    window_error_interval: Interval
+    floor: Number
+    peak_torque: Number
+    largest_peak_torque: Number
+    effort: Number
+    chattering: Number
+    unsettled: int
+    settling_time: Numbers | None
+    settling_near_far: tuple[Number, Number] | None
+    margins: dict[str, Left] | None
+    untold: dict[str, Changed]
+    verdicts: list[Entry]
+
+
+class Compare(msgspec.Struct, frozen=True):
+    """The summary of `ptsmc compare`."""
+
+    status: str
+    trials: int
+    paper_refused: str | None
+    paper_is: str | None
+    judged_on: str
+    settling_angle: float
+    laws: dict[str, Law]
+    cautions: list[str]
+
+
+class Quantile(msgspec.Struct, frozen=True):
+    """A quantile and its interval."""
+
+    value: Number
+    low: Number
+    high: Number
+
+
+class Quantiles(msgspec.Struct, frozen=True):
+    """A metric over the trials of a campaign."""
+
+    without_value: int
+    median: Quantile = msgspec.field(name="0.5")
+    high: Quantile | None = msgspec.field(name="0.9973", default=None)
+    low: Quantile | None = msgspec.field(name="0.0027", default=None)  # of a metric that is better when larger
+    rms: Number = None
+    max: Number = None
+    min: Number = None
+
+
+class Reason(msgspec.Struct, frozen=True):
+    """The reason why trials failed."""
+
+    status: str
+    reason: str
+    trials: int
+    first_bad_time: Number
+
+
+class Driver(msgspec.Struct, frozen=True):
+    """The relation of a metric to an input, see `statistics.drivers`."""
+
+    rank_correlation: Number
+    first_order: Number
+
+
+class Samples(msgspec.Struct, frozen=True):
+    """Samples of the controller that ended with a status."""
+
+    samples: int
+    trials: int
+
+
+class Pointing(msgspec.Struct, frozen=True):
+    """The pointing budget of a campaign."""
+
+    boresight: list[float]
+    window: float
+    after: float
+    probability: float
+    confidence: float
+    budget: dict[str, Numbers]
+
+
+class Campaign(msgspec.Struct, frozen=True, kw_only=True):
+    """The summary of `ptsmc montecarlo`."""
+
+    status: str
+    plant: str
+    seed: int
+    plan: str | None
+    trials: int
+    flown: int
+    unjudged: list[str]
+    counts: dict[str, int]
+    reasons: list[Reason]
+    floor: Number
+    verdicts: list[Entry]
+    quantiles: dict[str, Quantiles]
+    drivers: dict[str, dict[str, Driver]]
+    driver_trials: dict[str, int]
+    controller_samples: dict[str, Samples] = {}
+    pointing: Pointing | None = None
+    cautions: list[str]
+
+
+class Frozen(msgspec.Struct, frozen=True):
+    """The loop before the hand-over with its gains frozen."""
+
+    time_to_go: float
+    judged: bool
+    stable: bool
+    open: list[str]
+    cut: list[str]
+
+
+class Margins(msgspec.Struct, frozen=True, kw_only=True):
+    """The summary of `ptsmc margins`."""
+
+    stable: bool
+    open: list[str]  # inputs with an open loop
+    cut: list[str]  # those where a limit of the actuators opens it
+    worst: Numbers
+    hold: dict[str, Numbers]
+    together: Numbers
+    sensors: dict[str, Numbers]
+    before: list[Frozen]
+    missed: bool = False
+    dispersed: int | None = None
+    said: str | None
+    start_deg: Number = None
+    swing: Swing | None = None
+
+
+class Claim(msgspec.Struct, frozen=True):
+    """A claim of the paper."""
+
+    verdict: str
+    where: str
+    claim: str
+    measured: str
+
+
+class Slip(msgspec.Struct, frozen=True):
+    """An error of the paper."""
+
+    where: str
+    correct: str
+    shown: str
+
+
+class Paper(msgspec.Struct, frozen=True):
+    """The summary of `ptsmc reproduce`."""
+
+    verdicts: dict[str, int]
+    claims: list[Claim]
+    slips: list[Slip]
+
+
+def read(kind: type[T], summary: Mapping[str, Any]) -> T:
+    """Return a summary as this class. Raises msgspec.ValidationError if a field is missing or has another type."""
+    return msgspec.convert(store.plain(summary), kind)
+
+
+def run(summary: Mapping[str, Any], plant: str) -> Run:
+    """Return the summary of one run of this kind of plant; see `read`."""
+    units = {**CATALOGUES[plant], **MARGINS}
+    verdicts = [
+        {**entry, "metric": name, "unit": units[name].unit, "trials": 1, "failures": int(not entry["met"])}
+        for name, entry in summary["verdicts"].items()
+    ]
+    return read(Run, {**_folded(summary), "verdicts": verdicts})
+
+
+def tune(summary: Mapping[str, Any]) -> Tune:
+    """Return the summary of a tuning; see `read`."""
+    groups = {name: _folded(summary[name]) for name in ("training", "fresh", "paper", "before") if summary.get(name)}
+    return read(Tune, {**summary, **groups})
+
+
+def _folded(entries: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the entries with all metrics in one table."""
+    known = {**CATALOGUE, **CATALOGUES["chain"], **MARGINS}
+    return {**entries, "metrics": {name: value for name, value in entries.items() if name in known}}

@@ -1,0 +1,114 @@
+"""Single trials of a campaign in words: the worst ones, the reasons, and a replay."""
+
+import itertools
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ptsmc_jax.simulation import catalogues
+from ptsmc_jax.simulation.catalogues import percent
+from tuning.output.formats import with_unit
+from tuning.output.report import Table
+
+if TYPE_CHECKING:
+    import polars as pl
+
+COUNTS = 0.05  # fraction of a metric's variance that an input explains at least to be named as a reason
+ROUND_OFF = 1e-9  # relative: the programs of a campaign and of a run with its history round differently
+
+
+def worst(frame: "pl.DataFrame", by: str, plant: str) -> Table:
+    """Return the table of the worst trials by a metric, the worst first; plant: its kind."""
+    wanted = ("trial", "status", by, "window_error", "peak_torque", "settling_time", "initial_angle")
+    names = [name for name in dict.fromkeys(wanted) if name in frame.columns]
+    rows = [
+        tuple("-" if v is None else f"{v:.5g}" if isinstance(v, float) else str(v) for v in row)
+        for row in frame.select(names).iter_rows()
+    ]
+    return Table(tuple(with_unit(name, plant) for name in names), rows)
+
+
+def how_to_replay(frame: "pl.DataFrame", folder: Path, *, custom: bool) -> str:
+    """Return the command that replays the worst trial; custom: simulating it runs custom code."""
+    call = f"ptsmc replay {shlex.quote(str(folder))} --trial {frame['trial'][0]}" + (" --trust" if custom else "")
+    return f"all columns are in {folder / 'worst.csv'}; replay one trial with {call}"
+
+
+def why(inputs: list[dict[str, Any]], plant: str) -> Iterator[str]:
+    """Return the inputs that explain a metric in each of the worst trials, as percentiles of all trials.
+
+    If the trial failed, or too few trials show an influence, the inputs farthest from their medians are named.
+
+    Args:
+        inputs: rows of `reasons.why`.
+        plant: its kind.
+    """
+    from ptsmc_jax.numerics import statistics
+
+    for (metric, trial), group in itertools.groupby(inputs, lambda row: (row["metric"], row["trial"])):
+        rows = list(group)
+        value = rows[0]["value"]
+        explained = [row for row in rows if row["first_order"] is not None]
+        if explained and value is not None:
+            explained = [row for row in explained if statistics.beyond_chance(row, row["trials"])]
+            rows = sorted((row for row in explained if _explained(row) >= COUNTS), key=_explained, reverse=True)
+        else:
+            rows.sort(key=_unusual, reverse=True)
+        texts = [f"{row['input']} {_with_unit(row['drawn'], row['unit'])} {_among(row)}" for row in rows[:4]]
+        unit = catalogues.units(plant).get(metric, "")  # a custom metric has none
+        reached = f"no {metric}" if value is None else f"{metric} {_with_unit(value, unit)}"
+        none = "no sampled input explains it; sensor noise remains"
+        yield f"{reached} in trial {trial}: {', '.join(texts) or none}"
+
+
+def _among(row: dict[str, Any]) -> str:
+    """Return the percentile of an input among all trials."""
+    if row["share"] is not None:
+        return f"as in {percent(row['share'])} % of the trials"
+    return f"at {row['percentile']:.1f} % (median {row['median']:.3g})"
+
+
+def _unusual(row: dict[str, Any]) -> float:
+    """Return the distance of an input from the median in per cent, or how few trials have the same value."""
+    return 50.0 * (1.0 - row["share"]) if row["share"] is not None else abs(row["percentile"] - 50.0)
+
+
+def _with_unit(value: float, unit: str) -> str:
+    return f"{value:.4g} {unit}".rstrip(" -")
+
+
+def _explained(row: dict[str, Any]) -> float:
+    """Return the fraction of the metric's variance that an input explains."""
+    return max(row["first_order"], (row["rank_correlation"] or 0.0) ** 2)
+
+
+def replayed(off: float | None, rounding: float, same: float) -> Iterator[str]:
+    """Return how a replayed trial agrees with its row.
+
+    Args:
+        off: largest relative difference from the row; None: the campaign has no row of this trial.
+        rounding: the same of the run with its history from the replayed row.
+        same: the largest difference that counts as equal.
+    """
+    if off is None:
+        yield "the campaign has no row of this trial yet"
+    elif off == 0.0:
+        yield "the replayed trial equals its row to the last digit"
+    elif off <= same:
+        yield f"the replayed trial equals its row up to round-off: largest relative difference {off:.1e}"
+    else:
+        yield f"the replayed trial does NOT equal its row: {_apart(off)}; see versions and machine in versions.json"
+    if rounding <= ROUND_OFF:
+        yield f"the history is of the same run up to round-off: largest relative difference {rounding:.0e}"
+    else:
+        yield (
+            f"another program simulates the history, and its metrics differ: {_apart(rounding)}; a loop that chatters "
+            "or diverges magnifies round-off"
+        )
+
+
+def _apart(off: float) -> str:
+    if off == float("inf"):
+        return "it ends with another status, or other values are missing"
+    return f"largest relative difference {off:.1e}"
