@@ -3,6 +3,7 @@
 A scenario that names one is a program. `named` looks at the text alone; `digest`, `item` and `load` run what it names.
 """
 
+import ast
 import contextlib
 import hashlib
 import importlib
@@ -118,9 +119,9 @@ def line(error: BaseException, place: str) -> str:
 
 
 def digest(where: object) -> str | None:
-    """SHA-256 of the file in which a system or a function stands, not of what it imports; None: it stands in none.
+    """Return the SHA-256 of the file of a system or a function and of the files beside it that it imports.
 
-    Runs the packages around a module, as Python does to find it.
+    None if it is in no file. Runs the packages around a module, as Python does to find it.
     """
     place = where.rpartition(":")[0] if isinstance(where, str) else ""
     file: str | None = place
@@ -131,7 +132,38 @@ def digest(where: object) -> str | None:
         except (Exception, SystemExit):  # which `item` says
             spec = None
         file = None if spec is None else spec.origin
-    return _sha(file) if file else None
+    if not file or _sha(file) is None:
+        return None
+    first, *others = imported(Path(file), Path(_home(place)))
+    if not others:
+        return _sha(str(first))
+    each = sorted((one.name, str(_sha(str(one)))) for one in (first, *others))
+    return hashlib.sha256(repr(each).encode()).hexdigest()
+
+
+def imported(file: Path, folder: Path) -> list[Path]:
+    """Return a Python file and the files of a folder that it imports, directly or not, as their texts say."""
+    found: list[Path] = []
+    waiting = [file]
+    while waiting:
+        one = waiting.pop()
+        if one in found:
+            continue
+        found.append(one)
+        with contextlib.suppress(OSError, ValueError, SyntaxError, RecursionError):
+            for node in ast.walk(ast.parse(one.read_bytes())):
+                names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+                names += [node.module] if isinstance(node, ast.ImportFrom) and node.module else []
+                tops = {name.partition(".")[0] for name in names} - set(OURS)
+                waiting += [path for top in sorted(tops) for path in _files_of(folder / top)]
+    return found
+
+
+def _files_of(module: Path) -> list[Path]:
+    """Return the files of a module or a package; none if there is no such module."""
+    if module.is_dir():
+        return sorted({module / "__init__.py", *module.rglob("*.py")})
+    return [*filter(Path.is_file, [module.with_suffix(".py")])]
 
 
 def _content(path: Path) -> bytes:

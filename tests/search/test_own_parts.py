@@ -59,3 +59,22 @@ def test_a_program_without_a_checksum_in_the_results_is_reported(tmp_path, capsy
     (said,) = [line for line in capsys.readouterr().err.splitlines() if "no checksum" in line]
     assert str(other) in said
     assert str(law) not in said
+
+
+def test_checksum_of_a_program_covers_the_files_beside_it_that_it_imports(tmp_path):
+    """A campaign resumed with another helper, and its rows were of both."""
+    (tmp_path / "package").mkdir()
+    files = {"mine.py": "import helper\n", "helper.py": "from package.inner import f\n", "package/inner.py": "f = 1\n"}
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    (tmp_path / "other.py").write_text("")
+    where = f"{tmp_path}/mine.py:Mine"
+    known = [systems.digest(where)]
+    for name, text in files.items():
+        (tmp_path / name).write_text(f"{text}# changed\n")
+        known.append(systems.digest(where))
+    assert len(set(known)) == 4
+    (tmp_path / "other.py").write_text("x = 1\n")
+    assert systems.digest(where) == known[-1]
+    with pytest.raises(RefusedError, match=r"was made with another controller\.code"):
+        own_parts.check_unchanged({"controller.code": where}, tmp_path, {"controller_sha256": known[0]})

@@ -118,14 +118,11 @@ def carry(tables: dict[str, Any], folder: Path) -> dict[str, Any]:
 def alone(file: Path) -> bool:
     """Whether a copy of a Python file can be run: it imports nothing from its own folder, and asks not where it is."""
     try:
-        nodes = list(ast.walk(ast.parse(file.read_bytes())))
+        nodes = ast.walk(ast.parse(file.read_bytes()))
+        asks = any(isinstance(node, ast.Name) and node.id == "__file__" for node in nodes)
     except (OSError, ValueError, SyntaxError, RecursionError):
         return False
-    imported = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
-    imported |= {node.module for node in nodes if isinstance(node, ast.ImportFrom) and node.module}
-    beside = (file.with_name(name.partition(".")[0]) for name in imported)
-    asks = any(isinstance(node, ast.Name) and node.id == "__file__" for node in nodes)
-    return not asks and not any(one.is_dir() or one.with_suffix(".py").exists() for one in beside)
+    return not asks and len(systems.imported(file, file.parent)) == 1
 
 
 def _report(programs: Mapping[str, str], where_named: Path) -> None:
