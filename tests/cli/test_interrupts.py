@@ -15,6 +15,7 @@ from ptsmc_jax.scenario import parsing
 from tests.helpers import ROOT, SHORT_CHAIN, tree
 from tuning.cli import searches
 from tuning.output.report import Report
+from tuning.studies import compare, pareto, tuner
 
 EMPTY = Report("", "calm", [])
 IMPORTING = """
@@ -155,3 +156,20 @@ def test_a_search_by_another_version_of_the_code_does_not_resume(tmp_path, capsy
     run(force=True)
     assert len(asked) == 2
     assert store.read_versions(folder)["code_checksum"] != "before"
+
+
+@pytest.mark.parametrize("study", ["tune", "pareto", "compare"])
+def test_search_does_not_resume_on_another_device(command, tmp_path, monkeypatch, study):
+    """Its journal would contain numbers of a GPU and of a processor."""
+
+    def stopped(*_, **__):
+        raise KeyboardInterrupt
+
+    modules = {"tune": (tuner, "tune"), "pareto": (pareto, "trace"), "compare": (compare, "compare")}
+    monkeypatch.setattr(*modules[study], stopped)
+    assert command(study, "s.toml", "--out", "t")[0] == 130
+    versions = store.read_versions(tmp_path / "t")
+    assert versions["device"] == "cpu"
+    store.write_json(tmp_path / "t" / "versions.json", versions | {"device": "gpu"})
+    status, _, error = command(study, "s.toml", "--out", "t")
+    assert (status, "a run with device gpu, not cpu" in error) == (2, True)

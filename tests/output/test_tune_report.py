@@ -89,6 +89,22 @@ def test_margins_are_relative_to_their_limits():
     assert before.startswith("earlier gains reached 0.9 times the limit of gain_margin on held-out trials (seed 7)")
 
 
+def test_confidence_pays_for_every_look_at_held_out_trials():
+    """Three looks at 95 % were reported as 95 %; gains that just miss a quantile pass one of them with 14 %."""
+    asked = Requirement("peak_torque", 0.5, quantile=0.9, confidence=0.95)
+    verdict = asked.verdict(np.zeros(1000), np.ones(1000, bool)).in_summary()
+    earlier = {"margins": {"peak_torque": 0.03}, "over": {"peak_torque": 1.1}, "fresh_seed": 7}
+
+    def confidences(looks):
+        found = {"earlier": (looks - 1) * [earlier], "margins": {"peak_torque": 0.05}}
+        lines = tune_report.search(examples.tune(found, verdicts=[verdict]))
+        return [line for line in lines if "confidence" in line]
+
+    assert confidences(1) == []
+    (line,) = confidences(3)
+    assert line.startswith("peak_torque: the confidence is 85.7 % instead of 95 %")  # 0.95^3
+
+
 @pytest.mark.parametrize(
     ("tuned", "shown"),
     [

@@ -227,7 +227,7 @@ def tune(
     from tuning.studies import tune_files, tuner
 
     loaded = searches.with_tune(loaded)
-    known_by = tune_files.identity(loaded, seed, globally=global_check)
+    known_by = tune_files.identity(loaded, seed, globally=global_check) | {"device": device}
     search = searches.LongSearch(
         known_by,
         objective_name(loaded.search),
@@ -271,7 +271,7 @@ def pareto(
     from tuning.studies import pareto as fronts
 
     trade = trades.of(against, searches.with_tune(loaded), points, listed)
-    loaded, known_by = trade.scenario, trade.identity(seed)
+    loaded, known_by = trade.scenario, trade.identity(seed) | {"device": device}
     search = searches.LongSearch(
         known_by,
         "window error",
@@ -315,7 +315,7 @@ def compare(
     comparing.check(loaded)
     loaded = searches.with_tune(loaded)
     posed = functools.cache(lambda: comparing.that_fly(loaded, rivals))
-    known_by = comparing.identity(loaded, seed, rivals)
+    known_by = comparing.identity(loaded, seed, rivals) | {"device": device}
     search = searches.LongSearch(
         known_by,
         objective_name(loaded.search),

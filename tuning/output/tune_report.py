@@ -142,6 +142,7 @@ def search(summary: Tune) -> Iterator[str]:
         yield f"best compromise: {text}"
     yield from _conflict(summary)
     yield from _continued(record)
+    yield from _confidences(summary)
     for count in record.confirmed:
         most = "none allowed" if count.allowed is None else f"at most {count.allowed} allowed"
         yield (
@@ -193,6 +194,21 @@ def _continued(record: Search) -> Iterator[str]:
                 f"earlier gains reached {_of_limit(metric, reached):.4g} times the limit of {metric} on held-out "
                 f"trials (seed {one.fresh_seed}): the search continued with a reserve of {100 * margins[metric]:.2g} % "
                 f"instead of {100 * one.margins[metric]:.2g} %, and its result is verified on other trials"
+            )
+
+
+def _confidences(summary: Tune) -> Iterator[str]:
+    """Return the confidence of verdicts after several looks at held-out trials, each on other trials.
+
+    Each look accepts gains that miss the requirement with a probability of at most 1 - c, so k looks do with at most
+    1 - c^k.
+    """
+    looks = 1 + len(summary.search.earlier)
+    for one in summary.verdicts if looks > 1 else ():
+        if one.confidence is not None and one.met:
+            yield (
+                f"{one.metric}: the confidence is {percent(one.confidence**looks)} % instead of "
+                f"{percent(one.confidence)} %, because these are the gains of look {looks} at held-out trials"
             )
 
 
