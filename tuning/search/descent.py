@@ -110,6 +110,7 @@ def descend(
     keep: Callable[[Sloped], None],
     close: float = CLOSE,
     relaxed: Relaxed | None = None,
+    steepest: float = STEEPEST,
 ) -> None:
     """Search locally from a starting point inside the bounds, by sequential quadratic programming (SLSQP).
 
@@ -126,8 +127,9 @@ def descend(
         keep: is called with the measurement at accepted points, not at those of a line search.
         close: change of F at which the search ends.
         relaxed: minimise the violation of these limits only, the others being constraints.
+        steepest: gradients are clipped to this change of F or c per interval.
     """
-    local = _Local(slopes, best, start, steps, keep, close)
+    local = _Local(slopes, best, start, steps, keep, close, steepest)
     first = start.scale * start.share
     with contextlib.suppress(_EnoughError):
         keep(local.at(first))
@@ -156,7 +158,9 @@ class _Local:
         steps: int,
         keep: Callable[[Sloped], None],
         close: float,
+        steepest: float,
     ):
+        self._steepest = steepest
         self._slopes, self._best, self._start = slopes, best, start
         self._steps, self._keep, self._close = steps, keep, close
         self._seen, self._scale = start.seen, start.scale
@@ -182,13 +186,13 @@ class _Local:
         """Minimise F subject to c <= 0, and return the last point."""
         limits = {
             "type": "ineq",
-            "fun": lambda x: -_compressed(self.at(x))[0],
-            "jac": lambda x: -_compressed(self.at(x))[1] / self._scale,
+            "fun": lambda x: -_compressed(self.at(x), self._steepest)[0],
+            "jac": lambda x: -_compressed(self.at(x), self._steepest)[1] / self._scale,
         }
         found = minimize(
             lambda x: float(self.at(x).f[0]),
             scaled.copy(),
-            jac=lambda x: _usable(self.at(x).f_slope)[0] / self._scale,
+            jac=lambda x: _usable(self.at(x).f_slope, self._steepest)[0] / self._scale,
             method="SLSQP",
             bounds=self._bounds,
             constraints=[limits] if self.at(scaled).c.shape[1] else [],
@@ -211,14 +215,14 @@ class _Local:
             if not relaxed.to_the_end and relaxed.rows is None and ended(seen.c).max() <= 0.0:
                 reached = np.array(x)
                 raise _FeasibleError
-            return _compressed(seen)
+            return _compressed(seen, self._steepest)
 
         limits = {
             "type": "ineq",
             "fun": lambda y: y[-1] * soft - excess(y[:-1])[0],
             "jac": lambda y: np.column_stack([-excess(y[:-1])[1] / self._scale, soft.astype(float)]),
         }
-        first = _compressed(self.at(scaled))[0][soft].max()
+        first = _compressed(self.at(scaled), self._steepest)[0][soft].max()
         try:
             found = minimize(
                 lambda y: y[-1],
@@ -240,7 +244,7 @@ class _Local:
             self._keep(self._seen[key])
 
 
-def _compressed(seen: Sloped) -> tuple[np.ndarray, np.ndarray]:
+def _compressed(seen: Sloped, steepest: float) -> tuple[np.ndarray, np.ndarray]:
     """(limits,) ln(1 + c) for c above 0, else c, and its derivatives (limits, gains).
 
     Far beyond a limit c spans orders of magnitude; its logarithm has the same sign and the same derivative at 0.
@@ -248,7 +252,7 @@ def _compressed(seen: Sloped) -> tuple[np.ndarray, np.ndarray]:
     c = ended(seen.c).reshape(-1)
     beyond = np.maximum(c, 0.0)
     slopes = seen.c_slope.reshape(c.size, -1) / (1.0 + beyond)[:, None]
-    return np.where(c > 0.0, np.log1p(beyond), c), _usable(slopes)
+    return np.where(c > 0.0, np.log1p(beyond), c), _usable(slopes, steepest)
 
 
 def prices(at: Sloped, share: np.ndarray) -> np.ndarray:
@@ -265,8 +269,8 @@ def prices(at: Sloped, share: np.ndarray) -> np.ndarray:
     return paid
 
 
-def _usable(slopes: np.ndarray) -> np.ndarray:
-    """Slopes, (rows, gains), cut down to `STEEPEST`; zeros for a row with a number that is not finite."""
+def _usable(slopes: np.ndarray, steepest: float = STEEPEST) -> np.ndarray:
+    """Return gradients, (rows, gains), clipped to a largest element; zeros for a row that is not finite."""
     size = np.abs(slopes).max(axis=1, keepdims=True)
     known = np.where(np.isfinite(size), slopes, 0.0)
-    return known * np.minimum(1.0, STEEPEST / np.maximum(np.where(np.isfinite(size), size, 1.0), 1e-300))
+    return known * np.minimum(1.0, steepest / np.maximum(np.where(np.isfinite(size), size, 1.0), 1e-300))

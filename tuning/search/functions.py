@@ -1,0 +1,172 @@
+"""Minimises any function of JAX in a box, with constraints: the local search of the tuner without a scenario.
+
+The minimum of a sphere, of Rosenbrock's function inside a disc, and of a custom loss:
+
+>>> import jax.numpy as jnp
+>>> from tuning.search import Settings, minimise
+>>> def sphere(x):
+...     return jnp.sum(x**2)
+>>> found = minimise(sphere, None, [(-5.0, 4.0)] * 3)
+>>> found.feasible, bool(found.value < 1e-9)
+(True, True)
+
+>>> def rosenbrock(x):
+...     return (1.0 - x[0]) ** 2 + 100.0 * (x[1] - x[0] ** 2) ** 2
+>>> def outside_the_disc(x):
+...     return jnp.sum(x**2) - 1.0
+>>> found = minimise(rosenbrock, outside_the_disc, [(-2.0, 2.0), (-2.0, 2.0)])
+>>> found.x.round(3).tolist(), round(found.value, 3)
+([0.786, 0.618], 0.046)
+
+>>> t = jnp.linspace(0.0, 5.0, 40)
+>>> measured = 2.0 * jnp.exp(-0.7 * t)
+>>> def loss(x):
+...     return jnp.mean((x[0] * jnp.exp(-x[1] * t) - measured) ** 2)
+>>> found = minimise(loss, None, [(0.1, 10.0), (0.01, 5.0)], Settings(starts=3))
+>>> found.x.round(4).tolist()
+[2.0, 0.7]
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from tuning.search.descent import Best, Start, descend
+from tuning.search.evaluate import Measured, Sloped
+from tuning.search.starts import charged, distances, far_apart, spread
+
+Function = Callable[[Float[Array, " n"]], Float[Array, ""]]
+Constraints = Callable[[Float[Array, " n"]], Float[Array, "..."]]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The effort of `minimise`."""
+
+    starts: int = 8  # starting points of local searches
+    sampled: int = 64  # points of the box among which they are chosen
+    steps: int = 200  # largest number of evaluations with gradients from each starting point
+    tolerance: float = 1e-12  # change of the objective at which a local search ends
+    seed: int = 0  # of the sampled points
+
+
+@dataclass(frozen=True)
+class Local:
+    """The best point of one local search."""
+
+    x: np.ndarray  # (n,)
+    value: float  # of the objective
+    violation: float  # largest constraint above 0, else 0
+
+
+@dataclass(frozen=True)
+class Search:
+    """The result of `minimise`."""
+
+    locals: list[Local]  # by local search, the best first
+    evaluations: int  # of the objective
+    gradients: int  # evaluations with gradients
+
+    @property
+    def x(self) -> np.ndarray:
+        """Return the best point, (n,)."""
+        return self.locals[0].x
+
+    @property
+    def value(self) -> float:
+        """Return the objective at the best point."""
+        return self.locals[0].value
+
+    @property
+    def feasible(self) -> bool:
+        """Return whether the best point meets every constraint within 1e-4."""
+        return self.locals[0].violation == 0.0
+
+
+def minimise(
+    objective: Function,
+    constraints: Constraints | None,
+    bounds: Sequence[tuple[float, float]],
+    settings: Settings = Settings(),
+) -> Search:
+    """Minimise a function in a box subject to constraints, by SQP from the most promising of many points.
+
+    Sobol points of the box are ranked by objective and violation. Local searches (`descent.descend`) start from the
+    best of them that lie far apart. Far outside the constraints, a local search first minimises the violation.
+
+    Args:
+        objective: differentiable function of x (n,); NaN or infinity where it does not exist.
+        constraints: differentiable function of x (n,) with values of any shape, which are met if they are at most 0.
+            They should be scaled so that 0.1 is a large violation. None: there are none.
+        bounds: lower and upper bound of each element of x.
+        settings: the effort.
+
+    Returns:
+        The best point of each local search.
+
+    Raises:
+        ValueError: a bound is not finite or not below the other one, or the objective is finite at no sampled point.
+    """
+    lower, upper = np.asarray(bounds, dtype=float).T
+    if not np.all(np.isfinite(upper - lower) & (lower < upper)):
+        raise ValueError(f"bounds are {list(bounds)}, but must be finite, each lower one below its upper one")
+    problem = _Problem(objective, constraints, lower, upper)
+    points = spread(lower.size, settings.sampled, np.random.default_rng(settings.seed))
+    seen = problem.measured(points)
+    known = np.flatnonzero(np.isfinite(seen.f))
+    if not known.size:
+        raise ValueError(f"the objective is finite at none of {settings.sampled} points of the box")
+    scale = max(float(np.median(seen.f[known]) - seen.f[known].min()), np.finfo(float).tiny)
+    merits = charged((seen.f[known] - seen.f[known].min()) / scale, seen.beyond[known], 1.0)
+    order = known[np.argsort(merits, kind="stable")].tolist()
+    bests = []
+    for k in far_apart(order, distances(points), settings.starts):
+        best = Best(points[k], 1, 0.0)
+        ignored: Callable[[Sloped], None] = lambda seen: None  # noqa: E731
+        descend(problem.sloped, best, Start(points[k]), settings.steps, ignored, settings.tolerance, steepest=np.inf)
+        bests.append(best)
+    ended = sorted((best for best in bests if np.isfinite(best.f)), key=lambda best: best.rank)
+    if not ended:  # no gradient is finite
+        raise ValueError("the objective has a finite gradient at no starting point")
+    found = [Local(problem.x(best.share), best.f, best.over) for best in ended]
+    return Search(found, settings.sampled, problem.gradients)
+
+
+class _Problem:
+    """A function and its constraints over the unit cube."""
+
+    def __init__(self, objective: Function, constraints: Constraints | None, lower: np.ndarray, upper: np.ndarray):
+        self._lower, self._upper, self.gradients = lower, upper, 0
+
+        def both(share: Array) -> tuple[Array, Array]:
+            x = self.x(share)
+            c = jnp.zeros(0) if constraints is None else jnp.ravel(constraints(x))
+            return jnp.asarray(objective(x), dtype=float), c
+
+        self._values = jax.jit(jax.vmap(both))
+        self._both = jax.jit(lambda share: (both(share), jax.jacfwd(both)(share)))
+
+    def x(self, share: Any) -> Any:
+        """Return the point of the box, (n,), of a point of the unit cube."""
+        return self._lower + (self._upper - self._lower) * share
+
+    def measured(self, share: np.ndarray) -> Measured:
+        """Return the values at many points, (points, n)."""
+        f, c = map(np.asarray, self._values(share))
+        return Measured(gains=share, f=f, c=_rows(c), value=np.zeros_like(f))
+
+    def sloped(self, share: np.ndarray) -> Sloped:
+        """Return the values and gradients at one point, (1, n)."""
+        self.gradients += 1
+        (f, c), (f_slope, c_slope) = jax.tree.map(lambda v: np.asarray(v)[None], self._both(share[0]))
+        return Sloped(gains=share, f=f, c=_rows(c), value=np.zeros_like(f), f_slope=f_slope, c_slope=_rows(c_slope))
+
+
+def _rows(c: np.ndarray) -> np.ndarray:
+    """Return constraints as one row of `Measured.c`, (points, 1, constraints, ...), or no row without constraints."""
+    return c[:, None][:, : min(1, c.shape[1])]
