@@ -294,7 +294,7 @@ def test_trials_that_gains_were_found_with_are_told(command, tmp_path, made, sai
     for seed, times in ((), said), (("--seed", 7, "--out", "other"), 0):
         code, _, error = command(*asked, *seed)
         assert code == 0
-        assert error.count("with trials of seed 1000, which are flown again: for a proof give another --seed") == times
+        assert error.count("with the same trials of seed 1000; use another --seed") == times
 
 
 def test_a_dry_run_writes_what_would_be_flown(command, tmp_path):

@@ -260,7 +260,7 @@ def test_the_papers_case_one_without_a_file(command, tmp_path):
 def test_an_empty_file_is_said_to_be_the_papers_case(command, tmp_path):
     (tmp_path / "none.toml").write_text("# to come\n")
     status, _, said = command("simulate", "none.toml", "--quiet", "--no-figures")
-    assert (status, said) == (0, "ptsmc: none.toml says nothing: what flies is the paper's Case I\n")
+    assert (status, said) == (0, "ptsmc: none.toml is empty; the paper's Case I is simulated\n")
 
 
 @pytest.mark.parametrize("timing", ['clock = "flight"\nt_end = 6.47', 'clock = "anchored"\nt_end = 6.4700001'])
@@ -308,7 +308,7 @@ def test_a_finished_tuning_run_answers_again(command, tmp_path, met):
     folder = tmp_path / "done"
     folder.mkdir()
     store.write_toml(folder / "scenario.toml", tables)
-    store.write_json(folder / "versions.json", store.versions("tune", 5))
+    store.write_json(folder / "versions.json", store.versions("tune", 5, device="cpu"))
     store.write_json(folder / "summary.json", {"status": "met" if met else "not met"})
     before = tree(folder)
     run = ("tune", "s.toml", "--out", "done", "--quiet")
@@ -667,7 +667,7 @@ def test_a_long_run_says_how_many_steps_it_takes_before_it_is_flown(command, mon
     assert steps == parts.clock.ticks(parts.controller.t_f, parts.controller.delta).t.size * parts.substeps
     assert "integration steps" not in command(*run)[1]
     monkeypatch.setattr("tuning.cli.main.LONG", steps - 1)
-    assert command(*run)[1].startswith(f"flying {steps} integration steps, with their history\n")
+    assert command(*run)[1].startswith(f"simulating {steps} integration steps with their history\n")
     assert command(*run, "--quiet")[1] == ""
 
 

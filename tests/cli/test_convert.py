@@ -80,7 +80,7 @@ def test_gimbal_lock_is_said(command):
 @pytest.mark.parametrize(("options", "said"), [
     ((), "no attitude is given, but must be exactly one of --quat-xyzw, "),
     (("--mrp", "0,0,0", "--rotvec-deg", "0,0,0"), "--rotvec-deg and --mrp are given, but must be exactly one of "),
-    (("1", "2"), "convert-attitude does not take 1 2; what it takes: ptsmc convert-attitude --help"),
+    (("1", "2"), "convert-attitude does not take 1 2; its arguments: ptsmc convert-attitude --help"),
     (("--mrp", "0,0"), "--mrp is [0.0, 0.0], but must be three numbers"),
     (("--mrp", "a,b,c"), "--mrp is a,b,c, but must be numbers such as 0.1,0.2,0.3"),
     (("--mrp", ""), "--mrp is , but must be numbers such as"),

@@ -247,7 +247,7 @@ def test_the_examples_are_copied_and_none_is_written_over(command, tmp_path):
     assert changed.read_text() == ""
     assert command("examples", "mine", "--force", "--quiet") == (0, "", "")
     assert changed.read_text() == shipped[changed.name]
-    sentence = f"ptsmc: the folder is {changed}, but that is a file; allowed is a new folder, or one that is there\n"
+    sentence = f"ptsmc: the folder is {changed}, but that is a file; allowed is a new or an existing folder\n"
     assert command("examples", changed) == (2, "", sentence)
 
 

@@ -27,8 +27,8 @@ def test_headline_states_the_pointing_error_first_and_then_the_requirements():
     assert report.headline == "RMS pointing error 0.413 arcsec: every requirement is met"
     assert report.mood == "good"
     assert report.lines[0] == (
-        "RMS pointing error 0.413 arcsec (95 % interval: 0.371 arcsec to 0.495 arcsec) on held-out trials, "
-        "2 times the lower bound of 0.206 arcsec"
+        "held-out trials: 0.413 arcsec (95 % interval: 0.371 arcsec to 0.495 arcsec), 2 times the lower bound of 0.206 "
+        "arcsec"
     )
     assert [section.title for section in report.sections] == ["Requirements", "Gains", "Can the result be trusted?"]
     chain = tune_report.of(examples.tune(fresh=fresh, plant="chain", status="not met"))

@@ -31,14 +31,14 @@ if TYPE_CHECKING:
     from ptsmc_jax.campaigns.cluster import Cluster
     from tuning.studies.campaign_folder import Folder
 
-CAMPAIGN_SEED = 1000  # not that of a search: a proof does without the trials that gains were tuned on
-MOST = 2**32  # trials: their numbers have 32 bits
+CAMPAIGN_SEED = 1000  # not the seed of a search: its trials must not verify the gains
+MOST = 2**32  # trials, whose numbers have 32 bits
 
 SHOWN = Group.create_default_parameters()  # in the help
 # options of a group exclude each other
 TRIALS, CONFIDENT, PARTS, PLACES = (Group(show=False, validator=MutuallyExclusive()) for _ in range(4))
 
-CampaignFolder = Annotated[Path, Parameter(name="DIR", help="Folder of a campaign, made by `ptsmc montecarlo`.")]
+CampaignFolder = Annotated[Path, Parameter(name="DIR", help="Folder of `ptsmc montecarlo`.")]
 
 
 def montecarlo(
@@ -68,7 +68,7 @@ def montecarlo(
         ),
     ] = None,
     metrics: Annotated[
-        str | None, Parameter(help="FILE.py:NAME of a function that adds metrics of your own to the rows.")
+        str | None, Parameter(help="FILE.py:NAME of a function that adds custom metrics to the rows.")
     ] = None,
     shard: Annotated[
         str,
@@ -106,14 +106,13 @@ def montecarlo(
     quiet: Quiet = False,
     figures: Figures = True,
 ) -> int:
-    """Fly a campaign: many trials of a scenario, every one counted, kept and replayable.
+    """Simulate a campaign of many trials, and keep a row of each; every trial can be replayed.
 
-    Interrupted or killed, the same command goes on from there; with more trials it adds to what is there. With --plan a
-    row of a table is a trial. By default results are in out/montecarlo-NAME, with the names of --controller and --plan
-    behind it.
+    After Ctrl-C or a kill, the same command resumes the campaign. With more --trials it adds trials. The default folder
+    is out/montecarlo-NAME, followed by the names of --controller and --plan.
 
-    Exit status: 0 done and every requirement met (without any: no trial failed or missed t_f), 1 done but not so, 2 bad
-    input or a full disk, 130 interrupted.
+    Exit status: 0 every requirement met (without requirements: no trial failed or missed t_f), 1 not met, 2
+    configuration error or a full disk, 130 interrupted.
     """
     share = _shard(shard)
     tls_files = {"tls_ca_file": tls_ca, "tls_client_cert": tls_cert, "tls_client_key": tls_key}
@@ -140,7 +139,7 @@ def montecarlo(
     from ptsmc_jax.simulation import catalogues
 
     if confident and set(loaded.requirements) <= set(catalogues.MARGINS):
-        raise UsageError("--until-confident needs [requirements] on metrics in the scenario, whose shares it looks at")
+        raise UsageError("--until-confident needs [requirements] on metrics in the scenario")
     from tuning.studies import campaign_folder
 
     loaded = loaded if controller is None else flight_commands.flown(loaded)
@@ -161,7 +160,7 @@ def montecarlo(
         from tuning.studies import campaign_summary
 
         folder = replace(folder, first_look=campaign_summary.first_look(folder, force))
-    _ = folder.campaign  # what it refuses, it refuses before anything is written
+    _ = folder.campaign  # raises configuration errors before anything is written
     if folder.computer is not None:
         flight_commands.say_otherwise(folder.computer)
 
@@ -194,7 +193,7 @@ def _say_share(folder: "Folder", share: tuple[int, int], *, planned: bool) -> No
 
 
 def _elsewhere(cluster: str | None, tls: dict[str, str]) -> "contextlib.AbstractContextManager[Cluster | None]":
-    """What flies parts on a cluster, which is left at the end; None: they are flown here."""
+    """Return the context of a cluster, or of None without one."""
     if cluster is None:
         return contextlib.nullcontext()
     from ptsmc_jax.campaigns import cluster as clusters
@@ -209,14 +208,14 @@ def _flown(
     elsewhere: "Cluster | None",
     width: float | None,
 ) -> "Folder":
-    """The campaign flown, its share of it; width: until every requirement's share is known to within it."""
+    """Simulate a shard of a campaign; width: see --until-confident."""
     from tuning.studies import campaign_folder, campaign_theory
 
     campaign_theory.prepare(folder)
     if width is None:
         campaign_folder.fly(folder, share, report, elsewhere)
     else:
-        from tuning.studies import campaign_summary  # whose imports flying need not wait for
+        from tuning.studies import campaign_summary  # imported during the simulation
 
         stopped = campaign_summary.until_confident(
             folder, width, lambda first: campaign_folder.fly(folder, share, report, elsewhere, first)
@@ -227,10 +226,10 @@ def _flown(
 
 
 def summarize(folder: CampaignFolder, /, *, quiet: Quiet = False, figures: Figures = True) -> int:
-    """Verdicts, quantiles with intervals and figures of a campaign, from its rows.
+    """Write the verdicts, the quantiles with intervals, and the figures of a campaign from its rows.
 
-    Exit status: 0 every requirement met (without any: no trial failed or missed t_f), 1 not so, or not all trials flown
-    and margins judged yet, 2 bad input, among it rows that are damaged.
+    Exit status: 0 every requirement met (without requirements: no trial failed or missed t_f), 1 not met or not
+    finished, 2 configuration error or damaged rows.
     """
     _configured(folder)
     from ptsmc_jax.campaigns import store
@@ -252,7 +251,7 @@ def worst(
     by: Annotated[
         str,
         Parameter(
-            help="A column of the rows: the largest are the worst, of `within_*` and `controller_ok` the smallest."
+            help="Column of the rows. Its largest values are the worst, of `within_*` and `controller_ok` the smallest."
         ),
     ] = "window_error",
     n: Annotated[int, whole("Number of trials, 1 to 10000.", 1, 10_000, name=("--n", "-n"))] = 5,
@@ -260,14 +259,14 @@ def worst(
         bool,
         Parameter(
             negative="",
-            help="Say what was drawn in them, each input as a percentile of all trials, for every required metric too.",
+            help="List the inputs of these trials as percentiles of all trials, for every required metric too.",
         ),
     ] = False,
     quiet: Quiet = False,
 ) -> int:
-    """The worst trials of a campaign, failed ones first; leaves worst.csv, with --why why.csv, in its folder.
+    """Print the worst trials of a campaign, failed ones first, and write worst.csv, with --why also why.csv.
 
-    Exit status: 0 done, 2 bad input.
+    Exit status: 0 done, 2 configuration error.
     """
     _configured(folder)
     from ptsmc_jax import scenario as scenarios
@@ -295,15 +294,15 @@ def replay(
     /,
     *,
     trial: Annotated[int, whole("Number of the trial.")],
-    out: Annotated[Path | None, Parameter(help="Folder for the results; by default DIR/replay/TRIAL.")] = None,
+    out: Annotated[Path | None, Parameter(help="Folder for the results; default: DIR/replay/TRIAL.")] = None,
     trust: Trust = False,
     force: Force = False,
     quiet: Quiet = False,
     figures: Figures = True,
 ) -> int:
-    """Fly one trial of a campaign again, with its whole history, and compare it with its row.
+    """Simulate one trial of a campaign again with its history, and compare it with its row.
 
-    Exit status: 0 the run equals its row to 1e-12 (or has none yet), 1 it does not, 2 bad input.
+    Exit status: 0 the run equals its row to 1e-12 (or has no row yet), 1 it does not, 2 configuration error.
     """
     _configured(folder)
     from ptsmc_jax.campaigns import store
@@ -314,13 +313,13 @@ def replay(
     if trial >= opened.trials:
         raise UsageError(f"--trial is {trial}, but must be a whole number from 0 to {opened.trials - 1}")
     place = out if out is not None else folder / "replay" / str(trial)
-    store.check(place, force or out is None)  # a replay of the same trial is the same
+    store.check(place, force or out is None)  # a replay overwrites an earlier one
     own_parts.allow(opened.programs, folder, opened.identity, trust)
     opened = replace(opened, trusted=True)
     with store.in_use(place, force=force or out is None):
         again = campaign_summary.replay(opened, trial)
         about = opened.scenario, again.run, opened.seed, trial, figures, opened.computer
-        # what simulate does not fly: a plan's row, numbers of 32 bits
+        # simulate has no rows of run tables and no numbers of 32 bits
         from_here = opened.plan is not None or opened.bits != 64
         replayed = {"campaign": str(folder.absolute()), "metrics": opened.own} if from_here else {}
         store.write(place, lambda making: single.write(making, *about, replayed))
@@ -335,7 +334,7 @@ def replay(
 
 
 def _configured(folder: Path) -> None:
-    """Set JAX up with as many bits as the campaign was flown with."""
+    """Configure JAX with the precision of the campaign."""
     from ptsmc_jax.campaigns import store
     from ptsmc_jax.configure import configure
 

@@ -13,14 +13,14 @@ from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.spacecraft_scenario import SpacecraftScenario
 from tuning.errors import UsageError
 
-SEQUENCE = "ZYX"  # of Euler angles, where none is given
-DIGITS = 12  # that are printed: more would be rounding of the conversion
+SEQUENCE = "ZYX"  # default of Euler angles
+DIGITS = 12  # the conversion rounds further ones
 
 
 def quaternion(texts: Mapping[str, str | None]) -> np.ndarray:
     """Unit quaternion (4,), scalar last, of the one attitude key that is given as text; numbers by commas or spaces.
 
-    A `sequence` may stand beside euler_deg. Raises UsageError, naming the option.
+    A `sequence` may be given with euler_deg. Raises UsageError, naming the option.
     """
     keys = [key for key in ATTITUDE_KEYS if texts.get(key) is not None]
     options = [_option(key) for key in ATTITUDE_KEYS]

@@ -1,4 +1,4 @@
-"""The command that takes gains to flight, and what flies its C in the loop."""
+"""`ptsmc export`, and simulations with the exported C in the loop."""
 
 import shlex
 import sys
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 ControllerFolder = Annotated[
     Path | None,
-    Parameter(help="Folder that export left: its C is compiled and decides in the loop, on the flight clock."),
+    Parameter(help="Folder of ptsmc export: its C is compiled and runs in the loop, on the flight clock."),
 ]
 
 
@@ -28,16 +28,16 @@ def export(
     /,
     *,
     out: Out = None,
-    name: Annotated[str | None, Parameter(help="Name of the C files; by default the scenario file's.")] = None,
+    name: Annotated[str | None, Parameter(help="Name of the C files; default: the name of the scenario file.")] = None,
     trials: Annotated[int, whole("Trials in vectors.csv, 1 to 100.", 1, 100)] = 3,
     seed: Seed = 0,
     trust: Trust = False,
     force: Force = False,
     quiet: Quiet = False,
 ) -> int:
-    """Write the scenario's flight computer as C99: attitude filter, observer, law, wheels; with vectors that check it.
+    """Write the scenario's flight computer as C99 with test vectors: attitude filter, observer, law, wheels.
 
-    Exit status: 0 done, 2 bad input, or something in it that C cannot say.
+    Exit status: 0 done, 2 configuration error, or a part that cannot be written in C.
     """
     loaded, folder = prepare(scenario, "export", out, trust=trust, force=force)
     from ptsmc_jax.campaigns import store
@@ -55,16 +55,16 @@ def export(
 
 
 def flown(scenario: "Scenario") -> "Scenario":
-    """The scenario as a controller's C flies it: on the flight clock. Raises ScenarioError of what has none."""
+    """Return the scenario on the flight clock of exported C. Raises ScenarioError without one."""
     from ptsmc_jax.onboard import folder
 
     return folder.flown(scenario)
 
 
 def compiled(controller: Path, ready: "Study") -> "InTheLoop":
-    """The C of a folder, compiled, for the parts of a study; what it has otherwise is said.
+    """Compile the C of a folder for the parts of a study, and print which parameters differ.
 
-    Raises ScenarioError where it does not compile, or is a controller of other parts.
+    Raises ScenarioError if it does not compile or belongs to other parts.
     """
     from ptsmc_jax.onboard.library import InTheLoop, Library
 
@@ -74,7 +74,7 @@ def compiled(controller: Path, ready: "Study") -> "InTheLoop":
 
 
 def say_otherwise(computer: "InTheLoop") -> None:
-    """Say which parameters the C that decides has otherwise than the scenario."""
+    """Print the parameters in which the compiled controller differs from the scenario."""
     if computer.otherwise:
         print(f"ptsmc: {computer.otherwise}", file=sys.stderr)
 

@@ -1,4 +1,4 @@
-"""The `ptsmc` command. JAX is loaded by the commands that compute, after what they are given was looked at."""
+"""The `ptsmc` command. JAX is imported after the arguments are checked, by commands that compute."""
 
 import dataclasses
 import functools
@@ -43,7 +43,7 @@ app = App(
     suppress_keyboard_interrupt=False,
 )
 
-LONG = 20_000  # integration steps of a run that takes more than a moment
+LONG = 20_000  # integration steps of a run that takes several seconds
 
 
 @app.command
@@ -62,9 +62,9 @@ def simulate(
     quiet: Quiet = False,
     figures: Figures = True,
 ) -> int:
-    """Fly one run and write its history, metrics and figures.
+    """Simulate one run and write its history, metrics and figures.
 
-    Exit status: 0 done and every requirement met, 1 done but not met or the run failed, 2 bad input.
+    Exit status: 0 every requirement met, 1 not met or the run failed, 2 configuration error.
     """
     loaded, folder = prepare(scenario, "simulate", out, trust=trust, force=force)
     from ptsmc_jax.campaigns import runs, store
@@ -77,7 +77,7 @@ def simulate(
     computer = None if controller is None else flight_commands.compiled(controller, ready)
     steps = timing.steps(ready.parts)
     if steps > LONG and not quiet:
-        terminal.say(f"flying {steps} integration steps, with their history")
+        terminal.say(f"simulating {steps} integration steps with their history")
     with store.in_use(folder, force=force):
         run = runs.fly(ready, seed, trial, OURS if computer is None else computer.software)
         store.write(folder, lambda making: single.write(making, loaded, run, seed, trial, figures, computer))
@@ -91,9 +91,9 @@ def simulate(
 
 @app.command
 def reproduce(*, out: Out = None, force: Force = False, quiet: Quiet = False, figures: Figures = True) -> int:
-    """Fly every figure of the paper, and set its claims and its slips beside what is measured.
+    """Simulate every figure of the paper, and compare its claims and errors with measurements.
 
-    Exit status: 0 done, 1 a run failed, 2 bad input.
+    Exit status: 0 done, 1 a run failed, 2 configuration error.
     """
     from ptsmc_jax.campaigns import store
 
@@ -106,7 +106,7 @@ def reproduce(*, out: Out = None, force: Force = False, quiet: Quiet = False, fi
 
     with store.in_use(folder, force=force):
         with progress.Progress(quiet) as report:
-            report("flying the paper's figures", 0, 0)
+            report("simulating the paper's figures", 0, 0)
             reproduced = reproduction.reproduce()
         store.write(folder, lambda making: reproduction.write(making, reproduced, figures))
     if not quiet:
@@ -124,10 +124,10 @@ def map_(
     *,
     x: Annotated[
         str | None,
-        Parameter(help="KEY=LOW:HIGH:COUNT of the scenario; by default loop.period, 0.4 to 10 times its own."),
+        Parameter(help="KEY=LOW:HIGH:COUNT; default: loop.period from 0.4 to 10 times the scenario's period."),
     ] = None,
     y: Annotated[
-        str | None, Parameter(help="KEY=LOW:HIGH:COUNT; by default controller.delta, from a period to t_f / 7 or more.")
+        str | None, Parameter(help="KEY=LOW:HIGH:COUNT; default: controller.delta from a period to t_f / 7 or more.")
     ] = None,
     trials: Annotated[int, whole("Trials of each pair, 1 to 1000000.", 1, 1_000_000)] = 32,
     out: Out = None,
@@ -138,9 +138,9 @@ def map_(
     quiet: Quiet = False,
     figures: Figures = True,
 ) -> int:
-    """Fly the scenario over two of its keys: window error and peak torque, with the borders of linear theory.
+    """Simulate the scenario over two of its keys: error and peak torque, with the stability limits of linear theory.
 
-    Exit status: 0 done, 2 bad input. A pair that is not allowed or fails is marked, not dropped.
+    Exit status: 0 done, 2 configuration error. A pair that is not allowed or fails is marked, not dropped.
     """
     loaded, folder = prepare(scenario, "map", out, device, trust=trust, force=force)
     from ptsmc_jax.campaigns import store
@@ -153,7 +153,7 @@ def map_(
     with store.in_use(folder, force=force):
         with progress.Progress(quiet) as report:
             flown = mapping.fly(
-                loaded, across, up, seed, trials, lambda done, total: report("flying pairs", done, total)
+                loaded, across, up, seed, trials, lambda done, total: report("simulating pairs", done, total)
             )
         store.write(folder, lambda making: mapping.write(making, flown, seed, figures))
     if not quiet:
@@ -179,7 +179,7 @@ def margins(
 
     The nominal loop has no dispersions. `tune` and `montecarlo` judge required margins by the worst dispersed loop.
 
-    Exit status: 0 done and stable in the hold phase, 1 not stable in the hold phase, 2 bad input.
+    Exit status: 0 stable in the hold phase, 1 not stable in the hold phase, 2 configuration error.
     """
     loaded, folder = prepare(scenario, "margins", out, trust=trust, force=force)
     from ptsmc_jax.campaigns import store
@@ -206,7 +206,7 @@ def tune(
     out: Out = None,
     seed: Seed = 0,
     global_check: Annotated[
-        bool, Parameter(negative="", help="Compare with differential evolution, and report the distance.")
+        bool, Parameter(negative="", help="Compare with the result of differential evolution.")
     ] = False,
     device: Device = "cpu",
     trust: Trust = False,
@@ -214,12 +214,12 @@ def tune(
     quiet: Quiet = False,
     figures: Figures = True,
 ) -> int:
-    """Find the gains with the smallest error after t_f that keep every limit, and prove them on fresh trials.
+    """Find the gains with the smallest error after t_f that meet every requirement, and verify them on held-out trials.
 
-    Ctrl-C ends the search and judges the best gains so far; the same command goes on from there, and so it does after
-    a kill.
+    Ctrl-C ends the search and verifies the best gains so far; a second Ctrl-C kills it. In both cases, the same command
+    resumes the search.
 
-    Exit status: 0 done and every requirement met on the fresh trials, 1 done but not met, 2 bad input, 130 interrupted.
+    Exit status: 0 every requirement met on the held-out trials, 1 not met, 2 configuration error, 130 interrupted.
     """
     loaded, folder = prepare(scenario, "tune", out, device, trust=trust)
     from ptsmc_jax.scenario.tables import objective_name
@@ -257,12 +257,11 @@ def pareto(
     quiet: Quiet = False,
     figures: Figures = True,
 ) -> int:
-    """Find the front of accuracy against peak torque, or what margins or a faster slew cost, judged on fresh trials.
+    """Find the front of accuracy against peak torque, or the cost of margins or of a faster slew, on held-out trials.
 
-    Interrupted or killed, the same command goes on from there.
+    After Ctrl-C or a kill, the same command resumes the search.
 
-    Exit status: 0 done and some gains on the front meet every requirement, 1 done but none do, 2 bad input, 130
-    interrupted.
+    Exit status: 0 some gains on the front meet every requirement, 1 none do, 2 configuration error, 130 interrupted.
     """
     listed = listed_against(against, points, times, limits)
     loaded, folder = prepare(scenario, "pareto", out, device, trust=trust)
@@ -298,11 +297,11 @@ def compare(
     quiet: Quiet = False,
     figures: Figures = True,
 ) -> int:
-    """Tune the paper's law and others to the same requirements, and judge all on the same fresh trials.
+    """Tune the paper's law and other attitude laws to the same requirements, and compare them on held-out trials.
 
-    Those of --against, and laws of your own, for attitudes. Interrupted or killed, the same command goes on from there.
+    After Ctrl-C or a kill, the same command resumes the search.
 
-    Exit status: 0 done and the tuned law of the paper meets every requirement, 1 done but it does not, 2 bad input, 130
+    Exit status: 0 the tuned law of the paper meets every requirement, 1 it does not, 2 configuration error, 130
     interrupted.
     """
     loaded, folder = prepare(scenario, "compare", out, device, trust=trust)
@@ -335,7 +334,7 @@ def completion(
 ) -> int:
     """Print the script that completes commands and options in a shell: source <(ptsmc completion bash).
 
-    Exit status: 0 done, 2 bad input.
+    Exit status: 0 done, 2 configuration error.
     """
     terminal.say(app.generate_completion(shell=shell))
     return 0
@@ -346,10 +345,10 @@ for _command in (*writing_commands.COMMANDS, *campaign_commands.COMMANDS, *fligh
 
 
 def main() -> None:
-    """Entry point: bad input ends in one sentence and exit status 2, without a traceback."""
+    """Run a command; a configuration error ends it with one sentence and exit status 2, without a traceback."""
     status: object = None
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
-        sys.stdout.reconfigure(errors="backslashreplace")  # as the error stream's are: names have any letters
+        sys.stdout.reconfigure(errors="backslashreplace")  # like the error stream: file names contain any character
     try:
         status = app(sys.argv[1:], exit_on_error=False, print_error=False, result_action="return_value")
     except KeyboardInterrupt as error:
@@ -358,25 +357,25 @@ def main() -> None:
     except UnusedCliTokensError as error:
         _fail(_too_many(error))
     except CycloptsError as error:
-        refused = error.__cause__  # of one of `options`' converters
+        refused = error.__cause__
         _fail(str(refused) if isinstance(refused, UsageError) else " ".join(str(error).split()))
     except ValueError as error:
-        _fail(str(error) if _expected(error) else _of_own_code(error))
+        _fail(str(error) if _expected(error) else _in_custom_code(error))
     except OSError as error:
-        name = error.filename2 or error.filename  # where it was to be moved; of a full disk it is not known
+        name = error.filename2 or error.filename  # the target of a move; unknown if the disk is full
         _fail(f"{error.strerror or error}{'' if name is None else f': {name}'}")
-    except (Exception, SystemExit) as error:  # code of one's own may exit
-        _fail(_of_own_code(error))
+    except (Exception, SystemExit) as error:  # custom code may exit
+        _fail(_in_custom_code(error))
     finally:
         if (programs := sys.modules.get("ptsmc_jax.programs")) is not None:
-            programs.stop()  # exiting waits for what is being compiled
+            programs.stop()  # exiting waits for compilations
     sys.exit(status if isinstance(status, int) else 0)
 
 
 def _too_many(error: UnusedCliTokensError) -> str:
-    """What stands behind a command that takes less."""
+    """Return the message about arguments that a command does not take."""
     command, unused = " ".join(error.command_chain or ()), " ".join(error.unused_tokens or ())
-    return f"{command} does not take {unused}; what it takes: ptsmc {command} --help"
+    return f"{command} does not take {unused}; its arguments: ptsmc {command} --help"
 
 
 def _expected(error: ValueError) -> bool:
@@ -386,8 +385,8 @@ def _expected(error: ValueError) -> bool:
     return isinstance(error, ScenarioError | RefusedError | UsageError)
 
 
-def _of_own_code(error: BaseException) -> str:
-    """What fails in code of one's own that was run; raises the error where it did not come by any."""
+def _in_custom_code(error: BaseException) -> str:
+    """Return the message about an error in custom code; raise the error again if it is not from custom code."""
     systems = sys.modules.get("ptsmc_jax.scenario.systems")
     file = None if systems is None else systems.at_fault(error)
     if file is None:

@@ -1,4 +1,4 @@
-"""`ptsmc new`: a scenario with every key that its plant has, its value, unit and meaning; what is off is commented."""
+"""`ptsmc new`: a scenario with every key of its plant, its value, unit and meaning; keys that are off are comments."""
 
 import textwrap
 from collections.abc import Iterator, Mapping
@@ -17,8 +17,8 @@ from ptsmc_jax.scenario.values import Table
 from ptsmc_jax.simulation import catalogues
 from tuning.errors import UsageError
 
-COLUMN, WIDTH = 36, 120  # at which a meaning begins, and lines end
-# Values shown for keys that are off and have none of their own; a system's own name is what a user puts there.
+COLUMN, WIDTH = 36, 120  # first column of the meanings, and length of the lines
+# Values of keys that are off and have no default.
 EXAMPLES: dict[str, Any] = {
     "plant.system": "my_plant.py:my_plant",
     "controller.code": "my_parts.py:MyLaw",
@@ -64,24 +64,24 @@ EXAMPLES: dict[str, Any] = {
 }
 REQUIREMENTS = {"window_error": {"limit": 1e-4, "quantile": 0.9973, "confidence": 0.9}, "peak_torque": 0.5}
 INTRODUCTION = """\
-A scenario for ptsmc. Every key is optional; what is left out has the value shown here, but [tables] that are off, like
-#[hardware], stay off. To use a line such as #delay = 1, take its # away, and that of its table. Units stand in
-brackets. The keys of another kind follow it, and take the place of those of the kind in use."""
+A scenario for ptsmc. Every key is optional: an absent key has the value shown here. Tables that are off, like
+#[hardware], stay off. To use a line such as #delay = 1, remove its # and the # of its table. Units are in brackets.
+The keys of other kinds follow a table, and replace the keys of its kind."""
 
 
 class _File:
-    """The lines of one scenario file."""
+    """The lines of a scenario file."""
 
     def __init__(self, said: Scenario, resolved: Scenario):
         self.resolved, self.plant = resolved, resolved.plant.kind
         self.live = parsing.as_parsed(said)
         self.values = parsing.dump(resolved)
-        # with the gains that are known without running code of one's own
+        # with the gains that are known without running custom code
         default = parsing.plain(free_gains.resolve(resolved, Tune()))
         self.values["tune"] = {**default, **self.values.get("tune", {})}
 
     def lines(self) -> Iterator[str]:
-        """The file's lines."""
+        """Return all lines."""
         yield from _prose(INTRODUCTION)
         for name, table in layouts.TABLES[self.plant].items():
             if name == "tune":
@@ -89,7 +89,7 @@ class _File:
             yield from ("", *(self.dispersion() if name == "dispersion" else self.table(name, table)))
 
     def table(self, name: str, table: type[Table] | layouts.Kinds) -> Iterator[str]:
-        """A table as it is, and below it what its other kinds have."""
+        """Return the lines of a table, followed by the keys of its other kinds."""
         live, values = self.live.get(name), self.values.get(name, {})
         kinds = table if isinstance(table, Mapping) else {}
         kind = self.plant if name == "plant" else values.get("kind", next(iter(kinds), None))
@@ -100,8 +100,8 @@ class _File:
         if kind is not None:
             yield from _line(live is None, "kind", kind, keys.about(struct))
         values = {**self.defaults(name, struct), **values}
-        borrowed = Attitude.__struct_fields__ if name != "initial" else ()  # which [initial] explains
-        for key in keys.of(struct, self.resolved.unit_of_d):
+        borrowed = Attitude.__struct_fields__ if name != "initial" else ()  # explained at [initial]
+        for key in keys.of(struct):
             off = live is None or key.name not in live
             if f"{name}.{key.name}" in layouts.KINDS:
                 yield from self.inline(name, key, (live or {}).get(key.name, {}), layouts.KINDS[f"{name}.{key.name}"])
@@ -112,9 +112,9 @@ class _File:
         known = struct.__struct_fields__
         if issubclass(struct, Own):
             for key in (key for key in live or () if key not in ("kind", *known)):
-                yield from _line(False, key, values[key], "of one's own")
+                yield from _line(False, key, values[key], "custom")
         if issubclass(struct, Attitude) and borrowed:
-            yield from _prose("its attitude by any one of the keys that [initial] has")
+            yield from _prose("its attitude by one of the keys of [initial]")
         for other, alternative in kinds.items():
             if other != kind:
                 yield ""
@@ -126,7 +126,7 @@ class _File:
                         yield from _line(True, key.name, value, _meaning(key))
 
     def dispersion(self) -> Iterator[str]:
-        """A line for each kind of each thing drawn."""
+        """Return a line for each kind of each dispersion."""
         struct, live = layouts.TABLES[self.plant]["dispersion"], self.live.get("dispersion")
         assert isinstance(struct, type)
         yield from _prose(keys.about(struct))
@@ -136,7 +136,14 @@ class _File:
             yield from self.inline("dispersion", key, chosen, layouts.DISPERSIONS[key.name])
 
     def inline(self, name: str, key: keys.Key, chosen: Mapping[str, Any], kinds: layouts.Kinds) -> Iterator[str]:
-        """A line for each kind of an inline table of a table of this name; chosen: the one that is there."""
+        """Return a line for each kind of an inline table.
+
+        Args:
+            name: of the table that contains it.
+            key: of the inline table.
+            chosen: the inline table of the scenario.
+            kinds: all kinds.
+        """
         yield from _prose(f"{key.meaning}:")
         for kind, struct in kinds.items():
             scaled = {key: mission.scales(self.resolved).of(one) for key, one in struct.scaled.items()}
@@ -146,15 +153,15 @@ class _File:
             yield from _line(not mine, key.name, chosen if mine else table, keys.about(struct))
 
     def requirements(self) -> Iterator[str]:
-        """Those that are there, or two of the many."""
+        """Return the requirements of the scenario, or two examples."""
         catalogue, live = self.resolved.metrics, self.live.get("requirements")
-        limited = [name for name in catalogue if not name.startswith(catalogues.WITHIN)]  # which other keys ask for
+        limited = [name for name in catalogue if not name.startswith(catalogues.WITHIN)]  # required by other keys
         yield from _prose(
-            "The largest value allowed of any metric, in every trial, or in a share of them, shown with a confidence. "
-            f"A limit may be given with its unit: {'hold_angle' if 'hold_angle' in catalogue else 'settling_time'} = "
+            "The largest allowed value of a metric, in every trial or in a fraction of them, with a confidence. "
+            f"A limit may have a unit: {'hold_angle' if 'hold_angle' in catalogue else 'settling_time'} = "
             f'"{"0.05 deg" if "hold_angle" in catalogue else "800 ms"}". The metrics are {", ".join(limited)}. '
-            f"Of the sampled loop also {', '.join(catalogues.MARGINS)}: the least allowed, but for the last, which is "
-            "the largest sensitivity."
+            f"The margins of the sampled loop are {', '.join(catalogues.MARGINS)}: the smallest allowed value, of the "
+            "last one the largest sensitivity."
         )
         yield f"{'#' if live is None else ''}[requirements]"
         known = {**catalogue, **catalogues.MARGINS}
@@ -163,7 +170,7 @@ class _File:
             yield from _line(live is None, name, limit, f"{entry.meaning} [{entry.unit}]")
 
     def defaults(self, name: str, struct: type[Table]) -> dict[str, Any]:
-        """What the keys of a table of this kind are where they are absent, as far as they are anything."""
+        """Return the defaults of the keys of a table; keys without a default are missing."""
         needed = {"code": EXAMPLES[f"{name}.code"]} if issubclass(struct, Own) else {}
         needed |= {"t_f": self.resolved.controller.t_f} if issubclass(struct, LawTable) else {}
         table: Any = struct(**needed)
@@ -173,7 +180,7 @@ class _File:
         return {key: value for key, value in parsing.plain(table).items() if value not in ([], {})}
 
     def example(self, table: str, kind: str | None, key: keys.Key) -> Any:
-        """A value for a key that is off, or drawn: its default, or what it might be."""
+        """Return a value for a key that is off: its default or an example."""
         if key.default not in (None, (), msgspec.NODEFAULT):
             return key.default
         value = EXAMPLES[f"{table}.{key.name}"]
@@ -183,9 +190,15 @@ class _File:
 
 
 def text(plant: str | None, raw: Mapping[str, Any]) -> str:
-    """A commented scenario file: that of `raw`, tables as `parsing.load` reads them, or the default one of this plant.
+    """Return a commented scenario file.
 
-    Raises ScenarioError where raw is no scenario, UsageError where there is no such plant or raw has another one.
+    Args:
+        plant: its kind; None: that of `raw`, or a spacecraft.
+        raw: tables of a scenario, see `parsing.load`; empty: the default scenario of the plant.
+
+    Raises:
+        ScenarioError: raw is no scenario.
+        UsageError: there is no such plant, or raw has another one.
     """
     if plant is not None and plant not in layouts.TABLES:
         raise UsageError(f"--plant is {plant}, but must be {' or '.join(layouts.TABLES)}")
@@ -194,7 +207,7 @@ def text(plant: str | None, raw: Mapping[str, Any]) -> str:
     said = parsing.parse(given)
     if plant not in (None, said.plant.kind):
         raise UsageError(f"--plant is {plant}, but the scenario of --like has plant.kind = {said.plant.kind}")
-    # a system stands in a file that its user has yet to write: it cannot be checked
+    # the file of the system does not exist yet, so the scenario cannot be checked
     resolved = reading.resolve(said) if kind == "system" and not raw else scenario.from_tables(given)
     return "\n".join(_File(said, resolved).lines()) + "\n"
 
@@ -205,7 +218,7 @@ def _meaning(key: keys.Key) -> str:
 
 
 def _line(off: bool, key: str, value: Any, meaning: str) -> Iterator[str]:
-    """`key = value  # meaning`; a meaning too long for that stands above."""
+    """Return `key = value  # meaning`; a long meaning is on the lines above."""
     shown = f"{'#' if off else ''}{errors.show_key(key)} = {errors.show(value)}"
     line = f"{shown:<{COLUMN - 1}} # {meaning}"
     if len(line) > WIDTH:

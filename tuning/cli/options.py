@@ -1,4 +1,4 @@
-"""What the commands share: their options, and how these are read. A value that cannot be followed is a `UsageError`."""
+"""Options that several commands share."""
 
 import contextlib
 import sys
@@ -28,14 +28,16 @@ def whole(text: str, least: int = 0, most: int = 2**32 - 1, **others: Any) -> Pa
 
 
 ScenarioFile = Annotated[
-    Path | None, Parameter(name="SCENARIO", help="Scenario file (TOML); none: the paper's Case I.")
+    Path | None, Parameter(name="SCENARIO", help="Scenario file (TOML); default: the paper's Case I.")
 ]
 SampledFile = Annotated[
     Path | None, Parameter(name="SCENARIO", help='Scenario file (TOML) with loop.mode = "sampled".')
 ]
-Out = Annotated[Path | None, Parameter(help="Folder for the results; by default out/COMMAND-NAME, the file's name.")]
+Out = Annotated[
+    Path | None, Parameter(help="Folder for the results; default: out/COMMAND-NAME with the name of the scenario file.")
+]
 Seed = Annotated[int, whole("Seed of all random numbers, 0 to 4294967295.")]
-Force = Annotated[bool, Parameter(negative="", help="Write into a folder that holds something already.")]
+Force = Annotated[bool, Parameter(negative="", help="Write into a folder that is not empty.")]
 Quiet = Annotated[bool, Parameter(negative="", help="Print nothing but errors.")]
 Figures = Annotated[bool, Parameter(negative="--no-figures", help="Draw figures.")]
 
@@ -48,30 +50,32 @@ Against = Annotated[
     ),
 ]
 Laws = Annotated[
-    tuple[str, ...], Parameter(negative="", help="FILE.py:NAME of a law of your own beside them, several times.")
+    tuple[str, ...], Parameter(negative="", help="FILE.py:NAME of a custom law to compare with too, several times.")
 ]
 Device = Annotated[Literal["cpu", "gpu"], Parameter(help="Hardware that batches run on.")]
 Trust = Annotated[
     bool,
     Parameter(
         negative="",
-        help="Run Python files that results name (system, code, --metrics): read them first: they can do what you can.",
+        help="Run the Python files that results name. Read them first: they run with your permissions.",
     ),
 ]
 
 FrontAgainst = Annotated[
     Literal["torque", "margins", "t_f"], Parameter(help="Quantity that the accuracy is traded against.")
 ]
-Points = Annotated[int | None, whole("Number of limits on the torque to tune for, 3 to 100; none: 20.", 3, 100)]
+Points = Annotated[int | None, whole("Number of limits on the torque to tune for, 3 to 100; default: 20.", 3, 100)]
 Times = Annotated[
     str | None,
-    Parameter(help="Prescribed times to tune for, with --against t_f [s], such as 20,30,45; none: half to twice t_f."),
+    Parameter(
+        help="Prescribed times to tune for, with --against t_f [s], such as 20,30,45; default: t_f / 2 to 2 t_f."
+    ),
 ]
 SensitivityLimits = Annotated[
     str | None,
     Parameter(
-        help="Limits on the largest sensitivity |S| to tune for, with --against margins [dB], such as 4,6,9; none: "
-        "3 to 12. What no limit leaves is found too."
+        help="Limits on the largest sensitivity |S| to tune for, with --against margins [dB], such as 4,6,9; default: "
+        "3 to 12. The gains without a limit are found too."
     ),
 ]
 
@@ -110,7 +114,7 @@ def listed_against(against: str, points: int | None, times: str | None, limits: 
 
 
 def _numbers(option: str, text: str, least: int, allowed: str) -> tuple[float, ...]:
-    """Positive numbers between commas, in order, at least so many."""
+    """Return positive numbers between commas in ascending order, at least this many."""
     try:
         listed = tuple(sorted(float(part) for part in text.split(",")))
     except ValueError:
@@ -130,18 +134,24 @@ def prepare(
     trust: bool,
     force: bool | None = None,
 ) -> "tuple[Scenario, Path]":
-    """The checked scenario, which may be flown, and the folder for the results; the backend is configured on the way.
+    """Check a scenario and the folder for its results, and configure JAX.
 
     Args:
         scenario: its file; None: the paper's Case I.
-        command: after which the folder is named where none is given.
-        out: the folder that is asked for, if any.
-        device: what is flown on, "cpu" or "gpu".
+        command: its name, for the default name of the folder.
+        out: the folder of the option --out.
+        device: hardware of the simulations.
         bits: of every number.
-        trust: code that the scenario names may be run where it lies in results.
-        force: whether the folder may hold something already; None: the command looks at that later.
+        trust: code that a scenario in results names may be run.
+        force: the folder may contain files; None: the command checks the folder later.
 
-    Raises ScenarioError, RefusedError or UsageError where one of these cannot be followed.
+    Returns:
+        The scenario, and the folder.
+
+    Raises:
+        ScenarioError: the scenario is not valid.
+        RefusedError: the folder must not be written to, or the scenario names code that must not be run.
+        UsageError: there is no such device.
     """
     from ptsmc_jax.scenario import reading
 
@@ -163,6 +173,6 @@ def prepare(
         from tuning.search import own_parts
 
         if not any(parsing.stated(loaded).values()):
-            print(f"ptsmc: {scenario} says nothing: what flies is the paper's Case I", file=sys.stderr)
+            print(f"ptsmc: {scenario} is empty; the paper's Case I is simulated", file=sys.stderr)
         own_parts.allow_scenario(scenario, loaded, trust)
     return reading.complete(loaded), folder

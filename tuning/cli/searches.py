@@ -1,4 +1,4 @@
-"""What `tune`, `pareto` and `compare` share: a long search that is shown again, gone on with, or begun."""
+"""Long searches of `tune`, `pareto` and `compare`: begun, resumed, or shown again."""
 
 import importlib
 import sys
@@ -19,25 +19,25 @@ if TYPE_CHECKING:
     from tuning.search.journal import Journal
 
 COMMANDS = ("tune", "pareto", "compare")
-STATUS = {"met": 0, "not met": 1, "interrupted": INTERRUPTED}  # of the exit
+STATUS = {"met": 0, "not met": 1, "interrupted": INTERRUPTED}  # exit status
 
 
 @dataclass(frozen=True)
 class LongSearch:
-    """A search that takes minutes to hours: what does it, and how its outcome is kept and shown."""
+    """A search that takes minutes to hours."""
 
-    known_by: dict[str, Any]  # what tells it from others in a folder, see `store.begin`
-    goal: str  # what the progress says is minimised
-    work: Callable[[Progress, "Journal"], Any]  # searches; what it returns has a `status`
-    write: Callable[[Path, Any], None]  # fills a result folder with that outcome
-    summary: Callable[[Any], dict[str, Any]]  # what `summary.json` says of it
-    report: Callable[[dict[str, Any]], "Report"]  # of such a summary
-    check: Callable[[], Any] = lambda: None  # raises what is refused besides the scenario, before a folder is begun
-    needs: tuple[str, ...] = ()  # modules that take long to import, and only what follows the first steps needs
+    known_by: dict[str, Any]  # entries of versions.json that identify it, see `store.begin`
+    goal: str  # name of the objective in the progress
+    work: Callable[[Progress, "Journal"], Any]  # runs the search; its result has a `status`
+    write: Callable[[Path, Any], None]  # fills a result folder with a result
+    summary: Callable[[Any], dict[str, Any]]  # returns the content of summary.json
+    report: Callable[[dict[str, Any]], "Report"]  # of a summary
+    check: Callable[[], Any] = lambda: None  # raises configuration errors that the scenario does not have
+    needs: tuple[str, ...] = ()  # modules that are imported during the first steps
 
 
 def say_seen(scenario: Path, seed: int) -> None:
-    """Say so where a search found the gains of a scenario with the very trials of this seed, which prove nothing."""
+    """Print a warning if a search found the gains of a scenario with the trials of this seed."""
     from ptsmc_jax.campaigns import store
     from tuning.search import own_parts
 
@@ -45,14 +45,14 @@ def say_seen(scenario: Path, seed: int) -> None:
     made = {} if folder is None else store.read_versions(folder)
     if made.get("command") in COMMANDS and made.get("seed") == seed:
         print(
-            f"ptsmc: {made['command']} found the gains of {scenario} with trials of seed {seed}, which are flown "
-            "again: for a proof give another --seed",
+            f"ptsmc: {made['command']} found the gains of {scenario} with the same trials of seed {seed}; use another "
+            "--seed to verify them",
             file=sys.stderr,
         )
 
 
 def with_tune(scenario: "Scenario") -> "Scenario":
-    """The scenario with a `tune` table, the default one where it has none. Raises ScenarioError without any gain."""
+    """Return the scenario with a `tune` table. Raises ScenarioError without a free gain."""
     from ptsmc_jax.scenario import free_gains, replace
 
     scenario = scenario if scenario.tune is not None else replace(scenario, tune={})
@@ -61,7 +61,7 @@ def with_tune(scenario: "Scenario") -> "Scenario":
 
 
 def run(search: LongSearch, loaded: "Scenario", folder: Path, *, force: bool, quiet: bool) -> int:
-    """A long search: shown again if it was done before, gone on with if it was interrupted. Returns the exit status."""
+    """Show a finished search, resume an interrupted one, or begin a new one. Returns the exit status."""
     from ptsmc_jax.campaigns import store
     from ptsmc_jax.scenario import parsing
 
@@ -87,7 +87,7 @@ def _run(search: LongSearch, loaded: "Scenario", folder: Path, *, force: bool, q
     going_on = not force and store.begun(folder, tables, search.known_by)
     if not going_on:
         store.check(folder, force)
-    study(loaded)  # what it refuses, it refuses before the search
+    study(loaded)  # raises configuration errors before the search
     search.check()
     from tuning.search.journal import Journal
 
@@ -103,6 +103,6 @@ def _run(search: LongSearch, loaded: "Scenario", folder: Path, *, force: bool, q
     else:
         print(f"ptsmc: interrupted; {resume_by(force)}", file=sys.stderr)
     if not quiet:
-        summary = store.plain(search.summary(outcome))  # as it is read when it is shown again
+        summary = store.plain(search.summary(outcome))  # as an earlier result is read
         terminal.show(search.report(summary), folder)
     return STATUS[outcome.status]

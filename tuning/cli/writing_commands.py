@@ -1,4 +1,4 @@
-"""The commands that fly nothing: a page from results, scenario files to begin with, an attitude in every form."""
+"""Commands without simulations: a page from results, scenario files, attitudes in every form."""
 
 import json
 from importlib.resources import files
@@ -12,16 +12,16 @@ from tuning.output import terminal
 
 
 def report(
-    folder: Annotated[Path, Parameter(name="DIR", help="Folder that a command left.")], /, *, quiet: Quiet = False
+    folder: Annotated[Path, Parameter(name="DIR", help="Result folder of a command.")], /, *, quiet: Quiet = False
 ) -> int:
-    """Make one page of HTML, DIR/report.html, from the results in a folder: to be sent, opened and printed anywhere.
+    """Write the results in a folder as one page of HTML, DIR/report.html, which needs no other file.
 
-    Exit status: 0 done, 2 bad input.
+    Exit status: 0 done, 2 configuration error.
     """
     from ptsmc_jax.campaigns import store
     from tuning.output import page
 
-    page.read(folder)  # refuses what is no result
+    page.read(folder)  # raises RefusedError without a result
     with store.in_use(folder, shared=True):
         content = page.build(folder)
         store.write(folder, lambda making: store.write_text(making / "report.html", content))
@@ -35,15 +35,15 @@ def new(
     /,
     *,
     plant: Annotated[
-        str | None, Parameter(help="Kind of the plant: spacecraft, chain or system; without it spacecraft.")
+        str | None, Parameter(help="Kind of the plant: spacecraft, chain or system; default: spacecraft.")
     ] = None,
-    like: Annotated[Path | None, Parameter(help="Scenario to begin with; without it the defaults.")] = None,
-    force: Annotated[bool, Parameter(negative="", help="Write over a file that is there already.")] = False,
+    like: Annotated[Path | None, Parameter(help="Scenario to start from; default: the default values.")] = None,
+    force: Annotated[bool, Parameter(negative="", help="Overwrite an existing file.")] = False,
     quiet: Quiet = False,
 ) -> int:
-    """Write a scenario file with every key, its value, unit and meaning, to be changed at will.
+    """Write a scenario file with every key, its value, unit and meaning.
 
-    Exit status: 0 done, 2 bad input.
+    Exit status: 0 done, 2 configuration error.
     """
     from ptsmc_jax.campaigns import store
     from ptsmc_jax.scenario import parsing
@@ -82,20 +82,18 @@ def examples(
     folder: Annotated[Path, Parameter(name="DIR", help="Folder for them.")] = Path("scenarios"),
     /,
     *,
-    force: Annotated[bool, Parameter(negative="", help="Write over files that are there already.")] = False,
+    force: Annotated[bool, Parameter(negative="", help="Overwrite existing files.")] = False,
     quiet: Quiet = False,
 ) -> int:
-    """Copy the scenarios that come with ptsmc, with the Python files that some of them name, to be flown and changed.
+    """Copy the packaged scenarios and the Python files that some of them name.
 
-    Exit status: 0 done, 2 bad input.
+    Exit status: 0 done, 2 configuration error.
     """
     from ptsmc_jax.campaigns import store
 
     shipped = sorted(path for path in _examples().iterdir() if path.suffix in (".toml", ".py"))
     if folder.exists() and not folder.is_dir():
-        raise store.RefusedError(
-            f"the folder is {folder}, but that is a file; allowed is a new folder, or one that is there"
-        )
+        raise store.RefusedError(f"the folder is {folder}, but that is a file; allowed is a new or an existing folder")
     folder.mkdir(parents=True, exist_ok=True)
     for path in shipped:
         store.check_file(folder / path.name, force)
@@ -107,13 +105,13 @@ def examples(
 
 
 def _examples() -> Path:
-    """Where the scenarios lie: in the package where it was installed from a wheel, else at the top of the checkout."""
+    """Return the folder of the packaged scenarios: in the package, or at the top of a checkout."""
     package = Path(str(files("ptsmc_jax")))
     packed = package / "examples"
     return packed if packed.is_dir() else package.parent / "scenarios"
 
 
-# the first of them may be negative: -10,20,30 is no option
+# the first number may be negative
 _Numbers = Annotated[str | None, Parameter(help="Numbers, separated by commas or spaces.", allow_leading_hyphen=True)]
 _Rows = Annotated[str | None, Parameter(help="Nine numbers, row by row.", allow_leading_hyphen=True)]
 
@@ -127,12 +125,12 @@ def convert_attitude(
     dcm_body_to_inertial: _Rows = None,
     euler_deg: _Numbers = None,
     sequence: Annotated[
-        str | None, Parameter(help="Three axes in SciPy's notation, of euler_deg and of what is printed; default ZYX.")
+        str | None, Parameter(help="Three axes in SciPy's notation, for euler_deg and for the output; default: ZYX.")
     ] = None,
 ) -> int:
     """Print one attitude, of the body relative to the inertial frame, in every form that a scenario takes.
 
-    Exit status: 0 done, 2 bad input.
+    Exit status: 0 done, 2 configuration error.
     """
     from tuning.cli import convert
 

@@ -1,1 +1,1 @@
-"""What is said of a result: sentences, tables, the terminal, the page."""
+"""Reports of results, made from typed summaries, and their renderers: the terminal and the page."""

@@ -95,10 +95,10 @@ def accuracy(summary: Tune) -> Iterator[str]:
         times = over_bound(on_fresh.rms, fresh.floor)
         bound = "" if times is None else f", {ratio(times)} times the lower bound of {error(fresh.floor, plant)}"
         spread = interval(on_fresh.rms_interval, text)
-        yield f"RMS {_name(summary)} {text(on_fresh.rms)}{spread} on held-out trials{bound}"
+        yield f"held-out trials: {text(on_fresh.rms)}{spread}{bound}"
     if on_training is not None and on_training.rms is not None:
         spread = interval(on_training.rms_interval, text)
-        yield f"RMS {_name(summary)} {text(on_training.rms)}{spread} on training trials"
+        yield f"training trials: {text(on_training.rms)}{spread}"
     yield from _beside_paper(summary)
     if summary.gains:
         yield f"tuned gains: {', '.join(f'{name} {value:.6g}' for name, value in summary.gains.items())}"
