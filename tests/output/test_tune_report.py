@@ -8,6 +8,7 @@ from ptsmc_jax.simulation.catalogues import MARGINS, NO_SIGN
 from ptsmc_jax.simulation.requirements import Requirement
 from tests.output import examples
 from tuning.output import margins_report, summaries, tune_report
+from tuning.output.report import Text
 from tuning.search import gains
 from tuning.studies import tune_files, tuner
 
@@ -198,6 +199,37 @@ def test_conflicting_requirements_are_listed_with_the_limits_that_resolve_the_co
     told = [*tune_report.search(examples.tune(found, verdicts=[examples.torque(1.1), MARGIN]))]
     assert told[0] == "the search found no gains that meet every requirement, nor did a global search"
     assert told[3:-1] == lines
+
+
+def test_shortest_time_is_reported_if_simulation_confirms_it_or_theory_excludes_it():
+    def lines(theory, simulated, **changes):
+        times = {"limit": 0.5, "theory": theory, "simulated": simulated, "quantile": None, "unit": "N m", **changes}
+        (text,) = tune_report.of(examples.tune(shortest_t_f=times)).sections[-1].blocks
+        assert isinstance(text, Text)
+        return [line for line in text.lines if "t_f" in line]
+
+    (line,) = lines(20.1234, 20.5, quantile=0.9)
+    assert line == (
+        "the tuned gains keep peak_torque below 0.5 N m in 90 % of trials from t_f = 20.5 s on (20.12 s by theory)"
+    )
+    (line,) = lines(None, None)
+    assert line == "the tuned gains keep peak_torque below 0.5 N m at no t_f, by theory"
+    assert lines(20.1234, None) == []
+
+
+def test_confirmation_that_is_skipped_is_reported():
+    """The search does not confirm a quantile if its gains exceed a limit by more than a tenth; nothing said so."""
+    asked = Requirement("effort", 9.0, quantile=0.9).verdict(np.zeros(10), np.ones(10, bool)).in_summary()
+
+    def skipped(reached, verdict):
+        found = {"largest_over_limit": {"peak_torque": reached, "effort": 0.5}}
+        lines = tune_report.search(examples.tune(found, verdicts=[examples.torque(1.2), verdict]))
+        return [line for line in lines if "confirmed" in line]
+
+    (line,) = skipped(1.2, asked)
+    assert line.endswith("because peak_torque is out of reach")
+    assert skipped(1.05, asked) == []
+    assert skipped(1.2, {**asked, "quantile": None}) == []
 
 
 BROKEN = Requirement("peak_torque", 0.5).verdict(np.array([0.4, 0.7]), np.ones(2, bool))

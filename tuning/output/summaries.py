@@ -172,6 +172,16 @@ class Check(msgspec.Struct, frozen=True):
     rollouts: int
 
 
+class ShortestTime(msgspec.Struct, frozen=True):
+    """The shortest t_f [s] that a limit on the torque allows, by theory and by simulation."""
+
+    limit: float
+    theory: Number
+    simulated: Number
+    quantile: Number
+    unit: str | None
+
+
 class Tune(msgspec.Struct, frozen=True, kw_only=True):
     """The summary of `ptsmc tune`."""
 
@@ -188,7 +198,7 @@ class Tune(msgspec.Struct, frozen=True, kw_only=True):
     before: Group | None = None
     paper_refused: str | None
     paper_is: str
-    shortest_t_f: dict[str, Any] | None
+    shortest_t_f: ShortestTime | None
     broken_by: dict[str, list[str]]
     verdicts: list[Entry]
     judged_on: str

@@ -11,6 +11,7 @@ from tuning.output.run_report import cautions
 from tuning.output.summaries import Check, Entry, Group, Hardest, Search, Tune
 
 AGREE = 0.01  # largest relative difference of gradients from finite differences
+HOPELESS = 1.1  # see `optimise.HOPELESS`, whose import takes a second
 PAPER = {  # columns of the published gains in words
     "paper": "the published gains",
     "paper, scaled": "the published gains, scaled to this body and period",
@@ -150,6 +151,10 @@ def search(summary: Tune) -> Iterator[str]:
             f"{count.beyond} beyond the limit, {most}; probability that the held-out trials meet it: "
             f"{percent(count.probability)} %"
         )
+    hopeless = [metric for metric, one in over.items() if one is None or one > HOPELESS]
+    if hopeless and not record.confirmed and any(v.quantile is not None for v in summary.verdicts):
+        names = " and ".join(hopeless)
+        yield f"no requirement on a fraction of the trials was confirmed, because {names} is out of reach"
     if record.hardest is not None:
         yield _worst_case(record.hardest, tuned_for=record.worst_case)
     steps = "".join(f", {what} {spent:.0f} s" for what, spent in record.seconds_by_step.items() if spent >= 1.0)
@@ -344,9 +349,16 @@ def diagnostics(summary: Tune) -> Iterator[str]:
 
 def _shortest(summary: Tune) -> Iterator[str]:
     """Return the shortest t_f that the limit on the torque allows."""
-    from tuning.search import design
-
-    times = summary.shortest_t_f
+    found = summary.shortest_t_f
     # the theory ignores noise: without a simulation that keeps the limit its t_f would contradict the verdict
-    if times is not None and (times["simulated"] is not None or times["theory"] is None):
-        yield str(design.ShortestTime(**times))
+    if found is None or (found.simulated is None and found.theory is not None):
+        return
+    fraction = "" if found.quantile is None else f" in {100 * found.quantile:g} % of trials"
+    limit = f"peak_torque below {found.limit:g} {found.unit or ''}".rstrip() + fraction
+    if found.theory is None:
+        yield f"the tuned gains keep {limit} at no t_f, by theory"
+    else:
+        yield (
+            f"the tuned gains keep {limit} from t_f = {digits(found.simulated, '.4g')} s on ({found.theory:.4g} s by "
+            "theory)"
+        )

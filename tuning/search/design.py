@@ -35,15 +35,6 @@ class ShortestTime:
     quantile: float | None = None  # share of trials that must keep it; None: every one
     unit: str | None = None  # of the limit
 
-    def __str__(self) -> str:
-        """All of it in one line."""
-        share = "" if self.quantile is None else f" in {100 * self.quantile:g} % of trials"
-        limit = f"peak_torque below {self.limit:g} {self.unit or ''}".rstrip() + share
-        if self.theory is None:
-            return f"no t_f up to {FARTHEST:g} times the scenario's keeps {limit} with the tuned gains"
-        flown = "; none was found by simulation" if self.simulated is None else f", {self.simulated:.4g} s as flown"
-        return f"the tuned gains keep {limit} from t_f = {self.theory:.4g} s on by theory{flown}"
-
 
 def shortest_time(flown: Scenario, asked: Requirement, seed: int, trials: np.ndarray) -> ShortestTime:
     """Shortest t_f of a scenario's gains for a limit on the commanded input, over these trials of the seed.
