@@ -29,7 +29,7 @@ def tune(search: dict[str, Any] | None = None, trust: dict[str, Any] | None = No
     summary = {
         "status": "met", "plant": "spacecraft", "gain_units": {}, "gains": {}, "at_bound": {},
         "accuracy_gain_over_paper": None, "accuracy_gain_interval": None, "training": group(), "fresh": group(),
-        "paper_refused": None, "paper_is": "paper", "shortest_t_f": None, "broken_by": {}, "verdicts": [],
+        "paper_refused": None, "paper_is": "published", "shortest_t_f": None, "broken_by": {}, "verdicts": [],
         "judged_on": "flight clock", "cautions": [], "differential_evolution": None,
     }  # fmt: skip
     trusted = None if trust is None else {**known, **trust}

@@ -18,7 +18,7 @@ def front(*points, **changes):
             "against": "torque", "plant": "spacecraft", "points": list(points), "idle": [], "without": [],
             "trials": 1000, "seed": 1, "interval_confidence": 0.95, "floor": None, "rollouts": 1, "gradients": 1,
             "requirements": [], "gain_units": {"eta": "-", "observer_gain": "kg m^2/s"}, "cautions": [],
-            "paper_is": "paper", **changes,
+            "paper_is": "published", **changes,
         }
     )  # fmt: skip
     return read(plain(made.summary()))
@@ -72,7 +72,7 @@ def test_points_without_a_completed_trial_have_no_numbers():
     lost = torque(0.1, math.nan, math.nan, failures=9)
     made = front(lost, others={"paper": lost})
     row = ("-", "-", "-", "-", "-", "9 failed or missed")
-    assert front_report.results(made).rows == [("0.1", *row), ("paper", *row)]
+    assert front_report.results(made).rows == [("0.1", *row), ("published", *row)]
     assert list(front_report.answers(made)) == []
     assert page_charts.front(made, None)["data"] == []
 
@@ -80,8 +80,8 @@ def test_points_without_a_completed_trial_have_no_numbers():
 def test_gains_of_each_axis_next_to_one_gain_for_all_axes_or_none():
     each = torque(0.3, 0.3, 1e-5, {"observer_gain_1": 5.0, "observer_gain_2": 6.0})
     others = {"paper": torque(1.0, 1.0, 1e-5, {"observer_gain": 10.0}), "before": torque(1.0, 1.0, 1e-5, {})}
-    table = front_report.gains(front(each, others=others, paper_is="paper, scaled"))
-    assert table.rows == [("0.3", "5", "6"), ("paper, scaled", "10", "10"), ("before", "-", "-")]
+    table = front_report.gains(front(each, others=others, paper_is="published, scaled"))
+    assert table.rows == [("0.3", "5", "6"), ("published, scaled", "10", "10"), ("before", "-", "-")]
     assert table.head[1:] == ("observer_gain_1 [kg m^2/s]", "observer_gain_2 [kg m^2/s]")
 
 
@@ -150,10 +150,10 @@ def test_chart_of_a_front_has_intervals_knee_limit_and_no_point_without_an_error
     drawn = page_charts.front(front(*points, others=others), 1.5)
     named = {trace["name"]: trace for trace in drawn["data"]}
     assert {name: trace["x"] for name, trace in named.items()} == {
-        "front": [1.0, 2.0], "knee": [1.0], "dominated": [3.0], "paper": [5.0],
+        "front": [1.0, 2.0], "knee": [1.0], "dominated": [3.0], "published": [5.0],
     }  # fmt: skip
     np.testing.assert_allclose(named["front"]["error_y"]["array"], [0.8e-5, 0.2e-5])
     np.testing.assert_allclose(named["front"]["error_y"]["arrayminus"], [0.4e-5, 0.1e-5])
-    assert named["paper"]["error_y"]["array"] == [0.0]
+    assert named["published"]["error_y"]["array"] == [0.0]
     assert drawn["layout"]["shapes"][0]["x0"] == 1.5
     assert "peak torque [N m]" in json.dumps(drawn["layout"])

@@ -139,7 +139,7 @@ def beside(times, **changes):
 
 def test_less_accurate_gains_are_compared_by_their_larger_error():
     """The interval of a ratio turns over with it: from 0.05..0.1 to 10..20."""
-    less = {"paper_is": "paper, scaled", "accuracy_gain_interval": [0.05, 0.1]}
+    less = {"paper_is": "published, scaled", "accuracy_gain_interval": [0.05, 0.1]}
     (line,) = beside(0.08, **less)
     assert line == (
         "less accurate than the published gains, scaled to this body and period: 12.5 times the error "
@@ -258,9 +258,9 @@ def test_result_beyond_a_bound(seen, text):
 
 def test_column_of_the_published_gains_is_named_after_their_source():
     paper = scenario.from_tables({"loop": {"mode": "sampled"}})
-    assert gains.paper_is(paper) == "paper"
-    assert gains.paper_is(scenario.replace(paper, loop__period=0.5)) == "paper, scaled"  # a hand-over of a period
-    assert gains.paper_is(scenario.replace(paper, spacecraft={"inertia": [0.1, 0.1, 0.1]})) == "paper, scaled"
+    assert gains.paper_is(paper) == "published"
+    assert gains.paper_is(scenario.replace(paper, loop__period=0.5)) == "published, scaled"  # a hand-over of a period
+    assert gains.paper_is(scenario.replace(paper, spacecraft={"inertia": [0.1, 0.1, 0.1]})) == "published, scaled"
     assert gains.paper_is(scenario.replace(paper, controller={"kind": "pd"})) == "paper's law"
 
 

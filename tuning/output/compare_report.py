@@ -167,7 +167,8 @@ def _chart(question: Question, laws: dict[str, Law], k: int) -> Chart:
         for value in shown
     }
     axis = f"{question.what or shown[0].name} [{shown[0].unit}]"
-    figure = page_charts.laws(list(laws), series, axis, marks(question, list(laws.values())), question.logarithmic)
+    names = [_name(law) for law in laws]
+    figure = page_charts.laws(names, series, axis, marks(question, list(laws.values())), question.logarithmic)
     return Chart(f"question_{k}", figure, question.note)
 
 
@@ -228,8 +229,10 @@ def lines(summary: Compare) -> Iterator[str]:
     for name, law in summary.laws.items():
         gains = ", ".join(f"{gain} {value:.4g}" for gain, value in law.gains.items())
         bound = "".join(f"; {gain} on its {side} bound" for gain, side in law.at_bound.items())
-        scaled = ", scaled to this body and period" if (name, summary.paper_is) == ("paper", "paper, scaled") else ""
-        yield f"gains of {_name(name)}{scaled}: {gains}{bound}"
+        scaled = (
+            ", scaled to this body and period" if (name, summary.paper_is) == ("paper", "published, scaled") else ""
+        )
+        yield f"{_name(name)}{scaled}: {gains}{bound}"
         lost = failed(law.counts)
         if lost:
             yield f"  {sum(lost.values())} of {summary.trials} trials fail: {listed(lost)}"
@@ -257,4 +260,4 @@ def winner(laws: dict[str, Law]) -> str:
 
 
 def _name(law: str) -> str:
-    return law.replace("_", " ")
+    return "published gains" if law == "paper" else law.replace("_", " ")

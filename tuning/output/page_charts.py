@@ -170,21 +170,25 @@ def laws(
     marks: Mapping[str, float],
     logarithmic: bool,
 ) -> Chart:
-    """Numbers of several laws, one below the other.
+    """Return the chart of numbers of several laws, one below the other.
 
-    series: label -> (a number for each law, its interval); axis: what they are; marks: lines to draw, by what they are.
-    logarithmic: where they span a decade or more, whose ends the axis names.
+    Args:
+        names: of the laws.
+        series: label -> (a number for each law, its interval).
+        axis: label of the axis.
+        marks: positions of vertical lines by label.
+        logarithmic: use a logarithmic axis if the numbers span a decade or more.
     """
     finite = {label: [None if v is None or not np.isfinite(v) else v for v in values]
               for label, (values, _) in series.items()}  # fmt: skip
     every = [v for values in finite.values() for v in values if v is not None]
     logarithmic = logarithmic and bool(every) and min(every) > 0.0 and max(every) >= 10.0 * min(every)
-    labels, data = [name.replace("_", " ") for name in names], []
+    data = []
     for k, (label, (_, intervals)) in enumerate(series.items()):
         away = [(0.0, 0.0) if v is None or not both else (both[1] - v, v - both[0])
                 for v, both in zip(finite[label], intervals, strict=True)]  # fmt: skip
         data.append({
-            "type": "scatter", "mode": "markers", "name": label, "x": finite[label], "y": labels,
+            "type": "scatter", "mode": "markers", "name": label, "x": finite[label], "y": list(names),
             "hovertemplate": "%{y}: %{x:.4g}<extra>" + label + "</extra>", "showlegend": len(series) > 1,
             "marker": {"size": 10, "color": COLOURS[k % len(COLOURS)], "symbol": SYMBOLS[k % len(SYMBOLS)]},
             "error_x": {"type": "data", "symmetric": False, "thickness": 1.5, "visible": any(intervals),

@@ -13,8 +13,8 @@ from tuning.output.summaries import Check, Entry, Group, Hardest, Search, Tune
 AGREE = 0.01  # largest relative difference of gradients from finite differences
 HOPELESS = 1.1  # see `optimise.HOPELESS`, whose import takes a second
 PAPER = {  # columns of the published gains in words
-    "paper": "the published gains",
-    "paper, scaled": "the published gains, scaled to this body and period",
+    "published": "the published gains",
+    "published, scaled": "the published gains, scaled to this body and period",
     "paper's law": "the paper's law with the published gains",
 }
 

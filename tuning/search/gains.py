@@ -95,11 +95,11 @@ def papers(scenario: Scenario) -> Scenario:
 
 
 def paper_is(scenario: Scenario) -> str:
-    """What the paper's gains are for a scenario: its own, scaled to another body or period, or those of its law."""
-    if not scenario.controller.law.prescribed:
+    """Return the label of the published gains: as they are, scaled to another body or period, or of the paper's law."""
+    if not scenario.controller.prescribed:
         return "paper's law"
     as_published = mission.published(scenario) and of_paper(scenario)["delta"] == AS_PUBLISHED
-    return "paper" if as_published else "paper, scaled"
+    return "published" if as_published else "published, scaled"
 
 
 def differ(one: Scenario, other: Scenario) -> bool:
