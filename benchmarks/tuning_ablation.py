@@ -46,7 +46,7 @@ def changed(module: object, **values: object) -> Iterator[None]:
 
 def variants() -> dict[str, Callable]:
     """What is left out or changed, by name: a context to search in."""
-    from tuning.search import cma_es, descents, optimise, starts
+    from tuning.search import descents, evolution, optimise, starts
 
     everything = descents.Descents
 
@@ -64,11 +64,11 @@ def variants() -> dict[str, Callable]:
             return []
 
     class Evolved(everything):
-        """Evolution (CMA-ES) after the descents."""
+        """Differential evolution after the local searches."""
 
         def descend(self, problem, starts):
             super().descend(problem, starts)
-            self.evolve(problem, self.share, cma_es.NEARBY)
+            self.evolve(problem, self.share, evolution.NEARBY)
 
     def searching(kind: type) -> Callable:
         return lambda: changed(optimise, Descents=kind)

@@ -300,7 +300,7 @@ def refused(command, tmp_path, *args):
 
 def small_search(monkeypatch, fresh=40):
     """A search that looks at a few points only, judged on so many trials; rows hold little more than its few trials."""
-    from tuning.search import cma_es, confirm, descents, flights, starts, worst
+    from tuning.search import confirm, descents, evolution, flights, starts, worst
 
     for module, name, value in (
         (flights, "ROW", 10),
@@ -311,7 +311,7 @@ def small_search(monkeypatch, fresh=40):
         (starts, "SWEPT", 16),
         (starts, "WIDELY", 64),
         (descents, "MANY", 16),
-        (cma_es, "GENERATIONS", 3),
+        (evolution, "GENERATIONS", 3),
     ):
         monkeypatch.setattr(module, name, value)
 

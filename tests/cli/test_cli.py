@@ -391,8 +391,9 @@ def test_a_killed_search_goes_on(tmp_path):
     """kill -9 while it searches, in a process of its own; then the same command to the end."""
     (tmp_path / "s.toml").write_text(SHORT)
     code = (
-        "import sys; from tuning.cli import main; from tuning.search import cma_es, confirm, descents, starts, worst; "
-        "starts.SWEPT = 16; descents.MANY = 16; cma_es.GENERATIONS = 3; "
+        "import sys; from tuning.cli import main; "
+        "from tuning.search import confirm, descents, evolution, starts, worst; "
+        "starts.SWEPT = 16; descents.MANY = 16; evolution.GENERATIONS = 3; "
         "worst.SCREENED = 48; confirm.FRESH = 40; main.main()"
     )
     run = [sys.executable, "-c", code, "tune", "s.toml", "--out", "t", "--quiet", "--no-figures"]

@@ -21,10 +21,10 @@ from ptsmc_jax.theory import envelopes
 from tests import helpers
 from tests.helpers import chain_parts, parts, random_turns, vector
 from tuning.search import (
-    cma_es,
     confirm,
     descent,
     descents,
+    evolution,
     flights,
     gains,
     hand_overs,
@@ -543,7 +543,7 @@ def test_a_search_without_slopes_finds_the_optimum_too(monkeypatch):
     """The goal of a search with them, for a law that has both: what differs is how it is found."""
     helpers.small_search(monkeypatch)
     monkeypatch.setattr(descents, "MANY", 64)
-    monkeypatch.setattr(cma_es, "GENERATIONS", 25)
+    monkeypatch.setattr(evolution, "GENERATIONS", 25)
     found, evaluates = {}, {sloped: Evaluator(WITHIN) for sloped in (True, False)}
     for sloped, evaluate in evaluates.items():
         settings = optimise.Settings(3, 40, 1, sloped=sloped)

@@ -332,7 +332,10 @@ def diagnostics(summary: Tune) -> Iterator[str]:
     if gradients is None:
         if found.margins:
             yield NO_SIGN
-        yield "CMA-ES found the gains, because the discontinuous sign has no gradients; sign_width can be a free gain"
+        yield (
+            "differential evolution found the gains, because the discontinuous sign has no gradients; tune.free may "
+            "name sign_width"
+        )
         return
     off = {place: value for place, value in gradients.items() if value is not None}
     shown = " and ".join(f"{value:.0e} at the {place}" for place, value in off.items())

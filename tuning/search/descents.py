@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike
 
 from ptsmc_jax import configure
 from tuning.search import hand_overs
-from tuning.search.cma_es import GENERATIONS, WIDELY, evolve
 from tuning.search.descent import BOLD, CAREFUL, CLOSE, SLACK, Best, Relaxed, Start, descend, largest, prices
 from tuning.search.evaluate import Evaluator, Measured, Sloped
+from tuning.search.evolution import GENERATIONS, WIDELY, evolve
 from tuning.search.lockstep import Ask, in_step
 from tuning.search.objective import LIMITS, Problem, ended, failures, fewer_trials
 from tuning.search.progress import Report

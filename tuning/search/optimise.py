@@ -11,9 +11,9 @@ import numpy as np
 
 from ptsmc_jax.simulation.requirements import Requirement
 from tuning.search import confirm
-from tuning.search.cma_es import NEARBY
 from tuning.search.descents import Descents, Step, planned
 from tuning.search.evaluate import Evaluator
+from tuning.search.evolution import NEARBY
 from tuning.search.objective import Problem
 from tuning.search.progress import Report
 from tuning.search.rounds import Rounds

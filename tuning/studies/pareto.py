@@ -18,9 +18,9 @@ from ptsmc_jax.scenario import cautions, parsing, study, tables
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.scenario.timing import Reach
 from tuning.search import gains, trust
-from tuning.search.cma_es import NEARBY
 from tuning.search.descent import Best
 from tuning.search.descents import Descents
+from tuning.search.evolution import NEARBY
 from tuning.search.journal import Journal
 from tuning.search.objective import Problem
 from tuning.search.progress import Report

@@ -1,0 +1,69 @@
+"""Search without gradients, as the discontinuous sign needs it: differential evolution."""
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.optimize import differential_evolution
+
+from tuning.search.descent import SLACK, Best
+from tuning.search.evaluate import Evaluator, Measured
+from tuning.search.objective import Problem, failures
+from tuning.search.starts import STEEP, merit, spread
+
+GENERATIONS = 80  # at most: `PATIENCE` ends it earlier
+WIDELY = 64, np.inf  # points of a generation; spread of the first ones, relative to the bounds' intervals
+NEARBY = 32, 0.05  # the same from a point that is nearly the best
+PATIENCE, GAINED = 24, 1e-4  # generations without this much less F end it
+WORST = 1e9  # merit of a point that failed
+
+
+def evolve(
+    evaluate: Evaluator,
+    problem: Problem,
+    best: Best,
+    share: np.ndarray,
+    seed: int,
+    tell: Callable[[int, int], None],
+    keep: Callable[[Measured], None],
+    size: tuple[int, float] = WIDELY,
+) -> None:
+    """Search for better gains by differential evolution (Storn and Price, J. Global Optim. 11, 1997; SciPy's).
+
+    Args:
+        evaluate: measures the problem.
+        problem: what is minimised; violations are charged, see `merit`.
+        best: is offered the best point of each generation.
+        share: (gains,) one of the first points.
+        seed: of the random numbers.
+        tell: is called with the generation and their largest number.
+        keep: is called with the measurement of the best point of each generation.
+        size: points of a generation, and their spread around `share` at first; infinite: the whole box.
+    """
+    population, around = size
+    rng = np.random.default_rng(seed)
+    if np.isfinite(around):
+        first = np.clip(rng.normal(share, around, (population, share.size)), 0.0, 1.0)
+    else:
+        first = spread(share.size, population, rng)
+    first[0] = share
+    record = list[float]()
+
+    def merits(points: np.ndarray) -> np.ndarray:
+        tell(len(record), GENERATIONS)
+        seen = evaluate.fly(problem, points.T)
+        over = np.maximum(seen.beyond - SLACK, 0.0)
+        chosen = int(np.lexsort((seen.f, over, failures(seen.c)))[0])
+        best.offer(points.T[chosen : chosen + 1], seen.at(chosen))
+        keep(seen.at(chosen))
+        record.append(best.f if best.over == 0.0 else np.inf)
+        return np.nan_to_num(merit(seen, STEEP), nan=WORST, posinf=WORST)
+
+    def stop(intermediate_result: object) -> bool:
+        del intermediate_result
+        return len(record) > PATIENCE and record[-1 - PATIENCE] - record[-1] < GAINED
+
+    box = [(0.0, 1.0)] * share.size
+    differential_evolution(
+        merits, box, init=first, maxiter=GENERATIONS - 1, tol=0.0, rng=rng, polish=False, vectorized=True,
+        updating="deferred", callback=stop,
+    )  # fmt: skip
