@@ -33,7 +33,7 @@ from tuning.cli.options import (
     whole,
 )
 from tuning.errors import UsageError
-from tuning.output import progress, summaries, terminal
+from tuning.output import progress, terminal
 
 app = App(
     name="ptsmc",
@@ -82,7 +82,7 @@ def simulate(
         run = runs.fly(ready, seed, trial, OURS if computer is None else computer.software)
         store.write(folder, lambda making: single.write(making, loaded, run, seed, trial, figures, computer))
     if not quiet:
-        from tuning.output import run_report
+        from tuning.output import run_report, summaries
 
         summary = summaries.run(single.summary(run, loaded, computer), loaded.plant.kind)
         terminal.show(run_report.of(summary, loaded.plant.kind), folder)
@@ -110,7 +110,7 @@ def reproduce(*, out: Out = None, force: Force = False, quiet: Quiet = False, fi
             reproduced = reproduction.reproduce()
         store.write(folder, lambda making: reproduction.write(making, reproduced, figures))
     if not quiet:
-        from tuning.output import paper_report
+        from tuning.output import paper_report, summaries
 
         summary = summaries.read(summaries.Paper, reproduction.summary(reproduced))
         terminal.show(paper_report.of(summary), folder)
@@ -192,7 +192,7 @@ def margins(
         store.write(folder, lambda making: stability.write(making, ready, course, figures))
     summary = stability.summary(ready, course)
     if not quiet:
-        from tuning.output import margins_report
+        from tuning.output import margins_report, summaries
 
         terminal.show(margins_report.of(summaries.read(summaries.Margins, summary)), folder)
     return 0 if summary["stable"] else 1
@@ -223,7 +223,7 @@ def tune(
     """
     loaded, folder = prepare(scenario, "tune", out, device, trust=trust)
     from ptsmc_jax.scenario.tables import objective_name
-    from tuning.output import tune_report
+    from tuning.output import summaries, tune_report
     from tuning.studies import tune_files, tuner
 
     loaded = searches.with_tune(loaded)
@@ -306,7 +306,7 @@ def compare(
     """
     loaded, folder = prepare(scenario, "compare", out, device, trust=trust)
     from ptsmc_jax.scenario.tables import objective_name
-    from tuning.output import compare_report
+    from tuning.output import compare_report, summaries
     from tuning.studies import compare as comparing
 
     rivals = comparing.Rivals(against, law)

@@ -2,10 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from tuning.output.formats import ratio
-from tuning.output.summaries import Entry
+
+if TYPE_CHECKING:  # it imports NumPy, which a command that computes nothing need not wait for
+    from tuning.output.summaries import Entry
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,7 @@ class Text:
 class Bars:
     """Requirements, each with a bar relative to its limit."""
 
-    verdicts: list[Entry]
+    verdicts: "list[Entry]"
     texts: list[str]
     note: str = "The line is the limit; a bar that ends before it keeps the limit."
 
@@ -117,7 +119,7 @@ HEADLINES = {
 }
 
 
-def headline(status: str, verdicts: Sequence[Entry], first: str = "") -> tuple[str, str]:
+def headline(status: str, verdicts: "Sequence[Entry]", first: str = "") -> tuple[str, str]:
     """Return the headline and its mood.
 
     Args:
@@ -133,17 +135,17 @@ def headline(status: str, verdicts: Sequence[Entry], first: str = "") -> tuple[s
     return f"{first}: {text}" if first else text[0].upper() + text[1:], mood
 
 
-def requirements(verdicts: Sequence[Entry], texts: Sequence[str]) -> list[Section]:
+def requirements(verdicts: "Sequence[Entry]", texts: Sequence[str]) -> list[Section]:
     """Return the section of the requirements, none without any; texts: the verdicts in words."""
     return [Section("Requirements", [Bars(list(verdicts), list(texts))])] if verdicts else []
 
 
-def nearness(entry: Entry) -> float:
+def nearness(entry: "Entry") -> float:
     """Return the deciding value relative to the limit; infinite if a trial has no value."""
     return float("inf") if entry.margin is None else entry.margin
 
 
-def distance(entry: Entry) -> str:
+def distance(entry: "Entry") -> str:
     """Return the deciding value in per cent of the limit; empty if there is none."""
     if entry.margin is None or entry.at_least or entry.limit == 0.0:
         return ""
