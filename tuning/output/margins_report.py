@@ -49,7 +49,7 @@ def _lines(summary: Margins) -> Iterator[str]:
     if summary.stable and not summary.open:
         yield "these are the smallest margins at any input, in the hold phase and the judged approach phase"
     if summary.swing is not None:
-        yield swinging(summary.swing)
+        yield from swinging(summary.swing)
     if summary.start_deg is not None:
         yield f"the nominal run starts {summary.start_deg:.4g} deg from the reference; change [initial] for another"
     if summary.missed:
@@ -115,7 +115,7 @@ def tuned(margins: Mapping[str, Left] | None, *, required: bool) -> Iterator[str
             continue
         if left.swing is not None or not left.stable:
             short = True
-            yield f"the nominal loop is NOT stable in the {phase}" if left.swing is None else swinging(left.swing)
+            yield from swinging(left.swing) if left.swing else [f"the nominal loop is NOT stable in the {phase}"]
             continue
         yield f"margins of the nominal loop in the {phase}: {shown(left.numbers)}"
         few = [
@@ -131,12 +131,12 @@ def tuned(margins: Mapping[str, Left] | None, *, required: bool) -> Iterator[str
         yield f"for larger margins, tune with {more}; ptsmc pareto --against margins shows their cost"
 
 
-def swinging(swing: Swing) -> str:
+def swinging(swing: Swing) -> Iterator[str]:
     """Return the description of a limit cycle in the hold phase."""
-    return (
-        "the nominal run does NOT come to rest in the hold phase, so its margins count as zero: without noise and "
-        f"disturbance its command oscillates by {swing.size:.3g} {swing.unit} every {swing.periods:.3g} control "
-        "periods; the boundary layer is too thin for the period, or the gains are at the stability limit"
+    yield "the nominal run does NOT come to rest in the hold phase, so its margins count as zero"
+    yield (
+        f"without noise and disturbance its command oscillates by {swing.size:.3g} {swing.unit} every "
+        f"{swing.periods:.3g} control periods; the boundary layer is too thin, or the gains are at the stability limit"
     )
 
 

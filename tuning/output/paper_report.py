@@ -10,9 +10,9 @@ def of(summary: Paper) -> Report:
     slips = [(one.where, one.correct, one.shown) for one in summary.slips]
     counts = ", ".join(f"{count}: {word}" for word, count in summary.verdicts.items())
     return Report(
-        f"{summary.verdicts.get('holds', 0)} of {len(claims)} claims of the paper hold as they are written",
+        f"{summary.verdicts.get('holds', 0)} of {len(claims)} claims of the paper hold literally",
         "calm",
-        [counts, "claims.md states the reasons, and the errors as they are printed"],
+        [counts, "claims.md states the reasons, and quotes the errors"],
         [
             Section("Claims of the paper", [Table(("verdict", "the paper", "measured"), claims)]),
             Section("Errors of the paper", [Table(("where", "what it must be", "shown by"), slips)]),
