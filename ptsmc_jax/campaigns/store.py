@@ -38,6 +38,7 @@ MADE_OF_RESULTS = {  # files made from a result, with a mark near the beginning:
     "why.csv": b"metric,trial,value,input,drawn,",
 }
 CODE, COMMAND_LINE = "code_checksum", "command_line"  # in `versions.json`
+Tables = Mapping[str, Any]  # of a scenario, or of versions.json
 PACKAGES = ("ptsmc-jax", "jax", "jaxlib", "numpy", "scipy", "optax")
 
 
