@@ -63,7 +63,7 @@ the time."""
 REQUIREMENTS = """\
 Any [metric](metrics.md) by its name: the largest value allowed in every trial that is flown, or a table that says more,
 such as `window_error = { limit = 1e-4, quantile = 0.9973, confidence = 0.9 }`, or, of a [pointing
-error](manual.md#pointing-budgets) at a time, `ape_boresight = { limit = 1e-3, probability = 0.9973, confidence = 0.9,
+error](pointing.md) at a time, `ape_boresight = { limit = 1e-3, probability = 0.9973, confidence = 0.9,
 interpretation = "mixed" }`. And, of the sampled loop, any
 margin, a number: `gain_margin` [dB], `phase_margin` [deg] and `delay_margin` [s] are the least allowed,
 `modulus_margin` [dB] is the largest peak of the sensitivity. The keys of a table:"""
