@@ -21,19 +21,18 @@ HERE = Path(__file__).parent
 MADE = "<!-- Made by docs/generate.py from the code, where it is to be changed. -->"
 PLANTS = {"spacecraft": "A spacecraft", "chain": "An integrator chain", "system": "A system of one's own"}
 SCENARIOS = """\
-A scenario is a TOML file of tables; every table and every key is optional. A key that is left out has its default.
-Defaults marked with * are those of the paper's case. They [follow the
-mission](theory/default_gains.md) for any other body or t_f, and gains are designed for the sampled
-loop. `flexible`, `hardware`, `sensors`, `wheels`, `filter`, `pointing`, `dispersion`, `requirements` and `tune` are off
-if they are absent. A key that is misspelt, of the wrong type, out of range or not finite is refused by name.
-`ptsmc new` writes all this into a file for you to change.
+A scenario is a TOML file of tables. Every table and every key is optional, and has a default. Defaults with * are
+those of the paper's case. For any other body or t_f they [follow the mission](theory/default_gains.md), and gains are
+designed for the sampled loop. `flexible`, `hardware`, `sensors`, `wheels`, `filter`, `pointing`, `dispersion`,
+`requirements` and `tune` are off if they are absent. A key that is unknown, has the wrong type, is out of range or is
+not finite is refused with its name. `ptsmc new` writes a file with all of this.
 
-Numbers are in the unit of their key. One in rad, rad/s, N m, N m s, s or a noise's unit may have another:
-`"10 arcsec"`, `"2 deg/h"`, `"0.02 deg/sqrt(h)"`, `"5 mN m"`, `"50 ms"`; in a list each number may.
+Numbers are in the unit of their key. Numbers in rad, rad/s, N m, N m s, s or the unit of a noise may have another
+unit: `"10 arcsec"`, `"2 deg/h"`, `"0.02 deg/sqrt(h)"`, `"5 mN m"`, `"50 ms"`. In a list each number may have its own.
 
-A table with a `kind` has the keys of that kind. Commands that fly leave the scenario that they flew, every default
-filled in, as `scenario.toml` beside their results. What follows from several keys together, such as `delta` of at
-least one control period, is said when a scenario is refused."""
+A table with a `kind` has the keys of that kind. Commands that simulate write the complete scenario as `scenario.toml`
+beside their results. Conditions on several keys, such as `delta` of at least one control period, are reported if a
+scenario violates them."""
 METRICS = """\
 Metrics are in `summary.json`, in the rows of a campaign and in `[requirements]`. For many trials the summary lists
 mean, largest value and quantiles. For `window_error` it lists the RMS and `floor`, the [lower
@@ -46,20 +45,28 @@ bound](theory/lower_bound.md).
 | another metric is infinite or has no value | it counts as diverged at t_end |
 | it is `missed`: at t_f it is far from the reference | its metrics count |"""
 ERRORS = """\
-The attitude error vector is eps_1 = q_1 - q_1f, as in the paper, with `controller.error = "additive"`, and the vector
-part of q_f* q with `"multiplicative"` and for the laws to compare with. x1, x2 and u stand for the units of states and
-input. `peak_wheel_momentum` and `peak_wheel_torque` are there with `[wheels]` only, `peak_modal` and `residual_modal`
-with `[flexible]`. Numbers of one's own: `ptsmc montecarlo --metrics`.
+With `controller.error = "additive"` the attitude error vector is eps_1 = q_1 - q_1f, as in the paper. With
+`"multiplicative"`, and for the comparison laws, it is the vector part of q_f* q. The units x1, x2 and u are those of
+the states and the input.
 
-The pointing error indices are there with `[pointing]` only, whose observation begins `after` t_f and lasts to t_end, in
-windows one after the other; a last part that fills none counts for APE and AKE only. An error about an axis is a
-component of the rotation vector from the reference to the body, in body axes; a half-cone is the angle between where
-the boresight points and where it should, and what is a mean or a difference of such is one of arcs on the sphere, laid
-flat. They are taken at the ends of control periods and at the observation's begin, RPE at the ends of windows too, and
-means over all of the time; half-cones of RPE, PDE and RKE are known to 0.5 %, and said so much too large. PDE is the
-largest difference between the means of any two windows. What the law is given (AKE, MKE, RKE: with noise or a filter
-only) holds from one sample to the next. `within_ape_x` and the like are there where a requirement asks for a share of
-the time."""
+| metrics | condition |
+| --- | --- |
+| `peak_wheel_momentum`, `peak_wheel_torque` | the scenario has `[wheels]` |
+| `peak_modal`, `residual_modal` | the scenario has `[flexible]` |
+| pointing error indices | the scenario has `[pointing]` |
+| `within_ape_x` and similar | a requirement limits a fraction of the time |
+| AKE, MKE, RKE | the attitude is measured with noise or filtered |
+
+Custom metrics: `ptsmc montecarlo --metrics`.
+
+The observation of pointing errors begins `after` t_f and ends at t_end. It consists of consecutive windows; an
+incomplete last window counts for APE and AKE only. The error about an axis is a component of the rotation vector from
+the reference to the body, in body axes. The half-cone error is the angle between the actual and the desired boresight
+direction. For means and differences it is a two-dimensional vector across the boresight. The errors are evaluated at
+the ends of control periods and at the start of the observation, RPE also at the ends of windows. Means are integrals
+over time. Half-cones of RPE, PDE and RKE are up to 0.5 % too large. PDE is the largest difference between the means
+of any two windows. The measured attitude is constant between samples.
+"""
 REQUIREMENTS = """\
 Any [metric](metrics.md) by its name: the largest value allowed in every trial that is flown, or a table that says more,
 such as `window_error = { limit = 1e-4, quantile = 0.9973, confidence = 0.9 }`, or, of a [pointing
