@@ -85,7 +85,7 @@ def test_cells_run_on_flights_that_are_traced(monkeypatch):
         made_up = jax.tree.map(lambda v: np.linspace(1.0, 2.0, v.size).reshape(v.shape).astype(v.dtype), shapes)
         return made_up._replace(status=np.asarray(rollout.OK))
 
-    monkeypatch.setattr(rollout, "looked_at", lambda parts: flown)
+    monkeypatch.setattr(rollout, "single_run_program", lambda parts: flown)
     slope = "jax.jacfwd(peak)(jnp.asarray(3.0))"
     shape = slope.replace("(peak)(", "(peak), ")
     monkeypatch.setitem(SMALLER["05_your_own_plant"], slope, f"jnp.ones(jax.eval_shape({shape}.shape)")

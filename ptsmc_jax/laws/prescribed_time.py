@@ -159,9 +159,8 @@ class SurfaceGains(NamedTuple):
 class PrescribedTime(PrescribedTimeLaw):
     """The paper's law: (56) and (57) for a spacecraft before the hand-over, (59) and (60) after it; (29) for a system.
 
-    The law of an error vector eps whose second derivative the input sets: (29), with the cases (57) and (60).
-
-    In the approach phase (26), with tau = t_f - t:
+    It is written for an error vector eps whose second derivative the input sets. In the approach phase (26), with
+    tau = t_f - t:
 
         s = tau eps' + eta eps
         eps'' = -(eta-1) eps'/tau - eta s/tau^2 - N K2 sign(s) / 2.

@@ -154,26 +154,35 @@ def test_uniforms_are_below_1_and_normals_finite_in_single_precision():
 DRAWING = {f"draws.{name}" for name in ("stream", "streams", "draw_streams", "derive")}
 
 
+SENSORS = ("devices.sensors", "devices.sensor_suite")  # a run has one of the two, so they may share names
+
+
 def stream_names():
     """Return the stream names that the source passes to functions of `draws`; constants of a module are resolved."""
-    names = []
-    for module, path in modules().items():
-        source = path.read_text()
-        if "draws." not in source:
-            continue
-        calls = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Call)]
-        drawing = [node for node in calls if ast.unparse(node.func) in DRAWING]
-        known = vars(importlib.import_module(module)) if drawing else {}
-        constants = {k: v for k, v in known.items() if k.isupper() and isinstance(v, str)}
-        for node in drawing:
-            last = node.args[-1]
-            for name in last.elts if isinstance(last, ast.Tuple) else [last]:
-                if isinstance(name, ast.Constant):
-                    names.append(name.value)
-                elif ast.unparse(name) in constants:
-                    names.append(constants[ast.unparse(name)])
-                else:  # a variable: any constant of the module may be meant
-                    names += [value for value in constants.values() if isinstance(value, str)]
+    found = {module: module_stream_names(module, path) for module, path in modules().items()}
+    sensors = {name for module, names in found.items() if module.endswith(SENSORS) for name in names}
+    others = [name for module, names in found.items() if not module.endswith(SENSORS) for name in names]
+    return [*sensors, *others]
+
+
+def module_stream_names(module, path):
+    """Return the stream names in one module."""
+    source, names = path.read_text(), []
+    if "draws." not in source:
+        return names
+    calls = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Call)]
+    drawing = [node for node in calls if ast.unparse(node.func) in DRAWING]
+    known = vars(importlib.import_module(module)) if drawing else {}
+    constants = {k: v for k, v in known.items() if k.isupper() and isinstance(v, str)}
+    for node in drawing:
+        last = node.args[-1]
+        for name in last.elts if isinstance(last, ast.Tuple) else [last]:
+            if isinstance(name, ast.Constant):
+                names.append(name.value)
+            elif ast.unparse(name) in constants:
+                names.append(constants[ast.unparse(name)])
+            else:  # a variable: any constant of the module may be meant
+                names += [value for value in constants.values() if isinstance(value, str)]
     return names
 
 

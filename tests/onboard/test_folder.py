@@ -316,7 +316,7 @@ def test_other_gains_are_other_parameters_and_the_same_code(exported, tmp_path):
 
 def test_the_law_stands_in_it_with_its_names_and_equations(exported):
     text = (exported / "ptsmc_short.c").read_text()
-    assert "(56) and (57) before and (59) and (60) after the hand-over." in text.replace("\n * ", " ")
+    assert "(56) and (57) in the approach phase, (59) and (60) in the hold phase." in text.replace("\n * ", " ")
     for line in (
         "const real error_1 = now->attitude[0] - p->reference_q[0];",
         "const real acceleration_3 = -switching_3",

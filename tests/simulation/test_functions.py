@@ -291,7 +291,7 @@ def test_parts_and_results_are_shown_in_lines_that_can_be_read():
 def test_scenarios_and_studies_are_shown_by_their_tables():
     shown = repr(FLIGHT).splitlines()
     assert shown[0] == "SpacecraftScenario"
-    assert any(line.startswith("  controller: SpacecraftController(kind='prescribed_time', error=") for line in shown)
+    assert any(line.startswith("  controller: PrescribedTime(t_f=30.0, ") for line in shown)
     assert not any("defaulted" in line or "=None" in line or line.startswith("  hardware") for line in shown)
     assert f"    {shown[1]}" in repr(scenario.study(FLIGHT))
 

@@ -134,7 +134,7 @@ def gains(scenario: dict[str, Any], plant: str) -> Table:
         custom = given.get("kind") == "own"  # its class, which reading does not run, has the units
         kinds: Any = SCENARIOS[plant].TABLES.get(table, {})
         struct = kinds.get(given.get("kind"))
-        units = {key.name: key.unit for key in keys.of(struct)} if struct else {}
+        units = {key.name: key.unit for key in keys.of(struct, SCENARIOS[plant].unit_of_d)} if struct else {}
         for key, value in given.items():
             numbers = value if isinstance(value, list) else [value]
             each = [f"{one:.6g}" if isinstance(one, float | int) else str(one) for one in numbers]

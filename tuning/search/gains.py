@@ -96,7 +96,7 @@ def papers(scenario: Scenario) -> Scenario:
 
 def paper_is(scenario: Scenario) -> str:
     """Return the label of the published gains: as they are, scaled to another body or period, or of the paper's law."""
-    if not scenario.controller.prescribed:
+    if not scenario.controller.law.prescribed:
         return "paper's law"
     as_published = mission.published(scenario) and of_paper(scenario)["delta"] == AS_PUBLISHED
     return "published" if as_published else "published, scaled"

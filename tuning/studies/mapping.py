@@ -274,7 +274,7 @@ def _label(scenario: Scenario, key: str) -> str:
     """A key with its unit, as it stands in the documentation of its table; without, where the scenario has none."""
     table, _, name = key.partition(".")
     found = getattr(scenario, table, None)
-    known = [] if found is None else keys.of(type(found))
+    known = [] if found is None else keys.of(type(found), scenario.unit_of_d)
     unit = next((one.unit for one in known if one.name == name.partition("[")[0]), "")
     return f"{key} [{unit}]" if unit else key
 
