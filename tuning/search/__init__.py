@@ -1,6 +1,6 @@
-"""The search for gains: the problem, its evaluation, local searches from many starts, the worst case.
+"""The search for gains: problem, evaluation, local searches from many starting points, and the worst case.
 
-`minimise` is the search for any function of JAX.
+The search for gains begins in `optimise.search`. `minimise` is the same local search for any function of JAX.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -14,7 +14,7 @@ __all__ = ["Search", "Settings", "minimise"]
 
 
 def __getattr__(name: str) -> Any:
-    """Return a public name. JAX is imported when the first one is used."""
+    """Return a public name. JAX is imported only when a public name is first used."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from tuning.search import functions

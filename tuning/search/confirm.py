@@ -1,4 +1,8 @@
-"""Whether a limit for a share of the trials will hold: counted on trials that no search has seen, as it is judged."""
+"""Confirmation of quantile requirements on trials that the search has not used.
+
+The verdict is made later on held-out trials. `count` simulates other trials and estimates the probability that this
+verdict will be met. Read `count` first.
+"""
 
 import bisect
 from collections.abc import Sequence
@@ -10,24 +14,24 @@ from ptsmc_jax.simulation.requirements import Requirement, fewest_trials, must_k
 from tuning.search import flights
 from tuning.search.objective import Problem
 
-FRESH = 1000  # trials on which gains are judged, at least
-FEWEST, TIMES = 4096, 8  # trials to count on: this many, and so many times what the gains are judged on
-SHOWN = 2  # times the fewest trials that can show a quantile: some may then break its limit
-SURE = 0.98  # probability that gains which are confirmed are met by the verdict
-FARTHER, NEARER = 16, 8  # trials of a band: so many of those that may break a limit, at most, and of those that may not
+FRESH = 1000  # smallest number of held-out trials of the verdict
+FEWEST, TIMES = 4096, 8  # smallest number of confirmation trials: absolute, and relative to the held-out trials
+SHOWN = 2  # times the smallest number of trials that can verify a quantile, so that some trials may break its limit
+SURE = 0.98  # a requirement is confirmed if its verdict will be met with at least this probability
+FARTHER, NEARER = 16, 8  # trials of a band that may break the limit (at most), and trials that may not
 
 
 @dataclass(frozen=True)
 class Count:
-    """How many of the trials counted on break a requirement."""
+    """The number of confirmation trials that break a requirement."""
 
     metric: str
     trials: int
     beyond: int
-    allowed: int | None  # of them; None: even with none the verdict would not be sure
-    probability: float  # that the verdict on fresh trials is met
-    harder: np.ndarray  # trials beyond the limit but for the `allowed` farthest, the farthest of these first
-    band: np.ndarray  # trials about the last that may break it, within the limit or not, see `may_break`
+    allowed: int | None  # largest number beyond the limit; None: too few trials to confirm the requirement
+    probability: float  # probability that the verdict on held-out trials is met
+    harder: np.ndarray  # trials beyond the limit except for the `allowed` worst, the worst first
+    band: np.ndarray  # trials ranked around the last trial that may break the limit, see `may_break`
 
     @property
     def held(self) -> bool:
@@ -36,22 +40,28 @@ class Count:
 
 
 def fresh_trials(requirements: Sequence[Requirement]) -> int:
-    """Trials to judge on: enough to show every quantile that is asked for, with some beyond the limit."""
+    """Return the number of held-out trials: enough to verify every quantile with some trials beyond the limit."""
     needed = [fewest_trials(r.quantile, r.confidence) for r in requirements if r.quantile and r.confidence]
     return max([FRESH, *(SHOWN * count for count in needed)])
 
 
 def counted_on(requirements: Sequence[Requirement]) -> int:
-    """Trials to count on."""
+    """Return the number of confirmation trials."""
     return max(FEWEST, TIMES * fresh_trials(requirements))
 
 
 def may_break(requirement: Requirement, requirements: Sequence[Requirement], trials: int) -> tuple[int | None, bool]:
-    """How many of the trials that a limit is kept among may break it, and whether these are a band.
+    """Return how many of the constrained trials may break a limit, and whether these trials are a band.
 
-    None of a limit on every trial. Training trials show a share themselves where there are `SHOWN` times the fewest
-    that can: with the fewest every single one would have to keep the limit, 99 % with 95 % takes 299. Where there are
-    fewer than that, those in the `band` of a count stand for all that are counted on.
+    The number is None if every trial must keep the limit. Training trials represent a quantile if there are `SHOWN`
+    times the smallest number that can verify it. With this smallest number, every single trial would have to keep the
+    limit: 299 trials for 99 % of the trials with 95 % confidence. With fewer training trials, the `band` of a count
+    represents the confirmation trials.
+
+    Args:
+        requirement: the requirement with the limit.
+        requirements: all requirements, which set the numbers of held-out and confirmation trials.
+        trials: number of training trials.
     """
     quantile, confidence = requirement.quantile, requirement.confidence
     if quantile is None:
@@ -64,19 +74,34 @@ def may_break(requirement: Requirement, requirements: Sequence[Requirement], tri
 
 
 def probability(requirement: Requirement, fresh: int, trials: int, beyond: int) -> float:
-    """Probability that a verdict on `fresh` trials is met where `beyond` of `trials` others break the limit.
+    """Return the probability that a verdict on held-out trials is met, given a count on other trials.
 
-    Beta-binomial: the share is known by the count, with a uniform prior (Gelman and others, Bayesian Data Analysis,
-    2013, 2.4).
+    The distribution is beta-binomial with a uniform prior on the fraction of trials that break the limit (Gelman and
+    others, Bayesian Data Analysis, 2013, section 2.4).
+
+    Args:
+        requirement: the requirement.
+        fresh: number of held-out trials of the verdict.
+        trials: number of counted trials.
+        beyond: number of counted trials that break the limit.
     """
-    from scipy.stats import betabinom  # takes a while to import, which most runs need not wait for
+    from scipy.stats import betabinom  # imported here because the import is slow and most runs do not need it
 
     least = must_keep(fresh, requirement.quantile, requirement.confidence)
     return 0.0 if least is None else float(betabinom.cdf(fresh - least, fresh, beyond + 1, trials - beyond + 1))
 
 
 def allowed(requirement: Requirement, fresh: int, trials: int) -> int | None:
-    """How many of `trials` may break the limit for the verdict on `fresh` others to be met with `SURE`."""
+    """Return the largest number of trials that may break the limit if `probability` must be at least `SURE`.
+
+    Args:
+        requirement: the requirement.
+        fresh: number of held-out trials of the verdict.
+        trials: number of counted trials.
+
+    Returns:
+        The number, or None if the requirement cannot be confirmed on so few trials.
+    """
     too_many = bisect.bisect_left(
         range(trials), True, key=lambda beyond: probability(requirement, fresh, trials, beyond) < SURE
     )
@@ -86,7 +111,18 @@ def allowed(requirement: Requirement, fresh: int, trials: int) -> int | None:
 def count(
     problem: Problem, requirements: Sequence[Requirement], gains: np.ndarray, first: int, turn: int
 ) -> list[Count]:
-    """Fly gains (gains,) on trials from number `first` on, others each turn, and count those beyond each limit."""
+    """Simulate confirmation trials and count the trials that break each limit.
+
+    Args:
+        problem: the tuning problem.
+        requirements: the quantile requirements.
+        gains: (gains,) the gains to confirm.
+        first: number of the first confirmation trial of turn 0.
+        turn: number of the turn. Each turn simulates other trials.
+
+    Returns:
+        The count for each requirement.
+    """
     fresh, many = fresh_trials(requirements), counted_on(requirements)
     numbers = (first + turn * many + np.arange(many)).astype(np.uint32)
     flown = flights.trials(problem.others(numbers), gains)

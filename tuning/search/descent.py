@@ -1,4 +1,8 @@
-"""Local search by sequential quadratic programming (SLSQP)."""
+"""Local search by sequential quadratic programming (SciPy's SLSQP). Read `descend` first.
+
+F is the logarithm of the objective. c = metric / limit - 1 is the constraint of one limit in one trial, and is met if
+c <= 0. Gains are normalised (`share`): 0 is the lower bound and 1 the upper bound of a gain.
+"""
 
 import contextlib
 from collections.abc import Callable, Sequence
@@ -11,15 +15,15 @@ from scipy.optimize import minimize, nnls
 from tuning.search.evaluate import Measured, Sloped
 from tuning.search.objective import ended, failures
 
-ACTIVE = 1e-3  # of a limit, nearer to which it is active
-SLACK = 1e-4  # of a limit that an admissible point may use
-ELASTIC = 0.1  # of a limit, beyond which the violation is minimised before the objective
+ACTIVE = 1e-3  # a limit is active if c > -ACTIVE
+SLACK = 1e-4  # largest c of an admissible point
+ELASTIC = 0.1  # if c is larger at the starting point, the violation is minimised before the objective
 BROKEN = 1e3  # added to the relative violation for each failed trial
-CLOSE = 1e-5  # change of F at which a descent ends
-# Scaling of the variables. The first step is the gradient over its square: 1 may leave the neighbourhood of the
-# starting point, 4 stays in it.
+CLOSE = 1e-5  # change of F at which a local search ends
+# Scaling of the variables. The first step is the gradient divided by the square of the scaling. It may leave the
+# neighbourhood of the starting point with 1, and stays in it with 4.
 BOLD, CAREFUL = 1.0, 4.0
-# Gradients are clipped to this change of F per interval. A chattering loop has useless gradients that are far larger.
+# Gradients with respect to normalised gains are clipped to this size. A chattering loop has useless, far larger ones.
 STEEPEST = 30.0
 
 
@@ -28,28 +32,35 @@ def largest(c: np.ndarray, margin: ArrayLike) -> np.ndarray:
 
     Args:
         c: (points, rows, trials) constraints whose limits are tighter by the margin.
-        margin: (rows,) or one number, share of each limit.
+        margin: (rows,) or one number, relative tightening of each limit [-].
     """
     return (ended(c).max(axis=2, initial=-1.0) + 1.0) * (1.0 - np.asarray(margin))
 
 
 class Best:
-    """The best point so far. The order is: fewest failed trials, then smallest violation, then smallest F."""
+    """The best point so far, ordered by number of failed trials, then by violation, then by F."""
 
     def __init__(self, share: np.ndarray, requirements: int, margin: ArrayLike):
+        """Begin without a measured point.
+
+        Args:
+            share: (gains,) normalised gains of the starting point.
+            requirements: number of rows of c.
+            margin: relative tightening of each limit, (rows,) or one number [-].
+        """
         self.margin = np.asarray(margin)
-        self.share = share.copy()  # (gains,) the starting point, until a better one is offered
+        self.share = share.copy()  # (gains,) the starting point until a better point is offered
         self.f = self.value = self.over = self.lost = np.inf
         self.worst = np.full(requirements, np.inf)  # largest metric / limit
 
     @property
     def failed(self) -> bool:
-        """Whether a trial fails there, or has no value."""
+        """Whether a trial fails or lacks a metric at the best point."""
         return 0.0 < self.lost < np.inf
 
     @property
     def beyond(self) -> tuple[float, float]:
-        """Number of failed trials and relative violation; (0, 0) if every limit is kept."""
+        """Number of failed trials, and relative violation. It is (0, 0) if every limit is met."""
         return self.lost, self.over
 
     @property
@@ -59,11 +70,16 @@ class Best:
 
     @property
     def so_far(self) -> tuple[float, float]:
-        """Its goal, and how far it is beyond a limit; not numbers where none has been offered."""
+        """Objective and relative violation of the best point, or NaN if no point was offered yet."""
         return (self.value, self.over) if np.isfinite(self.f) else (np.nan, np.nan)
 
     def offer(self, share: np.ndarray, seen: Measured) -> None:
-        """Keep the best of these points, (points, gains), if it is better; admissible is what keeps the margin."""
+        """Replace the best point by the best of these points, if that is better.
+
+        Args:
+            share: (points, gains) normalised gains.
+            seen: the measurement at these points with tightened limits. A point is admissible if it meets them.
+        """
         worst = largest(seen.c, self.margin)
         over = np.maximum((worst - (1.0 - self.margin)).max(axis=1, initial=-1.0) - SLACK, 0.0)
         lost = np.where(np.isfinite(seen.f), failures(seen.c), np.inf)
@@ -76,30 +92,30 @@ class Best:
 
 
 class _EnoughError(Exception):
-    """A descent has looked at as many points as it may."""
+    """A local search has measured its largest number of points."""
 
 
 @dataclass(frozen=True)
 class Start:
-    """Where a descent begins, and how."""
+    """Starting point of a local search, and its options."""
 
     share: np.ndarray  # (gains,)
-    scale: float = BOLD  # the first step is the slope over its square
-    fixed: Sequence[int] = ()  # gains that stay as they are
-    # points that a shorter search from the same starting point has measured; a longer one uses them again
+    scale: float = BOLD  # scaling of the variables, see `BOLD` and `CAREFUL`
+    fixed: Sequence[int] = ()  # indices of gains that are not changed
+    # measurements of a shorter search from the same starting point, which a longer search reuses
     seen: dict[bytes, Sloped] = field(default_factory=dict)
 
 
 class _FeasibleError(Exception):
-    """A point keeps every limit. From there on the objective is minimised."""
+    """A point meets every limit. The search continues from it and minimises the objective."""
 
 
 @dataclass(frozen=True)
 class Relaxed:
-    """Which limits are exceeded by as little as possible, instead of minimising the objective."""
+    """Limits whose largest violation is minimised instead of the objective."""
 
-    rows: Sequence[int] | None = None  # of the problem; None: all of them
-    to_the_end: bool = False  # continue after every limit is kept, to maximise the distance from the limits
+    rows: Sequence[int] | None = None  # rows of the problem; None: all rows
+    to_the_end: bool = False  # continue after every limit is met, to maximise the distance from the limits
 
 
 def descend(
@@ -114,20 +130,21 @@ def descend(
 ) -> None:
     """Search locally from a starting point inside the bounds, by sequential quadratic programming (SLSQP).
 
-    From a point that breaks a limit by more than `ELASTIC`, the largest relative violation is minimised first: min t
-    subject to c <= t for every limit and trial. Its linearised constraints can always be met. Those of the problem
-    itself can contradict each other far from a solution. The same happens if the search ends at a point that breaks a
-    limit. The objective is not minimised if the violation cannot be removed.
+    If the starting point breaks a limit by more than `ELASTIC`, the search first minimises the largest relative
+    violation: min t subject to c <= t for every limit and trial. The linearised constraints of this problem can always
+    be met. The linearised limits themselves can contradict each other far from a solution. The violation is also
+    minimised if the search ends at a point that breaks a limit. If the violation cannot be removed, the objective is
+    not minimised.
 
     Args:
-        slopes: returns the measurement with gradients at a point (1, gains).
+        slopes: function that measures one point, (1, gains) normalised gains, with gradients.
         best: is offered every point.
-        start: the starting point and the scaling of the variables.
-        steps: how many points may be measured.
-        keep: is called with the measurement at accepted points, not at those of a line search.
+        start: starting point and scaling of the variables.
+        steps: largest number of points to measure.
+        keep: is called with the measurement at each accepted point, but not during line searches.
         close: change of F at which the search ends.
-        relaxed: minimise the violation of these limits only, the others being constraints.
-        steepest: gradients are clipped to this change of F or c per interval.
+        relaxed: if given, only the violation of these limits is minimised, and the other limits are constraints.
+        steepest: largest element of the gradients of F and c; larger gradients are scaled down.
     """
     local = _Local(slopes, best, start, steps, keep, close, steepest)
     first = start.scale * start.share
@@ -148,7 +165,10 @@ def descend(
 
 
 class _Local:
-    """Both programs of a local search, which share the points that were measured. Points are shares times a scale."""
+    """The two optimisation problems of a local search, with shared measurements.
+
+    Variables are normalised gains times the scaling.
+    """
 
     def __init__(
         self,
@@ -168,7 +188,7 @@ class _Local:
         self._bounds = [(own, own) if k in start.fixed else (0.0, self._scale) for k, own in enumerate(scaled)]
 
     def at(self, scaled: np.ndarray) -> Sloped:
-        """What is measured at a point, from memory if it was measured before."""
+        """Return the measurement at a point. A point is measured once."""
         key, point = scaled.tobytes(), np.clip(scaled / self._scale, 0.0, 1.0)[None]
         if key not in self._seen:
             if len(self._seen) == self._steps:
@@ -179,7 +199,7 @@ class _Local:
         return self._seen[key]
 
     def violation(self, scaled: np.ndarray) -> float:
-        """The largest c of the trials that end."""
+        """Return the largest c of the completed trials."""
         return float(ended(self.at(scaled).c).max(initial=-1.0))
 
     def minimise(self, scaled: np.ndarray) -> np.ndarray:
@@ -202,7 +222,7 @@ class _Local:
         return np.clip(found.x, *np.transpose(self._bounds))
 
     def least_violation(self, scaled: np.ndarray, relaxed: Relaxed) -> np.ndarray:
-        """Minimise t subject to c <= t. Return the first point that keeps every limit, or else the last point."""
+        """Minimise t subject to c <= t. Return the first point that meets every limit, or else the last point."""
         rows, trials = self.at(scaled).c.shape[1:]
         if not rows:
             return scaled
@@ -245,9 +265,9 @@ class _Local:
 
 
 def _compressed(seen: Sloped, steepest: float) -> tuple[np.ndarray, np.ndarray]:
-    """(limits,) ln(1 + c) for c above 0, else c, and its derivatives (limits, gains).
+    """Return ln(1 + c) for c above 0, else c, (limits,), and its derivatives, (limits, gains).
 
-    Far beyond a limit c spans orders of magnitude; its logarithm has the same sign and the same derivative at 0.
+    c spans orders of magnitude far beyond a limit. The logarithm has the same sign as c and the same derivative at 0.
     """
     c = ended(seen.c).reshape(-1)
     beyond = np.maximum(c, 0.0)
@@ -256,9 +276,13 @@ def _compressed(seen: Sloped, steepest: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def prices(at: Sloped, share: np.ndarray) -> np.ndarray:
-    """Return the Lagrange multiplier of each limit at an optimum (gains,), (rows,); 0 for inactive limits.
+    """Return the Lagrange multiplier of each limit at an optimum, (rows,). It is 0 for inactive limits.
 
-    They are estimated by nonnegative least squares over the gains that are not on a bound.
+    The multipliers are estimated by nonnegative least squares over the gains that are not on a bound.
+
+    Args:
+        at: the measurement at the optimum.
+        share: (gains,) normalised gains of the optimum.
     """
     c, inside = ended(at.c[0]), (share > 0.0) & (share < 1.0)
     active = np.flatnonzero(c.max(axis=1, initial=-1.0) > -ACTIVE)
@@ -270,7 +294,7 @@ def prices(at: Sloped, share: np.ndarray) -> np.ndarray:
 
 
 def _usable(slopes: np.ndarray, steepest: float = STEEPEST) -> np.ndarray:
-    """Return gradients, (rows, gains), clipped to a largest element; zeros for a row that is not finite."""
+    """Return gradients, (rows, gains), with no element above `steepest`. Rows that are not finite become zero."""
     size = np.abs(slopes).max(axis=1, keepdims=True)
     known = np.where(np.isfinite(size), slopes, 0.0)
     return known * np.minimum(1.0, steepest / np.maximum(np.where(np.isfinite(size), size, 1.0), 1e-300))

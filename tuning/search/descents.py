@@ -1,6 +1,8 @@
-"""Descents from many starts, from few of them all the way: the best point, and the points gone through.
+"""Local searches from many starting points by successive halving, with the best point and the history.
 
-Sequential quadratic programming on the slopes of what flies, see `descend`; where there are none, evolution.
+`Descents` runs the steps of a search, and `optimise.search` calls them in order. The local search is sequential
+quadratic programming with gradients of the simulation, see `descent.descend`. Without gradients, it is replaced by
+differential evolution. Points are normalised gains (`share`), 0 to 1 within the bounds.
 """
 
 from collections.abc import Mapping, Sequence
@@ -32,15 +34,15 @@ from tuning.search.starts import (
 )
 from tuning.search.work import ROUND, SLOPED
 
-AGAIN = 3  # starts from whose best points a further round goes on
-EXPLORED, AVERAGED = 32, 16  # trials on which most starts are given up; at least so many count in the objective
-TOGETHER = 2  # descents of each device that go in step: it waits for one call where they think, not for two
-FOLLOWED = 3  # of the explored starts go on with all trials
-SAME = 1e-4  # points whose F differs by less are equally good: 0.01 % of the error
-FINISH = 1e-2  # share of `CLOSE` at which the last descent, from the best point, ends
+AGAIN = 3  # number of local searches that a further round continues
+EXPLORED, AVERAGED = 32, 16  # trials of the first searches, constraints included; smallest number in the objective
+TOGETHER = 2  # concurrent local searches for each device, so that the device waits for SLSQP less often
+FOLLOWED = 3  # number of explored starting points that continue with all trials
+SAME = 1e-4  # points are equally good if their F differs by less: 0.01 % of the objective
+FINISH = 1e-2  # factor on `CLOSE` for the last local search, from the best point
 CONFLICTING = 0.1  # limits whose excess is within this fraction of the largest excess count as conflicting
-LOOKS = 3  # at other hand-overs, at most
-MANY = 512  # points swept where there are no slopes
+LOOKS = 3  # largest number of attempts with other hand-over times
+MANY = 512  # Sobol points of a search without gradients
 
 SETTING_OUT, SEARCHING, FOLLOWING, FINISHING, EVOLVING = (
     "setting out", "searching", "following the best", "finishing", "evolving",
@@ -49,24 +51,34 @@ SETTING_OUT, SEARCHING, FOLLOWING, FINISHING, EVOLVING = (
 
 @dataclass(frozen=True)
 class Step:
-    """A point that the search went through; kept as the history."""
+    """A point in the history of a search."""
 
     start: int
     gains: np.ndarray  # (gains,)
-    value: float  # the goal over the training trials, NaN where none has one
-    worst: np.ndarray  # (requirements,) largest metric / limit, infinite where a trial fails
+    value: float  # objective over the training trials; NaN if no trial completes
+    worst: np.ndarray  # (requirements,) largest metric / limit; infinite if a trial fails
 
 
 @dataclass(frozen=True)
 class _Racer:
-    """A start in a race, and the history that led to it."""
+    """A starting point in successive halving, and the history that led to it."""
 
     start: Start
     before: list[Step]
 
 
 def planned(problem: Problem, starts: int, steps: int, *, sloped: bool) -> tuple[dict, dict]:
-    """What each step of a search flies at most, in rollouts, and each of a further round; see `Work`."""
+    """Return the largest number of rollouts of each step of a search and of a further round, see `Work`.
+
+    Args:
+        problem: the tuning problem.
+        starts: number of starting points.
+        steps: largest number of measured points of each local search.
+        sloped: whether the search uses gradients.
+
+    Returns:
+        Rollouts of each step by its name, for the search and for a further round.
+    """
     trials = float(problem.trials.size)
     if not sloped:
         evolving = {EVOLVING: GENERATIONS * WIDELY[0] * trials}
@@ -85,12 +97,12 @@ def planned(problem: Problem, starts: int, steps: int, *, sloped: bool) -> tuple
 
 
 def _few_trials(problem: Problem) -> Problem:
-    """The problem with few trials."""
+    """Return the problem with few averaged trials, for the first searches."""
     return fewer_trials(problem, max(AVERAGED, EXPLORED - (problem.trials.size - problem.averaged)))
 
 
 class Descents:
-    """Descents from many starts and what they leave: the best point, the history."""
+    """The steps of a search, with its best point and its history."""
 
     def __init__(
         self,
@@ -100,25 +112,34 @@ class Descents:
         rng: np.random.Generator,
         report: Report = lambda *_: None,
     ):
+        """Prepare a search.
+
+        Args:
+            evaluate: measures the problem.
+            margin: relative tightening of each limit, (rows,) or one number.
+            steps: largest number of measured points of each local search.
+            rng: random generator of the search without gradients.
+            report: is called after every step.
+        """
         self._evaluate, self._steps, self._rng, self._report = evaluate, steps, rng, report
-        self._margin = np.asarray(margin)  # share kept from each limit, (rows,) or one number
-        self._own: np.ndarray | None = None  # (gains,) to come back to where one makes no difference
+        self._margin = np.asarray(margin)  # relative tightening of each limit, (rows,) or one number
+        self._own: np.ndarray | None = None  # (gains,) gains of the scenario
         self.globally = False  # `search_globally` was called
-        self._designs = np.zeros((0, 0))  # (designs, gains) shares
+        self._designs = np.zeros((0, 0))  # (designs, gains) normalised gains of the designs
         self._best: Best | None = None
         self._problem: Problem | None = None
-        self._history: dict[int, list[Step]] = {}  # by the start
-        self._ends: dict[int, Best] = {}  # the best point of each start
-        self._from = 0  # the start that the best point comes from
+        self._history: dict[int, list[Step]] = {}  # by number of the local search
+        self._ends: dict[int, Best] = {}  # best point of each local search
+        self._from = 0  # number of the local search that found the best point
 
     @property
     def started(self) -> bool:
-        """Whether there is a point at all."""
+        """Whether a point with a finite F was found."""
         return self._best is not None and bool(np.isfinite(self._best.f))
 
     @property
     def so_far(self) -> tuple[float, float]:
-        """The goal of the best point, and how far it is beyond a limit."""
+        """Objective and relative violation of the best point, or NaN before the first point."""
         return (np.nan, np.nan) if self._best is None else self._best.so_far
 
     @property
@@ -129,34 +150,37 @@ class Descents:
 
     @property
     def problem(self) -> Problem:
-        """What it is the best point of, with its own limits."""
+        """The problem that the best point belongs to, with the original limits."""
         assert self._problem is not None
         return self._problem.tightened(1.0 / (1.0 - self._margin))
 
     @property
     def share(self) -> np.ndarray:
-        """(gains,) shares of the best point."""
+        """Normalised gains of the best point, (gains,)."""
         return self.best.share
 
     @property
     def gains(self) -> np.ndarray:
-        """(gains,) of the best point."""
+        """Gains of the best point, (gains,)."""
         return self._evaluate.bounds.gains(self.share)
 
     @property
     def ends(self) -> list[np.ndarray]:
-        """Shares, (gains,) each, where the starts ended that were followed to the end, the best first."""
+        """Normalised gains of the best points of the local searches, (gains,) each, the best first."""
         return [end.share for _, end in _ranked(self._ends)]
 
     @property
     def history(self) -> list[Step]:
-        """The points gone through, in the order of the starts and of each start's steps."""
+        """The history of accepted points, ordered by local search and step."""
         return [step for _, steps in sorted(self._history.items()) for step in steps]
 
     def set_out(self, problem: Problem, own: np.ndarray, designs: np.ndarray) -> None:
-        """Search locally on a few trials, from the best of the scenario's gains, (gains,), and of the designs.
+        """Search locally on few trials, from the scenario's gains or from the best design if that is better.
 
-        designs: (designs, gains).
+        Args:
+            problem: the tuning problem.
+            own: (gains,) gains of the scenario.
+            designs: (designs, gains) gains of designs that follow from the mission.
         """
         few = _few_trials(problem)
         self._own, self._designs = own, np.asarray([self._evaluate.bounds.share(one) for one in designs])
@@ -168,9 +192,18 @@ class Descents:
         self._descend(few, 0, Start(first, CAREFUL), max(2, self._steps // 2))
 
     def explore(self, problem: Problem, starts: int, seed: int) -> dict[int, np.ndarray]:
-        """The shares where the most promising of so many starts end, after a few steps from each on a few trials.
+        """Run short local searches on few trials from many starting points, and return the best results.
 
-        The first goes on from where it set out to, with what has joined the problem; the others are chosen from there.
+        The first local search continues from the result of `set_out`, with the trials that joined since. The other
+        starting points are chosen after it.
+
+        Args:
+            problem: the tuning problem.
+            starts: number of starting points.
+            seed: seed of the candidates for starting points.
+
+        Returns:
+            Normalised gains, (gains,), of at most `FOLLOWED` results, by number of the local search.
         """
         problem, more = _few_trials(problem), max(2, self._steps // 2)
         self._report(SETTING_OUT, 1, 2, *self.so_far)
@@ -181,9 +214,12 @@ class Descents:
         return self._promising(problem, first)
 
     def _promising(self, problem: Problem, first: np.ndarray, number: int = 0) -> dict[int, np.ndarray]:
-        """Return the end points of the best short local searches, by the index of their starting point.
+        """Return the results of the best short local searches, by number of the local search.
 
-        first: (starts, gains) shares; number: index of the first one.
+        Args:
+            problem: the tuning problem.
+            first: (starts, gains) normalised gains of the starting points.
+            number: number of the first local search.
         """
         few, more = max(2, self._steps // 4), max(2, self._steps // 2)
         racing = dict(enumerate(first, number))
@@ -192,7 +228,12 @@ class Descents:
         return {k: self._ends[k].share for k in ranked[:FOLLOWED]} or {number: first[0]}
 
     def descend(self, problem: Problem, starts: Mapping[int, np.ndarray]) -> None:
-        """Descend part of the way from each of these shares, and from the best end to the optimum next to it."""
+        """Search locally with half of the steps from each starting point, then with all steps from the best one.
+
+        Args:
+            problem: the tuning problem.
+            starts: (gains,) normalised gains of each starting point, by number of the local search.
+        """
         half, self._ends = max(2, self._steps // 2), {}
         self._race(problem, starts, ((len(starts), half), (1, self._steps)), FOLLOWING, afresh=True)
         self._finish(problem)
@@ -207,9 +248,15 @@ class Descents:
         scales: Sequence[float] = (CAREFUL,),
         afresh: bool = False,
     ) -> list[int]:
-        """The starts by where they end, the best first; on each rung so many of them go so many steps in all.
+        """Run successive halving and return the numbers of the local searches, the best first.
 
-        scales: of the descents, by turns.
+        Args:
+            problem: the tuning problem.
+            starts: (gains,) normalised gains of each starting point, by number of the local search.
+            rungs: for each stage, the number of local searches that continue, and the total steps of each.
+            what: name of the step in progress reports.
+            scales: scalings of the variables, which the local searches use in turn.
+            afresh: replace the best point so far by the first result, because the problem has changed.
         """
         racers = {
             k: _Racer(Start(share, scales[k % len(scales)]), list(self._history.get(k, ())))
@@ -232,19 +279,19 @@ class Descents:
         *,
         afresh: bool,
     ) -> None:
-        """Descend from each of these starts, `TOGETHER` at a time of each device."""
+        """Run local searches from these starting points, with `TOGETHER` of them at a time for each device."""
         tightened, bests, reports = self.tightened(problem), dict[int, Best](), 0
 
         def race(k: int, ask: Ask) -> None:
             bests[k] = Best(racers[k].start.share, len(problem.rows), self._margin)
-            self._history[k] = list(racers[k].before)  # it goes through the same points again, and on
+            self._history[k] = list(racers[k].before)  # the longer search repeats the points of the shorter one
             descend(ask, bests[k], racers[k].start, steps, partial(self._keep, k), relaxed=_relaxed(problem))
 
         def tell() -> None:
             nonlocal reports
             begun = [*bests.values()] if afresh or self._best is None else [self._best, *bests.values()]
             best = min(begun, key=lambda best: best.rank)
-            while reports < len(bests):  # once for each that has begun
+            while reports < len(bests):  # one report for each local search that has begun
                 self._report(what, reports, len(racers), *best.so_far)
                 reports += 1
 
@@ -256,58 +303,75 @@ class Descents:
         try:
             in_step([partial(race, k) for k in racers], fly, TOGETHER * len(configure.devices()))
             tell()
-        finally:  # interrupted too
+        finally:  # also after an interrupt
             for k in racers:
                 if k in bests:
                     self._take(bests[k], tightened, k, afresh=afresh)
                     afresh = False
 
     def again(self, problem: Problem) -> None:
-        """Go on from where the best starts ended, with what has joined the problem."""
+        """Continue from the best results, with the trials that joined the problem."""
         self._instead(problem, [(start, end.share) for start, end in _ranked(self._ends)[:AGAIN]])
         self._finish(problem)
 
     def search_globally(self, problem: Problem, starts: int, seed: int) -> None:
-        """Search from the best of many points of the whole box, and keep the earlier result if it is better."""
+        """Search from the best of many points of the whole box, and keep the earlier result if it is better.
+
+        Args:
+            problem: the tuning problem.
+            starts: number of starting points.
+            seed: seed of the points.
+        """
         self.globally = True
         found = self.best, self._problem, self._from, self._ends
         try:
             few = _few_trials(problem)
             first = spread_widely(self._evaluate, self.tightened(few), starts, seed, self._report)
             self.descend(problem, self._promising(few, first, 1 + max(self._history, default=-1)))
-        finally:  # interrupted too
+        finally:  # also after an interrupt
             if found[0].rank <= self.best.rank:
                 self._best, self._problem, self._from, self._ends = found
 
     def _instead(self, problem: Problem, ends: Sequence[tuple[int, np.ndarray]]) -> None:
-        """Descend from each of these (start, shares); the best point found takes the place of the best so far."""
+        """Search locally from these points, (number, normalised gains). The best result replaces the best point."""
         for k, (start, share) in enumerate(ends):
             self._descend(problem, start, Start(share, CAREFUL), self._steps, afresh=k == 0)
 
     def sweep(self, problem: Problem, own: np.ndarray) -> None:
-        """The best of the scenario's gains and of points spread widely, where there are no slopes."""
+        """Measure Sobol points and the scenario's gains, and take the best of them. No gradients are used.
+
+        Args:
+            problem: the tuning problem.
+            own: (gains,) gains of the scenario.
+        """
         tightened = self.tightened(problem)
         share = np.concatenate([self._evaluate.bounds.share(own)[None], spread(len(problem.names), MANY, self._rng)])
         share = promising(self._evaluate, tightened, share, 1, partial(self._report, CHOOSING))
         best, flown = self._best_of(tightened, share)
-        self._keep(0, flown)  # interrupted before evolution has a generation, it is all that there is to tell
+        self._keep(0, flown)  # if the search is interrupted now, the history has this point
         self._take(best, tightened, 0, afresh=True)
 
     def _best_of(self, tightened: Problem, share: np.ndarray) -> tuple[Best, Measured]:
-        """The best of these points, (points, gains), flown without slopes, and what was measured at each of them."""
+        """Measure points (points, gains) without gradients. Return the best point and the measurement."""
         best, flown = Best(share[0], len(tightened.rows), self._margin), self._evaluate.fly(tightened, share)
         best.offer(share, flown)
         return best, flown
 
     def evolve(self, problem: Problem, share: np.ndarray, size: tuple[int, float] = WIDELY) -> None:
-        """Look for better points around these shares, without slopes."""
+        """Search by differential evolution from a point, without gradients.
+
+        Args:
+            problem: the tuning problem.
+            share: (gains,) normalised gains of the point.
+            size: points of a generation and spread of the first generation, see `evolution.evolve`.
+        """
         tightened = self.tightened(problem)
         best, _ = self._best_of(tightened, share[None])
         try:
             evolve(self._evaluate, tightened, best, share, int(self._rng.integers(2**31)),
                    lambda done, steps: self._report(EVOLVING, done, steps, *best.so_far),
                    partial(self._keep, 0), size)  # fmt: skip
-        finally:  # interrupted too
+        finally:  # also after an interrupt
             self._take(best, tightened, 0, afresh=True)
         on_samples = np.asarray(hand_overs.on_samples(problem, self._evaluate.bounds, self.share))
         if on_samples.size:
@@ -315,9 +379,10 @@ class Descents:
             self._take(best, tightened, 0, afresh=best.beyond <= self.best.beyond)
 
     def conflict(self, problem: Problem) -> dict[str, float | None]:
-        """Return the limits that the best compromise exceeds most, and the least ratio that each can reach alone.
+        """Return the limits that the best compromise exceeds most, and the smallest ratio that each can reach alone.
 
-        The ratio is metric over limit, with every other limit kept to 0.1 %. It is None if the others cannot be kept.
+        The ratio is metric / limit, with every other limit kept to 0.1 %. It is None if the other limits cannot be
+        kept.
         """
         tightened, found = self.tightened(problem), dict[str, float | None]()
         worst = largest(self._evaluate.slopes(tightened, self.share[None]).c, 0.0)[0]
@@ -355,13 +420,21 @@ class Descents:
             self._take_back(problem, self._own, others)
 
     def _take_back(self, problem: Problem, own: np.ndarray, indices: Sequence[int]) -> None:
-        """The scenario's own value for as many of some gains as make no difference together."""
+        """Reset as many gains as possible to the scenario's values.
+
+        F may grow by `SAME`, and the violation may not grow.
+
+        Args:
+            problem: the tuning problem.
+            own: (gains,) gains of the scenario.
+            indices: indices of the gains that may be reset.
+        """
         tightened, current = self.tightened(problem), self.best
 
         def judged(changes: Sequence[Sequence[int]]) -> list[Best]:
             back = [np.isin(np.arange(own.size), change) for change in changes]
             share = np.clip([self._evaluate.bounds.replaced(current.share, own, which) for which in back], 0.0, 1.0)
-            flown = self._evaluate.slopes(tightened, share)  # the program that is compiled already
+            flown = self._evaluate.slopes(tightened, share)  # this program is already compiled
             bests = [Best(one, len(problem.rows), self._margin) for one in share]
             for k, best in enumerate(bests):
                 best.offer(share[k : k + 1], flown.at(k))
@@ -377,10 +450,10 @@ class Descents:
         return best.beyond <= self.best.beyond and best.f <= self.best.f + SAME
 
     def _hand_over_elsewhere(self, problem: Problem) -> bool:
-        """Whether the best of other hand-overs leads to a better point, the other gains at first as they are.
+        """Try other hand-over times, search locally from the best of them, and return whether that was better.
 
-        Noise moves along with the hand-over: by delta other noise falls into the window, and F of a few hundred trials
-        has ripples of a per cent, in which descents end.
+        The noise samples in the window change with delta. F of a few hundred trials therefore has ripples of 1 % over
+        delta, and a local search can end in the local minimum of a ripple.
         """
         found, share = self.best, hand_overs.elsewhere(problem, self._evaluate.bounds, self.share)
         if found.over > 0.0 or not share:
@@ -388,7 +461,7 @@ class Descents:
         tightened = self.tightened(problem)
         flown = self._evaluate.fly(tightened, np.stack(share))
         price = prices(self._evaluate.slopes(tightened, found.share[None]), found.share)
-        # a little beyond a limit: the other gains come back from there, at its price
+        # for small violations, the multipliers estimate F after the other gains have restored the limits
         paid = flown.f + np.maximum(ended(flown.c).max(axis=2, initial=-1.0), 0.0) @ price
         known = np.isfinite(paid) & (failures(flown.c) == 0) & (flown.beyond <= NEARLY)
         paid = np.where(known, paid, np.inf)
@@ -398,9 +471,9 @@ class Descents:
         return self.best is not found
 
     def _hand_over_on_a_sample(self, problem: Problem) -> None:
-        """The best point whose hand-over is flown as it is trained, the other gains anew, in place of the best so far.
+        """Move the hand-over of the best point onto a sample, as on a flight computer, and search the other gains.
 
-        Where that was admissible and what it becomes is not, from where other starts ended.
+        If the best point was admissible and the new point is not, the results of other local searches are tried.
         """
         admissible, moved = self.best.over == 0.0, False
         times = [k for k, name in enumerate(problem.names) if name in TIMES]
@@ -415,16 +488,25 @@ class Descents:
     def _descend(
         self, problem: Problem, number: int, start: Start, steps: int, close: float = CLOSE, *, afresh: bool = False
     ) -> None:
-        """Descend from a start of this number, and take what it finds."""
+        """Run a local search and take its result.
+
+        Args:
+            problem: the tuning problem.
+            number: number of the local search.
+            start: starting point.
+            steps: largest number of measured points.
+            close: change of F at which the search ends.
+            afresh: replace the best point so far, because the problem has changed.
+        """
         best, tightened = Best(start.share, len(problem.rows), self._margin), self.tightened(problem)
         try:
             keep = partial(self._keep, number)
             descend(partial(self._evaluate.slopes, tightened), best, start, steps, keep, close, _relaxed(problem))
-        finally:  # interrupted too
+        finally:  # also after an interrupt
             self._take(best, tightened, number, afresh=afresh)
 
     def _take(self, best: Best, tightened: Problem, start: int, *, afresh: bool) -> None:
-        """Take what was found where it is better than the best so far; afresh: whatever it is, of another problem."""
+        """Replace the best point by a better one, or, with `afresh`, by any result, because the problem has changed."""
         if np.isfinite(best.f):
             self._ends[start] = best
         if self._best is None or (np.isfinite(best.f) and (afresh or best.rank < self._best.rank)):
@@ -436,7 +518,7 @@ class Descents:
         self._history.setdefault(start, []).append(step)
 
     def tightened(self, problem: Problem) -> Problem:
-        """With the margin kept from the limits."""
+        """Return the problem with tightened limits."""
         return problem.tightened(1.0 - self._margin)
 
 
@@ -446,5 +528,5 @@ def _relaxed(problem: Problem) -> Relaxed | None:
 
 
 def _ranked(ends: Mapping[int, Best]) -> list[tuple[int, Best]]:
-    """Where starts ended, the best first."""
+    """Return the results of the local searches, the best first."""
     return sorted(ends.items(), key=lambda item: item[1].rank)

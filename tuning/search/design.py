@@ -1,4 +1,4 @@
-"""The design rule that a torque limit asks for: the shortest t_f, by theory and confirmed by simulation."""
+"""The shortest t_f that keeps a torque limit, by theory and by simulation. Read `shortest_time` first."""
 
 import contextlib
 from collections.abc import Callable
@@ -19,35 +19,41 @@ from ptsmc_jax.simulation.rollout import Parts
 from ptsmc_jax.theory import solutions
 from tuning.search.gains import in_scenario, with_gains
 
-FARTHEST = 100.0  # times the scenario's t_f: no longer one is looked at
+FARTHEST = 100.0  # largest t_f to examine, relative to the t_f of the scenario
 CLOSE = 1e-3  # relative width at which the search by simulation ends
-LONGEST = 12  # batches that it may fly
+LONGEST = 12  # largest number of simulated batches
 
 
 @dataclass(frozen=True)
 class ShortestTime:
-    """Shortest t_f [s] at which the largest input of every trial, or of a share of them, stays within the limit."""
+    """Shortest t_f [s] that keeps the largest input of all trials, or of a fraction of them, within the limit."""
 
     limit: float
-    theory: float | None  # along the exact motions; None: the limit cannot be kept at any t_f
-    simulated: float | None  # as flown; None: not found
+    theory: float | None  # along the exact motions; None: no t_f keeps the limit
+    simulated: float | None  # by simulation; None: not found
     trials: int
-    quantile: float | None = None  # share of trials that must keep it; None: every one
-    unit: str | None = None  # of the limit
+    quantile: float | None = None  # fraction of trials that must keep the limit; None: all trials
+    unit: str | None = None  # unit of the limit
 
 
 def shortest_time(flown: Scenario, asked: Requirement, seed: int, trials: np.ndarray) -> ShortestTime:
-    """Shortest t_f of a scenario's gains for a limit on the commanded input, over these trials of the seed.
+    """Return the shortest t_f that keeps a limit on the commanded input, with all other gains of the scenario.
 
-    As many of them keep it as the requirement's verdict asks for. By theory: the largest input along the exact motions
-    of the trials (rule 3.5 for any start, reference and order). By simulation: the same search on flown trials, begun
-    at what theory says.
+    The number of trials that must keep the limit follows from the requirement's verdict. Theory uses the largest input
+    along the exact motion of each trial, which extends rule 3.5 to any initial state, reference and order. The search
+    by simulation begins at the t_f from theory.
+
+    Args:
+        flown: the scenario.
+        asked: the requirement with the limit.
+        seed: seed of the dispersions and the noise.
+        trials: (trials,) numbers of the trials.
     """
     ready = scenario.study(flown)
     drawn = ready.dispersion, jnp.uint32(seed), jnp.asarray(trials, dtype=jnp.uint32)
     limit, quantile = asked.limit, None if len(trials) == 1 else asked.implied_by.quantile
     told = len(trials), quantile, asked.unit
-    deciding = (must_keep(len(trials), quantile, asked.confidence) or len(trials)) - 1  # of peaks in order
+    deciding = (must_keep(len(trials), quantile, asked.confidence) or len(trials)) - 1  # index in ascending order
 
     def predicted(t_f: float) -> float:
         return float(np.sort(_predicted(ready.parts, *drawn, t_f))[deciding])
@@ -67,11 +73,11 @@ def shortest_time(flown: Scenario, asked: Requirement, seed: int, trials: np.nda
 
         return _smallest(simulated, limit, rule, max(lowest, 0.2 * rule), longest, CLOSE, LONGEST)
 
-    # in the scenario's own time, by the program that judges it; only where that is too short in a longer one
+    # first on the clock of the scenario, whose program is compiled anyway, and on a longer clock only if t_f is longer
     shortest = simulated_in(ready, own) if rule <= own else None
     if shortest is None:
         longest = max(1.5 * rule, own)
-        with contextlib.suppress(ScenarioError):  # a reference that runs into the law's singularity later, say
+        with contextlib.suppress(ScenarioError):  # for example a reference that reaches the law's singularity later
             roomy = scenario.study(in_scenario(flown, {"t_f": longest}))
             shortest = simulated_in(roomy, longest)
     return ShortestTime(limit, rule, shortest, *told)
@@ -96,21 +102,22 @@ def _smallest(
     close: float,
     most: int,
 ) -> float | None:
-    """Smallest t_f at which peak(t_f) <= limit, the last crossing when t_f shrinks from where the limit is kept.
+    """Return the smallest t_f with peak(t_f) <= limit, or None.
 
-    Peaks fall about like 1 / t_f^2, so each guess is the last one times sqrt(peak / limit); every third one doubles it,
-    or halves the bracket, whatever the peaks are like.
+    The limit is kept at the returned t_f. It is broken at a slightly shorter t_f, or `lowest` is reached there. Peaks
+    decrease about as 1 / t_f^2, so each guess is the previous guess times sqrt(peak / limit). Every third guess doubles
+    t_f or halves the bracket, regardless of the peaks.
 
     Args:
-        peak: of the input by t_f [s].
-        limit: that it is to keep.
-        start: the first t_f to look at [s].
-        lowest: below which none is looked at [s].
-        longest: beyond which none is looked at [s]; None is returned where it breaks the limit.
+        peak: largest input as a function of t_f [s].
+        limit: limit on the peak.
+        start: first t_f to examine [s].
+        lowest: smallest t_f to examine [s].
+        longest: largest t_f to examine [s]. If it breaks the limit, None is returned.
         close: relative width of the bracket at which the search ends.
-        most: peaks that may be looked at.
+        most: largest number of peaks to compute.
     """
-    over, kept = lowest, None  # t_f known to break the limit, and to keep it
+    over, kept = lowest, None  # largest t_f that breaks the limit, and smallest t_f that keeps it
     guess = start
     for looked in range(most):
         value = peak(guess)
@@ -123,7 +130,7 @@ def _smallest(
         if kept is None and over >= longest:
             return None
         step = guess * (value / limit) ** 0.5 if np.isfinite(value) and value > 0 else 2 * guess
-        step *= 1 - 0.5 * close if value <= limit else 1 + 0.2 * close  # to the other side of the limit
+        step *= 1 - 0.5 * close if value <= limit else 1 + 0.2 * close  # aim just beyond the crossing
         bold = looked % 3 == 2
         if kept is None:
             guess = min(2 * over if bold else max(step, 1.001 * over), longest)

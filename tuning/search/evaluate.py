@@ -1,4 +1,7 @@
-"""Evaluates tuning problems at many gains: flown by `flights`, judged by the problem, journaled."""
+"""Evaluation of a tuning problem at many points: simulation by `flights`, judgement by `objective`, and a journal.
+
+`Evaluator` does the evaluation. Its results are `Measured` and, with gradients, `Sloped`.
+"""
 
 import re
 from collections.abc import Callable
@@ -16,79 +19,79 @@ from tuning.search.journal import Journal
 from tuning.search.objective import FAILED, LEAST, LIMITS, Problem, Rules, ended, judge, watched
 from tuning.search.shares import Bounds, Scale
 
-TOGETHER = 16  # points that are judged in one call
+TOGETHER = 16  # points of one call of the small compiled programs
 M = TypeVar("M", bound="Measured")
 
 
 @dataclass(frozen=True)
 class Measured:
-    """F, constraints and the goal's logarithm at many points, see `objective.measure`; arrays over the points first."""
+    """F, constraints c and logarithm of the objective at many points, see `objective.judge`."""
 
     gains: np.ndarray  # (points, gains)
     f: np.ndarray  # (points,)
     c: np.ndarray  # (points, rows, trials), see `Problem.rows`
-    value: np.ndarray  # (points,)
+    value: np.ndarray  # (points,) logarithm of the objective
 
     @property
     def goal(self) -> np.ndarray:
-        """(points,) of the trials that have one; NaN where none has, for which `FAILED` stands."""
+        """Objective over the completed trials, (points,). It is NaN if no trial completes."""
         return np.where(self.value < np.log(FAILED / 2.0), np.exp(self.value), np.nan)
 
     @property
     def beyond(self) -> np.ndarray:
-        """(points,) largest c over the trials that end; -1 without a requirement."""
+        """Largest c over the completed trials, (points,). It is -1 without requirements."""
         return ended(self.c).max(axis=(1, 2), initial=-1.0)
 
     @property
     def nearest(self) -> np.ndarray:
-        """(points,) number of the row of c that is nearest to its limit, or the farthest beyond it; 0 without one."""
+        """Index of the row with the largest c over the completed trials, (points,). It is 0 without requirements."""
         largest = ended(self.c).max(axis=2, initial=-1.0)
         return largest.argmax(axis=1) if largest.shape[1] else np.zeros(len(largest), int)
 
     def at(self: M, point: int) -> M:
-        """What was measured at one of the points."""
+        """Return the measurement at one of the points."""
         return replace(self, **{f.name: getattr(self, f.name)[point : point + 1] for f in fields(self)})
 
 
 @dataclass(frozen=True)
 class Sloped(Measured):
-    """What `Measured` has, with derivatives by the shares of the bounds' intervals."""
+    """Measurement with derivatives of F and c with respect to normalised gains."""
 
     f_slope: np.ndarray  # (points, gains)
     c_slope: np.ndarray  # (points, rows, trials, gains)
 
     @property
     def finite(self) -> np.ndarray:
-        """Which points have numbers throughout, (points,) bool."""
+        """Whether all numbers of each point are finite, (points,) bool."""
         arrays = (self.f, self.c, self.f_slope, self.c_slope)
         return np.all([np.isfinite(a).reshape(len(a), -1).all(axis=1) for a in arrays], axis=0)
 
 
 class Evaluator:
-    """Flies a problem's trials at shares of the bounds' intervals, (points, gains), and counts them."""
+    """Measures problems at points, (points, gains) normalised gains, and counts the rollouts."""
 
     def __init__(self, bounds: Bounds, journal: Journal | None = None):
         self.bounds, self._journal = bounds, journal or Journal()
-        self.rollouts, self.gradients = 0, 0  # trials flown without and with slopes
+        self.rollouts, self.gradients = 0, 0  # number of rollouts without and with gradients
 
     def count_on(self, other: "Evaluator") -> None:
-        """Continue from the counts of an evaluator of the same scenario with other bounds."""
+        """Continue the counts of an evaluator of the same scenario with other bounds."""
         self.rollouts, self.gradients = other.rollouts, other.gradients
 
     def fly(self, problem: Problem, share: np.ndarray) -> Measured:
-        """F, constraints and goal at these points."""
+        """Return F, constraints and objective at points, (points, gains) normalised gains."""
         self.rollouts += len(share) * problem.trials.size
         asked = _question(b"fly", problem, share)
         return Measured(**self._journal.get(asked, lambda: self._measured(self._fly, problem, share)))
 
     def slopes(self, problem: Problem, share: np.ndarray) -> Sloped:
-        """The same with their slopes."""
+        """Return F, constraints and objective with gradients at points, (points, gains) normalised gains."""
         self.gradients += len(share) * problem.trials.size
         asked = _question(b"slopes", problem, share)
         return Sloped(**self._journal.get(asked, lambda: self._measured(self._slopes, problem, share)))
 
     def prepare(self, problem: Problem) -> None:
-        """Begin to compile what a search needs after its first steps, beside what is being done."""
+        """Compile the program without gradients in the background. A search needs it after its first steps."""
         flights.prepare(problem.fleet)
 
     def _measured(
@@ -97,7 +100,7 @@ class Evaluator:
         flown = way(problem, share)
         if problem.margins is None:
             return flown
-        # with gradients in either case: a second program takes longer to compile than most searches would save
+        # margins always come with gradients: the compilation of a second program would take longer than it saves
         of_loop = margin_rows.of_points(problem.margins, self.bounds.scale, share)
         wide = max(flown["c"].shape[2], of_loop["c"].shape[2])
 
@@ -122,13 +125,13 @@ class Evaluator:
         return {"gains": gains, **_in_calls(partial(_judged_slopes, problem.rules), gains, along, *flown)}
 
     def _gains(self, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Gains of shares, (points, gains), and what a share of each more makes of them, (points, gains, gains)."""
+        """Return the gains, (points, gains), and their derivatives by the normalised gains, (points, gains, gains)."""
         gains = _in_calls(partial(_gains, scale=self.bounds.scale), share)
         return gains["gains"], gains["along"]
 
 
 def _with_margins(flown: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return F = ln of the largest metric over its limit with the rows of the margins among them, and its gradient."""
+    """Set F to ln of the largest metric / limit, including the rows of the margins, and update its gradient."""
     c = ended(flown["c"]).reshape(len(flown["c"]), -1)
     at, points = c.argmax(axis=1), np.arange(len(c))
     largest = np.maximum(1.0 + c[points, at], LEAST)
@@ -139,7 +142,7 @@ def _with_margins(flown: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def _in_calls(program: Callable[..., dict[str, jax.Array]], *arrays: np.ndarray) -> dict[str, np.ndarray]:
-    """What a program for `TOGETHER` points makes of these, arrays over the points first."""
+    """Apply a program for `TOGETHER` points to arrays with any number of points on the first axis."""
     count = len(arrays[0])
     padded = [np.resize(v, (-(-count // TOGETHER) * TOGETHER, *v.shape[1:])) for v in arrays]
     calls = [
@@ -149,7 +152,7 @@ def _in_calls(program: Callable[..., dict[str, jax.Array]], *arrays: np.ndarray)
     return {name: np.concatenate([call[name] for call in calls])[:count] for name in calls[0]}
 
 
-_ADDRESS = re.compile("0x[0-9a-f]+")  # of a function in a system of one's own: another one in each process
+_ADDRESS = re.compile("0x[0-9a-f]+")  # address of a custom function, different in each process
 
 
 def _question(kind: bytes, problem: Problem, share: np.ndarray) -> bytes:
@@ -173,7 +176,7 @@ def _judged(rules: Rules, gains: jax.Array, metrics: jax.Array, status: jax.Arra
 def _judged_slopes(
     rules: Rules, gains: jax.Array, along: jax.Array, metrics: jax.Array, status: jax.Array, slopes: jax.Array
 ) -> dict[str, jax.Array]:
-    """F, constraints and goal with slopes, from those of the gains and of the metrics along each share."""
+    """Return F, constraints and objective with gradients, by the chain rule from gradients of gains and metrics."""
 
     def one(gains: jax.Array, along: jax.Array, metrics: jax.Array, status: jax.Array, slopes: jax.Array) -> dict:
         def of(gains: jax.Array, metrics: jax.Array) -> tuple:

@@ -1,4 +1,4 @@
-"""Search without gradients, as the discontinuous sign needs it: differential evolution."""
+"""Search without gradients by differential evolution, for laws with a discontinuous sign. See `evolve`."""
 
 from collections.abc import Callable
 
@@ -10,10 +10,10 @@ from tuning.search.evaluate import Evaluator, Measured
 from tuning.search.objective import Problem, failures
 from tuning.search.starts import STEEP, merit, spread
 
-GENERATIONS = 80  # at most: `PATIENCE` ends it earlier
-WIDELY = 64, np.inf  # points of a generation; spread of the first ones, relative to the bounds' intervals
-NEARBY = 32, 0.05  # the same from a point that is nearly the best
-PATIENCE, GAINED = 24, 1e-4  # generations without this much less F end it
+GENERATIONS = 80  # largest number of generations; `PATIENCE` can end the search earlier
+WIDELY = 64, np.inf  # points of a generation; standard deviation of the first generation, in normalised gains
+NEARBY = 32, 0.05  # the same for a search from a point near the best
+PATIENCE, GAINED = 24, 1e-4  # the search ends if F decreases by less than `GAINED` in `PATIENCE` generations
 WORST = 1e9  # merit of a point that failed
 
 
@@ -27,17 +27,18 @@ def evolve(
     keep: Callable[[Measured], None],
     size: tuple[int, float] = WIDELY,
 ) -> None:
-    """Search for better gains by differential evolution (Storn and Price, J. Global Optim. 11, 1997; SciPy's).
+    """Search for better gains by differential evolution (Storn and Price, J. Global Optim. 11, 1997; SciPy).
 
     Args:
         evaluate: measures the problem.
-        problem: what is minimised; violations are charged, see `merit`.
+        problem: the tuning problem. Violations are penalised, see `starts.merit`.
         best: is offered the best point of each generation.
-        share: (gains,) one of the first points.
-        seed: of the random numbers.
-        tell: is called with the generation and their largest number.
+        share: (gains,) normalised gains of one point of the first generation.
+        seed: seed of the random numbers.
+        tell: is called with the number of the generation and the largest number of generations.
         keep: is called with the measurement of the best point of each generation.
-        size: points of a generation, and their spread around `share` at first; infinite: the whole box.
+        size: points of a generation, and standard deviation of the first generation around `share`. If it is infinite,
+            the first generation is spread over the whole box.
     """
     population, around = size
     rng = np.random.default_rng(seed)

@@ -1,8 +1,8 @@
-"""Flies trials at many gains, without slopes and with: by one program each, however many points and trials there are.
+"""Simulation of trials at many gains, without and with gradients. Read `fly` and `sloped` first.
 
-Sweeps, descents, screening, judging, profiles and the climb to the worst case all fly the same parts, but other numbers
-of trials, at other gains, along other directions. What is compiled is rows of so many trials, each at gains of its own;
-how many rows are flown is a number.
+All steps of the tuner simulate the same parts with other gains, numbers of trials and directions of derivatives. One
+compiled program without gradients and one with gradients serve all of them. A program simulates rows of `ROW` trials.
+Each row has its own gains, and the number of rows is a run-time argument.
 """
 
 from collections.abc import Callable, Mapping
@@ -24,46 +24,46 @@ from ptsmc_jax.simulation.rollout import Parts
 from tuning.search.gains import with_gains
 
 ROW = 40  # trials in a row
-ROWS, SLOPED = 64, 8  # rows in one call, of each device; with slopes
+ROWS, SLOPED = 64, 8  # largest number of rows of a device in one call: without gradients; with gradients
 
 
 class Fleet(NamedTuple):
-    """The trials that are flown at every point, and with what."""
+    """The trials to simulate at every point, with their parts and dispersions."""
 
     parts: Parts
     dispersion: Dispersion
     seed: Any
-    names: tuple[str, ...]  # of the gains
-    trials: np.ndarray  # (trials,) that name the noise
-    coordinates: Mapping[str, np.ndarray]  # of what is drawn, arrays over the trials first
-    pointing: tuple[str, ...]  # pointing metrics to compute; the results lack the others, see `_fly`
+    names: tuple[str, ...]  # names of the gains
+    trials: np.ndarray  # (trials,) numbers that select the noise
+    coordinates: Mapping[str, np.ndarray]  # random numbers of the dispersions, trials on the first axis
+    pointing: tuple[str, ...]  # pointing metrics to compute; results lack all other pointing metrics
 
     @property
     def by_trial(self) -> dict[str, Any]:
-        """What each of the trials is flown with, arrays over them first."""
+        """Arguments with trials on the first axis."""
         return {"trial": self.trials, "coordinates": dict(self.coordinates)}
 
     @property
     def shared(self) -> tuple[Parts, Dispersion, jax.Array]:
-        """What all of them are flown with."""
+        """Arguments that all trials share."""
         return self.parts, self.dispersion, jnp.uint32(self.seed)
 
 
 class Slopes(NamedTuple):
-    """Metrics and statuses, with slopes along so many directions; arrays over points and trials first."""
+    """Metrics and statuses, with derivatives of the metrics along directions."""
 
     metrics: np.ndarray  # (points, trials, metrics)
     status: np.ndarray  # (points, trials) codes, see `rollout.STATUS`
-    slopes: np.ndarray  # (points, trials, directions, metrics)
+    slopes: np.ndarray  # (points, trials, directions, metrics) derivatives
 
 
 def movable(dispersion: Dispersion) -> tuple[str, ...]:
-    """What is drawn and may be moved along a direction: all but the true inertia."""
+    """Return the names of the dispersions with derivatives: all except for the true inertia."""
     return tuple(name for name in dispersion.kinds if name != INERTIA)
 
 
 def fly(fleet: Fleet, gains: np.ndarray) -> Flown:
-    """The trials at every point of gains, (points, gains); arrays (points, trials)."""
+    """Simulate the trials at every point of gains, (points, gains). Return arrays (points, trials)."""
     rows = _Rows(len(gains), len(fleet.trials), ROWS)
 
     def call(some: dict[str, Any], needed: np.int32) -> Flown:
@@ -73,7 +73,7 @@ def fly(fleet: Fleet, gains: np.ndarray) -> Flown:
 
 
 def trials(fleet: Fleet, gains: np.ndarray) -> Trials:
-    """The trials at one point of gains, (gains,)."""
+    """Simulate the trials at one point of gains, (gains,)."""
     return Trials(np.asarray(fleet.trials), *jax.tree.map(lambda v: v[0], fly(fleet, gains[None])))
 
 
@@ -84,15 +84,18 @@ def sloped(
     metrics: tuple[str, ...],
     shifts: Mapping[str, np.ndarray] | None = None,
 ) -> Slopes:
-    """The trials at every point of gains with slopes along directions.
+    """Simulate the trials at every point of gains, with derivatives of the metrics along directions.
 
     Args:
         fleet: the trials.
-        gains: (points, gains).
-        directions: along which each point's gains move, (points, directions, gains).
-        metrics: names of those that are wanted.
-        shifts: what moves the coordinates along each direction, (trials, directions, numbers) for each of `movable`;
-            None: nothing.
+        gains: (points, gains) gains.
+        directions: (points, directions, gains) derivative of the gains along each direction.
+        metrics: names of the metrics.
+        shifts: derivative of the random numbers along each direction, (trials, directions, numbers) for each name of
+            `movable`. None: zero.
+
+    Returns:
+        Metrics, statuses and derivatives.
     """
     rows, count = _Rows(len(gains), len(fleet.trials), SLOPED), directions.shape[1]
     if shifts is None:
@@ -108,25 +111,28 @@ def sloped(
 
 
 def prepare(fleet: Fleet) -> None:
-    """Begin to compile what `fly` needs, beside what is being done."""
+    """Compile the program of `fly` in the background."""
     rows = _Rows(1, len(fleet.trials), ROWS)
     some, _ = rows.some(0, {"gains": np.zeros((1, len(fleet.names)))}, fleet.by_trial)
     _fly.prepare(*fleet.shared, some, np.int32(0), fleet.names, fleet.pointing, rows.devices)
 
 
 class _Rows:
-    """So many trials at so many points as rows of `ROW` trials each, at most `most` of them a device in one call."""
+    """Trials at points as rows of `ROW` trials. A call has at most `most` rows for each device."""
 
     def __init__(self, points: int, trials: int, most: int):
         self.devices = len(configure.devices())
         self._points, self._count, self._most = points, trials, most
-        self._trials = np.resize(np.arange(trials), (max(1, -(-trials // ROW)), ROW))  # of the rows at each point
+        self._trials = np.resize(np.arange(trials), (max(1, -(-trials // ROW)), ROW))  # trials of the rows of a point
         self._rows = points * len(self._trials)
 
     def some(self, first: int, by_point: dict[str, Any], by_trial: dict[str, Any]) -> tuple[dict[str, Any], int]:
-        """What the rows of one call fly, from the first on, arrays (devices, rows, ..), and how many a device has.
+        """Return the arguments of one call, (devices, rows, ..), and the number of rows of a device.
 
-        by_point, by_trial: arrays over points, and trials.
+        Args:
+            first: index of the first row of the call.
+            by_point: arguments with points on the first axis.
+            by_trial: arguments with trials on the first axis.
         """
         count = min(self._rows - first, self.devices * self._most)
         places, share = montecarlo.shared_out(count, self.devices, self._most)
@@ -136,7 +142,7 @@ class _Rows:
         return by_row | jax.tree.map(lambda v: np.asarray(v)[trial], by_trial), share
 
     def flown(self, program: Callable, by_point: dict[str, Any], by_trial: dict[str, Any]) -> Any:
-        """What the program makes of all rows: arrays (points, trials, ..)."""
+        """Apply a program to all rows. Return arrays (points, trials, ..)."""
         calls = []
         for first in range(0, self._rows, self.devices * self._most):
             some, share = self.some(first, by_point, by_trial)
@@ -161,9 +167,9 @@ def _fly(
     pointing: tuple[str, ...],
     devices: int,
 ) -> Flown:
-    """Results of (devices, rows, trials); rows from `needed` on are left zero.
+    """Simulate rows and return arrays (devices, rows, trials). Rows from index `needed` on are zero.
 
-    The 52 pointing metrics make up half of the program, so only those that the problem needs are compiled.
+    The 52 pointing metrics make up half of the program. It therefore contains only the pointing metrics in `pointing`.
     """
     skipped = {*POINTING} - {*pointing}
 
@@ -194,7 +200,7 @@ def _sloped(
     metrics: tuple[str, ...],
     devices: int,
 ) -> tuple[jax.Array, jax.Array]:
-    """Metrics of (devices, rows, trials), with the status as the last of them, and their slopes."""
+    """Return metrics, (devices, rows, trials, metrics + 1), with the status as the last one, and their derivatives."""
 
     def one(gains: jax.Array, trial: jax.Array, fixed: Coordinates, free: Coordinates) -> jax.Array:
         moved = with_gains(parts, dict(zip(names, gains, strict=True)))

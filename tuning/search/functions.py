@@ -1,6 +1,6 @@
-"""Minimises any function of JAX in a box, with constraints: the local search of the tuner without a scenario.
+"""Minimisation of any JAX function in a box, with constraints, by the local search of the tuner. See `minimise`.
 
-The minimum of a sphere, of Rosenbrock's function inside a disc, and of a custom loss:
+The examples minimise a sphere, Rosenbrock's function inside a disc, and a custom loss:
 
 >>> import jax.numpy as jnp
 >>> from tuning.search import Settings, minimise
@@ -46,13 +46,13 @@ Constraints = Callable[[Float[Array, " n"]], Float[Array, "..."]]
 
 @dataclass(frozen=True)
 class Settings:
-    """The effort of `minimise`."""
+    """Numbers of points, steps and the tolerance of `minimise`."""
 
     starts: int = 8  # starting points of local searches
-    sampled: int = 64  # points of the box among which they are chosen
+    sampled: int = 64  # candidates for starting points
     steps: int = 200  # largest number of evaluations with gradients from each starting point
     tolerance: float = 1e-12  # change of the objective at which a local search ends
-    seed: int = 0  # of the sampled points
+    seed: int = 0  # seed of the sampled points
 
 
 @dataclass(frozen=True)
@@ -60,17 +60,17 @@ class Local:
     """The best point of one local search."""
 
     x: np.ndarray  # (n,)
-    value: float  # of the objective
-    violation: float  # largest constraint above 0, else 0
+    value: float  # objective
+    violation: float  # largest constraint less 1e-4, at least 0
 
 
 @dataclass(frozen=True)
 class Search:
     """The result of `minimise`."""
 
-    locals: list[Local]  # by local search, the best first
-    evaluations: int  # of the objective
-    gradients: int  # evaluations with gradients
+    locals: list[Local]  # results of the local searches, the best first
+    evaluations: int  # number of evaluations of the objective without gradients
+    gradients: int  # number of evaluations with gradients
 
     @property
     def x(self) -> np.ndarray:
@@ -97,20 +97,22 @@ def minimise(
     """Minimise a function in a box subject to constraints, by SQP from the most promising of many points.
 
     Sobol points of the box are ranked by objective and violation. Local searches (`descent.descend`) start from the
-    best of them that lie far apart. Far outside the constraints, a local search first minimises the violation.
+    best of these points that lie far apart. If a starting point is far outside the constraints, the local search first
+    minimises the violation.
 
     Args:
-        objective: differentiable function of x (n,); NaN or infinity where it does not exist.
-        constraints: differentiable function of x (n,) with values of any shape, which are met if they are at most 0.
-            They should be scaled so that 0.1 is a large violation. None: there are none.
+        objective: differentiable function of x (n,). It returns NaN or infinity where it is undefined.
+        constraints: differentiable function of x (n,) with values of any shape. A constraint is met if its value is at
+            most 0. Scale it so that 0.1 is a large violation. None: no constraints.
         bounds: lower and upper bound of each element of x.
-        settings: the effort.
+        settings: numbers of points, steps and the tolerance.
 
     Returns:
         The best point of each local search.
 
     Raises:
-        ValueError: a bound is not finite or not below the other one, or the objective is finite at no sampled point.
+        ValueError: A bound is not finite, a lower bound is not below its upper bound, or the objective is finite at no
+            sampled point. It is also raised if no starting point has a finite gradient.
     """
     lower, upper = np.asarray(bounds, dtype=float).T
     if not np.all(np.isfinite(upper - lower) & (lower < upper)):
@@ -138,7 +140,7 @@ def minimise(
 
 
 class _Problem:
-    """A function and its constraints over the unit cube."""
+    """An objective and its constraints as functions on the unit cube."""
 
     def __init__(self, objective: Function, constraints: Constraints | None, lower: np.ndarray, upper: np.ndarray):
         self._lower, self._upper, self.gradients = lower, upper, 0
@@ -152,7 +154,7 @@ class _Problem:
         self._both = jax.jit(lambda share: (both(share), jax.jacfwd(both)(share)))
 
     def x(self, share: Any) -> Any:
-        """Return the point of the box, (n,), of a point of the unit cube."""
+        """Map a point of the unit cube to the box, (n,)."""
         return self._lower + (self._upper - self._lower) * share
 
     def measured(self, share: np.ndarray) -> Measured:
@@ -168,5 +170,5 @@ class _Problem:
 
 
 def _rows(c: np.ndarray) -> np.ndarray:
-    """Return constraints as one row of `Measured.c`, (points, 1, constraints, ...), or no row without constraints."""
+    """Return constraints as one row of `Measured.c`, (points, 1, constraints, ...), or no row if there are none."""
     return c[:, None][:, : min(1, c.shape[1])]

@@ -1,6 +1,7 @@
-"""The gains that tuning can move: their units, and how they are set in scenarios; in parts: `simulation.gains`.
+"""The gains that the tuner can change: names, units, published values and starting points from the mission.
 
-A gain that has a number for each axis may be named axis by axis, `observer_gain_1` and so on.
+`with_gains` sets gains in parts, and `in_scenario` sets them in a scenario. A gain with one value for each axis has
+names for single axes too, such as `observer_gain_1`.
 """
 
 from collections.abc import Iterable
@@ -20,11 +21,11 @@ from ptsmc_jax.simulation.gains import own as own
 from ptsmc_jax.simulation.gains import with_gains as with_gains
 from ptsmc_jax.simulation.rollout import Parts
 
-AS_PUBLISHED = 0.05  # delta in the paper [s]
+AS_PUBLISHED = 0.05  # published delta [s]
 
 
 def units(plant: str) -> dict[str, str]:
-    """The unit of each gain that a plant of this kind may have, from what its keys mean; "-" for none."""
+    """Return the unit of each gain that a plant of this kind can have, by name; "-" for a gain without unit."""
     tables: Any = SCENARIOS[plant].TABLES
     return _units(
         (*tables["controller"].values(), *tables["observer"].values(), *FILTERS.values(), *COMMAND_FILTERS.values())
@@ -32,18 +33,18 @@ def units(plant: str) -> dict[str, str]:
 
 
 def units_of(scenario: Scenario) -> dict[str, str]:
-    """The unit of each gain of a scenario, those of a law or an observer of one's own among them."""
+    """Return the unit of each gain of a scenario, by name, including the gains of custom laws and observers."""
     return units(scenario.plant.kind) | _units(type(table) for table in scenario.tuned_tables.values())
 
 
 def _units(tables: Iterable[Any]) -> dict[str, str]:
-    """The unit of each gain of these tables, as the first that has it says."""
+    """Return the unit of each gain of these tables, by name. The first table with the gain defines its unit."""
     named = [(table, key, table.prefix + key.name) for table in tables for key in keys.of(table)]
     return {name: key.unit or "-" for table, key, name in reversed(named) if name in table.gains}
 
 
 def named(scenario: Scenario) -> tuple[str, ...]:
-    """Names of the free gains, axis by axis where the scenario says so."""
+    """Return the names of the free gains, with one name for each axis if the scenario tunes per axis."""
     names: list[str] = []
     for name in scenario.search.gains:
         if scenario.search.per_axis and name == "observer_gain":
@@ -54,9 +55,10 @@ def named(scenario: Scenario) -> tuple[str, ...]:
 
 
 def of_paper(scenario: Scenario) -> dict[str, float]:
-    """Return the published gains, scaled to the mission: those of Case I, or eta = n + 1 as in Figs. 1 and 2.
+    """Return the published gains by name, scaled to the mission.
 
-    delta is at least a period.
+    A spacecraft has the gains of Case I. A chain of order n has eta = n + 1, as in Figs. 1 and 2. delta is at least one
+    period.
     """
     units, table = mission.scales(scenario), LAWS[scenario.plant.kind]["prescribed_time"]
     gains = {name: float(units.of(scaled)) for name, scaled in table.scaled.items() if name in table.gains}
@@ -69,9 +71,17 @@ def of_paper(scenario: Scenario) -> dict[str, float]:
 
 
 def of_designs(scenario: Scenario, parts: Parts, names: tuple[str, ...]) -> list[list[float]]:
-    """Return starting points (designs, gains) that follow from the mission, see `mission.designs`.
+    """Return starting points that follow from the mission, see `mission.designs`.
 
-    Gains that no design has, as those of a custom law, stay the scenario's.
+    A gain that the designs do not contain, such as a gain of a custom law, keeps the value of the scenario.
+
+    Args:
+        scenario: the scenario.
+        parts: its parts.
+        names: names of the free gains.
+
+    Returns:
+        Gains, (designs, gains), in their units. A scenario in continuous time has no designs.
     """
     if not scenario.sampled:
         return []
@@ -85,7 +95,7 @@ def of_designs(scenario: Scenario, parts: Parts, names: tuple[str, ...]) -> list
 
 
 def papers(scenario: Scenario) -> Scenario:
-    """The scenario under the paper's law with the paper's gains for its plant."""
+    """Return the scenario with the published law and the published gains for its plant."""
     table, own = scenario.controller, of_paper(scenario)
     if not table.law.prescribed:
         error = {"error": "multiplicative"} if scenario.motion == "spacecraft" else {}
@@ -95,15 +105,18 @@ def papers(scenario: Scenario) -> Scenario:
 
 
 def paper_is(scenario: Scenario) -> str:
-    """Return the label of the published gains: as they are, scaled to another body or period, or of the paper's law."""
-    if not scenario.controller.law.prescribed:
+    """Return the label of the published gains in tables.
+
+    It tells whether the gains are unchanged, scaled to another body or period, or belong to another law.
+    """
+    if not scenario.controller.prescribed:
         return "paper's law"
     as_published = mission.published(scenario) and of_paper(scenario)["delta"] == AS_PUBLISHED
     return "published" if as_published else "published, scaled"
 
 
 def differ(one: Scenario, other: Scenario) -> bool:
-    """Whether two scenarios fly another law or other gains; a default is what it stands for."""
+    """Return whether two scenarios differ in controller, observer, estimator or sensors, with defaults filled in."""
     one, other = one.written(), other.written()
     return any(
         getattr(one, name) != getattr(other, name) for name in ("controller", "observer", "estimator", "sensors")

@@ -1,4 +1,4 @@
-"""A global search of the same problem without slopes: how far the gradient search ended from it."""
+"""Independent check of a search: differential evolution on the same problem, and the distance between both results."""
 
 from dataclasses import dataclass, replace
 
@@ -13,29 +13,37 @@ from tuning.search.optimise import Search
 from tuning.search.progress import Report
 
 POPULATION = 40  # points for each gain
-GENERATIONS = 80  # at most: `SPREAD` ends it earlier
-STEPS = 100  # of the descent from what it found
-SPREAD = 1e-4  # of F in the population, at which it ends
-FORBIDDEN = 100.0  # beside F, for a point that breaks a limit: beyond every F
+GENERATIONS = 80  # largest number of generations; `SPREAD` can end the evolution earlier
+STEPS = 100  # steps of the local search from the result of the evolution
+SPREAD = 1e-4  # standard deviation of F in the population at which the evolution ends
+FORBIDDEN = 100.0  # merit of a point that breaks a limit, larger than every F
 
 
 @dataclass(frozen=True)
 class Check:
-    """What differential evolution found of the same problem."""
+    """The result of differential evolution on the same problem."""
 
     gains: dict[str, float]
-    value: float  # its goal
-    distance: float  # the search's F less this one's: ln of how many times its goal the search's is
-    kept: bool  # whether it keeps every limit
-    rollouts: int  # trials flown for it
+    value: float  # objective
+    distance: float  # F of the checked search less F of this result: ln of the ratio of the objectives
+    kept: bool  # whether these gains keep every limit
+    rollouts: int  # number of rollouts
 
 
 def check(
     evaluate: Evaluator, searched: Search, seed: int, report: Report = lambda *_: None, *, sloped: bool = True
 ) -> Check:
-    """Differential evolution (Storn and Price, 1997; SciPy's, whole generations at once) with the same limits.
+    """Check a search by differential evolution (Storn and Price, 1997; SciPy) with the same tightened limits.
 
-    Then the same descent as in the search, where F has slopes: what is compared is the valley that each of them found.
+    If F has gradients, a local search follows, as in the checked search. The check thus compares the local minima that
+    both methods find.
+
+    Args:
+        evaluate: measures the problem.
+        searched: result of the search to check.
+        seed: seed of the random numbers.
+        report: is called after every generation.
+        sloped: whether F has gradients.
     """
     margin = np.asarray([*searched.margins.values()])
     problem = searched.problem.tightened(1.0 - margin)
@@ -49,7 +57,7 @@ def check(
 
     def merit(share: np.ndarray) -> np.ndarray:
         found = merit_of(without, share.T)
-        # margins, which take far longer, can only add to it: of what is not chosen anyway they are not asked for
+        # margins take far longer and can only increase the merit, so only points that survive without them need margins
         chosen = found <= replaced
         if without is not problem and chosen.any():
             found[chosen] = merit_of(problem, share.T[chosen])
@@ -77,7 +85,7 @@ def check(
     )
     best = Best(result.x, len(problem.rows), margin)
     best.offer(result.x[None], evaluate.fly(problem, result.x[None]))
-    if sloped:  # near a limit evolution goes slowly: from where it ends, along it
+    if sloped:  # differential evolution converges slowly along a limit, so a local search follows
         run = Descents(evaluate, margin, STEPS, np.random.default_rng(seed))
         run.descend(searched.problem, {0: result.x})
         best = run.best
@@ -86,6 +94,6 @@ def check(
         gains=dict(zip(problem.names, at_best.gains[0].tolist(), strict=True)),
         value=best.value,
         distance=float(at_search.f[0]) - best.f,
-        kept=not best.failed and bool(np.all(best.worst <= 1.0)),  # the limits themselves, as the search is judged
+        kept=not best.failed and bool(np.all(best.worst <= 1.0)),  # original limits, as in the verdict
         rollouts=evaluate.rollouts - before,
     )

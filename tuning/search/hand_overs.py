@@ -1,4 +1,7 @@
-"""Hand-overs near that of a point of a search: on the samples beside it, and elsewhere."""
+"""Other hand-over times t_f - delta for a point of a search: on neighbouring samples, and farther away.
+
+Points are normalised gains (`share`), 0 to 1 within the bounds. Read `on_samples` first.
+"""
 
 import math
 from dataclasses import dataclass
@@ -9,25 +12,25 @@ import numpy as np
 from tuning.search.objective import Problem
 from tuning.search.shares import TIMES, Bounds
 
-LATER = 4  # samples from the one before the hand-over on, to which it is moved with t_f
-LOOKED = 16  # hand-overs looked at elsewhere, at most
-FACTOR = 2.0  # times delta, and its inverse, between which these lie
+LATER = 4  # number of consecutive samples that t_f moves the hand-over to, from the sample before it
+LOOKED = 16  # largest number of hand-overs from `elsewhere`
+FACTOR = 2.0  # largest ratio of their delta to the present delta, and inverse of the smallest ratio
 
 
 @dataclass(frozen=True)
 class _HandOver:
-    """The hand-over of one point of a search."""
+    """The hand-over of one point of a search, in s."""
 
-    share: np.ndarray  # (gains,) of the bounds' intervals
+    share: np.ndarray  # (gains,) normalised gains
     bounds: Bounds
     gains: np.ndarray  # (gains,)
-    at: dict[str, int]  # where its free times stand among them
+    at: dict[str, int]  # indices of delta and t_f among the free gains
     t_f: float
     delta: float
-    period: float  # between samples
+    period: float  # sampling period
 
     def moved(self, name: str, time: float) -> np.ndarray | None:
-        """The point's shares with another time; None: it is beyond a bound."""
+        """Return the normalised gains with another time, or None if the time is outside its bounds."""
         k = self.at[name]
         if not self.bounds.lower[k] * (1 - 1e-9) <= time <= self.bounds.upper[k]:
             return None
@@ -38,10 +41,10 @@ class _HandOver:
 
 
 def _of(problem: Problem, bounds: Bounds, share: np.ndarray) -> _HandOver | None:
-    """The hand-over of a point, or None where no gain moves it or the clock does not move along with it."""
+    """Return the hand-over of a point, or None if no free gain moves it or the clock is not anchored to it."""
     clock: Any = problem.parts.clock
     law, at = problem.parts.controller, {name: k for k, name in enumerate(problem.names) if name in TIMES}
-    if not at or not clock.anchored or "delta" not in law.tunable:  # a law without it does not hand over
+    if not at or not clock.anchored or "delta" not in law.tunable:  # a law without delta has no hand-over
         return None
     own = bounds.gains(share)
     t_f, delta = (float(own[at[name]] if name in at else getattr(law, name)) for name in ("t_f", "delta"))
@@ -49,9 +52,19 @@ def _of(problem: Problem, bounds: Bounds, share: np.ndarray) -> _HandOver | None
 
 
 def on_samples(problem: Problem, bounds: Bounds, share: np.ndarray) -> list[np.ndarray]:
-    """Shares, (gains,), with the nearest hand-overs that are flown as they are trained; none where all are.
+    """Return points whose hand-over lies on a sample near the present hand-over.
 
-    A flight computer hands over at its first sample not before t_f - delta, which the anchored clock has at it.
+    A flight computer hands over at its first sample at or after t_f - delta. The anchored clock of the search has a
+    sample exactly at t_f - delta. Both agree only if t_f - delta is a multiple of the period.
+
+    Args:
+        problem: the tuning problem.
+        bounds: bounds of the free gains.
+        share: (gains,) normalised gains of the point.
+
+    Returns:
+        Normalised gains, (gains,) each. The list is empty if no free gain moves the hand-over or the clock is not
+        anchored to it.
     """
     here = _of(problem, bounds, share)
     if here is None:
@@ -60,16 +73,22 @@ def on_samples(problem: Problem, bounds: Bounds, share: np.ndarray) -> list[np.n
     before, behind = math.floor(samples + 1e-9), math.ceil(samples - 1e-9)
     if "delta" in here.at:
         moves += [here.moved("delta", here.t_f - sample * here.period) for sample in sorted({before, behind})]
-    if "t_f" in here.at:  # where it is as short as limits allow, another delta may break one
+    if "t_f" in here.at:  # if t_f is as short as the limits allow, another delta may break a limit
         later = range(before, before + LATER)
         moves += [here.moved("t_f", sample * here.period + here.delta) for sample in later]
     return [there for there in moves if there is not None]
 
 
 def elsewhere(problem: Problem, bounds: Bounds, share: np.ndarray) -> list[np.ndarray]:
-    """Shares, (gains,), with other hand-overs by delta, on samples spread evenly over `FACTOR` of it to either side.
+    """Return points with other hand-overs, on samples spread evenly over delta / `FACTOR` to delta * `FACTOR`.
 
-    None where delta is not free.
+    Args:
+        problem: the tuning problem.
+        bounds: bounds of the free gains.
+        share: (gains,) normalised gains of the point.
+
+    Returns:
+        Normalised gains, (gains,) each. The list is empty if delta is not free.
     """
     here = _of(problem, bounds, share)
     if here is None or "delta" not in here.at:

@@ -1,6 +1,7 @@
-"""A journal of the evaluations of a long computation, from which an interrupted computation resumes.
+"""A journal of the evaluations of a long computation. An interrupted computation resumes from it. See `Journal.get`.
 
-Records are appended to one file, each with its length and checksum. One process writes at a time: see `store.in_use`.
+Records are appended to one file, each with its length and checksum. Only one process writes at a time, see
+`store.in_use`.
 """
 
 import io
@@ -16,24 +17,24 @@ _HEAD = struct.Struct("<QI")  # length and CRC-32 of the record that follows
 
 
 class Journal:
-    """Evaluations in the order in which they are asked for; without a path, none is kept."""
+    """Evaluations in the order of their requests. Without a path, nothing is recorded."""
 
     def __init__(self, path: Path | None = None):
         self._path = path
         self._earlier = deque(_records(path.read_bytes()) if path is not None and path.exists() else ())
-        self._end = 0  # bytes of the file that hold the evaluations so far
+        self._end = 0  # size of the records that were read or written, in bytes
 
     @property
     def replaying(self) -> bool:
-        """Whether an earlier process left evaluations that were not asked for yet."""
+        """Whether evaluations of an earlier process remain that were not requested yet."""
         return bool(self._earlier)
 
     def get(self, question: bytes, compute: Callable[[], Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
         """Return the recorded answer to a question, or compute and record it.
 
         Args:
-            question: everything that the answer depends on. If another question was recorded at this position, that
-                record and all later ones are replaced.
+            question: all inputs of the answer, as bytes. If another question was recorded at this position, its record
+                and all later records are replaced.
             compute: returns the answer.
         """
         asked = np.frombuffer(struct.pack("<I", zlib.crc32(question)), dtype=np.uint8)
@@ -46,7 +47,7 @@ class Journal:
         answer = {name: np.asarray(value) for name, value in compute().items()}
         if self._path is not None:
             with self._path.open("ab") as file:
-                file.truncate(self._end)  # a record that a kill cut, or records of other questions
+                file.truncate(self._end)  # removes an incomplete record, or records of other questions
                 self._end += file.write(_packed({"question": asked, **answer}))
         return answer
 
@@ -59,7 +60,7 @@ def _packed(record: Mapping[str, np.ndarray]) -> bytes:
 
 
 def _records(data: bytes) -> Iterator[tuple[dict[str, np.ndarray], int]]:
-    """Yield the whole records, each with the position of its end; stop at a damaged record."""
+    """Yield the complete records, each with the position of its end. Stop at a damaged record."""
     at = 0
     while at + _HEAD.size <= len(data):
         length, checksum = _HEAD.unpack_from(data, at)

@@ -1,4 +1,7 @@
-"""Tasks in threads of their own, whose questions are collected and answered in batches."""
+"""Batches of requests from concurrent tasks: each task has a thread, and requests are answered together.
+
+The tuner runs several local searches side by side in this way, and simulates their points in one call. See `in_step`.
+"""
 
 import threading
 from collections.abc import Callable, Sequence
@@ -8,7 +11,7 @@ Ask = Callable[[Any], Any]
 
 
 class _Task:
-    """A task in its thread, and what it asks."""
+    """A task in its own thread, and its current request."""
 
     def __init__(self, work: Callable[[Ask], None], turn: threading.Condition):
         self._work, self._turn = work, turn
@@ -39,16 +42,25 @@ class _Task:
         return self._answer
 
     def tell(self, answer: Any) -> None:
-        """Answer the question; an exception is raised where it was asked."""
+        """Answer the request. If the answer is an exception, it is raised inside the task."""
         self._answer, self.waits = answer, False
 
 
 def in_step(works: Sequence[Callable[[Ask], None]], answer: Callable[[list[Any]], list[Any]], width: int) -> None:
-    """Run all of these functions, at most `width` at a time; each asks one question at a time by calling its argument.
+    """Run functions concurrently and answer their requests in batches.
 
-    answer: called in this thread with the questions of all that run, in their order, once each of them waits or has
-    ended. What one of them raises is raised here. What `answer` raises, a KeyboardInterrupt too, is first raised in
-    those that wait for it: when this returns, or raises, none of them runs any more.
+    A function makes one request at a time, by calling its argument. All functions have stopped when `in_step` returns
+    or raises.
+
+    Args:
+        works: the functions.
+        answer: returns the answers to a list of requests. It is called in this thread as soon as every running function
+            waits for an answer.
+        width: largest number of functions that run at a time.
+
+    Raises:
+        BaseException: The exception of a function or of `answer`. An exception of `answer`, such as KeyboardInterrupt,
+            is first raised inside the functions that wait.
     """
     turn = threading.Condition()
     waiting, active, raised = [_Task(work, turn) for work in works], list[_Task](), None
@@ -69,7 +81,7 @@ def in_step(works: Sequence[Callable[[Ask], None]], answer: Callable[[list[Any]]
                 turn.wait_for(all_stopped)
                 if raised is not None:
                     raise raised
-                if not any(task.ended for task in active):  # else another may begin, and ask with these
+                if not any(task.ended for task in active):  # else another one starts and joins this batch
                     answers = answer([task.question for task in active])
                     for task, one in zip(active, answers, strict=True):
                         task.tell(one)

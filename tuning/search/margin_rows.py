@@ -1,6 +1,7 @@
-"""Margins as constraints of a tuning problem: rows beside those of what is flown, by a program of their own.
+"""Stability margins of the linearised loop as constraints of a tuning problem.
 
-One for each axis, time and case, so that what is the least of several has slopes where two of them change places.
+Each axis, time and case has its own constraint. The smallest margin alone would not be differentiable where two margins
+are equal. Read `ask` first, which selects the loops, and then `rows`, which computes the constraints.
 """
 
 from collections.abc import Callable
@@ -27,33 +28,40 @@ from tuning.search import gains as gain_names
 from tuning.search.gains import with_gains
 from tuning.search.shares import Bounds, Scale
 
-CASES = 1  # drawn trials whose loops are constrained, those that come nearest to a limit
-WITHOUT = 2.0  # how near to its limit a loop without slopes comes: as one without any margin
+CASES = 1  # number of random trials whose loops are constrained: the trials with the worst margins
+WITHOUT = 2.0  # violation ratio of a loop without derivatives: that of a margin of zero
 
 
 @pytree
 @dataclass(frozen=True)
 class Asked:
-    """Margins that are asked for, and of which loops."""
+    """The required margins, and the loops that must have them."""
 
     parts: Parts
     dispersion: Dispersion
     seed: Leaf  # uint32
-    coordinates: Coordinates  # of what is drawn, arrays over the cases first; empty: the nominal loop alone
+    coordinates: Coordinates  # random numbers of the dispersions, cases on the first axis; empty: the nominal loop only
     wanted: Leaf  # (margins,) the limits in their units
-    limits: Leaf  # (margins,) how near a loop may come, see `over`: 1, less what the search keeps from it
+    limits: Leaf  # (margins,) largest violation ratio, see `over`: 1 less the margin of the search
     metrics: tuple[str, ...] = field(metadata={"static": True})
-    names: tuple[str, ...] = field(metadata={"static": True})  # of the free gains
+    names: tuple[str, ...] = field(metadata={"static": True})  # names of the free gains
 
     def tightened(self, factor: np.ndarray) -> "Asked":
-        """Return the same with every limit multiplied by its factor, (margins,) [-]."""
+        """Return a copy with every limit multiplied by its factor, (margins,) [-]."""
         return replace(self, limits=self.limits * factor)
 
 
 def ask(ready: Study, bounds: Bounds, seed: int) -> Asked | None:
-    """The margins that a scenario asks for, or None; where loops differ, of the trials hardest by its gains.
+    """Return the margins that a scenario requires, or None if it requires none.
 
-    The program of a search's rows is compiled beside the one that finds these trials: each takes as long as a search.
+    If dispersions change the loop, the constrained loops are those of the worst trials for the scenario's gains. The
+    program that computes the constraints is compiled in parallel with the program that finds these trials. Each
+    compilation takes as long as a search.
+
+    Args:
+        ready: the scenario with its parts.
+        bounds: bounds of the free gains.
+        seed: seed of the dispersions.
     """
     if not ready.margins:
         return None
@@ -73,15 +81,18 @@ def ask(ready: Study, bounds: Bounds, seed: int) -> Asked | None:
 
 
 def _of_trials(asked: Asked, trials: np.ndarray) -> Asked:
-    """With the loops of these trials."""
+    """Return a copy with the loops of these trials."""
     drawn = montecarlo.coordinates(asked.dispersion, asked.seed, jnp.asarray(trials, dtype=jnp.uint32))
     return replace(asked, coordinates=drawn)
 
 
 def hardest(asked: Asked, gains: Float[np.ndarray, " gains"]) -> tuple[Asked, float]:
-    """With the `CASES` trials whose loops come nearest to a limit by these gains, and how near the nearest comes.
+    """Select the `CASES` trials with the worst margins for these gains, (gains,).
 
-    As it is where nothing is drawn that changes them: all loops are one, which is among the rows.
+    If no dispersion changes the loop, all trials have the nominal loop, and nothing is selected.
+
+    Returns:
+        The required margins for the loops of these trials, and the largest violation ratio of all trials, at least 0.
     """
     if not margin_verdicts.differ(asked.dispersion):
         return asked, 0.0
@@ -94,9 +105,18 @@ def hardest(asked: Asked, gains: Float[np.ndarray, " gains"]) -> tuple[Asked, fl
 
 
 def rows(asked: Asked, gains: Float[Array, " gains"], runs: linear.Nominal) -> Float[Array, "margins entries"]:
-    """Constraints c, met where c <= 0: how near to its limit each margin comes, over `limits`, less 1.
+    """Return the constraints c of the margins, which are met if c <= 0.
 
-    A loop without slopes is as far beyond as one without any margin. runs: see `nominal_runs`.
+    c is the violation ratio of a margin, see `over`, divided by `limits`, minus 1. A loop without derivatives counts as
+    a loop with a margin of zero.
+
+    Args:
+        asked: the required margins.
+        gains: (gains,) values of the free gains.
+        runs: the nominal run of each case, see `nominal_runs`.
+
+    Returns:
+        c, (margins, entries), with an entry for each case, axis and time.
     """
     late = margin_verdicts.DELAY in asked.metrics
 
@@ -115,14 +135,15 @@ def rows(asked: Asked, gains: Float[Array, " gains"], runs: linear.Nominal) -> F
 
 
 def nominal_runs(asked: Asked, gains: Float[Array, " gains"]) -> linear.Nominal:
-    """The nominal run of each case, arrays over them first; of the parts alone where there is no case."""
+    """Return the nominal run of each case, cases on the first axis, or the run of the nominal parts without cases."""
     return _by_case(asked, gains, linear.nominal)
 
 
 def _by_case(asked: Asked, gains: Float[Array, " gains"], of: Callable[..., Any], *by_case: Any) -> Any:
-    """What `of` says of each case's parts, and of what is known of each; arrays over the cases first.
+    """Apply `of` to the parts of each case and its entries of `by_case`. Return arrays with cases on the first axis.
 
-    One after the other: XLA aborts the process on products with an inertia of each case, with some sets of gains.
+    The cases are computed one after the other. With a batch axis for the inertia, XLA aborts the process for some sets
+    of gains.
     """
     parts = with_gains(asked.parts, dict(zip(asked.names, gains, strict=True)))
     if asked.coordinates:
@@ -132,10 +153,18 @@ def _by_case(asked: Asked, gains: Float[Array, " gains"], of: Callable[..., Any]
 
 
 def with_slopes(asked: Asked, scale: Scale, share: Float[Array, " gains"]) -> tuple[Array, Array]:
-    """The `rows` at a share of the bounds' intervals, and their slopes by it, (margins, entries, gains).
+    """Return the constraints `rows` and their derivatives with respect to normalised gains.
 
-    The runs' own slopes along one gain after the other, which takes a quarter of the time: a loop over periods with all
-    of them in it is one of many small products.
+    The nominal runs are differentiated with respect to one gain after the other. This takes a quarter of the time that
+    all gains together take, because a loop over periods with all gains consists of many small products.
+
+    Args:
+        asked: the required margins.
+        scale: map from normalised gains to gains.
+        share: (gains,) normalised gains.
+
+    Returns:
+        c, (margins, entries), and its derivatives, (margins, entries, gains).
     """
 
     def flown(share: Array) -> tuple[Any, Any]:
@@ -162,7 +191,16 @@ def _has_slopes(leaf: Any) -> bool:
 
 
 def of_points(asked: Asked, scale: Scale, share: Float[np.ndarray, "points gains"]) -> dict[str, np.ndarray]:
-    """The rows "c" at shares of the bounds' intervals, and "c_slope" by these, arrays over the points first."""
+    """Return the constraints and their derivatives with respect to normalised gains, at many points.
+
+    Args:
+        asked: the required margins.
+        scale: map from normalised gains to gains.
+        share: (points, gains) normalised gains.
+
+    Returns:
+        "c", (points, margins, entries), and "c_slope", (points, margins, entries, gains).
+    """
     count = len(configure.processors())
     padded = np.resize(share, (-(-len(share) // count) * count, share.shape[1]))
     each = [sloped(asked, scale, padded[k : k + count]) for k in range(0, len(padded), count)]
@@ -171,7 +209,13 @@ def of_points(asked: Asked, scale: Scale, share: Float[np.ndarray, "points gains
 
 @programs.jit
 def sloped(asked: Asked, scale: Scale, share: Array) -> dict[str, Array]:
-    """See `of_points`; one point for each device."""
+    """Return the result of `of_points` for as many points as there are devices, with one point on each device.
+
+    Args:
+        asked: the required margins.
+        scale: map from normalised gains to gains.
+        share: (devices, gains) normalised gains.
+    """
 
     def on_device(share: Array) -> dict[str, Array]:
         c, slope = with_slopes(asked, scale, share[0])

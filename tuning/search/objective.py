@@ -1,4 +1,8 @@
-"""What is minimised over the training trials, with requirements as constraints per trial."""
+"""The tuning problem: objective over the training trials, and requirements as constraints on each trial.
+
+`problem` builds a `Problem`, and `judge` computes F and the constraints from the metrics of the trials. Read `judge`
+first.
+"""
 
 import math
 from collections.abc import Sequence
@@ -26,30 +30,30 @@ from tuning.search.flights import Fleet
 from tuning.search.gains import with_gains
 from tuning.search.margin_rows import Asked
 
-FAILED = 1e9  # stands for the goal, and for metric / limit, of a trial that failed: beyond those of any that ends
-LEAST = 1e-300  # of what a logarithm is taken of
-DRAWN = 128  # trials whose coordinates are drawn in one call
+FAILED = 1e9  # metric, and metric / limit, of a failed trial: larger than those of any completed trial
+LEAST = 1e-300  # smallest argument of a logarithm
+DRAWN = 128  # trials whose dispersions are computed in one call
 
 
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class Rules:
-    """What metrics of the training trials are judged by. The first `averaged` trials make up the objective.
+    """The rules that judge the metrics of the training trials. The objective covers the first `averaged` trials.
 
-    A limit must be kept by every trial that is `counted`. One with a quantile must also be kept by the trials that are
-    `among` its sample, except for the `may_break` of them that exceed it most.
+    Every trial that is `counted` must keep a limit. If the limit has a quantile, the trials that are `among` its sample
+    must also keep it, except for the `may_break` worst of them.
     """
 
     limits: Leaf | np.ndarray  # (requirements,) in the metrics' units
-    among: Leaf | np.ndarray  # (requirements, trials) bool: trials of which a share must keep a limit
-    counted: Leaf | np.ndarray  # (requirements, trials) bool: trials that must keep it by themselves
+    among: Leaf | np.ndarray  # (requirements, trials) bool: sample of trials for a quantile
+    counted: Leaf | np.ndarray  # (requirements, trials) bool: each of these trials must keep the limit
     averaged: int = field(metadata={"static": True})
-    names: tuple[str, ...] = field(metadata={"static": True})  # of the free gains
-    # of those that are among, how many may break each limit; None: it is one on every trial
+    names: tuple[str, ...] = field(metadata={"static": True})  # names of the free gains
+    # largest number of trials of the sample that may break each limit; None: a limit on every trial
     may_break: tuple[int | None, ...] = field(metadata={"static": True})
     goal: str = field(default="window_error", metadata={"static": True})  # a metric, `T_F` or `LIMITS`
-    tail: int | None = field(default=None, metadata={"static": True})  # the worst trials that count; None: all
-    # as the key `statistic` of [tune]; a quantile is the smallest of the tail, the worst case its only trial
+    tail: int | None = field(default=None, metadata={"static": True})  # worst trials that count; None: all
+    # as key `statistic` of [tune]; a quantile is the smallest value of the tail, the worst case a tail of one trial
     statistic: str = field(default="rms", metadata={"static": True})
     torque_weight: float = field(default=0.0, metadata={"static": True})
 
@@ -57,36 +61,36 @@ class Rules:
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class Problem(Rules):
-    """A tuning problem: its rules, and what flies. What is over trials is NumPy's: rounds put it together anew."""
+    """A tuning problem: its rules and the simulation. Arrays over trials are NumPy arrays, which rounds can change."""
 
     parts: Parts
     dispersion: Dispersion
     seed: Leaf  # uint32
-    trials: Leaf | np.ndarray  # (trials,) uint32, that name the noise
-    coordinates: dict[str, Any]  # of what is drawn, arrays over the trials first
-    metrics: tuple[str, ...] = field(metadata={"static": True})  # of the requirements
-    margins: Asked | None = None  # of the loop; their rows stand after those of the requirements, see `Evaluator`
+    trials: Leaf | np.ndarray  # (trials,) uint32 numbers that select the noise
+    coordinates: dict[str, Any]  # random numbers of the dispersions, trials on the first axis
+    metrics: tuple[str, ...] = field(metadata={"static": True})  # metrics of the requirements
+    margins: Asked | None = None  # margins of the loop; their rows follow the rows of the requirements, see `Evaluator`
 
     @property
     def rows(self) -> tuple[str, ...]:
-        """What the rows of c are of."""
+        """Names of the rows of c: metrics of the requirements, then margins."""
         return self.metrics + (() if self.margins is None else self.margins.metrics)
 
     @property
     def rules(self) -> Rules:
-        """What its metrics are judged by, without what flies."""
+        """The rules without the simulation."""
         return Rules(**{one.name: getattr(self, one.name) for one in fields(Rules)})
 
     @property
     def fleet(self) -> Fleet:
-        """What is flown of it."""
+        """The trials to simulate, with their parts and dispersions."""
         trials, coordinates = np.asarray(self.trials), jax.tree.map(np.asarray, self.coordinates)
         names = watched(self)
         pointing = tuple(name for name in POINTING if name in names)
         return Fleet(self.parts, self.dispersion, self.seed, self.names, trials, coordinates, pointing)
 
     def others(self, trials: np.ndarray) -> Fleet:
-        """What is flown with other trials of its seed."""
+        """Return the fleet with other trials, (trials,), of the same seed."""
         coordinates = coordinates_of(self.dispersion, int(self.seed), trials)
         return self.fleet._replace(trials=np.asarray(trials, dtype=np.uint32), coordinates=coordinates)
 
@@ -109,18 +113,20 @@ def problem(
     banded: tuple[bool, ...] | None = None,
     **others: object,
 ) -> Problem:
-    """A problem over training trials.
+    """Build a problem over training trials.
 
     Args:
-        parts: the nominal ones.
-        dispersion: what is drawn about them.
-        seed: of the draws and the noise.
-        trials: numbers of the training trials, all of which are averaged.
-        names: of the free gains.
-        requirements: that are kept.
-        may_break: how many trials may break each of them, None for those on every trial, as all are by default.
-        banded: whether these are trials of a band that joins later, until when every training trial must keep it.
-        others: fields of `Problem`.
+        parts: nominal parts.
+        dispersion: dispersions about the nominal parts.
+        seed: seed of the dispersions and the noise.
+        trials: (trials,) numbers of the training trials, which are all averaged.
+        names: names of the free gains.
+        requirements: requirements on the metrics.
+        may_break: number of trials that may break each limit, or None for a limit on every trial. By default, every
+            trial must keep every limit.
+        banded: whether a band of trials will represent each limit, see `confirm.may_break`. Every training trial must
+            keep the limit until the band joins.
+        others: further fields of `Problem`.
     """
     empty = Problem(
         parts=parts,
@@ -142,7 +148,16 @@ def problem(
 
 
 def coordinates_of(dispersion: Dispersion, seed: int, trials: np.ndarray) -> dict[str, np.ndarray]:
-    """Coordinates of these trials, arrays over the trials first; drawn so many at a time, by one program."""
+    """Return the random numbers of the dispersions for trials. One program computes `DRAWN` trials at a time.
+
+    Args:
+        dispersion: the dispersions.
+        seed: seed of the dispersions.
+        trials: (trials,) numbers of the trials.
+
+    Returns:
+        Random numbers by the name of the dispersion, (trials, numbers).
+    """
     numbers = np.resize(np.asarray(trials, dtype=np.uint32), max(1, -(-len(trials) // DRAWN)) * DRAWN)
     calls = [
         montecarlo.coordinates(dispersion, jnp.uint32(seed), jnp.asarray(numbers[k : k + DRAWN]))
@@ -152,16 +167,26 @@ def coordinates_of(dispersion: Dispersion, seed: int, trials: np.ndarray) -> dic
 
 
 def replaced(array: Leaf | np.ndarray, at: Any, values: Any) -> np.ndarray:
-    """A copy of one of the problem's arrays with other values there."""
+    """Return a copy of an array with other values at some indices.
+
+    Args:
+        array: array of a problem.
+        at: index into the array, as in `array[at]`.
+        values: the new values.
+    """
     changed = np.array(array)
     changed[at] = values
     return changed
 
 
 def with_trials(problem: Problem, trials: np.ndarray, counted: np.ndarray | None = None) -> Problem:
-    """The problem with these trials added, which count in the constraints.
+    """Return the problem with additional trials in the constraints.
 
-    counted: (requirements,) bool, which limits they must keep; by default those that every trial must keep.
+    Args:
+        problem: the problem.
+        trials: (trials,) numbers of the additional trials.
+        counted: (requirements,) bool, the limits that each of these trials must keep. By default these are the limits
+            on every trial.
     """
     coordinates = coordinates_of(problem.dispersion, int(problem.seed), trials)
     rows = np.asarray(kept_by_every_trial(problem) if counted is None else counted, dtype=bool)
@@ -175,7 +200,10 @@ def with_trials(problem: Problem, trials: np.ndarray, counted: np.ndarray | None
 
 
 def fewer_trials(problem: Problem, averaged: int) -> Problem:
-    """The problem averaged over the first so many trials only, with those that were added; shares of them as before."""
+    """Return the problem with fewer averaged trials, and with all trials that were added.
+
+    The fractions of trials in tails and quantiles stay the same, up to rounding.
+    """
     if averaged >= problem.averaged:
         return problem
     fewer = np.r_[:averaged, problem.averaged : problem.trials.size]
@@ -199,20 +227,24 @@ def fewer_trials(problem: Problem, averaged: int) -> Problem:
 
 
 def kept_by_every_trial(problem: Problem) -> np.ndarray:
-    """(requirements,) bool: limits that every trial must keep."""
+    """Return which limits every trial must keep, (requirements,) bool."""
     return np.asarray([allowed is None for allowed in problem.may_break], dtype=bool)
 
 
 def watched(problem: Problem) -> tuple[str, ...]:
-    """Metrics that a problem is judged by: that of the goal, the peak torque, those of its requirements."""
+    """Return the names of the metrics of a problem: objective, peak torque, then requirements."""
     goal = "window_error" if problem.goal in (T_F, LIMITS) else problem.goal
     return (goal, "peak_torque", *problem.metrics)
 
 
 def measure(problem: Problem, gains: Float[Array, " gains"]) -> tuple[Array, Array, Array]:
-    """F that is minimised, c = metric / limit - 1, (requirements, trials), met where c <= 0, and ln of the goal.
+    """Simulate all trials and return F, c, (requirements, trials), and ln of the objective, see `judge`.
 
-    See `judge`; pure, for any transformation.
+    This is a pure function for any transformation of JAX.
+
+    Args:
+        problem: the tuning problem.
+        gains: (gains,) values of the free gains.
     """
     parts, names = with_gains(problem.parts, dict(zip(problem.names, gains, strict=True))), watched(problem)
 
@@ -227,13 +259,27 @@ def measure(problem: Problem, gains: Float[Array, " gains"]) -> tuple[Array, Arr
 def judge(
     rules: Rules, gains: Float[Array, " gains"], metrics: Float[Array, "trials watched"], status: Array
 ) -> tuple[Array, Array, Array]:
-    """F, c and ln of the goal, see `measure`, from the metrics that are `watched`, and the statuses, of all trials.
+    """Return F, c and ln of the objective from the metrics and statuses of all trials.
 
-    The goal is a statistic of a metric over the averaged trials, or over the `tail` worst of them: CVaR, or with one
-    the worst case; or t_f; or the largest metric over its limit, to which `Evaluator` adds the margins. F is its
-    logarithm, plus `torque_weight` times that of the RMS peak torque (Remark 1). Where only some trials must keep a
-    limit, c of the others is cut down to that of the last one that must. Where a trial fails, or has no value, c is
-    `FAILED` - 1; the goal is that of the others, and each such trial adds ln `FAILED` to F.
+    c = metric / limit - 1 is met if c <= 0. The objective is one of three quantities:
+
+    - a statistic of a metric over the completed averaged trials, or over the `tail` worst of them, such as the CVaR.
+      Then F = ln(objective) + w ln(RMS peak torque) + n ln(`FAILED`), with w = `torque_weight` (Remark 1). n is the
+      number of averaged trials that failed.
+    - t_f, with F = ln(t_f).
+    - the largest metric / limit, with F as its logarithm. `Evaluator` includes the margins.
+
+    If some trials may break a limit, their c is reduced to the c of the worst trial that must keep it. If a trial fails
+    or lacks a metric, its c is `FAILED` - 1.
+
+    Args:
+        rules: the rules.
+        gains: (gains,) values of the free gains.
+        metrics: (trials, watched) metrics of all trials, in the order of `watched`.
+        status: (trials,) status codes, see `rollout.STATUS`.
+
+    Returns:
+        F, c (requirements, trials), and ln of the objective.
     """
     goal, torque, *limited = metrics.T
     values, torques = (judged(v, status)[: rules.averaged] for v in (goal, torque))
@@ -254,29 +300,29 @@ def judge(
 
 
 def log_largest(constraints: Array) -> Array:
-    """Return ln of the largest metric over its limit among the trials that end, from c (rows, trials)."""
+    """Return ln of the largest metric / limit of the completed trials, from c, (rows, trials)."""
     ended = jnp.where(constraints < FAILED - 1.0, constraints, -1.0)
     return jnp.log(jnp.maximum(1.0 + jnp.max(ended, initial=-1.0), LEAST))
 
 
 def judged(value: Array, status: Array) -> Array:
-    """A trial's metric, or its share of a limit, as it counts: `FAILED` where the trial failed or has no value."""
+    """Return the values of completed trials, and `FAILED` for trials that failed or lack a value, (trials,)."""
     ended = (status == rollout.OK) | (status == rollout.MISSED)
     return jnp.where(ended & ~jnp.isnan(value), value, FAILED)
 
 
 def ended(c: np.ndarray) -> np.ndarray:
-    """Constraints, where a trial that fails or has no value is as if it kept its limit: no gain may change that."""
+    """Return constraints with c = -1 for failed trials. Gains may be unable to change a failure."""
     return np.where(c < FAILED - 1.0, c, -1.0)
 
 
 def failures(c: np.ndarray) -> np.ndarray:
-    """(points,) how many trials fail or have no value, of constraints c (points, requirements, trials)."""
+    """Return the number of trials that fail or lack a metric, (points,), from c, (points, requirements, trials)."""
     return np.sum(np.any(c >= FAILED - 1.0, axis=1), axis=1)
 
 
 def _log_statistic(values: Float[Array, " trials"], tail: int | None, statistic: str) -> Float[Array, ""]:
-    """Return ln of a statistic of the trials that end, or of the `tail` worst of them; ln `FAILED` if none ends."""
+    """Return ln of a statistic of the completed trials, or of the `tail` worst of them, or ln `FAILED` without any."""
     ends = values < FAILED
     count = jnp.sum(ends)
     counted = jnp.where(ends, values, 0.0)
@@ -290,7 +336,7 @@ def _log_statistic(values: Float[Array, " trials"], tail: int | None, statistic:
 
 
 def _asked(rules: Rules, row: int, over: Float[Array, " trials"]) -> Float[Array, " trials"]:
-    """What is asked of c: of the trials that are counted, and of those among which so many may break the limit."""
+    """Return c of one limit. It is unchanged for counted trials, and reduced for sampled trials that may break it."""
     alone, may_break = jnp.where(rules.counted[row], over, -1.0), rules.may_break[row]
     if may_break is None:
         return alone

@@ -1,7 +1,8 @@
-"""Gradient search from a few starts, each to the optimum next to it; the best admissible point is kept.
+"""The search for gains: local searches with gradients from a few starting points. Read `search` first.
 
-A small sweep chooses the starts, and sequential quadratic programming on the slopes of what flies (SciPy's SLSQP) goes
-on from each of them. Gains flown with the exact sign have no slopes: they are looked for by evolution instead.
+Sobol points are simulated to choose the starting points. Sequential quadratic programming (SciPy's SLSQP) then follows
+the gradients of the simulation. A law with a discontinuous sign has no useful gradients, so its gains are found by
+differential evolution.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -20,48 +21,48 @@ from tuning.search.rounds import Rounds
 from tuning.search.work import ROUND, Work
 from tuning.search.worst import Hardest
 
-Tell = Callable[[str], None]  # says what is being done
+Tell = Callable[[str], None]  # reports the name of the current step
 
 GLOBALLY = "no gains so far meet every requirement: searching globally"
-HOPELESS = 1.1  # times a limit that the best gains reach: harder trials would bring them no nearer
+HOPELESS = 1.1  # if the best gains have a larger metric / limit, harder trials cannot help and none join
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How a search is run."""
+    """Options of a search."""
 
-    starts: int  # from which it descends
-    steps: int  # points that may be looked at from each of them
-    seed: int  # of the points that starts are chosen among
-    sloped: bool = True  # F has slopes to go by
-    robust: bool = False  # what joins is the worst case inside the dispersions' support
-    judged: bool = True  # say how hard the worst case is
-    # share to keep from the limit of each metric, if it is more than the search's own
+    starts: int  # number of starting points
+    steps: int  # largest number of measured points of each local search
+    seed: int  # seed of the candidates for starting points
+    sloped: bool = True  # F has useful gradients
+    robust: bool = False  # the worst case inside the support of the dispersions joins the constraints
+    judged: bool = True  # find the worst case of the final gains, and conflicting requirements
+    # relative tightening of the limit of each metric, if larger than the default
     margins: Mapping[str, float] = field(default_factory=dict)
-    designs: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))  # (designs, gains) besides the scenario's
+    designs: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))  # (designs, gains) further starting points
 
 
 @dataclass(frozen=True)
 class Search:
-    """Outcome of a search."""
+    """Result of a search."""
 
     gains: np.ndarray  # (gains,) the best admissible point
-    share: np.ndarray  # its shares of the bounds' intervals
-    value: float  # its goal over the training trials
-    worst: np.ndarray  # (requirements,) its largest metric / limit, infinite where a trial fails
-    ended: np.ndarray  # (requirements,) the same over the trials that end
-    ends: list[np.ndarray]  # shares where the starts ended that were followed, the best first
-    history: list[Step]  # in the order of the starts, and of each start's steps
-    problem: Problem  # with the hardest trials
-    rounds: int = 0  # searches again with harder trials
-    margins: dict[str, float] = field(default_factory=dict)  # share that was kept from the limit of each metric
-    over: float = 0.0  # how far the best point is beyond a limit less that margin, as progress tells it
+    share: np.ndarray  # (gains,) normalised gains of the best point
+    value: float  # objective over the training trials
+    worst: np.ndarray  # (requirements,) largest metric / limit of the best point; infinite if a trial fails
+    ended: np.ndarray  # (requirements,) largest metric / limit over the completed trials
+    ends: list[np.ndarray]  # normalised gains of the final points of the local searches, the best first
+    history: list[Step]  # measured points, by local search and step
+    problem: Problem  # tuning problem with the trials that joined
+    rounds: int = 0  # number of further searches with harder trials
+    margins: dict[str, float] = field(default_factory=dict)  # relative tightening of the limit of each metric
+    over: float = 0.0  # relative violation of the tightened limits at the best point, as in progress reports
     # if no gains meet every requirement: the limits that conflict, see `Descents.conflict`
     conflict: dict[str, float | None] = field(default_factory=dict)
-    globally: bool = False  # the whole box was searched too
-    hardest: Hardest | None = None  # for the gains found; None: no requirement hangs on the hardest trial
-    counts: list[confirm.Count] = field(default_factory=list)  # of requirements on a share, on other trials
-    seconds: dict[str, float] = field(default_factory=dict)  # that each step of the search took
+    globally: bool = False  # a global search of the whole box followed
+    hardest: Hardest | None = None  # worst case of the gains; None: no requirement on every trial
+    counts: list[confirm.Count] = field(default_factory=list)  # confirmations of quantile requirements
+    seconds: dict[str, float] = field(default_factory=dict)  # duration of each step of the search [s]
     interrupted: bool = False
 
 
@@ -75,19 +76,22 @@ def search(
     report: Report = lambda *_: None,
     prepare: Callable[[], None] = lambda: None,
 ) -> Search:
-    """Minimise F with every requirement met on the training trials.
+    """Minimise F subject to the requirements on the training trials.
 
-    `Descents` finds gains, `Rounds` says which trials they must meet besides those that are drawn: after each search,
-    harder ones join, and the search goes on. Interrupted, it returns the best so far once there is one.
+    `Descents` runs the local searches. After each search, `Rounds` adds harder trials to the constraints, and the
+    search continues. If the search is interrupted, it returns the best point so far.
 
     Args:
         evaluate: measures the problem.
-        problem: what is minimised over the training trials.
-        requirements: those of its limits.
-        own: (gains,) the scenario's gains, the first start.
-        settings: how it is run.
+        problem: the tuning problem over the training trials, see `objective.judge` for F.
+        requirements: the requirements of its limits.
+        own: (gains,) gains of the scenario, the first starting point.
+        settings: options of the search.
         report: is called after every step.
-        prepare: is called once the search's own programs are being compiled, for those of what comes after it.
+        prepare: is called as soon as the programs of the search are being compiled, to compile later programs too.
+
+    Raises:
+        KeyboardInterrupt: The search was interrupted before the first point was measured.
     """
     sloped = settings.sloped
     rounds = Rounds(evaluate, problem, requirements, robust=settings.robust)
@@ -160,7 +164,7 @@ def _by_evolution(rounds: Rounds, descents: Descents, own: np.ndarray, tell: Tel
 
 
 def _go_on(rounds: Rounds, descents: Descents, again: Callable[[Problem], None], tell: Tell) -> None:
-    """Search on from what was found while harder trials join, or until these are out of reach."""
+    """Repeat the search as long as harder trials join, unless the limits are out of reach."""
     while np.all(descents.best.worst <= HOPELESS) and rounds.harder(descents.gains, tell):
         tell(f"{ROUND}, round {rounds.count}")
         again(rounds.problem)

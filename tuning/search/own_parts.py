@@ -1,8 +1,9 @@
-"""Programs that scenarios name: custom parts and metrics. A simulation runs their code, reading a scenario does not.
+"""Custom code that scenarios name: parts, metrics and controllers in C. Read `allow_scenario` first.
 
-Commands report every file that they run for a scenario. If a scenario lies in results, its programs run only with
-`--trust`, and not if their recorded checksum has changed. This is a reminder and no protection: whoever sends results
-can change or omit the file by which they are recognised, and the checksums too.
+A simulation runs custom code, but reading a scenario does not. Commands report every file that they run for a scenario.
+If a scenario is inside a folder of results, its code runs only with `--trust`, and only if its checksum is unchanged.
+This is a reminder and no protection. The sender of the results can change `versions.json`, which marks a folder of
+results and contains the checksums.
 """
 
 import ast
@@ -23,23 +24,38 @@ METRICS, CONTROLLER = "--metrics", own.CONTROLLER  # options that name programs
 
 
 def named(scenario: Scenario, metrics: str | None = None, controller: Path | None = None) -> dict[str, str]:
-    """What flying a scenario runs, with metrics of one's own and a controller's C: where it stands, by its key."""
+    """Return the location of all custom code that a simulation of a scenario runs, by key or option.
+
+    Args:
+        scenario: the scenario.
+        metrics: value of the option `--metrics`, or None.
+        controller: value of the option `--controller`, or None.
+    """
     options = {METRICS: metrics, CONTROLLER: controller}
     return own.programs(scenario) | {key: str(where) for key, where in options.items() if where is not None}
 
 
 def location(key: str, where: str) -> str:
-    """What would be run, as one may look at it."""
+    """Return the path of the file, or the name of the module, that would be run."""
     return os.path.realpath(where) if key == CONTROLLER else systems.location(where)
 
 
 def digest(key: str, where: str) -> str | None:
-    """SHA-256 of what would be run, as it is now; None: there is none."""
+    """Return the present SHA-256 checksum of the code, or None if it is in no file."""
     return sources.digest(Path(where)) if key == CONTROLLER else systems.digest(where)
 
 
 def allow_scenario(path: Path, scenario: Scenario, trusted: bool) -> None:
-    """Report the programs that a scenario file names, and let them run; in results see `allow`, and its errors."""
+    """Report the custom code that a scenario file names, and check that it may run.
+
+    Args:
+        path: path of the scenario file.
+        scenario: the scenario.
+        trusted: whether the user gave `--trust`. It matters only inside a folder of results.
+
+    Raises:
+        RefusedError: See `allow`. It is raised only inside a folder of results.
+    """
     programs, folder = named(scenario), results_of(path)
     if folder is None:
         _report(programs, path)
@@ -48,16 +64,16 @@ def allow_scenario(path: Path, scenario: Scenario, trusted: bool) -> None:
 
 
 def allow(programs: Mapping[str, str], results: Path, made: Mapping[str, Any], trusted: bool) -> None:
-    """Report the programs that results name, and let them run.
+    """Report the custom code that results name, and check that it may run.
 
     Args:
-        programs: see `named`.
-        results: the folder or the scenario file that names them.
-        made: its `versions.json`.
-        trusted: whether the user gave --trust.
+        programs: locations of the code, see `named`.
+        results: folder or scenario file that names the code.
+        made: content of the `versions.json` of the results.
+        trusted: whether the user gave `--trust`.
 
     Raises:
-        RefusedError: without --trust, or if a program is not the one that the results were made with.
+        RefusedError: The user did not give `--trust`, or the checksum of some code has changed.
     """
     if programs and not trusted:
         listed = " and ".join(f"{file} ({', '.join(keys)})" for file, keys in _by_file(programs).items())
@@ -72,9 +88,18 @@ def allow(programs: Mapping[str, str], results: Path, made: Mapping[str, Any], t
 
 
 def check_unchanged(programs: Mapping[str, str], results: Path, made: Mapping[str, Any]) -> list[str]:
-    """Raise RefusedError if a program is not the one that results were made with.
+    """Check that custom code has the checksums that results contain.
 
-    Returns the keys of the programs whose checksum the results do not have.
+    Args:
+        programs: locations of the code, see `named`.
+        results: folder or scenario file that names the code.
+        made: content of the `versions.json` of the results.
+
+    Returns:
+        Keys of the code without a checksum in the results.
+
+    Raises:
+        RefusedError: The checksum of some code has changed.
     """
     unknown = []
     for key, where in programs.items():
@@ -91,16 +116,16 @@ def check_unchanged(programs: Mapping[str, str], results: Path, made: Mapping[st
 
 
 def _digests(made: Mapping[str, Any], key: str) -> list[str]:
-    """What results knew a program by, of a comparison also its laws: each stands under this key in its own scenario."""
+    """Return the known checksums of custom code. A comparison has one for each of its laws, under the same key."""
     laws = made.get("own_laws") if key == "controller.code" else None
     digests = (made.get(own.digest_name(key)), *(laws.values() if isinstance(laws, dict) else ()))
     return list(dict.fromkeys(map(str, filter(None, digests))))
 
 
 def carry(tables: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """The tables of a scenario, their Python files copied into a folder and named as they lie in it.
+    """Copy the Python files of a scenario into a folder, and refer to the copies in its tables.
 
-    Not a file that needs others, see `alone`, nor a module: these are named where they lie.
+    Modules, and files that need other files (see `alone`), are not copied. The tables are changed and returned.
     """
     for table, key in own.named(tables):
         place, _, name = table[key].rpartition(":")
@@ -116,7 +141,7 @@ def carry(tables: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def alone(file: Path) -> bool:
-    """Whether a copy of a Python file can be run: it imports nothing from its own folder, and asks not where it is."""
+    """Return whether a copy of a Python file can run: it imports nothing from its folder and uses no `__file__`."""
     try:
         nodes = ast.walk(ast.parse(file.read_bytes()))
         asks = any(isinstance(node, ast.Name) and node.id == "__file__" for node in nodes)
@@ -133,7 +158,7 @@ def _report(programs: Mapping[str, str], where_named: Path) -> None:
 
 
 def _by_file(programs: Mapping[str, str]) -> dict[str, list[str]]:
-    """The keys that name each file."""
+    """Return the keys that name each file, by its path."""
     files: dict[str, list[str]] = {}
     for key, where in programs.items():
         files.setdefault(location(key, where), []).append(key)
@@ -141,7 +166,10 @@ def _by_file(programs: Mapping[str, str]) -> dict[str, list[str]]:
 
 
 def results_of(scenario: Path) -> Path | None:
-    """Return the nearest folder with results above a scenario file, links followed or not; None if there is none."""
+    """Return the nearest folder of results above a scenario file, or None.
+
+    The folders above the path as given come first, then those above the path with symbolic links resolved.
+    """
     paths = Path(os.path.abspath(scenario)), Path(os.path.realpath(scenario))
     folders = (folder for path in paths for folder in path.parents)
     return next((folder for folder in folders if (folder / "versions.json").exists()), None)

@@ -1,11 +1,11 @@
-"""How a search says where it stands, to whoever shows it."""
+"""The type of progress reports of a search."""
 
 from collections.abc import Callable
 
-# what is being done, steps done, in all, best goal, how far beyond a limit
+# arguments: current step, work done, total work, best objective, and relative violation
 Report = Callable[[str, int, int, float, float], None]
 
 
 def headed(report: Report, heading: str) -> Report:
-    """A report of one of several searches, what is being done headed by which one it is."""
+    """Return a report that puts a heading before the current step, for one of several searches."""
     return lambda what, *numbers: report(f"{heading}: {what}", *numbers)

@@ -1,4 +1,7 @@
-"""Rounds of a search: which trials, and which loops, join the constraints for the gains that were found last."""
+"""Rounds of a search: after each search, trials and loops that violate a requirement join the constraints.
+
+Read `Rounds` first.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -12,56 +15,66 @@ from tuning.search.evaluate import Evaluator
 from tuning.search.objective import Problem, coordinates_of, kept_by_every_trial, replaced, with_trials
 from tuning.search.worst import Hardest
 
-MARGIN = 0.03  # kept from a limit in the search: fresh trials hold some that are harder than any screened one
-SURE_MARGIN = 0.003  # where there is no harder one: the worst case is searched for, or nothing is drawn
-HARDEST = 8  # of the screened trials, that join the constraints
-SPARE = 8  # places for those that later rounds add: a trial more would be another program to compile
-BAND = confirm.FARTHER + confirm.NEARER  # places of a band
-ROUNDS = 6  # searches again with hardest trials added, at most
+MARGIN = 0.03  # relative tightening of limits in the search: held-out trials can be harder than all screened trials
+SURE_MARGIN = 0.003  # the same if no trial can be harder: with a search for the worst case, or without dispersions
+HARDEST = 8  # number of worst screened trials that join the constraints
+SPARE = 8  # slots for trials of later rounds: another number of trials would need another compilation
+BAND = confirm.FARTHER + confirm.NEARER  # slots of a band
+ROUNDS = 6  # largest number of further searches
 
 
 @dataclass(frozen=True)
 class Joining:
     """Trials that join the constraints."""
 
-    trials: np.ndarray  # that name the noise
-    counted: np.ndarray  # (requirements,) bool: the limits that they must keep
-    coordinates: dict[str, list[float]] | None = None  # of a single one, where they are not its own
+    trials: np.ndarray  # (trials,) numbers that select the noise and the dispersions
+    counted: np.ndarray  # (requirements,) bool: the limits that these trials must keep
+    coordinates: dict[str, list[float]] | None = None  # dispersions of a single trial, if moved by `worst.hardest`
 
 
 class Rounds:
-    """A problem that becomes harder from round to round.
+    """A tuning problem whose constraints grow from round to round.
 
-    A limit on every trial hangs on the few hardest ones, which a training set need not hold: the hardest of many
-    screened ones join the constraints first, and again after a search whose gains some of them still break; robust:
-    not those drawn, but the worst case inside the dispersions' support. A limit on a share of the trials is confirmed
-    on others after each search: where more of them break it than may, the hardest of the rest join. Where the training
-    trials are too few to show it, a band joins first: those about the last that may break it, of as many as are counted
-    on.
+    The hardest few trials decide a limit on every trial, and the training trials need not contain them. The hardest of
+    many screened trials therefore join the constraints after a first short search. They join again after each search
+    whose gains break the limit in some screened trial. After a robust search, the worst case inside the support of the
+    dispersions joins instead.
+
+    A limit on a fraction of the trials is confirmed on other trials after each search. If too many of these trials
+    break it, the worst trials that must keep it join. If the training trials are too few to represent the fraction, a
+    band joins first. A band consists of the confirmation trials ranked around the last trial that may break the limit.
     """
 
     def __init__(self, evaluate: Evaluator, problem: Problem, requirements: Sequence[Requirement], *, robust: bool):
+        """Reserve slots for the trials that will join.
+
+        Args:
+            evaluate: counts the rollouts.
+            problem: the tuning problem with the training trials.
+            requirements: the requirements of its limits.
+            robust: search for the worst case after each search, instead of screening.
+        """
         self._evaluate, self._robust = evaluate, robust
         every = [r for r in requirements if r.quantile is None]
-        self._every = every if problem.dispersion.varies else []  # limits on every trial
+        self._every = every if problem.dispersion.varies else []  # requirements on every trial
         several, among = problem.trials.size > 1, np.asarray(problem.among)
-        # limits on a share of the trials, and of these those with a band, by their rows in the problem
+        # requirements on a fraction of the trials by their rows in the problem, and the rows with a band
         self._shares = {k: r for k, r in enumerate(requirements) if r.quantile is not None and several}
         self._bands = [k for k in self._shares if not among[k].any()]
         self.margin = SURE_MARGIN if (robust and self._every) or not several else MARGIN
-        limits = bool(self._every) + len(self._shares)  # each of which may add its hardest trials in a round
+        limits = bool(self._every) + len(self._shares)  # number of limits that can add their hardest trials in a round
         if limits:
             problem = _with_room(problem, limits * HARDEST + SPARE)
-        self._places = np.arange(problem.averaged, problem.trials.size)  # for those that join
+        self._places = np.arange(problem.averaged, problem.trials.size)  # slots of trials that join
         self.problem = _with_room(problem, len(self._bands) * BAND)
-        self.count = 0  # rounds so far
-        self.hardest: Hardest | None = None  # for the gains found last
+        self.count = 0  # number of further rounds
+        self.hardest: Hardest | None = None  # worst case of the last gains
         self.counts: list[confirm.Count] = []
-        self._joined, self._counted = 0, 0  # trials; times
+        self._joined, self._counted = 0, 0  # number of joined trials; number of counts
         self._known: worst_case.Screened | None = None
 
     def begin(self, gains: np.ndarray) -> None:
-        """What is hardest for gains that are about right, (gains,), joins."""
+        """Add the hardest trials and loops for approximate gains, (gains,), to the constraints."""
         self.problem, _ = _harder_margins(self.problem, gains)
         if self._bands:
             counts = dict(zip(self._shares, self._count(gains), strict=True))
@@ -71,12 +84,20 @@ class Rounds:
             self._join(Joining(hardest, kept_by_every_trial(self.problem)))
 
     def harder(self, gains: np.ndarray, tell: Callable[[str], None]) -> bool:
-        """Whether anything joins that gains (gains,) do not meet, and a round is left: the search then goes on."""
+        """Add trials and loops that violate a requirement, if a round is left. The search then continues.
+
+        Args:
+            gains: (gains,) the gains of the last search.
+            tell: is called with the name of each step.
+
+        Returns:
+            Whether anything was added.
+        """
         if not (self._every or self._shares or self.problem.margins is not None):
             return False
         joining: list[Joining] = []
         nearer_loops, beyond = _harder_margins(self.problem, gains)
-        if self._shares:  # each time on other trials, which those screened are not among
+        if self._shares:  # on other trials each time, none of them screened
             tell("confirming on other trials")
             joining += self._confirmed(gains)
         if self._every and self._robust:
@@ -94,12 +115,17 @@ class Rounds:
         self.problem = nearer_loops if beyond else self.problem
         for more in joining:
             self._join(more)
-        self.hardest = None  # it was the worst case of gains that are searched on from
+        self.hardest = None  # it belongs to gains that the next search replaces
         self.count += 1
         return True
 
     def judge(self, gains: np.ndarray, tell: Callable[[str], None]) -> None:
-        """Look for the worst case of the gains found in the end, (gains,), where that is not known already."""
+        """Find the worst case of the final gains, unless it is already known.
+
+        Args:
+            gains: (gains,) the final gains.
+            tell: is called with the name of the step.
+        """
         if self._every and self.hardest is None:
             tell("looking for the worst case")
             self.hardest = worst_case.hardest(self.problem, self._every, gains, self._known)
@@ -109,7 +135,7 @@ class Rounds:
         return worst_case.screen(self.problem, self._every, gains)
 
     def _count(self, gains: np.ndarray) -> list[confirm.Count]:
-        """Count, each time on other trials."""
+        """Count the trials beyond each limit on a fraction of the trials. Each call simulates other trials."""
         first = self.problem.averaged + worst_case.SCREENED
         counts = confirm.count(self.problem, list(self._shares.values()), gains, first, self._counted)
         self._counted += 1
@@ -117,7 +143,7 @@ class Rounds:
         return counts
 
     def _confirmed(self, gains: np.ndarray) -> list[Joining]:
-        """Trials that join since more of those counted break a limit than may."""
+        """Return the worst violators of each quantile requirement whose confirmation failed."""
         self.counts = self._count(gains)
         rows = np.arange(len(self.problem.metrics))
         return [
@@ -133,12 +159,12 @@ class Rounds:
 
 
 def _with_room(problem: Problem, places: int) -> Problem:
-    """The problem with so many places more, which hold the first trial again until others join."""
+    """Return the problem with additional slots. They repeat the first trial until other trials join."""
     return with_trials(problem, np.repeat(np.asarray(problem.trials)[:1], places))
 
 
 def _harder_margins(problem: Problem, gains: np.ndarray) -> tuple[Problem, bool]:
-    """The problem with the loops whose margins are least by these gains, and whether one of them breaks a limit."""
+    """Return the problem with the loops that have the worst margins, and whether one of them breaks a limit."""
     if problem.margins is None:
         return problem, False
     asked, near = margin_rows.hardest(problem.margins, gains)
@@ -146,13 +172,16 @@ def _harder_margins(problem: Problem, gains: np.ndarray) -> tuple[Problem, bool]
 
 
 def _add(problem: Problem, at: np.ndarray, more: Joining) -> Problem:
-    """The problem with more trials, in these places."""
+    """Return the problem with more trials in these slots."""
     placed = _placed(problem, at, more.trials, more.coordinates)
     return replace(placed, counted=replaced(placed.counted, np.s_[:, at], more.counted[:, None]))
 
 
 def _with_bands(problem: Problem, bands: Mapping[int, np.ndarray]) -> Problem:
-    """The problem with limits, by their rows, kept among these trials in its last places, not by the averaged ones."""
+    """Return the problem with limits that apply to bands of trials, by row, instead of to the averaged trials.
+
+    The bands are in the last slots.
+    """
     for turn, (row, band) in enumerate(bands.items(), start=1):
         at = problem.trials.size - turn * BAND + np.arange(band.size)
         problem = _placed(problem, at, band)
@@ -167,7 +196,10 @@ def _with_bands(problem: Problem, bands: Mapping[int, np.ndarray]) -> Problem:
 def _placed(
     problem: Problem, at: np.ndarray, trials: np.ndarray, coordinates: Mapping[str, list[float]] | None = None
 ) -> Problem:
-    """The problem with other trials in these places; coordinates: of a single one, where they are not its own."""
+    """Return the problem with other trials in these slots.
+
+    If coordinates are given, they replace the dispersions of a single trial.
+    """
     if coordinates is None:
         own = coordinates_of(problem.dispersion, int(problem.seed), trials)
     else:
@@ -180,6 +212,6 @@ def _placed(
 
 
 def _hardest(problem: Problem, trials: np.ndarray, ratio: np.ndarray) -> np.ndarray:
-    """The screened trials that come nearest to a limit and are not in the problem yet."""
+    """Return the screened trials with the largest violation ratios that are not in the problem yet."""
     known = set(np.asarray(problem.trials).tolist())
     return np.asarray([t for t in trials[np.argsort(-ratio)] if int(t) not in known][:HARDEST], dtype=np.uint32)

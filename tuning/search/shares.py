@@ -1,4 +1,7 @@
-"""Intervals of the free gains; shares of them, from 0 to 1, <-> gains."""
+"""Bounds of the free gains, and the map between gains and normalised gains. Read `Bounds` first.
+
+A normalised gain (`share`) is 0 at the lower bound and 1 at the upper bound.
+"""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -13,28 +16,28 @@ from ptsmc_jax.simulation.rollout import Parts
 from ptsmc_jax.theory import envelopes
 from tuning.search import gains as gain_names
 
-TIMES, TIME_DIGITS = ("delta", "t_f"), 12  # with fewer digits a hand-over may fall behind its sample
+TIMES, TIME_DIGITS = ("delta", "t_f"), 12  # with fewer digits, a hand-over may move past its sample
 
-HALF = 0.5  # the lower bound of sign_width is at most this share of its upper one
-NEAR = 0.01  # share of its interval by which a gain is on a bound
+HALF = 0.5  # largest lower bound of sign_width relative to its upper bound
+NEAR = 0.01  # a gain within this fraction of its interval from a bound counts as on the bound
 
 
 @pytree
 @dataclass(frozen=True)
 class Scale:
-    """The map from shares of the bounds' intervals to gains, for compiled programs: other bounds, the same program."""
+    """The map from normalised gains to gains, as a pytree: compiled programs serve other bounds too."""
 
     lower: Leaf | np.ndarray  # (gains,)
     upper: Leaf | np.ndarray  # (gains,)
-    hop: Leaf | np.ndarray  # see `Bounds`
+    hop: Leaf | np.ndarray  # number that moves the lower bound of sign_width, see `Bounds`
     log: tuple[bool, ...] = field(metadata={"static": True})  # gains that are searched on a log scale
-    width: int | None = field(metadata={"static": True})  # place of a sign_width whose lower bound moves with `hop`
-    observers: tuple[int, ...] = field(metadata={"static": True})  # places of the observer's gains
+    width: int | None = field(metadata={"static": True})  # index of a sign_width whose lower bound moves with `hop`
+    observers: tuple[int, ...] = field(metadata={"static": True})  # indices of the observer's gains
 
     def gains(self, share: Any) -> Any:
-        """Gains of shares of the intervals, (gains,), NumPy's or JAX's: 0 is the lower bound, 1 the upper one.
+        """Return the gains of normalised gains, (gains,), as a NumPy or JAX array.
 
-        Bounds enter by their ratio only, so that other units of the gains change no share.
+        Only the ratio of the bounds enters on a log scale, so the normalised gains do not depend on the units.
         """
         xp, low, high, log = share.__array_namespace__(), self.lower, self.upper, np.asarray(self.log)
         ratio = xp.where(log, high, 1.0) / xp.where(log, low, 1.0)
@@ -45,50 +48,56 @@ class Scale:
         return xp.where(np.arange(len(self.log)) == k, least * (high[k] / least) ** share[k], gains)
 
     def least_width(self, gains: Any) -> Any:
-        """Lower bound of sign_width for these gains of the observer."""
+        """Return the lower bound of sign_width. It depends only on the observer's gains among the gains, (gains,)."""
         least = self.hop / gains[np.asarray(self.observers)].min()
         return gains.__array_namespace__().clip(least, self.lower[self.width], HALF * self.upper[self.width])
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """Intervals of the free gains, in order. A gain that may vary more than tenfold is searched on a log scale.
+    """Bounds of the free gains. A gain that may vary more than tenfold is searched on a log scale.
 
-    The interval of sign_width begins at hop / observer_gain where that is more than its lower bound: K2, and with it
-    the width below which the sampled sign hops from side to side, is inverse to that gain.
+    The lower bound of sign_width is raised to hop / observer_gain if that is larger. Below this boundary-layer
+    thickness, the sampled switching term jumps from one side of s = 0 to the other. The thickness is proportional to
+    K2, which is inversely proportional to the observer's gain.
     """
 
     names: tuple[str, ...]
     lower: tuple[float, ...]
     upper: tuple[float, ...]
-    hop: float = 0.0  # in the units of s times those of the observer's gain
+    hop: float = 0.0  # units of s times units of the observer's gain; 0: the lower bound of sign_width is fixed
 
     @property
     def logarithmic(self) -> np.ndarray:
-        """(gains,) bool: searched on a log scale."""
+        """Whether each gain is searched on a log scale, (gains,) bool."""
         return wide(np.asarray(self.lower), np.asarray(self.upper))
 
     @property
     def scale(self) -> Scale:
-        """What turns shares into gains."""
+        """The map from normalised gains to gains, for compiled programs."""
         observers = tuple(k for k, name in enumerate(self.names) if gain_names.base(name) == "observer_gain")
         width = self.names.index("sign_width") if self.hop else None
         log = tuple(map(bool, self.logarithmic))
         return Scale(np.asarray(self.lower), np.asarray(self.upper), np.asarray(self.hop), log, width, observers)
 
     def gains(self, share: Any) -> Any:
-        """Gains of shares of the intervals, see `Scale.gains`."""
+        """Return the gains of normalised gains, (gains,), see `Scale.gains`."""
         return self.scale.gains(share)
 
     def share(self, gains: np.ndarray) -> np.ndarray:
-        """Shares of gains, (gains,); of those beyond a bound the bound's."""
+        """Return the normalised gains of gains, (gains,). Gains beyond a bound are clipped to the bound."""
         return np.clip(self._share(gains), 0.0, 1.0)
 
     def replaced(self, share: np.ndarray, gains: np.ndarray, which: np.ndarray) -> np.ndarray:
-        """Shares (gains,) where some gains, `which`, are others, (gains,), and the rest stay what they are.
+        """Return normalised gains, (gains,), with some of the gains replaced and all other gains unchanged.
 
-        A share of sign_width is another width where the observer's gain is another one; a width that is then too narrow
-        has a share below 0.
+        The lower bound of sign_width depends on the observer's gain. If the observer's gain is replaced, the normalised
+        sign_width therefore changes, and it is below 0 if the same width is now below its lower bound.
+
+        Args:
+            share: (gains,) normalised gains.
+            gains: (gains,) the new values.
+            which: (gains,) bool, the gains to replace.
         """
         both = np.where(which, self.share(gains), share)
         if self.hop:
@@ -97,7 +106,7 @@ class Bounds:
         return both
 
     def _share(self, gains: np.ndarray) -> np.ndarray:
-        """Shares of gains, (gains,); of those beyond a bound below 0 or above 1."""
+        """Return the normalised gains of gains, (gains,), without clipping."""
         scale = self.scale
         low, high, log = scale.lower.copy(), scale.upper, np.asarray(scale.log)
         if scale.width is not None:
@@ -107,20 +116,23 @@ class Bounds:
         return np.where(log, logarithms / np.log(ratio), (gains - low) / (high - low))
 
     def at_bound(self, gains: np.ndarray) -> dict[str, str]:
-        """Gains that ended within the share `NEAR` of their interval from a bound: name to "lower" or "upper"."""
+        """Return "lower" or "upper" by name for each gain, (gains,), that is on a bound to within `NEAR`."""
         shares = dict(zip(self.names, self.share(gains).tolist(), strict=True))
         return {name: "lower" if share < NEAR else "upper" for name, share in shares.items()
                 if not NEAR <= share <= 1.0 - NEAR}  # fmt: skip
 
     def rounded(self, gains: np.ndarray, digits: int) -> dict[str, float]:
-        """Gains by name with so many digits, none of them beyond its bounds; times stay on their samples."""
+        """Return gains (gains,) by name, rounded to significant digits and kept within the bounds.
+
+        Times keep `TIME_DIGITS` digits, so that a hand-over stays on its sample.
+        """
         within = zip(self.names, gains, self.lower, self.upper, strict=True)
         shown = {name: TIME_DIGITS if name in TIMES else digits for name in self.names}
         return {name: min(max(float(f"{gain:.{shown[name]}g}"), low), high) for name, gain, low, high in within}
 
 
 def of_scenario(scenario: Scenario, parts: Parts) -> Bounds:
-    """The bounds of a checked scenario's free gains; its parts."""
+    """Return the bounds of the free gains of a validated scenario, which has these parts."""
     names = gain_names.named(scenario)
     intervals = {name: scenario.search.bounds[gain_names.base(name)] for name in names}
     hop = 0.0
@@ -128,7 +140,7 @@ def of_scenario(scenario: Scenario, parts: Parts) -> Bounds:
         hop = envelopes.narrowest_sign(parts, scenario.loop.period) / 2
         if parts.observer.linear and any(gain_names.base(name) == "observer_gain" for name in names):
             hop *= float(parts.observer.gain.min())
-        else:  # it does not move with a gain
+        else:  # the lower bound depends on no gain
             low, high = intervals["sign_width"]
             intervals["sign_width"], hop = (min(max(low, hop), HALF * high), high), 0.0
     lower, upper = zip(*intervals.values(), strict=True)
@@ -136,7 +148,7 @@ def of_scenario(scenario: Scenario, parts: Parts) -> Bounds:
 
 
 def _hops(scenario: Scenario, parts: Parts) -> bool:
-    """Whether the sign may be so narrow that it hops, by a bound that is nobody's but the usual one."""
+    """Return whether sign_width has the default lower bound and the sampled switching term can overshoot."""
     if not scenario.sampled or not parts.controller.prescribed:
         return False
     return scenario.search.bounds["sign_width"][0] == free_gains.usual(scenario, "sign_width")[0]

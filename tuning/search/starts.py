@@ -1,4 +1,7 @@
-"""Where a search starts: points spread over the bounds, and the most promising of them that lie far apart."""
+"""Starting points of local searches: the most promising of many points within the bounds that lie far apart.
+
+Points are normalised gains between 0 and 1 (`share`). Read `starting_points` first.
+"""
 
 import math
 import warnings
@@ -13,14 +16,14 @@ from tuning.search.evaluate import Evaluator, Measured, Sloped
 from tuning.search.objective import FAILED, Problem, failures
 from tuning.search.progress import Report
 
-SWEPT = 64  # points flown, among which starts are chosen
-CALL = 16  # of them between two reports
+SWEPT = 64  # points that are simulated to choose starting points
+CALL = 16  # points between two reports
 CHARGE = 3.0  # F is a logarithm: a metric at twice its limit counts like 2^3 times the error
-APART = (0.5, 0.35, 0.2, 0.0)  # in the unit cube, along the gain in which two points differ most
-STEEP = 10.0  # times the charge, where many points are close to a limit
+APART = (0.5, 0.35, 0.2, 0.0)  # smallest distances in the unit cube (maximum norm), tried in this order
+STEEP = 10.0  # factor on the violation in the penalty, if many points are close to a limit
 CHOOSING, SPREADING = "choosing starts", "searching the whole box"
-WIDELY, MARGINS_LOOKED = 2048, 256  # points of a global search, and how many of them margins are evaluated for
-NEARLY = 0.05  # of a limit
+WIDELY, MARGINS_LOOKED = 2048, 256  # points of a global search; largest number of them with margins
+NEARLY = 0.05  # a limit is nearly active if c > -NEARLY
 
 
 def starting_points(
@@ -32,22 +35,22 @@ def starting_points(
     seed: int,
     report: Report,
 ) -> np.ndarray:
-    """Return `first`, then the most promising points of designs and a Sobol sweep that lie far apart.
+    """Return `first`, then the most promising points of designs and a Sobol sequence that lie far apart.
 
-    The sweep fixes the gain with the largest effect on each nearly active limit, such as eta for the peak torque.
-    Otherwise most of its points would break the limit.
+    The gain with the largest effect on each nearly active limit has the same value at all points of the sequence. An
+    example is eta for the peak torque. Otherwise most of these points would break the limit.
 
     Args:
         evaluate: measures the problem.
-        problem: what is minimised.
-        first: (gains,) shares of the first point.
-        designs: (designs, gains) shares.
-        starts: how many points to return.
-        seed: of the sweep.
-        report: is called after every few points.
+        problem: the tuning problem.
+        first: (gains,) normalised gains of the first point.
+        designs: (designs, gains) normalised gains of designs that follow from the mission.
+        starts: number of points to return.
+        seed: seed of the Sobol sequence.
+        report: is called after every `CALL` points.
 
     Returns:
-        (starts, gains) shares.
+        Normalised gains, (starts, gains).
     """
     share = spread(len(problem.names), max(SWEPT - len(designs), starts), np.random.default_rng(seed))
     held = held_by_limits(evaluate.slopes(problem, first[None]))
@@ -58,11 +61,21 @@ def starting_points(
 
 
 def spread_widely(evaluate: Evaluator, problem: Problem, count: int, seed: int, report: Report) -> np.ndarray:
-    """Return the most promising of `WIDELY` points of the whole box that lie far apart, (count, gains) shares.
+    """Return the most promising of `WIDELY` points of the whole box that lie far apart.
 
-    Margins take far longer than simulations and can only add to a violation. The points are sorted by their merit
-    without margins, and margins are evaluated in this order. That stops when the next merit cannot be among the best,
-    or after `MARGINS_LOOKED` points.
+    Margins take far longer than simulations and can only increase a violation. The points are therefore sorted by
+    their merit without margins, and margins are evaluated in this order. The evaluation ends when the next point
+    cannot be among the best, or after `MARGINS_LOOKED` points.
+
+    Args:
+        evaluate: measures the problem.
+        problem: the tuning problem.
+        count: number of points to return.
+        seed: seed of the Sobol sequence.
+        report: is called after every `CALL` points.
+
+    Returns:
+        Normalised gains, (count, gains).
     """
     share = spread(len(problem.names), WIDELY, np.random.default_rng(seed))
     without = problem if problem.margins is None else replace(problem, margins=None)
@@ -86,7 +99,7 @@ def spread_widely(evaluate: Evaluator, problem: Problem, count: int, seed: int, 
 
 
 def held_by_limits(at: Sloped) -> list[int]:
-    """For each limit that is nearly active at a point, the gain that it depends on most; at least two stay free."""
+    """Return the index of the gain that each nearly active limit depends on most. At least two gains stay free."""
     nearest = at.c[0].argmax(axis=1)
     held: list[int] = []
     for row in np.argsort(-at.c[0].max(axis=1)):
@@ -98,8 +111,17 @@ def held_by_limits(at: Sloped) -> list[int]:
 
 
 def spread(gains: int, count: int, rng: np.random.Generator) -> np.ndarray:
-    """(count, gains) shares spread evenly: Sobol's sequence, scrambled."""
-    from scipy.stats import qmc  # takes half a second, in which a search flies
+    """Return points of a scrambled Sobol sequence in the unit cube.
+
+    Args:
+        gains: dimension of the cube.
+        count: number of points.
+        rng: random generator of the scrambling.
+
+    Returns:
+        Normalised gains, (count, gains).
+    """
+    from scipy.stats import qmc  # imported here because the import takes half a second
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # counts other than powers of 2 are a little less even
@@ -107,9 +129,20 @@ def spread(gains: int, count: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def promising(evaluate: Evaluator, problem: Problem, share: np.ndarray, count: int, tell: Callable) -> np.ndarray:
-    """Choose so many of the points, (points, gains), by F with breaches of a limit charged, those far apart first.
+    """Choose points by their merit, with points that lie far apart first.
 
-    By turns charged little and much: what is far beyond a limit may lead to better gains, and what keeps it is near.
+    The points are ranked twice, with a weak and with a strong penalty on violations, and are taken from both rankings
+    in turn. Points far beyond a limit may lead to better gains. Points that meet every limit need few further steps.
+
+    Args:
+        evaluate: measures the problem.
+        problem: the tuning problem.
+        share: (points, gains) normalised gains to choose from.
+        count: number of points to choose.
+        tell: is called after every `CALL` points, as a `Report` without its first argument.
+
+    Returns:
+        Normalised gains, (count, gains).
     """
     flown = []
     for k in range(0, len(share), CALL):
@@ -125,14 +158,22 @@ def promising(evaluate: Evaluator, problem: Problem, share: np.ndarray, count: i
 
 
 def distances(share: np.ndarray) -> np.ndarray:
-    """(points, points) how far apart points are, in the unit cube."""
+    """Return the distances of points (points, gains) in the maximum norm, (points, points)."""
     return np.abs(share[:, None] - share[None]).max(axis=2)
 
 
 def far_apart(order: Sequence[int], apart: np.ndarray, count: int) -> list[int]:
-    """Choose so many of the points in this order, those first that lie far from all before them.
+    """Choose points that lie far from all points chosen before.
 
-    With few gains, or many points to choose, they cannot all lie far apart: then nearer ones, step by step.
+    If not enough points lie far apart, the required distance is reduced step by step, see `APART`.
+
+    Args:
+        order: indices of the points, the most promising first.
+        apart: (points, points) distances.
+        count: number of points to choose.
+
+    Returns:
+        Indices of the chosen points.
     """
     chosen: list[int] = []
     for distance in APART:
@@ -143,13 +184,23 @@ def far_apart(order: Sequence[int], apart: np.ndarray, count: int) -> list[int]:
 
 
 def merit(flown: Measured, times: float = 1.0) -> np.ndarray:
-    """(points,) F, with what the trials that end are beyond a limit charged so many times as hard, and each that fails.
+    """Return F plus penalties for violated limits and for failed trials, (points,).
 
-    F knows of those alone that are averaged, and where t_f is minimised of none.
+    F itself only counts failures of the averaged trials, and counts no failures if t_f is minimised.
+
+    Args:
+        flown: the measurement at the points.
+        times: factor on the violation in the penalty, see `charged`.
     """
     return charged(flown.f + math.log(FAILED) * failures(flown.c), flown.beyond, times)
 
 
 def charged(f: Any, beyond: Any, times: float) -> Any:
-    """F with a breach of a limit charged, so many times as hard."""
+    """Return F plus a penalty on the violation, F + `CHARGE` ln(1 + times max(beyond, 0)).
+
+    Args:
+        f: F at the points, (points,) or one number.
+        beyond: largest c at the points, of the same shape.
+        times: factor on the violation [-].
+    """
     return f + CHARGE * np.log1p(times * np.maximum(beyond, 0.0))

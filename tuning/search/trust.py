@@ -1,4 +1,7 @@
-"""What makes a tuning result believable: slopes checked, gains' influence, intervals of what was averaged."""
+"""Checks of a tuning result: gradients against finite differences, influence of the gains, and confidence intervals.
+
+Read `slope_error` and `profiles` first.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -12,27 +15,35 @@ from tuning.search.evaluate import Evaluator
 from tuning.search.objective import Problem
 from tuning.search.shares import TIMES, Bounds
 
-DIFFERENCE = 3e-4  # of the bounds' intervals, for slopes by differences
-STEP = 1e-2  # of the gains, relative, for sensitivities
-SMALLEST = 1e-6  # slopes of ln F below this are none
-ACROSS = 15  # gains looked at between the bounds of each, besides the one found
-FLAT = 0.01  # what changes by less than this share between the bounds does not depend on the gain
-CONFIDENCE = 0.95  # of intervals
-RESAMPLED = 2000  # times, for an interval
+DIFFERENCE = 3e-4  # step of the finite differences, in normalised gains
+STEP = 1e-2  # relative step of a gain for sensitivities
+SMALLEST = 1e-6  # smallest scale of the relative gradient error
+ACROSS = 15  # number of values of a gain between its bounds, besides the final value
+FLAT = 0.01  # a quantity that changes by less than this fraction does not depend on the gain
+CONFIDENCE = 0.95  # confidence level of intervals
+RESAMPLED = 2000  # bootstrap samples of an interval
 
 
 def slope_error(evaluate: Evaluator, problem: Problem, share: np.ndarray) -> float:
-    """Largest difference of F's slopes, by automatic differentiation, from central differences, at shares (gains,).
+    """Return the largest relative error of the gradient of F, from automatic differentiation, at a point.
 
-    Over the largest slope by a share; differences of order 4 over +-`DIFFERENCE`, beside a bound just inside it, beside
-    a hand-over on a sample just behind it: F has a kink there, where the first period of the anchored clock vanishes.
-    NaN where there is nothing to compare, as where the error is zero or no trial ends.
+    The reference are central finite differences of order 4 with steps of `DIFFERENCE`. The error is relative to the
+    largest element of the gradient. Near a bound, the point is moved just inside the bound. A time gain is moved past
+    its sample, because F has a kink if the hand-over lies on a sample: the first period of the anchored clock vanishes.
+
+    Args:
+        evaluate: measures the problem.
+        problem: the tuning problem.
+        share: (gains,) normalised gains of the point.
+
+    Returns:
+        The relative error [-]. It is NaN if F has no gradient: no trial completes, or the objective is zero.
     """
     behind = 3 * DIFFERENCE * np.isin(problem.names, TIMES)
     count, inside = share.size, np.clip(share + behind, 2 * DIFFERENCE, 1.0 - 2 * DIFFERENCE)
     offsets = np.concatenate([k * DIFFERENCE * np.eye(count) for k in (-2, -1, 1, 2)])
     flown = evaluate.fly(problem, inside + offsets)
-    if np.isnan(flown.goal).all():  # what stands for the goal is the same everywhere
+    if np.isnan(flown.goal).all():  # F is then a constant
         return np.nan
     f = flown.f.reshape(4, count)
     numeric = (f[0] - 8 * f[1] + 8 * f[2] - f[3]) / (12 * DIFFERENCE)
@@ -42,35 +53,41 @@ def slope_error(evaluate: Evaluator, problem: Problem, share: np.ndarray) -> flo
 
 @dataclass(frozen=True)
 class Profile:
-    """The goal along one gain between its bounds, the others as they were found."""
+    """Objective and limits along one gain between its bounds, with the other gains at their final values."""
 
     gain: np.ndarray  # (points,)
-    value: np.ndarray  # (points,) the goal, NaN where no trial has one
-    over: np.ndarray  # (points,) largest metric / limit, `FAILED` where a trial fails; zero without a requirement
-    f: np.ndarray  # (points,) F: ln of the goal, with what the torque weighs in it
-    nearest: list[str] = field(default_factory=list)  # (points,) whose the largest metric / limit is
+    value: np.ndarray  # (points,) objective; NaN if no trial has a value
+    over: np.ndarray  # (points,) largest metric / limit; `FAILED` if a trial fails; zero without requirements
+    f: np.ndarray  # (points,) F: ln of the objective plus the weighted torque term
+    nearest: list[str] = field(default_factory=list)  # (points,) metric with the largest metric / limit
 
     @property
     def seen(self) -> bool:
-        """Whether a trial has a goal anywhere: if none has, what stands for it is the same everywhere."""
+        """Whether the objective has a value at some point."""
         return bool(np.isfinite(self.value).any())
 
     @property
     def flat(self) -> bool:
-        """Whether neither F nor the nearest limit depends on the gain."""
+        """Whether neither F nor the largest metric / limit depends on the gain."""
         steady = self.f.max() - self.f.min() <= np.log1p(FLAT)
         return bool(steady and self.over.max() <= (1.0 + FLAT) * self.over.min())
 
 
 def profiles(evaluate: Evaluator, problem: Problem, share: np.ndarray) -> dict[str, Profile]:
-    """How the goal goes with each gain, by its name; share: (gains,) of the bounds' intervals, of what was found."""
+    """Return the profile of each gain by name.
+
+    Args:
+        evaluate: measures the problem.
+        problem: the tuning problem.
+        share: (gains,) normalised gains of the final point.
+    """
     count, bounds = share.size, evaluate.bounds
     points = np.tile(share, (count, ACROSS + 1, 1))
     for k in range(count):
         points[k, :, k] = np.sort(np.append(np.linspace(0.0, 1.0, ACROSS), share[k]))
         points[k] = [bounds.replaced(share, bounds.gains(point), np.arange(count) == k) for point in points[k]]
     flown = evaluate.fly(problem, points.reshape(-1, count))
-    largest = flown.c.max(axis=2, initial=-1.0)  # (points, rows); a trial that fails keeps no limit
+    largest = flown.c.max(axis=2, initial=-1.0)  # (points, rows); a failed trial breaks every limit
     arrays = (flown.gains, flown.goal, largest.max(axis=1, initial=-1.0) + 1.0, flown.f)
     gains, value, over, f = (v.reshape(count, ACROSS + 1, -1) for v in arrays)
     rows = largest.argmax(axis=1) if problem.rows else np.zeros(len(largest), int)
@@ -84,11 +101,20 @@ def profiles(evaluate: Evaluator, problem: Problem, share: np.ndarray) -> dict[s
 def sensitivities(
     problem: Problem, bounds: Bounds, gains: np.ndarray, names: Sequence[str]
 ) -> dict[str, dict[str, float]]:
-    """D ln(metric) / d ln(gain), percent by percent, of each metric's RMS over the averaged trials; by metric and gain.
+    """Return d ln(RMS of metric) / d ln(gain) over the averaged trials, in percent per percent.
 
-    Central differences inside the bounds, of the program that judges, which has every metric: one that slopes are
-    compiled for takes longer to compile than these few runs take. A metric that is zero somewhere, or has no value, is
-    left out, and so is a gain that is zero, of which there is no percent.
+    The sensitivities are central finite differences inside the bounds. They use the program of the verdict, which
+    computes every metric. The compilation of a program with gradients would take longer than these few runs. A metric
+    whose RMS is zero or has no value is omitted. A gain that is zero has no relative change and is omitted.
+
+    Args:
+        problem: the tuning problem.
+        bounds: bounds of the free gains.
+        gains: (gains,) the final gains.
+        names: names of the metrics.
+
+    Returns:
+        Sensitivities [-] by metric and gain.
     """
     less, more = (np.clip(gains + side * np.diag(STEP * gains), bounds.lower, bounds.upper) for side in (-1.0, 1.0))
     trials = problem.others(np.asarray(problem.trials)[: problem.averaged])
@@ -111,32 +137,33 @@ def sensitivities(
 
 
 def rms(values: np.ndarray, axis: int = -1) -> Any:
-    """Root mean square."""
+    """Return the root mean square along an axis."""
     return np.sqrt(np.mean(values**2, axis=axis))
 
 
 def mean(values: np.ndarray, axis: int = -1) -> Any:
-    """Mean."""
+    """Return the mean along an axis."""
     return np.mean(values, axis=axis)
 
 
 def interval(values: np.ndarray, statistic=mean) -> tuple[float, float] | None:
-    """Bootstrap interval (bias-corrected and accelerated, Efron, JASA 82, 1987) of a statistic, at `CONFIDENCE`.
+    """Return the bootstrap confidence interval of a statistic of values (trials,).
 
-    None where there are too few trials to resample, or all are equal.
+    The interval is bias-corrected and accelerated (Efron, JASA 82, 1987) at the level `CONFIDENCE`. It is None for
+    fewer than 8 values and for equal values.
     """
     return _bootstrap((values,), statistic, paired=False)
 
 
 def ratio_interval(numerator: np.ndarray, denominator: np.ndarray) -> tuple[float, float] | None:
-    """Bootstrap interval of the ratio of two RMS over the same trials, which are resampled together."""
+    """Return the bootstrap interval of the ratio of two RMS over the same trials, (trials,), resampled in pairs."""
     return _bootstrap((numerator, denominator), lambda a, b, axis=-1: rms(a, axis) / rms(b, axis), paired=True)
 
 
 def _bootstrap(samples: tuple, statistic, *, paired: bool) -> tuple[float, float] | None:
     if len(samples[0]) < 8 or all(np.ptp(one) == 0.0 for one in samples):
         return None
-    from scipy import stats  # takes half a second, in which a search flies
+    from scipy import stats  # imported here because the import takes half a second
 
     bootstrap = stats.bootstrap(
         samples,

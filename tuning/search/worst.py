@@ -1,4 +1,7 @@
-"""The hardest trials: screened among many draws, then by gradient ascent inside what the dispersions can draw."""
+"""The worst case of gains: the hardest of many random trials, then gradient ascent within the dispersions.
+
+Read `hardest` first. The ascent moves the random numbers of a trial, called coordinates, through unbounded variables y.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,19 +21,25 @@ from tuning.search import flights
 from tuning.search.flights import Fleet
 from tuning.search.objective import FAILED, Problem, judged, watched
 
-SCREENED = 4096  # trials looked through
-CLIMBERS = 8  # of the hardest ones, from which is climbed
-STEPS, RATE, LAST_RATE = 30, 0.1, 0.01  # of the ascent
-HELD = 0.9999  # share of a normal dispersion that is searched
-TURNS = 3  # of what is normal towards its slopes, after the ascent
-NEAR = 1e-3  # how far a worst case may be beyond a limit
+SCREENED = 4096  # number of screened trials
+CLIMBERS = 8  # number of hardest screened trials where an ascent starts
+STEPS, RATE, LAST_RATE = 30, 0.1, 0.01  # number of steps of the ascent; first and last learning rate
+HELD = 0.9999  # probability content of the searched region of a normal dispersion
+TURNS = 3  # steps of the advanced mean value method for normal dispersions, after the ascent
+NEAR = 1e-3  # a worst case may exceed a limit by this fraction
 
 _ADAM = optax.adam(optax.cosine_decay_schedule(RATE, STEPS, LAST_RATE / RATE), b2=0.9)
 
 
 @programs.jit
 def _ascended(y: jax.Array, slope: jax.Array, state: optax.OptState) -> tuple[jax.Array, optax.OptState]:
-    """Free reals (cases, reals) a step of Adam's along their slopes, and what it remembers."""
+    """Return the variables after one step of Adam along the normalised gradient, and the new state of Adam.
+
+    Args:
+        y: (cases, variables) variables.
+        slope: (cases, variables) gradient.
+        state: state of Adam.
+    """
     size = jnp.linalg.norm(slope, axis=1, keepdims=True)
     updates, state = _ADAM.update(-slope / jnp.where(size > 0.0, size, 1.0), state)
     return jnp.asarray(optax.apply_updates(y, updates)), state
@@ -38,33 +47,43 @@ def _ascended(y: jax.Array, slope: jax.Array, state: optax.OptState) -> tuple[ja
 
 @dataclass(frozen=True)
 class Hardest:
-    """The trial, as drawn or as climbed to, that comes nearest to a limit or is farthest beyond it."""
+    """The trial with the largest violation ratio, as screened or after the ascent."""
 
     metric: str
     ratio: float  # metric / limit
-    screened: float  # the same of the hardest screened trial
+    screened: float  # metric / limit of the hardest screened trial
     status: str
-    trial: int  # which names its noise, and what was not moved
-    coordinates: dict[str, list[float]]  # of what is drawn
-    start: dict[str, float]  # what it flies with, see `Dispersion.values`
-    moved: tuple[str, ...]  # what the ascent moved
+    trial: int  # number that selects the noise and the dispersions that the ascent did not move
+    coordinates: dict[str, list[float]]  # random numbers of the dispersions, by name
+    start: dict[str, float]  # values of the dispersed quantities, see `Dispersion.values`
+    moved: tuple[str, ...]  # names of the dispersions that the ascent moved
 
     @property
     def unbounded(self) -> bool:
-        """Whether the metric has no largest value inside the dispersions: the law's singularity is among them."""
+        """Whether the trial fails, because the dispersions contain the law's singularity. The metric is unbounded."""
         return self.status not in ("ok", "missed")
 
     @property
     def beyond(self) -> bool:
-        """Whether it breaks its limit by more than `NEAR`."""
+        """Whether the trial breaks its limit by more than `NEAR`."""
         return not self.ratio <= 1.0 + NEAR
 
 
-Screened = tuple[np.ndarray, np.ndarray]  # trials, (trials,) metric / limit
+Screened = tuple[np.ndarray, np.ndarray]  # (trials,) numbers; (trials,) largest metric / limit
 
 
 def screen(problem: Problem, requirements: Sequence[Requirement], gains: np.ndarray) -> Screened:
-    """Trials that no search has averaged, and how near each comes to its limits, (trials,) metric / limit."""
+    """Simulate `SCREENED` trials that are not among the averaged trials.
+
+    Args:
+        problem: the tuning problem.
+        requirements: requirements on every trial.
+        gains: (gains,) the gains.
+
+    Returns:
+        Numbers of the trials, (trials,), and their largest metric / limit, (trials,). It is infinite for a trial that
+        fails or lacks a metric.
+    """
     trials = np.arange(problem.averaged, problem.averaged + SCREENED, dtype=np.uint32)
     flown = flights.trials(problem.others(trials), gains)
     ratios = np.stack([over(getattr(flown.metrics, r.metric), r.limit, at_least=False) for r in requirements])
@@ -74,16 +93,17 @@ def screen(problem: Problem, requirements: Sequence[Requirement], gains: np.ndar
 def hardest(
     problem: Problem, requirements: Sequence[Requirement], gains: np.ndarray, screened: Screened | None = None
 ) -> Hardest:
-    """The worst trial for these gains inside the dispersions' support, by gradient ascent from the hardest drawn.
+    """Find the worst trial for these gains by gradient ascent (Adam) from the hardest screened trials.
 
-    Moved is all that is drawn but the true inertia, which stays as drawn, as noise does. A normal dispersion, which has
-    no bounds, is searched where `HELD` of it lies.
+    The ascent maximises metric / limit within the support of the dispersions. It moves all dispersions except for the
+    true inertia, which keeps its random value, as the noise does. A normal dispersion has no bounds. Its numbers are
+    kept in the ball that has the probability `HELD`.
 
     Args:
-        problem: of the search.
-        requirements: whose limits it is to come nearest to.
-        gains: (gains,).
-        screened: what `screen` says of these; None: it is asked.
+        problem: the tuning problem.
+        requirements: requirements on every trial.
+        gains: (gains,) the gains.
+        screened: result of `screen` for these gains. None: the trials are screened first.
     """
     trials, ratio = screened or screen(problem, requirements, gains)
     chosen = trials[np.argsort(-ratio, kind="stable")][:CLIMBERS]
@@ -113,7 +133,7 @@ def hardest(
     fleet_of_one = fleet._replace(trials=chosen[first : first + 1], coordinates=reached_at)
     flown = jax.tree.map(lambda v: v[0, 0], flights.fly(fleet_of_one, gains[None]))
     ratios = {m: float(over(getattr(flown.metrics, m), limit, at_least=False)) for m, limit in limits.items()}
-    ratios = {m: np.inf if np.isnan(v) else v for m, v in ratios.items()}  # without a value: it never settles, say
+    ratios = {m: np.inf if np.isnan(v) else v for m, v in ratios.items()}  # it never settles, for example
     worst = max(ratios, key=ratios.__getitem__)
     return Hardest(
         metric=worst,
@@ -128,35 +148,41 @@ def hardest(
 
 
 def _charted(problem: Problem, name: str, c: np.ndarray) -> np.ndarray:
-    """Free reals of coordinates: of uniform ones u = (1 - cos pi y) / 2, which reaches both ends."""
+    """Return the variables y of coordinates c. A uniform c is (1 - cos pi y) / 2, which reaches both ends."""
     uniform = problem.dispersion.kinds[name].drawn == "uniform"
     return np.arccos(1.0 - 2.0 * c) / np.pi if uniform else c
 
 
 def _places(coordinates: Coordinates, names: tuple[str, ...]) -> dict[str, slice]:
-    """Where the free reals of each of these names stand, one after the other."""
+    """Return the slice of the variables that belongs to each of these names."""
     counts = [coordinates[name].shape[1] for name in names]
     ends = np.cumsum(counts, dtype=int).tolist()
     return {name: slice(end - count, end) for name, count, end in zip(names, counts, ends, strict=True)}
 
 
 def _normal(problem: Problem, moved: tuple[str, ...]) -> list[tuple[slice, float]]:
-    """Where among the free reals the normal numbers of each kind stand, and how far they are searched."""
+    """Return the slice of the variables of each normal dispersion, and the radius of its ball."""
     places, kinds = _places(problem.coordinates, moved), problem.dispersion.kinds
     return [(place, _farthest(place.stop - place.start))
             for name, place in places.items() if kinds[name].drawn != "uniform"]  # fmt: skip
 
 
 def _farthest(count: int) -> float:
-    """Radius of the ball that holds `HELD` of so many normal numbers."""
-    return float(np.sqrt(2.0 * special.gammaincinv(count / 2.0, HELD)))  # of chi square
+    """Return the radius of the ball that contains this number of normal numbers with probability `HELD`."""
+    return float(np.sqrt(2.0 * special.gammaincinv(count / 2.0, HELD)))  # quantile of the chi-squared distribution
 
 
 def _within(y: np.ndarray, normal: list[tuple[slice, float]], slope: np.ndarray | None = None) -> np.ndarray:
-    """Free reals with normal ones a hair inside their balls, where slopes are whole; with slopes, turned towards them.
+    """Return the variables with the normal ones moved just inside their balls, where gradients are not clipped.
 
-    The advanced mean value step (Wu, Millwater and Cruse, AIAA J. 28, 1990). Adam moves all numbers alike, and those
-    that hardly count are far out then, at the expense of those that do.
+    If a gradient is given, the normal variables move to the point of the sphere in its direction. This is a step of the
+    advanced mean value method (Wu, Millwater and Cruse, AIAA J. 28, 1990). Adam moves all numbers by similar steps.
+    Without this step, numbers with little effect would use up a large part of the radius.
+
+    Args:
+        y: (cases, variables) variables.
+        normal: slice and radius of each normal dispersion.
+        slope: (cases, variables) gradient, or None.
     """
     y = y.copy()
     for place, farthest in normal:
@@ -173,10 +199,20 @@ def _within(y: np.ndarray, normal: list[tuple[slice, float]], slope: np.ndarray 
 def climb(
     fleet: Fleet, gains: np.ndarray, y: np.ndarray, metrics: tuple[str, ...], limits: Mapping[str, float]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Largest metric / limit of each case, (cases,), and its slopes by the free reals y, (cases, reals).
+    """Return the largest metric / limit of each case and its gradient with respect to the variables y.
 
-    metrics: those of the search, `limits` among them: its program finds the slopes, along as many reals at a time as
+    The compiled program of the search computes the gradients. It differentiates along as many directions at a time as
     there are gains.
+
+    Args:
+        fleet: the trials, one for each case.
+        gains: (gains,) the gains.
+        y: (cases, variables) variables of the dispersions.
+        metrics: names of the metrics of the search, which include the names in `limits`.
+        limits: limit of each constrained metric.
+
+    Returns:
+        The ratio, (cases,), and its gradient, (cases, variables). A failed case has the ratio `FAILED` and no gradient.
     """
     coordinates, shifts = _moved_to(fleet, y)
     fleet, count, width = fleet._replace(coordinates=coordinates), y.shape[1], len(fleet.names)
@@ -196,12 +232,12 @@ def climb(
 
 
 def _filled(v: np.ndarray, width: int) -> np.ndarray:
-    """With zeros for directions that there are not, (cases, directions, ..)."""
+    """Append zeros for unused directions, (cases, directions, ..)."""
     return np.concatenate([v, np.zeros((v.shape[0], width - v.shape[1], *v.shape[2:]))], axis=1)
 
 
 def _moved_to(fleet: Fleet, y: np.ndarray) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Coordinates of free reals, and by what each real moves them, (cases, reals, numbers) of each that moves."""
+    """Return the coordinates of variables y, and for each moved name their derivatives, (cases, variables, numbers)."""
     names = flights.movable(fleet.dispersion)
     moved, shifts = jax.tree.map(np.asarray, _moved(fleet.dispersion, dict(fleet.coordinates), y, names))
     return {**fleet.coordinates, **moved}, shifts
@@ -209,7 +245,14 @@ def _moved_to(fleet: Fleet, y: np.ndarray) -> tuple[dict[str, np.ndarray], dict[
 
 @programs.jit(static_argnames="names", compiler_options=programs.QUICKLY)
 def _moved(dispersion: Dispersion, coordinates: Coordinates, y: jax.Array, names: tuple[str, ...]) -> tuple[dict, dict]:
-    """Coordinates of free reals y (cases, reals), those of these names, and their derivatives by each of them."""
+    """Return the coordinates of these names for variables y, (cases, variables), and their derivatives.
+
+    Args:
+        dispersion: the dispersions.
+        coordinates: coordinates of all names, which give the numbers of variables.
+        y: (cases, variables) variables.
+        names: names of the moved dispersions.
+    """
 
     def of(y: jax.Array) -> Coordinates:
         moved = {}
