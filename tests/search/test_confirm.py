@@ -1,4 +1,4 @@
-"""Limits for a share of the trials: what training calls met must be met on trials that it never saw."""
+"""Tests of quantile requirements: gains must keep them on trials that the search has not used."""
 
 import itertools
 from dataclasses import replace
@@ -22,34 +22,34 @@ SEEN = Requirement("window_error", 1e-4, None, 0.9, None)
 
 @pytest.mark.parametrize("requirement", [SHOWN, SEEN])
 @pytest.mark.parametrize("beyond", [0, 3, 30])
-def test_probability_is_the_verdicts_over_shares_that_the_count_allows(requirement, beyond):
-    """The share integrated out by brute force: Bayes with a uniform prior on a grid, then the verdict's binomial."""
+def test_probability_of_a_met_verdict_agrees_with_bayes_rule_on_a_grid(requirement, beyond):
+    """The reference integrates over the fraction on a grid, with a uniform prior and the binomial of the verdict."""
     share = (np.arange(20_000) + 0.5) / 20_000
     weight = binom.pmf(beyond, 4096, share)
     least = must_keep(1000, requirement.quantile, requirement.confidence)
     assert least is not None
     most = 1000 - least
     expected = np.sum(weight * binom.cdf(most, 1000, share)) / np.sum(weight)
-    # the grid's step of 5e-5 beside a share that is known to 2e-4: the midpoint rule leaves some 1e-3 of that
+    # the fraction is known to 2e-4, so the midpoint rule with a step of 5e-5 has a relative error of about 1e-3
     np.testing.assert_allclose(confirm.probability(requirement, 1000, 4096, beyond), expected, rtol=2e-3)
 
 
 @pytest.mark.parametrize("requirement", [SHOWN, SEEN, replace(SHOWN, quantile=0.9973, confidence=0.9)])
-def test_what_is_allowed_is_the_most_that_is_sure(requirement):
+def test_allowed_is_the_largest_count_with_a_sure_verdict(requirement):
     fresh = confirm.fresh_trials([requirement])
     trials = max(confirm.FEWEST, confirm.TIMES * fresh)
     most = confirm.allowed(requirement, fresh, trials)
     assert most is not None
     assert confirm.probability(requirement, fresh, trials, most) >= confirm.SURE
     assert confirm.probability(requirement, fresh, trials, most + 1) < confirm.SURE
-    assert most < (1.0 - requirement.quantile) * trials  # fewer than the share itself: the verdict is a sample
+    assert most < (1.0 - requirement.quantile) * trials  # fewer than the fraction itself, because the verdict is random
 
 
-def test_a_limit_on_a_share_is_kept_among_the_training_trials_or_a_band():
-    """With 299 trials 99 % at 95 % allows none beyond the limit: a search on them would ask for every one."""
+def test_a_quantile_limit_applies_to_the_training_trials_or_to_a_band():
+    """A quantile of 99 % with 95 % confidence allows no violation in 299 trials, so a search needs more trials."""
     every = Requirement("peak_torque", 0.5)
     assert confirm.may_break(every, [every], 64) == (None, False)
-    assert confirm.may_break(SEEN, [SEEN], 64) == (6, False)  # ceil(0.9 * 64) = 58 keep it
+    assert confirm.may_break(SEEN, [SEEN], 64) == (6, False)  # ceil(0.9 * 64) = 58 trials must keep it
     kept = must_keep(598, 0.99, 0.95)
     assert kept is not None
     assert confirm.may_break(SHOWN, [SHOWN], 598) == (598 - kept, False)
@@ -58,14 +58,14 @@ def test_a_limit_on_a_share_is_kept_among_the_training_trials_or_a_band():
     assert most is not None
     assert 0 < most < confirm.FARTHER
     loose = replace(SHOWN, quantile=0.9)
-    assert confirm.may_break(loose, [loose], 8) == (confirm.FARTHER, True)  # of 8 000 hundreds may
+    assert confirm.may_break(loose, [loose], 8) == (confirm.FARTHER, True)  # of 8000 trials
 
 
-def test_a_band_holds_the_last_that_may_break_the_limit_and_those_next_to_it(monkeypatch):
-    """Trial n has the error n: of those counted on, the band begins 16 before the last that may break the limit."""
+def test_a_band_contains_the_trials_ranked_around_the_last_that_may_break_the_limit(monkeypatch):
+    """Trial n has the error n. The band begins 16 trials before the last trial that may break the limit."""
     loose = replace(SHOWN, quantile=0.9)
     count = confirm.counted_on([loose])
-    flown = SimpleNamespace(finished=np.arange(count) != 5)  # one that fails is the farthest beyond
+    flown = SimpleNamespace(finished=np.arange(count) != 5)  # a failed trial is the worst one
 
     def fly(numbers, gains):
         flown.metrics = SimpleNamespace(window_error=numbers.astype(float))
@@ -82,8 +82,8 @@ def test_a_band_holds_the_last_that_may_break_the_limit_and_those_next_to_it(mon
     assert found.harder[:8].tolist() == order[found.allowed : found.allowed + 8]
 
 
-def test_a_band_stands_for_the_training_trials():
-    """What is asked of c is what all but the two farthest of the band keep, and of no training trial by itself."""
+def test_a_band_replaces_the_training_trials_in_a_quantile_limit():
+    """All but the two worst trials of the band must keep the limit. Single training trials need not keep it."""
     wanted = [replace(SHOWN, metric="peak_torque", limit=0.7), Requirement("effort", 5.0)]
     some = problem(peak_torque=0.7)
     banded = objective.problem(
@@ -94,7 +94,7 @@ def test_a_band_stands_for_the_training_trials():
     torque, effort = (np.asarray(v) for v in (ratios.metrics.peak_torque / 0.7 - 1, ratios.metrics.effort / 5.0 - 1))
     search = rounds.Rounds(Evaluator(shares.Bounds(some.names, (2.05, 0.2), (6.0, 4.0))), banded, wanted, robust=False)
     before = np.asarray(measure(objective.fewer_trials(search.problem, 8), at)[1])
-    np.testing.assert_allclose(before[0, :8], torque[:8], rtol=1e-10)  # at first each training trial must keep it
+    np.testing.assert_allclose(before[0, :8], torque[:8], rtol=1e-10)  # before the band joins
     assert before[0, 8:].max() == -1.0
     joined = rounds._with_bands(search.problem, {0: np.array([8, 9, 10, 0, 1])})
     after = np.asarray(measure(joined, at)[1])
@@ -104,15 +104,15 @@ def test_a_band_stands_for_the_training_trials():
     np.testing.assert_allclose(after[1, :8], effort[:8], rtol=1e-10)
 
 
-def test_trials_that_are_counted_are_none_that_the_search_has_seen(monkeypatch):
-    """Neither those averaged nor those screened, and others each time."""
+def test_confirmation_uses_trials_that_the_search_has_not_simulated(monkeypatch):
+    """They differ from the averaged and the screened trials, and each count uses new ones."""
     some, wanted, seen = problem(peak_torque=0.7), [replace(SHOWN, metric="peak_torque", limit=0.7)], list[range]()
     posed = objective.problem(some.parts, SPREAD, 3, np.arange(8), some.names, wanted, may_break=(2,), banded=(True,))
     limits, at = shares.Bounds(some.names, (2.05, 0.2), (6.0, 4.0)), np.array([3.0, 0.7])
     many = confirm.counted_on(wanted)
 
     def count(posed, asked, gains, first, turn):
-        seen.append(range(first + turn * many, first + (turn + 1) * many))  # see the test of a band
+        seen.append(range(first + turn * many, first + (turn + 1) * many))  # as in `confirm.count`
         return [SimpleNamespace(trials=many)]
 
     def trials(numbers, gains):
@@ -133,20 +133,20 @@ def test_trials_that_are_counted_are_none_that_the_search_has_seen(monkeypatch):
     assert evaluate.rollouts == 2 * many
 
 
-def test_too_few_trials_are_never_sure():
+def test_too_few_trials_cannot_confirm_a_requirement():
     assert confirm.allowed(SHOWN, 1000, 20) is None
 
 
 @pytest.mark.long
 @pytest.mark.parametrize(("quantile", "confidence"), [(0.9, None), (0.99, 0.95)])
-def test_a_share_that_training_keeps_is_kept_by_others(monkeypatch, quantile, confidence):
-    """Eight easy training trials: gains that keep a limit in all of them break it in more than a tenth of others.
+def test_gains_keep_a_quantile_limit_on_held_out_trials(monkeypatch, quantile, confidence):
+    """The eight training trials are easy: gains that keep a limit in them break it in more than 10 % of other trials.
 
-    They show nothing of 99 % with 95 %: a band stands for them.
+    Eight trials cannot represent a quantile of 99 % with 95 % confidence, so a band replaces them.
     """
     helpers.small_search(monkeypatch, fresh=200)
     limits = shares.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 4.0))
-    limit, seed = 0.7, 2  # whose first eight angles lie within 100 degrees; others go up to 140
+    limit, seed = 0.7, 2  # with this seed, the first eight trials are easy
     wanted = [Requirement("peak_torque", limit, None, quantile, confidence)]
     parts = problem(peak_torque=limit).parts
     allowed, banded = confirm.may_break(wanted[0], wanted, 8)
@@ -156,11 +156,11 @@ def test_a_share_that_training_keeps_is_kept_by_others(monkeypatch, quantile, co
     found = optimise.search(Evaluator(limits), some, wanted, np.array([3.0, 0.5]), optimise.Settings(2, 20, 1))
     (last,) = found.counts
     assert last.held
-    assert banded or found.rounds >= 1  # the first gains found were not confirmed
+    assert banded or found.rounds >= 1  # the gains of the first search were not confirmed
     at = gains.with_gains(parts, dict(zip(some.names, found.gains, strict=True)))
     others = montecarlo.run(at, SPREAD, 99, np.arange(2000))
     assert np.mean(others.metrics.peak_torque <= limit) >= quantile
-    # what joined must keep this limit, and is let off by no cut
+    # each trial that joined must keep this limit by itself
     assert np.asarray(found.problem.counted)[0, 8:].any() == (found.rounds > 0)
     _, c, _ = objective.measure(found.problem, helpers.vector(found.gains))
     assert np.asarray(c)[0].max() <= 0.0

@@ -1,4 +1,4 @@
-"""Local searches and what they end at, on problems whose solutions are known in closed form."""
+"""Tests of local searches on problems with solutions in closed form."""
 
 from dataclasses import replace
 from functools import partial
@@ -14,7 +14,7 @@ from tuning.search.evaluate import Evaluator, Sloped
 
 
 class Valley(Evaluator):
-    """F = (x0 - 0.2)^2 + 100 (x1 - x0^2)^2 and x2 of no account, without limits; what is asked for is counted."""
+    """Rosenbrock function F = (x0 - 0.2)^2 + 100 (x1 - x0^2)^2 without limits. x2 has no effect. Points are counted."""
 
     def slopes(self, problem, share):
         self.gradients += len(share)
@@ -27,7 +27,7 @@ class Valley(Evaluator):
 THREE = shares.Bounds(("eta", "k1", "sign_width"), (2.05, 0.1, 1e-5), (6.0, 50.0, 1e-1))
 
 
-def test_a_descent_goes_on_where_a_shorter_one_from_the_same_start_stopped():
+def test_a_longer_local_search_continues_a_shorter_one_from_the_same_point():
     ends, counts = [], []
     for parts_of_it in ((7, 30), (30,)):
         evaluate, start = Valley(THREE), descent.Start(np.array([0.9, 0.1, 0.5]))
@@ -42,12 +42,12 @@ def test_a_descent_goes_on_where_a_shorter_one_from_the_same_start_stopped():
     assert ends[0][0] < 1e-3
 
 
-def test_where_t_f_is_free_the_hand_over_is_moved_to_a_sample_with_it_too():
-    """By delta alone, t_f as short as it can be, a limit might be broken: later ones are looked at."""
+def test_hand_over_is_moved_to_samples_by_delta_and_by_t_f_if_both_are_free():
+    """If t_f is as short as possible, another delta may break a limit, so longer t_f are tried too."""
     some = replace(problem(2), names=("t_f", "delta"))
     evaluate = Evaluator(shares.Bounds(("t_f", "delta"), (10.0, 0.2), (20.0, 5.0)))
     run = descents.Descents(evaluate, 0.0, 2, np.random.default_rng(0))
-    own = np.array([15.13, 0.79])  # handed over at 14.34 s, between samples 71 and 72
+    own = np.array([15.13, 0.79])  # the hand-over at 14.34 s lies between samples 71 and 72
     share = evaluate.bounds.share(own)
     run._take(descent.Best(share, 0, 0.0), some, 0, afresh=True)
     moved = [
@@ -62,8 +62,8 @@ def test_where_t_f_is_free_the_hand_over_is_moved_to_a_sample_with_it_too():
     np.testing.assert_allclose(with_t_f, 0.79 + 0.2 * np.arange(71, 71 + hand_overs.LATER), atol=1e-9)
 
 
-def test_the_hand_over_is_moved_to_a_sample_where_t_f_is_free_and_delta_is_not():
-    """What is trained with it between two samples, a flight computer hands over later."""
+def test_hand_over_is_moved_to_samples_by_t_f_if_delta_is_not_free():
+    """A flight computer would delay a hand-over between two samples to the next sample."""
     some = replace(problem(2), names=("t_f",))
     evaluate = Evaluator(shares.Bounds(("t_f",), (10.0,), (20.0,)))
     run = descents.Descents(evaluate, 0.0, 2, np.random.default_rng(0))
@@ -150,7 +150,10 @@ def test_a_search_starts_from_the_best_design_if_that_is_better_than_the_scenari
 
 
 class Narrow(Evaluator):
-    """F = (delta - 1.1)^2 below delta = 2, where a limit is broken next to the samples, every 0.2 s; then 1 + .."""
+    """F = (delta - 1.1)^2 for delta < 2, else F = 1 + (delta - 3.5)^2.
+
+    The period is 0.2 s. If delta < 2, a limit is broken within 0.3 periods of each sample.
+    """
 
     def slopes(self, problem, share):
         gains = np.asarray(jax.vmap(self.bounds.gains)(jnp.asarray(share)))
@@ -166,18 +169,18 @@ class Narrow(Evaluator):
     fly = slopes
 
 
-def test_a_hand_over_that_breaks_a_limit_on_a_sample_gives_way_to_that_of_another_start():
-    """It took the place of what kept the limits: the search ended with "not met" where it knew gains that meet them."""
+def test_another_local_search_is_used_if_the_hand_over_on_a_sample_breaks_a_limit():
+    """The search would otherwise end with gains that break a limit, although it has found gains that meet it."""
     some = replace(problem(peak_torque=1.0), names=("delta",))
     evaluate = Narrow(shares.Bounds(("delta",), (0.2,), (5.0,)))
     run = descents.Descents(evaluate, 0.0, 20, np.random.default_rng(0))
     run.descend(some, {k: evaluate.bounds.share(np.array([delta])) for k, delta in enumerate((1.1, 3.5))})
     assert run.best.over == 0.0
-    np.testing.assert_allclose(run.best.f, 1.01, rtol=1e-6)  # on the samples beside 3.5 s
+    np.testing.assert_allclose(run.best.f, 1.01, rtol=1e-6)  # on the samples next to 3.5 s
 
 
 class Rippled(Evaluator):
-    """F = 0.02 (delta - 1.8)^2 + 0.01 (1 - cos(2 pi delta / 0.6)), a limit broken below 1.7 by more each s."""
+    """F = 0.02 (delta - 1.8)^2 + 0.01 (1 - cos(2 pi delta / 0.6)), with the limit c = 1.7 - delta."""
 
     def slopes(self, problem, share):
         gains = np.asarray(jax.vmap(self.bounds.gains)(jnp.asarray(share)))
@@ -193,8 +196,8 @@ class Rippled(Evaluator):
 
 
 @pytest.mark.parametrize("delta", [3.0, 4.8])
-def test_a_search_ends_in_the_best_of_the_ripples_that_noise_makes_over_delta(delta):
-    """Two searches that differed in rounding ended 2.4 % apart, each in a ripple of its own."""
+def test_a_search_finds_the_best_local_minimum_among_ripples_over_delta(delta):
+    """Two searches that differed only in rounding once ended 2.4 % apart, in different ripples."""
     some = replace(problem(peak_torque=1.0), names=("delta",))
     evaluate = Rippled(shares.Bounds(("delta",), (0.2,), (5.0,)))
     run = descents.Descents(evaluate, 0.0, 20, np.random.default_rng(0))
@@ -202,8 +205,8 @@ def test_a_search_ends_in_the_best_of_the_ripples_that_noise_makes_over_delta(de
     np.testing.assert_allclose(run.gains, 1.8, rtol=1e-9)
 
 
-def test_the_price_of_a_limit_is_what_f_falls_by_where_it_is_less_tight():
-    """F = x0 - 2 x1 with x1 - x0 / 2 <= c, at c = 0 on the bound x0 = 0, and a limit that is not active."""
+def test_prices_are_the_lagrange_multipliers_of_the_limits():
+    """F = x0 - 2 x1 subject to x1 - x0 / 2 <= 0, on the bound x0 = 0, with a second limit that is inactive."""
     f_slope, c_slope = np.array([[1.0, -2.0]]), np.array([[-0.5, 1.0], [3.0, 3.0]])
     c = np.array([[[-0.3, 0.0], [-0.5, -0.2]]])
     at = Sloped(np.zeros((1, 2)), np.zeros(1), c, np.zeros(1), f_slope, np.stack([0 * c_slope, c_slope], axis=1)[None])
@@ -212,7 +215,7 @@ def test_the_price_of_a_limit_is_what_f_falls_by_where_it_is_less_tight():
     assert descent.prices(none, np.array([0.0, 0.4])).size == 0
 
 
-def test_other_hand_overs_are_on_samples_within_the_bounds_and_twice_delta():
+def test_other_hand_overs_lie_on_samples_within_the_bounds_and_a_factor_of_two():
     some = replace(problem(2), names=("t_f", "delta"))
     bounds = shares.Bounds(("t_f", "delta"), (10.0, 0.9), (20.0, 5.0))
     looked = hand_overs.elsewhere(some, bounds, bounds.share(np.array([15.13, 1.5])))
@@ -225,8 +228,8 @@ def test_other_hand_overs_are_on_samples_within_the_bounds_and_twice_delta():
     )
 
 
-def test_a_gain_that_makes_no_difference_keeps_the_scenarios_value_and_the_others_do_not():
-    """So does a width whose interval begins elsewhere, and above it, for the scenario's own observer's gain."""
+def test_only_gains_without_effect_are_reset_to_the_scenarios_values():
+    """This also holds if the lower bound of sign_width depends on the observer's gain and lies above the value."""
     hops = shares.Bounds(("observer_gain", *THREE.names[1:]), (2.05, 0.1, 1e-5), (600.0, 50.0, 1e-1), hop=5e-3)
     for bounds, width, kept in ((THREE, 2e-3, True), (THREE, 2e-3, False), (hops, 2e-3, True), (hops, 1e-3, True)):
         some, own = replace(problem(), names=bounds.names), np.array([3.0, 5.0, width])
@@ -238,7 +241,7 @@ def test_a_gain_that_makes_no_difference_keeps_the_scenarios_value_and_the_other
         np.testing.assert_allclose(run.gains[2], width if kept else 1e-5 * 1e4**0.1)
 
 
-def test_starts_are_the_best_that_lie_far_apart_and_then_nearer_ones():
+def test_starting_points_are_the_best_far_apart_points_and_then_nearer_ones():
     share = np.array([[0.1, 0.1], [0.1, 0.15], [0.9, 0.1], [0.12, 0.45], [0.1, 0.1]])
     apart = starts.distances(share)
     np.testing.assert_allclose(apart[0], [0.0, 0.05, 0.8, 0.35, 0.0], atol=1e-12)
@@ -247,8 +250,8 @@ def test_starts_are_the_best_that_lie_far_apart_and_then_nearer_ones():
     ]  # fmt: skip
 
 
-def test_a_descent_looks_at_no_more_points_than_it_may_and_steps_over_slopes_without_sense():
-    """F = ln(1 + |x - a|^2) with slopes of 1e30 in one place, and with a number that is none in another."""
+def test_a_local_search_keeps_its_number_of_points_and_survives_useless_gradients():
+    """F = ln(1 + |x - a|^2), whose gradient is scaled by 1e30 at the first point and is NaN at the third point."""
 
     class Bowl(Evaluator):
         def slopes(self, problem, share):

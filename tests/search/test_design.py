@@ -1,4 +1,4 @@
-"""The shortest t_f for a limit on the input, by theory and as flown."""
+"""Tests of the shortest t_f for a limit on the input, by theory and by simulation."""
 
 from dataclasses import replace
 
@@ -34,12 +34,12 @@ def largest(tables, t_f, trials):
 
 
 @pytest.mark.long
-def test_shortest_time_is_where_flown_trials_cross_the_limit():
+def test_shortest_time_is_the_crossing_of_the_limit_in_simulations():
     limit, trials = 0.6, 32
     found = design.shortest_time(scenario.from_tables(FLOWN), Requirement("peak_torque", limit), 4, np.arange(trials))
     assert found.theory is not None
     assert found.simulated is not None
-    assert found.simulated == pytest.approx(found.theory, rel=0.03)  # disturbance and noise: 1e-3 and 1 % of 0.6 N m
+    assert found.simulated == pytest.approx(found.theory, rel=0.03)  # disturbance 1e-3 N m and noise 1 % of 0.6 N m
     assert largest(FLOWN, found.simulated, trials) <= limit
     assert largest(FLOWN, 0.995 * found.simulated, trials) > limit
     assert str(found).endswith(" s as flown")
@@ -54,8 +54,8 @@ RULES = {"chain": 14.0, "spacecraft": 2 * 14.0 * np.tan(np.pi / 4)}  # peak torq
 
 
 @pytest.mark.parametrize("plant", PLANTS)
-def test_shortest_time_from_rest_is_the_rule(plant):
-    """3.5 in closed form: without a disturbance the search finds it."""
+def test_shortest_time_from_rest_agrees_with_rule_3_5(plant):
+    """Rule 3.5 has a closed form from rest. Without a disturbance, the search agrees with it."""
     tables = {
         **STARTS[plant],
         "controller": {"eta": 4.0, "disturbance_rate_bound": 0.0},
@@ -74,7 +74,7 @@ def test_a_limit_below_the_disturbance_cannot_be_kept(plant):
     assert (found.theory, found.simulated) == (None, None)
 
 
-# posed for that time alone, on a clock of its own, in `make test-long`; that t_f alone is moved: below
+# `make test-long` also builds a new scenario with this t_f; a test below checks that only t_f changes
 @pytest.mark.parametrize("posed_anew", short([False, True], [False]))
 def test_shortest_time_of_a_chain(posed_anew):
     chain = scenario.from_tables({"plant": {"kind": "chain", "order": 3}})
@@ -82,8 +82,8 @@ def test_shortest_time_of_a_chain(posed_anew):
     assert found.theory is not None
     assert found.simulated is not None
     assert found.simulated == pytest.approx(found.theory, rel=5e-3)  # the disturbance is 0.01 of 5
-    t_f = found.simulated if posed_anew else 1.5 * found.theory  # the longest that was looked at: by its program
-    ready = scenario.study(in_scenario(chain, {"t_f": t_f}))  # all else stays that of the chain
+    t_f = found.simulated if posed_anew else 1.5 * found.theory  # longest examined t_f, so the program is compiled
+    ready = scenario.study(in_scenario(chain, {"t_f": t_f}))  # the rest of the scenario is unchanged
     run = montecarlo.run(with_gains(ready.parts, {"t_f": found.simulated}), ready.dispersion, 0, np.arange(1))
     assert run.metrics.peak_torque[0] <= 5.0 * (1 + 1e-6)
 
@@ -97,10 +97,10 @@ OBSERVED = {
 
 
 @pytest.mark.parametrize("fails_until", [None, 4.5])
-def test_the_observer_keeps_its_time_however_much_torque_there_is(fails_until, monkeypatch):
-    """Its error is gone 4 s after the start: t_f is looked for from a twentieth later on, and closed in on by 1e-3.
+def test_t_f_ends_after_the_observer_time_for_any_torque_limit(fails_until, monkeypatch):
+    """The observer converges in 4 s, so the search begins at 1.05 times 4 s and has a tolerance of 1e-3.
 
-    A run that fails keeps no limit, however small its torque was.
+    A failed run breaks every limit, even if its torque is small.
     """
 
     def run(parts, *others, flown=montecarlo.run):
@@ -118,12 +118,12 @@ def test_the_observer_keeps_its_time_however_much_torque_there_is(fails_until, m
 
 
 @pytest.mark.parametrize(("confidence", "least"), [(None, 6), (0.5, 7)])
-def test_a_limit_on_a_share_of_the_trials_is_kept_by_that_share(confidence, least):
-    """It was the shortest t_f at which every trial keeps it."""
+def test_a_quantile_limit_is_kept_by_that_fraction_of_the_trials(confidence, least):
+    """It is not necessary that all trials keep the limit."""
     tables = {
         "plant": {"kind": "chain", "order": 2, "x0": [1.0, 0.0]},
         "controller": {"t_f": 5.0, "delta": 0.5},
-        "loop": {"mode": "sampled", "clock": "flight", "period": 0.1, "t_end": 6.5},  # with what is judged one program
+        "loop": {"mode": "sampled", "clock": "flight", "period": 0.1, "t_end": 6.5},  # one program with the verdict
         "hardware": {"state_noise": [2e-5, 1e-5]},
         "dispersion": {"x0": {"kind": "uniform", "half_width": [0.5, 0.1]}},
     }
@@ -156,8 +156,8 @@ def test_search_finds_the_last_crossing(power):
     )
 
 
-def test_a_guess_that_is_the_last_one_does_not_keep_the_search_where_it_is():
-    """Peaks like 1 / t^2: three show both sides of the limit; once the search halved its way there."""
+def test_a_repeated_guess_does_not_stall_the_search():
+    """With peaks proportional to 1 / t^2, few evaluations suffice, without repeated halving."""
     asked = []
 
     def peak(t):
@@ -169,14 +169,14 @@ def test_a_guess_that_is_the_last_one_does_not_keep_the_search_where_it_is():
     assert len(asked) == len(set(asked)) <= 4
 
 
-def test_where_peaks_hardly_fall_with_t_f_the_bracket_is_halved():
-    """Steps by 1 / t^2 are tiny there, from either side."""
+def test_the_bracket_is_halved_if_peaks_hardly_decrease_with_t_f():
+    """Steps after the rule 1 / t^2 are tiny in this case, from both sides."""
     for start in (60.0, 10.0):
         found = design._smallest(lambda t: 1.0 + 1e-6 * (30.0 - t), 1.0, start, 1.0, 100.0, 1e-3, 60)
         assert found == pytest.approx(30.0, rel=1e-3)
 
 
-def test_only_t_f_and_what_follows_it_is_changed():
+def test_setting_t_f_changes_only_the_times_that_depend_on_it():
     parts = scenario.study(scenario.from_tables(FLOWN)).parts
     moved = with_gains(parts, {"t_f": 15.0})
     assert (float(moved.controller.t_f), float(moved.t_end), float(moved.clock.t_end)) == (15.0, 17.0, 17.0)
@@ -196,8 +196,8 @@ SPINNING = {
 
 
 @pytest.mark.parametrize(("limit", "flown"), [(5.0, True), (0.14, False)])
-def test_a_reference_that_the_law_cannot_follow_for_longer_costs_only_the_flown_time(limit, flown):
-    """The time after t_f stays what it was; where the law cannot follow for t_f itself, theory is left."""
+def test_a_reference_that_reaches_the_singularity_prevents_only_the_simulated_time(limit, flown):
+    """If the law cannot follow the reference until t_f, only the time from theory is returned."""
     found = design.shortest_time(scenario.from_tables(SPINNING), Requirement("peak_torque", limit), 0, np.arange(1))
     assert found.theory is not None
     assert (found.theory < 20.0) == flown

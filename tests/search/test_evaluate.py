@@ -1,4 +1,4 @@
-"""What is measured of a problem: rows of flown trials and rows of margins side by side."""
+"""Tests of the evaluation of a problem, with rows of simulated trials and rows of margins."""
 
 import math
 from types import SimpleNamespace
@@ -20,10 +20,10 @@ from tuning.search.shares import Bounds
 
 
 @pytest.mark.parametrize(("trials", "loops"), [(2, 5), (5, 2)])
-def test_rows_of_trials_and_of_loops_are_filled_up_by_what_breaks_no_limit(monkeypatch, trials, loops):
-    """Two limits on as many trials, one margin of as many loops: what neither has is as far within its limit as can be.
+def test_rows_of_trials_and_of_margins_are_padded_without_changing_the_result(monkeypatch, trials, loops):
+    """Two limits have entries for each trial, and one margin has entries for each loop. Padding is c = -1.
 
-    So the largest c is one that was measured, and no gain moves what was not.
+    The largest c is therefore a measured one, and the padding has a gradient of zero.
     """
     rng = np.random.default_rng(0)
     flown = {"c": rng.uniform(-0.9, -0.5, (2, 2, trials)), "c_slope": rng.normal(size=(2, 2, trials, 2))}
@@ -44,8 +44,8 @@ def test_rows_of_trials_and_of_loops_are_filled_up_by_what_breaks_no_limit(monke
     np.testing.assert_array_equal(found.beyond, largest)
 
 
-def test_the_torque_weighs_over_the_averaged_trials_as_the_error_does():
-    """Those that joined for a limit are hard ones, and count in the constraints alone."""
+def test_the_torque_term_of_f_covers_the_averaged_trials_only():
+    """Trials that joined for a limit are hard ones and count only in the constraints."""
     none = np.zeros((0, 3), dtype=bool)
     rules = Rules(limits=np.zeros(0), among=none, counted=none, averaged=2, names=("eta",), may_break=(),
                   torque_weight=0.3)  # fmt: skip
@@ -68,7 +68,7 @@ def test_the_torque_weighs_over_the_averaged_trials_as_the_error_does():
     ids=["rms", "mean", "worst", "quantile", "cvar"],
 )
 def test_f_is_the_logarithm_of_the_statistic_of_the_averaged_trials(statistic, tail, expected):
-    """The last of nine trials joined for a limit, and does not count. NumPy computes the expected values."""
+    """The last of nine trials joined for a limit, so it does not count. NumPy computes the expected values."""
     values = np.random.default_rng(5).lognormal(size=9)
     values[8] = 1e3
     none = np.zeros((0, 9), dtype=bool)
@@ -79,7 +79,7 @@ def test_f_is_the_logarithm_of_the_statistic_of_the_averaged_trials(statistic, t
     np.testing.assert_allclose(np.exp([f, value]), expected(values[:8]), rtol=1e-12)
 
 
-def test_a_search_for_limits_minimises_the_largest_metric_over_its_limit():
+def test_goal_limits_minimises_the_largest_metric_over_its_limit():
     """A trial that fails does not count in F, and its c stays that of a failure."""
     limits, status = np.array([0.5, 8.0]), np.array([rollout.OK, rollout.OK, rollout.DIVERGED])
     limited = np.array([[0.3, 5.0], [0.4, 7.0], [2.0, 90.0]])
@@ -99,7 +99,7 @@ def test_a_search_for_limits_minimises_the_largest_metric_over_its_limit():
     assert np.all(c[:, 2] == FAILED - 1.0)
 
 
-def test_a_search_for_limits_counts_the_margins_too(monkeypatch):
+def test_goal_limits_includes_the_margins(monkeypatch):
     """F and its gradient follow the largest row: a metric's at the first point, a margin's at the second point."""
     flown = {"c": np.array([[[0.3, -0.2]], [[-0.5, -0.4]]]), "c_slope": np.arange(8.0).reshape(2, 1, 2, 2)}
     of_loop = {"c": np.array([[[-0.1]], [[0.6]]]), "c_slope": 10.0 + np.arange(4.0).reshape(2, 1, 1, 2)}
@@ -114,8 +114,8 @@ def test_a_search_for_limits_counts_the_margins_too(monkeypatch):
     np.testing.assert_allclose(found.f_slope, [[0.0, 1.0 / 1.3], [12.0 / 1.6, 13.0 / 1.6]], rtol=1e-12)
 
 
-def test_where_no_trial_has_a_goal_there_is_none():
-    """What stands for it in F is no error of the gains': histories and progress had it as one of 1e9."""
+def test_the_objective_is_nan_if_no_trial_completes():
+    """F then contains the penalty `FAILED`, which must not appear as an error of 1e9 in histories and progress."""
     shape = {"limits": np.array([0.5]), "among": np.zeros((1, 2), bool), "counted": np.ones((1, 2), bool)}
     rules = Rules(averaged=2, names=("eta",), may_break=(None,), **shape)
     status = jnp.asarray([[rollout.OK, rollout.DIVERGED], [rollout.DIVERGED] * 2], jnp.int32)
@@ -134,8 +134,8 @@ def test_where_no_trial_has_a_goal_there_is_none():
     assert [step.worst.tolist() for step in run.history] == [[np.inf], [np.inf]]
 
 
-def test_a_system_of_ones_own_has_the_same_questions_in_another_process():
-    """Whose functions lie elsewhere in memory: a search that went on after an interrupt began anew."""
+def test_a_custom_system_has_the_same_journal_questions_in_another_process():
+    """Its functions have other memory addresses there. A resumed search must still find its journal entries."""
 
     def question():
         pendulum = ptsmc.system(

@@ -1,4 +1,4 @@
-"""Refinement without slopes, against optima known in closed form."""
+"""Tests of differential evolution against optima in closed form."""
 
 import numpy as np
 import pytest
@@ -14,9 +14,9 @@ from tuning.search.shares import Bounds
 
 
 class Valley(Evaluator):
-    """F = x'A x, x a share of the bounds less 0.5, with a'x >= b; no numbers beyond `wall` in the first gain.
+    """F = x'A x subject to a'x >= b, with x the normalised gains less 0.5.
 
-    Short of `lost` in it a trial fails that does not count in F.
+    F is NaN if the first element of x exceeds `wall`. If it is below `lost`, a trial fails that does not count in F.
     """
 
     def __init__(self, matrix, along=None, least=0.0, wall=1.0, lost=-1.0):
@@ -47,33 +47,33 @@ def refined(valley, start, seed=3, size=evolution.WIDELY):
 
 
 def narrow(count):
-    """Axes from 1 to 1/400 of each other's curvature, turned."""
+    """Return a rotated symmetric matrix with eigenvalues from 1 to 400."""
     turn, _ = np.linalg.qr(np.random.default_rng(7).normal(size=(count, count)))
     return turn @ np.diag(np.geomspace(1.0, 400.0, count)) @ turn.T
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_the_bottom_of_a_narrow_turned_valley_with_a_wall_is_found(seed):
+def test_minimum_of_an_ill_conditioned_rotated_quadratic_with_a_wall_is_found(seed):
     best, told = refined(Valley(narrow(3), wall=0.2), [-0.35, 0.3, -0.3], seed)
-    # it ends where twelve generations have gained less than GAINED: some times that is left
+    # the search ends if `PATIENCE` generations reduce F by less than GAINED, so a few times GAINED can remain
     assert best.f < 5.0 * evolution.GAINED
     assert np.isfinite(best.f)
     assert [done for done, _ in told] == list(range(len(told)))
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_a_limit_is_followed_to_the_optimum_on_it(seed):
+def test_constrained_optimum_on_an_active_limit_is_found(seed):
     matrix, along, least = narrow(3), np.array([1.0, 0.5, -0.4]), 0.2
     inverse = along @ np.linalg.solve(matrix, along)
     optimum = least**2 / inverse  # at x = A^-1 a b / (a' A^-1 a)
     best, _ = refined(Valley(matrix, along, least), [0.35, 0.3, -0.3], seed)
     assert best.over == 0.0
-    assert optimum - 2.0 * (2.0 * least / inverse) * 1e-4 <= best.f  # SLACK beyond the limit is allowed
+    assert optimum - 2.0 * (2.0 * least / inverse) * 1e-4 <= best.f  # points may exceed the limit by SLACK
     assert best.f <= optimum + 5.0 * evolution.GAINED
 
 
-def test_what_evolution_sets_out_from_is_the_first_of_the_history():
-    """All that there is to tell where it is interrupted then."""
+def test_the_first_point_of_the_history_is_the_best_of_the_sweep():
+    """It is the only result if the search is interrupted then."""
     valley = Valley(np.eye(2))
     names = valley.bounds.names
     valley.bounds = Bounds(names, (1.0, 1.0), (2.0, 2.0))
@@ -86,28 +86,28 @@ def test_what_evolution_sets_out_from_is_the_first_of_the_history():
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_gains_with_a_trial_that_fails_lead_nowhere(seed):
-    """F falls on where one that is no part of it fails."""
+def test_gains_with_a_failed_trial_are_not_accepted(seed):
+    """F decreases towards points with a failed trial that does not count in F."""
     best, _ = refined(Valley(np.eye(2), lost=0.2), [0.4, 0.1], seed)
     assert not best.failed
     assert 0.2**2 <= best.f <= 0.2**2 + 5.0 * evolution.GAINED
 
 
-def test_a_single_gain_is_refined_too():
+def test_a_single_gain_is_optimised():
     best, _ = refined(Valley(np.array([[4.0]])), [0.4])
     assert best.f < 1e-6
 
 
-def test_it_ends_early_where_nothing_is_gained():
+def test_search_ends_early_without_progress():
     _, told = refined(Valley(np.zeros((2, 2))), [0.1, 0.1])
     assert len(told) <= evolution.PATIENCE + 1
 
 
 @pytest.mark.parametrize("size", [evolution.NEARBY, evolution.WIDELY])
-def test_first_points_are_around_the_start_or_in_the_whole_box(size):
+def test_first_generation_is_around_the_starting_point_or_in_the_whole_box(size):
     valley = Valley(np.eye(2))
     refined(valley, [0.1, -0.2], size=size)
-    first = valley.seen[1]  # after the start itself
+    first = valley.seen[1]  # after the starting point itself
     assert first.shape == (size[0], 2)
     np.testing.assert_allclose(first[0], [0.1, -0.2])
     if size is evolution.NEARBY:
@@ -117,19 +117,19 @@ def test_first_points_are_around_the_start_or_in_the_whole_box(size):
         np.testing.assert_allclose(first.mean(axis=0), 0.0, atol=0.02)
 
 
-def test_where_nothing_keeps_the_limit_it_goes_on_toward_it():
+def test_search_approaches_a_limit_that_no_point_can_keep():
     best, told = refined(Valley(np.eye(2), np.array([1.0, 1.0]), least=3.0), [-0.3, -0.3])
     assert len(told) == evolution.GENERATIONS
     assert best.over < 2.01  # x is 0.5 at most
 
 
-def test_nothing_but_failures_keeps_the_start():
+def test_the_starting_point_remains_if_all_points_fail():
     best, _ = refined(Valley(np.eye(2), wall=-1.0), [0.1, 0.2])
     assert not np.isfinite(best.f)
     np.testing.assert_allclose(best.share, [0.6, 0.7])
 
 
-def test_of_many_points_one_that_keeps_the_limits_is_better_than_one_of_a_better_goal():
+def test_a_feasible_point_is_better_than_an_infeasible_one_with_a_smaller_objective():
     share, f, over = np.asarray([[0.2], [0.7]]), np.asarray([1.0, 2.0]), np.asarray([0.5, -0.1])
     best = Best(np.zeros(1), 1, 0.0)
     best.offer(share, Measured(share, f, over[:, None, None], f))

@@ -1,4 +1,4 @@
-"""The public search on functions with known minima."""
+"""Tests of `minimise` on functions with known minima."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -7,8 +7,8 @@ import pytest
 from tuning.search import Settings, minimise
 
 
-def test_quadratics_end_at_the_projection_on_the_box():
-    """With a diagonal matrix, the minimum in a box is the free one clipped to it."""
+def test_minimum_of_a_quadratic_is_its_projection_on_the_box():
+    """With a diagonal matrix, the minimum in a box is the unconstrained minimum clipped to the box."""
     rng = np.random.default_rng(0)
     for count in (1, 3, 6):
         centre, weights = rng.uniform(-2.0, 2.0, count), rng.uniform(0.1, 100.0, count)
@@ -34,7 +34,7 @@ def test_the_best_of_several_local_minima_is_found(scale):
 
 
 def test_a_narrow_feasible_set_is_found_and_its_constraints_are_active():
-    """Minimise the distance from (3, 0) on the arc |x|^2 in [1, 1.01], y >= 0.5: at (sqrt(1.01 - 0.25), 0.5)."""
+    """Minimise the distance from (3, 0) on the arc |x|^2 in [1, 1.01], y >= 0.5. Two limits are active there."""
 
     def constraints(x):
         square = jnp.sum(x**2)
@@ -45,14 +45,14 @@ def test_a_narrow_feasible_set_is_found_and_its_constraints_are_active():
     np.testing.assert_allclose(found.x, [np.sqrt(0.76), 0.5], atol=2e-4)
 
 
-def test_constraints_that_contradict_each_other_end_at_the_smallest_violation():
+def test_contradictory_constraints_lead_to_the_smallest_violation():
     found = minimise(lambda x: x[0], lambda x: jnp.stack([1.0 - x[0], x[0] + 1.0]), [(-3.0, 3.0)])
     assert not found.feasible
     assert found.locals[0].violation == pytest.approx(1.0, abs=1e-3)  # x >= 1 and x <= -1
     np.testing.assert_allclose(found.x, 0.0, atol=1e-3)
 
 
-def test_points_where_the_objective_does_not_exist_are_avoided():
+def test_points_with_an_undefined_objective_are_avoided():
     found = minimise(lambda x: jnp.sum(x - jnp.log(x)), None, [(-1.0, 4.0)] * 2)
     np.testing.assert_allclose(found.x, 1.0, atol=1e-4)
     with pytest.raises(ValueError, match="finite at none of 64 points"):
@@ -60,7 +60,7 @@ def test_points_where_the_objective_does_not_exist_are_avoided():
 
 
 @pytest.mark.parametrize("bounds", [[(0.0, 0.0)], [(1.0, -1.0)], [(0.0, float("inf"))]])
-def test_an_empty_or_infinite_box_is_refused(bounds):
+def test_an_empty_or_infinite_box_raises(bounds):
     with pytest.raises(ValueError, match="bounds are"):
         minimise(lambda x: x[0], None, bounds)
 

@@ -1,4 +1,4 @@
-"""Gains by name: moved in parts as in the scenario, axis by axis, the time after t_f kept."""
+"""Tests of gains by name: set in parts and in scenarios, for single axes, and their default bounds."""
 
 import tomllib
 from dataclasses import dataclass, fields, replace
@@ -58,14 +58,14 @@ OTHERS = {
 
 
 def wide(tables=None):
-    """The scenario and its parts with room for all gains."""
+    """Return the scenario and its parts, with a clock that has samples for all gains within their bounds."""
     scenario = from_tables({**BASE, "tune": TUNED, **(tables or {})})
     return scenario, posing.pose(scenario, 0).ready
 
 
 @pytest.mark.parametrize("name", OTHERS)
-def test_gains_moved_in_the_parts_are_those_of_the_scenario(name):
-    """Every number of law, observer, sensors and times, of the parts as the changed scenario is built into them."""
+def test_gains_set_in_parts_equal_gains_set_in_the_scenario(name):
+    """All numbers of law, observer, sensors, actuators and times agree with parts built from the changed scenario."""
     scenario, ready = wide()
     moved = gains.with_gains(ready.parts, OTHERS[name])
     changed = study(gains.in_scenario(scenario, OTHERS[name])).parts
@@ -80,10 +80,10 @@ def test_gains_moved_in_the_parts_are_those_of_the_scenario(name):
         np.testing.assert_allclose(known[gain], value, rtol=1e-12)
 
 
-@pytest.mark.long  # the numbers that are flown: above; a flight of a chain: below
+@pytest.mark.long  # shorter tests compare the numbers of the parts (above) and runs of a chain (below)
 @pytest.mark.parametrize("name", OTHERS)
-def test_gains_moved_in_the_parts_fly_as_in_the_scenario(name):
-    """The parts of a search, moved, against the parts that the changed scenario is built into."""
+def test_runs_with_gains_set_in_parts_equal_runs_of_the_changed_scenario(name):
+    """Compare runs of the parts of a search with runs of parts built from the changed scenario."""
     scenario, ready = wide()
     moved = gains.with_gains(ready.parts, OTHERS[name])
     changed = study(gains.in_scenario(scenario, OTHERS[name]))
@@ -96,7 +96,7 @@ def test_gains_moved_in_the_parts_fly_as_in_the_scenario(name):
             np.testing.assert_allclose(known[gain], value, rtol=1e-12)
 
 
-def test_the_time_after_t_f_is_kept():
+def test_time_after_t_f_is_unchanged():
     scenario, ready = wide()
     changed = gains.in_scenario(scenario, {"t_f": 11.0})
     assert changed.loop.t_end == 13.0
@@ -112,14 +112,14 @@ def test_the_time_after_t_f_is_kept():
         ("k1", "controller.k1"),
     ],
 )
-def test_a_gain_that_is_refused_is_named_also_where_t_f_comes_with_it(name, key):
+def test_an_invalid_gain_is_named_in_the_error_also_if_t_f_is_set_too(name, key):
     hardware = {"attitude_noise": 1e-5, "rate_noise": 1e-6, "command_filter": {"kind": "notch"}}
     ready = from_tables({"loop": {"mode": "sampled"}, "hardware": hardware, "filter": {}})
     with pytest.raises(ScenarioError, match=rf"^{key} is -1.0, but must be a number greater than 0"):
         gains.in_scenario(ready, {"t_f": 20.0, name: -1.0})
 
 
-def test_names_and_bounds_axis_by_axis():
+def test_gains_of_single_axes_have_names_and_bounds():
     tables = {"free": ["eta", "observer_gain"], "per_axis": True, "bounds": {"observer_gain": [1.0, 50.0]}}
     scenario, ready = wide({"tune": tables, "observer": {"gain": [3.0, 4.0, 5.0]}})
     names = gains.named(scenario)
@@ -129,21 +129,21 @@ def test_names_and_bounds_axis_by_axis():
     assert some.names == names
     assert (some.lower[1:], some.upper[1:]) == ((1.0,) * 3, (50.0,) * 3)
     assert gains.gains_of(ready.parts)["observer_gain"] == 4.0
-    again = gains.with_gains(ready.parts, gains.gains_of(ready.parts))  # each axis by its own name, not the mean
+    again = gains.with_gains(ready.parts, gains.gains_of(ready.parts))  # single axes take precedence over the mean
     np.testing.assert_array_equal(again.observer.gain, [3.0, 4.0, 5.0])
     assert [gains.base(name) for name in names] == ["eta", "observer_gain", "observer_gain", "observer_gain"]
 
 
-def test_the_bandwidth_of_a_filter_is_read_back_and_has_a_slope():
+def test_filter_gains_are_differentiable_with_respect_to_the_bandwidth():
     def sizes(bandwidth):
         found = attitude_filter.attitude_filter(bandwidth, 2e-5, 1e-6, 1e-8, 0.1, 2)
-        spread = found.spread.reshape(-1, 4)[:, jnp.array([0, 2, 3])]  # the factors' lower left half
+        spread = found.spread.reshape(-1, 4)[:, jnp.array([0, 2, 3])]  # lower triangle of the factors
         return jnp.log(jnp.abs(jnp.append(spread, jnp.stack([found.attitude_gain, found.bias_gain]))))
 
     at = vector(0.4)
     exact, step = jax.jit(jax.jacfwd(sizes))(at), 1e-4
     numeric = (sizes(at + step) - sizes(at - step)) / (2 * step)
-    np.testing.assert_allclose(exact, numeric, rtol=1e-6)  # step^2 times a third derivative of some 10
+    np.testing.assert_allclose(exact, numeric, rtol=1e-6)  # error: step^2 times a third derivative of about 10
     for star, gyro in ((2e-5, 0.0), (0.0, 1e-6), (0.0, 0.0)):
         spread = jax.jit(
             jax.jacfwd(
@@ -154,16 +154,16 @@ def test_the_bandwidth_of_a_filter_is_read_back_and_has_a_slope():
 
 
 @pytest.mark.parametrize(("interval", "highest"), [(0.1, 5.0), (0.4, 2.5), (8.0, 1.0)])
-def test_default_bounds_of_a_filters_bandwidth_end_where_its_star_tracker_is_too_slow(interval, highest):
-    """From a tenth of 0.5 rad/s to ten times as much, but to once in a sample of the star tracker, or to the double."""
+def test_default_bounds_of_the_filter_bandwidth_depend_on_the_star_tracker_period(interval, highest):
+    """They are a tenth to ten times 0.5 rad/s, with an upper bound of 1 / interval but at least twice the bandwidth."""
     hardware = {"attitude_noise": 2e-5, "rate_noise": 1e-6, "star_tracker_period": interval}
     tables = {"loop": {"mode": "sampled", "period": 0.1}, "filter": {"kind": "steady_state", "bandwidth": 0.5}}
     made = from_tables({**tables, "hardware": hardware, "tune": {"free": ["filter_bandwidth"]}})
     np.testing.assert_allclose(made.search.bounds["filter_bandwidth"], (0.05, highest), rtol=1e-12)
 
 
-def test_a_corner_of_the_command_is_tuned_anywhere_below_the_nyquist_frequency():
-    """By default from a tenth of 0.5 rad/s to ten times as much."""
+def test_bounds_of_the_command_filter_corner_must_be_below_the_nyquist_frequency():
+    """The default bounds are a tenth and ten times the corner of 0.5 rad/s."""
     device, free = {"kind": "first_order", "corner": 0.5}, {"free": ["command_corner"]}
     tables = {"loop": {"mode": "sampled", "period": 0.1}, "hardware": {"command_filter": device}}
     assert from_tables({**tables, "tune": free}).search.bounds == {"command_corner": (0.05, 5.0)}
@@ -176,14 +176,14 @@ def test_a_corner_of_the_command_is_tuned_anywhere_below_the_nyquist_frequency()
 
 @pytest.mark.parametrize("tables", [{}, {"plant": {"kind": "chain", "order": 2}}], ids=["spacecraft", "chain"])
 @pytest.mark.parametrize("name", ["filter_bandwidth", "command_corner"])
-def test_a_scenario_is_given_no_filter_that_it_does_not_have(tables, name):
+def test_gains_of_absent_filters_are_rejected(tables, name):
     sampled = from_tables({"loop": {"mode": "sampled"}, **tables})
     with pytest.raises(ScenarioError, match=f"{name} is no gain of this scenario; allowed is some of"):
         gains.in_scenario(sampled, {name: 2.0})
 
 
-def test_an_observers_gain_is_a_number_on_every_axis_or_one_for_each():
-    """A list, as in a scenario, made a matrix of three, and a scan of which JAX said that its carry did not fit."""
+def test_observer_gain_must_be_a_scalar():
+    """An array would cause an obscure shape error of JAX in the simulation."""
     parts = study(from_tables(BASE)).parts
     with pytest.raises(
         ValueError,
@@ -195,7 +195,7 @@ def test_an_observers_gain_is_a_number_on_every_axis_or_one_for_each():
 
 
 @pytest.mark.parametrize("kind", short(["nonlinear", "finite_time", "prescribed_time"], ["prescribed_time"]))
-def test_a_chain_and_its_observer_gain_move_too(kind):
+def test_gains_of_a_chain_and_its_observer_are_set_in_parts(kind):
     tables = {
         "plant": {"kind": "chain", "order": 2},
         "observer": {"kind": kind, **({"t_o": 2.0} if kind == "prescribed_time" else {})},
@@ -208,7 +208,7 @@ def test_a_chain_and_its_observer_gain_move_too(kind):
     wanted = {"t_f": 9.0, "eta": 3.4, "observer_gain": gains.gains_of(ready.parts)["observer_gain"] * 1.5}
     moved = gains.with_gains(ready.parts, wanted)
     changed = study(gains.in_scenario(scenario, wanted))
-    # two grids: both refined four times, which leaves 4^-4 of the 2e-3 that the smooth sign's layer costs
+    # the grids differ: refined four times, the error of 2e-3 from the boundary layer falls by a factor of 4^4
     one, other = (rollout.simulate_parts(finer(p, 4)).metrics for p in (moved, changed.parts))
     np.testing.assert_allclose(one.peak_torque, other.peak_torque, rtol=1e-6)
     np.testing.assert_allclose(one.window_error, other.window_error, rtol=1e-4)
@@ -292,7 +292,7 @@ def test_default_bounds_of_surface_rate_begin_at_1_75_over_t_f_and_end_at_half_o
         ({"kind": "fixed_time", "n": 0.97}, "n", 0.97),
     ],
 )
-def test_default_bounds_hold_the_scenarios_own_gain(law, gain, value):
+def test_default_bounds_contain_the_gain_of_the_scenario(law, gain, value):
     made = from_tables({"controller": law, "loop": {"mode": "sampled", "period": 0.01}, "tune": {"free": [gain]}})
     assert made.tune is not None
     low, high = made.tune.bounds[gain]
@@ -300,15 +300,15 @@ def test_default_bounds_hold_the_scenarios_own_gain(law, gain, value):
 
 
 @pytest.mark.parametrize(("eta", "expected"), [(12.0, (2.05, 22.0)), (2.03, (2.015, 8.0))])
-def test_bounds_that_are_moved_go_by_the_distance_from_what_is_not_allowed(eta, expected):
-    """Eta exceeds 2: to twice as far from it as the scenario's own is, or to half as far."""
+def test_default_bounds_of_eta_are_relative_to_its_smallest_allowed_value(eta, expected):
+    """eta must exceed 2. A bound beyond the scenario's eta is at twice or half its distance from 2."""
     made = from_tables({"controller": {"eta": eta}, "tune": {"free": ["eta"]}})
     np.testing.assert_allclose(made.search.bounds["eta"], expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize(("t_o", "shortest"), [(1.0, 15.0), (20.0, 21.0)])
-def test_default_bounds_of_t_f_leave_the_observer_its_time(t_o, shortest):
-    """From half of t_f on, or a twentieth after the observer's error is gone, before which t_f must not lie."""
+def test_default_bounds_of_t_f_exceed_the_observer_time(t_o, shortest):
+    """The lower bound is t_f / 2, or 1.05 times the convergence time t_o of the observer if that is larger."""
     observer = {"kind": "prescribed_time", "t_o": t_o}
     made = from_tables({"controller": {"t_f": 30.0}, "observer": observer, "tune": {"free": ["t_f"]}})
     np.testing.assert_allclose(made.search.bounds["t_f"], (shortest, 60.0), rtol=1e-12)
@@ -324,9 +324,10 @@ def test_the_lower_bound_of_delta_is_one_period_and_a_message_names_it_if_delta_
 
 
 def test_default_bounds_are_widened_on_the_side_where_a_gain_ended():
-    """Tenfold on a log scale, else by half of the interval, but only halfway to a value that is not allowed.
+    """They grow tenfold on a log scale, else by half of the interval, but only halfway to an invalid value.
 
-    Stated bounds stay. So do bounds at a stability limit of the sampled loop, and those of a deadbeat observer.
+    Bounds from the scenario file do not change. Bounds at a stability limit of the sampled loop or of a deadbeat
+    observer do not change either.
     """
     free = ["eta", "delta", "observer_gain", "k1", "surface_rate"]
     tune = {"free": free, "bounds": {"surface_rate": [0.1, 1.0]}}
@@ -344,7 +345,7 @@ def test_default_bounds_are_widened_on_the_side_where_a_gain_ended():
     assert free_gains.widened(made, sides, set()) == {}
 
 
-def test_bounds_of_a_baseline_hold_no_gains_that_are_refused_later():
+def test_default_bounds_of_comparison_laws_contain_only_valid_gains():
     from tuning.search import gains, shares
 
     for kind, more in (("pd", {}), ("terminal", {}), ("fixed_time", {}), ("fixed_time", {"gamma": 1.8, "p": 1.3})):
@@ -365,11 +366,11 @@ def test_bounds_of_a_baseline_hold_no_gains_that_are_refused_later():
     [
         ({"delta": 1.0}, "after", "11 s"),
         ({"t_f": 40.0}, "before", "39.95 s"),
-        ({"t_f": 35.1}, "before", "35.05 s"),  # by a single sample
+        ({"t_f": 35.1}, "before", "35.05 s"),  # one sample is missing
     ],
 )
-def test_gains_that_the_clock_has_no_samples_for_are_refused(other, where, needed):
-    """Its number of samples is fixed; without them the run would end before t_end, and nobody would know."""
+def test_gains_that_need_more_samples_than_the_clock_has_are_rejected(other, where, needed):
+    """The number of samples is fixed. With too few samples, a run would end before t_end without a message."""
     ready = scenario.study(scenario.replace(scenario.read(FIRST_FLIGHT), tune=None))
     with pytest.raises(ValueError, match=rf"needs {needed} of samples {where} the hand-over, but the parts' clock has"):
         gains.with_gains(ready.parts, other)
@@ -382,7 +383,7 @@ def test_gains_that_the_clock_has_no_samples_for_are_refused(other, where, neede
 
 
 def test_gains_are_compared_with_the_published_ones_only_if_these_can_be_simulated():
-    """At a spin of 0.6 rad/s the published eta of 3 overshoots past 180 degrees; 6 does not."""
+    """At a rate of 0.6 rad/s the published eta of 3 overshoots past 180 deg, and an eta of 6 does not."""
     fast = {"initial": {"rotvec_deg": [0.0, 0.0, 0.0], "rate": [0.6, 0.0, 0.0]}, "loop": {"mode": "sampled"}}
     law = {"t_f": 30.0, "delta": 0.5, "error": "multiplicative"}
     own = from_tables({**fast, "controller": {**law, "eta": 6.0}})
@@ -403,7 +404,7 @@ def test_gains_are_compared_with_the_published_ones_only_if_these_can_be_simulat
 @pytest.mark.parametrize(
     ("plant", "kind"), [(plant, kind) for plant, laws in LAWS.items() for kind in laws if kind != "own"]
 )
-def test_a_laws_table_has_bounds_for_what_its_physics_lets_tuning_move(plant, kind):
+def test_tables_of_laws_list_the_tunable_gains_of_the_laws(plant, kind):
     table = LAWS[plant][kind]
     assert set(table.gains) == set(table.made.tunable)
     assert {*table.free_by_default, *table.free_if_sampled} <= set(table.gains)
@@ -426,8 +427,8 @@ PLANTS = {
         if kind != "own" and kinds[plant][kind].gains
     ],
 )
-def test_usual_bounds_of_every_gain_are_allowed_and_hold_the_own_one(plant, table, kind):
-    """Alone and with all others, since what is allowed of one may hang on whether another is free."""
+def test_default_bounds_of_every_gain_are_valid_and_contain_the_scenarios_gain(plant, table, kind):
+    """Each gain is free alone and with all other gains, because its valid values can depend on other free gains."""
     tables = {**PLANTS[plant], table: {"kind": kind}}
     law = from_tables(tables)
     names = list(getattr(law, table).gains)
@@ -462,7 +463,7 @@ def test_the_published_gains_scale_with_the_mission_and_follow_the_order_of_a_ch
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class Shared(prescribed_time.PrescribedTime):
-    """A custom law whose gain has a name that begins like those of an observer."""
+    """A custom law with a gain whose name begins like the gains of an observer."""
 
     observer_share: float = 0.5
     tunable: ClassVar[tuple[str, ...]] = (*prescribed_time.PrescribedTime.tunable, "observer_share")
@@ -480,8 +481,8 @@ def test_a_gain_of_a_custom_law_is_set_in_the_law_whatever_its_name_begins_with(
     np.testing.assert_array_equal(moved.observer.gain, [4.0] * 3)
 
 
-def test_a_name_of_two_gains_is_refused():
-    """The gain `share` of an observer has the name `observer_share`, too."""
+def test_a_name_of_two_gains_is_rejected():
+    """The gain `share` of an observer is also called `observer_share`."""
     parts = shared(study(from_tables(BASE)).parts)
     observer = replace(parts.observer)
     object.__setattr__(observer, "tunable", ("share",))

@@ -1,4 +1,4 @@
-"""What was evaluated is read back, whatever a kill left half written."""
+"""Tests of the journal: evaluations are read back, even if a killed process left an incomplete record."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from tuning.search.journal import Journal
 
 
 def ask(journal, count, asked):
-    """Answers to so many questions; `asked` collects those that were computed."""
+    """Return the answers to `count` questions. `asked` collects the indices of the computed answers."""
 
     def compute(k):
         asked.append(k)
@@ -16,7 +16,7 @@ def ask(journal, count, asked):
     return [journal.get(b"question %d" % k, lambda k=k: compute(k)) for k in range(count)]
 
 
-def test_a_second_run_reads_what_the_first_one_wrote(tmp_path):
+def test_a_second_run_reads_the_records_of_the_first_run(tmp_path):
     first, again, asked = [], [], []
     wrote = ask(Journal(tmp_path / "j"), 5, first)
     read = ask(Journal(tmp_path / "j"), 7, again)
@@ -29,10 +29,10 @@ def test_a_second_run_reads_what_the_first_one_wrote(tmp_path):
             assert value.dtype == other[name].dtype
 
 
-def test_a_journal_cut_anywhere_keeps_its_whole_records(tmp_path):
+def test_complete_records_of_a_truncated_journal_are_used(tmp_path):
     ask(Journal(tmp_path / "j"), 4, [])
     data = (tmp_path / "j").read_bytes()
-    per_record = len(data) // 4  # all records are as long
+    per_record = len(data) // 4  # all records have the same length
     for cut in (0, 3, 11, per_record - 1, per_record, per_record + 5, 3 * per_record + 7, len(data)):
         (tmp_path / "j").write_bytes(data[:cut])
         asked = []
@@ -42,7 +42,7 @@ def test_a_journal_cut_anywhere_keeps_its_whole_records(tmp_path):
 
 
 @pytest.mark.parametrize("at", [0, 9, 30, 200])
-def test_a_damaged_record_and_all_after_it_are_computed_anew(tmp_path, at):
+def test_a_damaged_record_and_all_later_records_are_computed_again(tmp_path, at):
     ask(Journal(tmp_path / "j"), 3, [])
     data = bytearray((tmp_path / "j").read_bytes())
     record = len(data) // 3
@@ -53,7 +53,7 @@ def test_a_damaged_record_and_all_after_it_are_computed_anew(tmp_path, at):
     assert asked == [1, 2]
 
 
-def test_another_question_drops_what_follows(tmp_path):
+def test_another_question_replaces_all_later_records(tmp_path):
     ask(Journal(tmp_path / "j"), 4, [])
     journal, asked = Journal(tmp_path / "j"), []
     journal.get(b"question 0", dict)
@@ -68,8 +68,8 @@ def test_another_question_drops_what_follows(tmp_path):
     assert not replayed.replaying
 
 
-def test_reading_a_journal_changes_no_byte(tmp_path):
-    """Only the process that records the next evaluation cuts a record that a killed process left unfinished."""
+def test_reading_does_not_change_the_file(tmp_path):
+    """An incomplete record of a killed process is removed only when the next evaluation is recorded."""
     ask(Journal(tmp_path / "j"), 3, [])
     data = (tmp_path / "j").read_bytes()
     (tmp_path / "j").write_bytes(data[:-5])
@@ -77,7 +77,7 @@ def test_reading_a_journal_changes_no_byte(tmp_path):
     assert (tmp_path / "j").read_bytes() == data[:-5]
 
 
-def test_a_killed_process_loses_no_record_of_other_questions_before_it_has_an_answer(tmp_path):
+def test_records_of_other_questions_are_removed_only_after_the_answer_is_computed(tmp_path):
     def killed():
         raise KeyboardInterrupt
 
@@ -90,7 +90,7 @@ def test_a_killed_process_loses_no_record_of_other_questions_before_it_has_an_an
     assert not journal.replaying
 
 
-def test_a_record_that_an_interrupt_left_unfinished_is_replaced(tmp_path):
+def test_an_incomplete_record_is_replaced(tmp_path):
     journal, asked = Journal(tmp_path / "j"), []
     ask(journal, 1, [])
     with (tmp_path / "j").open("ab") as file:

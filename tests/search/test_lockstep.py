@@ -1,4 +1,4 @@
-"""Works side by side: who is asked together, and what becomes of errors and interrupts."""
+"""Tests of concurrent functions with batched requests, including errors and interrupts."""
 
 import threading
 
@@ -8,7 +8,7 @@ from tuning.search.lockstep import in_step
 
 
 def counting(upto, found, name):
-    """A work that asks for the double of 1, 2, .. and keeps what it is told."""
+    """Return a function that requests answers to 1, 2, .., `upto` and stores them in `found`."""
 
     def work(ask):
         for k in range(1, upto + 1):
@@ -17,7 +17,7 @@ def counting(upto, found, name):
     return work
 
 
-def test_questions_of_all_that_are_at_work_are_answered_together_in_order():
+def test_requests_of_all_running_functions_are_answered_together_in_order():
     asked, found = [], {}
 
     def answer(questions):
@@ -35,7 +35,7 @@ def test_questions_of_all_that_are_at_work_are_answered_together_in_order():
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError])
-def test_an_interrupt_reaches_all_that_wait_and_then_the_caller(error):
+def test_an_exception_of_answer_is_raised_in_waiting_functions_and_in_the_caller(error):
     put_away, threads, calls = [], threading.active_count(), iter(range(3))
 
     def work(ask):
@@ -52,11 +52,11 @@ def test_an_interrupt_reaches_all_that_wait_and_then_the_caller(error):
 
     with pytest.raises(error):
         in_step([work, work, work], answer, width=2)
-    assert len(put_away) == 2  # the third was not begun
-    assert threading.active_count() <= threads + 1  # the last may be on its way out
+    assert len(put_away) == 2  # the third function was not started
+    assert threading.active_count() <= threads + 1  # the last thread may not have ended yet
 
 
-def test_what_a_work_raises_stops_the_others_and_is_raised():
+def test_an_exception_of_a_function_stops_the_other_functions_and_is_raised():
     found = {}
 
     def fails(ask):

@@ -1,4 +1,4 @@
-"""Which results a scenario file lies in, whose programs are run with trust only."""
+"""Tests of custom code in results, which runs only with `--trust`, and of its checksums."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ from tuning.search import own_parts
 @pytest.mark.parametrize(("place", "inside"), [
     ("tuned.toml", True), ("scenarios/pd.toml", True), ("a/b/c/pd.toml", True), ("../mine.toml", False),
 ])  # fmt: skip
-def test_a_scenario_lies_in_results_at_any_depth(tmp_path, place, inside):
+def test_folder_of_results_is_found_at_any_depth(tmp_path, place, inside):
     results = tmp_path / "out" / "compare-x"
     results.mkdir(parents=True)
     (results / "versions.json").write_text("{}")
@@ -22,10 +22,10 @@ def test_a_scenario_lies_in_results_at_any_depth(tmp_path, place, inside):
     assert own_parts.results_of(path) == (results if inside else None)
     link = tmp_path / "link.toml"
     link.symlink_to(path)
-    assert own_parts.results_of(link) == (results if inside else None)  # to where it leads
+    assert own_parts.results_of(link) == (results if inside else None)  # the link is resolved
 
 
-def test_a_link_among_results_to_a_file_elsewhere_counts_as_one_of_theirs(tmp_path):
+def test_a_symbolic_link_in_results_to_an_outside_file_belongs_to_the_results(tmp_path):
     results, mine = tmp_path / "results", tmp_path / "mine" / "deep" / "mine.toml"
     for place in (results, mine.parent):
         place.mkdir(parents=True)
@@ -36,7 +36,7 @@ def test_a_link_among_results_to_a_file_elsewhere_counts_as_one_of_theirs(tmp_pa
     assert own_parts.results_of(mine) is None
 
 
-def test_a_file_that_several_keys_name_is_told_of_once(tmp_path, capsys):
+def test_a_file_named_by_several_keys_is_reported_once(tmp_path, capsys):
     law = tmp_path / "mine.py"
     law.write_text("")
     programs: Any = dict.fromkeys(("controller.code", "observer.code", "reference.code"), f"{law}:Mine")
@@ -61,8 +61,8 @@ def test_a_program_without_a_checksum_in_the_results_is_reported(tmp_path, capsy
     assert str(law) not in said
 
 
-def test_checksum_of_a_program_covers_the_files_beside_it_that_it_imports(tmp_path):
-    """A campaign resumed with another helper, and its rows were of both."""
+def test_checksum_covers_imported_files_in_the_same_folder(tmp_path):
+    """A campaign could otherwise resume after a change of an imported file, and mix rows of both versions."""
     (tmp_path / "package").mkdir()
     files = {"mine.py": "import helper\n", "helper.py": "from package.inner import f\n", "package/inner.py": "f = 1\n"}
     for name, text in files.items():

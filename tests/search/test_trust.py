@@ -1,4 +1,4 @@
-"""Slopes, influence, sensitivities, intervals and the global check, against what is known."""
+"""Tests of the gradient check, profiles, sensitivities, intervals and the global check against known results."""
 
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
@@ -24,7 +24,7 @@ BOUNDS = Bounds(("eta", "delta", "t_f"), (2.5, 0.3, 15.0), (5.0, 4.0, 25.0))
 
 
 def moved_in_time(**limits):
-    """A double integrator with noise on a clock for all of `BOUNDS`: one program flies all that is flown here."""
+    """Return a double integrator with noise. Its clock covers all of `BOUNDS`, so that tests share one program."""
     noisy = problem(**limits)
     far = replace(noisy.parts, clock=clock.anchored(0.2, 21.0, 25.0, 5.0))
     return replace(noisy, parts=far, names=BOUNDS.names)
@@ -32,23 +32,23 @@ def moved_in_time(**limits):
 
 @pytest.fixture(scope="module")
 def quiet():
-    """From rest, without noise or disturbance: the first input is the largest, eta^2 |x| / t_f^2."""
+    """Return a problem from rest without noise. The largest input is the first one, eta^2 |x| / t_f^2."""
     noisy = moved_in_time(peak_torque=0.9)
     return replace(noisy, parts=replace(noisy.parts, sensors=sensors.StateSensor(jnp.zeros(2))))
 
 
-def test_sensitivities_of_the_first_torque_are_its_powers(quiet):
+def test_sensitivities_of_the_peak_torque_are_its_exponents(quiet):
     found = trust.sensitivities(
         quiet, BOUNDS, np.array([3.3, 2.0, 19.0]), ("peak_torque", "window_error", "settling_time")
     )
     powers = found["peak_torque"]
-    # central differences of a power p in logs: p atanh(h) / h, off by h^2 / 3 for a relative step h of 0.01
+    # central differences of an exponent p have the relative error h^2 / 3 for a relative step h of 0.01
     np.testing.assert_allclose([powers["eta"], powers["t_f"]], [2.0, -2.0], rtol=1e-4)
     assert abs(powers["delta"]) < 1e-4
     assert found["window_error"]["delta"] > 0.1
 
 
-def test_a_goal_that_a_gain_cannot_move_is_called_flat(quiet):
+def test_an_objective_that_does_not_depend_on_a_gain_is_flat(quiet):
     evaluate = Evaluator(BOUNDS)
     problem = replace(quiet, goal="peak_torque")
     z = BOUNDS.share(np.array([3.3, 1.0, 19.0]))
@@ -56,13 +56,13 @@ def test_a_goal_that_a_gain_cannot_move_is_called_flat(quiet):
     assert {name: profile.flat for name, profile in found.items()} == {"eta": False, "delta": True, "t_f": False}
     eta = found["eta"]
     assert np.all(np.diff(eta.gain) > 0)
-    np.testing.assert_allclose(np.min(np.abs(eta.gain - 3.3)), 0.0, atol=1e-9)  # what was found is among them
+    np.testing.assert_allclose(np.min(np.abs(eta.gain - 3.3)), 0.0, atol=1e-9)  # the final gain is one of the points
     np.testing.assert_allclose(eta.value / eta.value[0], (eta.gain / eta.gain[0]) ** 2, rtol=1e-4)
     np.testing.assert_allclose(eta.over / eta.over[0], (eta.gain / eta.gain[0]) ** 2, rtol=1e-4)
 
 
-def test_beside_the_gain_that_a_profile_is_of_all_are_as_found():
-    """The width's too, whose interval begins elsewhere for every observer's gain."""
+def test_a_profile_varies_only_its_own_gain():
+    """This also holds for sign_width, whose lower bound depends on the observer's gain."""
     names = ("eta", "observer_gain", "sign_width")
     bounds = Bounds(names, (2.5, 0.5, 1e-6), (5.0, 1000.0, 0.1), hop=1e-3)
     found = np.array([3.0, 20.0, 1e-3])
@@ -80,8 +80,11 @@ def test_beside_the_gain_that_a_profile_is_of_all_are_as_found():
     np.testing.assert_allclose(profiles["sign_width"].gain[[0, -1]], [1e-3 / 20.0, 0.1])
 
 
-def test_where_a_trial_fails_no_limit_is_kept_and_without_one_that_ends_there_is_no_goal_and_no_slope():
-    """Of two trials the first fails below 0.5 of the gain, the other below 0.25; those that end keep the limit."""
+def test_profiles_and_gradient_check_handle_failed_trials():
+    """The first of two trials fails for gains below 0.5, the second one below 0.25. Completed trials keep the limit.
+
+    A failed trial breaks the limit. If both fail, the objective and the gradient error are NaN.
+    """
     bounds = Bounds(("k",), (0.01,), (1.0,))
 
     def fly(problem: Any, share: np.ndarray) -> Measured:
@@ -104,16 +107,16 @@ def test_where_a_trial_fails_no_limit_is_kept_and_without_one_that_ends_there_is
     assert trust.slope_error(evaluate, asked, bounds.share(np.array([0.7]))) == 0.0
 
 
-def test_sensitivities_at_a_bound_are_taken_inside_it(quiet):
-    """The clock has no samples beyond; a power p is the same to one side: off by p (p - 1) h / 2 for a step of h."""
+def test_sensitivities_at_a_bound_use_points_inside_it(quiet):
+    """The clock has no samples beyond the bound. One-sided differences in logarithms are accurate for powers."""
     for at in (0, 1):
         gains = np.array([3.3, (BOUNDS.lower, BOUNDS.upper)[at][1], (BOUNDS.upper, BOUNDS.lower)[at][2]])
         powers = trust.sensitivities(quiet, BOUNDS, gains, ("peak_torque",))["peak_torque"]
         np.testing.assert_allclose([powers["eta"], powers["t_f"]], [2.0, -2.0], rtol=1e-4)
 
 
-def test_a_gain_that_is_zero_has_no_sensitivity_and_hides_no_others(monkeypatch):
-    """The error is the first gain's square, whatever the second, which is zero."""
+def test_a_zero_gain_has_no_sensitivity_and_the_other_gains_have_one(monkeypatch):
+    """The error is the square of the first gain. The second gain is zero and has no effect."""
 
     def fly(_, gains):
         errors = np.tile(gains[:, :1] ** 2, (1, 4))
@@ -124,19 +127,19 @@ def test_a_gain_that_is_zero_has_no_sensitivity_and_hides_no_others(monkeypatch)
     bounds = Bounds(problem.names, (1.0, -1.0), (3.0, 1.0))
     found = trust.sensitivities(problem, bounds, np.array([2.0, 0.0]), ("window_error",))
     assert list(found["window_error"]) == ["k"]
-    np.testing.assert_allclose(found["window_error"]["k"], 2.0, rtol=1e-4)  # see above
+    np.testing.assert_allclose(found["window_error"]["k"], 2.0, rtol=1e-4)  # error of the finite differences, as above
 
 
 @pytest.mark.parametrize(("ratio", "flat"), [(1.0, True), (1.005, True), (1.02, False), (3.0, False)])
-def test_what_moves_goal_and_limits_by_less_than_a_percent_is_flat(ratio, flat):
+def test_a_gain_is_flat_if_objective_and_limits_change_by_less_than_one_percent(ratio, flat):
     ones, moved = np.ones(3), np.array([2.0, 2.0 * ratio, 2.0])
     assert trust.Profile(ones, moved, ones, np.log(moved)).flat == flat
-    assert trust.Profile(ones, ones, moved, 0.0 * ones).flat == flat  # t_f, say, which other gains leave as it is
-    assert trust.Profile(ones, ones, ones, np.log(moved)).flat == flat  # what the torque weighs
-    assert trust.Profile(ones, moved, 0.0 * ones, np.log(moved)).flat == flat  # no requirement
+    assert trust.Profile(ones, ones, moved, 0.0 * ones).flat == flat  # constant objective such as t_f
+    assert trust.Profile(ones, ones, ones, np.log(moved)).flat == flat  # torque term of F
+    assert trust.Profile(ones, moved, 0.0 * ones, np.log(moved)).flat == flat  # no requirements
 
 
-def test_without_a_requirement_there_is_no_limit_to_move(quiet):
+def test_profiles_without_requirements_depend_on_the_objective_only(quiet):
     free = objective.problem(quiet.parts, quiet.dispersion, 3, np.arange(8), BOUNDS.names)
     found = trust.profiles(
         Evaluator(BOUNDS), replace(free, goal="peak_torque"), BOUNDS.share(np.array([3.3, 1.0, 19.0]))
@@ -144,24 +147,24 @@ def test_without_a_requirement_there_is_no_limit_to_move(quiet):
     assert {name: profile.flat for name, profile in found.items()} == {"eta": False, "delta": True, "t_f": False}
 
 
-def test_slopes_are_checked_against_differences():
+def test_gradients_are_checked_against_finite_differences():
     noisy = moved_in_time()
-    # not where t_f - delta is a multiple of the period: there the first period's noise has a kink
+    # t_f - delta is not a multiple of the period, because the noise of the first period has a kink there
     evaluate, z = Evaluator(BOUNDS), BOUNDS.share(np.array([3.3, 1.07, 19.0]))
-    assert trust.slope_error(evaluate, noisy, z) < 1e-6  # of order 4 over 1e-3
+    assert trust.slope_error(evaluate, noisy, z) < 1e-6  # differences of order 4
 
     class Wrong(Evaluator):
         def slopes(self, problem, share):
             seen = super().slopes(problem, share)
             return replace(seen, f_slope=seen.f_slope * np.array([1.0, 1.01, 1.0]))
 
-    behind = z + 3 * trust.DIFFERENCE * np.array([0.0, 1.0, 1.0])  # where the slopes by times are taken
+    behind = z + 3 * trust.DIFFERENCE * np.array([0.0, 1.0, 1.0])  # point of the gradients
     share = np.abs(evaluate.slopes(noisy, behind[None]).f_slope[0])
     expected = 0.01 * share[1] / (share * [1.0, 1.01, 1.0]).max()
     np.testing.assert_allclose(trust.slope_error(Wrong(BOUNDS), noisy, z), expected, rtol=1e-3)
 
 
-def test_intervals_of_a_mean_and_an_rms_are_those_of_large_samples():
+def test_intervals_of_mean_and_rms_agree_with_large_sample_theory():
     values = np.random.default_rng(1).normal(5.0, 1.0, 4000)
     low, high = trust.interval(values) or (0.0, 0.0)
     half = stats.norm.ppf(0.975) * values.std() / np.sqrt(values.size)
@@ -172,24 +175,24 @@ def test_intervals_of_a_mean_and_an_rms_are_those_of_large_samples():
     np.testing.assert_allclose([low, high], [rms - half, rms + half], atol=0.1 * half)
 
 
-def test_intervals_hold_the_truth_about_as_often_as_they_say():
+def test_intervals_contain_the_true_value_with_their_confidence():
     rng = np.random.default_rng(2)
     held = 0
     for _ in range(100):
         low, high = trust.interval(rng.normal(0.0, 1.0, 50), trust.rms) or (0.0, 0.0)
         held += low <= 1.0 <= high
-    assert 86 <= held <= 100  # 95 expected; 3 sigma is 6.5, and two for 50 values being few
+    assert 86 <= held <= 100  # 95 expected, 3 sigma is 6.5, and few values cost about 2
 
 
-def test_a_ratio_over_the_same_trials_has_a_narrower_interval():
+def test_a_ratio_over_the_same_trials_has_a_narrow_interval():
     rng = np.random.default_rng(3)
     common = rng.lognormal(0.0, 0.5, 500)
     low, high = trust.ratio_interval(10.0 * common, common * rng.normal(1.0, 0.01, 500)) or (0.0, 0.0)
     assert low < 10.0 < high
-    assert high - low < 0.05  # each RMS alone is known to 5 %
+    assert high - low < 0.05  # each single RMS has an uncertainty of 5 %
 
 
-def test_what_cannot_be_resampled_has_no_interval():
+def test_equal_or_too_few_values_have_no_interval():
     assert trust.interval(np.full(100, 2.0)) is None
     assert trust.interval(np.arange(7.0)) is None
     assert trust.interval(np.arange(8.0)) is not None
@@ -209,17 +212,17 @@ def test_differential_evolution_finds_the_same_optimum(monkeypatch):
     assert abs(checked.distance) < 1e-3
     np.testing.assert_allclose(np.log(found.value / checked.value), checked.distance, atol=1e-12)
     assert checked.rollouts >= 30 * 4
-    # and where the search is stopped at its start, the distance says so
+    # the distance is large for a search that has not left its starting point
     lost = replace(found, share=evaluate.bounds.share(np.array([2.3, 3.0])))
     assert global_check.check(evaluate, lost, 0).distance > 0.5
 
 
 @pytest.mark.parametrize(("share", "kept"), [(0.985, True), (1.01, False)])
-def test_a_global_search_is_judged_by_the_limits_themselves(monkeypatch, share, kept):
-    """Gains that keep a limit, but not all of the margin that a search keeps from it, keep the limit."""
+def test_the_global_check_reports_the_original_limits(monkeypatch, share, kept):
+    """Gains that keep the original limit, but not the tightened limit, count as keeping it."""
     monkeypatch.setattr(global_check, "GENERATIONS", 1)
     monkeypatch.setattr(global_check, "POPULATION", 4)
-    bounds = Bounds(BOUNDS.names, (3.0, 0.5, 20.0), (3.0001, 0.5001, 20.0001))  # all gains ask for one torque
+    bounds = Bounds(BOUNDS.names, (3.0, 0.5, 20.0), (3.0001, 0.5001, 20.0001))  # one torque for all gains
     evaluate = Evaluator(bounds)
     peak = float(evaluate.fly(moved_in_time(peak_torque=1.0), np.full((1, 3), 0.5)).beyond[0]) + 1.0
     settings, limit = optimise.Settings(1, 2, 1, judged=False, margins={"peak_torque": 0.03}), peak / share
@@ -230,7 +233,7 @@ def test_a_global_search_is_judged_by_the_limits_themselves(monkeypatch, share, 
 
 @dataclass(frozen=True)
 class Told:
-    """A problem of one gain with one requirement, and margins or None."""
+    """A problem with one gain and one requirement, with or without margins."""
 
     limit: float = 1.0
     margins: Any = None
@@ -241,7 +244,7 @@ class Told:
 
 
 class Steps:
-    """Evaluates F = 3 + share, as of a t_f, without a value beyond 0.9, and c; counts what is asked for margins."""
+    """Evaluates F = 3 + share, infinite above 0.9, and a given c. It counts the points with margins."""
 
     def __init__(self, c):
         self.c, self.rollouts, self.judged = c, 0, 0
@@ -253,10 +256,10 @@ class Steps:
         return Measured(2.0 + share, f, self.c(problem, share)[:, :, None], f)
 
 
-def test_a_global_search_keeps_the_margin_that_the_search_keeps(monkeypatch):
-    """A metric of 1.05, from 0.3 on 0.95, from 0.6 on 0.8: 10 % from a limit of 1.
+def test_the_global_check_uses_the_tightened_limits_of_the_search(monkeypatch):
+    """The metric is a step function, and only its last step keeps the limit of 1 tightened by 10 %.
 
-    What breaks the limit by a little is not looked at for its F, which is less there, nor what has none.
+    F is smaller at points that break the limit slightly, and infinite at others. Neither may be the result.
     """
     monkeypatch.setattr(global_check, "POPULATION", 10)
     metric = [1.05, 0.95, 0.8]
@@ -266,17 +269,17 @@ def test_a_global_search_keeps_the_margin_that_the_search_keeps(monkeypatch):
     searched: Any = SimpleNamespace(problem=Told(), margins={"peak_torque": 0.1}, share=np.array([0.8]))
     found = global_check.check(evaluate, searched, 1, sloped=False)
     assert found.kept
-    assert 2.6 <= found.gains["eta"] < 2.6 + 10.0 * global_check.SPREAD  # at which the population's F ends to differ
+    assert 2.6 <= found.gains["eta"] < 2.6 + 10.0 * global_check.SPREAD  # spread of F in the final population
     np.testing.assert_allclose(np.log(found.value), found.gains["eta"] + 1.0, rtol=1e-12)
     np.testing.assert_allclose(found.distance, 2.8 - found.gains["eta"], rtol=1e-12)
     assert found.rollouts == evaluate.rollouts
 
 
-def test_a_global_search_asks_for_margins_only_where_they_decide(monkeypatch):
-    """And ends where it would with them at every point: there the row of margins is one of what is flown."""
+def test_the_global_check_computes_margins_only_for_surviving_points(monkeypatch):
+    """The result equals the result with margins at every point, which a row of the metrics represents here."""
     monkeypatch.setattr(global_check, "POPULATION", 10)
 
-    def lazily(problem, share):  # breaks the requirement below 0.2, the margins below 0.6
+    def lazily(problem, share):  # the requirement is broken below 0.2, and the margins below 0.6
         rows = [0.2 - share, 0.6 - share] if problem.margins else [0.2 - share]
         return np.concatenate(rows, axis=1)
 
@@ -291,7 +294,5 @@ def test_a_global_search_asks_for_margins_only_where_they_decide(monkeypatch):
     (found, lazy), (eager, every) = ends["gain_margin"], ends[None]
     assert (found.gains, found.value) == (eager.gains, eager.value)
     assert found.kept
-    assert (
-        lazy.rollouts - lazy.judged == every.rollouts - 3
-    )  # the best alone, it once more and the search's end: with all
-    assert lazy.judged < 0.9 * every.rollouts  # all of them if it asked everywhere
+    assert lazy.rollouts - lazy.judged == every.rollouts - 3  # 3 single points have margins in both cases
+    assert lazy.judged < 0.9 * every.rollouts  # fewer than all points

@@ -1,4 +1,4 @@
-"""Gradients of the noisy loss, bounds, the search and what is handed over."""
+"""Tests of gradients of the noisy objective, bounds, the search, and the reported gains."""
 
 from dataclasses import replace
 
@@ -44,13 +44,13 @@ SPREAD = variation.Dispersion({"initial_state": RandomNumbers("uniform", vector(
 
 @pytest.fixture(autouse=True)
 def short_rows(monkeypatch):
-    """As those of `small_search`, for what looks at points without it."""
+    """Use short rows, as `small_search` does, in tests without it."""
     monkeypatch.setattr(flights, "ROW", 10)
 
 
 @pytest.fixture(scope="module", params=helpers.short(["chain", "spacecraft"], ["chain"]))
 def loss(request):
-    """ln RMS window error of 6 noisy trials over (eta, delta, l, t_f), and its derivative, compiled once."""
+    """Return ln RMS window error of 6 noisy trials as a function of (eta, delta, l, t_f), and its derivative."""
     if request.param == "chain":
         model, wave = integrator_chain.chain(2), disturbances.Sinusoid(*(vector([v]) for v in (0.01, 0.1, 0.0, 0.0)))
         observer = nonlinear.NonlinearObserver(model, vector([10.0]), vector(1e-3), vector(0.0))
@@ -74,7 +74,7 @@ def loss(request):
 
 
 def central(value, at, k, h):
-    """Fourth-order central difference along one gain."""
+    """Return the fourth-order central finite difference along one gain."""
     steps = np.eye(at.size)[k] * h
     f = [float(value(jnp.asarray(at + n * steps))) for n in (-2, -1, 1, 2)]
     return (f[0] - 8 * f[1] + 8 * f[2] - f[3]) / (12 * h)
@@ -91,14 +91,14 @@ def test_gradients_of_the_noisy_loss_agree_with_central_differences(loss):
 
 
 @pytest.mark.parametrize("delta", [0.5, 1.0, 2.0])
-def test_loss_and_gradient_are_finite_and_continuous_where_delta_is_a_multiple_of_the_period(loss, delta):
+def test_loss_is_continuous_and_gradient_is_finite_if_delta_is_a_multiple_of_the_period(loss, delta):
     value, slope = loss
     points = [jnp.asarray([3.2, delta + nudge, 12.0, 20.0]) for nudge in (-1e-7, 0.0, 1e-7)]
     values, slopes = np.array([value(p) for p in points]), np.array([slope(p) for p in points])
     assert np.all(np.isfinite(slopes))
-    # continuous: what is left is the slope (and the curvature) times the nudge
+    # continuous: the change of the value is the derivative times the step
     np.testing.assert_allclose(values, values[1], atol=2e-7 * np.abs(slopes).max() + 1e-12)
-    # the first period vanishes there, and with it its share of the noise: the slope is one of its two sides'
+    # the first period and its noise vanish there, so the derivative equals one of the one-sided derivatives
     sides = [np.abs(slopes[1] - slopes[k]).max() for k in (0, 2)]
     assert min(sides) < 1e-4 * np.abs(slopes).max()
     assert max(sides) < 0.05 * np.abs(slopes).max()
@@ -106,7 +106,7 @@ def test_loss_and_gradient_are_finite_and_continuous_where_delta_is_a_multiple_o
 
 @pytest.mark.long
 def test_forward_and_reverse_mode_agree_for_a_spacecraft():
-    """For a chain see the slopes of tail and share."""
+    """The test of gradients of tail and quantile covers a chain."""
     run = parts(5.0, 3.0, 0.5, period=0.1, noise=(2e-5, 1e-6), t_end=6.5)
 
     def value(at):
@@ -118,7 +118,7 @@ def test_forward_and_reverse_mode_agree_for_a_spacecraft():
     np.testing.assert_allclose(jax.jit(jax.jacfwd(value))(at), jax.jit(jax.grad(value))(at), rtol=1e-9)
 
 
-def test_bounds_map_shares_into_the_interval_and_back():
+def test_bounds_map_normalised_gains_to_gains_and_back():
     some = shares.Bounds(("eta", "delta", "observer_gain"), (2.05, 0.05, 0.5), (8.0, 5.0, 300.0))
     assert list(some.logarithmic) == [False, True, True]
     rng = np.random.default_rng(0)
@@ -132,7 +132,7 @@ def test_bounds_map_shares_into_the_interval_and_back():
     assert some.at_bound(np.array([2.051, 0.5, 299.9])) == {"eta": "lower", "observer_gain": "upper"}
 
 
-def test_a_gain_that_may_be_negative_is_searched_between_its_bounds_as_they_are():
+def test_a_gain_that_may_be_negative_is_searched_on_a_linear_scale():
     some = shares.Bounds(("k", "lead"), (0.1, -1.0), (10.0, 3.0))
     assert list(some.logarithmic) == [True, False]
     np.testing.assert_allclose(some.gains(jnp.asarray([0.5, 0.5])), [1.0, 1.0], rtol=1e-14)
@@ -140,8 +140,11 @@ def test_a_gain_that_may_be_negative_is_searched_between_its_bounds_as_they_are(
     assert some.at_bound(np.array([1.0, -1.0])) == {"lead": "lower"}
 
 
-def test_the_narrowest_sign_follows_the_observer():
-    """K2 is inverse to the observer's gain, and at half of what K2 moves s by in a period the sampled sign hops."""
+def test_the_lower_bound_of_sign_width_depends_on_the_observer_gain():
+    """K2 is inversely proportional to the observer gain.
+
+    The sampled switching term overshoots if sign_width is at most half of the change of s by K2 in one period.
+    """
     tune = {"free": ["eta", "delta", "observer_gain", "k1", "sign_width"]}
     table = {"loop": {"mode": "sampled", "period": 0.05}, "hardware": {"rate_noise": 1e-6}, "tune": tune}
     made = scenario.from_tables(table)
@@ -155,41 +158,41 @@ def test_the_narrowest_sign_follows_the_observer():
         np.testing.assert_allclose(width, envelopes.narrowest_sign(moved, 0.05) / 2, rtol=1e-12)
         inside = np.append(share[:4], 0.3)
         np.testing.assert_allclose(some.share(np.asarray(some.gains(jnp.asarray(inside)))), inside, rtol=1e-9)
-    # bounds that are the user's stay as they are
+    # bounds from the scenario file do not change
     given = scenario.replace(made, tune=tune | {"bounds": {"sign_width": [1e-7, 1e-2]}})
     assert shares.of_scenario(given, ready.parts).hop == 0.0
 
 
-def test_the_narrowest_sign_is_that_of_the_slowest_axis():
-    """Where each axis of the observer has a gain of its own, K2 hangs on the smallest of them."""
+def test_the_lower_bound_of_sign_width_depends_on_the_slowest_observer_axis():
+    """If each axis has its own observer gain, K2 depends on the smallest one."""
     names = ("observer_gain_1", "sign_width", "observer_gain_2")
     some = shares.Bounds(names, (5.0, 1e-6, 5.0), (80.0, 1.0, 80.0), hop=0.2)
     for slow in (0, 2):
         share = np.where(np.arange(3) == slow, 0.25, 0.75)
         share[1] = 0.0
         at = np.asarray(some.gains(jnp.asarray(share)))
-        np.testing.assert_allclose(np.sort(at), [0.2 / 10.0, 10.0, 40.0], rtol=1e-12)  # 5 to 80 by factors of 2
+        np.testing.assert_allclose(np.sort(at), [0.2 / 10.0, 10.0, 40.0], rtol=1e-12)  # shares 0.25, 0.75 of 5 to 80
         np.testing.assert_allclose(some.share(at), share, atol=1e-12)
 
 
-def test_gains_handed_over_are_rounded_inside_their_bounds():
+def test_reported_gains_are_rounded_within_their_bounds():
     some = shares.Bounds(("eta", "k1"), (2.123456789, 0.1), (5.0, 1.23456789))
     found = some.rounded(np.array([2.123456789, 1.23456789]), 6)
     assert found == {"eta": 2.12346, "k1": 1.23456789}
     assert some.rounded(np.array([2.5012345678, 0.1]), 6) == {"eta": 2.50123, "k1": 0.1}
-    times = shares.Bounds(("delta",), (0.1,), (5.0,))  # on its sample, however long the period
+    times = shares.Bounds(("delta",), (0.1,), (5.0,))  # the hand-over stays on its sample
     assert times.rounded(np.array([7 * 0.123456789]), 6)["delta"] == pytest.approx(7 * 0.123456789, rel=1e-11)
 
 
 measure = programs.jit(objective.measure)
 WITHIN = shares.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0))
-FAR_OFF = dict.fromkeys(("peak_torque", "effort", "window_error"), 1e9)  # limits that nothing comes near
+FAR_OFF = dict.fromkeys(("peak_torque", "effort", "window_error"), 1e9)  # limits far out of reach
 
 
 def problem(count=8, dispersion=SPREAD, may_break=None, **limits):
-    """Of a double integrator, or of the spacecraft where attitudes are drawn: the search does not know which it is.
+    """Return a problem of a double integrator, or of the spacecraft if initial attitudes are dispersed.
 
-    Limits that are not asked for are far off, so that one program serves all.
+    Limits that are not given are out of reach, so that one program serves all tests.
     """
     if "initial_attitude" not in dispersion.kinds:
         run = chain_parts([25.0, 0.0], 20.0, 3.0, 0.5, period=0.2, noise=[5e-4, 2.5e-5])
@@ -202,17 +205,17 @@ def problem(count=8, dispersion=SPREAD, may_break=None, **limits):
 
 
 def looked_at(some, *gains):
-    """F, c and the goal's logarithm at these gains as a search has them."""
+    """Return F, c and the logarithm of the objective at these gains, as `Evaluator` computes them."""
     found = Evaluator(WITHIN).fly(some, WITHIN.share(np.asarray(gains))[None])
     return found.f[0], found.c[0], found.value[0]
 
 
 def flown_at(some, trials, *gains):
-    """Metrics of these trials."""
+    """Return the metrics of these trials."""
     return flights.trials(some.others(np.asarray(trials)), np.asarray(gains)).metrics
 
 
-def test_measure_is_the_log_of_the_rms_and_the_ratio_to_the_limits():
+def test_measure_returns_the_logarithm_of_the_rms_and_the_ratios_to_the_limits():
     some = problem(peak_torque=0.7, effort=5.0)
     flown = flown_at(some, np.arange(8), 3.0, 0.7)
     for f, c, _ in (measure(some, vector([3.0, 0.7])), looked_at(some, 3.0, 0.7)):
@@ -222,7 +225,7 @@ def test_measure_is_the_log_of_the_rms_and_the_ratio_to_the_limits():
 
 
 @pytest.mark.parametrize("tail", helpers.short([1, 3, 8], [3]))
-def test_the_tail_is_the_mean_of_the_worst(tail):
+def test_a_tail_is_the_rms_of_the_worst_trials(tail):
     some = replace(problem(), tail=tail)
     f, _, _ = looked_at(some, 3.0, 0.7)
     worst = np.sort(flown_at(some, np.arange(8), 3.0, 0.7).window_error)[-tail:]
@@ -236,17 +239,17 @@ def test_the_tail_is_the_mean_of_the_worst(tail):
         ("mean", None, 3.0), ("quantile", 1, 4.0), ("quantile", 2, 2.0),
     ],
 )  # fmt: skip
-def test_a_statistic_ignores_trials_that_fail(statistic, tail, value):
-    """Two of four trials end, with the values 2 and 4. A tail may have more trials than end."""
+def test_a_statistic_ignores_failed_trials(statistic, tail, value):
+    """Two of four trials complete, with the values 2 and 4. A tail can be longer than the completed trials."""
     values = jnp.array([2.0, objective.FAILED, 4.0, objective.FAILED])
     np.testing.assert_allclose(np.exp(objective._log_statistic(values, tail, statistic)), value, rtol=1e-12)
 
 
 @pytest.mark.parametrize("least", helpers.short([1, 5, 8], [5]))
-def test_a_limit_for_a_share_of_the_trials_is_the_limit_on_the_last_of_them(least):
-    """The largest c is that order statistic of the averaged trials; of added trials those count that are said to."""
+def test_a_quantile_limit_is_a_limit_on_an_order_statistic(least):
+    """The largest c is an order statistic of the averaged trials. Added trials do not count in the quantile."""
     some = problem(may_break=8 - least, peak_torque=0.7, effort=5.0)
-    some = objective.with_trials(some, np.arange(8, 11))  # they must keep what every trial must keep
+    some = objective.with_trials(some, np.arange(8, 11))  # they must keep the limits on every trial
     f, c, _ = looked_at(some, 3.0, 0.7)
     flown = flown_at(some, np.arange(11), 3.0, 0.7)
     np.testing.assert_allclose(np.exp(f), np.sqrt(np.mean(flown.window_error[:8] ** 2)), rtol=1e-10)
@@ -257,7 +260,7 @@ def test_a_limit_for_a_share_of_the_trials_is_the_limit_on_the_last_of_them(leas
 
 @programs.jit
 def backwards(some, at):
-    """Slopes of F and of the largest c by the gains, in reverse mode."""
+    """Return the gradients of F and of the largest c with respect to the gains, in reverse mode."""
 
     def value(at):
         f, c, _ = objective.measure(some, at)
@@ -266,7 +269,7 @@ def backwards(some, at):
     return jax.jacrev(value)(at)
 
 
-def test_slopes_of_tail_and_share_agree_in_both_modes_and_with_central_differences():
+def test_gradients_of_tail_and_quantile_agree_in_both_modes_and_with_finite_differences():
     some, evaluate = replace(problem(may_break=2, peak_torque=0.7), tail=2), Evaluator(WITHIN)
     at, h = np.array([3.1, 0.73]), 1e-4
     share = WITHIN.share(at)
@@ -282,7 +285,7 @@ def test_slopes_of_tail_and_share_agree_in_both_modes_and_with_central_differenc
 
 
 @pytest.mark.long
-def test_a_search_for_the_worst_case_ends_with_a_smaller_one_than_a_search_for_the_rms(monkeypatch):
+def test_minimising_the_worst_case_gives_a_smaller_worst_case_than_minimising_the_rms(monkeypatch):
     helpers.small_search(monkeypatch)
     largest = {}
     for tail in (None, 1):
@@ -293,7 +296,7 @@ def test_a_search_for_the_worst_case_ends_with_a_smaller_one_than_a_search_for_t
     assert largest[1] <= largest[None] * (1 + 1e-6)
 
 
-def test_requirements_and_statistic_of_a_scenario_reach_the_problem():
+def test_statistic_of_a_scenario_sets_the_tail_and_requirements_set_the_held_out_trials():
     """Of 64 trials the worst 6 are the tail for CVaR at 90 %; the 7th worst is the 90 % quantile."""
     share = Requirement("peak_torque", 0.5, None, 0.9, None)
     sure = Requirement("peak_torque", 0.5, None, 0.9973, 0.9)
@@ -306,14 +309,14 @@ def test_requirements_and_statistic_of_a_scenario_reach_the_problem():
         assert posing._tail(table, 64) == tail
 
 
-NEAR = random_turns(np.pi - 1e-5, np.pi)  # the law's singularity
+NEAR = random_turns(np.pi - 1e-5, np.pi)  # next to the law's singularity
 FAR = variation.Dispersion(
     {"initial_state": RandomNumbers("uniform", vector([1e308, 0.0]))}
-)  # no square of it is finite
+)  # its square is infinite in double precision
 
 
 @pytest.mark.parametrize("lost", helpers.short([FAR, NEAR], [FAR]), ids=["far", "near"])
-def test_a_failed_trial_counts_against_the_gains_and_leaves_the_slope_finite(lost):
+def test_failed_trials_increase_f_and_gradients_stay_finite(lost):
     some = problem(dispersion=lost, peak_torque=0.7)
     evaluate = Evaluator(WITHIN)
     found = evaluate.slopes(some, evaluate.bounds.share(np.array([3.0, 0.7]))[None])
@@ -323,8 +326,8 @@ def test_a_failed_trial_counts_against_the_gains_and_leaves_the_slope_finite(los
     assert np.all(np.isfinite(found.c_slope))
 
 
-def test_a_limit_that_is_far_out_of_reach_is_no_failed_trial(monkeypatch):
-    """A thousand times beyond one, and within another: each says how far, where every trial ends."""
+def test_a_large_violation_does_not_count_as_a_failed_trial(monkeypatch):
+    """All trials complete. One limit is exceeded more than a thousandfold, and the others are kept."""
     helpers.small_search(monkeypatch)
     monkeypatch.setattr(worst, "SCREENED", 16)
     some, wanted = (
@@ -341,7 +344,7 @@ def test_a_limit_that_is_far_out_of_reach_is_no_failed_trial(monkeypatch):
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_a_search_whose_limit_is_out_of_reach_adds_no_trials(monkeypatch, count):
-    """Harder trials would bring the gains no nearer. A search from several starting points ends with a global one."""
+    """Harder trials cannot help. A search from several starting points continues with a global search."""
     helpers.small_search(monkeypatch)
     monkeypatch.setattr(worst, "SCREENED", 16)
     monkeypatch.setattr(rounds.Rounds, "harder", lambda *_: pytest.fail("harder"))
@@ -360,15 +363,15 @@ def test_a_search_whose_limit_is_out_of_reach_adds_no_trials(monkeypatch, count)
 
 
 @pytest.mark.parametrize(("joined", "averaged"), [(0, 32), (8, 24), (16, 16), (24, 16)])
-def test_starts_are_given_up_on_few_trials_those_that_joined_among_them(joined, averaged):
+def test_first_searches_use_few_trials_including_the_trials_that_joined(joined, averaged):
     few = descents._few_trials(objective.with_trials(problem(40, peak_torque=0.7), np.arange(40, 40 + joined)))
     assert np.asarray(few.trials).tolist() == [*range(averaged), *range(40, 40 + joined)]
     assert few.averaged == averaged
 
 
 @pytest.mark.parametrize("far", [0.5, 1e7])
-def test_a_failed_trial_is_worse_than_any_that_ends_however_far_beyond_its_limit(far):
-    """Two trials at two points: nearer the limit with one that fails, farther with none."""
+def test_a_failed_trial_is_worse_than_any_violation(far):
+    """At the first of two points, one of two trials fails. At the second point, both violations are larger."""
     c = np.asarray([[[0.4 * far, objective.FAILED - 1.0]], [[far, far]]])
     seen = Measured(np.zeros((2, 1)), np.asarray([1.0, 2.0]), c, np.zeros(2))
     share = np.asarray([[0.2], [0.8]])
@@ -384,13 +387,13 @@ def test_a_failed_trial_is_worse_than_any_that_ends_however_far_beyond_its_limit
 
 @pytest.mark.long
 @pytest.mark.parametrize("tail", [None, 3])
-def test_a_trial_that_fails_whatever_the_gains_hides_nothing_of_the_others(tail):
-    """One that starts in the law's singularity: F is that of the others, and what a failure costs, to 14 digits."""
+def test_a_trial_that_always_fails_does_not_change_the_result_for_the_others(tail):
+    """One trial starts at the law's singularity. F equals F of the other trials plus the penalty, to 14 digits."""
     turned = random_turns(0.4, np.pi)
     eight = replace(problem(8, turned, peak_torque=0.7), tail=tail)
     ((name, drawn),) = eight.coordinates.items()
     lost = 0.9 * drawn
-    lost[5, 2] = 1.0  # by 180 degrees, the others by less than 165
+    lost[5, 2] = 1.0  # 180 deg; all other trials start below 165 deg
     left = np.delete(np.arange(8), 5)
     asked = {name: getattr(eight, name)[:, left] for name in ("among", "counted")}
     others = replace(eight, trials=eight.trials[left], coordinates={name: lost[left]}, averaged=7, tail=tail, **asked)
@@ -411,8 +414,8 @@ def test_a_trial_that_fails_whatever_the_gains_hides_nothing_of_the_others(tail)
     np.testing.assert_array_equal(best.worst, known.worst)
 
 
-def test_search_finds_the_constrained_optimum(monkeypatch):
-    """Against a brute-force scan of the same problem, screening for harder trials left out."""
+def test_search_agrees_with_a_brute_force_scan(monkeypatch):
+    """The scan covers the same problem, almost without screening for harder trials."""
     helpers.small_search(monkeypatch)
     monkeypatch.setattr(worst, "SCREENED", 16)
     monkeypatch.setattr(starts, "SWEPT", 64)
@@ -425,23 +428,24 @@ def test_search_finds_the_constrained_optimum(monkeypatch):
     assert found.worst[0] <= 1.0
     assert [step.start for step in found.history] == sorted(step.start for step in found.history)
     assert {step.start for step in found.history} == set(range(3))
-    assert sum(told[0] == "searching" for told in seen) == 2 * 3  # three starts on two rungs
-    assert not any(np.isinf(told[3:]).any() for told in seen)  # where nothing is found yet there is no goal to tell
-    # 64 points are swept, and 16 trials screened twice; other hand-overs are looked at once or more
+    assert sum(told[0] == "searching" for told in seen) == 2 * 3  # three starting points in two stages
+    assert not any(np.isinf(told[3:]).any() for told in seen)  # NaN before the first point
+    # 64 Sobol points, two screenings of 16 trials, and at least one attempt with other hand-overs
     swept = (evaluate.rollouts - 2 * 16) / found.problem.trials.size
     assert 64 < swept <= 64 + descents.LOOKS * hand_overs.LOOKED
-    # twice half of the steps from the scenario's gains, and the limits there; twice half of them from each start, all
-    # of them from the most promising one, from other hand-overs, from its end and on two samples; eta put back
+    # Upper limit of the gradients. The scenario's gains: half of the steps twice, and one point for active limits. Each
+    # starting point: half of the steps twice. The best one: all steps. Then other hand-overs, the final search, two
+    # hand-overs on samples, and the reset of eta.
     most = 2 * 20 + 1 + 2 * 3 * 20 + 20 + descents.LOOKS * 40 + 3 * 40 + 2
     assert evaluate.gradients <= most * found.problem.trials.size
     np.testing.assert_allclose(found.gains[1] / 0.2, np.round(found.gains[1] / 0.2), rtol=1e-9)
-    # hand-overs on samples, as they are flown
+    # grid with hand-overs on samples
     grid = np.stack(np.meshgrid(np.linspace(2.1, 4.5, 49), 0.2 * np.arange(1, 26)), axis=-1).reshape(-1, 2)
     scan = evaluate.fly(found.problem, np.asarray([WITHIN.share(at) for at in grid]))
     margin = max(found.margins.values())
-    best = np.exp(scan.f[scan.beyond <= -margin].min())  # which it keeps
+    best = np.exp(scan.f[scan.beyond <= -margin].min())  # with the tightened limit
     assert found.value <= best * 1.01
-    assert found.worst[0] > 1.0 - 1.5 * margin  # and no more than it must
+    assert found.worst[0] > 1.0 - 1.5 * margin  # the limit is active
     f, c, _ = looked_at(found.problem, *found.gains)
     np.testing.assert_allclose(np.exp(f), found.value, rtol=1e-9)
     assert c.max() <= 0.0
@@ -476,7 +480,7 @@ def test_a_global_search_follows_if_harder_trials_lead_beyond_a_limit(monkeypatc
         if "Ctrl-C" in second and seeds:
             raise KeyboardInterrupt
 
-    joins = iter([True])  # once, nothing in fact
+    joins = iter([True])  # once, without adding a trial
     monkeypatch.setattr(rounds.Rounds, "harder", lambda self, *_: next(joins, False) and not vars(self).update(count=1))
     monkeypatch.setattr(descents.Descents, "again", end_lost)
     monkeypatch.setattr(descents.Descents, "search_globally", search_globally)
@@ -489,7 +493,7 @@ def test_a_global_search_follows_if_harder_trials_lead_beyond_a_limit(monkeypatc
 
 
 @pytest.mark.long
-def test_starts_begin_with_the_first_one_and_differ():
+def test_starting_points_differ_and_begin_with_the_given_one():
     first, designs = np.array([0.2, 0.3]), np.array([[0.4, 0.5]])
     share = starts.starting_points(Evaluator(WITHIN), problem(), first, designs, 4, 7, lambda *told: None)
     assert share.shape == (4, 2)
@@ -501,21 +505,21 @@ def test_starts_begin_with_the_first_one_and_differ():
     ("rows", "held"),
     [
         ([(0.0, [3.0, -9.0, 1.0, 2.0])], [1]),
-        ([(0.3, [3.0, -9.0, 1.0, 2.0])], [1]),  # broken
-        ([(-0.1, [3.0, -9.0, 1.0, 2.0])], []),  # not nearly reached
-        ([(-0.01, [3.0, -9.0, 1.0, 2.0]), (0.0, [1.0, -7.0, 5.0, 0.0])], [1, 0]),  # the nearest first
+        ([(0.3, [3.0, -9.0, 1.0, 2.0])], [1]),  # violated
+        ([(-0.1, [3.0, -9.0, 1.0, 2.0])], []),  # not nearly active
+        ([(-0.01, [3.0, -9.0, 1.0, 2.0]), (0.0, [1.0, -7.0, 5.0, 0.0])], [1, 0]),  # the largest c first
         ([(0.0, [0.0, 0.0, 0.0, 0.0])], []),
         ([(0.0, [4.0, 1.0, 0.0, 0.0]), (0.0, [4.0, 1.0, 0.0, 0.0]), (0.0, [1.0, 1.0, 1.0, 9.0])], [0, 1]),
     ],
 )
-def test_gains_that_active_limits_hang_on_are_held_but_for_two(rows, held):
-    c = np.array([[[over - 0.5, over] for over, _ in rows]])  # of two trials the second one is nearer
+def test_gains_with_the_largest_effect_on_active_limits_are_held_except_for_two(rows, held):
+    c = np.array([[[over - 0.5, over] for over, _ in rows]])  # the second of two trials has the larger c
     slope = np.array([[[np.full(4, 1e3), np.asarray(by)] for _, by in rows]])
     seen = Sloped(np.zeros((1, 4)), np.zeros(1), c, np.zeros(1), np.zeros((1, 4)), slope)
     assert starts.held_by_limits(seen) == held
 
 
-def test_a_problem_of_fewer_trials_keeps_those_added_and_shares_of_the_others():
+def test_a_problem_with_fewer_trials_keeps_added_trials_and_fractions():
     some = replace(problem(may_break=2, peak_torque=0.7, effort=5.0), tail=2)
     some = objective.with_trials(some, np.arange(8, 11))
     fewer = objective.fewer_trials(some, 4)
@@ -532,15 +536,15 @@ def test_a_problem_of_fewer_trials_keeps_those_added_and_shares_of_the_others():
 @pytest.mark.parametrize(("width", "free", "sloped"), [
     (0.0, ["eta", "delta"], False), (1e-3, ["eta", "delta"], True), (0.0, ["eta", "sign_width"], True),
 ])  # fmt: skip
-def test_only_gains_flown_with_the_exact_sign_are_looked_for_without_slopes(width, free, sloped):
+def test_only_a_discontinuous_sign_leads_to_a_search_without_gradients(width, free, sloped):
     tables = {"loop": {"mode": "sampled"}, "controller": {"sign_width": width}, "tune": {"free": free, "trials": 4}}
     posed = posing.pose(scenario.from_tables(tables), 0)
     assert posed.sloped == sloped
     assert float(posed.problem.parts.controller.sign_width) == width
 
 
-def test_a_search_without_slopes_finds_the_optimum_too(monkeypatch):
-    """The goal of a search with them, for a law that has both: what differs is how it is found."""
+def test_a_search_without_gradients_finds_the_same_optimum(monkeypatch):
+    """Both kinds of search minimise the same objective, for a law with useful gradients."""
     helpers.small_search(monkeypatch)
     monkeypatch.setattr(descents, "MANY", 64)
     monkeypatch.setattr(evolution, "GENERATIONS", 25)
@@ -552,7 +556,7 @@ def test_a_search_without_slopes_finds_the_optimum_too(monkeypatch):
     np.testing.assert_allclose(found[False].value, found[True].value, rtol=1e-3)
 
 
-def test_statistics_count_failures_and_average_the_rest(monkeypatch):
+def test_statistics_count_failures_and_cover_the_other_trials(monkeypatch):
     trials = flights.trials(problem().others(np.arange(8)), np.array([3.0, 0.5]))
     lost = np.array([1, 4, 6])
     trials.status[lost] = rollout.SINGULAR
@@ -564,18 +568,18 @@ def test_statistics_count_failures_and_average_the_rest(monkeypatch):
     errors = trials.metrics.window_error[trials.ok]
     np.testing.assert_allclose(told["window_error"]["rms"], np.sqrt(np.mean(errors**2)))
     np.testing.assert_allclose(told["peak_torque"]["max"], trials.metrics.peak_torque[trials.ok].max())
-    second, last = np.sort(errors)[-2:]  # of five: 99 % of the way from the first to the last lies between these
+    second, last = np.sort(errors)[-2:]  # the 99 % quantile of five values lies between these
     np.testing.assert_allclose(told["window_error"]["q99"], second + 0.96 * (last - second), rtol=1e-12)
     assert told["window_error"]["median"] == np.sort(errors)[2]
     assert "min" not in told["window_error"]
-    monkeypatch.setattr(catalogues, "LARGER_IS_BETTER", ("window_error",))  # as shares of time are
+    monkeypatch.setattr(catalogues, "LARGER_IS_BETTER", ("window_error",))  # as for fractions of time
     told = tune_files.statistics(trials, "chain")
     first, second = np.sort(errors)[:2]
     assert told["window_error"]["min"] == first
     np.testing.assert_allclose(told["window_error"]["q01"], first + 0.04 * (second - first), rtol=1e-12)
 
 
-def test_the_goal_may_be_t_f_itself_or_another_metric():
+def test_the_objective_can_be_t_f_or_another_metric():
     some = problem()
     f, _, value = looked_at(replace(some, goal="peak_torque", tail=1), 3.0, 0.7)
     largest = flown_at(some, np.arange(8), 3.0, 0.7).peak_torque.max()
@@ -585,7 +589,7 @@ def test_the_goal_may_be_t_f_itself_or_another_metric():
     np.testing.assert_allclose([f, value], np.log(19.0), rtol=1e-15)
 
 
-def test_a_weighted_goal_is_a_product_of_powers():
+def test_torque_weight_is_an_exponent_of_the_rms_peak_torque():
     some = replace(problem(), torque_weight=0.3)
     f, _, value = looked_at(some, 3.0, 0.7)
     flown = flown_at(some, np.arange(8), 3.0, 0.7)
@@ -595,10 +599,10 @@ def test_a_weighted_goal_is_a_product_of_powers():
 
 
 @pytest.mark.parametrize("plant", helpers.short(["chain", "spacecraft"], ["chain"]))
-def test_the_shortest_t_f_for_a_torque_limit_is_the_one_theory_names(plant, monkeypatch):
+def test_shortest_t_f_for_a_torque_limit_agrees_with_theory(plant, monkeypatch):
     """From rest, without noise or disturbance: t_f = eta sqrt(2 max |J n| tan(theta/2) / limit) (theory 3.5).
 
-    Of a chain of two eta sqrt(|x| / limit): x'' = -eta^2 x / t_f^2 at t = 0.
+    A chain of order two has t_f = eta sqrt(|x| / limit), because x'' = -eta^2 x / t_f^2 at t = 0.
     """
     helpers.small_search(monkeypatch)
     eta, limit, theta = 3.0, 0.9, np.deg2rad(100.0)
@@ -614,7 +618,7 @@ def test_the_shortest_t_f_for_a_torque_limit_is_the_one_theory_names(plant, monk
     evaluate = Evaluator(shares.Bounds(("t_f", "delta"), (8.0, 0.4), (40.0, 4.0)))
     found = optimise.search(evaluate, some, wanted, np.array([20.0, 1.0]), optimise.Settings(2, 20, 0))
     expected = eta * np.sqrt(moved / limit)
-    # it keeps SURE_MARGIN of the limit, which costs half as much of t_f
+    # the limit is tightened by SURE_MARGIN, which increases t_f by half of it
     np.testing.assert_allclose(found.gains[0], expected * (1 + rounds.SURE_MARGIN / 2), rtol=2e-4)
     np.testing.assert_allclose(found.value, found.gains[0], rtol=1e-9)
     assert found.worst[0] <= 1.0

@@ -1,4 +1,4 @@
-"""A search in other units of time and inertia goes through the same points, and finds the same gains in those units."""
+"""Test that a search in other units of time and inertia finds the same gains, converted to these units."""
 
 import copy
 import tomllib
@@ -19,7 +19,7 @@ SMALL = {"trials": 8, "starts": 3, "steps": 8}
 
 
 def tables_of(name: str, **changes: Any) -> dict[str, Any]:
-    """Return the tables of a satellite, tuned by a small search; changes: of tables."""
+    """Return the tables of a satellite scenario with a small search. Changes replace whole tables."""
     raw = tomllib.loads((SATELLITES / f"{name}.toml").read_text())
     return {**copy.deepcopy(raw), **changes, "tune": SMALL}
 
@@ -31,14 +31,14 @@ def without_margins(name: str) -> dict[str, Any]:
     return {**tables, "requirements": requirements}
 
 
-@pytest.mark.long  # a search compiles for minutes; tests/scenario/test_units.py looks at defaults and bounds
+@pytest.mark.long  # compilation takes minutes; tests/scenario/test_units.py checks defaults and bounds
 @pytest.mark.parametrize(
     "tables",
     [without_margins("cubetas"), without_margins("sixu"), tables_of("microsat")],
     ids=["cubetas", "sixu", "microsat"],
 )
 def test_other_units_rescale_the_tuned_gains_and_change_nothing_else(tables):
-    """To 1e-9 in the gains, which are handed over with 10 digits; single trials amplify these digits."""
+    """Gains are reported with 10 digits and agree to 1e-9. Single trials amplify this rounding."""
     here, there = (tuner.tune(from_tables(one), 0, trusted=False) for one in (tables, in_units(tables, INERTIA, TIME)))
     units = gain_names.units_of(here.tuned)
     for name, value in here.gains.items():

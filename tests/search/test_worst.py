@@ -1,4 +1,4 @@
-"""The worst trial inside what the dispersions can draw, against closed forms."""
+"""Tests of the worst case within the dispersions against closed forms."""
 
 from dataclasses import replace
 
@@ -21,13 +21,14 @@ T_F, ETA = 20.0, 3.0
 LIMIT = 0.5
 
 
-FAR = dict.fromkeys(("peak_torque", "peak_rate", "effort", "settling_time"), 1e9)  # limits that nothing comes near
+FAR = dict.fromkeys(("peak_torque", "peak_rate", "effort", "settling_time"), 1e9)  # limits far out of reach
 
 
 def posed(dispersion, requirement=None, settling_angle=4.0, **others):
-    """A problem without noise or disturbance, from rest to the identity; settled, unless asked for, from the start.
+    """Return a problem without noise or disturbance, from rest to the identity attitude.
 
-    Beside what a test asks stand all of `FAR`, so that its programs are those of other tests.
+    All limits of `FAR` are added, so that the tests share programs. By default, the run counts as settled from the
+    start.
     """
     run = parts(T_F, ETA, 1.0, period=0.2, t_end=21.0, disturbance=sine(0.0), **others)
     run = replace(run, clock=clock.anchored(0.2, 21.0, T_F, 5.0), settling_angle=vector(settling_angle))
@@ -43,7 +44,7 @@ def sine(amplitude):
 
 
 def first_torque(inertia, theta, eta=ETA):
-    """Largest torque at t = 0 from rest over all axes: 2 eta^2 max |J n| tan(theta/2) / t_f^2 (theory 3.3)."""
+    """Return the largest torque at t = 0 from rest, 2 eta^2 max |J n| tan(theta/2) / t_f^2 (theory 3.3)."""
     return 2 * eta**2 * np.linalg.norm(inertia, axis=1).max() * np.tan(theta / 2) / T_F**2
 
 
@@ -66,17 +67,17 @@ def few_screened(monkeypatch):
     monkeypatch.setattr(flights, "ROW", 10)
 
 
-@pytest.mark.long  # what an ascent finds of a chain, and turns of a body by slopes and theory: below
+@pytest.mark.long  # shorter tests below cover the ascent for a chain, and gradients of attitudes
 @pytest.mark.parametrize("inertia", [(10.0, 12.0, 14.0), ((11.0, 1.5, -0.7), (1.5, 9.0, 0.4), (-0.7, 0.4, 14.0))])
-def test_the_worst_attitude_is_the_one_theory_names(inertia):
-    """For a torque component i, |(J n)_i| is largest along row i of J: the worst axis is that of the longest row."""
+def test_the_worst_attitude_agrees_with_theory(inertia):
+    """For torque component i, |(J n)_i| is largest along row i of J. The worst axis is along the longest row."""
     smallest, largest = np.deg2rad(20.0), np.deg2rad(140.0)
     spread = random_turns(smallest, largest)
     problem, wanted = posed(spread, inertia=inertia)
     found = worst.hardest(problem, wanted, np.array([ETA, 1.0]))
     tensor = np.diag(inertia) if np.ndim(inertia) == 1 else np.asarray(inertia)
     expected = first_torque(tensor, largest) / LIMIT
-    # what the ascent's last steps of 1e-2 leave of a maximum is of second order
+    # the error of a maximum is of second order in the last steps of 1e-2
     np.testing.assert_allclose(found.ratio, expected, rtol=2e-3)
     assert found.ratio <= expected * (1 + 1e-9)
     assert found.screened < found.ratio
@@ -89,15 +90,15 @@ def test_the_worst_attitude_is_the_one_theory_names(inertia):
     assert found.moved == ("initial_attitude",)
 
 
-@pytest.mark.long  # beyond all numbers: below
+@pytest.mark.long  # a shorter test below uses very large initial states
 @pytest.mark.parametrize("kind", [numbers.any_attitude(), numbers.axis_angle(np.pi / 2, np.pi)])
 def test_attitudes_up_to_180_degrees_have_no_worst_case(kind):
     problem, wanted = posed(variation.Dispersion({"initial_attitude": kind}))
     assert worst.hardest(problem, wanted, np.array([ETA, 1.0])).unbounded
 
 
-def test_turns_have_slopes_by_what_they_are_drawn_from():
-    """Against central differences, as the ascent moves them; at the ends of the angles too, where reals turn back."""
+def test_random_attitudes_are_differentiable_with_respect_to_their_coordinates():
+    """The derivatives by the variables of the ascent agree with finite differences, also at the largest angle."""
     name, spread, step = "initial_attitude", random_turns(0.4, 2.0), 1e-6
     problem, _ = posed(spread)
     y = np.array([[0.3, 0.6, 0.2], [0.7, 0.9, 1.0]])
@@ -121,13 +122,14 @@ def test_turns_have_slopes_by_what_they_are_drawn_from():
     np.testing.assert_allclose(longest, 2.0, rtol=1e-12)
 
 
-EDGE = 0.02  # of what an actuator may do too much
+EDGE = 0.02  # largest actuator scale factor error
 
 
 def swinging(x0, std, amplitude, settling_angle=1e9, **limits):
-    """A chain's problem: starts drawn, normal with these deviations (2,), the phase of a disturbance, two misfits.
+    """Return a problem of a chain with dispersions of the initial state, disturbance phase and two hardware errors.
 
-    Limits that are not asked for are far off; settled, unless asked for, from the start.
+    The initial state is normal with the standard deviations `std` (2,). Limits that are not given are out of reach. By
+    default, the run counts as settled from the start.
     """
     acting = disturbances.Sinusoid(*(vector([v]) for v in (amplitude, 0.1, 0.0, 0.0)))
     run = chain_parts([x0, 0.0], T_F, ETA, 1.0, period=0.2, disturbance=acting)
@@ -144,32 +146,35 @@ def swinging(x0, std, amplitude, settling_angle=1e9, **limits):
     return objective.problem(run, spread, 5, np.arange(8), ("eta", "delta"), wanted), wanted
 
 
-def test_normal_numbers_are_searched_where_nearly_all_of_them_lie():
+def test_normal_numbers_are_searched_within_a_ball_of_high_probability():
     from scipy.stats import chi2
 
     problem, wanted = swinging(0.0, [1e-9, 1e-3], 0.0, peak_rate=0.05)
     found = worst.hardest(problem, wanted, np.array([ETA, 1.0]))
     size = np.linalg.norm(found.coordinates["initial_state"])
-    np.testing.assert_allclose(size, np.sqrt(chi2.ppf(worst.HELD, 2)), rtol=1e-8)  # on the edge of the ball
-    # the first number counts for a millionth of the second, and so does its share of the ball
+    np.testing.assert_allclose(size, np.sqrt(chi2.ppf(worst.HELD, 2)), rtol=1e-8)  # on the surface of the ball
+    # the first number has a millionth of the effect of the second one, and a corresponding part of the radius
     np.testing.assert_allclose(abs(found.start["initial_x2"]), 1e-3 * size, rtol=1e-8)
-    np.testing.assert_allclose(found.ratio, 1e-3 * size / 0.05, rtol=1e-8)  # it only slows down from there
+    np.testing.assert_allclose(found.ratio, 1e-3 * size / 0.05, rtol=1e-8)  # the initial rate is the peak rate
 
 
-def test_normal_numbers_stay_a_hair_inside_their_ball_whose_edge_cuts_slopes_off():
-    """Two of them at 1 and 2, in a ball of 2, beside a uniform one that is left alone; then turned to their slopes."""
+def test_normal_numbers_stay_just_inside_their_ball():
+    """Gradients are cut off at the surface of the ball. Uniform numbers do not change.
+
+    With a gradient, the normal numbers move to the point of the sphere in its direction.
+    """
     y, normal = np.array([[9.0, 0.6, 0.8], [9.0, 3.0, 4.0]]), [(slice(1, 3), 2.0)]
     inside = worst._within(y, normal)
     np.testing.assert_allclose(inside, [y[0], [9.0, 1.2, 1.6]], rtol=1e-8)
     assert np.linalg.norm(inside[1, 1:]) < 2.0
     turned = worst._within(y, normal, np.array([[5.0, 3.0, -4.0], [5.0, 0.0, 0.0]]))
-    np.testing.assert_allclose(turned, [[9.0, 1.2, -1.6], [9.0, 1.2, 1.6]], rtol=1e-8)  # none: where it is
+    np.testing.assert_allclose(turned, [[9.0, 1.2, -1.6], [9.0, 1.2, 1.6]], rtol=1e-8)  # zero gradient: no change
     assert np.all(np.linalg.norm(turned[:, 1:], axis=1) < 2.0)
     assert y[1, 1] == 3.0
 
 
-def test_the_worst_misfits_are_found_by_their_slopes():
-    """The first torque of a chain, eta^2 x / t_f^2, as far as it is delivered; late samples move it by nothing."""
+def test_the_worst_actuator_scale_is_found_by_gradients():
+    """The first delivered torque of a chain is eta^2 x / t_f^2 times the scale factor. Jitter has no effect on it."""
     limit = 0.01
     problem, wanted = swinging(1.0, [0.0, 0.0], 0.0, peak_torque_delivered=limit)
     found = worst.hardest(problem, wanted, np.array([ETA, 1.0]))
@@ -180,10 +185,10 @@ def test_the_worst_misfits_are_found_by_their_slopes():
 
 
 @pytest.mark.long
-def test_the_worst_turn_of_a_star_tracker_is_found_by_its_slopes():
-    """A star tracker turned by a leaves sin(a / 2) of error; as far as a box goes: to a corner, 3^(1/2) of its edge.
+def test_the_worst_star_tracker_misalignment_is_found_by_gradients():
+    """A star tracker misalignment by an angle a causes the error sin(a / 2). It is largest in a corner of the box.
 
-    The gyro's factor and late samples move the error of a body at rest by nothing, and slopes must say so.
+    Gyro scale factor and timing jitter have no effect on a body at rest, and their gradients must be zero.
     """
     edge, limit = 0.02, 0.01
     spread = variation.Dispersion({
@@ -206,7 +211,7 @@ MOVED = ["attitudes", "normal starts, a phase and misfits"]
 
 
 @pytest.mark.parametrize("what", short(MOVED, MOVED[1:]))
-def test_slopes_of_the_ascent_agree_with_central_differences(what):
+def test_gradients_of_the_ascent_agree_with_finite_differences(what):
     if what == "attitudes":
         problem, _ = posed(random_turns(0.4, 2.0))
         limits = {"peak_torque": 0.5, "effort": 3.0}
@@ -230,10 +235,10 @@ def test_slopes_of_the_ascent_agree_with_central_differences(what):
 
 @pytest.mark.parametrize("plant", short(["chain", "spacecraft"], ["chain"]))
 def test_a_robust_search_keeps_the_limit_in_the_worst_case(monkeypatch, plant):
-    """The largest eta that keeps the limit at 140 degrees about the longest row, or at misfits' edge."""
+    """The expected eta just keeps the limit at the worst attitude (140 deg), or at the largest scale factor error."""
     steps = worst.STEPS
     small_search(monkeypatch)
-    monkeypatch.setattr(worst, "STEPS", steps)  # all of the ascent, which is what finds it
+    monkeypatch.setattr(worst, "STEPS", steps)  # all steps, because the ascent finds the worst case
     if plant == "spacecraft":
         largest, limit = np.deg2rad(140.0), 1.9
         spread = random_turns(np.deg2rad(20.0), largest)
@@ -252,12 +257,12 @@ def test_a_robust_search_keeps_the_limit_in_the_worst_case(monkeypatch, plant):
     assert plain.hardest is not None
     assert robust.hardest.ratio <= 1.0 + worst.NEAR
     assert robust.gains[0] <= eta * (1 + worst.NEAR)
-    np.testing.assert_allclose(robust.gains[0], eta, rtol=0.01)  # it gives up no more than its margin
+    np.testing.assert_allclose(robust.gains[0], eta, rtol=0.01)  # it loses only the margin
     np.testing.assert_allclose(plain.hardest.ratio, (plain.gains[0] / eta) ** 2, rtol=5e-3)
 
 
-def test_what_has_no_worst_case_to_look_for_keeps_the_whole_margin(monkeypatch):
-    """With a quantile no single trial counts: `robust` finds nothing to do."""
+def test_a_robust_search_with_quantile_limits_only_keeps_the_default_margin(monkeypatch):
+    """A quantile limit does not depend on a single trial, so the option `robust` has no effect."""
     problem, wanted = swinging(1.0, [0.2, 0.1], 0.01)
     wanted = [replace(one, quantile=0.9) for one in wanted]
     small_search(monkeypatch)
@@ -267,8 +272,8 @@ def test_what_has_no_worst_case_to_look_for_keeps_the_whole_margin(monkeypatch):
     assert {*found.margins.values()} == {rounds.MARGIN}
 
 
-def test_coordinates_given_are_flown_as_drawn_ones():
-    """A case that joined by its coordinates counts in the constraints like the trial that has them."""
+def test_given_coordinates_are_simulated_as_random_ones():
+    """A trial that joined with given coordinates has the same constraints as the trial with these coordinates."""
     problem, _ = swinging(1.0, [0.2, 0.1], 0.01, peak_rate=0.05)
     more = objective.with_trials(problem, np.asarray([40]))
     drawn_ones = objective.coordinates_of(problem.dispersion, 5, np.asarray([40]))
@@ -276,7 +281,7 @@ def test_coordinates_given_are_flown_as_drawn_ones():
     roomy = rounds._with_room(problem, rounds.SPARE)
     assert roomy.trials.size == 8 + rounds.SPARE
     given = rounds._add(roomy, np.array([8]), rounds.Joining(np.asarray([7]), np.array([True]), drawn))
-    assert roomy.trials[8] == roomy.trials[0]  # left as it was
+    assert roomy.trials[8] == roomy.trials[0]  # the original is not changed
     evaluate = Evaluator(Bounds(problem.names, (2.5, 0.3), (6.0, 4.0)))
     share = evaluate.bounds.share(np.array([3.2, 0.9]))[None]
     one, other = evaluate.fly(more, share), evaluate.fly(given, share)
@@ -285,7 +290,7 @@ def test_coordinates_given_are_flown_as_drawn_ones():
     np.testing.assert_allclose(other.c[0, 0, 9:], one.c[0, 0, 0], rtol=1e-12)
 
 
-def test_trials_that_join_take_free_places_first_and_then_those_of_the_oldest():
+def test_joining_trials_fill_free_slots_first_and_then_replace_the_oldest():
     problem, wanted = posed(random_turns(0.4, 2.0))
     evaluate = Evaluator(Bounds(("eta", "delta"), (2.5, 0.3), (6.0, 4.0)))
     search, joined = rounds.Rounds(evaluate, problem, wanted, robust=False), 0
@@ -293,7 +298,7 @@ def test_trials_that_join_take_free_places_first_and_then_those_of_the_oldest():
         new = np.arange(200 + joined, 200 + joined + count)
         search._join(rounds.Joining(new, np.array([True])))
         problem, joined = search.problem, joined + count
-        # the last 16 of those that joined, in whatever order, and the first trial where there is room
+        # the last 16 trials that joined, in any order, and the first trial in free slots
         kept = [0] * max(0, 16 - joined) + [*range(200, 200 + joined)][-16:]
         assert sorted(np.asarray(problem.trials)[8:].tolist()) == sorted(kept)
         np.testing.assert_array_equal(problem.trials[:8], np.arange(8))
@@ -301,8 +306,8 @@ def test_trials_that_join_take_free_places_first_and_then_those_of_the_oldest():
     np.testing.assert_array_equal(problem.coordinates["initial_attitude"], own["initial_attitude"])
 
 
-def test_several_limits_on_shares_of_the_trials_keep_their_critical_trials():
-    """The trials of the last limit took the places of those of the limit before it."""
+def test_critical_trials_of_several_quantile_limits_are_all_kept():
+    """The trials of one limit must not replace the trials of another limit in the same round."""
     problem, wanted = posed(random_turns(0.4, 2.0))
     wanted = [replace(wanted[0], quantile=0.9), replace(wanted[0], metric="effort", quantile=0.9)]
     problem = objective.problem(
@@ -329,8 +334,8 @@ def test_a_limit_broken_on_other_trials_does_not_tighten_the_others(monkeypatch)
     np.testing.assert_allclose(problem.tightened(1.0 - kept).limits, problem.limits * (1.0 - kept), rtol=1e-15)
 
 
-def test_where_nothing_can_be_moved_the_hardest_drawn_one_is_the_worst():
-    """Only the true inertia is drawn, or, of a chain, noise alone."""
+def test_the_hardest_screened_trial_is_the_worst_case_if_nothing_can_be_moved():
+    """The true inertia cannot be moved, and neither can noise."""
     body = vector([10.0, 12.0, 14.0]), vector(np.eye(3)), vector(0.05), vector(0.0)
     spread = variation.Dispersion(
         {"initial_attitude": numbers.any_attitude(), "inertia": inertias.RelativeInertia(*body)}
@@ -343,12 +348,12 @@ def test_where_nothing_can_be_moved_the_hardest_drawn_one_is_the_worst():
     at = np.array([ETA, 1.0])
     found = worst.hardest(problem, wanted, at)
     trials, ratio = worst.screen(problem, wanted, at)
-    assert trials[0] == problem.averaged  # none that the gains are tuned on
+    assert trials[0] == problem.averaged  # no training trial
     assert found.moved == ()
     assert found.trial == trials[np.argmax(ratio)]
     np.testing.assert_allclose([found.ratio, found.screened], ratio.max(), rtol=1e-9)
     assert np.ptp(ratio) > 0.0
-    # more trials than a row has: each is flown, and stands in its own place
+    # with more trials than a row, the results keep the order of the trials
     assert trials.size > flights.ROW
     some = trials[[3, -1, -2]]
     alone = flights.trials(problem.others(some), at)
@@ -356,8 +361,8 @@ def test_where_nothing_can_be_moved_the_hardest_drawn_one_is_the_worst():
 
 
 @pytest.mark.parametrize("plant", short(["chain", "spacecraft"], ["chain"]))
-def test_a_trial_without_a_value_is_the_hardest(plant):
-    """Nearer ones settle, farther ones not before the end."""
+def test_a_trial_without_a_metric_is_the_hardest(plant):
+    """Trials near the target settle, and trials farther away do not settle before the end."""
     if plant == "spacecraft":
         spread = random_turns(0.01, 2.0)
         problem, wanted = posed(spread, Requirement("settling_time", 19.0), settling_angle=1e-4)
@@ -376,8 +381,8 @@ def test_a_trial_without_a_value_is_the_hardest(plant):
     assert (found.c == objective.FAILED - 1.0).any()
 
 
-def test_trials_that_fail_have_no_worst_case():
-    """Starts no square of which is finite."""
+def test_failing_trials_have_no_worst_case():
+    """The squares of the initial states overflow."""
     problem, wanted = swinging(1.0, [1e160, 0.0], 0.0)
     found = worst.hardest(problem, wanted, np.array([ETA, 1.0]))
     assert found.unbounded
