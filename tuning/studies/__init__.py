@@ -1,1 +1,4 @@
-"""One file for each question that a command answers."""
+"""The computations of the commands: each study returns its results and writes a result folder.
+
+Read `tuner.tune` first, then `campaign_folder.fly` for Monte Carlo campaigns.
+"""

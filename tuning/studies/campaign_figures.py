@@ -1,4 +1,4 @@
-"""Figures of a campaign, from its rows."""
+"""Figures of a Monte Carlo campaign, made from its rows. Read `of` first."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -15,12 +15,12 @@ from ptsmc_jax.simulation.catalogues import percent
 from ptsmc_jax.simulation.requirements import INTERPRETATIONS, Requirement, Verdict
 from tuning.studies.campaign_folder import Folder
 
-DRAWN = 1000  # trials whose histories are drawn
-POINTS = 5000  # trials in a figure of points
+DRAWN = 1000  # largest number of trials whose histories are plotted
+POINTS = 5000  # largest number of trials in a scatter plot
 
 
 def of(folder: Folder, summary: dict[str, Any]) -> dict[str, Figure]:
-    """Figures of a campaign by name."""
+    """Return the figures of a campaign by name; summary: the content of its `summary.json`."""
     parts = folder.whole_parts()
     wanted = scenario.requirements(folder.scenario)
     limits = {r.metric: r.limit for r in wanted}
@@ -36,7 +36,7 @@ def of(folder: Folder, summary: dict[str, Any]) -> dict[str, Figure]:
 
     figures: dict[str, Figure] = {}
     if finished.any():
-        if folder.flies:  # its histories are not kept, but flown for it
+        if folder.flies:  # campaigns store no histories, so the figure simulates its trials again
             figures |= _fan(folder, frame, finished)
         figures["distributions"] = plots.distributions(
             {name: column(name, np.where(finished, frame[name].to_numpy(), np.nan)) for name in names}
@@ -45,7 +45,7 @@ def of(folder: Folder, summary: dict[str, Any]) -> dict[str, Figure]:
     totals = {name: int((outcome == name).sum()) for name in plots.MARKS}
     fine = np.isin(outcome, ("ok", plots.AT_TIMES))
     bad, good = np.flatnonzero(~fine)[: POINTS // 2], np.flatnonzero(fine)
-    some = np.concatenate([good[: POINTS - bad.size], bad])  # what went wrong, however rare, on top
+    some = np.concatenate([good[: POINTS - bad.size], bad])  # trials with problems last, so that their marks are on top
     angle, torque = (frame[name].to_numpy().astype(float)[some] for name in ("initial_angle", "peak_torque"))
     if np.isfinite(torque).any():
         starts, torques = column("initial_angle", angle), column("peak_torque", torque)
@@ -64,10 +64,10 @@ def of(folder: Folder, summary: dict[str, Any]) -> dict[str, Figure]:
 
 
 def _outcomes(frame: pl.DataFrame, wanted: Sequence[Requirement]) -> np.ndarray:
-    """How each trial ended, by its name in `plots.MARKS`, (trials,).
+    """Return the outcome of each trial, a key of `plots.MARKS`, (trials,).
 
-    A limit that is asked for in a share of the time is broken by a trial where each must keep it for that long; where
-    the share is of the time of all runs, no single one breaks it.
+    Some requirements ask for a fraction of the time within the limit. A single trial can break such a requirement if
+    its interpretation is "temporal", but not if it is "mixed": then the fraction is a mean over all runs.
     """
     outcome = frame["status"].to_numpy().astype(object)
     ok = outcome == "ok"
@@ -82,7 +82,7 @@ def _outcomes(frame: pl.DataFrame, wanted: Sequence[Requirement]) -> np.ndarray:
 
 
 def _of_time(verdict: Verdict) -> str:
-    """What a requirement on a share of the time asks for and what is seen of it; empty: it is on trials."""
+    """Return the required and the observed fraction of time in words, or "" if the requirement counts trials."""
     if verdict.share_of_time is None or verdict.quantile is None:
         return ""
     asked = f"asked for: {100 * verdict.quantile:g} % of {INTERPRETATIONS[verdict.interpretation].split(':')[0]}"
@@ -91,11 +91,11 @@ def _of_time(verdict: Verdict) -> str:
 
 
 def _fan(folder: Folder, frame: pl.DataFrame, finished: np.ndarray) -> dict[str, Figure]:
-    """Errors over time of the first trials, and of that with the largest window error, flown again.
+    """Simulate the first trials and the trial with the largest window error again, and plot their errors over time.
 
-    No figure where there is nothing that a log axis shows: no such trial ends, or none has an error.
+    The result is empty if none of the first trials reaches its end, or if all errors are zero: the axis is logarithmic.
     """
-    trials, window = frame["trial"].to_numpy(), frame["window_error"].to_numpy()  # of a share rows are not all trials
+    trials, window = frame["trial"].to_numpy(), frame["window_error"].to_numpy()  # a shard has some of the trials
     shown = trials[:DRAWN]
     hardest = int(np.argmax(np.where(finished & np.isfinite(window), window, -np.inf)))
     t, error = flying.history(folder.flights, np.append(shown, trials[hardest]).astype(np.uint32))

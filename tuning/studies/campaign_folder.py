@@ -1,4 +1,8 @@
-"""Campaign folders: begun, opened, flown, planned; what tells one campaign from another."""
+"""Campaign folders: create, open and identify a Monte Carlo campaign, and simulate its trials.
+
+A campaign is identified by its scenario, its seed and checksums of all custom code. `Folder` has these data. `begin`
+creates a folder, `opened` reads one, and `fly` simulates the missing trials. Read `Folder` first.
+"""
 
 import contextlib
 import os
@@ -30,15 +34,15 @@ from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.computer import OURS, Software
 from tuning.search import own_parts
 
-C = "controller"  # the folder with the flight software's C, where it is flown
-FLOOR = "floor.json"  # what theory says, see `campaign_theory`
-TABLE = "plan.parquet"  # the plan that is flown; what `--dry-run` writes is a folder
-PLAN = "plan_sha256"  # by which it is known
+C = "controller"  # subfolder with the C code of the controller, if C code controls the simulated spacecraft
+FLOOR = "floor.json"  # lower bound and margins, see `campaign_theory`
+TABLE = "plan.parquet"  # the run table; `--dry-run` writes a folder instead
+PLAN = "plan_sha256"  # key of the checksum of the run table in `versions.json`
 OWN = f"{systems.WHERE}, a function of a run's Result and its Parts that returns named numbers"
 
 
 class Made(msgspec.Struct, frozen=True):
-    """What `versions.json` of a campaign says of it, as far as its rows are known by it."""
+    """Entries of `versions.json` that define the rows of a campaign."""
 
     command: Literal["montecarlo"]
     seed: Annotated[int, Meta(ge=0, lt=2**32)]
@@ -46,37 +50,40 @@ class Made(msgspec.Struct, frozen=True):
     precision: Literal[32, 64]
     metrics: str | None = None
     metrics_names: tuple[str, ...] | None = None
-    plan: str | None = None  # the name of its file
-    controller_otherwise: str | None = None
+    plan: str | None = None  # file name of the run table
+    controller_otherwise: str | None = None  # see `Folder.otherwise`
     first_look: Annotated[int, Meta(ge=1, le=2**32)] | None = None
 
 
 @dataclass(frozen=True)
 class Folder:
-    """A campaign and where it is kept."""
+    """A campaign and its folder."""
 
     path: Path
     scenario: Scenario
     seed: int
-    trials: int  # that it is to have
-    own: str | None = None  # where the function stands that makes metrics of one's own
-    bits: int = 64  # of every number
-    made: Made | None = None  # as its folder says; None: it is yet to be begun
-    digests: Mapping[str, str] = field(default_factory=dict)  # of what it was begun with, as its folder says
-    trusted: bool = True  # systems and metrics of one's own may be run
-    plan: str | None = None  # of the trials, what its file is called
-    table: pl.DataFrame | None = None  # of that plan
-    controller: Path | None = None  # folder of the C that decides; None: the parts' own code does
-    first_look: int | None = None  # trials after which `--until-confident` first looks; None: a part
+    trials: int  # number of trials of the complete campaign
+    own: str | None = None  # FILE.py:NAME of the function that computes custom metrics
+    bits: int = 64  # floating-point precision
+    made: Made | None = None  # content of the existing folder; None: the folder does not exist yet
+    digests: Mapping[str, str] = field(default_factory=dict)  # checksums of custom code in the existing folder
+    trusted: bool = True  # custom systems and metrics may be executed
+    plan: str | None = None  # file name of the run table
+    table: pl.DataFrame | None = None  # content of the run table
+    controller: Path | None = None  # folder of the C code that controls; None: the simulated law controls
+    first_look: int | None = None  # trials before the first check of `--until-confident`; None: one part
 
     @cached_property
     def programs(self) -> dict[str, str]:
-        """What flying it runs, by the key that names it."""
+        """The locations of all custom code that the campaign executes, by scenario key or option."""
         return own_parts.named(self.scenario, self.own, self.controller)
 
     @cached_property
     def identity(self) -> dict[str, Any]:
-        """What `versions.json` knows a campaign by; digests of programs as the folder has them, or as they are now."""
+        """The entries of `versions.json` that identify the campaign.
+
+        The checksums are those in the folder if it exists, else those of the present files.
+        """
         digests = {}
         for key, where in self.programs.items():
             name = own.digest_name(key)
@@ -89,7 +96,7 @@ class Folder:
 
     @property
     def versions(self) -> dict[str, Any]:
-        """What its `versions.json` says."""
+        """The content of `versions.json`."""
         names = None if self.own is None else self.own_names
         counts = {"trials": self.trials, "first_look": self.first_look}
         entries = {**self.identity, **counts, "metrics_names": names, "plan": self.plan}
@@ -99,7 +106,7 @@ class Folder:
 
     @cached_property
     def own_names(self) -> list[str]:
-        """Names of the metrics of one's own."""
+        """The names of the custom metrics."""
         if self.own is None:
             return []
         if self.made is None:
@@ -112,18 +119,18 @@ class Folder:
 
     @property
     def units(self) -> dict[str, str]:
-        """Units of its metrics and of what was drawn, as far as they are known, by column."""
+        """The units of metrics and dispersions by column, if they are known."""
         drawn = {} if self.ready is None else quantities.units(self.ready.parts)
         return catalogues.units(self.scenario.plant.kind) | drawn
 
     @cached_property
     def rows(self) -> Rows:
-        """Its rows."""
+        """The result rows of the trials."""
         return Rows(self.path / rows.FOLDER, self._key)
 
     @cached_property
     def dry(self) -> Rows:
-        """What its trials fly with, written without flying them."""
+        """The dispersions of the trials, which `--dry-run` writes without simulating."""
         return Rows(self.path / "plan", self._key)
 
     @property
@@ -132,7 +139,7 @@ class Folder:
 
     @cached_property
     def ready(self) -> Study | None:
-        """What is flown, without metrics of one's own; None where that would run a system that nobody trusts."""
+        """The scenario, ready to simulate without custom metrics; None if that would execute untrusted custom code."""
         named = set(self.programs) - {own_parts.METRICS, own_parts.CONTROLLER}
         if named and not self.trusted:
             return None
@@ -142,7 +149,10 @@ class Folder:
 
     @cached_property
     def computer(self) -> InTheLoop | None:
-        """The controller's C, compiled; None: there is none. Raises RefusedError where that would take trust."""
+        """The compiled C code of the controller, or None if there is none.
+
+        Raises RefusedError if the C code is not trusted.
+        """
         if self.controller is None:
             return None
         if not self.flies:
@@ -153,19 +163,19 @@ class Folder:
 
     @property
     def otherwise(self) -> str:
-        """What the C that decides has otherwise than the scenario, a sentence; empty: nothing, or there is none."""
+        """A sentence about parameters that differ between the C code and the scenario; empty if none differ."""
         if self.made is not None:
             return self.made.controller_otherwise or ""
         return "" if self.computer is None else self.computer.otherwise
 
     @property
     def software(self) -> Software:
-        """What decides in flight."""
+        """The controller of the simulation: the C code, or the simulated law."""
         return OURS if self.computer is None else self.computer.software
 
     @property
     def flies(self) -> bool:
-        """Whether it can be flown without running what nobody trusts, but for metrics of one's own."""
+        """Whether the trials can be simulated without executing untrusted code, apart from custom metrics."""
         return self.ready is not None and (self.controller is None or self.trusted)
 
     @property
@@ -174,7 +184,7 @@ class Folder:
 
     @cached_property
     def planned(self) -> Plan:
-        """The plan that is flown, looked at; raises RefusedError where it cannot be, or is not what it was."""
+        """The validated run table. Raises RefusedError if it is invalid or has changed since the campaign began."""
         assert self.table is not None
         assert self.ready is not None
         where = f"the plan {self.plan}"
@@ -186,7 +196,7 @@ class Folder:
 
     @cached_property
     def flights(self) -> Campaign:
-        """What is flown, without metrics of one's own. Raises RefusedError where that would take trust."""
+        """The campaign without custom metrics. Raises RefusedError if it needs untrusted code."""
         if self.ready is None:
             raise self._untrusted
         campaign = Campaign(self.ready, self.seed)
@@ -196,13 +206,16 @@ class Folder:
 
     @cached_property
     def campaign(self) -> Campaign:
-        """What is flown. Raises ScenarioError where the metrics of one's own are none, RefusedError without trust."""
-        own = self._own.own  # before `flights`: what it refuses comes first
+        """The campaign.
+
+        Raises ScenarioError if the custom metrics are invalid, and RefusedError if the campaign needs untrusted code.
+        """
+        own = self._own.own  # before `flights`, so that errors of the metrics are raised first
         return replace(self.flights, own=own)
 
     @cached_property
     def _own(self) -> Campaign:
-        """A campaign with the metrics of one's own, whatever its trials."""
+        """The campaign with custom metrics, but without the run table."""
         if self.ready is None or (self.own is not None and not self.trusted):
             raise self._untrusted
         if self.own is None:
@@ -224,11 +237,11 @@ class Folder:
             own_parts.check_unchanged({key: self.programs[key]}, self.path, self.identity)
 
     def recipe(self) -> tuple[Callable, tuple[str, str]]:
-        """What a worker elsewhere makes the same campaign and rows from: a function and what it is called with."""
+        """Return a function and its arguments: another process calls it to rebuild the campaign and its rows."""
         return made_again, (str(self.path.resolve()), self._key.hex())
 
     def whole_parts(self) -> list[Part]:
-        """Its parts; raises RefusedError where one is damaged, or there is none."""
+        """Return the parts of the rows. Raises RefusedError if a part is damaged, or if there are none."""
         parts, broken = self.rows.parts()
         if broken:
             raise RefusedError(
@@ -241,9 +254,12 @@ class Folder:
 
 
 def begin(wanted: Folder, force: bool) -> None:
-    """Make the folder, or see that it holds the beginning of the same campaign; raises RefusedError otherwise."""
+    """Create the folder, or check that it contains the same campaign. Raises RefusedError if it contains another one.
+
+    force: discard the results of an existing campaign.
+    """
     tables, path = parsing.dump(wanted.scenario), wanted.path
-    made = store.read_versions(path)  # what no campaign left there is a user's
+    made = store.read_versions(path)  # files that no campaign wrote belong to the user
     kept = sources.listed(path / C) if own.digest_name(own_parts.CONTROLLER) in made else []
     if wanted.controller is not None and kept != sources.listed(path / C):
         raise RefusedError(f"--out is {path}, whose {C} holds C that no campaign left there; allowed is another folder")
@@ -263,15 +279,18 @@ def begin(wanted: Folder, force: bool) -> None:
             (making / TABLE).write_bytes(rows.encoded(wanted.planned.frame(parts)))
         if wanted.controller is not None:
             sources.copy(wanted.controller, making / C)
-        for file in kept:  # now: what is copied may lie there
+        for file in kept:  # not earlier: these files may be the source of the copy
             file.unlink(missing_ok=True)
-        store.forget(path)  # what was another campaign's, or that of fewer trials
+        store.forget(path)  # results of another campaign, or of fewer trials
 
     store.write(path, fill)
 
 
 def _begun(wanted: Folder, tables: Mapping[str, Any]) -> bool:
-    """Whether its folder holds this very campaign already; raises RefusedError where that may not become it."""
+    """Return whether the folder contains exactly this campaign.
+
+    Raises RefusedError if the folder can neither be continued nor extended to this campaign.
+    """
     path = wanted.path
     store.check(path, force=True)
     if not path.is_dir() or store.is_empty(path):
@@ -288,12 +307,12 @@ def _begun(wanted: Folder, tables: Mapping[str, Any]) -> bool:
 
 
 def _as_known(folder: Folder, key: str) -> bool:
-    """Whether a program that the folder keeps is there, as the campaign was begun with it."""
+    """Return whether the folder's copy of a program exists and still has its original checksum."""
     return own_parts.digest(key, folder.programs[key]) == folder.digests.get(own.digest_name(key))
 
 
 def opened(path: Path) -> Folder:
-    """The campaign of a folder, of which nothing is run that it names; raises RefusedError where there is none."""
+    """Read the campaign of a folder without executing its custom code. Raises RefusedError if there is no campaign."""
     try:
         versions = store.read_versions(path)
         if versions.get("command", "montecarlo") != "montecarlo":
@@ -329,14 +348,15 @@ def opened(path: Path) -> Folder:
 
 
 def _made(folder: Folder) -> Made:
-    """What `versions.json` is to say of it."""
+    """Return the entries of `versions.json` for a campaign that may not exist yet."""
     return msgspec.convert(folder.versions, Made)
 
 
 def made_again(path: str, key: str) -> tuple[Campaign, Rows]:
-    """Campaign and rows of a folder, on a worker that shares it; raises RefusedError where it holds another one.
+    """Rebuild a campaign and its rows in another process that can read the folder, see `Folder.recipe`.
 
-    The key knows scenario and digests: what is run here is what was trusted where the campaign was begun.
+    The key includes the scenario and the checksums. Matching keys therefore mean that this process executes the code
+    that the user trusted when the campaign began. Raises RefusedError if the folder contains another campaign.
     """
     folder = opened(Path(path))
     if folder.rows.key.hex() != key:
@@ -352,25 +372,25 @@ def fly(
     elsewhere: Callable[[Folder, list[Wanted]], Iterator[tuple[Part, int]]] | None = None,
     trials: int | None = None,
 ) -> None:
-    """Fly what is missing; what is damaged is named, set aside and flown again.
+    """Simulate the missing trials. Damaged parts are reported, renamed and simulated again.
 
     Args:
-        folder: the campaign's.
-        shard: (i, n), the i-th of n shares of it.
-        report: is called as parts land.
-        elsewhere: flies parts on other machines; None: they are flown here.
-        trials: how many of the first trials; None: all of them.
+        folder: the campaign.
+        shard: (i, n) simulates the i-th of n shards, i from 1 to n.
+        report: called with the progress after every part.
+        elsewhere: simulates parts on other machines; None: this process simulates them.
+        trials: simulate only the first trials up to this number; None: all of them.
     """
     trials = folder.trials if trials is None else trials
     parts, broken = folder.rows.parts()
     for path in broken:
         aside = path.with_name(path.name + ".damaged")
-        with contextlib.suppress(FileNotFoundError):  # another shard has set it aside
+        with contextlib.suppress(FileNotFoundError):  # another shard has renamed it
             os.replace(path, aside)
         what = "is damaged and is flown again" if rows.named(path) else "is no part of a campaign"
         print(f"ptsmc: {path} {what}; it is kept as {aside.name}", file=sys.stderr)
     alone = shard == (1, 1) and elsewhere is None
-    if alone:  # others may be writing otherwise
+    if alone:  # else other processes may be writing into the folder
         folder.rows.tidy(parts)
     wanted = flying.missing(parts, trials, shard)
     landing = elsewhere(folder, wanted) if elsewhere else flying.here(folder.campaign.fly, folder.rows, wanted)
@@ -380,7 +400,7 @@ def fly(
 
 
 def write_plan(folder: Folder, report: Callable[[Tally], None]) -> None:
-    """Write what each trial flies with, without flying it."""
+    """Write the dispersions of each trial without simulating it (`ptsmc montecarlo --dry-run`)."""
     parts, _ = folder.dry.parts()
     folder.dry.tidy(parts)
     wanted = flying.missing(parts, folder.trials)
@@ -389,7 +409,7 @@ def write_plan(folder: Folder, report: Callable[[Tally], None]) -> None:
 
 
 def settle(folder: Folder, trials: int) -> Folder:
-    """The campaign as one of so many trials."""
+    """Return the campaign with this final number of trials, and write the number to `versions.json`."""
     settled = replace(folder, trials=trials, first_look=None)
     store.write_json(folder.path / "versions.json", settled.versions)
     return settled

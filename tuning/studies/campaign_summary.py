@@ -1,4 +1,7 @@
-"""What is said of a campaign from its rows: verdicts, quantiles with intervals, drivers, single trials."""
+"""The statistics of a Monte Carlo campaign: verdicts, quantiles with intervals, sensitivities, worst trials, replays.
+
+All of them are computed from the rows of the campaign. Read `summarise` first.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,21 +24,22 @@ from ptsmc_jax.simulation.rollout import STATUS
 from tuning.studies.campaign_folder import Folder, opened
 from tuning.studies.campaign_theory import floor_of, margins_of, unjudged
 
-SAME = 1e-12  # how far a replayed run may be off its row, relative
-CONFIDENCE = 0.95  # of the intervals, where a requirement says nothing else
+SAME = 1e-12  # largest relative difference of equal results
+CONFIDENCE = 0.95  # of the intervals, unless a requirement has its own confidence
 QUANTILES = (0.5, 0.9, 0.99, 0.9973)
-SHOWN = 0.9973  # share of the runs that a pointing budget holds for: three sigma of a normal number
-SEARCHED = 100_000  # trials by which it is judged what drives a metric
+SHOWN = 0.9973  # fraction of the runs that keep a pointing budget: three sigma of a normal distribution
+SEARCHED = 100_000  # largest number of trials for the sensitivities to inputs
 
 
 def first_look(folder: Folder, force: bool) -> int | None:
-    """How many trials are looked at first: all that a finished campaign has that goes on; None: a part.
+    """Return the number of trials before `until_confident` first checks the intervals; None: one part.
 
-    One that was interrupted has the same first look when it goes on, and so stops where it would have stopped anyway.
+    A finished campaign that is extended is first checked with all its trials. An interrupted campaign keeps its first
+    check when it resumes, and so stops after the same number of trials as without the interruption.
     """
     try:
         before = None if force else opened(folder.path)
-    except RefusedError:  # there is none
+    except RefusedError:  # the folder has no campaign yet
         before = None
     if before is None:
         return None
@@ -44,13 +48,21 @@ def first_look(folder: Folder, force: bool) -> int | None:
 
 
 def until_confident(folder: Folder, width: float, fly_first: Callable[[int], None]) -> int:
-    """Fly ever more trials until every requirement's share is known to within `width`; returns how many.
+    """Simulate until the confidence interval of every requirement's fraction is narrow enough.
 
-    Looked at after each doubling. The intervals are those of a campaign whose size was fixed beforehand: looking
-    often, and stopping by what is seen, makes them a little too sure.
+    The number of trials doubles until the check succeeds, or until the campaign is complete. The intervals are valid
+    for a number of trials that is fixed in advance. Repeated checks reduce their coverage probability slightly.
+
+    Args:
+        folder: the campaign. It has at most `folder.trials` trials.
+        width: largest width of the intervals [-].
+        fly_first: simulates the first trials up to a number.
+
+    Returns:
+        The number of trials.
     """
     count, there = folder.first_look or flying.PART, _there(folder)
-    while count < there:  # none is left out
+    while count < there:  # use all existing trials
         count *= 2
     while True:
         count = min(count, folder.trials)
@@ -67,7 +79,7 @@ def _there(folder: Folder) -> int:
 
 
 def judged(folder: Folder, first: int | None = None) -> list[dict[str, Any]]:
-    """What `summary.json` says of each verdict over the trials (the first so many), but for margins."""
+    """Return the verdict on each requirement except margins, as in `summary.json`; first: use only the first trials."""
     wanted = scenario.requirements(folder.scenario)
     names = dict.fromkeys(name for r in wanted for name in (r.metric, r.timed) if name is not None)
     frame = rows.read(folder.whole_parts(), ["status", *names]).head(first or folder.trials)
@@ -77,7 +89,10 @@ def judged(folder: Folder, first: int | None = None) -> list[dict[str, Any]]:
 
 
 def _beyond(frame: pl.DataFrame, wanted: Requirement, ok: np.ndarray) -> np.ndarray:
-    """Share of the time that each trial is beyond a limit: 0 or 1 where it is asked for at all times, (trials,)."""
+    """Return the fraction of time that each trial is beyond a limit, (trials,).
+
+    A failed trial counts as beyond the limit at all times. The array is empty if the requirement is not "mixed".
+    """
     if wanted.interpretation != "mixed" or wanted.timed is None:
         return np.zeros(0)
     return np.where(ok, 1.0 - frame[wanted.timed].fill_null(0.0).to_numpy(), 1.0)
@@ -86,7 +101,7 @@ def _beyond(frame: pl.DataFrame, wanted: Requirement, ok: np.ndarray) -> np.ndar
 def _in_summary(verdict: Verdict, wanted: Requirement, beyond: np.ndarray) -> dict[str, Any]:
     within, confidence = verdict.trials - verdict.failures, wanted.confidence or CONFIDENCE
     entry = verdict.in_summary()
-    if beyond.size:  # a share of the time, of which runs are what is independent
+    if beyond.size:  # fraction of time: the samples of one run depend on each other, but the runs are independent
         each = (1.0 + CONFIDENCE) / 2.0
         entry["share"] = 1.0 - beyond.mean()
         entry["share_interval"] = 1.0 - statistics.mean_bound(beyond, each), statistics.mean_bound(1.0 - beyond, each)
@@ -102,7 +117,7 @@ def _in_summary(verdict: Verdict, wanted: Requirement, beyond: np.ndarray) -> di
 
 
 def summarise(folder: Folder) -> dict[str, Any]:
-    """What `summary.json` says."""
+    """Return the content of `summary.json`."""
     parts = folder.whole_parts()
     verdicts, waiting = [*judged(folder), *margins_of(folder)], unjudged(folder)
     head = rows.read(parts, ["status", "reason", "bad_time"]).head(folder.trials)
@@ -113,7 +128,7 @@ def summarise(folder: Folder) -> dict[str, Any]:
         for (status, reason), part in sorted(failed.group_by(["status", "reason"]))
     ]
     quantiles, drivers, driver_trials = {}, {}, {}
-    ranks: dict[bytes, dict[str, tuple]] = {}  # of the inputs, by the trials that they are ranked among
+    ranks: dict[bytes, dict[str, tuple]] = {}  # cached ranks of the inputs, by the subset of trials
     drawn = drawn_columns(folder, parts)
     inputs = rows.read(parts, drawn).head(min(SEARCHED, folder.trials))
     for name in (*scenario.catalogue(folder.scenario), *folder.own_names):
@@ -143,7 +158,7 @@ def summarise(folder: Folder) -> dict[str, Any]:
         **_pointing(folder, parts, finished),
         "quantiles": quantiles,
         "drivers": drivers,
-        "driver_trials": driver_trials,  # in which they were seen: those that have the metric
+        "driver_trials": driver_trials,  # number of trials that have the metric
         **_samples(folder, parts),
         "cautions": [
             *cautions.of(folder.scenario),
@@ -154,11 +169,11 @@ def summarise(folder: Folder) -> dict[str, Any]:
 
 
 def _samples(folder: Folder, parts: list[rows.Part]) -> dict[str, Any]:
-    """How many samples the controller's C ended with each status, and in how many trials; nothing without one."""
+    """Return the numbers of samples and of trials for each status of the C code; empty without C code."""
     if folder.controller is None:
         return {}
     kept = rows.columns_of(parts[0])
-    names = [name for name in plans.SAMPLES if name in kept]  # the gravest last
+    names = [name for name in plans.SAMPLES if name in kept]  # most severe status last
     counts = rows.read(parts, names).head(folder.trials)
     told = {
         name.removeprefix(plans.COUNTED): {"samples": int(counts[name].sum()), "trials": int((counts[name] > 0).sum())}
@@ -168,22 +183,22 @@ def _samples(folder: Folder, parts: list[rows.Part]) -> dict[str, Any]:
 
 
 def drawn_columns(folder: Folder, parts: list[rows.Part]) -> list[str]:
-    """The columns that say what trials flew with: all but results, and whose draws a row has.
+    """Return the columns with the inputs of the trials: dispersions, and the values of a run table.
 
-    They stand in the order of their names: inertias and disturbances before the initial angle.
+    They are all columns except the results, the trial number and the columns that identify a row's random sample.
     """
     others = {plans.TRIAL, *plans.OF_ROWS.values(), *plans.RESULTS, *plans.SAMPLES, *folder.own_names}
     return [name for name in rows.columns_of(parts[0]) if name not in others]
 
 
 def _alike(quantiles: dict[str, Any], trials: int, *, drawn: bool = False) -> list[str]:
-    """Whether every trial is the same flight, to round-off; drawn: something is that differs between them."""
+    """Return a caution if all trials have the same metrics; drawn: the inputs of the trials differ."""
     known = [metric for metric in quantiles.values() if "max" in metric]
     if trials < 2 or not known or any(abs(m["max"] - m["mean"]) > SAME * abs(m["max"]) for m in known):
         return []
-    if any(m["without_value"] for m in known):  # a trial that failed is no flight of one that did not
+    if any(m["without_value"] for m in known):  # failed trials differ from the others
         return []
-    if drawn:  # as another inertia of a body that stays at rest
+    if drawn:  # for example a dispersed inertia of a body that stays at rest
         return [f"all {trials} trials have the same metrics: what is drawn in them changes none"]
     return [
         f"all {trials} trials are the same flight: nothing is drawn in them, neither by [dispersion] nor as noise of "
@@ -192,7 +207,11 @@ def _alike(quantiles: dict[str, Any], trials: int, *, drawn: bool = False) -> li
 
 
 def _pointing(folder: Folder, parts: list[rows.Part], finished: np.ndarray) -> dict[str, Any]:
-    """The pointing budget: of every index what `SHOWN` of the runs keep, with `CONFIDENCE` at most this much [rad]."""
+    """Return the pointing budget: an upper bound for every pointing error index and axis [rad].
+
+    At least the fraction `SHOWN` of all possible runs stays below the bound, with the confidence `CONFIDENCE`. A bound
+    is None if there are too few trials, or too many of them failed.
+    """
     table = getattr(folder.scenario, "pointing", None)
     if table is None:
         return {}
@@ -211,9 +230,9 @@ def _pointing(folder: Folder, parts: list[rows.Part], finished: np.ndarray) -> d
 
 
 def _of_metric(values: np.ndarray, finished: np.ndarray) -> dict[str, Any]:
-    """Statistics of a metric: mean, RMS and largest of the trials that have it, quantiles over all trials.
+    """Return statistics of a metric: mean, RMS and maximum of the trials with a value, and quantiles of all trials.
 
-    In the quantiles a trial without a value counts as beyond all others: it is not left out.
+    Quantiles count a trial without a value as infinite.
     """
     has = finished & np.isfinite(values)
     ordered = np.sort(np.where(has, values, np.inf))
@@ -221,12 +240,12 @@ def _of_metric(values: np.ndarray, finished: np.ndarray) -> dict[str, Any]:
 
 
 def _of_share(values: np.ndarray, finished: np.ndarray) -> dict[str, Any]:
-    """The same of a metric that is better when larger: its smallest too, and quantiles of its bad end.
+    """Return statistics of a metric that is better when larger: as `_of_metric`, the minimum, and low quantiles.
 
-    A trial without a value counts as 0. "0.0027" is what 99.73 % of the trials reach.
+    Quantiles count a trial without a value as 0. Key "0.0027" has the value that 99.73 % of the trials reach.
     """
     has = finished & np.isfinite(values)
-    ordered = np.sort(-np.where(has, values, 0.0))  # the best first
+    ordered = np.sort(-np.where(has, values, 0.0))  # best value first
     entry = _of_known(values, has) | {"min": -ordered[-1]}
     for quantile in QUANTILES:
         at = _at(ordered, quantile)
@@ -235,7 +254,7 @@ def _of_share(values: np.ndarray, finished: np.ndarray) -> dict[str, Any]:
 
 
 def _of_known(values: np.ndarray, has: np.ndarray) -> dict[str, Any]:
-    """Statistics of the trials that have a value."""
+    """Return statistics of the trials with a value."""
     known = values[has]
     entry: dict[str, Any] = {"without_value": int(values.size - known.size)}
     if known.size:
@@ -244,18 +263,24 @@ def _of_known(values: np.ndarray, has: np.ndarray) -> dict[str, Any]:
 
 
 def _at(ordered: np.ndarray, quantile: float) -> dict[str, float]:
-    """A quantile with its interval."""
+    """Return a quantile and its confidence interval."""
     low, high = statistics.quantile_interval(ordered, quantile, CONFIDENCE)
     return {"value": statistics.value_at(ordered, quantile), "low": low, "high": high}
 
 
 def write_summary(folder: Folder, summary: dict[str, Any], figures: bool) -> None:
-    """Write the summary and the figures into the campaign's folder."""
+    """Write `summary.json` and the figures into the campaign's folder.
+
+    Args:
+        folder: the campaign.
+        summary: content of the file, see `summarise`.
+        figures: write the figures too.
+    """
 
     def fill(making: Path) -> None:
         store.write_json(making / store.SUMMARY, summary)
         if figures:
-            from ptsmc_jax.figures import style  # takes half a second, which no other reader of rows need wait for
+            from ptsmc_jax.figures import style  # the import takes half a second, which only figures need
             from tuning.studies import campaign_figures
 
             style.save(campaign_figures.of(folder, summary), making / "figures")
@@ -264,7 +289,16 @@ def write_summary(folder: Folder, summary: dict[str, Any], figures: bool) -> Non
 
 
 def worst(folder: Folder, by: str, count: int) -> pl.DataFrame:
-    """The rows of the worst trials by a metric, failed ones first."""
+    """Return the rows of the worst trials, failed trials first.
+
+    Args:
+        folder: the campaign.
+        by: column that orders the trials.
+        count: number of rows.
+
+    Raises:
+        RefusedError: there is no such column, or the rows are damaged.
+    """
     parts = folder.whole_parts()
     names = rows.columns_of(parts[0])
     allowed = [name for name in names if name not in (plans.TRIAL, *plans.HEADING, *plans.OF_ROWS.values())]
@@ -278,22 +312,29 @@ def worst(folder: Folder, by: str, count: int) -> pl.DataFrame:
 
 
 def most_extreme(metric: str, values: np.ndarray, failed: np.ndarray, count: int) -> np.ndarray:
-    """Indices of the worst of trials (trials,) by a metric, failed ones first; see `statistics.most_extreme`."""
-    better = metric in (*catalogues.LARGER_IS_BETTER, plans.SAMPLES[0])  # as of samples that ended well
+    """Return the indices of the worst trials by a metric, failed trials first; see `statistics.most_extreme`.
+
+    Args:
+        metric: name of the metric, which decides whether large values are good.
+        values: values of the metric (trials,), in its unit; NaN if a trial has no value.
+        failed: whether each trial failed (trials,) [-].
+        count: number of indices.
+    """
+    better = metric in (*catalogues.LARGER_IS_BETTER, plans.SAMPLES[0])  # SAMPLES[0] counts samples without an error
     return statistics.most_extreme(values, failed, count, larger_is_better=better)
 
 
 @dataclass(frozen=True)
 class Replay:
-    """A trial flown again."""
+    """A repeated simulation of a trial."""
 
     run: runs.Run  # with its history
-    off: float | None  # largest difference of the row flown again from the one kept, relative; None: none is kept
-    rounding: float  # the same of the run with its history, which another program flies, from the row flown again
+    off: float | None  # largest relative difference between the new and the stored row; None: no row is stored
+    rounding: float  # largest relative difference between `run`, from another compiled program, and the new row
 
 
 def replay(folder: Folder, trial: int) -> Replay:
-    """A trial's row as the campaign flies it, and its run in full."""
+    """Simulate a trial again: once as the campaign does, for its row, and once with its history."""
     campaign = folder.campaign
     flown = trial if campaign.plan is None else campaign.plan.row(trial, folder.seed)
     run = runs.fly(campaign.ready, folder.seed, flown, campaign.software)
@@ -310,7 +351,10 @@ def replay(folder: Folder, trial: int) -> Replay:
 
 
 def _off(a: Any, b: Any) -> float:
-    """Relative difference of two values of a row."""
+    """Return the relative difference of two values of a row.
+
+    It is 0 if both are equal or missing. It is infinite if they differ and are not both finite floats.
+    """
     if isinstance(a, float) and isinstance(b, float) and np.isfinite([a, b]).all():
         return 0.0 if a == b else abs(a - b) / max(abs(a), abs(b))
     missing = [v is None or v != v for v in (a, b)]

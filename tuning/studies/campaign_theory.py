@@ -1,4 +1,7 @@
-"""What theory says of a campaign, kept in its folder: the floor of its errors, and verdicts on margins."""
+"""The lower bound of the error and the verdicts on stability margins of a campaign.
+
+`find` computes both and writes them to `floor.json` in the campaign's folder. The other functions read this file.
+"""
 
 import json
 from typing import Any
@@ -12,9 +15,9 @@ from tuning.studies.campaign_folder import FLOOR, Folder
 
 
 def find(folder: Folder) -> None:
-    """Write what theory says into the folder, where it is not there yet, or cannot be read.
+    """Write `floor.json` if it is missing, incomplete or damaged.
 
-    The RMS window error that no controller can beat, and verdicts on the margins that are asked for.
+    It has the lower bound of the RMS window error, and the verdicts on the required stability margins.
     """
     if _lacks_theory(folder):
         ready, plan = folder.campaign.ready, folder.campaign.plan
@@ -26,7 +29,7 @@ def find(folder: Folder) -> None:
 
 
 def prepare(folder: Folder) -> None:
-    """Begin to compile what `find` needs, beside flying."""
+    """Start to compile the programs of `find` in the background, while the trials are simulated."""
     if _lacks_theory(folder):
         margin_verdicts.prepare(folder.campaign.ready, _looked_at(folder))
         runs.prepare(folder.campaign.ready)
@@ -37,23 +40,23 @@ def _lacks_theory(folder: Folder) -> bool:
 
 
 def _looked_at(folder: Folder) -> np.ndarray | Row | None:
-    """The rows of a plan whose loops are looked at; None: there is none."""
+    """Return the rows of the run table whose margins are computed, or None without a run table."""
     plan = folder.campaign.plan
     return None if plan is None else plan.rows(np.arange(min(margin_verdicts.TRIALS, plan.count)), folder.seed)
 
 
 def floor_of(folder: Folder) -> float | None:
-    """The floor that `find` wrote; None: none, as in campaigns of earlier versions."""
+    """Return the lower bound of the RMS window error that `find` wrote; None: there is none."""
     return _theory(folder).get("window_error")
 
 
 def margins_of(folder: Folder) -> list[dict[str, Any]]:
-    """The verdicts on margins that `find` wrote, as `summary.json` says them."""
+    """Return the verdicts on margins that `find` wrote, as in `summary.json`."""
     return _theory(folder).get("margins", [])
 
 
 def unjudged(folder: Folder) -> list[str]:
-    """Margins that are asked for and that no verdict is there of: flying ended before, or what it wrote is damaged."""
+    """Return the required margins without a verdict: the campaign was interrupted, or `floor.json` is damaged."""
     judged = {verdict["metric"] for verdict in margins_of(folder)}
     return [name for name in catalogues.MARGINS if name in folder.scenario.requirements and name not in judged]
 

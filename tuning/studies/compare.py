@@ -1,4 +1,8 @@
-"""The paper's law beside others, tuned to the same requirements by the same search, judged on the same trials."""
+"""`ptsmc compare`: tune several control laws to the same requirements and judge them on the same held-out trials.
+
+The laws are the prescribed-time law, the built-in baselines and custom laws. Each is also simulated with a wrong
+inertia and an unknown delay. Read `compare` first.
+"""
 
 import contextlib
 import dataclasses
@@ -29,8 +33,8 @@ from tuning.search.objective import T_F
 from tuning.search.progress import Report, headed
 from tuning.studies import judging, stability, tuner
 
-OURS, PAPER = "prescribed_time", "paper"  # the paper's law as tuned, and with the paper's gains
-OFF = 0.1  # share by which the inertia differs from what laws are told
+OURS, PAPER = "prescribed_time", "paper"  # the prescribed-time law with tuned gains, and with published gains
+OFF = 0.1  # relative difference between the true inertia and the design model
 UNTOLD = ("heavier", "lighter", "later")
 KEPT = (
     "minimise",
@@ -41,47 +45,47 @@ KEPT = (
     "trials",
     "starts",
     "steps",
-)  # of `tune`, for every law
+)  # keys of `tune` that are the same for every law
 
 
 @dataclass(frozen=True)
 class Contender:
-    """A law with its gains, judged on the fresh trials."""
+    """A law with its gains, judged on held-out trials."""
 
     flown: Scenario
     gains: dict[str, float]
     at_bound: dict[str, str]
     trials: Trials
     verdicts: list[Verdict]
-    floor: float | None  # RMS window error that no controller can beat
+    floor: float | None  # lower bound of the RMS window error
     margins: dict[str, dict[str, Any]] | None = None  # of the nominal loop, see `stability.worst`
-    changed: Mapping[str, Trials] = field(default_factory=dict)  # with what it is not told, see `perturbed`
+    changed: Mapping[str, Trials] = field(default_factory=dict)  # trials with unknown model errors, see `perturbed`
 
     @property
     def met(self) -> bool:
-        """Every requirement met, and no trial failed or missed t_f."""
+        """Whether every requirement is met, every trial reaches its end, and every trial converges by t_f."""
         return judging.met(self.verdicts, self.trials)
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """All contenders on the same trials: the paper's gains first where they can fly, then the tuned laws."""
+    """All contenders on the same trials: first the published gains if they can be simulated, then the tuned laws."""
 
     contenders: dict[str, Contender]
     fresh_seed: int
     interrupted: bool
-    paper_refused: str | None = None  # why the paper's gains are not among them
+    paper_refused: str | None = None  # reason why the published gains cannot be simulated
 
     @property
     def status(self) -> str:
-        """Whether the tuned law of the paper meets every requirement, in a word."""
+        """Return "interrupted", or "met" if the tuned prescribed-time law meets every requirement, else "not met"."""
         if self.interrupted:
             return "interrupted"
         return "met" if self.contenders[OURS].met else "not met"
 
 
 def check(scenario: Scenario) -> None:
-    """Raise ScenarioError where there is nothing to compare with."""
+    """Raise ScenarioError if the other laws cannot control the plant or the loop of the scenario."""
     if scenario.motion != "spacecraft":
         kind = errors.show(scenario.plant.kind)
         raise ScenarioError(
@@ -94,19 +98,19 @@ def check(scenario: Scenario) -> None:
 
 
 def laws() -> list[str]:
-    """The kinds of laws that are compared, the paper's first."""
+    """Return the kinds of the compared laws, the prescribed-time law first."""
     return [OURS, *(kind for kind, law in LAWS["spacecraft"].items() if kind != "prescribed_time" and kind != "own")]
 
 
 @dataclass(frozen=True)
 class Rivals:
-    """What the paper's law is compared with."""
+    """The laws that the prescribed-time law is compared with."""
 
-    kinds: tuple[str, ...] | None = None  # None: all of them
-    own: tuple[str, ...] = ()  # laws of one's own, "FILE.py:NAME"
+    kinds: tuple[str, ...] | None = None  # built-in laws; None: all of them
+    own: tuple[str, ...] = ()  # custom laws, "FILE.py:NAME"
 
     def check(self) -> None:
-        """Raise UsageError where a kind is not known, or a law of one's own is no name."""
+        """Raise UsageError if a kind is unknown, or the location of a custom law is malformed."""
         others = laws()[1:]
         for kind in self.kinds or ():
             if kind not in others:
@@ -119,7 +123,7 @@ class Rivals:
 
     @property
     def named(self) -> dict[str, dict[str, str]]:
-        """The law of the table [controller] of each, the paper's first, by what it is called."""
+        """The keys of the table [controller] that select each law, by its label, the prescribed-time law first."""
         kinds = laws() if self.kinds is None else [OURS, *self.kinds]
         tables = {kind: {"kind": kind} for kind in kinds}
         for code in self._codes:
@@ -128,28 +132,29 @@ class Rivals:
 
     @property
     def _codes(self) -> list[str]:
-        """Where the laws of one's own stand, links followed: each once, in however many ways it is written."""
+        """The locations of the custom laws with symbolic links resolved, without duplicates."""
         split = (where.rpartition(":") for where in self.own)
         codes = (f"{os.path.realpath(at)}:{name}" if at.endswith(".py") else f"{at}:{name}" for at, _, name in split)
         return list(dict.fromkeys(codes))
 
     def identity(self) -> dict[str, Any]:
-        """What `versions.json` knows these rivals by; nothing where they are all the kinds that there are."""
+        """Return the entries of `versions.json` that identify these laws; empty for the default laws."""
         digests = {code: systems.digest(code) for code in self._codes}
         return {"laws": list(self.named), "own_laws": digests} if self != Rivals() else {}
 
 
 def _free_name(name: str, taken: Iterable[str]) -> str:
-    """What a law of one's own is called: as its class, where no other law is."""
+    """Return a unique label for a custom law: its class name, after "own" if another law has this label."""
     while name in (PAPER, *taken):
         name = f"own {name}"
     return name
 
 
 def contenders(scenario: Scenario, rivals: Rivals = Rivals()) -> dict[str, Scenario]:
-    """The scenario under each law: what is tuned is for the scenario's own as it says, for the others the default.
+    """Return the scenario with each law, by label.
 
-    Its own is among them where it is one of those asked for, or of the user's own.
+    The scenario's own law has its free gains and bounds from the scenario. The other laws have the default ones. The
+    scenario's own law is included if it is among the requested laws, or if it is a custom law.
     """
     table, tune = scenario.controller, scenario.search
     same = {key: getattr(tune, key) for key in KEPT if getattr(tune, key) is not None}
@@ -171,7 +176,7 @@ def contenders(scenario: Scenario, rivals: Rivals = Rivals()) -> dict[str, Scena
 
 
 def _is(table: Any, law: Mapping[str, str]) -> bool:
-    """Whether the scenario's law is the one that is named; one of one's own by where it stands, links followed."""
+    """Return whether the scenario's law is this law. Custom laws are compared by file, links resolved, and name."""
     if table.kind != law["kind"] or table.kind != "own":
         return table.kind == law["kind"]
 
@@ -182,7 +187,10 @@ def _is(table: Any, law: Mapping[str, str]) -> bool:
 
 
 def that_fly(scenario: Scenario, rivals: Rivals = Rivals()) -> dict[str, Scenario]:
-    """The contenders; raises ScenarioError where one cannot fly: before hours of search, not after."""
+    """Return the contenders, see `contenders`.
+
+    Raises ScenarioError if a law cannot control the scenario. The check comes before the search, which may take hours.
+    """
     each = contenders(scenario, rivals)
     for law, posed in each.items():
         try:
@@ -194,7 +202,13 @@ def that_fly(scenario: Scenario, rivals: Rivals = Rivals()) -> dict[str, Scenari
 
 
 def _posed(other: Scenario, tune: tables.Tune, same: dict[str, Any]) -> Scenario:
-    """With the default gains of its law free, and t_f in the same interval where it is what is minimised."""
+    """Return the scenario with the default free gains of its law, and with the same bounds of t_f if t_f is minimised.
+
+    Args:
+        other: the scenario with another law.
+        tune: the table of the original scenario.
+        same: keys of `tune` that are the same for every law, with their values.
+    """
     if tune.minimise != T_F:
         return replace(other, tune=same)
     free = [*replace(other, tune={}).search.gains, "t_f"]
@@ -202,7 +216,11 @@ def _posed(other: Scenario, tune: tables.Tune, same: dict[str, Any]) -> Scenario
 
 
 def perturbed(flown: Scenario) -> dict[str, Scenario]:
-    """The scenario with what its law is not told of: another inertia, a control period of delay; those that can fly."""
+    """Return the scenario with each model error that the law does not know, by the names in `UNTOLD`.
+
+    The true inertia is 10 % larger or smaller than in the design model, or the delay is one control period longer. A
+    variant that is not a valid scenario is left out.
+    """
     assert isinstance(flown, SpacecraftScenario)
     inertia = np.asarray(flown.true_inertia)
     changes: list[dict[str, Any]] = [
@@ -218,7 +236,7 @@ def perturbed(flown: Scenario) -> dict[str, Scenario]:
 
 
 def _with_more(one: Contender, fresh_seed: int) -> Contender:
-    """With its margins, and flown once more with what its law is not told of."""
+    """Return the contender with its stability margins, and with the trials under the model errors of `perturbed`."""
     changed = {name: judging.judge(other, fresh_seed) for name, other in perturbed(one.flown).items()}
     return dataclasses.replace(one, margins=stability.worst(study(one.flown)), changed=changed)
 
@@ -230,14 +248,20 @@ def compare(
     journal: Journal | None = None,
     rivals: Mapping[str, Scenario] | None = None,
 ) -> Comparison:
-    """Tune every law, and judge them and the paper's gains on trials that none of them saw.
+    """Tune every law, and judge the tuned laws and the published gains on the same held-out trials.
 
     Args:
-        scenario: what all of them fly.
-        seed: of the search; fresh trials have one that follows from it.
-        tell: is called after every step.
-        journal: of evaluations, from which an interrupted comparison goes on.
-        rivals: the scenario under each law, as `that_fly` gives them; None: all of them.
+        scenario: the mission, requirements and dispersions for all laws.
+        seed: of the searches. The seed of the held-out trials follows from it.
+        tell: called with the progress after every step.
+        journal: evaluations of an interrupted comparison, which then resumes.
+        rivals: the scenario with each law, as `that_fly` returns it; None: all built-in laws.
+
+    Returns:
+        The results of each law. If the comparison is interrupted, the laws after the interruption are missing.
+
+    Raises:
+        ScenarioError: a law cannot control the scenario.
     """
     fresh_seed = judging.seed_of_judge(seed)
     rivals = that_fly(scenario) if rivals is None else rivals
@@ -248,7 +272,8 @@ def compare(
         found[PAPER] = _with_more(_papers(judging.as_flown(others[PAPER]), fresh_seed), fresh_seed)
     for law, posed in rivals.items():
         report = headed(tell, law)
-        tuned = tuner.tune(posed, seed, report, journal, trusted=False, tries=1)  # all on the same fresh trials
+        # more tries would judge the laws on different held-out trials
+        tuned = tuner.tune(posed, seed, report, journal, trusted=False, tries=1)
         fresh, floor = tuned.fresh["tuned"], tuned.floors["tuned"]
         found[law] = Contender(tuned.tuned, tuned.gains, tuned.at_bound, fresh, tuned.verdicts, floor)
         interrupted = tuned.search.interrupted
@@ -266,14 +291,17 @@ def _papers(flown: Scenario, fresh_seed: int) -> Contender:
 
 
 def figures_of(contender: Contender) -> dict[str, Any]:
-    """What is said of a contender: over the trials that were flown to the end, but for the counts."""
+    """Return the results of a contender as in `summary.json`.
+
+    Statistics use the trials that reached their end. The counts and the quantiles of the settling time use all trials.
+    """
     trials = contender.trials
     rank: Any = stats.spearmanr
     angle, finished = trials.drawn["initial_angle"], trials.finished
     error, interval = judging.window_error(trials)
     settling = np.asarray(trials.metrics.settling_time)
     settled = finished & np.isfinite(settling)
-    times, times_or_never = settling[settled], np.where(settled, settling, np.inf)  # never is beyond every quantile
+    times, times_or_never = settling[settled], np.where(settled, settling, np.inf)  # infinite: the trial never settles
     spread = times.size > 2 and vary(angle[settled]) and vary(times)
     mean = {name: float(np.mean(getattr(trials.metrics, name)[finished])) if finished.any() else None
             for name in ("peak_torque", "effort", "chattering")}  # fmt: skip
@@ -289,7 +317,7 @@ def figures_of(contender: Contender) -> dict[str, Any]:
         "largest_peak_torque": _largest_peak(trials),
         "unsettled": int(trials.status.size - times.size),
         "settling_time": {str(q): _quantile(times_or_never, q) for q in (0.01, 0.5, 0.99)},
-        # how far settling hangs on where a trial starts: rank correlation, and seconds from the nearest to the farthest
+        # dependence of the settling time on the initial angle: rank correlation, and medians at small and large angles
         "settling_by_angle": float(rank(angle[settled], times)[0]) if spread else None,
         "settling_near_far": _near_far(angle, times_or_never) if spread else None,
         "margins": contender.margins,
@@ -299,7 +327,7 @@ def figures_of(contender: Contender) -> dict[str, Any]:
 
 
 def _perturbed_figures(trials: Trials) -> dict[str, Any]:
-    """What is said of trials with something that the law is not told of."""
+    """Return the results of trials with a model error that the law does not know."""
     error, interval = judging.window_error(trials)
     return {
         "window_error": error,
@@ -310,25 +338,28 @@ def _perturbed_figures(trials: Trials) -> dict[str, Any]:
 
 
 def _largest_peak(trials: Trials) -> float | None:
-    """The largest peak torque [N m] of the trials that were flown to the end; None: none was."""
+    """Return the largest peak torque of the trials that reached their end [N m]; None: no trial did."""
     return float(np.max(trials.metrics.peak_torque[trials.finished])) if trials.finished.any() else None
 
 
 def _quantile(times: np.ndarray, q: float) -> float | None:
-    """A quantile of settling times [s], infinite where a trial never settles; None: never."""
+    """Return a quantile of settling times (trials,) [s], or None if the quantile is infinite.
+
+    A settling time is infinite if the trial never settles.
+    """
     value = value_at(np.sort(times), q)
     return value if np.isfinite(value) else None
 
 
 def _near_far(angle: np.ndarray, times: np.ndarray) -> tuple[float | None, float | None]:
-    """Median settling times of the nearest and the farthest fifth of the starts [s]; see `_quantile`."""
+    """Return the median settling times [s] of the fifths of the trials with the smallest and largest initial angles."""
     order = np.argsort(angle)
     fifth = max(1, angle.size // 5)
     return _quantile(times[order[:fifth]], 0.5), _quantile(times[order[-fifth:]], 0.5)
 
 
 def summary(comparison: Comparison) -> dict[str, Any]:
-    """What `summary.json` says."""
+    """Return the content of `summary.json`."""
     found = comparison.contenders
     first = next(iter(found.values()))
     return {
@@ -337,7 +368,7 @@ def summary(comparison: Comparison) -> dict[str, Any]:
         "trials": int(first.trials.status.size),
         "paper_refused": comparison.paper_refused,
         "paper_is": gains.paper_is(found[PAPER].flown) if PAPER in found else None,
-        "judged_on": "flight clock",  # each with a sign of its own, or none
+        "judged_on": "flight clock",  # no sign function is named here, because the laws have different ones
         "settling_angle": first.flown.loop.settling_angle,
         "laws": {law: figures_of(contender) for law, contender in found.items()},
         "cautions": list(dict.fromkeys(text for one in found.values() for text in cautions.of(one.flown))),
@@ -345,7 +376,15 @@ def summary(comparison: Comparison) -> dict[str, Any]:
 
 
 def write(folder: Path, scenario: Scenario, comparison: Comparison, figures: bool, known_by: Mapping[str, Any]) -> None:
-    """Fill a result folder."""
+    """Write a result folder: `summary.json`, `compare.csv`, a scenario for each law, and figures.
+
+    Args:
+        folder: an empty folder.
+        scenario: the scenario of the comparison.
+        comparison: the results.
+        figures: write figures too.
+        known_by: entries of `versions.json`, see `identity`.
+    """
     said = summary(comparison)
     store.record(folder, parsing.dump(scenario), known_by, said)
     (folder / "scenarios").mkdir()
@@ -363,9 +402,9 @@ _COLUMNS = ("met", "window_error", "peak_torque", "largest_peak_torque", "effort
 
 
 def _rows(scenario: Scenario, said: Mapping[str, Any]) -> tuple[list[str], list[list[Any]]]:
-    """Head and rows of `compare.csv`, a law each."""
+    """Return the header and the rows of `compare.csv`, one row for each law."""
     required = [name for name in catalogues.MARGINS if name in scenario.requirements]
-    nominal = [name for name in catalogues.MARGINS if name not in required]  # of the nominal loop in hold
+    nominal = [name for name in catalogues.MARGINS if name not in required]  # of the nominal loop in the hold phase
     head = ["law", *_COLUMNS, *(f"settling_time_{100 * float(q):g}" for q in _SHARES), *required, *nominal,
             "window_error_low", "window_error_high", *(f"window_error_{name}" for name in UNTOLD), "gains"]  # fmt: skip
 
@@ -398,5 +437,11 @@ def _figures(comparison: Comparison) -> Iterator[tuple[str, Any]]:
 
 
 def identity(scenario: Scenario, seed: int, against: Rivals = Rivals()) -> dict[str, Any]:
-    """What `versions.json` knows a finished or interrupted comparison by."""
+    """Return the entries of `versions.json` that identify a comparison.
+
+    Args:
+        scenario: the scenario of the comparison.
+        seed: of the searches.
+        against: the other laws.
+    """
     return {"command": "compare", "seed": seed, **own.digests(scenario), **against.identity()}

@@ -86,7 +86,7 @@ class Front:
     plant: str  # kind of the plant
     points: list[Point]
     idle: list[float]  # values that have the same gains as another value
-    without: list[float]  # values for which the search found no gains
+    without: list[float]  # values without feasible gains
     trials: int  # held-out trials
     seed: int  # of these trials
     interval_confidence: float

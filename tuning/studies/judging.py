@@ -1,4 +1,8 @@
-"""Gains judged as they are flown: on fresh trials and the flight clock, beside the paper's and those before."""
+"""Judge gains on held-out trials: simulate them on the flight clock and check the requirements.
+
+The tuned gains are compared with the published gains and with the scenario's original gains. Read `judge` first, then
+`verdicts_of`.
+"""
 
 from collections.abc import Sequence
 from typing import Any
@@ -18,10 +22,15 @@ from tuning.search import confirm, gains, trust
 
 
 def seed_of_judge(seed: int, turn: int = 0) -> int:
-    """The seed of the fresh trials; of others each turn, where gains that had broken a limit on some were tuned on.
+    """Return the seed of the held-out trials.
 
-    Never the search's own, nor that of another turn. A hash of 2^32 seeds has fixed points: that of seed 654735429 is
-    itself, and of two later turns one each is (all were tried).
+    It differs from the seed of the search, and from the seeds of earlier turns. The loop below is necessary because the
+    hash of `draws.derive` maps a few seeds to themselves. A test of all 2^32 seeds found one such seed for each of the
+    first three turns, for example 654735429 for turn 0.
+
+    Args:
+        seed: of the search.
+        turn: number of earlier searches whose gains broke a limit on their held-out trials.
     """
     taken = [seed]
     for k in range(turn + 1):
@@ -35,9 +44,12 @@ def seed_of_judge(seed: int, turn: int = 0) -> int:
 
 
 def beside(scenario: Scenario) -> tuple[dict[str, Scenario], str | None]:
-    """What tuned gains are set beside: "paper", the paper's, and "before", the scenario's own where they differ.
+    """Return the scenarios that tuned gains are compared with, and why the published gains cannot be simulated.
 
-    And why the scenario cannot be flown with the paper's, which are then not among them.
+    Returns:
+        "paper": the scenario with the published gains; "before": the scenario, if its gains differ from these. If the
+        published gains are not valid in the scenario, "paper" is missing, and the second value is the error message.
+        Otherwise the second value is None.
     """
     try:
         paper = gains.papers(scenario)
@@ -60,14 +72,20 @@ def judge(scenario: Scenario, fresh_seed: int, reach: Reach | None = None) -> Tr
 
 
 def floor_of(scenario: Scenario, fresh_seed: int) -> float | None:
-    """RMS window error that no controller can beat where a scenario is judged, see `runs.floor`."""
+    """Return the lower bound of the RMS window error on the flight clock, see `runs.floor`."""
     return runs.floor(study(as_flown(scenario)), fresh_seed)
 
 
 def verdicts_of(scenario: Scenario, trials: Trials, fresh_seed: int) -> list[Verdict]:
-    """One for each of the scenario's requirements over these trials, and for each margin asked of its loop."""
+    """Return the verdicts on the requirements, and on the required margins of the loop.
+
+    Args:
+        scenario: with the requirements and the gains.
+        trials: the held-out trials of these gains.
+        fresh_seed: of these trials.
+    """
     ready = study(as_flown(scenario))
-    one = 0 if trials.status.size == 1 else slice(None)  # nothing is drawn: no share of the trials to speak of
+    one = 0 if trials.status.size == 1 else slice(None)  # one nominal trial: a required fraction has no meaning
 
     def values(name: str) -> np.ndarray:
         return getattr(trials.metrics, name)[one]
@@ -77,18 +95,30 @@ def verdicts_of(scenario: Scenario, trials: Trials, fresh_seed: int) -> list[Ver
 
 
 def met(verdicts: Sequence[Verdict], trials: Trials) -> bool:
-    """Whether every requirement is met, and no trial failed or missed t_f."""
+    """Return whether every requirement is met, every trial reaches its end, and every trial converges by t_f."""
     return all(v.met for v in verdicts) and bool(np.all(trials.ok))
 
 
 def window_error(trials: Trials) -> tuple[float | None, tuple[float, float] | None]:
-    """RMS window error of the trials that were flown to the end, None if none was, and its interval."""
+    """Return the RMS window error of the trials that reached their end, and its confidence interval.
+
+    The error is None if no trial reached its end.
+    """
     errors = np.asarray(trials.metrics.window_error)[trials.finished]
     return float(trust.rms(errors)) if errors.size else None, trust.interval(errors, trust.rms)
 
 
 def figures(scenario: Scenario, trials: Trials, fresh_seed: int) -> dict[str, Any]:
-    """What fresh trials say of gains: RMS window error with its interval, failures, and whether all limits are met."""
+    """Return the results of gains on held-out trials, as fields of `front.Point`.
+
+    Args:
+        scenario: with the gains.
+        trials: the held-out trials of these gains.
+        fresh_seed: of these trials.
+
+    Returns:
+        RMS window error and its interval, number of failed trials, and whether every requirement is met.
+    """
     rms, interval = window_error(trials)
     return {
         "rms": np.nan if rms is None else rms,
@@ -99,9 +129,18 @@ def figures(scenario: Scenario, trials: Trials, fresh_seed: int) -> dict[str, An
 
 
 def largest(name: str, scenario: Scenario, trials: Trials) -> float:
-    """What a metric stays below in the share of trials that its requirement asks for, or in all; NaN: none ended.
+    """Return the value that a metric stays below in the required fraction of the trials, in the metric's unit.
 
-    A trial that failed is beyond all others, as in the verdict; where so many are, it is the largest of those that end.
+    Failed trials count as larger than all others, as in the verdict. If more trials fail than the fraction allows, the
+    result is the largest value of the trials that reach their end.
+
+    Args:
+        name: of the metric.
+        scenario: its requirement defines the fraction; without a requirement the fraction is 1.
+        trials: the trials.
+
+    Returns:
+        The value; NaN if no trial reaches its end.
     """
     values = np.sort(np.asarray(getattr(trials.metrics, name))[trials.finished])
     asked = scenario.requirements.get(name)
@@ -110,12 +149,12 @@ def largest(name: str, scenario: Scenario, trials: Trials) -> float:
 
 
 def as_flown(scenario: Scenario) -> Scenario:
-    """The scenario on the flight clock; a continuous loop as it is."""
+    """Return the scenario on the flight clock. A scenario with the continuous loop does not change."""
     return replace(scenario, loop__clock="flight") if scenario.sampled else scenario
 
 
 def judged_on(flown: Scenario) -> str:
-    """What a scenario was flown on to be judged, in words."""
+    """Return the clock and the sign function of the simulations in words, for reports."""
     if not flown.sampled:
         return "the continuous loop"
     if getattr(flown.controller, "implicit", False):
@@ -127,10 +166,10 @@ def judged_on(flown: Scenario) -> str:
 
 
 def trials_of(ready: Study, wanted: int) -> int:
-    """How many trials differ at all: one where nothing is drawn."""
+    """Return the number of trials to simulate: 1 if all trials are equal, else the wanted number."""
     return wanted if ready.drawn else 1
 
 
 def fresh_trials(ready: Study) -> int:
-    """On how many fresh trials gains are judged."""
+    """Return the number of held-out trials of a judgement."""
     return trials_of(ready, confirm.fresh_trials(ready.requirements))

@@ -1,4 +1,8 @@
-"""`ptsmc map`: accuracy and peak torque over two keys of a scenario, with what linear theory says beside it."""
+"""`ptsmc map`: accuracy, peak torque and stability margins over a grid of values for two scenario keys.
+
+Each pair of values is simulated. Linear covariance analysis and the poles of the frozen loop give the predictions of
+linear theory. Read `fly` first.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -21,7 +25,7 @@ from tuning.search import trust
 
 PERIOD, DELTA = "loop.period", "controller.delta"
 WHOLE_NUMBERS = ("hardware.delay", "hardware.star_tracker_every")
-WIDE = 5.0  # axes that span more than this factor are spaced by factors
+WIDE = 5.0  # axes that span more than this factor are logarithmic
 
 
 @dataclass(frozen=True)
@@ -30,60 +34,64 @@ class Axis:
 
     key: str
     values: tuple[float, ...]
-    span: str = ""  # LOW:HIGH:COUNT that they are of, where their ends and number do not say it
+    span: str = ""  # LOW:HIGH:COUNT of the option, if it cannot be derived from the values
 
     @property
     def text(self) -> str:
-        """The axis as `axis` reads it."""
+        """The axis in the format of the option, which `axis` parses."""
         return f"{self.key}={self.span or f'{self.values[0]:g}:{self.values[-1]:g}:{len(self.values)}'}"
 
     @property
     def logarithmic(self) -> bool:
-        """Whether it is spaced by factors."""
+        """Whether the axis is logarithmic."""
         return self.values[0] > 0 and self.values[-1] > WIDE * self.values[0]
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One pair of values."""
+    """The results for one pair of values. A number is NaN if it does not exist."""
 
     x: float
     y: float
-    status: str  # "flown", or why it was not
+    status: str  # "flown", or the reason why the pair was not simulated
     trials: int = 0
-    failures: int = 0  # not finished
-    missed: int = 0
+    failures: int = 0  # trials that did not reach their end
+    missed: int = 0  # trials that did not converge by t_f
     window_error: float = np.nan  # RMS over the trials
     peak_torque: float = np.nan  # mean over the trials [N m]
-    largest_peak_torque: float = np.nan
-    linear_window_error: float = np.nan  # of the noise alone, by linear covariance; NaN if it does not converge
-    linear_torque: float = np.nan
-    radius: float = np.nan  # of the frozen loop's poles at the hand-over
-    gain_margin: float = np.nan
-    delay_margin: float = np.nan  # [s]
-    hold_gain_margin: float = np.nan  # after it
-    hold_delay_margin: float = np.nan  # [s]
-    hold_radius: float = np.nan
+    largest_peak_torque: float = np.nan  # over the trials [N m]
+    linear_window_error: float = np.nan  # error due to noise alone, by linear covariance analysis
+    linear_torque: float = np.nan  # torque due to noise alone, by linear covariance analysis [N m]
+    radius: float = np.nan  # spectral radius of the frozen loop at the hand-over [-]
+    gain_margin: float = np.nan  # factor, at the hand-over [-]
+    delay_margin: float = np.nan  # at the hand-over [s]
+    hold_gain_margin: float = np.nan  # factor, in the hold phase [-]
+    hold_delay_margin: float = np.nan  # in the hold phase [s]
+    hold_radius: float = np.nan  # spectral radius of the frozen loop in the hold phase [-]
 
 
 @dataclass(frozen=True)
 class Map:
-    """Two keys of a scenario, and what was flown of each pair of their values."""
+    """The results for all pairs of values of two scenario keys."""
 
     scenario: Scenario
     x: Axis
     y: Axis
-    cells: list[Cell]  # row by row: the first has the first y
+    cells: list[Cell]  # x varies fastest
 
     def grid(self, name: str) -> np.ndarray:
-        """A field of the cells as an array (y, x)."""
+        """Return a field of the cells as an array (y, x)."""
         return np.array([getattr(cell, name) for cell in self.cells]).reshape(len(self.y.values), len(self.x.values))
 
 
 def axis(text: str, option: str) -> Axis:
-    """An axis from KEY=LOW:HIGH:COUNT, such as controller.delta=0.05:3:9, or of one number of several, KEY[0]=..
+    """Parse an axis from KEY=LOW:HIGH:COUNT, such as controller.delta=0.05:3:9.
 
-    Raises UsageError, which calls it by this option.
+    KEY[0] selects one element of a key with several numbers. Raises UsageError if the text is invalid.
+
+    Args:
+        text: value of the option.
+        option: name of the option in error messages, "--x" or "--y".
     """
     key, _, span = text.partition("=")
     parts = span.split(":")
@@ -101,41 +109,48 @@ def axis(text: str, option: str) -> Axis:
     if key in WHOLE_NUMBERS:
         values = np.round(values)
     different = tuple(dict.fromkeys(float(f"{v:.6g}") for v in values))
-    if len(different) < 2:  # a single value has no cells to draw
+    if len(different) < 2:  # a map needs at least two values
         those = "two whole numbers" if key in WHOLE_NUMBERS else "two values that differ in six digits"
         raise UsageError(f"{wanted}, with {those} between LOW and HIGH at least")
     return Axis(key, different, span if len(different) < count or key in WHOLE_NUMBERS else "")
 
 
 def usual_periods(scenario: Scenario) -> str:
-    """Return the default axis across: periods about the scenario's own."""
+    """Return the default x axis: control periods from 0.4 to 10 times the scenario's period."""
     period = scenario.loop.period
     return f"{PERIOD}={0.4 * period:.4g}:{10.0 * period:.4g}:9"
 
 
 def usual_deltas(scenario: Scenario) -> str:
-    """Return the default axis up: hand-over times from a period to a seventh of t_f, the scenario's own among them."""
+    """Return the default y axis: delta from one period to t_f / 7.
+
+    The range is extended to include the scenario's delta, and up to twice this delta.
+    """
     delta, shortest = scenario.hand_over, scenario.loop.period
     longest = max(scenario.controller.t_f / 7.0, 2.0 * delta)
     return f"{DELTA}={min(delta, shortest):.4g}:{longest:.4g}:9"
 
 
 def fly(scenario: Scenario, x: Axis, y: Axis, seed: int, trials: int, tell: Callable[[int, int], None]) -> Map:
-    """Fly the scenario's trials for every pair of values.
+    """Simulate the scenario's trials for every pair of values.
 
     Args:
-        scenario: what is flown.
-        x: the key across.
-        y: the key up.
-        seed: of the draws and the noise.
-        trials: of each pair; one where nothing is drawn.
-        tell: is called with the cells done, and in all.
+        scenario: the scenario.
+        x: the horizontal axis.
+        y: the vertical axis.
+        seed: of dispersions and noise.
+        trials: number of trials for each pair; 1 is used if all trials are equal.
+        tell: called with the number of finished cells and the number of all cells.
 
-    Raises ScenarioError where no pair at all is allowed.
+    Returns:
+        The map. A pair that is not a valid scenario has the error message as its status.
+
+    Raises:
+        ScenarioError: no pair is a valid scenario.
     """
     if PERIOD in (x.key, y.key):
         scenario.need_samples(PERIOD)
-    base = _with_its_gains(changed(scenario, tune=None))  # bounds would not fit every pair
+    base = _with_its_gains(changed(scenario, tune=None))  # the bounds in [tune] may be invalid for some pairs
     pairs = [(a, b) for b in y.values for a in x.values]
     studies: list[Study | str] = []
     for a, b in pairs:
@@ -155,7 +170,7 @@ def fly(scenario: Scenario, x: Axis, y: Axis, seed: int, trials: int, tell: Call
 
 
 def _with_its_gains(scenario: Scenario) -> Scenario:
-    """Return the scenario with its default gains stated: they stay when other keys change."""
+    """Return the scenario with explicit values of its default gains, so that other keys do not change them."""
     stated = {
         f"{where}__{name.removeprefix(table.prefix)}": getattr(table, name.removeprefix(table.prefix))
         for where, table in scenario.tuned_tables.items()
@@ -166,9 +181,10 @@ def _with_its_gains(scenario: Scenario) -> Scenario:
 
 
 def _with(scenario: Scenario, values: dict[str, float]) -> Scenario:
-    """The scenario with other values of these keys; a key with a number per axis or mode gets the value on each.
+    """Return the scenario with new values of some keys.
 
-    A key with a number in brackets, flexible.frequency[0], on that one alone.
+    If a key has a number for each axis or mode, all of them get the value. A key with an index, such as
+    flexible.frequency[0], changes one of them.
     """
     changes: dict[str, Any] = {}
     for key, value in values.items():
@@ -183,7 +199,7 @@ def _with(scenario: Scenario, values: dict[str, float]) -> Scenario:
                 raise ScenarioError(f"{key} names a number that {table}.{name} = {errors.brief(current)} has not")
             number = [value if k in chosen else old for k, old in enumerate(current)]
         changes[f"{table}__{name}"] = number
-    if "loop.t_end" not in values and {"controller.t_f", "loop.window"} & set(values):  # the time after t_f is kept
+    if "loop.t_end" not in values and {"controller.t_f", "loop.window"} & set(values):  # keep t_end - t_f
         t_f = values.get("controller.t_f", scenario.controller.t_f)
         after = max(scenario.end - scenario.controller.t_f, values.get("loop.window", scenario.window))
         changes["loop__t_end"] = t_f + after
@@ -191,7 +207,10 @@ def _with(scenario: Scenario, values: dict[str, float]) -> Scenario:
 
 
 def _common(parts: list[Parts]) -> Callable[[Parts], Parts]:
-    """What gives all parts clocks of one size and one number of substeps, so that one program flies them all."""
+    """Return a function that gives all parts clocks of equal size and equally many substeps.
+
+    One compiled program then simulates all of them.
+    """
     substeps, clocks = max(p.substeps for p in parts), [p.clock for p in parts]
     return lambda one: replace(one, clock=one.clock.long_enough_for(clocks), substeps=substeps)
 
@@ -209,17 +228,17 @@ def _cell(x: float, y: float, ready: Study, common: Callable[[Parts], Parts], se
             "peak_torque": float(np.mean(peaks)),
             "largest_peak_torque": float(peaks.max()),
         }
-    # of the plant's own steps as many as it needs, nearly: a program for each power of two
+    # substeps rounded up to a power of two, so that the cells share few compiled programs of the margins
     parts = replace(parts, substeps=1 << (ready.parts.substeps - 1).bit_length())
     if ready.scenario.sampled:
         ends = run_margins.at_ends(parts)
         for prefix, (left, radius) in (("", ends["hand_over"]), ("hold_", ends["hold"])):
-            # the factor on the gain of the worst axis up to which it is stable; below 1 where it is not: how near its
-            # nearest border is, which may as well be one of more gain
+            # Gain margin of the worst axis as a factor. If the loop is unstable, the factor is below 1. The nearest
+            # stability limit is then at this gain factor or at its inverse.
             figures[f"{prefix}gain_margin"] = float(10.0 ** (left.gain_up.min() / 20.0))
             figures[f"{prefix}delay_margin"] = float(left.delay.min())
             figures[f"{prefix}radius"] = radius
-        # of other laws it has not been set beside flown trials
+        # the prediction has been compared with simulated trials for the prescribed-time law only
         if parts.controller.prescribed and covariance.predicts(parts) and figures["radius"] < 1.0 + margins.NEUTRAL:
             expected = covariance.noise(parts)
             if expected.converged:
@@ -228,7 +247,17 @@ def _cell(x: float, y: float, ready: Study, common: Callable[[Parts], Parts], se
 
 
 def lines(scenario: Scenario, x: Axis, y: Axis) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Where the frozen loop loses its stability at the hand-over, over period and delta: label -> (x, y)."""
+    """Return the stability limits of the frozen loop at the hand-over in a map of period and delta, by label.
+
+    Args:
+        scenario: the scenario of the map.
+        x: the horizontal axis.
+        y: the vertical axis.
+
+    Returns:
+        Coordinates x (points,) and y (points,) of each curve [s], see `borders.smallest_delta`. The result is empty for
+        other keys, for other laws, and for plants whose order is not 2.
+    """
     papers_loop = scenario.sampled and scenario.controller.law.prescribed and scenario.order == 2
     if {x.key, y.key} != {PERIOD, DELTA} or not papers_loop:
         return {}
@@ -236,7 +265,7 @@ def lines(scenario: Scenario, x: Axis, y: Axis) -> dict[str, tuple[np.ndarray, n
     h = np.asarray(x.values if x.key == PERIOD else y.values)
     anchored = scenario.loop.clock == "anchored"
     implicit, border = scenario.controller.implicit, f"$\\delta = (\\eta - {3 if anchored else 1}/2) h$"
-    # without delay implicit sampling has no border: where it would be is drawn
+    # without delay, implicit sampling has no stability limit; the limit of explicit sampling is drawn instead
     without = f"{border}, of explicit sampling only" if implicit else border
     delayed = "with {} of delay" if implicit else "the same with {} of delay"
     delays = {without: 0.0, delayed.format("a period"): 1.0}
@@ -251,9 +280,12 @@ def lines(scenario: Scenario, x: Axis, y: Axis) -> dict[str, tuple[np.ndarray, n
 
 
 def spillover(flown: Map) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Where the modes that the law does not know cost the loop its stability, by linear theory: label -> (x, y).
+    """Return the stability limits of a loop with flexible modes, which the law does not model, by label.
 
-    The border between pairs with a pole inside and outside the unit circle, at the hand-over and in hold.
+    Each curve is the contour where the spectral radius of the frozen loop is 1, at the hand-over or in the hold phase.
+
+    Returns:
+        Coordinates x (points,) and y (points,) of each curve; NaN separates its pieces. Empty without flexible modes.
     """
     if getattr(flown.scenario, "flexible", None) is None:
         return {}
@@ -271,7 +303,7 @@ def spillover(flown: Map) -> dict[str, tuple[np.ndarray, np.ndarray]]:
 
 
 def _label(scenario: Scenario, key: str) -> str:
-    """A key with its unit, as it stands in the documentation of its table; without, where the scenario has none."""
+    """Return a key with its unit from the schema of its table; without a unit if the scenario has no such table."""
     table, _, name = key.partition(".")
     found = getattr(scenario, table, None)
     known = [] if found is None else keys.of(type(found), scenario.unit_of_d)
@@ -280,7 +312,14 @@ def _label(scenario: Scenario, key: str) -> str:
 
 
 def write(folder: Path, flown: Map, seed: int, figures: bool) -> None:
-    """Fill a result folder."""
+    """Write a result folder: `map.csv` and figures.
+
+    Args:
+        folder: an empty folder.
+        flown: the results.
+        seed: of dispersions and noise.
+        figures: write figures too.
+    """
     scenario, x, y, cells = flown.scenario, flown.x, flown.y, flown.cells
     trials = max((cell.trials for cell in cells), default=0)
     made_by = {"command": "map", "seed": seed, "x": x.text, "y": y.text, "trials": trials, **own.digests(scenario)}
@@ -293,7 +332,7 @@ def write(folder: Path, flown: Map, seed: int, figures: bool) -> None:
         names = ("window_error", "linear_window_error", "peak_torque", "largest_peak_torque")
         grids = {name: flown.grid(name) for name in names}
         if not any(np.isfinite(grid).any() for grid in grids.values()):
-            return  # every trial of every pair failed: map.csv says so, and there is nothing to draw
+            return  # every trial of every pair failed, so that there is nothing to plot
         across, up = (study_plots.MapAxis(_label(scenario, one.key), one.values, one.logarithmic) for one in (x, y))
         drawn = study_plots.accuracy_map(
             across,

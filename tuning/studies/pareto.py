@@ -30,7 +30,7 @@ from tuning.studies.front import KINDS, Front, Point, titled, unit_of
 from tuning.studies.trades import SENSITIVITY, TORQUE, Target, Trade
 
 WARM = 3  # starting points of a target among the known gains
-NEARLY = 0.05  # relative violation of a limit up to which known gains are as good a start as feasible ones
+NEARLY = 0.05  # known gains that violate a limit by less than this fraction are starting points like feasible ones
 STEPS = 40  # largest number of evaluations from each starting point
 APART = 1e-3  # smallest distance of two points, as a fraction of the bounds' intervals
 
@@ -175,7 +175,15 @@ def knee_of(points: np.ndarray) -> int:
 
 
 def write(folder: Path, trade: Trade, front: Front, figures: bool, known_by: dict[str, Any]) -> None:
-    """Write a result folder; known_by: entries of `versions.json`."""
+    """Write a result folder: `summary.json`, a CSV file with the points, and a figure.
+
+    Args:
+        folder: an empty folder.
+        trade: the scenario and the traded quantity.
+        front: the results.
+        figures: write the figure too.
+        known_by: entries of `versions.json`, see `Trade.identity`.
+    """
     kind, names = KINDS[front.against], gains.named(trade.scenario)
     store.record(folder, parsing.dump(trade.scenario), known_by, front.summary())
     error, marks = ("rms_window_error", "rms_low", "rms_high"), ("dominated", "knee", "trained_goal")

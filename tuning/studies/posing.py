@@ -1,4 +1,7 @@
-"""The tuning problem of a scenario over its training trials, and what evaluates it."""
+"""Turn a scenario into a tuning problem: training trials, limits, bounds of the gains, starting points.
+
+`pose` builds the problem, and `Posed.search` solves it. Read `pose` first.
+"""
 
 import dataclasses
 import math
@@ -20,19 +23,19 @@ from tuning.search.objective import Problem
 from tuning.search.optimise import Search, Settings, search
 from tuning.studies import judging
 
-DIGITS = 10  # of the gains handed over; what is judged is what is handed over
+DIGITS = 10  # significant digits of reported gains; the rounded gains are judged
 
 
 @dataclass(frozen=True)
 class Posed:
-    """A scenario's tuning problem over its training trials, and what evaluates it."""
+    """A scenario's tuning problem over its training trials, and the evaluator of gains."""
 
     ready: Study
     problem: Problem
     evaluate: Evaluator
     own: np.ndarray  # (gains,) of the scenario
-    sloped: bool  # F has slopes to go by: no gain is flown with the exact sign
-    asked: list[Requirement]  # what the search keeps
+    sloped: bool  # F has useful gradients: the sign function is not discontinuous
+    asked: list[Requirement]  # constraints of the search
     seed: int
     designs: np.ndarray  # (designs, gains) starting points that follow from the mission
 
@@ -47,10 +50,16 @@ class Posed:
         margins: Mapping[str, float] | None = None,
         **callbacks: Callable,
     ) -> Search:
-        """Look for the best gains of this problem from these gains, (gains,), and so many starts in all.
+        """Search for the best gains of a problem.
 
-        asked: requirements that are kept, where they are not the scenario's; judged, margins: see `Settings`;
-        callbacks: `report` and `prepare` of `search`.
+        Args:
+            problem: the objective and its constraints.
+            gains: first starting point (gains,), in the units of the gains.
+            starts: number of starting points.
+            asked: requirements that the search keeps; None: `self.asked`.
+            judged: see `Settings`.
+            margins: distance from the limit of each metric as a fraction of the limit, see `Settings`.
+            callbacks: `report` and `prepare` of `search`.
         """
         table, asked = self.ready.scenario.search, self.asked if asked is None else asked
         settings = Settings(
@@ -59,12 +68,12 @@ class Posed:
         return search(self.evaluate, problem, asked, gains, settings, **callbacks)
 
     def named(self, share: np.ndarray) -> dict[str, float]:
-        """The gains of these shares of the bounds' intervals, (gains,), by name, in the digits that are handed over."""
+        """Return rounded gains by name; share: gains as fractions of the bounds' intervals (gains,) [-]."""
         return self.evaluate.bounds.rounded(self.evaluate.bounds.gains(share), DIGITS)
 
 
 def with_bounds(scenario: Scenario, moved: Mapping[str, tuple[float, float]]) -> Scenario:
-    """Return the scenario with other bounds of some gains, which still count as default ones."""
+    """Return the scenario with other bounds of some gains. These bounds still count as default bounds."""
     tune = msgspec.structs.replace(scenario.search, bounds={**scenario.search.bounds, **moved})
     return msgspec.structs.replace(scenario, tune=tune)
 
@@ -73,9 +82,9 @@ def pose(scenario: Scenario, seed: int, journal: Journal | None = None, **farthe
     """Return the tuning problem of a scenario.
 
     Args:
-        scenario: what is tuned.
+        scenario: with free gains.
         seed: of the training trials and the search.
-        journal: of evaluations.
+        journal: stored evaluations, which are not simulated again.
         farther: see `reach`.
     """
     scenario, table = as_trained(scenario), scenario.search
@@ -106,16 +115,23 @@ def pose(scenario: Scenario, seed: int, journal: Journal | None = None, **farthe
 
 
 def as_trained(scenario: Scenario) -> Scenario:
-    """The scenario with a sample at the hand-over, where a gain moves it.
+    """Return the scenario on the anchored clock, which has a sample at t_f - delta, if delta or t_f is tuned.
 
-    A flight computer hands over at its first sample not before t_f - delta: up to there delta moves nothing.
+    A flight computer hands over at its first sample at or after t_f - delta. On the flight clock, small changes of
+    delta therefore have no effect, and the gradient is zero.
     """
     moved = scenario.sampled and any(name in gain_bounds.TIMES for name in gains.named(scenario))
     return replace(scenario, loop__clock="anchored") if moved else scenario
 
 
 def reach(scenario: Scenario, table: tables.Tune, **farther: float) -> Reach:
-    """How far the free gains may move; farther: fields of `Reach` that are to be others."""
+    """Return the ranges of the free gains that one compiled program must cover.
+
+    Args:
+        scenario: its gains are in the ranges.
+        table: its bounds are in the ranges.
+        farther: fields of `Reach` that get other values.
+    """
     own = reach_of(scenario)
 
     def interval(name: str, lower: float, upper: float | None = None) -> tuple[float, float]:
@@ -141,7 +157,7 @@ def reach(scenario: Scenario, table: tables.Tune, **farther: float) -> Reach:
 
 
 def _tail(table: tables.Tune, trials: int) -> int | None:
-    """How many of the worst training trials are averaged."""
+    """Return the number of worst training trials that define the objective, or None if all trials do."""
     if table.statistic in ("rms", "mean"):
         return None
     if table.statistic == "worst":

@@ -1,4 +1,4 @@
-"""Why trials of a campaign are the worst: what was drawn in them, beside all trials."""
+"""`ptsmc why`: compare the inputs of the worst trials of a campaign with the inputs of all trials. Read `why` first."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -14,12 +14,21 @@ from tuning.studies.campaign_folder import Folder
 
 
 def why(folder: Folder, metrics: Sequence[str], count: int) -> list[dict[str, Any]]:
-    """What was drawn in the worst trials by each metric: each input as a percentile of all trials, and their median.
+    """Return the inputs of the worst trials by each metric, compared with the inputs of all trials.
 
-    Failed trials first, as in `campaign_summary.worst`; of inputs that rank the trials alike only the first. For one
-    that says which of several things, such as a wheel, there is instead the share of the trials that have the same.
-    Beside each stands how the metric goes with it over all trials that end with a value, how many "trials" these are,
-    see `statistics.drivers`; None where so few do not show it.
+    Failed trials come first, as in `campaign_summary.worst`. If several inputs order the trials equally, only the first
+    of them is listed.
+
+    Args:
+        folder: the campaign.
+        metrics: names of metrics.
+        count: number of worst trials for each metric.
+
+    Returns:
+        An entry for each metric, trial and input. It has the percentile rank of the input [%] and the median of all
+        trials. A categorical input, such as the number of a failed wheel, has the fraction of equal trials instead.
+        "rank_correlation" and "first_order" are the sensitivities of the metric, see `statistics.drivers`. They are
+        None if too few trials have a value. "trials" is the number of trials with a value.
     """
     parts, unit_of = folder.whole_parts(), folder.units
     drawn = campaign_summary.drawn_columns(folder, parts)
@@ -54,7 +63,7 @@ def why(folder: Folder, metrics: Sequence[str], count: int) -> list[dict[str, An
 
 
 def _among(name: str, values: np.ndarray, drawn: float) -> dict[str, float | None]:
-    """Where what was drawn stands among all trials (trials,), or how many of them have the same."""
+    """Return the percentile rank of an input among all trials, or the fraction of equal trials for a category."""
     if name in CATEGORIES:
         return {"percentile": None, "median": None, "share": float(np.mean(values == drawn))}
     return {"percentile": statistics.percentile(values, drawn), "median": float(np.median(values)), "share": None}

@@ -1,4 +1,7 @@
-"""What `ptsmc reproduce` leaves: Figs. 1 to 10 of the paper, and its claims and slips beside what was measured."""
+"""`ptsmc reproduce`: Figs. 1 to 10 of the paper, and its claims and errors compared with simulations.
+
+Read `reproduce` first, then `write`.
+"""
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -16,7 +19,7 @@ from ptsmc_jax.scenario import from_tables, parsing
 
 @dataclass(frozen=True)
 class Reproduction:
-    """The paper's cases as flown, and what was measured."""
+    """Simulations of the paper's cases, and the results for its claims and its errors ("slips")."""
 
     cases: dict[str, Run]
     claims: list[claims.Claim]
@@ -25,18 +28,18 @@ class Reproduction:
 
     @property
     def ok(self) -> bool:
-        """Every case was flown to its end."""
+        """Whether every case reached its end."""
         return all(run.status == "ok" for run in self.cases.values())
 
 
 def reproduce() -> Reproduction:
-    """Fly every case of the paper and measure what it claims."""
+    """Simulate every case of the paper and check its claims."""
     cases = claims.fly_cases()
     return Reproduction(cases, claims.claims(cases), slips.slips(cases), remark_2.measure())
 
 
 def summary(reproduction: Reproduction) -> dict[str, Any]:
-    """What `summary.json` says."""
+    """Return the content of `summary.json`."""
     verdicts = [claim.verdict for claim in reproduction.claims]
     return {
         "status": "ok" if reproduction.ok else "failed",
@@ -55,7 +58,13 @@ def summary(reproduction: Reproduction) -> dict[str, Any]:
 
 
 def write(folder: Path, reproduction: Reproduction, figures: bool) -> None:
-    """Fill a result folder."""
+    """Write a result folder: `summary.json`, `claims.md`, the scenarios, and figures.
+
+    Args:
+        folder: an empty folder.
+        reproduction: the results.
+        figures: write figures too.
+    """
     store.write_json(folder / "versions.json", store.versions("reproduce", 0))
     store.write_json(folder / store.SUMMARY, summary(reproduction))
     (folder / "claims.md").write_text(_markdown(reproduction), encoding="utf-8")

@@ -1,4 +1,7 @@
-"""What `ptsmc simulate` leaves: the history of one run as CSV, its metrics and verdicts, figures."""
+"""The result folder of `ptsmc simulate`: history of one run as CSV, metrics, verdicts and figures.
+
+Read `write` first.
+"""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,15 +16,21 @@ from ptsmc_jax.onboard import sources
 from ptsmc_jax.scenario import cautions, own, parsing
 from ptsmc_jax.scenario.tables import Scenario
 
-if TYPE_CHECKING:  # what flies C is imported where C flies
+if TYPE_CHECKING:  # runs without C code do not need this import
     from ptsmc_jax.onboard.library import InTheLoop
 
-# of a verdict on a share of the time
+# fields of a verdict on a requirement that allows violations for some of the time
 OF_TIME = ("quantile", "confidence", "interpretation", "share_of_time", "shown")
 
 
 def summary(run: Run, scenario: Scenario, computer: "InTheLoop | None" = None) -> dict[str, Any]:
-    """What `summary.json` says; computer: the C that decided, where that is not the parts' own code."""
+    """Return the content of `summary.json`.
+
+    Args:
+        run: the simulated run.
+        scenario: its scenario.
+        computer: the C code that controlled the run; None: the simulated law did.
+    """
     verdicts = {
         v.metric: {
             **{"limit": v.limit, "margin": v.margin, "met": v.met, "worst": v.worst, "at_least": v.at_least},
@@ -49,7 +58,18 @@ def write(
     computer: "InTheLoop | None" = None,
     replayed: Mapping[str, Any] = MappingProxyType({}),
 ) -> None:
-    """Fill a result folder; computer: see `summary`; replayed: what else `versions.json` says of a campaign's trial."""
+    """Write a result folder: `summary.json`, `trajectory.csv` and figures.
+
+    Args:
+        folder: an empty folder.
+        scenario: the scenario.
+        run: the simulated run.
+        seed: of dispersions and noise.
+        trial: number of the trial; None: the nominal run.
+        figures: write figures too.
+        computer: the C code that controlled the run; None: the simulated law did.
+        replayed: further entries of `versions.json` if the run repeats a trial of a campaign.
+    """
     made_by = {"command": "simulate", "seed": seed, "trial": trial, **replayed, **own.digests(scenario)}
     if computer is not None:
         place = computer.library.folder
@@ -58,6 +78,6 @@ def write(
     columns = run.columns()
     store.write_csv(folder / "trajectory.csv", list(columns), np.column_stack(list(columns.values())).tolist())
     if figures:
-        from ptsmc_jax.figures import run_plots, style  # takes 0.3 s, which a run without figures need not wait for
+        from ptsmc_jax.figures import run_plots, style  # the import takes 0.3 s, which only figures need
 
         style.save(run_plots.run_figures(run.parts, run.log, run.torque_limit, run.floor), folder / "figures")

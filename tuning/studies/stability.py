@@ -1,4 +1,7 @@
-"""`ptsmc margins`: what gain, phase, delay and sensitivity the loop of a scenario leaves, and where."""
+"""`ptsmc margins`: gain, phase and delay margins and the peak sensitivity of a scenario's loop.
+
+The loop is linearised along the nominal run: at samples of the approach phase and in the hold phase. Read `find` first.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -21,9 +24,10 @@ from ptsmc_jax.theory.run_margins import Course
 
 
 def find(scenario: Scenario) -> tuple[Study, Course]:
-    """Margins of a scenario, along its nominal run.
+    """Return the margins of a scenario along its nominal run.
 
-    Raises ScenarioError without the sampled loop or slopes of it, or where that run is lost before its end.
+    Raises ScenarioError if the loop is continuous, if it has no finite derivatives in the hold phase, or if the nominal
+    run does not reach its end.
     """
     if not scenario.sampled:
         raise ScenarioError(f'margins need the sampled loop, but loop.mode is "{scenario.loop.mode}"')
@@ -46,10 +50,13 @@ def find(scenario: Scenario) -> tuple[Study, Course]:
 
 
 def worst(ready: Study) -> dict[str, dict[str, Any]] | None:
-    """Margins of the worst axis "before" the hand-over, where they are judged, and in "hold".
+    """Return the margins of the worst axis "before" the hand-over, at the samples that are judged, and in "hold".
 
-    None without the sampled loop, or without slopes in hold. Each with whether all its loops are "stable"; where the
-    nominal run does not come to rest none are left in hold, and its `swing` stands there.
+    Returns:
+        Margins in [dB], [deg] and [s] for both phases, and whether the loops of all axes are "stable". If the nominal
+        run ends in a limit cycle, positive margins in "hold" are replaced by 0, and "swing" has the amplitude and the
+        period of the cycle. The result is None for a continuous loop, and if the loop has no finite derivatives in the
+        hold phase.
     """
     if not ready.scenario.sampled:
         return None
@@ -76,17 +83,17 @@ def _swing(scenario: Scenario, swing: Swing) -> dict[str, Any]:
 
 
 def _number(value: Any) -> float | None:
-    return float(value) + 0.0 if np.isfinite(value) else None  # + 0.0: a peak of -0 dB is one of 0
+    return float(value) + 0.0 if np.isfinite(value) else None  # + 0.0 replaces -0 by 0
 
 
 def names(ready: Study) -> tuple[list[str], list[str]]:
-    """The names of the inputs, and of what the sensors see."""
+    """Return the names of the inputs and the names of the measured signals."""
     plant = ready.parts.plant
     return plant.input_labels, plant.signal_labels(plant.visible(ready.parts.initial))
 
 
 def summary(ready: Study, course: Course) -> dict[str, Any]:
-    """Return the margins for `summary.json`: [dB], [deg], [s]; null: no limit, or no value."""
+    """Return the content of `summary.json`: margins in [dB], [deg] and [s]; null: infinite, or no value."""
     inputs, seen = names(ready)
     (_, hold), before = course.hold, course.before
 
@@ -96,7 +103,7 @@ def summary(ready: Study, course: Course) -> dict[str, Any]:
     def opened(k: int) -> dict[str, list[str]]:
         left, new = jax.tree.map(lambda v: v[k], (course.at_input, course.loops.new))
         none_back = _open(left)
-        cut = none_back & ~np.any(new[0], axis=0)  # the plant does not feel the command
+        cut = none_back & ~np.any(new[0], axis=0)  # the command has no effect on the plant
         return {key: [name for name, it in zip(inputs, rows, strict=True) if it]
                 for key, rows in (("open", none_back), ("cut", cut))}  # fmt: skip
 
@@ -127,11 +134,12 @@ def summary(ready: Study, course: Course) -> dict[str, Any]:
 
 
 def _open(left: margins.Margins) -> np.ndarray:
-    """Where nothing comes back (m,), bool: L = 0.
+    """Return at which inputs the loop transfer L is zero, (m,).
 
-    As where a limit cuts the command of the nominal run, or the law or sensors pass nothing on at this sample.
+    For example, a torque limit saturates the command of the nominal run, or the law does not react to the state at this
+    sample.
     """
-    # infinite, or, where other axes make the loop unstable, as far from a border as is told
+    # infinite margins, or the largest reported distance from a stability limit if other axes make the loop unstable
     unlimited = (np.abs(left.gain_up) >= MOST) & (np.abs(left.gain_down) >= MOST)
     return unlimited & (np.abs(left.modulus) < 1e-9) & np.isnan(left.crossover)
 
@@ -145,7 +153,14 @@ def _start(ready: Study) -> dict[str, float]:
 
 
 def write(folder: Path, ready: Study, course: Course, figures: bool) -> None:
-    """Fill a result folder."""
+    """Write a result folder: `summary.json`, `margins.csv` and figures.
+
+    Args:
+        folder: an empty folder.
+        ready: the scenario, ready to simulate.
+        course: its margins.
+        figures: write figures too.
+    """
     scenario = ready.scenario
     made_by = {"command": "margins", "seed": None, **own.digests(scenario)}
     store.record(folder, parsing.dump(scenario), made_by, summary(ready, course))

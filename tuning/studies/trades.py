@@ -91,7 +91,13 @@ class Trade(ABC):
 
     @abstractmethod
     def costs(self, tuned: Scenario, trials: Trials, seed: int) -> dict[str, float]:
-        """Return the costs of gains by name, from the held-out trials of this seed."""
+        """Return the costs of gains by name, in the units of the metrics and margins.
+
+        Args:
+            tuned: the scenario with the gains.
+            trials: the held-out trials of the gains.
+            seed: of these trials.
+        """
 
     @abstractmethod
     def options(self) -> dict[str, Any]:
@@ -168,7 +174,7 @@ class Torque(Trade):
 class Margins(Trade):
     """Limits on the largest sensitivity max |S| = M, which bounds the other margins.
 
-    The loop tolerates a gain between the factors M / (M + 1) and M / (M - 1), and a phase error of 2 asin(1 / (2 M)).
+    The loop tolerates gain factors between M / (M + 1) and M / (M - 1), and a phase error up to 2 asin(1 / (2 M)).
     Source: Skogestad and Postlethwaite, Multivariable Feedback Control, 2005, 2.4.3.
     """
 
@@ -275,7 +281,10 @@ class SlewTime(Trade):
         return scenarios.replace(timed, tune={**parsing.plain(tune), "bounds": bounds})
 
     def targets(self, posed: Posed, tell: Report) -> tuple[list[Target], list[np.ndarray]]:
-        """Search for the longest time, the shortest, and the others. Trials that join these two join all."""
+        """Search for the longest time, the shortest, and the others.
+
+        Difficult trials that the first two searches add to the training trials are used for all other times too.
+        """
         joined, last, known = posed.problem, len(self.values) - 1, []
         parts = [gains.with_gains(joined.parts, {"t_f": t_f}) for t_f in self.values]
         for k in (last, 0, *range(last - 1, 0, -1)):
@@ -367,7 +376,15 @@ def least_torque(
 def _found(
     posed: Posed, problem: Problem, report: Report, starts: int | None = None, asked: Sequence[Any] | None = None
 ) -> Search:
-    """Search from the scenario's gains, and raise KeyboardInterrupt if the search was interrupted."""
+    """Search from the scenario's gains. Raises KeyboardInterrupt if the search was interrupted.
+
+    Args:
+        posed: the tuning problem of the scenario.
+        problem: the problem with a limit, or another value of the traded quantity.
+        report: called with the progress.
+        starts: number of starting points; None: as in the scenario.
+        asked: requirements that the search keeps; None: those of the scenario.
+    """
     starts = posed.ready.scenario.search.starts if starts is None else starts
     found = posed.search(problem, posed.own, starts, asked, judged=False, report=report)
     if found.interrupted:

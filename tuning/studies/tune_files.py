@@ -1,4 +1,4 @@
-"""The files of a tuning run: summary, history, tuned scenario, figures."""
+"""The result folder of `ptsmc tune`: summary, history, tuned scenario and figures. Read `write` first."""
 
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -23,13 +23,16 @@ JUDGED = {"window_error": "rms", "peak_torque": "mean", "effort": "mean"}  # sta
 
 
 def statistics(trials: Trials, kind: str) -> dict[str, Any]:
-    """Counts by status and statistics of each metric of this kind of plant over the trials that ended well."""
+    """Return counts by status, and statistics of each metric over the trials that reached their end.
+
+    kind: of the plant, which defines the metrics.
+    """
     found: dict[str, Any] = {"trials": int(trials.status.size), "counts": trials.counts()}
     for name, entry in catalogues.CATALOGUES[kind].items():
         values = getattr(trials.metrics, name)[trials.finished]
         known = values[np.isfinite(values)]
         if known.size == 0:
-            if entry.table is None:  # else the scenario has no table for it
+            if entry.table is None:  # else the metric needs a table that the scenario does not have
                 found[name] = None
             continue
         found[name] = {
@@ -39,7 +42,7 @@ def statistics(trials: Trials, kind: str) -> dict[str, Any]:
             "q99": np.quantile(known, 0.99),
             "max": known.max(),
         }
-        if name in catalogues.LARGER_IS_BETTER:  # whose bad end is the other one
+        if name in catalogues.LARGER_IS_BETTER:  # small values are the bad ones
             found[name] |= {"q01": np.quantile(known, 0.01), "min": known.min()}
         if known.size < values.size:
             found[name]["without_value"] = int(values.size - known.size)
@@ -50,7 +53,7 @@ def statistics(trials: Trials, kind: str) -> dict[str, Any]:
 
 
 def summary(tuning: Tuning) -> dict[str, Any]:
-    """What `summary.json` says."""
+    """Return the content of `summary.json`."""
     kind, search = tuning.tuned.plant.kind, tuning.search
     groups = {
         name: {
@@ -112,7 +115,10 @@ def summary(tuning: Tuning) -> dict[str, Any]:
 
 
 def _accuracy_gain(fresh: Mapping[str, Trials]) -> dict[str, Any]:
-    """How many times the paper's accuracy, over the trials that both fly to the end."""
+    """Return the ratio of the published gains' RMS window error to the tuned gains' error, and its interval.
+
+    The ratio is over the trials that reach their end with both sets of gains.
+    """
     both = fresh["tuned"].finished & fresh["paper"].finished if "paper" in fresh else np.zeros(0, bool)
     if not both.any():
         return {"accuracy_gain_over_paper": None, "accuracy_gain_interval": None}
@@ -124,7 +130,7 @@ def _accuracy_gain(fresh: Mapping[str, Trials]) -> dict[str, Any]:
 
 
 def _trust(found: Trust, tuning: Tuning) -> dict[str, Any]:
-    """What the gains found hang on, and whether they can be trusted, as `summary.json` says it."""
+    """Return the entry "trust" of `summary.json`: gradient check, influence of each gain, sensitivities and margins."""
     ideal = not tuning.tuned.sampled and tuning.tuned.hardware is None
     influence = {}
     for name, profile in found.profiles.items():
@@ -152,14 +158,14 @@ def _trust(found: Trust, tuning: Tuning) -> dict[str, Any]:
 
 
 def _beyond(seen: Beyond | None, bound: float) -> str:
-    """What was measured beyond a bound, in words."""
+    """Return the results beyond a bound in words."""
     if seen is None:
         return f"on its bound {bound:g}; what lies beyond it was not flown"
     if seen.better:
         return f"better beyond its bound: {seen.times:.3g} times the error at {seen.value:g}, every requirement kept"
     if seen.broken is not None:
         return f"no better beyond its bound: at {seen.value:g} {seen.broken}"
-    if seen.times is None:  # no trial is flown to the end by the tuned gains, or their error is zero
+    if seen.times is None:  # no trial reaches its end with the tuned gains, or their error is zero
         return f"on its bound {bound:g}: every requirement kept at {seen.value:g}, with no error to set that beside"
     times = f"{seen.times:.3g}"
     error = "the same error" if times == "1" else f"{times} times the error"
@@ -167,7 +173,15 @@ def _beyond(seen: Beyond | None, bound: float) -> str:
 
 
 def write(folder: Path, scenario: Scenario, tuning: Tuning, figures: bool, known_by: Mapping[str, Any]) -> None:
-    """Fill a result folder; known_by: see `identity`."""
+    """Write a result folder: `summary.json`, `tuned.toml`, `history.csv` and figures.
+
+    Args:
+        folder: an empty folder.
+        scenario: the scenario before tuning.
+        tuning: the results.
+        figures: write figures too.
+        known_by: entries of `versions.json`, see `identity`.
+    """
     store.record(folder, parsing.dump(scenario), known_by, summary(tuning))
     store.write_toml(folder / "tuned.toml", own_parts.carry(parsing.dump(tuning.tuned), folder))
     rows = [
@@ -183,25 +197,31 @@ def write(folder: Path, scenario: Scenario, tuning: Tuning, figures: bool, known
 
 
 def history_columns(scenario: Scenario, limited: Iterable[str]) -> list[str]:
-    """Names of the columns of `history.csv`; limited: metrics that the last ones tell as shares of limits."""
+    """Return the column names of `history.csv`; limited: metrics with a column for the ratio of value to limit."""
     tune = scenario.search
     goal = f"objective_{tune.minimise}" if tune.minimise in (T_F, LIMITS) else f"{tune.statistic}_{tune.minimise}"
     return ["step", "start", goal, *gain_names.named(scenario), *(f"{metric}_over_limit" for metric in limited)]
 
 
 def _paths(history: Sequence[Step]) -> list[list[Step]]:
-    """The points that each start went through, start by start."""
+    """Return the evaluated points of each starting point."""
     return [list(path) for _, path in itertools.groupby(history, lambda step: step.start)]
 
 
 def identity(scenario: Scenario, seed: int, *, globally: bool) -> dict[str, Any]:
-    """What `versions.json` knows a finished or interrupted tuning by."""
+    """Return the entries of `versions.json` that identify a tuning run.
+
+    Args:
+        scenario: the scenario before tuning.
+        seed: of the search.
+        globally: the run includes a global search for comparison.
+    """
     return {"command": "tune", "seed": seed, **({"global_check": True} if globally else {}), **own.digests(scenario)}
 
 
 def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
-    """Figures of a tuning run by name."""
-    from ptsmc_jax.figures import study_plots  # takes a while, in which the search flies
+    """Return the figures of a tuning run by name."""
+    from ptsmc_jax.figures import study_plots  # slow import, not needed before the search ends
 
     kind, names = scenario.plant.kind, gain_names.named(scenario)
     unit_of = gain_names.units_of(scenario)
@@ -237,7 +257,7 @@ def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
     if ended:
         limit, floor = tables.limit_of(scenario, "peak_torque"), tuning.floors["tuned"]
         figures["tradeoff"] = study_plots.tradeoff(ended, limit, kind, floor)
-    if tuning.trust is not None and tuning.trust.sensitivities:  # none where no trial ends
+    if tuning.trust is not None and tuning.trust.sensitivities:  # empty if no trial reaches its end
         figures["sensitivities"] = study_plots.tornado(tuning.trust.sensitivities)
     if tuning.trust is not None:
         figures["profiles"] = study_plots.profiles(

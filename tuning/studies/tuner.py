@@ -1,4 +1,8 @@
-"""What a tuning run hands its user: gains judged on fresh trials beside the paper's and the scenario's own."""
+"""`ptsmc tune`: search for gains and judge them on held-out trials, against published and original gains.
+
+If the gains break a limit on the held-out trials, the search is repeated with more distance from the limits. Read
+`tune` first.
+"""
 
 import time
 from dataclasses import dataclass, replace
@@ -26,94 +30,94 @@ from tuning.search.trust import Profile
 from tuning.studies import judging, posing, stability
 from tuning.studies.posing import Posed
 
-WIDENED = 3  # searches in larger bounds, at most
-TRIES = 3  # searches at most, each of whose gains are judged on fresh trials of their own
-FARTHER = 1.02  # a further search keeps so much more from the limits than what fresh trials found too little
-SENSITIVE = ("window_error", "hold_error", "peak_torque", "effort", "chattering")  # metrics whose slopes are shown
+WIDENED = 3  # largest number of searches in wider bounds
+TRIES = 3  # largest number of searches; each is judged on its own held-out trials
+FARTHER = 1.02  # a repeated search divides a metric by its value over the limit on held-out trials, times this factor
+SENSITIVE = ("window_error", "hold_error", "peak_torque", "effort", "chattering")  # metrics with sensitivities to gains
 
 
 @dataclass(frozen=True)
 class Trust:
-    """What makes the result believable, see `trust`."""
+    """Checks of a result: gradient errors, profiles, sensitivities and stability margins, see `trust`."""
 
-    slope_error: tuple[float, float] | None  # at the first start and at the end; None: flown with the exact sign
-    profiles: dict[str, Profile]
+    slope_error: tuple[float, float] | None  # relative, at the first and the last point; None: discontinuous sign
+    profiles: dict[str, Profile]  # objective along each gain
     sensitivities: dict[str, dict[str, float]]
     margins: dict[str, dict[str, Any]] | None  # of the tuned gains, see `stability.worst`
 
 
 @dataclass(frozen=True)
 class Beyond:
-    """What the fresh trials say of a gain that ended on its bound, a step beyond it, the others as they were found."""
+    """The results on held-out trials after moving one gain from its bound to a value beyond."""
 
-    value: float
-    times: float | None  # RMS window error there over that of the tuned gains; None: it has none
-    broken: str | None  # what is broken there, in words; None: every requirement met, and no trial failed
+    value: float  # of the gain
+    times: float | None  # RMS window error, relative to the tuned gains; None: an error is missing or zero
+    broken: str | None  # violated requirement, in words; None: all requirements are met, and no trial failed
 
     @property
     def better(self) -> bool:
-        """Whether it is more accurate there, by more than counts as nothing, with every requirement kept."""
+        """Whether the error decreases by more than 1 % beyond the bound, with all requirements met."""
         return self.broken is None and self.times is not None and self.times < 1.0 - trust.FLAT
 
 
 @dataclass(frozen=True)
 class Try:
-    """A search whose gains kept every limit, and broke one on fresh trials: another one went on from them."""
+    """A search whose gains kept every limit on the training trials, but broke a limit on the held-out trials."""
 
-    fresh_seed: int
+    fresh_seed: int  # of the held-out trials
     gains: dict[str, float]
-    margins: dict[str, float]  # share that it kept from the limit of each metric
-    over: dict[str, float]  # how many times its limit each metric reached on the fresh trials, as it is judged
+    margins: dict[str, float]  # distance from the limit of each metric in the search, as a fraction of the limit
+    over: dict[str, float]  # judged value over the limit, for each metric that broke its limit on the held-out trials
 
 
 @dataclass(frozen=True)
 class Tuning:
-    """A finished tuning run."""
+    """The results of a tuning run, which may have been interrupted."""
 
-    tuned: Scenario  # as it was judged
+    tuned: Scenario  # with the tuned gains, on the flight clock
     gains: dict[str, float]
     search: Search
     earlier: list[Try]
     at_bound: dict[str, str]
-    training: Trials  # tuned gains on the training trials as they were trained on
-    fresh: dict[str, Trials]  # by whose gains: "tuned" and those it is set `beside`
-    paper_refused: str | None  # why the paper's are not among them
-    seed: int
-    fresh_seed: int
-    judged_gains: dict[str, dict[str, float]]  # the gains of each of them
-    floors: dict[str, float | None]  # RMS window error that no controller can beat, for each of them
-    verdicts: list[Verdict]  # of the tuned gains on the fresh trials
-    broken_by: dict[str, list[str]]  # of those more accurate than the tuned ones: whose requirements are not met
-    shortest: ShortestTime | None  # t_f that the limit on the torque would allow; None without one
-    trust: Trust | None  # None: interrupted before
-    beyond: dict[str, Beyond]  # gains on a bound beyond which nothing is known, and what is there
-    check: Check | None  # of a global search, if it was asked for
-    rollouts: int  # trials flown in the search without slopes
-    gradients: int  # and with
-    seconds: float  # of the search
+    training: Trials  # tuned gains on the training trials
+    fresh: dict[str, Trials]  # held-out trials: "tuned" and the keys of `judging.beside`
+    paper_refused: str | None  # reason why the published gains cannot be simulated
+    seed: int  # of the training trials and the search
+    fresh_seed: int  # of the held-out trials
+    judged_gains: dict[str, dict[str, float]]  # gains by name, for each key of `fresh`
+    floors: dict[str, float | None]  # lower bound of the RMS window error, for each key of `fresh`
+    verdicts: list[Verdict]  # of the tuned gains on the held-out trials
+    broken_by: dict[str, list[str]]  # gains that are more accurate than the tuned ones, and the metrics that they break
+    shortest: ShortestTime | None  # shortest t_f that the torque limit allows; None: no torque limit, or t_f is tuned
+    trust: Trust | None  # None: interrupted, or not requested
+    beyond: dict[str, Beyond]  # results beyond the bounds of gains that ended on a bound
+    check: Check | None  # comparison with a global search, if requested
+    rollouts: int  # simulations of the search without gradients
+    gradients: int  # simulations of the search with gradients
+    seconds: float  # duration of the search
 
     @property
     def met(self) -> bool:
-        """Whether the fresh trials meet every requirement, and none of them failed."""
+        """Whether the held-out trials meet every requirement, and none of them failed."""
         return judging.met(self.verdicts, self.fresh["tuned"])
 
     @property
     def status(self) -> str:
-        """How it ended, in a word."""
+        """Return "interrupted", "met" or "not met"."""
         return "interrupted" if self.search.interrupted else "met" if self.met else "not met"
 
 
 @dataclass(frozen=True)
 class _Judged:
-    """Gains that a search found, and what fresh trials say of them."""
+    """The gains of a search, and their results on held-out trials."""
 
     search: Search
-    gains: dict[str, float]  # rounded as they are handed over
-    scenario: Scenario  # with these gains, as it is flown
-    seed: int  # of the fresh trials
+    gains: dict[str, float]  # rounded
+    scenario: Scenario  # with the rounded gains, on the flight clock
+    seed: int  # of the held-out trials
     trials: Trials
     verdicts: list[Verdict]
-    begun: float  # when judging them began, by the monotonic clock
+    begun: float  # time of the monotonic clock after the search [s]
 
 
 def tune(
@@ -126,19 +130,23 @@ def tune(
     trusted: bool = True,
     tries: int = TRIES,
 ) -> Tuning:
-    """Tune the scenario's free gains (`tune` table) and judge them on trials the search never saw.
+    """Tune the scenario's free gains (table `tune`) and judge them on held-out trials.
 
-    Where these break a limit that the search kept, it goes on from the gains it found, and from as many starts as
-    before, with more distance from the limits, and is judged on others.
+    If the gains break a limit on the held-out trials that the search kept, the search starts again from these gains. It
+    has as many starting points as before and keeps more distance from the limits. Its gains are judged on new held-out
+    trials.
 
     Args:
-        scenario: what is tuned.
-        seed: of training trials and search; fresh trials have one that follows from it.
-        report: is called after every step.
-        journal: of evaluations, from which an interrupted run goes on.
-        globally: compare with differential evolution.
-        trusted: find out what makes the result believable too.
-        tries: searches, at most.
+        scenario: with free gains.
+        seed: of the training trials and the search. The seeds of the held-out trials follow from it.
+        report: called with the progress after every step.
+        journal: evaluations of an interrupted run, which then resumes.
+        globally: compare the result with a global search (differential evolution).
+        trusted: compute gradient checks, profiles, sensitivities and margins of the result too.
+        tries: largest number of searches.
+
+    Returns:
+        The gains, and their results on training and held-out trials.
     """
     started = time.monotonic()
     report("compiling", 0, 0, np.nan, 0.0)
@@ -193,7 +201,8 @@ def _search_and_judge(
 
     If these break a limit that the search kept, search again with more distance from the limits.
     """
-    starts = scenario.search.starts  # of a further search too: near the gains found there may be none that keep more
+    # a repeated search has all starting points again: gains that keep more distance may not be near those found
+    starts = scenario.search.starts
     outcome = posed.search(posed.problem, posed.own, starts, report=report, prepare=partial(_prepare, scenario))
     outcome, posed = _in_larger_bounds(outcome, posed, journal, report)
     look, seed = partial(posed.search, posed.problem, report=report), posed.seed
@@ -206,14 +215,17 @@ def _search_and_judge(
         if not over or outcome.interrupted or len(earlier) + 1 >= tries:
             return judged, earlier, posed
         earlier.append(Try(judged.seed, judged.gains, outcome.margins, over))
-        reached = dict(zip(outcome.problem.rows, outcome.worst, strict=True))  # on the trials of the search
+        reached = dict(zip(outcome.problem.rows, outcome.worst, strict=True))  # value over limit on the training trials
         margins = {name: 1.0 - float(reached[name]) / (FARTHER * over[name]) for name in over}
         more = look(outcome.gains, starts, margins=outcome.margins | margins)
         outcome = replace(more, history=[*outcome.history, *_after(outcome.history, more.history)])
 
 
 def _in_larger_bounds(outcome: Search, posed: Posed, journal: Journal | None, report: Report) -> tuple[Search, Posed]:
-    """Search on in larger bounds as long as gains end on default bounds that matter, several gains at once."""
+    """Repeat the search in wider bounds while gains end on default bounds that affect the result, see `_that_matter`.
+
+    The bounds of several gains may be widened at the same time. A search without improvement ends the repetition.
+    """
     defaulted = posed.ready.scenario.defaulted
     for _ in range(WIDENED):
         if outcome.interrupted or not posed.sloped:
@@ -249,7 +261,7 @@ def _that_matter(posed: Posed, outcome: Search, sides: dict[str, str]) -> dict[s
 
 
 def _judge(scenario: Scenario, posed: Posed, outcome: Search, fresh_seed: int) -> _Judged:
-    """The gains that a search found, as they are handed over, on fresh trials."""
+    """Simulate the rounded gains of a search on held-out trials."""
     begun = time.monotonic()
     rounded = posed.named(outcome.share)
     flown = judging.as_flown(gains.in_scenario(scenario, rounded))
@@ -258,7 +270,10 @@ def _judge(scenario: Scenario, posed: Posed, outcome: Search, fresh_seed: int) -
 
 
 def _shortest(posed: Posed, judged: _Judged) -> ShortestTime | None:
-    """The shortest t_f that the limit on the torque would allow; None without one, or where t_f itself is tuned."""
+    """Return the shortest t_f that the torque limit allows.
+
+    None: there is no torque limit, t_f is tuned, or the law has no prescribed time.
+    """
     asked = next((one for one in posed.ready.requirements if one.metric == "peak_torque"), None)
     if asked is None or T_F in posed.problem.names or not judged.scenario.controller.law.prescribed:
         return None
@@ -266,7 +281,15 @@ def _shortest(posed: Posed, judged: _Judged) -> ShortestTime | None:
 
 
 def _broken_by(candidates: dict[str, Scenario], fresh: dict[str, Trials], seed: int) -> dict[str, list[str]]:
-    """The metrics whose requirements are not met by gains more accurate than the tuned ones, by whose they are."""
+    """Return the gains that are more accurate than the tuned gains, and the metrics whose requirements they break.
+
+    Accuracy is compared over the trials that reach their end with both sets of gains.
+
+    Args:
+        candidates: scenario of each set of gains, by name.
+        fresh: their held-out trials, with the tuned gains as "tuned".
+        seed: of these trials.
+    """
 
     def more_accurate(trials: Trials) -> bool:
         both = trials.finished & fresh["tuned"].finished
@@ -281,7 +304,7 @@ def _broken_by(candidates: dict[str, Scenario], fresh: dict[str, Trials], seed: 
 
 
 def _trust(posed: Posed, judged: _Judged) -> Trust:
-    """What makes the gains found believable."""
+    """Compute gradient errors, profiles, sensitivities and margins of the gains found."""
     outcome, evaluate = judged.search, posed.evaluate
     slope_error = None
     if posed.sloped:
@@ -297,30 +320,36 @@ def _trust(posed: Posed, judged: _Judged) -> Trust:
 
 
 def _over(outcome: Search, verdicts: list[Verdict]) -> dict[str, float]:
-    """How many times its limit each metric reached that broke it on fresh trials; empty: more distance is no help.
+    """Return value over limit for each metric that breaks its limit on the held-out trials.
 
-    It is one where the search kept every limit, came near those that are broken, and every value is a number.
+    The result is empty if a search with more distance from the limits cannot help. It can help if the search kept every
+    limit, if each broken limit had an effect in the search, and if every value is finite.
     """
-    # what is asked for a share of the time is searched for as a limit
+    # the search treats a requirement on a fraction of time as a limit at all times
     over = {one.metric: one.margin if one.interpretation == "ensemble" else one.worst / one.limit
             for one in verdicts if not one.met and one.limit}  # fmt: skip
     helped = bool(np.all(outcome.worst <= 1.0)) and all(np.isfinite(share) and share > 1.0 for share in over.values())
-    reached = dict(zip(outcome.problem.rows, outcome.worst, strict=True))  # 0: trials of the search saw nothing of it
-    # a loop that swings by itself has no margin left, see `theory.rest`, whatever the search keeps
+    reached = dict(zip(outcome.problem.rows, outcome.worst, strict=True))  # 0: the training trials do not depend on it
+    # a loop with a limit cycle has no margins, see `theory.rest`; more distance from the limits does not help
     swings = any(one.at_least and one.worst == 0.0 for one in verdicts)
     return over if helped and not swings and all(reached[name] > 0.0 for name in over) else {}
 
 
 def _after(history: list[Step], more: list[Step]) -> list[Step]:
-    """The steps of a search that goes on, as from one start more."""
+    """Return the steps of a repeated search with new numbers of starting points, which follow those of the history."""
     first = 1 + max((step.start for step in history), default=-1)
     return [replace(step, start=first + step.start) for step in more]
 
 
 def _beyond(judged: _Judged, at_bound: dict[str, str]) -> dict[str, Beyond]:
-    """What the fresh trials say of each gain that ended on a bound, a step beyond that bound, where it may go there.
+    """Simulate each gain that ended on a bound at a value beyond the bound, with the other gains unchanged.
 
-    Of the sampled loop, where what is minimised is an error.
+    The result is empty for the continuous loop, and if the objective is not the window error. Gains without a valid
+    value beyond their bound are left out.
+
+    Args:
+        judged: the tuned gains.
+        at_bound: "lower" or "upper" for each gain on a bound, by its name.
     """
     beyond, tuned = dict[str, Beyond](), judged.scenario
     if not tuned.sampled or tuned.search.minimise != "window_error":
@@ -332,7 +361,7 @@ def _beyond(judged: _Judged, at_bound: dict[str, str]) -> dict[str, Beyond]:
         try:
             other = judging.as_flown(gains.in_scenario(tuned, {**judged.gains, name: value}))
             trials = judging.judge(other, judged.seed)
-        except ScenarioError:  # it may not
+        except ScenarioError:  # no valid scenario beyond the bound
             continue
         both = trials.finished & judged.trials.finished
         there, here = (trust.rms(np.asarray(t.metrics.window_error)[both]) for t in (trials, judged.trials))
@@ -342,7 +371,7 @@ def _beyond(judged: _Judged, at_bound: dict[str, str]) -> dict[str, Beyond]:
 
 
 def _broken(verdicts: list[Verdict], trials: Trials) -> str | None:
-    """The first requirement that is broken, or how many trials fail, in words."""
+    """Return the first broken requirement, or the number of failed trials, in words; None: neither."""
     for one in verdicts:
         if not one.met:
             return str(one)
@@ -351,7 +380,7 @@ def _broken(verdicts: list[Verdict], trials: Trials) -> str | None:
 
 
 def _prepare(scenario: Scenario) -> None:
-    """Begin to compile what judges a scenario's gains."""
+    """Start to compile the programs that judge gains, in the background."""
     flown = study(judging.as_flown(scenario))
     montecarlo.prepare(flown.parts, flown.dispersion, judging.fresh_trials(flown))
     if scenario.sampled:
