@@ -1,5 +1,9 @@
-"""What a command refuses, besides a bad scenario (`ScenarioError`) and a folder in its way (`RefusedError`)."""
+"""Errors of the options of a command.
+
+Errors of a scenario are `ptsmc_jax.scenario.errors.ScenarioError`. Errors of a result folder are
+`ptsmc_jax.campaigns.store.RefusedError`.
+"""
 
 
 class UsageError(ValueError):
-    """An option that cannot be followed. Its text is one sentence."""
+    """An option of a command has an invalid value. The message is one sentence."""
