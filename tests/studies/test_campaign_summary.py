@@ -1,4 +1,4 @@
-"""Shares of time in what is said of a campaign, and how its figures judge trials."""
+"""Requirements on fractions of time in the summary and the figures of a campaign."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -11,7 +11,7 @@ from ptsmc_jax.figures.campaign_plots import AT_TIMES, BEYOND
 from ptsmc_jax.simulation.requirements import Requirement
 from tuning.studies import campaign_figures, campaign_summary
 
-# a run that keeps the limit, two that leave it for a tenth and for half of the time, one without an end
+# one run keeps the limit, two violate it for 10 % and 50 % of the time, and one diverges
 FRAME = pl.DataFrame({
     "status": ["ok", "ok", "ok", "diverged"], "ape_z": [0.5, 2.0, 2.0, None], "within_ape_z": [1.0, 0.9, 0.5, None],
     "peak_torque": [3.0, 1.0, 1.0, None],
@@ -24,18 +24,18 @@ FRAME = pl.DataFrame({
     ("temporal", ["ok", AT_TIMES, BEYOND, "diverged"],
      "asked for: 80 % of the time, in every run; seen: at least 0 %"),
 ])  # fmt: skip
-def test_a_limit_that_may_be_left_at_times_is_told_apart(interpretation, outcomes, said):
+def test_outcomes_distinguish_requirements_that_allow_violations_for_some_time(interpretation, outcomes, said):
     asked = Requirement("ape_z", 1.0, "rad", quantile=0.8, interpretation=interpretation)
     assert campaign_figures._outcomes(FRAME, [asked]).tolist() == outcomes
     torque = Requirement("peak_torque", 2.0, "N m")
-    for both in ([asked, torque], [torque, asked]):  # what a trial breaks is said whatever else it leaves
+    for both in ([asked, torque], [torque, asked]):  # a broken limit on trials has priority in either order
         assert campaign_figures._outcomes(FRAME, both).tolist() == [BEYOND, *outcomes[1:]]
     values, within = FRAME["ape_z"].to_numpy(), FRAME["within_ape_z"].to_numpy()
     verdict = asked.verdict(values, np.array([True, True, True, False]), within)
     assert campaign_figures._of_time(verdict) == said
 
 
-def test_the_share_of_the_time_of_all_runs_is_their_mean_and_a_run_without_one_keeps_the_limit_at_no_time():
+def test_mixed_requirement_averages_time_fractions_and_counts_a_missing_one_as_zero():
     frame = pl.concat([FRAME, FRAME.head(1).with_columns(within_ape_z=pl.lit(None, pl.Float64))])
     ended = np.array([True, True, True, False, True])
     asked = Requirement("ape_z", 1.0, "rad", quantile=0.8, interpretation="mixed")
@@ -46,12 +46,12 @@ def test_the_share_of_the_time_of_all_runs_is_their_mean_and_a_run_without_one_k
     assert told["share"] == pytest.approx(told["share_of_time"], rel=1e-12)
     assert told["share"] == pytest.approx((1.0 + 0.9 + 0.5) / 5.0, rel=1e-12)
     low, high = told["share_interval"]
-    assert low < told["share_bound"] < told["share"] < high  # 97.5 % to either side, and 95 % from below
+    assert low < told["share_bound"] < told["share"] < high  # two-sided 95 % interval, one-sided 95 % bound
     of_trials = Requirement("ape_z", 1.0, "rad", quantile=0.8)
     assert campaign_summary._beyond(frame, of_trials, ended).size == 0
 
 
-def test_a_failed_trial_has_no_share_of_time():
+def test_failed_trial_counts_as_zero_in_quantiles_of_a_time_fraction():
     told = campaign_summary._of_share(np.array([0.9, np.nan, 0.5, 0.8]), np.array([True, False, True, True]))
     assert (told["min"], told["max"], told["without_value"]) == (0.0, 0.9, 1)
     assert (told["0.0027"]["value"], told["0.1"]["value"], told["0.5"]["value"]) == (0.0, 0.0, 0.8)
@@ -65,8 +65,8 @@ def test_a_failed_trial_has_no_share_of_time():
     assert none["0.5"]["value"] == 0.0
 
 
-def test_the_fan_of_a_share_of_the_trials_is_of_those_that_are_there(monkeypatch):
-    """As of one shard alone: its rows are not those of the first trials."""
+def test_fan_figure_of_one_shard_shows_the_trials_of_the_shard(monkeypatch):
+    """The rows of one shard are not the first trials of the campaign."""
     frame = pl.DataFrame({"trial": [100, 101, 250], "window_error": [1.0, None, 3.0]})
     monkeypatch.setattr(campaign_figures.flying, "history", lambda flights, trials: (np.zeros(1), trials[:, None]))
     monkeypatch.setattr(campaign_figures.plots, "fan", lambda t, errors, worst, *_: (errors[:, 0].tolist(), worst[0]))
@@ -76,7 +76,7 @@ def test_the_fan_of_a_share_of_the_trials_is_of_those_that_are_there(monkeypatch
     assert campaign_figures._fan(folder, frame, np.array([False, False, False])) == {}  # no empty axes
 
 
-def test_the_worst_by_samples_that_ended_well_have_the_fewest():
+def test_worst_trials_by_successful_samples_have_the_fewest():
     counts, none = np.array([65, 31, 40]), np.zeros(3, bool)
     assert campaign_summary.most_extreme("controller_ok", counts, none, 2).tolist() == [1, 2]
     assert campaign_summary.most_extreme("controller_other", counts, none, 2).tolist() == [0, 2]

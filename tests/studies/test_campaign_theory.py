@@ -1,4 +1,4 @@
-"""What a campaign keeps of theory."""
+"""The lower bound and the margins in the folder of a campaign."""
 
 import json
 from types import SimpleNamespace
@@ -12,8 +12,8 @@ from tuning.studies import campaign_theory
 
 
 @pytest.mark.parametrize(("count", "rows", "looked"), [(None, [], None), (3, [0, 1, 2], 3), (900, [0, 1, 2, 3], 256)])
-def test_theory_is_of_the_first_trials_or_rows_and_found_once(tmp_path, monkeypatch, count, rows, looked):
-    """Of a plan the floor is that of its first four rows, or fewer, and margins are those of its first 256."""
+def test_bound_and_margins_use_the_first_trials_and_are_computed_once(tmp_path, monkeypatch, count, rows, looked):
+    """A run table has the lower bound of at most its first 4 rows, and the margins of at most its first 256 rows."""
     asked: list[Any] = []
 
     def floor(ready, seed, first):

@@ -1,4 +1,4 @@
-"""`ptsmc compare`: every law tuned alike and judged on the same trials."""
+"""`ptsmc compare`: all laws have the same search settings and are judged on the same trials."""
 
 import csv
 import json
@@ -40,7 +40,7 @@ def tuned(scenario):
     return scenario.tune
 
 
-def test_every_law_is_asked_for_the_same(monkeypatch):
+def test_all_laws_have_the_same_mission_requirements_and_search_settings(monkeypatch):
     base = scenario.from_tables(TABLES)
     posed = compare.contenders(base)
     assert list(posed) == ["prescribed_time", *BASELINES]
@@ -62,12 +62,12 @@ def test_every_law_is_asked_for_the_same(monkeypatch):
     assert free["fixed_time"] == ("a1", "b1", "a2", "b2", "p", "gamma", "m", "n", "observer_gain", "sign_width")
 
 
-def test_the_command_names_every_law():
+def test_help_of_option_against_lists_every_law():
     said = typing.get_args(options.Against)[1].help.split(": ")[1].split(";")[0]
     assert said.split(", ") == compare.laws()[1:]
 
 
-def test_a_law_of_ones_own_stands_beside_those_that_are_asked_for():
+def test_custom_law_is_compared_with_the_requested_laws():
     base = scenario.from_tables(TABLES)
     where = str(ROOT / "scenarios" / "own_parts.py") + ":Scaling"
     rivals = compare.Rivals(("pd",), (where,))
@@ -84,19 +84,19 @@ def test_a_law_of_ones_own_stands_beside_those_that_are_asked_for():
             wrong.check()
 
 
-def test_a_law_of_ones_own_that_is_flown_is_compared_as_the_scenario_says(tmp_path):
+def test_custom_law_of_the_scenario_keeps_the_settings_of_the_scenario(tmp_path):
     (tmp_path / "own.py").write_bytes((ROOT / "scenarios" / "own_parts.py").read_bytes())
     law = {"kind": "own", "code": f"{tmp_path}/own.py:Scaling", "t_f": 5.0, "delta": 0.7}
     own = scenario.replace(scenario.from_tables(TABLES), tune=None, controller=law)
     own = scenario.replace(own, tune={"free": ["delta"], "trials": 8})
-    assert compare.contenders(own, compare.Rivals(("pd",)))["Scaling"] is own  # without being named
+    assert compare.contenders(own, compare.Rivals(("pd",)))["Scaling"] is own  # without the option --law
     (tmp_path / "linked.py").symlink_to(tmp_path / "own.py")
     named = compare.contenders(own, compare.Rivals(("pd",), (f"{tmp_path}/linked.py:Scaling",)))
     assert list(named) == ["prescribed_time", "pd", "Scaling"]
     assert named["Scaling"] is own
 
 
-def test_scenarios_of_a_comparison_run_the_laws_that_it_was_made_with_and_no_others(tmp_path):
+def test_checksums_accept_only_the_custom_laws_of_the_comparison(tmp_path):
     for name in ("flown", "beside", "other"):
         (tmp_path / f"{name}.py").write_text(f"# {name}\n")
     where = {name: f"{tmp_path}/{name}.py:Mine" for name in ("flown", "beside", "other")}
@@ -109,14 +109,14 @@ def test_scenarios_of_a_comparison_run_the_laws_that_it_was_made_with_and_no_oth
             own_parts.check_unchanged({"controller.code": where["other"]}, tmp_path, made)
 
 
-def test_laws_of_ones_own_with_one_name_are_all_compared():
+def test_custom_laws_with_equal_names_get_different_labels():
     named = compare.Rivals((), ("a.py:Mine", "b.py:Mine", "c.py:Mine", "a.py:Mine", "a.py:paper")).named
     assert list(named) == ["prescribed_time", "Mine", "own Mine", "own own Mine", "own paper"]
     assert len({law.get("code") for law in named.values()}) == 5
 
 
-def test_a_law_of_ones_own_is_one_however_it_is_written(tmp_path, monkeypatch):
-    """`./mine.py:Mine` began a comparison anew that `mine.py:Mine` had begun, and both were two laws."""
+def test_different_paths_of_one_file_are_the_same_custom_law(tmp_path, monkeypatch):
+    """Earlier, `./mine.py:Mine` and `mine.py:Mine` were two laws, and the comparison did not resume."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.py").write_text("")
     ways = ("mine.py:Mine", "./mine.py:Mine", f"{tmp_path}/mine.py:Mine")
@@ -126,7 +126,7 @@ def test_a_law_of_ones_own_is_one_however_it_is_written(tmp_path, monkeypatch):
     assert list(compare.Rivals((), ways).named) == ["prescribed_time", "Mine"]
 
 
-def test_a_baselines_own_scenario_keeps_its_own_bounds():
+def test_baseline_law_of_the_scenario_keeps_the_bounds_of_the_scenario():
     own = scenario.replace(scenario.from_tables(TABLES), tune=None, controller={"kind": "pd", "t_f": 5.0, "k_p": 2.0})
     own = scenario.replace(own, tune={"free": ["k_d"], "bounds": {"k_d": [0.5, 3.0]}, "trials": 8})
     posed = compare.contenders(own)
@@ -145,16 +145,16 @@ def test_a_baselines_own_scenario_keeps_its_own_bounds():
         ({"plant": {"kind": "chain"}}, "for another plant ptsmc tune finds the gains of one law at a time"),
     ],
 )
-def test_what_cannot_be_compared_is_refused(tables, said):
+def test_comparison_refuses_the_continuous_loop_and_other_plants(tables, said):
     with pytest.raises(ScenarioError, match=said):
         compare.check(scenario.from_tables(tables))
 
 
 @pytest.mark.parametrize("others", short([[], ["pd"]], [[]]))
-def test_the_command(command, tmp_path, monkeypatch, others):
+def test_compare_command_writes_its_results(command, tmp_path, monkeypatch, others):
     small_search(monkeypatch)
-    monkeypatch.setattr(compare, "laws", lambda: [compare.OURS, *others])  # each compiles as long again
-    untold = compare.UNTOLD if others else ("heavier", "lighter")  # as one that is later does
+    monkeypatch.setattr(compare, "laws", lambda: [compare.OURS, *others])  # every further law compiles more programs
+    untold = compare.UNTOLD if others else ("heavier", "lighter")  # "later" compiles another program too
     perturbed = compare.perturbed
     monkeypatch.setattr(compare, "perturbed", lambda flown: {name: perturbed(flown)[name] for name in untold})
     code, said, _ = command("compare", "s.toml")
@@ -162,9 +162,9 @@ def test_the_command(command, tmp_path, monkeypatch, others):
     found = json.loads((folder / "summary.json").read_text())
     laws = ["paper", "prescribed_time", *others]
     assert list(found["laws"]) == laws
-    assert found["judged_on"] == "flight clock"  # not with the sign of one of them
+    assert found["judged_on"] == "flight clock"  # without the sign function of one law
     assert code == (0 if found["laws"]["prescribed_time"]["met"] else 1)
-    for said_of in found["laws"].values():  # another inertia, the same law: hardly another error
+    for said_of in found["laws"].values():  # another inertia changes the error slightly
         assert tuple(said_of["untold"]) == untold
         for other in said_of["untold"].values():
             assert other["window_error"] != said_of["window_error"]
@@ -174,8 +174,8 @@ def test_the_command(command, tmp_path, monkeypatch, others):
     for row, law in zip(rows, laws, strict=True):
         assert float(row["window_error"]) == found["laws"][law]["window_error"]
         assert law.split("_")[0] in said
-        again = scenario.read(folder / "scenarios" / f"{law}.toml")  # what was judged can be flown again
-        flown, _ = judging.window_error(judging.judge(again, found["seed"]))  # on the same trials as the others
+        again = scenario.read(folder / "scenarios" / f"{law}.toml")  # the judged scenario
+        flown, _ = judging.window_error(judging.judge(again, found["seed"]))  # simulated again on the same trials
         assert flown == pytest.approx(found["laws"][law]["window_error"], rel=1e-9)
         assert found["laws"][law]["margins"] == stability.worst(scenario.study(again))
         assert found["laws"][law]["gains"].keys() >= {"pd": {"k_p", "k_d"}}.get(law, {"eta", "delta"})
@@ -192,15 +192,15 @@ def test_the_command(command, tmp_path, monkeypatch, others):
 
 
 @pytest.mark.parametrize(("least", "said"), [(2e-6, "2 times as much"), (0.0, "1.65 arcsec")])
-def test_how_far_the_papers_law_is_behind_one_that_leaves_no_error_is_said_by_its_own(least, said):
-    """A quotient by zero broke off after all laws were tuned."""
+def test_report_has_no_ratio_if_the_best_error_is_zero(least, said):
+    """Earlier, a division by zero ended the command after all searches."""
     errors = {"pd": least, "prescribed_time": 4e-6}
     laws = examples.compare({name: examples.law(window_error=error) for name, error in errors.items()}).laws
     assert compare_report.winner(laws).endswith(f"; prescribed time has {said}")
 
 
-def test_laws_are_flown_once_more_with_what_they_are_not_told_of(eight):
-    """The plant that flies is a tenth heavier and lighter, or a period later; law and observer know what they knew."""
+def test_model_errors_change_the_plant_but_not_the_law(eight):
+    """The true inertia is 10 % larger or smaller, or the delay is one period longer. The design model is the same."""
     base = scenario.from_tables(TABLES)
     parts = scenario.study(base).parts
     others = compare.perturbed(base)
@@ -223,8 +223,8 @@ def test_laws_are_flown_once_more_with_what_they_are_not_told_of(eight):
                               "largest_peak_torque": 0.3, "lost": 1}}  # fmt: skip
 
 
-def test_every_law_has_a_row_an_interval_and_a_point_of_its_own(eight, tmp_path):
-    """More laws than there are colours: none is left out of a table, a chart or a figure."""
+def test_every_law_appears_in_table_page_and_figures(eight, tmp_path):
+    """There are more laws than plot colours. Tables, charts and figures show all of them."""
     base = scenario.from_tables(TABLES)
     margins = {"hold": {"stable": True, "gain_margin": 7.5, "phase_margin": 40.0, "delay_margin": None,
                         "modulus_margin": 3.0}}  # fmt: skip
@@ -244,7 +244,7 @@ def test_every_law_has_a_row_an_interval_and_a_point_of_its_own(eight, tmp_path)
     laws = summaries.read(summaries.Compare, said).laws
     answers = [(question, compare_report.table(question, laws)) for question in compare_report.QUESTIONS]
     read = checked(tmp_path / "out")
-    # of the scenario's own law all gains were said to be free, whatever tune.free says
+    # earlier, the page said that all gains of the scenario's own law were free, regardless of tune.free
     assert "tuned each law in all of its gains, the scenario's own law in those of tune.free" in read.text
     for k, (question, table) in enumerate(answers):
         assert [row[0] for row in table.rows] == ["published gains", *(name.replace("_", " ") for name in names[1:])]
@@ -259,16 +259,16 @@ def test_every_law_has_a_row_an_interval_and_a_point_of_its_own(eight, tmp_path)
     assert len(drawn) == len(looks) == len(names)
 
 
-def test_settling_is_summed_up_by_where_trials_start():
+def test_settling_times_of_small_and_large_initial_angles():
     angle, settling = np.linspace(0.3, 2.4, 100), np.concatenate([np.full(50, 30.0), np.full(50, 33.0)])
     assert compare._near_far(angle, settling) == (30.0, 33.0)
-    assert compare._near_far(-angle, angle) == (angle[89], angle[9])  # medians of the last and the first twenty
+    assert compare._near_far(-angle, angle) == (angle[89], angle[9])  # medians of the last and the first 20 trials
     assert compare._near_far(angle, np.where(angle > 2.2, np.inf, settling)) == (30.0, 33.0)
     assert compare._near_far(angle, np.where(angle > 2.0, np.inf, settling)) == (30.0, None)
 
 
 @pytest.mark.long
-def test_other_commands_take_a_baseline(command, tmp_path):
+def test_other_commands_simulate_a_baseline_law(command, tmp_path):
     text = re.sub(r"\[controller\][^[]*", '[controller]\nkind = "pd"\nt_f = 5.0\n', SHORT)
     (tmp_path / "pd.toml").write_text(text[: text.index("[tune]")])
     code, _, _ = command("simulate", "pd.toml")
@@ -279,14 +279,14 @@ def test_other_commands_take_a_baseline(command, tmp_path):
     assert command("montecarlo", "pd.toml", "--trials", 70, "--no-figures")[0] in (0, 1)
 
 
-def test_the_first_flight_can_be_compared():
+def test_first_flight_scenario_is_valid_with_every_law():
     posed = compare.contenders(scenario.replace(scenario.read(FIRST_FLIGHT), tune__trials=32))
     for other in posed.values():
         assert tuned(other).trials == 32
         scenario.study(other)
 
 
-def test_nothing_that_is_asked_of_one_law_is_not_asked_of_the_others():
+def test_search_settings_and_known_bounds_are_passed_to_all_laws():
     asked = {"minimise": "effort", "statistic": "cvar", "level": 0.8, "torque_weight": 0.1, "worst_case": True,
              "trials": 7, "starts": 3, "steps": 5}  # fmt: skip
     known = {"disturbance_rate_bound": 2e-3, "disturbance_bound": 0.03, "initial_estimate_error": 0.004}
@@ -298,7 +298,7 @@ def test_nothing_that_is_asked_of_one_law_is_not_asked_of_the_others():
         assert getattr(other.controller, "sign_width", 0.02) == 0.02, kind
 
 
-def test_for_the_shortest_t_f_every_law_may_move_its_gains():
+def test_all_laws_have_free_gains_if_t_f_is_minimised():
     base = scenario.replace(scenario.from_tables(TABLES), tune={
         "free": ["eta", "delta", "t_f"], "minimise": "t_f", "bounds": {"t_f": [4.0, 8.0]}})  # fmt: skip
     free = {kind: tuned(other) for kind, other in compare.contenders(base).items()}
@@ -310,7 +310,7 @@ def test_for_the_shortest_t_f_every_law_may_move_its_gains():
 
 @pytest.fixture(scope="module")
 def eight():
-    ready = scenario.study(judging.as_flown(scenario.from_tables(TABLES)))  # by the program that judges
+    ready = scenario.study(judging.as_flown(scenario.from_tables(TABLES)))  # the compiled program of judging
     return montecarlo.run(ready.parts, ready.dispersion, 0, np.arange(8))
 
 
@@ -325,21 +325,21 @@ def changed(trials, status, **metrics):
     return replace(trials, status=np.asarray(status, dtype=np.int32), metrics=Metrics({**trials.metrics, **numbers}))
 
 
-def test_a_contender_is_summed_up_over_what_it_flew(eight):
+def test_statistics_of_a_contender_use_finished_trials(eight):
     nan, ok, bad = np.nan, rollout.OK, rollout.DIVERGED
     trials = changed(eight, [ok] * 6 + [rollout.MISSED, bad], window_error=[1.0] * 5 + [2.0, 3.0, 99.0],
                      peak_torque=[1.0] * 5 + [2.0, 3.0, 99.0],
                      settling_time=[1.0, 2.0, 3.0, 4.0, nan, nan, nan, 0.5])  # fmt: skip
     one = contender(trials)
-    assert not one.met  # one failed, and one missed t_f
+    assert not one.met  # one trial diverged, and one did not converge by t_f
     found = compare.figures_of(one)
     assert found["window_error"] == pytest.approx(np.sqrt((5 + 4 + 9) / 7))
     assert found["peak_torque"] == pytest.approx(10 / 7)
     assert found["largest_peak_torque"] == 3.0
     assert found["unsettled"] == 4
-    assert found["settling_time"] == {"0.01": 1.0, "0.5": 4.0, "0.99": None}  # half of all, not of those that settled
+    assert found["settling_time"] == {"0.01": 1.0, "0.5": 4.0, "0.99": None}  # quantiles of all trials, settled or not
     assert found["settling_by_angle"] is not None
-    alike = np.full(8, 2.0) + 4.4e-16 * np.arange(8)  # of one angle, drawn from 115 to 115 deg
+    alike = np.full(8, 2.0) + 4.4e-16 * np.arange(8)  # an angle with a dispersion from 115 to 115 deg
     alike = compare.figures_of(contender(replace(trials, drawn={**trials.drawn, "initial_angle": alike})))
     assert alike["settling_by_angle"] is alike["settling_near_far"] is None
     missed = contender(changed(eight, [ok] * 7 + [rollout.MISSED]))
@@ -348,11 +348,11 @@ def test_a_contender_is_summed_up_over_what_it_flew(eight):
 
 
 def rivals(monkeypatch, eight, interrupt=None):
-    """What a comparison asks of `report`: seeds that laws are tuned and judged by, without any search."""
+    """Replace search and judging by functions that record their law and seed; return the list of records."""
     asked = []
 
     def tune(posed, seed, told, journal, *, trusted, tries):
-        assert tries == 1  # further ones would be judged on other trials
+        assert tries == 1  # more tries would judge on different trials
         law = posed.controller.kind
         asked.append(("tune", law, seed))
         return SimpleNamespace(tuned=posed, gains={}, at_bound={}, fresh={"tuned": eight}, verdicts=[],
@@ -387,7 +387,7 @@ def test_an_interruption_ends_the_comparison(monkeypatch, eight):
     assert [law for what, law, _ in asked if what == "tune"] == ["prescribed_time", "pd"]
 
 
-def test_what_a_rival_cannot_fly_is_refused_before_any_search(monkeypatch, eight):
+def test_scenario_that_a_law_cannot_control_is_refused_before_any_search(monkeypatch, eight):
     asked = rivals(monkeypatch, eight)
     opposite = {"initial": {"rotvec_deg": [0.0, 0.0, 90.0]}, "reference": {"rotvec_deg": [0.0, 0.0, -90.0]}}
     tables = {name: table for name, table in TABLES.items() if name != "dispersion"} | opposite
@@ -401,8 +401,8 @@ def lines_of(summary):
 
 
 @pytest.mark.parametrize(("period", "scaled"), [(0.05, False), (0.2, True)])
-def test_gains_that_the_paper_does_not_give_are_said_to_be_scaled(eight, period, scaled):
-    """Its delta of 0.05 s is shorter than a period of 0.2 s."""
+def test_report_says_if_published_gains_are_scaled(eight, period, scaled):
+    """The published delta of 0.05 s is shorter than a period of 0.2 s."""
     flown = gains.papers(scenario.from_tables({"loop": {"mode": "sampled", "period": period}}))
     made = {compare.PAPER: replace(contender(eight), flown=flown), compare.OURS: contender(eight)}
     lines = lines_of(compare.summary(compare.Comparison(made, 0, False)))
@@ -410,8 +410,8 @@ def test_gains_that_the_paper_does_not_give_are_said_to_be_scaled(eight, period,
     assert any(line.startswith("published gains: ") for line in lines) != scaled
 
 
-def test_margins_that_are_asked_for_stand_beside_what_is_flown(eight, tmp_path):
-    """Of every law, in the table, in compare.csv and, where it breaks a limit, in words; one without a limit too."""
+def test_required_margins_appear_in_table_csv_file_and_report(eight, tmp_path):
+    """The table and compare.csv have the margins of every law. The report has those that break a limit."""
     asked = Requirement("gain_margin", 6.0, "dB", at_least=True), Requirement("delay_margin", 0.1, "s", at_least=True)
     base = scenario.from_tables({**TABLES, "requirements": {one.metric: one.limit for one in asked}})
     values = {"paper": ([9.5, 5.04], [np.inf, np.inf]), compare.OURS: ([6.5, np.nan], [0.3, 0.2])}
@@ -441,7 +441,7 @@ def test_margins_that_are_asked_for_stand_beside_what_is_flown(eight, tmp_path):
     assert lines_of(cut_short)[0].startswith("interrupted while prescribed time was tuned")
 
 
-def test_a_law_of_ones_own_that_cannot_fly_leaves_no_folder(command, tmp_path):
+def test_missing_custom_law_is_refused_and_leaves_no_folder(command, tmp_path):
     status, _, err = command("compare", "s.toml", "--law", "gone.py:Mine")
     assert (status, err.count("\n")) == (2, 1)
     assert "gone.py is not there" in err
@@ -449,8 +449,8 @@ def test_a_law_of_ones_own_that_cannot_fly_leaves_no_folder(command, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_every_law_is_built_once_before_the_search(command, tmp_path, monkeypatch):
-    """And one that cannot fly is refused before a folder is begun, a built-in one too."""
+def test_every_law_is_validated_once_before_the_search(command, tmp_path, monkeypatch):
+    """A law that cannot control the scenario is refused before a folder is created, also if it is built in."""
     built = []
 
     def built_and(posed):

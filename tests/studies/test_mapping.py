@@ -1,4 +1,4 @@
-"""`ptsmc map`: axes, cells, borders."""
+"""`ptsmc map`: axes, cells and stability limits."""
 
 import csv
 import json
@@ -40,7 +40,7 @@ dispersion.x0 = { kind = "uniform", half_width = [0.5, 0.1] }
 
 @pytest.fixture(autouse=True, scope="module")
 def few_together():
-    """A cell's loop is opened in two periods: the program is for few."""
+    """Compile the margin programs for few loops: a cell has only two, at the hand-over and in the hold phase."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(linear, "TOGETHER", 4)
         yield
@@ -89,8 +89,8 @@ def test_axes(text, values):
     "text", ["hardware.delay=1:6:5", "hardware.delay=0.6:8.4:9", "hardware.delay=0:2:5", "controller.delta=0.05:5:9",
              "loop.t_end=100:100.001:5"]
 )  # fmt: skip
-def test_an_axis_is_made_again_by_what_is_kept_of_it(text):
-    """Of 1, 2, 4 and 6 periods of delay 1:6:4 was kept, which are 1, 2, 3 and 6."""
+def test_axis_text_parses_to_the_same_values(text):
+    """Earlier, the text was 1:6:4 for delays of 1, 2, 4 and 6 periods, but it gives other delays."""
     once = mapping.axis(text, "--x")
     assert mapping.axis(once.text, "--x").values == once.values
 
@@ -101,10 +101,10 @@ def test_axes_have_the_units_of_their_keys():
     for key, unit in shown.items():
         assert mapping._label(loaded, key) == f"{key} {unit}"
     assert mapping._label(loaded, "controller.eta") == "controller.eta"
-    assert mapping._label(scenario.from_tables({}), "hardware.delay") == "hardware.delay"  # without that table
+    assert mapping._label(scenario.from_tables({}), "hardware.delay") == "hardware.delay"  # no table [hardware]
     own = scenario.read(ROOT / "scenarios" / "own_parts.toml")
     assert mapping._label(own, "controller.t_f") == "controller.t_f [s]"
-    assert mapping._label(own, "controller.k1") == "controller.k1"  # its class knows
+    assert mapping._label(own, "controller.k1") == "controller.k1"  # a custom class states no unit
 
 
 @pytest.mark.parametrize(
@@ -112,7 +112,7 @@ def test_axes_have_the_units_of_their_keys():
              "a.b=1:nan:3", "a.b=x:2:3", "a.b=1:2:101", "a.b.c=1:2:3",
              "hardware.delay=0:0.4:2", "hardware.star_tracker_every=0.6:1.4:9", "a.b=1:1.0000001:5"]
 )  # fmt: skip
-def test_bad_axes_are_refused_in_a_sentence(text):
+def test_invalid_axes_are_refused(text):
     with pytest.raises(UsageError, match=r"--y is .*KEY=LOW:HIGH:COUNT"):
         mapping.axis(text, "--y")
 
@@ -122,14 +122,14 @@ def mapped():
     return flown("loop.period=0.05:0.2:2", "controller.delta=0.1:0.5:2", CHAIN)
 
 
-def test_every_pair_has_its_cell_and_each_is_what_a_run_of_its_own_gives(mapped, monkeypatch):
+def test_cells_agree_with_separate_simulations_of_their_pair(mapped, monkeypatch):
     loaded, x, y, cells = mapped
     assert [(c.x, c.y) for c in cells] == [(a, b) for b in y.values for a in x.values]
     refused = [c for c in cells if c.status != "flown"]
-    assert [(c.x, c.y) for c in refused] == [(0.2, 0.1)]  # below one period
+    assert [(c.x, c.y) for c in refused] == [(0.2, 0.1)]  # delta is shorter than one period
     assert all("at least one control period" in c.status for c in refused)
     for cell in cells:
-        if (cell.x, cell.y) == (0.2, 0.5):  # every one compiles a program of its own
+        if (cell.x, cell.y) == (0.2, 0.5):  # only one pair, because each compiles another program
             alone = scenario.study(scenario.replace(loaded, loop__period=cell.x, controller__delta=cell.y))
             trials = montecarlo.run(alone.parts, alone.dispersion, 3, np.arange(6))
             np.testing.assert_allclose(cell.window_error, np.sqrt(np.mean(trials.metrics.window_error**2)), rtol=1e-9)
@@ -150,8 +150,8 @@ def test_every_pair_has_its_cell_and_each_is_what_a_run_of_its_own_gives(mapped,
     assert any(cell.radius < 1.0 for cell in cells)
 
 
-def test_margins_of_the_worst_axis_stand_in_the_map(mapped, monkeypatch):
-    """A factor up to which all axes are stable: 20 dB are ten times, and below 0 dB the loop is unstable already."""
+def test_cells_have_the_margins_of_the_worst_axis(mapped, monkeypatch):
+    """The gain margin is a factor: 20 dB is the factor 10. A loop with a margin below 0 dB is unstable."""
 
     def left(gain_up, delay):
         values: dict[str, Any] = dict.fromkeys(margins.Margins._fields, np.zeros(3))
@@ -168,20 +168,20 @@ def test_margins_of_the_worst_axis_stand_in_the_map(mapped, monkeypatch):
     assert (cell.gain_margin, cell.hold_gain_margin) == (pytest.approx(0.1), pytest.approx(10.0))
     assert (cell.delay_margin, cell.hold_delay_margin) == (0.0, 1.0)
     assert (cell.radius, cell.hold_radius) == (1.2, 0.9)
-    assert np.isnan(cell.linear_window_error)  # of an unstable loop nothing is predicted
+    assert np.isnan(cell.linear_window_error)  # no prediction for an unstable loop
 
 
 @pytest.fixture
 def unflown(monkeypatch):
-    """Cells of whose trials nothing is looked at: what flies them takes the longest to compile."""
+    """Replace the simulation, which takes longest to compile, for tests that do not use trials."""
     zeros = Metrics(dict.fromkeys(CATALOGUE, np.zeros(1)))
     trials = montecarlo.Trials(np.arange(1), zeros, np.full(1, rollout.OK), np.full(1, np.nan), {})
     monkeypatch.setattr(montecarlo, "run", lambda *_: trials)
 
 
 @pytest.mark.usefixtures("unflown")
-def test_margins_of_every_law_stand_in_the_map():
-    """PD on two integrators, held over a period, in closed form; they were those of the paper's law alone."""
+def test_margins_of_a_pd_law_agree_with_the_closed_form():
+    """The loop is a PD law, a zero-order hold and a double integrator. Earlier, maps had margins of one law only."""
     text = CHAIN.replace("t_f = 5.0, delta = 0.5", 'kind = "pd", t_f = 5.0')
     text = text.replace('{ kind = "nonlinear", gain = [10.0] }', '{ kind = "none" }')
     _, _, _, cells = flown("controller.k_p=1:2:2", "controller.k_d=2:3:2", text, trials=1)
@@ -192,14 +192,14 @@ def test_margins_of_every_law_stand_in_the_map():
         def radius(factor, cell=cell, moved=moved, pushed=pushed):
             return np.abs(np.linalg.eigvals(moved - factor * pushed @ np.array([[cell.x, cell.y]]))).max()
 
-        assert cell.hold_radius == pytest.approx(1.0, abs=1e-9)  # of a memory that nothing is written into
+        assert cell.hold_radius == pytest.approx(1.0, abs=1e-9)  # pole of a memory state without input
         assert radius(0.999 * cell.hold_gain_margin) < 1.0 < radius(1.001 * cell.hold_gain_margin)
         assert 0.0 < cell.hold_delay_margin < 10.0
-        assert np.isnan(cell.linear_window_error)  # which was compared with flown trials of the paper's law alone
+        assert np.isnan(cell.linear_window_error)  # the prediction is validated for the prescribed-time law only
 
 
-def test_a_factor_below_one_is_how_near_the_border_is_on_either_side():
-    """A plant that moves a thousandth as much as the observer takes it to: what it lacks is gain."""
+def test_gain_factor_below_one_gives_the_distance_to_the_nearest_stability_limit():
+    """The input gain of the plant is 0.001 times the design model, so that the loop needs a larger gain."""
     parts = scenario.study(scenario.from_tables(tomllib.loads(CHAIN))).parts
     loops = run_margins.at(parts, jnp.asarray([1.0])).loops
     weak = replace(loops, new=1e-3 * loops.new, old=1e-3 * loops.old)
@@ -210,33 +210,33 @@ def test_a_factor_below_one_is_how_near_the_border_is_on_either_side():
 
 
 @pytest.mark.long
-def test_keys_of_every_kind_can_be_mapped():
-    """One with a number for each axis, and one that counts."""
+def test_keys_with_several_numbers_and_integer_keys_can_be_mapped():
+    """The axes are a gain with a number for each axis, and a delay in periods."""
     _, _, _, cells = flown("observer.gain=5:20:2", "hardware.delay=0:1:2", trials=2)
     assert all(c.status == "flown" for c in cells)
     assert len({c.window_error for c in cells}) == 4
     assert cells[2].delay_margin < cells[0].delay_margin
 
 
-def test_a_key_with_a_number_for_each_axis_gets_the_value_on_each_and_one_without_its_own():
+def test_value_is_set_on_all_axes_and_in_missing_keys():
     loaded, _, _ = asked("hardware.torque_lag=0.01:0.1:2", "controller.delta=1:2:2")
     changed: Any = mapping._with(loaded, {"observer.gain": 7.0, "hardware.torque_lag": 0.2, "hardware.delay": 1.0})
     assert changed.observer.gain == (7.0, 7.0, 7.0)
     assert (changed.hardware.torque_lag, changed.hardware.delay) == (0.2, 1)
 
 
-def test_a_map_without_an_allowed_pair_is_refused():
+def test_map_without_a_valid_pair_is_refused():
     with pytest.raises(ScenarioError, match=r"controller.eta is 1.0"):
         flown("controller.eta=1:2:2", "controller.delta=0.2:0.3:2")
 
 
-def test_time_after_t_f_is_kept_where_t_f_is_mapped():
+def test_time_after_t_f_is_constant_if_t_f_is_mapped():
     loaded, x, y = asked("controller.t_f=4:12:2", "loop.window=0.5:3:2")
     ends = [mapping._with(loaded, {x.key: a, y.key: b}).loop.t_end for a in x.values for b in y.values]
-    assert ends == [6.0, 7.0, 14.0, 15.0]  # 2 s after t_f, or the window where it is longer
+    assert ends == [6.0, 7.0, 14.0, 15.0]  # 2 s after t_f, or the window if it is longer
 
 
-def test_a_random_walk_alone_makes_trials_differ():
+def test_random_walk_disturbance_makes_trials_differ():
     text = 'loop = { mode = "sampled", period = 0.1 }\ncontroller = { t_f = 5.0, delta = 0.5 }\n'
     still, walking = (asked("controller.eta=3:4:2", "controller.delta=0.5:0.6:2", text + kind)[0]
                       for kind in ("", "disturbance.kind = 'random_walk'"))  # fmt: skip
@@ -244,7 +244,7 @@ def test_a_random_walk_alone_makes_trials_differ():
 
 
 @pytest.mark.long
-def test_a_map_on_which_everything_fails_is_written(tmp_path):
+def test_map_with_only_failed_trials_is_written(tmp_path):
     text = SHORT.replace("min_deg = 20.0, max_deg = 60.0", "min_deg = 180.0, max_deg = 180.0")
     loaded, x, y, cells = flown("controller.eta=3:4:2", "controller.delta=0.5:0.6:2", text, trials=2)
     assert all(c.failures == 2 for c in cells)
@@ -253,20 +253,20 @@ def test_a_map_on_which_everything_fails_is_written(tmp_path):
 
 
 @pytest.mark.long
-def test_a_map_of_nothing_but_zeros_is_written(tmp_path):
+def test_map_with_only_zero_errors_is_written(tmp_path):
     perfect = "initial.quat_xyzw = [0, 0, 0, 1]\ncontroller = { disturbance_rate_bound = 0, t_f = 5, delta = 0.5 }\n"
     perfect += "disturbance.kind = 'none'\nloop = { mode = 'sampled', period = 0.1 }"
     loaded, x, y, cells = flown("controller.eta=3:4:2", "controller.delta=0.5:0.6:2", perfect, trials=1)
     assert all(c.window_error == 0.0 for c in cells)
-    mapping.write(tmp_path, mapping.Map(loaded, x, y, cells), 3, figures=True)  # nothing but zeros to colour
+    mapping.write(tmp_path, mapping.Map(loaded, x, y, cells), 3, figures=True)  # the colour scale has no range
 
 
-def test_a_period_is_mapped_in_the_sampled_loop_only():
+def test_period_axis_needs_the_sampled_loop():
     with pytest.raises(ScenarioError, match=r"loop\.period needs the sampled loop"):
         flown("loop.period=0.1:0.2:2", "controller.delta=0.2:0.3:2", "controller.t_f = 5.0")
 
 
-def test_borders_are_drawn_over_period_and_delta_only():
+def test_stability_limits_are_drawn_over_period_and_delta_only():
     loaded, x, y = asked("controller.delta=0.2:0.9:2", "loop.period=0.05:0.1:2")
     for clock, factor, label in (("anchored", 1.5, "3/2"), ("flight", 2.5, "1/2")):
         lines = mapping.lines(scenario.replace(loaded, loop__clock=clock), x, y)
@@ -274,7 +274,7 @@ def test_borders_are_drawn_over_period_and_delta_only():
         np.testing.assert_allclose(delta, factor * np.asarray(period))
     lines = mapping.lines(
         scenario.replace(loaded, controller__sampling="implicit"), x, y
-    )  # with the border that is gone
+    )  # the limit of explicit sampling for comparison
     np.testing.assert_allclose(
         lines["$\\delta = (\\eta - 1/2) h$, of explicit sampling only"][0], 2.5 * np.asarray(y.values)
     )
@@ -282,10 +282,10 @@ def test_borders_are_drawn_over_period_and_delta_only():
     assert np.all(delta < mapping.lines(loaded, x, y)["the same with a period of delay"][0])
     assert not mapping.lines(loaded, x, mapping.axis("controller.eta=3:4:2", "--y"))
     third = scenario.from_tables({"plant": {"kind": "chain", "order": 3}, "loop": {"mode": "sampled"}})
-    assert not mapping.lines(third, x, y)  # another law, another border
+    assert not mapping.lines(third, x, y)  # the formula is for plants of order 2
 
 
-def test_folder_holds_the_map(mapped, tmp_path):
+def test_result_folder_of_a_map(mapped, tmp_path):
     loaded, x, y, cells = mapped
     mapping.write(tmp_path, mapping.Map(loaded, x, y, cells), 3, figures=True)
     with (tmp_path / "map.csv").open() as file:
@@ -314,8 +314,8 @@ MODES = ("flexible.frequency[0]=2.0:8.0:3", "controller.delta=1.0:2.0:2", FLEXIB
 
 
 @pytest.mark.usefixtures("unflown")
-def test_one_mode_is_moved_and_the_border_of_spillover_lies_between_stable_and_unstable_pairs(monkeypatch):
-    """With poles whose logarithm is even in frequency and delta, the border is a straight line."""
+def test_spillover_limit_separates_stable_and_unstable_pairs(monkeypatch):
+    """The logarithm of the poles is linear in frequency and delta, so that the stability limit is a straight line."""
 
     def at_ends(parts):
         law, frequency = parts.controller, np.asarray(parts.plant.frequency)
@@ -326,7 +326,8 @@ def test_one_mode_is_moved_and_the_border_of_spillover_lies_between_stable_and_u
 
     monkeypatch.setattr(mapping.run_margins, "at_ends", at_ends)
     loaded, x, y, cells = flown(*MODES)
-    ((label, (across, up)),) = mapping.spillover(mapping.Map(loaded, x, y, cells)).items()  # all spill at the hand-over
+    # all pairs are unstable at the hand-over, so that the only limit is in the hold phase
+    ((label, (across, up)),) = mapping.spillover(mapping.Map(loaded, x, y, cells)).items()
     assert label == "the same in hold"
     drawn = np.isfinite(across)
     np.testing.assert_allclose(across[drawn], 6.0 - 1.6 * (up[drawn] - 1.5), atol=1e-4)
@@ -340,13 +341,13 @@ def test_one_mode_is_moved_and_the_border_of_spillover_lies_between_stable_and_u
     assert mapping.spillover(mapping.Map(rigid, x, y, cells)) == {}
 
 
-@pytest.mark.long  # with the loop's own poles, which `test_spillover.py` has
+@pytest.mark.long  # poles of the real loop, see also `test_spillover.py`
 @pytest.mark.usefixtures("unflown")
-def test_a_slow_mode_is_damped_and_one_that_the_loop_is_late_for_is_driven():
+def test_loop_damps_a_slow_mode_and_destabilises_a_fast_one():
     loaded, x, y, cells = flown(*MODES)
     radii = np.array([cell.hold_radius for cell in cells]).reshape(2, 3)
-    assert np.all(radii[:, 0] < 1.0 + 1e-6)  # a slow mode is damped
-    assert np.all(radii[:, -1] > 1.0 + 1e-3)  # one that the loop is late for is driven
+    assert np.all(radii[:, 0] < 1.0 + 1e-6)  # slowest mode
+    assert np.all(radii[:, -1] > 1.0 + 1e-3)  # fastest mode: the delay of the loop is too long for it
     across, _ = mapping.spillover(mapping.Map(loaded, x, y, cells))["the same in hold"]
     after = np.flatnonzero(radii[0] > 1.0 + 1e-6)[0]
     assert np.all((across[np.isfinite(across)] > x.values[0]) & (across[np.isfinite(across)] < x.values[-1]))

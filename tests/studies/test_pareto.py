@@ -1,4 +1,4 @@
-"""The front of accuracy against peak torque: points, dominance, knee, what it leaves."""
+"""The Pareto front of accuracy against peak torque: points, dominance, knee, files."""
 
 import csv
 import json
@@ -24,16 +24,16 @@ from tuning.studies import front, judging, pareto, posing, trades
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e-6])
-def test_the_knee_is_where_a_front_bends(scale):
-    """Two straight lines in logs, steep then flat: the knee is where they meet."""
+def test_knee_is_at_the_bend_of_the_front(scale):
+    """The front is two straight lines in logarithms, first steep, then flat. The knee is their intersection."""
     torque = np.geomspace(0.1, 10.0, 21)
     error = np.where(torque < 1.0, torque**-3.0, torque**-0.2) * scale
     assert pareto.knee_of(np.stack([torque, error], axis=1)) == 10
 
 
 @pytest.mark.parametrize(("lost", "largest"), [(0, 90.0), (5, 90.0), (20, 80.0)])
-def test_the_share_that_a_torque_stays_below_is_one_of_all_trials(lost, largest):
-    """With 5 of 100 lost it was told of 90 % of the 95 others, which are 86 % of the trials."""
+def test_required_fraction_of_the_peak_torque_counts_failed_trials(lost, largest):
+    """Earlier, with 5 failed of 100 trials, the result was the 90 % quantile of the other 95."""
     asked = scenario.from_tables({"requirements": {"peak_torque": {"limit": 1.0, "quantile": 0.9}}})
     peaks, status = np.arange(1.0, 101.0), np.full(100, rollout.OK)
     status[100 - lost :] = rollout.DIVERGED
@@ -46,13 +46,13 @@ def point(peak, rms, **others):
 
 
 def trials(errors):
-    """Trials with these window errors; nothing else of them is looked at."""
+    """Return trials with these window errors. The tests do not use the other metrics."""
     ok = np.zeros(len(errors), dtype=np.int32)
     metrics = Metrics(dict.fromkeys(CATALOGUE, jnp.asarray(errors)))
     return Trials(np.arange(len(errors)), metrics, ok, np.full(len(errors), np.nan), {})
 
 
-def test_only_what_is_beaten_beyond_its_interval_is_dominated():
+def test_dominated_points_are_worse_by_more_than_the_interval():
     rng = np.random.default_rng(0)
     common = rng.lognormal(0.0, 0.5, 400)
     sizes = {0.2: 4.0, 0.3: 2.0, 0.4: 2.5, 0.5: 1.0, 0.6: 1.0005}  # by peak torque
@@ -62,21 +62,24 @@ def test_only_what_is_beaten_beyond_its_interval_is_dominated():
         judged.append((point(peak, float(np.sqrt(np.mean(errors**2)))), trials(errors)))
     marked = pareto.marked(judged)
     assert [p.peak for p in marked] == sorted(sizes)
-    # 0.4 is worse than 0.3 by a quarter; 0.6 than 0.5 by less than chance
+    # only the point with peak torque 0.4 is worse than a point with less torque by more than the interval
     assert {p.peak for p in marked if p.dominated} == {0.4}
     assert sum(p.knee for p in marked) == 1
     assert not any(p.knee and p.dominated for p in marked)
 
 
-def test_gains_without_an_error_or_without_a_trial_that_ends_are_no_knee_of_a_front():
-    """Their logarithms are no numbers, and one such made itself the knee."""
+def test_points_with_zero_or_missing_error_are_not_the_knee():
+    """Their logarithms are not finite. Earlier, such a point became the knee."""
     sizes = {0.2: 4.0, 0.3: 2.0, 0.5: 1.6, 0.6: 0.0, np.nan: np.nan}
     judged = [(point(peak, size), trials([size])) for peak, size in sizes.items()]
     assert [p.peak for p in pareto.marked(judged) if p.knee] == [0.3]
 
 
-def test_more_failures_or_too_few_trials_beat_nothing():
-    """Half the error at less torque, but from trials of which some failed; from too few; where nothing is drawn."""
+def test_points_with_more_failures_or_too_few_trials_do_not_dominate():
+    """A point has half the error at less torque, but failed trials, or too few trials for an interval.
+
+    A single trial without dispersions has no interval and can dominate.
+    """
     rng = np.random.default_rng(0)
     errors = rng.lognormal(0.0, 0.5, 400)
     better = point(0.2, 0.5), trials(0.5 * errors * rng.normal(1.0, 0.05, 400))
@@ -100,7 +103,7 @@ SPACECRAFT = SHORT.replace("peak_torque = 30.0", "peak_torque = 8.0")
 @pytest.mark.parametrize(
     ("text", "limit"), short([(CHAIN, 0.55), (SPACECRAFT, 8.0)], [(CHAIN, 0.55)]), ids=["chain", "spacecraft"]
 )
-def test_a_front_from_start_to_end(command, tmp_path, monkeypatch, text, limit):
+def test_pareto_command_computes_a_torque_front(command, tmp_path, monkeypatch, text, limit):
     small_search(monkeypatch, 60)
     (tmp_path / "s.toml").write_text(text.replace("steps = 4", "steps = 6"))
     refined, search, begun, searched = pareto.refined, posing.Posed.search, [], []
@@ -128,16 +131,16 @@ def test_a_front_from_start_to_end(command, tmp_path, monkeypatch, text, limit):
     assert sum(row["knee"] == "1" for row in rows) == 1
     peaks = [float(row["peak_torque"]) for row in rows]
     assert peaks == sorted(peaks)
-    # the scenario's own limit is one of the targets, and as accurate as the gains that a search for it alone found
+    # the scenario's torque limit is a target, and its gains are at least as accurate as all known feasible gains
     (own,) = [float(row["trained_goal"]) for row in rows if float(row["limit"]) == limit]
     ((problems, known, evaluate),) = begun
     flown = evaluate.fly(problems[limit].tightened(1.0 - pareto.MARGIN), known)
-    assert len(known) > len(searched)  # other valleys that the searches found among them
+    assert len(known) > len(searched)  # including other local minima of the searches
     assert searched.count(limit) == 1
     assert own <= np.exp(flown.value[flown.beyond <= descent.SLACK].min()) * (1.0 + 1e-9)
     for row in rows:
         assert float(row["rms_low"]) <= float(row["rms_window_error"]) <= float(row["rms_high"])
-        # the gains of a row, flown as the row says
+        # simulate the gains of the row again
         values = {"eta": float(row["eta"]), "delta": float(row["delta"])}
         made = scenario.replace(
             scenario.read(tmp_path / "s.toml"), **{f"controller__{k}": v for k, v in values.items()}
@@ -161,7 +164,7 @@ def test_a_front_from_start_to_end(command, tmp_path, monkeypatch, text, limit):
                                                ('minimise = "effort"', 'tune.minimise is "effort"'),
                                                ("torque_weight = 0.5", "tune.torque_weight is 0.5"),
                                                ("worst_case = true", "tune.worst_case is true")])  # fmt: skip
-def test_a_front_of_something_else_is_refused(command, tmp_path, change, value):
+def test_other_objectives_are_refused(command, tmp_path, change, value):
     text = SHORT.replace('free = ["eta", "delta"]', f'free = ["eta", "delta", "t_f"]\n{change}')
     (tmp_path / "s.toml").write_text(text)
     before = tree(tmp_path)
@@ -173,13 +176,13 @@ def test_a_front_of_something_else_is_refused(command, tmp_path, change, value):
 
 
 @pytest.mark.parametrize("points", ["2", "101", "many", "-3"])
-def test_a_number_of_points_out_of_range_is_refused(command, points):
+def test_invalid_number_of_points_is_refused(command, points):
     status, out, err = command("pareto", "s.toml", f"--points={points}")
     assert (status, out) == (2, "")
     assert "--points" in err
 
 
-def test_a_scenario_without_a_limit_on_the_torque_has_a_front_too():
+def test_torque_front_does_not_need_a_torque_limit():
     made = scenario.from_tables({"requirements": {"effort": 9.0}, "tune": {}})
     assert trades.Torque(made).base.requirements == {"effort": 9.0, "peak_torque": trades.OFF}
     quantile = scenario.replace(made, requirements={"peak_torque": {"limit": 0.5, "quantile": 0.9}})
@@ -189,17 +192,17 @@ def test_a_scenario_without_a_limit_on_the_torque_has_a_front_too():
 
 
 @pytest.mark.parametrize("own", [None, 0.5, 1.001, 1.4, 1.5, 3.0, 5.0, 6.0, 15.9, 16.0])
-def test_a_limit_of_ones_own_takes_the_place_of_the_nearest_rung(own):
-    """By logarithms; the ends stay, which are known to be kept."""
+def test_own_torque_limit_replaces_the_nearest_default_limit(own):
+    """The nearest limit is in logarithms. The ends stay, because searches have found feasible gains for them."""
     usual = np.array([1.0, 2.0, 4.0, 8.0, 16.0])
     ladder, middle = trades.limits_between(1.0, 16.0, 5, own)
-    rungs = {1.001: 1, 1.4: 1, 1.5: 1, 3.0: 2, 5.0: 2, 6.0: 3, 15.9: 3}  # from 2 sqrt(2) on 4 is nearer than 2
+    rungs = {1.001: 1, 1.4: 1, 1.5: 1, 3.0: 2, 5.0: 2, 6.0: 3, 15.9: 3}  # above 2 sqrt(2), 4 is nearer than 2
     assert middle == rungs.get(own, 2)
     np.testing.assert_allclose(np.delete(ladder, middle), np.delete(usual, middle), rtol=1e-14)
     assert ladder[middle] == (own if own in rungs else pytest.approx(4.0, rel=1e-14))
 
 
-def test_refining_reports_its_target(monkeypatch):
+def test_refinement_reports_its_target(monkeypatch):
     told = []
     monkeypatch.setattr(pareto, "_refined", lambda *_: None)
     problem: Any = None
@@ -209,8 +212,8 @@ def test_refining_reports_its_target(monkeypatch):
 
 
 @pytest.mark.parametrize(("found", "best"), [(None, 2.0), (3.0, 2.0), (1.5, 1.5)])
-def test_a_rung_is_as_good_as_the_gains_known_to_keep_it(monkeypatch, found, best):
-    """F as the gain itself: 1 is beyond the limit, 2 keeps it; descents from them may find nothing, worse or better."""
+def test_refined_target_is_not_worse_than_the_known_feasible_gains(monkeypatch, found, best):
+    """F is the gain itself. Gain 1 breaks the limit, gain 2 keeps it. The local search finds nothing, 3 or 1.5."""
 
     def measured(problem, share):
         f = share[:, 0]
@@ -235,8 +238,8 @@ def test_a_rung_is_as_good_as_the_gains_known_to_keep_it(monkeypatch, found, bes
 
 
 @pytest.mark.parametrize(("least", "limits"), [(9.0, [5.0]), (2.0, [5.0, 0.25]), (1e-9, [5.0, 0.25, 0.0125])])
-def test_the_least_torque_is_looked_for_under_a_limit_that_no_gains_keep(least, limits):
-    """Gains that keep a limit are the most accurate that do: a front began there, above what others ask for."""
+def test_least_torque_search_lowers_the_limit_until_it_is_infeasible(least, limits):
+    """Under a feasible limit, a search returns the most accurate gains, and not those with the least torque."""
     asked = []
 
     def asking_for(limit):
@@ -250,8 +253,8 @@ def test_the_least_torque_is_looked_for_under_a_limit_that_no_gains_keep(least, 
 
 @pytest.mark.long
 @pytest.mark.parametrize("stage", ["least torque: searching", "refining"])
-def test_an_interrupted_front_goes_on(command, tmp_path, monkeypatch, stage):
-    """The front is that of a run without it."""
+def test_interrupted_front_resumes_with_the_same_result(command, tmp_path, monkeypatch, stage):
+    """The result equals the result without the interruption."""
     small_search(monkeypatch, 60)
     run = ("pareto", "s.toml", "--points", 3, "--no-figures", "--out")
     whole = command(*run, "whole")[0]

@@ -1,4 +1,4 @@
-"""`ptsmc margins`: what it leaves, what it says, what it refuses."""
+"""`ptsmc margins`: files, report and errors."""
 
 import csv
 import dataclasses
@@ -19,7 +19,7 @@ from tests.theory.loops import held
 from tuning.output import margins_report, page, summaries
 from tuning.studies import stability
 
-# on the clock of what is tuned, whose loop is judged by the same program
+# the flight clock, so that judging of tuned gains uses the same compiled program
 CHAIN = SHORT_CHAIN.replace('mode = "sampled"', 'mode = "sampled"\nclock = "flight"')
 
 
@@ -28,11 +28,11 @@ def tables(path):
         return list(csv.DictReader(file))
 
 
-SCENARIOS = {"body": (SHORT, list("xyz"), 6), "chain": (CHAIN, ["u1"], 2)}  # axes, and how much sensors see
+SCENARIOS = {"body": (SHORT, list("xyz"), 6), "chain": (CHAIN, ["u1"], 2)}  # axes, number of measured signals
 
 
 @pytest.mark.parametrize("plant", short(SCENARIOS, ["chain"]))
-def test_margins_leaves_its_table_figures_and_page(command, tmp_path, plant):
+def test_margins_command_writes_table_figures_and_page(command, tmp_path, plant):
     text, names, seen = SCENARIOS[plant]
     (tmp_path / "s.toml").write_text(text)
     status, out, _ = command("margins", "s.toml")
@@ -43,7 +43,7 @@ def test_margins_leaves_its_table_figures_and_page(command, tmp_path, plant):
     assert {p.name for p in (folder / "figures").iterdir()} == {"nichols.png", "sensitivity.png", "margins.png"}
     found = json.loads((folder / "summary.json").read_text())
     of_axes(tables(folder / "margins.csv"), found, names, seen)
-    # one axis alone bears at least as much as all at once
+    # the gain margin of one axis is at least the margin of all axes together
     alone = min(one["gain_up"] for one in found["hold"].values())
     assert found["together"]["gain_up"] <= alone * (1 + 1e-6)
     if len(names) == 1:
@@ -55,7 +55,7 @@ def test_margins_leaves_its_table_figures_and_page(command, tmp_path, plant):
 
 
 def of_axes(rows, found, names, seen):
-    """What the table and the summary say of each axis, and of the worst of them."""
+    """Check the values of each axis and of the worst axis in the table and the summary."""
     hold = [row for row in rows if row["t"] == rows[-1]["t"]]
     assert [row["axis"] for row in hold] == names
     for row in hold:
@@ -63,7 +63,7 @@ def of_axes(rows, found, names, seen):
         for column, name in (("gain_up_dB", "gain_up"), ("phase_deg", "phase"), ("delay_s", "delay")):
             np.testing.assert_allclose(float(row[column]), said[name], rtol=1e-12)
     assert len(found["before"]) == len(rows) / len(names) - 1
-    for one in found["before"]:  # of the worst axis
+    for one in found["before"]:  # worst axis
         axes = [row for row in rows if float(row["time_to_go"]) == one["time_to_go"]]
         assert len({row["modulus_dB"] for row in axes}) == len(names)
         assert one["modulus"] == max(float(row["modulus_dB"]) for row in axes)
@@ -78,8 +78,8 @@ def of_axes(rows, found, names, seen):
     assert all(float(row["time_to_go"]) > 0.0 for row in rows if row not in hold)
 
 
-def test_the_table_has_every_axis_and_the_summary_the_worst(tmp_path):
-    """By numbers of no loop."""
+def test_table_has_every_axis_and_summary_has_the_worst_axis(tmp_path):
+    """The margins are random numbers."""
     ready, rng = scenario.study(scenario.from_tables(untuned(SHORT))), np.random.default_rng(3)
 
     def left(*shape):
@@ -100,7 +100,7 @@ def test_the_table_has_every_axis_and_the_summary_the_worst(tmp_path):
 ASKS = CHAIN.split("[requirements]")[0] + "[requirements]\ngain_margin = 1.0\nphase_margin = 89.0\n"
 
 
-def test_a_run_is_judged_by_the_margins_of_its_loop(command, tmp_path):
+def test_simulate_checks_required_margins(command, tmp_path):
     (tmp_path / "asks.toml").write_text(ASKS)
     status, out, _ = command("simulate", "asks.toml", "--no-figures")
     assert status == 1
@@ -112,8 +112,8 @@ def test_a_run_is_judged_by_the_margins_of_its_loop(command, tmp_path):
     np.testing.assert_allclose(said["phase_margin"]["worst"], course.worst()["phase_margin"], rtol=1e-9)
 
 
-def test_of_a_run_that_does_not_come_to_rest_no_margins_are_left(command, tmp_path, monkeypatch):
-    """By the command and in the verdicts of a run; which runs do not, theory/test_rest.py has."""
+def test_run_with_a_limit_cycle_has_no_margins(command, tmp_path, monkeypatch):
+    """`theory/test_rest.py` tests the detection of limit cycles."""
     (tmp_path / "asks.toml").write_text(ASKS)
     monkeypatch.setattr(rest, "swing", lambda *_: rest.Swing(0.04, 2.0))
     status, said, _ = command("margins", "asks.toml", "--no-figures")
@@ -130,7 +130,7 @@ def test_of_a_run_that_does_not_come_to_rest_no_margins_are_left(command, tmp_pa
     assert (verdict["met"], verdict["worst"]) == (False, 0.0)
 
 
-def test_each_of_several_loops_is_judged_once_and_in_its_place(monkeypatch):
+def test_margins_of_several_loops_are_in_their_order(monkeypatch):
     monkeypatch.setattr(margins, "of_each", lambda loops: margins.Margins(*(loops.period[:, None],) * 7))
     for count in (1, 2, 5):
         numbers = np.arange(float(count))
@@ -139,10 +139,10 @@ def test_each_of_several_loops_is_judged_once_and_in_its_place(monkeypatch):
         np.testing.assert_array_equal(margins.in_turn(loops).phase[:, 0], numbers)
 
 
-def test_an_unstable_hold_is_said_and_has_negative_margins(command, tmp_path):
+def test_unstable_hold_phase_is_reported_with_negative_margins(command, tmp_path):
     (tmp_path / "wild.toml").write_text(CHAIN.replace("[controller]", "[controller]\nk1 = 60.0"))
     loaded = scenario.read(tmp_path / "wild.toml")
-    assert loaded.controller.k1 * loaded.loop.period > 4.0  # K1 h / 2 beyond 2: the border without delay
+    assert loaded.controller.k1 * loaded.loop.period > 4.0  # stability limit without delay: K1 h / 2 = 2
     status, out, _ = command("margins", "wild.toml", "--no-figures")
     assert status == 1
     assert "NOT stable" in out
@@ -153,10 +153,10 @@ def test_an_unstable_hold_is_said_and_has_negative_margins(command, tmp_path):
 
 @pytest.mark.parametrize(("judged", "mood", "headline"), [
     (True, "bad", "Stable in the hold phase, NOT stable in the approach phase: gain -1.9 dB"),
-    (False, "calm", "The nominal loop is stable: gain -1.9 dB"),  # there its margins do not count
+    (False, "calm", "The nominal loop is stable: gain -1.9 dB"),  # this sample is not judged
 ])  # fmt: skip
 def test_loop_that_is_unstable_in_the_approach_phase_is_not_called_stable(judged, mood, headline):
-    """With a period of half of t_f the page began with a stable loop of -1.9 dB and -180 deg."""
+    """Earlier, with a period of t_f / 2, the page called a loop with -1.9 dB and -180 deg stable."""
     left = dict.fromkeys(("gain_up", "gain_down", "phase", "delay", "modulus"), 6.0)
     summary = {
         "stable": True, "open": [], "cut": [], "said": None, "hold": {"u1": left}, "together": left, "sensors": {},
@@ -179,20 +179,20 @@ def test_margins_need_the_sampled_loop(command, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_inputs_and_sensors_of_other_plants_have_names():
+def test_inputs_and_measured_signals_of_a_chain_have_names():
     loaded = scenario.from_tables({"plant": {"kind": "chain", "order": 3}, "loop": {"mode": "sampled"}})
     assert stability.names(scenario.study(loaded)) == (["u1"], ["x1", "x2", "x3"])
 
 
 def at_hand_over(period):
-    """A chain whose t_f - delta is half a period, with a sample there."""
+    """Return a chain with t_f - delta of half a period, and a sample at this time."""
     tables = {**tomllib.loads(CHAIN), "controller": {"t_f": 5.0, "delta": 5.0 - 0.5 * period}, "tune": {}}
     tables["loop"] |= {"period": period, "clock": "anchored"}
     return scenario.study(scenario.from_tables(tables))
 
 
-def test_a_run_that_is_not_finite_leaves_no_margins_and_is_no_error(monkeypatch):
-    """As of a pair of `map` whose nominal run flies away, by which the whole map ended; `margins` blamed the law."""
+def test_diverged_nominal_run_has_nan_margins_in_maps_and_is_refused_by_margins(monkeypatch):
+    """Earlier, one such pair ended a whole map, and `margins` reported an error of the law."""
     ready = at_hand_over(0.1)
     initial = jax.tree.map(lambda v: jnp.nan * v, ready.parts.initial)
     lost = dataclasses.replace(ready, parts=dataclasses.replace(ready.parts, initial=initial))
@@ -203,8 +203,8 @@ def test_a_run_that_is_not_finite_leaves_no_margins_and_is_no_error(monkeypatch)
         stability.find(lost.scenario)
 
 
-def test_a_run_that_comes_to_the_laws_singularity_has_no_margins(monkeypatch):
-    """`margins` called its loop in hold stable."""
+def test_nominal_run_near_the_singularity_is_refused(monkeypatch):
+    """Earlier, `margins` reported a stable loop."""
     ready = at_hand_over(0.1)
     course = run_margins.along(ready.parts)
     assert course.clearance == 1.0  # a chain's law has no singularity
@@ -215,8 +215,8 @@ def test_a_run_that_comes_to_the_laws_singularity_has_no_margins(monkeypatch):
 
 
 @pytest.mark.parametrize("period", short([0.1, 0.5], [0.1]))
-def test_without_a_whole_period_before_the_hand_over_margins_are_those_in_hold(period):
-    """No sample before the hand-over lasts a whole one."""
+def test_margins_at_a_hand_over_in_the_first_period_are_those_of_the_hold_phase(period):
+    """No sample before the hand-over lasts a whole period."""
     parts = at_hand_over(period).parts
     ends = run_margins.at_ends(parts)
     for one, other in zip(ends["hand_over"][0], ends["hold"][0], strict=True):
@@ -224,14 +224,14 @@ def test_without_a_whole_period_before_the_hand_over_margins_are_those_in_hold(p
     course = run_margins.along(parts)
     assert course.t.size == 1
     assert course.worst()["phase_margin"] == course.hold[1].phase.min()
-    assert np.isnan(course.at_sensors.delay).all()  # what comes late is a command
+    assert np.isnan(course.at_sensors.delay).all()  # delay margins are defined at the command only
 
 
 LIMITED = {
     "plant": {"kind": "chain", "x0": [1.0, 0.0]}, "disturbance": {"kind": "none"},
     "controller": {"t_f": 3.0, "delta": 1.0, "sign_width": 0.1},
     "loop": {"mode": "sampled", "period": 0.1, "window": 1.0},
-    "hardware": {"torque_limit": 0.02, "state_noise": [2e-5, 1e-5]},  # with it the loop has as many states as `CHAIN`
+    "hardware": {"torque_limit": 0.02, "state_noise": [2e-5, 1e-5]},  # noise: as many loop states as in `CHAIN`
 }  # fmt: skip
 
 
@@ -239,8 +239,8 @@ def limited_to(limit):
     return scenario.from_tables(LIMITED | {"hardware": LIMITED["hardware"] | {"torque_limit": limit}})
 
 
-def test_where_a_limit_cuts_the_command_the_loop_is_said_to_be_open():
-    """There L is zero: margins have no limit, which is no merit of the gains."""
+def test_saturated_command_is_reported_as_an_open_loop():
+    """The loop transfer L is zero, so that the margins are infinite, whatever the gains are."""
     ready, course = stability.find(scenario.from_tables(LIMITED))
     found = stability.summary(ready, course)
     cut = [one for one in found["before"] if one["open"]]
@@ -251,7 +251,7 @@ def test_where_a_limit_cuts_the_command_the_loop_is_said_to_be_open():
     assert held.startswith("the loop is open at input u1 in the hold phase: a limit of the actuators cuts")
     assert before.startswith("the loop is open at input u1 in the approach phase, at ")
     assert not any("smallest margins" in line for line in report.lines)
-    assert found["missed"]  # in 3 s it comes from 1 to 1 - 0.02 3^2 / 2 = 0.91 at best
+    assert found["missed"]  # with this limit, the state 1 decreases to 0.91 in 3 s at best
     assert any(line.startswith("the nominal run misses t_f") for line in report.lines)
     assert report.headline == "The nominal loop is open in the hold phase"
     found = stability.summary(*stability.find(limited_to(50.0)))
@@ -259,18 +259,18 @@ def test_where_a_limit_cuts_the_command_the_loop_is_said_to_be_open():
     assert "missed" not in found
     lines = reported(found).lines
     assert not any(word in line for line in lines for word in ("dispersed", "misses", "limit of the actuators"))
-    # not the margins at all inputs at once and at the sensors, which are in the table and may be smaller
+    # margins at all inputs together and at the sensors may be smaller; the table has them
     assert any(line.startswith("these are the smallest margins at any input") for line in lines)
-    # as of one axis of several, of which another makes the loop unstable
+    # margins of an axis if another axis makes the loop unstable
     least = np.full_like(course.at_input.modulus, -100.0)
     lost = {"gain_up": least, "gain_down": least, "modulus": np.copysign(0.0, least), "stable": least > 0.0}
     found = stability.summary(ready, course._replace(at_input=course.at_input._replace(**lost)))
     assert found["open"] == ["u1"]
-    assert str(found["hold"]["u1"]["modulus"]) == "0.0"  # was -0
+    assert str(found["hold"]["u1"]["modulus"]) == "0.0"  # not -0.0
 
 
 def blamed_on_no_limit(found, first, limited):
-    """Checks what is said of a sample of which the law makes nothing, in a run that a limit cuts elsewhere or not."""
+    """Check the report of a sample that the law ignores; limited: the command saturates at other samples."""
     assert (first["open"], first["cut"]) == (["u1"], [])
     assert any(loop["cut"] for loop in (found, *found["before"])) == limited
     lines, left = reported(found).lines, f"{first['time_to_go']:.3g} s to go"
@@ -280,10 +280,10 @@ def blamed_on_no_limit(found, first, limited):
 
 
 @pytest.mark.parametrize("limit", [50.0, 0.5])
-def test_a_sample_of_which_the_law_makes_nothing_is_blamed_on_no_limit(limit):
-    """`margins` said that a limit cuts it."""
+def test_sample_that_the_law_ignores_is_not_reported_as_saturation(limit):
+    """Earlier, `margins` reported saturation."""
     ready, course = stability.find(limited_to(limit))
-    k = np.flatnonzero(course.loops.new[:-1, 0].any(axis=(1, 2)))[0]  # where no limit cuts the command
+    k = np.flatnonzero(course.loops.new[:-1, 0].any(axis=(1, 2)))[0]  # a sample without saturation
     nothing = {"gain_up": np.inf, "gain_down": np.inf, "phase": 180.0, "modulus": 0.0, "crossover": np.nan}
     each = {name: getattr(course.at_input, name).copy() for name in nothing}
     for name, value in nothing.items():
@@ -292,10 +292,10 @@ def test_a_sample_of_which_the_law_makes_nothing_is_blamed_on_no_limit(limit):
     blamed_on_no_limit(found, found["before"][k], limit < 1.0)
 
 
-@pytest.mark.long  # what is said of such a sample: above
+@pytest.mark.long  # the previous test checks the report
 @pytest.mark.parametrize("hardware", [{}, {"torque_limit": 0.02}])
-def test_the_first_sample_of_a_time_base_is_one_of_which_the_law_makes_nothing(hardware):
-    """Its profile begins where the error is."""
+def test_time_base_law_ignores_the_first_sample(hardware):
+    """The reference profile of the law starts at the measured error."""
     tables = {"plant": {"kind": "chain", "x0": [1.0, 0.0]}, "disturbance": {"kind": "none"},
               "controller": {"kind": "time_base_pd", "t_f": 3.0},
               "loop": {"mode": "sampled", "period": 0.1, "window": 1.0},

@@ -22,8 +22,8 @@ from tuning.studies import judging, pareto, posing, stability, trades
 MARGINS = ("gain_margin", "phase_margin", "delay_margin", "modulus_margin")
 
 
-def test_more_margin_costs_accuracy(command, tmp_path, monkeypatch):
-    """Every row is what flying and linearising its gains gives; the limits are kept, and each costs more than none."""
+def test_larger_margins_reduce_the_accuracy(command, tmp_path, monkeypatch):
+    """Every row agrees with simulation and linearisation of its gains. Tighter limits increase the error."""
     small_search(monkeypatch, 60)
     (tmp_path / "c.toml").write_text(
         re.sub(r"\[dispersion\]\n.*\n", "", SHORT_CHAIN)  # one loop
@@ -84,7 +84,7 @@ def test_more_margin_costs_accuracy(command, tmp_path, monkeypatch):
         (("--against", "margins"), 'loop.mode is "continuous", but must be "sampled"'),
     ],
 )
-def test_limits_that_are_refused_in_one_sentence(command, tmp_path, options, said):
+def test_invalid_limits_are_refused(command, tmp_path, options, said):
     (tmp_path / "s.toml").write_text("[controller]\neta = 3.0\n")
     assert said in refused(command, tmp_path, "pareto", "s.toml", *options)
 
@@ -96,13 +96,13 @@ def test_limits_that_are_refused_in_one_sentence(command, tmp_path, options, sai
         ({"worst_case": True}, "tune.worst_case is true, but must be false to ask what margins cost"),
     ],
 )
-def test_scenarios_without_a_cost_of_margins(tune, said):
+def test_margin_trade_refuses_other_objectives(tune, said):
     known = scenario.from_tables({**tomllib.loads(SHORT_CHAIN), "tune": tune})
     with pytest.raises(ScenarioError, match=said):
         trades.Margins(known).check()
 
 
-def test_the_scenarios_own_limit_is_one_of_the_usual_ones():
+def test_default_limits_include_the_limit_of_the_scenario():
     tables = tomllib.loads(SHORT_CHAIN)
     usual = [np.inf, 12.0, 8.0, 6.0, 5.0, 4.0, 3.0]
     assert trades.Margins(scenario.from_tables(tables)).values == usual
@@ -110,17 +110,17 @@ def test_the_scenarios_own_limit_is_one_of_the_usual_ones():
     assert trades.Margins(asked).values == sorted([*usual, 5.5], reverse=True)
 
 
-def test_a_limit_stands_for_the_margins_that_it_bounds():
+def test_sensitivity_limit_replaces_the_margins_that_it_bounds():
     asked = {"peak_torque": 3.0, "gain_margin": 8.0, "phase_margin": 45.0, "delay_margin": 0.02, "modulus_margin": 5.0}
     known = scenario.from_tables({**tomllib.loads(SHORT_CHAIN), "requirements": asked})
     limited = trades.Margins(known, (6.0, 4.0)).base
     assert limited.requirements == {"peak_torque": 3.0, "delay_margin": 0.02, "modulus_margin": 4.0}
 
 
-def test_a_faster_slew_costs_torque_and_accuracy(command, tmp_path, monkeypatch):
-    """Two times, few steps: the peak torque of a slew goes with 1 / t_f^2, the rate with 1 / t_f."""
+def test_faster_slew_needs_more_torque_and_is_less_accurate(command, tmp_path, monkeypatch):
+    """The peak torque of a slew is proportional to 1 / t_f^2, and the peak rate to 1 / t_f."""
     small_search(monkeypatch, 60)
-    # no longer than the scenario's own time: on the clock of other searches, whose programs fly this one too
+    # times up to the scenario's t_f, so that the compiled programs of other searches can be used
     (tmp_path / "c.toml").write_text(SHORT_CHAIN.replace("[2e-5, 1e-5]", "[2e-3, 1e-3]"))
     status, out, err = command("pareto", "c.toml", "--against", "t_f", "--times", "2.5,5", "--out", "cost")
     assert status == 0, err
@@ -131,11 +131,11 @@ def test_a_faster_slew_costs_torque_and_accuracy(command, tmp_path, monkeypatch)
     assert (fast["t_f"], slow["t_f"]) == (2.5, 5.0)
     assert fast["peak_rate"] / slow["peak_rate"] == pytest.approx(2.0, rel=0.3)
     assert 2.5 < fast["peak_torque"] / slow["peak_torque"] < 6.5
-    # each time's gains are at least as good at it as the other time's, on the very trials
+    # at each time, its own gains are more accurate than the gains of the other time, on the same trials
     for own, other in ((fast, slow), (slow, fast)):
         untuned = scenario.replace(scenario.read(tmp_path / "c.toml"), tune=None)
         errors = []
-        for found in (own, other):  # all other gains stay those of t_f = 5 s
+        for found in (own, other):  # the fixed gains are those of t_f = 5 s
             known = gains.in_scenario(untuned, {"t_f": own["t_f"], "eta": found["eta"], "delta": found["delta"]})
             trials = judging.judge(known, judging.seed_of_judge(0))
             errors.append(np.sqrt(np.mean(trials.metrics.window_error[:60] ** 2)))
@@ -155,8 +155,8 @@ def test_a_faster_slew_costs_torque_and_accuracy(command, tmp_path, monkeypatch)
     assert "from an earlier run" in again[1]
 
 
-def test_each_time_is_searched_for_itself(monkeypatch):
-    """The gains of other times may lead to another local minimum. Hard trials of the first two times join all."""
+def test_every_prescribed_time_has_its_own_search(monkeypatch):
+    """Other times may have other local minima. All times use the difficult trials of the first two times."""
     small_search(monkeypatch, 8)
     searched, flown, joined, search = [], [], [], posing.Posed.search
 
@@ -168,7 +168,7 @@ def test_each_time_is_searched_for_itself(monkeypatch):
         return outcome
 
     monkeypatch.setattr(posing.Posed, "search", note)
-    usual = SHORT_CHAIN.replace(", delta = [0.1, 2.0]", "")  # to 2.55 s, where t_f is 5
+    usual = SHORT_CHAIN.replace(", delta = [0.1, 2.0]", "")  # default bounds, up to 2.55 s for t_f = 5 s
     pareto.trace(trades.SlewTime(scenario.from_tables(tomllib.loads(usual)), (3.9, 4.5, 5.0)), 0)
     assert searched == [(5.0, True), (3.9, True), (4.5, True)]
     assert set(joined[0]) > set(flown[0])
@@ -191,7 +191,7 @@ def test_each_time_is_searched_for_itself(monkeypatch):
         ),
     ],
 )
-def test_times_that_are_refused_in_one_sentence(command, tmp_path, options, said):
+def test_invalid_times_are_refused(command, tmp_path, options, said):
     assert said in refused(command, tmp_path, "pareto", "s.toml", *options)
 
 
@@ -215,23 +215,23 @@ def test_times_that_are_refused_in_one_sentence(command, tmp_path, options, said
         ),
     ],
 )
-def test_scenarios_without_a_cost_of_a_faster_slew(changes, said):
+def test_slew_time_trade_refuses_other_scenarios(changes, said):
     known = scenario.from_tables({"loop": {"mode": "sampled"}, "controller": {"t_f": 20.0}, **changes})
     with pytest.raises(ScenarioError, match=said.replace("(", r"\(")):
         trades.SlewTime(known, (20.0, 30.0)).check()
 
 
-def test_an_observer_with_a_time_of_its_own_is_asked():
+def test_slew_time_trade_accepts_an_observer_with_a_given_t_o():
     known = {"observer": {"kind": "prescribed_time", "t_o": 4.0}, "tune": {}, "loop": {"mode": "sampled"}}
     trades.SlewTime(scenario.from_tables({"controller": {"t_f": 20.0}, **known}), (20.0, 30.0)).check()
 
 
-def test_usual_times_go_from_half_to_twice_the_scenarios():
+def test_default_times_are_half_to_twice_the_time_of_the_scenario():
     assert trades.SlewTime(scenario.from_tables({})).values == [15.0, 21.0, 30.0, 42.0, 60.0]
 
 
-def test_a_study_is_known_by_all_digits_of_its_times():
-    """With six digits, the results of other times were shown as already done."""
+def test_identity_of_a_study_has_all_digits_of_its_times():
+    """Earlier, with six digits, results of other times were taken for the requested ones."""
     known = scenario.from_tables({})
     listed = [
         trades.SlewTime(known, times).identity(0)["times"] for times in ((100.0001, 20), (20.0, 100.0002), (20, 30))
@@ -239,7 +239,7 @@ def test_a_study_is_known_by_all_digits_of_its_times():
     assert listed == ["20,100.0001", "20,100.0002", "20,30"]
 
 
-def test_slew_costs_are_the_metrics_of_the_scenario():
+def test_costs_of_a_slew_are_the_metrics_of_the_scenario():
     trials = Trials(np.arange(1), Metrics(dict.fromkeys(METRICS, np.ones(1))), np.zeros(1, int), np.zeros(1), {})
 
     def costs(**tables):

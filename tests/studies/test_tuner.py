@@ -1,4 +1,4 @@
-"""What a tuning run does with what fresh trials say."""
+"""Tuning runs: repeated searches after held-out trials, wider bounds, judging and reports."""
 
 import tomllib
 from dataclasses import dataclass, replace
@@ -20,12 +20,12 @@ from tuning.search.evaluate import Evaluator
 from tuning.search.objective import FAILED
 from tuning.studies import judging, posing, tune_files, tuner
 
-LIMIT = 0.6  # of the peak torque
+LIMIT = 0.6  # on the peak torque
 
 
 @pytest.mark.parametrize("seed", [0, 1000, 654735429, 2933870671, 188629158])
-def test_fresh_trials_have_another_seed_than_those_of_the_search_and_of_other_turns(seed):
-    """The hash that they follow by takes one seed of all to itself, and another one for each later turn."""
+def test_seeds_of_held_out_trials_differ_from_each_other_and_from_the_search(seed):
+    """The hash maps one seed to itself, and another one in each later turn. The parameters include these seeds."""
     seeds = [seed, *(judging.seed_of_judge(seed, turn) for turn in range(tuner.TRIES))]
     assert len(set(seeds)) == len(seeds)
     plain = [draws.derive(seed, name) for name in ("fresh trials", "fresh trials 1", "fresh trials 2")]
@@ -34,15 +34,15 @@ def test_fresh_trials_have_another_seed_than_those_of_the_search_and_of_other_tu
 
 @pytest.fixture
 def small(monkeypatch):
-    """A search of few trials, judged on as many as are enough to break a limit: by the programs of test_cli.py."""
+    """Search with few trials and judge on enough trials to break a limit, by the compiled programs of test_cli.py."""
     small_search(monkeypatch, 60)
     monkeypatch.setattr(worst, "SCREENED", 2)
-    monkeypatch.setattr(tuner, "_prepare", lambda _: None)  # a program of margins, for which nobody asks here
-    monkeypatch.setattr(tuner, "_shortest", lambda *_: None)  # flown on a clock of its own
+    monkeypatch.setattr(tuner, "_prepare", lambda _: None)  # it compiles the margins, which the tests do not use
+    monkeypatch.setattr(tuner, "_shortest", lambda *_: None)  # it needs another compiled program
 
 
-def test_gains_that_break_a_limit_on_fresh_trials_are_tuned_on(small):
-    """The hardest of two training trials and two screened ones is easier than of 60 fresh ones."""
+def test_search_is_repeated_if_held_out_trials_break_a_limit(small):
+    """The largest torque of two training and two screened trials is smaller than that of 60 held-out trials."""
     text = SHORT_CHAIN.replace("peak_torque = 3.0", f"peak_torque = {LIMIT}").replace("trials = 8", "trials = 2")
     loaded = scenario.from_tables(tomllib.loads(text))
     found = tuner.tune(loaded, 0, trusted=False)
@@ -59,13 +59,13 @@ def test_gains_that_break_a_limit_on_fresh_trials_are_tuned_on(small):
     for one in (first, second):
         np.testing.assert_allclose(peak(one.gains, one.fresh_seed), one.over["peak_torque"], rtol=1e-12)
     assert first.over["peak_torque"] > second.over["peak_torque"] > 1.0
-    # as far as fresh trials went beyond those of the search, and 2 % more
+    # the violation on the held-out trials, and 2 % more
     reached = min(found.search.history, key=lambda step: abs(step.gains - [*second.gains.values()]).max()).worst[0]
     margins = [one["peak_torque"] for one in (first.margins, second.margins, found.search.margins)]
     np.testing.assert_allclose(margins[2], 1 - reached / (1.02 * second.over["peak_torque"]), rtol=1e-3)
     np.testing.assert_allclose(found.search.worst, 1 - margins[2], rtol=1e-3)  # the limit is active
     goes_on = {step.start: step.gains for step in reversed(found.search.history)}  # each start's first gains
-    assert sorted(goes_on) == [0, 1, 2, 3, 4, 5]  # two of each search: near those gains there may be none
+    assert sorted(goes_on) == [0, 1, 2, 3, 4, 5]  # two starting points for each search
     for one, start in zip((first, second), (2, 4), strict=True):
         np.testing.assert_allclose(goes_on[start], [*one.gains.values()], rtol=1e-9)  # rounded to ten digits
     assert [step.start for step in found.search.history] == sorted(step.start for step in found.search.history)
@@ -81,7 +81,7 @@ def test_gains_that_break_a_limit_on_fresh_trials_are_tuned_on(small):
     assert not once.met
 
 
-def test_progress_after_a_search_says_whether_it_kept_the_limits(small):
+def test_progress_reports_whether_the_search_kept_the_limits(small):
     for limit, kept in ((0.01, False), (50.0, True)):
         text = SHORT_CHAIN.replace("peak_torque = 3.0", f"peak_torque = {limit}")
         told = []
@@ -92,8 +92,8 @@ def test_progress_after_a_search_says_whether_it_kept_the_limits(small):
 
 
 @pytest.mark.parametrize(("free", "anchored"), [(["eta", "delta"], True), (["eta", "t_f"], True), (["eta"], False)])
-def test_a_hand_over_that_moves_has_its_sample_whatever_clock_flies(free, anchored):
-    """On the flight clock, which `tuned.toml` has too, delta moved nothing, and its slopes were zero."""
+def test_tuning_of_delta_or_t_f_uses_the_anchored_clock(free, anchored):
+    """On the flight clock, small changes of delta have no effect, and its gradient is zero."""
     bounds = {"eta": [2.6, 3.1], "delta": [0.1, 2.0], "t_f": [4.0, 6.0]}
     tables = tomllib.loads(SHORT_CHAIN) | {"tune": {"free": free, "bounds": {name: bounds[name] for name in free}}}
     flown = scenario.replace(scenario.from_tables(tables), loop__clock="flight")
@@ -102,8 +102,8 @@ def test_a_hand_over_that_moves_has_its_sample_whatever_clock_flies(free, anchor
     assert posed.ready.scenario == (scenario.from_tables(tables) if anchored else flown)
 
 
-def test_steps_and_samples_are_chosen_for_the_farthest_that_each_gain_may_go():
-    """To the end of its bounds at which more of them are needed, or its own value where that lies beyond."""
+def test_reach_covers_the_bounds_and_the_own_values_of_the_gains():
+    """The reach covers the bounds, and the scenario's own value if it is outside the bounds."""
     wide = {"eta": [2.1, 9.0], "delta": [0.1, 4.0], "t_f": [20.0, 60.0], "observer_gain": [2.0, 50.0],
             "k1": [0.5, 7.0], "sign_width": [1e-4, 1e-2], "surface_rate": [0.2, 3.0]}  # fmt: skip
     made = scenario.from_tables({"controller": {"sign_width": 1e-3}, "tune": {"free": [*wide], "bounds": wide}})
@@ -115,8 +115,8 @@ def test_steps_and_samples_are_chosen_for_the_farthest_that_each_gain_may_go():
     assert posing.reach(made, made.search, t_f=99.0).t_f == 99.0
 
 
-def test_one_trial_of_which_nothing_is_drawn_is_judged_by_the_limit_alone():
-    """It shows nothing of 99 % of the trials, all of which are that one."""
+def test_single_nominal_trial_is_judged_without_the_quantile():
+    """All trials are equal, so that one trial decides, without a confidence interval for 99 % of the trials."""
     asked = {"peak_torque": {"limit": 3.0, "quantile": 0.99, "confidence": 0.95}}
     tables = tomllib.loads(SHORT_CHAIN) | {"requirements": asked}
     del tables["tune"], tables["dispersion"], tables["hardware"]
@@ -127,8 +127,8 @@ def test_one_trial_of_which_nothing_is_drawn_is_judged_by_the_limit_alone():
         assert (verdict.met, verdict.quantile, verdict.worst) == (met, None, torque)
 
 
-def test_accuracy_beside_the_papers_gains_is_over_the_trials_that_both_fly_to_the_end():
-    """Ten that both do, whose RMS is five times as large; of one that is lost the other counts for nothing."""
+def test_accuracy_gain_uses_trials_that_both_sets_of_gains_finish():
+    """Both sets of gains finish ten trials, with an error ratio of five. Trials that one of them loses do not count."""
 
     def flown(errors: Any, lost: int) -> Any:
         finished = np.arange(12) != lost
@@ -143,8 +143,8 @@ def test_accuracy_beside_the_papers_gains_is_over_the_trials_that_both_fly_to_th
 
 
 @pytest.mark.parametrize(("goal", "said"), [(np.nan, "unknown"), (1e-3, "none")])
-def test_a_gain_with_which_no_trial_ends_anywhere_is_not_one_without_influence(goal, said):
-    """What stands for the goal where no trial has one is the same for all gains."""
+def test_influence_of_a_gain_is_unknown_if_no_trial_finishes(goal, said):
+    """If no trial has an objective, its replacement value is equal for all gains, which is no evidence."""
     profile = trust.Profile(np.arange(3.0), np.full(3, goal), np.ones(3), np.zeros(3))
     found: Any = SimpleNamespace(slope_error=None, profiles={"eta": profile}, sensitivities={}, margins={})
     tuning: Any = SimpleNamespace(tuned=SimpleNamespace(sampled=True, hardware=None), at_bound={"eta": "upper"})
@@ -170,7 +170,7 @@ def test_every_column_of_a_history_has_its_own_name(tune, column, name):
 
 @dataclass(frozen=True)
 class Found:
-    """The part of a `Search` that a further search in larger bounds depends on."""
+    """The part of a `Search` that a search in wider bounds depends on."""
 
     gains: np.ndarray
     value: float
@@ -185,7 +185,7 @@ class Found:
 
 
 class Rising:
-    """A posed problem of K1 and eta, F = -ln K1: a search ends at the upper bounds of both, and eta does not matter."""
+    """A problem of K1 and eta with F = -ln K1. A search ends at the upper bounds of both; eta has no effect."""
 
     def __init__(self, made: scenario.Scenario, searched: list[dict[str, tuple[float, float]]]):
         self.ready, self.seed, self.sloped, self.problem = SimpleNamespace(scenario=made), 0, True, None
@@ -208,8 +208,8 @@ class Rising:
         return Found(upper, value, history=(Step(0, upper, value, upper),))
 
 
-def test_a_search_goes_on_in_larger_bounds_if_a_gain_that_matters_ends_on_a_default_one(monkeypatch):
-    """K1 is searched in bounds that are ten times as large, three times at most; eta, without influence, is not."""
+def test_search_widens_default_bounds_of_gains_that_matter(monkeypatch):
+    """The bound of K1 is multiplied by ten, at most three times. The bound of eta stays, because eta has no effect."""
     tables = {"controller": {"t_f": 30.0}, "tune": {"free": ["eta", "k1"]}}
     searched = list[dict[str, tuple[float, float]]]()
     monkeypatch.setattr(posing, "pose", lambda made, *_, **__: Rising(made, searched))
@@ -228,12 +228,12 @@ def test_a_search_goes_on_in_larger_bounds_if_a_gain_that_matters_ends_on_a_defa
     assert len(found.history) == 1 + tuner.WIDENED
     assert posed.evaluate.rollouts == 10 * (1 + tuner.WIDENED)
     assert posed.ready.scenario.search.bounds == searched[-1]
-    stated = scenario.replace(some, tune__bounds={"k1": usual["k1"]})  # bounds of the user stay
+    stated = scenario.replace(some, tune__bounds={"k1": usual["k1"]})  # explicit bounds do not change
     first = Rising(stated, searched)
     assert tuner._in_larger_bounds(cast(Any, outcome), cast(Any, first), None, lambda *_: None)[1] is first
 
 
-def test_a_search_in_larger_bounds_that_finds_nothing_better_is_counted_too(monkeypatch):
+def test_search_in_wider_bounds_without_improvement_is_counted(monkeypatch):
     some = scenario.from_tables({"controller": {"t_f": 30.0}, "tune": {"free": ["eta", "k1"]}})
     monkeypatch.setattr(posing, "pose", lambda made, *_, **__: Rising(made, []))
     first = Rising(some, [])
@@ -243,7 +243,7 @@ def test_a_search_in_larger_bounds_that_finds_nothing_better_is_counted_too(monk
     assert (found.value, len(found.history), posed.evaluate.rollouts) == (1e-9, 2, 20)
 
 
-def test_a_search_of_gains_with_which_no_trial_ends_is_drawn():
+def test_figures_of_a_search_without_finished_trials():
     some = scenario.from_tables(tomllib.loads(SHORT_CHAIN) | {"tune": {"free": ["eta"]}})
     lost = np.full(2, np.nan)
     trials = SimpleNamespace(finished=np.zeros(2, bool), metrics=SimpleNamespace(window_error=lost, peak_torque=lost))
@@ -262,29 +262,29 @@ def test_a_search_of_gains_with_which_no_trial_ends_is_drawn():
     ("metric", "values", "reached", "over"),
     [
         ("peak_torque", [0.4, 0.6], 0.9, {"peak_torque": 1.2}),
-        ("peak_torque", [0.4, 0.6], 1.1, {}),  # not kept in the search either
-        ("peak_torque", [0.4, 0.6], 0.0, {}),  # nothing to keep more distance from
+        ("peak_torque", [0.4, 0.6], 1.1, {}),  # the search did not keep the limit either
+        ("peak_torque", [0.4, 0.6], 0.0, {}),  # the limit had no effect in the search
         ("gain_margin", [5.0, 7.0], 0.9, {"gain_margin": 2.0 - 5.0 / 6.0}),
-        ("gain_margin", [0.0, 7.0], 0.9, {}),  # the loop swings by itself
+        ("gain_margin", [0.0, 7.0], 0.9, {}),  # the loop has a limit cycle
     ],
 )
-def test_what_more_distance_from_a_limit_cannot_mend_is_left(metric, values, reached, over):
+def test_violations_that_a_repeated_search_cannot_fix_are_ignored(metric, values, reached, over):
     wanted = Requirement(metric, 0.5 if metric == "peak_torque" else 6.0, "", at_least=metric == "gain_margin")
     verdict = wanted.verdict(np.asarray(values), np.ones(2, bool))
     found = SimpleNamespace(worst=np.asarray([reached]), problem=SimpleNamespace(rows=[metric]))
     assert tuner._over(cast("Any", found), [verdict]) == pytest.approx(over)
 
 
-def test_a_default_is_what_it_stands_for():
-    """The bandwidth of the filter is not stated: with the number that stands for it, gains are the same."""
+def test_default_gain_equals_its_explicit_value():
+    """The scenario omits the bandwidth of the filter. Its default equals the published gain."""
     own = scenario.read(ROOT / "scenarios" / "filtered_flight.toml")
     assert list(judging.beside(own)[0]) == ["paper"]
     other = scenario.replace(own, controller__eta=4.0)
     assert list(judging.beside(other)[0]) == ["paper", "before"]
 
 
-def test_what_more_accurate_gains_break_is_known(monkeypatch):
-    """Their errors are compared over the trials that both end; a trial lost by one of them counts for neither."""
+def test_requirements_broken_by_more_accurate_gains_are_listed(monkeypatch):
+    """Errors are compared over the trials that both sets of gains finish."""
 
     def flown(errors, finished=(True, True)):
         return SimpleNamespace(metrics=SimpleNamespace(window_error=np.array(errors)), finished=np.array(finished))
@@ -304,7 +304,7 @@ def test_what_more_accurate_gains_break_is_known(monkeypatch):
     assert [*broken_by(flown([1.0, 9.0], (True, False)), flown([0.0, 0.0], (False, False)))] == ["paper"]
 
 
-def test_judged_is_the_very_law_on_the_flight_clock():
+def test_judging_changes_only_the_clock():
     own = scenario.read(FIRST_FLIGHT)
     flown = judging.as_flown(own)
     assert flown.loop.clock == "flight"
@@ -317,5 +317,5 @@ def test_judged_is_the_very_law_on_the_flight_clock():
     ({"sign_width": 0.0}, "flight clock, exact sign"),
     ({"kind": "pd"}, "flight clock"),
 ])  # fmt: skip
-def test_what_gains_are_judged_on_is_said_in_the_laws_own_terms(law, words):
+def test_judged_on_names_the_sign_function_if_the_law_has_one(law, words):
     assert judging.judged_on(scenario.from_tables({"controller": law, "loop": {"mode": "sampled"}})) == words
