@@ -26,7 +26,7 @@ def flown():
     return made, made.fly(range(300))
 
 
-def test_a_row_says_everything_of_its_trial(flown):
+def test_row_has_all_results_and_inputs_of_its_trial(flown):
     made, frame = flown
     assert frame.columns[:4] == ["trial", "status", "reason", "bad_time"]
     assert frame.columns[4 : 4 + len(made.ready.catalogue)] == list(made.ready.catalogue)
@@ -58,15 +58,15 @@ def test_rows_do_not_depend_on_blocks_and_devices(flown, monkeypatch, block, cap
     same(made.fly(range(300)), frame)
 
 
-def test_the_plan_is_what_is_flown(flown):
+def test_drawn_inputs_equal_the_inputs_of_the_simulated_rows(flown):
     made, frame = flown
     plan = made.draw(range(300))
     assert plan.columns == ["trial", *frame.columns[4 + len(made.ready.catalogue) :]]
     same(plan, frame.select(plan.columns))
 
 
-def test_a_third_that_goes_wrong_leaves_the_others_as_they_are():
-    """Starts near 180 deg: a third of the trials comes upon the law's singularity, or tumbles."""
+def test_failed_trials_do_not_affect_the_others():
+    """Initial angles are near 180 deg, so that a third of the trials reaches the law's singularity or diverges."""
     far = {"kind": "axis_angle", "min_deg": 170.0, "max_deg": 180.0}
     made = of_scenario({**untuned(SHORT), "dispersion": {"attitude": far}}, 0)
     frame = made.fly(range(600))
@@ -81,31 +81,31 @@ def test_a_third_that_goes_wrong_leaves_the_others_as_they_are():
     assert "" not in set(bad["reason"])
     lost = bad.filter(pl.col("effort").is_null())
     assert lost.height > 0
-    assert lost["saturated"].null_count() == lost.height  # no command, no share of the time in which it is cut
+    assert lost["saturated"].null_count() == lost.height  # no finite command, so no fraction of time in saturation
     good = frame.filter(~pl.col("status").is_in(["diverged", "singular"]))
     alone = montecarlo.run(made.ready.parts, made.ready.dispersion, 0, good["trial"].to_numpy())
     for name in made.ready.catalogue:
         got = getattr(alone.metrics, name)
         np.testing.assert_array_equal(np.isnan(got), good[name].is_null().to_numpy())
         known = ~np.isnan(got)
-        # rounding grows near the singularity, but the same program flies both
+        # rounding errors grow near the singularity, but both results are from the same compiled program
         np.testing.assert_array_equal(got[known], good[name].to_numpy()[known], err_msg=name)
 
 
-def test_what_is_missing():
+def test_missing_parts_of_a_campaign():
     part, nowhere = rows.Part, Path()
     full = campaign.PART
     assert campaign.missing([], 10) == [(0, 10)]
     assert campaign.missing([], 2 * full + 1) == [(0, full), (full, full), (2 * full, 1)]
     there = [part(0, full, nowhere), part(2 * full, 1, nowhere)]
     assert campaign.missing(there, 2 * full + 1) == [(full, full)]
-    assert campaign.missing(there, 3 * full) == [(full, full), (2 * full, full)]  # more trials: its last part again
+    assert campaign.missing(there, 3 * full) == [(full, full), (2 * full, full)]  # the short last part is repeated
     shares = [campaign.missing([], 7 * full, (k, 3)) for k in (1, 2, 3)]
     assert sorted(chain(*shares)) == campaign.missing([], 7 * full)
     assert [len(share) for share in shares] == [3, 2, 2]
 
 
-def test_parts_are_written_while_others_are_flown(flown, tmp_path, monkeypatch):
+def test_parts_are_written_one_after_the_other(flown, tmp_path, monkeypatch):
     made, frame = flown
     monkeypatch.setattr(campaign, "PART", 100)
     kept = rows.Rows(tmp_path / "trials", b"k")
@@ -120,11 +120,11 @@ def test_parts_are_written_while_others_are_flown(flown, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("together", short([2, 3, 16], [3]))
-def test_parts_made_in_one_go_are_the_same(flown, tmp_path, monkeypatch, together):
-    """As accelerators make them: some of a shard's, which do not follow one another, and the last one is short."""
+def test_parts_simulated_in_one_call_are_the_same(flown, tmp_path, monkeypatch, together):
+    """Accelerators simulate several parts of a shard together. They are not adjacent, and the last one is shorter."""
     made, frame = flown
     monkeypatch.setattr(campaign, "PART", 40)
-    monkeypatch.setattr(montecarlo, "run", partial(montecarlo.run, block=montecarlo.BLOCK))  # the program of `flown`
+    monkeypatch.setattr(montecarlo, "run", partial(montecarlo.run, block=montecarlo.BLOCK))  # program of `flown`
     monkeypatch.setattr(montecarlo, "block_size", lambda: 40 * together // len(configure.devices()))
     flights = []
 
@@ -142,7 +142,7 @@ def test_parts_made_in_one_go_are_the_same(flown, tmp_path, monkeypatch, togethe
         same(rows.read([part]), frame[part.first : part.end])
 
 
-def test_what_was_flown_is_kept_when_a_part_fails(flown, tmp_path, monkeypatch):
+def test_finished_parts_remain_if_a_later_part_fails(flown, tmp_path, monkeypatch):
     made, _ = flown
     monkeypatch.setattr(campaign, "PART", 100)
     kept = rows.Rows(tmp_path / "trials", b"k")
@@ -157,7 +157,7 @@ def test_what_was_flown_is_kept_when_a_part_fails(flown, tmp_path, monkeypatch):
     assert [part.first for part in kept.parts()[0]] == [0, 100]
 
 
-def test_failures_are_tallied(flown, tmp_path):
+def test_failures_are_counted_in_the_progress(flown, tmp_path):
     _, frame = flown
     kept = rows.Rows(tmp_path / "trials", b"k")
     worse = frame.with_columns(
@@ -173,7 +173,7 @@ def overshoot(result, parts):
     return {"overshoot": jnp.max(jnp.where(late, error, 0.0)), "rows": jnp.sum(result.log.has_length)}
 
 
-def test_metrics_of_ones_own_stand_in_the_rows():
+def test_custom_metrics_are_columns_of_the_rows():
     made = of_scenario(untuned(SHORT_CHAIN), 3)
     own = replace(made, own=overshoot)
     assert own.own_names() == ["overshoot", "rows"]
@@ -197,7 +197,8 @@ def test_metrics_of_ones_own_stand_in_the_rows():
             r"its 'x\\n' is no name of a column; allowed are names that",
         ),
         (lambda result, parts: {"effort": jnp.zeros(())}, "its effort has the name of a column"),
-        (lambda result, parts: {"plan_seed": jnp.zeros(())}, "its plan_seed has the name of a column"),  # with a plan
+        # a column of campaigns with a run table
+        (lambda result, parts: {"plan_seed": jnp.zeros(())}, "its plan_seed has the name of a column"),
         (lambda result, parts: {}, "named numbers"),
         (
             lambda result, parts: {"x": 1 / 0},
@@ -210,12 +211,12 @@ def test_metrics_of_ones_own_stand_in_the_rows():
         ),
     ],
 )
-def test_metrics_that_no_row_can_hold_are_refused(flown, made_of, said):
+def test_invalid_custom_metrics_are_refused(flown, made_of, said):
     with pytest.raises(ValueError, match=said):
         replace(flown[0], own=made_of).own_names()
 
 
-def test_histories_are_those_of_the_runs(flown):
+def test_histories_equal_those_of_single_runs(flown):
     made, _ = flown
     t, error = campaign.history(made, np.array([3, 250], dtype=np.uint32))
     for k, trial in enumerate((3, 250)):
@@ -225,7 +226,7 @@ def test_histories_are_those_of_the_runs(flown):
 
 
 @pytest.mark.parametrize("kind", [np.float64, np.float32])
-def test_what_a_trial_lacks_is_null_whatever_the_precision(monkeypatch, kind):
+def test_missing_values_are_null_in_both_precisions(monkeypatch, kind):
     made = of_scenario(tomllib.loads(SHORT_CHAIN), 3)
     flown = montecarlo.run(made.ready.parts, made.ready.dispersion, 3, np.arange(montecarlo.FEW))
     lacking = Metrics({**flown.metrics, "settling_time": np.full(montecarlo.FEW, np.nan)})

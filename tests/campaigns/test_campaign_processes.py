@@ -1,4 +1,4 @@
-"""Campaigns in real processes: killed, interrupted, out of disk, on a cluster that loses a worker."""
+"""Campaigns in real processes that are killed, interrupted, on a full disk, or on a cluster that loses a worker."""
 
 import contextlib
 import os
@@ -17,7 +17,7 @@ from tests.helpers import QUICKLY, ROOT, SHORT_CHAIN, same
 PTSMC = [sys.executable, "-c", "from tuning.cli.main import main; main()"]
 COMMAND = ["montecarlo", "s.toml", "--seed", "3", "--no-figures", "--quiet"]
 PARTS, TRIALS = 4, 4 * 4096 - 1000
-# as long as it takes to be killed in
+# long enough for a kill during the simulation
 SLOW = SHORT_CHAIN.replace("t_f = 5.0", "t_f = 15.0").replace("t_end = 6.5", "t_end = 20.0")
 
 
@@ -31,7 +31,7 @@ def started(folder, *options, **others):
 
 
 def ended(run, seconds=300):
-    """Exit status and errors of a process when it has ended."""
+    """Wait for the end of a process and return its exit status and error output."""
     _, error = run.communicate(timeout=seconds)
     return run.returncode, error
 
@@ -44,7 +44,7 @@ def rows_of(folder, out="out/montecarlo-s"):
     return pl.concat([pl.read_parquet(folder / out / "trials" / name) for name in parts(folder, out)])
 
 
-# a limit on the size of a file stands for a full disk: no part fits, nor does the compile cache. Then there is room
+# A limit on the file size imitates a full disk: no part and no compile cache fits. The second call has no limit.
 FULL_AT_FIRST = """
 import os, resource
 from tuning.cli.main import main
@@ -61,7 +61,7 @@ main()
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """The rows of an uninterrupted run, whose disk was full when it was tried first: it said so, and left nothing."""
+    """The rows of an uninterrupted run. Its first attempt found a full disk, reported it, and left no parts."""
     folder = tmp_path_factory.mktemp("whole")
     (folder / "s.toml").write_text(SLOW)
     call = [sys.executable, "-c", FULL_AT_FIRST, *COMMAND, "--trials", str(TRIALS)]
@@ -82,7 +82,7 @@ def folder(tmp_path):
 
 
 def await_parts(folder, count, run, patience=120.0, out="out/montecarlo-s"):
-    """Until so many parts are there; whether the run is still going."""
+    """Wait for this number of parts, and return whether the process still runs."""
     since = time.monotonic()
     while run.poll() is None:
         if len(parts(folder, out)) >= count:
@@ -92,10 +92,10 @@ def await_parts(folder, count, run, patience=120.0, out="out/montecarlo-s"):
     return False
 
 
-@pytest.mark.long  # what it leaves, a full disk, parts flown anew: `test_rows.py` and `test_campaign_commands.py`
+@pytest.mark.long  # shorter tests of the same functions: `test_rows.py` and `test_campaign_commands.py`
 @pytest.mark.parametrize("times", [1, 20])
-def test_killed_at_some_moments_it_ends_with_the_same_rows(folder, request, times):
-    """kill -9 a random while after the first part that a run adds, then the same command again, so many times over."""
+def test_campaign_killed_at_random_times_ends_with_the_same_rows(folder, request, times):
+    """A run is killed at a random time after its first new part, and repeated. `times` is the number of kills."""
     rng, killed = np.random.default_rng(0), 0
     for _ in range(200):
         before = len(parts(folder))
@@ -107,7 +107,7 @@ def test_killed_at_some_moments_it_ends_with_the_same_rows(folder, request, time
         killed += ended(run)[0] == -signal.SIGKILL
         if killed == times:
             break
-        if len(parts(folder)) > PARTS - 3:  # too few left to be killed in: one part is lost for each kill to come
+        if len(parts(folder)) > PARTS - 3:  # too few missing parts for another kill, so delete some
             for name in parts(folder)[: PARTS // 2]:
                 (folder / "out/montecarlo-s/trials" / name).unlink()
     assert killed == times
@@ -115,14 +115,14 @@ def test_killed_at_some_moments_it_ends_with_the_same_rows(folder, request, time
     assert ended(run) == (0, "")
     assert list((folder / "out/montecarlo-s/trials").glob(".making*")) == []
     rows = rows_of(folder)
-    assert rows["trial"].to_list() == list(range(TRIALS))  # none is missing, none is there twice
-    same(rows, request.getfixturevalue("whole"))  # its processes find the programs of these
+    assert rows["trial"].to_list() == list(range(TRIALS))  # no trial is missing or repeated
+    same(rows, request.getfixturevalue("whole"))  # evaluated last, so that it can use the compile cache
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("options", [((), ()), (("--shard", "1/2"), ("--shard", "2/2"))], ids=["same", "shards"])
 def test_two_processes_killed_in_one_folder_lose_no_row(folder, whole, options):
-    """Shards run at the same time; of two equal commands the later one is refused. Both are killed three times."""
+    """Shards run at the same time. Of two equal commands, the later one is refused. Both are killed three times."""
     rng, codes = np.random.default_rng(1), set()
     for _ in range(3):
         before = len(parts(folder))
@@ -146,7 +146,7 @@ def test_two_processes_killed_in_one_folder_lose_no_row(folder, whole, options):
 
 
 @pytest.mark.long
-def test_interrupted_it_keeps_what_is_flown(folder, whole):
+def test_interrupted_campaign_keeps_finished_parts_and_resumes(folder, whole):
     run = started(folder, "--trials", str(TRIALS))
     assert await_parts(folder, 2, run)
     run.send_signal(signal.SIGINT)
@@ -164,7 +164,7 @@ def test_interrupted_it_keeps_what_is_flown(folder, whole):
 
 @pytest.fixture
 def cluster(folder):
-    """A Dask scheduler and two workers on the loopback, as a user would start them; their processes."""
+    """Start a Dask scheduler and two workers on the loopback device, and return the processes of the workers."""
 
     def dask(*options):
         call = [sys.executable, "-m", "dask", *options, "--scheduler-file", "cluster.json"]
@@ -184,7 +184,7 @@ def cluster(folder):
 
 
 @pytest.mark.long
-def test_a_cluster_that_loses_a_worker_gives_the_same_rows(folder, whole, cluster):
+def test_cluster_that_loses_a_worker_gives_the_same_rows(folder, whole, cluster):
     run = started(folder, "--trials", str(TRIALS), "--cluster", "cluster.json")
     assert await_parts(folder, 2, run)
     cluster[0].kill()
@@ -196,7 +196,7 @@ def test_a_cluster_that_loses_a_worker_gives_the_same_rows(folder, whole, cluste
 
 
 @pytest.mark.long
-def test_a_cluster_that_is_not_there_is_refused(folder):
+def test_unreachable_cluster_is_refused(folder):
     run = started(folder, "--trials", "100", "--cluster", "tcp://127.0.0.1:1")
     code, error = ended(run)
     assert code == 2

@@ -1,4 +1,4 @@
-"""What is asked of Dask, without a cluster: `test_campaign_processes` has real ones."""
+"""Calls of Dask, without a cluster. `test_campaign_processes` starts real clusters."""
 
 import sys
 from concurrent.futures import Future
@@ -13,7 +13,7 @@ from ptsmc_jax.campaigns.store import RefusedError
 
 
 class FakeClient:
-    """Runs what is submitted at once; remembers how it was made."""
+    """Runs submitted functions immediately, and records its own options."""
 
     loop = None
 
@@ -43,12 +43,12 @@ def _dask(monkeypatch):
 
 
 def flown_by(monkeypatch, tmp_path, receipt):
-    """A folder whose parts are flown by a worker that returns this receipt."""
+    """Return a folder whose parts are simulated by a worker that returns this result."""
     monkeypatch.setattr(cluster, "_fly", lambda recipe, first, count: receipt(first, count))
     return SimpleNamespace(recipe=lambda: (None, "x"), rows=Rows(tmp_path, b"k"))
 
 
-def test_tls_is_passed_on_and_encryption_then_required():
+def test_tls_files_are_passed_to_dask_and_require_encryption():
     files = {"tls_ca_file": "ca.pem", "tls_client_cert": "cert.pem", "tls_client_key": "key.pem"}
     found = cluster.connected("tls://10.0.0.1:8786", files)
     security = FakeClient.made.options["security"]
@@ -68,7 +68,7 @@ def test_a_local_cluster_listens_on_the_loopback_only(monkeypatch):
     assert (asked["host"], asked["n_workers"], asked["threads_per_worker"]) == ("127.0.0.1", 3, 1)
 
 
-def test_receipts_become_parts(monkeypatch, tmp_path):
+def test_results_of_workers_become_parts(monkeypatch, tmp_path):
     here = store.packages()
     (tmp_path / "p.parquet").write_bytes(b"")
     folder = flown_by(monkeypatch, tmp_path, lambda first, count: (first, count, "p.parquet", 7, here))
@@ -85,7 +85,7 @@ def test_receipts_become_parts(monkeypatch, tmp_path):
         (ValueError("no\nroom"), "a worker of the cluster failed: no room"),
     ],
 )
-def test_what_cannot_be_trusted_is_refused(monkeypatch, tmp_path, change, said):
+def test_results_of_other_versions_or_failed_workers_are_refused(monkeypatch, tmp_path, change, said):
     def receipt(first, count):
         if isinstance(change, Exception):
             raise change
@@ -95,10 +95,10 @@ def test_what_cannot_be_trusted_is_refused(monkeypatch, tmp_path, change, said):
     folder = flown_by(monkeypatch, tmp_path, receipt)
     with pytest.raises(RefusedError, match=said):
         list(cluster.connected("tcp://a:1", {})(folder, [(0, 10)]))
-    assert len(FakeClient.made.cancelled) == 1  # nothing is left running
+    assert len(FakeClient.made.cancelled) == 1  # the other futures are cancelled
 
 
-def test_without_dask_it_says_how_to_get_it(monkeypatch):
+def test_missing_dask_is_reported_with_the_command_to_install_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(RefusedError, match=r"pip install 'ptsmc-jax\[cluster\]'"):
         cluster.connected("tcp://a:1", {})

@@ -1,4 +1,4 @@
-"""CSV tables from spreadsheets, pandas and R: unambiguous ones are read, others are refused with the cause."""
+"""CSV tables from spreadsheets, pandas and R: unambiguous tables are read, other tables are refused with the cause."""
 
 import numpy as np
 import polars as pl

@@ -22,7 +22,7 @@ def refused(folder, **options):
 
 @pytest.mark.parametrize("first", [False, True])
 @pytest.mark.parametrize("second", [False, True])
-def test_a_folder_has_one_writer_or_several_that_share(tmp_path, first, second):
+def test_folder_has_one_exclusive_writer_or_several_shared_writers(tmp_path, first, second):
     folder = tmp_path / "new" / "out"
     with store.in_use(folder, shared=first):
         assert refused(folder, shared=second) is not (first and second)
@@ -76,7 +76,7 @@ def test_a_file_system_without_locks_is_written_to(tmp_path, monkeypatch):
 
 
 def test_a_lock_file_inside_the_folder_does_not_count_as_its_content(tmp_path, monkeypatch):
-    """The folder may be a mounted disk, with nothing beside it on the same disk."""
+    """If the folder is a mount point, its parent is on another disk, so that the lock file is inside."""
     folder = tmp_path / "out"
     folder.mkdir()
     monkeypatch.setattr(type(tmp_path), "is_mount", lambda path: path == folder)

@@ -1,4 +1,4 @@
-"""Margins that are asked for: what is refused, verdicts, rows of constraints and their slopes."""
+"""Required stability margins: validation, verdicts, and constraints of the tuner with their gradients."""
 
 import dataclasses
 import json
@@ -45,7 +45,7 @@ BODY = {
         ({"controller": {"t_f": 8.0, "sign_width": 0.0}}, "needs a sign with a slope, but controller.sign_width is 0"),
     ],
 )
-def test_margins_that_cannot_be_judged_are_refused(changes, said):
+def test_invalid_margin_requirements_are_refused(changes, said):
     tables = {**BODY, **changes}
     del tables["tune"]
     if tables["loop"]["mode"] == "continuous":
@@ -54,13 +54,13 @@ def test_margins_that_cannot_be_judged_are_refused(changes, said):
         scenario.from_tables(tables)
 
 
-def test_every_margin_has_its_requirement():
+def test_every_margin_can_be_required():
     some = margins.Margins(*(jnp.ones(2) for _ in range(5)), stable=jnp.ones(2, bool), crossover=jnp.ones(2))
     assert tuple(some.worst()) == tuple(catalogues.MARGINS)
 
 
 @pytest.mark.parametrize("xp", [np, jnp], ids=["numpy", "jax"])
-def test_the_worst_margin_is_the_smallest_but_for_the_peak_of_the_sensitivity(xp):
+def test_worst_margins_are_the_smallest_and_the_largest_peak_sensitivity(xp):
     two = {"gain_up": [7.0, 9.0], "gain_down": [8.0, 6.5], "phase": [50.0, 40.0], "delay": [0.1, 0.2]}
     values = {**two, "modulus": [3.0, 4.0], "stable": [True, True], "crossover": [1.0, 2.0]}
     some = margins.Margins(**{name: xp.asarray(v) for name, v in values.items()})
@@ -73,19 +73,19 @@ def test_the_worst_margin_is_the_smallest_but_for_the_peak_of_the_sensitivity(xp
 @pytest.mark.parametrize(
     ("value", "met", "over"), [(6.0, True, 1.0), (5.9, False, 1.0 + 0.1 / 6), (np.inf, True, 0.0), (-3.0, False, 2.5)]
 )
-def test_a_margin_is_to_be_at_least_its_limit(value, met, over, tmp_path):
+def test_verdict_on_a_margin_with_a_lower_limit(value, met, over, tmp_path):
     verdict = Requirement("gain_margin", 6.0, "dB", at_least=True).verdict(np.asarray(value), np.asarray(True))
     assert verdict.met == met
     np.testing.assert_allclose(verdict.margin, over, rtol=1e-12)
     assert str(verdict).startswith("gain_margin at least 6 dB")
     store.write_json(tmp_path / "kept.json", {"worst": verdict.worst})
-    kept = json.loads((tmp_path / "kept.json").read_text())["worst"]  # null where infinite
+    kept = json.loads((tmp_path / "kept.json").read_text())["worst"]  # null if infinite
     read = str(Verdict.read({**dataclasses.asdict(verdict), "worst": kept}))
     assert read == str(verdict)
     assert ("unlimited" in read) == np.isinf(value)
 
 
-def test_of_many_loops_the_smallest_margin_counts_and_one_without_a_value_breaks_the_limit():
+def test_verdict_on_many_loops_uses_the_smallest_margin():
     asked = Requirement("phase_margin", 30.0, "deg", at_least=True)
     assert asked.verdict(np.array([50.0, 31.0]), np.array([True, True])).worst == 31.0
     assert asked.verdict(np.array([50.0, 29.0]), np.array([True, True])).failures == 1
@@ -104,13 +104,13 @@ def test_of_many_loops_the_smallest_margin_counts_and_one_without_a_value_breaks
         ({"actuator_scale": {"kind": "relative_normal"}}, True),
     ],
 )
-def test_loops_differ_where_what_they_hang_on_is_drawn(dispersion, differ):
+def test_loops_differ_if_a_dispersion_affects_them(dispersion, differ):
     made = scenario.from_tables({**BODY, "dispersion": dispersion})
     assert margin_verdicts.differ(scenario.study(made).dispersion) == differ
 
 
-TRIALS = 6  # whose loops are looked at: of two at a time on each device, in calls of which the second is not full
-JUDGED = run_margins.TIMES + 1  # as many as one trial has
+TRIALS = 6  # trials with margins: two at a time on each device, so that the last call is not full
+JUDGED = run_margins.TIMES + 1  # number of loops of one trial
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -132,15 +132,15 @@ loops_of = programs.jit(lambda parts: run_margins.judged_loops(parts)[0])
 
 
 def looked_at(parts, dispersion, seed, late):
-    """Loops (TRIALS, times, ..) of the first trials, and their margins by lines."""
+    """Return the loops (TRIALS, times, ..) of the first trials, and their interpolated margins."""
     every = margin_verdicts._look(*margin_verdicts._looked_at(parts, dispersion, seed, np.arange(TRIALS), late))
     return jax.tree.map(lambda v: np.asarray(v)[:TRIALS], every)
 
 
 def all_of(parts, dispersion, seed, late=False):
-    """Each margin of each of the first trials' loops, (TRIALS, times), of one trial's after the other.
+    """Return the exact margins of the first trials' loops, (TRIALS, times) each, computed trial by trial.
 
-    The delay, if not asked for, as if the command were not held.
+    If `late` is not set, the delay margin is the phase margin over the crossover frequency, without the hold.
     """
     loops, _ = looked_at(parts, dispersion, seed, late)
     each = [margins.of_each(jax.tree.map(lambda v, k=k: v[k], loops), with_delay=late) for k in range(TRIALS)]
@@ -150,12 +150,12 @@ def all_of(parts, dispersion, seed, late=False):
 
 
 def worst_of(each):
-    """Of each trial, over its times."""
+    """Return the worst margins of each trial over its times."""
     return {name: farthest(name, v, 1) for name, v in each.items()}
 
 
 def sloped(asked, bounds, share):
-    """Rows and slopes at one point."""
+    """Return the constraints and their gradients at one point."""
     return {name: v[0] for name, v in margin_rows.of_points(asked, bounds.scale, np.asarray(share)[None]).items()}
 
 
@@ -164,7 +164,7 @@ def farthest(name, values, axis):
 
 
 class Lag(ptsmc.Draw):
-    """Of the torque, and so another loop in each trial, as another inertia makes it."""
+    """A dispersion of the torque lag, so that every trial has another loop, as with a dispersed inertia."""
 
     count = 1
 
@@ -180,7 +180,7 @@ CHAIN = {
     "observer": {"kind": "nonlinear", "gain": [40.0]},
     "hardware": {"state_noise": [2e-5, 1e-6], "torque_lag": 0.03},
 }
-# none of what is drawn is nominal; a loop hangs on where on its way it is linearised, and so on its start
+# no trial is nominal; a loop also depends on the initial state, because it is linearised along the run
 DRAWN = {
     "chain": {
         **CHAIN,
@@ -200,7 +200,7 @@ DRAWN = {
 
 
 def posed_of(plant):
-    """Its problem over what is drawn."""
+    """Return the tuning problem of this plant with its dispersions."""
     tables = DRAWN[plant]
     return posing.pose(
         scenario.from_tables({**tables, "requirements": {**tables["requirements"], "peak_torque": 5.0}}), 3
@@ -209,12 +209,12 @@ def posed_of(plant):
 
 @pytest.fixture(scope="module", params=short(DRAWN, ["chain"]))
 def drawn(request):
-    """A problem of six loops, the two hardest of them rows; of a chain, whose programs are compiled sooner."""
+    """A tuning problem with six loops, whose two hardest are constraints. The chain compiles faster."""
     return posed_of(request.param)
 
 
-def test_rows_of_constraints_are_met_where_the_verdicts_are_and_have_slopes(drawn):
-    """Slopes against central differences of order 4, over all axes and times, along all gains at once."""
+def test_margin_constraints_agree_with_verdicts_and_finite_differences(drawn):
+    """Compare gradients with central differences of order 4 along a direction that changes all gains."""
     posed = drawn
     asked, bounds, share = posed.problem.margins, posed.evaluate.bounds, posed.evaluate.bounds.share(posed.own)
     assert asked is not None
@@ -224,24 +224,24 @@ def test_rows_of_constraints_are_met_where_the_verdicts_are_and_have_slopes(draw
         np.testing.assert_allclose(row.max() + 1.0, verdict.margin, rtol=1e-9)
     step, along = 1e-4, np.array([0.6, -0.9, 1.0, 0.7])
     points = [share + k * step * along for k in (-2, -1, 1, 2)]
-    c = margin_rows.of_points(asked, bounds.scale, np.stack(points[:3]))["c"]  # and one more than devices
+    c = margin_rows.of_points(asked, bounds.scale, np.stack(points[:3]))["c"]  # one point more than devices
     c = [*c, sloped(asked, bounds, points[3])["c"]]
     numeric = (c[0] - 8 * c[1] + 8 * c[2] - c[3]) / (12 * step)
     slopes = np.asarray(found["c_slope"])
-    assert np.all(np.abs(slopes).reshape(-1, share.size).max(axis=0) > 0.0)  # every gain counts
+    assert np.all(np.abs(slopes).reshape(-1, share.size).max(axis=0) > 0.0)  # every gain has an effect
     exact = slopes @ along
     np.testing.assert_allclose(exact, numeric, rtol=1e-6, atol=1e-8 * np.abs(exact).max())
-    rows = pl.DataFrame({"trial": [0, 1], "status": ["ok", "ok"], "peak_torque": [1.0, 2.0]})  # nothing of them counts
+    rows = pl.DataFrame({"trial": [0, 1], "status": ["ok", "ok"], "peak_torque": [1.0, 2.0]})  # not used by margins
     told = explore.verdicts(posed.ready.scenario, rows, seed=3)[-2:]
-    assert [v.worst for v in told] == [v.worst for v in verdicts]  # of the loops of the same trials
+    assert [v.worst for v in told] == [v.worst for v in verdicts]  # loops of the same trials
     tight = dataclasses.replace(asked, limits=asked.limits * 0.9)
     np.testing.assert_allclose(sloped(tight, bounds, share)["c"] + 1, (found["c"] + 1) / 0.9, rtol=1e-12)
 
 
 def products_for_each_case(of, posed):
-    """What multiplies with an inertia of each case in such a function of the shares, and whether any product is there.
+    """Return the matrix products with a batched inertia in the jaxpr of a function, and whether it has any product.
 
-    With one XLA (jaxlib 0.10.2) aborts the process, by chance of its layout: "Check failed: IsMonotonicWith..".
+    With such a product, XLA (jaxlib 0.10.2) sometimes aborts the process: "Check failed: IsMonotonicWith..".
     """
     trace = jax.make_jaxpr(of)(np.full(len(posed.evaluate.bounds.names), 0.5))
     products = [e for e in equations(trace) if e.primitive.name == "dot_general"]
@@ -252,14 +252,14 @@ def products_for_each_case(of, posed):
 
 @pytest.fixture
 def of_two_trials(monkeypatch):
-    """The spacecraft's problem, traced only."""
+    """The tuning problem of the spacecraft. The tests trace it without compiling."""
     monkeypatch.setattr(margin_rows.sloped, "prepare", lambda *_: None)
     monkeypatch.setattr(margin_rows, "hardest", lambda asked, _: (margin_rows._of_trials(asked, np.arange(2)), 0.0))
     return posed_of("spacecraft")
 
 
-def test_cases_are_flown_one_after_the_other(of_two_trials):
-    """What `by_case` is given, here a momentum, in place of runs and loops."""
+def test_cases_are_computed_one_after_the_other(of_two_trials):
+    """`_by_case` gets an angular momentum as its function, instead of runs and loops."""
     asked, bounds = of_two_trials.problem.margins, of_two_trials.evaluate.bounds
 
     def momenta(share):
@@ -269,8 +269,8 @@ def test_cases_are_flown_one_after_the_other(of_two_trials):
     assert products_for_each_case(momenta, of_two_trials) == ([], True)
 
 
-@pytest.mark.long  # how cases follow each other is seen above
-def test_no_product_has_an_inertia_for_each_case(of_two_trials):
+@pytest.mark.long  # the previous test checks the sequence of the cases
+def test_margin_gradients_have_no_batched_product_of_inertias(of_two_trials):
     asked, bounds = of_two_trials.problem.margins, of_two_trials.evaluate.bounds
 
     def with_slopes(share):
@@ -280,8 +280,8 @@ def test_no_product_has_an_inertia_for_each_case(of_two_trials):
 
 
 @pytest.mark.long
-def test_rows_of_drawn_inertias_are_compiled_where_the_hand_over_is_free():
-    """XLA once aborted the process, so another one looks: delta is free by default, and no filter saved it."""
+def test_margin_gradients_with_dispersed_inertia_compile_if_delta_is_free():
+    """Delta is free by default. The test starts another process, because XLA aborted it in an earlier version."""
     changes = {"dispersion__inertia": {"kind": "relative_normal", "std": 0.03}, "requirements": {"gain_margin": 6.0}}
     code = (
         "from ptsmc_jax.configure import configure; configure(1)\n"
@@ -297,22 +297,22 @@ def test_rows_of_drawn_inertias_are_compiled_where_the_hand_over_is_free():
     assert (done.returncode, done.stdout) == (0, "(1, 1, 30, 6)\n"), done.stderr[-2000:]
 
 
-def test_the_evaluator_puts_margins_beside_what_is_flown_and_drawn_loops_are_judged_by_the_worst(drawn, monkeypatch):
+def test_evaluator_appends_margins_of_the_hardest_trials(drawn, monkeypatch):
     posed = drawn
     assert posed.problem.rows == ("peak_torque", "gain_margin", "modulus_margin")
     share = posed.evaluate.bounds.share(posed.own)[None]
     flown = {"gains": share, "f": np.zeros(1), "c": np.array([[[-0.3, -0.2, -0.4]]]), "value": np.zeros(1)}
     monkeypatch.setattr(posed.evaluate, "_fly", lambda *_: dict(flown))
     c = posed.evaluate.fly(posed.problem, share).c[0]
-    assert c[0].tolist() == [-0.3, -0.2, -0.4] + [-1.0] * (c.shape[1] - 3)  # as wide as a row of loops
+    assert c[0].tolist() == [-0.3, -0.2, -0.4] + [-1.0] * (c.shape[1] - 3)  # padded to the length of margin rows
     verdicts = margin_verdicts.over_trials(posed.ready, 3)
     assert [v.trials for v in verdicts] == [TRIALS, TRIALS]
-    # its two hardest cases hold the worst of all
+    # the two hardest trials contain the worst margins of all trials
     for row, verdict in zip(c[1:], verdicts, strict=True):
         np.testing.assert_allclose(row.max() + 1.0, verdict.margin, rtol=1e-9)
     each = worst_of(all_of(posed.ready.parts, posed.ready.dispersion, 3))
     assert len(np.unique(each["gain_margin"])) == TRIALS
-    # with other gains others are the hardest, and they take the places
+    # with other gains, other trials are the hardest and become the constraints
     asked = posed.problem.margins
     assert asked is not None
     other = posed.own * np.asarray([1.0, 0.2, 1.0, 1.0])  # a slow observer
@@ -327,8 +327,8 @@ def test_the_evaluator_puts_margins_beside_what_is_flown_and_drawn_loops_are_jud
     np.testing.assert_allclose(near, np.max(shares), rtol=1e-12)
 
 
-def test_the_program_that_is_compiled_beside_is_the_one_that_the_search_asks_for(drawn, monkeypatch):
-    """Another one, by a shape or a type, would be compiled for nothing."""
+def test_prepared_margin_program_is_the_program_of_the_search(drawn, monkeypatch):
+    """A program with other shapes or types would be compiled in vain."""
     posed, prepared = drawn, []
     monkeypatch.setattr(margin_rows.sloped, "prepare", lambda *given: prepared.append(given))
     monkeypatch.setattr(margin_rows, "hardest", lambda asked, _: (asked, 0.0))
@@ -351,8 +351,8 @@ class _AskedError(Exception):
     ],
     ids=["margins", "floor"],
 )
-def test_what_a_campaign_prepares_is_what_its_theory_asks_for(drawn, monkeypatch, owner, program, prepare, ask):
-    """As above."""
+def test_prepared_programs_of_a_campaign_are_those_that_it_uses(drawn, monkeypatch, owner, program, prepare, ask):
+    """A program with other shapes or types would be compiled in vain."""
     known = []
 
     def heard(*given, **fixed):
@@ -372,19 +372,19 @@ def test_what_a_campaign_prepares_is_what_its_theory_asks_for(drawn, monkeypatch
 
 
 FACTORS = [[1.0, 1.0, 1.0, 1.0], [1.0, 0.2, 1.0, 1.0], [1.3, 1.0, 5.0, 0.1]]  # on the gains
-# and whether delays are asked for too: by programs that are three times as large
+# factors, and whether delay margins are computed too, which needs programs three times as large
 LOOKED = [*((factors, True) for factors in FACTORS), (FACTORS[2], False)]
 
 
 def changed(posed, factors):
-    """The parts with gains so many times as large."""
+    """Return the parts with the gains multiplied by these factors."""
     return with_gains(posed.problem.parts, dict(zip(posed.problem.names, posed.own * np.asarray(factors), strict=True)))
 
 
-@pytest.mark.long  # by the worst of them: rows are of runs by themselves, and verdicts of those that are looked at
+@pytest.mark.long  # shorter tests compare constraints, which use single runs, with verdicts on many trials
 @pytest.mark.parametrize("factors", FACTORS)
-def test_the_loops_that_are_looked_at_are_those_of_single_runs(drawn, factors):
-    """And the nominal one is not the worst of them."""
+def test_loops_of_many_trials_equal_those_of_single_runs(drawn, factors):
+    """The nominal loop is not the worst loop."""
     parts, dispersion = changed(drawn, factors), drawn.ready.dispersion
     each = drawn_parts(parts, dispersion, jnp.uint32(3), jnp.arange(TRIALS, dtype=jnp.uint32))
     loops, _ = looked_at(parts, dispersion, 3, late=True)
@@ -399,8 +399,8 @@ def test_the_loops_that_are_looked_at_are_those_of_single_runs(drawn, factors):
 
 
 @pytest.mark.parametrize(("factors", "late"), short(LOOKED, LOOKED[-1:]))
-def test_the_worst_of_many_loops_is_found_without_judging_all_of_them(drawn, factors, late, monkeypatch):
-    """As by judging all of them. Lines are off by less than half of `OFF`."""
+def test_worst_margins_are_exact_without_exact_margins_of_all_loops(drawn, factors, late, monkeypatch):
+    """The result equals that of exact margins of all loops. Interpolation errors are less than half of `OFF`."""
     posed = drawn
     parts, dispersion = changed(posed, factors), posed.ready.dispersion
     every = all_of(parts, dispersion, 3, late)
@@ -420,10 +420,10 @@ def test_the_worst_of_many_loops_is_found_without_judging_all_of_them(drawn, fac
 
     of_each = margins.of_each
     monkeypatch.setattr(margins, "of_each", counted)
-    # limits in the midst of the trials, each between what is exact and what is rough of one: its side hangs on digits
+    # each limit is between the exact and the interpolated margin of one trial, which are on different sides of it
     both = {name: np.stack([v, worst_of(rough)[name]])[:, np.argsort(v)[TRIALS // 2]] for name, v in each.items()}
     limits = {name: float(abs(v.mean())) for name, v in both.items() if late or name != "delay_margin"}
-    for known in (margin_verdicts.OFF, dict.fromkeys(margin_verdicts.OFF, 1e-9)):  # too small a one mends itself
+    for known in (margin_verdicts.OFF, dict.fromkeys(margin_verdicts.OFF, 1e-9)):  # a too small error is corrected
         monkeypatch.setattr(margin_verdicts, "OFF", known)
         for names in (list(limits), ["phase_margin", list(limits)[2]], ["phase_margin"]):
             asked = {name: limits[name] for name in names}
@@ -441,7 +441,7 @@ def test_the_worst_of_many_loops_is_found_without_judging_all_of_them(drawn, fac
 
 
 class _Told(NamedTuple):
-    """Loops by their numbers."""
+    """Loops, represented by their numbers."""
 
     number: Any
     period: Any
@@ -450,12 +450,12 @@ class _Told(NamedTuple):
 @pytest.mark.parametrize(
     ("period", "limit", "judged"), [(0.1, 0.25, {0}), (1.9, 0.25, {0, 1, 2, 3, 4, 5, 6, 7}), (0.1, 2.01, {0, 10})]
 )
-def test_lines_are_off_by_a_share_of_a_period_where_they_tell_a_delay(monkeypatch, period, limit, judged):
-    """Delay margins of 1, 1.1, .. s: 0.2 periods to either side, 0.02 or 0.38 s, so many may be the least, or 2.01."""
+def test_assumed_error_of_delay_margins_is_a_fraction_of_a_period(monkeypatch, period, limit, judged):
+    """Loops have delay margins of 1, 1.1, .. s. Only those near the smallest or the limit need exact values."""
     delays, seen = 1.0 + 0.1 * np.arange(32), set[int]()
 
     def looked(*given):
-        assert given[-1] is True  # late ones too
+        assert given[-1] is True  # with delay margins
         return _Told(np.arange(32)[:, None], np.full((32, 1), period)), {"delay_margin": delays[:, None]}
 
     def of_each(loops, with_delay):
@@ -475,12 +475,12 @@ def test_lines_are_off_by_a_share_of_a_period_where_they_tell_a_delay(monkeypatc
 @pytest.mark.parametrize(
     ("left", "of_loops"),
     [
-        pytest.param(None, True, marks=pytest.mark.long),  # what its loops have of margins is seen above
+        pytest.param(None, True, marks=pytest.mark.long),  # with real loops
         (None, False), ('{"window_error": 1e-6, "marg', False), ('{"window_error": 1e-6}', False),
     ],
 )  # fmt: skip
-def test_a_campaign_is_not_finished_before_its_margins_are_judged(command, tmp_path, monkeypatch, left, of_loops):
-    """A kill may come between the last trial and them; and a file may be damaged."""
+def test_campaign_without_its_margin_verdicts_is_unfinished(command, tmp_path, monkeypatch, left, of_loops):
+    """The process may be killed after the last trial, or the file of the verdicts may be damaged."""
     tables = {**untuned(SHORT_CHAIN), "requirements": {"peak_torque": 50.0, "gain_margin": 0.1}}
     if not of_loops:
         told = Requirement("gain_margin", 0.1, "dB", at_least=True).verdict(np.asarray(7.0), np.asarray(True))

@@ -18,13 +18,13 @@ TABLE = (
 SPREAD = random_turns(np.deg2rad(20.0), np.deg2rad(140.0))
 
 
-# on the flight clock one program flies all gains
+# on the flight clock, one compiled program simulates all gains
 FIRST = scenario.replace(scenario.read(FIRST_FLIGHT), controller__delta=0.5, loop__clock="flight")
 
 
 @pytest.fixture(scope="module")
 def chain():
-    """How trials are shared out hangs on no spacecraft."""
+    """The distribution of trials over devices and blocks does not depend on the plant."""
     return scenario.study(scenario.from_tables(untuned(SHORT_CHAIN)))
 
 
@@ -33,8 +33,8 @@ def flown(chain):
     return montecarlo.run(chain.parts, chain.dispersion, 5, np.arange(256))
 
 
-def test_256_trials_equal_the_loop_over_them(chain, flown):
-    """Flown alone, every fifth of them, and the last and the first of each device."""
+def test_batched_trials_equal_single_simulations(chain, flown):
+    """The test simulates every fifth trial alone, and the first and the last trial of each device."""
     draw = jax.jit(lambda trial: chain.dispersion.apply(chain.parts, np.uint32(5), trial))
     for k in {*range(0, 256, 5), 127, 128, 255}:
         drawn = draw(np.uint32(k))
@@ -47,11 +47,11 @@ def test_256_trials_equal_the_loop_over_them(chain, flown):
 
 
 @pytest.mark.parametrize("count", [1, 3, 63, 64, 65, 129, 255])
-def test_any_number_of_trials_is_flown(chain, flown, count):
-    """Shared out over two devices, in rows of 128 lanes or all at once: none is lost, none comes twice."""
+def test_any_number_of_trials_can_be_simulated(chain, flown, count):
+    """Trials are distributed over two devices, in blocks of 128 or fewer. No trial is lost or repeated."""
     some = montecarlo.run(chain.parts, chain.dispersion, 5, np.arange(count))
     assert some.status.shape == some.metrics.window_error.shape == (count,)
-    # one program below `FEW` and another from there on: roundings differ
+    # fewer than `FEW` trials use another compiled program with other rounding errors
     np.testing.assert_allclose(some.vectors("initial_x"), flown.vectors("initial_x")[:count], rtol=0, atol=1e-15)
     np.testing.assert_allclose(some.metrics.window_error, flown.metrics.window_error[:count], rtol=1e-12)
 
@@ -61,8 +61,8 @@ class _AskedError(Exception):
 
 
 @pytest.mark.parametrize("count", [1, 63, 64, 1000])
-def test_what_is_prepared_for_so_many_trials_is_what_flies_them(chain, count, monkeypatch):
-    """Another program, by a shape or a type, would be compiled for nothing."""
+def test_prepared_program_is_the_program_of_the_simulation(chain, count, monkeypatch):
+    """A program with other shapes or types would be compiled in vain."""
     known = []
 
     def heard(parts, dispersion, *numbers_and_fixed):
@@ -94,20 +94,20 @@ def test_what_is_prepared_for_so_many_trials_is_what_flies_them(chain, count, mo
         ([True, False], "of type bool"),
     ],
 )
-def test_numbers_that_name_no_trials_are_refused(chain, trials, said):
-    """None of them is cut off, or counted from the other end, without a word."""
+def test_invalid_trial_numbers_are_refused(chain, trials, said):
+    """Fractions are not truncated, and negative numbers do not count from the end."""
     with pytest.raises(ValueError, match=said):
         montecarlo.run(chain.parts, chain.dispersion, 5, trials)
 
 
 @pytest.mark.long  # campaigns of several calls: `test_campaign.py`
-def test_more_trials_than_one_call_takes(chain, flown, monkeypatch):
+def test_more_trials_than_the_capacity_of_one_call(chain, flown, monkeypatch):
     monkeypatch.setattr(montecarlo, "CAPACITY", 64)
     some = montecarlo.run(chain.parts, chain.dispersion, 5, np.arange(201), block=16)
     np.testing.assert_allclose(some.metrics.window_error, flown.metrics.window_error[:201], rtol=1e-12)
 
 
-@pytest.mark.long  # the loop over them is the same with less; `test_conformity.py` has vmap for each kind
+@pytest.mark.long  # shorter tests: single simulations above, and `vmap` of each law in `test_conformity.py`
 def test_trials_equal_plain_vmap():
     run = scenario.study(FIRST).parts
     trials = montecarlo.run(run, SPREAD, 5, np.arange(256))
@@ -127,8 +127,8 @@ def test_a_trial_does_not_depend_on_the_others(chain, flown):
     assert not np.any(other.metrics.window_error == again.metrics.window_error)
 
 
-def test_failed_trials_are_counted_and_leave_the_others_alone():
-    """Spacecraft, as many at least as the program of many trials flies."""
+def test_failed_trials_are_counted_and_do_not_affect_others():
+    """The numbers of trials are at least `FEW`, so that the program for many trials is tested."""
     run = scenario.study(FIRST).parts
     trials = montecarlo.run(run, SPREAD, 5, np.arange(256))
     wide = random_turns(np.deg2rad(20.0), np.pi)
@@ -143,7 +143,7 @@ def test_failed_trials_are_counted_and_leave_the_others_alone():
 
 
 @pytest.mark.parametrize(("eta", "delta", "gain", "quiet", "noisy"), short(TABLE, TABLE[::4]))
-def test_sampling_and_noise_do_what_the_theory_notes_measured(eta, delta, gain, quiet, noisy):
+def test_errors_and_torques_agree_with_the_theory_notes(eta, delta, gain, quiet, noisy):
     gains = {"controller__eta": eta, "controller__delta": delta, "observer__gain": [gain] * 3}
     base = scenario.replace(FIRST, **gains)
     silent = scenario.replace(base, hardware={"attitude_noise": 0.0, "rate_noise": 0.0})
@@ -151,14 +151,14 @@ def test_sampling_and_noise_do_what_the_theory_notes_measured(eta, delta, gain, 
         ready = scenario.study(case)
         trials = montecarlo.run(ready.parts, ready.dispersion, 0, np.arange(500))
         assert np.all(trials.ok)
-        # 15 %: the notes' figures come from 64 trials
+        # tolerance 15 %: the values in the theory notes are from 64 trials
         np.testing.assert_allclose(np.sqrt(np.mean(trials.metrics.window_error**2)), rms, rtol=0.15)
         np.testing.assert_allclose(np.mean(trials.metrics.peak_torque), peak, rtol=0.15)
 
 
 @pytest.mark.long
-def test_single_precision_keeps_what_its_documentation_says():
-    """docs/python.md: statuses the same, pooled errors to three digits, torques to 1e-3, no error below 1e-7."""
+def test_single_precision_has_the_documented_accuracy():
+    """Accuracy in `docs/python.md`: equal statuses, RMS errors and torques to 0.1 %, no resolution below 1e-7."""
     flight = scenario.replace(scenario.read(FIRST_FLIGHT), tune=None, controller__delta=0.5)
     away = scenario.replace(
         flight, hardware=None, reference={"quat_xyzw": [0.5, 0.5, 0.5, 0.5]}, controller__error="multiplicative"

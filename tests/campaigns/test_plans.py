@@ -1,4 +1,7 @@
-"""Trials from a table: what a plan says is flown, the rest as drawn; a plan that was written is the campaign itself."""
+"""Campaigns with a run table: given values are used, other quantities are random.
+
+A run table that a campaign has written reproduces the campaign.
+"""
 
 import dataclasses
 import tomllib
@@ -21,7 +24,7 @@ from ptsmc_jax.signals import disturbances
 from ptsmc_jax.simulation import catalogues, rollout
 from tests.helpers import SHORT_CHAIN, untuned, vector
 
-SEED, FLOWN = 3, 50  # trials, so few that the program of two of them flies them
+SEED, FLOWN = 3, 50  # number of trials, small enough for the compiled program of few trials
 EVERYTHING = """
 [controller]
 t_f = 3.0
@@ -65,14 +68,14 @@ def ready(text):
 
 @pytest.fixture(scope="module")
 def everything():
-    """A campaign in which all is drawn that a spacecraft has, and its plan."""
+    """A spacecraft campaign with a dispersion of every quantity, and its run table."""
     made = campaign.Campaign(ready(EVERYTHING), SEED)
     return made, made.draw(range(FLOWN))
 
 
 @pytest.fixture(scope="module")
 def of_a_chain():
-    """A campaign that the program of other tests flies, and its plan."""
+    """A campaign that uses the compiled program of other tests, and its run table."""
     made = campaign.Campaign(scenario.study(scenario.from_tables(untuned(SHORT_CHAIN))), SEED)
     return made, made.draw(range(FLOWN))
 
@@ -81,9 +84,9 @@ def of_plan(made, table):
     return campaign.of_plan(made.ready, made.seed, plans.checked(table, made.ready.parts))
 
 
-# where trials are flown hangs on no spacecraft; what is drawn for one stands in its plan to the last digit, below
+# the spacecraft is a long test, because a later test checks that its run table has the exact inputs
 @pytest.mark.parametrize("which", ["of_a_chain", pytest.param("everything", marks=pytest.mark.long)])
-def test_a_written_plan_flown_is_the_campaign_to_the_last_digit(which, request, tmp_path):
+def test_campaign_of_a_written_run_table_has_identical_rows(which, request, tmp_path):
     made, plan = request.getfixturevalue(which)
     frame = made.fly(range(FLOWN))
     plan.write_csv(tmp_path / "plan.csv")
@@ -93,18 +96,18 @@ def test_a_written_plan_flown_is_the_campaign_to_the_last_digit(which, request, 
         again = of_plan(made, plans.read(tmp_path / name))
         digests.add(plans.checked(plans.read(tmp_path / name), made.ready.parts).digest)
         assert again.plan is not None
-        assert not again.plan.given  # the campaign's own program flies it
+        assert not again.plan.given  # the program of the original campaign simulates it
         assert_frame_equal(again.fly(range(FLOWN)), frame, check_exact=True)
     assert len(digests) == 1
-    # rows of a campaign are a plan, from which results are left out; those of some trials have these trials' noise
+    # rows of a campaign are a valid run table; their results are ignored, and each row has the noise of its trial
     some = of_plan(made, frame[[40, 7]])
     flown = some.fly(range(2))
     assert flown["plan_trial"].to_list() == [40, 7]
     assert_frame_equal(flown.select(frame.columns[1:]), frame[[40, 7]].select(frame.columns[1:]), check_exact=True)
-    assert of_plan(made, flown).fly(range(2)).equals(flown)  # and so are its rows again
+    assert of_plan(made, flown).fly(range(2)).equals(flown)  # rows of this campaign are a run table too
 
 
-def test_a_written_plan_is_what_a_campaign_draws_to_the_last_digit(everything, tmp_path):
+def test_written_run_table_has_the_exact_inputs_of_the_campaign(everything, tmp_path):
     made, plan = everything
     plan.write_csv(tmp_path / "plan.csv")
     again = of_plan(made, plans.read(tmp_path / "plan.csv"))
@@ -114,17 +117,17 @@ def test_a_written_plan_is_what_a_campaign_draws_to_the_last_digit(everything, t
 
 
 class Farther(ptsmc.Draw):
-    """Starts farther away, from what nothing else draws."""
+    """A custom dispersion that moves the initial state farther away."""
 
     count = 1
 
     def at(self, c, parts):
-        """The parts with another initial state."""
+        """Return the parts with another initial state."""
         return dataclasses.replace(parts, initial=parts.initial * (2.0 + 0.1 * c[0]))
 
 
-def test_a_written_plan_with_a_draw_of_ones_own_is_flown_as_written():
-    """The draw is not made again about what it made: the start was twice as far, the plan's angle refused."""
+def test_custom_dispersion_is_not_applied_twice_to_a_run_table():
+    """Earlier, the dispersion was applied to its own result, and the angle in the run table was refused."""
     known = scenario.from_tables({"plant": {"kind": "chain"}, "loop": {"mode": "sampled"}})
     drawn = ptsmc.replace(known, dispersion={"own": {"kind": "own", "code": Farther}})
     made = campaign.Campaign(scenario.study(drawn), SEED)
@@ -139,8 +142,8 @@ def test_a_written_plan_with_a_draw_of_ones_own_is_flown_as_written():
     assert set(other.plan.given) == {"initial_state"}
 
 
-def test_numbers_of_a_draw_of_ones_own_are_what_is_drawn_or_refused():
-    """A plan that gave others was flown as if it had not."""
+def test_other_values_of_a_custom_dispersion_are_refused():
+    """Earlier, other values in the run table were ignored."""
     known = scenario.from_tables({"plant": {"kind": "chain"}, "loop": {"mode": "sampled"}})
     ready = scenario.study(ptsmc.replace(known, dispersion={"own": {"kind": "own", "code": Farther}}))
     written = campaign.Campaign(ready, SEED).draw(range(5))
@@ -158,7 +161,7 @@ def test_numbers_of_a_draw_of_ones_own_are_what_is_drawn_or_refused():
 
 @pytest.fixture(scope="module")
 def corners(everything):
-    """A table that gives everything otherwise than it is drawn, and its campaign."""
+    """A run table with values that differ from the random ones for every quantity, and its campaign."""
     made, plan = everything
     generator = np.random.default_rng(1)
     table = plan.head(2).drop("trial", "initial_angle")
@@ -173,14 +176,14 @@ def corners(everything):
 
 
 def stands(given, table):
-    """What is given stands in these rows."""
+    """Check that the rows have the values of the run table."""
     assert given["plan_trial"].to_list() == [5, 9]
     assert given["plan_seed"].to_list() == [SEED, 11]
     for name in set(table.columns) - {"trial", "seed"}:  # quaternions come normalised
         np.testing.assert_allclose(given[name], table[name], rtol=1e-12, err_msg=name)
 
 
-def test_every_number_that_is_given_is_what_a_trial_would_fly_with(corners):
+def test_values_of_a_run_table_are_the_inputs_of_the_trials(corners):
     table, planned = corners
     stands(planned.draw(range(2)), table)
 
@@ -188,12 +191,12 @@ def test_every_number_that_is_given_is_what_a_trial_would_fly_with(corners):
 alone = programs.jit(montecarlo.one)
 
 
-# given ones fly by a program of their own; a chain has one too, below; a batch: `test_montecarlo.py`
+# batches are long tests: they compile further programs, and a chain and `test_montecarlo.py` test batches too
 @pytest.mark.parametrize(
     "kind", ["alone", *(pytest.param(kind, marks=pytest.mark.long) for kind in ("drawn", "given"))]
 )
-def test_what_stands_in_a_row_is_what_is_flown(everything, corners, kind):
-    """Every number: against parts set by hand, from the nominal ones alone."""
+def test_simulation_with_parts_set_by_hand_reproduces_a_row(everything, corners, kind):
+    """Every number of a row is written into the nominal parts by hand."""
     made, rows = everything[0], everything[1].head(2)
     if kind == "alone":
         flown = [alone(made.ready.parts, made.ready.dispersion, jnp.uint32(SEED), jnp.uint32(k)) for k in range(2)]
@@ -221,7 +224,7 @@ def test_what_stands_in_a_row_is_what_is_flown(everything, corners, kind):
 
 
 def set_by_hand(parts, row):
-    """The nominal parts with every number that a row has of a spacecraft."""
+    """Return the nominal parts with every value of a spacecraft row."""
     row = dict(row)
 
     def numbers(name, count):
@@ -250,16 +253,16 @@ def set_by_hand(parts, row):
         sensors=dataclasses.replace(parts.sensors, given_bias=numbers("rate_bias_", 3), **noises),
         actuators=dataclasses.replace(parts.actuators, torque_limit=vector(row.pop("torque_limit"))),
     )
-    assert not row  # nothing else was drawn
+    assert not row  # the row has no other inputs
     return by_hand
 
 
 def made_of_a_run():
-    """Columns of a row that are no number that it is flown with."""
+    """Return the columns of a row that are not inputs."""
     return ("trial", "plan_trial", "plan_seed", "status", "reason", "bad_time", *catalogues.CATALOGUES["spacecraft"])
 
 
-def test_what_a_row_does_not_give_is_drawn():
+def test_quantities_that_a_row_omits_are_random():
     made = campaign.Campaign(ready(CHAIN), SEED)
     plan = made.draw(range(2))
     states = pl.DataFrame({f"initial_x{k}": [0.1 * k, -0.1] for k in (1, 2, 3)})
@@ -275,7 +278,7 @@ FILTER = '[filter]\nkind = "steady_state"\n'
 
 
 @pytest.mark.parametrize("text", [EVERYTHING + FILTER, CHAIN], ids=["spacecraft", "chain"])
-def test_every_quantity_is_read_as_it_was_set_and_flight_software_does_not_know_it(text):
+def test_quantities_are_read_as_written_and_do_not_change_the_controller(text):
     parts = ready(text).parts
     generator = np.random.default_rng(2)
     there = {name: quantity.columns(parts) for name, quantity in QUANTITIES.items()}
@@ -295,7 +298,7 @@ def onboard(parts):
     return parts.controller, parts.observer, getattr(parts.sensors, "filter", None)
 
 
-def test_flight_software_does_not_know_what_is_drawn():
+def test_dispersions_do_not_change_the_controller():
     whole, drawn = ready(EVERYTHING + FILTER), []
     jax.eval_shape(lambda k: drawn.append(whole.dispersion.apply(whole.parts, 3, k)), jnp.uint32(0))
     assert onboard(whole.parts)[2] is not None
@@ -303,9 +306,9 @@ def test_flight_software_does_not_know_what_is_drawn():
         assert one is other
 
 
-def test_a_chain_flies_a_plan():
-    """From where the plan says, with the noise of the seeds and trials that it says."""
-    noise = '[dispersion]\nstate_noise = { kind = "relative_normal" }'  # as `test_plan_commands.py`, by its program
+def test_chain_is_simulated_with_a_run_table():
+    """The initial states, and the seeds and trials of the noise, are from the run table."""
+    noise = '[dispersion]\nstate_noise = { kind = "relative_normal" }'  # compiled program of `test_plan_commands.py`
     flight = scenario.from_tables(untuned(SHORT_CHAIN.replace("[dispersion]", noise)))
     states = {"initial_x1": [1.1, -0.4], "initial_x2": [0.2, 0.3]}
     whose = {"trial": [2, 0], "seed": [SEED, 11]}
@@ -330,7 +333,7 @@ BAD = [
     ({}, "the plan has no rows, but must have one for each trial"),
     ({"inital_w1": [0.0]}, "the plan has the column inital_w1, which no trial of this scenario has; the nearest "
      "known one is initial_w1"),
-    ({"controller_ok": [65], "controller_eta": [3.0]},  # of a row by exported C, and what no C has said
+    ({"controller_ok": [65], "controller_eta": [3.0]},  # column of exported C code, and unknown column
      "the plan has the column controller_eta, which no trial of this scenario has"),
     ({"initial_x1": [0.0]}, "the column initial_x1, which no trial of this scenario has"),
     ({"initial_w1": [0.0], "initial_w2": [0.0]},
@@ -351,13 +354,13 @@ BAD = [
     ({"trial": [0, -1]}, "has trial -1 in row 1, but must have a whole number from 0 to 4294967295"),
     ({"trial": [0.5]}, "has trial 0.5 in row 0, but must have a whole number"),
     ({"seed": [2**32]}, "has seed 4294967296 in row 0, but must have a whole number"),
-    ({"star_tracker_outage_begin": [3.0], "star_tracker_outage_end": [17.0]},  # there is no filter that lacks anything
+    ({"star_tracker_outage_begin": [3.0], "star_tracker_outage_end": [17.0]},  # outages need a filter
      "has the column star_tracker_outage_begin, which no trial of this scenario has"),
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize(("columns", "said"), BAD, ids=[row[1][:50] for row in BAD])
-def test_what_cannot_be_flown_is_refused_with_row_and_column(everything, columns, said):
+def test_invalid_values_are_refused_with_row_and_column(everything, columns, said):
     with pytest.raises(RefusedError) as refused:
         plans.checked(pl.DataFrame(columns, strict=False), everything[0].ready.parts)
     assert said in str(refused.value)
@@ -395,7 +398,7 @@ MISFIT = [
     ([*COUPLING, *J], [(3.1, 0.0, 0.0, *body) for body in ((10.0, 0.0, 0.0, 12.0, 0.0, 14.0), (9.0, 0, 0, 9, 0, 9))],
      f"mode_coupling_11 to mode_coupling_13 = 3.1, 0, 0 in row 1, {NO_BODY}positive definite (its smallest principal "
      "moment is -0.61 kg m^2))"),
-    ([*J], [(10.0, 0.0, 0.0, 12.0, 0.0, 14.0), (2.0, 0.0, 0.0, 2.0, 0.0, 2.0)],  # less the nominal coupling's 2.25
+    ([*J], [(10.0, 0.0, 0.0, 12.0, 0.0, 14.0), (2.0, 0.0, 0.0, 2.0, 0.0, 2.0)],  # the nominal coupling subtracts 2.25
      f"inertia_11 to inertia_33 = 2, 0, 0, 2, 0, 2 in row 1, {NO_BODY.replace('coupling', 'inertia')}positive "
      "definite (its smallest principal moment is -0.25 kg m^2))"),
 ]  # fmt: skip
@@ -412,22 +415,22 @@ def table_of(columns, rows):
 
 
 @pytest.mark.parametrize(("columns", "rows", "said"), MISFIT, ids=[row[2][-60:] for row in MISFIT])
-def test_hardware_that_cannot_be_is_refused_with_row_and_column(misfit, columns, rows, said):
+def test_impossible_hardware_is_refused_with_row_and_column(misfit, columns, rows, said):
     with pytest.raises(RefusedError) as refused:
         plans.checked(table_of(columns, rows), misfit)
     assert said in str(refused.value)
     assert "\n" not in str(refused.value)
 
 
-def test_no_outage_no_failure_and_a_coupling_that_the_rows_own_body_bears_are_none_of_these(misfit):
-    """Outages without a length, wheel 0, the last wheel; a coupling too large for the nominal inertia alone."""
+def test_limiting_cases_of_hardware_are_accepted(misfit):
+    """Outages of zero length, wheel 0 (no failure), the last wheel, and a coupling that needs the row's inertia."""
     heavy = (20.0, 0.0, 0.0, 20.0, 0.0, 20.0)
     rows = [(-1.0, -1.0, 2.0, 0.0, 4.0, 0.0, 0.0, *heavy), (3.0, 3.0, 2.0, 4.0, 0.0, 0.0, 4.4, *heavy)]
     plan = plans.checked(table_of([*OUTAGE, *FAILURE, *COUPLING, *J], rows), misfit)
     assert [list(values[1]) for values in plan.given.values()] == [[3, 3], [2, 4], [0, 0, 4.4], list(heavy)]
 
 
-def test_an_angle_that_does_not_follow_is_refused(everything):
+def test_inconsistent_initial_angle_is_refused(everything):
     made, plan = everything
     wrong = pl.when(pl.col("trial") == 2).then(3.0).otherwise("initial_angle")
     with pytest.raises(RefusedError, match="has initial_angle 3 in row 2, but must have "):
@@ -435,16 +438,16 @@ def test_an_angle_that_does_not_follow_is_refused(everything):
 
 
 @pytest.mark.parametrize(("angle", "least"), [(0.5, 1e-5), (20.0, 2e-4)])
-def test_an_angle_may_be_off_by_the_digits_that_a_table_leaves_out(angle, least):
-    """1e-5 rad, and of an |x_1| above 1 this share of it."""
+def test_tolerance_of_the_initial_angle_allows_rounded_tables(angle, least):
+    """The tolerance is 1e-5 rad, or 1e-5 relative to a state |x_1| above 1."""
     said, off = np.array([1.0, angle]), np.array([0.0, least])
     plans.check_angle(said, said + 0.9 * off, "the plan")
     with pytest.raises(RefusedError, match="in row 1, but must have"):
         plans.check_angle(said, said + 1.1 * off, "the plan")
 
 
-def test_plans_that_fly_other_trials_have_other_digests():
-    """Other numbers, other names, other draws and noise, more rows; not the angle that follows from the rest."""
+def test_run_tables_of_different_trials_have_different_checksums():
+    """Values, names, trials, seeds and the number of rows change the checksum. The initial angle does not."""
     numbers, three = np.arange(6.0).reshape(2, 3), np.array([3, 5], np.uint32)
     some = plans.Plan({"initial_rate": numbers}, None, None, None, 2)
     others = [
@@ -459,7 +462,7 @@ def test_plans_that_fly_other_trials_have_other_digests():
 
 
 @pytest.mark.parametrize("folder", ["plans[1]", "plans*"])
-def test_a_plan_in_a_folder_whose_name_is_a_pattern_is_read(tmp_path, folder):
+def test_run_table_in_a_folder_with_wildcards_in_its_name_is_read(tmp_path, folder):
     table = pl.DataFrame({"trial": [4, 2]})
     for name, rows in ((folder, table), ("plans1", table.head(1))):
         (tmp_path / name).mkdir()
@@ -469,7 +472,7 @@ def test_a_plan_in_a_folder_whose_name_is_a_pattern_is_read(tmp_path, folder):
         assert plans.read(tmp_path / folder / path)["trial"].cast(int).to_list() == [4, 2]
 
 
-def test_files_that_are_no_plan_are_refused(tmp_path):
+def test_files_that_are_not_run_tables_are_refused(tmp_path):
     for name, content, said in (
         ("none.csv", None, "which is not there; allowed is a .csv or .parquet file with a row for each trial"),
         ("plan.txt", b"trial\n1\n", "plan.txt, but must be a .csv or .parquet file"),

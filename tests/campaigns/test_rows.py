@@ -19,7 +19,7 @@ def kept(tmp_path):
     return rows.Rows(tmp_path / "trials", KEY)
 
 
-def test_what_is_written_is_read_in_order(kept):
+def test_parts_are_read_in_order(kept):
     for first in (100, 0, 50):
         kept.write(first, frame(first, 50))
     parts, broken = kept.parts()
@@ -31,14 +31,14 @@ def test_what_is_written_is_read_in_order(kept):
 
 
 @pytest.mark.parametrize("harm", ["flip", "cut", "empty", "renamed", "foreign", "longer"])
-def test_a_damaged_part_is_told_from_a_whole_one(kept, harm):
+def test_damaged_part_is_detected(kept, harm):
     whole, harmed = kept.write(0, frame(0, 50)), kept.write(50, frame(50, 50))
     content = bytearray(harmed.path.read_bytes())
     if harm == "flip":
         content[len(content) // 2] ^= 1
     changed = {"cut": content[:-1], "empty": b"", "longer": content + b"\0"}.get(harm, content)
     harmed.path.write_bytes(bytes(changed))
-    if harm == "renamed":  # to stand for other trials
+    if harm == "renamed":  # the name is that of other trials
         harmed.path.rename(harmed.path.with_name("0000000060-0000000109" + harmed.path.name[21:]))
     if harm == "foreign":
         harmed.path.unlink()
@@ -56,13 +56,13 @@ def test_a_part_is_read_once_until_it_changes(kept, monkeypatch):
     monkeypatch.setattr(Path, "read_bytes", lambda path: (reads.append(path), read(path))[1])
     assert kept.parts() == kept.parts() == ([part], [])
     assert reads == [part.path]
-    part.path.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))  # of the same size
+    part.path.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))  # same size
     assert kept.parts() == kept.parts() == ([], [part.path])
     os.utime(part.path, (1e9 + 1, 1e9 + 1))
     assert kept.parts() == kept.parts() == ([], [part.path])
 
 
-def test_a_longer_part_takes_the_place_of_a_shorter_one(kept):
+def test_longer_part_replaces_a_shorter_one(kept):
     short, long = kept.write(0, frame(0, 20)), kept.write(0, frame(0, 50))
     after = kept.write(50, frame(50, 10))
     assert kept.parts()[0] == [long, after]
@@ -71,7 +71,7 @@ def test_a_longer_part_takes_the_place_of_a_shorter_one(kept):
     assert kept.parts()[0] == [long, after]
 
 
-def test_what_a_killed_process_left_is_swept_up_and_never_read(kept):
+def test_temporary_files_of_a_killed_process_are_ignored_and_removed(kept):
     kept.write(0, frame(0, 20))
     (kept.folder / ".making-xyz").write_bytes(b"half")
     assert len(kept.parts()[0]) == 1
@@ -79,7 +79,7 @@ def test_what_a_killed_process_left_is_swept_up_and_never_read(kept):
     assert [path.name[0] for path in kept.folder.iterdir()] == ["0"]
 
 
-def test_a_file_of_the_users_own_among_the_parts_is_left_alone(kept):
+def test_file_of_the_user_among_the_parts_is_kept(kept):
     kept.write(0, frame(0, 20))
     mine = kept.folder / "mine.parquet"
     frame(0, 5).write_parquet(mine)
@@ -87,7 +87,7 @@ def test_a_file_of_the_users_own_among_the_parts_is_left_alone(kept):
     assert mine.exists()
 
 
-def test_a_part_that_does_not_fit_leaves_nothing(kept, monkeypatch):
+def test_part_that_does_not_fit_on_the_disk_leaves_no_file(kept, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
@@ -97,25 +97,25 @@ def test_a_part_that_does_not_fit_leaves_nothing(kept, monkeypatch):
     assert list(kept.folder.iterdir()) == []
 
 
-def test_keys_tell_campaigns_apart():
+def test_different_campaigns_have_different_keys():
     assert rows.key_of({"a": {"b": 1}}, {"seed": 1}) == rows.key_of({"a": {"b": 1}}, {"seed": 1})
     others = [({"a": {"b": 2}}, {"seed": 1}), ({"a": {"b": 1}}, {"seed": 2}), ({"a": {"b": 1}}, {"seed": 1, "m": "x"})]
     assert len({rows.key_of(*o) for o in others} | {rows.key_of({"a": {"b": 1}}, {"seed": 1})}) == 4
 
 
 def test_a_key_is_the_same_in_every_process():
-    """What another process has flown is known again."""
+    """A process can read the parts of another process."""
     assert KEY.hex() == "79ec63fbf7446be36358bada73ee7bbd0088b974470097e1ab1365364697ff48"
 
 
-def test_trials_that_a_longer_part_has_are_not_read_twice(kept):
+def test_overlapping_parts_are_not_read_twice(kept):
     long, _, after = kept.write(0, frame(0, 50)), kept.write(20, frame(20, 20)), kept.write(50, frame(50, 10))
     assert kept.parts() == ([long, after], [])
     assert rows.read(kept.parts()[0])["trial"].to_list() == list(range(60))
 
 
 @pytest.mark.parametrize("name", ["runs[1]", "runs*", "runs?"])
-def test_a_folder_whose_name_is_a_pattern_is_that_folder_alone(tmp_path, name):
+def test_folder_with_wildcards_in_its_name_is_read_alone(tmp_path, name):
     for folder in (name, "runs1"):
         kept = rows.Rows(tmp_path / folder, KEY)
         kept.write(0, frame(0, 50).with_columns(status=pl.lit("ok" if folder == name else "diverged")))

@@ -1,4 +1,4 @@
-"""Which runs say what is told of a scenario."""
+"""Lower bound and status of single runs."""
 
 import math
 from dataclasses import replace
@@ -15,8 +15,8 @@ from ptsmc_jax.theory import error_floor
 @pytest.mark.parametrize(("varies", "rows", "flown"), [
     (True, (), [0, 1, 2, 3]), (False, (), [None]), (True, (7, 9), [7, 9]), (False, (7,), [7]),
 ])  # fmt: skip
-def test_a_scenarios_floor_is_pooled_over_the_first_trials_or_those_of_a_plan(monkeypatch, varies, rows, flown):
-    """Trial k has the floor k + 1, but for the second that is flown, which does not end."""
+def test_lower_bound_is_pooled_over_the_first_trials_or_rows(monkeypatch, varies, rows, flown):
+    """Trial k has the lower bound k + 1. The second simulated trial fails and has no bound."""
     seen: list[Any] = []
 
     def fly(ready, seed, trial):
@@ -35,8 +35,8 @@ def test_a_scenarios_floor_is_pooled_over_the_first_trials_or_those_of_a_plan(mo
 
 
 @pytest.mark.parametrize("status", ["missed", "singular", "diverged"])
-def test_a_run_that_does_not_end_well_has_met_nothing_even_where_nothing_is_asked(status):
-    """By it `ptsmc simulate` ends with 1."""
+def test_failed_run_is_not_met_even_without_requirements(status):
+    """`ptsmc simulate` then has exit status 1."""
     none: Any = None
     run = runs.Run(none, none, {}, {}, "ok", "", math.nan, [], {})
     assert run.met

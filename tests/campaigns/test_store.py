@@ -16,7 +16,7 @@ from ptsmc_jax.campaigns import store
 from ptsmc_jax.simulation.requirements import Requirement
 
 
-def test_a_folder_is_whole_or_not_there(tmp_path):
+def test_result_folder_is_written_completely_or_not_at_all(tmp_path):
     def broken(folder):
         (folder / "a.txt").write_text("half")
         raise RuntimeError
@@ -48,8 +48,8 @@ def test_writing_into_an_existing_folder_replaces_only_what_is_written(tmp_path)
     assert (tmp_path / "out" / "figures" / "a.png").read_text() == "new"
 
 
-def test_what_was_made_of_another_result_goes_and_the_summary_comes_last(tmp_path, monkeypatch):
-    """A page shows every figure that is there; a kill in between leaves nothing that passes for a whole result."""
+def test_files_of_an_earlier_result_are_removed_and_the_summary_is_written_last(tmp_path, monkeypatch):
+    """A page shows all figures of a folder, so old ones must go. Without a summary, a result is not complete."""
     moved, replace = [], os.replace
     monkeypatch.setattr(os, "replace", lambda a, b: (moved.append(b.name), replace(a, b)))
 
@@ -70,7 +70,7 @@ def test_what_was_made_of_another_result_goes_and_the_summary_comes_last(tmp_pat
     for name in made:
         (out / name).write_bytes(store.MADE_OF_RESULTS[name])
     before = tree(out)
-    store.write(out, result("first", "tuned.toml"))  # the same one, without figures
+    store.write(out, result("first", "tuned.toml"))  # same result, without figures
     assert tree(out) == before
     moved.clear()
     store.write(out, result("second", "versions.json", "tuned.toml", "figures/b.png"))
@@ -84,14 +84,14 @@ def test_what_was_made_of_another_result_goes_and_the_summary_comes_last(tmp_pat
     store.write(out, result("third"))
     assert [(out / name).read_text() for name in made] == ["a user's own"] * 3
     (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "report.html").write_bytes(store.MADE_OF_RESULTS["report.html"])  # of no result
+    (tmp_path / "mine" / "report.html").write_bytes(store.MADE_OF_RESULTS["report.html"])  # the folder has no result
     store.write(tmp_path / "mine", result("third"))
     assert (tmp_path / "mine" / "report.html").exists()
 
 
 @pytest.mark.parametrize("changed", ["versions.json", "scenario.toml"])
-def test_a_result_without_a_summary_takes_the_place_of_another_one_too(tmp_path, changed):
-    """As a map does: the figures of what was there would stand on its page."""
+def test_result_without_a_summary_replaces_an_earlier_result(tmp_path, changed):
+    """A map has no summary. Its page would show the figures of the earlier result."""
 
     def a_map(folder, other=""):
         made = {"command": "map", "command_line": str(folder), **({"seed": 1} if other == "versions.json" else {})}
@@ -102,7 +102,7 @@ def test_a_result_without_a_summary_takes_the_place_of_another_one_too(tmp_path,
     (out / "figures").mkdir(parents=True)
     (out / "figures" / "map.png").write_bytes(store.MADE_OF_RESULTS["figures/*.png"])
     a_map(out)
-    store.write(out, a_map)  # the same one by another command line, without figures
+    store.write(out, a_map)  # same result from another command line, without figures
     assert (out / "figures" / "map.png").exists()
     (out / "summary.json").write_text("{}")
     store.write(out, lambda folder: a_map(folder, changed))
@@ -121,7 +121,7 @@ def test_check_refuses_files_and_full_folders(tmp_path):
     store.check(tmp_path, force=True)
 
 
-def test_json_has_null_for_what_is_not_finite_and_csv_reads_back_exactly(tmp_path):
+def test_json_has_null_for_nonfinite_numbers_and_csv_is_exact(tmp_path):
     store.write_json(tmp_path / "a.json", {"x": math.nan, "y": [np.float64(1 / 3), math.inf], "z": np.arange(2)})
     assert json.loads((tmp_path / "a.json").read_text()) == {"x": None, "y": [1 / 3, None], "z": [0, 1]}
     rows = [[0.1, 1 / 3], [1e-300, -2.5e17]]
@@ -135,7 +135,7 @@ def test_json_has_null_for_what_is_not_finite_and_csv_reads_back_exactly(tmp_pat
 TOLD = {"command": "tune", "seed": 5}
 
 
-def test_only_the_same_scenario_seed_and_command_is_known_again(tmp_path):
+def test_earlier_result_needs_the_same_scenario_seed_and_command(tmp_path):
     tables = {"controller": {"eta": 3.0, "gain": [1.0, 2.0]}}
     store.write_toml(tmp_path / "scenario.toml", tables)
     store.write_json(tmp_path / "versions.json", store.versions("tune", 5))
@@ -171,7 +171,7 @@ def fill(folder):
 
 
 @pytest.mark.parametrize("before", ["nothing", "an empty folder", "a folder below new ones"])
-def test_write_makes_the_folder_and_nothing_beside_it(tmp_path, before):
+def test_write_creates_only_the_folder(tmp_path, before):
     folder = tmp_path / ("a/b/out" if before == "a folder below new ones" else "out")
     if before == "an empty folder":
         folder.mkdir()
@@ -183,21 +183,21 @@ def test_write_makes_the_folder_and_nothing_beside_it(tmp_path, before):
 
 @pytest.fixture
 def umask():
-    """Sets what is taken from the modes of new files, and sets it back."""
+    """Return `os.umask`, and restore the umask after the test."""
     before = os.umask(0o022)
     yield os.umask
     os.umask(before)
 
 
 @pytest.mark.parametrize(("mask", "mode"), [(0o022, 0o755), (0o002, 0o775), (0o077, 0o700)])
-def test_folders_are_for_those_whom_the_user_lets_in(tmp_path, umask, mask, mode):
+def test_mode_of_a_new_folder_follows_the_umask(tmp_path, umask, mask, mode):
     umask(mask)
     store.write(tmp_path / "out", fill)
     assert (tmp_path / "out").stat().st_mode & 0o777 == mode
 
 
-def test_where_a_link_leads_and_what_is_mounted_are_written_without_leaving_their_disk(tmp_path, monkeypatch):
-    """A file is moved within one disk only."""
+def test_links_and_mount_points_are_written_on_their_own_disk(tmp_path, monkeypatch):
+    """Files are written beside their destination, because a file can only be moved within one disk."""
     made, mounted = [], tmp_path / "mounted"
 
     def note(folder):
@@ -207,7 +207,7 @@ def test_where_a_link_leads_and_what_is_mounted_are_written_without_leaving_thei
     for name in ("links", "elsewhere", "mounted"):
         (tmp_path / name).mkdir()
     (tmp_path / "links" / "out").symlink_to(tmp_path / "elsewhere" / "out")
-    for _ in range(2):  # it leads nowhere yet, and then to a folder
+    for _ in range(2):  # the target of the link exists only the second time
         store.write(tmp_path / "links" / "out", note)
     monkeypatch.setattr(type(tmp_path), "is_mount", lambda path: path == mounted)
     store.write(mounted, note)
@@ -217,7 +217,7 @@ def test_where_a_link_leads_and_what_is_mounted_are_written_without_leaving_thei
     assert len(list(mounted.iterdir())) == 2
 
 
-def test_a_folder_is_written_where_nothing_may_stand_beside_it(tmp_path, monkeypatch):
+def test_folder_is_written_if_its_parent_is_not_writable(tmp_path, monkeypatch):
     (tmp_path / "out").mkdir()
     monkeypatch.setattr(store.os, "access", lambda path, _: path == tmp_path / "out")
     store.check(tmp_path / "out", force=False)
@@ -230,7 +230,7 @@ def test_a_folder_is_written_where_nothing_may_stand_beside_it(tmp_path, monkeyp
         store.check(tmp_path / "new", force=False)
 
 
-def test_a_file_that_cannot_be_written_leaves_what_was_there(tmp_path):
+def test_failed_write_keeps_the_existing_file(tmp_path):
     def rows():
         yield [1.0]
         raise OSError(28, "No space left on device")
@@ -246,12 +246,12 @@ def test_a_file_that_cannot_be_written_leaves_what_was_there(tmp_path):
     assert tree(tmp_path) == {"a.csv": b"before", "a" * 250: b"as long a name as there is"}
 
 
-def test_names_that_are_no_text_are_written_with_escapes(tmp_path):
+def test_names_that_are_not_unicode_are_written_with_escapes(tmp_path):
     store.write_text(tmp_path / "a.txt", os.fsdecode(b"gr\xf6\xdfe \xce\xb1"))
     assert (tmp_path / "a.txt").read_text(encoding="utf-8") == "gr\\udcf6\\udcdfe \u03b1"
 
 
-def test_a_run_that_finds_no_room_has_not_begun(tmp_path, monkeypatch):
+def test_run_that_cannot_begin_on_a_full_disk_leaves_no_files(tmp_path, monkeypatch):
     tables = {"controller": {"eta": 3.0}}
     finished(tmp_path / "old", tables)
     before = tree(tmp_path)
@@ -268,7 +268,7 @@ def test_a_run_that_finds_no_room_has_not_begun(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("stop", [RuntimeError, KeyboardInterrupt, OSError])
-def test_write_stopped_halfway_leaves_nothing_and_touches_nothing(tmp_path, stop):
+def test_interrupted_write_changes_nothing(tmp_path, stop):
     def stopped(folder):
         fill(folder)
         raise stop
@@ -282,7 +282,7 @@ def test_write_stopped_halfway_leaves_nothing_and_touches_nothing(tmp_path, stop
     assert [p.name for p in tmp_path.iterdir()] == ["old"]
 
 
-def test_fill_never_works_in_the_folder_itself(tmp_path):
+def test_files_are_written_in_a_temporary_folder(tmp_path):
     (tmp_path / "out").mkdir()
     seen = []
 
@@ -294,7 +294,7 @@ def test_fill_never_works_in_the_folder_itself(tmp_path):
     assert seen == [(True, [], [])]
 
 
-def test_check_names_the_folder_and_what_is_allowed(tmp_path):
+def test_check_reports_the_folder_and_the_allowed_values(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(store.RefusedError) as caught:
         store.check(tmp_path / "file", force=False)
@@ -344,11 +344,11 @@ TABLES = st.dictionaries(TEXT, st.one_of(SCALAR, ARRAY, st.dictionaries(TEXT, st
 
 @settings(max_examples=200, deadline=None, derandomize=True, database=None)
 @given(TABLES)
-def test_toml_reads_back_the_same_whatever_is_written(tmp_path_factory, tables):
+def test_toml_tables_are_read_back_exactly(tmp_path_factory, tables):
     path = tmp_path_factory.getbasetemp() / "a.toml"
     store.write_toml(path, tables)
     read = tomllib.loads(path.read_text(encoding="utf-8"))
-    # as text, where 1 is neither 1.0 nor true
+    # compared as text, which distinguishes 1, 1.0 and true
     assert json.dumps(read, sort_keys=True) == json.dumps(tables, sort_keys=True)
 
 
@@ -367,7 +367,7 @@ def finished(folder, tables):
 
 @pytest.mark.parametrize("name", ["scenario.toml", "versions.json", "summary.json"])
 @pytest.mark.parametrize("content", [None, "", "{", "\x00", "[]", "{}"])
-def test_a_folder_with_a_missing_or_broken_file_is_not_known(tmp_path, name, content):
+def test_folder_with_a_missing_or_broken_file_has_no_earlier_result(tmp_path, name, content):
     tables = {"controller": {"eta": 3.0, "bounds": {"eta": (2.5, 3.5)}}}
     finished(tmp_path / "out", tables)
     assert store.previous(tmp_path / "out", tables, TOLD) == {"status": "met"}
@@ -386,14 +386,14 @@ def test_a_folder_with_a_missing_or_broken_file_is_not_known(tmp_path, name, con
     ],
     ids=str,
 )
-def test_any_other_scenario_is_not_known(tmp_path, other):
+def test_other_scenario_has_no_earlier_result(tmp_path, other):
     tables = {"controller": {"eta": 3.0}}
     finished(tmp_path / "out", tables)
     assert store.previous(tmp_path / "out", tables, TOLD) is not None
     assert store.previous(tmp_path / "out", other, TOLD) is None
 
 
-def test_versions_name_what_made_a_result(monkeypatch):
+def test_versions_describe_command_code_and_platform(monkeypatch):
     monkeypatch.setattr(sys, "argv", ["/usr/bin/ptsmc", "simulate", "my file.toml", "--trial", "3"])
     made = store.versions("simulate", 7, trial=3)
     assert made["command_line"] == "ptsmc simulate 'my file.toml' --trial 3"
@@ -406,7 +406,7 @@ def test_versions_name_what_made_a_result(monkeypatch):
     assert made["machine"]
 
 
-def test_arrays_stand_on_one_line_however_deep(tmp_path):
+def test_nested_arrays_are_on_one_line(tmp_path):
     tables = {"a": {"flat": [1.0, 2.0], "deep": [[1.0, 0.0], [0.0, 1.0]], "words": ["x, [y]", "]"], "none": []}}
     store.write_toml(tmp_path / "t.toml", tables)
     text = (tmp_path / "t.toml").read_text()
@@ -415,7 +415,7 @@ def test_arrays_stand_on_one_line_however_deep(tmp_path):
     assert tomllib.loads(text) == tables
 
 
-def test_a_run_that_was_begun_is_gone_on_with_by_the_same_command_alone(tmp_path):
+def test_unfinished_run_resumes_only_with_the_same_command(tmp_path):
     tables, folder = {"controller": {"eta": 3.0}}, tmp_path / "new"
     assert not store.begun(folder, tables, TOLD)
     journal = store.begin(folder, tables, TOLD, fresh=True)
@@ -435,11 +435,11 @@ def test_a_run_that_was_begun_is_gone_on_with_by_the_same_command_alone(tmp_path
     assert store.begin(folder, tables, TOLD, fresh=False)
     assert (folder / "summary.json").exists()
     assert store.begin(folder, tables, TOLD, fresh=True).read_bytes() == b""
-    assert not (folder / "summary.json").exists()  # of another run, which a run that is stopped must not be taken for
+    assert not (folder / "summary.json").exists()  # the summary of another run must not remain
     made = json.loads((folder / "versions.json").read_text())
     for name, said in (("jax", "a run with jax other"), ("code_checksum", "another version of the source code")):
         (folder / "versions.json").write_text(json.dumps({**made, name: "other"}))
-        with pytest.raises(store.RefusedError, match=said):  # other versions may round otherwise
+        with pytest.raises(store.RefusedError, match=said):  # other versions may have other rounding errors
             store.begun(folder, tables, TOLD)
     (folder / "versions.json").write_text(json.dumps({**made, "command_line": "other"}))
     assert store.begun(folder, tables, TOLD)

@@ -1,4 +1,4 @@
-"""Why trials are the worst: their inputs as percentiles of all trials, beside the median one."""
+"""Reasons of the worst trials: percentiles of their inputs among all trials, medians, and sensitivities."""
 
 import inspect
 from types import SimpleNamespace
@@ -18,7 +18,7 @@ from tuning.studies import campaign_folder, campaign_summary, reasons
 
 
 class Rows:
-    """A campaign of 401 trials, whose torque follows the angle that is drawn."""
+    """A campaign of 401 trials whose torque depends on the random initial angle."""
 
     own_names = ()
     scenario = scenarios.from_tables({"dispersion": {"attitude": {"kind": "uniform"}}})
@@ -31,7 +31,7 @@ class Rows:
         return [self]
 
 
-def test_each_input_of_a_worst_trial_is_a_percentile_beside_the_median(monkeypatch):
+def test_inputs_of_the_worst_trial_have_percentile_median_and_sensitivity(monkeypatch):
     angle = np.linspace(0.0, 2.0, 401)
     rate = np.random.default_rng(0).permutation(401) / 400.0
     table = pl.DataFrame({
@@ -40,9 +40,9 @@ def test_each_input_of_a_worst_trial_is_a_percentile_beside_the_median(monkeypat
     })  # fmt: skip
     monkeypatch.setattr(campaign_summary.rows, "columns_of", lambda part: list(table.schema))
     monkeypatch.setattr(campaign_summary.rows, "read", lambda parts, names: table.select(names))
-    why: Any = inspect.unwrap(reasons.why)  # which would refuse these rows by their type
+    why: Any = inspect.unwrap(reasons.why)  # without the type check, which would refuse `Rows`
     told = why(Rows(), ["peak_torque"], 1)
-    assert [one["input"] for one in told] == ["initial_angle", "initial_w1"]  # q4 says what the angle does
+    assert [one["input"] for one in told] == ["initial_angle", "initial_w1"]  # q4 duplicates the angle
     assert told[0] == {"metric": "peak_torque", "trial": 400, "value": 4.0, "input": "initial_angle", "drawn": 2.0,
                        "unit": "rad", "percentile": 100.0, "median": 1.0, "share": None,
                        "rank_correlation": pytest.approx(1.0, rel=1e-12),
@@ -51,11 +51,11 @@ def test_each_input_of_a_worst_trial_is_a_percentile_beside_the_median(monkeypat
     (said,) = trials_report.why(told, "spacecraft")
     assert (
         said == "peak_torque 4 N m in trial 400: initial_angle 2 rad at 100.0 % (median 1)"
-    )  # the rate is drawn apart from it
+    )  # the rate has no effect on the torque
     table = table.with_columns(peak_torque=np.random.default_rng(5).permutation(401) / 50.0)
     (said,) = trials_report.why(why(Rows(), ["peak_torque"], 1), "spacecraft")
     assert said.endswith("no sampled input explains it; sensor noise remains")
-    # of the number of a wheel none is more: what fails is one of four, here the second, whose number is no middle
+    # the number of a failed wheel is a category without an order; here wheel 2 causes the largest torques
     wheel = np.arange(401) % 4 + 1.0
     table = table.with_columns(peak_torque=(wheel == 2.0) + 1e-3 * rate, wheel_failure_wheel=wheel)
     told = why(Rows(), ["peak_torque"], 1)
@@ -71,9 +71,9 @@ def test_each_input_of_a_worst_trial_is_a_percentile_beside_the_median(monkeypat
     assert "wheel_failure_wheel (56 % of the variance of the ranks)" in said
     table = table.with_columns(status=pl.Series(["diverged"] + ["ok"] * 400))
     told = why(Rows(), ["peak_torque"], 1)
-    # the unusual inputs of a trial that failed
+    # unusual inputs of a failed trial
     assert "wheel_failure_wheel 1 as in 25.2 % of the trials" in "".join(trials_report.why(told, "spacecraft"))
-    # a run that failed has metrics until then, which say nothing of what drives those of a whole run
+    # metrics of a failed run are those until its failure; sensitivities must not use them
     cut = np.where(np.arange(401) % 3 == 0, 1e3 * (1.0 - rate), table["peak_torque"].to_numpy())
     table = table.with_columns(
         peak_torque=cut, status=pl.Series(["diverged", "ok", "missed"] * 133 + ["diverged", "ok"])
@@ -83,13 +83,13 @@ def test_each_input_of_a_worst_trial_is_a_percentile_beside_the_median(monkeypat
     (one,) = [row for row in why(Rows(), ["peak_torque"], 1) if row["input"] == "initial_w1"]
     assert one["rank_correlation"] == pytest.approx(driven["initial_w1"]["rank_correlation"], rel=1e-12)
     assert one["trials"] == ended.height
-    table = table.with_columns(peak_torque=pl.Series([*cut[:-1], None]))  # as of a run that never settles
+    table = table.with_columns(peak_torque=pl.Series([*cut[:-1], None]))  # a metric that one trial does not have
     assert {row["value"] for row in why(Rows(), ["peak_torque"], 401) if row["trial"] == 400} == {None}
     assert statistics.distinct({"a": angle, "b": -angle, "c": rate}) == ["a", "c"]
 
 
-def test_whatever_is_drawn_may_be_a_reason(monkeypatch):
-    """Columns are in the order of their names, and inertia and disturbance, before the initial angle, were left out."""
+def test_every_random_input_may_be_a_reason(monkeypatch):
+    """Columns are in alphabetical order. Earlier, columns before the initial angle (the inertia) were left out."""
     drawn = {"attitude": {"kind": "uniform"}, "inertia": {"kind": "relative_normal", "std": 0.1},
              "disturbance_phase": {"kind": "uniform"}}  # fmt: skip
     ready = scenarios.study(scenarios.from_tables({"dispersion": drawn}))
@@ -102,8 +102,8 @@ def test_whatever_is_drawn_may_be_a_reason(monkeypatch):
     assert inspect.unwrap(campaign_summary.drawn_columns)(folder, [None]) == columns
 
 
-def test_what_chance_shows_among_the_few_trials_that_have_a_metric_is_no_reason():
-    """A correlation of 0.15 is nothing among 200 of 10 000 trials, as many as settle, say."""
+def test_insignificant_correlation_in_few_trials_is_not_a_reason():
+    """A correlation of 0.15 is not significant in 200 trials, for example if only these settle."""
     told = [{"metric": "settling_time", "trial": 3, "value": 1.0, "input": "initial_w1", "drawn": 2.0, "unit": "rad/s",
              "percentile": 70.0, "median": 1.0, "share": None, "rank_correlation": 0.15, "first_order": 0.06,
              "trials": 200}]  # fmt: skip
@@ -111,12 +111,12 @@ def test_what_chance_shows_among_the_few_trials_that_have_a_metric_is_no_reason(
     assert said.endswith("no sampled input explains it; sensor noise remains")
 
 
-def test_of_a_trial_that_failed_the_four_most_unusual_inputs_are_told():
-    """By how many percent of the trials they are from the middle, or half of the share that has another number."""
+def test_report_lists_the_four_most_unusual_inputs_of_a_failed_trial():
+    """Inputs are ranked by their distance from the 50 % percentile, categories by half the fraction of other trials."""
     alike: dict[str, Any] = {"metric": "effort", "trial": 3, "value": None, "drawn": 2.0, "unit": "",
                              "rank_correlation": None, "first_order": None}  # fmt: skip
-    ranked = {"initial_angle": 70.0, "initial_w1": 52.0, "initial_w2": 1.0}  # 20, 2 and 49 from the middle
-    shared = {"wheel_failure_wheel": 0.25, "own_1": 0.9}  # 37.5 and 5
+    ranked = {"initial_angle": 70.0, "initial_w1": 52.0, "initial_w2": 1.0}  # distances 20, 2 and 49
+    shared = {"wheel_failure_wheel": 0.25, "own_1": 0.9}  # distances 37.5 and 5
     told = [
         *({**alike, "input": name, "percentile": at, "median": 1.0, "share": None} for name, at in ranked.items()),
         *({**alike, "input": name, "percentile": None, "median": None, "share": at} for name, at in shared.items()),
@@ -127,8 +127,8 @@ def test_of_a_trial_that_failed_the_four_most_unusual_inputs_are_told():
     assert named == ["initial_w2", "wheel_failure_wheel", "initial_angle", "own_1"]
 
 
-def test_an_angle_that_is_drawn_from_one_point_is_no_reason():
-    """From 100 to 100 deg: what it differs by from trial to trial is the rounding of its quaternion."""
+def test_dispersion_of_zero_width_is_not_a_reason():
+    """Angles with a dispersion from 100 to 100 deg differ by rounding errors of the quaternion only."""
     random = np.random.default_rng(3)
     angle = np.deg2rad(100.0) + 2.2e-16 * random.integers(-2, 3, 401)
     rate = random.normal(size=401)
