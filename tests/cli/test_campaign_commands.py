@@ -17,7 +17,7 @@ from tuning.output import formats, progress
 from tuning.studies import campaign_summary
 
 FOLDER = "out/montecarlo-s"
-MANY = 70  # trials, so many that the program of hundreds flies them
+MANY = 70  # number of trials, large enough for the compiled program of many trials
 OVERSHOOT = """
 import jax.numpy as jnp
 
@@ -54,7 +54,7 @@ PLANTS = {"chain": (SHORT_CHAIN, "3 u"), "spacecraft": (SHORT, "30 N m")}
 
 
 @pytest.mark.parametrize("plant", short(PLANTS, ["chain"]))
-def test_a_campaign_leaves_rows_summary_and_figures(command, tmp_path, monkeypatch, plant):
+def test_montecarlo_writes_rows_summary_and_figures(command, tmp_path, monkeypatch, plant):
     text, limit = PLANTS[plant]
     (tmp_path / "s.toml").write_text(text)
     monkeypatch.setattr(progress, "EVERY", 0.05)
@@ -89,15 +89,15 @@ def test_a_campaign_leaves_rows_summary_and_figures(command, tmp_path, monkeypat
                                [errors.mean(), np.sqrt(np.mean(errors**2)), errors.max()], rtol=1e-12)  # fmt: skip
     assert told["0.9"]["value"] == np.sort(errors)[224]
     assert told["0.9"]["low"] < told["0.9"]["value"] < told["0.9"]["high"]
-    assert told["0.9973"]["high"] is None  # 250 trials bound it on no side
+    assert told["0.9973"]["high"] is None  # 250 trials are too few for an upper bound
     unsettled = rows["settling_time"].null_count()
     assert found["quantiles"]["settling_time"]["without_value"] == unsettled
 
 
 @pytest.mark.parametrize(("drawn", "instead"), short([(r"\[0.5, 0.1\]", "[0, 0]"), ("x0 = {.*", "")],
                                                      [(r"\[0.5, 0.1\]", "[0, 0]")]))  # fmt: skip
-def test_trials_that_are_all_the_same_flight_are_said(command, tmp_path, flown, drawn, instead):
-    """Nothing in the file, or nothing by its numbers, which other tests' programs fly."""
+def test_equal_trials_are_reported(command, tmp_path, flown, drawn, instead):
+    """The scenario has no dispersion, or one of zero width, which compiled programs of other tests can simulate."""
     assert not [said for said in summary(flown)["cautions"] if "the same flight" in said]
     text = re.sub(drawn, instead, SHORT_CHAIN).replace("[2e-5, 1e-5]", "[0, 0]")
     (tmp_path / "same.toml").write_text(text)
@@ -105,16 +105,16 @@ def test_trials_that_are_all_the_same_flight_are_said(command, tmp_path, flown, 
     assert "CAUTION: all 250 trials are the same flight: nothing is drawn" in said
 
 
-def test_trials_that_all_fail_are_not_said_to_be_the_same():
+def test_failed_trials_are_not_reported_as_equal():
     assert campaign_summary._alike({"window_error": {"without_value": 5}}, 5) == []
     at_rest = {"window_error": {"without_value": 0, "mean": 0.0, "max": 0.0}}
-    (said,) = campaign_summary._alike(at_rest, 5, drawn=True)  # another inertia of a body that stays at rest
+    (said,) = campaign_summary._alike(at_rest, 5, drawn=True)  # for example a dispersed inertia of a body at rest
     assert said == "all 5 trials have the same metrics: what is drawn in them changes none"
-    at_rest["window_error"]["without_value"] = 4  # one is all that is left of them
+    at_rest["window_error"]["without_value"] = 4  # only one trial has a value
     assert campaign_summary._alike(at_rest, 5, drawn=True) == campaign_summary._alike(at_rest, 5) == []
 
 
-def test_more_trials_add_to_what_is_there(command, flown):
+def test_more_trials_extend_an_existing_campaign(command, flown):
     before = rows_of(flown)
     files = {path: path.stat().st_mtime_ns for path in (flown / "trials").iterdir()}
     assert command("montecarlo", "s.toml", "--trials", 420, "--seed", 3, "--no-figures", "--quiet")[0] == 0
@@ -129,7 +129,7 @@ def test_more_trials_add_to_what_is_there(command, flown):
 
 
 @pytest.mark.parametrize("planned", [False, True])
-def test_a_part_that_is_flown_anew_is_not_counted_twice(command, monkeypatch, planned):
+def test_repeated_part_is_not_counted_twice_in_the_progress(command, monkeypatch, planned):
     standing = []
     monkeypatch.setattr(progress.CampaignProgress, "__call__", lambda _, tally: standing.append(replace(tally)))
     for trials in (10, 20):
@@ -138,7 +138,7 @@ def test_a_part_that_is_flown_anew_is_not_counted_twice(command, monkeypatch, pl
     assert [(tally.done, tally.total) for tally in standing] == [(0, 10), (10, 10), (0, 20), (20, 20)]
 
 
-def test_a_campaign_interrupted_while_it_is_summed_up_is_not_said_to_be_nothing(command, flown, monkeypatch):
+def test_interruption_of_the_summary_is_reported_as_resumable(command, flown, monkeypatch):
     def stopped(*_):
         raise KeyboardInterrupt
 
@@ -150,7 +150,7 @@ def test_a_campaign_interrupted_while_it_is_summed_up_is_not_said_to_be_nothing(
     )
 
 
-def test_the_same_command_again_flies_nothing(command, flown):
+def test_repeated_command_simulates_no_trials(command, flown):
     files = {path: path.stat().st_mtime_ns for path in (flown / "trials").iterdir()}
     code, said, _ = command("montecarlo", "s.toml", "--trials", 250, "--seed", 3, "--no-figures")
     assert code == 0
@@ -180,7 +180,7 @@ def test_another_campaign_in_the_same_folder_is_refused(command, flown, tmp_path
     assert said in error
     assert error.count("\n") == 1
     same(rows_of(flown), before)
-    if "--metrics" not in options:  # with these it is another program
+    if "--metrics" not in options:  # custom metrics would compile another program
         again = ("montecarlo", "s.toml", "--trials", 110, *options, "--force", "--no-figures", "--quiet")
         mine = "plan/mine.parquet", "plan.parquet", "controller/mine.c", "figures/mine.png"  # a user's own
         for name in mine:
@@ -188,7 +188,7 @@ def test_another_campaign_in_the_same_folder_is_refused(command, flown, tmp_path
             (flown / name).write_text("mine")
         assert command(*again, "--dry-run")[0] == 0
         assert [(flown / name).read_text() for name in mine] == ["mine"] * 4
-        assert not (flown / "summary.json").exists()  # that of the campaign before, which would pass for this one's
+        assert not (flown / "summary.json").exists()  # the summary of the earlier campaign must not remain
         (flown / "trials" / "mine.parquet").write_text("mine")
         code, _, error = command(*again)
         assert (code, "mine.parquet is no part of a campaign; it is kept as mine.parquet.damaged" in error) == (0, True)
@@ -216,7 +216,7 @@ def test_another_campaign_in_the_same_folder_is_refused(command, flown, tmp_path
         (["--metrics", "m.py:no"], "--metrics is m.py:no: m.py has no such name; allowed is"),
     ],
 )
-def test_bad_options_end_in_one_sentence_and_nothing_is_written(command, tmp_path, options, said):
+def test_invalid_options_print_one_line_and_write_nothing(command, tmp_path, options, said):
     (tmp_path / "m.py").write_text(OVERSHOOT)
     code, out, error = command("montecarlo", "s.toml", *options)
     assert (code, out) == (2, "")
@@ -226,15 +226,15 @@ def test_bad_options_end_in_one_sentence_and_nothing_is_written(command, tmp_pat
     assert not (tmp_path / "out").exists()
 
 
-def test_a_width_needs_requirements(command, tmp_path):
+def test_until_confident_needs_requirements(command, tmp_path):
     text = (tmp_path / "s.toml").read_text()
     (tmp_path / "s.toml").write_text(text.replace("[requirements]\npeak_torque = 3.0\n", ""))
     code, _, error = command("montecarlo", "s.toml", "--until-confident", "0.1")
     assert (code, "needs [requirements]" in error) == (2, True)
 
 
-def test_trials_until_the_share_is_known(command, tmp_path):
-    """A limit that about half of the trials keep: the width is about 4 sqrt(p (1 - p) / n), so 400 trials for 0.1."""
+def test_until_confident_stops_at_the_required_interval_width(command, tmp_path):
+    """About half of the trials keep the limit. The width is about 4 sqrt(p (1 - p) / n), so 0.1 needs 400 trials."""
     text = (tmp_path / "s.toml").read_text()
     (tmp_path / "s.toml").write_text(text.replace("peak_torque = 3.0", "peak_torque = 0.38"))
     code, said, _ = command("montecarlo", "s.toml", "--until-confident", "0.11", "--trials", 5000, "--no-figures")
@@ -249,12 +249,15 @@ def test_trials_until_the_share_is_known(command, tmp_path):
     assert summary(tmp_path / FOLDER)["flown"] == 400
     command("montecarlo", "s.toml", "--trials", 600, "--no-figures")
     command("montecarlo", "s.toml", "--until-confident", "0.11", "--trials", 5000, "--no-figures")
-    assert summary(tmp_path / FOLDER)["flown"] == 600  # what was flown besides counts
+    assert summary(tmp_path / FOLDER)["flown"] == 600  # existing trials count
 
 
 @pytest.mark.parametrize("before", [0, 150])
-def test_trials_until_the_share_is_known_are_as_many_after_an_interruption(command, tmp_path, monkeypatch, before):
-    """300 trials would do, but looked at are 200 and 400; behind 150 of another campaign 150 and 300, not 250."""
+def test_interrupted_until_confident_ends_with_the_same_number_of_trials(command, tmp_path, monkeypatch, before):
+    """A new campaign checks after 200 and 400 trials. A campaign with 150 trials checks after 150 and 300 trials.
+
+    The interruption after other numbers of trials must not change these checks.
+    """
     text = (tmp_path / "s.toml").read_text()
     (tmp_path / "s.toml").write_text(text.replace("peak_torque = 3.0", "peak_torque = 0.38"))
     width = "0.12" if before == 0 else "0.135"
@@ -284,8 +287,8 @@ def test_trials_until_the_share_is_known_are_as_many_after_an_interruption(comma
 
 
 @pytest.mark.parametrize(("made", "said"), [("tune", 1), ("montecarlo", 0)])
-def test_trials_that_gains_were_found_with_are_told(command, tmp_path, made, said):
-    """`tune --seed 1000` and a campaign by default fly the same draws and noise: a proof of nothing."""
+def test_montecarlo_warns_of_the_training_trials_of_tuned_gains(command, tmp_path, made, said):
+    """`tune --seed 1000` and a default campaign have the same dispersions and noise, which would verify nothing."""
     found = tmp_path / "found"
     found.mkdir()
     (found / "versions.json").write_text(json.dumps({"command": made, "seed": 1000}))
@@ -297,7 +300,7 @@ def test_trials_that_gains_were_found_with_are_told(command, tmp_path, made, sai
         assert error.count("with the same trials of seed 1000; use another --seed") == times
 
 
-def test_a_dry_run_writes_what_would_be_flown(command, tmp_path):
+def test_dry_run_writes_the_inputs_of_the_trials(command, tmp_path):
     code, said, _ = command("montecarlo", "s.toml", "--trials", 250, "--seed", 3, "--dry-run")
     folder = tmp_path / FOLDER
     assert (code, "run table of 250 trials" in said) == (0, True)
@@ -307,7 +310,7 @@ def test_a_dry_run_writes_what_would_be_flown(command, tmp_path):
     same(plan, rows_of(folder).select(plan.columns))
 
 
-def test_shards_of_one_folder_or_several_make_the_campaign(command, flown, tmp_path):
+def test_shards_in_one_folder_or_several_make_the_whole_campaign(command, flown, tmp_path):
     whole, options = rows_of(flown), ["--trials", 250, "--seed", 3, "--no-figures"]
     for k in (1, 2):
         code, said, _ = command("montecarlo", "s.toml", *options, "--shard", f"{k}/2", "--out", "one")
@@ -317,14 +320,14 @@ def test_shards_of_one_folder_or_several_make_the_campaign(command, flown, tmp_p
     code, said, _ = command("summarize", "part1", "--no-figures")
     assert (code, "NOT finished: 150 of 250 trials" in said) == (1, True)
     assert summary(tmp_path / "part1")["status"] == "unfinished"
-    for path in (tmp_path / "part2" / "trials").iterdir():  # gathered by copying
+    for path in (tmp_path / "part2" / "trials").iterdir():  # merge the shards into one folder
         path.rename(tmp_path / "part1" / "trials" / path.name)
     for folder in ("one", "part1"):
         assert command("summarize", folder, "--no-figures", "--quiet") == (0, "", "")
         same(rows_of(tmp_path / folder), whole)
 
 
-def test_rows_of_another_version_of_the_code_are_not_added_to(command, flown):
+def test_campaign_of_another_code_version_is_not_extended(command, flown):
     store.write_json(flown / "versions.json", store.read_versions(flown) | {"code_checksum": "before"})
     before, more = tree(flown), ("montecarlo", "s.toml", "--trials", 260, "--seed", 3, "--no-figures", "--quiet")
     code, _, error = command(*more)
@@ -345,7 +348,7 @@ def test_a_shard_does_not_delete_the_rows_of_other_shards(command, tmp_path):
     assert command("montecarlo", "s.toml", *options, "--shard", "1/1", "--force") == (0, "", "")
 
 
-def test_damaged_rows_are_named_never_read_and_flown_again(command, flown):
+def test_damaged_part_is_reported_and_simulated_again(command, flown):
     whole = rows_of(flown)
     part = sorted((flown / "trials").iterdir())[1]
     part.write_bytes(part.read_bytes()[:-100])
@@ -358,10 +361,10 @@ def test_damaged_rows_are_named_never_read_and_flown_again(command, flown):
     assert code == 0
     assert f"{part.name} is damaged and is flown again" in error
     same(rows_of(flown), whole)
-    assert part.with_name(part.name + ".damaged").exists()  # nothing of the user's is thrown away
+    assert part.with_name(part.name + ".damaged").exists()  # damaged files are renamed, not deleted
 
 
-def test_the_worst_trials_and_their_replay(command, flown, tmp_path):
+def test_worst_lists_trials_that_replay_reproduces(command, flown, tmp_path):
     whole = rows_of(flown)
     code, said, _ = command("worst", FOLDER, "--by", "peak_torque", "-n", 3)
     kept = pl.read_csv(flown / "worst.csv")
@@ -382,13 +385,13 @@ def test_the_worst_trials_and_their_replay(command, flown, tmp_path):
     assert (code, "--trial is 250, but must be a whole number from 0 to 249" in error) == (2, True)
     code, _, error = command("worst", FOLDER, "--by", "peek_torque")
     assert (code, "known ones are peak_torque, " in error) == (2, True)
-    code, _, error = command("worst", FOLDER, "--by", "xyz")  # all columns were listed where none is like it
+    code, _, error = command("worst", FOLDER, "--by", "xyz")  # earlier, the error listed all columns
     assert (code, "worst.csv, which ptsmc worst writes without --by, has all of them" in error) == (2, True)
     assert error.count(",") < 8
 
 
-def test_a_replay_that_differs_from_its_row_is_told(command, flown):
-    """As if a row had been made by another version: the digest is right, the number is not."""
+def test_replay_that_differs_from_its_row_is_reported(command, flown):
+    """The changed row has a valid checksum, as if another version had computed it."""
     from tuning.studies import campaign_folder
 
     opened = campaign_folder.opened(flown)
@@ -401,8 +404,8 @@ def test_a_replay_that_differs_from_its_row_is_told(command, flown):
 
 
 @pytest.mark.long
-def test_a_replay_is_its_row_to_the_last_digit_whatever_rounding_does(command, tmp_path):
-    """Errors of 1e-6 of a body that turns: another program's rounding shows at 1e-11, the campaign's own does not."""
+def test_replay_equals_its_row_exactly(command, tmp_path):
+    """The error is 1e-6, so that rounding errors of another program are visible at 1e-11. A replay has none."""
     (tmp_path / "h.toml").write_text(
         'controller = { error = "multiplicative", t_f = 12.0, delta = 0.5, sign_width = 0.0 }\n'
         'loop = { mode = "sampled", period = 0.05, t_end = 13.0, clock = "flight" }\n'
@@ -417,7 +420,7 @@ def test_a_replay_is_its_row_to_the_last_digit_whatever_rounding_does(command, t
     command("montecarlo", "h.toml", "--trials", 71, "--no-figures", "--quiet")
     rows = rows_of(tmp_path / "out/montecarlo-h")
     command("montecarlo", "h.toml", "--trials", 7, "--no-figures", "--quiet", "--out", "few")
-    assert rows_of(tmp_path / "few").equals(rows.head(7))  # few trials are flown by the same program
+    assert rows_of(tmp_path / "few").equals(rows.head(7))  # the same program simulates few trials
 
 
 @pytest.mark.parametrize("asked", [["summarize"], ["worst"], ["replay", "--trial", "1"]])
@@ -431,8 +434,8 @@ def test_a_folder_without_a_campaign_is_refused(command, tmp_path, asked):
     assert "holds results of `ptsmc simulate`" in command(asked[0], "run", *asked[1:])[2]
 
 
-def test_a_summary_made_anew_is_the_same_in_whatever_order_limits_stand(command, tmp_path):
-    """Verdicts came in another order, so page and worst trials went as if they were another campaign's."""
+def test_repeated_summary_does_not_depend_on_the_order_of_limits(command, tmp_path):
+    """Earlier, another order of the verdicts deleted page and worst trials as files of another campaign."""
     limits = "[requirements]\npeak_torque = { limit = 3.0, quantile = 0.9 }\nwindow_error = 1.0"
     (tmp_path / "s.toml").write_text(SHORT_CHAIN.replace("[requirements]\npeak_torque = 3.0", limits))
     code, said, _ = command("montecarlo", "s.toml", "--trials", 120, "--no-figures", "--seed", 3)
@@ -443,8 +446,8 @@ def test_a_summary_made_anew_is_the_same_in_whatever_order_limits_stand(command,
     assert (tmp_path / FOLDER / "worst.csv").exists()
 
 
-@pytest.mark.long  # rows with them: `test_campaign.py`; that they are asked for: the folder refuses another campaign
-def test_metrics_of_ones_own_are_kept_and_judged_by(command, tmp_path):
+@pytest.mark.long  # shorter tests: rows in `test_campaign.py`, and the refusal of another campaign above
+def test_custom_metrics_are_stored_and_order_the_worst_trials(command, tmp_path):
     (tmp_path / "m.py").write_text(OVERSHOOT)
     (tmp_path / "s.toml").write_text(SHORT_CHAIN)
     code, said, _ = command(
@@ -457,13 +460,16 @@ def test_metrics_of_ones_own_are_kept_and_judged_by(command, tmp_path):
     assert pl.read_csv(tmp_path / FOLDER / "worst.csv")["overshoot"][0] == rows["overshoot"].max()
 
 
-WILD = SHORT.replace("min_deg = 20.0, max_deg = 90.0", "min_deg = 170.0, max_deg = 180.0")  # few are turned back
+WILD = SHORT.replace("min_deg = 20.0, max_deg = 90.0", "min_deg = 170.0, max_deg = 180.0")  # few trials converge
 ASKED = "[requirements]\npeak_torque = 30.0\n"
 
 
 @pytest.fixture(params=short(["made up", "flown"], ["made up"]))
 def lost(request, tmp_path, monkeypatch):
-    """Makes many trials fail, or, made up, be said to: every fourth; returns which of both."""
+    """Return a function that makes trials fail, and returns how.
+
+    "made up" sets the status of every fourth trial, "flown" simulates initial angles near 180 deg.
+    """
 
     def run(parts, dispersion, seed, trials, *more, flown=montecarlo.run, **how):
         result, fails = flown(parts, dispersion, seed, trials, *more, **how), np.asarray(trials) % 4 == 0
@@ -503,7 +509,7 @@ def test_failures_are_counted_with_reason_and_time(command, tmp_path, lost):
     assert set(pl.read_csv(tmp_path / FOLDER / "worst.csv")["status"]) <= {"diverged", "singular"}
 
 
-def test_without_requirements_a_failed_trial_is_the_exit_status(command, tmp_path, lost):
+def test_failed_trial_sets_the_exit_status_without_requirements(command, tmp_path, lost):
     text = (tmp_path / "s.toml").read_text().replace("[requirements]\npeak_torque = 3.0\n", "")
     (tmp_path / "s.toml").write_text(text)
     assert command("montecarlo", "s.toml", "--trials", MANY, "--no-figures", "--quiet")[0] == 0
@@ -518,7 +524,7 @@ def test_other_plants_and_the_continuous_loop(command, tmp_path, plant):
         "continuous": 'controller = { t_f = 20.0, delta = 0.5 }\n'
                       'dispersion = { attitude = { kind = "uniform" }, disturbance_phase = {} }\n',
     }[plant])  # fmt: skip
-    drawn = ["--no-figures"] if plant == "chain" else []  # those of a chain: above
+    drawn = ["--no-figures"] if plant == "chain" else []  # other tests make the figures of a chain
     code, said, _ = command("montecarlo", "o.toml", "--trials", 70, *drawn)
     assert code in (0, 1)
     assert "70 trials of seed 1000" in said
@@ -529,8 +535,8 @@ def test_other_plants_and_the_continuous_loop(command, tmp_path, plant):
     assert code == 0, said
 
 
-def test_single_precision_is_another_campaign_whose_rows_are_nearly_the_same(command, tmp_path, monkeypatch):
-    """Where 32 bits are asked for, they are set; tests set them by hand, since JAX is set up already."""
+def test_single_precision_campaign_has_nearly_equal_rows(command, tmp_path, monkeypatch):
+    """The option sets JAX to 32 bits. The test sets them by itself, because JAX is configured already."""
     asked = []
     monkeypatch.setattr("ptsmc_jax.configure.configure", lambda **told: asked.append(told))
     (tmp_path / "s.toml").write_text(SHORT_CHAIN)
@@ -541,7 +547,7 @@ def test_single_precision_is_another_campaign_whose_rows_are_nearly_the_same(com
         code, _, error = command("replay", "half", "--trial", 7, "--no-figures")
     assert (code, error) == (0, "")
     made = json.loads((tmp_path / "half" / "replay" / "7" / "versions.json").read_text())
-    assert made["campaign"] == str(tmp_path / "half")  # simulate has 64 bits
+    assert made["campaign"] == str(tmp_path / "half")  # `ptsmc simulate` with 64 bits cannot repeat it
     assert asked == [{"device": "cpu", "bits": bits, "keep_programs": True} for bits in (64, 32, 32)]
     whole, half = (pl.read_parquet(tmp_path / name / "trials") for name in ("whole", "half"))
     assert half["window_error"].dtype == pl.Float32
@@ -561,7 +567,7 @@ def test_single_precision_is_another_campaign_whose_rows_are_nearly_the_same(com
         (["--precision", "32", "--cluster", "local:2"], "--cluster simulates on the workers' processors with 64 bits"),
     ],
 )
-def test_devices_and_precisions_that_there_are_none_of_are_refused(command, tmp_path, options, said):
+def test_unknown_devices_and_precisions_are_refused(command, tmp_path, options, said):
     code, _, error = command("montecarlo", "s.toml", "--trials", 10, *options)
     assert code == 2
     assert error.startswith(f"ptsmc: {said}")

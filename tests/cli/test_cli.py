@@ -1,4 +1,4 @@
-"""The command: files, exit statuses, sentences."""
+"""The command `ptsmc`: files, exit statuses, messages."""
 
 import json
 import os
@@ -28,7 +28,7 @@ from tuning.output import formats
 from tuning.studies import single, stability
 
 
-def test_simulate_leaves_what_the_contract_says(command, tmp_path):
+def test_simulate_writes_its_result_folder(command, tmp_path):
     status, out, err = command("simulate", "s.toml", "--trial", 3, "--seed", 7)
     assert (status, err) == (0, "")
     folder = tmp_path / "out" / "simulate-s"
@@ -60,10 +60,10 @@ def test_simulate_leaves_what_the_contract_says(command, tmp_path):
     assert tree(folder) == before
     status, _, _ = command("simulate", "s.toml", "--force", "--quiet", "--no-figures")
     assert status == 0
-    assert tree(folder)["trajectory.csv"] != before["trajectory.csv"]  # nominal now
+    assert tree(folder)["trajectory.csv"] != before["trajectory.csv"]  # the nominal run
 
 
-def test_a_requirement_that_is_not_met_is_exit_status_one(command, tmp_path):
+def test_violated_requirement_has_exit_status_one(command, tmp_path):
     (tmp_path / "s.toml").write_text(SHORT.replace("peak_torque = 30.0", "peak_torque = 0.01"))
     status, out, _ = command("simulate", "s.toml", "--no-figures")
     assert status == 1
@@ -89,7 +89,7 @@ BAD = [
 
 
 @pytest.mark.parametrize(("args", "said"), BAD, ids=[" ".join(row[0]) for row in BAD])
-def test_bad_input_is_one_sentence_and_exit_status_two(command, tmp_path, args, said):
+def test_invalid_input_prints_one_line_and_has_exit_status_two(command, tmp_path, args, said):
     (tmp_path / "folder").mkdir()
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine").write_text("keep")
@@ -107,9 +107,9 @@ def test_bad_input_is_one_sentence_and_exit_status_two(command, tmp_path, args, 
     assert not (tmp_path / "out").exists()
 
 
-# a chain's search: `test_an_interrupted_search_leaves_its_best_and_goes_on`
+# `test_interrupted_search_writes_its_best_gains_and_resumes` tunes a chain
 @pytest.mark.parametrize("text", short([SHORT_CHAIN, SHORT], [SHORT]), ids=["chain", "spacecraft"])
-def test_tune_from_start_to_end(command, tmp_path, monkeypatch, text):
+def test_tune_command_writes_results_and_repeats_them(command, tmp_path, monkeypatch, text):
     small_search(monkeypatch)
     (tmp_path / "s.toml").write_text(text)
     status, _, _ = command("tune", "s.toml", "--out", "t")
@@ -118,7 +118,7 @@ def test_tune_from_start_to_end(command, tmp_path, monkeypatch, text):
     assert {"gains", "training", "fresh", "paper", "verdicts"} <= set(summary)
     assert summary["fresh"]["trials"] == 40
     assert summary["fresh"]["seed"] != summary["training"]["seed"]
-    known = {"fresh": summary["gains"], "paper": {"eta": 3.0, "delta": 0.1}}  # a period: the paper's 0.05 s is less
+    known = {"fresh": summary["gains"], "paper": {"eta": 3.0, "delta": 0.1}}  # published 0.05 s is below one period
     for group, of_group in known.items():
         assert 0.0 < summary[group]["floor"] < summary[group]["window_error"]["rms"]
         assert summary[group]["gains"].items() >= of_group.items()
@@ -128,7 +128,7 @@ def test_tune_from_start_to_end(command, tmp_path, monkeypatch, text):
     tuned = scenario.read(tmp_path / "t" / "tuned.toml")
     assert tuned.controller.eta == summary["gains"]["eta"]
     assert tuned.controller.delta == summary["gains"]["delta"]
-    ready = scenario.study(tuned)  # what is handed over flies as it was judged
+    ready = scenario.study(tuned)  # tuned.toml reproduces the held-out trials
     again = montecarlo.run(ready.parts, ready.dispersion, summary["fresh"]["seed"], np.arange(40))
     rms = np.sqrt(np.mean(again.metrics.window_error**2))
     assert rms == pytest.approx(summary["fresh"]["window_error"]["rms"], rel=1e-12)
@@ -136,8 +136,8 @@ def test_tune_from_start_to_end(command, tmp_path, monkeypatch, text):
     header, *rows = (tmp_path / "t" / "history.csv").read_text().splitlines()
     assert header == "step,start,rms_window_error,eta,delta,peak_torque_over_limit"
     assert len(rows) == summary["search"]["steps"] >= 2
-    # the gains beat those of the scenario on the same trials, in this noise too; the published gains, scaled to this
-    # t_f, have a faster surface and a faster observer, which this search does not move
+    # The tuned gains are more accurate than the scenario's gains on the same trials. They need not be more accurate
+    # than the published gains, whose faster surface and observer are not free in this search.
     assert summary["fresh"]["window_error"]["rms"] < summary["before"]["window_error"]["rms"]
 
     assert summary["trust"]["margins"] == stability.worst(scenario.study(tuned))
@@ -166,13 +166,13 @@ def test_tune_from_start_to_end(command, tmp_path, monkeypatch, text):
     assert "--force" in err
 
 
-# each without the command: `test_bad_input_ends_in_one_sentence`
+# tests/scenario tests these scenarios without the command
 @pytest.mark.parametrize(
     ("text", "of_what", "allowed"),
     short(BAD_SCENARIOS, BAD_SCENARIOS[::8]),
     ids=[row[0][:60] for row in BAD_SCENARIOS],
 )
-def test_a_bad_scenario_ends_the_command_with_one_sentence(command, tmp_path, text, of_what, allowed):
+def test_invalid_scenario_prints_one_line(command, tmp_path, text, of_what, allowed):
     (tmp_path / "bad.toml").write_text(text)
     before = sorted(tmp_path.rglob("*"))
     status, out, err = command("simulate", "bad.toml", "--no-figures")
@@ -217,7 +217,7 @@ WHOLE = "whole number"
     ],
     ids=lambda part: " ".join(part),
 )
-def test_a_bad_option_ends_the_command_with_one_sentence(command, tmp_path, args, named):
+def test_invalid_option_prints_one_line(command, tmp_path, args, named):
     before = sorted(tmp_path.rglob("*"))
     status, out, err = command(*args, "--no-figures")
     assert (status, out) == (2, "")
@@ -232,21 +232,21 @@ def rows_of(folder):
     return np.loadtxt(folder / "trajectory.csv", delimiter=",", skiprows=1)
 
 
-def test_the_papers_case_one_without_a_file(command, tmp_path):
+def test_simulate_without_a_file_runs_case_one_of_the_paper(command, tmp_path):
     assert command("simulate", "--quiet", "--no-figures") == (0, "", "")
     folder = tmp_path / "out" / "simulate-default"
     assert set(tree(folder)) == {"trajectory.csv", "summary.json", "scenario.toml", "versions.json"}
     assert scenario.read(folder / "scenario.toml") == scenario.from_tables({})
     rows = rows_of(folder)
-    # by hand: s = t_f v' + eta v with v' = 0, and theory.md 3.3 for the torque, u = -2 eta^2 J v / (q4 t_f^2);
-    # the products of a few numbers, so a few roundings
+    # At rest, v' = 0, so that s = t_f v' + eta v = eta v. The torque is u = -2 eta^2 J v / (q4 t_f^2), theory.md 3.3.
+    # The tolerance allows rounding errors.
     v, q4 = PAPER_ATTITUDE[:3], PAPER_ATTITUDE[3]
     torque = -2 * 3.0**2 * np.array([10.0, 12.0, 14.0]) * v / (q4 * 30.0**2)
     np.testing.assert_allclose(rows[0], [0.0, *PAPER_ATTITUDE, *[0.0] * 6, *torque, *3.0 * v], atol=1e-14)
     assert (rows[0, 0], rows[-1, 0]) == (0.0, 40.0)
     assert np.all(np.diff(rows[:, 0]) > 0)
     np.testing.assert_allclose(np.linalg.norm(rows[:, 1:5], axis=1), 1.0, atol=1e-14)
-    # t_f is a node: what the summary says of it stands in the history, whose numbers are exact
+    # t_f is a grid point, so that the history contains the values of the summary exactly
     summary = json.loads((folder / "summary.json").read_text())
     (at_t_f,) = rows[rows[:, 0] == 30.0]
     assert summary["terminal_error"] == pytest.approx(np.linalg.norm(at_t_f[1:4]), rel=1e-12)
@@ -257,14 +257,14 @@ def test_the_papers_case_one_without_a_file(command, tmp_path):
     assert summary["peak_momentum"] == pytest.approx(momentum.max(), rel=1e-12)
 
 
-def test_an_empty_file_is_said_to_be_the_papers_case(command, tmp_path):
+def test_empty_scenario_file_is_reported_as_case_one_of_the_paper(command, tmp_path):
     (tmp_path / "none.toml").write_text("# to come\n")
     status, _, said = command("simulate", "none.toml", "--quiet", "--no-figures")
     assert (status, said) == (0, "ptsmc: none.toml is empty; the paper's Case I is simulated\n")
 
 
 @pytest.mark.parametrize("timing", ['clock = "flight"\nt_end = 6.47', 'clock = "anchored"\nt_end = 6.4700001'])
-def test_the_last_row_is_at_t_end_wherever_the_samples_fall(command, tmp_path, timing):
+def test_last_row_of_the_history_is_at_t_end(command, tmp_path, timing):
     (tmp_path / "s.toml").write_text(SHORT.replace("t_end = 6.5", timing))
     assert command("simulate", "s.toml", "--quiet", "--no-figures")[0] == 0
     rows = rows_of(tmp_path / "out" / "simulate-s")
@@ -272,22 +272,22 @@ def test_the_last_row_is_at_t_end_wherever_the_samples_fall(command, tmp_path, t
     assert np.all(np.diff(rows[:, 0]) > 0)
 
 
-def test_seed_and_trial_name_a_run(command, tmp_path):
+def test_seed_and_trial_select_a_run(command, tmp_path):
     def fly(name, *options):
         assert command("simulate", "s.toml", "--out", name, "--quiet", "--no-figures", *options) == (0, "", "")
         return rows_of(tmp_path / name)
 
     nominal, zero, three = fly("a"), fly("b", "--trial", 0), fly("c", "--trial", 3, "--seed", 4294967295)
     np.testing.assert_array_equal(fly("d", "--trial", 3, "--seed", 4294967295), three)
-    np.testing.assert_allclose(nominal[0, 1:5], PAPER_ATTITUDE, atol=1e-15)  # as in the file, normalised
+    np.testing.assert_allclose(nominal[0, 1:5], PAPER_ATTITUDE, atol=1e-15)  # quaternion of the file, normalised
     starts = [nominal[0, 1:5], zero[0, 1:5], three[0, 1:5], fly("e", "--trial", 3)[0, 1:5]]
     assert len({tuple(q) for q in starts}) == 4
     np.testing.assert_array_equal(fly("f", "--seed", 1)[0, 1:5], nominal[0, 1:5])
-    assert np.any(fly("g", "--seed", 1)[-1] != nominal[-1])  # another noise
+    assert np.any(fly("g", "--seed", 1)[-1] != nominal[-1])  # other noise
 
 
-def test_a_run_that_fails_says_so(command, tmp_path):
-    # with noise of 10 rad the law does not know the attitude, and cannot keep away from its singularity
+def test_failed_run_is_reported(command, tmp_path):
+    # with attitude noise of 10 rad, the law cannot avoid its singularity
     text = SHORT.replace("attitude_noise = 2e-5", "attitude_noise = 10.0")
     (tmp_path / "s.toml").write_text(text.replace("window = 1.0", "window = 1.0\nsettling_angle = 1e-3"))
     status, out, err = command("simulate", "s.toml", "--no-figures")
@@ -303,7 +303,7 @@ def test_a_run_that_fails_says_so(command, tmp_path):
 
 
 @pytest.mark.parametrize("met", [True, False])
-def test_a_finished_tuning_run_answers_again(command, tmp_path, met):
+def test_finished_tuning_run_is_not_repeated(command, tmp_path, met):
     tables = parsing.dump(scenario.read(tmp_path / "s.toml"))
     folder = tmp_path / "done"
     folder.mkdir()
@@ -319,7 +319,10 @@ def test_a_finished_tuning_run_answers_again(command, tmp_path, met):
 
 
 def stop_at(monkeypatch, call):
-    """Ctrl-C at this evaluation of the search; returns how many were computed, not read back."""
+    """Interrupt this evaluation of the search (0: none). Return a list with an item for each computed evaluation.
+
+    Evaluations that are read from the journal are not in the list.
+    """
     from tuning.search.evaluate import Evaluator
     from tuning.search.journal import Journal
 
@@ -345,8 +348,8 @@ def stop_at(monkeypatch, call):
 
 
 @pytest.mark.parametrize("calls", short([[1, 4], [7]], [[1, 4]]))
-def test_an_interrupted_search_leaves_its_best_and_goes_on(command, tmp_path, monkeypatch, calls):
-    """At the first evaluation there is nothing yet; later it is in the middle of a descent."""
+def test_interrupted_search_writes_its_best_gains_and_resumes(command, tmp_path, monkeypatch, calls):
+    """The first evaluation is before any result. Later ones are in the middle of a local search."""
     small_search(monkeypatch)
     (tmp_path / "s.toml").write_text(SHORT_CHAIN.replace("steps = 4", "steps = 2"))
     with monkeypatch.context() as patch:
@@ -372,12 +375,12 @@ def test_an_interrupted_search_leaves_its_best_and_goes_on(command, tmp_path, mo
             assert best["status"] == "interrupted"
             assert scenario.read(tmp_path / "cut" / "tuned.toml").controller.eta == best["gains"]["eta"]
             assert best["fresh"]["trials"] == 40
-    assert command("simulate", "s.toml", "--out", "cut")[0] == 2  # another command has no business here
+    assert command("simulate", "s.toml", "--out", "cut")[0] == 2  # the folder belongs to another command
 
     with monkeypatch.context() as patch:
         computed = stop_at(patch, 0)
         assert command(*run)[0] == whole
-        assert len(computed) == needed - done  # what was evaluated before is read back
+        assert len(computed) == needed - done  # earlier evaluations are read from the journal
     assert "journal.bin" not in tree(tmp_path / "cut")
     one, other = (json.loads((tmp_path / name / "summary.json").read_text()) for name in ("whole", "cut"))
     for summary in (one, other):
@@ -387,8 +390,8 @@ def test_an_interrupted_search_leaves_its_best_and_goes_on(command, tmp_path, mo
 
 
 @pytest.mark.long
-def test_a_killed_search_goes_on(tmp_path):
-    """kill -9 while it searches, in a process of its own; then the same command to the end."""
+def test_killed_search_resumes(tmp_path):
+    """Kill a search in its own process, then run the same command to its end."""
     (tmp_path / "s.toml").write_text(SHORT)
     code = (
         "import sys; from tuning.cli import main; "
@@ -416,7 +419,7 @@ def test_a_killed_search_goes_on(tmp_path):
 
 
 @pytest.mark.long
-def test_a_limit_that_no_gains_keep_is_reported(command, tmp_path, monkeypatch):
+def test_infeasible_limit_is_reported(command, tmp_path, monkeypatch):
     small_search(monkeypatch)
     text = re.sub(r"peak_torque = .*", "peak_torque = 0.01", SHORT)
     (tmp_path / "s.toml").write_text(text)
@@ -425,13 +428,13 @@ def test_a_limit_that_no_gains_keep_is_reported(command, tmp_path, monkeypatch):
     assert (status, summary["status"]) == (1, "not met")
     ratio = summary["search"]["largest_over_limit"]["peak_torque"]
     assert ratio > 1.0
-    assert summary["search"]["rounds_with_harder_trials"] == 0  # they would bring these gains no nearer
+    assert summary["search"]["rounds_with_harder_trials"] == 0  # more trials cannot make the problem feasible
     assert "the search found no gains that meet every requirement, nor did a global search" in told
     assert f"peak_torque reaches {ratio:.3g} times its limit of 0.01 N m on the training trials" in told
     assert list(summary["search"]["conflict"]) == ["peak_torque"]
     assert "peak_torque at most 0.01 N m: worst" in told
-    # the best compromise: the smallest torque within the bounds is that of the smallest eta
-    assert 2.6 <= summary["gains"]["eta"] < 2.8  # of 2.6 to 3.05
+    # the best compromise has the smallest torque within the bounds, which is at the smallest eta
+    assert 2.6 <= summary["gains"]["eta"] < 2.8  # bounds: 2.6 to 3.05
 
 
 def test_an_interrupted_run_writes_nothing(command, tmp_path, monkeypatch):
@@ -444,7 +447,7 @@ def test_an_interrupted_run_writes_nothing(command, tmp_path, monkeypatch):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_defect_of_ours_is_not_called_bad_input(tmp_path, monkeypatch):
+def test_internal_error_is_raised_with_its_traceback(tmp_path, monkeypatch):
     def broken(*_):
         raise ValueError("ours")
 
@@ -456,7 +459,7 @@ def test_a_defect_of_ours_is_not_called_bad_input(tmp_path, monkeypatch):
         main.main()
 
 
-def test_a_full_disk_is_one_sentence_and_leaves_nothing(command, tmp_path, monkeypatch):
+def test_full_disk_prints_one_line_and_leaves_no_files(command, tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
@@ -466,7 +469,7 @@ def test_a_full_disk_is_one_sentence_and_leaves_nothing(command, tmp_path, monke
     assert tree(tmp_path) == before
 
 
-def test_figures_only_where_wanted_and_force_keeps_what_is_not_ours(command, tmp_path):
+def test_force_keeps_files_of_the_user(command, tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").write_text("keep")
     assert command("simulate", "s.toml", "--out", "mine", "--quiet", "--no-figures")[0] == 2
@@ -479,8 +482,8 @@ def test_figures_only_where_wanted_and_force_keeps_what_is_not_ours(command, tmp
 HELP = [[], ["simulate", "--help"], ["tune", "--help"], ["--help"], ["--version"]]
 
 
-def test_help_and_version_are_told_without_jax():
-    """One after the other in one process, each as a user's first call."""
+def test_help_and_version_do_not_import_jax():
+    """The calls run one after the other in one process."""
     code = f"""
 import sys
 from tuning.cli.main import main
@@ -500,10 +503,10 @@ for args in {HELP}:
     assert rest == ""
 
 
-def test_a_process_exits_as_the_contract_says(tmp_path):
+def test_exit_statuses_of_a_process(tmp_path):
     (tmp_path / "s.toml").write_text(SHORT_CHAIN.replace("peak_torque = 3.0", "peak_torque = 0.01"))
     run = ("simulate", tmp_path / "s.toml", "--out", tmp_path / "out", "--quiet", "--no-figures")
-    # JAX looks for faults in code of a user's own: here it would stop at the NaN of a metric that a run lacks
+    # a user may set these variables to debug custom code; they must not stop a run with a NaN metric
     asked = dict.fromkeys(("JAX_DEBUG_NANS", "JAX_DEBUG_INFS"), "1")
     asked |= {"JAX_NUMPY_DTYPE_PROMOTION": "strict", "JAX_TRANSFER_GUARD": "disallow"}
     not_met = in_a_process(*run, **asked)
@@ -522,7 +525,7 @@ def test_a_process_exits_as_the_contract_says(tmp_path):
 
 
 def in_a_process(*args, then="", **variables):
-    """`ptsmc ...` as a user runs it; `then` is checked at its end."""
+    """Run `ptsmc` in a new process; then: Python code to execute at its end."""
     code = f"import sys\nfrom tuning.cli.main import main\ntry: main()\nfinally:\n    {then or 'pass'}"
     command, quickly = [sys.executable, "-c", code, *map(str, args)], os.environ | {"XLA_FLAGS": QUICKLY} | variables
     return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=quickly, check=False)
@@ -548,11 +551,11 @@ steps = 4
 """
 
 
-@pytest.mark.long  # files of a chain: `test_other_plants_have_pages_too`; noises and starts: of campaigns of chains
-def test_a_chain_is_simulated(command, tmp_path):
+@pytest.mark.long  # shorter tests: pages of other plants in tests/output, campaigns of chains
+def test_simulate_command_for_a_chain(command, tmp_path):
     (tmp_path / "c.toml").write_text(CHAIN)
     status, out, err = command("simulate", "c.toml", "--trial", 2)
-    assert (status, err) == (1, "")  # the paper's delta of one period is far beyond the limit
+    assert (status, err) == (1, "")  # the published delta of one period exceeds the torque limit by far
     assert "peak_torque at most 20 u" in out
     assert "NOT met" in out
     assert "terminal_angle" not in out
@@ -573,7 +576,7 @@ def test_a_chain_is_simulated(command, tmp_path):
 
 
 @pytest.mark.long
-def test_a_chain_is_tuned(command, tmp_path):
+def test_tune_command_for_a_chain(command, tmp_path):
     (tmp_path / "c.toml").write_text(CHAIN)
     status, out, _ = command("tune", "c.toml", "--seed", 2)
     assert status in (0, 1)
@@ -590,17 +593,17 @@ def test_a_chain_is_tuned(command, tmp_path):
     assert command("tune", "c.toml", "--seed", 2)[1].endswith("(from an earlier run)\n")
 
 
-def test_simulate_without_a_trial_refuses_a_nominal_start_that_the_law_cannot_leave(command, tmp_path):
+def test_simulate_refuses_a_nominal_initial_state_at_the_singularity(command, tmp_path):
     (tmp_path / "s.toml").write_text("initial.quat_xyzw = [1, 0, 0, 0]\n" + SHORT)
     status, _, err = command("simulate", "s.toml", "--no-figures")
     assert status == 2
     assert "initial.quat_xyzw is [1.0, 0.0, 0.0, 0.0]" in err
-    assert command("simulate", "s.toml", "--trial", 0, "--no-figures", "--quiet")[0] in (0, 1)  # drawn instead
+    assert command("simulate", "s.toml", "--trial", 0, "--no-figures", "--quiet")[0] in (0, 1)  # random initial state
 
 
 @pytest.fixture(params=short(["made up", "flown"], ["made up"]))
 def cells(request, monkeypatch):
-    """Of `map`, made up: `tests/studies/test_mapping.py` flies them and opens their loops."""
+    """Cells of a map with invented results. `tests/studies/test_mapping.py` computes real ones."""
     if request.param == "flown":
         return
     metrics = Metrics(dict.fromkeys(catalogues.CATALOGUE, np.full(2, 1e-3)))
@@ -613,9 +616,9 @@ def cells(request, monkeypatch):
 
 
 @pytest.mark.usefixtures("cells")
-def test_map_leaves_what_the_contract_says(command, tmp_path):
+def test_map_writes_its_result_folder(command, tmp_path):
     (tmp_path / "c.toml").write_text(SHORT_CHAIN)
-    pairs = ("--x", "controller.eta=2.7:2.9:2", "--y", "controller.k1=0.8:1.6:2")  # of one program
+    pairs = ("--x", "controller.eta=2.7:2.9:2", "--y", "controller.k1=0.8:1.6:2")  # one compiled program for all
     status, out, _ = command("map", "c.toml", *pairs, "--trials", 2)
     assert status == 0
     assert "4 of 4 pairs simulated" in out
@@ -625,8 +628,8 @@ def test_map_leaves_what_the_contract_says(command, tmp_path):
     assert again in read.text
     assert "linear_torque [u]" in read.text
     cells = pl.read_csv(tmp_path / "out" / "map-c" / "map.csv")
-    assert cells["linear_window_error"].is_between(0.0, cells["window_error"], closed="none").all()  # of noise alone
-    assert "gain_margin [" not in read.text  # a factor
+    assert cells["linear_window_error"].is_between(0.0, cells["window_error"], closed="none").all()  # noise only
+    assert "gain_margin [" not in read.text  # a factor without a unit
     first = out.splitlines()[0]
     assert first.startswith("the smallest RMS error is ")
     assert read.text.index(first[1:]) < read.text.index("Pairs")
@@ -661,7 +664,7 @@ done
     )
 
 
-def test_a_long_run_says_how_many_steps_it_takes_before_it_is_flown(command, monkeypatch):
+def test_long_run_prints_its_number_of_integration_steps(command, monkeypatch):
     run = ("simulate", "s.toml", "--no-figures", "--force")
     parts = scenario.study(scenario.read("s.toml")).parts
     steps = timing.steps(parts)
@@ -672,8 +675,8 @@ def test_a_long_run_says_how_many_steps_it_takes_before_it_is_flown(command, mon
     assert command(*run, "--quiet")[1] == ""
 
 
-def test_a_backend_that_matplotlib_does_not_know_is_none_of_a_campaigns_business():
-    """All rows were flown, and then came a traceback instead of a summary."""
+def test_unknown_matplotlib_backend_does_not_stop_a_command():
+    """Earlier, such a campaign ended with a traceback after its simulations, without a summary."""
     code = """
 from tuning.cli import main
 main.main = lambda: __import__("matplotlib") and print("whole")

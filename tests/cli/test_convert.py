@@ -1,4 +1,4 @@
-"""`ptsmc convert-attitude`: every form of an attitude is the same attitude, and can be pasted into a scenario."""
+"""`ptsmc convert-attitude`: all printed representations are the same attitude, and valid in a scenario."""
 
 import tomllib
 from typing import Any
@@ -13,7 +13,7 @@ from tuning.cli import convert
 
 
 def pasted(line, sequence):
-    """The quaternion of a printed line, read as a scenario."""
+    """Return the quaternion of a printed line, which is read as a part of a scenario."""
     table = tomllib.loads(line)
     if "euler_deg" in table:
         table["sequence"] = sequence
@@ -22,7 +22,7 @@ def pasted(line, sequence):
 
 
 def closed_forms(q):
-    """MRP, rotation vector [deg] and matrix of a quaternion, from their definitions."""
+    """Return MRP, rotation vector [deg] and rotation matrix of a quaternion from their definitions."""
     v, scalar = q[:3], q[3]
     angle = 2.0 * np.arctan2(np.linalg.norm(v), scalar)
     x, y, z = v
@@ -32,12 +32,12 @@ def closed_forms(q):
 
 
 @pytest.mark.parametrize("sequence", [None, "zyx", "XYZ", "ZXZ"])
-def test_every_form_is_the_same_attitude(sequence):
+def test_all_representations_are_the_same_attitude(sequence):
     rng = np.random.default_rng(4)
     for _ in range(20):
         q = rng.normal(size=4)
         q *= np.sign(q[3]) / np.linalg.norm(q)
-        if 2.0 * np.arccos(q[3]) > np.deg2rad(170.0):  # where Case I's law could not start
+        if 2.0 * np.arccos(q[3]) > np.deg2rad(170.0):  # near the singularity of the law in Case I
             continue
         said = convert.lines(q, sequence)
         assert [line.split(" = ")[0] for line in said] == list(ATTITUDE_KEYS)
@@ -64,13 +64,13 @@ def test_every_form_is_the_same_attitude(sequence):
     (("--rotvec-deg", "-90,0,0"), "90 degrees about [-1, 0, 0]"),
     (("--dcm-body-to-inertial", "-1 0 0 0 -1 0 0 0 1"), "180 degrees about [0, 0, 1]"),
 ])  # fmt: skip
-def test_the_command_takes_each_of_them(command, options, angle):
+def test_command_accepts_every_representation(command, options, angle):
     code, said, error = command("convert-attitude", *options)
     assert (code, error) == (0, "")
     assert f"# {angle}\n" in said
 
 
-def test_gimbal_lock_is_said(command):
+def test_gimbal_lock_is_reported(command):
     code, said, error = command("convert-attitude", "--euler-deg", "10,90,20")
     assert (code, error) == (0, "")
     assert "gimbal lock" in said
@@ -92,14 +92,14 @@ def test_gimbal_lock_is_said(command):
     (("--euler-deg", "1,2,3", "--sequence", ""), '--sequence is "", but must be three axes'),
     (("--mrp", "0,0,0", "--sequence", "abc"), "--sequence is abc, but must be three axes"),
 ])  # fmt: skip
-def test_what_is_no_attitude_is_refused(command, options, said):
+def test_invalid_attitudes_are_refused(command, options, said):
     code, out, error = command("convert-attitude", *options)
     assert (code, out) == (2, "")
     assert error.startswith(f"ptsmc: {said}"), error
     assert error.count("\n") == 1
 
 
-def test_of_a_whole_turn_no_rounding_is_left():
+def test_zero_rotation_is_printed_without_rounding_errors():
     said = convert.lines(np.array([0.0, 0.0, -1.2246e-16, 1.0]))
     assert "rotvec_deg = [0, 0, 0]  # 0 degrees" in said
     assert 'euler_deg = [0, 0, 0]  # with sequence = "ZYX"' in said

@@ -1,4 +1,4 @@
-"""`ptsmc export` and `ptsmc simulate --controller`: what they leave and say, and what they refuse in one sentence."""
+"""`ptsmc export` and the option `--controller`: files, messages and errors."""
 
 import json
 import shutil
@@ -21,25 +21,26 @@ def _of_a_chain(command, tmp_path):
 
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
-    """A controller of s.toml."""
+    """The folder of an exported controller of s.toml."""
     place = tmp_path_factory.mktemp("exported")
     (place / "s.toml").write_text(SHORT_CHAIN)
     return folder.export(place / "s.toml", place / "c", trials=1)
 
 
-def test_export_leaves_a_folder_and_says_what_a_step_takes(command, tmp_path, exported):
+def test_export_writes_a_folder_and_prints_the_cost_of_a_step(command, tmp_path, exported):
     status, out, err = command("export", "s.toml", "--trials", 1, "--out", "the c")
     assert (status, err) == (0, "")
     assert "a step takes at most" in out
-    assert "controller in the c; make -C 'the c' check" in out  # to be pasted into a shell
+    assert "controller in the c; make -C 'the c' check" in out  # quoted for a shell
     made = json.loads((tmp_path / "the c" / "versions.json").read_text())
     assert (made["command"], made["command_line"]) == ("export", "ptsmc export s.toml --trials 1 --out 'the c'")
-    files = [tree(folder) | {"versions.json": b""} for folder in (tmp_path / "the c", exported)]  # command lines differ
+    # versions.json is not compared, because the command lines differ
+    files = [tree(folder) | {"versions.json": b""} for folder in (tmp_path / "the c", exported)]
     assert files[0] == files[1]
 
 
 @needs_compiler
-def test_simulate_flies_the_controller(command, tmp_path, exported):
+def test_simulate_runs_the_exported_controller(command, tmp_path, exported):
     status, _, err = command("simulate", "s.toml", "--controller", exported, "--no-figures", "--out", "r")
     assert (status, err) == (0, "")
     told = json.loads((tmp_path / "r" / "summary.json").read_text())
@@ -50,7 +51,7 @@ def test_simulate_flies_the_controller(command, tmp_path, exported):
 
 
 @needs_compiler
-def test_what_the_controller_has_otherwise_is_said(command, tmp_path, exported):
+def test_parameters_that_differ_in_the_controller_are_reported(command, tmp_path, exported):
     (tmp_path / "s.toml").write_text(SHORT_CHAIN.replace("[controller]", "[controller]\neta = 2.9\nk1 = 0.8"))
     status, _, err = command("simulate", "s.toml", "--controller", exported, "--no-figures", "--quiet")
     said = (
@@ -63,8 +64,8 @@ def test_what_the_controller_has_otherwise_is_said(command, tmp_path, exported):
 
 
 @needs_compiler
-def test_a_campaign_flies_the_controller_and_keeps_it(command, tmp_path):
-    """Rows are those that the simulator's own code flies with the C's gains, to rounding, with how samples ended."""
+def test_campaign_runs_the_exported_controller_and_copies_it(command, tmp_path):
+    """Rows equal those of the simulated law with the gains of the C code, to rounding, and count sample statuses."""
     text = SHORT_CHAIN.replace('mode = "sampled"', 'mode = "sampled"\nclock = "flight"')
     (tmp_path / "of_c.toml").write_text(text)
     (tmp_path / "s.toml").write_text(text.replace("[controller]", "[controller]\neta = 2.9"))
@@ -93,7 +94,7 @@ def test_a_campaign_flies_the_controller_and_keeps_it(command, tmp_path):
     assert samples["ok"] == {"samples": 40 * 65, "trials": 40}
     assert samples["singular"] == {"samples": 0, "trials": 0}
 
-    said = refused(command, tmp_path, *flight, "--out", "r")  # its rows are others
+    said = refused(command, tmp_path, *flight, "--out", "r")  # without the controller, it is another campaign
     assert "holds a run with flight_code_sha256" in said
     assert "which is not asked for here" in said
     replay = "replay", "r", "--trial", 7, "--no-figures"
@@ -103,7 +104,7 @@ def test_a_campaign_flies_the_controller_and_keeps_it(command, tmp_path):
     code, out, err = command(*replay, "--trust")
     assert (code, "equals its row to the last digit" in out, "same run up to round-off" in out) == (0, True, True)
     assert err == f"ptsmc: runs {tmp_path / 'r' / 'controller'}, which --controller of r names\n"
-    assert command("summarize", "r", "--no-figures", "--quiet")[0] == 0  # runs nothing, and knows it still
+    assert command("summarize", "r", "--no-figures", "--quiet")[0] == 0  # it does not execute the C code
     assert json.loads((tmp_path / "r" / "summary.json").read_text()) == told
     replayed = tmp_path / "r" / "replay" / "7"
     assert json.loads((replayed / "summary.json").read_text())["cautions"] == told["cautions"][:1]
@@ -112,7 +113,7 @@ def test_a_campaign_flies_the_controller_and_keeps_it(command, tmp_path):
     with (kept / "ptsmc_of_c.c").open("a") as file:
         file.write("/* changed */\n")
     assert "was made with another --controller" in refused(command, tmp_path, *replay, "--trust")
-    assert command(*flight, "--controller", "c", "--out", "r")[:2] == (0, "")  # which has it again
+    assert command(*flight, "--controller", "c", "--out", "r")[:2] == (0, "")  # it restores the copy of the C code
     assert tree(kept) == before
 
 
@@ -127,18 +128,18 @@ def test_a_campaign_flies_the_controller_and_keeps_it(command, tmp_path):
         (SHORT, ("--seed", "-1"), 'Invalid value "-1" for --seed. Must be >= 0.'),
     ],
 )  # fmt: skip
-def test_export_refuses_in_one_sentence(command, tmp_path, text, args, said):
+def test_export_refuses_invalid_scenarios_and_options(command, tmp_path, text, args, said):
     (tmp_path / "s.toml").write_text(text)
     assert said in refused(command, tmp_path, "export", "s.toml", *args)
 
 
-def test_export_refuses_a_folder_that_holds_something(command, tmp_path, exported):
+def test_export_refuses_a_folder_with_files(command, tmp_path, exported):
     shutil.copytree(exported, tmp_path / "c")
     assert "holds something already" in refused(command, tmp_path, "export", "s.toml", "--out", "c")
 
 
 @needs_compiler
-def test_simulate_refuses_what_is_no_controller_of_the_scenario(command, tmp_path, exported, monkeypatch):
+def test_simulate_refuses_other_folders_and_controllers_of_other_scenarios(command, tmp_path, exported, monkeypatch):
     def said(controller):
         return refused(command, tmp_path, "simulate", "s.toml", "--controller", controller)
 

@@ -1,4 +1,4 @@
-"""The guide's commands, one after the other as they stand there, at a small size."""
+"""The commands in `docs/guide.md`, in their order, with fewer trials and smaller searches."""
 
 import re
 import shlex
@@ -15,18 +15,18 @@ SMALLER = {"--trials 2000": "--trials 64", "--law mine.py:Growing": "--law mine.
 
 
 def calls():
-    """Every call of the guide's shell blocks but those that install."""
+    """Return every command in the shell blocks of the guide, without the installation."""
     blocks = re.findall(r"^```(\S*)[^\n]*\n(.*?)^```", GUIDE, re.M | re.S)
     return [line.split("#")[0].strip() for language, block in blocks if not language for line in block.splitlines()]
 
 
 @pytest.mark.long
 @pytest.mark.skipif(shutil.which("make") is None or shutil.which("cc") is None, reason="no compiler for the C")
-def test_the_guide_is_walked_through(command, tmp_path, monkeypatch):
+def test_commands_of_the_guide_run(command, tmp_path, monkeypatch):
     small_search(monkeypatch)
     here = tmp_path / "scenarios"
     here.mkdir()
-    for name in ("cubesat", "first_flight"):  # without margins and shares of runs, which take thousands of trials
+    for name in ("cubesat", "first_flight"):  # without margins and probabilities, which need thousands of trials
         text = (ROOT / "scenarios" / f"{name}.toml").read_text().split("\n[tune]")[0]
         text = re.sub(r"\n\w+_margin = .*", "", text).replace(", probability = 0.9973, confidence = 0.9", "")
         (here / f"{name}.toml").write_text(text + TUNE)
@@ -46,7 +46,7 @@ def test_the_guide_is_walked_through(command, tmp_path, monkeypatch):
             assert done.returncode == 0, done.stdout + done.stderr
             continue
         status, out, err = command(*rest)
-        assert status in (0, 1), f"{call}: {err}"  # 1: a requirement is not met by gains of so small a search
+        assert status in (0, 1), f"{call}: {err}"  # 1: gains of a small search may violate a requirement
         assert out
         flown += 1
     assert flown >= 14

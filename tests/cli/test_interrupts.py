@@ -1,4 +1,4 @@
-"""Ctrl-C: one ends a command cleanly and loses nothing, a second one kills it."""
+"""Ctrl-C: the first one ends a command without loss of results, the second one kills it. Resuming of searches."""
 
 import math
 import signal
@@ -47,7 +47,7 @@ command()
 """
 
 
-def test_ctrl_c_during_imports_ends_the_command_in_one_sentence():
+def test_ctrl_c_during_imports_prints_one_line():
     done = subprocess.run([sys.executable, "-c", IMPORTING], capture_output=True, text=True, cwd=ROOT, check=False)
     assert (done.returncode, done.stderr) == (130, "ptsmc: interrupted\n")
 
@@ -63,7 +63,7 @@ def test_first_ctrl_c_ends_the_command_and_a_second_kills_it(twice, status, out,
 
 
 @pytest.mark.parametrize(("force", "same"), [(False, "the same command"), (True, "the same command without --force")])
-def test_a_search_interrupted_while_its_results_are_written_goes_on(tmp_path, force, same):
+def test_search_interrupted_during_writing_resumes(tmp_path, force, same):
     def stopped(making, outcome):
         (making / "summary.json").write_text(outcome.status)
         raise KeyboardInterrupt
@@ -106,8 +106,8 @@ def test_interrupted_search_that_wrote_its_best_gains_resumes_without_force(tmp_
     assert {"journal.bin", "summary.json"} <= set(tree(tmp_path / "out"))
 
 
-def test_a_search_is_shown_as_it_is_when_it_is_read_again(tmp_path):
-    """A front without gains told "|S| at most inf dB" when it was done, and what it meant when it was shown again."""
+def test_new_and_stored_results_of_a_search_have_the_same_report(tmp_path):
+    """Earlier, the report of a new front without gains printed "|S| at most inf dB", but the stored one did not."""
     (tmp_path / "s.toml").write_text(SHORT_CHAIN)
     loaded, shown = scenario.read(tmp_path / "s.toml"), []
     said = {"status": "not met", "without": [math.inf, 6.0], "slews": ({"rms": np.float64(math.nan)},)}
@@ -125,7 +125,7 @@ def test_a_search_is_shown_as_it_is_when_it_is_read_again(tmp_path):
 
 
 @pytest.mark.parametrize("status", ["interrupted", "met"])
-def test_a_search_by_another_version_of_the_code_does_not_resume(tmp_path, capsys, status):
+def test_search_of_another_code_version_does_not_resume(tmp_path, capsys, status):
     (tmp_path / "s.toml").write_text(SHORT_CHAIN)
     loaded, folder, asked = scenario.read(tmp_path / "s.toml"), tmp_path / "out", []
     search = searches.LongSearch(

@@ -1,4 +1,7 @@
-"""What `ptsmc new` writes: the scenario asked for, every key of its plant, and what is off is allowed as it stands."""
+"""`ptsmc new`, `schema` and `examples`: the written scenario, its keys, and the keys in comments.
+
+A written scenario has every key of its plant. Keys in comments are valid as soon as the # is removed.
+"""
 
 import io
 import json
@@ -27,13 +30,13 @@ FLIGHT = ROOT / "scenarios" / "first_flight.toml"
 
 
 def key_of(line):
-    """The key that a line sets, on or off; None where it sets none."""
+    """Return the key that a line sets, also in a comment; None: it sets no key."""
     found = KEY.match(line)
     return found[1] if found else None
 
 
 def blocks(text):
-    """Table -> its lines; what introduces the file is left out."""
+    """Return the lines with keys of each table, without the introduction of the file."""
     found, name = {}, None
     for line in text.splitlines():
         if match := TABLE.match(line):
@@ -45,7 +48,7 @@ def blocks(text):
 
 
 def kinds(lines):
-    """The lines of each kind of a table, that in use first; one without kinds is one."""
+    """Return the lines of each kind of a table, the active kind first. A table without kinds has one list of lines."""
     found = [[]]
     for line in lines:
         if key_of(line) == "kind" and found[-1]:
@@ -55,18 +58,18 @@ def kinds(lines):
 
 
 def values(lines):
-    """Key -> value of lines, on or off; of several with one key the last."""
+    """Return the values of the keys of lines, also in comments. The last line of a key counts."""
     return {key: value for line in lines for key, value in tomllib.loads(line.removeprefix("#")).items()}
 
 
 @pytest.mark.parametrize("plant", ["spacecraft", "chain"])
-def test_what_is_written_is_the_default_scenario(plant):
+def test_new_writes_the_default_scenario(plant):
     written = tomllib.loads(new.text(plant, {}))
     assert parsing.dump(from_tables(written)) == parsing.dump(from_tables({"plant": {"kind": plant}}))
-    assert len(written) > 4  # and says so key by key
+    assert len(written) > 4  # with explicit keys
 
 
-def test_the_schema_is_a_file_that_is_not_written_over(command, tmp_path):
+def test_schema_command_does_not_overwrite_its_file(command, tmp_path):
     code, said, _ = command("schema")
     assert (code, "anyOf" in json.loads((tmp_path / "scenario.schema.json").read_text())) == (0, True)
     assert "#:schema scenario.schema.json" in said
@@ -74,14 +77,14 @@ def test_the_schema_is_a_file_that_is_not_written_over(command, tmp_path):
     assert command("schema", "--force", "--quiet") == (0, "", "")
 
 
-def test_it_is_written_without_docstrings_too():
+def test_new_does_not_need_docstrings():
     call = [sys.executable, "-OO", "-c", "from tuning.cli import new; print(new.text('chain', {}), end='')"]
     done = subprocess.run(call, capture_output=True, text=True, cwd=ROOT, check=False)
     assert (tomllib.loads(done.stdout), done.stderr) == (tomllib.loads(new.text("chain", {})), "")
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "scenarios").glob("*.toml")), ids=lambda path: path.stem)
-def test_a_scenario_like_another_is_that_one(path):
+def test_new_like_a_scenario_writes_the_same_scenario(path):
     raw = parsing.load(path)
     written = tomllib.loads(new.text(None, raw))
     assert parsing.dump(from_tables(written)) == parsing.dump(from_tables(raw))
@@ -89,8 +92,8 @@ def test_a_scenario_like_another_is_that_one(path):
 
 
 @pytest.mark.parametrize("name", ["hubble", "pleiades"])
-def test_keys_of_other_laws_are_the_defaults_of_the_same_mission(name):
-    """Taking the # away from a law's lines is as stating its kind and t_f alone."""
+def test_commented_keys_of_other_laws_are_their_defaults(name):
+    """The commented keys of a law have the same values as a scenario with only its kind and t_f."""
     raw = parsing.load(ROOT / "benchmarks" / "satellites" / f"{name}.toml")
     others = [values(lines) for lines in kinds(blocks(new.text(None, raw))["controller"])[1:]]
     others = [other for other in others if other["kind"] != "own"]
@@ -100,8 +103,8 @@ def test_keys_of_other_laws_are_the_defaults_of_the_same_mission(name):
         assert parsing.dump(from_tables({**raw, "controller": stated}))["controller"] == pytest.approx(other)
 
 
-def test_keys_of_ones_own_stay_in_order_and_are_quoted_where_toml_asks_for_it():
-    """A field of a class may have any letters; bare keys have not."""
+def test_keys_of_custom_classes_keep_their_order_and_are_quoted():
+    """A field name may have letters that TOML allows only in quoted keys."""
     own = {"kind": "own", "code": "mine.py:Mine", "größe": 3.0, "beta": 1.0, "alpha": 4.0}
     terms = [own, {"kind": "none"}]
     raw = {"disturbance": {"kind": "sum", "terms": terms}, "dispersion": {"own": own}, "reference": own}
@@ -111,7 +114,7 @@ def test_keys_of_ones_own_stay_in_order_and_are_quoted_where_toml_asks_for_it():
 
 
 @pytest.mark.parametrize("plant", layouts.TABLES)
-def test_every_key_of_the_plant_is_there_with_its_meaning(plant):
+def test_every_key_of_the_plant_is_written_with_its_meaning(plant):
     text = new.text(plant, {})
     found = blocks(text)
     assert list(found) == [*[name for name in layouts.TABLES[plant] if name != "tune"], "requirements", "tune"]
@@ -119,18 +122,18 @@ def test_every_key_of_the_plant_is_there_with_its_meaning(plant):
         said = kinds(found[name])
         structs = list(table.values()) if isinstance(table, Mapping) else [table]
         assert len(said) == len(structs)
-        explained = set() if name == "initial" else ATTITUDE  # there
+        explained = set() if name == "initial" else ATTITUDE  # attitude keys are explained in [initial] only
         for lines, struct in zip(said, structs, strict=True):
             wanted = {key.name: key.meaning for key in keys.of(struct) if key.name not in explained}
             assert {key_of(line) for line in lines} - {"kind", *explained} == set(wanted), (name, struct)
             assert all(meaning in text.replace("\n# ", " ") for meaning in wanted.values())
-    for metric in catalogues.CATALOGUES[plant]:  # a share of the time is asked for by the metric's own key
+    for metric in catalogues.CATALOGUES[plant]:  # the key of the metric itself requires a fraction of time
         assert bool(re.search(rf"\b{metric}\b", text)) == (not metric.startswith(catalogues.WITHIN)), metric
 
 
 @pytest.mark.parametrize("plant", ["spacecraft", "chain"])
-def test_what_is_off_is_allowed_as_it_stands(plant):
-    """Each kind of each table, and each line of a dispersion, in a scenario with noise and a limit."""
+def test_commented_keys_are_valid(plant):
+    """Every kind of every table and every dispersion is valid in a scenario with noise and a torque limit."""
     text = new.text(plant, {})
     found = blocks(text)
     written = tomllib.loads(text)
@@ -139,20 +142,20 @@ def test_what_is_off_is_allowed_as_it_stands(plant):
         "rate_noise_density",
         "star_tracker_every",
         "star_tracker_period",
-    ):  # beside rate_noise; without a filter
+    ):  # they exclude rate_noise or need a filter
         hardware.pop(key, None)
     base = {**written, "loop": {**written["loop"], "mode": "sampled"}, "hardware": hardware}
     attitude = {key: value for key, value in written.get("initial", {}).items() if key in ATTITUDE_KEYS}
     tried = 0
     for name, lines in found.items():
         groups = [[line] for line in lines] if name == "dispersion" else kinds(lines)
-        if name == "dispersion" and plant == "spacecraft":  # of which some need these
+        if name == "dispersion" and plant == "spacecraft":  # some dispersions need these tables
             base |= {"flexible": {}, "wheels": {}, "filter": {}}
         for table in map(values, groups):
-            if name == "initial":  # one attitude key at a time, below
+            if name == "initial":  # the next test checks each attitude key
                 table = {**{key: value for key, value in table.items() if key not in ATTITUDE}, **attitude}
-            given = {"loop": {"mode": "sampled"}, "tune": {"statistic": "cvar"}}.get(name, {})  # cvar has a level
-            alone = {"hardware": {}} if name == "sensors" else {}  # of one's own, in place of noise
+            given = {"loop": {"mode": "sampled"}, "tune": {"statistic": "cvar"}}.get(name, {})  # key `level` needs cvar
+            alone = {"hardware": {}} if name == "sensors" else {}  # custom sensors exclude noise in [hardware]
             around = written if name == "tune" else base  # default bounds of delta follow the loop's mode
             from_tables({**around, **alone, name: hardware if name == "hardware" else {**table, **given}})
             tried += 1
@@ -161,17 +164,17 @@ def test_what_is_off_is_allowed_as_it_stands(plant):
     assert isinstance(dispersion, type)
     drawn = sum(len(layouts.DISPERSIONS[key.name]) for key in keys.of(dispersion))
     others = sum(len(table) if isinstance(table, Mapping) else 1 for table in layout.values()) - 1
-    assert tried == others + drawn + 1  # [requirements] is no table of the layout
+    assert tried == others + drawn + 1  # 1: the table [requirements] is not in the layout
 
 
 @pytest.mark.parametrize("key", ["quat_xyzw", "quat_wxyz", "rotvec_deg", "mrp", "dcm_body_to_inertial", "euler_deg"])
-def test_each_attitude_key_is_allowed_as_it_stands(key):
+def test_every_attitude_key_is_valid(key):
     table = values(blocks(new.text(None, {}))["initial"])
     beside = {"sequence": table["sequence"]} if key == "euler_deg" else {}
     assert from_tables({"initial": {key: table[key], **beside}})
 
 
-def test_what_cannot_be_written_is_refused():
+def test_new_refuses_unknown_plants_and_invalid_scenarios():
     with pytest.raises(UsageError, match=f"--plant is boat, but must be {PLANTS}"):
         new.text("boat", {})
     with pytest.raises(UsageError, match="--plant is chain, but the scenario of --like has"):
@@ -180,7 +183,7 @@ def test_what_cannot_be_written_is_refused():
         new.text(None, {"controller": {"eta": 1.0}})
 
 
-def test_the_command_writes_a_file_and_over_none(command, tmp_path):
+def test_new_command_does_not_overwrite_files(command, tmp_path):
     assert command("new") == (0, "scenario in scenario.toml\n", "")
     written = (tmp_path / "scenario.toml").read_text()
     assert written == new.text(None, {})
@@ -194,15 +197,15 @@ def test_the_command_writes_a_file_and_over_none(command, tmp_path):
     assert (tmp_path / "scenario.toml").read_text() == new.text(None, parsing.load(FLIGHT)) != written
 
 
-@pytest.mark.long  # what is written is what it is like: the test above
-def test_what_is_written_flies(command):
+@pytest.mark.long  # a shorter test checks that the written scenario equals its model
+def test_written_scenario_can_be_simulated(command):
     assert command("new", "--like", FLIGHT, "--quiet") == (0, "", "")
     code, said, _ = command("simulate", "scenario.toml", "--trial", 1, "--no-figures")
-    assert code == 1  # with the paper's gains, over its limit
+    assert code == 1  # the published gains exceed the torque limit
     assert "peak_torque" in said
 
 
-def test_a_name_is_told_where_the_output_lacks_its_letters(command, tmp_path, monkeypatch):
+def test_file_name_is_escaped_if_the_output_encoding_lacks_its_letters(command, tmp_path, monkeypatch):
     plain = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
     monkeypatch.setattr(sys, "stdout", plain)
     assert command("new", "größe.toml")[::2] == (0, "")
@@ -219,14 +222,14 @@ def test_a_name_is_told_where_the_output_lacks_its_letters(command, tmp_path, mo
         (["a.toml", "--like", "none.toml"], "the scenario file none.toml is not there"),
     ],
 )
-def test_the_command_refuses_and_leaves_nothing(command, tmp_path, options, said):
+def test_new_command_refuses_invalid_options_and_writes_nothing(command, tmp_path, options, said):
     before = sorted(tmp_path.iterdir())
     assert command("new", *options) == (2, "", f"ptsmc: {said}\n")
     assert sorted(tmp_path.iterdir()) == before
 
 
-def test_what_is_off_has_the_values_it_would_get(tmp_path):
-    """Other kinds too: a finite-time observer's gain is 20 times a bound, and positive where that is zero."""
+def test_commented_keys_have_their_default_values(tmp_path):
+    """The gain of a finite-time observer is 20 times a bound, and positive if the bound is zero."""
     for bound, gain in ((0.0, 0.02), (2e-3, 0.04)):
         lines = blocks(new.text(None, {"controller": {"disturbance_rate_bound": bound}}))["observer"]
         (shown,) = (values(group)["gain"] for group in kinds(lines) if values(group)["kind"] == "finite_time")
@@ -235,7 +238,7 @@ def test_what_is_off_has_the_values_it_would_get(tmp_path):
         assert parsing.dump(from_tables(given))["observer"]["gain"] == shown
 
 
-def test_the_examples_are_copied_and_none_is_written_over(command, tmp_path):
+def test_examples_are_copied_without_overwriting(command, tmp_path):
     code, said, _ = command("examples", "mine")
     shipped = {path.name: path.read_text() for path in (ROOT / "scenarios").iterdir() if path.is_file()}
     assert {path.name: path.read_text() for path in (tmp_path / "mine").iterdir()} == shipped
@@ -252,8 +255,8 @@ def test_the_examples_are_copied_and_none_is_written_over(command, tmp_path):
 
 
 @pytest.mark.long
-def test_a_wheel_brings_all_that_flying_takes(tmp_path):
-    """Built, unpacked elsewhere and used from there; what it depends on is this environment's."""
+def test_installed_wheel_simulates_an_example(tmp_path):
+    """The wheel is built, installed in another folder and used there, with the dependencies of this environment."""
     pip = sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"
     away = tmp_path / "away"
     away.mkdir()

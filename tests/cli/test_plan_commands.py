@@ -1,4 +1,4 @@
-"""`ptsmc montecarlo --plan`: the rows of a table as a campaign that is resumed, replayed and put on a page."""
+"""`ptsmc montecarlo --plan`: campaigns with a run table, which can be resumed, replayed and reported."""
 
 import json
 import shlex
@@ -24,7 +24,7 @@ def rows_of(folder):
     return pl.concat([pl.read_parquet(path) for path in sorted((folder / "trials").glob("*.parquet"))])
 
 
-def test_the_plan_of_a_campaign_flown_is_the_campaign(command, tmp_path):
+def test_run_table_of_a_dry_run_reproduces_the_campaign(command, tmp_path):
     options = ["--seed", 3, "--no-figures", "--quiet"]
     assert command("montecarlo", "s.toml", "--trials", 150, *options)[0] == 0
     assert command("montecarlo", "s.toml", "--trials", 150, "--dry-run", *options, "--out", "dry")[0] == 0
@@ -35,7 +35,7 @@ def test_the_plan_of_a_campaign_flown_is_the_campaign(command, tmp_path):
     assert (told["plan"], told["trials"]) == ("plan", 150)
 
 
-def test_corner_cases_are_flown_resumed_replayed_and_put_on_a_page(command, tmp_path):
+def test_run_table_is_simulated_resumed_replayed_and_reported(command, tmp_path):
     (tmp_path / "corners.csv").write_text(CORNERS)
     asked = ["montecarlo", "s.toml", "--plan", "corners.csv", "--no-figures"]
     code, said, _ = command(*asked)
@@ -46,20 +46,20 @@ def test_corner_cases_are_flown_resumed_replayed_and_put_on_a_page(command, tmp_
     rows = rows_of(folder)
     assert rows["trial"].to_list() == [0, 1, 2]
     assert rows["initial_x2"].to_list() == [0.0, 0.02, -0.02]
-    assert rows["state_noise_1"].n_unique() == 3  # noises are drawn as ever
+    assert rows["state_noise_1"].n_unique() == 3  # omitted quantities are random
     read = checked(folder)
     assert "ptsmc montecarlo s.toml --plan corners.csv --no-figures" in read.text
 
     part = next((folder / "trials").iterdir())
     part.unlink()
-    assert command(*asked, "--quiet")[0] == 0  # again what is missing
+    assert command(*asked, "--quiet")[0] == 0  # it simulates the missing part
     assert rows_of(folder).equals(rows)
     assert command("worst", folder, "--by", "peak_torque", "-n", 1)[0] == 0
     code, said, _ = command("replay", folder, "--trial", 1, "--no-figures")
     assert (code, "equals its row to the last digit" in said) == (0, True)
     history = pl.read_csv(folder / "replay" / "1" / "trajectory.csv")
     assert history["x2"][0] == 0.02
-    again = checked(folder / "replay" / "1").text  # simulate flies no row of a plan
+    again = checked(folder / "replay" / "1").text  # `ptsmc simulate` has no option for a row of a run table
     assert f"ptsmc replay {shlex.quote(str(folder))} --trial 1" in again
     assert "ptsmc simulate scenario.toml" not in again
     assert command("replay", folder, "--trial", 3)[0] == 2
@@ -88,7 +88,7 @@ def test_corner_cases_are_flown_resumed_replayed_and_put_on_a_page(command, tmp_
         (["--plan", "bad.csv", "--until-confident", "0.1"], "{--plan, --until-confident}"),
     ],
 )
-def test_a_plan_that_cannot_be_flown_is_refused_and_nothing_is_written(command, tmp_path, options, said):
+def test_invalid_run_tables_are_refused_and_nothing_is_written(command, tmp_path, options, said):
     (tmp_path / "bad.csv").write_text("initial_x1,initial_x2\n0,0\n0,nan\n")
     code, out, error = command("montecarlo", "s.toml", *options)
     assert (code, out) == (2, "")

@@ -1,4 +1,4 @@
-"""Pointing requirements as a user asks for them: rows, verdicts, the review's tables, the page."""
+"""Pointing requirements of a scenario: rows, verdicts, compliance table, pointing budget and page."""
 
 import json
 
@@ -35,7 +35,10 @@ drawn, values = jax.jit(lambda parts, dispersion, *at: dispersion.apply(parts, *
 
 @pytest.fixture(scope="module")
 def one_by_one():
-    """In place of `montecarlo.run`: the trials by the program of one, which flies the floor too; each of them once."""
+    """A replacement of `montecarlo.run` with the compiled program of single trials, which the lower bound uses too.
+
+    It simulates each trial once.
+    """
     known = {}
 
     def one(parts, dispersion, seed, trial):
@@ -54,7 +57,7 @@ def one_by_one():
     return run
 
 
-# batches: `test_montecarlo.py`; what they are made of in lanes: `test_lanes.py`
+# `test_montecarlo.py` and `test_lanes.py` test batches
 @pytest.fixture(params=short(["alone", "in a batch"], ["alone"]))
 def flown(request, command, tmp_path, monkeypatch, one_by_one):
     if request.param == "alone":
@@ -68,7 +71,7 @@ def flown(request, command, tmp_path, monkeypatch, one_by_one):
     return code, said, rows, json.loads((tmp_path / FOLDER / "summary.json").read_text())
 
 
-def test_pointing_is_asked_for_shown_and_told(flown, tmp_path):
+def test_pointing_requirements_have_verdicts_budget_and_table(flown, tmp_path):
     code, said, rows, found = flown
     verdicts = {told["metric"]: told for told in found["verdicts"]}
     assert code == (0 if all(told["met"] for told in verdicts.values()) else 1)
@@ -91,7 +94,7 @@ def test_pointing_is_asked_for_shown_and_told(flown, tmp_path):
 
     budget = found["pointing"]["budget"]
     assert set(budget) == {"ape", "mpe", "rpe", "pde", "ake", "mke", "rke"}
-    assert budget["ape"]["x"] is None  # 150 runs show nothing of 99.73 %
+    assert budget["ape"]["x"] is None  # 150 runs are too few for 99.73 %
     for place in (said, checked(tmp_path / FOLDER).text):
         assert "from 0.5 s after t_f to t_end, with 95 % confidence; boresight 1, 0, 0" in place
         assert "an angle is - without 1109 runs that all reach their end (852 for 90 % confidence)" in place
@@ -108,16 +111,16 @@ def test_pointing_is_asked_for_shown_and_told(flown, tmp_path):
     assert [row[9] for row in table.rows] == ["22", "4", "every run"]  # 0.9^22 <= 0.1
 
 
-def test_the_worst_share_of_time_is_the_smallest(command, flown, tmp_path):
+def test_worst_fraction_of_time_is_the_smallest(command, flown, tmp_path):
     _, said, rows, found = flown
     within = rows["within_ape_boresight"].to_numpy()
     ordered = np.sort(within)
     told = found["quantiles"]["within_ape_boresight"]
-    assert (told["min"], told["0.0027"]["value"]) == (ordered[0], ordered[0])  # 99.73 % of 150 runs are all of them
+    assert (told["min"], told["0.0027"]["value"]) == (ordered[0], ordered[0])  # 99.73 % of 150 runs: all runs
     assert told["0.1"]["value"] == ordered[15]  # 135 runs of 150 reach it
     assert told["0.5"]["value"] == ordered[75]
     assert "0.9973" not in told
-    assert "within_ape_boresight" not in said.split("99.73 % reach")[0]  # but below it, beside the smallest
+    assert "within_ape_boresight" not in said.split("99.73 % reach")[0]  # it is in the table after this heading
     assert f"{ordered[0]:.3g}" in said.split("99.73 % reach")[1]
     assert "Fractions of the time within a limit, larger is better" in checked(tmp_path / FOLDER).text
 
@@ -129,7 +132,7 @@ def test_the_worst_share_of_time_is_the_smallest(command, flown, tmp_path):
     assert set(why["trial"]) == set(np.argsort(within, kind="stable")[:3])
 
 
-def test_a_budget_is_the_order_statistic_that_shows_it(monkeypatch, flown):
+def test_pointing_budget_is_an_order_statistic(monkeypatch, flown):
     from tuning.studies import campaign_summary
 
     rows, found = flown[2:]
@@ -148,11 +151,11 @@ def test_a_budget_is_the_order_statistic_that_shows_it(monkeypatch, flown):
 
 @pytest.mark.parametrize(("flown", "ok", "missed", "said"), [
     (2000, 2000, 0, "without 1109 runs that all reach their end (852 for 90 % confidence)"),
-    (1108, 1098, 0, "without 1109 runs that all reach their end"),  # too few for 95 %, whether or not some fail
+    (1108, 1098, 0, "without 1109 runs that all reach their end"),  # too few runs for 95 % confidence
     (1109, 1099, 0, "because 10 runs did not reach their end"),
-    (1109, 1049, 50, "because 10 runs did not reach their end"),  # a run that misses t_f has angles
+    (1109, 1049, 50, "because 10 runs did not reach their end"),  # runs that do not converge by t_f have angles
 ])  # fmt: skip
-def test_why_a_budget_has_no_value_is_said(flown, ok, missed, said):
+def test_report_explains_a_missing_budget_value(flown, ok, missed, said):
     told = {"after": 0.0, "boresight": [1.0, 0.0, 0.0], "probability": 0.9973, "confidence": 0.95, "window": 1.0,
             "budget": {"ape": {"x": None}}}  # fmt: skip
     found = examples.campaign(pointing=told, flown=flown, counts={"ok": ok, "missed": missed})
@@ -160,7 +163,7 @@ def test_why_a_budget_has_no_value_is_said(flown, ok, missed, said):
     assert last.startswith(f"an angle is - {said}")
 
 
-def test_a_single_run_knows_the_indices(command, flown, tmp_path):
+def test_single_run_has_the_pointing_indices(command, flown, tmp_path):
     code, said, _ = command("simulate", "s.toml", "--trial", 3, "--no-figures", "--out", "one")
     made = json.loads((tmp_path / "one" / "summary.json").read_text())
     row = flown[2].row(3, named=True)
