@@ -109,7 +109,7 @@ def paper_is(scenario: Scenario) -> str:
 
     It tells whether the gains are unchanged, scaled to another body or period, or belong to another law.
     """
-    if not scenario.controller.prescribed:
+    if not scenario.controller.law.prescribed:
         return "paper's law"
     as_published = mission.published(scenario) and of_paper(scenario)["delta"] == AS_PUBLISHED
     return "published" if as_published else "published, scaled"
