@@ -178,7 +178,7 @@ def tradeoff(
     if limit is not None:
         axes.axhline(limit, **LIMIT, label=f"limit {limit:g} {unit}")
     if floor:
-        axes.axvline(floor, **FLOOR, label=f"floor {floor:.2g}")
+        axes.axvline(floor, **FLOOR, label=f"lower bound {floor:.2g}")
     axes.set_xlabel(f"window error [{error_unit}]")
     _legend_below(figure, len(arrays) + 2, columns=1)
     return figure
@@ -239,7 +239,7 @@ def front(
     if limit is not None:
         axes.axvline(limit, **LIMIT, label=f"limit {limit:g} {units[1]}")
     if floor:
-        axes.axhline(floor, **FLOOR, label=f"floor {floor:.2g}")
+        axes.axhline(floor, **FLOOR, label=f"lower bound {floor:.2g}")
     axes.set_xlabel(f"largest peak torque [{units[1]}]")
     plain_ticks(axes.xaxis)
     axes.legend(fontsize=9)

@@ -47,7 +47,7 @@ def test_a_tradeoff_has_each_trial_and_their_rms_beside_their_mean_peak():
     np.testing.assert_array_equal(trials, np.stack([errors, peaks], axis=1))
     np.testing.assert_allclose(whole, [13e-6 / np.sqrt(3.0), 0.3], rtol=1e-12)
     said = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
-    assert said == ["tuned: RMS 7.51e-06, mean peak 0.3 N m", "limit 0.5 N m", "floor 1e-06"]
+    assert said == ["tuned: RMS 7.51e-06, mean peak 0.3 N m", "limit 0.5 N m", "lower bound 1e-06"]
 
 
 @pytest.mark.parametrize(("low", "high", "least"), [(1e-6, 0.1, 5), (4.167e-5, 0.1188, 4)])  # the other: long numbers
