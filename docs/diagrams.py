@@ -137,7 +137,7 @@ def natural_frequency() -> Figure:
     for line in (axes.xaxis, axes.yaxis):
         style.plain_ticks(line)
     axes.set(xlabel=r"time to go $\tau$ [s]", ylabel="frequency [rad/s]", xlim=(t_f, 0.8 * delta))
-    axes.set_title("The published gains reach the Nyquist frequency before the hand-over", loc="left", pad=12)
+    axes.set_title("The natural frequency of the published gains reaches the Nyquist frequency", loc="left", pad=12)
     axes.legend(loc="upper left", bbox_to_anchor=(0.02, 0.86))
     return figure
 

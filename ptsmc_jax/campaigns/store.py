@@ -172,7 +172,7 @@ def difference(folder: Path, scenario: Tables, made_by: Tables) -> str | None:
         if name == CODE and old is not None and old != value:
             return f"a run of another version of the source code (checksum {old}, not {value})"
         if old != value:
-            here = "which is not asked for here" if value is None else f"not {value}"
+            here = "which is not used here" if value is None else f"not {value}"
             return f"a run without {name}" if old is None else f"a run with {name} {old}, {here}"
     for table in dict.fromkeys((*old_tables, *new_tables)):
         for key in dict.fromkeys((*old_tables.get(table, {}), *new_tables.get(table, {}))):

@@ -222,7 +222,7 @@ class InTheLoop:
         if not differing:
             return ""
         more = f" and {len(differing) - NAMED} more" if len(differing) > NAMED else ""
-        return f"the controller flies with its own numbers, not the scenario's: {', '.join(differing[:NAMED])}{more}"
+        return f"the controller has other parameters than the scenario: {', '.join(differing[:NAMED])}{more}"
 
     @property
     def software(self) -> Software:

@@ -54,7 +54,7 @@ class Spacecraft(Table, frozen=True):
         ),
     ] = (10.0, 12.0, 14.0)
     true_inertia: Annotated[
-        Inertia | None, Meaning("of the body that flies; default: inertia, which the law knows", "kg m^2")
+        Inertia | None, Meaning("of the true plant; default: inertia of the design model", "kg m^2")
     ] = None
 
 

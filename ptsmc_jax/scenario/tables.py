@@ -77,7 +77,7 @@ class Limit(Table, frozen=True):
         NotNegative, Meaning('the largest value allowed, a number or with its unit, "0.05 deg"; 0 of `saturated` only')
     ]
     quantile: Annotated[
-        Quantile | None, Meaning("the share of the trials in which it must hold; default: all that are flown")
+        Quantile | None, Meaning("fraction of the trials that must keep the limit; default: all simulated trials")
     ] = None
     probability: Annotated[
         Quantile | None, Meaning("of what `interpretation` says; of an ensemble it is the quantile")

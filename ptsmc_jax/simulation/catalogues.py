@@ -83,7 +83,7 @@ MARGINS = {
     "delay_margin": Margin("s", "further delay to the border of stability"),
     "modulus_margin": Margin("dB", "largest sensitivity, 1 / the distance of L from -1", at_least=False),
 }
-NO_SIGN = "the exact sign has no slope: margins are those of the loop without its switching term"
+NO_SIGN = "the discontinuous sign has no derivative: margins are those of the loop without its switching term"
 
 
 def units(kind: str) -> dict[str, str]:

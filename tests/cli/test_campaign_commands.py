@@ -359,7 +359,7 @@ def test_damaged_part_is_reported_and_simulated_again(command, flown):
         assert "damaged" in error
     code, _, error = command("montecarlo", "s.toml", "--trials", 250, "--seed", 3, "--no-figures", "--quiet")
     assert code == 0
-    assert f"{part.name} is damaged and is flown again" in error
+    assert f"{part.name} is damaged and is simulated again" in error
     same(rows_of(flown), whole)
     assert part.with_name(part.name + ".damaged").exists()  # damaged files are renamed, not deleted
 

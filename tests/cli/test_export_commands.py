@@ -55,8 +55,7 @@ def test_parameters_that_differ_in_the_controller_are_reported(command, tmp_path
     (tmp_path / "s.toml").write_text(SHORT_CHAIN.replace("[controller]", "[controller]\neta = 2.9\nk1 = 0.8"))
     status, _, err = command("simulate", "s.toml", "--controller", exported, "--no-figures", "--quiet")
     said = (
-        "the controller flies with its own numbers, not the scenario's: law_eta = 3 instead of 2.9, "
-        "law_k1 = 1 instead of 0.8"
+        "the controller has other parameters than the scenario: law_eta = 3 instead of 2.9, law_k1 = 1 instead of 0.8"
     )
     assert (status, err) == (0, f"ptsmc: {said}\n")
     (place,) = (tmp_path / "out").iterdir()
@@ -96,7 +95,7 @@ def test_campaign_runs_the_exported_controller_and_copies_it(command, tmp_path):
 
     said = refused(command, tmp_path, *flight, "--out", "r")  # without the controller, it is another campaign
     assert "holds a run with flight_code_sha256" in said
-    assert "which is not asked for here" in said
+    assert "which is not used here" in said
     replay = "replay", "r", "--trial", 7, "--no-figures"
     assert "r/controller (--controller), which this command would run; allowed is --trust" in refused(
         command, tmp_path, *replay

@@ -87,7 +87,7 @@ def test_progress_reports_whether_the_search_kept_the_limits(small):
         told = []
         loaded = scenario.from_tables(tomllib.loads(text))
         tuner.tune(loaded, 0, lambda *said, told=told: told.append(said), trusted=False, tries=1)
-        (over,) = (said[4] for said in told if said[0] == "judging on fresh trials")
+        (over,) = (said[4] for said in told if said[0] == "verifying on held-out trials")
         assert (over == 0.0) is kept
 
 

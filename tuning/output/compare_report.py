@@ -122,7 +122,7 @@ QUESTIONS = (
         logarithmic=False,
         limit="gain_margin",
         note="Margins of the nominal loop in the hold phase, at its worst input. A required margin is the worst of the "
-        "dispersed loops, in the hold phase and the judged part of the approach phase. Below 0 the loop is unstable. "
+        "dispersed loops, in the hold phase and the analysed part of the approach phase. Below 0 the loop is unstable. "
         "The chart shows the gain margin.",
     ),
     Question(

@@ -47,7 +47,7 @@ def table(summary: Margins) -> Table:
 def _lines(summary: Margins) -> Iterator[str]:
     """Return what limits the meaning of the margins."""
     if summary.stable and not summary.open:
-        yield "these are the smallest margins at any input, in the hold phase and the judged approach phase"
+        yield "these are the smallest margins at any input, in the hold phase and the frozen approach phase"
     if summary.swing is not None:
         yield from swinging(summary.swing)
     if summary.start_deg is not None:

@@ -85,7 +85,7 @@ def _of_time(verdict: Verdict) -> str:
     """Return the required and the observed fraction of time in words, or "" if the requirement counts trials."""
     if verdict.share_of_time is None or verdict.quantile is None:
         return ""
-    asked = f"asked for: {100 * verdict.quantile:g} % of {INTERPRETATIONS[verdict.interpretation].split(':')[0]}"
+    asked = f"required: {100 * verdict.quantile:g} % of {INTERPRETATIONS[verdict.interpretation].split(':')[0]}"
     least = "at least " if verdict.interpretation == "temporal" else ""
     return f"{asked}; seen: {least}{percent(verdict.share_of_time)} %"
 

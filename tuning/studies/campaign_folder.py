@@ -246,10 +246,10 @@ class Folder:
         if broken:
             raise RefusedError(
                 f"{broken[0]} is damaged or of another campaign; "
-                "`ptsmc montecarlo` with the same options flies it again"
+                "`ptsmc montecarlo` with the same options simulates it again"
             )
         if not parts:
-            raise RefusedError(f"{self.path} holds no trials yet; `ptsmc montecarlo` flies them")
+            raise RefusedError(f"{self.path} contains no trials yet; `ptsmc montecarlo` simulates them")
         return parts
 
 
@@ -387,7 +387,7 @@ def fly(
         aside = path.with_name(path.name + ".damaged")
         with contextlib.suppress(FileNotFoundError):  # another shard has renamed it
             os.replace(path, aside)
-        what = "is damaged and is flown again" if rows.named(path) else "is no part of a campaign"
+        what = "is damaged and is simulated again" if rows.named(path) else "is no part of a campaign"
         print(f"ptsmc: {path} {what}; it is kept as {aside.name}", file=sys.stderr)
     alone = shard == (1, 1) and elsewhere is None
     if alone:  # else other processes may be writing into the folder

@@ -197,7 +197,7 @@ def that_fly(scenario: Scenario, rivals: Rivals = Rivals()) -> dict[str, Scenari
             study(posed)
             free_gains.need_some(posed)
         except ScenarioError as error:
-            raise ScenarioError(f"the law {law} cannot fly this: {error}") from None
+            raise ScenarioError(f"the law {law} cannot be used in this scenario: {error}") from None
     return each
 
 
@@ -268,7 +268,7 @@ def compare(
     others, refused = judging.beside(scenario)
     found, interrupted = {}, False
     if PAPER in others:
-        tell("the paper's gains: judging on fresh trials", 0, 0, np.nan, 0.0)
+        tell("published gains: verifying on held-out trials", 0, 0, np.nan, 0.0)
         found[PAPER] = _with_more(_papers(judging.as_flown(others[PAPER]), fresh_seed), fresh_seed)
     for law, posed in rivals.items():
         report = headed(tell, law)

@@ -43,7 +43,7 @@ def find(scenario: Scenario) -> tuple[Study, Course]:
         raise ScenarioError(f"margins are those about the nominal run, which ends {status}: {why}")
     if without_slopes:
         raise ScenarioError(
-            f"margins need slopes of the loop by all that it carries, but with controller.kind = "
+            f"margins need derivatives of the loop by all of its states, but with controller.kind = "
             f"{errors.show(scenario.controller.kind)} one is not finite in hold; allowed is a law that has them there"
         )
     return ready, course

@@ -160,7 +160,7 @@ def _trust(found: Trust, tuning: Tuning) -> dict[str, Any]:
 def _beyond(seen: Beyond | None, bound: float) -> str:
     """Return the results beyond a bound in words."""
     if seen is None:
-        return f"on its bound {bound:g}; what lies beyond it was not flown"
+        return f"on its bound {bound:g}; values beyond it were not simulated"
     if seen.better:
         return f"better beyond its bound: {seen.times:.3g} times the error at {seen.value:g}, every requirement kept"
     if seen.broken is not None:

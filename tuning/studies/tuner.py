@@ -209,7 +209,7 @@ def _search_and_judge(
     scenario = posed.ready.scenario
     earlier = list[Try]()
     while True:
-        report("judging on fresh trials", 0, 0, outcome.value, outcome.over)
+        report("verifying on held-out trials", 0, 0, outcome.value, outcome.over)
         judged = _judge(scenario, posed, outcome, judging.seed_of_judge(seed, len(earlier)))
         over = _over(outcome, judged.verdicts)
         if not over or outcome.interrupted or len(earlier) + 1 >= tries:
@@ -376,7 +376,7 @@ def _broken(verdicts: list[Verdict], trials: Trials) -> str | None:
         if not one.met:
             return str(one)
     lost = int(np.count_nonzero(~trials.ok))
-    return f"{lost} of {trials.status.size} fresh trials do not arrive" if lost else None
+    return f"{lost} of {trials.status.size} held-out trials fail" if lost else None
 
 
 def _prepare(scenario: Scenario) -> None:
