@@ -1,1 +1,1 @@
-"""What theory says of a run: exact solutions, envelopes, rules, the linearised loop, margins, the floor."""
+"""Analysis without trials: exact solutions, envelopes, design rules, stability margins and the lower error bound."""

@@ -1,8 +1,9 @@
-"""Borders of stability of the sampled double integrator under proportional and derivative feedback, in closed form.
+"""Stability limits of the sampled double integrator under proportional and derivative feedback.
 
-Near the reference each component of the attitude error obeys eps'' = a, with the law's a = -kp eps - kd eps' computed
-from samples and held, periods later where there is a delay: kp and kd are (57)'s and (60)'s with the smooth sign's
-slope. What bounds of gains and the lines of a map are drawn from, before there is a loop to linearise (`linear`).
+Near the reference each component of the attitude error obeys eps'' = a with a = -kp eps - kd eps'. The command a is
+computed from a sample, may be delayed and is then held for a period. The gains kp and kd come from (57) and (60), see
+`gains`, which is the function to read first. The tuner derives its gain bounds, and maps their stability lines, from
+these limits; the linearised loop (`linear`) is not needed for them.
 """
 
 from collections.abc import Callable
@@ -13,18 +14,20 @@ import numpy as np
 def gains(
     t: np.ndarray, t_f: float, eta: float, delta: float, k1: float, slope: float, surface_rate: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Gains kp [1/s^2] and kd [1/s], (times,) each.
+    """Return the gains kp [1/s^2] and kd [1/s] of the frozen loop, (times,) each.
 
-    eta^2/tau^2 + slope eta/2 and (2 eta - 1)/tau + slope tau/2 before the hand-over; c k and c + k after it, with
-    k = (K1 + slope)/2.
+    The time to go is tau = t_f - t, and k = (K1 + slope)/2:
+
+        before the hand-over: kp = eta^2/tau^2 + slope eta/2,  kd = (2 eta - 1)/tau + slope tau/2
+        after the hand-over:  kp = c k,                        kd = c + k
 
     Args:
-        t: (times,) [s].
-        t_f: the prescribed time [s].
+        t: times (times,) [s].
+        t_f: prescribed time [s].
         eta: exponent of the law [-].
-        delta: how long before t_f it hands over [s].
+        delta: time between the hand-over and t_f [s].
         k1: K1 of (60) [1/s].
-        slope: |T J^-1| K2 / width of the smooth sign [1/s^2].
+        slope: derivative of the switching term in the boundary layer, |T J^-1| K2 / sign_width.
         surface_rate: c [1/s].
     """
     tau = t_f - np.asarray(t, dtype=float)
@@ -37,21 +40,28 @@ def gains(
 
 
 def _closed(kp: float, kd: float, h: float, delay: float) -> np.ndarray:
-    """Matrix of a period of the frozen loop; delay: in periods, any number of at least 0."""
+    """Return the transition matrix (n, n) of the frozen loop over one period.
+
+    Args:
+        kp: proportional gain [1/s^2].
+        kd: derivative gain [1/s].
+        h: control period [s].
+        delay: delay of the command in periods, whole or fractional, at least 0.
+    """
     whole = int(np.floor(delay))
-    part = delay - whole  # the command of `whole` periods ago acts from here on, the one before until then
+    part = delay - whole  # fraction of the period after which the command of `whole` periods ago replaces the older one
     n = 2 + whole + (part > 0)
     move = np.eye(n)
     move[0, 1] = h
 
     def push(share_from: float, share_to: float) -> tuple[float, float]:
-        """Effect on eps and eps' of a unit acceleration between two shares of the period."""
+        """Change of eps and eps' over the period by a unit acceleration between two fractions of it."""
         a, b = share_from * h, share_to * h
         return (h - a) ** 2 / 2 - (h - b) ** 2 / 2, b - a
 
     late_push, early_push = push(part, 1.0), push(0.0, part)
     feedback = np.array([-kp, -kd])
-    # behind eps and eps' stand the commands waiting, the newest first
+    # the state is eps, eps' and the delayed commands, newest first
     if whole == 0:
         move[:2, :2] += np.outer(late_push, feedback)
     else:
@@ -64,12 +74,19 @@ def _closed(kp: float, kd: float, h: float, delay: float) -> np.ndarray:
 
 
 def radius(kp: float, kd: float, h: float, delay: float = 0.0) -> float:
-    """Largest modulus of the frozen loop's poles: below 1 it is stable. h: period [s]; delay: in periods."""
+    """Return the spectral radius of the frozen loop [-]. The loop is stable below 1.
+
+    Args:
+        kp: proportional gain [1/s^2].
+        kd: derivative gain [1/s].
+        h: control period [s].
+        delay: delay of the command in periods, whole or fractional, at least 0.
+    """
     return float(np.abs(np.linalg.eigvals(_closed(kp, kd, h, delay))).max())
 
 
 def _last(stable: Callable[[float], bool], low: float, high: float) -> float:
-    """Largest number at which `stable` still holds, by bisection; inf where it holds at `high`."""
+    """Return the largest number for which `stable` is true, by bisection, or infinity if it is true at `high`."""
     if stable(high):
         return float("inf")
     for _ in range(60):
@@ -79,20 +96,34 @@ def _last(stable: Callable[[float], bool], low: float, high: float) -> float:
 
 
 def implicit_gains(eta: float, tau: float) -> tuple[float, float]:
-    """Gains kp, kd before the hand-over with implicit sampling and no switching term; tau: time to go in periods.
+    """Return kp and kd before the hand-over for implicit sampling without switching term, with the period as unit.
 
-    From (1 - 1/tau)^eta s = s_0 + g a, see `laws.prescribed_time.PrescribedTimeLaw.next_s`: eta (1 - share) / g and
-    (tau - 1 + eta - share tau) / g, g = tau - 1 + eta/2. On s = 0 the error falls by
-    (1 - eta/(2 tau)) / (1 + eta/(2 (tau - 1))) in a period, below 1 in size for every tau >= 1.
+    They solve (1 - 1/tau)^eta s = s_0 + g a, see `laws.prescribed_time.PrescribedTimeLaw.next_s`:
+
+        kp = eta (1 - share) / g,  kd = (tau - 1 + eta - share tau) / g,  share = (1 - 1/tau)^eta,  g = tau - 1 + eta/2
+
+    On s = 0 a period multiplies the error by
+
+        (1 - eta/(2 tau)) / (1 + eta/(2 (tau - 1))),
+
+    whose modulus is below 1 for every tau >= 1.
+
+    Args:
+        eta: exponent of the law [-].
+        tau: time to go in periods.
     """
     share, g = (1.0 - 1.0 / tau) ** eta, tau - 1.0 + eta / 2
     return eta * (1.0 - share) / g, (tau - 1.0 + eta - share * tau) / g
 
 
 def largest_index(eta: float, delay: float = 0.0, *, implicit: bool = False) -> float:
-    """Largest (2 eta - 1) h / tau at which the frozen loop before the hand-over is stable: 2 without delay.
+    """Return the largest (2 eta - 1) h / tau with a stable frozen loop before the hand-over [-]: 2 without delay.
 
-    implicit: with implicit sampling; infinite where it is stable down to a period before t_f.
+    Args:
+        eta: exponent of the law [-].
+        delay: delay of the command in periods.
+        implicit: whether the law uses implicit sampling. The result is then infinite if the loop is stable until one
+            period before t_f.
     """
 
     def stable(index: float) -> bool:
@@ -104,22 +135,34 @@ def largest_index(eta: float, delay: float = 0.0, *, implicit: bool = False) -> 
 
 
 def smallest_delta(eta: float, h: float, delay: float = 0.0, *, anchored: bool = True, implicit: bool = False) -> float:
-    """Smallest delta [s] for which the last sample before the hand-over is stable.
+    """Return the smallest delta [s] that keeps the frozen loop stable at the last sample before the hand-over.
 
-    On the anchored clock it lies at tau = delta + h: without delay (eta - 3/2) h, never below 0. On the flight clock it
-    may lie at the hand-over itself: (eta - 1/2) h. With implicit sampling, whose last such period ends before the
-    hand-over, it lies a period earlier on either; without delay there is no border: 0.
+    The limit depends on the time to go tau at that sample. The anchored clock has tau = delta + h, so that the smallest
+    delta is (eta - 3/2) h without delay. The flight clock may have tau = delta, so that it is (eta - 1/2) h. Implicit
+    sampling adds one period to tau on both clocks, because its last such period ends before the hand-over. It has no
+    limit without delay, and the result is 0. The result is never negative.
+
+    Args:
+        eta: exponent of the law [-].
+        h: control period [s].
+        delay: delay of the command in periods.
+        anchored: whether the clock is the anchored one; otherwise it is the flight clock.
+        implicit: whether the law uses implicit sampling.
     """
     before = float(anchored) + float(implicit)
     return max(0.0, ((2 * eta - 1) / largest_index(eta, delay, implicit=implicit) - before) * h)
 
 
 def largest_surface(delay: int = 0, *, implicit: bool = False) -> float:
-    """Largest c h for which some k, however small, leaves the frozen loop after the hand-over stable [-].
+    """Return the upper limit of c h for a stable frozen loop after the hand-over, if k may be arbitrarily small [-].
 
-    As k goes to 0 its poles are 1, which any k moves inwards, and those of z^d (z - 1) + c h: inside the unit circle up
-    to c h = 2 sin(pi / (4 d + 2)), which is 2 without delay. With implicit sampling c h / (1 + c h/2) stands in place
-    of c h: infinite without delay. delay: d, in periods.
+    For k -> 0 one pole is 1, and any positive k moves it inwards. The other poles are the roots of z^d (z - 1) + c h.
+    They are inside the unit circle below c h = 2 sin(pi / (4 d + 2)), which is 2 without delay. Implicit sampling
+    replaces c h by c h / (1 + c h/2), and the limit without delay is then infinite.
+
+    Args:
+        delay: d, delay of the command in whole periods.
+        implicit: whether the law uses implicit sampling.
     """
     border = 2.0 * float(np.sin(np.pi / (4 * delay + 2)))
     if not implicit:
@@ -128,13 +171,17 @@ def largest_surface(delay: int = 0, *, implicit: bool = False) -> float:
 
 
 def largest_reaching(surface: float, delay: float = 0.0, *, implicit: bool = False) -> float:
-    """Largest k h at which the frozen loop after the hand-over is stable for c h = surface [-]; k = K1/2 (60).
+    """Return the largest k h with a stable frozen loop after the hand-over [-], where k = K1/2 (60).
 
-    2 - c h without delay, 0 where c h alone is beyond the border; k and c may change places. delay: in periods.
-    The slope of a smooth sign counts as part of K1. A digital observer moves nothing: its error falls by e^(-l J^-1 h)
-    a period whatever the loop does, as long as it knows the torque that acts.
+    Without delay it is 2 - c h. It is 0 if c h alone exceeds its limit (`largest_surface`). The condition is symmetric
+    in k and c. The derivative of the switching term in the boundary layer counts as part of K1. A digital observer does
+    not change the limit: if it knows the applied torque, its error decays by e^(-l J^-1 h) per period in every loop.
 
-    implicit: with implicit sampling, in which e^(-k h) of s is left after a period: infinite without delay.
+    Args:
+        surface: c h [-].
+        delay: delay of the command in periods.
+        implicit: whether the law uses implicit sampling, which multiplies s by e^(-k h) per period. The result is then
+            infinite without delay.
     """
 
     def stable(reaching: float) -> bool:

@@ -1,4 +1,7 @@
-"""What the sampled loop carries from sample to sample, and local coordinates of it, in which `linear` has the loop."""
+"""State of the sampled loop between two samples, and its local coordinates, which `linear` uses to linearise the loop.
+
+Read `Carry` first, then `Local`.
+"""
 
 from typing import Any, NamedTuple
 
@@ -16,55 +19,58 @@ from ptsmc_jax.simulation.control_period import State
 
 
 class Carry(NamedTuple):
-    """What the loop carries from sample to sample."""
+    """Complete state of the sampled loop at a sample."""
 
     x: Any  # true state of the plant
-    acting: ActuatorState  # true state of the actuators, without commands on their way
+    acting: ActuatorState  # true state of the actuators, without delayed commands
     computer: Computer
-    model: ActuatorState  # the flight computer's own of its actuators, with them; momentum it measures
+    model: ActuatorState  # actuator state in the flight computer's model, with delayed commands, without momentum
 
     @classmethod
     def of(cls, state: State) -> "Carry":
-        """Return the carry of a state of the sampled loop, whose actuators are as the flight computer knows them."""
+        """Return the carry of a simulated state, assuming that the actuator model of the flight computer is exact."""
         actuators, computer = state.actuators, state.computer._replace(applied=state.applied)
         return cls(state.x, actuators._replace(queue=None), computer, actuators._replace(h=None))
 
 
 class _Stored:
-    """Coordinates (wheels,) of the momenta that wheels store, the total angular momentum among them.
+    """Local coordinates (wheels,) of the wheels' momenta, which represent the total angular momentum in inertial axes.
 
-    No command changes that: in inertial axes it stays as it is. In body axes it turns, and a period of its turning
-    alone, taken to go on for ever, would look as if commands changed it a little.
+    Commands do not change the total angular momentum, which is constant in inertial axes. In body axes it rotates with
+    the attitude. A linearisation of one period would then wrongly show that commands change it.
     """
 
     def __init__(self, parts: Parts, x: Any, h: Array):
         self._h, self._on_body = h, parts.actuators.on_body
-        self._plant: Any = parts.plant  # a spacecraft, which has a momentum
+        self._plant: Any = parts.plant  # a spacecraft, because only spacecraft have wheels and a method `momentum`
         self._total_there = self._total(x, h)
 
     def _inverse(self, momentum: Array) -> Array:
-        """The smallest momenta (wheels,) that make this one (3,) [N m s]."""
+        """Return the wheel momenta (wheels,) of least norm with this total (3,) [N m s]."""
         axes = jax.vmap(self._on_body, out_axes=1)(jnp.eye(self._h.size))
         return axes.T @ matrices.solve(axes @ axes.T, momentum)
 
     def _total(self, x: Any, h: Array) -> Array:
-        """The angular momentum (3,) of the body and the wheels [N m s], in the axes that its attitude turns from."""
+        """Return the angular momentum (3,) of body and wheels in inertial axes [N m s]."""
         return attitude.rotate(x.q, self._plant.momentum(x) + self._on_body(h))
 
     def retract(self, x: Any, z: Array) -> Array:
-        """The momenta (wheels,) [N m s] that have these coordinates where the true state is x."""
+        """Return the wheel momenta (wheels,) [N m s] with coordinates z (wheels,) at the true state x."""
         near, total = self._h + z, self._total_there + self._on_body(z)
         wanted = attitude.rotate(attitude.conjugate(x.q), total) - self._plant.momentum(x)
         return near + self._inverse(wanted - self._on_body(near))
 
     def local_coordinates(self, x: Any, h: Array) -> Array:
-        """The coordinates of momenta (wheels,) [N m s] and a true state."""
+        """Return the coordinates (wheels,) of wheel momenta h (wheels,) [N m s] at the true state x."""
         apart = h - self._h
         return apart + self._inverse(self._total(x, h) - self._total_there - self._on_body(apart))
 
 
 class Local:
-    """Local coordinates z of carries about one: x, the state last seen, sensors' memory, wheels' momenta, the rest."""
+    """Local coordinates z (n,) of carries near a base carry.
+
+    The blocks of lengths `sizes` are: plant state, last seen state, sensor memory, wheel momenta, all other floats.
+    """
 
     def __init__(self, parts: Parts, base: Carry):
         self._plant, self._model, self._sensors = parts.plant, parts.observer.model, parts.sensors
@@ -86,7 +92,7 @@ class Local:
         return carry.acting.v, computer.observer, computer.applied, carry.model, sensing, *own
 
     def retract(self, z: Array) -> Carry:
-        """The carry that has these coordinates (n,)."""
+        """Return the carry with coordinates z (n,)."""
         x, seen, sensing, stored, rest = jnp.split(z, np.cumsum(self.sizes)[:-1])
         base, plant = self._base, self._plant
         near = jax.tree.map(jnp.add, self._rest(base), self._unravel(rest))
@@ -100,7 +106,7 @@ class Local:
         return Carry(x, acting, computer, model)
 
     def local_coordinates(self, other: Carry) -> Array:
-        """The coordinates (n,) of a carry."""
+        """Return the coordinates (n,) of a carry."""
         base, plant = self._base, self._plant
         seen = self._model.local_coordinates(base.computer.seen, other.computer.seen)
         inside = stored = jnp.zeros(0)
@@ -114,11 +120,12 @@ class Local:
 
 
 def _numbers(memory: Any) -> list[Array]:
-    """The numbers of a memory, of sensors or a law, that can change by a little."""
+    """Return the floating-point leaves of the memory of sensors or of a law."""
     return [v for v in jax.tree.leaves(memory) if jnp.issubdtype(jnp.result_type(v), jnp.floating)]
 
 
 def _with_numbers(memory: Any, numbers: list[Array]) -> Any:
+    """Return the memory with its floating-point leaves replaced by `numbers`."""
     leaves, structure = jax.tree.flatten(memory)
     new = iter(numbers)
     leaves = [next(new) if jnp.issubdtype(jnp.result_type(v), jnp.floating) else v for v in leaves]

@@ -1,4 +1,8 @@
-"""Exact motions of Theorems 1 to 3 before the hand-over, without sampling, noise and switching: pure formulas."""
+"""Closed-form motions of Theorems 1 to 3 before the hand-over, without sampling, noise and switching.
+
+Read `exact_error` first (second-order law, attitude), then `exact_chain` (any order). Here tau = t_f - t and
+r = tau / t_f.
+"""
 
 import math
 from typing import NamedTuple
@@ -26,14 +30,20 @@ class ChainMotion(NamedTuple):
 
     x: Array  # (n,)
     s: Array
-    acceleration: Array  # x_n', the input where f = 0, g = 1 and d = 0
+    acceleration: Array  # x_n', which is the input if f = 0, g = 1 and d = 0
 
 
 def exact_error(t: Scalar, t_f: Scalar, eta: Scalar, error: Vector, error_rate: Vector) -> ExactError:
-    """Closed form of the second-order law before the hand-over, for each component of the attitude error vector.
+    """Return the motion of each component of the attitude error vector under the second-order law.
 
-    x(t) = r^eta (x(0) + s(0) L), s(t) = s(0) r^eta, s(0) = t_f x'(0) + eta x(0). t, t_f [s], t < t_f; error and
-    error_rate are those at t = 0.
+        x(t) = r^eta (x(0) - s(0) ln r),  s(t) = s(0) r^eta,  s(0) = t_f x'(0) + eta x(0)
+
+    Args:
+        t: time before the hand-over [s], below t_f.
+        t_f: prescribed time [s].
+        eta: exponent of the law [-].
+        error: x(0), attitude error vector at t = 0, (m,) [-].
+        error_rate: x'(0), its derivative at t = 0, (m,) [1/s].
     """
     tau = t_f - t
     r = tau / t_f
@@ -45,10 +55,16 @@ def exact_error(t: Scalar, t_f: Scalar, eta: Scalar, error: Vector, error_rate: 
 
 
 def exact_chain(t: Scalar, t_f: Scalar, eta: Scalar, x0: Vector) -> ChainMotion:
-    """Closed form of law (52) on a chain of any order n before the hand-over, d = 0 and K = 0; x0: (n,) at t = 0.
+    """Return the motion of an integrator chain of order n under law (52), with d = 0 and K = 0.
 
-    In the states' own units; s(t) = s(0) r^(eta+n-2), and y = x_1 / tau^eta obeys y^(n-1) = s(0) t_f^-(eta+n-2) / tau,
-    integrated n-1 times.
+    The surface decays as s(t) = s(0) r^(eta+n-2). The function integrates y^(n-1) = s(0) t_f^-(eta+n-2) / tau for
+    y = x_1 / tau^eta, n-1 times.
+
+    Args:
+        t: time before the hand-over [s], below t_f.
+        t_f: prescribed time [s].
+        eta: exponent of the law [-].
+        x0: states at t = 0, (n,), in the states' own units.
     """
     n = x0.shape[0]
     s0 = surface_at_start(t_f, eta, x0)
@@ -58,13 +74,29 @@ def exact_chain(t: Scalar, t_f: Scalar, eta: Scalar, x0: Vector) -> ChainMotion:
 
 
 def surface_at_start(t_f: Scalar, eta: Scalar, x: Vector) -> Scalar:
-    """The surface s of (37) for states x (n,) at t = 0, in the states' own units; t_f [s]."""
+    """Return the sliding variable s of (37) at t = 0.
+
+    Args:
+        t_f: prescribed time [s].
+        eta: exponent of the law [-].
+        x: states at t = 0, (n,), in the states' own units.
+    """
     c = expansion(eta, x.shape[0])
     return sum((c[i] * t_f**i * x[i] for i in range(x.shape[0])), jnp.zeros_like(t_f))
 
 
 def modes(t: Scalar, t_f: Scalar, eta: Scalar, x0: Vector) -> tuple[list[Scalar], list[Scalar]]:
-    """y, y', .. y^(n) of y = x_1 / r^eta at t [s]: what the initial state (n,) gives, and what s(0) = 1 adds."""
+    """Return y, y', .. y^(n) of y = x_1 / r^eta as two parts: the free response and the response to s(0) = 1.
+
+    Args:
+        t: time before the hand-over [s].
+        t_f: prescribed time [s].
+        eta: exponent of the law [-].
+        x0: states at t = 0, (n,), in the states' own units.
+
+    Returns:
+        The n + 1 values of the free response to x0 with s(0) = 0, and the n + 1 values that s(0) = 1 adds.
+    """
     n, tau = x0.shape[0], t_f - t
     rising = rising_factorials(eta, n)
     start = [
@@ -81,7 +113,7 @@ def modes(t: Scalar, t_f: Scalar, eta: Scalar, x0: Vector) -> tuple[list[Scalar]
 
 
 def _integral(t: Scalar, t_f: Scalar, p: int) -> Scalar:
-    """Integral over 0 < u < t of (t - u)^p / p! / (t_f - u) [s^p]."""
+    """Return the integral of (t - u)^p / p! / (t_f - u) over 0 < u < t [s^p]."""
     tau = t_f - t
     total = (-tau) ** p * jnp.log(t_f / tau)
     for j in range(1, p + 1):
@@ -90,7 +122,15 @@ def _integral(t: Scalar, t_f: Scalar, p: int) -> Scalar:
 
 
 def from_modes(t: Scalar, t_f: Scalar, eta: Scalar, y: list[Scalar], size=lambda v: v) -> list[Scalar]:
-    """x_1, x_1', .. of x_1 = r^eta y at t [s] by Leibniz's rule; size = abs: bounds on them from bounds on y."""
+    """Return x_1, x_1', .. of x_1 = r^eta y by Leibniz's rule, as many as y has values.
+
+    Args:
+        t: time before the hand-over [s].
+        t_f: prescribed time [s].
+        eta: exponent of the law [-].
+        y: y, y', .. at t, see `modes`.
+        size: applied to each factor of y. With `abs`, bounds on y give bounds on x_1 and its derivatives.
+    """
     r = (t_f - t) / t_f
     falling = [jnp.ones_like(eta)]
     for k in range(len(y)):

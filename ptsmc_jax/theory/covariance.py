@@ -1,4 +1,7 @@
-"""What noise alone does to accuracy and torque: the covariance of the linearised loop, without flying a trial."""
+"""Effect of sensor noise on accuracy and torque, from the covariance of the linearised loop, without trials.
+
+Read `noise` first; `predicts` reports whether it applies to a scenario.
+"""
 
 from typing import Any, NamedTuple
 
@@ -8,39 +11,42 @@ import numpy as np
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.theory import error_floor, linear
 
-ROUNDS = 8  # largest number of rounds that find the mean slope of a sign if s is not zero in the quiet run
-BEYOND = 1e60  # stands for a size of s that is no number any more
-FLAT = 1e30  # width of a sign without slope
+ROUNDS = 8  # Largest number of iterations of the statistical linearisation.
+BEYOND = 1e60  # Upper limit of the deviation of s, if the covariance overflows.
+FLAT = 1e30  # Width of a sign whose derivative is practically zero.
 _AT = np.linspace(-20.0, 20.0, 401)
 _SLOPE, _GAUSS = 1.0 / np.cosh(_AT) ** 2, np.exp(-(_AT**2) / 2.0)
 
 
 class Noise(NamedTuple):
-    """What noise alone does, 1 sigma."""
+    """Standard deviations (1 sigma) caused by noise alone."""
 
-    window_error: float  # RMS over the window of the error's 2-norm, in the unit of the metric
-    torque: float  # largest over time and axes of the command [N m]
-    s: float  # of the sliding variable, RMS over the window and its components
-    converged: bool = True  # whether the mean slope of the sign converged within `ROUNDS` rounds, see `noise`
+    window_error: float  # RMS of the error's 2-norm over the window, in the unit of the metric.
+    torque: float  # Largest deviation of the command over time and axes [N m].
+    s: float  # RMS deviation of the sliding variable over the window and its components.
+    converged: bool = True  # Whether the statistical linearisation converged within `ROUNDS` iterations, see `noise`.
 
 
 def predicts(parts: Parts) -> bool:
-    """Whether `noise` says what such sampled parts do under the noise of s, of any size [-].
+    """Return whether `noise` applies to these sampled parts, for noise of any size [-].
 
-    Not of implicit sampling: s lands at once where the noise is within what switching reaches in a period, and hardly
-    beyond; which of these rules, no slope about the quiet run tells.
+    It needs sensors with a linear model (`reading`) and a linear observer. It does not apply to implicit sampling.
+    There s reaches zero in one period if the noise is within the reach of the switching term, and rarely otherwise.
+    A linearisation about the noise-free run cannot tell which case prevails.
     """
     readable = hasattr(parts.sensors, "reading")
     return readable and parts.observer.linear and not getattr(parts.controller, "implicit", False)
 
 
 def noise(parts: Parts) -> Noise:
-    """Linear covariance along the nominal run of sampled parts that it `predicts`: what noise, bias, random walk cost.
+    """Propagate the covariance of noise, bias and random walk along the nominal run of sampled parts.
 
-    Behind an attitude filter its steady state is known at t = 0. The smooth sign counts in each period with the mean
-    slope that it has under the noise of s there, E[sech^2(s / width)] / width (statistical linearisation), which the
-    noise before it makes. The iteration repeats until the widths of two rounds agree to 1 %. After `ROUNDS` rounds it
-    stops, and the result has `converged` = False.
+    The parts must satisfy `predicts`. If there is an attitude filter, it starts with its steady-state covariance.
+
+    Statistical linearisation replaces the smooth sign in each period by its mean derivative under the noise of s,
+    E[sech^2(s / width)] / width. This derivative depends on the covariance and thus on the earlier periods. The
+    function therefore iterates until the equivalent widths of two iterations agree to 1 %. After `ROUNDS` iterations
+    it stops, and the result has `converged` = False.
     """
     run = linear.nominal_jit(parts)
     ticks = jax.tree.map(np.asarray, run.period.now)
@@ -50,8 +56,8 @@ def noise(parts: Parts) -> Noise:
     if flown is None:
         return _covariance(parts, ticks, linear.opened_in(parts, run, lasting, late=False))[0]
     flat = linear.opened_in(parts, run, lasting, np.full(lasting.size, FLAT), late=False)
-    own = _State(parts, ticks, flat).rows(flat.s_command, flat.s_direct).noise  # of this sample alone
-    units = np.ones(lasting.size)  # of s in each period, over those after the hand-over
+    own = _State(parts, ticks, flat).rows(flat.s_command, flat.s_direct).noise  # effect of each sample's own noise on s
+    units = np.ones(lasting.size)  # unit of s in each period, relative to its unit after the hand-over
     if parts.controller.prescribed:
         units[~ticks.hold] = float(parts.controller.layer_time) ** (parts.controller.order - 1)
     sigmas = [float(np.sqrt(np.sum(by**2) / len(by))) / unit for by, unit in zip(own, units, strict=True)]
@@ -69,23 +75,24 @@ def noise(parts: Parts) -> Noise:
 
 
 class _Sign(NamedTuple):
-    """The loops with a smooth sign of these widths, (periods,), and the width that is flown.
+    """Loops that are linearised with equivalent widths of the smooth sign.
 
-    Slopes of u go by 1/width: exactly where s is zero in the quiet run, else as nearly as the widths of these loops.
+    `_covariance` interpolates the loops in 1/width. This is exact if s is zero in the noise-free run. Otherwise its
+    error vanishes as the interpolated widths approach `widths`.
     """
 
     loops: Any
-    widths: np.ndarray
-    flown: float
-    units: np.ndarray  # (periods,) of s, over those after the hand-over
+    widths: np.ndarray  # (periods,) equivalent widths.
+    flown: float  # Width in the scenario.
+    units: np.ndarray  # (periods,) unit of s, relative to its unit after the hand-over.
 
 
 def _mean_width(width: float, sigma: float) -> float:
-    """Width of the smooth sign whose slope at 0 is the mean slope under Gaussian noise of this size."""
+    """Return the equivalent width: 1 / E[sech^2(s / width) / width] for Gaussian s with deviation sigma."""
     if sigma == 0.0:
         return width
     share = width / sigma
-    if share < 1.0:  # at _AT widths, else at _AT sigmas: steps of a tenth of what falls off sooner
+    if share < 1.0:  # the integration grid _AT is in units of the narrower function, sech^2 or the Gaussian density
         weighed = np.exp(-((share * _AT) ** 2) / 2.0) @ _SLOPE
     else:
         weighed = _GAUSS @ (1.0 / np.cosh(_AT / share) ** 2) / share
@@ -93,17 +100,17 @@ def _mean_width(width: float, sigma: float) -> float:
 
 
 class _Rows(NamedTuple):
-    """How something follows from the state that is propagated, and from the noise of this sample; or in each period."""
+    """Linear map from the propagated state and the noise of one sample to an output, or such maps of all periods."""
 
-    state: np.ndarray  # (rows, size)
-    noise: np.ndarray  # (rows, readings), times 1 sigma
+    state: np.ndarray  # (rows, size).
+    noise: np.ndarray  # (rows, readings), multiplied by 1 sigma.
 
     def covariance(self, p: np.ndarray) -> np.ndarray:
-        """Covariance (rows, rows), from that of the state before the sample, (size, size)."""
+        """Return the output covariance (rows, rows), given p (size, size), the state covariance before the sample."""
         return self.state @ p @ self.state.T + self.noise @ self.noise.T
 
     def at(self, j: int, other: "_Rows | None" = None, share: float = 0.0) -> "_Rows":
-        """Those of the j-th period, of rows (periods, rows, ..), so far on the way to other ones."""
+        """Return the map of period j, interpolated linearly toward `other` by the fraction `share` (0: this map)."""
         mine = _Rows(self.state[j], self.noise[j])
         if other is None:
             return mine
@@ -111,7 +118,7 @@ class _Rows(NamedTuple):
 
 
 class _State:
-    """The state that is propagated: z, the commands on their way, the sensors' own states, the random walk's torque."""
+    """Layout and dynamics of the propagated state: z, delayed commands, sensor states (bias), random-walk torque."""
 
     def __init__(self, parts: Parts, ticks: Any, opened: linear.Opened):
         loop: Any = opened.loop
@@ -123,23 +130,23 @@ class _State:
         before = self._n + self._waiting
         self._own = slice(before, before + reading.own.size)
         self.size = before + reading.own.size + self._m
-        # errors of the readings: of a suite the noise of the next sample is among the coordinates of its memory, other
-        # sensors have as many readings as the computer sees states
-        self._seen, self.memory = k, self.plant.stop + k  # the memory of the sensors follows x and what was seen of it
+        # A sensor suite has the noise of the next sample among the coordinates of its memory. Other sensors have as
+        # many readings as the computer sees states, so that the error of a reading is an error of the seen state.
+        self._seen, self.memory = k, self.plant.stop + k  # in z the sensors' memory follows x and the last seen state
         place = getattr(sensors, "noise_place", None)
         self._noise = None if place is None else slice(self.memory + place.start, self.memory + place.stop)
         self._from_readings = None if place is not None else np.linalg.pinv(reading.rows[:, :k])
-        # by how much the state moves by itself in a second, 1 sigma: the random walk as a period begins, in which it
-        # acts, the sensors' own states after its sample
+        # Process noise, 1 sigma per second. The random-walk torque changes at the start of a period and acts in that
+        # period. The sensor states change after the sample.
         self.walk = np.concatenate([np.zeros(self.size - self._m), error_floor.walk_of(parts)])
         self.drift = np.concatenate([np.zeros(before), reading.own_drift, np.zeros(self._m)])
 
     def start(self) -> np.ndarray:
-        """Covariance (size, size) before the first sample."""
+        """Return the covariance (size, size) before the first sample."""
         reading = self._reading
         factor = np.zeros((self.size, reading.own.size))
         factor[self._own] = np.diag(reading.own)
-        if reading.start is not None:  # the filter's errors: of its attitude, and of its bias beside the gyro's
+        if reading.start is not None:  # filter errors of attitude and bias; the bias error depends on the gyro bias
             start = np.zeros((self.size, 6))
             start[self.memory : self.memory + 6] = reading.start[1]
             factor[self.memory + 3 : self.memory + 6] = np.diag(reading.own)
@@ -147,7 +154,12 @@ class _State:
         return factor @ factor.T
 
     def rows(self, by_z: Any, by_seen: Any) -> _Rows:
-        """Rows of something by z and by what the computer sees, of NumPy; in each period where these are so."""
+        """Return the map of an output with derivatives `by_z` and `by_seen` (NumPy).
+
+        Args:
+            by_z: derivatives by z, (rows, n) or (periods, rows, n).
+            by_seen: derivatives by the state that the computer sees, (rows, k) or (periods, rows, k).
+        """
         by_state = np.pad(by_z, [(0, 0)] * (by_z.ndim - 1) + [(0, self.size - self._n)])
         by_errors = by_seen @ self._from_readings if self._noise is None else by_z[..., self._noise]
         by_state[..., : self._seen] += by_seen
@@ -155,7 +167,11 @@ class _State:
         return _Rows(by_state, by_errors * self._reading.noise)
 
     def moved(self, loops: Any) -> tuple[_Rows, _Rows]:
-        """The command, and the whole state a period later, in each period; loops: a `linear.Loop` of numpy arrays."""
+        """Return the maps of each period to the command and to the whole state one period later.
+
+        Args:
+            loops: a `linear.Loop` of NumPy arrays with a leading period axis.
+        """
         n, m, waiting, new = self._n, self._m, self._waiting, loops.new[:, 0]
         command = self.rows(loops.command, loops.direct)
         state = np.tile(np.eye(self.size), (len(new), 1, 1))
@@ -173,13 +189,13 @@ class _State:
 
 
 def _covariance(parts: Parts, ticks: Any, opened: linear.Opened, sign: _Sign | None = None) -> tuple[Noise, np.ndarray]:
-    """The covariance propagated along the run, and what it makes of error, command and s; widths of the sign."""
+    """Propagate the covariance along the run; return the deviations and the equivalent sign widths (periods,)."""
     lengths = ticks.t_next - ticks.t
     state = _State(parts, ticks, opened)
     p, sliding = state.start(), state.rows(opened.s_command, opened.s_direct)
     command, moved = state.moved(opened.loop)
     sloped = (None, None) if sign is None else state.moved(sign.loops)
-    # of the error at the start of a period and in its middle, of s
+    # columns of `squares`: error at the start of a period, error in its middle, mean square of the components of s
     squares, torque, widths = np.zeros((len(lengths) + 1, 3)), 0.0, np.zeros(len(lengths))
 
     def square(error: Any) -> float:
@@ -206,9 +222,14 @@ def _covariance(parts: Parts, ticks: Any, opened: linear.Opened, sign: _Sign | N
 
 
 def _middle(opened: linear.Opened, j: int, length: float, later: _Rows, plant: slice) -> _Rows:
-    """The error in the middle of the j-th period, by the cubic that metrics draw, `integrators.hermite_middle`.
+    """Return the map to the error in the middle of period j, by cubic Hermite interpolation as in the metrics.
 
-    later: the state a period later, without what the sensors' own states drift by then.
+    Args:
+        opened: linearised periods of the nominal run.
+        j: number of the period.
+        length: length of the period [s].
+        later: map to the state one period later, without the drift of the sensor states.
+        plant: place of the plant's local coordinates in the state.
     """
     after = min(j + 1, len(opened.error) - 1)
     start = np.asarray(opened.error[j] / 2 + length / 8 * opened.error_rate[j])

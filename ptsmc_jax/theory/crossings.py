@@ -1,6 +1,7 @@
-"""The frequency response of an opened loop on a grid, and between which of its points it crosses what margins are of.
+"""Frequency response of an opened loop on a grid, and the grid intervals that contain the crossings of the margins.
 
-All points at once: A comes in triangles, and what is solved with it goes state after state.
+Read `grid` and `brackets` first. A Schur decomposition makes A triangular. Each solution with z I - A is then a
+substitution, state by state, for all grid points at once.
 """
 
 from typing import Any, NamedTuple
@@ -12,29 +13,32 @@ from jaxtyping import Array, ArrayLike, Complex, Float
 
 from ptsmc_jax.theory.linear import Opening
 
-LOWEST, POINTS = 1e-6, 240  # of the grid: share of the Nyquist frequency that it begins at, and its size without poles
-AROUND = np.array([-3.0, -1.0, -0.3, 0.3, 1.0, 3.0])  # of a pole, in times its damping
-NEAREST = 3  # crossings of a kind that are closed in on
-SPLIT = (2 * NEAREST, 3 * NEAREST)  # of the places looked for: L real, |L| = 1, L nearest to -1
-REAL = 1e-2  # share of the real part below which the imaginary one counts as none, at the ends of the grid
-EVEN = 1e-6  # share by which sizes of L may differ that are the same: of points of the grid that fall on each other
-CHUNK = 64  # points of the grid at which L is evaluated at once: their states stay in the processor's cache
-MOST = 100.0  # dB: no limit of the gain; of the sensitivity, that of an unstable loop
+LOWEST, POINTS = 1e-6, 240  # Lowest grid frequency as a fraction of the Nyquist frequency; grid size without poles.
+AROUND = np.array([-3.0, -1.0, -0.3, 0.3, 1.0, 3.0])  # Offsets of grid points from a pole, in units of its damping.
+NEAREST = 3  # Crossings of each kind that are refined.
+SPLIT = (2 * NEAREST, 3 * NEAREST)  # Indices that split the crossings: L real, |L| = 1, L nearest to -1.
+REAL = 1e-2  # Largest |Im L / Re L| that counts as real, at the ends of the grid.
+EVEN = 1e-6  # Relative difference of |L| that counts as none, for grid points that coincide.
+CHUNK = 64  # Grid points in one evaluation of L, few enough for the processor's cache.
+MOST = 100.0  # dB. Larger gain margins count as infinite; peak sensitivity reported for an unstable loop.
 
 
 def poles_of(opening: Opening) -> Complex[Array, "loops n"]:
-    """Poles [-] of the closed loop, at which the sensitivity may peak, then of those with an axis open, where L may."""
+    """Return the poles [-] of the closed loop, then of the loops with one axis open.
+
+    The sensitivity may peak near the poles of the closed loop, and L of an axis near those of the loop open there.
+    """
     m = opening.c.shape[0]
     closed = jnp.asarray(np.append(np.ones((1, m)), 1.0 - np.eye(m), axis=0))
     return jax.lax.map(lambda on: jnp.linalg.eigvals(opening.closed(jnp.diag(on))), closed)
 
 
 def grid(poles: Complex[Array, "loops n"], h: Any) -> Float[Array, " points"]:
-    """Frequencies [rad/s] for a period h [s], graded toward 0 and the Nyquist frequency, and around `poles_of`."""
+    """Return grid frequencies [rad/s] for a period h [s], denser toward 0, the Nyquist frequency and the poles."""
     low = np.geomspace(LOWEST, 0.5, POINTS // 2, endpoint=False)
     high = 1.0 - np.append(0.5 * np.geomspace(1.0, 1e-4, POINTS // 4), 0.0)
     base = np.unique(np.concatenate([low, np.linspace(0.05, 0.95, POINTS // 4), high]))
-    upper = jnp.argsort(-poles.imag, axis=1)[:, : (poles.shape[1] + 1) // 2]  # of pairs one; real ones need no more
+    upper = jnp.argsort(-poles.imag, axis=1)[:, : (poles.shape[1] + 1) // 2]  # one pole of each conjugate pair
     poles = jnp.take_along_axis(poles, upper, axis=1).reshape(-1)
     damping = jnp.clip(jnp.abs(jnp.log(jnp.maximum(jnp.abs(poles), 1e-12))) / jnp.pi, LOWEST, 1.0)
     near = jnp.abs(jnp.angle(poles))[None] / jnp.pi + AROUND[:, None] * damping[None]
@@ -43,21 +47,21 @@ def grid(poles: Complex[Array, "loops n"], h: Any) -> Float[Array, " points"]:
 
 
 class Triangles(NamedTuple):
-    """An opened loop by Schur's decomposition: many of its values cost little. It has no slopes."""
+    """An opened loop in Schur coordinates, for cheap evaluation at many points. Gradients are stopped."""
 
-    opening: Opening  # with a triangular A
-    axes: Array  # (n, n) unitary: of its states in columns
+    opening: Opening  # With a triangular A.
+    axes: Array  # (n, n) unitary, with the Schur vectors as columns.
 
     def halves(self, z: Complex[Array, " points"]) -> tuple[Array, Array]:
-        """X = (z I - A)^-1 B and, turned, Y = C (z I - A)^-1, (n, m, points) each, by its own states."""
+        """Return X = (z I - A)^-1 B and Y' of Y = C (z I - A)^-1, (n, m, points) each, in Schur coordinates."""
         a, n = self.opening.a, self.opening.a.shape[0]
 
         def solved(rest: Array, b: Array, *, up: bool) -> Array:
-            """State after state, for all points at once; rest: A without its diagonal."""
+            """Return (z I - A)^-1 b by substitution, for all points at once; rest: A without its diagonal."""
 
             def state(k: Array, x: Array) -> Array:
                 i = n - 1 - k if up else k
-                own = x[i] / (z - a[i, i])[None]  # and what it adds to the others: three times as fast as row by row
+                own = x[i] / (z - a[i, i])[None]  # substitution by columns is three times as fast as by rows
                 return (x + rest[:, i][:, None, None] * own[None]).at[i].set(own)
 
             return jax.lax.fori_loop(0, n, state, jnp.broadcast_to(b[:, :, None] + 0j, (*b.shape, z.size)))
@@ -66,35 +70,40 @@ class Triangles(NamedTuple):
         return solved(rest, self.opening.b, up=True), solved(rest.T, self.opening.c.T, up=False)
 
     def response(self, z: Complex[Array, " points"]) -> tuple[Array, Array]:
-        """L [-] at many z and its derivative by z, (points, m, m) each."""
+        """Return L [-] at many z and its derivative by z, (points, m, m) each."""
         x, y = self.halves(z)
         return -jnp.einsum("kn,nmp->pkm", self.opening.c, x), jnp.einsum("nkp,nmp->pkm", y, x)
 
     def values(self, z: Complex[Array, " points"]) -> Complex[Array, "points m m"]:
-        """L [-] at any number of z, evaluated in chunks."""
+        """Return L [-] at any number of z, evaluated in chunks of `CHUNK` points."""
         chunks = jnp.resize(z, (-(-z.size // CHUNK), CHUNK))
         each = jax.lax.map(lambda z: self.response(z)[0], chunks)
         return each.reshape(-1, *each.shape[2:])[: z.size]
 
 
 def triangle(a: ArrayLike) -> tuple[Array, Array]:
-    """A matrix A as a triangle, and the axes that it is one in (Schur), (n, n) each; without slopes."""
+    """Return the complex Schur form of a matrix and its unitary basis, (n, n) each. Gradients are stopped."""
     upper, axes = jax.scipy.linalg.schur(jax.lax.stop_gradient(a), output="complex")
     return upper, axes
 
 
 def in_triangles(opening: Opening, known: tuple[Array, Array] | None = None) -> Triangles:
-    """The loop L [-] in coordinates in which its matrix A is a `triangle`; known: that of A."""
+    """Return the opened loop L [-] in Schur coordinates; known: the `triangle` of its A, if available."""
     fixed = jax.lax.stop_gradient(opening)
     a, axes = known or triangle(fixed.a)
     return Triangles(Opening(a, jnp.conj(axes.T) @ fixed.b, fixed.c @ axes), axes)
 
 
 def response(opening: Opening, quick: Triangles, z: Complex[Array, " points"]) -> tuple[Array, Array]:
-    """L [-] at many z with its slopes by the loop, and its derivative by z, (points, m, m) each.
+    """Return L [-] at many z, differentiable by the loop, and its derivative by z, (points, m, m) each.
 
-    L = Y (z X - A X - B) - C X: what X and Y are off by, Schur's rounding, counts in the second order only, and so does
-    what they change with the loop.
+    L = Y (z X - A X - B) - C X with X and Y of `Triangles.halves`, whose gradients are stopped. The bracket is zero for
+    an exact X. Rounding errors of X and Y, and their dependence on the loop, therefore enter in second order only.
+
+    Args:
+        opening: the opened loop.
+        quick: the same loop in Schur coordinates.
+        z: points e^(i w h).
     """
     x, y = jax.lax.stop_gradient(quick.halves(z))
     x = jnp.einsum("ij,jmp->imp", quick.axes, x)
@@ -106,9 +115,10 @@ def response(opening: Opening, quick: Triangles, z: Complex[Array, " points"]) -
 
 @jax.jit
 def one_axis(response: Complex[Array, "m m"], axis: Any) -> Complex[Array, ""]:
-    """L of one axis with the others closed one after the other: each takes what goes around it off the rest.
+    """Return L [-] of one axis with all other axes closed.
 
-    A loop over the axes, which compiles in a fraction of what a solution of equations takes.
+    The function closes the other axes one after the other. Closing axis j subtracts L e_j e_j' L / (1 + L_jj) from L.
+    This loop compiles much faster than the solution of a linear system.
     """
     each = jnp.eye(response.shape[0])
     own = each[axis]
@@ -122,30 +132,31 @@ def one_axis(response: Complex[Array, "m m"], axis: Any) -> Complex[Array, ""]:
 
 
 def each_axis(response: Complex[Array, "points m m"]) -> Complex[Array, "points m"]:
-    """The same of all axes at many points."""
+    """Return L [-] of every axis with the other axes closed, at many points."""
     axes = jnp.arange(response.shape[1])
     return jax.vmap(jax.vmap(one_axis, (None, 0)), (0, None))(response, axes)
 
 
 class Brackets(NamedTuple):
-    """Between which points L is real and may be -1 with more gain, or with less, has the size 1, is nearest to -1.
+    """Grid intervals with crossings, (places,): `NEAREST` intervals of each of four kinds.
 
-    `NEAREST` places of each of these four, (places,); those that there are too few of are not `there`.
+    The kinds are: L real and -1 with more gain; L real and -1 with less gain; |L| = 1; |1 + L| smallest. If there are
+    fewer crossings of a kind, the remaining entries have `there` = False.
     """
 
-    low: Array  # [rad/s]
-    high: Array  # [rad/s]
-    at_low: Array  # what is zero in between: `sine`, ln |L|, the slope of |1 + L|^2 by w
-    at_high: Array
+    low: Array  # [rad/s] Lower end.
+    high: Array  # [rad/s] Upper end.
+    at_low: Array  # Function with a zero in the interval, at its lower end: `sine`, ln |L|, d|1 + L|^2/dw.
+    at_high: Array  # The same at the upper end.
     there: Array  # bool
-    elsewhere: Array  # frequencies to look at besides [rad/s]: where L is nearest to -1, and both ends
+    elsewhere: Array  # [rad/s] Further frequencies to evaluate: the grid point with L nearest to -1, and both ends.
 
 
 def brackets(w: Array, seen: Array) -> Brackets:
-    """The `Brackets` of an L [-] at frequencies w [rad/s], (points,) each."""
+    """Return the `Brackets` of an L [-] at frequencies w [rad/s], (points,) each."""
     turned, size, near = sine(seen), jnp.log(jnp.abs(seen)), jnp.abs(1.0 + seen) ** 2
     real, factor = real_at(seen)
-    # one that lies a little to the other side may turn out to lie on this one
+    # the tolerance of 0.1 keeps crossings near -1, because refinement may move them to the other side of -1
     more, less = (jnp.where(real & (side * factor > -0.1), side * factor, jnp.inf) for side in (1.0, -1.0))
     even, phase = even_at(seen)
     least = (near[1:-1] <= near[:-2]) & (near[1:-1] <= near[2:])
@@ -169,27 +180,27 @@ def brackets(w: Array, seen: Array) -> Brackets:
 
 
 def sine(L: Array) -> Array:
-    """Of the phase of L [-]: zero where L is real, as Im L is, but no larger next to a pole."""
+    """Return the sine of the phase of L [-]. Like Im L it is zero for a real L, but it stays bounded near a pole."""
     size = jnp.abs(L)
     return L.imag / jnp.where(size > 0.0, size, 1.0)
 
 
 def smallest(values: Array, count: int = NEAREST) -> tuple[Array, Array]:
-    """The least of them, so many, and their places, in order; several times as fast as to sort them all."""
+    """Return the `count` smallest values, in ascending order, and their indices. Faster than sorting all values."""
     least, places = [], []
     for _ in range(count):
         place = jnp.argmin(values)
         least.append(values[place])
         places.append(place)
-        values = jnp.where(jnp.arange(values.size) == place, jnp.inf, values)  # `at`: scattered under vmap, in vain
+        values = jnp.where(jnp.arange(values.size) == place, jnp.inf, values)  # `.at[]` is a slow scatter under vmap
     return jnp.stack(least), jnp.stack(places)
 
 
 def real_at(seen: Array) -> tuple[Array, Array]:
-    """Between which points L [-] is real and negative, bool, and ln of the gain with which it is -1 there.
+    """Return the intervals in which L [-] crosses the negative real axis, bool, and ln of the gain that makes it -1.
 
-    What no gain below `MOST` brings to -1 counts for nothing: so large an L is rounding, next to poles at 1. Nor does a
-    way through infinity, past a pole on the unit circle.
+    Crossings that need a gain change of more than `MOST` are ignored, because such a large L is rounding near poles
+    at 1. Sign changes of Im L at a pole on the unit circle, where L is infinite, are ignored as well.
     """
     real, imag = seen.real, seen.imag
     share = imag[:-1] / jnp.where(imag[:-1] == imag[1:], 1.0, imag[:-1] - imag[1:])
@@ -200,7 +211,10 @@ def real_at(seen: Array) -> tuple[Array, Array]:
 
 
 def _through_infinity(seen: Array) -> Array:
-    """Between which points L [-] turns back, (points - 1,) bool, larger and larger on its way there from both sides."""
+    """Return the intervals with a pole on the unit circle, (points - 1,) bool.
+
+    There |L| grows toward the interval from both sides, and the phase of L jumps by more than 90 deg.
+    """
     size = jnp.abs(seen)
     grows, falls = size[1:-1] >= (1.0 - EVEN) * size[:-2], size[1:-1] >= (1.0 - EVEN) * size[2:]
     back = (seen[1:] * jnp.conj(seen[:-1])).real < 0.0
@@ -208,38 +222,45 @@ def _through_infinity(seen: Array) -> Array:
 
 
 def even_at(seen: Array) -> tuple[Array, Array]:
-    """Between which points |L| is 1, bool, and the phase to -1 there (-pi, pi] [rad]."""
+    """Return the intervals in which |L| crosses 1, bool, and the phase from -1 to L there, in (-pi, pi] [rad]."""
     there, share = _even(seen)
     turned = jnp.angle(seen[1:] / seen[:-1])
     return there, jnp.angle(-seen[:-1] * jnp.exp(1j * share * turned))
 
 
 def _even(seen: Array) -> tuple[Array, Array]:
-    """Between which points |L| is 1, and where, as a share of the way from one to the next, by logarithms."""
+    """Return the intervals in which |L| crosses 1, and the fraction of the interval, by interpolation of ln |L|."""
     size = jnp.log(jnp.abs(seen))
     there = size[:-1] * size[1:] < 0.0
     return there, size[:-1] / jnp.where(there, size[:-1] - size[1:], 1.0)
 
 
 def delay_at(w: Array, seen: Array) -> tuple[Array, Array]:
-    """Delays [s] that turn L to -1 where |L| is 1, and frequencies [rad/s]; infinite where it is not, (points - 1,)."""
+    """Return delays [s] that rotate L to -1 if |L| crosses 1 in an interval, else infinity, (points - 1,).
+
+    The second result is the frequency of each crossing [rad/s].
+    """
     there, left = even_at(seen)
     at = w[:-1] * (w[1:] / w[:-1]) ** jnp.where(there, _even(seen)[1], 0.0)
     return jnp.where(there, jnp.where(left < 0.0, left + 2.0 * jnp.pi, left) / at, jnp.inf), at
 
 
 def zeros_of(values: Complex[Array, "rows points"], count: int) -> tuple[Array, Array]:
-    """Near zeros of an analytic function that is real at the last point: rows and points, (count,) each, with shares.
+    """Return approximate zeros of an analytic function on a grid: fractional row and point, (count,) each.
 
-    Those of the first rows; infinite rows where there are no more. By the argument principle: there is one between two
-    rows and two points around which the function goes around zero, as it crosses the negative real axis along the four
-    lines from one to the next, and at the last point where its sign changes. Two of them in one place may be missed.
+    The search applies the argument principle to every cell of the grid. A cell contains a zero if the values at its
+    four corners wind around zero, which shows in the crossings of the negative real axis. At the last point the values
+    are real, and a sign change between rows is a zero. Two zeros in one cell may be missed.
+
+    Args:
+        values: the function on the grid, real at the last point.
+        count: number of zeros to return, those in the first rows. The row is infinite if there are fewer zeros.
     """
     x, y = values.real, values.imag.at[:, -1].set(0.0)
     above = (y >= 0.0).astype(int)
 
     def crossed(begin: tuple, end: tuple) -> Array:
-        """1 where the line from one to the next comes from above, -1 where it comes from below, else 0."""
+        """Return 1 (-1) if the line between two points crosses the negative real axis from above (below), else 0."""
         way = above[begin] - above[end]
         return jnp.where(way * (x[begin] * y[end] - x[end] * y[begin]) > 0.0, way, 0)
 
@@ -250,7 +271,7 @@ def zeros_of(values: Complex[Array, "rows points"], count: int) -> tuple[Array, 
     rows, places = smallest(jnp.where(inside, jnp.arange(len(inside))[:, None], jnp.inf).reshape(-1), count)
     row, point = jnp.divmod(places, values.shape[1])
     last = point == values.shape[1] - 1
-    # by a plane through three corners
+    # linear interpolation from three corners of the cell
     here = values[row, point]
     to_row, to_point = values[row + 1, point] - here, jnp.where(last, 1j, values[row, point + 1] - here)
     area = (jnp.conj(to_point) * to_row).imag
@@ -261,14 +282,14 @@ def zeros_of(values: Complex[Array, "rows points"], count: int) -> tuple[Array, 
 
 
 def ends_at(ends: Array) -> Array:
-    """Whether L [-] is real at the ends of the grid too, bool: a pole comes to 1 there, or to -1."""
+    """Return whether L [-] is real at each end of the grid, bool. A gain can then move a pole to 1 or to -1."""
     return jnp.abs(ends.imag) < REAL * jnp.abs(ends.real)
 
 
 def straight(seen: Complex[Array, " points"]) -> tuple[Array, Array, Array]:
-    """Nearest gain [dB], infinite without any, phase [deg] and peak of the sensitivity [dB].
+    """Return gain margin [dB] (infinite if there is none), phase margin [deg] and peak sensitivity [dB] of a grid.
 
-    By lines between points, of the logarithm where L crosses something.
+    The function interpolates between grid points: crossings in ln L, the distance to -1 along straight lines.
     """
     there, _ = real_at(seen)
     size, angle = jnp.log(jnp.abs(seen)), jnp.angle(-seen)

@@ -1,17 +1,23 @@
-"""The floor: what no controller can beat, since no estimator knows the state better at the time of acting.
+"""Lower bound on the pointing error: the posterior Cramer-Rao bound of the state along a run.
 
-The true state differs from the target by at least what the samples do not say of it. With Gaussian noise and everything
-else known, the covariance of the Kalman filter along the run is the least that any estimator leaves: the posterior
-Cramer-Rao bound (Tichavsky, Muravchik, Nehorai, IEEE Trans. Signal Processing 46(5), 1998), at every sample
-P+ = P - P H' (H P H' + R)^-1 H P and P <- F P F' + Q between them; F is the derivative of a period of the true plant.
+A controller cannot make the error smaller than the uncertainty of the state at the time when its torque acts. With
+Gaussian noise, and under the assumptions below, the Kalman filter along the run has the smallest covariance P of all
+estimators (Tichavsky, Muravchik, Nehorai, IEEE Trans. Signal Processing 46(5), 1998). At every sample
+P+ = P - P H' (H P H' + R)^-1 H P, and between samples P <- F P F' + Q. F is the derivative of a period of the true
+plant.
 
-Known are the plant, its true inertia, its flexible modes, which are at rest at t = 0, the disturbance but for its
-random walk, the torque on the body, and how large every noise is. Attitude and rate are not, but by the samples: the
-bound is on whoever does as well from every start. Behind an attitude filter its steady state is known at t = 0, a
-gyro's bias by its 1 sigma. The torque in a period can use samples up to `delay` periods before its start: from there on
-the error is predicted.
+Assumptions:
 
-It bounds the mean over trials. A single run, or a small campaign, may come out below it by chance.
+- The plant, its true inertia and the torque on the body are known.
+- Flexible modes are known, and they are at rest at t = 0.
+- The disturbance is known except for its random walk. The intensity of every noise is known.
+- Attitude and rate are unknown before the first sample, so that the bound applies to controllers that perform equally
+  well from every initial state.
+- An attitude filter starts with its steady-state covariance, and a gyro bias with its 1 sigma.
+- The torque in a period uses samples up to `delay` periods before its start. The error is predicted from there on.
+
+The bound applies to the mean over trials. A single run, or a small campaign, may be below it by chance. Read `along`
+first.
 """
 
 from collections import deque
@@ -33,43 +39,44 @@ from ptsmc_jax.simulation.control_period import PeriodMotion, star_state
 from ptsmc_jax.simulation.interval import Criteria, integral_in_window
 from ptsmc_jax.simulation.rollout import Log, Parts
 
-UNKNOWN = 1e5  # 1 sigma of a state at t = 0, in those of its sensor: of no weight beside the first sample
-EXACT = 1e-10  # 1 sigma of a sensor without noise, in those of what is read before the first sample
+UNKNOWN = 1e5  # Initial 1 sigma of an unknown state, relative to its sensor's, so that the first sample outweighs it.
+EXACT = 1e-10  # 1 sigma of a sensor without noise, relative to the largest deviation of its reading so far.
 
 
 @dataclass(frozen=True)
 class Floor:
-    """What no controller can beat; 0 where nothing is unknown."""
+    """Lower bound on the error of a run; 0 if nothing is unknown."""
 
     window_error: float  # RMS over the window after t_f, in the unit of the metric
     t: np.ndarray = field(repr=False)  # (time,) ends of the control periods [s]
-    error: np.ndarray = field(repr=False)  # (time,) RMS of the error's 2-norm then
+    error: np.ndarray = field(repr=False)  # (time,) RMS of the error's 2-norm at these times
 
 
 class Model(NamedTuple):
-    """A linear-Gaussian model of `periods` control periods: z' = F (z + B v), y = H z + n; or those of several runs.
+    """Linear-Gaussian model of `periods` control periods: z' = F (z + B v), y = H z + n.
 
-    In a period the sample comes first, then v acts, then the state moves. v, n: independent, of 1 sigma each as said.
-    Runs, where there are several, have the axis after the periods, and the same samples.
+    Each period begins with the sample. Then the process noise v acts, and then the state moves. v and n are
+    independent. If the model combines several runs, the axis of the runs follows the axis of the periods, and all runs
+    have readings at the same samples.
     """
 
-    start: np.ndarray  # (.., n, k) factor of the covariance before the first sample: S S'
-    rows: np.ndarray  # (m, n) H, or (periods, .., m, n)
-    noise: np.ndarray  # (periods, .., m) 1 sigma of each reading; infinite: there is none
-    kick: np.ndarray  # (periods, .., n, v) B, times 1 sigma
-    move: np.ndarray  # (periods, .., n, n) F
-    output: np.ndarray  # (periods, .., outputs, n) what is asked, of z + B v
+    start: np.ndarray  # (.., n, k) Factor S of the covariance S S' before the first sample.
+    rows: np.ndarray  # (m, n) H, or (periods, .., m, n).
+    noise: np.ndarray  # (periods, .., m) 1 sigma of each reading; infinite if the reading is not available.
+    kick: np.ndarray  # (periods, .., n, v) B, times the 1 sigma of v.
+    move: np.ndarray  # (periods, .., n, n) F.
+    output: np.ndarray  # (periods, .., outputs, n) Derivatives of the outputs by z + B v.
 
 
 def along(parts: Parts, log: Log) -> Floor:
-    """The floor along a run with this history (`rollout.simulate`, record=True)."""
+    """Return the lower bound along a run with this history (`rollout.simulate`, record=True)."""
     return along_each([(parts, log)])[0]
 
 
 def along_each(runs: Sequence[tuple[Parts, Log]]) -> list[Floor]:
-    """The floor along each of several runs of a scenario, side by side."""
+    """Return the lower bound along each of several runs of a scenario; runs with equal shapes are computed together."""
     lasting = [(parts, *_lasting(parts, log)) for parts, log in runs]
-    alike = dict[tuple, dict[int, Model]]()  # by the samples and the delay
+    alike = dict[tuple, dict[int, Model]]()  # by delay, available samples and shapes
     for k, (parts, ticks, log) in enumerate(lasting):
         if parts.clock.sampled and (not parts.sensors.perfect or parts.walk_rate is not None):  # something is unknown
             model = _model(parts, log, ticks)
@@ -84,18 +91,24 @@ def along_each(runs: Sequence[tuple[Parts, Log]]) -> list[Floor]:
 
 
 def _together(models: Sequence[Model]) -> Model:
-    """The models of several runs as one."""
+    """Return the models of several runs as one model."""
     start, *others = zip(*models, strict=True)
     return Model(np.stack(start), *(np.stack(some, axis=1) for some in others))
 
 
 def _floor(parts: Parts, ticks: Ticks, squares: np.ndarray) -> Floor:
-    """From squares of the error (periods, 3) at start, middle and end of each period."""
+    """Return the bound from mean squares of the error (periods, 3) at start, middle and end of each period."""
     return Floor(window_error(parts, ticks, squares), np.asarray(ticks.t_next), np.sqrt(squares[:, 2]))
 
 
 def window_error(parts: Parts, ticks: Ticks, squares: np.ndarray) -> float:
-    """RMS over the window, from squares of the error (periods, 3) as the metric has it of a run."""
+    """Return the RMS error over the window, integrated as in the metric of a run.
+
+    Args:
+        parts: the scenario.
+        ticks: control periods of the run.
+        squares: mean squares of the error at start, middle and end of each period, (periods, 3).
+    """
     times: Any = map(np.asarray, (parts.controller.t_f, parts.t_end, parts.window, parts.settling_angle))
     start, middle, end = squares.T
     total = np.sum(integral_in_window(ticks.t, ticks.t_next, (start, middle, end), Criteria(*times)))
@@ -103,15 +116,15 @@ def window_error(parts: Parts, ticks: Ticks, squares: np.ndarray) -> float:
 
 
 def pooled(floors: Iterable[Floor]) -> float | None:
-    """RMS of the floors of several runs, as window errors pool; None: there is no run."""
+    """Return the RMS of the bounds of several runs, pooled like window errors, or None without runs."""
     squares = [one.window_error**2 for one in floors]
     return float(np.sqrt(np.mean(squares))) if squares else None
 
 
 def _lasting(parts: Parts, log: Log) -> tuple[Any, Any]:
-    """`Ticks` of a run that have a length, beyond rounding, its `Log` at their starts and at t_end; numpy arrays.
+    """Return the `Ticks` of nonzero length (beyond rounding), and the `Log` at their starts and at t_end, in NumPy.
 
-    They begin and end when samples came, which may be early or late.
+    The ticks begin and end at the actual sample times, which may differ from the nominal times.
     """
     ticks = jax.tree.map(np.asarray, _ticks(parts.clock, parts.controller.t_f, parts.controller.delta))
     lengths = ticks.t_next - ticks.t
@@ -128,27 +141,30 @@ def _ticks(clock: Any, t_f: Array, delta: Array) -> Ticks:
 
 
 def _unknown(model: Model, delay: int) -> np.ndarray:
-    """`deviations`, those zero that are nothing but how exact sensors without noise are taken to be."""
+    """Return `deviations`, with 0 for those that only result from the small noise `EXACT` of noise-free sensors."""
     sizes = deviations(model, delay)
     if np.all(model.noise > 0.0):
         return sizes
-    # ten times as exact, what is left of them is a tenth
+    # such deviations are proportional to the assumed noise, and a tenth of it leaves a tenth of them
     return np.where(sizes > 3.0 * deviations(model, delay, EXACT / 10.0), 0.0, sizes)
 
 
 def deviations(model: Model, delay: int = 0, exact: float = EXACT) -> np.ndarray:
-    """1 sigma of each output (periods, .., outputs) given all samples up to `delay` periods before.
+    """Return 1 sigma of each output (periods, .., outputs), given all samples up to `delay` periods before.
 
-    exact: `EXACT`, or another one.
+    The function propagates factors S of P = S S' by orthogonal transformations (Kaminski, Bryson, Schmidt, IEEE TAC
+    16(6), 1971). It subtracts and inverts nothing, so that the noise levels may differ by many orders of magnitude.
 
-    Factors S of P = S S' are carried by orthogonal transformations (Kaminski, Bryson, Schmidt, IEEE TAC 16(6), 1971):
-    nothing is subtracted or inverted, so that noises of any sizes go together.
+    Args:
+        model: linear-Gaussian model of one run or of several runs.
+        delay: delay of the torque in whole periods.
+        exact: relative 1 sigma of sensors without noise, see `EXACT`.
     """
     periods, sizes = len(model.move), np.zeros(model.output.shape[:-1])
     shape = (*model.move.shape[:-2], *model.rows.shape[-2:])
     rows, available = np.broadcast_to(model.rows, shape), np.isfinite(model.noise).reshape(periods, -1, shape[-2])
     factor, largest = model.start, np.zeros(shape[1:-1])
-    known = deque([(0, factor)], maxlen=delay + 1)  # period, and what the samples up to it say
+    known = deque([(0, factor)], maxlen=delay + 1)  # period, and covariance factor given the samples up to it
 
     def moved(k: int, factor: np.ndarray) -> np.ndarray:
         return model.move[k] @ np.concatenate([factor, model.kick[k]], axis=-1)
@@ -168,17 +184,17 @@ def deviations(model: Model, delay: int = 0, exact: float = EXACT) -> np.ndarray
 
 
 def _triangular(factor: np.ndarray) -> np.ndarray:
-    """A lower triangular factor (.., n, n) of the same covariance as a factor (.., n, k), k >= n."""
+    """Return a lower triangular factor (.., n, n) of the same covariance as a factor (.., n, k), k >= n."""
     return np.swapaxes(np.linalg.qr(np.swapaxes(factor, -1, -2), mode="r"), -1, -2)
 
 
 def _corrected(factor: np.ndarray, read: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """Factor (.., n, n) of the covariance after readings.
+    """Return a factor (.., n, n) of the covariance after readings.
 
     Args:
-        factor: of the covariance before, (.., n, k), k >= n.
-        read: the readings' rows by the factor, (.., m, k).
-        noise: a factor of the readings' covariance, (.., m, m).
+        factor: factor of the covariance before the readings, (.., n, k), k >= n.
+        read: H times the factor, (.., m, k).
+        noise: a factor of the covariance of the reading noise, (.., m, m).
     """
     *many, m, k = read.shape
     both = np.zeros((*many, m + factor.shape[-2], m + k))
@@ -187,14 +203,15 @@ def _corrected(factor: np.ndarray, read: np.ndarray, noise: np.ndarray) -> np.nd
 
 
 def _sizes(rows: np.ndarray) -> np.ndarray:
-    """2-norms of the rows."""
+    """Return the 2-norms of the rows."""
     return np.sqrt(np.einsum("...ij,...ij->...i", rows, rows))
 
 
 def _model(parts: Parts, log: Log, ticks: Ticks) -> Model:
-    """What a run's samples say, and its error, of these states.
+    """Return the linear-Gaussian model of a run.
 
-    The plant's local coordinates, the sensor's, the walk's torque, and readings that wait until they are used.
+    Its states are the plant's local coordinates, the sensor states (bias), the random-walk torque, and readings that
+    were taken but are not used yet.
     """
     linear: Any = jax.tree.map(np.asarray, _linear(parts, log, ticks))
     periods, n, m = linear.push.shape
@@ -206,11 +223,11 @@ def _model(parts: Parts, log: Log, ticks: Ticks) -> Model:
     size, torque = n + own + m + len(places), slice(n + own, n + own + m)
 
     def wide(rows: np.ndarray) -> np.ndarray:
-        seen = rows.shape[-1] - own  # what no sensor reads, the modes of a flexible body, comes after it
+        seen = rows.shape[-1] - own  # the flexible modes, which no sensor reads, follow the seen states
         rows = np.insert(rows, [seen] * (n - seen), 0.0, axis=-1)
         return np.pad(rows, [*[(0, 0)] * (rows.ndim - 1), (0, size - rows.shape[-1])])
 
-    # derivatives of each reading by the state at the start of a period: as it is then, and as it is when it is taken
+    # derivatives by the state at the start of a period: `now` for a reading then, `taken` for one at its actual time
     now, suite = np.tile(wide(reading.rows), (periods, 1, 1)), linear.now.shape[1] > 0
     if suite:
         now[:, :, :n] = linear.now
@@ -220,7 +237,7 @@ def _model(parts: Parts, log: Log, ticks: Ticks) -> Model:
         taken[:, early, :n] = by_seen[early] @ linear.early
         taken[:, early, torque] = by_seen[early] @ linear.early_push
 
-    # how far a reading may be off tells what "unknown" is in its unit; a state read without noise is known
+    # `UNKNOWN` is relative to the 1 sigma of the reading, noise and bias; a state that is read without noise is known
     off = np.hypot(reading.noise, np.linalg.norm(now[0, :, n : n + own] * reading.own, axis=1))
     unknown = UNKNOWN * np.max(np.abs(now[0, :, :n]) * off[:, None], axis=0)
     start = np.diag(np.concatenate([unknown, reading.own, np.zeros(size - n - own)]))
@@ -230,12 +247,12 @@ def _model(parts: Parts, log: Log, ticks: Ticks) -> Model:
     move[:, :n, :n], move[:, :n, torque] = linear.move, linear.push
     output = np.zeros((periods, linear.seen.shape[1], size))
     output[:, :, :n], output[:, :, torque] = linear.seen, linear.seen_push
-    # a reading that is not of the sample at which it is used waits in states of its own, moved on at every sample
+    # a reading that is used at a later sample is stored in extra states, which form a shift register
     rows = now.copy()
     for (k, number), place in places.items():
         move[:, place] = taken[:, k] if number == 1 else np.eye(size)[places[k, number - 1]]
         if number == 1 and early[k]:
-            start[place] = now[0, k] @ start  # the first sample's readings are of its own time
+            start[place] = now[0, k] @ start  # the readings of the first sample are taken at the sample itself
         rows[lag[:, k] + early[k] == number, k] = np.eye(size)[place]
     if reading.start is not None:
         known, factor = reading.start
@@ -252,12 +269,12 @@ def _model(parts: Parts, log: Log, ticks: Ticks) -> Model:
 
 
 def _places(lag: np.ndarray, early: np.ndarray, first: int) -> dict[tuple[int, int], int]:
-    """Return the places, from `first` on, of the states in which readings wait, by (reading, number).
+    """Return the index of each state that stores a delayed reading, by (reading, position in its shift register).
 
     Args:
         lag: whole control samples between a reading, or the sample after it, and its use, (periods, readings).
         early: whether readings are taken between control samples (readings,).
-        first: place of the first one.
+        first: index of the first such state.
     """
     numbers = np.max(lag, axis=0) + early
     waiting = [(k, number) for k, depth in enumerate(numbers) for number in range(1, depth + 1)]
@@ -265,9 +282,12 @@ def _places(lag: np.ndarray, early: np.ndarray, first: int) -> dict[tuple[int, i
 
 
 def reading_of(sensors: Any, size: int, ticks: Ticks) -> Reading:
-    """What sensors read of a state of this size at each control sample; where there are none, all of it, exactly.
+    """Return the linear measurement model of the sensors. Perfect sensors read the whole state exactly.
 
-    ticks: periods that have a length, of which the first is asked for what is known then.
+    Args:
+        sensors: the sensors of the scenario.
+        size: number of states that the sensors see.
+        ticks: control periods of nonzero length; the first one gives the initial conditions.
     """
     if sensors.perfect:
         return Reading(np.eye(size), np.zeros(size), np.zeros(0), np.zeros(0))
@@ -275,30 +295,30 @@ def reading_of(sensors: Any, size: int, ticks: Ticks) -> Reading:
 
 
 def walk_of(parts: Parts) -> np.ndarray:
-    """1 sigma of the random walk's change per second, (m,) [N m/s]; zero without one."""
+    """Return 1 sigma of the change of the random-walk torque per second, (m,) [N m/s]; zero without a random walk."""
     return np.zeros(parts.plant.inputs) if parts.walk_rate is None else np.asarray(parts.walk_rate)
 
 
 class _Linear(NamedTuple):
-    """Derivatives of a period by the plant's local coordinates z at its start and by a torque p held through it.
+    """Derivatives by the plant's local coordinates z at the start of a period and by a torque p held through it.
 
-    seen: of the error at the start, in the middle and at the end, one after the other; in the middle it is that of the
-    cubic that `window_error` uses. early: of what sensors can see at the times of `star_state`; of a sensor suite the
-    readings that are taken then. now: of a sensor suite all readings, if they are taken at the start of the period.
+    `seen` is the error at the start, in the middle and at the end. The middle is interpolated as in `window_error`.
+    `early` is the state that sensors see at the times of `star_state`; a sensor suite has its readings there instead.
+    `now` has all readings of a sensor suite, assuming that they are taken at the start of the period.
     """
 
-    move: Array  # (periods, n, n)
-    push: Array  # (periods, n, m)
-    seen: Array  # (periods, 3 m, n)
-    seen_push: Array  # (periods, 3 m, m)
-    early: Array  # (periods, k, n); of no rows where there is no such time
-    early_push: Array  # (periods, k, m)
-    now: Array  # (periods, readings, n); of no rows without a sensor suite
+    move: Array  # (periods, n, n) State at the end, by z.
+    push: Array  # (periods, n, m) State at the end, by p.
+    seen: Array  # (periods, 3 m, n) Error, by z.
+    seen_push: Array  # (periods, 3 m, m) Error, by p.
+    early: Array  # (periods, k, n) By z; no rows if all readings are taken at control samples.
+    early_push: Array  # (periods, k, m) By p.
+    now: Array  # (periods, readings, n) By z; no rows without a sensor suite.
 
 
 @programs.jit(compiler_options=programs.QUICKLY)
 def _linear(parts: Parts, log: Log, ticks: Ticks) -> _Linear:
-    """Every period of a run linearised, by the code that flies it."""
+    """Linearise the simulation code of every period of a run."""
     actuators, kinematics, plant = parts.actuators, parts.controller.kinematics, parts.plant
     before, after = (jax.tree.map(lambda v, k=k: v[k : v.shape[0] - 1 + k], log.x) for k in (0, 1))
 

@@ -1,4 +1,8 @@
-"""The exact motion of a prescribed-time law before the hand-over, and the motion of the plant for a given error."""
+"""Exact motion of a prescribed-time law before the hand-over, and the motion of the plant for a given error.
+
+Read `exact` (error and s) first, then `exact_motion` (state of the plant). "Exact" means without sampling, noise and
+switching.
+"""
 
 import functools
 from typing import Any, NamedTuple
@@ -19,17 +23,20 @@ Errors = tuple[Vector, Vector, Vector]
 
 
 class Motion(NamedTuple):
-    """The motion of a plant whose error moves as prescribed."""
+    """Motion of a plant whose error follows the closed form."""
 
     x: Any  # state
-    w_dot: Array  # (m,) derivative of its velocity
-    clearance: Array  # distance to a singularity, positive on this side of it
+    w_dot: Array  # (m,) derivative of the velocity
+    clearance: Array  # distance to the singularity, positive before it is reached
 
 
 def exact(law: PrescribedTimeLaw, t: Scalar, start: Float[Array, "m n"]) -> tuple[Vector, Vector]:
     """Return the error and s, (m,) each, of the exact motion at t [s] before the hand-over.
 
-    start: each component of the error and its derivatives at t = 0, `Kinematics.derivatives`.
+    Args:
+        law: the prescribed-time law.
+        t: time before the hand-over [s].
+        start: each component of the error and its derivatives at t = 0, (m, n), see `Kinematics.derivatives`.
     """
     if isinstance(law, PrescribedTimeChain):
         chain = exact_chain(t, law.t_f, law.eta, start[0])
@@ -39,12 +46,12 @@ def exact(law: PrescribedTimeLaw, t: Scalar, start: Float[Array, "m n"]) -> tupl
 
 
 def exact_motion(law: PrescribedTimeLaw, t: Scalar, target: Any, start: Any, errors: Float[Array, "m n"]) -> Motion:
-    """Return the plant's motion in `exact`.
+    """Return the motion of the plant that has the error of `exact`.
 
     Args:
         law: the prescribed-time law.
         t: time before the hand-over [s].
-        target: of the reference at t.
+        target: the reference at t.
         start: the initial state.
         errors: each component of the error and its derivatives at t = 0, (m, n).
     """
@@ -57,20 +64,23 @@ def exact_motion(law: PrescribedTimeLaw, t: Scalar, target: Any, start: Any, err
 
 @functools.singledispatch
 def plant_motion(kinematics: Kinematics, target: Any, start: Any, errors: Errors) -> Motion:
-    """Return the plant's state and w' for an error and its derivatives.
+    """Return the plant's state, w' and distance to the singularity for an error and its derivatives.
 
     Args:
-        kinematics: of the error.
-        target: of the reference.
+        kinematics: error kinematics, which select the implementation.
+        target: the reference.
         start: the initial state, which chooses the branch if there are several.
         errors: eps, eps' [1/s] and eps'' [1/s^2], (m,) each.
+
+    Raises:
+        NotImplementedError: if there is no implementation for these kinematics.
     """
     raise NotImplementedError
 
 
 @plant_motion.register
 def _(kinematics: AdditiveKinematics, target: Any, start: Any, errors: Errors) -> Motion:
-    # q4^2 = 1 - |v|^2 stands for the clearance; at or below 0 the path leaves the unit ball
+    # q4^2 = 1 - |v|^2 is the distance to the singularity; at or below 0 the path leaves the unit ball
     error, error_rate, acceleration = errors
     rate_f, acceleration_f = target.vector_rates()
     q, square = attitude.from_vector_part(target.q[:3] + error, target.q[3])
@@ -81,7 +91,7 @@ def _(kinematics: AdditiveKinematics, target: Any, start: Any, errors: Errors) -
 
 @plant_motion.register
 def _(kinematics: MultiplicativeKinematics, target: Any, start: Any, errors: Errors) -> Motion:
-    # q_e4^2 = 1 - |v|^2 stands for the clearance
+    # q_e4^2 = 1 - |v|^2 is the distance to the singularity
     error, error_rate, acceleration = errors
     q_e, square = attitude.from_vector_part(error, jnp.ones(()))
     w_e = 2.0 * attitude.t_inverse_times(q_e, error_rate)
@@ -94,7 +104,7 @@ def _(kinematics: MultiplicativeKinematics, target: Any, start: Any, errors: Err
 
 @plant_motion.register
 def _(kinematics: SecondOrderKinematics, target: Any, start: Any, errors: Errors) -> Motion:
-    # x_2 from F(t, x_1, x_2) = x_1' by Newton's method from the initial x_2: one step if F is linear in x_2
+    # Newton's method solves F(t, x_1, x_2) = x_1' for x_2 from the initial x_2, in one step if F is linear in x_2
     error, error_rate, acceleration = errors
     model, n = kinematics.model, kinematics.model.inputs
 

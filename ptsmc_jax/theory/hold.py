@@ -1,6 +1,7 @@
-"""After the hand-over: the exact motion, and envelopes of s and of the error, for every order.
+"""Exact motion, and envelopes of s and of the error, in the hold phase (after the hand-over), for every order.
 
-"Exact" means: a perfect estimate of the disturbance and K2 = 0. Envelopes: the continuous loop without noise.
+Read `exact_hold` first. "Exact" means a perfect disturbance estimate and K2 = 0. The envelopes hold for the continuous
+loop without noise.
 """
 
 from typing import NamedTuple
@@ -23,10 +24,14 @@ Vector = Float[Array, " n"]
 
 
 def hold_matrix(surface: Float[Array, " roots"], rate: Scalar) -> Float[Array, "n n"]:
-    """Matrix A of x' = A x after the hand-over, of the error and its derivatives x_1 .. x_n; d = 0 and K = 0.
+    """Return the matrix A of x' = A x in the hold phase, for the error and its derivatives x_1 .. x_n.
 
-    Companion matrix of (p + rate)(p^(n-1) + a_(n-1) p^(n-2) + .. + a_1): s' = -rate s with s = x_n + .. + a_1 x_1.
-    surface: a_1 .. a_(n-1), (c,) for order 2 [1/s^(n-i)]; rate: K1 of a chain, K1/2 of a spacecraft [1/s].
+    Here d = 0 and K2 = 0. A is the companion matrix of (p + rate)(p^(n-1) + a_(n-1) p^(n-2) + .. + a_1), so that
+    s = x_n + .. + a_1 x_1 obeys s' = -rate s.
+
+    Args:
+        surface: a_1 .. a_(n-1) [1/s^(n-i)]; (c,) for order 2.
+        rate: K1 of a chain, or K1/2 of a spacecraft [1/s].
     """
     weights = jnp.append(surface, 1.0)
     last = -rate * weights - jnp.concatenate([jnp.zeros(1), surface])
@@ -35,14 +40,20 @@ def hold_matrix(surface: Float[Array, " roots"], rate: Scalar) -> Float[Array, "
 
 
 def exact_hold(after: Scalar, surface: Float[Array, " roots"], rate: Scalar, x: Vector) -> ChainMotion:
-    """Closed form after the hand-over, `after` seconds later, of the error and its derivatives x (n,) there.
+    """Return the motion of one component of the error in the hold phase, x(t) = e^(A t) x(0) with A of `hold_matrix`.
 
-    x(t) = e^(A t) x(0) with A of `hold_matrix`, whose roots may repeat. For order 2, of each component of the error:
-    s(t) = s(0) e^(-k t), s(0) = x'(0) + c x(0), and x(t) = e^(-c t) x(0) + s(0) (e^(-k t) - e^(-c t)) / (c - k), where
-    k = c: s(0) t e^(-c t); c is the `surface_rate` and k = K1/2 for a spacecraft. after [s]; x in the states' own
-    units; surface and rate as `hold_matrix` has them.
+    The eigenvalues of A may repeat. For order 2, with c = `surface_rate` and k = K1/2 of a spacecraft:
 
-    From rest at 1, with c = k = 2 1/s, half a second later (1 + 2 0.5) e^(-1) is left:
+        s(t) = s(0) e^(-k t),  s(0) = x'(0) + c x(0)
+        x(t) = e^(-c t) x(0) + s(0) (e^(-k t) - e^(-c t)) / (c - k),  or with s(0) t e^(-c t) as last term if k = c
+
+    Args:
+        after: time t since the hand-over [s].
+        surface: a_1 .. a_(n-1) [1/s^(n-i)], see `hold_matrix`.
+        rate: decay rate of s [1/s], see `hold_matrix`.
+        x: the error and its derivatives at the hand-over, (n,), in the states' own units.
+
+    From x(0) = 1 and x'(0) = 0 with c = k = 2 1/s the error after half a second is (1 + 2 0.5) e^(-1):
 
     >>> motion = exact_hold(jnp.asarray(0.5), jnp.array([2.0]), jnp.asarray(2.0), jnp.array([1.0, 0.0]))
     >>> f"{motion.x[0]:.6f}"
@@ -54,11 +65,15 @@ def exact_hold(after: Scalar, surface: Float[Array, " roots"], rate: Scalar, x: 
 
 
 def sliding_bound(parts: Parts, t: ArrayLike) -> np.ndarray:
-    """Bound on |s|_2 at times t (time,) [s] from the hand-over on.
+    """Return a bound on |s|_2 at times t (time,) [s] in the hold phase.
 
-    With s_i s_i' <= -k s_i^2 + beta, k = `reaching_rate` and beta = (factor of sign(s) in s') * 0.2785 width, each
-    component keeps s_i^2 <= s_i(t_s)^2 e^(-2 k t) + (beta/k) (1 - e^(-2 k t)), t counted from the hand-over t_s; what
-    it is at most there follows from `solutions.state_envelope`. (23) and (51) are beta = 0, the exact sign.
+    Each component obeys s_i s_i' <= -k s_i^2 + beta with k = `reaching_rate` and
+    beta = (factor of sign(s) in s') * 0.2785 width. With t counted from the hand-over t_s, this gives
+
+        s_i^2 <= s_i(t_s)^2 e^(-2 k t) + (beta/k) (1 - e^(-2 k t)).
+
+    The bound on |s_i(t_s)| follows from `solutions.state_envelope`. Equations (23) and (51) are the special case
+    beta = 0, the discontinuous sign.
     """
     law, (_, _, s, floor) = parts.controller, _at_hand_over(parts)
     fallen = np.exp(-2.0 * float(law.reaching_rate) * (np.asarray(t) - float(law.hand_over)))[:, None]
@@ -66,10 +81,11 @@ def sliding_bound(parts: Parts, t: ArrayLike) -> np.ndarray:
 
 
 def error_bound(parts: Parts, t: ArrayLike) -> np.ndarray:
-    """Bound on |error|_2, the attitude error vector's or |x_1|, at times t (time,) [s] from the hand-over on.
+    """Return a bound on the error at times t (time,) [s] in the hold phase.
 
-    The error answers to what it is at the hand-over and to s as a chain of lags, the roots p_i of the surface (39); no
-    more than the chain of the lags Re p_i answers to the bound |s(t_s)| e^(-k t) + (beta/k)^(1/2) of `sliding_bound`.
+    The error is |v|_2 of the attitude error vector v, or |x_1| of a chain. It is the response of a chain of first-order
+    lags to its initial state and to s. The poles of the lags are the roots p_i of the surface (39). Lags with the poles
+    Re p_i, driven by the bound |s(t_s)| e^(-k t) + (beta/k)^(1/2) of `sliding_bound`, bound the response to s.
     """
     known = _at_hand_over(parts)
     lags = np.poly(np.real(surface_roots(parts.controller.surface())))[1:][::-1]
@@ -77,12 +93,12 @@ def error_bound(parts: Parts, t: ArrayLike) -> np.ndarray:
 
 
 class _HandOver(NamedTuple):
-    """What is known at the hand-over, of each component of the error."""
+    """Bounds at the hand-over, for each component of the error."""
 
-    centre: Array  # (m, n) the error and its derivatives lie between centre - half and centre + half
+    centre: Array  # (m, n) The error and its derivatives are between centre - half and centre + half.
     half: Array  # (m, n)
-    s: Array  # (m,) bound on |s|
-    floor: Array  # what the smooth sign leaves of |s| in the end, (beta/k)^(1/2)
+    s: Array  # (m,) Bound on |s|.
+    floor: Array  # Limit of the bound on |s_i| for t -> infinity, (beta/k)^(1/2).
 
 
 def _at_hand_over(parts: Parts) -> _HandOver:
@@ -108,8 +124,8 @@ def _handed(parts: Parts, s0: Scalar, floor_before: Scalar, floor: Scalar) -> _H
 def _error_bound(parts: Parts, known: _HandOver, lags: Vector, t: Array) -> Array:
     law, n = parts.controller, parts.controller.order
     surface, rate = law.surface(), law.reaching_rate
-    on_it = jnp.eye(n, n - 1).at[-1].set(-surface)  # s = 0: x_n follows from the others
-    off_it = jnp.eye(n)[-1]  # s = 1, nothing else
+    on_it = jnp.eye(n, n - 1).at[-1].set(-surface)  # states with s = 0, where x_n follows from the others
+    off_it = jnp.eye(n)[-1]  # the state with s = 1 and all other states 0
 
     def size(after: Scalar) -> Scalar:
         slid = integrators.phi_functions(hold_matrix(surface, rate) * after, 0)[0][0] @ on_it

@@ -1,16 +1,19 @@
-"""The sampled loop linearised by the code that flies it, and opened: at the plant's input and at the sensors.
+"""Linearised sampled loop, opened at the plant's input or at the sensors.
 
-A control period takes z, local coordinates of all that the loop carries, to z' (`jax.jacfwd` of the steps of
-`control_period`): the true state x, the state of the actuators, and what the flight computer keeps, its own model of
-the actuators among it. Closed are
+`jax.jacfwd` linearises the simulation code of a control period about the nominal run, without noise and disturbance.
+The state z has local coordinates of the complete loop (`carries`): plant, actuators and flight computer, including the
+flight computer's model of the actuators. One period is
 
-    z' = A z + B x_seen + N u_new + O u_old + E d,    u = C z + D x_seen,
+    z' = A z + B x_seen + N u_new + O u_old + E d,    u = C z + D x_seen.
 
-with x_seen the part of x that sensors see; u_new the command of `delay` periods ago, which acts from the share `part`
-of the period on, and u_old the one before it, which acts until then; d a torque on the plant. The flight computer is
-told what its own model of the actuators makes of u: it knows nothing of a gain or a delay at the plant's input. All is
-linearised about the nominal run, without noise and disturbance; of a star tracker that is slower than the loop the mean
-over its interval is taken, see `Sensors.in_step` too.
+- x_seen is the part of the plant state that sensors see.
+- u_new is the command of `delay` periods ago. It acts from the fraction `part` of the period on.
+- u_old is the command before u_new. It acts until then.
+- d is a torque on the plant.
+
+The flight computer predicts the applied torque from u with its model of the actuators. It does not see a gain or a
+delay that the analysis inserts at the plant's input. If a star tracker is slower than the loop, the matrices are means
+over its interval; see also `Sensors.in_step`. Read `nominal`, `opened` and `at_input` first.
 """
 
 from collections.abc import Sequence
@@ -34,44 +37,44 @@ from ptsmc_jax.simulation.computer import Computer, Decision, Period, decide
 from ptsmc_jax.simulation.control_period import PeriodMotion, State, Tick, control_period, schedule, start
 from ptsmc_jax.theory.carries import Carry, Local
 
-NODES = 0.5 - 0.5 * np.cos(np.pi * np.arange(13) / 12)  # of a period: Chebyshev's, for what acts late within one
-_WEIGHTS = np.where(np.isin(np.arange(13), (0, 12)), 0.5, 1.0) * (-1.0) ** np.arange(13)  # of Lagrange's polynomials
+NODES = 0.5 - 0.5 * np.cos(np.pi * np.arange(13) / 12)  # Chebyshev nodes for delays within a period, in periods.
+_WEIGHTS = np.where(np.isin(np.arange(13), (0, 12)), 0.5, 1.0) * (-1.0) ** np.arange(13)  # Barycentric weights.
 
 
 @pytree
 @dataclass(frozen=True)
 class Loop:
-    """A period of the loop, opened, see above: z (n,), of which the first k are what sensors see of x; u (m,)."""
+    """One period of the opened loop, as the module describes: z (n,), u (m,). The first k of z are x_seen."""
 
     a: Leaf  # (n, n) A
     seen: Leaf  # (n, k) B
-    new: Leaf  # (nodes, n, m) N, for `part` at NODES of a period; at the first of them alone: `opened(late=False)`
+    new: Leaf  # (nodes, n, m) N, for `part` at each of NODES; only for the first of them with `opened(late=False)`
     old: Leaf  # (nodes, n, m) O
     command: Leaf  # (m, n) C
     direct: Leaf  # (m, k) D
     disturbed: Leaf  # (n, m) E
     period: Leaf  # h [s]
-    delay: int = field(metadata={"static": True})  # whole periods that the actuators are late by
+    delay: int = field(metadata={"static": True})  # delay of the actuators in whole periods
 
     def closed_at_sensors(
         self, xp: Any = jnp
     ) -> tuple[Float[Array | np.ndarray, "n n"], Float[Array | np.ndarray, "m n"]]:
-        """A (n, n) and C (m, n) with x_seen closed, in the units of the coordinates: rad, rad/s, [N m]."""
+        """Return A (n, n) and C (m, n) with x_seen closed, in the units of the coordinates: rad, rad/s, [N m]."""
         others = ((0, 0), (0, self.a.shape[0] - self.seen.shape[1]))
         return self.a + xp.pad(self.seen, others), self.command + xp.pad(self.direct, others)
 
 
 class Nominal(NamedTuple):
-    """The nominal run: arrays over the control periods first."""
+    """Nominal run without noise and disturbance; the first axis of all arrays is the control period."""
 
     period: Period
     carry: Carry  # before the period
-    after: Carry
-    command: Array  # u that arrives in it
+    after: Carry  # after the period
+    command: Array  # u that acts in the period, after the delay
 
 
 def quiet(parts: Parts) -> Parts:
-    """The parts without noise, disturbance and timing jitter."""
+    """Return the parts without noise, disturbance and timing jitter."""
     nothing = jax.tree_util.Partial(_nothing, jnp.zeros(parts.plant.inputs))
     return replace(parts, sensors=parts.sensors.in_step().quiet(), disturbance=nothing, walk_rate=None, jitter=None)
 
@@ -81,7 +84,7 @@ def _nothing(zero: Array, t: Scalar, x: Any) -> Array:
 
 
 def nominal(parts: Parts) -> Nominal:
-    """The nominal run of sampled parts."""
+    """Simulate the nominal run of sampled parts."""
     assert parts.clock.sampled
     parts = quiet(parts)
     ticks = parts.clock.ticks(parts.controller.t_f, parts.controller.delta)
@@ -102,9 +105,14 @@ nominal_jit = programs.jit(nominal, compiler_options=programs.QUICKLY)
 def _computed(
     parts: Parts, k2: Any, period: Period, carry: Carry, seen: Any
 ) -> tuple[Decision, Computer, ActuatorState]:
-    """Return what the flight software decides and remembers, by its own model of the actuators.
+    """Return the decision of the flight software, its memory, and the actuator state in its own model.
 
-    seen: the true state, as far as sensors see it.
+    Args:
+        parts: the scenario.
+        k2: bound on the estimation error, see `Observer.error_bound`.
+        period: the control period.
+        carry: the loop at the sample.
+        seen: the part of the true state that sensors see.
     """
     actuators, dt = parts.actuators, period.length
     decision, computer = decide(parts, k2, period, carry.computer, seen)
@@ -124,10 +132,17 @@ def _acted(
     commands: Sequence[tuple[Array, Scalar, Scalar]],
     pushed: Array | None = None,
 ) -> tuple[Any, ActuatorState]:
-    """What actuators and plant make of commands that arrive, each with its time and how long it acts [s].
+    """Return the states of plant and actuators after commands have acted one after the other.
 
-    pushed: additional torque on the plant, (m,). Delayed commands are already limited and compensated. Commands without
-    a delay are limited and compensated here.
+    Delayed commands are already limited and compensated. Commands without a delay are limited and compensated here.
+
+    Args:
+        parts: the scenario.
+        period: the control period.
+        carry: the loop at the sample.
+        w: body rate that the flight computer knows, (m,) [rad/s].
+        commands: each command (m,) [N m], the time when it begins to act [s], and how long it acts [s].
+        pushed: additional torque on the plant, (m,) [N m].
     """
     actuators = parts.actuators
 
@@ -145,20 +160,25 @@ def _acted(
 
 
 class Opened(NamedTuple):
-    """A control period of the nominal run: the loop, and what is asked of it."""
+    """Opened loop of a control period of the nominal run, and derivatives of the error and of s."""
 
     loop: Loop
-    error: Array  # (m, x) of what the law drives to zero, by x
-    error_rate: Array  # (m, x) and of its rate
-    s_command: Array  # (components, n) of s by z
-    s_direct: Array  # (components, k) and by x_seen
+    error: Array  # (m, x) Derivative of the error by the plant's local coordinates.
+    error_rate: Array  # (m, x) Derivative of the error's rate by the same.
+    s_command: Array  # (components, n) Derivative of s by z.
+    s_direct: Array  # (components, k) Derivative of s by x_seen.
 
 
 def opened(parts: Parts, during: Nominal, *, late: bool = True) -> Opened:
-    """The loop opened in one control period of the nominal run; see `Loop`, h in [s]. Does not look at the clock.
+    """Linearise and open the loop in one control period of the nominal run; see `Loop`, h in [s].
 
-    late: for commands that act late within the period too, which `at_input` and `late_axis` need for a share of a
-    period; most of the work.
+    The function does not use the clock of the scenario.
+
+    Args:
+        parts: the scenario.
+        during: the period of the nominal run.
+        late: whether to compute N and O for commands that begin to act within the period, which is most of the work.
+            `at_input` and `late_axis` need them for delays that are not a whole number of periods.
     """
     parts = quiet(parts)
     period, before, after, arriving = during
@@ -196,25 +216,32 @@ def opened(parts: Parts, during: Nominal, *, late: bool = True) -> Opened:
 
 
 def _whole(period: Period) -> Period:
-    """A period whose length [s], where it is a whole one, is that of the clock's periods, and has its slopes.
+    """Return the period; if it is a full one, its length [s] and derivatives become those of the clock's period.
 
-    The last of a run may end at t_end, which stays where it is when the sample before it moves with delta: that one is
-    then no whole one any more, and those before it are as long as ever.
+    Otherwise the last full period could end at t_end. Its length would then have a wrong derivative by delta, because
+    the sample before it depends on delta and t_end does not.
     """
     now, length = period.now, period.full_length
     ends = jnp.where(is_full(now, length), now.t + length, now.t_next)
     return period._replace(now=now._replace(t_next=ends))
 
 
-TOGETHER = 64  # periods that one call of the compiled program opens
+TOGETHER = 64  # periods that one call of the compiled program linearises
 
 
 def opened_in(
     parts: Parts, run: Nominal, indices: np.ndarray, widths: np.ndarray | None = None, *, late: bool = True
 ) -> Opened:
-    """The loop opened in these periods, by their numbers (periods,): arrays over them first, h in [s]; late: `opened`.
+    """Linearise and open the loop in several periods, h in [s]; the first axis of the result is the period.
 
-    By one program, however many they are and however many the run has. widths: of the law's smooth sign in each.
+    One compiled program serves any number of periods.
+
+    Args:
+        parts: the scenario.
+        run: the nominal run.
+        indices: numbers of the periods (periods,).
+        widths: width of the law's smooth sign in each period (periods,), or None for the law's own width.
+        late: see `opened`.
     """
     parts = replace(parts, clock=clock.flight(1.0, 1.0))
     listed = jax.tree.map(lambda v: np.asarray(v)[indices], run), widths
@@ -238,16 +265,28 @@ def _opened(parts: Parts, during: Nominal, widths: Array | None, late: bool) -> 
 
 
 def loops_in(parts: Parts, run: Nominal, indices: np.ndarray) -> Loop:
-    """The loops opened in these periods, by their numbers (periods,), arrays over them first, h in [s].
+    """Return the opened loops of several periods, h in [s]; the first axis of the result is the period.
 
-    Of a star tracker that is slower than the loop means over its interval.
+    If a star tracker is slower than the loop, each loop is the mean over the star tracker's interval.
+
+    Args:
+        parts: the scenario.
+        run: the nominal run.
+        indices: numbers of the periods (periods,).
     """
     several = _interval(parts, indices)
     return _means(opened_in(parts, run, several.reshape(-1)).loop, several.shape)
 
 
 def loops_at(parts: Parts, run: Nominal, indices: Array, *, late: bool = True) -> Loop:
-    """As `loops_in`, h in [s], for indices (periods,) that may be traced: it composes with every transformation."""
+    """Return the loops of `loops_in`, h in [s], for indices that may be traced by JAX transformations.
+
+    Args:
+        parts: the scenario.
+        run: the nominal run.
+        indices: numbers of the periods (periods,).
+        late: see `opened`.
+    """
     several = _interval(parts, indices)
 
     def one(index: Array) -> Loop:
@@ -257,12 +296,12 @@ def loops_at(parts: Parts, run: Nominal, indices: Array, *, late: bool = True) -
 
 
 def averaged(parts: Parts) -> int:
-    """How many control periods a loop is the mean of: those of an interval between star tracker samples."""
+    """Return the number of control periods between star tracker samples, over which a loop is averaged."""
     return getattr(parts.sensors, "every", 1)
 
 
 def _interval(parts: Parts, indices: Any) -> Any:
-    """(periods, every): those since the star tracker's sample before."""
+    """Return the numbers of the periods to average for each index, (periods, every)."""
     return (indices[:, None] - np.arange(averaged(parts))[None]).clip(0)
 
 
@@ -271,12 +310,12 @@ def _means(loops: Loop, shape: tuple[int, ...]) -> Loop:
 
 
 def is_full(ticks: Ticks, period: Any) -> Any:
-    """Which periods of a run are whole ones, (periods,) bool; of times in [s], NumPy's or JAX's."""
+    """Return whether each period of a run has the full length, (periods,) bool; times in [s], in NumPy or JAX."""
     return ticks.t_next - ticks.t > (1.0 - 1e-6) * period
 
 
 def full_periods(parts: Parts, run: Nominal, *, hold: bool) -> np.ndarray:
-    """Numbers (periods,) of the whole control periods [s] after, or before, the hand-over."""
+    """Return the numbers (periods,) of the full control periods [s] after (hold=True) or before the hand-over."""
     ticks = run.period.now
     in_hold = ticks.hold if hold else parts.controller.in_hold(ticks.t, ticks.t_next, ticks.hold)
     long_enough = is_full(jax.tree.map(np.asarray, ticks), np.asarray(parts.period))
@@ -284,7 +323,15 @@ def full_periods(parts: Parts, run: Nominal, *, hold: bool) -> np.ndarray:
 
 
 def acting(loop: Loop, part: ArrayLike, xp: Any = jnp) -> tuple[Any, Any]:
-    """N and O, (n, m) each, for a command [N m] that is late by a share of a period, by polynomials through NODES."""
+    """Return N and O, (n, m) each, for a command [N m] that begins to act within the period.
+
+    The function interpolates by polynomials through `NODES`.
+
+    Args:
+        loop: the opened loop.
+        part: fraction of the period after which the command acts, 0 to 1.
+        xp: `jax.numpy` or `numpy`.
+    """
     gap = part - xp.asarray(NODES)
     on = xp.abs(gap) < 1e-14
     weights = xp.asarray(_WEIGHTS) / xp.where(on, 1.0, gap)
@@ -293,9 +340,9 @@ def acting(loop: Loop, part: ArrayLike, xp: Any = jnp) -> tuple[Any, Any]:
 
 
 class Opening(NamedTuple):
-    """L(z) = -C (z - A)^-1 B of a loop opened somewhere: what comes back there, its sign changed.
+    """State space of an opened loop, L(z) = -C (z - A)^-1 B with negative feedback.
 
-    Its states are z and the commands on their way. 1 + L = 0 is the border of stability.
+    The states are z and the delayed commands. A pole of the closed loop is on the unit circle if det(I + L) = 0 there.
     """
 
     a: Any  # (n, n)
@@ -303,20 +350,26 @@ class Opening(NamedTuple):
     c: Any  # (m, n)
 
     def closed(self, gain: Any = 1.0) -> Any:
-        """Matrix (n, n) of a period of the closed loop with this gain [-], a number or a matrix (m, m)."""
+        """Return the transition matrix (n, n) of the closed loop with a gain [-], a number or a matrix (m, m)."""
         return self.a + self.b @ (gain * self.c if np.ndim(gain) == 0 else gain @ self.c)
 
 
 def at_input(loop: Loop, extra_delay: float = 0.0, xp: Any = jnp) -> Opening:
-    """The loop opened at the plant's input, B (n, m), the command [N m] late by so many periods more."""
+    """Return the loop opened at the plant's input, B (n, m), with an additional delay of the command [N m].
+
+    Args:
+        loop: the linearised loop.
+        extra_delay: additional delay of all axes in periods, whole or fractional.
+        xp: `jax.numpy` or `numpy`.
+    """
     a, command = loop.closed_at_sensors(xp)
     (m, n), total = command.shape, loop.delay + extra_delay
     whole = int(np.floor(total + 1e-12))
     part = max(total - whole, 0.0)
-    pushes = [xp.zeros((n, m))] * whole + [loop.new[0]]  # of the commands of so many periods ago
+    pushes = [xp.zeros((n, m))] * whole + [loop.new[0]]  # entry k: effect of the command of k periods ago
     if part > 0.0:
         pushes[whole:] = acting(loop, part, xp)
-    waiting = (len(pushes) - 1) * m  # states that hold commands on their way, the newest first
+    waiting = (len(pushes) - 1) * m  # number of states for delayed commands, newest first
     coming = xp.concatenate([a, *pushes[1:]], axis=1)
     moving = xp.concatenate([xp.zeros((waiting, n)), xp.eye(waiting, k=-m)], axis=1)
     b = xp.concatenate([pushes[0], xp.eye(waiting, m)])
@@ -324,7 +377,7 @@ def at_input(loop: Loop, extra_delay: float = 0.0, xp: Any = jnp) -> Opening:
 
 
 def at_sensors(loop: Loop) -> Opening:
-    """The loop opened at the sensors, B (n, k): the state that follows, in rad and rad/s, of what they see."""
+    """Return the loop opened at the sensors, B (n, k), with x_seen in rad and rad/s as input."""
     (n, k), (m, _) = loop.seen.shape, loop.command.shape
     push, waiting = loop.new[0], loop.delay * m
     if not waiting:
@@ -336,9 +389,15 @@ def at_sensors(loop: Loop) -> Opening:
 
 
 def late_axis(loop: Loop, z: Array, extra_delay: Scalar, axis: Any) -> Opening:
-    """The loop at one z [-] opened at the plant's input, B (n, m), one axis late by any number of periods more.
+    """Return the loop opened at the plant's input, B (n, m), with an additional delay of one axis, valid at one z [-].
 
-    Its L(z) times z^-`loop.delay` is what comes back.
+    The loop transfer matrix is z^-`loop.delay` times the L(z) of the result.
+
+    Args:
+        loop: the linearised loop.
+        z: the point e^(i w h).
+        extra_delay: additional delay in periods, whole or fractional.
+        axis: number of the delayed axis.
     """
     a, command = loop.closed_at_sensors()
     whole = jnp.floor(extra_delay)
@@ -348,10 +407,16 @@ def late_axis(loop: Loop, z: Array, extra_delay: Scalar, axis: Any) -> Opening:
 
 
 def radius(loop: Loop, gain: Any = 1.0, extra_delay: float = 0.0) -> float:
-    """Largest modulus of the closed loop's poles [-]; stable below 1, but for stored momentum, which is at 1.
+    """Return the spectral radius of the closed loop [-].
 
-    NaN of a loop about a run that is not finite. In NumPy: with every delay the matrix has another size, and would be
-    another program.
+    The loop is stable below 1. Poles of stored wheel momentum are at 1. The result is NaN if the nominal run is not
+    finite. The function uses NumPy, because the size of the matrix depends on the delay and JAX would compile a program
+    for each size.
+
+    Args:
+        loop: the linearised loop.
+        gain: gain at the plant's input [-], a number or a matrix (m, m).
+        extra_delay: additional delay of all axes in periods.
     """
     closed = at_input(jax.tree.map(np.asarray, loop), extra_delay, np).closed(gain)
     return float(np.abs(np.linalg.eigvals(closed)).max()) if np.all(np.isfinite(closed)) else float("nan")

@@ -1,9 +1,9 @@
-"""Stability margins of a sampled loop at the plant's input, one axis opened at a time, the others closed.
+"""Stability margins of a sampled loop at the plant's input, one axis opened at a time, the other axes closed.
 
-From L(e^(i w h)) of `linear.at_input` between 0 and the Nyquist frequency: crossings are found on a grid that is fine
-around every pole, closed in on, and end in a Newton step, through which they have their derivative. Gains and delays
-are those at which the loop that flies comes to its border of stability, the delayed command held in between: no
-continuous stand-in.
+The margins follow from L(e^(i w h)) of `linear.at_input` between 0 and the Nyquist frequency. Crossings are located on
+a grid that is dense around every pole, refined, and completed by a differentiable Newton step. The margins are exact
+for the sampled loop: at the gain or delay margin the simulated loop, with held commands, reaches its stability limit.
+There is no continuous approximation. Read `Margins` and `of` first.
 """
 
 from collections.abc import Callable
@@ -22,34 +22,38 @@ from ptsmc_jax.theory import crossings, linear
 from ptsmc_jax.theory.crossings import MOST, SPLIT, Brackets, Triangles
 from ptsmc_jax.theory.linear import Loop, Opening
 
-NEUTRAL = 1e-6  # by which a pole may lie outside the unit circle: rounding of those of stored momentum
-NEAREST = 3  # places where |L| is 1 from which a delay is searched for, those of the least estimates
-LOOKED, PARTS = 8, 16  # periods of delay that are looked through, and in how many steps each
-NEAR = 6  # places from there that it is searched from too
-PAIR = 2  # loops that one call of the compiled program judges: of a map's cell there are no more
-STARTS, FARTHER = 8, 0.15  # of Newton's search for a delay, at most, and by how many periods each lies beyond the last
+NEUTRAL = 1e-6  # Tolerance of the unit circle, because rounding moves the poles at 1 of stored momentum.
+NEAREST = 3  # Crossings |L| = 1 that start a search for the delay margin, those with the smallest estimates.
+LOOKED, PARTS = 8, 16  # Range of the grid search for the delay margin in periods, and its steps per period.
+NEAR = 6  # Results of the grid search that start a search for the delay margin.
+PAIR = 2  # Loops in one call of the compiled program, because a cell of a map has two.
+STARTS, FARTHER = 8, 0.15  # Largest number of Newton starts for a delay, and the distance between them in periods.
 
 
 class Margins(NamedTuple):
-    """The margins of each axis, (m,); of an unstable loop they are negative: how far the nearest border is.
+    """Margins of each axis, (m,).
 
-    There a pole crosses the unit circle, by more gain or by less; others may still be outside. Its delay margin is 0.
+    The margins of an unstable loop are negative. Their size is the distance to the nearest gain or phase that moves a
+    pole across the unit circle; other poles may still be outside. The delay margin of an unstable loop is 0.
     """
 
-    gain_up: Array  # [dB]; infinite: stable with any gain
-    gain_down: Array  # [dB]
+    gain_up: Array  # [dB] Allowed gain increase; infinite if no gain makes the loop unstable.
+    gain_down: Array  # [dB] Allowed gain reduction.
     phase: Array  # [deg]
     delay: Array  # [s]
-    modulus: Array  # [dB] peak of the sensitivity
-    stable: Array  # bool, of the loop
-    crossover: Array  # [rad/s] where the phase margin is
+    modulus: Array  # [dB] Peak sensitivity M_s.
+    stable: Array  # bool, whether the loop is stable.
+    crossover: Array  # [rad/s] Frequency at which the phase margin is attained.
 
     def worst(self) -> dict[str, Any]:
-        """Each of `catalogues.MARGINS`, the worst over all axes and loops."""
+        """Return the worst of each of `catalogues.MARGINS` over all axes and loops."""
         return {name: (v.max if name == "modulus_margin" else v.min)() for name, v in self.each().items()}
 
     def each(self) -> dict[str, Any]:
-        """Each of `catalogues.MARGINS` by axis: the nearer of both gains, of an unstable loop's sensitivity `MOST`."""
+        """Return each of `catalogues.MARGINS` by axis.
+
+        The gain margin is the smaller of increase and reduction. The peak sensitivity of an unstable loop is `MOST`.
+        """
         xp: Any = np if isinstance(self.phase, np.ndarray) else jnp
         return {
             "gain_margin": xp.minimum(self.gain_up, self.gain_down),
@@ -59,17 +63,23 @@ class Margins(NamedTuple):
         }
 
 
-FIELDS = Margins._fields[:5]  # that are margins
+FIELDS = Margins._fields[:5]  # fields of `Margins` that are margins
 
 
 @programs.jit(static_argnames=("sensors", "with_delay"))
 def of_each(loops: Loop, sensors: bool = False, with_delay: bool = True) -> Margins:
-    """Margins of several loops, arrays over them first; see `of`."""
+    """Return the margins of several loops; the first axis is the loop.
+
+    Args:
+        loops: the loops.
+        sensors: see `of`.
+        with_delay: see `of`.
+    """
     return jax.lax.map(partial(of, sensors=sensors, with_delay=with_delay), loops)
 
 
 def in_turn(loops: Loop) -> Margins:
-    """Margins of several loops, arrays over them first, in NumPy: by one program, however many they are."""
+    """Return the margins of several loops in NumPy; the first axis is the loop. One program serves any number."""
     count = np.shape(loops.period)[0]
 
     def call(k: int) -> Margins:
@@ -83,16 +93,19 @@ def in_turn(loops: Loop) -> Margins:
 class _Spectrum(NamedTuple):
     """L of an opened loop from 0 to the Nyquist frequency."""
 
-    finite: Array  # bool; of one that is not, numbers mean nothing
+    finite: Array  # bool; if False, all numbers are meaningless.
     loop: Loop
     opening: Opening
-    quick: Triangles  # the same
+    quick: Triangles  # The opening in Schur coordinates.
     stable: Array  # bool
     w: Array  # (points,) [rad/s]
-    each: Array  # (m, points) L of each axis, without slopes
+    each: Array  # (m, points) L of each axis, with stopped gradients.
 
     def at(self, w: Array, *, sloped: bool) -> tuple[Array, Array]:
-        """L of each axis at frequencies of its own (m, places) [rad/s], their derivatives by w; sloped: by the loop."""
+        """Return L of each axis and its derivative by w, at frequencies w (m, places) [rad/s] of each axis.
+
+        sloped: whether L is differentiable by the loop.
+        """
         m, places = w.shape
         z = jnp.exp(1j * w.reshape(-1) * jax.lax.stop_gradient(self.loop.period))
         by_w = 1j * jax.lax.stop_gradient(self.loop.period) * z
@@ -118,14 +131,19 @@ def _spectrum(loop: Loop, opened: Callable[[Loop], Opening] = linear.at_input) -
 
 
 def of(loop: Loop, sensors: bool = False, with_delay: bool = True) -> Margins:
-    """Margins of each axis of an opened loop; sensors: opened there, of each coordinate that they see, not of delay.
+    """Return the margins of each axis of a loop, or NaN if the loop contains numbers that are not finite.
 
-    NaN where the loop has a number that is not finite; with_delay: of delay too, else it is NaN.
+    Args:
+        loop: the loop.
+        sensors: whether to open the loop at the sensors instead of the plant's input. The margins are then those of
+            each coordinate that sensors see, and the delay margin is NaN.
+        with_delay: whether to compute the delay margin; otherwise it is NaN.
     """
     if not sensors:
         return _of(_spectrum(loop), with_delay)
 
-    def at_one(axis: Array) -> Margins:  # L of all of them is so large at low frequencies that rounding is left of one
+    # one coordinate at a time: at low frequencies L of all is so large that rounding would hide L of one coordinate
+    def at_one(axis: Array) -> Margins:
         def opened(loop: Loop) -> Opening:
             opening, only = linear.at_sensors(loop), jax.nn.one_hot(axis, loop.seen.shape[1])
             a = opening.closed(jnp.diag(1.0 - only))
@@ -137,7 +155,7 @@ def of(loop: Loop, sensors: bool = False, with_delay: bool = True) -> Margins:
 
 
 def _of(spectrum: _Spectrum, with_delay: bool) -> Margins:
-    """Margins of each axis of an opened loop, see `of`."""
+    """Return the margins of each axis of an opened loop, see `of`."""
     brackets = jax.vmap(partial(crossings.brackets, spectrum.w))(spectrum.each)
     root = jax.lax.stop_gradient(_closed_in(spectrum, brackets))
     L, slope = spectrum.at(jnp.append(root, brackets.elsewhere, axis=1), sloped=True)
@@ -152,15 +170,15 @@ def _of(spectrum: _Spectrum, with_delay: bool) -> Margins:
 
 
 def _crossed(L: Array) -> Array:
-    """What is zero at crossings: of the real axis, of the size 1."""
+    """Return the functions that are zero at the crossings: Im L for the real axis, ln |L| for |L| = 1."""
     return jnp.append(L[..., : SPLIT[0]].imag, jnp.log(jnp.abs(L[..., SPLIT[0] : SPLIT[1]])), axis=-1)
 
 
 def _closed_in(spectrum: _Spectrum, brackets: Brackets) -> Array:
-    """Frequencies (m, places) [rad/s] of all crossings of all axes.
+    """Return the frequencies (m, places) [rad/s] of all crossings of all axes.
 
-    By Illinois' regula falsi (Dowell and Jarratt, BIT 11, 1971), until none moves by more than the step of Newton's
-    that follows makes good.
+    The function uses the Illinois variant of regula falsi (Dowell and Jarratt, BIT 11, 1971). It stops when the
+    remaining error is small enough for the Newton step that follows.
     """
 
     def closer(state: tuple[Array, tuple, Array]) -> tuple[Array, tuple, Array]:
@@ -183,9 +201,9 @@ def _closed_in(spectrum: _Spectrum, brackets: Brackets) -> Array:
 
 
 def roughly(loop: Loop) -> dict[str, Array]:
-    """Each of `catalogues.MARGINS` of each axis by straight lines between the points of the grid, (m,); no slopes.
+    """Return approximate margins of each axis (m,) by interpolation between grid points, with stopped gradients.
 
-    A tenth of the work of `of`.
+    The keys are those of `catalogues.MARGINS`. The function takes about a tenth of the time of `of`.
     """
     spectrum = _spectrum(loop)
     gain, phase, modulus = jax.vmap(crossings.straight)(spectrum.each)
@@ -201,20 +219,29 @@ def roughly(loop: Loop) -> dict[str, Array]:
 
 
 def _axis(root: Array, L: Array, slope: Array, there: Array, stable: Array, lowest: Scalar) -> Margins:
-    """Margins of one axis, from its L and slopes by w at the crossings and at what `brackets` looks at besides."""
+    """Return the margins of one axis.
+
+    Args:
+        root: frequencies of the crossings (crossings,) [rad/s].
+        L: L at the crossings and at `Brackets.elsewhere`.
+        slope: derivative of L by w at the same frequencies.
+        there: which crossings exist.
+        stable: whether the loop is stable.
+        lowest: lowest frequency of the grid [rad/s].
+    """
     crosses = SPLIT[1]
-    ends = L[-2:]  # where a pole comes to 1, and to -1
-    on_ends = crossings.ends_at(ends.at[0].add(-lowest * slope[-2]))  # where w is 0: of a slow loop not yet at `lowest`
+    ends = L[-2:]  # a gain can move a pole to 1 or to -1 there
+    on_ends = crossings.ends_at(ends.at[0].add(-lowest * slope[-2]))  # extrapolated to w = 0, which slow loops need
     slope = slope[:crosses]
     fall = jnp.append(slope[: SPLIT[0]].imag, (slope / L[:crosses]).real[SPLIT[0] :])
-    # one step of Newton's, with slopes that stay: through it the crossing has its derivative
+    # one Newton step with constant derivatives makes the crossing differentiable by the loop
     rate = jax.lax.stop_gradient(slope / jnp.where(fall == 0.0, 1.0, fall))
     real, even = jnp.split(L[:crosses] - rate * _crossed(L), SPLIT[:1])
     on = jnp.append(there[: real.size], on_ends)
     real = jnp.append(real.real, ends.real)
     factor = -20.0 * jnp.log10(jnp.where(on & (real < 0.0), -real, 1.0))
     up, down = (jnp.min(jnp.where(side * factor > 0.0, side * factor, MOST)) for side in (1.0, -1.0))
-    evens = slice(SPLIT[0], crosses)  # places where the size is 1
+    evens = slice(SPLIT[0], crosses)  # crossings with |L| = 1
     angles = jnp.where(there[evens], jnp.rad2deg(jnp.abs(jnp.angle(-even))), 180.0)
     nearest, worst = jnp.minimum(up, down), jnp.argmin(angles)
     return Margins(
@@ -222,26 +249,26 @@ def _axis(root: Array, L: Array, slope: Array, there: Array, stable: Array, lowe
         gain_down=jnp.where(stable, jnp.where(down < MOST, down, jnp.inf), -nearest),
         phase=jnp.where(stable, 1.0, -1.0) * jnp.min(angles),
         delay=jnp.zeros_like(up),
-        modulus=-20.0 * jnp.log10(jnp.min(jnp.abs(1.0 + L[crosses:]))),  # its slope by w is none: no step to take
+        modulus=-20.0 * jnp.log10(jnp.min(jnp.abs(1.0 + L[crosses:]))),  # derivative by w is 0: no Newton step
         stable=stable,
         crossover=jnp.where(there[evens][worst], root[evens][worst], jnp.nan),
     )
 
 
 def _delay(loop: Loop, w: Array, seen: Array, axis: Array) -> Scalar:
-    """Further delay [s] at which the loop comes to its border, the axis's command late by it."""
-    # not by LAPACK's solutions: jaxlib's wait for XLA's threads, on which two of them beside each other stand for ever
+    """Return the smallest additional delay [s] of one axis's command that brings the loop to its stability limit."""
+    # no LAPACK solver: jaxlib's wait for threads of XLA, and two of them at the same time deadlock
     of_a = crossings.triangle(loop.closed_at_sensors()[0])
     still, fixed = jax.lax.stop_gradient((loop, of_a))
     near = _looked_through(still, fixed, w, axis)
     estimates, crossed = crossings.delay_at(w, seen)
     sizes, crossed = jax.lax.stop_gradient((estimates, crossed))
-    # the hold moves each border away from its estimate, by its own share: the least estimate need not be the nearest
+    # the estimates ignore that commands are held, so that the smallest estimate need not give the smallest delay
     values, places = crossings.smallest(sizes, NEAREST)
     starts = jnp.append(near, jnp.stack([jnp.log(crossed[places]), values / still.period], axis=1), axis=0)
     tries = jnp.append(jnp.ones(len(near), int), jnp.full(NEAREST, STARTS))
 
-    def border(of: tuple) -> tuple[Array, Array]:  # ln w and delay, searched from a start; whether one is found
+    def border(of: tuple) -> tuple[Array, Array]:  # ln w and delay in periods at a stability limit; whether found
         start, tries = of
         known = jnp.isfinite(start[1])
 
@@ -249,9 +276,9 @@ def _delay(loop: Loop, w: Array, seen: Array, axis: Array) -> Scalar:
             steps, starts, x, _ = state
             by = _delay_step(still, fixed, axis, x)
             x = x - by
-            settled = jnp.all(jnp.abs(by) <= 1e-9 * jnp.maximum(jnp.abs(x), 1.0))  # one step more is of its square
+            settled = jnp.all(jnp.abs(by) <= 1e-9 * jnp.maximum(jnp.abs(x), 1.0))  # convergence is quadratic
             found = settled & (x[1] > 0.0)
-            lost = ~found & (settled | (steps == 11) | ~jnp.all(jnp.isfinite(x)))  # a border of less delay, or none
+            lost = ~found & (settled | (steps == 11) | ~jnp.all(jnp.isfinite(x)))  # delay not positive, or diverged
             starts = starts + lost
             x = jnp.where(lost, start.at[1].add(FARTHER * starts), x)
             return jnp.where(lost, 0, steps + 1), starts, x, found
@@ -262,19 +289,25 @@ def _delay(loop: Loop, w: Array, seen: Array, axis: Array) -> Scalar:
         return root, known & found
 
     roots, found = jax.lax.map(border, (starts, tries))
-    # one that is near and not found is none, but for where none is found
+    # a start in the range of the grid search without a limit is ignored, unless no start leads to a limit
     counts = jnp.where((starts[:, 1] < LOOKED) & jnp.any(found), jnp.inf, starts[:, 1])
-    first = jnp.argmin(jnp.where(found, roots[:, 1], counts))  # to be reached
+    first = jnp.argmin(jnp.where(found, roots[:, 1], counts))  # smallest delay
     root = jax.lax.stop_gradient(jnp.where(found[first], roots[first], 1.0))
     exact = (root - _delay_step(loop, of_a, axis, root))[1] * loop.period
     return jnp.where(found[first], exact, jnp.append(near[:, 1] * still.period, estimates[places])[first])
 
 
 def _looked_through(loop: Loop, of_a: tuple[Array, Array], w: Array, axis: Array) -> Array:
-    """Near where the loop comes to its border as the axis is later and later, in steps: (NEAR, 2), see `border`.
+    """Return approximate stability limits by a grid search over delay and frequency, (NEAR, 2): ln w and the delay.
 
-    At each step L is known at all frequencies, and 1 + L is zero near where it goes around zero. Those of the least
-    delays; infinite where there are none. of_a: as in `_delay_step`.
+    A zero of 1 + L is inside a grid cell around which 1 + L winds around zero. The function returns the zeros with the
+    smallest delays in periods, and infinity if there are fewer.
+
+    Args:
+        loop: the loop.
+        of_a: see `_delay_step`.
+        w: frequencies [rad/s].
+        axis: number of the delayed axis.
     """
     a, command = loop.closed_at_sensors()
     z = jnp.exp(1j * w * loop.period)
@@ -284,7 +317,7 @@ def _looked_through(loop: Loop, of_a: tuple[Array, Array], w: Array, axis: Array
     into = jnp.conj(quick.axes.T)
     response = -jnp.einsum("nkp,nm->pkm", y, into @ loop.new[0])
 
-    def back(response: Array, column: Array) -> Array:  # linear in the axis's column
+    def back(response: Array, column: Array) -> Array:  # L of the axis, linear in its column of the response
         return crossings.one_axis(response.at[:, axis].set(column), axis)
 
     each = jnp.eye(command.shape[0]) + 0j
@@ -295,19 +328,23 @@ def _looked_through(loop: Loop, of_a: tuple[Array, Array], w: Array, axis: Array
     parts = jnp.arange(PARTS) / PARTS
     within = jax.vmap(lambda part: jnp.add(*linear.acting(nodes, part)))(parts)
     wholes = jnp.arange(LOOKED)[:, None, None]
-    late = (within[None] * z[None, None] ** -wholes).reshape(-1, w.size)  # a period turns L and leaves its size
+    late = (within[None] * z[None, None] ** -wholes).reshape(-1, w.size)  # a whole period only rotates L
     step, point = crossings.zeros_of(1.0 + late, NEAR)
     return jnp.stack([jnp.log(jnp.interp(point, jnp.arange(w.size), w)), step / PARTS], axis=1)
 
 
 @jax.jit
 def _delay_step(loop: Loop, of_a: tuple[Array, Array], axis: Array, x: Array) -> Array:
-    """Newton's step from x, ln w and a delay in periods, to where -L of an axis that is late by it is 1.
+    """Return the Newton step toward L = -1 of one delayed axis; the new estimate is x minus the step.
 
-    of_a: A of the loop closed at its sensors in a triangle.
+    Args:
+        loop: the loop.
+        of_a: `crossings.triangle` of A of the loop closed at its sensors.
+        axis: number of the delayed axis.
+        x: ln w and the delay in periods.
     """
 
-    def off(at: Array) -> tuple[Array, Array]:  # ln(-L), twice
+    def off(at: Array) -> tuple[Array, Array]:  # ln(-L), as value to differentiate and as auxiliary value
         z = jnp.exp(1j * jnp.exp(at[0]) * loop.period)
         late = linear.late_axis(loop, z, at[1], axis)
         L = crossings.response(late, crossings.in_triangles(late, of_a), z[None])[0][0]
@@ -323,16 +360,17 @@ def _delay_step(loop: Loop, of_a: tuple[Array, Array], axis: Array, x: Array) ->
 
 
 def together(loop: Loop) -> dict[str, float]:
-    """`FIELDS` with the same gain, phase or delay at all axes at once, by poles; the modulus by singular values.
+    """Return margins against the same change of gain, phase or delay in all axes at once, by the poles of the loop.
 
-    [dB], [deg], [s]: infinite beyond 80 dB and 200 periods, `nan` where the loop itself is unstable.
+    The keys are `FIELDS`, in dB, deg and s. The peak sensitivity is the largest singular value of (I + L)^-1. Margins
+    beyond 80 dB, 180 deg or 200 periods are infinite. All values are NaN if the loop is unstable.
     """
 
     def unstable(gain: Any = 1.0, delay: float = 0.0) -> bool:
         return not linear.radius(loop, gain, delay) < 1.0 + NEUTRAL
 
     def first(lost: Callable[[float], bool], values: np.ndarray) -> float:
-        """The least of these values, closed in on, at which it is unstable."""
+        """Return the smallest change that makes the loop unstable, bracketed by `values` and refined by bisection."""
         low = 0.0
         for high in values:
             if lost(high):
@@ -361,7 +399,7 @@ def together(loop: Loop) -> dict[str, float]:
 
 @programs.jit
 def _responses(loop: Loop) -> tuple[Array, Array, Array]:
-    """Frequencies, L (points, m, m) and that of each axis with the others closed (points, m)."""
+    """Return frequencies, L (points, m, m), and L of each axis with the other axes closed (points, m)."""
     opening = linear.at_input(loop)
     w = crossings.grid(crossings.poles_of(opening), loop.period)
     seen, _ = crossings.in_triangles(opening).response(jnp.exp(1j * w * loop.period))
@@ -369,6 +407,6 @@ def _responses(loop: Loop) -> tuple[Array, Array, Array]:
 
 
 def responses(loop: Loop) -> tuple[np.ndarray, np.ndarray]:
-    """Frequencies (points,) [rad/s] and L of each axis (points, m), the others closed."""
+    """Return frequencies (points,) [rad/s] and L of each axis with the other axes closed (points, m)."""
     w, _, each = _responses(loop)
     return np.asarray(w), np.asarray(each)

@@ -1,4 +1,4 @@
-"""Rates of a prescribed-time law: of its switching term, of its boundary layer and after the hand-over."""
+"""Rates of a prescribed-time law: switching term, boundary layer and hold phase. Read `switching_rate` first."""
 
 from typing import Any
 
@@ -17,13 +17,16 @@ from ptsmc_jax.numerics.pytrees import Scalar
 def switching_rate(law: PrescribedTimeLaw, k2: Scalar, visited: tuple[Any, Any] | None = None) -> Scalar:
     """Return the factor of -tau^(n-1) sign(s) in s' before the hand-over, and of -sign(s) after it, for K2 up to k2.
 
-    For an attitude it is at most |T J^-1| K2 / 2 [1/s^2], |T|_2 = 1. For a second-order system it is the largest
-    |dF/dx2 D| K2 over the states of a run.
+    For an attitude it is at most |T J^-1| K2 / 2 [1/s^2] with |T|_2 = 1. For a second-order system it is the largest
+    |dF/dx2 D| K2 over the states of a run. For a chain it is K2.
 
     Args:
         law: the prescribed-time law.
         k2: bound on the 2-norm of the estimation error.
         visited: targets (points,) and states (points, ..) of a run, for a second-order system.
+
+    Raises:
+        TypeError: if the law's kinematics are of another kind.
     """
     kinematics = law.kinematics
     if isinstance(kinematics, AttitudeKinematics):
@@ -40,18 +43,23 @@ def switching_rate(law: PrescribedTimeLaw, k2: Scalar, visited: tuple[Any, Any] 
 def boundary_layer(law: PrescribedTimeLaw, k2: Scalar, visited: tuple[Any, Any] | None = None) -> tuple[Scalar, Scalar]:
     """Return the fastest rates of the boundary layer before and after the hand-over [1/s], for K2 up to k2.
 
-    s' = -c sign(s) with the sign tanh(s / width) has the rate c / width, c by `switching_rate`.
+    The switching term s' = -c tanh(s / width) has the rate c / width near s = 0, with c of `switching_rate`.
+
+    Args:
+        law: the prescribed-time law.
+        k2: bound on the 2-norm of the estimation error.
+        visited: see `switching_rate`.
     """
     after = switching_rate(law, k2, visited) / law.sign_width
     return (law.t_f / law.layer_time) ** (law.order - 1) * after, after
 
 
 def hold_rates(law: PrescribedTimeLaw) -> dict[str, float]:
-    """Return the fastest decay after the hand-over [1/s], by the gain that sets it: toward the surface, and on it."""
+    """Return the decay rates in the hold phase [1/s]: toward the surface ("k1"), and fastest on it ("surface_rate")."""
     reaching, surface = _rates_of_hold(law)
     return {"k1": float(reaching), "surface_rate": float(np.max(np.abs(formulas.surface_roots(surface))))}
 
 
-@programs.jit  # one program, where each of its operations would be one
+@programs.jit  # one compiled program instead of one for each operation
 def _rates_of_hold(law: PrescribedTimeLaw) -> tuple[Scalar, Float[Array, " roots"]]:
     return law.reaching_rate, law.surface()

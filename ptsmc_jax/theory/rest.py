@@ -1,13 +1,18 @@
-"""Whether the nominal run comes to rest in hold, without which the slopes at its last sample are nobody's margins.
+"""Detection of limit cycles in the hold phase of the nominal run. Linearised margins are meaningless there.
 
-A loop that swings by itself, such as one whose sign is too narrow for its control period, is at its border of stability
-(harmonic balance), though the sign, saturated at every sample, has no slope there: of each margin nothing is left.
+A limit cycle occurs, for example, if the boundary layer is too thin for the control period. By harmonic balance the
+loop is then at its stability limit, and all its margins are zero. The linearisation does not show this, because the
+derivative of the saturated sign is zero at every sample.
 
-Looked for in the second half of the hold's whole periods, without noise and disturbance. What is no such swing is told
-apart by three things: a run on its way to rest gets slower; a reference or a disturbance is slower than `SLOWEST`
-samples; and what rings in a linear way, such as a flexible mode, is what slopes say it is. For the last, the command
-u at the state x as it was seen is set beside that at x_0 where the error and its derivatives are zero, all else alike:
-u(x_0) - u(x) - (du/dx) (x_0 - x) is zero where the slopes hold as far as the run swings.
+`swing`, which is the function to read first, examines the second half of the full periods in the hold phase, without
+noise and disturbance. Three criteria exclude other motions:
+
+- A run that converges gets slower.
+- A reference or a disturbance turns back less often than once in `SLOWEST` samples.
+- The linearisation explains a linear oscillation, such as a flexible mode.
+
+The third criterion compares the command u at the seen state x with the command at the state x_0 of zero error, all else
+equal. The residual u(x_0) - u(x) - (du/dx) (x_0 - x) is zero if the linearisation is valid over the amplitude.
 """
 
 from typing import Any, NamedTuple
@@ -24,37 +29,41 @@ from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.theory import linear
 from ptsmc_jax.theory.crossings import MOST
 
-FEWEST = 16  # whole periods in hold, below which nothing is said
-TURNS, SLOWEST = 4, 40  # times that the command turns back at least, and samples of a turn at most
-STAYS = 0.75  # of the swing in the first half of what is looked at is there in the second
-SHARE = 0.1  # of the swing is not what slopes say it is
-ROUNDING = 1e-8  # of the largest command
+FEWEST = 16  # Smallest number of full hold periods for a decision.
+TURNS, SLOWEST = 4, 40  # Smallest number of reversals of the command, and largest number of samples between them.
+STAYS = 0.75  # Smallest ratio of the activity in the second half of the examined periods to that in the first half.
+SHARE = 0.1  # Smallest fraction of the oscillation that the linearisation does not explain.
+ROUNDING = 1e-8  # Rounding error, relative to the largest command.
 
 
 class History(NamedTuple):
     """Commands of a nominal run."""
 
     command: Array  # (periods, m) [N m]
-    in_hold: Array  # (periods,) bool: whole periods in hold
+    in_hold: Array  # (periods,) bool: full periods in the hold phase
 
 
 def history(parts: Parts, run: linear.Nominal) -> History:
-    """The commands [N m] of a nominal run."""
+    """Return the commands [N m] of a nominal run."""
     return History(run.command, linear.is_full(run.period.now, parts.period) & run.period.now.hold)
 
 
 class Swing(NamedTuple):
-    """How a run that does not come to rest swings, on its worst axis."""
+    """Limit cycle of the command, on its worst axis."""
 
-    size: float  # of the command, from peak to peak [N m]
-    periods: float  # control periods from one peak to the next
+    size: float  # peak-to-peak amplitude of the command [N m]
+    periods: float  # period of the limit cycle in control periods
 
 
 def swing(parts: Parts, seen: History | None = None) -> Swing | None:
-    """How the nominal run of sampled parts swings in hold; None: it comes to rest, or slopes say how it rings.
+    """Return the limit cycle of the nominal run in the hold phase, or None.
 
-    seen: its history, where it is known; only where the command does swing is more computed. Of a law with the exact
-    sign, which always swings, margins are those without it: None.
+    The result is None if the run converges or oscillates linearly. It is also None for a law with a discontinuous sign,
+    which always chatters: its margins ignore the switching term.
+
+    Args:
+        parts: the sampled scenario.
+        seen: commands of the nominal run, if known. The nominal run is then only simulated if the command oscillates.
     """
     if not np.all(np.asarray(getattr(parts.controller, "sign_width", 1.0))):
         return None
@@ -79,34 +88,41 @@ def swing(parts: Parts, seen: History | None = None) -> Swing | None:
 
 
 def _measured(u: np.ndarray, off: np.ndarray) -> Swing:
-    """The swing of an axis's commands (times,), of which slopes leave `off`; what is slower adds little in a turn."""
+    """Return the limit cycle of one axis.
+
+    The amplitude is the median over windows of one cycle, so that slower motions contribute little.
+
+    Args:
+        u: commands of the axis (times,) [N m].
+        off: part of the commands that the linearisation does not explain (times,) [N m].
+    """
     periods = 2.0 * (off.size - 1) / float(np.count_nonzero(_reversals(off, 0.0)))
     turns = np.lib.stride_tricks.sliding_window_view(u, int(np.ceil(periods)))
     return Swing(float(np.median(np.ptp(turns, axis=1))), periods)
 
 
 def _reversals(values: np.ndarray, least: Any) -> np.ndarray:
-    """Where values (times,), those that are too small left out, change their sign."""
+    """Return the sign changes of values (times,), ignoring values of at most `least` in size."""
     signs = np.sign(values[np.abs(values) > least])
     return signs[1:] != signs[:-1]
 
 
 def _turns(values: np.ndarray, least: Any) -> np.ndarray:
-    """Which of values (times, m) change their sign often enough, (m,)."""
+    """Return which columns of values (times, m) change their sign often enough, (m,)."""
     least = np.broadcast_to(least, values.shape[1])
     turns = [np.count_nonzero(_reversals(v, low)) for v, low in zip(values.T, least, strict=True)]
     return np.asarray(turns) >= max(TURNS, values.shape[0] / SLOWEST)
 
 
 def _stays(u: np.ndarray) -> np.ndarray:
-    """Which of commands (times, m) change as much in the second half as in the first, (m,)."""
+    """Return which commands (times, m) vary nearly as much in the second half as in the first, (m,)."""
     first, second = np.array_split(np.diff(u, axis=0), 2)
     return np.linalg.norm(second, axis=0) >= STAYS * np.linalg.norm(first, axis=0)
 
 
 @programs.jit(compiler_options=programs.QUICKLY)
 def _unexplained(parts: Parts, run: linear.Nominal) -> tuple[Array, Array]:
-    """What slopes leave of the command's way to where the error is zero, see above, and all of it, (periods, m)."""
+    """Return the residual of the module docstring and u(x_0) - u(x), (periods, m) each."""
     parts = linear.quiet(parts)
     k2, kinematics, model = parts.observer.error_bound(), parts.controller.kinematics, parts.observer.model
 
@@ -121,7 +137,7 @@ def _unexplained(parts: Parts, run: linear.Nominal) -> tuple[Array, Array]:
             return computer.command(parts, k2, period, before, model.retract(seen, by), target, d_hat)[0]
 
         zero = jnp.zeros(model.local_coordinates(seen, seen).size)
-        # LAPACK's: written out, a body's six equations are compiled for longer than all else here
+        # LAPACK, because `matrices.solve` of six equations takes longer to compile than everything else here
         way = -jnp.linalg.solve(jax.jacfwd(error)(zero), error(zero))
         here, sloped = jax.jvp(commanded, (zero,), (way,))
         whole = commanded(way) - here
@@ -131,7 +147,7 @@ def _unexplained(parts: Parts, run: linear.Nominal) -> tuple[Array, Array]:
 
 
 def none_left(margins: Any, rows: Any) -> Any:
-    """The `Margins` of loops, (times, m), with none left in these rows (times,) where they are not negative anyway."""
+    """Return the `Margins` of loops (times, m) with zero margins in the marked rows (times,), except negative ones."""
     values = jax.tree.map(np.asarray, margins)
     lost = np.asarray(rows)[:, None] & values.stable
     none = dict.fromkeys(values._fields, 0.0) | {"modulus": MOST, "stable": False, "crossover": np.nan}

@@ -1,4 +1,7 @@
-"""Margins along the nominal run of a sampled loop: in hold, and on the way to the hand-over with its gains frozen."""
+"""Margins along the nominal run of a sampled loop: in the hold phase, and in the approach phase with frozen gains.
+
+Read `along` first. It is the function behind `ptsmc margins`.
+"""
 
 from typing import NamedTuple
 
@@ -17,44 +20,45 @@ from ptsmc_jax.theory.linear import Loop
 from ptsmc_jax.theory.margins import FIELDS, Margins
 from ptsmc_jax.theory.rest import History, history
 
-SLOWEST = 10  # periods to go: from one to the next the gains before the hand-over change by a tenth
-TIMES, SHARE = 4, 0.25  # to go at which margins are judged, and the longest as a share of t_f
+SLOWEST = 10  # Shortest time to go in periods. The gains then change by a tenth from one period to the next.
+TIMES, SHARE = 4, 0.25  # Number of times at which margins are judged, and the longest time to go as a fraction of t_f.
 
 
 class Course(NamedTuple):
     """Margins along a nominal run."""
 
-    t: np.ndarray  # (times,) [s], the last in hold, those before it before the hand-over
-    judged: np.ndarray  # (times,) bool: where the frozen loop means something, see `judged_times`
-    loops: Loop  # arrays over the times first
+    t: np.ndarray  # (times,) [s] The last is in the hold phase, the others are before the hand-over.
+    judged: np.ndarray  # (times,) bool: whether the frozen loop is meaningful, see `judged_times`.
+    loops: Loop  # The first axis of all arrays is the time.
     at_input: Margins  # (times, m)
-    at_sensors: Margins  # (k,) in hold
-    together: dict[str, float]  # the same of all axes of the input at once, in hold
-    clearance: float  # the run's least, as `run_state.SINGULAR_CLEARANCE` has it
-    missed: bool  # the run is not where it should be at t_f, as `run_state.misses` has it
-    swing: rest.Swing | None = None  # by which the run does not come to rest in hold
+    at_sensors: Margins  # (k,) in the hold phase.
+    together: dict[str, float]  # Margins of all axes of the input at once, in the hold phase.
+    clearance: float  # Smallest distance to the singularity, in the unit of `run_state.SINGULAR_CLEARANCE`.
+    missed: bool  # Whether the run has not converged at t_f, see `run_state.misses`.
+    swing: rest.Swing | None = None  # Limit cycle in the hold phase, if there is one.
 
     @property
     def hold(self) -> tuple[Loop, Margins]:
-        """The loop in hold, and its margins (m,)."""
+        """The loop in the hold phase, and its margins (m,)."""
         return jax.tree.map(lambda v: v[-1], (self.loops, self.at_input))
 
     @property
     def before(self) -> Margins:
-        """(times, m) before the hand-over."""
+        """The margins before the hand-over, (times, m)."""
         return jax.tree.map(lambda v: v[:-1], self.at_input)
 
     def worst(self) -> dict[str, float]:
-        """`catalogues.MARGINS`, the worst over the axes, in hold and where it is judged before the hand-over."""
+        """Return the worst of each of `catalogues.MARGINS` over the axes, the judged times and the hold phase."""
         where_judged = jax.tree.map(lambda v: v[self.judged], self.at_input)
         return {name: float(v) for name, v in where_judged.worst().items()}
 
 
 def judged_times(parts: Parts) -> Float[Array, " times"]:
-    """Times to go [s] at which frozen gains mean something, the shortest first, evenly spaced by their logarithms.
+    """Return times to go [s] at which a loop with frozen gains is meaningful, shortest first, logarithmically spaced.
 
-    From the hand-over, where gains are largest, but no nearer than where they change by a tenth from one sample to the
-    next; to where the loop takes as long to settle as it has left. They move with t_f and delta, and with them slopes.
+    The shortest is at the hand-over, where gains are largest, but at least `SLOWEST` periods. The gains then change by
+    at most a tenth from one sample to the next. The longest is the fraction `SHARE` of t_f, where the settling time of
+    the loop equals the time to go. The times are differentiable by t_f and delta.
     """
     law = parts.controller
     shortest = jnp.maximum(law.delta, SLOWEST * parts.period)
@@ -63,11 +67,16 @@ def judged_times(parts: Parts) -> Float[Array, " times"]:
 
 
 def moments(parts: Parts, run: linear.Nominal, times: Array) -> Array:
-    """Numbers of the whole control periods nearest to so long before t_f [s], and then of one in hold.
+    """Return the numbers of the full control periods nearest to some times to go, and of one period in the hold phase.
 
-    Before the hand-over, or in hold where there is none. In hold: the last; of an unstable loop the last at whose start
-    it is at most twice as far off as at the hand-over, but one whose mean over a star tracker's interval is all of the
-    hold.
+    If there is no full period before the hand-over, all are the period in the hold phase. The latter is the last one.
+    If the loop diverges, it is the last one whose initial error is at most twice the error at the hand-over. If loops
+    are averaged over a star tracker's interval, this interval must fit into the hold phase.
+
+    Args:
+        parts: the sampled scenario.
+        run: its nominal run.
+        times: times to go (times,) [s].
     """
     ticks, law = run.period.now, parts.controller
     full = linear.is_full(ticks, parts.period)
@@ -87,16 +96,22 @@ _moments = programs.jit(moments)
 
 
 class TimedMargins(NamedTuple):
-    """Margins at times of a nominal run, the last of them in hold."""
+    """Margins at several times of a nominal run. The last time is in the hold phase."""
 
     t: np.ndarray  # (times,) [s]
-    hold: np.ndarray  # (times,) bool: in hold
-    loops: Loop  # arrays over the times first
+    hold: np.ndarray  # (times,) bool: whether the time is in the hold phase
+    loops: Loop  # the first axis of all arrays is the time
     margins: Margins  # (times, m)
 
 
 def at(parts: Parts, left: Float[Array, " times"], flown: linear.Nominal | None = None) -> TimedMargins:
-    """Margins of sampled parts at these times to go [s], (times,), and in hold; flown: their nominal run, if known."""
+    """Return the margins at some times to go and in the hold phase.
+
+    Args:
+        parts: the sampled scenario.
+        left: times to go (times,) [s].
+        flown: its nominal run, or None to simulate it.
+    """
     run: linear.Nominal = linear.nominal_jit(parts) if flown is None else flown
     indices = np.asarray(_moments(parts, run, left))
     loops = linear.loops_in(parts, run, indices)
@@ -105,9 +120,12 @@ def at(parts: Parts, left: Float[Array, " times"], flown: linear.Nominal | None 
 
 
 def judged_loops(parts: Parts, flown: linear.Nominal | None = None, *, late: bool = True) -> tuple[Loop, Array]:
-    """The loops whose margins are judged, and in hold, (times + 1, ..), and which are in hold; h in [s].
+    """Return the loops whose margins are judged (times + 1, ..), h in [s], and which of them are in the hold phase.
 
-    late: of delay too, see `linear.opened`.
+    Args:
+        parts: the sampled scenario.
+        flown: its nominal run, or None to simulate it.
+        late: whether the loops support fractional delays, see `linear.opened`.
     """
     run = linear.nominal(parts) if flown is None else flown
     indices = moments(parts, run, judged_times(parts))
@@ -115,7 +133,10 @@ def judged_loops(parts: Parts, flown: linear.Nominal | None = None, *, late: boo
 
 
 def judged(parts: Parts) -> tuple[Margins, Array, History]:
-    """Margins of `judged_loops`, (times + 1, m), which are in hold, and the run; for any transformation."""
+    """Return the margins of `judged_loops` (times + 1, m), which of them are in the hold phase, and the commands.
+
+    The function supports all JAX transformations.
+    """
     run = linear.nominal(parts)
     loops, hold = judged_loops(parts, run)
     return margins.of_each(loops), hold, history(parts, run)
@@ -125,9 +146,10 @@ judged_jit = programs.jit(judged, compiler_options=programs.QUICKLY)
 
 
 def along(parts: Parts, times: int = 24) -> Course:
-    """Margins of sampled parts along their nominal run: in hold, where judged, and at about so many times besides.
+    """Return the margins of sampled parts along their nominal run.
 
-    None is left in hold where the run does not come to rest, see `rest`.
+    The times are the judged ones, one in the hold phase, and about `times` further ones. If there is a limit cycle, the
+    margins in the hold phase are zero, see `rest`.
     """
     run = linear.nominal_jit(parts)
     looked_at, commands, clearance, missed = _along(parts, run, times)
@@ -150,9 +172,11 @@ def along(parts: Parts, times: int = 24) -> Course:
 
 @programs.jit(static_argnames="times", compiler_options=programs.QUICKLY)
 def _along(parts: Parts, run: linear.Nominal, times: int) -> tuple[Array, History, Scalar, Array]:
-    """The times to go that `along` looks at, (TIMES + times,) [s], those that are judged first; the commands.
+    """Return the data of `along` that one compiled program computes.
 
-    And the least clearance from the law's singularity [-], and whether the run misses t_f.
+    Returns:
+        The times to go (TIMES + times,) [s], judged ones first; the commands; the smallest distance to the law's
+        singularity [-]; whether the run has not converged at t_f.
     """
     law = parts.controller
     besides = jnp.geomspace(parts.period, law.t_f, times)
@@ -168,9 +192,9 @@ def _along(parts: Parts, run: linear.Nominal, times: int) -> tuple[Array, Histor
 
 
 def at_ends(parts: Parts) -> dict[str, tuple[Margins, float]]:
-    """Margins at the last whole period before the "hand_over" and in "hold", and the largest modulus of the poles.
+    """Return the margins and the spectral radius at the last full period before the "hand_over" and in "hold".
 
-    Without a whole period before the hand-over those in hold are both.
+    If there is no full period before the hand-over, both are those of the hold phase.
     """
     run = linear.nominal_jit(parts)
     before = linear.full_periods(parts, run, hold=False)[-1:]

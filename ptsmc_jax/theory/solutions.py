@@ -1,4 +1,7 @@
-"""Exact solutions of Theorems 1 to 3: where a run without sampling or noise is, and by what torque."""
+"""Exact solutions of Theorems 1 to 3 for a scenario: motion and torque without sampling and noise.
+
+Read `exact_sizes` (error and s) and `exact_path` (torque) first.
+"""
 
 import math
 from typing import Any
@@ -21,19 +24,27 @@ from ptsmc_jax.theory.exact_motion import exact, exact_motion, plant_motion
 
 Vector = Float[Array, " n"]
 
-VISITED = 64  # times on either part of a run
+VISITED = 64  # number of times in the approach phase, and on the target
 
 
 def state_envelope(t: Scalar, t_f: Scalar, eta: Scalar, x0: Vector, s0: Scalar, floor: Scalar) -> tuple[Vector, Vector]:
-    """Centre and half width, (n,) each, of the interval that holds x_1 .. x_n where |s|^2 <= s0^2 r^(..) + floor tau^n.
+    """Return centre and half width, (n,) each, of the interval that contains x_1 .. x_n before the hand-over.
 
-    In the states' own units. (20)-(22) and (47)-(50) with their constants, for any residual that `sliding_envelope`
-    allows: the exact solution without s is the centre, and each of the n-1 integrations of
-    |y^(n-1)| <= |s| / tau^(eta+n-1) adds to the width.
+    The interval follows from |s|^2 <= s0^2 r^(2 (eta+n-2)) + floor tau^n of `envelopes.sliding_envelope`. The centre is
+    the exact solution without s. Each of the n-1 integrations of |y^(n-1)| <= |s| / tau^(eta+n-1) adds to the width.
+    The result generalises (20)-(22) and (47)-(50), with explicit constants.
+
+    Args:
+        t: time before the hand-over [s].
+        t_f: prescribed time [s].
+        eta: exponent of the law [-].
+        x0: states at t = 0, (n,), in the states' own units.
+        s0: bound on |s| at t = 0, see `envelopes.sliding_envelope`.
+        floor: coefficient of tau^n, see `envelopes.sliding_envelope`.
     """
     n, tau = x0.shape[0], t_f - t
     free, forced = modes(t, t_f, eta, x0)
-    scale = jnp.sqrt(floor) * tau ** (n / 2)  # what the smooth sign leaves of |s|
+    scale = jnp.sqrt(floor) * tau ** (n / 2)  # bound on the residual |s| of the smooth sign
     widths = []
     for j in range(n):
         p = n - 2 - j
@@ -46,19 +57,22 @@ def state_envelope(t: Scalar, t_f: Scalar, eta: Scalar, x0: Vector, s0: Scalar, 
 
 
 def bare(parts: Setup) -> Setup:
-    """Return the parts without clock and devices, on which the exact motion does not depend; one program serves all."""
+    """Return the parts without clock and devices.
+
+    The exact motion does not depend on them, so that one compiled program serves all scenarios.
+    """
     names = "plant", "disturbance", "reference", "controller", "initial", "t_end", "window", "settling_angle"
     return Setup(**{name: getattr(parts, name) for name in names}, observer=None)
 
 
 def starts(parts: Setup) -> Float[Array, "m n"]:
-    """Each component of the error and its derivatives at t = 0, in the states' own units: x_1 .. x_n = x_1^(n-1)."""
+    """Return each component of the error and its derivatives x_1 .. x_n at t = 0, in the states' own units."""
     kinematics, target = parts.controller.kinematics, parts.reference(jnp.zeros_like(parts.t_end))
     return kinematics.derivatives(parts.aligned_initial, target)
 
 
 def exact_sizes(parts: Setup, t: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """2-norms of the error and of s along the exact motion at times t (time,) [s] before the hand-over."""
+    """Return the 2-norms of the error and of s along the exact motion at times t (time,) [s] before the hand-over."""
     error, s = _exact_sizes(bare(parts), jnp.asarray(t))
     return np.asarray(error), np.asarray(s)
 
@@ -73,9 +87,9 @@ def _exact_sizes(parts: Setup, t: Array) -> tuple[Array, Array]:
 
 
 def exact_input(parts: Setup, t: Scalar) -> tuple[Array, Scalar]:
-    """Input (m,) [N m] along the exact motion at t [s] before the hand-over, and the law's clearance then [-].
+    """Return the input (m,) [N m] of the exact motion at t [s], and the distance to the singularity.
 
-    For attitudes 1 - |v|^2, the square of the scalar part, stands for the clearance; at or below 0 there is no path.
+    For attitudes this distance is 1 - |v|^2 [-], the square of the scalar part. No motion exists at or below 0.
     """
     motion = exact_motion(parts.controller, t, parts.reference(t), parts.initial, starts(parts))
     d = parts.disturbance(t, parts.plant.with_hidden_at_rest(motion.x))
@@ -84,9 +98,10 @@ def exact_input(parts: Setup, t: Scalar) -> tuple[Array, Scalar]:
 
 
 def visited(parts: Setup) -> tuple[Array, Any]:
-    """Targets and states of a second-order run, (2 VISITED,) each: along the exact motion, then on the target.
+    """Return targets and states of a second-order run, (2 VISITED,) each, in the states' own units.
 
-    States in the states' own units; half of the times close in on the hand-over.
+    The first half is on the exact motion, at times that become denser toward the hand-over. The second half is on the
+    target.
     """
     return _visited(bare(parts))
 
@@ -110,7 +125,7 @@ def _visited(parts: Setup) -> tuple[Array, Any]:
 
 
 def exact_path(parts: Setup, points: int = 2000) -> tuple[Array, Array, Array]:
-    """Times before the hand-over [s], (points,), inputs (points, m) and clearance (points,) along the exact motion.
+    """Return times before the hand-over [s], inputs (points, m) and distances to the singularity of the exact motion.
 
     See `exact_input`.
     """
@@ -126,6 +141,9 @@ def _exact_path(parts: Setup, points: int) -> tuple[Array, Array, Array]:
 
 
 def exact_peak(parts: Setup, points: int = 400) -> Scalar:
-    """Largest input along the exact motion before the hand-over [N m]: rule 3.5 for any start, reference and order."""
+    """Return the largest input of the exact motion before the hand-over [N m].
+
+    This generalises rule 3.5 to any initial state, reference and order.
+    """
     _, u, _ = exact_path(parts, points)
     return jnp.max(jnp.abs(u))
