@@ -1,1 +1,1 @@
-"""Devices between the flight computer and the body: star tracker, gyro, attitude filter, actuators, wheels."""
+"""Hardware and filters between the control law and the body: sensors, attitude filters, actuators, wheels."""

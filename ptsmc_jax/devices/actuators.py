@@ -1,7 +1,7 @@
 """Actuators, between the commanded torque and the body: delay, quantisation, limits, lag, reaction wheels.
 
-Each device is off where it is None. A channel is what makes torque: a body axis, or a wheel. Quantisation has the
-derivative of its command.
+An effect is disabled if its field is None. A channel is a source of torque: a body axis or a wheel. The derivative of
+quantisation is taken as 1. Read `Actuators` first, then `Actuators.command`.
 """
 
 from dataclasses import dataclass, field, fields, replace
@@ -17,38 +17,38 @@ from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector, pytree
 
 
 def quantise(u: Array, step: Scalar) -> Array:
-    """The nearest multiple of step [N m], (m,), with the derivative of u: that of a staircase is 0 or infinite."""
+    """Return the nearest multiple of step [N m], (m,), with derivative 1 by u instead of 0 or infinity."""
     return u + jax.lax.stop_gradient(step * jnp.round(u / step) - u)
 
 
 class ActuatorState(NamedTuple):
     """State of the actuators between control periods."""
 
-    queue: Array | None  # (delay, m) commands on their way, the oldest first [N m]
-    v: Array | None  # (channels,) torque at the end of the last period [N m]; None where nothing depends on it
+    queue: Array | None  # (delay, m) delayed commands, the oldest first [N m]
+    v: Array | None  # (channels,) torque at the end of the last period [N m]; None if nothing depends on it
     h: Array | None  # (wheels,) stored momentum [N m s]
 
 
 class Drive(NamedTuple):
     """One control period of the actuators: their torques move from v toward the target c."""
 
-    v: Array | None  # (channels,) [N m]; None: at c from the start
-    c: Array  # (channels,) [N m]
-    h: Array | None  # (wheels,) at the start of the period [N m s]; None without wheels
-    limited: Array  # bool: a limit cuts the command
-    works: Array | None = None  # (channels,) bool; None: all of them
+    v: Array | None  # (channels,) torque at the start [N m]; None if it is c from the start
+    c: Array  # (channels,) target torque [N m]
+    h: Array | None  # (wheels,) momentum at the start of the period [N m s]; None without wheels
+    limited: Array  # bool: whether a limit reduces the command
+    works: Array | None = None  # (channels,) bool: channels without failure; None if no channel can fail
 
 
 class AppliedTorque(NamedTuple):
     """The torque on the body over a time dt inside a period, linear in time, and the momentum of the wheels."""
 
     mean: Array  # (m,) [N m]
-    slope: Array | None  # (m,) about the middle [N m/s]; None where the torque is held
+    slope: Array | None  # (m,) rate of change [N m/s]; None if the torque is held
     stored: Array | None  # (m,) momentum A h at the start [N m s]; None without wheels
     dt: Array  # [s]
 
     def at(self, s: Scalar, w: Vector) -> Vector:
-        """Torque on a body that turns at w [rad/s], s [s] from the start: u - w x A h [N m], with (A h)' = -u."""
+        """Return the torque u - w x A h [N m] at s [s] from the start, with (A h)' = -u and body rate w [rad/s]."""
         u, impulse = self.mean, self.mean * s
         if self.slope is not None:
             u = u + self.slope * (s - self.dt / 2)
@@ -59,7 +59,7 @@ class AppliedTorque(NamedTuple):
 @pytree
 @dataclass(frozen=True)
 class Actuators:
-    """The limit per axis, delay, then per axis or per wheel: quantisation, limits, rate limit and first-order lag."""
+    """Torque limit per axis, delay, then per channel: quantisation, limits, rate limit and first-order lag."""
 
     torque_limit: Leaf | None = None  # per body axis [N m]
     rate_limit: Leaf | None = None  # [N m/s]
@@ -67,39 +67,40 @@ class Actuators:
     step: Leaf | None = None  # quantisation [N m]
     wheels: Wheels | None = None
     delay: int = field(default=0, metadata={"static": True})  # whole control periods
-    # misfits: how the true actuators differ from those that the flight software knows
-    scale: Leaf | None = None  # (channels,) true torque over the nominal one [-]
-    directions: Leaf | None = None  # (m, channels) unit vectors along which they act
-    failure_times: Leaf | None = None  # (channels,) from the first sample not before it on a channel has no torque [s]
-    spare_allocations: Leaf | None = None  # (wheels, wheels, 3) without each wheel, where failures are known
+    # hardware errors: differences between the true actuators and those that the flight software knows
+    scale: Leaf | None = None  # (channels,) ratio of true to nominal torque [-]
+    directions: Leaf | None = None  # (m, channels) true unit vectors of the channels in body axes
+    failure_times: Leaf | None = None  # (channels,) time of failure; no torque from the first sample at or after it [s]
+    spare_allocations: Leaf | None = None  # (wheels, wheels, 3) allocation without each wheel, if failures are known
 
     @property
     def ideal(self) -> bool:
-        """Whether they deliver every command at once and exactly."""
+        """Whether the actuators deliver every command immediately and exactly."""
         return not self.delay and all(getattr(self, one.name) is None for one in fields(self) if one.name != "delay")
 
     @property
     def nominal(self) -> "Actuators":
-        """The actuators as the flight software knows them: without their misfits."""
+        """The actuators as the flight software knows them, without hardware errors."""
         return replace(self, scale=None, directions=None, failure_times=None)
 
     def assumed(self, drive: Drive, dt: Scalar) -> tuple[Vector, Vector | None]:
-        """Return what the flight software knows of a period of dt [s].
+        """Return the torque and momentum that the flight software assumes for a period of dt [s].
 
-        That is the mean torque (m,) [N m], and the wheels' momentum in its middle (m,) [N m s] or None.
+        The result is the mean torque (m,) [N m], and the wheels' momentum in the middle of the period (m,) [N m s], or
+        None without wheels.
         """
-        if self.spare_allocations is None:  # then it does not know of failures
+        if self.spare_allocations is None:  # the flight software does not know of failures
             drive = drive._replace(works=None)
         torque = self.nominal.over(drive, jnp.zeros_like(dt), dt)
         return torque.mean, None if torque.stored is None else torque.stored - torque.mean * dt / 2
 
     def delivered(self, drive: Drive, v: Array) -> Array:
-        """True torques of the channels for nominal ones [N m], or of anything linear in them, (channels,)."""
+        """Return the true torques of the channels (channels,) [N m] from nominal torques, or from their integrals."""
         scaled = v if self.scale is None else self.scale * v
         return scaled if drive.works is None else jnp.where(drive.works, scaled, 0.0)
 
     def on_body(self, v: Array) -> Vector:
-        """The vector (m,) in body axes of numbers (channels,) along the channels' directions, such as torques [N m]."""
+        """Return the sum (m,) in body axes of channel values (channels,), such as torques [N m]."""
         axes = self.directions
         if axes is None and self.wheels is not None:
             axes = self.wheels.axes
@@ -117,7 +118,7 @@ class Actuators:
         return fits and not self.moves and self.wheels is None
 
     def begin(self, inputs: int) -> ActuatorState:
-        """The state at rest: no torque acts, no command is on its way."""
+        """Return the initial state: no torque acts, and no command is delayed."""
         queue = jnp.zeros((self.delay, inputs)) if self.delay else None
         momentum = None if self.wheels is None else self.wheels.initial
         rest = jnp.zeros(inputs) if momentum is None else jnp.zeros_like(momentum)
@@ -134,8 +135,8 @@ class Actuators:
             w: measured rate, (m,) [rad/s].
             t: start of the period [s].
             dt: its length [s].
-            weight: share that a partial first period is of a whole one; its command counts that much on its way
-                through the queue, so that nothing jumps where the period vanishes.
+            weight: length of a partial first period as a fraction of a full one. The command has this weight in the
+                queue, so that the result is continuous when the length goes to 0.
         """
         sent, limited = self.send(state, u, w)
         queue, due = state.queue, sent
@@ -147,9 +148,15 @@ class Actuators:
         return drive._replace(limited=limited | drive.limited), queue
 
     def send(self, state: ActuatorState, u: Vector, w: Vector) -> tuple[Vector, Array]:
-        """Return what the flight computer sends at a sample, (m,) [N m], and whether the torque limit cuts it.
+        """Return the torque that the flight computer sends at a sample, (m,) [N m], and whether the torque limit acts.
 
-        It adds w x A h, which compensates the wheels' momentum h by the measured rate w. All of it takes the delay.
+        The flight computer adds w x A h to compensate the gyroscopic torque of the wheels' momentum h. The delay
+        applies to the sum.
+
+        Args:
+            state: at the start of the period.
+            u: command of the law, (m,) [N m].
+            w: measured rate, (m,) [rad/s].
         """
         sent = u if self.torque_limit is None else jnp.clip(u, -self.torque_limit, self.torque_limit)
         limited = jnp.any(sent != u)
@@ -159,13 +166,20 @@ class Actuators:
         return sent, limited
 
     def drive(self, state: ActuatorState, due: Vector, t: Scalar, dt: Scalar) -> Drive:
-        """Return the drive of a control period by the command that arrives in it, (m,) [N m], see `send`."""
+        """Return the drive of a control period.
+
+        Args:
+            state: at the start of the period.
+            due: command that acts in the period, after the delay, (m,) [N m]; see `send`.
+            t: start of the period [s].
+            dt: its length [s].
+        """
         target = due
         if self.wheels is not None:
             target = self._allocation(self.wheels, t) @ target
         if self.step is not None:
             target = quantise(target, self.step)
-            if self.torque_limit is not None and self.wheels is None:  # a step may lie beyond it
+            if self.torque_limit is not None and self.wheels is None:  # rounding may exceed the limit
                 target = jnp.clip(target, -self.torque_limit, self.torque_limit)
         c = target
         if self.wheels is not None:
@@ -179,7 +193,7 @@ class Actuators:
         return Drive(state.v if self.moves else None, c, state.h, limited, works)
 
     def _allocation(self, device: Wheels, t: Scalar) -> Float[Array, "wheels 3"]:
-        """The matrix that allots a torque to the wheels at t [s]: without a wheel that is known to have failed."""
+        """Return the matrix that allocates a torque to the wheels at t [s], except to a wheel with a known failure."""
         if self.failure_times is None or self.spare_allocations is None:
             return device.allocation
         failed = t >= self.failure_times
@@ -187,10 +201,10 @@ class Actuators:
         return jnp.where(jnp.any(failed), spare, device.allocation)
 
     def _within_wheels(self, device: Wheels, v: Array, state: ActuatorState, dt: Scalar) -> Array:
-        """Wheel torques that keep the momentum limit at the end of the period, and the torque limit in any case.
+        """Return wheel torques within the torque limit and, at the end of the period, within the momentum limit.
 
-        A lag is taken into account: the impulse of the period is c (dt - a) + v a, a = lag (1 - e^(-dt/lag)). A rate
-        limit is not, and the torque limit comes last: these two may let the momentum exceed its limit.
+        With a lag the impulse of the period is c (dt - a) + v a, where a = lag (1 - e^(-dt/lag)). The momentum may
+        exceed its limit in two cases: the function ignores a rate limit, and it applies the torque limit last.
         """
         if device.momentum_limit is not None:
             assert state.h is not None
@@ -198,17 +212,17 @@ class Actuators:
             if self.lag is not None and state.v is not None:
                 a = self.lag * -jnp.expm1(-dt / self.lag)
                 h = h - a * state.v
-            per_span = 1.0 / jnp.where(dt > a, dt - a, 1.0)  # one division, which all trials and wheels share
+            per_span = 1.0 / jnp.where(dt > a, dt - a, 1.0)  # one division for all trials and wheels
             v = jnp.clip(v, per_span * (h - device.momentum_limit), per_span * (h + device.momentum_limit))
         if device.torque_limit is not None:
             v = jnp.clip(v, -device.torque_limit, device.torque_limit)
         return v
 
     def channels(self, drive: Drive, s: Scalar) -> tuple[Array, Array, Array]:
-        """Nominal torque of each channel s [s] into the period, its integral from the start and the integral of that.
+        """Return the nominal torque of each channel s [s] into the period, its integral, and the integral of that.
 
-        [N m, N m s, N m s^2]; v' = (c - v) / lag, |v'| at most the rate limit: a ramp until |c - v| is rate limit times
-        lag, then the lag.
+        The units are [N m, N m s, N m s^2]. The torque obeys v' = (c - v) / lag with |v'| at most the rate limit. It is
+        a ramp until |c - v| equals rate limit times lag, and then an exponential.
         """
         v, c = drive.v, drive.c
         if v is None:
@@ -226,7 +240,7 @@ class Actuators:
             torque_on_ramp = v + ramp_rate * s
             first = on_ramp * (v + ramp_rate * on_ramp / 2)
             second = on_ramp * on_ramp * (v / 2 + ramp_rate * on_ramp / 6)
-        left = area = twice = 0.0  # the gap that the lag leaves, and its two integrals
+        left = area = twice = 0.0  # the remaining gap c - v of the lag, and its two integrals
         if self.lag is not None:
             left = gap * jnp.exp(-span / self.lag)
             area = gap * (self.lag * -jnp.expm1(-span / self.lag))
@@ -235,20 +249,26 @@ class Actuators:
         return torque, first + c * span - area, second + first * span + c * (span * span / 2) - twice
 
     def at(self, drive: Drive, s: Scalar) -> tuple[Array, Array | None]:
-        """True torque of each channel s [s] into the period [N m], and the momentum of each wheel [N m s] or None."""
+        """Return the true torque of each channel [N m] s [s] into the period, and the wheels' momentum [N m s]."""
         v, impulse, _ = self.channels(drive, s)
         momentum = None if drive.h is None else drive.h - self.delivered(drive, impulse)
         return self.delivered(drive, v), momentum
 
     def over(self, drive: Drive, start: Scalar, dt: Scalar) -> AppliedTorque:
-        """The torque over dt [s] from `start` in the period, whose impulse and first moment are exact.
+        """Return the torque over a part of the period, linear in time, with exact impulse and first moment.
 
-        So momentum is, and to leading order the attitude, whatever a lag or a rate limit does within a step.
+        The momentum after an integration step is therefore exact, and the attitude is exact to leading order, even if
+        a lag or a rate limit changes the torque within the step.
+
+        Args:
+            drive: the drive of the period.
+            start: start of the part, from the start of the period [s].
+            dt: length of the part [s].
         """
         v, slope, has_length = drive.c, None, dt > 0.0
         _, first, _ = self.channels(drive, start)
         if drive.v is not None:
-            # with a lag alone all channels move alike: by their gap times the motion of one from 1 to 0
+            # with a lag alone the torque of each channel is c plus its gap times a common decay from 1 to 0
             gap, moving = drive.v - drive.c, drive
             if self.rate_limit is None:
                 moving = drive._replace(v=jnp.ones_like(dt), c=jnp.zeros_like(dt))
@@ -266,7 +286,14 @@ class Actuators:
         return AppliedTorque(mean, None if slope is None else self.on_body(self.delivered(drive, slope)), stored, dt)
 
     def end(self, state: ActuatorState, drive: Drive, queue: Array | None, dt: Scalar) -> ActuatorState:
-        """State after a period of dt [s]; one of length zero changes nothing."""
+        """Return the state after a period; a period of length zero changes nothing.
+
+        Args:
+            state: at the start of the period.
+            drive: the drive of the period.
+            queue: delayed commands after the period, see `command`.
+            dt: length of the period [s].
+        """
         v, impulse, _ = self.channels(drive, dt)
         v = None if state.v is None else jnp.where(dt > 0.0, v, state.v)
         return ActuatorState(queue, v, None if drive.h is None else drive.h - self.delivered(drive, impulse))

@@ -1,4 +1,7 @@
-"""The attitude filter: propagated by the gyro, corrected by the star tracker, in its steady state."""
+"""Steady-state attitude filter, propagated with the gyro and corrected by the star tracker.
+
+Read `attitude_filter` first, which builds the filter, then `AttitudeFilter`.
+"""
 
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -22,46 +25,59 @@ class Estimate(NamedTuple):
 @pytree
 @dataclass(frozen=True)
 class AttitudeFilter:
-    """Steady-state multiplicative filter: propagated by the gyro, corrected by star tracker samples.
+    """Multiplicative attitude filter with constant gains, propagated with the gyro and corrected by the star tracker.
 
-    The error is a rotation (Lefferts, Markley, Shuster, JGCD 5(5), 1982) and the gains are constant, as in Farrenkopf's
-    steady state (J. Guidance and Control 1(4), 1978); build it with `attitude_filter`, which chooses them by bandwidth.
+    The attitude error is a small rotation (Lefferts, Markley, Shuster, JGCD 5(5), 1982). The gains are constant as in
+    Farrenkopf's steady state (J. Guidance and Control 1(4), 1978). `attitude_filter` computes them from a bandwidth.
     """
 
-    attitude_gain: Leaf  # share of a star tracker residual that corrects the attitude [-]
-    bias_gain: Leaf  # of it, per second, that corrects the bias [1/s]
-    # (every, 2, 2) Cholesky factors of the covariance per axis of its errors [rad, rad/s] in the steady state, just
-    # before the sample after the star tracker's, the one after that, and so on to the next one of the star tracker
+    attitude_gain: Leaf  # ratio of the attitude correction to the star tracker residual [-]
+    bias_gain: Leaf  # ratio of the bias correction to the star tracker residual [1/s]
+    # (every, 2, 2) Cholesky factors of the steady-state error covariance of each axis [rad, rad/s], just before each
+    # control sample of a star tracker interval, beginning with the sample after the star tracker's
     spread: Leaf
 
     def begin(
         self, q: Float[Array, "4"], bias: Float[Array, "3"], normals: Float[Array, "6"], sample: Array, share: Scalar
     ) -> Estimate:
-        """An estimate [-, rad/s] whose errors are those of the steady state: the filter has run before the slew.
+        """Return an estimate [-, rad/s] with random steady-state errors, because the filter has run before the slew.
 
         Args:
-            q: true attitude.
-            bias: true bias of the gyro [rad/s].
-            normals: standard normal numbers that the errors are made of.
-            sample: number of the first sample; the estimate is that just before it.
-            share: below 1 in a partial first period, where the errors are between those before this sample and before
-                the next one.
+            q: true attitude, a unit quaternion (4,).
+            bias: true bias of the gyro (3,) [rad/s].
+            normals: standard normal numbers for the errors (6,).
+            sample: number of the first sample; the estimate is the one just before it.
+            share: length of a partial first period as a fraction of a full one, else 1. The error covariance is
+                interpolated between this sample and the next one.
         """
         turn, drift = self.first_spread(sample, share) @ normals.reshape(2, 3)
         return Estimate(attitude.multiply(q, attitude.from_rotation_vector(turn)), bias + drift)
 
     def first_spread(self, sample: Any, share: Scalar) -> Float[Array, "2 2"]:
-        """The factor of `spread` that `begin` draws errors by, (2, 2) [rad, rad/s]; arguments as there."""
+        """Return the covariance factor (2, 2) [rad, rad/s] of the errors in `begin`, which explains the arguments."""
         every = self.spread.shape[0]
         return guards.lerp(share, self.spread[(sample - 1) % every], self.spread[sample % every])
 
     def propagate(self, old: Estimate, w: Float[Array, "3"], w_next: Float[Array, "3"], dt: Scalar) -> Estimate:
-        """The estimate dt [s] later, from the rates measured at both ends [rad/s], coning to second order included."""
+        """Return the estimate after a control period, with the coning correction to second order.
+
+        Args:
+            old: estimate at the start of the period.
+            w: rate measured at the start (3,) [rad/s].
+            w_next: rate measured at the end (3,) [rad/s].
+            dt: length of the period [s].
+        """
         turn = rotation_over(w - old.bias, w_next - old.bias, dt)
         return Estimate(attitude.multiply(old.q, attitude.from_rotation_vector(turn)), old.bias)
 
     def correct(self, old: Estimate, measured: Float[Array, "4"], weight: Scalar) -> Estimate:
-        """The estimate after a star tracker sample [-] that counts with this weight (0: none)."""
+        """Return the estimate after a star tracker sample.
+
+        Args:
+            old: estimate before the sample.
+            measured: measured attitude, a unit quaternion (4,).
+            weight: weight of the correction [-]; 0 if there is no sample.
+        """
         error = attitude.multiply(attitude.conjugate(old.q), measured)
         residual = jnp.where(error[3] < 0.0, -2.0, 2.0) * error[:3]
         turn = self.attitude_gain * weight * residual
@@ -78,9 +94,18 @@ class AttitudeFilter:
         age: Scalar,
         weight: Scalar,
     ) -> Estimate:
-        """The estimate dt [s] later, corrected on the way: by a star tracker sample taken age [s] before the end.
+        """Return the estimate after a control period with a star tracker sample within the period.
 
-        w, w_next: rates measured at both ends [rad/s], linear in time between; measured [-] counts with this weight.
+        The gyro rate is interpolated linearly to the time of the sample.
+
+        Args:
+            old: estimate at the start of the period.
+            w: rate measured at the start (3,) [rad/s].
+            w_next: rate measured at the end (3,) [rad/s].
+            dt: length of the period [s].
+            measured: measured attitude, a unit quaternion (4,).
+            age: time from the sample to the end of the period [s].
+            weight: weight of the correction [-]; 0 if there is no sample.
         """
         share = 1.0 - age / jnp.where(dt > 0.0, dt, 1.0)
         w_at_sample = w + share * (w_next - w)
@@ -89,37 +114,47 @@ class AttitudeFilter:
 
 
 def rotation_over(a: Float[Array, "3"], b: Float[Array, "3"], dt: Scalar) -> Float[Array, "3"]:
-    """Return the rotation vector (3,) [rad] of a body in dt [s] whose rate goes from a to b [rad/s], with coning."""
+    """Return the rotation vector (3,) [rad] over a time in which the rate changes linearly, with coning correction.
+
+    Args:
+        a: rate at the start (3,) [rad/s].
+        b: rate at the end (3,) [rad/s].
+        dt: length of the time [s].
+    """
     return dt / 2 * (a + b) + dt * dt / 12 * attitude.cross(a, b)
 
 
 def filter_gains(bandwidth: Any, interval: Any) -> tuple[Any, Any]:
-    """Gains (attitude [-], bias [1/s]) that put both poles of the estimation error at e^(-bandwidth interval).
+    """Return the gains (attitude [-], bias [1/s]) that place both poles of the estimation error at the same p.
 
-    bandwidth [rad/s]; interval between star tracker samples [s]. With p that pole: 1 - p^2 and (1 - p)^2 / interval.
+    With p = e^(-bandwidth interval) they are 1 - p^2 and (1 - p)^2 / interval.
+
+    Args:
+        bandwidth: bandwidth of the filter [rad/s].
+        interval: time between star tracker samples [s].
     """
     pole = jnp.exp(-bandwidth * interval)
     return 1.0 - pole**2, (1.0 - pole) ** 2 / interval
 
 
-@programs.jit(static_argnames="every")  # one program; else each of its operations would be compiled by itself
+@programs.jit(static_argnames="every")  # one compiled program instead of one for each operation
 def attitude_filter(
     bandwidth: Any, attitude_noise: Any, rate_noise: Any, bias_walk: Any, period: Any, every: int
 ) -> AttitudeFilter:
-    """Filter of a bandwidth whose errors at t = 0 are those of its steady state under these noises.
+    """Return a filter of given bandwidth, with its steady-state error covariance under these noises.
 
     Args:
-        bandwidth: [rad/s].
+        bandwidth: bandwidth of the filter [rad/s].
         attitude_noise: 1 sigma of a star tracker sample about each axis [rad].
         rate_noise: 1 sigma of a gyro sample, one in each control period [rad/s].
         bias_walk: random walk of the gyro's bias [rad/s/sqrt(s)].
-        period: of control [s].
+        period: control period [s].
         every: control periods between star tracker samples.
     """
     k1, k2 = filter_gains(bandwidth, period * every)
-    # The error e just before a sample is (attitude, without what this sample of the gyro adds to it; bias). It obeys
-    # e+ = after(period) e, or `corrected` e where the star tracker has a sample, plus noises times the vectors `gyro`,
-    # `walk` and `star`
+    # The error e = (attitude, bias) just before a sample excludes the contribution of this gyro sample. It obeys
+    # e+ = after(period) e, or e+ = corrected e if there is a star tracker sample, plus noises times the vectors `gyro`,
+    # `walk` and `star`.
     zero, one, half = jnp.zeros_like(k1), jnp.ones_like(k1), period / 2
 
     def after(t: Any) -> Array:
@@ -134,7 +169,7 @@ def attitude_filter(
     drive = square(2.0 * gyro, rate_noise) + square(walk, bias_walk)
     steps = jax.vmap(after)(period * jnp.arange(every).astype(float))
     increments = jax.vmap(lambda step: step @ drive @ step.T)(steps)
-    added = jnp.cumsum(increments, axis=0) - increments  # covariance since the star tracker's sample
+    added = jnp.cumsum(increments, axis=0) - increments  # covariance accumulated since the star tracker sample
     move = corrected @ steps[-1]
     drive = corrected @ added[-1] @ corrected.T + square(star, attitude_noise)
     drive = drive + square(corrected @ gyro + gyro, rate_noise) + square(walk, bias_walk)
@@ -147,7 +182,10 @@ def attitude_filter(
 
 
 def cholesky(covariance: Float[Array, "2 2"]) -> Float[Array, "2 2"]:
-    """Lower factor (2, 2) of a covariance, in the units of its roots; its derivatives are finite without noise, too."""
+    """Return the lower Cholesky factor (2, 2) of a covariance matrix, in the units of its square roots.
+
+    The derivatives are finite even for a zero covariance.
+    """
     (a, b), (_, d) = covariance
     first = guards.sqrt(jnp.maximum(a, 0.0))
     along = jnp.where(first > 0.0, b / jnp.where(first > 0.0, first, 1.0), 0.0)

@@ -1,7 +1,7 @@
-"""Sensors of the attitude: star trackers and others, each with its mounting, noise per axis, sample times and latency.
+"""Attitude sensors of a suite: star trackers and others, each with mounting, noise per axis, sample times and latency.
 
-A sensor takes a reading at its own times, and the flight software has it a latency later. A reading is compared with
-the attitude at the time at which it was taken, see `kalman_filter`.
+A sensor takes readings at its own times, and the flight software receives a reading one latency later. The filter
+compares a reading with the attitude at the time of the reading, see `kalman_filter`. Read `AttitudeSensor` first.
 """
 
 import math
@@ -29,12 +29,12 @@ class SampleTimes:
     `sample_times`.
     """
 
-    interval: Leaf  # between readings, at least a control period [s]
-    latency: Leaf  # from a reading until the flight software has it [s]
-    period: Leaf  # of control [s]
-    every: int | None = field(metadata={"static": True})  # control periods between readings; None: not a whole number
-    wait: int = field(metadata={"static": True})  # control samples between a reading and its use, or one more
-    split: bool = field(metadata={"static": True})  # `wait` or one more, depending on the time of the reading
+    interval: Leaf  # time between readings, at least a control period [s]
+    latency: Leaf  # time from a reading until the flight software receives it [s]
+    period: Leaf  # control period [s]
+    every: int | None = field(metadata={"static": True})  # control periods between readings; None if not a whole number
+    wait: int = field(metadata={"static": True})  # smallest number of control samples between a reading and its use
+    split: bool = field(metadata={"static": True})  # whether this number is `wait` + 1 for some readings
 
     @property
     def queue(self) -> int:
@@ -75,7 +75,7 @@ class SampleTimes:
         return jnp.maximum(self._time(sample) - self._count(sample, self.latency) * self.interval, self.latency)
 
     def place(self, age: Any) -> tuple[Any, Any]:
-        """Return where a reading of this age [s] lies: whole control periods back, and the rest of the age [s].
+        """Return the age of a reading [s] as a number of whole control periods and the remaining time [s].
 
         The number of periods is an int if it is the same for all readings.
         """
@@ -109,9 +109,9 @@ def sample_times(interval: float, latency: float, period: float) -> SampleTimes:
     """Return the sample times of a sensor.
 
     Args:
-        interval: between readings, at least a control period [s].
-        latency: from a reading until the flight software has it [s].
-        period: of control [s].
+        interval: time between readings, at least a control period [s].
+        latency: time from a reading until the flight software receives it [s].
+        period: control period [s].
     """
     ratio, late = interval / period, latency / period
     every = round(ratio) if abs(ratio - round(ratio)) < TOLERANCE * ratio else None
@@ -130,7 +130,7 @@ class AttitudeSensor:
     axes [rad], or additive, and its components are independent.
     """
 
-    name: str = field(metadata={"static": True})  # also of its random numbers, and of its input in exported C
+    name: str = field(metadata={"static": True})  # name of the sensor, its random numbers and its input in exported C
     noise: Leaf  # (m,) 1 sigma of each component of a reading
     mounting: Leaf  # (4,) unit quaternion
     times: SampleTimes
@@ -140,11 +140,11 @@ class AttitudeSensor:
         raise NotImplementedError
 
     def changed(self, reading: Float[Array, " size"], change: Float[Array, " m"]) -> Float[Array, " size"]:
-        """Return a reading that differs by these components (m,), such as noise."""
+        """Return the reading plus a small change with components (m,), such as noise."""
         return reading + change
 
     def change(self, reading: Float[Array, " size"], other: Float[Array, " size"]) -> Float[Array, " m"]:
-        """Return the components (m,) by which another reading differs from a reading."""
+        """Return the difference (m,) of another reading from a reading."""
         return other - reading
 
     def sensitivity(self, q: Float[Array, "4"]) -> Float[Array, "m 3"]:
@@ -156,11 +156,14 @@ class AttitudeSensor:
         return jax.jacfwd(turned)(jnp.zeros(3))
 
     def axes(self) -> Float[Array, "3 3"]:
-        """Return the sensor's axes in body axes, one a row (3, 3)."""
+        """Return the sensor's axes in body axes, one per row (3, 3)."""
         return jax.vmap(lambda axis: attitude.rotate(self.mounting, axis))(jnp.eye(3))
 
     def in_step(self) -> "AttitudeSensor":
-        """Return a sensor with equally much information that reads at every control sample, if it has its own clock."""
+        """Return a sensor that reads at every control sample, with noise that gives the same information per time.
+
+        A sensor without its own clock is returned unchanged.
+        """
         if self.times.every is not None:
             return self
         fraction = self.times.period / self.times.interval
@@ -193,7 +196,7 @@ class StarTracker(AttitudeSensor):
         return jnp.where(error[3] < 0.0, -2.0, 2.0) * error[:3]
 
     def sensitivity(self, q: Float[Array, "4"]) -> Float[Array, "3 3"]:
-        """Return the tracker's axes in body axes (3, 3): components about them, of a rotation about body axes."""
+        """Return the tracker's axes in body axes (3, 3), which convert a body rotation [rad] to the tracker's axes."""
         return self.axes()
 
 
@@ -202,7 +205,7 @@ class StarTracker(AttitudeSensor):
 class VectorSensor(AttitudeSensor):
     """Sun sensor or magnetometer: its reading is a known inertial direction, a unit vector in its own axes.
 
-    It says nothing of the rotation about that direction.
+    It does not measure the rotation about that direction.
     """
 
     direction: Leaf  # (3,) unit vector in inertial axes

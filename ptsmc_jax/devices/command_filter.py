@@ -1,9 +1,9 @@
-"""Filters of the commanded torque, between the law and its actuators, that keep it off what rings in the body.
+"""Filters of the commanded torque, between the law and the actuators, that avoid the excitation of flexible modes.
 
-Each is that of continuous time by the bilinear rule, its corner W met exactly: g = tan(W h / 2) for a period h (Tustin
-with prewarping; Franklin, Powell, Workman, Digital Control of Dynamic Systems, 1998). It integrates from one sample to
-the next, whatever the period's length is, and begins at rest: a roll-off has no output at the first sample. The flight
-computer knows its filter: observers use the filtered command. Vectors (m,) in N m.
+Each filter is a continuous filter discretised by the bilinear rule with prewarping at its corner frequency W:
+g = tan(W h / 2) for a period h (Franklin, Powell, Workman, Digital Control of Dynamic Systems, 1998). Periods may
+differ in length. A filter begins at rest: the integrator of a roll-off is zero before the first sample. Observers use
+the filtered command. Vectors are (m,) in [N m]. Read `CommandFilter.step` first.
 """
 
 from dataclasses import dataclass
@@ -19,8 +19,8 @@ from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector, pytree
 class FilterState(NamedTuple):
     """Integrators of a second-order filter between samples, advanced by half of the next period."""
 
-    first: Array  # (m,) of the band [N m]
-    second: Array  # (m,) of the low pass [N m]
+    first: Array  # (m,) integrator of the band-pass output [N m]
+    second: Array  # (m,) integrator of the low-pass output [N m]
 
 
 @dataclass(frozen=True)
@@ -36,21 +36,25 @@ class CommandFilter(declare.Tunable):
     )
 
     def dead_time(self) -> Scalar | float:
-        """Return its delay at low frequencies, the derivative of its phase [s]."""
+        """Return the delay of the filter at low frequencies, the derivative of its phase [s]."""
         raise NotImplementedError
 
     def begin(self, inputs: int) -> Any:
-        """At rest."""
+        """Return the state at rest."""
         raise NotImplementedError
 
     def prewarped(self, dt: Scalar) -> Scalar:
-        """The g = tan(W dt / 2) [-] for a period dt [s]; W dt below pi."""
+        """Return g = tan(W dt / 2) [-] for a period dt [s]; W dt must be below pi."""
         return jnp.tan(0.5 * self.corner * dt)
 
     def step(self, state: Any, u: Vector, before: Scalar, dt: Scalar) -> tuple[Vector, Any]:
-        """Filtered command (m,) [N m] of a sample, and the state for the next one.
+        """Return the filtered command (m,) [N m] of a sample, and the state for the next sample.
 
-        before, dt: lengths of the periods that end and begin at the sample [s].
+        Args:
+            state: from `begin` or from the last sample.
+            u: command of the law (m,) [N m].
+            before: length of the period that ends at the sample [s].
+            dt: length of the period that begins at the sample [s].
         """
         raise NotImplementedError
 
@@ -64,15 +68,15 @@ class FirstOrder(CommandFilter):
     """
 
     def dead_time(self) -> Scalar | float:
-        """1 / W [s]."""
+        """Return 1 / W [s]."""
         return 1.0 / self.corner
 
     def begin(self, inputs: int) -> Vector:
-        """At rest: its one integrator (m,) [N m], between samples too advanced by half of the next period."""
+        """Return the integrator (m,) [N m] at rest. Between samples it is advanced by half of the next period."""
         return jnp.zeros(inputs)
 
     def step(self, state: Vector, u: Vector, before: Scalar, dt: Scalar) -> tuple[Vector, Vector]:
-        """The low pass y, y' = W (u - y)."""
+        """Return the low-pass output y of y' = W (u - y), and the next state."""
         g = self.prewarped(before)
         y = (state + g * u) / (1.0 + g)
         return y, y + self.prewarped(dt) * (u - y)
@@ -80,22 +84,22 @@ class FirstOrder(CommandFilter):
 
 @dataclass(frozen=True)
 class _Second(CommandFilter):
-    """Two integrators: b' = W h, l' = W b, h = u - 2 z b - l, as one of all second-order filters has them."""
+    """State-variable filter with two integrators: b' = W h, l' = W b, h = u - 2 z b - l."""
 
     damping: Leaf = declare.number(0.7, above=0.0, meaning="z, its damping ratio")
 
     def dead_time(self) -> Scalar | float:
-        """2 z / W [s]."""
+        """Return 2 z / W [s]."""
         return 2.0 * self.damping / self.corner
 
     def begin(self, inputs: int) -> FilterState:
-        """At rest."""
+        """Return the state at rest."""
         return FilterState(jnp.zeros(inputs), jnp.zeros(inputs))
 
     def _integrated(
         self, state: FilterState, u: Vector, before: Scalar, dt: Scalar
     ) -> tuple[Vector, Vector, FilterState]:
-        """Band b and low pass l of this sample."""
+        """Return the band-pass output b, the low-pass output l and the next state."""
         g, next_g = self.prewarped(before), self.prewarped(dt)
         band = (state.first + g * (u - state.second)) / (1.0 + g * (g + 2.0 * self.damping))
         low = state.second + g * band
@@ -112,7 +116,7 @@ class SecondOrder(_Second):
     """
 
     def step(self, state: FilterState, u: Vector, before: Scalar, dt: Scalar) -> tuple[Vector, FilterState]:
-        """The low pass."""
+        """Return the low-pass output and the next state."""
         _, low, state = self._integrated(state, u, before, dt)
         return low, state
 
@@ -128,6 +132,6 @@ class Notch(_Second):
     damping: Leaf = declare.number(0.5, above=0.0, meaning="z, how wide it is")
 
     def step(self, state: FilterState, u: Vector, before: Scalar, dt: Scalar) -> tuple[Vector, FilterState]:
-        """The command without the band, u - 2 z b."""
+        """Return u - 2 z b, the command minus the band-pass output, and the next state."""
         band, _, state = self._integrated(state, u, before, dt)
         return u - 2.0 * self.damping * band, state

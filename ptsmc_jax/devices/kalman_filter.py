@@ -1,17 +1,20 @@
 """A multiplicative extended Kalman filter of the attitude: any number of attitude sensors, and a gyro.
 
-The estimation error is e = (a, b, n) and past attitude errors: a is a small rotation about body axes [rad], b the error
-of the gyro bias [rad/s], n the noise of the newest gyro sample [rad/s]. Over a control period h, with the rotation R of
-the body in it and the trapezoidal rule for the rate,
+The estimation error has the components e = (a, b, n) and past attitude errors. Here a is a small rotation about body
+axes [rad], b is the error of the gyro bias [rad/s], and n is the noise of the newest gyro sample [rad/s]. Over a
+control period h with the body rotation R, the trapezoidal rule for the rate gives
 
     a+ = R' (a - h/2 (b + n)) - h/2 (b+ + n+),    b+ = b + drift,    n+ = noise of the next gyro sample
 
-(Lefferts, Markley, Shuster, JGCD 5(5), 1982; n is a state since each gyro sample acts in two periods). A reading of age
-L is compared with the attitude that the filter estimated for that time. The filter therefore keeps the attitude of the
-last control samples and their errors as further states, which every correction corrects too: stochastic cloning
-(Roumeliotis and Burdick, ICRA 2002), exact for a linear system, unlike a reading that is moved to the present by the
-gyro, since it takes account of the gyro noise that has come since. Components of a reading are processed one by one
-(Bierman, Factorization Methods for Discrete Sequential Estimation, 1977), so no matrix is inverted.
+(Lefferts, Markley, Shuster, JGCD 5(5), 1982). The noise n is a state because each gyro sample acts in two periods.
+
+The filter compares a reading of age L with its attitude estimate for that time. The state therefore includes the
+attitudes at the last control samples, and every correction updates them too (stochastic cloning, Roumeliotis and
+Burdick, ICRA 2002). This is exact for a linear system. Propagating a reading to the present with the gyro is not exact,
+because it ignores the gyro noise in between. The components of a reading are processed one by one (Bierman,
+Factorization Methods for Discrete Sequential Estimation, 1977), so that no matrix is inverted.
+
+Read `kalman_filter` first, which builds the filter, then `KalmanFilter`.
 """
 
 import math
@@ -30,9 +33,9 @@ from ptsmc_jax.devices.attitude_sensors import AttitudeSensor
 from ptsmc_jax.numerics import attitude, guards
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
 
-LONGEST = 1000  # control periods of a cycle at most; of a longer one, only the first are in `first`
-DOUBLINGS = 60  # of the number of cycles, until the steady state
-SWITCHED_ON = 0.1  # 1 sigma of the attitude if the first reading is that of a body that turned in its latency [rad]
+LONGEST = 1000  # Largest number of control periods of a cycle; `first` has only this many of a longer cycle.
+DOUBLINGS = 60  # Largest number of times that the number of cycles is doubled until the steady state.
+SWITCHED_ON = 0.1  # 1 sigma of the initial attitude [rad], as the body may turn in the first reading's latency.
 TURN, BIAS, NOISE = slice(0, 3), slice(3, 6), slice(6, 9)
 
 
@@ -40,11 +43,11 @@ class Track(NamedTuple):
     """The state of the filter."""
 
     q: Array  # (4,) attitude
-    bias: Array  # (3,) of the gyro [rad/s]
+    bias: Array  # (3,) gyro bias [rad/s]
     rate: Array  # (3,) last gyro sample, less its estimated noise [rad/s]
-    past_q: Any  # (past, 4) attitudes at the last control samples, the newest first; None: no sensor needs them
-    past_w: Any  # (past, 3) body rates then [rad/s]; None: no sensor reads between control samples
-    covariance: Array  # (9 + 3 past, 9 + 3 past) of the errors (a, b, n, past a ..) [rad, rad/s]
+    past_q: Any  # (past, 4) attitudes at the last control samples, newest first; None if no sensor needs them
+    past_w: Any  # (past, 3) body rates at these samples [rad/s]; None if all sensors read at control samples
+    covariance: Array  # (9 + 3 past, 9 + 3 past) covariance of the errors (a, b, n, past a ..) [rad, rad/s]
 
     @property
     def w(self) -> Array:
@@ -57,14 +60,14 @@ class Track(NamedTuple):
 class KalmanFilter:
     """The filter, with the sensors as the flight software knows them. Build it with `kalman_filter`.
 
-    Its errors are those of attitude [rad], gyro bias [rad/s], last gyro sample [rad/s] and past attitudes [rad].
+    The estimation errors are: attitude [rad], gyro bias [rad/s], last gyro sample [rad/s] and past attitudes [rad].
     """
 
     sensors: tuple[AttitudeSensor, ...]
     rate_noise: Leaf  # (3,) 1 sigma of a gyro sample [rad/s]
     drift: Leaf  # (3,) 1 sigma of the change of the bias per second of a period [rad/s^2]
-    rate_bias: Leaf  # (3,) 1 sigma of the bias of a gyro that was just switched on [rad/s]
-    period: Leaf  # of control [s]
+    rate_bias: Leaf  # (3,) 1 sigma of the gyro bias when the gyro is switched on [rad/s]
+    period: Leaf  # control period [s]
     # (cycle, 6, 6) factors of the covariance of (a, b) in the steady state at rest, just before a control sample
     first: Leaf
 
@@ -79,7 +82,7 @@ class KalmanFilter:
         return any(sensor.times.every is None for sensor in self.sensors)
 
     def first_factor(self, sample: Any, weight: Any) -> Float[Array, "6 6"]:
-        """Return a factor (6, 6) of the covariance of (a, b) that `begin` starts from; arguments as there."""
+        """Return a factor (6, 6) of the initial covariance of (a, b) in `begin`, which explains the arguments."""
         count = len(self.first)
         return guards.lerp(jnp.asarray(weight), self.first[sample % count], self.first[(sample + 1) % count])
 
@@ -87,15 +90,15 @@ class KalmanFilter:
         self, q: Float[Array, "4"], bias: Float[Array, "3"], w: Float[Array, "3"], normals: Float[Array, "6"],
         sample: Array, weight: Scalar,
     ) -> Track:  # fmt: skip
-        """Return the state of a filter that has run before the slew: its errors are those of the steady state at rest.
+        """Return the state of a filter that has run before the slew, with random steady-state errors.
 
         Args:
             q: true attitude, a unit quaternion (4,).
             bias: true bias of the gyro (3,) [rad/s].
             w: true body rate (3,) [rad/s].
-            normals: standard normal numbers (6,) from which the errors are made.
+            normals: standard normal numbers for the errors (6,).
             sample: number of the first control sample; the state is the one just before it.
-            weight: of this sample, below 1 in a partial first period.
+            weight: weight of this sample, below 1 in a partial first period.
         """
         factor, past = self.first_factor(sample, weight), self.past
         error = factor @ normals
@@ -111,7 +114,7 @@ class KalmanFilter:
         return jnp.pad(factor @ factor.T, ((0, more), (0, more)))
 
     def unknown(self) -> Float[Array, "n n"]:
-        """Return the covariance (n, n) of all errors before the first reading, of a body that hardly turned before."""
+        """Return the covariance (n, n) of all errors before the first reading, assuming that the body hardly turned."""
         covariance = self.covariance(self.first[0])
         attitudes = np.r_[0:3, 9 : 9 + 3 * self.past]
         same = np.zeros(covariance.shape)
@@ -137,7 +140,13 @@ class KalmanFilter:
         return Track(attitude.multiply(old.q, turn), old.bias, gyro, past_q, past_w, covariance)
 
     def _propagated(self, p: Array, turn: Array, dt: Scalar) -> Array:
-        """Return the covariance a control period later; turn: rotation of the body in it."""
+        """Return the covariance a control period later.
+
+        Args:
+            p: covariance at the start (n, n).
+            turn: rotation of the body in the period, a unit quaternion (4,).
+            dt: length of the period [s].
+        """
         half, zero = dt / 2, jnp.zeros((3, 3))
         back = jax.vmap(partial(attitude.rotate, turn))(jnp.eye(3))  # R'
         fresh, drift = jnp.diag(self.rate_noise**2), jnp.diag((self.drift * dt) ** 2)
@@ -156,7 +165,7 @@ class KalmanFilter:
         ]
         if not self.past:
             return jnp.block(rows)
-        kept = np.r_[0:3, 9 : 6 + 3 * self.past]  # the error at the last sample becomes a past one, the oldest goes
+        kept = np.r_[0:3, 9 : 6 + 3 * self.past]  # the current attitude error becomes a past one, the oldest is dropped
         by_past = [by_old[:, kept], p[BIAS, kept], jnp.zeros((3, len(kept)))]
         rows = [[*row, last] for row, last in zip(rows, by_past, strict=True)]
         return jnp.block([*rows, [*(last.T for last in by_past), p[kept][:, kept]]])
@@ -167,14 +176,14 @@ class KalmanFilter:
         Args:
             old: state at this control sample.
             k: index of the sensor.
-            reading: of the sensor (size,).
+            reading: reading of the sensor (size,).
             age: time since the reading was taken [s].
-            weight: 1: the reading counts; 0: there is none. Between them the noise is larger, by 1/sqrt(weight).
+            weight: 1 for a reading, 0 for none. A weight between 0 and 1 multiplies the noise by 1/sqrt(weight).
         """
         sensor = self.sensors[k]
         q, picked, fraction = self._when_taken(old, sensor, age)
         rows, residual = sensor.sensitivity(q), sensor.change(sensor.read(q), reading)
-        # between control samples the errors are nearly a straight line; the rest is gyro noise of this size
+        # between control samples the errors are interpolated linearly; this is the variance of the remaining gyro noise
         lost = (self.period * fraction * (1.0 - fraction)) ** 2 / 2 if sensor.times.every is None else 0.0
         p, change = old.covariance, jnp.zeros(len(old.covariance))
         for row, difference, noise in zip(rows, residual, sensor.noise, strict=True):
@@ -186,16 +195,22 @@ class KalmanFilter:
         return self._moved(old, change)._replace(covariance=p)
 
     def _when_taken(self, old: Track, sensor: AttitudeSensor, age: Scalar) -> tuple[Array, Any, Scalar]:
-        """Return the attitude when a reading of this age was taken, and its error as a part of all errors.
+        """Return the estimated attitude when a reading was taken, a function for its error, and a fraction.
 
-        The error is a function of an array (errors, ..) to (3, ..); the third value is the fraction of a control period
-        between the reading and the control sample after it.
+        Args:
+            old: state at this control sample.
+            sensor: the sensor.
+            age: time since the reading was taken [s].
+
+        Returns:
+            The attitude (4,); a function that extracts the rows of its error (3, ..) from an array (errors, ..); the
+            fraction of a control period between the reading and the control sample after it.
         """
         whole, rest = sensor.times.place(age)
         fraction = rest / self.period
 
         def at(values: Array, number: Any, first: Array | None = None) -> Array:
-            """Return the entry `number` control samples back; the present one is the first value, or `first`."""
+            """Return the entry `number` control samples back; entry 0 is the first value, or `first` if passed."""
             if first is not None:
                 values = jnp.concatenate([first[None], values])
             if isinstance(number, int):
@@ -237,7 +252,7 @@ class KalmanFilter:
         return replace(self, sensors=tuple(sensor.in_step() for sensor in self.sensors))
 
     def retract(self, track: Track, by: Float[Array, " n"]) -> Track:
-        """Return the state near another one at local coordinates (9 + 3 past,): estimates, not the covariance."""
+        """Return the state with estimates changed by local coordinates (9 + 3 past,), and the same covariance."""
         return self._moved(track, by)
 
     def local_coordinates(self, track: Track, other: Track) -> Float[Array, " n"]:
@@ -255,15 +270,17 @@ def kalman_filter(
 ) -> KalmanFilter:
     """Return a filter that starts in its steady state at rest.
 
+    The sensors together must determine the attitude; the function does not check this.
+
     Args:
         sensors: attitude sensors.
         rate_noise: 1 sigma of a gyro sample (3,) [rad/s].
         drift: 1 sigma of the change of the bias per second of a period (3,) [rad/s^2].
-        rate_bias: 1 sigma of the bias of a gyro that was just switched on (3,) [rad/s].
-        period: of control [s].
+        rate_bias: 1 sigma of the gyro bias when the gyro is switched on (3,) [rad/s].
+        period: control period [s].
 
     Raises:
-        ValueError: a sensor has no noise, or the sensors together do not determine the attitude.
+        ValueError: if a sensor has no noise.
     """
     if any(np.any(np.asarray(sensor.noise) <= 0.0) for sensor in sensors):
         raise ValueError("every attitude sensor must have noise greater than 0")
@@ -274,7 +291,7 @@ def kalman_filter(
 
 
 class _Element(NamedTuple):
-    """The change of a covariance p over some steps, a p (1 + c p)^-1 a' + b.
+    """Map of a covariance p over several filter steps, a p (1 + c p)^-1 a' + b.
 
     Source: Särkkä and García-Fernández, IEEE Trans. Automatic Control 66(1), 2021.
     """
@@ -284,7 +301,7 @@ class _Element(NamedTuple):
     c: np.ndarray
 
     def then(self, other: "_Element") -> "_Element":
-        """Return the map of these steps and then others."""
+        """Return the map of these steps followed by other steps."""
         left = other.a @ np.linalg.inv(np.eye(len(self.a)) + self.b @ other.c)
         right = self.a.T @ np.linalg.inv(np.eye(len(self.a)) + other.c @ self.b)
         return _Element(left @ self.a, left @ self.b @ other.a.T + other.b, right @ other.c @ self.a + self.c)
@@ -293,7 +310,8 @@ class _Element(NamedTuple):
 def _steady_state(found: KalmanFilter) -> np.ndarray:
     """Return factors (cycle, 6, 6) of the covariance of (a, b) just before each control sample of a cycle, at rest.
 
-    The number of cycles is doubled until nothing changes (Anderson and Moore, Optimal Filtering, 1979, section 6.7).
+    The function doubles the number of cycles until the covariance converges (Anderson and Moore, Optimal Filtering,
+    1979, section 6.7).
     """
     count = min(math.lcm(*(sensor.times.cycle for sensor in found.sensors)), LONGEST)
     size, one = 9 + 3 * found.past, np.eye(9 + 3 * found.past)

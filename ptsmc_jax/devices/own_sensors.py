@@ -1,6 +1,7 @@
-"""Sensors of one's own: at a sample they turn the true state x into the measured one, and may remember something.
+"""Custom sensors: user-defined classes that return the measured state for the true state x, and may have a memory.
 
-measured, memory = see(memory, x, n, t, dt), with n standard normal numbers of the trial and the sample.
+The interface is measured, memory = see(memory, x, n, t, dt), where n are standard normal numbers of the trial and the
+sample. Read `SampledSensor` first.
 """
 
 from dataclasses import dataclass, replace
@@ -21,24 +22,31 @@ OWN_NOISE = "own_noise"
 
 @dataclass(frozen=True)
 class SampledSensor(declare.Tunable):
-    """The base of sensors of one's own; they fly in the sampled loop.
+    """Base class of custom sensors, which need a sampled loop.
 
-    `draws` standard normal numbers are drawn for each sample, [-]. Their memory is any pytree of arrays; `begin`'s
-    default is none.
+    The simulator passes `draws` standard normal numbers [-] for each sample. The memory is any pytree of arrays; by
+    default there is none.
     """
 
     draws: ClassVar[int] = 0
-    model: Any  # the plant as law and observer know it
+    model: Any  # design model of the plant, as law and observer know it
 
     def begin(self, x: Any) -> Any:
-        """The memory before the first sample, at which the true state is x."""
+        """Return the memory before the first sample; x: true state at the first sample."""
         return None
 
     def see(self, memory: Any, x: Any, noise: Float[Array, " draws"], t: Scalar, dt: Scalar) -> tuple[Any, Any]:
-        """The state as the law sees it, and the memory, from the true state x at t [s]; noise: (draws,) [-].
+        """Return the measured state and the new memory.
 
-        dt: time since the sample before [s], 0 at the first. What is seen has the form of x: (q, w) of a spacecraft,
-        (n,) of another plant; the memory keeps its shapes and types.
+        Args:
+            memory: from `begin` or from the last sample.
+            x: true state: (q, w) of a spacecraft, or (n,) of another plant.
+            noise: standard normal numbers of the sample (draws,) [-].
+            t: time of the sample [s].
+            dt: time since the last sample [s]; 0 at the first sample.
+
+        Returns:
+            The measured state, in the form of x, and the memory with unchanged shapes and types.
         """
         raise NotImplementedError
 
@@ -46,27 +54,27 @@ class SampledSensor(declare.Tunable):
 @pytree
 @dataclass(frozen=True)
 class OwnSensors(Sensor):
-    """Sensors of one's own as the rollout asks for them: with noise that belongs to (seed, trial, sample)."""
+    """Adapter of custom sensors to the `Sensor` interface. The noise depends on (seed, trial, sample)."""
 
     own: Any  # `SampledSensor`
-    noise_scale: Leaf  # 1, or 0 without noise [-]
+    noise_scale: Leaf  # factor of the noise: 1, or 0 for no noise [-]
 
     def noise(self, key: draws.Key, sample: Int[Array, ""]) -> Float[Array, " draws"]:
-        """Noise of one sample, (draws,) [-]."""
+        """Return the noise of one sample, (draws,) [-]."""
         return self.noise_scale * draws.normals(key, self.own.draws, sample) if self.own.draws else jnp.zeros(0)
 
     def begin(self, seed: WholeNumber, trial: WholeNumber, x0: Any, now: Ticks) -> tuple:
-        """Memory before the first sample of positive length [s], which is now."""
+        """Return the memory before the first sample; see `Sensor.begin`."""
         key = draws.stream(seed, trial, OWN_NOISE)
         return key, self.noise(key, now.sample), self.own.begin(x0)
 
     def measure(self, memory: tuple, x: Any, now: Ticks, dt: Scalar, star_x: None = None) -> tuple[Any, tuple]:
-        """The measured state, and the memory; a period without a length [s] does not change the memory."""
+        """Return the measured state and the memory. A period of length 0 does not change the memory."""
         key, noise, own_memory = memory
         noise_next = self.noise(key, now.sample + 1)
         measured, new = self.own.see(own_memory, x, guards.lerp(now.noise_weight, noise, noise_next), now.t, dt)
         return measured, (key, noise_next, guards.select(now.t_next > now.t, new, own_memory))
 
     def quiet(self) -> "OwnSensors":
-        """The sensors with all their standard normal numbers zero."""
+        """Return the sensors with all standard normal numbers set to zero."""
         return replace(self, noise_scale=0.0 * self.noise_scale)

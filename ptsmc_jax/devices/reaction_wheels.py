@@ -1,4 +1,4 @@
-"""Reaction wheels: axes, limits and momentum."""
+"""Reaction wheels: axes, torque allocation, limits and momentum. Read `wheels` first, which builds the set."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -16,8 +16,8 @@ from ptsmc_jax.numerics.pytrees import Leaf, pytree, vector
 class Wheels:
     """Reaction wheels: torque A v on the body, stored momentum h' = -v, allocation by the pseudo-inverse of A.
 
-    h is absolute, spin inertia times (wheel speed + a . w); J is then the whole spacecraft's less the spin inertia of
-    each wheel about its axis, J_total - sum I a a' (Hughes, Spacecraft Attitude Dynamics, 1986).
+    The momentum h is absolute: spin inertia times (wheel speed + a . w). The inertia J of the body therefore excludes
+    the spin inertia of each wheel, J = J_total - sum I a a' (Hughes, Spacecraft Attitude Dynamics, 1986).
     """
 
     axes: Leaf  # (3, n) A: spin axes in body axes, unit columns
@@ -28,9 +28,16 @@ class Wheels:
 
 
 def wheels(axes: Any, initial: Any = None, torque_limit: Any = None, momentum_limit: Any = None) -> Wheels:
-    """Wheels from their spin axes (n, 3) in body axes, of any length; initial: momenta (n,) [N m s], default 0.
+    """Return reaction wheels.
 
-    Raises ValueError where the axes do not span all directions.
+    Args:
+        axes: spin axes (n, 3) in body axes, of any length.
+        initial: momenta at t = 0 (n,) [N m s]; default 0.
+        torque_limit: limit of each wheel [N m], or None.
+        momentum_limit: limit of each wheel [N m s], or None.
+
+    Raises:
+        ValueError: if the axes do not span all directions.
     """
     unit = wheel_axes(axes)
     start = np.zeros(len(unit)) if initial is None else np.asarray(initial, dtype=float)
@@ -39,6 +46,9 @@ def wheels(axes: Any, initial: Any = None, torque_limit: Any = None, momentum_li
 
 
 def spare_allocations(device: Wheels) -> Float[Array, "n n 3"]:
-    """Allocations (n, n, 3) without each of the wheels: pseudo-inverses of A = axes [-], one of whose columns is 0."""
+    """Return the allocation matrices (n, n, 3) without each of the wheels [-].
+
+    Entry k is the pseudo-inverse of A with column k set to 0.
+    """
     axes, numbers = np.asarray(device.axes), np.arange(device.axes.shape[1])
     return jnp.stack([jnp.asarray(np.linalg.pinv(axes * (numbers != k), rcond=1e-6)) for k in numbers])

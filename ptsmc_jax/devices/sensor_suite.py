@@ -1,4 +1,7 @@
-"""A sensor suite: any number of attitude sensors and a gyro, behind a Kalman filter of the attitude."""
+"""A sensor suite: any number of attitude sensors and a gyro, combined by a Kalman filter of the attitude.
+
+Read `SensorSuite.measure` first.
+"""
 
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
@@ -19,27 +22,27 @@ from ptsmc_jax.plants.rigid_body import AttitudeState
 
 
 class Delivery(NamedTuple):
-    """What a sensor delivers to the flight software at a control sample."""
+    """Reading of one sensor for the flight software at a control sample."""
 
     reading: Array  # (size,)
-    weight: Scalar  # 1; 0: there is no reading; between them in a partial first period, see `KalmanFilter.correct`
+    weight: Scalar  # 1, or 0 for no reading; in a partial first period between them, see `KalmanFilter.correct`
 
 
 class Readings(NamedTuple):
-    """What all sensors deliver at a control sample."""
+    """Readings of all sensors at a control sample."""
 
-    delivered: tuple[Delivery, ...]  # of each attitude sensor
-    ages: tuple[Array, ...]  # of these readings [s]
-    rate: Array  # (3,) of the gyro [rad/s]
+    delivered: tuple[Delivery, ...]  # one for each attitude sensor
+    ages: tuple[Array, ...]  # ages of these readings [s]
+    rate: Array  # (3,) gyro sample [rad/s]
 
 
 class SuiteMemory(NamedTuple):
     """Memory of a `SensorSuite` between control samples."""
 
-    keys: Any  # of the noise of each attitude sensor, of the gyro and of its drift; None: no random numbers
-    noise: tuple[Array, ...]  # of the next sample: of each attitude sensor (m,), of the gyro (3,) [rad/s]
-    bias: Array  # (3,) of the gyro [rad/s]
-    waiting: tuple[Any, ...]  # of each attitude sensor: `Delivery` (queue, ..) of the last samples, the newest first
+    keys: Any  # random keys: noise of each attitude sensor, gyro noise, gyro drift; None for no noise
+    noise: tuple[Array, ...]  # noise of the next sample: each attitude sensor (m,), then the gyro (3,) [rad/s]
+    bias: Array  # (3,) gyro bias [rad/s]
+    waiting: tuple[Any, ...]  # for each attitude sensor: `Delivery` (queue, ..) of the last samples, newest first
     estimate: Track
 
 
@@ -53,10 +56,10 @@ class SensorSuite(Sensor):
     rate_bias: Leaf  # (3,) 1 sigma of the gyro bias at the first sample [rad/s]
     bias_rate: Leaf  # (3,) 1 sigma of the change of the bias per second of a period: walk / sqrt(period) [rad/s^2]
     filter: KalmanFilter
-    given_bias: Leaf | None = None  # (3,) at the first sample, if it is not random [rad/s]
-    rate_scale: Leaf | None = None  # (3,) gyro reading over true rate [-]
-    outage: Leaf | None = None  # (2,) start and end of the time without readings of the first attitude sensor [s]
-    noise_free: bool = field(default=False, metadata={"static": True})  # no random number is computed, see `quiet`
+    given_bias: Leaf | None = None  # (3,) gyro bias at the first sample, if it is not random [rad/s]
+    rate_scale: Leaf | None = None  # (3,) ratio of gyro reading to true rate [-]
+    outage: Leaf | None = None  # (2,) start and end of an outage of the first attitude sensor [s]
+    noise_free: bool = field(default=False, metadata={"static": True})  # whether no noise is generated, see `quiet`
 
     @property
     def every(self) -> int:
@@ -71,7 +74,7 @@ class SensorSuite(Sensor):
         return tuple(None if times is None else times.taken_ago(sample, dt) for times in clocks)
 
     def keys(self, seed: WholeNumber, trial: WholeNumber) -> Any:
-        """Return the keys of a trial's noise: of each attitude sensor, of the gyro and of its drift."""
+        """Return the random keys of a trial: noise of each attitude sensor, gyro noise, gyro drift."""
         if self.noise_free:
             return None
         names = [f"{sensor.name}_noise" for sensor in self.sensors]
@@ -96,7 +99,7 @@ class SensorSuite(Sensor):
         return {f"{RATE_BIAS}_{k + 1}": bias[k] for k in range(3)}
 
     def begin(self, seed: WholeNumber, trial: WholeNumber, x0: AttitudeState, now: Ticks) -> SuiteMemory:
-        """Return the memory before the first sample of positive length, which is now. No reading is on its way."""
+        """Return the memory before the first sample of positive length. No delayed reading is pending."""
         keys = self.keys(seed, trial)
         bias = jnp.zeros(3) if self.noise_free else self.first_bias(seed, trial)
         normals = jnp.zeros(6) if self.noise_free else draws.normals(draws.stream(seed, trial, FILTER_START), 6)
@@ -110,7 +113,7 @@ class SensorSuite(Sensor):
     def readings(
         self, memory: SuiteMemory, x: AttitudeState, now: Ticks, dt: Scalar, star_x: Any = None
     ) -> tuple[Readings, SuiteMemory]:
-        """Return what the sensors deliver at a sample, and the memory; arguments as in `Sensor.measure`."""
+        """Return the readings at a sample, and the memory; see `Sensor.measure` for the arguments."""
         noise_next = self.noise(memory.keys, now.sample + 1)
         *noises, shift = guards.lerp(now.noise_weight, memory.noise, noise_next)
         bias = memory.bias
@@ -156,7 +159,7 @@ class SensorSuite(Sensor):
     def measure(
         self, memory: SuiteMemory, x: AttitudeState, now: Ticks, dt: Scalar, star_x: Any = None
     ) -> tuple[AttitudeState, SuiteMemory]:
-        """Return attitude and rate as the filter estimates them, and the memory."""
+        """Return the attitude and rate that the filter estimates, and the memory."""
         found, memory_next = self.readings(memory, x, now, dt, star_x)
         estimate = self.filter.propagate(memory.estimate, found.rate, dt)
         for k, ((reading, weight), age) in enumerate(zip(found.delivered, found.ages, strict=True)):
@@ -168,7 +171,7 @@ class SensorSuite(Sensor):
         return replace(self, noise_free=True, given_bias=None)
 
     def in_step(self) -> "SensorSuite":
-        """Return a suite of sensors with equally much information that all read at control samples."""
+        """Return a suite whose sensors all read at control samples, with the same information per time."""
         sensors = tuple(sensor.in_step() for sensor in self.sensors)
         return replace(self, sensors=sensors, filter=self.filter.in_step())
 
@@ -189,13 +192,14 @@ class SensorSuite(Sensor):
         return Reading(rows, noise, np.asarray(self.rate_bias), np.asarray(self.bias_rate), start, early)
 
     def change(self, x: AttitudeState, near: AttitudeState, taken: Any = None, near_taken: Any = None) -> Array:
-        """Return how much all readings (m,) differ between two true states.
+        """Return the differences of all readings (m,) between two true states.
 
         Args:
-            x: true state at the control sample.
-            near: another one.
-            taken: true states at the times of `taken_ago`; None: all readings are taken at the control sample.
-            near_taken: other ones.
+            x: first true state at the control sample.
+            near: second true state at the control sample.
+            taken: first true states at the times of `taken_ago`, or None if all readings are taken at the control
+                sample.
+            near_taken: second true states at these times, or None.
         """
         changes = []
         for k, sensor in enumerate(self.sensors):
@@ -204,13 +208,16 @@ class SensorSuite(Sensor):
         return jnp.concatenate([*changes, (near.w - x.w) * (1.0 if self.rate_scale is None else self.rate_scale)])
 
     def lag(self, now: Ticks) -> np.ndarray:
-        """Return how many control samples ago each reading was taken, (N, m); between samples, before the later one."""
+        """Return how many control samples ago each reading was taken, (N, m).
+
+        A reading between two control samples counts from the later one.
+        """
         whole = [np.broadcast_to(sensor.times.place(sensor.times.age(now.sample))[0], now.sample.shape)
                  for sensor in self.sensors]  # fmt: skip
         return self._each(whole, np.zeros(now.sample.shape, int)).T
 
     def available(self, now: Ticks) -> np.ndarray:
-        """Return whether there is each reading at control samples, (N, m) bool."""
+        """Return whether each reading is available at each control sample, (N, m) bool."""
         there = []
         for k, sensor in enumerate(self.sensors):
             times = sensor.times
@@ -229,21 +236,21 @@ class SensorSuite(Sensor):
 
     @property
     def _queues(self) -> list[int]:
-        """The numbers of coordinates of the readings on their way, of each sensor."""
+        """For each sensor, the number of local coordinates of its delayed readings."""
         return [sensor.times.queue * sensor.noise.shape[-1] for sensor in self.sensors]
 
     @property
     def noise_place(self) -> slice:
-        """Return where the coordinates of a memory have the noise of the next sample, see `retract`."""
+        """The place of the noise of the next sample in the coordinates of `retract`."""
         first = 9 + 3 * self.filter.past + sum(self._queues)
         return slice(first, first + sum(sensor.noise.shape[-1] for sensor in self.sensors) + 3)
 
     def retract(self, memory: SuiteMemory, by: Float[Array, " n"]) -> SuiteMemory:
-        """Return the memory near another one at local coordinates.
+        """Return the memory at local coordinates relative to another memory.
 
         Args:
-            memory: the other one.
-            by: coordinates (n,) of the filter [rad, rad/s], of the readings on their way, of the next sample's noise.
+            memory: the memory at coordinates 0.
+            by: coordinates (n,): filter [rad, rad/s], delayed readings, noise of the next sample.
         """
         size = 9 + 3 * self.filter.past
         own, *waiting, noise = jnp.split(by, np.cumsum([size, *self._queues]))
@@ -259,7 +266,7 @@ class SensorSuite(Sensor):
         return memory._replace(estimate=estimate, waiting=tuple(near), noise=noise)
 
     def local_coordinates(self, memory: SuiteMemory, other: SuiteMemory) -> Float[Array, " n"]:
-        """Return the local coordinates (n,) of a memory near another one, to first order; see `retract`."""
+        """Return the local coordinates (n,) of another memory relative to a memory, to first order; see `retract`."""
         shifts = [
             jax.vmap(sensor.change)(mine.reading, theirs.reading).reshape(-1)
             for sensor, mine, theirs in zip(self.sensors, memory.waiting, other.waiting, strict=True)
@@ -273,7 +280,15 @@ class SensorSuite(Sensor):
 def _passed(
     new: Delivery, waiting: Delivery | None, sensor: AttitudeSensor, now: Ticks, age: Scalar
 ) -> tuple[Delivery, Delivery | None]:
-    """Return what a sensor delivers at a sample, from its newest reading and those on their way, and the new queue."""
+    """Return the reading that the flight software receives at a sample, and the new queue of delayed readings.
+
+    Args:
+        new: reading taken at this sample; its weight is 0 if there is none.
+        waiting: delayed readings, newest first, or None without latency.
+        sensor: the sensor.
+        now: the control period that the sample begins.
+        age: age of the received reading [s].
+    """
     times = sensor.times
     if waiting is None:
         return new, None

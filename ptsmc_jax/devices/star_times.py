@@ -1,7 +1,7 @@
-"""Times of a star tracker that samples by a clock of its own, which need not be those of the control samples.
+"""Sample times of a star tracker with its own clock, whose samples need not coincide with the control samples.
 
-It samples once in `interval`, which is at least a control period: at control sample 0 of the clock (t = 0, or the
-hand-over) and every interval from there. Its measurement is used at the next control sample.
+The star tracker samples at control sample 0 of the clock (t = 0, or the hand-over) and then once per `interval`, which
+is at least a control period. The flight software uses a measurement at the next control sample. Read `StarTimes` first.
 """
 
 import math
@@ -19,46 +19,46 @@ from ptsmc_jax.devices.attitude_filter import AttitudeFilter, cholesky, filter_g
 from ptsmc_jax.numerics import guards, matrices
 from ptsmc_jax.numerics.pytrees import Leaf, pytree
 
-ROUNDING = 1e-9  # share of a period by which ages may differ and still count as equal
-LONGEST = 1000  # control periods of a pattern at most
+ROUNDING = 1e-9  # tolerance for equal ages, as a fraction of a period
+LONGEST = 1000  # largest number of control periods of a pattern
 
 
 @pytree
 @dataclass(frozen=True)
 class StarTimes:
-    """When a star tracker samples that goes by its own clock."""
+    """Sample times of a star tracker with its own clock."""
 
-    interval: Leaf  # between its samples [s]
-    period: Leaf  # of control [s]
+    interval: Leaf  # time between star tracker samples [s]
+    period: Leaf  # control period [s]
     pattern: tuple[int, int] = field(metadata={"static": True})  # see the function `pattern`
 
     def age(self, sample: Any) -> Any:
-        """How long before a control sample, given by its number, the star tracker's last sample was [s]."""
+        """Return the age of the newest star tracker sample [s] at a control sample, given by its number."""
         return jnp.maximum(self._time(sample) - self._last(sample) * self.interval, 0.0)
 
     def due(self, sample: Any) -> Any:
-        """Whether it has sampled since the control sample before this one, given by its number."""
-        return self._last(sample) > self._last(sample - 1)  # none twice, none never, however times are rounded
+        """Return whether there is a new star tracker sample at a control sample, given by its number."""
+        return self._last(sample) > self._last(sample - 1)  # each is used exactly once, even with rounding errors
 
     def _time(self, sample: Any) -> Any:
         return jnp.asarray(sample, float) * self.period
 
     def _last(self, sample: Any) -> Any:
-        """Number of the star tracker's last sample."""
+        """Return the number of the newest star tracker sample."""
         t = self._time(sample)
         return jnp.floor((t + guards.rounding(self.period, t)) / self.interval)
 
 
 def star_times(interval: float, period: float) -> StarTimes:
-    """Times of a star tracker that samples once in an interval [s], beside control periods [s]."""
+    """Return the sample times of a star tracker with this interval [s], for this control period [s]."""
     return StarTimes(jnp.asarray(float(interval)), jnp.asarray(float(period)), pattern(interval / period))
 
 
 def pattern(ratio: float) -> tuple[int, int]:
-    """(control periods, star tracker samples in them) after which the times repeat, at most `LONGEST` periods.
+    """Return the number of control periods after which the times repeat, and the star tracker samples in them.
 
-    ratio: of the interval to the control period [-]. Where the times repeat later, or never, these are nearly so; only
-    the errors of a filter at t = 0 are made of them.
+    There are at most `LONGEST` control periods. If the times repeat later, or never, the result is an approximation. It
+    only affects the error covariance of a filter at t = 0. The ratio is that of the interval to the control period [-].
 
     >>> pattern(2.5), pattern(4.0)
     ((5, 2), (4, 1))
@@ -72,10 +72,16 @@ def filter_between(
     bandwidth: Any, attitude_noise: Any, rate_noise: Any, bias_walk: Any, period: Any, interval: Any,
     repeating: tuple[int, int],
 ) -> AttitudeFilter:  # fmt: skip
-    """The `attitude_filter` of a star tracker that samples by its own clock.
+    """Return the `attitude_filter` for a star tracker with its own clock.
 
-    bandwidth [rad/s]; attitude_noise [rad] a star tracker sample; rate_noise [rad/s] a control period [s]; bias_walk
-    [rad/s/sqrt(s)]; interval between star tracker samples [s]; repeating: the `pattern` of its times.
+    Args:
+        bandwidth: bandwidth of the filter [rad/s].
+        attitude_noise: 1 sigma of a star tracker sample about each axis [rad].
+        rate_noise: 1 sigma of a gyro sample, one in each control period [rad/s].
+        bias_walk: random walk of the gyro's bias [rad/s/sqrt(s)].
+        period: control period [s].
+        interval: time between star tracker samples [s].
+        repeating: the `pattern` of the sample times.
     """
     k1, k2 = filter_gains(bandwidth, interval)
     periods, samples = repeating
@@ -84,7 +90,7 @@ def filter_between(
     sizes = jnp.stack([rate_noise, bias_walk * jnp.sqrt(period), attitude_noise])
 
     def after(errors: Float[Array, "3"], noise: Float[Array, "3"], age: Any, weight: Any) -> Float[Array, "3"]:
-        """Errors (attitude, bias, gyro) at the next control sample; between samples the gyro's is linear in time."""
+        """Return the errors (attitude, bias, gyro) at the next control sample; the gyro error is linear in between."""
         (turn, bias, gyro), (gyro_next, drift, star) = errors, sizes * noise
         before = period - age
         turn_rate = (gyro_next + drift - gyro) / period
@@ -95,7 +101,7 @@ def filter_between(
         return jnp.stack([turn, corrected - drift, gyro_next])
 
     def linear(age: Any, weight: Any) -> tuple[Array, Array]:
-        """Matrices of the errors and of the noise in `after`."""
+        """Return the derivatives of `after` by the errors and by the noise."""
         return jax.jacfwd(after, argnums=(0, 1))(jnp.zeros(3), jnp.zeros(3), age, weight)
 
     def step(covariance: Array, linear_step: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -106,13 +112,13 @@ def filter_between(
     at = jnp.asarray(np.minimum(ages, 1.0)) * period
     steps = jax.vmap(linear)(at, jnp.asarray((ages < 1.0 - ROUNDING) * 1.0))
     whole = jax.lax.scan(lambda m, a: (a @ m, None), jnp.eye(3), steps[0])[0]
-    # of the gyro's error, which is new at every sample, the covariance is known at once; the other block solves for it
+    # the gyro error is independent at each sample, so that its covariance is known; the other block needs a solution
     gyro_only = jax.lax.scan(step, jnp.zeros((3, 3)), steps)[0].at[:2, :2].set(0.0)
     once = jax.lax.scan(step, gyro_only, steps)[0][:2, :2]
     block = matrices.solve(jnp.eye(4) - jnp.kron(whole[:2, :2], whole[:2, :2]), once.reshape(4)).reshape(2, 2)
     first = gyro_only.at[:2, :2].set(block)
     ends = jax.lax.scan(step, first, steps)[1]
-    starts = jnp.concatenate([first[None], ends[:-1]])  # at the control samples of the pattern, the first one first
+    starts = jnp.concatenate([first[None], ends[:-1]])  # covariances at the control samples of the pattern, in order
     a, b = linear(jnp.zeros_like(period), 0.0)
     spread = jax.vmap(lambda covariance: cholesky((a @ covariance @ a.T + b @ b.T)[:2, :2]))(starts)
     return AttitudeFilter(k1, k2, spread)
