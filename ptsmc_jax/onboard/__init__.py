@@ -1,1 +1,1 @@
-"""To flight: what the flight computer of the sampled loop does, written as C99, with vectors that check it."""
+"""Export of the flight software of the sampled loop as C99, with test vectors that check the C."""

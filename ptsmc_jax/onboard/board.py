@@ -1,8 +1,15 @@
-"""What the flight computer of the sampled loop does in a control period, in stages that become functions of C.
+"""The control period of the flight computer as a sequence of stages; the export turns each stage into a C function.
 
-A stage calls the very code that the rollout flies, of `devices`, `observers` and `laws`. It reads and writes by name:
-`in.` what comes in at this sample, `before.` what is remembered of the last one, `last.` what went out then, `now.` and
-`out.` what this one makes of it.
+A stage calls the same code of `devices`, `observers` and `laws` as the simulation. It reads and writes values by name,
+with a prefix:
+
+- `in.`: inputs at this sample
+- `before.`: state after the last sample
+- `last.`: outputs of the last sample
+- `now.`: state after this sample
+- `out.`: outputs of this sample
+
+Read `board` first.
 """
 
 import dataclasses
@@ -44,21 +51,21 @@ class Stage:
     about: str
     reads: tuple[str, ...]
     run: Callable[[Given, Given], Given]  # (parameters, values that it reads) -> values that it writes, by name
-    parts: tuple[Any, ...] = ()  # whose docstrings say what it does
+    parts: tuple[Any, ...] = ()  # parts whose docstrings describe the stage in the C
 
 
 @dataclass
 class Board:
-    """The flight computer of some parts: shapes by name, and what each is."""
+    """The flight computer of a scenario: shapes of its values by name, their meanings, and its stages."""
 
-    model: Plant  # the plant as the flight computer knows it
+    model: Plant  # design model of the plant
     parameters: dict[str, Any]
     inputs: dict[str, Any] = field(default_factory=dict)
     state: dict[str, Any] = field(default_factory=dict)
     outputs: dict[str, Any] = field(default_factory=dict)
     stages: list[Stage] = field(default_factory=list)
-    rules: list[derived.Rule] = field(default_factory=list)  # by which parameters follow from others
-    about: dict[str, str] = field(default_factory=dict)
+    rules: list[derived.Rule] = field(default_factory=list)  # rules that derive parameters from other parameters
+    about: dict[str, str] = field(default_factory=dict)  # meaning of each value, by name
 
     @property
     def unit(self) -> str:
@@ -75,13 +82,13 @@ class Board:
 
     @property
     def parts(self) -> dict[str, str]:
-        """What it is made of, by name: the type of each part, and what is fixed in it."""
+        """The type of each part and the values that are fixed in it, by name of the part."""
         made = {name: part for name, part in self.parameters.items() if dataclasses.is_dataclass(part)}
         return {name: _kind(part) for name, part in made.items()}
 
 
 def _kind(part: Any) -> str:
-    """Return the type of a part and what is fixed in it, and in the parts that it has a list of."""
+    """Return the type of a part, and the values that are fixed in it and in the parts that it contains."""
     fixed = []
     for entry in dataclasses.fields(part):
         value = getattr(part, entry.name)
@@ -104,11 +111,11 @@ def integer() -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct((), jnp.int32)
 
 
-SCALARS = {"t": real, "dt": real, "regular": integer, "tracking": integer}  # arguments of C's functions
+SCALARS = {"t": real, "dt": real, "regular": integer, "tracking": integer}  # scalar arguments of the C functions
 
 
 def board(parts: Parts) -> Board:
-    """The flight computer of parts whose loop is sampled."""
+    """Return the flight computer of a scenario with a sampled loop."""
     observer, law = parts.observer, parts.controller
     device = parts.actuators
     parameters, inputs = known(parts), observer.model.inputs
@@ -132,7 +139,7 @@ def board(parts: Parts) -> Board:
 
 
 def known(parts: Parts) -> dict[str, Any]:
-    """All that the flight computer of these parts computes with [SI units], by name: of a trial what it is told."""
+    """Return all parameters of the flight computer [SI units], by name; in a trial, the values that it knows."""
     observer, sensors, period = parts.observer, parts.sensors, parts.period
     parameters = {
         "law": parts.controller,
@@ -147,7 +154,7 @@ def known(parts: Parts) -> dict[str, Any]:
     }
     if isinstance(parameters["filter"], KalmanFilter):  # C starts at control sample 0
         parameters["filter"] = dataclasses.replace(parameters["filter"], first=parameters["filter"].first[:1])
-    elif parameters["filter"] is not None:  # what its gains follow from
+    elif parameters["filter"] is not None:  # the parameters that determine its gains
         parameters["filter_bandwidth"] = sensors.bandwidth(period)
         if sensors.own_times is not None:
             parameters["star_tracker_interval"] = sensors.own_times.interval
@@ -155,7 +162,7 @@ def known(parts: Parts) -> dict[str, Any]:
 
 
 def _filter_parameters(computer: Board, sensors: Any, period: Any) -> None:
-    """The filter's bandwidth as a short number, and what is said of what its gains follow from."""
+    """Round the filter's bandwidth to a short number, and describe the parameters that determine its gains."""
     computer.parameters["filter_bandwidth"] = derived.bandwidth(sensors, period)
     computer.about["filter_bandwidth"] = "of the corrections by the star tracker [rad/s]"
     if sensors.own_times is not None:
@@ -167,7 +174,10 @@ def _said(function: Any) -> str:
 
 
 def _continued(parameters: Given, given: Given, x: State, before: State) -> State:
-    """Return the form of a state, such as the sign of q: that of the last sample; at the start the law chooses."""
+    """Return the state in one of its equivalent forms, such as the sign of q.
+
+    It is the form nearest to the last sample. At the first sample the law chooses the form.
+    """
     law, target = parameters["law"], parameters["reference"](given["t"])
     near, first = law.model.nearest(x, before), law.kinematics.align(x, target)
     return jax.tree.map(lambda *forms: jnp.where(given["tracking"] != 0, *forms), near, first)
@@ -190,7 +200,7 @@ def _reading(computer: Board, parts: Parts) -> None:
 
 
 def _filtering(computer: Board, filter_: Any, *, aged: bool) -> None:
-    """Star tracker and gyro through the attitude filter; aged: the star tracker has times of its own."""
+    """Add a stage that filters star tracker and gyro; aged: whether the star tracker has its own clock."""
     age = {"attitude_age": real()} if aged else {}
     computer.inputs |= {"attitude": real(4), "attitude_valid": integer(), **age, "rate": real(3)}
     computer.state |= {"attitude": real(4), "rate": real(3), "bias": real(3), "gyro": real(3)}
@@ -231,7 +241,7 @@ def _filtering(computer: Board, filter_: Any, *, aged: bool) -> None:
 
 
 def _estimating(computer: Board, estimator: KalmanFilter) -> None:
-    """Add a gyro and attitude sensors, through a Kalman filter of the attitude."""
+    """Add a stage that combines a gyro and attitude sensors in a Kalman filter of the attitude."""
     computer.inputs["rate"] = real(3)
     computer.about["rate"] = computer.model.signals["rate"]
     for sensor in estimator.sensors:
@@ -260,7 +270,7 @@ def _estimating(computer: Board, estimator: KalmanFilter) -> None:
     def sense(parameters: Given, given: Given) -> Given:
         known, before, one = parameters["filter"], given["before.attitude"], jnp.ones_like(given["dt"])
         start, readings = before, []
-        for sensor in known.sensors:  # if the attitude is not known yet, it is that of a star tracker
+        for sensor in known.sensors:  # before the attitude is known, use the reading of a star tracker
             valid = given[f"in.{sensor.name}_valid"] != 0
             reading = jnp.where(valid, given[f"in.{sensor.name}"], sensor.read(start))
             if isinstance(sensor, StarTracker):
@@ -297,13 +307,13 @@ def _estimating(computer: Board, estimator: KalmanFilter) -> None:
 
 
 def _observing(computer: Board, observer: Observer, device: Actuators) -> None:
-    """The disturbance by what the last period's motion shows."""
+    """Add a stage that estimates the disturbance from the motion in the last period."""
     m, wheels = observer.model.inputs, device.wheels
     computer.state["observer"] = jax.eval_shape(observer.begin)
     computer.outputs["d_hat"] = real(m)
     computer.about |= {"observer": "memory of the observer, which begins with the estimate",
                    "d_hat": f"estimated disturbance{computer.unit}"}  # fmt: skip
-    measured = {}  # of the wheels: what the torque over the next period is known by
+    measured = {}  # wheel telemetry that determines the torque over the next period
     if wheels is not None:
         each = real(*np.shape(wheels.initial))
         computer.about["wheel_momentum"] = "of each wheel: spin inertia times (wheel speed + axis . body rate) [N m s]"
@@ -344,7 +354,7 @@ def _observing(computer: Board, observer: Observer, device: Actuators) -> None:
 
 
 def _commanding(computer: Board, law: Law, observer: Observer, command_filter: CommandFilter | None) -> None:
-    """The law, before and after its hand-over, and the filter of its command."""
+    """Add a stage that evaluates the law, before and after its hand-over, and filters its command."""
     m, memory = observer.model.inputs, law.begin()
     x = computer.model.state_of(computer.state)
     target = jax.eval_shape(computer.parameters["reference"], real())
@@ -385,10 +395,10 @@ def _commanding(computer: Board, law: Law, observer: Observer, command_filter: C
         def decided() -> tuple[Any, Any, dict[str, Any]]:
             sample, d_hat, k2 = Sample(t, hold, period, last["law"]), given["out.d_hat"], parameters["bound"](t)
             u, s, law = known(sample, now, reference, d_hat, k2)
-            u, s = (jnp.asarray(v, jnp.result_type(float)) for v in (u, s))  # a law of one's own may say whole numbers
+            u, s = (jnp.asarray(v, jnp.result_type(float)) for v in (u, s))  # a custom law may return integers
             if command_filter is None:
                 return u, s, {"law": law}
-            before = jnp.where(given["dt"] > 0.0, period, 0.0)  # a whole period, also where samples were missed
+            before = jnp.where(given["dt"] > 0.0, period, 0.0)  # a whole period, even after missed samples
             u, integrators = parameters["command_filter"].step(last["command_filter"], u, before, period)
             return u, s, {"law": law, "command_filter": integrators}
 
@@ -419,13 +429,13 @@ def begin(parameters: Given, given: Given) -> Given:
 
 
 def _depends(function: Callable, *args: Any) -> list[bool]:
-    """Which outputs of a function depend on its arguments."""
+    """Return which outputs of a function depend on its arguments."""
     traced = jax.make_jaxpr(function)(*args)
     return [bool(found) for found in dependence(traced.jaxpr, [True] * len(traced.jaxpr.invars))]
 
 
 def _acting(computer: Board, device: Actuators, m: int) -> None:
-    """What of the command acts on the body: delay, limits, allocation to wheels."""
+    """Add a stage that models the actuators: delay, limits, allocation to wheels."""
     wheels, reads = device.wheels, ["out.command"]
     if device.delay:
         computer.state["queue"] = real(device.delay, m)

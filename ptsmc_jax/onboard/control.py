@@ -15,7 +15,7 @@ WRITTEN = 200  # largest number of their operations
 
 
 def _inside(to: Any, region: Region, made: Callable[[], list[np.ndarray]]) -> None:
-    """Add a block to a region; `made` makes its components, which are its outputs."""
+    """Add a block to a region. `made` returns the components of the block's outputs."""
     outer = to.pool.block
     to.pool.block = Block(outer)
     region.outputs.append(_flat(made()))

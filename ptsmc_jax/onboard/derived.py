@@ -1,6 +1,7 @@
-"""Which parameters of a flight computer follow from others, and how.
+"""Rules that derive parameters of a flight computer from other parameters, such as filter gains from a bandwidth.
 
-The same functions as the library's own give them here; traced, they are what C does where gains or the body change.
+The rules call the functions of the library. The export traces them, so that the C updates derived parameters when a
+user changes gains or the body. Read `rules` first.
 """
 
 from collections.abc import Callable
@@ -16,11 +17,11 @@ from ptsmc_jax.numerics import matrices
 from ptsmc_jax.simulation.assembly import Parts
 
 Given = dict[str, Any]  # the parameters, see `board.board`
-Rule = Callable[[Given], Given]  # of all parameters: all of them, those that follow from others computed anew
+Rule = Callable[[Given], Given]  # maps all parameters to all parameters, with the derived ones recomputed
 
 
 def rules(parts: Parts) -> list[Rule]:
-    """The rules for the flight computer of these parts, each for what the ones before it give."""
+    """Return the rules for the flight computer of these parts; each uses the result of the rule before it."""
     found: list[Rule] = [_inverses, _estimation]
     estimator = getattr(parts.sensors, "filter", None)
     if isinstance(estimator, KalmanFilter):
@@ -33,7 +34,7 @@ def rules(parts: Parts) -> list[Rule]:
 
 
 def _inverse(model: Any) -> Any:
-    """A plant's model with the inverse of its inertia, where it keeps one."""
+    """Return a plant model with the inverse of its inertia, if it has such a field."""
     if all(field.name != "inertia_inverse" for field in fields(model)):
         return model
     return replace(model, inertia_inverse=matrices.solve(model.inertia, jnp.eye(model.inputs)))
@@ -46,13 +47,13 @@ def _inverses(given: Given) -> Given:
 
 
 def _estimation(given: Given) -> Given:
-    """The observer's matrix for a period, and K2, the bound on its error."""
+    """Derive the observer's matrix for a period, and K2, the bound on the observer's error."""
     observer = given["observer"]
     return given | {"observer_matrix": observer.update_matrix(given["period"]), "bound": observer.error_bound()}
 
 
 def _clocks(given: Given) -> Given:
-    """The control period, which a Kalman filter and its sensors have too."""
+    """Copy the control period into the Kalman filter and its sensors."""
     estimator, period = given["filter"], given["period"]
     sensors = (replace(sensor, times=replace(sensor.times, period=period)) for sensor in estimator.sensors)
     return given | {"filter": replace(estimator, sensors=tuple(sensors), period=period)}
@@ -62,7 +63,7 @@ def _filtering(sensors: Any) -> Rule:
     every = sensors.every
 
     def run(given: Given) -> Given:
-        """`attitude_filter.filter_gains` without a difference of two near ones, which single precision cannot take."""
+        """Derive the gains of `attitude_filter.filter_gains` with `expm1` against cancellation in single precision."""
         interval = given.get("star_tracker_interval", given["period"] * every)
         gone = -jnp.expm1(-given["filter_bandwidth"] * interval)  # 1 - p
         known = replace(given["filter"], attitude_gain=gone * (2.0 - gone), bias_gain=gone**2 / interval)
@@ -72,7 +73,7 @@ def _filtering(sensors: Any) -> Rule:
 
 
 def _allocation(given: Given) -> Given:
-    """The pseudo-inverse of the wheels' axes, A' (A A')^-1: they span all directions."""
+    """Derive the pseudo-inverse of the wheels' axes, A' (A A')^-1, which exists because they span all directions."""
     device = given["actuators"]
     axes = device.wheels.axes
     allocation = axes.T @ matrices.solve(axes @ axes.T, jnp.eye(len(axes)))
@@ -80,7 +81,7 @@ def _allocation(given: Given) -> Given:
 
 
 def bandwidth(sensors: Any, period: Any) -> np.ndarray:
-    """Bandwidth of an attitude filter [rad/s] behind these sensors: the shortest number that gives its gains."""
+    """Return the bandwidth of the sensors' attitude filter [rad/s], as the shortest number that gives its gains."""
     exact = float(sensors.bandwidth(period))
     interval = float(period) * sensors.every if sensors.own_times is None else float(sensors.own_times.interval)
     wanted = float(sensors.filter.attitude_gain)

@@ -189,7 +189,7 @@ class Pool:
                 return yes if test.value else no
             return yes if yes is no else None
         if op in ("lt", "ge") and known[1] and args[0].kind.startswith("u") and args[1].value == 0:
-            return self.constant(op == "ge", BOOL)  # of which compilers warn
+            return self.constant(op == "ge", BOOL)  # compilers warn about comparisons that are always true or false
         if not any(known):
             return args[0].args[0] if op in ("neg", "not") and args[0].op == op else None
         if op in ("add", "sub", "mul", "div") and len(args) == 2:

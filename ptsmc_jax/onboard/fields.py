@@ -24,7 +24,7 @@ class Field:
 
     @property
     def size(self) -> int:
-        """The number of its elements."""
+        """The number of elements."""
         return int(np.prod(self.shape, dtype=int))
 
     def elements(self) -> list[str]:

@@ -1,4 +1,4 @@
-"""The folder of an exported controller: C, test vectors, programs that check them, README."""
+"""The folder of an exported controller: C, test vectors, programs that check them, README. Read `export` first."""
 
 import hashlib
 import json
@@ -51,15 +51,15 @@ class Controller:
 
     @property
     def last(self) -> float:
-        """Smallest time to go of the last sample before the hand-over [s]."""
+        """The smallest possible time to go at the last sample before the hand-over [s]."""
         return float(self.ready.parts.controller.delta) + self.period
 
 
 def flown(scenario: Scenario) -> Scenario:
-    """Return the scenario of a flight computer, with the flight clock.
+    """Return the scenario with the flight clock, which the exported controller uses.
 
     Raises:
-        ScenarioError: the loop is continuous, or the flight computer knows of wheel failures.
+        ScenarioError: if the loop is continuous, or if the flight computer knows of wheel failures.
     """
     if not scenario.sampled:
         raise wrong("loop.mode", scenario.loop.mode, '"sampled" to be exported: a flight computer has samples')
@@ -82,7 +82,16 @@ def identifier(text: str) -> str:
 
 
 def fly(made: Controller, seed: int, trials: int) -> dict[int, vectors.Samples]:
-    """Simulate trials; return those that can be used as test vectors, by number."""
+    """Return simulated trials that can be used as test vectors, by number of the trial.
+
+    Args:
+        made: the controller.
+        seed: seed of the trials.
+        trials: number of trials.
+
+    Raises:
+        ScenarioError: if no trial is usable, see `vectors.usable`.
+    """
     dispersion = vectors.known_alike(made.ready.dispersion)
     numbers = np.arange(trials, dtype=np.uint32)
     flown = vectors.fly_many(made.ready.parts, dispersion, jnp.uint32(seed), jnp.asarray(numbers))
@@ -115,7 +124,14 @@ def table(made: Controller, flown: dict[int, vectors.Samples]) -> tuple[list[str
 
 
 def write(folder: Path, made: Controller, seed: int, trials: int) -> None:
-    """Write all files into an existing folder."""
+    """Write all files into an existing folder.
+
+    Args:
+        folder: the folder.
+        made: the controller.
+        seed: seed of the trials in the test vectors.
+        trials: number of these trials.
+    """
     flown, t_f = fly(made, seed, trials), float(made.ready.parts.controller.t_f)
     rounding = made.board.model.error_rounding
     header, rows = table(made, flown)
@@ -127,7 +143,13 @@ def write(folder: Path, made: Controller, seed: int, trials: int) -> None:
 
 
 def write_program(folder: Path, made: Controller, steepness: float = 0.0) -> None:
-    """Write the files that do not need trials; steepness: at least that of check.c, see `About`."""
+    """Write the files that do not need trials.
+
+    Args:
+        folder: the folder.
+        made: the controller.
+        steepness: lower limit of the steepness in check.c, see `About`.
+    """
     code, about = made.code, made.about._replace(steepness=max(made.about.steepness, steepness))
     texts = {**templates.texts(code, about), "README.md": readme(code, about)}
     for name, text in texts.items():
@@ -146,18 +168,18 @@ def export(
     Args:
         what: the scenario or its file.
         folder: the new folder.
-        name: of the files; by default that of the scenario's file.
+        name: name of the files; by default the name of the scenario's file.
         trials: number of trials in the test vectors.
-        seed: of the trials.
-        force: write into a folder that has content.
+        seed: seed of the trials.
+        force: whether to write into a folder that has content.
 
     Returns:
         The folder.
 
     Raises:
-        ScenarioError: the loop is continuous, or C cannot express a part.
-        RefusedError: the folder has content, and `force` is not set.
-        ValueError: `trials` or `seed` is not such a number.
+        ScenarioError: if the loop is continuous, or C cannot express a part.
+        RefusedError: if the folder has content, and `force` is not set.
+        ValueError: if `trials` or `seed` is not a valid number.
     """
     path = Path(folder)
     draws.check_whole_number("trials", trials, 1)

@@ -1,4 +1,4 @@
-"""The C functions and structs of a flight computer, generated from its stages."""
+"""The C functions and structs of a flight computer, generated from its stages. Read `generate` first."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ from ptsmc_jax.onboard.translate import Translator
 Struct = dict[str, list[Field]]  # the fields of each named tree
 POINTERS = {"p": "const ptsmc_params *p", "d": "const ptsmc_derived *d", "in": "const ptsmc_in *in",
             "before": "const ptsmc_state *before", "now": "ptsmc_state *now", "out": "ptsmc_out *out"}  # fmt: skip
-PASSED = {"d": "&state->derived", "before": "state", "now": "&now", "out": "&found"}  # what a step has of these names
+PASSED = {"d": "&state->derived", "before": "state", "now": "&now", "out": "&found"}  # arguments in ptsmc_step
 ARGUMENTS = {"t": "real t", "dt": "real dt", "regular": "int regular", "tracking": "int tracking"}
 COMMON = (object, Law, AccelerationLaw, Kinematics, AttitudeKinematics, Observer)  # not described in the C
 
@@ -31,26 +31,26 @@ class Code:
     """The generated C of a flight computer."""
 
     parameters: list[Field]
-    values: dict[str, np.ndarray]  # of the parameters
+    values: dict[str, np.ndarray]  # values of the parameters, by name
     inputs: list[Field]
     state: list[Field]
     outputs: list[Field]
-    functions: list[str] = field(default_factory=list)  # their text
-    calls: dict[str, str] = field(default_factory=dict)  # by stage
+    functions: list[str] = field(default_factory=list)  # text of the functions
+    calls: dict[str, str] = field(default_factory=dict)  # text of the function calls, by stage
     about: dict[str, str] = field(default_factory=dict)  # description of each stage of a sample
     counts: Counter[str] = field(default_factory=Counter)  # largest number of operations of a step
-    open: bool = False  # a loop has an unknown number of passes; one is counted
-    derived: list[Field] = field(default_factory=list)  # numbers that follow from parameters
-    basis: list[Field] = field(default_factory=list)  # the parameters that they follow from
-    derivation: str = ""  # text of the function that derives them
-    follows: dict[str, list[str]] = field(default_factory=dict)  # derived name: names of its parameters
-    fixed: dict[str, str] = field(default_factory=dict)  # parameters that C cannot derive: reason
-    deriving: dict[str, int] = field(default_factory=dict)  # operations of the derivation
-    variables: int = 0  # largest number in a function
+    open: bool = False  # whether a loop has an unknown number of passes; `counts` has one pass of it
+    derived: list[Field] = field(default_factory=list)  # numbers that C derives from parameters
+    basis: list[Field] = field(default_factory=list)  # parameters that determine the derived numbers
+    derivation: str = ""  # text of the function that computes the derived numbers
+    follows: dict[str, list[str]] = field(default_factory=dict)  # names of the parameters behind each derived number
+    fixed: dict[str, str] = field(default_factory=dict)  # reason why C cannot derive a parameter, by name
+    deriving: dict[str, int] = field(default_factory=dict)  # number of operations of the derivation
+    variables: int = 0  # largest number of variables in a function
 
     @property
     def columns(self) -> dict[str, list[str]]:
-        """The elements of the structs, by struct, see `columns`."""
+        """The names of the elements, by struct, see the function `columns`."""
         params = [element for made in self.parameters for element in made.elements()]
         return {**columns(self.inputs, self.state, self.outputs), "params": params}
 
@@ -98,12 +98,21 @@ def _structs(board: Board) -> dict[str, Struct]:
 
 
 def _listed(made: Struct) -> list[Field]:
-    """Return the fields that C declares: it has no arrays without elements."""
+    """Return the fields that C declares. Arrays without elements are left out, because C has none."""
     return [one for group in made.values() for one in group if one.size]
 
 
 def columns(inputs: Sequence[Field], state: Sequence[Field], outputs: Sequence[Field]) -> dict[str, list[str]]:
-    """Return the columns of inputs, outputs and state in vectors.csv, named as in C."""
+    """Return the columns of inputs, outputs and state in vectors.csv, named as in C.
+
+    Args:
+        inputs: fields of the inputs.
+        state: fields of the state.
+        outputs: fields of the outputs.
+
+    Returns:
+        The columns by struct: "in", "out" and "state".
+    """
 
     def all_of(members: Sequence[Field], owner: str = "") -> list[str]:
         return [owner + element for made in members for element in made.elements()]

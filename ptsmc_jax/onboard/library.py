@@ -1,4 +1,7 @@
-"""Exported controllers, compiled, as the flight computer of a simulation."""
+"""Compiled controllers as the flight computer of a simulation (software in the loop).
+
+Read `Library` first, which compiles an exported folder, then `InTheLoop`, which connects it to the simulation.
+"""
 
 import ctypes
 import itertools
@@ -50,7 +53,7 @@ def compiler() -> list[str]:
 
 
 class Library:
-    """A compiled controller; `parameters` are those of its folder and may be changed."""
+    """A compiled controller. Its `parameters` begin with the values of its folder and may be changed."""
 
     def __init__(self, folder: str | Path, real: str = "double", options: tuple[str, ...] = ()):
         """Compile a folder. Raises ScenarioError if it is not a controller or does not compile."""
@@ -88,7 +91,7 @@ class Library:
 
     @property
     def parameters(self) -> np.ndarray:
-        """The parameters in C, (columns,) in the order of columns["params"]; changes act on C."""
+        """The parameters (columns,) in the order of columns["params"]. The array is the memory of C."""
         return self._given
 
     def _compiled(self, place: Path, real: str, options: tuple[str, ...]) -> Path:
@@ -117,7 +120,16 @@ class Library:
         return state
 
     def many(self, state: Any, given: Any, parameters: Any = np.nan) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Step each row (.., columns); return new states, outputs and statuses. NaN in parameters: `parameters`."""
+        """Call `ptsmc_step` for each row.
+
+        Args:
+            state: states (.., columns).
+            given: inputs (.., columns).
+            parameters: parameters (.., columns) of the rows; NaN selects the value of `self.parameters`.
+
+        Returns:
+            New states (.., columns), outputs (.., columns) and statuses (..).
+        """
         shape = np.shape(state)[:-1]
         state, given = (
             np.ascontiguousarray(v, dtype=float).reshape(*shape, len(self.columns[kind]))  # C reads doubles
@@ -131,9 +143,15 @@ class Library:
         return after, out, status
 
     def called(self, state: jax.Array, given: jax.Array, parameters: jax.Array) -> tuple[jax.Array, ...]:
-        """Step one row in a JAX program, or many rows under vmap; return new state, outputs and status.
+        """Call `ptsmc_step` for one row in a JAX program, or for many rows under vmap.
 
-        The numbers have the state's precision, 32 or 64 bits.
+        Args:
+            state: state (columns,), whose precision, 32 or 64 bits, is that of the results.
+            given: inputs (columns,).
+            parameters: parameters (columns,); NaN selects the value of `self.parameters`.
+
+        Returns:
+            The new state (columns,), the outputs (columns,) and the status.
         """
         real = jnp.promote_types(jnp.result_type(state, float), jnp.float32)
         state, given, parameters = (
@@ -155,7 +173,8 @@ def _at(array: np.ndarray) -> ctypes.c_void_p:
 class InTheLoop:
     """A compiled controller as the flight computer of a simulation.
 
-    The simulator has the true sensors, their noise and the actuators. C reads the measurements and gives the commands.
+    The simulator computes the true motion, the measurements with noise, and the actuators. The C reads the measurements
+    and returns the commands.
     """
 
     def __init__(self, library: Library, parts: Parts, dispersion: Dispersion | None = None):
@@ -230,7 +249,17 @@ class InTheLoop:
         return Software(self.boot, self.decide, self.statuses, on_processor=True)
 
     def boot(self, parts: Parts, seed: Any, trial: Any, x0: Any, first: Any) -> Computer:
-        """Before the first sample: the state of `ptsmc_init`, an attitude filter as it has run before."""
+        """Return the flight computer before the first sample, with the state of `ptsmc_init`.
+
+        The state of an attitude filter is replaced by that of a filter that has run before the manoeuvre.
+
+        Args:
+            parts: the scenario of the trial.
+            seed: seed of the campaign.
+            trial: number of the trial.
+            x0: true state at the first sample.
+            first: the first control period.
+        """
         computer = OURS.boot(parts, seed, trial, x0, first)
         state = jnp.asarray(self.library.first())
         for name, value in parts.sensors.remembered(computer.sensors).items():
@@ -240,7 +269,17 @@ class InTheLoop:
     def decide(
         self, parts: Parts, k2: Any, period: Period, computer: Computer, x: Any, star_x: Any, acting: ActuatorState
     ) -> tuple[Decision, Computer]:
-        """A period by `ptsmc_step`; k2 is C's own."""
+        """Return the decision of `ptsmc_step` for a control period, and the flight computer after it.
+
+        Args:
+            parts: the scenario of the trial.
+            k2: not used, because the C computes the bound on the estimation error itself.
+            period: the control period.
+            computer: the flight computer before the sample.
+            x: true state at the sample.
+            star_x: true state at the times of `Sensor.taken_ago`.
+            acting: true state of the actuators, for telemetry.
+        """
         (now, dt_before, *_), (sensing, state, counts) = period, computer.sensors
         inputs, sensing = parts.sensors.inputs(sensing, x, now, dt_before, star_x)
         inputs |= {"wheel_momentum": acting.h, "acting": acting.v}
@@ -267,7 +306,7 @@ class InTheLoop:
         return dict(zip(SAMPLES, computer.sensors[2], strict=True))
 
     def _told(self, parts: Parts) -> Any:
-        """Return the parameters (columns,) that a trial changes; NaN for unchanged ones."""
+        """Return the parameters (columns,) that a trial changes, with NaN for unchanged ones."""
         told = jnp.full(len(self.library.columns["params"]), jnp.nan)
         drawn, nominal = (dict(jax.tree_util.tree_leaves_with_path(known(of))) for of in (parts, self.nominal))
         for path, at in self._columns.items():

@@ -1,4 +1,7 @@
-"""The parameters of a flight computer as fields of C: parameters that are set, and numbers derived from them."""
+"""The parameters of a flight computer as fields of C: independent parameters, and numbers derived from them.
+
+Read `parameters` first.
+"""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -23,12 +26,12 @@ class Parameters:
 
     structure: Any
     leaves: list[Any]
-    fields: list[Field]  # of each leaf; leaves that are one array share a field
-    values: dict[str, np.ndarray]  # by name
-    derived: set[str] = field(default_factory=set)  # names
-    origins: dict[str, list[str]] = field(default_factory=dict)  # derived name: names that it follows from
-    fixed: dict[str, str] = field(default_factory=dict)  # name that C cannot derive: reason
-    rules: list[Rule] = field(default_factory=list)  # rules in C
+    fields: list[Field]  # field of each leaf; leaves that are the same array share a field
+    values: dict[str, np.ndarray]  # values by name
+    derived: set[str] = field(default_factory=set)  # names of derived parameters
+    origins: dict[str, list[str]] = field(default_factory=dict)  # names of the parameters behind each derived one
+    fixed: dict[str, str] = field(default_factory=dict)  # reason why C cannot derive a parameter, by name
+    rules: list[Rule] = field(default_factory=list)  # rules that C can evaluate
     used: set[str] = field(default_factory=set)  # names that C reads
 
     def tree(self, leaves: Any) -> Any:

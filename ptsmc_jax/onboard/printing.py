@@ -1,4 +1,4 @@
-"""Expressions as the body of a C function, with variables and sections named as in the source."""
+"""Expressions as the body of a C function, with variables and sections named as in the source. Read `Printer` first."""
 
 import re
 import textwrap
@@ -97,7 +97,7 @@ class Printer:
         self.section: Any = None
         self.count = 0
         self.entries = 0  # of the tables of its loops
-        self.open = False  # it has a loop with an unknown number of passes; one is counted
+        self.open = False  # whether a loop has an unknown number of passes; `counts` has one pass of it
 
     @property
     def variables(self) -> int:
@@ -107,7 +107,14 @@ class Printer:
     def body(
         self, block: Block, outputs: Sequence[tuple[str, Node]], indent: str = "    ", returned: Node | None = None
     ) -> list[str]:
-        """Return the lines of a block that sets these places and returns a number, if any."""
+        """Return the lines of C of a function body.
+
+        Args:
+            block: the statements.
+            outputs: places in memory to set, and their values.
+            indent: indentation of each line.
+            returned: value of the return statement, or None without one.
+        """
         for node in [*(node for _, node in outputs), *([] if returned is None else [returned])]:
             self._use(node)
         for node in sorted(self.nodes.values(), key=lambda node: node.serial):
@@ -311,7 +318,7 @@ class Printer:
         return f"M({'fabs' if node.op == 'abs' else node.op})({listed})", ATOM
 
     def _infix(self, sign: str, level: int, a: Node, b: Node) -> tuple[str, int]:
-        # compilers warn where && and || are mixed, or comparisons compared
+        # parentheses avoid compiler warnings about mixed && and ||, and about comparisons of comparisons
         mixed = {"&&": "or", "||": "and"}.get(sign)
         compared = level in (9, 10)
         left = self._at_least(a, ATOM if a.op == mixed else 11 if compared else level)

@@ -32,14 +32,14 @@ class About(NamedTuple):
     """Properties of the controller and its origin."""
 
     name: str  # a C identifier
-    scenario: str  # its file
-    digest: str
-    law: str
-    filtered: bool  # with an attitude filter
-    largest: float  # measured number that is accepted
-    wheels: bool
-    delay: int  # control periods
-    steepness: float  # (t_f / time to go of the last sample before the hand-over)^2, by which gains grow, or more
+    scenario: str  # name of the scenario's file
+    digest: str  # checksum of the scenario
+    law: str  # class name of the law
+    filtered: bool  # whether there is an attitude filter
+    largest: float  # largest accepted size of a measured number
+    wheels: bool  # whether there are reaction wheels
+    delay: int  # delay of the commands in control periods
+    steepness: float  # growth of the gains until the hand-over, at least (t_f / time to go of the last sample)^2
 
 
 # public names of a controller: the templates have them after ptsmc_ and PTSMC_, exported files after ptsmc_NAME_

@@ -1,4 +1,7 @@
-"""What a flight computer is given and gives, sample by sample, as the simulator flies it: what C is checked by."""
+"""Test vectors for exported C: inputs, outputs and state of the simulated flight computer at each sample.
+
+Read `fly` first.
+"""
 
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -21,34 +24,41 @@ from ptsmc_jax.simulation.run_state import SINGULAR_CLEARANCE
 
 
 class Samples(NamedTuple):
-    """A run by samples, arrays (samples, ..); what there is none of is None."""
+    """The samples of a run, arrays (samples, ..); None for values that the scenario does not have."""
 
-    t: Array  # [s]
-    flown: Array  # bool: its period has a length
-    inputs: dict[str, Array]  # what the sensors deliver, see `Sensor.inputs`
-    before: dict[str, Array]  # of an attitude filter before the sample, see `Sensor.remembered`
-    after: dict[str, Array]  # and after it
-    applied: Array  # mean torque over the last period [N m]
-    acting: Array | None  # torque of the channels [N m]
-    momentum: Array | None  # of the wheels [N m s]
-    seen: Any  # state as the law sees it
-    observer: Any  # memory
-    law: Any  # memory
-    command_filter: Any  # memory
-    queue: Array | None
-    d_hat: Array
-    command: Array
-    s: Array
-    error: Array  # as the law sees it
-    torque: Array  # on the body from this sample on [N m]
-    wheel_torque: Array | None
-    limited: Array  # bool
-    clearance: Array
-    clearance_unit: Array
+    t: Array  # time [s].
+    flown: Array  # bool: whether the period has a nonzero length.
+    inputs: dict[str, Array]  # inputs from the sensors, see `Sensor.inputs`.
+    before: dict[str, Array]  # attitude filter before the sample, see `Sensor.remembered`.
+    after: dict[str, Array]  # attitude filter after the sample.
+    applied: Array  # mean torque over the last period [N m].
+    acting: Array | None  # torque of the channels [N m].
+    momentum: Array | None  # momentum of the wheels [N m s].
+    seen: Any  # measured state.
+    observer: Any  # memory of the observer.
+    law: Any  # memory of the law.
+    command_filter: Any  # memory of the command filter.
+    queue: Array | None  # delayed commands [N m].
+    d_hat: Array  # estimated disturbance [N m].
+    command: Array  # command of the law [N m].
+    s: Array  # sliding variable.
+    error: Array  # error of the measured state.
+    torque: Array  # torque on the body from this sample on [N m].
+    wheel_torque: Array | None  # torque of each wheel [N m].
+    limited: Array  # bool: whether a limit reduces the command.
+    clearance: Array  # distance to the singularity, in `clearance_unit` [-].
+    clearance_unit: Array  # unit of `clearance`.
 
 
 def fly(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Samples:
-    """Return a trial by samples, at their nominal times."""
+    """Simulate a trial without timing jitter and return its samples.
+
+    Args:
+        parts: the nominal scenario.
+        dispersion: the dispersions.
+        seed: seed of the campaign.
+        trial: number of the trial.
+    """
     parts = replace(dispersion.apply(parts, seed, trial), jitter=None)
     ticks = parts.clock.ticks(parts.controller.t_f, parts.controller.delta)
     law, sensors, wheels = parts.controller, parts.sensors, parts.actuators.wheels
@@ -82,17 +92,24 @@ def fly(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Samples:
 
 @programs.jit(compiler_options=programs.QUICKLY)
 def fly_many(parts: Parts, dispersion: Dispersion, seed: Array, trials: Array) -> Samples:
-    """Trials by samples, (trials, samples, ..)."""
+    """Simulate trials and return their samples, (trials, samples, ..).
+
+    Args:
+        parts: the nominal scenario.
+        dispersion: the dispersions.
+        seed: seed of the campaign.
+        trials: numbers of the trials (trials,).
+    """
     return lapack.vmap(lambda trial: fly(parts, dispersion, seed, trial))(trials)
 
 
 def known_alike(dispersion: Dispersion) -> Dispersion:
-    """Return the dispersion without reference and torque limit: the flight computer knows only the nominal ones."""
+    """Return the dispersion without reference and torque limit, because the C knows only their nominal values."""
     return dispersion.without((REFERENCE, level_name("torque_limit")))
 
 
 def usable(samples: Samples) -> bool:
-    """Whether a trial is finite, and stays away from the law's singularity."""
+    """Return whether a trial is finite and stays away from the law's singularity."""
     finite = all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(samples))
     return finite and bool(np.min(samples.clearance) >= SINGULAR_CLEARANCE)
 
@@ -117,13 +134,13 @@ def steepness(samples: Samples, rounding: float, t_f: float, last: float) -> flo
 
 
 def one(samples: Samples, trial: int) -> Samples:
-    """A trial of many, on NumPy arrays, without samples of no length."""
+    """Return one of many trials in NumPy arrays, without samples whose period has length 0."""
     found = jax.tree.map(lambda v: np.asarray(v[trial]), samples)
     return jax.tree.map(lambda v: v[found.flown], found)
 
 
 def rows(board: Board, samples: Samples) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Inputs, outputs and state of one trial, (samples, columns) each, in the order of `templates.columns`."""
+    """Return inputs, outputs and state of one trial, (samples, columns) each, in the order of `generate.columns`."""
     inputs = samples.inputs | {"wheel_momentum": samples.momentum, "applied": samples.applied, "acting": samples.acting}
     state_by_name = {**samples.after, **board.model.signals_of(samples.seen), "observer": samples.observer,
                      "law": samples.law, "queue": samples.queue, "command_filter": samples.command_filter,
@@ -137,7 +154,7 @@ def rows(board: Board, samples: Samples) -> tuple[np.ndarray, np.ndarray, np.nda
 
 
 def first_state(board: Board, samples: Samples) -> np.ndarray:
-    """The state before a trial's first sample, (columns,)."""
+    """Return the state before a trial's first sample, (columns,)."""
     law, observer = (board.parameters[name].begin() for name in ("law", "observer"))
     kept = {"law": jax.tree.map(lambda v: np.asarray(v)[None], law),
             "observer": jax.tree.map(lambda v: np.asarray(v)[None], observer)}  # fmt: skip
@@ -147,7 +164,7 @@ def first_state(board: Board, samples: Samples) -> np.ndarray:
 
 
 def _columns(shapes: dict[str, Any], values: dict[str, Any]) -> np.ndarray:
-    """Columns of named trees, in their order; zero where there is no value."""
+    """Return the columns of named trees, in their order, with zeros for missing values."""
     found = []
     for name, shape in shapes.items():
         given = values.get(name)
