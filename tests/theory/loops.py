@@ -1,4 +1,4 @@
-"""Loops by their matrices, for which no scenario has to be linearised, and what they are."""
+"""Linear loops built from matrices, without a scenario, and helpers that evaluate their margins and poles."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from scipy import linalg
 from ptsmc_jax import programs
 from ptsmc_jax.theory import linear, margins
 
-# a body with all that a loop may have
+# a spacecraft with slow star tracker, attitude filter, delay, lag and wheels
 ALL_AT_ONCE = {
     "controller": {"t_f": 10.0, "delta": 0.5},
     "loop": {"mode": "sampled", "period": 0.1, "t_end": 14.0},
@@ -24,12 +24,12 @@ ALL_AT_ONCE = {
 }  # fmt: skip
 
 
-# states, what sensors see of them, inputs: as many as a chain has, whose loops need no programs of their own
+# numbers of states, seen states and inputs of a chain's loop; smaller loops are padded to share its compiled programs
 ROOM, LATE_ROOM = (8, 2, 2), (9, 2, 1)
 
 
 def of(loop, **how):
-    """Its margins; of small loops by one program without delay, by that of slopes behind a period of it."""
+    """Margins of a loop. Small loops are padded so that one compiled program serves all of them."""
     sizes, room = (*loop.seen.shape, len(loop.command)), {0: ROOM, 1: LATE_ROOM}.get(loop.delay)
     if not how and room is not None and np.all(np.array(sizes) <= room):
         loop = larger(loop, *room)
@@ -41,7 +41,7 @@ def of(loop, **how):
 
 @programs.jit
 def sloped(loop, way):
-    """Those of the first input, their slopes along a way, and all of them."""
+    """Margins of the first input, their derivatives along a direction, and the margins of all inputs."""
 
     def margins_of(loop):
         found = margins.of(loop)
@@ -51,7 +51,7 @@ def sloped(loop, way):
 
 
 def larger(loop, n, k, m):
-    """The loop with states and inputs besides that nothing moves, and that move nothing."""
+    """The loop padded with states and inputs that have no effect."""
     sizes = {"a": (n, n), "seen": (n, k), "new": (n, m), "old": (n, m), "command": (m, n), "direct": (m, k),
              "disturbed": (n, m)}  # fmt: skip
 
@@ -60,11 +60,11 @@ def larger(loop, n, k, m):
         return np.pad(np.asarray(v), [(0, 0)] * (np.ndim(v) - 2) + more)
 
     all_of = replace(loop, **{name: grown(getattr(loop, name), to) for name, to in sizes.items()})
-    return jax.tree.map(np.asarray, all_of)  # whose types are never weak
+    return jax.tree.map(np.asarray, all_of)  # NumPy arrays, because weak types would compile another program
 
 
 def a_loop(a, b, c):
-    """The loop x' = a x + b u, u = c x of one input, seen by no sensor, at a period of 1 s."""
+    """The discrete loop x' = a x + b u, u = c x with one input, no sensor and a period of 1 s."""
     n, zero = len(a), jnp.zeros
     push = jnp.tile(jnp.reshape(jnp.asarray(b, float), (n, 1)), (linear.NODES.size, 1, 1))
     c = jnp.reshape(jnp.asarray(c, float), (1, n))
@@ -73,7 +73,7 @@ def a_loop(a, b, c):
 
 
 def held(a, b, c, h=1.0, sensors=False):
-    """The loop of dx/dt = a x + b u, u = c x held for h [s]; sensors: that see all of x, else none does."""
+    """The sampled loop of dx/dt = a x + b u with u = c x held for h [s]; sensors: whether they see all of x."""
     n, m = b.shape
     both = np.vstack([np.hstack([a, b]), np.zeros((m, n + m))])
     spans = [[linalg.expm(both * share * h) for share in (part, 1.0 - part)] for part in linear.NODES]
@@ -84,11 +84,11 @@ def held(a, b, c, h=1.0, sensors=False):
     return linear.Loop(*map(jnp.asarray, values), delay=0)
 
 
-INTEGRATORS = np.eye(3, k=1), np.eye(3)[:, 2:], -np.array([[0.027, 0.27, 0.9]])  # three, whose poles are at -0.3 / s
+INTEGRATORS = np.eye(3, k=1), np.eye(3)[:, 2:], -np.array([[0.027, 0.27, 0.9]])  # closed-loop poles at -0.3 1/s
 
 
 def drawn_loop(seed):
-    """Two oscillators or integrators with damping, two inputs, linear-quadratic feedback that is a little off."""
+    """Random loop: two damped oscillators or integrators, two inputs, perturbed linear-quadratic feedback."""
     rng = np.random.default_rng(seed)
     turns, damping, a = rng.uniform(0.3, 2.8, 2), 10 ** rng.uniform(-3.0, -0.5, 2), np.zeros((4, 4))
     for k, (w, share) in enumerate(zip(turns, damping, strict=True)):
@@ -105,7 +105,7 @@ def drawn_loop(seed):
 
 
 def radius_late(loop, axis, late):
-    """Largest modulus of the poles of a loop without delay, an axis late by so many periods."""
+    """Spectral radius of a loop without delay if one axis is delayed by `late` periods."""
     (a, command), whole = loop.closed_at_sensors(np), int(late)
     (m, n), pushes = command.shape, np.zeros((whole + 2, *command.T.shape))
     pushes[0] = loop.new[0] * (np.arange(m) != axis)

@@ -1,4 +1,4 @@
-"""Closed-form borders of the sampled double integrator against brute force and the law itself."""
+"""Closed-form stability limits of the sampled double integrator, checked by time stepping and against the law."""
 
 import jax
 import jax.numpy as jnp
@@ -11,8 +11,8 @@ from tests.helpers import commanded, parts, vector
 
 
 @pytest.mark.parametrize("t", [3.0, 18.9, 19.6])
-def test_gains_are_the_slopes_of_the_law(t):
-    """Acceleration of eps by eps and eps' at the reference, by automatic differentiation of the closed loop."""
+def test_gains_are_the_derivatives_of_the_law(t):
+    """Automatic differentiation of the closed loop gives the derivatives of eps'' by eps and eps' at the reference."""
     run = parts(20.0, 3.4, 1.0, inertia=(10.0,) * 3, k1=1.7, sign_width=0.05, surface_rate=2.3)
     law, k2 = run.controller, vector(0.02)
     hold = jnp.asarray(t >= 19.0)
@@ -30,7 +30,7 @@ def test_gains_are_the_slopes_of_the_law(t):
 
 
 def flown_radius(kp, kd, h, late):
-    """Growth per period of a double integrator under sampled feedback that acts late, by stepping it."""
+    """Growth per period of a double integrator under delayed sampled feedback, by time stepping."""
     fine = 20
     state, commands = np.array([1.0, 0.3]), [0.0] * 10
     sizes = []
@@ -45,12 +45,12 @@ def flown_radius(kp, kd, h, late):
 
 
 @pytest.mark.parametrize("late", [0.0, 1.0, 2.0, 0.25, 1.5])
-def test_poles_are_those_of_the_loop_stepped_by_hand(late):
+def test_spectral_radius_equals_growth_of_time_stepping(late):
     for kp, kd in ((0.2, 0.5), (1.0, 0.9), (0.05, 0.2)):
         np.testing.assert_allclose(borders.radius(kp, kd, 1.0, late), flown_radius(kp, kd, 1.0, late), rtol=0.03)
 
 
-def test_borders_are_those_of_the_theory_notes():
+def test_stability_limits_equal_the_documented_values():
     for eta in (2.2, 3.0, 5.0, 8.0):
         np.testing.assert_allclose(borders.largest_index(eta), 2.0, rtol=1e-9)
         np.testing.assert_allclose(borders.smallest_delta(eta, 0.05), max(0.0, (eta - 1.5) * 0.05), rtol=1e-8)
@@ -61,7 +61,7 @@ def test_borders_are_those_of_the_theory_notes():
 
 @pytest.mark.parametrize("implicit", [False, True])
 @pytest.mark.parametrize("delay", [0, 1, 2, 5])
-def test_the_fastest_surface_that_can_be_held_is_the_border_of_small_k(delay, implicit):
+def test_no_reaching_rate_is_stable_above_the_largest_surface_rate(delay, implicit):
     border = borders.largest_surface(delay, implicit=implicit)
     if implicit and not delay:
         assert border == np.inf
@@ -73,8 +73,8 @@ def test_the_fastest_surface_that_can_be_held_is_the_border_of_small_k(delay, im
 
 @pytest.mark.parametrize("anchored", [False, True])
 @pytest.mark.parametrize("implicit", [False, True])
-def test_at_the_smallest_delta_the_last_sample_before_the_hand_over_is_on_the_border(implicit, anchored):
-    """It lies at delta on the flight clock, a period earlier on the anchored one, and one more if implicit."""
+def test_smallest_delta_puts_the_last_sample_before_the_hand_over_at_the_stability_limit(implicit, anchored):
+    """Its time to go is delta on the flight clock, one period more on the anchored clock, one more if implicit."""
     eta, h = 4.0, 0.05
     delta = borders.smallest_delta(eta, h, 1.0, anchored=anchored, implicit=implicit)
     tau = delta / h + anchored + implicit

@@ -1,4 +1,4 @@
-"""The covariance of the linearised loop against flown trials."""
+"""The covariance of the linearised loop, compared with simulated trials."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -20,7 +20,7 @@ from tests.helpers import parts as a_body
 from tests.theory.loops import ALL_AT_ONCE
 
 FILTER = {"filter": {"kind": "steady_state", "bandwidth": 0.1}}
-# no disturbance, and a law that has arrived: what is left is the noise
+# no disturbance, and a small error without noise at t_f, so that noise dominates the error
 QUIET = {"controller__delta": 1.0, "controller__eta": 4.0, "loop__clock": "flight", "disturbance": {"kind": "none"}}
 CASES = {
     "slow observer": {},
@@ -28,7 +28,7 @@ CASES = {
     "narrow sign": {"observer__gain": [100.0] * 3, "controller__k1": 5.0, "controller__sign_width": 1e-6},
     "exact sign": {"observer__gain": [30.0] * 3, "controller__sign_width": 0.0},
     "delay": {"hardware__delay": 2},
-    "filter": {**FILTER, "controller__delta": 0.5},  # behind it noise is less than what a delta of 1 s leaves
+    "filter": {**FILTER, "controller__delta": 0.5},  # with delta = 1 s the noise-free error would exceed the noise
     "filter, slow star tracker, lag": {**FILTER, "hardware__torque_lag": 0.1, "hardware__star_tracker_every": 4},
     "filter, bias": {**FILTER, "hardware__rate_bias": 1e-5, "hardware__rate_bias_walk": 1e-6},
     "filter, slow star tracker, wheels, lag": {
@@ -43,26 +43,26 @@ NOISES = {"attitude_noise": 1e-13, "rate_noise": 1e-13, "rate_bias": 1e-16, "rat
 
 
 SHORT = ("filter, slow star tracker, wheels, lag",)
-# from nearby a law arrives in 15 s, too
+# for a small slew 15 s are sufficient
 NEAR = {
     "dispersion": {"attitude": {"kind": "axis_angle", "min_deg": 0.1, "max_deg": 0.5}},
     "controller__t_f": 15.0, "loop__t_end": 18.0,
 }  # fmt: skip
 
 
-@pytest.mark.long  # noise and random walk: theory/test_spillover.py; delays and a filter's steady state: below
+@pytest.mark.long  # short tests: test_spillover.py (noise, random walk) and below (delay, filter steady state)
 @pytest.mark.parametrize(
     ("case", "trials", "start"),
     [(case, 500, NEAR) for case in SHORT] + [(case, 2000, {}) for case in CASES],
 )
-def test_covariance_predicts_the_accuracy_of_flown_trials(case, trials, start):
-    """RMS of 500 trials, 3 % of sampling error at most; the rest is what the law does beyond first order.
+def test_covariance_predicts_the_error_of_simulated_trials(case, trials, start):
+    """The sampling error of 500 trials is at most 3 %. The rest of the tolerance is for nonlinear effects.
 
-    What the law leaves without noise, in the same trials, is taken away.
+    The test subtracts the error of the same trials without noise.
     """
     noisy = scenario.replace(scenario.read(FIRST_FLIGHT), tune=None, **{**QUIET, **CASES[case], **start})
     given = {f"hardware__{k}": v for k, v in NOISES.items() if getattr(noisy.hardware, k)}
-    walk = noisy.disturbance.kind == "random_walk"  # the same program, whatever is quiet
+    walk = noisy.disturbance.kind == "random_walk"  # tiny noise instead of none, so that the compiled program is reused
     quiet = {"kind": "random_walk", "density": [1e-16] * 3} if walk else {"kind": "none"}
     still = scenario.replace(noisy, **given, disturbance=quiet)
     rms = []
@@ -72,12 +72,12 @@ def test_covariance_predicts_the_accuracy_of_flown_trials(case, trials, start):
         assert np.all(flown.finished)
         rms.append(float(np.sqrt(np.mean(flown.metrics.window_error**2))))
     share = np.sqrt(rms[0] ** 2 - rms[1] ** 2)
-    assert share > 0.4 * rms[0]  # the noise can be told from the rest
+    assert share > 0.4 * rms[0]  # noise is a large part of the error
     np.testing.assert_allclose(covariance.noise(scenario.study(noisy).parts).window_error, share, rtol=0.1)
 
 
 def flown_chain(**changes):
-    """A chain of order 2 from rest at its target; 2 000 trials, all by one program."""
+    """Window error of 2 000 trials of a chain of order 2 at rest on its target, by one compiled program."""
     tables = {
         "plant": {"kind": "chain", "x0": [0.0, 0.0]},
         "loop": {"mode": "sampled", "clock": "flight", **changes.pop("loop")},
@@ -94,8 +94,8 @@ _fly = jax.jit(jax.vmap(lambda parts, k: rollout.simulate(parts, np.uint32(1), k
 
 
 @pytest.mark.parametrize(("rounds", "converged"), [(1, False), (covariance.ROUNDS, True)])
-def test_a_mean_slope_that_has_not_converged_is_reported(monkeypatch, rounds, converged):
-    """The noise makes s as large as the width of the sign, so one round is not enough."""
+def test_noise_reports_whether_the_statistical_linearisation_converged(monkeypatch, rounds, converged):
+    """The noise of s equals about the width of the sign, so that one iteration is not enough."""
     tables = {
         "plant": {"kind": "chain", "x0": [0.0, 0.0]},
         "controller": {"t_f": 4.0, "delta": 2.0, "k1": 0.5, "sign_width": 1e-3},
@@ -107,8 +107,8 @@ def test_a_mean_slope_that_has_not_converged_is_reported(monkeypatch, rounds, co
     assert covariance.noise(scenario.study(scenario.from_tables(tables)).parts).converged is converged
 
 
-def test_the_error_between_samples_counts_where_few_of_them_are_in_the_window():
-    """One, 0.49 s after t_f and 0.11 s before the window's end."""
+def test_window_error_includes_the_error_between_samples():
+    """The window contains only one sample, 0.49 s after t_f."""
     parts, flown = flown_chain(
         controller={"t_f": 15.01, "delta": 0.9, "k1": 3.0, "sign_width": 0.01, "surface_rate": 1.5},
         observer={"kind": "nonlinear", "gain": [5.0]},
@@ -119,8 +119,8 @@ def test_the_error_between_samples_counts_where_few_of_them_are_in_the_window():
     np.testing.assert_allclose(covariance.noise(parts).window_error, flown, rtol=0.05)
 
 
-def test_a_random_walk_acts_from_the_start_of_its_period_on():
-    """Over four periods of 1 s, on 2 000 trials known to 1 %; a period later it would say much less."""
+def test_a_random_walk_acts_from_the_start_of_its_period():
+    """The window has few periods of 1 s. A step that acts one period later would predict a much smaller error."""
     parts, flown = flown_chain(
         controller={"t_f": 4.0, "delta": 2.0, "k1": 0.5, "sign_width": 1e3},
         observer={"kind": "nonlinear", "gain": [0.3]},
@@ -131,9 +131,9 @@ def test_a_random_walk_acts_from_the_start_of_its_period_on():
     np.testing.assert_allclose(covariance.noise(parts).window_error, flown, rtol=0.04)
 
 
-@pytest.mark.long  # of a chain above
-def test_the_error_of_a_body_between_samples_counts_where_few_of_them_are_in_the_window():
-    """One, 0.49 s after t_f and 0.11 s before the window's end: it says three quarters of the error of 2 000 trials."""
+@pytest.mark.long  # short test: the chain above
+def test_window_error_of_a_spacecraft_includes_the_error_between_samples():
+    """The window contains only one sample. The error at this sample alone is three quarters of the trials' error."""
     tables = {
         "controller": {"t_f": 15.01, "delta": 0.9, "k1": 3.0, "sign_width": 0.01, "surface_rate": 1.5},
         "observer": {"gain": [5.0] * 3},
@@ -147,9 +147,9 @@ def test_the_error_of_a_body_between_samples_counts_where_few_of_them_are_in_the
     np.testing.assert_allclose(covariance.noise(ready.parts).window_error, np.sqrt(np.mean(flown**2)), rtol=0.05)
 
 
-@pytest.mark.long  # of a chain above
-def test_a_random_walk_on_a_body_acts_from_the_start_of_its_period_on():
-    """Over four periods of 1 s, on 2 000 trials known to 1 %; a period later it would say 12 % less."""
+@pytest.mark.long  # short test: the chain above
+def test_a_random_walk_on_a_spacecraft_acts_from_the_start_of_its_period():
+    """A step that acts one period later would predict a 12 % smaller error. The trials determine it to 1 %."""
     tables = {
         "controller": {"t_f": 4.0, "delta": 2.0, "k1": 0.5, "sign_width": 1e3},
         "observer": {"gain": [3.0] * 3},
@@ -163,8 +163,8 @@ def test_a_random_walk_on_a_body_acts_from_the_start_of_its_period_on():
     np.testing.assert_allclose(covariance.noise(ready.parts).window_error, np.sqrt(np.mean(flown**2)), rtol=0.04)
 
 
-def test_a_filters_errors_stay_in_the_steady_state_that_they_start_in():
-    """Of attitude and bias, for six of its time constants; means over a star tracker's interval are off by a tenth."""
+def test_filter_covariance_stays_at_its_initial_steady_state():
+    """It covers attitude and bias for six time constants. Averaged loops change the covariance by about a tenth."""
     parts = scenario.study(scenario.from_tables(ALL_AT_ONCE)).parts
     run, periods = linear.nominal_jit(parts), np.arange(linear.TOGETHER)
     opened = linear.opened_in(parts, run, periods)
@@ -185,8 +185,8 @@ def test_a_filters_errors_stay_in_the_steady_state_that_they_start_in():
 
 
 @pytest.mark.parametrize("delay", [0, 1, 2, 3])
-def test_what_is_propagated_moves_as_the_closed_loop(delay):
-    """Whatever its matrices and however many commands are on their way; besides, a torque pushes it and stays."""
+def test_propagated_state_has_the_dynamics_of_the_closed_loop(delay):
+    """The loop has random matrices and delayed commands. A constant torque is an additional state."""
     rng, (n, k, m) = np.random.default_rng(delay), (6, 4, 3)
     shapes = (n, n), (n, k), (1, n, m), (m, n), (m, k), (n, m)
     a, seen, push, command, direct, pushed = (jnp.asarray(rng.normal(size=(1, *shape))) for shape in shapes)
@@ -201,8 +201,8 @@ def test_what_is_propagated_moves_as_the_closed_loop(delay):
     np.testing.assert_allclose(commanded.state[0], np.pad(at_input.c, ((0, 0), (0, m))), rtol=0.0, atol=1e-14)
 
 
-def test_implicit_sampling_is_not_predicted():
-    """A noise beyond what its switching reaches would count thirteen times in the torque."""
+def test_noise_does_not_apply_to_implicit_sampling():
+    """For noise beyond the reach of the switching term the predicted torque would be 13 times too large."""
     parts = scenario.study(scenario.from_tables({"loop": {"mode": "sampled"}, "hardware": {"rate_noise": 1e-6}})).parts
     assert covariance.predicts(parts)
     assert not covariance.predicts(replace(parts, controller=replace(parts.controller, implicit=True)))
@@ -210,9 +210,9 @@ def test_implicit_sampling_is_not_predicted():
 
 
 @pytest.mark.parametrize("width", [1e-4, 0.02, 0.1, 0.3, 2.0, 30.0])
-def test_the_mean_slope_of_a_sign_under_noise_is_the_integral_over_it(width):
-    """E[sech^2(n / width)] / width, by the trapezium rule with 16 steps and more within a width."""
-    reach, step = min(12.0, 40.0 * width), min(1.0, width) / 16.0  # beyond, either factor is below 1e-31
+def test_equivalent_width_matches_numerical_integration(width):
+    """The trapezium rule integrates E[sech^2(n / width)] / width with at least 16 steps in a width."""
+    reach, step = min(12.0, 40.0 * width), min(1.0, width) / 16.0  # the integrand is below 1e-31 beyond `reach`
     n = np.linspace(-reach, reach, 2 * round(reach / step) + 1)
     slope = np.trapezoid(np.exp(-(n**2) / 2.0) / np.cosh(n / width) ** 2, n) / np.sqrt(2.0 * np.pi) / width
     for sigma in (1.0, 2e-6):
@@ -221,11 +221,11 @@ def test_the_mean_slope_of_a_sign_under_noise_is_the_integral_over_it(width):
     assert covariance._mean_width(0.0, 1.0) == pytest.approx(np.sqrt(np.pi / 2.0), rel=1e-12)
 
 
-def test_the_sign_has_the_slope_that_the_noise_of_its_moment_leaves_it():
-    """Command and s of 200 flown trials, 1 sigma, on the way and in hold; of s that is 25 times as noisy on the way.
+def test_equivalent_width_follows_the_noise_of_each_period():
+    """Compare the deviations of command and s with 200 trials; s is 25 times as noisy in the approach phase.
 
-    Each is known to 5 % (1 sigma), the largest of 160 to some 20 %. One slope for all, that of the hold, predicted 0.26
-    for 0.11.
+    The trials determine each deviation to 5 % and the largest of 160 to about 20 %. A single equivalent width, that of
+    the hold phase, would predict 0.26 instead of 0.11.
     """
     tables = {
         "plant": {"kind": "chain", "order": 3, "x0": [0.1, 0.0, 0.0]},
@@ -245,8 +245,8 @@ def test_the_sign_has_the_slope_that_the_noise_of_its_moment_leaves_it():
 
 
 @pytest.mark.long
-def test_noise_that_makes_a_sign_flyable_is_predicted():
-    """3.3e-6 of 100 flown trials, with what the narrow sign leaves without noise; once it was 1e5."""
+def test_noise_that_stabilises_a_narrow_sign_is_predicted():
+    """The window error of 100 simulated trials is 3.3e-6, including the noise-free error of the narrow sign."""
     given = {**QUIET, **CASES[SHORT[0]], "controller__sign_width": 1e-7, "controller__disturbance_rate_bound": 1e-3}
     parts = scenario.study(scenario.replace(scenario.read(FIRST_FLIGHT), tune=None, **given)).parts
     assert covariance.noise(parts).window_error == pytest.approx(3.3e-6, rel=0.2)

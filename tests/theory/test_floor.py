@@ -1,4 +1,4 @@
-"""The floor: closed forms, a brute-force estimator, the filter that attains it, and who says it."""
+"""The lower bound: closed forms, a batch least-squares estimator, a filter that attains it, and its display."""
 
 import dataclasses
 import math
@@ -18,11 +18,11 @@ from ptsmc_jax.theory.error_floor import Model
 from tests.helpers import chain_parts, parts, vector
 from tuning.output import run_report, summaries
 
-PERIOD = 0.125  # a power of two: t_f and the window lie on samples exactly
+PERIOD = 0.125  # a power of two, so that t_f and the ends of the window are exactly at samples
 
 
 def still(made):
-    """A history in which nothing moves, as long as the run of these parts; only what `estimation` reads."""
+    """A history at rest with the duration of the scenario; only the fields that `error_floor` reads have values."""
     periods = int(np.ceil(float(made.t_end) / PERIOD))
 
     def kept(v):
@@ -36,7 +36,7 @@ def still(made):
 
 
 def flown_at(made, **changes):
-    """The parts on the flight clock, with other devices."""
+    """The parts with the flight clock and changed devices."""
     return dataclasses.replace(made, clock=clock.flight(PERIOD, float(made.t_end)), **changes)
 
 
@@ -45,11 +45,18 @@ def delayed(periods):
 
 
 def by_least_squares(move, push, rows, noise, prior, output, delay):
-    """Variances (periods, outputs) by conditioning on all samples at once.
+    """Variances (periods, outputs) by least squares over all samples at once.
 
-    z_{k+1} = move z_k + push v_k, v_k standard normal; samples rows z_k, those of all periods or of each, with noise
-    (periods, m), infinite where there is none; prior: information (n, n) on z_0; output: rows of (z_k, v_k) that are
-    asked for, (outputs, n + v).
+    The model is z_{k+1} = move z_k + push v_k with standard normal v_k.
+
+    Args:
+        move: transition matrix (n, n).
+        push: effect of v_k (n, v).
+        rows: measurement matrix (m, n), or (periods, m, n).
+        noise: 1 sigma of the samples (periods, m); infinite for a missing sample.
+        prior: information matrix (n, n) of z_0.
+        output: rows of the outputs by (z_k, v_k), (outputs, n + v).
+        delay: number of newest samples that are not used.
     """
     periods, n, v = len(noise), len(move), push.shape[1]
     rows = np.broadcast_to(rows, (periods, noise.shape[1], n))
@@ -58,7 +65,7 @@ def by_least_squares(move, push, rows, noise, prior, output, delay):
     for k in range(periods - 1):
         drawn = np.eye(v, total, n + v * k)
         state.append(move @ state[k] + push @ drawn)
-    scale = np.concatenate([np.min(noise[np.isfinite(noise)]) * np.ones(n), np.ones(v * periods)])  # well conditioned
+    scale = np.concatenate([np.min(noise[np.isfinite(noise)]) * np.ones(n), np.ones(v * periods)])  # for conditioning
     start = np.zeros((total, total))
     start[:n, :n] = prior
     start[n:, n:] = np.eye(v * periods)
@@ -76,14 +83,14 @@ def by_least_squares(move, push, rows, noise, prior, output, delay):
 
 
 def pooled_in_window(made, squares):
-    """RMS over the window of squares at the start, the middle and the end of each period (periods, 3), by Simpson."""
+    """RMS over the window, by Simpson's rule, of squares at start, middle and end of each period (periods, 3)."""
     t_f, window = float(made.controller.t_f), float(made.window)
     inside = slice(round(t_f / PERIOD), round((t_f + window) / PERIOD))
     return np.sqrt(np.sum(squares[inside] @ np.array([1, 4, 1]) / 6) * PERIOD / window)
 
 
-def test_farrenkopfs_steady_state():
-    """His two states, attitude and the gyro's bias, by the closed form of theory (Markley and Reynolds, 2000)."""
+def test_deviations_attain_farrenkopfs_steady_state():
+    """The closed form for attitude and gyro bias is from Markley and Reynolds (2000)."""
     interval, star, gyro, walk = 0.25, 2e-5, 1e-5, 3e-6
     s_v, s_u = gyro * math.sqrt(interval) / star, walk * interval**1.5 / star
     g = math.sqrt(1 + s_v**2 / 4 + s_u**2 / 48)
@@ -93,7 +100,7 @@ def test_farrenkopfs_steady_state():
     grown = walk**2 * interval
     noise = np.array([[gyro**2 * interval + grown * interval**2 / 3, -grown * interval / 2],
                       [-grown * interval / 2, grown]])  # fmt: skip
-    periods = 2000  # the slower of both errors falls by e each 40
+    periods = 2000  # the slower error decays by a factor e in 40 periods
     moves, kicks = (
         np.tile(move, (periods, 1, 1)),
         np.tile(np.linalg.solve(move, np.linalg.cholesky(noise)), (periods, 1, 1)),
@@ -109,8 +116,8 @@ def test_farrenkopfs_steady_state():
 
 @pytest.mark.parametrize("order", [2, 3])
 @pytest.mark.parametrize("delay", [0, 2])
-def test_a_chain_as_by_a_brute_force_estimator(order, delay):
-    """Its motion under a held input is a polynomial, which RK4 and the metric's cubic follow exactly up to order 3."""
+def test_lower_bound_of_a_chain_equals_least_squares(order, delay):
+    """RK4 and the metric's cubic are exact up to order 3, because the motion under a held input is a polynomial."""
     made = chain_parts([0.5, -0.2, 0.1][:order], t_f=2.0, period=PERIOD, noise=[1e-3, 5e-2, 2e-4][:order])
     density = 3e-3
     made = flown_at(made, walk_rate=vector([density]), actuators=delayed(delay))
@@ -118,7 +125,7 @@ def test_a_chain_as_by_a_brute_force_estimator(order, delay):
     periods, n = len(found.t), order
 
     def motion(t):
-        """Transition by t of (x, walk)."""
+        """Transition matrix of (x, walk) over a time t."""
         a = np.diag(np.ones(n), 1)
         return expm(a * t)
 
@@ -129,13 +136,13 @@ def test_a_chain_as_by_a_brute_force_estimator(order, delay):
     noise = np.tile(np.asarray(made.sensors.sigma), (periods, 1))
     prior = np.diag([0.0] * n + [1e30])  # the walk starts at zero
     squares = by_least_squares(move, push, np.eye(n, n + 1), noise, prior, output, delay)
-    # 1e-9: the start is "unknown" by 1e5 sigma, which is 1e-10 of the variance after one sample
+    # 1e-9: the initial deviation of 1e5 sigma changes the variance after one sample by 1e-10
     np.testing.assert_allclose(found.error[delay:], np.sqrt(squares[delay:, 2]), rtol=1e-9)
     np.testing.assert_allclose(found.window_error, pooled_in_window(made, squares), rtol=1e-9)
 
 
-def test_samples_say_what_they_do_at_the_times_when_they_came():
-    """Of a chain whose samples are early or late: all of them at once, moved to the last one's time."""
+def test_lower_bound_uses_the_actual_sample_times():
+    """A chain has early and late samples. Least squares moves all samples to the time of the last one."""
     made = flown_at(chain_parts([0.5, -0.2], t_f=2.0, period=PERIOD, noise=[1e-3, 5e-3]))
     log = still(made)
     late = 0.4 * PERIOD * np.sin(7.0 * np.arange(len(log.t)))
@@ -154,13 +161,13 @@ def test_samples_say_what_they_do_at_the_times_when_they_came():
 AT_REST = {"q": [0.0, 0.0, 0.0, 1.0], "t_f": 3.0, "t_end": 5.0, "period": PERIOD}
 
 
-# of the filter: a star tracker by its own clock, one that is not due at the first sample, one that pauses; a wrong gyro
+# with a filter: own clock, first reading after the first sample, outage of the star tracker, gyro scale factor
 KINDS = ["raw", "bias", "filter", "own times", "later", "outage", "scale"]
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_body_at_rest_as_by_a_brute_force_estimator(kind):
-    """Each axis on its own: angle, rate, the gyro's bias and its walk, the torque's walk."""
+def test_lower_bound_of_a_spacecraft_at_rest_equals_least_squares(kind):
+    """Each axis is independent, with angle, rate, gyro bias and torque as states."""
     star, gyro, bias, drift, every = 2e-5, 1e-6, 3e-6, 4e-7, 4
     walk = np.array([1e-5, 2e-5, 0.0])
     own: tuple[Any, Any] = vector(bias), vector(drift)
@@ -169,7 +176,7 @@ def test_a_body_at_rest_as_by_a_brute_force_estimator(kind):
     if kind == "raw":
         bias, drift, own = 0.0, 0.0, (None, None)
     if kind == "own times":
-        every, walk = 1, 1e3 * walk  # so large that it tells within a period
+        every, walk = 1, 1e3 * walk  # large enough to have an effect within a period
     sensor = sensors.Sensors(vector(star), vector(gyro), *own, None, every)
     if kind == "own times":
         sensor = dataclasses.replace(sensor, own_times=star_times.star_times(2.5 * PERIOD, PERIOD))
@@ -206,12 +213,12 @@ def test_a_body_at_rest_as_by_a_brute_force_estimator(kind):
             prior[np.ix_([0, 2], [0, 2])] += np.linalg.inv(root @ root.T)
         output = np.stack([expm(a * t)[0] / 2 for t in (0.0, PERIOD / 2, PERIOD)])
         squares += by_least_squares(move, move @ steps, rows, noise, prior, np.hstack([output, output @ steps]), 1)
-    np.testing.assert_allclose(found.error[1:], np.sqrt(squares[1:, 2]), rtol=1e-8)  # of numbers 1e10 apart
+    np.testing.assert_allclose(found.error[1:], np.sqrt(squares[1:, 2]), rtol=1e-8)  # numbers differ by 1e10
     np.testing.assert_allclose(found.window_error, pooled_in_window(made, squares), rtol=1e-8)
 
 
-def test_side_by_side_each_run_has_its_own_floor():
-    """Runs alike but for their noise, one that acts later, a longer one, and one without anything unknown."""
+def test_along_each_equals_separate_calls():
+    """The runs differ in noise, delay and duration, and one has no uncertainty."""
 
     def chain(t_f=2.0, noise: Any = (1e-3, 5e-2), delay=0):
         made = chain_parts([0.5, -0.2], t_f=t_f, period=PERIOD, noise=noise)
@@ -221,25 +228,25 @@ def test_side_by_side_each_run_has_its_own_floor():
     flown = [(made, still(made)) for made in runs]
     for (made, log), found in zip(flown, error_floor.along_each(flown), strict=True):
         alone = error_floor.along(made, log)
-        # QR of the same matrices, one after the other
+        # QR of the same matrices, batched or one after the other
         np.testing.assert_allclose(found.error, alone.error, rtol=1e-13)
         np.testing.assert_allclose(found.window_error, alone.window_error, rtol=1e-13)
         np.testing.assert_array_equal(found.t, alone.t)
     floors = [found.window_error for found in error_floor.along_each(flown)]
-    assert len(set(floors)) == 5  # of six, two of which are the same
+    assert len(set(floors)) == 5  # two of the six runs are equal
     assert floors[4] == 0.0
     assert error_floor.along_each([]) == []
 
 
-def test_a_state_that_is_measured_without_noise_is_known():
-    """With the rate known the position does not move: it is known as the mean of all samples."""
+def test_a_state_measured_without_noise_is_known():
+    """The rate is known to be zero, so that the best estimate of the position is the mean of all samples."""
     made = flown_at(chain_parts([1.0, 0.0], t_f=2.0, period=PERIOD, noise=[1e-3, 0.0]))
     found = error_floor.along(made, still(made))
     np.testing.assert_allclose(found.error, 1e-3 / np.sqrt(1.0 + np.arange(len(found.t))), rtol=1e-9)
 
 
-def test_without_noise_only_what_pushes_is_unknown():
-    """Every state is seen exactly: what a step of the walk does within a period is all that is left."""
+def test_without_noise_only_the_random_walk_is_unknown():
+    """All states are measured exactly. Only the effect of the walk's step within a period remains."""
     density = 0.2
     made = flown_at(chain_parts([1.0, 0.0], t_f=2.0, period=PERIOD), walk_rate=vector([density]))
     found = error_floor.along(made, still(made))
@@ -247,8 +254,8 @@ def test_without_noise_only_what_pushes_is_unknown():
 
 
 @pytest.mark.parametrize("delay", [0, 2])
-def test_where_positions_without_noise_tell_the_rate_there_is_no_floor(delay):
-    """From the second sample on, however noisy the rate is; 1e-14 of rounding would be told as a floor."""
+def test_lower_bound_is_zero_if_exact_positions_determine_the_rate(delay):
+    """It is zero from the second sample on for any noise of the rate. Rounding of 1e-14 must not appear as a bound."""
     made = flown_at(chain_parts([1.0, 0.0], t_f=2.0, period=PERIOD, noise=[0.0, 1e-3]), actuators=delayed(delay))
     found = error_floor.along(made, still(made))
     np.testing.assert_allclose(found.error[delay], (1 + delay) * PERIOD * 1e-3, rtol=1e-9)  # by its only sample
@@ -256,7 +263,7 @@ def test_where_positions_without_noise_tell_the_rate_there_is_no_floor(delay):
     assert found.window_error == 0.0
 
 
-def test_without_noise_there_is_no_floor():
+def test_lower_bound_is_zero_without_noise():
     continuous = parts(t_f=3.0)
     assert error_floor.along(continuous, still(continuous)).window_error == 0.0
     for noise in (None, [0.0, 0.0]):
@@ -266,8 +273,8 @@ def test_without_noise_there_is_no_floor():
         np.testing.assert_array_equal(found.error, 0.0)
 
 
-def test_momentum_stored_in_wheels_couples_the_axes():
-    """At rest with momentum h in the wheels the rate moves by J dw' = h x dw."""
+def test_wheel_momentum_couples_the_axes():
+    """At rest with wheel momentum h a small rate obeys J dw' = h x dw."""
     momentum = np.array([3.0, -2.0, 1.0])
     device = reaction_wheels.wheels(np.eye(3), momentum)
     calm = parts(**AT_REST, noise=(2e-5, 1e-6), disturbance=disturbances.Constant(jnp.zeros(3)))
@@ -275,14 +282,14 @@ def test_momentum_stored_in_wheels_couples_the_axes():
     ticks, log = error_floor._lasting(made, still(made))
     linear = error_floor._linear(made, log, ticks)
     coupled = np.asarray(made.plant.inertia_inverse) @ np.cross(momentum, np.eye(3)).T
-    # RK4: 0.3 rad/s over a period, 0.04^5 / 120
+    # the error of RK4 is 0.04^5 / 120 for 0.3 rad/s over a period
     np.testing.assert_allclose(linear.move[0][3:, 3:], expm(coupled * PERIOD), rtol=0, atol=1e-9)
 
 
-def test_a_filter_with_the_kalman_filters_gains_is_at_the_floor():
-    """A body pushed about so much that its motion tells nothing: what is left is the gyro, Farrenkopf's case.
+def test_a_filter_with_kalman_gains_attains_the_lower_bound():
+    """The random disturbance is so large that only the sensors determine the attitude, as in Farrenkopf's model.
 
-    The floor is 0.9 % below: his model has the gyro's mean over an interval, the floor each of its samples.
+    The bound is 0.9 % lower, because it uses each gyro sample and Farrenkopf's model uses the mean over an interval.
     """
     star, gyro, drift, every = 2e-5, 4e-5, 2e-6, 4
     interval, walk = PERIOD * every, drift * math.sqrt(PERIOD)
@@ -311,13 +318,13 @@ def test_a_filter_with_the_kalman_filters_gains_is_at_the_floor():
 
 @pytest.mark.parametrize("least", [None, 0.0])
 def test_run_without_a_lower_bound_has_no_ratio_to_it(least):
-    """Without noise, and if no run reaches its end."""
+    """The bound is 0 without noise, and None if no run reaches its end."""
     run = {"status": "ok", "reason": "", "bad_time": None, "window_error": 1e-5, "verdicts": {}, "cautions": []}
     report = run_report.of(summaries.run({**run, "floor": least}, "spacecraft"), "spacecraft")
     assert report.headline == "pointing error 4.13 arcsec: the run reached its end"
     assert report.lines == []
 
 
-def test_a_floor_is_shown_by_its_number_and_not_by_its_course():
+def test_repr_of_a_lower_bound_omits_its_arrays():
     course = np.arange(900.0)
     assert repr(error_floor.Floor(8e-7, course, course)) == "Floor(window_error=8e-07)"

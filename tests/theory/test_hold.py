@@ -1,4 +1,4 @@
-"""After the hand-over: runs of every order and both error laws against the closed form, and its slopes."""
+"""The hold phase: runs of every order and both error definitions against the closed form, and its derivatives."""
 
 from dataclasses import replace
 
@@ -17,18 +17,18 @@ from tests.helpers import FULL_INERTIA, chain_parts, fly, parts, short, vector
 QUIET = disturbances.Sinusoid(*[jnp.zeros(3)] * 4)
 AWAY = vector(0.4, -0.3, 0.2, np.sqrt(1 - 0.29))
 SPIN = references.Spin(vector(0.1, -0.2, 0.1, np.sqrt(1 - 0.06)), vector(0.02, -0.05, 0.03))
-# c, and the rate toward the surface: slower, the same (the root repeats), faster
+# surface rate c and reaching rate k: slower, equal (repeated root), faster
 RATES = [(0.3, 1.1), (1.0, 1.0), (1.0, 0.5), (2.5, 2.5), (2.5, 0.7)]
 GRID = (4000, 800)
 
 
 def flown(law, c, k):
-    """A run without disturbance or switching from 2 s before t_f = 10 s, where much is left to do; one program."""
+    """A run without disturbance or switching, whose hand-over 2 s before t_f = 10 s leaves a large error."""
     t_end = 12.0
     grid = clock.Graded(vector(t_end), vector(1.0), vector(1.5 * 10.0 / GRID[0]), jnp.zeros(0), *GRID)
     if isinstance(law, int):
         run = chain_parts([1.0, -0.5, 0.3][:law], 10.0, law + 1.0, 2.0, k1=k, surface_rate=c)
-    else:  # K1/2 is what acts; as `finer` runs have them: by one program with those of laws/test_controllers.py
+    else:  # the reaching rate is K1/2; the grid is that of laws/test_controllers.py, to share its compiled program
         grid = replace(grid, before=1024, after=1024, max_step=vector(1.5 * 10.0 / 1024))
         run = parts(10.0, 3.0, 2.0, inertia=FULL_INERTIA, q=AWAY, reference=SPIN, disturbance=QUIET, rate_bound=0.0,
                     k1=2 * k, surface_rate=c, kinematics=law, t_end=t_end)  # fmt: skip
@@ -37,7 +37,7 @@ def flown(law, c, k):
 
 @jax.jit
 def exact(run, t):
-    """Error and s of the closed forms, before the hand-over and on from there."""
+    """Error, s and acceleration of the closed forms at times t in the hold phase."""
     law = run.controller
 
     def component(x0):
@@ -58,8 +58,8 @@ LAWS = {
 
 @pytest.mark.parametrize(("c", "k"), short(RATES, RATES[:1]))
 @pytest.mark.parametrize("law", short(LAWS, list(LAWS)[1::2]))
-def test_runs_move_on_after_the_hand_over_as_the_closed_form_says(law, c, k):
-    """From t = 0 on in closed form. RK4 leaves below 1e-11: steps are a half of the default grid's or less."""
+def test_runs_follow_the_closed_form_in_the_hold_phase(law, c, k):
+    """The closed form begins at t = 0. The error of RK4 is below 1e-11, with half of the default step or less."""
     law = LAWS[law]
     run = flown(law, c, k)
     result = fly(run)
@@ -74,7 +74,7 @@ def test_runs_move_on_after_the_hand_over_as_the_closed_form_says(law, c, k):
 
 
 @pytest.mark.parametrize(("c", "k"), [*RATES, (1.0, 1.0 + 1e-9)])
-def test_order_two_by_hand(c, k):
+def test_order_two_equals_the_explicit_formula(c, k):
     t, x, x_dot = np.array([0.0, 0.3, 2.0, 30.0]), 0.7, -1.9
     s = x_dot + c * x
     between = t * np.exp(-c * t) if abs(c - k) < 1e-6 else (np.exp(-k * t) - np.exp(-c * t)) / (c - k)
@@ -87,7 +87,7 @@ def test_order_two_by_hand(c, k):
         )
 
 
-def test_surface_of_a_chain_at_another_rate_has_its_poles_times_that():
+def test_surface_rate_scales_the_surface_poles_of_a_chain():
     a = [2.0, 3.0, 1.7]
     law = chain_parts([1.0] * 4, a=a, surface_rate=2.5).controller
     found = np.sort_complex(formulas.surface_roots(law.surface()))
@@ -96,8 +96,8 @@ def test_surface_of_a_chain_at_another_rate_has_its_poles_times_that():
     assert rates.hold_rates(law)["surface_rate"] == pytest.approx(np.abs(found).max())
 
 
-def test_slopes_along_the_surfaces_rate_are_those_of_the_closed_form():
-    """RMS of a chain's error over the window: also where the two rates are the same."""
+def test_gradient_by_the_surface_rate_equals_the_closed_form():
+    """The function is the RMS of a chain's error over the window, also with equal surface and reaching rates."""
     late = np.linspace(10.0, 11.0, 401)
 
     def expected(run, c):
@@ -113,15 +113,15 @@ def test_slopes_along_the_surfaces_rate_are_those_of_the_closed_form():
     for c, k in ((1.0, 1.0), (2.5, 0.7)):
         run, at, h = flown(2, c, k), vector(c), 1e-3
         forward = float(sloped(run, at)[1])
-        # the trapezoid is off by (1/400)^2 / 12 of a second derivative of some 10
+        # the error of the trapezium rule is (1/400)^2 / 12 times a second derivative of about 10
         np.testing.assert_allclose(forward, jax.jacfwd(expected, 1)(run, at), rtol=1e-5)
         two_back, back, ahead, two_ahead = (float(sloped(run, at + step * h)[0]) for step in (-2, -1, 1, 2))
         difference = (two_back - 8 * back + 8 * ahead - two_ahead) / (12 * h)
-        np.testing.assert_allclose(forward, difference, rtol=1e-8)  # h^4 and rounding 1e-15 / h beside a slope of 4e-4
+        np.testing.assert_allclose(forward, difference, rtol=1e-8)  # errors of order h^4 and 1e-15 / h
 
 
-def test_envelopes_after_the_hand_over_are_not_empty():
-    """Where nothing pushes they fall as the run does, some times what is flown: the sign of s is not made use of."""
+def test_hold_envelopes_are_within_a_factor_of_ten():
+    """Without a disturbance the envelopes decay like the run. They are larger, because they ignore the sign of s."""
     run = flown(2, 2.5, 0.7)
     log = fly(run).log
     t = log.t[log.t >= 8.0]
@@ -133,8 +133,8 @@ def test_envelopes_after_the_hand_over_are_not_empty():
         assert 0.1 < ratio[-1] <= ratio.max() <= 1.0
 
 
-def test_the_envelope_of_s_goes_over_into_what_the_smooth_sign_leaves():
-    """At the rate 2 k in squares: from s at the hand-over to 0.2785 K width / k, half of each after ln 2 / (2 k)."""
+def test_squared_envelope_of_s_decays_to_the_residual_of_the_smooth_sign():
+    """The limit is 0.2785 K width / k. Half of the way is reached after ln 2 / (2 k)."""
     bound, width, k = 0.02, 0.1, 0.7
     run = chain_parts([1.0, -0.5], 10.0, 3.0, 2.0, k1=k, bound=bound, sign_width=width)
     first, half, last = hold.sliding_bound(run, 8.0 + np.array([0.0, np.log(2.0) / (2.0 * k), 1e3])) ** 2

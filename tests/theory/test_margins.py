@@ -1,4 +1,4 @@
-"""Margins against closed forms, an independent frequency response, central differences and the flown loop."""
+"""Margins against closed forms, an independent frequency response, finite differences and the simulated loop."""
 
 import itertools
 from dataclasses import replace
@@ -40,7 +40,7 @@ CHAIN = {
 
 
 def chain(**changes):
-    """A chain's parts, its loop in hold, and kp, kd of a = -kp x1 - kd x2."""
+    """A chain's parts, its loop in the hold phase, and kp, kd of a = -kp x1 - kd x2."""
     parts = scenario.study(scenario.replace(scenario.from_tables(CHAIN), **changes)).parts
     law = parts.controller
     reaching = float(law.k1) + float(parts.observer.error_bound().largest) / float(law.sign_width)
@@ -59,25 +59,25 @@ def opened(parts, hold=True):
 
 
 @pytest.mark.parametrize("m", [1, 3, 4])
-def test_the_loop_of_one_axis_is_the_ratio_of_determinants(m):
+def test_one_axis_loop_equals_a_ratio_of_determinants(m):
     parts = np.random.default_rng(m).normal(size=(2, 5, m, m))
     L = parts[0] + 1j * parts[1]
     rest = np.eye(m) + L
     expected = [
         [np.linalg.det(r) / np.linalg.det(np.delete(np.delete(r, k, 0), k, 1)) - 1.0 for k in range(m)] for r in rest
     ]
-    # m eliminations, none of whose pivots is below 0.15
+    # rounding errors of m eliminations, whose pivots are at least 0.15
     np.testing.assert_allclose(crossings.each_axis(jnp.asarray(L)), expected, rtol=1e-11)
 
 
-def test_the_grid_has_points_at_a_resonance_that_only_an_open_axis_shows():
-    """Two oscillators that their feedback damps: with its axis open each swings as if there were none."""
+def test_grid_includes_resonances_of_loops_with_an_open_axis():
+    """Feedback damps two oscillators. If an axis is open, its oscillator is undamped."""
     size, h = 1.0 - 1e-5, 0.1
     turns = [size * np.array([[np.cos(at), -np.sin(at)], [np.sin(at), np.cos(at)]]) for at in (0.7, 1.3)]
     a, b = np.kron([[1.0, 0.0], [0.0, 0.0]], turns[0]) + np.kron([[0.0, 0.0], [0.0, 1.0]], turns[1]), np.eye(4)[:, ::2]
     opening = linear.Opening(jnp.asarray(a), jnp.asarray(b), jnp.asarray(-0.3 * b.T))
     w = np.asarray(crossings.grid(crossings.poles_of(opening), h))
-    for at in (0.7, 1.3):  # of `AROUND`, the nearest is 0.3 of the damping away, 1e-5 rad a period
+    for at in (0.7, 1.3):  # the nearest offset in `AROUND` is 0.3 times the damping of 1e-5 rad per period
         assert np.abs(w * h - at).min() < 0.4e-5
 
 
@@ -85,8 +85,8 @@ GAINS = [(1.0, 0.05, 1.0, 0), (6.0, 0.02, 1.0, 0), (3.0, 0.05, 2.0, 1), (2.0, 0.
 
 
 @pytest.mark.parametrize(("k1", "period", "rate", "delay"), short(GAINS, GAINS[:3]))
-def test_margins_are_those_of_an_independent_transfer_function(k1, period, rate, delay):
-    """kp x + kd x' around SciPy's zero-order hold of 1/s^2, its crossings found by bisection."""
+def test_margins_equal_those_of_an_independent_transfer_function(k1, period, rate, delay):
+    """SciPy discretises 1/s^2 with a zero-order hold and feedback kp x + kd x'; a bracketing solver finds crossings."""
     changes = {"controller__k1": k1, "loop__period": period, "controller__surface_rate": rate}
     _, loop, (kp, kd) = chain(**changes, hardware={"delay": delay, "state_noise": [1e-6, 1e-6]})
     found = of(loop)
@@ -118,13 +118,13 @@ def test_margins_are_those_of_an_independent_transfer_function(k1, period, rate,
     )
     np.testing.assert_allclose(found.modulus, -20 * np.log10(peak.fun), atol=1e-8)
     assert np.isinf(found.gain_down)  # a double integrator is stable with any small gain
-    late = float(found.delay[0]) / period  # `borders` has the delayed hold by hand
+    late = float(found.delay[0]) / period  # `borders` models delayed commands independently
     for share, stable in ((1 - 1e-7, True), (1 + 1e-7, False)):
         assert (borders.radius(kp, kd, period, delay + share * late) < 1.0) == stable
 
 
 def test_gain_margin_of_a_sampled_double_integrator():
-    """A pole comes to -1 at k kd h = 2."""
+    """A pole reaches -1 at k kd h = 2."""
     _, loop, (_, kd) = chain(hardware={"delay": 0, "state_noise": [1e-6, 1e-6]})
     found, factor = of(loop), 2.0 / (kd * 0.05)
     np.testing.assert_allclose(10 ** (found.gain_up / 20), factor, rtol=1e-10)
@@ -135,8 +135,8 @@ def test_gain_margin_of_a_sampled_double_integrator():
     assert lost.delay == 0.0
 
 
-def test_slopes_of_margins_are_those_of_central_differences():
-    """Along all numbers of a loop, its period too; of a chain's gains see below."""
+def test_margin_derivatives_equal_finite_differences():
+    """The directions change all numbers of a loop, including its period. The next test has the gains of a chain."""
     loop = larger(replace(held(*INTEGRATORS, 0.2), delay=1), *LATE_ROOM)
     rng = np.random.default_rng(5)
     ways = [jax.tree.map(lambda v: v * rng.normal(size=np.shape(v)), loop) for _ in range(3)]
@@ -150,8 +150,8 @@ def test_slopes_of_margins_are_those_of_central_differences():
         np.testing.assert_allclose(exact, numeric, rtol=1e-6, atol=1e-9 * np.abs(exact).max())
 
 
-@pytest.mark.long  # of a loop by hand above, of a scenario's gains campaigns/test_margin_requirements.py
-def test_slopes_of_a_chains_margins_are_those_of_central_differences():
+@pytest.mark.long  # short tests: the loop above, and scenario gains in campaigns/test_margin_requirements.py
+def test_margin_derivatives_of_a_chain_equal_finite_differences():
     parts, _, _ = chain(hardware={"delay": 1, "state_noise": [1e-6, 1e-6]})
     run = linear.nominal_jit(parts)
     index = jnp.asarray(linear.full_periods(parts, run, hold=True)[-1])
@@ -176,9 +176,12 @@ def test_slopes_of_a_chains_margins_are_those_of_central_differences():
 
 
 def flown(parts, run, index, gain, late):
-    """Growth a period of a small deviation from the nominal run, its time frozen: axes with other gains and delays."""
+    """Growth rate per period of a small deviation from the nominal run, with changed gains and delays.
+
+    The simulation repeats one period of the nominal run, so that the gains are frozen.
+    """
     sizes = np.asarray(_flown(linear.quiet(parts), run, *map(jnp.asarray, (index, gain, late))))
-    beyond = np.flatnonzero((sizes > np.log(1e-3)) | (sizes < np.log(1e-8)))  # no small one any more, or rounding
+    beyond = np.flatnonzero((sizes > np.log(1e-3)) | (sizes < np.log(1e-8)))  # nonlinear, or rounding
     last = beyond[0] if beyond.size else sizes.size
     second = sizes[last // 2 : last]
     return np.polyfit(np.arange(second.size), second, 1)[0]
@@ -198,7 +201,7 @@ def _flown(parts, run, index, gain, late):
         decision, computer, model = linear._computed(parts, k2, period, carry, carry.x)
         sent = jnp.concatenate([(gain * decision.u)[None], sent[:-1]])
         whole = jnp.floor(late).astype(int)
-        part = jnp.max(late - whole)  # one axis is late
+        part = jnp.max(late - whole)  # only one axis is delayed
         new = sent[whole + delay, axes]
         old = jnp.where(late > 0.0, sent[whole + delay + 1, axes], new)
         spans = [(old, now.t, part * dt), (new, now.t + part * dt, (1.0 - part) * dt)]
@@ -251,8 +254,8 @@ KINDS[SLOW] = ALL_AT_ONCE
 
 
 @pytest.mark.parametrize("kind", short(KINDS, [SLOW]))
-def test_the_nominal_run_is_the_one_that_flies(kind):
-    """The flight computer with a model of its own of the actuators flies as the one that is told what they did."""
+def test_nominal_run_equals_the_simulated_run(kind):
+    """`linear.nominal` and `rollout.simulate` give the same states without noise and disturbance."""
     law = {"controller": {"t_f": 10.0, "delta": 0.5}}
     parts = scenario.study(scenario.from_tables({**KINDS[kind], **law})).parts
     log = fly(linear.quiet(parts)).log
@@ -269,8 +272,8 @@ TURNING = {
 }
 
 
-def test_a_run_beside_the_nominal_one_is_off_by_what_the_loops_say():
-    """All that two nominal runs carry, and commands on their way, from sample to sample, through the hand-over."""
+def test_loops_predict_the_deviation_of_a_neighbouring_run():
+    """The deviation includes the complete state and the delayed commands, at every sample around the hand-over."""
     parts = scenario.study(scenario.from_tables(TURNING)).parts
     aside = parts.plant.retract(parts.initial, 1e-7 * jnp.asarray([1.0, -2.0, 1.5, 0.3, 0.2, -0.4]))
     run, other = (linear.nominal_jit(replace(parts, initial=x)) for x in (parts.initial, aside))
@@ -289,16 +292,16 @@ def test_a_run_beside_the_nominal_one_is_off_by_what_the_loops_say():
     closed = np.stack([linear.at_input(loop, xp=np).closed() for loop in each])
     wrong = between[1:] - np.einsum("jkl,jl->jk", closed, between[:-1])
     assert np.all(np.abs(wrong) < 1e-5 * np.abs(between).max(axis=0) + 1e-14)  # rounding
-    # a command acts with its old value until it comes, and with its new one from then on; integrated in other steps
+    # old and new command together act over the whole period; the integration steps differ
     wrong, whole = loops.new + loops.old - loops.new[:, :1], np.abs(loops.new[:, 0]).max(axis=(0, 2))
-    assert np.all(np.abs(wrong).max(axis=(0, 1, 3)) <= 1e-3 * whole + 1e-10)  # stored momentum's rounding
+    assert np.all(np.abs(wrong).max(axis=(0, 1, 3)) <= 1e-3 * whole + 1e-10)  # rounding of stored momentum
     assert np.abs(loops.new[:, -1]).max() < 1e-12
 
 
-@pytest.mark.long  # what loops are of: above; what margins are of a loop: each kind of them by poles
+@pytest.mark.long  # short tests: loops above, margins of a loop by poles below
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != SLOW])
-def test_the_flown_loop_loses_stability_where_the_margins_say(kind):
-    """Two scenarios of each kind: 1 % on either side of a margin in gain, up and down, and in delay, one axis."""
+def test_simulated_loop_loses_stability_at_its_margins(kind):
+    """Simulate two scenarios of each kind 1 % below and above the gain margins and the delay margin of one axis."""
     checked = 0
     for _ in range(2):
         law = {"t_f": 10.0, "delta": 0.5, "k1": float(RNG.uniform(1.0, 8.0)), "sign_width": 0.05}
@@ -322,34 +325,34 @@ def test_the_flown_loop_loses_stability_where_the_margins_say(kind):
                     continue
                 gain = np.where(only, share * border, 1.0)
                 expected = np.log(linear.radius(loop, np.diag(gain)))
-                if abs(expected) * 3000 > 1.0:  # slower than that: another kind of flight
+                if abs(expected) * 3000 > 1.0:  # slower growth would not show in the simulated time
                     growth = flown(parts, run, index, gain, np.zeros(m))
                     assert (growth > 0.0) == ((share > 1) == (way > 0)), (name, share, growth, expected)
                     checked += 1
         for share in (0.99, 1.01):
             late = np.where(only, share * found.delay[axis] / float(loop.period), 0.0)
             growth = flown(parts, run, index, np.ones(m), late)
-            # stored momentum stays as it is where all else decays
+            # stored momentum is constant when everything else decays
             assert (growth > margins.NEUTRAL) == (share > 1), ("delay", share, growth)
             checked += 1
     assert checked >= 4
 
 
-# of 1 600 drawn ones these, at which slips of the search for the delay show
+# seeds, out of 1 600, whose loops reveal errors in the search for the delay margin
 LATE = (1047, 1082, 1169, 1217, 1233, 1236, 2157, 2391)
-# at whose borders a pole comes to -1, where |L| is 1 at no frequency before (1065, 1080, 1122), or another one (1111)
+# seeds whose pole reaches -1 at the delay margin, far from any crossing |L| = 1 without the delay
 AT_NYQUIST = (1065, 1080, 1111, 1122)
 
 
 @jax.jit
 def closed_at_both(loop):
-    """The closed loop as it was opened at the sensors, and at the input."""
+    """Transition matrices after closing the loop that was opened at the sensors, and at the input."""
     return linear.at_sensors(loop).closed(), linear.at_input(loop).closed()
 
 
 @pytest.mark.parametrize("delay", [0, 1, 2, 3])
-def test_any_loop_closes_to_the_same_wherever_it_is_opened(delay):
-    """Whatever its matrices and however many commands are on their way."""
+def test_closed_loop_is_the_same_for_both_openings(delay):
+    """The loop has random matrices and `delay` delayed commands."""
     rng, (n, k, m) = np.random.default_rng(delay), (5, 3, 2)
     shapes = (n, n), (n, k), (m, n), (m, k), (1, n, m)
     a, seen, command, direct, push = (jnp.asarray(rng.normal(size=shape)) for shape in shapes)
@@ -360,7 +363,7 @@ def test_any_loop_closes_to_the_same_wherever_it_is_opened(delay):
 
 
 def alone_as_together(loop):
-    """Checks that one input is all of them at once."""
+    """Check that margins of one axis and of all axes at once are equal for a loop with one input."""
     found, at_once = of(loop), margins.together(loop)
     for name in ("gain_up", "gain_down", "phase", "delay"):
         assert 0.0 < at_once[name] < np.inf
@@ -368,17 +371,17 @@ def alone_as_together(loop):
     np.testing.assert_allclose(at_once["modulus"], found.modulus[0], atol=1e-3)  # on the grid
 
 
-def test_one_input_is_all_of_them_at_once():
-    """Of three integrators, which less gain makes unstable too; by poles, see below."""
+def test_margins_of_one_input_equal_margins_of_all_at_once():
+    """Three integrators also become unstable with less gain."""
     alone_as_together(held(*INTEGRATORS, 0.5))
 
 
-@pytest.mark.long  # the same of a loop by hand above
+@pytest.mark.long  # short test: the loop above
 @pytest.mark.parametrize("delay", [0, 1])
-def test_one_input_of_a_chain_is_all_of_them_at_once_and_the_closed_loop_is_the_same_wherever_it_is_opened(delay):
-    """Of three integrators, which less gain makes unstable too; by poles, where one may be 1e-6 outside of the circle.
+def test_margins_of_a_chain_equal_margins_of_all_inputs_and_both_openings_agree(delay):
+    """Three integrators also become unstable with less gain. Poles have a tolerance of 1e-6 around the unit circle.
 
-    A margin's border moves by about that over the slope of the pole's modulus, of the order 0.1 here: 1e-5 of it.
+    The derivative of a pole's modulus is about 0.1, so that this tolerance changes a margin by about 1e-5.
     """
     plant = {"kind": "chain", "order": 3}
     parts = scenario.study(
@@ -393,7 +396,7 @@ def test_one_input_of_a_chain_is_all_of_them_at_once_and_the_closed_loop_is_the_
 
 
 def held_by_each_sensor(loop):
-    """Checks that the poles leave the circle where the phase margin of each sensor says."""
+    """Check that a pole leaves the unit circle at the phase margin of each sensor."""
     opening = jax.tree.map(np.asarray, linear.at_sensors(loop))
     size = loop.seen.shape[1]
     assert np.abs(np.linalg.eigvals(opening.closed())).max() < 1.0
@@ -408,14 +411,14 @@ def held_by_each_sensor(loop):
         assert radius(sensor, 0.9999 * phase) < 1.0 < radius(sensor, 1.0001 * phase)
 
 
-def test_each_sensor_has_its_own_phase_margin_where_the_loop_of_all_is_steep():
-    """Five integrators: at low frequencies rounding of the loop of all their sensors told 0.1 deg of one."""
+def test_phase_margin_of_each_sensor_is_accurate_for_five_integrators():
+    """The loop of all sensors is so large at low frequencies that its rounding once gave a wrong margin of 0.1 deg."""
     poles = -np.array([0.6, 0.6, 0.6, 0.6, 1.0])
     held_by_each_sensor(held(np.eye(5, k=1), np.eye(5)[:, 4:], -np.poly(poles)[None, :0:-1], 0.05, sensors=True))
 
 
-@pytest.mark.long  # the same of a loop by hand above
-def test_each_sensor_of_a_chain_has_its_own_phase_margin():
+@pytest.mark.long  # short test: the loop above
+def test_phase_margin_of_each_sensor_is_accurate_for_a_chain():
     tables = {
         "plant": {"kind": "chain", "x0": [1.0, 0.0, 0.0, 0.0, 0.0]},
         "controller": {"t_f": 7.0, "eta": 6.0, "delta": 1.0, "k1": 1.0, "surface_rate": 0.6, "sampling": "implicit"},
@@ -429,7 +432,7 @@ def test_each_sensor_of_a_chain_has_its_own_phase_margin():
 
 
 def bears_delays_below_its_margin(loop, most=1.0):
-    """Checks by poles that a loop of NumPy's arrays does; most: their largest modulus."""
+    """Check by poles that a loop in NumPy is stable for delays below its margin; most: largest allowed modulus."""
     for axis, border in enumerate(np.asarray(of(loop).delay) / loop.period):
         for share in np.append(np.arange(0.02, 1.0, 0.02), 0.9999):
             assert radius_late(loop, axis, share * min(border, 12.0)) < most, (axis, border, share)
@@ -437,22 +440,22 @@ def bears_delays_below_its_margin(loop, most=1.0):
 
 
 @pytest.mark.parametrize("seed", [*LATE, *AT_NYQUIST])
-def test_a_loop_bears_all_delays_below_its_margin(seed):
-    """Of loops where it hangs on which crossings are looked at, and on how far they are looked for."""
+def test_selected_loops_are_stable_for_all_delays_below_the_margin(seed):
+    """The delay margins of these loops depend on the choice of crossings and on the range of the search."""
     bears_delays_below_its_margin(jax.tree.map(np.asarray, drawn_loop(seed)))
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("seed", range(3000, 3200))
-def test_any_stable_loop_bears_all_delays_below_its_margin(seed):
-    """But for those between two steps of a sixteenth of a period, with which a pole hardly leaves the circle."""
+def test_random_loops_are_stable_for_all_delays_below_the_margin(seed):
+    """A pole may leave the circle slightly between two steps of the search, which are a sixteenth of a period."""
     loop = jax.tree.map(np.asarray, drawn_loop(seed))
     if radius_late(loop, 0, 0.0) < 1.0:
         bears_delays_below_its_margin(loop, most=1.001)
 
 
-def test_zeros_are_found_near_where_they_are():
-    """Of lines in rows and points with a zero in between, and of one that is real at the last point."""
+def test_zeros_of_linear_functions_are_found_exactly():
+    """One function has a zero inside a cell. Another one is real at the last point and has a zero there."""
     row, point = np.meshgrid(np.arange(7.0), np.arange(9.0), indexing="ij")
 
     def at(k, j):
@@ -470,9 +473,9 @@ def test_zeros_are_found_near_where_they_are():
     np.testing.assert_allclose((rows[0], points[0]), (2.4, 8.0), rtol=1e-12)
 
 
-@pytest.mark.long  # this and those below: the same of drawn loops above
-def test_the_delay_is_the_least_at_which_any_crossing_comes_to_its_border():
-    """Behind a notch, where the crossing of the least estimate has its border at twice the delay of another's."""
+@pytest.mark.long  # short tests of this test and the following ones: the random loops above
+def test_delay_margin_is_the_smallest_over_all_crossings():
+    """With a notch, the crossing of the smallest estimate has twice the delay margin of another crossing."""
     tables = {
         "spacecraft": {"inertia": [5.2, 4.3, 5.5]},
         "initial": {"rotvec_deg": [8.0, 2.0, -9.0], "rate": [-0.018, -0.016, -0.029]},
@@ -486,7 +489,7 @@ def test_the_delay_is_the_least_at_which_any_crossing_comes_to_its_border():
     of_a = crossings.triangle(loop.closed_at_sensors()[0])
 
     def border(start):
-        """The delay [periods] at which Newton's search ends, infinite where it ends nowhere."""
+        """The delay [periods] to which Newton's method converges, or infinity."""
         step = jax.jit(lambda x: margins._delay_step(loop, of_a, jnp.int32(1), x))
         x = jax.lax.fori_loop(0, 30, lambda _, x: x - step(x), start)
         good = jnp.all(jnp.abs(step(x)) < 1e-9) & (x[1] > 0.0) & (jnp.exp(x[0]) * loop.period < jnp.pi)
@@ -499,10 +502,10 @@ def test_the_delay_is_the_least_at_which_any_crossing_comes_to_its_border():
 
 @pytest.mark.long
 @pytest.mark.parametrize("frequency", [7.08, 6.9])
-def test_a_flexible_body_bears_all_delays_below_its_margin(frequency):
-    """Of a mode that is sampled a few times a turn: over a part of a period its crossing moves far from its estimate.
+def test_a_flexible_body_is_stable_for_all_delays_below_its_margin(frequency):
+    """The mode has only a few samples per oscillation, so that the first estimate of the delay is poor.
 
-    Newton's search from there ended at another border, at twice the delay.
+    A Newton search from this estimate converged to another stability limit, at twice the delay.
     """
     tables = {
         "spacecraft": {"inertia": [[1.24, 0.107, 0.038], [0.107, 1.41, 0.076], [0.038, 0.076, 1.24]]},
@@ -522,8 +525,8 @@ def test_a_flexible_body_bears_all_delays_below_its_margin(frequency):
 
 
 @pytest.mark.long
-def test_a_border_that_moves_by_more_than_a_step_is_not_passed_over():
-    """Of a plant whose command is late by two periods: looked at one step before, its border is farther than a step."""
+def test_delay_search_does_not_skip_a_moving_stability_limit():
+    """The command of this plant has a delay of two periods. Its limit moves by more than a step of the search."""
     plant = second_order.system(
         1,
         F=lambda t, x_1, x_2: x_2 + 0.1 * jnp.sin(x_1),
@@ -553,8 +556,8 @@ def test_a_border_that_moves_by_more_than_a_step_is_not_passed_over():
     assert radius_late(loop, 0, 2.0 + 1.0001 * border) > 1.0
 
 
-def test_a_delay_is_found_where_the_loop_crosses_next_to_the_nyquist_frequency():
-    """Of three integrators, as a law of that order holds them; by poles, see below."""
+def test_delay_margin_is_found_for_a_crossing_near_the_nyquist_frequency():
+    """Three integrators with the gains of a third-order law; poles give the expected margin."""
     for k1, rate in ((1.97, 17.39), (4.514, 17.341)):
         reaching, surface = k1 + 1e-4, np.array([rate**2, 2.0 * rate, 1.0])
         gains = reaching * surface + np.append(0.0, surface[:2])
@@ -564,9 +567,9 @@ def test_a_delay_is_found_where_the_loop_crosses_next_to_the_nyquist_frequency()
         assert 0.01 < late < 0.02
 
 
-@pytest.mark.long  # the same of loops by hand above
-def test_a_delay_of_a_chain_is_found_where_the_loop_crosses_next_to_the_nyquist_frequency():
-    """By poles; Newton's search stepped beyond that frequency, or to the border of an advance, and found no number."""
+@pytest.mark.long  # short test: the loops above
+def test_delay_margin_of_a_chain_is_found_for_a_crossing_near_the_nyquist_frequency():
+    """Newton's method once left the frequency range, or converged to a negative delay. Poles give the margin."""
     found = []
     for k1, rate in ((1.97, 17.39), (4.514, 17.341)):
         _, loop, _ = chain(
@@ -579,7 +582,7 @@ def test_a_delay_of_a_chain_is_found_where_the_loop_crosses_next_to_the_nyquist_
 
 
 def sensitive_together(loop):
-    """Checks the largest sensitivity of all inputs against one on an even grid, and against those of each."""
+    """Check the peak sensitivity of all inputs on a uniform grid, and that no single input exceeds it."""
     opening = linear.at_input(loop)
     a, b, c = (np.asarray(v) for v in (opening.a, opening.b, opening.c))
     z = np.exp(1j * np.pi * np.linspace(1e-3, 1.0, 4000))
@@ -592,20 +595,20 @@ def sensitive_together(loop):
     assert found > of(loop).modulus.max() - 5e-3
 
 
-def test_the_sensitivity_of_all_inputs_at_once_is_the_largest_singular_value():
-    """Of (I + L)^-1; no axis alone has a larger one."""
+def test_peak_sensitivity_of_all_inputs_is_the_largest_singular_value():
+    """The matrix is (I + L)^-1. No axis alone has a larger peak."""
     sensitive_together(drawn_loop(LATE[0]))
 
 
-@pytest.mark.long  # the same of a loop by hand above
-def test_the_sensitivity_of_all_inputs_of_a_system_is_the_largest_singular_value():
+@pytest.mark.long  # short test: the loop above
+def test_peak_sensitivity_of_a_second_order_system_is_the_largest_singular_value():
     law = {"t_f": 10.0, "delta": 0.5, "k1": 3.0, "sign_width": 0.05}
     parts = scenario.study(scenario.from_tables({**COUPLED, "controller": law})).parts
     sensitive_together(opened(parts))
 
 
-def test_a_slow_star_tracker_is_judged_by_the_mean_over_its_interval():
-    """The loop between its samples is another one than at them."""
+def test_loop_of_a_slow_star_tracker_is_the_mean_over_its_interval():
+    """The loop at a star tracker sample differs from the loops between two samples."""
     every, law = 4, {"controller": {"t_f": 10.0, "delta": 0.5}}
     slow = KINDS[SLOW]
     parts = scenario.study(scenario.from_tables({**slow, **law})).parts
@@ -618,8 +621,8 @@ def test_a_slow_star_tracker_is_judged_by_the_mean_over_its_interval():
     assert np.ptp(each.a, axis=0).max() > 1e-6
 
 
-def test_the_mean_over_a_slow_star_trackers_interval_in_hold_has_no_loop_from_before_it():
-    """Also where the nominal run is nearer to its reference at the hand-over than after it, as may be by chance."""
+def test_mean_loop_of_the_hold_phase_excludes_the_approach_phase():
+    """This also holds if the error at the hand-over happens to be smaller than the error after it."""
     slow = KINDS[SLOW]
     parts = scenario.study(scenario.from_tables({**slow, "controller": {"t_f": 10.0, "delta": 0.5}})).parts
     run = linear.nominal_jit(parts)
@@ -633,8 +636,8 @@ def test_the_mean_over_a_slow_star_trackers_interval_in_hold_has_no_loop_from_be
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
-def test_a_runs_clearance_is_its_least_from_the_side_that_it_begins_on(side):
-    """q4, at which the paper's law is singular; its sign is that of a start that `align` has looked at."""
+def test_distance_to_the_singularity_is_the_smallest_signed_q4_of_a_run(side):
+    """The law is singular at q4 = 0. The sign is relative to the initial state after `align`."""
     slow = KINDS[SLOW]
     parts = scenario.study(scenario.from_tables({**slow, "controller": {"t_f": 10.0, "delta": 0.5}})).parts
     run = linear.nominal_jit(parts)
@@ -645,8 +648,8 @@ def test_a_runs_clearance_is_its_least_from_the_side_that_it_begins_on(side):
         np.testing.assert_allclose(run_margins._along(parts, there, 24)[2], q4, rtol=1e-12)
 
 
-def test_rounding_next_to_a_pole_at_one_is_no_crossing():
-    """Where L is as large as 1e9, beside the poles of stored momentum, its sign is noise: no gain brings it to -1."""
+def test_rounding_near_a_pole_at_one_is_not_a_crossing():
+    """Near the poles of stored momentum L is about 1e9, and rounding determines the sign of its imaginary part."""
     seen = jnp.asarray([-1e9 + 1e8j, -1e9 - 1e8j, 3.0 - 3.0j, -2.0 - 1.0j, -2.0 + 3.0j])
     there, factor = crossings.real_at(seen)
     assert there.tolist() == [False, False, False, True]
@@ -657,13 +660,13 @@ SWINGS = [
     (1.5, 0.1, [-0.5, 0.5, 0.3]),
     (0.9, 0.3, [-0.5, 0.0, 0.4]),
     (1.3, 0.2, [0.3, 0.0, 0.3]),
-    (1.1, -0.2, [0.4, 0.2, 0.4]),  # of one that is, next to it, 32.25 dB: L is 24 000 where it begins to be looked for
+    (1.1, -0.2, [0.4, 0.2, 0.4]),  # has a true crossing near the pole, at 32.25 dB, where |L| on the grid is 24 000
 ]
 
 
 @pytest.mark.parametrize(("at", "lag", "feedback"), SWINGS)
-def test_a_pole_on_the_unit_circle_is_no_crossing(at, lag, feedback):
-    """L turns by 180 degrees there through infinity: its sign changes, but no gain brings it to -1."""
+def test_a_pole_on_the_unit_circle_is_not_a_crossing(at, lag, feedback):
+    """L passes through infinity and its phase jumps by 180 deg. Its sign changes, but no gain makes it -1."""
     a = np.zeros((3, 3))
     a[:2, :2], a[2, 2] = [[np.cos(at), -np.sin(at)], [np.sin(at), np.cos(at)]], lag
     b, c = np.array([[1.0], [0.0], [1.0]]), np.asarray([feedback])
@@ -680,25 +683,25 @@ def test_a_pole_on_the_unit_circle_is_no_crossing(at, lag, feedback):
     assert np.isfinite(found.gain_up[0])
 
 
-def test_the_phase_of_an_open_loop_is_a_number_in_single_precision():
-    """Its L is zero, and what kept 0 / 0 away there was itself zero in 32 bits."""
+def test_sine_of_a_zero_loop_is_finite_in_single_precision():
+    """An earlier guard against 0 / 0 was itself zero in 32 bits."""
     with jax.enable_x64(False):
         np.testing.assert_array_equal(crossings.sine(jnp.asarray([0.0, 2j, -3.0], jnp.complex64)), [0.0, 1.0, 0.0])
 
 
-def test_a_slow_pole_comes_to_one_where_the_loop_is_real_at_rest_only():
-    """x' = (1 + e) x - c x bears a gain of e / c; at the lowest frequency of the grid L is 0.8 deg from real."""
+def test_gain_margin_is_found_at_zero_frequency_for_a_slow_pole():
+    """The stability limit of x' = (1 + e) x - c x is the gain e / c. L is 0.8 deg from real at the lowest frequency."""
     e, c = 2.2e-4, 0.033
-    a, at = np.diag([1.0 + e, 0.0, 0.0]), np.array([1.0, 0.0, 0.0])  # by the program of others here
+    a, at = np.diag([1.0 + e, 0.0, 0.0]), np.array([1.0, 0.0, 0.0])  # padded to share a compiled program
     found = of(a_loop(jnp.asarray(a), at, -c * at))
     np.testing.assert_allclose(found.gain_down, 20.0 * np.log10(c / e), rtol=1e-4)
 
 
-@pytest.mark.long  # rounding beside such poles: above; of a memory that stays, a pole at 1 too, a chain's margins
-def test_momentum_in_wheels_is_no_border_of_stability_while_the_body_turns():
-    """No gain changes it: its poles stay at 1, and gains are limited where other poles leave the circle.
+@pytest.mark.long  # short tests: rounding near such poles above, constant memories in the margins of a chain
+def test_wheel_momentum_does_not_limit_the_gain_margin_of_a_rotating_body():
+    """The poles of wheel momentum stay at 1 for any gain. The margin is the gain at which other poles leave the circle.
 
-    On the way as in hold, about a body that turns; by the poles of the loop with other gains of one axis.
+    The test checks the poles with changed gains of one axis, in the approach phase and in the hold phase.
     """
     parts = scenario.study(scenario.from_tables(TURNING)).parts
     run = linear.nominal_jit(parts)
@@ -708,7 +711,7 @@ def test_momentum_in_wheels_is_no_border_of_stability_while_the_body_turns():
         found = of(loop)
         assert found.stable.all()
         poles = np.linalg.eigvals(linear.at_input(loop, xp=np).closed())
-        assert np.sum(np.abs(poles - 1.0) < 1e-9) == 4  # each wheel's; of rounding of 1e-15, by the square root
+        assert np.sum(np.abs(poles - 1.0) < 1e-9) == 4  # one pole for each wheel
         for (way, borders_of), axis in itertools.product(((1, found.gain_up), (-1, found.gain_down)), range(3)):
             gains = (10 ** (way * share * borders_of[axis] / 20) for share in (0.2, 0.4, 0.6, 0.8, 0.99, 1.01))
             sizes = [linear.radius(loop, np.diag(np.where(np.arange(3) == axis, gain, 1.0))) for gain in gains]
@@ -717,8 +720,8 @@ def test_momentum_in_wheels_is_no_border_of_stability_while_the_body_turns():
 
 
 @pytest.mark.parametrize(("growth", "last"), [(1.1, 7), (0.9, 20), (3.0, 0)])
-def test_a_loop_that_grows_is_linearised_where_it_is_near_yet(growth, last):
-    """In hold from period to period by 1.1, up to twice as far off as at the hand-over: 7 periods later, not 8."""
+def test_a_diverging_loop_is_linearised_before_its_error_doubles(growth, last):
+    """With a growth of 1.1 per period the error is below twice its value at the hand-over for 7 periods, not for 8."""
     tables = {"plant": {"kind": "chain", "x0": [1.0, 0.0]}, "controller": {"t_f": 5.0, "delta": 0.5},
               "loop": {"mode": "sampled", "period": 0.1, "t_end": 6.65, "window": 1.0}}  # fmt: skip
     parts = scenario.study(scenario.from_tables(tables)).parts
@@ -734,8 +737,8 @@ def test_a_loop_that_grows_is_linearised_where_it_is_near_yet(growth, last):
 
 
 @pytest.mark.parametrize("delta", [0.5, 0.53])
-def test_the_loop_in_hold_does_not_hang_on_when_it_was_handed_over(delta):
-    """Also where the run ends with a whole period, from a sample that moves with delta to t_end, which does not."""
+def test_hold_loop_does_not_depend_on_delta(delta):
+    """This also holds if the last full period ends at t_end, which does not depend on delta."""
     tables = {"plant": {"kind": "chain"}, "controller": {"t_f": 5.0, "delta": delta}, "disturbance": {"kind": "none"},
               "loop": {"mode": "sampled", "period": 0.125, "t_end": 7.0, "window": 1.0}}  # fmt: skip
     parts = scenario.study(scenario.from_tables(tables)).parts
@@ -752,20 +755,20 @@ def test_the_loop_in_hold_does_not_hang_on_when_it_was_handed_over(delta):
 
 @pytest.mark.parametrize(("t_f", "delta", "period", "ends"), [
     (40.0, 2.0, 0.05, (2.0, 10.0)),  # from the hand-over to a quarter of t_f
-    (40.0, 0.2, 0.1, (1.0, 10.0)),  # ten periods: from one to the next gains change by a tenth
-    (40.0, 12.0, 0.1, (12.0, 12.0)),  # a hand-over before that quarter
+    (40.0, 0.2, 0.1, (1.0, 10.0)),  # from ten periods before t_f, where gains change by a tenth per period
+    (40.0, 12.0, 0.1, (12.0, 12.0)),  # delta exceeds a quarter of t_f
 ])  # fmt: skip
-def test_frozen_gains_are_judged_where_they_mean_something(t_f, delta, period, ends):
+def test_judged_times_are_between_hand_over_and_a_quarter_of_t_f(t_f, delta, period, ends):
     tables = {"plant": {"kind": "chain"}, "controller": {"t_f": t_f, "delta": delta}}
     made = scenario.from_tables({**tables, "loop": {"mode": "sampled", "period": period}})
     spread = np.geomspace(ends[0], ends[1], 4)
     np.testing.assert_allclose(run_margins.judged_times(scenario.study(made).parts), spread, rtol=1e-12)
 
 
-def test_lapack_is_given_one_matrix_at_a_time():
-    """Many it shares among XLA's threads, and waits in one of them: two at once stood still for ever (jaxlib 0.10).
+def test_lapack_receives_one_matrix_at_a_time():
+    """jaxlib 0.10 distributes batches over XLA's threads and waits in one of them. Two such calls deadlock.
 
-    What `lapack.vmap` takes over many is one at a time there alone.
+    `lapack.vmap` may batch matrices if the installed version cannot deadlock.
     """
     loop = replace(held(*INTEGRATORS, 0.5), delay=1)
     body = a_body(period=0.1)
@@ -782,4 +785,4 @@ def test_lapack_is_given_one_matrix_at_a_time():
         solved = [e for e in equations(trace.jaxpr) if e.primitive.name in lapack.COUNTED | lapack.SHARED]
         most = 2 if lapack.CAN_DEADLOCK or name != "at rest" else 3
         assert max(e.invars[0].aval.ndim for e in solved) <= most, name
-        assert ("eig" in {e.primitive.name for e in solved}) == (name != "at rest")  # it is looked at
+        assert ("eig" in {e.primitive.name for e in solved}) == (name != "at rest")  # the trace includes LAPACK calls

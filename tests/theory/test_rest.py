@@ -1,4 +1,4 @@
-"""Nominal runs that do not come to rest in hold: their closed form, and what must not be taken for them."""
+"""Limit cycles in the hold phase of nominal runs: their closed form, and motions that are not limit cycles."""
 
 import json
 from types import SimpleNamespace
@@ -12,7 +12,7 @@ from ptsmc_jax import scenario
 from ptsmc_jax.theory import linear, margins, rest
 from tests.helpers import short
 
-K, C, H = 0.02, 1.0, 0.05  # bound on the disturbance [1/s^2], slope of the surface [1/s], period [s]
+K, C, H = 0.02, 1.0, 0.05  # bound on the disturbance [1/s^2], surface rate [1/s], period [s]
 CHAIN = {
     "plant": {"kind": "chain", "order": 2},
     "controller": {"t_f": 4.0, "delta": 0.5, "disturbance_bound": K, "surface_rate": C, "k1": 1.0},
@@ -26,21 +26,22 @@ def swing(**changes):
 
 
 @pytest.mark.parametrize("k1", short([1.0, 4.0, 8.0], [1.0, 8.0]))
-def test_a_sign_that_is_too_narrow_swings_as_its_closed_form_says(k1):
-    """From s = a > 0 to -a in a period, a = h K / (2 - h K1), by s+ = s + h (c v + u), u = -c v - K1 s - K sign(s).
+def test_limit_cycle_of_a_narrow_sign_has_the_closed_form(k1):
+    """With s+ = s + h (c v + u) and u = -c v - K1 s - K sign(s), s alternates between a and -a.
 
-    The command swings by 2 (K + K1 a) every second period, but for a share of c h / 2 for what v does within one.
+    Here a = h K / (2 - h K1). The peak-to-peak command is 2 (K + K1 a), with a relative error of about c h / 2, because
+    v changes within a period.
     """
     found = swing(controller__k1=k1, controller__sign_width=1e-7)
     assert found is not None
     a = H * K / (2.0 - H * k1)
     np.testing.assert_allclose(found.size, 2.0 * (K + k1 * a), rtol=C * H)
-    assert found.periods == 2.0  # it turns at every sample between the first and the last
+    assert found.periods == 2.0  # the command reverses at every sample
 
 
 @pytest.mark.parametrize("delay", short([1, 3, 8], [8]))
-def test_a_slow_swing_is_told_from_peak_to_peak_too(delay):
-    """Its commands change from one sample to the next by much less than from one peak to the other."""
+def test_size_of_a_slow_limit_cycle_is_peak_to_peak(delay):
+    """The command changes between two samples by much less than from peak to peak."""
     delayed = {"controller__sign_width": 1e-7, "hardware__delay": delay}
     parts = scenario.study(scenario.replace(scenario.from_tables(CHAIN), **delayed)).parts
     seen = rest.history(parts, linear.nominal_jit(parts))
@@ -52,25 +53,25 @@ def test_a_slow_swing_is_told_from_peak_to_peak_too(delay):
 
 
 @pytest.mark.parametrize(("share", "swings"), [(0.5, True), (0.9, True), (1.2, False), (50.0, False)])
-def test_it_swings_from_the_width_on_at_which_the_layer_is_unstable(share, swings):
-    """The pole at 1 - h (K1 + K / width), but for c h, is at -1 where width = h K / (2 - h K1)."""
+def test_limit_cycle_begins_at_the_width_of_an_unstable_boundary_layer(share, swings):
+    """The pole 1 - h (K1 + K / width), neglecting c h, is -1 for width = h K / (2 - h K1)."""
     border = H * K / (2.0 - H)
     assert (swing(controller__sign_width=share * border) is not None) == swings
 
 
-def test_what_rings_as_slopes_say_is_none():
-    """K1 h = 1.98: s changes its sign in every period and loses 2 % of itself, in a layer wide enough to be linear."""
+def test_a_linear_oscillation_is_not_a_limit_cycle():
+    """With K1 h = 1.98 the sign of s alternates and |s| decays by 2 % per period, inside a wide boundary layer."""
     assert swing(controller__k1=1.98 / H, controller__sign_width=10.0) is None
 
 
-def test_an_exact_sign_is_judged_without_it_and_a_short_hold_is_not_judged():
+def test_no_limit_cycle_for_a_discontinuous_sign_or_a_short_hold_phase():
     assert swing(controller__sign_width=0.0) is None
     assert swing(controller__sign_width=1e-7, loop__t_end=4.2, loop__window=0.1) is None
 
 
 @pytest.mark.parametrize(("whole", "judged"), [(15, False), (16, True)])
-def test_a_hold_is_judged_from_sixteen_whole_periods_on(whole, judged):
-    """Of a run that swings all along: its history told as if only so many of its last periods were in hold."""
+def test_limit_cycle_detection_needs_sixteen_full_periods(whole, judged):
+    """The run has a limit cycle throughout. The test marks only the last periods as hold phase."""
     parts = scenario.study(scenario.replace(scenario.from_tables(CHAIN), controller__sign_width=1e-7)).parts
     seen = rest.history(parts, linear.nominal_jit(parts))
     in_hold = np.flatnonzero(seen.in_hold)
@@ -78,24 +79,24 @@ def test_a_hold_is_judged_from_sixteen_whole_periods_on(whole, judged):
     assert (rest.swing(parts, seen._replace(in_hold=told)) is not None) == judged
 
 
-def test_where_a_run_swings_none_is_left_but_of_loops_that_are_unstable_anyway():
+def test_none_left_sets_positive_margins_to_zero_and_keeps_negative_ones():
     stable = np.array([[True], [True], [False]])
     values: Any = {name: np.array([[3.0], [3.0], [-3.0]]) for name in margins.Margins._fields} | {"stable": stable}
     left = rest.none_left(margins.Margins(**values), [False, True, True])
     for name, of in left._asdict().items():
-        none = {"modulus": 100.0, "stable": False, "crossover": np.nan}.get(name, 0.0)  # as of an unstable loop's peak
+        none = {"modulus": 100.0, "stable": False, "crossover": np.nan}.get(name, 0.0)  # values of an unstable loop
         np.testing.assert_array_equal(of, [values[name][0], [none], values[name][2]], err_msg=name)
 
 
 REFERENCES = {
     "moving": {"reference": {"kind": "sinusoid", "amplitude": [0.3, 0.2, 0.1], "frequency": [0.5, 0.3, 0.2]}},
     "moving fast": {"reference": {"kind": "sinusoid", "amplitude": [0.03, 0.02, 0.01], "frequency": [3.0, 2.0, 2.5]}},
-    "quantised": {"hardware": {"torque_step": 2e-2}},  # larger than all that the law commands in hold
+    "quantised": {"hardware": {"torque_step": 2e-2}},  # larger than all commands in the hold phase
 }
 
 
 @pytest.mark.parametrize("kind", short(REFERENCES, ["moving fast", "quantised"]))
-def test_a_moving_reference_and_quantisation_are_none(kind):
+def test_a_moving_reference_or_quantisation_is_not_a_limit_cycle(kind):
     tables = {
         "controller": {"t_f": 10.0, "delta": 0.5, "eta": 3.0, "k1": 1.0, "surface_rate": 1.0, "sign_width": 1e-3},
         "observer": {"gain": [10.0] * 3},
@@ -120,8 +121,8 @@ class Relay(ptsmc.AccelerationLaw):
 """
 
 
-def test_a_law_without_a_width_of_its_sign_is_judged_as_others(monkeypatch):
-    """As one's own: of commands that turn at every sample, of which slopes explain a tenth or all."""
+def test_limit_cycle_of_a_law_without_sign_width_is_detected(monkeypatch):
+    """The command of a custom law reverses at every sample. The linearisation explains a tenth or all of it."""
     turning = np.where(np.arange(40) % 2, 0.5, -0.5)[:, None]
     law: Any = SimpleNamespace(controller=SimpleNamespace())
     run = SimpleNamespace(command=turning)
@@ -132,8 +133,8 @@ def test_a_law_without_a_width_of_its_sign_is_judged_as_others(monkeypatch):
         assert rest.swing(law, seen) == found
 
 
-@pytest.mark.long  # above, and of a chain in studies/test_stability.py
-def test_an_own_law_that_swings_has_no_margins_left(command, tmp_path):
+@pytest.mark.long  # short tests: above, and a chain in studies/test_stability.py
+def test_a_custom_law_with_a_limit_cycle_has_zero_margins(command, tmp_path):
     (tmp_path / "relay.py").write_text(OWN)
     (tmp_path / "relay.toml").write_text(
         'plant = { kind = "chain", order = 2 }\nobserver = { kind = "none" }\n'

@@ -1,4 +1,4 @@
-"""Linear theory of sensor suites: the lower bound beside a brute-force Kalman filter, the covariance beside trials."""
+"""Linear theory of sensor suites: lower bound against an independent Kalman filter, covariance against trials."""
 
 import dataclasses
 
@@ -18,9 +18,10 @@ from tests.theory.test_floor import AT_REST, PERIOD, delayed, flown_at, pooled_i
 
 
 def history(moments, walks):
-    """The state (angle, rate, bias, torque; each 3) as a function of (period, time in it), by the unknowns (12 + 6 N).
+    """Return a function of (period, time in it) with the derivatives of the state by all unknowns, (12, 12 + 6 N).
 
-    The unknowns are the state at t = 0, then in each period the drift of the bias and the step of the torque.
+    The state is angle, rate, bias and torque, 3 components each. The unknowns are the state at t = 0, and in each
+    period the drift of the bias and the step of the torque.
     """
     a = np.zeros((12, 12))
     a[0:3, 3:6], a[3:6, 9:12] = np.eye(3), np.diag(1.0 / moments)
@@ -46,7 +47,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_two_star_trackers_as_by_a_brute_force_kalman_filter(case):
+def test_lower_bound_with_two_star_trackers_equals_an_independent_kalman_filter(case):
     intervals, latencies = CASES[case]
     suite = suites.two_star_trackers(PERIOD, intervals, latencies)
     walk = np.array([1e-3, 2e-3, 0.0])
@@ -60,7 +61,7 @@ def test_two_star_trackers_as_by_a_brute_force_kalman_filter(case):
     sizes = np.concatenate([np.asarray(suite.bias_rate) * PERIOD, walk * PERIOD])
     p = np.zeros((12 + 6 * periods,) * 2, np.longdouble)
     p[np.ix_([0, 1, 2, 6, 7, 8], [0, 1, 2, 6, 7, 8])] = np.linalg.inv(known)
-    p[3:6, 3:6] = np.diag(np.full(3, 1.0))  # the rate: unknown beside the first sample of the gyro
+    p[3:6, 3:6] = np.diag(np.full(3, 1.0))  # the rate is practically unknown before the first gyro sample
     p[range(12, len(p)), range(12, len(p))] = np.tile(sizes**2, periods)
     squares = np.full((periods, 3), np.nan)
     axes = [Rotation.from_rotvec(v).as_matrix().T for v in suites.MOUNTINGS]
@@ -87,8 +88,8 @@ def test_two_star_trackers_as_by_a_brute_force_kalman_filter(case):
     np.testing.assert_allclose(found.window_error, pooled_in_window(made, squares), rtol=1e-9)
 
 
-def test_the_covariance_predicts_the_error_of_simulated_trials():
-    """From the target at rest: all of the error is due to noise. 400 trials, of a sampling error of 2 %."""
+def test_covariance_predicts_the_error_of_simulated_trials_with_a_suite():
+    """The run begins at rest on the target, so that noise causes the whole error. 400 trials determine it to 2 %."""
     made = parts(q=[0.0, 0.0, 0.0, 1.0], t_f=6.0, t_end=7.0, period=PERIOD, flight=True, delta=1.0, eta=4.0, gain=20.0,
                  sign_width=1e-2, disturbance=disturbances.Constant(jnp.zeros(3)))  # fmt: skip
     made = dataclasses.replace(made, sensors=suites.two_star_trackers(PERIOD, (2.0, 3.0), (1.0, 2.0)))

@@ -1,4 +1,4 @@
-"""What a mode that the law does not know does to the loop: linear theory."""
+"""Spillover: linear theory of a loop with a flexible mode that the law does not model."""
 
 from dataclasses import replace
 
@@ -11,7 +11,7 @@ from ptsmc_jax.simulation import rollout
 from ptsmc_jax.theory import covariance, linear, margins
 from tests.helpers import fly, roomy
 
-# one mode about x that a late loop of some bandwidth drives; no noise, no switching term, small angles: it is linear
+# a delayed loop excites one mode about x; without noise and switching term, and for small angles, the loop is linear
 SPILLS = {
     "flexible": {"frequency": [6.0], "damping": [0.02], "coupling": [[1.6, 0.0, 0.0]]},
     "controller": {
@@ -29,12 +29,12 @@ NOISY = {
     "hardware": {"attitude_noise": 1e-4, "rate_noise": 1e-4, "delay": 1},
     "disturbance": {"kind": "random_walk", "density": [3e-4] * 3},
 }
-CALM = {**SPILLS["controller"], "k1": 0.2, "surface_rate": 0.2}  # a bandwidth at which the mode is let alone
+CALM = {**SPILLS["controller"], "k1": 0.2, "surface_rate": 0.2}  # a bandwidth that does not excite the mode
 
 
 @pytest.fixture(autouse=True)
 def few_together(monkeypatch):
-    """Most loops here are opened in one period: the program is for few."""
+    """Compile the program for fewer periods, because most tests here linearise one period."""
     monkeypatch.setattr(linear, "TOGETHER", 8)
 
 
@@ -43,21 +43,21 @@ def parts_of(**changes):
 
 
 def in_theory(**changes):
-    """With noise, of which no loop knows, room for more periods and steps of all: by one program of each kind."""
+    """Parts with noise, which does not affect loops, and padded time grids, so that compiled programs are shared."""
     parts = parts_of(**NOISY, **changes)
     return replace(parts, clock=roomy(parts.clock), substeps=25)
 
 
 def in_hold(parts):
-    """The loop of the last period."""
+    """The linearised loop of the last full period in the hold phase."""
     run = linear.nominal_jit(parts)
     index = linear.full_periods(parts, run, hold=True)[-1:]
-    width = np.asarray(parts.controller.sign_width)[None]  # `late`, as of covariances: no command is late by a share
+    width = np.asarray(parts.controller.sign_width)[None]  # as in `covariance`, to share its compiled program
     opened = linear.opened_in(parts, run, index, width, late=False)
     return jax.tree.map(lambda v: np.asarray(v)[0], opened.loop)
 
 
-def test_margins_see_the_mode_and_sensors_see_the_body_alone():
+def test_margins_include_the_mode_and_sensors_see_only_the_body():
     loop = in_hold(in_theory(controller=CALM))
     assert loop.seen.shape[1] == 6
     assert jax.eval_shape(lambda loop: margins.of(loop, sensors=True), loop).gain_up.shape == (6,)
@@ -67,11 +67,11 @@ def test_margins_see_the_mode_and_sensors_see_the_body_alone():
 
     assert bears(0, 0.0)
     border = next(decibels for decibels in np.arange(0.0, 60.0, 0.1) if not bears(0, decibels))
-    assert all(bears(1, decibels) for decibels in np.arange(0.0, border + 3.0, 0.1))  # the mode rings about x
+    assert all(bears(1, decibels) for decibels in np.arange(0.0, border + 3.0, 0.1))  # the mode is about x
 
 
-def test_noise_and_random_walk_by_linear_covariance_are_those_of_flown_trials():
-    """Either of them is a good part of it, behind a delay."""
+def test_covariance_of_noise_and_random_walk_equals_simulated_trials():
+    """Noise and random walk both contribute considerably. The loop has a delay."""
     changes = {
         "controller": CALM,
         "loop": {"mode": "sampled", "period": 0.2, "t_end": 12.0, "window": 4.0},
@@ -84,18 +84,18 @@ def test_noise_and_random_walk_by_linear_covariance_are_those_of_flown_trials():
 
 
 def slowest_pair(y):
-    """Modulus of the pair of poles that a free oscillation y(k) ends in: y(k + 2) = 2 r cos(a) y(k + 1) - r^2 y(k)."""
+    """Modulus r of the dominant pole pair of an oscillation, from y(k + 2) = 2 r cos(a) y(k + 1) - r^2 y(k)."""
     return np.sqrt(-np.linalg.lstsq(np.stack([y[1:-1], y[:-2]], axis=1), y[2:])[0][1])
 
 
 @pytest.mark.parametrize(("damping", "grows"), [(0.02, True), (0.06, False)])
-def test_a_flown_mode_grows_or_decays_as_the_poles_of_its_loop_say(damping, grows):
-    """The last 70 periods of hold, in which faster motions are gone; the rigid design is stable either way."""
+def test_simulated_mode_grows_or_decays_like_the_dominant_poles(damping, grows):
+    """Only the last 70 periods count, after faster motions have decayed. The loop without the mode is stable."""
     stiff = {**SPILLS["flexible"], "coupling": [[1e-6, 0.0, 0.0]]}
     assert linear.radius(in_hold(in_theory(flexible=stiff))) < 1.0 + margins.NEUTRAL
     flexible = {**SPILLS["flexible"], "damping": [damping]}
     poles = np.abs(np.linalg.eigvals(linear.at_input(in_hold(in_theory(flexible=flexible)), 0.0, np).closed()))
-    radius = poles[np.abs(poles - 1.0) > margins.NEUTRAL].max()  # without an observer a memory stays as it is
+    radius = poles[np.abs(poles - 1.0) > margins.NEUTRAL].max()  # constant memories have poles at 1
     assert radius > 1.01 if grows else radius < 0.99
     log = fly(parts_of(flexible=flexible)).log
     ringing = log.x.modes.e[log.has_length][-72:-1, 0]

@@ -24,7 +24,7 @@ from tests.helpers import (
     with_controller,
 )
 
-# no disturbance, by the program of the usual one
+# no disturbance, as a sinusoid of amplitude 0, to share a compiled program
 QUIET = disturbances.Sinusoid(*[vector([0.0] * 3)] * 4)
 
 
@@ -45,7 +45,7 @@ def test_exact_error_solves_the_second_order_system(eta):
         np.testing.assert_allclose(exact.s[0], (7.0 - t) * y[1, k] + eta * y[0, k], atol=1e-8)
 
 
-def test_first_torque_against_the_run_and_in_angles():
+def test_first_torque_equals_the_simulated_torque_and_the_angle_formula():
     body = np.asarray(FULL_INERTIA)
     run = parts(25.0, 3.5, 0.5, inertia=FULL_INERTIA)
     log = fly(run).log
@@ -56,20 +56,20 @@ def test_first_torque_against_the_run_and_in_angles():
 
 
 @pytest.mark.parametrize("eta", [2.05, 2.1, 2.2, 2.3])
-def test_later_peak_of_small_eta(eta):
-    """A small slew without disturbance: the braking peak, its size over the first torque and its time."""
+def test_braking_peak_of_a_small_slew(eta):
+    """Compare the ratio to the initial torque, and the time of the peak, with a simulation without disturbance."""
     small = np.array([0.0, 0.0, np.sin(0.01), np.cos(0.01)])
     run = parts(30.0, eta, 1e-9, q=small, disturbance=QUIET, rate_bound=0.0, t_end=31.0)
     log = fly(run).log
     u, t = log.u[:, 2], log.t
-    first, k = abs(u[0]), int(np.argmax(u))  # it brakes with the opposite sign
-    # small-angle formula: corrections of (0.01)^2; the peak is read off nodes some tau/10 apart, flat at the top
+    first, k = abs(u[0]), int(np.argmax(u))  # the braking torque has the opposite sign
+    # the error of the small-angle formula is 0.01^2; time steps of about tau/10 limit the accuracy of the flat peak
     np.testing.assert_allclose(u[k] / first, rules.later_peak_ratio(vector(eta)), rtol=2e-3)
     remaining = (30.0 - t[k]) / (30.0 - float(rules.later_peak_time(vector(eta), vector(30.0))))
     assert 0.93 < remaining < 1.07
 
 
-def test_later_peak_ratio_published_values():
+def test_later_peak_ratio_equals_published_values():
     for eta, ratio in ((2.05, 7.4), (2.1, 3.7), (2.2, 1.87), (2.3, 1.27), (2.5, 0.79), (3.0, 0.45)):
         np.testing.assert_allclose(rules.later_peak_ratio(vector(eta)), ratio, atol=0.006 * ratio + 0.005)
     np.testing.assert_allclose(rules.later_peak_ratio(vector(2.386)), 1.0, atol=1e-3)
@@ -87,14 +87,14 @@ def test_sliding_variable_stays_inside_its_envelope(eta, width):
     assert np.all(size <= allowed * (1 + 1e-6) + 1e-9)
 
 
-def test_the_narrowest_sign_is_reached_through_in_one_period():
+def test_narrowest_sign_is_crossed_in_one_period():
     run = parts(30.0, 3.0, 0.05, inertia=FULL_INERTIA)
     width = envelopes.narrowest_sign(run, 0.05)
     before, _ = rates.boundary_layer(run.controller, run.observer.error_bound().largest)
-    # its layer's rate times the period, from the law's own rate at its own width
+    # the rate of the boundary layer is inversely proportional to its width
     np.testing.assert_allclose(float(before) * float(run.controller.sign_width) * 0.05, width, rtol=1e-12)
     np.testing.assert_allclose(envelopes.narrowest_sign(run, 0.1), 2.0 * width, rtol=1e-12)
-    # of K2 when the observer has settled: of what it starts with e^(-26) is left at t_end, and 600 times as much counts
+    # the width uses the K2 of a settled observer: e^(-26) of the initial error remains at t_end, here 600 times larger
     unknown = dataclasses.replace(run.observer, initial_error=vector(1.0))
     assert float(unknown.error_bound().largest) < 600.0 * float(run.observer.error_bound().largest)
     np.testing.assert_allclose(
@@ -102,7 +102,7 @@ def test_the_narrowest_sign_is_reached_through_in_one_period():
     )
 
 
-def test_exact_path_is_the_path_of_the_run():
+def test_exact_path_equals_the_simulated_path():
     rate = (0.02, -0.03, 0.05)
     run = parts(30.0, 3.0, 0.05, rate=rate)
     quiet = parts(30.0, 3.0, 0.05, rate=rate, disturbance=QUIET, rate_bound=0.0)
@@ -114,7 +114,7 @@ def test_exact_path_is_the_path_of_the_run():
 
 
 def random_body(rng):
-    """A physical inertia: that of point masses."""
+    """Random inertia of point masses, which is physically possible."""
     points = rng.normal(size=(6, 3)) * rng.uniform(0.3, 2.0, size=3)
     return np.trace(points.T @ points) * np.eye(3) - points.T @ points
 
@@ -138,12 +138,12 @@ SPACECRAFT = st.fixed_dictionaries(
 
 
 def grid(t_f):
-    """As many steps as `roomy` makes them: by the same program as other runs here."""
+    """Time grid with the number of steps of `roomy`, to share a compiled program."""
     return clock.Graded(vector(t_f + 10.0), vector(1.0), vector(1.5 * t_f / 512), jnp.zeros(0), 512, 512)
 
 
 def stays_inside_the_corrected_bounds(case):
-    """(55) with sqrt(3) c and l_m of a full inertia; (32), (20) and (23) with what the smooth sign leaves."""
+    """Check (55) with sqrt(3) c and l_m of a full inertia; (32), (20), (23) with the residual of the smooth sign."""
     rng = np.random.default_rng(case["seed"])
     body, t_f = random_body(rng), case["t_f"]
     axis = rng.normal(size=3)
@@ -159,13 +159,13 @@ def stays_inside_the_corrected_bounds(case):
         initial_error=vector(np.linalg.norm(amplitude * np.sin(case["phase"]))),
     )
     bound = observer.error_bound()
-    # the boundary layer's rate times the largest step stays below 1.4
+    # choose a width so that the rate of the boundary layer times the largest step is below 1.4
     layer = float(rates.switching_rate(run.controller, jnp.maximum(bound.start, bound.floor))) * t_f
     width = max(layer * 1.5 * t_f / 512 / 1.4 / case["sharp"], 1e-9)
     law = {"sign_width": vector(width), "k1": vector(case["k1"]), "surface_rate": vector(case["surface_rate"])}
     run = dataclasses.replace(with_controller(run, **law), observer=observer, clock=grid(t_f))
     result = fly(run)
-    assert int(result.status) in rollout.FINISHED  # a slow surface may leave the target out of reach at t_f
+    assert int(result.status) in rollout.FINISHED  # with a slow surface the run may not have converged at t_f
     log = result.log
     before = log.t < float(run.controller.hand_over)
     t = log.t[before]
@@ -175,7 +175,7 @@ def stays_inside_the_corrected_bounds(case):
     assert np.all(size <= envelopes.sliding_bound(run, t) * (1 + 1e-6) + 1e-9 * size.max())
     error = np.linalg.norm(log.error[before], axis=1)
     assert np.all(error <= envelopes.error_bound(run, t) * (1 + 1e-6) + 1e-9)
-    # after it steps of at most 0.06 s take (2 0.06)^5 / 120 of what decays, 400 times
+    # in the hold phase the integration error is (2 0.06)^5 / 120 of the decaying part, in 400 steps of at most 0.06 s
     later, t = ~before, log.t[~before]
     size, error = (np.linalg.norm(v[later], axis=1) for v in (log.s, log.error))
     assert np.all(size <= hold.sliding_bound(run, t) * (1 + 1e-4) + 1e-9)
@@ -196,8 +196,8 @@ def slew(seed, eta, t_f):
 
 
 @pytest.mark.parametrize("below", [False, True], ids=["eta from 2.4 to 6", "eta from 2.05 to 2.4"])
-def test_shortest_time_of_fifty_spacecraft(below):
-    """Rule 3.5: within 1 % from eta = 2.4 on; never too short below, where its factor is the small-angle one."""
+def test_shortest_time_is_sufficient_for_fifty_spacecraft(below):
+    """Rule 3.5 is accurate to 1 % for eta >= 2.4. Below it is conservative, because it uses a small-angle factor."""
     rng = np.random.default_rng(5)
     for seed in range(50):
         eta, limit = rng.uniform(2.05, 2.4) if below else rng.uniform(2.4, 6.0), rng.uniform(0.05, 2.0)
@@ -205,14 +205,14 @@ def test_shortest_time_of_fifty_spacecraft(below):
         t_f = float(rules.shortest_time(start.plant.inertia, start.initial.q, vector(eta), vector(limit)))
         flown = fly(slew(seed, eta, t_f))
         assert int(flown.status) == rollout.OK
-        # the torque of an undisturbed slew goes like 1 / t_f^2
+        # the torque of an undisturbed slew is proportional to 1 / t_f^2
         needed = t_f * np.sqrt(float(flown.metrics.peak_torque) / limit)
         assert needed <= t_f * (1 + 1e-6)
         assert below or needed >= 0.99 * t_f
 
 
-def test_input_along_the_exact_motion_is_the_flown_one():
-    """Rates at t = 0, moving references and small eta, where the closed rule does not reach."""
+def test_exact_input_equals_the_simulated_input():
+    """The cases are beyond the design rule: initial rates, moving references and small eta."""
     spin = references.Spin(vector(0.1, -0.2, 0.1, np.sqrt(1 - 0.06)), vector(0.004, -0.006, 0.005))
     rest, rate = (0.0, 0.0, 0.0), (0.02, -0.03, 0.01)
     still = dataclasses.replace(spin, q=vector([0.0, 0.0, 0.0, 1.0]), rate=jnp.zeros(3))
@@ -222,7 +222,7 @@ def test_input_along_the_exact_motion_is_the_flown_one():
         flown = fly(run)
         before = flown.log.t < 24.49
         u = inputs_along(run, flown.log.t)[before]
-        # gains of 2 J eta^2 / tau^2 < 3000 on states within 1e-9
+        # state errors of 1e-9 times gains 2 J eta^2 / tau^2 < 3000
         np.testing.assert_allclose(flown.log.u[before], u, rtol=0, atol=3e-6)
         _, u, _ = solutions.exact_path(run, 400)
         np.testing.assert_allclose(solutions.exact_peak(run), np.abs(u).max())
@@ -233,7 +233,7 @@ def test_input_along_the_exact_motion_is_the_flown_one():
     np.testing.assert_allclose(against, np.broadcast_to([0.01, -0.02, 0.0], against.shape), atol=1e-12)
 
 
-def test_first_torque_to_a_reference_elsewhere():
+def test_first_torque_to_a_reference_other_than_the_identity():
     q_f = np.array([0.2, -0.3, 0.1, np.sqrt(1 - 0.14)])
     run = parts(25.0, 3.5, 0.5, inertia=FULL_INERTIA, reference=references.Fixed(vector(q_f)))
     log = fly(run).log
@@ -241,20 +241,20 @@ def test_first_torque_to_a_reference_elsewhere():
     np.testing.assert_allclose(log.u[0], first, rtol=1e-12)
 
 
-def test_residual_error_is_what_a_constant_disturbance_leaves():
-    """Rule 3.6, with no observer and no switching: a tau^2 / (eta-2)^2, then the parabola to t_f."""
+def test_residual_error_equals_the_error_under_a_constant_disturbance():
+    """Rule 3.6 without observer and switching: a tau^2 / (eta-2)^2, then a parabola until t_f."""
     eta, delta, d = 4.5, 0.5, 1e-4
     run = chain_parts([0.0, 0.0], 30.0, eta, delta, disturbance=disturbances.Constant(vector([d])))
     log = fly(run).log
     at_hand_over, at_t_f = rules.residual_error(vector(d), vector(eta), vector(delta))
     k = np.argmax(log.t >= 29.5 - 1e-9)
-    np.testing.assert_allclose(log.x[k, 0], at_hand_over, rtol=1e-3)  # (delta/t_f)^(eta-2) of the start is left
-    np.testing.assert_allclose(log.x[np.argmax(log.t >= 30.0), 0], at_t_f, rtol=0.25)  # the hold law acts meanwhile
+    np.testing.assert_allclose(log.x[k, 0], at_hand_over, rtol=1e-3)  # the transient is (delta/t_f)^(eta-2)
+    np.testing.assert_allclose(log.x[np.argmax(log.t >= 30.0), 0], at_t_f, rtol=0.25)  # the rule ignores the hold law
 
 
 @pytest.mark.parametrize("rate", short([1.0, 2.5], [2.5]))
-def test_hold_floor_is_what_an_axis_holds(rate):
-    """Rule 3.7: a ramp of the disturbance leaves d'/(l c (K1 + |T J^-1| K2/width)) in the end."""
+def test_hold_floor_equals_the_simulated_error_under_a_ramp(rate):
+    """Rule 3.7: a ramp disturbance causes the final error d'/(l c (K1 + |T J^-1| K2/width))."""
     ramp = 2e-5
     gain, width = 20.0, 0.05
     wave = disturbances.Sinusoid(*(vector([v] * 3) for v in (ramp / 1e-3, 1e-3, 0.0, 0.0)))
@@ -274,10 +274,10 @@ def test_hold_floor_is_what_an_axis_holds(rate):
     log = fly(run).log
     switching = float(np.sqrt(3.0) / 10.0 * run.observer.error_bound().floor)
     expected = rules.hold_floor(vector(ramp), vector(gain), vector(1.0), vector(switching), vector(width), vector(rate))
-    np.testing.assert_allclose(np.abs(log.error[-1]), expected, rtol=2e-2)  # cos(1e-3 t) is not yet a ramp's
+    np.testing.assert_allclose(np.abs(log.error[-1]), expected, rtol=2e-2)  # a slow sinusoid approximates the ramp
 
 
-def test_spacecraft_without_an_observer_keeps_its_envelope():
+def test_spacecraft_without_an_observer_stays_inside_its_envelope():
     wave = disturbances.Sinusoid(*(vector([v] * 3) for v in (0.01, 0.4, 0.3, 0.0)))
     run = parts(30.0, 3.0, 0.5, disturbance=wave, sign_width=0.2)
     blind = dataclasses.replace(run, observer=none.NoObserver(run.plant, vector(0.01)))
