@@ -1,4 +1,8 @@
-"""Scenarios: read, checked as a whole and changed without JAX (`reading`); turned into what is flown (`flyable`)."""
+"""Read, validate and change scenarios without JAX (`reading`), and build the parts of a run from them (`flyable`).
+
+Start with `read`, which returns a `Scenario`, and `study`, which builds its parts. The exports are imported at their
+first use, so that reading a scenario does not load JAX.
+"""
 
 import importlib
 from typing import TYPE_CHECKING, Any
@@ -24,7 +28,7 @@ _EXPORTS = {
 
 
 def __getattr__(name: str) -> Any:
-    """Loaded when first used: reading a scenario does not load JAX."""
+    """Import an export at its first use."""
     if name in _EXPORTS:
         return getattr(importlib.import_module(f"ptsmc_jax.scenario.{_EXPORTS[name]}"), name)
     raise AttributeError(f"module 'ptsmc_jax.scenario' has no attribute {name!r}")

@@ -1,4 +1,7 @@
-"""Attitudes as a scenario file gives them: every key turned into a unit quaternion, or refused."""
+"""Convert the attitude keys of scenario files to unit quaternions and validate them.
+
+A table gives an attitude by one of the keys in `ATTITUDE_KEYS`. Start with `quaternion`.
+"""
 
 from typing import Annotated, Any
 
@@ -31,7 +34,10 @@ ATTITUDE_KEYS = ("quat_xyzw", "quat_wxyz", "rotvec_deg", "mrp", "dcm_body_to_ine
 
 
 def unit(key: str, value: Any) -> np.ndarray:
-    """A quaternion of a scenario, normalised; refused where it is not a unit one already."""
+    """Return a quaternion (4,) normalised; raise ScenarioError if its norm is not 1 within 1e-6.
+
+    The order of the components stays. `key` is the full name of the key for errors, such as "initial.quat_xyzw".
+    """
     array = np.array(value, dtype=float)
     length = np.linalg.norm(array)
     if abs(length - 1.0) > 1e-6:
@@ -40,7 +46,10 @@ def unit(key: str, value: Any) -> np.ndarray:
 
 
 def quaternion(table: Attitude, name: str) -> np.ndarray:
-    """Unit quaternion [q1 q2 q3 q4] of a table's attitude key; `name` is the table's, for errors."""
+    """Return the unit quaternion [q1 q2 q3 q4] (4,) of a table's attitude key.
+
+    It raises ScenarioError if the value is not an attitude. `name` is the table's name, for errors.
+    """
     key, value = attitude_key(table)
     full = f"{name}.{key}"
     if table.sequence is not None and key != "euler_deg":
@@ -48,7 +57,7 @@ def quaternion(table: Attitude, name: str) -> np.ndarray:
     if key in ("quat_xyzw", "quat_wxyz"):
         given = unit(full, value)
         return given if key == "quat_xyzw" else np.roll(given, -1)
-    with np.errstate(all="ignore"):  # of numbers too large to be turned by, which are refused
+    with np.errstate(all="ignore"):  # the norm below detects an overflow
         found = _turned(table, name, full, np.array(value, dtype=float))
     if not abs(np.linalg.norm(found) - 1.0) < 1e-6:
         raise wrong(full, value, "an attitude in numbers whose squares are finite")
@@ -56,8 +65,8 @@ def quaternion(table: Attitude, name: str) -> np.ndarray:
 
 
 def _turned(table: Attitude, name: str, full: str, array: np.ndarray) -> np.ndarray:
-    """The attitude of a key that holds no quaternion, as one."""
-    from scipy.spatial.transform import Rotation  # takes 0.15 s, which most scenarios need not wait for
+    """Return the quaternion (4,) of an attitude key that holds another parametrisation."""
+    from scipy.spatial.transform import Rotation  # the import takes 0.15 s, and most scenarios do not need it
 
     key = full.removeprefix(f"{name}.")
     if key == "rotvec_deg":
@@ -80,18 +89,18 @@ def _turned(table: Attitude, name: str, full: str, array: np.ndarray) -> np.ndar
 
 
 def has_attitude(table: Attitude) -> bool:
-    """Whether a table gives an attitude at all."""
+    """Whether a table has an attitude key."""
     return any(getattr(table, key) is not None for key in ATTITUDE_KEYS)
 
 
 def attitude_key(table: Attitude) -> tuple[str, Any]:
-    """The attitude key that a table uses, and its value."""
+    """Return the attitude key that a table uses, and its value."""
     key = next(key for key in ATTITUDE_KEYS if getattr(table, key) is not None)
     return key, getattr(table, key)
 
 
 def at_most_one(name: str, table: Any) -> None:
-    """Raise ScenarioError where a table gives its attitude twice."""
+    """Raise ScenarioError if a table has more than one attitude key; name: of the table, for errors."""
     said = [key for key in ATTITUDE_KEYS if getattr(table, key) is not None]
     if len(said) > 1:
         two, allowed = " and ".join(said), ", ".join(ATTITUDE_KEYS)

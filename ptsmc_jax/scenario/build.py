@@ -1,4 +1,7 @@
-"""The parts of a checked scenario that any plant has: law, observer, disturbance, sensors, actuators, dispersion."""
+"""Build the simulation parts of a validated scenario: law, observer, disturbance, sensors, actuators, dispersions.
+
+Start with `setup`. `timing` adds the clock, and `flyable.study` combines both.
+"""
 
 import dataclasses
 from typing import Any
@@ -17,7 +20,7 @@ from ptsmc_jax.simulation.assembly import Parts, Setup
 
 
 def setup(scenario: Scenario) -> Setup:
-    """All parts but the clock, which follows from how fast these make things happen."""
+    """Return all parts except the clock. `timing.timing` derives the clock from the fastest rates of these parts."""
     model = scenario.model()
     plant = scenario.truth(model)
     acting, walk = disturbance(scenario, plant)
@@ -45,21 +48,24 @@ def setup(scenario: Scenario) -> Setup:
 
 
 def _sensors(scenario: Scenario, model: Any) -> Any:
-    """The sensors of [sensors] or [[sensors]], else of [hardware]."""
+    """Return the sensors of [sensors] or [[sensors]] if given, otherwise the sensors of [hardware]."""
     if scenario.sensors is None:
         return scenario.devices.sensors(scenario)
     return scenario.sensors.build(model, scenario.loop.period)
 
 
 def disturbance(scenario: Scenario, plant: Plant) -> tuple[Any, Any]:
-    """The disturbance of the plant that flies, by time and state, and the rate of its random walk (None: none)."""
+    """Return the disturbance of the true plant, a function of time and state, and the rate of its random walk or None.
+
+    The rate of the random walk is one sigma per second for each input (m,).
+    """
     signal, walk = [], None
     inertia = getattr(plant, "inertia", None)
     for table in scenario.terms:
         acting, step = table.build(inertia), table.walk(scenario.loop.period)
         signal += [] if acting is None else [acting]
         if step is not None:
-            walk = step if walk is None else jnp.sqrt(walk**2 + step**2)  # independent walks add up to one
+            walk = step if walk is None else jnp.sqrt(walk**2 + step**2)  # variances of independent walks add up
     if len(signal) > 1:
         return disturbances.Sum(tuple(signal)), walk
     return (signal[0] if signal else disturbances.Constant(jnp.zeros(plant.inputs))), walk
@@ -72,7 +78,7 @@ def _quantity_of(key: str) -> str:
 
 
 def dispersion(scenario: Scenario, parts: Parts) -> Dispersion:
-    """Return the random quantities of each trial, about these nominal parts."""
+    """Return the dispersions of a scenario about these nominal parts."""
     table = scenario.dispersion
     if table is None:
         return Dispersion()
@@ -82,7 +88,7 @@ def dispersion(scenario: Scenario, parts: Parts) -> Dispersion:
         {
             name: one.build(parts, QUANTITIES[name].count(parts))
             for name, one in tables.items()
-            # hardware errors of zero size are left out, so that the program, and every digit, are the same
+            # hardware errors of zero size are omitted: the compiled program is then the program without them
             if one is not None and not (QUANTITIES[name].hardware and getattr(one, "nothing", False))
         },
         own=None if table.own is None else table.own.build(),

@@ -1,6 +1,7 @@
-"""What is odd about a scenario though it flies: bounds far off its disturbance, a mostly noisy estimate, no gyro.
+"""Warn about valid scenarios whose values are probably mistakes. Start with `of`.
 
-Or a surface that is too fast for the control period.
+The warnings concern disturbance bounds far from the disturbance, noisy estimates, a missing gyro error, values in wrong
+units, and a sliding surface that is too fast for the control period.
 """
 
 from typing import Any
@@ -11,20 +12,23 @@ from ptsmc_jax.scenario import disturbance_bounds, errors
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.theory import borders
 
-FAR = 10.0  # times off, from which on a stated bound is said to be
-LATE = 0.1  # of t_f, from which on a delay is likely the number of another unit
-COARSE = np.deg2rad(5.0)  # of noise [rad], from which on it is likely another unit's number
+FAR = 10.0  # largest ratio of a stated bound to the bound of the disturbance, or its inverse, without a warning
+LATE = 0.1  # fraction of t_f: a longer delay was probably given in another unit
+COARSE = np.deg2rad(5.0)  # [rad]: a larger noise was probably given in another unit
 
 
 def of(scenario: Scenario) -> list[str]:
-    """Sentences, none where nothing is odd or code of one's own was not run yet."""
+    """Return the warnings of a scenario, one sentence each.
+
+    Bounds and estimate are not examined if custom code that defines the disturbance has not run yet.
+    """
     bounds = disturbance_bounds.of(scenario)
     bounded = [] if bounds is None else [*_far_off(scenario, *bounds), *_noisy(scenario, bounds[0])]
     return [*bounded, *_perfect_rate(scenario), *_coarse(scenario), *_late(scenario), *_fast_surface(scenario)]
 
 
 def _late(scenario: Scenario) -> list[str]:
-    """A delay that is likely a time: it is counted in control periods."""
+    """Warn about a delay that was probably given in seconds: the key counts control periods."""
     delay, period = scenario.devices.delay_periods, scenario.loop.period
     if delay * period < LATE * scenario.controller.t_f:
         return []
@@ -35,12 +39,15 @@ def _late(scenario: Scenario) -> list[str]:
 
 
 def _fast_surface(scenario: Scenario) -> list[str]:
-    """A surface on which no K1 keeps the sampled loop after the hand-over: the paper's 1 1/s is one of slow loops."""
+    """Warn if no K1 stabilises the sampled hold phase at the scenario's surface rate c.
+
+    The published c = 1 1/s assumes a control period that is short compared with 1 s.
+    """
     law: Any = scenario.controller
     if not scenario.sampled or law.kind != "prescribed_time" or scenario.order != 2:
         return []
     period, delay = scenario.loop.period, scenario.devices.delay_periods
-    share = getattr(law, "a", (1.0,))[0]  # of the rate: a chain's surface has c a_1
+    share = getattr(law, "a", (1.0,))[0]  # the surface of a chain has the rate c a_1
     border = borders.largest_surface(delay, implicit=law.implicit) / (share * period)
     if law.surface_rate < border:
         return []
@@ -52,7 +59,7 @@ def _fast_surface(scenario: Scenario) -> list[str]:
 
 
 def _coarse(scenario: Scenario) -> list[str]:
-    """A star tracker with a noise that none has."""
+    """Warn about a star tracker whose noise is larger than that of any real device."""
     noise = getattr(scenario.hardware, "attitude_noise", None)
     if not noise or noise < COARSE:
         return []
@@ -63,7 +70,7 @@ def _coarse(scenario: Scenario) -> list[str]:
 
 
 def _perfect_rate(scenario: Scenario) -> list[str]:
-    """A star tracker with noise beside a gyro of which nothing is said: its rate is the true one."""
+    """Warn about a noisy star tracker with a gyro without errors: the law then knows the true rate."""
     device: Any = scenario.hardware
     star = getattr(device, "attitude_noise", None)
     gyro = ("rate_noise", "rate_noise_density", "rate_bias", "rate_bias_walk")
@@ -76,7 +83,10 @@ def _perfect_rate(scenario: Scenario) -> list[str]:
 
 
 def _far_off(scenario: Scenario, largest: float, fastest: float) -> list[str]:
-    """Stated bounds that are more than ten times off what the disturbance reaches; only that which the law uses."""
+    """Warn about a stated bound that differs from the bound of the disturbance by more than the factor `FAR`.
+
+    Only the bound that the law uses is examined: K without an observer, c with an observer.
+    """
     if not scenario.controller.law.switches:
         return []
     name, follows = ("disturbance_rate_bound", fastest)
@@ -92,7 +102,7 @@ def _far_off(scenario: Scenario, largest: float, fastest: float) -> list[str]:
 
 
 def _noisy(scenario: Scenario, largest: float) -> list[str]:
-    """An estimate whose noise is larger than what it is to estimate."""
+    """Warn about an observer whose estimate has more noise than the disturbance has amplitude."""
     noise = estimate_noise(scenario)
     if not noise > largest > 0.0:
         return []
@@ -106,10 +116,12 @@ def _noisy(scenario: Scenario, largest: float) -> list[str]:
 
 
 def estimate_noise(scenario: Scenario) -> float:
-    """Noise of the estimate of an observer with a constant gain l [N m, 1 sigma], on the noisiest axis; 0: none known.
+    """Return the noise of the disturbance estimate on the noisiest axis [N m, 1 sigma], 0 if it is not known.
 
-    A sample says d + J (n_k+1 - n_k) / h, n the noise of the rate, of sigma; what is left of an estimate after a period
-    is E = e^(-l h / J). Of that first-order filter of a difference is left J sigma / h (1 - E) (2 / (1 + E))^(1/2).
+    It is known for an observer with a constant gain l in the sampled loop. A sample of the disturbance is
+    d + J (n_(k+1) - n_k) / h, where n is the noise of the rate (1 sigma: `sigma`) and h the control period. The
+    observer is a first-order filter of these samples with the decay E = exp(-l h / J). The noise of its output is
+    J sigma / h (1 - E) sqrt(2 / (1 + E)).
     """
     gains, loop = getattr(scenario.observer, "gain", None), scenario.loop
     if scenario.observer.kind not in ("nonlinear", "prescribed_time") or gains is None or not scenario.sampled:
@@ -121,7 +133,7 @@ def estimate_noise(scenario: Scenario) -> float:
         sigmas = np.full(3, scenario.devices.gyro_noise(loop.period))
     else:
         noise = getattr(scenario.hardware, "state_noise", None)
-        if noise is None or scenario.plant.kind != "chain":  # the matrix M of a system of one's own is not known here
+        if noise is None or scenario.plant.kind != "chain":  # the matrix M of a custom system is not known here
             return 0.0
         moments, sigmas = np.ones(1), np.asarray(noise[-1:])
     left = np.exp(-np.asarray(gains) * loop.period / moments)

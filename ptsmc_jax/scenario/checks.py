@@ -1,4 +1,7 @@
-"""What single keys of a scenario cannot tell: keys against each other."""
+"""Validate constraints that involve more than one key of a scenario. Start with `check`.
+
+`parsing` validates single keys, and `own_checks` and `start_checks` validate the parts that are built from a scenario.
+"""
 
 import math
 from typing import Any
@@ -9,12 +12,12 @@ from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.scenario.values import MOST_STEPS
 from ptsmc_jax.simulation import catalogues
 
-OF_SENSORS = ("star_tracker_misalignment", "gyro_scale", "star_tracker_outage")  # what is drawn of the built-in ones
-SHORTEST_WINDOW = 1e-5  # of t_f, continuous loop: 80 times what 32 bits tell apart at t_f, whose steps may be finer
+OF_SENSORS = ("star_tracker_misalignment", "gyro_scale", "star_tracker_outage")  # dispersions of the built-in sensors
+SHORTEST_WINDOW = 1e-5  # fraction of t_f, continuous loop: 80 times the resolution of a 32-bit float at t_f
 
 
 def check(scenario: Scenario) -> None:
-    """Raise ScenarioError where keys contradict each other or ask for what the project cannot do yet."""
+    """Raise ScenarioError if keys contradict each other or if their combination is not supported."""
     scenario.check_plant()
     _check_requirements(scenario)
     scenario.observer.check(scenario)
@@ -45,7 +48,7 @@ def _check_requirements(scenario: Scenario) -> None:
 
 
 def _check_limit(metric: str, limit: tables.Limit) -> None:
-    """What the keys of a requirement in full say together."""
+    """Raise ScenarioError if the keys of a requirement table contradict each other."""
     key = f"requirements.{metric}"
     if limit.quantile is not None and limit.probability is not None:
         raise ScenarioError(f"{key} has both quantile and probability, but must have one of them: they are the same")
@@ -67,7 +70,10 @@ def _check_limit(metric: str, limit: tables.Limit) -> None:
 
 
 def check_sensors(scenario: Scenario) -> None:
-    """Sensors of one's own are all that there are, and sample."""
+    """Raise ScenarioError if [sensors] or [[sensors]] contradict other keys.
+
+    They replace the noise keys of [hardware] and the table [filter], and they need the sampled loop.
+    """
     if scenario.sensors is None:
         return
     scenario.need_samples("[sensors]")
@@ -92,7 +98,7 @@ def _check_loop(scenario: Scenario) -> None:
     if not controller.law.prescribed:
         scenario.need_samples(f"controller.kind = {errors.show(controller.kind)}")
     controller.check(scenario)
-    if scenario.sampled and t_f <= loop.period:  # whatever delta is, which has at least a period
+    if scenario.sampled and t_f <= loop.period:  # before delta is checked, which is at least one period
         raise wrong("controller.t_f", t_f, f"greater than one control period, loop.period = {loop.period}")
     if delta >= t_f:
         raise wrong("controller.delta", delta, f"less than controller.t_f, {t_f}")
@@ -118,7 +124,7 @@ def _check_loop(scenario: Scenario) -> None:
 
 
 def _check_periods(scenario: Scenario) -> None:
-    """What is counted in periods, or holds some, against the period and the run."""
+    """Raise ScenarioError if a time or a number of control periods does not fit the period or the run."""
     loop, window, filtering = scenario.loop, scenario.window, scenario.devices.command_filter
     delta = scenario.hand_over
     if delta < loop.period * (1 - 1e-9):
@@ -174,7 +180,10 @@ def _check_dispersion(scenario: Scenario) -> None:
 
 
 def _has(term: Any, what: str) -> bool:
-    """Whether a disturbance may have its phase or amplitude drawn; a key of one's own of that name is any number."""
+    """Whether a dispersion can change the phase or the amplitude of a disturbance.
+
+    A custom disturbance declares this in `drawn`. A custom key of that name alone does not suffice.
+    """
     if isinstance(term, own.Own):
         return term.waits or what in term.made.drawn
     return hasattr(term, what)

@@ -1,6 +1,7 @@
-"""The tables of a scenario file that name devices: actuators and sensors, wheels and filters, and what they build.
+"""The tables [hardware], [filter] and [wheels] of scenario files, and the parts that they build.
 
-A filter is its physics in `devices`, a table here, and a row in `FILTERS`; wheels likewise in `WHEELS`.
+Start with `Hardware`. A new filter needs its physics in `devices`, a table here, and a row in `FILTERS`. New wheels
+need a row in `WHEELS`.
 """
 
 import math
@@ -24,7 +25,7 @@ from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.schema import PartTable, table
 from ptsmc_jax.scenario.values import Count, Kinds, Meaning, NotNegative, NotNegatives, Positive, Table, Three
 
-SAME = 1e-9  # of a number of periods, which is whole then
+SAME = 1e-9  # relative tolerance for a whole number of periods
 
 
 class CommandFilterTable(PartTable, frozen=True):
@@ -33,7 +34,7 @@ class CommandFilterTable(PartTable, frozen=True):
     prefix: ClassVar[str] = "command_"
 
     def dead_time(self) -> float:
-        """Return its delay at low frequencies, the derivative of its phase [s]."""
+        """Return the delay of the filter at low frequencies, the negative derivative of its phase [s]."""
         return self.made.dead_time(self)
 
 
@@ -64,17 +65,17 @@ class Actuators(Table, frozen=True):
             "does not predict over it"
         ),
     ] = None
-    levels: ClassVar[Mapping[str, tuple[str, ...]]] = {}  # that can be drawn: the keys, any of which gives it
-    noises: ClassVar[tuple[str, ...]] = ()  # keys of what the sensors are off by
+    levels: ClassVar[Mapping[str, tuple[str, ...]]] = {}  # by dispersion key: the keys here that set the nominal value
+    noises: ClassVar[tuple[str, ...]] = ()  # keys of sensor errors
 
     @property
     def noisy(self) -> bool:
-        """Whether any of `noises` is there."""
+        """Whether any key of `noises` is given."""
         return any(getattr(self, key) is not None for key in self.noises)
 
     @property
     def delay_periods(self) -> int:
-        """Control periods from measuring to acting."""
+        """Control periods from the measurement to the torque."""
         return self.delay or 0
 
     @property
@@ -83,26 +84,26 @@ class Actuators(Table, frozen=True):
         return self.torque_rate_limit is not None or self.torque_lag is not None
 
     def check(self, scenario: Any) -> None:
-        """Raise ScenarioError where its keys contradict each other, or the scenario's."""
+        """Raise ScenarioError if keys contradict each other or the scenario."""
         step, limit = self.torque_step, self.torque_limit
         if step is not None and limit is not None and step >= 2.0 * limit and getattr(scenario, "wheels", None) is None:
             allowed = f"less than twice hardware.torque_limit, {limit}: larger ones round every torque to zero"
             raise wrong("hardware.torque_step", step, allowed)
 
     def noise_of_error(self, scenario: Any) -> tuple[float, float]:
-        """Return the noise of the error and of its rate [1/s], 1 sigma an axis and raw sample, in their units."""
+        """Return the noise of the error and of its rate [1/s], 1 sigma per axis and raw sample."""
         raise NotImplementedError
 
     def noise_of_s(self, scenario: Any) -> float:
-        """Return the noise of the sliding variable after the hand-over, 1 sigma an axis and raw sample."""
+        """Return the noise of the sliding variable in the hold phase, 1 sigma per axis and raw sample."""
         return scenario.controller.noise_of_s(*self.noise_of_error(scenario))
 
     def sensors(self, scenario: Any) -> Any:
-        """Parts of `devices.sensors`."""
+        """Return the sensors, a part of `devices.sensors`."""
         raise NotImplementedError
 
     def actuators(self, wheels: Any) -> Any:
-        """Limits, lag, delay and wheels (None: none)."""
+        """Return the actuators; wheels: the part of `devices.reaction_wheels`, or None."""
         values = (self.torque_limit, self.torque_rate_limit, self.torque_lag, self.torque_step)
         limit, rate_limit, lag, step = (None if v is None else vector(v) for v in values)
         return ActuatorsPart(limit, rate_limit, lag, step, wheels, self.delay_periods)
@@ -153,21 +154,21 @@ class Hardware(Actuators, frozen=True):
     )  # fmt: skip
 
     def gyro_noise(self, period: float) -> float:
-        """Noise of the gyro, 1 sigma a sample [rad/s]."""
+        """Return the noise of the gyro, 1 sigma per sample [rad/s]; period: of control [s]."""
         return self.rate_noise or formulas.per_sample(self.rate_noise_density or 0.0, period)
 
     def interval(self, period: float) -> float:
-        """Between two samples of the star tracker [s]."""
+        """Return the time between two samples of the star tracker [s]; period: of control [s]."""
         return period * (self.star_tracker_every or 1) if self.star_tracker_period is None else self.star_tracker_period
 
     def periods_apart(self, period: float) -> int | None:
-        """Control periods [s] between two of its samples; None where that is no whole number."""
+        """Return the number of control periods between two star tracker samples, None if it is not whole."""
         ratio = self.interval(period) / period
-        whole = ratio if math.isinf(ratio) else round(ratio)  # `checks` refuses what is beyond the run
+        whole = ratio if math.isinf(ratio) else round(ratio)  # `checks` refuses an interval longer than the run
         return int(whole) if abs(ratio - whole) < SAME * ratio else None
 
     def check(self, scenario: Any) -> None:
-        """One noise of the gyro; a star tracker that pauses needs a filter."""
+        """Raise ScenarioError for two gyro noises, or for a slow star tracker without a filter."""
         super().check(scenario)
         if self.rate_noise is not None and self.rate_noise_density is not None:
             raise wrong("hardware.rate_noise_density", self.rate_noise_density, "absent where rate_noise is given")
@@ -183,14 +184,15 @@ class Hardware(Actuators, frozen=True):
             raise errors.refused(f"hardware.star_tracker_{key}", value, reason, allowed)
 
     def noise_of_error(self, scenario: Any) -> tuple[float, float]:
-        """Return half of both noises: the error is half an angle.
+        """Return half of the star tracker noise [-] and half of the gyro noise [1/s].
 
-        The additive error has at most that noise, if the reference is turned away from the inertial axes.
+        The error is half an angle. The additive error has at most this noise, depending on the attitude of the
+        reference in the inertial frame.
         """
         return 0.5 * (self.attitude_noise or 0.0), 0.5 * self.gyro_noise(scenario.loop.period)
 
     def sensors(self, scenario: Any) -> Any:
-        """Star tracker, gyro and filter."""
+        """Return star tracker, gyro and filter."""
         if not scenario.measured:
             return PerfectSensors()
         period, walk = scenario.loop.period, self.rate_bias_walk
@@ -205,7 +207,7 @@ class Hardware(Actuators, frozen=True):
         )
 
     def star_times(self, period: float) -> Any:
-        """`devices.star_times`; None where the star tracker goes with the control periods [s]."""
+        """Return the sample times of the star tracker, None if its interval is a whole number of control periods."""
         return star_times(self.interval(period), period) if self.periods_apart(period) is None else None
 
 
@@ -220,15 +222,15 @@ class StateHardware(Actuators, frozen=True):
     noises: ClassVar[tuple[str, ...]] = ("state_noise",)
 
     def check(self, scenario: Any) -> None:
-        """One number for each state."""
+        """Raise ScenarioError unless the noise has one number for each state."""
         super().check(scenario)
         states = len(scenario.plant.x0)
         if self.state_noise is not None and len(self.state_noise) != states:
             raise wrong("hardware.state_noise", self.state_noise, f"a list of {states} numbers, one for each state")
 
     def noise_of_error(self, scenario: Any) -> tuple[float, float]:
-        """Return the noise of the first state and of its derivative; of a system, of its noisiest components."""
-        inputs = scenario.inputs  # a system's positions, then its rates
+        """Return the noise of the first state and of its derivative; for a system, of the noisiest components."""
+        inputs = scenario.inputs  # a system has its positions first, then its rates
         noises = self.state_noise or (0.0,) * (2 * inputs)
         return max(noises[:inputs]), max(noises[inputs : 2 * inputs])
 
@@ -242,7 +244,7 @@ class StateHardware(Actuators, frozen=True):
         return math.hypot(*(w * noise for w, noise in zip(weights, noises, strict=False)))
 
     def sensors(self, scenario: Any) -> Any:
-        """`sensors.StateSensor`."""
+        """Return `sensors.StateSensor`, or `PerfectSensors` without noise."""
         return PerfectSensors() if self.state_noise is None else StateSensor(vector(self.state_noise))
 
 
@@ -257,10 +259,10 @@ class FilterTable(PartTable, frozen=True):
         return 1.0
 
     def check(self, scenario: Any) -> None:
-        """Raise ScenarioError where its keys contradict each other, or the scenario's."""
+        """Raise ScenarioError if keys contradict each other or the scenario."""
 
     def build(self, scenario: Any) -> Any:
-        """A part of `devices` that `Sensors` reads through; None: the samples themselves."""
+        """Return the filter, a part of `devices`, or None if the law sees the samples themselves."""
 
 
 class NoFilter(FilterTable, frozen=True):
@@ -286,7 +288,7 @@ class SteadyStateFilter(FilterTable, frozen=True):
         return bool(table.attitude_noise and (table.rate_noise or table.rate_noise_density))
 
     def width(self, scenario: Any) -> float:
-        """Its bandwidth [rad/s]: where star tracker and gyro weigh the same, if none is given."""
+        """Return the bandwidth [rad/s]. By default, star tracker and gyro noise have equal weight at it."""
         if self.bandwidth is not None:
             return self.bandwidth
         table, period = scenario.devices, scenario.loop.period
@@ -294,7 +296,7 @@ class SteadyStateFilter(FilterTable, frozen=True):
         return formulas.best_bandwidth(*noises, period, table.interval(period))
 
     def written(self, scenario: Any) -> Any:
-        """With its bandwidth, where there are noises that it follows from."""
+        """Return the table with the default bandwidth filled in if both noises are greater than 0."""
         noisy = self._noisy(scenario.devices)
         return msgspec.structs.replace(self, bandwidth=self.width(scenario)) if noisy else self
 
@@ -303,14 +305,14 @@ class SteadyStateFilter(FilterTable, frozen=True):
         return -math.expm1(-2.0 * self.width(scenario) * scenario.devices.interval(scenario.loop.period))
 
     def check(self, scenario: Any) -> None:
-        """Noises that the bandwidth follows from."""
+        """Raise ScenarioError if the bandwidth is absent and a noise that determines its default is 0."""
         if self.bandwidth is None and not self._noisy(scenario.devices):
             raise ScenarioError(
                 "filter.bandwidth is absent, but must be given where attitude_noise or rate_noise of [hardware] is 0"
             )
 
     def build(self, scenario: Any) -> Any:
-        """`devices.attitude_filter`."""
+        """Return a filter of `devices.attitude_filter`, or of `devices.star_times` if samples lie between periods."""
         table, period = scenario.devices, scenario.loop.period
         star, gyro, walk = table.attitude_noise or 0.0, table.gyro_noise(period), table.rate_bias_walk or 0.0
         known = tuple(vector(v) for v in (self.width(scenario), star, gyro, walk, period))
@@ -321,7 +323,7 @@ class SteadyStateFilter(FilterTable, frozen=True):
 
 
 class WheelLimits(Table, frozen=True):
-    """What reaction wheels have besides their axes; lag, step and rate limit of [hardware] are then theirs."""
+    """Limits and initial momentum of reaction wheels. Lag, step and rate limit of [hardware] then act on each wheel."""
 
     torque_limit: Annotated[Positive | None, Meaning("of each wheel", "N m")] = None
     momentum_limit: Annotated[Positive | None, Meaning("of each wheel", "N m s")] = None
@@ -335,15 +337,15 @@ class WheelLimits(Table, frozen=True):
     ] = None
 
     def spin_axes(self) -> Any:
-        """The spin axis of each wheel in body axes, (wheels, 3)."""
+        """Return the spin axis of each wheel in body axes (wheels, 3)."""
         raise NotImplementedError
 
     def refused(self, error: ValueError) -> ScenarioError:
-        """What is said of axes that are not allowed."""
+        """Return the configuration error for spin axes that are not allowed."""
         raise NotImplementedError
 
     def check(self) -> None:
-        """Raise ScenarioError where its keys contradict each other."""
+        """Raise ScenarioError if keys contradict each other."""
         axes = self.spin_axes()
         try:
             formulas.wheel_axes(axes)
@@ -356,7 +358,7 @@ class WheelLimits(Table, frozen=True):
             raise wrong("wheels.momentum", self.momentum, f"within wheels.momentum_limit, {limit}")
 
     def build(self) -> Any:
-        """`devices.reaction_wheels`."""
+        """Return the wheels of `devices.reaction_wheels`."""
         return wheels(self.spin_axes(), self.momentum, self.torque_limit, self.momentum_limit)
 
 
@@ -370,11 +372,11 @@ class PyramidWheels(WheelLimits, frozen=True):
     ] = 35.264389682754654
 
     def spin_axes(self) -> Any:
-        """The axes of four wheels, tilted toward +z."""
+        """Return the spin axes of four wheels (4, 3), tilted toward +z."""
         return formulas.pyramid(np.deg2rad(self.cant_deg))
 
     def refused(self, error: ValueError) -> ScenarioError:
-        """The tilt is to blame."""
+        """Return the error for a cant angle whose wheels do not span all directions."""
         enough = "far enough from 0 and 90 degrees for the wheels to span all directions"
         return wrong("wheels.cant_deg", self.cant_deg, enough)
 
@@ -393,11 +395,11 @@ class AxesWheels(WheelLimits, frozen=True):
     )
 
     def spin_axes(self) -> Any:
-        """The rows of `axes`."""
+        """Return `axes` as an array (wheels, 3)."""
         return np.asarray(self.axes)
 
     def refused(self, error: ValueError) -> ScenarioError:
-        """What is wrong with them."""
+        """Return the error for `axes`."""
         return ScenarioError(f"wheels.axes is {errors.brief(self.spin_axes().tolist())}: {error}")
 
 

@@ -1,4 +1,7 @@
-"""The random quantities of each trial in scenario files: the kinds of their tables, and what they apply to."""
+"""The table [dispersion] of scenario files: its keys, and the kinds of random quantities that a key may have.
+
+`_SPACECRAFT` and `_STATE` list the keys and their kinds. Each kind is a table whose `build` returns the distribution.
+"""
 
 import dataclasses
 import typing
@@ -22,22 +25,25 @@ BelowOne = Annotated[float, Meta(ge=0, lt=1, description="a number from 0 to bel
 
 
 class Numbers(Table, frozen=True):
-    """Random numbers about those of the scenario."""
+    """Random numbers about the nominal values of a scenario."""
 
     name: ClassVar[str] = "normal"  # of the kind
     distribution: ClassVar[str] = "normal"  # of `dispersions.numbers.RandomNumbers`
     width: ClassVar[str] = "std"  # the key that holds the spread; it is in degrees if its name ends with _deg
-    widest: ClassVar[float] = 4.6  # size that vectors of three stay below, all but one in 10 000, over the spread
+    widest: ClassVar[float] = 4.6  # norm over spread that one vector of three in 10 000 exceeds
     farthest: ClassVar[float] = 3.0  # largest deviation that bounds allow for, over the spread: three sigma
 
     def of(self, count: int = 1) -> np.ndarray:
-        """Return the widths of so many numbers, of which one of the table stands for all; in rad for degrees."""
+        """Return the widths of `count` numbers (count,), converted to rad if the key is in degrees.
+
+        A single width in the table applies to all numbers.
+        """
         width = np.ones(count) * getattr(self, self.width)
         return np.deg2rad(width) if self.width.endswith("_deg") else width
 
     @property
     def nothing(self) -> bool:
-        """Whether it leaves everything as it is."""
+        """Whether the spread is zero."""
         return not np.any(self.of())
 
     def build(self, parts: Any, count: int) -> Any:
@@ -46,7 +52,7 @@ class Numbers(Table, frozen=True):
 
 
 class Uniform(Numbers, frozen=True):
-    """Random numbers that are uniform, as far on either side."""
+    """Uniform random numbers, symmetric about the nominal value."""
 
     name: ClassVar[str] = "uniform"
     distribution: ClassVar[str] = "uniform"
@@ -85,12 +91,12 @@ def _numbers(
     Args:
         name: of the class.
         base: the distribution.
-        about: what the kind is.
-        meaning: of the width.
-        unit: of the width.
-        default: of the width; a `Scaled` one follows the mission.
-        type_: of the width.
-        deg: the width is in degrees, and its name says so.
+        about: docstring of the class.
+        meaning: meaning of the width.
+        unit: unit of the width.
+        default: default of the width; a `Scaled` one follows the mission.
+        type_: type of the width.
+        deg: whether the width is in degrees; its name then ends with _deg.
     """
     width, follows = base.width + ("_deg" if deg else ""), isinstance(default, Scaled)
     key = (width, Annotated[type_ | None if follows else type_, Meaning(meaning, unit)], None if follows else default)
@@ -102,7 +108,7 @@ def _numbers(
 _RATE, _BIAS = ("rad/s", Scaled(0.01, time=-1)), ("unit of d", Scaled(1e-3, inertia=1, order=-1))
 _BY_RATE, _BY_BIAS = "; default: 0.01, scaled to the mission", "; default: 1e-3, scaled to the mission"
 _ONE_EACH = ", one number for each state; default: 1 each"
-# the names are those of the classes, by which they are pickled
+# each variable has the name of its class, so that pickle finds the class in this module
 NormalRate = _numbers(
     "NormalRate", Numbers, "Each axis normal about initial.rate.", "1 sigma per axis" + _BY_RATE, *_RATE
 )
@@ -145,12 +151,12 @@ FACTORS, TURNS = (NormalFactor, UniformFactor), (NormalTurn, UniformTurn)
 
 
 class UniformAttitude(Table, frozen=True):
-    """Any attitude at all, uniform on SO(3)."""
+    """A random attitude, uniform on SO(3)."""
 
     kind: Literal["uniform"] = "uniform"
 
     def largest_angle(self, angle: float) -> float:
-        """Return the largest angle [rad] of an attitude drawn about one at this angle."""
+        """Return pi, the largest angle [rad] to the reference."""
         return np.pi
 
     def build(self, parts: Any, count: int) -> Any:
@@ -159,14 +165,14 @@ class UniformAttitude(Table, frozen=True):
 
 
 class AxisAngle(Table, frozen=True):
-    """A uniform angle about any axis: a body's from the reference at t = 0, a reference's from its own attitude."""
+    """A uniform angle about a random axis: of the body from the reference at t = 0, or of the reference."""
 
     kind: Literal["axis_angle"] = "axis_angle"
     min_deg: Annotated[Angle, Meaning("smallest angle", "deg")] = 20.0
     max_deg: Annotated[Angle, Meaning("largest angle", "deg")] = 140.0
 
     def largest_angle(self, angle: float) -> float:
-        """Return the largest angle [rad] of an attitude drawn about one at this angle."""
+        """Return the largest angle [rad] to the reference; angle: of the nominal attitude [rad]."""
         return float(np.deg2rad(self.max_deg))
 
     def build(self, parts: Any, count: int) -> Any:
@@ -175,13 +181,13 @@ class AxisAngle(Table, frozen=True):
 
 
 class NormalAttitude(Table, frozen=True):
-    """Turned by a normal rotation vector from what the scenario says."""
+    """The nominal attitude, turned by a normal rotation vector."""
 
     kind: Literal["normal"] = "normal"
     std_deg: Annotated[NotNegative, Meaning("1 sigma per axis", "deg")] = 1.0
 
     def largest_angle(self, angle: float) -> float:
-        """Return the angle [rad] that all but one of 10 000 attitudes drawn about one at this angle stay below."""
+        """Return the angle to the reference [rad] that one random attitude in 10 000 exceeds; angle: nominal [rad]."""
         return min(angle + 4.6 * float(np.deg2rad(self.std_deg)), np.pi)
 
     def build(self, parts: Any, count: int) -> Any:
@@ -190,9 +196,9 @@ class NormalAttitude(Table, frozen=True):
 
 
 class RelativeInertia(Table, frozen=True):
-    """The true body's principal moments off by a normal share, truncated at three sigma and to what a body can have."""
+    """Normal relative errors of the true principal moments, truncated at three sigma and to moments of a real body."""
 
-    farthest: ClassVar[float] = 3.0  # how far a moment goes, in times std
+    farthest: ClassVar[float] = 3.0  # largest deviation of a moment, over std
     kind: Literal["relative_normal"] = "relative_normal"
     std: Annotated[Share, Meaning("1 sigma of the share")] = 0.05
     axes_deg: Annotated[NotNegative, Meaning("1 sigma of the small rotation of the principal axes", "deg")] = 0.0
@@ -214,19 +220,25 @@ class UniformPhase(Table, frozen=True):
 
 
 class Interval(Table, frozen=True):
-    """A time between two, uniformly."""
+    """A uniform time between two times."""
 
     earliest: Annotated[NotNegative, Meaning("from when on it may be", "s")] = 0.0
     latest: Annotated[NotNegative | None, Meaning("until when; default: loop.t_end", "s")] = None
 
     def numbers(self, parts: Any, low: float, high: float) -> RandomNumbers:
-        """Return the random time [s], until the end of the run by default, and a number between two."""
+        """Return a uniform random time [s] and a uniform random number.
+
+        Args:
+            parts: nominal parts; the end of their run [s] is the default of `latest`.
+            low: smallest number.
+            high: largest number.
+        """
         end = float(parts.t_end) if self.latest is None else self.latest
         return interval([self.earliest, low], [end, high])
 
 
 class Outage(Interval, frozen=True):
-    """Begins at any time between two, uniformly."""
+    """Begins at a uniform time between two times."""
 
     kind: Literal["uniform"] = "uniform"
     duration: Annotated[
@@ -241,7 +253,7 @@ class Outage(Interval, frozen=True):
 
 
 class Failure(Interval, frozen=True):
-    """Of any one wheel, at any time between two, uniformly."""
+    """One random wheel fails at a uniform time between two times."""
 
     kind: Literal["uniform"] = "uniform"
     known: Annotated[Truth, Meaning("the torque is given to the other wheels from then on")] = False
@@ -252,7 +264,7 @@ class Failure(Interval, frozen=True):
 
 
 class Jitter(Table, frozen=True):
-    """Of each trial its own, between two, uniformly; each sample then comes early or late by up to it, uniformly."""
+    """A uniform largest jitter for each trial. Each sample is early or late by a uniform time up to it."""
 
     kind: Literal["uniform"] = "uniform"
     largest: Annotated[
@@ -265,7 +277,7 @@ class Jitter(Table, frozen=True):
         return interval([self.smallest], [self.largest])
 
 
-# by key: what is random, and the kinds, the default first
+# by key: its meaning and its kinds, the default first
 _DISTURBANCE: dict[str, tuple[str, tuple[Any, ...]]] = {
     "disturbance_phase": ("of every sinusoid, and of the orbit", (UniformPhase,)),
     "disturbance_amplitude": ("of each sinusoid and constant, an independent factor on each component", FACTORS),

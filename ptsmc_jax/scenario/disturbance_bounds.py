@@ -1,7 +1,8 @@
-"""The bounds of Assumption 1 that follow from a scenario's disturbance and from what is drawn of it.
+"""Compute the disturbance bounds of Assumption 1 from a scenario's disturbance and its dispersions. Start with `of`.
 
-K bounds each component of d, c each component of d'. The paper's own, 0.01 N m and 1e-3 N m/s, are those of its Case I:
-0.01 sin(0.1 t). Each disturbance says its own in its table; they add up over a sum.
+K bounds each component of d, and c bounds each component of d'. The published bounds, 0.01 N m and 1e-3 N m/s, belong
+to the disturbance 0.01 sin(0.1 t) of Case I. Each disturbance table has a method `bounds`, and the bounds of a sum add
+up.
 """
 
 import math
@@ -20,24 +21,27 @@ from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.values import MOST_STEPS
 from ptsmc_jax.signals import disturbances
 
-RATE = 10.0 / 12.0  # l / J of the paper's observer, 10 N m s on its mean moment of 12 kg m^2 [1/s]
-SIGMAS = 3.0  # of what is normal, and has no largest value
-POINTS = 2001  # of the run at least, along which a disturbance of one's own is looked at, and
-FINE = 0.1  # of its fastest rate a step at most [rad]: its own is then 0.2 % off
-PHASES = 16  # at which one is looked at whose phase is drawn
+RATE = 10.0 / 12.0  # l / J of the published observer [1/s], with a mean moment of inertia of 12 kg m^2
+SIGMAS = 3.0  # standard deviations that count as the largest value of a normal random number
+POINTS = 2001  # smallest number of times at which a custom disturbance is evaluated
+FINE = 0.1  # largest phase between two of these times [rad]: the error of the derivative is then 0.2 %
+PHASES = 16  # random phases at which a custom disturbance is evaluated
 
 
 class Bounds(NamedTuple):
-    """Largest size and rate of a disturbance, component by component."""
+    """Largest magnitude and rate of each component of a disturbance."""
 
     size: np.ndarray  # (m,) of d [N m, or unit of d]
     rate: np.ndarray  # (m,) of d' [the same per second]
 
 
 def of(scenario: Any) -> tuple[float, float] | None:
-    """K and c of a scenario's disturbance; None: it, or a reference on which it depends, is one's own, and was not run.
+    """Return K [N m, or unit of d] and c [the same per second] of a scenario's disturbance.
 
-    Raises ScenarioError where they are beyond all numbers.
+    The result is None if the disturbance, or the reference that determines it, is custom code that has not run yet.
+
+    Raises:
+        ScenarioError: a bound overflows.
     """
     inputs = scenario.inputs
     with np.errstate(over="ignore"):
@@ -53,7 +57,7 @@ def of(scenario: Any) -> tuple[float, float] | None:
 
 
 def drawn_factor(scenario: Any) -> float:
-    """The largest factor on the scenario's amplitude that is drawn."""
+    """Return the largest random factor on the disturbance's amplitude."""
     drawn = getattr(scenario.dispersion, "disturbance_amplitude", None)
     return 1.0 if drawn is None else 1.0 + drawn.farthest * getattr(drawn, drawn.width)
 
@@ -64,42 +68,61 @@ def _drawn_bias(scenario: Any) -> float:
 
 
 def walk_rate(scenario: Any, density: np.ndarray) -> np.ndarray:
-    """A rate c [unit of d/s] for a random walk of this density, which has no largest one.
+    """Return a rate c [unit of d/s] for a random walk, whose rate is not bounded.
 
-    Three sigma of what it changes by while the default observer forgets, 1 / RATE, over that time: so large are then
-    the errors of the estimate that K2 = c J / l covers.
+    It is three sigma of the change of the walk over the time constant J / l of the default observer, divided by that
+    time constant. With this c, K2 = c J / l covers three sigma of the estimate's error.
+
+    Args:
+        scenario: the scenario, for the observer's time constant.
+        density: density of the walk (m,) [unit of d/sqrt(s)].
     """
     forgets = 1.0 / observer_rate(scenario)
     return SIGMAS * density / math.sqrt(forgets)
 
 
 def observer_rate(scenario: Any) -> float:
-    """Return l / J of the paper's observer, scaled to the mission and at most 1 / h [1/s]; 10 without a body."""
+    """Return l / J of the published observer [1/s], scaled to the mission and at most 1 / h.
+
+    For a plant without a body the published rate is 10 1/s.
+    """
     rate = mission.scales(scenario).of(Scaled(10.0 if scenario.moments[0] is None else RATE, time=-1))
     return min(rate, 1.0 / scenario.loop.period) if scenario.sampled else rate
 
 
 def observer_gain(scenario: Any) -> float:
-    """Gain l of the paper's observer, 10 N m s on a mean moment of 12 kg m^2, scaled to the mission."""
+    """Return the gain l of the published observer [N m s], scaled to the mission.
+
+    The published gain is 10 N m s for a mean moment of 12 kg m^2.
+    """
     return observer_rate(scenario) * scenario.mean_inertia
 
 
 def turning(scenario: Any) -> float:
-    """How fast a body turns, about [rad/s]: as it starts, twice as fast as half a turn until t_f, and as its target."""
+    """Return an approximate bound on the body rate [rad/s].
+
+    It is the sum of the initial rate, the rate of the reference, and 2 pi / t_f, which is twice the mean rate of half a
+    turn within t_f.
+    """
     target = sum(scenario.reference.frequencies().values())
     return scenario.turning + target + 2.0 * math.pi / scenario.controller.t_f
 
 
 def target_waits(scenario: Any) -> bool:
-    """Whether the reference is one's own whose code was not run, so that nobody knows yet how it turns."""
+    """Whether the reference is custom code that has not run yet, so that its rate is unknown."""
     return getattr(getattr(scenario, "reference", None), "waits", False)
 
 
 def gravity_gradient(scenario: Any, orbit_rate: float) -> Bounds:
-    """Of 3 n^2 c x J c, c a unit vector: |c x J c| <= (J_3 - J_1)/2, and c x J c changes by J_3 - J_1 times |c'|.
+    """Return bounds of the gravity-gradient torque 3 n^2 c x J c, where c is the unit vector to the central body.
 
-    J_1 and J_3 are the smallest and the largest principal moment of the true body, three sigma apart where drawn; c
-    moves in the body's axes as the orbit and the body turn.
+    They follow from |c x J c| <= (J_3 - J_1) / 2 and |(c x J c)'| <= (J_3 - J_1) |c'|. J_1 and J_3 are the smallest and
+    the largest principal moment of the true body. If the inertia is dispersed, J_1 is decreased and J_3 increased by
+    three sigma. c moves in body axes with the rates of the orbit and of the body.
+
+    Args:
+        scenario: a scenario of a spacecraft whose reference is known.
+        orbit_rate: n [rad/s].
     """
     inertia = np.asarray(scenario.true_inertia, dtype=float)
     moments = np.sort(inertia) if inertia.ndim == 1 else np.linalg.eigvalsh(inertia)
@@ -133,7 +156,7 @@ def along_the_run(scenario: Any, signal: Any, fastest: float = 0.0) -> Bounds:
     for drawn in _as_drawn(scenario, signal):
         try:
             acting = np.asarray(lapack.vmap(drawn)(jnp.asarray(t), jax.tree.map(jnp.asarray, states)))
-        except Exception:  # which `own_checks` refuses before a flight, in one sentence
+        except Exception:  # `own_checks` reports it before a run
             acting = np.zeros(0)
         bad = np.flatnonzero(~np.isfinite(acting).all(axis=1)) if acting.shape == (t.size, scenario.inputs) else [0]
         if len(bad) and bad[0] == 0:
@@ -150,7 +173,7 @@ def along_the_run(scenario: Any, signal: Any, fastest: float = 0.0) -> Bounds:
 
 
 def _as_drawn(scenario: Any, signal: Any) -> list[Any]:
-    """A disturbance of one's own with the smallest and the largest amplitudes that are drawn, at phases all around."""
+    """Return a custom disturbance with the smallest and the largest random amplitudes, at `PHASES` phases."""
     found, most = [signal], drawn_factor(scenario)
     if most != 1.0 and disturbances.count(signal, "amplitude"):
         amplitudes = disturbances.values(signal, "amplitude")
@@ -162,7 +185,10 @@ def _as_drawn(scenario: Any, signal: Any) -> list[Any]:
 
 
 def _attitudes(scenario: Any, t: np.ndarray, left: np.ndarray) -> Any:
-    """States of the body on that way."""
+    """Return the states of the body on the nominal path at times t (n,) [s].
+
+    `left` (n,) is the remaining fraction of the initial rotation from the reference.
+    """
     reference = scenario.reference.build()
     target = lapack.vmap(lambda time: reference(time).q)(jnp.asarray(t))
     start = jnp.asarray(attitude_keys.quaternion(scenario.initial, "initial"))

@@ -1,4 +1,7 @@
-"""The disturbances of scenario files: their bounds, the keys besides their numbers, and the classes by kind."""
+"""The table [disturbance] of scenario files: bounds of each kind, and the classes by kind in `DISTURBANCES`.
+
+The numbers of a disturbance are declared in `signals.disturbances`. Start with `DisturbanceTable`.
+"""
 
 import dataclasses
 from collections.abc import Mapping
@@ -26,21 +29,27 @@ class DisturbanceTable(PartTable, frozen=True):
     sampled_only: ClassVar[bool] = False
 
     def placed(self, name: str) -> dict[str, Any]:
-        """Return the disturbances that act at once, by where a file has them; name: of this table."""
+        """Return the disturbances that act together, by their place in a file; name: of this table."""
         return {name: self}
 
     def quickest(self) -> float:
-        """Return how fast it changes [rad/s]; 0 if it is not known before its code is run."""
+        """Return the largest angular frequency of the disturbance [rad/s], 0 if its custom code has not run yet."""
         if self.made is None:
             return 0.0
         return fastest(self, "disturbance", self.part() if isinstance(self, Own) else self)
 
     def impulse(self, end: float) -> float:
-        """Return a bound on its integral until `end` [s], in N m s; 0: it stays small however long it acts."""
+        """Return a bound on the integral of the disturbance until `end` [s], in N m s.
+
+        It is 0 if the integral stays small over any time.
+        """
         return 0.0 if self.made is None else self.made.impulse(self, end)
 
     def bounds(self, scenario: Any) -> Bounds | None:
-        """Return the largest size and rate of each component, also if drawn; None: not known until its code is run."""
+        """Return the largest magnitude and rate of each component, dispersions included.
+
+        The result is None if custom code that determines it has not run yet.
+        """
         if self.made is None or disturbance_bounds.target_waits(scenario):
             return None
         if isinstance(self, Own):
@@ -50,10 +59,14 @@ class DisturbanceTable(PartTable, frozen=True):
         return Bounds(*self.made.bounds(msgspec.structs.replace(known, amplitude=largest)))
 
     def check(self, name: str) -> None:
-        """Raise ScenarioError if keys contradict each other; name: of its table."""
+        """Raise ScenarioError if keys contradict each other; name: of the table, for errors."""
 
     def build(self, inertia: Any) -> Any:
-        """Return the part of `signals.disturbances`; None: nothing acts. inertia: the true body's; None without one."""
+        """Return the part of `signals.disturbances`, None if nothing acts.
+
+        `inertia` is the inertia of the true body (3, 3) [kg m^2], None for a plant without a body. ScenarioError is
+        raised if a custom class declares random numbers that are not fields.
+        """
         made = self.part()
         fields = tuple(field.name for field in dataclasses.fields(made))
         known = isinstance(made.drawn, Mapping) and all(
@@ -67,7 +80,10 @@ class DisturbanceTable(PartTable, frozen=True):
         return made
 
     def walk(self, period: float) -> Any:
-        """Return 1 sigma a second of its random walk, a number for each input; None: there is none."""
+        """Return the rate of the random walk, 1 sigma per second for each input (m,), None if there is none.
+
+        `period` is the control period [s].
+        """
 
 
 class NoDisturbance(DisturbanceTable, frozen=True):
@@ -80,14 +96,14 @@ class NoDisturbance(DisturbanceTable, frozen=True):
         return Bounds(np.zeros(scenario.inputs), np.zeros(scenario.inputs))
 
     def build(self, inertia: Any) -> Any:
-        """Return None: nothing acts."""
+        """Return None."""
 
 
 class GravityTable(Attitude, DisturbanceTable, frozen=True):
     """The gravity gradient of a circular orbit."""
 
     def check(self, name: str) -> None:
-        """One attitude at most."""
+        """Raise ScenarioError for two attitudes or an invalid attitude."""
         attitude_keys.at_most_one(name, self)
         if attitude_keys.has_attitude(self):
             attitude_keys.quaternion(self, name)
@@ -95,21 +111,21 @@ class GravityTable(Attitude, DisturbanceTable, frozen=True):
             raise ScenarioError(f"{name}.sequence is {brief(self.sequence)}, but goes with euler_deg only")
 
     def quickest(self) -> float:
-        """Return 0: an orbit is slow."""
+        """Return 0, since an orbit is slow compared with the loop."""
         return 0.0
 
     def impulse(self, end: float) -> float:
-        """Return 0: it stays small."""
+        """Return 0: the torque is periodic, so its integral stays small."""
         return 0.0
 
     def bounds(self, scenario: Any) -> Bounds | None:
-        """See `disturbance_bounds.gravity_gradient`."""
+        """Return the bounds of `disturbance_bounds.gravity_gradient`."""
         if disturbance_bounds.target_waits(scenario):
             return None
         return disturbance_bounds.gravity_gradient(scenario, self.orbit_rate)  # pyright: ignore[reportAttributeAccessIssue]
 
     def build(self, inertia: Any) -> Any:
-        """Return the gravity gradient; the orbit's frame is the inertial one if no attitude is given."""
+        """Return the gravity gradient. The orbit frame is the inertial frame if no attitude is given."""
         turned = attitude_keys.has_attitude(self)
         orbit = attitude_keys.quaternion(self, "disturbance") if turned else np.array([0.0, 0.0, 0.0, 1.0])
         return self.part(inertia=inertia, orbit=vector(orbit))
@@ -127,10 +143,10 @@ class RandomWalkTable(DisturbanceTable, frozen=True):
         return Bounds(wandered, disturbance_bounds.walk_rate(scenario, density))
 
     def build(self, inertia: Any) -> Any:
-        """Return None: the rollout adds its steps."""
+        """Return None: the rollout adds the steps of the walk."""
 
     def walk(self, period: float) -> Any:
-        """Return steps of white noise, held over a period."""
+        """Return the density over the square root of the period: white noise that is held over a period."""
         return vector(self.density) / np.sqrt(period)  # pyright: ignore[reportAttributeAccessIssue]
 
 
@@ -151,12 +167,12 @@ class SumDisturbance(Table, frozen=True):
         return self
 
     def placed(self, name: str) -> dict[str, Any]:
-        """Return the terms of the sum."""
+        """Return the terms of the sum by their place in a file, such as disturbance.terms[0]."""
         return {f"{name}.terms[{k}]": term for k, term in enumerate(self.terms)}
 
 
 def _disturbances(first: str, body: bool) -> Mapping[str, type[Table]]:
-    """Return the disturbances by kind, this one first."""
+    """Return the disturbances by kind; first: the default kind, body: whether the plant is a spacecraft."""
     quicker = () if body else (("frequency", Scaled(1.0, time=-1, each=True)),)  # as in the paper's Figs. 1 and 2
     kinds: dict[str, Any] = {
         "sinusoid": table(DisturbanceTable, disturbances.Sinusoid, "sinusoid", body, quicker),

@@ -1,4 +1,7 @@
-"""What is wrong in a scenario, in one sentence, and values as such a sentence says them."""
+"""Configuration errors of scenarios, and the text of values in their messages. Start with `wrong`.
+
+A message is one sentence that names the key, its value and the allowed values.
+"""
 
 import json
 import re
@@ -6,17 +9,17 @@ from collections.abc import Mapping
 from typing import Any
 
 LONGEST_VALUE = 160  # characters of a value in an error
-MOST_BITS = 1023  # of a whole number, beyond which it is no finite float
+MOST_BITS = 1023  # largest length of a whole number that can become a finite float
 
 
 class ScenarioError(ValueError):
-    """A scenario that cannot be run. Its text is one sentence that names the key, the value and what is allowed.
+    """A configuration error. Its text is one sentence that names the key, the value and the allowed values.
 
     Attributes:
-        key: the key whose value is refused, such as "controller.eta"; empty if the error is about no single key.
+        key: the key whose value is not allowed, such as "controller.eta"; empty if no single key is wrong.
         value: the value of that key, as read.
         reason: the text after the value.
-        allowed: what is allowed, in words; empty if `reason` does not say it as "but must be ..".
+        allowed: the allowed values in words; empty if `reason` does not contain "but must be ..".
     """
 
     def __init__(self, text: str, *, key: str = "", value: Any = None, reason: str = "", allowed: str = ""):
@@ -24,12 +27,12 @@ class ScenarioError(ValueError):
         self.key, self.value, self.reason, self.allowed = key, value, reason, allowed
 
     def quoting(self, value: str) -> "ScenarioError":
-        """Return the error with this text in place of the value."""
+        """Return the error with this text instead of the value."""
         text = f"{self.key} is {value}{self.reason}"
         return ScenarioError(text, key=self.key, value=self.value, reason=self.reason, allowed=self.allowed)
 
     def _render_traceback_(self) -> list[str]:
-        """In a notebook that sentence, and nothing of how it came about: IPython asks for this."""
+        """Return the sentence alone: IPython prints it in notebooks instead of a traceback."""
         return [f"ScenarioError: {self}"]
 
 
@@ -39,7 +42,7 @@ def wrong(key: str, value: Any, allowed: str) -> ScenarioError:
     Args:
         key: the key, such as "controller.eta".
         value: its value.
-        allowed: what is allowed, in words.
+        allowed: the allowed values, in words.
     """
     return refused(key, value, f", but must be {allowed}", allowed)
 
@@ -51,25 +54,25 @@ def refused(key: str, value: Any, reason: str, allowed: str = "") -> ScenarioErr
         key: the key, such as "controller.eta".
         value: its value.
         reason: the text after the value, with the punctuation before it.
-        allowed: what is allowed, in words; empty if the reason says it in another way.
+        allowed: the allowed values, in words; empty if the reason does not end with them.
     """
     error = ScenarioError("", key=key, value=value, reason=reason, allowed=allowed)
     return error.quoting(brief(value))
 
 
 def brief(value: Any) -> str:
-    """A value as an error says it: as `terminal` does, a long one cut."""
+    """Return the text of a value for an error message, cut after `LONGEST_VALUE` characters."""
     shown = show(value)
     return shown if len(shown) <= LONGEST_VALUE else f"{shown[:LONGEST_VALUE]} ... ({len(shown)} characters)"
 
 
 def show_key(key: str) -> str:
-    """A key as a scenario file would write it: in quotes where it has other letters than TOML's own."""
+    """Return a key as TOML writes it, in quotes if it has characters that a bare key must not have."""
     return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else json.dumps(key, ensure_ascii=False)
 
 
 def show(value: Any) -> str:
-    """A value as a scenario file would write it."""
+    """Return a value as a scenario file would write it."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, str):
@@ -80,6 +83,6 @@ def show(value: Any) -> str:
         return "[" + ", ".join(map(show, value)) + "]"
     if isinstance(value, Mapping):
         return "{ " + ", ".join(f"{show_key(k)} = {show(v)}" for k, v in value.items()) + " }"
-    if isinstance(value, int) and value.bit_length() > MOST_BITS:  # Python refuses to write very long ones out
+    if isinstance(value, int) and value.bit_length() > MOST_BITS:  # Python refuses to print longer ones
         return f"a whole number of {value.bit_length()} bits"
     return str(value)

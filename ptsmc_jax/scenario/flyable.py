@@ -1,4 +1,4 @@
-"""Checked scenarios turned into what flies: parts, dispersion, requirements."""
+"""Build everything that a run needs from a validated scenario: parts, dispersions, requirements. Start with `study`."""
 
 import typing
 from dataclasses import dataclass
@@ -17,29 +17,29 @@ from ptsmc_jax.simulation.requirements import Requirement
 
 @dataclass(frozen=True)
 class Study:
-    """A scenario ready to run."""
+    """A scenario with the parts, dispersions and requirements that are built from it."""
 
     scenario: Scenario
     parts: Parts
     dispersion: variation.Dispersion
-    requirements: tuple[Requirement, ...]  # of its runs
-    margins: tuple[Requirement, ...]  # of its loop
+    requirements: tuple[Requirement, ...]  # on metrics of runs
+    margins: tuple[Requirement, ...]  # on stability margins of the loop
 
     __repr__ = listing
 
     @property
     def drawn(self) -> bool:
-        """Whether anything differs from trial to trial."""
+        """Whether trials differ from each other."""
         return self.dispersion.varies or not self.parts.sensors.perfect or self.parts.walk_rate is not None
 
     @property
     def catalogue(self) -> dict[str, catalogues.Entry]:
-        """The metrics that this scenario's runs have, by name."""
+        """The metrics of this scenario's runs, by name."""
         return catalogue(self.scenario)
 
 
 def catalogue(scenario: Scenario) -> dict[str, catalogues.Entry]:
-    """The metrics that a scenario's runs have, by name."""
+    """Return the metrics of a scenario's runs, by name."""
     timed = {r.timed for r in requirements(scenario)}
 
     def there(name: str, entry: catalogues.Entry) -> bool:
@@ -53,7 +53,7 @@ def catalogue(scenario: Scenario) -> dict[str, catalogues.Entry]:
 
 
 def requirements(scenario: Scenario) -> tuple[Requirement, ...]:
-    """What a scenario asks of its runs."""
+    """Return the requirements on the metrics of a scenario's runs."""
     units = scenario.metrics
     return tuple(
         Requirement(
@@ -72,7 +72,7 @@ def requirements(scenario: Scenario) -> tuple[Requirement, ...]:
 
 
 def margin_requirements(scenario: Scenario) -> tuple[Requirement, ...]:
-    """What a scenario asks of its loop."""
+    """Return the requirements on the stability margins of a scenario's loop."""
     return tuple(
         Requirement(name, float(typing.cast(float, value)), margin.unit, at_least=margin.at_least)
         for name, value in scenario.requirements.items()
@@ -83,12 +83,25 @@ def margin_requirements(scenario: Scenario) -> tuple[Requirement, ...]:
 def study(
     scenario: Scenario | str | Path, saves: object = (), reach: timing.Reach | None = None, *, drawn: bool = True
 ) -> Study:
-    """The parts of a checked scenario, or of its file; `saves`: times [s] at which a continuous run must have nodes.
+    """Build the parts, dispersions and requirements of a scenario.
 
-    drawn: the initial attitude is drawn where a dispersion says so; False: the nominal one is flown, and looked at.
-    Runs the file of a system that the scenario names, which is then a program: read it before. Raises ScenarioError
-    where the law meets its singularity on the way from the initial state to the reference, TypeError where what is
-    given is no scenario, or no reach.
+    The function runs Python files that the scenario names. Read such a file before you run a scenario of somebody else.
+
+    Args:
+        scenario: a validated scenario, or the path of a scenario file.
+        saves: times [s] at which the grid of the continuous loop must have nodes.
+        reach: ranges of gains and control period that the compiled program must cover; by default the scenario's
+            values only, see `timing.reach_of`.
+        drawn: whether the dispersed initial attitude is simulated. If False, the nominal path is checked for the
+            singularity of the law even if the attitude is dispersed.
+
+    Returns:
+        The study, whose `parts` are the arguments of the simulation.
+
+    Raises:
+        ScenarioError: the law meets its singularity between the initial state and the reference, custom code fails, or
+            the run needs too many steps.
+        TypeError: `scenario` is not a scenario, or `reach` is not a `Reach`.
     """
     if not isinstance(reach, timing.Reach | None):
         raise TypeError(f"a reach is needed, as reach_of(scenario) returns it, but this is a {type(reach).__name__}")

@@ -1,4 +1,7 @@
-"""What tuning may move in a scenario: the default bounds of each gain, and how far they may be set."""
+"""Resolve the table [tune]: the free gains, their default bounds, and the allowed range of bounds.
+
+Start with `resolve`. The bounds of single gains are in `gain_bounds`.
+"""
 
 import math
 from collections.abc import Container, Mapping
@@ -11,13 +14,18 @@ from ptsmc_jax.scenario.gain_bounds import Choice, wide
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import catalogues
 
-FIRST = ("t_f", "p", "surface_rate")  # whose bounds those of other gains follow
+FIRST = ("t_f", "p", "surface_rate")  # gains whose bounds determine the bounds of other gains
 
 
 def resolve(scenario: Scenario, tune: tables.Tune) -> tables.Tune:
-    """The table with its defaults: gains, bounds, level; of a scenario that is checked but for it.
+    """Return the table [tune] with its default gains, bounds and level.
 
-    Raises ScenarioError where it asks for what cannot be tuned.
+    Args:
+        scenario: a scenario that is validated except for this table.
+        tune: the table as read.
+
+    Raises:
+        ScenarioError: a gain, a bound or the objective is not possible in this scenario.
     """
     free = tune.free
     if free is None:
@@ -39,7 +47,7 @@ def resolve(scenario: Scenario, tune: tables.Tune) -> tables.Tune:
 
 
 def need_some(scenario: Scenario) -> None:
-    """Raise ScenarioError where a scenario with [tune] has no gain to find: a law of one's own need not have any."""
+    """Raise ScenarioError if a scenario with [tune] has no free gain, which is possible with a custom law."""
     if not scenario.search.gains:
         raise ScenarioError(
             f"tune.free is absent, and controller.kind = {errors.show(scenario.controller.kind)} with observer.kind = "
@@ -49,12 +57,12 @@ def need_some(scenario: Scenario) -> None:
 
 
 def observer_follows(scenario: Scenario) -> bool:
-    """Whether the observer's t_o is absent, and so a share of t_f."""
+    """Whether the observer's t_o is absent, so that it is a fraction of t_f."""
     return getattr(scenario.observer, "t_o", 0.0) is None
 
 
 def _check(scenario: Scenario, tune: tables.Tune) -> None:
-    """Raise ScenarioError where the table asks for what cannot be tuned, before defaults are computed from it."""
+    """Raise ScenarioError for invalid gains, objective or bounds, before default bounds are computed."""
     free, own = tune.gains, scenario.gains
     if len(set(free)) < len(free):
         raise wrong("tune.free", free, "a list that names each gain once")
@@ -104,7 +112,7 @@ def _check_objective(scenario: Scenario, tune: tables.Tune, said: str) -> None:
 
 
 def _absent(scenario: Scenario, name: str) -> str:
-    """Why a scenario has no such gain, and what would give it one."""
+    """Return the reason why a scenario lacks a gain, and the change that provides it."""
     law, observer = (errors.show(table.kind) for table in (scenario.controller, scenario.observer))
     match name:
         case "observer_gain":
@@ -135,15 +143,16 @@ def _check_bounds(choice: Choice, name: str) -> None:
 
 
 def _default(choice: Choice, name: str) -> tuple[float, float]:
-    """The usual bounds, moved where the law allows the scenario's own gain outside them.
+    """Return the usual bounds, widened if the scenario's gain is outside of them and allowed.
 
-    Then to half the distance, or twice the distance, that it keeps from the least that is allowed.
+    The lower bound moves to the middle between the gain and the smallest allowed value. The upper bound moves to twice
+    the gain's distance from the smallest allowed value, at most to the middle between the gain and the largest one.
     """
     gain = gain_bounds.of(choice.scenario, name)
     (low, high), own = gain.usual(choice), _own(choice.scenario, name)
     if own:
         least, most, closed = gain.allowed(choice)
-        if math.isinf(least):  # of one's own, that may be negative: as far out as the usual ones are apart
+        if math.isinf(least):  # a custom gain that may be negative: extend the interval by its width
             least = min(low, *own) - (high - low)
         if min(own) < low and (least <= min(own) if closed else least < min(own)):
             low = (least + min(own)) / 2
@@ -153,7 +162,7 @@ def _default(choice: Choice, name: str) -> tuple[float, float]:
 
 
 def _own(scenario: Scenario, name: str) -> tuple[float, ...]:
-    """The scenario's gain of this name, on each axis where it has several; none if it has none."""
+    """Return the scenario's values of a gain: one for each axis, or one for all, or none if it is absent."""
     table = next(table for table in scenario.tuned_tables.values() if name in table.gains)
     value = getattr(table, name.removeprefix(table.prefix))
     if value is None or (name == "sign_width" and value == 0.0):
@@ -162,9 +171,15 @@ def _own(scenario: Scenario, name: str) -> tuple[float, ...]:
 
 
 def border(scenario: Scenario, name: str, side: str, bound: float) -> str | None:
-    """What lies beyond a bound of a gain, "lower" or "upper", in words; None: nothing that is known.
+    """Return the reason, in words, why a gain beyond a bound is useless; None if no reason is known.
 
-    A bound says something where it is the usual one, or beyond it.
+    A reason is known only for a bound that is at or beyond the usual bound.
+
+    Args:
+        scenario: a scenario.
+        name: name of the gain.
+        side: "lower" or "upper".
+        bound: the bound.
     """
     tune = scenario.tune
     if not scenario.sampled or tune is None:
@@ -179,9 +194,18 @@ def border(scenario: Scenario, name: str, side: str, bound: float) -> str | None
 
 
 def beyond(scenario: Scenario, name: str, side: str) -> float | None:
-    """A gain a tenth of its interval beyond a bound, or half as far as it may go; None: known, or none is allowed.
+    """Return a value of a gain beyond a bound, to test whether the bound limits the objective.
 
-    Of an interval that is searched on a log scale a tenth of its logarithm.
+    The value lies a tenth of the interval beyond the bound, on a log scale if the interval is searched on one. It stays
+    closer to the bound than to the end of the allowed range.
+
+    Args:
+        scenario: a scenario with [tune].
+        name: name of the gain.
+        side: "lower" or "upper".
+
+    Returns:
+        The value, or None if `border` knows the reason of the bound or if no value beyond it is allowed.
     """
     tune = scenario.search
     low, high = tune.bounds[name]
@@ -194,7 +218,7 @@ def beyond(scenario: Scenario, name: str, side: str) -> float | None:
     else:
         value = low - 0.1 * (high - low) if side == "lower" else high + 0.1 * (high - low)
     value = max(value, 0.5 * (least + low)) if side == "lower" else min(value, 0.5 * (most + high))
-    return None if value in (low, high) else float(f"{value:.4g}")  # on it: the least that there is
+    return None if value in (low, high) else float(f"{value:.4g}")  # None: at the end of the allowed range
 
 
 def widened(
@@ -202,14 +226,14 @@ def widened(
 ) -> dict[str, tuple[float, float]]:
     """Return wider bounds for gains that ended on a default bound, by name.
 
+    A bound on a log scale moves by a factor of ten, and a bound on a linear scale by half of the interval. Neither
+    moves more than half way to the end of the allowed range. A bound stays if the loop is unstable beyond it, or if
+    the gain has no influence there.
+
     Args:
         scenario: with the bounds that were searched.
         sides: "lower" or "upper" for each gain on a bound, by its name.
         defaulted: paths of the keys that the user's scenario leaves out.
-
-    A bound on a log scale moves by a factor of ten, and a bound on a linear scale by half of the interval. Neither
-    moves more than half way to the end of the allowed range. A bound stays if the loop is unstable beyond it, or if
-    the gain has no influence there.
     """
     tune, found = scenario.search, dict[str, tuple[float, float]]()
     for name, side in sides.items():
@@ -232,12 +256,12 @@ def widened(
 
 
 def usual(scenario: Scenario, name: str) -> tuple[float, float]:
-    """The default bounds of a free gain, before they reach out to the scenario's own."""
+    """Return the usual bounds of a free gain, before they are widened to include the scenario's gain."""
     tune = scenario.search
     return gain_bounds.of(scenario, name).usual(Choice(scenario, tune.gains, tune.bounds))
 
 
 def by_default(scenario: Scenario, name: str) -> tuple[float, float]:
-    """The bounds of a free gain where none are given: the usual ones, reaching out to the scenario's own."""
+    """Return the default bounds of a free gain: the usual ones, widened to include the scenario's gain."""
     tune = scenario.search
     return _default(Choice(scenario, tune.gains, tune.bounds), name)

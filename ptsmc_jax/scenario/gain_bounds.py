@@ -1,4 +1,7 @@
-"""The usual bounds of gains by the names that declarations use, and the bounds that a declaration itself has."""
+"""Usual and allowed bounds of each gain of a search. Start with `of`.
+
+The bounds are in `BOUNDS`, by the names that declarations of gains use, or in the declaration itself.
+"""
 
 import math
 from collections.abc import Callable, Mapping
@@ -14,7 +17,9 @@ SLOWEST_DECAY = 3.5  # t_f times the least K1
 
 
 def wide(low: Any, high: Any) -> Any:
-    """Whether an interval, or each of many, is searched on a log scale: above zero, its ends more than tenfold apart.
+    """Whether an interval is searched on a log scale: it is above zero and its ends differ by more than a factor of 10.
+
+    The arguments are numbers, or arrays of one shape for many intervals.
 
     >>> wide(0.1, 2.0), wide(0.5, 2.0), wide(-1.0, 2.0)
     (True, False, False)
@@ -23,7 +28,7 @@ def wide(low: Any, high: Any) -> Any:
 
 
 class Choice(NamedTuple):
-    """What bounds of a gain follow from: the scenario, the gains that are free, and bounds that are known already."""
+    """The inputs of the bounds of a gain: the scenario, the free gains, and the bounds that are known already."""
 
     scenario: Any
     free: tuple[str, ...]
@@ -46,16 +51,16 @@ class Choice(NamedTuple):
 
     @property
     def shortest_delta(self) -> float:
-        """The shortest delta [s]: a period, if there is one."""
+        """The shortest delta [s]: a control period in the sampled loop, otherwise 0."""
         return self.scenario.loop.period if self.sampled else 0.0
 
     def smallest(self, name: str) -> float:
-        """What one of the law's gains is at least: its lower bound, or its own value where it is not free."""
+        """Return the smallest value of a gain of the law: its lower bound, or its value if it is not free."""
         return self.bounds[name][0] if name in self.bounds else getattr(self.law, name)
 
 
 class Allowed(NamedTuple):
-    """Between which numbers bounds of a gain may be set, the upper one excluded."""
+    """The open range of allowed bounds of a gain; `lower_included`: whether `lower` itself is allowed."""
 
     lower: float
     upper: float
@@ -69,15 +74,15 @@ def _positive(_: Choice) -> Allowed:
 class GainBounds(NamedTuple):
     """The bounds of a gain, as functions of a `Choice`."""
 
-    usual: Callable[[Choice], Interval]  # where a scenario gives none
-    # None of them contains zero, since the discontinuous sign has no gradient
+    usual: Callable[[Choice], Interval]  # the bounds if a scenario gives none
+    # No range contains sign_width = 0, since the discontinuous sign has no gradient
     allowed: Callable[[Choice], Allowed] = _positive
-    below: str | None = None  # what lies below the usual lower bound in the sampled loop, in words
-    above: str | None = None  # and above the upper one
+    below: str | None = None  # why values below the usual lower bound are useless in the sampled loop, in words
+    above: str | None = None  # the same for values above the usual upper bound
 
 
 def of(scenario: Any, name: str) -> GainBounds:
-    """Return the bounds of a gain of a scenario, by its name."""
+    """Return the bounds of a scenario's gain; name: of the gain, such as "observer_gain"."""
     table = next(table for table in scenario.tuned_tables.values() if name in table.gains)
     key = name.removeprefix(table.prefix)
     declared = table.declared.get(key)
@@ -112,7 +117,7 @@ def _declared(declared: Declaration, called: str) -> GainBounds:
 
 
 def _converged(scenario: Any) -> float:
-    """Prescribed time of the observer [s], which t_f must not fall below."""
+    """Return the prescribed time of the observer [s], the smallest t_f; 0 if it has none."""
     return getattr(scenario.observer, "t_o", None) or 0.0
 
 
@@ -130,7 +135,7 @@ def _allowed_t_f(choice: Choice) -> Allowed:
 
 def _usual_delta(choice: Choice) -> Interval:
     """A period to a quarter of t_f, or to twice the design's delta if that is longer."""
-    t_f = choice.smallest("t_f")  # below every one
+    t_f = choice.smallest("t_f")  # delta must be below every t_f of the search
     lower = choice.shortest_delta or t_f / 600.0
     upper = max(t_f / 4.0, 4.0 * lower)
     if choice.sampled:
@@ -162,7 +167,7 @@ def _usual_eta(choice: Choice) -> Interval:
 
 
 def _in_mission(low: float, high: float, power: Callable[[Any], float]) -> Callable[[Choice], Interval]:
-    """Return bounds in the units of a mission; power: of time in them, from the law."""
+    """Return bounds that scale with the mission time to a power; power: a function of the law's table."""
 
     def interval(choice: Choice) -> Interval:
         unit = mission.scales(choice.scenario).time ** power(choice.law)
@@ -177,7 +182,7 @@ def _usual_p(choice: Choice) -> Interval:
 
 
 def _allowed_p(choice: Choice) -> Allowed:
-    """For gamma - 1/p > 1; if gamma is free too, it follows p."""
+    """Return the p with gamma - 1/p > 1. If gamma is free too, its bounds follow p instead."""
     return Allowed(1.0 if "gamma" in choice.free else max(1.0, 1.0 / (choice.law.gamma - 1.0)), 2.0)
 
 
@@ -187,19 +192,19 @@ def _usual_gamma(choice: Choice) -> Interval:
 
 
 def _allowed_gamma(choice: Choice) -> Allowed:
-    """Gamma - 1/p > 1, for every p."""
+    """Return the gamma with gamma - 1/p > 1 for every p of the search."""
     return Allowed(1.0 + 1.0 / choice.smallest("p"), math.inf)
 
 
 def _dead_beat(choice: Choice) -> Interval:
-    """An observer's gain: from l / J = 1.5 / t_f up to that of a deadbeat one."""
+    """Return observer gains [N m s] from l / J = 1.5 / t_f to the gain of a deadbeat observer."""
     least = mission.SLOWEST_OBSERVER / choice.t_f * choice.scenario.mean_inertia
     high = scales.dead_beat_gain(choice.scenario) if choice.sampled else 0.0
     return least, high if high > least else 600.0 * least
 
 
 def _usual_bound(choice: Choice) -> Interval:
-    """C of a finite-time observer, a bound on the disturbance's rate."""
+    """Return gains of a finite-time observer, which bound the disturbance's rate."""
     own = choice.scenario.observer.gain
     return max(choice.law.disturbance_rate_bound, 0.05 * min(own)), 50.0 * max(own)
 
@@ -210,7 +215,7 @@ def _allowed_bound(choice: Choice) -> Allowed:
 
 
 def _usual_corner(choice: Choice) -> Interval:
-    """A decade either way, but half of the Nyquist frequency."""
+    """Return a tenth to ten times the corner, at most half of the Nyquist frequency or the corner."""
     corner = choice.scenario.devices.command_filter.corner
     return 0.1 * corner, min(10.0 * corner, max(0.5 * math.pi / choice.scenario.loop.period, 0.5 * corner))
 

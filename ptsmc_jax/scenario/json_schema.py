@@ -1,4 +1,4 @@
-"""The JSON Schema of scenario files, with which editors complete and check them."""
+"""The JSON Schema of scenario files, for completion and validation in editors. Start with `json_schema`."""
 
 import typing
 from collections.abc import Mapping
@@ -16,7 +16,7 @@ Schema = dict[str, Any]
 
 
 def json_schema() -> Schema:
-    """Return the JSON Schema (draft 2020-12) of scenario files: the tables of a spacecraft, a chain or a system."""
+    """Return the JSON Schema (draft 2020-12) of scenario files for a spacecraft, a chain or a system."""
     plants = [_plant(kind, made) for kind, made in layouts.SCENARIOS.items()]
     dialect = "https://json-schema.org/draft/2020-12/schema"
     return {"$schema": dialect, "title": "Scenario of ptsmc", "anyOf": plants}
@@ -41,7 +41,7 @@ def _plant(kind: str, made: type[Scenario]) -> Schema:
 
 
 def _kinds(name: str, kinds: type[Table] | Kinds, unit_of_d: str) -> Schema:
-    """Return the schema of a table: one object for each kind, the default one without the key `kind` too."""
+    """Return the schema of a table: one object for each kind. The key `kind` is optional for the default kind."""
     if not isinstance(kinds, Mapping):
         return _struct(kinds, unit_of_d, name)
     first, found = next(iter(kinds)), []
@@ -72,7 +72,7 @@ def _object(description: str, properties: Schema, *, more: bool = False) -> Sche
 
 
 def _leaf(hint: Any) -> Schema:
-    """Return the schema of a value, without what only a default of None allows."""
+    """Return the schema of a value, without null for a default of None."""
     found: Schema = msgspec.json.schema(hint)
     some = [one for one in found.get("anyOf", []) if one.get("type") != "null"]
     one = {**(some[0] if len(some) == 1 else found)}
@@ -82,7 +82,7 @@ def _leaf(hint: Any) -> Schema:
 
 
 def _with_unit(number: Schema, items: Schema) -> Schema:
-    """Return the schema of a number, or a list of numbers, each of which may be text with a unit."""
+    """Return the schema of a number, or of a list of numbers, and allow texts with a unit as numbers."""
     if items:
         return {**number, "items": {"anyOf": [items, {"type": "string"}]}}
     return {"anyOf": [number, {"type": "string"}]}

@@ -1,4 +1,8 @@
-"""What a scenario's tables and keys mean, from the declarations, types and defaults of their structs."""
+"""Meanings, units, allowed values and defaults of the keys of scenario files. Start with `of`.
+
+They come from the declarations, types and defaults of the table classes. Error messages, the JSON Schema and the
+reference page of scenarios are made from them.
+"""
 
 import types
 import typing
@@ -18,24 +22,24 @@ class Key(NamedTuple):
 
     name: str
     meaning: str
-    unit: str  # empty where it has none
-    allowed: str  # in words
-    default: Any  # None: off, or said in `meaning`; NODEFAULT: needed
+    unit: str  # empty if it has none
+    allowed: str  # allowed values, in words
+    default: Any  # None: off, or described in `meaning`; NODEFAULT: required
 
     @property
     def text(self) -> str:
-        """Its meaning with its unit."""
+        """The meaning with the unit in brackets."""
         return self.meaning + (f" [{self.unit}]" if self.unit else "")
 
 
 def of(struct: type[Table], unit_of_d: str = UNIT_OF_D) -> list[Key]:
     """Return the keys of a table, without `kind`, in the order of the struct.
 
-    The keys of a custom kind are those that every such table has. The keys of its class, in `rest`, are not known here.
+    For a custom kind, only the keys that all custom parts share are known here. The keys of its class are in `rest`.
 
     Args:
         struct: the table.
-        unit_of_d: the unit of the plant's disturbance, for the keys whose unit is made from it.
+        unit_of_d: the unit of the plant's disturbance, for units that contain it.
     """
     hints = typing.get_type_hints(struct, include_extras=True)
     declared: Mapping[str, Declaration] = getattr(struct, "declared", {})
@@ -58,19 +62,26 @@ def of(struct: type[Table], unit_of_d: str = UNIT_OF_D) -> list[Key]:
 
 
 def about(struct: type[Table]) -> str:
-    """Return what a table, or a kind of it, is: its docstring, which python -OO leaves out."""
+    """Return the description of a table or of one of its kinds: its docstring, which python -OO removes."""
     return " ".join((struct.__doc__ or "").split())
 
 
 def kinds_with(name: str, key: str, struct: type[Table], kinds: Kinds) -> str:
-    """Which kind a table is of, and of which others a key is that it has not; empty where it is of none."""
+    """Return a hint that a key belongs to other kinds of a table, empty if no other kind has it.
+
+    Args:
+        name: name of the table.
+        key: name of the key.
+        struct: class of the table, one of `kinds`.
+        kinds: classes by kind.
+    """
     others = [f'"{kind}"' for kind, other in kinds.items() if key in other.__struct_fields__]
     own = next((kind for kind, other in kinds.items() if other is struct), None)
     return f' of {name}.kind = "{own}", but of {", ".join(others)}' if others else ""
 
 
 def homes(layout: Mapping[str, type[Table] | Kinds]) -> dict[str, list[str]]:
-    """The tables of a scenario in which each key stands, in order, but for "kind"."""
+    """Return the names of the tables that have a key, for each key except "kind"."""
     found: dict[str, list[str]] = {}
     for name, table in layout.items():
         for struct in table.values() if isinstance(table, Mapping) else [table]:
@@ -81,7 +92,16 @@ def homes(layout: Mapping[str, type[Table] | Kinds]) -> dict[str, list[str]]:
 
 
 def elsewhere(name: str, key: str, layout: Mapping[str, type[Table] | Kinds]) -> str:
-    """Where a key stands that the table of this name has not, as in "loop.period is"; empty: nowhere, or there too."""
+    """Return a hint that other tables have a key, such as "loop.period is".
+
+    Args:
+        name: name of the table that was searched.
+        key: name of the key.
+        layout: the tables of a scenario, by name.
+
+    Returns:
+        The hint, empty if the table has the key itself or if no table has it.
+    """
     known = homes(layout).get(key, [])
     if name in known or not known:
         return ""
@@ -94,7 +114,7 @@ def bare(kind: Any) -> Any:
 
 
 def allowed(kind: Any) -> str:
-    """Return what a type allows, in words."""
+    """Return the values that a type allows, in words."""
     said = next((one.description for one in getattr(kind, "__metadata__", ()) if isinstance(one, msgspec.Meta)), None)
     if said is not None:
         return said

@@ -1,4 +1,7 @@
-"""The laws of scenario files: the keys that they have besides their own numbers, and the classes by kind."""
+"""The table [controller] of scenario files: keys and defaults that laws share, and the classes by kind in `LAWS`.
+
+The numbers of a law are declared in `laws`. Start with `LawTable`.
+"""
 
 import dataclasses
 from collections.abc import Mapping
@@ -19,7 +22,7 @@ KINEMATICS = {"chain": kinematics.ChainKinematics, "system": kinematics.SecondOr
 
 
 class LawTable(PartTable, frozen=True):
-    """A law, whatever it is for."""
+    """A law for any plant."""
 
     t_f: Annotated[Positive, Meaning("the prescribed time, or when the error is judged", "s")] = 30.0
     disturbance_rate_bound: Annotated[
@@ -39,12 +42,12 @@ class LawTable(PartTable, frozen=True):
 
     @property
     def implicit(self) -> bool:
-        """Whether the held input is chosen for the end of its period."""
+        """Whether the sampled law is discretised implicitly: it uses s at the end of the control period."""
         return getattr(self, "sampling", None) == "implicit"
 
     @property
     def law(self) -> Any:
-        """The class of the law; `AccelerationLaw` stands for a custom one whose code was not run yet."""
+        """The class of the law, `AccelerationLaw` for a custom law whose code has not run yet."""
         return self.made or AccelerationLaw
 
     def kinematics(self, motion: str) -> Any:
@@ -55,7 +58,7 @@ class LawTable(PartTable, frozen=True):
         return kinematics.AdditiveKinematics if additive else kinematics.MultiplicativeKinematics
 
     def free(self, *, sampled: bool) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Its gains that are free where a scenario does not say, those before and those after the observer's."""
+        """Return the law's gains that are free by default: those before and those after the observer's in the list."""
         rest = self.free_if_sampled if sampled else ()  # implicit sampling has no boundary layer
         return self.free_by_default, tuple(name for name in rest if not (self.implicit and name == "sign_width"))
 
@@ -76,31 +79,43 @@ class LawTable(PartTable, frozen=True):
         return msgspec.structs.replace(self, **{k: v for k, v in follows.items() if getattr(self, k) is None})
 
     def designed(self, scenario: Any) -> Mapping[str, float]:
-        """Return the gains that the mission suggests; none if those of the paper's case stay, scaled or not."""
+        """Return the gains that are designed for the sampled loop, by key.
+
+        There are none if the loop is continuous or if the scenario is a published case: `filled` then uses the
+        published gains, scaled to the mission.
+        """
         if not scenario.sampled or mission.published(scenario):
             return {}
         return self.gains_of(mission.design(scenario), scenario)
 
     def published_in(self, units: mission.Scales) -> dict[str, Any]:
-        """Return the gains of the paper's case, by key, in the units of a mission."""
+        """Return the published gains by key, scaled to the units of a mission."""
         return {key: units.of(scaled, self) for key, scaled in self.scaled.items()}
 
     def gains_of(self, design: mission.Design, scenario: Any) -> Mapping[str, float]:
-        """Return this law's gains for a design of the sampled loop, by key: published ones within the bandwidth."""
+        """Return this law's gains for a design of the sampled loop, by key.
+
+        The law receives the published gains, scaled to the bandwidth of the design.
+        """
         published = self.published_in(mission.scales(scenario)._replace(time=1.0 / design.rate))
         return self.law.designed(design, published)
 
     def noise_of_s(self, position: float, velocity: float) -> float:
-        """Return the noise of the sliding variable (1 sigma) for noise of the error and of its rate [1/s]."""
+        """Return the noise of the sliding variable s, 1 sigma.
+
+        Args:
+            position: noise of the error, 1 sigma.
+            velocity: noise of the error's rate, 1 sigma [1/s].
+        """
         return self.law.noise_of_s(self, position, velocity)
 
     def turning(self, t_f: float) -> tuple[str, float]:
-        """Return the key that says how fast the law turns the body, and that rate [rad/s], at most."""
+        """Return the key that determines how fast the law turns the body, and the largest rate [rad/s]; t_f: [s]."""
         key, rate = self.law.turning(self, t_f)
         return f"controller.{key}", rate
 
     def check(self, scenario: Any) -> None:
-        """Raise ScenarioError if keys contradict each other, or the scenario's."""
+        """Raise ScenarioError if keys contradict each other or the scenario."""
         if not self.law.prescribed and scenario.order != 2:
             needed = f"2 with controller.kind = {show(scenario.controller.kind)}, a law of second order"
             raise wrong("plant.order", scenario.order, needed)
@@ -111,7 +126,7 @@ class LawTable(PartTable, frozen=True):
             scenario.need_samples('controller.sampling = "implicit"')
 
     def build(self, scenario: Any, model: Any) -> Any:
-        """Return the law for a plant's model."""
+        """Return the law for the design model of the plant, see `Scenario.model`."""
         law = self.part(kinematics=self.kinematics(scenario.motion)(model), delta=vector(scenario.hand_over))
         return dataclasses.replace(law, implicit=True) if self.implicit else law
 
@@ -156,7 +171,7 @@ class OwnAttitudeTable(OwnTable, frozen=True):
 
 
 def common_keys(law: LawTable) -> dict[str, Any]:
-    """The keys that every law has, with this one's values."""
+    """Return the keys that all laws share, with the values of this law."""
     names = ("t_f", "disturbance_rate_bound", "disturbance_bound", "initial_estimate_error")
     return {name: getattr(law, name) for name in names}
 

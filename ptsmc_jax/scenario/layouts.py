@@ -1,4 +1,7 @@
-"""The plants of scenario files, a row each; and the kinds of what may be drawn."""
+"""The tables of scenario files by the kind of their plant, and the kinds of each dispersion.
+
+A new kind of plant needs a row in `SCENARIOS`.
+"""
 
 from collections.abc import Mapping
 
@@ -27,4 +30,4 @@ OPTIONAL = (
     "requirements",
     "tune",
 )  # off where absent
-KINDS: dict[str, Kinds] = {"hardware.command_filter": COMMAND_FILTERS}  # of a key that is a table
+KINDS: dict[str, Kinds] = {"hardware.command_filter": COMMAND_FILTERS}  # keys that are an inline table with a kind

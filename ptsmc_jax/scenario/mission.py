@@ -1,8 +1,8 @@
-"""Defaults that follow from the mission: the paper's numbers, scaled, and gains designed for the sampled loop.
+"""Defaults that follow from the mission: published numbers, scaled, and gains designed for the sampled loop.
 
-Two scales carry every default with a unit. Time is measured in t_f, and inertia in the mean moment of the body. A
-scenario whose times, inertias and torques are all stated in other units therefore gets the same defaults in those
-units. The paper's own cases keep the paper's numbers (`published`).
+Every default with a unit scales with t_f and with the mean moment of inertia of the body. A scenario that is stated in
+other units of time and inertia therefore gets the same defaults in those units. The published cases keep the published
+numbers (`published`). Start with `scales` and `design`.
 """
 
 import math
@@ -26,7 +26,7 @@ OBSERVER = 0.5  # l / J over p
 # Modes with w T below this are phase stabilised: the resonance circle in the Nyquist plot stays 30 deg away from -1.
 FASTEST_MODE = math.pi / 3
 SIGMAS = 5.0  # largest noise sample assumed, in standard deviations
-NOISE_FRACTION = 0.5  # of the torque limit that noise may take
+NOISE_FRACTION = 0.5  # fraction of the torque limit that noise may use
 SLOWEST = 20.0  # smallest p t_f: the error at the hand-over then decays for five time constants within t_f / 4
 SLOWEST_OBSERVER = 1.5  # smallest t_f l / J
 LEAST_ETA = 2.4  # below 2.386 the braking peak exceeds the first torque, see `theory.rules.later_peak_ratio`
@@ -34,7 +34,7 @@ TRIED = 256  # rates p among which the most accurate one is chosen
 
 
 class Scales(NamedTuple):
-    """Units of a mission: its mean moment of inertia and its t_f, over those of the paper's case."""
+    """Units of a mission: its mean moment of inertia and its t_f over those of the published case."""
 
     inertia: float
     time: float
@@ -42,7 +42,15 @@ class Scales(NamedTuple):
     inputs: int = 3
 
     def of(self, scaled: Scaled, table: Any = None) -> Any:
-        """Return a number of the paper's case, or a tuple of numbers, in these units; table: its power follows from."""
+        """Return a published number, or a tuple of numbers, in these units.
+
+        Args:
+            scaled: the number and its powers of inertia and time.
+            table: the table of the key, for numbers whose power of time depends on other keys.
+
+        Raises:
+            ScenarioError: the factor overflows or underflows.
+        """
         power = scaled.time(table) if callable(scaled.time) else scaled.time
         with np.errstate(all="ignore"):
             time = np.float64(self.time) ** (power + scaled.order * self.order)
@@ -61,7 +69,7 @@ def _times(value: Any, factor: float) -> Any:
 
 
 def published(scenario: Any) -> bool:
-    """Whether the scenario is one of the paper's cases, whose numbers then stay as published."""
+    """Whether the scenario is one of the published cases, which keep the published numbers."""
     t_f = scenario.controller.t_f
     if scenario.moments[0] is None:
         return t_f == CHAIN_TIME
@@ -96,7 +104,7 @@ def with_defaults(table: Any, units: Scales) -> Any:
 
 
 class Design(NamedTuple):
-    """Gains of the sampled loop in terms of the mission, whatever the law.
+    """Gains of the sampled loop in terms of the mission, for any law.
 
     After the hand-over the closed loop is (s + p)^2. Before it the rate gain is (2 eta - 1) / tau, with tau the time
     left until t_f. It reaches its value in the hold phase, 2 p, at tau = delta.
@@ -107,11 +115,11 @@ class Design(NamedTuple):
     observer: float  # l [N m s], or l [1/s] without a body
     width: float  # of the boundary layer, in units of s
     reaching: float  # K1 over the pole, see `Scenario.reaching`
-    time: float  # t_f in the units of the paper's case, see `Scales`
+    time: float  # t_f over t_f of the published case, see `Scales`
 
     @property
     def delta(self) -> float:
-        """The hand-over lies this long before t_f [s]."""
+        """Time from the hand-over to t_f [s]."""
         return (2.0 * self.eta - 1.0) / (2.0 * self.pole)
 
     @property
@@ -121,7 +129,7 @@ class Design(NamedTuple):
 
 
 class _Limits(NamedTuple):
-    """Rates [1/s] between which p lies, and the most accurate one."""
+    """Smallest, most accurate and largest pole rate p [1/s]."""
 
     least: float
     accurate: float
@@ -144,7 +152,7 @@ def designs(scenario: Any) -> list[Design]:
 
 
 def dead_time(scenario: Any) -> float:
-    """Time from measuring to acting [s]: the delay, half a period of the hold, lag and command filter."""
+    """Return the dead time of the loop [s]: delay, half a control period for the hold, lag and command filter."""
     devices, period = scenario.devices, scenario.loop.period
     filtering = devices.command_filter
     return (
@@ -156,7 +164,7 @@ def dead_time(scenario: Any) -> float:
 
 def _design(scenario: Any, pole: float, eta: float, observer: float) -> Design:
     law, period = scenario.controller, scenario.loop.period
-    longest = 0.5 * (law.t_f + period)  # of delta
+    longest = 0.5 * (law.t_f + period)  # largest delta [s]
     eta = min(eta, max(0.5 + pole * longest, _least_eta(scenario)))
     rate = min(observer * pole, 1.0 / period)
     position, velocity = scenario.devices.noise_of_error(scenario)
@@ -180,7 +188,7 @@ def _limits(scenario: Any) -> _Limits:
     - sigma (h / p)^(1/2), from the rate noise.
     """
     t_f, period = scenario.controller.t_f, scenario.loop.period
-    stable = STABLE * 2.0 / scenario.order  # of n poles at -p the crossover lies near n p
+    stable = STABLE * 2.0 / scenario.order  # n poles at -p put the crossover near n p
     most = min(stable / dead_time(scenario), _with_modes(scenario), _with_noise(scenario))
     least = SLOWEST / t_f
     if most <= least:  # the larger of this limit and the p with delta = t_f / 2
@@ -188,7 +196,7 @@ def _limits(scenario: Any) -> _Limits:
         return _Limits(slow, slow, slow)
     position, velocity = scenario.devices.noise_of_error(scenario)
     position = 0.0 if scenario.estimator.on else position  # an attitude filter passes slow errors only
-    rates = least * (most / least) ** np.linspace(1.0, 0.0, TRIED)  # descending: of equal errors the first
+    rates = least * (most / least) ** np.linspace(1.0, 0.0, TRIED)  # descending: argmin prefers fast rates
     with np.errstate(all="ignore"):
         lag = _disturbance(scenario)[1] / (OBSERVER * rates**3)
         error = lag**2 + position**2 * rates * period + velocity**2 * period / rates
@@ -209,7 +217,7 @@ def _with_modes(scenario: Any) -> float:
 
 
 def _with_noise(scenario: Any) -> float:
-    """Return the largest p [1/s] whose noise leaves the torque within `NOISE_FRACTION` of its limit.
+    """Return the largest p [1/s] at which noise uses at most `NOISE_FRACTION` of the torque limit.
 
     A noise sample (x, v) commands the acceleration (2 p + l / J) v + p^2 x of the error.
     """
@@ -223,7 +231,7 @@ def _with_noise(scenario: Any) -> float:
 
 
 def _disturbance(scenario: Any) -> tuple[float, float]:
-    """Return size and rate of what disturbs the error's acceleration; zeros if they are not known yet."""
+    """Return the bounds on the disturbing acceleration of the error and on its rate, zeros if they are unknown."""
     law = scenario.controller
     return tuple((value or 0.0) * scenario.influence for value in (law.disturbance_bound, law.disturbance_rate_bound))
 
@@ -233,7 +241,7 @@ def _least_eta(scenario: Any) -> float:
 
 
 def _eta(scenario: Any) -> float:
-    """Return the paper's eta, or a smaller one if its first torque would exceed the limit."""
+    """Return the published eta, or a smaller one if the first torque would exceed the limit."""
     usual, limit, angle = scenario.least_eta + 1.0, scenario.largest_acceleration(), scenario.start_tangent()
     if limit is None or angle == 0.0:
         return usual

@@ -1,4 +1,7 @@
-"""The observers of scenario files: what their keys follow from and are refused for, and the classes by kind."""
+"""The table [observer] of scenario files: defaults, validation, and the classes by kind in `OBSERVERS`.
+
+The numbers of an observer are declared in `observers`. Start with `ObserverTable`.
+"""
 
 import dataclasses
 from collections.abc import Mapping
@@ -18,17 +21,17 @@ SHORTEST = Scaled(0.05, time=1)  # delta_o of the prescribed-time observer [s]
 
 
 class ObserverTable(PartTable, frozen=True):
-    """An observer, whatever it is for."""
+    """An observer for any plant."""
 
     prefix: ClassVar[str] = "observer_"
 
     def check(self, scenario: Any) -> None:
-        """Raise ScenarioError if keys contradict each other, or the scenario's."""
+        """Raise ScenarioError if keys contradict each other or the scenario."""
         if isinstance(self, Own):
             scenario.need_samples('observer.kind = "own"')
 
     def build(self, scenario: Any, model: Any) -> Any:
-        """Return the observer for a plant's model."""
+        """Return the observer for the design model of the plant, see `Scenario.model`."""
         law, names = scenario.controller, {field.name for field in dataclasses.fields(self.made)}
         known = {
             "disturbance_bound": law.disturbance_bound,
@@ -39,10 +42,10 @@ class ObserverTable(PartTable, frozen=True):
 
 
 class LinearTable(ObserverTable, frozen=True):
-    """An observer with the gain of l(w) in (53), or of its constant part."""
+    """An observer with the gain of l(w) in (53), or with its constant part."""
 
     def filled(self, scenario: Any) -> Any:
-        """Fill an absent gain, the same on each axis: as in the paper's case, or designed for the sampled loop."""
+        """Fill an absent gain, equal on all axes: the published one, scaled, or a design for the sampled loop."""
         if self.gain is not None:  # pyright: ignore[reportAttributeAccessIssue]
             return self
         gain = disturbance_bounds.observer_gain(scenario)
@@ -55,7 +58,7 @@ class PrescribedTimeTable(LinearTable, frozen=True):
     """An observer that has converged by t_o."""
 
     def written(self, scenario: Any) -> Any:
-        """Fill T_o with a third of t_f, and delta_o with the paper's 0.05 s, scaled, or a period."""
+        """Fill absent times: t_o with t_f / 3, delta_o with the published 0.05 s, scaled, or a control period."""
         table: Any = self
         t_o = scenario.controller.t_f / 3 if table.t_o is None else table.t_o
         shortest = max(mission.scales(scenario).of(SHORTEST), scenario.loop.period if scenario.sampled else 0.0)
@@ -63,7 +66,7 @@ class PrescribedTimeTable(LinearTable, frozen=True):
         return msgspec.structs.replace(self, t_o=t_o, delta_o=delta_o)
 
     def check(self, scenario: Any) -> None:
-        """The observer must have converged before t_f."""
+        """Raise ScenarioError unless delta_o < t_o <= t_f: the observer must have converged before t_f."""
         table, t_f = self.written(scenario), scenario.controller.t_f
         if table.t_o > t_f:
             raise wrong("observer.t_o", table.t_o, f"at most controller.t_f, {t_f}")
@@ -83,15 +86,15 @@ class FiniteTimeTable(ObserverTable, frozen=True):
         return msgspec.structs.replace(self, gain=(20.0 * rate,) * scenario.inputs)
 
     def check(self, scenario: Any) -> None:
-        """Its gain is a bound on the disturbance's rate."""
+        """Raise ScenarioError if the gain is below the bound on the disturbance's rate."""
         gain = self.gain  # pyright: ignore[reportAttributeAccessIssue]
-        least = scenario.controller.disturbance_rate_bound or 0.0  # not known yet where custom code says it
+        least = scenario.controller.disturbance_rate_bound or 0.0  # None before custom code has run
         if min(gain) < least or min(gain) <= 0.0:
             raise wrong("observer.gain", gain, f"at least controller.disturbance_rate_bound, {least}, each")
 
 
 def _observers(first: str, body: bool) -> Mapping[str, type[ObserverTable]]:
-    """Return the observers by kind, this one first."""
+    """Return the observers by kind; first: the default kind, body: whether the plant is a spacecraft."""
     kinds = {
         "nonlinear": table(LinearTable, nonlinear.NonlinearObserver, "nonlinear", body),
         "none": table(ObserverTable, none.NoObserver, "none"),

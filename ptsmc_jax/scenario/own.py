@@ -1,6 +1,7 @@
-"""Custom parts: `kind = "own"` and `code = "FILE.py:NAME"`, a class whose fields are further keys of its table.
+"""Custom parts of scenarios: `kind = "own"` and `code = "FILE.py:NAME"`, a class whose fields are further keys.
 
-Reading a scenario runs nothing that it names: until `reading.complete` does, such a table keeps these keys in `rest`.
+Reading a scenario does not run the code that it names. Until `reading.complete` runs it, these keys are in `rest` and
+are not validated. Start with `own_kind` and `read`.
 """
 
 import dataclasses
@@ -21,9 +22,9 @@ from ptsmc_jax.scenario.errors import ScenarioError, brief, show
 from ptsmc_jax.scenario.values import Meaning, Table
 from ptsmc_jax.simulation.gains import is_reserved
 
-KEYS = ("system", "truth", "code")  # that name code, in any table
-CONTROLLER = "--controller"  # an option that names code: C that export left, not `controller.code`
-DECLARED = "delta"  # what a law's class may declare anew, as a gain
+KEYS = ("system", "truth", "code")  # keys that name code, in any table
+CONTROLLER = "--controller"  # option that names the exported C code, unlike the key `controller.code`
+DECLARED = "delta"  # field of the base class that a custom law may declare again, as a gain
 Code = Annotated[Any, Meta(description=systems.WHERE), Meaning('the class, "FILE.py:NAME" or "package.module:NAME"')]
 
 
@@ -31,14 +32,14 @@ class Own:
     """The tables of custom parts; their keys `kind`, `code` and `rest` are in `own_kind`."""
 
     __slots__ = ()
-    base: ClassVar[Any] = None  # the class that such classes are derived from
-    needs: ClassVar[tuple[str, ...]] = ()  # methods of which the class must have one
-    tuned: ClassVar[bool] = False  # whether it may have gains
-    made: ClassVar[Any] = None
+    base: ClassVar[Any] = None  # required base class of the custom class
+    needs: ClassVar[tuple[str, ...]] = ()  # methods: the custom class must define at least one of them
+    tuned: ClassVar[bool] = False  # whether the custom class may have gains
+    made: ClassVar[Any] = None  # the custom class, None until its code has run
 
     @property
     def waits(self) -> bool:
-        """Whether its code was not run yet."""
+        """Whether the code has not run yet."""
         return self.made is None
 
 
@@ -46,11 +47,11 @@ def own_kind(table: Any, base: type, needs: tuple[str, ...], summary: str, tuned
     """Return the table of custom parts.
 
     Args:
-        table: the table that all these parts have.
-        base: the class that a custom one is derived from.
-        needs: methods of which it must define one.
-        summary: what the kind is.
-        tuned: whether it may have gains.
+        table: the table class that custom and built-in parts share.
+        base: the required base class of custom classes.
+        needs: methods; a custom class must define at least one of them.
+        summary: description of the kind.
+        tuned: whether a custom class may have gains.
     """
     return _own_kind(table, base, needs, summary, tuned)
 
@@ -65,7 +66,7 @@ def _own_kind(table: Any, base: type, needs: tuple[str, ...], summary: str, tune
 
 
 def named(raw: Mapping[str, Any]) -> Iterator[tuple[dict, str]]:
-    """The tables of a parsed file that name code, and the key that does, in tables within tables too."""
+    """Yield each table of a parsed file that names code, nested tables included, with the key that names it."""
     for table in _tables(raw):
         for key in KEYS:
             if isinstance(table.get(key), str):
@@ -81,7 +82,7 @@ def _tables(value: Any) -> Iterator[dict]:
 
 
 def programs(scenario: Table) -> dict[str, str]:
-    """What flying a scenario runs: where it stands, by the key that names it."""
+    """Return the custom code that a scenario runs, "FILE.py:NAME", by the key that names it."""
     found = {}
     for place, table in _places(scenario):
         for key in KEYS:
@@ -91,7 +92,7 @@ def programs(scenario: Table) -> dict[str, str]:
 
 
 def _places(scenario: Table) -> Iterator[tuple[str, Any]]:
-    """The tables that may name code, by where they stand: also those of a sum, and of what is drawn."""
+    """Yield the tables that can name code with their place, those in a sum and in [dispersion] included."""
     for name in scenario.__struct_fields__:
         table = getattr(scenario, name)
         if hasattr(table, "placed"):
@@ -103,7 +104,7 @@ def _places(scenario: Table) -> Iterator[tuple[str, Any]]:
 
 
 def digest_name(key: str) -> str:
-    """The name in `versions.json` for the digest of what a key names.
+    """Return the name in `versions.json` for the checksum of the code that a key names.
 
     >>> digest_name("plant.system"), digest_name("controller.code"), digest_name("disturbance.terms[0].code")
     ('system_sha256', 'controller_sha256', 'disturbance_terms_0_sha256')
@@ -117,20 +118,26 @@ def digest_name(key: str) -> str:
 
 
 def digests(scenario: Table) -> dict[str, str]:
-    """What a result depends on besides its scenario: the digests of the files that it names, as they are now."""
+    """Return the current SHA-256 checksums of the files that a scenario names, by their names in `versions.json`."""
     found = {digest_name(key): systems.digest(where) for key, where in programs(scenario).items()}
     return {name: digest for name, digest in found.items() if digest is not None}
 
 
 def waits(scenario: Table) -> bool:
-    """Whether a scenario has a table of one's own whose code was not run yet."""
+    """Whether a scenario has a custom part whose code has not run yet."""
     return any(getattr(table, "waits", False) for _, table in _places(scenario))
 
 
 def read(table: Any, name: str, code: object) -> Any:
-    """The table with the keys of the class that is named, which is run for it, or is there.
+    """Return the table of a custom part with the keys of its class.
 
-    name: of the table in the scenario. Raises ScenarioError where there is no such class.
+    Args:
+        table: the table class from `own_kind`.
+        name: name of the table in the scenario, for errors.
+        code: "FILE.py:NAME" or "package.module:NAME", which is run, or the class itself.
+
+    Raises:
+        ScenarioError: there is no such class, or its fields cannot be keys.
     """
     try:
         item = systems.item(code, f"{systems.WHERE} of a class") if isinstance(code, str) else code
@@ -161,7 +168,7 @@ def _with_keys(table: Any, found: Any, remake: tuple) -> Any:
             raise _taken(found, name, "another name")
         if hasattr(base, name):
             raise _taken(found, name, f"{name} = .. without a type")
-    for cls in reversed(found.__mro__):  # custom classes that it is derived from have fields too
+    for cls in reversed(found.__mro__):  # custom base classes have fields too
         if issubclass(cls, base) and "__dataclass_fields__" not in cls.__dict__:
             try:
                 dataclasses.dataclass(frozen=True)(cls)
@@ -171,7 +178,7 @@ def _with_keys(table: Any, found: Any, remake: tuple) -> Any:
     for field in dataclasses.fields(found):
         if common.get(field.name) is not None and common[field.name].default is field.default:
             continue
-        if (hasattr(table, field.name) or field.name == "rest") and field.name not in common:  # tables have it
+        if (hasattr(table, field.name) or field.name == "rest") and field.name not in common:  # in use
             raise _taken(found, field.name, "another name")
         if table.prefix + field.name == "observer_gain" or re.fullmatch(
             r"observer_gain_\d+", table.prefix + field.name
@@ -184,7 +191,7 @@ def _with_keys(table: Any, found: Any, remake: tuple) -> Any:
 
 
 def _annotated(found: type, base: type) -> Iterator[str]:
-    """The names that the classes of one's own under a base give a type, which makes fields of them."""
+    """Yield the annotated names of a custom class and its custom bases; annotations make them dataclass fields."""
     for cls in found.__mro__:
         if issubclass(cls, base) and cls is not base:
             yield from (name for name, kind in inspect.get_annotations(cls).items() if "ClassVar" not in str(kind))
@@ -196,12 +203,15 @@ def _taken(found: type, name: str, allowed: str) -> ValueError:
 
 
 def fastest(table: Any, name: str, part: Any) -> float:
-    """Return what the method `fastest` of the class of a table says [rad/s].
+    """Return the largest angular frequency that the method `fastest` of a table's class reports [rad/s].
 
     Args:
         table: the table.
-        name: of the table, for errors.
-        part: the part, or the table itself, which has the same numbers.
+        name: name of the table, for errors.
+        part: the part, or the table itself, which has the same fields.
+
+    Raises:
+        ScenarioError: the method does not return a number of at least 0.
     """
     said = table.made.fastest(part)
     try:
@@ -219,7 +229,10 @@ def fastest(table: Any, name: str, part: Any) -> float:
 
 
 def _declaration(table: Any, found: Any, field: dataclasses.Field) -> Declaration:
-    """Return what a custom class declares of a field; a plain number is a key without a unit. Raises ValueError."""
+    """Return the declaration of a field of a custom class. A plain number becomes a key without a unit.
+
+    ValueError is raised if the default is not a number, not allowed, or not possible for a gain.
+    """
     value, missing = typing.cast(Any, field.default), dataclasses.MISSING
     one = field.metadata.get("declared")
     numbers = value if isinstance(value, tuple) and value and not (one and one.gain) else (value,)

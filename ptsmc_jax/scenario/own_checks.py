@@ -1,4 +1,7 @@
-"""What parts of one's own do where a run begins: that they fit, in one sentence, before anything is flown."""
+"""Validate custom parts at t = 0 before a run: shapes, types, finite values, and traceability by JAX.
+
+Start with `check`. An error names the method of the custom class and the returned value in one sentence.
+"""
 
 import dataclasses
 import inspect
@@ -25,7 +28,13 @@ from ptsmc_jax.simulation.rollout import Parts
 
 
 def check(parts: Parts, dispersion: Dispersion, scenario: Scenario) -> None:
-    """Raise ScenarioError where a part of one's own fails at t = 0, or returns what a run cannot go on with."""
+    """Raise ScenarioError if a custom part fails at t = 0 or returns values that a run cannot use.
+
+    Args:
+        parts: the parts of a run.
+        dispersion: its dispersions, which may be custom too.
+        scenario: the scenario that they are built from.
+    """
     tables = {name: getattr(scenario, name, None) for name in ("reference", "sensors", "observer", "controller")}
     acting = iter(parts.disturbance.terms if isinstance(parts.disturbance, Sum) else (parts.disturbance,))
     for place, term in scenario.placed_terms.items():
@@ -40,7 +49,7 @@ def check(parts: Parts, dispersion: Dispersion, scenario: Scenario) -> None:
 
 
 def what_fails(error: BaseException, file: str) -> str:
-    """What is wrong with code of one's own in this file that ended in an error while it was asked, or traced."""
+    """Return the reason why custom code in a file failed when it was called or traced, as the end of a sentence."""
     if isinstance(error, TRACED):
         return f"needs the value of a number that is known in flight only{systems.line(error, file)}; {INSTEAD}"
     if isinstance(error, jax.errors.UnexpectedTracerError):
@@ -49,12 +58,12 @@ def what_fails(error: BaseException, file: str) -> str:
 
 
 def names_column(name: str) -> bool:
-    """Whether a name can stand above a column."""
+    """Whether a name can be the heading of a column."""
     return name.isprintable() and bool(name.strip())
 
 
 class _Asked:
-    """Calls what a table's code names, and says what is wrong with it."""
+    """Calls methods of a custom class and validates what they return."""
 
     def __init__(self, name: str, table: Any):
         shown = brief(table.code) if isinstance(table.code, str) else table.made.__name__
@@ -74,11 +83,24 @@ class _Asked:
             raise ScenarioError(f"{self._said} {method} {told}") from None
 
     def refused(self, method: str, returns: str, must: str) -> ScenarioError:
-        """The error for what a method returns."""
+        """Return the error for a returned value.
+
+        Args:
+            method: name of the method.
+            returns: description of the returned value.
+            must: description of the required value.
+        """
         return ScenarioError(f"{self._said} {method} returns {returns} at t = 0, but must return {must}")
 
     def check(self, method: str, what: str, value: Any, shape: tuple[int, ...]) -> None:
-        """Raise ScenarioError where this is no array, not finite, or of another shape."""
+        """Raise ScenarioError if a value is not an array, not finite, or of another shape.
+
+        Args:
+            method: name of the method that returned it.
+            what: description of the value.
+            value: the value.
+            shape: the required shape.
+        """
         if not isinstance(value, jax.Array | np.ndarray):
             raise self.refused(method, f"{what} that is a {type(value).__name__}", f"an array of shape {shape}")
         got = np.asarray(value)
@@ -88,16 +110,22 @@ class _Asked:
             raise self.refused(method, f"{what} {got.tolist()}", "finite numbers, real ones")
 
     def same_memory(self, method: str, before: Any, after: Any) -> None:
-        """Raise ScenarioError where a memory changes its shapes or types."""
+        """Raise ScenarioError if a memory changes its shapes or types.
+
+        Args:
+            method: name of the method that returned `after`.
+            before: the memory that it received.
+            after: the memory that it returned.
+        """
         was, now = (jax.tree.map(_kind, tree) for tree in (before, after))
         if was != now:
             raise self.refused(method, f"a memory {now}", f"one as begin does, {was}")
 
 
 def _trace(function: Callable, args: tuple) -> None:
-    """Raise what a method raises as it is flown, where its arguments and its own fields are traced."""
+    """Raise the errors that a method raises in a run, when its arguments and the fields of its object are traced."""
     own = getattr(function, "__self__", function)
-    if jax.tree_util.all_leaves([own]):  # what is no pytree has no fields to trace
+    if jax.tree_util.all_leaves([own]):  # an object that is not a pytree has no fields to trace
         jax.eval_shape(function, *args)
         return
     called = getattr(function, "__func__", type(own).__call__)
@@ -105,12 +133,12 @@ def _trace(function: Callable, args: tuple) -> None:
 
 
 def _kind(value: Any) -> str:
-    """Type and shape of an array: f64(3,)."""
+    """Return the type and shape of an array, such as f64(3,)."""
     return f"{value.dtype.name.replace('float', 'f')}{value.shape}"
 
 
 def _described(returned: Any) -> str:
-    """What a method returned, in words."""
+    """Describe a returned value in words."""
     if returned is None:
         return "nothing"
     if isinstance(returned, jax.Array):
@@ -121,7 +149,7 @@ def _described(returned: Any) -> str:
 
 
 def _changed(parts: Parts, drawn: Parts) -> str:
-    """Which of the parts has another structure than it had."""
+    """Describe the first part whose structure has changed."""
     for field in dataclasses.fields(parts):
         was, now = (getattr(one, field.name) for one in (parts, drawn))
         if jax.tree.structure(was) != jax.tree.structure(now):

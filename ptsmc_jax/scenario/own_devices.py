@@ -1,4 +1,4 @@
-"""The tables of scenario files for custom sensors and draws."""
+"""The tables of scenario files for custom sensors and custom dispersions."""
 
 from typing import Any, ClassVar
 
@@ -13,12 +13,12 @@ from ptsmc_jax.scenario.values import Kinds
 
 
 class SensorTable(PartTable, frozen=True):
-    """Custom sensors. They take the place of what [hardware] says of noise, and of [filter]."""
+    """Custom sensors. They replace the noise of [hardware] and the table [filter]."""
 
     prefix: ClassVar[str] = "sensors_"
 
     def build(self, model: Any, period: float) -> Any:
-        """Return the sensors as the rollout asks for them."""
+        """Return the sensors for the rollout; model: the design model of the plant, period: of control [s]."""
         made = self.part(model=model)
         _check_count(made, "sensors", "draws", 0)
         return own_sensors.OwnSensors(made, vector(1.0))
@@ -28,7 +28,7 @@ class DrawTable(PartTable, frozen=True):
     """Custom random quantities."""
 
     def build(self) -> Any:
-        """Return the draw."""
+        """Return the dispersion, an instance of `ptsmc_jax.Draw`."""
         made = self.part()
         _check_count(made, "dispersion.own", "count", 1)
         if made.drawn not in DISTRIBUTIONS:
@@ -37,7 +37,7 @@ class DrawTable(PartTable, frozen=True):
 
 
 def _check_count(made: Any, table: str, field: str, least: int) -> None:
-    """Raise ScenarioError where a class says no whole number of what is drawn for it."""
+    """Raise ScenarioError if the number of random numbers that a class declares is not a whole number >= `least`."""
     value = getattr(made, field)
     if not isinstance(value, int) or isinstance(value, bool) or value < least:
         raise _unfit(made, table, field, f"a whole number of at least {least}")

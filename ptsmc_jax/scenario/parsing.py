@@ -1,6 +1,6 @@
-"""Scenario files read and written: what is wrong in one, in one sentence.
+"""Parse and write scenario files. Start with `parse` and `dump`.
 
-Only single tables and keys are looked at here; `checks.py` looks at keys against each other.
+This module validates single tables and keys. `checks` validates constraints between keys.
 """
 
 import difflib
@@ -24,22 +24,22 @@ from ptsmc_jax.scenario.tables import Limit, Scenario
 from ptsmc_jax.scenario.values import Kinds, NotNegative, Positive, Table
 from ptsmc_jax.simulation import catalogues
 
-DEEPEST = 8  # tables and arrays in each other; a rotation matrix of a disturbance in a sum is at 6
+DEEPEST = 8  # nesting of tables and arrays; a rotation matrix of a disturbance in a sum has depth 6
 LONGEST_KEY = 100  # characters
 _TOO_DEEP = f"but at most {DEEPEST} levels are allowed"
-# a dotted key without end, for which the parser would take memory by the square of its length
+# a very long dotted key: the memory that the parser needs for it grows with the square of its length
 _DOTTED = re.compile(r"""(?<![\w-])(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){20}""")
 
 
 class Context(NamedTuple):
-    """What reading a table needs to know of the whole scenario."""
+    """Properties of the whole scenario that the parser of a table needs."""
 
     plant: type[Scenario]  # one of `layouts.SCENARIOS`
-    run: bool = False  # whether code that the scenario names may be run
+    run: bool = False  # whether code that the scenario names may run
 
 
 def toml(text: str, name: str) -> dict[str, Any]:
-    """The raw tables of a TOML file, which errors call by this name; raises ScenarioError where it is none."""
+    """Return the raw tables of a TOML text; raise ScenarioError if it is not valid. `name` is used in errors."""
     try:
         if _DOTTED.search(text):
             raise RecursionError
@@ -51,9 +51,9 @@ def toml(text: str, name: str) -> dict[str, Any]:
 
 
 def load(path: str | Path) -> dict[str, Any]:
-    """The raw tables of a TOML file; raises ScenarioError where it is not there or no TOML.
+    """Return the raw tables of a TOML file; raise ScenarioError if it is missing or not valid.
 
-    A Python file that it names is looked for beside it, and not run.
+    Relative paths of Python files in it become absolute, relative to the folder of the TOML file. No code is run.
     """
     try:
         text = Path(path).read_text(encoding="utf-8-sig")  # some editors begin a file with a byte order mark
@@ -74,9 +74,14 @@ def load(path: str | Path) -> dict[str, Any]:
 
 
 def parse(raw: Mapping[str, Any], *, run: bool = False) -> Scenario:
-    """Scenario from raw tables, absent keys at their defaults; raises ScenarioError.
+    """Return the scenario of raw tables, with defaults that do not depend on other keys.
 
-    run: code of one's own may be run, for its keys.
+    Args:
+        raw: tables by name, as TOML returns them.
+        run: whether custom code may run, which provides its keys.
+
+    Raises:
+        ScenarioError: a table or key is unknown, or a value is not allowed.
     """
     _check_shape(raw)
     suite = raw.get("sensors")
@@ -105,14 +110,14 @@ def parse(raw: Mapping[str, Any], *, run: bool = False) -> Scenario:
             attitude_keys.at_most_one(name, tables[name])
     if isinstance(suite, list | tuple):
         tables["sensors"] = _suite(suite, context)
-    # plain limits first, as TOML writes them: verdicts come in the same order when a result's own scenario is read
+    # plain limits first, as TOML writes them, so that the order of verdicts is the same for a scenario that was saved
     asked = sorted(raw.get("requirements", {}).items(), key=lambda one: isinstance(one[1], Mapping))
     tables["requirements"] = {key: _requirement(key, value, context) for key, value in asked}
     return kind_of_scenario(**tables)
 
 
 def _check_shape(raw: Mapping[str, Any]) -> None:
-    """Refuse what is nested without end and keys that no sentence can name, before anything walks through them."""
+    """Raise ScenarioError for too deep nesting and for keys that cannot be printed, before other code visits them."""
     level: list[tuple[str, Any]] = [("", raw)]
     for _ in range(DEEPEST):
         inside: list[tuple[str, Any]] = []
@@ -138,7 +143,7 @@ def _plant_kind(plant: Mapping[str, Any]) -> str:
 
 
 def _unknown(name: str, value: Any, kind: str) -> ScenarioError:
-    """The error for a table that this kind of plant does not have, or a key that stands outside a table."""
+    """Return the error for an unknown table, or for a key outside a table; kind: of the plant."""
     layout = TABLES[kind]
     others = [other for other, theirs in TABLES.items() if name in theirs]
     if others:
@@ -154,19 +159,19 @@ def _unknown(name: str, value: Any, kind: str) -> ScenarioError:
 
 
 def _with_defaults(given: Mapping[str, Any], fallback: Mapping[str, Any]) -> Mapping[str, Any]:
-    """A table with what is absent filled in; an attitude that is given replaces the default one."""
+    """Return a table with absent keys filled in. An attitude that is given replaces the default attitude."""
     if any(key in given for key in ATTITUDE_KEYS):
         fallback = {key: value for key, value in fallback.items() if key not in ATTITUDE_KEYS}
     return {**fallback, **given}
 
 
 def dump(scenario: Scenario) -> dict[str, Any]:
-    """Tables for a file, with every key that follows from others; `parse` reads them back to what flies the same."""
+    """Return tables for a file, with all defaults filled in. `parse` returns an equivalent scenario from them."""
     return as_parsed(scenario.written())
 
 
 def as_parsed(scenario: Scenario) -> dict[str, Any]:
-    """Tables that `parse` reads back to the same scenario; what is None is left out."""
+    """Return tables that `parse` converts back to the same scenario; keys that are None are omitted."""
     written = plain(scenario)
     if "each" in written.get("sensors", {}):
         written["sensors"] = written["sensors"]["each"]
@@ -175,7 +180,7 @@ def as_parsed(scenario: Scenario) -> dict[str, Any]:
 
 
 def stated(scenario: Scenario) -> dict[str, Any]:
-    """Tables for a file, without the defaults: keys that the scenario's file does not state and nobody has changed."""
+    """Return tables for a file without the keys that have their defaults and that the scenario's file omits."""
     tables = dump(scenario)
     for (*place, key), value in scenario.defaulted.items():
         table: Any = tables
@@ -187,7 +192,7 @@ def stated(scenario: Scenario) -> dict[str, Any]:
 
 
 def not_said(raw: Mapping[str, Any], tables: Mapping[str, Any]) -> dict[tuple[str, ...], Any]:
-    """The values of these tables whose keys the raw tables do not have, by the path of the key."""
+    """Return the values of keys in `tables` that `raw` does not have, by the path of the key."""
     unsaid: dict[tuple[str, ...], Any] = {}
     for key, value in tables.items():
         if isinstance(value, Mapping):
@@ -200,12 +205,12 @@ def not_said(raw: Mapping[str, Any], tables: Mapping[str, Any]) -> dict[tuple[st
 
 
 def plain(table: Table) -> dict[str, Any]:
-    """A table as a scenario file would have it; what is None is left out."""
+    """Return a table as a scenario file would write it; keys that are None are omitted."""
     return typing.cast(dict, _without_none(table))
 
 
 def _without_none(value: Any) -> Any:
-    """Structs as mappings, lists for tuples; what is made in Python, a system or a class, stays what it is."""
+    """Convert structs to mappings and tuples to lists. Python objects such as systems and classes stay unchanged."""
     if isinstance(value, msgspec.Struct):
         value = {key: getattr(value, key) for key in value.__struct_fields__}
         value |= value.pop("rest", {})
@@ -218,7 +223,13 @@ def _without_none(value: Any) -> Any:
 
 
 def nearest(name: str, known: Iterable[str], form: str = "{}") -> str:
-    """What a name may have been meant for: the known one most like it, or, where none is like it, all of them."""
+    """Return a hint for an unknown name: the most similar known name, or all known names.
+
+    Args:
+        name: the unknown name.
+        known: the known names.
+        form: format of a known name in the hint.
+    """
     known = list(known)
     close = difflib.get_close_matches(name, known, n=1)
     if close:
@@ -227,7 +238,16 @@ def nearest(name: str, known: Iterable[str], form: str = "{}") -> str:
 
 
 def like(name: str, known: Iterable[str], all_of_them: str) -> str:
-    """Of too many known names to list, those most like one, and where all of them are, in words."""
+    """Return a hint for an unknown name if there are too many known names to list.
+
+    Args:
+        name: the unknown name.
+        known: the known names.
+        all_of_them: where to find all names, in words.
+
+    Returns:
+        The three most similar names, followed by `all_of_them`.
+    """
     known = list(known)
     close = difflib.get_close_matches(name, known, n=3, cutoff=0.0)
     return f"the nearest of {len(known)} known ones are {', '.join(close)}; {all_of_them}"
@@ -251,7 +271,7 @@ def _table(name: str, raw: Mapping[str, Any], kinds: type[Table] | Kinds, contex
 
 
 def _own(name: str, raw: Mapping[str, Any], struct: Any, context: Context) -> Table:
-    """A table of one's own: with the keys of the class that it names, if that may be run or is there already."""
+    """Return the table of a custom part. It has the keys of its class if the code may run or is a class already."""
     code = raw.get("code")
     if code is None:
         raise ScenarioError(f"{name}.code is absent, but must be given: {systems.WHERE}")
@@ -270,7 +290,7 @@ def _own(name: str, raw: Mapping[str, Any], struct: Any, context: Context) -> Ta
 
 
 def _sum(name: str, raw: Mapping[str, Any], kinds: Kinds, context: Context) -> Table:
-    """A table whose `terms` are tables of the other kinds."""
+    """Return the table of a sum of disturbances, whose `terms` are tables of the other kinds."""
     others = {key: value for key, value in raw.items() if key != "terms"}
     _fields(name, others, disturbance_tables.SumDisturbance, context)
     terms = raw.get("terms", ())
@@ -297,7 +317,7 @@ def _suite(each: Any, context: Context) -> Table:
 
 
 def _dispersion(raw: Mapping[str, Any], struct: type[Table], context: Context) -> Table:
-    """The table whose keys are tables of one of several kinds each."""
+    """Return the table [dispersion], whose keys are inline tables with a kind."""
     tables = {}
     for key, table in raw.items():
         _check_known("dispersion", key, struct, context)
@@ -322,7 +342,7 @@ def _requirement(metric: str, value: Any, context: Context) -> float | Limit:
 
 
 def _limit(key: str, value: Any, metric: str, metrics: Mapping[str, Any]) -> float:
-    """A limit as a number in the metric's unit, also from one in words: "0.05 deg"."""
+    """Return a limit in the metric's unit; the value is a number or a text such as "0.05 deg"."""
     allowed = NotNegative if metric in catalogues.MAY_BE_ZERO else Positive
     if isinstance(value, str):
         value = _in_unit(key, value, {**metrics, **catalogues.MARGINS}[metric].unit, keys.allowed(allowed))
@@ -330,7 +350,7 @@ def _limit(key: str, value: Any, metric: str, metrics: Mapping[str, Any]) -> flo
 
 
 def _in_unit(key: str, text: str, unit: str, allowed: str) -> float:
-    """A number in words, "0.05 deg", in a unit."""
+    """Convert a text such as "0.05 deg" to a number in a unit; raise ScenarioError if it is not possible."""
     units = catalogues.UNITS.get(unit, {})
     size, name = _parts(text)
     if name not in units or not math.isfinite(size):
@@ -350,7 +370,7 @@ def _parts(text: str) -> tuple[float, str]:
 
 
 def as_written(error: ScenarioError, raw: Mapping[str, Any]) -> ScenarioError:
-    """Return an error with its value as the raw tables write it, "8 arcsec", and in SI units beside it."""
+    """Return an error that quotes its value as the raw tables write it, such as "8 arcsec", and in SI units."""
     written = _at(raw, error.key)
     several = isinstance(written, list | tuple)
     if not any(map(_si_unit, written if several else [written])):
@@ -383,13 +403,16 @@ def _in_si(value: Any) -> Any:
 
 
 def _si_unit(value: Any) -> str:
-    """Return the SI unit of a text such as "8 arcsec", rad; empty if it is no such text."""
+    """Return the SI unit of a text such as "8 arcsec", here rad; empty if the value is not such a text."""
     name = _parts(value)[1] if isinstance(value, str) else ""
     return next((unit for unit, names in catalogues.UNITS.items() if name in names), "")
 
 
 def _in_words(name: str, value: Any, struct: type[Table], kind: Any, context: Context) -> Any:
-    """Return the value of a key as a number or numbers if it has its unit, "1 mN m", and the key's unit has others."""
+    """Convert the value of a key from text with a unit, such as "1 mN m", to a number or a list of numbers.
+
+    Other values are returned unchanged.
+    """
     several = isinstance(value, list | tuple)
     said = isinstance(value, str) or (several and any(isinstance(one, str) for one in value))
     if not said or name in layouts.KINDS or _fits(value, kind):
@@ -432,7 +455,7 @@ def _check_known(name: str, key: str, struct: type[Table], context: Context, kin
 
 
 def _key(key: str, value: Any, kind: Any, context: Context) -> Any:
-    """A value, or a table of one of several kinds."""
+    """Return the value of a key, or its inline table with a kind."""
     kinds = layouts.KINDS.get(key)
     if kinds is None:
         return _value(key, value, kind)
@@ -446,12 +469,12 @@ def _key(key: str, value: Any, kind: Any, context: Context) -> Any:
 def _value(key: str, value: Any, kind: Any) -> Any:
     try:
         value = _plain(value)
-    except TypeError:  # of JAX, which is not imported here
+    except TypeError:  # raised by JAX for a traced value; this module does not import JAX
         raise ScenarioError(f"{key} is traced by JAX, but must be known here; with_gains takes traced gains") from None
     bad = _not_finite(value)
     if bad is not None:
         raise wrong(key, value, f"{keys.allowed(kind)}, and {show(bad)} is no finite number")
-    if _holds_truth(value) and keys.bare(kind) is not bool:  # numpy, which reads the inertia, takes true for 1
+    if _holds_truth(value) and keys.bare(kind) is not bool:  # numpy, which reads the inertia, converts true to 1
         raise wrong(key, value, keys.allowed(kind))
     try:
         return msgspec.convert(value, kind, strict=True)
@@ -468,7 +491,7 @@ def _for_axes(key: str, value: Any) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Python numbers and tuples for lists and numpy's."""
+    """Convert lists and NumPy arrays to tuples of Python numbers."""
     if hasattr(value, "tolist"):
         value = value.tolist()
     return tuple(map(_plain, value)) if isinstance(value, list | tuple) else value

@@ -1,4 +1,4 @@
-"""The table of a scenario file that says what pointing is observed."""
+"""The table [pointing] of scenario files: the observation of pointing errors after t_f. Start with `Pointing`."""
 
 import math
 from collections.abc import Mapping
@@ -14,11 +14,11 @@ from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.pointing import Pointing as PointingPart
 from ptsmc_jax.simulation.pointing import across
 
-LONGEST_STEP = 0.02  # of the continuous loop after the hand-over, over t_f, see `clock`
+LONGEST_STEP = 0.02  # largest step of the continuous loop in the hold phase, over t_f, see `clock`
 
 
 class Pointing(Table, frozen=True):
-    """What pointing error indices (ECSS-E-ST-60-10C) are taken of: from `after` t_f to t_end, in windows."""
+    """Observation of pointing error indices (ECSS-E-ST-60-10C) in windows, from t_f + `after` to t_end."""
 
     boresight: Annotated[
         Three,
@@ -32,7 +32,10 @@ class Pointing(Table, frozen=True):
     scaled: ClassVar[Mapping[str, Scaled]] = {"window": Scaled(1.0, time=1)}
 
     def check(self, scenario: Any) -> None:
-        """Raise ScenarioError where no direction is given, or not two windows fit into the observation."""
+        """Raise ScenarioError for a zero boresight or a window that is too short or too long.
+
+        Two windows must fit into the observation, and one control period into a window.
+        """
         if not np.linalg.norm(self.boresight) > 0.0:
             raise wrong("pointing.boresight", self.boresight, "a direction, not all zero")
         left, needed = scenario.end - scenario.controller.t_f, 2.0 * self.window * (1 - 1e-9)
@@ -45,20 +48,20 @@ class Pointing(Table, frozen=True):
         longest = LONGEST_STEP * scenario.controller.t_f
         least, what = (scenario.loop.period, "loop.period") if sampled else (longest, "the longest step")
         jitter = getattr(scenario.dispersion, "timing_jitter", None)
-        if sampled and jitter is not None:  # in which a period may end late that began early
+        if sampled and jitter is not None:  # a period may begin early and end late
             least, what = least * (1.0 + 2.0 * jitter.largest), "the longest control period with its jitter"
         if self.window < least * (1 - 1e-9):
             raise wrong("pointing.window", self.window, f"at least {what}, {least:.9g}")
 
     def build(self, scenario: Any) -> Any:
-        """`pointing.Pointing`, with the limits of which shares of time are asked for."""
+        """Return `pointing.Pointing`, with the limits whose requirements concern a fraction of the time."""
         timed = {
             name: vector(limit.limit)
             for name, limit in scenario.requirements.items()
             if getattr(limit, "interpretation", None) not in (None, "ensemble")
         }
-        # where no limit needs it, their number is 0 whatever the period, and one program flies them all
+        # if no limit needs the samples, their number is 0 for every period, so that one program serves all periods
         kept = scenario.sampled and any(name.startswith(catalogues.RELATIVE) for name in timed)
-        # both ends of a window may be samples, and since each may be off by half a period, one more may lie in it
+        # both ends of a window may be samples, and jitter of half a period may move one more sample into it
         samples = math.ceil(self.window / scenario.loop.period) + 2 if kept else 0
         return PointingPart(vector(across(self.boresight)), vector(self.after), vector(self.window), timed, samples)

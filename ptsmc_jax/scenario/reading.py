@@ -1,4 +1,7 @@
-"""Scenarios read, checked as a whole and changed; without JAX, so that a bad one is refused at once."""
+"""Read, validate and change scenarios. Start with `read`, `from_tables` and `replace`.
+
+The module does not import JAX, so that configuration errors are reported at once.
+"""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,23 +19,27 @@ AFTER = Scaled(10.0, time=1)  # from t_f to the end of a run [s]
 
 
 def read(path: str | Path) -> Scenario:
-    """The scenario of a TOML file, checked; raises ScenarioError with one sentence. Runs nothing that it names."""
+    """Return the validated scenario of a TOML file; raise ScenarioError with one sentence. Custom code is not run."""
     return from_tables(parsing.load(path))
 
 
 def of(what: object) -> Scenario:
-    """What is a scenario, or the file of one; raises TypeError, with one sentence, where it is neither."""
+    """Return a scenario, or read it if `what` is the path of a file; raise TypeError for anything else."""
     if isinstance(what, str | Path):
         return read(what)
     return check_scenario(what, ", or its file")
 
 
 def from_tables(raw: Mapping[str, Any], *, run: bool = False) -> Scenario:
-    """The scenario of raw tables (a parsed file), checked; raises ScenarioError with one sentence.
+    """Return the validated scenario of raw tables, such as a parsed TOML file.
 
-    run: code of one's own may be run, without which its keys and gains are not known, and not checked: see `complete`.
+    Args:
+        raw: tables by name; keys that are absent get their defaults.
+        run: whether custom code may run. If not, the keys and gains of custom parts are not validated, see `complete`.
 
-    Raises TypeError where these are no tables.
+    Raises:
+        ScenarioError: a key, a value or a combination of values is not allowed; the message is one sentence.
+        TypeError: `raw` is not a mapping.
     """
     if not isinstance(raw, Mapping):
         found = f"this is a {type(raw).__name__}"
@@ -53,9 +60,10 @@ def _checked(raw: Mapping[str, Any], run: bool) -> Scenario:
 
 
 def resolve(scenario: Scenario) -> Scenario:
-    """The scenario with the defaults that depend on other keys: t_end, lists as long as there are inputs, bounds.
+    """Return a scenario with the defaults that depend on other keys: times, gains, disturbance bounds, lists.
 
-    Raises ScenarioError where the body is none, from whose inertia some follow.
+    Raises:
+        ScenarioError: the inertia, which determines defaults, is not that of a body, or devices contradict each other.
     """
     scenario.check_body()
     units, law = mission.scales(scenario), scenario.controller
@@ -81,20 +89,27 @@ def resolve(scenario: Scenario) -> Scenario:
 
 
 def complete(scenario: Scenario) -> Scenario:
-    """The scenario with the keys and gains of parts of one's own, whose files are run; raises ScenarioError."""
+    """Return a scenario with the keys and gains of its custom parts, whose code is run; raise ScenarioError."""
     return from_tables(parsing.stated(scenario), run=True) if own.waits(scenario) else scenario
 
 
 def settled(scenario: Scenario) -> Scenario:
-    """The scenario with its defaults as stated values: replacing a key then moves no default that depends on it."""
+    """Return a scenario whose defaults count as stated values, so that `replace` does not change them."""
     return msgspec.structs.replace(scenario, defaulted={})
 
 
 def replace(scenario: Scenario | str | Path, **changes: Any) -> Scenario:
-    """The scenario, or a file's, with other values, keys written table__key, checked: replace(s, controller__eta=4.0).
+    """Return a validated scenario with other values, such as replace(scenario, controller__eta=4.0).
 
-    None returns a key, or a whole table, to its default. Another kind of a table drops the keys of the old one. What
-    the scenario does not say stays the default, which may follow what is changed.
+    Keys that the scenario does not state keep their defaults, which may change with the new values. A new kind of a
+    table discards the keys of the old kind.
+
+    Args:
+        scenario: a scenario or the path of its file.
+        changes: values by key, written table__key, or whole tables by name. None restores the default.
+
+    Raises:
+        ScenarioError: a value or a combination of values is not allowed.
 
     >>> faster = replace(from_tables({}), controller__t_f=20.0)
     >>> faster.controller.t_f, round(faster.loop.t_end, 3)
@@ -109,13 +124,13 @@ def replace(scenario: Scenario | str | Path, **changes: Any) -> Scenario:
         value, (table, _, key) = changes[name], name.partition("__")
         within = tables.get(table, {})
         if key and not isinstance(within, Mapping):
-            continue  # given beside it, and refused as in a file
+            continue  # `from_tables` reports a table that is not a mapping
         if value is None and _is_known(scenario, table, key):
             if not key:
                 tables.pop(table, None)
             elif key == "kind" and _is_another_kind(scenario, table):
                 tables[table] = {}
-            elif key in within:  # of a copy: it may be the caller's
+            elif key in within:  # in a copy: the table may belong to the caller
                 tables[table] = {other: kept for other, kept in within.items() if other != key}
         elif not key:
             tables[table] = value
@@ -127,20 +142,20 @@ def replace(scenario: Scenario | str | Path, **changes: Any) -> Scenario:
 
 
 def _comes(name: str) -> int:
-    """When a change is made: whole tables and kinds first, which would drop the keys that go with them."""
+    """Return the order of a change: whole tables, then kinds, then other keys, which these would discard."""
     _, _, key = name.partition("__")
     return 0 if not key else 1 if key == "kind" else 2
 
 
 def _is_another_kind(scenario: Scenario, table: str) -> bool:
-    """Whether a table is of another kind than the default one."""
+    """Whether the kind of a table differs from the default kind."""
     kinds = layouts.SCENARIOS if table == "plant" else scenario.TABLES.get(table)
     kind = getattr(getattr(scenario, table), "kind", None)
     return isinstance(kinds, Mapping) and kind not in (None, next(iter(kinds)))
 
 
 def _is_known(scenario: Scenario, table: str, key: str) -> bool:
-    """Whether there is such a table or key; one that is not known is handed on, and refused as in a file."""
+    """Whether a table or key exists; `from_tables` reports an unknown one."""
     tables = set(scenario.__struct_fields__) - {"defaulted"}
     now = getattr(scenario, table) if table in tables else None
     if not key or now is None:

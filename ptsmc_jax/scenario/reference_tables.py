@@ -1,4 +1,7 @@
-"""Start of a spacecraft, and references: their keys besides the numbers that their classes declare, and the classes."""
+"""The tables [initial] and [reference] of scenario files of a spacecraft, with the references by kind in `REFERENCES`.
+
+The numbers of a reference are declared in `signals.references`. Start with `ReferenceTable`.
+"""
 
 from typing import Annotated, Any, Literal
 
@@ -14,7 +17,7 @@ from ptsmc_jax.signals import references
 
 
 class Initial(Attitude, frozen=True):
-    """Where the spacecraft starts: one attitude key and the body rate."""
+    """Initial state of the spacecraft: one attitude key and the body rate."""
 
     rate: Annotated[Three, Meaning("body rate at t = 0, body axes", "rad/s")] = (0.0, 0.0, 0.0)
 
@@ -23,12 +26,12 @@ class ReferenceTable(Attitude, PartTable, frozen=True):
     """An attitude that a spacecraft is to follow."""
 
     def frequencies(self) -> dict[str, float]:
-        """Return how fast the reference turns and changes [rad/s], by the key that says so."""
+        """Return the angular frequency of the reference [rad/s], by the key that determines it."""
         part = self.build() if isinstance(self, Own) else self
         return {f"reference.{self.made.paced_by}": fastest(self, "reference", part)}
 
     def check(self) -> None:
-        """Raise ScenarioError if its keys ask for no attitude."""
+        """Raise ScenarioError if the attitude is not valid."""
         attitude_keys.quaternion(self, "reference")
 
     def build(self) -> Any:
@@ -49,7 +52,7 @@ class SlewTable(ReferenceTable, frozen=True):
 
     @property
     def turn(self) -> np.ndarray:
-        """Rotation vector from its attitude to `to_quat_xyzw`, the short way or the long way round (3,) [rad]."""
+        """Rotation vector (3,) [rad] from the initial attitude to `to_quat_xyzw`, by the short or the long way."""
         from scipy.spatial.transform import Rotation
 
         start = Rotation.from_quat(attitude_keys.quaternion(self, "reference"))
@@ -59,7 +62,7 @@ class SlewTable(ReferenceTable, frozen=True):
         return short * (1.0 - 2.0 * np.pi / angle) if self.way == "long" and angle > 0.0 else short
 
     def check(self) -> None:
-        """Both attitudes must be given as unit quaternions can be."""
+        """Raise ScenarioError if one of the two attitudes is not valid."""
         super().check()
         attitude_keys.unit("reference.to_quat_xyzw", self.to_quat_xyzw)
 

@@ -1,8 +1,8 @@
-"""Between which values the gains of a sampled run matter and are stable.
+"""Ranges of the gains of a sampled run that are stable and have an influence.
 
-A period h, a moment of inertia J and the noise sigma_s of s turn every gain that acts after the hand-over into a
-number: l h / J, K1 h, c h, width / sigma_s, delta / h. On the log scales that a search goes by, these are its
-coordinates; their ends are here.
+Every gain of the hold phase is dimensionless in units of the control period h, the moment of inertia J and the noise
+sigma_s of s: l h / J, K1 h, c h, width / sigma_s, delta / h. A search uses these numbers on log scales. The functions
+here return the ends of their ranges.
 """
 
 import math
@@ -12,29 +12,33 @@ from ptsmc_jax.declare import Scaled
 from ptsmc_jax.scenario import mission
 from ptsmc_jax.theory import borders
 
-LEFT = 5e-5  # share of the observer's error that a dead-beat one leaves after a period
-SHARE = 0.05  # of the slope toward s = 0: what changes less does not matter
-WIDEST = 1e4  # times the noise of s: hardly a switching term any more
-QUIET = (1e-2, 1e2)  # widths without noise, over the default one of the paper's case, scaled
+LEFT = 5e-5  # remaining fraction of an error after one period that counts as deadbeat
+SHARE = 0.05  # relative change of the mean derivative of the sign at s = 0 that counts as no influence
+WIDEST = 1e4  # thickest boundary layer over the noise of s: the switching term then nearly vanishes
+QUIET = (1e-2, 1e2)  # thinnest and thickest boundary layer without noise, over the default one
 
 
 def dead_beat_gain(scenario: Any) -> float:
-    """Gain l [N m s], the same on all axes, from which on at most `LEFT` of the observer's error is left.
+    """Return the gain l [N m s] of a deadbeat observer, equal on all axes.
 
-    After one period, and of the error about the axis of the largest principal moment J: l h / J = ln(1 / LEFT) = 9.9. A
-    larger gain has no influence. Without a body J = 1.
+    It decreases the error about the axis of the largest principal moment J to the fraction `LEFT` in one period:
+    l h / J = ln(1 / LEFT) = 9.9. A larger gain has no influence. Without a body J = 1.
     """
     _, largest = scenario.moments
     return math.log(1.0 / LEFT) * (1.0 if largest is None else largest) / scenario.loop.period
 
 
 def largest_k1(scenario: Any, surface_rate: float) -> float:
-    """The largest K1 [1/s] with which the sampled loop is stable after the hand-over, by delay and `surface_rate`.
+    """Return the largest K1 [1/s] that stabilises the sampled hold phase, 0 if no K1 does.
 
-    `borders.largest_reaching` is K1 h / 2 for a spacecraft (60), K1 h for laws with the K1 of (10) and (29); without
-    delay it is 2 - c h. Implicit sampling without delay has no border: there the largest K1 is the one that leaves
-    `LEFT` of s after a period. For an order above 2 it is an estimate, by the slowest pole of the surface. 0: no K1 is
-    stable.
+    The limit is K1 h / 2 = `borders.largest_reaching` for a spacecraft (60), and K1 h for the K1 of (10) and (29).
+    Without delay it is 2 - c h. Implicit sampling without delay has no stability limit. Its largest K1 decreases s to
+    the fraction `LEFT` in one period. For an order above 2 the limit is an estimate from the slowest pole of the
+    surface.
+
+    Args:
+        scenario: a scenario with a sampled loop.
+        surface_rate: c [1/s].
     """
     h = scenario.loop.period
     delay = float(scenario.devices.delay_periods)
@@ -45,10 +49,11 @@ def largest_k1(scenario: Any, surface_rate: float) -> float:
 
 
 def narrowest_that_matters(noise: float) -> float:
-    """Width of the smooth sign below which it is as good as the exact one under this noise, in the units of s.
+    """Return the thickness of the boundary layer below which noise hides it, in the units of s.
 
-    The mean slope at s = 0 of tanh((s + n) / width), n Gaussian, is the exact sign's (2 / pi)^(1/2) / noise but for
-    `SHARE`: 1 - (pi^2/24) (width / noise)^2.
+    Averaged over Gaussian noise n, tanh((s + n) / width) has the derivative sqrt(2 / pi) / noise at s = 0, times
+    1 - (pi^2 / 24) (width / noise)^2. The first factor belongs to the discontinuous sign. The function returns the
+    width at which the second factor is 1 - `SHARE`.
     """
     return math.sqrt(24.0 * SHARE) / math.pi * noise
 
@@ -67,6 +72,6 @@ def quiet(scenario: Any) -> tuple[float, float]:
 
 
 def widths(scenario: Any) -> tuple[float, float]:
-    """Between which the width of the smooth sign matters, in the units of s: by the noise of s, if there is any."""
+    """Return the smallest and largest useful boundary layer in the units of s, from the noise of s if it is not 0."""
     noise = scenario.devices.noise_of_s(scenario)
     return (narrowest_that_matters(noise), WIDEST * noise) if noise > 0.0 else quiet(scenario)

@@ -1,4 +1,8 @@
-"""Tables of scenario files, made from what the classes of parts declare of their numbers."""
+"""Build the tables of scenario files from the declarations in the classes of parts. Start with `table`.
+
+A law, an observer, a disturbance or a reference declares each of its numbers once, see `declare`. The table of its kind
+has these numbers as keys.
+"""
 
 import dataclasses
 import functools
@@ -15,36 +19,36 @@ from ptsmc_jax.scenario.values import Table
 
 
 class PartTable(Table, frozen=True):
-    """A table whose keys are the numbers of the class of a part, besides those that the table itself has."""
+    """A table whose keys are its own fields and the numbers that the class of a part declares."""
 
     made: ClassVar[Any] = None  # the class of the part
-    declared: ClassVar[Mapping[str, Declaration]] = {}  # its numbers
-    body: ClassVar[bool] = True  # the plant is a spacecraft
-    prefix: ClassVar[str] = ""  # with the key it makes the name of a gain
-    gains: ClassVar[tuple[str, ...]] = ()  # names of all that tuning may move
-    usual: ClassVar[Mapping[str, str]] = {}  # names of the usual bounds of gains that the table itself declares
-    # gains that are free if a scenario does not say; the second ones in the sampled loop only, since without samples a
-    # larger K1 and a thinner boundary layer cost nothing but steps
+    declared: ClassVar[Mapping[str, Declaration]] = {}  # declarations of its numbers, by key
+    body: ClassVar[bool] = True  # whether the plant is a spacecraft
+    prefix: ClassVar[str] = ""  # prefix of a key in the name of its gain, such as observer_ for observer_gain
+    gains: ClassVar[tuple[str, ...]] = ()  # names of all gains that tuning can change
+    usual: ClassVar[Mapping[str, str]] = {}  # by key: entry of `gain_bounds.BOUNDS`, for gains of the table itself
+    # Gains that are free by default. The second tuple is free in the sampled loop only: in the continuous loop a larger
+    # K1 and a thinner boundary layer cost only integration steps.
     free_by_default: ClassVar[tuple[str, ...]] = ()
     free_if_sampled: ClassVar[tuple[str, ...]] = ()
-    remake: ClassVar[tuple] = ()  # how a process makes this type again: a function and its arguments
+    remake: ClassVar[tuple] = ()  # how unpickling makes this type again: a function and its arguments
 
     def __reduce__(self) -> tuple:
-        """Pickle by the arguments that this type is made from, since no module has its name."""
+        """Pickle with the arguments that make this type, since no module contains it."""
         return _restored, (self.remake or type(self), {name: getattr(self, name) for name in self.__struct_fields__})
 
     def part(self, **known: Any) -> Any:
-        """Return the part: its fields are those known, and else the numbers of the keys with their names."""
+        """Return the part. Fields that are not in `known` get the numbers of the keys with their names."""
         fields = [one.name for one in dataclasses.fields(self.made) if not one.metadata.get("static")]
         numbers = {name: vector(getattr(self, name)) for name in fields if name not in known}
         return registered(self.made)(**known, **numbers)
 
     def filled(self, scenario: Any) -> Any:
-        """Return the table with the defaults that follow from other keys, besides those in `scaled`."""
+        """Return the table with its defaults that depend on other keys, except those in `scaled`."""
         return self
 
     def written(self, scenario: Any) -> Any:
-        """Return the table with its keys that follow from others of a checked scenario."""
+        """Return the table for a file, with the keys that depend on others of a validated scenario."""
         return self
 
     @property
@@ -59,10 +63,10 @@ def _restored(remake: Any, values: dict[str, Any]) -> Any:
 
 @functools.cache
 def registered(made: type) -> type:
-    """Return a class registered as a pytree, as the built-in ones are."""
+    """Return a class registered as a JAX pytree, if it is not registered yet."""
     try:
         return pytree(made)
-    except ValueError:  # it is one already
+    except ValueError:  # it is registered already
         return made
 
 
@@ -70,11 +74,11 @@ def table(base: Any, made: Any, kind: str, body: bool = True, changes: tuple[tup
     """Return the table of a class of parts.
 
     Args:
-        base: the table with the keys that all these parts have.
-        made: the class; its docstring begins with what the kind is.
+        base: the table with the keys that all these parts share.
+        made: the class of the part; the first paragraph of its docstring describes the kind.
         kind: name of the kind.
-        body: the plant is a spacecraft.
-        changes: defaults that are others for these plants, by key.
+        body: whether the plant is a spacecraft.
+        changes: keys and defaults that replace the declared defaults for this plant.
     """
     return _table(base, made, kind, body, changes)
 
@@ -87,7 +91,15 @@ def _table(base: Any, made: Any, kind: str, body: bool, changes: tuple) -> Any:
 
 
 def extended(base: Any, made: Any, kind: str, declared: Mapping[str, Declaration], **space: Any) -> Any:
-    """Return `base` with the keys that are declared; space: further class variables."""
+    """Return a subclass of a table with declared keys.
+
+    Args:
+        base: the table.
+        made: the class of the part.
+        kind: name of the kind.
+        declared: declarations by key.
+        space: further class variables.
+    """
     body, fields = space.get("body", base.body), []
     for name, one in declared.items():
         scaled = one.default is None or isinstance(one.default, Scaled)

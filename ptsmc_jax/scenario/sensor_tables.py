@@ -1,4 +1,7 @@
-"""The tables of [[sensors]]: any number of star trackers, vector sensors and gyros, which a Kalman filter combines."""
+"""The tables of [[sensors]]: any number of star trackers, vector sensors and gyros, which a Kalman filter combines.
+
+Start with `SensorSuite`. `SENSORS` lists the classes by kind.
+"""
 
 import math
 from collections.abc import Mapping
@@ -26,18 +29,18 @@ Bias = Annotated[float, Meta(ge=0, le=1e3, description="a number from 0 to 1000"
 
 
 class SensorTable(PartTable, frozen=True):
-    """A sensor."""
+    """A table of [[sensors]]."""
 
     required: ClassVar[tuple[str, ...]] = ()  # keys without a default
 
     def check_alone(self, place: str) -> None:
-        """Raise ScenarioError if a key is missing, or its keys contradict each other."""
+        """Raise ScenarioError if a key is missing or keys contradict each other; place: of the table, for errors."""
         for key in self.required:
             if getattr(self, key) is None:
                 raise ScenarioError(f"{place}.{key} is absent, but must be given")
 
     def check(self, place: str, scenario: Any) -> None:
-        """Raise ScenarioError if its keys contradict those of the scenario."""
+        """Raise ScenarioError if keys contradict other tables of the scenario; place: of the table, for errors."""
 
 
 class AttitudeSensorTable(SensorTable, frozen=True):
@@ -53,7 +56,7 @@ class AttitudeSensorTable(SensorTable, frozen=True):
     latency: Annotated[NotNegative, Meaning("time from a reading until the flight software has it", "s")] = 0.0
 
     def check_alone(self, place: str) -> None:
-        """Raise ScenarioError for two mountings, or a boresight without a direction, too."""
+        """Raise ScenarioError also for two mountings or a zero boresight."""
         super().check_alone(place)
         if self.boresight is not None and self.rotvec_deg is not None:
             raise wrong(f"{place}.rotvec_deg", self.rotvec_deg, "absent if boresight is given")
@@ -70,7 +73,7 @@ class AttitudeSensorTable(SensorTable, frozen=True):
             raise wrong(f"{place}.latency", self.latency, f"at most {LATEST} control periods, {LATEST * control:.6g} s")
 
     def mounting(self) -> np.ndarray:
-        """Return the unit quaternion (4,) of the rotation from body axes to its axes."""
+        """Return the unit quaternion (4,) of the rotation from body axes to sensor axes."""
         from scipy.spatial.transform import Rotation
 
         if self.rotvec_deg is not None:
@@ -91,15 +94,15 @@ class AttitudeSensorTable(SensorTable, frozen=True):
         raise NotImplementedError
 
     def information(self) -> np.ndarray:
-        """Return the information (3, 3) of a reading about a small rotation about body axes [1/rad^2]."""
+        """Return the Fisher information (3, 3) of a reading about a small rotation about body axes [1/rad^2]."""
         raise NotImplementedError
 
     def build(self, name: str, period: float) -> Any:
-        """Return the part of `devices.attitude_sensors`; period: of control [s]."""
+        """Return the part of `devices.attitude_sensors`; name: of the sensor, period: of control [s]."""
         raise NotImplementedError
 
     def common(self, name: str, period: float) -> dict[str, Any]:
-        """Return the fields that all attitude sensors have."""
+        """Return the fields that all attitude sensors share; name: of the sensor, period: of control [s]."""
         return {
             "name": name,
             "noise": vector(self.sigmas()),
@@ -117,12 +120,12 @@ class StarTracker(AttitudeSensorTable, frozen=True):
     required: ClassVar[tuple[str, ...]] = ("noise_across",)
 
     def sigmas(self) -> tuple[float, ...]:
-        """Return the noise about its x, y and z axis [rad]."""
+        """Return the noise about the x, y and z axis of the sensor [rad]."""
         across = self.noise_across or 0.0  # `check_alone` refuses 0
         return across, across, self.noise_about or across
 
     def information(self) -> np.ndarray:
-        """Return the information (3, 3) of a reading [1/rad^2]."""
+        """Return the Fisher information (3, 3) of a reading [1/rad^2]."""
         from scipy.spatial.transform import Rotation
 
         axes = Rotation.from_quat(self.mounting()).as_matrix()
@@ -142,7 +145,7 @@ class VectorSensor(AttitudeSensorTable, frozen=True):
     required: ClassVar[tuple[str, ...]] = ("direction", "noise")
 
     def check_alone(self, place: str) -> None:
-        """Raise ScenarioError for a direction without a length, too."""
+        """Raise ScenarioError also for a zero direction."""
         super().check_alone(place)
         _check_direction(f"{place}.direction", self.direction)
 
@@ -151,7 +154,7 @@ class VectorSensor(AttitudeSensorTable, frozen=True):
         return (self.noise or 0.0,) * 3
 
     def information(self) -> np.ndarray:
-        """Return the information (3, 3) of a reading at a body attitude along inertial axes [1/rad^2]."""
+        """Return the Fisher information (3, 3) of a reading [1/rad^2], if body axes and inertial axes coincide."""
         return (np.eye(3) - np.outer(self.along, self.along)) / self.sigmas()[0] ** 2
 
     @property
@@ -178,9 +181,9 @@ class CustomTable(AttitudeSensorTable, frozen=True):
         return self.noise or ()
 
     def information(self) -> np.ndarray:
-        """Return the information (3, 3) of a reading at a body attitude along inertial axes [1/rad^2].
+        """Return the Fisher information (3, 3) of a reading [1/rad^2], if body axes and inertial axes coincide.
 
-        Before the code is run it is that of a sensor that measures the attitude.
+        Before the code has run, the sensor counts as a sensor of the whole attitude.
         """
         if self.made is None:
             return np.eye(3) / max(self.sigmas(), default=1.0) ** 2
@@ -188,7 +191,7 @@ class CustomTable(AttitudeSensorTable, frozen=True):
         return rows.T @ (rows / np.array(self.sigmas())[:, None] ** 2)
 
     def build(self, name: str, period: float) -> Any:
-        """Return the sensor; raise ScenarioError if it has another number of components than noises."""
+        """Return the sensor; raise ScenarioError if the numbers of noises and of components of a reading differ."""
         made = self.part(**self.common(name, period))
         reading = made.read(jnp.array([0.0, 0.0, 0.0, 1.0]))
         components = np.size(made.change(reading, reading))
@@ -198,7 +201,7 @@ class CustomTable(AttitudeSensorTable, frozen=True):
 
 
 class Gyro(SensorTable, frozen=True):
-    """A gyro of three axes that samples in each control period. Several count as their mean, weighted by 1/noise^2."""
+    """A gyro of three axes that samples once a control period. Several are averaged with weights 1/noise^2."""
 
     kind: Literal["gyro"] = "gyro"
     rate_noise: Annotated[Noise, Meaning("1 sigma per axis and sample", "rad/s")] = None
@@ -234,12 +237,12 @@ SENSORS: Kinds = {
 
 
 class KalmanFilter(FilterTable, frozen=True):
-    """The filter of [[sensors]], which has no keys: it follows from the sensors."""
+    """The filter of [[sensors]]. It has no keys, since its design follows from the sensors."""
 
     kind: Literal["kalman"] = "kalman"
 
     def passes(self, scenario: Any) -> float:
-        """Return the fraction of a reading's noise that reaches the law at once, about."""
+        """Return approximately the fraction of a reading's noise that reaches the law at once."""
         table, period = scenario.devices, scenario.loop.period
         width = formulas.best_bandwidth(table.attitude_noise, table.gyro_noise(period), period, table.interval(period))
         return -math.expm1(-2.0 * width * table.interval(period))
@@ -252,7 +255,7 @@ class SensorSuite(Table, frozen=True):
     gains: ClassVar[Mapping[str, Any]] = {}
 
     def placed(self, name: str) -> dict[str, SensorTable]:
-        """Return the tables by their place in a file, such as sensors[0]; name: of the list."""
+        """Return the tables by their place in a file, such as sensors[0]; name: of the list in the file."""
         return {f"{name}[{k}]": table for k, table in enumerate(self.each)}
 
     @property
@@ -262,7 +265,7 @@ class SensorSuite(Table, frozen=True):
 
     @property
     def attitude(self) -> dict[str, AttitudeSensorTable]:
-        """Return the attitude sensors by name, such as star_tracker_1, which is that of their input in exported C."""
+        """Return the attitude sensors by name, such as star_tracker_1; exported C uses the same names for inputs."""
         found, counts = dict[str, Any](), dict[str, int]()
         for table in self.each:
             kind = table.kind
@@ -272,7 +275,7 @@ class SensorSuite(Table, frozen=True):
         return found
 
     def check_alone(self) -> None:
-        """Raise ScenarioError if a sensor is wrong, or the sensors together do not determine the attitude."""
+        """Raise ScenarioError if a sensor is not valid or if the sensors together do not determine the attitude."""
         for place, table in self.placed("sensors").items():
             table.check_alone(place)
         if not self.gyros:
@@ -287,7 +290,7 @@ class SensorSuite(Table, frozen=True):
             )
 
     def check(self, scenario: Any) -> None:
-        """Raise ScenarioError if keys contradict those of the scenario."""
+        """Raise ScenarioError if keys contradict other tables of the scenario."""
         for place, table in self.placed("sensors").items():
             table.check(place, scenario)
 
@@ -300,13 +303,13 @@ class SensorSuite(Table, frozen=True):
         return noise, bias, walk
 
     def short_form(self, table: Hardware, period: float | None) -> Hardware:
-        """Return [hardware] with one star tracker and gyro that say about as much, for defaults and bounds.
+        """Return [hardware] with one star tracker and one gyro of about the same accuracy, for defaults and bounds.
 
         Args:
             table: [hardware] of the scenario.
-            period: of control [s]; None: not known yet.
+            period: control period [s], None if it is not known yet; the table is then returned unchanged.
         """
-        if period is None:  # of a loop without samples, or not known yet
+        if period is None:  # the loop is continuous, or its period is not known yet
             return table
         intervals = {name: max(one.interval(period), period) for name, one in self.attitude.items()}
         interval = min(intervals.values())
@@ -319,7 +322,7 @@ class SensorSuite(Table, frozen=True):
         )  # fmt: skip
 
     def build(self, model: Any, period: float) -> Any:
-        """Return `devices.sensor_suite`."""
+        """Return the sensors of `devices.sensor_suite`; model: not used, period: of control [s]."""
         sensors = [table.build(name, period) for name, table in self.attitude.items()]
         noise, bias, walk = self.gyro(period)
         gyro, drift = jnp.full(3, noise), jnp.full(3, formulas.per_sample(walk, period))

@@ -1,4 +1,4 @@
-"""Scenarios of a rigid spacecraft: its tables, what is checked of them, and what they are made into."""
+"""Scenarios of a spacecraft: tables, validation, and the parts that they build. Start with `SpacecraftScenario`."""
 
 import math
 from collections.abc import Collection, Mapping
@@ -27,7 +27,8 @@ from ptsmc_jax.scenario.tables import Loop, Scenario, Tune
 from ptsmc_jax.scenario.values import Inertia, Kinds, Meaning, NotNegative, Positive, Table, Three
 from ptsmc_jax.simulation.catalogues import CATALOGUE
 
-# of a law to compare with, at most so many steps of 0.025 rad in two periods: a run that turns faster is marked
+# Largest number of integration steps of 0.025 rad in two control periods under a comparison law. A run that turns
+# faster is marked.
 BASELINES = 50
 _CASE_I: dict[str, Mapping[str, Any]] = {
     "initial": {"quat_xyzw": [0.4714045207910317, -0.3333333333333333, 0.5773502691896258, 0.5773502691896258]},
@@ -36,7 +37,7 @@ _CASE_I: dict[str, Mapping[str, Any]] = {
 
 
 class SpacecraftPlant(Table, frozen=True):
-    """A rigid spacecraft, by quaternion and body rate; its body is [spacecraft], its start [initial]."""
+    """A spacecraft with quaternion and body rate as its state; [spacecraft] and [initial] hold its numbers."""
 
     kind: Literal["spacecraft"] = "spacecraft"
 
@@ -59,10 +60,11 @@ class Spacecraft(Table, frozen=True):
 
 
 class Flexible(Table, frozen=True):
-    """Flexible appendages, or liquid that sloshes, of the body that flies; law, observer and filter know a rigid one.
+    """Flexible appendages, or sloshing liquid, of the true plant. Law, observer and filter use a rigid design model.
 
-    J w' + D' e'' = -w x (J w + D' e') + u + d, e'' + 2 z W e' + W^2 e = -D w', with the modes e at rest at t = 0, J the
-    inertia of the whole body and D the rows of `coupling`.
+    J w' + D' e'' = -w x (J w + D' e') + u + d,
+    e'' + 2 z W e' + W^2 e = -D w'.
+    The modes e are at rest at t = 0. J is the inertia of the whole body, and D has the rows of `coupling`.
     """
 
     frequency: Annotated[
@@ -93,9 +95,12 @@ class Flexible(Table, frozen=True):
     }
 
     def check(self, inertia: Any) -> None:
-        """Refuse lists of other lengths, and modes that no body can have; inertia: of the body that flies [kg m^2]."""
+        """Raise ScenarioError for lists of different lengths and for modes that no body can have.
+
+        `inertia` is the inertia of the true body [kg m^2].
+        """
         lists = {key: getattr(self, key) for key in self.__struct_fields__}
-        modes = sorted(map(len, lists.values()))[1]  # two of the three say it
+        modes = sorted(map(len, lists.values()))[1]  # the length that two of the three lists have
         for key, value in lists.items():
             if len(value) != modes:
                 raise wrong(f"flexible.{key}", value, f"a list of {modes}, one for each mode")
@@ -105,10 +110,15 @@ class Flexible(Table, frozen=True):
             raise ScenarioError(f"flexible.coupling is {errors.brief(self.coupling)}: {error}") from None
 
     def check_drawn(self, inertia: Any, drawn: Any) -> None:
-        """Refuse draws of couplings and inertias that no body can have; inertia: of the body that flies [kg m^2].
+        """Raise ScenarioError if random couplings and inertias can be those of no body.
 
-        Rows are at most f times as long and moments at least s times as large, so that every draw leaves at least
-        s J - f^2 D'D. Axes that are turned besides are not looked at.
+        A random row of D is at most f times the nominal row, and a random moment at least s times the nominal moment.
+        The inertia of the rigid rest of the body is then at least s J - f^2 D'D, which must be positive definite.
+        Random rotations of the principal axes are not considered.
+
+        Args:
+            inertia: inertia of the true body [kg m^2].
+            drawn: the table [dispersion].
         """
         rows, moments = (getattr(drawn, key, None) for key in ("mode_coupling", "inertia"))
         longest = smallest = 1.0
@@ -130,7 +140,7 @@ class Flexible(Table, frozen=True):
 
 
 class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
-    """A scenario of a rigid spacecraft."""
+    """A scenario of a spacecraft."""
 
     spacecraft: Spacecraft
     initial: Initial
@@ -165,35 +175,35 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
 
     @classmethod
     def fallback(cls, plant: Any, given: Collection[str], law: object) -> dict[str, Mapping[str, Any]]:
-        """The paper's Case I."""
+        """Return the attitudes of the published Case I."""
         return _CASE_I
 
     @property
     def inputs(self) -> int:
-        """Torques about the body axes."""
+        """The number of torques: one about each body axis."""
         return 3
 
     @property
     def grid_order(self) -> int:
-        """The paper's cases need no finer grid."""
+        """The order of the finest grid that the published cases need."""
         return 1
 
     @property
     def estimator(self) -> Any:
-        """The table [filter], `NoFilter` where it is absent; of [[sensors]] their Kalman filter."""
+        """The table [filter], `NoFilter` if it is absent, or the Kalman filter of [[sensors]]."""
         if isinstance(self.sensors, SensorSuite):
             return KalmanFilter()
         return NoFilter() if self.filter is None else self.filter
 
     @property
     def devices(self) -> Any:
-        """The table [hardware], with the noise of [[sensors]] as one star tracker and gyro have it."""
+        """The table [hardware], with one star tracker and one gyro that are equivalent to [[sensors]]."""
         table = super().devices
         return self.sensors.short_form(table, self.loop.period) if isinstance(self.sensors, SensorSuite) else table
 
     @property
     def reaction_wheels(self) -> Any:
-        """The table [wheels]; None: there are none."""
+        """The table [wheels], None without wheels."""
         return self.wheels
 
     @property
@@ -234,7 +244,7 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
         return 0.5 * float(min(found)) if found else None
 
     def start_angle(self) -> float:
-        """Return the largest angle to the reference at t = 0 [rad]: of the nominal run, or of dispersed ones."""
+        """Return the largest angle to the reference at t = 0 [rad], dispersions included."""
         start, target = (
             np.asarray(attitude_keys.quaternion(table, name), dtype=float)
             for table, name in ((self.initial, "initial"), (self.reference, "reference"))
@@ -246,7 +256,7 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
         return angle
 
     def start_tangent(self) -> float:
-        """Return tan(angle / 2) at the start, at most that of 160 degrees."""
+        """Return tan(angle / 2) for the angle to the reference at t = 0, limited to 160 degrees."""
         return math.tan(0.5 * min(self.start_angle(), math.radians(160.0)))
 
     def usual_settling(self) -> float:
@@ -255,18 +265,18 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
         return max(1e-3 * min(1.0, self.start_angle() or 1.0), min(5.0 * noise, 1.0))
 
     def written(self) -> Any:
-        """With the filter's keys too."""
+        """Return the scenario for a file, keys of the filter included."""
         found = super().written()
         return found if self.filter is None else msgspec.structs.replace(found, filter=self.filter.written(self))
 
     @property
     def true_inertia(self) -> Any:
-        """Inertia of the body that flies, as the scenario gives it [kg m^2]."""
+        """Inertia of the true body, three moments or a tensor (3, 3) [kg m^2]."""
         table = self.spacecraft
         return table.inertia if table.true_inertia is None else table.true_inertia
 
     def check_body(self) -> None:
-        """A body that can be."""
+        """Raise ScenarioError for an inertia that no body can have."""
         for key in ("inertia", "true_inertia"):
             value = getattr(self.spacecraft, key)
             if value is not None:
@@ -276,7 +286,7 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
                     raise ScenarioError(f"spacecraft.{key} is {errors.brief(value)}: {error}") from None
 
     def check_devices(self) -> None:
-        """Modes that a body can have, and devices that fit."""
+        """Raise ScenarioError for modes that no body can have and for devices that contradict each other."""
         if self.flexible is not None:
             self.flexible.check(self.true_inertia)
         if isinstance(self.sensors, SensorSuite):
@@ -287,10 +297,10 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
             self.wheels.check()
 
     def check_plant(self) -> None:
-        """Attitudes that are given once, devices that fit, and modes that a body can have however they are drawn."""
+        """Raise ScenarioError for invalid attitudes, settling angle, disturbance, pointing or random modes."""
         attitude_keys.quaternion(self.initial, "initial")
         settled = self.loop.settling_angle
-        if settled >= math.pi:  # as in degrees: nothing would ever be away from the reference, or missed
+        if settled >= math.pi:  # probably degrees; every attitude would count as settled
             raise wrong("loop.settling_angle", settled, 'less than pi [rad], or with its unit, such as "0.5 deg"')
         self.reference.check()
         for place, term in self.placed_terms.items():
@@ -301,43 +311,48 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
             self.flexible.check_drawn(self.true_inertia, self.dispersion)
 
     def observation(self) -> Any:
-        """What pointing error indices are taken of."""
+        """Return the observation of pointing errors, None without [pointing]."""
         return None if self.pointing is None else self.pointing.build(self)
 
     def model(self) -> Any:
-        """The body that the law knows."""
+        """Return the rigid body of the design model."""
         return spacecraft(self.spacecraft.inertia)
 
     def truth(self, model: Any) -> Any:
-        """The body with its true inertia, where the scenario gives one, and its flexible modes."""
+        """Return the true plant: the body with its true inertia and its flexible modes."""
         modes = self.flexible
         if modes is None:
             return spacecraft(self.true_inertia)
         return flexible(self.true_inertia, modes.frequency, modes.damping, modes.coupling)
 
     def start(self) -> Any:
-        """Attitude and rate at t = 0."""
+        """Return attitude and rate at t = 0."""
         q = vector(attitude_keys.quaternion(self.initial, "initial"))
         return AttitudeState(q, vector(self.initial.rate))
 
     def target(self) -> Any:
-        """The reference."""
+        """Return the reference."""
         return self.reference.build()
 
     @property
     def turning(self) -> float:
-        """How fast the body turns at t = 0 [rad/s]; where it is drawn, all but one in 10 000."""
+        """Bound on the body rate at t = 0 [rad/s]; one dispersed rate in 10 000 exceeds it."""
         return sum(self._turning.values())
 
     @property
     def _turning(self) -> dict[str, float]:
-        """What that is made of, by the key that says so."""
+        """The nominal and the dispersed part of `turning` [rad/s], by key."""
         table = getattr(self.dispersion, "rate", None)
         drawn = {} if table is None else {f"dispersion.rate.{table.width}": float(table.widest * table.of()[0])}
         return {"initial.rate": float(np.linalg.norm(self.initial.rate)), **drawn}
 
     def frequencies(self, setup: Any, t_f: float) -> dict[str, float]:
-        """How fast start, reference, law, wheels and flexible modes move the body [rad/s], by key."""
+        """Return the angular frequencies of start, reference, law, wheels and flexible modes [rad/s], by key.
+
+        Args:
+            setup: the parts without a clock.
+            t_f: shortest prescribed time [s].
+        """
         found = {**self._turning, **self.reference.frequencies()}
         key, rate = self.controller.turning(t_f)
         if not self.controller.law.prescribed:
@@ -354,10 +369,10 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
         return found
 
     def _nutation(self, setup: Any) -> dict[str, float]:
-        """How fast a body with wheels nutates at most [rad/s], by the key that says so: |H| over its smallest moments.
+        """Return bounds on the nutation rate of a body with wheels [rad/s], by the key that causes each of them.
 
-        J w' = -w x H + u, where H = J w + A h changes in inertial axes by disturbances only: wheels that give a body
-        its rate take as much.
+        The bound is |H| / sqrt(J_1 J_2) with the two smallest principal moments, from J w' = -w x H + u. In inertial
+        axes only disturbances change H = J w + A h, since torques of the wheels are internal.
         """
         if self.wheels is None:
             return {}

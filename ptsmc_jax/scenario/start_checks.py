@@ -1,4 +1,7 @@
-"""Starts from which a law meets its singularity, or that it cannot invert: refused before anything is flown."""
+"""Reject runs that the law cannot perform, before they start: singular paths and singular input matrices.
+
+Start with `check`.
+"""
 
 import typing
 from typing import Any
@@ -16,14 +19,19 @@ from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation.rollout import SINGULAR_CLEARANCE, Parts
 from ptsmc_jax.theory import solutions
 
-SINGULAR_CONDITION = 1e14  # of a matrix in double precision
+SINGULAR_CONDITION = 1e14  # condition number of a matrix that counts as singular in double precision
 
 
 def check(scenario: Any, parts: Parts, dispersion: Any, *, drawn: bool) -> None:
-    """Raise ScenarioError if the law meets its singularity on the reference or on the way to it, or cannot be inverted.
+    """Raise ScenarioError if the law meets its singularity on the nominal path, or if it must invert a singular matrix.
 
-    A trial with a random attitude that meets the singularity is marked instead; drawn: the attitude is random if a
-    dispersion says so.
+    Trials with random attitudes are not checked here: a trial that meets the singularity is marked in the results.
+
+    Args:
+        scenario: the scenario.
+        parts: its parts.
+        dispersion: its dispersions.
+        drawn: whether dispersed attitudes are simulated. If so, the nominal initial attitude is not checked.
     """
     if scenario.motion == "system":
         system(scenario, parts)
@@ -34,7 +42,7 @@ def check(scenario: Any, parts: Parts, dispersion: Any, *, drawn: bool) -> None:
 
 
 def system(scenario: Any, parts: Parts) -> None:
-    """Refuse a system that is not finite where it starts, or that the law, or the observer, cannot invert there."""
+    """Raise ScenarioError if a system is not finite at t = 0, or if law or observer cannot invert it there."""
     start, plant = (jnp.zeros(()), parts.initial), typing.cast(System, parts.controller.model)
     _finite("system", plant, *start)
     if scenario.plant.truth is not None:
@@ -52,7 +60,7 @@ def system(scenario: Any, parts: Parts) -> None:
 
 
 def _finite(key: str, plant: System, t: Array, x: Array) -> None:
-    """Refuse a system whose functions are not finite in this state."""
+    """Raise ScenarioError if a function of a system is not finite in this state; key: "system" or "truth"."""
     functions = {"F": plant.position_rate, "H": plant.drift, "G": plant.input_gain, "D": plant.disturbance_gain}
     values = [(name, function(t, x)) for name, function in (*functions.items(), ("dF/dx2", plant.slope))]
     values += [("Z", z) for z in plant.hidden_rates(t, x, jnp.zeros(plant.inputs))]
@@ -69,7 +77,7 @@ _OPPOSITE = "q_e4 = 0 (180 degrees from the reference), at which the law is sing
 
 
 def reference(scenario: Any, parts: Parts) -> None:
-    """Refuse a reference on which the additive law meets its singularity."""
+    """Raise ScenarioError if the additive law meets its singularity q4 = 0 on the reference."""
     if not parts.controller.kinematics.additive:
         return
     grid = np.linspace(0.0, float(parts.t_end), 4001)
@@ -93,18 +101,18 @@ def reference(scenario: Any, parts: Parts) -> None:
 
 @programs.jit
 def _scalar_part(reference: Any, times: Array) -> Array:
-    """q_f4 of a reference at these times (times,) [s]."""
+    """Return q_f4 of a reference at the times (n,) [s]."""
     return lapack.vmap(lambda time: reference(time).q[3])(times)
 
 
 def attitude(scenario: Any, parts: Parts) -> None:
-    """Refuse an initial attitude from which the law meets its singularity on the way."""
+    """Raise ScenarioError if the nominal path from the initial attitude to the reference meets the singularity."""
     law = parts.controller
     singular, name = (_SINGULAR, "|q4|") if law.kinematics.additive else (_OPPOSITE, "|q_e4|")
     key, value = attitude_keys.attitude_key(scenario.initial)
     if law.prescribed:
         times, _, square = (np.asarray(v) for v in solutions.exact_path(parts))
-    else:  # of the others only the start is known
+    else:  # the path of other laws is not known, so only the start is checked
         target = parts.reference(jnp.zeros_like(parts.t_end))
         first = law.clearance(law.kinematics.align(parts.initial, target), target)
         times, square = np.zeros(1), np.square([float(first)])

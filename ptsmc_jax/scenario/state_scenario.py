@@ -1,4 +1,7 @@
-"""Scenarios of plants whose states are plain numbers, x0 in [plant]: integrator chains and systems of one's own."""
+"""Scenarios of integrator chains and custom second-order systems, whose initial state is x0 in [plant].
+
+Start with `ChainScenario` and `SystemScenario`.
+"""
 
 import math
 from collections.abc import Collection, Mapping
@@ -35,10 +38,10 @@ class ChainPlant(Table, frozen=True):
 
 
 class SystemPlant(Table, frozen=True):
-    """A second-order system of one's own, x_1' = F, x_2' = H + G u + D d, equation (25), in a Python file.
+    """A custom second-order system x_1' = F, x_2' = H + G u + D d, equation (25), in a Python file.
 
-    A scenario that names one is a program: flying it runs that file, which can do what you can. Read it before you fly
-    somebody else's; results that name one are flown with --trust only.
+    A scenario with a custom system is a program: a run executes the file with your permissions. Read the file before
+    you run a scenario of somebody else. Results that name such a file are run again with --trust only.
     """
 
     kind: Literal["system"] = "system"
@@ -57,7 +60,7 @@ class SystemPlant(Table, frozen=True):
 
 
 def tables_of(plant: type[Table], kind: str) -> dict[str, type[Table] | Kinds]:
-    """The tables of a scenario of this plant; kind: of the plant whose disturbances, laws and observers it has."""
+    """Return the tables of a scenario; kind: the key of its disturbances, laws and observers in their registries."""
     return {
         "plant": plant,
         "disturbance": DISTURBANCES[kind],
@@ -72,12 +75,12 @@ def tables_of(plant: type[Table], kind: str) -> dict[str, type[Table] | Kinds]:
 
 
 class StateScenario(Scenario, frozen=True, kw_only=True):
-    """What chains and systems share."""
+    """Base class of scenarios of chains and systems."""
 
     metrics: ClassVar[Any] = STATE_CATALOGUE
 
     def resolved(self) -> Any:
-        """With as many widths of the drawn initial state as there are states."""
+        """Return the scenario with one width of the dispersed initial state for each state."""
         drawn = getattr(self.dispersion, "x0", None)
         if drawn is None:
             return self
@@ -86,26 +89,26 @@ class StateScenario(Scenario, frozen=True, kw_only=True):
         return msgspec.structs.replace(self, dispersion=msgspec.structs.replace(self.dispersion, x0=drawn))
 
     def start_size(self) -> float:
-        """Return the size of x_1 at t = 0."""
+        """Return |x_1| at t = 0."""
         return math.hypot(*self.plant.x0[: self.inputs])
 
     def start_tangent(self) -> float:
-        """Return the size of x_1 at t = 0."""
+        """Return |x_1| at t = 0, which determines the first acceleration."""
         return self.start_size()
 
     def largest_acceleration(self) -> float | None:
-        """Return the limit on a chain's input; a system's own input matrix is not known here."""
+        """Return the limit on the input of a chain; None for a system, whose input matrix is not known here."""
         limits = [self.devices.torque_limit, tables.limit_of(self, "peak_torque")]
         known = [limit for limit in limits if limit is not None]
         return min(known) if known and self.plant.kind == "chain" else None
 
     def usual_settling(self) -> float:
-        """Return the default of `loop.settling_angle`, in units of x_1: 1e-3 of the start in the paper, 5."""
+        """Return the default of `loop.settling_angle` in units of x_1: 2e-4 |x_1(0)|, or five sigma of the noise."""
         noises = getattr(self.hardware, "state_noise", None) or (0.0,)
         return max(2e-4 * (self.start_size() or 5.0), 5.0 * max(noises[: self.inputs]))
 
     def check_devices(self) -> None:
-        """Refuse lists that are not as long as there are inputs, or states."""
+        """Raise ScenarioError for lists whose length is not the number of inputs or states."""
         self.devices.check(self)
         m = self.inputs
         for place, table in {**self.placed_terms, "observer": self.observer}.items():
@@ -115,7 +118,7 @@ class StateScenario(Scenario, frozen=True, kw_only=True):
                     raise wrong(f"{place}.{key}", value, f"a list of {m} number{'s' * (m > 1)}, one for each input")
 
     def start(self) -> Any:
-        """The state x0."""
+        """Return the state x0."""
         return vector(self.plant.x0)
 
 
@@ -127,9 +130,18 @@ class ChainScenario(StateScenario, frozen=True, kw_only=True):
 
     @classmethod
     def fallback(cls, plant: Any, given: Collection[str], law: object) -> dict[str, Mapping[str, Any]]:
-        """Figs. 1 and 2 for order 2 and 3, with poles at -1; the paper's t_f for every law.
+        """Return the defaults of a chain: the published cases of Figs. 1 and 2 for the orders 2 and 3.
 
-        x0 says the order where that is absent. Raises ScenarioError where there are too few states.
+        All laws have the published t_f. Surfaces of all orders have their poles at -1. If the order is absent, it is
+        the length of x0.
+
+        Args:
+            plant: the table [plant].
+            given: keys of [plant] in the file.
+            law: kind of the law.
+
+        Raises:
+            ScenarioError: x0 has fewer than two numbers.
         """
         order = len(plant.x0) if "x0" in given and "order" not in given else plant.order
         if order < 2:
@@ -141,7 +153,7 @@ class ChainScenario(StateScenario, frozen=True, kw_only=True):
 
     @property
     def inputs(self) -> int:
-        """A chain has one input."""
+        """One: a chain has one input."""
         return 1
 
     @property
@@ -150,29 +162,29 @@ class ChainScenario(StateScenario, frozen=True, kw_only=True):
         return self.plant.order
 
     def check_body(self) -> None:
-        """Refuse an initial state of another length than the chain's order."""
+        """Raise ScenarioError if the length of x0 is not the order of the chain."""
         n = self.plant.order
         if len(self.plant.x0) != n:
             raise wrong("plant.x0", self.plant.x0, f"a list of plant.order = {n} numbers")
 
     def model(self) -> Any:
-        """The chain."""
+        """Return the chain."""
         return chain(self.plant.order)
 
     def target(self) -> Any:
-        """Rest at the origin."""
+        """Return the reference, rest at the origin."""
         return Origin()
 
 
 class SystemScenario(StateScenario, frozen=True, kw_only=True):
-    """A scenario of a system of one's own."""
+    """A scenario of a custom system."""
 
     TABLES: ClassVar[Mapping[str, type[Table] | Kinds]] = tables_of(SystemPlant, "system")
     motion: ClassVar[str] = "system"
 
     @classmethod
     def fallback(cls, plant: Any, given: Collection[str], law: object) -> dict[str, Mapping[str, Any]]:
-        """The paper's t_f of a chain. Raises ScenarioError where x0 has no halves."""
+        """Return the published t_f of a chain; raise ScenarioError if x0 has an odd length."""
         if len(plant.x0) % 2:
             raise wrong("plant.x0", plant.x0, "a list of x_1 followed by x_2, as many numbers each")
         return {"controller": {"t_f": 5.0}}
@@ -183,7 +195,7 @@ class SystemScenario(StateScenario, frozen=True, kw_only=True):
         return len(self.plant.x0) // 2
 
     def check_plant(self) -> None:
-        """What can be said without running the file that it names: whoever reads a scenario may not want that."""
+        """Raise ScenarioError for invalid names of systems. Files are not run, since the user may only read them."""
         plant = self.plant
         if plant.system is None:
             raise ScenarioError(f"plant.system is absent, but must be given: {systems.ALLOWED}")
@@ -197,15 +209,15 @@ class SystemScenario(StateScenario, frozen=True, kw_only=True):
                 self._loaded(key)
 
     def model(self) -> Any:
-        """The system that law and observer know. Raises ScenarioError where there is none."""
+        """Return the design model, plant.system; raise ScenarioError if it cannot be loaded."""
         return self._loaded("system")
 
     def truth(self, model: Any) -> Any:
-        """The system that flies. Raises ScenarioError where there is none."""
+        """Return the true plant, plant.truth or the design model; raise ScenarioError if it cannot be loaded."""
         return model if self.plant.truth is None else self._loaded("truth")
 
     def _loaded(self, key: str) -> Any:
-        """The system that a key holds, or names: that file is run."""
+        """Return the system of a key, and run its file if the key names one."""
         value = getattr(self.plant, key)
         try:
             found = systems.load(value)
@@ -225,5 +237,5 @@ class SystemScenario(StateScenario, frozen=True, kw_only=True):
         return found
 
     def target(self) -> Any:
-        """Time: the reference is in x_1, an error already."""
+        """Return the time as the reference: x_1 is already an error."""
         return CurrentTime()

@@ -1,6 +1,7 @@
-"""Systems and functions of one's own by where they stand, "FILE.py:NAME" or "package.module:NAME".
+"""Load custom systems, classes and functions by name, "FILE.py:NAME" or "package.module:NAME".
 
-A scenario that names one is a program. `named` looks at the text alone; `digest`, `item` and `load` run what it names.
+Start with `item`. `named` and `location` examine the name only. `item` and `load` run the code, and `digest` may run
+packages around a module.
 """
 
 import ast
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 WHERE = '"FILE.py:NAME" or "package.module:NAME"'
 ALLOWED = f"{WHERE}, a system made with plants.system"
 LONGEST = 4096  # characters of a path, on Linux
-OURS = ("ptsmc_jax", "tuning")  # packages that no folder of one's own has helpers of the name of
+OURS = ("ptsmc_jax", "tuning")  # packages that are never helpers of custom code
 
 
 class _Ran(NamedTuple):
@@ -35,15 +36,18 @@ class _Ran(NamedTuple):
     helpers: dict[str, str | None]  # files beside it that were imported, by path: their SHA-256
 
 
-_NO_SLOPES = re.compile("support JVP|Differentiation rule for")  # in what JAX says then
-_files: set[str] = set()  # of what was run, links followed
-_ran: dict[tuple[str, str], _Ran] = {}  # by path and SHA-256: what has changed is run anew
-# modules that the last ones imported from beside them: path and SHA-256
+_NO_SLOPES = re.compile("support JVP|Differentiation rule for")  # in JAX's messages for code without derivatives
+_files: set[str] = set()  # real paths of all files that were run
+_ran: dict[tuple[str, str], _Ran] = {}  # by path and SHA-256, so that a changed file is run again
+# helper modules that custom files imported from their own folder: path and SHA-256 by name
 _helpers: dict[str, tuple[str, str | None]] = {}
 
 
 def named(where: str, allowed: str) -> tuple[str, str]:
-    """The file or module, and the name in it; looks at the text only. Raises ValueError where it is neither."""
+    """Split a text into the file or module and the name in it; raise ValueError if it is not of this form.
+
+    Nothing is run. `allowed` describes the allowed texts in the error.
+    """
     place, _, name = where.rpartition(":")
     file = place.endswith(".py")
     if not name.isidentifier() or len(where) > LONGEST or not where.isprintable():
@@ -54,13 +58,16 @@ def named(where: str, allowed: str) -> tuple[str, str]:
 
 
 def location(where: str) -> str:
-    """What would be run, as one may look at it: the file with its whole path, links followed, or the module."""
+    """Return the real path of the file, or "the module NAME", so that the user can read the code before a run."""
     place = where.rpartition(":")[0]
     return os.path.realpath(place) if place.endswith(".py") else f"the module {place}"
 
 
 def load(where: object) -> "System":
-    """The system that stands there, the same object as long as its file stays the same, see `item`; or is there."""
+    """Return a system, or load it by its name; raise ValueError if there is none.
+
+    The result is the same object as long as the file does not change, see `item`.
+    """
     from ptsmc_jax.plants.second_order import System  # scenarios without one are checked without JAX
 
     if not isinstance(where, str):
@@ -75,10 +82,17 @@ def load(where: object) -> "System":
 
 
 def item(where: str, allowed: str) -> object:
-    """What stands there under its name.
+    """Run the file or module and return the object of the name in it.
 
-    Runs the file, as Python does with any import; it may import from its own folder, a module from where the command
-    was called. Raises ValueError that says what is wrong in one line.
+    A file can import from its own folder, and a module from the current folder. A file runs again only if it or a file
+    that it imported has changed.
+
+    Args:
+        where: "FILE.py:NAME" or "package.module:NAME".
+        allowed: description of the allowed texts, for errors.
+
+    Raises:
+        ValueError: there is no such file or name, or running it fails; the message has one line.
     """
     place, name = named(where, allowed)
     path = Path(place)
@@ -95,15 +109,15 @@ def item(where: str, allowed: str) -> object:
 
 
 def failure(error: BaseException, place: str) -> str:
-    """What went wrong in code of one's own, in one line: the error, and the last line of that file that led to it."""
+    """Describe an error in custom code in one line: its type and text, and the line of the file that raised it."""
     return f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}{line(error, place)}"
 
 
 def at_fault(error: BaseException) -> str | None:
-    """The file of one's own by which an error came; None: it came by none.
+    """Return the custom file that caused an error, None if no custom code is involved.
 
-    What was kept of another trace, or has no slopes, JAX finds later, where no file of one's own is on the way: it is
-    of one that was run.
+    JAX reports leaked tracers and missing derivatives later, when no custom file is in the traceback. All custom files
+    that were run are then returned, joined by "or".
     """
     if type(error).__name__ == "UnexpectedTracerError" or _NO_SLOPES.search(str(error)):
         return " or ".join(sorted(_files)) or None
@@ -112,7 +126,7 @@ def at_fault(error: BaseException) -> str | None:
 
 
 def line(error: BaseException, place: str) -> str:
-    """The last line of a file that led to an error, in parentheses after a space; nothing where none of it did."""
+    """Return the last line of a file in an error's traceback as " (line 3 of FILE.py)", empty if there is none."""
     walked = [(frame.f_code.co_filename, number) for frame, number in traceback.walk_tb(error.__traceback__)]
     numbers = [number for file, number in walked if os.path.realpath(file) == os.path.realpath(place)]
     return f" (line {numbers[-1]} of {Path(place).name})" if numbers else ""
@@ -121,7 +135,7 @@ def line(error: BaseException, place: str) -> str:
 def digest(where: object) -> str | None:
     """Return the SHA-256 of the file of a system or a function and of the files beside it that it imports.
 
-    None if it is in no file. Runs the packages around a module, as Python does to find it.
+    The result is None if there is no file. To find a module, Python runs the packages that contain it.
     """
     place = where.rpartition(":")[0] if isinstance(where, str) else ""
     file: str | None = place
@@ -129,7 +143,7 @@ def digest(where: object) -> str | None:
         try:
             with _importing_from(_home(place)):
                 spec = importlib.util.find_spec(place)
-        except (Exception, SystemExit):  # which `item` says
+        except (Exception, SystemExit):  # `item` reports it
             spec = None
         file = None if spec is None else spec.origin
     if not file or _sha(file) is None:
@@ -142,7 +156,7 @@ def digest(where: object) -> str | None:
 
 
 def imported(file: Path, folder: Path) -> list[Path]:
-    """Return a Python file and the files of a folder that it imports, directly or not, as their texts say."""
+    """Return a Python file and the files of a folder that it imports, directly or not, according to their source."""
     found: list[Path] = []
     waiting = [file]
     while waiting:
@@ -176,13 +190,13 @@ def _content(path: Path) -> bytes:
 
 
 def _home(place: str) -> str:
-    """The folder from which it may import."""
+    """Return the folder that custom code can import from: the folder of the file, or the current folder."""
     return os.path.realpath(Path(place).parent if place.endswith(".py") else Path.cwd())
 
 
 @contextlib.contextmanager
 def _importing_from(folder: str) -> Iterator[None]:
-    written, sys.dont_write_bytecode = sys.dont_write_bytecode, True  # a copy hides a change within the same second
+    written, sys.dont_write_bytecode = sys.dont_write_bytecode, True  # a .pyc hides a change within a second
     sys.path.insert(0, folder)
     try:
         yield
@@ -192,9 +206,10 @@ def _importing_from(folder: str) -> Iterator[None]:
 
 
 def _run(path: Path, content: bytes) -> ModuleType:
-    """The file as a module of a name of its own; two files with one name do not meet, nor do those that they import.
+    """Run a file as a module with a unique name, and return the module.
 
-    What is run is what was read and can be read: no compiled copy from a __pycache__ that came with it.
+    Files of the same name in different folders, and their helper modules, are kept apart. The source itself is run,
+    never a compiled copy from a __pycache__ folder.
     """
     known = os.path.realpath(path), hashlib.sha256(content).hexdigest()
     ran = _ran.get(known)
@@ -202,7 +217,7 @@ def _run(path: Path, content: bytes) -> ModuleType:
         return ran.module
     home = _home(str(path))
     if not all(file.startswith(home + os.sep) and _sha(file) == sha for file, sha in _helpers.values()):
-        for name in _helpers:  # all: one may have imported another
+        for name in _helpers:  # remove all of them, since they may import each other
             sys.modules.pop(name, None)
         _helpers.clear()
         importlib.invalidate_caches()
@@ -211,8 +226,8 @@ def _run(path: Path, content: bytes) -> ModuleType:
     spec = importlib.util.spec_from_file_location(f"_ptsmc_jax_{path.stem}_{unique}", path)
     assert spec is not None
     module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses look their module up there
-    configure.programs = None  # what they are made of may be patched from here on
+    sys.modules[spec.name] = module  # dataclasses look up their module there
+    configure.programs = None  # custom code may patch the package: disable the compile cache
     try:
         exec(compile(content, str(path), "exec", dont_inherit=True), module.__dict__)
     except BaseException:
@@ -225,7 +240,7 @@ def _run(path: Path, content: bytes) -> ModuleType:
 
 
 def _beside(home: str, before: set[str]) -> dict[str, tuple[str, str | None]]:
-    """The modules from a folder that were not there before: path and SHA-256 by name."""
+    """Return path and SHA-256, by name, of the modules that were imported from a folder since `before`."""
     found = {}
     for name in set(sys.modules) - before:
         top, file = name.partition(".")[0], os.path.realpath(getattr(sys.modules[name], "__file__", None) or "")
@@ -235,7 +250,7 @@ def _beside(home: str, before: set[str]) -> dict[str, tuple[str, str | None]]:
 
 
 def _sha(file: str) -> str | None:
-    """SHA-256 of a file; None where it cannot be read."""
+    """Return the SHA-256 of a file, None if it cannot be read."""
     try:
         return hashlib.sha256(Path(file).read_bytes()).hexdigest()
     except (OSError, ValueError):

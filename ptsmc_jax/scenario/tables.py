@@ -1,7 +1,7 @@
-"""The tables that every scenario has, whatever its plant: how a run is closed, judged and tuned; and the scenario.
+"""The tables that all scenarios share ([loop], [requirements], [tune]) and the base class `Scenario`.
 
-A table is a struct whose docstring says what each key means, with its unit; its type says what is allowed and the
-default. Errors, `ptsmc new` and the scenario reference are made from them.
+A table is a struct. The annotation of each field holds meaning, unit and allowed values of a key. Errors, `ptsmc new`
+and the scenario reference are made from them. Start with `Scenario`.
 """
 
 from collections.abc import Collection, Mapping
@@ -31,7 +31,7 @@ from ptsmc_jax.simulation.catalogues import Entry
 
 
 class Loop(Table, frozen=True):
-    """How the loop is closed, and until when a run goes."""
+    """Type of the control loop, and the times of a run."""
 
     mode: Annotated[
         Literal["continuous", "sampled"], Meaning("the law inside the integrator, or computed and held once a period")
@@ -71,7 +71,7 @@ class Loop(Table, frozen=True):
 
 
 class Limit(Table, frozen=True):
-    """A requirement in full: metric <= limit in a share of the trials, or of the time."""
+    """A requirement as a table: metric <= limit in a fraction of the trials or of the time."""
 
     limit: Annotated[
         NotNegative, Meaning('the largest value allowed, a number or with its unit, "0.05 deg"; 0 of `saturated` only')
@@ -92,11 +92,11 @@ class Limit(Table, frozen=True):
 
     @property
     def share(self) -> float | None:
-        """What is asked for, by either name."""
+        """The required fraction, given as `quantile` or as `probability`."""
         return self.quantile if self.probability is None else self.probability
 
 
-# gains that tuning may move, besides those of parts of one's own
+# gains that tuning can change, without the gains of custom parts
 OF_NO_LAW = ("observer_gain", "filter_bandwidth", "command_corner")
 FREE = (*dict.fromkeys(name for laws in LAWS.values() for law in laws.values() for name in law.gains), *OF_NO_LAW)
 FREE_ALLOWED = f"a list of some of {', '.join(FREE)}"
@@ -141,7 +141,7 @@ class Tune(Table, frozen=True):
     worst_case: Annotated[
         Truth, Meaning("keep the requirements in the worst case inside the dispersions too, not only where drawn")
     ] = False
-    # all trials are flown at once and held in memory
+    # all trials run at once, in memory
     trials: Annotated[
         Annotated[int, Meta(ge=1, le=10**6, description="a whole number from 1 to 1000000")],
         Meaning("trials to tune on; requirements with a quantile add more of them"),
@@ -157,7 +157,7 @@ class Tune(Table, frozen=True):
 
     @property
     def gains(self) -> tuple[str, ...]:
-        """The gains to find, in a checked scenario, where `free` is filled in."""
+        """The free gains; in a validated scenario `free` is filled in."""
         return self.free or ()
 
 
@@ -170,7 +170,7 @@ T_F, LIMITS = "t_f", "limits"  # objectives that are no metric of a run
 
 
 def objective_name(tune: Tune) -> str:
-    """Name what a search minimises.
+    """Return the name of a search's objective.
 
     >>> objective_name(Tune()), objective_name(Tune(minimise="effort", statistic="quantile", level=0.9))
     ('RMS window error', '90 % quantile of effort')
@@ -181,15 +181,15 @@ def objective_name(tune: Tune) -> str:
 
 
 class Scenario(Table, frozen=True, kw_only=True, eq=False):
-    """A scenario as its file says it, every key resolved: the tables that all plants have; optional ones may be off.
+    """A validated scenario: one field for each table, with all defaults filled in. Optional tables may be None.
 
-    Each kind of plant has its own type, see `layouts.SCENARIOS`, which says what depends on the plant. `defaulted`
-    holds what the file does not say, by the path of its key: `replace` returns such keys to their defaults.
+    Each kind of plant has a subclass, see `layouts.SCENARIOS`. `defaulted` holds the values of the keys that the file
+    omits, by the path of the key: `replace` computes their defaults again.
     """
 
     defaulted: dict[tuple[str, ...], Any] = {}  # noqa: RUF012
     plant: Any
-    # the tables of their kinds, see `TABLES`
+    # the classes of these tables by kind are in `TABLES`
     disturbance: Any  # `disturbance_tables.DisturbanceTable`, or several
     controller: Any  # `law_tables.LawTable`
     observer: Any  # `observer_tables.ObserverTable`
@@ -200,20 +200,26 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
     requirements: dict[str, float | Limit] = {}  # noqa: RUF012
     tune: Tune | None = None
 
-    TABLES: ClassVar[Mapping[str, type[Table] | Kinds]] = {}  # a table, or one for each kind, the default first
+    TABLES: ClassVar[Mapping[str, type[Table] | Kinds]] = {}  # class of each table, or classes by kind
     unit_of_d: ClassVar[str] = keys.UNIT_OF_D
     metrics: ClassVar[Mapping[str, Entry]] = {}
-    motion: ClassVar[str] = ""  # what the laws drive to zero: "spacecraft", "chain" or "system"
-    reaching: ClassVar[float] = 1.0  # K1 over the rate at which s decays after the hand-over: 2 where (60) halves it
+    motion: ClassVar[str] = ""  # selects the error kinematics: "spacecraft", "chain" or "system"
+    reaching: ClassVar[float] = 1.0  # K1 over the decay rate of s in the hold phase: 2 for a spacecraft, see (60)
 
     def __repr__(self) -> str:
-        """The tables that it has, a line each."""
+        """Return the tables of the scenario, one line each."""
         tables = {name: getattr(self, name) for name in self.__struct_fields__ if name != "defaulted"}
         return type(self).__name__ + "".join(f"\n  {name}: {table!r}" for name, table in tables.items() if table)
 
     @classmethod
     def fallback(cls, plant: Any, given: Collection[str], law: object) -> dict[str, Mapping[str, Any]]:
-        """Defaults that depend on other keys, by table; given: keys of [plant] that are there, law: its kind."""
+        """Return defaults that depend on the plant and the law, by table and key.
+
+        Args:
+            plant: the table [plant].
+            given: keys of [plant] in the file.
+            law: kind of the law.
+        """
         return {}
 
     @property
@@ -222,28 +228,28 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
         return self.loop.mode == "sampled"
 
     def need_samples(self, what: str) -> None:
-        """Raise ScenarioError in the continuous loop; what: the table, or the key, that needs the sampled one."""
+        """Raise ScenarioError unless the loop is sampled; what: the table or key that needs the sampled loop."""
         if not self.sampled:
             raise ScenarioError(f'{what} needs the sampled loop, but loop.mode is "{self.loop.mode}"')
 
     @property
     def exact_sign(self) -> bool:
-        """Whether the law switches by the exact sign, which has no slope."""
+        """Whether the law switches with the discontinuous sign, which has no derivative."""
         return getattr(self.controller, "sign_width", None) == 0.0
 
     @property
     def terms(self) -> tuple[Any, ...]:
-        """The disturbances that act together."""
+        """The disturbances that act together, one for [disturbance] unless it is a sum."""
         return tuple(self.placed_terms.values())
 
     @property
     def placed_terms(self) -> dict[str, Any]:
-        """These by where a file has them: "disturbance", or "disturbance.terms[0]" and so on."""
+        """The same disturbances by their place in a file: "disturbance", or "disturbance.terms[0]" and so on."""
         return self.disturbance.placed("disturbance")
 
     @property
     def inputs(self) -> int:
-        """How many inputs the plant has."""
+        """The number of inputs of the plant."""
         raise NotImplementedError
 
     @property
@@ -253,33 +259,33 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
 
     @property
     def grid_order(self) -> int:
-        """The order that the grid of the continuous loop is made for, see `clock.graded`."""
+        """The order that determines the grid of the continuous loop, see `clock.graded`."""
         return self.order
 
     @property
     def devices(self) -> Any:
-        """The table [hardware], all of it off where it is absent."""
+        """The table [hardware], with all devices off if it is absent."""
         table: Any = self.TABLES["hardware"]
         return table() if self.hardware is None else self.hardware
 
     @property
     def estimator(self) -> Any:
-        """The table [filter], `NoFilter` where it is absent."""
+        """The table [filter], `NoFilter` if it is absent."""
         return NoFilter()
 
     @property
     def reaction_wheels(self) -> Any:
-        """The table [wheels]; None: there are none."""
+        """The table [wheels], None without wheels."""
         return None
 
     @property
     def influence(self) -> float:
-        """Acceleration of the error for a unit of the disturbance."""
+        """Acceleration of the error for a unit disturbance."""
         return 1.0
 
     @property
     def least_eta(self) -> float:
-        """The number that eta must exceed (Theorems 2 and 3)."""
+        """The lower bound of eta, excluded (Theorems 2 and 3)."""
         return float(self.order)
 
     def modes(self) -> list[tuple[float, float, float]]:
@@ -291,7 +297,7 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
         return None
 
     def start_tangent(self) -> float:
-        """Return what the first acceleration is proportional to, eta^2 / t_f^2 times this."""
+        """Return the first acceleration of the error over eta^2 / t_f^2."""
         raise NotImplementedError
 
     def usual_settling(self) -> float:
@@ -300,7 +306,7 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
 
     @property
     def moments(self) -> tuple[float, float] | tuple[None, None]:
-        """Mean and largest moment of inertia [kg m^2]; None without a body."""
+        """Mean and largest moment of inertia [kg m^2], (None, None) without a body."""
         return None, None
 
     @property
@@ -310,9 +316,9 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
 
     @property
     def tuned_tables(self) -> dict[str, Any]:
-        """The tables that may have gains for tuning to move, by where a file has them.
+        """The tables that may have gains, by their place in a file.
 
-        A table knows its gains by name, which is its `prefix` and the key: "filter_bandwidth" of the table [filter].
+        The name of a gain is the `prefix` of its table and the key, such as "filter_bandwidth" for [filter].
         """
         tables = {
             "controller": self.controller,
@@ -325,22 +331,22 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
 
     @property
     def gains(self) -> tuple[str, ...]:
-        """The names of the gains that it has for tuning to move."""
+        """The names of all gains that tuning can change."""
         return tuple(name for table in self.tuned_tables.values() for name in table.gains)
 
     @property
     def hand_over(self) -> float:
-        """How long before t_f the law hands over [s]; a period for a law that does not."""
+        """Time delta from the hand-over to t_f [s], a control period for a law without a hand-over."""
         return getattr(self.controller, "delta", None) or self.loop.period
 
     @property
     def measured(self) -> bool:
-        """Whether the law sees something else than the true state."""
+        """Whether the law uses measurements instead of the true state."""
         return self.estimator.on or self.devices.noisy
 
     @property
     def search(self) -> Tune:
-        """The table [tune] of a scenario that is to be tuned."""
+        """The table [tune], which must be given."""
         assert self.tune is not None, "a scenario without [tune]"
         return self.tune
 
@@ -352,53 +358,58 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
 
     @property
     def window(self) -> float:
-        """How long the window after t_f is, `loop.window` [s]."""
+        """The length of the window after t_f, `loop.window` [s]."""
         assert self.loop.window is not None, "a scenario that is not resolved"
         return self.loop.window
 
     def observation(self) -> Any:
-        """What pointing error indices are taken of, a part of `simulation.pointing`; None: nothing."""
+        """Return the observation of pointing errors, a part of `simulation.pointing`, or None."""
         return None
 
     def resolved(self) -> Any:
-        """With the defaults of its plant that depend on other keys."""
+        """Return the scenario with the defaults of its plant that depend on other keys."""
         return self
 
     def written(self) -> Any:
-        """With every key that follows from others where it is absent, as files have it."""
+        """Return the scenario for a file, with all keys that depend on other keys filled in."""
         return msgspec.structs.replace(self, observer=self.observer.written(self))
 
     def check_body(self) -> None:
-        """Raise ScenarioError if there is no such body: before defaults follow from its inertia."""
+        """Raise ScenarioError if the body or its initial state is not valid, before defaults are derived from it."""
 
     def check_devices(self) -> None:
-        """Raise ScenarioError if devices contradict each other or have lists of another length, before gains follow."""
+        """Raise ScenarioError if devices contradict each other or lists have a wrong length, before gains are set."""
 
     def check_plant(self) -> None:
-        """Raise ScenarioError where keys of the plant contradict each other."""
+        """Raise ScenarioError if keys that concern the plant contradict each other."""
 
     def model(self) -> Any:
-        """The plant as the law knows it, a part of `plants`."""
+        """Return the design model of law and observer, a part of `plants`."""
         raise NotImplementedError
 
     def truth(self, model: Any) -> Any:
-        """The plant that flies."""
+        """Return the true plant; model: the design model, which is the default."""
         return model
 
     def start(self) -> Any:
-        """Its initial state."""
+        """Return the initial state."""
         raise NotImplementedError
 
     def target(self) -> Any:
-        """What the law is to reach, a part of `signals.references`."""
+        """Return the reference, a part of `signals.references`."""
         raise NotImplementedError
 
     def frequencies(self, setup: Any, t_f: float) -> dict[str, float]:
-        """How fast the plant moves and turns [rad/s], by the key that says so, on the way to the shortest t_f [s]."""
+        """Return the angular frequencies of the plant's motion [rad/s], by the key that causes each of them.
+
+        Args:
+            setup: the parts without a clock.
+            t_f: shortest prescribed time [s].
+        """
         return {}
 
     def __eq__(self, other: object) -> bool:
-        """Two scenarios are equal where their values are, whether a file says them or not."""
+        """Compare the values of two scenarios, stated and default ones alike."""
         names = [name for name in self.__struct_fields__ if name != "defaulted"]
         return isinstance(other, Scenario) and all(getattr(self, name) == getattr(other, name) for name in names)
 
@@ -410,7 +421,10 @@ def limit_of(scenario: Scenario, metric: str) -> float | None:
 
 
 def check_scenario(what: object, besides: str = "") -> Scenario:
-    """What is a scenario; raises TypeError, with one sentence, where it is none; besides: what else it may be."""
+    """Return a scenario; raise TypeError for any other object.
+
+    `besides` names further allowed objects in the error, such as ", or its file".
+    """
     if not isinstance(what, Scenario):
         found = type(what).__name__
         raise TypeError(f"a scenario is needed, as read or from_tables return it{besides}, but this is a {found}")

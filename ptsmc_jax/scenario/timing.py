@@ -1,4 +1,4 @@
-"""How fast things happen in a scenario, and the clock and steps that follow it."""
+"""Choose the clock and the integration steps of a run from the fastest rates of the scenario. Start with `timing`."""
 
 import dataclasses
 import functools
@@ -25,40 +25,46 @@ from ptsmc_jax.simulation.assembly import Parts, Setup
 from ptsmc_jax.theory import rates, solutions
 from ptsmc_jax.theory.exact_motion import plant_motion
 
-MOST_SUBSTEPS = 200  # a period: one that needs more is far too long for what happens in it
-MOVING = 4  # steps a period at least where the torque changes within it
-# of these 0.1 rad a step is enough, see `_substeps`
+MOST_SUBSTEPS = 200  # largest number of integration steps in a control period
+MOVING = 4  # smallest number of steps in a control period if the torque changes within it
+# keys for which steps of 0.1 rad are accurate enough, see `_substeps`
 _SMOOTHED = ("disturbance.frequency", "plant.system", "flexible.frequency")
 
 
 @dataclass(frozen=True)
 class Reach:
-    """How far gains and period may move without another compilation: the clock's sizes are chosen for it."""
+    """Ranges of gains and control period that one compiled program covers. The clock is sized for them."""
 
     smallest_t_f: float  # [s]
     t_f: float  # largest [s]
     delta: float  # largest [s]
     smallest_delta: float  # [s]
-    gain: float  # smallest observer gain [N m s]; of no meaning without an observer
-    largest_gain: float
+    gain: float  # smallest observer gain [N m s]; not used without an observer
+    largest_gain: float  # largest observer gain [N m s]
     k1: float  # largest [1/s]
-    sign_width: float  # smallest
+    sign_width: float  # smallest thickness of the boundary layer
     surface_rate: float  # largest [1/s]
-    smallest_period: float  # [s]; of no meaning in the continuous loop
+    smallest_period: float  # [s]; not used in the continuous loop
     period: float  # largest [s]
 
 
-_INTERVALS = (  # of `Reach`
+_INTERVALS = (  # smallest and largest value in `Reach`
     ("smallest_t_f", "t_f"), ("smallest_delta", "delta"), ("gain", "largest_gain"), ("smallest_period", "period")
 )  # fmt: skip
-_ABOVE_ZERO = ("smallest_t_f", "t_f", "smallest_period", "period")  # what clocks and steps are divided by
+_ABOVE_ZERO = ("smallest_t_f", "t_f", "smallest_period", "period")  # divisors of clocks and steps
 
 
 def reach_of(scenario: Scenario, **farther: float) -> Reach:
-    """The reach of a scenario's own gains, none beyond them; farther: fields of `Reach` that are to be others.
+    """Return the reach that contains only the scenario's gains and control period, with some fields changed.
 
-    Raises ValueError where there is no such field, one of these is no finite number, negative, or a time of zero, and
-    where a smallest one exceeds its largest; TypeError where there is no scenario.
+    Args:
+        scenario: a validated scenario.
+        farther: fields of `Reach` with other values.
+
+    Raises:
+        ValueError: there is no such field, a value is not finite, is negative or is a time of 0, or a smallest value
+            exceeds its largest value.
+        TypeError: `scenario` is not a scenario.
 
     >>> from ptsmc_jax.scenario import from_tables
     >>> reach = reach_of(from_tables({}), delta=2.0)
@@ -87,9 +93,16 @@ def reach_of(scenario: Scenario, **farther: float) -> Reach:
 
 
 def timing(scenario: Scenario, setup: Setup, reach: Reach, saves: object) -> tuple[Any, int]:
-    """Clock for gains within `reach`, and integration steps a control period; saves: times that are nodes [s].
+    """Return the clock of a run, and the number of integration steps in a control period.
 
-    Raises ScenarioError where too many steps would be needed, naming what asks for them.
+    Args:
+        scenario: the scenario.
+        setup: its parts without a clock.
+        reach: ranges of gains and control period that the clock must suit.
+        saves: times [s] at which the grid of the continuous loop must have nodes.
+
+    Raises:
+        ScenarioError: the run would need too many steps; the message names the key that causes them.
     """
     loop, frequencies, visited = scenario.loop, _frequencies(scenario, setup, reach), None
     if setup.plant.of_own_functions:
@@ -98,7 +111,7 @@ def timing(scenario: Scenario, setup: Setup, reach: Reach, saves: object) -> tup
         frequencies["plant.system"] = _fastest_of_system(hurried, visited)
     if not scenario.sampled:
         for key in {"plant.system", "flexible.frequency"} & set(frequencies):
-            frequencies[key] *= 2.0  # 0.15 rad a step: of a system nothing else is known, and modes ring for long
+            frequencies[key] *= 2.0  # 0.15 rad per step, since a system is unknown and modes ring for a long time
         return _grid(scenario, reach, setup, saves, frequencies, visited), 1
     substeps = _substeps(scenario, reach.period, frequencies)
     last = scenario.end + reach.t_f - scenario.controller.t_f
@@ -112,12 +125,12 @@ def timing(scenario: Scenario, setup: Setup, reach: Reach, saves: object) -> tup
 
 
 def steps(parts: Parts) -> int:
-    """Integration steps of a run."""
+    """Return the number of integration steps of a run."""
     return parts.clock.count * parts.substeps
 
 
 def _check_steps(scenario: Scenario, last: float, period: float, substeps: int) -> None:
-    """Refuse a sampled loop of more integration steps until `last` [s] than a sensible number; period [s]."""
+    """Raise ScenarioError if a sampled run until `last` [s] needs more than `MOST_STEPS` integration steps."""
     needed = last / period * substeps
     if needed > MOST_STEPS:
         asks = (
@@ -130,21 +143,22 @@ def _check_steps(scenario: Scenario, last: float, period: float, substeps: int) 
 
 
 def _frequencies(scenario: Scenario, setup: Setup, reach: Reach) -> dict[str, float]:
-    """How fast things happen [rad/s], by the key that says so."""
+    """Return the angular frequencies of disturbance and plant [rad/s], by the key that causes each of them."""
     disturbed = {"disturbance.frequency": max(term.quickest() for term in scenario.terms)}
     return disturbed | scenario.frequencies(setup, reach.smallest_t_f)
 
 
 def _fastest(frequencies: Mapping[str, float]) -> float:
-    """Highest angular frequency of the motion [rad/s]."""
+    """Return the highest angular frequency of the motion [rad/s]: of the disturbance, or the sum of all others."""
     others = sum(value for key, value in frequencies.items() if key != "disturbance.frequency")
     return max(frequencies["disturbance.frequency"], others)
 
 
 def _substeps(scenario: Scenario, period: float, frequencies: Mapping[str, float]) -> int:
-    """Integration steps a control period [s]: RK4 at 0.025 rad a step leaves some 1e-9 rad over 100 s.
+    """Return the number of integration steps in a control period [s].
 
-    At 0.1 rad of a disturbance, of a flexible mode, or of a system of one's own, 1e-7 of what it does.
+    RK4 with 0.025 rad per step has an error of about 1e-9 rad over 100 s. For disturbances, flexible modes and custom
+    systems, 0.1 rad per step gives a relative error of about 1e-7.
     """
     frequencies = {key: value / (4 if key in _SMOOTHED else 1) for key, value in frequencies.items()}
     needed = period * _fastest(frequencies) / 0.025
@@ -163,27 +177,27 @@ def _lower(scenario: Scenario, key: str, asks: str) -> ScenarioError:
     table, _, name = key.partition(".")
     if name == "code":
         return ScenarioError(f"{key} says that it is too fast: {asks}")
-    if key == "controller.eta":  # over a short t_f: eta itself may have no room below
+    if key == "controller.eta":  # a short t_f is the cause: eta may be at its lower bound already
         eta = f"with controller.eta = {scenario.controller.eta}"
         shorter = ", or loop.period shorter" if scenario.sampled else ""
         return wrong("controller.t_f", scenario.controller.t_f, f"longer {eta}{shorter}: {asks}")
     *tables, name = name.split(".")
     value = getattr(functools.reduce(getattr, tables, getattr(scenario, table)), name, None)
-    if value is None:  # of a term in a sum
+    if value is None:  # the key belongs to a term of a sum
         value = [getattr(term, name) for term in scenario.terms if hasattr(term, name)]
     if value == []:
         return ScenarioError(f"{table} is too fast: {asks}")
     return wrong(key, value, f"{'longer' if key in ('reference.duration', 'controller.t_f') else 'lower'}: {asks}")
 
 
-@programs.jit  # one program, where each of its operations would be one
+@programs.jit  # compiled as one program instead of one for each operation
 def _boundary_layer(controller: Any, observer: Any, visited: Any) -> tuple:
-    """Fastest rates of the smooth sign's boundary layer before and after the hand-over [1/s]."""
+    """Return the fastest rates in the boundary layer before and after the hand-over [1/s]."""
     return rates.boundary_layer(controller, observer.error_bound().largest, visited)
 
 
 def _with_papers_law(setup: Setup) -> Setup:
-    """The parts under the paper's law, whose exact motion stands for the states that a run under any law visits."""
+    """Return the parts with the prescribed-time law. Its exact motion represents the states of a run under any law."""
     law = setup.controller
     if law.prescribed:
         return setup
@@ -193,7 +207,7 @@ def _with_papers_law(setup: Setup) -> Setup:
 
 @programs.jit
 def _rates_of_system(setup: Setup, visited: tuple) -> tuple:
-    """Jacobians of the motion along a run, and how a steady run on the target accelerates and changes that."""
+    """Return the Jacobians of a custom system along a run, and acceleration and its rate on the reference."""
     plant, kinematics = typing.cast(System, setup.plant), setup.controller.kinematics
     none = jnp.zeros(plant.inputs)
 
@@ -204,13 +218,13 @@ def _rates_of_system(setup: Setup, visited: tuple) -> tuple:
     def along(t: Any) -> Any:
         return plant_motion(kinematics, t, setup.initial, (none, none, none)).w_dot
 
-    times = setup.t_end * jnp.linspace(0.0, 1.0, 509)  # a prime of intervals, which meets no period often
+    times = setup.t_end * jnp.linspace(0.0, 1.0, 509)  # 509 is prime, so that the samples rarely alias with a period
     steady = lapack.vmap(lambda t: jax.jvp(along, (t,), (jnp.ones_like(t),)))(times)
     return lapack.vmap(jacobian)(*visited), steady
 
 
 def _fastest_of_system(setup: Setup, visited: tuple) -> float:
-    """Fastest rate of a system of one's own along its run [rad/s]: of its modes, and of what time does to it."""
+    """Return the fastest rate of a custom system along its run [rad/s], from its modes and its explicit time."""
     jacobians, (acceleration, change) = _rates_of_system(solutions.bare(setup), visited)
     matrices = np.asarray(jacobians)
     modes = np.abs(np.linalg.eigvals(matrices[np.all(np.isfinite(matrices), axis=(1, 2))])).max(initial=0.0)
@@ -223,7 +237,7 @@ def _with_gain(observer: Any, gain: float) -> Any:
 
 
 def _fastest_layer(reach: Reach, law: Any, observer: Any, visited: Any) -> tuple[float, float]:
-    """Fastest rates of the boundary layer, or of the observer, before and after the hand-over, within reach [1/s]."""
+    """Return the fastest rates of boundary layer and observer before and after the hand-over, within reach [1/s]."""
     before = after = 0.0
     if hasattr(observer, "gain"):  # K2 is largest with the smallest gain
         before = after = _with_gain(observer, reach.largest_gain).fastest()
@@ -238,7 +252,7 @@ def _fastest_layer(reach: Reach, law: Any, observer: Any, visited: Any) -> tuple
 def _grid(
     scenario: Scenario, reach: Reach, setup: Setup, saves: object, frequencies: Mapping[str, float], visited: Any
 ) -> clock.Graded:
-    """Grid of the continuous loop; refused where it would take more than a sensible number of steps."""
+    """Return the grid of the continuous loop; raise ScenarioError if it needs more than `MOST_STEPS` steps."""
     loop = scenario.loop
     t_end = scenario.end + reach.t_f - scenario.controller.t_f
     saves = (*np.ravel(np.asarray(saves, dtype=float)), *setup.observer.nodes())
@@ -259,7 +273,7 @@ def _grid(
         by_key |= {f"controller.{key}": steps(rate=value) for key, value in decays.items()}
         by_key["controller.sign_width"] = steps(layer=layer)
         worst = max(by_key, key=lambda key: by_key[key])
-        if not by_key["disturbance.frequency"] <= MOST_STEPS:  # whose rate the switching follows too
+        if not by_key["disturbance.frequency"] <= MOST_STEPS:  # the switching follows its rate too
             worst = "disturbance.frequency"
         if by_key[worst] <= steps() * 1.5:
             raise wrong("loop.t_end", t_end, f"earlier: {asks}")

@@ -1,4 +1,4 @@
-"""A scenario with other gains; parts with other gains: `simulation.gains`."""
+"""Set gains in a scenario, see `in_scenario`. `simulation.gains` sets gains in the parts of a run."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -11,10 +11,17 @@ from ptsmc_jax.simulation.gains import AXIS, base, on_every_axis
 
 
 def in_scenario(scenario: Scenario, gains: Mapping[str, Any]) -> Scenario:
-    """The scenario with other gains, by the names that `gains_of` has, checked; with t_f goes the time after it.
+    """Return a validated scenario with other gains.
 
-    All else stays, defaults too. Raises ScenarioError where the scenario must not have them, TypeError where they have
-    no names.
+    A new t_f moves the end of the run by the same time. All other values stay, defaults included.
+
+    Args:
+        scenario: a scenario or the path of its file.
+        gains: values by the names that `gains_of` returns.
+
+    Raises:
+        ScenarioError: a name is not a gain of the scenario, or a value is not allowed.
+        TypeError: `gains` is not a mapping.
     """
     scenario = reading.of(scenario)
     if not isinstance(gains, Mapping):

@@ -1,4 +1,4 @@
-"""What a scenario file is made of: the table, and types of values with their ranges and what is allowed in words."""
+"""Base class `Table` of all tables of scenario files, and types of values with their ranges and descriptions."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
@@ -33,7 +33,7 @@ Interval = Annotated[tuple[float, float], Meta(description="two numbers, the low
 Inertia = Annotated[Any, Meta(description="three principal moments or a symmetric 3x3 tensor [kg m^2]")]
 Quantile = Annotated[float, Meta(gt=0, lt=1, description="a number between 0 and 1")]
 
-# Types of keys whose default follows from other keys. They are absent, None, until the scenario is resolved.
+# Types of keys whose default depends on other keys. Their value is None until `reading.resolve` fills it in.
 ABSENT: Any = None
 if TYPE_CHECKING:
     ResolvedPositive = float
@@ -44,11 +44,11 @@ else:
     ResolvedNotNegative = NotNegative | None
     ResolvedThree = Three | None
 
-MOST_STEPS = 200_000  # of a run
+MOST_STEPS = 200_000  # largest number of integration steps in a run
 
 
 class Meaning(NamedTuple):
-    """Meaning of a key, and its unit."""
+    """Meaning and unit of a key."""
 
     text: str
     unit: str = ""
@@ -64,4 +64,4 @@ class Table(msgspec.Struct, kw_only=True, frozen=True, omit_defaults=False):
         return f"{type(self).__name__}({', '.join(f'{key}={v!r}' for key, v in keys.items() if v is not None)})"
 
 
-Kinds = Mapping[str, type[Table]]  # of a table by name, the default first
+Kinds = Mapping[str, type[Table]]  # classes of a table by kind, the default first
