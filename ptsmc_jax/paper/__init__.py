@@ -1,1 +1,1 @@
-"""The paper's cases, claims, slips and Remark 2, measured."""
+"""Simulations that test the paper: its cases and claims (`claims`), its errors (`slips`), and Remark 2 (`remark_2`)."""

@@ -1,4 +1,4 @@
-"""The paper's cases as changes to the default scenario, and what it claims about each beside what is measured.
+"""Simulate the cases of the paper and compare its claims with measurements. Start with `fly_cases` and `claims`.
 
 Z. Chen, X. Ju, Z. Wang, Q. Li: The prescribed time sliding mode control for attitude tracking of spacecraft.
 """
@@ -12,9 +12,9 @@ from ptsmc_jax.campaigns import runs
 from ptsmc_jax.campaigns.runs import Run
 from ptsmc_jax.scenario import from_tables, study
 
-CALM = {"amplitude": [0.0] * 3}  # no disturbance, by the program of the usual one
-_CHAIN = {"disturbance_bound": 0.01, "delta": 0.01}  # the example of Remark 1; Section 3 names no delta
-# name: (figures, what they show, tables of the scenario)
+CALM = {"amplitude": [0.0] * 3}  # no disturbance, with the same compiled program
+_CHAIN = {"disturbance_bound": 0.01, "delta": 0.01}  # delta from Remark 1, since Section 3 gives none
+# name: (figures, their subject, tables of the scenario)
 CASES: dict[str, tuple[str, str, dict[str, Any]]] = {
     "second_order": ("1", "second-order system, eta = 3", {"plant": {"kind": "chain"}, "controller": _CHAIN}),
     "third_order": ("2", "third-order system, eta = 4", {"plant": {"kind": "chain", "order": 3}, "controller": _CHAIN}),
@@ -31,7 +31,7 @@ STABILISED = 1e-3  # largest error after t_f over the initial one that counts as
 
 @dataclass(frozen=True)
 class Claim:
-    """A claim of the paper beside what was measured."""
+    """A claim of the paper, the measurement, and the verdict."""
 
     where: str
     claim: str
@@ -42,12 +42,12 @@ class Claim:
 
 
 def fly_cases() -> dict[str, Run]:
-    """Every case of the paper, flown in continuous time."""
+    """Simulate every case of the paper in continuous time; return the runs by name."""
     return {name: runs.fly(study(from_tables(tables))) for name, (_, _, tables) in CASES.items()}
 
 
 def claims(cases: dict[str, Run]) -> list[Claim]:
-    """Each claim beside its measurement; cases: of `fly_cases`."""
+    """Compare each claim of the paper with its measurement; cases: as `fly_cases` returns them."""
     return [
         *(_stabilised(name, cases[name]) for name in _CHAINS),
         _accuracy("4.2 A", "errors of 10E-4 at t_f = 30 and 40 s", 1e-4, cases, "case_1_30", "case_1_40"),
@@ -66,26 +66,26 @@ def claims(cases: dict[str, Run]) -> list[Claim]:
 
 
 def _size(run: Run) -> np.ndarray:
-    """Norm of the state of a chain, or largest component of the attitude error vector, over time."""
+    """Return the norm of a chain's state, or the largest component of the attitude error vector, over time (n,)."""
     one_array = isinstance(run.log.x, np.ndarray)
     return np.linalg.norm(run.log.x, axis=1) if one_array else np.abs(run.log.error).max(axis=1)
 
 
 def _at_and_after(run: Run) -> tuple[float, float]:
-    """`_size` at t_f and its largest value from then on."""
+    """Return `_size` at t_f and its largest value from t_f on."""
     size = _size(run)
     k = int(np.flatnonzero(run.log.t <= float(run.parts.controller.t_f))[-1])  # t_f is a node of the grid
     return float(size[k]), float(size[k:].max())
 
 
 def _reached(run: Run) -> float:
-    """Time from which the error stays below 1 % of the initial one, up to t_f [s]."""
+    """Return the time [s] after which the error stays below 1 % of the initial error."""
     size = np.linalg.norm(run.log.error, axis=1)
     return float(run.log.t[np.flatnonzero(size > 0.01 * size[0])[-1] + 1])
 
 
 def _first_torque(run: Run) -> float:
-    """Largest component of the torque at t = 0 [N m]."""
+    """Return the largest component of the torque at t = 0 [N m]."""
     return float(np.abs(run.log.u[0]).max())
 
 

@@ -1,4 +1,7 @@
-"""Remark 2 measured: chattering, estimation error and settling with every observer under both signs."""
+"""Simulate Remark 2: chattering, estimation error and settling time for each observer and both sign functions.
+
+Start with `measure`.
+"""
 
 from dataclasses import dataclass
 from typing import Any
@@ -10,9 +13,9 @@ from ptsmc_jax.scenario import from_tables, study
 
 OBSERVERS = ("none", "nonlinear", "finite_time", "prescribed_time")
 SIGNS = {"exact": 0.0, "smooth": 1e-3}
-SETTLED = 0.2  # share of the largest disturbance: an estimate whose error stays below it has settled
-# Case II, eta = 3, as it would fly: 20 Hz, handed over half a second before t_f, and a disturbance that is there from
-# the start, which no estimate knows.
+SETTLED = 0.2  # fraction of the largest disturbance: an estimate has settled if its error stays below it
+# Case II with eta = 3 in a sampled loop: 20 Hz, a hand-over 0.5 s before t_f, and a disturbance that is not zero at
+# t = 0, when the estimate is still zero.
 _TABLES: dict[str, Any] = {
     "controller": {"t_f": 35.0, "delta": 0.5, "initial_estimate_error": 0.01 * 3**0.5},
     "disturbance": {"phase": [np.pi / 2] * 3},
@@ -22,7 +25,7 @@ _TABLES: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class Measured:
-    """One observer under one sign, sampled at 20 Hz, without noise."""
+    """Measurements of a run with one observer and one sign function, sampled at 20 Hz, without noise."""
 
     observer: str
     sign: str
@@ -37,7 +40,7 @@ class Measured:
 
 
 def measure() -> list[Measured]:
-    """Every observer under both signs."""
+    """Simulate each observer with the discontinuous and the smooth sign."""
     return [_measured(observer, sign) for observer in OBSERVERS for sign in SIGNS]
 
 
@@ -54,7 +57,7 @@ def _measured(observer: str, sign: str) -> Measured:
 
 
 def rows(measured: list[Measured]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """The table: a header, and a line for each measurement."""
+    """Return a table as text: a header, and a line for each measurement."""
     head = (
         "observer", "sign", "chattering [N m/s]", f"estimate within {SETTLED:.0%} from [s]",
         "estimation error after t_f [N m]", "attitude settled [s]", "RMS window error", "peak torque [N m]",

@@ -1,4 +1,7 @@
-"""The paper's slips that a number can show; the others are named in the docstrings of the laws that they touch."""
+"""Errors and gaps of the paper that a simulation can show. Start with `slips`.
+
+The docstrings of the laws name the other errors.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -24,7 +27,7 @@ from ptsmc_jax.theory import rules
 
 @dataclass(frozen=True)
 class Slip:
-    """A slip or gap of the paper, what it must be, and what shows it."""
+    """An error or gap of the paper, the correction, and the numerical evidence."""
 
     where: str
     paper: str
@@ -34,7 +37,7 @@ class Slip:
 
 
 def slips(cases: dict[str, Run]) -> list[Slip]:
-    """Each slip with what shows it; cases: of `claims.fly_cases`."""
+    """Return each error with its evidence; cases: as `claims.fly_cases` returns them."""
     return [
         _expansion(),
         _theorem_3(),
@@ -49,7 +52,7 @@ def slips(cases: dict[str, Run]) -> list[Slip]:
 
 
 def _expansion() -> Slip:
-    """(36) by automatic differentiation against (37) with the c_i."""
+    """Compare (36), by automatic differentiation, with (37) and the coefficients c_i."""
     t_f, eta, t = 5.0, 4.3, 1.7
 
     def x(time: jax.Array) -> jax.Array:
@@ -96,7 +99,7 @@ def _theorem_3() -> Slip:
 
 
 def _missing_term() -> Slip:
-    """X'' = -K1 s - F with and without F = x', from s = 0: x = 1, x' = -1, K1 = 1."""
+    """Simulate x'' = -K1 s - F with and without F = x', from x = 1, x' = -1 (s = 0), with K1 = 1."""
 
     def largest(factor: float) -> float:
         def rate(_: float, y: np.ndarray) -> list[float]:
@@ -116,7 +119,7 @@ def _missing_term() -> Slip:
 
 
 def _over_bound(run: Run, start: float) -> float:
-    """Largest estimation error over K2 later than `start` [s]."""
+    """Return the largest estimation error over K2 after the time `start` [s]."""
     error = np.linalg.norm(run.log.d_hat - run.log.disturbance, axis=1)
     bound = np.asarray(jax.vmap(run.parts.observer.error_bound())(jnp.asarray(run.log.t)))
     later = run.log.t > start
@@ -192,7 +195,7 @@ def _effective_gain() -> Slip:
 @pytree
 @dataclass(frozen=True)
 class _Unaligned(AdditiveKinematics):
-    """The error as printed, for any sign of q."""
+    """The error as printed in the paper, without a choice of the sign of q."""
 
     def align(self, x: rigid_body.AttitudeState, target: Target) -> rigid_body.AttitudeState:
         return x
@@ -213,7 +216,7 @@ def _sign_of_q4() -> Slip:
     printed = replace(law, kinematics=_Unaligned(law.model))
 
     def at_t_f(controller: PrescribedTime) -> tuple[float, float]:
-        """Size of eps_1 and angle to the reference [deg]."""
+        """Return the norm of eps_1 and the angle to the reference [deg] at t_f."""
         run = runs.fly(replace(ready, parts=replace(ready.parts, controller=controller)))
         k = int(np.flatnonzero(run.log.t <= float(law.t_f))[-1])
         angle = attitude.angle(jnp.asarray(run.log.x.q[k]), jnp.asarray(run.log.reference.q[k]))
