@@ -1,6 +1,7 @@
 """Differentiable simulator of prescribed-time sliding mode control for spacecraft attitude.
 
-The names below are loaded when first used: importing the package does not import JAX.
+Start with `read` and `simulate`. The names below are imported at their first use, so that importing the package does
+not import JAX.
 """
 
 import importlib

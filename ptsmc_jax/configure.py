@@ -46,11 +46,11 @@ OPTIONS = (
     _Option("--xla_backend_optimization_level=1", on_gpu=False),
     _Option("--xla_cpu_use_fusion_emitters=false", jaxlib=("0.10",), on_gpu=False),
 )
-_DECISIVE = ("--xla_backend_extra_options", "--xla_disable_hlo_passes")  # a user who sets one of these gets no options
+_DECISIVE = ("--xla_backend_extra_options", "--xla_disable_hlo_passes")  # no options are set if the user sets one
 
 programs: Path | None = None  # folder of stored programs, see `ptsmc_jax.programs`; None: do not store any
 _configured: tuple | None = None  # arguments of the last call of `configure`
-_warned = False  # that `configure` was not called
+_warned = False  # whether the warning about a missing call of `configure` was issued
 
 
 class NoDeviceError(ValueError):

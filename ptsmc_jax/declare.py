@@ -30,7 +30,7 @@ class Scaled(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """Between which values a number must lie."""
+    """Range of allowed values of a number."""
 
     above: float = -math.inf
     below: float = math.inf

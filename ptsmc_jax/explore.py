@@ -1,4 +1,7 @@
-"""For notebooks: a scenario flown, looked at and plotted in a line each. The pure core is `rollout.simulate`."""
+"""Short functions for notebooks: simulate a scenario, plot it, run trials, compute verdicts. Start with `simulate`.
+
+The pure function of JAX underneath is `rollout.simulate`.
+"""
 
 import html
 import warnings
@@ -27,7 +30,7 @@ from ptsmc_jax.theory.error_floor import Floor
 
 
 class Quantities(Mapping[str, float]):
-    """Numbers by name, shown with their units and meanings."""
+    """Numbers by name. Notebooks show them with units and meanings."""
 
     def __init__(self, values: Mapping[str, float], catalogue: Mapping[str, catalogues.Entry]):
         self._values, self._catalogue = dict(values), catalogue
@@ -55,10 +58,18 @@ class Quantities(Mapping[str, float]):
 
 
 def write(scenario: Scenario, file: str | Path, *, force: bool = False) -> None:
-    """Write a scenario as a file that every command takes, with every key; force: over one that is there.
+    """Write a scenario to a TOML file with all keys, for the commands of `ptsmc`.
 
-    Raises RefusedError where the file must not be written. What was made in Python is named there, and refused when it
-    is read: only code in files can stand in one.
+    Objects that were made in Python, such as a custom law, are written by name only. A file with such a name cannot be
+    read: scenario files can refer only to code in files.
+
+    Args:
+        scenario: a scenario.
+        file: path of the file.
+        force: whether an existing file is overwritten.
+
+    Raises:
+        RefusedError: the file exists and `force` is False, or it cannot be written.
 
     >>> write(scenario.replace(scenario.from_tables({}), controller__eta=4.0), "mine.toml")  # doctest: +SKIP
     """
@@ -68,36 +79,36 @@ def write(scenario: Scenario, file: str | Path, *, force: bool = False) -> None:
 
 @dataclass(frozen=True)
 class Flight:
-    """A run of a scenario."""
+    """A simulated run of a scenario, with its metrics, verdicts and plots."""
 
     scenario: Scenario
     run: Run
 
     @property
     def status(self) -> str:
-        """Ok, missed, singular or diverged."""
+        """Status of the run: ok, missed (not converged at t_f), singular or diverged."""
         return self.run.status
 
     @property
     def metrics(self) -> Quantities:
-        """What the run is judged by, see `catalogues`; settling_time is NaN where it never settles."""
+        """Metrics of the run, see `catalogues`. The settling time is NaN if the run never settles."""
         return Quantities(self.run.metrics, self.run.catalogue)
 
     @property
     def verdicts(self) -> list[Verdict]:
-        """One for each requirement of the scenario."""
+        """One verdict for each requirement of the scenario."""
         return self.run.verdicts
 
     @property
     def floor(self) -> Floor | None:
-        """What no controller can beat along this run, and its course over time.
+        """Lower bound of the error along this run (posterior Cramer-Rao bound), over time.
 
-        None: not flown to the end, or with sensors of one's own, of which it is not known what they say.
+        It is None if the run is incomplete or if its sensors are custom, since their measurement model is unknown.
         """
         return self.run.floor
 
     def plot(self, *names: str) -> "Figures":
-        """Figures of the run, all of them or those named; raises ValueError for a name that there is not."""
+        """Return all figures of the run, or the named ones; raise ValueError for an unknown name."""
         figures = run_plots.run_figures(self.run.parts, self.run.log, self.run.torque_limit, self.run.floor)
         unknown = [name for name in names if name not in figures]
         if unknown:
@@ -105,11 +116,11 @@ class Flight:
         return Figures({name: figures[name] for name in names or figures})
 
     def animate(self, frames: int = 40) -> "animation.Animation":
-        """The body turning toward its reference, in three dimensions; spacecraft only, else raises ValueError."""
+        """Animate the rotation of the body to its reference in 3D; raise ValueError if the plant is no spacecraft."""
         return animation.of_run(self.run.parts, self.run.log, frames)
 
     def to_polars(self) -> pl.DataFrame:
-        """The history, a row a sample: t [s], state, estimate, delivered torque, sliding variable, error."""
+        """Return the history, one row per sample: t [s], state, estimate, delivered torque, sliding variable, error."""
         return pl.DataFrame({**self.run.columns(), **runs.numbered("error", self.run.log.error)})
 
     def __repr__(self) -> str:
@@ -125,7 +136,7 @@ class Flight:
 
 
 class Figures(dict[str, Figure]):
-    """Figures by name, shown one below the other."""
+    """Figures by name. Notebooks show them one below the other."""
 
     def _repr_html_(self) -> str:
         import base64
@@ -146,11 +157,17 @@ def simulate(
     trial: int | None = None,
     controller: str | Path | None = None,
 ) -> Flight:
-    """Fly a scenario, that of a file or of a study, once: nominal, or a trial with its dispersions and noise.
+    """Simulate a scenario once.
 
-    controller: folder that `export` left, whose C then decides in the loop, on the flight clock.
+    Args:
+        what: a scenario, the path of its file, or a study.
+        seed: seed of the dispersions and the noise.
+        trial: number of a trial with random dispersions and noise; None: the nominal run.
+        controller: a folder that `export` wrote. Its C code then computes the torque, on the flight clock.
 
-    Raises ScenarioError, with one sentence, where it cannot be flown.
+    Raises:
+        ScenarioError: the scenario is not valid or cannot be simulated; the message is one sentence.
+        ValueError: `seed` or `trial` is not a whole number of at least 0.
     """
     draws.check_whole_number("seed", seed)
     draws.check_whole_number("trial", 0 if trial is None else trial)
@@ -167,22 +184,26 @@ def trials(
     own: OwnMetrics | None = None,
     controller: str | Path | None = None,
 ) -> pl.DataFrame:
-    """Rows of the first so many trials of a scenario, or of a plan's, as `ptsmc montecarlo` keeps them.
-
-    Number, status, reason, bad_time [s], the metrics in the units of `catalogues.CATALOGUE`, what each trial flew with,
-    and metrics of one's own; of a controller's C how many samples of each trial ended with which status of its own.
+    """Run trials of a scenario, the same trials as `ptsmc montecarlo` runs.
 
     Args:
-        what: a scenario, its file, or one made ready to fly.
-        count: how many trials, or a plan: a table with a row for each, see `plans`.
-        seed: of the draws and the noise.
-        own: metrics of one's own, see `montecarlo.one`.
-        controller: folder that `export` left, whose C then decides in the loop, on the flight clock; a study is flown
-            as its scenario says.
+        what: a scenario, the path of its file, or a study.
+        count: number of trials, or a run table with one row for each trial, see `plans`.
+        seed: seed of the dispersions and the noise.
+        own: function that returns custom metrics, see `montecarlo.one`.
+        controller: a folder that `export` wrote. Its C code then computes the torque, on the flight clock. If `what` is
+            a study, its scenario is simulated.
 
-    Raises RefusedError, with one sentence, where a plan cannot be flown, ScenarioError where the controller is none of
-    the scenario, and ValueError where metrics of one's own are no named numbers, or have the name of a column, and
-    where `count` is neither a whole number nor such a table.
+    Returns:
+        One row for each trial: number, status, reason, bad_time [s], the metrics in the units of
+        `catalogues.CATALOGUE`, the dispersed values, and custom metrics. With a controller, also the number of samples
+        by the status that its C code returned.
+
+    Raises:
+        RefusedError: the run table cannot be simulated.
+        ScenarioError: the controller does not belong to the scenario.
+        ValueError: custom metrics are not named numbers or have the name of a column, or `count` is neither a whole
+            number nor a table.
     """
     draws.check_whole_number("seed", seed)
     ready = _ready(what if controller is None else folder.flown(_read(what)))
@@ -202,7 +223,10 @@ def trials(
 
 
 def _software(controller: str | Path | None, ready: Study) -> Software:
-    """The flight computer that a folder's C is, or the parts' own code; what C has otherwise is warned of."""
+    """Return the flight software: the C code of a folder, or the code of the parts.
+
+    Warn about differences between the C code and the scenario.
+    """
     if controller is None:
         return OURS
     computer = InTheLoop(Library(controller), ready.parts, ready.dispersion)
@@ -212,10 +236,10 @@ def _software(controller: str | Path | None, ready: Study) -> Software:
 
 
 def floor(what: Scenario | Study | str | Path, *, seed: int = 0) -> float | None:
-    """RMS window error that no controller can beat in a scenario, in the unit of the metric; 0: nothing is unknown.
+    """Return the lower bound of the RMS window error of a scenario, in the unit of the metric.
 
-    Pooled over a few trials, see `runs.floor`; what is taken as known: `error_floor`. None: none of them flies, or with
-    sensors of one's own, of which it is not known what they say.
+    It is the posterior Cramer-Rao bound of a few trials, combined by `runs.floor`. `error_floor` lists the assumptions.
+    The bound is 0 if nothing is unknown, and None if no trial is complete or if the sensors are custom.
     """
     draws.check_whole_number("seed", seed)
     return runs.floor(_ready(what), seed)
@@ -230,12 +254,19 @@ def _ready(what: Scenario | Study | str | Path) -> Study:
 
 
 def verdicts(what: Scenario | Study | str | Path, rows: pl.DataFrame, *, seed: int = 0) -> list[Verdict]:
-    """One for each requirement of the scenario over these rows; a failed trial breaks every one of its runs.
+    """Return one verdict for each requirement of a scenario over the rows of trials.
 
-    Margins are those of its loop, see `margin_verdicts`; where loops differ, of those of this seed's trials.
+    A failed trial violates all requirements on runs. Margins come from the linearised loop, see `margin_verdicts`. If
+    loops differ between trials, they come from the trials of this seed.
 
-    Raises ValueError where there are no rows, or a column that is asked for is missing; TypeError where they are no
-    polars table.
+    Args:
+        what: a scenario, the path of its file, or a study.
+        rows: rows as `trials` returns them.
+        seed: seed of the trials whose loops are linearised.
+
+    Raises:
+        ValueError: there are no rows, or a required column is missing.
+        TypeError: `rows` is not a polars DataFrame.
     """
     draws.check_whole_number("seed", seed)
     if not isinstance(rows, pl.DataFrame):
@@ -253,7 +284,7 @@ def verdicts(what: Scenario | Study | str | Path, rows: pl.DataFrame, *, seed: i
 
 
 def units(kind: str = "spacecraft") -> dict[str, str]:
-    """The unit of each metric of this kind of plant; raises ValueError where there is no such kind."""
+    """Return the unit of each metric for a kind of plant; raise ValueError for an unknown kind."""
     if kind not in catalogues.CATALOGUES:
         raise ValueError(f"there is no kind of plant {kind!r}; allowed are {', '.join(catalogues.CATALOGUES)}")
     return catalogues.units(kind)

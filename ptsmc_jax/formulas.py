@@ -1,4 +1,4 @@
-"""Formulas of the parts in plain NumPy: what a scenario is checked by before JAX is loaded."""
+"""Formulas of plants and devices in plain NumPy, which validate scenarios before JAX is imported."""
 
 from typing import Any
 
@@ -6,13 +6,17 @@ import numpy as np
 
 
 def check_inertia(inertia: object) -> np.ndarray:
-    """The (3, 3) inertia tensor [kg m^2] that `spacecraft` would use; raises ValueError as it does."""
+    """Return the inertia tensor (3, 3) [kg m^2] from three principal moments or a tensor.
+
+    Raises:
+        ValueError: no rigid body has this inertia; the message gives the reason.
+    """
     try:
         tensor = np.asarray(inertia)
         if not np.issubdtype(tensor.dtype, np.number):
             raise TypeError
         tensor = tensor.astype(float)
-    except (ValueError, TypeError):  # rows of different lengths, or no numbers
+    except (ValueError, TypeError):  # rows of different lengths, or values that are not numbers
         tensor = np.zeros(0)
     tensor = np.diag(tensor) if tensor.shape == (3,) else tensor
     if tensor.shape != (3, 3):
@@ -35,27 +39,34 @@ def check_inertia(inertia: object) -> np.ndarray:
 
 
 def bodies(tensors: np.ndarray) -> np.ndarray:
-    """Which symmetric tensors (n, 3, 3) a rigid body may have, (n,) bool.
+    """Return which symmetric tensors (n, 3, 3) [kg m^2] can be the inertia of a rigid body, (n,) bool.
 
-    Those that are positive definite, no principal moment of theirs above the sum of the other two.
+    Such a tensor is positive definite, and no principal moment exceeds the sum of the other two.
     """
     moments, scale = np.linalg.eigvalsh(tensors), np.abs(tensors).max(axis=(1, 2))
     return (moments[:, 0] > 1e-12 * scale) & (moments[:, 2] <= (moments[:, 0] + moments[:, 1]) * (1 + 1e-9))
 
 
 def flexible_bodies(tensors: np.ndarray, couplings: np.ndarray) -> np.ndarray:
-    """Which flexible bodies can be, (n,) bool: those whose J - D'D is positive definite.
+    """Return which flexible bodies are possible, (n,) bool: those with a positive definite J - D'D.
 
-    tensors: J (n, 3, 3) [kg m^2]; couplings: D (n, modes, 3) [sqrt(kg) m].
+    Args:
+        tensors: J (n, 3, 3) [kg m^2].
+        couplings: D (n, modes, 3) [sqrt(kg) m].
     """
     least = np.linalg.eigvalsh(tensors - np.swapaxes(couplings, 1, 2) @ couplings)[:, 0]
     return least > 1e-9 * np.abs(tensors).max(axis=(1, 2))
 
 
 def rest_inertia(inertia: np.ndarray, coupling: Any) -> np.ndarray:
-    """J - D'D (3, 3) of a flexible body [kg m^2], for D (modes, 3) [sqrt(kg) m]; raises ValueError where it is not > 0.
+    """Return J - D'D (3, 3) [kg m^2], the inertia of the rigid rest of a flexible body.
 
-    inertia: J (3, 3), of the whole body with its modes at rest.
+    Args:
+        inertia: J (3, 3) [kg m^2] of the whole body with its modes at rest.
+        coupling: D (modes, 3) [sqrt(kg) m].
+
+    Raises:
+        ValueError: J - D'D is not positive definite.
     """
     rows = np.asarray(coupling, dtype=float)
     rest = inertia - rows.T @ rows
@@ -69,26 +80,37 @@ def rest_inertia(inertia: np.ndarray, coupling: Any) -> np.ndarray:
 
 
 def free_modes(inertia: np.ndarray, frequency: Any, coupling: Any) -> np.ndarray:
-    """Angular frequencies (modes,) at which a flexible body rings where nothing holds it, without damping [rad/s]."""
+    """Return the undamped angular frequencies (modes,) [rad/s] of a free flexible body.
+
+    They solve det(W^2 - w^2 (1 - D J^-1 D')) = 0.
+
+    Args:
+        inertia: J (3, 3) [kg m^2].
+        frequency: W of each mode with the body held (modes,) [rad/s].
+        coupling: D (modes, 3) [sqrt(kg) m].
+    """
     rows, stiff = np.asarray(coupling, dtype=float), np.asarray(frequency, dtype=float) ** 2
-    # w' eliminated: (1 - D J^-1 D') e'' + W^2 e = 0
+    # eliminate w': (1 - D J^-1 D') e'' + W^2 e = 0
     mass = np.eye(len(rows)) - rows @ np.linalg.solve(inertia, rows.T)
     root = np.sqrt(stiff)
     return np.sqrt(np.linalg.eigvalsh(root[:, None] * np.linalg.inv(mass) * root))
 
 
 def surface_roots(a: Any) -> np.ndarray:
-    """Roots of p^(n-1) + a_(n-1) p^(n-2) + .. + a_1 [1/s], a number for each a_i: the motion on a surface (39)."""
+    """Return the roots (n-1,) [1/s] of p^(n-1) + a_(n-1) p^(n-2) + .. + a_1: the motion on the surface (39)."""
     return np.roots([1.0, *np.asarray(a, dtype=float)[::-1]])
 
 
 def hurwitz(a: Any) -> bool:
-    """Whether the matrix of (39) is Hurwitz: all roots of p^(n-1) + a_(n-1) p^(n-2) + .. + a_1 left of the axis."""
+    """Whether the matrix of (39) is Hurwitz: all roots of p^(n-1) + .. + a_1 have a negative real part."""
     return bool(np.all(np.real(surface_roots(a)) < 0.0))
 
 
 def wheel_axes(axes: Any) -> np.ndarray:
-    """Unit spin axes (n, 3) of wheels in body axes, of any length; raises ValueError where they do not span all."""
+    """Return spin axes of wheels (n, 3) in body axes, normalised; raise ValueError if they do not span all directions.
+
+    `axes` are directions (n, 3) of any length.
+    """
     unit = np.asarray(axes, dtype=float)
     if (
         unit.ndim != 2
@@ -104,23 +126,34 @@ def wheel_axes(axes: Any) -> np.ndarray:
 
 
 def pyramid(cant: float = np.arctan(1.0 / np.sqrt(2.0))) -> np.ndarray:
-    """Spin axes (4, 3) of four wheels, `cant` [rad] above the x-y plane; by default all axes are equally strong."""
+    """Return the spin axes (4, 3) of four wheels, `cant` [rad] above the x-y plane.
+
+    With the default cant, the largest torque is equal about all body axes.
+    """
     around = np.deg2rad([45.0, 135.0, 225.0, 315.0])
     return np.stack([np.cos(cant) * np.cos(around), np.cos(cant) * np.sin(around), np.full(4, np.sin(cant))], axis=1)
 
 
 def per_sample(density: float, period: float) -> float:
-    """1 sigma of samples of white noise, each an average over a period [s]: density / sqrt(period).
+    """Return the noise of samples of white noise, 1 sigma, each averaged over a period: density / sqrt(period).
 
-    density: of a rate in rad/s/sqrt(Hz), which is rad/sqrt(s), a gyro's angle random walk (IEEE Std 952).
+    Args:
+        density: noise density; for a rate in [rad/s/sqrt(Hz)] = [rad/sqrt(s)], the angle random walk of a gyro (IEEE
+            Std 952).
+        period: sample period [s].
     """
     return float(density / np.sqrt(period))
 
 
 def best_bandwidth(attitude_noise: float, rate_noise: float, period: float, interval: float) -> float:
-    """Bandwidth [rad/s] at which star tracker and gyro noise weigh the same: sigma_v / (sigma_n sqrt(interval)).
+    """Return the bandwidth [rad/s] at which star tracker and gyro noise have equal weight.
 
-    attitude_noise: 1 sigma a sample [rad]; rate_noise: 1 sigma a control period [rad/s]; sigma_v = rate_noise
-    sqrt(period) is the gyro's angle random walk.
+    It is sigma_v / (sigma_n sqrt(interval)), with the gyro's angle random walk sigma_v = rate_noise sqrt(period).
+
+    Args:
+        attitude_noise: sigma_n, noise of a star tracker sample, 1 sigma [rad].
+        rate_noise: noise of a gyro sample, 1 sigma [rad/s].
+        period: control period [s].
+        interval: time between star tracker samples [s].
     """
     return rate_noise * float(np.sqrt(period)) / (attitude_noise * float(np.sqrt(interval)))

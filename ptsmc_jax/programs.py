@@ -121,7 +121,7 @@ class Program:
         self._prepared.append(_background().submit(_with_settings(compiled)))
 
     def _restored(self) -> Callable:
-        """Return the function that JAX traces in place of ours: it calls the stored program, or stores it first."""
+        """Return the function that JAX traces instead of ours: it calls the stored program, or stores it first."""
 
         @functools.wraps(self._function)
         def restored(*args: Any, **kwargs: Any) -> Any:
@@ -225,7 +225,7 @@ def call_on_cpu(function: Callable, /, *args: Any, **kwargs: Any) -> Any:
 
 
 def _to_host(leaf: Any) -> Any:
-    """Return an array of a device as one that every device takes."""
+    """Return an array of a device as a NumPy array, which every device accepts."""
     unchanged = not isinstance(leaf, jax.Array) or jnp.issubdtype(leaf.dtype, jax.dtypes.extended)
     return leaf if unchanged else np.asarray(leaf)
 
