@@ -1,4 +1,4 @@
-"""Parts of one's own for own_parts.toml, one of each kind; see docs/own_parts.md."""
+"""Custom parts for own_parts.toml, one of each kind. See docs/own_parts.md."""
 
 import dataclasses
 
@@ -16,7 +16,7 @@ class Scaling(ptsmc.AccelerationLaw):
     k: float = ptsmc.gain(1e-3, lambda t_f, h: (1e-5 / t_f, 1.0 / t_f), unit="1/s", meaning="rate of its surface")
 
     def acceleration(self, now, error, error_rate, bound):
-        """The error's second derivative that it wants, and its sliding variable, (3,) each."""
+        """Return the commanded second derivative of the error, and the sliding variable, (3,) each."""
         p, left = 2.0 + self.m, jnp.where(now.hold, self.delta, self.t_f - now.t)
         s = error_rate + (p / left + self.k1) * error
         a = -2.0 * p / left * error_rate - p * (p + 1.0) / left**2 * error
@@ -25,54 +25,54 @@ class Scaling(ptsmc.AccelerationLaw):
 
 
 class LowPass(ptsmc.SampledObserver):
-    """The disturbance that the motion shows, through a low pass of first order."""
+    """A first-order low pass of the disturbance that the measured motion implies."""
 
     rate: float = ptsmc.gain(1.0, lambda t_f, h: (1.0 / t_f, 1.0 / h), unit="1/s", meaning="bandwidth")
 
     def step(self, memory, d_mean, t, dt):
-        """The estimate (3,) [N m] at the end of a period."""
+        """Return the estimate (3,) [N m] at the end of a period."""
         return d_mean + jnp.exp(-self.rate * dt) * (memory - d_mean)
 
 
 class SolarPressure(ptsmc.Disturbance):
-    """Radiation pressure on a panel: a torque about one body axis, by the angle between panel and sun."""
+    """Radiation pressure on a panel: a torque about one body axis that depends on the angle to the sun."""
 
     torque: float = 0.01
     sun: tuple = (1.0, 0.0, 0.0)  # in inertial axes
 
     def __call__(self, t, x):
-        """Torque (3,) [N m] in the state x: attitude x.q (scalar last), rate x.w."""
+        """Return the torque (3,) [N m] in the state x: attitude x.q (scalar last), rate x.w."""
         v, s = x.q[:3], x.q[3]
         sun = self.sun + 2.0 * jnp.cross(jnp.cross(self.sun, v) + s * self.sun, v)  # in body axes
         return self.torque * sun[0] * jnp.abs(sun[0]) * jnp.asarray([0.0, 1.0, 0.0])
 
 
 class Nodding(ptsmc.Reference):
-    """Nods about the x axis of the attitude that [reference] gives."""
+    """An oscillation about the x axis of the attitude in [reference]."""
 
     angle: float = 0.05  # rad
     frequency: float = 0.2  # rad/s
 
     def attitude(self, t):
-        """Unit quaternion (4,), scalar last."""
+        """Return the unit quaternion (4,), scalar last."""
         half = 0.5 * self.angle * jnp.sin(self.frequency * t)
         return jnp.stack([jnp.sin(half), 0.0 * half, 0.0 * half, jnp.cos(half)])
 
     def fastest(self):
-        """How fast it changes [rad/s]."""
+        """Return the largest angular frequency of the reference [rad/s]."""
         return float(self.frequency)
 
 
 class StarTracker(ptsmc.SampledSensor):
-    """A star tracker that sees worse the faster the body turns, and a gyro."""
+    """A gyro, and a star tracker whose noise grows with the body rate."""
 
     draws = 6
-    attitude_noise: float = 2e-5  # rad, 1 sigma of each axis of a body that does not turn
-    smear: float = 20.0  # s: how much more of it by the body rate
+    attitude_noise: float = 2e-5  # rad, 1 sigma of each axis for a body at rest
+    smear: float = 20.0  # s: relative growth of the noise over the body rate
     rate_noise: float = 1e-6  # rad/s
 
     def see(self, memory, x, noise, t, dt):
-        """The state as seen, and the memory, of which there is none."""
+        """Return the measured state and the memory, which is empty."""
         spread = self.attitude_noise * (1.0 + self.smear * jnp.sqrt(x.w @ x.w + 1e-20))
         half = 0.5 * spread * noise[:3]
         v, s = x.q[:3], x.q[3]
@@ -81,7 +81,7 @@ class StarTracker(ptsmc.SampledSensor):
 
 
 class LateStarTracker(ptsmc.SampledSensor):
-    """A star tracker whose samples arrive some control periods after they were taken, and a gyro that is in time."""
+    """A star tracker whose samples arrive some control periods late, and a gyro without delay."""
 
     draws = 6
     late = 2  # control periods
@@ -89,11 +89,11 @@ class LateStarTracker(ptsmc.SampledSensor):
     rate_noise: float = 1e-6  # rad/s
 
     def begin(self, x):
-        """Samples on their way, the oldest first, as many as are late: the body was there before."""
+        """Return the samples that have not arrived yet, oldest first: `late` copies of the initial attitude."""
         return jnp.tile(x.q, (self.late, 1))
 
     def see(self, memory, x, noise, t, dt):
-        """The attitude that arrives and the rate of now, and the samples that are then on their way."""
+        """Return the attitude that arrives with the current rate, and the samples that have not arrived yet."""
         half = 0.5 * self.attitude_noise * noise[:3]
         v, s = x.q[:3], x.q[3]
         taken = jnp.concatenate([v + s * half + jnp.cross(v, half), jnp.stack([s - v @ half])])  # to first order
@@ -103,18 +103,18 @@ class LateStarTracker(ptsmc.SampledSensor):
 
 
 class SunDirection(ptsmc.Draw):
-    """The sun about which `SolarPressure` knows stands elsewhere in each trial."""
+    """A random direction of the sun in `SolarPressure` in each trial."""
 
     count = 3
 
     def at(self, c, parts):
-        """The parts with another sun, from three standard normal numbers."""
+        """Return the parts with another direction of the sun, from three standard normal numbers c (3,)."""
         *others, solar = parts.disturbance.terms
         solar = dataclasses.replace(solar, sun=c / jnp.sqrt(c @ c))
         return dataclasses.replace(parts, disturbance=dataclasses.replace(parts.disturbance, terms=(*others, solar)))
 
 
 def slowest_turn(result, parts):
-    """Metrics of one's own, for `montecarlo --metrics`: what is asked of the run's history."""
+    """Custom metrics for `montecarlo --metrics`, computed from the history of a run."""
     turning = jnp.linalg.norm(result.log.x.w, axis=1)
     return {"mean_rate": jnp.mean(turning), "last_rate": turning[-1]}
