@@ -1,4 +1,4 @@
-"""Scenario files that must be refused, and what the one sentence must say of each."""
+"""Scenario files with configuration errors, and the expected parts of each error message."""
 
 import re
 
@@ -19,7 +19,7 @@ LONG_RUN = (
 FLEXIBLE = "spacecraft.inertia = [10, 12, 14]\nflexible.coupling = [[3, 0, 0]]\n"
 OWN = 'plant = { kind = "system", system = "%s" }'
 
-# scenario file; what its one sentence must say of key and value; what it must say is allowed
+# scenario file; expected text about key and value; expected text about allowed values
 BAD = [
     ("controller.eta = 2.0", "controller.eta is 2.0", "greater than 2"),
     ("controller.eta = -3", "controller.eta is -3", "greater than 2"),
@@ -32,7 +32,7 @@ BAD = [
     ("controller.delta = 30.0", "controller.delta is 30.0", "less than controller.t_f, 30.0"),
     ("controller.delta = 31", "controller.delta is 31", "less than controller.t_f, 30.0"),
     ("controller = { t_f = 0.05, delta = 0.05 }", "controller.delta is 0.05", "less than controller.t_f, 0.05"),
-    (  # it was told as a delta that nobody had written
+    (  # an earlier error named a delta that the file does not contain
         'controller.t_f = 0.03\nloop = { mode = "sampled", period = 0.05 }',
         "controller.t_f is 0.03",
         "greater than one control period, loop.period = 0.05",
@@ -76,7 +76,7 @@ BAD = [
         "disturbance.kind",
     ),
     (
-        CHAIN + "observer.gain = [6.0]",  # whose default is none
+        CHAIN + "observer.gain = [6.0]",  # the default observer of a chain is "none"
         'key of observer.kind = "none", but of "nonlinear", "finite_time", "prescribed_time"; ',
         "known are",
     ),
@@ -217,7 +217,7 @@ BAD = [
     ),
     (CHAIN + SAMPLED + "hardware.attitude_noise = 1e-5", "hardware.attitude_noise is not a", "nearest"),
     (CHAIN + SAMPLED + "hardware.state_noise = [1e-5]", "hardware.state_noise is [1e-05]", "a list of 2 numbers"),
-    (  # also if default gains are designed for the noise
+    (  # the same if default gains are designed for the noise
         CHAIN + SAMPLED + "hardware.state_noise = [1e-5]\ncontroller.t_f = 60.0",
         "hardware.state_noise is [1e-05]",
         "a list of 2 numbers",
@@ -250,7 +250,7 @@ BAD = [
     ),
     (SAMPLED + "controller.eta = 1e6", "controller.t_f is 30.0", "or loop.period shorter: loop.period = 0.05"),
     ("initial.rate = [1e5, 0, 0]", "initial.rate is [100000.0, 0.0, 0.0]", "lower"),
-    (SAMPLED + "dispersion.rate = { std = 30.0 }", "dispersion.rate.std is 30.0", "lower"),  # initial.rate was, of 0
+    (SAMPLED + "dispersion.rate = { std = 30.0 }", "dispersion.rate.std is 30.0", "lower"),  # not initial.rate
     (SAMPLED + "dispersion.rate = { kind = 'uniform', half_width = 99 }\nwheels = {}", "rate.half_width is 99", "low"),
     ("loop.settling_angle = 5.0", "loop.settling_angle is 5.0", "less than pi [rad]"),
     # devices
@@ -311,7 +311,7 @@ BAD = [
         "wheels.axes is [[1.0, 0.0, 0.0]",
         "must span all three directions",
     ),
-    # the same where gains are designed for the mission, for which defaults are filled in before anything is checked
+    # the same if gains are designed for the mission: their defaults are filled in before keys are checked
     (
         SAMPLED
         + "controller.t_f = 60\nwheels = { kind = 'axes', torque_limit = 1, axes = [[1, 0, 0], [0, 1, 0], [1, 1, 0]] }",
@@ -381,7 +381,7 @@ BAD = [
         "dispersion.mode_coupling.std is 0.02, but with rows 1.06 times those of flexible.coupling",
         "must be positive definite",
     ),
-    (  # (1 + 0.01)^2 9 < 10, but not of moments 1 - 3 * 0.05 times as large
+    (  # (1 + 0.01)^2 9 < 10, but > 10 (1 - 3 * 0.05)
         FLEXIBLE + "dispersion = { mode_coupling = { kind = 'relative_uniform', half_width = 0.01 }, inertia = {} }",
         "half_width is 0.01, but with rows 1.01 times those of flexible.coupling, and moments 0.85 times as large",
         "must be positive definite",
@@ -440,7 +440,7 @@ BAD = [
     ),
     ("wheels.torque_limit = 1\nfilter.kind = 'none'", "[wheels] needs the sampled loop", 'loop.mode is "continuous"'),
     ("spacecraft.true_inertia = [1, 2, 9]", "spacecraft.true_inertia is [1", "no rigid body"),
-    # out of the additive law's reach: 180 degrees from the inertial identity, and paths through there
+    # singular for the additive law: 180 deg from the inertial identity, and paths through this attitude
     ("initial.quat_xyzw = [1, 0, 0, 0]", "initial.quat_xyzw is [1.0, 0.0, 0.0, 0.0]", CLEAR),
     ("initial.quat_wxyz = [0, 0, 0.6, 0.8]", "initial.quat_wxyz is [0.0, 0.0, 0.6, 0.8]", CLEAR),
     ("initial.rotvec_deg = [0, 180, 0]", "initial.rotvec_deg is [0.0, 180.0, 0.0]", CLEAR),
@@ -539,7 +539,7 @@ BAD = [
     ("tune.trials = 4294967297", "tune.trials is 4294967297", "a whole number from 1 to 1000000"),
     ("tune.starts = 101", "tune.starts is 101", "a whole number from 1 to 100"),
     (f"tune.steps = {10**26}", "tune.steps is 100000000000000000000000000", "from 1 to 100000"),
-    # what is too much of it
+    # values beyond a limit
     (f"controller.eta = {'[' * 300}{']' * 300}", "has tables or arrays in each other", "at most 8 levels"),
     (f"controller{'.a' * 300} = 1", "has tables or arrays in each other", "at most 8 levels"),
     (f"[{'a.' * 5000}a]", "has tables or arrays in each other", "at most 8 levels"),
@@ -593,7 +593,7 @@ BAD = [
         "tune.bounds.sign_width is [0.0",
         "above 0.0",
     ),
-    # what the contract knows and the project cannot do yet
+    # combinations that the contract names and the project does not support
     ("controller.kind = 'pd'", 'controller.kind = "pd" needs the sampled loop', 'loop.mode is "continuous"'),
     ("controller.kind = 'lqr'", 'controller.kind is "lqr"', 'one of "prescribed_time", "pd", "terminal", "fixed_time"'),
     ("plant.kind = 'chain'\ncontroller.kind = 'pd'", 'controller.kind = "pd" needs', 'loop.mode is "continuous"'),
@@ -789,12 +789,12 @@ BAD = [
     ("tune.worst_case = 'yes'", 'tune.worst_case is "yes"', "true or false"),
 ]
 
-# what has no place in a sentence for somebody who wrote a scenario file
+# words that must not occur in an error message for the author of a scenario file
 JARGON = re.compile(r"\n|Traceback|Error|Errno|could not convert|array element|np\.|tuple|\bNone\b|float64")
 
 
 def check_sentence(said, of_what, allowed):
-    """A sentence for somebody who wrote a scenario file: names the key and its value, and what is allowed."""
+    """Assert that an error message is one sentence that names the key, its value and the allowed values."""
     assert of_what in said
     assert allowed in said
     assert not JARGON.search(said)

@@ -1,4 +1,4 @@
-"""Defaults that follow from what is flown: bounds on the disturbance, the observer's gain; what is odd is said."""
+"""Defaults that follow from other keys (disturbance bounds, observer gain), and warnings about unusual values."""
 
 import math
 from typing import ClassVar
@@ -34,7 +34,7 @@ def bounds(**tables):
 
 
 def reached(disturbance, dispersion=None, count=400, spacecraft=None):
-    """Largest component of d and of d' over drawn times, phases and factors, by finite differences."""
+    """Return the largest component of d and of d' over random times, phases and factors, by finite differences."""
     tables = {"disturbance": disturbance, "dispersion": dispersion or {}, "spacecraft": spacecraft or {}}
     ready = scenario.study(scenario.from_tables(tables))
     t = np.linspace(0.0, 40.0, 8001)
@@ -48,15 +48,15 @@ def reached(disturbance, dispersion=None, count=400, spacecraft=None):
     return max(np.abs(d).max() for d in each), max(np.abs(np.gradient(d, t, axis=0)).max() for d in each)
 
 
-def test_the_papers_own_follow_from_its_case_and_its_chains():
-    """Case I: 0.01 sin(0.1 t) on the paper's body; Figs. 1 and 2: 0.01 sin(t)."""
+def test_published_disturbance_bounds_follow_from_the_published_cases():
+    """Case I has 0.01 sin(0.1 t) on the published body, Figs. 1 and 2 have 0.01 sin(t)."""
     assert bounds() == (0.01, 1e-3)
     assert scenario.from_tables({}).observer.gain == (10.0, 10.0, 10.0)
     assert bounds(plant={"kind": "chain"}) == (0.01, 0.01)
     assert bounds(disturbance={"kind": "none"}) == (0.0, 0.0)
 
 
-def test_a_sinusoid_reaches_amplitude_and_bias_and_amplitude_times_frequency():
+def test_bounds_of_a_sinusoid_follow_from_amplitude_bias_and_frequency():
     table = {
         "kind": "sinusoid",
         "amplitude": [2e-3, 1e-3, 0.0],
@@ -64,11 +64,11 @@ def test_a_sinusoid_reaches_amplitude_and_bias_and_amplitude_times_frequency():
         "bias": [0.0, -4e-3, 1e-3],
     }
     assert bounds(disturbance=table) == (5e-3, 3e-3)
-    assert reached(table, count=1) == pytest.approx((5e-3, 3e-3), rel=1e-3)  # 2.5 mrad of the fastest a step
+    assert reached(table, count=1) == pytest.approx((5e-3, 3e-3), rel=1e-3)  # steps of 2.5 mrad
 
 
-def test_what_is_drawn_counts():
-    """Factors truncated at three sigma, or uniform; a bias at three sigma; of any phase."""
+def test_disturbance_bounds_include_dispersions():
+    """Bounds include factors (truncated at three sigma, or uniform), a bias of three sigma, and all phases."""
     table = {"kind": "sinusoid", "amplitude": [1e-3] * 3, "frequency": [1.0] * 3}
     drawn = {
         "disturbance_amplitude": {"kind": "relative_uniform", "half_width": 0.5},
@@ -77,7 +77,7 @@ def test_what_is_drawn_counts():
     }
     assert bounds(disturbance=table, dispersion=drawn) == (3.5e-3, 1.5e-3)
     seen = reached(table, drawn, count=60)
-    assert 0.9 * 3.5e-3 < seen[0] <= 3.5e-3  # the largest of 180 draws of two uniform numbers each
+    assert 0.9 * 3.5e-3 < seen[0] <= 3.5e-3  # the largest of 180 random pairs of uniform numbers
     assert 0.9 * 1.5e-3 < seen[1] <= 1.5e-3
     normal = {"disturbance_amplitude": {"kind": "relative_normal", "std": 0.1},
               "disturbance_bias": {"kind": "normal", "std": 1e-3}}  # fmt: skip
@@ -91,7 +91,7 @@ def test_several_disturbances_add_up_component_by_component():
 
 
 def test_independent_random_walks_add_up_by_their_squares():
-    """Densities of 3 and 4 are one of 5, where both push the same axis."""
+    """Two walks with densities of 3 and 4 on the same axis are one walk with a density of 5."""
 
     def walking(*densities):
         terms = [{"kind": "random_walk", "density": density} for density in densities]
@@ -102,8 +102,8 @@ def test_independent_random_walks_add_up_by_their_squares():
     np.testing.assert_allclose(walking(one, other), walking(both), rtol=1e-12)
 
 
-def test_the_gravity_gradient_reaches_what_its_moments_allow():
-    """The largest c x J c over all c is half the difference of the moments; it changes by at most that times |c'|."""
+def test_bounds_of_the_gravity_gradient_are_tight():
+    """The largest c x J c is half the difference of the moments, and its rate is at most the difference times |c'|."""
     n, inertia = 1.1e-3, np.asarray(FULL_INERTIA)
     apart = np.ptp(np.linalg.eigvalsh(inertia))
     rng = np.random.default_rng(0)
@@ -113,26 +113,26 @@ def test_the_gravity_gradient_reaches_what_its_moments_allow():
     along /= np.linalg.norm(along, axis=1, keepdims=True)  # c' at unit rate
     torque = np.linalg.norm(np.cross(c, c @ inertia), axis=1).max()
     changes = np.linalg.norm(np.cross(along, c @ inertia) + np.cross(c, along @ inertia), axis=1).max()
-    assert 0.99 < torque / (0.5 * apart) <= 1.0  # of 20000 directions the nearest are 1 degree off
+    assert 0.99 < torque / (0.5 * apart) <= 1.0  # the nearest of 20000 directions is 1 deg off
     assert 0.98 < changes / apart <= 1.0
     tables = {"spacecraft": {"inertia": FULL_INERTIA}, "disturbance": {"kind": "gravity_gradient", "orbit_rate": n}}
     size, rate = bounds(**tables)
     assert size == pytest.approx(1.5 * n**2 * apart, rel=1e-3)
     turns = n + 2 * np.pi / 30.0
     assert rate == pytest.approx(3 * n**2 * apart * turns, rel=1e-3)
-    # drawn moments, three sigma apart the other way
+    # random moments, three sigma further apart
     least, _, most = np.linalg.eigvalsh(inertia)
     drawn, _ = bounds(**tables, dispersion={"inertia": {"kind": "relative_normal", "std": 0.05}})
     assert drawn == pytest.approx(1.5 * n**2 * (1.15 * most - 0.85 * least), rel=1e-3)
 
 
-def test_a_random_walk_counts_with_three_sigma():
-    """Of where it is at t_end, and of what it changes by while the observer forgets, 1.2 s, over that time."""
+def test_bounds_of_a_random_walk_are_three_sigma():
+    """The size bound is the walk at t_end. The rate bound is the change in the observer's time constant of 1.2 s."""
     table = {"kind": "random_walk", "density": [1e-5, 2e-5, 0.0]}
     size, rate = bounds(disturbance=table, loop=SAMPLED)
     assert size == pytest.approx(3 * 2e-5 * np.sqrt(40.0), rel=1e-3)
     assert rate == pytest.approx(3 * 2e-5 / np.sqrt(1.2), rel=1e-3)
-    rng = np.random.default_rng(1)  # what such an observer is off by: 3 sigma are c J / l = c 1.2 s, over sqrt(2)
+    rng = np.random.default_rng(1)  # 3 sigma of the observer's error: c J / l / sqrt(2), with J / l = 1.2 s
     h, off = 0.1, np.zeros(4000)
     for _ in range(400):
         off = np.exp(-h / 1.2) * (off + 2e-5 * np.sqrt(h) * rng.normal(size=off.size))
@@ -140,7 +140,7 @@ def test_a_random_walk_counts_with_three_sigma():
 
 
 class Wobble(Disturbance):
-    """Of one's own: 0.02 sin(0.3 t) about x, and what grows with the rate about y."""
+    """A custom disturbance: 0.02 sin(0.3 t) about x, and a term about y that grows with the rate."""
 
     share: float = 0.1
 
@@ -149,7 +149,7 @@ class Wobble(Disturbance):
         return jnp.stack([0.02 * jnp.sin(0.3 * t), self.share * jnp.sum(x.w**2), 0.0 * t])
 
 
-def test_ones_own_is_looked_at_along_the_nominal_run():
+def test_bounds_of_a_custom_disturbance_are_taken_along_the_nominal_run():
     table = {"kind": "own", "code": Wobble, "share": 0.0}
     assert bounds(disturbance=table) == pytest.approx((0.02, 6e-3), rel=1e-3)
     angle = 2.0 * np.arccos(0.5773502691896258)  # until t_f, fastest at the start, three times the mean rate
@@ -161,19 +161,19 @@ def test_ones_own_is_looked_at_along_the_nominal_run():
 
 
 class BreaksOff(Disturbance):
-    """A disturbance without a value after 10 s."""
+    """A disturbance that is NaN after 10 s."""
 
     def __call__(self, t, x):
         """Torque (3,) [N m]."""
         return jnp.where(t > 10.0, jnp.nan, 0.01) * jnp.ones(3)
 
 
-def test_a_custom_disturbance_that_breaks_off_during_the_run_is_refused():
+def test_a_custom_disturbance_that_becomes_nan_during_the_run_is_refused():
     with pytest.raises(ScenarioError, match=r"class BreaksOff .* \[nan, nan, nan\] at t = 10\.02 s .* finite numbers"):
         bounds(disturbance={"kind": "own", "code": BreaksOff})
 
 
-def test_the_observers_gain_follows_body_and_period():
+def test_the_default_observer_gain_depends_on_inertia_and_period():
     def gain(**tables):
         (value,) = set(scenario.from_tables(tables).observer.gain)
         return value
@@ -189,27 +189,27 @@ def test_the_observers_gain_follows_body_and_period():
 
 
 def test_the_observer_gain_scales_with_the_inverse_of_t_f():
-    """Continuous loop: the paper's 10 / 12 1/s holds at t_f = 30 s, the chain's 10 1/s at t_f = 5 s."""
+    """In the continuous loop, l / J is 10 / 12 1/s at t_f = 30 s, and 10 1/s for a chain at t_f = 5 s."""
     body = scenario.from_tables({"controller": {"t_f": 120.0}})
     assert body.observer.gain == pytest.approx((2.5, 2.5, 2.5), rel=1e-12)
     chain = {"plant": {"kind": "chain"}, "observer": {"kind": "nonlinear"}, "controller": {"t_f": 20.0}}
     assert scenario.from_tables(chain).observer.gain == pytest.approx((2.5,), rel=1e-12)
 
 
-def test_bounds_that_are_given_stay():
+def test_stated_disturbance_bounds_are_kept():
     given = {"disturbance_rate_bound": 2e-3, "disturbance_bound": 0.0}
     assert bounds(controller=given) == (0.0, 2e-3)
 
 
-def test_what_is_not_said_follows_what_is_replaced():
-    """Bounds of gains follow the period, t_end t_f, bounds on the disturbance the disturbance; what is said stays."""
+def test_defaults_change_with_replaced_values_and_stated_values_do_not():
+    """Bounds of gains follow the period, t_end follows t_f, and disturbance bounds follow the disturbance."""
     said = scenario.from_tables({"loop": SAMPLED, "tune": {"bounds": {"eta": [2.1, 5.0]}}})
     slow = scenario.replace(said, loop__period=0.5, controller__t_f=36.0)
     assert slow.tune is not None
     assert slow.controller.delta == slow.tune.bounds["delta"][0] == 0.5
     assert slow.tune.bounds["eta"] == (2.1, 5.0)
-    assert slow.loop.t_end == 46.0  # one of the paper's cases, which end 10 s after t_f
-    assert scenario.replace(said, controller__t_f=45.0).loop.t_end == pytest.approx(60.0)  # another one: 4/3 t_f
+    assert slow.loop.t_end == 46.0  # a published case ends 10 s after t_f
+    assert scenario.replace(said, controller__t_f=45.0).loop.t_end == pytest.approx(60.0)  # otherwise 4/3 t_f
     assert scenario.replace(said, disturbance__amplitude=[0.02] * 3).controller.disturbance_bound == 0.02
     assert "observer_gain" not in free(scenario.replace(said, observer__kind="none"))
     assert scenario.replace(slow, loop__t_end=50.0, controller__t_f=30.0).loop.t_end == 50.0
@@ -217,7 +217,7 @@ def test_what_is_not_said_follows_what_is_replaced():
     assert scenario.from_tables(parsing.stated(slow)) == slow
 
 
-def test_gains_set_in_a_scenario_move_nothing_else():
+def test_setting_gains_in_a_scenario_changes_no_other_value():
     walk = {"kind": "random_walk", "density": [1e-5] * 3}
     said = scenario.from_tables({"loop": SAMPLED, "tune": {}, "disturbance": walk})
     tuned = gains.in_scenario(said, {"eta": 4.0, "observer_gain": 100.0})
@@ -236,7 +236,7 @@ QUIET = {"kind": "constant", "amplitude": [1e-6] * 3}
         ({"controller": {"disturbance_rate_bound": 9e-3}}, []),
         ({"controller": {"disturbance_rate_bound": 0.011}}, ["rate_bound is 0.011", "reaches 0.001: the law"]),
         ({"controller": {"disturbance_rate_bound": 9e-5}}, ["disturbance_rate_bound is 9e-05", "need not hold it"]),
-        ({"controller": {"disturbance_bound": 1.0}}, []),  # which an observer has no use for
+        ({"controller": {"disturbance_bound": 1.0}}, []),  # not used with an observer
         ({"controller": {"disturbance_bound": 1.0}, "observer": {"kind": "none"}}, ["bound is 1", "chatters"]),
         ({"controller": {"disturbance_rate_bound": 1e-3}, "disturbance": QUIET}, ["reaches 0: the law switches"]),
         *(
@@ -252,24 +252,24 @@ QUIET = {"kind": "constant", "amplitude": [1e-6] * 3}
     ],
     ids=str,
 )  # fmt: skip
-def test_what_is_odd_is_said(tables, said):
+def test_unusual_bounds_and_noisy_estimates_cause_a_warning(tables, said):
     found = cautions.of(scenario.from_tables(tables))
     assert len(found) == bool(said)
     assert all(words in found[0] for words in said)
 
 
 @pytest.mark.parametrize(("share", "said"), [(1.02, False), (0.98, True)])
-def test_an_estimate_is_noisy_where_its_noise_is_more_than_what_it_estimates(share, said):
+def test_an_estimate_with_more_noise_than_the_disturbance_causes_a_warning(share, said):
     observed = {**NOISY, "observer": {"gain": [0.07] * 3}}
     noise = cautions.estimate_noise(scenario.from_tables({**observed, "disturbance": {"kind": "none"}}))
     acting = {"kind": "constant", "amplitude": [share * noise, 0.0, 0.0]}
     tables = {**observed, "disturbance": acting}
-    assert cautions.estimate_noise(scenario.from_tables(tables)) == noise  # whatever acts
+    assert cautions.estimate_noise(scenario.from_tables(tables)) == noise  # for any disturbance
     assert any("look at a smaller gain" in one for one in cautions.of(scenario.from_tables(tables))) is said
 
 
-def test_the_noise_of_an_estimate_is_that_of_the_observer_itself():
-    """The digital observer on 40000 samples of noise alone: 3 axes, one of them 1 % off at most by chance (3 sigma)."""
+def test_the_predicted_noise_of_the_estimate_matches_the_observer():
+    """Run the digital observer on 40000 samples of noise. Chance changes an axis by at most 1 % (3 sigma)."""
     gain, h, sigma = [0.05, 0.2, 1.0], 0.1, 1e-4
     tables = {**NOISY, "observer": {"gain": gain}}
     observer = NonlinearObserver(rigid_body.spacecraft(CUBESAT), vector(gain), vector(0.0), vector(0.0))
@@ -286,24 +286,24 @@ def test_the_noise_of_an_estimate_is_that_of_the_observer_itself():
     )
 
 
-def test_how_far_beyond_a_bound_is_looked_at():
-    """A tenth of the interval, none where it is known what lies there, never beyond what is allowed."""
+def test_probe_values_beyond_a_bound_stay_in_the_allowed_range():
+    """The value is a tenth of the interval beyond the bound, or None if the reason of the bound is known."""
     said = scenario.from_tables({"loop": SAMPLED, "tune": {"bounds": {"eta": [2.05, 8.0], "delta": [0.1, 10.0]}}})
     assert free_gains.beyond(said, "eta", "upper") == pytest.approx(8.595)
     assert free_gains.beyond(said, "eta", "lower") == pytest.approx(2.025)  # half way to 2, which is not allowed
     assert free_gains.beyond(said, "delta", "upper") == pytest.approx(10.0 * 100.0**0.1, rel=1e-3)
-    assert free_gains.beyond(said, "delta", "lower") is None  # a period: there is none shorter
+    assert free_gains.beyond(said, "delta", "lower") is None  # one period, the shortest delta
     assert free_gains.beyond(said, "observer_gain", "upper") is None  # dead-beat
     law, observer = {"kind": "scaling", "disturbance_rate_bound": 0.123456}, {"kind": "finite_time"}
     other = scenario.from_tables({"controller": law, "observer": observer, "loop": SAMPLED, "tune": {}})
     assert other.search.bounds["m"][0] == 1.0
     assert other.search.bounds["observer_gain"][0] == 0.123456
-    for gain in ("m", "observer_gain"):  # the least that is allowed, itself
+    for gain in ("m", "observer_gain"):  # the bound is the smallest allowed value
         assert free_gains.beyond(other, gain, "lower") is None
 
 
-def test_the_disturbance_that_is_built_keeps_within_its_bounds():
-    """Along a whole run of the wobbly gravity gradient, which the bounds must hold for."""
+def test_a_built_disturbance_stays_within_its_bounds_over_a_run():
+    """The disturbance of a whole run with a gravity gradient stays within the bounds."""
     tables = {"disturbance": {"kind": "gravity_gradient", "orbit_rate": 1e-2}, "initial": {"rate": [0.05, 0.0, 0.02]}}
     said = scenario.from_tables(tables)
     known = disturbance_bounds.of(said)
@@ -316,7 +316,7 @@ def test_the_disturbance_that_is_built_keeps_within_its_bounds():
 
 
 class Vibration(Disturbance):
-    """What vibrates at a rate [rad/s]."""
+    """A vibration with an angular frequency [rad/s]."""
 
     rate: float = 1.0
 
@@ -325,13 +325,13 @@ class Vibration(Disturbance):
         return 0.01 * jnp.sin(self.rate * t) * jnp.ones(3)
 
     def fastest(self):
-        """Its rate [rad/s]."""
+        """Return the angular frequency [rad/s]."""
         return self.rate
 
 
 @pytest.mark.parametrize("rate", [1.0, 50.0, 50.0 * math.pi])
-def test_bounds_of_a_fast_disturbance_of_ones_own_are_what_it_reaches(rate):
-    """Of 25 Hz, in step with the points that were looked at, they were 8e-9 N m and 8e-7 N m/s."""
+def test_bounds_of_a_fast_custom_disturbance_are_not_aliased(rate):
+    """An earlier version aliased a disturbance of 25 Hz with its sample times and found bounds of nearly zero."""
     said = scenario.from_tables({"disturbance": {"kind": "own", "code": Vibration, "rate": rate}})
     known = disturbance_bounds.of(said)
     assert known is not None
@@ -339,7 +339,7 @@ def test_bounds_of_a_fast_disturbance_of_ones_own_are_what_it_reaches(rate):
 
 
 class Swell(Disturbance):
-    """What takes ten minutes, of a size and a phase that are drawn [N m, rad]."""
+    """A disturbance with a period of ten minutes, and random size [N m] and phase [rad]."""
 
     size: float = 0.01
     late: float = 0.0
@@ -353,13 +353,13 @@ class Swell(Disturbance):
 @pytest.mark.parametrize(
     ("drawn", "most"),
     [
-        ({}, math.sin(0.4)),  # as far as it comes in 40 s
+        ({}, math.sin(0.4)),  # the largest value within 40 s
         ({"disturbance_amplitude": {"kind": "relative_uniform", "half_width": 0.5}}, 1.5 * math.sin(0.4)),
         ({"disturbance_phase": {}}, 1.0),
         ({"disturbance_amplitude": {"kind": "relative_normal", "std": 0.1}, "disturbance_phase": {}}, 1.3),
     ],
 )
-def test_bounds_of_a_disturbance_of_ones_own_hold_what_is_drawn_of_it(drawn, most):
+def test_bounds_of_a_custom_disturbance_include_dispersions(drawn, most):
     dispersion = {"dispersion": drawn} if drawn else {}
     known = disturbance_bounds.of(scenario.from_tables({"disturbance": {"kind": "own", "code": Swell}, **dispersion}))
     assert known is not None
@@ -369,7 +369,7 @@ def test_bounds_of_a_disturbance_of_ones_own_hold_what_is_drawn_of_it(drawn, mos
 @pytest.mark.parametrize(
     ("drawn", "said"), [({"amplitude": "siz"}, "siz"), ({"sizes": "size"}, "sizes"), (("size",), "size")]
 )
-def test_a_disturbance_of_ones_own_that_draws_what_it_has_not_is_refused(drawn, said):
+def test_a_custom_disturbance_that_disperses_an_unknown_field_is_refused(drawn, said):
     wrong = type("Wrong", (Swell,), {"drawn": drawn, "__annotations__": {"drawn": ClassVar}})
     with pytest.raises(ScenarioError, match=rf"class Wrong whose drawn is .*{said}.*, but must name fields of it"):
         scenario.from_tables({"disturbance": {"kind": "own", "code": wrong}})
@@ -380,30 +380,30 @@ def test_a_disturbance_of_ones_own_that_draws_what_it_has_not_is_refused(drawn, 
     [
         ({"attitude_noise": 2e-5}, True),
         ({"attitude_noise": 2e-5, "torque_limit": 0.5}, True),
-        ({"attitude_noise": 2e-5, "rate_noise": 0.0}, False),  # said, and meant
+        ({"attitude_noise": 2e-5, "rate_noise": 0.0}, False),  # stated on purpose
         ({"attitude_noise": 2e-5, "rate_noise_density": 1e-6}, False),
         ({"attitude_noise": 2e-5, "rate_bias": 1e-6}, False),
         ({"attitude_noise": 0.0}, False),
         ({"torque_limit": 0.5}, False),
     ],
 )
-def test_a_star_tracker_without_a_gyro_is_said(hardware, said):
+def test_a_noisy_star_tracker_with_a_perfect_gyro_causes_a_warning(hardware, said):
     found = cautions.of(scenario.from_tables({"loop": {"mode": "sampled"}, "hardware": hardware}))
     assert [one for one in found if "hardware.attitude_noise is 2e-05" in one and "perfectly" in one] == found
     assert bool(found) == said
 
 
 @pytest.mark.parametrize(("delay", "said"), [(0, False), (59, False), (60, True), (599, True)])
-def test_a_delay_that_is_likely_a_time_is_said(delay, said):
-    """From a tenth of t_f = 30 s on, 60 periods of 0.05 s."""
+def test_a_delay_that_is_probably_in_seconds_causes_a_warning(delay, said):
+    """The warning begins at a tenth of t_f = 30 s, 60 periods of 0.05 s."""
     every = cautions.of(scenario.from_tables({"loop": {"mode": "sampled"}, "hardware": {"delay": delay}}))
-    found = [one for one in every if "surface_rate" not in one]  # which is too fast for so late a loop
+    found = [one for one in every if "surface_rate" not in one]  # the surface is too fast for this delay
     known = f"hardware.delay is {delay}, which are {delay * 0.05:g} s: it counts control periods, of 0.05 s each"
     assert found == [f"{known}, and no time"] * said
 
 
 @pytest.mark.parametrize(("noise", "said"), [(10.0, True), (0.1, True), (1e-2, False), ("10 arcsec", False)])
-def test_a_noise_that_no_star_tracker_has_is_said(noise, said):
+def test_an_implausible_star_tracker_noise_causes_a_warning(noise, said):
     tables = {"loop": {"mode": "sampled"}, "hardware": {"attitude_noise": noise, "rate_noise": 0.0}}
     found = [one for one in cautions.of(scenario.from_tables(tables)) if "another unit" in one]
     assert len(found) == said
@@ -420,7 +420,7 @@ SURFACE = {"t_f": 60.0, "surface_rate": 1.0}
         ({}, False),  # the default is designed for the period
         ({"controller": {"surface_rate": 0.39}}, False),
         ({"controller": {"surface_rate": 0.41}}, True),
-        ({"controller": {"surface_rate": 0.39}, "hardware": {"delay": 1}}, True),  # there c h must be below 1
+        ({"controller": {"surface_rate": 0.39}, "hardware": {"delay": 1}}, True),  # with this delay c h must be below 1
         ({"controller": {"surface_rate": 1.0, "sampling": "implicit"}}, False),
         ({"controller": {"kind": "pd"}}, False),
         ({"plant": {"kind": "chain", "order": 2}, "controller": {**SURFACE, "a": [0.1]}}, False),
@@ -428,8 +428,8 @@ SURFACE = {"t_f": 60.0, "surface_rate": 1.0}
     ],
     ids=str,
 )
-def test_a_surface_that_no_k1_holds_at_the_control_period_is_said(changes, said):
-    """Without delay it takes c h < 2, and of a chain of order 2 c a_1 h < 2, for any K1 to be small enough."""
+def test_a_surface_rate_without_a_stable_k1_causes_a_warning(changes, said):
+    """Without delay a stable K1 exists if c h < 2, and for a chain of order 2 if c a_1 h < 2."""
     law = {"t_f": 300.0, **changes.get("controller", {})}
     tables = {"loop": {"mode": "sampled", "period": 5.0}, "disturbance": QUIET, **changes, "controller": law}
     if "plant" in changes:

@@ -1,4 +1,4 @@
-"""The JSON Schema of scenario files against an independent validator."""
+"""Check the JSON Schema of scenario files with an independent validator."""
 
 import tomllib
 
@@ -19,7 +19,7 @@ def test_packaged_scenarios_are_valid(path):
     VALIDATOR.validate(tomllib.loads(path.read_text()))
 
 
-def test_every_key_is_known_and_no_other():
+def test_the_schema_has_every_key_and_no_other():
     for tables in COMPLETE:
         VALIDATOR.validate(tables)
         for path, _ in leaves(tables):

@@ -1,4 +1,4 @@
-"""Limits in an engineer's units, limits of zero, and the share of a limit that a verdict names."""
+"""Limits with units, limits of zero, and the ratio to the limit in a verdict."""
 
 import math
 
@@ -31,7 +31,7 @@ SAMPLED = {"mode": "sampled"}
         ("effort", 2, 2.0),
     ],
 )
-def test_a_limit_may_have_its_unit(metric, said, value):
+def test_a_limit_can_be_text_with_a_unit(metric, said, value):
     read = scenario.from_tables({"requirements": {metric: said}})
     assert read.requirements == {metric: pytest.approx(value, rel=1e-15)}
     share = scenario.from_tables({"requirements": {metric: {"limit": said, "quantile": 0.9}}}).requirements[metric]
@@ -40,7 +40,7 @@ def test_a_limit_may_have_its_unit(metric, said, value):
     assert scenario.from_tables(parsing.dump(read)) == read
 
 
-def test_every_unit_of_a_spacecrafts_metrics_has_words():
+def test_every_metric_unit_of_a_spacecraft_accepts_text():
     assert {entry.unit for entry in catalogues.CATALOGUE.values()} - {"-"} <= set(catalogues.UNITS)
 
 
@@ -57,7 +57,7 @@ def test_every_unit_of_a_spacecrafts_metrics_has_words():
         ("disturbance", "amplitude", ("1 mN m", 0.0, "20 uN m"), (1e-3, 0.0, 2e-5)),
     ],
 )
-def test_a_number_may_have_its_unit(table, key, said, value):
+def test_a_number_can_be_text_with_a_unit(table, key, said, value):
     kind = {"kind": "sinusoid"} if table == "disturbance" else {}
     read = scenario.from_tables(
         {"loop": SAMPLED, table: {**({"mode": "sampled"} if table == "loop" else kind), key: said}}
@@ -69,12 +69,12 @@ def test_a_number_may_have_its_unit(table, key, said, value):
 
 
 @pytest.mark.parametrize(("kind", "key"), [("normal", "std"), ("uniform", "half_width")])
-def test_the_spread_of_the_disturbance_may_have_a_unit_of_torque(kind, key):
+def test_the_spread_of_the_disturbance_can_have_a_torque_unit(kind, key):
     read = scenario.from_tables({"dispersion": {"disturbance_bias": {"kind": kind, key: "2 mN m"}}})
     assert getattr(read.dispersion.disturbance_bias, key) == 2e-3
 
 
-def test_a_limit_of_zero_is_kept_by_zero_alone():
+def test_only_zero_meets_a_limit_of_zero():
     tables = {"plant": {"kind": "chain"}, "requirements": {"saturated": 0}, "loop": SAMPLED}
     ready = scenario.study(scenario.from_tables(tables))
     (requirement,) = ready.requirements
@@ -86,11 +86,11 @@ def test_a_limit_of_zero_is_kept_by_zero_alone():
     np.testing.assert_array_equal(over(np.array([0.0, 0.2]), 0.0, at_least=False), [0.0, 1.2])
     trials = objective.problem(ready.parts, ready.dispersion, 0, np.arange(2), ("eta",), ready.requirements)
     c = np.asarray(jax.jit(objective.measure)(trials, vector([3.0]))[1])
-    np.testing.assert_array_equal(c, [[-1.0, -1.0]])  # no limit of the actuators: nothing saturates
+    np.testing.assert_array_equal(c, [[-1.0, -1.0]])  # without a torque limit nothing saturates
 
 
 def test_report_states_the_deciding_value_relative_to_the_limit():
-    """For a fraction of the trials this is not the worst one: of 0.3, 0.4, 0.45 and 0.7 the third."""
+    """For a fraction of the trials the deciding value is not the largest one, here the third of four values."""
     values = np.array([0.3, 0.4, 0.45, 0.7])
 
     def told(quantile):

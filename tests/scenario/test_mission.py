@@ -60,7 +60,7 @@ MISSIONS = {
 
 
 def numbers_of(tables):
-    """Defaults with a unit, by table and key."""
+    """Return the defaults with a unit, by table and key."""
     dumped = parsing.dump(scenario.from_tables({**tables, "tune": {}}))
     found = {}
     for place, units in UNITS.items():
@@ -72,14 +72,14 @@ def numbers_of(tables):
 
 
 def of_body(tables, inertia, t_f):
-    """The scenario's tables for a body of this mean inertia [kg m^2] and this t_f [s]."""
+    """Return the tables of a scenario for a body of this mean inertia [kg m^2] and this t_f [s]."""
     body = {"inertia": [0.5 * inertia, inertia, 1.5 * inertia]}
     return {**tables, "spacecraft": body, "controller": {**tables.get("controller", {}), "t_f": t_f}}
 
 
 @pytest.mark.parametrize("name", MISSIONS)
 def test_defaults_scale_with_the_units_of_the_mission(name):
-    """A body of a thousandth of the inertia in eight times the time gets the same defaults in other units."""
+    """A body with a thousandth of the inertia and eight times the t_f gets the same defaults in other units."""
     inertia, time = 1e-3, 8.0
     one, other = (
         numbers_of(of_body(MISSIONS[name], 20.0 * by, 50.0 * slower)) for by, slower in ((1.0, 1.0), (inertia, time))
@@ -93,7 +93,7 @@ def test_defaults_scale_with_the_units_of_the_mission(name):
 
 @pytest.mark.parametrize("order", [2, 3])
 def test_defaults_of_a_chain_scale_with_t_f(order):
-    """The unit of d is that of x_1 over s^order; that of s is x_1 over s^(order - 1)."""
+    """The unit of d is the unit of x_1 over s^order, and the unit of s is the unit of x_1 over s^(order - 1)."""
     units = {"loop": {"period": 1, "t_end": 1, "window": 1},
              "controller": {"delta": 1, "layer_time": 1, "k1": -1, "surface_rate": -1, "sign_width": 1 - order,
                             "disturbance_bound": -order, "disturbance_rate_bound": -order - 1},
@@ -121,7 +121,7 @@ def test_defaults_of_a_chain_scale_with_t_f(order):
     ],
     ids=str,
 )
-def test_the_papers_cases_keep_the_published_numbers(changes, published):
+def test_published_cases_keep_the_published_numbers(changes, published):
     law = scenario.from_tables({**SAMPLED, **changes}).controller
     assert mission.published(scenario.from_tables(changes)) == published
     found = (law.eta, law.delta, law.k1, law.surface_rate, law.sign_width)
@@ -162,7 +162,7 @@ def test_the_default_settling_angle_follows_the_start_and_the_noise(tables, angl
     assert scenario.from_tables(tables).loop.settling_angle == pytest.approx(angle, rel=1e-9)
 
 
-def test_another_time_or_body_scales_the_published_numbers():
+def test_other_times_and_bodies_scale_the_published_numbers():
     slow = scenario.from_tables({"controller": {"t_f": 60.0}})
     assert (slow.controller.delta, slow.controller.k1, slow.disturbance.frequency) == (0.1, 0.5, (0.05,) * 3)
     assert slow.disturbance.amplitude == (0.0025,) * 3
@@ -179,17 +179,18 @@ def sampled(**tables: Any) -> Any:
 
 
 def test_dead_time_limits_the_bandwidth():
-    """Without noise p T = 0.25, T of hold, delay and lag together."""
+    """Without noise p T = 0.25, where T is the sum of hold, delay and lag."""
     for hardware, dead in (({}, 0.125), ({"delay": 2}, 0.625), ({"delay": 1, "torque_lag": 0.3}, 0.675)):
         said = sampled(hardware=hardware) if hardware else sampled()
         assert mission.dead_time(said) == pytest.approx(dead)
         assert mission.design(said).pole == pytest.approx(0.25 / dead)
 
 
-def test_both_poles_of_the_design_keep_the_margins_that_it_promises():
-    """In continuous time, with the dead time as e^(-sT), T = 1, and the observer of the rate l / J = r.
+def test_the_designed_loop_has_the_documented_stability_margins():
+    """The loop is in continuous time, with the dead time e^(-sT), T = 1, and an observer with the rate l / J = r.
 
-    L = (1 + r / s) (2 p s + p^2) e^(-sT) / s^2 + r e^(-sT) / s, since the estimate is r / s of the unexplained torque.
+    L = (1 + r / s) (2 p s + p^2) e^(-sT) / s^2 + r e^(-sT) / s, since the estimate is r / s times the unexplained
+    torque.
     """
     p, r = mission.STABLE, mission.OBSERVER * mission.STABLE
     w = np.geomspace(1e-3, 30.0, 200_001)
@@ -203,7 +204,7 @@ def test_both_poles_of_the_design_keep_the_margins_that_it_promises():
 
 
 def test_noise_and_the_torque_limit_limit_the_bandwidth():
-    """Five sigma of the torque noise, J (2 p + l / J) sigma_w with l = J p / 2, take half of the limit."""
+    """Five sigma of the torque noise J (2 p + l / J) sigma_w, with l = J p / 2, are half of the limit."""
     limit, sigma = 0.1, 1e-4
     said = sampled(hardware={"rate_noise": sigma, "torque_limit": limit})
     pole = mission.design(said).pole
@@ -220,8 +221,8 @@ def test_late_modes_limit_the_bandwidth_and_early_ones_do_not():
     assert mission.design(late).pole == pytest.approx(0.5 * 0.002 * free / (fraction / (1.0 - fraction)))
 
 
-def test_a_weak_actuator_asks_for_a_smaller_eta():
-    """From rest the first torque is 2 eta^2 J tan(angle / 2) / t_f^2; 2.4 is the least."""
+def test_a_weak_actuator_reduces_eta():
+    """From rest the first torque is 2 eta^2 J tan(angle / 2) / t_f^2. The smallest default of eta is 2.4."""
     start = {"dispersion": {"attitude": {"kind": "axis_angle", "min_deg": 60.0, "max_deg": 60.0}}}
     needed = 2.0 * 60.0 * math.tan(math.radians(30.0)) / 100.0**2
     weak = sampled(**start, hardware={"torque_limit": 7.0 * needed})
@@ -231,7 +232,7 @@ def test_a_weak_actuator_asks_for_a_smaller_eta():
 
 
 def test_designs_are_starting_points_within_the_bounds_or_near():
-    """Each has gains for the whole law, delta between a period and t_f."""
+    """Each design has all gains of the law, with delta between a control period and t_f."""
     said = scenario.replace(sampled(), tune={})
     designs = mission.designs(said)
     assert len(designs) > 5

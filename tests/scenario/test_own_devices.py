@@ -1,4 +1,4 @@
-"""Sensors and draws of one's own: beside the built-in ones, a loop by hand, and what is wrong with them."""
+"""Custom sensors and dispersions: comparison with built-in parts and a loop computed by hand, and error messages."""
 
 import dataclasses
 
@@ -83,7 +83,7 @@ DRIFT = {"own": {"kind": "own", "code": "mine.py:Drift"}}
 
 @pytest.fixture(autouse=True)
 def here(tmp_path, monkeypatch):
-    """An empty folder with the parts in mine.py, and a process that has run nothing yet."""
+    """An empty folder with the parts in mine.py; no custom file counts as run yet."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(systems, "_ran", {})
     (tmp_path / "mine.py").write_text(FILE)
@@ -94,8 +94,8 @@ def parts_of(**tables):
     return scenario.study(scenario.from_tables({**CHAIN, **tables})).parts
 
 
-def test_sensors_do_what_they_say_with_noise_of_the_trial():
-    """u = -2 x_1 - 2 x_2 of what is seen: x_1 of the sample before, and the noise of (seed, trial, sample)."""
+def test_custom_sensors_match_a_loop_computed_by_hand():
+    """u = -2 x_1 - 2 x_2 with measured states: x_1 of the previous sample, and the noise of (seed, trial, sample)."""
     parts = parts_of(sensors={**NOISY, "sigma": [0.02, 0.03]}, disturbance={"kind": "none"})
     log = rollout.simulate_parts(parts, 3, 7, record=True).log
     kept = np.asarray(log.has_length)
@@ -105,7 +105,7 @@ def test_sensors_do_what_they_say_with_noise_of_the_trial():
     key = draws.stream(np.uint32(3), np.uint32(7), OWN_NOISE)
     noise = np.asarray(jax.jit(jax.vmap(lambda k: draws.normals(key, 2, k)))(sample[1:]))
     seen = x[1:-1] + np.array([0.02, 0.03]) * noise
-    wanted = -2.0 * seen[:-1, 0] - 2.0 * seen[1:, 1]  # its first one lies a sample back
+    wanted = -2.0 * seen[:-1, 0] - 2.0 * seen[1:, 1]  # x_1 is one sample late
     np.testing.assert_allclose(u[2:-1, 0], wanted, rtol=0.0, atol=1e-13)
     other = rollout.simulate_parts(parts, 3, 8)
     assert float(other.metrics.window_error) != float(rollout.simulate_parts(parts, 3, 7).metrics.window_error)
@@ -113,8 +113,8 @@ def test_sensors_do_what_they_say_with_noise_of_the_trial():
     assert t.size > 60
 
 
-def test_a_period_without_a_length_leaves_their_memory():
-    """Clocks have such periods; what is seen in them is not flown with."""
+def test_a_period_of_length_zero_does_not_change_the_sensor_memory():
+    """Clocks contain periods of length zero. Measurements in them are not used."""
     own = parts_of(sensors=NOISY, disturbance={"kind": "none"}).sensors
     now = Ticks(*(jnp.asarray(v) for v in (0.5, 0.5, False, 3, 1.0, False)))
     _, (_, _, kept) = own.measure(own.begin(3, 7, vector([1.0, 2.0]), now), vector([5.0, 6.0]), now, vector(0.1))
@@ -125,7 +125,7 @@ def test_a_period_without_a_length_leaves_their_memory():
     assert abs(float(new[0]) - 5.0) < 0.1
 
 
-def test_a_sensor_that_sees_the_state_flies_as_none_does():
+def test_a_perfect_custom_sensor_gives_the_run_without_sensors():
     class Clear(ptsmc.SampledSensor):
         def see(self, memory, x, noise, t, dt):
             return x, memory
@@ -136,8 +136,8 @@ def test_a_sensor_that_sees_the_state_flies_as_none_does():
         np.testing.assert_allclose(one, other, rtol=1e-12)  # two programs
 
 
-def test_a_spacecrafts_sensors_see_attitude_and_rate(command, here):
-    """One that turns what is seen by a bias brings the body to rest that far from the reference; every row is known."""
+def test_custom_sensors_of_a_spacecraft_measure_attitude_and_rate(command, here):
+    """A sensor with an attitude bias brings the body to rest with this error, and every row is predicted."""
     (here / "mine.py").write_text(
         "import jax.numpy as jnp\nimport ptsmc_jax as ptsmc\nfrom ptsmc_jax.numerics import attitude\n\n"
         "class Tilted(ptsmc.SampledSensor):\n    turn: float = 2e-3\n\n"
@@ -151,7 +151,7 @@ def test_a_spacecrafts_sensors_see_attitude_and_rate(command, here):
     (here / "s.toml").write_text(text)
     run = explore.simulate(scenario.read("s.toml"))
     turned = np.asarray(run.run.log.x.q)[-1]
-    np.testing.assert_allclose(2.0 * np.linalg.norm(turned[:3]), 2e-3, rtol=0.05)  # what the observer lags by is left
+    np.testing.assert_allclose(2.0 * np.linalg.norm(turned[:3]), 2e-3, rtol=0.05)  # the rest is the observer's lag
     assert run.run.floor is None
     status, _, error = command("simulate", "s.toml", "--no-figures", "--quiet")
     assert (status, error) == (0, f"ptsmc: runs {here}/mine.py, which sensors.code of s.toml names\n")
@@ -162,7 +162,7 @@ def test_a_spacecrafts_sensors_see_attitude_and_rate(command, here):
     assert "(sensors.code), which this command would run" in again[2]
 
 
-def test_a_late_star_tracker_says_where_the_body_was_and_the_gyro_how_it_turns_now():
+def test_a_late_star_tracker_delays_the_attitude_and_not_the_rate():
     sensor, rng = LateStarTracker(model=None), np.random.default_rng(1)
     q = rng.normal(size=(8, 4))
     q /= np.linalg.norm(q, axis=1)[:, None]
@@ -176,8 +176,8 @@ def test_a_late_star_tracker_says_where_the_body_was_and_the_gyro_how_it_turns_n
 
 
 @pytest.mark.long
-def test_a_delay_of_the_whole_loop_leaves_less_than_a_late_star_tracker():
-    """At most what is left with neither, at least what is left where the gyro is late as well."""
+def test_margins_with_a_late_star_tracker_lie_between_no_delay_and_full_delay():
+    """Margins are smaller than without delay, and larger than with an equally late gyro."""
     flight = scenario.replace(
         scenario.read(FIRST_FLIGHT), tune=None, requirements=None, controller__delta=1.0, observer__gain=[5.0] * 3
     )
@@ -191,7 +191,7 @@ def test_a_delay_of_the_whole_loop_leaves_less_than_a_late_star_tracker():
         assert least < own_delay < most
 
 
-def test_draws_of_ones_own_change_the_parts_and_stand_in_the_rows(command, here):
+def test_custom_dispersions_change_the_parts_and_appear_in_the_rows(command, here):
     tables = {**CHAIN, "disturbance": {"kind": "sinusoid", "amplitude": [0.05]}, "dispersion": DRIFT}
     ready = scenario.study(scenario.from_tables(tables))
     assert ready.dispersion.varies
@@ -203,7 +203,7 @@ def test_draws_of_ones_own_change_the_parts_and_stand_in_the_rows(command, here)
     rows = ptsmc.trials(scenario.from_tables(tables), 40, seed=2)
     assert rows["drift"].n_unique() == 40
     np.testing.assert_allclose(rows["drift"][5], 1.0 + 0.1 * float(c[0]), rtol=1e-12)
-    plan = rows[3:9].select("trial", "drift", "window_error")  # rows are a plan: `trial` says the draws
+    plan = rows[3:9].select("trial", "drift", "window_error")  # a run table: `trial` selects the draws
     again = ptsmc.trials(scenario.from_tables(tables), plan, seed=2)
     np.testing.assert_array_equal(again["drift"], rows["drift"][3:9])
     text = "\n".join([
@@ -219,7 +219,7 @@ def test_draws_of_ones_own_change_the_parts_and_stand_in_the_rows(command, here)
     np.testing.assert_allclose(kept["drift"][5], 1.0 + 0.2 * float(c[0]), rtol=1e-12)
 
 
-def test_keys_of_both_are_read_written_and_known_as_programs(command, here):
+def test_keys_of_custom_sensors_and_dispersions_are_read_and_written(command, here):
     loaded = scenario.from_tables({**CHAIN, "sensors": {**NOISY, "sigma": [1.0, 2.0]}, "dispersion": DRIFT})
     assert own.waits(loaded)
     assert set(own.programs(loaded)) == {"sensors.code", "dispersion.own.code"}
@@ -260,8 +260,8 @@ DRAWS = [
     ("0.01 * c[1]", "1 / 0 * c[1]", "at fails: ZeroDivisionError"),
     ('{"drift": 1.0', '{" ": 1.0', "returns a number ' ' at t = 0, but must return names that can be printed"),
     ('{"drift": 1.0', '{"status": 1.0', "names that no column of the rows has"),
-    ('{"drift": 1.0', '{"plan_trial": 1.0', "names that no column of the rows has"),  # took that column's place
-    ('{"drift": 1.0 + self.std * c[0]}', '{"drift": c[0] > 0.0}', "a number drift True"),  # a summary had no rank of it
+    ('{"drift": 1.0', '{"plan_trial": 1.0', "names that no column of the rows has"),  # would replace this column
+    ('{"drift": 1.0 + self.std * c[0]}', '{"drift": c[0] > 0.0}', "a number drift True"),  # a summary cannot rank it
     ('{"drift": 1.0 + self.std * c[0]}', "[c[0]]", "must return a dict of numbers by name"),
     ('{"drift": 1.0 + self.std * c[0]}', '{"drift": 1 / 0}', "values fails: ZeroDivisionError"),
     ("count = 2", "count = 0", "count is 0, but must be a whole number of at least 1"),
@@ -270,7 +270,7 @@ DRAWS = [
 
 
 @pytest.mark.parametrize(("old", "new", "said"), SEES + DRAWS, ids=[row[2][:30] for row in SEES + DRAWS])
-def test_what_is_wrong_with_them_is_one_sentence(here, old, new, said):
+def test_errors_in_custom_sensors_and_dispersions_are_one_sentence(here, old, new, said):
     assert old in FILE
     (here / "mine.py").write_text(FILE.replace(old, new))
     which = {"sensors": NOISY} if (old, new, said) in SEES else {"dispersion": DRIFT}
@@ -289,22 +289,22 @@ def test_what_is_wrong_with_them_is_one_sentence(here, old, new, said):
         ({"loop": {"mode": "continuous"}, "controller": {"t_f": 5.0}}, "[sensors] needs the sampled loop"),
     ],
 )
-def test_sensors_of_ones_own_are_all_that_there_are(tables, said):
+def test_custom_sensors_exclude_built_in_sensors_and_filters(tables, said):
     with pytest.raises(ScenarioError) as caught:
         scenario.from_tables({**CHAIN, "sensors": NOISY, **tables})
     assert said in str(caught.value)
     flight = {"loop": {"mode": "sampled"}, "sensors": NOISY}
     with pytest.raises(ScenarioError, match=r"filter\.kind"):
-        scenario.from_tables({**flight, "filter": {}})  # was asked for its bandwidth
+        scenario.from_tables({**flight, "filter": {}})  # earlier: an error about its bandwidth
     for key in ("attitude_noise", "rate_noise", "star_tracker_misalignment", "gyro_scale", "star_tracker_outage"):
         with pytest.raises(
             ScenarioError, match=rf"^dispersion\.{key} is drawn of what \[hardware\] says, but \[sensors\]"
         ):
-            scenario.from_tables({**flight, "dispersion": {key: {}}})  # was asked for a noise that must be absent
+            scenario.from_tables({**flight, "dispersion": {key: {}}})  # not an error about noise
     assert dataclasses.is_dataclass(ptsmc.SampledSensor)
 
 
-def test_gains_of_sensors_of_ones_own_are_tuned_and_stand_in_the_file():
+def test_gains_of_custom_sensors_are_tuned_and_written():
     tables = {**CHAIN, "sensors": {"kind": "own", "code": "mine.py:Smoothed"}, "tune": {}}
     loaded = reading.complete(scenario.from_tables(tables))
     assert loaded.tune is not None

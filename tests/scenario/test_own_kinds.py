@@ -1,4 +1,4 @@
-"""Laws, observers, disturbances and references of one's own: keys and gains of their classes, flown like the others."""
+"""Custom laws, observers, disturbances and references: keys and gains of their classes, and runs with them."""
 
 import dataclasses
 import pickle
@@ -43,7 +43,7 @@ class Mine(ptsmc.AccelerationLaw):
 SAMPLED = {"mode": "sampled", "period": 0.1, "t_end": 6.5}
 CHAIN = {"plant": {"kind": "chain", "order": 2, "x0": [1.0, 0.0]}, "loop": SAMPLED}
 MINE = {"kind": "own", "code": "mine.py:Mine", "t_f": 5.0}
-# the law above in place of the paper's, without the keys that only the paper's law has
+# the law above instead of the published law, without the keys that only the published law has
 SHORT_OWN = SHORT.replace("[controller]\n", '[controller]\nkind = "own"\ncode = "mine.py:Mine"\n').replace(
     "surface_rate = 1.0\nsign_width = 1e-3\n", ""
 )
@@ -51,7 +51,7 @@ SHORT_OWN = SHORT.replace("[controller]\n", '[controller]\nkind = "own"\ncode = 
 
 @pytest.fixture(autouse=True)
 def here(tmp_path, monkeypatch):
-    """An empty folder with the law in mine.py, and a process that has run nothing yet."""
+    """An empty folder with the law in mine.py; no custom file counts as run yet."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(systems, "_ran", {})
     (tmp_path / "mine.py").write_text(HEAD + LAW)
@@ -59,7 +59,7 @@ def here(tmp_path, monkeypatch):
 
 
 def made(file, name) -> Any:
-    """What stands in a file of ours."""
+    """Load an object from a file of the test."""
     return systems.item(f"{file}:{name}", systems.WHERE)
 
 
@@ -68,7 +68,7 @@ def flown(tables, record=True):
 
 
 @pytest.mark.parametrize("plant", short(["chain", "spacecraft"], ["chain"]))
-def test_the_papers_law_as_ones_own_flies_like_the_built_in(plant):
+def test_the_published_law_as_a_custom_law_gives_the_same_run(plant):
     tables = tomllib.loads(SHORT if plant == "spacecraft" else SHORT_CHAIN)
     del tables["tune"]
     if plant == "chain":
@@ -77,13 +77,13 @@ def test_the_papers_law_as_ones_own_flies_like_the_built_in(plant):
     both = []
     for law in (MINE | error | {"k1": 1.5}, {"kind": "prescribed_time", "t_f": 5.0, "k1": rate}):
         both.append(flown({**tables, "controller": {**law, "eta": 2.7, "delta": 0.5}}))
-    # bit for bit with the command's own settings; here two programs may fuse differently, which the gains amplify
+    # equal to the last bit with the settings of `ptsmc`; here two programs may fuse differently, and gains amplify it
     for mine, builtin in zip(*map(jax.tree.leaves, both), strict=True):
         np.testing.assert_allclose(mine, builtin, rtol=1e-9, atol=1e-10)
 
 
-def test_a_part_of_ones_own_may_say_itself_that_it_is_a_pytree(here):
-    """As a class that is used from Python does."""
+def test_a_custom_part_can_be_registered_as_a_pytree_already(here):
+    """Classes that are used from Python can be registered by the user."""
     (here / "said.py").write_text(
         "from dataclasses import dataclass\nfrom ptsmc_jax.numerics.pytrees import pytree\n"
         + HEAD
@@ -95,7 +95,7 @@ def test_a_part_of_ones_own_may_say_itself_that_it_is_a_pytree(here):
     assert one.metrics.effort == other.metrics.effort > 0.0
 
 
-def test_reading_runs_nothing_and_completing_finds_keys_gains_and_bounds():
+def test_reading_runs_no_code_and_completing_finds_keys_gains_and_bounds():
     (systems.Path("mine.py")).write_text(HEAD + "raise RuntimeError('was run')\n" + LAW)
     tables = {**CHAIN, "controller": {**MINE, "k1": 2}, "tune": {"trials": 8}}
     loaded = scenario.from_tables(tables)
@@ -118,19 +118,19 @@ def test_reading_runs_nothing_and_completing_finds_keys_gains_and_bounds():
     assert reading.complete(scenario.from_tables(parsing.dump(whole))) == whole
 
 
-def test_a_number_has_a_unit_and_a_gain_the_bounds_of_built_in_ones(here):
+def test_custom_numbers_have_units_and_custom_gains_have_bounds(here):
     declared = LAW.replace("width: float = 1e-3", 'width: float = ptsmc.number(1e-3, above=0.0, unit="s", meaning="w")')
     declared = declared.replace("(2.1, 6.0), above=2.0", '"eta", above=2.0')
     (here / "mine.py").write_text(HEAD + declared)
     tables = {**CHAIN, "controller": {**MINE, "width": "2 ms"}, "tune": {"free": ["eta"]}}
     found = reading.complete(scenario.from_tables(tables))
     assert found.controller.width == 2e-3
-    assert found.search.bounds["eta"] == (2.05, 8.0)  # as the paper's law has them for order 2
+    assert found.search.bounds["eta"] == (2.05, 8.0)  # the bounds of the built-in law for order 2
     with pytest.raises(ScenarioError, match=r"controller\.width is 0\.0, but must be a number greater than 0"):
         reading.complete(scenario.from_tables({**tables, "controller": {**MINE, "width": 0.0}}))
 
 
-def test_a_scenario_with_code_of_ones_own_is_pickled_run_or_not(here):
+def test_a_scenario_with_custom_code_can_be_pickled_before_and_after_the_code_runs(here):
     (here / "mine.toml").write_text('controller = { kind = "own", code = "mine.py:Mine" }\nloop.mode = "sampled"\n')
     waits = ptsmc.read("mine.toml")
     for read in (waits, reading.complete(waits)):
@@ -139,7 +139,7 @@ def test_a_scenario_with_code_of_ones_own_is_pickled_run_or_not(here):
         assert own.waits(again) == own.waits(read)
 
 
-def test_gains_of_ones_own_are_set_in_parts_and_in_the_scenario():
+def test_custom_gains_can_be_set_in_parts_and_in_the_scenario():
     file = ROOT / "scenarios" / "own_parts.py"
     tables = {
         **CHAIN,
@@ -174,7 +174,7 @@ class Signed(ptsmc.AccelerationLaw):
 
 
 @pytest.mark.parametrize(("own", "bounds"), [(0.5, (-1.0, 1.0)), (-3.0, (-4.0, 1.0)), (2.0, (-1.0, 7.0))])
-def test_bounds_of_a_gain_of_any_sign_hold_the_scenarios_own(here, own, bounds):
+def test_default_bounds_of_a_gain_of_any_sign_contain_its_value(here, own, bounds):
     (here / "signed.py").write_text(HEAD + SIGNED)
     law = {"kind": "own", "code": "signed.py:Signed", "t_f": 5.0, "lead": own}
     whole = reading.complete(scenario.from_tables({**CHAIN, "controller": law, "tune": {}}))
@@ -242,8 +242,8 @@ class Turning(ptsmc.Reference):
 
 
 @pytest.mark.parametrize("what", ["amplitude", "phase"])
-def test_a_number_of_a_disturbance_of_ones_own_is_drawn_only_where_its_class_says_so(here, what):
-    """A key of that name alone is any number."""
+def test_only_declared_numbers_of_a_custom_disturbance_are_dispersed(here, what):
+    """A key with the name phase or amplitude alone does not suffice."""
     how = {"amplitude": "relative_normal", "phase": "uniform"}[what]
     tables = {
         **CHAIN,
@@ -262,16 +262,16 @@ def test_a_number_of_a_disturbance_of_ones_own_is_drawn_only_where_its_class_say
 
 
 @pytest.mark.parametrize("beside", ["none", "random_walk"])
-def test_a_disturbance_is_looked_at_beside_one_that_is_no_signal(here, beside):
-    """The sum of the two is then the disturbance itself."""
+def test_a_custom_disturbance_is_checked_beside_terms_without_a_signal(here, beside):
+    """The sum of both is then the custom disturbance itself."""
     (here / "other.py").write_text(HEAD + OTHER)
     terms = [{"kind": "own", "code": "other.py:Wave"}, {"kind": beside}]
     ready = scenario.study(scenario.from_tables({**CHAIN, "disturbance": {"kind": "sum", "terms": terms}}))
     assert type(ready.parts.disturbance).__name__ == "Wave"
 
 
-def test_a_disturbance_and_an_observer_do_what_they_say(here):
-    """The built-in sum of two sinusoids flies alike; the observer's memory is what a loop by hand makes of the log."""
+def test_a_custom_disturbance_and_observer_match_built_in_parts_and_a_loop_by_hand(here):
+    """The built-in sum of two sinusoids gives the same run, and a loop by hand gives the observer's memory."""
     (here / "other.py").write_text(HEAD + OTHER)
     law = {"kind": "pd", "k_p": 2.0, "k_d": 2.0, "t_f": 5.0}
     own_one = {**CHAIN, "controller": law, "disturbance": {"kind": "own", "code": "other.py:Wave", "size": 0.03}}
@@ -280,7 +280,7 @@ def test_a_disturbance_and_an_observer_do_what_they_say(here):
     one, other = (flown(tables) for tables in (own_one, known))
     np.testing.assert_allclose(one.log.x, other.log.x, rtol=0, atol=1e-14)
     steps = [scenario.study(scenario.from_tables(tables)).parts.substeps for tables in (own_one, known)]
-    assert steps[0] == steps[1]  # `fastest` sets the pace as the keys of the built-in one do
+    assert steps[0] == steps[1]  # `fastest` sets the steps like the keys of the built-in sum
 
     watched = flown({**own_one, "observer": {"kind": "own", "code": "other.py:Filtered", "share": 0.7}})
     kept = np.asarray(watched.log.has_length)
@@ -290,8 +290,8 @@ def test_a_disturbance_and_an_observer_do_what_they_say(here):
     np.testing.assert_allclose(np.asarray(watched.log.d_hat)[kept][2:-1, 0], wanted[:-1], atol=1e-12)
 
 
-def test_a_disturbance_that_depends_on_a_reference_of_ones_own_is_bounded_once_that_is_run(here):
-    """Reading runs nothing, so how the reference turns is not known then; the disturbance may be there already."""
+def test_bounds_that_depend_on_a_custom_reference_are_known_after_its_code_has_run(here):
+    """Reading a scenario runs no code, so the rate of the reference is unknown until then."""
     (here / "other.py").write_text(HEAD + OTHER)
     shared = {"loop": SAMPLED, "controller": {"t_f": 5.0}}
     waiting = {**shared, "reference": {"kind": "own", "code": "other.py:Turning", "rate": 0.03}}
@@ -300,14 +300,14 @@ def test_a_disturbance_that_depends_on_a_reference_of_ones_own_is_bounded_once_t
     for acting in ({"kind": "gravity_gradient", "orbit_rate": 1e-2}, there):
         loaded = scenario.from_tables({**waiting, "disturbance": acting})
         assert loaded.controller.disturbance_rate_bound is None
-        # what `fastest` says of the reference, nothing, is not asked of one that turns steadily
+        # `fastest` of the reference returns nothing; a steady rotation does not need it
         known = reading.complete(scenario.from_tables({**spin, "disturbance": acting})).controller
         found = reading.complete(loaded).controller
         assert found.disturbance_bound == known.disturbance_bound > 0.0
         assert 0.0 <= found.disturbance_rate_bound <= known.disturbance_rate_bound
 
 
-def test_a_reference_of_ones_own_has_exact_rates(here):
+def test_a_custom_reference_has_exact_rates(here):
     (here / "other.py").write_text(HEAD + OTHER)
     start = {"rotvec_deg": [10.0, 20.0, -30.0]}
     tables = {"loop": {**SAMPLED}, "controller": {"kind": "pd", "t_f": 5.0}}
@@ -327,7 +327,7 @@ REMEMBERS = LAW.replace(
 
 
 def changed(old, new):
-    """The law with a mistake in it."""
+    """Return the code of the law with an error in it."""
     assert old in LAW
     return LAW.replace(old, new)
 
@@ -348,11 +348,11 @@ BAD = [
         "acceleration returns an array of shape (1,)", "an acceleration, a sliding variable",
     ),
     (changed("return 0.5 * wanted, s", "0.5 * wanted, s"), {}, "acceleration returns nothing", "a sliding variable"),
-    (  # it flew as 0 and 1, and margins ended in a traceback
+    (  # an earlier version ran it as 0 and 1, and margins ended in a traceback
         changed("return 0.5 * wanted, s", "return 0.5 * wanted, s > 0.0"), {},
         "acceleration returns a sliding variable [", "must return finite numbers, real ones",
     ),
-    (  # it was MineOnErrorOfChain
+    (  # an earlier error named the class MineOnErrorOfChain
         changed("return 0.5 * wanted", "return self.width_ * wanted"), {},
         "acceleration fails: AttributeError: 'Mine' object has no attribute 'width_'", "line 19 of mine.py",
     ),
@@ -379,7 +379,7 @@ BAD = [
         changed("(2.1, 6.0)", "(6.0, 2.1)"), {"tune": {}},
         "the usual bounds of the gain eta of the class Mine are [6, 2.1]", "lower one first",
     ),
-    (  # they were told as tune.bounds.eta, which nobody had written
+    (  # an earlier error named tune.bounds.eta, which is not in the file
         changed("(2.1, 6.0)", "(2.0, 6.0)"), {"tune": {}},
         "the usual bounds of the gain eta of the class Mine are [2, 6]",
         "two numbers greater than 2, the lower one first",
@@ -418,7 +418,7 @@ BAD = [
 @pytest.mark.parametrize(
     ("law", "keys", "of_what", "allowed"), BAD, ids=[f"{k} {row[2][:40]}" for k, row in enumerate(BAD)]
 )
-def test_what_is_wrong_with_ones_own_law_is_one_sentence(here, law, keys, of_what, allowed):
+def test_errors_in_a_custom_law_are_one_sentence(here, law, keys, of_what, allowed):
     (here / "mine.py").write_text(HEAD + law)
     controller = {key: value for key, value in {**MINE, **keys}.items() if value is not None and key != "tune"}
     tables = {**CHAIN, "controller": controller, **({"tune": {}} if "tune" in keys else {})}
@@ -462,7 +462,7 @@ def test_what_is_wrong_with_ones_own_law_is_one_sentence(here, law, keys, of_wha
         ("disturbance", "(0.5, 1.5)", "(0.5, 1e9)", "disturbance.frequency"),
     ],
 )
-def test_what_is_wrong_with_other_parts_is_one_sentence(here, name, old, new, of_what):
+def test_errors_in_other_custom_parts_are_one_sentence(here, name, old, new, of_what):
     assert old in OTHER
     (here / "other.py").write_text(HEAD + OTHER.replace(old, new))
     kind = {"observer": "Filtered", "disturbance": "Wave"}[name]
@@ -485,7 +485,7 @@ def test_what_is_wrong_with_other_parts_is_one_sentence(here, name, old, new, of
         ),
     ],
 )
-def test_a_reference_that_is_no_attitude_is_refused(here, old, new, said):
+def test_a_custom_reference_that_returns_no_attitude_is_refused(here, old, new, said):
     (here / "other.py").write_text(HEAD + OTHER.replace(old, new))
     tables = {"loop": SAMPLED, "controller": {"kind": "pd", "t_f": 5.0},
               "reference": {"kind": "own", "code": "other.py:Turning"}}  # fmt: skip
@@ -494,21 +494,21 @@ def test_a_reference_that_is_no_attitude_is_refused(here, old, new, said):
     assert said in str(caught.value)
 
 
-def test_a_reference_that_ends_on_the_way_is_none_that_is_crossed(here):
+def test_a_reference_that_becomes_nan_is_not_reported_as_singular(here):
     (here / "other.py").write_text(HEAD + OTHER.replace("jnp.cos(half)", "jnp.where(t > 3.0, jnp.nan, jnp.cos(half))"))
     tables = {"loop": SAMPLED, "controller": {"t_f": 5.0}, "reference": {"kind": "own", "code": "other.py:Turning"}}
     with pytest.raises(ScenarioError, match=r"^reference.*its attitude is not finite at t = 3\.00. s; allowed are"):
         scenario.study(scenario.from_tables(tables))
 
 
-def test_a_class_from_python_is_named_in_a_file_and_refused_when_it_is_read(here):
+def test_a_file_that_names_a_class_from_python_cannot_be_read(here):
     made_here = ptsmc.replace(scenario.from_tables(CHAIN), controller={"kind": "own", "code": made("mine.py", "Mine")})
     ptsmc.write(made_here, "s.toml")
     with pytest.raises(ScenarioError, match=r'^controller\.code is "<Mine made in Python>": it names nothing'):
         scenario.read("s.toml")
 
 
-def test_results_with_code_of_ones_own_ask_before_it_is_run(command, here):
+def test_results_with_custom_code_need_trust(command, here):
     text = SHORT_CHAIN.replace("[controller]\n", '[controller]\nkind = "own"\ncode = "mine.py:Mine"\n')
     (here / "s.toml").write_text(text)
     assert command("simulate", "s.toml", "--no-figures", "--quiet")[0] == 0
@@ -531,8 +531,8 @@ def test_results_with_code_of_ones_own_ask_before_it_is_run(command, here):
     )
 
 
-def test_what_fails_late_in_code_of_ones_own_is_one_sentence_too(command, here, monkeypatch):
-    """A law that keeps a traced number in a list, found by JAX in the flight; and what an error came by."""
+def test_late_errors_in_custom_code_are_one_sentence(command, here, monkeypatch):
+    """JAX finds a traced number in a list during the run. The error names the custom file."""
     monkeypatch.setattr(systems, "_files", set())
     kept = LAW.replace("        left =", "        kept.append(error)\n        error = kept[-4:][0]\n        left =")
     (here / "mine.py").write_text(HEAD + "kept = []\n\n\ndef fails():\n    return 1 / 0\n" + kept)
@@ -549,13 +549,13 @@ def test_what_fails_late_in_code_of_ones_own_is_one_sentence_too(command, here, 
     with pytest.raises(ZeroDivisionError) as caught:
         raise ZeroDivisionError
     assert systems.at_fault(caught.value) is None
-    with pytest.raises(ValueError, match="JVP") as no_slopes:  # as in a search: JAX alone is on the way
+    with pytest.raises(ValueError, match="JVP") as no_slopes:  # as in a search: the traceback contains only JAX
         jax.jvp(lambda x: jax.pure_callback(lambda x: x, x, x), (1.0,), (1.0,))
     assert systems.at_fault(no_slopes.value) == str(here / "mine.py")
 
 
-def test_a_law_that_uses_a_number_of_its_last_call_is_refused(command, here):
-    """A run would use the number of the check at t = 0 in every sample."""
+def test_a_custom_law_that_stores_a_number_between_calls_is_refused(command, here):
+    """Every sample of a run would use the number that the check at t = 0 stored."""
     kept = LAW.replace("        left =", "        kept.append(error)\n        error = kept[-2:][0]\n        left =")
     (here / "mine.py").write_text(HEAD + "kept = []\n\n\n" + kept)
     (here / "s.toml").write_text(SHORT_OWN)
@@ -564,8 +564,8 @@ def test_a_law_that_uses_a_number_of_its_last_call_is_refused(command, here):
         assert (code, "its acceleration keeps a number of a run" in error) == (2, True)
 
 
-def test_code_of_ones_own_that_exits_late_is_bad_input(command, here):
-    """It ended the command with its own status, 0: done and every requirement met."""
+def test_custom_code_that_exits_is_a_configuration_error(command, here):
+    """An earlier version ended with the status of the custom code, 0, which means that all requirements are met."""
     late = LAW.replace("        left =", "        asked.append(0)\n        if len(asked) > 4: exit(0)\n        left =")
     (here / "mine.py").write_text(HEAD + "asked = []\n" + late)
     (here / "s.toml").write_text(SHORT_OWN)
@@ -575,7 +575,7 @@ def test_code_of_ones_own_that_exits_late_is_bad_input(command, here):
     assert not (here / "out").exists()
 
 
-def test_where_there_is_no_gain_at_all_it_is_said_before_a_search(command, here):
+def test_a_scenario_without_gains_is_refused_before_a_search(command, here):
     (here / "mine.py").write_text(HEAD + LAW.split("    eta:")[0] + "    def acceleration(self, now, error, *_):\n"
                                   "        return -error, error\n")  # fmt: skip
     (here / "s.toml").write_text(
@@ -591,7 +591,7 @@ def test_where_there_is_no_gain_at_all_it_is_said_before_a_search(command, here)
 
 
 @pytest.mark.long
-def test_the_command_tunes_it(command, here, monkeypatch):
+def test_the_command_tunes_a_custom_law(command, here, monkeypatch):
     small_search(monkeypatch)
     text = SHORT_OWN
     (here / "s.toml").write_text(text)
@@ -600,7 +600,7 @@ def test_the_command_tunes_it(command, here, monkeypatch):
     assert 2.1 <= found["eta"] <= 6.0
     assert found["eta"] != 3.0
     assert found["code"] == "mine.py:Mine"
-    (here / "out/tune-s").rename(here / "sent")  # to somebody who has no mine.py
+    (here / "out/tune-s").rename(here / "sent")  # as on another computer without mine.py
     (here / "mine.py").unlink()
     assert command("simulate", "sent/tuned.toml", "--no-figures", "--quiet")[0] == 2
     status, _, error = command("simulate", "sent/tuned.toml", "--no-figures", "--quiet", "--trust")
@@ -609,7 +609,7 @@ def test_the_command_tunes_it(command, here, monkeypatch):
 
 
 def test_a_law_integrates_the_error_in_its_memory():
-    """Against the same sum by hand."""
+    """The result equals the same sum by hand."""
 
     class Integral(ptsmc.AccelerationLaw):
         k: float = ptsmc.gain(0.3, (0.01, 1.0))
@@ -631,8 +631,8 @@ def test_a_law_integrates_the_error_in_its_memory():
 
 
 @pytest.mark.parametrize("clock", ["anchored", "flight"])
-def test_a_law_finds_the_first_error_in_its_first_sample(clock):
-    """On the anchored clock periods without a length, which remember nothing, come before it."""
+def test_the_first_sample_of_a_law_sees_the_initial_error(clock):
+    """The anchored clock begins with periods of length zero, which must not change the memory."""
 
     class First(ptsmc.AccelerationLaw):
         k: float = ptsmc.gain(1.0, (0.1, 2.0))
@@ -644,14 +644,14 @@ def test_a_law_finds_the_first_error_in_its_first_sample(clock):
             start = jnp.where(now.t == 0.0, error, now.memory)
             return -self.k * error - 2.0 * error_rate, start, start
 
-    table = {"kind": "own", "code": First, "t_f": 5.03, "delta": 0.5}  # no whole number of periods
+    table = {"kind": "own", "code": First, "t_f": 5.03, "delta": 0.5}  # not a whole number of periods
     log = flown({**CHAIN, "controller": table, "loop": {**SAMPLED, "clock": clock}}).log
     kept = np.asarray(log.has_length)
     assert kept.any()
     np.testing.assert_array_equal(np.asarray(log.s)[kept], np.asarray(log.x)[kept][0, 0])
 
 
-def test_a_commented_scenario_keeps_keys_of_ones_own(command, here):
+def test_a_commented_scenario_keeps_custom_keys(command, here):
     (here / "s.toml").write_text(f"{(ROOT / 'scenarios' / 'own_parts.toml').read_text()}")
     for name in ("own_parts.py",):
         (here / name).write_text((ROOT / "scenarios" / name).read_text())
@@ -660,7 +660,7 @@ def test_a_commented_scenario_keeps_keys_of_ones_own(command, here):
     assert first == second
 
 
-def test_fields_of_a_class_that_it_is_derived_from_are_keys_too(here):
+def test_fields_of_custom_base_classes_are_keys(here):
     (here / "mine.py").write_text(
         HEAD + LAW.replace("class Mine", "class First") + "\n\nclass Mine(First):\n    pass\n"
     )
@@ -669,8 +669,8 @@ def test_fields_of_a_class_that_it_is_derived_from_are_keys_too(here):
     assert scenario.study(whole).parts.controller.eta == 2.5
 
 
-def test_what_files_import_from_beside_them_is_of_their_own_folder_and_as_it_is_now(tmp_path):
-    """Two folders with a helper of one name, then the helper changed: by the acceleration that the law asks for."""
+def test_helper_modules_come_from_the_folder_of_the_file_and_are_current(tmp_path):
+    """Two folders have a helper of the same name, then a helper changes. The commanded acceleration shows which ran."""
     law = "import helper\n" + HEAD + LAW.replace("return 0.5 * wanted", "return helper.K * wanted")
     for folder, k in (("a", 1.0), ("b", 3.0)):
         (tmp_path / folder).mkdir()
@@ -691,15 +691,15 @@ def test_what_files_import_from_beside_them_is_of_their_own_folder_and_as_it_is_
 
 
 @pytest.mark.parametrize("name", ["observer_rate", "sensors_x", "filter_bandwidth"])
-def test_a_law_has_no_gain_of_the_name_of_another_parts(here, name):
+def test_a_custom_law_cannot_reuse_the_gain_name_of_another_part(here, name):
     gain = f"{name}: float = ptsmc.gain(1.0, (0.5, 2.0))\n    width: float"
     (here / "mine.py").write_text(HEAD + LAW.replace("width: float", gain))
     with pytest.raises(ScenarioError, match=f"the name of its gain {name} stands for one of another part"):
         scenario.study(scenario.from_tables({**CHAIN, "controller": MINE}))
 
 
-def test_a_gain_of_an_observer_may_begin_like_one_of_an_axis(here):
-    """It was taken for the gain of an axis, of which this observer has none: a search ended in a traceback."""
+def test_a_gain_of_an_observer_can_have_a_name_like_a_gain_of_an_axis(here):
+    """An earlier version took it for the gain of an axis, and a search ended in a traceback."""
     low = OTHER.replace("self.share", "self.gain_low").replace("share: float", "gain_low: float")
     (here / "mine.py").write_text(HEAD + low)
     observer = {"kind": "own", "code": "mine.py:Filtered", "gain_low": 0.7}
@@ -723,7 +723,7 @@ class Detumbling(ptsmc.AccelerationLaw):
 
 
 def test_a_law_that_computes_its_own_torque_has_no_singularity(here):
-    """It was reported singular wherever the attitude error passed 180 deg, where only the inversion is singular."""
+    """An earlier version reported it as singular at an attitude error of 180 deg, where only the inversion is."""
     (here / "mine.py").write_text(HEAD + DETUMBLING)
     law = {"kind": "own", "code": "mine.py:Detumbling", "t_f": 5.0}
     tables = {"controller": law, "loop": SAMPLED, "initial": {"rotvec_deg": [0.0, 0.0, 150.0]}}
@@ -735,8 +735,8 @@ def test_a_law_that_computes_its_own_torque_has_no_singularity(here):
     assert "clearance" not in board(ready.parts).state
 
 
-def test_a_law_whose_memory_is_lost_has_diverged(here):
-    """Exported code refuses every sample after it. Simulated runs were called ok as long as the command was finite."""
+def test_a_run_whose_law_memory_becomes_nan_has_diverged(here):
+    """Exported code rejects every later sample. An earlier version reported ok as long as the command was finite."""
     forgetful = """
 class Forgetful(ptsmc.AccelerationLaw):
     '''PD, which loses what it remembers after 2 s, and does not notice.'''

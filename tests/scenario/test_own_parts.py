@@ -1,4 +1,4 @@
-"""A scenario with own parts is a program: reading results runs none of it, flying them asks first."""
+"""A scenario with custom parts is a program: reading results does not run it, and simulating it needs trust."""
 
 import importlib.util
 import py_compile
@@ -16,7 +16,7 @@ from ptsmc_jax.scenario.errors import ScenarioError
 from tuning.search import own_parts
 from tuning.studies import campaign_folder
 
-# what marks that it was run; a double integrator, and a metric of one's own
+# a custom file that writes a marker when it runs, with a double integrator and a custom metric
 PROGRAM = """
 from pathlib import Path
 
@@ -43,27 +43,27 @@ FOLDER = "out/montecarlo-mine"
 
 
 def reported(place, by="mine.toml"):
-    """The line on the error stream that names the file that a command runs."""
+    """Return the line on stderr that names the custom file before a command runs it."""
     return f"ptsmc: runs {place}/my.py, which plant.system of {by} names\n"
 
 
 @pytest.fixture(autouse=True)
 def fresh(monkeypatch):
-    """A process that has run nothing yet."""
+    """No custom file counts as run yet."""
     monkeypatch.setattr(systems, "_ran", {})
 
 
 @pytest.fixture(scope="module")
 def places(tmp_path_factory):
-    """A folder, and one for a copy of what is in it."""
+    """A folder, and a folder for a copy of its content."""
     return tmp_path_factory.mktemp("home"), tmp_path_factory.mktemp("kept") / "home"
 
 
 @pytest.fixture
 def home(command, places, monkeypatch):
-    """A folder with a campaign whose scenario and metrics name my.py, its marker removed; the current one.
+    """The current folder, with a campaign whose scenario and metrics name my.py. The marker of my.py is removed.
 
-    Flown once, and put back for each test: results name their files by where they lie.
+    The campaign runs once, and its folder is restored for each test, because results name files by their path.
     """
     place, kept = places
     if kept.exists():
@@ -85,25 +85,25 @@ def home(command, places, monkeypatch):
 
 @pytest.fixture
 def flown(home):
-    """The campaign's folder."""
+    """The folder of the campaign."""
     return home / FOLDER
 
 
 def ran(folder):
-    """Whether my.py was run since this was asked last."""
+    """Whether my.py has run since the last call."""
     marker = folder / "my.ran"
     found = marker.exists()
     marker.unlink(missing_ok=True)
     return found
 
 
-def test_summarize_worst_and_report_run_nothing_that_a_folder_names(command, flown, home):
+def test_summarize_worst_and_report_run_no_custom_code(command, flown, home):
     rows = pl.read_parquet(flown / "trials")
     code, said, error = command("summarize", FOLDER)
     assert (code, error) == (0, "")
     assert "farthest" in said
     assert (flown / "figures" / "distributions.png").exists()
-    assert not (flown / "figures" / "fan.png").exists()  # of histories, which would be flown
+    assert not (flown / "figures" / "fan.png").exists()  # this figure needs histories, which would need a run
     code, said, _ = command("worst", FOLDER, "--by", "farthest", "-n", 1)
     assert (code, f"ptsmc replay {FOLDER} --trial {pl.read_csv(flown / 'worst.csv')['trial'][0]} --trust" in said) == (
         0,
@@ -117,13 +117,13 @@ def test_summarize_worst_and_report_run_nothing_that_a_folder_names(command, flo
     assert "--metrics my.py:farthest" in page
 
 
-def test_rows_are_read_where_the_program_is_not(command, flown, home):
+def test_rows_can_be_read_without_the_custom_file(command, flown, home):
     (home / "my.py").unlink()
     for asked in ("summarize", "worst", "report"):
         assert command(asked, FOLDER)[0] == 0, asked
 
 
-def test_replay_says_what_it_would_run_and_runs_it_with_trust_only(command, flown, home):
+def test_replay_names_the_custom_file_and_runs_it_with_trust_only(command, flown, home):
     code, out, error = command("replay", FOLDER, "--trial", 3, "--no-figures")
     assert (code, out) == (2, "")
     for said in (f"{home}/my.py (plant.system, --metrics)", "--trust"):
@@ -137,7 +137,7 @@ def test_replay_says_what_it_would_run_and_runs_it_with_trust_only(command, flow
     assert ran(home)
 
 
-def test_what_has_changed_is_refused_by_its_digest_even_beside_and_with_trust(command, flown, home):
+def test_a_changed_custom_file_is_refused_even_with_trust(command, flown, home):
     shutil.copy(home / "my.py", flown)
     text = (flown / "scenario.toml").read_text().replace(f"{home}/my.py", "my.py")
     (flown / "scenario.toml").write_text(text)
@@ -151,13 +151,13 @@ def test_what_has_changed_is_refused_by_its_digest_even_beside_and_with_trust(co
     code, _, error = command("montecarlo", "mine.toml", "--trials", 30, "--metrics", "my.py:farthest")
     assert (code, "holds a run with system_sha256" in error) == (2, True)
     assert not ran(flown)
-    other = campaign_folder.opened(flown)  # as a worker elsewhere does
+    other = campaign_folder.opened(flown)  # as a worker on another computer does
     with pytest.raises(RefusedError, match=r"was made with another plant\.system"):
         campaign_folder.made_again(str(flown), other.rows.key.hex())
     assert not ran(flown)
 
 
-def test_the_same_campaign_goes_on_without_a_flag(command, flown, home):
+def test_the_same_campaign_resumes_without_a_flag(command, flown, home):
     code, _, error = command(
         "montecarlo", "mine.toml", "--trials", 30, "--metrics", "my.py:farthest", "--no-figures", "--quiet"
     )
@@ -166,7 +166,7 @@ def test_the_same_campaign_goes_on_without_a_flag(command, flown, home):
     assert campaign_folder.opened(flown).own_names == ["farthest"]
 
 
-def test_a_scenario_in_results_asks_wherever_its_program_lies(command, flown, home, capsys):
+def test_a_scenario_in_results_needs_trust_wherever_its_file_is(command, flown, home, capsys):
     shutil.copy(home / "my.py", flown)
     (flown / "evil.toml").write_text(SCENARIO)
     (flown / "scenarios" / "deeper").mkdir(parents=True)
@@ -225,16 +225,16 @@ def test_reading_a_scenario_imports_no_module_and_no_package_around_it(tmp_path,
     assert systems.digest("around.inside:mine") is None
 
 
-def test_what_is_run_is_the_source_and_no_compiled_copy_that_came_with_it(tmp_path):
+def test_the_source_of_a_custom_file_is_run_and_never_a_compiled_copy(tmp_path):
     file = tmp_path / "my.py"
     file.write_text(PROGRAM.replace("system(1", "no_system_at_all(1"))
     cached = Path(importlib.util.cache_from_source(str(file)))
     py_compile.compile(str(file), str(cached), invalidation_mode=py_compile.PycInvalidationMode.UNCHECKED_HASH)
-    file.write_text(PROGRAM)  # the compiled copy says that it need not be compared
+    file.write_text(PROGRAM)  # the .pyc claims to be valid without a comparison
     assert systems.load(f"{file}:mine").inputs == 1
 
 
-def test_a_file_that_changes_is_run_anew_and_one_that_does_not_is_not(tmp_path):
+def test_a_custom_file_runs_again_only_if_it_has_changed(tmp_path):
     file = tmp_path / "my.py"
     file.write_text(PROGRAM)
     first = systems.load(f"{file}:mine")
@@ -244,7 +244,7 @@ def test_a_file_that_changes_is_run_anew_and_one_that_does_not_is_not(tmp_path):
         systems.load(f"{file}:mine")
 
 
-def test_a_run_says_which_program_it_was_made_with(command, tmp_path):
+def test_a_run_records_the_checksum_of_its_custom_file(command, tmp_path):
     (tmp_path / "my.py").write_text(PROGRAM)
     (tmp_path / "mine.toml").write_text(SCENARIO)
     assert command("simulate", "mine.toml", "--out", "run", "--quiet", "--no-figures")[0] == 0
@@ -268,7 +268,7 @@ def test_a_run_says_which_program_it_was_made_with(command, tmp_path):
         ("summary.json", "[" * 100_000),
     ],
 )
-def test_folders_that_nobody_could_have_made_are_refused_in_one_sentence(command, tmp_path, name, text):
+def test_inconsistent_result_folders_are_refused_in_one_sentence(command, tmp_path, name, text):
     folder = tmp_path / "theirs"
     folder.mkdir()
     said = '{"command": "montecarlo", "seed": 0, "trials": 20, "precision": 64}'
@@ -287,8 +287,8 @@ def _tables(*codes):
     return {"controller": laws[0], "disturbance": {"terms": laws[1:]}} if laws[1:] else {"controller": laws[0]}
 
 
-def test_a_folder_carries_the_files_that_its_scenario_names(tmp_path):
-    """Two files of one name, one of them named twice: two copies."""
+def test_a_result_folder_contains_copies_of_its_custom_files(tmp_path):
+    """Two files of the same name, one of them named twice, give two copies."""
     made = tmp_path / "made"
     made.mkdir()
     for name, text in {"a": "x = 1\n", "b": "x = 2\n"}.items():
@@ -313,7 +313,7 @@ def test_a_folder_carries_the_files_that_its_scenario_names(tmp_path):
         ("x = = 1\n", False),
     ],
 )
-def test_a_file_that_needs_others_is_named_where_it_lies(tmp_path, text, carried):
+def test_a_custom_file_with_local_imports_is_not_copied(tmp_path, text, carried):
     made = tmp_path / "made"
     for folder in (made, tmp_path / "package"):
         folder.mkdir()

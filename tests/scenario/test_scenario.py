@@ -25,7 +25,7 @@ from tests.scenario.bad_scenarios import BAD, ONE_KEY, SAMPLED, check_sentence
 
 
 @pytest.mark.parametrize(("text", "of_what", "allowed"), BAD, ids=[text[:60] for text, _, _ in BAD])
-def test_bad_input_ends_in_one_sentence(text, of_what, allowed):
+def test_a_configuration_error_is_one_sentence(text, of_what, allowed):
     with pytest.raises(ScenarioError) as caught:
         study(from_tables(tomllib.loads(text)))
     check_sentence(str(caught.value), of_what, allowed)
@@ -35,8 +35,8 @@ def test_bad_input_ends_in_one_sentence(text, of_what, allowed):
     "form", ["controller.eta = %s1%s|[|]", "eta = %s1%s|{ a = |}", "[%sa%s]|a.|", "a%s = 1%s|.a|", "a%s = 1%s| . 'b'|"]
 )
 @pytest.mark.parametrize("levels", [9, 300, 100_000])
-def test_what_is_nested_deeper_than_the_parser_goes_is_refused_as_well(tmp_path, form, levels):
-    """A key of 100 000 dots would take the parser 40 GB."""
+def test_too_deep_nesting_is_refused(tmp_path, form, levels):
+    """The parser would need 40 GB for a key with 100 000 dots."""
     path = tmp_path / "s.toml"
     text, opens, closes = form.split("|")
     path.write_text(text % (opens * levels, closes * levels))
@@ -45,10 +45,10 @@ def test_what_is_nested_deeper_than_the_parser_goes_is_refused_as_well(tmp_path,
     check_sentence(str(caught.value), "tables or arrays in each other", "at most 8 levels are allowed")
 
 
-def test_an_error_has_the_key_the_value_and_what_is_allowed():
+def test_an_error_has_the_key_the_value_and_the_allowed_values():
     with pytest.raises(ScenarioError) as caught:
         from_tables({"hardware": {"attitude_noise": "-8 arcsec"}, "loop": {"mode": "sampled"}})
-    error = pickle.loads(pickle.dumps(caught.value))  # as a cluster sends it
+    error = pickle.loads(pickle.dumps(caught.value))  # as between processes of a cluster
     assert error.key == "hardware.attitude_noise"
     assert error.value == pytest.approx(-np.deg2rad(8.0 / 3600.0), rel=1e-15)
     assert error.allowed.startswith("a number, at least 0")
@@ -77,7 +77,7 @@ def test_disturbance_too_fast_for_the_sampled_loop_is_refused():
 )
 @pytest.mark.parametrize("mode", ["continuous", "sampled"])
 @pytest.mark.parametrize("size", ["1e300", "1e-300"])
-def test_absurd_numbers_are_taken_or_refused_but_never_crash(key, mode, size):
+def test_extreme_numbers_never_crash_a_study(key, mode, size):
     three = key.split(".")[0] in ("spacecraft", "observer", "disturbance", "initial")
     tables = tomllib.loads(f"loop.mode = '{mode}'\n{key} = {[float(size)] * 3 if three else size}")
     with contextlib.suppress(ScenarioError):
@@ -107,14 +107,14 @@ def test_absurd_numbers_are_taken_or_refused_but_never_crash(key, mode, size):
         "hardware = {}\nrequirements = {}\ndispersion = {}\ntune.bounds = {}",
     ],
 )
-def test_what_is_just_allowed_is_taken(text):
+def test_values_at_the_limits_are_accepted(text):
     study(from_tables(tomllib.loads(text)))
 
 
 @pytest.mark.parametrize(
     "text", ["period = 6.0\nwindow = 6.0\n[controller]\ndelta = 6.0", "[controller]\nt_f = 0.15\ndelta = 0.05"]
 )
-def test_tune_without_bounds_is_taken_wherever_the_scenario_is(text):
+def test_tune_without_bounds_is_accepted_for_every_valid_scenario(text):
     tables = tomllib.loads(f"[loop]\nmode = 'sampled'\n{text}")
     from_tables(tables)
     bounds = from_tables({**tables, "tune": {}}).tune
@@ -125,7 +125,7 @@ def test_tune_without_bounds_is_taken_wherever_the_scenario_is(text):
     ("text", "t_end"),
     [
         ("", 40.0),
-        ("controller.t_f = 36.0", 46.0),  # one of the paper's cases, with its 10 s
+        ("controller.t_f = 36.0", 46.0),  # a published case, with its 10 s after t_f
         ("controller.t_f = 12.5", 12.5 * 4.0 / 3.0),
         ("controller.t_f = 1200.0", 1600.0),
         ("controller.t_f = 1200.0\nloop.window = 500.0", 1700.0),
@@ -136,22 +136,22 @@ def test_tune_without_bounds_is_taken_wherever_the_scenario_is(text):
     ids=str,
 )
 def test_a_run_ends_a_third_of_t_f_or_the_window_after_t_f_by_default(text, t_end):
-    """A chain's run ends at 3 t_f."""
+    """The run of a chain ends at 3 t_f."""
     assert from_tables(tomllib.loads(text)).loop.t_end == pytest.approx(t_end, rel=1e-12)
 
 
 @pytest.mark.parametrize(("period", "window", "t_end"), [(0.5, 1.0, 40.0), (2.5, 2.5, 40.0), (12.0, 12.0, 42.0)])
-def test_the_window_is_a_second_or_a_longer_period_unless_said(period, window, t_end):
+def test_the_default_window_is_a_second_or_a_longer_period(period, window, t_end):
     slow = from_tables({"loop": {"mode": "sampled", "period": period}})
     assert (slow.loop.window, slow.controller.delta, slow.loop.t_end) == (window, max(0.05, period), t_end)
-    again = replace(slow, loop__period=0.5)  # a default stays one
+    again = replace(slow, loop__period=0.5)  # a default stays a default
     assert (again.loop.window, again.loop.t_end) == (1.0, 40.0)
-    assert from_tables({"loop": {"period": period}}).loop.window == 1.0  # a period of no meaning
+    assert from_tables({"loop": {"period": period}}).loop.window == 1.0  # the continuous loop has no period
 
 
-# Attitudes. Hand computed: "ZYX" turns by 90 degrees about z, then about the new x: q = q_z q_x; "zyx" about the fixed
-# axes, so q = q_x q_z; x -> y -> z -> x is 120 degrees about (1, 1, 1), mrp tan(30 degrees) / sqrt(3); its matrix
-# holds the body axes as columns.
+# Attitudes, computed by hand. "ZYX" rotates by 90 deg about z, then about the new x: q = q_z q_x. "zyx" rotates about
+# the fixed axes: q = q_x q_z. The permutation x -> y -> z -> x is a rotation of 120 deg about (1, 1, 1), with the MRP
+# tan(30 deg) / sqrt(3). Its matrix has the body axes as columns.
 BY_HAND = [
     ({"quat_xyzw": [0.6, 0.0, 0.0, 0.8]}, [0.6, 0.0, 0.0, 0.8]),
     ({"quat_wxyz": [0.8, 0.6, 0.0, 0.0]}, [0.6, 0.0, 0.0, 0.8]),
@@ -161,7 +161,7 @@ BY_HAND = [
     ({"euler_deg": [90.0, 0.0, 90.0], "sequence": "ZYX"}, [0.5, 0.5, 0.5, 0.5]),
     ({"euler_deg": [90.0, 0.0, 90.0], "sequence": "zyx"}, [0.5, -0.5, 0.5, 0.5]),
 ]
-# a few dozen roundings of numbers of order one
+# some dozen rounding errors of numbers of order one
 ROUNDING = 1e-14
 
 
@@ -180,7 +180,7 @@ def test_attitudes_by_hand(table, said, expected):
 
 
 def every_parametrisation(rotation):
-    """All that a file may say for the rotation from body to inertial vectors, from its matrix and vector by NumPy."""
+    """Return all attitude keys of a file for the rotation from body to inertial vectors, computed by NumPy."""
     matrix = rotation.as_matrix()
     vector = rotation.as_rotvec()
     angle = np.linalg.norm(vector)
@@ -262,7 +262,7 @@ peak_torque = { limit = 0.5 }
 """
 
 
-def test_every_key_reaches_its_part():
+def test_every_key_sets_a_field_of_its_part():
     scenario: Any = from_tables(tomllib.loads(EVERYTHING))
     ready = study(scenario)
     parts = ready.parts
@@ -335,7 +335,7 @@ def test_kinds_of_dispersion():
 
 
 @pytest.mark.parametrize("mode", ["anchored", "flight"])
-def test_the_clock_has_room_for_the_reach_of_the_gains(mode):
+def test_the_clock_covers_the_reach_of_the_gains(mode):
     scenario = from_tables(tomllib.loads(SAMPLED + f"loop.clock = '{mode}'"))
     parts = study(scenario, reach=reach_of(scenario, t_f=35.0, delta=4.0)).parts
     for t_f, delta in ((30.0, 0.05), (30.0, 4.0)):
@@ -356,7 +356,7 @@ def test_the_clock_has_room_for_the_reach_of_the_gains(mode):
     ],
     ids=str,
 )
-def test_a_reach_that_no_clock_can_have_is_refused(farther, refused):
+def test_an_impossible_reach_is_refused(farther, refused):
     with pytest.raises(ValueError, match=f"^{re.escape(refused)}$"):
         reach_of(from_tables({"loop": {"mode": "sampled"}}), **farther)
 
@@ -378,24 +378,24 @@ def test_periods_within_a_reach_share_a_structure_and_each_has_samples_to_the_en
     assert found[0] == found[1] == found[2]
 
 
-def test_steps_are_bounded_for_the_longest_run_that_tuning_may_try():
+def test_steps_are_bounded_for_the_longest_run_of_a_search():
     loop = {"mode": "sampled", "period": 0.5, "t_end": 60_010.0, "window": 1.0}
     scenario = from_tables({"loop": loop, "controller": {"t_f": 6e4, "delta": 1.0}})
     reach = reach_of(scenario, t_f=12e4)
-    assert 120_020 <= timing.steps(study(scenario).parts) <= 120_025  # (6e4 + 10) / 0.5, and a few for the clock's ends
+    assert 120_020 <= timing.steps(study(scenario).parts) <= 120_025  # (6e4 + 10) / 0.5, and some at the ends
     with pytest.raises(ScenarioError) as caught:
         study(scenario, reach=reach)
     check_sentence(str(caught.value), "tune.bounds.t_f asks for runs of 120010 s", "take 240020 steps, 1 a period")
 
 
-def test_read_reads_the_scenario_that_comes_with_the_project():
+def test_read_accepts_a_packaged_scenario():
     scenario = read(FIRST_FLIGHT)
     assert (scenario.controller.t_f, scenario.loop.mode, scenario.loop.t_end) == (35.0, "sampled", 45.0)
     assert scenario.requirements == {"peak_torque": 0.5}
 
 
 # replace
-def test_replace_changes_what_is_said_and_keeps_the_rest():
+def test_replace_changes_only_the_given_keys():
     before = from_tables(tomllib.loads(EVERYTHING))
     kept = parsing.dump(before)
     after = parsing.dump(
@@ -409,7 +409,7 @@ def test_replace_changes_what_is_said_and_keeps_the_rest():
     assert parsing.dump(before) == kept
 
 
-def test_replace_by_none_returns_a_key_to_its_default():
+def test_replace_with_none_restores_a_default():
     scenario = replace(from_tables({}), controller__t_f=20.0, loop__t_end=None)
     assert scenario.loop.t_end == pytest.approx(20.0 * 4.0 / 3.0, rel=1e-12)
     turned: Any = replace(scenario, initial__quat_xyzw=None, initial__rotvec_deg=[0.0, 0.0, 90.0])
@@ -419,7 +419,7 @@ def test_replace_by_none_returns_a_key_to_its_default():
 @pytest.mark.parametrize(
     "whole", [{"controller__kind": "pd"}, {"controller": {"kind": "pd"}}], ids=["a kind", "a whole table"]
 )
-def test_replace_keeps_the_keys_that_stand_before_a_kind_or_a_table(whole):
+def test_replace_does_not_depend_on_the_order_of_changes(whole):
     sampled = from_tables({"loop": {"mode": "sampled"}})
     law: Any = replace(sampled, controller__k_p=0.5, **whole).controller
     assert (law.kind, law.k_p) == ("pd", 0.5)
@@ -435,7 +435,7 @@ def test_replace_keeps_the_keys_that_stand_before_a_kind_or_a_table(whole):
         ("requirements", {}),  # has no kinds
     ],
 )
-def test_a_kind_that_returns_to_its_default_takes_the_keys_of_the_old_one_with_it(table, given):
+def test_restoring_the_default_kind_discards_the_keys_of_the_old_kind(table, given):
     sampled = {"loop": {"mode": "sampled"}}
     back = replace(from_tables({**sampled, table: given}), **{f"{table}__kind": None})
     assert back == from_tables(sampled)
@@ -443,7 +443,7 @@ def test_a_kind_that_returns_to_its_default_takes_the_keys_of_the_old_one_with_i
     assert kept.controller.t_f == 20.0  # it was the default one
 
 
-def test_replace_leaves_the_tables_that_it_is_given():
+def test_replace_does_not_change_its_arguments():
     given = {"t_f": 20.0, "eta": 4.0}
     assert replace(from_tables({}), controller=given, controller__eta=None).controller.eta == 3.0
     assert given == {"t_f": 20.0, "eta": 4.0}
@@ -476,7 +476,7 @@ def test_replace_adds_a_table():
     ],
     ids=str,
 )
-def test_replace_checks(changes, of_what, allowed):
+def test_replace_validates_the_new_values(changes, of_what, allowed):
     with pytest.raises(ScenarioError) as caught:
         replace(from_tables({}), **changes)
     check_sentence(str(caught.value), of_what, allowed)
@@ -524,7 +524,7 @@ ATTITUDES = st.one_of(
     st.fixed_dictionaries({"dcm_body_to_inertial": MATRICES}),
     st.fixed_dictionaries({"euler_deg": threes(-180.0, 180.0), "sequence": st.sampled_from(["ZYX", "zxz"])}),
 )
-# of any a, b, c > 0 the moments b + c, c + a and a + b are a rigid body's
+# for any a, b, c > 0 the moments b + c, c + a and a + b belong to a rigid body
 MOMENTS = threes(0.1, 1e3).map(lambda v: [v[1] + v[2], v[2] + v[0], v[0] + v[1]])
 TENSORS = st.tuples(MOMENTS, MATRICES).map(lambda v: np.asarray(v[1]) @ np.diag(v[0]) @ np.asarray(v[1]).T)
 AMPLITUDE = {"amplitude": threes(-1.0, 1.0)}
@@ -582,7 +582,7 @@ def is_in(said, dumped):
 
 @settings(max_examples=100, deadline=None, derandomize=True, database=None)
 @given(tables=valid_scenarios())
-def test_what_is_dumped_loads_to_the_same_scenario(tmp_path_factory, tables):
+def test_a_dumped_scenario_loads_to_the_same_scenario(tmp_path_factory, tables):
     scenario = from_tables(tables)
     dumped = parsing.dump(scenario)
     path = tmp_path_factory.getbasetemp() / "scenario.toml"
@@ -600,8 +600,8 @@ def test_what_is_dumped_loads_to_the_same_scenario(tmp_path_factory, tables):
          "filter", ("bandwidth",)),
     ],
 )  # fmt: skip
-def test_files_have_every_key_that_follows_from_others_and_fly_the_same(text, table, keys):
-    """In memory such keys go on following: another t_f moves t_o along, but not one that stands in a file."""
+def test_written_files_have_every_default_and_give_the_same_run(text, table, keys):
+    """In memory a default t_o follows t_f. A t_o that was written to a file does not."""
     said = from_tables(tomllib.loads(text))
     written = parsing.dump(said)
     assert set(keys) <= written[table].keys()

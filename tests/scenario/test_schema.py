@@ -18,7 +18,7 @@ from ptsmc_jax.scenario.values import Table
 from ptsmc_jax.simulation.catalogues import CATALOGUE, STATE_CATALOGUE
 from tests.helpers import ROOT
 
-# design.md, "A scenario file": the paper's Case I, and what tuning does where nothing is said
+# design.md, "A scenario file": the published Case I, and the defaults of [tune]
 DEFAULTS = {
     "plant": {"kind": "spacecraft"},
     "spacecraft": {"inertia": [10.0, 12.0, 14.0]},
@@ -59,7 +59,7 @@ DEFAULTS = {
         "settling_angle": 1e-3,
     },
 }
-# the paper's Fig. 2
+# Fig. 2 of the paper
 CHAIN_DEFAULTS = {
     "plant": {"kind": "chain", "order": 3, "x0": [5.0, 3.0, 2.0]},
     "disturbance": {"kind": "sinusoid", "amplitude": [0.01], "frequency": [1.0], "phase": [0.0], "bias": [0.0]},
@@ -83,7 +83,7 @@ CHAIN_DEFAULTS = {
 }
 TUNE_DEFAULTS = {
     "free": ["eta", "delta", "observer_gain"],
-    # delta: t_f / 600 to t_f / 4; observer_gain: 1.5 J / t_f to 600 times as much
+    # delta: t_f / 600 to t_f / 4; observer_gain: 1.5 J / t_f to 600 times this value
     "bounds": {"eta": [2.05, 8.0], "delta": [0.05, 7.5], "observer_gain": [0.6, 360.0]},
     "per_axis": False,
     "minimise": "window_error",
@@ -117,7 +117,7 @@ BASELINES = {
     "predefined_time": {"share": 0.6, "q1": 0.3, "q2": 0.3, "sign_width": 1e-2},
     "super_twisting": {"surface_rate": 0.4, "lipschitz": 0.01, "sign_width": 1e-3},
 }  # fmt: skip
-# every key of every table, one table at a time so that what is made wrong in it is all that is wrong
+# every key of every table, one table at a time, so that a scenario contains only one error
 ARM = str(ROOT / "scenarios" / "two_link_arm.py") + ":arm"
 SYSTEM_CONTROLLER = {key: value for key, value in CHAIN_DEFAULTS["controller"].items() if key != "a"}
 COMPLETE = [
@@ -278,14 +278,14 @@ def value_at(tables, path):
 
 
 def changed(tables, path, value):
-    """The tables with this value at the path."""
+    """Return the tables with a new value at a path."""
     tables = copy.deepcopy(tables)
     value_at(tables, path[:-1])[path[-1]] = value
     return tables
 
 
 def key_of(path):
-    """The key that an error names: bounds are named as a whole."""
+    """Return the key that an error names. For bounds it is the key of the interval."""
     key = ".".join(part for part in path if isinstance(part, str))
     return "tune.bounds" if key.startswith("tune.bounds") else key
 
@@ -314,7 +314,7 @@ each_list = pytest.mark.parametrize(
 )
 
 
-def test_defaults_are_the_papers_case_one():
+def test_defaults_are_the_published_case_one():
     assert parsing.dump(from_tables({})) == DEFAULTS
     tune = parsing.dump(from_tables({"tune": {}}))["tune"]
     for name, bounds in TUNE_DEFAULTS["bounds"].items():
@@ -322,7 +322,7 @@ def test_defaults_are_the_papers_case_one():
     assert tune == {**TUNE_DEFAULTS, "bounds": {}}
 
 
-def test_defaults_of_a_chain_are_the_papers_figures_one_and_two():
+def test_defaults_of_a_chain_are_the_published_figures_one_and_two():
     assert parsing.dump(from_tables({"plant": {"kind": "chain", "order": 3}})) == CHAIN_DEFAULTS
     second = from_tables({"plant": {"kind": "chain"}})
     assert (second.plant, second.controller.eta) == (ChainPlant(order=2, x0=(5.0, 3.0)), 3.0)
@@ -332,21 +332,21 @@ def test_defaults_of_a_chain_are_the_papers_figures_one_and_two():
     assert fourth["tune"]["bounds"] == {"eta": [4.05, 10.0], "delta": [5.0 / 600.0, 5.0 / 4.0]}
 
 
-def test_off_when_absent():
+def test_optional_tables_are_off_by_default():
     scenario = parsing.parse({})
     assert scenario.hardware is scenario.dispersion is scenario.tune is None
     assert scenario.requirements == {}
 
 
 def every_kind():
-    """Every table of a scenario file by kind, but for custom parts, see test_own_kinds, and a sum of others."""
+    """Return all tables by kind, except custom parts (see test_own_kinds) and sums of disturbances."""
     tables = [kinds for layout in layouts.TABLES.values() for kinds in layout.values()]
     tables += [*layouts.DISPERSIONS.values(), *layouts.KINDS.values(), Limit]
     found = {one for kinds in tables for one in (kinds.values() if isinstance(kinds, Mapping) else [kinds])}
     return {one for one in found if not issubclass(one, Own | SumDisturbance)}
 
 
-def test_tables_of_these_tests_name_every_key_there_is():
+def test_the_tables_of_these_tests_contain_every_key():
     named = {struct: set() for struct in every_kind()}
 
     def visit(parsed, raw):
@@ -358,7 +358,7 @@ def test_tables_of_these_tests_name_every_key_there_is():
 
     for tables in COMPLETE:
         visit(parsing.parse(tables), tables)
-    named[AxesWheels].add("axes")  # rows of numbers, looked at where they are checked
+    named[AxesWheels].add("axes")  # a list of rows, which is tested elsewhere
     for wheels in (PyramidWheels, AxesWheels):
         named[wheels] |= {"momentum", "torque_limit", "momentum_limit"}
     for struct, keys in named.items():
@@ -370,7 +370,7 @@ def test_tables_of_these_tests_name_every_key_there_is():
 
 
 @each_number
-def test_no_number_may_be_nan_or_infinite(tables, path):
+def test_nan_and_infinite_numbers_are_refused(tables, path):
     for bad in (math.nan, math.inf, -math.inf):
         said = refusal(changed(tables, path, bad))
         assert said.startswith(f"{key_of(path)} is ")
@@ -378,17 +378,17 @@ def test_no_number_may_be_nan_or_infinite(tables, path):
 
 
 @each_number
-def test_a_number_is_no_boolean_quoted_number_list_or_table(tables, path):
+def test_other_types_are_refused_as_numbers(tables, path):
     for bad, shown in ((True, "true"), ("1.0", '"1.0"'), ([1.0], "[1.0]"), ({}, "{")):
         said = refusal(changed(tables, path, bad))
         assert said.startswith(f"{key_of(path)} is ")
         assert shown in said
-        # booleans and strings are numbers to numpy: said must be that they are none, not what follows from them
+        # NumPy converts booleans and strings to numbers; the error must name the wrong type
         assert re.search("number|angle|three principal moments", said)
 
 
 @each_list
-def test_lists_of_wrong_length(tables, path):
+def test_lists_of_wrong_length_are_refused(tables, path):
     right = value_at(tables, path[:-1])
     for wrong in ([], right[:-1], [*right, 0.0]):
         said = refusal(changed(tables, path[:-1], wrong))
@@ -417,7 +417,7 @@ def test_misspelt_key_names_the_nearest(tables, path):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_table_is_a_table(name):
+def test_a_value_instead_of_a_table_is_refused(name):
     assert refusal({name: 3}) == f"{name} is 3, but must be a table"
 
 
@@ -437,7 +437,7 @@ def test_values_are_shown_as_a_scenario_file_would_write_them(value, shown):
     assert errors.show(value) == shown
 
 
-def test_dump_leaves_out_what_is_none_and_keeps_what_is_zero():
+def test_dump_omits_none_and_keeps_zero():
     dumped = parsing.dump(from_tables({"hardware": {"rate_noise": 0.0}, "loop": {"mode": "sampled"}}))
     assert dumped["hardware"] == {"rate_noise": 0.0}
     assert {"requirements", "tune", "dispersion"}.isdisjoint(dumped)
@@ -450,7 +450,7 @@ def test_dump_leaves_out_what_is_none_and_keeps_what_is_zero():
         (b"[controller]\neta = 3.0\neta = 4.0", "is no valid TOML"),
         (b"\x00", "is no valid TOML"),
         (b"\xff\xfe", "is no text in UTF-8"),
-        (b"x = " + 5000 * b"9", ""),  # more digits than Python turns into a number
+        (b"x = " + 5000 * b"9", ""),  # more digits than Python converts to a number
         (None, "is a folder"),
     ],
     ids=["unclosed", "twice", "null", "binary", "digits", "directory"],
@@ -469,7 +469,7 @@ def test_a_file_that_is_not_there_is_named(tmp_path):
     assert str(caught.value) == f"the scenario file {tmp_path / 'none.toml'} is not there"
 
 
-def test_every_kind_of_a_table_is_pickled():
+def test_every_kind_of_a_table_can_be_pickled():
     for tables in COMPLETE:
         parsed = parsing.parse(tables)
         assert pickle.loads(pickle.dumps(parsed)) == parsed, tables

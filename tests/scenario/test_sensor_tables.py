@@ -1,4 +1,4 @@
-"""[[sensors]]: what is read, refused and built."""
+"""The tables [[sensors]]: reading, errors, and the sensors that are built."""
 
 import dataclasses
 
@@ -26,7 +26,7 @@ def read(*sensors, **tables):
     return scenario.from_tables({"loop": LOOP, "sensors": list(sensors), **tables})
 
 
-def test_sensors_are_built_as_the_tables_say():
+def test_the_built_sensors_have_the_numbers_of_the_tables():
     made = read(
         {**TRACKER, "boresight": [1.0, 2.0, -2.0], "period": 0.25, "latency": 0.12},
         {**TRACKER, "rotvec_deg": [10.0, 20.0, 30.0]},
@@ -55,29 +55,29 @@ def test_every_boresight_has_a_mounting(boresight):
     np.testing.assert_allclose(suite.sensors[0].axes() @ suite.sensors[0].axes().T, np.eye(3), atol=1e-14)
 
 
-def test_several_gyros_are_their_mean_weighted_by_their_information():
-    """Two equal ones: every error is smaller by sqrt(2); a much worse one changes little."""
+def test_several_gyros_are_averaged_with_information_weights():
+    """Two equal gyros reduce every error by sqrt(2). A second gyro with far more noise changes little."""
     both = read(TRACKER, GYRO, GYRO).sensors.gyro(0.1)
     np.testing.assert_allclose(both, np.array([1e-6, 1e-5, 1e-8]) / np.sqrt(2.0), rtol=1e-14)
     one = read(TRACKER, GYRO, {**GYRO, "rate_noise": 1e-3, "rate_bias": 1e-4}).sensors.gyro(0.1)
     np.testing.assert_allclose(one, [1e-6, 1e-5, 1e-8], rtol=1e-5)
 
 
-def test_what_is_written_reads_back_to_the_same():
+def test_written_sensors_read_back_to_the_same_tables():
     made = read({**TRACKER, "latency": 0.2}, SUN, GYRO)
     tables = parsing.dump(made)
     assert [table["kind"] for table in tables["sensors"]] == ["star_tracker", "vector_sensor", "gyro"]
     assert parsing.dump(scenario.from_tables(tables)) == tables
 
 
-def test_the_json_schema_allows_them():
+def test_the_json_schema_accepts_sensor_tables():
     valid = jsonschema.Draft202012Validator(json_schema()).is_valid
     assert valid({"loop": LOOP, "sensors": [TRACKER, SUN, GYRO]})
     assert not valid({"loop": LOOP, "sensors": [{**TRACKER, "noise_across": -1.0}, GYRO]})
 
 
-def test_defaults_are_those_of_one_star_tracker_that_says_as_much():
-    """Two alike along one axis say as much as one with the noise over sqrt(2), as [hardware] has it."""
+def test_defaults_follow_from_an_equivalent_star_tracker():
+    """Two equal star trackers are equivalent to one in [hardware] with the noise over sqrt(2)."""
     noise = 2e-5
     tracker = {"kind": "star_tracker", "noise_across": noise, "latency": 0.1}
     suite = read(tracker, {**tracker, "boresight": [0.0, 1.0, 0.0]}, {"kind": "gyro", "rate_noise": 1e-6})
@@ -108,7 +108,7 @@ def custom(**keys):
     return scenario.reading.complete(read(TRACKER, table, GYRO))
 
 
-def test_a_custom_sensor_has_its_keys_and_its_digest():
+def test_a_custom_sensor_has_keys_and_a_checksum():
     made = custom(scale=3.0, latency=0.1)
     sensor = scenario.study(made).parts.sensors.sensors[1]
     assert (sensor.name, float(sensor.scale), sensor.times.wait) == ("own_1", 3.0, 1)

@@ -1,4 +1,4 @@
-"""A system of one's own that flies while law and observer know another one."""
+"""A custom system as the true plant, while law and observer use another system as the design model."""
 
 from dataclasses import replace
 
@@ -39,17 +39,18 @@ TABLES = {
 
 @pytest.fixture(autouse=True)
 def here(tmp_path, monkeypatch):
-    """An empty folder with the systems in my.py, and a process that has run nothing yet."""
+    """An empty folder with the systems in my.py; no custom file counts as run yet."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(systems, "_ran", {})
     (tmp_path / "my.py").write_text(FILE)
     return tmp_path
 
 
-def test_the_truth_flies_under_a_law_that_knows_the_model():
-    """u = -2 x_1 - 1.5 x_2 held, the truth's motion by the matrix exponential.
+def test_the_true_plant_is_simulated_with_a_law_for_the_design_model():
+    """The input u = -2 x_1 - 1.5 x_2 is held, and the true motion follows from the matrix exponential.
 
-    RK4 leaves h^5 / 120 = 8e-8 of its fifth derivative a period, of the order 1, which the loop forgets within ten.
+    The error of RK4 per period is h^5 / 120 = 8e-8 times the fifth derivative, which is about 1. It decays within ten
+    periods.
     """
     parts = scenario.study(scenario.from_tables(TABLES)).parts
     log = rollout.simulate_parts(parts, record=True).log
@@ -67,11 +68,11 @@ def test_the_truth_flies_under_a_law_that_knows_the_model():
 HIDDEN = {**TABLES, "plant": {**TABLES["plant"], "truth": "my.py:late"}}
 
 
-def test_a_truth_with_a_state_that_nobody_sees():
-    """An input that comes late, z' = (u - z) / 0.3 s: the motion of all three states by the matrix exponential.
+def test_a_true_plant_with_a_hidden_state_matches_the_matrix_exponential():
+    """An input with a lag, z' = (u - z) / 0.3 s: all three states follow from the matrix exponential.
 
-    RK4 leaves (h / 0.3)^5 / 120 = 3e-5 of z a period where one step is taken; steps of 0.1 / 0.3 s, which how fast z is
-    asks for, leave less than a millionth.
+    With one step per period, RK4 would have a relative error of (h / 0.3)^5 / 120 = 3e-5 in z. The steps that follow
+    from the rate of z have an error below a millionth.
     """
     ready = scenario.study(scenario.from_tables({**HIDDEN, "hardware": {"state_noise": [0.0, 0.0]}}))
     parts = ready.parts
@@ -93,12 +94,12 @@ def test_a_truth_with_a_state_that_nobody_sees():
     loop = jax.tree.map(lambda v: np.asarray(v)[0], linear.loops_in(parts, course, last))  # with z
     poles = np.abs(np.linalg.eigvals(linear.at_input(loop, 0.0, np).closed()))
     closed = block[:3, :3] + np.outer(block[:3, 3], [-2.0, -1.5, 0.0])
-    slowest = poles[np.abs(poles - 1.0) > margins.NEUTRAL].max()  # without an observer a memory stays as it is
+    slowest = poles[np.abs(poles - 1.0) > margins.NEUTRAL].max()  # without an observer, the memory has a pole at 1
     np.testing.assert_allclose(slowest, np.abs(np.linalg.eigvals(closed)).max(), rtol=1e-5)
 
 
-def test_trials_of_a_truth_with_hidden_states():
-    """Drawn, told in rows and given by them is what sensors see at the start; z begins at z0."""
+def test_dispersions_and_rows_contain_only_visible_states():
+    """Dispersions, rows and run tables contain the visible initial state only; z begins at z0."""
     drawn = {"x0": {"kind": "uniform", "half_width": [0.1, 0.0]}}
     ready = scenario.study(scenario.from_tables({**HIDDEN, "dispersion": drawn}))
     flown = montecarlo.run(ready.parts, ready.dispersion, 0, np.arange(3))
@@ -108,8 +109,8 @@ def test_trials_of_a_truth_with_hidden_states():
     np.testing.assert_allclose(flown.metrics.window_error[2], again.window_error, rtol=1e-12)
 
 
-def test_what_plans_reads_and_exports_a_truth_with_hidden_states_knows_nothing_of_them():
-    """The input along the exact motion is the model's; names and what the C reads are of what sensors see."""
+def test_exact_motion_names_and_exported_code_ignore_hidden_states():
+    """The input along the exact motion uses the design model, and exported C reads visible states only."""
     law = {"t_f": 5.0, "delta": 1.0}
     parts, known = (
         scenario.study(scenario.from_tables({**tables, "controller": law})).parts
@@ -133,27 +134,27 @@ def test_what_plans_reads_and_exports_a_truth_with_hidden_states_knows_nothing_o
         ({"H": lambda t, a, b: a}, "H(t, x_1, x_2, z) fails"),
     ],
 )
-def test_hidden_states_that_cannot_be(changes, said):
+def test_invalid_hidden_states_are_refused(changes, said):
     good = {"H": lambda t, a, b, z: z[:1], "Z": lambda t, a, b, z, u: -z, "z0": [0.0, 1.0]}
     with pytest.raises(ValueError) as caught:  # noqa: PT011
         system(1, lambda t, a, b: b, G=lambda t, a, b: jnp.eye(1), **{**good, **changes})
     assert said in str(caught.value)
 
 
-def test_the_observer_sees_what_the_model_leaves_out():
-    """At rest off the origin the truth pulls by -0.5 x_1: what an observer that knows 1/s^2 takes for a disturbance."""
+def test_the_observer_estimates_the_difference_between_truth_and_model():
+    """At rest off the origin the true plant has the force -0.5 x_1. An observer of a double integrator estimates it."""
     tables = {**TABLES, "observer": {"kind": "nonlinear", "gain": [5.0]}}
     log = rollout.simulate_parts(scenario.study(scenario.from_tables(tables)).parts, record=True).log
     kept = np.asarray(log.has_length)
     x, u, seen = (np.asarray(v)[kept] for v in (log.x, log.u, log.d_hat))
     left_out = -0.5 * x[:, 0] - 0.3 * x[:, 1] + 0.2 * u[:, 0]
-    # the estimate follows at 5 1/s what changes at about 1 1/s: a fifth of its rate, and a period, behind
+    # the estimate has the rate 5 1/s, the force about 1 1/s: the lag is a fifth of the force's rate, plus a period
     late = slice(10, -2)
     assert np.abs(seen[late, 0] - left_out[late]).max() < 0.5 * np.abs(left_out).max()
     assert np.corrcoef(seen[late, 0], left_out[late])[0, 1] > 0.9
 
 
-def test_the_same_system_as_truth_changes_nothing():
+def test_a_true_plant_equal_to_the_model_changes_nothing():
     same = {**TABLES, "plant": {**TABLES["plant"], "truth": "my.py:known"}}
     none = {**TABLES, "plant": {key: value for key, value in TABLES["plant"].items() if key != "truth"}}
     both = [
@@ -167,14 +168,14 @@ def test_the_same_system_as_truth_changes_nothing():
 
 
 @pytest.mark.parametrize("kind", ["terminal", "time_base_pd", "predefined_time"])
-def test_laws_to_compare_with_fly_a_system_by_its_scenario(kind):
-    """How fast a system is along its run is asked of the paper's way, whatever law flies."""
+def test_comparison_laws_control_a_custom_system(kind):
+    """The rates of a system come from the motion under the published law, for every law."""
     tables = {**TABLES, "controller": {"kind": kind, "t_f": 5.0}}
     run = rollout.simulate_parts(scenario.study(scenario.from_tables(tables)).parts)
     assert int(run.status) in rollout.FINISHED
 
 
-def test_a_truth_is_a_program_too():
+def test_a_custom_true_plant_is_reported_as_custom_code():
     loaded = scenario.from_tables(TABLES)
     assert set(own.programs(loaded)) == {"plant.system", "plant.truth"}
     assert set(own.digests(loaded)) == {"system_sha256", "truth_sha256"}
@@ -191,13 +192,13 @@ def test_a_truth_is_a_program_too():
         (3, "plant.truth is 3"),
     ],
 )
-def test_what_is_no_truth_is_refused(truth, said):
+def test_an_invalid_true_plant_is_refused(truth, said):
     with pytest.raises(ScenarioError) as caught:
         scenario.study(scenario.from_tables({**TABLES, "plant": {**TABLES["plant"], "truth": truth}}))
     assert said in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-def test_a_law_cannot_know_what_nobody_sees():
+def test_a_design_model_with_hidden_states_is_refused():
     with pytest.raises(ScenarioError, match=r'plant.system is "my.py:late", which has states that no law knows'):
         scenario.study(scenario.from_tables({**TABLES, "plant": {**TABLES["plant"], "system": "my.py:late"}}))

@@ -1,4 +1,4 @@
-"""Defaults, bounds and designs follow the mission: other units of time and inertia rescale them and change nothing."""
+"""Defaults, bounds and designs scale with the mission: other units of time and inertia only rescale them."""
 
 import tomllib
 from collections.abc import Mapping
@@ -29,7 +29,7 @@ def flat(tables: Any, path: str = "") -> dict[str, Any]:
 @pytest.mark.parametrize("path", SATELLITES, ids=lambda path: path.stem)
 @pytest.mark.parametrize(("inertia", "time"), [(4.0, 1.0), (1.0, 0.25), (0.0625, 16.0)])
 def test_other_units_rescale_every_default_and_every_bound(path, inertia, time):
-    """Powers of 4 leave even square roots exact, so equal means equal but for the last digits of powers."""
+    """Square roots of powers of 4 are exact, so values agree except for rounding in other powers."""
     raw = {**tomllib.loads(path.read_text()), "tune": {}}
     here = parsing.dump(from_tables(raw))
     there = parsing.dump(from_tables(in_units(raw, inertia, time)))
@@ -40,7 +40,7 @@ def test_other_units_rescale_every_default_and_every_bound(path, inertia, time):
 
 
 @pytest.mark.parametrize("law", [law for law in LAWS["spacecraft"] if law != "own"])
-def test_gains_of_every_law_follow_the_mission(law):
+def test_gains_of_every_law_scale_with_the_mission(law):
     raw = tomllib.loads((ROOT / "benchmarks" / "satellites" / "uosat12.toml").read_text())
     raw = {**raw, "controller": {"kind": law, "t_f": raw["controller"]["t_f"]}, "tune": {}}
     here, there = (from_tables(tables) for tables in (raw, in_units(raw, 4.0, 16.0)))
@@ -59,13 +59,13 @@ def test_gains_of_every_law_follow_the_mission(law):
             assert there.search.bounds[name] == pytest.approx(tuple(bounds), rel=1e-12), name
 
 
-def test_a_slew_of_ten_milliseconds_is_taken():
-    """Its run ends 3.3 ms after t_f, not 10 s."""
+def test_a_slew_of_ten_milliseconds_is_accepted():
+    """The run ends 3.3 ms after t_f instead of 10 s."""
     quick = from_tables({"controller": {"t_f": 0.01}, "loop": {"mode": "sampled"}})
     assert quick.loop.t_end == pytest.approx(0.04 / 3.0)
     assert quick.loop.window == pytest.approx(0.01 / 30.0)
 
 
-def test_beyond_all_numbers_is_refused():
+def test_overflowing_defaults_are_refused():
     with pytest.raises(ScenarioError, match=r"controller\.t_f"):
         from_tables({"controller": {"t_f": 1e300}})
