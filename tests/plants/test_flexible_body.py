@@ -1,4 +1,4 @@
-"""The flexible body: against an integration of its own, energy and momentum, how it rings, what a run tells of it."""
+"""The flexible body: an independent integration, energy and momentum, mode frequencies, and metrics of the modes."""
 
 from dataclasses import replace
 from functools import partial
@@ -16,9 +16,9 @@ from ptsmc_jax.plants import flexible_body, rigid_body
 from ptsmc_jax.simulation import control_period
 from tests.helpers import fly, vector
 
-FINE = 40  # steps a period
+FINE = 40  # steps per control period
 EPS = np.finfo(float).eps
-# Di Gennaro's satellite: four modes, full tensor
+# the satellite of Di Gennaro: four modes, full tensor
 INERTIA = np.array([[350.0, 3.0, 4.0], [3.0, 270.0, 10.0], [4.0, 10.0, 190.0]])
 FREQUENCY, DAMPING = [0.7681, 1.1038, 1.8733, 2.5496], [0.0056, 0.0086, 0.013, 0.025]
 COUPLING = [
@@ -53,7 +53,7 @@ def state(seed):
 
 
 def independent(t, y, torque):
-    """The motion by psi = e' + D w, written out in NumPy: q, w, e, psi."""
+    """Return the rates of q, w, e and psi = e' + D w, written out in NumPy."""
     q, w, e, psi = y[:4], y[4:7], y[7:11], y[11:]
     D, W, z = np.array(COUPLING), np.array(FREQUENCY), np.array(DAMPING)
     moved = 2 * z * W * psi + W**2 * e - 2 * z * W * (D @ w)
@@ -66,12 +66,12 @@ def independent(t, y, torque):
 
 @pytest.fixture(scope="module")
 def flown():
-    """A sampled run of the satellite, with steps that leave some 1e-11: 0.025 rad of the fastest mode each."""
+    """A sampled run of the satellite with steps of 0.025 rad of the fastest mode: their error is about 1e-11."""
     ready = scenario.study(scenario.from_tables(SATELLITE))
     return runs.fly(replace(ready, parts=replace(ready.parts, substeps=FINE)))
 
 
-def test_a_run_is_that_of_an_independent_integration(flown):
+def test_a_run_matches_an_independent_integration(flown):
     log, D = flown.log, np.array(COUPLING)
     modes = log.x.modes
     y = np.concatenate([log.x.q[0], log.x.w[0], np.zeros(4), D @ log.x.w[0]])
@@ -83,11 +83,11 @@ def test_a_run_is_that_of_an_independent_integration(flown):
         np.testing.assert_allclose(log.x.w[k + 1], y[4:7], rtol=0, atol=1e-9)
         np.testing.assert_allclose(modes.e[k + 1], y[7:11], rtol=0, atol=1e-9)
         np.testing.assert_allclose(modes.rate[k + 1], y[11:] - D @ y[4:7], rtol=0, atol=1e-9)
-    assert np.abs(modes.e).max() > 1e-3  # they did ring
+    assert np.abs(modes.e).max() > 1e-3  # the modes were excited
 
 
-def test_the_steps_that_a_study_takes_keep_the_modes_to_a_millionth(flown):
-    """The torques that were flown, by a study's steps; what these leave of the loop's motion: below."""
+def test_default_steps_keep_modes_accurate_to_a_millionth_for_given_torques(flown):
+    """The torques of the run are applied with the default steps. The test below includes the loop."""
     made, log = scenario.study(scenario.from_tables(SATELLITE)).parts, flown.log
     actuators = made.actuators
     assert 1 < made.substeps < 20
@@ -107,9 +107,9 @@ def test_the_steps_that_a_study_takes_keep_the_modes_to_a_millionth(flown):
     np.testing.assert_allclose(found.q, log.x.q[1:], rtol=0, atol=1e-7)
 
 
-@pytest.mark.long  # by themselves: above
-def test_the_steps_that_a_study_takes_keep_the_loops_modes_to_a_millionth(flown):
-    """0.1 rad a step of RK4 is off by 0.1^5 / 120 of a mode each: 4e-5 over some 500, of 0.1 that they reach."""
+@pytest.mark.long  # the test above covers the modes alone
+def test_default_steps_keep_modes_accurate_to_a_millionth_in_the_loop(flown):
+    """A step of 0.1 rad has a relative error of 0.1^5 / 120 in RK4, so 500 steps have an error of 4e-5."""
     found = runs.fly(scenario.study(scenario.from_tables(SATELLITE)))
     assert 1 < found.parts.substeps < 20
     np.testing.assert_allclose(found.log.x.modes.e, flown.log.x.modes.e, rtol=0, atol=1e-5)
@@ -138,12 +138,12 @@ def test_a_rigid_body_has_no_metrics_of_modes():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_free_energy_falls_by_what_dampers_take_and_momentum_stays(seed):
+def test_free_motion_loses_the_damped_energy_and_conserves_momentum(seed):
     plant, x = body(), state(seed)
     x_dot = plant.rate(vector(0.0), x, jnp.zeros(3), jnp.zeros(3))
     momentum, turned = jax.jvp(plant.momentum, (x,), (x_dot,))
     scale = float(jnp.linalg.norm(momentum)) * np.linalg.norm(x.w) + float(jnp.linalg.norm(plant.force(x.modes))) * 10
-    # in inertial axes it does not change: h' = -w x h in the body's
+    # the momentum is constant in inertial axes: h' = -w x h in body axes
     np.testing.assert_allclose(turned, -np.cross(x.w, momentum), rtol=0, atol=50 * EPS * scale)
     energy, falls = jax.jvp(plant.energy, (x,), (x_dot,))
     taken = 2.0 * np.sum(np.array(DAMPING) * FREQUENCY * np.asarray(x.modes.rate) ** 2)
@@ -162,30 +162,30 @@ def coast(plant, x, end, count):
     return jax.lax.scan(step, x, jnp.arange(count))
 
 
-def test_energy_never_grows():
+def test_energy_of_free_motion_never_grows():
     _, energies = coast(body(), state(1), 60.0, 6000)
     assert np.all(np.diff(energies) <= 0.0)
 
 
-def test_a_free_undamped_mode_rings_at_its_frequency_over_the_root_of_what_is_left_of_the_body():
+def test_a_free_undamped_mode_has_the_frequency_of_the_formula():
     J, d, W = np.array([12.0, 9.0, 11.0]), 1.7, 3.0
     plant = flexible_body.flexible(J, [W], [0.0], [[d, 0.0, 0.0]])
     omega = W / np.sqrt(1 - d**2 / J[0])
     rest = plant.with_hidden_at_rest(rigid_body.AttitudeState(vector([0.0, 0.0, 0.0, 1.0]), jnp.zeros(3)))
     start = rest._replace(modes=flexible_body.Modes(vector([0.1]), vector([0.0])))
     count, turns = 20_000, 20
-    # RK4 lags by (omega h)^4 / 120 of the phase: 1.3e-11 at 1000 steps a turn
+    # the relative phase error of RK4 is (omega h)^4 / 120: 1.3e-11 with 1000 steps per period
     x, _ = coast(plant, start, 2 * np.pi * turns / omega, count)
     off = np.arctan2(-float(x.modes.rate[0]) / omega, float(x.modes.e[0]))
     assert abs(off) / (2 * np.pi * turns) < 1e-8
-    np.testing.assert_allclose(float(x.modes.e[0]), 0.1, rtol=1e-6)  # and does not decay
+    np.testing.assert_allclose(float(x.modes.e[0]), 0.1, rtol=1e-6)  # no decay
     from ptsmc_jax import formulas
 
     np.testing.assert_allclose(formulas.free_modes(np.diag(J), [W], [[d, 0.0, 0.0]]), [omega], rtol=1e-12)
 
 
-@pytest.mark.long  # with coupling: the independent integration above
-def test_without_coupling_it_flies_as_a_rigid_body():
+@pytest.mark.long  # the independent integration above has coupling
+def test_a_flexible_body_without_coupling_moves_like_a_rigid_body():
     uncoupled = {**SATELLITE, "flexible": {**SATELLITE["flexible"], "coupling": [[0.0] * 3] * 4}}
     ready = scenario.study(scenario.from_tables(uncoupled))
     rigid = scenario.study(scenario.from_tables({k: v for k, v in SATELLITE.items() if k != "flexible"}))
@@ -196,7 +196,7 @@ def test_without_coupling_it_flies_as_a_rigid_body():
     assert np.all(one.log.x.modes.e == 0.0)
 
 
-def test_a_drawn_inertia_moves_what_is_left_and_one_that_leaves_nothing_is_marked():
+def test_a_random_inertia_changes_the_rigid_rest_and_impossible_bodies_are_marked():
     plant = body()
     drawn = plant.with_inertia(*(vector(v) for v in (1.1 * INERTIA, np.linalg.inv(1.1 * INERTIA))))
     rest = 1.1 * INERTIA - np.array(COUPLING).T @ np.array(COUPLING)
@@ -209,15 +209,15 @@ def test_a_drawn_inertia_moves_what_is_left_and_one_that_leaves_nothing_is_marke
 
 
 @pytest.mark.parametrize("too_far", [(0,), (1,), (2,), (0, 1), (0, 2), (1, 2), (0, 1, 2)])
-def test_a_body_whose_modes_weigh_more_than_it_does_about_some_axes_is_none(too_far):
-    """About two of them J - D'D has a positive determinant again."""
+def test_modes_with_more_inertia_than_the_body_are_refused(too_far):
+    """With two such axes, the determinant of J - D'D is positive again."""
     coupling = np.diag([1.5 if axis in too_far else 0.5 for axis in range(3)])
     plain = flexible_body.flexible(4.0 * np.eye(3), [1.0] * 3, [0.01] * 3, coupling)
     one = vector(np.eye(3))
     assert np.all(np.isnan(plain.with_inertia(one, one).rest_inverse))
 
 
-def test_moved_and_apart_are_inverse():
+def test_moved_and_apart_are_inverse_functions():
     plant, x = body(), state(2)
     by = vector(1e-7 * np.random.default_rng(0).normal(size=14))
     np.testing.assert_allclose(plant.local_coordinates(x, plant.retract(x, by)), by, rtol=0, atol=1e-14)

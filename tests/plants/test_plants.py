@@ -19,7 +19,7 @@ EPS = np.finfo(float).eps
 
 
 def random_body(seed):
-    """A tensor that a body has: the sum of m (|r|^2 I - r r') over points."""
+    """Return the inertia of random point masses, the sum of m (|r|^2 I - r r')."""
     points = np.random.default_rng(seed).normal(size=(6, 3)) * [1.0, 2.0, 0.5]
     return sum((r @ r) * np.eye(3) - np.outer(r, r) for r in points)
 
@@ -31,7 +31,7 @@ INERTIAS = [np.diag(PAPER_INERTIA), np.array(FULL_INERTIA), random_body(0), rand
 
 
 @pytest.mark.parametrize("inertia", INERTIAS)
-def test_rate_is_eulers_equation(inertia):
+def test_the_rate_follows_eulers_equation(inertia):
     rng = np.random.default_rng(4)
     body = rigid_body.spacecraft(inertia)
     for _ in range(5):
@@ -70,7 +70,7 @@ def coast(body, x, end, count):
 
 
 @pytest.mark.parametrize("inertia", INERTIAS)
-def test_free_motion_conserves_momentum_and_energy_to_order_4(inertia):
+def test_free_motion_conserves_momentum_and_energy_with_order_4(inertia):
     body, rotation = rigid_body.spacecraft(inertia), Rotation.from_rotvec([0.3, -2.0, 1.0])
     w, end = np.array([0.3, -0.5, 0.4]), 40.0
     start = rigid_body.AttitudeState(vector(rotation.as_quat()), vector(w))
@@ -88,36 +88,36 @@ def test_free_motion_conserves_momentum_and_energy_to_order_4(inertia):
                 abs(q @ q - 1),
             ]
         )
-        # the remainder of a step of RK4 is (rate h)^5/120 with rates of |w| times the spread of the moments
+        # the error of an RK4 step is (rate h)^5/120, with rates of |w| times the spread of the moments
         moments = np.linalg.eigvalsh(inertia)
         rate = np.linalg.norm(w) * max(1.0, (moments[2] - moments[0]) / moments[0])
         assert max(drifts[-1]) <= end * rate * (rate * end / count) ** 4 / 120
-    # the momentum's drift falls by 2^4, up to the next term, and is still truncation
+    # the drift of the momentum falls by 2^4, except for the next term, and is still above rounding
     assert drifts[1][0] > 1e4 * EPS
     np.testing.assert_allclose(drifts[0][0] / drifts[1][0], 16.0, atol=0.5)
-    assert np.linalg.norm(np.asarray(x.w) - w) > 0.1  # it did move
+    assert np.linalg.norm(np.asarray(x.w) - w) > 0.1  # the rate changed
 
 
-def test_the_body_is_turned_by_its_rate():
+def test_a_principal_spin_matches_the_exact_attitude():
     # a principal spin: q exp(w t) exactly, body axes on the right
     body, w = rigid_body.spacecraft(PAPER_INERTIA), np.array([0.0, 0.2, 0.0])
     start = Rotation.from_rotvec([1.0, 0.2, -0.5])
     x = coast(body, rigid_body.AttitudeState(vector(start.as_quat()), vector(w)), 10.0, 100)
     end = (start * Rotation.from_rotvec(w * 10.0)).as_quat()
     np.testing.assert_allclose(x.w, w, rtol=0, atol=4 * EPS)
-    # (|w|/2 h)^5/120 a step
+    # the error per step is (|w|/2 h)^5/120
     np.testing.assert_allclose(x.q * np.sign(x.q[3]), end * np.sign(end[3]), rtol=0, atol=100 * 0.01**5 / 120)
 
 
 @pytest.mark.parametrize("dt", [0.02, 0.5, 4.0])
-def test_a_body_that_turns_more_than_a_radian_in_a_step_is_too_fast(dt):
+def test_a_rotation_of_more_than_a_radian_per_step_is_too_fast(dt):
     body, still = rigid_body.spacecraft(PAPER_INERTIA), vector([0.0, 0.0, 0.0, 1.0])
     for turn, too_fast in ((0.99, False), (1.01, True)):
         w = turn / dt * vector([0.6, 0.0, -0.8])
         assert bool(body.too_fast(rigid_body.AttitudeState(still, w), vector(dt))) == too_fast
 
 
-def test_normalise_restores_the_norm_alone():
+def test_normalise_changes_only_the_norm():
     x = rigid_body.AttitudeState(vector([0.1, 0.2, -0.3, 0.4]), vector([1.0, 2.0, 3.0]))
     got = rigid_body.spacecraft(PAPER_INERTIA).normalise(x)
     np.testing.assert_allclose(got.q, np.array([1, 2, -3, 4]) / np.sqrt(30), rtol=4 * EPS)
@@ -137,11 +137,11 @@ def test_the_spacecraft_is_a_frozen_pytree_of_arrays():
         body.inertia = jnp.eye(3)  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def test_three_moments_are_a_diagonal_tensor():
+def test_three_moments_give_a_diagonal_tensor():
     np.testing.assert_array_equal(formulas.check_inertia([1, 2, 2.5]), np.diag([1, 2, 2.5]))
 
 
-# which inertias there are
+# possible inertias
 
 ALLOWED = {
     "sphere": (1, 1, 1),
@@ -162,18 +162,18 @@ ROTATIONS = [np.eye(3), *Rotation.random(3, rng=np.random.default_rng(8)).as_mat
 
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
 @pytest.mark.parametrize("moments", ALLOWED.values(), ids=list(ALLOWED))
-def test_bodies_that_exist_are_allowed_in_any_size_and_axes(moments, scale):
+def test_possible_inertias_are_accepted_at_any_scale_and_orientation(moments, scale):
     for order in itertools.permutations(moments):
         for rotation in ROTATIONS:
             tensor = scale * rotation @ np.diag(order) @ rotation.T
-            # made symmetric at most, by an eps
+            # the tensor may be made symmetric, a change of one eps
             rounding = 8 * EPS * scale * max(order)
             np.testing.assert_allclose(formulas.check_inertia(tensor), tensor, rtol=0, atol=rounding)
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
 @pytest.mark.parametrize(("moments", "reason"), REFUSED.values(), ids=list(REFUSED))
-def test_bodies_that_cannot_exist_are_refused_in_any_size_and_axes(moments, reason, scale):
+def test_impossible_inertias_are_refused_at_any_scale_and_orientation(moments, reason, scale):
     for order in itertools.permutations(moments):
         for rotation in ROTATIONS:
             tensor = scale * rotation @ np.diag(order) @ rotation.T
@@ -195,7 +195,7 @@ def test_bodies_that_cannot_exist_are_refused_in_any_size_and_axes(moments, reas
         ([[2e-7, 1e-9, 0], [0.0, 2e-7, 0], [0, 0, 2e-7]], "symmetric"),
     ],
 )
-def test_what_is_no_inertia_is_refused(inertia, reason):
+def test_values_that_are_no_inertia_are_refused(inertia, reason):
     for build in (formulas.check_inertia, rigid_body.spacecraft):
         with pytest.raises(ValueError, match=reason):
             build(inertia)
@@ -213,7 +213,7 @@ HELD = {0.1: (1.3e-12, 9e-15, 1e-13), 0.2: (4e-11, 1e-12, 2e-12), 0.5: (4e-9, 3e
 
 
 @pytest.mark.parametrize("rate", HELD)
-def test_a_control_period_of_twenty_hertz_needs_one_step(rate):
+def test_one_step_per_period_suffices_at_twenty_hertz(rate):
     body, inertia = rigid_body.spacecraft(PAPER_INERTIA), np.diag(PAPER_INERTIA)
     w0 = rate * np.array([1.0, -0.7, 0.5]) / np.linalg.norm([1.0, -0.7, 0.5])
     start = rigid_body.AttitudeState(vector([0.0, 0.0, 0.0, 1.0]), vector(w0))
@@ -226,14 +226,14 @@ def test_a_control_period_of_twenty_hertz_needs_one_step(rate):
     truth = solve_ivp(derivative, (0, 100), [0, 0, 0, 1, *w0], method="DOP853", rtol=1e-13, atol=1e-15).y[:, -1]
     short, long = coast(body, start, 100.0, 2000), coast(body, start, 500.0, 10_000)
     error, norm, momentum = HELD[rate]
-    # the notes' runs had other axes: half as much again
+    # the runs of the notes had other axes, so 50 % more is allowed
     assert np.abs(np.concatenate([short.q, short.w]) - truth).max() < 1.5 * error
     assert abs(np.linalg.norm(long.q) - 1) < 1.5 * norm
     now = Rotation.from_quat(np.asarray(long.q)).apply(inertia @ np.asarray(long.w))
     assert np.linalg.norm(now - inertia @ w0) / np.linalg.norm(inertia @ w0) < 1.5 * momentum
 
 
-# of any plant
+# all plants
 
 
 ARM = second_order.system(
@@ -256,17 +256,17 @@ PLANTS = {
 
 
 @pytest.mark.parametrize("name", PLANTS)
-def test_input_for_an_acceleration_gives_it_and_what_is_unexplained_is_the_disturbance(name):
+def test_the_input_for_an_acceleration_and_the_unexplained_torque_are_consistent(name):
     plant, x = PLANTS[name]
     t, (w_dot, d) = vector(0.6), np.random.default_rng(5).normal(size=(2, plant.inputs))
     u = plant.input_for(t, x, vector(w_dot), vector(d))
     x_dot = plant.rate(t, x, u, vector(d))
-    unit = 100 * EPS * np.linalg.norm(plant.inertia)  # some ten sums of numbers of the order of it
+    unit = 100 * EPS * np.linalg.norm(plant.inertia)  # rounding of about ten sums of such numbers
     np.testing.assert_allclose(plant.velocity(x_dot), w_dot, rtol=0, atol=unit)
     np.testing.assert_allclose(plant.unexplained(t, x, x_dot, u), d, rtol=0, atol=unit)
 
 
-def test_indices_beyond_an_argument_are_seen_beside_plain_numbers_and_others_left_alone():
+def test_only_indices_out_of_range_are_reported():
     given = {"a": vector([1.0, 2.0, 3.0])}, 2.0
     for beyond in (3, -4):
         with pytest.raises(IndexError, match=f"index {beyond} is out of bounds"):

@@ -1,4 +1,4 @@
-"""Systems of one's own under law (29): the spacecraft and a two-link arm written as such, singular runs, files."""
+"""Custom systems with law (29): the spacecraft and a two-link arm as systems, singular runs, and files."""
 
 import re
 import sys
@@ -33,7 +33,7 @@ SPIN = references.Spin(vector(0.1, -0.2, 0.1, np.sqrt(1 - 0.06)), vector(0.02, -
 
 
 def spacecraft_as_system(reference, inertia=FULL_INERTIA):
-    """The error eps_1 and the body rate as x_1 and x_2: only the kinematics, nothing differentiated by hand."""
+    """Write a spacecraft as a system: x_1 is the error eps_1, x_2 the body rate, without derivatives by hand."""
     tensor = vector(inertia)
     inverse = jnp.linalg.inv(tensor)
 
@@ -53,7 +53,7 @@ def spacecraft_as_system(reference, inertia=FULL_INERTIA):
 
 
 def as_system(run, reference):
-    """The same run with the spacecraft written as a system: K1 of (29) is half of (60)'s."""
+    """Return the same run with the spacecraft written as a system: K1 of (29) is half of K1 of (60)."""
     model, law = spacecraft_as_system(reference), run.controller
     error, _ = law.kinematics.errors(run.initial, reference(vector(0.0)))
     return replace(
@@ -73,14 +73,14 @@ torque = jax.jit(commanded)
 
 @jax.jit
 def looked_at(model, t, x, u):
-    """Slope, acceleration without force, mass matrix and generalised force of a system."""
+    """Return dF/dx_2, acceleration without force, mass matrix and generalised force of a system."""
     force = model.generalised_force(t, x, u)
     return model.slope(t, x), model.coasting_acceleration(t, x), model.mass(t, x), force
 
 
 @pytest.mark.parametrize("hold", [False, True])
 @pytest.mark.parametrize("seed", short(range(4), [0]))
-def test_law_for_a_system_is_the_hand_written_law_and_its_jacobians_those_derived_by_hand(seed, hold):
+def test_law_and_jacobians_of_a_system_match_those_derived_by_hand(seed, hold):
     rng = np.random.default_rng(seed)
     run = parts(20.0, 3.5, 0.5, inertia=FULL_INERTIA, reference=SPIN, k1=1.7, sign_width=0.1, surface_rate=1.3)
     own = as_system(run, SPIN)
@@ -93,7 +93,7 @@ def test_law_for_a_system_is_the_hand_written_law_and_its_jacobians_those_derive
     found, surface = torque(own.controller, t, phase, state, t, d_hat, k2)
     np.testing.assert_allclose(surface, s, rtol=0, atol=1e-12)
     np.testing.assert_allclose(found, u, rtol=0, atol=1e-11)  # terms of some 10 N m
-    # by hand: dF/dx2 = T / 2, and what no acceleration makes of x_1'': -|w|^2 v / 4 - q_1f'' (58)
+    # by hand: dF/dx2 = T / 2, and x_1'' without acceleration is -|w|^2 v / 4 - q_1f'' (58)
     slope, coasting, mass, force = looked_at(own.plant, t, state, u)
     np.testing.assert_allclose(slope, 0.5 * attitude.t_matrix(x.q), rtol=0, atol=1e-15)
     by_hand = -0.25 * (x.w @ x.w) * x.q[:3] - jax.jit(lambda t: SPIN(t).vector_rates()[1])(t)
@@ -104,11 +104,11 @@ def test_law_for_a_system_is_the_hand_written_law_and_its_jacobians_those_derive
 
 @pytest.mark.long  # laws and observers at one state: the test above, `test_observers_others.py`
 @pytest.mark.parametrize("period", [None, 0.05])
-def test_a_spacecraft_written_as_a_system_flies_the_hand_written_trajectory(period):
+def test_a_spacecraft_written_as_a_system_gives_the_same_trajectory(period):
     start = vector(0.4, -0.3, 0.2, np.sqrt(1 - 0.29))
     others = {"inertia": FULL_INERTIA, "reference": SPIN, "q": start, "sign_width": 0.05, "delta": 0.4}
     run = parts(8.0, 3.0, period=period, **others)
-    # x_1 and q are integrated as different equations: what differs is the error of the steps
+    # x_1 and q follow from different equations, so the integration errors differ
     run = finer(run, 8) if period is None else replace(run, substeps=4)
     one, other = (fly(r) for r in (run, as_system(run, SPIN)))
     assert one.status == other.status == rollout.OK
@@ -134,9 +134,9 @@ def arm_tables(**changes):
     return {name: {**table, **changes.get(name, {})} for name, table in tables.items()}
 
 
-@pytest.mark.long  # its mass matrix: the books of energy below; exact motions of a system: Newton's below
-def test_arm_follows_the_exact_solution_without_a_disturbance():
-    """A mass matrix by the book: the error moves as solution 1 says whatever M, C and g are."""
+@pytest.mark.long  # tests below cover the mass matrix and exact motions of a system
+def test_the_arm_follows_the_exact_solution_without_a_disturbance():
+    """With a mass matrix from a textbook, the error follows exact solution 1 for any M, C and g."""
     tables = arm_tables(controller={"disturbance_rate_bound": 0.0})
     ready = scenario.study(scenario.from_tables({**tables, "disturbance": {"kind": "none"}}))
     result = fly(ready.parts)
@@ -144,26 +144,26 @@ def test_arm_follows_the_exact_solution_without_a_disturbance():
     start = ready.parts.controller.kinematics.errors(ready.parts.initial, vector(0.0))
     exact = errors_along(result.log.t, vector(3.0), vector(3.0), *start)
     np.testing.assert_allclose(result.log.error[before], exact.error[before], rtol=0, atol=1e-8)  # of the default grid
-    # and the torque of the exact motion is the one flown, down to the feedback gain times that
+    # the torque is that of the exact motion, within the feedback gain times the error of the state
     u = inputs_along(ready.parts, result.log.t)[before]
     assert np.abs(u - result.log.u[before]).max() < 1e-8 * 9.0 / 0.05**2
 
 
 @pytest.mark.parametrize("mode", short(["continuous", "sampled"], ["sampled"]))
-def test_arm_stays_inside_its_envelope(mode):
+def test_the_arm_stays_inside_its_envelope(mode):
     ready = scenario.study(scenario.from_tables(arm_tables(loop={"mode": mode, "period": 0.002})))
     result = fly(ready.parts)
     assert result.status == rollout.OK
     before = result.log.t < 2.949
     size = np.linalg.norm(result.log.error[before], axis=1)
     limit = envelopes.error_bound(ready.parts, result.log.t[before])
-    slack = 0.0 if mode == "continuous" else 1e-3  # a period's hold of torques that change by some 10 N m/s
+    slack = 0.0 if mode == "continuous" else 1e-3  # torques change by about 10 N m/s and are held for a period
     assert np.all(size <= limit * (1 + 1e-9) + slack)
     assert result.metrics.window_error < 5e-3
 
 
-def test_mass_matrix_and_coriolis_of_the_arm_keep_the_books_of_energy():
-    """Lagrange: C q' = M' q' - d(q' M q' / 2)/dq, by automatic differentiation of the mass matrix."""
+def test_coriolis_forces_of_the_arm_match_the_lagrangian():
+    """Lagrange's equation C q' = M' q' - d(q' M q' / 2)/dq holds, by automatic differentiation of the mass matrix."""
     ready = scenario.study(scenario.from_tables(arm_tables()))
     arm: Any = ready.parts.plant
     rng = np.random.default_rng(3)
@@ -174,13 +174,13 @@ def test_mass_matrix_and_coriolis_of_the_arm_keep_the_books_of_energy():
         def lagrangian_force(q, rate=rate):
             return 0.5 * rate @ mass(q) @ rate
 
-        # C q' = M' q' - d(q' M q'/2)/dq, the rest of `load` is gravity: what is left at rest
+        # C q' = M' q' - d(q' M q'/2)/dq; the rest of `load`, its value at rest, is gravity
         m_dot = jax.jvp(mass, (q,), (rate,))[1]
         coriolis = m_dot @ rate - jax.grad(lagrangian_force)(q)
         np.testing.assert_allclose(load(q, rate) - load(q, 0 * rate), coriolis, rtol=0, atol=1e-14)
 
 
-def test_jacobians_of_the_arm_are_those_derived_by_hand():
+def test_jacobians_of_the_arm_match_those_derived_by_hand():
     arm: Any = scenario.study(scenario.from_tables(arm_tables())).parts.plant
     t, x = vector(0.7), vector(0.3, -0.2, 0.5, 0.1)
     np.testing.assert_array_equal(arm.slope(t, x), np.eye(2))
@@ -191,7 +191,7 @@ def test_jacobians_of_the_arm_are_those_derived_by_hand():
 
 @pytest.mark.parametrize("mode", short(["continuous", "sampled"], ["sampled"]))
 def test_a_run_that_meets_a_singular_input_gain_is_marked_with_the_time(mode):
-    """The input gain is x_1 - 0.2, alone or across the diagonal of a matrix, and x_1 goes from 0.5 to 0."""
+    """The input gain x_1 - 0.2, alone or off the diagonal of a matrix, is singular on the way of x_1 from 0.5 to 0."""
 
     def F(t, x_1, x_2):  # noqa: N802
         return x_2
@@ -207,7 +207,7 @@ def test_a_run_that_meets_a_singular_input_gain_is_marked_with_the_time(mode):
 
     one = second_order.system(1, F, H, G)
     two = second_order.system(2, lambda t, a, b: b, lambda t, a, b: 0 * a, swapped)
-    t = np.linspace(0.0, 4.9, 4000)  # solution 1 says when x_1 is 0.2
+    t = np.linspace(0.0, 4.9, 4000)  # exact solution 1 gives the time of x_1 = 0.2
     x = errors_along(t, vector(5.0), vector(3.0), vector([0.5]), vector([0.0])).error[:, 0]
     model, x0 = (one, [0.5, 0.0]) if mode == "continuous" else (two, [0.5, 0.3, 0.0, 0.0])
     run = study(model, x0, controller={"disturbance_bound": 0.0}, loop={"mode": mode, "period": 0.05}).parts
@@ -224,8 +224,8 @@ CURVED = second_order.system(2, no_linear_rate, lambda t, a, b: -b, lambda t, a,
 AT_FIRST = (0.4, -0.2, 0.3, 0.1)
 
 
-def test_newton_finds_x_2_where_x_1_dot_is_no_linear_function_of_it():
-    """And the law, there, asks for the input that keeps it on the exact motion."""
+def test_newton_finds_x_2_of_a_nonlinear_rate():
+    """The law then commands the input of the exact motion."""
     law = PrescribedTime(SecondOrderKinematics(CURVED), *(vector(v) for v in (5.0, 3.0, 0.1, 1.0, 1e-3, 1.0)))
     start, none_known = vector(AT_FIRST), jnp.zeros(2)
     begun = law.kinematics.errors(start, vector(0.0))
@@ -247,11 +247,11 @@ def test_newton_finds_x_2_where_x_1_dot_is_no_linear_function_of_it():
     np.testing.assert_array_equal(x[:, :2], error)
     found = np.sinh(x[:, 2:]) - 0.1 * np.sin(t)[:, None] + 0.2 * x[:, 1::-1]
     np.testing.assert_allclose(found, rate, rtol=0, atol=1e-14)
-    np.testing.assert_allclose(u, exact, rtol=0, atol=1e-12)  # gains of up to 225 times rounding
+    np.testing.assert_allclose(u, exact, rtol=0, atol=1e-12)  # rounding times gains of up to 225
 
 
-@pytest.mark.long  # at states of the exact motion: above
-def test_a_run_flies_by_the_x_2_that_newton_finds():
+@pytest.mark.long  # the test above covers states of the exact motion
+def test_a_run_uses_the_x_2_that_newton_finds():
     tables = {"plant": {"kind": "system", "system": CURVED, "x0": list(AT_FIRST)}, "controller": {"delta": 0.1}}
     ready = scenario.study(scenario.from_tables({**tables, "observer": {"kind": "nonlinear"}}))
     quiet = replace(ready.parts.observer, disturbance_rate_bound=vector(0.0))
@@ -262,7 +262,7 @@ def test_a_run_flies_by_the_x_2_that_newton_finds():
     assert np.abs(u - log.u[before]).max() < 1e-6
 
 
-def test_what_is_no_system_is_refused_in_one_sentence():
+def test_an_invalid_system_is_refused_in_one_sentence():
     def F(t, x_1, x_2):  # noqa: N802
         return x_2
 
@@ -274,11 +274,11 @@ def test_what_is_no_system_is_refused_in_one_sentence():
     with pytest.raises(ValueError, match=r"H\(t, x_1, x_2\) fails for x_1 and x_2 of shape \(2,\)"):
         second_order.system(2, F, lambda t, x: x, G)
     with pytest.raises(ValueError, match=r"^H\(t, x_1, x_2\) fails .*: IndexError: index 2 is out of bounds [^\n]*$"):
-        second_order.system(2, F, lambda t, a, b: -a * b[2], G)  # JAX takes b[1]
+        second_order.system(2, F, lambda t, a, b: -a * b[2], G)  # JAX clamps the index to b[1]
     second_order.system(2, F, lambda t, a, b: -a * b[jnp.argmax(a)] - b[jnp.array([1, 0])], G)
     with pytest.raises(ValueError, match="n is 0"):
         second_order.system(0, F, F, G)
-    for size in (1.0, 1e-9):  # of small systems too
+    for size in (1.0, 1e-9):  # also for small numbers
         with pytest.raises(ValueError, match="inertia must be a symmetric, positive definite"):
             second_order.system(2, F, F, G, inertia=size * np.array([[1.0, 5.0], [0.0, 1.0]]))
     with pytest.raises(ValueError, match="inertia must be a symmetric, positive definite"):
@@ -316,7 +316,7 @@ def test_what_is_no_system_is_refused_in_one_sentence():
         ({"kind": "system", "system": ARM, "order": 2}, "plant.order is not a known key"),
     ],
 )
-def test_scenarios_that_name_no_system_are_refused(plant, said):
+def test_invalid_system_names_are_refused(plant, said):
     with pytest.raises(ScenarioError) as error:
         scenario.study(scenario.from_tables({"plant": plant}))
     assert said in str(error.value)
@@ -333,12 +333,12 @@ def test_scenarios_that_name_no_system_are_refused(plant, said):
         ({"controller": {"error": "multiplicative"}}, "controller.error is not a known key"),
     ],
 )
-def test_keys_of_a_system_are_checked_against_its_size(changes, said):
+def test_keys_of_a_system_must_have_its_size(changes, said):
     with pytest.raises(ScenarioError, match="^" + re.escape(said)):
         scenario.from_tables(arm_tables(**changes))
 
 
-def test_a_system_made_in_python_survives_a_change_and_one_in_a_file_is_found_beside_its_scenario(tmp_path: Path):
+def test_systems_from_python_and_from_files_survive_replace(tmp_path: Path):
     made = one()
     tables = {"plant": {"kind": "system", "system": made, "x0": [0.1, 0.0]}}
     changed = scenario.study(scenario.replace(scenario.from_tables(tables), controller__eta=4.0))
@@ -347,7 +347,7 @@ def test_a_system_made_in_python_survives_a_change_and_one_in_a_file_is_found_be
     (tmp_path / "my.py").write_text((ROOT / "scenarios" / "two_link_arm.py").read_text())
     (tmp_path / "my.toml").write_text('[plant]\nkind = "system"\nsystem = "my.py:arm"\nx0 = [1, 1, 0, 0]\n')
     first, other = (scenario.study(scenario.read(tmp_path / "my.toml")) for _ in range(2))
-    assert first.parts.plant is other.parts.plant  # one program for all its runs
+    assert first.parts.plant is other.parts.plant  # one compiled program for all runs
     assert first.parts.plant.inputs == 2
 
 
@@ -363,7 +363,7 @@ FAST = [one(H=lambda t, a, b: -60 * b), one(H=lambda t, a, b: -2500 * a)]
 
 
 @pytest.mark.parametrize("system", short(FAST, FAST[1:]))
-def test_steps_follow_the_modes_of_a_fast_plant(system):
+def test_steps_follow_the_fast_modes_of_a_plant(system):
     loop = {"loop": {"mode": "sampled", "period": 0.05}, "controller": {"delta": 0.3, "disturbance_bound": 0.0}}
     run = study(system, [1.0, 0.0], **loop).parts
     ours, finer_steps = fly(run), fly(replace(run, substeps=8 * run.substeps))
@@ -374,7 +374,7 @@ def test_steps_follow_the_modes_of_a_fast_plant(system):
 
 
 @pytest.mark.parametrize("w", short([10.0, 20.0], [20.0]))
-def test_steps_follow_what_time_does_to_a_system(w):
+def test_steps_follow_the_explicit_time_of_a_system(w):
     system = one(F=lambda t, a, b: b - jnp.cos(w * t))
     tables = {"controller": {"t_f": 30.0, "disturbance_bound": 0.0}}
     run = study(system, [1.0, 0.0], **tables).parts
@@ -382,13 +382,13 @@ def test_steps_follow_what_time_does_to_a_system(w):
     np.testing.assert_allclose(ours.window_error, theirs.window_error, rtol=0.02)
 
 
-def test_the_boundary_layer_is_resolved_wherever_the_run_leads():
+def test_steps_resolve_the_boundary_layer_along_the_whole_run():
     steep = {"controller": {"disturbance_bound": 1.0, "sign_width": 1e-2}}
     with pytest.raises(ScenarioError, match=r"^controller\.sign_width is 0\.01, but must be larger"):
         study(one(D=lambda t, a, b: jnp.eye(1) * (1 + 99 * jnp.tanh(t))), [1.0, 0.0], **steep)
 
 
-# inputs in different units, and a disturbance that acts on one of two
+# inputs in different units, and a disturbance on one of two inputs
 HALF = second_order.system(
     2,
     lambda t, a, b: b,
@@ -407,7 +407,7 @@ BOTH = second_order.system(2, lambda t, a, b: b, lambda t, a, b: 0 * a, lambda t
         (HALF, [1.0, 0.2, 0.0, 0.0], "continuous", False),
     ],
 )
-def test_singular_is_what_vanishes_beside_the_start_in_any_units(system, x0, mode, singular):
+def test_singularity_is_relative_to_the_start_in_any_units(system, x0, mode, singular):
     run = study(system, x0, controller={"disturbance_bound": 0.0}, loop={"mode": mode}).parts
     assert fly(run).status == (rollout.SINGULAR if singular else rollout.OK)
 
@@ -429,7 +429,7 @@ def test_a_singular_matrix_at_the_start_is_refused_by_name():
         ({"D": lambda t, a, b: jnp.eye(1) / b[0]}, "D = [[inf]]"),
     ],
 )
-def test_what_is_not_finite_at_the_start_is_refused_by_name(changes, said):
+def test_functions_that_are_not_finite_at_the_start_are_refused_by_name(changes, said):
     with pytest.raises(ScenarioError, match=f"^{re.escape(f'plant.system has {said} at t = 0 in plant.x0; allowed')}"):
         study(one(**changes), [1.0, 0.0])
 
@@ -453,7 +453,7 @@ FILES = {
 }
 
 
-def test_files_of_users_may_import_their_own_and_cannot_end_the_command(tmp_path):
+def test_custom_files_can_import_helpers_and_cannot_exit_the_command(tmp_path):
     for name, text in FILES.items():
         (tmp_path / name).write_text(text)
     assert systems.load(f"{tmp_path}/future.py:mine").inputs == 1
@@ -467,7 +467,7 @@ def test_files_of_users_may_import_their_own_and_cannot_end_the_command(tmp_path
     assert systems.digest(spacecraft_as_system(SPIN)) is None
 
 
-def test_a_scenario_with_a_system_made_in_python_is_written_and_refused_when_read(tmp_path):
+def test_a_written_system_from_python_cannot_be_read(tmp_path):
     tables = {"plant": {"kind": "system", "system": spacecraft_as_system(SPIN), "x0": [0.1, 0.0, 0.0, 0.0, 0.0, 0.0]}}
     made = scenario.from_tables(tables)
     store.write_toml(tmp_path / "s.toml", parsing.dump(made))
@@ -476,7 +476,7 @@ def test_a_scenario_with_a_system_made_in_python_is_written_and_refused_when_rea
     assert store.previous(tmp_path, parsing.dump(made), {"command": "tune", "seed": 0}) is None
 
 
-def test_steps_follow_the_run_with_the_shortest_t_f_that_tuning_may_try(monkeypatch):
+def test_steps_follow_the_run_with_the_shortest_t_f_of_a_search(monkeypatch):
     tables = {
         "plant": {"kind": "system", "system": ARM, "x0": [0.8, -1.0, 0.0, 0.0]},
         "controller": {"t_f": 3.0, **GAINS},
