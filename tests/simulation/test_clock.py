@@ -13,7 +13,7 @@ from tests.helpers import ticks_of, vector
 
 @settings(max_examples=60, deadline=None)
 @given(t_f=st.floats(5.0, 40.0), share=st.floats(0.01, 0.4), coast=st.floats(1.0, 12.0))
-def test_anchored_periods_fill_the_time_and_meet_the_hand_over(t_f, share, coast):
+def test_anchored_periods_cover_the_run_and_have_a_sample_at_the_hand_over(t_f, share, coast):
     period, delta = 0.1, max(share * t_f, 0.1)
     ticks = ticks_of(clock.Anchored(vector(period), vector(t_f + coast), 401, 400), vector(t_f), vector(delta))
     t, t_next = np.asarray(ticks.t), np.asarray(ticks.t_next)
@@ -30,8 +30,8 @@ def test_anchored_periods_fill_the_time_and_meet_the_hand_over(t_f, share, coast
 
 
 @pytest.mark.parametrize(("period", "t_f", "delta", "after"), [(0.3, 7.3, 1.1, 10.0), (0.01, 12.1, 0.05, 2.0)])
-def test_the_last_period_of_an_anchored_clock_ends_with_the_run_whatever_rounding_does(period, t_f, delta, after):
-    """As many periods as there are from the hand-over on end 4e-15 s before it."""
+def test_rounding_does_not_move_the_end_of_an_anchored_clock(period, t_f, delta, after):
+    """The sum of the periods from the hand-over on is 4e-15 s less than t_end."""
     t_end = t_f + after
     whole = round((t_end - t_f + delta) / period)
     assert 0.0 < t_end - (t_f - delta + whole * period) < 1e-14
@@ -40,7 +40,7 @@ def test_the_last_period_of_an_anchored_clock_ends_with_the_run_whatever_roundin
 
 
 @pytest.mark.parametrize("periods", [10, 20])
-def test_anchored_ticks_are_continuous_where_delta_is_a_multiple_of_the_period(periods):
+def test_anchored_ticks_are_continuous_at_multiples_of_the_period(periods):
     anchored = clock.anchored(0.1, 15.0, 10.0, 8.0)
 
     def ends(delta):
@@ -51,17 +51,17 @@ def test_anchored_ticks_are_continuous_where_delta_is_a_multiple_of_the_period(p
     for nearby in (at - 1e-9, at + 1e-9):
         for a, b in zip(ends(at), ends(nearby), strict=True):
             np.testing.assert_allclose(a, b, atol=1.1e-9)
-    # the lengths' derivatives add up to none: t_end does not move
+    # the derivatives of the lengths add up to zero, since t_end is constant
     slopes = jax.jvp(ends, (at,), (vector(1.0),))[1]
     np.testing.assert_allclose(np.sum(np.asarray(slopes[1] - slopes[0])), 0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize(("t_f", "delta"), [(12.0, 0.7), (30.3, 0.9), (12.0, 0.8), (30.0, 0.7)])
-def test_rounding_makes_no_sample_just_after_the_first_one(t_f, delta):
-    """12.0 - 0.7 is 8e-17 s beyond 113 periods: a run had two samples at t = 0, slopes of its peak half of each."""
+def test_rounding_adds_no_sample_just_after_the_first_sample(t_f, delta):
+    """12.0 - 0.7 is 8e-17 s beyond 113 periods. An earlier version had two samples at t = 0 and wrong gradients."""
     anchored = clock.anchored(0.1, t_f + 4.03, t_f, 6.0)
 
-    @jax.jit  # whose rounding is another one
+    @jax.jit  # has other rounding errors
     def starts(delta):
         return ticks_of(anchored, vector(t_f), delta).t
 
@@ -73,13 +73,13 @@ def test_rounding_makes_no_sample_just_after_the_first_one(t_f, delta):
     at = vector(delta)
     flown = np.asarray(lengths(at))[np.asarray(lengths(at)) > 0]
     np.testing.assert_allclose(flown, [0.1] * round((t_f + 4.0) / 0.1) + [0.03], atol=1e-12)
-    for function in (starts, lengths):  # slopes are those of a slightly larger delta
+    for function in (starts, lengths):  # derivatives of a slightly larger delta
         np.testing.assert_array_equal(jax.jacfwd(function)(at), jax.jacfwd(function)(at + 1e-6))
 
 
 @pytest.mark.parametrize(("delta", "t_end"), [(0.6, 8.3), (0.9, 8.3), (0.6, 10.3), (0.8, 8.3)])
-def test_rounding_makes_no_sample_just_before_the_end(delta, t_end):
-    """7.3 - 0.6 s and 16 periods are 2e-15 s before 8.3: a sample more, and slopes of the effort those of another."""
+def test_rounding_adds_no_sample_just_before_the_end(delta, t_end):
+    """7.3 - 0.6 s and 16 periods are 2e-15 s before 8.3 s. Earlier, this added a sample and changed gradients."""
     anchored = clock.anchored(0.1, t_end, 7.3, 5.0)
 
     def lengths(delta):
@@ -87,7 +87,7 @@ def test_rounding_makes_no_sample_just_before_the_end(delta, t_end):
         return ticks.t_next - ticks.t
 
     at = vector(delta)
-    for function in (lengths, jax.jit(lengths)):  # whose rounding is another one
+    for function in (lengths, jax.jit(lengths)):  # has other rounding errors
         flown = np.asarray(function(at))
         np.testing.assert_allclose(flown[flown > 0.0], [0.1] * round(t_end / 0.1), atol=1e-12)
         np.testing.assert_array_equal(
@@ -96,8 +96,8 @@ def test_rounding_makes_no_sample_just_before_the_end(delta, t_end):
 
 
 @pytest.mark.parametrize(("t_f", "delta"), [(35.0, 1.0), (35.0, 0.6), (30.0, 0.7), (12.0, 0.8)])
-def test_what_is_computed_in_a_first_period_that_is_a_whole_one_has_the_slopes_of_a_slightly_larger_delta(t_f, delta):
-    """35 - 1 s are 340 periods and 1e-14 s: observer and law were told of a whole period, whose length is constant."""
+def test_a_whole_first_period_has_the_derivatives_of_a_slightly_larger_delta(t_f, delta):
+    """35 - 1 s are 340 periods and 1e-14 s. An earlier version passed a constant length of the first period."""
     tables = {"controller": {"t_f": t_f, "delta": delta}, "loop": {"mode": "sampled", "period": 0.1}}
     parts = scenario.study(scenario.from_tables(tables)).parts
 
@@ -117,14 +117,14 @@ def test_what_is_computed_in_a_first_period_that_is_a_whole_one_has_the_slopes_o
         np.testing.assert_allclose(one, other, rtol=1e-4)
 
 
-def test_a_partial_first_period_takes_part_of_its_noise_from_the_next_sample():
+def test_the_noise_of_a_partial_first_period_includes_noise_of_the_next_sample():
     ticks = ticks_of(clock.anchored(0.1, 15.0, 10.0, 8.0), vector(10.0), vector(1.07))
     first = int(np.flatnonzero(np.asarray(ticks.t_next) > 0)[0])
     np.testing.assert_allclose(ticks.t_next[first] - ticks.t[first], 0.03, atol=1e-12)
     np.testing.assert_allclose(ticks.noise_weight[first], 0.3, atol=1e-10)
 
 
-def test_flight_clock_counts_from_zero_and_hands_over_at_the_first_sample_not_before_t_s():
+def test_the_flight_clock_starts_at_zero_and_hands_over_at_the_first_sample_from_t_s_on():
     flight = clock.flight(0.1, 15.04)
     ticks = ticks_of(flight, vector(10.0), vector(1.07))
     np.testing.assert_allclose(ticks.t[:150], 0.1 * np.arange(150), rtol=1e-15)
@@ -135,7 +135,7 @@ def test_flight_clock_counts_from_zero_and_hands_over_at_the_first_sample_not_be
 
 
 @pytest.mark.parametrize(("t_f", "delta"), [(30.0, 0.05), (0.5, 0.001), (3000.0, 2.0), (10.0, 5.0)])
-def test_graded_grid_has_its_nodes_and_steps_as_promised(t_f, delta):
+def test_the_graded_grid_has_the_documented_nodes_and_steps(t_f, delta):
     saves = [0.3 * t_f, t_f - delta, t_f + 0.5]
     grid = clock.graded(t_f, delta, t_f + 10.0, 1.0, 1.0, 0.1, (1e-3 * t_f, 1e-3), saves)
     ticks = ticks_of(grid, vector(t_f), vector(delta))
@@ -145,21 +145,21 @@ def test_graded_grid_has_its_nodes_and_steps_as_promised(t_f, delta):
     assert t_next[-1] == t_f + 10.0
     for node in (t_f - delta, t_f, t_f + 1.0, *saves):
         assert node in t_next
-    lasts = t_next > t  # saves on other nodes make intervals of length zero
+    lasts = t_next > t  # save times at other nodes give intervals of length zero
     before = lasts & (t_next <= t_f - delta)
     np.testing.assert_array_equal(np.asarray(ticks.hold)[lasts], ~before[lasts])
     steps = (t_next - t)[before]
     assert steps.max() <= float(grid.max_step) * (1 + 1e-9)
     tau = t_f - t[before]
-    # a d(ln tau) + d(tau)/max_step = 1 a step: each is at most tau/a of what remains
+    # each step has a d(ln tau) + d(tau)/max_step = 1, so it is at most tau/a
     a = (grid.before - (t_f - delta) / float(grid.max_step)) / np.log(t_f / delta)
     assert np.all(steps <= tau / a * (1 + 1e-9) + 1e-12)
-    # and nowhere much smaller than both allow, away from inserted nodes
+    # away from inserted nodes, no step is much smaller than both limits allow
     allowed = 1 / (a / tau + 1 / float(grid.max_step))
     assert np.median(steps / allowed) > 0.8
 
 
-def test_graded_nodes_move_with_t_f_and_delta_by_their_exact_derivative():
+def test_graded_nodes_have_exact_derivatives_in_t_f_and_delta():
     grid = clock.graded(30.0, 0.05, 45.0, 1.0, 1.0, 0.1, (3.0, 0.1))
 
     def nodes(t_f, delta):
@@ -172,12 +172,12 @@ def test_graded_nodes_move_with_t_f_and_delta_by_their_exact_derivative():
         moved = [list(point), list(point)]
         moved[0][k], moved[1][k] = point[k] - h, point[k] + h
         central = (nodes(*moved[1]) - nodes(*moved[0])) / (2 * h)
-        np.testing.assert_allclose(slope, central, atol=1e-6)  # h^2 times third derivatives of up to 1e3
+        np.testing.assert_allclose(slope, central, atol=1e-6)  # error h^2 times third derivatives of up to 1e3
 
 
 @pytest.mark.parametrize("bits", [64, 32])
-def test_rounding_costs_no_period_whatever_the_precision(bits):
-    """With 32 bits a tenth of such flights handed over a period late, and as many were said to end before t_end."""
+def test_rounding_removes_no_period_in_32_or_64_bits(bits):
+    """An earlier version with 32 bits handed over a period late, or ended before t_end, in a tenth of such runs."""
     count, before = 1200, np.arange(1, 40)
     period = np.array([0.01, 0.02, 0.05, 0.1, 0.25, 0.3])[:, None]
     t_end, t_f, delta = np.broadcast_arrays(count * period, (count - 100) * period, before * period)

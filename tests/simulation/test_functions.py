@@ -1,4 +1,4 @@
-"""What those who know JAX expect: plain functions among the parts, names at the top."""
+"""Expectations of JAX users: plain functions as parts, and the main names in the top-level package."""
 
 import re
 from dataclasses import replace
@@ -25,8 +25,8 @@ from tests.helpers import chain_parts, parts
 WAVE = Sinusoid(*(vector(v) for v in ([0.01] * 3, [0.1] * 3, [0.0] * 3, [0.0] * 3)))
 
 
-def test_a_lambda_is_a_disturbance_and_a_function_a_reference_under_jit():
-    """The same numbers as the parts of the library, to rounding."""
+def test_plain_functions_can_be_disturbance_and_reference_under_jit():
+    """The results equal those of the library's parts except for rounding."""
     still = Fixed(vector([0.0, 0.0, 0.0, 1.0]))
 
     def reference(t):
@@ -40,19 +40,19 @@ def test_a_lambda_is_a_disturbance_and_a_function_a_reference_under_jit():
 
 
 class Push:
-    """What is called, and no pytree."""
+    """A callable that is not a pytree."""
 
     def __call__(self, t, x):
-        """The wave of a chain."""
+        """Return the wave for a chain."""
         return self.wave(0.1, t, x)
 
     def wave(self, size, t, x):
-        """A wave of any size."""
+        """Return a wave of any size."""
         return size * jnp.sin(t) * jnp.ones(1)
 
 
-def test_whatever_is_called_is_a_disturbance():
-    """JAX took all but plain functions for arrays, and said so from deep inside."""
+def test_every_callable_can_be_a_disturbance():
+    """An earlier version passed other callables to JAX as arrays, which ended in an error inside JAX."""
     push = Push()
     for called in (jax.jit(push), partial(push.wave, 0.1), push, push.__call__):
         run = chain_parts([1.0, 0.0], period=0.5, disturbance=called)
@@ -66,8 +66,8 @@ def test_whatever_is_called_is_a_disturbance():
     np.testing.assert_allclose(turned, [0.0, 0.0, 0.02], atol=1e-15)
 
 
-def test_a_function_that_returns_a_quaternion_is_a_reference():
-    """Of any length; a turn about z at 0.02 rad/s is `Spin`, whose rates are written down."""
+def test_a_function_that_returns_a_quaternion_can_be_a_reference():
+    """The quaternion can have any norm. A rotation about z at 0.02 rad/s equals `Spin`, whose rates are analytic."""
     turn = Spin(vector([0.0, 0.0, 0.0, 1.0]), vector([0.0, 0.0, 0.02]))
 
     def reference(t):
@@ -76,11 +76,11 @@ def test_a_function_that_returns_a_quaternion_is_a_reference():
     plain = parts(8.0, 3.0, 0.5, reference=reference)
     for t in (0.0, 7.0):
         for found, expected in zip(plain.reference(jnp.asarray(t)), turn(jnp.asarray(t)), strict=True):
-            np.testing.assert_allclose(found, expected, atol=1e-16)  # some rounding of 0.02
+            np.testing.assert_allclose(found, expected, atol=1e-16)  # rounding of 0.02
 
 
-def test_the_numbers_of_a_reference_function_are_leaves_of_the_parts():
-    """As docs/python.md says of any function: the quaternion of such a one was taken for a Target."""
+def test_numbers_of_a_reference_function_are_leaves_of_the_parts():
+    """docs/python.md allows this for any function. An earlier version took the quaternion for a Target."""
 
     def turning(rate, t):
         return jnp.stack([0.0 * t, 0.0 * t, jnp.sin(rate * t / 2.0), jnp.cos(rate * t / 2.0)])
@@ -93,7 +93,7 @@ def test_the_numbers_of_a_reference_function_are_leaves_of_the_parts():
     np.testing.assert_allclose(jax.tree.leaves(slopes), [[0.0, 0.0, 1.0]], atol=1e-15)
 
 
-def test_what_is_no_attitude_and_what_has_no_inertia_is_refused_in_a_sentence():
+def test_invalid_attitudes_and_inertias_are_refused_in_one_sentence():
     wrong = parts(8.0, 3.0, 0.5, reference=lambda t: jnp.zeros(3))
     with pytest.raises(TypeError, match=r"must return a quaternion \(4,\), scalar last, or a Target"):
         wrong.reference(jnp.asarray(0.0))
@@ -101,7 +101,7 @@ def test_what_is_no_attitude_and_what_has_no_inertia_is_refused_in_a_sentence():
         chain_parts([1.0, 0.0]).with_inertia([1.0, 1.0, 1.0])
 
 
-def test_a_reference_may_return_a_list():
+def test_a_reference_can_return_a_list():
     plain = parts(8.0, 3.0, 0.5, reference=lambda t: [0.0, 0.0, jnp.sin(t), jnp.cos(t)])
     np.testing.assert_allclose(jax.jit(plain.reference)(jnp.asarray(1.0)).w, [0.0, 0.0, 2.0], atol=1e-15)
 
@@ -111,7 +111,7 @@ CHAIN = chain_parts([1.0, 0.0])
 LATE = system(1, lambda t, p, v: v, lambda t, p, v, z: z, lambda t, p, v: jnp.zeros((1, 1)),
               Z=lambda t, p, v, z, u: u - z, z0=[0.0])  # fmt: skip
 FLIGHT = scenario.from_tables({})
-API: Any = ptsmc  # whose types say already what does not fit
+API: Any = ptsmc  # hides the types, which forbid these arguments already
 REFUSED = {
     "a start of another shape": (
         lambda: ptsmc.simulate_parts(replace(RUN, initial=RUN.initial._replace(w=jnp.zeros(4)))),
@@ -141,7 +141,7 @@ REFUSED = {
         lambda: ptsmc.simulate_parts(jax.tree.map(lambda leaf: leaf.astype(jnp.float32), RUN)),
         "the parts were built in 32-bit precision, but JAX now uses 64-bit",
     ),
-    "a trial of 40 bits": (  # it was trial 0
+    "a trial of 40 bits": (  # an earlier version ran trial 0
         lambda: ptsmc.simulate_parts(RUN, 0, trial=2**40),
         "trial is 1099511627776, but must be a whole number below 2.32 = 4294967296",
     ),
@@ -232,15 +232,15 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("what", REFUSED)
-def test_what_does_not_fit_is_refused_in_a_sentence(what):
-    """JAX said it, from deep inside, or flew three different eta on the three axes."""
+def test_invalid_arguments_are_refused_in_one_sentence(what):
+    """Earlier, JAX raised an error inside, or a run had three different values of eta on the three axes."""
     call, said = REFUSED[what]
     with pytest.raises((TypeError, ValueError), match=said):
         call()
 
 
-def test_a_start_of_whole_numbers_or_in_single_precision_flies():
-    """As gains and weights of these types do: JAX spoke of the carry of a scan."""
+def test_an_initial_state_of_integers_or_single_precision_is_simulated():
+    """Gains and weights of these types work too. An earlier version ended in an error about the carry of a scan."""
     q, w = jnp.asarray([0, 0, 1, 0]), RUN.initial.w.astype(jnp.float32)
     run = replace(RUN, initial=RUN.initial._replace(q=q, w=w))
     for record in (False, True):
@@ -249,13 +249,13 @@ def test_a_start_of_whole_numbers_or_in_single_precision_flies():
     assert shapes.log.x.q.dtype == float
 
 
-def test_a_study_and_other_values_are_made_of_a_file_too(tmp_path):
+def test_study_and_replace_accept_a_file(tmp_path):
     (tmp_path / "s.toml").write_text("controller = { eta = 3.5 }")
     assert float(ptsmc.study(tmp_path / "s.toml").parts.controller.eta) == 3.5
     assert ptsmc.replace(str(tmp_path / "s.toml"), controller__eta=4.0).controller.eta == 4.0
 
 
-def test_metrics_show_what_a_run_has():
+def test_metrics_print_only_metrics_that_the_run_has():
     run = parts(8.0, 3.0, 0.5, disturbance=WAVE, period=0.1, flight=True)
     found = ptsmc.simulate_parts(run, np.uint32(0), np.uint32(0)).metrics
     shown = dict(line.split() for line in repr(found).splitlines())
@@ -270,8 +270,8 @@ def test_metrics_show_what_a_run_has():
     jax.jit(lambda metrics: repr(metrics) and metrics)(found)
 
 
-def test_parts_and_results_are_shown_in_lines_that_can_be_read():
-    """A history in its shapes, for its numbers are hundreds of lines; shapes in the place of metrics, which raised."""
+def test_parts_and_results_print_short_lines():
+    """A history prints its shapes, since its numbers would fill hundreds of lines. Batches of metrics do the same."""
     shown = repr(RUN).splitlines()
     assert {"  disturbance: Sinusoid", "    amplitude: [0.01, 0.01, 0.01]", "    delta: 0.5"} <= set(shown)
     assert not any(": None" in line for line in shown)
@@ -284,11 +284,11 @@ def test_parts_and_results_are_shown_in_lines_that_can_be_read():
     assert {"  u: float64 (181, 3)", "    q: float64 (181, 4)"} <= set(repr(log).splitlines())
     jax.jit(lambda run: repr(run) and run.t_end)(RUN)
     given = replace(RUN, t_end=RUN.t_end + 0.0, window=jax.random.key(0))
-    given.t_end.delete()  # as donated arguments are
+    given.t_end.delete()  # like a donated argument
     assert {"  t_end: float64 ()", "  window: key<fry> ()"} <= set(repr(given).splitlines())
 
 
-def test_scenarios_and_studies_are_shown_by_their_tables():
+def test_scenarios_and_studies_print_their_tables():
     shown = repr(FLIGHT).splitlines()
     assert shown[0] == "SpacecraftScenario"
     assert any(line.startswith("  controller: PrescribedTime(t_f=30.0, ") for line in shown)
@@ -296,7 +296,7 @@ def test_scenarios_and_studies_are_shown_by_their_tables():
     assert f"    {shown[1]}" in repr(scenario.study(FLIGHT))
 
 
-def test_the_names_that_everybody_needs_are_at_the_top():
+def test_the_main_names_are_exported_by_the_package():
     for name in ("one", "run", "study", "Reach", "reach_of"):
         assert callable(getattr(ptsmc, name))
     assert len(dir(ptsmc)) == len(set(dir(ptsmc)))

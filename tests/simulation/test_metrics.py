@@ -1,4 +1,4 @@
-"""Metrics against plain numpy on the history of the same run, and against hand-made intervals."""
+"""Compare metrics with plain NumPy on the history of the same run, and with intervals made by hand."""
 
 import pickle
 
@@ -39,7 +39,7 @@ def run(request):
     return flown(**{"continuous": {}, "sampled": noisy, "flight": {**noisy, "flight": True}}[request.param])
 
 
-def test_window_metrics_are_integrals_of_the_squared_error_and_of_the_squared_angle(run):
+def test_window_metrics_match_integrals_of_squared_error_and_angle(run):
     parts, found, log = run
     rates = jax.jit(jax.vmap(lambda t, x: parts.controller.kinematics.errors(x, parts.reference(t))[1]))
     slope = rates(jnp.asarray(log.t), jax.tree.map(jnp.asarray, log.x))
@@ -48,13 +48,13 @@ def test_window_metrics_are_integrals_of_the_squared_error_and_of_the_squared_an
     squares = np.sum(spline(t) ** 2, axis=1)
     angles = 2.0 * np.arcsin(np.sqrt(squares))  # the reference is the identity
     expected = np.sqrt([np.trapezoid(squares, t), np.trapezoid(angles**2, t)])
-    # Simpson in a step: 0.1^4 times slopes of 1/s
+    # error of Simpson's rule in a step: 0.1^4 with rates of 1/s
     np.testing.assert_allclose([found.window_error, found.window_angle], expected, rtol=1e-5)
 
 
 @pytest.mark.parametrize("kinematics", [AdditiveKinematics, MultiplicativeKinematics])
-def test_the_angle_in_the_middle_is_that_of_a_turn_which_passes_the_reference(kinematics):
-    """From -0.1 to 0.3 rad about a reference that turns itself: 0.1 rad, where the mean of both ends is 0.2 rad."""
+def test_the_angle_at_mid_step_is_right_for_a_rotation_past_the_reference(kinematics):
+    """For a rotation from -0.1 to 0.3 rad about a moving reference it is 0.1 rad, and not the mean of 0.2 rad."""
     axis = np.array([0.6, 0.0, 0.8])
     first = attitude.from_rotation_vector(vector([0.2, -0.3, 0.1]))
 
@@ -70,11 +70,11 @@ def test_the_angle_in_the_middle_is_that_of_a_turn_which_passes_the_reference(ki
     np.testing.assert_allclose(middle, 0.1, rtol=1e-4)
 
 
-def test_torque_metrics(run):
+def test_torque_metrics_match_the_history(run):
     parts, found, log = run
     held = not parts.sensors.perfect
     size = np.abs(log.commanded)
-    # the continuous run also looks at the far ends of its rows, where the torque is steep by 3 % a step
+    # the continuous run includes the ends of steps, where the torque changes by 3 % per step
     np.testing.assert_allclose(found.peak_torque, size.max(), rtol=1e-15 if held else 0.03)
     np.testing.assert_allclose(found.peak_torque_delivered, found.peak_torque)
     total = np.sum(np.abs(log.u), axis=1)
@@ -84,22 +84,22 @@ def test_torque_metrics(run):
         np.testing.assert_allclose(found.effort, effort, rtol=1e-12)
         np.testing.assert_allclose(found.chattering, jumps.sum(axis=0).max() / 10.0, rtol=1e-12)
     else:
-        # trapezium over the rows: second order, 0.2 % at these steps
+        # the trapezoidal rule over the rows has an error of 0.2 % at these steps
         np.testing.assert_allclose(found.effort, np.trapezoid(total, log.t), rtol=5e-3)
         late = log.u[log.t >= 20.0]
         np.testing.assert_allclose(found.chattering, np.abs(np.diff(late, axis=0)).sum(axis=0).max() / 10.0, rtol=1e-6)
     assert float(found.saturated) == 0.0
 
 
-def test_effort_of_the_continuous_loop_is_that_of_torques_at_ends_of_steps():
-    """That of a stage in their midst zigzags in a narrow sign, the more the longer they are: here 1 % of the effort."""
+def test_effort_of_the_continuous_loop_uses_torques_at_ends_of_steps():
+    """The torque of a stage at mid step oscillates in a thin boundary layer, here by 1 % of the effort."""
     wave = disturbances.Sinusoid(*(vector([v]) for v in (0.2, 2.0, 0.0, 0.0)))
     flight = fly(chain_parts([1.0, 0.2], delta=0.5, bound=0.3, disturbance=wave, steps=(800, 800)))
     total = np.sum(np.abs(flight.log.u), axis=1)
     np.testing.assert_allclose(flight.metrics.effort, np.trapezoid(total, flight.log.t), rtol=1e-3)
 
 
-def test_error_rate_and_momentum_metrics(run):
+def test_error_rate_and_momentum_metrics_match_the_history(run):
     parts, found, log = run
     late = log.t >= 20.0
     hold = np.linalg.norm(log.error[late], axis=1).max()
@@ -110,7 +110,7 @@ def test_error_rate_and_momentum_metrics(run):
     np.testing.assert_allclose(found.terminal_angle, 2 * np.arcsin(found.terminal_error), rtol=1e-6)
 
 
-def test_settling_time(run):
+def test_settling_time_matches_the_history(run):
     _, found, log = run
     angle = 2 * np.arcsin(np.minimum(np.linalg.norm(log.error, axis=1), 1.0))  # the reference is the identity
     last = np.flatnonzero(angle >= 1e-3)[-1]
@@ -144,7 +144,7 @@ def judge(intervals, t_end=4.0):
     return metrics.finish(running, criteria)
 
 
-def test_settling_interpolates_restarts_and_is_nan_where_it_never_comes():
+def test_settling_time_interpolates_restarts_and_can_be_nan():
     falls = judge([interval(0, 1, (1.0, 0.5)), interval(1, 2, (0.5, 0.3)), interval(2, 4, (0.3, 0.05))])
     np.testing.assert_allclose(falls.settling_time, 2.0 + 2.0 * 0.2 / 0.25)
     again = judge([interval(0, 1, (0.05, 0.05)), interval(1, 2, (0.05, 0.3)), interval(2, 4, (0.3, 0.05))])
@@ -154,7 +154,7 @@ def test_settling_interpolates_restarts_and_is_nan_where_it_never_comes():
     assert np.isnan(float(judge([interval(0, 1, (1.0, 0.05)), interval(1, 4, (0.05, np.nan))]).settling_time))
 
 
-def test_saturation_counts_time_and_peaks_tell_commanded_from_delivered():
+def test_saturation_is_a_time_and_peaks_distinguish_commanded_and_delivered():
     found = judge([interval(0, 1, (1, 1), 3.0, 2.0), interval(1, 3, (1, 1), 1.0), interval(3, 4, (1, 1), -1.0)])
     np.testing.assert_allclose(found.saturated, 0.25)
     np.testing.assert_allclose([found.peak_torque, found.peak_torque_delivered], [3.0, 2.0])
@@ -167,37 +167,37 @@ def test_saturation_counts_time_and_peaks_tell_commanded_from_delivered():
         np.testing.assert_allclose(found.chattering, 2.0 / 3.0)
 
 
-def test_angles_after_t_f_are_the_largest_and_the_rms_of_the_parabola_through_their_squares():
-    """From t_f = 1 s on, over a window of 1 s: 0.3 to 0.1 rad, whose square in between is that of the line."""
+def test_angles_after_t_f_use_a_parabola_through_their_squares():
+    """From t_f = 1 s on, over a window of 1 s, the angle falls linearly from 0.3 to 0.1 rad."""
     found = judge([interval(0, 1, (1.0, 0.3)), interval(1, 2, (0.3, 0.1)), interval(2, 4, (0.1, 0.25))])
     np.testing.assert_allclose(found.hold_angle, 0.3)
     np.testing.assert_allclose(found.window_angle, np.sqrt((0.09 + 0.03 + 0.01) / 3), rtol=1e-14)
     later = judge([interval(0, 1, (1.0, 0.1)), interval(1, 2, (0.1, 0.2)), interval(2, 4, (0.2, 0.4))])
-    np.testing.assert_allclose(later.hold_angle, 0.4)  # to the end of the run, not of the window
+    np.testing.assert_allclose(later.hold_angle, 0.4)  # until the end of the run, not of the window
 
 
 def part(squares, begin, end):
-    """Of an interval from 2 to 2.5 s, between these shares of it."""
+    """Return the integral over part of an interval from 2 to 2.5 s, between two fractions of it."""
     times = (2.0 + 0.5 * begin, 9.0, 0.5 * (end - begin), 0.1)
     return integral_in_window(vector(2.0), vector(2.5), squares, Criteria(*map(vector, times)))
 
 
-def test_a_part_of_an_interval_has_a_share_of_its_square_however_near_the_error_comes_to_zero_in_it():
-    """Of errors along a line exactly; else the parabola may be below zero there: a run's RMS was no number."""
+def test_part_of_an_interval_has_a_positive_integral_of_the_squared_error():
+    """For a linear error the integral is exact. Otherwise the parabola can be negative, and an RMS was NaN earlier."""
     rng = np.random.default_rng(0)
     for _ in range(20):
         zero, (begin, end) = rng.uniform(-0.2, 1.2), np.sort(rng.uniform(0.0, 1.0, 2))
         exact = 0.5 * ((end - zero) ** 3 - (begin - zero) ** 3) / 3.0
         along = [(x - zero) ** 2 for x in (0.0, 0.5, 1.0)]
         np.testing.assert_allclose(part(along, begin, end), exact, rtol=1e-9)
-    bent = (1.0, 0.01, 4.0)  # an error that is nearly zero in the middle, and no line
-    np.testing.assert_allclose(part(bent, 0.0, 1.0), 0.5 * 5.04 / 6.0, rtol=1e-14)  # Simpson's
+    bent = (1.0, 0.01, 4.0)  # a nonlinear error that is nearly zero at mid step
+    np.testing.assert_allclose(part(bent, 0.0, 1.0), 0.5 * 5.04 / 6.0, rtol=1e-14)  # Simpson's rule
     np.testing.assert_allclose(part(bent, 0.3, 0.5), 0.5 * 0.2**3 / 4.0 * 5.04 / 6.0, rtol=1e-9)
     wider = [float(part(bent, 0.3, end)) for end in np.linspace(0.31, 1.0, 70)]
     assert np.all(np.diff(wider) > 0.0)
 
 
-def test_the_torque_of_wheels_is_the_largest_of_any():
+def test_wheel_torque_is_the_largest_of_all_wheels():
     wheels = jnp.asarray([[0.1, -0.2], [0.05, 0.3]])
     one = interval(0, 4, (1.0, 1.0))
     one = one._replace(torques=one.torques._replace(wheel_momentum=wheels, wheel_torque=-2.0 * wheels))
@@ -225,7 +225,7 @@ def test_a_metric_that_the_run_lacks_is_nan_and_not_listed():
         _ = found.ape_w
 
 
-def test_the_metrics_of_many_runs_keep_names_and_values_through_transformations():
+def test_metrics_of_many_runs_survive_jax_transformations():
     def squares(x):
         return metrics.Metrics({"window_error": x**2, "effort": 2.0 * x})
 
@@ -238,9 +238,9 @@ def test_the_metrics_of_many_runs_keep_names_and_values_through_transformations(
 
 @pytest.mark.parametrize("flight", [False, True])
 def test_the_last_row_holds_the_torque_of_the_last_period(flight):
-    """Periods beyond t_end, of length zero, and the first one before t = 0 leave nothing behind."""
+    """Periods of length zero beyond t_end, and the period before t = 0, have no effect."""
     body = parts(20.0, 3.0, 0.53, period=0.05, noise=(2e-4, 1e-5), reach=(25.0, 2.0))
-    run = chain_flight() if flight else body  # by the programs of other tests
+    run = chain_flight() if flight else body  # with the compiled programs of other tests
     log = fly(run, 1, 4).log
     rows = np.flatnonzero(np.asarray(log.has_length))
     np.testing.assert_array_equal(log.u[rows[-1]], log.u[rows[-2]])

@@ -1,4 +1,4 @@
-"""Pointing error indices against brute force: over made-up errors, and over the recorded history of a run."""
+"""Compare pointing error indices with brute force, for synthetic errors and for the history of a run."""
 
 import dataclasses
 from typing import Any
@@ -16,13 +16,14 @@ from ptsmc_jax.numerics import attitude
 from ptsmc_jax.simulation import catalogues, pointing, rollout
 from tests.helpers import SHORT, drawn, fly, untuned, vector
 
-SLACK = 1.0 / np.cos(0.5 * np.pi / pointing.DIRECTIONS)  # half-cones of deviations are known to this factor, from above
+SLACK = 1.0 / np.cos(0.5 * np.pi / pointing.DIRECTIONS)  # upper bound of computed over exact half-cones of deviations
 
 
 def brute_force(t, error, mean_of, begins, window, t_end, limits: Any = None) -> Any:
-    """Indices (4,) each from errors (n, 5) at times t (n,) and a function of two times for their mean between them.
+    """Return the indices (4,) about x, y, z and of the half-cone, from errors (n, 5) at times t (n,).
 
-    About x, y, z, and the half-cone. limits: the share of windows whose means keep them (4,) instead.
+    `mean_of` returns the mean error between two times. With limits (4,), the result is the fraction of windows whose
+    means are within the limits.
     """
     count = int((t_end - begins) / window + 1e-9)
     interpolated = mean_of("at")
@@ -47,13 +48,13 @@ def brute_force(t, error, mean_of, begins, window, t_end, limits: Any = None) ->
 
 
 def of_spline(spline):
-    """The mean between two times of a piecewise cubic, exactly; "at": itself."""
+    """Return a function for the exact mean of a piecewise cubic between two times; its attribute `at` is the cubic."""
     integral = spline.antiderivative()
     return lambda low, high=0.0: spline if isinstance(low, str) else (integral(high) - integral(low)) / (high - low)
 
 
 def close(found, expected, rel):
-    """Half-cones of deviations are said at most 0.5 % too large, and never too small."""
+    """Assert equality, except that half-cones of deviations may be up to 0.5 % too large."""
     for index, values in expected.items():
         np.testing.assert_allclose(found[index][:3], values[:3], rtol=rel, atol=1e-15, err_msg=index)
         ratio = found[index][3] / values[3]
@@ -62,9 +63,9 @@ def close(found, expected, rel):
 
 
 def relative_share(t, error, mean_of, begins, window, t_end, limits) -> Any:
-    """Of the time in whole windows, that in which the error less its window's mean is within limits (4,).
+    """Return the fraction of the time in whole windows in which the error minus its mean is within limits (4,).
 
-    Sizes go straight from node to node, and are taken at a window's ends as well.
+    Magnitudes are linear between nodes, and the ends of windows count as nodes.
     """
     count, shares = int((t_end - begins) / window + 1e-9), []
     for k in range(count):
@@ -80,7 +81,7 @@ def relative_share(t, error, mean_of, begins, window, t_end, limits) -> Any:
 
 @programs.jit(static_argnames="segments")
 def tallied(nodes, error, rate, begins, window, limits, segments=33):
-    """A tally over errors (n, 5) with their rates at nodes (n,)."""
+    """Return a tally over errors (n, 5) with their rates at nodes (n,)."""
 
     def step(tally, row):
         t, t_next, start, start_rate, end, end_rate = row
@@ -92,35 +93,35 @@ def tallied(nodes, error, rate, begins, window, limits, segments=33):
 
 
 def indices(tally):
-    """By their names."""
+    """Return the indices by name."""
     return {"ape": tally.largest, "mpe": tally.mean, "rpe": tally.relative, "pde": pointing.drift(tally)}
 
 
 NODES = 0.1 * np.arange(101)
-# windows that end at nodes, between them, and an observation that begins between them and holds no whole number of them
+# windows that end at nodes or between nodes, and an observation that begins between nodes with a partial last window
 OBSERVED = [(4.0, 1.0), (4.0, 0.37), (4.03, 0.1), (0.0, 2.5), (3.999, 3.0)]
 
 
 @pytest.mark.parametrize(("begins", "window"), OBSERVED)
-def test_indices_of_an_error_are_those_of_its_history(begins, window):
+def test_indices_match_a_brute_force_evaluation(begins, window):
     def check(seed):
         rng = np.random.default_rng(seed)
         error, rate = rng.normal(size=(NODES.size, 5)), 10.0 * rng.normal(size=(NODES.size, 5))
         spline = CubicHermiteSpline(NODES, error, rate)
         expected = brute_force(NODES, error, of_spline(spline), begins, window, NODES[-1])
         limits = np.array([0.5, 1.0, 1.5, 2.0])
-        of_means = 0.9 * expected["mpe"]  # which some windows keep
+        of_means = 0.9 * expected["mpe"]  # some windows are within this limit
         deviations = np.array([0.6, 0.9, 1.2, 1.6])
         asked = np.stack([limits, of_means, deviations])
         tally = tallied(*map(jnp.asarray, (NODES, error, rate, begins, window, asked)))
-        close(indices(tally), expected, 1e-10)  # sums of a hundred numbers
+        close(indices(tally), expected, 1e-10)  # rounding of sums of a hundred numbers
         assert float(tally.windows) == int((NODES[-1] - begins) / window + 1e-9)
         kept = brute_force(NODES, error, of_spline(spline), begins, window, NODES[-1], of_means)
         np.testing.assert_allclose(1.0 - tally.means_beyond / (tally.windows * window), kept, rtol=1e-12)
         off = relative_share(NODES, error, of_spline(spline), begins, window, NODES[-1], deviations)
         np.testing.assert_allclose(1.0 - tally.relative_beyond / (tally.windows * window), off, atol=2e-4)
         assert np.all((off > 0.0) & (off < 1.0))
-        # the time within a limit, sizes going straight from node to node
+        # the time within a limit, with magnitudes that are linear between nodes
         sizes = np.concatenate([np.abs(error[:, :3]), np.linalg.norm(error[:, 3:], axis=1)[:, None]], axis=1)
         fine = np.linspace(begins, NODES[-1], 200_001)
         at_first = spline(begins)
@@ -150,7 +151,7 @@ def test_a_constant_error_has_no_deviation_and_a_ramp_has_half_its_rise():
 
 @programs.jit
 def held(nodes, error, begins, window):
-    """A tally over errors (n, 5) that are each held from a node to the next one."""
+    """Return a tally over errors (n, 5), each held from a node to the next node."""
 
     def step(tally, row):
         t, t_next, value = row
@@ -161,8 +162,8 @@ def held(nodes, error, begins, window):
 
 
 @pytest.mark.parametrize(("begins", "window"), [*OBSERVED, (3.0 * 0.1, 0.2), (4.0, 0.1)])
-def test_a_held_error_counts_where_it_is_held(begins, window):
-    """What ends as a window begins, or the observation, is none of it: with one sample a window none deviates."""
+def test_a_held_error_counts_in_the_windows_that_it_is_held_in(begins, window):
+    """An error that ends when a window begins does not count in it. With one sample per window, no error deviates."""
     error = np.random.default_rng(3).normal(size=(NODES.size - 1, 5))
     tally, relative = held(*map(jnp.asarray, (NODES, error, begins, window))), []
     for k in range(int((NODES[-1] - begins) / window + 1e-9)):
@@ -176,7 +177,7 @@ def test_a_held_error_counts_where_it_is_held(begins, window):
 
 
 def check_the_cone(seed):
-    """Against the angle between the boresight and where it points, and SciPy's rotation vector."""
+    """Compare with the angle between both boresights, and with the rotation vector of SciPy."""
     rng = np.random.default_rng(seed)
     b = rng.normal(size=3)
     frame = pointing.across(b)
@@ -184,7 +185,7 @@ def check_the_cone(seed):
     target = Rotation.from_rotvec(rng.normal(size=3))
     off = Rotation.from_rotvec(rng.normal(size=3) * 10.0 ** rng.uniform(-9, -0.5))
     error = pointing.attitude_error(vector((target * off).as_quat()), vector(target.as_quat()), vector(frame))
-    np.testing.assert_allclose(error[:3], off.as_rotvec(), rtol=1e-9, atol=1e-15)  # quaternions' rounding
+    np.testing.assert_allclose(error[:3], off.as_rotvec(), rtol=1e-9, atol=1e-15)  # rounding of quaternions
     unit = b / np.linalg.norm(b)
     turned = off.apply(unit)
     angle = np.arctan2(np.linalg.norm(np.cross(unit, turned)), unit @ turned)
@@ -195,8 +196,8 @@ test_the_half_cone_is_the_angle_of_the_boresight = drawn(check_the_cone, 20, see
 
 
 @pytest.mark.parametrize("angle", [1.0, 2.0, 2.5, 3.0, 3.14, np.pi - 2e-6, np.pi])
-def test_a_boresight_that_points_back_is_off_by_more_than_a_right_angle(angle):
-    """Up to half a turn, all of it about an axis across the boresight; straight back by any direction."""
+def test_boresight_errors_can_exceed_a_right_angle(angle):
+    """The rotation is up to 180 deg about an axis across the boresight. At 180 deg any axis is right."""
     frame = pointing.across([1.0, -2.0, 0.5])
     off = Rotation.from_rotvec(angle * (0.6 * frame[1] + 0.8 * frame[2]))
     error = pointing.attitude_error(vector(off.as_quat()), vector([0.0, 0.0, 0.0, 1.0]), vector(frame))
@@ -232,7 +233,7 @@ def flown():
     return ready, fly(ready.parts, 3, 5)
 
 
-def test_indices_of_a_run_are_those_of_its_history(flown):
+def test_indices_of_a_run_match_its_history(flown):
     ready, result = flown
     frame = np.array(ready.parts.pointing.frame)
     log = result.log
@@ -241,7 +242,7 @@ def test_indices_of_a_run_are_those_of_its_history(flown):
     target, rate = log.reference.q[kept], log.reference.w[kept]
 
     def errors(step):
-        """At step [s] from each row, on the tangent of the motion."""
+        """Return the errors a step [s] after each row, along the tangent of the motion."""
         body = Rotation.from_quat(q) * Rotation.from_rotvec(step * w)
         wanted = Rotation.from_quat(target) * Rotation.from_rotvec(step * rate)
         off = wanted.inv() * body
@@ -249,22 +250,22 @@ def test_indices_of_a_run_are_those_of_its_history(flown):
         size = np.linalg.norm(side, axis=1, keepdims=True)
         return np.concatenate([off.as_rotvec(), side * np.arcsin(size) / size], axis=1)
 
-    late = t > 4.0  # from where on errors are small, and the cone's arc is its sine's
+    late = t > 4.0  # errors are small then, so that angle and sine agree
     spline = CubicHermiteSpline(t[late], errors(0.0)[late], ((errors(1e-5) - errors(-1e-5)) / 2e-5)[late])
     begins = 5.25
     expected = brute_force(t[late], errors(0.0)[late], of_spline(spline), begins, 0.33, 6.5)
     found = {
         index: np.array([getattr(result.metrics, f"{index}_{axis}") for axis in catalogues.AXES]) for index in expected
     }
-    close(found, expected, 1e-7)  # rates by differences
+    close(found, expected, 1e-7)  # rates by finite differences
     assert 1e-3 < found["ape"][3] < 0.1
     fine = np.linspace(begins, 6.5, 100_001)
     nodes = np.append(begins, t[t > begins])
     seen = np.concatenate([spline([begins]), errors(0.0)[t > begins]])
-    share = np.mean(np.interp(fine, nodes, np.linalg.norm(seen[:, 3:], axis=1)) <= 0.016)  # straight from node to node
+    share = np.mean(np.interp(fine, nodes, np.linalg.norm(seen[:, 3:], axis=1)) <= 0.016)  # linear between nodes
     assert float(result.metrics.within_ape_boresight) == pytest.approx(share, abs=1e-4)
     assert 0.0 < share < 1.0
-    # without a limit of their own: exactly all of the time, or else rounding would count as time beyond it
+    # without a limit the fraction is exactly 1; rounding must not count as time beyond a limit
     assert [float(getattr(result.metrics, f"within_{name}_x")) for name in ("ape", "mpe", "rpe")] == [1.0, 1.0, 1.0]
     limits = np.array([np.inf, np.inf, np.inf, 5e-4])
     relative = relative_share(t[late], errors(0.0)[late], of_spline(spline), begins, 0.33, 6.5, limits)[3]
@@ -272,8 +273,8 @@ def test_indices_of_a_run_are_those_of_its_history(flown):
     assert 0.1 < relative < 0.9
 
 
-def test_a_run_that_never_keeps_a_limit_has_a_share_of_0(flown):
-    """Times beyond it may add up to more or less than the observation, by rounding: no two programs by the same."""
+def test_a_run_that_never_meets_a_limit_has_a_fraction_of_0(flown):
+    """Times beyond the limit add up to the observation only within rounding, which differs between programs."""
     observed = flown[0].parts.pointing
     observed = dataclasses.replace(observed, limits={name: vector(1e-12) for name in observed.limits})
     for after in (0.2, 0.25, 0.3, 0.31, 0.37):
@@ -285,13 +286,13 @@ def test_a_run_that_never_keeps_a_limit_has_a_share_of_0(flown):
             assert float(share) == 0.0
 
 
-def test_what_the_law_is_told_is_off_by_its_noise(flown):
+def test_knowledge_errors_are_the_measurement_noise(flown):
     ready, result = flown
     keys = ready.parts.sensors.keys(jnp.uint32(3), jnp.uint32(5))
     samples = np.arange(50, 65)
     turns = np.stack([np.asarray(ready.parts.sensors.noise(keys, jnp.int32(k))[0]) for k in samples])
     began, found = 0.1 * samples, result.metrics
-    in_view = began + 0.1 > 5.25 + 1e-9  # the sample before the observation is held into it
+    in_view = began + 0.1 > 5.25 + 1e-9  # the last sample before the observation is held into it
     for k, axis in enumerate("xyz"):
         assert float(getattr(found, f"ake_{axis}")) == pytest.approx(np.abs(turns[in_view, k]).max(), rel=1e-6)
     frame = np.asarray(ready.parts.pointing.frame)
@@ -309,14 +310,14 @@ def test_what_the_law_is_told_is_off_by_its_noise(flown):
         assert float(getattr(found, f"mke_{axis}")) == pytest.approx(np.abs(means)[:, k].max(), rel=1e-6)
 
 
-def test_a_window_with_more_samples_than_there_is_room_for_has_no_share_of_time():
+def test_a_window_with_too_many_samples_has_no_fraction_of_time():
     error = np.zeros((NODES.size, 5))
     asked = [jnp.asarray(given) for given in (NODES, error, error, 4.0, 1.0, np.ones((3, 4)))]
     np.testing.assert_array_equal(tallied(*asked).relative_beyond, 0.0)
     assert np.all(np.isnan(tallied(*asked, segments=9).relative_beyond))
 
 
-def test_a_run_that_is_not_sampled_has_room_for_all_its_steps():
+def test_a_continuous_run_has_room_for_all_its_steps():
     frame = pointing.across((0.0, 0.0, 1.0))
     zero, one = jnp.zeros(()), jnp.ones(())
     asked = pointing.Pointing(jnp.asarray(frame), zero, one, {"rpe_z": one})
@@ -325,8 +326,8 @@ def test_a_run_that_is_not_sampled_has_room_for_all_its_steps():
     assert dataclasses.replace(asked, samples=12).of_run(700).segments("rpe") == 14
 
 
-def test_slopes_of_indices_are_those_of_differences():
-    """Along attitudes, their rates, the times of the nodes and where the observation begins, all at once."""
+def test_gradients_of_indices_match_finite_differences():
+    """The direction changes attitudes, rates, times of nodes and the begin of the observation together."""
     rng, frame = np.random.default_rng(5), vector(pointing.across((1.0, 2.0, -0.5)))
     decay = np.exp(-0.3 * NODES)[:, None]  # so that the first window and its first moment are among the largest
     turns, aside = (vector(0.01 * decay * (1.0 + 0.1 * rng.normal(size=(NODES.size, 3)))) for _ in range(2))
@@ -345,9 +346,9 @@ def test_slopes_of_indices_are_those_of_differences():
     assert np.all(np.abs(slopes) > 1e-6)
 
 
-@pytest.mark.long  # the test above, and metrics' slopes in `test_rollout.py`
-def test_indices_have_slopes(flown):
-    """Against central differences, of a gain that moves the hand-over with everything behind it."""
+@pytest.mark.long  # covered by the test above and by gradients of metrics in `test_rollout.py`
+def test_indices_of_a_run_have_gradients(flown):
+    """Gradients in delta, which moves the hand-over, match central differences."""
     ready, _ = flown
     parts = scenario.study(scenario.replace(ready.scenario, loop__clock="anchored")).parts
     names = ("ape_boresight", "mpe_x", "rpe_boresight", "pde_y")
@@ -365,7 +366,7 @@ def test_indices_have_slopes(flown):
     assert np.all(np.abs(slopes) > 1e-8)
 
 
-def test_every_index_is_a_metric_of_a_scenario_that_observes_it(flown):
+def test_every_index_is_a_metric_of_a_scenario_with_pointing(flown):
     ready, _ = flown
     named = {f"{index}_{axis}" for index in catalogues.INDICES for axis in catalogues.AXES}
     assert named | {"within_ape_boresight", "within_rpe_boresight", "within_rke_x"} <= set(ready.catalogue)

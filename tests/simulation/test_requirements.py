@@ -20,18 +20,18 @@ def verdict(values, ok=None, metric="peak_torque"):
     ("values", "ok", "failures", "worst"),
     [
         ([0.1, 0.4, 0.2], [True, True, True], 0, 0.4),
-        ([0.1, LIMIT], [True, True], 0, LIMIT),  # at the limit is within it
+        ([0.1, LIMIT], [True, True], 0, LIMIT),  # a value at the limit meets it
         ([0.1, BEYOND], [True, True], 1, BEYOND),
         ([0.6, 0.1, 0.9], [True, True, True], 2, 0.9),
         ([0.0], [True], 0, 0.0),
         ([0.1, np.inf], [True, True], 1, np.inf),
-        ([0.1, np.nan], [True, True], 1, np.nan),  # a trial without a value cannot have kept the limit
-        ([0.1, 0.2], [True, False], 1, np.nan),  # nor one that failed, whatever its value
+        ([0.1, np.nan], [True, True], 1, np.nan),  # a trial without a value violates the limit
+        ([0.1, 0.2], [True, False], 1, np.nan),  # a failed trial violates the limit with any value
         ([0.9, np.nan, 0.1, 0.2], [True, True, False, True], 3, np.nan),
         ([np.nan, np.nan], [False, False], 2, np.nan),
     ],
 )
-def test_verdict(values, ok, failures, worst):
+def test_verdict_counts_failures_and_the_worst_value(values, ok, failures, worst):
     told = verdict(values, ok)
     assert (told.failures, told.trials, told.met) == (failures, len(values), failures == 0)
     np.testing.assert_equal((told.worst, told.margin), (worst, worst / LIMIT))
@@ -45,7 +45,7 @@ def test_verdict_on_a_single_run(value, ok, met):
 
 
 def test_a_verdict_over_many_loops_says_that_they_are_dispersed():
-    """One loop, of a run or without dispersions, has the value alone."""
+    """The verdict of a single loop prints the value alone."""
     required = Requirement("gain_margin", 6.0, "dB", at_least=True)
     many, one = (required.verdict(np.asarray(v), np.ones(np.shape(v), bool)) for v in ([7.0, 6.2, 9.0], 6.2))
     assert str(many) == "gain_margin at least 6 dB: worst of 3 dispersed loops 6.2: met"
@@ -54,8 +54,8 @@ def test_a_verdict_over_many_loops_says_that_they_are_dispersed():
 
 @settings(max_examples=100, deadline=None, derandomize=True, database=None)
 @given(st.lists(st.tuples(st.floats(), st.booleans()), min_size=1, max_size=20))
-@example([(9e307, True)])  # beyond what a share of the limit can say
-def test_a_verdict_is_what_each_trial_says(trials):
+@example([(9e307, True)])  # the ratio to the limit overflows
+def test_a_verdict_over_trials_combines_the_verdicts_of_each_trial(trials):
     told = verdict([value for value, _ in trials], [ok for _, ok in trials])
     assert told.failures == sum(not (ok and value <= LIMIT) for value, ok in trials)
     assert told.met == all(ok and value <= LIMIT for value, ok in trials)
@@ -67,7 +67,7 @@ def test_a_verdict_carries_the_unit_of_its_metric(metric):
     assert verdict([0.1], metric=metric).unit == CATALOGUE[metric][0]
 
 
-def test_a_verdict_in_words():
+def test_a_verdict_prints_one_sentence():
     assert str(verdict([0.1, 0.25])) == "peak_torque at most 0.5 N m: worst 0.25: met"
     said = str(verdict([0.1, 0.75, 0.9]))
     assert said == "peak_torque at most 0.5 N m: worst 0.9: NOT met in 2 of 3 trials"
@@ -78,7 +78,7 @@ def test_a_verdict_in_words():
     assert str(verdict([0.1], metric="saturated")) == "saturated at most 0.5: 0.1: met"
 
 
-def test_angles_are_in_degrees_too():
+def test_verdicts_print_angles_in_degrees_too():
     turned = Requirement("hold_angle", np.deg2rad(0.1)).verdict(np.deg2rad([0.05, 0.02]), np.array([True, True]))
     assert str(turned) == "hold_angle at most 0.00174533 rad (0.1 deg): worst 0.0008727 (0.05 deg): met"
     turning = Requirement("peak_rate", np.deg2rad(2.0)).verdict(np.deg2rad(3.0), np.array(True))
@@ -88,24 +88,27 @@ def test_angles_are_in_degrees_too():
 @pytest.mark.parametrize("quantile", [0.5, 0.9, 0.99, 0.9973])
 @pytest.mark.parametrize("confidence", [0.5, 0.9, 0.99])
 @pytest.mark.parametrize("trials", [10, 100, 1000, 5000])
-def test_a_share_is_shown_when_chance_alone_would_seldom_show_it(quantile, confidence, trials):
-    """The definition by the binomial distribution: were the true share no better, at most 1 - confidence of campaigns
-    would see as many trials within the limit; one trial fewer would not be enough."""
+def test_a_fraction_is_demonstrated_by_the_exact_binomial_bound(quantile, confidence, trials):
+    """The binomial distribution defines the required number of trials within the limit.
+
+    If the true fraction were only the quantile, at most 1 - confidence of all campaigns would reach this number. One
+    trial fewer would not suffice.
+    """
     least = must_keep(trials, quantile, confidence)
     if least is None:
         assert trials < fewest_trials(quantile, confidence)
-        assert quantile**trials > 1 - confidence  # not even all of them would do
+        assert quantile**trials > 1 - confidence  # even all trials would not suffice
         return
     assert binom.sf(least - 1, trials, quantile) <= (1 - confidence) * (1 + 1e-9)
     assert binom.sf(least - 2, trials, quantile) > 1 - confidence
     assert trials >= fewest_trials(quantile, confidence)
 
 
-def test_the_usual_three_sigma_requirement_takes_852_trials():
+def test_a_three_sigma_requirement_needs_852_trials():
     assert fewest_trials(0.9973, 0.9) == 852
     assert must_keep(852, 0.9973, 0.9) == 852
     assert must_keep(851, 0.9973, 0.9) is None
-    assert must_keep(1000, 0.9973, None) == 998  # what is seen, with no confidence
+    assert must_keep(1000, 0.9973, None) == 998  # the observed fraction, without a confidence
     assert must_keep(1000, None, None) == 1000
 
 
@@ -115,12 +118,12 @@ def test_the_usual_three_sigma_requirement_takes_852_trials():
     (5, 0.99, 0.9, True), (6, 0.99, 0.9, False),
     (0, 0.9999, 0.9, False),
 ])  # fmt: skip
-def test_a_requirement_on_a_share_of_the_trials(beyond, quantile, confidence, met):
+def test_a_requirement_on_a_fraction_of_the_trials(beyond, quantile, confidence, met):
     values = np.linspace(0.1, LIMIT, 1000)
     values[:beyond] = BEYOND + np.arange(beyond) * 0.01
     told = Requirement("peak_torque", LIMIT, None, quantile, confidence).verdict(values, np.ones(1000, bool))
     assert (told.met, told.failures) == (met, beyond)
-    if np.isfinite(told.margin):  # the margin is the factor on the limit that would just do
+    if np.isfinite(told.margin):  # the margin is the factor on the limit at which the requirement is just met
         for factor, does in ((1.0, True), (1.0 - 1e-9, False)):
             moved = Requirement("peak_torque", LIMIT * told.margin * factor, None, quantile, confidence)
             assert moved.verdict(values, np.ones(1000, bool)).met == does
@@ -129,7 +132,7 @@ def test_a_requirement_on_a_share_of_the_trials(beyond, quantile, confidence, me
         assert must_keep(1000, quantile, confidence) is None
 
 
-def test_trials_that_failed_use_up_what_a_share_allows():
+def test_failed_trials_count_as_violations():
     values, ok = np.full(100, 0.1), np.ones(100, bool)
     ok[:11] = False
     told = Requirement("peak_torque", LIMIT, None, 0.9).verdict(values, ok)
@@ -142,7 +145,7 @@ def test_a_single_run_is_judged_by_the_limit_alone():
     assert str(told) == "peak_torque at most 0.5 N m: 0.4: met"
 
 
-def test_a_campaign_of_one_trial_shows_no_share():
+def test_a_campaign_of_one_trial_demonstrates_no_fraction():
     told = Requirement("peak_torque", LIMIT, None, 0.99, 0.9).verdict(np.array([0.4]), np.array([True]))
     assert not told.met
     assert str(told).endswith("0.4: NOT shown, which takes at least 230 trials")
@@ -150,8 +153,8 @@ def test_a_campaign_of_one_trial_shows_no_share():
 
 @pytest.mark.parametrize("trials", [2, 3, 10])
 @pytest.mark.parametrize("quantile", [0.05, 0.3, 0.5])
-def test_as_many_trials_as_it_takes_are_enough_whatever_rounding_says(trials, quantile):
-    """A confidence for which quantile^n is 1 - confidence exactly, but for the last digits."""
+def test_rounding_does_not_change_the_required_number_of_trials(trials, quantile):
+    """For such a confidence, quantile^n equals 1 - confidence except for rounding."""
     for digits in (-2, -1, 0, 1, 2):
         confidence = float(1.0 - quantile**trials * (1.0 + digits * 2.0**-52))
         needed = fewest_trials(quantile, confidence)
@@ -159,7 +162,7 @@ def test_as_many_trials_as_it_takes_are_enough_whatever_rounding_says(trials, qu
         assert must_keep(needed, quantile, confidence) == needed
 
 
-def test_a_share_in_words():
+def test_a_fraction_is_printed_in_words():
     values = np.linspace(0.1, 0.4, 1000)
     share = Requirement("peak_torque", LIMIT, None, 0.99, 0.9)
     said = "peak_torque at most 0.5 N m in 99 % of trials with 90 % confidence: worst"
@@ -185,29 +188,29 @@ def of_time(interpretation, within, probability=0.9973, confidence=None, ok=None
     return asked.verdict(values, np.ones(within.shape, bool) if ok is None else ok, within)
 
 
-def test_temporal_is_a_share_of_the_time_in_every_run():
+def test_temporal_requires_a_fraction_of_the_time_in_every_run():
     kept = np.full(RUNS, 1.0)
     kept[7] = 0.998
     told = of_time("temporal", kept)
     assert (told.met, told.failures, told.shown) == (True, 0, pytest.approx(0.998))
     assert told.margin == pytest.approx(0.002 / 0.0027)
     kept[7] = 0.9973
-    assert of_time("temporal", kept).met  # the very share that is asked for
+    assert of_time("temporal", kept).met  # exactly the required fraction
     kept[8] = 0.99
     told = of_time("temporal", kept)
     assert (told.met, told.failures) == (False, 1)
     assert "in 99.73 % of the time, in every run: the least of a run is 99 %: NOT met, 1 of 1000 runs have less" in str(
         told
     )
-    assert not of_time("temporal", np.ones(RUNS), ok=np.arange(RUNS) > 0).met  # a run that failed keeps it never
+    assert not of_time("temporal", np.ones(RUNS), ok=np.arange(RUNS) > 0).met  # a failed run counts as 0
 
 
-def test_mixed_is_a_random_run_at_a_random_time():
+def test_mixed_requires_a_fraction_of_the_time_of_all_runs():
     never = of_time("mixed", np.ones(852), confidence=0.9)
-    assert never.met  # as many runs without a failure as of an ensemble
+    assert never.met  # as many runs without a violation as for an ensemble
     assert never.shown == pytest.approx(0.1 ** (1 / 852))
     assert not of_time("mixed", np.ones(851), confidence=0.9).met
-    # half of the runs leave it for a two-hundredth of the time: an ensemble never would keep it
+    # half of the runs exceed the limit for 1/200 of the time, which would violate an ensemble requirement
     kept = np.where(np.arange(RUNS) % 2, 1.0, 0.995)
     told = of_time("mixed", kept)
     assert (told.met, told.share_of_time) == (True, pytest.approx(0.9975))
@@ -218,7 +221,7 @@ def test_mixed_is_a_random_run_at_a_random_time():
     assert 0.9973 < sure.shown < 0.9975
     assert sure.met
     assert not of_time("mixed", many, confidence=0.999).met
-    # runs are what is independent: of fewer, 2.3/n may fail and stay unseen, 0.1^(1/n) not doing so
+    # only runs are independent: with n runs, a fraction 1 - 0.1^(1/n), about 2.3/n, may fail without being observed
     fewer = of_time("mixed", kept, confidence=0.9)
     assert fewer.shown == pytest.approx(0.9975 - 2.3 / RUNS, abs=1e-4)
     assert not fewer.met
@@ -228,7 +231,7 @@ def test_mixed_is_a_random_run_at_a_random_time():
     assert failed.share_of_time == pytest.approx(0.9975 - 0.995 / RUNS)
 
 
-def test_one_run_is_judged_by_its_own_share():
+def test_a_single_run_is_judged_by_its_fraction_of_the_time():
     for interpretation in ("temporal", "mixed"):
         asked = Requirement(INDEX, 1e-3, "rad", 0.9, 0.95 if interpretation == "mixed" else None,
                             interpretation=interpretation)  # fmt: skip
@@ -236,7 +239,7 @@ def test_one_run_is_judged_by_its_own_share():
             assert asked.verdict(np.asarray(2e-3), np.asarray(True), np.asarray(share)).met is met
 
 
-def test_the_ensemble_is_what_a_quantile_always_was():
+def test_ensemble_is_the_same_as_a_quantile():
     asked = Requirement(INDEX, 1e-3, "rad", 0.9973, 0.9)
     assert asked.timed is None
     assert asked.implied_by == asked

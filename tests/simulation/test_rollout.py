@@ -35,20 +35,20 @@ TIGHT = clock.anchored(0.25, 30.0, 20.0, 11.0)
 
 
 def at_20_hz(*gains) -> rollout.Parts:
-    """By the program of runs at up to 100 Hz."""
+    """Return a run at 20 Hz that uses the compiled program of runs at up to 100 Hz."""
     run = parts(*gains, period=0.05)
     return replace(run, clock=run.clock.long_enough_for([parts(20.0, 3.0, 2.0, period=0.01).clock]))
 
 
 def perfect(run: rollout.Parts) -> rollout.Parts:
-    """No disturbance, so that d_hat = 0 is a perfect estimate, and K2 = 0: exact solution 1 applies."""
+    """Remove disturbance and K2, so that d_hat = 0 is a perfect estimate and exact solution 1 applies."""
     quiet = disturbances.Constant(jnp.zeros(3))
     bound = replace(run.observer, disturbance_rate_bound=vector(0.0))
     return replace(run, disturbance=quiet, observer=bound)
 
 
 def reference_run(case: dict) -> rollout.Parts:
-    # the data were made with c instead of sqrt(3) c in (55)
+    # the reference data use c instead of sqrt(3) c in (55)
     times = [row["t"] for row in case["trajectory"]]
     run = parts(case["t_f"], case["eta"], case["delta"], rate_bound=1e-3 / np.sqrt(3.0), saves=times)
     assert isinstance(run.clock, clock.Graded)
@@ -58,7 +58,7 @@ def reference_run(case: dict) -> rollout.Parts:
 
 
 @pytest.mark.parametrize("case", REFERENCE["cases"], ids=lambda case: case["name"])
-def test_continuous_loop_meets_the_independent_integration(case):
+def test_the_continuous_loop_matches_an_independent_integration(case):
     run = reference_run(case)
     result = fly(run)
     log = result.log
@@ -68,7 +68,7 @@ def test_continuous_loop_meets_the_independent_integration(case):
         k = int(np.flatnonzero(log.t == row["t"])[-1])  # save times are nodes, exactly
         for name, value in (("q", log.x.q), ("omega", log.x.w), ("d_hat", log.d_hat), ("s", log.s)):
             np.testing.assert_allclose(value[k], row[name], rtol=0, atol=2e-8, err_msg=f"{name} at {row['t']}")
-        # the torque is no state: it is the states times gains up to 2 J eta^2/tau^2 before the hand-over, 2 J after
+        # the torque is the state times gains of up to 2 J eta^2/tau^2 before the hand-over, and 2 J after it
         tau = max(case["t_f"] - row["t"], case["delta"])
         gain = 2 * 14 * case["eta"] ** 2 / tau**2 if row["t"] < case["t_f"] - case["delta"] else 2 * 14
         np.testing.assert_allclose(log.u[k], row["torque"], rtol=0, atol=2e-8 * max(gain, 1.0))
@@ -81,13 +81,13 @@ def test_continuous_loop_meets_the_independent_integration(case):
 
 @pytest.mark.parametrize("eta", [2.2, 3.0, 5.0])
 @pytest.mark.parametrize("rate", [(0.0, 0.0, 0.0), (0.02, -0.03, 0.01)])
-def test_perfect_estimate_gives_the_exact_solution(eta, rate):
+def test_a_perfect_estimate_gives_the_exact_solution(eta, rate):
     run = finer(perfect(parts(30.0, eta, 0.05, inertia=FULL_INERTIA, rate=rate)), 2)
     log = fly(run).log
     before = log.t < 29.949
     error, error_rate = run.controller.kinematics.errors(run.initial, run.reference(vector(0.0)))
     exact = errors_along(log.t, vector(30.0), vector(eta), error, error_rate)
-    # the default grid leaves up to 1e-9, twice its steps a sixteenth; s is tau times a rate, tau up to 30 s
+    # the error is up to 1e-9 on the default grid and a sixteenth with twice the steps; s is tau <= 30 s times a rate
     np.testing.assert_allclose(log.error[before], exact.error[before], rtol=0, atol=1e-10)
     np.testing.assert_allclose(log.s[before], exact.s[before], rtol=0, atol=3e-9)
 
@@ -100,7 +100,7 @@ MOVING = {
 }
 
 
-@pytest.mark.long  # laws for moving references at a state: `test_controllers.py`
+@pytest.mark.long  # `test_controllers.py` tests laws for moving references at single states
 @pytest.mark.parametrize("kind", MOVING)
 def test_exact_solution_for_a_moving_reference(kind):
     moving = MOVING[kind]
@@ -113,9 +113,9 @@ def test_exact_solution_for_a_moving_reference(kind):
 
 
 @pytest.mark.parametrize("plant", short(["chain", "spacecraft"], ["chain"]))
-def test_derivatives_of_the_whole_rollout_are_those_of_the_exact_solution(plant):
+def test_derivatives_of_the_rollout_match_the_exact_solution(plant):
     run = perfect(parts(30.0, 3.0, 0.5)) if plant == "spacecraft" else chain_parts([0.6, 0.0], 30.0, 3.0, 0.5)
-    run = finer(run, 4)  # 3e-8 relative on the default grid, 1/256 of it here
+    run = finer(run, 4)  # relative error 3e-8 on the default grid, 1/256 of it here
     error, error_rate = run.controller.kinematics.errors(run.initial, run.reference(vector(0.0)))
     start = error + 0 * error_rate
 
@@ -135,9 +135,9 @@ def test_derivatives_of_the_whole_rollout_are_those_of_the_exact_solution(plant)
     np.testing.assert_allclose(by_delta, r**3 * (3.0 * (start + s0 * log_r) - s0) / 0.5, rtol=1e-8)
 
 
-@pytest.mark.long  # RK4: `test_numerics.py`; exact motions to what its steps leave: the tests above and `test_chain.py`
+@pytest.mark.long  # also covered by `test_numerics.py`, `test_chain.py` and the tests above
 def test_order_of_convergence_is_four():
-    """Of the whole loop, for a chain with an observer of a sinusoid."""
+    """The order is that of the whole loop, for a chain with an observer and a sinusoidal disturbance."""
     wave = disturbances.Sinusoid(*(vector([v]) for v in (0.05, 0.7, 0.3, 0.0)))
     model = integrator_chain.chain(2)
     observer = nonlinear.NonlinearObserver(model, vector([2.0]), vector(0.035), vector(0.02))
@@ -151,27 +151,27 @@ def test_order_of_convergence_is_four():
     truth = final(64)
     sizes = np.array([4, 8, 16])
     errors = np.array([np.abs(final(int(n)) - truth).max() for n in sizes])
-    assert errors[-1] > 1e-13  # still truncation, not rounding
+    assert errors[-1] > 1e-13  # still above rounding
     slope = -np.polyfit(np.log(sizes), np.log(errors), 1)[0]
     assert 3.7 < slope < 4.5
 
 
 @pytest.mark.parametrize("inertia", [(10.0, 12.0, 14.0), FULL_INERTIA, (0.01, 0.012, 0.015)])
 @pytest.mark.parametrize("gain", [0.5, 10.0, 300.0])
-def test_no_observer_gain_blows_up(inertia, gain):
+def test_every_observer_gain_gives_a_bounded_estimate(inertia, gain):
     scale = np.max(inertia) / 14.0
     wave = disturbances.Sinusoid(*(vector([v] * 3) for v in (0.01 * scale, 0.1, 0.0, 0.0)))
     run = parts(30.0, 3.0, 0.5, gain, inertia=inertia, disturbance=wave, rate_bound=1e-3 * scale)
     result = fly(run)
     assert int(result.status) == rollout.OK
-    # (55): the estimate stays as near as its own bound says
+    # (55): the error of the estimate stays within its bound
     bound = run.observer.error_bound()
     off = np.linalg.norm(result.log.d_hat - result.log.disturbance, axis=1)
     allowed = np.asarray(jax.vmap(bound)(result.log.t)) + 1e-12
     assert np.all(off <= allowed * (1 + 1e-6))
 
 
-def test_sampled_loop_converges_to_the_continuous_one_with_first_order():
+def test_the_sampled_loop_converges_to_the_continuous_loop_with_first_order():
     truth = fly(parts(20.0, 3.0, 2.0, 5.0, sign_width=0.05)).metrics
     sampled = [parts(20.0, 3.0, 2.0, 5.0, sign_width=0.05, period=period) for period in (0.04, 0.02, 0.01)]
     clocks = [run.clock for run in sampled]
@@ -183,7 +183,7 @@ def test_sampled_loop_converges_to_the_continuous_one_with_first_order():
     assert np.all((ratios > 1.8) & (ratios < 2.2))  # zero-order hold: half a period of delay
 
 
-def test_held_torque_is_what_an_adaptive_integrator_makes_of_it():
+def test_motion_under_held_torque_matches_an_adaptive_integrator():
     from scipy.integrate import solve_ivp
 
     run = parts(20.0, 3.0, 1.0, period=0.25, noise=(2e-5, 1e-6), inertia=FULL_INERTIA)
@@ -203,11 +203,11 @@ def test_held_torque_is_what_an_adaptive_integrator_makes_of_it():
         if log.t[k + 1] > log.t[k]:
             span = (log.t[k], log.t[k + 1])
             y = solve_ivp(rate, span, y, args=(log.u[k],), rtol=1e-11, atol=1e-13).y[:, -1]
-    # RK4 at 0.25 s and up to 0.15 rad/s: (0.04)^5/120 a step, 120 steps: 1e-7
+    # the error of RK4 at 0.25 s and up to 0.15 rad/s is (0.04)^5/120 per step, 1e-7 after 120 steps
     np.testing.assert_allclose(np.concatenate([log.x.q[-1], log.x.w[-1]]), y, atol=1e-7)
 
 
-@pytest.mark.long  # of sampled runs by the command: `tests/cli/test_cli.py`; clocks by themselves: `test_clock.py`
+@pytest.mark.long  # also covered by `tests/cli/test_cli.py` and `test_clock.py`
 def test_the_last_row_is_at_t_end_and_time_never_runs_backwards():
     for run in (parts(), parts(period=0.07), parts(period=0.069, flight=True, t_end=41.37)):
         log = fly(run).log
@@ -217,7 +217,7 @@ def test_the_last_row_is_at_t_end_and_time_never_runs_backwards():
 
 @pytest.mark.parametrize("kind", ["anchored", "flight"])
 def test_the_last_row_has_the_estimate_and_s_of_a_sample_at_t_end(kind):
-    """Equal to the row at this time of a longer run, which takes a sample there; the torque is the one held before."""
+    """It equals the row at this time in a longer run, which has a sample there. The torque is still the held one."""
     noise = {"attitude_noise": 1e-5, "rate_noise": 1e-6}
     loop = {"mode": "sampled", "period": 0.25, "window": 1.0, "clock": kind}
 
@@ -242,8 +242,8 @@ def test_metrics_at_t_f_are_taken_inside_the_period(flight):
     result = fly(run)
     log = result.log
     k = np.flatnonzero((log.t < t_f) & log.has_length)[-1]
-    assert t_f - log.t[k] > 1e-3  # not on a sample
-    halves = 64  # Euler-free check: RK4 in many small steps from the sample before, under the same torque
+    assert t_f - log.t[k] > 1e-3  # t_f is not at a sample
+    halves = 64  # independent check: many small RK4 steps from the previous sample with the same torque
     x = jax.tree.map(lambda v: jnp.asarray(v[k]), log.x)
     from ptsmc_jax.numerics import integrators
 
@@ -259,7 +259,7 @@ def test_metrics_at_t_f_are_taken_inside_the_period(flight):
     np.testing.assert_allclose(result.metrics.terminal_error, np.linalg.norm(error), rtol=1e-8)
 
 
-def test_status_of_a_run_that_comes_near_the_singularity_or_diverges():
+def test_status_of_singular_and_diverged_runs():
     turned = np.array([0.0, 0.0, 1.0, 1e-4])
     near = fly(parts(q=turned / np.linalg.norm(turned)))
     assert int(near.status) == rollout.SINGULAR
@@ -275,10 +275,10 @@ def test_status_of_a_run_that_comes_near_the_singularity_or_diverges():
 
 
 @pytest.mark.parametrize(("disturbance", "status"), [(0.5, rollout.OK), (50.0, rollout.MISSED)])
-def test_a_run_that_starts_where_it_is_to_be_has_missed_t_f_by_ten_settling_angles(disturbance, status):
-    """5 % of an initial error of zero is none: what no observer takes off leaves a tau^2 / (eta - 2)^2 at tau = delta.
+def test_a_run_that_starts_on_the_target_is_missed_beyond_ten_settling_angles(disturbance, status):
+    """The limit of 5 % of the initial error is 0 here, so the limit of ten settling angles of 1e-3 applies.
 
-    Here 1.25e-3 and 0.125, beside settling angles of 1e-3 that the run may be off by ten of.
+    A constant disturbing acceleration a leaves the error a tau^2 / (eta - 2)^2 at tau = delta, here 1.25e-3 and 0.125.
     """
     pushed = disturbances.Constant(vector([disturbance]))
     result = fly(chain_parts([0.0, 0.0], disturbance=pushed))
@@ -301,12 +301,12 @@ LOOPS = [(CHAIN, "continuous"), (CHAIN, "sampled"), (SYSTEM, "continuous"), (SYS
 
 @pytest.mark.parametrize(("plant", "mode"), short(LOOPS, LOOPS[1:3]))
 def test_a_run_with_a_metric_that_is_not_finite_is_not_ok(plant, mode):
-    """The state stays finite, but its square is beyond 1.8e308: the RMS over the window has no value."""
+    """The state stays finite, but its square overflows (1.8e308), so the RMS over the window has no value."""
     needs = {"requirements": {"peak_torque": 1e300, "window_error": 1e300}}
     large, lost = (flown({**plant, "x0": [x, 0.0]}, mode, **needs) for x in (1e140, 1e160))
     assert (large.status, large.met) == ("ok", True)
     assert all(np.isfinite(value) for name, value in large.metrics.items() if name != "settling_time")
-    assert np.isnan(large.metrics["settling_time"])  # it never settles, which alone is no failure
+    assert np.isnan(large.metrics["settling_time"])  # a run that never settles can still be ok
     assert np.isfinite(lost.log.x).all()
     assert not np.isfinite(lost.metrics["window_error"])
     assert (lost.status, lost.reason) == ("diverged", "a metric is not finite")
@@ -315,7 +315,7 @@ def test_a_run_with_a_metric_that_is_not_finite_is_not_ok(plant, mode):
     assert not lost.met
 
 
-def test_a_spacecraft_whose_momentum_has_no_2_norm_is_not_ok():
+def test_a_spacecraft_with_an_overflowing_momentum_is_not_ok():
     for inertia, code in ((1e140, rollout.OK), (1e170, rollout.UNBOUNDED)):
         result = fly(parts(inertia=(inertia,) * 3, gain=inertia, rate=(0.02, -0.03, 0.01)))
         assert int(result.status) == code
@@ -334,7 +334,7 @@ def test_either_sign_of_the_quaternion_is_the_same_run():
     assert float(flipped.metrics.terminal_angle) < 1e-6
 
 
-def test_another_number_is_the_same_program(monkeypatch):
+def test_other_numbers_use_the_same_compiled_program(monkeypatch):
     traced, loop = [], sampled.simulate
 
     def counted(*args):
@@ -346,7 +346,7 @@ def test_another_number_is_the_same_program(monkeypatch):
         run = parts(20.0 - k, 3.0 + k, 0.5 + k, 10.0 * (1 + k), k1=1.0 + k, period=0.25, noise=(1e-5 * k, 1e-6))
         run = replace(run, clock=replace(TIGHT, period=vector(0.25 + 0.01 * k), t_end=vector(30.0 - k)))
         fly(run, k, k)
-    assert len(traced) <= 1  # none where another test has flown it
+    assert len(traced) <= 1  # 0 if another test has compiled it
 
 
 def test_a_run_is_its_control_periods_one_after_the_other():
@@ -371,7 +371,7 @@ def test_a_run_is_its_control_periods_one_after_the_other():
 
 
 @pytest.mark.long
-def test_simulate_without_jit_is_the_same():
+def test_simulate_without_jit_gives_the_same_result():
     run = parts(5.0, 3.0, 0.5, period=0.5, noise=(2e-5, 1e-6), t_end=6.0)
     with jax.disable_jit():
         plain = rollout.simulate(run, np.uint32(1), np.uint32(2))
@@ -380,7 +380,7 @@ def test_simulate_without_jit_is_the_same():
         np.testing.assert_allclose(value, compiled.metrics[name], rtol=1e-10, err_msg=name)
 
 
-def test_observer_and_controller_hold_a_model_of_their_own():
+def test_observer_and_controller_use_the_design_model():
     heavier = rigid_body.spacecraft((10.5, 12.6, 14.7))
     run = at_20_hz(20.0, 3.0, 0.5)
     off = fly(replace(run, plant=heavier))
@@ -391,8 +391,8 @@ def test_observer_and_controller_hold_a_model_of_their_own():
     np.testing.assert_array_equal(run.observer.model.inertia, run.controller.model.inertia)
 
 
-def test_gains_that_the_clock_has_no_samples_for_are_said():
-    """Of `TIGHT`: a longer t_f begins late, a longer delta ends early."""
+def test_gains_beyond_the_clock_are_refused():
+    """With the clock `TIGHT`, a longer t_f begins too late and a longer delta ends too early."""
     run = parts(20.0, 3.0, 0.5, period=0.25, noise=(2e-4, 1e-5))
     run = replace(run, clock=TIGHT)
     codes = {}
@@ -411,8 +411,8 @@ def test_gains_that_the_clock_has_no_samples_for_are_said():
     assert rollout.UNFINISHED not in rollout.FINISHED
 
 
-def test_a_t_f_that_the_steps_of_a_continuous_loop_are_too_coarse_for_is_said():
-    """Twice the t_f that its grid was made for leaves no steps to close in on it: the window error was 66 % off."""
+def test_a_t_f_beyond_the_grid_of_the_continuous_loop_is_refused():
+    """Twice the t_f of the grid leaves too few steps near t_f. Earlier the window error was wrong by 66 %."""
     run = reference_run(REFERENCE["cases"][0])
     codes = {t_f: int(fly(run.with_t_f(vector(t_f))).status) for t_f in (30.0, 45.0, 60.0, 90.0)}
     assert codes == {30.0: rollout.OK, 45.0: rollout.OK, 60.0: rollout.UNFINISHED, 90.0: rollout.UNFINISHED}
@@ -445,11 +445,11 @@ def test_a_continuous_loop_refuses_parts_that_it_would_ignore(changes, name):
 
 
 def test_a_continuous_loop_refuses_a_law_of_the_sampled_loop():
-    """The run ended in NotImplementedError without a sentence."""
+    """An earlier version raised NotImplementedError without a message."""
     run = parts(20.0, 3.0, 2.0)
     law = PD(MultiplicativeKinematics(run.controller.model), vector(20.0), vector(2.0), vector(1.0), vector(2.0))
     with pytest.raises(TypeError, match=r"^the law PD needs the sampled loop"):
         rollout.simulate_parts(replace(run, controller=law))
-    # implicit sampling, which the continuous loop ignored
+    # implicit sampling, which the continuous loop ignored earlier
     with pytest.raises(TypeError, match=r"^the law PrescribedTime needs the sampled loop"):
         rollout.simulate_parts(replace(run, controller=replace(run.controller, implicit=True)))
