@@ -1,4 +1,4 @@
-"""What figures of campaigns say, read back from their legends."""
+"""Content of campaign figures, read from their legends and lines."""
 
 import numpy as np
 import pytest
@@ -12,14 +12,14 @@ from ptsmc_jax.figures import campaign_plots
     ("asked for: 50 % of the time of all runs; seen: 80 %",
      "limit 2.5 rad: 50 % of the trials within at all times\nasked for: 50 % of the time of all runs; seen: 80 %"),
 ])  # fmt: skip
-def test_a_limit_on_a_share_of_the_time_is_said_as_such(of_time, said):
+def test_a_limit_on_a_fraction_of_the_time_is_labelled(of_time, said):
     column = campaign_plots.Column("rad", np.array([1.0, 2.0, 3.0, np.nan]), 2.5, of_time)
     (axes,) = campaign_plots.distributions({"ape_z": column}).axes
     assert axes.get_legend_handles_labels()[1] == [said]
 
 
-def test_a_value_stands_at_the_share_of_the_trials_up_to_the_middle_of_its_own():
-    """Of four trials, one without a value, each is a quarter, and the last quarter lies beyond all values."""
+def test_the_distribution_places_a_value_at_the_middle_of_its_step():
+    """Each of four trials is a quarter. A trial without a value lies beyond all values."""
     column = campaign_plots.Column("rad", np.array([3.0, 1.0, np.nan, 2.0]))
     (axes,) = campaign_plots.distributions({"ape_z": column}).axes
     np.testing.assert_allclose(np.asarray(axes.lines[0].get_xydata()), [[1.0, 1 / 8], [2.0, 3 / 8], [3.0, 5 / 8]])
@@ -51,14 +51,14 @@ def test_each_outcome_is_counted_and_drawn():
         axes.collections, (marker for _, marker, _ in campaign_plots.MARKS.values()), strict=True
     ):
         drawn = np.all(np.asarray(points.get_linewidth()) > 0.0)
-        assert drawn or MarkerStyle(marker).is_filled(), marker  # else nothing of it is seen
+        assert drawn or MarkerStyle(marker).is_filled(), marker  # otherwise it is invisible
     flown = x[np.isin(outcome, ("ok", campaign_plots.AT_TIMES, campaign_plots.BEYOND, "missed"))]
     assert axes.get_ylim() == pytest.approx((flown.min() / 1.3, flown.max() * 1.5))
 
 
 @pytest.mark.parametrize("limit", [1e-3, 1e3])
 def test_a_limit_in_the_legend_is_on_the_axis(limit):
-    """Far below torques of 10 kN m, which no wheel gave, the line of 0.5 N m was not."""
+    """An earlier version lost the line of 0.5 N m on an axis of 10 kN m, the commanded torque."""
     x, outcome = np.arange(1.0, 4.0), np.full(3, "missed", dtype=object)
     start, torque = campaign_plots.Column("rad", x), campaign_plots.Column("N m", x, limit)
     (axes,) = campaign_plots.torque_by_angle(start, torque, outcome, {"missed": 3}).axes
@@ -78,8 +78,8 @@ def test_the_legend_of_a_narrow_figure_stays_inside_it():
     assert figure.bbox.x0 <= legend.get_window_extent().x0
 
 
-def test_a_metric_over_what_was_drawn_has_plain_numbers():
-    """As the other figures of a campaign, not 2 x 10^-1."""
+def test_axes_of_metrics_over_dispersions_have_plain_numbers():
+    """The numbers have the form of other campaign figures, not 2 x 10^-1."""
     x = np.geomspace(0.03, 0.9, 5)
     column, outcome = campaign_plots.Column("N m", x), np.full(5, "ok", dtype=object)
     totals = dict.fromkeys(campaign_plots.MARKS, 5)

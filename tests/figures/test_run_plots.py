@@ -1,4 +1,4 @@
-"""What figures of a run say, read back from their legends."""
+"""Content of the figures of a run, read from their legends and lines."""
 
 import re
 import warnings
@@ -16,12 +16,12 @@ PEAKS = [(SHORT, 0, " N m", r"peak \d"), (SHORT_CHAIN, 1, "", r"peak of the comm
 
 
 @pytest.mark.parametrize(("text", "delay", "unit", "said"), PEAKS, ids=["0", "1"])
-def test_a_peak_that_is_not_on_the_curves_is_said_to_be_the_commands(text, delay, unit, said):
-    """Delivered torque is drawn, and the metric `peak_torque` is marked, which is what was asked for."""
+def test_a_peak_of_the_command_is_labelled_as_commanded(text, delay, unit, said):
+    """The figure shows the delivered torque and marks the metric `peak_torque`, which is the commanded torque."""
     late = ptsmc_jax.replace(from_tables(untuned(text)), hardware__delay=delay)
     flight = ptsmc_jax.simulate(late)
     log = flight.run.log._replace(commanded=flight.run.log.commanded.copy())
-    log.commanded[17, -1] = -50.0  # the peak, at a time and about an axis that are known
+    log.commanded[17, -1] = -50.0  # the peak, at a known time and axis
     (axes,) = run_plots.torque(flight.run.parts, log).axes
     (label,) = [label for label in axes.get_legend_handles_labels()[1] if label.startswith("peak")]
     assert label.startswith(f"peak of the command 50{unit} at {log.t[17]:.4g} s")
@@ -29,8 +29,8 @@ def test_a_peak_that_is_not_on_the_curves_is_said_to_be_the_commands(text, delay
     assert any(re.match(said, label) for label in axes.get_legend_handles_labels()[1])
 
 
-def test_the_time_to_go_has_plain_numbers():
-    """It runs from t_f down to delta: 60 to 4 s stood there as 6x10^1, 4x10^1, 3x10^1."""
+def test_the_axis_of_the_time_to_go_has_plain_numbers_in_run_figures():
+    """The axis runs from t_f down to delta. An earlier version printed 60 s as 6x10^1."""
     figure = ptsmc_jax.simulate(from_tables(untuned(SHORT))).plot("convergence")["convergence"]
     (axes,) = figure.axes
     figure.draw_without_rendering()
@@ -40,7 +40,7 @@ def test_the_time_to_go_has_plain_numbers():
 
 
 def test_no_two_of_twenty_states_look_alike():
-    """Of a chain of order 20, x6, x11 and x16 did: the legend named three lines of the same colour, style and width."""
+    """An earlier version drew x6, x11 and x16 with the same colour, style and width."""
     axes = Figure().subplots()
     run_plots._components(axes, np.arange(3.0), np.zeros((3, 20)), "x")
     looks = {(one.get_color(), one.get_linestyle(), one.get_linewidth(), one.get_alpha()) for one in axes.lines}
@@ -48,8 +48,8 @@ def test_no_two_of_twenty_states_look_alike():
 
 
 @pytest.mark.parametrize("order", [2, 3])
-def test_slopes_of_theory_are_drawn_with_the_powers_that_they_are_said_to_have(order):
-    """The error falls like r^eta, and of a chain of order 3 s like r^(eta + 1)."""
+def test_theoretical_decay_lines_have_the_labelled_powers(order):
+    """The error falls like r^eta, and s of a chain of order 3 falls like r^(eta + 1)."""
     tables = {"plant": {"kind": "chain", "order": order}, "controller": {"t_f": 5.0, "eta": 4.5, "delta": 0.5}}
     chain = from_tables({**tables, "loop": {"mode": "sampled", "period": 0.1}})
     (axes,) = ptsmc_jax.simulate(chain).plot("convergence")["convergence"].axes
@@ -69,19 +69,19 @@ def test_the_window_that_a_run_is_judged_in_is_shaded():
 
 
 @pytest.mark.parametrize(("disturbance", "drawn"), [("none", set()), ("sinusoid", {"error", "sliding"})])
-def test_what_log_axes_cannot_show_is_not_drawn(disturbance, drawn):
-    """A run that begins on its target: its errors are zero, or have no exact motion that theory knows."""
+def test_zeros_are_not_drawn_on_log_axes(disturbance, drawn):
+    """A run that begins on its target has zero errors, or errors without an exact solution."""
     tables = untuned(SHORT_CHAIN) | {"disturbance": {"kind": disturbance}, "hardware": {}}
     figures = ptsmc_jax.simulate(ptsmc_jax.replace(from_tables(tables), plant__x0=[0.0, 0.0])).plot()
     assert {"error", "sliding", "convergence"} & set(figures) == drawn
     for name in drawn:
         (axes,) = figures[name].axes
-        assert np.isnan(np.asarray(axes.lines[0].get_ydata())[0])  # the first sample's zero is no 1e-16
+        assert np.isnan(np.asarray(axes.lines[0].get_ydata())[0])  # the zero of the first sample is not drawn as 1e-16
         assert axes.get_ylim()[0] >= run_plots.SMALLEST
 
 
-def test_a_command_far_beyond_what_is_delivered_leaves_its_axis():
-    """Wheels were drawn as a line at zero, the 970 N m that were asked of them far below."""
+def test_a_command_far_beyond_the_delivered_torque_is_cut_by_the_axis():
+    """An earlier version drew the wheels' torque as a line at zero beside a command of 970 N m."""
     weak = ptsmc_jax.replace(from_tables(untuned(SHORT_CHAIN)), hardware__torque_limit=1e-3)
     flight = ptsmc_jax.simulate(weak)
     (axes,) = flight.plot("torque")["torque"].axes
@@ -91,8 +91,8 @@ def test_a_command_far_beyond_what_is_delivered_leaves_its_axis():
 
 
 @pytest.mark.parametrize(("points", "where"), [(100, "best"), (300_000, "upper right")])
-def test_the_legend_of_a_long_run_has_its_corner(points, where, monkeypatch):
-    """Matplotlib looks for a place at each point of each curve, and warns of it where that is slow."""
+def test_the_legend_of_a_long_run_has_a_fixed_corner(points, where, monkeypatch):
+    """For the best place of a legend, Matplotlib examines each point, and it warns if this is slow."""
     axes, asked = Figure().subplots(), []
     axes.plot(np.zeros(points), label="q")
     monkeypatch.setattr(axes, "legend", lambda **how: asked.append(how["loc"]))
@@ -101,7 +101,7 @@ def test_the_legend_of_a_long_run_has_its_corner(points, where, monkeypatch):
 
 
 def test_a_run_that_diverges_is_drawn_without_warnings():
-    """Beyond 1e154 squares are infinite: the axis of s ended at 10, and the peak of the command was "nan"."""
+    """Squares of numbers beyond 1e154 overflow. Earlier, the axis of s ended at 10 and the peak was "nan"."""
     tables = untuned(SHORT_CHAIN) | {"loop": {"mode": "sampled", "period": 0.3, "t_end": 400.0}}
     flight = ptsmc_jax.simulate(ptsmc_jax.replace(from_tables(tables), controller__k1=100.0))
     assert flight.status == "diverged"

@@ -1,4 +1,4 @@
-"""What figures of studies draw, read back from their lines and axes."""
+"""Content of the figures of studies, read from their lines and axes."""
 
 import warnings
 from itertools import pairwise
@@ -15,7 +15,7 @@ NAMES = ("window_error", "linear_window_error", "peak_torque", "largest_peak_tor
 
 
 def numbers_apart(axes):
-    """How many numbers stand along the axis across, none over the next one or so near that they read as one."""
+    """Return how many numbers the horizontal axis has, after checking that they do not overlap or touch."""
     axes.figure.draw_without_rendering()
     boxes = [label.get_window_extent() for label in axes.get_xticklabels() if label.get_text()]
     boxes = sorted((b for b in boxes if axes.bbox.x0 <= (b.x0 + b.x1) / 2 <= axes.bbox.x1), key=lambda b: b.x0)
@@ -24,12 +24,12 @@ def numbers_apart(axes):
 
 
 def test_the_search_is_coloured_where_the_requirements_are_met():
-    """Grey: all steps of a start; coloured above it: those that are admissible."""
+    """All steps of a local search are grey, and the steps that meet the requirements are coloured."""
     values = np.array([[3.0, 5.0], [2.0, 4.0], [1.0, np.nan]])
     met = np.array([[False, True], [True, False], [True, False]])
     judged = 0.9, {"eta": 3.1}
     figure = study_plots.tuning_history({"eta": ("-", np.full((3, 2), 3.0))}, values, met, "window error", judged)
-    for axes, value in zip(figure.axes, (0.9, 3.1), strict=True):  # whatever the last step of a start was
+    for axes, value in zip(figure.axes, (0.9, 3.1), strict=True):  # not the last step of a local search
         (line,) = [line for line in axes.lines if str(line.get_label()).startswith("result")]
         assert set(np.asarray(line.get_ydata()).tolist()) == {value}
     drawn = [np.asarray(line.get_ydata(), dtype=float) for line in figure.axes[0].lines[:4]]
@@ -38,8 +38,8 @@ def test_the_search_is_coloured_where_the_requirements_are_met():
         np.testing.assert_array_equal(drawn[2 * start + 1], np.where(met[:, start], values[:, start], np.nan))
 
 
-def test_a_tradeoff_has_each_trial_and_their_rms_beside_their_mean_peak():
-    """Errors of 3e-6, 4e-6 and 12e-6, an RMS of 13e-6 / 3^(1/2)."""
+def test_a_tradeoff_figure_has_each_trial_and_their_rms():
+    """Errors of 3e-6, 4e-6 and 12e-6 have an RMS of 13e-6 / sqrt(3)."""
     errors, peaks = np.array([3e-6, 4e-6, 12e-6]), np.array([0.2, 0.4, 0.3])
     figure = study_plots.tradeoff({"tuned": (errors, peaks)}, limit=0.5, floor=1e-6)
     (axes,) = figure.axes
@@ -50,8 +50,8 @@ def test_a_tradeoff_has_each_trial_and_their_rms_beside_their_mean_peak():
     assert said == ["tuned: RMS 7.51e-06, mean peak 0.3 N m", "limit 0.5 N m", "lower bound 1e-06"]
 
 
-@pytest.mark.parametrize(("low", "high", "least"), [(1e-6, 0.1, 5), (4.167e-5, 0.1188, 4)])  # the other: long numbers
-def test_profiles_name_the_limit_that_is_broken_and_their_numbers_do_not_overlap(low, high, least):
+@pytest.mark.parametrize(("low", "high", "least"), [(1e-6, 0.1, 5), (4.167e-5, 0.1188, 4)])  # second: long numbers
+def test_profiles_name_the_violated_limit_and_their_numbers_do_not_overlap(low, high, least):
     at = np.geomspace(low, high, 4)
     over, nearest = np.array([1.2, 0.5, 1.1, 1.5]), ["peak_torque", "peak_torque", "gain_margin", "peak_torque"]
     figure = study_plots.profiles({"sign_width": study_plots.Profile("-", at, at, over, nearest, 1e-3)}, "goal")
@@ -88,7 +88,7 @@ def test_the_legend_of_profiles_is_inside_the_figure_and_above_the_axes(count, l
 
 
 @pytest.mark.parametrize("known", [0, 1])
-def test_a_profile_with_hardly_a_goal_has_the_whole_interval_of_its_gain(known):
+def test_a_profile_with_few_values_shows_the_whole_interval_of_its_gain(known):
     at = np.geomspace(1e-3, 1.0, 4)
     goal = np.where(np.arange(4) < known, 1e-5, np.nan)
     one = study_plots.Profile("-", at, goal, np.full(4, 1e9), ["peak_torque"] * 4, 0.1)
@@ -103,7 +103,7 @@ def test_a_profile_with_hardly_a_goal_has_the_whole_interval_of_its_gain(known):
 
 
 @pytest.mark.parametrize(("limit", "drawn"), [(2.9, True), (3.1, False)])
-def test_a_limit_far_above_what_is_drawn_is_said_and_does_not_flatten_it(limit, drawn):
+def test_a_limit_far_above_the_curves_is_labelled_and_does_not_flatten_them(limit, drawn):
     _, axes = figure_of("torque", "u")
     axes.plot([0.0, 1.0], [-1.0, 0.5])
     run_plots._limit(axes, limit, " N m")
@@ -112,25 +112,25 @@ def test_a_limit_far_above_what_is_drawn_is_said_and_does_not_flatten_it(limit, 
     assert said == f"limit {limit:g} N m" + ("" if drawn else ", beyond this axis")
 
 
-def test_cells_of_a_map_reach_half_way_to_the_next_ones_and_as_far_at_the_ends():
+def test_cells_of_a_map_meet_half_way_between_grid_points():
     np.testing.assert_allclose(study_plots.MapAxis("x", [1.0, 2.0, 4.0], False).edges, [0.5, 1.5, 3.0, 5.0])
-    powers = 2.0 ** np.array([-0.5, 0.5, 1.5, 2.5])  # as the axis is drawn
+    powers = 2.0 ** np.array([-0.5, 0.5, 1.5, 2.5])  # the axis is logarithmic
     np.testing.assert_allclose(study_plots.MapAxis("x", [1.0, 2.0, 4.0], True).edges, powers)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4])
-def test_every_grid_that_has_numbers_has_its_map(count):
+def test_every_grid_with_numbers_has_a_map(count):
     grids = {name: GRID if k < count else np.full((2, 2), np.nan) for k, name in enumerate(NAMES)}
     axis = study_plots.MapAxis("delta [s]", [1.0, 2.0], False)
     figure = study_plots.accuracy_map(axis, axis, grids, np.zeros((2, 2), bool), {})
     titles = [axes.get_title() for axes in figure.axes if axes.get_title()]
     assert len(titles) == count
-    assert len(figure.axes) == 2 * count  # and its bar of colours
+    assert len(figure.axes) == 2 * count  # each map has a colour bar
 
 
 @pytest.mark.parametrize("high", [2.3, 50.0])
-def test_the_bar_of_a_maps_colours_has_plain_numbers(high):
-    """Not 6 x 10^-1 and 2 x 10^0 beside axes that have 0.5 and 2."""
+def test_the_colour_bar_of_a_map_has_plain_numbers(high):
+    """The numbers have the form of the axes, 0.5 and 2, not 6 x 10^-1."""
     axis = study_plots.MapAxis("delta [s]", [1.0, 2.0], False)
     grid = np.array([[0.15, 1.0], [0.3, high]])
     figure = study_plots.accuracy_map(axis, axis, dict.fromkeys(NAMES, grid), np.zeros((2, 2), bool), {})
@@ -149,7 +149,7 @@ def test_numbers_of_a_maps_logarithmic_axis_do_not_overlap(low, high):
     assert numbers_apart(figure.axes[2]) >= 2
 
 
-def test_whole_numbers_along_a_map_have_no_halves_between_them():
+def test_an_axis_of_whole_numbers_has_no_halves():
     delay = study_plots.MapAxis("hardware.delay", [0.0, 1.0], False)
     figure = study_plots.accuracy_map(delay, delay, dict.fromkeys(NAMES, GRID), np.zeros((2, 2), bool), {})
     for line in (figure.axes[0].xaxis, figure.axes[0].yaxis):
