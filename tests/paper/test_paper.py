@@ -1,4 +1,4 @@
-"""The paper reproduced: its claims and slips as measured, and what `ptsmc reproduce` leaves of them."""
+"""Reproduction of the paper: measured claims and errors, and the files that `ptsmc reproduce` writes."""
 
 import json
 from types import SimpleNamespace
@@ -26,8 +26,8 @@ def test_every_figure_of_the_paper_is_a_case():
     assert numbers == list(range(1, 11))
 
 
-def test_cases_are_those_of_the_reference_data(made):
-    """The independent integration was made with c instead of sqrt(3) c in (55): a larger K2 holds a tenth less."""
+def test_cases_match_the_reference_data(made):
+    """The independent integration uses c instead of sqrt(3) c in (55). The larger K2 reduces the error by a tenth."""
     by_name = {(c["t_f"], c["eta"]): c["summary"] for c in REFERENCE["cases"]}
     for name in claims.SPACECRAFT:
         law = made.cases[name].parts.controller
@@ -40,8 +40,8 @@ def test_cases_are_those_of_the_reference_data(made):
         )
 
 
-def test_verdicts_are_those_that_the_theory_notes_expect(made):
-    """Accuracy is better than claimed at t_f, not kept after it, and no better for a larger eta."""
+def test_verdicts_match_the_theory_notes(made):
+    """The accuracy is better than claimed at t_f, worse after t_f, and not better for a larger eta."""
     told = {claim.claim.split(" (")[0]: claim for claim in made.claims}
     assert [claim.verdict for claim in made.claims].count("differs") == 3
     assert told["error of 10E-5 at t_f for eta = 5"].verdict == "holds in part"
@@ -59,9 +59,9 @@ def test_verdicts_are_those_that_the_theory_notes_expect(made):
     assert settled["spread_disturbed"] > 0.3
 
 
-def test_a_verdict_follows_its_measurement(made, monkeypatch):
-    """The same words with other runs: nothing is decided beforehand."""
-    for measured in ("_independent_of_the_start", "_bounded_when_sampled"):  # by flights of their own
+def test_a_verdict_depends_on_its_measurement(made, monkeypatch):
+    """Other runs give other verdicts with the same text, so the verdicts are not fixed."""
+    for measured in ("_independent_of_the_start", "_bounded_when_sampled"):  # these claims need further runs
         monkeypatch.setattr(claims, measured, lambda *_: made.claims[0])
     swapped = {**made.cases, "case_2_eta_3": made.cases["case_2_eta_5"], "case_2_eta_5": made.cases["case_2_eta_3"]}
     told = {claim.claim: claim.verdict for claim in claims.claims(swapped)}
@@ -69,20 +69,20 @@ def test_a_verdict_follows_its_measurement(made, monkeypatch):
     assert told["so does a larger eta"] == "differs"
 
 
-def test_slips_show_what_they_say(made):
+def test_slips_show_the_stated_numbers(made):
     values = {slip.where + slip.correct[:4]: slip.values for slip in made.slips}
     assert len(values) == len(made.slips)
     (expansion,) = [v for k, v in values.items() if k.startswith("(37)")]
     assert expansion["largest_relative_difference"] < 1e-12
     (growth,) = [v for k, v in values.items() if k.startswith("Theorem 3")]
-    assert growth["growth"] == pytest.approx(100.0, rel=0.02)  # 5 s over 0.05 s, read off between nodes
+    assert growth["growth"] == pytest.approx(100.0, rel=0.02)  # 5 s over 0.05 s, interpolated between nodes
     (term,) = [v for k, v in values.items() if k.startswith("(29)")]
-    # x'' + x' + x = 0 from (1, -1): s = x + x' = 2/sqrt(3) e^(-t/2) sin(sqrt(3) t/2) in size, largest at t = 1.209
+    # x'' + x' + x = 0 from (1, -1) has |s| = |x + x'| = 2/sqrt(3) e^(-t/2) sin(sqrt(3) t/2), largest at t = 1.209
     assert term["without"] == pytest.approx(2 / 3**0.5 * np.exp(-1.2092 / 2) * np.sin(3**0.5 * 1.2092 / 2), rel=1e-2)
     assert term["with"] < 1e-9
     (factor,) = [v for k, v in values.items() if k.startswith("(55)sqrt")]
     assert factor["over_corrected"] < 1.0 < factor["over_printed"]
-    assert factor["over_printed"] == pytest.approx(3**0.5 * factor["over_corrected"], rel=1e-12)  # a 2-norm's factor
+    assert factor["over_printed"] == pytest.approx(3**0.5 * factor["over_corrected"], rel=1e-12)  # factor of a 2-norm
     (decay,) = [v for k, v in values.items() if k.startswith("(55)the")]
     assert decay["corrected"] < decay["printed"]
     (gain,) = [v for k, v in values.items() if k.startswith("(60)")]
@@ -97,8 +97,8 @@ def test_slips_show_what_they_say(made):
     assert singular["179"] / singular["90"] == pytest.approx(np.tan(np.deg2rad(89.5)), rel=1e-9)
 
 
-def test_each_figure_of_the_paper_has_its_number_and_shows_what_it_shows_there(monkeypatch):
-    """Of a chain (a) its states and (b) its control; of a spacecraft the first its attitude, the last its torque."""
+def test_each_figure_has_the_number_and_the_content_of_the_paper(monkeypatch):
+    """Figures of a chain show (a) states and (b) control. Figures of a spacecraft show attitude first, torque last."""
     monkeypatch.setattr(reproduction.run_plots, "torque", lambda run, log, title: ("torque", log, title))
     monkeypatch.setattr(reproduction.run_plots, "state", lambda run, log, chart, title: (chart.name, log, title))
     monkeypatch.setattr(reproduction.run_plots, "convergence", lambda run, log, title: ("convergence", log, title))
@@ -125,7 +125,7 @@ def test_each_figure_of_the_paper_has_its_number_and_shows_what_it_shows_there(m
 
 
 def test_folder_holds_figures_claims_and_scenarios(made, tmp_path, monkeypatch):
-    monkeypatch.setattr(Figure, "savefig", lambda self, path, **_: path.touch())  # nobody looks at them here
+    monkeypatch.setattr(Figure, "savefig", lambda self, path, **_: path.touch())  # the content is not tested here
     reproduction.write(tmp_path, made, figures=True)
     names = {path.name for path in (tmp_path / "figures").iterdir()}
     for number in range(1, 11):
@@ -149,8 +149,8 @@ def test_folder_holds_figures_claims_and_scenarios(made, tmp_path, monkeypatch):
     assert slips.__doc__
 
 
-def test_reproduce_leaves_what_the_contract_says(made, command, tmp_path, monkeypatch):
-    monkeypatch.setattr(reproduction, "reproduce", lambda: made)  # it takes as long as all other tests here
+def test_reproduce_writes_the_files_of_the_contract(made, command, tmp_path, monkeypatch):
+    monkeypatch.setattr(reproduction, "reproduce", lambda: made)  # it takes as long as all other tests of this file
     status, out, err = command("reproduce", "--no-figures")
     assert (status, err) == (0, "")
     assert "holds in part" in out
@@ -160,29 +160,29 @@ def test_reproduce_leaves_what_the_contract_says(made, command, tmp_path, monkey
     for claim in json.loads((folder / "summary.json").read_text())["claims"]:
         assert " ".join(claim["claim"].split()) in read.text
     assert {"summary.json", "versions.json", "claims.md"} <= set(tree(folder))
-    assert command("reproduce")[0] == 2  # it is there already
+    assert command("reproduce")[0] == 2  # the folder exists already
     assert command("reproduce", "some.toml")[0] == 2
 
 
-def test_remark_2_is_measured_as_theory_says(made):
+def test_remark_2_matches_theory(made):
     by = {(one.observer, one.sign): one for one in made.observers}
     assert len(by) == 8
     k2 = {"none": 0.01 * 3**0.5, "nonlinear": 1e-3 * 3**0.5 * 14 / 10, "prescribed_time": 1e-3 * 3**0.5 * 14 / 10}
     for kind, bound in k2.items():
         exact, smooth = by[kind, "exact"], by[kind, "smooth"]
-        assert exact.chattering > 100 * smooth.chattering  # what Remark 2 is about
-        # the exact sign jumps by 2 |T J^-1| K2 of 2 eps'' at most, through J, in each period
+        assert exact.chattering > 100 * smooth.chattering  # the claim of Remark 2
+        # the discontinuous sign changes 2 eps'' by at most 2 |T J^-1| K2 in each period, and the torque by J times this
         most = 2 * 14 * np.linalg.norm(1 / np.array([10.0, 12.0, 14.0])) * bound / 0.05
         assert 0.05 * most < exact.chattering < most
-    # all that is left of the finite-time observer's K2 is what its own smooth sign costs
+    # the rest of the finite-time observer's K2 comes from its own boundary layer
     left = 3**0.5 * 1.5 * 0.02**0.5 * 1e-5**0.5 * np.arctanh(0.05 / 1.1)
     most = 2 * 14 * np.linalg.norm(1 / np.array([10.0, 12.0, 14.0])) * left / 0.05
     assert by["finite_time", "exact"].chattering < by["finite_time", "smooth"].chattering + most
-    # a disturbance that starts at its bound: 1.25 |d| / c by theory for a constant one, by less than 1.1 c slower here
+    # a disturbance that starts at its bound: theory gives 1.25 |d| / c for a constant one; 0.1 s are allowed for changes
     assert by["finite_time", "smooth"].estimate_settled < 1.2519 * 0.01 / 0.02 + 0.1
     assert by["prescribed_time", "smooth"].estimate_settled < 1.0
     assert by["prescribed_time", "smooth"].estimate_settled < by["nonlinear", "smooth"].estimate_settled
-    # at rest the nonlinear observer lags by J / l: |d'| J / l, largest together
+    # at rest the nonlinear observer lags by J / l, so its error is |d'| J / l
     lag = np.linalg.norm([10.0, 12.0, 14.0]) / 10.0 * 1e-3
     assert by["nonlinear", "smooth"].estimate_error == pytest.approx(lag, rel=0.1)
     assert all(by[key].estimate_error < 0.1 * lag for key in by if key[0] == "finite_time")
