@@ -1,4 +1,4 @@
-"""Strictness for the tests alone: 64 bit, two host devices, no silent rank promotion, shapes checked at run time."""
+"""Settings of all tests: 64 bit, two host devices, no silent rank promotion, shapes checked at run time."""
 
 import gc
 import os
@@ -12,8 +12,8 @@ import pytest
 from ptsmc_jax.configure import configure
 from tests.tree import QUICKLY, ROOT, modules
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of workers, which inherit it: threads that wait take a core
-# most programs of tests fly once: what optimising saves is less than what it takes; not so in processes of their own
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # workers inherit it; waiting BLAS threads would occupy a core
+# most programs of tests run once, so optimising them takes longer than it saves; separate processes are optimised
 os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {QUICKLY}"
 configure(devices=2)
 
@@ -24,27 +24,27 @@ jax.devices()  # reads the flags
 os.environ["XLA_FLAGS"] = os.environ["XLA_FLAGS"].replace(QUICKLY, "").strip()
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
-# modules that name shapes: a function inside another is decorated anew whenever that one is called. Not folders, whose
-# names would stand for all modules in them
+# modules whose annotated shapes are checked. Nested functions are decorated again at every call of the outer function.
+# Folders are not listed, because a folder would mean all of its modules.
 SHAPES = re.compile(r"\b(Float|Int|Bool|Complex)\[")
 checked = [name for name, path in modules().items() if path.name != "__init__.py" and SHAPES.search(path.read_text())]
 hook = jaxtyping.install_import_hook(checked, "beartype.beartype")
 
 from ptsmc_jax.simulation import rollout  # noqa: E402
 
-rollout.simulate_once = rollout.simulate_parts  # all programs are compiled quickly here: not the same one twice
-# rooms of tests whose commands and campaigns call what other rooms test by itself, with its shapes
+rollout.simulate_once = rollout.simulate_parts  # tests do not need a second, optimised program
+# folders of tests of commands and campaigns: other folders test the called functions with their shapes
 CALLERS = ("campaigns", "cli", "onboard", "output", "paper", "scenario", "studies")
 
-matplotlib.rcParams["savefig.dpi"] = 30  # what figures show, tests ask of these themselves: not of their files
+matplotlib.rcParams["savefig.dpi"] = 30  # tests examine figures in memory, so the files can be small
 
-# tracing makes objects by the million, and hardly any in cycles: looking for these took a fifth of its time
+# tracing creates millions of objects with few reference cycles: garbage collection took a fifth of the time
 gc.set_threshold(200_000, 10, 10)
 
-MANY = 25_000  # mappings of memory; Linux allows a process 65 530: with these a worker comes to 3 GB
+MANY = 25_000  # memory mappings of a worker, about 3 GB; Linux allows 65 530
 
 
-# files that a worker is to begin with, the longest first: the last ones would keep one of them waiting
+# files with the longest tests, which workers run first, so that no worker runs them alone at the end
 LONGEST = """
     cli/test_cli studies/test_compare studies/test_pareto campaigns/test_margin_requirements search/test_tuning
     search/test_worst theory/test_margins plants/test_systems devices/test_hardware simulation/test_rollout
@@ -58,7 +58,7 @@ assert all((ROOT / "tests" / f"{name}.py").exists() for name in LONGEST)
 
 
 def pytest_collection_modifyitems(items):
-    """Files in the order of `LONGEST`, then the others."""
+    """Run the files in `LONGEST` first, in this order."""
     names = {item: item.path.relative_to(ROOT / "tests").with_suffix("").as_posix() for item in items}
     items.sort(key=lambda item: LONGEST.index(names[item]) if names[item] in LONGEST else len(LONGEST))
 
@@ -70,24 +70,24 @@ def _shapes_are_checked_where_a_thing_is_tested_by_itself(request):
 
 @pytest.fixture(autouse=True, scope="module")
 def _room_for_compiled_programs():
-    """A process that keeps every program it ever compiled is ended by the kernel after some 500 of them."""
+    """Delete compiled programs in time: the kernel ends a process that keeps more than about 500 programs."""
     yield
     maps = Path("/proc/self/maps")
     if maps.exists() and maps.read_bytes().count(b"\n") > MANY:
         jax.clear_caches()
         gc.unfreeze()
         gc.collect()
-    gc.freeze()  # programs live on: no collection is to walk through them again
+    gc.freeze()  # programs stay alive, so garbage collection need not visit them
 
 
 @pytest.fixture
 def command(tmp_path, monkeypatch, capsys):
-    """Runs `ptsmc ...` in an empty folder with the scenario `SHORT` as s.toml: exit status, output, errors."""
+    """Run `ptsmc ...` in an empty folder with the scenario `SHORT` as s.toml; return exit status, stdout and stderr."""
     from tests.helpers import SHORT
     from tuning.cli import main
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("ptsmc_jax.configure.configure", lambda **_: None)  # conftest did
+    monkeypatch.setattr("ptsmc_jax.configure.configure", lambda **_: None)  # done above
     (tmp_path / "s.toml").write_text(SHORT)
 
     def run(*args):

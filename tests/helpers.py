@@ -76,7 +76,7 @@ starts = 2
 steps = 4
 """
 
-# the same for a chain, whose programs are compiled in a quarter of the time: for what hangs on no spacecraft
+# the same for a chain, whose programs compile in a quarter of the time, for tests that do not need a spacecraft
 SHORT_CHAIN = """
 [plant]
 kind = "chain"
@@ -104,27 +104,27 @@ steps = 4
 
 
 def untuned(text: str) -> dict[str, Any]:
-    """The tables of such a scenario but for [tune]."""
+    """Return the tables of a scenario without [tune]."""
     return {name: table for name, table in tomllib.loads(text).items() if name != "tune"}
 
 
 def roomy(timing: Any) -> Any:
-    """The clock with more steps, or periods of length zero, so that runs of other times are the same program."""
+    """Return the clock with more steps, or periods of length zero, so that runs with other times share one program."""
     counts = {name: getattr(timing, name) for name in ("before", "after")}
     more = {name: count if count > 1024 else 512 if count <= 512 else 1024 for name, count in counts.items()}
     return dataclasses.replace(timing, **more)
 
 
 def fly(run: Parts, seed: int = 0, trial: int = 0) -> Any:
-    """A run with its history, all of it NumPy's, so that one program flies all parts of a structure."""
-    numbers = jax.tree.map(np.asarray, run)  # whose types are never weak, as Python's numbers are
+    """Simulate a run with its history as NumPy arrays. One program serves all parts with the same structure."""
+    numbers = jax.tree.map(np.asarray, run)  # without the weak types of Python numbers
     flown = rollout.simulate_parts(numbers, np.uint32(seed), np.uint32(trial), record=True, software=rollout.OURS)
     return jax.tree.map(np.asarray, flown)
 
 
 @programs.jit
 def inputs_along(run: Parts, t: Any) -> Any:
-    """Inputs (time, m) of the exact motion at times t (time,), which mean something before the hand-over."""
+    """Return the inputs (n, m) of the exact motion at times t (n,) before the hand-over."""
     return jax.vmap(lambda time: solutions.exact_input(run, time)[0])(t)
 
 
@@ -133,7 +133,7 @@ errors_along = jax.jit(jax.vmap(solutions.exact_error, (0, None, None, None, Non
 
 
 def vector(*values: Any) -> Any:
-    """A float64 array."""
+    """Return a float64 array."""
     return jnp.asarray(np.asarray(values[0] if len(values) == 1 else values, dtype=float), dtype=float)
 
 
@@ -165,7 +165,10 @@ def parts(
     reach: tuple[float, float] | None = None,
     kinematics: Any = AdditiveKinematics,
 ) -> Parts:
-    """Parts of the paper's Case I with changes; continuous unless a period is given; reach: largest (t_f, delta)."""
+    """Return the parts of the published Case I with changes, in the continuous loop unless a period is given.
+
+    `reach` is the largest (t_f, delta) of the clock.
+    """
     body = rigid_body.spacecraft(inertia)
     t_end = t_f + 10.0 if t_end is None else t_end
     if period is None:
@@ -196,7 +199,7 @@ def parts(
 
 
 def commanded(law: Any, t: Any, hold: Any, x: Any, target: Any, d_hat: Any, k2: Any) -> Any:
-    """Input and sliding variable of a law without a memory at t [s]."""
+    """Return input and sliding variable of a law without a memory at t [s]."""
     u, s, _ = law(Sample(t, hold, vector(0.1)), x, target, d_hat, k2)
     return u, s
 
@@ -220,7 +223,10 @@ def chain_parts(
     f: Any = None,
     g: Any = None,
 ) -> Parts:
-    """An integrator chain as long as x0, without disturbance; steps: of a grid of its own, before and after t_s."""
+    """Return the parts of an integrator chain with the length of x0, without disturbance.
+
+    `steps` are the numbers of steps before and after the hand-over time t_s, for another grid than the default.
+    """
     n, t_end = len(x0), t_f + 2.0
     model = integrator_chain.chain(n, f, g)
     eta = n + 1.0 if eta is None else eta
@@ -251,18 +257,18 @@ def chain_parts(
 
 
 def chain_flight() -> Parts:
-    """A chain with noise on the flight clock, t_f between two samples and t_end too."""
+    """Return a chain with noise on the flight clock. Its t_f and t_end lie between samples."""
     run = chain_parts([1.0, 0.2], 5.02, delta=0.53, period=0.05, noise=[2e-4, 1e-4])
     return dataclasses.replace(run, clock=clock.flight(0.05, 7.02))
 
 
 def with_controller(run: Parts, **changes: Any) -> Parts:
-    """The parts with other values in the controller."""
+    """Return the parts with other values in the controller."""
     return dataclasses.replace(run, controller=dataclasses.replace(run.controller, **changes))
 
 
 def finer(run: Parts, times: int) -> Parts:
-    """The same run on a grid with that many times the steps."""
+    """Return the same run on a grid with `times` as many steps."""
     grid = run.clock
     assert isinstance(grid, clock.Graded)
     grid = dataclasses.replace(
@@ -272,24 +278,24 @@ def finer(run: Parts, times: int) -> Parts:
 
 
 def short(cases: Any, kept: Any) -> list[Any]:
-    """Cases for `parametrize`, a tuple being several arguments, all but those kept marked `long`."""
+    """Return cases for `parametrize`. All cases except those in `kept` are marked `long`."""
     many = [case if isinstance(case, tuple) else (case,) for case in cases]
     return [case if case in kept else pytest.param(*one, marks=pytest.mark.long)
             for case, one in zip(cases, many, strict=True)]  # fmt: skip
 
 
 def drawn(check: Any, count: int, **cases: Any) -> Any:
-    """A test of `check` on so many drawn cases, the same ones each time."""
+    """Return a test that calls `check` for `count` random cases, which are the same in every run."""
     return settings(max_examples=count, deadline=None, derandomize=True, database=None)(given(**cases)(check))
 
 
 def tree(folder):
-    """Files of a folder: path -> content."""
+    """Return the contents of the files of a folder, by path."""
     return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
 def refused(command, tmp_path, *args):
-    """The one sentence of a command that writes nothing."""
+    """Run a command that must fail; return its one-sentence error after checking that it wrote no files."""
     before = tree(tmp_path)
     status, out, err = command(*args)
     assert (status, out) == (2, "")
@@ -299,7 +305,7 @@ def refused(command, tmp_path, *args):
 
 
 def small_search(monkeypatch, fresh=40):
-    """A search that looks at a few points only, judged on so many trials; rows hold little more than its few trials."""
+    """Make searches small: a few points, few trials, and `fresh` held-out trials."""
     from tuning.search import confirm, descents, evolution, flights, starts, worst
 
     for module, name, value in (
@@ -317,7 +323,7 @@ def small_search(monkeypatch, fresh=40):
 
 
 def same(one, other):
-    """Whole numbers and words the same, others to 1e-12 of their size, as every way to fly must give them."""
+    """Assert that two tables have equal integers and texts, and other numbers equal to a relative 1e-12."""
     assert one.columns == other.columns
     assert_frame_equal(one.select(pl.exclude(pl.Float64)), other.select(pl.exclude(pl.Float64)))
     for name in one.select(pl.col(pl.Float64)).columns:
@@ -325,12 +331,12 @@ def same(one, other):
 
 
 def gpus() -> list[Any]:
-    """What `configure.devices` says where JAX has a GPU, and is not kept from it."""
+    """Replace `configure.devices` as if JAX had a GPU: return JAX's default device if it is set, otherwise a GPU."""
     return [configure.default_device() or SimpleNamespace(platform="gpu")]
 
 
 def equations(trace: Any) -> Any:
-    """All equations of a trace, of those inside it too."""
+    """Return all equations of a jaxpr, those of nested jaxprs included."""
     for eqn in getattr(trace, "jaxpr", trace).eqns:
         yield eqn
         for value in eqn.params.values():

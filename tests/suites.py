@@ -13,7 +13,7 @@ NOISES = [(8.0, 8.0, 40.0), (12.0, 10.0, 60.0)]  # [arcsec]
 
 
 def star_tracker(k, interval, latency, period):
-    """The k-th star tracker."""
+    """Return the k-th star tracker."""
     mounting = attitude.from_rotation_vector(vector(MOUNTINGS[k]))
     times = attitude_sensors.sample_times(interval, latency, period)
     noise = ARCSEC * jnp.asarray(NOISES[k])
@@ -21,7 +21,7 @@ def star_tracker(k, interval, latency, period):
 
 
 def suite(sensors, period, gyro=(1e-5, 2e-5, 1e-5), bias=1e-4, walk=1e-7):
-    """A suite of attitude sensors and a gyro; walk: random walk of its bias [rad/s/sqrt(s)]."""
+    """Return a suite of attitude sensors and a gyro; walk: random walk of the gyro bias [rad/s/sqrt(s)]."""
     drift = jnp.full(3, walk / np.sqrt(period))
     found = kalman_filter.kalman_filter(sensors, gyro, drift, bias, period)
     return sensor_suite.SensorSuite(
@@ -30,6 +30,6 @@ def suite(sensors, period, gyro=(1e-5, 2e-5, 1e-5), bias=1e-4, walk=1e-7):
 
 
 def two_star_trackers(period, intervals=(2.0, 2.5), latencies=(1.0, 0.7)):
-    """The suite with two star trackers; intervals and latencies in control periods [s]."""
+    """Return the suite with two star trackers; period [s], intervals and latencies in control periods."""
     both = zip(intervals, latencies, strict=True)
     return suite([star_tracker(k, i * period, late * period, period) for k, (i, late) in enumerate(both)], period)

@@ -28,16 +28,16 @@ from tests.helpers import ROOT
         {"devices": "2"},
     ],
 )
-def test_other_bits_and_devices_are_refused(asked):
-    """Whatever was not the number 64 was taken for 32 bits, no devices for all and fewer than none for one."""
+def test_invalid_bits_and_devices_are_refused(asked):
+    """An earlier version took other values for 32 bits, 0 devices for all, and negative numbers for one."""
     (name,) = asked
     with pytest.raises(ValueError, match=f"^{name} is .*, but must be"):
         setup.configure(**asked)
 
 
 @pytest.mark.parametrize("said", ["", "elsewhere"])
-def test_the_cache_lies_where_the_desktop_standard_says(tmp_path, monkeypatch, said):
-    """$XDG_CACHE_HOME, or ~/.cache where that is not set or empty."""
+def test_the_cache_folder_follows_the_xdg_standard(tmp_path, monkeypatch, said):
+    """The folder is in $XDG_CACHE_HOME, or in ~/.cache if the variable is not set or empty."""
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / said) if said else "")
     folder = setup._cache_folder()
@@ -46,7 +46,7 @@ def test_the_cache_lies_where_the_desktop_standard_says(tmp_path, monkeypatch, s
 
 
 def test_a_user_without_a_home_has_no_cache(monkeypatch):
-    """As in a container, under a number that is nobody's."""
+    """A container may run under a user number without an entry in /etc/passwd."""
 
     def unknown():
         raise RuntimeError("Could not determine home directory.")
@@ -69,7 +69,7 @@ LEVEL = "--xla_backend_optimization_level"
         ("0.10", "x86_64", "gpu", ["--xla_cpu_prefer_vector_width=512"], ["-unroll-runtime=false", f"{LEVEL}=1"]),
     ],
 )
-def test_options_go_by_version_machine_and_device(monkeypatch, jaxlib, machine, device, included, excluded):
+def test_options_depend_on_version_machine_and_device(monkeypatch, jaxlib, machine, device, included, excluded):
     monkeypatch.setattr(setup, "JAXLIB", jaxlib)
     monkeypatch.setattr(setup, "MACHINE", machine)
     options = setup._options(device)
@@ -98,20 +98,20 @@ def test_options_are_written_as_xla_reads_them():
     "user",
     ["", f"{LEVEL}=3", "--xla_cpu_enable_fast_math=false", f"{EXTRA}=x=1", "--xla_disable_hlo_passes=", "a/file"],
 )
-def test_options_of_the_user_stay(user):
-    """XLA takes the last of two; two options decide on all others, and a file of options cannot be extended."""
+def test_options_of_the_user_take_precedence(user):
+    """XLA uses the last of two equal options. No option is added to a decisive option or a file of the user."""
     flags = setup._flags(user, ALL)
     assert flags.startswith(user)
     assert (flags == user) == user.startswith((EXTRA, "--xla_disable_hlo_passes", "a/file"))
     assert flags.count(f"{LEVEL}=") <= 1
-    assert setup._flags(flags, ALL) == flags  # a second call, or a process that this one begins
+    assert setup._flags(flags, ALL) == flags  # a second call, or a child process
     assert setup._flags(flags, ()) == user
     assert setup._flags(setup._flags(user, setup._options("gpu")), ALL) == flags
 
 
 @pytest.mark.parametrize("mode", [0o700, 0o770, 0o702])
-def test_a_cache_that_others_may_write_is_not_used(tmp_path, mode):
-    """Loading an entry runs machine code."""
+def test_a_cache_that_other_users_can_write_is_not_used(tmp_path, mode):
+    """Loading an entry runs machine code, so other users must not write it."""
     folder = tmp_path / "cache"
     folder.mkdir()
     folder.chmod(mode)
@@ -123,7 +123,7 @@ def test_a_cache_that_others_may_write_is_not_used(tmp_path, mode):
 
 
 @pytest.mark.parametrize("case", ["of somebody else", "a link", "a file", "closed"])
-def test_a_cache_that_is_no_folder_of_the_user_is_not_used(tmp_path, monkeypatch, case):
+def test_a_cache_folder_of_another_user_is_not_used(tmp_path, monkeypatch, case):
     folder = tmp_path / "cache"
     (tmp_path / "elsewhere").mkdir(mode=0o700)
     if case == "of somebody else":
@@ -132,7 +132,7 @@ def test_a_cache_that_is_no_folder_of_the_user_is_not_used(tmp_path, monkeypatch
         folder.symlink_to(tmp_path / "elsewhere")
     elif case == "a file":
         folder.write_text("")
-    else:  # as in a container that runs as a user whose HOME is root's
+    else:  # as in a container whose user has the HOME of root
 
         def refused(self, *args, **kwargs):
             raise PermissionError(13, "Permission denied", str(self))
@@ -147,8 +147,8 @@ def test_a_new_cache_is_closed_to_others(tmp_path):
     assert (tmp_path / "a" / "cache").stat().st_mode & 0o777 == 0o700
 
 
-def test_a_cache_that_takes_no_entries_is_read_with_one_warning(tmp_path, monkeypatch):
-    """JAX would warn of each entry."""
+def test_a_read_only_cache_causes_one_warning(tmp_path, monkeypatch):
+    """JAX itself would warn for each entry."""
     monkeypatch.setattr(setup.os, "access", lambda *_: False)
     with warnings.catch_warnings(record=True) as shown:
         warnings.simplefilter("default")
@@ -160,7 +160,7 @@ def test_a_cache_that_takes_no_entries_is_read_with_one_warning(tmp_path, monkey
 
 
 def test_the_options_of_this_version_and_machine_change_no_result():
-    """In a process of its own, which XLA ends if it does not know an option."""
+    """The test needs a separate process, because XLA ends a process that sets an unknown option."""
 
     def tried(options):
         environment = {**os.environ, "JAX_PLATFORMS": "cpu", "XLA_FLAGS": setup._flags("", options)}
@@ -170,7 +170,7 @@ def test_the_options_of_this_version_and_machine_change_no_result():
     assert tried((*ALL, "--xla_no_such_flag=true")).returncode != 0
 
 
-# 64 damped pendulums side by side, with a branch and a scalar clock, as in a simulation; also with options of batches
+# a batch of 64 damped pendulums with a branch and a scalar clock, as in a simulation; also with the options of batches
 _TRIAL = """
 import sys
 import jax
@@ -204,8 +204,8 @@ for options in (None, {"xla_disable_hlo_passes": ""}):
 
 
 @pytest.mark.skipif(shutil.which("nvidia-smi") is not None, reason="there is a GPU")
-def test_a_gpu_that_is_not_there_is_refused_in_one_sentence(tmp_path):
-    """In a process of its own, as a user's first call; it is looked for as JAX does by itself, whatever it is told."""
+def test_a_missing_gpu_is_refused_in_one_sentence(tmp_path):
+    """The test needs a separate process, like the first call of a user."""
     call = [sys.executable, "-c", "from tuning.cli.main import main; main()", "montecarlo", "--device", "gpu"]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "tpu"}
     done = subprocess.run(call, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
@@ -214,9 +214,9 @@ def test_a_gpu_that_is_not_there_is_refused_in_one_sentence(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.long  # asked for by that name, or a TPU: no such sentence as above
-def test_a_gpu_is_looked_for_as_jax_does_by_itself(tmp_path):
-    """Asked for by the name "gpu", JAX wants every maker's, and finds none where one of them is missing."""
+@pytest.mark.long  # the error differs from the sentence above
+def test_jax_chooses_the_gpu_plug_in(tmp_path):
+    """With jax_platforms = "gpu", JAX would require plug-ins of all makers, so `configure` does not set it."""
     code = (
         "import jax; jax.default_backend = lambda: 'gpu'\n"
         "from ptsmc_jax.configure import configure; configure(device='gpu', cache=None, fast=False)\n"
@@ -268,9 +268,9 @@ print(json.dumps(told))
 
 @pytest.fixture(scope="module")
 def told(tmp_path_factory):
-    """What a process says that calls `configure` several times, before anything runs on JAX and after."""
+    """Return the results of a process that calls `configure` several times, before and after JAX has run."""
     environment = {name: value for name, value in os.environ.items() if name != "TF_CPP_MIN_LOG_LEVEL"}
-    environment["JAX_NUMPY_DTYPE_PROMOTION"] = "strict"  # of a user's own code: not of what is kept
+    environment["JAX_NUMPY_DTYPE_PROMOTION"] = "strict"  # a setting for the user's code, not for stored programs
     cache = tmp_path_factory.mktemp("cache")
     call = [sys.executable, "-c", IN_TURN, str(cache)]
     done = subprocess.run(call, cwd=ROOT, env=environment, capture_output=True, text=True, check=True)
@@ -283,25 +283,25 @@ def test_a_second_call_with_the_same_arguments_does_nothing(told):
 
 
 def test_bits_and_device_are_set_and_the_compiler_is_silent(told):
-    """XLA's log ("Very slow compile?") is off when jaxlib is looked for, which reads its level once."""
+    """The log of XLA ("Very slow compile?") is off before jaxlib is loaded, since jaxlib reads the level once."""
     assert (told["level"], told["set"]) == ("3", ["float32", "cpu", "standard"])
 
 
-def test_other_compiler_options_are_set_before_anything_runs_or_refused(told):
+def test_compiler_options_can_change_only_before_jax_runs(told):
     fast, plain, again, late = told["flags"]
     assert fast == again == late != ""
     assert plain.strip() == ""
     assert "than fast=False asks for" in told["refused"]
 
 
-def test_programs_that_are_cut_short_in_the_cache_are_compiled_again(told):
-    """As another process sees them that starts at the same time, without a warning."""
+def test_truncated_cache_entries_are_compiled_again(told):
+    """A process that starts at the same time can see truncated entries. It must not warn."""
     assert (told["found"], told["cut"]) == ([7.0, 7.0], True)
 
 
 @pytest.mark.parametrize("options", [None, programs.QUICKLY], ids=["as usual", "quickly"])
-def test_what_reverse_mode_keeps_of_each_step_is_written_in_place(options):
-    """XLA copies whole arrays in every step where a fusion of several outputs writes into them."""
+def test_reverse_mode_writes_its_residuals_in_place(options):
+    """XLA would copy whole arrays in every step if a fusion with several outputs wrote into them."""
 
     def off(x):
         def step(carry, t):
@@ -313,4 +313,4 @@ def test_what_reverse_mode_keeps_of_each_step_is_written_in_place(options):
     compiled = jax.jit(jax.grad(off), compiler_options=options).lower(jnp.arange(3.0)).compile().as_text()
     writes = [line.split()[0] for line in str(compiled).splitlines() if " dynamic-update-slice(" in line]
     assert len(writes) >= 4
-    assert set(writes) == {"ROOT"}  # each the only output of its fusion
+    assert set(writes) == {"ROOT"}  # each write is the only output of its fusion

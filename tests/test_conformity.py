@@ -1,7 +1,7 @@
-"""Every part in short runs: lanes = vmap = loop, compiled or not, shapes kept, slopes finite at the awkward points.
+"""Every part in short runs: equal results in lanes, vmap and loop, constant shapes, finite gradients at special points.
 
-Each row is a scenario; together they hold every part that a scenario or Python can name. A new law has a row by itself,
-another new part joins one here.
+Each row is a scenario. Together the rows contain every part that a scenario or Python can name. A new law gets its own
+row, and another new part joins a row.
 """
 
 import contextlib
@@ -38,7 +38,7 @@ SAMPLED = {"mode": "sampled", "period": 0.25, **SHORT}
 SPREAD = {"attitude": {"kind": "axis_angle", "min_deg": 5.0, "max_deg": 60.0}}
 NOISE = {"attitude_noise": 2e-4, "rate_noise": 1e-5}
 
-QUICK = {  # gains that reach the goal in so short a run; others fly with their defaults
+QUICK = {  # gains that reach the target in such a short run; other laws have their defaults
     "pd": {"k_p": 2.0, "k_d": 2.5},
     "terminal": {"p": 1.3, "b": 1.0, "k": 1.0},
     "fixed_time": {"a1": 0.5, "b1": 0.8},
@@ -204,7 +204,7 @@ KINDS = (
 )
 
 
-IN_FULL = KINDS[-1:]  # with slopes, under vmap and in a loop; the other in lanes and in a loop
+IN_FULL = KINDS[-1:]  # with gradients, vmap and loop; the others in lanes and loop
 CASES = [pytest.param(name, name in IN_FULL, id=name) for name in KINDS] + [
     pytest.param(name, True, id=f"{name}, in full", marks=pytest.mark.long) for name in ROWS if name not in IN_FULL
 ]
@@ -227,7 +227,10 @@ def test_every_kind_has_a_row(name, known):
 
 @programs.jit(static_argnames=("in_lanes", "sloped"))
 def batch(parts, still, dispersion, in_lanes, sloped):
-    """Metrics, status and bad times of some trials, `still` the last, and the metrics' slopes along the law's gains."""
+    """Return metrics, status and bad times of some trials, and gradients of metrics in the law's gains.
+
+    The last trial is `still`.
+    """
     vmap = strict if in_lanes else jax.vmap
     names = [name for name in parts.controller.tunable if name not in ("sign_width", "t_f", "k1")]
     gains = {name: getattr(parts.controller, name) for name in names}
@@ -255,7 +258,7 @@ def batch(parts, still, dispersion, in_lanes, sloped):
 
 
 def at_rest_on_the_target(parts):
-    """From the start, with the exact sign: every norm, root and sign at 0."""
+    """Return parts at rest on the target with the discontinuous sign: every norm, root and sign is at 0."""
     target = parts.reference(jnp.zeros(()))
     if isinstance(target, references.Target):
         initial = parts.plant.with_hidden_at_rest(rigid_body.AttitudeState(target.q, target.w))
@@ -270,7 +273,7 @@ def strict(function):
 
 
 def agree(values, wanted, unit, name, skip=()):
-    """Metrics (trials,) by name, within `unit` of the largest of each."""
+    """Assert that metrics (trials,) agree by name, within `unit` times the largest value of each."""
     for metric in wanted:
         a, b = np.asarray(values[metric]), np.asarray(wanted[metric])
         np.testing.assert_array_equal(np.isfinite(a), np.isfinite(b), err_msg=metric)
@@ -280,7 +283,7 @@ def agree(values, wanted, unit, name, skip=()):
 
 
 def one_by_one(parts, still, dispersion, sloped):
-    """The same as `batch`, in a loop, whose program is compiled in half the time; without slopes."""
+    """Do the same as `batch` in a loop, without gradients. Its program compiles in half the time."""
     assert not sloped
     begun = [drawn(dispersion, parts, trial) for trial in (*NUMBERS, np.uint32(NUMBERS.size))]
     begun[-1] = replace(begun[-1], initial=still.initial)
@@ -299,7 +302,7 @@ under_vmap = partial(batch, in_lanes=False)
 
 
 def compare(parts, dispersion, name, sloped, reference: Any = under_vmap):
-    """In lanes and under vmap: (metrics of the trials) and (status, metrics, slopes) of the awkward one."""
+    """Compare lanes with vmap: metrics of the trials, and status, metrics and gradients of the special trial."""
     still, by_lanes = at_rest_on_the_target(parts), partial(batch, in_lanes=True)
     both = [jax.tree.map(np.asarray, of(parts, still, dispersion, sloped=sloped)) for of in (by_lanes, reference)]
     got, expected = (jax.tree.map(lambda v: v[:-1], one) for one in both)
@@ -308,13 +311,13 @@ def compare(parts, dispersion, name, sloped, reference: Any = under_vmap):
     np.testing.assert_array_equal(got[2], expected[2])
     assert np.any(np.isin(expected[1], [0, 4])), "some trial must fly to the end"
     agree(got[0], expected[0], 1e-12, name)
-    # chattering is a sum of magnitudes: where a difference is 0 but for rounding, either slope is right
+    # chattering is a sum of magnitudes: for a difference of 0 except for rounding, both derivatives are right
     agree(got[3], expected[3], 1e-9, name, skip=("chattering",))
     return expected[0], (last[1], last[0], last[3])
 
 
 @pytest.mark.parametrize(("name", "in_full"), CASES)
-def test_every_part_is_the_same_in_lanes_under_vmap_and_in_a_loop_with_finite_slopes(name, in_full):
+def test_every_part_gives_equal_results_in_lanes_vmap_and_loop_with_finite_gradients(name, in_full):
     ready = scenario.study(scenario.from_tables(ROWS[name]))
     reference = under_vmap if in_full else one_by_one
     metrics, (status, values, slopes) = compare(ready.parts, ready.dispersion, name, in_full, reference)
@@ -329,7 +332,7 @@ def test_every_part_is_the_same_in_lanes_under_vmap_and_in_a_loop_with_finite_sl
 @pytest.mark.parametrize(
     "name", short(("chain, finite-time observer", "raw samples, full inertia, other truth"), KINDS[-1:])
 )
-def test_uncompiled_it_is_the_same(name):
+def test_runs_without_jit_give_equal_results(name):
     ready = scenario.study(scenario.from_tables(ROWS[name]))
     run = ready.dispersion.apply(ready.parts, SEED, NUMBERS[0])
     one, other = (dict(fly(run, SEED, NUMBERS[0]).metrics) for fly in (rollout.simulate, rollout.simulate_parts))
@@ -337,10 +340,10 @@ def test_uncompiled_it_is_the_same(name):
 
 
 @pytest.mark.parametrize("name", short(ROWS, KINDS))
-def test_carries_keep_their_shapes_whatever_is_batched(name):
-    """A run's result has the same shapes and types, alone and in a batch of one: nothing is broadcast on the way.
+def test_results_have_the_same_shapes_alone_and_in_a_batch(name):
+    """The result of a run has the same shapes and types alone and in a batch of one, so nothing is broadcast.
 
-    Nor does a whole number become another by itself, which users may have forbidden.
+    Integers are not promoted implicitly, which users may have forbidden.
     """
     ready = scenario.study(scenario.from_tables(ROWS[name]))
     with jax.numpy_dtype_promotion("strict"):
@@ -358,10 +361,10 @@ def test_carries_keep_their_shapes_whatever_is_batched(name):
 
 
 @pytest.mark.parametrize("name", ROWS)
-def test_programs_of_parts_of_ours_are_stored_for_the_next_command(name, tmp_path, monkeypatch):
-    """All static values, flight software too, can be identified, alone and in a batch, but never custom code.
+def test_programs_of_built_in_parts_are_stored(name, tmp_path, monkeypatch):
+    """All static values can be identified, flight software included, but never custom code.
 
-    A program that cannot be identified is traced in every process, and only its time shows it.
+    A program that cannot be identified would be traced in every process, which only takes time.
     """
     monkeypatch.setattr(configure, "programs", tmp_path)
     stored: list[Any] = []
@@ -378,7 +381,7 @@ def test_programs_of_parts_of_ours_are_stored_for_the_next_command(name, tmp_pat
 
 
 def test_lanes_equal_vmap_for_a_plant_from_python():
-    """Branches, loops, powers and tables in f and g: what users write."""
+    """The plant has branches, loops, powers and tables in f and g, like plants of users."""
 
     def f(x):
         drag = jax.lax.cond(x[1] > 0, lambda v: v * v, lambda v: -v * v, x[1])

@@ -1,4 +1,4 @@
-"""The documentation says what the code does: references, commands, keys, code, names, docstrings; and it builds."""
+"""The documentation matches the code (reference pages, commands, keys, code blocks, names, docstrings) and builds."""
 
 import doctest
 import importlib
@@ -36,12 +36,12 @@ FENCE = re.compile(r"^( *)```(\w*)\n(.*?)^\1```", re.M | re.S)
 
 
 def blocks(path, *languages):
-    """Code blocks of a page in one of these languages."""
+    """Return the code blocks of a page in one of these languages."""
     return [textwrap.dedent(block) for _, language, block in FENCE.findall(path.read_text()) if language in languages]
 
 
 def commands():
-    """Command -> its options, as the command line knows them."""
+    """Return the options of each command, by its name."""
     found, command = {}, ""
     for line in app.generate_docs(output_format="markdown", usage_name="ptsmc").splitlines():
         if line.startswith("## ptsmc "):
@@ -56,12 +56,12 @@ COMMANDS = commands()
 
 
 @pytest.mark.parametrize("name", MADE)
-def test_references_are_what_the_code_says(name):
+def test_reference_pages_match_the_code(name):
     assert (DOCS / name).read_text(encoding="utf-8") == MADE[name](), "run `python docs/generate.py`"
 
 
-def test_which_kind_is_the_default_is_said_for_each_plant():
-    """A system's disturbance is none where a spacecraft's is a sinusoid: neither has all that the other has."""
+def test_reference_pages_name_the_default_kind_of_each_plant():
+    """The default disturbance is "none" for a system and "sinusoid" for a spacecraft."""
     page = (DOCS / "scenarios.md").read_text(encoding="utf-8")
     for plant, title in TITLES.items():
         part = page.split(f"## {title}\n")[1].split("\n## ")[0]
@@ -79,7 +79,7 @@ def test_which_kind_is_the_default_is_said_for_each_plant():
             assert others or re.search(rf'"{next(iter(kinds))}"` \(default\)', said), (plant, name)
 
 
-def test_the_references_name_everything():
+def test_reference_pages_name_every_key_and_metric():
     scenarios, metric_list = MADE["scenarios.md"](), MADE["metrics.md"]()
     for plant, tables in layouts.TABLES.items():
         part = scenarios[scenarios.index(f"## {TITLES[plant]}") :]
@@ -94,8 +94,8 @@ def test_the_references_name_everything():
         assert all(f"| `{metric}` | {entry.unit} | " in metric_list for metric, entry in catalogue.items())
 
 
-def test_what_others_rely_on_is_documented():
-    """The commands and keys of the contract, written down by hand: see `tests.scenario.test_schema`."""
+def test_commands_and_keys_of_the_contract_are_documented():
+    """The commands and keys of the contract are listed by hand, see `tests.scenario.test_schema`."""
     promised = """reproduce simulate map montecarlo summarize worst replay tune pareto compare report new
         convert-attitude""".split()
     assert set(promised) <= set(COMMANDS)
@@ -114,11 +114,11 @@ def test_the_guides_name_every_command():
 
 @pytest.mark.parametrize("path", WRITTEN, ids=page_name)
 def test_commands_in_the_text_exist(path):
-    """Each line of a shell block that calls ptsmc is one that the command line takes; so is each `ptsmc ...`."""
+    """The command line accepts each call of ptsmc in shell blocks and in the text."""
     lines = [line.split("#")[0].strip() for block in blocks(path, "", "bash", "console") for line in block.splitlines()]
     calls = [line.removeprefix(".venv/bin/") for line in lines if re.match(r"(\.venv/bin/)?ptsmc ", line)]
     for call in calls:
-        if any(word in call for word in ("[OPTIONS]", "COMMAND", "SHELL")):  # how a command is called
+        if any(word in call for word in ("[OPTIONS]", "COMMAND", "SHELL")):  # a usage line
             continue
         app.parse_args(shlex.split(call)[1:], exit_on_error=False, print_error=False)
     text = FENCE.sub("", path.read_text())
@@ -131,7 +131,7 @@ def test_commands_in_the_text_exist(path):
 
 
 @pytest.mark.parametrize("path", [page for page in WRITTEN if blocks(page, "toml")], ids=page_name)
-def test_scenarios_in_the_text_are_allowed(path, tmp_path, monkeypatch):
+def test_scenarios_in_the_text_are_valid(path, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for block in blocks(path, "python"):
         if "pendulum = system(" in block:
@@ -145,7 +145,7 @@ def test_scenarios_in_the_text_are_allowed(path, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("path", WRITTEN, ids=page_name)
 def test_names_in_the_text_exist(path):
-    """`module.name` of ours, and files."""
+    """The text names existing modules, functions and files of the project."""
     text = FENCE.sub("", path.read_text())
     for place, name in re.findall(r"`((?:[a-z_\d]+\.)+)([A-Za-z_]\w*)(?:\([^`]*\))?`", text):
         meant = [module for module in modules() if f".{module}.".endswith(f".{place}")]
@@ -169,15 +169,15 @@ LARGE = [page for page in CODED if page.name in ("README.md", "python.md", "expo
         pytest.param(ROOT / "README.md", True, id="README.md, on a flight of five seconds"),
     ],
 )
-def test_code_in_the_text_runs(path, small, monkeypatch, tmp_path, capsys, request):
+def test_code_in_the_text_runs_without_errors(path, small, monkeypatch, tmp_path, capsys, request):
     monkeypatch.chdir(tmp_path)
     Path("scenarios").symlink_to(ROOT / "scenarios")
-    monkeypatch.setattr("ptsmc_jax.configure.configure", lambda **_: None)  # conftest did
-    if small:  # flown by programs of other tests, as rooms of callers have them
+    monkeypatch.setattr("ptsmc_jax.configure.configure", lambda **_: None)  # done in conftest
+    if small:  # simulated with the compiled programs of other tests
         request.addfinalizer(lambda: jaxtyping.config.update("jaxtyping_disable", False))
         jaxtyping.config.update("jaxtyping_disable", True)
         monkeypatch.setattr("ptsmc_jax.read", lambda name: scenario.read(name) and from_tables(tomllib.loads(SHORT)))
-    if path.name == "export.md":  # the page does so by the command
+    if path.name == "export.md":  # the page calls the command instead
         ptsmc_jax.export("scenarios/first_flight.toml", "out/controller")
     space = {}
     for block in blocks(path, "python"):
@@ -185,7 +185,7 @@ def test_code_in_the_text_runs(path, small, monkeypatch, tmp_path, capsys, reque
 
 
 @pytest.mark.long
-def test_the_pages_build_without_a_warning_and_need_nothing_from_elsewhere(tmp_path):
+def test_the_pages_build_without_warnings_and_external_files(tmp_path):
     building = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html", str(DOCS), str(tmp_path)]
     done = subprocess.run(building, capture_output=True, text=True, cwd=ROOT, check=False)
     assert (done.returncode, done.stderr) == (0, "")
@@ -215,7 +215,7 @@ SHAPE = re.compile(r"\([\w ]+,[^()]*\)|\(its shape\)|\b(?:matrix|number|scalar)\
 
 
 def public(module):
-    """(name, function, docstrings that speak for it) of what a module offers: bases speak for what they declare."""
+    """Yield name, function and docstrings of the public functions of a module; bases document inherited methods."""
     for name, thing in vars(module).items():
         if name.startswith("_") or getattr(thing, "__module__", None) != module.__name__:
             continue
@@ -233,11 +233,11 @@ def public(module):
 
 
 def lacking(function, docs):
-    """What the docstrings of a function of arrays do not say."""
+    """Yield "units" or "shapes" if the docstrings of a function with array arguments lack them."""
     annotations = [str(value) for key, value in function.__annotations__.items()]
     if not any(ARRAYS.search(annotation) for annotation in annotations):
         return
-    text = re.sub(r"^ *>>> .*(?:\n.+)*", "", "\n".join(docs), flags=re.M)  # an example is no statement
+    text = re.sub(r"^ *>>> .*(?:\n.+)*", "", "\n".join(docs), flags=re.M)  # ignore examples
     if not UNIT.search(text):
         yield "units"
     bare = [
@@ -250,13 +250,13 @@ def lacking(function, docs):
 
 
 @pytest.mark.parametrize("name", PHYSICS)
-def test_docstrings_say_shapes_and_units(name):
+def test_docstrings_state_shapes_and_units(name):
     module = importlib.import_module(name)
     seen = list(public(module))
     assert not [f"{own}: {what}" for own, function, docs in seen for what in lacking(function, docs)]
 
 
-def test_the_look_at_docstrings_sees_what_is_missing():
+def test_the_docstring_check_finds_missing_shapes_and_units():
     def silent(x: Array) -> Array:
         """Something."""
         return x
@@ -273,18 +273,18 @@ def test_examples_in_docstrings_run():
     finder, runner = doctest.DocTestFinder(), doctest.DocTestRunner()
     for module in modules():
         for test in finder.find(importlib.import_module(module)):
-            if test.examples:  # most docstrings have none: to run them would take longer than the examples
+            if test.examples:  # most docstrings have no examples
                 failed, _ = runner.run(test)
                 assert not failed, test.name
     assert runner.tries > 20
 
 
-def test_who_cites_this_names_its_version():
+def test_the_citation_file_has_the_current_version():
     assert f"\nversion: {ptsmc_jax.__version__}\n" in (ROOT / "CITATION.cff").read_text()
 
 
 @pytest.mark.long
-def test_what_the_guide_says_of_a_trial_is_what_is_printed():
+def test_the_guide_shows_the_printed_numbers_of_a_trial():
     guide = " ".join((DOCS / "guide.md").read_text().split())
     said = dict(re.findall(r"`(\w+ at (?:least|most) [^:`]*): ([^`]*)`", guide))
     printed = [str(v) for v in ptsmc_jax.simulate(ROOT / "scenarios" / "cubesat.toml", trial=7).verdicts]

@@ -1,6 +1,6 @@
-"""Scenarios drawn from every table that there is: each flies alike by every way, and has the slopes of differences.
+"""Random scenarios from all tables: equal results by all ways to run them, and gradients equal to finite differences.
 
-What goes with what nobody has chosen here: a table or a key that is refused beside the others is left out again.
+Tables and keys are chosen at random. A table or key that contradicts the others is removed again.
 """
 
 import random
@@ -24,13 +24,13 @@ from tests.scenario.test_schema import COMPLETE
 from tuning.search.gains import gains_of, with_gains
 
 SEED, TRIALS = 7, 3
-# of two ways to fly the same: rounding, which a thin sign makes larger
+# relative difference between two ways to run a scenario: rounding, which a thin boundary layer amplifies
 close = partial(np.testing.assert_allclose, rtol=1e-6, atol=1e-12)
-METRICS = ("window_error", "terminal_error", "peak_torque", "effort")  # of every plant
+METRICS = ("window_error", "terminal_error", "peak_torque", "effort")  # metrics of all plants
 
 
 def drawn(seed):
-    """A sampled scenario from `COMPLETE`: of each table one of those there, of hardware and dispersion some keys."""
+    """Return a random sampled scenario from `COMPLETE`: one kind of each table, and some hardware and dispersions."""
     chance = random.Random(seed)
     kind = chance.choice(["spacecraft", "spacecraft", "spacecraft", "chain"])
     tables = {}
@@ -51,7 +51,7 @@ def drawn(seed):
 
 
 def accepted(tables):
-    """The scenario, without the keys that are refused, or their tables where what is lacking is another key."""
+    """Return the scenario without keys that are refused, or without their tables if another key is missing."""
     while said := refusal(lambda: scenario.study(scenario.from_tables(tables))):
         table, key = re.findall(r"\w+", said)[:2]
         del (tables[table] if key in tables[table] else tables)[key if key in tables[table] else table]
@@ -59,7 +59,7 @@ def accepted(tables):
 
 
 def refusal(call):
-    """Why it is refused; empty where it is not."""
+    """Return the text of a configuration error, empty if there is none."""
     try:
         call()
     except ScenarioError as error:
@@ -69,8 +69,8 @@ def refusal(call):
 
 @pytest.mark.long
 @pytest.mark.parametrize("seed", range(12))
-def test_a_drawn_scenario_flies_alike_by_every_way(seed, tmp_path):
-    """In a batch, alone, from its file, as the plan that its rows are, and by its C."""
+def test_a_random_scenario_gives_equal_results_by_all_ways_to_run(seed, tmp_path):
+    """The results agree in a batch, alone, from the written file, from the run table, and with the exported C."""
     known = drawn(seed)
     ready = scenario.study(known)
     rows = ptsmc.trials(known, TRIALS, seed=SEED)
@@ -86,12 +86,10 @@ def test_a_drawn_scenario_flies_alike_by_every_way(seed, tmp_path):
         planned = ptsmc.trials(known, rows, seed=SEED).select(rows.columns)
         assert_frame_equal(planned, rows, rel_tol=1e-6, abs_tol=1e-12)
     if said := refusal(lambda: ptsmc.export(known, tmp_path / "controller")):
-        assert re.search(
-            "the C is not told of|nothing to check by", said
-        )  # failures of wheels, or trials that are lost
+        assert re.search("the C is not told of|nothing to check by", said)  # failed wheels or diverged
         return
     alike = rows["status"].is_in(montecarlo.FINISHED).to_numpy()
-    if "peak_rate" in rows:  # a body that turns by a radian in a period makes rounding as large as its errors
+    if "peak_rate" in rows:  # a rotation of a radian per period amplifies rounding
         alike &= rows["peak_rate"].fill_null(np.inf).to_numpy() * known.loop.period < 1.0
     software = InTheLoop(Library(tmp_path / "controller"), ready.parts).software
     flown = montecarlo.run(ready.parts, ready.dispersion, SEED, np.arange(TRIALS), software=software)
@@ -102,10 +100,10 @@ def test_a_drawn_scenario_flies_alike_by_every_way(seed, tmp_path):
 
 @pytest.mark.long
 @pytest.mark.parametrize("seed", range(100, 108))
-def test_a_drawn_scenario_has_the_slopes_of_differences(seed):
-    """Along all gains at once; of order 4, of steps between truncation and rounding one of which is right to 1e-4.
+def test_gradients_of_a_random_scenario_match_finite_differences(seed):
+    """The derivative along all gains at once agrees with differences of order 4, to 1e-4 for at least one step size.
 
-    On the flight clock t_f and delta have a corner at each sample, and a quantised torque has no slope.
+    On the flight clock, t_f and delta have a kink at each sample, and a quantised torque has no derivative.
     """
     known = drawn(seed)
     if known.hardware is not None and known.hardware.torque_step is not None:

@@ -25,7 +25,7 @@ def flight():
     return ptsmc_jax.simulate(scenario.from_tables(TABLES), seed=3, trial=7)
 
 
-def test_a_flight_is_the_run_of_its_trial(flight):
+def test_simulate_gives_the_run_of_the_trial(flight):
     run = runs.fly(scenario.study(flight.scenario), 3, 7)
     assert list(flight.metrics) == list(run.metrics)
     np.testing.assert_array_equal(list(flight.metrics.values()), list(run.metrics.values()))
@@ -38,18 +38,18 @@ def test_a_flight_is_the_run_of_its_trial(flight):
     assert flight.metrics["hold_error"] == pytest.approx(error[frame["t"].to_numpy() >= 5.0].max(), rel=0.05)
 
 
-def test_a_file_is_read_and_errors_are_those_of_the_command(tmp_path):
+def test_simulate_reads_a_file_and_raises_the_errors_of_the_command(tmp_path):
     (tmp_path / "s.toml").write_text(SHORT)
     assert ptsmc_jax.simulate(tmp_path / "s.toml").status == "ok"
     with pytest.raises(ScenarioError, match="is not there"):
         ptsmc_jax.simulate(tmp_path / "none.toml")
     with pytest.raises(ScenarioError, match=r"controller\.eta is 1\.5, but must be a number greater than 2") as caught:
         ptsmc_jax.replace(scenario.from_tables(TABLES), controller__eta=1.5)
-    # what IPython shows in the place of a traceback
+    # IPython shows this instead of a traceback
     assert caught.value._render_traceback_() == [f"ScenarioError: {caught.value}"]
 
 
-def test_a_scenario_with_other_gains_is_written_and_read_again(flight, tmp_path):
+def test_a_scenario_with_other_gains_can_be_written_and_read(flight, tmp_path):
     gains = {**ptsmc_jax.gains_of(scenario.study(flight.scenario).parts), "eta": 3.5, "delta": np.float64(0.4)}
     other = ptsmc_jax.in_scenario(flight.scenario, gains)
     ptsmc_jax.write(other, tmp_path / "s.toml")
@@ -76,7 +76,7 @@ def test_a_scenario_with_other_gains_is_written_and_read_again(flight, tmp_path)
         ptsmc_jax.in_scenario(flight.scenario, 3.0)  # type: ignore[arg-type]
 
 
-def test_another_inertia_is_known_to_law_and_observer_or_to_none_but_the_truth(flight):
+def test_a_new_inertia_changes_the_design_model_or_only_the_true_plant(flight):
     inertia = np.array([[11.0, 0.5, 0.0], [0.5, 12.0, -0.3], [0.0, -0.3, 9.0]])
     own = scenario.study(flight.scenario).parts
     wanted = scenario.study(scenario.replace(flight.scenario, spacecraft__inertia=inertia.tolist())).parts
@@ -84,7 +84,7 @@ def test_another_inertia_is_known_to_law_and_observer_or_to_none_but_the_truth(f
     for part in (lambda p: p.plant, lambda p: p.controller.model, lambda p: p.observer.model):
         np.testing.assert_array_equal(part(moved).inertia, part(wanted).inertia)
         np.testing.assert_array_equal(part(moved).inertia_inverse, part(wanted).inertia_inverse)
-        # elimination against LAPACK: some rounding of a matrix whose moments differ by less than 2
+        # elimination and LAPACK differ by some rounding
         np.testing.assert_allclose(part(traced).inertia_inverse, np.linalg.inv(inertia), rtol=1e-14, atol=1e-17)
     unknown = own.with_inertia([9.0, 8.0, 7.0], known=False)
     np.testing.assert_array_equal(unknown.plant.inertia, np.diag([9.0, 8.0, 7.0]))
@@ -93,7 +93,7 @@ def test_another_inertia_is_known_to_law_and_observer_or_to_none_but_the_truth(f
 
 
 @pytest.mark.parametrize("known", [True, False])
-def test_a_gravity_gradient_acts_on_the_body_that_another_inertia_makes(flight, known):
+def test_the_gravity_gradient_uses_the_new_inertia_of_the_true_plant(flight, known):
     orbit = {"kind": "gravity_gradient", "orbit_rate": 0.001, "quat_xyzw": [0.6, 0.0, 0.0, 0.8]}
     pushed = scenario.replace(flight.scenario, disturbance={"kind": "sum", "terms": [orbit, {"kind": "constant"}]})
     body = {"spacecraft__inertia" if known else "spacecraft__true_inertia": [4.0, 12.0, 14.0]}
@@ -103,7 +103,7 @@ def test_a_gravity_gradient_acts_on_the_body_that_another_inertia_makes(flight, 
     np.testing.assert_array_equal(torque, expected)
 
 
-def test_a_nominal_flight_refuses_what_a_nominal_run_refuses():
+def test_simulate_refuses_a_singular_nominal_start():
     turned = scenario.from_tables({**TABLES, "initial": {"rotvec_deg": [180.0, 0.0, 0.0]}})
     with pytest.raises(ScenarioError, match="q4 = 0"):
         ptsmc_jax.simulate(turned)
@@ -134,7 +134,7 @@ def test_figures_by_name(flight):
         flight.plot("eror")
 
 
-def test_trials_are_the_campaigns_rows(flight):
+def test_trials_returns_the_rows_of_the_campaign(flight):
     rows = ptsmc_jax.trials(flight.scenario, 70, seed=3)
     made = campaign.Campaign(scenario.study(flight.scenario), 3)
     assert rows.equals(made.fly(range(70)))
@@ -146,7 +146,7 @@ def test_trials_are_the_campaigns_rows(flight):
     assert ptsmc_jax.verdicts(flight.scenario, broken)[0].failures == 1
 
 
-def test_verdicts_are_on_rows_of_what_trials_take(flight, tmp_path):
+def test_verdicts_accepts_all_kinds_of_scenarios_and_validates_rows(flight, tmp_path):
     rows = ptsmc_jax.trials(flight.scenario, 3)
     (tmp_path / "s.toml").write_text(SHORT)
     (expected,) = ptsmc_jax.verdicts(flight.scenario, rows)
@@ -158,7 +158,7 @@ def test_verdicts_are_on_rows_of_what_trials_take(flight, tmp_path):
             ptsmc_jax.verdicts(flight.scenario, other)
 
 
-def test_margins_are_those_of_the_trials_whose_rows_are_judged(monkeypatch):
+def test_margins_come_from_the_trials_of_the_rows(monkeypatch):
     asked: list[Any] = []
     monkeypatch.setattr(explore.margin_verdicts, "over_trials", lambda ready, seed: asked.append((ready, seed)) or [])
     tables = tomllib.loads(SHORT_CHAIN) | {"requirements": {"gain_margin": 3.0, "peak_torque": 3.0}}
@@ -169,7 +169,7 @@ def test_margins_are_those_of_the_trials_whose_rows_are_judged(monkeypatch):
     assert asked == [(ready, 7)]
 
 
-def test_an_animation_is_one_page_that_fetches_nothing(flight, tmp_path):
+def test_an_animation_is_one_page_without_external_files(flight, tmp_path):
     made = flight.animate(frames=4)
     content = made._repr_html_()
     assert content.count("data:image/png;base64") == 4
@@ -186,7 +186,7 @@ def test_an_animation_is_one_page_that_fetches_nothing(flight, tmp_path):
     assert "states" in chain.plot()
 
 
-def test_axes_are_turned_as_scipy_turns_them():
+def test_rotated_axes_match_scipy():
     turn, vectors = Rotation.from_rotvec([0.4, -1.2, 0.7]), np.random.default_rng(0).normal(size=(5, 3))
     np.testing.assert_allclose(animation.turned(turn.as_quat(), vectors), turn.apply(vectors), atol=1e-14)
 
@@ -195,7 +195,7 @@ def peak(result, parts):
     return {"mine": 2.0 * result.metrics.peak_torque}
 
 
-def test_numbers_of_trials_are_whole_and_metrics_of_ones_own_come_along():
+def test_trials_validates_numbers_and_returns_custom_metrics():
     flight = scenario.from_tables(tomllib.loads(SHORT_CHAIN))
     rows = ptsmc_jax.trials(flight, 2, own=peak)
     np.testing.assert_allclose(rows["mine"], 2.0 * rows["peak_torque"], rtol=1e-14)
@@ -214,12 +214,12 @@ def test_numbers_of_trials_are_whole_and_metrics_of_ones_own_come_along():
         (lambda result, parts: {"window_error": result.metrics.effort}, "has the name of a column that the rows have"),
     ],
 )
-def test_metrics_of_ones_own_are_named_numbers_that_hide_no_others(own, said):
+def test_invalid_custom_metrics_are_refused(own, said):
     with pytest.raises(ValueError, match=f"^own is <lambda>: .*{said}"):
         ptsmc_jax.trials(scenario.from_tables(tomllib.loads(SHORT_CHAIN)), 2, own=own)
 
 
-def test_a_run_that_ends_early_says_why_and_what_it_never_did_is_a_dash():
+def test_an_incomplete_run_shows_its_reason_and_dashes_for_missing_metrics():
     slow = scenario.replace(scenario.from_tables(CHAIN), hardware__torque_limit=1e-3)
     run = ptsmc_jax.simulate(slow)
     assert repr(run).startswith("status: missed, at t_f more than 5 % of the initial error is left, at 5 s")
@@ -259,7 +259,7 @@ def test_an_animation_draws_body_and_reference_at_even_times(monkeypatch):
             )
 
 
-def test_plans_and_floors_are_those_of_the_seed_that_is_asked_for(monkeypatch):
+def test_trials_and_floor_use_the_given_seed(monkeypatch):
     monkeypatch.setattr(campaign.Campaign, "fly", lambda self, trials: self.seed)
     monkeypatch.setattr(runs, "floor", lambda ready, seed=0, rows=(): seed)
     made = scenario.from_tables(TABLES)

@@ -13,7 +13,7 @@ from tests.tree import ROOT, modules
 
 
 def python(code):
-    """Last line that a fresh interpreter prints, read as JSON."""
+    """Run code in a new interpreter; return the last printed line, read as JSON."""
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout.splitlines()[-1])
@@ -25,8 +25,8 @@ def test_importing_the_package_and_the_command_does_not_import_jax():
     assert not {"jax", "jaxlib", "numpy", "scipy", "matplotlib", "optax"} & set(loaded)
 
 
-def test_importing_the_library_changes_nothing_of_jax_or_the_environment():
-    """So that `configure` can still be called: who forgets it is warned by a study, and told when it comes too late."""
+def test_importing_the_library_changes_no_setting_of_jax_or_the_environment():
+    """The user can call `configure` after the import. A study warns if the call is missing."""
     names = list(modules())
     changed, started, looked, warned, late = python(f"""
 import importlib, json, os, warnings
@@ -55,7 +55,7 @@ print(json.dumps([changed, started, len(before), warned, late]))
 """)
     assert changed == []
     assert started is False
-    assert looked > 50  # it did look
+    assert looked > 50  # names were found
     assert warned.startswith("JAX computes with 32 bits here")
     assert late.startswith("configure() comes too late")
 
@@ -85,9 +85,9 @@ def test_type_checkers_see_the_same_exports(package):
 
 
 @pytest.mark.parametrize("package", ["ptsmc_jax", "ptsmc_jax.scenario"])
-def test_type_checkers_know_every_argument_of_the_functions_offered(package):
+def test_exported_functions_have_type_annotations(package):
     offering = importlib.import_module(package)
     functions = [item for item in map(offering.__getattr__, offering._EXPORTS) if inspect.isfunction(item)]
-    assert len(functions) > 3  # it did look
+    assert len(functions) > 3  # functions were found
     for function in functions:
         assert set(inspect.signature(function).parameters) <= set(function.__annotations__), function.__name__

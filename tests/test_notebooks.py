@@ -1,4 +1,4 @@
-"""Every notebook runs without an error, and what is kept with its outputs has the source that is edited."""
+"""Every notebook runs without an error, and the stored .ipynb file matches the .py source."""
 
 import base64
 import importlib
@@ -24,7 +24,7 @@ executed = importlib.import_module("execute").executed
 SOURCES = sorted((ROOT / "notebooks").glob("0*.py"))
 
 
-def test_all_six_are_there():
+def test_all_notebooks_exist():
     names = [path.stem for path in SOURCES]
     assert names == [
         "01_paper",
@@ -36,7 +36,7 @@ def test_all_six_are_there():
     ]
 
 
-# what makes a cell smaller, of the notebooks whose cells fly much
+# replacements that make cells with many runs smaller
 SMALLER = {
     "02_sampling_and_noise": {"count=300": "count=20", "0.05, 4.0, 9)": "0.1, 4.0, 3)"},
     "03_tuning": {
@@ -54,8 +54,8 @@ SMALLER = {
 
 
 def cells(source, monkeypatch):
-    """Runs them at a small size, on a flight of five seconds."""
-    monkeypatch.setattr("ptsmc_jax.configure.configure", lambda: None)  # conftest did
+    """Run the cells at a small size, with a run of five seconds."""
+    monkeypatch.setattr("ptsmc_jax.configure.configure", lambda: None)  # done in conftest
     monkeypatch.setattr("ptsmc_jax.read", lambda path: scenario.from_tables(tomllib.loads(SHORT)))
     code = "\n".join(cell.source for cell in jupytext.read(source).cells if cell.cell_type == "code")
     for of_the_notebook, small in SMALLER.get(source.stem, {}).items():
@@ -67,14 +67,14 @@ def cells(source, monkeypatch):
 
 @pytest.mark.long
 @pytest.mark.parametrize("source", SOURCES, ids=lambda path: path.stem)
-def test_its_cells_run_at_a_small_size(source, monkeypatch):
-    """In this process; as they stand, in a kernel, see below."""
+def test_notebook_cells_run_at_a_small_size(source, monkeypatch):
+    """The cells run in this process. Another test runs them unchanged in a kernel."""
     small_search(monkeypatch)
     cells(source, monkeypatch)
 
 
-def test_cells_run_on_flights_that_are_traced(monkeypatch):
-    """Nothing is compiled but what a plant is asked before: a flight's numbers are made up, of its own shapes."""
+def test_notebook_cells_run_with_traced_runs(monkeypatch):
+    """Runs are only traced, and their results are made up with the right shapes, so that little is compiled."""
     traced = {}
 
     def flown(*args, **how):
@@ -98,17 +98,17 @@ SLIDING = [source for source in SOURCES if "interact(" in source.read_text()]
 
 
 def ends(widget):
-    """Both ends of a slider."""
+    """Return both ends of a slider."""
     base = getattr(widget, "base", None)
     return [float(v) if base is None else base**v for v in (widget.min, widget.max)]
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("source", SLIDING, ids=lambda path: path.stem)
-def test_every_slider_moves_to_both_ends(source, monkeypatch, capsys):
-    """Each by itself, and all together, of the flight that the notebook flies; few trials a stop."""
+def test_every_slider_accepts_both_ends(source, monkeypatch, capsys):
+    """Each slider moves alone, then all move together, with few trials at each position."""
     kept = []
-    monkeypatch.chdir(source.parent)  # where a kernel runs
+    monkeypatch.chdir(source.parent)  # the working folder of a kernel
     monkeypatch.setattr("ipywidgets.interact", lambda function, **widgets: kept.append((function, widgets)))
     monkeypatch.setattr("ptsmc_jax.configure.configure", lambda: None)
     cells = [cell.source for cell in jupytext.read(source).cells if cell.cell_type == "code"]
@@ -130,9 +130,9 @@ def test_every_slider_moves_to_both_ends(source, monkeypatch, capsys):
 
 
 @pytest.mark.long
-@pytest.mark.filterwarnings("ignore")  # of the machinery that runs kernels
+@pytest.mark.filterwarnings("ignore")  # warnings of the kernel client
 @pytest.mark.parametrize("source", SOURCES, ids=lambda path: path.stem)
-def test_it_runs(source):
+def test_the_notebook_runs_in_a_kernel(source):
     book = executed(source)
     code = [cell for cell in book.cells if cell.cell_type == "code"]
     assert all(cell.execution_count for cell in code if cell.source.strip())
@@ -143,19 +143,19 @@ def test_it_runs(source):
 
 
 @pytest.mark.parametrize("source", SOURCES, ids=lambda path: path.stem)
-def test_what_is_kept_is_this_source_with_its_outputs(source):
+def test_the_stored_notebook_matches_its_source(source):
     kept, edited = nbformat.read(source.with_suffix(".ipynb"), 4), jupytext.read(source)
     assert [(cell.cell_type, cell.source) for cell in kept.cells] == [
         (cell.cell_type, cell.source) for cell in edited.cells
     ], "run: make notebooks-kept"
-    assert [cell["id"] for cell in kept.cells] == [f"cell-{k}" for k in range(len(kept.cells))]  # not drawn anew
+    assert [cell["id"] for cell in kept.cells] == [f"cell-{k}" for k in range(len(kept.cells))]  # not random
     outputs = [output for cell in kept.cells if cell.cell_type == "code" for output in cell.outputs]
     assert outputs
     assert all(output.output_type != "error" for output in outputs)
     text = nbformat.writes(kept)
     shown = [out for out in outputs if "image/png" in out.get("data", {}) or "<img" in str(out.get("data", {}))]
     assert len(shown) >= 2  # figures
-    # nothing is fetched when it is opened, and no machine's folders are told
+    # an opened notebook loads no external files, and its outputs contain no local paths
     assert not re.search(r'(src|href)=\\?"https?://', text)
     assert not re.search(r"/(home|root|work|Users)/", text)
     for output in outputs:
@@ -164,8 +164,8 @@ def test_what_is_kept_is_this_source_with_its_outputs(source):
 
 
 @pytest.mark.parametrize("source", SOURCES, ids=lambda path: path.stem)
-def test_every_figure_is_explained(source):
-    """Text of two sentences or more stands above every cell that draws."""
+def test_text_explains_every_figure(source):
+    """Every cell that draws a figure follows a text of at least two sentences."""
     cells = jupytext.read(source).cells
     for k, cell in enumerate(cells):
         if cell.cell_type == "code" and re.search(r"\.plot\(|Figures\(|subplots\(|animate\(", cell.source):

@@ -1,4 +1,4 @@
-"""Stored programs: which are read, which are traced again, and that the numbers are right in every doubtful case."""
+"""Stored programs: which of them are read, which are traced again, and that results are right in doubtful cases."""
 
 import importlib
 import os
@@ -30,7 +30,7 @@ def folder(tmp_path, monkeypatch):
 
 
 def ours(function, name="ours"):
-    """The function as if it stood at the top of one of our modules."""
+    """Make a function look like a function at the top of a module of the project."""
     function.__module__, function.__qualname__, function.__name__ = "ptsmc_jax.numerics.attitude", name, name
     return function
 
@@ -64,7 +64,7 @@ def test_a_program_is_traced_once_and_read_by_the_next_process(folder):
 
 @pytest.mark.parametrize("stored", [False, True])
 def test_all_programs_but_batches_run_on_the_cpu_if_jax_has_a_gpu(tmp_path, monkeypatch, stored):
-    """A second device of the CPU stands for the GPU."""
+    """A second CPU device represents the GPU."""
     if stored:
         monkeypatch.setattr(configure, "programs", tmp_path)
     cpu, gpu = jax.local_devices()[:2]
@@ -82,7 +82,7 @@ def test_all_programs_but_batches_run_on_the_cpu_if_jax_has_a_gpu(tmp_path, monk
         np.testing.assert_array_equal(result, 2.0 * X)
     assert set(seen) == {cpu}
     with monkeypatch.context() as patch:
-        patch.setattr(configure, "programs", None)  # no stand-in has programs of a GPU
+        patch.setattr(configure, "programs", None)  # the CPU device cannot run stored GPU programs
         assert batch(x).devices() == {gpu}
         assert seen[-1] is None
         assert jax.jit(lambda x: single(x))(x).devices() == {gpu}  # part of a program of the caller
@@ -99,7 +99,7 @@ def test_a_ctrl_c_does_not_interrupt_a_compilation(folder):
     assert not any(thread.daemon for thread in traced)
 
 
-def test_a_thread_with_other_bits_has_other_programs(folder):
+def test_a_thread_with_another_precision_has_other_programs(folder):
     program, _ = spied()
     double = program(X)["both"]
     with jax.enable_x64(False):
@@ -132,8 +132,8 @@ def test_a_prepared_program_is_read_and_compiled_once(folder):
     assert (len(traced), len(traced_other)) == (0, 1)
 
 
-def test_a_prepared_program_may_call_one_that_waits_for_the_same_thread(folder, monkeypatch):
-    """Waiting for it would never end."""
+def test_a_prepared_program_can_call_another_prepared_program(folder, monkeypatch):
+    """Waiting for the own thread would be a deadlock."""
     monkeypatch.setattr(configure, "processors", lambda: [None])  # one thread
     monkeypatch.setattr(programs, "_background", programs.functools.cache(programs._background.__wrapped__))
     begin, (inner, _) = threading.Event(), spied("inner")
@@ -162,7 +162,7 @@ def test_an_error_of_the_function_is_raised_by_the_call(folder):
             program(X)
 
 
-def test_nothing_is_compiled_or_stored_if_jit_is_disabled(folder):
+def test_no_program_is_compiled_or_stored_if_jit_is_disabled(folder):
     program, _ = spied()
     with jax.disable_jit():
         np.testing.assert_allclose(program(X)["both"], np.sin(2 * X) + 5.0, rtol=1e-15)
@@ -249,7 +249,7 @@ def test_results_keep_their_structure(folder):
     assert count(folder) == 1
 
 
-def test_a_result_may_be_an_argument_of_a_program_for_several_devices(folder):
+def test_a_result_can_be_an_argument_of_a_program_for_several_devices(folder):
     def function(x, devices):
         return montecarlo.spread(lambda part: 2.0 * part + x, jnp.arange(4.0), devices)
 
@@ -283,7 +283,7 @@ def test_a_damaged_file_is_traced_again(folder, damage):
     assert stored.read_bytes() == content
 
 
-def test_a_reader_sees_no_file_or_a_whole_one(folder):
+def test_a_reader_never_sees_an_incomplete_file(folder):
     """Several threads write the same file, others read it."""
     program, _ = spied()
     program(X)
@@ -408,7 +408,7 @@ def test_processes_share_programs_with_lapack_and_several_devices_in_them(tmp_pa
 
 
 def test_every_program_is_a_function_of_its_module():
-    """It is called by keywords when it is stored, and known by its name, so no function that another one wraps."""
+    """Stored programs are called by keywords and identified by name, so the function must not be wrapped."""
     found = 0
     for module in map(importlib.import_module, modules()):
         for program in [v for v in vars(module).values() if isinstance(v, programs.Program)]:

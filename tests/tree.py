@@ -1,11 +1,11 @@
-"""Where the project's files lie, and what its modules are called; imports none of them."""
+"""Paths of the project's files and names of its modules. Nothing of the project is imported."""
 
 from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
 PACKAGES = ("ptsmc_jax", "tuning")
-# what compiles in half the time and flies at a third of the speed: for programs that fly once
+# options that halve the compile time and reduce the speed to a third, for programs that run once
 QUICKLY = (
     "--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1 "
     "--xla_llvm_enable_alias_scope_metadata=false --xla_llvm_enable_noalias_metadata=false"
@@ -14,7 +14,7 @@ QUICKLY = (
 
 @cache
 def modules(*packages: str) -> dict[str, Path]:
-    """Files by the dotted names of their modules, folders' own `__init__` among them."""
+    """Return files by the dotted names of their modules, `__init__` of packages included."""
     found = {}
     for package in packages or PACKAGES:
         for path in sorted((ROOT / package).rglob("*.py")):

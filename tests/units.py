@@ -31,7 +31,7 @@ def powers(unit: str) -> tuple[float, float]:
 
 
 def in_units(tables: Mapping[str, Any], inertia: float, time: float) -> dict[str, Any]:
-    """Return the tables of a scenario with every number in other units, by the units that the keys declare."""
+    """Return the tables of a scenario with every number in other units, according to the declared units of keys."""
     plant = tables.get("plant", {}).get("kind", "spacecraft")
     layout: Mapping[str, Any] = layouts.TABLES[plant]
     scaled = copy.deepcopy(dict(tables))
