@@ -1,4 +1,4 @@
-"""`jax.jit` whose traced programs are stored on disk, so that later processes trace and lower them no more.
+"""A `jax.jit` that stores traced programs on disk, so that later processes need not trace and lower them again.
 
 Tracing and lowering a large program takes 2 to 18 s. If `configure(keep_programs=True)` was called, as the `ptsmc`
 command does, the first process stores the StableHLO of a program by `jax.export`. Later processes read it, and find its
@@ -216,7 +216,7 @@ def jit(
 
 
 def call_on_cpu(function: Callable, /, *args: Any, **kwargs: Any) -> Any:
-    """Call a function on the CPU, also if JAX's default device is a GPU; part of a traced program stays where it is."""
+    """Call a function on the CPU, even if JAX's default device is a GPU. Calls with traced arguments are unchanged."""
     if configure.backend() == "cpu" or _is_traced(args, kwargs):
         return function(*args, **kwargs)
     args, kwargs = jax.tree.map(_to_host, (args, kwargs))

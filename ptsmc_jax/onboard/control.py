@@ -47,7 +47,16 @@ def _region(to: Any, region: Region, like: Sequence[Any]) -> list[np.ndarray]:
 
 
 def branch(to: Any, eqn: Any, values: list[np.ndarray]) -> list[np.ndarray]:
-    """Translate lax.cond and lax.switch: C runs one of the branches."""
+    """Translate lax.cond and lax.switch: C runs one of the branches.
+
+    Args:
+        to: the translator.
+        eqn: the equation of the trace.
+        values: components of its inputs.
+
+    Returns:
+        The components of its outputs.
+    """
     index, *operands = values
     branches, test = eqn.params["branches"], index.item()
     if test.op == "constant":
@@ -74,7 +83,7 @@ def _switch(to: Any, eqn: Any, test: Node, branches: Sequence[Any], operands: li
 
 
 def loop(to: Any, eqn: Any, values: list[np.ndarray]) -> list[np.ndarray]:
-    """Translate lax.while_loop."""
+    """Translate lax.while_loop; see `branch` for arguments and result."""
     test, body, test_consts, body_consts, init = unpack_while(eqn, values)
     region = Region("while")
     carry = _carry(to, region, init, eqn.outvars)
@@ -91,7 +100,10 @@ def _carry(to: Any, region: Region, init: Sequence[np.ndarray], like: Sequence[A
 
 
 def scan(to: Any, eqn: Any, values: list[np.ndarray]) -> list[np.ndarray]:
-    """Translate lax.scan and fori_loop of fixed length: unrolled if short, otherwise a loop in C."""
+    """Translate lax.scan and fori_loop of fixed length: unrolled if short, otherwise a loop in C.
+
+    See `branch` for arguments and result.
+    """
     params = eqn.params
     body, length = params["jaxpr"], params["length"]
     consts, init, xs = split_scan_operands(params, values)

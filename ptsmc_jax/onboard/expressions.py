@@ -163,7 +163,14 @@ class Pool:
         return node
 
     def make(self, op: str, *args: Node, kind: str = REAL, value: Any = None) -> Node:
-        """Return the node of an operation; equal operations give the same node."""
+        """Return the node of an operation; equal operations give the same node.
+
+        Args:
+            op: name of the operation.
+            *args: operands.
+            kind: kind of the result.
+            value: further data of the operation, if any.
+        """
         simple = self._simplified(op, args, kind)
         if simple is not None:
             return simple

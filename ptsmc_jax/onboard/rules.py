@@ -13,7 +13,13 @@ KNOWN_FUNCTIONS = {"log": "log", "arctan2": "atan2"}
 
 
 def power(pool: Pool, x: Node, exponent: int) -> Node:
-    """Return x^exponent by squaring, as XLA does."""
+    """Return x^exponent by squaring, as XLA does.
+
+    Args:
+        pool: makes the nodes.
+        x: the base.
+        exponent: an integer, which may be negative for a real base.
+    """
     left, found, square = abs(exponent), None, x
     while left:
         if left & 1:
@@ -27,7 +33,13 @@ def power(pool: Pool, x: Node, exponent: int) -> Node:
 
 
 def convert(pool: Pool, kind: str, x: Node) -> Node:
-    """Convert a number to another kind."""
+    """Return a number converted to another kind.
+
+    Args:
+        pool: makes the nodes.
+        kind: kind of the result.
+        x: the number.
+    """
     if x.kind == kind:
         return x
     if x.op == "constant" and (kind == REAL or 0 <= x.value < 2**31):  # others as C has them beyond its types

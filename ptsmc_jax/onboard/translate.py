@@ -79,7 +79,16 @@ class Translator:
                 node.title, node.part = group, "".join(str(i + 1) for i in index)
 
     def apply(self, eqn: Any, values: list[np.ndarray], where: list[origins.Frame]) -> list[np.ndarray]:
-        """Return the components of one equation's outputs."""
+        """Return the components of one equation's outputs.
+
+        Args:
+            eqn: the equation of the trace.
+            values: components of its inputs.
+            where: frames of its call stack, for sections and errors.
+
+        Raises:
+            NoRuleError: if an operation has no counterpart in C.
+        """
         name, inner = eqn.primitive.name, called_jaxpr(eqn)
         if name == "custom_jvp_call" or name == "custom_vjp_call":
             inner = eqn.params.get("call_jaxpr", eqn.params.get("fun_jaxpr"))

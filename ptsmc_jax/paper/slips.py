@@ -158,7 +158,7 @@ def _decay_of_the_bound() -> Slip:
 
 
 def _initial_estimate() -> Slip:
-    bound = {"disturbance_rate_bound": 1e-3}  # the paper's, not that of a constant
+    bound = {"disturbance_rate_bound": 1e-3}  # the published bound, not the bound 0 of a constant
     tables = {"disturbance": {"frequency": [0.0] * 3, "phase": [np.pi / 2] * 3}}  # constant
     true_bound = {**bound, "initial_estimate_error": 0.01 * 3**0.5}
     ratios = [

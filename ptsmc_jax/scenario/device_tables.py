@@ -46,7 +46,7 @@ COMMAND_FILTERS: Kinds = {
 
 
 class Actuators(Table, frozen=True):
-    """Between the command and the plant; each device is off where it is absent."""
+    """Actuators between the commanded torque and the plant. A device without a key is off."""
 
     command_filter: Annotated[
         CommandFilterTable | None, Meaning("between the law and all that follows, an inline table with a kind")
@@ -110,7 +110,7 @@ class Actuators(Table, frozen=True):
 
 
 class Hardware(Actuators, frozen=True):
-    """Actuators, star tracker and gyro of the sampled loop; each device is off where it is absent."""
+    """Actuators, star tracker and gyro of the sampled loop. A device without a key is off."""
 
     attitude_noise: Annotated[
         NotNegative | None,
@@ -212,7 +212,7 @@ class Hardware(Actuators, frozen=True):
 
 
 class StateHardware(Actuators, frozen=True):
-    """Actuators and noise of the sampled loop; each device is off where it is absent."""
+    """Actuators and measurement noise of the sampled loop. A device without a key is off."""
 
     state_noise: Annotated[NotNegatives | None, Meaning("1 sigma per sample, one number for each state")] = None
     levels: ClassVar[Mapping[str, tuple[str, ...]]] = {

@@ -68,7 +68,7 @@ def _drawn_bias(scenario: Any) -> float:
 
 
 def walk_rate(scenario: Any, density: np.ndarray) -> np.ndarray:
-    """Return a rate c [unit of d/s] for a random walk, whose rate is not bounded.
+    """Return a bound c [unit of d/s] on the rate of a random walk, which has no exact bound.
 
     It is three sigma of the change of the walk over the time constant J / l of the default observer, divided by that
     time constant. With this c, K2 = c J / l covers three sigma of the estimate's error.

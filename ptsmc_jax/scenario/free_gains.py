@@ -82,7 +82,7 @@ def _check(scenario: Scenario, tune: tables.Tune) -> None:
 
 
 def _check_objective(scenario: Scenario, tune: tables.Tune, said: str) -> None:
-    """Raise ScenarioError if there is no such objective; said: the beginning of a sentence about tune.free."""
+    """Raise ScenarioError if the objective is not possible; said: the beginning of a message about tune.free."""
     if tune.level is not None and tune.statistic not in tables.LEVELS:
         raise ScenarioError(f'tune.level is {tune.level}, but goes with tune.statistic = "quantile" or "cvar" only')
     shown = f"tune.minimise is {errors.show(tune.minimise)}"

@@ -29,5 +29,5 @@ OPTIONAL = (
     "dispersion",
     "requirements",
     "tune",
-)  # off where absent
+)  # tables that are off if they are absent
 KINDS: dict[str, Kinds] = {"hardware.command_filter": COMMAND_FILTERS}  # keys that are an inline table with a kind

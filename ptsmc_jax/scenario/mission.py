@@ -15,9 +15,9 @@ from ptsmc_jax.declare import Scaled
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.values import Table
 
-PAPER_INERTIA = (10.0, 12.0, 14.0)  # of the paper's spacecraft [kg m^2]
-PAPER_TIMES = (30.0, 40.0)  # range of t_f in the paper's cases of a spacecraft [s]
-CHAIN_TIME = 5.0  # t_f of the paper's integrator chains [s]
+PAPER_INERTIA = (10.0, 12.0, 14.0)  # of the published spacecraft [kg m^2]
+PAPER_TIMES = (30.0, 40.0)  # range of t_f in the published cases of a spacecraft [s]
+CHAIN_TIME = 5.0  # t_f of the published integrator chains [s]
 
 # Largest p T, with p the rate of both hold poles and T the dead time. With an observer of l / J = p / 2 the loop then
 # has a phase margin of 35 deg and a gain margin of 7 dB.

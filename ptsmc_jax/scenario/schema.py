@@ -19,7 +19,7 @@ from ptsmc_jax.scenario.values import Table
 
 
 class PartTable(Table, frozen=True):
-    """A table whose keys are its own fields and the numbers that the class of a part declares."""
+    """A table with two groups of keys: its own fields, and the numbers that the class of a part declares."""
 
     made: ClassVar[Any] = None  # the class of the part
     declared: ClassVar[Mapping[str, Declaration]] = {}  # declarations of its numbers, by key

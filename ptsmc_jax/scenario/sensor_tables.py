@@ -44,7 +44,7 @@ class SensorTable(PartTable, frozen=True):
 
 
 class AttitudeSensorTable(SensorTable, frozen=True):
-    """A sensor of the attitude, whose z axis is its boresight."""
+    """A sensor of the attitude. Its boresight is the z axis of sensor axes."""
 
     boresight: Annotated[Three | None, Meaning("direction of its boresight in body axes; default: the z axis")] = None
     rotvec_deg: Annotated[

@@ -31,7 +31,8 @@ def check(scenario: Any, parts: Parts, dispersion: Any, *, drawn: bool) -> None:
         scenario: the scenario.
         parts: its parts.
         dispersion: its dispersions.
-        drawn: whether dispersed attitudes are simulated. If so, the nominal initial attitude is not checked.
+        drawn: whether dispersed attitudes are simulated. If so, and if attitude or reference is dispersed, the nominal
+            initial attitude is not checked.
     """
     if scenario.motion == "system":
         system(scenario, parts)

@@ -27,7 +27,7 @@ _PAPERS = "prescribed_time"
 
 
 class ChainPlant(Table, frozen=True):
-    """An integrator chain x_i' = x_(i+1), x_n' = u + d, equation (35): the paper's Section 3."""
+    """An integrator chain x_i' = x_(i+1), x_n' = u + d, equation (35) in Section 3 of the paper."""
 
     kind: Literal["chain"] = "chain"
     order: Annotated[

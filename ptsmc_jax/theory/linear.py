@@ -315,7 +315,13 @@ def is_full(ticks: Ticks, period: Any) -> Any:
 
 
 def full_periods(parts: Parts, run: Nominal, *, hold: bool) -> np.ndarray:
-    """Return the numbers (periods,) of the full control periods [s] after (hold=True) or before the hand-over."""
+    """Return the numbers (periods,) of the full control periods before or after the hand-over.
+
+    Args:
+        parts: the sampled scenario.
+        run: its nominal run, with times in [s].
+        hold: whether to return periods after the hand-over; otherwise those before it.
+    """
     ticks = run.period.now
     in_hold = ticks.hold if hold else parts.controller.in_hold(ticks.t, ticks.t_next, ticks.hold)
     long_enough = is_full(jax.tree.map(np.asarray, ticks), np.asarray(parts.period))

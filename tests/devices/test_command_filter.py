@@ -1,4 +1,4 @@
-"""Filters of the command: SciPy's bilinear transform, periods of any length, and what the loop makes of them."""
+"""Command filters: SciPy's bilinear transform, periods of any length, and the filter in the linearised loop."""
 
 import jax
 import numpy as np
@@ -27,7 +27,7 @@ def digital(kind):
 
 
 def filtered(device, u, lengths):
-    """Outputs for inputs (samples,), the periods between them `lengths` (samples - 1,) long [s], from rest."""
+    """Outputs from rest for inputs u (samples,) with periods of these lengths (samples - 1,) [s] between them."""
     kept, out = device.begin(1), []
     for value, before, after in zip(u, [0.0, *lengths], [*lengths, H], strict=True):
         y, kept = device.step(kept, vector([value]), vector(before), vector(after))
@@ -36,16 +36,16 @@ def filtered(device, u, lengths):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_it_is_the_bilinear_transform(kind):
+def test_filter_equals_the_bilinear_transform(kind):
     device, _, _ = KINDS[kind]
-    u = np.append(0.0, np.random.default_rng(0).normal(size=40))  # rest has gone on for a period
+    u = np.append(0.0, np.random.default_rng(0).normal(size=40))  # begins with a period at rest
     b, a = digital(kind)
     np.testing.assert_allclose(filtered(device, u, [H] * 40), signal.lfilter(b, a, u), rtol=0, atol=1e-13)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_it_remembers_has_the_poles_of_the_filter_and_no_others(kind):
-    """A state that nothing uses stayed as it was: a pole at 1, which margins took for the loop's radius."""
+def test_filter_state_has_only_the_poles_of_the_filter(kind):
+    """An unused constant state would add a pole at 1, which the margin analysis would use as spectral radius."""
     device, _, _ = KINDS[kind]
     start, tree = ravel_pytree(device.begin(1))
     moved = jax.jacfwd(lambda kept: ravel_pytree(device.step(tree(kept), vector([0.0]), H, H)[1])[0])(start)
@@ -57,8 +57,7 @@ def test_what_it_remembers_has_the_poles_of_the_filter_and_no_others(kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_periods_of_any_length_integrate_the_same_filter(kind):
-    """A sine from rest, sampled unevenly: that of continuous time to second order, and a period of no length does
-    nothing."""
+    """The response to an unevenly sampled sine has second-order accuracy, and a period of length 0 has no effect."""
     device, b, a = KINDS[kind]
     rng, errors = np.random.default_rng(1), []
     for count in (100, 200):
@@ -73,7 +72,7 @@ def test_periods_of_any_length_integrate_the_same_filter(kind):
     np.testing.assert_allclose(np.delete(again, 1), filtered(device, [0.3, 0.5, 0.2], [H, H]), rtol=0, atol=1e-15)
 
 
-# a law alone, that nothing tells of what it commands: L of the loop is that of the filter times that without it
+# no observer uses the command, so that L with the filter equals the filter's response times L without it
 ALONE = {
     "plant": {"kind": "chain", "order": 2, "x0": [0.01, 0.0]},
     "controller": {"t_f": 4.0, "delta": 1.0, "eta": 3.0, "k1": 1.0, "surface_rate": 1.0, "disturbance_bound": 0.0},
@@ -83,8 +82,8 @@ ALONE = {
 }
 
 
-def test_the_loop_of_linear_theory_has_the_filter_in_it():
-    """Frozen at the end of both runs, where they are at the target: 16 s at 0.5 1/s leave 3e-4 of a small angle."""
+def test_linearised_loop_includes_the_filter():
+    """The loops are linearised at the end of both runs, where only 3e-4 of the small initial angle remains."""
     found, tones = [], (0.3, 2.0, 6.0, 15.0)
     for hardware in ({}, {"hardware": {"command_filter": {"kind": "second_order", "corner": 6.0, "damping": 0.7}}}):
         parts = scenario.study(scenario.from_tables({**ALONE, **hardware})).parts
@@ -98,7 +97,7 @@ def test_the_loop_of_linear_theory_has_the_filter_in_it():
         np.testing.assert_allclose(behind, factor[0] * without, rtol=0, atol=1e-4 * np.abs(without).max())
 
 
-def test_what_is_commanded_is_what_the_filter_lets_through():
+def test_commanded_torque_is_the_filtered_torque():
     ready = scenario.study(
         scenario.from_tables(
             {**ALONE, "hardware": {"command_filter": {"kind": "notch", "corner": 3.0, "damping": 0.5}}}
@@ -106,5 +105,5 @@ def test_what_is_commanded_is_what_the_filter_lets_through():
     )
     run = runs.fly(ready)
     assert run.status == "ok"
-    np.testing.assert_array_equal(run.log.commanded, run.log.u)  # nothing is behind it
+    np.testing.assert_array_equal(run.log.commanded, run.log.u)  # the actuators are ideal
     assert run.metrics["peak_torque"] == np.abs(run.log.commanded).max()

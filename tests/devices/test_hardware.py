@@ -1,4 +1,4 @@
-"""Delay, limits, lag, quantisation and wheels, each against an independent model of a few lines."""
+"""Delay, limits, lag, quantisation and wheels, each compared with a short independent model."""
 
 import dataclasses
 from itertools import pairwise
@@ -28,14 +28,14 @@ def drive_of(device, v, c):
     return actuators.Drive(vector(v), vector(c), None, jnp.asarray(False))
 
 
-# the first channel's value, its integral and that of the integral, over times (time,)
+# the first channel's torque, its integral and its double integral at times (time,)
 channels = jax.jit(jax.vmap(lambda device, drive, s: jnp.stack(device.channels(drive, s))[:, 0], (None, None, 0)))
 
 
 @pytest.mark.parametrize("lag", [None, 0.03, 0.5])
 @pytest.mark.parametrize("rate_limit", [None, 0.4, 20.0])
 def test_channels_follow_their_differential_equation(lag, rate_limit):
-    """v' = clip((c - v)/lag, -R, R); without a lag v' = R sign(c - v) until c is met."""
+    """The equation is v' = clip((c - v)/lag, -R, R), or without a lag v' = R sign(c - v) until v = c."""
     device = actuators.Actuators(
         rate_limit=None if rate_limit is None else vector(rate_limit), lag=None if lag is None else vector(lag)
     )
@@ -60,7 +60,7 @@ def test_channels_follow_their_differential_equation(lag, rate_limit):
 
 
 def commanded(device, u, *, v=None, h=None, dt=0.1):
-    """The drive that a command becomes in one period from t = 0, and what the channels have come to at its end."""
+    """The drive of a command in one period from t = 0, and the actuator state at the end of the period."""
     state = actuators.ActuatorState(None, None if v is None else vector(v), None if h is None else vector(h))
     t, dt, rest = vector(0.0), vector(dt), vector([0.0] * 3)
     drive, queue = device.command(state, vector(u), rest, t, dt, vector(1.0))
@@ -68,8 +68,8 @@ def commanded(device, u, *, v=None, h=None, dt=0.1):
 
 
 @pytest.mark.parametrize("lag", [None, 0.05])
-def test_a_command_is_limited_once_one_axis_is_out_of_reach(lag):
-    """A rate limit R brings an axis at most R (dt + lag) nearer: with the lag, v' = (c - v) / lag stays below R."""
+def test_a_command_counts_as_limited_if_one_axis_is_out_of_reach(lag):
+    """The rate limit R does not act if |c - v| <= R (dt + lag)."""
     device = actuators.Actuators(rate_limit=vector(2.0), lag=None if lag is None else vector(lag))
     most = 2.0 * (0.1 + (lag or 0.0))
     for far, limited in ((0.99 * most, False), (1.01 * most, True)):
@@ -78,8 +78,8 @@ def test_a_command_is_limited_once_one_axis_is_out_of_reach(lag):
 
 @pytest.mark.parametrize("lag", [None, 0.08])
 @pytest.mark.parametrize("way", [1.0, -1.0])
-def test_wheels_end_a_period_at_their_limit_of_momentum(lag, way):
-    """h' = -v: what asks for more than is left there, whichever way, is cut to what ends the period exactly there."""
+def test_wheels_end_a_period_at_their_momentum_limit(lag, way):
+    """A torque in either direction that would exceed the limit is reduced, so that the period ends at the limit."""
     wheels = reaction_wheels.wheels(np.eye(3), None, momentum_limit=0.5)
     device = actuators.Actuators(lag=None if lag is None else vector(lag), wheels=wheels)
     v = None if lag is None else [0.3 * way] * 3
@@ -90,8 +90,8 @@ def test_wheels_end_a_period_at_their_limit_of_momentum(lag, way):
 
 
 @pytest.mark.parametrize("share", [0.5, 2.0])
-def test_effort_follows_what_a_lag_delivers_within_the_period(share):
-    """Integral of c - (c - v) exp(-s/lag), which keeps its sign: Simpson is off by dt^5/2880 of its fourth slope."""
+def test_effort_includes_the_lag_within_a_period(share):
+    """The effort is the integral of c - (c - v) exp(-s/lag). Simpson's error is dt^5/2880 times the 4th derivative."""
     lag, v, c, u = 0.2, vector([0.1, -0.4, 0.0]), vector([0.5, -0.2, 0.3]), vector([0.0] * 3)
     dt = share * lag
     device = actuators.Actuators(lag=vector(lag))
@@ -101,7 +101,7 @@ def test_effort_follows_what_a_lag_delivers_within_the_period(share):
     assert 0.0 < abs(got - exact) < dt**5 / 2880 * float(np.sum(np.abs(c - v))) / lag**4
 
 
-def test_quantisation_rounds_and_lets_the_slope_through():
+def test_quantisation_rounds_and_has_derivative_one():
     u = vector([0.024, -0.036, 0.0])
     np.testing.assert_allclose(actuators.quantise(u, vector(0.01)), [0.02, -0.04, 0.0], atol=1e-17)
     np.testing.assert_array_equal(jax.jacfwd(lambda u: actuators.quantise(u, vector(0.01)))(u), np.eye(3))
@@ -113,8 +113,8 @@ def with_device(device, t_end=23.0, **changes):
 
 
 @pytest.mark.parametrize("step", [0.01, 0.03])
-def test_limits_and_steps_as_delivered_whole_periods_later(step):
-    """The step next to what is cut off at 0.11 N m may lie beyond it."""
+def test_limited_and_quantised_torque_is_delivered_after_the_delay(step):
+    """The multiple of the step nearest to the limit of 0.11 N m may exceed the limit."""
     device = actuators.Actuators(torque_limit=vector(0.11), step=vector(step), delay=3)
     result = fly(with_device(device, t_end=120.0), 1, 2)
     log = result.log
@@ -127,8 +127,8 @@ def test_limits_and_steps_as_delivered_whole_periods_later(step):
     np.testing.assert_allclose(result.metrics.saturated, np.sum(np.diff(log.t)[3:][beyond]) / 120.0, rtol=1e-9)
 
 
-@pytest.mark.long  # with wheels besides: `test_wheels_exchange_momentum_with_the_body`
-def test_held_torque_with_lag_is_what_an_adaptive_integrator_makes_of_it():
+@pytest.mark.long  # short test, with wheels: `test_wheels_exchange_momentum_with_the_body`
+def test_motion_with_lag_equals_an_adaptive_integration():
     device = actuators.Actuators(rate_limit=vector(0.5), lag=vector(0.04))
     log = fly(with_device(device, inertia=FULL_INERTIA), 1, 2).log
     inertia = np.asarray(FULL_INERTIA)
@@ -144,13 +144,13 @@ def test_held_torque_with_lag_is_what_an_adaptive_integrator_makes_of_it():
         y = solve_ivp(
             rate, (log.t[k], log.t[k + 1]), y, args=(log.commanded[k],), rtol=1e-10, atol=1e-12, max_step=0.01
         ).y[:, -1]
-    # impulse and first moment of the torque are exact in a step: what is left is its bend, turned by w dt
+    # impulse and first moment of the torque are exact in a step; the error comes from higher moments
     np.testing.assert_allclose(np.concatenate([log.x.q[60], log.x.w[60]]), y[:7], atol=1e-9)
     np.testing.assert_allclose(log.u[60], y[7:], atol=1e-9)
 
 
 def wheels_by_an_adaptive_integrator(inertia, axes, log, lag, limit, intervals):
-    """Body and wheels, J w' = A v - w x (J w + A h) and h' = -v, from the first row on: attitude and momenta."""
+    """Attitude and wheel momenta from J w' = A v - w x (J w + A h) and h' = -v, from the first row of the log."""
     n, inverse = axes.shape[1], np.linalg.inv(inertia)
     y = np.concatenate([log.x.q[0], log.x.w[0], log.wheels[1][0], log.wheels[0][0]])
 
@@ -166,7 +166,7 @@ def wheels_by_an_adaptive_integrator(inertia, axes, log, lag, limit, intervals):
         ramps = [] if lag is None else np.abs(gap - np.clip(gap, -limit * lag, limit * lag)) / limit
         y[7 : 7 + n] = c if lag is None else y[7 : 7 + n]
         ends = [log.t[k], *np.sort([log.t[k] + r for r in ramps if 0 < r < log.t[k + 1] - log.t[k]]), log.t[k + 1]]
-        for start, end in pairwise(ends):  # no interval has a bend inside
+        for start, end in pairwise(ends):  # the torque is smooth in each interval
             y = solve_ivp(rate, (start, end), y, args=(c,), method="DOP853", rtol=1e-13, atol=1e-15).y[:, -1]
     return y[:4], y[7 + n :]
 
@@ -174,7 +174,7 @@ def wheels_by_an_adaptive_integrator(inertia, axes, log, lag, limit, intervals):
 CHANNELS = [(None, np.inf), (0.2, np.inf), (0.05, np.inf), (0.1, 0.5)]
 
 
-MOST, SAMPLES = 64, 160  # integration steps a period and periods: one program for different momenta
+MOST, SAMPLES = 64, 160  # integration steps per period, and periods: equal, to share one compiled program
 
 
 def as_many(ready, substeps=MOST):
@@ -188,7 +188,7 @@ MOMENTA = [[0.5, -0.2, 0.1, 0.3], [40.0, 0.0, 0.0, 0.0]]
 @pytest.mark.parametrize("momentum", MOMENTA)
 @pytest.mark.parametrize(("lag", "limit"), short(CHANNELS, CHANNELS[::3]))
 def test_wheels_exchange_momentum_with_the_body(momentum, lag, limit):
-    """Total angular momentum stays where it is in the inertial frame; attitude as by an independent integration."""
+    """The total inertial angular momentum is constant, and the attitude equals an independent integration."""
     hardware_table = {"torque_lag": lag, "torque_rate_limit": limit if np.isfinite(limit) else None}
     tables = {
         "spacecraft": {"inertia": FULL_INERTIA},
@@ -207,7 +207,7 @@ def test_wheels_exchange_momentum_with_the_body(momentum, lag, limit):
         Rotation.from_quat(q).apply(inertia @ w + axes @ h)
         for q, w, h in zip(log.x.q, log.x.w, log.wheels[0], strict=True)
     ]
-    # RK4's own: (0.025 rad)^5 / 120 a step at most, of the part of the momentum that turns
+    # the error of RK4 is at most (0.025 rad)^5 / 120 per step, relative to the rotating part of the momentum
     np.testing.assert_allclose(total, np.tile(total[0], (len(total), 1)), atol=1e-10 * float(np.linalg.norm(total[0])))
     q, h = wheels_by_an_adaptive_integrator(inertia, axes, log, lag, limit, intervals := 80)
     off = Rotation.from_quat(q).inv() * Rotation.from_quat(log.x.q[intervals])
@@ -231,25 +231,25 @@ CUBESAT = {
 SPINNING = {**CUBESAT, "wheels": {"momentum": [0.4, 0.0, 0.0, 0.0]}}
 
 
-def test_steps_follow_the_nutation():
-    """0.4 N m s on a CubeSat turn it 1.6 rad a period: steps follow |H|/J."""
+def test_integration_steps_resolve_the_nutation():
+    """A momentum of 0.4 N m s gives a CubeSat a nutation of 1.6 rad per period, so that |H|/J sets the steps."""
     steps = scenario.study(scenario.from_tables(SPINNING)).parts.substeps
     assert steps == MOST
     assert steps >= 0.4 / np.sqrt(0.05 * 0.08) * 0.2 / 0.025
 
 
-@pytest.mark.long  # steps of that size: momentum and attitude of `test_wheels_exchange_momentum_with_the_body`
-def test_more_steps_than_follow_the_nutation_change_nothing():
+@pytest.mark.long  # short test of these steps: `test_wheels_exchange_momentum_with_the_body`
+def test_more_integration_steps_do_not_change_the_result():
     ready = scenario.study(scenario.from_tables(SPINNING))
     ours, theirs = (runs.fly(as_many(ready, times * MOST)) for times in (1, 3))
-    # RK4 at 0.025 rad a step, |H| / sqrt(J_1 J_2) of them: some 1e-9 rad (theory: the same bound as for the body rate)
+    # the error of RK4 with 0.025 rad of nutation per step is about 1e-9 rad
     np.testing.assert_allclose(ours.metrics["window_error"], theirs.metrics["window_error"], rtol=1e-6)
     off = Rotation.from_quat(ours.log.x.q[-1]).inv() * Rotation.from_quat(theirs.log.x.q[-1])
     assert off.magnitude() < 1e-9
 
 
-def test_most_gains_share_a_number_of_steps():
-    """Each number of steps is another program to compile: the tuned gains of a flexible body had 12, its own had 11."""
+def test_different_gains_have_the_same_number_of_steps():
+    """Another number of steps needs another compiled program."""
     frequency = {"flexible": {"frequency": [4.5], "damping": [0.005], "coupling": [[0.02, 0.0, 0.0]]}}
     tables = {**CUBESAT, **frequency, "loop": {**CUBESAT["loop"], "t_end": 60.0}}
     each = {
@@ -261,8 +261,8 @@ def test_most_gains_share_a_number_of_steps():
     assert len(each) == 1
 
 
-def test_steps_follow_what_disturbances_leave_in_the_wheels():
-    """What is constant adds up until t_end; a wheel takes it."""
+def test_integration_steps_include_the_momentum_of_the_disturbance():
+    """The wheels store the impulse of a constant disturbance until t_end."""
     drifting = {"disturbance": {"kind": "constant", "amplitude": [0.005, 0.0, 0.0]}, "wheels": {}}
     ready = scenario.study(scenario.from_tables({**CUBESAT, **drifting}))
     assert ready.parts.substeps >= 0.005 * 22.0 / np.sqrt(0.05 * 0.08) * 0.2 / 0.025
@@ -275,7 +275,7 @@ def test_steps_follow_what_disturbances_leave_in_the_wheels():
         ({"wheels": {}, "disturbance": {"kind": "constant", "amplitude": [0.5] * 3}}, r"^disturbance\.amplitude is"),
     ],
 )
-def test_too_much_momentum_for_the_period_is_refused(changes, said):
+def test_momentum_that_is_too_large_for_the_period_raises_an_error(changes, said):
     with pytest.raises(ScenarioError, match=said):
         scenario.study(scenario.from_tables({**CUBESAT, **changes}))
 
@@ -286,8 +286,8 @@ def with_spinning(wheels, **changes):
     return dataclasses.replace(run, actuators=actuators.Actuators(wheels=wheels))
 
 
-def test_peak_wheel_momentum_counts_from_the_start():
-    """A wheel that first speeds the body up, and not quite takes that back: its largest momentum is that at t = 0."""
+def test_peak_wheel_momentum_includes_the_initial_momentum():
+    """The wheel gives momentum to the body and takes back less, so that its momentum is largest at t = 0."""
     spinning = reaction_wheels.wheels(np.eye(3), [5.0, 0.0, 0.0])
     turned = {"q": Rotation.from_rotvec([-1.0, 0.0, 0.0]).as_quat(), "rate": (-0.1, 0.0, 0.0)}
     result = fly(with_spinning(spinning, **turned))
@@ -295,19 +295,19 @@ def test_peak_wheel_momentum_counts_from_the_start():
     assert result.metrics.peak_wheel_momentum == 5.0
 
 
-def test_wheels_keep_their_limits():
+def test_wheels_respect_their_limits():
     limits = reaction_wheels.wheels(PYRAMID, None, torque_limit=0.08, momentum_limit=0.6)
     result = fly(dataclasses.replace(with_device(actuators.Actuators(wheels=limits)), substeps=4), 1, 2)
     assert np.all(np.abs(result.log.u) <= 0.08 * np.abs(PYRAMID).sum(axis=0) * (1 + 1e-9))
     assert float(result.metrics.peak_wheel_momentum) <= 0.6 * (1 + 1e-9)
     assert float(result.metrics.saturated) > 0.1
-    assert int(result.status) == rollout.MISSED  # a slew that needs 1.2 N m s and gets half of it
+    assert int(result.status) == rollout.MISSED  # the slew needs 1.2 N m s, twice the limit
     assert all(np.isfinite(v) for v in (result.metrics.window_error, result.metrics.peak_torque))
 
 
 @pytest.mark.parametrize("early", [True, False])
-def test_a_wheel_fails_at_its_time_for_the_wheels_and_for_their_allocation_alike(early):
-    """At a sample at that very time the others do all of it, and nothing is lost nor done twice."""
+def test_wheel_and_allocation_change_at_the_same_sample_on_failure(early):
+    """At a sample exactly at the failure time the other wheels deliver the whole torque."""
     device = reaction_wheels.wheels(PYRAMID)
     failing = actuators.Actuators(
         wheels=device,
@@ -322,7 +322,7 @@ def test_a_wheel_fails_at_its_time_for_the_wheels_and_for_their_allocation_alike
     assert (abs(float(drive.c[0])) > 1e-3) is early
 
 
-def test_allocation_gives_the_wanted_torque_for_any_geometry():
+def test_allocation_gives_the_commanded_torque_for_any_geometry():
     rng = np.random.default_rng(0)
     for axes in (PYRAMID, np.eye(3), rng.normal(size=(6, 3)), 7.0 * rng.normal(size=(3, 3))):
         found = reaction_wheels.wheels(axes)
@@ -337,7 +337,7 @@ def test_allocation_gives_the_wanted_torque_for_any_geometry():
 
 
 def everything(delta=0.93, **changes):
-    """A run with every device on."""
+    """A run with every device enabled."""
     run = parts(
         15.0,
         3.2,
@@ -369,22 +369,22 @@ def error_with_everything(eta, delta, gain):
 
 @programs.jit
 def sloped_with_everything(gains, along):
-    """The error and its slope along a direction of eta, delta and the observer's gain."""
+    """The error and its derivative along a direction of eta, delta and the observer's gain."""
     return jax.jvp(lambda gains: error_with_everything(*gains), (gains,), (along,))
 
 
-def test_gradients_with_every_device_on():
+def test_gradients_with_every_device_equal_finite_differences():
     point = np.array([3.2, 0.93, 30.0])
     for k, along in enumerate(np.eye(3)):
         slope = sloped_with_everything(point, along)[1]
         assert np.isfinite(slope)
-        h = 2e-5 * point[k] * along  # wide enough that the staircase of 1e-13 N m does not show
+        h = 2e-5 * point[k] * along  # large enough to average over the quantisation of 1e-13 N m
         up, down = (sloped_with_everything(at, along)[0] for at in (point + h, point - h))
         np.testing.assert_allclose(slope, (up - down) / (2 * h[k]), rtol=1e-4)
 
 
 @pytest.mark.long
-def test_batches_with_every_device_on():
+def test_lanes_equal_vmap_with_every_device():
     trials, run = jnp.arange(5, dtype=jnp.uint32), everything()
 
     def one(trial):
@@ -397,8 +397,8 @@ def test_batches_with_every_device_on():
     assert np.std(plain.window_error) > 0
 
 
-def test_nothing_jumps_where_delta_is_a_multiple_of_the_period():
-    """With delay, filter and walk too: the vanishing first period weighs nothing."""
+def test_error_is_continuous_where_delta_is_a_multiple_of_the_period():
+    """The run has delay, filter and random walk. A first period of length 0 has no weight."""
     gains = (np.array([3.2, 1.0 + shift, 30.0]) for shift in (-1e-7, 1e-7))
     below, above = (sloped_with_everything(at, np.eye(3)[1])[0] for at in gains)
     np.testing.assert_allclose(below, above, rtol=1e-4)
@@ -413,19 +413,19 @@ def test_gravity_gradient_is_the_textbook_torque():
         found = whole(vector(0.0), AttitudeState(vector(q), vector([0.0] * 3)))
         expected = [0.0, 0.0, -1.5 * rate**2 * (12.0 - 10.0) * np.sin(2 * angle)]
         np.testing.assert_allclose(found, expected, atol=1e-18)
-        # a quarter of the orbit later the body lies the other way
+        # a quarter of the orbit later the angle from the radial direction differs by 90 deg
         later = whole(vector(np.pi / 2 / rate), AttitudeState(vector(q), vector([0.0] * 3)))
         np.testing.assert_allclose(later, [0.0, 0.0, 1.5 * rate**2 * 2.0 * np.sin(2 * angle)], atol=1e-18)
 
 
 def walking():
-    """A run with a random walk of 1e-3 N m / sqrt(s) for its disturbance."""
+    """A run whose disturbance is a random walk of 1e-3 N m / sqrt(s)."""
     run = parts(10.0, 3.0, 0.5, period=0.1, t_end=12.0, disturbance=disturbances.Constant(vector([0.0] * 3)))
     return dataclasses.replace(run, walk_rate=vector([1e-3 / np.sqrt(0.1)] * 3))
 
 
-def test_random_walk_is_the_sum_of_its_stream():
-    """By hand, from the stream that is documented."""
+def test_random_walk_is_the_sum_of_its_random_steps():
+    """The steps come from the documented random stream."""
     run = walking()
     d = fly(run, 4, 7).log.disturbance
     ticks, key = ticks_of(run.clock, run.controller.t_f, run.controller.delta), draws.stream(4, 7, "disturbance_walk")
@@ -435,7 +435,7 @@ def test_random_walk_is_the_sum_of_its_stream():
     assert np.ptp(grown, axis=0).min() > 1e-4
 
 
-@pytest.mark.long  # its steps: the test above; how these are distributed: `test_draws.py`
+@pytest.mark.long  # short tests: the steps above, and their distribution in `test_draws.py`
 def test_random_walk_grows_like_the_square_root_of_time():
     run, density = walking(), 1e-3
 
@@ -448,7 +448,7 @@ def test_random_walk_grows_like_the_square_root_of_time():
     for at in (3.0, 12.0):
         k = int(np.flatnonzero(t[0] >= at - 1e-9)[0])
         spread = d[:, k].std(axis=0)
-        # the sample at `at` has its own step already: 0.1 s more
+        # the sample at `at` already includes its own step, for 0.1 s more
         np.testing.assert_allclose(spread, density * np.sqrt(min(at + 0.1, 12.0)), rtol=5 / np.sqrt(2 * 512))
     begun = int(np.flatnonzero(t[0] >= 2.0)[0])
     steps = np.diff(d[:, begun : begun + 100], axis=1)
@@ -457,8 +457,8 @@ def test_random_walk_grows_like_the_square_root_of_time():
     assert np.abs(np.corrcoef(steps[..., 0].ravel(), steps[..., 1].ravel())[0, 1]) < limit
 
 
-def test_gradients_are_finite_at_the_corners():
-    """On a limit, at rest, with nothing to do: where clip, sign and the end of a ramp have no slope of their own."""
+def test_gradients_are_finite_where_functions_are_not_differentiable():
+    """These points are at a limit, at rest and at the target, where clip, sign and the end of a ramp have a kink."""
     device = actuators.Actuators(
         torque_limit=vector(0.3), rate_limit=vector(0.5), lag=vector(0.1), step=vector(0.1),
         wheels=reaction_wheels.wheels(PYRAMID, None, 0.2, 0.5), delay=1,
@@ -479,7 +479,7 @@ def test_gradients_are_finite_at_the_corners():
                 assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(slopes))
 
 
-def test_a_saturated_slew_misses_t_f_stays_finite_and_arrives_later():
+def test_a_saturated_slew_stays_finite_and_converges_after_t_f():
     device = actuators.Actuators(torque_limit=vector(0.1), step=vector(1e-3), delay=3)
     result = fly(with_device(device, t_end=120.0))
     assert int(result.status) == rollout.MISSED
@@ -489,33 +489,33 @@ def test_a_saturated_slew_misses_t_f_stays_finite_and_arrives_later():
     kept = {name: float(getattr(metrics, name)) for name in always}
     assert all(map(np.isfinite, kept.values()))
     assert float(metrics.terminal_angle) > 0.1
-    assert float(metrics.settling_time) > 20.0  # the hold law brings it home, and the metrics say when
+    assert float(metrics.settling_time) > 20.0  # the hold law converges after t_f
     assert float(metrics.saturated) > 0.1
     assert np.abs(result.log.u).max() <= 0.1
 
 
 @pytest.mark.parametrize("lag", short([None, 0.08], [None]))
-def test_momentum_limit_is_kept_and_never_at_the_cost_of_the_torque_limit(lag):
+def test_momentum_limit_does_not_violate_the_torque_limit(lag):
     limits = reaction_wheels.wheels(PYRAMID, [0.4, 0.0, 0.0, -0.4], torque_limit=0.1, momentum_limit=0.45)
     device = actuators.Actuators(lag=None if lag is None else vector(lag), wheels=limits)
     run = dataclasses.replace(with_device(device), substeps=4)
     result = fly(run, 1, 2)
     assert np.all(np.abs(result.log.u) <= 0.1 * np.abs(PYRAMID).sum(axis=0) * (1 + 1e-9))
-    # with a lag the torque that is still flowing may meet the torque limit first
+    # with a lag the momentum limit may be exceeded, because the torque limit has priority
     assert float(result.metrics.peak_wheel_momentum) <= 0.45 * (1 + 1e-9) + (0.0 if lag is None else 0.1 * 0.08)
     assert int(result.status) == rollout.MISSED
 
 
-def test_observer_invents_no_disturbance_from_the_wheels():
-    """20 N m s in one wheel and no disturbance: w x A h is known at both ends of the period, like the rest."""
+def test_observer_estimates_no_disturbance_from_wheel_momentum():
+    """One wheel has 20 N m s, and there is no disturbance. The observer knows w x A h at both ends of the period."""
     spinning = reaction_wheels.wheels(np.eye(3), [20.0, 0.0, 0.0])
     log = fly(with_spinning(spinning)).log
-    # the trapezium rule of w x A h over a period: h^2/12 w'' H, 0.05 rad/s^3 at the end of the slew
+    # the error of the trapezium rule is h^2/12 w'' H, with w'' = 0.05 rad/s^3 at the end of the slew
     assert np.abs(log.d_hat).max() < 1e-3
 
 
-def test_the_compensation_of_the_wheels_momentum_takes_the_delay_of_the_command():
-    """w x A h is computed with the command from the same sample, so it acts as late; it had no delay."""
+def test_wheel_momentum_compensation_has_the_delay_of_the_command():
+    """The flight computer adds w x A h to the command of the same sample, so that both have the same delay."""
     momentum, rate = [0.3, -0.1, 0.2], vector([0.02, 0.05, -0.01])
     device = actuators.Actuators(wheels=reaction_wheels.wheels(np.eye(3), momentum), delay=2)
     state, applied = device.begin(3), []

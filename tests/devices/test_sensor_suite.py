@@ -1,4 +1,4 @@
-"""Sensor suites: sample times, the filter beside brute-force conditioning, and an honest covariance."""
+"""Sensor suites: sample times, the filter against batch conditioning, and the consistency of its covariance."""
 
 import dataclasses
 import itertools
@@ -75,7 +75,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_the_normalised_error_squared_is_within_its_95_percent_interval(case):
+def test_normalised_estimation_error_squared_is_within_its_95_percent_interval(case):
     suite, trials, count = CASES[case](), 1000, 48
     run = jax.jit(jax.vmap(lambda suite, trial: filtered(suite, trial, count), (None, 0)))
     errors, covariances = (np.asarray(v) for v in run(suite, jnp.arange(trials, dtype=jnp.uint32)))
@@ -85,10 +85,10 @@ def test_the_normalised_error_squared_is_within_its_95_percent_interval(case):
         assert low < np.mean(np.sum(weighed * errors[:, k], axis=1)) < high
 
 
-def test_covariance_and_estimate_are_those_of_conditioning_on_all_readings_at_once():
-    """At rest the errors are linear: a Gaussian vector of all unknowns is conditioned on every reading that has come.
+def test_filter_equals_batch_conditioning_on_all_readings():
+    """At rest the errors are linear. The test conditions a Gaussian vector of all unknowns on every received reading.
 
-    The errors are measured less true: attitude, bias, then in each period the drift and the noise of the gyro sample.
+    The unknowns are the initial errors of attitude and bias, and in each period the drift and the gyro noise.
     """
     intervals, latencies, count = (2, 3), (2, 1), 9
     suite = suites.two_star_trackers(H, intervals, latencies)
@@ -126,10 +126,10 @@ def test_covariance_and_estimate_are_those_of_conditioning_on_all_readings_at_on
                     for row, sigma, seen in zip(rows, size, rows @ truth + error, strict=True):
                         gain = p @ row / (row @ p @ row + sigma**2)
                         mean, p = mean + gain * (seen - row @ mean), p - np.outer(gain, row @ p)
-        # the same numbers for the filter: noise of the readings, and a gyro that is off by what the truth says
+        # the same numbers for the filter: noise of the readings, and gyro errors of the true vector
         drift = np.asarray(bias @ truth)
         noises = (*(vector(values.get(j, np.zeros(3))) for j in range(2)), vector(noise @ truth))
-        # the body turns so that the gyro reads the bias that the filter starts with: all the filter's changes are mean
+        # the body turns so that the gyro reads the initial bias estimate; only corrections change the estimate
         true = AttitudeState(attitude.from_rotation_vector(vector(turn @ truth)), -vector((bias + noise) @ truth))
         ready = memory._replace(keys=None, noise=noises, bias=first.bias + vector(drift))
         still = dataclasses.replace(suite, noise_free=True)
@@ -164,8 +164,8 @@ def test_each_reading_is_used_once_at_the_first_sample_after_its_latency(interva
     assert np.all(used - taken < times.past + 1e-9)
 
 
-def test_a_reading_that_is_late_is_that_of_its_own_time():
-    """Without noise: what comes is the attitude when the reading was taken, and the estimate stays exact."""
+def test_a_delayed_reading_is_the_attitude_at_its_own_time():
+    """Without noise the reading is the attitude when it was taken, and the estimate stays exact."""
     suite = suites.two_star_trackers(H, (2.5, 3.0), (1.2, 2.0)).quiet()
     memory, seen = suite.begin(0, 0, state(0.0), tick(0)), None
     for k in range(12):
@@ -182,7 +182,7 @@ def test_a_reading_that_is_late_is_that_of_its_own_time():
 
 
 @pytest.mark.parametrize("case", ["latency", "own clocks", "outage"])
-def test_theory_knows_which_readings_the_simulation_delivers_and_their_age(case):
+def test_available_and_lag_equal_the_simulated_readings(case):
     suite, count = CASES[case]().quiet(), 40
     ticks = jax.vmap(tick)(jnp.arange(count))
     available, lag = suite.available(ticks), suite.lag(ticks)
@@ -203,13 +203,13 @@ def test_theory_knows_which_readings_the_simulation_delivers_and_their_age(case)
         np.testing.assert_array_equal(np.flatnonzero(second), range(0, count, 8))
 
 
-def test_without_noise_no_number_is_drawn():
+def test_no_random_numbers_are_generated_without_noise():
     quiet = suites.two_star_trackers(H).quiet()
     trace = jax.make_jaxpr(lambda seed: quiet.begin(seed, 0, state(0.0), tick(0)))(jnp.uint32(3))
-    assert not any(one.primitive.name == "shift_left" for one in equations(trace))  # which every random number needs
+    assert not any(one.primitive.name == "shift_left" for one in equations(trace))  # every random number needs it
 
 
-def test_a_sensor_without_noise_is_refused():
+def test_a_sensor_without_noise_raises_an_error():
     tracker = suites.star_tracker(0, H, 0.0, H)
     with pytest.raises(ValueError, match="noise greater than 0"):
         suites.suite([dataclasses.replace(tracker, noise=vector([1e-5, 1e-5, 0.0]))], H)

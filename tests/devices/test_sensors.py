@@ -26,7 +26,7 @@ STATE = rigid_body.AttitudeState(vector(ATTITUDE.as_quat()), vector([0.01, -0.2,
 
 
 def tick(sample, weight=1.0):
-    """A control period's number and weight: what sensors look at."""
+    """A control period with this number and weight, the only values that sensors use."""
     zero = vector(0.0)
     return ticks.Ticks(zero, zero, jnp.asarray(False), jnp.asarray(sample), vector(weight), jnp.asarray(weight < 1.0))
 
@@ -57,7 +57,7 @@ def test_noise_has_the_stated_size_about_every_body_axis(errors):
 
 
 @pytest.mark.parametrize("filtered", [False, True])
-def test_sensors_without_noise_measure_the_true_state_and_draw_no_numbers(filtered):
+def test_sensors_without_noise_measure_the_true_state_without_random_numbers(filtered):
     noisy = sensors.Sensors(vector(SIZES[0]), vector(SIZES[1]), rate_bias=vector(1e-6), bias_rate=vector(1e-8))
     quiet = (noisy.with_bandwidth(vector(0.2), vector(0.05)) if filtered else noisy).quiet()
     x = STATE._replace(w=0.0 * STATE.w) if filtered else STATE  # a filter propagates from the sample before
@@ -80,20 +80,20 @@ def test_noise_differs_from_sample_to_sample_and_trial_to_trial(errors):
         assert len(np.unique(error[:, 0])) > 0.999 * len(error)  # birthdays among 2^32 pairs: one or none
 
 
-def test_noise_is_drawn_from_the_streams_named_after_the_sensors():
+def test_noise_uses_the_random_streams_named_after_the_sensors():
     noises = SENSORS.noise(SENSORS.keys(7, 8), jnp.asarray(-5))
     for noise, name, size in zip(noises, ("attitude_noise", "rate_noise"), SIZES, strict=True):
         np.testing.assert_array_equal(noise, size * draws.normals(draws.stream(7, 8, name), 3, -5))
 
 
-def test_no_noise_measures_exactly():
+def test_zero_noise_measures_exactly():
     silent = sensors.Sensors(vector(0.0), vector(0.0))
     got = measure(silent, 3, jnp.arange(4), jnp.arange(4))
     np.testing.assert_array_equal(got.q, np.tile(STATE.q, (4, 1)))
     np.testing.assert_array_equal(got.w, np.tile(STATE.w, (4, 1)))
 
 
-def test_the_attitude_is_turned_about_body_axes():
+def test_attitude_noise_is_a_rotation_about_body_axes():
     turn, push = np.array([0.3, -0.1, 0.2]), np.array([1.0, 2.0, 3.0])
     memory = SENSORS.begin(0, 0, STATE, tick(0))._replace(noise=(vector(turn), vector(push)))
     got, _ = SENSORS.measure(memory, STATE, tick(0), vector(0.05))
@@ -125,8 +125,8 @@ def test_state_sensor_adds_independent_noise_of_the_stated_size_to_every_state()
     )
 
 
-def test_filter_propagates_a_turning_body():
-    """Two-sample coning: the error of a period is of fifth order in it."""
+def test_filter_propagates_a_rotating_body():
+    """With the two-sample coning correction the error of a period is of fifth order in its length."""
     found = attitude_filter.attitude_filter(0.2, 1e-5, 1e-6, 0.0, 0.05, 1)
     errors = []
     for steps in (8, 16, 32):
@@ -152,9 +152,9 @@ TRACKED = {"period": 0.25, "every": 4, "attitude_noise": 2e-5, "rate_noise": 2e-
 
 @pytest.fixture(scope="module")
 def filtered():
-    """A function (first sample, share of the steady state's error at the start, samples) -> (sample, error, 12 000).
+    """A function (first sample, factor of the steady-state error at the start, samples) -> (sample, error, 12 000).
 
-    Errors of attitude [rad] and bias [rad/s] per axis of 4 000 trials just after each sample of a body at rest.
+    The errors are those of attitude [rad] and bias [rad/s] just after each sample, for 4 000 trials of a body at rest.
     """
     period, every, noise, gyro, walk = (TRACKED[name] for name in list(TRACKED)[:5])
     found = attitude_filter.attitude_filter(TRACKED["bandwidth"], noise, gyro, walk, period, every)
@@ -180,9 +180,9 @@ def filtered():
 
 
 def steady():
-    """Covariance of a filter's errors just before each sample after the star tracker's, by iteration.
+    """Steady-state covariance of a filter's errors just before each control sample, by iteration.
 
-    Of attitude, bias and the gyro's noise at the sample, half of which the trapezium rule takes into each period.
+    The states are attitude, bias and the gyro noise at the sample, because each gyro sample acts in two periods.
     """
     h, every, noise, gyro, walk, bandwidth = TRACKED.values()
     k1, k2 = (float(v) for v in attitude_filter.filter_gains(vector(bandwidth), h * every))
@@ -192,25 +192,25 @@ def steady():
     drive = gyro**2 * np.outer(fresh, fresh) + walk**2 * h * np.outer(drift, drift)
     star = noise**2 * np.outer([k1, -k2, 0.0], [k1, -k2, 0.0])
     found, after = [np.zeros((3, 3))] * every, np.zeros((3, 3))
-    for k in range(1000 * every):  # e^-0.3 a star tracker sample: nothing is left of zero
+    for k in range(1000 * every):  # the initial zero decays by e^-0.3 per star tracker sample
         after = keep @ found[-1] @ keep.T + star if k % every == 0 else found[k % every - 1]
         found[k % every] = step @ after @ step.T + drive
     return np.array(found)[:, :2, :2], keep[:2, :2], star[:2, :2]
 
 
-def test_spread_of_the_filter_solves_lyapunovs_equation():
+def test_filter_spread_equals_the_iterated_covariance():
     found = np.asarray(attitude_filter.attitude_filter(**{k: TRACKED[k] for k in sorted(TRACKED)}).spread)
     covariance, keep, star = steady()
     np.testing.assert_allclose(found @ found.swapaxes(1, 2), covariance, rtol=1e-12)
     after = keep @ covariance[-1] @ keep.T + star
-    assert -0.79 < after[0, 1] / np.sqrt(after[0, 0] * after[1, 1]) < -0.65  # they are far from independent
+    assert -0.79 < after[0, 1] / np.sqrt(after[0, 0] * after[1, 1]) < -0.65  # they are correlated
 
 
 @pytest.mark.parametrize("first", [0, -4, 2, -1])
-def test_errors_of_the_filter_are_the_same_from_the_first_sample_on(first, filtered):
-    """Whether or not that is one of the star tracker; drawn independently, they would fall to 0.8 of their size."""
+def test_filter_errors_are_stationary_from_the_first_sample(first, filtered):
+    """The first sample may lack a star tracker reading. Uncorrelated initial errors would decrease by a fifth."""
     covariance, keep, star = steady()
-    sampling, smallest = SIGMAS / np.sqrt(12_000), np.inf  # of a correlation; of a size 1 / sqrt 2 of it
+    sampling, smallest = SIGMAS / np.sqrt(12_000), np.inf  # sampling error of a correlation
     for k, errors in enumerate(filtered(first, 1.0, 40), first):
         before = covariance[(k - 1) % 4]
         wanted = keep @ before @ keep.T + star if k % 4 == 0 else before
@@ -219,20 +219,20 @@ def test_errors_of_the_filter_are_the_same_from_the_first_sample_on(first, filte
         np.testing.assert_allclose(errors.std(axis=1) / size, 1.0, rtol=0, atol=sampling / np.sqrt(2.0), err_msg=str(k))
         found = np.corrcoef(errors)[0, 1]
         assert abs(found - wanted[0, 1] / size.prod()) < sampling
-    assert smallest < 0.6 * TRACKED["attitude_noise"]  # what the filter is for
+    assert smallest < 0.6 * TRACKED["attitude_noise"]  # the filter reduces the noise
 
 
-@pytest.mark.long  # its covariance: `test_spread_of_the_filter_solves_lyapunovs_equation`, and the test above
-def test_filter_comes_to_its_steady_state_from_far_away(filtered):
+@pytest.mark.long  # short tests: `test_filter_spread_equals_the_iterated_covariance`, and the test above
+def test_filter_converges_to_its_steady_state_from_large_errors(filtered):
     covariance, keep, star = steady()
     wanted = keep @ covariance[-1] @ keep.T + star
-    errors = filtered(0, 30.0, 401)[-1]  # after 100 s of a bandwidth of 0.15 rad/s: 30 (1 + 15) e^-15 is left
+    errors = filtered(0, 30.0, 401)[-1]  # the initial error decays to 30 (1 + 15) e^-15 in 100 s
     np.testing.assert_allclose(errors.std(axis=1), np.sqrt(np.diag(wanted)), rtol=SIGMAS / np.sqrt(24_000))
     correlation = wanted[0, 1] / np.sqrt(wanted[0, 0] * wanted[1, 1])
     assert abs(np.corrcoef(errors)[0, 1] - correlation) < SIGMAS / np.sqrt(12_000)
 
 
-def test_start_of_the_filter_does_not_jump_where_the_partial_first_period_vanishes():
+def test_filter_start_is_continuous_when_the_partial_first_period_vanishes():
     found = attitude_filter.attitude_filter(0.15, 2e-5, 2e-6, 1e-7, 0.25, 4)
     q, none, normals = STATE.q, vector([0.0] * 3), vector([1.0, -0.3, 0.2, 0.5, 0.1, -1.0])
     for k in range(-4, 1):
@@ -257,7 +257,7 @@ def test_filter_corrects_at_star_tracker_samples_only_and_by_their_weight():
     np.testing.assert_allclose(left(-3, 0.5), 1e-3 * (1 - 0.5 * float(k1)), rtol=1e-6)
 
 
-def test_filter_gains_put_both_poles_where_they_are_said_to_be():
+def test_filter_gains_place_both_poles_at_the_documented_value():
     k1, k2 = (float(v) for v in attitude_filter.filter_gains(vector(0.7), 0.4))
     matrix = np.array([[1 - k1, 0], [k2, 1]]) @ np.array([[1, -0.4], [0, 1]])
     poles = np.linalg.eigvals(matrix)
@@ -275,15 +275,15 @@ def test_bias_of_the_gyro_is_constant_and_has_its_size():
     np.testing.assert_allclose(both[:, 0].std(axis=0), 3e-5, rtol=SIGMAS / np.sqrt(2 * 4000))
 
 
-def test_density_becomes_a_sigma_a_sample():
-    """White noise of density N, averaged over T: its integral has the variance N^2 t, whatever T is."""
+def test_noise_density_gives_the_deviation_of_a_sample():
+    """The integral of white noise of density N over a time t has the variance N^2 t for every sample period."""
     for period in (0.01, 0.2):
         sigma = formulas.per_sample(1e-5, period)
         np.testing.assert_allclose(sigma * period * np.sqrt(100.0 / period), 1e-5 * np.sqrt(100.0), rtol=1e-12)
 
 
-def test_the_best_bandwidth_hangs_on_what_sensors_tell_in_a_time():
-    """A star tracker with twice the noise, or four times the interval, tells as much; a gyro's periods likewise."""
+def test_best_bandwidth_depends_on_the_information_per_time():
+    """Half the noise with four times the interval gives the same information, for star tracker and gyro."""
     best = formulas.best_bandwidth(2e-5, 1e-6, 0.1, 0.4)
     assert best == pytest.approx(1e-6 / 2e-5 / 2.0, rel=1e-12)
     for same in ((1e-5, 1e-6, 0.1, 1.6), (2e-5, 5e-7, 0.4, 0.4)):

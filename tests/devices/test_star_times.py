@@ -1,4 +1,4 @@
-"""A star tracker that samples by a clock of its own, beside what is computed by hand, sample for sample."""
+"""A star tracker with its own clock, compared with an independent computation for each sample."""
 
 import dataclasses
 import math
@@ -23,7 +23,7 @@ SIGMAS = 6.0
 
 
 def of(**hardware):
-    """The study of a short flight behind a filter, on the flight clock."""
+    """The study of a short scenario with an attitude filter, on the flight clock."""
     case_one = {"amplitude": [0.01] * 3, "frequency": [0.1] * 3}
     tables = flight(**FILTER, hardware=hardware, loop={"clock": "flight"}, disturbance=case_one)
     return scenario.study(scenario.from_tables({**tables, "dispersion": {}}))
@@ -39,31 +39,31 @@ def of(**hardware):
         (0.1 * math.pi, 0.1, [0.0, 0.1 * math.pi, 0.2 * math.pi, 0.3 * math.pi]),
     ],
 )
-def test_every_sample_is_told_once_at_the_control_sample_that_follows(interval, period, times):
+def test_every_star_tracker_sample_is_used_once_at_the_next_control_sample(interval, period, times):
     found = star_times.star_times(interval, period)
     samples = jnp.arange(0, 11)
     due, age = np.asarray(found.due(samples)), np.asarray(found.age(samples))
     told = samples[due]
     np.testing.assert_allclose(told * period - age[due], times, rtol=0, atol=1e-12)
     assert np.all(age[due] < period)
-    before = np.asarray(found.due(jnp.arange(-40, 0)))  # before the hand-over: as often
+    before = np.asarray(found.due(jnp.arange(-40, 0)))  # equally often before the hand-over
     assert abs(before.sum() - 40 * period / interval) <= 1.0
-    for first in (0, -18_000):  # half an hour, after which 32 bits know a time to a thousandth of a period
+    for first in (0, -18_000):  # half an hour, after which the resolution of 32 bits is a thousandth of a period
         due = found.due(jnp.arange(first, first + 18_000))
         with jax.enable_x64(False):
             short = star_times.StarTimes(vector(interval), vector(period), found.pattern)
             off = np.cumsum(short.due(jnp.arange(first, first + 18_000))) - np.cumsum(due)
-        # a sample early where times come to lie within the rounding
+        # rounding may shift a sample by one if times nearly coincide
         assert np.abs(off).max() <= (found.pattern[0] > 10)
 
 
 def by_hand(parts, flown):
-    """What the filter says at each sample (attitude as a rotation, bias), in plain NumPy and SciPy."""
+    """The filter's attitude (as a rotation) and bias at each sample, computed with NumPy and SciPy."""
     known = parts.sensors.filter
     k1, k2 = float(known.attitude_gain), float(known.bias_gain)
     said = [(Rotation.from_quat(flown.before["attitude"][0]), flown.before["bias"][0])]
     gyro = flown.inputs["rate"]
-    rates = np.concatenate([gyro[:1], gyro])  # of the sample before, at the first its own
+    rates = np.concatenate([gyro[:1], gyro])  # entry k: rate at the previous sample, for the first its own
     moments = np.concatenate([flown.t[:1], flown.t])
     for k in range(len(flown.t)):
         q, bias = said[-1]
@@ -86,14 +86,14 @@ def by_hand(parts, flown):
 
 @pytest.fixture(scope="module")
 def run():
-    """Parts of a flight at 10 Hz with a star tracker of 4 Hz, and its samples."""
+    """The parts of a scenario at 10 Hz with a star tracker at 4 Hz, and the samples of a run."""
     ready = of(star_tracker_period=0.25, rate_bias=1e-4)
     parts = dataclasses.replace(ready.parts, walk_rate=None)
     flown = vectors.fly_many(parts, ready.dispersion, jnp.uint32(3), jnp.arange(1, dtype=jnp.uint32))
     return parts, vectors.one(flown, 0)
 
 
-def test_the_filter_says_what_is_computed_by_hand(run):
+def test_filter_equals_the_independent_computation(run):
     parts, flown = run
     valid = flown.inputs["attitude_valid"] > 0.0
     assert np.flatnonzero(valid[:12]).tolist() == [0, 3, 5, 8, 10]
@@ -105,8 +105,8 @@ def test_the_filter_says_what_is_computed_by_hand(run):
         np.testing.assert_allclose(flown.after["bias"][k], bias, rtol=0, atol=1e-12)
 
 
-def test_it_sees_the_body_at_its_own_time(run):
-    """Its noise taken off: RK4 by hand from t = 0, under the torque held and the disturbance, to 0.25, 0.5, .. s."""
+def test_star_tracker_measures_the_attitude_at_its_own_sample_time(run):
+    """An independent RK4 integration gives the true attitude at 0.25, 0.5, .. s. The test subtracts the noise."""
     parts, flown = run
     inertia, steps = np.array([10.0, 12.0, 14.0]), parts.substeps
 
@@ -142,7 +142,7 @@ def test_it_sees_the_body_at_its_own_time(run):
     assert looked_at == 11  # 0.25 to 2.75 s
 
 
-def test_where_the_ratio_is_whole_nothing_changes():
+def test_an_integer_ratio_gives_the_same_parts_as_star_tracker_every():
     one, other = of(star_tracker_period=0.5).parts, of(star_tracker_every=5).parts
     assert jax.tree.structure(one) == jax.tree.structure(other)
     jax.tree.map(np.testing.assert_array_equal, one, other)
@@ -152,15 +152,15 @@ NOISES = {"bandwidth": 0.15, "attitude_noise": 2e-5, "rate_noise": 2e-6, "bias_w
 
 
 @pytest.mark.parametrize("every", [1, 4])
-def test_the_filter_of_a_whole_ratio_is_the_one_that_goes_with_the_loop(every):
+def test_filter_between_equals_attitude_filter_for_an_integer_ratio(every):
     found = star_times.filter_between(*NOISES.values(), interval=0.25 * every, repeating=(every, 1))
     known = attitude_filter.attitude_filter(*NOISES.values(), every)
     for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(known), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-20)
 
 
-def test_errors_of_the_filter_are_those_of_its_steady_state_from_the_first_sample_on():
-    """Of 4 000 trials of a body at rest, per axis, five periods and two of its samples long; and later on."""
+def test_filter_errors_have_the_steady_state_covariance_from_the_first_sample():
+    """4 000 trials of a body at rest. The sample times repeat after five periods with two star tracker samples."""
     times = star_times.star_times(0.625, 0.25)
     found = star_times.filter_between(*NOISES.values(), times.interval, times.pattern)
     walk = NOISES["bias_walk"] / np.sqrt(NOISES["period"])
@@ -184,7 +184,7 @@ def test_errors_of_the_filter_are_those_of_its_steady_state_from_the_first_sampl
 
     got = np.asarray(errors(jnp.arange(4000, dtype=jnp.uint32))).transpose(1, 2, 0, 3).reshape(40, 2, -1)
     spread = np.asarray(found.spread)
-    covariance = spread @ spread.swapaxes(1, 2)  # of what is propagated to a sample, the star tracker's left out
+    covariance = spread @ spread.swapaxes(1, 2)  # covariance at a control sample before the star tracker correction
     for k, sample in enumerate(got):
         wanted = covariance[(k - 1) % 5]
         size = np.sqrt(np.diag(wanted))
@@ -194,8 +194,8 @@ def test_errors_of_the_filter_are_those_of_its_steady_state_from_the_first_sampl
         assert abs(np.corrcoef(sample)[0, 1] - wanted[0, 1] / size.prod()) < SIGMAS / np.sqrt(12_000)
 
 
-def test_in_an_outage_a_period_is_what_the_gyro_says_of_it(run):
-    """In one piece, as the exported C has it: in two, split where the lost sample was, its coning differs."""
+def test_in_an_outage_the_filter_propagates_the_whole_period_at_once(run):
+    """Exported C does the same. A split at the lost sample would change the coning correction."""
     parts, _ = run
     seen = dataclasses.replace(parts.sensors, outage=vector([0.0, 9.0]))
     x = rigid_body.AttitudeState(vector([0.0, 0.0, 0.0, 1.0]), vector([0.3, -0.2, 0.1]))
@@ -207,8 +207,8 @@ def test_in_an_outage_a_period_is_what_the_gyro_says_of_it(run):
     np.testing.assert_allclose(found.q, alone.q, rtol=0, atol=1e-15)
 
 
-def test_an_outage_loses_the_samples_that_were_taken_in_it_whenever_they_are_used():
-    """The sample of 0.25 s is used at 0.3 s."""
+def test_an_outage_removes_the_samples_taken_during_it():
+    """The time of the measurement, 0.25 s, counts, and not the time of its use, 0.3 s."""
     own = of(star_tracker_period=0.25).parts.sensors
     now = Ticks(vector(0.3), vector(0.4), jnp.asarray(False), jnp.int32(3), vector(1.0), jnp.asarray(False))
     for outage, weight in (([0.2, 0.27], 0.0), ([0.28, 0.4], 1.0)):
@@ -217,13 +217,13 @@ def test_an_outage_loses_the_samples_that_were_taken_in_it_whenever_they_are_use
 
 @pytest.fixture(scope="module")
 def anchored():
-    """Such parts on the anchored clock."""
+    """The parts of a scenario with such a star tracker on the anchored clock."""
     tables = {**flight(**FILTER, hardware={"star_tracker_period": 0.25}), "dispersion": {}}
     return scenario.study(scenario.from_tables(tables)).parts
 
 
-@pytest.mark.long  # what it is made of: `test_the_filter_of_a_whole_ratio..`, `tests/theory/test_floor.py`
-def test_the_floor_lies_between_those_of_the_whole_ratios(anchored):
+@pytest.mark.long  # short tests: `test_filter_between_equals_attitude_filter..`, `tests/theory/test_floor.py`
+def test_lower_bound_is_between_those_of_neighbouring_integer_ratios(anchored):
     parts, log = anchored, fly(anchored, 3).log
     floors = [error_floor.along(parts, log).window_error]
     bandwidth = parts.sensors.bandwidth(0.1)
@@ -233,8 +233,8 @@ def test_the_floor_lies_between_those_of_the_whole_ratios(anchored):
     assert floors[1] < floors[0] < floors[2]
 
 
-def test_a_run_does_not_jump_where_the_partial_first_period_vanishes(anchored):
-    """With a hand-over a little before and after a whole number of periods from t = 0."""
+def test_metrics_are_continuous_when_the_partial_first_period_vanishes(anchored):
+    """The hand-over is slightly before, at and slightly after a whole number of periods from t = 0."""
     found = []
     for off in (1e-7, 0.0, -1e-7):
         law = dataclasses.replace(anchored.controller, delta=vector(0.5 + off))
@@ -244,8 +244,8 @@ def test_a_run_does_not_jump_where_the_partial_first_period_vanishes(anchored):
     np.testing.assert_allclose(found[2], found[1], rtol=1e-4)
 
 
-def test_linear_theory_has_a_star_tracker_at_every_sample_that_tells_as_much():
-    """Its corrections add up to the same share in an interval, and so do the squares of what noise makes of them."""
+def test_in_step_gives_the_same_correction_and_noise_per_interval():
+    """The sum of the corrections in an interval is the same, and so is the sum of their noise variances."""
     own = of(star_tracker_period=0.25).parts.sensors
     often, share = own.in_step(), 0.1 / 0.25
     assert often.own_times is None
@@ -258,7 +258,7 @@ def test_linear_theory_has_a_star_tracker_at_every_sample_that_tells_as_much():
     assert whole.in_step() is whole
 
 
-def test_a_constant_bias_of_the_gyro_has_no_effect_behind_the_filter():
-    """The filter starts in its steady state: its error of the bias is the same, whatever the bias is."""
+def test_a_constant_gyro_bias_has_no_effect_with_the_filter():
+    """The filter starts in its steady state, so that the error of its bias estimate does not depend on the bias."""
     without, with_bias = (runs.fly(of(star_tracker_period=0.25, **bias), 3, 2) for bias in ({}, {"rate_bias": 1e-3}))
     np.testing.assert_allclose(with_bias.metrics["window_error"], without.metrics["window_error"], rtol=1e-6)

@@ -32,7 +32,7 @@ typedef double real;
 
 
 def body(function, *args):
-    """The statements of a function of arrays in C, and its printer."""
+    """The C statements of a function of arrays, and the printer that wrote them."""
     closed = jax.make_jaxpr(function)(*args)
     pool, given, at = Pool(), [], 0
     for arg in args:
@@ -49,7 +49,7 @@ def body(function, *args):
 
 
 def source(function, *args):
-    """A program of C that computes it."""
+    """The text of a C program that computes a function."""
     lines, _ = body(function, *args)
     text = "\n".join(lines)
     helpers = "\n".join(code for name, code in templates.HELPERS.items() if f"{name}(" in text)
@@ -58,7 +58,7 @@ def source(function, *args):
 
 
 def library(folder, text, *options):
-    """A shared library of a program."""
+    """A shared library, compiled from the text of a C program."""
     path = folder / "run.c"
     path.write_text(text)
     flags = [*STRICT, "-O1", "-shared", "-fPIC", *options, str(path), "-o", str(folder / "run.so"), "-lm"]
@@ -68,7 +68,7 @@ def library(folder, text, *options):
 
 
 def both(folder, function, *args):
-    """Outputs of a function in C and in JAX, flat."""
+    """Outputs of a function in C and in JAX, as flat arrays."""
     expected = np.concatenate(
         [np.ravel(np.asarray(v, dtype=float)) for v in jax.tree.leaves(function(*map(jnp.asarray, args)))]
     )
@@ -80,7 +80,7 @@ def both(folder, function, *args):
 
 
 def program(name, place):
-    """Writes a flight's controller, without vectors."""
+    """Write the controller of a scenario in FLIGHTS, without test vectors."""
     made = folder.Controller(scenario.reading.complete(scenario.from_tables(FLIGHTS[name])), "flight", name)
     store.write(place, lambda making: folder.write_program(making, made))
     return made

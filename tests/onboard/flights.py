@@ -1,4 +1,4 @@
-"""Scenarios whose flight computers are written in C: one of each kind of what it may consist of."""
+"""Scenarios for the export to C, which together contain every kind of law, observer, sensor and actuator."""
 
 from typing import Any
 
@@ -7,7 +7,7 @@ from tests.tree import ROOT
 
 LOOP = {"mode": "sampled", "period": 0.1, "t_end": 6.5}
 LAW = {"t_f": 5.0, "delta": 0.5}
-BETWEEN = {"t_f": 5.3, "delta": 0.6}  # single precision puts the hand-over behind its sample
+BETWEEN = {"t_f": 5.3, "delta": 0.6}  # in single precision the hand-over is after its sample
 NOISE = {"attitude_noise": 2e-5, "rate_noise": 1e-6}
 SPREAD = {"attitude": {"kind": "axis_angle", "min_deg": 20.0, "max_deg": 90.0}}
 MISFITS = {**SPREAD, "actuator_scale": {"kind": "relative_uniform", "half_width": 0.05},
@@ -18,7 +18,7 @@ PENDULUM = f"{ROOT / 'scenarios' / 'two_link_arm.py'}:arm"
 
 
 def flight(**tables: Any) -> dict[str, Any]:
-    """A short flight on raw samples, with these tables."""
+    """Tables of a short scenario without filter, changed by these tables."""
     found: dict[str, Any] = {"loop": LOOP, "controller": LAW, "hardware": NOISE, "dispersion": SPREAD}
     for name, table in tables.items():
         found[name] = {**found.get(name, {}), **table} if isinstance(table, dict) and name != "observer" else table
@@ -42,7 +42,7 @@ FLIGHTS: dict[str, dict[str, Any]] = {
     "own law": flight(controller={"kind": "own", "code": OWN + "Scaling", "delta": 1.0},
                       observer={"kind": "own", "code": OWN + "LowPass"},
                       reference={"kind": "own", "code": OWN + "Nodding", "angle": 0.1}),
-    # more of each kind
+    # further variants
     "no observer": flight(observer={"kind": "none"}, controller={"sign_width": 0.0}),
     "finite time observer": flight(observer={"kind": "finite_time", "gain": [0.1, 0.1, 0.1]}),
     "prescribed time observer": flight(observer={"kind": "prescribed_time", "t_o": 2.0}),
@@ -50,7 +50,7 @@ FLIGHTS: dict[str, dict[str, Any]] = {
     "chain of order 4": {**CHAIN, "plant": {"kind": "chain", "order": 4, "x0": [1.0, 0.0, 0.0, 0.0]},
                          "hardware": {}, "dispersion": {}, "controller": {"t_f": 5.0, "delta": 1.0}},
     "implicit chain": {**CHAIN, "controller": {**BETWEEN, "sampling": "implicit"}},
-    # stated gains: the designed ones would keep the torque below its limit
+    # explicit gains, because designed gains would keep the torque below its limit
     "delay, limit, quantised": flight(
         hardware={"delay": 2, "torque_limit": 3.0, "torque_step": 1e-3}, observer={"gain": [10.0] * 3},
         controller={"delta": 1.0, "eta": 3.0, "k1": 1.0, "surface_rate": 1.0, "sign_width": 1e-3}),
@@ -72,7 +72,7 @@ FLIGHTS: dict[str, dict[str, Any]] = {
                               "duration": 4.0}),
     **{kind: {**flight(), "controller": {"kind": kind, "t_f": 5.0}} for kind in
        BASELINES},
-    # from farther it turns by more than 1 rad in a period, which the C refuses
+    # for larger angles the body turns by more than 1 rad in a period, which the C rejects
     "predefined_time": {**flight(), "controller": {"kind": "predefined_time", "t_f": 5.0},
                         "dispersion": {"attitude": {"kind": "axis_angle", "min_deg": 5.0, "max_deg": 15.0}}},
     "system": {"plant": {"kind": "system", "system": PENDULUM, "x0": [1.0, -0.5, 0.0, 0.0]}, "loop": LOOP,

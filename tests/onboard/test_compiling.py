@@ -1,4 +1,4 @@
-"""A controller's folder is compiled, or refused in one sentence."""
+"""Compilation of a controller's folder, and the error messages if it fails."""
 
 import json
 import re
@@ -25,13 +25,13 @@ def chain(tmp_path_factory):
 
 
 def parts(name, **loop):
-    """Those of a flight, with such a loop."""
+    """The parts of a scenario in FLIGHTS, with changes of its loop table."""
     tables = {**FLIGHTS[name], "loop": {**FLIGHTS[name]["loop"], **loop}}
     return scenario.study(folder.flown(scenario.reading.complete(scenario.from_tables(tables)))).parts
 
 
 @needs_compiler
-def test_what_is_no_controller_is_refused(chain, tmp_path):
+def test_an_invalid_controller_raises_an_error(chain, tmp_path):
     with pytest.raises(ScenarioError, match=r"^the controller is .*nothing, but must be a folder that ptsmc export"):
         Library(tmp_path / "nothing")
     library = Library(chain)
@@ -46,12 +46,12 @@ def test_what_is_no_controller_is_refused(chain, tmp_path):
 
 
 @needs_compiler
-def test_what_flies_is_what_a_campaign_keeps_and_knows_of_a_folder(chain, tmp_path):
-    """A header elsewhere flew, changed or not in the same campaign, and its replay did not compile."""
+def test_compiled_files_are_those_that_a_campaign_copies_and_checks(chain, tmp_path):
+    """A header in another folder would not be part of the campaign's copy and checksum."""
     changed = shutil.copytree(chain, tmp_path / "changed")
     code = changed / "ptsmc_flight.c"
     code.write_text('#include "board.h"\n' + code.read_text())
-    (changed / ".#ptsmc_flight.c").symlink_to("somebody@elsewhere:1")  # an editor's, of nothing
+    (changed / ".#ptsmc_flight.c").symlink_to("somebody@elsewhere:1")  # lock file of an editor, a dangling link
     (changed / "board.h").touch()
     Library(changed)
     before = sources.digest(changed)
@@ -67,8 +67,8 @@ def test_what_flies_is_what_a_campaign_keeps_and_knows_of_a_folder(chain, tmp_pa
 
 
 @needs_compiler
-def test_a_second_file_flies_where_it_is_included_and_is_asked_for_where_not(chain, tmp_path):
-    """It was said that the compiler must be one for this machine."""
+def test_a_second_c_file_must_be_included(chain, tmp_path):
+    """Otherwise the error message names the undefined symbol."""
     changed = shutil.copytree(chain, tmp_path / "changed")
     code = changed / "ptsmc_flight.c"
     (changed / "mine.c").write_text("double mine(double x) { return 2.0 * x; }\n")
@@ -82,8 +82,8 @@ def test_a_second_file_flies_where_it_is_included_and_is_asked_for_where_not(cha
 
 
 @needs_compiler
-def test_a_folder_of_two_controllers_is_none(chain, tmp_path):
-    """C wrote beyond the rows of a controller.json that was not its own; numbers for a name ended in a traceback."""
+def test_a_folder_with_the_layout_of_another_controller_raises_an_error(chain, tmp_path):
+    """C would write beyond the rows of another layout. Values of a wrong type must not end in a traceback."""
     shutil.copytree(chain, tmp_path / "other")
     layout = json.loads((chain / "controller.json").read_text())
     fewer = {**layout["columns"], "state": layout["columns"]["state"][1:]}
@@ -94,8 +94,8 @@ def test_a_folder_of_two_controllers_is_none(chain, tmp_path):
 
 
 @needs_compiler
-def test_cc_may_have_options_and_be_a_compiler_for_this_machine_only(chain, monkeypatch, tmp_path):
-    """XLA's headers have what -pedantic warns of; what cannot be loaded ended in a traceback."""
+def test_cc_may_have_options_and_must_compile_for_this_machine(chain, monkeypatch, tmp_path):
+    """Warnings of -pedantic in XLA's headers must not stop the compilation."""
     monkeypatch.chdir(tmp_path)
     shutil.copytree(chain, "-c")
     monkeypatch.setenv("CC", f"{CC} -pedantic -Wall -Wextra -Werror")
@@ -109,7 +109,7 @@ def test_cc_may_have_options_and_be_a_compiler_for_this_machine_only(chain, monk
 
 @needs_compiler
 def test_a_period_read_with_32_bits_is_the_same(chain):
-    """It was refused: 0.1 s, but must be 0.1 s."""
+    """The comparison of periods allows for the rounding of 32 bits."""
     library = Library(chain)
     with jax.enable_x64(False):
         known = parts("chain")
@@ -127,8 +127,8 @@ compilers = pytest.mark.parametrize("compiler", [name for name in ("gcc", "clang
 
 @compilers
 @pytest.mark.parametrize("option", ["-ffast-math", "-Ofast", "-ffinite-math-only"])
-def test_code_that_needs_nan_does_not_compile_without_it(chain, compiler, option):
-    """A NaN at an input would pass every check: status 0, and an estimate that stays NaN."""
+def test_code_does_not_compile_with_options_that_disable_nan(chain, compiler, option):
+    """With such options a NaN input would pass all checks, with status 0 and an estimate that remains NaN."""
     done = compiled(compiler, option, "-fsyntax-only", chain / "ptsmc_flight.c")
     assert done.returncode != 0
     assert "compile without -ffast-math" in done.stderr
@@ -178,6 +178,6 @@ def test_files_of_different_precision_do_not_link(chain, tmp_path, compiler, rea
 
 @needs_compiler
 @pytest.mark.parametrize("name", ["in", "init", "state", "parameters"])
-def test_a_controller_may_be_named_like_a_part_of_it(tmp_path, name):
+def test_a_controller_may_have_the_name_of_one_of_its_symbols(tmp_path, name):
     folder.export(scenario.from_tables(FLIGHTS["chain"]), tmp_path / "out", name=name, trials=1)
     assert Library(tmp_path / "out").name == name

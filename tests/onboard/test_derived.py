@@ -1,4 +1,4 @@
-"""Other parameters in the struct, without another export, fly what the library flies with them."""
+"""Changed parameters in the C struct, without another export, give the commands of the library."""
 
 import subprocess
 from dataclasses import replace
@@ -22,7 +22,7 @@ from tests.onboard.flights import FILTER, FLIGHTS, FULL, flight
 
 OTHER = np.diag([8.0, 13.0, 12.0]) + np.array([[0.0, 0.4, 0.3], [0.4, 0.0, -0.5], [0.3, -0.5, 0.0]])
 
-# of a scenario's key: the parameter of the C that it is, and another value
+# for each key of a scenario: the name of the parameter in C, and another value
 PAPERS = {
     "spacecraft__inertia": ("inertia", OTHER),
     "controller__t_f": ("law_t_f", 4.6),
@@ -38,7 +38,7 @@ PAPERS = {
 }
 FILTERS = {"filter__bandwidth": ("filter_bandwidth", 0.13)}
 AXES = np.array([[0.6, 0.0, 0.8], [-0.6, 0.0, 0.8], [0.0, 0.6, 0.8], [0.0, -1.0, 0.0]])  # unit vectors
-GAIN = {"gain": [10.0, 10.0, 10.0]}  # whose default follows from the inertia
+GAIN = {"gain": [10.0, 10.0, 10.0]}  # explicit, because the default depends on the inertia
 FLOWN = {
     "raw": (flight(observer=GAIN), PAPERS),
     "filter": (flight(observer=GAIN, **FILTER), PAPERS | FILTERS),
@@ -72,10 +72,10 @@ FLOWN = {
 
 
 def off(known, library):
-    """Largest difference of a command by C from one by the library, of the largest one; two trials."""
+    """Largest difference of the commands of C and of the library, relative to the largest command, in two trials."""
     ready = scenario.study(folder.flown(known))
     computer, trials = board(ready.parts), jnp.arange(2, dtype=jnp.uint32)
-    parts = replace(ready.parts, substeps=10)  # as many for all gains, which one program then flies
+    parts = replace(ready.parts, substeps=10)  # equal for all gains, to share one compiled program
     flown = vectors.fly_many(parts, vectors.known_alike(ready.dispersion), jnp.uint32(0), trials)
     flown = jax.tree.map(np.asarray, flown)
     at, worst = library.columns["out"].index("command[0]"), 0.0
@@ -93,7 +93,7 @@ def off(known, library):
 
 
 def put(library, name, value):
-    """Sets a parameter."""
+    """Set a parameter of the compiled controller."""
     columns = library.columns["params"]
     at = [k for k, column in enumerate(columns) if column.partition("[")[0] == name]
     assert at, (name, columns)
@@ -101,7 +101,7 @@ def put(library, name, value):
 
 
 def exported(tables, place):
-    """A complete scenario, and its controller compiled."""
+    """A complete scenario, and its compiled controller."""
     known = scenario.reading.complete(scenario.from_tables(tables))
     made = folder.Controller(known, "flight", "flight")
     store.write(place, lambda making: folder.write_program(making, made))
@@ -117,8 +117,8 @@ def changed(known, changes):
 
 @needs_compiler
 @pytest.mark.parametrize("name", short(list(FLOWN), ["wheels"]))
-def test_changed_parameters_fly_what_the_library_flies_with_them(name, tmp_path):
-    """Rounding leaves 1e-16 of the largest command, behind the filter 1e-14; 1e-12 is what is promised."""
+def test_changed_parameters_give_the_commands_of_the_library(name, tmp_path):
+    """Rounding is 1e-16 of the largest command, or 1e-14 with a filter. The documented accuracy is 1e-12."""
     tables, changes = FLOWN[name]
     known, library = exported(tables, tmp_path / "controller")
     assert off(known, library) < 1e-12
@@ -131,7 +131,7 @@ def test_changed_parameters_fly_what_the_library_flies_with_them(name, tmp_path)
 @needs_compiler
 @pytest.mark.long
 @pytest.mark.parametrize("name", list(FLOWN))
-def test_each_parameter_alone(name, tmp_path):
+def test_each_changed_parameter_alone_gives_the_commands_of_the_library(name, tmp_path):
     tables, changes = FLOWN[name]
     known, library = exported(tables, tmp_path / "controller")
     first = library.parameters.copy()
@@ -193,17 +193,17 @@ def test_parameters_may_change_between_samples(tmp_path):
 
 
 class Steepest(LowPass):
-    """A K2 that C has no rule for."""
+    """An observer whose K2 needs an operation without a counterpart in C."""
 
     def error_bound(self):
         return ErrorBound(*[self.disturbance_bound * jnp.linalg.eigvalsh(self.model.inertia)[-1]] * 3)
 
 
-def test_what_c_cannot_derive_stays_a_parameter_and_is_said():
+def test_a_value_that_c_cannot_derive_is_a_parameter_and_the_readme_reports_it():
     tables = {**FLIGHTS["raw"], "observer": {"kind": "own", "code": f"{__file__}:Steepest"}}
     made = folder.Controller(scenario.reading.complete(scenario.from_tables(tables)), "flight", "flight")
     names = [field.name for field in made.code.parameters]
-    assert [name for name in made.code.fixed if name in names] == ["bound_rate"]  # one number, three times
+    assert [name for name in made.code.fixed if name in names] == ["bound_rate"]  # three fields with the same number
     assert {"inertia", "observer_disturbance_bound"} == set(made.code.follows["bound_rate"])
     assert [field.name for field in made.code.derived] == ["inertia_inverse"]
     said = readme(made.code, made.about)

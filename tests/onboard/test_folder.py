@@ -1,4 +1,4 @@
-"""A controller's folder: it compiles without a warning, replays what the simulator flew, and refuses what it must."""
+"""The folder of a controller: it compiles without warnings, replays the simulation, and rejects invalid input."""
 
 import csv
 import os
@@ -29,30 +29,30 @@ from tests.onboard.flights import FILTER, FLIGHTS, flight
 
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
-    """The folder of a short flight on raw samples."""
+    """The exported folder of a short scenario without filter."""
     place = tmp_path_factory.mktemp("short")
     (place / "short.toml").write_text(SHORT)
     return folder.export(place / "short.toml", place / "controller", trials=2)
 
 
-QUICK = "CFLAGS=-O0"  # of what is built as it is built elsewhere
+QUICK = "CFLAGS=-O0"  # for builds that another test compiles with optimisation
 
 
 def make(place, *args):
     own = {name: value for name, value in os.environ.items() if name not in ("MAKEFLAGS", "MFLAGS", "MAKELEVEL")}
-    called = ["make", "-B", f"CC={CC}", *args]  # as by hand: these tests may run under another make
+    called = ["make", "-B", f"CC={CC}", *args]  # without variables of an outer make that may run these tests
     return subprocess.run(called, cwd=place, env=own, capture_output=True, text=True, check=False)
 
 
 @needs_compiler
 @pytest.mark.skipif(shutil.which("make") is None, reason="this machine has no make")
 @pytest.mark.parametrize("real", ["double", "float"])
-def test_it_compiles_without_a_warning_and_replays_the_simulator(exported, tmp_path, real):
+def test_exported_c_compiles_without_warnings_and_replays_the_simulation(exported, tmp_path, real):
     place = shutil.copytree(exported, tmp_path / "controller")
     done = make(place, "check", f"REAL={real}")
     assert done.returncode == 0, done.stdout + done.stderr
     assert "130 samples; other status: 0" in done.stdout
-    # another gain is another flight
+    # another gain gives other commands
     (parameters,) = place.glob("*_parameters.c")
     text = parameters.read_text()
     assert "R(3), /* law_eta */" in text
@@ -63,8 +63,8 @@ def test_it_compiles_without_a_warning_and_replays_the_simulator(exported, tmp_p
 
 
 @needs_compiler
-def test_it_compiles_in_the_compiler_s_own_language_too(exported):
-    """With the names of a C library beside those of C99: `finite` is one, and stopped gcc without -std=c99."""
+def test_exported_c_compiles_with_the_compilers_default_language(exported):
+    """Without -std=c99 the C library declares further names such as `finite`, which must not conflict."""
     sources = [str(place) for place in sorted(exported.glob("*.c"))]
     called = [*compiler(), "-fsyntax-only", "-Wall", "-Wextra", "-Werror", *sources]
     done = subprocess.run(called, capture_output=True, text=True, check=False)
@@ -75,7 +75,7 @@ EVERY = [(plant, kind) for plant, laws in LAWS.items() for kind in laws if kind 
 
 
 def of_law(plant, kind):
-    """A short flight under this law, every default of its own."""
+    """A short scenario with this law and its default gains."""
     gains = {"delta": 0.5} if kind == "prescribed_time" else {}
     tables = {"spacecraft": FLIGHTS["raw"], "chain": FLIGHTS["chain"], "system": FLIGHTS["system"]}[plant]
     return {**tables, "controller": {"kind": kind, "t_f": 5.0, **gains}}
@@ -83,9 +83,9 @@ def of_law(plant, kind):
 
 @needs_compiler
 @pytest.mark.skipif(shutil.which("make") is None, reason="this machine has no make")
-@pytest.mark.long  # laws with memories: `Odd` below; the paper's, and of one's own: `test_library.py`
+@pytest.mark.long  # short tests: `Odd` below (memories), and `test_library.py` (published and custom laws)
 @pytest.mark.parametrize(("plant", "kind"), EVERY)
-def test_every_law_of_the_registry_replays_the_simulator(plant, kind, tmp_path):
+def test_every_registered_law_replays_the_simulation(plant, kind, tmp_path):
     made = scenario.reading.complete(scenario.from_tables(of_law(plant, kind)))
     place = folder.export(made, tmp_path / "controller", name="law", trials=1)
     done = make(place, "check")
@@ -114,14 +114,14 @@ class Named(ptsmc.AccelerationLaw):
     k: float = ptsmc.gain(1.0, (0.1, 10.0), meaning="of v, */ and of /* v", unit="1/s^2")
 
     def __call__(self, now: Any, x: Any, target: Any, d_hat: Any, k2: Any) -> Any:
-        """What the function has as a pointer, and what it is given by it: the inverse of the inertia."""
+        """Use a variable `d`, the name of a pointer in the C, and the inverse inertia, which that pointer provides."""
         d = jnp.sum(x.w * x.w)
         damped = self.model.inertia_inverse @ (-self.k * x.q[:3] - 2.0 * x.w) / (1.0 + d)
         return self.model.inertia @ self.model.inertia @ damped * (1.0 + d), x.w, now.memory
 
 
 def of_own(law):
-    """A short flight under a law of one's own, to a reference that moves."""
+    """A short scenario with a custom law and a moving reference."""
     moving = {"kind": "spin", "rate": [0.01, 0.02, -0.01]}
     flown = {**FLIGHTS["raw"], "reference": moving, "controller": {"kind": "own", "code": law, "t_f": 5.0}}
     return scenario.reading.complete(scenario.from_tables(flown))
@@ -130,8 +130,8 @@ def of_own(law):
 @needs_compiler
 @pytest.mark.skipif(shutil.which("make") is None, reason="this machine has no make")
 @pytest.mark.parametrize("law", short([Odd, Named], [Odd]))
-def test_memories_names_and_words_of_any_kind_are_written(law, tmp_path):
-    """C did not compile, or was not written at all."""
+def test_export_supports_unusual_memories_and_names(law, tmp_path):
+    """The memories contain integers, empty arrays and names that are not identifiers in C."""
     done = make(folder.export(of_own(law), tmp_path / "controller", name="law", trials=1), "check")
     assert done.returncode == 0, done.stdout + done.stderr
     assert "other status: 0" in done.stdout
@@ -139,7 +139,7 @@ def test_memories_names_and_words_of_any_kind_are_written(law, tmp_path):
 
 @needs_compiler
 @pytest.mark.parametrize("law", [Named])
-def test_names_and_words_of_c_compile(law, tmp_path):
+def test_names_and_comment_marks_of_c_in_a_law_compile(law, tmp_path):
     folder.write_program(tmp_path, folder.Controller(of_own(law), "law", "a scenario"))
     called = [*compiler(), *STRICT, "-fsyntax-only", *map(str, sorted(tmp_path.glob("*.c")))]
     done = subprocess.run(called, capture_output=True, text=True, check=False)
@@ -147,7 +147,7 @@ def test_names_and_words_of_c_compile(law, tmp_path):
 
 
 class Tabled(ptsmc.AccelerationLaw):
-    """PD with a loop through a table, which fills another one."""
+    """PD with a loop that reads a table and fills another table."""
 
     def acceleration(self, now: Any, error: Any, error_rate: Any, bound: Any) -> Any:
         """With 600 and 900 numbers."""
@@ -157,8 +157,8 @@ class Tabled(ptsmc.AccelerationLaw):
 
 
 @pytest.mark.skipif(shutil.which("make") is None or shutil.which("gcc") is None, reason="this machine has no gcc")
-def test_the_stack_that_is_stated_has_the_tables_of_loops(tmp_path):
-    """2 800 bytes were stated, where gcc counts 12 632."""
+def test_documented_stack_size_includes_the_tables_of_loops(tmp_path):
+    """The README must not state less than the 12 632 bytes that gcc reports."""
     folder.write_program(tmp_path, folder.Controller(of_own(Tabled), "law", "a scenario"))
     (stated,) = re.findall(r"At most (\d+) bytes of stack", (tmp_path / "README.md").read_text())
     counted = dict(re.findall(r":(\w+)\t(\d+)", make(tmp_path, "stack").stdout))
@@ -166,22 +166,22 @@ def test_the_stack_that_is_stated_has_the_tables_of_loops(tmp_path):
 
 
 class Halving(ptsmc.AccelerationLaw):
-    """PD, its command halved until it is small."""
+    """PD with a command that is halved until it is small."""
 
     def acceleration(self, now: Any, error: Any, error_rate: Any, bound: Any) -> Any:
-        """Of as many passes as it takes."""
+        """Use a loop with an unknown number of passes."""
         start = -error - 2.0 * error_rate
         return jax.lax.while_loop(lambda a: jnp.max(jnp.abs(a)) > 1.0, lambda a: 0.5 * a, start), error
 
 
 @pytest.mark.parametrize(("law", "said"), [(Halving, True), (Odd, False)])
-def test_operations_of_loops_whose_passes_are_not_known_are_those_of_one(law, said, tmp_path):
+def test_readme_reports_loops_with_an_unknown_number_of_passes(law, said, tmp_path):
     folder.write_program(tmp_path, folder.Controller(of_own(law), "law", "a scenario"))
     assert ("one pass of each loop whose passes are not known" in (tmp_path / "README.md").read_text()) == said
 
 
 class Unsigned(Odd):
-    """With numbers that C has no kind for."""
+    """A law with numbers of a type that C does not have here."""
 
     def begin(self) -> Any:
         """The memory [-]."""
@@ -193,7 +193,7 @@ class Unsigned(Odd):
 
 
 class Lost(ptsmc.AccelerationLaw):
-    """Ends in no number."""
+    """A law whose command becomes NaN."""
 
     def acceleration(self, now: Any, error: Any, error_rate: Any, bound: Any) -> Any:
         """NaN behind 2 s."""
@@ -207,18 +207,18 @@ class Lost(ptsmc.AccelerationLaw):
         (Lost, "^none of the first 1 trials stays finite and away from the law's singularity"),
     ],
 )
-def test_what_cannot_be_written_or_checked_is_said(tmp_path, law, said):
+def test_export_raises_an_error_for_unsupported_or_diverging_laws(tmp_path, law, said):
     flown = {**FLIGHTS["chain"], "controller": {"kind": "own", "code": law, "t_f": 5.0}}
     made = scenario.reading.complete(scenario.from_tables(flown))
     with pytest.raises(ScenarioError, match=said):
         folder.export(made, tmp_path / "controller", name="law", trials=1)
 
 
-@pytest.mark.long  # what is allowed for it: `test_what_rounding_may_leave_is_reckoned_to_the_last_sample..`
+@pytest.mark.long  # short test of the tolerance: `test_rounding_tolerance_uses_the_gain_growth..`
 @needs_compiler
 @pytest.mark.skipif(shutil.which("make") is None, reason="this machine has no make")
-def test_a_slew_of_a_third_of_a_degree_replays_too(tmp_path):
-    """Its torque is small and its gains grow by 160 000: C was off by 4e-8 of it, and 1e-10 was allowed."""
+def test_a_slew_of_a_third_of_a_degree_replays_the_simulation(tmp_path):
+    """The torque is small and the gains grow by 160 000, so that rounding errors of 4e-8 must be allowed."""
     tables = {
         "spacecraft": {"inertia": [3200.0, 4500.0, 2600.0]},
         "initial": {"rotvec_deg": [20.1, 30.3, 40.0]}, "reference": {"rotvec_deg": [20.0, 30.0, 40.0]},
@@ -234,8 +234,8 @@ def test_a_slew_of_a_third_of_a_degree_replays_too(tmp_path):
 
 @needs_compiler
 @pytest.mark.skipif(shutil.which("make") is None, reason="this machine has no make")
-def test_each_sample_begins_where_the_simulator_was(exported, tmp_path):
-    """And not where C was, whose rounding would add up: from a state of another time the next sample is bad input."""
+def test_check_starts_each_sample_from_the_simulated_state(exported, tmp_path):
+    """Rounding errors thus do not accumulate. With a state of another time the next sample is invalid input."""
     place = shutil.copytree(exported, tmp_path / "controller")
     with (place / "vectors.csv").open() as file:
         header, *rows = csv.reader(file)
@@ -246,11 +246,11 @@ def test_each_sample_begins_where_the_simulator_was(exported, tmp_path):
     assert "130 samples; other status: 1;" in done.stdout
 
 
-@pytest.mark.long  # that nothing can add up: the test above; implicit sampling: `test_library.py`
+@pytest.mark.long  # short tests: the test above, and `test_library.py` (implicit sampling)
 @needs_compiler
 @pytest.mark.skipif(shutil.which("make") is None, reason="this machine has no make")
-def test_what_rounding_leaves_does_not_add_up(tmp_path):
-    """Over 1 250 samples of a loop that is open: C went off by 3e-12 of the command, and 1e-12 was allowed."""
+def test_rounding_errors_do_not_accumulate(tmp_path):
+    """In an open loop of 1 250 samples they would exceed the tolerance of 1e-12."""
     law = {"t_f": 20.0, "delta": 3.0, "sampling": "implicit", "k1": 7.0}
     tables = flight(**FILTER, controller=law, loop={"period": 0.02, "t_end": 25.0}, dispersion={})
     made = scenario.reading.complete(scenario.from_tables(tables))
@@ -262,8 +262,8 @@ def test_what_rounding_leaves_does_not_add_up(tmp_path):
 
 @needs_compiler
 @pytest.mark.skipif(shutil.which("make") is None, reason="this machine has no make")
-def test_anything_may_come_in(exported, tmp_path):
-    """A hundredth of what `make fuzz` takes, under the sanitizers where the compiler has them."""
+def test_random_input_passes_a_short_fuzz_run(exported, tmp_path):
+    """The run has a hundredth of the rounds of `make fuzz`, with sanitizers if the compiler has them."""
     place = shutil.copytree(exported, tmp_path / "controller")
     text = (place / "Makefile").read_text().replace("1000000", "10000")
     (place / "Makefile").write_text(text)
@@ -274,8 +274,8 @@ def test_anything_may_come_in(exported, tmp_path):
     assert done.stdout.splitlines()[-1].startswith("10000 rounds:")
 
 
-def test_vectors_are_the_run_that_the_simulator_flies(exported):
-    """Command by command: the recorded trial is the rollout's, of which the history keeps commands and estimates."""
+def test_vectors_equal_the_simulated_run(exported):
+    """Commands, estimates and s in vectors.csv equal the history of the same trial."""
     with (exported / "vectors.csv").open() as file:
         header, *rows = csv.reader(file)
     mine = [row for row in rows if row[0] == "1" and row[1] != "-1"]
@@ -288,10 +288,11 @@ def test_vectors_are_the_run_that_the_simulator_flies(exported):
         np.testing.assert_allclose(found, column[: len(found)], rtol=1e-11, atol=1e-13)
 
 
-def test_what_rounding_may_leave_is_reckoned_to_the_last_sample_before_the_hand_over(exported):
-    """A period before it, delta + h before t_f, where gains are (t_f / (delta + h))^2 times those at the start.
+def test_rounding_tolerance_uses_the_gain_growth_until_the_last_sample_before_the_hand_over(exported):
+    """At this sample, delta + h before t_f, the gains are (t_f / (delta + h))^2 times the initial gains.
 
-    From rest an error is |v| r^3 (1 + 3 ln(1/r)), r = (t_f - t) / t_f, and over r^2 at most 3 e^(-2/3) |v|.
+    From rest the error is |v| r^3 (1 + 3 ln(1/r)) with r = (t_f - t) / t_f. Divided by r^2 it is at most
+    3 e^(-2/3) |v|.
     """
     with (exported / "vectors.csv").open() as file:
         starts = [row for row in csv.DictReader(file) if row["sample"] == "0"]
@@ -301,7 +302,7 @@ def test_what_rounding_may_leave_is_reckoned_to_the_last_sample_before_the_hand_
     np.testing.assert_allclose(float(told), expected, rtol=0.05)  # sampled every 0.02 t_f
 
 
-def test_other_gains_are_other_parameters_and_the_same_code(exported, tmp_path):
+def test_other_gains_change_the_parameters_and_not_the_code(exported, tmp_path):
     known = scenario.replace(
         scenario.read(exported / "scenario.toml"), controller__eta=2.8, spacecraft__inertia=[9, 11, 13]
     )
@@ -314,7 +315,7 @@ def test_other_gains_are_other_parameters_and_the_same_code(exported, tmp_path):
     assert (other / "ptsmc_short_parameters.c").read_text() != (exported / "ptsmc_short_parameters.c").read_text()
 
 
-def test_the_law_stands_in_it_with_its_names_and_equations(exported):
+def test_exported_c_has_the_names_and_equations_of_the_law(exported):
     text = (exported / "ptsmc_short.c").read_text()
     assert "(56) and (57) in the approach phase, (59) and (60) in the hold phase." in text.replace("\n * ", " ")
     for line in (
@@ -325,14 +326,14 @@ def test_the_law_stands_in_it_with_its_names_and_equations(exported):
     assert "power of the approach" in (exported / "ptsmc_short.h").read_text()
 
 
-def test_the_limit_of_the_singularity_is_that_of_the_simulator(monkeypatch):
+def test_singularity_limit_in_c_equals_that_of_the_simulator(monkeypatch):
     monkeypatch.setattr(run_state, "SINGULAR_CLEARANCE", 0.0125)
     made = folder.Controller(scenario.from_tables(flight()), "short", "a scenario")
     limits = re.findall(r"clearance >= R\((.*?)\)", templates.texts(made.code, made.about)["ptsmc_short.c"])
     assert limits == ["0.0125", "0.0125"]
 
 
-def test_a_continuous_loop_and_a_full_folder_are_refused(exported, tmp_path):
+def test_export_raises_an_error_for_a_continuous_loop_or_a_full_folder(exported, tmp_path):
     with pytest.raises(ScenarioError, match=r'^loop.mode is "continuous", but must be "sampled" to be exported'):
         folder.export(scenario.from_tables({}), tmp_path / "x")
     with pytest.raises(RefusedError, match="holds something already"):
@@ -340,8 +341,8 @@ def test_a_continuous_loop_and_a_full_folder_are_refused(exported, tmp_path):
     assert not (tmp_path / "x").exists()
 
 
-def test_a_filter_of_the_command_goes_on_by_a_whole_period_wherever_samples_are_missed():
-    """The prewarped tan(W h / 2) of a gap may be anything; at the first sample there is none, and nothing goes out."""
+def test_command_filter_advances_by_one_period_after_missed_samples():
+    """The prewarped tan(W h / 2) of a longer gap could have any value. At the first sample the output is zero."""
     tables = flight(controller={"error": "multiplicative"}, hardware={"command_filter": {"kind": "first_order"}})
     parts: Any = scenario.study(scenario.from_tables(tables)).parts
     known = {"t": 1.0, "tracking": 1, "out.d_hat": np.zeros(3), "before.law": parts.controller.begin(),
@@ -362,5 +363,5 @@ def test_a_filter_of_the_command_goes_on_by_a_whole_period_wherever_samples_are_
     np.testing.assert_array_equal(commanded(parts, 0.0), 0.0)
 
 
-def test_names_are_ones_that_c_takes():
+def test_identifier_returns_valid_c_names():
     assert [folder.identifier(name) for name in ("tuned", "2 flights", "é-x", "")] == ["tuned", "c_2_flights", "x", "c"]

@@ -1,4 +1,4 @@
-"""Exported C with a sensor suite: it replays the simulator, and treats missing and bad readings as it should."""
+"""Exported C with a sensor suite: replay of the simulation, and missing and invalid readings."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -48,7 +48,7 @@ pytestmark = needs_compiler
 
 @pytest.fixture(scope="module")
 def suite(tmp_path_factory):
-    """The controller, compiled, and the inputs, outputs and states of a simulated trial, the first state before it."""
+    """The compiled controller, and inputs, outputs and states of a simulated trial, with the initial state first."""
     place = tmp_path_factory.mktemp("suite") / "controller"
     made = folder.Controller(scenario.reading.complete(scenario.from_tables(TABLES)), "flight", "suite")
     store.write(place, lambda making: folder.write_program(making, made))
@@ -58,7 +58,7 @@ def suite(tmp_path_factory):
 
 
 def replayed(library, given, state):
-    """Statuses, outputs and states of samples one after the other."""
+    """Statuses, outputs and states of a sequence of samples."""
     statuses, outputs, states = [], [], []
     for row in given:
         state, out, status = library.many(state, row)
@@ -72,8 +72,8 @@ def columns(library, name):
     return [k for k, column in enumerate(library.columns["in"]) if column.partition("[")[0] == name]
 
 
-def test_it_replays_the_simulator(suite):
-    """Each sample from the state before it: all outputs and states to 1e-12 of their peak."""
+def test_exported_c_with_a_suite_replays_the_simulation(suite):
+    """Each sample starts from the simulated state. Outputs and states agree to 1e-12 of their peak."""
     library, given, out, states = suite
     after, outputs, statuses = library.many(states[:-1], given)
     assert not statuses.any()
@@ -88,7 +88,7 @@ def test_it_replays_the_simulator(suite):
     assert 0.0 < given[:, columns(library, "star_tracker_2_valid")].mean() < 1.0
 
 
-def test_a_reading_that_is_not_valid_is_not_looked_at(suite):
+def test_a_reading_marked_as_invalid_is_ignored(suite):
     library, given, _, states = suite
     _, outputs, _ = replayed(library, given, states[0])
     missing, at = given.copy(), int(np.flatnonzero(given[:, columns(library, "star_tracker_2_valid")[0]] == 0.0)[3])
@@ -101,7 +101,7 @@ def test_a_reading_that_is_not_valid_is_not_looked_at(suite):
 
 @pytest.mark.parametrize("name", ["star_tracker_1", "star_tracker_2", "star_tracker_2_age", "vector_sensor_1", "own_1"])
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_a_valid_reading_that_is_not_finite_is_refused(suite, name, value):
+def test_a_reading_marked_as_valid_that_is_not_finite_is_invalid_input(suite, name, value):
     library, given, _, states = suite
     bad, valid = given.copy(), name.removesuffix("_age") + "_valid"
     at = int(np.flatnonzero(given[:, columns(library, valid)[0]])[5])
@@ -109,8 +109,8 @@ def test_a_valid_reading_that_is_not_finite_is_refused(suite, name, value):
     assert replayed(library, bad[: at + 1], states[0])[0][at] == INPUT
 
 
-def test_an_unknown_attitude_is_that_of_the_first_star_tracker(suite):
-    """Without a star tracker there is no attitude to start from, whatever the vector sensor says."""
+def test_the_first_star_tracker_reading_initialises_the_attitude(suite):
+    """A vector sensor alone cannot initialise the attitude."""
     library, given, _, states = suite
     begin = int(np.flatnonzero(given[:, columns(library, "star_tracker_2_valid")[0]])[0])
     none = given[: begin + 1].copy()

@@ -1,4 +1,4 @@
-"""Functions of arrays in C compute what JAX computes; what C cannot say is refused by its line."""
+"""Functions of arrays in C equal those in JAX; operations without a counterpart in C raise an error with their line."""
 
 import re
 
@@ -199,10 +199,10 @@ FUNCTIONS = {
 
 @needs_compiler
 @pytest.mark.parametrize("name", FUNCTIONS)
-def test_a_function_in_c_is_the_one_in_jax(name, tmp_path):
+def test_a_function_in_c_equals_the_function_in_jax(name, tmp_path):
     function, *args = FUNCTIONS[name]
     found, expected = both(tmp_path, function, *args)
-    # a few roundings each, of numbers of order one
+    # a few rounding errors of numbers of order one
     np.testing.assert_allclose(found, expected, rtol=2e-15, atol=2e-15)
 
 
@@ -210,14 +210,14 @@ def text(function, *args):
     return "\n".join(body(function, *map(jnp.asarray, args))[0])
 
 
-def test_equal_expressions_are_one_and_what_is_known_is_computed():
+def test_equal_expressions_are_shared_and_constants_are_folded():
     code = text(lambda x: (x[0] * x[1] + jnp.sin(x[1] * x[0]), 0.0 * x[2] + 1.0 * x[0], jnp.sqrt(4.0) * x[0]), X)
     assert code.count(" * ") == 2  # x0 x1 once, and 2 x0
     assert "R(2) * in[0]" in code
     assert "in[2]" not in code
 
 
-def test_names_are_those_of_the_source():
+def test_variables_have_the_names_of_the_source():
     def law(x):
         wanted = -2.0 * x
         speed = jnp.sum(wanted * wanted)
@@ -229,8 +229,8 @@ def test_names_are_those_of_the_source():
 
 
 @needs_compiler
-def test_a_name_of_the_source_hides_no_function_of_c(tmp_path):
-    """A law with `tanh = jnp.tanh(s)` in it did not compile."""
+def test_names_of_the_source_do_not_hide_c_functions(tmp_path):
+    """A law may contain an assignment such as `tanh = jnp.tanh(s)`."""
 
     def law(x):
         tanh, NAN = jnp.tanh(x[0]), jnp.sin(x[1])
@@ -243,7 +243,7 @@ def test_a_name_of_the_source_hides_no_function_of_c(tmp_path):
     np.testing.assert_allclose(found, expected, rtol=4e-15)
 
 
-def test_branches_are_branches_and_loops_loops():
+def test_branches_and_loops_are_branches_and_loops_in_c():
     assert "if (in[0] > R(0)) {" in text(branched, X)
     assert "for (int k" in text(counted, X)
     assert "for (" not in text(lambda x: jax.lax.fori_loop(0, 3, lambda k, y: 0.5 * y + x, x), X)
@@ -268,7 +268,7 @@ def test_branches_are_branches_and_loops_loops():
         ),
     ],
 )
-def test_what_c_cannot_say_is_refused_by_its_name_and_line(law, name):
+def test_the_error_for_an_unsupported_operation_has_its_name_and_line(law, name):
     line = law.__code__.co_firstlineno
     said = rf"^`{re.escape(name)}` \(.*test_translate\.py:{line}\) cannot be written in C, but must"
     with pytest.raises(NoRuleError, match=said):
@@ -276,8 +276,8 @@ def test_what_c_cannot_say_is_refused_by_its_name_and_line(law, name):
 
 
 @pytest.mark.parametrize("name", ["solve", "inv", "cholesky", "pinv", "qr"])
-def test_the_refusal_of_linear_algebra_names_functions_that_c_has(name):
-    """The refusal of `jnp.linalg.solve` named `lu`, which no user has written."""
+def test_the_error_for_linear_algebra_names_supported_functions(name):
+    """The error names the function in the source, such as `jnp.linalg.solve`, and not its primitive `lu`."""
     calls = {
         "solve": lambda x: jnp.linalg.solve(jnp.outer(x, x), x),
         "inv": lambda x: jnp.linalg.inv(jnp.outer(x, x)),
@@ -295,8 +295,8 @@ def test_the_refusal_of_linear_algebra_names_functions_that_c_has(name):
         body(lambda x, f=function: f(jnp.outer(x, x), x) if f is matrices.solve else f(jnp.outer(x, x)), X)
 
 
-def test_keys_of_random_numbers_are_refused_wherever_they_come_from():
-    """They ended in a traceback, in a law's memory too."""
+def test_random_keys_raise_an_error_as_constants_and_in_memories():
+    """The error is one sentence instead of a traceback."""
     key = jax.random.key(0)
     with pytest.raises(NoRuleError, match=r"^key<fry> cannot be written in C, but must be numbers"):
         body(lambda x: x + jax.random.normal(key), X)
@@ -305,7 +305,7 @@ def test_keys_of_random_numbers_are_refused_wherever_they_come_from():
 
 
 @pytest.mark.parametrize("known", [jnp.asarray([1.0 + 2.0j, 2.0, 3.0]), jnp.asarray([1, 2, 3], jnp.uint64)])
-def test_known_numbers_of_which_c_has_none_are_refused(known):
-    """They ended in a traceback."""
+def test_constants_of_unsupported_types_raise_an_error(known):
+    """The error is one sentence instead of a traceback."""
     with pytest.raises(NoRuleError, match=rf"^{known.dtype} cannot be written in C, which has no number for it here$"):
         body(lambda x: (x * known).real, X)

@@ -178,7 +178,7 @@ def test_remark_2_matches_theory(made):
     left = 3**0.5 * 1.5 * 0.02**0.5 * 1e-5**0.5 * np.arctanh(0.05 / 1.1)
     most = 2 * 14 * np.linalg.norm(1 / np.array([10.0, 12.0, 14.0])) * left / 0.05
     assert by["finite_time", "exact"].chattering < by["finite_time", "smooth"].chattering + most
-    # a disturbance that starts at its bound: theory gives 1.25 |d| / c if it is constant; 0.1 s for changes
+    # a disturbance that starts at its bound: theory gives 1.25 |d| / c for a constant one; 0.1 s are for changes
     assert by["finite_time", "smooth"].estimate_settled < 1.2519 * 0.01 / 0.02 + 0.1
     assert by["prescribed_time", "smooth"].estimate_settled < 1.0
     assert by["prescribed_time", "smooth"].estimate_settled < by["nonlinear", "smooth"].estimate_settled
