@@ -316,7 +316,7 @@ def test_trials_with_a_compiled_controller_equal_single_simulations(exported, mo
     with pytest.raises(ptsmc.ScenarioError, match="has other inputs than the scenario"):
         ptsmc.trials(scenario.from_tables(FLIGHTS["raw"]), 3, controller=library.folder)
     otherwise = scenario.from_tables({**FLIGHTS["chain"], "controller": {**FLIGHTS["chain"]["controller"], "eta": 2.9}})
-    with pytest.warns(RuntimeWarning, match=r"its own numbers, not the scenario's: law_eta = 3 instead of 2\.9$"):
+    with pytest.warns(RuntimeWarning, match=r"other parameters than the scenario: law_eta = 3 instead of 2\.9$"):
         one = ptsmc.simulate(otherwise, seed=5, trial=1, controller=library.folder)
     assert one.metrics["window_error"] == pytest.approx(rows["window_error"][1], rel=1e-9)
 

@@ -20,9 +20,9 @@ FRAME = pl.DataFrame({
 
 @pytest.mark.parametrize(("interpretation", "outcomes", "said"), [
     ("ensemble", ["ok", BEYOND, BEYOND, "diverged"], ""),
-    ("mixed", ["ok", AT_TIMES, AT_TIMES, "diverged"], "asked for: 80 % of the time of all runs; seen: 60 %"),
+    ("mixed", ["ok", AT_TIMES, AT_TIMES, "diverged"], "required: 80 % of the time of all runs; seen: 60 %"),
     ("temporal", ["ok", AT_TIMES, BEYOND, "diverged"],
-     "asked for: 80 % of the time, in every run; seen: at least 0 %"),
+     "required: 80 % of the time, in every run; seen: at least 0 %"),
 ])  # fmt: skip
 def test_outcomes_distinguish_requirements_that_allow_violations_for_some_time(interpretation, outcomes, said):
     asked = Requirement("ape_z", 1.0, "rad", quantile=0.8, interpretation=interpretation)

@@ -391,7 +391,7 @@ def test_scenario_that_a_law_cannot_control_is_refused_before_any_search(monkeyp
     asked = rivals(monkeypatch, eight)
     opposite = {"initial": {"rotvec_deg": [0.0, 0.0, 90.0]}, "reference": {"rotvec_deg": [0.0, 0.0, -90.0]}}
     tables = {name: table for name, table in TABLES.items() if name != "dispersion"} | opposite
-    with pytest.raises(ScenarioError, match=r"the law terminal cannot fly this: .*q_e4 = 0"):
+    with pytest.raises(ScenarioError, match=r"the law terminal cannot be used in this scenario: .*q_e4 = 0"):
         compare.compare(scenario.from_tables(tables), 0, lambda *told: None)
     assert not asked
 
@@ -468,7 +468,7 @@ def test_every_law_is_validated_once_before_the_search(command, tmp_path, monkey
     asked = "compare", "s.toml", "--law", "own_parts.py:Scaling", "--against", "pd"
     refused = "pd"
     status, _, err = command(*asked)
-    assert (status, "the law pd cannot fly this: no such luck" in err) == (2, True)
+    assert (status, "the law pd cannot be used in this scenario: no such luck" in err) == (2, True)
     assert not (tmp_path / "out").exists()
     refused, built[:] = None, []
     assert command(*asked)[0] == 130
