@@ -19,7 +19,7 @@ from tuning.cli.main import app
 
 HERE = Path(__file__).parent
 MADE = "<!-- Made by docs/generate.py from the code, where it is to be changed. -->"
-PLANTS = {"spacecraft": "A spacecraft", "chain": "An integrator chain", "system": "A system of one's own"}
+PLANTS = {"spacecraft": "A spacecraft", "chain": "An integrator chain", "system": "A custom system"}
 SCENARIOS = """\
 A scenario is a TOML file of tables. Every table and every key is optional, and has a default. Defaults with * are
 those of the paper's case. For any other body or t_f they [follow the mission](theory/default_gains.md), and gains are
@@ -68,12 +68,14 @@ over time. Half-cones of RPE, PDE and RKE are up to 0.5 % too large. PDE is the 
 of any two windows. The measured attitude is constant between samples.
 """
 REQUIREMENTS = """\
-Any [metric](metrics.md) by its name: the largest value allowed in every trial that is flown, or a table that says more,
-such as `window_error = { limit = 1e-4, quantile = 0.9973, confidence = 0.9 }`, or, of a [pointing
-error](pointing.md) at a time, `ape_boresight = { limit = 1e-3, probability = 0.9973, confidence = 0.9,
-interpretation = "mixed" }`. And, of the sampled loop, any
-margin, a number: `gain_margin` [dB], `phase_margin` [deg] and `delay_margin` [s] are the least allowed,
-`modulus_margin` [dB] is the largest peak of the sensitivity. The keys of a table:"""
+The key is a [metric](metrics.md). The value is the largest allowed value in every simulated trial, or a table:
+`window_error = { limit = 1e-4, quantile = 0.9973, confidence = 0.9 }`. For a [pointing error](pointing.md) it may have
+an interpretation:
+`ape_boresight = { limit = 1e-3, probability = 0.9973, confidence = 0.9, interpretation = "mixed" }`.
+
+In the sampled loop the key may also be a margin. `gain_margin` [dB], `phase_margin` [deg] and `delay_margin` [s] are
+the smallest allowed values. `modulus_margin` [dB] is the largest allowed peak of the sensitivity. The keys of a
+table:"""
 
 
 SUITE = """\

@@ -33,11 +33,11 @@ small = ptsmc.replace(flight, tune={"trials": 16, "starts": 3, "steps": 30})  # 
 
 # %% [markdown]
 # `ptsmc tune scenarios/first_flight.toml` does the same with 64 trials and 12 starting points. The table compares the tuned
-# gains with the published gains on 1 000 held-out trials. Read three lines below it before you trust the gains:
+# gains with the published gains on 1 000 held-out trials. Read three lines below it before you trust the gains.
 #
-# - the interval of the accuracy gain,
-# - the worst case that a search inside the dispersions finds (`worst_case = true` tunes for it),
-# - the error of the gradients.
+# - One line is the interval of the accuracy gain.
+# - One line is the worst case inside the dispersions. With `worst_case = true` the tuner keeps its limits, too.
+# - One line is the error of the gradients.
 
 # %%
 tuned = tuner.tune(small, seed=0)

@@ -7,10 +7,10 @@
 # ---
 
 # %% [markdown]
-# # A campaign, its verdict, its worst case, again
+# # A campaign, its verdict and its worst case
 #
-# A review board asks: in how many cases, with what confidence, and show me the worst. Every trial is a pure function of
-# the seed and its number, so each can be flown again, alone and in full.
+# A review board asks for the fraction of good cases, the confidence, and the worst case. Every trial is a pure function of
+# the seed and its number, so you can simulate each of them again with its whole history.
 
 # %%
 from ptsmc_jax.configure import configure
@@ -25,10 +25,9 @@ from tuning.output import campaign_report, summaries, terminal
 from tuning.studies import campaign_figures, campaign_folder, campaign_summary
 
 # %% [markdown]
-# The gains of `ptsmc tune scenarios/first_flight.toml` (its `tuned.toml`, so with the flight clock on which they were
-# judged), and more that varies than attitudes: rates, a body known to 5 %, the disturbance's phase and
-# size, a gyro with a bias. The requirements are put as the field puts them: in 99.73 % of all trials that could be flown,
-# with 90 % confidence.
+# The scenario has gains of `ptsmc tune scenarios/first_flight.toml` and the flight clock. It has more dispersions than the
+# initial attitude: rate, inertia, the phase and amplitude of the disturbance, and a gyro bias. The requirements are on
+# 99.73 % of all possible trials, with 90 % confidence.
 
 # %%
 flight = ptsmc.replace(
@@ -50,11 +49,10 @@ flight = ptsmc.replace(
 )
 
 # %% [markdown]
-# This is `ptsmc montecarlo S.toml --trials 20000`, which one would use outside a notebook. The rows are kept in a folder,
-# in parts that are whole or not there; an interrupted campaign goes on where it was. Each verdict says how many trials
-# are beyond the limit, the share that keeps it with its interval, and how many trials would have been enough to show it.
-# (The shares of the variance that inputs explain do not add up to one where the inputs hang together, as the angle and
-# the quaternion of the same attitude do.)
+# The command for this campaign is `ptsmc montecarlo S.toml --trials 20000`. The rows are stored in complete files, so an
+# interrupted campaign can be resumed. Each verdict has the number of trials beyond the limit, the fraction that keeps it
+# with its interval, and the number of trials that would be enough. The fractions of the variance that inputs explain do
+# not add up to one if inputs are correlated, such as the angle and the quaternion of an attitude.
 
 # %%
 place = Path(tempfile.mkdtemp()) / "campaign"
@@ -65,8 +63,8 @@ found = campaign_summary.summarise(folder)
 terminal.show(campaign_report.of(summaries.read(summaries.Campaign, found)), Path("campaign"))
 
 # %% [markdown]
-# The fan shows where 50, 90 and 99.7 % of a thousand trials lie at each time, with the run of the largest window error;
-# the distributions put the limits beside all trials, on a scale on which 99.9 % is as far from 99 % as 1 % from 10 %.
+# The fan shows quantiles of the error over time, and the run with the largest window error. The distributions show all
+# trials beside the limits. Their scale spreads both tails, so that rare values are visible.
 
 # %%
 from ptsmc_jax.explore import Figures
@@ -75,16 +73,15 @@ figures = campaign_figures.of(folder, found)
 Figures({name: figures[name] for name in ("fan", "distributions")})
 
 # %% [markdown]
-# Peak torque goes with the initial angle: it is the first torque, 2 η² tan(θ/2)/t_f² times the inertia, as theory says.
-# Points of another colour are trials beyond a limit, of the torque or of the error, however rare: they are drawn first and
-# the others thinned, so colours say where they lie, and not how many they are.
+# The peak torque is the first torque, 2 η² tan(θ/2)/t_f² times the inertia, so it grows with the initial angle. Points of
+# another colour are trials beyond a limit of torque or error. All of them are drawn, but only a part of the others.
 
 # %%
 Figures({"torque_by_angle": figures["torque_by_angle"]})
 
 # %% [markdown]
-# The five worst trials by window error, with what they flew with: initial angle in rad, true inertia in kg m². As the
-# drivers above say, the angle explains little of it (4 % of the variance): what makes them bad is their noise.
+# These are the five worst trials by window error, with their initial angle in rad and true inertia in kg m². The angle
+# explains only a small part of the variance, as the table of inputs above shows. The noise is the main cause.
 
 # %%
 worst = campaign_summary.worst(folder, "window_error", 5)
@@ -93,8 +90,8 @@ worst.select(
 )
 
 # %% [markdown]
-# The worst of them flown again: its metrics are those of its row, to the last digit. The error bounces after t_f, where
-# the constant gains take over, and the torque is largest at the start, where theory (dotted) has it.
+# The worst trial is simulated again. Its metrics are equal to its row, to the last digit. The error oscillates after t_f
+# under the constant gains. The torque is largest at the start, as in theory (dotted).
 
 # %%
 found = campaign_summary.replay(folder, worst["trial"][0])
@@ -103,5 +100,5 @@ again = ptsmc.simulate(flight, seed=1, trial=worst["trial"][0])
 again.plot("error", "torque")
 
 # %% [markdown]
-# The verdict, its confidence and the worst case, all from one folder that anyone can fly again: `ptsmc report` makes a
-# page of it. The next notebook is for plants that are no spacecraft.
+# One folder has the verdict, its confidence and the worst case. `ptsmc report` makes a page of it. The next notebook is
+# about plants other than a spacecraft.
