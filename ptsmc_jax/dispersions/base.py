@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from ptsmc_jax.dispersions.numbers import Combine, Numbers, Random, add_to_nominal
 from ptsmc_jax.numerics import draws, paths
-from ptsmc_jax.simulation.rollout import Parts
+from ptsmc_jax.simulation.assembly import Parts
 
 Coordinates = dict[str, Array]  # standard random numbers of a trial, by the name of the quantity
 

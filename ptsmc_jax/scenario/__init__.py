@@ -1,7 +1,7 @@
-"""Read, validate and change scenarios without JAX (`reading`), and build the parts of a run from them (`flyable`).
+"""Read, validate and change scenarios (`reading`), and build the parts of a run from them (`flyable`).
 
 Start with `read`, which returns a `Scenario`, and `study`, which builds its parts. The exports are imported at their
-first use, so that reading a scenario does not load JAX.
+first use, so that `scenario.errors` does not load JAX, and reading a scenario does not load the rollout.
 """
 
 import importlib

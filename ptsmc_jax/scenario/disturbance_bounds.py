@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ptsmc_jax.batching import lapack
 from ptsmc_jax.declare import Scaled
 from ptsmc_jax.numerics import attitude
 from ptsmc_jax.plants.rigid_body import AttitudeState
@@ -148,6 +147,8 @@ def along_the_run(scenario: Any, signal: Any, fastest: float = 0.0) -> Bounds:
     Raises:
         ScenarioError: the disturbance is finite at t = 0 and not finite later on the path.
     """
+    from ptsmc_jax.batching import lapack  # the import takes 0.1 s, and most scenarios do not need it
+
     needed = min(float(scenario.loop.t_end) * fastest / FINE, MOST_STEPS)
     t = np.linspace(0.0, float(scenario.loop.t_end), max(POINTS, math.ceil(needed) + 1))
     left = np.clip(1.0 - t / scenario.controller.t_f, 0.0, 1.0) ** 3
@@ -189,6 +190,8 @@ def _attitudes(scenario: Any, t: np.ndarray, left: np.ndarray) -> Any:
 
     `left` (n,) is the remaining fraction of the initial rotation from the reference.
     """
+    from ptsmc_jax.batching import lapack
+
     reference = scenario.reference.build()
     target = lapack.vmap(lambda time: reference(time).q)(jnp.asarray(t))
     start = jnp.asarray(attitude_keys.quaternion(scenario.initial, "initial"))

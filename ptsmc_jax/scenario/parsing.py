@@ -469,7 +469,7 @@ def _key(key: str, value: Any, kind: Any, context: Context) -> Any:
 def _value(key: str, value: Any, kind: Any) -> Any:
     try:
         value = _plain(value)
-    except TypeError:  # raised by JAX for a traced value; this module does not import JAX
+    except TypeError:  # raised by JAX for a traced value
         raise ScenarioError(f"{key} is traced by JAX, but must be known here; with_gains takes traced gains") from None
     bad = _not_finite(value)
     if bad is not None:

@@ -1,7 +1,4 @@
-"""Read, validate and change scenarios. Start with `read`, `from_tables` and `replace`.
-
-The module does not import JAX, so that configuration errors are reported at once.
-"""
+"""Read, validate and change scenarios. Start with `read`, `from_tables` and `replace`."""
 
 from collections.abc import Mapping
 from pathlib import Path

@@ -16,12 +16,10 @@ import traceback
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from ptsmc_jax import configure
-
-if TYPE_CHECKING:
-    from ptsmc_jax.plants.second_order import System
+from ptsmc_jax.plants.second_order import System
 
 WHERE = '"FILE.py:NAME" or "package.module:NAME"'
 ALLOWED = f"{WHERE}, a system made with plants.system"
@@ -63,13 +61,11 @@ def location(where: str) -> str:
     return os.path.realpath(place) if place.endswith(".py") else f"the module {place}"
 
 
-def load(where: object) -> "System":
+def load(where: object) -> System:
     """Return a system, or load it by its name; raise ValueError if there is none.
 
     The result is the same object as long as the file does not change, see `item`.
     """
-    from ptsmc_jax.plants.second_order import System  # scenarios without one are checked without JAX
-
     if not isinstance(where, str):
         if not isinstance(where, System):
             raise ValueError(f"allowed is {ALLOWED}")
