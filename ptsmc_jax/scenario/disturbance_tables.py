@@ -41,7 +41,7 @@ class DisturbanceTable(PartTable, frozen=True):
     def impulse(self, end: float) -> float:
         """Return a bound on the integral of the disturbance until `end` [s], in N m s.
 
-        It is 0 if the integral stays small over any time.
+        It is 0 if the integral is neglected.
         """
         return 0.0 if self.made is None else self.made.impulse(self, end)
 
@@ -115,7 +115,7 @@ class GravityTable(Attitude, DisturbanceTable, frozen=True):
         return 0.0
 
     def impulse(self, end: float) -> float:
-        """Return 0: the torque is periodic, so its integral stays small."""
+        """Return 0: the integral of the torque is neglected."""
         return 0.0
 
     def bounds(self, scenario: Any) -> Bounds | None:

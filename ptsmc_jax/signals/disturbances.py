@@ -33,7 +33,7 @@ class Disturbance:
         return 0.0
 
     def impulse(self, end: float) -> float:
-        """Return a bound on its integral until `end` [s], in N m s; 0: it stays small however long it acts."""
+        """Return a bound on its integral until `end` [s], in N m s, or 0 if it is neglected."""
         return 0.0
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray] | None:
@@ -133,7 +133,7 @@ class GravityGradient(Disturbance):
     The frame's z is along the orbit's normal, its x points to where the phase counts from. The torque is 3 n^2 c x J c,
     c the unit vector to the planet in body axes.
 
-    c is the unit vector to the planet in body axes, which depends on the true attitude. Wie, Space Vehicle Dynamics and
+    c depends on the true attitude. Wie, Space Vehicle Dynamics and
     Control (2008), eq. (6.128).
     """
 
@@ -183,7 +183,7 @@ class Sum(Disturbance):
 
 def terms(disturbance: Any) -> tuple[Any, ...]:
     """Return the terms of a sum, or the disturbance itself as the only term."""
-    return getattr(disturbance, "terms", (disturbance,))
+    return disturbance.terms if isinstance(disturbance, Sum) else (disturbance,)
 
 
 def _field_name(term: Any, quantity: str) -> str | None:
@@ -223,7 +223,7 @@ def with_values(disturbance: Any, quantity: Literal["phase", "amplitude"], new: 
             term = replace(term, **{field: new[used : used + old.size].reshape(old.shape)})
             used += old.size
         changed.append(term)
-    return Sum(tuple(changed)) if hasattr(disturbance, "terms") else changed[0]
+    return Sum(tuple(changed)) if isinstance(disturbance, Sum) else changed[0]
 
 
 def bias(disturbance: Any, inputs: int) -> Float[Array, " m"]:

@@ -222,6 +222,20 @@ def test_slew_can_take_the_longer_rotation():
 MULTIPLICATIVE = {"controller": {"error": "multiplicative"}}
 
 
+def test_a_custom_disturbance_can_have_a_number_called_terms():
+    """An earlier version took it for a sum, and a dispersion of its amplitude ended in a traceback."""
+
+    @dataclasses.dataclass(frozen=True)
+    class Push(disturbances.Disturbance):
+        terms: float = 2.0
+        size: float = 0.1
+        drawn = {"amplitude": "size"}  # noqa: RUF012
+
+    assert disturbances.values(Push(), "amplitude").tolist() == [0.1]
+    changed = disturbances.with_values(Push(), "amplitude", jnp.array([0.2]))
+    assert (type(changed), float(changed.size), changed.terms) == (Push, 0.2, 2.0)
+
+
 def test_with_bias_replaces_the_previous_bias():
     """A row of a run table may give a bias to parts that have one already."""
     constant = disturbances.Constant(vector([0.1, -0.2, 0.3]))
