@@ -6,7 +6,7 @@ C and the JSON Schema are all made from these declarations. Built-in and custom 
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -189,13 +189,9 @@ class Tunable:
         """Add the gains that this class declares to the gains of its bases."""
         super().__init_subclass__(**options)
         if "tunable" not in vars(cls):
-            cls.tunable = tuple(dict.fromkeys((*cls.tunable, *_gains(vars(cls).items()))))
-
-
-def _gains(members: Iterable[tuple[str, Any]]) -> Iterable[str]:
-    for name, field in members:
-        if isinstance(field, dataclasses.Field) and getattr(field.metadata.get("declared"), "gain", False):
-            yield name
+            fields = {name: one for name, one in vars(cls).items() if isinstance(one, dataclasses.Field)}
+            gains = [name for name, one in fields.items() if getattr(one.metadata.get("declared"), "gain", False)]
+            cls.tunable = tuple(dict.fromkeys((*cls.tunable, *gains)))
 
 
 class Rates(NamedTuple):

@@ -17,6 +17,17 @@ from ptsmc_jax.laws.kinematics import Kinematics
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector
 
 
+def boundary_layer(default: Any, unit: str = "") -> Any:
+    """Declare the field `sign_width`, the thickness of the boundary layer of tanh(s / sign_width).
+
+    Args:
+        default: as for `declare.gain`.
+        unit: of s.
+    """
+    meaning = "thickness of the boundary layer; 0 is the discontinuous sign"
+    return declare.gain(default, "sign_width", at_least=0.0, free="sampled", unit=unit, meaning=meaning)
+
+
 class Sample(NamedTuple):
     """A sample time at which a law is evaluated."""
 

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import jax.numpy as jnp
 
 from ptsmc_jax.declare import Rates, Scaled, gain
-from ptsmc_jax.laws.base import ComparisonLaw, Sample
+from ptsmc_jax.laws.base import ComparisonLaw, Sample, boundary_layer
 from ptsmc_jax.laws.kinematics import MultiplicativeKinematics
 from ptsmc_jax.numerics import guards
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector, pytree
@@ -98,13 +98,7 @@ class Terminal(ComparisonLaw):
         Scaled(0.1, time=lambda table: -table.p), "terminal_surface", unit="1/s^p", meaning="scale of the surface"
     )
     k: Leaf = gain(Scaled(0.1, time=-2), Rates(2.0, 2000.0, 2), unit="1/s^2", meaning="reaching gain")
-    sign_width: Leaf = gain(
-        1e-3,
-        "sign_width",
-        at_least=0.0,
-        free="sampled",
-        meaning="thickness of the boundary layer; 0 is the discontinuous sign",
-    )
+    sign_width: Leaf = boundary_layer(1e-3)
 
     def acceleration(self, now: Sample, error: Vector, error_rate: Vector, bound: Scalar) -> tuple[Vector, Vector]:
         s = error + guards.signed_power(error_rate, self.p) / self.b
@@ -124,8 +118,6 @@ class Terminal(ComparisonLaw):
 @dataclass(frozen=True)
 class FixedTime(ComparisonLaw):
     """Fixed-time sliding mode (Zuo 2015; Jiang, Hu, Friswell 2016), gamma - 1/p > 1.
-
-    s = v + sig^p(v'/kappa), kappa = a1 |v|^(gamma-1/p) + b1; 1 < p < 2, gamma - 1/p > 1, m > 1 > n > 0.
 
     The law for the error v, with 1 < p < 2, gamma - 1/p > 1 and m > 1 > n > 0, is
 
@@ -159,13 +151,7 @@ class FixedTime(ComparisonLaw):
     gamma: Leaf = gain(2.0, "fixed_time_gamma", above=1.0, meaning="power of the surface")
     m: Leaf = gain(1.5, (1.05, 3.0), above=1.0, meaning="power of the reaching law")
     n: Leaf = gain(0.5, (0.05, 0.95), below=1.0, meaning="power of the reaching law")
-    sign_width: Leaf = gain(
-        1e-3,
-        "sign_width",
-        at_least=0.0,
-        free="sampled",
-        meaning="thickness of the boundary layer; 0 is the discontinuous sign",
-    )
+    sign_width: Leaf = boundary_layer(1e-3)
 
     def acceleration(self, now: Sample, error: Vector, error_rate: Vector, bound: Scalar) -> tuple[Vector, Vector]:
         exponent = self.gamma - 1.0 / self.p
@@ -196,8 +182,6 @@ class FixedTime(ComparisonLaw):
 @dataclass(frozen=True)
 class Scaling(ComparisonLaw):
     """Prescribed time by scaling with (t_f/(t_f - t))^(2+m) (Song, Wang, Holloway, Krstic 2017).
-
-    a = -2 p eps'/r - p (p+1) eps/r^2 - k1 (eps' + p eps/r) - k z, p = 2 + m, r = t_f - t, from r = delta on held.
 
     The scaled error is xi = mu eps with mu = (t_f/r)^p, p = 2 + m and r = t_f - t. The law is
 
@@ -253,8 +237,6 @@ def phi(x: Vector, q: Scalar, settling: Scalar) -> Vector:
 class PredefinedTime(ComparisonLaw):
     """Predefined-time sliding mode (Sanchez-Torres and others 2018; Jimenez-Rodriguez and others 2020).
 
-    s = eps' + sig^(1/2)(sig^2(eps') + 2 sig^2(Phi_1(eps))), a = -Phi_2(s) - (K + 2 Phi_1 Phi_1'(eps)) sign(s).
-
     The law, with Phi_i the function `phi` with q_i and T_i, is
 
         s = eps' + sig^(1/2)(sig^2(eps') + 2 sig^2(Phi_1(eps)))
@@ -273,14 +255,7 @@ class PredefinedTime(ComparisonLaw):
     )  # fmt: skip
     q1: Leaf = gain(0.3, (0.05, 0.49), at_most=0.5, meaning="power of the surface")
     q2: Leaf = gain(0.3, (0.05, 0.95), below=1.0, meaning="power of the reaching law")
-    sign_width: Leaf = gain(
-        Scaled(1e-2, time=-1),
-        "sign_width",
-        at_least=0.0,
-        free="sampled",
-        unit="1/s",
-        meaning="thickness of the boundary layer; 0 is the discontinuous sign",
-    )
+    sign_width: Leaf = boundary_layer(Scaled(1e-2, time=-1), "1/s")
 
     def acceleration(self, now: Sample, error: Vector, error_rate: Vector, bound: Scalar) -> tuple[Vector, Vector]:
         first, second = self.share * self.t_f, (1.0 - self.share) * self.t_f
@@ -312,8 +287,6 @@ class PredefinedTime(ComparisonLaw):
 class SuperTwisting(ComparisonLaw):
     """Super-twisting, s = eps' + c eps (Levant 1998; Moreno, Osorio 2012).
 
-    s = eps' + c eps, a = -c eps' - 1.5 sqrt(L) sig^(1/2)(s) + v, v' = -1.1 L sign(s).
-
     The law is
 
         s = eps' + c eps
@@ -333,14 +306,7 @@ class SuperTwisting(ComparisonLaw):
         Scaled(0.01, time=-3), Rates(0.1, 1e4, 3), unit="1/s^3",
         meaning="L, bound on each component of the derivative of eps'' that the disturbance makes",
     )  # fmt: skip
-    sign_width: Leaf = gain(
-        Scaled(1e-3, time=-1),
-        "sign_width",
-        at_least=0.0,
-        free="sampled",
-        unit="1/s",
-        meaning="thickness of the boundary layer; 0 is the discontinuous sign",
-    )
+    sign_width: Leaf = boundary_layer(Scaled(1e-3, time=-1), "1/s")
     switches: ClassVar[bool] = False
 
     def begin(self) -> Vector:

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from ptsmc_jax.declare import Rates, Scaled, gain
-from ptsmc_jax.laws.base import ComparisonLaw, Sample
+from ptsmc_jax.laws.base import ComparisonLaw, Sample, boundary_layer
 from ptsmc_jax.numerics import guards
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector, pytree
 
@@ -35,7 +35,7 @@ class Profile(NamedTuple):
 
 @dataclass(frozen=True)
 class TimeBase(ComparisonLaw):
-    """Follows r(x) = e0 (1 - 10 x^3 + 15 x^4 - 6 x^5) + e0' t_f (x - 6 x^3 + 8 x^4 - 3 x^5), x = t/t_f, then 0.
+    """Follow a quintic profile from the first measured error to zero at t_f.
 
     The profile is the quintic that starts at the measured error e0 with its rate e0' and is at rest at zero at t_f:
 
@@ -135,14 +135,7 @@ class TimeBaseSliding(TimeBase):
         Scaled(1.0, time=-1), Rates(0.3, 1.0, sampled=True), unit="1/s", meaning="c, rate on the surface"
     )
     k: Leaf = gain(Scaled(1.0, time=-1), Rates(0.3, 1.0, sampled=True), unit="1/s", meaning="rate of s")
-    sign_width: Leaf = gain(
-        Scaled(1e-3, time=-1),
-        "sign_width",
-        at_least=0.0,
-        free="sampled",
-        unit="1/s",
-        meaning="thickness of the boundary layer; 0 is the discontinuous sign",
-    )
+    sign_width: Leaf = boundary_layer(Scaled(1e-3, time=-1), "1/s")
 
     def feedback(self, deviation: Vector, rate: Vector, bound: Scalar) -> tuple[Vector, Vector]:
         s = rate + self.surface_rate * deviation

@@ -15,13 +15,12 @@ from msgspec import Meta
 from ptsmc_jax import formulas
 from ptsmc_jax.devices import attitude_sensors, kalman_filter, sensor_suite
 from ptsmc_jax.numerics.pytrees import vector
-from ptsmc_jax.scenario.device_tables import FilterTable, Hardware
+from ptsmc_jax.scenario.device_tables import SAME, FilterTable, Hardware
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.own import own_kind
 from ptsmc_jax.scenario.schema import PartTable
 from ptsmc_jax.scenario.values import Kinds, Meaning, NotNegative, Positive, Table, Three
 
-SAME = 1e-9  # relative
 LATEST = 8  # control periods until a reading is used; the filter keeps an attitude for each
 Size = Annotated[float, Meta(ge=1e-15, le=1e3, description="a number from 1e-15 to 1000")]
 Noise = Size | None

@@ -88,13 +88,9 @@ class StateScenario(Scenario, frozen=True, kw_only=True):
         drawn = msgspec.structs.replace(drawn, **{drawn.width: width})
         return msgspec.structs.replace(self, dispersion=msgspec.structs.replace(self.dispersion, x0=drawn))
 
-    def start_size(self) -> float:
-        """Return |x_1| at t = 0."""
-        return math.hypot(*self.plant.x0[: self.inputs])
-
     def start_tangent(self) -> float:
         """Return |x_1| at t = 0, which determines the first acceleration."""
-        return self.start_size()
+        return math.hypot(*self.plant.x0[: self.inputs])
 
     def largest_acceleration(self) -> float | None:
         """Return the limit on the input of a chain; None for a system, whose input matrix is not known here."""
@@ -105,7 +101,7 @@ class StateScenario(Scenario, frozen=True, kw_only=True):
     def usual_settling(self) -> float:
         """Return the default of `loop.settling_angle` in units of x_1: 2e-4 |x_1(0)|, or five sigma of the noise."""
         noises = getattr(self.hardware, "state_noise", None) or (0.0,)
-        return max(2e-4 * (self.start_size() or 5.0), 5.0 * max(noises[: self.inputs]))
+        return max(2e-4 * (self.start_tangent() or 5.0), 5.0 * max(noises[: self.inputs]))
 
     def check_devices(self) -> None:
         """Raise ScenarioError for lists whose length is not the number of inputs or states."""

@@ -8,24 +8,14 @@ from msgspec import Meta
 
 from ptsmc_jax.declare import Scaled
 
-Number = Annotated[float, Meta(description="a number")]
 Positive = Annotated[float, Meta(gt=0, description="a number greater than 0")]
 NotNegative = Annotated[float, Meta(ge=0, description="a number, at least 0")]
 Truth = Annotated[bool, Meta(description="true or false")]
 Count = Annotated[int, Meta(ge=1, description="a whole number, at least 1")]
 Three = Annotated[tuple[float, float, float], Meta(description="three numbers")]
-ThreePositive = Annotated[tuple[Positive, Positive, Positive], Meta(description="three numbers greater than 0")]
-Each = Annotated[tuple[float, ...], Meta(description="a list of numbers, one for each input")]
-EachNotNegative = Annotated[
-    tuple[NotNegative, ...], Meta(description="a list of numbers of at least 0, one for each input")
-]
-EachPositive = Annotated[tuple[Positive, ...], Meta(description="a list of numbers greater than 0, one for each input")]
 Numbers = Annotated[tuple[float, ...], Meta(min_length=1, description="a list of numbers, one for each state")]
 NotNegatives = Annotated[
     tuple[NotNegative, ...], Meta(min_length=1, description="a list of numbers of at least 0, one for each state")
-]
-ThreeNotNegative = Annotated[
-    tuple[NotNegative, NotNegative, NotNegative], Meta(description="three numbers of at least 0")
 ]
 Four = Annotated[tuple[float, float, float, float], Meta(description="four numbers")]
 Matrix = Annotated[tuple[Three, Three, Three], Meta(description="three rows of three numbers")]
@@ -37,12 +27,8 @@ Quantile = Annotated[float, Meta(gt=0, lt=1, description="a number between 0 and
 ABSENT: Any = None
 if TYPE_CHECKING:
     ResolvedPositive = float
-    ResolvedNotNegative = float
-    ResolvedThree = tuple[float, float, float]
 else:
     ResolvedPositive = Positive | None
-    ResolvedNotNegative = NotNegative | None
-    ResolvedThree = Three | None
 
 MOST_STEPS = 200_000  # largest number of integration steps in a run
 
