@@ -224,16 +224,8 @@ def test_simulated_loop_is_stable_beyond_the_stability_limit_of_explicit_samplin
 def test_s_of_a_spacecraft_is_accurate_to_second_order_in_the_period(hold):
     """The torque is exact for a constant eps'', but T(q) changes within the period."""
     body = rigid_body.spacecraft(FULL_INERTIA)
-    law = PrescribedTime(
-        MultiplicativeKinematics(body),
-        vector(30.0),
-        vector(3.0),
-        vector(2.0),
-        vector(1.5),
-        vector(1e-3),
-        vector(1.2),
-        implicit=True,
-    )
+    gains = (vector(v) for v in (30.0, 3.0, 2.0, 1.5, 1e-3, 1.2))
+    law = PrescribedTime(MultiplicativeKinematics(body), *gains, implicit=True)
     q = np.array([0.3, -0.2, 0.4, 0.0])
     x = rigid_body.AttitudeState(vector(np.append(q[:3], np.sqrt(1 - q @ q))), vector([0.05, -0.02, 0.04]))
     target = references.Fixed(vector([0.0, 0.0, 0.0, 1.0]))(vector(0.0))

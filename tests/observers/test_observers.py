@@ -91,7 +91,7 @@ def test_error_bound_equals_the_corrected_form_of_55():
         np.testing.assert_allclose(bound(vector(t)), expected, atol=1e-17)
 
 
-def worst_error(a, sign_pattern, c, seconds, steps=20000):
+def worst_error(a, sign_pattern, c, seconds):
     """Return the exact estimation error for constant d' = +-c with this sign pattern: A^-1 (I - E) c."""
     return np.linalg.solve(a, (np.eye(3) - expm(-a * seconds)) @ (c * sign_pattern))
 

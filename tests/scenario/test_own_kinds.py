@@ -2,6 +2,7 @@
 
 import dataclasses
 import pickle
+import shutil
 import tomllib
 from typing import Any
 
@@ -593,8 +594,7 @@ def test_a_scenario_without_gains_is_refused_before_a_search(command, here):
 @pytest.mark.long
 def test_the_command_tunes_a_custom_law(command, here, monkeypatch):
     small_search(monkeypatch)
-    text = SHORT_OWN
-    (here / "s.toml").write_text(text)
+    (here / "s.toml").write_text(SHORT_OWN)
     assert command("tune", "s.toml", "--no-figures")[0] in (0, 1)
     found = tomllib.loads((here / "out/tune-s/tuned.toml").read_text())["controller"]
     assert 2.1 <= found["eta"] <= 6.0
@@ -652,11 +652,10 @@ def test_the_first_sample_of_a_law_sees_the_initial_error(clock):
 
 
 def test_a_commented_scenario_keeps_custom_keys(command, here):
-    (here / "s.toml").write_text(f"{(ROOT / 'scenarios' / 'own_parts.toml').read_text()}")
-    for name in ("own_parts.py",):
-        (here / name).write_text((ROOT / "scenarios" / name).read_text())
-    assert command("new", "commented.toml", "--like", "s.toml", "--quiet")[0] == 0
-    first, second = (reading.complete(scenario.read(path)) for path in ("s.toml", "commented.toml"))
+    for name in ("own_parts.toml", "own_parts.py"):
+        shutil.copy(ROOT / "scenarios" / name, here)
+    assert command("new", "commented.toml", "--like", "own_parts.toml", "--quiet")[0] == 0
+    first, second = (reading.complete(scenario.read(path)) for path in ("own_parts.toml", "commented.toml"))
     assert first == second
 
 

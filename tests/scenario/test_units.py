@@ -14,7 +14,28 @@ from tests.tree import ROOT
 from tests.units import in_units, powers
 from tuning.search import gains as gain_names
 
-SATELLITES = sorted((ROOT / "benchmarks" / "satellites").glob("*.toml"))
+SATELLITES = {
+    path.stem: tomllib.loads(path.read_text()) for path in sorted((ROOT / "benchmarks" / "satellites").glob("*.toml"))
+}
+BODY = {"inertia": [10.0, 20.0, 30.0]}
+SAMPLED = {"loop": {"mode": "sampled"}}
+NORMAL = {"rate": {"kind": "normal"}, "disturbance_bias": {"kind": "normal"}}
+UNIFORM = {"rate": {"kind": "uniform"}, "disturbance_bias": {"kind": "uniform"}}
+MISSIONS = {
+    "continuous": {},
+    "sampled": SAMPLED,
+    "flexible modes": {**SAMPLED, "flexible": {}},
+    "moving reference": {**SAMPLED, "reference": {"kind": "sinusoid"}},
+    "slew": {"reference": {"kind": "slew"}, "pointing": {}},
+    "constant disturbance": {**SAMPLED, "disturbance": {"kind": "constant"}},
+    "random walk": {**SAMPLED, "disturbance": {"kind": "random_walk"}},
+    "normal dispersions": {**SAMPLED, "dispersion": NORMAL},
+    "uniform dispersions": {"dispersion": UNIFORM},
+    "outage": {**SAMPLED, "filter": {"kind": "steady_state", "bandwidth": 0.1}, "hardware": {"attitude_noise": 1e-5},
+               "dispersion": {"star_tracker_outage": {"kind": "uniform"}}},
+    "proportional-derivative law": {**SAMPLED, "controller": {"kind": "pd"}},
+    "super-twisting law": {**SAMPLED, "controller": {"kind": "super_twisting"}},
+}  # fmt: skip
 
 
 def flat(tables: Any, path: str = "") -> dict[str, Any]:
@@ -26,14 +47,23 @@ def flat(tables: Any, path: str = "") -> dict[str, Any]:
     return {path: tables}
 
 
-@pytest.mark.parametrize("path", SATELLITES, ids=lambda path: path.stem)
-@pytest.mark.parametrize(("inertia", "time"), [(4.0, 1.0), (1.0, 0.25), (0.0625, 16.0)])
-def test_other_units_rescale_every_default_and_every_bound(path, inertia, time):
+CASES = {
+    f"{name}, units of {units}": (raw, units)
+    for name, raw in SATELLITES.items()
+    for units in ((4.0, 1.0), (1.0, 0.25), (0.0625, 16.0))
+} | {
+    name: ({**tables, "spacecraft": BODY, "controller": {**tables.get("controller", {}), "t_f": 50.0}}, (0.0625, 16.0))
+    for name, tables in MISSIONS.items()
+}
+
+
+@pytest.mark.parametrize(("raw", "units"), CASES.values(), ids=CASES)
+def test_other_units_rescale_every_default_and_every_bound(raw, units):
     """Square roots of powers of 4 are exact, so values agree except for rounding in other powers."""
-    raw = {**tomllib.loads(path.read_text()), "tune": {}}
+    raw = {**raw, "tune": {}}
     here = parsing.dump(from_tables(raw))
-    there = parsing.dump(from_tables(in_units(raw, inertia, time)))
-    expected, found = flat(in_units(here, inertia, time)), flat(there)
+    there = parsing.dump(from_tables(in_units(raw, *units)))
+    expected, found = flat(in_units(here, *units)), flat(there)
     assert expected.keys() == found.keys()
     for key, value in expected.items():
         assert found[key] == (pytest.approx(value, rel=1e-12) if isinstance(value, float) else value), key
@@ -41,7 +71,7 @@ def test_other_units_rescale_every_default_and_every_bound(path, inertia, time):
 
 @pytest.mark.parametrize("law", [law for law in LAWS["spacecraft"] if law != "own"])
 def test_gains_of_every_law_scale_with_the_mission(law):
-    raw = tomllib.loads((ROOT / "benchmarks" / "satellites" / "uosat12.toml").read_text())
+    raw = SATELLITES["uosat12"]
     raw = {**raw, "controller": {"kind": law, "t_f": raw["controller"]["t_f"]}, "tune": {}}
     here, there = (from_tables(tables) for tables in (raw, in_units(raw, 4.0, 16.0)))
     units = gain_names.units_of(here)
