@@ -74,7 +74,6 @@ def test_search_interrupted_during_writing_resumes(tmp_path, force, same):
         "window error",
         work=lambda report, journal: SimpleNamespace(status=journal.get(b"asked", lambda: {}) or "met"),
         write=stopped,
-        summary=lambda _: {},
         report=lambda _: pytest.fail("there is nothing to show"),
     )
     loaded = scenario.read(tmp_path / "s.toml")
@@ -90,14 +89,13 @@ def test_interrupted_search_that_wrote_its_best_gains_resumes_without_force(tmp_
     shown = []
 
     def write(making, outcome):
-        (making / "summary.json").write_text(outcome.status)
+        store.write_json(making / "summary.json", {"status": outcome.status})
 
     search = searches.LongSearch(
         {"command": "tune", "seed": 0},
         "window error",
         work=lambda report, journal: SimpleNamespace(status="interrupted"),
         write=write,
-        summary=lambda outcome: {"status": outcome.status},
         report=lambda summary: shown.append(summary["status"]) or EMPTY,
     )
     assert searches.run(search, scenario.read(tmp_path / "s.toml"), tmp_path / "out", force=force, quiet=False) == 130
@@ -116,7 +114,6 @@ def test_new_and_stored_results_of_a_search_have_the_same_report(tmp_path):
         "window error",
         work=lambda report, journal: SimpleNamespace(status="not met"),
         write=lambda making, _: store.record(making, parsing.dump(loaded), search.known_by, said),
-        summary=lambda _: said,
         report=lambda summary: shown.append(summary) or EMPTY,
     )
     for _ in range(2):
@@ -135,7 +132,6 @@ def test_search_of_another_code_version_does_not_resume(tmp_path, capsys, status
         write=lambda making, outcome: store.record(
             making, parsing.dump(loaded), search.known_by, {"status": outcome.status}
         ),
-        summary=lambda outcome: {"status": outcome.status},
         report=lambda _: EMPTY,
     )
 

@@ -127,6 +127,7 @@ def test_every_key_of_the_plant_is_written_with_its_meaning(plant):
             wanted = {key.name: key.meaning for key in keys.of(struct) if key.name not in explained}
             assert {key_of(line) for line in lines} - {"kind", *explained} == set(wanted), (name, struct)
             assert all(meaning in text.replace("\n# ", " ") for meaning in wanted.values())
+    assert ("[unit of d" in text) == (layouts.SCENARIOS[plant].unit_of_d == keys.UNIT_OF_D)
     for metric in catalogues.CATALOGUES[plant]:  # the key of the metric itself requires a fraction of time
         assert bool(re.search(rf"\b{metric}\b", text)) == (not metric.startswith(catalogues.WITHIN)), metric
 

@@ -5,8 +5,6 @@ from typing import Any
 from ptsmc_jax.simulation.requirements import Requirement, Verdict
 from tuning.output import summaries
 
-METRIC = {"rms": 1.0, "mean": 1.0, "max": 1.0}
-
 
 def entry(verdict: Verdict, **changes: Any) -> summaries.Entry:
     """Return a verdict as it is read from a summary."""

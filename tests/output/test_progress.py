@@ -13,12 +13,6 @@ from tuning.output.progress import Lines
 from tuning.output.report import Table
 
 
-def test_line_with_count_percentage_or_neither():
-    assert progress.line("searching", 1, 7, 10.4) == "ptsmc: searching, 1 of 7, 10 s"
-    assert progress.line("searching", 7, 100, 99.0) == "ptsmc: searching, 7 %, 99 s"
-    assert progress.line("compiling", 0, 0, 99.0) == "ptsmc: compiling, 99 s"
-
-
 def test_a_line_comes_also_while_nothing_new_is_said(capsys, monkeypatch):
     """As where a law is compiled for minutes: what was said last, and how long ago the command began."""
     monkeypatch.setattr(progress, "EVERY", 0.05)

@@ -446,7 +446,6 @@ def test_missing_custom_law_is_refused_and_leaves_no_folder(command, tmp_path):
     assert (status, err.count("\n")) == (2, 1)
     assert "gone.py is not there" in err
     assert not (tmp_path / "out").exists()
-    assert not (tmp_path / "out").exists()
 
 
 def test_every_law_is_validated_once_before_the_search(command, tmp_path, monkeypatch):

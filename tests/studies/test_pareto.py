@@ -266,7 +266,7 @@ def test_interrupted_front_resumes_with_the_same_result(command, tmp_path, monke
     with monkeypatch.context() as patch:
         patch.setattr(progress.Progress, "__call__", stop)
         status, _, err = command(*run, "cut")
-    assert (status, err.splitlines()[-1]) == (130, "ptsmc: interrupted; the same command goes on from here")
+    assert (status, err.splitlines()[-1]) == (130, "ptsmc: interrupted; the same command resumes it")
     assert not (tmp_path / "cut" / "front.csv").exists()
     assert command(*run, "cut")[0] == whole
     assert (tmp_path / "cut" / "front.csv").read_text() == (tmp_path / "whole" / "front.csv").read_text()

@@ -233,7 +233,6 @@ def tune(
         objective_name(loaded.search),
         work=lambda report, journal: tuner.tune(loaded, seed, report, journal, globally=global_check),
         write=lambda making, tuning: tune_files.write(making, loaded, tuning, figures, known_by),
-        summary=tune_files.summary,
         report=lambda summary: tune_report.of(summaries.tune(summary)),
         needs=("scipy.stats", *(["ptsmc_jax.figures.study_plots"] if figures else [])),
     )
@@ -276,7 +275,6 @@ def pareto(
         "window error",
         work=lambda report, journal: fronts.trace(trade, seed, report, journal),
         write=lambda making, found: fronts.write(making, trade, found, figures, known_by),
-        summary=lambda found: found.summary(),
         report=lambda summary: front_report.of(front.read(summary)),
     )
     return searches.run(search, loaded, folder, force=force, quiet=quiet)
@@ -320,7 +318,6 @@ def compare(
         objective_name(loaded.search),
         work=lambda report, journal: comparing.compare(loaded, seed, report, journal, posed()),
         write=lambda making, comparison: comparing.write(making, loaded, comparison, figures, known_by),
-        summary=comparing.summary,
         report=lambda summary: compare_report.of(summaries.read(summaries.Compare, summary)),
         check=posed,
     )

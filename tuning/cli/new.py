@@ -101,7 +101,7 @@ class _File:
             yield from _line(live is None, "kind", kind, keys.about(struct))
         values = {**self.defaults(name, struct), **values}
         borrowed = Attitude.__struct_fields__ if name != "initial" else ()  # explained at [initial]
-        for key in keys.of(struct):
+        for key in keys.of(struct, self.resolved.unit_of_d):
             off = live is None or key.name not in live
             if f"{name}.{key.name}" in layouts.KINDS:
                 yield from self.inline(name, key, (live or {}).get(key.name, {}), layouts.KINDS[f"{name}.{key.name}"])

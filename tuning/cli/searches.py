@@ -30,8 +30,7 @@ class LongSearch:
     goal: str  # name of the objective in the progress
     work: Callable[[Progress, "Journal"], Any]  # runs the search; its result has a `status`
     write: Callable[[Path, Any], None]  # fills a result folder with a result
-    summary: Callable[[Any], dict[str, Any]]  # returns the content of summary.json
-    report: Callable[[dict[str, Any]], "Report"]  # of a summary
+    report: Callable[[dict[str, Any]], "Report"]  # of the content of summary.json
     check: Callable[[], Any] = lambda: None  # raises configuration errors that the scenario does not have
     needs: tuple[str, ...] = ()  # modules that are imported during the first steps
 
@@ -67,19 +66,23 @@ def run(search: LongSearch, loaded: "Scenario", folder: Path, *, force: bool, qu
 
     tables = parsing.dump(loaded)
     done = None if force else store.previous(folder, tables, search.known_by)
-    if done is not None and done["status"] != "interrupted":
+    earlier = done is not None and done["status"] != "interrupted"
+    if earlier:
         other = store.difference(folder, tables, store.packages())
         if other is not None:
             print(f"ptsmc: {folder} holds {other}; --force runs it again", file=sys.stderr)
-        if not quiet:
-            terminal.show(search.report(done), folder, "already done")
-        return STATUS[done["status"]]
-    with store.in_use(folder):
-        return _run(search, loaded, folder, force=force, quiet=quiet)
+    else:
+        with store.in_use(folder):
+            _run(search, loaded, folder, force=force, quiet=quiet)
+            done = store.previous(folder, tables, search.known_by)
+    assert done is not None
+    if not quiet:
+        terminal.show(search.report(done), folder, earlier=earlier)
+    return STATUS[done["status"]]
 
 
-def _run(search: LongSearch, loaded: "Scenario", folder: Path, *, force: bool, quiet: bool) -> int:
-    """Begin or resume a search in a folder that this process has locked. Returns the exit status."""
+def _run(search: LongSearch, loaded: "Scenario", folder: Path, *, force: bool, quiet: bool) -> None:
+    """Begin or resume a search in a folder that this process has locked, and write its result."""
     from ptsmc_jax.campaigns import store
     from ptsmc_jax.scenario import parsing, study
 
@@ -102,7 +105,3 @@ def _run(search: LongSearch, loaded: "Scenario", folder: Path, *, force: bool, q
         store.end(folder)
     else:
         print(f"ptsmc: interrupted; {resume_by(force)}", file=sys.stderr)
-    if not quiet:
-        summary = store.plain(search.summary(outcome))  # as an earlier result is read
-        terminal.show(search.report(summary), folder)
-    return STATUS[outcome.status]

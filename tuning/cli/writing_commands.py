@@ -10,6 +10,8 @@ from cyclopts import Parameter
 from tuning.cli.options import Quiet
 from tuning.output import terminal
 
+Overwrite = Annotated[bool, Parameter(negative="", help="Overwrite existing files.")]
+
 
 def report(
     folder: Annotated[Path, Parameter(name="DIR", help="Result folder of a command.")], /, *, quiet: Quiet = False
@@ -38,7 +40,7 @@ def new(
         str | None, Parameter(help="Kind of the plant: spacecraft, chain or system; default: spacecraft.")
     ] = None,
     like: Annotated[Path | None, Parameter(help="Scenario to start from; default: the default values.")] = None,
-    force: Annotated[bool, Parameter(negative="", help="Overwrite an existing file.")] = False,
+    force: Overwrite = False,
     quiet: Quiet = False,
 ) -> int:
     """Write a scenario file with every key, its value, unit and meaning.
@@ -61,12 +63,12 @@ def schema(
     file: Annotated[Path, Parameter(name="FILE", help="JSON Schema to write.")] = Path("scenario.schema.json"),
     /,
     *,
-    force: Annotated[bool, Parameter(negative="", help="Write over a file that is there already.")] = False,
+    force: Overwrite = False,
     quiet: Quiet = False,
 ) -> int:
     """Write the JSON Schema of scenario files, with which editors complete keys and check values.
 
-    Exit status: 0 done, 2 bad input.
+    Exit status: 0 done, 2 configuration error.
     """
     from ptsmc_jax.campaigns import store
     from ptsmc_jax.scenario.json_schema import json_schema
@@ -82,7 +84,7 @@ def examples(
     folder: Annotated[Path, Parameter(name="DIR", help="Folder for them.")] = Path("scenarios"),
     /,
     *,
-    force: Annotated[bool, Parameter(negative="", help="Overwrite existing files.")] = False,
+    force: Overwrite = False,
     quiet: Quiet = False,
 ) -> int:
     """Copy the packaged scenarios and the Python files that some of them name.

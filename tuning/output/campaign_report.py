@@ -9,9 +9,9 @@ from ptsmc_jax.numerics import statistics
 from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.catalogues import percent
 from tuning.output import pointing_report, report
-from tuning.output.formats import digits, error, listed, many, over_bound, ratio
+from tuning.output.formats import digits, listed, many, named_error
 from tuning.output.report import Block, Report, Section, Table, Text
-from tuning.output.run_report import cautions
+from tuning.output.run_report import bound, cautions
 from tuning.output.summaries import Campaign, Entry, Quantile
 
 WEAK = 0.05  # rank correlation or fraction of the variance below which an input is not named
@@ -25,18 +25,18 @@ NOTES = {
 
 def of(summary: Campaign) -> Report:
     """Return the report of a campaign."""
-    spacecraft = summary.plant == "spacecraft"
-    found = error(summary.quantiles["window_error"].rms, summary.plant)
-    first = "" if found == "-" else f"RMS {'pointing error' if spacecraft else 'error'} {found}"
+    error = summary.quantiles["window_error"].rms
+    first = named_error(error, summary.plant, "RMS ")
     headline, mood = report.headline(summary.status, summary.verdicts, first)
     driven = list(drivers(summary))
     blocks: list[Block] = [*quantiles(summary), *([Text(driven)] if driven else [])]
     sections = [
-        *report.requirements(summary.verdicts, [f"{verdict(one)}{report.distance(one)}" for one in summary.verdicts]),
+        *report.requirements(summary.verdicts, verdict),
         Section("Metrics", blocks),
         *pointing_report.sections(summary),
     ]
-    return Report(headline, mood, [*_bound(summary), *counts(summary), *cautions(summary.cautions)], sections)
+    lines = [*bound(error, summary.floor, summary.plant), *counts(summary), *cautions(summary.cautions)]
+    return Report(headline, mood, lines, sections)
 
 
 def verdict(entry: Entry) -> str:
@@ -52,12 +52,6 @@ def verdict(entry: Entry) -> str:
             failures = "as many failures" if entry.failures else "no failure"
             text += f"; {entry.fewest_trials} trials with {failures} are enough"
     return text
-
-
-def _bound(summary: Campaign) -> Iterator[str]:
-    times = over_bound(summary.quantiles["window_error"].rms, summary.floor)
-    if times is not None:
-        yield f"{ratio(times)} times the lower bound of {error(summary.floor, summary.plant)} with these sensors"
 
 
 def counts(summary: Campaign) -> Iterator[str]:

@@ -61,6 +61,20 @@ def error(value: float | None, plant: str) -> str:
     return angle(pointing(value)) if plant == "spacecraft" else valued(value, "window_error", plant)
 
 
+def error_name(plant: str) -> str:
+    """Return the name of the window error that `error` shows."""
+    return "pointing error" if plant == "spacecraft" else "error"
+
+
+def named_error(value: float | None, plant: str, statistic: str = "") -> str:
+    """Return the window error with its name, empty if there is none.
+
+    >>> named_error(1e-6, "spacecraft", "RMS "), named_error(None, "chain")
+    ('RMS pointing error 0.413 arcsec', '')
+    """
+    return "" if (text := error(value, plant)) == "-" else f"{statistic}{error_name(plant)} {text}"
+
+
 def valued(value: float, metric: str, plant: str) -> str:
     """Return a metric of this kind of plant with its unit.
 

@@ -1,6 +1,6 @@
 """The content of a result for its readers: a headline, lines, and sections. The terminal and the page render it."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -135,9 +135,10 @@ def headline(status: str, verdicts: "Sequence[Entry]", first: str = "") -> tuple
     return f"{first}: {text}" if first else text[0].upper() + text[1:], mood
 
 
-def requirements(verdicts: "Sequence[Entry]", texts: Sequence[str]) -> list[Section]:
-    """Return the section of the requirements, none without any; texts: the verdicts in words."""
-    return [Section("Requirements", [Bars(list(verdicts), list(texts))])] if verdicts else []
+def requirements(verdicts: "Sequence[Entry]", text: "Callable[[Entry], str]" = str) -> list[Section]:
+    """Return the section of the requirements, none without any; text: returns a verdict in words."""
+    texts = [f"{text(one)}{distance(one)}" for one in verdicts]
+    return [Section("Requirements", [Bars(list(verdicts), texts)])] if verdicts else []
 
 
 def nearness(entry: "Entry") -> float:

@@ -4,34 +4,37 @@ from collections.abc import Iterator
 
 from ptsmc_jax.simulation.catalogues import CATALOGUES
 from tuning.output import report
-from tuning.output.formats import digits, error, listed, over_bound, ratio
+from tuning.output.formats import digits, error, listed, named_error, over_bound, ratio
 from tuning.output.report import Report, Section, Table
 from tuning.output.summaries import Run
 
 
 def of(summary: Run, plant: str) -> Report:
     """Return the report of a run of this kind of plant."""
-    found = error(summary.metrics.get("window_error"), plant)
     status = summary.status
     if status == "ok" and summary.verdicts:
         status = "met" if all(one.met for one in summary.verdicts) else "not met"
-    first = "" if found == "-" else f"{'pointing error' if plant == 'spacecraft' else 'error'} {found}"
+    first = named_error(summary.metrics.get("window_error"), plant)
     headline, mood = report.headline(status, summary.verdicts, first)
-    texts = [f"{one}{report.distance(one)}" for one in summary.verdicts]
-    sections = [*report.requirements(summary.verdicts, texts), Section("Metrics", [metrics(summary, plant)])]
+    sections = [*report.requirements(summary.verdicts), Section("Metrics", [metrics(summary, plant)])]
     return Report(headline, mood, [*_lines(summary, plant), *cautions(summary.cautions)], sections)
 
 
 def _lines(summary: Run, plant: str) -> Iterator[str]:
     """Return the ratio to the lower bound, the reason of a failure, and the status of the samples of C code."""
-    times = over_bound(summary.metrics.get("window_error"), summary.floor)
-    if times is not None:
-        yield f"{ratio(times)} times the lower bound of {error(summary.floor, plant)} with these sensors"
+    yield from bound(summary.metrics.get("window_error"), summary.floor, plant)
     if summary.reason:
         when = "" if summary.bad_time is None else f", at {summary.bad_time:.4g} s"
         yield f"status {summary.status}: {summary.reason}{when}"
     if summary.controller_statuses:
         yield f"samples of the controller: {listed(summary.controller_statuses)}"
+
+
+def bound(value: float | None, floor: float | None, plant: str) -> Iterator[str]:
+    """Return the ratio of an error to its lower bound; nothing without a bound."""
+    times = over_bound(value, floor)
+    if times is not None:
+        yield f"{ratio(times)} times the lower bound of {error(floor, plant)} with these sensors"
 
 
 def metrics(summary: Run, plant: str) -> Table:

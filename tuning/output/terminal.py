@@ -10,13 +10,13 @@ WIDE = 1000  # columns of a file or a pipe
 UNBROKEN = 24  # largest number of columns of a cell that is never broken
 
 
-def show(report: Report, folder: Path | str, how: str = "done") -> None:
+def show(report: Report, folder: Path | str, *, earlier: bool = False) -> None:
     """Print a report without its charts and pictures.
 
     Args:
         report: of a result.
         folder: of the result.
-        how: "done", "interrupted" or "already done".
+        earlier: an earlier run wrote the result.
     """
     say(report.headline, *report.lines)
     for section in report.sections:
@@ -27,7 +27,7 @@ def show(report: Report, folder: Path | str, how: str = "done") -> None:
                 table(block)
             else:
                 say(*(block.texts if isinstance(block, Bars) else block.lines))
-    say("", f"results in {folder}" + (" (from an earlier run)" if how == "already done" else ""))
+    say("", f"results in {folder}" + (" (from an earlier run)" if earlier else ""))
 
 
 def say(*lines: str) -> None:

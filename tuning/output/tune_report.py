@@ -5,7 +5,18 @@ from collections.abc import Callable, Iterator
 
 from ptsmc_jax.simulation.catalogues import CATALOGUES, MARGINS, NO_SIGN, percent
 from tuning.output import margins_report, report
-from tuning.output.formats import digits, error, failed, interval, listed, many, over_bound, ratio
+from tuning.output.formats import (
+    digits,
+    error,
+    error_name,
+    failed,
+    interval,
+    listed,
+    many,
+    named_error,
+    over_bound,
+    ratio,
+)
 from tuning.output.report import Report, Section, Table, Text
 from tuning.output.run_report import cautions
 from tuning.output.summaries import Check, Entry, Group, Hardest, Search, Tune
@@ -21,21 +32,15 @@ PAPER = {  # columns of the published gains in words
 
 def of(summary: Tune) -> Report:
     """Return the report of a tuning."""
-    found = error(summary.fresh.number("window_error", "rms"), summary.plant)
-    first = "" if found == "-" else f"RMS {_name(summary)} {found}"
+    first = named_error(summary.fresh.number("window_error", "rms"), summary.plant, "RMS ")
     headline, mood = report.headline(summary.status, summary.verdicts, first)
-    texts = [f"{one}{report.distance(one)}" for one in summary.verdicts]
     trust = [*advice(summary), *search(summary), *diagnostics(summary), *_shortest(summary)]
     sections = [
-        *report.requirements(summary.verdicts, texts),
+        *report.requirements(summary.verdicts),
         Section("Gains", [gains(summary)]),
         Section("Can the result be trusted?", [Text(trust)]),
     ]
     return Report(headline, mood, [*accuracy(summary), *cautions(summary.cautions)], sections)
-
-
-def _name(summary: Tune) -> str:
-    return "pointing error" if summary.plant == "spacecraft" else "error"
 
 
 def _groups(summary: Tune) -> dict[str, Group]:
@@ -46,27 +51,26 @@ def _groups(summary: Tune) -> dict[str, Group]:
 
 def gains(summary: Tune) -> Table:
     """Return the table of the gains that differ, and of the results of all of them on the held-out trials."""
-    from tuning.search.gains import base, units
+    from ptsmc_jax.simulation.gains import base
 
     groups, plant = _groups(summary), summary.plant
-    rows: list[tuple[str, ...]] = []
-    gain_units = units(plant) | summary.gain_units
+    quantity, rows = error_name(plant), list[tuple[str, ...]]()
     for gain in dict.fromkeys(name for group in groups.values() for name in group.gains):
         values = [group.gains.get(gain, group.gains.get(base(gain))) for group in groups.values()]
         by_axis = gain == "observer_gain" and "observer_gain_1" in summary.fresh.gains
         if len(set(values)) > 1 and not by_axis:
-            rows.append((gain, *(digits(v, ".6g") for v in values), gain_units[base(gain)]))
+            rows.append((gain, *(digits(v, ".6g") for v in values), summary.gain_units.get(base(gain), "-")))
 
     def row(label: str, text: Callable[[Group], str], unit: str = "") -> None:
         rows.append((label, *map(text, groups.values()), unit))
 
-    row(f"RMS {_name(summary)}", lambda group: error(group.number("window_error", "rms"), plant))
+    row(f"RMS {quantity}", lambda group: error(group.number("window_error", "rms"), plant))
     if summary.fresh.floor:
         row(
             "ratio to the lower bound",
             lambda group: ratio(over_bound(group.number("window_error", "rms"), group.floor)),
         )
-    row(f"largest {_name(summary)}", lambda group: error(group.number("window_error", "max"), plant))
+    row(f"largest {quantity}", lambda group: error(group.number("window_error", "max"), plant))
     for label, metric, statistic in (
         ("mean peak torque", "peak_torque", "mean"),
         ("largest peak torque", "peak_torque", "max"),
