@@ -128,7 +128,7 @@ def test_search_of_another_code_version_does_not_resume(tmp_path, capsys, status
     search = searches.LongSearch(
         {"command": "tune", "seed": 0},
         "window error",
-        work=lambda report, journal: SimpleNamespace(status=asked.append(journal.replaying) or status),
+        work=lambda report, journal: SimpleNamespace(status=asked.append(1) or status),
         write=lambda making, outcome: store.record(
             making, parsing.dump(loaded), search.known_by, {"status": outcome.status}
         ),

@@ -97,6 +97,29 @@ class _File:
         if kind is None:
             yield from _prose(keys.about(struct))
         yield f"{'#' if live is None else ''}[{name}]"
+        yield from self.kind(name, kind, struct, live, values)
+        if issubclass(struct, Own):
+            for key in (key for key in live or () if key not in ("kind", *struct.__struct_fields__)):
+                yield from _line(False, key, values[key], "custom")
+        if issubclass(struct, Attitude) and name != "initial":
+            yield from _prose("its attitude by one of the keys of [initial]")
+        for other, alternative in kinds.items():
+            if other != kind:
+                yield ""
+                yield from self.kind(name, other, alternative, None, {})
+
+    def kind(
+        self, name: str, kind: str | None, struct: type[Table], live: dict[str, Any] | None, values: dict[str, Any]
+    ) -> Iterator[str]:
+        """Return the lines of the keys of one kind of a table.
+
+        Args:
+            name: of the table.
+            kind: its kind; None: the table has no kinds.
+            struct: of the kind.
+            live: the keys in the scenario; None: all lines are comments.
+            values: the values that the scenario states or implies.
+        """
         if kind is not None:
             yield from _line(live is None, "kind", kind, keys.about(struct))
         values = {**self.defaults(name, struct), **values}
@@ -105,25 +128,9 @@ class _File:
             off = live is None or key.name not in live
             if f"{name}.{key.name}" in layouts.KINDS:
                 yield from self.inline(name, key, (live or {}).get(key.name, {}), layouts.KINDS[f"{name}.{key.name}"])
-                continue
-            if not (off and key.name in borrowed):
+            elif not (off and key.name in borrowed):
                 value = values[key.name] if key.name in values else self.example(name, kind, key)
                 yield from _line(off, key.name, value, _meaning(key))
-        known = struct.__struct_fields__
-        if issubclass(struct, Own):
-            for key in (key for key in live or () if key not in ("kind", *known)):
-                yield from _line(False, key, values[key], "custom")
-        if issubclass(struct, Attitude) and borrowed:
-            yield from _prose("its attitude by one of the keys of [initial]")
-        for other, alternative in kinds.items():
-            if other != kind:
-                yield ""
-                yield from _line(True, "kind", other, keys.about(alternative))
-                defaults = self.defaults(name, alternative)
-                for key in keys.of(alternative, self.resolved.unit_of_d):
-                    if key.name not in borrowed:
-                        value = defaults[key.name] if key.name in defaults else self.example(name, other, key)
-                        yield from _line(True, key.name, value, _meaning(key))
 
     def dispersion(self) -> Iterator[str]:
         """Return a line for each kind of each dispersion."""

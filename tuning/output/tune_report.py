@@ -4,19 +4,8 @@ import math
 from collections.abc import Callable, Iterator
 
 from ptsmc_jax.simulation.catalogues import CATALOGUES, MARGINS, NO_SIGN, percent
-from tuning.output import margins_report, report
-from tuning.output.formats import (
-    digits,
-    error,
-    error_name,
-    failed,
-    interval,
-    listed,
-    many,
-    named_error,
-    over_bound,
-    ratio,
-)
+from tuning.output import formats, margins_report, report
+from tuning.output.formats import digits, error, failed, interval, listed, many, over_bound, ratio
 from tuning.output.report import Report, Section, Table, Text
 from tuning.output.run_report import cautions
 from tuning.output.summaries import Check, Entry, Group, Hardest, Search, Tune
@@ -32,7 +21,7 @@ PAPER = {  # columns of the published gains in words
 
 def of(summary: Tune) -> Report:
     """Return the report of a tuning."""
-    first = named_error(summary.fresh.number("window_error", "rms"), summary.plant, "RMS ")
+    first = formats.named_error(summary.fresh.number("window_error", "rms"), summary.plant, "RMS ")
     headline, mood = report.headline(summary.status, summary.verdicts, first)
     trust = [*advice(summary), *search(summary), *diagnostics(summary), *_shortest(summary)]
     sections = [
@@ -54,7 +43,7 @@ def gains(summary: Tune) -> Table:
     from ptsmc_jax.simulation.gains import base
 
     groups, plant = _groups(summary), summary.plant
-    quantity, rows = error_name(plant), list[tuple[str, ...]]()
+    quantity, rows = formats.error_name(plant), list[tuple[str, ...]]()
     for gain in dict.fromkeys(name for group in groups.values() for name in group.gains):
         values = [group.gains.get(gain, group.gains.get(base(gain))) for group in groups.values()]
         by_axis = gain == "observer_gain" and "observer_gain_1" in summary.fresh.gains

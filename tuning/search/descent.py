@@ -123,7 +123,7 @@ def descend(
     best: Best,
     start: Start,
     steps: int,
-    keep: Callable[[Sloped], None],
+    keep: Callable[[Sloped], None] = lambda _: None,
     close: float = CLOSE,
     relaxed: Relaxed | None = None,
     steepest: float = STEEPEST,

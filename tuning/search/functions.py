@@ -129,8 +129,7 @@ def minimise(
     bests = []
     for k in far_apart(order, distances(points), settings.starts):
         best = Best(points[k], 1, 0.0)
-        ignored: Callable[[Sloped], None] = lambda seen: None  # noqa: E731
-        descend(problem.sloped, best, Start(points[k]), settings.steps, ignored, settings.tolerance, steepest=np.inf)
+        descend(problem.sloped, best, Start(points[k]), settings.steps, close=settings.tolerance, steepest=np.inf)
         bests.append(best)
     ended = sorted((best for best in bests if np.isfinite(best.f)), key=lambda best: best.rank)
     if not ended:  # no gradient is finite

@@ -24,11 +24,6 @@ class Journal:
         self._earlier = deque(_records(path.read_bytes()) if path is not None and path.exists() else ())
         self._end = 0  # size of the records that were read or written, in bytes
 
-    @property
-    def replaying(self) -> bool:
-        """Whether evaluations of an earlier process remain that were not requested yet."""
-        return bool(self._earlier)
-
     def get(self, question: bytes, compute: Callable[[], Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
         """Return the recorded answer to a question, or compute and record it.
 

@@ -36,16 +36,8 @@ from tuning.studies import judging, stability, tuner
 OURS, PAPER = "prescribed_time", "paper"  # the prescribed-time law with tuned gains, and with published gains
 OFF = 0.1  # relative difference between the true inertia and the design model
 UNTOLD = ("heavier", "lighter", "later")
-KEPT = (
-    "minimise",
-    "statistic",
-    "level",
-    "torque_weight",
-    "worst_case",
-    "trials",
-    "starts",
-    "steps",
-)  # keys of `tune` that are the same for every law
+# keys of `tune` that are the same for every law
+KEPT = ("minimise", "statistic", "level", "torque_weight", "worst_case", "trials", "starts", "steps")
 
 
 @dataclass(frozen=True)
