@@ -21,8 +21,8 @@ def digits(value: float | None, form: str, none: str = "-") -> str:
 def ratio(times: float | None) -> str:
     """Return a ratio with three digits, below a million without an exponent.
 
-    >>> ratio(0.98765), ratio(1234.4), ratio(1.5e6), ratio(None)
-    ('0.988', '1234', '1.5e+06', '-')
+    >>> ratio(0.98765), ratio(999.4), ratio(999.7), ratio(1234.4), ratio(999_999.7), ratio(1.5e6), ratio(None)
+    ('0.988', '999', '1000', '1234', '1000000', '1.5e+06', '-')
     """
     return digits(times, ".0f" if times is not None and 999.5 <= times < 1e6 else ".3g")
 
@@ -32,6 +32,8 @@ def angle(value: float | None) -> str:
 
     >>> angle(1e-4), angle(0.1), angle(None)
     ('20.6 arcsec', '5.73 deg', '-')
+    >>> [angle(math.radians(arcseconds / 3600.0)) for arcseconds in (-999.4, 999.7, 3599.4, 3601.0)]
+    ['-999 arcsec', '1000 arcsec', '3599 arcsec', '1 deg']
     """
     if value is None or not math.isfinite(value):
         return "-"

@@ -311,7 +311,8 @@ class Descents:
 
     def again(self, problem: Problem) -> None:
         """Continue from the best results, with the trials that joined the problem."""
-        self._instead(problem, [(start, end.share) for start, end in _ranked(self._ends)[:AGAIN]])
+        for k, (start, end) in enumerate(_ranked(self._ends)[:AGAIN]):
+            self._descend(problem, start, Start(end.share, CAREFUL), self._steps, afresh=k == 0)
         self._finish(problem)
 
     def search_globally(self, problem: Problem, starts: int, seed: int) -> None:
@@ -331,11 +332,6 @@ class Descents:
         finally:  # also after an interrupt
             if found[0].rank <= self.best.rank:
                 self._best, self._problem, self._from, self._ends = found
-
-    def _instead(self, problem: Problem, ends: Sequence[tuple[int, np.ndarray]]) -> None:
-        """Search locally from these points, (number, normalised gains). The best result replaces the best point."""
-        for k, (start, share) in enumerate(ends):
-            self._descend(problem, start, Start(share, CAREFUL), self._steps, afresh=k == 0)
 
     def sweep(self, problem: Problem, own: np.ndarray) -> None:
         """Measure Sobol points and the scenario's gains, and take the best of them. No gradients are used.

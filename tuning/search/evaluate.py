@@ -90,10 +90,6 @@ class Evaluator:
         asked = _question(b"slopes", problem, share)
         return Sloped(**self._journal.get(asked, lambda: self._measured(self._slopes, problem, share)))
 
-    def prepare(self, problem: Problem) -> None:
-        """Compile the program without gradients in the background. A search needs it after its first steps."""
-        flights.prepare(problem.fleet)
-
     def _measured(
         self, way: Callable[[Problem, np.ndarray], dict[str, np.ndarray]], problem: Problem, share: np.ndarray
     ) -> dict[str, np.ndarray]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ptsmc_jax.simulation.requirements import Requirement
-from tuning.search import confirm
+from tuning.search import confirm, flights
 from tuning.search.descents import Descents, Step, planned
 from tuning.search.evaluate import Evaluator
 from tuning.search.evolution import NEARBY
@@ -106,7 +106,7 @@ def search(
 
     try:
         if sloped:
-            evaluate.prepare(rounds.problem)
+            flights.prepare(rounds.problem.fleet)
             prepare()
             _by_slopes(rounds, descents, own, settings, tell)
         else:

@@ -5,7 +5,6 @@ The tuned gains are compared with the published gains and with the scenario's or
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -106,26 +105,6 @@ def window_error(trials: Trials) -> tuple[float | None, tuple[float, float] | No
     """
     errors = np.asarray(trials.metrics.window_error)[trials.finished]
     return float(trust.rms(errors)) if errors.size else None, trust.interval(errors, trust.rms)
-
-
-def figures(scenario: Scenario, trials: Trials, fresh_seed: int) -> dict[str, Any]:
-    """Return the results of gains on held-out trials, as fields of `front.Point`.
-
-    Args:
-        scenario: with the gains.
-        trials: the held-out trials of these gains.
-        fresh_seed: of these trials.
-
-    Returns:
-        RMS window error and its interval, number of failed trials, and whether every requirement is met.
-    """
-    rms, interval = window_error(trials)
-    return {
-        "rms": np.nan if rms is None else rms,
-        "interval": interval,
-        "failures": int(np.sum(~trials.ok)),
-        "meets": met(verdicts_of(scenario, trials, fresh_seed), trials),
-    }
 
 
 def largest(name: str, scenario: Scenario, trials: Trials) -> float:

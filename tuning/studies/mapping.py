@@ -22,6 +22,7 @@ from ptsmc_jax.simulation.rollout import Parts
 from ptsmc_jax.theory import borders, covariance, margins, run_margins
 from tuning.errors import UsageError
 from tuning.search import trust
+from tuning.studies import judging
 
 PERIOD, DELTA = "loop.period", "controller.delta"
 WHOLE_NUMBERS = ("hardware.delay", "hardware.star_tracker_every")
@@ -216,7 +217,7 @@ def _common(parts: list[Parts]) -> Callable[[Parts], Parts]:
 
 
 def _cell(x: float, y: float, ready: Study, common: Callable[[Parts], Parts], seed: int, trials: int) -> Cell:
-    count = trials if ready.drawn else 1
+    count = judging.trials_of(ready, trials)
     parts = common(ready.parts)
     flown = montecarlo.run(parts, ready.dispersion, seed, np.arange(count))
     done, counts = flown.finished, flown.counts()

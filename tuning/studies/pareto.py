@@ -86,8 +86,10 @@ def trace(trade: Trade, seed: int, tell: Report = lambda *_: None, journal: Jour
 def _judged(trade: Trade, point: Point, tuned: Scenario, seed: int, reach: Reach | None) -> Judged:
     """Return a point with its results on the held-out trials of this seed, and these trials."""
     trials = judging.judge(tuned, seed, reach)
-    costs = trade.costs(tuned, trials, seed)
-    return replace(point, costs=costs, **judging.figures(tuned, trials, seed)), trials
+    rms, interval = judging.window_error(trials)
+    met, costs = judging.met(judging.verdicts_of(tuned, trials, seed), trials), trade.costs(tuned, trials, seed)
+    found = {"rms": np.nan if rms is None else rms, "interval": interval, "failures": int(np.sum(~trials.ok))}
+    return replace(point, costs=costs, meets=met, **found), trials
 
 
 def refined(targets: Sequence[Target], known: list[np.ndarray], posed: posing.Posed, tell: Report) -> dict[int, Best]:
