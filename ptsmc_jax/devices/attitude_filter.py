@@ -78,8 +78,7 @@ class AttitudeFilter:
             measured: measured attitude, a unit quaternion (4,).
             weight: weight of the correction [-]; 0 if there is no sample.
         """
-        error = attitude.multiply(attitude.conjugate(old.q), measured)
-        residual = jnp.where(error[3] < 0.0, -2.0, 2.0) * error[:3]
+        residual = attitude.small_rotation(old.q, measured)
         turn = self.attitude_gain * weight * residual
         q = attitude.normalise(attitude.multiply(old.q, attitude.from_rotation_vector(turn)))
         return Estimate(q, old.bias - self.bias_gain * weight * residual)

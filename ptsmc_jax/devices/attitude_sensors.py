@@ -192,8 +192,7 @@ class StarTracker(AttitudeSensor):
 
     def change(self, reading: Float[Array, "4"], other: Float[Array, "4"]) -> Float[Array, "3"]:
         """Return the small rotation (3,) [rad] about the tracker's axes from one attitude to another."""
-        error = attitude.multiply(attitude.conjugate(reading), other)
-        return jnp.where(error[3] < 0.0, -2.0, 2.0) * error[:3]
+        return attitude.small_rotation(reading, other)
 
     def sensitivity(self, q: Float[Array, "4"]) -> Float[Array, "3 3"]:
         """Return the tracker's axes in body axes (3, 3), which convert a body rotation [rad] to the tracker's axes."""

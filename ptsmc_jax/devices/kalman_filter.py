@@ -18,7 +18,7 @@ Read `kalman_filter` first, which builds the filter, then `KalmanFilter`.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -192,7 +192,7 @@ class KalmanFilter:
             gain = weight / (weight * (row @ picked(by_all)) + variance)
             change = change + gain * (difference - row @ picked(change)) * by_all
             p = p - gain * jnp.outer(by_all, by_all)
-        return self._moved(old, change)._replace(covariance=p)
+        return self.retract(old, change)._replace(covariance=p)
 
     def _when_taken(self, old: Track, sensor: AttitudeSensor, age: Scalar) -> tuple[Array, Any, Scalar]:
         """Return the estimated attitude when a reading was taken, a function for its error, and a fraction.
@@ -209,58 +209,45 @@ class KalmanFilter:
         whole, rest = sensor.times.place(age)
         fraction = rest / self.period
 
-        def at(values: Array, number: Any, first: Array | None = None) -> Array:
-            """Return the entry `number` control samples back; entry 0 is the first value, or `first` if passed."""
-            if first is not None:
-                values = jnp.concatenate([first[None], values])
-            if isinstance(number, int):
-                return values[number]
-            low = sensor.times.wait + (number is not whole)
-            return jnp.where(number == low, values[low], values[low + 1])
+        def at(values: Array, more: int = 0) -> Array:
+            """Return the entry `whole` + `more` control samples back; entry 0 is the current one."""
+            if isinstance(whole, int):
+                return values[whole + more]
+            low = sensor.times.wait + more
+            return jnp.where(whole == sensor.times.wait, values[low], values[low + 1])
 
         def picked(values: Array) -> Array:
             blocks = jnp.concatenate([values[TURN], values[9:]]).reshape(self.past + 1, 3, *values.shape[1:])
-            here = at(blocks, whole)
-            return here if sensor.times.every is not None else here + fraction * (at(blocks, whole + 1) - here)
+            here = at(blocks)
+            return here if sensor.times.every is not None else here + fraction * (at(blocks, 1) - here)
 
-        q = old.q if self.past == 0 else at(old.past_q, whole, old.q)
+        q = old.q if self.past == 0 else at(jnp.concatenate([old.q[None], old.past_q]))
         if sensor.times.every is None:
-            here, before = at(old.past_w, whole, old.w), at(old.past_w, whole + 1, old.w)
+            rates = jnp.concatenate([old.w[None], old.past_w])
+            here, before = at(rates), at(rates, 1)
             turn = rest * here - rest * fraction / 2 * (here - before)
             q = attitude.multiply(q, attitude.from_rotation_vector(-turn))
         return q, picked, fraction
 
-    @staticmethod
-    def _moved(old: Track, change: Array) -> Track:
-        """Return the state with its estimate changed by estimated errors (errors,)."""
+    def retract(self, track: Track, by: Float[Array, " n"]) -> Track:
+        """Return the state with its estimate changed by local coordinates (9 + 3 past,), the errors of the filter."""
 
         def turned(q: Array, turn: Array) -> Array:
             return attitude.normalise(attitude.multiply(q, attitude.from_rotation_vector(turn)))
 
-        past_q = old.past_q
+        past_q = track.past_q
         if past_q is not None:
-            past_q = jax.vmap(turned)(past_q, change[9:].reshape(-1, 3))
-        return old._replace(
-            q=turned(old.q, change[TURN]),
-            bias=old.bias + change[BIAS],
-            rate=old.rate - change[NOISE],
-            past_q=past_q,
-        )
+            past_q = jax.vmap(turned)(past_q, by[9:].reshape(-1, 3))
+        q, bias, rate = turned(track.q, by[TURN]), track.bias + by[BIAS], track.rate - by[NOISE]
+        return track._replace(q=q, bias=bias, rate=rate, past_q=past_q)
 
     def in_step(self) -> "KalmanFilter":
         """Return the filter for sensors that all read at control samples, for linear theory."""
         return replace(self, sensors=tuple(sensor.in_step() for sensor in self.sensors))
 
-    def retract(self, track: Track, by: Float[Array, " n"]) -> Track:
-        """Return the state with estimates changed by local coordinates (9 + 3 past,), and the same covariance."""
-        return self._moved(track, by)
-
     def local_coordinates(self, track: Track, other: Track) -> Float[Array, " n"]:
         """Return local coordinates (9 + 3 past,) [rad, rad/s] of a state near another one, to first order."""
-
-        def turn(q: Array, near: Array) -> Array:
-            return 2.0 * attitude.multiply(attitude.conjugate(q), near)[:3]
-
+        turn = attitude.small_rotation
         past = [] if track.past_q is None else [jax.vmap(turn)(track.past_q, other.past_q).reshape(-1)]
         return jnp.concatenate([turn(track.q, other.q), other.bias - track.bias, track.rate - other.rate, *past])
 
@@ -325,7 +312,7 @@ def _steady_state(found: KalmanFilter) -> np.ndarray:
         move[9:12, TURN] = np.eye(3)
         move[12:, 9:-3] = np.eye(size - 12)
     predicted = _Element(move, grown, np.zeros((size, size)))
-    corrected = [list(_corrections(found, number)) for number in range(1, count + 1)]
+    corrected = _corrections(found, count)
     cycle = _Element(one, np.zeros((size, size)), np.zeros((size, size)))
     for updates in corrected:
         cycle = cycle.then(predicted)
@@ -344,23 +331,24 @@ def _steady_state(found: KalmanFilter) -> np.ndarray:
     return factors
 
 
-def _corrections(found: KalmanFilter, number: int) -> Iterator[np.ndarray]:
-    """Yield the information (errors, errors) of each reading that is due at a control sample, at rest at q = 1."""
-    sample, size = jnp.asarray(number), 9 + 3 * found.past
-    q = jnp.array([0.0, 0.0, 0.0, 1.0])
+def _corrections(found: KalmanFilter, count: int) -> list[list[np.ndarray]]:
+    """Return the information (errors, errors) of the readings due at each control sample 1 .. count, at rest."""
+    numbers, size = jnp.arange(1, count + 1), 9 + 3 * found.past
+    places = [TURN, *(slice(k, k + 3) for k in range(9, size, 3))]
+    corrected: list[list[np.ndarray]] = [[] for _ in range(count)]
     for sensor in found.sensors:
-        if not bool(sensor.times.due(sample)):
-            continue
-        whole, rest = sensor.times.place(jnp.asarray(sensor.times.age(sample)))
-        fraction = float(rest / found.period)
-        rows = np.zeros((len(sensor.noise), size))
-        axes, places = np.asarray(sensor.sensitivity(q)), [TURN, *(slice(k, k + 3) for k in range(9, size, 3))]
-        rows[:, places[int(whole)]] = (1.0 - fraction) * axes
-        if fraction > 0.0:
-            rows[:, places[int(whole) + 1]] = fraction * axes
-        lost = (float(found.period) * fraction * (1.0 - fraction)) ** 2 / 2
-        variance = np.asarray(sensor.noise) ** 2 + lost * np.sum((axes * np.asarray(found.rate_noise)) ** 2, axis=1)
-        yield rows.T @ (rows / variance[:, None])
+        axes = np.asarray(sensor.sensitivity(jnp.array([0.0, 0.0, 0.0, 1.0])))
+        whole, rest = sensor.times.place(sensor.times.age(numbers))
+        whole, fractions = (np.broadcast_to(v, count) for v in (whole, np.asarray(rest) / np.asarray(found.period)))
+        for k in np.flatnonzero(sensor.times.due(numbers)):
+            fraction, rows = float(fractions[k]), np.zeros((len(sensor.noise), size))
+            rows[:, places[whole[k]]] = (1.0 - fraction) * axes
+            if fraction > 0.0:
+                rows[:, places[whole[k] + 1]] = fraction * axes
+            lost = (float(found.period) * fraction * (1.0 - fraction)) ** 2 / 2
+            variance = np.asarray(sensor.noise) ** 2 + lost * np.sum((axes * np.asarray(found.rate_noise)) ** 2, axis=1)
+            corrected[k].append(rows.T @ (rows / variance[:, None]))
+    return corrected
 
 
 def _factor(covariance: np.ndarray) -> np.ndarray:

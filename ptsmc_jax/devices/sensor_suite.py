@@ -13,9 +13,9 @@ from jaxtyping import Array, Float
 
 from ptsmc_jax.devices.attitude_sensors import AttitudeSensor
 from ptsmc_jax.devices.kalman_filter import KalmanFilter, Track
-from ptsmc_jax.devices.sensors import BIAS_WALK, FILTER_START, RATE_BIAS, RATE_NOISE, Reading, Sensor
+from ptsmc_jax.devices.sensors import ATTITUDE_AND_BIAS, RATE_NOISE, Reading, SpacecraftSensors
 from ptsmc_jax.devices.ticks import Ticks
-from ptsmc_jax.numerics import draws, guards
+from ptsmc_jax.numerics import guards
 from ptsmc_jax.numerics.draws import WholeNumber
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
 from ptsmc_jax.plants.rigid_body import AttitudeState
@@ -48,7 +48,7 @@ class SuiteMemory(NamedTuple):
 
 @pytree
 @dataclass(frozen=True, kw_only=True)
-class SensorSuite(Sensor):
+class SensorSuite(SpacecraftSensors):
     """Attitude sensors and a gyro. The law sees the attitude [-] and the rate [rad/s] that the filter estimates."""
 
     sensors: tuple[AttitudeSensor, ...]
@@ -73,37 +73,18 @@ class SensorSuite(Sensor):
         clocks = (None if sensor.times.every is not None else sensor.times for sensor in self.sensors)
         return tuple(None if times is None else times.taken_ago(sample, dt) for times in clocks)
 
-    def keys(self, seed: WholeNumber, trial: WholeNumber) -> Any:
-        """Return the random keys of a trial: noise of each attitude sensor, gyro noise, gyro drift."""
-        if self.noise_free:
-            return None
-        names = [f"{sensor.name}_noise" for sensor in self.sensors]
-        return tuple(draws.streams(seed, trial, [*names, RATE_NOISE, BIAS_WALK]))
-
-    def noise(self, keys: Any, sample: Array) -> tuple[Array, ...]:
-        """Return the noise of one sample: of each attitude sensor (m,), of the gyro (3,) [rad/s]."""
-        sigmas = (*(sensor.noise for sensor in self.sensors), self.rate_noise)
-        if keys is None:
-            return tuple(map(jnp.zeros_like, sigmas))
-        return tuple(s * draws.normals(key, s.shape[-1], sample) for s, key in zip(sigmas, keys, strict=False))
-
-    def first_bias(self, seed: WholeNumber, trial: WholeNumber) -> Float[Array, "3"]:
-        """Return the bias of the gyro at the first sample (3,) [rad/s]."""
-        if self.given_bias is not None:
-            return self.given_bias
-        return self.rate_bias * draws.normals(draws.stream(seed, trial, RATE_BIAS), 3)
-
-    def drawn(self, seed: WholeNumber, trial: WholeNumber) -> dict[str, Array]:
-        """Return the bias of the gyro at the first sample [rad/s]."""
-        bias = self.first_bias(seed, trial)
-        return {f"{RATE_BIAS}_{k + 1}": bias[k] for k in range(3)}
+    @property
+    def noises(self) -> list[tuple[str, Leaf, int]]:
+        """Return the noise of each attitude sensor, and of the gyro [rad/s]; see `SpacecraftSensors.noises`."""
+        each = [(f"{sensor.name}_noise", sensor.noise, sensor.noise.shape[-1]) for sensor in self.sensors]
+        return [*each, (RATE_NOISE, self.rate_noise, 3)]
 
     def begin(self, seed: WholeNumber, trial: WholeNumber, x0: AttitudeState, now: Ticks) -> SuiteMemory:
         """Return the memory before the first sample of positive length. No delayed reading is pending."""
         keys = self.keys(seed, trial)
         bias = jnp.zeros(3) if self.noise_free else self.first_bias(seed, trial)
-        normals = jnp.zeros(6) if self.noise_free else draws.normals(draws.stream(seed, trial, FILTER_START), 6)
-        estimate = self.filter.begin(x0.q, bias, x0.w, normals, now.sample, now.noise_weight)
+        errors = self.filter_errors(seed, trial)
+        estimate = self.filter.begin(x0.q, bias, x0.w, errors, now.sample, now.noise_weight)
         waiting = []
         for sensor in self.sensors:
             count, reading = sensor.times.queue, sensor.read(x0.q)
@@ -116,17 +97,14 @@ class SensorSuite(Sensor):
         """Return the readings at a sample, and the memory; see `Sensor.measure` for the arguments."""
         noise_next = self.noise(memory.keys, now.sample + 1)
         *noises, shift = guards.lerp(now.noise_weight, memory.noise, noise_next)
-        bias = memory.bias
-        if memory.keys is not None:
-            bias = bias + self.bias_rate * dt * draws.normals(memory.keys[-1], 3, now.sample)
-        rate = (x.w if self.rate_scale is None else self.rate_scale * x.w) + shift + bias
+        rate, bias = self.gyro_sample(memory, x.w, shift, now, dt)
         delivered, ages, waiting = [], [], []
         for k, (sensor, noise) in enumerate(zip(self.sensors, noises, strict=True)):
             seen = x if star_x is None or star_x[k] is None else star_x[k]
             weight = jnp.where(sensor.times.taken(now.sample), now.noise_weight, 0.0)
-            if k == 0 and self.outage is not None:
+            if k == 0:
                 t = now.t if sensor.times.every is not None else now.t - sensor.times.taken_ago(now.sample, dt)
-                weight = jnp.where((t >= self.outage[0]) & (t < self.outage[1]), 0.0, weight)
+                weight = self.outside_outage(weight, t)
             age = jnp.asarray(sensor.times.age(now.sample), float)
             new, queue = _passed(
                 Delivery(sensor.changed(sensor.read(seen.q), noise), weight), memory.waiting[k], sensor, now, age
@@ -182,13 +160,12 @@ class SensorSuite(Sensor):
             sample: number of the first control sample.
             share: its weight, see `KalmanFilter.begin`.
         """
-        one, zero, still = np.eye(3), np.zeros((3, 3)), jnp.array([0.0, 0.0, 0.0, 1.0])
-        scale = one if self.rate_scale is None else np.diag(np.asarray(self.rate_scale))
-        axes = [np.asarray(sensor.sensitivity(still)) for sensor in self.sensors]
-        rows = np.vstack([*(np.hstack([v, np.zeros((len(v), 6))]) for v in axes), np.hstack([zero, scale, one])])
-        noise = np.concatenate([np.asarray(sigma) for sigma in (*(s.noise for s in self.sensors), self.rate_noise)])
+        still = jnp.array([0.0, 0.0, 0.0, 1.0])
+        axes = [np.pad(sensor.sensitivity(still), ((0, 0), (0, 6))) for sensor in self.sensors]
+        rows = np.vstack([*axes, self.gyro_rows()])
+        noise = np.concatenate([sigma for _, sigma, _ in self.noises])
         early = self._each([sensor.times.every is None for sensor in self.sensors], False)
-        start = np.block([[one, zero, zero], [zero, zero, one]]), np.asarray(self.filter.first_factor(sample, share))
+        start = ATTITUDE_AND_BIAS, np.asarray(self.filter.first_factor(sample, share))
         return Reading(rows, noise, np.asarray(self.rate_bias), np.asarray(self.bias_rate), start, early)
 
     def change(self, x: AttitudeState, near: AttitudeState, taken: Any = None, near_taken: Any = None) -> Array:

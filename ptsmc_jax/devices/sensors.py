@@ -27,6 +27,7 @@ from ptsmc_jax.plants.rigid_body import AttitudeState
 
 ATTITUDE_NOISE, RATE_NOISE, STATE_NOISE = "attitude_noise", "rate_noise", "state_noise"
 RATE_BIAS, BIAS_WALK, FILTER_START = "rate_bias", "rate_bias_walk", "filter_start"
+ATTITUDE_AND_BIAS = np.eye(9)[np.r_[0:3, 6:9]]  # rows of `Reading.start` for a filter's errors of attitude and bias
 
 
 class Sensor(ABC):
@@ -141,16 +142,93 @@ class Reading(NamedTuple):
 class Memory(NamedTuple):
     """Memory of `Sensors` between samples."""
 
-    keys: tuple[draws.Key, draws.Key, draws.Key] | None  # see `Sensors.keys`; None without noise
-    noise: tuple[Array, Array]  # noise of the next sample
+    keys: tuple[draws.Key, ...] | None  # see `Sensors.keys`; None without noise
+    noise: tuple[Array, ...]  # noise of the next sample
     bias: Any  # (3,) gyro bias [rad/s]; None without bias
     estimate: Any  # `Estimate`; None without a filter
     rate: Any  # (3,) last measured rate [rad/s]; None without a filter
 
 
+class SpacecraftSensors(Sensor):
+    """Base class of attitude sensors with a gyro. Derived classes declare the fields, each described there."""
+
+    rate_bias: Any
+    bias_rate: Any
+    given_bias: Any
+    rate_scale: Any
+    outage: Any
+    noise_free: bool
+
+    @property
+    def noises(self) -> list[tuple[str, Leaf, int]]:
+        """Return the stream, the 1 sigma and the number of components of each white noise, the gyro's last."""
+        raise NotImplementedError
+
+    def keys(self, seed: WholeNumber, trial: WholeNumber) -> tuple[draws.Key, ...] | None:
+        """Return the random keys of a trial for each of `noises` and for the bias drift, or None without noise."""
+        if self.noise_free:
+            return None
+        return tuple(draws.streams(seed, trial, [*(name for name, _, _ in self.noises), BIAS_WALK]))
+
+    def noise(self, keys: tuple[draws.Key, ...] | None, sample: Int[Array, ""]) -> tuple[Array, ...]:
+        """Return each of `noises` at one sample, in its unit; that of the gyro is (3,) [rad/s]."""
+        if keys is None:
+            return tuple(jnp.zeros(size) for _, _, size in self.noises)
+        each = zip(self.noises, keys, strict=False)
+        return tuple(sigma * draws.normals(key, size, sample) for (_, sigma, size), key in each)
+
+    def first_bias(self, seed: WholeNumber, trial: WholeNumber) -> Float[Array, "3"]:
+        """Return the gyro bias at the first sample, (3,) [rad/s]."""
+        if self.given_bias is not None:
+            return self.given_bias
+        if self.rate_bias is None:
+            return jnp.zeros(3)
+        return self.rate_bias * draws.normals(draws.stream(seed, trial, RATE_BIAS), 3)
+
+    def drawn(self, seed: WholeNumber, trial: WholeNumber) -> dict[str, Array]:
+        """Return the gyro bias at the first sample [rad/s]."""
+        if self.rate_bias is None and self.given_bias is None:
+            return {}
+        bias = self.first_bias(seed, trial)
+        return {f"{RATE_BIAS}_{k + 1}": bias[k] for k in range(3)}
+
+    def filter_errors(self, seed: WholeNumber, trial: WholeNumber) -> Float[Array, "6"]:
+        """Return standard normal numbers for the initial errors of the filter (6,), or zeros without noise."""
+        return jnp.zeros(6) if self.noise_free else draws.normals(draws.stream(seed, trial, FILTER_START), 6)
+
+    def gyro_sample(
+        self, memory: Any, w: Float[Array, "3"], noise: Float[Array, "3"], now: Ticks, dt: Scalar
+    ) -> tuple[Float[Array, "3"], Any]:
+        """Return the gyro sample (3,) [rad/s], and the gyro bias (3,) [rad/s] or None.
+
+        Args:
+            memory: memory of the sensors, with `keys` and `bias`.
+            w: true body rate (3,) [rad/s].
+            noise: noise of the sample (3,) [rad/s].
+            now: the control period that the sample begins.
+            dt: length of the period just ended [s].
+        """
+        bias = memory.bias
+        if self.bias_rate is not None and memory.keys is not None:
+            bias = bias + self.bias_rate * dt * draws.normals(memory.keys[-1], 3, now.sample)
+        rate = (w if self.rate_scale is None else self.rate_scale * w) + noise
+        return rate if bias is None else rate + bias, bias
+
+    def gyro_rows(self) -> np.ndarray:
+        """Return the derivatives (3, 9) of a gyro sample by rotation, rate and gyro bias."""
+        scale = np.ones(3) if self.rate_scale is None else np.asarray(self.rate_scale)
+        return np.hstack([np.zeros((3, 3)), np.diag(scale), np.eye(3)])
+
+    def outside_outage(self, weight: Scalar, t: Scalar) -> Scalar:
+        """Return the weight of a reading taken at t [s], or 0 in the outage."""
+        if self.outage is None:
+            return weight
+        return jnp.where((t >= self.outage[0]) & (t < self.outage[1]), 0.0, weight)
+
+
 @pytree
 @dataclass(frozen=True)
-class Sensors(Sensor):
+class Sensors(SpacecraftSensors):
     """Star tracker [rad] and gyro [rad/s] sampled once a period, white noise, independent per axis and sample.
 
     Without a filter the law receives the samples. With a filter it receives the filter's attitude, and the gyro's rate
@@ -192,29 +270,10 @@ class Sensors(Sensor):
         interval = period * self.every if self.own_times is None else self.own_times.interval
         return -0.5 * jnp.log1p(-self.filter.attitude_gain) / interval
 
-    def keys(self, seed: WholeNumber, trial: WholeNumber) -> tuple[draws.Key, draws.Key, draws.Key] | None:
-        """Return the random keys of a trial for attitude noise, rate noise and bias drift, or None without noise."""
-        if self.noise_free:
-            return None
-        attitude, rate, walk = draws.streams(seed, trial, (ATTITUDE_NOISE, RATE_NOISE, BIAS_WALK))
-        return attitude, rate, walk
-
-    def noise(self, keys: tuple | None, sample: Int[Array, ""]) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-        """Return attitude noise [rad] and rate noise [rad/s] of one sample, (3,) each."""
-        if keys is None:
-            return jnp.zeros(3), jnp.zeros(3)
-        return (
-            self.attitude_noise * draws.normals(keys[0], 3, sample),
-            self.rate_noise * draws.normals(keys[1], 3, sample),
-        )
-
-    def first_bias(self, seed: WholeNumber, trial: WholeNumber) -> Float[Array, "3"]:
-        """Return the gyro bias at the first sample, (3,) [rad/s]."""
-        if self.given_bias is not None:
-            return self.given_bias
-        if self.rate_bias is None:
-            return jnp.zeros(3)
-        return self.rate_bias * draws.normals(draws.stream(seed, trial, RATE_BIAS), 3)
+    @property
+    def noises(self) -> list[tuple[str, Leaf, int]]:
+        """Return the noise of the attitude [rad] and of the gyro [rad/s]; see `SpacecraftSensors.noises`."""
+        return [(ATTITUDE_NOISE, self.attitude_noise, 3), (RATE_NOISE, self.rate_noise, 3)]
 
     def begin(self, seed: WholeNumber, trial: WholeNumber, x0: AttitudeState, now: Ticks) -> Memory:
         """Return the memory before the first sample; see `Sensor.begin`."""
@@ -222,10 +281,8 @@ class Sensors(Sensor):
         if any(source is not None for source in (self.rate_bias, self.bias_rate, self.given_bias)):
             bias = self.first_bias(seed, trial)
         if self.filter is not None:
-            drawn = not self.noise_free
-            normals = draws.normals(draws.stream(seed, trial, FILTER_START), 6) if drawn else jnp.zeros(6)
-            true_bias = jnp.zeros(3) if bias is None else bias
-            estimate = self.filter.begin(self.star_attitude(x0.q), true_bias, normals, now.sample, now.noise_weight)
+            true_bias, errors = jnp.zeros(3) if bias is None else bias, self.filter_errors(seed, trial)
+            estimate = self.filter.begin(self.star_attitude(x0.q), true_bias, errors, now.sample, now.noise_weight)
         return Memory(keys, self.noise(keys, now.sample), bias, estimate, None if estimate is None else x0.w)
 
     def sample(
@@ -234,12 +291,7 @@ class Sensors(Sensor):
         """Return the attitude and rate that star tracker and gyro measure, and the memory."""
         noise_next = self.noise(memory.keys, now.sample + 1)
         turn, shift = guards.lerp(now.noise_weight, memory.noise, noise_next)
-        bias = memory.bias
-        if self.bias_rate is not None and memory.keys is not None:
-            bias = bias + self.bias_rate * dt * draws.normals(memory.keys[2], 3, now.sample)
-        w = jnp.add(x.w if self.rate_scale is None else self.rate_scale * x.w, shift)
-        if bias is not None:
-            w = w + bias
+        w, bias = self.gyro_sample(memory, x.w, shift, now, dt)
         q = self.star_attitude(x.q if star_x is None else star_x.q)
         if not self.noise_free:
             q = attitude.multiply(q, attitude.from_rotation_vector(turn))
@@ -250,10 +302,7 @@ class Sensors(Sensor):
         due, t = now.sample % self.every == 0, now.t
         if self.own_times is not None:
             due, t = self.own_times.due(now.sample), now.t - self.own_times.age(now.sample)
-        weight = jnp.where(due, now.noise_weight, 0.0)
-        if self.outage is not None:
-            weight = jnp.where((t >= self.outage[0]) & (t < self.outage[1]), 0.0, weight)
-        return weight
+        return self.outside_outage(jnp.where(due, now.noise_weight, 0.0), t)
 
     def taken_ago(self, sample: Int[Array, ""], dt: Scalar) -> Scalar | None:
         """Return the age of the star tracker's newest measurement at a sample [s], at most dt [s].
@@ -302,13 +351,6 @@ class Sensors(Sensor):
         quiet = replace(self, attitude_noise=zero, rate_noise=zero, filter=exact, noise_free=True)
         return replace(quiet, rate_bias=None, bias_rate=None, given_bias=None)
 
-    def drawn(self, seed: WholeNumber, trial: WholeNumber) -> dict[str, Array]:
-        """Return the gyro bias at the first sample [rad/s]."""
-        if self.rate_bias is None and self.given_bias is None:
-            return {}
-        bias = self.first_bias(seed, trial)
-        return {f"{RATE_BIAS}_{k + 1}": bias[k] for k in range(3)}
-
     def retract(self, memory: Memory, by: Float[Array, " n"]) -> Memory:
         """Return the memory at local coordinates (n,) relative to another memory.
 
@@ -324,7 +366,7 @@ class Sensors(Sensor):
         """Return local coordinates (n,) [rad, rad/s] of another memory relative to a memory, to first order."""
         if memory.estimate is None or other.estimate is None:
             return jnp.zeros(0)
-        turn = 2.0 * attitude.multiply(attitude.conjugate(memory.estimate.q), other.estimate.q)[:3]
+        turn = attitude.small_rotation(memory.estimate.q, other.estimate.q)
         return jnp.concatenate([turn, other.estimate.bias - memory.estimate.bias, other.rate - memory.rate])
 
     def reading(self, sample: int = 0, share: float = 1.0) -> Reading:
@@ -334,17 +376,15 @@ class Sensors(Sensor):
             sample: number of the first control sample.
             share: its weight, see `AttitudeFilter.begin`.
         """
-        one, zero = np.eye(3), np.zeros((3, 3))
         star, gyro = (float(v) for v in (self.attitude_noise, self.rate_noise))
         bias, drift = (0.0 if v is None else float(v) for v in (self.rate_bias, self.bias_rate))
-        scale = one if self.rate_scale is None else np.diag(np.asarray(self.rate_scale))
         start = early = None
         if self.filter is not None:
             root = np.asarray(self.filter.first_spread(sample, jnp.asarray(share)))
-            start = np.block([[one, zero, zero], [zero, zero, one]]), np.kron(root, one)
+            start = ATTITUDE_AND_BIAS, np.kron(root, np.eye(3))
         if self.own_times is not None:
             early = np.repeat([True, False], 3)
-        rows, noise = np.block([[one, zero, zero], [zero, scale, one]]), np.repeat([star, gyro], 3)
+        rows, noise = np.vstack([np.eye(3, 9), self.gyro_rows()]), np.repeat([star, gyro], 3)
         return Reading(rows, noise, np.full(3, bias), np.full(3, drift), start, early)
 
     def available(self, now: Ticks) -> np.ndarray:

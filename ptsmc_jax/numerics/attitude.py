@@ -159,6 +159,12 @@ def rotation_vector(v: Vector) -> Vector:
     return v * jnp.where(small, series, 2.0 * elementary.arctan2(size, scalar) / size)
 
 
+def small_rotation(q: Quaternion, other: Quaternion) -> Vector:
+    """Return the small rotation [rad] in body axes from one attitude to another, to first order."""
+    error = multiply(conjugate(q), other)
+    return jnp.where(error[3] < 0.0, -2.0, 2.0) * error[:3]
+
+
 @jax.jit
 def angle(q: Quaternion, reference: Quaternion) -> Float[Array, ""]:
     """Angle of the rotation from one attitude to another, 0 to pi [rad]. Small angles are accurate.

@@ -43,7 +43,7 @@ def paths_of(parts: Parts) -> dict[str, str]:
     observer |= {f"observer_{name}": f"observer.{name}" for name in parts.observer.tunable}
     own_sensors = getattr(parts.sensors, "own", None)
     devices = {f"sensors_{name}": f"sensors.own.{name}" for name in getattr(own_sensors, "tunable", ())}
-    if getattr(parts.sensors, "filter", None) is not None:
+    if hasattr(parts.sensors, "with_bandwidth") and parts.sensors.filter is not None:  # a Kalman filter has no gains
         devices["filter_bandwidth"] = BANDWIDTH
     if parts.command_filter is not None:
         devices["command_corner"] = "command_filter.corner"

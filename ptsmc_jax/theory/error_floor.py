@@ -87,18 +87,17 @@ def along_each(runs: Sequence[tuple[Parts, Log]]) -> list[Floor]:
         sizes = _unknown(_together([*models.values()]), delay)
         for number, k in enumerate(models):
             squares[k] = np.sum(sizes[:, number].reshape(len(sizes), 3, -1) ** 2, axis=2)
-    return [_floor(parts, ticks, of_run) for (parts, ticks, _), of_run in zip(lasting, squares, strict=True)]
+    # `squares` are mean squares of the error at the start, in the middle and at the end of each period
+    return [
+        Floor(window_error(parts, ticks, of_run), np.asarray(ticks.t_next), np.sqrt(of_run[:, 2]))
+        for (parts, ticks, _), of_run in zip(lasting, squares, strict=True)
+    ]
 
 
 def _together(models: Sequence[Model]) -> Model:
     """Return the models of several runs as one model."""
     start, *others = zip(*models, strict=True)
     return Model(np.stack(start), *(np.stack(some, axis=1) for some in others))
-
-
-def _floor(parts: Parts, ticks: Ticks, squares: np.ndarray) -> Floor:
-    """Return the bound from mean squares of the error (periods, 3) at start, middle and end of each period."""
-    return Floor(window_error(parts, ticks, squares), np.asarray(ticks.t_next), np.sqrt(squares[:, 2]))
 
 
 def window_error(parts: Parts, ticks: Ticks, squares: np.ndarray) -> float:

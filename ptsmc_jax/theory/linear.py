@@ -126,7 +126,6 @@ def _computed(
 
 def _acted(
     parts: Parts,
-    period: Period,
     carry: Carry,
     w: Array,
     commands: Sequence[tuple[Array, Scalar, Scalar]],
@@ -138,7 +137,6 @@ def _acted(
 
     Args:
         parts: the scenario.
-        period: the control period.
         carry: the loop at the sample.
         w: body rate that the flight computer knows, (m,) [rad/s].
         commands: each command (m,) [N m], the time when it begins to act [s], and how long it acts [s].
@@ -192,7 +190,7 @@ def opened(parts: Parts, during: Nominal, *, late: bool = True) -> Opened:
         carry = here.retract(z)
         seen = parts.observer.model.retract(plant.visible(before.x), seen)
         decision, computer, model = _computed(parts, k2, period, carry, seen)
-        x, acting = _acted(parts, period, carry, decision.w, [(arriving + new, now.t, dt)], d)
+        x, acting = _acted(parts, carry, decision.w, [(arriving + new, now.t, dt)], d)
         sent = decision.u
         if parts.actuators.delay:
             sent, _ = parts.actuators.send(carry.acting, decision.u, decision.w)
@@ -202,7 +200,7 @@ def opened(parts: Parts, during: Nominal, *, late: bool = True) -> Opened:
         def ended(old: Array, new: Array) -> Array:
             from_then_on = (arriving + new, now.t + part * dt, (1.0 - part) * dt)
             commands = [(arriving + old, now.t, part * dt), from_then_on]
-            x, acting = _acted(parts, period, before, plant.velocity(after.computer.seen), commands)
+            x, acting = _acted(parts, before, plant.velocity(after.computer.seen), commands)
             return there.local_coordinates(after._replace(x=x, acting=acting))
 
         return jax.jacfwd(ended, argnums=(0, 1))(u0, u0)

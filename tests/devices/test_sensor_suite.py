@@ -14,8 +14,9 @@ from ptsmc_jax.devices import attitude_sensors
 from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.numerics import attitude
 from ptsmc_jax.plants.rigid_body import AttitudeState
+from ptsmc_jax.simulation import gains
 from tests import suites
-from tests.helpers import equations, vector
+from tests.helpers import equations, parts, vector
 
 H = 0.1  # control period [s]
 RATE = np.array([0.02, -0.03, 0.05])  # [rad/s], constant, so that the filter propagates it exactly
@@ -213,3 +214,10 @@ def test_a_sensor_without_noise_raises_an_error():
     tracker = suites.star_tracker(0, H, 0.0, H)
     with pytest.raises(ValueError, match="noise greater than 0"):
         suites.suite([dataclasses.replace(tracker, noise=vector([1e-5, 1e-5, 0.0]))], H)
+
+
+def test_the_kalman_filter_of_a_suite_is_no_gain_of_the_parts():
+    made = dataclasses.replace(parts(), sensors=suites.two_star_trackers(H))
+    assert "filter_bandwidth" not in gains.gains_of(made)
+    with pytest.raises(ValueError, match="filter_bandwidth is no gain of these parts"):
+        gains.with_gains(made, {"filter_bandwidth": 0.3})

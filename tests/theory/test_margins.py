@@ -205,7 +205,7 @@ def _flown(parts, run, index, gain, late):
         new = sent[whole + delay, axes]
         old = jnp.where(late > 0.0, sent[whole + delay + 1, axes], new)
         spans = [(old, now.t, part * dt), (new, now.t + part * dt, (1.0 - part) * dt)]
-        x, acting = linear._acted(parts, period, carry, decision.w, spans)
+        x, acting = linear._acted(parts, carry, decision.w, spans)
         size = jnp.linalg.norm(parts.plant.local_coordinates(carry_0.x, x))
         return (linear.Carry(x, acting, computer, model), sent), jnp.log(size)
 
