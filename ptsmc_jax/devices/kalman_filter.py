@@ -28,6 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ptsmc_jax import programs
 from ptsmc_jax.devices.attitude_filter import rotation_over
 from ptsmc_jax.devices.attitude_sensors import AttitudeSensor
 from ptsmc_jax.numerics import attitude, guards
@@ -302,8 +303,7 @@ def _steady_state(found: KalmanFilter) -> np.ndarray:
     """
     count = min(math.lcm(*(sensor.times.cycle for sensor in found.sensors)), LONGEST)
     size, one = 9 + 3 * found.past, np.eye(9 + 3 * found.past)
-    step = jax.jit(lambda p: found._propagated(p, jnp.array([0.0, 0.0, 0.0, 1.0]), found.period))
-    grown = np.asarray(step(jnp.zeros((size, size))))
+    grown = np.asarray(_grown(found))
     half = float(found.period) / 2
     move = np.zeros((size, size))
     move[TURN, :9] = np.hstack([np.eye(3), -2 * half * np.eye(3), -half * np.eye(3)])
@@ -329,6 +329,13 @@ def _steady_state(found: KalmanFilter) -> np.ndarray:
         for rows in updates:
             p = p @ np.linalg.inv(one + rows @ p)
     return factors
+
+
+@programs.jit  # one compiled program for all filters with sensors of the same kinds and sample times
+def _grown(found: KalmanFilter) -> Array:
+    """Return the covariance (errors, errors) that a control period at rest adds."""
+    size = 9 + 3 * found.past
+    return found._propagated(jnp.zeros((size, size)), jnp.array([0.0, 0.0, 0.0, 1.0]), found.period)
 
 
 def _corrections(found: KalmanFilter, count: int) -> list[list[np.ndarray]]:
