@@ -1,11 +1,10 @@
-"""Batches on an accelerator: the scan and the whole-run kernel, in both precisions, beside the arithmetic floor.
+"""Batches on an accelerator: the scan and the whole-run kernel, in both precisions, and the arithmetic limit.
 
     python benchmarks/accelerator.py [LARGEST]
 
-Prints trajectory-steps a second of the first flight, without noise and with it, all metrics, from 1e3 to LARGEST (1e6)
-trials, and of the same with slopes along eta. The floor is what the device would do if a step were its arithmetic
-alone, at 40 % of the rate that a kernel of multiply-adds reaches here. Needs a GPU that JAX finds (`pip install
-'jax[cuda12]'`); without one it says so and ends.
+Print trial-steps per second of the first flight with all metrics, without and with noise, for 1e3 to LARGEST (1e6)
+trials. Further rows have derivatives along eta. The limit is the time of a step's arithmetic alone, at 40 % of the
+measured rate of a kernel of multiply-adds. The program needs a GPU that JAX finds (`pip install 'jax[cuda12]'`).
 """
 
 import sys
@@ -30,7 +29,7 @@ ATTAINABLE = 0.4  # of the rate of multiply-adds
 
 
 def primal(ready, trials: int):
-    """What flies so many trials as campaigns do, by scan and by kernel."""
+    """Return functions that simulate this number of trials like a campaign, by scan and by kernel."""
 
     def flight(whole: bool):
         block = min(trials, montecarlo.BLOCK_ON_GPU)
@@ -42,7 +41,7 @@ def primal(ready, trials: int):
 
 
 def slopes(ready, trials: int):
-    """Metrics and their slopes along eta, by scan and by kernel."""
+    """Return functions for metrics and their derivatives along eta, by scan and by kernel."""
 
     def one(eta, trial):
         return montecarlo.one(with_gains(ready.parts, {"eta": eta}), ready.dispersion, jnp.uint32(0), trial).metrics

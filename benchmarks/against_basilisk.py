@@ -1,16 +1,16 @@
-"""The library's flights flown again with Basilisk's C++ modules: how far apart; then many slews, and how fast.
+"""Compare runs of the library with Basilisk's C++ modules: difference of the attitudes, then speed of many slews.
 
     python3.11 -m venv benchmarks/.venv-basilisk  # its versions of others are not those that the tests use
     benchmarks/.venv-basilisk/bin/python -m pip install --editable . bsk==2.12.1
     benchmarks/.venv-basilisk/bin/python benchmarks/against_basilisk.py [RUNS]
 
-How far apart: bodies, wheels and a gravity gradient fly under the paper's law in the library; Basilisk flies the
-torques of that flight, period by period, in steps four times as fine. RUNS = 0 leaves the rest out.
+Difference: the library simulates bodies, wheels and a gravity gradient with the paper's law. Basilisk applies the same
+torques in each period, in steps four times as fine. RUNS = 0 omits the second part.
 
-How fast: both fly the first flight's body from attitudes 20 to 140 degrees away to rest, 900 control periods of 0.05 s,
-one RK4 step each, torque held over the period. Basilisk: MRP feedback on the true state, one run after the other in a
-process for each core, set-up and execution timed apart. The library: the paper's law with its disturbance, observer and
-every metric, so that it does more in a step.
+Speed: both simulate slews of the first flight's body from attitudes 20 to 140 degrees away to rest. A slew has 900
+control periods of 0.05 s with one RK4 step each; the torque is constant in a period. Basilisk runs MRP feedback on the
+true state, one run after the other in a process for each core. Set-up and execution are timed separately. The library
+computes more in a step: the paper's law with its disturbance, observer and every metric.
 """
 
 import multiprocessing
@@ -27,7 +27,7 @@ INERTIA = [10.0, 0.0, 0.0, 0.0, 12.0, 0.0, 0.0, 0.0, 14.0]
 
 
 def slews(seed: int, count: int) -> np.ndarray:
-    """Initial MRPs (count, 3): axis uniform, angle uniform from 20 to 140 degrees."""
+    """Return initial MRPs (count, 3): axis uniform, angle uniform from 20 to 140 degrees."""
     rng = np.random.default_rng(seed)
     axis = rng.normal(size=(count, 3))
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
@@ -35,7 +35,7 @@ def slews(seed: int, count: int) -> np.ndarray:
 
 
 def basilisk(starts: np.ndarray) -> tuple[float, float, float]:
-    """Fly them one by one: seconds of set-up and of execution, and the largest final MRP."""
+    """Simulate slews one by one; return seconds of set-up and of execution, and the largest final MRP."""
     from Basilisk.architecture import messaging  # pyright: ignore[reportMissingImports]
     from Basilisk.fswAlgorithms import attTrackingError, inertial3D, mrpFeedback  # pyright: ignore[reportMissingImports]
     from Basilisk.simulation import extForceTorque, simpleNav, spacecraft  # pyright: ignore[reportMissingImports]
@@ -107,7 +107,7 @@ SPIN = 1e-3  # spin inertia of a wheel [kg m^2]: how its momentum is shared betw
 
 
 def flown_again(run: Any, table: dict[str, Any]) -> np.ndarray:
-    """Fly the torques of a run: attitudes (rows, 4), scalar last, at the times of its rows."""
+    """Apply the torques of a run; return attitudes (rows, 4), scalar last, at the times of its rows."""
     from Basilisk.architecture import messaging  # pyright: ignore[reportMissingImports]
     from Basilisk.simulation import (  # pyright: ignore[reportMissingImports]
         GravityGradientEffector,
@@ -178,7 +178,7 @@ def flown_again(run: Any, table: dict[str, Any]) -> np.ndarray:
 
 
 def apart() -> None:
-    """Print the largest angle between both over each flight."""
+    """Print the largest angle between both over each run."""
     from common import say
     from scipy.spatial.transform import Rotation
 
@@ -194,7 +194,7 @@ def apart() -> None:
 
 
 def main() -> None:
-    """Print how far apart both are, then both rates and their ratio."""
+    """Print the differences, then both rates and their ratio."""
     from ptsmc_jax.configure import configure
 
     configure()

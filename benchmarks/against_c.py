@@ -61,7 +61,7 @@ def cpu_medians(runs: dict[str, Callable]) -> dict[str, float]:
 
 
 def batch(metrics: bool) -> None:
-    """Many trials, noise off: rates and ratios."""
+    """Print rates and ratios of many trials without noise."""
     quiet, noisy = study(), study(noise=True)
     numbers = np.arange(TRIALS)
     flown = montecarlo.run(quiet.parts, quiet.dispersion, 0, numbers)
@@ -96,7 +96,7 @@ def batch(metrics: bool) -> None:
 
 
 def single() -> None:
-    """One run, on one core."""
+    """Print the times of one run on one core."""
     quiet = study()
     fly = Program(lanes=1).prepare(quiet.parts, np.asarray(quiet.parts.initial.q)[None])
     run = partial(rollout.simulate_parts, quiet.parts, np.uint32(0), np.uint32(0))
@@ -107,7 +107,7 @@ def single() -> None:
 
 
 def cubesat(pointing: bool) -> None:
-    """Many trials of the CubeSat: rates and ratios."""
+    """Print rates and ratios of many trials of the CubeSat."""
     scene = scenario.read(CUBESAT)
     if not pointing:
         scene = scenario.replace(scene, pointing=None, requirements__ape_boresight=None)

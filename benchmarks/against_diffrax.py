@@ -37,7 +37,7 @@ class RK4(diffrax.AbstractERK):
 
 
 def loop(parts, x0):
-    """Largest torque of one run: law and observer of the library, plant by diffrax."""
+    """Return the largest torque of one run: law and observer of the library, plant by diffrax."""
     law, watch, plant = parts.controller, parts.observer, parts.plant
     ticks = parts.clock.ticks(law.t_f, law.delta)
     k2, matrix, solver = watch.error_bound(), watch.update_matrix(parts.clock.period), RK4()
@@ -61,7 +61,7 @@ def loop(parts, x0):
 
 
 def main() -> None:
-    """Rates and their ratio."""
+    """Print both rates and their ratio."""
     ready = study()
     numbers = np.arange(TRIALS)
     flown = montecarlo.run(ready.parts, ready.dispersion, 0, numbers)

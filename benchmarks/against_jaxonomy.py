@@ -4,10 +4,10 @@
     benchmarks/.venv-jaxonomy/bin/python -m pip install jaxonomy==3.4.1
     benchmarks/.venv/bin/python benchmarks/against_jaxonomy.py benchmarks/.venv-jaxonomy/bin/python
 
-The same slews as against Basilisk: 900 control periods of 0.05 s, one RK4 step each, torque held over the period. A
-block diagram of a body and a quaternion feedback law on the true state; its `Simulator`, compiled once, under vmap, a
-share of the trials on each core's device. The library: the paper's law with its disturbance, observer and every metric,
-so that it does more in a step.
+The slews are those of `against_basilisk.py`: 900 control periods of 0.05 s with one RK4 step each; the torque is
+constant in a period. In jaxonomy, a block diagram has a body and a quaternion feedback law on the true state. Its
+`Simulator` is compiled once and runs under vmap, with a part of the trials on each core's device. The library computes
+more in a step: the paper's law with its disturbance, observer and every metric.
 """
 
 import os
@@ -24,7 +24,7 @@ INVERSE = np.linalg.inv(INERTIA)
 
 
 def slews(count: int) -> np.ndarray:
-    """Initial quaternions and rates (count, 7): axis uniform, angle uniform from 20 to 140 degrees, at rest."""
+    """Return initial quaternions and rates (count, 7): axis uniform, angle uniform from 20 to 140 degrees, at rest."""
     rng = np.random.default_rng(9)
     axis = rng.normal(size=(count, 3))
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
@@ -41,12 +41,12 @@ def rate(x, u, xp):
 
 
 def torque(x, xp):
-    """Quaternion feedback, the short way."""
+    """Return the torque of quaternion feedback, along the shorter rotation."""
     return -PROPORTIONAL * x[:3] * xp.where(x[3] < 0.0, -1.0, 1.0) - DERIVATIVE * x[4:]
 
 
 def by_hand(x: np.ndarray) -> np.ndarray:
-    """The final state of one run."""
+    """Return the final state of one run."""
     for _ in range(PERIODS):
         u, h = torque(x, np), PERIOD
         k1 = rate(x, u, np)
@@ -57,7 +57,7 @@ def by_hand(x: np.ndarray) -> np.ndarray:
 
 
 def jaxonomy(cores: int) -> None:
-    """In jaxonomy's environment: compile, tell so, and fly them all at each line that is read."""
+    """In jaxonomy's environment: compile, print a line, and simulate all slews for each line that is read."""
     import jax
 
     jax.config.update("jax_enable_x64", True)

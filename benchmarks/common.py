@@ -1,4 +1,4 @@
-"""What the benchmarks share: the study that they fly, the C program, medians of interleaved runs."""
+"""Functions of several benchmarks: the study, the C programs, medians of interleaved runs."""
 
 import ctypes
 import os
@@ -42,13 +42,13 @@ POINTING_METRICS = [f"{index}_{axis}" for index in catalogues.INDICES for axis i
 
 
 def study(noise: bool = False, **changes) -> Study:
-    """The first flight's study with its sensors' noise or without."""
+    """Return the first flight's study, with or without sensor noise."""
     quiet = {} if noise else {"hardware__attitude_noise": None, "hardware__rate_noise": None}
     return scenario.study(scenario.replace(scenario.read(SCENARIO), **quiet, **changes))
 
 
 def machine() -> str:
-    """One line on what this runs on."""
+    """Return a line that describes this machine."""
     cores = len(os.sched_getaffinity(0))
     name = next((x.split(":")[1].strip() for x in Path("/proc/cpuinfo").read_text().splitlines() if "model name" in x),
                 platform.processor())  # fmt: skip
@@ -74,13 +74,13 @@ def medians(
 
 
 def steps(parts: Parts) -> int:
-    """Control periods of a run, those of length zero included."""
+    """Return the number of control periods of a run, those of length zero included."""
     assert isinstance(parts.clock, Anchored)
     return parts.clock.before + parts.clock.after
 
 
 def step_operations(ready: Study) -> int:
-    """Operations on numbers in a control period, at least: those of the whole-run kernel, of the shorter branches."""
+    """Return the smallest number of operations of a control period: the whole-run kernel with its shorter branches."""
 
     def loops(jaxpr) -> Iterator:
         for eqn in jaxpr.eqns:
@@ -105,7 +105,7 @@ def step_operations(ready: Study) -> int:
 
 
 def peak_rate(interpret: bool = False, rounds: int = 4096, blocks: int = 16_384) -> float:
-    """Operations a second of a kernel that multiplies and adds, two operations each, as many bits as are set."""
+    """Return the operations per second of a kernel of multiply-adds, two operations each, in the current precision."""
     chains, unrolled = 8, 16
 
     def body(given, result):
@@ -158,7 +158,7 @@ class Program:
         self.library = compiled("loop.c", options if self.lanes > 1 else [*options, "-fno-openmp"])
 
     def prepare(self, parts: Parts, q0: np.ndarray) -> Callable[[], np.ndarray]:
-        """What flies these initial attitudes (trials, 4) with the constants of these parts: () -> (trials, columns)."""
+        """Return a function () -> (trials, columns) that simulates initial attitudes (trials, 4) with these parts."""
         clock, law, d, watch = parts.clock, parts.controller, parts.disturbance, parts.observer
         ticks = clock.ticks(law.t_f, law.delta)
         nodes = np.ascontiguousarray(np.concatenate([ticks.t, ticks.t_next[-1:]]))
@@ -240,7 +240,7 @@ class CubesatProgram:
 
 
 def row(other: str, theirs: float, ours: float) -> None:
-    """A row of the table that `speed_table.py` gathers: million trial-steps a second, measured in one run."""
+    """Print a row of the table of `speed_table.py`: million trial-steps per second, measured in one run."""
     say(f"| {other} | {theirs:.3g} | {ours:.3g} | {ours / theirs:.3g} |")
 
 

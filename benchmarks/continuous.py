@@ -1,6 +1,6 @@
 """Continuous runs against `solve_ivp` with a NumPy right-hand side and adaptive diffrax, at matched error.
 
-One run, and a batch of so many from drawn attitudes: its time is told for a run.
+The table has one run, and a batch from random attitudes, whose time is divided by the number of runs.
 """
 
 import jax
@@ -28,7 +28,7 @@ DRAWN = {"dispersion": {"attitude": {"kind": "axis_angle", "min_deg": 20.0, "max
 
 
 def numpy_loop(parts):
-    """The closed loop's right-hand side on (q, w, d_hat), the formulas of the paper in NumPy."""
+    """Return the closed loop's right-hand side on (q, w, d_hat), the formulas of the paper in NumPy."""
     J, J_inverse = np.asarray(parts.plant.inertia), np.asarray(parts.plant.inertia_inverse)
     law, d = parts.controller, parts.disturbance
     qf = np.asarray(parts.reference(jnp.zeros(())).q)
@@ -60,7 +60,7 @@ def numpy_loop(parts):
 
 
 def main() -> None:
-    """Times at matched error, and their ratios."""
+    """Print times at matched error, and their ratios."""
     parts = scenario.study(scenario.from_tables({})).parts
     t_f, t_s = float(parts.controller.t_f), float(parts.controller.hand_over)
     t_end = float(parts.t_end)

@@ -1,8 +1,8 @@
-"""The exported C beside the simulator: commands of many trials, one by one, what a step takes, single precision.
+"""Compare the exported C with the simulator: commands of many trials, time of a step, accuracy in single precision.
 
 `python benchmarks/exported_c.py [TRIALS] [FLIGHT ..]`; flights are those of tests/onboard/flights.py, by default six.
-In single precision the compiled C flies in the loop, whose body, sensors and noise stay those of the simulator: RMS
-window error and mean peak torque of the trials beside those that the simulator's own code flies.
+For single precision, the compiled C runs in the loop with the simulator's body, sensors and noise. The program compares
+RMS window error and mean peak torque of the trials with those of the simulator's own flight software.
 """
 
 import sys
@@ -21,7 +21,7 @@ sys.path.insert(0, str(ROOT))
 
 
 def compared(name: str, count: int) -> None:
-    """Print how far apart the commands of these trials are, and how long a step takes."""
+    """Print the differences of the commands of these trials, and the time of a step."""
     from ptsmc_jax import scenario
     from ptsmc_jax.campaigns import store
     from ptsmc_jax.onboard import folder, vectors
@@ -71,7 +71,7 @@ def compared(name: str, count: int) -> None:
 
 
 def single_precision(ready: Any, library: Any, count: int) -> str:
-    """RMS window error and mean peak of the trials: how far single precision is off, relative."""
+    """Return relative errors of single precision (RMS window error, mean peak torque) and numbers of trials."""
     from ptsmc_jax.onboard.library import InTheLoop
     from ptsmc_jax.simulation import rollout
 
@@ -94,7 +94,7 @@ def single_precision(ready: Any, library: Any, count: int) -> str:
 
 
 def main() -> None:
-    """A row for each flight."""
+    """Print a row for each flight."""
     from ptsmc_jax.configure import configure
 
     configure(keep_programs=True)

@@ -1,13 +1,13 @@
-"""A spacecraft with two hinged panels in Basilisk, full and nonlinear, beside its modes in the library: how far apart.
+"""Compare a spacecraft with two hinged panels, nonlinear in Basilisk, with its linear modes in the library.
 
     python3.11 -m venv benchmarks/.venv-basilisk
     benchmarks/.venv-basilisk/bin/python -m pip install --editable . bsk==2.12.1
     benchmarks/.venv-basilisk/bin/python benchmarks/flexible_against_basilisk.py
 
-Modes follow from the panels' mass matrix about rest, free in translation, by the generalised eigenproblem. The
-library flies a slew under the paper's law, Basilisk the torques of that flight, period by period, in steps four times
-as fine. Modes are the linear motion: what is left is of the square of the panels' angles and of the rate, and falls
-with the slew.
+The modes follow from the panels' mass matrix about rest, free in translation, by the generalised eigenproblem. The
+library simulates a slew with the paper's law. Basilisk applies the same torques in each period, in steps four times as
+fine. Modes describe the linear motion, so the difference is of the order of the squares of the panels' angles and of
+the rate, and smaller for smaller slews.
 """
 
 from typing import Any
@@ -23,7 +23,7 @@ SIDES = (1.0, -1.0)
 
 
 def frames() -> list[tuple[np.ndarray, np.ndarray]]:
-    """Of each panel: where its hinge is [m], and its axes h1, h2, h3 at rest in rows; it reaches out along -h1."""
+    """Return the hinge [m] of each panel, and its axes h1, h2, h3 at rest as rows; the panel extends along -h1."""
     found = []
     for side in SIDES:
         h1, h2 = np.array([0.0, -side, 0.0]), np.array([1.0, 0.0, 0.0])
@@ -32,12 +32,12 @@ def frames() -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 def cross(v: np.ndarray) -> np.ndarray:
-    """The matrix of v x."""
+    """Return the matrix of the cross product v x."""
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
 def modal() -> dict[str, Any]:
-    """Inertia of the whole body, and frequency, damping and coupling of its modes, free in translation."""
+    """Return the inertia of the whole body, and frequency, damping and coupling of its modes, free in translation."""
     n = len(SIDES)
     mass = np.zeros((6 + n, 6 + n))  # by the hub's velocity, its rate and the panels' angular rates
     mass[:3, :3], mass[3:6, 3:6] = HUB_MASS * np.eye(3), HUB
@@ -60,7 +60,7 @@ def modal() -> dict[str, Any]:
 
 
 def flown_again(run: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Fly the torques of a run: attitudes (rows, 4), scalar last, at its times, and the panels' angles (rows, 2)."""
+    """Apply the torques of a run; return attitudes (rows, 4), scalar last, and angles of the panels (rows, 2)."""
     from Basilisk.architecture import messaging  # pyright: ignore[reportMissingImports]
     from Basilisk.simulation import (  # pyright: ignore[reportMissingImports]
         extForceTorque,

@@ -1,9 +1,9 @@
-"""Gains tuned for the rigid body and gains tuned with its modes, side by side on the flexible truth.
+"""Compare gains tuned for the rigid body and gains tuned with flexible modes, on the flexible body.
 
     python benchmarks/flexible_tuning.py [scenarios/flexible_panels.toml] [TRIALS STARTS]
 
-Both searches keep the scenario's requirements, margins among them, the first those of the rigid loop. Each set of
-gains, and the scenario's own, then flies 1 000 fresh trials of the flexible body; margins are those of its loop.
+Both searches meet the scenario's requirements; the margins of the first search belong to the rigid loop. Then 1 000
+held-out trials of the flexible body are simulated with each set of gains and with the scenario's gains.
 """
 
 import sys

@@ -1,6 +1,6 @@
-"""What value and gradient in three gains cost beside the forward run, and the memory they take as runs grow longer.
+"""Time of value and gradient in three gains relative to the forward run, and their memory for longer runs.
 
-And reverse mode, as `configure` has it and with the compiler options of batches, which are not meant for it.
+Reverse mode is measured with the options of `configure` and with those of batches, which are not made for it.
 """
 
 import jax
@@ -28,20 +28,20 @@ LENGTHS = (1_000, 10_000, 100_000)
 
 
 def problem(ready, trials: int) -> Problem:
-    """The first flight's tuning problem on so many trials."""
+    """Return the first flight's tuning problem on this number of trials."""
     limit = Requirement("peak_torque", 0.5)
     return objective.problem(ready.parts, ready.dispersion, 0, np.arange(trials), GAINS, [limit])
 
 
 @jax.jit
 def value(problem: Problem, gains):
-    """What tuning measures, without derivatives."""
+    """Return what tuning measures, without derivatives."""
     return measure(problem, gains)
 
 
 @jax.jit
 def value_and_gradient(problem: Problem, gains):
-    """The same with its derivatives by the gains, forward."""
+    """Return the value with its derivatives in the gains, in forward mode."""
 
     def twice(gains):
         measured = measure(problem, gains)
@@ -52,7 +52,7 @@ def value_and_gradient(problem: Problem, gains):
 
 @jax.jit
 def everything(problem: Problem):
-    """The forward run with all its metrics, on the same one device."""
+    """Return the forward run with all its metrics, on the same device."""
 
     def one(trial):
         return montecarlo.one(problem.parts, problem.dispersion, problem.seed, trial)[0]
@@ -61,7 +61,7 @@ def everything(problem: Problem):
 
 
 def ratios() -> None:
-    """Times on one device."""
+    """Print times on one device."""
     for noise in (True, False):
         for trials in (128, 1024):
             some = problem(study(noise), trials)
@@ -77,7 +77,7 @@ def ratios() -> None:
 
 
 def memory() -> None:
-    """What the compiled gradient of 128 trials allocates, as the compiler tells it."""
+    """Print the memory of the compiled gradient of 128 trials, as the compiler reports it."""
     say("\nmemory of value and gradient, 128 trials:")
     for steps in LENGTHS:
         some = problem(study(True, loop__period=45.0 / steps), 128)
@@ -87,7 +87,7 @@ def memory() -> None:
 
 
 def reverse() -> None:
-    """Reverse mode of one run, and of 64 in lanes, on one device."""
+    """Print times of reverse mode of one run, and of 64 runs in lanes, on one device."""
     say("\nvalue and gradient by reverse mode:")
 
     def squares(ready, trials):

@@ -12,7 +12,7 @@ from ptsmc_jax.campaigns import montecarlo  # noqa: E402
 
 
 def chain(order: int):
-    """A sampled chain without noise."""
+    """Return a sampled chain without noise."""
     return scenario.study(scenario.from_tables({
         "plant": {"kind": "chain", "order": order, "x0": [1.0] + [0.0] * (order - 1)},
         "controller": {"t_f": 35.0, "eta": order + 1.0, "delta": 1.0},
@@ -22,7 +22,7 @@ def chain(order: int):
 
 
 def grow(what: str, sizes: list[int], flights: dict) -> None:
-    """Times, and the exponent between neighbours."""
+    """Print times, and the exponent between neighbouring rows."""
     seconds = medians(flights)
     say(f"\n{what}")
     for k, (size, name) in enumerate(zip(sizes, flights, strict=True)):
@@ -36,7 +36,7 @@ def grow(what: str, sizes: list[int], flights: dict) -> None:
 
 
 def flight(ready, trials: int):
-    """What flies so many trials."""
+    """Return a function that simulates this number of trials."""
     return lambda: montecarlo.run(ready.parts, ready.dispersion, 0, np.arange(trials)).metrics
 
 

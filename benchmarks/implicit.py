@@ -1,6 +1,6 @@
-"""Implicit beside explicit sampling of the paper's law: the first flight with the paper's gains and with tuned ones.
+"""Compare implicit with explicit sampling of the paper's law: the first flight with published and with tuned gains.
 
-The tuned ones are those that `ptsmc tune` finds for the first flight as it is, and with implicit sampling.
+`ptsmc tune` finds the tuned gains for the first flight with explicit and with implicit sampling.
 """
 
 from ptsmc_jax.configure import configure
@@ -19,7 +19,7 @@ IMPLICIT = {"eta": 2.86403, "delta": 0.6, "observer_gain": 1144.06, "k1": 8.1920
 
 
 def main() -> None:
-    """Judged on 1 000 fresh trials."""
+    """Print the results on 1 000 held-out trials."""
     flight = scenario.read(SCENARIO)
     sets = {"paper's gains": gains.papers(flight)}
     for name, found in (("explicit", EXPLICIT), ("implicit", IMPLICIT)):

@@ -1,13 +1,13 @@
-"""The exported C flies in Basilisk: its body, wheels, star tracker and gyro; beside the library for the same gains.
+"""Run the exported C in Basilisk, with its body, wheels, star tracker and gyro, and compare it with the library.
 
     python3.11 -m venv benchmarks/.venv-basilisk  # its versions of others are not those that the tests use
     benchmarks/.venv-basilisk/bin/python -m pip install --editable . bsk==2.12.1
     benchmarks/.venv-basilisk/bin/python benchmarks/in_basilisk.py [TRIALS]
 
-Each period Basilisk integrates the body, its star tracker and inertial measurement unit say what they see, `ptsmc_step`
-takes it, and the motors of the wheels get what comes out. Attitudes at t = 0, the start of the filter and its gains are
-those of the library's trials; noise is Basilisk's own, white and of the scenario's size. What the library adds to a
-body that Basilisk has not is the scenario's disturbance, an external torque, held over a period at its mean.
+In each period Basilisk integrates the body. `ptsmc_step` reads its star tracker and inertial measurement unit, and
+commands the motors of the wheels. Attitudes at t = 0, the start of the filter and its gains are those of the library's
+trials. The noise is Basilisk's own, white and of the scenario's size. The scenario's disturbance is an external torque,
+constant in a period at its mean.
 """
 
 import sys
@@ -32,7 +32,7 @@ TUNED: dict[str, Any] = {
 
 
 class Basilisk:
-    """A spacecraft of Basilisk with wheels, star tracker and gyro, from an attitude (4,) at rest."""
+    """A spacecraft of Basilisk with wheels, star tracker and gyro, at rest at an initial attitude (4,)."""
 
     def __init__(self, parts: Any, attitude: np.ndarray, seed: int):
         from Basilisk.architecture import messaging  # pyright: ignore[reportMissingImports]
@@ -89,7 +89,7 @@ class Basilisk:
         self.sim.InitializeSimulation()
 
     def act(self, k: int, wheel_torque: np.ndarray, disturbance: np.ndarray) -> None:
-        """Wheels (wheels,) and what disturbs (3,) from period k on [N m]."""
+        """Apply the torques of the wheels (wheels,) and the disturbance (3,) from period k on [N m]."""
         motors, torque = self._motor(), self._torque()
         motors.motorTorque = (-wheel_torque).tolist()  # on the wheel
         torque.torqueRequestBody = disturbance.tolist()
@@ -97,7 +97,7 @@ class Basilisk:
         self._pushed.write(torque, self._nano(self.period * k))
 
     def until(self, k: int) -> dict[str, np.ndarray]:
-        """Flies to sample k: what the sensors say there, and the truth."""
+        """Simulate up to sample k; return the measurements and the true state."""
         self.sim.ConfigureStopTime(self._nano(self.period * k))
         self.sim.ExecuteSimulation()
         true = self.body.scStateOutMsg.read()
@@ -109,7 +109,7 @@ class Basilisk:
 
 
 def flown(made: Any, library: Any, trial: int, seed: int = 0) -> tuple[float, float, int]:
-    """A trial in Basilisk: RMS error over the window [-], peak of a wheel's torque [N m], samples that were not ok."""
+    """Simulate a trial; return RMS window error [-], peak torque of a wheel [N m], and samples with another status."""
     import jax.numpy as jnp
     from scipy.spatial.transform import Rotation
 
@@ -145,7 +145,7 @@ def flown(made: Any, library: Any, trial: int, seed: int = 0) -> tuple[float, fl
 
 
 def main() -> None:
-    """Print both accuracies for the paper's and for tuned gains."""
+    """Print both accuracies for published and for tuned gains."""
     from ptsmc_jax.configure import configure
 
     configure()
@@ -158,7 +158,7 @@ def main() -> None:
     from ptsmc_jax.simulation.control_period import first_period
 
     class Controller(folder.Controller):
-        """With what a trial begins, and what disturbs it."""
+        """A controller with the first control period and the disturbance of a trial."""
 
         def first(self, parts: Any) -> Any:
             return first_period(parts.clock.ticks(parts.controller.t_f, parts.controller.delta))

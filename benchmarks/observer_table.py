@@ -12,7 +12,7 @@ TRIALS = 1000
 
 
 def main() -> None:
-    """Fly every row without noise, with noise, and with noise through the filter; else scenarios/first_flight.toml."""
+    """Print the table: each row without noise, with noise, and with noise and the filter."""
     configure(keep_programs=True)
     from ptsmc_jax import scenario
     from ptsmc_jax.campaigns import montecarlo

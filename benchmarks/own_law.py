@@ -1,4 +1,4 @@
-"""The paper's law written as a law of one's own beside the built-in one: the same bits, and how fast both are."""
+"""Compare the paper's law, written as a custom law, with the built-in law: equal bits, and both times."""
 
 from ptsmc_jax.configure import configure
 
@@ -32,7 +32,7 @@ class Papers(ptsmc.AccelerationLaw):
 
 
 def main() -> None:
-    """Both on the same trials, noise on."""
+    """Simulate the same trials with both laws, with noise."""
     law = {"kind": "own", "code": Papers, "error": "additive", "t_f": 35.0, "delta": 0.5}
     both = {"built in": study(noise=True, controller__delta=0.5), "own": study(noise=True, tune=None, controller=law)}
     trials = np.arange(TRIALS)

@@ -1,4 +1,4 @@
-"""What single precision costs: metrics of the same trials with 32 and with 64 bits.
+"""Errors of single precision: metrics of the same trials with 32 and with 64 bits.
 
 python benchmarks/precision.py [TRIALS]
 """
@@ -33,7 +33,7 @@ SHOWN = "terminal_error window_error peak_torque settling_time".split()
 
 
 def flown(one: scenario.Scenario, trials: int) -> montecarlo.Trials:
-    """The trials with as many bits as are set."""
+    """Return the trials in the current precision."""
     ready = scenario.study(one)
     return montecarlo.run(ready.parts, ready.dispersion, 3, np.arange(trials))
 

@@ -1,4 +1,4 @@
-"""Three ways to second derivatives of a metric by three gains: seconds to compile and to run, and how far they agree.
+"""Three ways to second derivatives of a metric in three gains: seconds to compile and to run, and differences.
 
 python benchmarks/second_derivatives.py
 """

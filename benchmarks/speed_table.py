@@ -1,11 +1,11 @@
-"""The whole speed table, in one command: every program that the library is set beside, and a GPU where there is one.
+"""Print the whole speed table: the library beside other simulators, and on a GPU if there is one.
 
     python3.11 benchmarks/speed_table.py [--keep]
 
-Makes an environment for each under benchmarks/ (a C compiler and a package index are needed; --keep: takes those that
-are there as they are), runs the scripts one after the other, and prints a Markdown table: million trial-steps a second
-of both, measured in one run, and their ratio. What cannot be measured here stands in it with the reason. Leave the
-machine alone meanwhile.
+The program makes an environment for each simulator under benchmarks/; `--keep` uses existing environments. It needs a C
+compiler and a package index. Then it runs the scripts one after the other and prints a Markdown table. The table has
+million trial-steps per second of both, measured in one run, and their ratio. Rows that cannot be measured here name the
+reason. Run nothing else on the machine meanwhile.
 """
 
 import datetime
@@ -35,12 +35,12 @@ PUBLISHED = """\
 
 
 def python(name: str) -> Path:
-    """The interpreter of an environment."""
+    """Return the interpreter of an environment."""
     return HERE / name / "bin" / "python"
 
 
 def make(name: str, needs: list[str]) -> str:
-    """Make an environment anew; returns why it could not be made, or nothing."""
+    """Make an environment; return the reason if that fails, or an empty text."""
     shutil.rmtree(HERE / name, ignore_errors=True)
     for call in (
         [sys.executable, "-m", "venv", str(HERE / name)],
@@ -53,12 +53,12 @@ def make(name: str, needs: list[str]) -> str:
 
 
 def last(text: str) -> str:
-    """What a program said at its end, in one line."""
+    """Return the last line that a program printed."""
     return ([line.strip() for line in text.splitlines() if line.strip()] or ["no word"])[-1]
 
 
 def rows(name: str, environment: str, call: list[str]) -> list[str]:
-    """The rows that a script prints, or one that says why there are none."""
+    """Return the rows that a script prints, or a row with the reason if there are none."""
     done = subprocess.run([str(python(environment)), *call], cwd=HERE, capture_output=True, text=True, check=False)
     print(done.stdout, flush=True)
     found = [line for line in done.stdout.splitlines() if line.startswith("| ")]

@@ -1,7 +1,7 @@
-"""Cold and warm start of the commands, each in a process of its own, and what compiling the sampled loop takes.
+"""Cold and warm start of the commands, each in a separate process, and the time to compile the sampled loop.
 
-Seconds, and seconds of the processors beside them: those hardly change where other work runs on the machine. With names
-of commands, as printed, only those.
+The table has seconds and CPU seconds, which other work on the machine hardly changes. Arguments select commands by
+their printed names.
 """
 
 import os
@@ -33,7 +33,7 @@ WARM = 5
 
 
 def run(arguments: list[str], cache: str) -> tuple[float, float]:
-    """Seconds of one call with this compile cache, and of the processors."""
+    """Return seconds and CPU seconds of one call with this compile cache."""
     with tempfile.TemporaryDirectory() as out:
         (Path(out) / "refused.toml").write_text("[controller]\neta = 1.0\n", encoding="utf-8")
         extra = [] if arguments[0].startswith("--") else ["--quiet", "--out", str(Path(out) / "made")]
@@ -46,7 +46,7 @@ def run(arguments: list[str], cache: str) -> tuple[float, float]:
 
 
 def compiling() -> None:
-    """Seconds to trace, lower and compile the sampled loop for a batch and for one run."""
+    """Print seconds to trace, lower and compile the sampled loop for a batch and for one run."""
     from ptsmc_jax.configure import configure
 
     configure(cache=None)

@@ -1,10 +1,10 @@
-"""Is every stage of the search needed? Each one left out, or changed, on five problems and many seeds.
+"""Measure the effect of each stage of the search: searches without it or with a change, on five problems.
 
     python benchmarks/tuning_ablation.py [SEEDS [PROBLEM ...]]
 
-A line a search, kept in out/tuning_ablation.jsonl: what is there already is not searched again. In the end a table: for
-each problem and variant the largest and the median distance from the best goal that any of them found, the seeds within
-1 % of it, and the flights spent. `global_check.py`'s differential evolution is one of the variants, on the first seed.
+Each search adds a line to out/tuning_ablation.jsonl and is not repeated. The table has a row for each problem and
+variant: the median and largest distance from the best objective of all variants, the seeds within 1 % of it, and the
+number of simulations. Differential evolution of `tuning.search.global_check` is a variant, on the first seed.
 """
 
 import json
@@ -33,7 +33,7 @@ CHAIN = {
 
 @contextmanager
 def changed(module: object, **values: object) -> Iterator[None]:
-    """A module with other values."""
+    """Change values of a module within the context."""
     before = {name: getattr(module, name) for name in values}
     for name, value in values.items():
         setattr(module, name, value)
@@ -45,23 +45,17 @@ def changed(module: object, **values: object) -> Iterator[None]:
 
 
 def variants() -> dict[str, Callable]:
-    """What is left out or changed, by name: a context to search in."""
-    from tuning.search import descents, evolution, optimise, starts
+    """Return a context for each variant of the search, by name."""
+    from tuning.search import descents, evolution, hand_overs, optimise, starts
 
     everything = descents.Descents
 
     class AllTheWay(everything):
-        """No race: every start goes half of the way."""
+        """A search without successive halving: every local search has half of the steps."""
 
         def _race(self, problem, starts, rungs, what, **others):
             rungs = ((len(starts), max(2, self._steps // 2)),) if what == descents.SEARCHING else rungs
             return super()._race(problem, starts, rungs, what, **others)
-
-    class OffSamples(everything):
-        """The hand-over stays where the descent left it."""
-
-        def _with_the_hand_over_on_a_sample(self, problem):
-            return []
 
     class Evolved(everything):
         """Differential evolution after the local searches."""
@@ -82,13 +76,13 @@ def variants() -> dict[str, Callable]:
         "nothing held in the sweep": lambda: changed(starts, held_by_limits=lambda _: []),
         "careful steps only": lambda: changed(descents, BOLD=descents.CAREFUL),
         "bold steps only": lambda: changed(descents, CAREFUL=descents.BOLD),
-        "off samples": searching(OffSamples),
+        "off samples": lambda: changed(hand_overs, on_samples=lambda *_: []),
         "evolution added": searching(Evolved),
     }
 
 
 def main() -> None:
-    """Print a line a search, and the table."""
+    """Print a line for each search, and the table."""
     configure()
     from ptsmc_jax import scenario
     from tuning.search import global_check, optimise
@@ -132,7 +126,7 @@ def main() -> None:
 
 
 def _table(rows: list[dict]) -> None:
-    print("\n| problem | variant | seeds | within 1 % | median, largest distance | rollouts | with slopes |")
+    print("\n| problem | variant | seeds | within 1 % | median, largest distance | simulations | with gradients |")
     print("|---|---|---|---|---|---|---|")
     for problem in dict.fromkeys(row["problem"] for row in rows):
         of_it = [row for row in rows if row["problem"] == problem]

@@ -1,9 +1,9 @@
-"""Is what training calls met, met? Five scenarios with limits for shares of the trials, twenty seeds each.
+"""Test on held-out trials whether tuned gains meet quantile requirements: five scenarios, twenty seeds each.
 
     python benchmarks/tuning_quantiles.py [SEEDS [SCENARIO ...]]
 
-A line a run: what the search said of its gains (every limit kept in training and confirmed on other trials), and how
-many of the fresh trials break each limit. In the end the share of those said to be met that are.
+Each run prints a line: whether the search reports every limit as met and confirmed, and how many held-out trials
+violate each limit. The last line counts the reported results, and those that held-out trials confirm.
 """
 
 import sys
@@ -27,7 +27,7 @@ CUBESAT = {
 
 
 def law(t_f: float, **more: object) -> dict:
-    """A controller's table."""
+    """Return the table of a controller."""
     return {"controller": {"t_f": t_f, "delta": 0.5, "error": "multiplicative", **more}}
 
 
@@ -58,7 +58,7 @@ SCENARIOS = {
 
 
 def main() -> None:
-    """Print a line a run, and the shares."""
+    """Print a line for each run, and the counts."""
     configure()
     from ptsmc_jax import scenario
     from tuning.studies import tuner

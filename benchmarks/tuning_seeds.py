@@ -1,10 +1,10 @@
-"""Does the search find the optimum? Twenty seeds of its starts against differential evolution, on the same problem.
+"""Compare twenty seeds of the search with differential evolution on the same problem.
 
     python benchmarks/tuning_seeds.py scenarios/first_flight.toml [SEEDS | FIRST:END] [FREE,FREE,...]
 
-The training trials are those of seed 0; what changes from seed to seed are the starts. The gains of every seed fly
-1 000 fresh trials of three seeds, beside the floor; the best ones beside the paper's. With the names of gains these are
-free, and differential evolution is left out.
+The training trials are those of seed 0; only the starting points depend on the seed. The gains of every seed are
+simulated on 1 000 held-out trials of three seeds, and compared with the lower bound. The best gains are also compared
+with the published gains. Names of gains select the free gains; differential evolution is then omitted.
 """
 
 import sys
@@ -16,7 +16,7 @@ from ptsmc_jax.configure import configure
 
 
 def fresh_trials(loaded, names, values) -> str:
-    """Tuned gains on fresh trials of three seeds: RMS, what it is beside the floor, and the largest peak torque."""
+    """Return RMS on held-out trials of three seeds, its ratio to the lower bound, and the largest peak torque."""
     from tuning.search import gains
     from tuning.studies import judging
 
@@ -39,7 +39,7 @@ def fresh_trials(loaded, names, values) -> str:
 
 
 def main() -> None:
-    """Print a line a seed."""
+    """Print a line for each seed."""
     configure()
     from ptsmc_jax import scenario
     from tuning.search import gains, global_check, optimise

@@ -1,4 +1,4 @@
-"""How `make docs` builds these pages: everything offline, every warning an error."""
+"""Settings of Sphinx for `make docs`, which builds these pages offline and treats every warning as an error."""
 
 import ast
 import inspect
@@ -30,7 +30,7 @@ suppress_warnings = ["ref.python"]  # names of axes in shapes, taken for names o
 
 
 def as_written(app: Sphinx, what: str, name: str, thing: object, options: Any, lines: list[str]) -> None:
-    """Docstrings are plain text with equations in it: nothing in them is markup but `code` and indented lines."""
+    """Escape a docstring, which is plain text with equations: only `code` and indented lines are markup."""
     text = []
     lines += _fields(thing) if what == "class" else []
     for before, line in zip(["", *lines], lines, strict=False):
@@ -42,7 +42,7 @@ def as_written(app: Sphinx, what: str, name: str, thing: object, options: Any, l
 
 
 def _fields(thing: Any) -> list[str]:
-    """What the source says of a class's fields, in comments beside them."""
+    """Return the fields of a class with the comments beside them in the source."""
     try:
         source = textwrap.dedent(inspect.getsource(thing))
     except (OSError, TypeError):  # an alias of a type
@@ -51,24 +51,25 @@ def _fields(thing: Any) -> list[str]:
     found = ["", "Fields:", ""]
     for node in ast.parse(source).body[0].body:  # pyright: ignore[reportAttributeAccessIssue]
         if isinstance(node, ast.AnnAssign) and not (name := ast.unparse(node.target)).startswith("_"):
-            _, _, comment = rows[node.lineno - 1].partition("  # ")
+            comments = rows[node.lineno - 1].split("  # ")[1:]
+            comment = next((text for text in comments if not text.startswith("pyright:")), "")
             found.append(f"- `{name}`" + (f": {comment}" if comment else ""))
     return found if len(found) > 3 else []
 
 
 def inline(self: Any, node: nodes.math) -> None:
-    """An equation in a line, as MathML, which browsers draw without a script from elsewhere."""
+    """Write an equation in a line as MathML, which browsers draw without an external script."""
     self.body.append(latex2mathml.converter.convert(node.astext()))
     raise nodes.SkipNode
 
 
 def block(self: Any, node: nodes.math_block) -> None:
-    """An equation of its own."""
+    """Write an equation on its own line."""
     self.body.append(latex2mathml.converter.convert(node.astext(), display="block"))
     raise nodes.SkipNode
 
 
 def setup(app: Sphinx) -> None:
-    """What Sphinx calls."""
+    """Register the functions above; Sphinx calls this."""
     app.add_html_math_renderer("mathml", (inline, None), (block, None))
     app.connect("autodoc-process-docstring", as_written)

@@ -1,6 +1,6 @@
-"""Writes the references in docs/: scenario files and metrics from the code's types, commands from the command itself.
+"""Write the reference pages in docs/: scenario files and metrics from the code's types, commands from the program.
 
-`python docs/generate.py` writes them anew; a test fails while they differ from what the code says.
+`python docs/generate.py` writes them. A test fails if they differ from the code.
 """
 
 import sys
@@ -68,15 +68,13 @@ over time. Half-cones of RPE, PDE and RKE are up to 0.5 % too large. PDE is the 
 of any two windows. The measured attitude is constant between samples.
 """
 REQUIREMENTS = """\
-The key is a [metric](metrics.md). The value is the largest allowed value in every simulated trial, or a table:
-`window_error = { limit = 1e-4, quantile = 0.9973, confidence = 0.9 }`. For a [pointing error](pointing.md) it may have
-an interpretation:
-`ape_boresight = { limit = 1e-3, probability = 0.9973, confidence = 0.9, interpretation = "mixed" }`.
+The name of any [metric](metrics.md), with the largest value that is allowed in every trial, or with a table. An example
+is `window_error = { limit = 1e-4, quantile = 0.9973, confidence = 0.9 }`. For a [pointing error](pointing.md), the
+table may be `ape_boresight = { limit = 1e-3, probability = 0.9973, confidence = 0.9, interpretation = "mixed" }`.
 
-In the sampled loop the key may also be a margin. `gain_margin` [dB], `phase_margin` [deg] and `delay_margin` [s] are
-the smallest allowed values. `modulus_margin` [dB] is the largest allowed peak of the sensitivity. The keys of a
-table:"""
-
+The sampled loop may also have required margins, which are numbers. `gain_margin` [dB], `phase_margin` [deg] and
+`delay_margin` [s] are lower limits. `modulus_margin` [dB] is the largest allowed peak of the sensitivity. A table has
+these keys:"""
 
 SUITE = """\
 Any number of sensors, a table each: at least one gyro, and attitude sensors that determine the attitude together. A
@@ -85,7 +83,7 @@ which are the short form for one star tracker and one gyro."""
 
 
 def scenarios() -> str:
-    """Reference of scenario files, for each kind of plant what it does not share with those before."""
+    """Return the reference of scenario files. A kind of plant lists only the tables that earlier kinds do not have."""
     parts = ["# Scenario files", MADE, SCENARIOS]
     seen: dict[type[Table], str] = {}
     whole: dict[tuple, str] = {}  # a table with all its kinds, the default first
@@ -127,7 +125,7 @@ def scenarios() -> str:
 
 
 def metric_list() -> str:
-    """Reference of the metrics."""
+    """Return the reference of the metrics."""
     parts = ["# Metrics", MADE, METRICS]
     for title, known in (
         ("A spacecraft's", catalogues.CATALOGUE),
@@ -141,7 +139,7 @@ def metric_list() -> str:
 
 
 def commands() -> str:
-    """Reference of the commands."""
+    """Return the reference of the commands."""
     with mock.patch.object(sys, "argv", ["ptsmc"]):  # which the usage lines are made from
         text = app.generate_docs(output_format="markdown")
     text = text[text.index("## ptsmc simulate") :]
@@ -155,7 +153,7 @@ def commands() -> str:
 
 
 def _keys(table: str, struct: type[Table], plant: str) -> Iterator[str]:
-    """The keys of a table as a table."""
+    """Yield the keys of a table of the scenario, as a table of the page."""
     if table == "dispersion":
         yield from _dispersion(struct, layouts.SCENARIOS[plant].unit_of_d)
         return
@@ -177,7 +175,7 @@ def _keys(table: str, struct: type[Table], plant: str) -> Iterator[str]:
 
 
 def _case_i(plant: str) -> Mapping[str, Mapping[str, Any]]:
-    """The defaults of a plant that no key tells, under the paper's law."""
+    """Return the defaults of a plant with the paper's law that are not defaults of single keys."""
     made = layouts.SCENARIOS[plant]
     return made.fallback(typing.cast(type[Table], made.TABLES["plant"])(), (), "prescribed_time")
 
@@ -210,7 +208,7 @@ def _default(value: object) -> str:
 
 
 def _grid(header: str, rows: list[list[str]]) -> str:
-    """A table; a column that is empty throughout is left out."""
+    """Return a table without its empty columns."""
     titles = header.split()
     used = [k for k in range(len(titles)) if any(row[k] for row in rows)]
     lines = [titles, ["---"] * len(titles), *rows]

@@ -335,6 +335,32 @@ def gpus() -> list[Any]:
     return [configure.default_device() or SimpleNamespace(platform="gpu")]
 
 
+class _CalledError(Exception):
+    pass
+
+
+def assert_prepared(monkeypatch, owner, program, prepare, call):
+    """Assert that `prepare` and `call` pass arguments of equal structure, types and static values to a program."""
+    calls = []
+
+    def heard(*given, **fixed):
+        leaves = [leaf if callable(leaf) or isinstance(leaf, int) else jax.typeof(leaf)
+                  for leaf in jax.tree.leaves(given)]  # fmt: skip
+        calls.append((jax.tree.structure(given), leaves, fixed))
+
+    def called(*given, **fixed):
+        heard(*given, **fixed)
+        raise _CalledError
+
+    called.prepare = heard  # pyright: ignore[reportFunctionMemberAccess]
+    monkeypatch.setattr(owner, program, called)
+    prepare()
+    with pytest.raises(_CalledError):
+        call()
+    assert len(calls) == 2
+    assert calls[0] == calls[1]
+
+
 def equations(trace: Any) -> Any:
     """Return all equations of a jaxpr, those of nested jaxprs included."""
     for eqn in getattr(trace, "jaxpr", trace).eqns:

@@ -120,16 +120,14 @@ def board(parts: Parts) -> Board:
     device = parts.actuators
     parameters, inputs = known(parts), observer.model.inputs
     computer = Board(observer.model, parameters, rules=derived.rules(parts))
-    if "filter_bandwidth" in parameters:
-        _filter_parameters(computer, parts.sensors, parts.period)
     computer.about["period"] = "of the control loop [s]"
-    computer.about["observer_matrix"] = _said(type(observer).update_matrix)
+    computer.about["observer_matrix"] = _summary(type(observer).update_matrix).rstrip(".")
     if parameters["filter"] is None:
         _reading(computer, parts)
     elif isinstance(parameters["filter"], KalmanFilter):
         _estimating(computer, parameters["filter"])
     else:
-        _filtering(computer, parameters["filter"], aged=getattr(parts.sensors, "own_times", None) is not None)
+        _filtering(computer, parts)
     _observing(computer, observer, device)
     _commanding(computer, law, observer, parts.command_filter)
     computer.stages.append(Stage("begin", "What is remembered before the first sample.", (), begin))
@@ -161,16 +159,8 @@ def known(parts: Parts) -> dict[str, Any]:
     return parameters
 
 
-def _filter_parameters(computer: Board, sensors: Any, period: Any) -> None:
-    """Round the filter's bandwidth to a short number, and describe the parameters that determine its gains."""
-    computer.parameters["filter_bandwidth"] = derived.bandwidth(sensors, period)
-    computer.about["filter_bandwidth"] = "of the corrections by the star tracker [rad/s]"
-    if sensors.own_times is not None:
-        computer.about["star_tracker_interval"] = "between its samples [s]"
-
-
-def _said(function: Any) -> str:
-    return " ".join((function.__doc__ or "").strip().split("\n\n")[0].split()).rstrip(".")
+def _summary(documented: Any) -> str:
+    return " ".join((documented.__doc__ or "").strip().split("\n\n")[0].split())
 
 
 def _continued(parameters: Given, given: Given, x: State, before: State) -> State:
@@ -199,8 +189,11 @@ def _reading(computer: Board, parts: Parts) -> None:
     computer.stages.append(Stage("sense", "The state for the law: as measured.", reads, sense))
 
 
-def _filtering(computer: Board, filter_: Any, *, aged: bool) -> None:
-    """Add a stage that filters star tracker and gyro; aged: whether the star tracker has its own clock."""
+def _filtering(computer: Board, parts: Parts) -> None:
+    """Add a stage that filters star tracker and gyro."""
+    sensors: Any = parts.sensors
+    aged = sensors.own_times is not None  # the star tracker has its own clock
+    computer.parameters["filter_bandwidth"] = derived.bandwidth(sensors, parts.period)  # a short number
     age = {"attitude_age": real()} if aged else {}
     computer.inputs |= {"attitude": real(4), "attitude_valid": integer(), **age, "rate": real(3)}
     computer.state |= {"attitude": real(4), "rate": real(3), "bias": real(3), "gyro": real(3)}
@@ -209,6 +202,8 @@ def _filtering(computer: Board, filter_: Any, *, aged: bool) -> None:
         "attitude_age": "how long before this sample that attitude was taken, from 0 to the time since the last [s]",
         "bias": "of the gyro, estimated [rad/s]",
         "gyro": "rate as the gyro measured it last [rad/s]",
+        "filter_bandwidth": "of the corrections by the star tracker [rad/s]",
+        "star_tracker_interval": "between its samples [s]",
     }
 
     def sense(parameters: Given, given: Given) -> Given:
@@ -237,7 +232,7 @@ def _filtering(computer: Board, filter_: Any, *, aged: bool) -> None:
     about = "Attitude and rate as the law sees them: the gyro carries the attitude, the star tracker corrects it."
     reads = ("in.attitude", "in.attitude_valid", "in.rate", "before.attitude", "before.bias", "before.gyro", "dt",
              "tracking", "t", *(("in.attitude_age",) if age else ()))  # fmt: skip
-    computer.stages.append(Stage("sense", about, reads, sense, (filter_,)))
+    computer.stages.append(Stage("sense", about, reads, sense, (sensors.filter,)))
 
 
 def _estimating(computer: Board, estimator: KalmanFilter) -> None:
@@ -245,9 +240,9 @@ def _estimating(computer: Board, estimator: KalmanFilter) -> None:
     computer.inputs["rate"] = real(3)
     computer.about["rate"] = computer.model.signals["rate"]
     for sensor in estimator.sensors:
-        name, kind, forward = sensor.name, type(sensor).__doc__ or "", jnp.array([0.0, 0.0, 0.0, 1.0])
+        name, forward = sensor.name, jnp.array([0.0, 0.0, 0.0, 1.0])
         computer.inputs |= {name: jax.eval_shape(sensor.read, forward), f"{name}_valid": integer()}
-        computer.about[name] = " ".join(kind.split("\n\n")[0].split())
+        computer.about[name] = _summary(type(sensor))
         computer.about[f"{name}_valid"] = f"whether {name} has a reading at this sample: 0 or 1"
         if sensor.times.every is None:
             computer.inputs[f"{name}_age"] = real()
@@ -376,7 +371,8 @@ def _commanding(computer: Board, law: Law, observer: Observer, command_filter: C
         computer.state["command_filter"] = jax.eval_shape(lambda: command_filter.begin(m))
         computer.about["command_filter"] = "integrators of the command's filter, advanced by half a period"
         memories, shaped = ["law", "command_filter"], (command_filter,)
-    singular = any(_depends(law.clearance, x, target))
+    traced = jax.make_jaxpr(law.clearance)(x, target)
+    singular = any(dependence(traced.jaxpr, [True] * len(traced.jaxpr.invars)))  # the clearance is no constant
     if singular:
         computer.state |= {"clearance": real(), "clearance_unit": real()}
         computer.about |= {"clearance": "distance from the law's singularity, by `clearance_unit` [-]",
@@ -426,12 +422,6 @@ def begin(parameters: Given, given: Given) -> Given:
     if isinstance(estimator, KalmanFilter):
         begun["now.covariance"] = estimator.covariance(estimator.first[0])
     return {"now.observer": parameters["observer"].begin(), "now.law": parameters["law"].begin(), **begun}
-
-
-def _depends(function: Callable, *args: Any) -> list[bool]:
-    """Return which outputs of a function depend on its arguments."""
-    traced = jax.make_jaxpr(function)(*args)
-    return [bool(found) for found in dependence(traced.jaxpr, [True] * len(traced.jaxpr.invars))]
 
 
 def _acting(computer: Board, device: Actuators, m: int) -> None:

@@ -207,7 +207,7 @@ class Pool:
         return None
 
     def _arithmetic(self, op: str, a: Node, b: Node, kind: str) -> Node | None:
-        def holds(node: Node, value: int) -> bool:
+        def holds(node: Node, value: float) -> bool:
             return node.op == "constant" and node.value == value
 
         if op == "add" and (holds(a, 0) or holds(b, 0)):
@@ -219,7 +219,7 @@ class Pool:
                 return self.make("neg", b, kind=kind)
         if op == "mul":
             half, other = (a, b) if a.op == "constant" else (b, a)
-            if half.value == 0.5 and half.op == "constant" and other.op == "add" and other.args[0] is other.args[1]:
+            if holds(half, 0.5) and other.op == "add" and other.args[0] is other.args[1]:
                 return other.args[0]  # exact
             if (holds(a, 0) and b.finite) or (holds(b, 0) and a.finite):
                 return self.constant(0, kind)

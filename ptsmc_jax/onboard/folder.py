@@ -65,7 +65,7 @@ def flown(scenario: Scenario) -> Scenario:
         raise wrong("loop.mode", scenario.loop.mode, '"sampled" to be exported: a flight computer has samples')
     failure = getattr(scenario.dispersion, "wheel_failure", None)
     if failure is not None and failure.known:
-        raise wrong("dispersion.wheel_failure.known", True, "false to be exported: the C is not told of failures")
+        raise wrong("dispersion.wheel_failure.known", True, "false to be exported: the C does not know of failures")
     return scenarios.replace(scenario, loop__clock="flight")
 
 

@@ -92,9 +92,12 @@ def _derivation(code: Code, known: parameters.Parameters) -> None:
     code.variables = max(code.variables, printer.variables)
 
 
+def _shapes(board: Board) -> dict[str, dict[str, Any]]:
+    return {"in": board.inputs, "before": board.state, "out": board.outputs}
+
+
 def _structs(board: Board) -> dict[str, Struct]:
-    shapes = {"in": board.inputs, "before": board.state, "out": board.outputs}
-    return {name: struct(trees, board.about) for name, trees in shapes.items()}
+    return {name: struct(trees, board.about) for name, trees in _shapes(board).items()}
 
 
 def _listed(made: Struct) -> list[Field]:
@@ -183,10 +186,7 @@ def _function(code: Code, board: Board, stage: Stage, structs: dict[str, Struct]
 
 def _shape_of(board: Board, name: str) -> Any:
     prefix, _, key = name.partition(".")
-    if name in SCALARS:
-        return SCALARS[name]()
-    return {"in": board.inputs, "before": board.state, "now": board.state, "last": board.outputs,
-            "out": board.outputs}[prefix][key]  # fmt: skip
+    return SCALARS[name]() if name in SCALARS else _shapes(board)[STRUCTS[prefix]][key]
 
 
 def _titled(result: np.ndarray, name: str) -> None:

@@ -81,18 +81,12 @@ class Library:
                     f"allowed is a C compiler for this machine, and code that ptsmc_{self.name}.c and "
                     f"ptsmc_{self.name}_parameters.c contain or #include"
                 ) from None
-        if sizes != list(
-            (ctypes.c_long * 4).in_dll(self._made, "ptsmc_sizes")
-        ):  # the C belongs to another controller.json
+        if sizes != list((ctypes.c_long * 4).in_dll(self._made, "ptsmc_sizes")):  # C of another controller.json
             raise none
-        self._given = np.ctypeslib.as_array((ctypes.c_double * sizes[-1]).in_dll(self._made, "ptsmc_given"))
+        # in the order of columns["params"], (columns,); the array is the memory of C
+        self.parameters = np.ctypeslib.as_array((ctypes.c_double * sizes[-1]).in_dll(self._made, "ptsmc_given"))
         self.target = f"ptsmc_{self.name}_{self.digest}_{real}_{next(_loaded)}"  # its name in XLA
         jax.ffi.register_ffi_target(self.target, jax.ffi.pycapsule(self._made.ptsmc_called), platform="cpu")
-
-    @property
-    def parameters(self) -> np.ndarray:
-        """The parameters (columns,) in the order of columns["params"]. The array is the memory of C."""
-        return self._given
 
     def _compiled(self, place: Path, real: str, options: tuple[str, ...]) -> Path:
         glue, library = place / "glue.c", place / "controller.so"
@@ -325,8 +319,7 @@ class InTheLoop:
             leaves, tree = jax.tree.flatten(shape)
             values = []
             for leaf in leaves:
-                size = int(np.prod(leaf.shape, dtype=int))
-                values.append(row[at : at + size].reshape(leaf.shape).astype(leaf.dtype))
-                at += size
+                values.append(row[at : at + leaf.size].reshape(leaf.shape).astype(leaf.dtype))
+                at += leaf.size
             trees[name] = jax.tree.unflatten(tree, values)
         return trees

@@ -104,15 +104,12 @@ class Printer:
         """Largest number of variables, including the entries of tables."""
         return len(self.names) + self.entries
 
-    def body(
-        self, block: Block, outputs: Sequence[tuple[str, Node]], indent: str = "    ", returned: Node | None = None
-    ) -> list[str]:
+    def body(self, block: Block, outputs: Sequence[tuple[str, Node]], returned: Node | None = None) -> list[str]:
         """Return the lines of C of a function body.
 
         Args:
             block: the statements.
             outputs: places in memory to set, and their values.
-            indent: indentation of each line.
             returned: value of the return statement, or None without one.
         """
         for node in [*(node for _, node in outputs), *([] if returned is None else [returned])]:
@@ -122,6 +119,7 @@ class Printer:
             if self._alone(node):
                 self.kept.add(id(node))
                 self.lengths[id(node)] = 8
+        indent = "    "
         lines = self._block(block, indent)
         if outputs and self.section is not None:
             lines.append("")
@@ -130,9 +128,9 @@ class Printer:
 
     # nodes that are needed, and nodes that get a variable
 
-    def _use(self, node: Node, times: int = 1) -> None:
+    def _use(self, node: Node) -> None:
         first = id(node) not in self.nodes
-        self.uses[id(node)] += times
+        self.uses[id(node)] += 1
         self.nodes[id(node)] = node
         if not first:
             return
@@ -142,7 +140,6 @@ class Printer:
             self._use_region(node.value)
 
     def _use_region(self, region: Region) -> None:
-        again = 1 if region.kind == "branch" else 2  # the inputs of a loop are computed before it
         if region.test is not None:
             self._use(region.test)
         for node in (*region.initial, *(entry for _, entries in region.tables for entry in entries)):
@@ -150,7 +147,7 @@ class Printer:
         for outputs in region.outputs:
             for node in outputs:
                 self._use(node)
-        if again > 1:
+        if region.kind != "branch":  # the inputs of a loop are computed before it
             inside = {id(block) for block in region.blocks}
             for node in list(self.nodes.values()):
                 for arg in node.args:
@@ -171,7 +168,8 @@ class Printer:
                 continue
             if node.op == "region":
                 lines += self._heading(node, indent)
-                lines += self._region(node.value, indent)
+                statement = self._branch if node.value.kind == "branch" else self._loop
+                lines += statement(node.value, indent)
             elif id(node) in self.kept:
                 lines += self._heading(node, indent)
                 text = self.text(node, inside=True)
@@ -186,13 +184,8 @@ class Printer:
         said = f"{section.name}, {section.place}" + (f": {section.about}" if section.about else "")
         return ["", *comment(said, indent)]
 
-    def _region(self, region: Region, indent: str) -> list[str]:
+    def _branch(self, region: Region, indent: str) -> list[str]:
         live = [id(node) in self.nodes for node in region.results]
-        if region.kind == "branch":
-            return self._branch(region, indent, live)
-        return self._loop(region, indent)
-
-    def _branch(self, region: Region, indent: str, live: list[bool]) -> list[str]:
         results = [node for node, on in zip(region.results, live, strict=True) if on]
         lines = [f"{indent}{declared(node.kind)} {self._name(node)};" for node in results]
         assert region.test is not None

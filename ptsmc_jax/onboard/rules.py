@@ -124,13 +124,10 @@ def _one_over(pool: Pool, x: Node) -> Node:
 
 
 ELEMENTWISE: dict[str, Callable] = {
-    **{op: _plain(op) for op in ("add", "sub", "mul", "neg", "max", "min", "abs", "sign", "atan2")},
-    **{op: _plain(op) for op in ("lt", "le", "gt", "ge", "eq", "ne")},
-    **{op: _plain(op) for op in "sqrt cbrt exp exp2 expm1 log log1p sin cos tan asin acos atan sinh cosh tanh asinh "
-       "acosh atanh erf erfc floor ceil".split()},
+    **{op: _plain(op) for op in "add sub mul neg max min abs sign lt le gt ge eq ne sqrt cbrt exp exp2 expm1 log log1p "
+       "lgamma sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh erf erfc nextafter floor ceil"
+       .split()},
     **{f"{op}_to": _plain(op) for op in ("lt", "le", "eq")},
-    "lgamma": _plain("lgamma"),
-    "nextafter": _plain("nextafter"),
     "is_finite": lambda pool, params, kind, x: pool.make("isfinite", x, kind=BOOL),
     "and": _logical("and"), "or": _logical("or"), "not": _logical("not"), "xor": _xor,
     "add_any": _plain("add"), "integer_pow": _integer_pow, "select_n": _select, "round": _round,

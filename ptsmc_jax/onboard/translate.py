@@ -215,21 +215,18 @@ class Translator:
             return None
         if not open_places:
             return [self._at(eqn, values, arrays, None, 0)]
-        chosen, index = open_places[0], None
-        bound = max(values[0].shape)
+        chosen, bound = open_places[0], max(values[0].shape)
         least = 0 if chosen.kind.startswith("u") else -1
-        for k in range(bound, least - 1, -1):  # beyond either end, too, where what is to be set may be dropped
+        index = self._at(eqn, values, arrays, chosen, bound)  # for all indices beyond the end; -1: below 0
+        for k in range(bound - 1, least - 1, -1):
             case = self._at(eqn, values, arrays, chosen, k)
-            if index is None:
-                index = case
-                continue
             beyond = self.pool.make("le", chosen, self.pool.constant(k, chosen.kind), kind=BOOL)
             index = self._each(
                 lambda yes, no, beyond=beyond: self.pool.make("select", beyond, yes, no, kind=yes.kind),
                 [case, index],
                 case.shape,
             )
-        return None if index is None else [index]
+        return [index]
 
     def _at(
         self, eqn: Any, values: Sequence[np.ndarray], arrays: Sequence[np.ndarray], chosen: Node | None, k: int
@@ -249,8 +246,7 @@ class Translator:
             if id(value) in numbered:
                 operands.append(jnp.asarray(numbered[id(value)]))
             else:
-                known = [k if node is chosen else node.value for node in value.flat]
-                operands.append(jnp.asarray(np.asarray(known).reshape(value.shape), dtype=variable.aval.dtype))
+                operands.append(jnp.asarray(_known(value, chosen, k), dtype=variable.aval.dtype))
         with jax.ensure_compile_time_eval():
             out = np.asarray(components.bind(_numbering(eqn), operands)[0])
         inside = (out >= 0) & (out < len(pool) - 1)
@@ -260,8 +256,7 @@ class Translator:
         self, eqn: Any, array: np.ndarray, places: np.ndarray, more: np.ndarray, chosen: Node | None, k: int
     ) -> np.ndarray:
         """Return an array with additions or subtractions at indices, if the computed index `chosen` is k."""
-        known = np.asarray([k if node is chosen else node.value for node in places.flat]).reshape(places.shape)
-        types = [variable.aval.dtype for variable in eqn.invars]
+        known, types = _known(places, chosen, k), [variable.aval.dtype for variable in eqn.invars]
         total = array.copy()
         for index in np.ndindex(*more.shape):  # where each of them comes
             one = np.zeros(more.shape)
@@ -307,9 +302,9 @@ def _has_kind(dtype: Any) -> bool:
         return False
 
 
-def _known(value: np.ndarray) -> np.ndarray:
-    """Return the values of constant nodes."""
-    return np.asarray([node.value for node in value.flat]).reshape(value.shape)
+def _known(value: np.ndarray, chosen: Node | None = None, k: int = 0) -> np.ndarray:
+    """Return the values of constant nodes, and k for the node `chosen`."""
+    return np.asarray([k if node is chosen else node.value for node in value.flat]).reshape(value.shape)
 
 
 _FOLDS = {"reduce_sum": "add", "reduce_max": "max", "reduce_min": "min", "reduce_prod": "mul", "reduce_and": "and",

@@ -159,7 +159,7 @@ def first_state(board: Board, samples: Samples) -> np.ndarray:
     kept = {"law": jax.tree.map(lambda v: np.asarray(v)[None], law),
             "observer": jax.tree.map(lambda v: np.asarray(v)[None], observer)}  # fmt: skip
     kept |= {name: value[:1] for name, value in samples.before.items()}
-    empty = np.zeros((1, sum(int(np.prod(leaf.shape, dtype=int)) for leaf in jax.tree.leaves(board.outputs))))
+    empty = np.zeros((1, sum(leaf.size for leaf in jax.tree.leaves(board.outputs))))
     return np.column_stack([np.zeros((1, 3)), _columns(board.state, kept), empty])[0]
 
 
@@ -169,11 +169,9 @@ def _columns(shapes: dict[str, Any], values: dict[str, Any]) -> np.ndarray:
     for name, shape in shapes.items():
         given = values.get(name)
         for k, leaf in enumerate(jax.tree.leaves(shape)):
-            size = int(np.prod(leaf.shape, dtype=int))
             if given is None:
-                count = next(len(v) for v in jax.tree.leaves([v for v in values.values() if v is not None]))
-                found.append(np.zeros((count, size)))
+                found.append(np.zeros((len(jax.tree.leaves(values)[0]), leaf.size)))
             else:
                 column = np.asarray(jax.tree.leaves(given)[k], dtype=float)
-                found.append(column.reshape(len(column), size))
+                found.append(column.reshape(len(column), leaf.size))
     return np.column_stack(found) if found else np.zeros((0, 0))

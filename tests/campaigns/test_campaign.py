@@ -188,7 +188,7 @@ def test_custom_metrics_are_columns_of_the_rows():
 @pytest.mark.parametrize(
     ("made_of", "said"),
     [
-        (lambda result, parts: jnp.zeros(()), "named numbers"),
+        (lambda result, parts: jnp.zeros(()), "but must return named numbers, a dict"),
         (lambda result, parts: {"x": result.log.t}, "its x is no single number"),
         (lambda result, parts: {"x": "no"}, "its x is no single number"),
         (lambda result, parts: {"x": 1j * result.log.u[0, 0]}, "its x is no single number"),
@@ -196,10 +196,10 @@ def test_custom_metrics_are_columns_of_the_rows():
             lambda result, parts: {"x\n": result.log.u[0, 0]},
             r"its 'x\\n' is no name of a column; allowed are names that",
         ),
-        (lambda result, parts: {"effort": jnp.zeros(())}, "its effort has the name of a column"),
+        (lambda result, parts: {"effort": jnp.zeros(())}, "its effort has the name of a column that the rows have"),
         # a column of campaigns with a run table
         (lambda result, parts: {"plan_seed": jnp.zeros(())}, "its plan_seed has the name of a column"),
-        (lambda result, parts: {}, "named numbers"),
+        (lambda result, parts: {}, "it returns an empty dict, but must return named numbers"),
         (
             lambda result, parts: {"x": 1 / 0},
             r"it fails: ZeroDivisionError: division by zero \(line \d+ of test_campaign",

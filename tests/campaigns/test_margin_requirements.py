@@ -19,7 +19,7 @@ from ptsmc_jax.campaigns import margin_verdicts, runs, store
 from ptsmc_jax.simulation import catalogues, rollout
 from ptsmc_jax.simulation.requirements import Requirement, Verdict, over
 from ptsmc_jax.theory import margins, run_margins
-from tests.helpers import FIRST_FLIGHT, ROOT, SHORT_CHAIN, equations, short, untuned
+from tests.helpers import FIRST_FLIGHT, ROOT, SHORT_CHAIN, assert_prepared, equations, short, untuned
 from tuning.search import margin_rows
 from tuning.search.gains import with_gains
 from tuning.studies import posing
@@ -339,10 +339,6 @@ def test_prepared_margin_program_is_the_program_of_the_search(drawn, monkeypatch
     assert known == [(jax.tree.structure(asked), [jax.typeof(leaf) for leaf in jax.tree.leaves(asked)])]
 
 
-class _AskedError(Exception):
-    pass
-
-
 @pytest.mark.parametrize(
     ("owner", "program", "prepare", "ask"),
     [
@@ -353,22 +349,8 @@ class _AskedError(Exception):
 )
 def test_prepared_programs_of_a_campaign_are_those_that_it_uses(drawn, monkeypatch, owner, program, prepare, ask):
     """A program with other shapes or types would be compiled in vain."""
-    known = []
-
-    def heard(*given, **fixed):
-        known.append((jax.tree.structure(given), [jax.typeof(leaf) for leaf in jax.tree.leaves(given)], fixed))
-
-    def called(*given, **fixed):
-        heard(*given, **fixed)
-        raise _AskedError
-
-    called.prepare = heard  # pyright: ignore[reportFunctionMemberAccess]
-    monkeypatch.setattr(owner, program, called)
-    prepare(drawn.ready)
-    with pytest.raises(_AskedError):
-        ask(drawn.ready)
-    assert len(known) == 2
-    assert known[0] == known[1]
+    ready = drawn.ready
+    assert_prepared(monkeypatch, owner, program, lambda: prepare(ready), lambda: ask(ready))
 
 
 FACTORS = [[1.0, 1.0, 1.0, 1.0], [1.0, 0.2, 1.0, 1.0], [1.3, 1.0, 5.0, 0.1]]  # on the gains

@@ -5,7 +5,7 @@ import pytest
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.simulation import rollout
-from tests.helpers import FIRST_FLIGHT, SHORT_CHAIN, random_turns, short, untuned
+from tests.helpers import FIRST_FLIGHT, SHORT_CHAIN, assert_prepared, random_turns, short, untuned
 
 # eta, delta [s], observer gain: RMS window error and mean peak torque [N m], without and with noise (theory notes, 6)
 TABLE = (
@@ -56,30 +56,12 @@ def test_any_number_of_trials_can_be_simulated(chain, flown, count):
     np.testing.assert_allclose(some.metrics.window_error, flown.metrics.window_error[:count], rtol=1e-12)
 
 
-class _AskedError(Exception):
-    pass
-
-
 @pytest.mark.parametrize("count", [1, 63, 64, 1000])
 def test_prepared_program_is_the_program_of_the_simulation(chain, count, monkeypatch):
     """A program with other shapes or types would be compiled in vain."""
-    known = []
-
-    def heard(parts, dispersion, *numbers_and_fixed):
-        *numbers, devices, own, kernel, software = numbers_and_fixed
-        known.append(([jax.typeof(v) for v in numbers], devices, own, kernel, software))
-
-    def called(*given):
-        heard(*given)
-        raise _AskedError
-
-    called.prepare = heard  # pyright: ignore[reportFunctionMemberAccess]
-    monkeypatch.setattr(montecarlo, "_fly", called)
-    montecarlo.prepare(chain.parts, chain.dispersion, count)
-    with pytest.raises(_AskedError):
-        montecarlo.run(chain.parts, chain.dispersion, 5, np.arange(count))
-    assert len(known) == 2
-    assert known[0] == known[1]
+    ready, trials = (chain.parts, chain.dispersion), np.arange(count)
+    prepare, run = (lambda: montecarlo.prepare(*ready, count)), (lambda: montecarlo.run(*ready, 5, trials))
+    assert_prepared(monkeypatch, montecarlo, "_fly", prepare, run)
 
 
 @pytest.mark.parametrize(

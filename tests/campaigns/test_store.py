@@ -14,24 +14,7 @@ from hypothesis import strategies as st
 
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.simulation.requirements import Requirement
-
-
-def test_result_folder_is_written_completely_or_not_at_all(tmp_path):
-    def broken(folder):
-        (folder / "a.txt").write_text("half")
-        raise RuntimeError
-
-    with pytest.raises(RuntimeError):
-        store.write(tmp_path / "new", broken)
-    assert list(tmp_path.iterdir()) == []
-
-    existing = tmp_path / "old"
-    existing.mkdir()
-    (existing / "a.txt").write_text("before")
-    with pytest.raises(RuntimeError):
-        store.write(existing, broken)
-    assert [p.name for p in tmp_path.iterdir()] == ["old"]
-    assert (existing / "a.txt").read_text() == "before"
+from tests.helpers import tree
 
 
 def test_writing_into_an_existing_folder_replaces_only_what_is_written(tmp_path):
@@ -136,14 +119,12 @@ TOLD = {"command": "tune", "seed": 5}
 
 
 def test_earlier_result_needs_the_same_scenario_seed_and_command(tmp_path):
-    tables = {"controller": {"eta": 3.0, "gain": [1.0, 2.0]}}
-    store.write_toml(tmp_path / "scenario.toml", tables)
-    store.write_json(tmp_path / "versions.json", store.versions("tune", 5))
-    store.write_json(tmp_path / "summary.json", {"status": "met"})
-    assert store.previous(tmp_path, tables, TOLD) == {"status": "met"}
-    assert store.previous(tmp_path, tables, {**TOLD, "seed": 6}) is None
-    assert store.previous(tmp_path, tables, {**TOLD, "command": "simulate"}) is None
-    assert store.previous(tmp_path, {"controller": {"eta": 3.1, "gain": [1.0, 2.0]}}, TOLD) is None
+    tables, folder = {"controller": {"eta": 3.0, "gain": [1.0, 2.0]}}, tmp_path / "out"
+    finished(folder, tables)
+    assert store.previous(folder, tables, TOLD) == {"status": "met"}
+    assert store.previous(folder, tables, {**TOLD, "seed": 6}) is None
+    assert store.previous(folder, tables, {**TOLD, "command": "simulate"}) is None
+    assert store.previous(folder, {"controller": {"eta": 3.1, "gain": [1.0, 2.0]}}, TOLD) is None
     assert store.previous(tmp_path / "none", tables, TOLD) is None
 
 
@@ -158,10 +139,6 @@ def test_verdicts_count_failures_and_missing_values():
     failed = limit.verdict(np.array([29.0, 1.0, 31.0]), np.array([True, False, True]))
     assert (failed.met, failed.failures, failed.trials) == (False, 2, 3)
     assert "NOT met in 2 of 3 trials" in str(failed)
-
-
-def tree(folder):
-    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
 def fill(folder):
@@ -352,12 +329,6 @@ def test_toml_tables_are_read_back_exactly(tmp_path_factory, tables):
     assert json.dumps(read, sort_keys=True) == json.dumps(tables, sort_keys=True)
 
 
-def test_toml_has_arrays_on_one_line(tmp_path):
-    store.write_toml(tmp_path / "a.toml", {"a": {"x": [1.0, 0.25], "w": ["a", "b"]}})
-    lines = (tmp_path / "a.toml").read_text().splitlines()
-    assert lines == ["[a]", "x = [1.0, 0.25]", 'w = ["a", "b"]']
-
-
 def finished(folder, tables):
     folder.mkdir()
     store.write_toml(folder / "scenario.toml", tables)
@@ -410,8 +381,8 @@ def test_nested_arrays_are_on_one_line(tmp_path):
     tables = {"a": {"flat": [1.0, 2.0], "deep": [[1.0, 0.0], [0.0, 1.0]], "words": ["x, [y]", "]"], "none": []}}
     store.write_toml(tmp_path / "t.toml", tables)
     text = (tmp_path / "t.toml").read_text()
-    assert "deep = [[1.0, 0.0], [0.0, 1.0]]" in text
-    assert len(text.splitlines()) == 5
+    deep, words = "deep = [[1.0, 0.0], [0.0, 1.0]]", 'words = ["x, [y]", "]"]'
+    assert text.splitlines() == ["[a]", "flat = [1.0, 2.0]", deep, words, "none = []"]
     assert tomllib.loads(text) == tables
 
 

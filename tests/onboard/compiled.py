@@ -17,7 +17,6 @@ from ptsmc_jax.onboard import folder, printing, templates
 from ptsmc_jax.onboard.expressions import Pool, kind_of
 from ptsmc_jax.onboard.library import compiler
 from ptsmc_jax.onboard.translate import Translator
-from tests.onboard.flights import FLIGHTS
 
 CC = os.environ.get("CC") or shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 needs_compiler = pytest.mark.skipif(CC is None, reason="this machine has no C compiler")
@@ -79,8 +78,8 @@ def both(folder, function, *args):
     return found, expected
 
 
-def program(name, place):
-    """Write the controller of a scenario in FLIGHTS, without test vectors."""
-    made = folder.Controller(scenario.reading.complete(scenario.from_tables(FLIGHTS[name])), "flight", name)
+def program(tables, place):
+    """Write the controller of a scenario, without test vectors."""
+    made = folder.Controller(scenario.reading.complete(scenario.from_tables(tables)), "flight", "a scenario")
     store.write(place, lambda making: folder.write_program(making, made))
     return made

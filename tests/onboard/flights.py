@@ -44,7 +44,8 @@ FLIGHTS: dict[str, dict[str, Any]] = {
                       reference={"kind": "own", "code": OWN + "Nodding", "angle": 0.1}),
     # further variants
     "no observer": flight(observer={"kind": "none"}, controller={"sign_width": 0.0}),
-    "finite time observer": flight(observer={"kind": "finite_time", "gain": [0.1, 0.1, 0.1]}),
+    "finite time observer": flight(observer={"kind": "finite_time", "gain": [0.1, 0.1, 0.1]},
+                                   controller={"disturbance_rate_bound": 1e-3}),
     "prescribed time observer": flight(observer={"kind": "prescribed_time", "t_o": 2.0}),
     "implicit": flight(controller={"sampling": "implicit"}),
     "chain of order 4": {**CHAIN, "plant": {"kind": "chain", "order": 4, "x0": [1.0, 0.0, 0.0, 0.0]},

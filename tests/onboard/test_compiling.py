@@ -20,7 +20,7 @@ from tests.onboard.flights import FLIGHTS
 def chain(tmp_path_factory):
     """The folder of a small controller."""
     place = tmp_path_factory.mktemp("exported") / "controller"
-    program("chain", place)
+    program(FLIGHTS["chain"], place)
     return place
 
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from ptsmc_jax import scenario
-from ptsmc_jax.campaigns import store
 from ptsmc_jax.observers.base import ErrorBound
 from ptsmc_jax.onboard import folder, vectors
 from ptsmc_jax.onboard.board import board
@@ -17,7 +16,7 @@ from ptsmc_jax.onboard.library import Library, compiler
 from ptsmc_jax.onboard.readme import readme
 from scenarios.own_parts import LowPass
 from tests.helpers import short
-from tests.onboard.compiled import STRICT, needs_compiler
+from tests.onboard.compiled import STRICT, needs_compiler, program
 from tests.onboard.flights import FILTER, FLIGHTS, FULL, flight
 
 OTHER = np.diag([8.0, 13.0, 12.0]) + np.array([[0.0, 0.4, 0.3], [0.4, 0.0, -0.5], [0.3, -0.5, 0.0]])
@@ -101,11 +100,8 @@ def put(library, name, value):
 
 
 def exported(tables, place):
-    """A complete scenario, and its compiled controller."""
-    known = scenario.reading.complete(scenario.from_tables(tables))
-    made = folder.Controller(known, "flight", "flight")
-    store.write(place, lambda making: folder.write_program(making, made))
-    return known, Library(place)
+    """A complete scenario, whose defaults do not follow later changes, and its compiled controller."""
+    return scenario.reading.settled(program(tables, place).scenario), Library(place)
 
 
 def changed(known, changes):

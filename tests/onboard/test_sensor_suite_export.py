@@ -6,13 +6,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import ptsmc_jax as ptsmc
-from ptsmc_jax import scenario
-from ptsmc_jax.campaigns import store
 from ptsmc_jax.numerics import attitude
 from ptsmc_jax.onboard import folder, vectors
 from ptsmc_jax.onboard.library import Library
 from ptsmc_jax.simulation.computer import SAMPLES
-from tests.onboard.compiled import needs_compiler
+from tests.onboard.compiled import needs_compiler, program
 from tests.onboard.flights import LAW, LOOP, SPREAD
 
 
@@ -50,8 +48,7 @@ pytestmark = needs_compiler
 def suite(tmp_path_factory):
     """The compiled controller, and inputs, outputs and states of a simulated trial, with the initial state first."""
     place = tmp_path_factory.mktemp("suite") / "controller"
-    made = folder.Controller(scenario.reading.complete(scenario.from_tables(TABLES)), "flight", "suite")
-    store.write(place, lambda making: folder.write_program(making, made))
+    made = program(TABLES, place)
     samples = folder.fly(made, 3, 1)[0]
     given, out, states = vectors.rows(made.board, samples)
     return Library(place), given, out, np.vstack([vectors.first_state(made.board, samples), states])
