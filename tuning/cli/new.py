@@ -98,8 +98,9 @@ class _File:
             yield from _prose(keys.about(struct))
         yield f"{'#' if live is None else ''}[{name}]"
         yield from self.kind(name, kind, struct, live, values)
+        declared = struct.__struct_fields__
         if issubclass(struct, Own):
-            for key in (key for key in live or () if key not in ("kind", *struct.__struct_fields__)):
+            for key in (key for key in live or () if key not in ("kind", *declared)):
                 yield from _line(False, key, values[key], "custom")
         if issubclass(struct, Attitude) and name != "initial":
             yield from _prose("its attitude by one of the keys of [initial]")
