@@ -32,7 +32,7 @@ from ptsmc_jax.scenario.tables import Scenario  # noqa: E402
 SCENARIOS = HERE.parent / "scenarios"
 PLAIN = scenario.read(SCENARIOS / "filtered_flight.toml")
 FULL_INERTIA = [[11.0, 0.8, -0.5], [0.8, 12.0, 0.6], [-0.5, 0.6, 14.0]]
-CUSTOM = {"kind": "own", "code": str(SCENARIOS / "own_parts.py")}
+CUSTOM = {"kind": "custom", "code": str(SCENARIOS / "own_parts.py")}
 EXCLUDED = ("loop.mode continuous",)  # it has no control periods
 
 
@@ -48,13 +48,13 @@ VALUES: dict[str, dict[str, Any]] = {
     "spacecraft.true_inertia": {"spacecraft__true_inertia": FULL_INERTIA},
     "reference spin": {"reference": {"kind": "spin", "rate": [0.01, -0.02, 0.03]}},
     "reference slew": {"reference": {"kind": "slew", "to_quat_xyzw": [0.28, 0.0, 0.0, 0.96]}},
-    "reference own": {"reference": custom("Nodding")},
+    "reference custom": {"reference": custom("Nodding")},
     "disturbance gravity_gradient": {"disturbance": {"kind": "gravity_gradient", "orbit_rate": 1e-3}},
-    "disturbance own": {"disturbance": custom("SolarPressure")},
+    "disturbance custom": {"disturbance": custom("SolarPressure")},
     "disturbance sum": {"disturbance": {"kind": "sum", "terms": [{"kind": "sinusoid"}, {"kind": "constant"}]}},
-    "observer own": {"observer": custom("LowPass")},
-    "controller own": {"controller": custom("Scaling", t_f=35.0, delta=3.0), "tune": None},
-    "sensors own": {"sensors": custom("StarTracker"), "filter": None, "hardware": None},
+    "observer custom": {"observer": custom("LowPass")},
+    "controller custom": {"controller": custom("Scaling", t_f=35.0, delta=3.0), "tune": None},
+    "sensors custom": {"sensors": custom("StarTracker"), "filter": None, "hardware": None},
     "hardware.torque_limit": {"hardware__torque_limit": 0.5},
     "hardware.torque_rate_limit": {"hardware__torque_rate_limit": 5.0},
     "hardware.torque_lag": {"hardware__torque_lag": 0.1},
@@ -65,7 +65,7 @@ VALUES: dict[str, dict[str, Any]] = {
     "hardware.rate_bias_walk": {"hardware__rate_bias_walk": 1e-8},
     "hardware.star_tracker_every": {"hardware__star_tracker_every": 4},
     "hardware.star_tracker_period": {"hardware__star_tracker_period": 0.12},
-    "dispersion.own own": {"dispersion__own": custom("SunDirection"), "disturbance": custom("SolarPressure")},
+    "dispersion.custom custom": {"dispersion__custom": custom("SunDirection"), "disturbance": custom("SolarPressure")},
 }
 KEYS: dict[str, dict[str, Any]] = {  # that a kind needs besides `kind`, by table
     "controller": {"t_f": 35.0},
@@ -76,7 +76,7 @@ BASES = {
     "dispersion.torque_limit": "hardware.torque_limit",
     "dispersion.wheel_failure": "wheels pyramid",
     "dispersion.mode": "flexible",
-    "dispersion.own": "disturbance own",
+    "dispersion.custom": "disturbance custom",
 }
 
 

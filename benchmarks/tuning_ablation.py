@@ -112,7 +112,9 @@ def main() -> None:
                 started, before = time.monotonic(), (evaluate.rollouts, evaluate.gradients)
                 with inside():
                     settings = optimise.Settings(table.starts, table.steps, seed, posed.sloped, judged=False)
-                    found = optimise.search(evaluate, posed.problem, posed.ready.requirements, posed.own, settings)
+                    found = optimise.search(
+                        evaluate, posed.problem, posed.ready.requirements, posed.scenario_gains, settings
+                    )
                 keep(name, variant, seed, goal=found.value, kept=bool(found.worst.max(initial=0.0) <= 1.0),
                      rollouts=evaluate.rollouts - before[0], gradients=evaluate.gradients - before[1],
                      seconds=round(time.monotonic() - started, 1), gains=found.gains.tolist())  # fmt: skip

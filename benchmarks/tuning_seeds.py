@@ -56,11 +56,17 @@ def main() -> None:
     table = loaded.tune
     assert table is not None
     posed = posing.pose(loaded, 0)
-    ready, problem, evaluate, own, found = posed.ready, posed.problem, posed.evaluate, posed.own, []
+    ready, problem, evaluate, scenario_gains, found = (
+        posed.ready,
+        posed.problem,
+        posed.evaluate,
+        posed.scenario_gains,
+        [],
+    )
     for seed in range(first, end):
         started, before = time.monotonic(), (evaluate.rollouts, evaluate.gradients)
         settings = optimise.Settings(table.starts, table.steps, seed, posed.sloped, table.worst_case, judged=False)
-        one = optimise.search(evaluate, problem, ready.requirements, own, settings)
+        one = optimise.search(evaluate, problem, ready.requirements, scenario_gains, settings)
         took = time.monotonic() - started
         flown, slopes = evaluate.rollouts - before[0], evaluate.gradients - before[1]
         found.append(one)

@@ -147,7 +147,7 @@ class Scaling(ptsmc.AccelerationLaw):
 flight = ptsmc.read("../scenarios/first_flight.toml")
 t_f, delta = flight.controller.t_f, 0.1 * flight.controller.t_f
 laws = {
-    "of my own": {"kind": "own", "code": Scaling, "t_f": t_f, "delta": delta},
+    "of my own": {"kind": "custom", "code": Scaling, "t_f": t_f, "delta": delta},
     "built in": {"kind": "scaling", "t_f": t_f, "delta": delta},
 }
 figure, axes = plt.subplots(figsize=(8, 4))
@@ -161,12 +161,12 @@ _ = axes.legend()
 
 # %%
 swung = ptsmc.replace(
-    swing, controller={"kind": "own", "code": Scaling, "t_f": 4.0, "delta": 0.4, "k": 0.01}, loop={"mode": "sampled"}
+    swing, controller={"kind": "custom", "code": Scaling, "t_f": 4.0, "delta": 0.4, "k": 0.01}, loop={"mode": "sampled"}
 )
 ptsmc.simulate(swung).metrics["window_error"]
 
 # %% [markdown]
 # A plant or a law of your own goes through every command: `plant.system = "FILE.py:NAME"` in a scenario file, or
-# `controller.kind = "own"` with `code = "FILE.py:NAME"`, then `ptsmc tune` and `ptsmc montecarlo` as for any other, and
+# `controller.kind = "custom"` with `code = "FILE.py:NAME"`, then `ptsmc tune` and `ptsmc montecarlo` as for any other, and
 # `ptsmc compare --law FILE.py:NAME` beside the built-in ones. `scenarios/two_link_arm.toml` has a plant, with its equations
 # beside, `scenarios/own_parts.toml` a law, an observer, a disturbance, a reference, sensors and a draw.

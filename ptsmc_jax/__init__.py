@@ -14,7 +14,7 @@ _NAMES = {
     "campaigns.montecarlo": "one run",
     "declare": "gain number",
     "devices.attitude_sensors": "AttitudeSensor",
-    "devices.own_sensors": "SampledSensor",
+    "devices.custom_sensors": "SampledSensor",
     "devices.sensors": "Sensors",
     "dispersions.base": "Draw",
     "dispersions.variation": "Dispersion",
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from ptsmc_jax.declare import gain as gain
     from ptsmc_jax.declare import number as number
     from ptsmc_jax.devices.attitude_sensors import AttitudeSensor as AttitudeSensor
-    from ptsmc_jax.devices.own_sensors import SampledSensor as SampledSensor
+    from ptsmc_jax.devices.custom_sensors import SampledSensor as SampledSensor
     from ptsmc_jax.devices.sensors import Sensors as Sensors
     from ptsmc_jax.dispersions.base import Draw as Draw
     from ptsmc_jax.dispersions.variation import Dispersion as Dispersion

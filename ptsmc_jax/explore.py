@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import campaign, margin_verdicts, plans, runs, store
-from ptsmc_jax.campaigns.montecarlo import OwnMetrics
+from ptsmc_jax.campaigns.montecarlo import CustomMetrics
 from ptsmc_jax.campaigns.runs import Run
 from ptsmc_jax.figures import animation, run_plots
 from ptsmc_jax.numerics import draws
@@ -181,7 +181,7 @@ def trials(
     count: int | pl.DataFrame = 1000,
     *,
     seed: int = 0,
-    own: OwnMetrics | None = None,
+    custom_metrics: CustomMetrics | None = None,
     controller: str | Path | None = None,
 ) -> pl.DataFrame:
     """Run trials of a scenario, the same trials as `ptsmc montecarlo` runs.
@@ -190,7 +190,7 @@ def trials(
         what: a scenario, the path of its file, or a study.
         count: number of trials, or a run table with one row for each trial, see `plans`.
         seed: seed of the dispersions and the noise.
-        own: function that returns custom metrics, see `montecarlo.one`.
+        custom_metrics: function that returns custom metrics, see `montecarlo.one`.
         controller: a folder that `export` wrote. Its C code then computes the torque, on the flight clock. If `what` is
             a study, its scenario is simulated.
 
@@ -208,14 +208,16 @@ def trials(
     draws.check_whole_number("seed", seed)
     ready = _ready(what if controller is None else folder.flown(_read(what)))
     software = _software(controller, ready)
-    drawn = campaign.Campaign(ready, seed, own, software=software)
+    drawn = campaign.Campaign(ready, seed, custom_metrics, software=software)
     try:
-        names = drawn.own_names()
+        names = drawn.custom_metric_names()
     except ValueError as error:
-        raise ValueError(f"own is {getattr(own, '__name__', type(own).__name__)}: {error}") from None
+        raise ValueError(
+            f"custom_metrics is {getattr(custom_metrics, '__name__', type(custom_metrics).__name__)}: {error}"
+        ) from None
     if isinstance(count, pl.DataFrame):
-        plan = plans.checked(count, ready.parts, own=names, drawn=ready.dispersion.own_names())
-        drawn, count = replace(campaign.of_plan(ready, seed, plan, own), software=software), plan.count
+        plan = plans.checked(count, ready.parts, custom_metrics=names, drawn=ready.dispersion.custom_names())
+        drawn, count = replace(campaign.of_plan(ready, seed, plan, custom_metrics), software=software), plan.count
     if np.ndim(count) or np.asarray(count).dtype == object:
         raise ValueError(f"count is a {type(count).__name__}, but must be a whole number, or a plan as a polars table")
     draws.check_whole_number("count", count, 1)

@@ -1,4 +1,4 @@
-"""Custom parts for own_parts.toml, one of each kind. See docs/own_parts.md."""
+"""Custom parts for own_parts.toml, one of each kind. See docs/custom_parts.md."""
 
 import dataclasses
 

@@ -31,7 +31,7 @@ from tuning.search.gains import with_gains
 
 SEED, NUMBERS = np.uint32(3), np.arange(4, dtype=np.uint32)
 ARM = str(ROOT / "scenarios" / "two_link_arm.py") + ":arm"
-OWN = str(ROOT / "scenarios" / "own_parts.py")
+CUSTOM = str(ROOT / "scenarios" / "own_parts.py")
 SLEW = {"t_f": 6.0, "delta": 0.3, "eta": 2.6}
 SHORT = {"t_end": 7.5, "window": 1.0}
 SAMPLED = {"mode": "sampled", "period": 0.25, **SHORT}
@@ -133,7 +133,7 @@ ROWS: dict[str, dict] = {
             "dispersion": SPREAD,
         }
         for kind, law in LAWS["spacecraft"].items()
-        if kind != "own" and not law.made.prescribed
+        if kind != "custom" and not law.made.prescribed
     },
     "system": {
         "plant": {"kind": "system", "system": ARM, "x0": [0.4, -0.3, 0.0, 0.0]},
@@ -144,10 +144,10 @@ ROWS: dict[str, dict] = {
         "dispersion": {"x0": {"kind": "normal", "std": [0.1, 0.1, 0.0, 0.1]}},
     },
     "parts of one's own": {
-        "controller": {"kind": "own", "code": f"{OWN}:Scaling", "t_f": 6.0, "delta": 1.0},
-        "observer": {"kind": "own", "code": f"{OWN}:LowPass"},
-        "reference": {"kind": "own", "code": f"{OWN}:Nodding"},
-        "disturbance": {"kind": "own", "code": f"{OWN}:SolarPressure"},
+        "controller": {"kind": "custom", "code": f"{CUSTOM}:Scaling", "t_f": 6.0, "delta": 1.0},
+        "observer": {"kind": "custom", "code": f"{CUSTOM}:LowPass"},
+        "reference": {"kind": "custom", "code": f"{CUSTOM}:Nodding"},
+        "disturbance": {"kind": "custom", "code": f"{CUSTOM}:SolarPressure"},
         "loop": SAMPLED,
         "hardware": NOISE,
         "dispersion": SPREAD,
@@ -377,7 +377,7 @@ def test_programs_of_built_in_parts_are_stored(name, tmp_path, monkeypatch):
     ready = scenario.study(scenario.from_tables(ROWS[name]))
     runs.prepare(ready)
     montecarlo.prepare(ready.parts, ready.dispersion, len(NUMBERS))
-    assert len(stored) == (0 if ARM in str(ROWS[name]) or OWN in str(ROWS[name]) else 2)
+    assert len(stored) == (0 if ARM in str(ROWS[name]) or CUSTOM in str(ROWS[name]) else 2)
 
 
 def test_lanes_equal_vmap_for_a_plant_from_python():

@@ -253,7 +253,7 @@ def lacking(function, docs):
 def test_docstrings_state_shapes_and_units(name):
     module = importlib.import_module(name)
     seen = list(public(module))
-    assert not [f"{own}: {what}" for own, function, docs in seen for what in lacking(function, docs)]
+    assert not [f"{name}: {what}" for name, function, docs in seen for what in lacking(function, docs)]
 
 
 def test_the_docstring_check_finds_missing_shapes_and_units():

@@ -78,18 +78,18 @@ def test_a_scenario_with_other_gains_can_be_written_and_read(flight, tmp_path):
 
 def test_a_new_inertia_changes_the_design_model_or_only_the_true_plant(flight):
     inertia = np.array([[11.0, 0.5, 0.0], [0.5, 12.0, -0.3], [0.0, -0.3, 9.0]])
-    own = scenario.study(flight.scenario).parts
+    parts = scenario.study(flight.scenario).parts
     wanted = scenario.study(scenario.replace(flight.scenario, spacecraft__inertia=inertia.tolist())).parts
-    moved, traced = own.with_inertia(inertia), jax.jit(own.with_inertia)(inertia)
+    moved, traced = parts.with_inertia(inertia), jax.jit(parts.with_inertia)(inertia)
     for part in (lambda p: p.plant, lambda p: p.controller.model, lambda p: p.observer.model):
         np.testing.assert_array_equal(part(moved).inertia, part(wanted).inertia)
         np.testing.assert_array_equal(part(moved).inertia_inverse, part(wanted).inertia_inverse)
         # elimination and LAPACK differ by some rounding
         np.testing.assert_allclose(part(traced).inertia_inverse, np.linalg.inv(inertia), rtol=1e-14, atol=1e-17)
-    unknown = own.with_inertia([9.0, 8.0, 7.0], known=False)
+    unknown = parts.with_inertia([9.0, 8.0, 7.0], known=False)
     np.testing.assert_array_equal(unknown.plant.inertia, np.diag([9.0, 8.0, 7.0]))
-    np.testing.assert_array_equal(unknown.controller.model.inertia, own.controller.model.inertia)
-    np.testing.assert_array_equal(unknown.observer.model.inertia, own.observer.model.inertia)
+    np.testing.assert_array_equal(unknown.controller.model.inertia, parts.controller.model.inertia)
+    np.testing.assert_array_equal(unknown.observer.model.inertia, parts.observer.model.inertia)
 
 
 @pytest.mark.parametrize("known", [True, False])
@@ -197,7 +197,7 @@ def peak(result, parts):
 
 def test_trials_validates_numbers_and_returns_custom_metrics():
     flight = scenario.from_tables(tomllib.loads(SHORT_CHAIN))
-    rows = ptsmc_jax.trials(flight, 2, own=peak)
+    rows = ptsmc_jax.trials(flight, 2, custom_metrics=peak)
     np.testing.assert_allclose(rows["mine"], 2.0 * rows["peak_torque"], rtol=1e-14)
     for asked in (lambda: ptsmc_jax.trials(flight, -1), lambda: ptsmc_jax.simulate(flight, seed=2**32),
                   lambda: ptsmc_jax.simulate(flight, trial=-1)):  # fmt: skip
@@ -207,8 +207,10 @@ def test_trials_validates_numbers_and_returns_custom_metrics():
 
 def test_the_error_of_invalid_custom_metrics_names_their_function():
     """See `test_campaign.py` for the other errors."""
-    with pytest.raises(ValueError, match=r"^own is <lambda>: it returns an empty dict, but must return named numbers"):
-        ptsmc_jax.trials(scenario.from_tables(tomllib.loads(SHORT_CHAIN)), 2, own=lambda result, parts: {})
+    with pytest.raises(
+        ValueError, match=r"^custom_metrics is <lambda>: it returns an empty dict, but must return named numbers"
+    ):
+        ptsmc_jax.trials(scenario.from_tables(tomllib.loads(SHORT_CHAIN)), 2, custom_metrics=lambda result, parts: {})
 
 
 def test_an_incomplete_run_shows_its_reason_and_dashes_for_missing_metrics():

@@ -16,16 +16,16 @@ import polars as pl
 from ptsmc_jax import configure, programs
 from ptsmc_jax.batching import lanes
 from ptsmc_jax.campaigns import montecarlo, plans
-from ptsmc_jax.campaigns.montecarlo import OwnMetrics
+from ptsmc_jax.campaigns.montecarlo import CustomMetrics
 from ptsmc_jax.campaigns.plans import Plan
 from ptsmc_jax.campaigns.rows import Part, Rows, read
 from ptsmc_jax.devices.sensors import RATE_BIAS
 from ptsmc_jax.dispersions import planned
-from ptsmc_jax.dispersions.base import OWN
+from ptsmc_jax.dispersions.base import CUSTOM
 from ptsmc_jax.dispersions.planned import Row
 from ptsmc_jax.dispersions.quantities import QUANTITIES
 from ptsmc_jax.dispersions.variation import Dispersion
-from ptsmc_jax.scenario import Study, own_checks
+from ptsmc_jax.scenario import Study, custom_checks
 from ptsmc_jax.simulation import requirements, rollout
 from ptsmc_jax.simulation.computer import OURS, Software
 from ptsmc_jax.simulation.requirements import Requirement, Verdict
@@ -42,7 +42,7 @@ class Campaign:
 
     ready: Study
     seed: int
-    own: OwnMetrics | None = None  # custom metrics
+    custom_metrics: CustomMetrics | None = None  # custom metrics
     plan: Plan | None = None  # run table with a row for each trial
     software: Software = OURS  # the flight computer
 
@@ -60,7 +60,9 @@ class Campaign:
         # at least as many as the usual program simulates, so that rows are equal to the last digit
         wanted = np.resize(np.asarray(trials, dtype=np.uint32), max(len(trials), montecarlo.FEW))
         parts, rows = self.ready.parts, self.rows(wanted)
-        flown = montecarlo.run(parts, self.ready.dispersion, self.seed, rows, own=self.own, software=self.software)
+        flown = montecarlo.run(
+            parts, self.ready.dispersion, self.seed, rows, custom_metrics=self.custom_metrics, software=self.software
+        )
         statuses = [rollout.STATUS[int(code)] for code in flown.status]
         frame = pl.DataFrame({
             "trial": wanted,
@@ -71,7 +73,7 @@ class Campaign:
             **{name: getattr(flown.metrics, name) for name in self.ready.catalogue},
             **_counted(flown.samples),
             **flown.drawn,
-            **flown.own,
+            **flown.custom_metrics,
         })  # fmt: skip
         return frame.head(len(trials)).with_columns(pl.col(pl.Float64, pl.Float32).fill_nan(None))
 
@@ -86,9 +88,9 @@ class Campaign:
     def _origin(self, trials: np.ndarray) -> dict[str, np.ndarray]:
         return {} if self.plan is None else self.plan.origin(trials)
 
-    def own_names(self) -> list[str]:
+    def custom_metric_names(self) -> list[str]:
         """Return the names of the custom metrics. Raises ValueError if they fail or a row cannot hold them."""
-        made = self.own
+        made = self.custom_metrics
         if made is None:
             return []
 
@@ -97,7 +99,7 @@ class Campaign:
                 returned: Any = made(result, parts)
             except (Exception, SystemExit) as error:
                 file = getattr(getattr(made, "__code__", None), "co_filename", "")
-                raise ValueError(f"it {own_checks.what_fails(error, file)}") from error
+                raise ValueError(f"it {custom_checks.what_fails(error, file)}") from error
             if not isinstance(returned, dict) or not returned or not all(isinstance(name, str) for name in returned):
                 what = "an empty dict" if isinstance(returned, dict) and not returned else type(returned).__name__
                 raise ValueError(f"it returns {what}, but must return named numbers, a dict")
@@ -108,14 +110,14 @@ class Campaign:
             return returned
 
         about = self.ready.parts, self.ready.dispersion, self.seed, 0
-        flown = jax.eval_shape(lambda: montecarlo.one(*about, own=asked, software=self.software))
+        flown = jax.eval_shape(lambda: montecarlo.one(*about, custom_metrics=asked, software=self.software))
         counted = _counted(flown.samples)
-        for name in flown.own:
-            if not own_checks.names_column(name):
+        for name in flown.custom_metrics:
+            if not custom_checks.names_column(name):
                 raise ValueError(f"its {name!r} is no name of a column; allowed are names that can be printed")
             if name in {"trial", *plans.OF_ROWS.values(), *plans.RESULTS, *counted, *flown.drawn}:
                 raise ValueError(f"its {name} has the name of a column that the rows have already")
-        return list(flown.own)
+        return list(flown.custom_metrics)
 
 
 def _counted(samples: dict[str, Any]) -> dict[str, Any]:
@@ -123,7 +125,9 @@ def _counted(samples: dict[str, Any]) -> dict[str, Any]:
     return {f"{plans.COUNTED}{status}": count for status, count in samples.items()}
 
 
-def of_plan(ready: Study, seed: int, plan: Plan, own: OwnMetrics | None = None, where: str = "the plan") -> Campaign:
+def of_plan(
+    ready: Study, seed: int, plan: Plan, custom_metrics: CustomMetrics | None = None, where: str = "the plan"
+) -> Campaign:
     """Return the campaign of a run table.
 
     A quantity that the table sets to its dispersed values, as `--dry-run` writes them, is dispersed instead. The trials
@@ -133,7 +137,7 @@ def of_plan(ready: Study, seed: int, plan: Plan, own: OwnMetrics | None = None, 
         ready: the scenario, ready to simulate.
         seed: of rows without a seed.
         plan: the run table.
-        own: custom metrics.
+        custom_metrics: custom metrics.
         where: the name of the table in errors.
 
     Raises:
@@ -145,19 +149,19 @@ def of_plan(ready: Study, seed: int, plan: Plan, own: OwnMetrics | None = None, 
     for name, values in plan.given.items():
         quantity = QUANTITIES[name]
         columns, usual = quantity.columns(ready.parts), np.asarray(quantity.read(ready.parts))[None]
-        if not kinds.isdisjoint({name, OWN}):  # a custom dispersion may change any
+        if not kinds.isdisjoint({name, CUSTOM}):  # a custom dispersion may change any
             if drawn is None:
-                drawn = Campaign(ready, seed, own, plan.without(plan.given)).draw(range(plan.count))
+                drawn = Campaign(ready, seed, custom_metrics, plan.without(plan.given)).draw(range(plan.count))
             if set(columns) <= set(drawn.columns):
                 usual = drawn.select(columns).to_numpy()
             elif name in kinds:
                 usual = np.zeros_like(values)
         if np.array_equal(np.broadcast_to(usual, values.shape), values):
             same.append(name)
-    campaign = Campaign(ready, seed, own, plan.without(same))
-    if plan.angle is not None or plan.own:
+    campaign = Campaign(ready, seed, custom_metrics, plan.without(same))
+    if plan.angle is not None or plan.custom:
         rows = drawn if drawn is not None and not campaign.plan_given else campaign.draw(range(plan.count))
-        plans.check_drawn(plan.own, rows, where)
+        plans.check_drawn(plan.custom, rows, where)
         if plan.angle is not None:
             plans.check_angle(plan.angle, rows[plans.ANGLE].to_numpy(), where)
     return campaign

@@ -13,7 +13,7 @@ from ptsmc_jax import configure, programs
 from ptsmc_jax.batching import lapack
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.dispersions import planned
-from ptsmc_jax.dispersions.base import INERTIA, INITIAL_ATTITUDE, INITIAL_RATE, INITIAL_STATE, OWN, REFERENCE
+from ptsmc_jax.dispersions.base import CUSTOM, INERTIA, INITIAL_ATTITUDE, INITIAL_RATE, INITIAL_STATE, REFERENCE
 from ptsmc_jax.dispersions.planned import Row
 from ptsmc_jax.dispersions.quantities import QUANTITIES
 from ptsmc_jax.dispersions.variation import Dispersion
@@ -25,7 +25,7 @@ from ptsmc_jax.theory import linear, margins, rest, run_margins
 
 TRIALS = 256  # number of trials whose loops are judged if they differ
 # quantities that change the linearised loop: hardware errors, the body, and the trajectory
-OF_LOOPS = {INERTIA, OWN, INITIAL_ATTITUDE, INITIAL_RATE, INITIAL_STATE, REFERENCE}
+OF_LOOPS = {INERTIA, CUSTOM, INITIAL_ATTITUDE, INITIAL_RATE, INITIAL_STATE, REFERENCE}
 OF_LOOPS |= {name for name, quantity in QUANTITIES.items() if quantity.hardware}
 CALL = 32  # loops that are simulated and linearised at once
 JUDGED = 16  # loops whose exact margins are computed at a time

@@ -15,7 +15,7 @@ from ptsmc_jax import configure, programs
 from ptsmc_jax.batching import lanes
 from ptsmc_jax.devices.sensors import RATE_BIAS
 from ptsmc_jax.dispersions import planned
-from ptsmc_jax.dispersions.base import OWN, Coordinates
+from ptsmc_jax.dispersions.base import CUSTOM, Coordinates
 from ptsmc_jax.dispersions.planned import Row
 from ptsmc_jax.dispersions.variation import Dispersion, check_dispersion
 from ptsmc_jax.numerics.draws import WholeNumber, check_whole_number
@@ -41,7 +41,7 @@ class Trials:
     status: np.ndarray  # codes, see rollout.STATUS
     bad_time: np.ndarray  # first bad time [s], NaN if none
     drawn: dict[str, np.ndarray]  # dispersed quantities by name, see `values`
-    own: dict[str, np.ndarray] = field(default_factory=dict)  # custom metrics
+    custom_metrics: dict[str, np.ndarray] = field(default_factory=dict)  # custom metrics
     samples: dict[str, np.ndarray] = field(default_factory=dict)  # see `rollout.Result`
 
     __repr__ = listing
@@ -70,7 +70,7 @@ class Trials:
 
 
 # a custom metric: (run with its history, its parts) -> named numbers
-OwnMetrics = Callable[[rollout.Result, Parts], dict[str, jax.Array]]
+CustomMetrics = Callable[[rollout.Result, Parts], dict[str, jax.Array]]
 
 
 class Flown(NamedTuple):
@@ -80,7 +80,7 @@ class Flown(NamedTuple):
     status: jax.Array
     bad_time: jax.Array
     drawn: dict[str, jax.Array]
-    own: dict[str, jax.Array]
+    custom_metrics: dict[str, jax.Array]
     samples: dict[str, jax.Array]
 
     __repr__ = listing
@@ -92,7 +92,7 @@ def one(
     seed: WholeNumber,
     trial: WholeNumber | Row,
     coordinates: Coordinates | None = None,
-    own: OwnMetrics | None = None,
+    custom_metrics: CustomMetrics | None = None,
     software: Software = OURS,
 ) -> Flown:
     """Simulate one trial: a pure function, for any transformation.
@@ -103,7 +103,7 @@ def one(
         seed: of the dispersions and the noise, a whole number.
         trial: its number, or a `Row` of a run table with a seed of its own.
         coordinates: random numbers of the dispersions; None: those of the trial. The noise is always the trial's.
-        own: custom metrics; the run's history is recorded for them.
+        custom_metrics: custom metrics; the run's history is recorded for them.
         software: the flight computer.
 
     Returns:
@@ -118,10 +118,10 @@ def one(
     if coordinates is None:
         coordinates = about.dispersion.coordinates(about.seed, about.trial)
     drawn = about.dispersion.at(about.parts, coordinates)
-    result = rollout.simulate(drawn, about.seed, about.trial, record=own is not None, software=software)
-    own_metrics = {} if own is None else own(result, drawn)
+    result = rollout.simulate(drawn, about.seed, about.trial, record=custom_metrics is not None, software=software)
+    found = {} if custom_metrics is None else custom_metrics(result, drawn)
     flown_with = _values(dispersion, drawn, about, coordinates)
-    return Flown(result.metrics, result.status, result.bad_time, flown_with, own_metrics, result.samples)
+    return Flown(result.metrics, result.status, result.bad_time, flown_with, found, result.samples)
 
 
 @programs.jit
@@ -142,8 +142,8 @@ def _values(
 ) -> dict[str, jax.Array]:
     """Read the quantities from the parts of a trial; add the gyro's bias and numbers of custom dispersions."""
     by_column = dispersion.values(drawn, set(about.given) - {RATE_BIAS})
-    if dispersion.own is not None:
-        by_column |= dispersion.own.values(coordinates[OWN])
+    if dispersion.custom is not None:
+        by_column |= dispersion.custom.values(coordinates[CUSTOM])
     return by_column | drawn.sensors.drawn(about.seed, about.trial)
 
 
@@ -153,7 +153,7 @@ def run(
     seed: int,
     trials: Sequence[int] | np.ndarray | Array | Row,
     block: int | None = None,
-    own: OwnMetrics | None = None,
+    custom_metrics: CustomMetrics | None = None,
     kernel: bool | None = None,
     software: Software = OURS,
 ) -> Trials:
@@ -168,7 +168,7 @@ def run(
         seed: of the dispersions and the noise.
         trials: their numbers, whole numbers below 2^32, or rows of a run table.
         block: trials that a device simulates at a time; None: `block_size()`.
-        own: custom metrics, see `one`.
+        custom_metrics: custom metrics, see `one`.
         kernel: whether the loop over time is one kernel, see `batching.kernel`; None: `by_kernel()`. A processor
             interprets the kernel, slowly.
         software: the flight computer.
@@ -182,7 +182,9 @@ def run(
     """
     if software.on_processor and configure.backend() != "cpu":
         with jax.default_device(configure.processors()[0]):
-            return run(parts, dispersion, seed, trials, block, own=own, kernel=kernel, software=software)
+            return run(
+                parts, dispersion, seed, trials, block, custom_metrics=custom_metrics, kernel=kernel, software=software
+            )
     check_parts(parts)
     check_whole_number("seed", seed)
     check_dispersion(dispersion)
@@ -199,7 +201,7 @@ def run(
         chosen = k + places.reshape(devices, rows, block)
         numbers = jax.tree.map(lambda v, chosen=chosen: jnp.asarray(v[chosen]), trials)
         needed = jnp.int32(-(-share // block))
-        results = _fly(parts, dispersion, jnp.uint32(seed), numbers, needed, devices, own, kernel, software)
+        results = _fly(parts, dispersion, jnp.uint32(seed), numbers, needed, devices, custom_metrics, kernel, software)
         flat = jax.tree.map(lambda v: np.asarray(v).reshape(devices, rows * block, *v.shape[3:]), results)
         calls.append(jax.tree.map(lambda v, k=k, share=share: gathered(v, share)[: count - k], flat))
     return Trials(number, *jax.tree.map(lambda *many: np.concatenate(many), *calls))
@@ -236,8 +238,8 @@ def shared_out(count: int, devices: int, slots: int) -> tuple[np.ndarray, int]:
 
 def gathered(results: np.ndarray, share: int) -> np.ndarray:
     """Return the results of `shared_out` items in their order, (devices, slots, ..) -> (devices * share, ..)."""
-    own = np.asarray(results)[:, :share]
-    return own.reshape(-1, *own.shape[2:])
+    counted = np.asarray(results)[:, :share]
+    return counted.reshape(-1, *counted.shape[2:])
 
 
 def _slots(count: int, block: int | None = None) -> tuple[int, int, int]:
@@ -256,7 +258,9 @@ def prepare(parts: Parts, dispersion: Dispersion, count: int) -> None:
     _fly.prepare(parts, dispersion, jnp.uint32(0), numbers, jnp.int32(0), slots[0], None, by_kernel(), OURS)
 
 
-@programs.jit(static_argnames=("devices", "own", "kernel", "software"), compiler_options=programs.BATCHED, batch=True)
+@programs.jit(
+    static_argnames=("devices", "custom_metrics", "kernel", "software"), compiler_options=programs.BATCHED, batch=True
+)
 def _fly(
     parts: Parts,
     dispersion: Dispersion,
@@ -264,14 +268,14 @@ def _fly(
     trials: jax.Array | Row,
     needed: jax.Array,
     devices: int,
-    own: OwnMetrics | None,
+    custom_metrics: CustomMetrics | None,
     kernel: bool,
     software: Software,
 ) -> Flown:
     """Return the results of (devices, rows, block) trials; rows from `needed` on are zero."""
 
     def fly(trial: jax.Array | Row) -> Flown:
-        return one(parts, dispersion, seed, trial, own=own, software=software)
+        return one(parts, dispersion, seed, trial, custom_metrics=custom_metrics, software=software)
 
     result = jax.eval_shape(fly, jax.tree.map(lambda v: v[0, 0, 0], trials))
     width = jax.tree.leaves(trials)[0].shape[2]
@@ -294,12 +298,12 @@ def row_by_row(flown: Callable, result: PyTree, width: int, rows: PyTree, needed
     """
 
     def on_device(rows: PyTree) -> PyTree:
-        own = jax.tree.map(lambda v: v[0], rows)
-        count = jax.tree.leaves(own)[0].shape[0]
+        here = jax.tree.map(lambda v: v[0], rows)
+        count = jax.tree.leaves(here)[0].shape[0]
         empty = jax.tree.map(lambda v: jnp.zeros((count, width, *v.shape), v.dtype), result)
 
         def step(k: jax.Array, done: PyTree) -> PyTree:
-            row = flown(jax.tree.map(lambda v: v[k], own))
+            row = flown(jax.tree.map(lambda v: v[k], here))
             return jax.tree.map(lambda into, v: into.at[k].set(v), done, row)
 
         return jax.tree.map(lambda v: v[None], jax.lax.fori_loop(0, needed, step, empty))

@@ -41,7 +41,7 @@ class Plan:
     seed: np.ndarray | None  # (rows,)
     angle: np.ndarray | None  # (rows,) initial angle of the table [rad]
     count: int  # rows
-    own: dict[str, np.ndarray] = field(default_factory=dict)  # (rows,) numbers of custom dispersions, by name
+    custom: dict[str, np.ndarray] = field(default_factory=dict)  # (rows,) numbers of custom dispersions, by name
 
     @property
     def digest(self) -> str:
@@ -105,7 +105,11 @@ def read(path: Path) -> pl.DataFrame:
 
 
 def checked(
-    table: pl.DataFrame, parts: Parts, where: str = "the plan", own: Iterable[str] = (), drawn: Iterable[str] = ()
+    table: pl.DataFrame,
+    parts: Parts,
+    where: str = "the plan",
+    custom_metrics: Iterable[str] = (),
+    drawn: Iterable[str] = (),
 ) -> Plan:
     """Return the run table of a data frame.
 
@@ -113,7 +117,7 @@ def checked(
         table: a row for each trial.
         parts: the nominal parts; the quantities depend on them.
         where: the name of the table in errors.
-        own: names of custom metrics, which are allowed as columns.
+        custom_metrics: names of custom metrics, which are allowed as columns.
         drawn: names of the numbers of custom dispersions, see `check_drawn`.
 
     Returns:
@@ -130,7 +134,16 @@ def checked(
     columns_of = {name: quantity.columns(parts) for name, quantity in QUANTITIES.items()}
     quantity_of = {column: name for name, columns in columns_of.items() for column in columns}
     for column in table.columns:
-        if column not in (*quantity_of, *OF_ROWS, *OF_ROWS.values(), ANGLE, *RESULTS, *SAMPLES, *own, *drawn):
+        if column not in (
+            *quantity_of,
+            *OF_ROWS,
+            *OF_ROWS.values(),
+            ANGLE,
+            *RESULTS,
+            *SAMPLES,
+            *custom_metrics,
+            *drawn,
+        ):
             close = parsing.nearest(column, (*quantity_of, *OF_ROWS))
             raise RefusedError(f"{where} has the column {column}, which no trial of this scenario has; {close}")
     given: dict[str, np.ndarray] = {}

@@ -20,7 +20,8 @@ Coordinates = dict[str, Array]  # standard random numbers of a trial, by the nam
 
 # names of quantities, which are also the names of their random streams
 INITIAL_ATTITUDE, INITIAL_STATE, INITIAL_RATE = "initial_attitude", "initial_state", "initial_rate"
-INERTIA, REFERENCE, OWN = "inertia", "reference", "own"
+INERTIA, REFERENCE = "inertia", "reference"
+CUSTOM = "own"  # [dispersion] custom; a stream of another name would have other random numbers
 DISTURBANCE_PHASE, DISTURBANCE_AMPLITUDE = "disturbance_phase", "disturbance_amplitude"
 DISTURBANCE_BIAS = "disturbance_bias"
 
@@ -181,5 +182,5 @@ class Draw:
         raise NotImplementedError
 
     def values(self, c: Float[Array, " count"]) -> dict[str, Array]:
-        """Return numbers for the result file by column; by default the random numbers [-] as own_1, own_2."""
-        return {f"{OWN}_{k + 1}": c[k] for k in range(self.count)}
+        """Return numbers for the result file by column; by default the random numbers [-] as custom_1, custom_2."""
+        return {f"custom_{k + 1}": c[k] for k in range(self.count)}

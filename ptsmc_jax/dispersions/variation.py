@@ -11,7 +11,15 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ptsmc_jax.dispersions import quantities
-from ptsmc_jax.dispersions.base import INITIAL_ATTITUDE, INITIAL_RATE, INITIAL_STATE, OWN, REFERENCE, Coordinates, Draw
+from ptsmc_jax.dispersions.base import (
+    CUSTOM,
+    INITIAL_ATTITUDE,
+    INITIAL_RATE,
+    INITIAL_STATE,
+    REFERENCE,
+    Coordinates,
+    Draw,
+)
 from ptsmc_jax.dispersions.inertias import RelativeInertia
 from ptsmc_jax.dispersions.numbers import RandomNumbers
 from ptsmc_jax.dispersions.quantities import QUANTITIES
@@ -35,29 +43,29 @@ class Dispersion:
 
     Attributes:
         numbers: random numbers by the name of the quantity, see `quantities.QUANTITIES`.
-        own: a custom dispersion, which is applied last.
+        custom: a custom dispersion, which is applied last.
     """
 
     numbers: dict[str, RandomNumbers | RelativeInertia] = field(default_factory=dict)
-    own: Draw | None = None
+    custom: Draw | None = None
 
     @property
     def varies(self) -> bool:
         """Whether any quantity is random."""
         return bool(self.kinds)
 
-    def own_names(self) -> tuple[str, ...]:
+    def custom_names(self) -> tuple[str, ...]:
         """Return the names of the columns that a custom dispersion adds to result files."""
-        if self.own is None:
+        if self.custom is None:
             return ()
-        numbers = jax.ShapeDtypeStruct((self.own.count,), jnp.result_type(float))
-        return tuple(jax.eval_shape(self.own.values, numbers))
+        numbers = jax.ShapeDtypeStruct((self.custom.count,), jnp.result_type(float))
+        return tuple(jax.eval_shape(self.custom.values, numbers))
 
     @property
     def kinds(self) -> Mapping[str, RandomNumbers | RelativeInertia | Draw]:
         """Random quantities by the name of their stream, in the order of `QUANTITIES`, the custom dispersion last."""
         kinds = {name: self.numbers[name] for name in QUANTITIES if name in self.numbers}
-        return kinds if self.own is None else {**kinds, OWN: self.own}
+        return kinds if self.custom is None else {**kinds, CUSTOM: self.custom}
 
     def coordinates(self, seed: WholeNumber, trial: WholeNumber) -> Coordinates:
         """Return the coordinates [-] of a trial. Each quantity has its own stream, independent of the others.

@@ -19,7 +19,7 @@ from ptsmc_jax.onboard.readme import readme
 from ptsmc_jax.onboard.sources import LAYOUT
 from ptsmc_jax.onboard.templates import About
 from ptsmc_jax.onboard.translate import NoRuleError
-from ptsmc_jax.scenario import own, parsing
+from ptsmc_jax.scenario import custom, parsing
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.flyable import Study
 from ptsmc_jax.scenario.tables import Scenario
@@ -71,7 +71,7 @@ def flown(scenario: Scenario) -> Scenario:
 
 def digest(scenario: Scenario) -> str:
     """Return the SHA-256 of a scenario's tables with all defaults, and of the files that it names."""
-    said = json.dumps([parsing.dump(scenario), own.digests(scenario)], sort_keys=True, default=str)
+    said = json.dumps([parsing.dump(scenario), custom.digests(scenario)], sort_keys=True, default=str)
     return hashlib.sha256(said.encode()).hexdigest()
 
 
@@ -138,7 +138,7 @@ def write(folder: Path, made: Controller, seed: int, trials: int) -> None:
     steepness = min(vectors.steepness(one, rounding, t_f, made.last) for one in flown.values())
     write_program(folder, made, steepness)
     store.write_csv(folder / "vectors.csv", header, rows)
-    made_by = {"command": "export", "seed": seed, **own.digests(made.scenario)}
+    made_by = {"command": "export", "seed": seed, **custom.digests(made.scenario)}
     store.record(folder, parsing.dump(made.scenario), made_by)
 
 

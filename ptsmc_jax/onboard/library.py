@@ -197,8 +197,8 @@ class InTheLoop:
         firsts = zip(paths, (made.elements()[:1] for made in named(self.board).fields), strict=True)
         # the first column of each parameter in C, by its path
         self._columns = {path: columns.index(*first) for (path, _), first in firsts if first and first[0] in columns}
-        if dispersion is not None and dispersion.own is not None:
-            self._check_draw(Dispersion(own=dispersion.own))
+        if dispersion is not None and dispersion.custom is not None:
+            self._check_draw(Dispersion(custom=dispersion.custom))
 
     def _check_draw(self, dispersion: Dispersion) -> None:
         """Raise ScenarioError if a custom dispersion changes only one of several parameters that are one in C."""
@@ -217,9 +217,9 @@ class InTheLoop:
             off = SAME * float(jnp.max(jnp.abs(value), initial=0.0))
             if not np.allclose(stands, value, rtol=0.0, atol=off, equal_nan=True):
                 raise ScenarioError(
-                    f"dispersion.own draws {jax.tree_util.keystr(path, simple=True, separator='.')} by itself, but the "
-                    f"controller in {self.library.folder} has one {field.name} for it and others; allowed are draws "
-                    "that change all of them alike"
+                    f"dispersion.custom draws {jax.tree_util.keystr(path, simple=True, separator='.')} by itself, but "
+                    f"the controller in {self.library.folder} has one {field.name} for it and others; allowed are "
+                    "draws that change all of them alike"
                 )
 
     @property

@@ -277,8 +277,8 @@ class Printer:
 
     def _text(self, node: Node, inside: bool = False) -> tuple[str, int]:
         if node.op == "constant":
-            own = node.kind == REAL and node.value == guards.resolution()  # of the type in C
-            return "resolution()" if own else number(node.value, node.kind), ATOM
+            is_resolution = node.kind == REAL and node.value == guards.resolution()  # of the type in C
+            return "resolution()" if is_resolution else number(node.value, node.kind), ATOM
         if node.op == "place":
             return node.value, ATOM
         if node.op in ATOMS or (id(node) in self.kept and not inside):
@@ -319,8 +319,8 @@ class Printer:
         return f"{left} {sign} {f'({right})' if right.startswith('-') else right}", level
 
     def _at_least(self, node: Node, level: int) -> str:
-        text, own = self._text(node)
-        return text if own >= level else f"({text})"
+        text, level_of_node = self._text(node)
+        return text if level_of_node >= level else f"({text})"
 
 
 def wrapped(text: str, indent: str) -> list[str]:

@@ -36,7 +36,7 @@ class Plant(ABC):
 
     inertia: Any  # (m, m)
     inertia_inverse: Any  # (m, m)
-    of_own_functions: ClassVar[bool] = False  # its rates are unknown before a run
+    custom_functions: ClassVar[bool] = False  # its rates are unknown before a run
     input_name: ClassVar[str] = "control"
     input_unit: ClassVar[str] = ""  # of inputs and disturbances; empty: the plant has units of its own
     # what sensors measure of a state: names and meanings

@@ -28,7 +28,7 @@ class System(Plant):
     H: Any  # -> (n,)
     G: Any  # -> (n, n)
     D: Any  # -> (n, n), or None for the identity
-    of_own_functions: ClassVar[bool] = True
+    custom_functions: ClassVar[bool] = True
     inertia: Leaf  # (n, n) scale of observer gains, by default the identity
     inertia_inverse: Leaf  # (n, n)
 

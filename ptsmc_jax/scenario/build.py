@@ -83,7 +83,7 @@ def dispersion(scenario: Scenario, parts: Parts) -> Dispersion:
     if table is None:
         return Dispersion()
     keys: tuple[str, ...] = table.__struct_fields__
-    tables: dict[str, Any] = {_quantity_of(key): getattr(table, key) for key in keys if key != "own"}
+    tables: dict[str, Any] = {_quantity_of(key): getattr(table, key) for key in keys if key != "custom"}
     return Dispersion(
         {
             name: one.build(parts, QUANTITIES[name].count(parts))
@@ -91,5 +91,5 @@ def dispersion(scenario: Scenario, parts: Parts) -> Dispersion:
             # hardware errors of zero size are omitted: the compiled program is then the program without them
             if one is not None and not (QUANTITIES[name].hardware and getattr(one, "nothing", False))
         },
-        own=None if table.own is None else table.own.build(),
+        custom=None if table.custom is None else table.custom.build(),
     )

@@ -90,7 +90,7 @@ def _far_off(scenario: Scenario, largest: float, fastest: float) -> list[str]:
     if not scenario.controller.law.switches:
         return []
     name, follows = ("disturbance_rate_bound", fastest)
-    if scenario.observer.kind in ("none", "own"):
+    if scenario.observer.kind in ("none", "custom"):
         name, follows = ("disturbance_bound", largest)
     stated = getattr(scenario.controller, name)
     if stated is None or max(stated, follows) <= FAR * min(stated, follows):

@@ -1,12 +1,12 @@
 """Validate constraints that involve more than one key of a scenario. Start with `check`.
 
-`parsing` validates single keys, and `own_checks` and `start_checks` validate the parts that are built from a scenario.
+`parsing` validates single keys. `custom_checks` and `start_checks` validate the parts that are built from a scenario.
 """
 
 import math
 from typing import Any
 
-from ptsmc_jax.scenario import errors, own, tables
+from ptsmc_jax.scenario import custom, errors, tables
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.scenario.values import MOST_STEPS
@@ -88,7 +88,7 @@ def check_sensors(scenario: Scenario) -> None:
         if getattr(scenario.dispersion, key, None) is not None:
             raise ScenarioError(
                 f"dispersion.{key} is drawn of what [hardware] says, but [sensors] says what is seen; allowed is "
-                "dispersion.own, which can draw numbers of these sensors"
+                "dispersion.custom, which can draw numbers of these sensors"
             )
 
 
@@ -184,7 +184,7 @@ def _has(term: Any, what: str) -> bool:
 
     A custom disturbance declares this in `drawn`. A custom key of that name alone does not suffice.
     """
-    if isinstance(term, own.Own):
+    if isinstance(term, custom.Custom):
         return term.waits or what in term.made.drawn
     return hasattr(term, what)
 

@@ -172,13 +172,13 @@ class Hardware(Actuators, frozen=True):
         super().check(scenario)
         if self.rate_noise is not None and self.rate_noise_density is not None:
             raise wrong("hardware.rate_noise_density", self.rate_noise_density, "absent where rate_noise is given")
-        own, every, period = self.star_tracker_period, self.star_tracker_every, scenario.loop.period
-        if own is not None and every is not None:
-            raise wrong("hardware.star_tracker_period", own, "absent where star_tracker_every is given")
-        if own is not None and own < period * (1.0 - SAME):
-            raise wrong("hardware.star_tracker_period", own, f"at least loop.period, {period}")
+        tracker_period, every, period = self.star_tracker_period, self.star_tracker_every, scenario.loop.period
+        if tracker_period is not None and every is not None:
+            raise wrong("hardware.star_tracker_period", tracker_period, "absent where star_tracker_every is given")
+        if tracker_period is not None and tracker_period < period * (1.0 - SAME):
+            raise wrong("hardware.star_tracker_period", tracker_period, f"at least loop.period, {period}")
         if self.periods_apart(period) != 1 and not scenario.estimator.on:
-            key, value, one = ("every", every, 1) if own is None else ("period", own, period)
+            key, value, one = ("every", every, 1) if tracker_period is None else ("period", tracker_period, period)
             allowed = f'{one}, or [filter] with kind = "steady_state"'
             reason = f", but without a filter the law needs a sample every period; allowed is {allowed}"
             raise errors.refused(f"hardware.star_tracker_{key}", value, reason, allowed)

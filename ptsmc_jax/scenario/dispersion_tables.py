@@ -16,7 +16,7 @@ from ptsmc_jax.declare import Scaled
 from ptsmc_jax.dispersions import inertias
 from ptsmc_jax.dispersions.numbers import RandomNumbers, any_attitude, axis_angle, interval
 from ptsmc_jax.numerics.pytrees import vector
-from ptsmc_jax.scenario.own_devices import OWN_DRAW
+from ptsmc_jax.scenario.custom_devices import CUSTOM_DRAW
 from ptsmc_jax.scenario.values import Kinds, Meaning, NotNegative, NotNegatives, Positive, Table, Truth
 
 Angle = Annotated[float, Meta(ge=0, le=180, description="an angle from 0 to 180 degrees")]
@@ -288,7 +288,7 @@ _ANY: dict[str, tuple[str, tuple[Any, ...]]] = {
     "timing_jitter": (
         "share of loop.period by which samples come early or late, of which flight software knows nothing", (Jitter,),
     ),
-    "own": ("what custom code makes of random numbers", (OWN_DRAW,)),
+    "custom": ("what custom code makes of random numbers", (CUSTOM_DRAW,)),
 }  # fmt: skip
 _SPACECRAFT: dict[str, tuple[str, tuple[Any, ...]]] = {
     "attitude": ("of the body at t = 0", (AxisAngle, UniformAttitude, NormalAttitude)),

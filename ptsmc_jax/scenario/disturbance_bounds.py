@@ -137,7 +137,7 @@ def along_the_run(scenario: Any, signal: Any, fastest: float = 0.0) -> Bounds:
 
     On that path the error falls like (t_f - t)^3 until t_f, then the state follows the target. Amplitudes and phases
     that the dispersions can draw are included, see `_as_drawn`. The bounds of a disturbance that fails, or is not
-    finite at t = 0, are zero: `own_checks` refuses it before a run.
+    finite at t = 0, are zero: `custom_checks` refuses it before a run.
 
     Args:
         scenario: a scenario whose reference is known.
@@ -157,7 +157,7 @@ def along_the_run(scenario: Any, signal: Any, fastest: float = 0.0) -> Bounds:
     for drawn in _as_drawn(scenario, signal):
         try:
             acting = np.asarray(lapack.vmap(drawn)(jnp.asarray(t), jax.tree.map(jnp.asarray, states)))
-        except Exception:  # `own_checks` reports it before a run
+        except Exception:  # `custom_checks` reports it before a run
             acting = np.zeros(0)
         bad = np.flatnonzero(~np.isfinite(acting).all(axis=1)) if acting.shape == (t.size, scenario.inputs) else [0]
         if len(bad) and bad[0] == 0:

@@ -15,9 +15,9 @@ from ptsmc_jax.declare import Scaled
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.scenario import attitude_keys, disturbance_bounds
 from ptsmc_jax.scenario.attitude_keys import Attitude
+from ptsmc_jax.scenario.custom import Custom, custom_kind, fastest
 from ptsmc_jax.scenario.disturbance_bounds import Bounds
 from ptsmc_jax.scenario.errors import ScenarioError, brief
-from ptsmc_jax.scenario.own import Own, fastest, own_kind
 from ptsmc_jax.scenario.schema import PartTable, table
 from ptsmc_jax.scenario.values import Meaning, Table
 from ptsmc_jax.signals import disturbances
@@ -36,7 +36,7 @@ class DisturbanceTable(PartTable, frozen=True):
         """Return the largest angular frequency of the disturbance [rad/s], 0 if its custom code has not run yet."""
         if self.made is None:
             return 0.0
-        return fastest(self, "disturbance", self.part() if isinstance(self, Own) else self)
+        return fastest(self, "disturbance", self.part() if isinstance(self, Custom) else self)
 
     def impulse(self, end: float) -> float:
         """Return a bound on the integral of the disturbance until `end` [s], in N m s.
@@ -52,7 +52,7 @@ class DisturbanceTable(PartTable, frozen=True):
         """
         if self.made is None or disturbance_bounds.target_waits(scenario):
             return None
-        if isinstance(self, Own):
+        if isinstance(self, Custom):
             return disturbance_bounds.along_the_run(scenario, self.build(None), self.quickest())
         known: Any = self
         largest = np.abs(known.amplitude) * disturbance_bounds.drawn_factor(scenario)
@@ -180,7 +180,7 @@ def _disturbances(first: str, body: bool) -> Mapping[str, type[Table]]:
         "constant": table(DisturbanceTable, disturbances.Constant, "constant", body),
         "gravity_gradient": table(GravityTable, disturbances.GravityGradient, "gravity_gradient"),
         "random_walk": table(RandomWalkTable, disturbances.RandomWalk, "random_walk", body),
-        "own": own_kind(
+        "custom": custom_kind(
             DisturbanceTable, disturbances.Disturbance, ("__call__",),
             "A custom disturbance, a class derived from ptsmc_jax.Disturbance; its fields are further keys.",
         ),

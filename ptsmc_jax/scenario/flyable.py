@@ -7,7 +7,7 @@ from pathlib import Path
 from ptsmc_jax import configure
 from ptsmc_jax.dispersions import variation
 from ptsmc_jax.numerics.pytrees import listing
-from ptsmc_jax.scenario import build, own_checks, reading, start_checks, timing
+from ptsmc_jax.scenario import build, custom_checks, reading, start_checks, timing
 from ptsmc_jax.scenario import tables as t
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import catalogues
@@ -110,6 +110,6 @@ def study(
     setup = build.setup(scenario)
     parts = setup.timed(*timing.timing(scenario, setup, reach or timing.reach_of(scenario), saves))
     dispersion = build.dispersion(scenario, parts)
-    own_checks.check(parts, dispersion, scenario)
+    custom_checks.check(parts, dispersion, scenario)
     start_checks.check(scenario, parts, dispersion, drawn=drawn)
     return Study(scenario, parts, dispersion, requirements(scenario), margin_requirements(scenario))

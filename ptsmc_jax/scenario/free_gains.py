@@ -63,14 +63,14 @@ def observer_follows(scenario: Scenario) -> bool:
 
 def _check(scenario: Scenario, tune: tables.Tune) -> None:
     """Raise ScenarioError for invalid gains, objective or bounds, before default bounds are computed."""
-    free, own = tune.gains, scenario.gains
+    free, present = tune.gains, scenario.gains
     if len(set(free)) < len(free):
         raise wrong("tune.free", free, "a list that names each gain once")
-    if not set(free) <= {*tables.FREE, *own}:
+    if not set(free) <= {*tables.FREE, *present}:
         raise wrong("tune.free", free, tables.FREE_ALLOWED)
     said = f"tune.free is {errors.brief(free)}, but"
     for name in free:
-        if name not in own:
+        if name not in present:
             raise ScenarioError(f"{said} {_absent(scenario, name)}")
     if "t_f" in free and observer_follows(scenario):
         raise ScenarioError(f"{said} observer.t_o then follows t_f; allowed is t_f with observer.t_o given")
@@ -149,19 +149,19 @@ def _default(choice: Choice, name: str) -> tuple[float, float]:
     the gain's distance from the smallest allowed value, at most to the middle between the gain and the largest one.
     """
     gain = gain_bounds.of(choice.scenario, name)
-    (low, high), own = gain.usual(choice), _own(choice.scenario, name)
-    if own:
+    (low, high), present = gain.usual(choice), _present_values(choice.scenario, name)
+    if present:
         least, most, closed = gain.allowed(choice)
         if math.isinf(least):  # a custom gain that may be negative: extend the interval by its width
-            least = min(low, *own) - (high - low)
-        if min(own) < low and (least <= min(own) if closed else least < min(own)):
-            low = (least + min(own)) / 2
-        if high < max(own) < most:
-            high = min(2 * max(own) - least, (max(own) + most) / 2)
+            least = min(low, *present) - (high - low)
+        if min(present) < low and (least <= min(present) if closed else least < min(present)):
+            low = (least + min(present)) / 2
+        if high < max(present) < most:
+            high = min(2 * max(present) - least, (max(present) + most) / 2)
     return low, high
 
 
-def _own(scenario: Scenario, name: str) -> tuple[float, ...]:
+def _present_values(scenario: Scenario, name: str) -> tuple[float, ...]:
     """Return the scenario's values of a gain: one for each axis, or one for all, or none if it is absent."""
     table = next(table for table in scenario.tuned_tables.values() if name in table.gains)
     value = getattr(table, name.removeprefix(table.prefix))

@@ -205,8 +205,8 @@ def _dead_beat(choice: Choice) -> Interval:
 
 def _usual_bound(choice: Choice) -> Interval:
     """Return gains of a finite-time observer, which bound the disturbance's rate."""
-    own = choice.scenario.observer.gain
-    return max(choice.law.disturbance_rate_bound, 0.05 * min(own)), 50.0 * max(own)
+    present = choice.scenario.observer.gain
+    return max(choice.law.disturbance_rate_bound, 0.05 * min(present)), 50.0 * max(present)
 
 
 def _allowed_bound(choice: Choice) -> Allowed:

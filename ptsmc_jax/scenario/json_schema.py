@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 
 from ptsmc_jax.scenario import keys, layouts, sensor_tables
-from ptsmc_jax.scenario.own import Own
+from ptsmc_jax.scenario.custom import Custom
 from ptsmc_jax.scenario.tables import Limit, Scenario
 from ptsmc_jax.scenario.values import Kinds, NotNegative, Table
 from ptsmc_jax.simulation import catalogues
@@ -63,7 +63,7 @@ def _struct(struct: type[Table], unit_of_d: str, name: str = "") -> Schema:
         if isinstance(key.default, bool | int | float | str):
             one["default"] = key.default
         properties[key.name] = one | {"description": key.text if inline else f"{key.text}: {key.allowed}"}
-    return _object(keys.about(struct), properties, more=issubclass(struct, Own))
+    return _object(keys.about(struct), properties, more=issubclass(struct, Custom))
 
 
 def _object(description: str, properties: Schema, *, more: bool = False) -> Schema:

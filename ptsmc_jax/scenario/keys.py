@@ -76,8 +76,8 @@ def kinds_with(name: str, key: str, struct: type[Table], kinds: Kinds) -> str:
         kinds: classes by kind.
     """
     others = [f'"{kind}"' for kind, other in kinds.items() if key in other.__struct_fields__]
-    own = next((kind for kind, other in kinds.items() if other is struct), None)
-    return f' of {name}.kind = "{own}", but of {", ".join(others)}' if others else ""
+    this_kind = next((kind for kind, other in kinds.items() if other is struct), None)
+    return f' of {name}.kind = "{this_kind}", but of {", ".join(others)}' if others else ""
 
 
 def homes(layout: Mapping[str, type[Table] | Kinds]) -> dict[str, list[str]]:

@@ -13,8 +13,8 @@ from ptsmc_jax.laws import baselines, kinematics, prescribed_time, time_base
 from ptsmc_jax.laws.base import AccelerationLaw
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.scenario import disturbance_bounds, mission
+from ptsmc_jax.scenario.custom import custom_kind
 from ptsmc_jax.scenario.errors import show, wrong
-from ptsmc_jax.scenario.own import own_kind
 from ptsmc_jax.scenario.schema import PartTable, table
 from ptsmc_jax.scenario.values import Meaning, NotNegative, Positive
 
@@ -151,7 +151,7 @@ class AttitudeTable(PrescribedTable, frozen=True):
     ] = "additive"
 
 
-class OwnTable(LawTable, frozen=True):
+class CustomTable(LawTable, frozen=True):
     """A custom law."""
 
     delta: Annotated[
@@ -161,7 +161,7 @@ class OwnTable(LawTable, frozen=True):
     gains: ClassVar[tuple[str, ...]] = ("delta", "t_f")
 
 
-class OwnAttitudeTable(OwnTable, frozen=True):
+class CustomAttitudeTable(CustomTable, frozen=True):
     """A custom law for a spacecraft."""
 
     error: Annotated[
@@ -195,13 +195,13 @@ LAWS: dict[str, Mapping[str, type[LawTable]]] = {
         "prescribed_time": table(AttitudeTable, prescribed_time.PrescribedTime, "prescribed_time"),
         **BASELINES,
         "pd": table(LawTable, baselines.QuaternionPD, "pd"),
-        "own": own_kind(OwnAttitudeTable, AccelerationLaw, _NEEDS, _SUMMARY, tuned=True),
+        "custom": custom_kind(CustomAttitudeTable, AccelerationLaw, _NEEDS, _SUMMARY, tuned=True),
     },
     **{
         plant: {
             "prescribed_time": table(PrescribedTable, made, "prescribed_time", body=False),
             **BASELINES,
-            "own": own_kind(OwnTable, AccelerationLaw, _NEEDS, _SUMMARY, tuned=True),
+            "custom": custom_kind(CustomTable, AccelerationLaw, _NEEDS, _SUMMARY, tuned=True),
         }
         for plant, made in (
             ("chain", prescribed_time.PrescribedTimeChain),

@@ -13,8 +13,8 @@ from ptsmc_jax.declare import Scaled
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.observers import base, finite_time, none, nonlinear, prescribed_time
 from ptsmc_jax.scenario import disturbance_bounds, mission
+from ptsmc_jax.scenario.custom import Custom, custom_kind
 from ptsmc_jax.scenario.errors import wrong
-from ptsmc_jax.scenario.own import Own, own_kind
 from ptsmc_jax.scenario.schema import PartTable, table
 
 SHORTEST = Scaled(0.05, time=1)  # delta_o of the prescribed-time observer [s]
@@ -27,8 +27,8 @@ class ObserverTable(PartTable, frozen=True):
 
     def check(self, scenario: Any) -> None:
         """Raise ScenarioError if keys contradict each other or the scenario."""
-        if isinstance(self, Own):
-            scenario.need_samples('observer.kind = "own"')
+        if isinstance(self, Custom):
+            scenario.need_samples('observer.kind = "custom"')
 
     def build(self, scenario: Any, model: Any) -> Any:
         """Return the observer for the design model of the plant, see `Scenario.model`."""
@@ -100,7 +100,7 @@ def _observers(first: str, body: bool) -> Mapping[str, type[ObserverTable]]:
         "none": table(ObserverTable, none.NoObserver, "none"),
         "finite_time": table(FiniteTimeTable, finite_time.FiniteTimeObserver, "finite_time", body),
         "prescribed_time": table(PrescribedTimeTable, prescribed_time.PrescribedTimeObserver, "prescribed_time", body),
-        "own": own_kind(
+        "custom": custom_kind(
             ObserverTable, base.SampledObserver, ("step",), tuned=True,
             summary="A custom observer, a class derived from ptsmc_jax.SampledObserver; its fields are further keys.",
         ),

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from ptsmc_jax.scenario import attitude_keys, device_tables, disturbance_tables, keys, layouts, own, systems
+from ptsmc_jax.scenario import attitude_keys, custom, device_tables, disturbance_tables, keys, layouts, systems
 from ptsmc_jax.scenario import sensor_tables as sensing
 from ptsmc_jax.scenario.attitude_keys import ATTITUDE_KEYS
 from ptsmc_jax.scenario.errors import MOST_BITS, ScenarioError, brief, show, wrong
@@ -66,7 +66,7 @@ def load(path: str | Path) -> dict[str, Any]:
     except OSError as error:
         raise ScenarioError(f"the scenario file {path} cannot be read: {error.strerror}") from None
     raw = toml(text, f"the scenario file {path}")
-    for table, key in own.named(raw):
+    for table, key in custom.named(raw):
         file, _, name = table[key].rpartition(":")
         if file.endswith(".py") and not os.path.isabs(file) and file.isprintable():
             table[key] = f"{os.path.realpath(Path(path).parent / file)}:{name}"
@@ -265,12 +265,12 @@ def _table(name: str, raw: Mapping[str, Any], kinds: type[Table] | Kinds, contex
     struct = kinds[kind]
     if struct is disturbance_tables.SumDisturbance:
         return _sum(name, raw, kinds, context)
-    if issubclass(struct, own.Own):
-        return _own(name, raw, struct, context)
+    if issubclass(struct, custom.Custom):
+        return _custom(name, raw, struct, context)
     return _fields(name, raw, struct, context, kinds)
 
 
-def _own(name: str, raw: Mapping[str, Any], struct: Any, context: Context) -> Table:
+def _custom(name: str, raw: Mapping[str, Any], struct: Any, context: Context) -> Table:
     """Return the table of a custom part. It has the keys of its class if the code may run or is a class already."""
     code = raw.get("code")
     if code is None:
@@ -281,12 +281,12 @@ def _own(name: str, raw: Mapping[str, Any], struct: Any, context: Context) -> Ta
         except ValueError as error:
             raise ScenarioError(f"{name}.code is {brief(code)}: {error}") from None
     if context.run or not isinstance(code, str):
-        return _fields(name, raw, own.read(struct, name, code), context)
-    own_keys = {key: value for key, value in raw.items() if key in struct.__struct_fields__ and key != "rest"}
-    rest = {key: value for key, value in raw.items() if key not in own_keys}
+        return _fields(name, raw, custom.read(struct, name, code), context)
+    shared_keys = {key: value for key, value in raw.items() if key in struct.__struct_fields__ and key != "rest"}
+    rest = {key: value for key, value in raw.items() if key not in shared_keys}
     for key in (key for key, value in rest.items() if _not_finite(value) is not None):
         raise wrong(f"{name}.{key}", rest[key], "made of finite numbers")
-    return msgspec.structs.replace(_fields(name, own_keys, struct, context), rest=rest)
+    return msgspec.structs.replace(_fields(name, shared_keys, struct, context), rest=rest)
 
 
 def _sum(name: str, raw: Mapping[str, Any], kinds: Kinds, context: Context) -> Table:
@@ -305,7 +305,7 @@ def _suite(each: Any, context: Context) -> Table:
     """Return the table of [[sensors]]."""
     if context.plant.motion != "spacecraft":
         raise ScenarioError(
-            '[[sensors]] goes with plant.kind = "spacecraft" only; allowed is [sensors] with kind = "own"'
+            '[[sensors]] goes with plant.kind = "spacecraft" only; allowed is [sensors] with kind = "custom"'
         )
     if not each or not all(isinstance(one, Mapping) for one in each):
         raise wrong("sensors", each, "tables with a kind, [[sensors]] for each sensor")

@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 
 from ptsmc_jax.declare import Scaled
-from ptsmc_jax.scenario import checks, free_gains, layouts, mission, own, parsing
+from ptsmc_jax.scenario import checks, custom, free_gains, layouts, mission, parsing
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario, check_scenario
 from ptsmc_jax.scenario.values import Table
@@ -51,7 +51,7 @@ def _checked(raw: Mapping[str, Any], run: bool) -> Scenario:
     """Return the scenario of raw tables, with the defaults that depend on other keys."""
     scenario = resolve(parsing.parse(raw, run=run))
     checks.check(scenario)
-    if scenario.tune is not None and not own.waits(scenario):
+    if scenario.tune is not None and not custom.waits(scenario):
         scenario = msgspec.structs.replace(scenario, tune=free_gains.resolve(scenario, scenario.tune))
     return msgspec.structs.replace(scenario, defaulted=parsing.not_said(raw, parsing.dump(scenario)))
 
@@ -87,7 +87,7 @@ def resolve(scenario: Scenario) -> Scenario:
 
 def complete(scenario: Scenario) -> Scenario:
     """Return a scenario with the keys and gains of its custom parts, whose code is run; raise ScenarioError."""
-    return from_tables(parsing.stated(scenario), run=True) if own.waits(scenario) else scenario
+    return from_tables(parsing.stated(scenario), run=True) if custom.waits(scenario) else scenario
 
 
 def settled(scenario: Scenario) -> Scenario:
@@ -135,7 +135,7 @@ def replace(scenario: Scenario | str | Path, **changes: Any) -> Scenario:
             tables[table] = {"kind": value}
         else:
             tables[table] = {**within, key: value}
-    return from_tables(tables, run=not own.waits(scenario))
+    return from_tables(tables, run=not custom.waits(scenario))
 
 
 def _comes(name: str) -> int:

@@ -10,7 +10,7 @@ import numpy as np
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.scenario import attitude_keys
 from ptsmc_jax.scenario.attitude_keys import Attitude
-from ptsmc_jax.scenario.own import Own, fastest, own_kind
+from ptsmc_jax.scenario.custom import Custom, custom_kind, fastest
 from ptsmc_jax.scenario.schema import PartTable, table
 from ptsmc_jax.scenario.values import Four, Kinds, Meaning, Three
 from ptsmc_jax.signals import references
@@ -27,7 +27,7 @@ class ReferenceTable(Attitude, PartTable, frozen=True):
 
     def frequencies(self) -> dict[str, float]:
         """Return the angular frequency of the reference [rad/s], by the key that determines it."""
-        part = self.build() if isinstance(self, Own) else self
+        part = self.build() if isinstance(self, Custom) else self
         return {f"reference.{self.made.paced_by}": fastest(self, "reference", part)}
 
     def check(self) -> None:
@@ -73,7 +73,7 @@ REFERENCES: Kinds = {
     "spin": table(ReferenceTable, references.Spin, "spin"),
     "sinusoid": table(ReferenceTable, references.Swing, "sinusoid"),
     "slew": table(SlewTable, references.Slew, "slew"),
-    "own": own_kind(
+    "custom": custom_kind(
         ReferenceTable, references.Reference, ("attitude",),
         "A custom reference, a class derived from ptsmc_jax.Reference; its fields are further keys.",
     ),

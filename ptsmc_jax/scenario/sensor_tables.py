@@ -15,9 +15,9 @@ from msgspec import Meta
 from ptsmc_jax import formulas
 from ptsmc_jax.devices import attitude_sensors, kalman_filter, sensor_suite
 from ptsmc_jax.numerics.pytrees import vector
+from ptsmc_jax.scenario.custom import custom_kind
 from ptsmc_jax.scenario.device_tables import SAME, FilterTable, Hardware
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
-from ptsmc_jax.scenario.own import own_kind
 from ptsmc_jax.scenario.schema import PartTable
 from ptsmc_jax.scenario.values import Kinds, Meaning, NotNegative, Positive, Table, Three
 
@@ -186,7 +186,7 @@ class CustomTable(AttitudeSensorTable, frozen=True):
         """
         if self.made is None:
             return np.eye(3) / max(self.sigmas(), default=1.0) ** 2
-        rows = np.asarray(self.build("own", 1.0).sensitivity(jnp.array([0.0, 0.0, 0.0, 1.0])))
+        rows = np.asarray(self.build("custom", 1.0).sensitivity(jnp.array([0.0, 0.0, 0.0, 1.0])))
         return rows.T @ (rows / np.array(self.sigmas())[:, None] ** 2)
 
     def build(self, name: str, period: float) -> Any:
@@ -228,7 +228,7 @@ SENSORS: Kinds = {
     "star_tracker": StarTracker,
     "vector_sensor": VectorSensor,
     "gyro": Gyro,
-    "own": own_kind(
+    "custom": custom_kind(
         CustomTable, attitude_sensors.AttitudeSensor, ("read",),
         "A custom sensor, a class derived from ptsmc_jax.AttitudeSensor; its fields are further keys.",
     ),

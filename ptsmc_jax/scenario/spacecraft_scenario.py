@@ -14,12 +14,12 @@ from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.plants.flexible_body import flexible
 from ptsmc_jax.plants.rigid_body import AttitudeState, spacecraft
 from ptsmc_jax.scenario import attitude_keys, dispersion_tables, errors, tables
+from ptsmc_jax.scenario.custom_devices import SENSORS
 from ptsmc_jax.scenario.device_tables import FILTERS, WHEELS, FilterTable, Hardware, NoFilter, WheelLimits
 from ptsmc_jax.scenario.disturbance_tables import DISTURBANCES
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.law_tables import LAWS
 from ptsmc_jax.scenario.observer_tables import OBSERVERS
-from ptsmc_jax.scenario.own_devices import SENSORS
 from ptsmc_jax.scenario.pointing_table import Pointing
 from ptsmc_jax.scenario.reference_tables import REFERENCES, Initial
 from ptsmc_jax.scenario.sensor_tables import KalmanFilter, SensorSuite

@@ -13,11 +13,11 @@ from msgspec import Meta
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.plants.integrator_chain import chain
 from ptsmc_jax.scenario import device_tables, dispersion_tables, errors, systems, tables
+from ptsmc_jax.scenario.custom_devices import SENSORS
 from ptsmc_jax.scenario.disturbance_tables import DISTURBANCES
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.law_tables import LAWS
 from ptsmc_jax.scenario.observer_tables import OBSERVERS
-from ptsmc_jax.scenario.own_devices import SENSORS
 from ptsmc_jax.scenario.tables import Loop, Scenario, Tune
 from ptsmc_jax.scenario.values import Kinds, Meaning, Numbers, Table
 from ptsmc_jax.signals.references import CurrentTime, Origin

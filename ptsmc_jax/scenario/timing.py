@@ -84,8 +84,8 @@ def reach_of(scenario: Scenario, **farther: float) -> Reach:
     gains, delta = getattr(scenario.observer, "gain", (0.0,)), scenario.hand_over
     k1, width, rate = getattr(table, "k1", 1.0), getattr(table, "sign_width", 0.0), getattr(table, "surface_rate", 1.0)
     period = scenario.loop.period
-    own = Reach(table.t_f, table.t_f, delta, delta, min(gains), max(gains), k1, width, rate, period, period)
-    made = dataclasses.replace(own, **farther)
+    present = Reach(table.t_f, table.t_f, delta, delta, min(gains), max(gains), k1, width, rate, period, period)
+    made = dataclasses.replace(present, **farther)
     for low, high in _INTERVALS:
         if getattr(made, low) > getattr(made, high):
             raise ValueError(f"{low} is {getattr(made, low):g}, but must be at most {high}, {getattr(made, high):g}")
@@ -105,7 +105,7 @@ def timing(scenario: Scenario, setup: Setup, reach: Reach, saves: object) -> tup
         ScenarioError: the run would need too many steps; the message names the key that causes them.
     """
     loop, frequencies, visited = scenario.loop, _frequencies(scenario, setup, reach), None
-    if setup.plant.of_own_functions:
+    if setup.plant.custom_functions:
         hurried = _with_papers_law(setup.with_t_f(vector(reach.smallest_t_f)))
         visited = solutions.visited(hurried)
         frequencies["plant.system"] = _fastest_of_system(hurried, visited)
@@ -244,8 +244,8 @@ def _fastest_layer(reach: Reach, law: Any, observer: Any, visited: Any) -> tuple
         observer = _with_gain(observer, reach.gain)
     if reach.sign_width > 0.0:
         for t_f in (reach.smallest_t_f, reach.t_f):
-            own = _boundary_layer(dataclasses.replace(law, t_f=vector(t_f)), observer, visited)
-            before, after = max(before, float(own[0])), max(after, float(own[1]))
+            layer = _boundary_layer(dataclasses.replace(law, t_f=vector(t_f)), observer, visited)
+            before, after = max(before, float(layer[0])), max(after, float(layer[1]))
     return before, after
 
 

@@ -219,7 +219,7 @@ class PeriodMotion(NamedTuple):
                 torque = applied.at(time - start, parts.plant.velocity(y))
                 return parts.plant.rate(time, y, torque, d if walk is None else d + walk)
 
-            return integrators.rk4(rate, start, x, step, rolled=self.rolled or parts.plant.of_own_functions)
+            return integrators.rk4(rate, start, x, step, rolled=self.rolled or parts.plant.custom_functions)
 
         if parts.substeps == 1:
             return parts.plant.normalise(substep(jnp.zeros_like(dt), self.x))

@@ -41,8 +41,8 @@ def paths_of(parts: Parts) -> dict[str, str]:
     axes = {f"{AXIS}{k + 1}": f"observer.gain[{k}]" for k in range(len(getattr(parts.observer, "gain", ())))}
     observer = {WHOLE: "observer.gain"} if axes else {}
     observer |= {f"observer_{name}": f"observer.{name}" for name in parts.observer.tunable}
-    own_sensors = getattr(parts.sensors, "own", None)
-    devices = {f"sensors_{name}": f"sensors.own.{name}" for name in getattr(own_sensors, "tunable", ())}
+    custom = getattr(parts.sensors, "custom", None)
+    devices = {f"sensors_{name}": f"sensors.custom.{name}" for name in getattr(custom, "tunable", ())}
     if hasattr(parts.sensors, "with_bandwidth") and parts.sensors.filter is not None:  # a Kalman filter has no gains
         devices["filter_bandwidth"] = BANDWIDTH
     if parts.command_filter is not None:
@@ -136,7 +136,7 @@ def _check_clock(parts: Parts) -> None:
             )
 
 
-def own(parts: Parts, names: Iterable[str]) -> list[float]:
+def present_values(parts: Parts, names: Iterable[str]) -> list[float]:
     """Return the present values of these gains. For `observer_gain` it is the mean of the axes."""
     known, values = paths_of(parts), list[float]()
     for name in names:
@@ -149,19 +149,19 @@ def gains_of(parts: Parts) -> dict[str, float]:
     """Return every gain of the parts by name. Gains of single axes are listed if they differ."""
     check_parts(parts)
     names = [*paths_of(parts)]
-    gains = dict(zip(names, own(parts, names), strict=True))
+    gains = dict(zip(names, present_values(parts, names), strict=True))
     axes = [name for name in names if base(name) != name]
     alike = len({gains[name] for name in axes}) <= 1
     return {name: value for name, value in gains.items() if not (alike and name in axes)}
 
 
-def on_every_axis(gains: Mapping[str, Any], own: list[Any]) -> list[Any] | None:
+def on_every_axis(gains: Mapping[str, Any], present: list[Any]) -> list[Any] | None:
     """Return the observer gain of every axis, or None if `gains` has no observer gain.
 
     Args:
         gains: new values by name.
-        own: present value of each axis, used for an axis without a new value.
+        present: present value of each axis, used for an axis without a new value.
     """
     if not any(base(name) == WHOLE for name in gains):
         return None
-    return [gains.get(f"{AXIS}{k + 1}", gains.get(WHOLE, value)) for k, value in enumerate(own)]
+    return [gains.get(f"{AXIS}{k + 1}", gains.get(WHOLE, value)) for k, value in enumerate(present)]

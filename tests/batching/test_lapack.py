@@ -106,7 +106,7 @@ def batched_calls(monkeypatch):
 
 
 CUSTOM = {
-    "disturbance": {"kind": "own", "code": EighDisturbance},
+    "disturbance": {"kind": "custom", "code": EighDisturbance},
     "controller": {"t_f": 3.0, "delta": 0.5},
     "loop": {"mode": "sampled", "period": 0.1, "t_end": 4.0},
 }
@@ -149,6 +149,6 @@ def test_analyses_of_a_system_never_batch_eigh(batched_calls):
 
 
 def test_analyses_of_a_spacecraft_never_batch_eigh(batched_calls):
-    studied = scenario.study(scenario.from_tables(CUSTOM | {"reference": {"kind": "own", "code": EighReference}}))
+    studied = scenario.study(scenario.from_tables(CUSTOM | {"reference": {"kind": "custom", "code": EighReference}}))
     trace_analyses(studied.parts, studied.dispersion)
     assert not batched_calls

@@ -175,9 +175,9 @@ def overshoot(result, parts):
 
 def test_custom_metrics_are_columns_of_the_rows():
     made = of_scenario(untuned(SHORT_CHAIN), 3)
-    own = replace(made, own=overshoot)
-    assert own.own_names() == ["overshoot", "rows"]
-    more = own.fly(range(100))
+    with_metrics = replace(made, custom_metrics=overshoot)
+    assert with_metrics.custom_metric_names() == ["overshoot", "rows"]
+    more = with_metrics.fly(range(100))
     same(more.drop("overshoot", "rows"), made.fly(range(100)))
     log = runs.fly(made.ready, 3, 42).log
     after = np.linalg.norm(log.error, axis=1)[log.t > 5.0].max()
@@ -213,7 +213,7 @@ def test_custom_metrics_are_columns_of_the_rows():
 )
 def test_invalid_custom_metrics_are_refused(flown, made_of, said):
     with pytest.raises(ValueError, match=said):
-        replace(flown[0], own=made_of).own_names()
+        replace(flown[0], custom_metrics=made_of).custom_metric_names()
 
 
 def test_histories_equal_those_of_single_runs(flown):

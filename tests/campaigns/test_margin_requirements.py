@@ -185,7 +185,7 @@ DRAWN = {
     "chain": {
         **CHAIN,
         "dispersion": {
-            "own": {"kind": "own", "code": Lag},
+            "custom": {"kind": "custom", "code": Lag},
             "x0": {"kind": "uniform", "half_width": [0.5, 0.1]},
         },
     },
@@ -216,7 +216,11 @@ def drawn(request):
 def test_margin_constraints_agree_with_verdicts_and_finite_differences(drawn):
     """Compare gradients with central differences of order 4 along a direction that changes all gains."""
     posed = drawn
-    asked, bounds, share = posed.problem.margins, posed.evaluate.bounds, posed.evaluate.bounds.share(posed.own)
+    asked, bounds, share = (
+        posed.problem.margins,
+        posed.evaluate.bounds,
+        posed.evaluate.bounds.share(posed.scenario_gains),
+    )
     assert asked is not None
     found = sloped(asked, bounds, share)
     verdicts = margin_verdicts.over_trials(posed.ready, 3)
@@ -300,7 +304,7 @@ def test_margin_gradients_with_dispersed_inertia_compile_if_delta_is_free():
 def test_evaluator_appends_margins_of_the_hardest_trials(drawn, monkeypatch):
     posed = drawn
     assert posed.problem.rows == ("peak_torque", "gain_margin", "modulus_margin")
-    share = posed.evaluate.bounds.share(posed.own)[None]
+    share = posed.evaluate.bounds.share(posed.scenario_gains)[None]
     flown = {"gains": share, "f": np.zeros(1), "c": np.array([[[-0.3, -0.2, -0.4]]]), "value": np.zeros(1)}
     monkeypatch.setattr(posed.evaluate, "_fly", lambda *_: dict(flown))
     c = posed.evaluate.fly(posed.problem, share).c[0]
@@ -315,7 +319,7 @@ def test_evaluator_appends_margins_of_the_hardest_trials(drawn, monkeypatch):
     # with other gains, other trials are the hardest and become the constraints
     asked = posed.problem.margins
     assert asked is not None
-    other = posed.own * np.asarray([1.0, 0.2, 1.0, 1.0])  # a slow observer
+    other = posed.scenario_gains * np.asarray([1.0, 0.2, 1.0, 1.0])  # a slow observer
     parts = with_gains(asked.parts, dict(zip(asked.names, other, strict=True)))
     each = worst_of(all_of(parts, asked.dispersion, 3))
     harder, near = margin_rows.hardest(asked, other)
@@ -335,7 +339,11 @@ def test_prepared_margin_program_is_the_program_of_the_search(drawn, monkeypatch
     bounds = posed.evaluate.bounds
     margin_rows.ask(posed.ready, bounds, 3)
     known = [(jax.tree.structure(given), [jax.typeof(leaf) for leaf in jax.tree.leaves(given)]) for given in prepared]
-    asked = (posed.problem.margins, bounds.scale, np.stack([bounds.share(posed.own)] * len(jax.local_devices())))
+    asked = (
+        posed.problem.margins,
+        bounds.scale,
+        np.stack([bounds.share(posed.scenario_gains)] * len(jax.local_devices())),
+    )
     assert known == [(jax.tree.structure(asked), [jax.typeof(leaf) for leaf in jax.tree.leaves(asked)])]
 
 
@@ -360,7 +368,9 @@ LOOKED = [*((factors, True) for factors in FACTORS), (FACTORS[2], False)]
 
 def changed(posed, factors):
     """Return the parts with the gains multiplied by these factors."""
-    return with_gains(posed.problem.parts, dict(zip(posed.problem.names, posed.own * np.asarray(factors), strict=True)))
+    return with_gains(
+        posed.problem.parts, dict(zip(posed.problem.names, posed.scenario_gains * np.asarray(factors), strict=True))
+    )
 
 
 @pytest.mark.long  # shorter tests compare constraints, which use single runs, with verdicts on many trials

@@ -129,9 +129,9 @@ class Farther(ptsmc.Draw):
 def test_custom_dispersion_is_not_applied_twice_to_a_run_table():
     """Earlier, the dispersion was applied to its own result, and the angle in the run table was refused."""
     known = scenario.from_tables({"plant": {"kind": "chain"}, "loop": {"mode": "sampled"}})
-    drawn = ptsmc.replace(known, dispersion={"own": {"kind": "own", "code": Farther}})
+    drawn = ptsmc.replace(known, dispersion={"custom": {"kind": "custom", "code": Farther}})
     made = campaign.Campaign(scenario.study(drawn), SEED)
-    plan = made.draw(range(5)).drop("own_1")
+    plan = made.draw(range(5)).drop("custom_1")
     assert plan["initial_x1"].n_unique() == 5
     again = of_plan(made, plan)
     assert again.plan is not None
@@ -145,17 +145,19 @@ def test_custom_dispersion_is_not_applied_twice_to_a_run_table():
 def test_other_values_of_a_custom_dispersion_are_refused():
     """Earlier, other values in the run table were ignored."""
     known = scenario.from_tables({"plant": {"kind": "chain"}, "loop": {"mode": "sampled"}})
-    ready = scenario.study(ptsmc.replace(known, dispersion={"own": {"kind": "own", "code": Farther}}))
+    ready = scenario.study(ptsmc.replace(known, dispersion={"custom": {"kind": "custom", "code": Farther}}))
     written = campaign.Campaign(ready, SEED).draw(range(5))
 
     def again(table):
-        return campaign.of_plan(ready, SEED, plans.checked(table, ready.parts, drawn=ready.dispersion.own_names()))
+        return campaign.of_plan(ready, SEED, plans.checked(table, ready.parts, drawn=ready.dispersion.custom_names()))
 
     assert_frame_equal(again(written).draw(range(5)), written, check_exact=True)
     worst = written[[3, 1]]
-    assert again(worst).draw(range(2))["own_1"].to_list() == worst["own_1"].to_list()
-    for table in (written.with_columns(own_1=pl.lit(3.0)), worst.drop("trial", "initial_angle")):
-        with pytest.raises(RefusedError, match=r"^the plan has own_1 \S+ in row 0, but must have \S+ there, which is"):
+    assert again(worst).draw(range(2))["custom_1"].to_list() == worst["custom_1"].to_list()
+    for table in (written.with_columns(custom_1=pl.lit(3.0)), worst.drop("trial", "initial_angle")):
+        with pytest.raises(
+            RefusedError, match=r"^the plan has custom_1 \S+ in row 0, but must have \S+ there, which is"
+        ):
             again(table)
 
 

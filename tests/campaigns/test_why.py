@@ -20,7 +20,7 @@ from tuning.studies import campaign_folder, campaign_summary, reasons
 class Rows:
     """A campaign of 401 trials whose torque depends on the random initial angle."""
 
-    own_names = ()
+    custom_metric_names = ()
     scenario = scenarios.from_tables({"dispersion": {"attitude": {"kind": "uniform"}}})
     ready = scenarios.study(scenario)
     trials = 401
@@ -98,7 +98,7 @@ def test_every_random_input_may_be_a_reason(monkeypatch):
     assert any(name.startswith("disturbance") for name in columns)
     kept = ["trial", *plans.HEADING, *plans.OF_ROWS.values(), *ready.catalogue, *plans.SAMPLES, *columns, "mine"]
     monkeypatch.setattr(campaign_summary.rows, "columns_of", lambda part: kept)
-    folder: Any = SimpleNamespace(own_names=["mine"])
+    folder: Any = SimpleNamespace(custom_metric_names=["mine"])
     assert inspect.unwrap(campaign_summary.drawn_columns)(folder, [None]) == columns
 
 
@@ -116,7 +116,7 @@ def test_report_lists_the_four_most_unusual_inputs_of_a_failed_trial():
     alike: dict[str, Any] = {"metric": "effort", "trial": 3, "value": None, "drawn": 2.0, "unit": "",
                              "rank_correlation": None, "first_order": None}  # fmt: skip
     ranked = {"initial_angle": 70.0, "initial_w1": 52.0, "initial_w2": 1.0}  # distances 20, 2 and 49
-    shared = {"wheel_failure_wheel": 0.25, "own_1": 0.9}  # distances 37.5 and 5
+    shared = {"wheel_failure_wheel": 0.25, "custom_1": 0.9}  # distances 37.5 and 5
     told = [
         *({**alike, "input": name, "percentile": at, "median": 1.0, "share": None} for name, at in ranked.items()),
         *({**alike, "input": name, "percentile": None, "median": None, "share": at} for name, at in shared.items()),
@@ -124,7 +124,7 @@ def test_report_lists_the_four_most_unusual_inputs_of_a_failed_trial():
     (said,) = trials_report.why(told, "spacecraft")
     assert said.startswith("no effort in trial 3: ")
     named = [part.split()[0] for part in said.split(": ")[1].split(", ")]
-    assert named == ["initial_w2", "wheel_failure_wheel", "initial_angle", "own_1"]
+    assert named == ["initial_w2", "wheel_failure_wheel", "initial_angle", "custom_1"]
 
 
 def test_dispersion_of_zero_width_is_not_a_reason():

@@ -31,7 +31,7 @@ def test_commands_of_the_guide_run(command, tmp_path, monkeypatch):
         text = re.sub(r"\n\w+_margin = .*", "", text).replace(", probability = 0.9973, confidence = 0.9", "")
         (here / f"{name}.toml").write_text(text + TUNE)
     (tmp_path / "mine.py").write_text(re.findall(r"```python\n(.*?)```", GUIDE, re.S)[0])
-    law = '[controller]\nkind = "own"\ncode = "mine.py:Growing"'
+    law = '[controller]\nkind = "custom"\ncode = "mine.py:Growing"'
     (tmp_path / "mine.toml").write_text((here / "first_flight.toml").read_text().replace("[controller]", law))
     shutil.copy(tmp_path / "mine.py", here)
     flown = 0

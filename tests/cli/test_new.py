@@ -96,7 +96,7 @@ def test_commented_keys_of_other_laws_are_their_defaults(name):
     """The commented keys of a law have the same values as a scenario with only its kind and t_f."""
     raw = parsing.load(ROOT / "benchmarks" / "satellites" / f"{name}.toml")
     others = [values(lines) for lines in kinds(blocks(new.text(None, raw))["controller"])[1:]]
-    others = [other for other in others if other["kind"] != "own"]
+    others = [other for other in others if other["kind"] != "custom"]
     assert len(others) > 5
     for other in others:
         stated = {"kind": other["kind"], "t_f": raw["controller"]["t_f"]}
@@ -105,12 +105,12 @@ def test_commented_keys_of_other_laws_are_their_defaults(name):
 
 def test_keys_of_custom_classes_keep_their_order_and_are_quoted():
     """A field name may have letters that TOML allows only in quoted keys."""
-    own = {"kind": "own", "code": "mine.py:Mine", "größe": 3.0, "beta": 1.0, "alpha": 4.0}
-    terms = [own, {"kind": "none"}]
-    raw = {"disturbance": {"kind": "sum", "terms": terms}, "dispersion": {"own": own}, "reference": own}
+    custom = {"kind": "custom", "code": "mine.py:Mine", "größe": 3.0, "beta": 1.0, "alpha": 4.0}
+    terms = [custom, {"kind": "none"}]
+    raw = {"disturbance": {"kind": "sum", "terms": terms}, "dispersion": {"custom": custom}, "reference": custom}
     written = tomllib.loads(new.text(None, raw))
     assert list(written["reference"])[-3:] == ["größe", "beta", "alpha"]
-    assert (written["dispersion"]["own"], written["disturbance"]["terms"]) == (own, terms)
+    assert (written["dispersion"]["custom"], written["disturbance"]["terms"]) == (custom, terms)
 
 
 @pytest.mark.parametrize("plant", layouts.TABLES)

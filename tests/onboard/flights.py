@@ -13,7 +13,7 @@ SPREAD = {"attitude": {"kind": "axis_angle", "min_deg": 20.0, "max_deg": 90.0}}
 MISFITS = {**SPREAD, "actuator_scale": {"kind": "relative_uniform", "half_width": 0.05},
            "wheel_failure": {"kind": "uniform", "latest": 4.0}, "timing_jitter": {"largest": 0.3}}  # fmt: skip
 FULL = [[11.0, 1.5, -0.7], [1.5, 9.0, 0.4], [-0.7, 0.4, 14.0]]
-OWN = f"{ROOT / 'scenarios' / 'own_parts.py'}:"
+CUSTOM = f"{ROOT / 'scenarios' / 'own_parts.py'}:"
 PENDULUM = f"{ROOT / 'scenarios' / 'two_link_arm.py'}:arm"
 
 
@@ -39,9 +39,9 @@ FLIGHTS: dict[str, dict[str, Any]] = {
     "multiplicative": flight(controller={"error": "multiplicative"}, spacecraft={"inertia": FULL},
                              reference={"kind": "sinusoid", "amplitude": [0.1, 0.05, 0.08],
                                         "frequency": [0.2, 0.3, 0.1]}),
-    "own law": flight(controller={"kind": "own", "code": OWN + "Scaling", "delta": 1.0},
-                      observer={"kind": "own", "code": OWN + "LowPass"},
-                      reference={"kind": "own", "code": OWN + "Nodding", "angle": 0.1}),
+    "custom law": flight(controller={"kind": "custom", "code": CUSTOM + "Scaling", "delta": 1.0},
+                      observer={"kind": "custom", "code": CUSTOM + "LowPass"},
+                      reference={"kind": "custom", "code": CUSTOM + "Nodding", "angle": 0.1}),
     # further variants
     "no observer": flight(observer={"kind": "none"}, controller={"sign_width": 0.0}),
     "finite time observer": flight(observer={"kind": "finite_time", "gain": [0.1, 0.1, 0.1]},
@@ -79,4 +79,4 @@ FLIGHTS: dict[str, dict[str, Any]] = {
     "system": {"plant": {"kind": "system", "system": PENDULUM, "x0": [1.0, -0.5, 0.0, 0.0]}, "loop": LOOP,
                "controller": LAW},
 }  # fmt: skip
-SIX = ("raw", "filter", "wheels", "chain", "multiplicative", "own law")
+SIX = ("raw", "filter", "wheels", "chain", "multiplicative", "custom law")

@@ -47,7 +47,7 @@ FLOWN = {
                wheels={"kind": "axes", "axes": np.eye(3)[[0, 1, 2, 2]].tolist(), "torque_limit": 2.0}),
         PAPERS | FILTERS | {"wheels__axes": ("actuators_wheels_axes", AXES.T)}),
     "multiplicative": ({**FLIGHTS["multiplicative"], "observer": GAIN}, PAPERS),
-    "own law": (FLIGHTS["own law"], {
+    "custom law": (FLIGHTS["custom law"], {
         "spacecraft__inertia": ("inertia", OTHER),
         "controller__t_f": ("law_t_f", 4.6),
         "controller__delta": ("law_delta", 0.8),
@@ -196,7 +196,7 @@ class Steepest(LowPass):
 
 
 def test_a_value_that_c_cannot_derive_is_a_parameter_and_the_readme_reports_it():
-    tables = {**FLIGHTS["raw"], "observer": {"kind": "own", "code": f"{__file__}:Steepest"}}
+    tables = {**FLIGHTS["raw"], "observer": {"kind": "custom", "code": f"{__file__}:Steepest"}}
     made = folder.Controller(scenario.reading.complete(scenario.from_tables(tables)), "flight", "flight")
     names = [field.name for field in made.code.parameters]
     assert [name for name in made.code.fixed if name in names] == ["bound_rate"]  # three fields with the same number

@@ -41,9 +41,11 @@ QUICK = "CFLAGS=-O0"  # for builds that another test compiles with optimisation
 
 
 def make(place, *args):
-    own = {name: value for name, value in os.environ.items() if name not in ("MAKEFLAGS", "MFLAGS", "MAKELEVEL")}
+    environment = {
+        name: value for name, value in os.environ.items() if name not in ("MAKEFLAGS", "MFLAGS", "MAKELEVEL")
+    }
     called = ["make", "-B", f"CC={CC}", *args]  # without variables of an outer make that may run these tests
-    return subprocess.run(called, cwd=place, env=own, capture_output=True, text=True, check=False)
+    return subprocess.run(called, cwd=place, env=environment, capture_output=True, text=True, check=False)
 
 
 @needs_make
@@ -72,7 +74,7 @@ def test_exported_c_compiles_with_the_compilers_default_language(exported):
     assert done.returncode == 0, done.stderr
 
 
-EVERY = [(plant, kind) for plant, laws in LAWS.items() for kind in laws if kind != "own"]
+EVERY = [(plant, kind) for plant, laws in LAWS.items() for kind in laws if kind != "custom"]
 
 
 def of_law(plant, kind):
@@ -120,10 +122,10 @@ class Named(ptsmc.AccelerationLaw):
         return self.model.inertia @ self.model.inertia @ damped * (1.0 + d), x.w, now.memory
 
 
-def of_own(law):
+def with_custom_law(law):
     """A short scenario with a custom law and a moving reference."""
     moving = {"kind": "spin", "rate": [0.01, 0.02, -0.01]}
-    flown = {**FLIGHTS["raw"], "reference": moving, "controller": {"kind": "own", "code": law, "t_f": 5.0}}
+    flown = {**FLIGHTS["raw"], "reference": moving, "controller": {"kind": "custom", "code": law, "t_f": 5.0}}
     return scenario.reading.complete(scenario.from_tables(flown))
 
 
@@ -131,14 +133,14 @@ def of_own(law):
 @pytest.mark.parametrize("law", short([Odd, Named], [Odd]))
 def test_export_supports_unusual_memories_and_names(law, tmp_path):
     """The memories contain integers, empty arrays and names that are not identifiers in C."""
-    done = make(folder.export(of_own(law), tmp_path / "controller", name="law", trials=1), "check")
+    done = make(folder.export(with_custom_law(law), tmp_path / "controller", name="law", trials=1), "check")
     assert done.returncode == 0, done.stdout + done.stderr
     assert "other status: 0" in done.stdout
 
 
 @needs_compiler
 def test_names_and_comment_marks_of_c_in_a_law_compile(tmp_path):
-    folder.write_program(tmp_path, folder.Controller(of_own(Named), "law", "a scenario"))
+    folder.write_program(tmp_path, folder.Controller(with_custom_law(Named), "law", "a scenario"))
     called = [*compiler(), *STRICT, "-fsyntax-only", *map(str, sorted(tmp_path.glob("*.c")))]
     done = subprocess.run(called, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -157,7 +159,7 @@ class Tabled(ptsmc.AccelerationLaw):
 @pytest.mark.skipif(shutil.which("make") is None or shutil.which("gcc") is None, reason="this machine has no gcc")
 def test_documented_stack_size_includes_the_tables_of_loops(tmp_path):
     """The README must not state less than the 12 632 bytes that gcc reports."""
-    folder.write_program(tmp_path, folder.Controller(of_own(Tabled), "law", "a scenario"))
+    folder.write_program(tmp_path, folder.Controller(with_custom_law(Tabled), "law", "a scenario"))
     (stated,) = re.findall(r"At most (\d+) bytes of stack", (tmp_path / "README.md").read_text())
     counted = dict(re.findall(r":(\w+)\t(\d+)", make(tmp_path, "stack").stdout))
     assert int(counted["ptsmc_law_step_double"]) + int(counted["command"]) <= int(stated) < 20_000
@@ -174,7 +176,7 @@ class Halving(ptsmc.AccelerationLaw):
 
 @pytest.mark.parametrize(("law", "said"), [(Halving, True), (Odd, False)])
 def test_readme_reports_loops_with_an_unknown_number_of_passes(law, said, tmp_path):
-    folder.write_program(tmp_path, folder.Controller(of_own(law), "law", "a scenario"))
+    folder.write_program(tmp_path, folder.Controller(with_custom_law(law), "law", "a scenario"))
     assert ("one pass of each loop whose passes are not known" in (tmp_path / "README.md").read_text()) == said
 
 
@@ -206,7 +208,7 @@ class Lost(ptsmc.AccelerationLaw):
     ],
 )
 def test_export_raises_an_error_for_unsupported_or_diverging_laws(tmp_path, law, said):
-    flown = {**FLIGHTS["chain"], "controller": {"kind": "own", "code": law, "t_f": 5.0}}
+    flown = {**FLIGHTS["chain"], "controller": {"kind": "custom", "code": law, "t_f": 5.0}}
     made = scenario.reading.complete(scenario.from_tables(flown))
     with pytest.raises(ScenarioError, match=said):
         folder.export(made, tmp_path / "controller", name="law", trials=1)

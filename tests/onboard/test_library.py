@@ -44,8 +44,8 @@ def exported(tmp_path_factory):
         return library, library.parameters.copy()
 
     def as_it_was(name, real="double"):
-        library, own = compiled(name, real)
-        library.parameters[:] = own
+        library, parameters = compiled(name, real)
+        library.parameters[:] = parameters
         return written(name)[0], library
 
     return as_it_was
@@ -389,7 +389,7 @@ def test_parameters_that_a_trial_changes_are_passed_to_c(name, exported):
     if name != "filter":
         drawn["torque_limit"] = {"kind": "relative_normal", "std": 0.2}
     ready = scenario.study(folder.flown(scenario.from_tables({**FLIGHTS[name], "dispersion": drawn})))
-    ready = replace(ready, dispersion=replace(ready.dispersion, own=Measured()))
+    ready = replace(ready, dispersion=replace(ready.dispersion, custom=Measured()))
     ours = runs.fly(ready, 3, 2)
     software = InTheLoop(library, ready.parts, ready.dispersion).software
     theirs = runs.fly(ready, 3, 2, software)
@@ -427,8 +427,8 @@ class Apart(ptsmc.Draw):
 def test_a_draw_that_changes_one_of_several_shared_parameters_raises_an_error(where, exported):
     """C has one inertia for law and observer, so that it cannot use different values."""
     made, library = exported("delay, limit, quantised")
-    with pytest.raises(ScenarioError, match=r"dispersion\.own draws .*inertia.* by itself, but the controller in"):
-        InTheLoop(library, made.ready.parts, Dispersion(own=Apart(where)))
+    with pytest.raises(ScenarioError, match=r"dispersion\.custom draws .*inertia.* by itself, but the controller in"):
+        InTheLoop(library, made.ready.parts, Dispersion(custom=Apart(where)))
 
 
 @needs_compiler
@@ -445,9 +445,9 @@ def test_single_precision_gives_the_same_metrics(exported, name):
 @needs_compiler
 def test_report_of_many_different_parameters_names_some_and_counts_the_others(exported):
     made, library = exported("chain")
-    own = library.parameters.copy()
-    changed = np.flatnonzero(own)[:6]
-    library.parameters[changed] = 2.0 * own[changed]
+    parameters = library.parameters.copy()
+    changed = np.flatnonzero(parameters)[:6]
+    library.parameters[changed] = 2.0 * parameters[changed]
     said = InTheLoop(library, made.ready.parts).otherwise
     assert said.count(" instead of ") == 4
     assert said.endswith(" and 2 more")

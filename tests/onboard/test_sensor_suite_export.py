@@ -35,7 +35,7 @@ TABLES = {
         {**TRACKER, "boresight": [0.0, 1.0, 1.0], "period": 0.2, "latency": 0.1},
         {**TRACKER, "rotvec_deg": [20.0, 60.0, -30.0], "period": 0.25, "latency": 0.07},
         {"kind": "vector_sensor", "direction": [0.0, 0.6, 0.8], "noise": 1e-3, "period": 0.3},
-        {"kind": "own", "code": f"{__file__}:Horizon", "noise": [1e-3, 2e-3], "scale": 2.0, "latency": 0.1},
+        {"kind": "custom", "code": f"{__file__}:Horizon", "noise": [1e-3, 2e-3], "scale": 2.0, "latency": 0.1},
         {"kind": "gyro", "rate_noise": 1e-6, "rate_bias": 1e-5, "rate_bias_walk": 1e-8},
     ],
 }
@@ -96,7 +96,9 @@ def test_a_reading_marked_as_invalid_is_ignored(suite):
     np.testing.assert_array_equal(others, outputs)
 
 
-@pytest.mark.parametrize("name", ["star_tracker_1", "star_tracker_2", "star_tracker_2_age", "vector_sensor_1", "own_1"])
+@pytest.mark.parametrize(
+    "name", ["star_tracker_1", "star_tracker_2", "star_tracker_2_age", "vector_sensor_1", "custom_1"]
+)
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_a_reading_marked_as_valid_that_is_not_finite_is_invalid_input(suite, name, value):
     library, given, _, states = suite

@@ -75,7 +75,9 @@ def test_gains_of_a_campaign_have_their_units():
         ("controller.disturbance_bound", "0.1", "N m"),
         ("observer.gain", "0.02", "N m/s"),  # the nonlinear observer's is in N m s
     ]
-    custom = {"controller": {"kind": "own", "t_f": 30.0, "k": 2.0}}  # its class may have another unit than a built-in k
+    custom = {
+        "controller": {"kind": "custom", "t_f": 30.0, "k": 2.0}
+    }  # its class may have another unit than a built-in k
     assert campaign_report.gains(custom, "spacecraft").rows[1:] == [
         ("controller.t_f", "30", "s"),
         ("controller.k", "2", ""),

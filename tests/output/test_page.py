@@ -290,5 +290,5 @@ def test_other_plants_have_pages_too(command, tmp_path):
 @pytest.mark.parametrize(("values", "kind"), [([2.7, 3.05], None), ([1e-6, 4e-4], "log"), ([0.0, 5.0], None)])
 def test_an_axis_of_laws_has_numbers_on_it(values, kind):
     """A logarithmic one names powers of ten: between 2.7 and 3.05 there is none."""
-    made = page_charts.laws(["pd", "own"], {"all": (values, [None, None])}, "effort [N m s]", {}, logarithmic=True)
+    made = page_charts.laws(["pd", "custom"], {"all": (values, [None, None])}, "effort [N m s]", {}, logarithmic=True)
     assert made["layout"]["xaxis"].get("type") == kind

@@ -17,7 +17,7 @@ LONG_RUN = (
     "loop = { mode = 'sampled', period = %s, window = 1.0, t_end = 100010.0 }\n"
 )
 FLEXIBLE = "spacecraft.inertia = [10, 12, 14]\nflexible.coupling = [[3, 0, 0]]\n"
-OWN = 'plant = { kind = "system", system = "%s" }'
+CUSTOM = 'plant = { kind = "system", system = "%s" }'
 
 # scenario file; expected text about key and value; expected text about allowed values
 BAD = [
@@ -559,14 +559,14 @@ BAD = [
         "at most the 800 control periods",
     ),
     ("initial.rotvec_deg = [1.0, 2.0, 1e308]", "initial.rotvec_deg is [1.0, 2.0, 1e+308]", "squares are finite"),
-    (OWN % ("a" * 5000 + ".py:arm"), 'plant.system is "', "it names nothing; allowed is"),
-    (OWN % ("a" * 300 + ".py:arm"), 'plant.system is "', "it cannot be read: File name too long"),
-    (OWN % "a\\u0000b.py:arm", r'plant.system is "a\u0000b.py:arm"', "it names nothing; allowed is"),
-    (OWN % "a\\u001b[2K.py:arm", r'plant.system is "a\u001b[2K.py:arm"', "it names nothing; allowed is"),
-    (OWN % "a\\u0000b:arm", r'plant.system is "a\u0000b:arm"', "it names nothing; allowed is"),
-    (OWN % "arm.py:a b", "arm.py:a b", "it names nothing; allowed is"),
-    (OWN % "a..b:arm", 'plant.system is "a..b:arm"', "it names nothing; allowed is"),
-    (OWN % "/:arm", 'plant.system is "/:arm"', "it names nothing; allowed is"),
+    (CUSTOM % ("a" * 5000 + ".py:arm"), 'plant.system is "', "it names nothing; allowed is"),
+    (CUSTOM % ("a" * 300 + ".py:arm"), 'plant.system is "', "it cannot be read: File name too long"),
+    (CUSTOM % "a\\u0000b.py:arm", r'plant.system is "a\u0000b.py:arm"', "it names nothing; allowed is"),
+    (CUSTOM % "a\\u001b[2K.py:arm", r'plant.system is "a\u001b[2K.py:arm"', "it names nothing; allowed is"),
+    (CUSTOM % "a\\u0000b:arm", r'plant.system is "a\u0000b:arm"', "it names nothing; allowed is"),
+    (CUSTOM % "arm.py:a b", "arm.py:a b", "it names nothing; allowed is"),
+    (CUSTOM % "a..b:arm", 'plant.system is "a..b:arm"', "it names nothing; allowed is"),
+    (CUSTOM % "/:arm", 'plant.system is "/:arm"', "it names nothing; allowed is"),
     ("tune.bound = {}", "tune.bound is not a known key", "nearest known one is tune.bounds"),
     ("tune.bounds = [1, 2]", "tune.bounds is [1, 2]", "two numbers for each gain"),
     ("tune.bounds.eta = 3.0", "tune.bounds is { eta = 3.0 }", "two numbers for each gain"),

@@ -150,13 +150,14 @@ class Wobble(Disturbance):
 
 
 def test_bounds_of_a_custom_disturbance_are_taken_along_the_nominal_run():
-    table = {"kind": "own", "code": Wobble, "share": 0.0}
+    table = {"kind": "custom", "code": Wobble, "share": 0.0}
     assert bounds(disturbance=table) == pytest.approx((0.02, 6e-3), rel=1e-3)
     angle = 2.0 * np.arccos(0.5773502691896258)  # until t_f, fastest at the start, three times the mean rate
     largest, _ = bounds(disturbance={**table, "share": 10.0})
     assert largest == pytest.approx(10.0 * (3.0 * angle / 30.0) ** 2, rel=0.02)
     assert (
-        scenario.from_tables({"disturbance": {"kind": "own", "code": "any.py:D"}}).controller.disturbance_bound is None
+        scenario.from_tables({"disturbance": {"kind": "custom", "code": "any.py:D"}}).controller.disturbance_bound
+        is None
     )
 
 
@@ -170,7 +171,7 @@ class BreaksOff(Disturbance):
 
 def test_a_custom_disturbance_that_becomes_nan_during_the_run_is_refused():
     with pytest.raises(ScenarioError, match=r"class BreaksOff .* \[nan, nan, nan\] at t = 10\.02 s .* finite numbers"):
-        bounds(disturbance={"kind": "own", "code": BreaksOff})
+        bounds(disturbance={"kind": "custom", "code": BreaksOff})
 
 
 def test_the_default_observer_gain_depends_on_inertia_and_period():
@@ -332,7 +333,7 @@ class Vibration(Disturbance):
 @pytest.mark.parametrize("rate", [1.0, 50.0, 50.0 * math.pi])
 def test_bounds_of_a_fast_custom_disturbance_are_not_aliased(rate):
     """An earlier version aliased a disturbance of 25 Hz with its sample times and found bounds of nearly zero."""
-    said = scenario.from_tables({"disturbance": {"kind": "own", "code": Vibration, "rate": rate}})
+    said = scenario.from_tables({"disturbance": {"kind": "custom", "code": Vibration, "rate": rate}})
     known = disturbance_bounds.of(said)
     assert known is not None
     np.testing.assert_allclose(known, (0.01, 0.01 * rate), rtol=3e-3)
@@ -361,7 +362,9 @@ class Swell(Disturbance):
 )
 def test_bounds_of_a_custom_disturbance_include_dispersions(drawn, most):
     dispersion = {"dispersion": drawn} if drawn else {}
-    known = disturbance_bounds.of(scenario.from_tables({"disturbance": {"kind": "own", "code": Swell}, **dispersion}))
+    known = disturbance_bounds.of(
+        scenario.from_tables({"disturbance": {"kind": "custom", "code": Swell}, **dispersion})
+    )
     assert known is not None
     np.testing.assert_allclose(known[0], 0.01 * most, rtol=3e-3)
 
@@ -372,7 +375,7 @@ def test_bounds_of_a_custom_disturbance_include_dispersions(drawn, most):
 def test_a_custom_disturbance_that_disperses_an_unknown_field_is_refused(drawn, said):
     wrong = type("Wrong", (Swell,), {"drawn": drawn, "__annotations__": {"drawn": ClassVar}})
     with pytest.raises(ScenarioError, match=rf"class Wrong whose drawn is .*{said}.*, but must name fields of it"):
-        scenario.from_tables({"disturbance": {"kind": "own", "code": wrong}})
+        scenario.from_tables({"disturbance": {"kind": "custom", "code": wrong}})
 
 
 @pytest.mark.parametrize(

@@ -8,10 +8,10 @@ import pytest
 
 from ptsmc_jax.scenario import errors, from_tables, layouts, parsing
 from ptsmc_jax.scenario.attitude_keys import Attitude
+from ptsmc_jax.scenario.custom import Custom
 from ptsmc_jax.scenario.device_tables import AxesWheels, PyramidWheels
 from ptsmc_jax.scenario.disturbance_tables import GravityTable, SumDisturbance
 from ptsmc_jax.scenario.errors import ScenarioError
-from ptsmc_jax.scenario.own import Own
 from ptsmc_jax.scenario.state_scenario import ChainPlant
 from ptsmc_jax.scenario.tables import Limit, Scenario
 from ptsmc_jax.scenario.values import Table
@@ -343,7 +343,7 @@ def every_kind():
     tables = [kinds for layout in layouts.TABLES.values() for kinds in layout.values()]
     tables += [*layouts.DISPERSIONS.values(), *layouts.KINDS.values(), Limit]
     found = {one for kinds in tables for one in (kinds.values() if isinstance(kinds, Mapping) else [kinds])}
-    return {one for one in found if not issubclass(one, Own | SumDisturbance)}
+    return {one for one in found if not issubclass(one, Custom | SumDisturbance)}
 
 
 def test_the_tables_of_these_tests_contain_every_key():
@@ -364,8 +364,8 @@ def test_the_tables_of_these_tests_contain_every_key():
     for struct, keys in named.items():
         if issubclass(struct, GravityTable):
             keys |= set(Attitude.__struct_fields__)  # as in [initial]
-        if "own" in struct.__struct_fields__:
-            keys.add("own")  # see test_own_devices
+        if "custom" in struct.__struct_fields__:
+            keys.add("custom")  # see test_custom_devices
     assert named == {struct: set(struct.__struct_fields__) for struct in named}
 
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 import ptsmc_jax as ptsmc
 from ptsmc_jax import scenario
 from ptsmc_jax.numerics import attitude
-from ptsmc_jax.scenario import own, parsing
+from ptsmc_jax.scenario import custom, parsing
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.json_schema import json_schema
 
@@ -103,17 +103,17 @@ class Level(ptsmc.AttitudeSensor):
         return attitude.rotate(self.mounting, jnp.array([0.0, 0.0, 1.0]))
 
 
-def custom(**keys):
-    table = {"kind": "own", "code": f"{__file__}:Level", "noise": [1e-3], **keys}
+def with_custom_sensor(**keys):
+    table = {"kind": "custom", "code": f"{__file__}:Level", "noise": [1e-3], **keys}
     return scenario.reading.complete(read(TRACKER, table, GYRO))
 
 
 def test_a_custom_sensor_has_keys_and_a_checksum():
-    made = custom(scale=3.0, latency=0.1)
+    made = with_custom_sensor(scale=3.0, latency=0.1)
     sensor = scenario.study(made).parts.sensors.sensors[1]
-    assert (sensor.name, float(sensor.scale), sensor.times.wait) == ("own_1", 3.0, 1)
+    assert (sensor.name, float(sensor.scale), sensor.times.wait) == ("custom_1", 3.0, 1)
     np.testing.assert_allclose(sensor.sensitivity(jnp.array([0.0, 0.0, 0.0, 1.0])), [[0.0, 3.0, 0.0]], atol=1e-15)
-    assert list(own.digests(made)) == ["sensors_1_sha256"]
+    assert list(custom.digests(made)) == ["sensors_1_sha256"]
     tables = parsing.dump(made)
     assert parsing.dump(scenario.reading.complete(scenario.from_tables(tables))) == tables
 
@@ -123,7 +123,7 @@ def test_a_custom_sensor_has_keys_and_a_checksum():
 )
 def test_a_custom_sensor_with_a_bad_key_is_refused(key, keys):
     with pytest.raises(ScenarioError, match=rf"sensors.*\.{key} is"):
-        scenario.study(custom(**keys))
+        scenario.study(with_custom_sensor(**keys))
 
 
 BAD = {

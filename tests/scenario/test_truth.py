@@ -12,7 +12,7 @@ from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo, runs
 from ptsmc_jax.onboard import board
 from ptsmc_jax.plants import system
-from ptsmc_jax.scenario import own, systems
+from ptsmc_jax.scenario import custom, systems
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.theory import linear, margins, solutions
@@ -177,8 +177,8 @@ def test_comparison_laws_control_a_custom_system(kind):
 
 def test_a_custom_true_plant_is_reported_as_custom_code():
     loaded = scenario.from_tables(TABLES)
-    assert set(own.programs(loaded)) == {"plant.system", "plant.truth"}
-    assert set(own.digests(loaded)) == {"system_sha256", "truth_sha256"}
+    assert set(custom.programs(loaded)) == {"plant.system", "plant.truth"}
+    assert set(custom.digests(loaded)) == {"system_sha256", "truth_sha256"}
 
 
 @pytest.mark.parametrize(

@@ -69,7 +69,7 @@ def test_other_units_rescale_every_default_and_every_bound(raw, units):
         assert found[key] == (pytest.approx(value, rel=1e-12) if isinstance(value, float) else value), key
 
 
-@pytest.mark.parametrize("law", [law for law in LAWS["spacecraft"] if law != "own"])
+@pytest.mark.parametrize("law", [law for law in LAWS["spacecraft"] if law != "custom"])
 def test_gains_of_every_law_scale_with_the_mission(law):
     raw = SATELLITES["uosat12"]
     raw = {**raw, "controller": {"kind": law, "t_f": raw["controller"]["t_f"]}, "tune": {}}

@@ -47,8 +47,8 @@ def test_hand_over_is_moved_to_samples_by_delta_and_by_t_f_if_both_are_free():
     some = replace(problem(2), names=("t_f", "delta"))
     evaluate = Evaluator(shares.Bounds(("t_f", "delta"), (10.0, 0.2), (20.0, 5.0)))
     run = descents.Descents(evaluate, 0.0, 2, np.random.default_rng(0))
-    own = np.array([15.13, 0.79])  # the hand-over at 14.34 s lies between samples 71 and 72
-    share = evaluate.bounds.share(own)
+    scenario_gains = np.array([15.13, 0.79])  # the hand-over at 14.34 s lies between samples 71 and 72
+    share = evaluate.bounds.share(scenario_gains)
     run._take(descent.Best(share, 0, 0.0), some, 0, afresh=True)
     moved = [
         np.asarray(evaluate.bounds.gains(jnp.asarray(one)))
@@ -56,9 +56,9 @@ def test_hand_over_is_moved_to_samples_by_delta_and_by_t_f_if_both_are_free():
     ]
     on_samples = np.asarray([(t_f - delta) / 0.2 for t_f, delta in moved])
     np.testing.assert_allclose(on_samples, np.round(on_samples), atol=1e-9)
-    with_delta = sorted(delta for t_f, delta in moved if abs(t_f - own[0]) < 1e-9)
+    with_delta = sorted(delta for t_f, delta in moved if abs(t_f - scenario_gains[0]) < 1e-9)
     np.testing.assert_allclose(with_delta, [0.73, 0.93], atol=1e-9)
-    with_t_f = sorted(t_f for t_f, delta in moved if abs(delta - own[1]) < 1e-9)
+    with_t_f = sorted(t_f for t_f, delta in moved if abs(delta - scenario_gains[1]) < 1e-9)
     np.testing.assert_allclose(with_t_f, 0.79 + 0.2 * np.arange(71, 71 + hand_overs.LATER), atol=1e-9)
 
 
@@ -141,11 +141,11 @@ def test_a_local_search_minimises_the_objective_or_the_violation_of_some_limits(
 
 def test_a_search_starts_from_the_best_design_if_that_is_better_than_the_scenarios_gains():
     evaluate = Conflicting(0.1, 0.7, -1.0)
-    some, own = replace(problem(2), names=evaluate.bounds.names), np.array([1.6, 1.3])
+    some, scenario_gains = replace(problem(2), names=evaluate.bounds.names), np.array([1.6, 1.3])
     designs = np.array([[1.9, 1.3], [1.2, 1.3], [1.65, 1.3]])
-    for given, first in ((designs, designs[1]), (designs[::2], own), (np.zeros((0, 2)), own)):
+    for given, first in ((designs, designs[1]), (designs[::2], scenario_gains), (np.zeros((0, 2)), scenario_gains)):
         run = descents.Descents(evaluate, 0.0, 2, np.random.default_rng(0))
-        run.set_out(some, own, given)
+        run.set_out(some, scenario_gains, given)
         np.testing.assert_allclose(evaluate.bounds.gains(run.history[0].gains), first, rtol=1e-12)
 
 
@@ -232,10 +232,10 @@ def test_only_gains_without_effect_are_reset_to_the_scenarios_values():
     """This also holds if the lower bound of sign_width depends on the observer's gain and lies above the value."""
     hops = shares.Bounds(("observer_gain", *THREE.names[1:]), (2.05, 0.1, 1e-5), (600.0, 50.0, 1e-1), hop=5e-3)
     for bounds, width, kept in ((THREE, 2e-3, True), (THREE, 2e-3, False), (hops, 2e-3, True), (hops, 1e-3, True)):
-        some, own = replace(problem(), names=bounds.names), np.array([3.0, 5.0, width])
+        some, scenario_gains = replace(problem(), names=bounds.names), np.array([3.0, 5.0, width])
         run = descents.Descents(Valley(bounds), 0.0, 40, np.random.default_rng(0))
         if kept:
-            run.set_out(some, own, np.zeros((0, 3)))
+            run.set_out(some, scenario_gains, np.zeros((0, 3)))
         run.descend(some, {0: np.array([0.9, 0.1, 0.1])})
         np.testing.assert_allclose(run.share[:2], [0.2, 0.04], atol=0.02)
         np.testing.assert_allclose(run.gains[2], width if kept else 1e-5 * 1e4**0.1)

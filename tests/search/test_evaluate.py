@@ -37,8 +37,8 @@ def test_rows_of_trials_and_of_margins_are_padded_without_changing_the_result(mo
     assert found.c.shape == (2, 3, 5)
     for name, filled in (("c", -1.0), ("c_slope", 0.0)):
         seen = getattr(found, name)
-        for rows, own, size in ((seen[:, :2], flown[name], trials), (seen[:, 2:], of_loop[name], loops)):
-            np.testing.assert_array_equal(rows[:, :, :size], own)
+        for rows, expected, size in ((seen[:, :2], flown[name], trials), (seen[:, 2:], of_loop[name], loops)):
+            np.testing.assert_array_equal(rows[:, :, :size], expected)
             assert np.all(rows[:, :, size:] == filled)
     largest = np.maximum(flown["c"].max(axis=(1, 2)), of_loop["c"].max(axis=(1, 2)))
     np.testing.assert_array_equal(found.beyond, largest)

@@ -124,7 +124,7 @@ def test_gains_of_single_axes_have_names_and_bounds():
     scenario, ready = wide({"tune": tables, "observer": {"gain": [3.0, 4.0, 5.0]}})
     names = gains.named(scenario)
     assert names == ("eta", "observer_gain_1", "observer_gain_2", "observer_gain_3")
-    assert gains.own(ready.parts, names) == [3.0, 3.0, 4.0, 5.0]
+    assert gains.present_values(ready.parts, names) == [3.0, 3.0, 4.0, 5.0]
     some = shares.of_scenario(scenario, ready.parts)
     assert some.names == names
     assert (some.lower[1:], some.upper[1:]) == ((1.0,) * 3, (50.0,) * 3)
@@ -386,9 +386,9 @@ def test_gains_are_compared_with_the_published_ones_only_if_these_can_be_simulat
     """At a rate of 0.6 rad/s the published eta of 3 overshoots past 180 deg, and an eta of 6 does not."""
     fast = {"initial": {"rotvec_deg": [0.0, 0.0, 0.0], "rate": [0.6, 0.0, 0.0]}, "loop": {"mode": "sampled"}}
     law = {"t_f": 30.0, "delta": 0.5, "error": "multiplicative"}
-    own = from_tables({**fast, "controller": {**law, "eta": 6.0}})
-    found, refused = judging.beside(own)
-    assert found == {"before": own}
+    before = from_tables({**fast, "controller": {**law, "eta": 6.0}})
+    found, refused = judging.beside(before)
+    assert found == {"before": before}
     assert refused is not None
     assert refused.startswith("initial.rotvec_deg is")
     quick = {"t_f": 0.04, "delta": 0.01}  # t_f is shorter than the published delta
@@ -402,7 +402,7 @@ def test_gains_are_compared_with_the_published_ones_only_if_these_can_be_simulat
 
 
 @pytest.mark.parametrize(
-    ("plant", "kind"), [(plant, kind) for plant, laws in LAWS.items() for kind in laws if kind != "own"]
+    ("plant", "kind"), [(plant, kind) for plant, laws in LAWS.items() for kind in laws if kind != "custom"]
 )
 def test_tables_of_laws_list_the_tunable_gains_of_the_laws(plant, kind):
     table = LAWS[plant][kind]
@@ -424,7 +424,7 @@ PLANTS = {
         for plant in PLANTS
         for table, kinds in (("controller", LAWS), ("observer", OBSERVERS))
         for kind in kinds[plant]
-        if kind != "own" and kinds[plant][kind].gains
+        if kind != "custom" and kinds[plant][kind].gains
     ],
 )
 def test_default_bounds_of_every_gain_are_valid_and_contain_the_scenarios_gain(plant, table, kind):
@@ -442,8 +442,8 @@ def test_default_bounds_of_every_gain_are_valid_and_contain_the_scenarios_gain(p
             )
             assert least <= low if closed else least < low, name
             assert low < high < most, name
-            own = free_gains._own(loaded, name)
-            assert all(low <= value <= high for value in own), name
+            present_values = free_gains._present_values(loaded, name)
+            assert all(low <= value <= high for value in present_values), name
 
 
 @pytest.mark.parametrize("order", [2, 4])

@@ -463,12 +463,12 @@ def test_a_global_search_follows_if_harder_trials_lead_beyond_a_limit(monkeypatc
         bad.offer(lost, evaluate.fly(run.tightened(harder), lost))
         run._take(bad, run.tightened(harder), 0, afresh=True)
 
-    def search_globally(run, harder, starts, seed, own=descents.Descents.search_globally):
+    def search_globally(run, harder, starts, seed, original=descents.Descents.search_globally):
         seeds.append(seed)
-        own(run, harder, starts, seed)
+        original(run, harder, starts, seed)
 
-    def descend(run, harder, shares, own=descents.Descents.descend):
-        own(run, harder, shares)
+    def descend(run, harder, shares, original=descents.Descents.descend):
+        original(run, harder, shares)
         if second == "worse" and seeds:
             run._best.over = np.inf
         if "Ctrl-C" in second and seeds:

@@ -302,8 +302,8 @@ def test_joining_trials_fill_free_slots_first_and_then_replace_the_oldest():
         kept = [0] * max(0, 16 - joined) + [*range(200, 200 + joined)][-16:]
         assert sorted(np.asarray(problem.trials)[8:].tolist()) == sorted(kept)
         np.testing.assert_array_equal(problem.trials[:8], np.arange(8))
-    own = objective.coordinates_of(problem.dispersion, 5, np.asarray(problem.trials))
-    np.testing.assert_array_equal(problem.coordinates["initial_attitude"], own["initial_attitude"])
+    expected = objective.coordinates_of(problem.dispersion, 5, np.asarray(problem.trials))
+    np.testing.assert_array_equal(problem.coordinates["initial_attitude"], expected["initial_attitude"])
 
 
 def test_critical_trials_of_several_quantile_limits_are_all_kept():

@@ -29,7 +29,7 @@ from tuning.cli import options
 from tuning.errors import UsageError
 from tuning.output import compare_report, page, summaries
 from tuning.output.formats import ratio
-from tuning.search import gains, own_parts
+from tuning.search import custom_parts, gains
 from tuning.studies import compare, judging, stability, tuner
 
 TABLES = tomllib.loads(SHORT)
@@ -86,14 +86,14 @@ def test_custom_law_is_compared_with_the_requested_laws():
 
 def test_custom_law_of_the_scenario_keeps_the_settings_of_the_scenario(tmp_path):
     (tmp_path / "own.py").write_bytes((ROOT / "scenarios" / "own_parts.py").read_bytes())
-    law = {"kind": "own", "code": f"{tmp_path}/own.py:Scaling", "t_f": 5.0, "delta": 0.7}
-    own = scenario.replace(scenario.from_tables(TABLES), tune=None, controller=law)
-    own = scenario.replace(own, tune={"free": ["delta"], "trials": 8})
-    assert compare.contenders(own, compare.Rivals(("pd",)))["Scaling"] is own  # without the option --law
+    law = {"kind": "custom", "code": f"{tmp_path}/own.py:Scaling", "t_f": 5.0, "delta": 0.7}
+    mine = scenario.replace(scenario.from_tables(TABLES), tune=None, controller=law)
+    mine = scenario.replace(mine, tune={"free": ["delta"], "trials": 8})
+    assert compare.contenders(mine, compare.Rivals(("pd",)))["Scaling"] is mine  # without the option --law
     (tmp_path / "linked.py").symlink_to(tmp_path / "own.py")
-    named = compare.contenders(own, compare.Rivals(("pd",), (f"{tmp_path}/linked.py:Scaling",)))
+    named = compare.contenders(mine, compare.Rivals(("pd",), (f"{tmp_path}/linked.py:Scaling",)))
     assert list(named) == ["prescribed_time", "pd", "Scaling"]
-    assert named["Scaling"] is own
+    assert named["Scaling"] is mine
 
 
 def test_checksums_accept_only_the_custom_laws_of_the_comparison(tmp_path):
@@ -101,17 +101,17 @@ def test_checksums_accept_only_the_custom_laws_of_the_comparison(tmp_path):
         (tmp_path / f"{name}.py").write_text(f"# {name}\n")
     where = {name: f"{tmp_path}/{name}.py:Mine" for name in ("flown", "beside", "other")}
     of_scenario = {"controller_sha256": systems.digest(where["flown"])}
-    of_rivals = {"own_laws": {where["beside"]: systems.digest(where["beside"])}}
+    of_rivals = {"custom_laws": {where["beside"]: systems.digest(where["beside"])}}
     for made, names in ((of_scenario | of_rivals, ("flown", "beside")), (of_rivals, ("beside",))):
         for name in names:
-            own_parts.check_unchanged({"controller.code": where[name]}, tmp_path, made)
+            custom_parts.check_unchanged({"controller.code": where[name]}, tmp_path, made)
         with pytest.raises(RefusedError, match="was made with another"):
-            own_parts.check_unchanged({"controller.code": where["other"]}, tmp_path, made)
+            custom_parts.check_unchanged({"controller.code": where["other"]}, tmp_path, made)
 
 
 def test_custom_laws_with_equal_names_get_different_labels():
     named = compare.Rivals((), ("a.py:Mine", "b.py:Mine", "c.py:Mine", "a.py:Mine", "a.py:paper")).named
-    assert list(named) == ["prescribed_time", "Mine", "own Mine", "own own Mine", "own paper"]
+    assert list(named) == ["prescribed_time", "Mine", "custom Mine", "custom custom Mine", "custom paper"]
     assert len({law.get("code") for law in named.values()}) == 5
 
 
@@ -127,15 +127,15 @@ def test_different_paths_of_one_file_are_the_same_custom_law(tmp_path, monkeypat
 
 
 def test_baseline_law_of_the_scenario_keeps_the_bounds_of_the_scenario():
-    own = scenario.replace(scenario.from_tables(TABLES), tune=None, controller={"kind": "pd", "t_f": 5.0, "k_p": 2.0})
-    own = scenario.replace(own, tune={"free": ["k_d"], "bounds": {"k_d": [0.5, 3.0]}, "trials": 8})
-    posed = compare.contenders(own)
-    assert posed["pd"] is own
+    mine = scenario.replace(scenario.from_tables(TABLES), tune=None, controller={"kind": "pd", "t_f": 5.0, "k_p": 2.0})
+    mine = scenario.replace(mine, tune={"free": ["k_d"], "bounds": {"k_d": [0.5, 3.0]}, "trials": 8})
+    posed = compare.contenders(mine)
+    assert posed["pd"] is mine
     assert posed["prescribed_time"].controller.kind == "prescribed_time"
     expected = ("eta", "delta", "observer_gain", "k1", "sign_width", "surface_rate")
     assert tuned(posed["prescribed_time"]).free == expected
-    assert gains.papers(own).controller.eta == 3.0
-    assert gains.papers(own).controller.t_f == 5.0
+    assert gains.papers(mine).controller.eta == 3.0
+    assert gains.papers(mine).controller.t_f == 5.0
 
 
 @pytest.mark.parametrize(
@@ -471,4 +471,4 @@ def test_every_law_is_validated_once_before_the_search(command, tmp_path, monkey
     assert not (tmp_path / "out").exists()
     refused, built[:] = None, []
     assert command(*asked)[0] == 130
-    assert built == ["prescribed_time", "pd", "own"]
+    assert built == ["prescribed_time", "pd", "custom"]

@@ -102,9 +102,9 @@ def test_axes_have_the_units_of_their_keys():
         assert mapping._label(loaded, key) == f"{key} {unit}"
     assert mapping._label(loaded, "controller.eta") == "controller.eta"
     assert mapping._label(scenario.from_tables({}), "hardware.delay") == "hardware.delay"  # no table [hardware]
-    own = scenario.read(ROOT / "scenarios" / "own_parts.toml")
-    assert mapping._label(own, "controller.t_f") == "controller.t_f [s]"
-    assert mapping._label(own, "controller.k1") == "controller.k1"  # a custom class states no unit
+    custom = scenario.read(ROOT / "scenarios" / "own_parts.toml")
+    assert mapping._label(custom, "controller.t_f") == "controller.t_f [s]"
+    assert mapping._label(custom, "controller.k1") == "controller.k1"  # a custom class states no unit
 
 
 @pytest.mark.parametrize(

@@ -132,12 +132,12 @@ def test_pareto_command_computes_a_torque_front(command, tmp_path, monkeypatch, 
     peaks = [float(row["peak_torque"]) for row in rows]
     assert peaks == sorted(peaks)
     # the scenario's torque limit is a target, and its gains are at least as accurate as all known feasible gains
-    (own,) = [float(row["trained_goal"]) for row in rows if float(row["limit"]) == limit]
+    (trained,) = [float(row["trained_goal"]) for row in rows if float(row["limit"]) == limit]
     ((problems, known, evaluate),) = begun
     flown = evaluate.fly(problems[limit].tightened(1.0 - pareto.MARGIN), known)
     assert len(known) > len(searched)  # including other local minima of the searches
     assert searched.count(limit) == 1
-    assert own <= np.exp(flown.value[flown.beyond <= descent.SLACK].min()) * (1.0 + 1e-9)
+    assert trained <= np.exp(flown.value[flown.beyond <= descent.SLACK].min()) * (1.0 + 1e-9)
     for row in rows:
         assert float(row["rms_low"]) <= float(row["rms_window_error"]) <= float(row["rms_high"])
         # simulate the gains of the row again
@@ -191,15 +191,15 @@ def test_torque_front_does_not_need_a_torque_limit():
         trades.Torque(scenario.replace(quantile, tune={"torque_weight": 1.0})).check()
 
 
-@pytest.mark.parametrize("own", [None, 0.5, 1.001, 1.4, 1.5, 3.0, 5.0, 6.0, 15.9, 16.0])
-def test_own_torque_limit_replaces_the_nearest_default_limit(own):
+@pytest.mark.parametrize("limit", [None, 0.5, 1.001, 1.4, 1.5, 3.0, 5.0, 6.0, 15.9, 16.0])
+def test_own_torque_limit_replaces_the_nearest_default_limit(limit):
     """The nearest limit is in logarithms. The ends stay, because searches have found feasible gains for them."""
     usual = np.array([1.0, 2.0, 4.0, 8.0, 16.0])
-    ladder, middle = trades.limits_between(1.0, 16.0, 5, own)
+    ladder, middle = trades.limits_between(1.0, 16.0, 5, limit)
     rungs = {1.001: 1, 1.4: 1, 1.5: 1, 3.0: 2, 5.0: 2, 6.0: 3, 15.9: 3}  # above 2 sqrt(2), 4 is nearer than 2
-    assert middle == rungs.get(own, 2)
+    assert middle == rungs.get(limit, 2)
     np.testing.assert_allclose(np.delete(ladder, middle), np.delete(usual, middle), rtol=1e-14)
-    assert ladder[middle] == (own if own in rungs else pytest.approx(4.0, rel=1e-14))
+    assert ladder[middle] == (limit if limit in rungs else pytest.approx(4.0, rel=1e-14))
 
 
 def test_refinement_reports_its_target(monkeypatch):

@@ -132,14 +132,14 @@ def test_faster_slew_needs_more_torque_and_is_less_accurate(command, tmp_path, m
     assert fast["peak_rate"] / slow["peak_rate"] == pytest.approx(2.0, rel=0.3)
     assert 2.5 < fast["peak_torque"] / slow["peak_torque"] < 6.5
     # at each time, its own gains are more accurate than the gains of the other time, on the same trials
-    for own, other in ((fast, slow), (slow, fast)):
+    for found_here, other in ((fast, slow), (slow, fast)):
         untuned = scenario.replace(scenario.read(tmp_path / "c.toml"), tune=None)
         errors = []
-        for found in (own, other):  # the fixed gains are those of t_f = 5 s
-            known = gains.in_scenario(untuned, {"t_f": own["t_f"], "eta": found["eta"], "delta": found["delta"]})
+        for found in (found_here, other):  # the fixed gains are those of t_f = 5 s
+            known = gains.in_scenario(untuned, {"t_f": found_here["t_f"], "eta": found["eta"], "delta": found["delta"]})
             trials = judging.judge(known, judging.seed_of_judge(0))
             errors.append(np.sqrt(np.mean(trials.metrics.window_error[:60] ** 2)))
-        np.testing.assert_allclose(own["rms_window_error"], errors[0], rtol=1e-9)
+        np.testing.assert_allclose(found_here["rms_window_error"], errors[0], rtol=1e-9)
         assert errors[0] < errors[1]
     told = json.loads((tmp_path / "cost" / "summary.json").read_text())
     assert [slew["value"] for slew in told["points"]] == [2.5, 5.0]
@@ -160,10 +160,10 @@ def test_every_prescribed_time_has_its_own_search(monkeypatch):
     small_search(monkeypatch, 8)
     searched, flown, joined, search = [], [], [], posing.Posed.search
 
-    def note(posed, problem, own, starts, *asked, **told):
+    def note(posed, problem, scenario_gains, starts, *asked, **told):
         searched.append((float(problem.parts.controller.t_f), starts > 1))
         flown.append(np.asarray(problem.trials).tolist())
-        outcome = search(posed, problem, own, starts, *asked, **told)
+        outcome = search(posed, problem, scenario_gains, starts, *asked, **told)
         joined.append(np.asarray(outcome.problem.trials).tolist())
         return outcome
 

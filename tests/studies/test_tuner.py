@@ -277,9 +277,9 @@ def test_violations_that_a_repeated_search_cannot_fix_are_ignored(metric, values
 
 def test_default_gain_equals_its_explicit_value():
     """The scenario omits the bandwidth of the filter. Its default equals the published gain."""
-    own = scenario.read(ROOT / "scenarios" / "filtered_flight.toml")
-    assert list(judging.beside(own)[0]) == ["paper"]
-    other = scenario.replace(own, controller__eta=4.0)
+    loaded = scenario.read(ROOT / "scenarios" / "filtered_flight.toml")
+    assert list(judging.beside(loaded)[0]) == ["paper"]
+    other = scenario.replace(loaded, controller__eta=4.0)
     assert list(judging.beside(other)[0]) == ["paper", "before"]
 
 
@@ -305,10 +305,10 @@ def test_requirements_broken_by_more_accurate_gains_are_listed(monkeypatch):
 
 
 def test_judging_changes_only_the_clock():
-    own = scenario.read(FIRST_FLIGHT)
-    flown = judging.as_flown(own)
+    loaded = scenario.read(FIRST_FLIGHT)
+    flown = judging.as_flown(loaded)
     assert flown.loop.clock == "flight"
-    assert flown.controller == own.controller
+    assert flown.controller == loaded.controller
     assert judging.as_flown(scenario.from_tables({})) == scenario.from_tables({})
 
 

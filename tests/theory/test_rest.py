@@ -107,7 +107,7 @@ def test_a_moving_reference_or_quantisation_is_not_a_limit_cycle(kind):
     assert rest.swing(scenario.study(scenario.from_tables(tables)).parts) is None
 
 
-OWN = """
+CUSTOM = """
 import jax.numpy as jnp
 import ptsmc_jax as ptsmc
 
@@ -135,10 +135,10 @@ def test_limit_cycle_of_a_law_without_sign_width_is_detected(monkeypatch):
 
 @pytest.mark.long  # short tests: above, and a chain in studies/test_stability.py
 def test_a_custom_law_with_a_limit_cycle_has_zero_margins(command, tmp_path):
-    (tmp_path / "relay.py").write_text(OWN)
+    (tmp_path / "relay.py").write_text(CUSTOM)
     (tmp_path / "relay.toml").write_text(
         'plant = { kind = "chain", order = 2 }\nobserver = { kind = "none" }\n'
-        'controller = { kind = "own", code = "relay.py:Relay", t_f = 8.0, delta = 0.5, disturbance_bound = 0.02 }\n'
+        'controller = { kind = "custom", code = "relay.py:Relay", t_f = 8.0, delta = 0.5, disturbance_bound = 0.02 }\n'
         'loop = { mode = "sampled", period = 0.05, t_end = 12.0 }\nrequirements = { gain_margin = 6.0 }\n'
     )
     status, said, _ = command("margins", "relay.toml", "--no-figures")

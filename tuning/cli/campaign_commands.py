@@ -306,7 +306,7 @@ def replay(
     """
     _configured(folder)
     from ptsmc_jax.campaigns import store
-    from tuning.search import own_parts
+    from tuning.search import custom_parts
     from tuning.studies import campaign_folder, campaign_summary, single
 
     opened = campaign_folder.opened(folder)
@@ -314,14 +314,14 @@ def replay(
         raise UsageError(f"--trial is {trial}, but must be a whole number from 0 to {opened.trials - 1}")
     place = out if out is not None else folder / "replay" / str(trial)
     store.check(place, force or out is None)  # a replay overwrites an earlier one
-    own_parts.allow(opened.programs, folder, opened.identity, trust)
+    custom_parts.allow(opened.programs, folder, opened.identity, trust)
     opened = replace(opened, trusted=True)
     with store.in_use(place, force=force or out is None):
         again = campaign_summary.replay(opened, trial)
         about = opened.scenario, again.run, opened.seed, trial, figures, opened.computer
         # simulate has no rows of run tables and no numbers of 32 bits
         from_here = opened.plan is not None or opened.bits != 64
-        replayed = {"campaign": str(folder.absolute()), "metrics": opened.own} if from_here else {}
+        replayed = {"campaign": str(folder.absolute()), "metrics": opened.custom_metrics} if from_here else {}
         store.write(place, lambda making: single.write(making, *about, replayed))
     if not quiet:
         from tuning.output import run_report, summaries

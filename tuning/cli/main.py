@@ -388,7 +388,7 @@ def _in_custom_code(error: BaseException) -> str:
     file = None if systems is None else systems.at_fault(error)
     if file is None:
         raise error
-    from ptsmc_jax.scenario.own_checks import what_fails
+    from ptsmc_jax.scenario.custom_checks import what_fails
 
     return f"{file} {what_fails(error, file)}"
 

@@ -9,8 +9,8 @@ import msgspec
 from ptsmc_jax import scenario
 from ptsmc_jax.scenario import errors, free_gains, keys, layouts, mission, parsing, reading
 from ptsmc_jax.scenario.attitude_keys import Attitude
+from ptsmc_jax.scenario.custom import Custom
 from ptsmc_jax.scenario.law_tables import LawTable
-from ptsmc_jax.scenario.own import Own
 from ptsmc_jax.scenario.schema import PartTable
 from ptsmc_jax.scenario.tables import Scenario, Tune
 from ptsmc_jax.scenario.values import Table
@@ -99,7 +99,7 @@ class _File:
         yield f"{'#' if live is None else ''}[{name}]"
         yield from self.kind(name, kind, struct, live, values)
         declared = struct.__struct_fields__
-        if issubclass(struct, Own):
+        if issubclass(struct, Custom):
             for key in (key for key in live or () if key not in ("kind", *declared)):
                 yield from _line(False, key, values[key], "custom")
         if issubclass(struct, Attitude) and name != "initial":
@@ -179,7 +179,7 @@ class _File:
 
     def defaults(self, name: str, struct: type[Table]) -> dict[str, Any]:
         """Return the defaults of the keys of a table; keys without a default are missing."""
-        needed = {"code": EXAMPLES[f"{name}.code"]} if issubclass(struct, Own) else {}
+        needed = {"code": EXAMPLES[f"{name}.code"]} if issubclass(struct, Custom) else {}
         needed |= {"t_f": self.resolved.controller.t_f} if issubclass(struct, LawTable) else {}
         table: Any = struct(**needed)
         table = table.filled(self.resolved) if isinstance(table, PartTable) else table

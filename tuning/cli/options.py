@@ -170,9 +170,9 @@ def prepare(
         raise UsageError(f"--device is {device}, but {error}") from None
     if scenario is not None:
         from ptsmc_jax.scenario import parsing
-        from tuning.search import own_parts
+        from tuning.search import custom_parts
 
         if not any(parsing.stated(loaded).values()):
             print(f"ptsmc: {scenario} is empty; the paper's Case I is simulated", file=sys.stderr)
-        own_parts.allow_scenario(scenario, loaded, trust)
+        custom_parts.allow_scenario(scenario, loaded, trust)
     return reading.complete(loaded), folder

@@ -38,9 +38,9 @@ class LongSearch:
 def say_seen(scenario: Path, seed: int) -> None:
     """Print a warning if a search found the gains of a scenario with the trials of this seed."""
     from ptsmc_jax.campaigns import store
-    from tuning.search import own_parts
+    from tuning.search import custom_parts
 
-    folder = own_parts.results_of(scenario)
+    folder = custom_parts.results_of(scenario)
     made = {} if folder is None else store.read_versions(folder)
     if made.get("command") in COMMANDS and made.get("seed") == seed:
         print(

@@ -125,7 +125,7 @@ def gains(scenario: dict[str, Any], plant: str) -> Table:
     rows: list[tuple[str, ...]] = []
     for table in ("controller", "observer", "filter", "sensors"):
         given = scenario.get(table, {})
-        custom = given.get("kind") == "own"  # its class, which reading does not run, has the units
+        custom = given.get("kind") == "custom"  # its class, which reading does not run, has the units
         kinds: Any = SCENARIOS[plant].TABLES.get(table, {})
         struct = kinds.get(given.get("kind"))
         units = {key.name: key.unit for key in keys.of(struct, SCENARIOS[plant].unit_of_d)} if struct else {}

@@ -210,12 +210,13 @@ def search(rows: Sequence[Mapping[str, str]], goal: str) -> Chart:
     over = [name for name in rows[0] if name.endswith("_over_limit")]
     gains = [name for name in rows[0] if name not in ("step", "start", goal, *over)]
     data = []
-    for k, (start, own) in enumerate(starts.items()):
-        met = [all(float(row[name] or "nan") <= 1.0 for name in over) for row in own]
+    for k, (start, steps) in enumerate(starts.items()):
+        met = [all(float(row[name] or "nan") <= 1.0 for name in over) for row in steps]
         data.append({
             "type": "scatter", "mode": "lines+markers", "name": f"start {start}",
-            "x": [int(row["step"]) for row in own], "y": numbers(np.array([float(row[goal] or "nan") for row in own])),
-            "text": [", ".join(f"{name} {float(row[name]):.4g}" for name in gains) for row in own],
+            "x": [int(row["step"]) for row in steps],
+            "y": numbers(np.array([float(row[goal] or "nan") for row in steps])),
+            "text": [", ".join(f"{name} {float(row[name]):.4g}" for name in gains) for row in steps],
             "hovertemplate": "step %{x}: %{y:.3e}<br>%{text}<extra></extra>",
             "marker": {"size": 6, "symbol": ["circle" if one else "circle-open" for one in met]},
             "line": {"width": 1, "color": COLOURS[k % len(COLOURS)]},

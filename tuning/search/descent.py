@@ -185,7 +185,7 @@ class _Local:
         self._steps, self._keep, self._close = steps, keep, close
         self._seen, self._scale = start.seen, start.scale
         scaled = self._scale * start.share
-        self._bounds = [(own, own) if k in start.fixed else (0.0, self._scale) for k, own in enumerate(scaled)]
+        self._bounds = [(value, value) if k in start.fixed else (0.0, self._scale) for k, value in enumerate(scaled)]
 
     def at(self, scaled: np.ndarray) -> Sloped:
         """Return the measurement at a point. A point is measured once."""

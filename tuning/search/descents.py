@@ -123,7 +123,7 @@ class Descents:
         """
         self._evaluate, self._steps, self._rng, self._report = evaluate, steps, rng, report
         self._margin = np.asarray(margin)  # relative tightening of each limit, (rows,) or one number
-        self._own: np.ndarray | None = None  # (gains,) gains of the scenario
+        self._scenario_gains: np.ndarray | None = None  # (gains,) gains of the scenario
         self.globally = False  # `search_globally` was called
         self._designs = np.zeros((0, 0))  # (designs, gains) normalised gains of the designs
         self._best: Best | None = None
@@ -174,18 +174,23 @@ class Descents:
         """The history of accepted points, ordered by local search and step."""
         return [step for _, steps in sorted(self._history.items()) for step in steps]
 
-    def set_out(self, problem: Problem, own: np.ndarray, designs: np.ndarray) -> None:
+    def set_out(self, problem: Problem, scenario_gains: np.ndarray, designs: np.ndarray) -> None:
         """Search locally on few trials, from the scenario's gains or from the best design if that is better.
 
         Args:
             problem: the tuning problem.
-            own: (gains,) gains of the scenario.
+            scenario_gains: (gains,) gains of the scenario.
             designs: (designs, gains) gains of designs that follow from the mission.
         """
         few = _few_trials(problem)
-        self._own, self._designs = own, np.asarray([self._evaluate.bounds.share(one) for one in designs])
+        self._scenario_gains, self._designs = (
+            scenario_gains,
+            np.asarray([self._evaluate.bounds.share(one) for one in designs]),
+        )
         self._report(SETTING_OUT, 0, 2, *self.so_far)
-        points = np.concatenate([self._evaluate.bounds.share(own)[None], self._designs.reshape(-1, own.size)])
+        points = np.concatenate(
+            [self._evaluate.bounds.share(scenario_gains)[None], self._designs.reshape(-1, scenario_gains.size)]
+        )
         first = points[0]
         if len(points) > 1:
             (first,) = promising(self._evaluate, self.tightened(few), points, 1, lambda *_: None)
@@ -333,15 +338,17 @@ class Descents:
             if found[0].rank <= self.best.rank:
                 self._best, self._problem, self._from, self._ends = found
 
-    def sweep(self, problem: Problem, own: np.ndarray) -> None:
+    def sweep(self, problem: Problem, scenario_gains: np.ndarray) -> None:
         """Measure Sobol points and the scenario's gains, and take the best of them. No gradients are used.
 
         Args:
             problem: the tuning problem.
-            own: (gains,) gains of the scenario.
+            scenario_gains: (gains,) gains of the scenario.
         """
         tightened = self.tightened(problem)
-        share = np.concatenate([self._evaluate.bounds.share(own)[None], spread(len(problem.names), MANY, self._rng)])
+        share = np.concatenate(
+            [self._evaluate.bounds.share(scenario_gains)[None], spread(len(problem.names), MANY, self._rng)]
+        )
         share = promising(self._evaluate, tightened, share, 1, partial(self._report, CHOOSING))
         best, flown = self._best_of(tightened, share)
         self._keep(0, flown)  # if the search is interrupted now, the history has this point
@@ -398,7 +405,7 @@ class Descents:
                 keep,
                 relaxed=Relaxed(rows=[int(row)], to_the_end=True),
             )
-            kept = [own for rest, own in seen if rest <= 1.0 + 10.0 * SLACK]
+            kept = [share_of_start for rest, share_of_start in seen if rest <= 1.0 + 10.0 * SLACK]
             margin = float(np.broadcast_to(self._margin, worst.size)[row])
             found[problem.rows[row]] = (1.0 - margin) * min(kept) if kept else None
         return found
@@ -412,24 +419,26 @@ class Descents:
         self._hand_over_on_a_sample(problem)
         times = [k for k, name in enumerate(problem.names) if name in TIMES]
         others = [k for k in range(len(problem.names)) if k not in times]
-        if self._own is not None and others:
-            self._take_back(problem, self._own, others)
+        if self._scenario_gains is not None and others:
+            self._take_back(problem, self._scenario_gains, others)
 
-    def _take_back(self, problem: Problem, own: np.ndarray, indices: Sequence[int]) -> None:
+    def _take_back(self, problem: Problem, scenario_gains: np.ndarray, indices: Sequence[int]) -> None:
         """Reset as many gains as possible to the scenario's values.
 
         F may grow by `SAME`, and the violation may not grow.
 
         Args:
             problem: the tuning problem.
-            own: (gains,) gains of the scenario.
+            scenario_gains: (gains,) gains of the scenario.
             indices: indices of the gains that may be reset.
         """
         tightened, current = self.tightened(problem), self.best
 
         def judged(changes: Sequence[Sequence[int]]) -> list[Best]:
-            back = [np.isin(np.arange(own.size), change) for change in changes]
-            share = np.clip([self._evaluate.bounds.replaced(current.share, own, which) for which in back], 0.0, 1.0)
+            back = [np.isin(np.arange(scenario_gains.size), change) for change in changes]
+            share = np.clip(
+                [self._evaluate.bounds.replaced(current.share, scenario_gains, which) for which in back], 0.0, 1.0
+            )
             flown = self._evaluate.slopes(tightened, share)  # this program is already compiled
             bests = [Best(one, len(problem.rows), self._margin) for one in share]
             for k, best in enumerate(bests):

@@ -58,9 +58,9 @@ def shortest_time(flown: Scenario, asked: Requirement, seed: int, trials: np.nda
     def predicted(t_f: float) -> float:
         return float(np.sort(_predicted(ready.parts, *drawn, t_f))[deciding])
 
-    own = float(ready.parts.controller.t_f)
+    present_t_f = float(ready.parts.controller.t_f)
     lowest = 1.05 * max(float(ready.parts.controller.delta), float(getattr(ready.parts.observer, "t_o", 0.0)))
-    rule = _smallest(predicted, limit, own, lowest, FARTHEST * own, CLOSE, 60)
+    rule = _smallest(predicted, limit, present_t_f, lowest, FARTHEST * present_t_f, CLOSE, 60)
     if rule is None:
         return ShortestTime(limit, None, None, *told)
 
@@ -74,9 +74,9 @@ def shortest_time(flown: Scenario, asked: Requirement, seed: int, trials: np.nda
         return _smallest(simulated, limit, rule, max(lowest, 0.2 * rule), longest, CLOSE, LONGEST)
 
     # first on the clock of the scenario, whose program is compiled anyway, and on a longer clock only if t_f is longer
-    shortest = simulated_in(ready, own) if rule <= own else None
+    shortest = simulated_in(ready, present_t_f) if rule <= present_t_f else None
     if shortest is None:
-        longest = max(1.5 * rule, own)
+        longest = max(1.5 * rule, present_t_f)
         with contextlib.suppress(ScenarioError):  # for example a reference that reaches the law's singularity later
             roomy = scenario.study(in_scenario(flown, {"t_f": longest}))
             shortest = simulated_in(roomy, longest)

@@ -17,7 +17,7 @@ from ptsmc_jax.scenario.tuned import in_scenario as in_scenario
 from ptsmc_jax.simulation.gains import AXIS
 from ptsmc_jax.simulation.gains import base as base
 from ptsmc_jax.simulation.gains import gains_of as gains_of
-from ptsmc_jax.simulation.gains import own as own
+from ptsmc_jax.simulation.gains import present_values as present_values
 from ptsmc_jax.simulation.gains import with_gains as with_gains
 from ptsmc_jax.simulation.rollout import Parts
 
@@ -85,7 +85,7 @@ def of_designs(scenario: Scenario, parts: Parts, names: tuple[str, ...]) -> list
     """
     if not scenario.sampled:
         return []
-    found, current = [], dict(zip(names, own(parts, names), strict=True))
+    found, current = [], dict(zip(names, present_values(parts, names), strict=True))
     for design in mission.designs(scenario):
         gains = scenario.controller.gains_of(design, scenario)
         if getattr(parts.observer, "linear", False):
@@ -96,12 +96,12 @@ def of_designs(scenario: Scenario, parts: Parts, names: tuple[str, ...]) -> list
 
 def papers(scenario: Scenario) -> Scenario:
     """Return the scenario with the published law and the published gains for its plant."""
-    table, own = scenario.controller, of_paper(scenario)
+    table, published = scenario.controller, of_paper(scenario)
     if not table.law.prescribed:
         error = {"error": "multiplicative"} if scenario.motion == "spacecraft" else {}
-        law = {"kind": "prescribed_time", **error, **common_keys(table), "delta": own["delta"]}
+        law = {"kind": "prescribed_time", **error, **common_keys(table), "delta": published["delta"]}
         scenario = scenarios.replace(scenario, tune=None, controller=law)
-    return in_scenario(scenario, own)
+    return in_scenario(scenario, published)
 
 
 def paper_is(scenario: Scenario) -> str:

@@ -46,9 +46,9 @@ def _of(problem: Problem, bounds: Bounds, share: np.ndarray) -> _HandOver | None
     law, at = problem.parts.controller, {name: k for k, name in enumerate(problem.names) if name in TIMES}
     if not at or not clock.anchored or "delta" not in law.tunable:  # a law without delta has no hand-over
         return None
-    own = bounds.gains(share)
-    t_f, delta = (float(own[at[name]] if name in at else getattr(law, name)) for name in ("t_f", "delta"))
-    return _HandOver(share, bounds, own, at, t_f, delta, float(clock.period))
+    values = bounds.gains(share)
+    t_f, delta = (float(values[at[name]] if name in at else getattr(law, name)) for name in ("t_f", "delta"))
+    return _HandOver(share, bounds, values, at, t_f, delta, float(clock.period))
 
 
 def on_samples(problem: Problem, bounds: Bounds, share: np.ndarray) -> list[np.ndarray]:

@@ -77,7 +77,7 @@ def ask(ready: Study, bounds: Bounds, seed: int) -> Asked | None:
     )
     some = _of_trials(asked, np.arange(CASES)) if margin_verdicts.differ(asked.dispersion) else asked
     sloped.prepare(some, bounds.scale, np.zeros((len(configure.processors()), len(bounds.names))))
-    return hardest(asked, np.asarray(gain_names.own(ready.parts, bounds.names)))[0]
+    return hardest(asked, np.asarray(gain_names.present_values(ready.parts, bounds.names)))[0]
 
 
 def _of_trials(asked: Asked, trials: np.ndarray) -> Asked:

@@ -70,7 +70,7 @@ def search(
     evaluate: Evaluator,
     problem: Problem,
     requirements: Sequence[Requirement],
-    own: np.ndarray,
+    scenario_gains: np.ndarray,
     settings: Settings,
     *,
     report: Report = lambda *_: None,
@@ -85,7 +85,7 @@ def search(
         evaluate: measures the problem.
         problem: the tuning problem over the training trials, see `objective.judge` for F.
         requirements: the requirements of its limits.
-        own: (gains,) gains of the scenario, the first starting point.
+        scenario_gains: (gains,) gains of the scenario, the first starting point.
         settings: options of the search.
         report: is called after every step.
         prepare: is called as soon as the programs of the search are being compiled, to compile later programs too.
@@ -108,9 +108,9 @@ def search(
         if sloped:
             flights.prepare(rounds.problem.fleet)
             prepare()
-            _by_slopes(rounds, descents, own, settings, tell)
+            _by_slopes(rounds, descents, scenario_gains, settings, tell)
         else:
-            _by_evolution(rounds, descents, own, tell)
+            _by_evolution(rounds, descents, scenario_gains, tell)
         if settings.judged:
             rounds.judge(descents.gains, tell)
             if sloped and descents.best.over > 0.0 and not descents.best.failed:
@@ -143,9 +143,9 @@ def search(
     )
 
 
-def _by_slopes(rounds: Rounds, descents: Descents, own: np.ndarray, settings: Settings, tell: Tell) -> None:
+def _by_slopes(rounds: Rounds, descents: Descents, scenario_gains: np.ndarray, settings: Settings, tell: Tell) -> None:
     starts, seed = settings.starts, settings.seed
-    descents.set_out(rounds.problem, own, settings.designs)
+    descents.set_out(rounds.problem, scenario_gains, settings.designs)
     rounds.begin(descents.gains)
     shares = descents.explore(rounds.problem, starts, seed) if starts > 1 else {0: descents.share}
     descents.descend(rounds.problem, shares)
@@ -156,8 +156,8 @@ def _by_slopes(rounds: Rounds, descents: Descents, own: np.ndarray, settings: Se
         _go_on(rounds, descents, descents.again, tell)
 
 
-def _by_evolution(rounds: Rounds, descents: Descents, own: np.ndarray, tell: Tell) -> None:
-    descents.sweep(rounds.problem, own)
+def _by_evolution(rounds: Rounds, descents: Descents, scenario_gains: np.ndarray, tell: Tell) -> None:
+    descents.sweep(rounds.problem, scenario_gains)
     rounds.begin(descents.gains)
     descents.evolve(rounds.problem, descents.share)
     _go_on(rounds, descents, lambda problem: descents.evolve(problem, descents.share, NEARBY), tell)

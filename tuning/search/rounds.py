@@ -201,13 +201,13 @@ def _placed(
     If coordinates are given, they replace the dispersions of a single trial.
     """
     if coordinates is None:
-        own = coordinates_of(problem.dispersion, int(problem.seed), trials)
+        added = coordinates_of(problem.dispersion, int(problem.seed), trials)
     else:
-        own = {name: np.asarray(v)[None] for name, v in coordinates.items()}
+        added = {name: np.asarray(v)[None] for name, v in coordinates.items()}
     return replace(
         problem,
         trials=replaced(problem.trials, at, trials),
-        coordinates={name: replaced(v, at, own[name]) for name, v in problem.coordinates.items()},
+        coordinates={name: replaced(v, at, added[name]) for name, v in problem.coordinates.items()},
     )
 
 

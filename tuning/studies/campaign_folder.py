@@ -27,18 +27,18 @@ from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.dispersions import quantities
 from ptsmc_jax.onboard import sources
 from ptsmc_jax.onboard.library import InTheLoop, Library
-from ptsmc_jax.scenario import Study, own, parsing, systems
+from ptsmc_jax.scenario import Study, custom, parsing, systems
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.computer import OURS, Software
-from tuning.search import own_parts
+from tuning.search import custom_parts
 
 C = "controller"  # subfolder with the C code of the controller, if C code controls the simulated spacecraft
 FLOOR = "floor.json"  # lower bound and margins, see `campaign_theory`
 TABLE = "plan.parquet"  # the run table; `--dry-run` writes a folder instead
 PLAN = "plan_sha256"  # key of the checksum of the run table in `versions.json`
-OWN = f"{systems.WHERE}, a function of a run's Result and its Parts that returns named numbers"
+CUSTOM = f"{systems.WHERE}, a function of a run's Result and its Parts that returns named numbers"
 
 
 class Made(msgspec.Struct, frozen=True):
@@ -63,7 +63,7 @@ class Folder:
     scenario: Scenario
     seed: int
     trials: int  # number of trials of the complete campaign
-    own: str | None = None  # FILE.py:NAME of the function that computes custom metrics
+    custom_metrics: str | None = None  # FILE.py:NAME of the function that computes custom metrics
     bits: int = 64  # floating-point precision
     made: Made | None = None  # content of the existing folder; None: the folder does not exist yet
     digests: Mapping[str, str] = field(default_factory=dict)  # checksums of custom code in the existing folder
@@ -76,7 +76,7 @@ class Folder:
     @cached_property
     def programs(self) -> dict[str, str]:
         """The locations of all custom code that the campaign executes, by scenario key or option."""
-        return own_parts.named(self.scenario, self.own, self.controller)
+        return custom_parts.named(self.scenario, self.custom_metrics, self.controller)
 
     @cached_property
     def identity(self) -> dict[str, Any]:
@@ -86,18 +86,18 @@ class Folder:
         """
         digests = {}
         for key, where in self.programs.items():
-            name = own.digest_name(key)
-            digests[name] = self.digests.get(name) if self.made else own_parts.digest(key, where)
+            name = custom.digest_name(key)
+            digests[name] = self.digests.get(name) if self.made else custom_parts.digest(key, where)
         if self.table is not None:
             digests[PLAN] = self.digests.get(PLAN) if self.made else self.planned.digest
-        metrics = {} if self.own is None else {"metrics": self.own}
+        metrics = {} if self.custom_metrics is None else {"metrics": self.custom_metrics}
         known = {name: digest for name, digest in digests.items() if digest is not None}
         return {"command": "montecarlo", "seed": self.seed, "precision": self.bits, **metrics, **known}
 
     @property
     def versions(self) -> dict[str, Any]:
         """The content of `versions.json`."""
-        names = None if self.own is None else self.own_names
+        names = None if self.custom_metrics is None else self.custom_metric_names
         counts = {"trials": self.trials, "first_look": self.first_look}
         entries = {**self.identity, **counts, "metrics_names": names, "plan": self.plan}
         if self.controller is not None:
@@ -105,12 +105,12 @@ class Folder:
         return store.versions(**{name: value for name, value in entries.items() if value is not None})
 
     @cached_property
-    def own_names(self) -> list[str]:
+    def custom_metric_names(self) -> list[str]:
         """The names of the custom metrics."""
-        if self.own is None:
+        if self.custom_metrics is None:
             return []
         if self.made is None:
-            return self._own.own_names()
+            return self._with_custom_metrics.custom_metric_names()
         if self.made.metrics_names is None:
             raise RefusedError(
                 f"{self.path} was begun by an earlier version; the same `ptsmc montecarlo` again mends it"
@@ -140,7 +140,7 @@ class Folder:
     @cached_property
     def ready(self) -> Study | None:
         """The scenario, ready to simulate without custom metrics; None if that would execute untrusted custom code."""
-        named = set(self.programs) - {own_parts.METRICS, own_parts.CONTROLLER}
+        named = set(self.programs) - {custom_parts.METRICS, custom_parts.CONTROLLER}
         if named and not self.trusted:
             return None
         for key in named:
@@ -158,7 +158,7 @@ class Folder:
         if not self.flies:
             raise self._untrusted
         assert self.ready is not None
-        self._check_unchanged(own_parts.CONTROLLER)
+        self._check_unchanged(custom_parts.CONTROLLER)
         return InTheLoop(Library(self.controller), self.ready.parts, self.ready.dispersion)
 
     @property
@@ -180,7 +180,7 @@ class Folder:
 
     @property
     def _untrusted(self) -> RefusedError:
-        return RefusedError(f"{self.path} names code of its own, which is run with --trust only")
+        return RefusedError(f"{self.path} names custom code, which is run with --trust only")
 
     @cached_property
     def planned(self) -> Plan:
@@ -188,8 +188,8 @@ class Folder:
         assert self.table is not None
         assert self.ready is not None
         where = f"the plan {self.plan}"
-        drawn = self.ready.dispersion.own_names()
-        plan = plans.checked(self.table, self.ready.parts, where, self.own_names, drawn)
+        drawn = self.ready.dispersion.custom_names()
+        plan = plans.checked(self.table, self.ready.parts, where, self.custom_metric_names, drawn)
         if self.made is not None and plan.digest != self.digests.get(PLAN):
             raise RefusedError(f"{self.path / TABLE} is not the plan that the campaign was begun with")
         return plan
@@ -210,31 +210,33 @@ class Folder:
 
         Raises ScenarioError if the custom metrics are invalid, and RefusedError if the campaign needs untrusted code.
         """
-        own = self._own.own  # before `flights`, so that errors of the metrics are raised first
-        return replace(self.flights, own=own)
+        custom_metrics = (
+            self._with_custom_metrics.custom_metrics
+        )  # before `flights`, so that errors of the metrics are raised first
+        return replace(self.flights, custom_metrics=custom_metrics)
 
     @cached_property
-    def _own(self) -> Campaign:
+    def _with_custom_metrics(self) -> Campaign:
         """The campaign with custom metrics, but without the run table."""
-        if self.ready is None or (self.own is not None and not self.trusted):
+        if self.ready is None or (self.custom_metrics is not None and not self.trusted):
             raise self._untrusted
-        if self.own is None:
+        if self.custom_metrics is None:
             return Campaign(self.ready, self.seed)
-        self._check_unchanged(own_parts.METRICS)
+        self._check_unchanged(custom_parts.METRICS)
         software = self.software
         try:
-            metrics: Any = systems.item(self.own, OWN)
+            metrics: Any = systems.item(self.custom_metrics, CUSTOM)
             if not isinstance(metrics, Callable):
-                raise ValueError(f"it is a {type(metrics).__name__}; allowed is {OWN}")
+                raise ValueError(f"it is a {type(metrics).__name__}; allowed is {CUSTOM}")
             campaign = Campaign(self.ready, self.seed, metrics, software=software)
-            campaign.own_names()
+            campaign.custom_metric_names()
             return campaign
         except ValueError as error:
-            raise ScenarioError(f"--metrics is {self.own}: {error}") from None
+            raise ScenarioError(f"--metrics is {self.custom_metrics}: {error}") from None
 
     def _check_unchanged(self, key: str) -> None:
         if self.made is not None:
-            own_parts.check_unchanged({key: self.programs[key]}, self.path, self.identity)
+            custom_parts.check_unchanged({key: self.programs[key]}, self.path, self.identity)
 
     def recipe(self) -> tuple[Callable, tuple[str, str]]:
         """Return a function and its arguments: another process calls it to rebuild the campaign and its rows."""
@@ -260,7 +262,7 @@ def begin(wanted: Folder, force: bool) -> None:
     """
     tables, path = parsing.dump(wanted.scenario), wanted.path
     made = store.read_versions(path)  # files that no campaign wrote belong to the user
-    kept = sources.listed(path / C) if own.digest_name(own_parts.CONTROLLER) in made else []
+    kept = sources.listed(path / C) if custom.digest_name(custom_parts.CONTROLLER) in made else []
     if wanted.controller is not None and kept != sources.listed(path / C):
         raise RefusedError(f"--out is {path}, whose {C} holds C that no campaign left there; allowed is another folder")
     if force and path.is_dir():
@@ -303,12 +305,12 @@ def _begun(wanted: Folder, tables: Mapping[str, Any]) -> bool:
             f"--trials is {wanted.trials}, but must be at least {before.trials}, which {path} was begun with"
         )
     same = before.trials == wanted.trials and before.made == _made(wanted) and before.identity == wanted.identity
-    return same and (before.controller is None or _as_known(before, own_parts.CONTROLLER))
+    return same and (before.controller is None or _as_known(before, custom_parts.CONTROLLER))
 
 
 def _as_known(folder: Folder, key: str) -> bool:
     """Return whether the folder's copy of a program exists and still has its original checksum."""
-    return own_parts.digest(key, folder.programs[key]) == folder.digests.get(own.digest_name(key))
+    return custom_parts.digest(key, folder.programs[key]) == folder.digests.get(custom.digest_name(key))
 
 
 def opened(path: Path) -> Folder:
@@ -321,7 +323,7 @@ def opened(path: Path) -> Folder:
             )
         made = msgspec.convert(versions, Made, strict=True)
         if made.metrics is not None:
-            systems.named(made.metrics, OWN)
+            systems.named(made.metrics, CUSTOM)
         flown = scenario.read(path / "scenario.toml")
     except ScenarioError as error:
         raise RefusedError(f"{path} holds a campaign of no scenario that can be read: {error}") from None
@@ -335,14 +337,14 @@ def opened(path: Path) -> Folder:
         scenario=flown,
         seed=made.seed,
         trials=made.trials,
-        own=made.metrics,
+        custom_metrics=made.metrics,
         bits=made.precision,
         made=made,
         digests=digests,
         trusted=False,
         plan=made.plan,
         table=None if made.plan is None else plans.read(path / TABLE),
-        controller=path / C if own.digest_name(own_parts.CONTROLLER) in digests else None,
+        controller=path / C if custom.digest_name(custom_parts.CONTROLLER) in digests else None,
         first_look=made.first_look,
     )
 

@@ -131,7 +131,7 @@ def summarise(folder: Folder) -> dict[str, Any]:
     ranks: dict[bytes, dict[str, tuple]] = {}  # cached ranks of the inputs, by the subset of trials
     drawn = drawn_columns(folder, parts)
     inputs = rows.read(parts, drawn).head(min(SEARCHED, folder.trials))
-    for name in (*scenario.catalogue(folder.scenario), *folder.own_names):
+    for name in (*scenario.catalogue(folder.scenario), *folder.custom_metric_names):
         values = rows.read(parts, [name]).head(folder.trials)[name].to_numpy().astype(float)
         quantiles[name] = (_of_share if name in catalogues.LARGER_IS_BETTER else _of_metric)(values, finished)
         known = np.isfinite(values[:SEARCHED]) & finished[:SEARCHED]
@@ -187,7 +187,7 @@ def drawn_columns(folder: Folder, parts: list[rows.Part]) -> list[str]:
 
     They are all columns except the results, the trial number and the columns that identify a row's random sample.
     """
-    others = {plans.TRIAL, *plans.OF_ROWS.values(), *plans.RESULTS, *plans.SAMPLES, *folder.own_names}
+    others = {plans.TRIAL, *plans.OF_ROWS.values(), *plans.RESULTS, *plans.SAMPLES, *folder.custom_metric_names}
     return [name for name in rows.columns_of(parts[0]) if name not in others]
 
 

@@ -19,7 +19,7 @@ from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.montecarlo import Trials
 from ptsmc_jax.figures import study_plots, style
 from ptsmc_jax.numerics.statistics import value_at, vary
-from ptsmc_jax.scenario import cautions, errors, free_gains, own, parsing, replace, study, systems, tables
+from ptsmc_jax.scenario import cautions, custom, errors, free_gains, parsing, replace, study, systems, tables
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.law_tables import LAWS, common_keys
 from ptsmc_jax.scenario.spacecraft_scenario import SpacecraftScenario
@@ -27,7 +27,7 @@ from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.requirements import Verdict
 from tuning.errors import UsageError
-from tuning.search import gains, own_parts
+from tuning.search import custom_parts, gains
 from tuning.search.journal import Journal
 from tuning.search.objective import T_F
 from tuning.search.progress import Report, headed
@@ -91,7 +91,7 @@ def check(scenario: Scenario) -> None:
 
 def laws() -> list[str]:
     """Return the kinds of the compared laws, the prescribed-time law first."""
-    return [OURS, *(kind for kind, law in LAWS["spacecraft"].items() if kind != "prescribed_time" and kind != "own")]
+    return [OURS, *(kind for kind, law in LAWS["spacecraft"].items() if kind != "prescribed_time" and kind != "custom")]
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ class Rivals:
     """The laws that the prescribed-time law is compared with."""
 
     kinds: tuple[str, ...] | None = None  # built-in laws; None: all of them
-    own: tuple[str, ...] = ()  # custom laws, "FILE.py:NAME"
+    custom: tuple[str, ...] = ()  # custom laws, "FILE.py:NAME"
 
     def check(self) -> None:
         """Raise UsageError if a kind is unknown, or the location of a custom law is malformed."""
@@ -107,7 +107,7 @@ class Rivals:
         for kind in self.kinds or ():
             if kind not in others:
                 raise UsageError(f"--against is {kind}, but must be one of {', '.join(others)}")
-        for where in self.own:
+        for where in self.custom:
             try:
                 systems.named(where, systems.WHERE)
             except ValueError as error:
@@ -119,26 +119,26 @@ class Rivals:
         kinds = laws() if self.kinds is None else [OURS, *self.kinds]
         tables = {kind: {"kind": kind} for kind in kinds}
         for code in self._codes:
-            tables[_free_name(code.rpartition(":")[2], tables)] = {"kind": "own", "code": code}
+            tables[_free_name(code.rpartition(":")[2], tables)] = {"kind": "custom", "code": code}
         return tables
 
     @property
     def _codes(self) -> list[str]:
         """The locations of the custom laws with symbolic links resolved, without duplicates."""
-        split = (where.rpartition(":") for where in self.own)
+        split = (where.rpartition(":") for where in self.custom)
         codes = (f"{os.path.realpath(at)}:{name}" if at.endswith(".py") else f"{at}:{name}" for at, _, name in split)
         return list(dict.fromkeys(codes))
 
     def identity(self) -> dict[str, Any]:
         """Return the entries of `versions.json` that identify these laws; empty for the default laws."""
         digests = {code: systems.digest(code) for code in self._codes}
-        return {"laws": list(self.named), "own_laws": digests} if self != Rivals() else {}
+        return {"laws": list(self.named), "custom_laws": digests} if self != Rivals() else {}
 
 
 def _free_name(name: str, taken: Iterable[str]) -> str:
-    """Return a unique label for a custom law: its class name, after "own" if another law has this label."""
+    """Return a unique label for a custom law: its class name, after "custom" if another law has this label."""
     while name in (PAPER, *taken):
-        name = f"own {name}"
+        name = f"custom {name}"
     return name
 
 
@@ -162,14 +162,14 @@ def contenders(scenario: Scenario, rivals: Rivals = Rivals()) -> dict[str, Scena
             width = {"sign_width": table.sign_width} if both else {}
             law = {**law, **common_keys(table), **width}
             posed[name] = _posed(replace(scenario, tune=None, controller=law), tune, same)
-    if table.kind == "own" and all(one is not scenario for one in posed.values()):
+    if table.kind == "custom" and all(one is not scenario for one in posed.values()):
         posed[_free_name(type(table).__name__, posed)] = scenario
     return posed
 
 
 def _is(table: Any, law: Mapping[str, str]) -> bool:
     """Return whether the scenario's law is this law. Custom laws are compared by file, links resolved, and name."""
-    if table.kind != law["kind"] or table.kind != "own":
+    if table.kind != law["kind"] or table.kind != "custom":
         return table.kind == law["kind"]
 
     def place(code: str) -> tuple[Any, str]:
@@ -381,7 +381,7 @@ def write(folder: Path, scenario: Scenario, comparison: Comparison, figures: boo
     store.record(folder, parsing.dump(scenario), known_by, said)
     (folder / "scenarios").mkdir()
     for law, contender in comparison.contenders.items():
-        tables = own_parts.carry(parsing.dump(contender.flown), folder / "scenarios")
+        tables = custom_parts.carry(parsing.dump(contender.flown), folder / "scenarios")
         store.write_toml(folder / "scenarios" / f"{law}.toml", tables)
     store.write_csv(folder / "compare.csv", *_rows(scenario, said))
     if figures:
@@ -436,4 +436,4 @@ def identity(scenario: Scenario, seed: int, against: Rivals = Rivals()) -> dict[
         seed: of the searches.
         against: the other laws.
     """
-    return {"command": "compare", "seed": seed, **own.digests(scenario), **against.identity()}
+    return {"command": "compare", "seed": seed, **custom.digests(scenario), **against.identity()}

@@ -14,7 +14,7 @@ from contourpy import contour_generator
 
 from ptsmc_jax.campaigns import montecarlo, store
 from ptsmc_jax.figures import study_plots, style
-from ptsmc_jax.scenario import Study, errors, keys, own, parsing, study
+from ptsmc_jax.scenario import Study, custom, errors, keys, parsing, study
 from ptsmc_jax.scenario import replace as changed
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
@@ -323,7 +323,7 @@ def write(folder: Path, flown: Map, seed: int, figures: bool) -> None:
     """
     scenario, x, y, cells = flown.scenario, flown.x, flown.y, flown.cells
     trials = max((cell.trials for cell in cells), default=0)
-    made_by = {"command": "map", "seed": seed, "x": x.text, "y": y.text, "trials": trials, **own.digests(scenario)}
+    made_by = {"command": "map", "seed": seed, "x": x.text, "y": y.text, "trials": trials, **custom.digests(scenario)}
     store.record(folder, parsing.dump(scenario), made_by)
     fields = [name for name in Cell.__dataclass_fields__ if name not in ("x", "y")]
     cells_of = ((cell.x, cell.y, *(getattr(cell, name) for name in fields)) for cell in cells)

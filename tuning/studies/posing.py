@@ -33,7 +33,7 @@ class Posed:
     ready: Study
     problem: Problem
     evaluate: Evaluator
-    own: np.ndarray  # (gains,) of the scenario
+    scenario_gains: np.ndarray  # (gains,) of the scenario
     sloped: bool  # F has useful gradients: the sign function is not discontinuous
     asked: list[Requirement]  # constraints of the search
     seed: int
@@ -108,10 +108,10 @@ def pose(scenario: Scenario, seed: int, journal: Journal | None = None, **farthe
         torque_weight=table.torque_weight,
         margins=margin_rows.ask(ready, bounds, seed),
     )
-    own = np.asarray(gains.own(ready.parts, bounds.names))
+    scenario_gains = np.asarray(gains.present_values(ready.parts, bounds.names))
     exact = scenario.exact_sign and "sign_width" not in bounds.names
     designs = np.asarray(gains.of_designs(scenario, ready.parts, bounds.names))
-    return Posed(ready, problem, Evaluator(bounds, journal), own, not exact, asked, seed, designs)
+    return Posed(ready, problem, Evaluator(bounds, journal), scenario_gains, not exact, asked, seed, designs)
 
 
 def as_trained(scenario: Scenario) -> Scenario:
@@ -132,26 +132,26 @@ def reach(scenario: Scenario, table: tables.Tune, **farther: float) -> Reach:
         table: its bounds are in the ranges.
         farther: fields of `Reach` that get other values.
     """
-    own = reach_of(scenario)
+    present = reach_of(scenario)
 
     def interval(name: str, lower: float, upper: float | None = None) -> tuple[float, float]:
         low, high = table.bounds.get(name, (lower, lower))
         return min(low, lower), max(high, lower if upper is None else upper)
 
-    smallest_delta, delta = interval("delta", own.delta)
-    smallest_t_f, t_f = interval("t_f", own.t_f)
-    gain, largest_gain = interval("observer_gain", own.gain, own.largest_gain)
+    smallest_delta, delta = interval("delta", present.delta)
+    smallest_t_f, t_f = interval("t_f", present.t_f)
+    gain, largest_gain = interval("observer_gain", present.gain, present.largest_gain)
     by_gains = dataclasses.replace(
-        own,
+        present,
         smallest_t_f=smallest_t_f,
         t_f=t_f,
         delta=delta,
         smallest_delta=smallest_delta,
         gain=gain,
         largest_gain=largest_gain,
-        k1=interval("k1", own.k1)[1],
-        sign_width=interval("sign_width", own.sign_width)[0],
-        surface_rate=interval("surface_rate", own.surface_rate)[1],
+        k1=interval("k1", present.k1)[1],
+        sign_width=interval("sign_width", present.sign_width)[0],
+        surface_rate=interval("surface_rate", present.surface_rate)[1],
     )
     return dataclasses.replace(by_gains, **farther)
 

@@ -13,7 +13,7 @@ import numpy as np
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.runs import Run
 from ptsmc_jax.onboard import sources
-from ptsmc_jax.scenario import cautions, own, parsing
+from ptsmc_jax.scenario import cautions, custom, parsing
 from ptsmc_jax.scenario.tables import Scenario
 
 if TYPE_CHECKING:  # runs without C code do not need this import
@@ -70,10 +70,10 @@ def write(
         computer: the C code that controlled the run; None: the simulated law did.
         replayed: further entries of `versions.json` if the run repeats a trial of a campaign.
     """
-    made_by = {"command": "simulate", "seed": seed, "trial": trial, **replayed, **own.digests(scenario)}
+    made_by = {"command": "simulate", "seed": seed, "trial": trial, **replayed, **custom.digests(scenario)}
     if computer is not None:
         place = computer.library.folder
-        made_by |= {"controller": str(place.absolute()), own.digest_name(own.CONTROLLER): sources.digest(place)}
+        made_by |= {"controller": str(place.absolute()), custom.digest_name(custom.CONTROLLER): sources.digest(place)}
     store.record(folder, parsing.dump(scenario), made_by, summary(run, scenario, computer))
     columns = run.columns()
     store.write_csv(folder / "trajectory.csv", list(columns), np.column_stack(list(columns.values())).tolist())

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ptsmc_jax.campaigns import margin_verdicts, store
-from ptsmc_jax.scenario import Study, errors, own, parsing, study
+from ptsmc_jax.scenario import Study, custom, errors, parsing, study
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import rollout
@@ -162,7 +162,7 @@ def write(folder: Path, ready: Study, course: Course, figures: bool) -> None:
         figures: write figures too.
     """
     scenario = ready.scenario
-    made_by = {"command": "margins", "seed": None, **own.digests(scenario)}
+    made_by = {"command": "margins", "seed": None, **custom.digests(scenario)}
     store.record(folder, parsing.dump(scenario), made_by, summary(ready, course))
     inputs, _ = names(ready)
     t_f = float(ready.parts.controller.t_f)

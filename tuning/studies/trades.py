@@ -14,7 +14,7 @@ import numpy as np
 from ptsmc_jax import scenario as scenarios
 from ptsmc_jax.campaigns import margin_verdicts
 from ptsmc_jax.campaigns.montecarlo import Trials
-from ptsmc_jax.scenario import free_gains, own, parsing, study, tables
+from ptsmc_jax.scenario import custom, free_gains, parsing, study, tables
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation.catalogues import MARGINS
@@ -105,7 +105,7 @@ class Trade(ABC):
 
     def identity(self, seed: int) -> dict[str, Any]:
         """Return the entries of `versions.json` that identify a finished or interrupted front."""
-        return {"command": "pareto", "seed": seed, **self.options(), **own.digests(self.scenario)}
+        return {"command": "pareto", "seed": seed, **self.options(), **custom.digests(self.scenario)}
 
 
 @dataclass(frozen=True)
@@ -152,8 +152,8 @@ class Torque(Trade):
             return found, found.ended[at] * limit
 
         least, lowest = least_torque(search, highest)
-        own_limit = tables.limit_of(self.scenario, TORQUE)
-        limits, middle = limits_between(lowest / (1.0 - MARGIN), highest / (1.0 - MARGIN), self.points, own_limit)
+        scenario_limit = tables.limit_of(self.scenario, TORQUE)
+        limits, middle = limits_between(lowest / (1.0 - MARGIN), highest / (1.0 - MARGIN), self.points, scenario_limit)
         targets = [Target(float(one), f"peak torque {one:.3g}", under(one, free.problem)) for one in limits]
         # the best local minimum between the ends may differ from those at the ends
         between = _found(posed, targets[middle].problem, headed(tell, targets[middle].name), asked=())
@@ -192,8 +192,8 @@ class Margins(Trade):
     @cached_property
     def values(self) -> list[float]:
         """Return the limits, loosest first [dB]; infinite: no limit."""
-        own_limit = tables.limit_of(self.scenario, SENSITIVITY)
-        usual = {*LIMITS, *([] if own_limit is None else [own_limit])}
+        scenario_limit = tables.limit_of(self.scenario, SENSITIVITY)
+        usual = {*LIMITS, *([] if scenario_limit is None else [scenario_limit])}
         return [np.inf, *sorted(self.limits or usual, reverse=True)]
 
     @cached_property
@@ -334,22 +334,22 @@ def of(against: str, scenario: Scenario, points: int | None, listed: tuple[float
     return trade
 
 
-def limits_between(lowest: float, highest: float, points: int, own: float | None) -> tuple[np.ndarray, int]:
+def limits_between(lowest: float, highest: float, points: int, scenario_limit: float | None) -> tuple[np.ndarray, int]:
     """Return limits on the peak torque that are evenly spaced in their logarithms.
 
     Args:
         lowest: first limit [N m].
         highest: last limit [N m].
         points: number of limits.
-        own: the scenario's limit [N m]. It replaces the nearest limit if it is between the ends.
+        scenario_limit: the scenario's limit [N m]. It replaces the nearest limit if it is between the ends.
 
     Returns:
         The limits (points,) [N m], and the index of the scenario's limit, or of the middle one.
     """
     limits, middle = np.geomspace(lowest, highest, points), points // 2
-    if own is not None and lowest < own < highest:
-        middle = 1 + int(np.argmin(np.abs(np.log(limits[1:-1] / own))))
-        limits[middle] = own
+    if scenario_limit is not None and lowest < scenario_limit < highest:
+        middle = 1 + int(np.argmin(np.abs(np.log(limits[1:-1] / scenario_limit))))
+        limits[middle] = scenario_limit
     return limits, middle
 
 
@@ -386,7 +386,7 @@ def _found(
         asked: requirements that the search keeps; None: those of the scenario.
     """
     starts = posed.ready.scenario.search.starts if starts is None else starts
-    found = posed.search(problem, posed.own, starts, asked, judged=False, report=report)
+    found = posed.search(problem, posed.scenario_gains, starts, asked, judged=False, report=report)
     if found.interrupted:
         raise KeyboardInterrupt
     return found

@@ -10,11 +10,11 @@ import numpy as np
 
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.montecarlo import Trials
-from ptsmc_jax.scenario import cautions, free_gains, own, parsing, tables
+from ptsmc_jax.scenario import cautions, custom, free_gains, parsing, tables
 from ptsmc_jax.scenario.tables import LIMITS, T_F, Scenario, objective_name
 from ptsmc_jax.simulation import catalogues
+from tuning.search import custom_parts, trust
 from tuning.search import gains as gain_names
-from tuning.search import own_parts, trust
 from tuning.search.descents import Step
 from tuning.studies import judging
 from tuning.studies.tuner import Beyond, Trust, Tuning
@@ -183,7 +183,7 @@ def write(folder: Path, scenario: Scenario, tuning: Tuning, figures: bool, known
         known_by: entries of `versions.json`, see `identity`.
     """
     store.record(folder, parsing.dump(scenario), known_by, summary(tuning))
-    store.write_toml(folder / "tuned.toml", own_parts.carry(parsing.dump(tuning.tuned), folder))
+    store.write_toml(folder / "tuned.toml", custom_parts.carry(parsing.dump(tuning.tuned), folder))
     rows = [
         [step, row.start, row.value, *row.gains, *row.worst]
         for path in _paths(tuning.search.history)
@@ -216,7 +216,7 @@ def identity(scenario: Scenario, seed: int, *, globally: bool) -> dict[str, Any]
         seed: of the search.
         globally: the run includes a global search for comparison.
     """
-    return {"command": "tune", "seed": seed, **({"global_check": True} if globally else {}), **own.digests(scenario)}
+    return {"command": "tune", "seed": seed, **({"global_check": True} if globally else {}), **custom.digests(scenario)}
 
 
 def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:

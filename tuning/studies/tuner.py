@@ -203,7 +203,9 @@ def _search_and_judge(
     """
     # a repeated search has all starting points again: gains that keep more distance may not be near those found
     starts = scenario.search.starts
-    outcome = posed.search(posed.problem, posed.own, starts, report=report, prepare=partial(_prepare, scenario))
+    outcome = posed.search(
+        posed.problem, posed.scenario_gains, starts, report=report, prepare=partial(_prepare, scenario)
+    )
     outcome, posed = _in_larger_bounds(outcome, posed, journal, report)
     look, seed = partial(posed.search, posed.problem, report=report), posed.seed
     scenario = posed.ready.scenario
@@ -308,7 +310,7 @@ def _trust(posed: Posed, judged: _Judged) -> Trust:
     outcome, evaluate = judged.search, posed.evaluate
     slope_error = None
     if posed.sloped:
-        at_start = trust.slope_error(evaluate, outcome.problem, evaluate.bounds.share(posed.own))
+        at_start = trust.slope_error(evaluate, outcome.problem, evaluate.bounds.share(posed.scenario_gains))
         slope_error = at_start, trust.slope_error(evaluate, outcome.problem, outcome.share)
     metrics = tuple(dict.fromkeys([*SENSITIVE, *outcome.problem.metrics]))
     return Trust(

@@ -11,11 +11,12 @@ import pytest
 import ptsmc_jax as ptsmc
 from ptsmc_jax import explore, scenario
 from ptsmc_jax.campaigns import margin_verdicts, store
-from ptsmc_jax.devices.own_sensors import OWN_NOISE
+from ptsmc_jax.devices.custom_sensors import CUSTOM_NOISE
 from ptsmc_jax.devices.ticks import Ticks
+from ptsmc_jax.dispersions.base import CUSTOM
 from ptsmc_jax.numerics import draws
 from ptsmc_jax.plants.rigid_body import AttitudeState
-from ptsmc_jax.scenario import own, parsing, reading, systems
+from ptsmc_jax.scenario import custom, parsing, reading, systems
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.theory import linear
@@ -77,8 +78,8 @@ CHAIN = {
     "controller": {"kind": "pd", "k_p": 2.0, "k_d": 2.0, "t_f": 5.0},
     "loop": {"mode": "sampled", "period": 0.1, "t_end": 6.5},
 }
-NOISY = {"kind": "own", "code": "mine.py:Noisy"}
-DRIFT = {"own": {"kind": "own", "code": "mine.py:Drift"}}
+NOISY = {"kind": "custom", "code": "mine.py:Noisy"}
+DRIFT = {"custom": {"kind": "custom", "code": "mine.py:Drift"}}
 
 
 @pytest.fixture(autouse=True)
@@ -102,7 +103,7 @@ def test_custom_sensors_match_a_loop_computed_by_hand():
     t, x, u = (np.asarray(v)[kept] for v in (log.t, log.x, log.u))
     ticks = ticks_of(parts.clock, parts.controller.t_f, parts.controller.delta)
     sample = np.asarray(ticks.sample)[np.asarray(ticks.t_next > ticks.t)]
-    key = draws.stream(np.uint32(3), np.uint32(7), OWN_NOISE)
+    key = draws.stream(np.uint32(3), np.uint32(7), CUSTOM_NOISE)
     noise = np.asarray(jax.jit(jax.vmap(lambda k: draws.normals(key, 2, k)))(sample[1:]))
     seen = x[1:-1] + np.array([0.02, 0.03]) * noise
     wanted = -2.0 * seen[:-1, 0] - 2.0 * seen[1:, 1]  # x_1 is one sample late
@@ -115,12 +116,14 @@ def test_custom_sensors_match_a_loop_computed_by_hand():
 
 def test_a_period_of_length_zero_does_not_change_the_sensor_memory():
     """Clocks contain periods of length zero. Measurements in them are not used."""
-    own = parts_of(sensors=NOISY, disturbance={"kind": "none"}).sensors
+    sensors = parts_of(sensors=NOISY, disturbance={"kind": "none"}).sensors
     now = Ticks(*(jnp.asarray(v) for v in (0.5, 0.5, False, 3, 1.0, False)))
-    _, (_, _, kept) = own.measure(own.begin(3, 7, vector([1.0, 2.0]), now), vector([5.0, 6.0]), now, vector(0.1))
+    _, (_, _, kept) = sensors.measure(
+        sensors.begin(3, 7, vector([1.0, 2.0]), now), vector([5.0, 6.0]), now, vector(0.1)
+    )
     assert kept.tolist() == [1.0]
-    _, (_, _, new) = own.measure(
-        own.begin(3, 7, vector([1.0, 2.0]), now), vector([5.0, 6.0]), now._replace(t_next=vector(0.6)), vector(0.1)
+    _, (_, _, new) = sensors.measure(
+        sensors.begin(3, 7, vector([1.0, 2.0]), now), vector([5.0, 6.0]), now._replace(t_next=vector(0.6)), vector(0.1)
     )
     assert abs(float(new[0]) - 5.0) < 0.1
 
@@ -130,7 +133,7 @@ def test_a_perfect_custom_sensor_gives_the_run_without_sensors():
         def see(self, memory, x, noise, t, dt):
             return x, memory
 
-    with_it = rollout.simulate_parts(parts_of(sensors={"kind": "own", "code": Clear}))
+    with_it = rollout.simulate_parts(parts_of(sensors={"kind": "custom", "code": Clear}))
     without = rollout.simulate_parts(parts_of())
     for one, other in zip(*map(jax.tree.leaves, (with_it.metrics, without.metrics)), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-12)  # two programs
@@ -146,7 +149,7 @@ def test_custom_sensors_of_a_spacecraft_measure_attitude_and_rate(command, here)
         "        return x._replace(q=attitude.multiply(x.q, attitude.from_rotation_vector(by))), memory\n"
     )
     text = SHORT.replace("attitude_noise = 2e-5\n", "").replace("rate_noise = 1e-6\n", "").replace("[hardware]\n", "")
-    text = text[: text.index("[requirements]")] + '[sensors]\nkind = "own"\ncode = "mine.py:Tilted"\n'
+    text = text[: text.index("[requirements]")] + '[sensors]\nkind = "custom"\ncode = "mine.py:Tilted"\n'
     text = text.replace("t_end = 6.5", "t_end = 25.0").replace("k1 = 1.0\n", "k1 = 4.0\n")
     (here / "s.toml").write_text(text)
     run = explore.simulate(scenario.read("s.toml"))
@@ -181,14 +184,14 @@ def test_margins_with_a_late_star_tracker_lie_between_no_delay_and_full_delay():
     flight = scenario.replace(
         scenario.read(FIRST_FLIGHT), tune=None, requirements=None, controller__delta=1.0, observer__gain=[5.0] * 3
     )
-    sensors = {"kind": "own", "code": LateStarTracker}
+    sensors = {"kind": "custom", "code": LateStarTracker}
     late = scenario.replace(flight, hardware=None, sensors=sensors)
     all_late = scenario.replace(flight, hardware__delay=LateStarTracker.late)
     judged = [stability.worst(scenario.study(one)) for one in (all_late, late, flight)]
     left = [one["hold"] for one in judged if one is not None]
     for margin in ("gain_margin", "phase_margin"):
-        least, own_delay, most = (found[margin] for found in left)
-        assert least < own_delay < most
+        least, with_delay, most = (found[margin] for found in left)
+        assert least < with_delay < most
 
 
 def test_custom_dispersions_change_the_parts_and_appear_in_the_rows(command, here):
@@ -196,7 +199,7 @@ def test_custom_dispersions_change_the_parts_and_appear_in_the_rows(command, her
     ready = scenario.study(scenario.from_tables(tables))
     assert ready.dispersion.varies
     assert margin_verdicts.differ(ready.dispersion)
-    c = ready.dispersion.coordinates(jnp.uint32(2), jnp.uint32(5))["own"]
+    c = ready.dispersion.coordinates(jnp.uint32(2), jnp.uint32(5))[CUSTOM]
     drawn = ready.dispersion.apply(ready.parts, jnp.uint32(2), jnp.uint32(5))
     np.testing.assert_allclose(drawn.disturbance.amplitude, 0.05 * (1.0 + 0.1 * c[0]), rtol=1e-15)
     np.testing.assert_allclose(drawn.initial, np.array([1.0, 0.0]) + 0.01 * np.asarray(c[1]), rtol=1e-15)
@@ -211,7 +214,7 @@ def test_custom_dispersions_change_the_parts_and_appear_in_the_rows(command, her
         'controller = { kind = "pd", k_p = 2.0, k_d = 2.0, t_f = 5.0 }',
         'disturbance = { kind = "sinusoid", amplitude = [0.05] }',
         'loop = { mode = "sampled", period = 0.1, t_end = 6.5 }',
-        'dispersion = { own = { kind = "own", code = "mine.py:Drift", std = 0.2 } }',
+        'dispersion = { custom = { kind = "custom", code = "mine.py:Drift", std = 0.2 } }',
     ])  # fmt: skip
     (here / "c.toml").write_text(text)
     assert command("montecarlo", "c.toml", "--trials", 40, "--seed", 2, "--no-figures", "--quiet")[0] in (0, 1)
@@ -221,17 +224,17 @@ def test_custom_dispersions_change_the_parts_and_appear_in_the_rows(command, her
 
 def test_keys_of_custom_sensors_and_dispersions_are_read_and_written(command, here):
     loaded = scenario.from_tables({**CHAIN, "sensors": {**NOISY, "sigma": [1.0, 2.0]}, "dispersion": DRIFT})
-    assert own.waits(loaded)
-    assert set(own.programs(loaded)) == {"sensors.code", "dispersion.own.code"}
-    assert set(own.digests(loaded)) == {"sensors_sha256", "dispersion_own_sha256"}
+    assert custom.waits(loaded)
+    assert set(custom.programs(loaded)) == {"sensors.code", "dispersion.custom.code"}
+    assert set(custom.digests(loaded)) == {"sensors_sha256", "dispersion_custom_sha256"}
     whole = reading.complete(loaded)
     assert whole.dispersion is not None
-    assert (whole.sensors.sigma, whole.dispersion.own.std) == ((1.0, 2.0), 0.1)
+    assert (whole.sensors.sigma, whole.dispersion.custom.std) == ((1.0, 2.0), 0.1)
     assert reading.complete(scenario.from_tables(parsing.dump(whole))) == whole
     (here / "c.toml").write_text(
         'plant = { kind = "chain", x0 = [1.0, 0.0] }\nloop = { mode = "sampled" }\n'
-        'sensors = { kind = "own", code = "mine.py:Noisy" }\n'
-        'dispersion = { own = { kind = "own", code = "mine.py:Drift" } }\n'
+        'sensors = { kind = "custom", code = "mine.py:Noisy" }\n'
+        'dispersion = { custom = { kind = "custom", code = "mine.py:Drift" } }\n'
     )
     assert command("new", "commented.toml", "--like", "c.toml", "--quiet")[0] == 0
     first, second = (reading.complete(scenario.read(path)) for path in ("c.toml", "commented.toml"))
@@ -279,7 +282,7 @@ def test_errors_in_custom_sensors_and_dispersions_are_one_sentence(here, old, ne
     text = str(caught.value).replace("f64", "float64") if "float64" in said else str(caught.value)
     assert said in text
     assert "\n" not in text
-    assert ("sensors.code" if "sensors" in which else "dispersion.own") in text
+    assert ("sensors.code" if "sensors" in which else "dispersion.custom") in text
 
 
 @pytest.mark.parametrize(
@@ -305,7 +308,7 @@ def test_custom_sensors_exclude_built_in_sensors_and_filters(tables, said):
 
 
 def test_gains_of_custom_sensors_are_tuned_and_written():
-    tables = {**CHAIN, "sensors": {"kind": "own", "code": "mine.py:Smoothed"}, "tune": {}}
+    tables = {**CHAIN, "sensors": {"kind": "custom", "code": "mine.py:Smoothed"}, "tune": {}}
     loaded = reading.complete(scenario.from_tables(tables))
     assert loaded.tune is not None
     assert loaded.tune.free == ("k_p", "k_d", "sensors_share")

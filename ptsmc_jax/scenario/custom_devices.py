@@ -2,12 +2,12 @@
 
 from typing import Any, ClassVar
 
-from ptsmc_jax.devices import own_sensors
+from ptsmc_jax.devices import custom_sensors
 from ptsmc_jax.dispersions.base import Draw
 from ptsmc_jax.numerics.draws import DISTRIBUTIONS
 from ptsmc_jax.numerics.pytrees import vector
+from ptsmc_jax.scenario.custom import custom_kind
 from ptsmc_jax.scenario.errors import ScenarioError, show
-from ptsmc_jax.scenario.own import own_kind
 from ptsmc_jax.scenario.schema import PartTable
 from ptsmc_jax.scenario.values import Kinds
 
@@ -21,7 +21,7 @@ class SensorTable(PartTable, frozen=True):
         """Return the sensors for the rollout; model: the design model of the plant, period: of control [s]."""
         made = self.part(model=model)
         _check_count(made, "sensors", "draws", 0)
-        return own_sensors.OwnSensors(made, vector(1.0))
+        return custom_sensors.CustomSensors(made, vector(1.0))
 
 
 class DrawTable(PartTable, frozen=True):
@@ -30,9 +30,9 @@ class DrawTable(PartTable, frozen=True):
     def build(self) -> Any:
         """Return the dispersion, an instance of `ptsmc_jax.Draw`."""
         made = self.part()
-        _check_count(made, "dispersion.own", "count", 1)
+        _check_count(made, "dispersion.custom", "count", 1)
         if made.drawn not in DISTRIBUTIONS:
-            raise _unfit(made, "dispersion.own", "drawn", '"normal" or "uniform"')
+            raise _unfit(made, "dispersion.custom", "drawn", '"normal" or "uniform"')
         return made
 
 
@@ -49,12 +49,12 @@ def _unfit(made: Any, table: str, field: str, must: str) -> ScenarioError:
 
 
 SENSORS: Kinds = {  # those that are built in are keys of [hardware] and [filter]
-    "own": own_kind(
-        SensorTable, own_sensors.SampledSensor, ("see",), tuned=True,
+    "custom": custom_kind(
+        SensorTable, custom_sensors.SampledSensor, ("see",), tuned=True,
         summary="Custom sensors, a class derived from ptsmc_jax.SampledSensor; its fields are further keys. They take "
         "the place of what [hardware] says of noise, and of [filter].",
     )
 }  # fmt: skip
-OWN_DRAW: Any = own_kind(
+CUSTOM_DRAW: Any = custom_kind(
     DrawTable, Draw, ("at",), "Any custom draw, a class derived from ptsmc_jax.Draw; its fields are further keys."
 )

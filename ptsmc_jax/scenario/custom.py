@@ -1,7 +1,7 @@
-"""Custom parts of scenarios: `kind = "own"` and `code = "FILE.py:NAME"`, a class whose fields are further keys.
+"""Custom parts of scenarios: `kind = "custom"` and `code = "FILE.py:NAME"`, a class whose fields are further keys.
 
 Reading a scenario does not run the code that it names. Until `reading.complete` runs it, these keys are in `rest` and
-are not validated. Start with `own_kind` and `read`.
+are not validated. Start with `custom_kind` and `read`.
 """
 
 import dataclasses
@@ -28,8 +28,8 @@ DECLARED = "delta"  # field of the base class that a custom law may declare agai
 Code = Annotated[Any, Meta(description=systems.WHERE), Meaning('the class, "FILE.py:NAME" or "package.module:NAME"')]
 
 
-class Own:
-    """The tables of custom parts; their keys `kind`, `code` and `rest` are in `own_kind`."""
+class Custom:
+    """The tables of custom parts; their keys `kind`, `code` and `rest` are in `custom_kind`."""
 
     __slots__ = ()
     base: ClassVar[Any] = None  # required base class of the custom class
@@ -43,7 +43,7 @@ class Own:
         return self.made is None
 
 
-def own_kind(table: Any, base: type, needs: tuple[str, ...], summary: str, tuned: bool = False) -> Any:
+def custom_kind(table: Any, base: type, needs: tuple[str, ...], summary: str, tuned: bool = False) -> Any:
     """Return the table of custom parts.
 
     Args:
@@ -53,16 +53,16 @@ def own_kind(table: Any, base: type, needs: tuple[str, ...], summary: str, tuned
         summary: description of the kind.
         tuned: whether a custom class may have gains.
     """
-    return _own_kind(table, base, needs, summary, tuned)
+    return _custom_kind(table, base, needs, summary, tuned)
 
 
 @functools.cache
-def _own_kind(table: Any, base: type, needs: tuple[str, ...], summary: str, tuned: bool) -> Any:
+def _custom_kind(table: Any, base: type, needs: tuple[str, ...], summary: str, tuned: bool) -> Any:
     space = {"__doc__": summary, "base": base, "needs": needs, "tuned": tuned, "__module__": __name__}
-    space["remake"] = (_own_kind, table, base, needs, summary, tuned)
+    space["remake"] = (_custom_kind, table, base, needs, summary, tuned)
     rest = ("rest", dict[str, Any], msgspec.field(default_factory=dict))
-    fields = [("kind", Literal["own"], "own"), ("code", Code), rest]
-    return msgspec.defstruct("Own", fields, bases=(Own, table), frozen=True, kw_only=True, namespace=space)
+    fields = [("kind", Literal["custom"], "custom"), ("code", Code), rest]
+    return msgspec.defstruct("Custom", fields, bases=(Custom, table), frozen=True, kw_only=True, namespace=space)
 
 
 def named(raw: Mapping[str, Any]) -> Iterator[tuple[dict, str]]:
@@ -98,7 +98,7 @@ def _places(scenario: Table) -> Iterator[tuple[str, Any]]:
         if hasattr(table, "placed"):
             yield from table.placed(name).items()
         elif name == "dispersion" and table is not None:
-            yield "dispersion.own", table.own
+            yield "dispersion.custom", table.custom
         else:
             yield name, table
 
@@ -132,7 +132,7 @@ def read(table: Any, name: str, code: object) -> Any:
     """Return the table of a custom part with the keys of its class.
 
     Args:
-        table: the table class from `own_kind`.
+        table: the table class from `custom_kind`.
         name: name of the table in the scenario, for errors.
         code: "FILE.py:NAME" or "package.module:NAME", which is run, or the class itself.
 
@@ -187,7 +187,7 @@ def _with_keys(table: Any, found: Any, remake: tuple) -> Any:
                 f"the name of its field must be another than {field.name}: gain has a number for each axis, gain_1 .."
             )
         declared[field.name] = _declaration(table, found, field)
-    return schema.extended(table, found, "own", declared, remake=remake)
+    return schema.extended(table, found, "custom", declared, remake=remake)
 
 
 def _annotated(found: type, base: type) -> Iterator[str]:
@@ -242,7 +242,7 @@ def _declaration(table: Any, found: Any, field: dataclasses.Field) -> Declaratio
         raise ValueError(f"the default of {field.name} is {shown}, but must be {allowed}")
     value = tuple(map(float, value)) if isinstance(value, tuple) else float(value)
     one = (one or Declaration(value, "", "", Limits()))._replace(default=value)
-    one = one._replace(meaning=" ".join(one.meaning.split()) or "of one of its own")
+    one = one._replace(meaning=" ".join(one.meaning.split()) or "declared by the custom class")
     try:
         msgspec.convert(value, one.type(table.body), strict=True)
     except msgspec.ValidationError:

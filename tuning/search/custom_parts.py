@@ -17,10 +17,10 @@ from typing import Any
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.onboard import sources
-from ptsmc_jax.scenario import own, systems
+from ptsmc_jax.scenario import custom, systems
 from ptsmc_jax.scenario.tables import Scenario
 
-METRICS, CONTROLLER = "--metrics", own.CONTROLLER  # options that name programs
+METRICS, CONTROLLER = "--metrics", custom.CONTROLLER  # options that name programs
 
 
 def named(scenario: Scenario, metrics: str | None = None, controller: Path | None = None) -> dict[str, str]:
@@ -32,7 +32,7 @@ def named(scenario: Scenario, metrics: str | None = None, controller: Path | Non
         controller: value of the option `--controller`, or None.
     """
     options = {METRICS: metrics, CONTROLLER: controller}
-    return own.programs(scenario) | {key: str(where) for key, where in options.items() if where is not None}
+    return custom.programs(scenario) | {key: str(where) for key, where in options.items() if where is not None}
 
 
 def location(key: str, where: str) -> str:
@@ -78,7 +78,7 @@ def allow(programs: Mapping[str, str], results: Path, made: Mapping[str, Any], t
     if programs and not trusted:
         listed = " and ".join(f"{file} ({', '.join(keys)})" for file, keys in _by_file(programs).items())
         raise RefusedError(
-            f"{results} names code of its own, {listed}, which this command would run; "
+            f"{results} names custom code, {listed}, which this command would run; "
             "allowed is --trust, for one who has read it"
         )
     unknown = check_unchanged(programs, results, made)
@@ -117,8 +117,8 @@ def check_unchanged(programs: Mapping[str, str], results: Path, made: Mapping[st
 
 def _digests(made: Mapping[str, Any], key: str) -> list[str]:
     """Return the known checksums of custom code. A comparison has one for each of its laws, under the same key."""
-    laws = made.get("own_laws") if key == "controller.code" else None
-    digests = (made.get(own.digest_name(key)), *(laws.values() if isinstance(laws, dict) else ()))
+    laws = made.get("custom_laws") if key == "controller.code" else None
+    digests = (made.get(custom.digest_name(key)), *(laws.values() if isinstance(laws, dict) else ()))
     return list(dict.fromkeys(map(str, filter(None, digests))))
 
 
@@ -127,7 +127,7 @@ def carry(tables: dict[str, Any], folder: Path) -> dict[str, Any]:
 
     Modules, and files that need other files (see `alone`), are not copied. The tables are changed and returned.
     """
-    for table, key in own.named(tables):
+    for table, key in custom.named(tables):
         place, _, name = table[key].rpartition(":")
         file = Path(place)
         if not place.endswith(".py") or not alone(file):

@@ -19,8 +19,8 @@ from ptsmc_jax.observers.base import Bound
 from ptsmc_jax.plants.base import check_indices
 from ptsmc_jax.plants.second_order import INSTEAD, TRACED
 from ptsmc_jax.scenario import systems
+from ptsmc_jax.scenario.custom import Custom
 from ptsmc_jax.scenario.errors import ScenarioError, brief
-from ptsmc_jax.scenario.own import Own
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.signals.disturbances import Sum
 from ptsmc_jax.simulation.catalogues import CATALOGUE
@@ -38,14 +38,14 @@ def check(parts: Parts, dispersion: Dispersion, scenario: Scenario) -> None:
     tables = {name: getattr(scenario, name, None) for name in ("reference", "sensors", "observer", "controller")}
     acting = iter(parts.disturbance.terms if isinstance(parts.disturbance, Sum) else (parts.disturbance,))
     for place, term in scenario.placed_terms.items():
-        if isinstance(term, Own):
+        if isinstance(term, Custom):
             _disturbance(parts, next(one for one in acting if isinstance(one, term.made)), _Asked(place, term))
     for name, table in tables.items():
-        if isinstance(table, Own):
+        if isinstance(table, Custom):
             _OF[name](parts, _Asked(name, table))
 
-    if dispersion.own is not None:
-        _draw(parts, dispersion, _Asked("dispersion.own", getattr(scenario.dispersion, "own", None)))
+    if dispersion.custom is not None:
+        _draw(parts, dispersion, _Asked("dispersion.custom", getattr(scenario.dispersion, "custom", None)))
 
 
 def what_fails(error: BaseException, file: str) -> str:
@@ -124,12 +124,12 @@ class _Asked:
 
 def _trace(function: Callable, args: tuple) -> None:
     """Raise the errors that a method raises in a run, when its arguments and the fields of its object are traced."""
-    own = getattr(function, "__self__", function)
-    if jax.tree_util.all_leaves([own]):  # an object that is not a pytree has no fields to trace
+    holder = getattr(function, "__self__", function)
+    if jax.tree_util.all_leaves([holder]):  # an object that is not a pytree has no fields to trace
         jax.eval_shape(function, *args)
         return
-    called = getattr(function, "__func__", type(own).__call__)
-    jax.eval_shape(lambda own, args: called(own, *args), own, args)
+    called = getattr(function, "__func__", type(holder).__call__)
+    jax.eval_shape(lambda holder, args: called(holder, *args), holder, args)
 
 
 def _kind(value: Any) -> str:
@@ -176,28 +176,28 @@ def _reference(parts: Parts, ask: _Asked) -> None:
 
 
 def _sensors(parts: Parts, ask: _Asked) -> None:
-    own, zero = parts.sensors.own, jnp.zeros(())
+    custom, zero = parts.sensors.custom, jnp.zeros(())
     x = parts.controller.kinematics.align(parts.plant.visible(parts.initial), parts.reference(zero))
-    memory = ask("begin", own.begin, x)
+    memory = ask("begin", custom.begin, x)
     period = jnp.asarray(parts.period)
-    returned = ask("see", own.see, memory, x, jnp.zeros(own.draws), zero, period)
+    returned = ask("see", custom.see, memory, x, jnp.zeros(custom.draws), zero, period)
     if not isinstance(returned, tuple) or len(returned) != 2:
         raise ask.refused("see", _described(returned), "the state as seen and its memory")
     was, now = (jax.tree.map(_kind, one) for one in (jax.tree.map(jnp.asarray, x), returned[0]))
     if was != now:
         raise ask.refused("see", f"a state {now}", f"one as the plant's, {was}")
     ask.same_memory("see", memory, returned[1])
-    first = ask("see", own.see, memory, x, jnp.zeros(own.draws), zero, zero)
+    first = ask("see", custom.see, memory, x, jnp.zeros(custom.draws), zero, zero)
     for (seen, _), where in ((returned, ""), (first, ", also where dt is 0, at the first sample")):
         if not all(np.all(np.isfinite(v)) for v in jax.tree.leaves(seen)):
             raise ask.refused("see", f"a state {jax.tree.map(np.asarray, seen)}", f"finite numbers{where}")
 
 
 def _draw(parts: Parts, dispersion: Dispersion, ask: _Asked) -> None:
-    own: Any = dispersion.own
+    custom: Any = dispersion.custom
     taken = {"status", "reason", "bad_time", *OF_ROWS, *OF_ROWS.values(), *CATALOGUE, *dispersion.values(parts)}
-    c = jnp.full(own.count, 0.5)
-    drawn = ask("at", own.at, c, parts)
+    c = jnp.full(custom.count, 0.5)
+    drawn = ask("at", custom.at, c, parts)
     was, now = (jax.tree.map(lambda v: _kind(jnp.asarray(v)), one) for one in (parts, drawn))
     if jax.tree.structure(was) != jax.tree.structure(now):
         what = f"parts with {_changed(parts, drawn)}" if isinstance(drawn, Parts) else _described(drawn)
@@ -207,7 +207,7 @@ def _draw(parts: Parts, dispersion: Dispersion, ask: _Asked) -> None:
             raise ask.refused("at", f"parts with {other} in place of {one}", "numbers of the same shapes")
         if not np.all(np.isfinite(value)):
             raise ask.refused("at", "parts with numbers that are not finite", "finite ones")
-    values = ask("values", own.values, c)
+    values = ask("values", custom.values, c)
     if not isinstance(values, dict) or not all(isinstance(name, str) for name in values):
         raise ask.refused("values", _described(values), "a dict of numbers by name")
     for name, value in values.items():

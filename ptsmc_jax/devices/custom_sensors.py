@@ -17,7 +17,7 @@ from ptsmc_jax.numerics import draws, guards
 from ptsmc_jax.numerics.draws import WholeNumber
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
 
-OWN_NOISE = "own_noise"
+CUSTOM_NOISE = "own_noise"  # name of the random stream; another name would give other random numbers
 
 
 @dataclass(frozen=True)
@@ -53,28 +53,28 @@ class SampledSensor(declare.Tunable):
 
 @pytree
 @dataclass(frozen=True)
-class OwnSensors(Sensor):
+class CustomSensors(Sensor):
     """Adapter of custom sensors to the `Sensor` interface. The noise depends on (seed, trial, sample)."""
 
-    own: Any  # `SampledSensor`
+    custom: Any  # `SampledSensor`
     noise_scale: Leaf  # factor of the noise: 1, or 0 for no noise [-]
 
     def noise(self, key: draws.Key, sample: Int[Array, ""]) -> Float[Array, " draws"]:
         """Return the noise of one sample, (draws,) [-]."""
-        return self.noise_scale * draws.normals(key, self.own.draws, sample) if self.own.draws else jnp.zeros(0)
+        return self.noise_scale * draws.normals(key, self.custom.draws, sample) if self.custom.draws else jnp.zeros(0)
 
     def begin(self, seed: WholeNumber, trial: WholeNumber, x0: Any, now: Ticks) -> tuple:
         """Return the memory before the first sample; see `Sensor.begin`."""
-        key = draws.stream(seed, trial, OWN_NOISE)
-        return key, self.noise(key, now.sample), self.own.begin(x0)
+        key = draws.stream(seed, trial, CUSTOM_NOISE)
+        return key, self.noise(key, now.sample), self.custom.begin(x0)
 
     def measure(self, memory: tuple, x: Any, now: Ticks, dt: Scalar, star_x: None = None) -> tuple[Any, tuple]:
         """Return the measured state and the memory. A period of length 0 does not change the memory."""
-        key, noise, own_memory = memory
+        key, noise, sensor_memory = memory
         noise_next = self.noise(key, now.sample + 1)
-        measured, new = self.own.see(own_memory, x, guards.lerp(now.noise_weight, noise, noise_next), now.t, dt)
-        return measured, (key, noise_next, guards.select(now.t_next > now.t, new, own_memory))
+        measured, new = self.custom.see(sensor_memory, x, guards.lerp(now.noise_weight, noise, noise_next), now.t, dt)
+        return measured, (key, noise_next, guards.select(now.t_next > now.t, new, sensor_memory))
 
-    def quiet(self) -> "OwnSensors":
+    def quiet(self) -> "CustomSensors":
         """Return the sensors with all standard normal numbers set to zero."""
         return replace(self, noise_scale=0.0 * self.noise_scale)

@@ -5,8 +5,8 @@ from typing import Any
 import pytest
 
 from ptsmc_jax.campaigns.store import RefusedError
-from ptsmc_jax.scenario import own, systems
-from tuning.search import own_parts
+from ptsmc_jax.scenario import custom, systems
+from tuning.search import custom_parts
 
 
 @pytest.mark.parametrize(("place", "inside"), [
@@ -19,10 +19,10 @@ def test_folder_of_results_is_found_at_any_depth(tmp_path, place, inside):
     path = results / place
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text("")
-    assert own_parts.results_of(path) == (results if inside else None)
+    assert custom_parts.results_of(path) == (results if inside else None)
     link = tmp_path / "link.toml"
     link.symlink_to(path)
-    assert own_parts.results_of(link) == (results if inside else None)  # the link is resolved
+    assert custom_parts.results_of(link) == (results if inside else None)  # the link is resolved
 
 
 def test_a_symbolic_link_in_results_to_an_outside_file_belongs_to_the_results(tmp_path):
@@ -32,18 +32,20 @@ def test_a_symbolic_link_in_results_to_an_outside_file_belongs_to_the_results(tm
     (results / "versions.json").write_text("{}")
     mine.write_text("")
     (results / "tuned.toml").symlink_to(mine)
-    assert own_parts.results_of(results / "tuned.toml") == results
-    assert own_parts.results_of(mine) is None
+    assert custom_parts.results_of(results / "tuned.toml") == results
+    assert custom_parts.results_of(mine) is None
 
 
 def test_a_file_named_by_several_keys_is_reported_once(tmp_path, capsys):
     law = tmp_path / "mine.py"
     law.write_text("")
     programs: Any = dict.fromkeys(("controller.code", "observer.code", "reference.code"), f"{law}:Mine")
-    with pytest.raises(RefusedError, match=rf"own, {law} \(controller.code, observer.code, reference.code\), which"):
-        own_parts.allow(programs, tmp_path, {}, trusted=False)
-    digests = {own.digest_name(key): systems.digest(where) for key, where in programs.items()}
-    own_parts.allow(programs, tmp_path, digests, trusted=True)
+    with pytest.raises(
+        RefusedError, match=rf"custom code, {law} \(controller.code, observer.code, reference.code\), which"
+    ):
+        custom_parts.allow(programs, tmp_path, {}, trusted=False)
+    digests = {custom.digest_name(key): systems.digest(where) for key, where in programs.items()}
+    custom_parts.allow(programs, tmp_path, digests, trusted=True)
     keys = "controller.code, observer.code and reference.code"
     assert capsys.readouterr().err == f"ptsmc: runs {law}, which {keys} of {tmp_path} name\n"
 
@@ -54,8 +56,8 @@ def test_a_program_without_a_checksum_in_the_results_is_reported(tmp_path, capsy
     other.write_text("")
     programs = {"controller.code": f"{law}:Mine", "observer.code": f"{other}:Mine"}
     made = {"controller_sha256": systems.digest(f"{law}:Mine")}
-    assert own_parts.check_unchanged(programs, tmp_path, made) == ["observer.code"]
-    own_parts.allow(programs, tmp_path, made, trusted=True)
+    assert custom_parts.check_unchanged(programs, tmp_path, made) == ["observer.code"]
+    custom_parts.allow(programs, tmp_path, made, trusted=True)
     (said,) = [line for line in capsys.readouterr().err.splitlines() if "no checksum" in line]
     assert str(other) in said
     assert str(law) not in said
@@ -77,4 +79,4 @@ def test_checksum_covers_imported_files_in_the_same_folder(tmp_path):
     (tmp_path / "other.py").write_text("x = 1\n")
     assert systems.digest(where) == known[-1]
     with pytest.raises(RefusedError, match=r"was made with another controller\.code"):
-        own_parts.check_unchanged({"controller.code": where}, tmp_path, {"controller_sha256": known[0]})
+        custom_parts.check_unchanged({"controller.code": where}, tmp_path, {"controller_sha256": known[0]})

@@ -13,7 +13,7 @@ from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.scenario import parsing, systems
 from ptsmc_jax.scenario.errors import ScenarioError
-from tuning.search import own_parts
+from tuning.search import custom_parts
 from tuning.studies import campaign_folder
 
 # a custom file that writes a marker when it runs, with a double integrator and a custom metric
@@ -163,7 +163,7 @@ def test_the_same_campaign_resumes_without_a_flag(command, flown, home):
     )
     assert (code, error) == (0, reported(home))
     assert pl.read_parquet(flown / "trials").height == 30
-    assert campaign_folder.opened(flown).own_names == ["farthest"]
+    assert campaign_folder.opened(flown).custom_metric_names == ["farthest"]
 
 
 def test_a_scenario_in_results_needs_trust_wherever_its_file_is(command, flown, home, capsys):
@@ -178,11 +178,11 @@ def test_a_scenario_in_results_needs_trust_wherever_its_file_is(command, flown, 
         for asked in ("simulate", "tune", "montecarlo", "map", "pareto"):
             code, out, error = command(asked, path, "--out", "new")
             assert (code, out) == (2, "")
-            assert "names code of its own" in error
+            assert "names custom code" in error
     assert not ran(flown)
     assert not ran(home)
     loaded = scenario.read(flown / "evil.toml")
-    own_parts.allow_scenario(flown / "evil.toml", loaded, True)
+    custom_parts.allow_scenario(flown / "evil.toml", loaded, True)
     assert capsys.readouterr().err == reported(flown, flown / "evil.toml")
 
 
@@ -206,7 +206,7 @@ def test_every_program_of_a_users_scenario_is_reported(tmp_path, capsys, system,
     (home / "link.py").symlink_to(tmp_path / "my.py")
     path = home / "mine.toml"
     path.write_text(SCENARIO.replace("my.py:mine", system.format(above=tmp_path)))
-    own_parts.allow_scenario(path, scenario.read(path), False)
+    custom_parts.allow_scenario(path, scenario.read(path), False)
     told = f"ptsmc: runs {runs.format(above=tmp_path)}, which plant.system of {path} names\n"
     assert capsys.readouterr().err == told
     assert not any(ran(folder) for folder in (tmp_path, home, home / "below"))
@@ -283,7 +283,7 @@ def test_inconsistent_result_folders_are_refused_in_one_sentence(command, tmp_pa
 
 
 def _tables(*codes):
-    laws = [{"kind": "own", "code": str(code)} for code in codes]
+    laws = [{"kind": "custom", "code": str(code)} for code in codes]
     return {"controller": laws[0], "disturbance": {"terms": laws[1:]}} if laws[1:] else {"controller": laws[0]}
 
 
@@ -295,7 +295,7 @@ def test_a_result_folder_contains_copies_of_its_custom_files(tmp_path):
         (tmp_path / name).mkdir()
         (tmp_path / name / "mine.py").write_text(text)
     where = [f"{tmp_path}/a/mine.py:Law", f"{tmp_path}/b/mine.py:Push", f"{tmp_path}/a/mine.py:Pull", "pack.age:Mine"]
-    found = own_parts.carry(_tables(*where), made)
+    found = custom_parts.carry(_tables(*where), made)
     assert found == _tables("mine.py:Law", "mine_2.py:Push", "mine.py:Pull", "pack.age:Mine")
     assert {path.name: path.read_text() for path in made.iterdir()} == {"mine.py": "x = 1\n", "mine_2.py": "x = 2\n"}
 
@@ -320,5 +320,5 @@ def test_a_custom_file_with_local_imports_is_not_copied(tmp_path, text, carried)
     (tmp_path / "beside.py").touch()
     (tmp_path / "mine.py").write_text(text)
     where = f"{tmp_path}/mine.py:Law"
-    assert own_parts.carry(_tables(where), made) == _tables("mine.py:Law" if carried else where)
+    assert custom_parts.carry(_tables(where), made) == _tables("mine.py:Law" if carried else where)
     assert [path.name for path in made.iterdir()] == (["mine.py"] if carried else [])

@@ -16,7 +16,7 @@ from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo, store
 from ptsmc_jax.laws.base import Sample
 from ptsmc_jax.onboard.board import board
-from ptsmc_jax.scenario import own, parsing, reading, systems
+from ptsmc_jax.scenario import custom, parsing, reading, systems
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import rollout
 from tests.helpers import ROOT, SHORT, SHORT_CHAIN, short, small_search, vector
@@ -43,9 +43,9 @@ class Mine(ptsmc.AccelerationLaw):
 """
 SAMPLED = {"mode": "sampled", "period": 0.1, "t_end": 6.5}
 CHAIN = {"plant": {"kind": "chain", "order": 2, "x0": [1.0, 0.0]}, "loop": SAMPLED}
-MINE = {"kind": "own", "code": "mine.py:Mine", "t_f": 5.0}
+MINE = {"kind": "custom", "code": "mine.py:Mine", "t_f": 5.0}
 # the law above instead of the published law, without the keys that only the published law has
-SHORT_OWN = SHORT.replace("[controller]\n", '[controller]\nkind = "own"\ncode = "mine.py:Mine"\n').replace(
+SHORT_CUSTOM = SHORT.replace("[controller]\n", '[controller]\nkind = "custom"\ncode = "mine.py:Mine"\n').replace(
     "surface_rate = 1.0\nsign_width = 1e-3\n", ""
 )
 
@@ -91,7 +91,7 @@ def test_a_custom_part_can_be_registered_as_a_pytree_already(here):
         + OTHER.replace("class Wave(", "@pytree\n@dataclass(frozen=True)\nclass Wave(")
     )
     (here / "other.py").write_text(HEAD + OTHER)
-    one, other = (flown({**CHAIN, "disturbance": {"kind": "own", "code": f"{file}.py:Wave"}}, record=False)
+    one, other = (flown({**CHAIN, "disturbance": {"kind": "custom", "code": f"{file}.py:Wave"}}, record=False)
                   for file in ("said", "other"))  # fmt: skip
     assert one.metrics.effort == other.metrics.effort > 0.0
 
@@ -100,13 +100,13 @@ def test_reading_runs_no_code_and_completing_finds_keys_gains_and_bounds():
     (systems.Path("mine.py")).write_text(HEAD + "raise RuntimeError('was run')\n" + LAW)
     tables = {**CHAIN, "controller": {**MINE, "k1": 2}, "tune": {"trials": 8}}
     loaded = scenario.from_tables(tables)
-    assert own.waits(loaded)
+    assert custom.waits(loaded)
     assert parsing.dump(loaded)["controller"]["k1"] == 2
     with pytest.raises(ScenarioError, match=r"controller\.code is .* running mine\.py fails: RuntimeError"):
         reading.complete(loaded)
     (systems.Path("mine.py")).write_text(HEAD + LAW)
     whole = reading.complete(loaded)
-    assert not own.waits(whole)
+    assert not custom.waits(whole)
     assert reading.complete(whole) is whole
     assert whole.controller.k1 == 2.0
     assert whole.controller.eta == 3.0
@@ -132,20 +132,20 @@ def test_custom_numbers_have_units_and_custom_gains_have_bounds(here):
 
 
 def test_a_scenario_with_custom_code_can_be_pickled_before_and_after_the_code_runs(here):
-    (here / "mine.toml").write_text('controller = { kind = "own", code = "mine.py:Mine" }\nloop.mode = "sampled"\n')
+    (here / "mine.toml").write_text('controller = { kind = "custom", code = "mine.py:Mine" }\nloop.mode = "sampled"\n')
     waits = ptsmc.read("mine.toml")
     for read in (waits, reading.complete(waits)):
         again = pickle.loads(pickle.dumps(read))
         assert again == read
-        assert own.waits(again) == own.waits(read)
+        assert custom.waits(again) == custom.waits(read)
 
 
 def test_custom_gains_can_be_set_in_parts_and_in_the_scenario():
     file = ROOT / "scenarios" / "own_parts.py"
     tables = {
         **CHAIN,
-        "controller": {"kind": "own", "code": f"{file}:Scaling", "t_f": 5.0, "delta": 0.5},
-        "observer": {"kind": "own", "code": f"{file}:LowPass"},
+        "controller": {"kind": "custom", "code": f"{file}:Scaling", "t_f": 5.0, "delta": 0.5},
+        "observer": {"kind": "custom", "code": f"{file}:LowPass"},
         "tune": {"trials": 8},
     }
     whole = reading.complete(scenario.from_tables(tables))
@@ -157,7 +157,7 @@ def test_custom_gains_can_be_set_in_parts_and_in_the_scenario():
     assert gains.gains_of(moved) == {
         "delta": 0.5, "m": 1.0, "k1": 0.25, "k": 1e-3, "observer_rate": 3.5, "t_f": 5.0,
     }  # fmt: skip
-    assert gains.own(moved, gains.named(whole)) == [0.5, 1.0, 0.25, 1e-3, 3.5]
+    assert gains.present_values(moved, gains.named(whole)) == [0.5, 1.0, 0.25, 1e-3, 3.5]
     written = gains.in_scenario(whole, {"m": 2.0, "observer_rate": 4.0})
     assert (written.controller.m, written.observer.rate) == (2.0, 4.0)
     assert gains.units_of(whole)["observer_rate"] == "1/s"
@@ -174,10 +174,10 @@ class Signed(ptsmc.AccelerationLaw):
 """
 
 
-@pytest.mark.parametrize(("own", "bounds"), [(0.5, (-1.0, 1.0)), (-3.0, (-4.0, 1.0)), (2.0, (-1.0, 7.0))])
-def test_default_bounds_of_a_gain_of_any_sign_contain_its_value(here, own, bounds):
+@pytest.mark.parametrize(("value", "bounds"), [(0.5, (-1.0, 1.0)), (-3.0, (-4.0, 1.0)), (2.0, (-1.0, 7.0))])
+def test_default_bounds_of_a_gain_of_any_sign_contain_its_value(here, value, bounds):
     (here / "signed.py").write_text(HEAD + SIGNED)
-    law = {"kind": "own", "code": "signed.py:Signed", "t_f": 5.0, "lead": own}
+    law = {"kind": "custom", "code": "signed.py:Signed", "t_f": 5.0, "lead": value}
     whole = reading.complete(scenario.from_tables({**CHAIN, "controller": law, "tune": {}}))
     assert whole.tune is not None
     assert whole.tune.bounds == {"lead": bounds}
@@ -186,7 +186,7 @@ def test_default_bounds_of_a_gain_of_any_sign_contain_its_value(here, own, bound
 def test_a_class_from_python_needs_no_file():
     law = made("mine.py", "Mine")
     base = scenario.from_tables({**CHAIN, "controller": {"kind": "pd", "t_f": 5.0}})
-    whole = scenario.replace(base, controller={"kind": "own", "code": law, "t_f": 5.0, "eta": 2.5})
+    whole = scenario.replace(base, controller={"kind": "custom", "code": law, "t_f": 5.0, "eta": 2.5})
     assert whole.controller.eta == 2.5
     np.testing.assert_array_equal(scenario.study(whole).parts.controller.eta, flown_with_file().controller.eta)
 
@@ -248,7 +248,7 @@ def test_only_declared_numbers_of_a_custom_disturbance_are_dispersed(here, what)
     how = {"amplitude": "relative_normal", "phase": "uniform"}[what]
     tables = {
         **CHAIN,
-        "disturbance": {"kind": "own", "code": "other.py:Wave"},
+        "disturbance": {"kind": "custom", "code": "other.py:Wave"},
         "dispersion": {f"disturbance_{what}": {"kind": how}},
     }
     named = OTHER.replace("size", what)
@@ -266,7 +266,7 @@ def test_only_declared_numbers_of_a_custom_disturbance_are_dispersed(here, what)
 def test_a_custom_disturbance_is_checked_beside_terms_without_a_signal(here, beside):
     """The sum of both is then the custom disturbance itself."""
     (here / "other.py").write_text(HEAD + OTHER)
-    terms = [{"kind": "own", "code": "other.py:Wave"}, {"kind": beside}]
+    terms = [{"kind": "custom", "code": "other.py:Wave"}, {"kind": beside}]
     ready = scenario.study(scenario.from_tables({**CHAIN, "disturbance": {"kind": "sum", "terms": terms}}))
     assert type(ready.parts.disturbance).__name__ == "Wave"
 
@@ -275,15 +275,15 @@ def test_a_custom_disturbance_and_observer_match_built_in_parts_and_a_loop_by_ha
     """The built-in sum of two sinusoids gives the same run, and a loop by hand gives the observer's memory."""
     (here / "other.py").write_text(HEAD + OTHER)
     law = {"kind": "pd", "k_p": 2.0, "k_d": 2.0, "t_f": 5.0}
-    own_one = {**CHAIN, "controller": law, "disturbance": {"kind": "own", "code": "other.py:Wave", "size": 0.03}}
+    custom_one = {**CHAIN, "controller": law, "disturbance": {"kind": "custom", "code": "other.py:Wave", "size": 0.03}}
     waves = [{"kind": "sinusoid", "amplitude": [0.03], "frequency": [w], "phase": [0.0]} for w in (0.5, 1.5)]
     known = {**CHAIN, "controller": law, "disturbance": {"kind": "sum", "terms": waves}}
-    one, other = (flown(tables) for tables in (own_one, known))
+    one, other = (flown(tables) for tables in (custom_one, known))
     np.testing.assert_allclose(one.log.x, other.log.x, rtol=0, atol=1e-14)
-    steps = [scenario.study(scenario.from_tables(tables)).parts.substeps for tables in (own_one, known)]
+    steps = [scenario.study(scenario.from_tables(tables)).parts.substeps for tables in (custom_one, known)]
     assert steps[0] == steps[1]  # `fastest` sets the steps like the keys of the built-in sum
 
-    watched = flown({**own_one, "observer": {"kind": "own", "code": "other.py:Filtered", "share": 0.7}})
+    watched = flown({**custom_one, "observer": {"kind": "custom", "code": "other.py:Filtered", "share": 0.7}})
     kept = np.asarray(watched.log.has_length)
     t, x, u = (np.asarray(v)[kept] for v in (watched.log.t, watched.log.x, watched.log.u))
     seen = np.diff(x[:, 1]) / np.diff(t) - u[:-1, 0]  # x_2' = u + d: the mean of d over each period
@@ -295,9 +295,9 @@ def test_bounds_that_depend_on_a_custom_reference_are_known_after_its_code_has_r
     """Reading a scenario runs no code, so the rate of the reference is unknown until then."""
     (here / "other.py").write_text(HEAD + OTHER)
     shared = {"loop": SAMPLED, "controller": {"t_f": 5.0}}
-    waiting = {**shared, "reference": {"kind": "own", "code": "other.py:Turning", "rate": 0.03}}
+    waiting = {**shared, "reference": {"kind": "custom", "code": "other.py:Turning", "rate": 0.03}}
     spin = {**shared, "reference": {"kind": "spin", "rate": [0.0, 0.0, 0.03]}}
-    there = {"kind": "own", "code": made("other.py", "Steady")}
+    there = {"kind": "custom", "code": made("other.py", "Steady")}
     for acting in ({"kind": "gravity_gradient", "orbit_rate": 1e-2}, there):
         loaded = scenario.from_tables({**waiting, "disturbance": acting})
         assert loaded.controller.disturbance_rate_bound is None
@@ -312,7 +312,7 @@ def test_a_custom_reference_has_exact_rates(here):
     (here / "other.py").write_text(HEAD + OTHER)
     start = {"rotvec_deg": [10.0, 20.0, -30.0]}
     tables = {"loop": {**SAMPLED}, "controller": {"kind": "pd", "t_f": 5.0}}
-    turning = {**tables, "reference": {"kind": "own", "code": "other.py:Turning", **start}}
+    turning = {**tables, "reference": {"kind": "custom", "code": "other.py:Turning", **start}}
     spin = {**tables, "reference": {"kind": "spin", "rate": [0.0, 0.0, 0.03], **start}}
     for t in (0.0, 2.5):
         one, other = (
@@ -467,7 +467,7 @@ def test_errors_in_other_custom_parts_are_one_sentence(here, name, old, new, of_
     assert old in OTHER
     (here / "other.py").write_text(HEAD + OTHER.replace(old, new))
     kind = {"observer": "Filtered", "disturbance": "Wave"}[name]
-    tables = {**CHAIN, "controller": {"kind": "pd", "t_f": 5.0}, name: {"kind": "own", "code": f"other.py:{kind}"}}
+    tables = {**CHAIN, "controller": {"kind": "pd", "t_f": 5.0}, name: {"kind": "custom", "code": f"other.py:{kind}"}}
     with pytest.raises(ScenarioError) as caught:
         scenario.study(scenario.from_tables(tables))
     assert of_what in str(caught.value) or "disturbance is too fast" in str(caught.value)
@@ -489,7 +489,7 @@ def test_errors_in_other_custom_parts_are_one_sentence(here, name, old, new, of_
 def test_a_custom_reference_that_returns_no_attitude_is_refused(here, old, new, said):
     (here / "other.py").write_text(HEAD + OTHER.replace(old, new))
     tables = {"loop": SAMPLED, "controller": {"kind": "pd", "t_f": 5.0},
-              "reference": {"kind": "own", "code": "other.py:Turning"}}  # fmt: skip
+              "reference": {"kind": "custom", "code": "other.py:Turning"}}  # fmt: skip
     with pytest.raises(ScenarioError, match=r"reference\.code") as caught:
         scenario.study(scenario.from_tables(tables))
     assert said in str(caught.value)
@@ -497,20 +497,22 @@ def test_a_custom_reference_that_returns_no_attitude_is_refused(here, old, new, 
 
 def test_a_reference_that_becomes_nan_is_not_reported_as_singular(here):
     (here / "other.py").write_text(HEAD + OTHER.replace("jnp.cos(half)", "jnp.where(t > 3.0, jnp.nan, jnp.cos(half))"))
-    tables = {"loop": SAMPLED, "controller": {"t_f": 5.0}, "reference": {"kind": "own", "code": "other.py:Turning"}}
+    tables = {"loop": SAMPLED, "controller": {"t_f": 5.0}, "reference": {"kind": "custom", "code": "other.py:Turning"}}
     with pytest.raises(ScenarioError, match=r"^reference.*its attitude is not finite at t = 3\.00. s; allowed are"):
         scenario.study(scenario.from_tables(tables))
 
 
 def test_a_file_that_names_a_class_from_python_cannot_be_read(here):
-    made_here = ptsmc.replace(scenario.from_tables(CHAIN), controller={"kind": "own", "code": made("mine.py", "Mine")})
+    made_here = ptsmc.replace(
+        scenario.from_tables(CHAIN), controller={"kind": "custom", "code": made("mine.py", "Mine")}
+    )
     ptsmc.write(made_here, "s.toml")
     with pytest.raises(ScenarioError, match=r'^controller\.code is "<Mine made in Python>": it names nothing'):
         scenario.read("s.toml")
 
 
 def test_results_with_custom_code_need_trust(command, here):
-    text = SHORT_CHAIN.replace("[controller]\n", '[controller]\nkind = "own"\ncode = "mine.py:Mine"\n')
+    text = SHORT_CHAIN.replace("[controller]\n", '[controller]\nkind = "custom"\ncode = "mine.py:Mine"\n')
     (here / "s.toml").write_text(text)
     assert command("simulate", "s.toml", "--no-figures", "--quiet")[0] == 0
     left = here / "out/simulate-s/scenario.toml"
@@ -537,7 +539,7 @@ def test_late_errors_in_custom_code_are_one_sentence(command, here, monkeypatch)
     monkeypatch.setattr(systems, "_files", set())
     kept = LAW.replace("        left =", "        kept.append(error)\n        error = kept[-4:][0]\n        left =")
     (here / "mine.py").write_text(HEAD + "kept = []\n\n\ndef fails():\n    return 1 / 0\n" + kept)
-    (here / "s.toml").write_text(SHORT_OWN)
+    (here / "s.toml").write_text(SHORT_CUSTOM)
     code, _, error = command("simulate", "s.toml", "--no-figures", "--quiet")
     assert code == 2
     runs, refused = error.splitlines()
@@ -559,7 +561,7 @@ def test_a_custom_law_that_stores_a_number_between_calls_is_refused(command, her
     """Every sample of a run would use the number that the check at t = 0 stored."""
     kept = LAW.replace("        left =", "        kept.append(error)\n        error = kept[-2:][0]\n        left =")
     (here / "mine.py").write_text(HEAD + "kept = []\n\n\n" + kept)
-    (here / "s.toml").write_text(SHORT_OWN)
+    (here / "s.toml").write_text(SHORT_CUSTOM)
     for asked in (["simulate", "s.toml"], ["montecarlo", "s.toml", "--trials", 2]):
         code, _, error = command(*asked, "--no-figures", "--quiet")
         assert (code, "its acceleration keeps a number of a run" in error) == (2, True)
@@ -569,7 +571,7 @@ def test_custom_code_that_exits_is_a_configuration_error(command, here):
     """An earlier version ended with the status of the custom code, 0, which means that all requirements are met."""
     late = LAW.replace("        left =", "        asked.append(0)\n        if len(asked) > 4: exit(0)\n        left =")
     (here / "mine.py").write_text(HEAD + "asked = []\n" + late)
-    (here / "s.toml").write_text(SHORT_OWN)
+    (here / "s.toml").write_text(SHORT_CUSTOM)
     code, _, error = command("simulate", "s.toml", "--no-figures", "--quiet")
     assert code == 2
     assert error.splitlines()[1:] == [f"ptsmc: {here}/mine.py fails: SystemExit: 0 (line 16 of mine.py)"]
@@ -580,7 +582,7 @@ def test_a_scenario_without_gains_is_refused_before_a_search(command, here):
     (here / "mine.py").write_text(HEAD + LAW.split("    eta:")[0] + "    def acceleration(self, now, error, *_):\n"
                                   "        return -error, error\n")  # fmt: skip
     (here / "s.toml").write_text(
-        '[plant]\nkind = "chain"\n[controller]\nkind = "own"\ncode = "mine.py:Mine"\n[observer]\nkind = "none"\n'
+        '[plant]\nkind = "chain"\n[controller]\nkind = "custom"\ncode = "mine.py:Mine"\n[observer]\nkind = "none"\n'
         '[loop]\nmode = "sampled"\n'
     )
     for search in ("tune", "pareto"):
@@ -594,7 +596,7 @@ def test_a_scenario_without_gains_is_refused_before_a_search(command, here):
 @pytest.mark.long
 def test_the_command_tunes_a_custom_law(command, here, monkeypatch):
     small_search(monkeypatch)
-    (here / "s.toml").write_text(SHORT_OWN)
+    (here / "s.toml").write_text(SHORT_CUSTOM)
     assert command("tune", "s.toml", "--no-figures")[0] in (0, 1)
     found = tomllib.loads((here / "out/tune-s/tuned.toml").read_text())["controller"]
     assert 2.1 <= found["eta"] <= 6.0
@@ -621,7 +623,7 @@ def test_a_law_integrates_the_error_in_its_memory():
             memory = now.memory + now.dt * error
             return -2.0 * error - 2.0 * error_rate - self.k * memory, error, memory
 
-    tables = {**CHAIN, "controller": {"kind": "own", "code": Integral, "t_f": 5.0}}
+    tables = {**CHAIN, "controller": {"kind": "custom", "code": Integral, "t_f": 5.0}}
     log = flown(tables).log
     kept = np.asarray(log.has_length)
     t, x, u = (np.asarray(v)[kept] for v in (log.t, log.x, log.u))
@@ -644,7 +646,7 @@ def test_the_first_sample_of_a_law_sees_the_initial_error(clock):
             start = jnp.where(now.t == 0.0, error, now.memory)
             return -self.k * error - 2.0 * error_rate, start, start
 
-    table = {"kind": "own", "code": First, "t_f": 5.03, "delta": 0.5}  # not a whole number of periods
+    table = {"kind": "custom", "code": First, "t_f": 5.03, "delta": 0.5}  # not a whole number of periods
     log = flown({**CHAIN, "controller": table, "loop": {**SAMPLED, "clock": clock}}).log
     kept = np.asarray(log.has_length)
     assert kept.any()
@@ -701,7 +703,7 @@ def test_a_gain_of_an_observer_can_have_a_name_like_a_gain_of_an_axis(here):
     """An earlier version took it for the gain of an axis, and a search ended in a traceback."""
     low = OTHER.replace("self.share", "self.gain_low").replace("share: float", "gain_low: float")
     (here / "mine.py").write_text(HEAD + low)
-    observer = {"kind": "own", "code": "mine.py:Filtered", "gain_low": 0.7}
+    observer = {"kind": "custom", "code": "mine.py:Filtered", "gain_low": 0.7}
     whole = reading.complete(scenario.from_tables({**CHAIN, "observer": observer, "tune": {}}))
     parts = gains.with_gains(scenario.study(whole).parts, {"observer_gain_low": 0.3})
     assert parts.observer.gain_low == 0.3
@@ -724,7 +726,7 @@ class Detumbling(ptsmc.AccelerationLaw):
 def test_a_law_that_computes_its_own_torque_has_no_singularity(here):
     """An earlier version reported it as singular at an attitude error of 180 deg, where only the inversion is."""
     (here / "mine.py").write_text(HEAD + DETUMBLING)
-    law = {"kind": "own", "code": "mine.py:Detumbling", "t_f": 5.0}
+    law = {"kind": "custom", "code": "mine.py:Detumbling", "t_f": 5.0}
     tables = {"controller": law, "loop": SAMPLED, "initial": {"rotvec_deg": [0.0, 0.0, 150.0]}}
     tables["dispersion"] = {"rate": {"kind": "normal", "std": 1.0}}
     ready = scenario.study(scenario.from_tables(tables))
@@ -747,7 +749,7 @@ class Forgetful(ptsmc.AccelerationLaw):
         return -error - 2.0 * error_rate, error, jnp.where(now.t > 2.0, jnp.nan, now.memory)
 """
     (here / "mine.py").write_text(HEAD + forgetful)
-    tables = {**CHAIN, "controller": {"kind": "own", "code": "mine.py:Forgetful", "t_f": 5.0}}
+    tables = {**CHAIN, "controller": {"kind": "custom", "code": "mine.py:Forgetful", "t_f": 5.0}}
     result = flown(tables, record=False)
     assert rollout.STATUS[int(result.status)][0] == "diverged"
     np.testing.assert_allclose(result.bad_time, 2.2, rtol=1e-12)  # the end of the first period after 2 s
