@@ -73,7 +73,7 @@ is `window_error = { limit = 1e-4, quantile = 0.9973, confidence = 0.9 }`. For a
 table may be `ape_boresight = { limit = 1e-3, probability = 0.9973, confidence = 0.9, interpretation = "mixed" }`.
 
 The sampled loop may also have required margins, which are numbers. `gain_margin` [dB], `phase_margin` [deg] and
-`delay_margin` [s] are lower limits. `modulus_margin` [dB] is the largest allowed peak of the sensitivity. A table has
+`delay_margin` [s] are lower limits. `peak_sensitivity` [dB] is the largest allowed peak sensitivity M_s. A table has
 these keys:"""
 
 SUITE = """\

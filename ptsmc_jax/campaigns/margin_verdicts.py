@@ -31,7 +31,7 @@ CALL = 32  # loops that are simulated and linearised at once
 JUDGED = 16  # loops whose exact margins are computed at a time
 DELAY = "delay_margin"  # the only margin that needs commands late within a period
 # first guess for the error of `margins.roughly`, in dB, deg, periods, dB; see `worst`
-OFF = {"gain_margin": 0.06, "phase_margin": 0.12, "delay_margin": 0.2, "modulus_margin": 0.01}
+OFF = {"gain_margin": 0.06, "phase_margin": 0.12, "delay_margin": 0.2, "peak_sensitivity": 0.01}
 # values that are not interpolated: of unstable loops, and of loops that no gain or phase makes unstable
 BOUNDS = (0.0, margins.MOST, -margins.MOST, 180.0, -180.0)
 

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from ptsmc_jax.figures.style import STYLES, plain_ticks, styled
 from ptsmc_jax.theory.margins import Margins
 
-MODULUS = 6.0  # sensitivity of the contour [dB]
+CONTOUR = 6.0  # sensitivity of the contour [dB]
 DEEPEST = 40.0  # largest and smallest |L| that is drawn [dB]
 
 
@@ -19,7 +19,7 @@ def _decibels(seen: np.ndarray) -> np.ndarray:
 
 @styled
 def nichols(L: np.ndarray, names: Sequence[str]) -> Figure:
-    """Plot |L| over its phase (points, axes), with the point -1 and the contour of the sensitivity `MODULUS`."""
+    """Plot |L| over its phase (points, axes), with the point -1 and the contour of the sensitivity `CONTOUR`."""
     figure = Figure(figsize=(8.0, 5.5), layout="constrained")
     axes = figure.subplots()
     for k, name in enumerate(names):
@@ -28,9 +28,9 @@ def nichols(L: np.ndarray, names: Sequence[str]) -> Figure:
         phase = phase - 360.0 * np.round((phase[near] + 180.0) / 360.0)
         colour, style = STYLES[k % len(STYLES)]
         axes.plot(phase, size, color=colour, ls=style, label=name)
-    around = np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 721)) * 10.0 ** (-MODULUS / 20.0) - 1.0
+    around = np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 721)) * 10.0 ** (-CONTOUR / 20.0) - 1.0
     angle = np.rad2deg(np.angle(around)) % 360.0 - 360.0
-    axes.plot(angle, _decibels(around), color="0.35", lw=1.0, label=f"sensitivity {MODULUS:g} dB")
+    axes.plot(angle, _decibels(around), color="0.35", lw=1.0, label=f"sensitivity {CONTOUR:g} dB")
     axes.plot(-180.0, 0.0, "+", color="0.0", ms=12, mew=1.6)
     axes.set(xlabel="phase of L [deg]", ylabel="|L| [dB]", ylim=(-DEEPEST, DEEPEST))
     axes.set_title("Nominal loop, opened at the plant's input, hold phase", loc="left")
@@ -49,7 +49,7 @@ def sensitivity(w: np.ndarray, L: np.ndarray, names: Sequence[str]) -> Figure:
         for letter, seen, style in (("S", 1.0 / (1.0 + L[:, k]), "-"), ("T", L[:, k] / (1.0 + L[:, k]), "--")):
             size = _decibels(seen)
             axes.semilogx(w[shown], size[shown], color=colour, ls=style, label=f"{letter} {name}")
-    axes.axhline(MODULUS, color="0.35", lw=1.0, ls=":")
+    axes.axhline(CONTOUR, color="0.35", lw=1.0, ls=":")
     axes.set(xlabel="frequency [rad/s]", ylabel="size [dB]", ylim=(-DEEPEST, 15.0))
     axes.set_title("Sensitivity S and complementary sensitivity T, nominal loop, hold phase", loc="left")
     axes.legend(ncols=len(names))

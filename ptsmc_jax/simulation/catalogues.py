@@ -81,7 +81,9 @@ MARGINS = {
     "gain_margin": Margin("dB", "factor on the gain, up or down, to the border of stability"),
     "phase_margin": Margin("deg", "phase, either way, to the border of stability"),
     "delay_margin": Margin("s", "further delay to the border of stability"),
-    "modulus_margin": Margin("dB", "largest sensitivity, 1 / the distance of L from -1", at_least=False),
+    "peak_sensitivity": Margin(
+        "dB", "peak sensitivity M_s = max |S|: 1 / the smallest distance of L from -1", at_least=False
+    ),
 }
 NO_SIGN = "the discontinuous sign has no derivative: margins are those of the loop without its switching term"
 

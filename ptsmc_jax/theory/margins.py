@@ -41,13 +41,13 @@ class Margins(NamedTuple):
     gain_down: Array  # [dB] Allowed gain reduction.
     phase: Array  # [deg]
     delay: Array  # [s]
-    modulus: Array  # [dB] Peak sensitivity M_s.
+    peak_sensitivity: Array  # [dB] Peak sensitivity M_s.
     stable: Array  # bool, whether the loop is stable.
     crossover: Array  # [rad/s] Frequency at which the phase margin is attained.
 
     def worst(self) -> dict[str, Any]:
         """Return the worst of each of `catalogues.MARGINS` over all axes and loops."""
-        return {name: (v.max if name == "modulus_margin" else v.min)() for name, v in self.each().items()}
+        return {name: (v.max if name == "peak_sensitivity" else v.min)() for name, v in self.each().items()}
 
     def each(self) -> dict[str, Any]:
         """Return each of `catalogues.MARGINS` by axis.
@@ -59,7 +59,7 @@ class Margins(NamedTuple):
             "gain_margin": xp.minimum(self.gain_up, self.gain_down),
             "phase_margin": self.phase,
             "delay_margin": self.delay,
-            "modulus_margin": xp.where(self.stable, self.modulus, MOST),
+            "peak_sensitivity": xp.where(self.stable, self.peak_sensitivity, MOST),
         }
 
 
@@ -206,14 +206,14 @@ def roughly(loop: Loop) -> dict[str, Array]:
     The keys are those of `catalogues.MARGINS`. The function takes about a tenth of the time of `of`.
     """
     spectrum = _spectrum(loop)
-    gain, phase, modulus = jax.vmap(crossings.straight)(spectrum.each)
+    gain, phase, peak_sensitivity = jax.vmap(crossings.straight)(spectrum.each)
     delay = jnp.min(jax.vmap(partial(crossings.delay_at, spectrum.w))(spectrum.each)[0], axis=1)
     sign = jnp.where(spectrum.stable, 1.0, -1.0)
     each = {
         "gain_margin": jnp.where(spectrum.stable & (gain >= MOST), jnp.inf, sign * jnp.minimum(gain, MOST)),
         "phase_margin": sign * phase,
         "delay_margin": jnp.where(spectrum.stable, delay, 0.0),
-        "modulus_margin": jnp.where(spectrum.stable, modulus, MOST),
+        "peak_sensitivity": jnp.where(spectrum.stable, peak_sensitivity, MOST),
     }
     return {name: jnp.where(spectrum.finite, v, jnp.nan) for name, v in each.items()}
 
@@ -249,7 +249,7 @@ def _axis(root: Array, L: Array, slope: Array, there: Array, stable: Array, lowe
         gain_down=jnp.where(stable, jnp.where(down < MOST, down, jnp.inf), -nearest),
         phase=jnp.where(stable, 1.0, -1.0) * jnp.min(angles),
         delay=jnp.zeros_like(up),
-        modulus=-20.0 * jnp.log10(jnp.min(jnp.abs(1.0 + L[crosses:]))),  # derivative by w is 0: no Newton step
+        peak_sensitivity=-20.0 * jnp.log10(jnp.min(jnp.abs(1.0 + L[crosses:]))),  # derivative by w is 0: no Newton step
         stable=stable,
         crossover=jnp.where(there[evens][worst], root[evens][worst], jnp.nan),
     )

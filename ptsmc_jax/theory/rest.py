@@ -150,5 +150,5 @@ def none_left(margins: Any, rows: Any) -> Any:
     """Return the `Margins` of loops (times, m) with zero margins in the marked rows (times,), except negative ones."""
     values = jax.tree.map(np.asarray, margins)
     lost = np.asarray(rows)[:, None] & values.stable
-    none = dict.fromkeys(values._fields, 0.0) | {"modulus": MOST, "stable": False, "crossover": np.nan}
+    none = dict.fromkeys(values._fields, 0.0) | {"peak_sensitivity": MOST, "stable": False, "crossover": np.nan}
     return values._replace(**{name: np.where(lost, none[name], getattr(values, name)) for name in values._fields})

@@ -30,7 +30,7 @@ BODY = {
     "observer": {"gain": [40.0, 40.0, 40.0]},
     "loop": {"mode": "sampled", "period": 0.1, "t_end": 10.0, "window": 1.0},
     "hardware": {"attitude_noise": 2e-5, "rate_noise": 1e-6},
-    "requirements": {"gain_margin": 6.0, "modulus_margin": 5.0},
+    "requirements": {"gain_margin": 6.0, "peak_sensitivity": 5.0},
     "tune": {"trials": 2, "free": ["eta", "observer_gain", "k1", "sign_width"]},
 }
 
@@ -62,12 +62,12 @@ def test_every_margin_can_be_required():
 @pytest.mark.parametrize("xp", [np, jnp], ids=["numpy", "jax"])
 def test_worst_margins_are_the_smallest_and_the_largest_peak_sensitivity(xp):
     two = {"gain_up": [7.0, 9.0], "gain_down": [8.0, 6.5], "phase": [50.0, 40.0], "delay": [0.1, 0.2]}
-    values = {**two, "modulus": [3.0, 4.0], "stable": [True, True], "crossover": [1.0, 2.0]}
+    values = {**two, "peak_sensitivity": [3.0, 4.0], "stable": [True, True], "crossover": [1.0, 2.0]}
     some = margins.Margins(**{name: xp.asarray(v) for name, v in values.items()})
-    expected = {"gain_margin": 6.5, "phase_margin": 40.0, "delay_margin": 0.1, "modulus_margin": 4.0}
+    expected = {"gain_margin": 6.5, "phase_margin": 40.0, "delay_margin": 0.1, "peak_sensitivity": 4.0}
     assert {name: float(v) for name, v in some.worst().items()} == expected
     unstable = some._replace(stable=xp.asarray([False, True]))
-    assert float(unstable.worst()["modulus_margin"]) == margins.MOST
+    assert float(unstable.worst()["peak_sensitivity"]) == margins.MOST
 
 
 @pytest.mark.parametrize(
@@ -160,7 +160,7 @@ def sloped(asked, bounds, share):
 
 
 def farthest(name, values, axis):
-    return (np.max if name == "modulus_margin" else np.min)(np.asarray(values), axis=axis)
+    return (np.max if name == "peak_sensitivity" else np.min)(np.asarray(values), axis=axis)
 
 
 class Lag(ptsmc.Draw):
@@ -303,7 +303,7 @@ def test_margin_gradients_with_dispersed_inertia_compile_if_delta_is_free():
 
 def test_evaluator_appends_margins_of_the_hardest_trials(drawn, monkeypatch):
     posed = drawn
-    assert posed.problem.rows == ("peak_torque", "gain_margin", "modulus_margin")
+    assert posed.problem.rows == ("peak_torque", "gain_margin", "peak_sensitivity")
     share = posed.evaluate.bounds.share(posed.scenario_gains)[None]
     flown = {"gains": share, "f": np.zeros(1), "c": np.array([[[-0.3, -0.2, -0.4]]]), "value": np.zeros(1)}
     monkeypatch.setattr(posed.evaluate, "_fly", lambda *_: dict(flown))

@@ -28,7 +28,9 @@ def test_commands_of_the_guide_run(command, tmp_path, monkeypatch):
     here.mkdir()
     for name in ("cubesat", "first_flight"):  # without margins and probabilities, which need thousands of trials
         text = (ROOT / "scenarios" / f"{name}.toml").read_text().split("\n[tune]")[0]
-        text = re.sub(r"\n\w+_margin = .*", "", text).replace(", probability = 0.9973, confidence = 0.9", "")
+        text = re.sub(r"\n(?:\w+_margin|peak_sensitivity) = .*", "", text).replace(
+            ", probability = 0.9973, confidence = 0.9", ""
+        )
         (here / f"{name}.toml").write_text(text + TUNE)
     (tmp_path / "mine.py").write_text(re.findall(r"```python\n(.*?)```", GUIDE, re.S)[0])
     law = '[controller]\nkind = "custom"\ncode = "mine.py:Growing"'

@@ -29,7 +29,7 @@ def torque(limit, peak, rms, gains=(("eta", 3.0),), **changes):
 
 
 def robust(limit, rms, **margins):
-    costs = {"gain_margin": 6.1, "phase_margin": 40.0, "delay_margin": math.inf, "modulus_margin": 5.8, **margins}
+    costs = {"gain_margin": 6.1, "phase_margin": 40.0, "delay_margin": math.inf, "peak_sensitivity": 5.8, **margins}
     interval = (0.95 * rms, 1.05 * rms)
     return Point(limit, {"eta": 3.0, "observer_gain_2": 25.0}, rms, interval, {"peak_torque": 0.2, **costs}, meets=True)
 
@@ -86,8 +86,8 @@ def test_gains_of_each_axis_next_to_one_gain_for_all_axes_or_none():
 
 
 def test_limit_exceeded_on_held_out_trials_is_not_compared_with_no_limit():
-    points = [robust(math.inf, 1e-5), robust(6.0, 2e-5, gain_margin=-100.0, modulus_margin=100.0),
-              robust(4.0, 3e-5, modulus_margin=4.02)]  # fmt: skip
+    points = [robust(math.inf, 1e-5), robust(6.0, 2e-5, gain_margin=-100.0, peak_sensitivity=100.0),
+              robust(4.0, 3e-5, peak_sensitivity=4.02)]  # fmt: skip
     assert list(front_report.answers(front(*points, against="margins", plant="chain"))) == [
         "RMS error 3e-05 x1 with |S| at most 4 dB, 3 times the error without a limit",
         "the gains found for |S| at most 6 dB exceed it on the held-out trials: 100 dB",
@@ -95,7 +95,7 @@ def test_limit_exceeded_on_held_out_trials_is_not_compared_with_no_limit():
 
 
 def test_unstable_loops_and_limits_without_gains_are_reported():
-    loose = robust(math.inf, 1e-5, gain_margin=-0.3, modulus_margin=100.0)
+    loose = robust(math.inf, 1e-5, gain_margin=-0.3, peak_sensitivity=100.0)
     made = front(loose, robust(6.0, 2e-5), against="margins", idle=[60.0], without=[3.0], floor=1e-6)
     assert list(front_report.answers(made)) == [
         "RMS error 8.25 arcsec with |S| at most 6 dB, 2 times the error without a limit",

@@ -63,12 +63,12 @@ def test_advice_on_a_fraction_of_the_time_uses_the_limit(interpretation):
     ("metric", "limit", "worst", "end"),
     [
         ("gain_margin", 6.0, 5.2, "requirements.gain_margin = 6.94"),
-        ("modulus_margin", 6.0, 7.5, "requirements.modulus_margin = 4.71"),
+        ("peak_sensitivity", 6.0, 7.5, "requirements.peak_sensitivity = 4.71"),
         ("phase_margin", 30.0, 0.0, "reduce [dispersion]"),
     ],
 )
 def test_advice_on_margins_that_held_out_loops_break(metric, limit, worst, end):
-    asked = Requirement(metric, limit, at_least=metric != "modulus_margin", unit=MARGINS[metric].unit)
+    asked = Requirement(metric, limit, at_least=metric != "peak_sensitivity", unit=MARGINS[metric].unit)
     values = np.full(256, worst)
     values[38:] = limit
     verdict = asked.verdict(values, np.ones(256, bool)).in_summary()
@@ -295,7 +295,7 @@ def test_global_check_is_compared_by_the_objectives(times, text):
 
 @pytest.mark.parametrize("gradients", [None, {"start": 1e-9, "end": 1e-9}])
 def test_margins_of_a_discontinuous_sign_are_reported_without_it(gradients):
-    hold = {"stable": True, "gain_margin": 9.0, "phase_margin": 40.0, "delay_margin": 0.1, "modulus_margin": 3.0}
+    hold = {"stable": True, "gain_margin": 9.0, "phase_margin": 40.0, "delay_margin": 0.1, "peak_sensitivity": 3.0}
     trust = {"margins": {"hold": hold}, "slopes_off_central_differences": gradients}
     text = " ".join(tune_report.diagnostics(examples.tune(trust=trust)))
     assert "gain 9 dB" in text
@@ -329,13 +329,13 @@ def test_gains_that_fit_their_training_trials_too_closely_are_reported(least, li
 
 
 def left(**changes):
-    known = {"stable": True, "gain_margin": 6.0, "phase_margin": 30.0, "delay_margin": 0.1, "modulus_margin": 5.0}
+    known = {"stable": True, "gain_margin": 6.0, "phase_margin": 30.0, "delay_margin": 0.1, "peak_sensitivity": 5.0}
     return summaries.read(summaries.Left, {**known, **changes})
 
 
 def test_small_margins_of_tuned_gains_are_warned_of():
-    enough, few = left(), left(gain_margin=5.9, phase_margin=0.0, modulus_margin=7.0)
-    unlimited = left(gain_margin=None, phase_margin=61.0, delay_margin=None, modulus_margin=1.0)
+    enough, few = left(), left(gain_margin=5.9, phase_margin=0.0, peak_sensitivity=7.0)
+    unlimited = left(gain_margin=None, phase_margin=61.0, delay_margin=None, peak_sensitivity=1.0)
     unstable = left(gain_margin=-1.2, stable=False)
     assert list(margins_report.tuned({"hold": enough, "before": unlimited}, required=False)) == [
         "margins of the nominal loop in the hold phase: gain 6 dB, phase 30 deg, delay 0.1 s, max |S| 5 dB",

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from ptsmc_jax.scenario import from_tables
+from ptsmc_jax.simulation import catalogues
 from tests.tree import ROOT
 from tests.units import in_units, powers
 from tuning.search import gains as gain_names
@@ -27,7 +28,7 @@ def tables_of(name: str, **changes: Any) -> dict[str, Any]:
 def without_margins(name: str) -> dict[str, Any]:
     """Return the tables of a satellite without requirements on margins, which take long to compile."""
     tables = tables_of(name)
-    requirements = {key: value for key, value in tables["requirements"].items() if not key.endswith("_margin")}
+    requirements = {key: value for key, value in tables["requirements"].items() if key not in catalogues.MARGINS}
     return {**tables, "requirements": requirements}
 
 

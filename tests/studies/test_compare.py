@@ -227,7 +227,7 @@ def test_every_law_appears_in_table_page_and_figures(eight, tmp_path):
     """There are more laws than plot colours. Tables, charts and figures show all of them."""
     base = scenario.from_tables(TABLES)
     margins = {"hold": {"stable": True, "gain_margin": 7.5, "phase_margin": 40.0, "delay_margin": None,
-                        "modulus_margin": 3.0}}  # fmt: skip
+                        "peak_sensitivity": 3.0}}  # fmt: skip
     one = replace(contender(eight), margins=margins, changed={"heavier": eight})
     names = ["paper", *compare.laws()]
     found = compare.Comparison(dict.fromkeys(names, one), 0, False)

@@ -65,8 +65,8 @@ def of_axes(rows, found, names, seen):
     assert len(found["before"]) == len(rows) / len(names) - 1
     for one in found["before"]:  # worst axis
         axes = [row for row in rows if float(row["time_to_go"]) == one["time_to_go"]]
-        assert len({row["modulus_dB"] for row in axes}) == len(names)
-        assert one["modulus"] == max(float(row["modulus_dB"]) for row in axes)
+        assert len({row["peak_sensitivity_dB"] for row in axes}) == len(names)
+        assert one["peak_sensitivity"] == max(float(row["peak_sensitivity_dB"]) for row in axes)
         assert one["phase"] == min(float(row["phase_deg"]) for row in axes)
         assert one["delay"] == min(float(row["delay_s"]) for row in axes)
     judged = [one["phase"] for one in found["before"] if one["judged"]]
@@ -74,7 +74,9 @@ def of_axes(rows, found, names, seen):
     np.testing.assert_allclose(found["worst"]["phase_margin"], min([*in_hold, *judged]))
     assert judged
     assert len(found["sensors"]) == seen
-    assert all({"gain_up", "phase", "modulus"} <= set(one) and "delay" not in one for one in found["sensors"].values())
+    assert all(
+        {"gain_up", "phase", "peak_sensitivity"} <= set(one) and "delay" not in one for one in found["sensors"].values()
+    )
     assert all(float(row["time_to_go"]) > 0.0 for row in rows if row not in hold)
 
 
@@ -157,11 +159,11 @@ def test_unstable_hold_phase_is_reported_with_negative_margins(command, tmp_path
 ])  # fmt: skip
 def test_loop_that_is_unstable_in_the_approach_phase_is_not_called_stable(judged, mood, headline):
     """Earlier, with a period of t_f / 2, the page called a loop with -1.9 dB and -180 deg stable."""
-    left = dict.fromkeys(("gain_up", "gain_down", "phase", "delay", "modulus"), 6.0)
+    left = dict.fromkeys(("gain_up", "gain_down", "phase", "delay", "peak_sensitivity"), 6.0)
     summary = {
         "stable": True, "open": [], "cut": [], "said": None, "hold": {"u1": left}, "together": left, "sensors": {},
         "before": [{"time_to_go": 1.0, "judged": judged, "stable": False, "open": [], "cut": []}],
-        "worst": {"gain_margin": -1.9, "phase_margin": None, "delay_margin": None, "modulus_margin": None},
+        "worst": {"gain_margin": -1.9, "phase_margin": None, "delay_margin": None, "peak_sensitivity": None},
     }  # fmt: skip
     report = reported(summary)
     assert (report.mood, report.headline) == (mood, headline)
@@ -262,11 +264,11 @@ def test_saturated_command_is_reported_as_an_open_loop():
     # margins at all inputs together and at the sensors may be smaller; the table has them
     assert any(line.startswith("these are the smallest margins at any input") for line in lines)
     # margins of an axis if another axis makes the loop unstable
-    least = np.full_like(course.at_input.modulus, -100.0)
-    lost = {"gain_up": least, "gain_down": least, "modulus": np.copysign(0.0, least), "stable": least > 0.0}
+    least = np.full_like(course.at_input.peak_sensitivity, -100.0)
+    lost = {"gain_up": least, "gain_down": least, "peak_sensitivity": np.copysign(0.0, least), "stable": least > 0.0}
     found = stability.summary(ready, course._replace(at_input=course.at_input._replace(**lost)))
     assert found["open"] == ["u1"]
-    assert str(found["hold"]["u1"]["modulus"]) == "0.0"  # not -0.0
+    assert str(found["hold"]["u1"]["peak_sensitivity"]) == "0.0"  # not -0.0
 
 
 def blamed_on_no_limit(found, first, limited):
@@ -284,7 +286,7 @@ def test_sample_that_the_law_ignores_is_not_reported_as_saturation(limit):
     """Earlier, `margins` reported saturation."""
     ready, course = stability.find(limited_to(limit))
     k = np.flatnonzero(course.loops.new[:-1, 0].any(axis=(1, 2)))[0]  # a sample without saturation
-    nothing = {"gain_up": np.inf, "gain_down": np.inf, "phase": 180.0, "modulus": 0.0, "crossover": np.nan}
+    nothing = {"gain_up": np.inf, "gain_down": np.inf, "phase": 180.0, "peak_sensitivity": 0.0, "crossover": np.nan}
     each = {name: getattr(course.at_input, name).copy() for name in nothing}
     for name, value in nothing.items():
         each[name][k] = value

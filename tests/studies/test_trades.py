@@ -19,7 +19,7 @@ from tests.output.pages import checked
 from tuning.search import gains
 from tuning.studies import judging, pareto, posing, stability, trades
 
-MARGINS = ("gain_margin", "phase_margin", "delay_margin", "modulus_margin")
+MARGINS = ("gain_margin", "phase_margin", "delay_margin", "peak_sensitivity")
 
 
 def test_larger_margins_reduce_the_accuracy(command, tmp_path, monkeypatch):
@@ -40,7 +40,7 @@ def test_larger_margins_reduce_the_accuracy(command, tmp_path, monkeypatch):
     assert [one["value"] for one in told["points"]] == [None, 6.0, 4.0]
     assert told["idle"] == [60.0]
     assert rows[0]["rms_window_error"] < rows[1]["rms_window_error"] < rows[2]["rms_window_error"]
-    assert rows[0]["modulus_margin"] > 6.0
+    assert rows[0]["peak_sensitivity"] > 6.0
     known = scenario.read(tmp_path / "c.toml")
     for row in rows:
         flown = scenario.replace(known, controller__k1=row["k1"], controller__sign_width=row["sign_width"])
@@ -50,13 +50,13 @@ def test_larger_margins_reduce_the_accuracy(command, tmp_path, monkeypatch):
         np.testing.assert_allclose(row["peak_torque"], np.max(trials.metrics.peak_torque[:60]), rtol=1e-9)
         by_place = stability.worst(scenario.study(judging.as_flown(flown))) or {}
         for name in MARGINS:
-            worst = max if name == "modulus_margin" else min
+            worst = max if name == "peak_sensitivity" else min
             limited = [place[name] for place in by_place.values() if place[name] is not None]
             np.testing.assert_allclose(row[name], worst(limited), rtol=1e-9, err_msg=name)
         # the limit replaces the required phase margin in the search, not in the verdict
-        assert row["modulus_margin"] <= row["limit"]
+        assert row["peak_sensitivity"] <= row["limit"]
         assert row["meets"] == (row["phase_margin"] >= 45.0 and row["peak_torque"] <= 3.0 and row["failures"] == 0)
-        sensitivity = 10.0 ** (row["modulus_margin"] / 20.0)
+        sensitivity = 10.0 ** (row["peak_sensitivity"] / 20.0)
         assert row["phase_margin"] >= np.rad2deg(2.0 * np.arcsin(0.5 / sensitivity)) * (1 - 1e-6)
         assert 10.0 ** (row["gain_margin"] / 20.0) >= (1.0 + 1.0 / sensitivity) * (1 - 1e-6)
     assert status == (0 if any(row["meets"] for row in rows) else 1)
@@ -106,15 +106,21 @@ def test_default_limits_include_the_limit_of_the_scenario():
     tables = tomllib.loads(SHORT_CHAIN)
     usual = [np.inf, 12.0, 8.0, 6.0, 5.0, 4.0, 3.0]
     assert trades.Margins(scenario.from_tables(tables)).values == usual
-    asked = scenario.from_tables({**tables, "requirements": {"modulus_margin": 5.5}})
+    asked = scenario.from_tables({**tables, "requirements": {"peak_sensitivity": 5.5}})
     assert trades.Margins(asked).values == sorted([*usual, 5.5], reverse=True)
 
 
 def test_sensitivity_limit_replaces_the_margins_that_it_bounds():
-    asked = {"peak_torque": 3.0, "gain_margin": 8.0, "phase_margin": 45.0, "delay_margin": 0.02, "modulus_margin": 5.0}
+    asked = {
+        "peak_torque": 3.0,
+        "gain_margin": 8.0,
+        "phase_margin": 45.0,
+        "delay_margin": 0.02,
+        "peak_sensitivity": 5.0,
+    }
     known = scenario.from_tables({**tomllib.loads(SHORT_CHAIN), "requirements": asked})
     limited = trades.Margins(known, (6.0, 4.0)).base
-    assert limited.requirements == {"peak_torque": 3.0, "delay_margin": 0.02, "modulus_margin": 4.0}
+    assert limited.requirements == {"peak_torque": 3.0, "delay_margin": 0.02, "peak_sensitivity": 4.0}
 
 
 def test_faster_slew_needs_more_torque_and_is_less_accurate(command, tmp_path, monkeypatch):

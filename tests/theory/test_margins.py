@@ -116,7 +116,7 @@ def test_margins_equal_those_of_an_independent_transfer_function(k1, period, rat
     peak = optimize.minimize_scalar(
         lambda w: np.abs(1 + respond(w)), bounds=(w[j - 1], w[min(j + 1, w.size - 1)]), options={"xatol": 1e-12}
     )
-    np.testing.assert_allclose(found.modulus, -20 * np.log10(peak.fun), atol=1e-8)
+    np.testing.assert_allclose(found.peak_sensitivity, -20 * np.log10(peak.fun), atol=1e-8)
     assert np.isinf(found.gain_down)  # a double integrator is stable with any small gain
     late = float(found.delay[0]) / period  # `borders` models delayed commands independently
     for share, stable in ((1 - 1e-7, True), (1 + 1e-7, False)):
@@ -160,7 +160,7 @@ def test_margin_derivatives_of_a_chain_equal_finite_differences():
         changed = with_gains(parts, {"k1": at[0], "sign_width": at[1], "surface_rate": at[2]})
         during = jax.tree.map(lambda v: v[index], linear.nominal(changed))
         found = margins.of(linear.opened(changed, during).loop)
-        return jnp.stack([found.gain_up[0], found.phase[0], found.delay[0], found.modulus[0]])
+        return jnp.stack([found.gain_up[0], found.phase[0], found.delay[0], found.peak_sensitivity[0]])
 
     @jax.jit
     def sloped(at, along):
@@ -369,7 +369,7 @@ def alone_as_together(loop):
     for name in ("gain_up", "gain_down", "phase", "delay"):
         assert 0.0 < at_once[name] < np.inf
         np.testing.assert_allclose(at_once[name], getattr(found, name)[0], rtol=1e-4)
-    np.testing.assert_allclose(at_once["modulus"], found.modulus[0], atol=1e-3)  # on the grid
+    np.testing.assert_allclose(at_once["peak_sensitivity"], found.peak_sensitivity[0], atol=1e-3)  # on the grid
 
 
 def test_margins_of_one_input_equal_margins_of_all_at_once():
@@ -591,9 +591,9 @@ def sensitive_together(loop):
         z[:, None, None] * np.eye(len(a)) - a, np.broadcast_to(b, (z.size, *b.shape))
     )
     peak = 20 * np.log10(np.linalg.svd(np.linalg.inv(back), compute_uv=False)[:, 0].max())
-    found = margins.together(loop)["modulus"]
+    found = margins.together(loop)["peak_sensitivity"]
     np.testing.assert_allclose(found, peak, atol=5e-3)  # both on grids
-    assert found > of(loop).modulus.max() - 5e-3
+    assert found > of(loop).peak_sensitivity.max() - 5e-3
 
 
 def test_peak_sensitivity_of_all_inputs_is_the_largest_singular_value():

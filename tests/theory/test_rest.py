@@ -84,7 +84,9 @@ def test_none_left_sets_positive_margins_to_zero_and_keeps_negative_ones():
     values: Any = {name: np.array([[3.0], [3.0], [-3.0]]) for name in margins.Margins._fields} | {"stable": stable}
     left = rest.none_left(margins.Margins(**values), [False, True, True])
     for name, of in left._asdict().items():
-        none = {"modulus": 100.0, "stable": False, "crossover": np.nan}.get(name, 0.0)  # values of an unstable loop
+        none = {"peak_sensitivity": 100.0, "stable": False, "crossover": np.nan}.get(
+            name, 0.0
+        )  # values of an unstable loop
         np.testing.assert_array_equal(of, [values[name][0], [none], values[name][2]], err_msg=name)
 
 

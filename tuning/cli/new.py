@@ -168,8 +168,8 @@ class _File:
             "The largest allowed value of a metric, in every trial or in a fraction of them, with a confidence. "
             f"A limit may have a unit: {'hold_angle' if 'hold_angle' in catalogue else 'settling_time'} = "
             f'"{"0.05 deg" if "hold_angle" in catalogue else "800 ms"}". The metrics are {", ".join(limited)}. '
-            f"The margins of the sampled loop are {', '.join(catalogues.MARGINS)}: the smallest allowed value, of the "
-            "last one the largest sensitivity."
+            f"The margins of the sampled loop are {', '.join(catalogues.MARGINS)}. The limit is "
+            "the smallest allowed margin, or the largest allowed peak sensitivity."
         )
         yield f"{'#' if live is None else ''}[requirements]"
         known = {**catalogue, **catalogues.MARGINS}

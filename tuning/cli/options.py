@@ -74,7 +74,7 @@ Times = Annotated[
 SensitivityLimits = Annotated[
     str | None,
     Parameter(
-        help="Limits on the largest sensitivity |S| to tune for, with --against margins [dB], such as 4,6,9; default: "
+        help="Limits on the peak sensitivity max |S| to tune for, with --against margins [dB], such as 4,6,9; default: "
         "3 to 12. The gains without a limit are found too."
     ),
 ]

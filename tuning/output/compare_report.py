@@ -71,7 +71,7 @@ def _hold(name: str) -> Value:
         left = law.margins["hold"].numbers[name]
         return math.inf if left is None else left  # null is unlimited
 
-    return Value(name.removesuffix("_margin"), MARGINS[name].unit, of)
+    return Value(name.removesuffix("_margin").replace("_", " "), MARGINS[name].unit, of)
 
 
 ERROR = Value(

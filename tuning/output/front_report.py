@@ -132,7 +132,7 @@ def _of_margins(front: Front) -> Iterator[str]:
         yield "without a limit on |S| some loops of the held-out trials are unstable"
     for point in limited:
         if not _keeps(point):
-            found = digits(point.costs["modulus_margin"], ".3g", "no value")
+            found = digits(point.costs["peak_sensitivity"], ".3g", "no value")
             yield f"the gains found for |S| at most {point.value:g} dB exceed it on the held-out trials: {found} dB"
 
 
@@ -156,7 +156,7 @@ def _of_times(front: Front) -> Iterator[str]:
 
 def _keeps(point: Point) -> bool:
     """Return whether the loops of the held-out trials keep the limit on |S| within 1 %."""
-    return point.costs["modulus_margin"] <= 1.01 * point.value
+    return point.costs["peak_sensitivity"] <= 1.01 * point.value
 
 
 def _rows(front: Front) -> list[tuple[str, Point]]:

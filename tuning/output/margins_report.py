@@ -14,7 +14,7 @@ COLUMNS = {
     "gain_down": "down [dB]",
     "phase": "phase [deg]",
     "delay": "delay [s]",
-    "modulus": "|S| [dB]",
+    "peak_sensitivity": "|S| [dB]",
 }
 
 
@@ -149,4 +149,4 @@ def shown(margins: Numbers) -> str:
 
 
 def _short(name: str) -> str:
-    return "max |S|" if name == "modulus_margin" else name.removesuffix("_margin")
+    return "max |S|" if name == "peak_sensitivity" else name.removesuffix("_margin")

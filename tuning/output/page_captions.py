@@ -14,7 +14,7 @@ CAPTIONS = {
     "a limit.",
     "front": "The front of accuracy against peak torque.",
     "slew_times": "The error and the costs of the slew over the prescribed time; open points break a requirement.",
-    "robustness": "The error, the torque and the margins over the limit on the largest sensitivity; open points break "
+    "robustness": "The error, the torque and the margins over the limit on the peak sensitivity; open points break "
     "a requirement.",
     "map": "Error and peak torque over the two keys, with the stability limits of the loop.",
     "nichols": "The open loop at each axis of the plant's input, the others closed.",

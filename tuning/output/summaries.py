@@ -146,7 +146,7 @@ class Left(msgspec.Struct, frozen=True):
     gain_margin: Number
     phase_margin: Number
     delay_margin: Number
-    modulus_margin: Number
+    peak_sensitivity: Number
     swing: Swing | None = None
 
     @property

@@ -44,11 +44,11 @@ def unit_of(name: str, plant: str) -> str:
 def titled(name: str, plant: str) -> str:
     """Return the heading of a metric or margin over trials, with its unit for this kind of plant.
 
-    >>> titled("peak_torque", "chain"), titled("delay_margin", "chain"), titled("modulus_margin", "chain")
+    >>> titled("peak_torque", "chain"), titled("delay_margin", "chain"), titled("peak_sensitivity", "chain")
     ('largest peak torque [u]', 'delay margin [s]', 'largest |S| [dB]')
     """
     words = name.replace("_", " ")
-    if name == "modulus_margin":
+    if name == "peak_sensitivity":
         words = "largest |S|"
     elif name == "window_error":
         words = f"RMS {words}"

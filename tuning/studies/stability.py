@@ -33,7 +33,7 @@ def find(scenario: Scenario) -> tuple[Study, Course]:
         raise ScenarioError(f'margins need the sampled loop, but loop.mode is "{scenario.loop.mode}"')
     ready = study(scenario)
     course = run_margins.along(ready.parts)
-    without_slopes, code = np.isnan(course.hold[1].modulus).any(), rollout.OK
+    without_slopes, code = np.isnan(course.hold[1].peak_sensitivity).any(), rollout.OK
     if course.clearance < rollout.SINGULAR_CLEARANCE:
         code = rollout.SINGULAR
     elif without_slopes:
@@ -61,7 +61,7 @@ def worst(ready: Study) -> dict[str, dict[str, Any]] | None:
     if not ready.scenario.sampled:
         return None
     left, hold, history = jax.tree.map(np.asarray, run_margins.judged_jit(ready.parts))
-    if np.isnan(left.modulus[-1]).any():
+    if np.isnan(left.peak_sensitivity[-1]).any():
         return None
     swing = rest.swing(ready.parts, history)
     if swing is not None:
@@ -120,7 +120,10 @@ def summary(ready: Study, course: Course) -> dict[str, Any]:
                 "time_to_go": t_f - float(t),
                 "judged": bool(counts),
                 "stable": bool(before.stable[k].all()),
-                **{name: _number((max if name == "modulus" else min)(getattr(before, name)[k])) for name in FIELDS},
+                **{
+                    name: _number((max if name == "peak_sensitivity" else min)(getattr(before, name)[k]))
+                    for name in FIELDS
+                },
                 **opened(k),
             }
             for k, (t, counts) in enumerate(zip(course.t[:-1], course.judged, strict=False))
@@ -141,7 +144,7 @@ def _open(left: margins.Margins) -> np.ndarray:
     """
     # infinite margins, or the largest reported distance from a stability limit if other axes make the loop unstable
     unlimited = (np.abs(left.gain_up) >= MOST) & (np.abs(left.gain_down) >= MOST)
-    return unlimited & (np.abs(left.modulus) < 1e-9) & np.isnan(left.crossover)
+    return unlimited & (np.abs(left.peak_sensitivity) < 1e-9) & np.isnan(left.crossover)
 
 
 def _start(ready: Study) -> dict[str, float]:
@@ -172,7 +175,7 @@ def write(folder: Path, ready: Study, course: Course, figures: bool) -> None:
         for j, t in enumerate(course.t.tolist())
         for k, name in enumerate(inputs)
     ]  # fmt: skip
-    units = ("gain_up_dB", "gain_down_dB", "phase_deg", "delay_s", "modulus_dB", "crossover_rad_s", "stable")
+    units = ("gain_up_dB", "gain_down_dB", "phase_deg", "delay_s", "peak_sensitivity_dB", "crossover_rad_s", "stable")
     store.write_csv(folder / "margins.csv", ["t", "time_to_go", "axis", *units], rows)
     if figures:
         from ptsmc_jax.figures import margin_plots, style

@@ -26,13 +26,13 @@ from tuning.search.rounds import MARGIN
 from tuning.studies import judging
 from tuning.studies.posing import Posed
 
-TORQUE, SENSITIVITY = "peak_torque", "modulus_margin"
+TORQUE, SENSITIVITY = "peak_torque", "peak_sensitivity"
 POINTS = 20  # default number of limits on the peak torque
 OFF = 1e9  # a limit on the peak torque that no gains reach
 HARDLY = 0.05  # fraction of the largest useful peak torque that hardly any gains keep
 TIGHTER = 3  # largest number of searches for the least peak torque
 FEWER = 4  # starting points of a search whose gains are refined later
-LIMITS = (3.0, 4.0, 5.0, 6.0, 8.0, 12.0)  # default limits on the largest sensitivity [dB]
+LIMITS = (3.0, 4.0, 5.0, 6.0, 8.0, 12.0)  # default limits on the peak sensitivity [dB]
 BOUNDED = ("gain_margin", "phase_margin", SENSITIVITY)  # margins that a limit on the sensitivity bounds
 SPAN = (0.5, 0.7, 1.0, 1.4, 2.0)  # default prescribed times, relative to the scenario's t_f
 # metrics that a faster slew may increase
@@ -172,9 +172,10 @@ class Torque(Trade):
 
 @dataclass(frozen=True)
 class Margins(Trade):
-    """Limits on the largest sensitivity max |S| = M, which bounds the other margins.
+    """Limits on the peak sensitivity M_s = max |S|, which bounds the other margins.
 
-    The loop tolerates gain factors between M / (M + 1) and M / (M - 1), and a phase error up to 2 asin(1 / (2 M)).
+    The loop tolerates gain factors between M_s / (M_s + 1) and M_s / (M_s - 1), and a phase error up to
+    2 asin(1 / (2 M_s)).
     Source: Skogestad and Postlethwaite, Multivariable Feedback Control, 2005, 2.4.3.
     """
 
@@ -319,7 +320,7 @@ def of(against: str, scenario: Scenario, points: int | None, listed: tuple[float
         against: "torque", "margins" or "t_f".
         scenario: with free gains.
         points: number of limits on the torque; None: `POINTS`.
-        listed: prescribed times [s], or limits on the largest sensitivity [dB]; empty: the defaults.
+        listed: prescribed times [s], or limits on the peak sensitivity [dB]; empty: the defaults.
 
     Raises:
         ScenarioError: the study does not apply to the scenario, or a time cannot be simulated.
