@@ -14,7 +14,7 @@ import polars as pl
 from matplotlib.figure import Figure
 
 from ptsmc_jax import scenario
-from ptsmc_jax.campaigns import campaign, margin_verdicts, plans, runs, store
+from ptsmc_jax.campaigns import campaign, margin_verdicts, run_tables, runs, store
 from ptsmc_jax.campaigns.montecarlo import CustomMetrics
 from ptsmc_jax.campaigns.runs import Run
 from ptsmc_jax.figures import animation, run_plots
@@ -188,7 +188,7 @@ def trials(
 
     Args:
         what: a scenario, the path of its file, or a study.
-        count: number of trials, or a run table with one row for each trial, see `plans`.
+        count: number of trials, or a run table with one row for each trial, see `run_tables`.
         seed: seed of the dispersions and the noise.
         custom_metrics: function that returns custom metrics, see `montecarlo.one`.
         controller: a folder that `export` wrote. Its C code then computes the torque, on the flight clock. If `what` is
@@ -216,10 +216,13 @@ def trials(
             f"custom_metrics is {getattr(custom_metrics, '__name__', type(custom_metrics).__name__)}: {error}"
         ) from None
     if isinstance(count, pl.DataFrame):
-        plan = plans.checked(count, ready.parts, custom_metrics=names, drawn=ready.dispersion.custom_names())
-        drawn, count = replace(campaign.of_plan(ready, seed, plan, custom_metrics), software=software), plan.count
+        table = run_tables.checked(count, ready.parts, custom_metrics=names, drawn=ready.dispersion.custom_names())
+        drawn = replace(campaign.of_run_table(ready, seed, table, custom_metrics), software=software)
+        count = table.count
     if np.ndim(count) or np.asarray(count).dtype == object:
-        raise ValueError(f"count is a {type(count).__name__}, but must be a whole number, or a plan as a polars table")
+        raise ValueError(
+            f"count is a {type(count).__name__}, but must be a whole number, or a polars table with a row for each"
+        )
     draws.check_whole_number("count", count, 1)
     return drawn.fly(range(count))
 

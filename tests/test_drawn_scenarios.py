@@ -83,8 +83,8 @@ def test_a_random_scenario_gives_equal_results_by_all_ways_to_run(seed, tmp_path
     for name in METRICS:
         close(np.float64(alone[name]), np.float64(rows[name][1]), err_msg=name)
     if ready.drawn:
-        planned = ptsmc.trials(known, rows, seed=SEED).select(rows.columns)
-        assert_frame_equal(planned, rows, rel_tol=1e-6, abs_tol=1e-12)
+        from_table = ptsmc.trials(known, rows, seed=SEED).select(rows.columns)
+        assert_frame_equal(from_table, rows, rel_tol=1e-6, abs_tol=1e-12)
     if said := refusal(lambda: ptsmc.export(known, tmp_path / "controller")):
         assert re.search("the C does not know of|nothing to check by", said)  # failed wheels or diverged
         return

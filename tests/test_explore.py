@@ -257,7 +257,7 @@ def test_trials_and_floor_use_the_given_seed(monkeypatch):
     monkeypatch.setattr(campaign.Campaign, "fly", lambda self, trials: self.seed)
     monkeypatch.setattr(runs, "floor", lambda ready, seed=0, rows=(): seed)
     made = scenario.from_tables(TABLES)
-    plan = pl.DataFrame({f"initial_w{k}": [0.01, 0.0] for k in (1, 2, 3)})
-    seed: Any = explore.trials(made, plan, seed=3)
+    run_table = pl.DataFrame({f"initial_w{k}": [0.01, 0.0] for k in (1, 2, 3)})
+    seed: Any = explore.trials(made, run_table, seed=3)
     assert seed == 3
     assert explore.floor(made, seed=5) == 5

@@ -15,15 +15,15 @@ import polars as pl
 
 from ptsmc_jax import configure, programs
 from ptsmc_jax.batching import lanes
-from ptsmc_jax.campaigns import montecarlo, plans
+from ptsmc_jax.campaigns import montecarlo, run_tables
 from ptsmc_jax.campaigns.montecarlo import CustomMetrics
-from ptsmc_jax.campaigns.plans import Plan
 from ptsmc_jax.campaigns.rows import Part, Rows, read
+from ptsmc_jax.campaigns.run_tables import RunTable
 from ptsmc_jax.devices.sensors import RATE_BIAS
-from ptsmc_jax.dispersions import planned
+from ptsmc_jax.dispersions import table_rows
 from ptsmc_jax.dispersions.base import CUSTOM
-from ptsmc_jax.dispersions.planned import Row
 from ptsmc_jax.dispersions.quantities import QUANTITIES
+from ptsmc_jax.dispersions.table_rows import Row
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.scenario import Study, custom_checks
 from ptsmc_jax.simulation import requirements, rollout
@@ -43,17 +43,17 @@ class Campaign:
     ready: Study
     seed: int
     custom_metrics: CustomMetrics | None = None  # custom metrics
-    plan: Plan | None = None  # run table with a row for each trial
+    run_table: RunTable | None = None  # run table with a row for each trial
     software: Software = OURS  # the flight computer
 
     @property
-    def plan_given(self) -> bool:
+    def table_sets_values(self) -> bool:
         """Whether a run table sets anything."""
-        return self.plan is not None and bool(self.plan.given)
+        return self.run_table is not None and bool(self.run_table.given)
 
     def rows(self, trials: np.ndarray) -> np.ndarray | Row:
         """Return the numbers of these trials, or their rows in the run table."""
-        return trials if self.plan is None else self.plan.rows(trials, self.seed)
+        return trials if self.run_table is None else self.run_table.rows(trials, self.seed)
 
     def fly(self, trials: Sequence[int] | np.ndarray) -> pl.DataFrame:
         """Simulate these trials; return their rows."""
@@ -86,7 +86,7 @@ class Campaign:
         return pl.DataFrame({"trial": wanted, **self._origin(wanted), **numbers})
 
     def _origin(self, trials: np.ndarray) -> dict[str, np.ndarray]:
-        return {} if self.plan is None else self.plan.origin(trials)
+        return {} if self.run_table is None else self.run_table.origin(trials)
 
     def custom_metric_names(self) -> list[str]:
         """Return the names of the custom metrics. Raises ValueError if they fail or a row cannot hold them."""
@@ -115,18 +115,22 @@ class Campaign:
         for name in flown.custom_metrics:
             if not custom_checks.names_column(name):
                 raise ValueError(f"its {name!r} is no name of a column; allowed are names that can be printed")
-            if name in {"trial", *plans.OF_ROWS.values(), *plans.RESULTS, *counted, *flown.drawn}:
+            if name in {"trial", *run_tables.OF_ROWS.values(), *run_tables.RESULTS, *counted, *flown.drawn}:
                 raise ValueError(f"its {name} has the name of a column that the rows have already")
         return list(flown.custom_metrics)
 
 
 def _counted(samples: dict[str, Any]) -> dict[str, Any]:
     """Return the numbers of samples by status, by column."""
-    return {f"{plans.COUNTED}{status}": count for status, count in samples.items()}
+    return {f"{run_tables.COUNTED}{status}": count for status, count in samples.items()}
 
 
-def of_plan(
-    ready: Study, seed: int, plan: Plan, custom_metrics: CustomMetrics | None = None, where: str = "the plan"
+def of_run_table(
+    ready: Study,
+    seed: int,
+    table: RunTable,
+    custom_metrics: CustomMetrics | None = None,
+    where: str = "the run table",
 ) -> Campaign:
     """Return the campaign of a run table.
 
@@ -136,7 +140,7 @@ def of_plan(
     Args:
         ready: the scenario, ready to simulate.
         seed: of rows without a seed.
-        plan: the run table.
+        table: the run table.
         custom_metrics: custom metrics.
         where: the name of the table in errors.
 
@@ -146,24 +150,24 @@ def of_plan(
     kinds = {*ready.dispersion.kinds, RATE_BIAS}
     same = []  # quantities that the table sets to the values that they have without it
     drawn = None  # the quantities of its trials without it
-    for name, values in plan.given.items():
+    for name, values in table.given.items():
         quantity = QUANTITIES[name]
         columns, usual = quantity.columns(ready.parts), np.asarray(quantity.read(ready.parts))[None]
         if not kinds.isdisjoint({name, CUSTOM}):  # a custom dispersion may change any
             if drawn is None:
-                drawn = Campaign(ready, seed, custom_metrics, plan.without(plan.given)).draw(range(plan.count))
+                drawn = Campaign(ready, seed, custom_metrics, table.without(table.given)).draw(range(table.count))
             if set(columns) <= set(drawn.columns):
                 usual = drawn.select(columns).to_numpy()
             elif name in kinds:
                 usual = np.zeros_like(values)
         if np.array_equal(np.broadcast_to(usual, values.shape), values):
             same.append(name)
-    campaign = Campaign(ready, seed, custom_metrics, plan.without(same))
-    if plan.angle is not None or plan.custom:
-        rows = drawn if drawn is not None and not campaign.plan_given else campaign.draw(range(plan.count))
-        plans.check_drawn(plan.custom, rows, where)
-        if plan.angle is not None:
-            plans.check_angle(plan.angle, rows[plans.ANGLE].to_numpy(), where)
+    campaign = Campaign(ready, seed, custom_metrics, table.without(same))
+    if table.angle is not None or table.custom:
+        rows = drawn if drawn is not None and not campaign.table_sets_values else campaign.draw(range(table.count))
+        run_tables.check_drawn(table.custom, rows, where)
+        if table.angle is not None:
+            run_tables.check_angle(table.angle, rows[run_tables.ANGLE].to_numpy(), where)
     return campaign
 
 
@@ -278,7 +282,7 @@ def _history(
     parts: Parts, dispersion: Dispersion, seed: jax.Array, trials: jax.Array | Row, software: Software
 ) -> tuple:
     def one(trial: jax.Array | Row) -> tuple:
-        about = planned.about(parts, dispersion, seed, trial)
+        about = table_rows.about(parts, dispersion, seed, trial)
         log = rollout.simulate(about.drawn, about.seed, about.trial, record=True, software=software).log
         assert log is not None
         return log.t, jnp.sqrt(jnp.sum(log.error**2, axis=-1)), log.has_length

@@ -12,10 +12,10 @@ from numpy.typing import ArrayLike
 from ptsmc_jax import configure, programs
 from ptsmc_jax.batching import lapack
 from ptsmc_jax.campaigns import montecarlo
-from ptsmc_jax.dispersions import planned
+from ptsmc_jax.dispersions import table_rows
 from ptsmc_jax.dispersions.base import CUSTOM, INERTIA, INITIAL_ATTITUDE, INITIAL_RATE, INITIAL_STATE, REFERENCE
-from ptsmc_jax.dispersions.planned import Row
 from ptsmc_jax.dispersions.quantities import QUANTITIES
+from ptsmc_jax.dispersions.table_rows import Row
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.scenario import Study
 from ptsmc_jax.simulation.assembly import Parts
@@ -79,8 +79,8 @@ def prepare(ready: Study, rows: np.ndarray | Row | None = None) -> None:
 
 def _whose_loops_differ(ready: Study, rows: np.ndarray | Row | None) -> np.ndarray | Row | None:
     """Return the trials whose margins are required; None: only the nominal loop, or no margin is required."""
-    planned_loops = isinstance(rows, Row) and not OF_LOOPS.isdisjoint(rows.given)
-    if not ready.margins or not (planned_loops or differ(ready.dispersion)):
+    given_loops = isinstance(rows, Row) and not OF_LOOPS.isdisjoint(rows.given)
+    if not ready.margins or not (given_loops or differ(ready.dispersion)):
         return None
     return np.arange(TRIALS) if rows is None else rows
 
@@ -195,7 +195,7 @@ def _look(
         return {name: _over(name, v) for name, v in margins.roughly(loop).items()}
 
     def one(trial: Array | Row) -> linear.Loop:
-        return run_margins.judged_loops(planned.about(parts, dispersion, seed, trial).drawn, late=late)[0]
+        return run_margins.judged_loops(table_rows.about(parts, dispersion, seed, trial).drawn, late=late)[0]
 
     def some(trials: Array | Row) -> tuple[linear.Loop, dict[str, Array]]:
         loops = lapack.vmap(one)(trials)

@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike
 from ptsmc_jax import configure, programs
 from ptsmc_jax.batching import lanes
 from ptsmc_jax.devices.sensors import RATE_BIAS
-from ptsmc_jax.dispersions import planned
+from ptsmc_jax.dispersions import table_rows
 from ptsmc_jax.dispersions.base import CUSTOM, Coordinates
-from ptsmc_jax.dispersions.planned import Row
+from ptsmc_jax.dispersions.table_rows import Row
 from ptsmc_jax.dispersions.variation import Dispersion, check_dispersion
 from ptsmc_jax.numerics.draws import WholeNumber, check_whole_number
 from ptsmc_jax.numerics.pytrees import listing
@@ -114,7 +114,7 @@ def one(
     """
     check_parts(parts)
     check_dispersion(dispersion)
-    about = planned.about(parts, dispersion, seed, trial)
+    about = table_rows.about(parts, dispersion, seed, trial)
     if coordinates is None:
         coordinates = about.dispersion.coordinates(about.seed, about.trial)
     drawn = about.dispersion.at(about.parts, coordinates)
@@ -132,13 +132,13 @@ def coordinates(dispersion: Dispersion, seed: jax.Array, trials: jax.Array) -> C
 
 def values(parts: Parts, dispersion: Dispersion, seed: WholeNumber, trial: WholeNumber | Row) -> dict[str, jax.Array]:
     """Return the dispersed quantities of a trial by name, without simulating it; arguments as for `one`."""
-    about = planned.about(parts, dispersion, seed, trial)
+    about = table_rows.about(parts, dispersion, seed, trial)
     coordinates = about.dispersion.coordinates(about.seed, about.trial)
     return _values(dispersion, about.dispersion.at(about.parts, coordinates), about, coordinates)
 
 
 def _values(
-    dispersion: Dispersion, drawn: Parts, about: planned.About, coordinates: Coordinates
+    dispersion: Dispersion, drawn: Parts, about: table_rows.About, coordinates: Coordinates
 ) -> dict[str, jax.Array]:
     """Read the quantities from the parts of a trial; add the gyro's bias and numbers of custom dispersions."""
     by_column = dispersion.values(drawn, set(about.given) - {RATE_BIAS})

@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 
 from ptsmc_jax import programs
 from ptsmc_jax.campaigns import margin_verdicts, montecarlo
-from ptsmc_jax.dispersions import planned
-from ptsmc_jax.dispersions.planned import Row
+from ptsmc_jax.dispersions import table_rows
+from ptsmc_jax.dispersions.table_rows import Row
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.scenario import Study
 from ptsmc_jax.simulation import requirements, rollout
@@ -125,7 +125,7 @@ def prepare(ready: Study) -> None:
 
 @programs.jit
 def _drawn(dispersion: Dispersion, parts: Parts, seed: jax.Array, trial: jax.Array | Row) -> Parts:
-    return planned.about(parts, dispersion, seed, trial).drawn
+    return table_rows.about(parts, dispersion, seed, trial).drawn
 
 
 def floor(ready: Study, seed: int = 0, rows: Sequence[int | Row] = ()) -> float | None:

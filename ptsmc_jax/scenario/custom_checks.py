@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ptsmc_jax.dispersions.planned import OF_ROWS
+from ptsmc_jax.dispersions.table_rows import OF_ROWS
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.laws.base import Law, Sample
 from ptsmc_jax.observers.base import Bound

@@ -60,9 +60,9 @@ def test_rows_do_not_depend_on_blocks_and_devices(flown, monkeypatch, block, cap
 
 def test_drawn_inputs_equal_the_inputs_of_the_simulated_rows(flown):
     made, frame = flown
-    plan = made.draw(range(300))
-    assert plan.columns == ["trial", *frame.columns[4 + len(made.ready.catalogue) :]]
-    same(plan, frame.select(plan.columns))
+    run_table = made.draw(range(300))
+    assert run_table.columns == ["trial", *frame.columns[4 + len(made.ready.catalogue) :]]
+    same(run_table, frame.select(run_table.columns))
 
 
 def test_failed_trials_do_not_affect_the_others():
@@ -198,7 +198,7 @@ def test_custom_metrics_are_columns_of_the_rows():
         ),
         (lambda result, parts: {"effort": jnp.zeros(())}, "its effort has the name of a column that the rows have"),
         # a column of campaigns with a run table
-        (lambda result, parts: {"plan_seed": jnp.zeros(())}, "its plan_seed has the name of a column"),
+        (lambda result, parts: {"run_seed": jnp.zeros(())}, "its run_seed has the name of a column"),
         (lambda result, parts: {}, "it returns an empty dict, but must return named numbers"),
         (
             lambda result, parts: {"x": 1 / 0},

@@ -4,7 +4,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from ptsmc_jax.campaigns import csv_tables, plans
+from ptsmc_jax.campaigns import csv_tables, run_tables
 from ptsmc_jax.campaigns.store import RefusedError
 
 PLAIN = "x1,x2\n1.5,-0.25\n1e-3,0.02\n"
@@ -72,5 +72,5 @@ def test_an_empty_cell_is_null(tmp_path):
 def test_another_table_is_refused_with_the_cause(tmp_path, written, cause):
     (tmp_path / "table.csv").write_bytes(written)
     with pytest.raises(RefusedError) as refused:
-        plans.read(tmp_path / "table.csv")
+        run_tables.read(tmp_path / "table.csv")
     assert cause in str(refused.value)

@@ -9,7 +9,7 @@ import polars as pl
 import pytest
 
 from ptsmc_jax import scenario as scenarios
-from ptsmc_jax.campaigns import campaign, plans
+from ptsmc_jax.campaigns import campaign, run_tables
 from ptsmc_jax.dispersions.quantities import CATEGORIES
 from ptsmc_jax.numerics import statistics
 from tests.output import examples
@@ -96,7 +96,15 @@ def test_every_random_input_may_be_a_reason(monkeypatch):
     columns = campaign.Campaign(ready, 0).draw(range(2)).drop("trial").columns
     assert {"inertia_11", "initial_angle"} <= set(columns)
     assert any(name.startswith("disturbance") for name in columns)
-    kept = ["trial", *plans.HEADING, *plans.OF_ROWS.values(), *ready.catalogue, *plans.SAMPLES, *columns, "mine"]
+    kept = [
+        "trial",
+        *run_tables.HEADING,
+        *run_tables.OF_ROWS.values(),
+        *ready.catalogue,
+        *run_tables.SAMPLES,
+        *columns,
+        "mine",
+    ]
     monkeypatch.setattr(campaign_summary.rows, "columns_of", lambda part: kept)
     folder: Any = SimpleNamespace(custom_metric_names=["mine"])
     assert inspect.unwrap(campaign_summary.drawn_columns)(folder, [None]) == columns

@@ -128,12 +128,12 @@ def test_more_trials_extend_an_existing_campaign(command, flown):
     assert "--trials is 300, but must be at least 420" in said
 
 
-@pytest.mark.parametrize("planned", [False, True])
-def test_repeated_part_is_not_counted_twice_in_the_progress(command, monkeypatch, planned):
+@pytest.mark.parametrize("from_table", [False, True])
+def test_repeated_part_is_not_counted_twice_in_the_progress(command, monkeypatch, from_table):
     standing = []
     monkeypatch.setattr(progress.CampaignProgress, "__call__", lambda _, tally: standing.append(replace(tally)))
     for trials in (10, 20):
-        dry = ["--dry-run"] if planned else []
+        dry = ["--dry-run"] if from_table else []
         command("montecarlo", "s.toml", "--trials", trials, "--out", "more", "--no-figures", "--quiet", *dry)
     assert [(tally.done, tally.total) for tally in standing] == [(0, 10), (10, 10), (0, 20), (20, 20)]
 
@@ -182,7 +182,7 @@ def test_another_campaign_in_the_same_folder_is_refused(command, flown, tmp_path
     same(rows_of(flown), before)
     if "--metrics" not in options:  # custom metrics would compile another program
         again = ("montecarlo", "s.toml", "--trials", 110, *options, "--force", "--no-figures", "--quiet")
-        mine = "plan/mine.parquet", "plan.parquet", "controller/mine.c", "figures/mine.png"  # a user's own
+        mine = "runs/mine.parquet", "run_table.parquet", "controller/mine.c", "figures/mine.png"  # a user's own
         for name in mine:
             (flown / name).parent.mkdir(exist_ok=True)
             (flown / name).write_text("mine")
@@ -305,9 +305,9 @@ def test_dry_run_writes_the_inputs_of_the_trials(command, tmp_path):
     folder = tmp_path / FOLDER
     assert (code, "run table of 250 trials" in said) == (0, True)
     assert not (folder / "trials").exists()
-    plan = pl.concat([pl.read_parquet(path) for path in sorted((folder / "plan").iterdir())])
+    run_table = pl.concat([pl.read_parquet(path) for path in sorted((folder / "runs").iterdir())])
     assert command("montecarlo", "s.toml", "--trials", 250, "--seed", 3, "--no-figures", "--quiet")[0] == 0
-    same(plan, rows_of(folder).select(plan.columns))
+    same(run_table, rows_of(folder).select(run_table.columns))
 
 
 def test_shards_in_one_folder_or_several_make_the_whole_campaign(command, flown, tmp_path):

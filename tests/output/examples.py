@@ -60,7 +60,7 @@ def compare(laws: dict[str, Any], **changes: Any) -> summaries.Compare:
 
 def campaign(**changes: Any) -> summaries.Campaign:
     """Return the summary of a campaign."""
-    summary = {"status": "met", "plant": "spacecraft", "seed": 1, "plan": None, "trials": 8, "flown": 8,
+    summary = {"status": "met", "plant": "spacecraft", "seed": 1, "run_table": None, "trials": 8, "flown": 8,
                "unjudged": [], "counts": {"ok": 8}, "reasons": [], "floor": None, "verdicts": [], "quantiles": {},
                "drivers": {}, "driver_trials": {}, "cautions": []}  # fmt: skip
     return summaries.read(summaries.Campaign, {**summary, **changes})

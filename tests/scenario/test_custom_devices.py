@@ -206,8 +206,8 @@ def test_custom_dispersions_change_the_parts_and_appear_in_the_rows(command, her
     rows = ptsmc.trials(scenario.from_tables(tables), 40, seed=2)
     assert rows["drift"].n_unique() == 40
     np.testing.assert_allclose(rows["drift"][5], 1.0 + 0.1 * float(c[0]), rtol=1e-12)
-    plan = rows[3:9].select("trial", "drift", "window_error")  # a run table: `trial` selects the draws
-    again = ptsmc.trials(scenario.from_tables(tables), plan, seed=2)
+    run_table = rows[3:9].select("trial", "drift", "window_error")  # a run table: `trial` selects the draws
+    again = ptsmc.trials(scenario.from_tables(tables), run_table, seed=2)
     np.testing.assert_array_equal(again["drift"], rows["drift"][3:9])
     text = "\n".join([
         'plant = { kind = "chain", order = 2, x0 = [1.0, 0.0] }',
@@ -263,7 +263,7 @@ DRAWS = [
     ("0.01 * c[1]", "1 / 0 * c[1]", "at fails: ZeroDivisionError"),
     ('{"drift": 1.0', '{" ": 1.0', "returns a number ' ' at t = 0, but must return names that can be printed"),
     ('{"drift": 1.0', '{"status": 1.0', "names that no column of the rows has"),
-    ('{"drift": 1.0', '{"plan_trial": 1.0', "names that no column of the rows has"),  # would replace this column
+    ('{"drift": 1.0', '{"run_trial": 1.0', "names that no column of the rows has"),  # would replace this column
     ('{"drift": 1.0 + self.std * c[0]}', '{"drift": c[0] > 0.0}', "a number drift True"),  # a summary cannot rank it
     ('{"drift": 1.0 + self.std * c[0]}', "[c[0]]", "must return a dict of numbers by name"),
     ('{"drift": 1.0 + self.std * c[0]}', '{"drift": 1 / 0}', "values fails: ZeroDivisionError"),

@@ -176,9 +176,9 @@ REFUSED = {
         lambda: API.run(RUN, Dispersion(), 0, [1], block=0),
         "block is 0, but must be a whole number from 1 to",
     ),
-    "a plan in no table": (
+    "a run table that is no data frame": (
         lambda: API.trials(FLIGHT, {"trial": [0, 1]}),
-        "count is a dict, but must be a whole number, or a plan as a polars table",
+        "count is a dict, but must be a whole number, or a polars table with a row for each trial",
     ),
     "verdicts on no table": (lambda: API.verdicts(FLIGHT, {}), "rows are needed in a polars DataFrame"),
     "vectors of no trial": (

@@ -26,8 +26,8 @@ def test_bound_and_margins_use_the_first_trials_and_are_computed_once(tmp_path, 
 
     monkeypatch.setattr(runs, "floor", floor)
     monkeypatch.setattr(margin_verdicts, "over_trials", over_trials)
-    plan = SimpleNamespace(count=count, row=lambda k, seed: (k, seed), rows=lambda numbers, seed: np.asarray(numbers))
-    flown = SimpleNamespace(ready="ready", plan=None if count is None else plan)
+    table = SimpleNamespace(count=count, row=lambda k, seed: (k, seed), rows=lambda numbers, seed: np.asarray(numbers))
+    flown = SimpleNamespace(ready="ready", run_table=None if count is None else table)
     folder: Any = SimpleNamespace(path=tmp_path, seed=7, campaign=flown, scenario=SimpleNamespace(requirements={}))
     campaign_theory.find(folder)
     assert asked == [("ready", 7, looked), ("ready", 7, [(k, 7) for k in rows])]

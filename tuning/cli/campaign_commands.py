@@ -48,11 +48,11 @@ def montecarlo(
     trials: Annotated[
         int | None, whole("Trials, 1 to 4294967296; none: 10000.", 1, MOST, group=(SHOWN, TRIALS))
     ] = None,
-    plan: Annotated[
+    runs: Annotated[
         Path | None,
         Parameter(
             group=(SHOWN, TRIALS, CONFIDENT),
-            help="Run table, .csv or .parquet, or DIR/plan of --dry-run: each row is a trial. Its columns are named as "
+            help="Run table, .csv or .parquet, or DIR/runs of --dry-run: each row is a trial. Its columns are named as "
             "in the rows of a campaign; quantities without a column are random, with the random numbers of the columns "
             "`trial` and `seed`.",
         ),
@@ -97,7 +97,7 @@ def montecarlo(
         Parameter(
             group=(SHOWN, PARTS, PLACES),
             negative="",
-            help="Write the run table of the trials into DIR/plan, and simulate nothing.",
+            help="Write the run table of the trials into DIR/runs, and simulate nothing.",
         ),
     ] = False,
     controller: flight_commands.ControllerFolder = None,
@@ -109,7 +109,7 @@ def montecarlo(
     """Simulate a campaign of many trials, and keep a row of each; every trial can be replayed.
 
     After Ctrl-C or a kill, the same command resumes the campaign. With more --trials it adds trials. The default folder
-    is out/montecarlo-NAME, followed by the names of --controller and --plan.
+    is out/montecarlo-NAME, followed by the names of --controller and --runs.
 
     Exit status: 0 every requirement met (without requirements: no trial failed or missed t_f), 1 not met, 2
     configuration error or a full disk, 130 interrupted.
@@ -146,13 +146,13 @@ def montecarlo(
     folder = campaign_folder.Folder(
         path, loaded, seed, 10_000 if trials is None else trials, metrics, bits, controller=controller
     )
-    if plan is not None:
-        from ptsmc_jax.campaigns import plans
+    if runs is not None:
+        from ptsmc_jax.campaigns import run_tables
 
-        table = plans.read(plan)
-        folder = replace(folder, trials=table.height, plan=plan.name, table=table)
+        table = run_tables.read(runs)
+        folder = replace(folder, trials=table.height, table_name=runs.name, table=table)
     if out is None:
-        names = [path.name, *([controller.resolve().name] if controller else ()), *([plan.stem] if plan else ())]
+        names = [path.name, *([controller.resolve().name] if controller else ()), *([runs.stem] if runs else ())]
         folder = replace(folder, path=path.with_name("-".join(names)))
     if scenario is not None:
         searches.say_seen(scenario, seed)
@@ -169,20 +169,20 @@ def montecarlo(
         campaign_folder.begin(folder, force)
         with CampaignProgress(quiet) as report:
             if dry_run:
-                campaign_folder.write_plan(folder, report)
+                campaign_folder.write_run_table(folder, report)
                 done = folder
             else:
                 done = _flown(folder, share, report, elsewhere, until_confident)
         if not a_part:
             return _summarised(done, quiet, figures)
     if not quiet:
-        _say_share(done, share, planned=dry_run)
+        _say_share(done, share, dry_run=dry_run)
     return 0
 
 
-def _say_share(folder: "Folder", share: tuple[int, int], *, planned: bool) -> None:
+def _say_share(folder: "Folder", share: tuple[int, int], *, dry_run: bool) -> None:
     """Print that a shard of a campaign, or its run table, is done."""
-    if planned:
+    if dry_run:
         terminal.say(f"run table of {folder.trials} trials in {folder.dry.folder}; nothing was simulated")
         return
     there = sum(part.count for part in folder.rows.parts()[0])
@@ -320,7 +320,7 @@ def replay(
         again = campaign_summary.replay(opened, trial)
         about = opened.scenario, again.run, opened.seed, trial, figures, opened.computer
         # simulate has no rows of run tables and no numbers of 32 bits
-        from_here = opened.plan is not None or opened.bits != 64
+        from_here = opened.table is not None or opened.bits != 64
         replayed = {"campaign": str(folder.absolute()), "metrics": opened.custom_metrics} if from_here else {}
         store.write(place, lambda making: single.write(making, *about, replayed))
     if not quiet:

@@ -60,7 +60,7 @@ def counts(summary: Campaign) -> Iterator[str]:
         yield f"NOT finished: {summary.flown} of {summary.trials} trials are simulated"
     for name in summary.unjudged:
         yield f"NOT finished: {name} is required and not judged yet; run the same `ptsmc montecarlo` again"
-    source = f"the run table {summary.plan} and seed" if summary.plan else "seed"
+    source = f"the run table {summary.run_table} and seed" if summary.run_table else "seed"
     yield f"{many(summary.flown, 'trial')} of {source} {summary.seed}: {listed(summary.counts)}"
     for reason in summary.reasons:
         first = "" if reason.first_bad_time is None else f", the first at {reason.first_bad_time:.4g} s"
@@ -69,7 +69,7 @@ def counts(summary: Campaign) -> Iterator[str]:
     if ended:
         each = (f"{one.samples} {status} in {many(one.trials, 'trial')}" for status, one in ended.items())
         yield f"samples of the controller: {', '.join(each)}"
-    if summary.plan:
+    if summary.run_table:
         yield "fractions, quantiles and intervals assume random trials; they hold as far as the run table is random"
 
 

@@ -311,7 +311,7 @@ class Campaign(msgspec.Struct, frozen=True, kw_only=True):
     status: str
     plant: str
     seed: int
-    plan: str | None
+    run_table: str | None
     trials: int
     flown: int
     unjudged: list[str]

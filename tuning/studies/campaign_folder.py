@@ -19,10 +19,10 @@ from msgspec import Meta
 
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import campaign as flying
-from ptsmc_jax.campaigns import plans, rows, store
+from ptsmc_jax.campaigns import rows, run_tables, store
 from ptsmc_jax.campaigns.campaign import Campaign, Tally, Wanted
-from ptsmc_jax.campaigns.plans import Plan
 from ptsmc_jax.campaigns.rows import Part, Rows
+from ptsmc_jax.campaigns.run_tables import RunTable
 from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.dispersions import quantities
 from ptsmc_jax.onboard import sources
@@ -36,8 +36,8 @@ from tuning.search import custom_parts
 
 C = "controller"  # subfolder with the C code of the controller, if C code controls the simulated spacecraft
 FLOOR = "floor.json"  # lower bound and margins, see `campaign_theory`
-TABLE = "plan.parquet"  # the run table; `--dry-run` writes a folder instead
-PLAN = "plan_sha256"  # key of the checksum of the run table in `versions.json`
+TABLE = "run_table.parquet"  # the run table; `--dry-run` writes a folder instead
+RUN_TABLE = "run_table_sha256"  # key of the checksum of the run table in `versions.json`
 CUSTOM = f"{systems.WHERE}, a function of a run's Result and its Parts that returns named numbers"
 
 
@@ -50,7 +50,7 @@ class Made(msgspec.Struct, frozen=True):
     precision: Literal[32, 64]
     metrics: str | None = None
     metrics_names: tuple[str, ...] | None = None
-    plan: str | None = None  # file name of the run table
+    run_table: str | None = None  # file name of the run table
     controller_otherwise: str | None = None  # see `Folder.otherwise`
     first_look: Annotated[int, Meta(ge=1, le=2**32)] | None = None
 
@@ -68,7 +68,7 @@ class Folder:
     made: Made | None = None  # content of the existing folder; None: the folder does not exist yet
     digests: Mapping[str, str] = field(default_factory=dict)  # checksums of custom code in the existing folder
     trusted: bool = True  # custom systems and metrics may be executed
-    plan: str | None = None  # file name of the run table
+    table_name: str | None = None  # file name of the run table
     table: pl.DataFrame | None = None  # content of the run table
     controller: Path | None = None  # folder of the C code that controls; None: the simulated law controls
     first_look: int | None = None  # trials before the first check of `--until-confident`; None: one part
@@ -89,7 +89,7 @@ class Folder:
             name = custom.digest_name(key)
             digests[name] = self.digests.get(name) if self.made else custom_parts.digest(key, where)
         if self.table is not None:
-            digests[PLAN] = self.digests.get(PLAN) if self.made else self.planned.digest
+            digests[RUN_TABLE] = self.digests.get(RUN_TABLE) if self.made else self.run_table.digest
         metrics = {} if self.custom_metrics is None else {"metrics": self.custom_metrics}
         known = {name: digest for name, digest in digests.items() if digest is not None}
         return {"command": "montecarlo", "seed": self.seed, "precision": self.bits, **metrics, **known}
@@ -99,7 +99,7 @@ class Folder:
         """The content of `versions.json`."""
         names = None if self.custom_metrics is None else self.custom_metric_names
         counts = {"trials": self.trials, "first_look": self.first_look}
-        entries = {**self.identity, **counts, "metrics_names": names, "plan": self.plan}
+        entries = {**self.identity, **counts, "metrics_names": names, "run_table": self.table_name}
         if self.controller is not None:
             entries |= {C: C, "controller_otherwise": self.otherwise or None}
         return store.versions(**{name: value for name, value in entries.items() if value is not None})
@@ -131,7 +131,7 @@ class Folder:
     @cached_property
     def dry(self) -> Rows:
         """The dispersions of the trials, which `--dry-run` writes without simulating."""
-        return Rows(self.path / "plan", self._key)
+        return Rows(self.path / "runs", self._key)
 
     @property
     def _key(self) -> bytes:
@@ -183,16 +183,16 @@ class Folder:
         return RefusedError(f"{self.path} names custom code, which is run with --trust only")
 
     @cached_property
-    def planned(self) -> Plan:
+    def run_table(self) -> RunTable:
         """The validated run table. Raises RefusedError if it is invalid or has changed since the campaign began."""
         assert self.table is not None
         assert self.ready is not None
-        where = f"the plan {self.plan}"
+        where = f"the run table {self.table_name}"
         drawn = self.ready.dispersion.custom_names()
-        plan = plans.checked(self.table, self.ready.parts, where, self.custom_metric_names, drawn)
-        if self.made is not None and plan.digest != self.digests.get(PLAN):
-            raise RefusedError(f"{self.path / TABLE} is not the plan that the campaign was begun with")
-        return plan
+        table = run_tables.checked(self.table, self.ready.parts, where, self.custom_metric_names, drawn)
+        if self.made is not None and table.digest != self.digests.get(RUN_TABLE):
+            raise RefusedError(f"{self.path / TABLE} is not the run table that the campaign was begun with")
+        return table
 
     @cached_property
     def flights(self) -> Campaign:
@@ -201,7 +201,8 @@ class Folder:
             raise self._untrusted
         campaign = Campaign(self.ready, self.seed)
         if self.table is not None:
-            campaign = flying.of_plan(self.ready, self.seed, self.planned, where=f"the plan {self.plan}")
+            where = f"the run table {self.table_name}"
+            campaign = flying.of_run_table(self.ready, self.seed, self.run_table, where=where)
         return replace(campaign, software=self.software)
 
     @cached_property
@@ -268,7 +269,7 @@ def begin(wanted: Folder, force: bool) -> None:
     if force and path.is_dir():
         for rows_of in (wanted.rows, wanted.dry):
             rows_of.tidy(())
-        for name in (FLOOR, *([TABLE] if PLAN in made else [])):
+        for name in (FLOOR, *([TABLE] if RUN_TABLE in made else [])):
             (path / name).unlink(missing_ok=True)
     elif _begun(wanted, tables):
         return
@@ -278,7 +279,7 @@ def begin(wanted: Folder, force: bool) -> None:
         store.write_json(making / "versions.json", wanted.versions)
         if wanted.table is not None:
             parts = wanted.campaign.ready.parts
-            (making / TABLE).write_bytes(rows.encoded(wanted.planned.frame(parts)))
+            (making / TABLE).write_bytes(rows.encoded(wanted.run_table.frame(parts)))
         if wanted.controller is not None:
             sources.copy(wanted.controller, making / C)
         for file in kept:  # not earlier: these files may be the source of the copy
@@ -342,8 +343,8 @@ def opened(path: Path) -> Folder:
         made=made,
         digests=digests,
         trusted=False,
-        plan=made.plan,
-        table=None if made.plan is None else plans.read(path / TABLE),
+        table_name=made.run_table,
+        table=None if made.run_table is None else run_tables.read(path / TABLE),
         controller=path / C if custom.digest_name(custom_parts.CONTROLLER) in digests else None,
         first_look=made.first_look,
     )
@@ -401,7 +402,7 @@ def fly(
         folder.rows.tidy(folder.rows.parts()[0])
 
 
-def write_plan(folder: Folder, report: Callable[[Tally], None]) -> None:
+def write_run_table(folder: Folder, report: Callable[[Tally], None]) -> None:
     """Write the dispersions of each trial without simulating it (`ptsmc montecarlo --dry-run`)."""
     parts, _ = folder.dry.parts()
     folder.dry.tidy(parts)

@@ -13,7 +13,7 @@ import polars as pl
 
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import campaign as flying
-from ptsmc_jax.campaigns import plans, rows, runs, store
+from ptsmc_jax.campaigns import rows, run_tables, runs, store
 from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.dispersions.quantities import CATEGORIES
 from ptsmc_jax.numerics import statistics
@@ -146,7 +146,7 @@ def summarise(folder: Folder) -> dict[str, Any]:
         "status": "unfinished" if done < folder.trials or waiting else "met" if met else "not met",
         "plant": folder.scenario.plant.kind,
         "seed": folder.seed,
-        "plan": folder.plan,
+        "run_table": folder.table_name,
         "trials": folder.trials,
         "flown": done,
         "unjudged": waiting,
@@ -173,10 +173,13 @@ def _samples(folder: Folder, parts: list[rows.Part]) -> dict[str, Any]:
     if folder.controller is None:
         return {}
     kept = rows.columns_of(parts[0])
-    names = [name for name in plans.SAMPLES if name in kept]  # most severe status last
+    names = [name for name in run_tables.SAMPLES if name in kept]  # most severe status last
     counts = rows.read(parts, names).head(folder.trials)
     told = {
-        name.removeprefix(plans.COUNTED): {"samples": int(counts[name].sum()), "trials": int((counts[name] > 0).sum())}
+        name.removeprefix(run_tables.COUNTED): {
+            "samples": int(counts[name].sum()),
+            "trials": int((counts[name] > 0).sum()),
+        }
         for name in names
     }
     return {"controller_samples": told}
@@ -187,7 +190,13 @@ def drawn_columns(folder: Folder, parts: list[rows.Part]) -> list[str]:
 
     They are all columns except the results, the trial number and the columns that identify a row's random sample.
     """
-    others = {plans.TRIAL, *plans.OF_ROWS.values(), *plans.RESULTS, *plans.SAMPLES, *folder.custom_metric_names}
+    others = {
+        run_tables.TRIAL,
+        *run_tables.OF_ROWS.values(),
+        *run_tables.RESULTS,
+        *run_tables.SAMPLES,
+        *folder.custom_metric_names,
+    }
     return [name for name in rows.columns_of(parts[0]) if name not in others]
 
 
@@ -301,7 +310,9 @@ def worst(folder: Folder, by: str, count: int) -> pl.DataFrame:
     """
     parts = folder.whole_parts()
     names = rows.columns_of(parts[0])
-    allowed = [name for name in names if name not in (plans.TRIAL, *plans.HEADING, *plans.OF_ROWS.values())]
+    allowed = [
+        name for name in names if name not in (run_tables.TRIAL, *run_tables.HEADING, *run_tables.OF_ROWS.values())
+    ]
     if by not in allowed:
         listed = f"the head of {folder.path / 'worst.csv'}, which ptsmc worst writes without --by, has all of them"
         raise RefusedError(f"--by is {by}, but must be a column of the rows; {parsing.like(by, allowed, listed)}")
@@ -320,7 +331,8 @@ def most_extreme(metric: str, values: np.ndarray, failed: np.ndarray, count: int
         failed: whether each trial failed (trials,) [-].
         count: number of indices.
     """
-    better = metric in (*catalogues.LARGER_IS_BETTER, plans.SAMPLES[0])  # SAMPLES[0] counts samples without an error
+    # SAMPLES[0] counts samples without an error
+    better = metric in (*catalogues.LARGER_IS_BETTER, run_tables.SAMPLES[0])
     return statistics.most_extreme(values, failed, count, larger_is_better=better)
 
 
@@ -336,7 +348,7 @@ class Replay:
 def replay(folder: Folder, trial: int) -> Replay:
     """Simulate a trial again: once as the campaign does, for its row, and once with its history."""
     campaign = folder.campaign
-    flown = trial if campaign.plan is None else campaign.plan.row(trial, folder.seed)
+    flown = trial if campaign.run_table is None else campaign.run_table.row(trial, folder.seed)
     run = runs.fly(campaign.ready, folder.seed, flown, campaign.software)
     again = campaign.fly([trial]).row(0, named=True)
     rounding = max(_off(value, again[name]) for name, value in run.metrics.items())

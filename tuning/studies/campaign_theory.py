@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ptsmc_jax.campaigns import margin_verdicts, runs, store
-from ptsmc_jax.dispersions.planned import Row
+from ptsmc_jax.dispersions.table_rows import Row
 from ptsmc_jax.simulation import catalogues
 from tuning.studies.campaign_folder import FLOOR, Folder
 
@@ -20,8 +20,8 @@ def find(folder: Folder) -> None:
     It has the lower bound of the RMS window error, and the verdicts on the required stability margins.
     """
     if _lacks_theory(folder):
-        ready, plan = folder.campaign.ready, folder.campaign.plan
-        first = [] if plan is None else [plan.row(k, folder.seed) for k in range(min(runs.FLOORS, plan.count))]
+        ready, table = folder.campaign.ready, folder.campaign.run_table
+        first = [] if table is None else [table.row(k, folder.seed) for k in range(min(runs.FLOORS, table.count))]
         verdicts = margin_verdicts.over_trials(ready, folder.seed, _looked_at(folder))
         floor = runs.floor(ready, folder.seed, first)
         theory = {"window_error": floor, "margins": [verdict.in_summary() for verdict in verdicts]}
@@ -41,8 +41,8 @@ def _lacks_theory(folder: Folder) -> bool:
 
 def _looked_at(folder: Folder) -> np.ndarray | Row | None:
     """Return the rows of the run table whose margins are computed, or None without a run table."""
-    plan = folder.campaign.plan
-    return None if plan is None else plan.rows(np.arange(min(margin_verdicts.TRIALS, plan.count)), folder.seed)
+    table = folder.campaign.run_table
+    return None if table is None else table.rows(np.arange(min(margin_verdicts.TRIALS, table.count)), folder.seed)
 
 
 def floor_of(folder: Folder) -> float | None:

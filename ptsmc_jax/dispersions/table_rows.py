@@ -12,7 +12,7 @@ from ptsmc_jax.simulation.rollout import Parts
 
 TRIAL, SEED = "trial", "seed"  # columns of a run table that select the random numbers of a row
 # names of these columns in result files, where `trial` is the number of the row
-OF_ROWS = {TRIAL: "plan_trial", SEED: "plan_seed"}
+OF_ROWS = {TRIAL: "run_trial", SEED: "run_seed"}
 
 
 class Row(NamedTuple):

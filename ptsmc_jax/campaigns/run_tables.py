@@ -1,4 +1,4 @@
-"""Run tables ("plans"): a table with a row for each trial, which sets quantities instead of dispersing them.
+"""Run tables: a table with a row for each trial, which sets quantities instead of dispersing them.
 
 The columns are those of a campaign's rows and of `--dry-run`, see `quantities`; the numbers of a vector come together.
 `trial` and `seed` name the random numbers of a row; by default the row's number and the campaign's seed. A quantity
@@ -16,8 +16,8 @@ import polars as pl
 
 from ptsmc_jax.campaigns import csv_tables
 from ptsmc_jax.campaigns.store import RefusedError
-from ptsmc_jax.dispersions.planned import OF_ROWS, SEED, TRIAL, Row
 from ptsmc_jax.dispersions.quantities import QUANTITIES, UnfitError
+from ptsmc_jax.dispersions.table_rows import OF_ROWS, SEED, TRIAL, Row
 from ptsmc_jax.scenario import parsing
 from ptsmc_jax.simulation import computer
 from ptsmc_jax.simulation.catalogues import CATALOGUE
@@ -33,7 +33,7 @@ MOST = 2**32  # of trials and seeds
 
 
 @dataclass(frozen=True)
-class Plan:
+class RunTable:
     """A checked run table, see `checked`."""
 
     given: dict[str, np.ndarray]  # numbers (rows, n) by the names of `QUANTITIES`
@@ -71,7 +71,7 @@ class Plan:
         many = self.rows(np.asarray([number]), seed)
         return jax.tree.map(lambda v: v[0], many) if isinstance(many, Row) else int(many[0])
 
-    def without(self, same: Iterable[str]) -> "Plan":
+    def without(self, same: Iterable[str]) -> "RunTable":
         """Return the table without these quantities."""
         return replace(self, given={name: values for name, values in self.given.items() if name not in same})
 
@@ -90,27 +90,27 @@ class Plan:
 def read(path: Path) -> pl.DataFrame:
     """Return the table of a file, or of a folder that `--dry-run` wrote. Raises RefusedError if it is not a table."""
     if not path.exists():
-        raise RefusedError(f"--plan is {path}, which is not there; allowed is {ALLOWED}")
+        raise RefusedError(f"--runs is {path}, which is not there; allowed is {ALLOWED}")
     files = sorted(path.glob("*.parquet")) if path.is_dir() else [path]
     kinds = {file.suffix.lower() for file in files}
     if not kinds or not (kinds == {".parquet"} or kinds == {".csv"}):
-        raise RefusedError(f"--plan is {path}, but must be {ALLOWED}")
+        raise RefusedError(f"--runs is {path}, but must be {ALLOWED}")
     try:
         if kinds == {".csv"}:
             return csv_tables.read(path)
         return pl.concat([pl.read_parquet(file, glob=False) for file in files])
     except (OSError, ValueError, pl.exceptions.PolarsError) as error:
         first_line = (str(error).splitlines() or [type(error).__name__])[0]
-        raise RefusedError(f"--plan is {path}, which cannot be read: {first_line}") from None
+        raise RefusedError(f"--runs is {path}, which cannot be read: {first_line}") from None
 
 
 def checked(
     table: pl.DataFrame,
     parts: Parts,
-    where: str = "the plan",
+    where: str = "the run table",
     custom_metrics: Iterable[str] = (),
     drawn: Iterable[str] = (),
-) -> Plan:
+) -> RunTable:
     """Return the run table of a data frame.
 
     Args:
@@ -172,7 +172,7 @@ def checked(
         whose[TRIAL] = None  # their own numbers
     angle = _numbers(table, ANGLE, where) if ANGLE in table.columns else None
     stated = {name: _cells(table[name]) for name in drawn if name in table.columns}
-    return Plan(given, whose[TRIAL], whose[SEED], angle, table.height, stated)
+    return RunTable(given, whose[TRIAL], whose[SEED], angle, table.height, stated)
 
 
 def check_angle(stated: np.ndarray, simulated: np.ndarray, where: str) -> None:

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 import ptsmc_jax as ptsmc
 from ptsmc_jax import programs, scenario
-from ptsmc_jax.campaigns import campaign, montecarlo, plans
+from ptsmc_jax.campaigns import campaign, montecarlo, run_tables
 from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.dispersions.quantities import QUANTITIES
 from ptsmc_jax.plants import rigid_body
@@ -80,40 +80,40 @@ def of_a_chain():
     return made, made.draw(range(FLOWN))
 
 
-def of_plan(made, table):
-    return campaign.of_plan(made.ready, made.seed, plans.checked(table, made.ready.parts))
+def of_run_table(made, table):
+    return campaign.of_run_table(made.ready, made.seed, run_tables.checked(table, made.ready.parts))
 
 
 # the spacecraft is a long test, because a later test checks that its run table has the exact inputs
 @pytest.mark.parametrize("which", ["of_a_chain", pytest.param("everything", marks=pytest.mark.long)])
 def test_campaign_of_a_written_run_table_has_identical_rows(which, request, tmp_path):
-    made, plan = request.getfixturevalue(which)
+    made, run_table = request.getfixturevalue(which)
     frame = made.fly(range(FLOWN))
-    plan.write_csv(tmp_path / "plan.csv")
-    plan.write_parquet(tmp_path / "plan.parquet")
+    run_table.write_csv(tmp_path / "run_table.csv")
+    run_table.write_parquet(tmp_path / "run_table.parquet")
     digests = set()
-    for name in ("plan.csv", "plan.parquet"):
-        again = of_plan(made, plans.read(tmp_path / name))
-        digests.add(plans.checked(plans.read(tmp_path / name), made.ready.parts).digest)
-        assert again.plan is not None
-        assert not again.plan.given  # the program of the original campaign simulates it
+    for name in ("run_table.csv", "run_table.parquet"):
+        again = of_run_table(made, run_tables.read(tmp_path / name))
+        digests.add(run_tables.checked(run_tables.read(tmp_path / name), made.ready.parts).digest)
+        assert again.run_table is not None
+        assert not again.run_table.given  # the program of the original campaign simulates it
         assert_frame_equal(again.fly(range(FLOWN)), frame, check_exact=True)
     assert len(digests) == 1
     # rows of a campaign are a valid run table; their results are ignored, and each row has the noise of its trial
-    some = of_plan(made, frame[[40, 7]])
+    some = of_run_table(made, frame[[40, 7]])
     flown = some.fly(range(2))
-    assert flown["plan_trial"].to_list() == [40, 7]
+    assert flown["run_trial"].to_list() == [40, 7]
     assert_frame_equal(flown.select(frame.columns[1:]), frame[[40, 7]].select(frame.columns[1:]), check_exact=True)
-    assert of_plan(made, flown).fly(range(2)).equals(flown)  # rows of this campaign are a run table too
+    assert of_run_table(made, flown).fly(range(2)).equals(flown)  # rows of this campaign are a run table too
 
 
 def test_written_run_table_has_the_exact_inputs_of_the_campaign(everything, tmp_path):
-    made, plan = everything
-    plan.write_csv(tmp_path / "plan.csv")
-    again = of_plan(made, plans.read(tmp_path / "plan.csv"))
-    assert again.plan is not None
-    assert not again.plan.given
-    assert_frame_equal(again.draw(range(FLOWN)).select(plan.columns), plan, check_exact=True)
+    made, run_table = everything
+    run_table.write_csv(tmp_path / "run_table.csv")
+    again = of_run_table(made, run_tables.read(tmp_path / "run_table.csv"))
+    assert again.run_table is not None
+    assert not again.run_table.given
+    assert_frame_equal(again.draw(range(FLOWN)).select(run_table.columns), run_table, check_exact=True)
 
 
 class Farther(ptsmc.Draw):
@@ -131,15 +131,15 @@ def test_custom_dispersion_is_not_applied_twice_to_a_run_table():
     known = scenario.from_tables({"plant": {"kind": "chain"}, "loop": {"mode": "sampled"}})
     drawn = ptsmc.replace(known, dispersion={"custom": {"kind": "custom", "code": Farther}})
     made = campaign.Campaign(scenario.study(drawn), SEED)
-    plan = made.draw(range(5)).drop("custom_1")
-    assert plan["initial_x1"].n_unique() == 5
-    again = of_plan(made, plan)
-    assert again.plan is not None
-    assert not again.plan.given
-    assert_frame_equal(again.draw(range(5)).select(plan.columns), plan, check_exact=True)
-    other = of_plan(made, plan.drop("initial_angle").with_columns(initial_x1=pl.col("initial_x1") + 1.0))
-    assert other.plan is not None
-    assert set(other.plan.given) == {"initial_state"}
+    run_table = made.draw(range(5)).drop("custom_1")
+    assert run_table["initial_x1"].n_unique() == 5
+    again = of_run_table(made, run_table)
+    assert again.run_table is not None
+    assert not again.run_table.given
+    assert_frame_equal(again.draw(range(5)).select(run_table.columns), run_table, check_exact=True)
+    other = of_run_table(made, run_table.drop("initial_angle").with_columns(initial_x1=pl.col("initial_x1") + 1.0))
+    assert other.run_table is not None
+    assert set(other.run_table.given) == {"initial_state"}
 
 
 def test_other_values_of_a_custom_dispersion_are_refused():
@@ -149,14 +149,16 @@ def test_other_values_of_a_custom_dispersion_are_refused():
     written = campaign.Campaign(ready, SEED).draw(range(5))
 
     def again(table):
-        return campaign.of_plan(ready, SEED, plans.checked(table, ready.parts, drawn=ready.dispersion.custom_names()))
+        return campaign.of_run_table(
+            ready, SEED, run_tables.checked(table, ready.parts, drawn=ready.dispersion.custom_names())
+        )
 
     assert_frame_equal(again(written).draw(range(5)), written, check_exact=True)
     worst = written[[3, 1]]
     assert again(worst).draw(range(2))["custom_1"].to_list() == worst["custom_1"].to_list()
     for table in (written.with_columns(custom_1=pl.lit(3.0)), worst.drop("trial", "initial_angle")):
         with pytest.raises(
-            RefusedError, match=r"^the plan has custom_1 \S+ in row 0, but must have \S+ there, which is"
+            RefusedError, match=r"^the run table has custom_1 \S+ in row 0, but must have \S+ there, which is"
         ):
             again(table)
 
@@ -164,9 +166,9 @@ def test_other_values_of_a_custom_dispersion_are_refused():
 @pytest.fixture(scope="module")
 def corners(everything):
     """A run table with values that differ from the random ones for every quantity, and its campaign."""
-    made, plan = everything
+    made, run_table = everything
     generator = np.random.default_rng(1)
-    table = plan.head(2).drop("trial", "initial_angle")
+    table = run_table.head(2).drop("trial", "initial_angle")
     columns = {name: table[name].to_numpy() * (1.0 + 0.01 * generator.uniform(size=2)) for name in table.columns}
     for what in ("initial", "reference"):
         q = Rotation.from_rotvec(generator.normal(size=(2, 3))).as_quat()
@@ -174,20 +176,20 @@ def corners(everything):
         q /= np.linalg.norm(q, axis=1, keepdims=True)
         columns |= {f"{what}_q{k + 1}": q[:, k] for k in range(4)}
     table = pl.DataFrame({"trial": [5, 9], "seed": [SEED, 11], **columns})
-    return table, of_plan(made, table)
+    return table, of_run_table(made, table)
 
 
 def stands(given, table):
     """Check that the rows have the values of the run table."""
-    assert given["plan_trial"].to_list() == [5, 9]
-    assert given["plan_seed"].to_list() == [SEED, 11]
+    assert given["run_trial"].to_list() == [5, 9]
+    assert given["run_seed"].to_list() == [SEED, 11]
     for name in set(table.columns) - {"trial", "seed"}:  # quaternions come normalised
         np.testing.assert_allclose(given[name], table[name], rtol=1e-12, err_msg=name)
 
 
 def test_values_of_a_run_table_are_the_inputs_of_the_trials(corners):
-    table, planned = corners
-    stands(planned.draw(range(2)), table)
+    table, from_table = corners
+    stands(from_table.draw(range(2)), table)
 
 
 alone = programs.jit(montecarlo.one)
@@ -210,12 +212,12 @@ def test_simulation_with_parts_set_by_hand_reproduces_a_row(everything, corners,
     elif kind == "drawn":
         rows = made.fly(range(2))
     else:
-        table, planned = corners
-        rows = planned.fly(range(2))
+        table, from_table = corners
+        rows = from_table.fly(range(2))
         stands(rows, table)
     for row in rows.iter_rows(named=True):
         by_hand = set_by_hand(made.ready.parts, row)
-        seed, trial = row.get("plan_seed", SEED), row.get("plan_trial", row["trial"])
+        seed, trial = row.get("run_seed", SEED), row.get("run_trial", row["trial"])
         run = rollout.simulate_parts(by_hand, jnp.uint32(seed), jnp.uint32(trial))
         assert rollout.STATUS[int(run.status)][0] == row["status"]
         for name in made.ready.catalogue:
@@ -261,19 +263,19 @@ def set_by_hand(parts, row):
 
 def made_of_a_run():
     """Return the columns of a row that are not inputs."""
-    return ("trial", "plan_trial", "plan_seed", "status", "reason", "bad_time", *catalogues.CATALOGUES["spacecraft"])
+    return ("trial", "run_trial", "run_seed", "status", "reason", "bad_time", *catalogues.CATALOGUES["spacecraft"])
 
 
 def test_quantities_that_a_row_omits_are_random():
     made = campaign.Campaign(ready(CHAIN), SEED)
-    plan = made.draw(range(2))
+    run_table = made.draw(range(2))
     states = pl.DataFrame({f"initial_x{k}": [0.1 * k, -0.1] for k in (1, 2, 3)})
-    drawn = of_plan(made, states).draw(range(2))
+    drawn = of_run_table(made, states).draw(range(2))
     given = list(states.columns)
     assert_frame_equal(drawn.select(given), states)
-    others = [name for name in plan.columns if name not in given and name != "initial_angle"]
+    others = [name for name in run_table.columns if name not in given and name != "initial_angle"]
     assert sum(name.startswith("state_noise") for name in others) == 3
-    assert_frame_equal(drawn.select(others), plan.select(others), rel_tol=1e-14, abs_tol=1e-18)
+    assert_frame_equal(drawn.select(others), run_table.select(others), rel_tol=1e-14, abs_tol=1e-18)
 
 
 FILTER = '[filter]\nkind = "steady_state"\n'
@@ -310,13 +312,15 @@ def test_dispersions_do_not_change_the_controller():
 
 def test_chain_is_simulated_with_a_run_table():
     """The initial states, and the seeds and trials of the noise, are from the run table."""
-    noise = '[dispersion]\nstate_noise = { kind = "relative_normal" }'  # compiled program of `test_plan_commands.py`
+    noise = (
+        '[dispersion]\nstate_noise = { kind = "relative_normal" }'  # compiled program of `test_run_table_commands.py`
+    )
     flight = scenario.from_tables(untuned(SHORT_CHAIN.replace("[dispersion]", noise)))
     states = {"initial_x1": [1.1, -0.4], "initial_x2": [0.2, 0.3]}
     whose = {"trial": [2, 0], "seed": [SEED, 11]}
     flown = ptsmc.trials(flight, pl.DataFrame(whose | states), seed=SEED)
-    assert flown["plan_trial"].to_list() == whose["trial"]
-    assert flown["plan_seed"].to_list() == whose["seed"]
+    assert flown["run_trial"].to_list() == whose["trial"]
+    assert flown["run_seed"].to_list() == whose["seed"]
     known = scenario.study(flight)
     for k, (trial, seed) in enumerate(zip(*whose.values(), strict=True)):
         row, at = flown.row(k, named=True), (jnp.uint32(seed), jnp.uint32(trial))
@@ -332,11 +336,11 @@ def test_chain_is_simulated_with_a_run_table():
 Q = {f"initial_q{k}": [0.0, 0.0] for k in (1, 2, 3)}
 J = {f"inertia_{i}{j}": {1: 10.0, 2: 12.0, 3: 14.0}[i] * (i == j) for i in (1, 2, 3) for j in range(i, 4)}
 BAD = [
-    ({}, "the plan has no rows, but must have one for each trial"),
-    ({"inital_w1": [0.0]}, "the plan has the column inital_w1, which no trial of this scenario has; the nearest "
+    ({}, "the run table has no rows, but must have one for each trial"),
+    ({"inital_w1": [0.0]}, "the run table has the column inital_w1, which no trial of this scenario has; the nearest "
      "known one is initial_w1"),
     ({"controller_ok": [65], "controller_eta": [3.0]},  # column of exported C code, and unknown column
-     "the plan has the column controller_eta, which no trial of this scenario has"),
+     "the run table has the column controller_eta, which no trial of this scenario has"),
     ({"initial_x1": [0.0]}, "the column initial_x1, which no trial of this scenario has"),
     ({"initial_w1": [0.0], "initial_w2": [0.0]},
      "has the column initial_w1, but not initial_w3: initial_w1 to initial_w3 come together"),
@@ -364,7 +368,7 @@ BAD = [
 @pytest.mark.parametrize(("columns", "said"), BAD, ids=[row[1][:50] for row in BAD])
 def test_invalid_values_are_refused_with_row_and_column(everything, columns, said):
     with pytest.raises(RefusedError) as refused:
-        plans.checked(pl.DataFrame(columns, strict=False), everything[0].ready.parts)
+        run_tables.checked(pl.DataFrame(columns, strict=False), everything[0].ready.parts)
     assert said in str(refused.value)
     assert "\n" not in str(refused.value)
 
@@ -419,7 +423,7 @@ def table_of(columns, rows):
 @pytest.mark.parametrize(("columns", "rows", "said"), MISFIT, ids=[row[2][-60:] for row in MISFIT])
 def test_impossible_hardware_is_refused_with_row_and_column(misfit, columns, rows, said):
     with pytest.raises(RefusedError) as refused:
-        plans.checked(table_of(columns, rows), misfit)
+        run_tables.checked(table_of(columns, rows), misfit)
     assert said in str(refused.value)
     assert "\n" not in str(refused.value)
 
@@ -428,30 +432,30 @@ def test_limiting_cases_of_hardware_are_accepted(misfit):
     """Outages of zero length, wheel 0 (no failure), the last wheel, and a coupling that needs the row's inertia."""
     heavy = (20.0, 0.0, 0.0, 20.0, 0.0, 20.0)
     rows = [(-1.0, -1.0, 2.0, 0.0, 4.0, 0.0, 0.0, *heavy), (3.0, 3.0, 2.0, 4.0, 0.0, 0.0, 4.4, *heavy)]
-    plan = plans.checked(table_of([*OUTAGE, *FAILURE, *COUPLING, *J], rows), misfit)
-    assert [list(values[1]) for values in plan.given.values()] == [[3, 3], [2, 4], [0, 0, 4.4], list(heavy)]
+    run_table = run_tables.checked(table_of([*OUTAGE, *FAILURE, *COUPLING, *J], rows), misfit)
+    assert [list(values[1]) for values in run_table.given.values()] == [[3, 3], [2, 4], [0, 0, 4.4], list(heavy)]
 
 
 def test_inconsistent_initial_angle_is_refused(everything):
-    made, plan = everything
+    made, run_table = everything
     wrong = pl.when(pl.col("trial") == 2).then(3.0).otherwise("initial_angle")
     with pytest.raises(RefusedError, match="has initial_angle 3 in row 2, but must have "):
-        of_plan(made, plan.with_columns(wrong.alias("initial_angle")))
+        of_run_table(made, run_table.with_columns(wrong.alias("initial_angle")))
 
 
 @pytest.mark.parametrize(("angle", "least"), [(0.5, 1e-5), (20.0, 2e-4)])
 def test_tolerance_of_the_initial_angle_allows_rounded_tables(angle, least):
     """The tolerance is 1e-5 rad, or 1e-5 relative to a state |x_1| above 1."""
     said, off = np.array([1.0, angle]), np.array([0.0, least])
-    plans.check_angle(said, said + 0.9 * off, "the plan")
+    run_tables.check_angle(said, said + 0.9 * off, "the run table")
     with pytest.raises(RefusedError, match="in row 1, but must have"):
-        plans.check_angle(said, said + 1.1 * off, "the plan")
+        run_tables.check_angle(said, said + 1.1 * off, "the run table")
 
 
 def test_run_tables_of_different_trials_have_different_checksums():
     """Values, names, trials, seeds and the number of rows change the checksum. The initial angle does not."""
     numbers, three = np.arange(6.0).reshape(2, 3), np.array([3, 5], np.uint32)
-    some = plans.Plan({"initial_rate": numbers}, None, None, None, 2)
+    some = run_tables.RunTable({"initial_rate": numbers}, None, None, None, 2)
     others = [
         dataclasses.replace(some, given={"initial_rate": np.nextafter(numbers, 9.0)}),
         dataclasses.replace(some, given={"disturbance_bias": numbers}),
@@ -463,21 +467,21 @@ def test_run_tables_of_different_trials_have_different_checksums():
     assert dataclasses.replace(some, angle=np.ones(2)).digest == some.digest
 
 
-@pytest.mark.parametrize("folder", ["plans[1]", "plans*"])
+@pytest.mark.parametrize("folder", ["tables[1]", "tables*"])
 def test_run_table_in_a_folder_with_wildcards_in_its_name_is_read(tmp_path, folder):
     table = pl.DataFrame({"trial": [4, 2]})
     for name, rows in ((folder, table), ("plans1", table.head(1))):
         (tmp_path / name).mkdir()
-        rows.write_csv(tmp_path / name / "plan.csv")
-        rows.write_parquet(tmp_path / name / "plan.parquet")
-    for path in ("plan.csv", "plan.parquet"):
-        assert plans.read(tmp_path / folder / path)["trial"].cast(int).to_list() == [4, 2]
+        rows.write_csv(tmp_path / name / "run_table.csv")
+        rows.write_parquet(tmp_path / name / "run_table.parquet")
+    for path in ("run_table.csv", "run_table.parquet"):
+        assert run_tables.read(tmp_path / folder / path)["trial"].cast(int).to_list() == [4, 2]
 
 
 def test_files_that_are_not_run_tables_are_refused(tmp_path):
     for name, content, said in (
         ("none.csv", None, "which is not there; allowed is a .csv or .parquet file with a row for each trial"),
-        ("plan.txt", b"trial\n1\n", "plan.txt, but must be a .csv or .parquet file"),
+        ("run_table.txt", b"trial\n1\n", "run_table.txt, but must be a .csv or .parquet file"),
         ("cut.parquet", b"PAR1", "cut.parquet, which cannot be read: "),
         ("empty.csv", b"", "empty.csv, which cannot be read: "),
         ("folder", None, "folder, but must be a .csv or .parquet"),
@@ -487,6 +491,6 @@ def test_files_that_are_not_run_tables_are_refused(tmp_path):
         if name == "folder":
             (tmp_path / name).mkdir()
         with pytest.raises(RefusedError) as refused:
-            plans.read(tmp_path / name)
+            run_tables.read(tmp_path / name)
         assert said in str(refused.value)
         assert "\n" not in str(refused.value)

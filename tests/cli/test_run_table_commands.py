@@ -1,4 +1,4 @@
-"""`ptsmc montecarlo --plan`: campaigns with a run table, which can be resumed, replayed and reported."""
+"""`ptsmc montecarlo --runs`: campaigns with a run table, which can be resumed, replayed and reported."""
 
 import json
 import shlex
@@ -28,16 +28,16 @@ def test_run_table_of_a_dry_run_reproduces_the_campaign(command, tmp_path):
     options = ["--seed", 3, "--no-figures", "--quiet"]
     assert command("montecarlo", "s.toml", "--trials", 150, *options)[0] == 0
     assert command("montecarlo", "s.toml", "--trials", 150, "--dry-run", *options, "--out", "dry")[0] == 0
-    assert command("montecarlo", "s.toml", "--plan", "dry/plan", *options) == (0, "", "")
-    made = tmp_path / "out" / "montecarlo-s-plan"
+    assert command("montecarlo", "s.toml", "--runs", "dry/runs", *options) == (0, "", "")
+    made = tmp_path / "out" / "montecarlo-s-runs"
     assert rows_of(made).equals(rows_of(tmp_path / "out" / "montecarlo-s"))
     told = json.loads((made / "versions.json").read_text())
-    assert (told["plan"], told["trials"]) == ("plan", 150)
+    assert (told["run_table"], told["trials"]) == ("runs", 150)
 
 
 def test_run_table_is_simulated_resumed_replayed_and_reported(command, tmp_path):
     (tmp_path / "corners.csv").write_text(CORNERS)
-    asked = ["montecarlo", "s.toml", "--plan", "corners.csv", "--no-figures"]
+    asked = ["montecarlo", "s.toml", "--runs", "corners.csv", "--no-figures"]
     code, said, _ = command(*asked)
     folder = tmp_path / "out" / "montecarlo-s-corners"
     assert code == 0
@@ -48,7 +48,7 @@ def test_run_table_is_simulated_resumed_replayed_and_reported(command, tmp_path)
     assert rows["initial_x2"].to_list() == [0.0, 0.02, -0.02]
     assert rows["state_noise_1"].n_unique() == 3  # omitted quantities are random
     read = checked(folder)
-    assert "ptsmc montecarlo s.toml --plan corners.csv --no-figures" in read.text
+    assert "ptsmc montecarlo s.toml --runs corners.csv --no-figures" in read.text
 
     part = next((folder / "trials").iterdir())
     part.unlink()
@@ -66,26 +66,26 @@ def test_run_table_is_simulated_resumed_replayed_and_reported(command, tmp_path)
 
     (tmp_path / "corners.csv").write_text(CORNERS.replace("-0.02", "-0.03"))
     code, _, error = command(*asked)
-    assert (code, "which holds a run with plan_sha256" in error) == (2, True)
-    pl.read_csv(tmp_path / "corners.csv").write_parquet(folder / "plan.parquet")
+    assert (code, "which holds a run with run_table_sha256" in error) == (2, True)
+    pl.read_csv(tmp_path / "corners.csv").write_parquet(folder / "run_table.parquet")
     for again in (["replay", folder, "--trial", 1], ["replay", folder, "--trial", 0]):
         code, out, error = command(*again)
         assert (code, out) == (2, "")
-        assert "plan.parquet is not the plan that the campaign was begun with" in error
+        assert "run_table.parquet is not the run table that the campaign was begun with" in error
     assert command(*asked, "--force", "--quiet")[0] == 0
     assert rows_of(folder)["initial_x2"][2] == -0.03
     assert command("montecarlo", "s.toml", "--out", folder, "--force", "--quiet", "--trials", 5, "--no-figures")[0] == 0
-    assert not (folder / "plan.parquet").exists()
+    assert not (folder / "run_table.parquet").exists()
 
 
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--plan", "none.csv"], "--plan is none.csv, which is not there"),
-        (["--plan", "s.toml"], "--plan is s.toml, but must be a .csv or .parquet file"),
-        (["--plan", "bad.csv"], "the plan bad.csv has initial_x2 nan in row 1, but must have a finite number"),
-        (["--plan", "bad.csv", "--trials", "5"], "Mutually exclusive arguments: {--trials, --plan}"),
-        (["--plan", "bad.csv", "--until-confident", "0.1"], "{--plan, --until-confident}"),
+        (["--runs", "none.csv"], "--runs is none.csv, which is not there"),
+        (["--runs", "s.toml"], "--runs is s.toml, but must be a .csv or .parquet file"),
+        (["--runs", "bad.csv"], "the run table bad.csv has initial_x2 nan in row 1, but must have a finite number"),
+        (["--runs", "bad.csv", "--trials", "5"], "Mutually exclusive arguments: {--trials, --runs}"),
+        (["--runs", "bad.csv", "--until-confident", "0.1"], "{--runs, --until-confident}"),
     ],
 )
 def test_invalid_run_tables_are_refused_and_nothing_is_written(command, tmp_path, options, said):
@@ -107,7 +107,7 @@ def test_invalid_run_tables_are_refused_and_nothing_is_written(command, tmp_path
 )
 def test_a_refused_table_prints_one_line_without_control_characters(command, tmp_path, table, shown):
     (tmp_path / "bad.csv").write_text(table)
-    code, out, error = command("montecarlo", "s.toml", "--plan", "bad.csv")
+    code, out, error = command("montecarlo", "s.toml", "--runs", "bad.csv")
     assert (code, out) == (2, "")
     assert shown in error
     assert error.removesuffix("\n").isprintable()
@@ -115,5 +115,5 @@ def test_a_refused_table_prints_one_line_without_control_characters(command, tmp
 
 def test_a_table_from_a_spreadsheet_with_decimal_commas_is_simulated(command, tmp_path):
     (tmp_path / "sheet.csv").write_text(";initial_x1;initial_x2\n0;1,4;0,0\n1;1,0;0,02\n", encoding="utf-16")
-    assert command("montecarlo", "s.toml", "--plan", "sheet.csv", "--no-figures", "--quiet") == (0, "", "")
+    assert command("montecarlo", "s.toml", "--runs", "sheet.csv", "--no-figures", "--quiet") == (0, "", "")
     assert rows_of(tmp_path / "out" / "montecarlo-s-sheet")["initial_x2"].to_list() == [0.0, 0.02]
