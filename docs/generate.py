@@ -43,7 +43,7 @@ bound](theory/lower_bound.md).
 | it never settles | `settling_time` is null, and a limit on `settling_time` is violated |
 | it diverged or met the singularity of the law | it has a status, a reason and a time, and violates every requirement |
 | another metric is infinite or has no value | it counts as diverged at t_end |
-| it is `missed`: at t_f it is far from the reference | its metrics count |"""
+| it is `not_converged`: at t_f it is far from the reference | its metrics count |"""
 ERRORS = """\
 With `controller.error = "additive"` the attitude error vector is eps_1 = q_1 - q_1f, as in the paper. With
 `"multiplicative"`, and for the comparison laws, it is the vector part of q_f* q. The units x1, x2 and u are those of

@@ -86,7 +86,7 @@ class Flight:
 
     @property
     def status(self) -> str:
-        """Status of the run: ok, missed (not converged at t_f), singular or diverged."""
+        """Status of the run: ok, not_converged (at t_f), singular or diverged."""
         return self.run.status
 
     @property

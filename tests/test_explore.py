@@ -107,7 +107,7 @@ def test_simulate_refuses_a_singular_nominal_start():
     turned = scenario.from_tables({**TABLES, "initial": {"rotvec_deg": [180.0, 0.0, 0.0]}})
     with pytest.raises(ScenarioError, match="q4 = 0"):
         ptsmc_jax.simulate(turned)
-    assert ptsmc_jax.simulate(turned, trial=0).status in ("ok", "missed")
+    assert ptsmc_jax.simulate(turned, trial=0).status in ("ok", "not_converged")
 
 
 def test_tables_show_units_and_escape_what_they_show(flight):
@@ -216,7 +216,7 @@ def test_the_error_of_invalid_custom_metrics_names_their_function():
 def test_an_incomplete_run_shows_its_reason_and_dashes_for_missing_metrics():
     slow = scenario.replace(scenario.from_tables(CHAIN), hardware__torque_limit=1e-3)
     run = ptsmc_jax.simulate(slow)
-    assert repr(run).startswith("status: missed, at t_f more than 5 % of the initial error is left, at 5 s")
+    assert repr(run).startswith("status: not_converged, at t_f more than 5 % of the initial error is left, at 5 s")
     assert "<td>settling_time</td><td>-</td><td>s</td>" in run.metrics._repr_html_()
     assert explore.units("chain")["peak_torque"] == "u"
     with pytest.raises(ValueError, match="no kind of plant 'boat'; allowed are spacecraft, chain, system"):

@@ -15,16 +15,16 @@ BANDS = ((99.7, "0.85"), (90.0, "0.68"), (50.0, "0.45"))  # central fraction of 
 # runs to the end that violate a limit on fractions of time, which may be met all the same, or on trials
 AT_TIMES = "beyond a limit that may be left at times"
 BEYOND = "beyond a limit"
-FLOWN = ("ok", AT_TIMES, BEYOND, "missed")  # to the end
+FLOWN = ("ok", AT_TIMES, BEYOND, "not_converged")  # to the end
 # outcome: colour, marker, size
 MARKS = {
     "ok": (STYLES[0][0], "o", 6.0),
     AT_TIMES: ("#E69F00", "v", 10.0),
     BEYOND: ("#CC79A7", "D", 8.0),
-    "missed": (STYLES[1][0], "^", 16.0),
+    "not_converged": (STYLES[1][0], "^", 16.0),
     "singular": (STYLES[3][0], "x", 18.0),
     "diverged": (STYLES[2][0], "s", 16.0),
-    "unfinished": ("#000000", "+", 18.0),
+    "incomplete": ("#000000", "+", 18.0),
 }
 
 
@@ -179,6 +179,6 @@ def _points(axes: Axes, x: np.ndarray, y: np.ndarray, outcome: np.ndarray, total
     for name, (colour, marker, size) in MARKS.items():
         those = outcome == name
         if np.any(those):
-            label = f"{name}: {totals[name]}"
+            label = f"{name.replace('_', ' ')}: {totals[name]}"
             width = 1.2 if marker in ("x", "+") else 0.0  # line markers are invisible without a width
             axes.scatter(x[those], y[those], s=size, c=colour, marker=marker, alpha=0.6, label=label, linewidths=width)

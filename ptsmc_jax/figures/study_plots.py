@@ -18,7 +18,7 @@ from ptsmc_jax.simulation.catalogues import CATALOGUES
 MARKERS = ("o", "^", "s", "D", "v")
 BEYOND = ("x", "+", "1", "2", "3", "4")  # of points that violate a limit, one for each limit
 # marker of a pair with a failed trial, visible on any colour
-LOST: Any = {"marker": "X", "color": "white", "mec": "black", "mew": 0.6, "ms": 6}
+FAILED: Any = {"marker": "X", "color": "white", "mec": "black", "mew": 0.6, "ms": 6}
 WIDEST = 1e4  # largest ratio of the values that the colours of a map span
 
 
@@ -306,7 +306,7 @@ def accuracy_map(
     x: MapAxis,
     y: MapAxis,
     grids: Mapping[str, np.ndarray],
-    lost: np.ndarray,
+    failed: np.ndarray,
     borders: Mapping[str, tuple[np.ndarray, np.ndarray]],
     kind: str = "spacecraft",
 ) -> Figure:
@@ -316,7 +316,7 @@ def accuracy_map(
         x: the horizontal key.
         y: the vertical key.
         grids: (y, x) by name; grids without finite numbers are not drawn.
-        lost: (y, x) bool, a trial failed or did not converge at t_f.
+        failed: (y, x) bool, a trial failed or did not converge at t_f.
         borders: lines (x, y) by label.
         kind: of the plant; it determines the units.
     """
@@ -335,7 +335,7 @@ def accuracy_map(
     for axes, name in zip(many, drawn, strict=False):
         kind_of_number = "error" if "error" in name else "torque"  # those of a kind have one scale
         _coloured(axes, x, y, grids[name], [grids[other] for other in drawn if kind_of_number in other])
-        axes.plot(column[lost], row[lost], ls="", **LOST)
+        axes.plot(column[failed], row[failed], ls="", **FAILED)
         limits = axes.get_xlim(), axes.get_ylim()
         for (label, line), style in zip(borders.items(), ("-", "--", ":"), strict=False):
             axes.plot(*line, color="white", lw=3.0, ls=style)
@@ -349,9 +349,9 @@ def accuracy_map(
     figure.supxlabel(x.label)
     figure.supylabel(y.label)
     handles, labels = many[0].get_legend_handles_labels()
-    if np.any(lost):
-        handles.append(matplotlib.lines.Line2D([], [], ls="", **LOST))
-        labels.append("a trial failed or missed t_f")
+    if np.any(failed):
+        handles.append(matplotlib.lines.Line2D([], [], ls="", **FAILED))
+        labels.append("a trial failed or did not converge at t_f")
     if handles:
         figure.legend(handles, labels, loc="outside upper left", ncols=len(handles))
     return figure

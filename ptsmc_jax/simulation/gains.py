@@ -78,7 +78,7 @@ def with_gains(parts: Parts, gains: Mapping[str, Array | float]) -> Parts:
 
     Raises:
         ValueError: a name is unknown, a value is no finite number, or the clock of the parts has too few samples or
-            steps for the new times. Under a JAX transformation the run has the status `unfinished` instead.
+            steps for the new times. Under a JAX transformation the run has the status `incomplete` instead.
         TypeError: the first argument is not the parts of a run.
     """
     check_parts(parts)

@@ -21,22 +21,35 @@ from ptsmc_jax.simulation.interval import Criteria
 from ptsmc_jax.simulation.run_state import (
     DIVERGED,
     FINISHED,
-    MISSED,
+    INCOMPLETE,
+    NOT_CONVERGED,
     OK,
     SINGULAR,
     SINGULAR_CLEARANCE,
     STATUS,
     TOO_FAST,
     UNBOUNDED,
-    UNFINISHED,
     Log,
     Result,
     Run,
 )  # fmt: skip
 
 __all__ = [
-    "DIVERGED", "FINISHED", "MISSED", "OK", "SINGULAR", "SINGULAR_CLEARANCE", "STATUS", "TOO_FAST", "UNBOUNDED",
-    "UNFINISHED", "Log", "Parts", "Result", "simulate", "simulate_parts",
+    "DIVERGED",
+    "FINISHED",
+    "INCOMPLETE",
+    "NOT_CONVERGED",
+    "OK",
+    "SINGULAR",
+    "SINGULAR_CLEARANCE",
+    "STATUS",
+    "TOO_FAST",
+    "UNBOUNDED",
+    "Log",
+    "Parts",
+    "Result",
+    "simulate",
+    "simulate_parts",
 ]  # fmt: skip
 
 

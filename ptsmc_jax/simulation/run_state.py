@@ -16,23 +16,23 @@ from ptsmc_jax.simulation.computer import Decision
 from ptsmc_jax.simulation.control_period import Record, State
 from ptsmc_jax.simulation.interval import Arrival, Criteria, Errors, Interval, Snapshot, Start
 
-OK, DIVERGED, TOO_FAST, SINGULAR, MISSED, UNBOUNDED, UNFINISHED = range(7)
+OK, DIVERGED, TOO_FAST, SINGULAR, NOT_CONVERGED, UNBOUNDED, INCOMPLETE = range(7)
 # code: (status, reason)
 STATUS = {
     OK: ("ok", ""),
     DIVERGED: ("diverged", "the state, the torque or the law's memory is not finite"),
     TOO_FAST: ("diverged", "the body turns more than 1 rad in an integration step"),
     SINGULAR: ("singular", "the law's singularity came nearer than 1e-3"),
-    MISSED: ("missed", "at t_f more than 5 % of the initial error is left"),
+    NOT_CONVERGED: ("not_converged", "at t_f more than 5 % of the initial error is left"),
     UNBOUNDED: ("diverged", "a metric is not finite"),
-    UNFINISHED: ("unfinished", "the clock was made for other gains, and has too few samples or steps for these"),
+    INCOMPLETE: ("incomplete", "the clock was made for other gains, and has too few samples or steps for these"),
 }
-FINISHED = (OK, MISSED)  # statuses of runs that were simulated to t_end
+FINISHED = (OK, NOT_CONVERGED)  # statuses of runs that were simulated to t_end
 # clearance from the singularity of the law; its gain grows like 1 / clearance and is 1000 times as large here
 SINGULAR_CLEARANCE = 1e-3
 # a run has not converged if its angle at t_f is larger than both of these
-MISSED_SHARE = 0.05  # fraction of the initial angle
-MISSED_SETTLING_ANGLES = 10.0
+NOT_CONVERGED_FRACTION = 0.05  # fraction of the initial angle
+NOT_CONVERGED_SETTLING_ANGLES = 10.0
 
 
 class Log(NamedTuple):
@@ -190,16 +190,16 @@ def finish(run: Run, first: Score, score: Score, log: Log | None, samples: dict[
     criteria, angle_at_t_f = run.criteria, score.running.arrival.angle
     values = metrics.finish(score.running, criteria)
     unbounded = (score.status == OK) & metrics.unbounded(values)
-    missed = (score.status == OK) & misses(angle_at_t_f, first.snapshot.angle, criteria.settling_angle)
+    not_converged = (score.status == OK) & is_not_converged(angle_at_t_f, first.snapshot.angle, criteria.settling_angle)
     cut = ~jnp.isnan(run.gap) & ~(score.bad_time < run.gap)  # later statuses mean nothing without samples
-    status = jnp.where(unbounded, UNBOUNDED, jnp.where(missed, MISSED, score.status))
-    status = jnp.where(cut, UNFINISHED, status).astype(jnp.int32)
-    bad_time = jnp.where(unbounded, criteria.t_end, jnp.where(missed, criteria.t_f, score.bad_time))
+    status = jnp.where(unbounded, UNBOUNDED, jnp.where(not_converged, NOT_CONVERGED, score.status))
+    status = jnp.where(cut, INCOMPLETE, status).astype(jnp.int32)
+    bad_time = jnp.where(unbounded, criteria.t_end, jnp.where(not_converged, criteria.t_f, score.bad_time))
     bad_time = jnp.where(cut, run.gap, bad_time)
     return Result(values, status, bad_time, log, samples or {})
 
 
-def misses(angle_at_t_f: Scalar, first: Scalar, settling_angle: Scalar) -> Array:
+def is_not_converged(angle_at_t_f: Scalar, first: Scalar, settling_angle: Scalar) -> Array:
     """Return whether a completed run has not converged at t_f.
 
     Args:
@@ -207,7 +207,7 @@ def misses(angle_at_t_f: Scalar, first: Scalar, settling_angle: Scalar) -> Array
         first: angle to the reference at t = 0 [rad].
         settling_angle: of the scenario [rad].
     """
-    return angle_at_t_f > jnp.maximum(MISSED_SHARE * first, MISSED_SETTLING_ANGLES * settling_angle)
+    return angle_at_t_f > jnp.maximum(NOT_CONVERGED_FRACTION * first, NOT_CONVERGED_SETTLING_ANGLES * settling_angle)
 
 
 def _snapshot(parts: Parts, target: Any, x: Any) -> Snapshot:

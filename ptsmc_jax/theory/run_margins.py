@@ -34,7 +34,7 @@ class Course(NamedTuple):
     at_sensors: Margins  # (k,) in the hold phase.
     together: dict[str, float]  # Margins of all axes of the input at once, in the hold phase.
     clearance: float  # Smallest distance to the singularity, in the unit of `run_state.SINGULAR_CLEARANCE`.
-    missed: bool  # Whether the run has not converged at t_f, see `run_state.misses`.
+    not_converged: bool  # Whether the run has not converged at t_f, see `run_state.is_not_converged`.
     swing: rest.Swing | None = None  # Limit cycle in the hold phase, if there is one.
 
     @property
@@ -152,7 +152,7 @@ def along(parts: Parts, times: int = 24) -> Course:
     margins in the hold phase are zero, see `rest`.
     """
     run = linear.nominal_jit(parts)
-    looked_at, commands, clearance, missed = _along(parts, run, times)
+    looked_at, commands, clearance, not_converged = _along(parts, run, times)
     at_times = at(parts, looked_at, run)
     first_at = {t: k for k, t in reversed(list(enumerate(at_times.t.tolist()))) if not at_times.hold[k]}
     order = np.asarray([k for _, k in sorted(first_at.items())] + [len(at_times.t) - 1])
@@ -167,7 +167,7 @@ def along(parts: Parts, times: int = 24) -> Course:
         at_once = dict.fromkeys(FIELDS, float("nan"))
         at_input, at_sensors = rest.none_left(at_input, order == order[-1]), rest.none_left(at_sensors, [True])
     at_sensors = jax.tree.map(lambda v: np.asarray(v)[0], at_sensors)
-    return Course(t, counts, loops, at_input, at_sensors, at_once, float(clearance), bool(missed), swing)
+    return Course(t, counts, loops, at_input, at_sensors, at_once, float(clearance), bool(not_converged), swing)
 
 
 @programs.jit(static_argnames="times", compiler_options=programs.QUICKLY)
@@ -187,8 +187,8 @@ def _along(parts: Parts, run: linear.Nominal, times: int) -> tuple[Array, Histor
         law.kinematics.angle(jax.tree.map(lambda v, k=k: v[k], run.carry.x), parts.reference(t[k]))
         for k in (0, jnp.argmax(t >= law.t_f))
     )
-    missed = run_state.misses(arrived, first, parts.settling_angle)
-    return jnp.append(judged_times(parts), besides), history(parts, run), nearest, missed
+    not_converged = run_state.is_not_converged(arrived, first, parts.settling_angle)
+    return jnp.append(judged_times(parts), besides), history(parts, run), nearest, not_converged
 
 
 def at_ends(parts: Parts) -> dict[str, tuple[Margins, float]]:

@@ -486,6 +486,6 @@ def test_campaign_without_its_margin_verdicts_is_unfinished(command, tmp_path, m
     code, said, _ = command("summarize", folder, "--no-figures")
     assert code == 1
     assert "NOT finished: gain_margin is required and not judged yet; " in said
-    assert json.loads((folder / "summary.json").read_text())["status"] == "unfinished"
+    assert json.loads((folder / "summary.json").read_text())["status"] == "incomplete"
     assert command(*again, "--quiet") == (0, "", "")
     assert (folder / "floor.json").read_text() == whole

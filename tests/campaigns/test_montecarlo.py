@@ -116,12 +116,12 @@ def test_failed_trials_are_counted_and_do_not_affect_others():
     wide = random_turns(np.deg2rad(20.0), np.pi)
     near = random_turns(np.pi - 1e-4, np.pi)
     failed = montecarlo.run(run, near, 5, np.arange(montecarlo.FEW))
-    assert failed.counts() == {"ok": 0, "diverged": 0, "singular": montecarlo.FEW, "missed": 0, "unfinished": 0}
+    assert failed.counts() == {"ok": 0, "diverged": 0, "singular": montecarlo.FEW, "not_converged": 0, "incomplete": 0}
     assert np.all(failed.bad_time >= 0.0)
     mixed = montecarlo.run(run, wide, 5, np.arange(256))
     assert sum(mixed.counts().values()) == 256
     assert np.all(np.isfinite(mixed.metrics.window_error[mixed.ok]))
-    assert trials.counts() == {"ok": 256, "diverged": 0, "singular": 0, "missed": 0, "unfinished": 0}
+    assert trials.counts() == {"ok": 256, "diverged": 0, "singular": 0, "not_converged": 0, "incomplete": 0}
 
 
 @pytest.mark.parametrize(("eta", "delta", "gain", "quiet", "noisy"), short(TABLE, TABLE[::4]))

@@ -34,7 +34,7 @@ def test_lower_bound_is_pooled_over_the_first_trials_or_rows(monkeypatch, varies
     assert seen == [(5, k) for k in flown]
 
 
-@pytest.mark.parametrize("status", ["missed", "singular", "diverged"])
+@pytest.mark.parametrize("status", ["not_converged", "singular", "diverged"])
 def test_failed_run_is_not_met_even_without_requirements(status):
     """`ptsmc simulate` then has exit status 1."""
     none: Any = None

@@ -76,7 +76,7 @@ def test_inputs_of_the_worst_trial_have_percentile_median_and_sensitivity(monkey
     # metrics of a failed run are those until its failure; sensitivities must not use them
     cut = np.where(np.arange(401) % 3 == 0, 1e3 * (1.0 - rate), table["peak_torque"].to_numpy())
     table = table.with_columns(
-        peak_torque=cut, status=pl.Series(["diverged", "ok", "missed"] * 133 + ["diverged", "ok"])
+        peak_torque=cut, status=pl.Series(["diverged", "ok", "not_converged"] * 133 + ["diverged", "ok"])
     )
     ended = table.filter(pl.col("status") != "diverged")
     driven = statistics.drivers({"initial_w1": ended["initial_w1"].to_numpy()}, ended["peak_torque"].to_numpy())

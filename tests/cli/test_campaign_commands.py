@@ -319,7 +319,7 @@ def test_shards_in_one_folder_or_several_make_the_whole_campaign(command, flown,
         command("montecarlo", "s.toml", *options, "--shard", f"{k}/2", "--out", f"part{k}", "--quiet")
     code, said, _ = command("summarize", "part1", "--no-figures")
     assert (code, "NOT finished: 150 of 250 trials" in said) == (1, True)
-    assert summary(tmp_path / "part1")["status"] == "unfinished"
+    assert summary(tmp_path / "part1")["status"] == "incomplete"
     for path in (tmp_path / "part2" / "trials").iterdir():  # merge the shards into one folder
         path.rename(tmp_path / "part1" / "trials" / path.name)
     for folder in ("one", "part1"):

@@ -301,7 +301,7 @@ def test_wheels_respect_their_limits():
     assert np.all(np.abs(result.log.u) <= 0.08 * np.abs(PYRAMID).sum(axis=0) * (1 + 1e-9))
     assert float(result.metrics.peak_wheel_momentum) <= 0.6 * (1 + 1e-9)
     assert float(result.metrics.saturated) > 0.1
-    assert int(result.status) == rollout.MISSED  # the slew needs 1.2 N m s, twice the limit
+    assert int(result.status) == rollout.NOT_CONVERGED  # the slew needs 1.2 N m s, twice the limit
     assert all(np.isfinite(v) for v in (result.metrics.window_error, result.metrics.peak_torque))
 
 
@@ -482,7 +482,7 @@ def test_gradients_are_finite_where_functions_are_not_differentiable():
 def test_a_saturated_slew_stays_finite_and_converges_after_t_f():
     device = actuators.Actuators(torque_limit=vector(0.1), step=vector(1e-3), delay=3)
     result = fly(with_device(device, t_end=120.0))
-    assert int(result.status) == rollout.MISSED
+    assert int(result.status) == rollout.NOT_CONVERGED
     assert result.bad_time == 20.0
     metrics = result.metrics
     always = [name for name, entry in catalogues.CATALOGUE.items() if entry.table is None]
@@ -503,7 +503,7 @@ def test_momentum_limit_does_not_violate_the_torque_limit(lag):
     assert np.all(np.abs(result.log.u) <= 0.1 * np.abs(PYRAMID).sum(axis=0) * (1 + 1e-9))
     # with a lag the momentum limit may be exceeded, because the torque limit has priority
     assert float(result.metrics.peak_wheel_momentum) <= 0.45 * (1 + 1e-9) + (0.0 if lag is None else 0.1 * 0.08)
-    assert int(result.status) == rollout.MISSED
+    assert int(result.status) == rollout.NOT_CONVERGED
 
 
 def test_observer_estimates_no_disturbance_from_wheel_momentum():

@@ -52,16 +52,16 @@ def test_each_outcome_is_counted_and_drawn():
     ):
         drawn = np.all(np.asarray(points.get_linewidth()) > 0.0)
         assert drawn or MarkerStyle(marker).is_filled(), marker  # otherwise it is invisible
-    flown = x[np.isin(outcome, ("ok", campaign_plots.AT_TIMES, campaign_plots.BEYOND, "missed"))]
+    flown = x[np.isin(outcome, ("ok", campaign_plots.AT_TIMES, campaign_plots.BEYOND, "not_converged"))]
     assert axes.get_ylim() == pytest.approx((flown.min() / 1.3, flown.max() * 1.5))
 
 
 @pytest.mark.parametrize("limit", [1e-3, 1e3])
 def test_a_limit_in_the_legend_is_on_the_axis(limit):
     """An earlier version lost the line of 0.5 N m on an axis of 10 kN m, the commanded torque."""
-    x, outcome = np.arange(1.0, 4.0), np.full(3, "missed", dtype=object)
+    x, outcome = np.arange(1.0, 4.0), np.full(3, "not_converged", dtype=object)
     start, torque = campaign_plots.Column("rad", x), campaign_plots.Column("N m", x, limit)
-    (axes,) = campaign_plots.torque_by_angle(start, torque, outcome, {"missed": 3}).axes
+    (axes,) = campaign_plots.torque_by_angle(start, torque, outcome, {"not_converged": 3}).axes
     low, high = axes.get_ylim()
     assert low < limit < high
 

@@ -42,7 +42,9 @@ def test_no_largest_settling_time_if_a_run_that_ended_never_settled(without, lar
     """Trials that failed have none either, but they are counted above the table."""
     at = {"value": 56.0, "low": 55.0, "high": 57.0}
     settling = {"without_value": without, "max": 57.2, "0.5": at, "0.9973": at}
-    found = examples.campaign(counts={"ok": 58, "missed": 1, "diverged": 1}, quantiles={"settling_time": settling})
+    found = examples.campaign(
+        counts={"ok": 58, "not_converged": 1, "diverged": 1}, quantiles={"settling_time": settling}
+    )
     (table,) = campaign_report.quantiles(found)
     assert table.rows == [("settling_time", "56", "56", "55..57", largest, "s")]
 
@@ -130,18 +132,18 @@ def test_command_that_replays_the_worst_trial_can_be_pasted_into_a_shell():
 
 
 def test_best_pair_of_a_map_has_the_fewest_failed_trials():
-    pair = {"status": "flown", "failures": 0.0, "missed": 0.0, "window_error": 2e-6, "peak_torque": 0.3}
+    pair = {"status": "flown", "failures": 0.0, "not_converged": 0.0, "window_error": 2e-6, "peak_torque": 0.3}
     pairs = [
         {**pair, "x": 1.0, "y": 1.0, "failures": 3.0, "window_error": 1e-6},
         {**pair, "x": 1.0, "y": 2.0},
-        {**pair, "x": 2.0, "y": 1.0, "missed": 2.0, "window_error": 1e-6},
+        {**pair, "x": 2.0, "y": 1.0, "not_converged": 2.0, "window_error": 1e-6},
         {**pair, "x": 2.0, "y": 2.0, "status": "not allowed", "window_error": float("nan")},
     ]
     keys = "loop.period", "controller.delta"
     assert list(map_report.lines(pairs, keys, "spacecraft")) == [
         "the smallest RMS error is 0.825 arcsec at loop.period = 1 and controller.delta = 2, with a mean peak torque "
         "of 0.3 N m",
-        "3 of 4 pairs simulated, 2 of them with trials that failed or missed t_f",
+        "3 of 4 pairs simulated, 2 of them with trials that failed or did not converge at t_f",
     ]
     best, _ = map_report.lines(pairs[:1], keys, "spacecraft")
-    assert best.endswith("of 0.3 N m; 3 of its trials failed or missed t_f")
+    assert best.endswith("of 0.3 N m; 3 of its trials failed or did not converge at t_f")

@@ -71,7 +71,7 @@ def test_missing_and_dominated_points_and_missed_requirements_are_reported():
 def test_points_without_a_completed_trial_have_no_numbers():
     lost = torque(0.1, math.nan, math.nan, failures=9)
     made = front(lost, others={"paper": lost})
-    row = ("-", "-", "-", "-", "-", "9 failed or missed")
+    row = ("-", "-", "-", "-", "-", "9 failed or not converged")
     assert front_report.results(made).rows == [("0.1", *row), ("published", *row)]
     assert list(front_report.answers(made)) == []
     assert page_charts.front(made, None)["data"] == []
@@ -123,7 +123,7 @@ def test_slew_times_state_the_shortest_time_and_the_cost_of_the_fastest_slew():
     ]
     assert list(front_report.remarks(made)) == ["no gains found keep all limits on the training trials for t_f: 4 s"]
     rows = front_report.results(made).rows
-    assert rows[0] == ("8", "4.13 arcsec", "10.0 %", "1.000e-05", "0.2", "2 failed or missed")
+    assert rows[0] == ("8", "4.13 arcsec", "10.0 %", "1.000e-05", "0.2", "2 failed or not converged")
     assert list(front_report.answers(front(against="t_f"))) == []
 
 

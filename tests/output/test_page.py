@@ -96,7 +96,7 @@ def test_the_body_turns_as_it_flew(flown):
 
 @pytest.mark.parametrize(("status", "mood", "said"), [
     ("ok", "good", "every requirement is met"),
-    ("missed", "bad", "the run failed: missed"),
+    ("not_converged", "bad", "the run failed: not converged"),
     ("diverged", "bad", "the run failed: diverged"),
 ])  # fmt: skip
 def test_the_verdict_comes_first(flown, status, mood, said):

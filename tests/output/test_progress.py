@@ -39,9 +39,9 @@ def test_trials_a_second_are_those_flown_since_the_command_began(monkeypatch):
         bar(campaign.Tally(done, 9000, failed))
     assert said == [
         "1000 of 9000 trials, compiling",
-        "4000 of 9000 trials, 750 a second, 2 failed or missed",
-        "9000 of 9000 trials, 2,000 a second, 2 failed or missed",
-        "9000 of 9000 trials, 0.5 a second, 2 failed or missed",
+        "4000 of 9000 trials, 750 a second, 2 failed or not converged",
+        "9000 of 9000 trials, 2,000 a second, 2 failed or not converged",
+        "9000 of 9000 trials, 0.5 a second, 2 failed or not converged",
     ]
 
 

@@ -124,13 +124,13 @@ def test_table_shows_an_observer_that_is_tuned_by_axis(tuned, shown):
 
 def test_table_has_errors_as_angles_and_their_ratio_to_the_lower_bound():
     fresh = examples.group(window_error=errors(1e-6, largest=2e-6), floor=5e-7, peak_torque=errors(0.25))
-    paper = examples.group(window_error=errors(1e-4), floor=5e-7, counts={"ok": 60, "missed": 4})
+    paper = examples.group(window_error=errors(1e-4), floor=5e-7, counts={"ok": 60, "not_converged": 4})
     rows = {row[0]: row[1:] for row in tune_report.gains(examples.tune(fresh=fresh, paper=paper)).rows}
     assert rows["RMS pointing error"] == ("41.3 arcsec", "0.413 arcsec", "")
     assert rows["ratio to the lower bound"] == ("200", "2", "")
     assert rows["largest pointing error"] == ("41.3 arcsec", "0.825 arcsec", "")
     assert rows["largest peak torque"] == ("-", "0.25", "N m")
-    assert rows["failed or missed"] == ("4", "0", "")
+    assert rows["failed or not converged"] == ("4", "0", "")
 
 
 def beside(times, **changes):
@@ -151,17 +151,17 @@ def test_less_accurate_gains_are_compared_by_their_larger_error():
 
 
 def test_gains_whose_trials_all_fail_are_not_compared():
-    lost = examples.group(counts={"ok": 0, "missed": 60, "diverged": 4})
+    lost = examples.group(counts={"ok": 0, "not_converged": 60, "diverged": 4})
     (line,) = beside(0.08, fresh=lost)
-    assert line == "64 of 64 held-out trials fail with the tuned gains: 60 missed, 4 diverged"
+    assert line == "64 of 64 held-out trials fail with the tuned gains: 60 not converged, 4 diverged"
 
 
 def test_failed_training_trials_are_reported_once_for_all_limits():
-    training = examples.group(trials=16, counts={"ok": 2, "missed": 14})
+    training = examples.group(trials=16, counts={"ok": 2, "not_converged": 14})
     over = {"peak_torque": None, "effort": None, "chattering": float("inf")}
     lines = tune_report.search(examples.tune({"largest_over_limit": over}, training=training))
     assert [line for line in lines if "compromise" in line] == [
-        "best compromise: 14 of 16 training trials fail (14 missed) and keep no limit"
+        "best compromise: 14 of 16 training trials fail (14 not converged) and keep no limit"
     ]
 
 

@@ -217,10 +217,10 @@ def test_model_errors_change_the_plant_but_not_the_law(eight):
     )
     assert getattr(scenario.study(again["later"]).parts.actuators, "delay", 0) == 2
     ok = rollout.OK
-    lost = changed(eight, [ok] * 7 + [rollout.MISSED], window_error=[2.0] * 7 + [2.0], peak_torque=[0.3] * 8)
+    lost = changed(eight, [ok] * 7 + [rollout.NOT_CONVERGED], window_error=[2.0] * 7 + [2.0], peak_torque=[0.3] * 8)
     said = compare.figures_of(replace(contender(eight), changed={"later": lost}))["untold"]
     assert said == {"later": {"window_error": 2.0, "window_error_interval": None,
-                              "largest_peak_torque": 0.3, "lost": 1}}  # fmt: skip
+                              "largest_peak_torque": 0.3, "failures": 1}}  # fmt: skip
 
 
 def test_every_law_appears_in_table_page_and_figures(eight, tmp_path):
@@ -327,7 +327,7 @@ def changed(trials, status, **metrics):
 
 def test_statistics_of_a_contender_use_finished_trials(eight):
     nan, ok, bad = np.nan, rollout.OK, rollout.DIVERGED
-    trials = changed(eight, [ok] * 6 + [rollout.MISSED, bad], window_error=[1.0] * 5 + [2.0, 3.0, 99.0],
+    trials = changed(eight, [ok] * 6 + [rollout.NOT_CONVERGED, bad], window_error=[1.0] * 5 + [2.0, 3.0, 99.0],
                      peak_torque=[1.0] * 5 + [2.0, 3.0, 99.0],
                      settling_time=[1.0, 2.0, 3.0, 4.0, nan, nan, nan, 0.5])  # fmt: skip
     one = contender(trials)
@@ -342,9 +342,9 @@ def test_statistics_of_a_contender_use_finished_trials(eight):
     alike = np.full(8, 2.0) + 4.4e-16 * np.arange(8)  # an angle with a dispersion from 115 to 115 deg
     alike = compare.figures_of(contender(replace(trials, drawn={**trials.drawn, "initial_angle": alike})))
     assert alike["settling_by_angle"] is alike["settling_near_far"] is None
-    missed = contender(changed(eight, [ok] * 7 + [rollout.MISSED]))
-    assert all(v.met for v in missed.verdicts)
-    assert not missed.met
+    one_not_converged = contender(changed(eight, [ok] * 7 + [rollout.NOT_CONVERGED]))
+    assert all(v.met for v in one_not_converged.verdicts)
+    assert not one_not_converged.met
 
 
 def rivals(monkeypatch, eight, interrupt=None):

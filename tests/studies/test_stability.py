@@ -92,7 +92,7 @@ def test_table_has_every_axis_and_summary_has_the_worst_axis(tmp_path):
     loops = jax.tree.map(lambda v: np.stack([v] * 5), held(*three, 0.1))
     t, together = np.array([3.0, 3.5, 4.0, 4.5, 6.4]), dict.fromkeys(margins.FIELDS, 0.5)
     judged = np.array([False, True, False, True, True])
-    course = run_margins.Course(t, judged, loops, left(5, 3), left(6), together, 1.0, missed=False)
+    course = run_margins.Course(t, judged, loops, left(5, 3), left(6), together, 1.0, not_converged=False)
     (tmp_path / "made").mkdir()
     stability.write(tmp_path / "made", ready, course, figures=False)
     found = json.loads((tmp_path / "made" / "summary.json").read_text())
@@ -253,12 +253,12 @@ def test_saturated_command_is_reported_as_an_open_loop():
     assert held.startswith("the loop is open at input u1 in the hold phase: a limit of the actuators cuts")
     assert before.startswith("the loop is open at input u1 in the approach phase, at ")
     assert not any("smallest margins" in line for line in report.lines)
-    assert found["missed"]  # with this limit, the state 1 decreases to 0.91 in 3 s at best
-    assert any(line.startswith("the nominal run misses t_f") for line in report.lines)
+    assert found["not_converged"]  # with this limit, the state 1 decreases to 0.91 in 3 s at best
+    assert any(line.startswith("the nominal run has not converged at t_f") for line in report.lines)
     assert report.headline == "The nominal loop is open in the hold phase"
     found = stability.summary(*stability.find(limited_to(50.0)))
     assert not any(one["open"] for one in (found, *found["before"]))
-    assert "missed" not in found
+    assert "not_converged" not in found
     lines = reported(found).lines
     assert not any(word in line for line in lines for word in ("dispersed", "misses", "limit of the actuators"))
     # margins at all inputs together and at the sensors may be smaller; the table has them

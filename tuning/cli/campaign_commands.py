@@ -111,7 +111,7 @@ def montecarlo(
     After Ctrl-C or a kill, the same command resumes the campaign. With more --trials it adds trials. The default folder
     is out/montecarlo-NAME, followed by the names of --controller and --runs.
 
-    Exit status: 0 every requirement met (without requirements: no trial failed or missed t_f), 1 not met, 2
+    Exit status: 0 every requirement met (without requirements: every trial converged at t_f), 1 not met, 2
     configuration error or a full disk, 130 interrupted.
     """
     share = _shard(shard)
@@ -228,7 +228,7 @@ def _flown(
 def summarize(folder: CampaignFolder, /, *, quiet: Quiet = False, figures: Figures = True) -> int:
     """Write the verdicts, the quantiles with intervals, and the figures of a campaign from its rows.
 
-    Exit status: 0 every requirement met (without requirements: no trial failed or missed t_f), 1 not met or not
+    Exit status: 0 every requirement met (without requirements: every trial converged at t_f), 1 not met or not
     finished, 2 configuration error or damaged rows.
     """
     _configured(folder)

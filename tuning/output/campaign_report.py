@@ -85,7 +85,7 @@ def _rows(summary: Campaign, extreme: str) -> list[tuple[str, ...]]:
     """Return the rows of the metrics whose bad end is "max" or "min"."""
     rows: list[tuple[str, ...]] = []
     units = catalogues.units(summary.plant)
-    failed = sum(count for status, count in summary.counts.items() if status not in ("ok", "missed"))
+    failed = sum(count for status, count in summary.counts.items() if status not in ("ok", "not_converged"))
     for name, found in summary.quantiles.items():
         far: Quantile | None = found.high if extreme == "max" else found.low
         if pointing_report.is_index(name) or far is None:

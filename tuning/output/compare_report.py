@@ -233,13 +233,13 @@ def lines(summary: Compare) -> Iterator[str]:
             ", scaled to this body and period" if (name, summary.paper_is) == ("paper", "published, scaled") else ""
         )
         yield f"{_name(name)}{scaled}: {gains}{bound}"
-        lost = failed(law.counts)
-        if lost:
-            yield f"  {sum(lost.values())} of {summary.trials} trials fail: {listed(lost)}"
+        failures = failed(law.counts)
+        if failures:
+            yield f"  {sum(failures.values())} of {summary.trials} trials fail: {listed(failures)}"
         yield from (f"  {verdict}" for verdict in law.verdicts if not verdict.met)
         for change, results in law.untold.items():
-            if results.lost:
-                yield f"  {results.lost} of {summary.trials} trials fail with {CHANGES[change]}"
+            if results.failures:
+                yield f"  {results.failures} of {summary.trials} trials fail with {CHANGES[change]}"
     yield f"a trial has settled when its angle stays below {summary.settling_angle:g} rad"
 
 

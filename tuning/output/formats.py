@@ -124,14 +124,14 @@ def many(count: int, thing: str) -> str:
 def listed(counts: Mapping[str, int]) -> str:
     """Return counts by status in one line, without those that are zero.
 
-    >>> listed({"ok": 5, "missed": 2, "singular": 0})
-    '5 ok, 2 missed'
+    >>> listed({"ok": 5, "not_converged": 2, "singular": 0})
+    '5 ok, 2 not converged'
     """
-    return ", ".join(f"{count} {status}" for status, count in counts.items() if count)
+    return ", ".join(f"{count} {status.replace('_', ' ')}" for status, count in counts.items() if count)
 
 
 def failed(counts: Mapping[str, int]) -> dict[str, int]:
-    """Return the counts of the trials that failed or missed t_f."""
+    """Return the counts of the trials that failed or did not converge at t_f."""
     return {status: count for status, count in counts.items() if count and status != "ok"}
 
 

@@ -174,4 +174,4 @@ def _listed(front: Front, values: Sequence[float]) -> str:
 
 def _marks(point: Point) -> str:
     words = [word for word, is_so in (("knee", point.knee), ("meets", point.meets)) if is_so]
-    return ", ".join([*words, *([f"{point.failures} failed or missed"] if point.failures else [])])
+    return ", ".join([*words, *([f"{point.failures} failed or not converged"] if point.failures else [])])

@@ -34,20 +34,23 @@ def lines(pairs: Sequence[Mapping[str, Any]], keys: tuple[str, str], plant: str)
     simulated = [pair for pair in pairs if pair["status"] == "flown"]
     with_error = [pair for pair in simulated if pair["window_error"] == pair["window_error"]]  # not NaN
     if with_error:
-        best = min(with_error, key=lambda pair: (_lost(pair), pair["window_error"]))
-        failed = f"; {_lost(best):.0f} of its trials failed or missed t_f" if _lost(best) else ""
+        best = min(with_error, key=lambda pair: (_failed(pair), pair["window_error"]))
+        failed = f"; {_failed(best):.0f} of its trials failed or did not converge at t_f" if _failed(best) else ""
         peak = valued(best["peak_torque"], "peak_torque", plant)
         yield (
             f"the smallest RMS error is {error(best['window_error'], plant)} at {keys[0]} = {best['x']:.4g} and "
             f"{keys[1]} = {best['y']:.4g}, with a mean peak torque of {peak}{failed}"
         )
-    lost = sum(_lost(pair) > 0 for pair in simulated)
-    yield f"{len(simulated)} of {len(pairs)} pairs simulated, {lost} of them with trials that failed or missed t_f"
+    failed = sum(_failed(pair) > 0 for pair in simulated)
+    yield (
+        f"{len(simulated)} of {len(pairs)} pairs simulated, {failed} of them with trials that failed or "
+        "did not converge at t_f"
+    )
 
 
-def _lost(pair: Mapping[str, Any]) -> float:
-    """Return the number of trials of a pair that failed or missed t_f."""
-    return pair["failures"] + pair["missed"]
+def _failed(pair: Mapping[str, Any]) -> float:
+    """Return the number of trials of a pair that failed or did not converge at t_f."""
+    return pair["failures"] + pair["not_converged"]
 
 
 def _short(cell: str) -> str:

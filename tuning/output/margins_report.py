@@ -52,8 +52,8 @@ def _lines(summary: Margins) -> Iterator[str]:
         yield from swinging(summary.swing)
     if summary.start_deg is not None:
         yield f"the nominal run starts {summary.start_deg:.4g} deg from the reference; change [initial] for another"
-    if summary.missed:
-        yield "the nominal run misses t_f, so its loop in the hold phase is not at the reference"
+    if summary.not_converged:
+        yield "the nominal run has not converged at t_f, so its loop in the hold phase is not at the reference"
     if summary.dispersed is not None:
         yield (
             "the nominal loop has no dispersions; ptsmc tune and montecarlo judge required margins by the worst of "

@@ -126,6 +126,6 @@ class CampaignProgress(Bar):
             text += f", {rate:,.0f} a second" if rate >= 1.0 else f", {rate:.1g} a second"
         elif tally.done < tally.total:
             text += ", compiling"
-        text += f", {tally.failed} failed or missed" if tally.failed else ""
+        text += f", {tally.failed} failed or not converged" if tally.failed else ""
         self._bar.update(self._task, completed=tally.done, total=tally.total, description=text)
         self._lines(text, 0, 0)

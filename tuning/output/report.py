@@ -114,7 +114,7 @@ HEADLINES = {
     "met": "every requirement is met",
     "not met": "NOT every requirement is met",
     "interrupted": "interrupted: the best result so far",
-    "unfinished": "NOT finished",
+    "incomplete": "NOT finished",
     "ok": "the run reached its end",
 }
 
@@ -127,7 +127,7 @@ def headline(status: str, verdicts: "Sequence[Entry]", first: str = "") -> tuple
         verdicts: on the requirements.
         first: the number that the user decides by, with its name; empty: there is none.
     """
-    text = HEADLINES.get(status, f"the run failed: {status}")
+    text = HEADLINES.get(status, f"the run failed: {status.replace('_', ' ')}")
     if not verdicts and status in ("met", "not met"):
         text = "every trial reached its end" if status == "met" else "NOT every trial reached its end"
     mood = {"met": "good", "ok": "calm"}.get(status, "bad")

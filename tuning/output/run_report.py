@@ -39,7 +39,7 @@ def bound(value: float | None, floor: float | None, plant: str) -> Iterator[str]
 
 def metrics(summary: Run, plant: str) -> Table:
     """Return the table of the metrics."""
-    none = "never" if summary.status in ("ok", "missed") else "-"
+    none = "never" if summary.status in ("ok", "not_converged") else "-"
     rows = [
         (name, digits(summary.metrics[name], ".5g", none), entry.unit, entry.meaning)
         for name, entry in CATALOGUES[plant].items()

@@ -213,7 +213,7 @@ class Changed(msgspec.Struct, frozen=True):
 
     window_error: Number
     window_error_interval: Interval
-    lost: int
+    failures: int
 
 
 class Law(msgspec.Struct, frozen=True, kw_only=True):
@@ -348,7 +348,7 @@ class Margins(msgspec.Struct, frozen=True, kw_only=True):
     together: Numbers
     sensors: dict[str, Numbers]
     before: list[Frozen]
-    missed: bool = False
+    not_converged: bool = False
     dispersed: int | None = None
     said: str | None
     start_deg: Number = None

@@ -67,7 +67,7 @@ def gains(summary: Tune) -> Table:
     ):
         unit = CATALOGUES[plant][metric].unit
         row(label, lambda group, m=metric, s=statistic: digits(group.number(m, s), ".4g"), unit)
-    row("failed or missed", lambda group: str(summary.fresh.trials - group.counts["ok"]))
+    row("failed or not converged", lambda group: str(summary.fresh.trials - group.counts["ok"]))
     note = f"Results on {many(summary.fresh.trials, 'held-out trial')} ({summary.judged_on})."
     return Table(("", *groups, "unit"), rows, note)
 
@@ -81,9 +81,10 @@ def accuracy(summary: Tune) -> Iterator[str]:
 
     if summary.status == "interrupted":
         yield "these are the best gains so far; the same command resumes the search"
-    lost = failed(fresh.counts)
-    if lost:
-        yield f"{sum(lost.values())} of {fresh.trials} held-out trials fail with the tuned gains: {listed(lost)}"
+    failures = failed(fresh.counts)
+    if failures:
+        count = sum(failures.values())
+        yield f"{count} of {fresh.trials} held-out trials fail with the tuned gains: {listed(failures)}"
     on_fresh, on_training = fresh.metrics.get("window_error"), summary.training.metrics.get("window_error")
     if on_fresh is not None and on_fresh.rms is not None:
         times = over_bound(on_fresh.rms, fresh.floor)
@@ -244,10 +245,11 @@ def _violation(summary: Tune, metric: str, reached: float | None) -> str:
     if reached is not None and math.isfinite(reached):
         limit = next((f" of {v.limit:g} {v.unit}".rstrip(" -") for v in summary.verdicts if v.metric == metric), "")
         return f"{metric} reaches {_of_limit(metric, reached):.3g} times its limit{limit} on the training trials"
-    lost = failed(summary.training.counts)
-    if not lost:
+    failures = failed(summary.training.counts)
+    if not failures:
         return f"a training trial has no {metric}"
-    return f"{sum(lost.values())} of {summary.training.trials} training trials fail ({listed(lost)}) and keep no limit"
+    count = sum(failures.values())
+    return f"{count} of {summary.training.trials} training trials fail ({listed(failures)}) and keep no limit"
 
 
 def _of_limit(metric: str, over: float) -> float:

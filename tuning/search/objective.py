@@ -307,7 +307,7 @@ def log_largest(constraints: Array) -> Array:
 
 def judged(value: Array, status: Array) -> Array:
     """Return the values of completed trials, and `FAILED` for trials that failed or lack a value, (trials,)."""
-    ended = (status == rollout.OK) | (status == rollout.MISSED)
+    ended = (status == rollout.OK) | (status == rollout.NOT_CONVERGED)
     return jnp.where(ended & ~jnp.isnan(value), value, FAILED)
 
 

@@ -61,7 +61,7 @@ class Hardest:
     @property
     def unbounded(self) -> bool:
         """Whether the trial fails, because the dispersions contain the law's singularity. The metric is unbounded."""
-        return self.status not in ("ok", "missed")
+        return self.status not in ("ok", "not_converged")
 
     @property
     def beyond(self) -> bool:

@@ -143,7 +143,7 @@ def summarise(folder: Folder) -> dict[str, Any]:
     differ = any(statistics.vary(inputs[key].to_numpy().astype(float)) for key in drawn)
     met = all(v["met"] for v in verdicts) if verdicts else counts["ok"] == done
     return {
-        "status": "unfinished" if done < folder.trials or waiting else "met" if met else "not met",
+        "status": "incomplete" if done < folder.trials or waiting else "met" if met else "not met",
         "plant": folder.scenario.plant.kind,
         "seed": folder.seed,
         "run_table": folder.table_name,

@@ -325,7 +325,7 @@ def _perturbed_figures(trials: Trials) -> dict[str, Any]:
         "window_error": error,
         "window_error_interval": interval,
         "largest_peak_torque": _largest_peak(trials),
-        "lost": int(np.count_nonzero(~trials.ok)),
+        "failures": int(np.count_nonzero(~trials.ok)),
     }
 
 

@@ -66,7 +66,7 @@ class Point:
     rms: float = math.nan  # window error
     interval: tuple[float, float] | None = None  # of rms
     costs: dict[str, float] = field(default_factory=dict)  # other metrics by name, see `trades`
-    failures: int = 0  # trials that failed or missed t_f
+    failures: int = 0  # trials that failed or did not converge at t_f
     meets: bool = False  # every requirement
     trained: float = math.nan  # objective over the training trials
     dominated: bool = False  # by another point, beyond the interval of the ratio of their errors

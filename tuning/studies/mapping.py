@@ -57,7 +57,7 @@ class Cell:
     status: str  # "flown", or the reason why the pair was not simulated
     trials: int = 0
     failures: int = 0  # trials that did not reach their end
-    missed: int = 0  # trials that did not converge by t_f
+    not_converged: int = 0  # trials that did not converge by t_f
     window_error: float = np.nan  # RMS over the trials
     peak_torque: float = np.nan  # mean over the trials [N m]
     largest_peak_torque: float = np.nan  # over the trials [N m]
@@ -244,7 +244,7 @@ def _cell(x: float, y: float, ready: Study, common: Callable[[Parts], Parts], se
             expected = covariance.noise(parts)
             if expected.converged:
                 figures |= {"linear_window_error": expected.window_error, "linear_torque": expected.torque}
-    return Cell(x, y, "flown", count, int(np.sum(~done)), counts["missed"], **figures)
+    return Cell(x, y, "flown", count, int(np.sum(~done)), counts["not_converged"], **figures)
 
 
 def lines(scenario: Scenario, x: Axis, y: Axis) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -339,7 +339,7 @@ def write(folder: Path, flown: Map, seed: int, figures: bool) -> None:
             across,
             up,
             grids,
-            flown.grid("failures") + flown.grid("missed") > 0,
+            flown.grid("failures") + flown.grid("not_converged") > 0,
             lines(scenario, x, y) | spillover(flown),
             scenario.plant.kind,
         )

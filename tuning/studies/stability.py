@@ -128,7 +128,7 @@ def summary(ready: Study, course: Course) -> dict[str, Any]:
             }
             for k, (t, counts) in enumerate(zip(course.t[:-1], course.judged, strict=False))
         ],
-        **({"missed": True} if course.missed else {}),
+        **({"not_converged": True} if course.not_converged else {}),
         **({"dispersed": margin_verdicts.TRIALS} if margin_verdicts.differ(ready.dispersion) else {}),
         "said": NO_SIGN if ready.scenario.exact_sign else None,
         **_start(ready),

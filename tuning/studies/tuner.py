@@ -377,8 +377,8 @@ def _broken(verdicts: list[Verdict], trials: Trials) -> str | None:
     for one in verdicts:
         if not one.met:
             return str(one)
-    lost = int(np.count_nonzero(~trials.ok))
-    return f"{lost} of {trials.status.size} held-out trials fail" if lost else None
+    failures = int(np.count_nonzero(~trials.ok))
+    return f"{failures} of {trials.status.size} held-out trials fail" if failures else None
 
 
 def _prepare(scenario: Scenario) -> None:
