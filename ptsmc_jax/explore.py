@@ -220,9 +220,8 @@ def trials(
         drawn = replace(campaign.of_run_table(ready, seed, table, custom_metrics), software=software)
         count = table.count
     if np.ndim(count) or np.asarray(count).dtype == object:
-        raise ValueError(
-            f"count is a {type(count).__name__}, but must be a whole number, or a polars table with a row for each"
-        )
+        allowed = "a whole number, or a polars table with a row for each trial"
+        raise ValueError(f"count is a {type(count).__name__}, but must be {allowed}")
     draws.check_whole_number("count", count, 1)
     return drawn.fly(range(count))
 
