@@ -214,19 +214,6 @@ def test_a_missing_gpu_is_refused_in_one_sentence(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.long  # the error differs from the sentence above
-def test_jax_chooses_the_gpu_plug_in(tmp_path):
-    """With jax_platforms = "gpu", JAX would require plug-ins of all makers, so `configure` does not set it."""
-    code = (
-        "import jax; jax.default_backend = lambda: 'gpu'\n"
-        "from ptsmc_jax.configure import configure; configure(device='gpu', cache=None, fast=False)\n"
-        "print(jax.config.jax_platforms, len(jax.devices()) > 0)"
-    )
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "tpu"}
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
-    assert (done.stdout, done.stderr) == ("None True\n", "")
-
-
 IN_TURN = """
 import json, os, pathlib, sys
 class Watching:

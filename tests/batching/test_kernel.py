@@ -116,12 +116,6 @@ def test_interpreted_kernel_equals_scan(name, kernels):
     assert len(kernels) == 1
 
 
-@pytest.mark.long  # short test with several directions below
-def test_derivatives_inside_the_kernel_equal_scan(kernels):
-    check_kernel(metrics_and_derivatives(CHAIN), 1e-12)
-    assert len(kernels) == 1
-
-
 def test_derivatives_along_several_directions_equal_scan(kernels):
     """delta changes the sample times, eta a parameter of the loop, and the initial state differs by trial."""
     ready = scenario.study(scenario.from_tables({**CHAIN, "hardware": {}}))

@@ -14,7 +14,7 @@ import polars as pl
 import pytest
 
 import ptsmc_jax as ptsmc
-from ptsmc_jax import explore, programs, scenario
+from ptsmc_jax import explore, scenario
 from ptsmc_jax.campaigns import margin_verdicts, runs, store
 from ptsmc_jax.simulation import catalogues, rollout
 from ptsmc_jax.simulation.requirements import Requirement, Verdict, over
@@ -121,14 +121,6 @@ def _few_loops():
         patch.setattr(margin_verdicts, "JUDGED", JUDGED)
         patch.setattr(margin_rows, "CASES", 2)
         yield
-
-
-@programs.jit
-def drawn_parts(parts, dispersion, seed, trials):
-    return jax.vmap(lambda trial: dispersion.apply(parts, seed, trial))(trials)
-
-
-loops_of = programs.jit(lambda parts: run_margins.judged_loops(parts)[0])
 
 
 def looked_at(parts, dispersion, seed, late):
@@ -273,16 +265,6 @@ def test_cases_are_computed_one_after_the_other(of_two_trials):
     assert products_for_each_case(momenta, of_two_trials) == ([], True)
 
 
-@pytest.mark.long  # the previous test checks the sequence of the cases
-def test_margin_gradients_have_no_batched_product_of_inertias(of_two_trials):
-    asked, bounds = of_two_trials.problem.margins, of_two_trials.evaluate.bounds
-
-    def with_slopes(share):
-        return margin_rows.with_slopes(asked, bounds.scale, share)
-
-    assert products_for_each_case(with_slopes, of_two_trials) == ([], True)
-
-
 @pytest.mark.long
 def test_margin_gradients_with_dispersed_inertia_compile_if_delta_is_free():
     """Delta is free by default. The test starts another process, because XLA aborted it in an earlier version."""
@@ -371,23 +353,6 @@ def changed(posed, factors):
     return with_gains(
         posed.problem.parts, dict(zip(posed.problem.names, posed.scenario_gains * np.asarray(factors), strict=True))
     )
-
-
-@pytest.mark.long  # shorter tests compare constraints, which use single runs, with verdicts on many trials
-@pytest.mark.parametrize("factors", FACTORS)
-def test_loops_of_many_trials_equal_those_of_single_runs(drawn, factors):
-    """The nominal loop is not the worst loop."""
-    parts, dispersion = changed(drawn, factors), drawn.ready.dispersion
-    each = drawn_parts(parts, dispersion, jnp.uint32(3), jnp.arange(TRIALS, dtype=jnp.uint32))
-    loops, _ = looked_at(parts, dispersion, 3, late=True)
-    for k in range(TRIALS):
-        single = loops_of(jax.tree.map(lambda v, k=k: v[k], each))
-        for one, other in zip(jax.tree.leaves(single), jax.tree.leaves(loops), strict=True):
-            np.testing.assert_allclose(other[k], one, rtol=1e-9, atol=1e-9 * np.abs(one).max())
-    nominal = margins.of_each(loops_of(parts), with_delay=True).each()
-    for name, of_trials in all_of(parts, dispersion, 3, late=True).items():
-        worst = farthest(name, of_trials, None)
-        assert farthest(name, np.append(worst, nominal[name]), 0) == worst != farthest(name, nominal[name], None)
 
 
 @pytest.mark.parametrize(("factors", "late"), short(LOOKED, LOOKED[-1:]))

@@ -82,24 +82,6 @@ def test_invalid_trial_numbers_are_refused(chain, trials, said):
         montecarlo.run(chain.parts, chain.dispersion, 5, trials)
 
 
-@pytest.mark.long  # campaigns of several calls: `test_campaign.py`
-def test_more_trials_than_the_capacity_of_one_call(chain, flown, monkeypatch):
-    monkeypatch.setattr(montecarlo, "CAPACITY", 64)
-    some = montecarlo.run(chain.parts, chain.dispersion, 5, np.arange(201), block=16)
-    np.testing.assert_allclose(some.metrics.window_error, flown.metrics.window_error[:201], rtol=1e-12)
-
-
-@pytest.mark.long  # shorter tests: single simulations above, and `vmap` of each law in `test_conformity.py`
-def test_trials_equal_plain_vmap():
-    run = scenario.study(FIRST).parts
-    trials = montecarlo.run(run, SPREAD, 5, np.arange(256))
-    plain = jax.jit(jax.vmap(lambda trial: montecarlo.one(run, SPREAD, np.uint32(5), trial)))
-    metrics, *_ = plain(np.arange(256, dtype=np.uint32))
-    for name in metrics:
-        a, b = metrics[name], trials.metrics[name]
-        np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12, err_msg=name)
-
-
 def test_a_trial_does_not_depend_on_the_others(chain, flown):
     some = np.array([200, 3, 3, 77])
     again = montecarlo.run(chain.parts, chain.dispersion, 5, some)

@@ -446,20 +446,6 @@ def test_repeated_summary_does_not_depend_on_the_order_of_limits(command, tmp_pa
     assert (tmp_path / FOLDER / "worst.csv").exists()
 
 
-@pytest.mark.long  # shorter tests: rows in `test_campaign.py`, and the refusal of another campaign above
-def test_custom_metrics_are_stored_and_order_the_worst_trials(command, tmp_path):
-    (tmp_path / "m.py").write_text(OVERSHOOT)
-    (tmp_path / "s.toml").write_text(SHORT_CHAIN)
-    code, said, _ = command(
-        "montecarlo", "s.toml", "--trials", 120, "--no-figures", "--metrics", "m.py:overshoot", "--seed", 3
-    )
-    assert (code, "overshoot" in said) == (0, True)
-    rows = rows_of(tmp_path / FOLDER)
-    assert rows.columns[-1] == "overshoot"
-    code, _, _ = command("worst", FOLDER, "--by", "overshoot", "-n", 1)
-    assert pl.read_csv(tmp_path / FOLDER / "worst.csv")["overshoot"][0] == rows["overshoot"].max()
-
-
 WILD = SHORT.replace("min_deg = 20.0, max_deg = 90.0", "min_deg = 170.0, max_deg = 180.0")  # few trials converge
 ASKED = "[requirements]\npeak_torque = 30.0\n"
 

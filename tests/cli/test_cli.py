@@ -527,68 +527,6 @@ def in_a_process(*args, then="", **variables):
     return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=quickly, check=False)
 
 
-CHAIN = """
-[plant]
-kind = "chain"
-order = 3
-[loop]
-mode = "sampled"
-t_end = 6.0
-[hardware]
-state_noise = [1e-4, 1e-4, 1e-3]
-[dispersion]
-x0 = { kind = "uniform", half_width = [1.0, 1.0, 0.5] }
-[requirements]
-peak_torque = 20.0
-[tune]
-trials = 8
-starts = 2
-steps = 4
-"""
-
-
-@pytest.mark.long  # shorter tests: pages of other plants in tests/output, campaigns of chains
-def test_simulate_command_for_a_chain(command, tmp_path):
-    (tmp_path / "c.toml").write_text(CHAIN)
-    status, out, err = command("simulate", "c.toml", "--trial", 2)
-    assert (status, err) == (1, "")  # the published delta of one period exceeds the torque limit by far
-    assert "peak_torque at most 20 u" in out
-    assert "NOT met" in out
-    assert "terminal_angle" not in out
-    folder = tmp_path / "out" / "simulate-c"
-    header = (folder / "trajectory.csv").read_text().splitlines()[0]
-    assert header == "t,x1,x2,x3,d_hat1,u1,s1"
-    names = {path.name for path in (folder / "figures").iterdir()}
-    assert names == {"states.png", "error.png", "torque.png", "sliding.png", "convergence.png"}
-    summary = json.loads((folder / "summary.json").read_text())
-    assert set(catalogues.STATE_CATALOGUE) <= set(summary)
-    assert "peak_momentum" not in summary
-    rows = rows_of(folder)
-    assert np.all(np.abs(rows[0, 1:4] - [5.0, 3.0, 2.0]) <= [1.0, 1.0, 0.5])
-    assert np.any(rows[0, 1:4] != [5.0, 3.0, 2.0])
-    assert summary["peak_torque"] == pytest.approx(np.abs(rows[:, 5]).max(), rel=1e-12)
-    assert command("simulate", "c.toml", "--out", "n", "--quiet", "--no-figures")[0] == 1
-    np.testing.assert_array_equal(rows_of(tmp_path / "n")[0, 1:4], [5.0, 3.0, 2.0])
-
-
-@pytest.mark.long
-def test_tune_command_for_a_chain(command, tmp_path):
-    (tmp_path / "c.toml").write_text(CHAIN)
-    status, out, _ = command("tune", "c.toml", "--seed", 2)
-    assert status in (0, 1)
-    assert "the tuned gains keep peak_torque below 20 u from t_f = " in out
-    assert "observer_gain" not in out
-    folder = tmp_path / "out" / "tune-c"
-    summary = json.loads((folder / "summary.json").read_text())
-    assert set(summary["gains"]) == {"eta", "delta", "k1", "sign_width", "surface_rate"}
-    assert summary["gains"]["eta"] > 3.0
-    assert "peak_momentum" not in summary["fresh"]
-    assert summary["shortest_t_f"]["theory"] > 0.0
-    tuned = scenario.read(folder / "tuned.toml")
-    assert tuned.controller.eta == summary["gains"]["eta"]
-    assert command("tune", "c.toml", "--seed", 2)[1].endswith("(from an earlier run)\n")
-
-
 def test_simulate_refuses_a_nominal_initial_state_at_the_singularity(command, tmp_path):
     (tmp_path / "s.toml").write_text("initial.quat_xyzw = [1, 0, 0, 0]\n" + SHORT)
     status, _, err = command("simulate", "s.toml", "--no-figures")

@@ -198,14 +198,6 @@ def test_new_command_does_not_overwrite_files(command, tmp_path):
     assert (tmp_path / "scenario.toml").read_text() == new.text(None, parsing.load(FLIGHT)) != written
 
 
-@pytest.mark.long  # a shorter test checks that the written scenario equals its model
-def test_written_scenario_can_be_simulated(command):
-    assert command("new", "--like", FLIGHT, "--quiet") == (0, "", "")
-    code, said, _ = command("simulate", "scenario.toml", "--trial", 1, "--no-figures")
-    assert code == 1  # the published gains exceed the torque limit
-    assert "peak_torque" in said
-
-
 def test_file_name_is_escaped_if_the_output_encoding_lacks_its_letters(command, tmp_path, monkeypatch):
     plain = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
     monkeypatch.setattr(sys, "stdout", plain)

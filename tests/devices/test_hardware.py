@@ -238,16 +238,6 @@ def test_integration_steps_resolve_the_nutation():
     assert steps >= 0.4 / np.sqrt(0.05 * 0.08) * 0.2 / 0.025
 
 
-@pytest.mark.long  # short test of these steps: `test_wheels_exchange_momentum_with_the_body`
-def test_more_integration_steps_do_not_change_the_result():
-    ready = scenario.study(scenario.from_tables(SPINNING))
-    ours, theirs = (runs.fly(as_many(ready, times * MOST)) for times in (1, 3))
-    # the error of RK4 with 0.025 rad of nutation per step is about 1e-9 rad
-    np.testing.assert_allclose(ours.metrics["window_error"], theirs.metrics["window_error"], rtol=1e-6)
-    off = Rotation.from_quat(ours.log.x.q[-1]).inv() * Rotation.from_quat(theirs.log.x.q[-1])
-    assert off.magnitude() < 1e-9
-
-
 def test_different_gains_have_the_same_number_of_steps():
     """Another number of steps needs another compiled program."""
     frequency = {"flexible": {"frequency": [4.5], "damping": [0.005], "coupling": [[0.02, 0.0, 0.0]]}}
@@ -433,28 +423,6 @@ def test_random_walk_is_the_sum_of_its_random_steps():
     grown = jnp.cumsum(steps, axis=0)
     np.testing.assert_allclose(d[:-1], grown, rtol=0, atol=1e-13 * float(jnp.max(jnp.abs(grown))))
     assert np.ptp(grown, axis=0).min() > 1e-4
-
-
-@pytest.mark.long  # short tests: the steps above, and their distribution in `test_draws.py`
-def test_random_walk_grows_like_the_square_root_of_time():
-    run, density = walking(), 1e-3
-
-    def found(trial):
-        log = rollout.simulate(run, 4, trial, record=True).log
-        assert log is not None
-        return log.t, log.disturbance
-
-    t, d = (np.asarray(v) for v in jax.jit(jax.vmap(found))(jnp.arange(512, dtype=jnp.uint32)))
-    for at in (3.0, 12.0):
-        k = int(np.flatnonzero(t[0] >= at - 1e-9)[0])
-        spread = d[:, k].std(axis=0)
-        # the sample at `at` already includes its own step, for 0.1 s more
-        np.testing.assert_allclose(spread, density * np.sqrt(min(at + 0.1, 12.0)), rtol=5 / np.sqrt(2 * 512))
-    begun = int(np.flatnonzero(t[0] >= 2.0)[0])
-    steps = np.diff(d[:, begun : begun + 100], axis=1)
-    limit = 5 / np.sqrt(512 * 99)
-    assert np.abs(np.corrcoef(steps[:, 1:, 0].ravel(), steps[:, :-1, 0].ravel())[0, 1]) < limit
-    assert np.abs(np.corrcoef(steps[..., 0].ravel(), steps[..., 1].ravel())[0, 1]) < limit
 
 
 def test_gradients_are_finite_where_functions_are_not_differentiable():

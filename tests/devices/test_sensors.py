@@ -222,16 +222,6 @@ def test_filter_errors_are_stationary_from_the_first_sample(first, filtered):
     assert smallest < 0.6 * TRACKED["attitude_noise"]  # the filter reduces the noise
 
 
-@pytest.mark.long  # short tests: `test_filter_spread_equals_the_iterated_covariance`, and the test above
-def test_filter_converges_to_its_steady_state_from_large_errors(filtered):
-    covariance, keep, star = steady()
-    wanted = keep @ covariance[-1] @ keep.T + star
-    errors = filtered(0, 30.0, 401)[-1]  # the initial error decays to 30 (1 + 15) e^-15 in 100 s
-    np.testing.assert_allclose(errors.std(axis=1), np.sqrt(np.diag(wanted)), rtol=SIGMAS / np.sqrt(24_000))
-    correlation = wanted[0, 1] / np.sqrt(wanted[0, 0] * wanted[1, 1])
-    assert abs(np.corrcoef(errors)[0, 1] - correlation) < SIGMAS / np.sqrt(12_000)
-
-
 def test_filter_start_is_continuous_when_the_partial_first_period_vanishes():
     found = attitude_filter.attitude_filter(0.15, 2e-5, 2e-6, 1e-7, 0.25, 4)
     q, none, normals = STATE.q, vector([0.0] * 3), vector([1.0, -0.3, 0.2, 0.5, 0.1, -1.0])

@@ -15,7 +15,6 @@ from ptsmc_jax.devices import attitude_filter, sensors, star_times
 from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.onboard import vectors
 from ptsmc_jax.plants import rigid_body
-from ptsmc_jax.theory import error_floor
 from tests.helpers import fly, vector
 from tests.onboard.flights import FILTER, flight
 
@@ -220,17 +219,6 @@ def anchored():
     """The parts of a scenario with such a star tracker on the anchored clock."""
     tables = {**flight(**FILTER, hardware={"star_tracker_period": 0.25}), "dispersion": {}}
     return scenario.study(scenario.from_tables(tables)).parts
-
-
-@pytest.mark.long  # short tests: `test_filter_between_equals_attitude_filter..`, `tests/theory/test_floor.py`
-def test_lower_bound_is_between_those_of_neighbouring_integer_ratios(anchored):
-    parts, log = anchored, fly(anchored, 3).log
-    floors = [error_floor.along(parts, log).window_error]
-    bandwidth = parts.sensors.bandwidth(0.1)
-    for every in (2, 3):
-        seen = dataclasses.replace(parts.sensors, every=every, own_times=None).with_bandwidth(bandwidth, 0.1)
-        floors.append(error_floor.along(dataclasses.replace(parts, sensors=seen), log).window_error)
-    assert floors[1] < floors[0] < floors[2]
 
 
 def test_metrics_are_continuous_when_the_partial_first_period_vanishes(anchored):

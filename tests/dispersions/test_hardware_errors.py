@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ptsmc_jax import formulas, scenario
-from ptsmc_jax.campaigns import montecarlo, runs
+from ptsmc_jax.campaigns import runs
 from ptsmc_jax.devices import actuators, reaction_wheels
 from ptsmc_jax.dispersions.numbers import FARTHEST
 from ptsmc_jax.dispersions.quantities import QUANTITIES, read_columns
@@ -84,17 +84,6 @@ def test_every_trial_equals_a_run_that_is_built_from_its_columns(dispersed):
     assert np.ptp([run.metrics["window_error"] for run in trials]) > 1e-5
 
 
-@pytest.mark.long  # short tests: batches in `test_conformity.py`, dispersions in `test_dispersions.py`
-def test_trials_of_a_batch_have_their_hardware_errors(dispersed):
-    batch = montecarlo.run(dispersed.parts, dispersed.dispersion, 5, np.arange(3))
-    for trial in range(3):
-        run = runs.fly(dispersed, 5, trial)
-        for name in METRICS:  # rounding errors of two programs differ
-            np.testing.assert_allclose(getattr(batch.metrics, name)[trial], run.metrics[name], rtol=1e-11, err_msg=name)
-        for name, value in dispersed.dispersion.values(run.parts).items():
-            np.testing.assert_allclose(batch.drawn[name][trial], value, rtol=1e-11, err_msg=name)
-
-
 def test_torque_on_the_body_has_scale_and_misalignment_that_the_flight_software_does_not_know(dispersed):
     run = runs.fly(dispersed, 5, 1)
     device = run.parts.actuators
@@ -155,28 +144,6 @@ def test_wheels_with_scale_and_misalignment_deliver_and_store_momentum_along_the
     torque[1] = 0.0
     np.testing.assert_allclose(failing.on_body(failing.at(drive, dt)[0]), turned @ torque, rtol=1e-13)
     np.testing.assert_allclose(np.asarray(failing.end(start, drive, queue, dt).h), stored - 0.5 * torque, rtol=1e-13)
-
-
-@pytest.mark.long  # short tests: one period above, runs in `test_hardware.py`
-def test_wheels_with_scale_and_misalignment_conserve_total_momentum():
-    tables = {
-        **{key: FLIGHT[key] for key in ("controller", "initial", "loop")},
-        "disturbance": {"kind": "none"},
-        "wheels": {"momentum": [0.5, -0.2, 0.1, 0.3]},
-        "dispersion": {key: DISPERSION[key] for key in ("actuator_scale", "actuator_misalignment")},
-    }
-    ready = scenario.study(scenario.from_tables(tables))
-    run = runs.fly(replace(ready, parts=replace(ready.parts, substeps=8)), 0, 1)
-    log, device = run.log, run.parts.actuators
-    assert device is not None
-    assert device.directions is not None
-    assert device.directions.shape == (3, 4)
-    assert log.wheels is not None
-    body = np.asarray(log.x.w) @ np.asarray(run.parts.plant.inertia).T + log.wheels[0] @ np.asarray(device.directions).T
-    total = Rotation.from_quat(np.asarray(log.x.q)).apply(body)
-    # integration error of RK4
-    np.testing.assert_allclose(total, np.broadcast_to(total[0], total.shape), rtol=0, atol=1e-8)
-    assert np.abs(log.wheels[0] - log.wheels[0][0]).max() > 0.1
 
 
 WHEELED = {

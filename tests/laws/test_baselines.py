@@ -114,21 +114,6 @@ def simulate_rotation(law, angle, rate, t_end, period=0.005):
     return log.t[log.has_length], log.error[log.has_length, 2]
 
 
-@pytest.mark.long  # a short test of the torque is `test_pd_torque_gives_the_relative_acceleration_of_its_formula`
-def test_pd_simulation_follows_its_eigenaxis_equation():
-    """The equation is theta'' + k_d theta' + k_p sin(theta/2) = 0.
-
-    The difference is due to the zero-order hold of 5 ms.
-    """
-    t, v = simulate_rotation(LAWS["pd"], 2.0, 0.0, 15.0)
-    exact = solve_ivp(lambda _, y: (y[1], -0.9 * y[1] - 0.4 * np.sin(y[0] / 2)), (0.0, 15.0), (2.0, 0.0), t_eval=t,
-                      rtol=1e-10, atol=1e-12)  # fmt: skip
-    np.testing.assert_allclose(v, np.sin(exact.y[0] / 2), atol=2e-3)
-    halved = simulate_rotation(LAWS["pd"], 2.0, 0.0, 15.0, period=0.0025)
-    late = [np.abs(np.interp(12.0, *run) - np.sin(np.interp(12.0, t, exact.y[0]) / 2)) for run in ((t, v), halved)]
-    assert late[1] < 0.6 * late[0]  # proportional to the period
-
-
 def sliding_rate(name, v):
     """Return v' on the surface s = 0."""
     return -((0.6 * v) ** (1 / 1.3)) if name == "terminal" else -(0.3 * v**2.0 + 0.5 * v**0.8)

@@ -196,15 +196,6 @@ def test_multiplicative_error_follows_exact_solution_1_while_reference_crosses_a
     assert np.all(np.abs(u - result.log.u[before]).max(axis=1) < 1e-9 * np.maximum(feedback, 1.0))
 
 
-@pytest.mark.long  # short tests of both: `test_align_chooses..`, and the test above
-def test_additive_error_is_singular_on_a_slew_on_which_the_multiplicative_error_is_not():
-    additive, multiplicative = (fly(slew(kind, CROSSING, AWAY, undisturbed=False)) for kind in KINEMATICS)
-    assert additive.status == rollout.SINGULAR
-    assert 0.0 < additive.bad_time < 20.0
-    assert multiplicative.status == rollout.OK
-    assert multiplicative.metrics.terminal_angle < 1e-3
-
-
 @pytest.mark.parametrize("seed", [1, 2])
 def test_multiplicative_loop_does_not_depend_on_the_inertial_frame(seed):
     turn = vector(Rotation.random(rng=np.random.default_rng(seed)).as_quat())

@@ -106,25 +106,6 @@ def test_prescribed_time_bound_is_between_1_and_2_times_the_worst_error(gain):
     np.testing.assert_allclose(without_gain(vector(2.0)), exact, rtol=1e-6)
 
 
-@pytest.mark.long  # short tests: closed forms above, all plants below
-@pytest.mark.parametrize("mode", ["continuous", "sampled"])
-def test_prescribed_time_observer_of_a_spacecraft_is_within_its_bound(mode):
-    """The simulation has a full inertia matrix and a sinusoidal disturbance."""
-    tables = {
-        "spacecraft": {"inertia": FULL_INERTIA},
-        "observer": {"kind": "prescribed_time", "t_o": 6.0, "mu": 3.0},
-        "disturbance": {"phase": [1.0, 0.5, 2.0]},
-        "controller": {"initial_estimate_error": 0.0175},
-    }
-    ready = scenario.study(scenario.from_tables({**tables, "loop": {"mode": mode}}))
-    log, bound = fly(ready.parts).log, ready.parts.observer.error_bound()
-    limit = np.asarray(jax.vmap(bound)(vector(log.t)))
-    size = np.linalg.norm(log.d_hat - log.disturbance, axis=1)
-    delay = 0.002 if mode == "sampled" else 1e-9  # a sampled estimate is at least half a period old: c sqrt(3) h / 2
-    assert np.all(size <= limit + delay)
-    assert size[np.searchsorted(log.t, 5.95)] < 0.15 * size[0]
-
-
 def super_twisting(gain, d, seconds, start=0.0):
     """Return times and errors d_hat - d of the observer with a discontinuous sign, integrated by SciPy."""
     width = 1e-9

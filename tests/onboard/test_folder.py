@@ -24,7 +24,7 @@ from ptsmc_jax.scenario.law_tables import LAWS
 from ptsmc_jax.simulation import run_state
 from tests.helpers import SHORT, fly, short
 from tests.onboard.compiled import CC, STRICT, needs_compiler
-from tests.onboard.flights import FILTER, FLIGHTS, flight
+from tests.onboard.flights import FLIGHTS, flight
 
 
 @pytest.fixture(scope="module")
@@ -214,23 +214,6 @@ def test_export_raises_an_error_for_unsupported_or_diverging_laws(tmp_path, law,
         folder.export(made, tmp_path / "controller", name="law", trials=1)
 
 
-@pytest.mark.long  # short test of the tolerance: `test_rounding_tolerance_uses_the_gain_growth..`
-@needs_make
-def test_a_slew_of_a_third_of_a_degree_replays_the_simulation(tmp_path):
-    """The torque is small and the gains grow by 160 000, so that rounding errors of 4e-8 must be allowed."""
-    tables = {
-        "spacecraft": {"inertia": [3200.0, 4500.0, 2600.0]},
-        "initial": {"rotvec_deg": [20.1, 30.3, 40.0]}, "reference": {"rotvec_deg": [20.0, 30.0, 40.0]},
-        "disturbance": {"kind": "none"}, "controller": {"error": "multiplicative", "t_f": 300.0, "delta": 0.5},
-        "loop": {"mode": "sampled", "period": 0.25, "t_end": 302.0}, "filter": {"kind": "steady_state"},
-        "hardware": {"attitude_noise": 1e-6, "rate_noise": 1e-8},
-    }  # fmt: skip
-    made = scenario.reading.complete(scenario.from_tables(tables))
-    place = folder.export(made, tmp_path / "controller", name="small", trials=1)
-    done = make(place, "check")
-    assert done.returncode == 0, done.stdout + done.stderr
-
-
 @needs_make
 def test_check_starts_each_sample_from_the_simulated_state(exported, tmp_path):
     """Rounding errors thus do not accumulate. With a state of another time the next sample is invalid input."""
@@ -242,19 +225,6 @@ def test_check_starts_each_sample_from_the_simulated_state(exported, tmp_path):
     done = make(place, "check", QUICK)
     assert done.returncode != 0
     assert "130 samples; other status: 1;" in done.stdout
-
-
-@pytest.mark.long  # short tests: the test above, and `test_library.py` (implicit sampling)
-@needs_make
-def test_rounding_errors_do_not_accumulate(tmp_path):
-    """In an open loop of 1 250 samples they would exceed the tolerance of 1e-12."""
-    law = {"t_f": 20.0, "delta": 3.0, "sampling": "implicit", "k1": 7.0}
-    tables = flight(**FILTER, controller=law, loop={"period": 0.02, "t_end": 25.0}, dispersion={})
-    made = scenario.reading.complete(scenario.from_tables(tables))
-    place = folder.export(made, tmp_path / "controller", name="long", trials=1)
-    for real in ("double", "float"):
-        done = make(place, "check", f"REAL={real}")
-        assert done.returncode == 0, done.stdout + done.stderr
 
 
 @needs_make

@@ -14,7 +14,7 @@ from ptsmc_jax.campaigns import runs
 from ptsmc_jax.numerics import integrators
 from ptsmc_jax.plants import flexible_body, rigid_body
 from ptsmc_jax.simulation import control_period
-from tests.helpers import fly, vector
+from tests.helpers import vector
 
 FINE = 40  # steps per control period
 EPS = np.finfo(float).eps
@@ -107,15 +107,6 @@ def test_default_steps_keep_modes_accurate_to_a_millionth_for_given_torques(flow
     np.testing.assert_allclose(found.q, log.x.q[1:], rtol=0, atol=1e-7)
 
 
-@pytest.mark.long  # the test above covers the modes alone
-def test_default_steps_keep_modes_accurate_to_a_millionth_in_the_loop(flown):
-    """A step of 0.1 rad has a relative error of 0.1^5 / 120 in RK4, so 500 steps have an error of 4e-5."""
-    found = runs.fly(scenario.study(scenario.from_tables(SATELLITE)))
-    assert 1 < found.parts.substeps < 20
-    np.testing.assert_allclose(found.log.x.modes.e, flown.log.x.modes.e, rtol=0, atol=1e-5)
-    np.testing.assert_allclose(found.log.x.q, flown.log.x.q, rtol=0, atol=1e-7)
-
-
 def test_metrics_and_columns_of_the_modes(flown):
     log, metrics = flown.log, flown.metrics
     size = np.sqrt(np.sum(log.x.modes.e**2 + (log.x.modes.rate / FREQUENCY) ** 2, axis=1))
@@ -182,18 +173,6 @@ def test_a_free_undamped_mode_has_the_frequency_of_the_formula():
     from ptsmc_jax import formulas
 
     np.testing.assert_allclose(formulas.free_modes(np.diag(J), [W], [[d, 0.0, 0.0]]), [omega], rtol=1e-12)
-
-
-@pytest.mark.long  # the independent integration above has coupling
-def test_a_flexible_body_without_coupling_moves_like_a_rigid_body():
-    uncoupled = {**SATELLITE, "flexible": {**SATELLITE["flexible"], "coupling": [[0.0] * 3] * 4}}
-    ready = scenario.study(scenario.from_tables(uncoupled))
-    rigid = scenario.study(scenario.from_tables({k: v for k, v in SATELLITE.items() if k != "flexible"}))
-    one = fly(ready.parts)
-    other = fly(replace(rigid.parts, substeps=ready.parts.substeps))
-    np.testing.assert_allclose(one.log.x.q, other.log.x.q, rtol=0, atol=1e-13)
-    np.testing.assert_allclose(one.log.u, other.log.u, rtol=0, atol=1e-10)  # 1e3 N m / rad
-    assert np.all(one.log.x.modes.e == 0.0)
 
 
 def test_a_random_inertia_changes_the_rigid_rest_and_impossible_bodies_are_marked():

@@ -25,7 +25,7 @@ from ptsmc_jax.signals import references
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.theory import envelopes, solutions
 from ptsmc_jax.theory.exact_motion import plant_motion
-from tests.helpers import FULL_INERTIA, ROOT, commanded, errors_along, finer, fly, inputs_along, parts, short, vector
+from tests.helpers import FULL_INERTIA, ROOT, commanded, errors_along, finer, fly, parts, short, vector
 from tuning.studies import posing
 
 ARM = str(ROOT / "scenarios" / "two_link_arm.py") + ":arm"
@@ -134,21 +134,6 @@ def arm_tables(**changes):
     return {name: {**table, **changes.get(name, {})} for name, table in tables.items()}
 
 
-@pytest.mark.long  # tests below cover the mass matrix and exact motions of a system
-def test_the_arm_follows_the_exact_solution_without_a_disturbance():
-    """With a mass matrix from a textbook, the error follows exact solution 1 for any M, C and g."""
-    tables = arm_tables(controller={"disturbance_rate_bound": 0.0})
-    ready = scenario.study(scenario.from_tables({**tables, "disturbance": {"kind": "none"}}))
-    result = fly(ready.parts)
-    before = result.log.t < 2.949
-    start = ready.parts.controller.kinematics.errors(ready.parts.initial, vector(0.0))
-    exact = errors_along(result.log.t, vector(3.0), vector(3.0), *start)
-    np.testing.assert_allclose(result.log.error[before], exact.error[before], rtol=0, atol=1e-8)  # of the default grid
-    # the torque is that of the exact motion, within the feedback gain times the error of the state
-    u = inputs_along(ready.parts, result.log.t)[before]
-    assert np.abs(u - result.log.u[before]).max() < 1e-8 * 9.0 / 0.05**2
-
-
 @pytest.mark.parametrize("mode", short(["continuous", "sampled"], ["sampled"]))
 def test_the_arm_stays_inside_its_envelope(mode):
     ready = scenario.study(scenario.from_tables(arm_tables(loop={"mode": mode, "period": 0.002})))
@@ -248,18 +233,6 @@ def test_newton_finds_x_2_of_a_nonlinear_rate():
     found = np.sinh(x[:, 2:]) - 0.1 * np.sin(t)[:, None] + 0.2 * x[:, 1::-1]
     np.testing.assert_allclose(found, rate, rtol=0, atol=1e-14)
     np.testing.assert_allclose(u, exact, rtol=0, atol=1e-12)  # rounding times gains of up to 225
-
-
-@pytest.mark.long  # the test above covers states of the exact motion
-def test_a_run_uses_the_x_2_that_newton_finds():
-    tables = {"plant": {"kind": "system", "system": CURVED, "x0": list(AT_FIRST)}, "controller": {"delta": 0.1}}
-    ready = scenario.study(scenario.from_tables({**tables, "observer": {"kind": "nonlinear"}}))
-    quiet = replace(ready.parts.observer, disturbance_rate_bound=vector(0.0))
-    run = replace(ready.parts, observer=quiet)
-    log = fly(run).log
-    before = log.t < 4.8
-    u = inputs_along(run, log.t)[before]
-    assert np.abs(u - log.u[before]).max() < 1e-6
 
 
 def test_an_invalid_system_is_refused_in_one_sentence():

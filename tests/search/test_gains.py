@@ -80,22 +80,6 @@ def test_gains_set_in_parts_equal_gains_set_in_the_scenario(name):
         np.testing.assert_allclose(known[gain], value, rtol=1e-12)
 
 
-@pytest.mark.long  # shorter tests compare the numbers of the parts (above) and runs of a chain (below)
-@pytest.mark.parametrize("name", OTHERS)
-def test_runs_with_gains_set_in_parts_equal_runs_of_the_changed_scenario(name):
-    """Compare runs of the parts of a search with runs of parts built from the changed scenario."""
-    scenario, ready = wide()
-    moved = gains.with_gains(ready.parts, OTHERS[name])
-    changed = study(gains.in_scenario(scenario, OTHERS[name]))
-    one, other = (rollout.simulate_parts(parts, np.uint32(3), np.uint32(1)).metrics for parts in (moved, changed.parts))
-    for metric in ("window_error", "peak_torque", "effort", "hold_error"):
-        np.testing.assert_allclose(getattr(one, metric), getattr(other, metric), rtol=1e-9, err_msg=metric)
-    for parts in (moved, changed.parts):
-        known = gains.gains_of(parts)
-        for gain, value in OTHERS[name].items():
-            np.testing.assert_allclose(known[gain], value, rtol=1e-12)
-
-
 def test_time_after_t_f_is_unchanged():
     scenario, ready = wide()
     changed = gains.in_scenario(scenario, {"t_f": 11.0})

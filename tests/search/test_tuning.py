@@ -104,20 +104,6 @@ def test_loss_is_continuous_and_gradient_is_finite_if_delta_is_a_multiple_of_the
     assert max(sides) < 0.05 * np.abs(slopes).max()
 
 
-@pytest.mark.long
-def test_forward_and_reverse_mode_agree_for_a_spacecraft():
-    """The test of gradients of tail and quantile covers a chain."""
-    run = parts(5.0, 3.0, 0.5, period=0.1, noise=(2e-5, 1e-6), t_end=6.5)
-
-    def value(at):
-        moved = gains.with_gains(run, {"eta": at[0], "delta": at[1], "k1": at[2]})
-        metrics = rollout.simulate(moved, np.uint32(0), np.uint32(1)).metrics
-        return jnp.log(metrics.window_error) + metrics.peak_torque
-
-    at = jnp.asarray([3.0, 0.53, 1.3])
-    np.testing.assert_allclose(jax.jit(jax.jacfwd(value))(at), jax.jit(jax.grad(value))(at), rtol=1e-9)
-
-
 def test_bounds_map_normalised_gains_to_gains_and_back():
     some = shares.Bounds(("eta", "delta", "observer_gain"), (2.05, 0.05, 0.5), (8.0, 5.0, 300.0))
     assert list(some.logarithmic) == [False, True, True]
@@ -379,35 +365,6 @@ def test_a_failed_trial_is_worse_than_any_violation(far):
     assert best.share == share[1]
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("tail", [None, 3])
-def test_a_trial_that_always_fails_does_not_change_the_result_for_the_others(tail):
-    """One trial starts at the law's singularity. F equals F of the other trials plus the penalty, to 14 digits."""
-    turned = random_turns(0.4, np.pi)
-    eight = replace(problem(8, turned, peak_torque=0.7), tail=tail)
-    ((name, drawn),) = eight.coordinates.items()
-    lost = 0.9 * drawn
-    lost[5, 2] = 1.0  # 180 deg; all other trials start below 165 deg
-    left = np.delete(np.arange(8), 5)
-    asked = {name: getattr(eight, name)[:, left] for name in ("among", "counted")}
-    others = replace(eight, trials=eight.trials[left], coordinates={name: lost[left]}, averaged=7, tail=tail, **asked)
-    share = np.array([[0.6, 0.4], [0.3, 0.55]])
-    evaluate = Evaluator(WITHIN)
-    with_it, without = (evaluate.slopes(one, share) for one in (replace(eight, coordinates={name: lost}), others))
-    np.testing.assert_allclose(with_it.f, without.f + np.log(objective.FAILED), rtol=1e-14)
-    np.testing.assert_allclose(with_it.value, without.value, rtol=1e-13)
-    np.testing.assert_allclose(with_it.f_slope, without.f_slope, rtol=1e-10)
-    np.testing.assert_array_equal(with_it.beyond, without.beyond)
-    assert without.c.max() < objective.FAILED / 2
-    np.testing.assert_allclose(np.diff(starts.merit(with_it)), np.diff(starts.merit(without)), rtol=1e-12)
-    best, known = (descent.Best(np.zeros(2), 1, 0.0) for _ in range(2))
-    for kept, seen in ((best, with_it), (known, without)):
-        kept.offer(share, seen)
-    np.testing.assert_allclose(best.over, known.over + descent.BROKEN, rtol=1e-14)
-    np.testing.assert_array_equal(best.share, known.share)
-    np.testing.assert_array_equal(best.worst, known.worst)
-
-
 def test_search_agrees_with_a_brute_force_scan(monkeypatch):
     """The scan covers the same problem, almost without screening for harder trials."""
     helpers.small_search(monkeypatch)
@@ -484,15 +441,6 @@ def test_a_global_search_follows_if_harder_trials_lead_beyond_a_limit(monkeypatc
     assert found.interrupted is ("Ctrl-C" in second)
     assert bool(found.worst[0] <= 1.0) is (second != "worse")
     assert np.array_equal(found.share, lost[0]) is (second == "worse")
-
-
-@pytest.mark.long
-def test_starting_points_differ_and_begin_with_the_given_one():
-    first, designs = np.array([0.2, 0.3]), np.array([[0.4, 0.5]])
-    share = starts.starting_points(Evaluator(WITHIN), problem(), first, designs, 4, 7, lambda *told: None)
-    assert share.shape == (4, 2)
-    np.testing.assert_array_equal(share[0], [0.2, 0.3])
-    assert len(np.unique(share, axis=0)) == 4
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from ptsmc_jax import programs, scenario
 from ptsmc_jax.numerics import attitude
-from ptsmc_jax.simulation import catalogues, pointing, rollout
+from ptsmc_jax.simulation import catalogues, pointing
 from tests.helpers import SHORT, drawn, fly, untuned, vector
 
 SLACK = 1.0 / np.cos(0.5 * np.pi / pointing.DIRECTIONS)  # upper bound of computed over exact half-cones of deviations
@@ -344,26 +344,6 @@ def test_gradients_of_indices_match_finite_differences():
     differences = (sloped(vector(at + step))[0] - sloped(vector(at - step))[0]) / (2 * step)
     np.testing.assert_allclose(slopes, differences, rtol=1e-6, atol=1e-9)
     assert np.all(np.abs(slopes) > 1e-6)
-
-
-@pytest.mark.long  # covered by the test above and by gradients of metrics in `test_rollout.py`
-def test_indices_of_a_run_have_gradients(flown):
-    """Gradients in delta, which moves the hand-over, match central differences."""
-    ready, _ = flown
-    parts = scenario.study(scenario.replace(ready.scenario, loop__clock="anchored")).parts
-    names = ("ape_boresight", "mpe_x", "rpe_boresight", "pde_y")
-
-    def of(delta):
-        moved = dataclasses.replace(parts, controller=dataclasses.replace(parts.controller, delta=delta))
-        found = rollout.simulate(moved, jnp.uint32(3), jnp.uint32(5)).metrics
-        return jnp.stack([getattr(found, name) for name in names])
-
-    at, step = 0.437, 1e-6
-    sloped = jax.jit(lambda delta: jax.jvp(of, (delta,), (jnp.ones_like(delta),)))
-    slopes = sloped(vector(at))[1]
-    differences = (sloped(vector(at + step))[0] - sloped(vector(at - step))[0]) / (2 * step)
-    np.testing.assert_allclose(slopes, differences, rtol=1e-4, atol=1e-9)
-    assert np.all(np.abs(slopes) > 1e-8)
 
 
 def test_every_index_is_a_metric_of_a_scenario_with_pointing(flown):

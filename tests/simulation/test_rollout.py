@@ -10,8 +10,7 @@ from ptsmc_jax.campaigns import runs
 from ptsmc_jax.devices.actuators import Actuators
 from ptsmc_jax.laws.baselines import PD
 from ptsmc_jax.laws.kinematics import MultiplicativeKinematics
-from ptsmc_jax.observers import nonlinear
-from ptsmc_jax.plants import integrator_chain, rigid_body, second_order
+from ptsmc_jax.plants import rigid_body, second_order
 from ptsmc_jax.signals import disturbances, references
 from ptsmc_jax.simulation import clock, control_period, rollout, sampled
 from ptsmc_jax.simulation.gains import with_gains
@@ -92,26 +91,6 @@ def test_a_perfect_estimate_gives_the_exact_solution(eta, rate):
     np.testing.assert_allclose(log.s[before], exact.s[before], rtol=0, atol=3e-9)
 
 
-TILTED = vector(0.1, -0.2, 0.1, np.sqrt(1 - 0.06))
-MOVING = {
-    "spin": references.Spin(TILTED, vector(0.004, -0.006, 0.005)),
-    "sinusoid": references.Swing(TILTED, vector(0.1, -0.05, 0.08), vector(0.1, 0.15, 0.2), vector(0.0, 1.0, 2.0)),
-    "slew": references.Slew(TILTED, vector(0.3, 0.4, -0.2), vector(25.0)),
-}
-
-
-@pytest.mark.long  # `test_controllers.py` tests laws for moving references at single states
-@pytest.mark.parametrize("kind", MOVING)
-def test_exact_solution_for_a_moving_reference(kind):
-    moving = MOVING[kind]
-    run = finer(perfect(parts(20.0, 3.5, 0.1, inertia=FULL_INERTIA, reference=moving, rate=(0.01, 0.0, -0.01))), 2)
-    log = fly(run).log
-    before = log.t < 19.89
-    error, error_rate = run.controller.kinematics.errors(run.initial, run.reference(vector(0.0)))
-    exact = errors_along(log.t, vector(20.0), vector(3.5), error, error_rate)
-    np.testing.assert_allclose(log.error[before], exact.error[before], rtol=0, atol=1e-10)
-
-
 @pytest.mark.parametrize("plant", short(["chain", "spacecraft"], ["chain"]))
 def test_derivatives_of_the_rollout_match_the_exact_solution(plant):
     run = perfect(parts(30.0, 3.0, 0.5)) if plant == "spacecraft" else chain_parts([0.6, 0.0], 30.0, 3.0, 0.5)
@@ -133,27 +112,6 @@ def test_derivatives_of_the_rollout_match_the_exact_solution(plant):
     # d/d eta of r^eta (x0 + eta x0 L): -L r^eta (x0 + s0 L) + r^eta x0 L = -s0 L^2 r^eta from rest
     np.testing.assert_allclose(by_eta, -s0 * log_r**2 * r**3, rtol=1e-8)
     np.testing.assert_allclose(by_delta, r**3 * (3.0 * (start + s0 * log_r) - s0) / 0.5, rtol=1e-8)
-
-
-@pytest.mark.long  # also covered by `test_numerics.py`, `test_chain.py` and the tests above
-def test_order_of_convergence_is_four():
-    """The order is that of the whole loop, for a chain with an observer and a sinusoidal disturbance."""
-    wave = disturbances.Sinusoid(*(vector([v]) for v in (0.05, 0.7, 0.3, 0.0)))
-    model = integrator_chain.chain(2)
-    observer = nonlinear.NonlinearObserver(model, vector([2.0]), vector(0.035), vector(0.02))
-
-    def final(scale: int) -> np.ndarray:
-        run = chain_parts([1.0, 0.2], 10.0, delta=0.5, sign_width=0.5, disturbance=wave, observer=observer,
-                          steps=(20 * scale, 10 * scale))  # fmt: skip
-        log = fly(run).log
-        return np.append(log.x[-1], log.d_hat[-1])
-
-    truth = final(64)
-    sizes = np.array([4, 8, 16])
-    errors = np.array([np.abs(final(int(n)) - truth).max() for n in sizes])
-    assert errors[-1] > 1e-13  # still above rounding
-    slope = -np.polyfit(np.log(sizes), np.log(errors), 1)[0]
-    assert 3.7 < slope < 4.5
 
 
 @pytest.mark.parametrize("inertia", [(10.0, 12.0, 14.0), FULL_INERTIA, (0.01, 0.012, 0.015)])
@@ -205,14 +163,6 @@ def test_motion_under_held_torque_matches_an_adaptive_integrator():
             y = solve_ivp(rate, span, y, args=(log.u[k],), rtol=1e-11, atol=1e-13).y[:, -1]
     # the error of RK4 at 0.25 s and up to 0.15 rad/s is (0.04)^5/120 per step, 1e-7 after 120 steps
     np.testing.assert_allclose(np.concatenate([log.x.q[-1], log.x.w[-1]]), y, atol=1e-7)
-
-
-@pytest.mark.long  # also covered by `tests/cli/test_cli.py` and `test_clock.py`
-def test_the_last_row_is_at_t_end_and_time_never_runs_backwards():
-    for run in (parts(), parts(period=0.07), parts(period=0.069, flight=True, t_end=41.37)):
-        log = fly(run).log
-        assert float(log.t[-1]) == float(run.t_end)
-        assert np.all(np.diff(log.t) >= 0.0)
 
 
 @pytest.mark.parametrize("kind", ["anchored", "flight"])

@@ -339,16 +339,3 @@ def test_spillover_limit_separates_stable_and_unstable_pairs(monkeypatch):
         mapping._with(loaded, {"flexible.frequency[2]": 5.0})
     rigid, *_ = asked("loop.period=0.1:0.4:3", "controller.delta=0.5:1:3")
     assert mapping.spillover(mapping.Map(rigid, x, y, cells)) == {}
-
-
-@pytest.mark.long  # poles of the real loop, see also `test_spillover.py`
-@pytest.mark.usefixtures("unflown")
-def test_loop_damps_a_slow_mode_and_destabilises_a_fast_one():
-    loaded, x, y, cells = flown(*MODES)
-    radii = np.array([cell.hold_radius for cell in cells]).reshape(2, 3)
-    assert np.all(radii[:, 0] < 1.0 + 1e-6)  # slowest mode
-    assert np.all(radii[:, -1] > 1.0 + 1e-3)  # fastest mode: the delay of the loop is too long for it
-    across, _ = mapping.spillover(mapping.Map(loaded, x, y, cells))["the same in hold"]
-    after = np.flatnonzero(radii[0] > 1.0 + 1e-6)[0]
-    assert np.all((across[np.isfinite(across)] > x.values[0]) & (across[np.isfinite(across)] < x.values[-1]))
-    assert x.values[after - 1] < np.nanmin(across) < x.values[after]

@@ -17,7 +17,6 @@ from ptsmc_jax.simulation.catalogues import CATALOGUE
 from ptsmc_jax.simulation.metrics import Metrics
 from tests.helpers import SHORT, SHORT_CHAIN, short, small_search, tree
 from tests.output.pages import checked
-from tuning.output import progress
 from tuning.search import descent, descents
 from tuning.search.evaluate import Measured
 from tuning.studies import front, judging, pareto, posing, trades
@@ -249,25 +248,3 @@ def test_least_torque_search_lowers_the_limit_until_it_is_infeasible(least, limi
     found, peak = trades.least_torque(asking_for, 100.0)
     np.testing.assert_allclose(asked, limits)
     assert (found, peak) == (len(limits), max(0.97 * limits[-1], least))
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("stage", ["least torque: searching", "refining"])
-def test_interrupted_front_resumes_with_the_same_result(command, tmp_path, monkeypatch, stage):
-    """The result equals the result without the interruption."""
-    small_search(monkeypatch, 60)
-    run = ("pareto", "s.toml", "--points", 3, "--no-figures", "--out")
-    whole = command(*run, "whole")[0]
-
-    def stop(self, what, *numbers):
-        if what.startswith(stage):
-            raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(progress.Progress, "__call__", stop)
-        status, _, err = command(*run, "cut")
-    assert (status, err.splitlines()[-1]) == (130, "ptsmc: interrupted; the same command resumes it")
-    assert not (tmp_path / "cut" / "front.csv").exists()
-    assert command(*run, "cut")[0] == whole
-    assert (tmp_path / "cut" / "front.csv").read_text() == (tmp_path / "whole" / "front.csv").read_text()
-    assert "journal.bin" not in tree(tmp_path / "cut")

@@ -292,16 +292,3 @@ def test_sample_that_the_law_ignores_is_not_reported_as_saturation(limit):
         each[name][k] = value
     found = stability.summary(ready, course._replace(at_input=course.at_input._replace(**each)))
     blamed_on_no_limit(found, found["before"][k], limit < 1.0)
-
-
-@pytest.mark.long  # the previous test checks the report
-@pytest.mark.parametrize("hardware", [{}, {"torque_limit": 0.02}])
-def test_time_base_law_ignores_the_first_sample(hardware):
-    """The reference profile of the law starts at the measured error."""
-    tables = {"plant": {"kind": "chain", "x0": [1.0, 0.0]}, "disturbance": {"kind": "none"},
-              "controller": {"kind": "time_base_pd", "t_f": 3.0},
-              "loop": {"mode": "sampled", "period": 0.1, "window": 1.0},
-              "hardware": hardware}  # fmt: skip
-    found = stability.summary(*stability.find(scenario.from_tables(tables)))
-    assert found["before"][0]["time_to_go"] == 3.0
-    blamed_on_no_limit(found, found["before"][0], bool(hardware))

@@ -131,38 +131,6 @@ def test_a_random_walk_acts_from_the_start_of_its_period():
     np.testing.assert_allclose(covariance.noise(parts).window_error, flown, rtol=0.04)
 
 
-@pytest.mark.long  # short test: the chain above
-def test_window_error_of_a_spacecraft_includes_the_error_between_samples():
-    """The window contains only one sample. The error at this sample alone is three quarters of the trials' error."""
-    tables = {
-        "controller": {"t_f": 15.01, "delta": 0.9, "k1": 3.0, "sign_width": 0.01, "surface_rate": 1.5},
-        "observer": {"gain": [5.0] * 3},
-        "initial": {"rotvec_deg": [0.0, 0.0, 0.0]},
-        "disturbance": {"kind": "none"},
-        "loop": {"mode": "sampled", "clock": "flight", "period": 0.5, "t_end": 18.0, "window": 0.6},
-        "hardware": {"attitude_noise": 2e-5, "rate_noise": 1e-6},
-    }
-    ready = scenario.study(scenario.from_tables(tables))
-    flown = montecarlo.run(ready.parts, ready.dispersion, 0, np.arange(2000)).metrics.window_error
-    np.testing.assert_allclose(covariance.noise(ready.parts).window_error, np.sqrt(np.mean(flown**2)), rtol=0.05)
-
-
-@pytest.mark.long  # short test: the chain above
-def test_a_random_walk_on_a_spacecraft_acts_from_the_start_of_its_period():
-    """A step that acts one period later would predict a 12 % smaller error. The trials determine it to 1 %."""
-    tables = {
-        "controller": {"t_f": 4.0, "delta": 2.0, "k1": 0.5, "sign_width": 1e3},
-        "observer": {"gain": [3.0] * 3},
-        "initial": {"rotvec_deg": [0.0, 0.0, 0.0]},
-        "disturbance": {"kind": "random_walk", "density": [1e-5] * 3},
-        "loop": {"mode": "sampled", "clock": "flight", "period": 1.0, "t_end": 5.0},
-        "hardware": {"attitude_noise": 1e-12, "rate_noise": 1e-12},
-    }
-    ready = scenario.study(scenario.from_tables(tables))
-    flown = montecarlo.run(ready.parts, ready.dispersion, 0, np.arange(2000)).metrics.window_error
-    np.testing.assert_allclose(covariance.noise(ready.parts).window_error, np.sqrt(np.mean(flown**2)), rtol=0.04)
-
-
 def test_filter_covariance_stays_at_its_initial_steady_state():
     """It covers attitude and bias for six time constants. Averaged loops change the covariance by about a tenth."""
     parts = scenario.study(scenario.from_tables(ALL_AT_ONCE)).parts

@@ -1,6 +1,5 @@
 """Margins against closed forms, an independent frequency response, finite differences and the simulated loop."""
 
-import itertools
 from dataclasses import replace
 from typing import Any
 
@@ -148,31 +147,6 @@ def test_margin_derivatives_equal_finite_differences():
         exact = np.asarray(sloped(loop, way)[1])
         assert np.all(np.abs(exact) > 1e-6)
         np.testing.assert_allclose(exact, numeric, rtol=1e-6, atol=1e-9 * np.abs(exact).max())
-
-
-@pytest.mark.long  # short tests: the loop above, and scenario gains in campaigns/test_margin_requirements.py
-def test_margin_derivatives_of_a_chain_equal_finite_differences():
-    parts, _, _ = chain(hardware={"delay": 1, "state_noise": [1e-6, 1e-6]})
-    run = linear.nominal_jit(parts)
-    index = jnp.asarray(linear.full_periods(parts, run, hold=True)[-1])
-
-    def margins_at(at):
-        changed = with_gains(parts, {"k1": at[0], "sign_width": at[1], "surface_rate": at[2]})
-        during = jax.tree.map(lambda v: v[index], linear.nominal(changed))
-        found = margins.of(linear.opened(changed, during).loop)
-        return jnp.stack([found.gain_up[0], found.phase[0], found.delay[0], found.peak_sensitivity[0]])
-
-    @jax.jit
-    def sloped(at, along):
-        return jax.jvp(margins_at, (at,), (along,))
-
-    at, axes = np.array([3.0, 2e-2, 1.5]), np.eye(3)
-    exact = np.stack([sloped(at, along)[1] for along in axes], axis=1)
-    for k, along in enumerate(axes):
-        step = 1e-4 * at[k]
-        far_down, down, up, far_up = (np.asarray(sloped(at + n * step * along, along)[0]) for n in (-2, -1, 1, 2))
-        numeric = (8 * (up - down) - far_up + far_down) / (12 * step)
-        np.testing.assert_allclose(exact[:, k], numeric, rtol=1e-6, atol=1e-9 * np.abs(exact).max())
 
 
 def flown(parts, run, index, gain, late):
@@ -377,25 +351,6 @@ def test_margins_of_one_input_equal_margins_of_all_at_once():
     alone_as_together(held(*INTEGRATORS, 0.5))
 
 
-@pytest.mark.long  # short test: the loop above
-@pytest.mark.parametrize("delay", [0, 1])
-def test_margins_of_a_chain_equal_margins_of_all_inputs_and_both_openings_agree(delay):
-    """Three integrators also become unstable with less gain. Poles have a tolerance of 1e-6 around the unit circle.
-
-    The derivative of a pole's modulus is about 0.1, so that this tolerance changes a margin by about 1e-5.
-    """
-    plant = {"kind": "chain", "order": 3}
-    parts = scenario.study(
-        scenario.replace(
-            scenario.from_tables({**CHAIN, "plant": plant}), hardware={"delay": delay, "state_noise": [1e-6] * 3}
-        )
-    ).parts
-    loop = opened(parts)
-    alone_as_together(loop)
-    elsewhere, here = closed_at_both(loop)
-    np.testing.assert_allclose(elsewhere, here, rtol=0.0, atol=1e-12 * np.abs(here).max())
-
-
 def held_by_each_sensor(loop):
     """Check that a pole leaves the unit circle at the phase margin of each sensor."""
     opening = jax.tree.map(np.asarray, linear.at_sensors(loop))
@@ -416,20 +371,6 @@ def test_phase_margin_of_each_sensor_is_accurate_for_five_integrators():
     """The loop of all sensors is so large at low frequencies that its rounding once gave a wrong margin of 0.1 deg."""
     poles = -np.array([0.6, 0.6, 0.6, 0.6, 1.0])
     held_by_each_sensor(held(np.eye(5, k=1), np.eye(5)[:, 4:], -np.poly(poles)[None, :0:-1], 0.05, sensors=True))
-
-
-@pytest.mark.long  # short test: the loop above
-def test_phase_margin_of_each_sensor_is_accurate_for_a_chain():
-    tables = {
-        "plant": {"kind": "chain", "x0": [1.0, 0.0, 0.0, 0.0, 0.0]},
-        "controller": {"t_f": 7.0, "eta": 6.0, "delta": 1.0, "k1": 1.0, "surface_rate": 0.6, "sampling": "implicit"},
-        "observer": {"kind": "nonlinear", "gain": [1.0]},
-        "disturbance": {"kind": "none"},
-        "loop": {"mode": "sampled", "period": 0.05, "t_end": 9.0, "clock": "flight"},
-        "hardware": {"state_noise": [1e-5] * 5},
-    }
-    loop = opened(scenario.study(scenario.from_tables(tables)).parts)
-    held_by_each_sensor(loop)
 
 
 def bears_delays_below_its_margin(loop, most=1.0):
@@ -502,30 +443,6 @@ def test_delay_margin_is_the_smallest_over_all_crossings():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("frequency", [7.08, 6.9])
-def test_a_flexible_body_is_stable_for_all_delays_below_its_margin(frequency):
-    """The mode has only a few samples per oscillation, so that the first estimate of the delay is poor.
-
-    A Newton search from this estimate converged to another stability limit, at twice the delay.
-    """
-    tables = {
-        "spacecraft": {"inertia": [[1.24, 0.107, 0.038], [0.107, 1.41, 0.076], [0.038, 0.076, 1.24]]},
-        "flexible": {"frequency": [frequency], "damping": [0.01], "coupling": [[-0.478, 0.167, -0.235]]},
-        "filter": {"bandwidth": 0.114},
-        "initial": {"rotvec_deg": [45.0, 9.0, 4.0]},
-        "controller": {"t_f": 13.5, "eta": 2.84, "delta": 5.75, "k1": 0.23, "sign_width": 0.14, "surface_rate": 0.29},
-        "observer": {"gain": [6.55, 6.55, 6.55]},
-        "disturbance": {"kind": "none"},
-        "loop": {"mode": "sampled", "period": 0.2476, "t_end": 25.0, "clock": "flight"},
-        "hardware": {"attitude_noise": 2e-5, "rate_noise": 1e-6},
-    }
-    loop = jax.tree.map(np.asarray, opened(scenario.study(scenario.from_tables(tables)).parts, hold=False))
-    assert radius_late(loop, 0, 0.0) < 1.0
-    assert np.all(of(loop).delay < 12.0 * loop.period)
-    bears_delays_below_its_margin(loop)
-
-
-@pytest.mark.long
 def test_delay_search_does_not_skip_a_moving_stability_limit():
     """The command of this plant has a delay of two periods. Its limit moves by more than a step of the search."""
     plant = second_order.system(
@@ -568,20 +485,6 @@ def test_delay_margin_is_found_for_a_crossing_near_the_nyquist_frequency():
         assert 0.01 < late < 0.02
 
 
-@pytest.mark.long  # short test: the loops above
-def test_delay_margin_of_a_chain_is_found_for_a_crossing_near_the_nyquist_frequency():
-    """Newton's method once left the frequency range, or converged to a negative delay. Poles give the margin."""
-    found = []
-    for k1, rate in ((1.97, 17.39), (4.514, 17.341)):
-        _, loop, _ = chain(
-            plant={"kind": "chain", "order": 3, "x0": [0.1, 0.0, 0.0]}, loop__t_end=12.0,
-            controller={**CHAIN["controller"], "eta": 4.0, "k1": k1, "surface_rate": rate, "disturbance_bound": 1e-6},
-        )  # fmt: skip
-        found.append((float(of(loop).delay[0]), margins.together(loop)["delay"]))
-    assert found == [pytest.approx((late, late), rel=1e-4) for _, late in found]
-    assert all(0.01 < late < 0.02 for _, late in found)
-
-
 def sensitive_together(loop):
     """Check the peak sensitivity of all inputs on a uniform grid, and that no single input exceeds it."""
     opening = linear.at_input(loop)
@@ -599,13 +502,6 @@ def sensitive_together(loop):
 def test_peak_sensitivity_of_all_inputs_is_the_largest_singular_value():
     """The matrix is (I + L)^-1. No axis alone has a larger peak."""
     sensitive_together(drawn_loop(LATE[0]))
-
-
-@pytest.mark.long  # short test: the loop above
-def test_peak_sensitivity_of_a_second_order_system_is_the_largest_singular_value():
-    law = {"t_f": 10.0, "delta": 0.5, "k1": 3.0, "sign_width": 0.05}
-    parts = scenario.study(scenario.from_tables({**COUPLED, "controller": law})).parts
-    sensitive_together(opened(parts))
 
 
 def test_loop_of_a_slow_star_tracker_is_the_mean_over_its_interval():
@@ -696,28 +592,6 @@ def test_gain_margin_is_found_at_zero_frequency_for_a_slow_pole():
     a, at = np.diag([1.0 + e, 0.0, 0.0]), np.array([1.0, 0.0, 0.0])  # padded to share a compiled program
     found = of(a_loop(jnp.asarray(a), at, -c * at))
     np.testing.assert_allclose(found.gain_down, 20.0 * np.log10(c / e), rtol=1e-4)
-
-
-@pytest.mark.long  # short tests: rounding near such poles above, constant memories in the margins of a chain
-def test_wheel_momentum_does_not_limit_the_gain_margin_of_a_rotating_body():
-    """The poles of wheel momentum stay at 1 for any gain. The margin is the gain at which other poles leave the circle.
-
-    The test checks the poles with changed gains of one axis, in the approach phase and in the hold phase.
-    """
-    parts = scenario.study(scenario.from_tables(TURNING)).parts
-    run = linear.nominal_jit(parts)
-    on_the_way, in_hold = (linear.full_periods(parts, run, hold=hold) for hold in (False, True))
-    loops = linear.loops_in(parts, run, np.array([on_the_way[len(on_the_way) // 2], in_hold[-1]]))
-    for loop in (jax.tree.map(lambda v, k=k: v[k], loops) for k in range(2)):
-        found = of(loop)
-        assert found.stable.all()
-        poles = np.linalg.eigvals(linear.at_input(loop, xp=np).closed())
-        assert np.sum(np.abs(poles - 1.0) < 1e-9) == 4  # one pole for each wheel
-        for (way, borders_of), axis in itertools.product(((1, found.gain_up), (-1, found.gain_down)), range(3)):
-            gains = (10 ** (way * share * borders_of[axis] / 20) for share in (0.2, 0.4, 0.6, 0.8, 0.99, 1.01))
-            sizes = [linear.radius(loop, np.diag(np.where(np.arange(3) == axis, gain, 1.0))) for gain in gains]
-            assert max(sizes[:-1]) < 1.0 + 1e-9
-            assert sizes[-1] > 1.0 + 1e-5
 
 
 @pytest.mark.parametrize(("growth", "last"), [(1.1, 7), (0.9, 20), (3.0, 0)])

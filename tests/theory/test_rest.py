@@ -1,6 +1,5 @@
 """Limit cycles in the hold phase of nominal runs: their closed form, and motions that are not limit cycles."""
 
-import json
 from types import SimpleNamespace
 from typing import Any
 
@@ -109,20 +108,6 @@ def test_a_moving_reference_or_quantisation_is_not_a_limit_cycle(kind):
     assert rest.swing(scenario.study(scenario.from_tables(tables)).parts) is None
 
 
-CUSTOM = """
-import jax.numpy as jnp
-import ptsmc_jax as ptsmc
-
-
-class Relay(ptsmc.AccelerationLaw):
-    width: float = 1e-6
-
-    def acceleration(self, now, error, error_rate, bound):
-        s = error_rate + error
-        return -error_rate - s - bound * jnp.tanh(s / self.width), s
-"""
-
-
 def test_limit_cycle_of_a_law_without_sign_width_is_detected(monkeypatch):
     """The command of a custom law reverses at every sample. The linearisation explains a tenth or all of it."""
     turning = np.where(np.arange(40) % 2, 0.5, -0.5)[:, None]
@@ -133,24 +118,3 @@ def test_limit_cycle_of_a_law_without_sign_width_is_detected(monkeypatch):
     for left, found in ((0.9, rest.Swing(1.0, 2.0)), (0.0, None)):
         monkeypatch.setattr(rest, "_unexplained", lambda *_, left=left: (left * turning, turning))
         assert rest.swing(law, seen) == found
-
-
-@pytest.mark.long  # short tests: above, and a chain in studies/test_stability.py
-def test_a_custom_law_with_a_limit_cycle_has_zero_margins(command, tmp_path):
-    (tmp_path / "relay.py").write_text(CUSTOM)
-    (tmp_path / "relay.toml").write_text(
-        'plant = { kind = "chain", order = 2 }\nobserver = { kind = "none" }\n'
-        'controller = { kind = "custom", code = "relay.py:Relay", t_f = 8.0, delta = 0.5, disturbance_bound = 0.02 }\n'
-        'loop = { mode = "sampled", period = 0.05, t_end = 12.0 }\nrequirements = { gain_margin = 6.0 }\n'
-    )
-    status, said, _ = command("margins", "relay.toml", "--no-figures")
-    assert status == 1
-    assert "the nominal run does NOT come to rest in hold" in said
-    found = json.loads((tmp_path / "out/margins-relay/summary.json").read_text())
-    assert found["worst"]["gain_margin"] == found["worst"]["delay_margin"] == 0.0
-    assert not found["stable"]
-    status, said, _ = command("simulate", "relay.toml", "--no-figures")
-    assert status == 1
-    assert "gain_margin" in said
-    verdict = json.loads((tmp_path / "out/simulate-relay/summary.json").read_text())["verdicts"]["gain_margin"]
-    assert (verdict["met"], verdict["worst"]) == (False, 0.0)
