@@ -11,7 +11,7 @@ import pytest
 
 from ptsmc_jax.campaigns import campaign, montecarlo, store
 from ptsmc_jax.simulation import rollout
-from tests.helpers import SHORT, SHORT_CHAIN, same, short, tree
+from tests.helpers import SHORT, SHORT_CHAIN, refused, same, short, tree
 from tests.output.pages import checked
 from tuning.output import formats, progress
 from tuning.studies import campaign_summary
@@ -138,18 +138,6 @@ def test_repeated_part_is_not_counted_twice_in_the_progress(command, monkeypatch
     assert [(tally.done, tally.total) for tally in standing] == [(0, 10), (10, 10), (0, 20), (20, 20)]
 
 
-def test_interruption_of_the_summary_is_reported_as_resumable(command, flown, monkeypatch):
-    def stopped(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(campaign_summary, "summarise", stopped)
-    assert command("montecarlo", "s.toml", "--trials", 250, "--seed", 3, "--quiet") == (
-        130,
-        "",
-        "ptsmc: interrupted; the same command resumes it\n",
-    )
-
-
 def test_repeated_command_simulates_no_trials(command, flown):
     files = {path: path.stat().st_mtime_ns for path in (flown / "trials").iterdir()}
     code, said, _ = command("montecarlo", "s.toml", "--trials", 250, "--seed", 3, "--no-figures")
@@ -198,6 +186,9 @@ def test_another_campaign_in_the_same_folder_is_refused(command, flown, tmp_path
 @pytest.mark.parametrize(
     ("options", "said"),
     [
+        (["--device", "tpu"], 'Invalid value "tpu" for --device. Choose from: "cpu", "gpu".'),
+        (["--precision", "16"], 'Invalid value "16" for --precision. Choose from: "64", "32".'),
+        (["--precision", "32", "--cluster", "local:2"], "--cluster simulates on the workers' processors with 64 bits"),
         (["--trials", "0"], 'Invalid value "0" for --trials. Must be >= 1.'),
         (["--trials", "1e4"], "for --trials: 1e4 is no whole number"),
         (["--seed", "-1"], "--seed"),
@@ -218,12 +209,9 @@ def test_another_campaign_in_the_same_folder_is_refused(command, flown, tmp_path
 )
 def test_invalid_options_print_one_line_and_write_nothing(command, tmp_path, options, said):
     (tmp_path / "m.py").write_text(OVERSHOOT)
-    code, out, error = command("montecarlo", "s.toml", *options)
-    assert (code, out) == (2, "")
-    assert said in error
-    assert error.startswith("ptsmc: ")
-    assert error.count("\n") == 1
-    assert not (tmp_path / "out").exists()
+    line = refused(command, tmp_path, "montecarlo", "s.toml", *options)
+    assert line.startswith("ptsmc: ")
+    assert said in line
 
 
 def test_until_confident_needs_requirements(command, tmp_path):
@@ -503,24 +491,6 @@ def test_failed_trial_sets_the_exit_status_without_requirements(command, tmp_pat
     assert command("montecarlo", "s.toml", "--trials", MANY, "--no-figures", "--quiet", "--out", "b")[0] == 1
 
 
-@pytest.mark.parametrize("plant", short(["chain", "continuous"], ["chain"]))
-def test_other_plants_and_the_continuous_loop(command, tmp_path, plant):
-    (tmp_path / "o.toml").write_text({
-        "chain": SHORT_CHAIN,
-        "continuous": 'controller = { t_f = 20.0, delta = 0.5 }\n'
-                      'dispersion = { attitude = { kind = "uniform" }, disturbance_phase = {} }\n',
-    }[plant])  # fmt: skip
-    drawn = ["--no-figures"] if plant == "chain" else []  # other tests make the figures of a chain
-    code, said, _ = command("montecarlo", "o.toml", "--trials", 70, *drawn)
-    assert code in (0, 1)
-    assert "70 trials of seed 1000" in said
-    frame = rows_of(tmp_path / "out/montecarlo-o")
-    assert frame.height == 70
-    assert ("initial_x2" if plant == "chain" else "disturbance_phase_3") in frame.columns
-    code, said, _ = command("replay", "out/montecarlo-o", "--trial", 66, "--no-figures")
-    assert code == 0, said
-
-
 def test_single_precision_campaign_has_nearly_equal_rows(command, tmp_path, monkeypatch):
     """The option sets JAX to 32 bits. The test sets them by itself, because JAX is configured already."""
     asked = []
@@ -543,18 +513,3 @@ def test_single_precision_campaign_has_nearly_equal_rows(command, tmp_path, monk
     code, _, error = command(*run, "--out", "half")
     assert code == 2
     assert "holds a run with precision 32, not 64" in error
-
-
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        (["--device", "tpu"], 'Invalid value "tpu" for --device. Choose from: "cpu", "gpu".'),
-        (["--precision", "16"], 'Invalid value "16" for --precision. Choose from: "64", "32".'),
-        (["--precision", "32", "--cluster", "local:2"], "--cluster simulates on the workers' processors with 64 bits"),
-    ],
-)
-def test_unknown_devices_and_precisions_are_refused(command, tmp_path, options, said):
-    code, _, error = command("montecarlo", "s.toml", "--trials", 10, *options)
-    assert code == 2
-    assert error.startswith(f"ptsmc: {said}")
-    assert not (tmp_path / "out").exists()

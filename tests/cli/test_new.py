@@ -19,47 +19,12 @@ from ptsmc_jax.scenario.attitude_keys import ATTITUDE_KEYS
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import catalogues
 from tests.helpers import ROOT
+from tests.scenario.every_key import ATTITUDE, blocks, complete, key_of, kinds, values
 from tuning.cli import new
 from tuning.errors import UsageError
 
-KEY = re.compile(r"^#?([a-z]\w*) = ")
-TABLE = re.compile(r"^#?\[(\w+)\]")
-ATTITUDE = {*ATTITUDE_KEYS, "sequence"}
 PLANTS = " or ".join(layouts.SCENARIOS)
 FLIGHT = ROOT / "scenarios" / "first_flight.toml"
-
-
-def key_of(line):
-    """Return the key that a line sets, also in a comment; None: it sets no key."""
-    found = KEY.match(line)
-    return found[1] if found else None
-
-
-def blocks(text):
-    """Return the lines with keys of each table, without the introduction of the file."""
-    found, name = {}, None
-    for line in text.splitlines():
-        if match := TABLE.match(line):
-            name = match[1]
-            found[name] = []
-        elif name and key_of(line):
-            found[name].append(line)
-    return found
-
-
-def kinds(lines):
-    """Return the lines of each kind of a table, the active kind first. A table without kinds has one list of lines."""
-    found = [[]]
-    for line in lines:
-        if key_of(line) == "kind" and found[-1]:
-            found.append([])
-        found[-1].append(line)
-    return found
-
-
-def values(lines):
-    """Return the values of the keys of lines, also in comments. The last line of a key counts."""
-    return {key: value for line in lines for key, value in tomllib.loads(line.removeprefix("#")).items()}
 
 
 @pytest.mark.parametrize("plant", ["spacecraft", "chain"])
@@ -134,45 +99,17 @@ def test_every_key_of_the_plant_is_written_with_its_meaning(plant):
 
 @pytest.mark.parametrize("plant", ["spacecraft", "chain"])
 def test_commented_keys_are_valid(plant):
-    """Every kind of every table and every dispersion is valid in a scenario with noise and a torque limit."""
-    text = new.text(plant, {})
-    found = blocks(text)
-    written = tomllib.loads(text)
-    hardware = values(found["hardware"])
-    for key in (
-        "rate_noise_density",
-        "star_tracker_every",
-        "star_tracker_period",
-    ):  # they exclude rate_noise or need a filter
-        hardware.pop(key, None)
-    base = {**written, "loop": {**written["loop"], "mode": "sampled"}, "hardware": hardware}
-    attitude = {key: value for key, value in written.get("initial", {}).items() if key in ATTITUDE_KEYS}
-    tried = 0
-    for name, lines in found.items():
-        groups = [[line] for line in lines] if name == "dispersion" else kinds(lines)
-        if name == "dispersion" and plant == "spacecraft":  # some dispersions need these tables
-            base |= {"flexible": {}, "wheels": {}, "filter": {}}
-        for table in map(values, groups):
-            if name == "initial":  # the next test checks each attitude key
-                table = {**{key: value for key, value in table.items() if key not in ATTITUDE}, **attitude}
-            given = {"loop": {"mode": "sampled"}, "tune": {"statistic": "cvar"}}.get(name, {})  # key `level` needs cvar
-            alone = {"hardware": {}} if name == "sensors" else {}  # custom sensors exclude noise in [hardware]
-            around = written if name == "tune" else base  # default bounds of delta follow the loop's mode
-            from_tables({**around, **alone, name: hardware if name == "hardware" else {**table, **given}})
-            tried += 1
+    """Every kind of every table, every dispersion and every attitude key is valid."""
+    every = complete(plant)
+    for _, tables in every:
+        from_tables(tables)
     layout = layouts.TABLES[plant]
     dispersion = layout["dispersion"]
     assert isinstance(dispersion, type)
     drawn = sum(len(layouts.DISPERSIONS[key.name]) for key in keys.of(dispersion))
     others = sum(len(table) if isinstance(table, Mapping) else 1 for table in layout.values()) - 1
-    assert tried == others + drawn + 1  # 1: the table [requirements] is not in the layout
-
-
-@pytest.mark.parametrize("key", ["quat_xyzw", "quat_wxyz", "rotvec_deg", "mrp", "dcm_body_to_inertial", "euler_deg"])
-def test_every_attitude_key_is_valid(key):
-    table = values(blocks(new.text(None, {}))["initial"])
-    beside = {"sequence": table["sequence"]} if key == "euler_deg" else {}
-    assert from_tables({"initial": {key: table[key], **beside}})
+    attitudes = len(ATTITUDE_KEYS) - 1 if plant == "spacecraft" else 0
+    assert len(every) == others + drawn + attitudes + 1  # 1: the table [requirements] is not in the layout
 
 
 def test_new_refuses_unknown_plants_and_invalid_scenarios():

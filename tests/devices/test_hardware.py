@@ -11,7 +11,6 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from ptsmc_jax import formulas, programs, scenario
-from ptsmc_jax.batching import lanes
 from ptsmc_jax.campaigns import runs
 from ptsmc_jax.devices import actuators, attitude_filter, reaction_wheels, sensors
 from ptsmc_jax.numerics import draws
@@ -125,28 +124,6 @@ def test_limited_and_quantised_torque_is_delivered_after_the_delay(step):
     np.testing.assert_allclose(result.metrics.peak_torque_delivered, 0.11)
     beyond = np.any(np.abs(log.commanded[:-4]) > 0.11, axis=1)
     np.testing.assert_allclose(result.metrics.saturated, np.sum(np.diff(log.t)[3:][beyond]) / 120.0, rtol=1e-9)
-
-
-@pytest.mark.long  # short test, with wheels: `test_wheels_exchange_momentum_with_the_body`
-def test_motion_with_lag_equals_an_adaptive_integration():
-    device = actuators.Actuators(rate_limit=vector(0.5), lag=vector(0.04))
-    log = fly(with_device(device, inertia=FULL_INERTIA), 1, 2).log
-    inertia = np.asarray(FULL_INERTIA)
-
-    def rate(t, y, c):
-        q, w, v = y[:4], y[4:7], y[7:]
-        v_dot = np.clip((c - v) / 0.04, -0.5, 0.5)
-        w_dot = np.linalg.solve(inertia, v + 0.01 * np.sin(0.1 * t) - np.cross(w, inertia @ w))
-        return np.concatenate([0.5 * (q[3] * w + np.cross(q[:3], w)), [-0.5 * q[:3] @ w], w_dot, v_dot])
-
-    y = np.concatenate([log.x.q[0], log.x.w[0], np.zeros(3)])
-    for k in range(60):
-        y = solve_ivp(
-            rate, (log.t[k], log.t[k + 1]), y, args=(log.commanded[k],), rtol=1e-10, atol=1e-12, max_step=0.01
-        ).y[:, -1]
-    # impulse and first moment of the torque are exact in a step; the error comes from higher moments
-    np.testing.assert_allclose(np.concatenate([log.x.q[60], log.x.w[60]]), y[:7], atol=1e-9)
-    np.testing.assert_allclose(log.u[60], y[7:], atol=1e-9)
 
 
 def wheels_by_an_adaptive_integrator(inertia, axes, log, lag, limit, intervals):
@@ -371,20 +348,6 @@ def test_gradients_with_every_device_equal_finite_differences():
         h = 2e-5 * point[k] * along  # large enough to average over the quantisation of 1e-13 N m
         up, down = (sloped_with_everything(at, along)[0] for at in (point + h, point - h))
         np.testing.assert_allclose(slope, (up - down) / (2 * h[k]), rtol=1e-4)
-
-
-@pytest.mark.long
-def test_lanes_equal_vmap_with_every_device():
-    trials, run = jnp.arange(5, dtype=jnp.uint32), everything()
-
-    def one(trial):
-        return rollout.simulate(run, 3, trial).metrics
-
-    plain = jax.jit(jax.vmap(one))(trials)
-    by_lanes = jax.jit(lanes.vmap(one))(trials)
-    for name, value in plain.items():
-        np.testing.assert_allclose(value, by_lanes[name], rtol=1e-9, atol=1e-12, err_msg=name)
-    assert np.std(plain.window_error) > 0
 
 
 def test_error_is_continuous_where_delta_is_a_multiple_of_the_period():

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from ptsmc_jax import formulas
-from ptsmc_jax.batching import lanes
 from ptsmc_jax.laws.prescribed_time import expansion
 from ptsmc_jax.observers import nonlinear
 from ptsmc_jax.plants import integrator_chain
@@ -337,31 +336,6 @@ def test_derivatives_of_input_and_s_by_gains_equal_finite_differences(hold):
     differences = np.stack([(input_and_s(point + h) - input_and_s(point - h)) / 2e-6 for h in steps], axis=-1)
     np.testing.assert_allclose(jax.jacfwd(input_and_s)(point), differences, rtol=1e-6, atol=1e-6)
     assert np.count_nonzero(np.abs(differences[0]) > 1e-4) == 3  # two gains of the phase, and sign_width
-
-
-# short tests: `lanes` in `test_conformity.py`, derivatives of the law above, of sampled runs in `test_implicit.py`
-@pytest.mark.long
-def test_batch_of_chains_equals_jax_vmap_and_gradients_equal_finite_differences():
-    run = chain_parts([5.0, 3.0, 2.0], delta=0.5, period=0.05, noise=[1e-4, 1e-4, 1e-4], bound=0.01)
-
-    def error(gains, trial):
-        law = dict(zip(("eta", "delta", "k1", "surface_rate"), gains, strict=True))
-        return rollout.simulate(with_controller(run, **law), 3, trial).metrics.window_error
-
-    trials = jnp.arange(6, dtype=jnp.uint32)
-    point = vector([4.5, 0.53, 1.2, 1.7])
-    one = jax.jit(jax.vmap(lambda trial: error(point, trial)))(trials)
-    np.testing.assert_allclose(jax.jit(lanes.vmap(lambda trial: error(point, trial)))(trials), one, rtol=1e-12)
-    assert np.std(one) > 0.0
-
-    @jax.jit
-    def value_and_derivative(gains, along):
-        return jax.jvp(lambda gains: error(gains, trials[0]), (gains,), (along,))
-
-    for along in np.eye(4):
-        h = 1e-6
-        up, down = (value_and_derivative(point + s * h * along, along)[0] for s in (1, -1))
-        np.testing.assert_allclose(value_and_derivative(point, along)[1], (up - down) / (2 * h), rtol=1e-4)
 
 
 def test_chain_validates_its_order_and_functions():

@@ -24,19 +24,6 @@ def test_fractions_have_the_digits_that_matter():
     assert str(examples.entry(seen)).endswith("98.33 %: met")
 
 
-@pytest.mark.parametrize(("failures", "end"), [
-    (0, "; 299 trials with no failure are enough"), (9, "; 1568 trials with as many failures are enough"), (10, ""),
-])  # fmt: skip
-def test_number_of_trials_that_is_enough(failures, end):
-    """Of 1 000 trials 10 are the fraction that is allowed: more trials would have as many more of them."""
-    asked = Requirement("peak_torque", 0.5, quantile=0.99, confidence=0.95)
-    verdict = asked.verdict(np.r_[np.zeros(1000 - failures), np.ones(failures)], np.ones(1000, bool))
-    more = {"share": 1.0 - failures / 1000, "share_interval": [0.9, 1.0], "share_bound": 0.985,
-            "fewest_trials": statistics.fewest_for(failures, 0.99, 0.95)}  # fmt: skip
-    text = campaign_report.verdict(examples.entry(verdict, **more))
-    assert text.endswith(f"at least 98.5 % at 95 % one-sided confidence{end}")
-
-
 @pytest.mark.parametrize(("without", "largest"), [(1, "57.2"), (2, "none")])
 def test_no_largest_settling_time_if_a_run_that_ended_never_settled(without, largest):
     """Trials that failed have none either, but they are counted above the table."""
@@ -107,22 +94,6 @@ def test_chance_is_no_driver():
     assert driven(drivers) == []
     (line,) = driven(statistics.drivers({"y": metric + rng.normal(size=300)}, metric))
     assert line.startswith("window_error is driven by y (rank correlation +0.")
-
-
-@pytest.mark.parametrize(
-    ("off", "rounding", "texts", "absent"),
-    [
-        (0.0, 0.0, ["equals its row to the last digit", "same run up to round-off"], "NOT"),
-        (7e-16, 3e-15, ["equals its row up to round-off: largest relative difference 7.0e-16", "3e-15"], "NOT"),
-        (2e-3, 3e-15, ["NOT equal its row: largest relative difference 2.0e-03", "versions.json"], "its row up to"),
-        (np.inf, 0.1, ["NOT equal its row: it ends with another status", "1.0e-01; a loop that chatters"], "inf"),
-        (None, 0.0, ["no row of this trial yet"], "NOT"),
-    ],
-)
-def test_round_off_of_a_replay_is_no_difference(off, rounding, texts, absent):
-    text = " ".join(trials_report.replayed(off, rounding, 1e-12))
-    assert all(words in text for words in texts)
-    assert absent not in text
 
 
 def test_command_that_replays_the_worst_trial_can_be_pasted_into_a_shell():

@@ -10,7 +10,6 @@ from tests.output import examples
 from tuning.output import margins_report, summaries, tune_report
 from tuning.output.report import Text
 from tuning.search import gains
-from tuning.studies import tune_files, tuner
 
 
 def errors(rms, interval=None, largest=None):
@@ -232,30 +231,6 @@ def test_confirmation_that_is_skipped_is_reported():
     assert skipped(1.2, {**asked, "quantile": None}) == []
 
 
-BROKEN = Requirement("peak_torque", 0.5).verdict(np.array([0.4, 0.7]), np.ones(2, bool))
-
-
-@pytest.mark.parametrize(
-    ("seen", "text"),
-    [
-        (
-            tuner.Beyond(4.3, 0.5, str(BROKEN)),
-            "no better beyond its bound: at 4.3 peak_torque at most 0.5 N m: worst 0.7: NOT met in 1 of 2 trials",
-        ),
-        (tuner.Beyond(4.3, 1.002, None), "no better beyond its bound: the same error at 4.3"),
-        (tuner.Beyond(4.3, 1.02, None), "no better beyond its bound: 1.02 times the error at 4.3"),
-        # trained on the anchored clock, no trial reaches its end on the flight clock
-        (
-            tuner.Beyond(4.3, None, None),
-            "on its bound 4: every requirement kept at 4.3, with no error to set that beside",
-        ),
-    ],
-)
-def test_result_beyond_a_bound(seen, text):
-    assert not seen.better
-    assert tune_files._beyond(seen, 4.0) == text
-
-
 def test_column_of_the_published_gains_is_named_after_their_source():
     paper = scenario.from_tables({"loop": {"mode": "sampled"}})
     assert gains.paper_is(paper) == "published"
@@ -282,15 +257,6 @@ def test_saturated_actuators_are_reported(most, count):
     lines = list(tune_report.accuracy(examples.tune(fresh=fresh)))
     assert len(lines) == count
     assert all(line.endswith("0.59 % of a trial on average, 6.33 % at most") for line in lines)
-
-
-@pytest.mark.parametrize(
-    ("times", "text"), [(1.001, "+0.10 % from that"), (0.98, "-2.00 % from that"), (3835.0, "3.84e+03 times that")]
-)
-def test_global_check_is_compared_by_the_objectives(times, text):
-    check = {"rollouts": 7, "value": 2.0, "distance": float(np.log(times)), "kept": True}
-    *_, last = tune_report.search(examples.tune(differential_evolution=check))
-    assert last.endswith(f"the tuned gains are {text}")
 
 
 @pytest.mark.parametrize("gradients", [None, {"start": 1e-9, "end": 1e-9}])

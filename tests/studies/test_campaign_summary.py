@@ -1,8 +1,5 @@
 """Requirements on fractions of time in the summary and the figures of a campaign."""
 
-from types import SimpleNamespace
-from typing import Any
-
 import numpy as np
 import polars as pl
 import pytest
@@ -63,17 +60,6 @@ def test_failed_trial_counts_as_zero_in_quantiles_of_a_time_fraction():
     assert told["0.1"]["low"] < told["0.1"]["value"] < told["0.1"]["high"]
     none = campaign_summary._of_share(np.array([np.nan]), np.array([False]))
     assert none["0.5"]["value"] == 0.0
-
-
-def test_fan_figure_of_one_shard_shows_the_trials_of_the_shard(monkeypatch):
-    """The rows of one shard are not the first trials of the campaign."""
-    frame = pl.DataFrame({"trial": [100, 101, 250], "window_error": [1.0, None, 3.0]})
-    monkeypatch.setattr(campaign_figures.flying, "history", lambda flights, trials: (np.zeros(1), trials[:, None]))
-    monkeypatch.setattr(campaign_figures.plots, "fan", lambda t, errors, worst, *_: (errors[:, 0].tolist(), worst[0]))
-    tables = SimpleNamespace(controller=SimpleNamespace(t_f=1.0), plant=SimpleNamespace(kind="spacecraft"))
-    folder: Any = SimpleNamespace(flights=None, scenario=tables)
-    assert campaign_figures._fan(folder, frame, np.array([True, False, True])) == {"fan": ([100, 250], 250)}
-    assert campaign_figures._fan(folder, frame, np.array([False, False, False])) == {}  # no empty axes
 
 
 def test_worst_trials_by_successful_samples_have_the_fewest():

@@ -2,8 +2,6 @@
 
 import csv
 import json
-import re
-import shutil
 import tomllib
 import typing
 from dataclasses import replace
@@ -267,18 +265,6 @@ def test_settling_times_of_small_and_large_initial_angles():
     assert compare._near_far(angle, np.where(angle > 2.0, np.inf, settling)) == (30.0, None)
 
 
-@pytest.mark.long
-def test_other_commands_simulate_a_baseline_law(command, tmp_path):
-    text = re.sub(r"\[controller\][^[]*", '[controller]\nkind = "pd"\nt_f = 5.0\n', SHORT)
-    (tmp_path / "pd.toml").write_text(text[: text.index("[tune]")])
-    code, _, _ = command("simulate", "pd.toml")
-    assert code in (0, 1)
-    assert {path.stem for path in (tmp_path / "out/simulate-pd/figures").iterdir()} >= {"error", "torque", "sliding"}
-    axes = ["--x", "controller.k_p=0.1:1:2", "--y", "controller.k_d=0.5:2:2", "--trials", 2]
-    assert command("map", "pd.toml", *axes)[0] == 0
-    assert command("montecarlo", "pd.toml", "--trials", 70, "--no-figures")[0] in (0, 1)
-
-
 def test_first_flight_scenario_is_valid_with_every_law():
     posed = compare.contenders(scenario.replace(scenario.read(FIRST_FLIGHT), tune__trials=32))
     for other in posed.values():
@@ -446,29 +432,3 @@ def test_missing_custom_law_is_refused_and_leaves_no_folder(command, tmp_path):
     assert (status, err.count("\n")) == (2, 1)
     assert "gone.py is not there" in err
     assert not (tmp_path / "out").exists()
-
-
-def test_every_law_is_validated_once_before_the_search(command, tmp_path, monkeypatch):
-    """A law that cannot control the scenario is refused before a folder is created, also if it is built in."""
-    built = []
-
-    def built_and(posed):
-        built.append(posed.controller.kind)
-        if posed.controller.kind == refused:
-            raise scenario.ScenarioError("no such luck")
-
-    def interrupted(*_, **__):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(compare, "study", built_and)
-    monkeypatch.setattr(compare.judging, "beside", lambda _: ({}, None))
-    monkeypatch.setattr(compare.tuner, "tune", interrupted)
-    shutil.copy(ROOT / "scenarios" / "own_parts.py", tmp_path)
-    asked = "compare", "s.toml", "--law", "own_parts.py:Scaling", "--against", "pd"
-    refused = "pd"
-    status, _, err = command(*asked)
-    assert (status, "the law pd cannot be used in this scenario: no such luck" in err) == (2, True)
-    assert not (tmp_path / "out").exists()
-    refused, built[:] = None, []
-    assert command(*asked)[0] == 130
-    assert built == ["prescribed_time", "pd", "custom"]

@@ -150,27 +150,6 @@ def test_cells_agree_with_separate_simulations_of_their_pair(mapped, monkeypatch
     assert any(cell.radius < 1.0 for cell in cells)
 
 
-def test_cells_have_the_margins_of_the_worst_axis(mapped, monkeypatch):
-    """The gain margin is a factor: 20 dB is the factor 10. A loop with a margin below 0 dB is unstable."""
-
-    def left(gain_up, delay):
-        values: dict[str, Any] = dict.fromkeys(margins.Margins._fields, np.zeros(3))
-        values |= {"gain_up": np.array(gain_up), "delay": np.array(delay)}
-        return margins.Margins(**values)
-
-    ends = {
-        "hand_over": (left([20.0, -20.0, 40.0], [0.3, 0.0, 0.4]), 1.2),
-        "hold": (left([40, 60, 20], [3, 1, 2]), 0.9),
-    }
-    monkeypatch.setattr(mapping.run_margins, "at_ends", lambda parts: ends)
-    loaded, x, y, _ = mapped
-    cell = mapping.fly(loaded, x, y, 3, 6, lambda done, total: None).cells[0]
-    assert (cell.gain_margin, cell.hold_gain_margin) == (pytest.approx(0.1), pytest.approx(10.0))
-    assert (cell.delay_margin, cell.hold_delay_margin) == (0.0, 1.0)
-    assert (cell.radius, cell.hold_radius) == (1.2, 0.9)
-    assert np.isnan(cell.linear_window_error)  # no prediction for an unstable loop
-
-
 @pytest.fixture
 def unflown(monkeypatch):
     """Replace the simulation, which takes longest to compile, for tests that do not use trials."""
@@ -209,15 +188,6 @@ def test_gain_factor_below_one_gives_the_distance_to_the_nearest_stability_limit
     assert linear.radius(weak, 0.999 / factor) > 1.0 > linear.radius(weak, 1.001 / factor)
 
 
-@pytest.mark.long
-def test_keys_with_several_numbers_and_integer_keys_can_be_mapped():
-    """The axes are a gain with a number for each axis, and a delay in periods."""
-    _, _, _, cells = flown("observer.gain=5:20:2", "hardware.delay=0:1:2", trials=2)
-    assert all(c.status == "flown" for c in cells)
-    assert len({c.window_error for c in cells}) == 4
-    assert cells[2].delay_margin < cells[0].delay_margin
-
-
 def test_value_is_set_on_all_axes_and_in_missing_keys():
     loaded, _, _ = asked("hardware.torque_lag=0.01:0.1:2", "controller.delta=1:2:2")
     changed: Any = mapping._with(loaded, {"observer.gain": 7.0, "hardware.torque_lag": 0.2, "hardware.delay": 1.0})
@@ -241,24 +211,6 @@ def test_random_walk_disturbance_makes_trials_differ():
     still, walking = (asked("controller.eta=3:4:2", "controller.delta=0.5:0.6:2", text + kind)[0]
                       for kind in ("", "disturbance.kind = 'random_walk'"))  # fmt: skip
     assert [scenario.study(one).drawn for one in (still, walking)] == [False, True]
-
-
-@pytest.mark.long
-def test_map_with_only_failed_trials_is_written(tmp_path):
-    text = SHORT.replace("min_deg = 20.0, max_deg = 60.0", "min_deg = 180.0, max_deg = 180.0")
-    loaded, x, y, cells = flown("controller.eta=3:4:2", "controller.delta=0.5:0.6:2", text, trials=2)
-    assert all(c.failures == 2 for c in cells)
-    mapping.write(tmp_path, mapping.Map(loaded, x, y, cells), 3, figures=True)
-    assert (tmp_path / "map.csv").exists()
-
-
-@pytest.mark.long
-def test_map_with_only_zero_errors_is_written(tmp_path):
-    perfect = "initial.quat_xyzw = [0, 0, 0, 1]\ncontroller = { disturbance_rate_bound = 0, t_f = 5, delta = 0.5 }\n"
-    perfect += "disturbance.kind = 'none'\nloop = { mode = 'sampled', period = 0.1 }"
-    loaded, x, y, cells = flown("controller.eta=3:4:2", "controller.delta=0.5:0.6:2", perfect, trials=1)
-    assert all(c.window_error == 0.0 for c in cells)
-    mapping.write(tmp_path, mapping.Map(loaded, x, y, cells), 3, figures=True)  # the colour scale has no range
 
 
 def test_period_axis_needs_the_sampled_loop():

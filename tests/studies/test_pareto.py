@@ -201,15 +201,6 @@ def test_own_torque_limit_replaces_the_nearest_default_limit(limit):
     assert ladder[middle] == (limit if limit in rungs else pytest.approx(4.0, rel=1e-14))
 
 
-def test_refinement_reports_its_target(monkeypatch):
-    told = []
-    monkeypatch.setattr(pareto, "_refined", lambda *_: None)
-    problem: Any = None
-    targets = [trades.Target(limit, f"peak torque {limit}", problem) for limit in (0.2, 0.4)]
-    assert pareto.refined(targets, [np.zeros(1)], problem, lambda what, *_: told.append(what)) == {}
-    assert told == [f"refining, peak torque {limit}" for limit in (0.4, 0.2, 0.2, 0.4)]
-
-
 @pytest.mark.parametrize(("found", "best"), [(None, 2.0), (3.0, 2.0), (1.5, 1.5)])
 def test_refined_target_is_not_worse_than_the_known_feasible_gains(monkeypatch, found, best):
     """F is the gain itself. Gain 1 breaks the limit, gain 2 keeps it. The local search finds nothing, 3 or 1.5."""

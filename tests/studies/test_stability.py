@@ -4,7 +4,6 @@ import csv
 import dataclasses
 import json
 import tomllib
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +12,7 @@ import pytest
 
 from ptsmc_jax import scenario
 from ptsmc_jax.scenario.errors import ScenarioError
-from ptsmc_jax.theory import linear, margins, rest, run_margins
+from ptsmc_jax.theory import margins, rest, run_margins
 from tests.helpers import SHORT, SHORT_CHAIN, short, untuned
 from tests.theory.loops import held
 from tuning.output import margins_report, page, summaries
@@ -130,15 +129,6 @@ def test_run_with_a_limit_cycle_has_no_margins(command, tmp_path, monkeypatch):
     assert "gain_margin" in said
     verdict = json.loads((tmp_path / "out" / "simulate-asks" / "summary.json").read_text())["verdicts"]["gain_margin"]
     assert (verdict["met"], verdict["worst"]) == (False, 0.0)
-
-
-def test_margins_of_several_loops_are_in_their_order(monkeypatch):
-    monkeypatch.setattr(margins, "of_each", lambda loops: margins.Margins(*(loops.period[:, None],) * 7))
-    for count in (1, 2, 5):
-        numbers = np.arange(float(count))
-        each: Any = dict.fromkeys([field.name for field in dataclasses.fields(linear.Loop)], numbers) | {"delay": 0}
-        loops = linear.Loop(**each)
-        np.testing.assert_array_equal(margins.in_turn(loops).phase[:, 0], numbers)
 
 
 def test_unstable_hold_phase_is_reported_with_negative_margins(command, tmp_path):

@@ -323,8 +323,3 @@ def test_run_without_a_lower_bound_has_no_ratio_to_it(least):
     report = run_report.of(summaries.run({**run, "floor": least}, "spacecraft"), "spacecraft")
     assert report.headline == "pointing error 4.13 arcsec: the run reached its end"
     assert report.lines == []
-
-
-def test_repr_of_a_lower_bound_omits_its_arrays():
-    course = np.arange(900.0)
-    assert repr(error_floor.Floor(8e-7, course, course)) == "Floor(window_error=8e-07)"
