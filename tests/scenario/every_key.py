@@ -1,0 +1,83 @@
+"""Every key of every table and kind of a scenario, as `ptsmc new` writes them, most of them in comments."""
+
+import re
+import tomllib
+
+from ptsmc_jax.scenario.attitude_keys import ATTITUDE_KEYS
+from tuning.cli import new
+
+KEY = re.compile(r"^#?([a-z]\w*) = ")
+TABLE = re.compile(r"^#?\[(\w+)\]")
+ATTITUDE = {*ATTITUDE_KEYS, "sequence"}
+
+
+def key_of(line):
+    """Return the key that a line sets, also in a comment; None: it sets no key."""
+    found = KEY.match(line)
+    return found[1] if found else None
+
+
+def blocks(text):
+    """Return the lines with keys of each table, without the introduction of the file."""
+    found, name = {}, None
+    for line in text.splitlines():
+        if match := TABLE.match(line):
+            name = match[1]
+            found[name] = []
+        elif name and key_of(line):
+            found[name].append(line)
+    return found
+
+
+def kinds(lines):
+    """Return the lines of each kind of a table, the active kind first. A table without kinds has one list of lines."""
+    found = [[]]
+    for line in lines:
+        if key_of(line) == "kind" and found[-1]:
+            found.append([])
+        found[-1].append(line)
+    return found
+
+
+def values(lines):
+    """Return the values of the keys of lines, also in comments. The last line of a key counts."""
+    return {key: value for line in lines for key, value in tomllib.loads(line.removeprefix("#")).items()}
+
+
+def attitudes(lines):
+    """Return the lines with the other keys and one attitude key for each attitude key."""
+    others = [line for line in lines if key_of(line) not in ATTITUDE]
+    return [
+        [*others, *(line for line in lines if key_of(line) in (key, key == "euler_deg" and "sequence"))]
+        for key in ATTITUDE_KEYS
+    ]
+
+
+def complete(plant):
+    """Return pairs of a table's name and a valid scenario with all keys of one kind of this table.
+
+    The scenario around the table is sampled and has the noises and limits that dispersions need.
+    """
+    text = new.text(plant, {})
+    found, written = blocks(text), tomllib.loads(text)
+    hardware = values(found["hardware"])
+    for key in ("rate_noise_density", "star_tracker_every", "star_tracker_period"):  # exclude rate_noise, need a filter
+        hardware.pop(key, None)
+    base = {**written, "loop": {**written["loop"], "mode": "sampled"}, "hardware": hardware}
+    drawn = base | ({"flexible": {}, "wheels": {}, "filter": {}} if plant == "spacecraft" else {})  # for dispersions
+    every = []
+    for name, lines in found.items():
+        groups = kinds(lines)
+        if name == "dispersion":
+            groups = [[line] for line in lines]
+        elif name == "initial":
+            groups = attitudes(lines)
+        around = {"tune": written, "dispersion": drawn}.get(
+            name, base
+        )  # default bounds of delta follow the loop's mode
+        if name == "sensors":  # custom sensors exclude noise in [hardware]
+            around = around | {"hardware": {}}
+        more = {"loop": {"mode": "sampled"}, "tune": {"statistic": "cvar"}}.get(name, {})  # key `level` needs cvar
+        for table in map(values, groups):
+            every.append((name, {**around, name: hardware if name == "hardware" else {**table, **more}}))
+    return every
