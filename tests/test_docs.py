@@ -1,8 +1,7 @@
-"""The documentation matches the code (reference pages, commands, keys, code blocks, names, docstrings) and builds."""
+"""The documentation matches the code (reference pages, commands, keys, code blocks, names) and builds."""
 
 import doctest
 import importlib
-import inspect
 import operator
 import re
 import runpy
@@ -16,14 +15,12 @@ from pathlib import Path
 
 import jaxtyping
 import pytest
-from jaxtyping import Array
 
 import ptsmc_jax
 from ptsmc_jax import scenario
 from ptsmc_jax.scenario import from_tables, layouts
 from ptsmc_jax.simulation import catalogues
 from tests.helpers import SHORT
-from tests.scenario.test_schema import COMPLETE
 from tests.tree import ROOT, modules
 from tuning.cli.main import app
 
@@ -60,25 +57,6 @@ def test_reference_pages_match_the_code(name):
     assert (DOCS / name).read_text(encoding="utf-8") == MADE[name](), "run `python docs/generate.py`"
 
 
-def test_reference_pages_name_the_default_kind_of_each_plant():
-    """The default disturbance is "none" for a system and "sinusoid" for a spacecraft."""
-    page = (DOCS / "scenarios.md").read_text(encoding="utf-8")
-    for plant, title in TITLES.items():
-        part = page.split(f"## {title}\n")[1].split("\n## ")[0]
-        for name, kinds in layouts.TABLES[plant].items():
-            if not isinstance(kinds, Mapping):
-                continue
-            said = part.split(f"### [{name}]\n")[1].split("\n### ")[0].strip()
-            others = [
-                other for other, name_of in TITLES.items() if said == f"As for {name_of[0].lower()}{name_of[1:]}."
-            ]
-            for other in others:
-                theirs = layouts.TABLES[other][name]
-                assert isinstance(theirs, Mapping), (plant, name)
-                assert list(kinds.items()) == list(theirs.items()), (plant, name)
-            assert others or re.search(rf'"{next(iter(kinds))}"` \(default\)', said), (plant, name)
-
-
 def test_reference_pages_name_every_key_and_metric():
     scenarios, metric_list = MADE["scenarios.md"](), MADE["metrics.md"]()
     for plant, tables in layouts.TABLES.items():
@@ -92,19 +70,6 @@ def test_reference_pages_name_every_key_and_metric():
                 ), struct
     for catalogue in catalogues.CATALOGUES.values():
         assert all(f"| `{metric}` | {entry.unit} | " in metric_list for metric, entry in catalogue.items())
-
-
-def test_commands_and_keys_of_the_contract_are_documented():
-    """The commands and keys of the contract are listed by hand, see `tests.scenario.test_schema`."""
-    promised = """reproduce simulate map montecarlo summarize worst replay tune pareto compare report new
-        convert-attitude""".split()
-    assert set(promised) <= set(COMMANDS)
-    page = (DOCS / "scenarios.md").read_text()
-    for tables in COMPLETE:
-        for name, table in tables.items():
-            keys = table if isinstance(table, Mapping) and name != "requirements" else {}
-            assert f"### [{name}]" in page
-            assert all(f"`{key}`" in page or key == "kind" for key in keys), name
 
 
 def test_the_guides_name_every_command():
@@ -195,78 +160,6 @@ def test_the_pages_build_without_warnings_and_external_files(tmp_path):
         loaded = re.findall(r"<(?:script|img|link|iframe)\b[^>]*?(?:src|href)=\"(https?:)?//[^\"]*", page.read_text())
         assert not loaded, page.name
     assert (tmp_path / "theory" / "law.html").read_text().count("<math") > 50
-
-
-# --- docstrings ---
-
-ROOMS = ("plants", "signals", "laws", "observers", "devices", "dispersions")
-PHYSICS = [name for name in modules("ptsmc_jax") if name.split(".")[1:2] and name.split(".")[1] in ROOMS]
-PHYSICS += [
-    f"ptsmc_jax.{name}"
-    for name in """
-    numerics.attitude numerics.draws simulation.clock theory.hold theory.linear theory.solutions theory.rules
-    theory.closed_forms theory.envelopes theory.exact_motion theory.rates scenario.scales""".split()
-]
-ARRAYS = re.compile(r"\b(Array|Float|Int|Bool|UInt32|ndarray|ArrayLike|Leaf)\b")
-UNIT = re.compile(
-    r"\[[^][]+\]|in the (?:states'|inputs'|states' own|inputs' own) units|in the units of|unit quaternion", re.I
-)
-SHAPE = re.compile(r"\([\w ]+,[^()]*\)|\(its shape\)|\b(?:matrix|number|scalar)\b")
-
-
-def public(module):
-    """Yield name, function and docstrings of the public functions of a module; bases document inherited methods."""
-    for name, thing in vars(module).items():
-        if name.startswith("_") or getattr(thing, "__module__", None) != module.__name__:
-            continue
-        if inspect.isclass(thing):
-            for key, member in vars(thing).items():
-                function = member.fget if isinstance(member, property) else member
-                if key.startswith("_") or not inspect.isfunction(function):
-                    continue
-                bases = [base for base in thing.__mro__ if base is not object]
-                docs = [inspect.getdoc(vars(base)[key]) or "" for base in bases if key in vars(base)]
-                docs += [vars(base).get("__doc__") or "" for base in bases]
-                yield f"{name}.{key}", function, docs
-        elif inspect.isfunction(inspect.unwrap(thing)):
-            yield name, inspect.unwrap(thing), [inspect.getdoc(thing) or ""]
-
-
-def lacking(function, docs):
-    """Yield "units" or "shapes" if the docstrings of a function with array arguments lack them."""
-    annotations = [str(value) for key, value in function.__annotations__.items()]
-    if not any(ARRAYS.search(annotation) for annotation in annotations):
-        return
-    text = re.sub(r"^ *>>> .*(?:\n.+)*", "", "\n".join(docs), flags=re.M)  # ignore examples
-    if not UNIT.search(text):
-        yield "units"
-    bare = [
-        annotation
-        for annotation in annotations
-        if re.search(r"<class '.*(?:Array|ndarray)'>|^(?:Array|np\.ndarray)$", annotation)
-    ]
-    if bare and not SHAPE.search(text):
-        yield "shapes"
-
-
-@pytest.mark.parametrize("name", PHYSICS)
-def test_docstrings_state_shapes_and_units(name):
-    module = importlib.import_module(name)
-    seen = list(public(module))
-    assert not [f"{name}: {what}" for name, function, docs in seen for what in lacking(function, docs)]
-
-
-def test_the_docstring_check_finds_missing_shapes_and_units():
-    def silent(x: Array) -> Array:
-        """Something."""
-        return x
-
-    def telling(x: Array) -> Array:
-        """Something = x [N m], (3,)."""
-        return x
-
-    assert list(lacking(silent, [silent.__doc__])) == ["units", "shapes"]
-    assert not list(lacking(telling, [telling.__doc__]))
 
 
 def test_examples_in_docstrings_run():

@@ -20,7 +20,7 @@ from ptsmc_jax.onboard.library import InTheLoop, Library
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.layouts import OPTIONAL
 from ptsmc_jax.simulation import rollout
-from tests.scenario.test_schema import COMPLETE
+from tests.scenario.test_schema import BUILT_IN
 from tuning.search.gains import gains_of, with_gains
 
 SEED, TRIALS = 7, 3
@@ -30,14 +30,13 @@ METRICS = ("window_error", "terminal_error", "peak_torque", "effort")  # metrics
 
 
 def drawn(seed):
-    """Return a random sampled scenario from `COMPLETE`: one kind of each table, and some hardware and dispersions."""
+    """Return a random sampled scenario from `BUILT_IN`: one kind of each table, and some hardware and dispersions."""
     chance = random.Random(seed)
     kind = chance.choice(["spacecraft", "spacecraft", "spacecraft", "chain"])
     tables = {}
-    for some in COMPLETE:
+    for name, some in BUILT_IN:
         if some.get("plant", {}).get("kind", "spacecraft") == kind:
-            for name, table in some.items():
-                tables.setdefault(name, []).append(table)
+            tables.setdefault(name, []).append(some[name])
     chosen = {}
     for name, ones in tables.items():
         if name in ("hardware", "dispersion"):
