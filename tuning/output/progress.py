@@ -15,12 +15,12 @@ EVERY = 10.0  # seconds
 
 
 def line(what: str, done: int, total: int, seconds: float) -> str:
-    """Return a line of progress. A total of 100 is a percentage; 0: unknown.
+    """Return a line of progress. A total of 0: unknown.
 
-    >>> line("searching", 7, 100, 99.0), line("refining", 1, 7, 10.4), line("compiling", 0, 0, 10.2)
-    ('ptsmc: searching, 7 %, 99 s', 'ptsmc: refining, 1 of 7, 10 s', 'ptsmc: compiling, 10 s')
+    >>> line("searching", 1, 7, 10.4), line("compiling", 0, 0, 10.2)
+    ('ptsmc: searching, 1 of 7, 10 s', 'ptsmc: compiling, 10 s')
     """
-    fraction = "" if not total else f", {done} %" if total == 100 else f", {done} of {total}"
+    fraction = "" if not total else f", {done} of {total}"
     return f"ptsmc: {what}{fraction}, {seconds:.0f} s"
 
 

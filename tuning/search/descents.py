@@ -16,23 +16,20 @@ from ptsmc_jax import configure
 from tuning.search import hand_overs
 from tuning.search.descent import BOLD, CAREFUL, CLOSE, SLACK, Best, Relaxed, Start, descend, largest, prices
 from tuning.search.evaluate import Evaluator, Measured, Sloped
-from tuning.search.evolution import GENERATIONS, WIDELY, evolve
+from tuning.search.evolution import WIDELY, evolve
 from tuning.search.lockstep import Ask, in_step
 from tuning.search.objective import LIMITS, Problem, ended, failures, fewer_trials
 from tuning.search.progress import Report
 from tuning.search.shares import TIMES
 from tuning.search.starts import (
-    CHOOSING,
     NEARLY,
     STEEP,
-    SWEPT,
     charged,
     promising,
     spread,
     spread_widely,
     starting_points,
 )
-from tuning.search.work import ROUND, SLOPED
 
 AGAIN = 3  # number of local searches that a further round continues
 EXPLORED, AVERAGED = 32, 16  # trials of the first searches, constraints included; smallest number in the objective
@@ -43,10 +40,6 @@ FINISH = 1e-2  # factor on `CLOSE` for the last local search, from the best poin
 CONFLICTING = 0.1  # limits whose excess is within this fraction of the largest excess count as conflicting
 LOOKS = 3  # largest number of attempts with other hand-over times
 MANY = 512  # Sobol points of a search without gradients
-
-SETTING_OUT, SEARCHING, FOLLOWING, FINISHING, EVOLVING = (
-    "setting out", "searching", "following the best", "finishing", "evolving",
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -65,35 +58,6 @@ class _Racer:
 
     start: Start
     before: list[Step]
-
-
-def planned(problem: Problem, starts: int, steps: int, *, sloped: bool) -> tuple[dict, dict]:
-    """Return the largest number of rollouts of each step of a search and of a further round, see `Work`.
-
-    Args:
-        problem: the tuning problem.
-        starts: number of starting points.
-        steps: largest number of measured points of each local search.
-        sloped: whether the search uses gradients.
-
-    Returns:
-        Rollouts of each step by its name, for the search and for a further round.
-    """
-    trials = float(problem.trials.size)
-    if not sloped:
-        evolving = {EVOLVING: GENERATIONS * WIDELY[0] * trials}
-        return {CHOOSING: MANY * trials, **evolving}, {ROUND: 0.0, **evolving}
-    one, few = SLOPED * steps, _few_trials(problem).trials.size
-    finishing = (hand_overs.LOOKED + one) * trials
-    exploring = {SETTING_OUT: one * few, CHOOSING: max(SWEPT, starts) * few, SEARCHING: starts * one * 3 / 8 * few}
-    return (
-        {
-            **(exploring if starts > 1 else {}),
-            FOLLOWING: (min(starts, FOLLOWED) + 1) / 2 * one * trials,
-            FINISHING: finishing,
-        },
-        {ROUND: AGAIN * one * trials, FINISHING: finishing},
-    )
 
 
 def _few_trials(problem: Problem) -> Problem:
@@ -183,11 +147,9 @@ class Descents:
             designs: (designs, gains) gains of designs that follow from the mission.
         """
         few = _few_trials(problem)
-        self._scenario_gains, self._designs = (
-            scenario_gains,
-            np.asarray([self._evaluate.bounds.share(one) for one in designs]),
-        )
-        self._report(SETTING_OUT, 0, 2, *self.so_far)
+        self._scenario_gains = scenario_gains
+        self._designs = np.asarray([self._evaluate.bounds.share(one) for one in designs])
+        self._report("setting out", 0, 2, *self.so_far)
         points = np.concatenate(
             [self._evaluate.bounds.share(scenario_gains)[None], self._designs.reshape(-1, scenario_gains.size)]
         )
@@ -211,7 +173,7 @@ class Descents:
             Normalised gains, (gains,), of at most `FOLLOWED` results, by number of the local search.
         """
         problem, more = _few_trials(problem), max(2, self._steps // 2)
-        self._report(SETTING_OUT, 1, 2, *self.so_far)
+        self._report("setting out", 1, 2, *self.so_far)
         self._descend(problem, 0, Start(self.share, CAREFUL), more, afresh=True)
         first = starting_points(
             self._evaluate, self.tightened(problem), self.share, self._designs, starts, seed, self._report
@@ -229,7 +191,7 @@ class Descents:
         few, more = max(2, self._steps // 4), max(2, self._steps // 2)
         racing = dict(enumerate(first, number))
         rungs = ((len(racing), few), (max(FOLLOWED, len(racing) // 2), more))
-        ranked = self._race(problem, racing, rungs, SEARCHING, scales=(CAREFUL, BOLD))
+        ranked = self._race(problem, racing, rungs, "searching", scales=(CAREFUL, BOLD))
         return {k: self._ends[k].share for k in ranked[:FOLLOWED]} or {number: first[0]}
 
     def descend(self, problem: Problem, starts: Mapping[int, np.ndarray]) -> None:
@@ -240,7 +202,7 @@ class Descents:
             starts: (gains,) normalised gains of each starting point, by number of the local search.
         """
         half, self._ends = max(2, self._steps // 2), {}
-        self._race(problem, starts, ((len(starts), half), (1, self._steps)), FOLLOWING, afresh=True)
+        self._race(problem, starts, ((len(starts), half), (1, self._steps)), "following the best", afresh=True)
         self._finish(problem)
 
     def _race(
@@ -349,7 +311,7 @@ class Descents:
         share = np.concatenate(
             [self._evaluate.bounds.share(scenario_gains)[None], spread(len(problem.names), MANY, self._rng)]
         )
-        share = promising(self._evaluate, tightened, share, 1, partial(self._report, CHOOSING))
+        share = promising(self._evaluate, tightened, share, 1, partial(self._report, "choosing starts"))
         best, flown = self._best_of(tightened, share)
         self._keep(0, flown)  # if the search is interrupted now, the history has this point
         self._take(best, tightened, 0, afresh=True)
@@ -372,7 +334,7 @@ class Descents:
         best, _ = self._best_of(tightened, share[None])
         try:
             evolve(self._evaluate, tightened, best, share, int(self._rng.integers(2**31)),
-                   lambda done, steps: self._report(EVOLVING, done, steps, *best.so_far),
+                   lambda done, steps: self._report("evolving", done, steps, *best.so_far),
                    partial(self._keep, 0), size)  # fmt: skip
         finally:  # also after an interrupt
             self._take(best, tightened, 0, afresh=True)
@@ -411,7 +373,7 @@ class Descents:
         return found
 
     def _finish(self, problem: Problem) -> None:
-        self._report(FINISHING, 0, 1, *self.so_far)
+        self._report("finishing", 0, 1, *self.so_far)
         for _ in range(LOOKS):
             if not self._hand_over_elsewhere(problem):
                 break

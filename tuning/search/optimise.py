@@ -12,13 +12,12 @@ import numpy as np
 
 from ptsmc_jax.simulation.requirements import Requirement
 from tuning.search import confirm, flights
-from tuning.search.descents import Descents, Step, planned
+from tuning.search.descents import Descents, Step
 from tuning.search.evaluate import Evaluator
 from tuning.search.evolution import NEARBY
 from tuning.search.objective import Problem
-from tuning.search.progress import Report
+from tuning.search.progress import Report, timed
 from tuning.search.rounds import Rounds
-from tuning.search.work import ROUND, Work
 from tuning.search.worst import Hardest
 
 Tell = Callable[[str], None]  # reports the name of the current step
@@ -96,7 +95,8 @@ def search(
     sloped = settings.sloped
     rounds = Rounds(evaluate, problem, requirements, robust=settings.robust)
     margins = {row: max(settings.margins.get(row, 0.0), rounds.margin) for row in rounds.problem.rows}
-    report = Work(report, evaluate, *planned(rounds.problem, settings.starts, settings.steps, sloped=sloped))
+    seconds = dict[str, float]()
+    report = timed(report, seconds)
     kept = np.asarray([*margins.values()])
     descents = Descents(evaluate, kept, settings.steps, np.random.default_rng(settings.seed), report)
     interrupted, conflict = False, dict[str, float | None]()
@@ -138,7 +138,7 @@ def search(
         globally=descents.globally,
         hardest=rounds.hardest,
         counts=[] if interrupted else rounds.counts,
-        seconds=report.seconds,
+        seconds=seconds,
         interrupted=interrupted,
     )
 
@@ -166,5 +166,5 @@ def _by_evolution(rounds: Rounds, descents: Descents, scenario_gains: np.ndarray
 def _go_on(rounds: Rounds, descents: Descents, again: Callable[[Problem], None], tell: Tell) -> None:
     """Repeat the search as long as harder trials join, unless the limits are out of reach."""
     while np.all(descents.best.worst <= HOPELESS) and rounds.harder(descents.gains, tell):
-        tell(f"{ROUND}, round {rounds.count}")
+        tell(f"harder trials, round {rounds.count}")
         again(rounds.problem)

@@ -21,7 +21,7 @@ CALL = 16  # points between two reports
 CHARGE = 3.0  # F is a logarithm: a metric at twice its limit counts like 2^3 times the error
 APART = (0.5, 0.35, 0.2, 0.0)  # smallest distances in the unit cube (maximum norm), tried in this order
 STEEP = 10.0  # factor on the violation in the penalty, if many points are close to a limit
-CHOOSING, SPREADING = "choosing starts", "searching the whole box"
+SPREADING = "searching the whole box"
 WIDELY, MARGINS_LOOKED = 2048, 256  # points of a global search; largest number of them with margins
 NEARLY = 0.05  # a limit is nearly active if c > -NEARLY
 
@@ -56,7 +56,7 @@ def starting_points(
     held = held_by_limits(evaluate.slopes(problem, first[None]))
     share[:, held] = first[held]
     share = np.concatenate([designs.reshape(-1, first.size), share])
-    chosen = promising(evaluate, problem, share, starts - 1, partial(report, CHOOSING))
+    chosen = promising(evaluate, problem, share, starts - 1, partial(report, "choosing starts"))
     return np.concatenate([first[None], chosen])
 
 
