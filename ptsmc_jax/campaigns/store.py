@@ -2,6 +2,7 @@
 
 import contextlib
 import csv
+import glob
 import importlib.metadata
 import json
 import math
@@ -30,7 +31,7 @@ except ImportError:  # Windows
 JOURNAL = "journal.bin"  # of an unfinished run
 SUMMARY = "summary.json"  # of a finished run
 IDENTITY = (SUMMARY, "versions.json", "scenario.toml")  # files that differ between results
-MAKING = ".making-"  # prefix of temporary files
+MAKING = ".making-"  # in the names of temporary files and folders
 MADE_OF_RESULTS = {  # files made from a result, with a mark near the beginning: files of the user stay
     "figures/*.png": b"Creator\0ptsmc",  # written by `style.save`
     "report.html": b'<meta name="generator" content="ptsmc">',
@@ -205,6 +206,7 @@ def is_empty(folder: Path) -> bool:
 def in_use(folder: Path, *, force: bool = True, shared: bool = False) -> Iterator[None]:
     """Lock a result folder while this process writes into it; the lock ends with the process, even if it is killed.
 
+    At the end, the last process that holds the lock removes the temporary folders of killed ones, see `write`.
     Platforms without `fcntl` and file systems without locks are not protected.
 
     Args:
@@ -227,7 +229,9 @@ def in_use(folder: Path, *, force: bool = True, shared: bool = False) -> Iterato
         yield
     finally:
         with contextlib.suppress(OSError), lock:
-            _flock(lock, shared=False)  # fails if others share it
+            if _flock(lock, shared=False):  # raises an error if others share it
+                for left in path.parent.glob(f"{glob.escape(path.stem)}{MAKING}????????"):
+                    shutil.rmtree(left, ignore_errors=True)
             path.unlink()
         for parent in made:
             with contextlib.suppress(OSError):  # it is not empty
@@ -257,16 +261,17 @@ def _locked(path: Path, *, shared: bool) -> IO[str] | None:
     return None
 
 
-def _flock(file: IO[str], *, shared: bool) -> None:
-    """Lock an open file. Raises BlockingIOError if another process holds the lock."""
+def _flock(file: IO[str], *, shared: bool) -> bool:
+    """Lock an open file; return False without locks. Raises BlockingIOError if another process holds the lock."""
     if fcntl is None:
-        return
+        return False
     try:
         fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
     except BlockingIOError:
         raise
     except OSError:  # the file system has no locks
-        pass
+        return False
+    return True
 
 
 def check_file(file: Path, force: bool, way: str = "--force") -> None:
@@ -286,7 +291,7 @@ def write(folder: Path, fill: Callable[[Path], None]) -> None:
     """
     folder = Path(os.path.realpath(folder))
     folder.parent.mkdir(parents=True, exist_ok=True)
-    making = _beside(folder) / f".{folder.name}-{secrets.token_hex(4)}"
+    making = _beside(folder) / f".{folder.name}{MAKING}{secrets.token_hex(4)}"
     making.mkdir()
     try:
         fill(making)
