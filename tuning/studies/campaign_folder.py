@@ -111,11 +111,7 @@ class Folder:
             return []
         if self.made is None:
             return self._with_custom_metrics.custom_metric_names()
-        if self.made.metrics_names is None:
-            raise RefusedError(
-                f"{self.path} was begun by an earlier version; the same `ptsmc montecarlo` again mends it"
-            )
-        return list(self.made.metrics_names)
+        return list(self.made.metrics_names or ())
 
     @property
     def units(self) -> dict[str, str]:
@@ -306,12 +302,10 @@ def _begun(wanted: Folder, tables: Mapping[str, Any]) -> bool:
             f"--trials is {wanted.trials}, but must be at least {before.trials}, which {path} was begun with"
         )
     same = before.trials == wanted.trials and before.made == _made(wanted) and before.identity == wanted.identity
-    return same and (before.controller is None or _as_known(before, custom_parts.CONTROLLER))
-
-
-def _as_known(folder: Folder, key: str) -> bool:
-    """Return whether the folder's copy of a program exists and still has its original checksum."""
-    return custom_parts.digest(key, folder.programs[key]) == folder.digests.get(custom.digest_name(key))
+    if not same or before.controller is None:
+        return same
+    key = custom_parts.CONTROLLER  # the folder's copy may be missing or changed
+    return custom_parts.digest(key, before.programs[key]) == before.digests.get(custom.digest_name(key))
 
 
 def opened(path: Path) -> Folder:
