@@ -11,14 +11,14 @@ from cyclopts.validators import MutuallyExclusive, Number
 
 from tuning.cli import flight_commands, searches
 from tuning.cli.options import (
+    USUAL,
+    Common,
     Device,
     Figures,
-    Force,
     Out,
     Quiet,
     ScenarioFile,
     Seed,
-    Trust,
     prepare,
     resumable,
     whole,
@@ -101,10 +101,7 @@ def montecarlo(
         ),
     ] = False,
     controller: flight_commands.ControllerFolder = None,
-    trust: Trust = False,
-    force: Force = False,
-    quiet: Quiet = False,
-    figures: Figures = True,
+    common: Common = USUAL,
 ) -> int:
     """Simulate a campaign of many trials, and keep a row of each; every trial can be replayed.
 
@@ -121,7 +118,7 @@ def montecarlo(
     for refused, sentence in (
         (tls and not clustered, "--tls-ca, --tls-cert and --tls-key need --cluster"),
         (
-            force and share != (1, 1),
+            common.force and share != (1, 1),
             "--force starts the whole campaign again, which would delete the rows of other shards, and does not go "
             "with --shard; remove the folder before the first shard starts, or choose another with --out",
         ),
@@ -134,7 +131,7 @@ def montecarlo(
         if refused:
             raise UsageError(sentence)
     bits = 32 if precision == "32" else 64
-    loaded, path = prepare(scenario, "montecarlo", out, device, bits, trust=trust)
+    loaded, path = prepare(scenario, "montecarlo", out, device, bits, trust=common.trust)
     from ptsmc_jax.campaigns import store
     from ptsmc_jax.simulation import catalogues
 
@@ -159,23 +156,23 @@ def montecarlo(
     if confident:
         from tuning.studies import campaign_summary
 
-        folder = replace(folder, first_look=campaign_summary.first_look(folder, force))
+        folder = replace(folder, first_look=campaign_summary.first_look(folder, common.force))
     _ = folder.campaign  # raises configuration errors before anything is written
     if folder.computer is not None:
         flight_commands.say_otherwise(folder.computer)
 
     shared = share != (1, 1) and not dry_run
-    with resumable(force), store.in_use(folder.path, shared=shared), _elsewhere(cluster, tls) as elsewhere:
-        campaign_folder.begin(folder, force)
-        with CampaignProgress(quiet) as report:
+    with resumable(common.force), store.in_use(folder.path, shared=shared), _elsewhere(cluster, tls) as elsewhere:
+        campaign_folder.begin(folder, common.force)
+        with CampaignProgress(common.quiet) as report:
             if dry_run:
                 campaign_folder.write_run_table(folder, report)
                 done = folder
             else:
                 done = _flown(folder, share, report, elsewhere, until_confident)
         if not a_part:
-            return _summarised(done, quiet, figures)
-    if not quiet:
+            return _summarised(done, common.quiet, common.figures)
+    if not common.quiet:
         _say_share(done, share, dry_run=dry_run)
     return 0
 
@@ -295,10 +292,7 @@ def replay(
     *,
     trial: Annotated[int, whole("Number of the trial.")],
     out: Annotated[Path | None, Parameter(help="Folder for the results; default: DIR/replay/TRIAL.")] = None,
-    trust: Trust = False,
-    force: Force = False,
-    quiet: Quiet = False,
-    figures: Figures = True,
+    common: Common = USUAL,
 ) -> int:
     """Simulate one trial of a campaign again with its history, and compare it with its row.
 
@@ -313,17 +307,17 @@ def replay(
     if trial >= opened.trials:
         raise UsageError(f"--trial is {trial}, but must be a whole number from 0 to {opened.trials - 1}")
     place = out if out is not None else folder / "replay" / str(trial)
-    store.check(place, force or out is None)  # a replay overwrites an earlier one
-    custom_parts.allow(opened.programs, folder, opened.identity, trust)
+    store.check(place, common.force or out is None)  # a replay overwrites an earlier one
+    custom_parts.allow(opened.programs, folder, opened.identity, common.trust)
     opened = replace(opened, trusted=True)
-    with store.in_use(place, force=force or out is None):
+    with store.in_use(place, force=common.force or out is None):
         again = campaign_summary.replay(opened, trial)
-        about = opened.scenario, again.run, opened.seed, trial, figures, opened.computer
+        about = opened.scenario, again.run, opened.seed, trial, common.figures, opened.computer
         # simulate has no rows of run tables and no numbers of 32 bits
         from_here = opened.table is not None or opened.bits != 64
         replayed = {"campaign": str(folder.absolute()), "metrics": opened.custom_metrics} if from_here else {}
         store.write(place, lambda making: single.write(making, *about, replayed))
-    if not quiet:
+    if not common.quiet:
         from tuning.output import run_report, summaries
 
         plant = opened.scenario.plant.kind

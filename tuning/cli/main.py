@@ -13,7 +13,9 @@ from cyclopts.exceptions import UnusedCliTokensError
 import ptsmc_jax
 from tuning.cli import INTERRUPTED, campaign_commands, flight_commands, searches, writing_commands
 from tuning.cli.options import (
+    USUAL,
     Against,
+    Common,
     Device,
     Figures,
     Force,
@@ -27,7 +29,6 @@ from tuning.cli.options import (
     Seed,
     SensitivityLimits,
     Times,
-    Trust,
     listed_against,
     prepare,
     whole,
@@ -57,16 +58,13 @@ def simulate(
         int | None, whole("Simulate this trial's dispersions; none: nominal, with trial 0's noise.")
     ] = None,
     controller: flight_commands.ControllerFolder = None,
-    trust: Trust = False,
-    force: Force = False,
-    quiet: Quiet = False,
-    figures: Figures = True,
+    common: Common = USUAL,
 ) -> int:
     """Simulate one run and write its history, metrics and figures.
 
     Exit status: 0 every requirement met, 1 not met or the run failed, 2 configuration error.
     """
-    loaded, folder = prepare(scenario, "simulate", out, trust=trust, force=force)
+    loaded, folder = prepare(scenario, "simulate", out, trust=common.trust, force=common.force)
     from ptsmc_jax.campaigns import runs, store
     from ptsmc_jax.scenario import study, timing
     from ptsmc_jax.simulation.computer import OURS
@@ -76,12 +74,12 @@ def simulate(
     ready = study(loaded, drawn=trial is not None)
     computer = None if controller is None else flight_commands.compiled(controller, ready)
     steps = timing.steps(ready.parts)
-    if steps > LONG and not quiet:
+    if steps > LONG and not common.quiet:
         terminal.say(f"simulating {steps} integration steps with their history")
-    with store.in_use(folder, force=force):
+    with store.in_use(folder, force=common.force):
         run = runs.fly(ready, seed, trial, OURS if computer is None else computer.software)
-        store.write(folder, lambda making: single.write(making, loaded, run, seed, trial, figures, computer))
-    if not quiet:
+        store.write(folder, lambda making: single.write(making, loaded, run, seed, trial, common.figures, computer))
+    if not common.quiet:
         from tuning.output import run_report, summaries
 
         summary = summaries.run(single.summary(run, loaded, computer), loaded.plant.kind)
@@ -133,16 +131,13 @@ def map_(
     out: Out = None,
     seed: Seed = 0,
     device: Device = "cpu",
-    trust: Trust = False,
-    force: Force = False,
-    quiet: Quiet = False,
-    figures: Figures = True,
+    common: Common = USUAL,
 ) -> int:
     """Simulate the scenario over two of its keys: error and peak torque, with the stability limits of linear theory.
 
     Exit status: 0 done, 2 configuration error. A pair that is not allowed or fails is marked, not dropped.
     """
-    loaded, folder = prepare(scenario, "map", out, device, trust=trust, force=force)
+    loaded, folder = prepare(scenario, "map", out, device, trust=common.trust, force=common.force)
     from ptsmc_jax.campaigns import store
     from tuning.studies import mapping
 
@@ -150,13 +145,13 @@ def map_(
     up = mapping.axis(y or mapping.usual_deltas(loaded), "--y")
     if across.key == up.key:
         raise UsageError(f"--y is {up.text}, but must be another key than --x")
-    with store.in_use(folder, force=force):
-        with progress.Progress(quiet) as report:
+    with store.in_use(folder, force=common.force):
+        with progress.Progress(common.quiet) as report:
             flown = mapping.fly(
                 loaded, across, up, seed, trials, lambda done, total: report("simulating pairs", done, total)
             )
-        store.write(folder, lambda making: mapping.write(making, flown, seed, figures))
-    if not quiet:
+        store.write(folder, lambda making: mapping.write(making, flown, seed, common.figures))
+    if not common.quiet:
         from tuning.output import map_report
 
         pairs = [dataclasses.asdict(cell) for cell in flown.cells]
@@ -170,10 +165,7 @@ def margins(
     /,
     *,
     out: Out = None,
-    trust: Trust = False,
-    force: Force = False,
-    quiet: Quiet = False,
-    figures: Figures = True,
+    common: Common = USUAL,
 ) -> int:
     """Print gain, phase, delay and sensitivity margins of the nominal loop: hold phase, and approach phase frozen.
 
@@ -181,17 +173,17 @@ def margins(
 
     Exit status: 0 stable in the hold phase, 1 not stable in the hold phase, 2 configuration error.
     """
-    loaded, folder = prepare(scenario, "margins", out, trust=trust, force=force)
+    loaded, folder = prepare(scenario, "margins", out, trust=common.trust, force=common.force)
     from ptsmc_jax.campaigns import store
     from tuning.studies import stability
 
-    with store.in_use(folder, force=force):
-        with progress.Progress(quiet) as report:
+    with store.in_use(folder, force=common.force):
+        with progress.Progress(common.quiet) as report:
             report("linearising the loop", 0, 0)
             ready, course = stability.find(loaded)
-        store.write(folder, lambda making: stability.write(making, ready, course, figures))
+        store.write(folder, lambda making: stability.write(making, ready, course, common.figures))
     summary = stability.summary(ready, course)
-    if not quiet:
+    if not common.quiet:
         from tuning.output import margins_report, summaries
 
         terminal.show(margins_report.of(summaries.read(summaries.Margins, summary)), folder)
@@ -209,10 +201,7 @@ def tune(
         bool, Parameter(negative="", help="Compare with the result of differential evolution.")
     ] = False,
     device: Device = "cpu",
-    trust: Trust = False,
-    force: Force = False,
-    quiet: Quiet = False,
-    figures: Figures = True,
+    common: Common = USUAL,
 ) -> int:
     """Find the gains with the smallest error after t_f that meet every requirement, and verify them on held-out trials.
 
@@ -221,7 +210,7 @@ def tune(
 
     Exit status: 0 every requirement met on the held-out trials, 1 not met, 2 configuration error, 130 interrupted.
     """
-    loaded, folder = prepare(scenario, "tune", out, device, trust=trust)
+    loaded, folder = prepare(scenario, "tune", out, device, trust=common.trust)
     from ptsmc_jax.scenario.tables import objective_name
     from tuning.output import summaries, tune_report
     from tuning.studies import tune_files, tuner
@@ -232,11 +221,11 @@ def tune(
         known_by,
         objective_name(loaded.search),
         work=lambda report, journal: tuner.tune(loaded, seed, report, journal, globally=global_check),
-        write=lambda making, tuning: tune_files.write(making, loaded, tuning, figures, known_by),
+        write=lambda making, tuning: tune_files.write(making, loaded, tuning, common.figures, known_by),
         report=lambda summary: tune_report.of(summaries.tune(summary)),
-        needs=("scipy.stats", *(["ptsmc_jax.figures.study_plots"] if figures else [])),
+        needs=("scipy.stats", *(["ptsmc_jax.figures.study_plots"] if common.figures else [])),
     )
-    return searches.run(search, loaded, folder, force=force, quiet=quiet)
+    return searches.run(search, loaded, folder, force=common.force, quiet=common.quiet)
 
 
 @app.command
@@ -251,10 +240,7 @@ def pareto(
     out: Out = None,
     seed: Seed = 0,
     device: Device = "cpu",
-    trust: Trust = False,
-    force: Force = False,
-    quiet: Quiet = False,
-    figures: Figures = True,
+    common: Common = USUAL,
 ) -> int:
     """Find the front of accuracy against peak torque, or the cost of margins or of a faster slew, on held-out trials.
 
@@ -263,7 +249,7 @@ def pareto(
     Exit status: 0 some gains on the front meet every requirement, 1 none do, 2 configuration error, 130 interrupted.
     """
     listed = listed_against(against, points, times, limits)
-    loaded, folder = prepare(scenario, "pareto", out, device, trust=trust)
+    loaded, folder = prepare(scenario, "pareto", out, device, trust=common.trust)
     from tuning.output import front_report
     from tuning.studies import front, trades
     from tuning.studies import pareto as fronts
@@ -274,10 +260,10 @@ def pareto(
         known_by,
         "window error",
         work=lambda report, journal: fronts.trace(trade, seed, report, journal),
-        write=lambda making, found: fronts.write(making, trade, found, figures, known_by),
+        write=lambda making, found: fronts.write(making, trade, found, common.figures, known_by),
         report=lambda summary: front_report.of(front.read(summary)),
     )
-    return searches.run(search, loaded, folder, force=force, quiet=quiet)
+    return searches.run(search, loaded, folder, force=common.force, quiet=common.quiet)
 
 
 @app.command
@@ -290,10 +276,7 @@ def compare(
     against: Against = None,
     law: Laws = (),
     device: Device = "cpu",
-    trust: Trust = False,
-    force: Force = False,
-    quiet: Quiet = False,
-    figures: Figures = True,
+    common: Common = USUAL,
 ) -> int:
     """Tune the paper's law and other attitude laws to the same requirements, and compare them on held-out trials.
 
@@ -302,7 +285,7 @@ def compare(
     Exit status: 0 the tuned law of the paper meets every requirement, 1 it does not, 2 configuration error, 130
     interrupted.
     """
-    loaded, folder = prepare(scenario, "compare", out, device, trust=trust)
+    loaded, folder = prepare(scenario, "compare", out, device, trust=common.trust)
     from ptsmc_jax.scenario.tables import objective_name
     from tuning.output import compare_report, summaries
     from tuning.studies import compare as comparing
@@ -317,11 +300,11 @@ def compare(
         known_by,
         objective_name(loaded.search),
         work=lambda report, journal: comparing.compare(loaded, seed, report, journal, posed()),
-        write=lambda making, comparison: comparing.write(making, loaded, comparison, figures, known_by),
+        write=lambda making, comparison: comparing.write(making, loaded, comparison, common.figures, known_by),
         report=lambda summary: compare_report.of(summaries.read(summaries.Compare, summary)),
         check=posed,
     )
-    return searches.run(search, loaded, folder, force=force, quiet=quiet)
+    return searches.run(search, loaded, folder, force=common.force, quiet=common.quiet)
 
 
 @app.command

@@ -3,6 +3,7 @@
 import contextlib
 import sys
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -41,6 +42,27 @@ Force = Annotated[bool, Parameter(negative="", help="Write into a folder that is
 Quiet = Annotated[bool, Parameter(negative="", help="Print nothing but errors.")]
 Figures = Annotated[bool, Parameter(negative="--no-figures", help="Draw figures.")]
 
+Trust = Annotated[
+    bool,
+    Parameter(
+        negative="",
+        help="Run the Python files that results name. Read them first: they run with your permissions.",
+    ),
+]
+
+
+@Parameter(name="*")  # its fields are options
+@dataclass(frozen=True)
+class Common:
+    """The options of every command that runs code of the user and writes a result folder."""
+
+    trust: Trust = False
+    force: Force = False
+    quiet: Quiet = False
+    figures: Figures = True
+
+
+USUAL = Common()
 Against = Annotated[
     tuple[str, ...] | None,
     Parameter(
@@ -53,13 +75,6 @@ Laws = Annotated[
     tuple[str, ...], Parameter(negative="", help="FILE.py:NAME of a custom law to compare with too, several times.")
 ]
 Device = Annotated[Literal["cpu", "gpu"], Parameter(help="Hardware that batches run on.")]
-Trust = Annotated[
-    bool,
-    Parameter(
-        negative="",
-        help="Run the Python files that results name. Read them first: they run with your permissions.",
-    ),
-]
 
 FrontAgainst = Annotated[
     Literal["torque", "margins", "t_f"], Parameter(help="Quantity that the accuracy is traded against.")
