@@ -43,26 +43,44 @@ def test_the_last_of_several_writers_removes_the_lock_file(tmp_path):
 
 
 HOLDING = """
-import sys, time
+import time
 from pathlib import Path
 from ptsmc_jax.campaigns import store
-with store.in_use(Path("out")):
-    print("locked", flush=True)
+
+def fill(making):
+    print("writing", flush=True)
     time.sleep(60.0)
+
+folder = Path("a[b]")
+with store.in_use(folder):
+    store.write(folder, fill)
 """
 
 
-def test_the_lock_ends_with_a_killed_process(tmp_path):
+def test_the_lock_of_a_killed_process_ends_and_the_next_one_removes_its_temporary_folder(tmp_path):
     environment = dict(os.environ, PYTHONPATH=str(ROOT))
     call = [sys.executable, "-c", HOLDING]
     with subprocess.Popen(call, cwd=tmp_path, env=environment, text=True, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
-        assert process.stdout.readline() == "locked\n"
-        assert refused(tmp_path / "out")
+        assert process.stdout.readline() == "writing\n"
+        assert refused(tmp_path / "a[b]")
         process.send_signal(signal.SIGKILL)
         process.wait()
-    assert not refused(tmp_path / "out")
+    assert len(list(tmp_path.iterdir())) == 2  # the temporary folder and the lock file
+    assert not refused(tmp_path / "a[b]")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_temporary_folder_stays_while_another_process_shares_the_lock(tmp_path):
+    folder = tmp_path / "out"
+
+    def fill(making):
+        assert not refused(folder, shared=True)
+        (making / "a").write_text("kept")
+
+    with store.in_use(folder, shared=True):
+        store.write(folder, fill)
+    assert tree(folder) == {"a": b"kept"}
 
 
 def test_a_file_system_without_locks_is_written_to(tmp_path, monkeypatch):

@@ -3,8 +3,6 @@ import json
 import math
 import os
 import re
-import signal
-import subprocess
 import sys
 import tomllib
 
@@ -219,25 +217,6 @@ def test_interrupted_write_changes_nothing(tmp_path, stop):
             store.write(tmp_path / name, stopped)
     assert tree(tmp_path) == {"old/summary.json": b"before"}
     assert [p.name for p in tmp_path.iterdir()] == ["old"]
-
-
-KILLED = """
-import os, pathlib, signal, sys
-from ptsmc_jax.campaigns import store
-store.write(pathlib.Path(sys.argv[1]), lambda making: os.kill(os.getpid(), signal.SIGKILL))
-"""
-
-
-def test_temporary_folder_of_a_killed_process_is_removed_when_nobody_writes(tmp_path):
-    """While others write, it may be theirs."""
-    folder = tmp_path / "a[b]"
-    assert subprocess.run([sys.executable, "-c", KILLED, folder], check=False).returncode == -signal.SIGKILL
-    (left,) = tmp_path.iterdir()
-    with store.in_use(folder, shared=True):
-        with store.in_use(folder, shared=True):
-            pass
-        assert left.exists()
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_check_reports_the_folder_and_the_allowed_values(tmp_path):
