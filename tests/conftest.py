@@ -46,14 +46,14 @@ MANY = 25_000  # memory mappings of a worker, about 3 GB; Linux allows 65 530
 
 # files with the longest tests, which workers run first, so that no worker runs them alone at the end
 LONGEST = """
-    cli/test_cli studies/test_compare studies/test_pareto campaigns/test_margin_requirements search/test_tuning
+    cli/test_cli studies/test_pareto campaigns/test_margin_requirements search/test_tuning
     search/test_worst theory/test_margins plants/test_systems devices/test_hardware simulation/test_rollout
     cli/test_campaign_commands dispersions/test_hardware_errors test_conformity onboard/test_library batching/test_lanes
     campaigns/test_montecarlo campaigns/test_run_tables studies/test_mapping theory/test_spillover
     theory/test_covariance
     laws/test_family batching/test_kernel campaigns/test_campaign_processes search/test_gains laws/test_chain
     studies/test_tuner observers/test_observers_others campaigns/test_campaign paper/test_paper
-    studies/test_stability theory/test_theory dispersions/test_dispersions
+    studies/test_stability studies/test_compare theory/test_theory dispersions/test_dispersions
 """.split()
 assert all((ROOT / "tests" / f"{name}.py").exists() for name in LONGEST)
 

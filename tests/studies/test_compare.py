@@ -20,7 +20,7 @@ from ptsmc_jax.scenario.law_tables import BASELINES
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.metrics import Metrics
 from ptsmc_jax.simulation.requirements import Requirement
-from tests.helpers import FIRST_FLIGHT, ROOT, SHORT, short, small_search
+from tests.helpers import FIRST_FLIGHT, ROOT, SHORT
 from tests.output import examples
 from tests.output.pages import checked
 from tuning.cli import options
@@ -28,7 +28,7 @@ from tuning.errors import UsageError
 from tuning.output import compare_report, page, summaries
 from tuning.output.formats import ratio
 from tuning.search import custom_parts, gains
-from tuning.studies import compare, judging, stability, tuner
+from tuning.studies import compare, judging, tuner
 
 TABLES = tomllib.loads(SHORT)
 
@@ -146,47 +146,6 @@ def test_baseline_law_of_the_scenario_keeps_the_bounds_of_the_scenario():
 def test_comparison_refuses_the_continuous_loop_and_other_plants(tables, said):
     with pytest.raises(ScenarioError, match=said):
         compare.check(scenario.from_tables(tables))
-
-
-@pytest.mark.parametrize("others", short([[], ["pd"]], [[]]))
-def test_compare_command_writes_its_results(command, tmp_path, monkeypatch, others):
-    small_search(monkeypatch)
-    monkeypatch.setattr(compare, "laws", lambda: [compare.OURS, *others])  # every further law compiles more programs
-    untold = compare.UNTOLD if others else ("heavier", "lighter")  # "later" compiles another program too
-    perturbed = compare.perturbed
-    monkeypatch.setattr(compare, "perturbed", lambda flown: {name: perturbed(flown)[name] for name in untold})
-    code, said, _ = command("compare", "s.toml")
-    folder = tmp_path / "out/compare-s"
-    found = json.loads((folder / "summary.json").read_text())
-    laws = ["paper", "prescribed_time", *others]
-    assert list(found["laws"]) == laws
-    assert found["judged_on"] == "flight clock"  # without the sign function of one law
-    assert code == (0 if found["laws"]["prescribed_time"]["met"] else 1)
-    for said_of in found["laws"].values():  # another inertia changes the error slightly
-        assert tuple(said_of["untold"]) == untold
-        for other in said_of["untold"].values():
-            assert other["window_error"] != said_of["window_error"]
-    assert {path.name for path in (folder / "figures").iterdir()} == {"settling.png", "tradeoff.png"}
-    rows = list(csv.DictReader((folder / "compare.csv").read_text().splitlines()))
-    assert [row["law"] for row in rows] == laws
-    for row, law in zip(rows, laws, strict=True):
-        assert float(row["window_error"]) == found["laws"][law]["window_error"]
-        assert law.split("_")[0] in said
-        again = scenario.read(folder / "scenarios" / f"{law}.toml")  # the judged scenario
-        flown, _ = judging.window_error(judging.judge(again, found["seed"]))  # simulated again on the same trials
-        assert flown == pytest.approx(found["laws"][law]["window_error"], rel=1e-9)
-        assert found["laws"][law]["margins"] == stability.worst(scenario.study(again))
-        assert found["laws"][law]["gains"].keys() >= {"pd": {"k_p", "k_d"}}.get(law, {"eta", "delta"})
-        for name, value in found["laws"][law]["gains"].items():
-            if name != "observer_gain":
-                assert getattr(again.controller, name) == pytest.approx(value, rel=1e-9)
-    read = checked(folder)
-    assert read.text.startswith("ptsmc compare: compare-s")
-    error = found["laws"][laws[-1]]["window_error"]
-    assert ratio(np.degrees(2 * np.arcsin(error)) * 3600) in read.text
-    code, again, _ = command("compare", "s.toml")
-    assert "from an earlier run" in again
-    assert command("compare", "s.toml", "--seed", "x")[0] == 2
 
 
 @pytest.mark.parametrize(("least", "said"), [(2e-6, "2 times as much"), (0.0, "1.65 arcsec")])
