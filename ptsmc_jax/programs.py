@@ -52,6 +52,17 @@ GLOBAL_SETTINGS = ["random_seed_offset", "use_shardy_partitioner"]  # the same i
 _CHECKS = [export.DisabledSafetyCheck.custom_call("__gpu$xla.gpu.triton")]
 BACKGROUND = "compiling"  # name of the threads that compile what was prepared
 _logger = logging.getLogger(__name__)
+_compiled: dict[str, bool] = {}  # whether each titled program that this process has begun or prepared is compiled
+_awaited: dict[str, None] = {}  # titles of the programs that callers wait for, in the order of their calls
+
+
+def compiling() -> str:
+    """Return "compiling TITLE, k of n" if a caller waits for a titled program to be compiled, and "" otherwise.
+
+    n is the number of titled programs that this process has begun or prepared so far.
+    """
+    title = next(iter(tuple(_awaited)), "")
+    return title and f"compiling {title}, {min(sum(_compiled.values()) + 1, len(_compiled))} of {len(_compiled)}"
 
 
 class NotStorableError(Exception):
@@ -72,10 +83,11 @@ class Program:
         options: dict[str, Any] | None = None,
         *,
         batch: bool = False,
+        title: str = "",
     ):
         functools.update_wrapper(self, function)
         self._function, self._static, self._signature = function, static, inspect.signature(function)
-        self._batch = batch
+        self._batch, self._title = batch, title
         self._jitted = jax.jit(function, static_argnames=static, compiler_options=options)
         self._stored = jax.jit(self._restored(), static_argnames=static, compiler_options=options)
         self._prepared: list[Future] = []
@@ -101,6 +113,8 @@ class Program:
         thread = threading.current_thread()
         # a background thread must not wait for prepared programs: it would occupy the thread that compiles them
         if not thread.name.startswith(BACKGROUND):
+            if not all(future.done() for future in self._prepared):
+                self._begin(awaited=True)
             for future in self._prepared:
                 with contextlib.suppress(CancelledError):  # by `stop`
                     future.exception()  # an error comes again from the call itself
@@ -110,14 +124,32 @@ class Program:
 
     def _call_stored(self, *args: Any, **kwargs: Any) -> Any:
         args, kwargs = _uncommitted(args, kwargs)
-        return self._stored(*args, **kwargs)
+        try:
+            return self._stored(*args, **kwargs)
+        finally:
+            self._end()
+
+    def _begin(self, *, awaited: bool) -> None:
+        """Report the compilation of this program in `compiling`; awaited: a caller waits for it."""
+        if self._title:
+            _compiled.setdefault(self._title, False)
+        if self._title and awaited:
+            _awaited[self._title] = None
+
+    def _end(self) -> None:
+        """Report that this program is compiled, unless it has not been traced at all."""
+        if self._title in _compiled:
+            _compiled[self._title] = True
+            _awaited.pop(self._title, None)
 
     def _prepare(self, *args: Any, **kwargs: Any) -> None:
         args, kwargs = _uncommitted(args, kwargs)
 
         def compiled() -> None:
             self._stored.lower(*args, **kwargs).compile()
+            _compiled.update({self._title: True} if self._title else {})
 
+        self._begin(awaited=False)
         self._prepared.append(_background().submit(_with_settings(compiled)))
 
     def _restored(self) -> Callable:
@@ -125,6 +157,7 @@ class Program:
 
         @functools.wraps(self._function)
         def restored(*args: Any, **kwargs: Any) -> Any:
+            self._begin(awaited=not threading.current_thread().name.startswith(BACKGROUND))
             try:
                 path = self.path(*args, **kwargs)
                 content = _read(path)
@@ -199,6 +232,7 @@ def jit(
     static_argnames: str | tuple[str, ...] = (),
     compiler_options: dict | None = None,
     batch: bool = False,
+    title: str = "",
 ) -> Any:
     """Return the `Program` of a function, or a decorator that does.
 
@@ -207,12 +241,13 @@ def jit(
         static_argnames: names of the arguments that are constants of the program.
         compiler_options: as of `jax.jit`.
         batch: run on JAX's default device instead of the CPU.
+        title: plural noun for progress reports; programs without a title are not reported, see `compiling`.
     """
     if function is None:
         options = {"static_argnames": static_argnames, "compiler_options": compiler_options, "batch": batch}
-        return functools.partial(jit, **options)
+        return functools.partial(jit, **options, title=title)
     static = (static_argnames,) if isinstance(static_argnames, str) else static_argnames
-    return Program(function, static, compiler_options, batch=batch)
+    return Program(function, static, compiler_options, batch=batch, title=title)
 
 
 def call_on_cpu(function: Callable, /, *args: Any, **kwargs: Any) -> Any:

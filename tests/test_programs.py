@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -130,6 +131,36 @@ def test_a_prepared_program_is_read_and_compiled_once(folder):
     other.prepare(X)
     np.testing.assert_allclose(other(X)["both"], np.sin(3 * X) + 5.0, rtol=1e-15)
     assert (len(traced), len(traced_other)) == (0, 1)
+
+
+def test_a_program_is_named_while_a_caller_waits_for_its_compilation(folder, monkeypatch):
+    """A prepared program counts from its preparation on, but is named only if a caller waits for it."""
+    monkeypatch.setattr(programs, "_compiled", {})
+    monkeypatch.setattr(programs, "_awaited", {})
+    held, seen = threading.Event(), []
+
+    def slow(x):
+        held.wait(20.0)
+        return 2.0 * x
+
+    def quick(x):
+        seen.append(programs.compiling())
+        return 3.0 * x
+
+    first = programs.jit(ours(slow, "slow"), title="slow numbers")
+    second = programs.jit(ours(quick, "quick"), title="quick numbers")
+    first.prepare(X)
+    assert programs.compiling() == ""
+    second(X)
+    assert seen[0] == "compiling quick numbers, 1 of 2"
+    with ThreadPoolExecutor(1) as pool:
+        waiting = pool.submit(first, X)
+        while not programs.compiling():
+            time.sleep(0.001)
+        assert programs.compiling() == "compiling slow numbers, 2 of 2"
+        held.set()
+        np.testing.assert_array_equal(waiting.result(), 2.0 * X)
+    assert programs.compiling() == ""
 
 
 def test_a_prepared_program_can_call_another_prepared_program(folder, monkeypatch):

@@ -182,7 +182,7 @@ def _over(name: str, values: Any) -> Any:
     return values.min(axis=-1) if MARGINS[name].at_least else values.max(axis=-1)
 
 
-@programs.jit(static_argnames=("devices", "late"))
+@programs.jit(static_argnames=("devices", "late"), title="the margins of many trials")
 def _look(
     parts: Parts, dispersion: Dispersion, seed: Array, trials: Array | Row, devices: int, late: bool
 ) -> tuple[linear.Loop, dict[str, Array]]:

@@ -155,9 +155,9 @@ class _SimulateProgram(programs.Program):
 
 
 # one compiled program for all parts of the same structure
-simulate_parts = _SimulateProgram(simulate, ("record", "software"))
+simulate_parts = _SimulateProgram(simulate, ("record", "software"), title="the simulation")
 # for a single run: compiles in half to a tenth of the time, and runs 3 to 8 times as long
-simulate_once = _SimulateProgram(simulate, ("record", "software"), programs.QUICKLY)
+simulate_once = _SimulateProgram(simulate, ("record", "software"), programs.QUICKLY, title="the simulation")
 LONG = 20_000  # periods of a run from which fast compilation no longer pays
 
 

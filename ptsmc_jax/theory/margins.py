@@ -66,7 +66,7 @@ class Margins(NamedTuple):
 FIELDS = Margins._fields[:5]  # fields of `Margins` that are margins
 
 
-@programs.jit(static_argnames=("sensors", "with_delay"))
+@programs.jit(static_argnames=("sensors", "with_delay"), title="the exact margins")
 def of_each(loops: Loop, sensors: bool = False, with_delay: bool = True) -> Margins:
     """Return the margins of several loops; the first axis is the loop.
 

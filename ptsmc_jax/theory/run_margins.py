@@ -142,7 +142,7 @@ def judged(parts: Parts) -> tuple[Margins, Array, History]:
     return margins.of_each(loops), hold, history(parts, run)
 
 
-judged_jit = programs.jit(judged, compiler_options=programs.QUICKLY)
+judged_jit = programs.jit(judged, compiler_options=programs.QUICKLY, title="the margins of the nominal run")
 
 
 def along(parts: Parts, times: int = 24) -> Course:

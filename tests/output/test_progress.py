@@ -7,6 +7,7 @@ import time
 
 import pytest
 
+from ptsmc_jax import programs
 from ptsmc_jax.campaigns import campaign
 from tuning.output import progress, terminal
 from tuning.output.progress import Lines
@@ -90,3 +91,12 @@ def test_terminal_prints_text_as_it_is(capsys):
     assert "out/tune:x:/[bold]" in out
     assert "a:key:" in out
     assert "b:x:[bold]" in out
+
+
+def test_a_compilation_that_a_step_waits_for_is_named(capsys, monkeypatch):
+    monkeypatch.setattr(progress, "EVERY", 0.02)
+    monkeypatch.setattr(programs, "compiling", lambda: "compiling the gradients, 2 of 3")
+    with progress.Progress(quiet=False) as tell:
+        tell("searching", 1, 7)
+        time.sleep(0.2)
+    assert set(capsys.readouterr().err.splitlines()) == {"ptsmc: compiling the gradients, 2 of 3, 0 s"}

@@ -16,6 +16,8 @@ def command() -> None:
     gc.set_threshold(1_000_000)
     atexit.register(gc.freeze)
     os.environ["MPLBACKEND"] = "agg"  # figures are files
+    # the compiler prints no messages ("Very slow compile?") except for fatal errors; jaxlib reads this when imported
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     signal.signal(signal.SIGINT, _interrupt)
     try:
         from tuning.cli.main import main

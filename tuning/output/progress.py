@@ -47,10 +47,22 @@ class Lines:
         """Report the current step, and the number of steps done and in all."""
         self._doing = (what, done, total)
 
+    def __rich__(self) -> str:
+        """Return the current step, or the program that it waits for, for a column of `rich`."""
+        return _compiling() or self._doing[0]
+
     def _watch(self) -> None:
         while not self._ended.wait(EVERY):
+            compiling, seconds = _compiling(), time.monotonic() - self._begun
+            text = line(compiling, 0, 0, seconds) if compiling else line(*self._doing, seconds)
             with contextlib.suppress(OSError):  # a closed pipe or a full disk is no reason to stop
-                print(line(*self._doing, time.monotonic() - self._begun), file=sys.stderr, flush=True)
+                print(text, file=sys.stderr, flush=True)
+
+
+def _compiling() -> str:
+    """Return which program is being compiled, see `programs.compiling`, without importing JAX."""
+    programs = sys.modules.get("ptsmc_jax.programs")
+    return "" if programs is None else programs.compiling()
 
 
 class Bar:
@@ -68,7 +80,7 @@ class Bar:
         console = Console(stderr=True)
         self._lines = Lines(silent=quiet or console.is_terminal)
         self._bar = progress.Progress(
-            progress.TextColumn("{task.description}"),
+            progress.RenderableColumn(self._lines),
             progress.BarColumn(20),
             *([progress.MofNCompleteColumn()] if counted else []),
             progress.TimeElapsedColumn(),
@@ -103,7 +115,7 @@ class Progress(Bar):
             self._bar.reset(self._task, total=total or None)
         limits = "limits met" if over == 0.0 else f"{ratio(100.0 * over)} % beyond a limit"
         best = f": {self._objective} {value:.4g}, {limits}" if value == value else ""
-        self._bar.update(self._task, completed=done, total=total or None, description=what + best)
+        self._bar.update(self._task, completed=done, total=total or None)
         self._lines(what + best, done, total)
 
 
@@ -127,5 +139,5 @@ class CampaignProgress(Bar):
         elif tally.done < tally.total:
             text += ", compiling"
         text += f", {tally.failed} failed or not converged" if tally.failed else ""
-        self._bar.update(self._task, completed=tally.done, total=tally.total, description=text)
+        self._bar.update(self._task, completed=tally.done, total=tally.total)
         self._lines(text, 0, 0)

@@ -156,7 +156,12 @@ class _Rows:
         return jax.tree.map(joined, *calls)
 
 
-@programs.jit(static_argnames=("names", "pointing", "devices"), compiler_options=programs.BATCHED, batch=True)
+@programs.jit(
+    static_argnames=("names", "pointing", "devices"),
+    compiler_options=programs.BATCHED,
+    batch=True,
+    title="the simulations of the search",
+)
 def _fly(
     parts: Parts,
     dispersion: Dispersion,
@@ -189,7 +194,12 @@ def _fly(
     return montecarlo.row_by_row(flown, result, ROW, rows, needed, devices)
 
 
-@programs.jit(static_argnames=("names", "metrics", "devices"), compiler_options=programs.BATCHED, batch=True)
+@programs.jit(
+    static_argnames=("names", "metrics", "devices"),
+    compiler_options=programs.BATCHED,
+    batch=True,
+    title="the gradients of the simulations",
+)
 def _sloped(
     parts: Parts,
     dispersion: Dispersion,

@@ -207,7 +207,7 @@ def of_points(asked: Asked, scale: Scale, share: Float[np.ndarray, "points gains
     return jax.tree.map(lambda *v: np.concatenate(v)[: len(share)], *each)
 
 
-@programs.jit
+@programs.jit(title="the gradients of the margins")
 def sloped(asked: Asked, scale: Scale, share: Array) -> dict[str, Array]:
     """Return the result of `of_points` for as many points as there are devices, with one point on each device.
 
