@@ -46,36 +46,36 @@ def changed(module: object, **values: object) -> Iterator[None]:
 
 def variants() -> dict[str, Callable]:
     """Return a context for each variant of the search, by name."""
-    from tuning.search import descents, evolution, hand_overs, optimise, starts
+    from tuning.search import evolution, hand_overs, local_searches, optimise, starts
 
-    everything = descents.Descents
+    everything = local_searches.LocalSearches
 
     class AllTheWay(everything):
         """A search without successive halving: every local search has half of the steps."""
 
-        def _race(self, problem, starts, rungs, what, **others):
-            rungs = ((len(starts), max(2, self._steps // 2)),) if what == descents.SEARCHING else rungs
-            return super()._race(problem, starts, rungs, what, **others)
+        def _successive_halving(self, problem, starts, stages, what, **others):
+            stages = ((len(starts), max(2, self._steps // 2)),) if what == local_searches.SEARCHING else stages
+            return super()._successive_halving(problem, starts, stages, what, **others)
 
     class Evolved(everything):
         """Differential evolution after the local searches."""
 
-        def descend(self, problem, starts):
-            super().descend(problem, starts)
-            self.evolve(problem, self.share, evolution.NEARBY)
+        def search_locally(self, problem, starts):
+            super().search_locally(problem, starts)
+            self.evolve(problem, self.normalised, evolution.NEARBY)
 
     def searching(kind: type) -> Callable:
-        return lambda: changed(optimise, Descents=kind)
+        return lambda: changed(optimise, LocalSearches=kind)
 
     return {
-        "as it is": lambda: changed(descents),
-        "all trials from the start": lambda: changed(descents, AVERAGED=10**6),
+        "as it is": lambda: changed(local_searches),
+        "all trials from the start": lambda: changed(local_searches, AVERAGED=10**6),
         "without a race": searching(AllTheWay),
         "starts drawn, not chosen": lambda: changed(starts, promising=lambda _, __, share, count, ___: share[:count]),
         "chosen by merit alone": lambda: changed(starts, APART=(0.0,)),
         "nothing held in the sweep": lambda: changed(starts, held_by_limits=lambda _: []),
-        "careful steps only": lambda: changed(descents, BOLD=descents.CAREFUL),
-        "bold steps only": lambda: changed(descents, CAREFUL=descents.BOLD),
+        "careful steps only": lambda: changed(local_searches, BOLD=local_searches.CAREFUL),
+        "bold steps only": lambda: changed(local_searches, CAREFUL=local_searches.BOLD),
         "off samples": lambda: changed(hand_overs, on_samples=lambda *_: []),
         "evolution added": searching(Evolved),
     }
@@ -111,7 +111,7 @@ def main() -> None:
                     continue
                 started, before = time.monotonic(), (evaluate.rollouts, evaluate.gradients)
                 with inside():
-                    settings = optimise.Settings(table.starts, table.steps, seed, posed.sloped, judged=False)
+                    settings = optimise.Settings(table.starts, table.steps, seed, posed.with_gradients, judged=False)
                     found = optimise.search(
                         evaluate, posed.problem, posed.ready.requirements, posed.scenario_gains, settings
                     )

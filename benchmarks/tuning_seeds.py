@@ -15,7 +15,7 @@ import numpy as np
 from ptsmc_jax.configure import configure
 
 
-def fresh_trials(loaded, names, values) -> str:
+def held_out_trials(loaded, names, values) -> str:
     """Return RMS on held-out trials of three seeds, its ratio to the lower bound, and the largest peak torque."""
     from tuning.search import gains
     from tuning.studies import judging
@@ -65,7 +65,9 @@ def main() -> None:
     )
     for seed in range(first, end):
         started, before = time.monotonic(), (evaluate.rollouts, evaluate.gradients)
-        settings = optimise.Settings(table.starts, table.steps, seed, posed.sloped, table.worst_case, judged=False)
+        settings = optimise.Settings(
+            table.starts, table.steps, seed, posed.with_gradients, table.worst_case, judged=False
+        )
         one = optimise.search(evaluate, problem, ready.requirements, scenario_gains, settings)
         took = time.monotonic() - started
         flown, slopes = evaluate.rollouts - before[0], evaluate.gradients - before[1]
@@ -74,12 +76,12 @@ def main() -> None:
         print(f"seed {seed:2}: goal {one.value:.5e}, largest metric/limit {one.worst.max(initial=0.0):.5f}, "
               f"{one.rounds} rounds, {flown} rollouts, {slopes} gradients, {took:.0f} s, gains {gained}",
               flush=True)  # fmt: skip
-        print(f"         fresh: {fresh_trials(loaded, problem.names, one.gains)}", flush=True)
+        print(f"         fresh: {held_out_trials(loaded, problem.names, one.gains)}", flush=True)
     best = min(found, key=lambda one: one.value if one.worst.max(initial=0.0) <= 1.0 else np.inf)
     started = time.monotonic()
     if len(sys.argv) > 3:
         return
-    check = global_check.check(evaluate, best, 1, sloped=posed.sloped)
+    check = global_check.check(evaluate, best, 1, with_gradients=posed.with_gradients)
     print(f"differential evolution: goal {check.value:.5e}, {check.rollouts} rollouts, "
           f"{time.monotonic() - started:.0f} s, gains {check.gains}")  # fmt: skip
     references = {"differential evolution's": check.value, "the better of both": min(check.value, best.value)}
@@ -88,7 +90,7 @@ def main() -> None:
         print(f"within 1 % of {name}: {sum(near)} of {len(near)}; "
               f"largest distance {100 * (max(one.value for one in found) / reference - 1):+.2f} %")  # fmt: skip
     fresh = judging.seed_of_judge(0)
-    paper = judging.judge(gains.papers(loaded), fresh)
+    paper = judging.judge(gains.published_scenario(loaded), fresh)
     named = dict(zip(problem.names, best.gains.tolist(), strict=True))
     tuned = judging.judge(gains.in_scenario(loaded, named), fresh)
     rms = [float(np.sqrt(np.mean(one.metrics.window_error[one.finished] ** 2))) for one in (paper, tuned)]

@@ -306,17 +306,17 @@ def refused(command, tmp_path, *args):
 
 def small_search(monkeypatch, fresh=40):
     """Make searches small: a few points, few trials, and `fresh` held-out trials."""
-    from tuning.search import confirm, descents, evolution, flights, starts, worst
+    from tuning.search import confirm, evolution, local_searches, simulations, starts, worst
 
     for module, name, value in (
-        (flights, "ROW", 10),
+        (simulations, "ROW", 10),
         (worst, "SCREENED", 48),
         (worst, "STEPS", 5),
         (confirm, "FRESH", fresh),
         (confirm, "FEWEST", 64),
         (starts, "SWEPT", 16),
         (starts, "WIDELY", 64),
-        (descents, "MANY", 16),
+        (local_searches, "MANY", 16),
         (evolution, "GENERATIONS", 3),
     ):
         monkeypatch.setattr(module, name, value)

@@ -97,7 +97,7 @@ def differ(dispersion: Dispersion) -> bool:
 
 
 def nearness(value: Any, limit: Any, name: str) -> Any:
-    """Return the violation ratio, as `requirements.over`, but with negative values: all margins have an order."""
+    """Return the violation ratio of a margin. It may be negative, so that any two margins can be compared."""
     return 2.0 - value / limit if MARGINS[name].at_least else value / limit
 
 

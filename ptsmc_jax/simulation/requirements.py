@@ -49,7 +49,7 @@ def fewest_trials(quantile: float, confidence: float) -> int:
     return math.ceil(math.log(1.0 - confidence) / math.log(quantile) - 1e-9)
 
 
-def over(values: Any, limit: Any, *, at_least: bool) -> Any:
+def violation_ratio(values: Any, limit: Any, *, at_least: bool) -> Any:
     """Return values over a limit, as arrays of NumPy or JAX. The ratio is 1 at the limit and larger beyond it.
 
     If values must be at least the limit, the ratio is 2 - value / limit, and 0 for an infinite value. For a limit of
@@ -77,7 +77,7 @@ class Verdict:
     limit: float
     unit: str
     worst: float  # largest value, NaN if a trial failed
-    margin: float  # deciding value over the limit, see `over`: met up to 1; NaN or infinite: not met
+    margin: float  # deciding value over the limit, see `violation_ratio`: met up to 1; NaN or infinite: not met
     failures: int  # trials beyond the limit or without a value
     trials: int
     quantile: float | None = None  # fraction of trials that must keep the limit; None: all of them
@@ -207,7 +207,9 @@ class Requirement:
         least = must_keep(values.size, quantile, confidence)
         ordered = np.sort(np.where(ok & ~np.isnan(values), values, np.inf))
         deciding = float(ordered[least - 1]) if least is not None else np.nan
-        margin = over(np.asarray(worst if least == values.size else deciding), self.limit, at_least=self.at_least)
+        margin = violation_ratio(
+            np.asarray(worst if least == values.size else deciding), self.limit, at_least=self.at_least
+        )
         return Verdict(
             self.metric, self.limit, self.stated_unit, worst, float(margin), int(np.sum(~keeps)), int(values.size),
             quantile, confidence, self.at_least,

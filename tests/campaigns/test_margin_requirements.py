@@ -17,7 +17,7 @@ import ptsmc_jax as ptsmc
 from ptsmc_jax import explore, scenario
 from ptsmc_jax.campaigns import margin_verdicts, runs, store
 from ptsmc_jax.simulation import catalogues, rollout
-from ptsmc_jax.simulation.requirements import Requirement, Verdict, over
+from ptsmc_jax.simulation.requirements import Requirement, Verdict, violation_ratio
 from ptsmc_jax.theory import margins, run_margins
 from tests.helpers import FIRST_FLIGHT, ROOT, SHORT_CHAIN, assert_prepared, equations, short, untuned
 from tuning.search import margin_rows
@@ -211,7 +211,7 @@ def test_margin_constraints_agree_with_verdicts_and_finite_differences(drawn):
     asked, bounds, share = (
         posed.problem.margins,
         posed.evaluate.bounds,
-        posed.evaluate.bounds.share(posed.scenario_gains),
+        posed.evaluate.bounds.normalise(posed.scenario_gains),
     )
     assert asked is not None
     found = sloped(asked, bounds, share)
@@ -223,7 +223,7 @@ def test_margin_constraints_agree_with_verdicts_and_finite_differences(drawn):
     c = margin_rows.of_points(asked, bounds.scale, np.stack(points[:3]))["c"]  # one point more than devices
     c = [*c, sloped(asked, bounds, points[3])["c"]]
     numeric = (c[0] - 8 * c[1] + 8 * c[2] - c[3]) / (12 * step)
-    slopes = np.asarray(found["c_slope"])
+    slopes = np.asarray(found["c_gradient"])
     assert np.all(np.abs(slopes).reshape(-1, share.size).max(axis=0) > 0.0)  # every gain has an effect
     exact = slopes @ along
     np.testing.assert_allclose(exact, numeric, rtol=1e-6, atol=1e-8 * np.abs(exact).max())
@@ -249,7 +249,7 @@ def products_for_each_case(of, posed):
 @pytest.fixture
 def of_two_trials(monkeypatch):
     """The tuning problem of the spacecraft. The tests trace it without compiling."""
-    monkeypatch.setattr(margin_rows.sloped, "prepare", lambda *_: None)
+    monkeypatch.setattr(margin_rows.rows_with_derivatives, "prepare", lambda *_: None)
     monkeypatch.setattr(margin_rows, "hardest", lambda asked, _: (margin_rows._of_trials(asked, np.arange(2)), 0.0))
     return posed_of("spacecraft")
 
@@ -272,7 +272,7 @@ def test_margin_gradients_with_dispersed_inertia_compile_if_delta_is_free():
     code = (
         "from ptsmc_jax.configure import configure; configure(1)\n"
         "import numpy as np; from ptsmc_jax import scenario\n"
-        "from tuning.search import margin_rows; from tuning.search.shares import of_scenario\n"
+        "from tuning.search import margin_rows; from tuning.search.normalisation import of_scenario\n"
         f"known = scenario.replace(scenario.read({str(FIRST_FLIGHT)!r}), **{changes!r})\n"
         "margin_rows.hardest = lambda asked, _: (margin_rows._of_trials(asked, np.arange(2)), 0.0)\n"
         "ready = scenario.study(known); bounds = of_scenario(known, ready.parts)\n"
@@ -286,7 +286,7 @@ def test_margin_gradients_with_dispersed_inertia_compile_if_delta_is_free():
 def test_evaluator_appends_margins_of_the_hardest_trials(drawn, monkeypatch):
     posed = drawn
     assert posed.problem.rows == ("peak_torque", "gain_margin", "peak_sensitivity")
-    share = posed.evaluate.bounds.share(posed.scenario_gains)[None]
+    share = posed.evaluate.bounds.normalise(posed.scenario_gains)[None]
     flown = {"gains": share, "f": np.zeros(1), "c": np.array([[[-0.3, -0.2, -0.4]]]), "value": np.zeros(1)}
     monkeypatch.setattr(posed.evaluate, "_fly", lambda *_: dict(flown))
     c = posed.evaluate.fly(posed.problem, share).c[0]
@@ -306,17 +306,17 @@ def test_evaluator_appends_margins_of_the_hardest_trials(drawn, monkeypatch):
     each = worst_of(all_of(parts, asked.dispersion, 3))
     harder, near = margin_rows.hardest(asked, other)
     bounds = posed.evaluate.bounds
-    row = sloped(harder, bounds, bounds.share(other))["c"]
+    row = sloped(harder, bounds, bounds.normalise(other))["c"]
     np.testing.assert_allclose(row.max() + 1.0, near, rtol=1e-9)
     limits = posed.ready.margins
-    shares = [over(each[r.metric], r.limit, at_least=r.at_least) for r in limits]
+    shares = [violation_ratio(each[r.metric], r.limit, at_least=r.at_least) for r in limits]
     np.testing.assert_allclose(near, np.max(shares), rtol=1e-12)
 
 
 def test_prepared_margin_program_is_the_program_of_the_search(drawn, monkeypatch):
     """A program with other shapes or types would be compiled in vain."""
     posed, prepared = drawn, []
-    monkeypatch.setattr(margin_rows.sloped, "prepare", lambda *given: prepared.append(given))
+    monkeypatch.setattr(margin_rows.rows_with_derivatives, "prepare", lambda *given: prepared.append(given))
     monkeypatch.setattr(margin_rows, "hardest", lambda asked, _: (asked, 0.0))
     bounds = posed.evaluate.bounds
     margin_rows.ask(posed.ready, bounds, 3)
@@ -324,7 +324,7 @@ def test_prepared_margin_program_is_the_program_of_the_search(drawn, monkeypatch
     asked = (
         posed.problem.margins,
         bounds.scale,
-        np.stack([bounds.share(posed.scenario_gains)] * len(jax.local_devices())),
+        np.stack([bounds.normalise(posed.scenario_gains)] * len(jax.local_devices())),
     )
     assert known == [(jax.tree.structure(asked), [jax.typeof(leaf) for leaf in jax.tree.leaves(asked)])]
 

@@ -306,13 +306,13 @@ def stop_at(monkeypatch, call):
     from tuning.search.journal import Journal
 
     calls, computed = [], []
-    slopes, get = Evaluator.slopes, Journal.get
+    measure, get = Evaluator.measure_with_gradients, Journal.get
 
     def interrupted(self, problem, z):
         calls.append(1)
         if len(calls) == call:
             raise KeyboardInterrupt
-        return slopes(self, problem, z)
+        return measure(self, problem, z)
 
     def counted(self, question, compute):
         def one():
@@ -321,7 +321,7 @@ def stop_at(monkeypatch, call):
 
         return get(self, question, one)
 
-    monkeypatch.setattr(Evaluator, "slopes", interrupted)
+    monkeypatch.setattr(Evaluator, "measure_with_gradients", interrupted)
     monkeypatch.setattr(Journal, "get", counted)
     return computed
 

@@ -27,7 +27,7 @@ def tune(search: dict[str, Any] | None = None, trust: dict[str, Any] | None = No
     summary = {
         "status": "met", "plant": "spacecraft", "gain_units": {}, "gains": {}, "at_bound": {},
         "accuracy_gain_over_paper": None, "accuracy_gain_interval": None, "training": group(), "fresh": group(),
-        "paper_refused": None, "paper_is": "published", "shortest_t_f": None, "broken_by": {}, "verdicts": [],
+        "paper_refused": None, "published_label": "published", "shortest_t_f": None, "broken_by": {}, "verdicts": [],
         "judged_on": "flight clock", "cautions": [], "differential_evolution": None,
     }  # fmt: skip
     trusted = None if trust is None else {**known, **trust}
@@ -53,7 +53,8 @@ def law(**changes: Any) -> dict[str, Any]:
 
 def compare(laws: dict[str, Any], **changes: Any) -> summaries.Compare:
     """Return the summary of a comparison."""
-    summary = {"status": "met", "trials": 8, "paper_refused": None, "paper_is": None, "judged_on": "flight clock",
+    summary = {"status": "met", "trials": 8, "paper_refused": None, "published_label": None,
+               "judged_on": "flight clock",
                "settling_angle": 1e-3, "cautions": []}  # fmt: skip
     return summaries.read(summaries.Compare, {**summary, "laws": laws, **changes})
 

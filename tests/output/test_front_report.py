@@ -18,7 +18,7 @@ def front(*points, **changes):
             "against": "torque", "plant": "spacecraft", "points": list(points), "idle": [], "without": [],
             "trials": 1000, "seed": 1, "interval_confidence": 0.95, "floor": None, "rollouts": 1, "gradients": 1,
             "requirements": [], "gain_units": {"eta": "-", "observer_gain": "kg m^2/s"}, "cautions": [],
-            "paper_is": "published", **changes,
+            "published_label": "published", **changes,
         }
     )  # fmt: skip
     return read(plain(made.summary()))
@@ -80,7 +80,7 @@ def test_points_without_a_completed_trial_have_no_numbers():
 def test_gains_of_each_axis_next_to_one_gain_for_all_axes_or_none():
     each = torque(0.3, 0.3, 1e-5, {"observer_gain_1": 5.0, "observer_gain_2": 6.0})
     others = {"paper": torque(1.0, 1.0, 1e-5, {"observer_gain": 10.0}), "before": torque(1.0, 1.0, 1e-5, {})}
-    table = front_report.gains(front(each, others=others, paper_is="published, scaled"))
+    table = front_report.gains(front(each, others=others, published_label="published, scaled"))
     assert table.rows == [("0.3", "5", "6"), ("published, scaled", "10", "10"), ("before", "-", "-")]
     assert table.head[1:] == ("observer_gain_1 [kg m^2/s]", "observer_gain_2 [kg m^2/s]")
 

@@ -79,7 +79,7 @@ def test_advice_on_margins_that_held_out_loops_break(metric, limit, worst, end):
 
 
 def test_margins_are_relative_to_their_limits():
-    """4.8 dB of 6 dB are 0.8 times the limit, although `over` is 1.2."""
+    """4.8 dB of 6 dB are 0.8 times the limit, although `violation_ratio` is 1.2."""
     margin = {"metric": "gain_margin", "limit": 6.0, "unit": "dB", "worst": 4.8, "margin": 1.2, "failures": 1,
               "trials": 1, "met": False, "at_least": True}  # fmt: skip
     earlier = {"margins": {"gain_margin": 0.03}, "over": {"gain_margin": 1.1}, "fresh_seed": 7}
@@ -138,7 +138,7 @@ def beside(times, **changes):
 
 def test_less_accurate_gains_are_compared_by_their_larger_error():
     """The interval of a ratio turns over with it: from 0.05..0.1 to 10..20."""
-    less = {"paper_is": "published, scaled", "accuracy_gain_interval": [0.05, 0.1]}
+    less = {"published_label": "published, scaled", "accuracy_gain_interval": [0.05, 0.1]}
     (line,) = beside(0.08, **less)
     assert line == (
         "less accurate than the published gains, scaled to this body and period: 12.5 times the error "
@@ -146,7 +146,9 @@ def test_less_accurate_gains_are_compared_by_their_larger_error():
     )
     (line,) = beside(0.08, **less, broken_by={"paper": ["gain_margin", "effort"]})
     assert line.endswith("10 to 20); these break gain_margin and effort")
-    assert beside(40.0, paper_is="paper's law") == ["40 times as accurate as the paper's law with the published gains"]
+    assert beside(40.0, published_label="paper's law") == [
+        "40 times as accurate as the paper's law with the published gains"
+    ]
 
 
 def test_gains_whose_trials_all_fail_are_not_compared():
@@ -233,10 +235,14 @@ def test_confirmation_that_is_skipped_is_reported():
 
 def test_column_of_the_published_gains_is_named_after_their_source():
     paper = scenario.from_tables({"loop": {"mode": "sampled"}})
-    assert gains.paper_is(paper) == "published"
-    assert gains.paper_is(scenario.replace(paper, loop__period=0.5)) == "published, scaled"  # a hand-over of a period
-    assert gains.paper_is(scenario.replace(paper, spacecraft={"inertia": [0.1, 0.1, 0.1]})) == "published, scaled"
-    assert gains.paper_is(scenario.replace(paper, controller={"kind": "pd"})) == "paper's law"
+    assert gains.published_label(paper) == "published"
+    assert (
+        gains.published_label(scenario.replace(paper, loop__period=0.5)) == "published, scaled"
+    )  # a hand-over of a period
+    assert (
+        gains.published_label(scenario.replace(paper, spacecraft={"inertia": [0.1, 0.1, 0.1]})) == "published, scaled"
+    )
+    assert gains.published_label(scenario.replace(paper, controller={"kind": "pd"})) == "paper's law"
 
 
 @pytest.mark.parametrize("kind", ["chain", "spacecraft"])
@@ -245,9 +251,13 @@ def test_the_papers_law_replaces_another_on_every_plant(kind):
     flown = scenario.from_tables(
         {"plant": {"kind": kind, **order}, "loop": {"mode": "sampled"}, "controller": {"kind": "pd", "t_f": 12.0}}
     )
-    papers = gains.papers(flown)
-    assert (papers.controller.kind, papers.controller.t_f, papers.controller.eta) == ("prescribed_time", 12.0, 3.0)
-    assert getattr(papers.controller, "error", "multiplicative") == "multiplicative"
+    published_scenario = gains.published_scenario(flown)
+    assert (
+        published_scenario.controller.kind,
+        published_scenario.controller.t_f,
+        published_scenario.controller.eta,
+    ) == ("prescribed_time", 12.0, 3.0)
+    assert getattr(published_scenario.controller, "error", "multiplicative") == "multiplicative"
 
 
 @pytest.mark.parametrize(("most", "count"), [(0.0633, 1), (0.0, 0)])

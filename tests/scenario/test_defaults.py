@@ -186,7 +186,7 @@ def test_the_default_observer_gain_depends_on_inertia_and_period():
     assert gain(loop={"mode": "sampled", "period": 4.0, "window": 4.0}) == 3.0  # 12 / 4
     assert gain(plant={"kind": "chain"}, observer={"kind": "nonlinear"}) == 10.0
     cubesat = scenario.from_tables({"spacecraft": {"inertia": CUBESAT}})
-    assert gains.of_paper(cubesat)["observer_gain"] == cubesat_gain
+    assert gains.published_gains(cubesat)["observer_gain"] == cubesat_gain
 
 
 def test_the_observer_gain_scales_with_the_inverse_of_t_f():

@@ -11,7 +11,7 @@ from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.scenario import parsing
 from ptsmc_jax.scenario.tables import Limit
 from ptsmc_jax.simulation import catalogues
-from ptsmc_jax.simulation.requirements import Requirement, over
+from ptsmc_jax.simulation.requirements import Requirement, violation_ratio
 from tests.output import examples
 from tuning.output import report
 from tuning.search import objective
@@ -83,7 +83,7 @@ def test_only_zero_meets_a_limit_of_zero():
     broken = requirement.verdict(np.array([0.0, 1e-6, 0.0]), np.ones(3, bool))
     assert (broken.met, broken.failures) == (False, 1)
     assert broken.margin > 1.0
-    np.testing.assert_array_equal(over(np.array([0.0, 0.2]), 0.0, at_least=False), [0.0, 1.2])
+    np.testing.assert_array_equal(violation_ratio(np.array([0.0, 0.2]), 0.0, at_least=False), [0.0, 1.2])
     trials = objective.problem(ready.parts, ready.dispersion, 0, np.arange(2), ("eta",), ready.requirements)
     c = np.asarray(jax.jit(objective.measure)(trials, vector([3.0]))[1])
     np.testing.assert_array_equal(c, [[-1.0, -1.0]])  # without a torque limit nothing saturates

@@ -13,7 +13,7 @@ from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.simulation.requirements import Requirement, must_keep
 from tests import helpers
 from tests.search.test_tuning import SPREAD, measure, problem
-from tuning.search import confirm, gains, objective, optimise, rounds, shares
+from tuning.search import confirm, gains, normalisation, objective, optimise, rounds
 from tuning.search.evaluate import Evaluator
 
 SHOWN = Requirement("window_error", 1e-4, None, 0.99, 0.95)
@@ -36,7 +36,7 @@ def test_probability_of_a_met_verdict_agrees_with_bayes_rule_on_a_grid(requireme
 
 @pytest.mark.parametrize("requirement", [SHOWN, SEEN, replace(SHOWN, quantile=0.9973, confidence=0.9)])
 def test_allowed_is_the_largest_count_with_a_sure_verdict(requirement):
-    fresh = confirm.fresh_trials([requirement])
+    fresh = confirm.held_out_trials([requirement])
     trials = max(confirm.FEWEST, confirm.TIMES * fresh)
     most = confirm.allowed(requirement, fresh, trials)
     assert most is not None
@@ -71,13 +71,13 @@ def test_a_band_contains_the_trials_ranked_around_the_last_that_may_break_the_li
         flown.metrics = SimpleNamespace(window_error=numbers.astype(float))
         return flown
 
-    monkeypatch.setattr(confirm.flights, "trials", fly)
+    monkeypatch.setattr(confirm.simulations, "simulate_trials", fly)
     some: Any = SimpleNamespace(others=lambda numbers: numbers)
     (found,) = confirm.count(some, [loose], np.zeros(2), 100, 2)
     assert found.allowed is not None
     first = 100 + 2 * count
     order = [first + 5, *range(first + count - 1, first + count // 2, -1)]
-    assert found.beyond == count
+    assert found.violations == count
     assert found.band.tolist() == order[found.allowed - confirm.FARTHER : found.allowed + confirm.NEARER]
     assert found.harder[:8].tolist() == order[found.allowed : found.allowed + 8]
 
@@ -92,7 +92,9 @@ def test_a_band_replaces_the_training_trials_in_a_quantile_limit():
     at = helpers.vector([3.0, 0.7])
     ratios = montecarlo.run(gains.with_gains(some.parts, {"eta": 3.0, "delta": 0.7}), SPREAD, 3, np.arange(11))
     torque, effort = (np.asarray(v) for v in (ratios.metrics.peak_torque / 0.7 - 1, ratios.metrics.effort / 5.0 - 1))
-    search = rounds.Rounds(Evaluator(shares.Bounds(some.names, (2.05, 0.2), (6.0, 4.0))), banded, wanted, robust=False)
+    search = rounds.Rounds(
+        Evaluator(normalisation.Bounds(some.names, (2.05, 0.2), (6.0, 4.0))), banded, wanted, robust=False
+    )
     before = np.asarray(measure(objective.fewer_trials(search.problem, 8), at)[1])
     np.testing.assert_allclose(before[0, :8], torque[:8], rtol=1e-10)  # before the band joins
     assert before[0, 8:].max() == -1.0
@@ -108,7 +110,7 @@ def test_confirmation_uses_trials_that_the_search_has_not_simulated(monkeypatch)
     """They differ from the averaged and the screened trials, and each count uses new ones."""
     some, wanted, seen = problem(peak_torque=0.7), [replace(SHOWN, metric="peak_torque", limit=0.7)], list[range]()
     posed = objective.problem(some.parts, SPREAD, 3, np.arange(8), some.names, wanted, may_break=(2,), banded=(True,))
-    limits, at = shares.Bounds(some.names, (2.05, 0.2), (6.0, 4.0)), np.array([3.0, 0.7])
+    limits, at = normalisation.Bounds(some.names, (2.05, 0.2), (6.0, 4.0)), np.array([3.0, 0.7])
     many = confirm.counted_on(wanted)
 
     def count(posed, asked, gains, first, turn):
@@ -120,7 +122,7 @@ def test_confirmation_uses_trials_that_the_search_has_not_simulated(monkeypatch)
         return SimpleNamespace(finished=np.ones(numbers.size, bool), metrics=SimpleNamespace(peak_torque=0.0 * numbers))
 
     monkeypatch.setattr(rounds.confirm, "count", count)
-    monkeypatch.setattr(rounds.worst_case.flights, "trials", trials)
+    monkeypatch.setattr(rounds.worst_case.simulations, "simulate_trials", trials)
     evaluate = Evaluator(limits)
     search = rounds.Rounds(evaluate, posed, wanted, robust=False)
     told: Any = SimpleNamespace(averaged=search.problem.averaged, others=lambda numbers: numbers)
@@ -145,7 +147,7 @@ def test_gains_keep_a_quantile_limit_on_held_out_trials(monkeypatch, quantile, c
     Eight trials cannot represent a quantile of 99 % with 95 % confidence, so a band replaces them.
     """
     helpers.small_search(monkeypatch, fresh=200)
-    limits = shares.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 4.0))
+    limits = normalisation.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 4.0))
     limit, seed = 0.7, 2  # with this seed, the first eight trials are easy
     wanted = [Requirement("peak_torque", limit, None, quantile, confidence)]
     parts = problem(peak_torque=limit).parts
@@ -155,7 +157,7 @@ def test_gains_keep_a_quantile_limit_on_held_out_trials(monkeypatch, quantile, c
     )
     found = optimise.search(Evaluator(limits), some, wanted, np.array([3.0, 0.5]), optimise.Settings(2, 20, 1))
     (last,) = found.counts
-    assert last.held
+    assert last.confirmed
     assert banded or found.rounds >= 1  # the gains of the first search were not confirmed
     at = gains.with_gains(parts, dict(zip(some.names, found.gains, strict=True)))
     others = montecarlo.run(at, SPREAD, 99, np.arange(2000))

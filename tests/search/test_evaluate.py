@@ -12,11 +12,11 @@ import ptsmc_jax as ptsmc
 from ptsmc_jax import scenario
 from ptsmc_jax.simulation import rollout
 from tuning.search import evaluate
-from tuning.search.descent import Best
-from tuning.search.descents import Descents
-from tuning.search.evaluate import Evaluator, Measured, Sloped
+from tuning.search.evaluate import Evaluator, Measured, MeasuredWithGradients
+from tuning.search.local_search import Best
+from tuning.search.local_searches import LocalSearches
+from tuning.search.normalisation import Bounds
 from tuning.search.objective import FAILED, Rules, judge, problem
-from tuning.search.shares import Bounds
 
 
 @pytest.mark.parametrize(("trials", "loops"), [(2, 5), (5, 2)])
@@ -26,28 +26,30 @@ def test_rows_of_trials_and_of_margins_are_padded_without_changing_the_result(mo
     The largest c is therefore a measured one, and the padding has a gradient of zero.
     """
     rng = np.random.default_rng(0)
-    flown = {"c": rng.uniform(-0.9, -0.5, (2, 2, trials)), "c_slope": rng.normal(size=(2, 2, trials, 2))}
-    of_loop = {"c": rng.uniform(-0.9, -0.5, (2, 1, loops)), "c_slope": rng.normal(size=(2, 1, loops, 2))}
-    share = np.array([[0.0, 0.0], [1.0, 1.0]])
-    monkeypatch.setattr(evaluate.margin_rows, "of_points", lambda margins, bounds, share: of_loop)
-    some: Any = SimpleNamespace(margins=object(), goal="window_error")
+    flown = {"c": rng.uniform(-0.9, -0.5, (2, 2, trials)), "c_gradient": rng.normal(size=(2, 2, trials, 2))}
+    of_loop = {"c": rng.uniform(-0.9, -0.5, (2, 1, loops)), "c_gradient": rng.normal(size=(2, 1, loops, 2))}
+    normalised = np.array([[0.0, 0.0], [1.0, 1.0]])
+    monkeypatch.setattr(evaluate.margin_rows, "of_points", lambda margins, bounds, normalised: of_loop)
+    some: Any = SimpleNamespace(margins=object(), objective="window_error")
     evaluator = Evaluator(Bounds(("eta", "delta"), (2.0, 0.1), (3.0, 1.0)))
-    rest = {"gains": share, "f": np.zeros(2), "value": np.zeros(2), "f_slope": np.zeros((2, 2))}
-    found = Sloped(**evaluator._measured(lambda problem, share: {**rest, **flown}, some, share))
+    rest = {"gains": normalised, "f": np.zeros(2), "value": np.zeros(2), "f_gradient": np.zeros((2, 2))}
+    found = MeasuredWithGradients(
+        **evaluator._measured(lambda problem, normalised: {**rest, **flown}, some, normalised)
+    )
     assert found.c.shape == (2, 3, 5)
-    for name, filled in (("c", -1.0), ("c_slope", 0.0)):
+    for name, filled in (("c", -1.0), ("c_gradient", 0.0)):
         seen = getattr(found, name)
         for rows, expected, size in ((seen[:, :2], flown[name], trials), (seen[:, 2:], of_loop[name], loops)):
             np.testing.assert_array_equal(rows[:, :, :size], expected)
             assert np.all(rows[:, :, size:] == filled)
     largest = np.maximum(flown["c"].max(axis=(1, 2)), of_loop["c"].max(axis=(1, 2)))
-    np.testing.assert_array_equal(found.beyond, largest)
+    np.testing.assert_array_equal(found.largest_c, largest)
 
 
 def test_the_torque_term_of_f_covers_the_averaged_trials_only():
     """Trials that joined for a limit are hard ones and count only in the constraints."""
     none = np.zeros((0, 3), dtype=bool)
-    rules = Rules(limits=np.zeros(0), among=none, counted=none, averaged=2, names=("eta",), may_break=(),
+    rules = Rules(limits=np.zeros(0), quantile_sample=none, counted=none, averaged=2, names=("eta",), may_break=(),
                   torque_weight=0.3)  # fmt: skip
     metrics, status = jnp.asarray([[3.0, 0.3], [4.0, 0.4], [40.0, 9.0]]), jnp.zeros(3, jnp.int32)
     f, c, value = judge(rules, jnp.asarray([3.0]), metrics, status)
@@ -72,7 +74,7 @@ def test_f_is_the_logarithm_of_the_statistic_of_the_averaged_trials(statistic, t
     values = np.random.default_rng(5).lognormal(size=9)
     values[8] = 1e3
     none = np.zeros((0, 9), dtype=bool)
-    rules = Rules(limits=np.zeros(0), among=none, counted=none, averaged=8, names=("eta",), may_break=(),
+    rules = Rules(limits=np.zeros(0), quantile_sample=none, counted=none, averaged=8, names=("eta",), may_break=(),
                   tail=tail, statistic=statistic)  # fmt: skip
     metrics = jnp.asarray(np.stack([values, np.ones(9)], axis=1))
     f, _, value = judge(rules, jnp.asarray([3.0]), metrics, jnp.zeros(9, jnp.int32))
@@ -85,12 +87,12 @@ def test_goal_limits_minimises_the_largest_metric_over_its_limit():
     limited = np.array([[0.3, 5.0], [0.4, 7.0], [2.0, 90.0]])
     rules = Rules(
         limits=limits,
-        among=np.zeros((2, 3), bool),
+        quantile_sample=np.zeros((2, 3), bool),
         counted=np.ones((2, 3), bool),
         averaged=3,
         names=("eta",),
         may_break=(None, None),
-        goal="limits",
+        objective="limits",
     )
     metrics = jnp.asarray(np.concatenate([np.ones((3, 2)), limited], axis=1))
     f, c, value = judge(rules, jnp.asarray([3.0]), metrics, jnp.asarray(status, jnp.int32))
@@ -101,17 +103,19 @@ def test_goal_limits_minimises_the_largest_metric_over_its_limit():
 
 def test_goal_limits_includes_the_margins(monkeypatch):
     """F and its gradient follow the largest row: a metric's at the first point, a margin's at the second point."""
-    flown = {"c": np.array([[[0.3, -0.2]], [[-0.5, -0.4]]]), "c_slope": np.arange(8.0).reshape(2, 1, 2, 2)}
-    of_loop = {"c": np.array([[[-0.1]], [[0.6]]]), "c_slope": 10.0 + np.arange(4.0).reshape(2, 1, 1, 2)}
-    monkeypatch.setattr(evaluate.margin_rows, "of_points", lambda margins, scale, share: of_loop)
-    some: Any = SimpleNamespace(margins=object(), goal="limits")
+    flown = {"c": np.array([[[0.3, -0.2]], [[-0.5, -0.4]]]), "c_gradient": np.arange(8.0).reshape(2, 1, 2, 2)}
+    of_loop = {"c": np.array([[[-0.1]], [[0.6]]]), "c_gradient": 10.0 + np.arange(4.0).reshape(2, 1, 1, 2)}
+    monkeypatch.setattr(evaluate.margin_rows, "of_points", lambda margins, scale, normalised: of_loop)
+    some: Any = SimpleNamespace(margins=object(), objective="limits")
     evaluator = Evaluator(Bounds(("eta", "delta"), (2.0, 0.1), (3.0, 1.0)))
-    share = np.zeros((2, 2))
-    rest = {"gains": share, "f": np.zeros(2), "value": np.zeros(2), "f_slope": np.zeros((2, 2))}
-    found = Sloped(**evaluator._measured(lambda problem, share: {**rest, **flown}, some, share))
+    normalised = np.zeros((2, 2))
+    rest = {"gains": normalised, "f": np.zeros(2), "value": np.zeros(2), "f_gradient": np.zeros((2, 2))}
+    found = MeasuredWithGradients(
+        **evaluator._measured(lambda problem, normalised: {**rest, **flown}, some, normalised)
+    )
     np.testing.assert_allclose(np.exp(found.f), [1.3, 1.6], rtol=1e-12)
     np.testing.assert_array_equal(found.value, found.f)
-    np.testing.assert_allclose(found.f_slope, [[0.0, 1.0 / 1.3], [12.0 / 1.6, 13.0 / 1.6]], rtol=1e-12)
+    np.testing.assert_allclose(found.f_gradient, [[0.0, 1.0 / 1.3], [12.0 / 1.6, 13.0 / 1.6]], rtol=1e-12)
 
 
 def test_the_objective_is_nan_if_no_trial_completes():
@@ -122,14 +126,14 @@ def test_the_objective_is_nan_if_no_trial_completes():
     judged = [judge(rules, jnp.asarray([3.0]), jnp.asarray([[4.0, 0.3, 0.3], [5.0, 0.2, 0.2]]), one) for one in status]
     f, c, value = map(np.asarray, zip(*judged, strict=True))
     seen = Measured(gains=np.array([[3.0], [3.0]]), f=f, c=c, value=value)
-    np.testing.assert_allclose(seen.goal, [4.0, np.nan], rtol=1e-12)
-    run = Descents(Evaluator(Bounds(("eta",), (2.0,), (4.0,))), 0.0, 2, np.random.default_rng(0))
+    np.testing.assert_allclose(seen.objective, [4.0, np.nan], rtol=1e-12)
+    run = LocalSearches(Evaluator(Bounds(("eta",), (2.0,), (4.0,))), 0.0, 2, np.random.default_rng(0))
     best = Best(np.array([0.5]), 1, 0.0)
     best.offer(np.array([[0.5]]), seen.at(1))
     assert np.isnan(best.value)
     assert best.failed
     for point in (0, 1):
-        run._keep(point, seen.at(point))
+        run._record(point, seen.at(point))
     np.testing.assert_allclose([step.value for step in run.history], [4.0, np.nan], rtol=1e-12)
     assert [step.worst.tolist() for step in run.history] == [[np.inf], [np.inf]]
 
@@ -144,7 +148,7 @@ def test_a_custom_system_has_the_same_journal_questions_in_another_process():
         tables = {"plant": {"kind": "system", "system": pendulum, "x0": [1.0, 0.0]}, "loop": {"mode": "sampled"}}
         ready = scenario.study(scenario.from_tables(tables))
         posed = problem(ready.parts, ready.dispersion, 0, np.arange(2), ("eta",))
-        return pendulum, evaluate._question(b"fly", posed, np.zeros((1, 1)))
+        return pendulum, evaluate._request(b"values", posed, np.zeros((1, 1)))
 
     (one, asked), (other, again) = question(), question()
     assert one != other

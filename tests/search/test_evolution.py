@@ -7,10 +7,10 @@ from ptsmc_jax.simulation.requirements import Requirement
 from tests.helpers import parts
 from tests.search.test_tuning import TURNED
 from tuning.search import evolution, objective
-from tuning.search.descent import Best
-from tuning.search.descents import Descents
 from tuning.search.evaluate import Evaluator, Measured
-from tuning.search.shares import Bounds
+from tuning.search.local_search import Best
+from tuning.search.local_searches import LocalSearches
+from tuning.search.normalisation import Bounds
 
 
 class Valley(Evaluator):
@@ -25,23 +25,23 @@ class Valley(Evaluator):
         self.matrix, self.along, self.least, self.wall, self.lost = matrix, along, least, wall, lost
         self.seen = []
 
-    def fly(self, problem, share):
-        x = share - 0.5
+    def measure(self, problem, normalised):
+        x = normalised - 0.5
         self.seen.append(x)
         f = np.where(x[:, 0] > self.wall, np.nan, np.einsum("pi,ij,pj->p", x, self.matrix, x))
-        over = np.zeros(len(share)) - 1.0 if self.along is None else self.least - x @ self.along
-        over = np.where(x[:, 0] < self.lost, objective.FAILED - 1.0, over)
-        return Measured(share, f, over[:, None, None], f)
+        violation = np.zeros(len(normalised)) - 1.0 if self.along is None else self.least - x @ self.along
+        violation = np.where(x[:, 0] < self.lost, objective.FAILED - 1.0, violation)
+        return Measured(normalised, f, violation[:, None, None], f)
 
 
 def refined(valley, start, seed=3, size=evolution.WIDELY):
     names = valley.bounds.names
     some = objective.problem(parts(20.0, 3.0, 1.0), TURNED, 0, np.arange(1), names, [Requirement("peak_torque", 1.0)])
-    share = 0.5 + np.asarray(start)
-    best, told = Best(share, 1, 0.0), []
-    best.offer(share[None], valley.fly(some, share[None]))
+    normalised = 0.5 + np.asarray(start)
+    best, told = Best(normalised, 1, 0.0), []
+    best.offer(normalised[None], valley.fly(some, normalised[None]))
     path = []
-    evolution.evolve(valley, some, best, share, seed, lambda *at: told.append(at), path.append, size)
+    evolution.evolve(valley, some, best, normalised, seed, lambda *at: told.append(at), path.append, size)
     assert len(path) == len(told)
     return best, told
 
@@ -67,7 +67,7 @@ def test_constrained_optimum_on_an_active_limit_is_found(seed):
     inverse = along @ np.linalg.solve(matrix, along)
     optimum = least**2 / inverse  # at x = A^-1 a b / (a' A^-1 a)
     best, _ = refined(Valley(matrix, along, least), [0.35, 0.3, -0.3], seed)
-    assert best.over == 0.0
+    assert best.violation == 0.0
     assert optimum - 2.0 * (2.0 * least / inverse) * 1e-4 <= best.f  # points may exceed the limit by SLACK
     assert best.f <= optimum + 5.0 * evolution.GAINED
 
@@ -78,7 +78,7 @@ def test_the_first_point_of_the_history_is_the_best_of_the_sweep():
     names = valley.bounds.names
     valley.bounds = Bounds(names, (1.0, 1.0), (2.0, 2.0))
     some = objective.problem(parts(20.0, 3.0, 1.0), TURNED, 0, np.arange(1), names, [Requirement("peak_torque", 1.0)])
-    search = Descents(valley, 0.0, 4, np.random.default_rng(0))
+    search = LocalSearches(valley, 0.0, 4, np.random.default_rng(0))
     search.sweep(some, np.full(2, 1.9))
     (first,) = search.history
     assert first.value == search.best.value
@@ -120,17 +120,17 @@ def test_first_generation_is_around_the_starting_point_or_in_the_whole_box(size)
 def test_search_approaches_a_limit_that_no_point_can_keep():
     best, told = refined(Valley(np.eye(2), np.array([1.0, 1.0]), least=3.0), [-0.3, -0.3])
     assert len(told) == evolution.GENERATIONS
-    assert best.over < 2.01  # x is 0.5 at most
+    assert best.violation < 2.01  # x is 0.5 at most
 
 
 def test_the_starting_point_remains_if_all_points_fail():
     best, _ = refined(Valley(np.eye(2), wall=-1.0), [0.1, 0.2])
     assert not np.isfinite(best.f)
-    np.testing.assert_allclose(best.share, [0.6, 0.7])
+    np.testing.assert_allclose(best.normalised, [0.6, 0.7])
 
 
 def test_a_feasible_point_is_better_than_an_infeasible_one_with_a_smaller_objective():
-    share, f, over = np.asarray([[0.2], [0.7]]), np.asarray([1.0, 2.0]), np.asarray([0.5, -0.1])
+    normalised, f, violation = np.asarray([[0.2], [0.7]]), np.asarray([1.0, 2.0]), np.asarray([0.5, -0.1])
     best = Best(np.zeros(1), 1, 0.0)
-    best.offer(share, Measured(share, f, over[:, None, None], f))
-    assert (best.share[0], best.f, best.over) == (0.7, 2.0, 0.0)
+    best.offer(normalised, Measured(normalised, f, violation[:, None, None], f))
+    assert (best.normalised[0], best.f, best.violation) == (0.7, 2.0, 0.0)

@@ -21,7 +21,7 @@ from ptsmc_jax.scenario.observer_tables import OBSERVERS
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.theory import borders
 from tests.helpers import FIRST_FLIGHT, SHORT, finer, short, ticks_of, vector
-from tuning.search import gains, shares
+from tuning.search import gains, normalisation
 from tuning.studies import judging, posing
 
 BASE = {
@@ -109,7 +109,7 @@ def test_gains_of_single_axes_have_names_and_bounds():
     names = gains.named(scenario)
     assert names == ("eta", "observer_gain_1", "observer_gain_2", "observer_gain_3")
     assert gains.present_values(ready.parts, names) == [3.0, 3.0, 4.0, 5.0]
-    some = shares.of_scenario(scenario, ready.parts)
+    some = normalisation.of_scenario(scenario, ready.parts)
     assert some.names == names
     assert (some.lower[1:], some.upper[1:]) == ((1.0,) * 3, (50.0,) * 3)
     assert gains.gains_of(ready.parts)["observer_gain"] == 4.0
@@ -330,7 +330,7 @@ def test_default_bounds_are_widened_on_the_side_where_a_gain_ended():
 
 
 def test_default_bounds_of_comparison_laws_contain_only_valid_gains():
-    from tuning.search import gains, shares
+    from tuning.search import gains, normalisation
 
     for kind, more in (("pd", {}), ("terminal", {}), ("fixed_time", {}), ("fixed_time", {"gamma": 1.8, "p": 1.3})):
         base = scenario.replace(
@@ -338,7 +338,7 @@ def test_default_bounds_of_comparison_laws_contain_only_valid_gains():
         )
         free = {"free": ["p", "b1"]} if more else {}
         base = scenario.replace(base, tune=free)
-        box = shares.of_scenario(base, scenario.study(base).parts)
+        box = normalisation.of_scenario(base, scenario.study(base).parts)
         for corner in (box.lower, box.upper):
             scenario.study(gains.in_scenario(base, dict(zip(box.names, corner, strict=True))))
     with pytest.raises(ScenarioError, match=r"tune.bounds.p is \[1.05, 1.2\], but must be two numbers above 1.25"):
@@ -437,9 +437,9 @@ def test_the_published_gains_scale_with_the_mission_and_follow_the_order_of_a_ch
     known = {"eta": 3.0, "delta": 0.1, "k1": 1.0, "sign_width": 1e-3, "surface_rate": 1.0, "observer_gain": 10.0}
     six_times = ("k1", "sign_width", "surface_rate", "observer_gain")
     expected = {name: value * (6.0 if name in six_times else 1.0) for name, value in known.items()}
-    assert gains.of_paper(from_tables(tables)) == pytest.approx(expected, rel=1e-12)
+    assert gains.published_gains(from_tables(tables)) == pytest.approx(expected, rel=1e-12)
     known |= {"eta": order + 1.0}
-    of_chain = gains.of_paper(from_tables({**tables, "plant": {"kind": "chain", "order": order}}))
+    of_chain = gains.published_gains(from_tables({**tables, "plant": {"kind": "chain", "order": order}}))
     assert of_chain == {name: known[name] for name in of_chain}
     assert {"eta", "delta", "k1"} <= set(of_chain)
 
@@ -466,7 +466,7 @@ def test_a_gain_of_a_custom_law_is_set_in_the_law_whatever_its_name_begins_with(
 
 
 def test_a_name_of_two_gains_is_rejected():
-    """The gain `share` of an observer is also called `observer_share`."""
+    """The gain `normalised` of an observer is also called `observer_share`."""
     parts = shared(study(from_tables(BASE)).parts)
     observer = replace(parts.observer)
     object.__setattr__(observer, "tunable", ("share",))

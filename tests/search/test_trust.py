@@ -17,8 +17,8 @@ from tests.helpers import parts
 from tests.search.test_tuning import problem
 from tuning.search import global_check, objective, optimise, trust
 from tuning.search.evaluate import Evaluator, Measured
+from tuning.search.normalisation import Bounds
 from tuning.search.objective import FAILED
-from tuning.search.shares import Bounds
 
 BOUNDS = Bounds(("eta", "delta", "t_f"), (2.5, 0.3, 15.0), (5.0, 4.0, 25.0))
 
@@ -50,15 +50,15 @@ def test_sensitivities_of_the_peak_torque_are_its_exponents(quiet):
 
 def test_an_objective_that_does_not_depend_on_a_gain_is_flat(quiet):
     evaluate = Evaluator(BOUNDS)
-    problem = replace(quiet, goal="peak_torque")
-    z = BOUNDS.share(np.array([3.3, 1.0, 19.0]))
+    problem = replace(quiet, objective="peak_torque")
+    z = BOUNDS.normalise(np.array([3.3, 1.0, 19.0]))
     found = trust.profiles(evaluate, problem, z)
     assert {name: profile.flat for name, profile in found.items()} == {"eta": False, "delta": True, "t_f": False}
     eta = found["eta"]
     assert np.all(np.diff(eta.gain) > 0)
     np.testing.assert_allclose(np.min(np.abs(eta.gain - 3.3)), 0.0, atol=1e-9)  # the final gain is one of the points
     np.testing.assert_allclose(eta.value / eta.value[0], (eta.gain / eta.gain[0]) ** 2, rtol=1e-4)
-    np.testing.assert_allclose(eta.over / eta.over[0], (eta.gain / eta.gain[0]) ** 2, rtol=1e-4)
+    np.testing.assert_allclose(eta.violation_ratio / eta.violation_ratio[0], (eta.gain / eta.gain[0]) ** 2, rtol=1e-4)
 
 
 def test_a_profile_varies_only_its_own_gain():
@@ -67,13 +67,13 @@ def test_a_profile_varies_only_its_own_gain():
     bounds = Bounds(names, (2.5, 0.5, 1e-6), (5.0, 1000.0, 0.1), hop=1e-3)
     found = np.array([3.0, 20.0, 1e-3])
 
-    def fly(problem: Any, share: np.ndarray) -> Measured:
-        gains, none = np.stack([bounds.gains(one) for one in share]), np.zeros(len(share))
-        return Measured(gains, none, np.zeros((len(share), 0, 1)), gains @ [0.0, 0.0, 1.0])
+    def fly(problem: Any, normalised: np.ndarray) -> Measured:
+        gains, none = np.stack([bounds.gains(one) for one in normalised]), np.zeros(len(normalised))
+        return Measured(gains, none, np.zeros((len(normalised), 0, 1)), gains @ [0.0, 0.0, 1.0])
 
     evaluate: Any = SimpleNamespace(bounds=bounds, fly=fly)
     asked: Any = SimpleNamespace(rows=(), names=names)
-    profiles = trust.profiles(evaluate, asked, bounds.share(found))
+    profiles = trust.profiles(evaluate, asked, bounds.normalise(found))
     for name in ("eta", "observer_gain"):
         np.testing.assert_allclose(np.log(profiles[name].value), 1e-3, rtol=1e-12)
     np.testing.assert_allclose(profiles["observer_gain"].gain[[0, -1]], [0.5, 1000.0])
@@ -87,24 +87,24 @@ def test_profiles_and_gradient_check_handle_failed_trials():
     """
     bounds = Bounds(("k",), (0.01,), (1.0,))
 
-    def fly(problem: Any, share: np.ndarray) -> Measured:
-        gains = np.stack([bounds.gains(one) for one in share])
+    def fly(problem: Any, normalised: np.ndarray) -> Measured:
+        gains = np.stack([bounds.gains(one) for one in normalised])
         c = np.where(gains[:, None, :] < [0.5, 0.25], FAILED - 1.0, -0.5)
         value = np.log(np.where(gains[:, 0] < 0.25, FAILED, 1e-3))
         return Measured(gains, value + np.log(FAILED) * (c[:, 0] > 0.0).sum(axis=1), c, value)
 
-    def slopes(problem: Any, share: np.ndarray) -> Any:
-        return SimpleNamespace(f_slope=np.zeros_like(share))
+    def measure_with_gradients(problem: Any, normalised: np.ndarray) -> Any:
+        return SimpleNamespace(f_gradient=np.zeros_like(normalised))
 
-    evaluate: Any = SimpleNamespace(bounds=bounds, fly=fly, slopes=slopes)
+    evaluate: Any = SimpleNamespace(bounds=bounds, fly=fly, measure_with_gradients=measure_with_gradients)
     asked: Any = SimpleNamespace(rows=("peak_torque",), names=("k",))
-    found = trust.profiles(evaluate, asked, bounds.share(np.array([0.7])))["k"]
-    np.testing.assert_array_equal(found.over <= 1.0, found.gain >= 0.5)
+    found = trust.profiles(evaluate, asked, bounds.normalise(np.array([0.7])))["k"]
+    np.testing.assert_array_equal(found.violation_ratio <= 1.0, found.gain >= 0.5)
     np.testing.assert_array_equal(np.isnan(found.value), found.gain < 0.25)
     assert found.seen
     assert not found.flat
-    assert np.isnan(trust.slope_error(evaluate, asked, bounds.share(np.array([0.1]))))
-    assert trust.slope_error(evaluate, asked, bounds.share(np.array([0.7]))) == 0.0
+    assert np.isnan(trust.gradient_error(evaluate, asked, bounds.normalise(np.array([0.1]))))
+    assert trust.gradient_error(evaluate, asked, bounds.normalise(np.array([0.7]))) == 0.0
 
 
 def test_sensitivities_at_a_bound_use_points_inside_it(quiet):
@@ -122,7 +122,7 @@ def test_a_zero_gain_has_no_sensitivity_and_the_other_gains_have_one(monkeypatch
         errors = np.tile(gains[:, :1] ** 2, (1, 4))
         return SimpleNamespace(status=np.zeros((len(gains), 4), int), metrics=SimpleNamespace(window_error=errors))
 
-    monkeypatch.setattr(trust.flights, "fly", fly)
+    monkeypatch.setattr(trust.simulations, "simulate", fly)
     problem: Any = SimpleNamespace(others=lambda trials: trials, trials=np.arange(4), averaged=4, names=("k", "lead"))
     bounds = Bounds(problem.names, (1.0, -1.0), (3.0, 1.0))
     found = trust.sensitivities(problem, bounds, np.array([2.0, 0.0]), ("window_error",))
@@ -142,7 +142,7 @@ def test_a_gain_is_flat_if_objective_and_limits_change_by_less_than_one_percent(
 def test_profiles_without_requirements_depend_on_the_objective_only(quiet):
     free = objective.problem(quiet.parts, quiet.dispersion, 3, np.arange(8), BOUNDS.names)
     found = trust.profiles(
-        Evaluator(BOUNDS), replace(free, goal="peak_torque"), BOUNDS.share(np.array([3.3, 1.0, 19.0]))
+        Evaluator(BOUNDS), replace(free, objective="peak_torque"), BOUNDS.normalise(np.array([3.3, 1.0, 19.0]))
     )
     assert {name: profile.flat for name, profile in found.items()} == {"eta": False, "delta": True, "t_f": False}
 
@@ -150,18 +150,18 @@ def test_profiles_without_requirements_depend_on_the_objective_only(quiet):
 def test_gradients_are_checked_against_finite_differences():
     noisy = moved_in_time()
     # t_f - delta is not a multiple of the period, because the noise of the first period has a kink there
-    evaluate, z = Evaluator(BOUNDS), BOUNDS.share(np.array([3.3, 1.07, 19.0]))
-    assert trust.slope_error(evaluate, noisy, z) < 1e-6  # differences of order 4
+    evaluate, z = Evaluator(BOUNDS), BOUNDS.normalise(np.array([3.3, 1.07, 19.0]))
+    assert trust.gradient_error(evaluate, noisy, z) < 1e-6  # differences of order 4
 
     class Wrong(Evaluator):
-        def slopes(self, problem, share):
-            seen = super().slopes(problem, share)
-            return replace(seen, f_slope=seen.f_slope * np.array([1.0, 1.01, 1.0]))
+        def measure_with_gradients(self, problem, normalised):
+            seen = super().measure_with_gradients(problem, normalised)
+            return replace(seen, f_gradient=seen.f_gradient * np.array([1.0, 1.01, 1.0]))
 
     behind = z + 3 * trust.DIFFERENCE * np.array([0.0, 1.0, 1.0])  # point of the gradients
-    share = np.abs(evaluate.slopes(noisy, behind[None]).f_slope[0])
-    expected = 0.01 * share[1] / (share * [1.0, 1.01, 1.0]).max()
-    np.testing.assert_allclose(trust.slope_error(Wrong(BOUNDS), noisy, z), expected, rtol=1e-3)
+    normalised = np.abs(evaluate.measure_with_gradients(noisy, behind[None]).f_gradient[0])
+    expected = 0.01 * normalised[1] / (normalised * [1.0, 1.01, 1.0]).max()
+    np.testing.assert_allclose(trust.gradient_error(Wrong(BOUNDS), noisy, z), expected, rtol=1e-3)
 
 
 def test_intervals_of_mean_and_rms_agree_with_large_sample_theory():
@@ -213,19 +213,19 @@ def test_differential_evolution_finds_the_same_optimum(monkeypatch):
     np.testing.assert_allclose(np.log(found.value / checked.value), checked.distance, atol=1e-12)
     assert checked.rollouts >= 30 * 4
     # the distance is large for a search that has not left its starting point
-    lost = replace(found, share=evaluate.bounds.share(np.array([2.3, 3.0])))
+    lost = replace(found, normalised=evaluate.bounds.normalise(np.array([2.3, 3.0])))
     assert global_check.check(evaluate, lost, 0).distance > 0.5
 
 
 @pytest.mark.parametrize(("share", "kept"), [(0.985, True), (1.01, False)])
-def test_the_global_check_reports_the_original_limits(monkeypatch, share, kept):
+def test_the_global_check_reports_the_original_limits(monkeypatch, normalised, kept):
     """Gains that keep the original limit, but not the tightened limit, count as keeping it."""
     monkeypatch.setattr(global_check, "GENERATIONS", 1)
     monkeypatch.setattr(global_check, "POPULATION", 4)
     bounds = Bounds(BOUNDS.names, (3.0, 0.5, 20.0), (3.0001, 0.5001, 20.0001))  # one torque for all gains
     evaluate = Evaluator(bounds)
-    peak = float(evaluate.fly(moved_in_time(peak_torque=1.0), np.full((1, 3), 0.5)).beyond[0]) + 1.0
-    settings, limit = optimise.Settings(1, 2, 1, judged=False, margins={"peak_torque": 0.03}), peak / share
+    peak = float(evaluate.measure(moved_in_time(peak_torque=1.0), np.full((1, 3), 0.5)).largest_c[0]) + 1.0
+    settings, limit = optimise.Settings(1, 2, 1, judged=False, margins={"peak_torque": 0.03}), peak / normalised
     found = optimise.search(evaluate, moved_in_time(peak_torque=limit), (), np.array([3.0, 0.5, 20.0]), settings)
     assert bool(found.worst[0] <= 1.0) is kept
     assert global_check.check(evaluate, found, 0).kept is kept
@@ -249,11 +249,11 @@ class Steps:
     def __init__(self, c):
         self.c, self.rollouts, self.judged = c, 0, 0
 
-    def fly(self, problem, share):
-        self.rollouts += len(share)
-        self.judged += len(share) * (problem.margins is not None)
-        f = np.where(share[:, 0] > 0.9, np.inf, 3.0 + share[:, 0])
-        return Measured(2.0 + share, f, self.c(problem, share)[:, :, None], f)
+    def measure(self, problem, normalised):
+        self.rollouts += len(normalised)
+        self.judged += len(normalised) * (problem.margins is not None)
+        f = np.where(normalised[:, 0] > 0.9, np.inf, 3.0 + normalised[:, 0])
+        return Measured(2.0 + normalised, f, self.c(problem, normalised)[:, :, None], f)
 
 
 def test_the_global_check_uses_the_tightened_limits_of_the_search(monkeypatch):
@@ -264,10 +264,12 @@ def test_the_global_check_uses_the_tightened_limits_of_the_search(monkeypatch):
     monkeypatch.setattr(global_check, "POPULATION", 10)
     metric = [1.05, 0.95, 0.8]
     evaluate: Any = Steps(
-        lambda problem, share: np.select([share < 0.3, share < 0.6], metric[:2], 0.8) / problem.limit - 1.0
+        lambda problem, normalised: (
+            np.select([normalised < 0.3, normalised < 0.6], metric[:2], 0.8) / problem.limit - 1.0
+        )
     )
-    searched: Any = SimpleNamespace(problem=Told(), margins={"peak_torque": 0.1}, share=np.array([0.8]))
-    found = global_check.check(evaluate, searched, 1, sloped=False)
+    searched: Any = SimpleNamespace(problem=Told(), margins={"peak_torque": 0.1}, normalised=np.array([0.8]))
+    found = global_check.check(evaluate, searched, 1, with_gradients=False)
     assert found.kept
     assert 2.6 <= found.gains["eta"] < 2.6 + 10.0 * global_check.SPREAD  # spread of F in the final population
     np.testing.assert_allclose(np.log(found.value), found.gains["eta"] + 1.0, rtol=1e-12)
@@ -279,18 +281,18 @@ def test_the_global_check_computes_margins_only_for_surviving_points(monkeypatch
     """The result equals the result with margins at every point, which a row of the metrics represents here."""
     monkeypatch.setattr(global_check, "POPULATION", 10)
 
-    def lazily(problem, share):  # the requirement is broken below 0.2, and the margins below 0.6
-        rows = [0.2 - share, 0.6 - share] if problem.margins else [0.2 - share]
+    def lazily(problem, normalised):  # the requirement is broken below 0.2, and the margins below 0.6
+        rows = [0.2 - normalised, 0.6 - normalised] if problem.margins else [0.2 - normalised]
         return np.concatenate(rows, axis=1)
 
     ends = {}
     for told, c in (
         (Told(margins="gain_margin"), lazily),
-        (Told(), lambda _, share: np.concatenate([0.2 - share, 0.6 - share], axis=1)),
+        (Told(), lambda _, normalised: np.concatenate([0.2 - normalised, 0.6 - normalised], axis=1)),
     ):
         evaluate: Any = Steps(c)
-        searched: Any = SimpleNamespace(problem=told, margins={"peak_torque": 0.1}, share=np.array([0.8]))
-        ends[told.margins] = global_check.check(evaluate, searched, 1, sloped=False), evaluate
+        searched: Any = SimpleNamespace(problem=told, margins={"peak_torque": 0.1}, normalised=np.array([0.8]))
+        ends[told.margins] = global_check.check(evaluate, searched, 1, with_gradients=False), evaluate
     (found, lazy), (eager, every) = ends["gain_margin"], ends[None]
     assert (found.gains, found.value) == (eager.gains, eager.value)
     assert found.kept

@@ -22,20 +22,20 @@ from tests import helpers
 from tests.helpers import chain_parts, parts, random_turns, vector
 from tuning.search import (
     confirm,
-    descent,
-    descents,
     evolution,
-    flights,
     gains,
     hand_overs,
+    local_search,
+    local_searches,
+    normalisation,
     objective,
     optimise,
     rounds,
-    shares,
+    simulations,
     starts,
     worst,
 )
-from tuning.search.evaluate import Evaluator, Measured, Sloped
+from tuning.search.evaluate import Evaluator, Measured, MeasuredWithGradients
 from tuning.studies import posing, tune_files
 
 TURNED = random_turns(np.deg2rad(20.0), np.deg2rad(140.0))
@@ -45,7 +45,7 @@ SPREAD = variation.Dispersion({"initial_state": RandomNumbers("uniform", vector(
 @pytest.fixture(autouse=True)
 def short_rows(monkeypatch):
     """Use short rows, as `small_search` does, in tests without it."""
-    monkeypatch.setattr(flights, "ROW", 10)
+    monkeypatch.setattr(simulations, "ROW", 10)
 
 
 @pytest.fixture(scope="module", params=helpers.short(["chain", "spacecraft"], ["chain"]))
@@ -105,24 +105,26 @@ def test_loss_is_continuous_and_gradient_is_finite_if_delta_is_a_multiple_of_the
 
 
 def test_bounds_map_normalised_gains_to_gains_and_back():
-    some = shares.Bounds(("eta", "delta", "observer_gain"), (2.05, 0.05, 0.5), (8.0, 5.0, 300.0))
+    some = normalisation.Bounds(("eta", "delta", "observer_gain"), (2.05, 0.05, 0.5), (8.0, 5.0, 300.0))
     assert list(some.logarithmic) == [False, True, True]
     rng = np.random.default_rng(0)
-    for share in rng.random((20, 3)):
-        gains = np.asarray(some.gains(jnp.asarray(share)))
-        np.testing.assert_allclose(gains, [2.05 + 5.95 * share[0], 0.05 * 100 ** share[1], 0.5 * 600 ** share[2]])
-        np.testing.assert_allclose(some.share(gains), share, rtol=1e-12)
+    for normalised in rng.random((20, 3)):
+        gains = np.asarray(some.gains(jnp.asarray(normalised)))
+        np.testing.assert_allclose(
+            gains, [2.05 + 5.95 * normalised[0], 0.05 * 100 ** normalised[1], 0.5 * 600 ** normalised[2]]
+        )
+        np.testing.assert_allclose(some.normalise(gains), normalised, rtol=1e-12)
     np.testing.assert_allclose(some.gains(jnp.zeros(3)), some.lower, rtol=1e-14)
     np.testing.assert_allclose(some.gains(jnp.ones(3)), some.upper, rtol=1e-14)
-    np.testing.assert_array_equal(some.share(np.array([1.0, 9.0, 0.0])), [0.0, 1.0, 0.0])
+    np.testing.assert_array_equal(some.normalise(np.array([1.0, 9.0, 0.0])), [0.0, 1.0, 0.0])
     assert some.at_bound(np.array([2.051, 0.5, 299.9])) == {"eta": "lower", "observer_gain": "upper"}
 
 
 def test_a_gain_that_may_be_negative_is_searched_on_a_linear_scale():
-    some = shares.Bounds(("k", "lead"), (0.1, -1.0), (10.0, 3.0))
+    some = normalisation.Bounds(("k", "lead"), (0.1, -1.0), (10.0, 3.0))
     assert list(some.logarithmic) == [True, False]
     np.testing.assert_allclose(some.gains(jnp.asarray([0.5, 0.5])), [1.0, 1.0], rtol=1e-14)
-    np.testing.assert_allclose(some.share(np.array([1.0, 0.0])), [0.5, 0.25], rtol=1e-14)
+    np.testing.assert_allclose(some.normalise(np.array([1.0, 0.0])), [0.5, 0.25], rtol=1e-14)
     assert some.at_bound(np.array([1.0, -1.0])) == {"lead": "lower"}
 
 
@@ -135,43 +137,43 @@ def test_the_lower_bound_of_sign_width_depends_on_the_observer_gain():
     table = {"loop": {"mode": "sampled", "period": 0.05}, "hardware": {"rate_noise": 1e-6}, "tune": tune}
     made = scenario.from_tables(table)
     ready = scenario.study(made)
-    some = shares.of_scenario(made, ready.parts)
+    some = normalisation.of_scenario(made, ready.parts)
     for l_gain in (10.0, 100.0):
         moved = gains.with_gains(ready.parts, {"observer_gain": l_gain})
-        share = some.share(np.array([3.0, 0.5, l_gain, 1.0, 1e-9]))
-        assert share[4] == 0.0
-        width = some.gains(jnp.asarray(share))[4]
+        normalised = some.normalise(np.array([3.0, 0.5, l_gain, 1.0, 1e-9]))
+        assert normalised[4] == 0.0
+        width = some.gains(jnp.asarray(normalised))[4]
         np.testing.assert_allclose(width, envelopes.narrowest_sign(moved, 0.05) / 2, rtol=1e-12)
-        inside = np.append(share[:4], 0.3)
-        np.testing.assert_allclose(some.share(np.asarray(some.gains(jnp.asarray(inside)))), inside, rtol=1e-9)
+        inside = np.append(normalised[:4], 0.3)
+        np.testing.assert_allclose(some.normalise(np.asarray(some.gains(jnp.asarray(inside)))), inside, rtol=1e-9)
     # bounds from the scenario file do not change
     given = scenario.replace(made, tune=tune | {"bounds": {"sign_width": [1e-7, 1e-2]}})
-    assert shares.of_scenario(given, ready.parts).hop == 0.0
+    assert normalisation.of_scenario(given, ready.parts).hop == 0.0
 
 
 def test_the_lower_bound_of_sign_width_depends_on_the_slowest_observer_axis():
     """If each axis has its own observer gain, K2 depends on the smallest one."""
     names = ("observer_gain_1", "sign_width", "observer_gain_2")
-    some = shares.Bounds(names, (5.0, 1e-6, 5.0), (80.0, 1.0, 80.0), hop=0.2)
+    some = normalisation.Bounds(names, (5.0, 1e-6, 5.0), (80.0, 1.0, 80.0), hop=0.2)
     for slow in (0, 2):
-        share = np.where(np.arange(3) == slow, 0.25, 0.75)
-        share[1] = 0.0
-        at = np.asarray(some.gains(jnp.asarray(share)))
+        normalised = np.where(np.arange(3) == slow, 0.25, 0.75)
+        normalised[1] = 0.0
+        at = np.asarray(some.gains(jnp.asarray(normalised)))
         np.testing.assert_allclose(np.sort(at), [0.2 / 10.0, 10.0, 40.0], rtol=1e-12)  # shares 0.25, 0.75 of 5 to 80
-        np.testing.assert_allclose(some.share(at), share, atol=1e-12)
+        np.testing.assert_allclose(some.normalise(at), normalised, atol=1e-12)
 
 
 def test_reported_gains_are_rounded_within_their_bounds():
-    some = shares.Bounds(("eta", "k1"), (2.123456789, 0.1), (5.0, 1.23456789))
+    some = normalisation.Bounds(("eta", "k1"), (2.123456789, 0.1), (5.0, 1.23456789))
     found = some.rounded(np.array([2.123456789, 1.23456789]), 6)
     assert found == {"eta": 2.12346, "k1": 1.23456789}
     assert some.rounded(np.array([2.5012345678, 0.1]), 6) == {"eta": 2.50123, "k1": 0.1}
-    times = shares.Bounds(("delta",), (0.1,), (5.0,))  # the hand-over stays on its sample
+    times = normalisation.Bounds(("delta",), (0.1,), (5.0,))  # the hand-over stays on its sample
     assert times.rounded(np.array([7 * 0.123456789]), 6)["delta"] == pytest.approx(7 * 0.123456789, rel=1e-11)
 
 
 measure = programs.jit(objective.measure)
-WITHIN = shares.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0))
+WITHIN = normalisation.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0))
 FAR_OFF = dict.fromkeys(("peak_torque", "effort", "window_error"), 1e9)  # limits far out of reach
 
 
@@ -192,13 +194,13 @@ def problem(count=8, dispersion=SPREAD, may_break=None, **limits):
 
 def looked_at(some, *gains):
     """Return F, c and the logarithm of the objective at these gains, as `Evaluator` computes them."""
-    found = Evaluator(WITHIN).fly(some, WITHIN.share(np.asarray(gains))[None])
+    found = Evaluator(WITHIN).measure(some, WITHIN.normalise(np.asarray(gains))[None])
     return found.f[0], found.c[0], found.value[0]
 
 
 def flown_at(some, trials, *gains):
     """Return the metrics of these trials."""
-    return flights.trials(some.others(np.asarray(trials)), np.asarray(gains)).metrics
+    return simulations.simulate_trials(some.others(np.asarray(trials)), np.asarray(gains)).metrics
 
 
 def test_measure_returns_the_rms_of_the_worst_trials_weighted_by_the_torque_and_the_ratios_to_the_limits():
@@ -252,13 +254,13 @@ def backwards(some, at):
 def test_gradients_of_tail_and_quantile_agree_in_both_modes_and_with_finite_differences():
     some, evaluate = replace(problem(may_break=2, peak_torque=0.7), tail=2), Evaluator(WITHIN)
     at, h = np.array([3.1, 0.73]), 1e-4
-    share = WITHIN.share(at)
-    found = evaluate.slopes(some, share[None])
+    normalised = WITHIN.normalise(at)
+    found = evaluate.measure_with_gradients(some, normalised[None])
     last = np.unravel_index(found.c[0].argmax(), found.c[0].shape)
-    exact = np.stack([found.f_slope[0], found.c_slope[0][last]])
-    np.testing.assert_allclose(exact, backwards(some, at) @ jax.jacfwd(WITHIN.gains)(share), rtol=1e-9)
+    exact = np.stack([found.f_gradient[0], found.c_gradient[0][last]])
+    np.testing.assert_allclose(exact, backwards(some, at) @ jax.jacfwd(WITHIN.gains)(normalised), rtol=1e-9)
     for k in range(2):
-        seen = evaluate.fly(some, np.stack([share + n * h * np.eye(2)[k] for n in (-2, -1, 1, 2)]))
+        seen = evaluate.measure(some, np.stack([normalised + n * h * np.eye(2)[k] for n in (-2, -1, 1, 2)]))
         for slope, f in zip(exact[:, k], (seen.f, seen.c.reshape(4, -1).max(axis=1)), strict=True):
             numeric = (f[0] - 8 * f[1] + 8 * f[2] - f[3]) / (12 * h)
             np.testing.assert_allclose(slope, numeric, rtol=1e-4, atol=1e-6)
@@ -278,10 +280,10 @@ def test_minimising_the_worst_case_gives_a_smaller_worst_case_than_minimising_th
 
 def test_statistic_of_a_scenario_sets_the_tail_and_requirements_set_the_held_out_trials():
     """Of 64 trials the worst 6 are the tail for CVaR at 90 %; the 7th worst is the 90 % quantile."""
-    share = Requirement("peak_torque", 0.5, None, 0.9, None)
+    normalised = Requirement("peak_torque", 0.5, None, 0.9, None)
     sure = Requirement("peak_torque", 0.5, None, 0.9973, 0.9)
-    assert confirm.fresh_trials([share]) == confirm.FRESH
-    assert confirm.fresh_trials([share, sure]) == 2 * 852
+    assert confirm.held_out_trials([normalised]) == confirm.HELD_OUT
+    assert confirm.held_out_trials([normalised, sure]) == 2 * 852
     tables = {"rms": None, "mean": None, "worst": 1, "quantile": 7, "cvar": 6}
     for kind, tail in tables.items():
         table = scenario.from_tables({"tune": {"statistic": kind}}).tune
@@ -299,11 +301,11 @@ FAR = variation.Dispersion(
 def test_failed_trials_increase_f_and_gradients_stay_finite(lost):
     some = problem(dispersion=lost, peak_torque=0.7)
     evaluate = Evaluator(WITHIN)
-    found = evaluate.slopes(some, evaluate.bounds.share(np.array([3.0, 0.7]))[None])
+    found = evaluate.measure_with_gradients(some, evaluate.bounds.normalise(np.array([3.0, 0.7]))[None])
     np.testing.assert_allclose(found.f, (1 + 8) * np.log(objective.FAILED))
     assert np.all(found.c == objective.FAILED - 1)
-    assert np.all(np.isfinite(found.f_slope))
-    assert np.all(np.isfinite(found.c_slope))
+    assert np.all(np.isfinite(found.f_gradient))
+    assert np.all(np.isfinite(found.c_gradient))
 
 
 def test_a_large_violation_does_not_count_as_a_failed_trial(monkeypatch):
@@ -316,7 +318,7 @@ def test_a_large_violation_does_not_count_as_a_failed_trial(monkeypatch):
     )
     evaluate, settings = Evaluator(WITHIN), optimise.Settings(1, 2, 1)
     found = optimise.search(evaluate, some, wanted, np.array([3.0, 0.5]), settings)
-    assert found.worst[2] > descent.BROKEN
+    assert found.worst[2] > local_search.BROKEN
     assert found.worst[:2].max() < 1.0
     np.testing.assert_array_equal(found.worst, found.ended)
     assert list(found.conflict) == ["window_error"]
@@ -333,7 +335,7 @@ def test_a_search_whose_limit_is_out_of_reach_adds_no_trials(monkeypatch, count)
     def search_globally(run, some, count, seed):
         seeds.append((count, seed))
 
-    monkeypatch.setattr(descents.Descents, "search_globally", search_globally)
+    monkeypatch.setattr(local_searches.LocalSearches, "search_globally", search_globally)
     wanted = [Requirement("window_error", 1e-9)]
     settings = optimise.Settings(count, 2, 1, judged=False)
     found = optimise.search(Evaluator(WITHIN), problem(window_error=1e-9), wanted, np.array([3.0, 0.5]), settings)
@@ -344,7 +346,7 @@ def test_a_search_whose_limit_is_out_of_reach_adds_no_trials(monkeypatch, count)
 
 @pytest.mark.parametrize(("joined", "averaged"), [(0, 32), (8, 24), (16, 16), (24, 16)])
 def test_first_searches_use_few_trials_including_the_trials_that_joined(joined, averaged):
-    few = descents._few_trials(objective.with_trials(problem(40, peak_torque=0.7), np.arange(40, 40 + joined)))
+    few = local_searches._few_trials(objective.with_trials(problem(40, peak_torque=0.7), np.arange(40, 40 + joined)))
     assert np.asarray(few.trials).tolist() == [*range(averaged), *range(40, 40 + joined)]
     assert few.averaged == averaged
 
@@ -354,15 +356,15 @@ def test_a_failed_trial_is_worse_than_any_violation(far):
     """At the first of two points, one of two trials fails. At the second point, both violations are larger."""
     c = np.asarray([[[0.4 * far, objective.FAILED - 1.0]], [[far, far]]])
     seen = Measured(np.zeros((2, 1)), np.asarray([1.0, 2.0]), c, np.zeros(2))
-    share = np.asarray([[0.2], [0.8]])
+    normalised = np.asarray([[0.2], [0.8]])
     for order in ([0, 1], [1, 0]):
-        best = descent.Best(np.zeros(1), 1, 0.0)
+        best = local_search.Best(np.zeros(1), 1, 0.0)
         for k in order:
-            best.offer(share[k : k + 1], seen.at(k))
-        assert best.share == share[1]
+            best.offer(normalised[k : k + 1], seen.at(k))
+        assert best.normalised == normalised[1]
         assert not best.failed
-    best.offer(share, seen)
-    assert best.share == share[1]
+    best.offer(normalised, seen)
+    assert best.normalised == normalised[1]
 
 
 def test_search_agrees_with_a_brute_force_scan(monkeypatch):
@@ -383,18 +385,18 @@ def test_search_agrees_with_a_brute_force_scan(monkeypatch):
     assert not any(np.isinf(told[3:]).any() for told in seen)  # NaN before the first point
     # 64 Sobol points, two screenings of 16 trials, and at least one attempt with other hand-overs
     swept = (evaluate.rollouts - 2 * 16) / found.problem.trials.size
-    assert 64 < swept <= 64 + descents.LOOKS * hand_overs.LOOKED
+    assert 64 < swept <= 64 + local_searches.HAND_OVER_ATTEMPTS * hand_overs.OTHER_HAND_OVERS
     # Upper limit of the gradients. The scenario's gains: half of the steps twice, and one point for active limits. Each
     # starting point: half of the steps twice. The best one: all steps. Then other hand-overs, the final search, two
     # hand-overs on samples, and the reset of eta.
-    most = 2 * 20 + 1 + 2 * 3 * 20 + 20 + descents.LOOKS * 40 + 3 * 40 + 2
+    most = 2 * 20 + 1 + 2 * 3 * 20 + 20 + local_searches.HAND_OVER_ATTEMPTS * 40 + 3 * 40 + 2
     assert evaluate.gradients <= most * found.problem.trials.size
     np.testing.assert_allclose(found.gains[1] / 0.2, np.round(found.gains[1] / 0.2), rtol=1e-9)
     # grid with hand-overs on samples
     grid = np.stack(np.meshgrid(np.linspace(2.1, 4.5, 49), 0.2 * np.arange(1, 26)), axis=-1).reshape(-1, 2)
-    scan = evaluate.fly(found.problem, np.asarray([WITHIN.share(at) for at in grid]))
+    scan = evaluate.measure(found.problem, np.asarray([WITHIN.normalise(at) for at in grid]))
     margin = max(found.margins.values())
-    best = np.exp(scan.f[scan.beyond <= -margin].min())  # with the tightened limit
+    best = np.exp(scan.f[scan.largest_c <= -margin].min())  # with the tightened limit
     assert found.value <= best * 1.01
     assert found.worst[0] > 1.0 - 1.5 * margin  # the limit is active
     f, c, _ = looked_at(found.problem, *found.gains)
@@ -416,31 +418,31 @@ def test_a_global_search_follows_if_harder_trials_lead_beyond_a_limit(monkeypatc
     seeds = []
 
     def end_lost(run, harder):
-        bad = descent.Best(lost[0], 1, run._margin)
-        bad.offer(lost, evaluate.fly(run.tightened(harder), lost))
-        run._take(bad, run.tightened(harder), 0, afresh=True)
+        bad = local_search.Best(lost[0], 1, run._margin)
+        bad.offer(lost, evaluate.measure(run.tightened(harder), lost))
+        run._update_best(bad, run.tightened(harder), 0, replace_best=True)
 
-    def search_globally(run, harder, starts, seed, original=descents.Descents.search_globally):
+    def search_globally(run, harder, starts, seed, original=local_searches.LocalSearches.search_globally):
         seeds.append(seed)
         original(run, harder, starts, seed)
 
-    def descend(run, harder, shares, original=descents.Descents.descend):
+    def search_locally(run, harder, shares, original=local_searches.LocalSearches.search_locally):
         original(run, harder, shares)
         if second == "worse" and seeds:
-            run._best.over = np.inf
+            run._best.violation = np.inf
         if "Ctrl-C" in second and seeds:
             raise KeyboardInterrupt
 
     joins = iter([True])  # once, without adding a trial
     monkeypatch.setattr(rounds.Rounds, "harder", lambda self, *_: next(joins, False) and not vars(self).update(count=1))
-    monkeypatch.setattr(descents.Descents, "again", end_lost)
-    monkeypatch.setattr(descents.Descents, "search_globally", search_globally)
-    monkeypatch.setattr(descents.Descents, "descend", descend)
+    monkeypatch.setattr(local_searches.LocalSearches, "again", end_lost)
+    monkeypatch.setattr(local_searches.LocalSearches, "search_globally", search_globally)
+    monkeypatch.setattr(local_searches.LocalSearches, "search_locally", search_locally)
     found = optimise.search(evaluate, some, wanted, np.array([3.0, 0.5]), optimise.Settings(2, 10, 1))
     assert seeds == [2]
     assert found.interrupted is ("Ctrl-C" in second)
     assert bool(found.worst[0] <= 1.0) is (second != "worse")
-    assert np.array_equal(found.share, lost[0]) is (second == "worse")
+    assert np.array_equal(found.normalised, lost[0]) is (second == "worse")
 
 
 @pytest.mark.parametrize(
@@ -455,9 +457,9 @@ def test_a_global_search_follows_if_harder_trials_lead_beyond_a_limit(monkeypatc
     ],
 )
 def test_gains_with_the_largest_effect_on_active_limits_are_held_except_for_two(rows, held):
-    c = np.array([[[over - 0.5, over] for over, _ in rows]])  # the second of two trials has the larger c
+    c = np.array([[[violation - 0.5, violation] for violation, _ in rows]])  # the second of two trials has the larger c
     slope = np.array([[[np.full(4, 1e3), np.asarray(by)] for _, by in rows]])
-    seen = Sloped(np.zeros((1, 4)), np.zeros(1), c, np.zeros(1), np.zeros((1, 4)), slope)
+    seen = MeasuredWithGradients(np.zeros((1, 4)), np.zeros(1), c, np.zeros(1), np.zeros((1, 4)), slope)
     assert starts.held_by_limits(seen) == held
 
 
@@ -475,31 +477,31 @@ def test_a_problem_with_fewer_trials_keeps_added_trials_and_fractions():
     assert objective.fewer_trials(replace(some, may_break=(1,) * 3), 4).may_break[0] == 0
 
 
-@pytest.mark.parametrize(("width", "free", "sloped"), [
+@pytest.mark.parametrize(("width", "free", "with_gradients"), [
     (0.0, ["eta", "delta"], False), (1e-3, ["eta", "delta"], True), (0.0, ["eta", "sign_width"], True),
 ])  # fmt: skip
-def test_only_a_discontinuous_sign_leads_to_a_search_without_gradients(width, free, sloped):
+def test_only_a_discontinuous_sign_leads_to_a_search_without_gradients(width, free, with_gradients):
     tables = {"loop": {"mode": "sampled"}, "controller": {"sign_width": width}, "tune": {"free": free, "trials": 4}}
     posed = posing.pose(scenario.from_tables(tables), 0)
-    assert posed.sloped == sloped
+    assert posed.with_gradients == with_gradients
     assert float(posed.problem.parts.controller.sign_width) == width
 
 
 def test_a_search_without_gradients_finds_the_same_optimum(monkeypatch):
     """Both kinds of search minimise the same objective, for a law with useful gradients."""
     helpers.small_search(monkeypatch)
-    monkeypatch.setattr(descents, "MANY", 64)
+    monkeypatch.setattr(local_searches, "MANY", 64)
     monkeypatch.setattr(evolution, "GENERATIONS", 25)
-    found, evaluates = {}, {sloped: Evaluator(WITHIN) for sloped in (True, False)}
-    for sloped, evaluate in evaluates.items():
-        settings = optimise.Settings(3, 40, 1, sloped=sloped)
-        found[sloped] = optimise.search(evaluate, problem(), (), np.array([3.0, 0.5]), settings)
+    found, evaluates = {}, {with_gradients: Evaluator(WITHIN) for with_gradients in (True, False)}
+    for with_gradients, evaluate in evaluates.items():
+        settings = optimise.Settings(3, 40, 1, with_gradients=with_gradients)
+        found[with_gradients] = optimise.search(evaluate, problem(), (), np.array([3.0, 0.5]), settings)
     assert evaluates[False].gradients == 0
     np.testing.assert_allclose(found[False].value, found[True].value, rtol=1e-3)
 
 
 def test_statistics_count_failures_and_cover_the_other_trials(monkeypatch):
-    trials = flights.trials(problem().others(np.arange(8)), np.array([3.0, 0.5]))
+    trials = simulations.simulate_trials(problem().others(np.arange(8)), np.array([3.0, 0.5]))
     lost = np.array([1, 4, 6])
     trials.status[lost] = rollout.SINGULAR
     for values in trials.metrics.values():
@@ -523,10 +525,10 @@ def test_statistics_count_failures_and_cover_the_other_trials(monkeypatch):
 
 def test_the_objective_can_be_t_f_or_another_metric():
     some = problem()
-    f, _, value = looked_at(replace(some, goal="peak_torque", tail=1), 3.0, 0.7)
+    f, _, value = looked_at(replace(some, objective="peak_torque", tail=1), 3.0, 0.7)
     largest = flown_at(some, np.arange(8), 3.0, 0.7).peak_torque.max()
     np.testing.assert_allclose(np.exp([f, value]), largest, rtol=1e-10)
-    rules = replace(some, names=("eta", "t_f"), goal="t_f").rules
+    rules = replace(some, names=("eta", "t_f"), objective="t_f").rules
     f, _, value = objective.judge(rules, vector([3.0, 19.0]), jnp.ones((8, 5)), jnp.zeros(8, int))
     np.testing.assert_allclose([f, value], np.log(19.0), rtol=1e-15)
 
@@ -547,8 +549,8 @@ def test_shortest_t_f_for_a_torque_limit_agrees_with_theory(plant, monkeypatch):
         moved = 2 * 14.0 * np.tan(theta / 2)
     run = replace(run, clock=clock.anchored(0.2, 21.0, 40.0, 5.0), t_end=vector(21.0))
     wanted = [Requirement("peak_torque", limit)]
-    some = objective.problem(run, variation.Dispersion(), 3, np.arange(1), ("t_f", "delta"), wanted, goal="t_f")
-    evaluate = Evaluator(shares.Bounds(("t_f", "delta"), (8.0, 0.4), (40.0, 4.0)))
+    some = objective.problem(run, variation.Dispersion(), 3, np.arange(1), ("t_f", "delta"), wanted, objective="t_f")
+    evaluate = Evaluator(normalisation.Bounds(("t_f", "delta"), (8.0, 0.4), (40.0, 4.0)))
     found = optimise.search(evaluate, some, wanted, np.array([20.0, 1.0]), optimise.Settings(2, 20, 0))
     expected = eta * np.sqrt(moved / limit)
     # the limit is tightened by SURE_MARGIN, which increases t_f by half of it

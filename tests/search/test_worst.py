@@ -13,9 +13,9 @@ from ptsmc_jax.signals import disturbances
 from ptsmc_jax.simulation import clock, pointing
 from ptsmc_jax.simulation.requirements import Requirement
 from tests.helpers import chain_parts, parts, random_turns, short, small_search, vector
-from tuning.search import flights, objective, optimise, rounds, worst
+from tuning.search import objective, optimise, rounds, simulations, worst
 from tuning.search.evaluate import Evaluator
-from tuning.search.shares import Bounds
+from tuning.search.normalisation import Bounds
 
 T_F, ETA = 20.0, 3.0
 LIMIT = 0.5
@@ -54,7 +54,7 @@ def test_a_search_computes_only_the_pointing_metrics_that_its_problem_needs():
     problem, _ = posed(spread, Requirement("ape_z", 1e-3))
     problem = replace(problem, parts=replace(problem.parts, pointing=observed))
     gains = np.array([ETA, 1.0])
-    found = flights.trials(problem.others(np.arange(8)), gains).metrics
+    found = simulations.simulate_trials(problem.others(np.arange(8)), gains).metrics
     every = montecarlo.run(problem.parts, spread, 5, np.arange(8)).metrics
     np.testing.assert_allclose(found.ape_z, every.ape_z, rtol=1e-12)
     np.testing.assert_allclose(found.hold_error, every.hold_error, rtol=1e-12)
@@ -64,7 +64,7 @@ def test_a_search_computes_only_the_pointing_metrics_that_its_problem_needs():
 @pytest.fixture(autouse=True)
 def few_screened(monkeypatch):
     monkeypatch.setattr(worst, "SCREENED", 64)
-    monkeypatch.setattr(flights, "ROW", 10)
+    monkeypatch.setattr(simulations, "ROW", 10)
 
 
 @pytest.mark.long  # shorter tests below cover the ascent for a chain, and gradients of attitudes
@@ -188,18 +188,18 @@ def test_gradients_of_the_ascent_agree_with_finite_differences(what):
     else:
         limits = {"effort": 3.0, "peak_rate": 0.05}
         problem, _ = swinging(0.0, [1.0, 0.1], 0.01, **limits)
-    fleet = problem.others(np.arange(4, 7))
-    y = np.concatenate([worst._charted(problem, name, v) for name, v in fleet.coordinates.items()], axis=1)
+    batch = problem.others(np.arange(4, 7))
+    y = np.concatenate([worst._charted(problem, name, v) for name, v in batch.coordinates.items()], axis=1)
     at = np.array([ETA, 1.0])
 
-    def climb(y):
-        return worst.climb(fleet, at, y, objective.watched(problem), limits)
+    def ratio_with_gradient(y):
+        return worst.ratio_with_gradient(batch, at, y, objective.watched(problem), limits)
 
-    slope = climb(y)[1]
+    slope = ratio_with_gradient(y)[1]
     assert slope.shape == y.shape == (3, 3 if what == "attitudes" else 5)
     assert np.all(np.abs(slope).max(axis=0) > 0.0) or what == "attitudes"
     for k, step in enumerate(1e-5 * np.eye(y.shape[1])):
-        numeric = (climb(y + step)[0] - climb(y - step)[0]) / 2e-5
+        numeric = (ratio_with_gradient(y + step)[0] - ratio_with_gradient(y - step)[0]) / 2e-5
         np.testing.assert_allclose(slope[:, k], numeric, rtol=1e-5, atol=1e-6 * np.abs(slope).max())
 
 
@@ -253,8 +253,8 @@ def test_given_coordinates_are_simulated_as_random_ones():
     given = rounds._add(roomy, np.array([8]), rounds.Joining(np.asarray([7]), np.array([True]), drawn))
     assert roomy.trials[8] == roomy.trials[0]  # the original is not changed
     evaluate = Evaluator(Bounds(problem.names, (2.5, 0.3), (6.0, 4.0)))
-    share = evaluate.bounds.share(np.array([3.2, 0.9]))[None]
-    one, other = evaluate.fly(more, share), evaluate.fly(given, share)
+    normalised = evaluate.bounds.normalise(np.array([3.2, 0.9]))[None]
+    one, other = evaluate.measure(more, normalised), evaluate.measure(given, normalised)
     np.testing.assert_allclose(one.f, other.f, rtol=1e-12)
     np.testing.assert_allclose(other.c[0, 0, 8], one.c[0, 0, 8], rtol=1e-12)
     np.testing.assert_allclose(other.c[0, 0, 9:], one.c[0, 0, 0], rtol=1e-12)
@@ -310,7 +310,7 @@ def test_the_hardest_screened_trial_is_the_worst_case_if_nothing_can_be_moved():
     spread = variation.Dispersion(
         {"initial_attitude": numbers.any_attitude(), "inertia": inertias.RelativeInertia(*body)}
     )
-    assert flights.movable(spread) == ("initial_attitude",)
+    assert simulations.movable(spread) == ("initial_attitude",)
     run = chain_parts([1.0, 0.0], T_F, ETA, 1.0, period=0.2, noise=[1e-2, 1e-3])
     run = replace(run, clock=clock.anchored(0.2, 21.0, T_F, 5.0), t_end=vector(21.0))
     wanted = [Requirement("peak_rate", 0.1)]
@@ -324,9 +324,9 @@ def test_the_hardest_screened_trial_is_the_worst_case_if_nothing_can_be_moved():
     np.testing.assert_allclose([found.ratio, found.screened], ratio.max(), rtol=1e-9)
     assert np.ptp(ratio) > 0.0
     # with more trials than a row, the results keep the order of the trials
-    assert trials.size > flights.ROW
+    assert trials.size > simulations.ROW
     some = trials[[3, -1, -2]]
-    alone = flights.trials(problem.others(some), at)
+    alone = simulations.simulate_trials(problem.others(some), at)
     np.testing.assert_allclose(alone.metrics.peak_rate / 0.1, ratio[[3, -1, -2]], rtol=1e-12)
 
 
@@ -344,9 +344,9 @@ def test_a_trial_without_a_metric_is_the_hardest(plant):
     assert not np.isnan(ratio).any()
     found = worst.hardest(problem, wanted, at)
     assert found.status in ("ok", "not_converged")
-    assert (found.ratio, found.beyond, found.unbounded) == (np.inf, True, False)
+    assert (found.ratio, found.breaks_limit, found.unbounded) == (np.inf, True, False)
     evaluate = Evaluator(Bounds(problem.names, (2.5, 0.3), (6.0, 4.0)))
-    found = evaluate.slopes(problem, evaluate.bounds.share(at)[None])
+    found = evaluate.measure_with_gradients(problem, evaluate.bounds.normalise(at)[None])
     assert all(np.isfinite(v).all() for v in vars(found).values())
     assert (found.c == objective.FAILED - 1.0).any()
 

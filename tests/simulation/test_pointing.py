@@ -339,9 +339,9 @@ def test_gradients_of_indices_match_finite_differences():
         tally = tallied(NODES * (1.0 + 0.01 * size), error, rates * (0.1 + size), 4.03 + 0.02 * size, 0.37, none)
         return jnp.stack(list(indices(tally).values()))
 
-    sloped, at, step = jax.jit(lambda size: jax.jvp(of, (size,), (vector(1.0),))), 0.3, 1e-6
-    slopes = sloped(vector(at))[1]
-    differences = (sloped(vector(at + step))[0] - sloped(vector(at - step))[0]) / (2 * step)
+    with_gradients, at, step = jax.jit(lambda size: jax.jvp(of, (size,), (vector(1.0),))), 0.3, 1e-6
+    slopes = with_gradients(vector(at))[1]
+    differences = (with_gradients(vector(at + step))[0] - with_gradients(vector(at - step))[0]) / (2 * step)
     np.testing.assert_allclose(slopes, differences, rtol=1e-6, atol=1e-9)
     assert np.all(np.abs(slopes) > 1e-6)
 

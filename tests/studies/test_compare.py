@@ -132,8 +132,8 @@ def test_baseline_law_of_the_scenario_keeps_the_bounds_of_the_scenario():
     assert posed["prescribed_time"].controller.kind == "prescribed_time"
     expected = ("eta", "delta", "observer_gain", "k1", "sign_width", "surface_rate")
     assert tuned(posed["prescribed_time"]).free == expected
-    assert gains.papers(mine).controller.eta == 3.0
-    assert gains.papers(mine).controller.t_f == 5.0
+    assert gains.published_scenario(mine).controller.eta == 3.0
+    assert gains.published_scenario(mine).controller.t_f == 5.0
 
 
 @pytest.mark.parametrize(
@@ -348,7 +348,7 @@ def lines_of(summary):
 @pytest.mark.parametrize(("period", "scaled"), [(0.05, False), (0.2, True)])
 def test_report_says_if_published_gains_are_scaled(eight, period, scaled):
     """The published delta of 0.05 s is shorter than a period of 0.2 s."""
-    flown = gains.papers(scenario.from_tables({"loop": {"mode": "sampled", "period": period}}))
+    flown = gains.published_scenario(scenario.from_tables({"loop": {"mode": "sampled", "period": period}}))
     made = {compare.PAPER: replace(contender(eight), flown=flown), compare.OURS: contender(eight)}
     lines = lines_of(compare.summary(compare.Comparison(made, 0, False)))
     assert any(line.startswith("published gains, scaled to this body and period: ") for line in lines) == scaled

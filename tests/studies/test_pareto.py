@@ -17,7 +17,7 @@ from ptsmc_jax.simulation.catalogues import CATALOGUE
 from ptsmc_jax.simulation.metrics import Metrics
 from tests.helpers import SHORT, SHORT_CHAIN, short, small_search, tree
 from tests.output.pages import checked
-from tuning.search import descent, descents
+from tuning.search import local_search, local_searches
 from tuning.search.evaluate import Measured
 from tuning.studies import front, judging, pareto, posing, trades
 
@@ -133,10 +133,10 @@ def test_pareto_command_computes_a_torque_front(command, tmp_path, monkeypatch, 
     # the scenario's torque limit is a target, and its gains are at least as accurate as all known feasible gains
     (trained,) = [float(row["trained_goal"]) for row in rows if float(row["limit"]) == limit]
     ((problems, known, evaluate),) = begun
-    flown = evaluate.fly(problems[limit].tightened(1.0 - pareto.MARGIN), known)
+    flown = evaluate.measure(problems[limit].tightened(1.0 - pareto.MARGIN), known)
     assert len(known) > len(searched)  # including other local minima of the searches
     assert searched.count(limit) == 1
-    assert trained <= np.exp(flown.value[flown.beyond <= descent.SLACK].min()) * (1.0 + 1e-9)
+    assert trained <= np.exp(flown.value[flown.largest_c <= local_search.SLACK].min()) * (1.0 + 1e-9)
     for row in rows:
         assert float(row["rms_low"]) <= float(row["rms_window_error"]) <= float(row["rms_high"])
         # simulate the gains of the row again
@@ -195,10 +195,10 @@ def test_own_torque_limit_replaces_the_nearest_default_limit(limit):
     """The nearest limit is in logarithms. The ends stay, because searches have found feasible gains for them."""
     usual = np.array([1.0, 2.0, 4.0, 8.0, 16.0])
     ladder, middle = trades.limits_between(1.0, 16.0, 5, limit)
-    rungs = {1.001: 1, 1.4: 1, 1.5: 1, 3.0: 2, 5.0: 2, 6.0: 3, 15.9: 3}  # above 2 sqrt(2), 4 is nearer than 2
-    assert middle == rungs.get(limit, 2)
+    stages = {1.001: 1, 1.4: 1, 1.5: 1, 3.0: 2, 5.0: 2, 6.0: 3, 15.9: 3}  # above 2 sqrt(2), 4 is nearer than 2
+    assert middle == stages.get(limit, 2)
     np.testing.assert_allclose(np.delete(ladder, middle), np.delete(usual, middle), rtol=1e-14)
-    assert ladder[middle] == (limit if limit in rungs else pytest.approx(4.0, rel=1e-14))
+    assert ladder[middle] == (limit if limit in stages else pytest.approx(4.0, rel=1e-14))
 
 
 @pytest.mark.parametrize(("found", "best"), [(None, 2.0), (3.0, 2.0), (1.5, 1.5)])
@@ -209,21 +209,21 @@ def test_refined_target_is_not_worse_than_the_known_feasible_gains(monkeypatch, 
         f = share[:, 0]
         return Measured(share, f, np.where(f < 1.4, 0.1, -0.1)[:, None, None], f)
 
-    class Found(descents.Descents):
-        def descend(self, problem, starts):
+    class Found(local_searches.LocalSearches):
+        def search_locally(self, problem, starts):
             if found is not None:
-                self._best = descent.Best(np.full(1, found), 1, pareto.MARGIN)
-                self._best.offer(self._best.share[None], measured(problem, self._best.share[None]))
+                self._best = local_search.Best(np.full(1, found), 1, pareto.MARGIN)
+                self._best.offer(self._best.normalised[None], measured(problem, self._best.normalised[None]))
 
         def tightened(self, problem):
             return problem
 
     monkeypatch.setattr(pareto, "Descents", Found)
-    posed: Any = SimpleNamespace(evaluate=SimpleNamespace(fly=measured), sloped=True)
+    posed: Any = SimpleNamespace(evaluate=SimpleNamespace(fly=measured), with_gradients=True)
     problem: Any = SimpleNamespace(rows=["peak_torque"])
     step = pareto._refined(posed, problem, np.asarray([[1.0], [2.0], [4.0]]))
     assert step is not None
-    assert (step.f, step.over) == (best, 0.0)
+    assert (step.f, step.violation) == (best, 0.0)
     assert pareto._refined(posed, problem, np.asarray([[1.0]])) is None or found is not None
 
 

@@ -14,9 +14,9 @@ from ptsmc_jax.scenario.tables import objective_name
 from ptsmc_jax.simulation.requirements import Requirement
 from tests.helpers import FIRST_FLIGHT, ROOT, SHORT_CHAIN, small_search
 from tuning.output import summaries, tune_report
-from tuning.search import shares, trust, worst
-from tuning.search.descents import Step
+from tuning.search import normalisation, trust, worst
 from tuning.search.evaluate import Evaluator
+from tuning.search.local_searches import Step
 from tuning.studies import judging, posing, tune_files, tuner
 
 LIMIT = 0.6  # on the peak torque
@@ -135,7 +135,7 @@ def test_accuracy_gain_uses_trials_that_both_sets_of_gains_finish():
 def test_influence_of_a_gain_is_unknown_if_no_trial_finishes(goal, said):
     """If no trial has an objective, its replacement value is equal for all gains, which is no evidence."""
     profile = trust.Profile(np.arange(3.0), np.full(3, goal), np.ones(3), np.zeros(3))
-    found: Any = SimpleNamespace(slope_error=None, profiles={"eta": profile}, sensitivities={}, margins={})
+    found: Any = SimpleNamespace(gradient_error=None, profiles={"eta": profile}, sensitivities={}, margins={})
     tuning: Any = SimpleNamespace(tuned=SimpleNamespace(sampled=True, hardware=None), at_bound={"eta": "upper"})
     assert tune_files._trust(found, tuning)["influence"] == {"eta": said}
 
@@ -169,7 +169,7 @@ class Found:
     history: tuple[Step, ...] = ()
 
     @property
-    def share(self) -> np.ndarray:
+    def normalised(self) -> np.ndarray:
         return np.ones(len(self.gains))
 
 
@@ -177,17 +177,17 @@ class Rising:
     """A problem of K1 and eta with F = -ln K1. A search ends at the upper bounds of both; eta has no effect."""
 
     def __init__(self, made: scenario.Scenario, searched: list[dict[str, tuple[float, float]]]):
-        self.ready, self.seed, self.sloped, self.problem = SimpleNamespace(scenario=made), 0, True, None
+        self.ready, self.seed, self.with_gradients, self.problem = SimpleNamespace(scenario=made), 0, True, None
         self.searched, names = searched, tuple(made.search.bounds)
         lower, upper = zip(*made.search.bounds.values(), strict=True)
-        bounds = shares.Bounds(names, lower, upper)
+        bounds = normalisation.Bounds(names, lower, upper)
 
-        def fly(problem: Any, share: np.ndarray) -> Any:
-            k1 = np.array([bounds.gains(one)[names.index("k1")] for one in share])
-            return SimpleNamespace(f=-np.log(k1), beyond=np.zeros(len(k1)))
+        def fly(problem: Any, normalised: np.ndarray) -> Any:
+            k1 = np.array([bounds.gains(one)[names.index("k1")] for one in normalised])
+            return SimpleNamespace(f=-np.log(k1), largest_c=np.zeros(len(k1)))
 
         self.evaluate = Evaluator(bounds)
-        self.evaluate.fly = fly
+        self.evaluate.measure = fly
 
     def search(self, problem: Any, gains: Any, starts: int, report: Any) -> Found:
         self.searched.append(dict(self.ready.scenario.search.bounds))

@@ -34,13 +34,13 @@ def of(loop, **how):
     if not how and room is not None and np.all(np.array(sizes) <= room):
         loop = larger(loop, *room)
         if loop.delay == 1:
-            return jax.tree.map(np.asarray, sloped(loop, jax.tree.map(np.zeros_like, loop))[2])
+            return jax.tree.map(np.asarray, with_gradients(loop, jax.tree.map(np.zeros_like, loop))[2])
     each = margins.of_each(jax.tree.map(lambda v: np.asarray(v)[None], loop), **how)
     return jax.tree.map(lambda v: np.asarray(v)[0] if how else np.asarray(v)[0, : sizes[2]], each)
 
 
 @programs.jit
-def sloped(loop, way):
+def with_gradients(loop, way):
     """Margins of the first input, their derivatives along a direction, and the margins of all inputs."""
 
     def margins_of(loop):

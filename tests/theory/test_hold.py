@@ -109,13 +109,13 @@ def test_gradient_by_the_surface_rate_equals_the_closed_form():
         run = replace(run, controller=replace(run.controller, surface_rate=c))
         return rollout.simulate(run).metrics.window_error
 
-    sloped = jax.jit(lambda run, c: jax.jvp(lambda c: measured(run, c), (c,), (jnp.ones_like(c),)))
+    with_gradients = jax.jit(lambda run, c: jax.jvp(lambda c: measured(run, c), (c,), (jnp.ones_like(c),)))
     for c, k in ((1.0, 1.0), (2.5, 0.7)):
         run, at, h = flown(2, c, k), vector(c), 1e-3
-        forward = float(sloped(run, at)[1])
+        forward = float(with_gradients(run, at)[1])
         # the error of the trapezium rule is (1/400)^2 / 12 times a second derivative of about 10
         np.testing.assert_allclose(forward, jax.jacfwd(expected, 1)(run, at), rtol=1e-5)
-        two_back, back, ahead, two_ahead = (float(sloped(run, at + step * h)[0]) for step in (-2, -1, 1, 2))
+        two_back, back, ahead, two_ahead = (float(with_gradients(run, at + step * h)[0]) for step in (-2, -1, 1, 2))
         difference = (two_back - 8 * back + 8 * ahead - two_ahead) / (12 * h)
         np.testing.assert_allclose(forward, difference, rtol=1e-8)  # errors of order h^4 and 1e-15 / h
 

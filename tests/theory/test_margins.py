@@ -26,7 +26,7 @@ from tests.theory.loops import (
     larger,
     of,
     radius_late,
-    sloped,
+    with_gradients,
 )
 from tuning.search.gains import with_gains
 
@@ -142,9 +142,9 @@ def test_margin_derivatives_equal_finite_differences():
     h = 1e-4
     for way in ways:
         moved = {n: jax.tree.map(lambda v, by, n=n: v + n * h * by, loop, way) for n in (-2, -1, 1, 2)}
-        far_down, down, up, far_up = (np.asarray(sloped(one, way)[0]) for one in moved.values())
+        far_down, down, up, far_up = (np.asarray(with_gradients(one, way)[0]) for one in moved.values())
         numeric = (8 * (up - down) - far_up + far_down) / (12 * h)
-        exact = np.asarray(sloped(loop, way)[1])
+        exact = np.asarray(with_gradients(loop, way)[1])
         assert np.all(np.abs(exact) > 1e-6)
         np.testing.assert_allclose(exact, numeric, rtol=1e-6, atol=1e-9 * np.abs(exact).max())
 
@@ -648,10 +648,10 @@ def test_lapack_receives_one_matrix_at_a_time():
     loop = replace(held(*INTEGRATORS, 0.5), delay=1)
     body = a_body(period=0.1)
     loops = jax.tree.map(lambda v: jnp.stack([v, v]), loop)
-    sloped = jax.jacfwd(lambda x: margins.of_each(jax.tree.map(lambda v: x * v, loops)))
+    with_gradients = jax.jacfwd(lambda x: margins.of_each(jax.tree.map(lambda v: x * v, loops)))
     traces = {
         "each": margins.of_each.trace(loops),
-        "their slopes": jax.make_jaxpr(sloped)(1.0),
+        "their slopes": jax.make_jaxpr(with_gradients)(1.0),
         "roughly": jax.make_jaxpr(lambda loops: jax.lax.map(margins.roughly, loops))(loops),
         "responses": margins._responses.trace(loop),
         "at rest": rest._unexplained.trace(body, jax.eval_shape(linear.nominal, body)),

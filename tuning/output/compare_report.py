@@ -230,7 +230,9 @@ def lines(summary: Compare) -> Iterator[str]:
         gains = ", ".join(f"{gain} {value:.4g}" for gain, value in law.gains.items())
         bound = "".join(f"; {gain} on its {side} bound" for gain, side in law.at_bound.items())
         scaled = (
-            ", scaled to this body and period" if (name, summary.paper_is) == ("paper", "published, scaled") else ""
+            ", scaled to this body and period"
+            if (name, summary.published_label) == ("paper", "published, scaled")
+            else ""
         )
         yield f"{_name(name)}{scaled}: {gains}{bound}"
         failures = failed(law.counts)

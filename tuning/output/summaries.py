@@ -95,9 +95,9 @@ class Confirmed(msgspec.Struct, frozen=True):
     """The confirmation of a requirement on a fraction of the trials."""
 
     metric: str
-    held: bool
+    confirmed: bool
     trials: int
-    beyond: int
+    violations: int
     allowed: int | None
     probability: float
 
@@ -108,7 +108,7 @@ class Hardest(msgspec.Struct, frozen=True):
     metric: str
     ratio: Number
     unbounded: bool
-    beyond: bool
+    breaks_limit: bool
     moved: list[str]
     status: str
 
@@ -197,7 +197,7 @@ class Tune(msgspec.Struct, frozen=True, kw_only=True):
     paper: Group | None = None
     before: Group | None = None
     paper_refused: str | None
-    paper_is: str
+    published_label: str
     shortest_t_f: ShortestTime | None
     broken_by: dict[str, list[str]]
     verdicts: list[Entry]
@@ -244,7 +244,7 @@ class Compare(msgspec.Struct, frozen=True):
     status: str
     trials: int
     paper_refused: str | None
-    paper_is: str | None
+    published_label: str | None
     judged_on: str
     settling_angle: float
     laws: dict[str, Law]

@@ -34,7 +34,7 @@ def of(summary: Tune) -> Report:
 
 def _groups(summary: Tune) -> dict[str, Group]:
     """Return the gains side by side, by the headings of their columns."""
-    groups = {summary.paper_is: summary.paper, "before": summary.before, "tuned": summary.fresh}
+    groups = {summary.published_label: summary.paper, "before": summary.before, "tuned": summary.fresh}
     return {name: group for name, group in groups.items() if group is not None}
 
 
@@ -111,7 +111,11 @@ def accuracy(summary: Tune) -> Iterator[str]:
 
 def _beside_paper(summary: Tune) -> Iterator[str]:
     """Return the comparison with the published gains."""
-    times, bounds, paper = summary.accuracy_gain_over_paper, summary.accuracy_gain_interval, PAPER[summary.paper_is]
+    times, bounds, paper = (
+        summary.accuracy_gain_over_paper,
+        summary.accuracy_gain_interval,
+        PAPER[summary.published_label],
+    )
     if summary.paper_refused:
         yield f"the published gains cannot be simulated in this scenario: {summary.paper_refused}"
     if times is None or not summary.fresh.counts.get("ok", 0):
@@ -141,8 +145,8 @@ def search(summary: Tune) -> Iterator[str]:
     for count in record.confirmed:
         most = "none allowed" if count.allowed is None else f"at most {count.allowed} allowed"
         yield (
-            f"{count.metric} {'confirmed' if count.held else 'NOT confirmed'} on {count.trials} other trials: "
-            f"{count.beyond} beyond the limit, {most}; probability that the held-out trials meet it: "
+            f"{count.metric} {'confirmed' if count.confirmed else 'NOT confirmed'} on {count.trials} other trials: "
+            f"{count.violations} beyond the limit, {most}; probability that the held-out trials meet it: "
             f"{percent(count.probability)} %"
         )
     hopeless = [metric for metric, one in over.items() if one is None or one > HOPELESS]
@@ -222,7 +226,7 @@ def _worst_case(hardest: Hardest, *, tuned_for: bool) -> str:
             f"trials instead, {hardest.metric} = {{ limit = .., quantile = 0.99 }}"
         )
     far = "has no value" if hardest.ratio is None else f"is {hardest.ratio:.4g} times its limit"
-    tip = "" if tuned_for or not hardest.beyond else "; tune.worst_case = true tunes for it"
+    tip = "" if tuned_for or not hardest.breaks_limit else "; tune.worst_case = true tunes for it"
     return f"{where}, {hardest.metric} {far}{tip}"
 
 
@@ -253,7 +257,7 @@ def _violation(summary: Tune, metric: str, reached: float | None) -> str:
 
 
 def _of_limit(metric: str, over: float) -> float:
-    """Return the value of a metric relative to its limit from `requirements.over`."""
+    """Return the value of a metric relative to its limit from `requirements.violation_ratio`."""
     return 2.0 - over if metric in MARGINS and MARGINS[metric].at_least else over
 
 

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ptsmc_jax.simulation.requirements import Requirement, fewest_trials, must_keep, over
-from tuning.search import flights
+from ptsmc_jax.simulation.requirements import Requirement, fewest_trials, must_keep, violation_ratio
+from tuning.search import simulations
 from tuning.search.objective import Problem
 
-FRESH = 1000  # smallest number of held-out trials of the verdict
+HELD_OUT = 1000  # smallest number of held-out trials of the verdict
 FEWEST, TIMES = 4096, 8  # smallest number of confirmation trials: absolute, and relative to the held-out trials
 SHOWN = 2  # times the smallest number of trials that can verify a quantile, so that some trials may break its limit
 SURE = 0.98  # a requirement is confirmed if its verdict will be met with at least this probability
@@ -27,27 +27,27 @@ class Count:
 
     metric: str
     trials: int
-    beyond: int
+    violations: int
     allowed: int | None  # largest number beyond the limit; None: too few trials to confirm the requirement
     probability: float  # probability that the verdict on held-out trials is met
     harder: np.ndarray  # trials beyond the limit except for the `allowed` worst, the worst first
     band: np.ndarray  # trials ranked around the last trial that may break the limit, see `may_break`
 
     @property
-    def held(self) -> bool:
+    def confirmed(self) -> bool:
         """Whether the requirement is confirmed."""
-        return self.allowed is not None and self.beyond <= self.allowed
+        return self.allowed is not None and self.violations <= self.allowed
 
 
-def fresh_trials(requirements: Sequence[Requirement]) -> int:
+def held_out_trials(requirements: Sequence[Requirement]) -> int:
     """Return the number of held-out trials: enough to verify every quantile with some trials beyond the limit."""
     needed = [fewest_trials(r.quantile, r.confidence) for r in requirements if r.quantile and r.confidence]
-    return max([FRESH, *(SHOWN * count for count in needed)])
+    return max([HELD_OUT, *(SHOWN * count for count in needed)])
 
 
 def counted_on(requirements: Sequence[Requirement]) -> int:
     """Return the number of confirmation trials."""
-    return max(FEWEST, TIMES * fresh_trials(requirements))
+    return max(FEWEST, TIMES * held_out_trials(requirements))
 
 
 def may_break(requirement: Requirement, requirements: Sequence[Requirement], trials: int) -> tuple[int | None, bool]:
@@ -70,10 +70,10 @@ def may_break(requirement: Requirement, requirements: Sequence[Requirement], tri
         least = must_keep(trials, quantile, confidence)
         assert least is not None
         return trials - least, False
-    return min(FARTHER, allowed(requirement, fresh_trials(requirements), counted_on(requirements)) or 0), True
+    return min(FARTHER, allowed(requirement, held_out_trials(requirements), counted_on(requirements)) or 0), True
 
 
-def probability(requirement: Requirement, fresh: int, trials: int, beyond: int) -> float:
+def probability(requirement: Requirement, held_out: int, trials: int, violations: int) -> float:
     """Return the probability that a verdict on held-out trials is met, given a count on other trials.
 
     The distribution is beta-binomial with a uniform prior on the fraction of trials that break the limit (Gelman and
@@ -81,29 +81,33 @@ def probability(requirement: Requirement, fresh: int, trials: int, beyond: int) 
 
     Args:
         requirement: the requirement.
-        fresh: number of held-out trials of the verdict.
+        held_out: number of held-out trials of the verdict.
         trials: number of counted trials.
-        beyond: number of counted trials that break the limit.
+        violations: number of counted trials that break the limit.
     """
     from scipy.stats import betabinom  # imported here because the import is slow and most runs do not need it
 
-    least = must_keep(fresh, requirement.quantile, requirement.confidence)
-    return 0.0 if least is None else float(betabinom.cdf(fresh - least, fresh, beyond + 1, trials - beyond + 1))
+    least = must_keep(held_out, requirement.quantile, requirement.confidence)
+    return (
+        0.0
+        if least is None
+        else float(betabinom.cdf(held_out - least, held_out, violations + 1, trials - violations + 1))
+    )
 
 
-def allowed(requirement: Requirement, fresh: int, trials: int) -> int | None:
+def allowed(requirement: Requirement, held_out: int, trials: int) -> int | None:
     """Return the largest number of trials that may break the limit if `probability` must be at least `SURE`.
 
     Args:
         requirement: the requirement.
-        fresh: number of held-out trials of the verdict.
+        held_out: number of held-out trials of the verdict.
         trials: number of counted trials.
 
     Returns:
         The number, or None if the requirement cannot be confirmed on so few trials.
     """
     too_many = bisect.bisect_left(
-        range(trials), True, key=lambda beyond: probability(requirement, fresh, trials, beyond) < SURE
+        range(trials), True, key=lambda violations: probability(requirement, held_out, trials, violations) < SURE
     )
     return too_many - 1 if too_many else None
 
@@ -123,25 +127,25 @@ def count(
     Returns:
         The count for each requirement.
     """
-    fresh, many = fresh_trials(requirements), counted_on(requirements)
+    held_out, many = held_out_trials(requirements), counted_on(requirements)
     numbers = (first + turn * many + np.arange(many)).astype(np.uint32)
-    flown = flights.trials(problem.others(numbers), gains)
+    simulated = simulations.simulate_trials(problem.others(numbers), gains)
     counts = []
     for requirement in requirements:
-        values = np.where(flown.finished, getattr(flown.metrics, requirement.metric), np.inf)
-        ratio = over(np.where(np.isnan(values), np.inf, values), requirement.limit, at_least=False)
+        values = np.where(simulated.finished, getattr(simulated.metrics, requirement.metric), np.inf)
+        ratio = violation_ratio(np.where(np.isnan(values), np.inf, values), requirement.limit, at_least=False)
         farthest_first = numbers[np.argsort(-ratio, kind="stable")]
-        beyond = int(np.sum(ratio > 1.0))
-        most = allowed(requirement, fresh, many)
+        violations = int(np.sum(ratio > 1.0))
+        most = allowed(requirement, held_out, many)
         last = most or 0
         counts.append(
             Count(
                 metric=requirement.metric,
                 trials=many,
-                beyond=beyond,
+                violations=violations,
                 allowed=most,
-                probability=probability(requirement, fresh, many, beyond),
-                harder=farthest_first[last:beyond],
+                probability=probability(requirement, held_out, many, violations),
+                harder=farthest_first[last:violations],
                 band=farthest_first[max(0, last - FARTHER) : last + NEARER],
             )
         )

@@ -36,7 +36,7 @@ class ShortestTime:
     unit: str | None = None  # unit of the limit
 
 
-def shortest_time(flown: Scenario, asked: Requirement, seed: int, trials: np.ndarray) -> ShortestTime:
+def shortest_time(loaded: Scenario, requirement: Requirement, seed: int, trials: np.ndarray) -> ShortestTime:
     """Return the shortest t_f that keeps a limit on the commanded input, with all other gains of the scenario.
 
     The number of trials that must keep the limit follows from the requirement's verdict. Theory uses the largest input
@@ -44,16 +44,16 @@ def shortest_time(flown: Scenario, asked: Requirement, seed: int, trials: np.nda
     by simulation begins at the t_f from theory.
 
     Args:
-        flown: the scenario.
-        asked: the requirement with the limit.
+        loaded: the scenario.
+        requirement: the requirement with the limit.
         seed: seed of the dispersions and the noise.
         trials: (trials,) numbers of the trials.
     """
-    ready = scenario.study(flown)
+    ready = scenario.study(loaded)
     drawn = ready.dispersion, jnp.uint32(seed), jnp.asarray(trials, dtype=jnp.uint32)
-    limit, quantile = asked.limit, None if len(trials) == 1 else asked.implied_by.quantile
-    told = len(trials), quantile, asked.unit
-    deciding = (must_keep(len(trials), quantile, asked.confidence) or len(trials)) - 1  # index in ascending order
+    limit, quantile = requirement.limit, None if len(trials) == 1 else requirement.implied_by.quantile
+    context = len(trials), quantile, requirement.unit
+    deciding = (must_keep(len(trials), quantile, requirement.confidence) or len(trials)) - 1  # index in ascending order
 
     def predicted(t_f: float) -> float:
         return float(np.sort(_predicted(ready.parts, *drawn, t_f))[deciding])
@@ -62,7 +62,7 @@ def shortest_time(flown: Scenario, asked: Requirement, seed: int, trials: np.nda
     lowest = 1.05 * max(float(ready.parts.controller.delta), float(getattr(ready.parts.observer, "t_o", 0.0)))
     rule = _smallest(predicted, limit, present_t_f, lowest, FARTHEST * present_t_f, CLOSE, 60)
     if rule is None:
-        return ShortestTime(limit, None, None, *told)
+        return ShortestTime(limit, None, None, *context)
 
     def simulated_in(ready: scenario.Study, longest: float) -> float | None:
         def simulated(t_f: float) -> float:
@@ -78,9 +78,9 @@ def shortest_time(flown: Scenario, asked: Requirement, seed: int, trials: np.nda
     if shortest is None:
         longest = max(1.5 * rule, present_t_f)
         with contextlib.suppress(ScenarioError):  # for example a reference that reaches the law's singularity later
-            roomy = scenario.study(in_scenario(flown, {"t_f": longest}))
+            roomy = scenario.study(in_scenario(loaded, {"t_f": longest}))
             shortest = simulated_in(roomy, longest)
-    return ShortestTime(limit, rule, shortest, *told)
+    return ShortestTime(limit, rule, shortest, *context)
 
 
 @programs.jit
@@ -117,23 +117,23 @@ def _smallest(
         close: relative width of the bracket at which the search ends.
         most: largest number of peaks to compute.
     """
-    over, kept = lowest, None  # largest t_f that breaks the limit, and smallest t_f that keeps it
+    too_short, long_enough = lowest, None  # largest t_f that breaks the limit, and smallest t_f that keeps it
     guess = start
     for looked in range(most):
         value = peak(guess)
         if value <= limit:
-            kept = guess
+            long_enough = guess
         else:
-            over = max(over, guess)
-        if kept is not None and kept - over <= close * kept:
+            too_short = max(too_short, guess)
+        if long_enough is not None and long_enough - too_short <= close * long_enough:
             break
-        if kept is None and over >= longest:
+        if long_enough is None and too_short >= longest:
             return None
         step = guess * (value / limit) ** 0.5 if np.isfinite(value) and value > 0 else 2 * guess
         step *= 1 - 0.5 * close if value <= limit else 1 + 0.2 * close  # aim just beyond the crossing
         bold = looked % 3 == 2
-        if kept is None:
-            guess = min(2 * over if bold else max(step, 1.001 * over), longest)
+        if long_enough is None:
+            guess = min(2 * too_short if bold else max(step, 1.001 * too_short), longest)
         else:
-            guess = step if over < step < kept and not bold else 0.5 * (over + kept)
-    return kept
+            guess = step if too_short < step < long_enough and not bold else 0.5 * (too_short + long_enough)
+    return long_enough

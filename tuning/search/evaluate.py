@@ -14,10 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from ptsmc_jax import programs
-from tuning.search import flights, margin_rows
+from tuning.search import margin_rows, simulations
 from tuning.search.journal import Journal
+from tuning.search.normalisation import Bounds, Scale
 from tuning.search.objective import FAILED, LEAST, LIMITS, Problem, Rules, ended, judge, watched
-from tuning.search.shares import Bounds, Scale
 
 TOGETHER = 16  # points of one call of the small compiled programs
 M = TypeVar("M", bound="Measured")
@@ -33,12 +33,12 @@ class Measured:
     value: np.ndarray  # (points,) logarithm of the objective
 
     @property
-    def goal(self) -> np.ndarray:
+    def objective(self) -> np.ndarray:
         """Objective over the completed trials, (points,). It is NaN if no trial completes."""
         return np.where(self.value < np.log(FAILED / 2.0), np.exp(self.value), np.nan)
 
     @property
-    def beyond(self) -> np.ndarray:
+    def largest_c(self) -> np.ndarray:
         """Largest c over the completed trials, (points,). It is -1 without requirements."""
         return ended(self.c).max(axis=(1, 2), initial=-1.0)
 
@@ -54,16 +54,16 @@ class Measured:
 
 
 @dataclass(frozen=True)
-class Sloped(Measured):
+class MeasuredWithGradients(Measured):
     """Measurement with derivatives of F and c with respect to normalised gains."""
 
-    f_slope: np.ndarray  # (points, gains)
-    c_slope: np.ndarray  # (points, rows, trials, gains)
+    f_gradient: np.ndarray  # (points, gains)
+    c_gradient: np.ndarray  # (points, rows, trials, gains)
 
     @property
     def finite(self) -> np.ndarray:
         """Whether all numbers of each point are finite, (points,) bool."""
-        arrays = (self.f, self.c, self.f_slope, self.c_slope)
+        arrays = (self.f, self.c, self.f_gradient, self.c_gradient)
         return np.all([np.isfinite(a).reshape(len(a), -1).all(axis=1) for a in arrays], axis=0)
 
 
@@ -78,63 +78,65 @@ class Evaluator:
         """Continue the counts of an evaluator of the same scenario with other bounds."""
         self.rollouts, self.gradients = other.rollouts, other.gradients
 
-    def fly(self, problem: Problem, share: np.ndarray) -> Measured:
+    def measure(self, problem: Problem, normalised: np.ndarray) -> Measured:
         """Return F, constraints and objective at points, (points, gains) normalised gains."""
-        self.rollouts += len(share) * problem.trials.size
-        asked = _question(b"fly", problem, share)
-        return Measured(**self._journal.get(asked, lambda: self._measured(self._fly, problem, share)))
+        self.rollouts += len(normalised) * problem.trials.size
+        asked = _request(b"values", problem, normalised)
+        return Measured(**self._journal.get(asked, lambda: self._measured(self._metrics, problem, normalised)))
 
-    def slopes(self, problem: Problem, share: np.ndarray) -> Sloped:
+    def measure_with_gradients(self, problem: Problem, normalised: np.ndarray) -> MeasuredWithGradients:
         """Return F, constraints and objective with gradients at points, (points, gains) normalised gains."""
-        self.gradients += len(share) * problem.trials.size
-        asked = _question(b"slopes", problem, share)
-        return Sloped(**self._journal.get(asked, lambda: self._measured(self._slopes, problem, share)))
+        self.gradients += len(normalised) * problem.trials.size
+        asked = _request(b"gradients", problem, normalised)
+        return MeasuredWithGradients(
+            **self._journal.get(asked, lambda: self._measured(self._metrics_with_gradients, problem, normalised))
+        )
 
     def _measured(
-        self, way: Callable[[Problem, np.ndarray], dict[str, np.ndarray]], problem: Problem, share: np.ndarray
+        self, way: Callable[[Problem, np.ndarray], dict[str, np.ndarray]], problem: Problem, normalised: np.ndarray
     ) -> dict[str, np.ndarray]:
-        flown = way(problem, share)
+        values = way(problem, normalised)
         if problem.margins is None:
-            return flown
+            return values
         # margins always come with gradients: the compilation of a second program would take longer than it saves
-        of_loop = margin_rows.of_points(problem.margins, self.bounds.scale, share)
-        wide = max(flown["c"].shape[2], of_loop["c"].shape[2])
+        of_loop = margin_rows.of_points(problem.margins, self.bounds.scale, normalised)
+        wide = max(values["c"].shape[2], of_loop["c"].shape[2])
 
         def padded(c: np.ndarray, fill: float) -> np.ndarray:  # every row as long as the longest
             widths = [(0, wide - c.shape[2] if k == 2 else 0) for k in range(c.ndim)]
             return np.pad(c, widths, constant_values=fill)
 
-        for name, fill in (("c", -1.0), ("c_slope", 0.0)):
-            if name in flown:
-                flown[name] = np.concatenate([padded(flown[name], fill), padded(of_loop[name], fill)], axis=1)
-        return _with_margins(flown) if problem.goal == LIMITS else flown
+        for name, fill in (("c", -1.0), ("c_gradient", 0.0)):
+            if name in values:
+                values[name] = np.concatenate([padded(values[name], fill), padded(of_loop[name], fill)], axis=1)
+        return _with_margins(values) if problem.objective == LIMITS else values
 
-    def _fly(self, problem: Problem, share: np.ndarray) -> dict[str, np.ndarray]:
-        gains = self._gains(share)[0]
-        flown = flights.fly(problem.fleet, gains)
-        metrics = np.stack([getattr(flown.metrics, name) for name in watched(problem)], axis=-1)
-        return {"gains": gains, **_in_calls(partial(_judged, problem.rules), gains, metrics, np.asarray(flown.status))}
+    def _metrics(self, problem: Problem, normalised: np.ndarray) -> dict[str, np.ndarray]:
+        gains = self._gains(normalised)[0]
+        values = simulations.simulate(problem.batch, gains)
+        metrics = np.stack([getattr(values.metrics, name) for name in watched(problem)], axis=-1)
+        return {"gains": gains, **_in_calls(partial(_judged, problem.rules), gains, metrics, np.asarray(values.status))}
 
-    def _slopes(self, problem: Problem, share: np.ndarray) -> dict[str, np.ndarray]:
-        gains, along = self._gains(share)
-        flown = flights.sloped(problem.fleet, gains, along, watched(problem))
-        return {"gains": gains, **_in_calls(partial(_judged_slopes, problem.rules), gains, along, *flown)}
+    def _metrics_with_gradients(self, problem: Problem, normalised: np.ndarray) -> dict[str, np.ndarray]:
+        gains, along = self._gains(normalised)
+        values = simulations.simulate_with_derivatives(problem.batch, gains, along, watched(problem))
+        return {"gains": gains, **_in_calls(partial(_judged_slopes, problem.rules), gains, along, *values)}
 
-    def _gains(self, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _gains(self, normalised: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the gains, (points, gains), and their derivatives by the normalised gains, (points, gains, gains)."""
-        gains = _in_calls(partial(_gains, scale=self.bounds.scale), share)
+        gains = _in_calls(partial(_gains, scale=self.bounds.scale), normalised)
         return gains["gains"], gains["along"]
 
 
-def _with_margins(flown: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def _with_margins(values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Set F to ln of the largest metric / limit, including the rows of the margins, and update its gradient."""
-    c = ended(flown["c"]).reshape(len(flown["c"]), -1)
+    c = ended(values["c"]).reshape(len(values["c"]), -1)
     at, points = c.argmax(axis=1), np.arange(len(c))
     largest = np.maximum(1.0 + c[points, at], LEAST)
-    flown["f"] = flown["value"] = np.log(largest)
-    if "c_slope" in flown:
-        flown["f_slope"] = flown["c_slope"].reshape(*c.shape, -1)[points, at] / largest[:, None]
-    return flown
+    values["f"] = values["value"] = np.log(largest)
+    if "c_gradient" in values:
+        values["f_gradient"] = values["c_gradient"].reshape(*c.shape, -1)[points, at] / largest[:, None]
+    return values
 
 
 def _in_calls(program: Callable[..., dict[str, jax.Array]], *arrays: np.ndarray) -> dict[str, np.ndarray]:
@@ -151,16 +153,16 @@ def _in_calls(program: Callable[..., dict[str, jax.Array]], *arrays: np.ndarray)
 _ADDRESS = re.compile("0x[0-9a-f]+")  # address of a custom function, different in each process
 
 
-def _question(kind: bytes, problem: Problem, share: np.ndarray) -> bytes:
+def _request(kind: bytes, problem: Problem, normalised: np.ndarray) -> bytes:
     leaves, structure = jax.tree.flatten(problem)
     said = _ADDRESS.sub("", str(structure)).encode()
-    return b"|".join([kind, share.tobytes(), said, *(np.asarray(leaf).tobytes() for leaf in leaves)])
+    return b"|".join([kind, normalised.tobytes(), said, *(np.asarray(leaf).tobytes() for leaf in leaves)])
 
 
 @programs.jit(compiler_options=programs.QUICKLY)
-def _gains(share: jax.Array, scale: Scale) -> dict[str, jax.Array]:
-    slopes = jax.vmap(jax.jacfwd(scale.gains))(share)
-    return {"gains": jax.vmap(scale.gains)(share), "along": jnp.swapaxes(slopes, 1, 2)}
+def _gains(normalised: jax.Array, scale: Scale) -> dict[str, jax.Array]:
+    slopes = jax.vmap(jax.jacfwd(scale.gains))(normalised)
+    return {"gains": jax.vmap(scale.gains)(normalised), "along": jnp.swapaxes(slopes, 1, 2)}
 
 
 @programs.jit(compiler_options=programs.QUICKLY)
@@ -180,9 +182,9 @@ def _judged_slopes(
             return (f, c), value
 
         (f, c), value = of(gains, metrics)
-        f_slope, c_slope = jax.vmap(
+        f_gradient, c_gradient = jax.vmap(
             lambda by, slope: jax.jvp(of, (gains, metrics), (by, slope), has_aux=True)[1], in_axes=(0, 1), out_axes=-1
         )(along, slopes)
-        return {"f": f, "c": c, "value": value, "f_slope": f_slope, "c_slope": c_slope}
+        return {"f": f, "c": c, "value": value, "f_gradient": f_gradient, "c_gradient": c_gradient}
 
     return jax.vmap(one)(gains, along, metrics, status, slopes)

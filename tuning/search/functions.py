@@ -36,9 +36,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from tuning.search.descent import Best, Start, descend
-from tuning.search.evaluate import Measured, Sloped
-from tuning.search.starts import charged, distances, far_apart, spread
+from tuning.search.evaluate import Measured, MeasuredWithGradients
+from tuning.search.local_search import Best, Start, search_locally
+from tuning.search.starts import distances, far_apart, penalised, spread
 
 Function = Callable[[Float[Array, " n"]], Float[Array, ""]]
 Constraints = Callable[[Float[Array, " n"]], Float[Array, "..."]]
@@ -96,9 +96,9 @@ def minimise(
 ) -> Search:
     """Minimise a function in a box subject to constraints, by SQP from the most promising of many points.
 
-    Sobol points of the box are ranked by objective and violation. Local searches (`descent.descend`) start from the
-    best of these points that lie far apart. If a starting point is far outside the constraints, the local search first
-    minimises the violation.
+    Sobol points of the box are ranked by objective and violation. Local searches, see `local_search.search_locally`,
+    start from the best of these points that lie far apart. If a starting point is far outside the constraints, the
+    local search first minimises the violation.
 
     Args:
         objective: differentiable function of x (n,). It returns NaN or infinity where it is undefined.
@@ -124,17 +124,19 @@ def minimise(
     if not known.size:
         raise ValueError(f"the objective is finite at none of {settings.sampled} points of the box")
     scale = max(float(np.median(seen.f[known]) - seen.f[known].min()), np.finfo(float).tiny)
-    merits = charged((seen.f[known] - seen.f[known].min()) / scale, seen.beyond[known], 1.0)
+    merits = penalised((seen.f[known] - seen.f[known].min()) / scale, seen.largest_c[known], 1.0)
     order = known[np.argsort(merits, kind="stable")].tolist()
     bests = []
     for k in far_apart(order, distances(points), settings.starts):
         best = Best(points[k], 1, 0.0)
-        descend(problem.sloped, best, Start(points[k]), settings.steps, close=settings.tolerance, steepest=np.inf)
+        search_locally(
+            problem.with_gradients, best, Start(points[k]), settings.steps, close=settings.tolerance, steepest=np.inf
+        )
         bests.append(best)
     ended = sorted((best for best in bests if np.isfinite(best.f)), key=lambda best: best.rank)
     if not ended:  # no gradient is finite
         raise ValueError("the objective has a finite gradient at no starting point")
-    found = [Local(problem.x(best.share), best.f, best.over) for best in ended]
+    found = [Local(problem.x(best.normalised), best.f, best.violation) for best in ended]
     return Search(found, settings.sampled, problem.gradients)
 
 
@@ -144,28 +146,35 @@ class _Problem:
     def __init__(self, objective: Function, constraints: Constraints | None, lower: np.ndarray, upper: np.ndarray):
         self._lower, self._upper, self.gradients = lower, upper, 0
 
-        def both(share: Array) -> tuple[Array, Array]:
-            x = self.x(share)
+        def both(normalised: Array) -> tuple[Array, Array]:
+            x = self.x(normalised)
             c = jnp.zeros(0) if constraints is None else jnp.ravel(constraints(x))
             return jnp.asarray(objective(x), dtype=float), c
 
         self._values = jax.jit(jax.vmap(both))
-        self._both = jax.jit(lambda share: (both(share), jax.jacfwd(both)(share)))
+        self._both = jax.jit(lambda normalised: (both(normalised), jax.jacfwd(both)(normalised)))
 
-    def x(self, share: Any) -> Any:
+    def x(self, normalised: Any) -> Any:
         """Map a point of the unit cube to the box, (n,)."""
-        return self._lower + (self._upper - self._lower) * share
+        return self._lower + (self._upper - self._lower) * normalised
 
-    def measured(self, share: np.ndarray) -> Measured:
+    def measured(self, normalised: np.ndarray) -> Measured:
         """Return the values at many points, (points, n)."""
-        f, c = map(np.asarray, self._values(share))
-        return Measured(gains=share, f=f, c=_rows(c), value=np.zeros_like(f))
+        f, c = map(np.asarray, self._values(normalised))
+        return Measured(gains=normalised, f=f, c=_rows(c), value=np.zeros_like(f))
 
-    def sloped(self, share: np.ndarray) -> Sloped:
+    def with_gradients(self, normalised: np.ndarray) -> MeasuredWithGradients:
         """Return the values and gradients at one point, (1, n)."""
         self.gradients += 1
-        (f, c), (f_slope, c_slope) = jax.tree.map(lambda v: np.asarray(v)[None], self._both(share[0]))
-        return Sloped(gains=share, f=f, c=_rows(c), value=np.zeros_like(f), f_slope=f_slope, c_slope=_rows(c_slope))
+        (f, c), (f_gradient, c_gradient) = jax.tree.map(lambda v: np.asarray(v)[None], self._both(normalised[0]))
+        return MeasuredWithGradients(
+            gains=normalised,
+            f=f,
+            c=_rows(c),
+            value=np.zeros_like(f),
+            f_gradient=f_gradient,
+            c_gradient=_rows(c_gradient),
+        )
 
 
 def _rows(c: np.ndarray) -> np.ndarray:

@@ -54,7 +54,7 @@ def named(scenario: Scenario) -> tuple[str, ...]:
     return tuple(names)
 
 
-def of_paper(scenario: Scenario) -> dict[str, float]:
+def published_gains(scenario: Scenario) -> dict[str, float]:
     """Return the published gains by name, scaled to the mission.
 
     A spacecraft has the gains of Case I. A chain of order n has eta = n + 1, as in Figs. 1 and 2. delta is at least one
@@ -70,7 +70,7 @@ def of_paper(scenario: Scenario) -> dict[str, float]:
     return gains | ({"observer_gain": observer_gain} if scenario.observer.kind == "nonlinear" else {})
 
 
-def of_designs(scenario: Scenario, parts: Parts, names: tuple[str, ...]) -> list[list[float]]:
+def design_gains(scenario: Scenario, parts: Parts, names: tuple[str, ...]) -> list[list[float]]:
     """Return starting points that follow from the mission, see `mission.designs`.
 
     A gain that the designs do not contain, such as a gain of a custom law, keeps the value of the scenario.
@@ -94,9 +94,9 @@ def of_designs(scenario: Scenario, parts: Parts, names: tuple[str, ...]) -> list
     return found
 
 
-def papers(scenario: Scenario) -> Scenario:
+def published_scenario(scenario: Scenario) -> Scenario:
     """Return the scenario with the published law and the published gains for its plant."""
-    table, published = scenario.controller, of_paper(scenario)
+    table, published = scenario.controller, published_gains(scenario)
     if not table.law.prescribed:
         error = {"error": "multiplicative"} if scenario.motion == "spacecraft" else {}
         law = {"kind": "prescribed_time", **error, **common_keys(table), "delta": published["delta"]}
@@ -104,14 +104,14 @@ def papers(scenario: Scenario) -> Scenario:
     return in_scenario(scenario, published)
 
 
-def paper_is(scenario: Scenario) -> str:
+def published_label(scenario: Scenario) -> str:
     """Return the label of the published gains in tables.
 
     It tells whether the gains are unchanged, scaled to another body or period, or belong to another law.
     """
     if not scenario.controller.law.prescribed:
         return "paper's law"
-    as_published = mission.published(scenario) and of_paper(scenario)["delta"] == AS_PUBLISHED
+    as_published = mission.published(scenario) and published_gains(scenario)["delta"] == AS_PUBLISHED
     return "published" if as_published else "published, scaled"
 
 

@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import differential_evolution
 
-from tuning.search.descent import SLACK, Best
-from tuning.search.descents import Descents
 from tuning.search.evaluate import Evaluator
+from tuning.search.local_search import SLACK, Best
+from tuning.search.local_searches import LocalSearches
 from tuning.search.objective import Problem
 from tuning.search.optimise import Search
 from tuning.search.progress import Report
@@ -31,7 +31,7 @@ class Check:
 
 
 def check(
-    evaluate: Evaluator, searched: Search, seed: int, report: Report = lambda *_: None, *, sloped: bool = True
+    evaluate: Evaluator, searched: Search, seed: int, report: Report = lambda *_: None, *, with_gradients: bool = True
 ) -> Check:
     """Check a search by differential evolution (Storn and Price, 1997; SciPy) with the same tightened limits.
 
@@ -43,24 +43,24 @@ def check(
         searched: result of the search to check.
         seed: seed of the random numbers.
         report: is called after every generation.
-        sloped: whether F has gradients.
+        with_gradients: whether F has gradients.
     """
     margin = np.asarray([*searched.margins.values()])
     problem = searched.problem.tightened(1.0 - margin)
     without = problem if problem.margins is None else replace(problem, margins=None)
     before, generation, replaced = evaluate.rollouts, 0, np.asarray(np.inf)
 
-    def merit_of(problem: Problem, share: np.ndarray) -> np.ndarray:
-        flown = evaluate.fly(problem, share)
-        bad = FORBIDDEN * np.where(np.isfinite(flown.f), 1.0, 2.0) + np.log1p(np.maximum(flown.beyond, 0.0))
-        return np.where((flown.beyond <= SLACK) & np.isfinite(flown.f), flown.f, bad)
+    def merit_of(problem: Problem, normalised: np.ndarray) -> np.ndarray:
+        measured = evaluate.measure(problem, normalised)
+        bad = FORBIDDEN * np.where(np.isfinite(measured.f), 1.0, 2.0) + np.log1p(np.maximum(measured.largest_c, 0.0))
+        return np.where((measured.largest_c <= SLACK) & np.isfinite(measured.f), measured.f, bad)
 
-    def merit(share: np.ndarray) -> np.ndarray:
-        found = merit_of(without, share.T)
+    def merit(normalised: np.ndarray) -> np.ndarray:
+        found = merit_of(without, normalised.T)
         # margins take far longer and can only increase the merit, so only points that survive without them need margins
         chosen = found <= replaced
         if without is not problem and chosen.any():
-            found[chosen] = merit_of(problem, share.T[chosen])
+            found[chosen] = merit_of(problem, normalised.T[chosen])
         return found
 
     def tell(intermediate_result) -> None:
@@ -84,12 +84,15 @@ def check(
         callback=tell,
     )
     best = Best(result.x, len(problem.rows), margin)
-    best.offer(result.x[None], evaluate.fly(problem, result.x[None]))
-    if sloped:  # differential evolution converges slowly along a limit, so a local search follows
-        run = Descents(evaluate, margin, STEPS, np.random.default_rng(seed))
-        run.descend(searched.problem, {0: result.x})
+    best.offer(result.x[None], evaluate.measure(problem, result.x[None]))
+    if with_gradients:  # differential evolution converges slowly along a limit, so a local search follows
+        run = LocalSearches(evaluate, margin, STEPS, np.random.default_rng(seed))
+        run.search_locally(searched.problem, {0: result.x})
         best = run.best
-    at_search, at_best = evaluate.fly(problem, searched.share[None]), evaluate.fly(problem, best.share[None])
+    at_search, at_best = (
+        evaluate.measure(problem, searched.normalised[None]),
+        evaluate.measure(problem, best.normalised[None]),
+    )
     return Check(
         gains=dict(zip(problem.names, at_best.gains[0].tolist(), strict=True)),
         value=best.value,

@@ -1,6 +1,6 @@
 """Other hand-over times t_f - delta for a point of a search: on neighbouring samples, and farther away.
 
-Points are normalised gains (`share`), 0 to 1 within the bounds. Read `on_samples` first.
+Points are normalised gains, 0 at the lower bound and 1 at the upper bound. Read `on_samples` first.
 """
 
 import math
@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from tuning.search.normalisation import TIMES, Bounds
 from tuning.search.objective import Problem
-from tuning.search.shares import TIMES, Bounds
 
 LATER = 4  # number of consecutive samples that t_f moves the hand-over to, from the sample before it
-LOOKED = 16  # largest number of hand-overs from `elsewhere`
+OTHER_HAND_OVERS = 16  # largest number of hand-overs from `other_hand_overs`
 FACTOR = 2.0  # largest ratio of their delta to the present delta, and inverse of the smallest ratio
 
 
@@ -21,7 +21,7 @@ FACTOR = 2.0  # largest ratio of their delta to the present delta, and inverse o
 class _HandOver:
     """The hand-over of one point of a search, in s."""
 
-    share: np.ndarray  # (gains,) normalised gains
+    normalised: np.ndarray  # (gains,) normalised gains
     bounds: Bounds
     gains: np.ndarray  # (gains,)
     at: dict[str, int]  # indices of delta and t_f among the free gains
@@ -34,24 +34,24 @@ class _HandOver:
         k = self.at[name]
         if not self.bounds.lower[k] * (1 - 1e-9) <= time <= self.bounds.upper[k]:
             return None
-        gains, there = self.gains.copy(), self.share.copy()
+        gains, there = self.gains.copy(), self.normalised.copy()
         gains[k] = time
-        there[k] = self.bounds.share(gains)[k]
+        there[k] = self.bounds.normalise(gains)[k]
         return there
 
 
-def _of(problem: Problem, bounds: Bounds, share: np.ndarray) -> _HandOver | None:
+def _of(problem: Problem, bounds: Bounds, normalised: np.ndarray) -> _HandOver | None:
     """Return the hand-over of a point, or None if no free gain moves it or the clock is not anchored to it."""
     clock: Any = problem.parts.clock
     law, at = problem.parts.controller, {name: k for k, name in enumerate(problem.names) if name in TIMES}
     if not at or not clock.anchored or "delta" not in law.tunable:  # a law without delta has no hand-over
         return None
-    values = bounds.gains(share)
+    values = bounds.gains(normalised)
     t_f, delta = (float(values[at[name]] if name in at else getattr(law, name)) for name in ("t_f", "delta"))
-    return _HandOver(share, bounds, values, at, t_f, delta, float(clock.period))
+    return _HandOver(normalised, bounds, values, at, t_f, delta, float(clock.period))
 
 
-def on_samples(problem: Problem, bounds: Bounds, share: np.ndarray) -> list[np.ndarray]:
+def on_samples(problem: Problem, bounds: Bounds, normalised: np.ndarray) -> list[np.ndarray]:
     """Return points whose hand-over lies on a sample near the present hand-over.
 
     A flight computer hands over at its first sample at or after t_f - delta. The anchored clock of the search has a
@@ -60,13 +60,13 @@ def on_samples(problem: Problem, bounds: Bounds, share: np.ndarray) -> list[np.n
     Args:
         problem: the tuning problem.
         bounds: bounds of the free gains.
-        share: (gains,) normalised gains of the point.
+        normalised: (gains,) normalised gains of the point.
 
     Returns:
         Normalised gains, (gains,) each. The list is empty if no free gain moves the hand-over or the clock is not
         anchored to it.
     """
-    here = _of(problem, bounds, share)
+    here = _of(problem, bounds, normalised)
     if here is None:
         return []
     samples, moves = (here.t_f - here.delta) / here.period, list[np.ndarray | None]()
@@ -79,23 +79,23 @@ def on_samples(problem: Problem, bounds: Bounds, share: np.ndarray) -> list[np.n
     return [there for there in moves if there is not None]
 
 
-def elsewhere(problem: Problem, bounds: Bounds, share: np.ndarray) -> list[np.ndarray]:
+def other_hand_overs(problem: Problem, bounds: Bounds, normalised: np.ndarray) -> list[np.ndarray]:
     """Return points with other hand-overs, on samples spread evenly over delta / `FACTOR` to delta * `FACTOR`.
 
     Args:
         problem: the tuning problem.
         bounds: bounds of the free gains.
-        share: (gains,) normalised gains of the point.
+        normalised: (gains,) normalised gains of the point.
 
     Returns:
         Normalised gains, (gains,) each. The list is empty if delta is not free.
     """
-    here = _of(problem, bounds, share)
+    here = _of(problem, bounds, normalised)
     if here is None or "delta" not in here.at:
         return []
     k = here.at["delta"]
     longest, shortest = min(bounds.upper[k], FACTOR * here.delta), max(bounds.lower[k], here.delta / FACTOR)
     first, last = ((here.t_f - delta) / here.period for delta in (longest, shortest))
-    spread = np.linspace(math.ceil(first - 1e-9), math.floor(last + 1e-9), LOOKED)
+    spread = np.linspace(math.ceil(first - 1e-9), math.floor(last + 1e-9), OTHER_HAND_OVERS)
     moves = [here.moved("delta", here.t_f - sample * here.period) for sample in np.unique(np.round(spread)).tolist()]
     return [there for there in moves if there is not None]

@@ -21,12 +21,12 @@ from ptsmc_jax.numerics.pytrees import Leaf, pytree
 from ptsmc_jax.scenario import Study
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.catalogues import MARGINS
-from ptsmc_jax.simulation.requirements import over
+from ptsmc_jax.simulation.requirements import violation_ratio
 from ptsmc_jax.theory import linear, margins, run_margins
 from ptsmc_jax.theory.linear import Loop
 from tuning.search import gains as gain_names
 from tuning.search.gains import with_gains
-from tuning.search.shares import Bounds, Scale
+from tuning.search.normalisation import Bounds, Scale
 
 CASES = 1  # number of random trials whose loops are constrained: the trials with the worst margins
 WITHOUT = 2.0  # violation ratio of a loop without derivatives: that of a margin of zero
@@ -34,7 +34,7 @@ WITHOUT = 2.0  # violation ratio of a loop without derivatives: that of a margin
 
 @pytree
 @dataclass(frozen=True)
-class Asked:
+class RequiredMargins:
     """The required margins, and the loops that must have them."""
 
     parts: Parts
@@ -42,16 +42,16 @@ class Asked:
     seed: Leaf  # uint32
     coordinates: Coordinates  # random numbers of the dispersions, cases on the first axis; empty: the nominal loop only
     wanted: Leaf  # (margins,) the limits in their units
-    limits: Leaf  # (margins,) largest violation ratio, see `over`: 1 less the margin of the search
+    limits: Leaf  # (margins,) largest violation ratio, see `violation_ratio`: 1 less the margin of the search
     metrics: tuple[str, ...] = field(metadata={"static": True})
     names: tuple[str, ...] = field(metadata={"static": True})  # names of the free gains
 
-    def tightened(self, factor: np.ndarray) -> "Asked":
+    def tightened(self, factor: np.ndarray) -> "RequiredMargins":
         """Return a copy with every limit multiplied by its factor, (margins,) [-]."""
         return replace(self, limits=self.limits * factor)
 
 
-def ask(ready: Study, bounds: Bounds, seed: int) -> Asked | None:
+def ask(ready: Study, bounds: Bounds, seed: int) -> RequiredMargins | None:
     """Return the margins that a scenario requires, or None if it requires none.
 
     If dispersions change the loop, the constrained loops are those of the worst trials for the scenario's gains. The
@@ -65,7 +65,7 @@ def ask(ready: Study, bounds: Bounds, seed: int) -> Asked | None:
     """
     if not ready.margins:
         return None
-    asked = Asked(
+    asked = RequiredMargins(
         parts=ready.parts,
         dispersion=ready.dispersion,
         seed=jnp.uint32(seed),
@@ -76,17 +76,17 @@ def ask(ready: Study, bounds: Bounds, seed: int) -> Asked | None:
         names=bounds.names,
     )
     some = _of_trials(asked, np.arange(CASES)) if margin_verdicts.differ(asked.dispersion) else asked
-    sloped.prepare(some, bounds.scale, np.zeros((len(configure.processors()), len(bounds.names))))
+    rows_with_derivatives.prepare(some, bounds.scale, np.zeros((len(configure.processors()), len(bounds.names))))
     return hardest(asked, np.asarray(gain_names.present_values(ready.parts, bounds.names)))[0]
 
 
-def _of_trials(asked: Asked, trials: np.ndarray) -> Asked:
+def _of_trials(asked: RequiredMargins, trials: np.ndarray) -> RequiredMargins:
     """Return a copy with the loops of these trials."""
     drawn = montecarlo.coordinates(asked.dispersion, asked.seed, jnp.asarray(trials, dtype=jnp.uint32))
     return replace(asked, coordinates=drawn)
 
 
-def hardest(asked: Asked, gains: Float[np.ndarray, " gains"]) -> tuple[Asked, float]:
+def hardest(asked: RequiredMargins, gains: Float[np.ndarray, " gains"]) -> tuple[RequiredMargins, float]:
     """Select the `CASES` trials with the worst margins for these gains, (gains,).
 
     If no dispersion changes the loop, all trials have the nominal loop, and nothing is selected.
@@ -99,16 +99,18 @@ def hardest(asked: Asked, gains: Float[np.ndarray, " gains"]) -> tuple[Asked, fl
     parts, seed = with_gains(asked.parts, dict(zip(asked.names, gains, strict=True))), int(asked.seed)
     limits = dict(zip(asked.metrics, np.asarray(asked.wanted).tolist(), strict=True))
     each = margin_verdicts.worst(parts, asked.dispersion, seed, np.arange(margin_verdicts.TRIALS), limits, CASES)
-    shares = [margin_verdicts.nearness(each[name], limit, name) for name, limit in limits.items()]
-    near = np.max(np.nan_to_num(shares, nan=WITHOUT, neginf=-1e9), axis=0)
+    ratios = [margin_verdicts.nearness(each[name], limit, name) for name, limit in limits.items()]
+    near = np.max(np.nan_to_num(ratios, nan=WITHOUT, neginf=-1e9), axis=0)
     return _of_trials(asked, np.argsort(-near, kind="stable")[:CASES]), max(float(near.max()), 0.0)
 
 
-def rows(asked: Asked, gains: Float[Array, " gains"], runs: linear.Nominal) -> Float[Array, "margins entries"]:
+def rows(
+    asked: RequiredMargins, gains: Float[Array, " gains"], runs: linear.Nominal
+) -> Float[Array, "margins entries"]:
     """Return the constraints c of the margins, which are met if c <= 0.
 
-    c is the violation ratio of a margin, see `over`, divided by `limits`, minus 1. A loop without derivatives counts as
-    a loop with a margin of zero.
+    c is the violation ratio of a margin, see `violation_ratio`, divided by `limits`, minus 1. A loop without
+    derivatives counts as a loop with a margin of zero.
 
     Args:
         asked: the required margins.
@@ -126,20 +128,20 @@ def rows(asked: Asked, gains: Float[Array, " gains"], runs: linear.Nominal) -> F
     each = _by_case(asked, gains, loops_of, runs)
     loops = jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), each)
     values = margins.of_each(loops, with_delay=late).each()
-    shares = [
-        over(values[name].reshape(-1), wanted, at_least=MARGINS[name].at_least)
+    ratios = [
+        violation_ratio(values[name].reshape(-1), wanted, at_least=MARGINS[name].at_least)
         for name, wanted in zip(asked.metrics, asked.wanted, strict=True)
     ]
-    near = jnp.stack([jnp.where(jnp.isnan(share), WITHOUT, share) for share in shares])
+    near = jnp.stack([jnp.where(jnp.isnan(ratio), WITHOUT, ratio) for ratio in ratios])
     return near / asked.limits[:, None] - 1.0
 
 
-def nominal_runs(asked: Asked, gains: Float[Array, " gains"]) -> linear.Nominal:
+def nominal_runs(asked: RequiredMargins, gains: Float[Array, " gains"]) -> linear.Nominal:
     """Return the nominal run of each case, cases on the first axis, or the run of the nominal parts without cases."""
     return _by_case(asked, gains, linear.nominal)
 
 
-def _by_case(asked: Asked, gains: Float[Array, " gains"], of: Callable[..., Any], *by_case: Any) -> Any:
+def _by_case(asked: RequiredMargins, gains: Float[Array, " gains"], of: Callable[..., Any], *by_case: Any) -> Any:
     """Apply `of` to the parts of each case and its entries of `by_case`. Return arrays with cases on the first axis.
 
     The cases are computed one after the other. With a batch axis for the inertia, XLA aborts the process for some sets
@@ -152,7 +154,7 @@ def _by_case(asked: Asked, gains: Float[Array, " gains"], of: Callable[..., Any]
     return jax.tree.map(lambda v: v[None], of(parts, *known))
 
 
-def with_slopes(asked: Asked, scale: Scale, share: Float[Array, " gains"]) -> tuple[Array, Array]:
+def with_derivatives(asked: RequiredMargins, scale: Scale, normalised: Float[Array, " gains"]) -> tuple[Array, Array]:
     """Return the constraints `rows` and their derivatives with respect to normalised gains.
 
     The nominal runs are differentiated with respect to one gain after the other. This takes a quarter of the time that
@@ -161,64 +163,67 @@ def with_slopes(asked: Asked, scale: Scale, share: Float[Array, " gains"]) -> tu
     Args:
         asked: the required margins.
         scale: map from normalised gains to gains.
-        share: (gains,) normalised gains.
+        normalised: (gains,) normalised gains.
 
     Returns:
         c, (margins, entries), and its derivatives, (margins, entries, gains).
     """
 
-    def flown(share: Array) -> tuple[Any, Any]:
-        runs = nominal_runs(asked, scale.gains(share))
+    def differentiable_runs(normalised: Array) -> tuple[Any, Any]:
+        runs = nominal_runs(asked, scale.gains(normalised))
         return tuple(
-            jax.tree.map(lambda v, kept=kept: v if _has_slopes(v) is kept else None, runs) for kept in (True, False)
+            jax.tree.map(lambda v, kept=kept: v if _has_derivatives(v) is kept else None, runs)
+            for kept in (True, False)
         )
 
-    def judged(share: Array, numbers: Any) -> Array:
+    def judged(normalised: Array, numbers: Any) -> Array:
         def either(one: Any, other: Any) -> Any:
             return other if one is None else one
 
         runs = jax.tree.map(either, numbers, others, is_leaf=lambda v: v is None)
-        return rows(asked, scale.gains(share), runs)
+        return rows(asked, scale.gains(normalised), runs)
 
-    axes = jnp.eye(share.size)
-    each = jax.lax.map(lambda axis: jax.jvp(flown, (share,), (axis,), has_aux=True), axes)
+    axes = jnp.eye(normalised.size)
+    each = jax.lax.map(lambda axis: jax.jvp(differentiable_runs, (normalised,), (axis,), has_aux=True), axes)
     (numbers, others), moved = jax.tree.map(lambda v: v[0], (each[0], each[2])), each[1]
-    return jax.vmap(lambda *by: jax.jvp(judged, (share, numbers), by), out_axes=(None, -1))(axes, moved)
+    return jax.vmap(lambda *by: jax.jvp(judged, (normalised, numbers), by), out_axes=(None, -1))(axes, moved)
 
 
-def _has_slopes(leaf: Any) -> bool:
+def _has_derivatives(leaf: Any) -> bool:
     return bool(jnp.issubdtype(leaf.dtype, jnp.inexact))
 
 
-def of_points(asked: Asked, scale: Scale, share: Float[np.ndarray, "points gains"]) -> dict[str, np.ndarray]:
+def of_points(
+    asked: RequiredMargins, scale: Scale, normalised: Float[np.ndarray, "points gains"]
+) -> dict[str, np.ndarray]:
     """Return the constraints and their derivatives with respect to normalised gains, at many points.
 
     Args:
         asked: the required margins.
         scale: map from normalised gains to gains.
-        share: (points, gains) normalised gains.
+        normalised: (points, gains) normalised gains.
 
     Returns:
-        "c", (points, margins, entries), and "c_slope", (points, margins, entries, gains).
+        "c", (points, margins, entries), and "c_gradient", (points, margins, entries, gains).
     """
     count = len(configure.processors())
-    padded = np.resize(share, (-(-len(share) // count) * count, share.shape[1]))
-    each = [sloped(asked, scale, padded[k : k + count]) for k in range(0, len(padded), count)]
-    return jax.tree.map(lambda *v: np.concatenate(v)[: len(share)], *each)
+    padded = np.resize(normalised, (-(-len(normalised) // count) * count, normalised.shape[1]))
+    each = [rows_with_derivatives(asked, scale, padded[k : k + count]) for k in range(0, len(padded), count)]
+    return jax.tree.map(lambda *v: np.concatenate(v)[: len(normalised)], *each)
 
 
 @programs.jit(title="the gradients of the margins")
-def sloped(asked: Asked, scale: Scale, share: Array) -> dict[str, Array]:
+def rows_with_derivatives(asked: RequiredMargins, scale: Scale, normalised: Array) -> dict[str, Array]:
     """Return the result of `of_points` for as many points as there are devices, with one point on each device.
 
     Args:
         asked: the required margins.
         scale: map from normalised gains to gains.
-        share: (devices, gains) normalised gains.
+        normalised: (devices, gains) normalised gains.
     """
 
-    def on_device(share: Array) -> dict[str, Array]:
-        c, slope = with_slopes(asked, scale, share[0])
-        return {"c": c[None], "c_slope": jnp.nan_to_num(slope)[None]}
+    def on_device(normalised: Array) -> dict[str, Array]:
+        c, slope = with_derivatives(asked, scale, normalised[0])
+        return {"c": c[None], "c_gradient": jnp.nan_to_num(slope)[None]}
 
-    return montecarlo.spread(on_device, share, share.shape[0])
+    return montecarlo.spread(on_device, normalised, normalised.shape[0])

@@ -24,11 +24,11 @@ from ptsmc_jax.scenario.tables import T_F as T_F
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.catalogues import POINTING
 from ptsmc_jax.simulation.requirements import Requirement
-from ptsmc_jax.simulation.requirements import over as near
+from ptsmc_jax.simulation.requirements import violation_ratio as near
 from ptsmc_jax.simulation.rollout import Parts
-from tuning.search.flights import Fleet
 from tuning.search.gains import with_gains
-from tuning.search.margin_rows import Asked
+from tuning.search.margin_rows import RequiredMargins
+from tuning.search.simulations import Batch
 
 FAILED = 1e9  # metric, and metric / limit, of a failed trial: larger than those of any completed trial
 LEAST = 1e-300  # smallest argument of a logarithm
@@ -40,18 +40,18 @@ DRAWN = 128  # trials whose dispersions are computed in one call
 class Rules:
     """The rules that judge the metrics of the training trials. The objective covers the first `averaged` trials.
 
-    Every trial that is `counted` must keep a limit. If the limit has a quantile, the trials that are `among` its sample
+    Every trial that is `counted` must keep a limit. If the limit has a quantile, the trials in its `quantile_sample`
     must also keep it, except for the `may_break` worst of them.
     """
 
     limits: Leaf | np.ndarray  # (requirements,) in the metrics' units
-    among: Leaf | np.ndarray  # (requirements, trials) bool: sample of trials for a quantile
+    quantile_sample: Leaf | np.ndarray  # (requirements, trials) bool: sample of trials for a quantile
     counted: Leaf | np.ndarray  # (requirements, trials) bool: each of these trials must keep the limit
     averaged: int = field(metadata={"static": True})
     names: tuple[str, ...] = field(metadata={"static": True})  # names of the free gains
     # largest number of trials of the sample that may break each limit; None: a limit on every trial
     may_break: tuple[int | None, ...] = field(metadata={"static": True})
-    goal: str = field(default="window_error", metadata={"static": True})  # a metric, `T_F` or `LIMITS`
+    objective: str = field(default="window_error", metadata={"static": True})  # a metric, `T_F` or `LIMITS`
     tail: int | None = field(default=None, metadata={"static": True})  # worst trials that count; None: all
     # as key `statistic` of [tune]; a quantile is the smallest value of the tail, the worst case a tail of one trial
     statistic: str = field(default="rms", metadata={"static": True})
@@ -69,7 +69,9 @@ class Problem(Rules):
     trials: Leaf | np.ndarray  # (trials,) uint32 numbers that select the noise
     coordinates: dict[str, Any]  # random numbers of the dispersions, trials on the first axis
     metrics: tuple[str, ...] = field(metadata={"static": True})  # metrics of the requirements
-    margins: Asked | None = None  # margins of the loop; their rows follow the rows of the requirements, see `Evaluator`
+    margins: RequiredMargins | None = (
+        None  # margins of the loop; their rows follow the rows of the requirements, see `Evaluator`
+    )
 
     @property
     def rows(self) -> tuple[str, ...]:
@@ -82,17 +84,17 @@ class Problem(Rules):
         return Rules(**{one.name: getattr(self, one.name) for one in fields(Rules)})
 
     @property
-    def fleet(self) -> Fleet:
+    def batch(self) -> Batch:
         """The trials to simulate, with their parts and dispersions."""
         trials, coordinates = np.asarray(self.trials), jax.tree.map(np.asarray, self.coordinates)
         names = watched(self)
         pointing = tuple(name for name in POINTING if name in names)
-        return Fleet(self.parts, self.dispersion, self.seed, self.names, trials, coordinates, pointing)
+        return Batch(self.parts, self.dispersion, self.seed, self.names, trials, coordinates, pointing)
 
-    def others(self, trials: np.ndarray) -> Fleet:
+    def others(self, trials: np.ndarray) -> Batch:
         """Return the fleet with other trials, (trials,), of the same seed."""
         coordinates = coordinates_of(self.dispersion, int(self.seed), trials)
-        return self.fleet._replace(trials=np.asarray(trials, dtype=np.uint32), coordinates=coordinates)
+        return self.batch._replace(trials=np.asarray(trials, dtype=np.uint32), coordinates=coordinates)
 
     def tightened(self, factor: ArrayLike) -> "Problem":
         """Return the problem with every limit multiplied by its factor, (rows,) or one number [-]."""
@@ -135,7 +137,7 @@ def problem(
         trials=np.zeros(0, dtype=np.uint32),
         coordinates=coordinates_of(dispersion, seed, np.zeros(0)),
         limits=np.asarray([r.limit for r in requirements], dtype=float),
-        among=np.zeros((len(requirements), 0), dtype=bool),
+        quantile_sample=np.zeros((len(requirements), 0), dtype=bool),
         counted=np.zeros((len(requirements), 0), dtype=bool),
         averaged=len(trials),
         names=names,
@@ -144,7 +146,7 @@ def problem(
     )
     alone = kept_by_every_trial(empty) | np.asarray(banded or False, dtype=bool)
     posed = with_trials(empty, trials, counted=alone)
-    return replace(posed, among=~posed.counted, **others)
+    return replace(posed, quantile_sample=~posed.counted, **others)
 
 
 def coordinates_of(dispersion: Dispersion, seed: int, trials: np.ndarray) -> dict[str, np.ndarray]:
@@ -193,7 +195,7 @@ def with_trials(problem: Problem, trials: np.ndarray, counted: np.ndarray | None
     return replace(
         problem,
         trials=np.concatenate([problem.trials, np.asarray(trials, dtype=np.uint32)]),
-        among=np.pad(problem.among, [(0, 0), (0, len(trials))]),
+        quantile_sample=np.pad(problem.quantile_sample, [(0, 0), (0, len(trials))]),
         counted=np.concatenate([problem.counted, np.tile(rows[:, None], (1, len(trials)))], axis=1),
         coordinates={name: np.concatenate([v, coordinates[name]]) for name, v in problem.coordinates.items()},
     )
@@ -208,21 +210,21 @@ def fewer_trials(problem: Problem, averaged: int) -> Problem:
         return problem
     fewer = np.r_[:averaged, problem.averaged : problem.trials.size]
 
-    def share(count: int) -> int:
+    def scaled(count: int) -> int:
         return max(1, math.ceil(count * averaged / problem.averaged))
 
     def allowed(count: int | None, averaged_are_among: bool) -> int | None:
-        return averaged - share(problem.averaged - count) if count is not None and averaged_are_among else count
+        return averaged - scaled(problem.averaged - count) if count is not None and averaged_are_among else count
 
     return replace(
         problem,
         trials=problem.trials[fewer],
-        among=problem.among[:, fewer],
+        quantile_sample=problem.quantile_sample[:, fewer],
         counted=problem.counted[:, fewer],
         coordinates={name: v[fewer] for name, v in problem.coordinates.items()},
         averaged=averaged,
-        may_break=tuple(map(allowed, problem.may_break, np.asarray(problem.among)[:, 0].tolist())),
-        tail=None if problem.tail is None else share(problem.tail),
+        may_break=tuple(map(allowed, problem.may_break, np.asarray(problem.quantile_sample)[:, 0].tolist())),
+        tail=None if problem.tail is None else scaled(problem.tail),
     )
 
 
@@ -233,8 +235,8 @@ def kept_by_every_trial(problem: Problem) -> np.ndarray:
 
 def watched(problem: Problem) -> tuple[str, ...]:
     """Return the names of the metrics of a problem: objective, peak torque, then requirements."""
-    goal = "window_error" if problem.goal in (T_F, LIMITS) else problem.goal
-    return (goal, "peak_torque", *problem.metrics)
+    objective = "window_error" if problem.objective in (T_F, LIMITS) else problem.objective
+    return (objective, "peak_torque", *problem.metrics)
 
 
 def measure(problem: Problem, gains: Float[Array, " gains"]) -> tuple[Array, Array, Array]:
@@ -281,15 +283,15 @@ def judge(
     Returns:
         F, c (requirements, trials), and ln of the objective.
     """
-    goal, torque, *limited = metrics.T
-    values, torques = (judged(v, status)[: rules.averaged] for v in (goal, torque))
-    over = [judged(near(one, rules.limits[k], at_least=False), status) - 1.0 for k, one in enumerate(limited)]
-    rows = [_asked(rules, k, one) for k, one in enumerate(over)]
+    objective, torque, *limited = metrics.T
+    values, torques = (judged(v, status)[: rules.averaged] for v in (objective, torque))
+    excesses = [judged(near(one, rules.limits[k], at_least=False), status) - 1.0 for k, one in enumerate(limited)]
+    rows = [_constraint(rules, k, one) for k, one in enumerate(excesses)]
     constraints = jnp.stack(rows) if rows else jnp.zeros((0, metrics.shape[0]))
-    if rules.goal == T_F:
+    if rules.objective == T_F:
         value = jnp.log(gains[rules.names.index(T_F)])
         return value, constraints, value
-    if rules.goal == LIMITS:
+    if rules.objective == LIMITS:
         value = log_largest(constraints)
         return value, constraints, value
     value = _log_statistic(values, rules.tail, rules.statistic)
@@ -335,11 +337,11 @@ def _log_statistic(values: Float[Array, " trials"], tail: int | None, statistic:
     return jnp.log(jnp.where(count > 0, mean, FAILED**power)) / power
 
 
-def _asked(rules: Rules, row: int, over: Float[Array, " trials"]) -> Float[Array, " trials"]:
+def _constraint(rules: Rules, row: int, constraints: Float[Array, " trials"]) -> Float[Array, " trials"]:
     """Return c of one limit. It is unchanged for counted trials, and reduced for sampled trials that may break it."""
-    alone, may_break = jnp.where(rules.counted[row], over, -1.0), rules.may_break[row]
+    alone, may_break = jnp.where(rules.counted[row], constraints, -1.0), rules.may_break[row]
     if may_break is None:
         return alone
-    together = jnp.where(rules.among[row], over, -1.0)
+    together = jnp.where(rules.quantile_sample[row], constraints, -1.0)
     last = jax.lax.top_k(together, may_break + 1)[0][-1]
     return jnp.maximum(alone, jnp.minimum(together, last))

@@ -11,16 +11,16 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ptsmc_jax.simulation.requirements import Requirement
-from tuning.search import confirm, flights
-from tuning.search.descents import Descents, Step
+from tuning.search import confirm, simulations
 from tuning.search.evaluate import Evaluator
 from tuning.search.evolution import NEARBY
+from tuning.search.local_searches import LocalSearches, Step
 from tuning.search.objective import Problem
 from tuning.search.progress import Report, timed
 from tuning.search.rounds import Rounds
 from tuning.search.worst import Hardest
 
-Tell = Callable[[str], None]  # reports the name of the current step
+Announce = Callable[[str], None]  # reports the name of the current step
 
 GLOBALLY = "no gains so far meet every requirement: searching globally"
 HOPELESS = 1.1  # if the best gains have a larger metric / limit, harder trials cannot help and none join
@@ -33,7 +33,7 @@ class Settings:
     starts: int  # number of starting points
     steps: int  # largest number of measured points of each local search
     seed: int  # seed of the candidates for starting points
-    sloped: bool = True  # F has useful gradients
+    with_gradients: bool = True  # F has useful gradients
     robust: bool = False  # the worst case inside the support of the dispersions joins the constraints
     judged: bool = True  # find the worst case of the final gains, and conflicting requirements
     # relative tightening of the limit of each metric, if larger than the default
@@ -46,7 +46,7 @@ class Search:
     """Result of a search."""
 
     gains: np.ndarray  # (gains,) the best admissible point
-    share: np.ndarray  # (gains,) normalised gains of the best point
+    normalised: np.ndarray  # (gains,) normalised gains of the best point
     value: float  # objective over the training trials
     worst: np.ndarray  # (requirements,) largest metric / limit of the best point; infinite if a trial fails
     ended: np.ndarray  # (requirements,) largest metric / limit over the completed trials
@@ -55,7 +55,7 @@ class Search:
     problem: Problem  # tuning problem with the trials that joined
     rounds: int = 0  # number of further searches with harder trials
     margins: dict[str, float] = field(default_factory=dict)  # relative tightening of the limit of each metric
-    over: float = 0.0  # relative violation of the tightened limits at the best point, as in progress reports
+    violation: float = 0.0  # relative violation of the tightened limits at the best point, as in progress reports
     # if no gains meet every requirement: the limits that conflict, see `Descents.conflict`
     conflict: dict[str, float | None] = field(default_factory=dict)
     globally: bool = False  # a global search of the whole box followed
@@ -77,7 +77,7 @@ def search(
 ) -> Search:
     """Minimise F subject to the requirements on the training trials.
 
-    `Descents` runs the local searches. After each search, `Rounds` adds harder trials to the constraints, and the
+    `LocalSearches` runs the local searches. After each search, `Rounds` adds harder trials to the constraints, and the
     search continues. If the search is interrupted, it returns the best point so far.
 
     Args:
@@ -92,50 +92,50 @@ def search(
     Raises:
         KeyboardInterrupt: The search was interrupted before the first point was measured.
     """
-    sloped = settings.sloped
+    with_gradients = settings.with_gradients
     rounds = Rounds(evaluate, problem, requirements, robust=settings.robust)
     margins = {row: max(settings.margins.get(row, 0.0), rounds.margin) for row in rounds.problem.rows}
     seconds = dict[str, float]()
     report = timed(report, seconds)
     kept = np.asarray([*margins.values()])
-    descents = Descents(evaluate, kept, settings.steps, np.random.default_rng(settings.seed), report)
+    local_searches = LocalSearches(evaluate, kept, settings.steps, np.random.default_rng(settings.seed), report)
     interrupted, conflict = False, dict[str, float | None]()
 
     def tell(what: str) -> None:
-        report(what, 0, 0, *descents.so_far)
+        report(what, 0, 0, *local_searches.so_far)
 
     try:
-        if sloped:
-            flights.prepare(rounds.problem.fleet)
+        if with_gradients:
+            simulations.prepare(rounds.problem.batch)
             prepare()
-            _by_slopes(rounds, descents, scenario_gains, settings, tell)
+            _search_with_gradients(rounds, local_searches, scenario_gains, settings, tell)
         else:
-            _by_evolution(rounds, descents, scenario_gains, tell)
+            _search_without_gradients(rounds, local_searches, scenario_gains, tell)
         if settings.judged:
-            rounds.judge(descents.gains, tell)
-            if sloped and descents.best.over > 0.0 and not descents.best.failed:
+            rounds.judge(local_searches.gains, tell)
+            if with_gradients and local_searches.best.violation > 0.0 and not local_searches.best.failed:
                 tell("finding the conflicting requirements")
-                conflict = descents.conflict(rounds.problem)
+                conflict = local_searches.conflict(rounds.problem)
     except KeyboardInterrupt:
-        if not descents.started:
+        if not local_searches.started:
             raise
         interrupted = True
     tell("done")
-    best = descents.best
+    best = local_searches.best
     return Search(
-        gains=descents.gains,
-        share=best.share,
+        gains=local_searches.gains,
+        normalised=best.normalised,
         value=best.value,
         worst=np.where(best.failed, np.inf, best.worst),
         ended=best.worst,
-        ends=descents.ends,
-        history=descents.history,
-        problem=descents.problem,
+        ends=local_searches.ends,
+        history=local_searches.history,
+        problem=local_searches.problem,
         rounds=rounds.count,
         margins=margins,
-        over=best.over,
+        violation=best.violation,
         conflict=conflict,
-        globally=descents.globally,
+        globally=local_searches.globally,
         hardest=rounds.hardest,
         counts=[] if interrupted else rounds.counts,
         seconds=seconds,
@@ -143,28 +143,36 @@ def search(
     )
 
 
-def _by_slopes(rounds: Rounds, descents: Descents, scenario_gains: np.ndarray, settings: Settings, tell: Tell) -> None:
+def _search_with_gradients(
+    rounds: Rounds, local_searches: LocalSearches, scenario_gains: np.ndarray, settings: Settings, tell: Announce
+) -> None:
     starts, seed = settings.starts, settings.seed
-    descents.set_out(rounds.problem, scenario_gains, settings.designs)
-    rounds.begin(descents.gains)
-    shares = descents.explore(rounds.problem, starts, seed) if starts > 1 else {0: descents.share}
-    descents.descend(rounds.problem, shares)
-    _go_on(rounds, descents, descents.again, tell)
-    if starts > 1 and descents.best.over > 0.0:
+    local_searches.begin(rounds.problem, scenario_gains, settings.designs)
+    rounds.begin(local_searches.gains)
+    shares = local_searches.explore(rounds.problem, starts, seed) if starts > 1 else {0: local_searches.normalised}
+    local_searches.search_locally(rounds.problem, shares)
+    _repeat_with_harder_trials(rounds, local_searches, local_searches.again, tell)
+    if starts > 1 and local_searches.best.violation > 0.0:
         tell(GLOBALLY)
-        descents.search_globally(rounds.problem, starts, seed + 1)
-        _go_on(rounds, descents, descents.again, tell)
+        local_searches.search_globally(rounds.problem, starts, seed + 1)
+        _repeat_with_harder_trials(rounds, local_searches, local_searches.again, tell)
 
 
-def _by_evolution(rounds: Rounds, descents: Descents, scenario_gains: np.ndarray, tell: Tell) -> None:
-    descents.sweep(rounds.problem, scenario_gains)
-    rounds.begin(descents.gains)
-    descents.evolve(rounds.problem, descents.share)
-    _go_on(rounds, descents, lambda problem: descents.evolve(problem, descents.share, NEARBY), tell)
+def _search_without_gradients(
+    rounds: Rounds, local_searches: LocalSearches, scenario_gains: np.ndarray, tell: Announce
+) -> None:
+    local_searches.sweep(rounds.problem, scenario_gains)
+    rounds.begin(local_searches.gains)
+    local_searches.evolve(rounds.problem, local_searches.normalised)
+    _repeat_with_harder_trials(
+        rounds, local_searches, lambda problem: local_searches.evolve(problem, local_searches.normalised, NEARBY), tell
+    )
 
 
-def _go_on(rounds: Rounds, descents: Descents, again: Callable[[Problem], None], tell: Tell) -> None:
+def _repeat_with_harder_trials(
+    rounds: Rounds, local_searches: LocalSearches, again: Callable[[Problem], None], tell: Announce
+) -> None:
     """Repeat the search as long as harder trials join, unless the limits are out of reach."""
-    while np.all(descents.best.worst <= HOPELESS) and rounds.harder(descents.gains, tell):
+    while np.all(local_searches.best.worst <= HOPELESS) and rounds.harder(local_searches.gains, tell):
         tell(f"harder trials, round {rounds.count}")
         again(rounds.problem)

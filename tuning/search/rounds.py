@@ -57,12 +57,14 @@ class Rounds:
         self._evaluate, self._robust = evaluate, robust
         every = [r for r in requirements if r.quantile is None]
         self._every = every if problem.dispersion.varies else []  # requirements on every trial
-        several, among = problem.trials.size > 1, np.asarray(problem.among)
+        several, quantile_sample = problem.trials.size > 1, np.asarray(problem.quantile_sample)
         # requirements on a fraction of the trials by their rows in the problem, and the rows with a band
-        self._shares = {k: r for k, r in enumerate(requirements) if r.quantile is not None and several}
-        self._bands = [k for k in self._shares if not among[k].any()]
+        self._quantiles = {k: r for k, r in enumerate(requirements) if r.quantile is not None and several}
+        self._bands = [k for k in self._quantiles if not quantile_sample[k].any()]
         self.margin = SURE_MARGIN if (robust and self._every) or not several else MARGIN
-        limits = bool(self._every) + len(self._shares)  # number of limits that can add their hardest trials in a round
+        limits = bool(self._every) + len(
+            self._quantiles
+        )  # number of limits that can add their hardest trials in a round
         if limits:
             problem = _with_room(problem, limits * HARDEST + SPARE)
         self._places = np.arange(problem.averaged, problem.trials.size)  # slots of trials that join
@@ -77,7 +79,7 @@ class Rounds:
         """Add the hardest trials and loops for approximate gains, (gains,), to the constraints."""
         self.problem, _ = _harder_margins(self.problem, gains)
         if self._bands:
-            counts = dict(zip(self._shares, self._count(gains), strict=True))
+            counts = dict(zip(self._quantiles, self._count(gains), strict=True))
             self.problem = _with_bands(self.problem, {k: counts[k].band for k in self._bands})
         if self._every:
             hardest = _hardest(self.problem, *self._screened(gains))
@@ -93,26 +95,26 @@ class Rounds:
         Returns:
             Whether anything was added.
         """
-        if not (self._every or self._shares or self.problem.margins is not None):
+        if not (self._every or self._quantiles or self.problem.margins is not None):
             return False
         joining: list[Joining] = []
-        nearer_loops, beyond = _harder_margins(self.problem, gains)
-        if self._shares:  # on other trials each time, none of them screened
+        nearer_loops, loops_break_limits = _harder_margins(self.problem, gains)
+        if self._quantiles:  # on other trials each time, none of them screened
             tell("confirming on other trials")
             joining += self._confirmed(gains)
         if self._every and self._robust:
             tell("looking for the worst case")
             self.hardest = worst_case.hardest(self.problem, self._every, gains, self._screened(gains))
-            if self.hardest.beyond and not self.hardest.unbounded:
+            if self.hardest.breaks_limit and not self.hardest.unbounded:
                 trial, counted = np.asarray([self.hardest.trial]), kept_by_every_trial(self.problem)
                 joining.append(Joining(trial, counted, self.hardest.coordinates))
         elif self._every:
             self._known = self._screened(gains)
             if np.any(self._known[1] > 1.0):
                 joining.append(Joining(_hardest(self.problem, *self._known), kept_by_every_trial(self.problem)))
-        if not (joining or beyond) or self.count == ROUNDS:
+        if not (joining or loops_break_limits) or self.count == ROUNDS:
             return False
-        self.problem = nearer_loops if beyond else self.problem
+        self.problem = nearer_loops if loops_break_limits else self.problem
         for more in joining:
             self._join(more)
         self.hardest = None  # it belongs to gains that the next search replaces
@@ -137,7 +139,7 @@ class Rounds:
     def _count(self, gains: np.ndarray) -> list[confirm.Count]:
         """Count the trials beyond each limit on a fraction of the trials. Each call simulates other trials."""
         first = self.problem.averaged + worst_case.SCREENED
-        counts = confirm.count(self.problem, list(self._shares.values()), gains, first, self._counted)
+        counts = confirm.count(self.problem, list(self._quantiles.values()), gains, first, self._counted)
         self._counted += 1
         self._evaluate.rollouts += counts[0].trials
         return counts
@@ -148,8 +150,8 @@ class Rounds:
         rows = np.arange(len(self.problem.metrics))
         return [
             Joining(one.harder[:HARDEST], rows == k)
-            for k, one in zip(self._shares, self.counts, strict=True)
-            if not one.held
+            for k, one in zip(self._quantiles, self.counts, strict=True)
+            if not one.confirmed
         ]
 
     def _join(self, more: Joining) -> None:
@@ -187,7 +189,7 @@ def _with_bands(problem: Problem, bands: Mapping[int, np.ndarray]) -> Problem:
         problem = _placed(problem, at, band)
         problem = replace(
             problem,
-            among=replaced(problem.among, np.s_[row, at], True),
+            quantile_sample=replaced(problem.quantile_sample, np.s_[row, at], True),
             counted=replaced(problem.counted, np.s_[row, : problem.averaged], False),
         )
     return problem

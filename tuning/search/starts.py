@@ -1,6 +1,6 @@
 """Starting points of local searches: the most promising of many points within the bounds that lie far apart.
 
-Points are normalised gains between 0 and 1 (`share`). Read `starting_points` first.
+Points are normalised gains, 0 at the lower bound and 1 at the upper bound. Read `starting_points` first.
 """
 
 import math
@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from tuning.search.evaluate import Evaluator, Measured, Sloped
+from tuning.search.evaluate import Evaluator, Measured, MeasuredWithGradients
 from tuning.search.objective import FAILED, Problem, failures
 from tuning.search.progress import Report
 
 SWEPT = 64  # points that are simulated to choose starting points
 CALL = 16  # points between two reports
-CHARGE = 3.0  # F is a logarithm: a metric at twice its limit counts like 2^3 times the error
+PENALTY = 3.0  # F is a logarithm: a metric at twice its limit counts like 2^3 times the error
 APART = (0.5, 0.35, 0.2, 0.0)  # smallest distances in the unit cube (maximum norm), tried in this order
 STEEP = 10.0  # factor on the violation in the penalty, if many points are close to a limit
 SPREADING = "searching the whole box"
@@ -52,15 +52,15 @@ def starting_points(
     Returns:
         Normalised gains, (starts, gains).
     """
-    share = spread(len(problem.names), max(SWEPT - len(designs), starts), np.random.default_rng(seed))
-    held = held_by_limits(evaluate.slopes(problem, first[None]))
-    share[:, held] = first[held]
-    share = np.concatenate([designs.reshape(-1, first.size), share])
-    chosen = promising(evaluate, problem, share, starts - 1, partial(report, "choosing starts"))
+    normalised = spread(len(problem.names), max(SWEPT - len(designs), starts), np.random.default_rng(seed))
+    held = held_by_limits(evaluate.measure_with_gradients(problem, first[None]))
+    normalised[:, held] = first[held]
+    normalised = np.concatenate([designs.reshape(-1, first.size), normalised])
+    chosen = promising(evaluate, problem, normalised, starts - 1, partial(report, "choosing starts"))
     return np.concatenate([first[None], chosen])
 
 
-def spread_widely(evaluate: Evaluator, problem: Problem, count: int, seed: int, report: Report) -> np.ndarray:
+def global_starting_points(evaluate: Evaluator, problem: Problem, count: int, seed: int, report: Report) -> np.ndarray:
     """Return the most promising of `WIDELY` points of the whole box that lie far apart.
 
     Margins take far longer than simulations and can only increase a violation. The points are therefore sorted by
@@ -77,11 +77,11 @@ def spread_widely(evaluate: Evaluator, problem: Problem, count: int, seed: int, 
     Returns:
         Normalised gains, (count, gains).
     """
-    share = spread(len(problem.names), WIDELY, np.random.default_rng(seed))
+    normalised = spread(len(problem.names), WIDELY, np.random.default_rng(seed))
     without = problem if problem.margins is None else replace(problem, margins=None)
     merits = np.zeros(0)
     for k in range(0, WIDELY, CALL):
-        merits = np.append(merits, merit(evaluate.fly(without, share[k : k + CALL]), STEEP))
+        merits = np.append(merits, merit(evaluate.measure(without, normalised[k : k + CALL]), STEEP))
         report(SPREADING, k + CALL, WIDELY, np.nan, np.nan)
     order = np.argsort(merits, kind="stable")
     if without is not problem:
@@ -90,20 +90,20 @@ def spread_widely(evaluate: Evaluator, problem: Problem, count: int, seed: int, 
             some = order[k : k + CALL]
             if merits[some[0]] >= np.sort(known)[count]:
                 break
-            known[some] = merit(evaluate.fly(problem, share[some]), STEEP)
+            known[some] = merit(evaluate.measure(problem, normalised[some]), STEEP)
             report(SPREADING, WIDELY, WIDELY, np.nan, np.nan)
         merits = known
         order = np.argsort(merits, kind="stable")
     promising = [int(k) for k in order[: 8 * count] if np.isfinite(merits[k])]
-    return share[far_apart(promising, distances(share), count)]
+    return normalised[far_apart(promising, distances(normalised), count)]
 
 
-def held_by_limits(at: Sloped) -> list[int]:
+def held_by_limits(at: MeasuredWithGradients) -> list[int]:
     """Return the index of the gain that each nearly active limit depends on most. At least two gains stay free."""
     nearest = at.c[0].argmax(axis=1)
     held: list[int] = []
     for row in np.argsort(-at.c[0].max(axis=1)):
-        largest, slope = at.c[0, row, nearest[row]], np.abs(at.c_slope[0, row, nearest[row]])
+        largest, slope = at.c[0, row, nearest[row]], np.abs(at.c_gradient[0, row, nearest[row]])
         free = [k for k in np.argsort(-slope) if k not in held]
         if largest > -NEARLY and len(free) > 2 and slope[free[0]] > 0.0:
             held.append(int(free[0]))
@@ -128,7 +128,7 @@ def spread(gains: int, count: int, rng: np.random.Generator) -> np.ndarray:
         return qmc.Sobol(gains, rng=rng).random(count)
 
 
-def promising(evaluate: Evaluator, problem: Problem, share: np.ndarray, count: int, tell: Callable) -> np.ndarray:
+def promising(evaluate: Evaluator, problem: Problem, normalised: np.ndarray, count: int, tell: Callable) -> np.ndarray:
     """Choose points by their merit, with points that lie far apart first.
 
     The points are ranked twice, with a weak and with a strong penalty on violations, and are taken from both rankings
@@ -137,29 +137,29 @@ def promising(evaluate: Evaluator, problem: Problem, share: np.ndarray, count: i
     Args:
         evaluate: measures the problem.
         problem: the tuning problem.
-        share: (points, gains) normalised gains to choose from.
+        normalised: (points, gains) normalised gains to choose from.
         count: number of points to choose.
         tell: is called after every `CALL` points, as a `Report` without its first argument.
 
     Returns:
         Normalised gains, (count, gains).
     """
-    flown = []
-    for k in range(0, len(share), CALL):
-        flown.append(evaluate.fly(problem, share[k : k + CALL]))
-        tell(min(k + CALL, len(share)), len(share), np.nan, np.nan)
-    apart = distances(share)
+    measured = []
+    for k in range(0, len(normalised), CALL):
+        measured.append(evaluate.measure(problem, normalised[k : k + CALL]))
+        tell(min(k + CALL, len(normalised)), len(normalised), np.nan, np.nan)
+    apart = distances(normalised)
     orders = []
     for times in (1.0, STEEP):
-        merits = np.concatenate([merit(one, times) for one in flown])
+        merits = np.concatenate([merit(one, times) for one in measured])
         orders.append([int(k) for k in np.argsort(merits, kind="stable") if np.isfinite(merits[k])])
     queue = [k for pair in zip(*orders, strict=True) for k in pair]
-    return share[far_apart(queue, apart, count)]
+    return normalised[far_apart(queue, apart, count)]
 
 
-def distances(share: np.ndarray) -> np.ndarray:
+def distances(normalised: np.ndarray) -> np.ndarray:
     """Return the distances of points (points, gains) in the maximum norm, (points, points)."""
-    return np.abs(share[:, None] - share[None]).max(axis=2)
+    return np.abs(normalised[:, None] - normalised[None]).max(axis=2)
 
 
 def far_apart(order: Sequence[int], apart: np.ndarray, count: int) -> list[int]:
@@ -183,24 +183,24 @@ def far_apart(order: Sequence[int], apart: np.ndarray, count: int) -> list[int]:
     return chosen
 
 
-def merit(flown: Measured, times: float = 1.0) -> np.ndarray:
+def merit(measured: Measured, times: float = 1.0) -> np.ndarray:
     """Return F plus penalties for violated limits and for failed trials, (points,).
 
     F itself only counts failures of the averaged trials, and counts no failures if t_f is minimised.
 
     Args:
-        flown: the measurement at the points.
-        times: factor on the violation in the penalty, see `charged`.
+        measured: the measurement at the points.
+        times: factor on the violation in the penalty, see `penalised`.
     """
-    return charged(flown.f + math.log(FAILED) * failures(flown.c), flown.beyond, times)
+    return penalised(measured.f + math.log(FAILED) * failures(measured.c), measured.largest_c, times)
 
 
-def charged(f: Any, beyond: Any, times: float) -> Any:
-    """Return F plus a penalty on the violation, F + `CHARGE` ln(1 + times max(beyond, 0)).
+def penalised(f: Any, largest_c: Any, times: float) -> Any:
+    """Return F plus a penalty on the violation, F + `PENALTY` ln(1 + times max(largest_c, 0)).
 
     Args:
         f: F at the points, (points,) or one number.
-        beyond: largest c at the points, of the same shape.
+        largest_c: largest c at the points, of the same shape.
         times: factor on the violation [-].
     """
-    return f + CHARGE * np.log1p(times * np.maximum(beyond, 0.0))
+    return f + PENALTY * np.log1p(times * np.maximum(largest_c, 0.0))

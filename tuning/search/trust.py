@@ -1,6 +1,6 @@
 """Checks of a tuning result: gradients against finite differences, influence of the gains, and confidence intervals.
 
-Read `slope_error` and `profiles` first.
+Read `gradient_error` and `profiles` first.
 """
 
 from collections.abc import Sequence
@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from ptsmc_jax.simulation import rollout
-from tuning.search import flights
+from tuning.search import simulations
 from tuning.search.evaluate import Evaluator
+from tuning.search.normalisation import TIMES, Bounds
 from tuning.search.objective import Problem
-from tuning.search.shares import TIMES, Bounds
 
 DIFFERENCE = 3e-4  # step of the finite differences, in normalised gains
 STEP = 1e-2  # relative step of a gain for sensitivities
@@ -24,7 +24,7 @@ CONFIDENCE = 0.95  # confidence level of intervals
 RESAMPLED = 2000  # bootstrap samples of an interval
 
 
-def slope_error(evaluate: Evaluator, problem: Problem, share: np.ndarray) -> float:
+def gradient_error(evaluate: Evaluator, problem: Problem, normalised: np.ndarray) -> float:
     """Return the largest relative error of the gradient of F, from automatic differentiation, at a point.
 
     The reference are central finite differences of order 4 with steps of `DIFFERENCE`. The error is relative to the
@@ -34,20 +34,20 @@ def slope_error(evaluate: Evaluator, problem: Problem, share: np.ndarray) -> flo
     Args:
         evaluate: measures the problem.
         problem: the tuning problem.
-        share: (gains,) normalised gains of the point.
+        normalised: (gains,) normalised gains of the point.
 
     Returns:
         The relative error [-]. It is NaN if F has no gradient: no trial completes, or the objective is zero.
     """
     behind = 3 * DIFFERENCE * np.isin(problem.names, TIMES)
-    count, inside = share.size, np.clip(share + behind, 2 * DIFFERENCE, 1.0 - 2 * DIFFERENCE)
+    count, inside = normalised.size, np.clip(normalised + behind, 2 * DIFFERENCE, 1.0 - 2 * DIFFERENCE)
     offsets = np.concatenate([k * DIFFERENCE * np.eye(count) for k in (-2, -1, 1, 2)])
-    flown = evaluate.fly(problem, inside + offsets)
-    if np.isnan(flown.goal).all():  # F is then a constant
+    measured = evaluate.measure(problem, inside + offsets)
+    if np.isnan(measured.objective).all():  # F is then a constant
         return np.nan
-    f = flown.f.reshape(4, count)
+    f = measured.f.reshape(4, count)
     numeric = (f[0] - 8 * f[1] + 8 * f[2] - f[3]) / (12 * DIFFERENCE)
-    exact = evaluate.slopes(problem, inside[None]).f_slope[0]
+    exact = evaluate.measure_with_gradients(problem, inside[None]).f_gradient[0]
     return float(np.abs(exact - numeric).max() / max(np.abs(exact).max(), SMALLEST))
 
 
@@ -57,7 +57,9 @@ class Profile:
 
     gain: np.ndarray  # (points,)
     value: np.ndarray  # (points,) objective; NaN if no trial has a value
-    over: np.ndarray  # (points,) largest metric / limit; `FAILED` if a trial fails; zero without requirements
+    violation_ratio: (
+        np.ndarray
+    )  # (points,) largest metric / limit; `FAILED` if a trial fails; zero without requirements
     f: np.ndarray  # (points,) F: ln of the objective plus the weighted torque term
     nearest: list[str] = field(default_factory=list)  # (points,) metric with the largest metric / limit
 
@@ -70,30 +72,30 @@ class Profile:
     def flat(self) -> bool:
         """Whether neither F nor the largest metric / limit depends on the gain."""
         steady = self.f.max() - self.f.min() <= np.log1p(FLAT)
-        return bool(steady and self.over.max() <= (1.0 + FLAT) * self.over.min())
+        return bool(steady and self.violation_ratio.max() <= (1.0 + FLAT) * self.violation_ratio.min())
 
 
-def profiles(evaluate: Evaluator, problem: Problem, share: np.ndarray) -> dict[str, Profile]:
+def profiles(evaluate: Evaluator, problem: Problem, normalised: np.ndarray) -> dict[str, Profile]:
     """Return the profile of each gain by name.
 
     Args:
         evaluate: measures the problem.
         problem: the tuning problem.
-        share: (gains,) normalised gains of the final point.
+        normalised: (gains,) normalised gains of the final point.
     """
-    count, bounds = share.size, evaluate.bounds
-    points = np.tile(share, (count, ACROSS + 1, 1))
+    count, bounds = normalised.size, evaluate.bounds
+    points = np.tile(normalised, (count, ACROSS + 1, 1))
     for k in range(count):
-        points[k, :, k] = np.sort(np.append(np.linspace(0.0, 1.0, ACROSS), share[k]))
-        points[k] = [bounds.replaced(share, bounds.gains(point), np.arange(count) == k) for point in points[k]]
-    flown = evaluate.fly(problem, points.reshape(-1, count))
-    largest = flown.c.max(axis=2, initial=-1.0)  # (points, rows); a failed trial breaks every limit
-    arrays = (flown.gains, flown.goal, largest.max(axis=1, initial=-1.0) + 1.0, flown.f)
-    gains, value, over, f = (v.reshape(count, ACROSS + 1, -1) for v in arrays)
+        points[k, :, k] = np.sort(np.append(np.linspace(0.0, 1.0, ACROSS), normalised[k]))
+        points[k] = [bounds.replaced(normalised, bounds.gains(point), np.arange(count) == k) for point in points[k]]
+    measured = evaluate.measure(problem, points.reshape(-1, count))
+    largest = measured.c.max(axis=2, initial=-1.0)  # (points, rows); a failed trial breaks every limit
+    arrays = (measured.gains, measured.objective, largest.max(axis=1, initial=-1.0) + 1.0, measured.f)
+    gains, value, violation_ratio, f = (v.reshape(count, ACROSS + 1, -1) for v in arrays)
     rows = largest.argmax(axis=1) if problem.rows else np.zeros(len(largest), int)
     nearest = np.asarray(problem.rows or ("",))[rows].reshape(count, ACROSS + 1)
     return {
-        name: Profile(gains[k, :, k], value[k, :, 0], over[k, :, 0], f[k, :, 0], nearest[k].tolist())
+        name: Profile(gains[k, :, k], value[k, :, 0], violation_ratio[k, :, 0], f[k, :, 0], nearest[k].tolist())
         for k, name in enumerate(problem.names)
     }
 
@@ -118,9 +120,9 @@ def sensitivities(
     """
     less, more = (np.clip(gains + side * np.diag(STEP * gains), bounds.lower, bounds.upper) for side in (-1.0, 1.0))
     trials = problem.others(np.asarray(problem.trials)[: problem.averaged])
-    flown = flights.fly(trials, np.concatenate([less, more]))
-    finished = np.isin(flown.status, rollout.FINISHED)
-    metrics = (getattr(flown.metrics, name) for name in names)
+    simulated = simulations.simulate(trials, np.concatenate([less, more]))
+    finished = np.isin(simulated.status, rollout.FINISHED)
+    metrics = (getattr(simulated.metrics, name) for name in names)
     with np.errstate(divide="ignore", invalid="ignore"):
         metric_rms = [
             [rms(one[ended]) if ended.any() else np.nan for one, ended in zip(metric, finished, strict=True)]

@@ -16,16 +16,16 @@ from ptsmc_jax import programs
 from ptsmc_jax.dispersions.base import Coordinates
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.simulation import rollout
-from ptsmc_jax.simulation.requirements import Requirement, over
-from tuning.search import flights
-from tuning.search.flights import Fleet
+from ptsmc_jax.simulation.requirements import Requirement, violation_ratio
+from tuning.search import simulations
 from tuning.search.objective import FAILED, Problem, judged, watched
+from tuning.search.simulations import Batch
 
 SCREENED = 4096  # number of screened trials
-CLIMBERS = 8  # number of hardest screened trials where an ascent starts
+ASCENTS = 8  # number of hardest screened trials where an ascent starts
 STEPS, RATE, LAST_RATE = 30, 0.1, 0.01  # number of steps of the ascent; first and last learning rate
 HELD = 0.9999  # probability content of the searched region of a normal dispersion
-TURNS = 3  # steps of the advanced mean value method for normal dispersions, after the ascent
+MEAN_VALUE_STEPS = 3  # steps of the advanced mean value method for normal dispersions, after the ascent
 NEAR = 1e-3  # a worst case may exceed a limit by this fraction
 
 _ADAM = optax.adam(optax.cosine_decay_schedule(RATE, STEPS, LAST_RATE / RATE), b2=0.9)
@@ -64,7 +64,7 @@ class Hardest:
         return self.status not in ("ok", "not_converged")
 
     @property
-    def beyond(self) -> bool:
+    def breaks_limit(self) -> bool:
         """Whether the trial breaks its limit by more than `NEAR`."""
         return not self.ratio <= 1.0 + NEAR
 
@@ -85,9 +85,11 @@ def screen(problem: Problem, requirements: Sequence[Requirement], gains: np.ndar
         fails or lacks a metric.
     """
     trials = np.arange(problem.averaged, problem.averaged + SCREENED, dtype=np.uint32)
-    flown = flights.trials(problem.others(trials), gains)
-    ratios = np.stack([over(getattr(flown.metrics, r.metric), r.limit, at_least=False) for r in requirements])
-    return trials, np.max(np.where(flown.finished & ~np.isnan(ratios), ratios, np.inf), axis=0)
+    simulated = simulations.simulate_trials(problem.others(trials), gains)
+    ratios = np.stack(
+        [violation_ratio(getattr(simulated.metrics, r.metric), r.limit, at_least=False) for r in requirements]
+    )
+    return trials, np.max(np.where(simulated.finished & ~np.isnan(ratios), ratios, np.inf), axis=0)
 
 
 def hardest(
@@ -106,43 +108,45 @@ def hardest(
         screened: result of `screen` for these gains. None: the trials are screened first.
     """
     trials, ratio = screened or screen(problem, requirements, gains)
-    chosen = trials[np.argsort(-ratio, kind="stable")][:CLIMBERS]
+    chosen = trials[np.argsort(-ratio, kind="stable")][:ASCENTS]
     limits = {r.metric: r.limit for r in requirements}
-    fleet = problem.others(chosen)
-    moved = flights.movable(problem.dispersion)
-    charted = [_charted(problem, name, fleet.coordinates[name]) for name in moved]
+    batch = problem.others(chosen)
+    moved = simulations.movable(problem.dispersion)
+    charted = [_charted(problem, name, batch.coordinates[name]) for name in moved]
     y = np.concatenate([np.zeros((chosen.size, 0)), *charted], axis=1)
     best, best_y = np.full(len(y), -np.inf), y.copy()
 
-    def look(y: np.ndarray) -> np.ndarray:
-        value, slope = climb(fleet, gains, y, watched(problem), limits)
+    def evaluate(y: np.ndarray) -> np.ndarray:
+        value, slope = ratio_with_gradient(batch, gains, y, watched(problem), limits)
         better = value > best
         best[better], best_y[better] = value[better], y[better]
         return np.where(np.isfinite(slope), slope, 0.0)
 
     state = _ADAM.init(y)
     for _ in range(STEPS + 1 if moved else 0):
-        ascended, state = _ascended(y, look(y), state)
+        ascended, state = _ascended(y, evaluate(y), state)
         y = np.asarray(ascended)
     normal = _normal(problem, moved)
     y = _within(best_y, normal)
-    for _ in range(TURNS + 1 if normal else 0):
-        y = _within(y, normal, look(y))
+    for _ in range(MEAN_VALUE_STEPS + 1 if normal else 0):
+        y = _within(y, normal, evaluate(y))
     first = int(np.argmax(best))
-    reached_at = {name: v[first : first + 1] for name, v in _moved_to(fleet, best_y)[0].items()}
-    fleet_of_one = fleet._replace(trials=chosen[first : first + 1], coordinates=reached_at)
-    flown = jax.tree.map(lambda v: v[0, 0], flights.fly(fleet_of_one, gains[None]))
-    ratios = {m: float(over(getattr(flown.metrics, m), limit, at_least=False)) for m, limit in limits.items()}
+    reached_at = {name: v[first : first + 1] for name, v in _moved_to(batch, best_y)[0].items()}
+    batch_of_one = batch._replace(trials=chosen[first : first + 1], coordinates=reached_at)
+    simulated = jax.tree.map(lambda v: v[0, 0], simulations.simulate(batch_of_one, gains[None]))
+    ratios = {
+        m: float(violation_ratio(getattr(simulated.metrics, m), limit, at_least=False)) for m, limit in limits.items()
+    }
     ratios = {m: np.inf if np.isnan(v) else v for m, v in ratios.items()}  # it never settles, for example
     worst = max(ratios, key=ratios.__getitem__)
     return Hardest(
         metric=worst,
         ratio=ratios[worst],
         screened=float(ratio.max()),
-        status=rollout.STATUS[int(flown.status)][0],
+        status=rollout.STATUS[int(simulated.status)][0],
         trial=int(chosen[first]),
         coordinates={name: v[0].tolist() for name, v in reached_at.items()},
-        start={name: float(v) for name, v in flown.drawn.items()},
+        start={name: float(v) for name, v in simulated.drawn.items()},
         moved=moved,
     )
 
@@ -196,8 +200,8 @@ def _within(y: np.ndarray, normal: list[tuple[slice, float]], slope: np.ndarray 
     return y
 
 
-def climb(
-    fleet: Fleet, gains: np.ndarray, y: np.ndarray, metrics: tuple[str, ...], limits: Mapping[str, float]
+def ratio_with_gradient(
+    batch: Batch, gains: np.ndarray, y: np.ndarray, metrics: tuple[str, ...], limits: Mapping[str, float]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the largest metric / limit of each case and its gradient with respect to the variables y.
 
@@ -205,7 +209,7 @@ def climb(
     there are gains.
 
     Args:
-        fleet: the trials, one for each case.
+        batch: the trials, one for each case.
         gains: (gains,) the gains.
         y: (cases, variables) variables of the dispersions.
         metrics: names of the metrics of the search, which include the names in `limits`.
@@ -214,19 +218,20 @@ def climb(
     Returns:
         The ratio, (cases,), and its gradient, (cases, variables). A failed case has the ratio `FAILED` and no gradient.
     """
-    coordinates, shifts = _moved_to(fleet, y)
-    fleet, count, width = fleet._replace(coordinates=coordinates), y.shape[1], len(fleet.names)
+    coordinates, shifts = _moved_to(batch, y)
+    batch, count, width = batch._replace(coordinates=coordinates), y.shape[1], len(batch.names)
     columns, limit = [metrics.index(name) for name in limits], np.asarray([*limits.values()], dtype=float)
     value, slopes = np.zeros(len(y)), list[np.ndarray]()
     for k in range(0, count, width):
         shift = {name: _filled(v[:, k : k + width], width) for name, v in shifts.items()}
-        flown = jax.tree.map(
-            lambda v: v[0], flights.sloped(fleet, gains[None], np.zeros((1, width, width)), metrics, shift)
+        simulated = jax.tree.map(
+            lambda v: v[0],
+            simulations.simulate_with_derivatives(batch, gains[None], np.zeros((1, width, width)), metrics, shift),
         )
-        shares = jnp.asarray(over(flown.metrics[:, columns], limit, at_least=False))
-        ratios = np.asarray(judged(shares, jnp.asarray(flown.status[:, None])))
+        ratios_or_nan = jnp.asarray(violation_ratio(simulated.metrics[:, columns], limit, at_least=False))
+        ratios = np.asarray(judged(ratios_or_nan, jnp.asarray(simulated.status[:, None])))
         nearest, value = ratios.argmax(axis=1), ratios.max(axis=1)
-        slope = np.take_along_axis(flown.slopes[:, :, columns], nearest[:, None, None], axis=2)[:, :, 0]
+        slope = np.take_along_axis(simulated.slopes[:, :, columns], nearest[:, None, None], axis=2)[:, :, 0]
         slopes.append(np.where(value[:, None] < FAILED, slope / (limit + (limit == 0.0))[nearest][:, None], 0.0))
     return value, np.concatenate(slopes, axis=1)[:, :count]
 
@@ -236,11 +241,11 @@ def _filled(v: np.ndarray, width: int) -> np.ndarray:
     return np.concatenate([v, np.zeros((v.shape[0], width - v.shape[1], *v.shape[2:]))], axis=1)
 
 
-def _moved_to(fleet: Fleet, y: np.ndarray) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+def _moved_to(batch: Batch, y: np.ndarray) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Return the coordinates of variables y, and for each moved name their derivatives, (cases, variables, numbers)."""
-    names = flights.movable(fleet.dispersion)
-    moved, shifts = jax.tree.map(np.asarray, _moved(fleet.dispersion, dict(fleet.coordinates), y, names))
-    return {**fleet.coordinates, **moved}, shifts
+    names = simulations.movable(batch.dispersion)
+    moved, shifts = jax.tree.map(np.asarray, _moved(batch.dispersion, dict(batch.coordinates), y, names))
+    return {**batch.coordinates, **moved}, shifts
 
 
 @programs.jit(static_argnames="names", compiler_options=programs.QUICKLY)

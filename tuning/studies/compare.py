@@ -155,7 +155,7 @@ def contenders(scenario: Scenario, rivals: Rivals = Rivals()) -> dict[str, Scena
         if _is(table, law):
             posed[name] = scenario
         elif name == OURS:
-            posed[name] = _posed(gains.papers(scenario), tune, same)
+            posed[name] = _posed(gains.published_scenario(scenario), tune, same)
         else:
             fields = LAWS["spacecraft"][law["kind"]].__struct_fields__
             both = "sign_width" in fields and hasattr(table, "sign_width")
@@ -359,7 +359,7 @@ def summary(comparison: Comparison) -> dict[str, Any]:
         "seed": comparison.fresh_seed,
         "trials": int(first.trials.status.size),
         "paper_refused": comparison.paper_refused,
-        "paper_is": gains.paper_is(found[PAPER].flown) if PAPER in found else None,
+        "published_label": gains.published_label(found[PAPER].flown) if PAPER in found else None,
         "judged_on": "flight clock",  # no sign function is named here, because the laws have different ones
         "settling_angle": first.flown.loop.settling_angle,
         "laws": {law: figures_of(contender) for law, contender in found.items()},

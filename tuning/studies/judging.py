@@ -43,7 +43,7 @@ def beside(scenario: Scenario) -> tuple[dict[str, Scenario], str | None]:
         Otherwise the second value is None.
     """
     try:
-        paper = gains.papers(scenario)
+        paper = gains.published_scenario(scenario)
         study(as_flown(paper))
     except ScenarioError as error:
         return {"before": scenario}, str(error)
@@ -59,7 +59,7 @@ def judge(scenario: Scenario, fresh_seed: int, reach: Reach | None = None) -> Tr
         reach: ranges of the gains that share a compiled program; None: those of the scenario.
     """
     flown = study(as_flown(scenario), reach=reach)
-    return montecarlo.run(flown.parts, flown.dispersion, fresh_seed, np.arange(fresh_trials(flown)))
+    return montecarlo.run(flown.parts, flown.dispersion, fresh_seed, np.arange(held_out_trials(flown)))
 
 
 def floor_of(scenario: Scenario, fresh_seed: int) -> float | None:
@@ -141,6 +141,6 @@ def trials_of(ready: Study, wanted: int) -> int:
     return wanted if ready.drawn else 1
 
 
-def fresh_trials(ready: Study) -> int:
+def held_out_trials(ready: Study) -> int:
     """Return the number of held-out trials of a judgement."""
-    return trials_of(ready, confirm.fresh_trials(ready.requirements))
+    return trials_of(ready, confirm.held_out_trials(ready.requirements))

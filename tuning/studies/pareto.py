@@ -18,10 +18,10 @@ from ptsmc_jax.scenario import cautions, parsing, study, tables
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.scenario.timing import Reach
 from tuning.search import gains, trust
-from tuning.search.descent import Best
-from tuning.search.descents import Descents
 from tuning.search.evolution import NEARBY
 from tuning.search.journal import Journal
+from tuning.search.local_search import Best
+from tuning.search.local_searches import LocalSearches
 from tuning.search.objective import Problem
 from tuning.search.progress import Report
 from tuning.search.rounds import MARGIN
@@ -53,7 +53,7 @@ def trace(trade: Trade, seed: int, tell: Report = lambda *_: None, journal: Jour
     chosen, fresh_seed, judged = apart(best) if trade.merged else best, judging.seed_of_judge(seed), []
     for done, k in enumerate(sorted(chosen)):
         tell("judging on held-out trials", done, len(chosen), np.nan, 0.0)
-        found, value = posed.named(chosen[k].share), targets[k].value
+        found, value = posed.named(chosen[k].normalised), targets[k].value
         tuned = trade.tuned(value, found)
         judged.append(_judged(trade, Point(value, found, trained=chosen[k].value), tuned, fresh_seed, reach))
     others, refused = judging.beside(trade.scenario) if trade.compared else ({}, None)
@@ -77,7 +77,7 @@ def trace(trade: Trade, seed: int, tell: Report = lambda *_: None, journal: Jour
         requirements=list(scenario.requirements),
         gain_units=gains.units_of(scenario),
         cautions=cautions.of(scenario),
-        paper_is=gains.paper_is(scenario),
+        published_label=gains.published_label(scenario),
         paper_refused=refused,
         others={name: reference(one) for name, one in others.items()},
     )
@@ -111,30 +111,30 @@ def refined(targets: Sequence[Target], known: list[np.ndarray], posed: posing.Po
         found = _refined(posed, targets[k].problem, np.unique(np.asarray(known), axis=0))
         if found is not None and (k not in best or found.f < best[k].f):
             best[k] = found
-            known.append(found.share)
+            known.append(found.normalised)
     return best
 
 
 def _refined(posed: posing.Posed, problem: Problem, known: np.ndarray) -> Best | None:
     """Return the best feasible gains, known ones or those of searches from the most promising known ones."""
-    run = Descents(posed.evaluate, MARGIN, STEPS, np.random.default_rng(0))
-    flown = posed.evaluate.fly(run.tightened(problem), known)
-    chosen = known[np.lexsort((flown.f, np.maximum(flown.beyond - NEARLY, 0.0)))[:WARM]]
+    run = LocalSearches(posed.evaluate, MARGIN, STEPS, np.random.default_rng(0))
+    flown = posed.evaluate.measure(run.tightened(problem), known)
+    chosen = known[np.lexsort((flown.f, np.maximum(flown.largest_c - NEARLY, 0.0)))[:WARM]]
     best = Best(known[0], len(problem.rows), MARGIN)
     best.offer(known, flown)
-    if posed.sloped:
-        run.descend(problem, dict(enumerate(chosen)))
+    if posed.with_gradients:
+        run.search_locally(problem, dict(enumerate(chosen)))
     else:
         run.evolve(problem, chosen[0], NEARBY)
     best = min(best, run.best, key=lambda one: one.rank) if run.started else best
-    return best if best.over == 0.0 else None
+    return best if best.violation == 0.0 else None
 
 
 def apart(best: dict[int, Best]) -> dict[int, Best]:
     """Return the first target of those with the same gains, whose limits are not active."""
     kept: dict[int, Best] = {}
     for k in sorted(best):
-        if all(np.abs(best[k].share - other.share).max() >= APART for other in kept.values()):
+        if all(np.abs(best[k].normalised - other.normalised).max() >= APART for other in kept.values()):
             kept[k] = best[k]
     return kept
 

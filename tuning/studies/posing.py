@@ -16,7 +16,7 @@ from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.scenario.timing import Reach, reach_of
 from ptsmc_jax.simulation.requirements import Requirement
 from tuning.search import confirm, gains, margin_rows, objective
-from tuning.search import shares as gain_bounds
+from tuning.search import normalisation as gain_bounds
 from tuning.search.evaluate import Evaluator
 from tuning.search.journal import Journal
 from tuning.search.objective import Problem
@@ -34,7 +34,7 @@ class Posed:
     problem: Problem
     evaluate: Evaluator
     scenario_gains: np.ndarray  # (gains,) of the scenario
-    sloped: bool  # F has useful gradients: the sign function is not discontinuous
+    with_gradients: bool  # F has useful gradients: the sign function is not discontinuous
     asked: list[Requirement]  # constraints of the search
     seed: int
     designs: np.ndarray  # (designs, gains) starting points that follow from the mission
@@ -63,7 +63,7 @@ class Posed:
         """
         table, asked = self.ready.scenario.search, self.asked if asked is None else asked
         settings = Settings(
-            starts, table.steps, self.seed, self.sloped, table.worst_case, judged, margins or {}, self.designs
+            starts, table.steps, self.seed, self.with_gradients, table.worst_case, judged, margins or {}, self.designs
         )
         return search(self.evaluate, problem, asked, gains, settings, **callbacks)
 
@@ -102,7 +102,7 @@ def pose(scenario: Scenario, seed: int, journal: Journal | None = None, **farthe
         asked,
         may_break=tuple(allowed for allowed, _ in may_break),
         banded=tuple(banded for _, banded in may_break),
-        goal=table.minimise,
+        objective=table.minimise,
         tail=_tail(table, trained),
         statistic=table.statistic,
         torque_weight=table.torque_weight,
@@ -110,7 +110,7 @@ def pose(scenario: Scenario, seed: int, journal: Journal | None = None, **farthe
     )
     scenario_gains = np.asarray(gains.present_values(ready.parts, bounds.names))
     exact = scenario.exact_sign and "sign_width" not in bounds.names
-    designs = np.asarray(gains.of_designs(scenario, ready.parts, bounds.names))
+    designs = np.asarray(gains.design_gains(scenario, ready.parts, bounds.names))
     return Posed(ready, problem, Evaluator(bounds, journal), scenario_gains, not exact, asked, seed, designs)
 
 

@@ -157,7 +157,7 @@ class Torque(Trade):
         targets = [Target(float(one), f"peak torque {one:.3g}", under(one, free.problem)) for one in limits]
         # the best local minimum between the ends may differ from those at the ends
         between = _found(posed, targets[middle].problem, headed(tell, targets[middle].name), asked=())
-        return targets, [share for found in (free, least, between) for share in (found.share, *found.ends)]
+        return targets, [share for found in (free, least, between) for share in (found.normalised, *found.ends)]
 
     def costs(self, tuned: Scenario, trials: Trials, seed: int) -> dict[str, float]:
         """Return the largest and the mean peak torque [N m]."""
@@ -212,7 +212,7 @@ class Margins(Trade):
             limited = replace(posed.problem, margins=replace(asked, wanted=replaced(asked.wanted, at, value)))
             found = _found(posed, limited, headed(tell, name), FEWER if targets else None)
             targets.append(Target(value, name, found.problem))
-            known.append(found.share)
+            known.append(found.normalised)
         return targets, known
 
     def costs(self, tuned: Scenario, trials: Trials, seed: int) -> dict[str, float]:
@@ -292,7 +292,7 @@ class SlewTime(Trade):
             name = {last: "longest time", 0: "shortest time"}.get(k, f"{self.values[k]:g} s")
             starts, asked = None if k == last else FEWER, None if k in (0, last) else ()
             found = _found(posed, replace(joined, parts=parts[k]), headed(tell, name), starts, asked)
-            known.append(found.share)
+            known.append(found.normalised)
             joined = found.problem if k in (0, last) else joined
         problems = [replace(joined, parts=one) for one in parts]
         targets = [Target(t_f, f"{t_f:g} s", one) for t_f, one in zip(self.values, problems, strict=True)]

@@ -15,7 +15,7 @@ from ptsmc_jax.scenario.tables import LIMITS, T_F, Scenario, objective_name
 from ptsmc_jax.simulation import catalogues
 from tuning.search import custom_parts, trust
 from tuning.search import gains as gain_names
-from tuning.search.descents import Step
+from tuning.search.local_searches import Step
 from tuning.studies import judging
 from tuning.studies.tuner import Beyond, Trust, Tuning
 
@@ -66,7 +66,10 @@ def summary(tuning: Tuning) -> dict[str, Any]:
     }
     hardest = None
     if search.hardest is not None:
-        hardest = asdict(search.hardest) | {"unbounded": search.hardest.unbounded, "beyond": search.hardest.beyond}
+        hardest = asdict(search.hardest) | {
+            "unbounded": search.hardest.unbounded,
+            "breaks_limit": search.hardest.breaks_limit,
+        }
     return {
         "status": tuning.status,
         "plant": kind,
@@ -79,7 +82,7 @@ def summary(tuning: Tuning) -> dict[str, Any]:
         "fresh": groups["tuned"],
         **{name: group for name, group in groups.items() if name != "tuned"},
         "paper_refused": tuning.paper_refused,
-        "paper_is": gain_names.paper_is(tuning.tuned),
+        "published_label": gain_names.published_label(tuning.tuned),
         "shortest_t_f": None if tuning.shortest is None else asdict(tuning.shortest),
         "broken_by": tuning.broken_by,
         "verdicts": [verdict.in_summary() for verdict in tuning.verdicts],
@@ -98,7 +101,8 @@ def summary(tuning: Tuning) -> dict[str, Any]:
             "conflict": search.conflict,
             "searched_globally": search.globally,
             "confirmed": [
-                {**{k: v for k, v in asdict(one).items() if k != "harder"}, "held": one.held} for one in search.counts
+                {**{k: v for k, v in asdict(one).items() if k != "harder"}, "confirmed": one.confirmed}
+                for one in search.counts
             ],
             "worst_case": tuning.tuned.search.worst_case,
             "hardest": hardest,
@@ -147,7 +151,7 @@ def _trust(found: Trust, tuning: Tuning) -> dict[str, Any]:
             bound = tuning.tuned.search.bounds[gain][side == "upper"]
             border = free_gains.border(tuning.tuned, gain, side, bound)
             influence[name] = border or _beyond(tuning.beyond.get(name), bound)
-    slopes = found.slope_error
+    slopes = found.gradient_error
     return {
         "slopes_off_central_differences": None if slopes is None else dict(zip(("start", "end"), slopes, strict=True)),
         "influence": influence,
@@ -248,7 +252,7 @@ def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
         ),
     }
     ended = {
-        gain_names.paper_is(scenario) if name == "paper" else name: (
+        gain_names.published_label(scenario) if name == "paper" else name: (
             trials.metrics.window_error[trials.finished], trials.metrics.peak_torque[trials.finished]
         )
         for name, trials in tuning.fresh.items()
@@ -262,7 +266,9 @@ def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
     if tuning.trust is not None:
         figures["profiles"] = study_plots.profiles(
             {
-                name: study_plots.Profile(units[k], p.gain, p.value, p.over, p.nearest, float(tuning.search.gains[k]))
+                name: study_plots.Profile(
+                    units[k], p.gain, p.value, p.violation_ratio, p.nearest, float(tuning.search.gains[k])
+                )
                 for k, (name, p) in enumerate(tuning.trust.profiles.items())
             },
             goal,

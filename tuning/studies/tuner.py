@@ -18,11 +18,11 @@ from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation.requirements import Verdict
 from ptsmc_jax.theory import run_margins
-from tuning.search import flights, gains, global_check, trust
-from tuning.search.descents import Step
+from tuning.search import gains, global_check, simulations, trust
 from tuning.search.design import ShortestTime, shortest_time
 from tuning.search.global_check import Check
 from tuning.search.journal import Journal
+from tuning.search.local_searches import Step
 from tuning.search.objective import T_F
 from tuning.search.optimise import Search
 from tuning.search.progress import Report
@@ -40,7 +40,7 @@ SENSITIVE = ("window_error", "hold_error", "peak_torque", "effort", "chattering"
 class Trust:
     """Checks of a result: gradient errors, profiles, sensitivities and stability margins, see `trust`."""
 
-    slope_error: tuple[float, float] | None  # relative, at the first and the last point; None: discontinuous sign
+    gradient_error: tuple[float, float] | None  # relative, at the first and the last point; None: discontinuous sign
     profiles: dict[str, Profile]  # objective along each gain
     sensitivities: dict[str, dict[str, float]]
     margins: dict[str, dict[str, Any]] | None  # of the tuned gains, see `stability.worst`
@@ -157,15 +157,17 @@ def tune(
     outcome, rollouts, gradients = judged.search, evaluate.rollouts, evaluate.gradients
     check = None
     if globally and not outcome.interrupted:
-        check = global_check.check(evaluate, outcome, seed, report, sloped=posed.sloped)
+        check = global_check.check(evaluate, outcome, seed, report, with_gradients=posed.with_gradients)
     problem = posed.problem
-    training = flights.trials(problem.others(np.arange(problem.averaged)), np.asarray([*judged.gains.values()]))
+    training = simulations.simulate_trials(
+        problem.others(np.arange(problem.averaged)), np.asarray([*judged.gains.values()])
+    )
     candidates = {"tuned": judged.scenario} | {name: judging.as_flown(other) for name, other in others.items()}
     fresh = {"tuned": judged.trials} | {name: judging.judge(other, judged.seed) for name, other in others.items()}
     shortest = _shortest(posed, judged)
     trust_in_it, beyond, at_bound = None, {}, evaluate.bounds.at_bound(outcome.gains)
     if trusted and not outcome.interrupted:
-        report("profiles, sensitivities and margins of the gains found", 0, 0, outcome.value, outcome.over)
+        report("profiles, sensitivities and margins of the gains found", 0, 0, outcome.value, outcome.violation)
         trust_in_it = _trust(posed, judged)
         profiles = trust_in_it.profiles
         beyond = _beyond(judged, {name: side for name, side in at_bound.items() if not profiles[name].flat})
@@ -211,7 +213,7 @@ def _search_and_judge(
     scenario = posed.ready.scenario
     earlier = list[Try]()
     while True:
-        report("verifying on held-out trials", 0, 0, outcome.value, outcome.over)
+        report("verifying on held-out trials", 0, 0, outcome.value, outcome.violation)
         judged = _judge(scenario, posed, outcome, judging.seed_of_judge(seed, len(earlier)))
         over = _over(outcome, judged.verdicts)
         if not over or outcome.interrupted or len(earlier) + 1 >= tries:
@@ -230,19 +232,19 @@ def _in_larger_bounds(outcome: Search, posed: Posed, journal: Journal | None, re
     """
     defaulted = posed.ready.scenario.defaulted
     for _ in range(WIDENED):
-        if outcome.interrupted or not posed.sloped:
+        if outcome.interrupted or not posed.with_gradients:
             break
         sides = _that_matter(posed, outcome, posed.evaluate.bounds.at_bound(outcome.gains))
         scenario = posed.ready.scenario
         moved = free_gains.widened(scenario, {gains.base(name): side for name, side in sides.items()}, defaulted)
         if not moved:
             break
-        report(f"searching beyond the bounds of {', '.join(moved)}", 0, 0, outcome.value, outcome.over)
+        report(f"searching beyond the bounds of {', '.join(moved)}", 0, 0, outcome.value, outcome.violation)
         larger = posing.pose(posing.with_bounds(scenario, moved), posed.seed, journal)
         larger.evaluate.count_on(posed.evaluate)
         more = larger.search(larger.problem, outcome.gains, 1, report=report)
         history = [*outcome.history, *_after(outcome.history, more.history)]
-        better = (more.over, more.value) < (outcome.over, outcome.value * (1.0 - trust.FLAT))
+        better = (more.violation, more.value) < (outcome.violation, outcome.value * (1.0 - trust.FLAT))
         if not better:
             posed.evaluate.count_on(larger.evaluate)
             return replace(outcome, history=history), posed
@@ -255,17 +257,17 @@ def _that_matter(posed: Posed, outcome: Search, sides: dict[str, str]) -> dict[s
 
     It matters if moving the gain inwards by a tenth of its interval changes F or the violation by more than 0.01.
     """
-    names, found = posed.evaluate.bounds.names, outcome.share
+    names, found = posed.evaluate.bounds.names, outcome.normalised
     points = np.asarray([found, *(np.where(np.isin(names, name), np.abs(found - 0.1), found) for name in sides)])
-    seen = posed.evaluate.fly(outcome.problem, points)
-    changes = np.abs(seen.f - seen.f[0]) + np.abs(seen.beyond - seen.beyond[0])
+    seen = posed.evaluate.measure(outcome.problem, points)
+    changes = np.abs(seen.f - seen.f[0]) + np.abs(seen.largest_c - seen.largest_c[0])
     return {name: side for (name, side), change in zip(sides.items(), changes[1:], strict=True) if change > trust.FLAT}
 
 
 def _judge(scenario: Scenario, posed: Posed, outcome: Search, fresh_seed: int) -> _Judged:
     """Simulate the rounded gains of a search on held-out trials."""
     begun = time.monotonic()
-    rounded = posed.named(outcome.share)
+    rounded = posed.named(outcome.normalised)
     flown = judging.as_flown(gains.in_scenario(scenario, rounded))
     trials = judging.judge(flown, fresh_seed)
     return _Judged(outcome, rounded, flown, fresh_seed, trials, judging.verdicts_of(flown, trials, fresh_seed), begun)
@@ -308,14 +310,14 @@ def _broken_by(candidates: dict[str, Scenario], fresh: dict[str, Trials], seed: 
 def _trust(posed: Posed, judged: _Judged) -> Trust:
     """Compute gradient errors, profiles, sensitivities and margins of the gains found."""
     outcome, evaluate = judged.search, posed.evaluate
-    slope_error = None
-    if posed.sloped:
-        at_start = trust.slope_error(evaluate, outcome.problem, evaluate.bounds.share(posed.scenario_gains))
-        slope_error = at_start, trust.slope_error(evaluate, outcome.problem, outcome.share)
+    gradient_error = None
+    if posed.with_gradients:
+        at_start = trust.gradient_error(evaluate, outcome.problem, evaluate.bounds.normalise(posed.scenario_gains))
+        gradient_error = at_start, trust.gradient_error(evaluate, outcome.problem, outcome.normalised)
     metrics = tuple(dict.fromkeys([*SENSITIVE, *outcome.problem.metrics]))
     return Trust(
-        slope_error=slope_error,
-        profiles=trust.profiles(evaluate, outcome.problem, outcome.share),
+        gradient_error=gradient_error,
+        profiles=trust.profiles(evaluate, outcome.problem, outcome.normalised),
         sensitivities=trust.sensitivities(outcome.problem, evaluate.bounds, outcome.gains, metrics),
         margins=stability.worst(study(judged.scenario)),
     )
@@ -384,6 +386,6 @@ def _broken(verdicts: list[Verdict], trials: Trials) -> str | None:
 def _prepare(scenario: Scenario) -> None:
     """Start to compile the programs that judge gains, in the background."""
     flown = study(judging.as_flown(scenario))
-    montecarlo.prepare(flown.parts, flown.dispersion, judging.fresh_trials(flown))
+    montecarlo.prepare(flown.parts, flown.dispersion, judging.held_out_trials(flown))
     if scenario.sampled:
         run_margins.judged_jit.prepare(flown.parts)

@@ -1,8 +1,8 @@
 """Local searches from many starting points by successive halving, with the best point and the history.
 
-`Descents` runs the steps of a search, and `optimise.search` calls them in order. The local search is sequential
-quadratic programming with gradients of the simulation, see `descent.descend`. Without gradients, it is replaced by
-differential evolution. Points are normalised gains (`share`), 0 to 1 within the bounds.
+`LocalSearches` runs the steps of a search, and `optimise.search` calls them in order. The local search is sequential
+quadratic programming with gradients of the simulation, see `local_search.search_locally`. Without gradients,
+differential evolution replaces it. Points are normalised gains, 0 at the lower bound and 1 at the upper bound.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,31 +14,42 @@ from numpy.typing import ArrayLike
 
 from ptsmc_jax import configure
 from tuning.search import hand_overs
-from tuning.search.descent import BOLD, CAREFUL, CLOSE, SLACK, Best, Relaxed, Start, descend, largest, prices
-from tuning.search.evaluate import Evaluator, Measured, Sloped
+from tuning.search.evaluate import Evaluator, Measured, MeasuredWithGradients
 from tuning.search.evolution import WIDELY, evolve
+from tuning.search.local_search import (
+    BOLD,
+    CAREFUL,
+    CLOSE,
+    SLACK,
+    Best,
+    Relaxed,
+    Start,
+    largest,
+    multipliers,
+    search_locally,
+)
 from tuning.search.lockstep import Ask, in_step
+from tuning.search.normalisation import TIMES
 from tuning.search.objective import LIMITS, Problem, ended, failures, fewer_trials
 from tuning.search.progress import Report
-from tuning.search.shares import TIMES
 from tuning.search.starts import (
     NEARLY,
     STEEP,
-    charged,
+    global_starting_points,
+    penalised,
     promising,
     spread,
-    spread_widely,
     starting_points,
 )
 
-AGAIN = 3  # number of local searches that a further round continues
+CONTINUED = 3  # number of local searches that a further round continues
 EXPLORED, AVERAGED = 32, 16  # trials of the first searches, constraints included; smallest number in the objective
 TOGETHER = 2  # concurrent local searches for each device, so that the device waits for SLSQP less often
 FOLLOWED = 3  # number of explored starting points that continue with all trials
-SAME = 1e-4  # points are equally good if their F differs by less: 0.01 % of the objective
+SAME_F = 1e-4  # points are equally good if their F differs by less: 0.01 % of the objective
 FINISH = 1e-2  # factor on `CLOSE` for the last local search, from the best point
 CONFLICTING = 0.1  # limits whose excess is within this fraction of the largest excess count as conflicting
-LOOKS = 3  # largest number of attempts with other hand-over times
+HAND_OVER_ATTEMPTS = 3  # largest number of attempts with other hand-over times
 MANY = 512  # Sobol points of a search without gradients
 
 
@@ -53,7 +64,7 @@ class Step:
 
 
 @dataclass(frozen=True)
-class _Racer:
+class _Contender:
     """A starting point in successive halving, and the history that led to it."""
 
     start: Start
@@ -65,7 +76,7 @@ def _few_trials(problem: Problem) -> Problem:
     return fewer_trials(problem, max(AVERAGED, EXPLORED - (problem.trials.size - problem.averaged)))
 
 
-class Descents:
+class LocalSearches:
     """The steps of a search, with its best point and its history."""
 
     def __init__(
@@ -119,26 +130,26 @@ class Descents:
         return self._problem.tightened(1.0 / (1.0 - self._margin))
 
     @property
-    def share(self) -> np.ndarray:
+    def normalised(self) -> np.ndarray:
         """Normalised gains of the best point, (gains,)."""
-        return self.best.share
+        return self.best.normalised
 
     @property
     def gains(self) -> np.ndarray:
         """Gains of the best point, (gains,)."""
-        return self._evaluate.bounds.gains(self.share)
+        return self._evaluate.bounds.gains(self.normalised)
 
     @property
     def ends(self) -> list[np.ndarray]:
         """Normalised gains of the best points of the local searches, (gains,) each, the best first."""
-        return [end.share for _, end in _ranked(self._ends)]
+        return [end.normalised for _, end in _ranked(self._ends)]
 
     @property
     def history(self) -> list[Step]:
         """The history of accepted points, ordered by local search and step."""
         return [step for _, steps in sorted(self._history.items()) for step in steps]
 
-    def set_out(self, problem: Problem, scenario_gains: np.ndarray, designs: np.ndarray) -> None:
+    def begin(self, problem: Problem, scenario_gains: np.ndarray, designs: np.ndarray) -> None:
         """Search locally on few trials, from the scenario's gains or from the best design if that is better.
 
         Args:
@@ -147,21 +158,23 @@ class Descents:
             designs: (designs, gains) gains of designs that follow from the mission.
         """
         few = _few_trials(problem)
-        self._scenario_gains = scenario_gains
-        self._designs = np.asarray([self._evaluate.bounds.share(one) for one in designs])
+        self._scenario_gains, self._designs = (
+            scenario_gains,
+            np.asarray([self._evaluate.bounds.normalise(one) for one in designs]),
+        )
         self._report("setting out", 0, 2, *self.so_far)
         points = np.concatenate(
-            [self._evaluate.bounds.share(scenario_gains)[None], self._designs.reshape(-1, scenario_gains.size)]
+            [self._evaluate.bounds.normalise(scenario_gains)[None], self._designs.reshape(-1, scenario_gains.size)]
         )
         first = points[0]
         if len(points) > 1:
             (first,) = promising(self._evaluate, self.tightened(few), points, 1, lambda *_: None)
-        self._descend(few, 0, Start(first, CAREFUL), max(2, self._steps // 2))
+        self._search(few, 0, Start(first, CAREFUL), max(2, self._steps // 2))
 
     def explore(self, problem: Problem, starts: int, seed: int) -> dict[int, np.ndarray]:
         """Run short local searches on few trials from many starting points, and return the best results.
 
-        The first local search continues from the result of `set_out`, with the trials that joined since. The other
+        The first local search continues from the result of `begin`, with the trials that joined since. The other
         starting points are chosen after it.
 
         Args:
@@ -174,9 +187,9 @@ class Descents:
         """
         problem, more = _few_trials(problem), max(2, self._steps // 2)
         self._report("setting out", 1, 2, *self.so_far)
-        self._descend(problem, 0, Start(self.share, CAREFUL), more, afresh=True)
+        self._search(problem, 0, Start(self.normalised, CAREFUL), more, replace_best=True)
         first = starting_points(
-            self._evaluate, self.tightened(problem), self.share, self._designs, starts, seed, self._report
+            self._evaluate, self.tightened(problem), self.normalised, self._designs, starts, seed, self._report
         )
         return self._promising(problem, first)
 
@@ -189,12 +202,12 @@ class Descents:
             number: number of the first local search.
         """
         few, more = max(2, self._steps // 4), max(2, self._steps // 2)
-        racing = dict(enumerate(first, number))
-        rungs = ((len(racing), few), (max(FOLLOWED, len(racing) // 2), more))
-        ranked = self._race(problem, racing, rungs, "searching", scales=(CAREFUL, BOLD))
-        return {k: self._ends[k].share for k in ranked[:FOLLOWED]} or {number: first[0]}
+        contenders = dict(enumerate(first, number))
+        stages = ((len(contenders), few), (max(FOLLOWED, len(contenders) // 2), more))
+        ranked = self._successive_halving(problem, contenders, stages, "searching", scales=(CAREFUL, BOLD))
+        return {k: self._ends[k].normalised for k in ranked[:FOLLOWED]} or {number: first[0]}
 
-    def descend(self, problem: Problem, starts: Mapping[int, np.ndarray]) -> None:
+    def search_locally(self, problem: Problem, starts: Mapping[int, np.ndarray]) -> None:
         """Search locally with half of the steps from each starting point, then with all steps from the best one.
 
         Args:
@@ -202,84 +215,92 @@ class Descents:
             starts: (gains,) normalised gains of each starting point, by number of the local search.
         """
         half, self._ends = max(2, self._steps // 2), {}
-        self._race(problem, starts, ((len(starts), half), (1, self._steps)), "following the best", afresh=True)
+        self._successive_halving(
+            problem, starts, ((len(starts), half), (1, self._steps)), "following the best", replace_best=True
+        )
         self._finish(problem)
 
-    def _race(
+    def _successive_halving(
         self,
         problem: Problem,
         starts: Mapping[int, np.ndarray],
-        rungs: Sequence[tuple[int, int]],
+        stages: Sequence[tuple[int, int]],
         what: str,
         *,
         scales: Sequence[float] = (CAREFUL,),
-        afresh: bool = False,
+        replace_best: bool = False,
     ) -> list[int]:
         """Run successive halving and return the numbers of the local searches, the best first.
 
         Args:
             problem: the tuning problem.
             starts: (gains,) normalised gains of each starting point, by number of the local search.
-            rungs: for each stage, the number of local searches that continue, and the total steps of each.
+            stages: for each stage, the number of local searches that continue, and the total steps of each.
             what: name of the step in progress reports.
             scales: scalings of the variables, which the local searches use in turn.
-            afresh: replace the best point so far by the first result, because the problem has changed.
+            replace_best: replace the best point so far by the first result, because the problem has changed.
         """
-        racers = {
-            k: _Racer(Start(share, scales[k % len(scales)]), list(self._history.get(k, ())))
-            for k, share in starts.items()
+        contenders = {
+            k: _Contender(Start(normalised, scales[k % len(scales)]), list(self._history.get(k, ())))
+            for k, normalised in starts.items()
         }
         ranked = list(starts)
-        for count, steps in rungs:
-            self._descend_in_lockstep(problem, {k: racers[k] for k in ranked[:count]}, steps, what, afresh=afresh)
-            afresh = False
+        for count, steps in stages:
+            self._search_in_lockstep(
+                problem, {k: contenders[k] for k in ranked[:count]}, steps, what, replace_best=replace_best
+            )
+            replace_best = False
             ends = {k: self._ends[k] for k in ranked if k in self._ends}
-            ranked = sorted(ends, key=lambda k, ends=ends: (ends[k].lost, charged(ends[k].f, ends[k].over, STEEP)))
+            ranked = sorted(
+                ends, key=lambda k, ends=ends: (ends[k].failed_trials, penalised(ends[k].f, ends[k].violation, STEEP))
+            )
         return ranked
 
-    def _descend_in_lockstep(
+    def _search_in_lockstep(
         self,
         problem: Problem,
-        racers: Mapping[int, _Racer],
+        contenders: Mapping[int, _Contender],
         steps: int,
         what: str,
         *,
-        afresh: bool,
+        replace_best: bool,
     ) -> None:
         """Run local searches from these starting points, with `TOGETHER` of them at a time for each device."""
         tightened, bests, reports = self.tightened(problem), dict[int, Best](), 0
 
         def race(k: int, ask: Ask) -> None:
-            bests[k] = Best(racers[k].start.share, len(problem.rows), self._margin)
-            self._history[k] = list(racers[k].before)  # the longer search repeats the points of the shorter one
-            descend(ask, bests[k], racers[k].start, steps, partial(self._keep, k), relaxed=_relaxed(problem))
+            bests[k] = Best(contenders[k].start.normalised, len(problem.rows), self._margin)
+            self._history[k] = list(contenders[k].before)  # the longer search repeats the points of the shorter one
+            search_locally(
+                ask, bests[k], contenders[k].start, steps, partial(self._record, k), relaxed=_relaxed(problem)
+            )
 
         def tell() -> None:
             nonlocal reports
-            begun = [*bests.values()] if afresh or self._best is None else [self._best, *bests.values()]
+            begun = [*bests.values()] if replace_best or self._best is None else [self._best, *bests.values()]
             best = min(begun, key=lambda best: best.rank)
             while reports < len(bests):  # one report for each local search that has begun
-                self._report(what, reports, len(racers), *best.so_far)
+                self._report(what, reports, len(contenders), *best.so_far)
                 reports += 1
 
-        def fly(points: list[np.ndarray]) -> list[Sloped]:
+        def fly(points: list[np.ndarray]) -> list[MeasuredWithGradients]:
             tell()
-            measured = self._evaluate.slopes(tightened, np.concatenate(points))
+            measured = self._evaluate.measure_with_gradients(tightened, np.concatenate(points))
             return [measured.at(k) for k in range(len(points))]
 
         try:
-            in_step([partial(race, k) for k in racers], fly, TOGETHER * len(configure.devices()))
+            in_step([partial(race, k) for k in contenders], fly, TOGETHER * len(configure.devices()))
             tell()
         finally:  # also after an interrupt
-            for k in racers:
+            for k in contenders:
                 if k in bests:
-                    self._take(bests[k], tightened, k, afresh=afresh)
-                    afresh = False
+                    self._update_best(bests[k], tightened, k, replace_best=replace_best)
+                    replace_best = False
 
     def again(self, problem: Problem) -> None:
         """Continue from the best results, with the trials that joined the problem."""
-        for k, (start, end) in enumerate(_ranked(self._ends)[:AGAIN]):
-            self._descend(problem, start, Start(end.share, CAREFUL), self._steps, afresh=k == 0)
+        for k, (start, end) in enumerate(_ranked(self._ends)[:CONTINUED]):
+            self._search(problem, start, Start(end.normalised, CAREFUL), self._steps, replace_best=k == 0)
         self._finish(problem)
 
     def search_globally(self, problem: Problem, starts: int, seed: int) -> None:
@@ -294,8 +315,8 @@ class Descents:
         found = self.best, self._problem, self._from, self._ends
         try:
             few = _few_trials(problem)
-            first = spread_widely(self._evaluate, self.tightened(few), starts, seed, self._report)
-            self.descend(problem, self._promising(few, first, 1 + max(self._history, default=-1)))
+            first = global_starting_points(self._evaluate, self.tightened(few), starts, seed, self._report)
+            self.search_locally(problem, self._promising(few, first, 1 + max(self._history, default=-1)))
         finally:  # also after an interrupt
             if found[0].rank <= self.best.rank:
                 self._best, self._problem, self._from, self._ends = found
@@ -308,40 +329,43 @@ class Descents:
             scenario_gains: (gains,) gains of the scenario.
         """
         tightened = self.tightened(problem)
-        share = np.concatenate(
-            [self._evaluate.bounds.share(scenario_gains)[None], spread(len(problem.names), MANY, self._rng)]
+        normalised = np.concatenate(
+            [self._evaluate.bounds.normalise(scenario_gains)[None], spread(len(problem.names), MANY, self._rng)]
         )
-        share = promising(self._evaluate, tightened, share, 1, partial(self._report, "choosing starts"))
-        best, flown = self._best_of(tightened, share)
-        self._keep(0, flown)  # if the search is interrupted now, the history has this point
-        self._take(best, tightened, 0, afresh=True)
+        normalised = promising(self._evaluate, tightened, normalised, 1, partial(self._report, "choosing starts"))
+        best, measured = self._best_of(tightened, normalised)
+        self._record(0, measured)  # if the search is interrupted now, the history has this point
+        self._update_best(best, tightened, 0, replace_best=True)
 
-    def _best_of(self, tightened: Problem, share: np.ndarray) -> tuple[Best, Measured]:
+    def _best_of(self, tightened: Problem, normalised: np.ndarray) -> tuple[Best, Measured]:
         """Measure points (points, gains) without gradients. Return the best point and the measurement."""
-        best, flown = Best(share[0], len(tightened.rows), self._margin), self._evaluate.fly(tightened, share)
-        best.offer(share, flown)
-        return best, flown
+        best, measured = (
+            Best(normalised[0], len(tightened.rows), self._margin),
+            self._evaluate.measure(tightened, normalised),
+        )
+        best.offer(normalised, measured)
+        return best, measured
 
-    def evolve(self, problem: Problem, share: np.ndarray, size: tuple[int, float] = WIDELY) -> None:
+    def evolve(self, problem: Problem, normalised: np.ndarray, size: tuple[int, float] = WIDELY) -> None:
         """Search by differential evolution from a point, without gradients.
 
         Args:
             problem: the tuning problem.
-            share: (gains,) normalised gains of the point.
+            normalised: (gains,) normalised gains of the point.
             size: points of a generation and spread of the first generation, see `evolution.evolve`.
         """
         tightened = self.tightened(problem)
-        best, _ = self._best_of(tightened, share[None])
+        best, _ = self._best_of(tightened, normalised[None])
         try:
-            evolve(self._evaluate, tightened, best, share, int(self._rng.integers(2**31)),
+            evolve(self._evaluate, tightened, best, normalised, int(self._rng.integers(2**31)),
                    lambda done, steps: self._report("evolving", done, steps, *best.so_far),
-                   partial(self._keep, 0), size)  # fmt: skip
+                   partial(self._record, 0), size)  # fmt: skip
         finally:  # also after an interrupt
-            self._take(best, tightened, 0, afresh=True)
-        on_samples = np.asarray(hand_overs.on_samples(problem, self._evaluate.bounds, self.share))
+            self._update_best(best, tightened, 0, replace_best=True)
+        on_samples = np.asarray(hand_overs.on_samples(problem, self._evaluate.bounds, self.normalised))
         if on_samples.size:
             best, _ = self._best_of(tightened, on_samples)
-            self._take(best, tightened, 0, afresh=best.beyond <= self.best.beyond)
+            self._update_best(best, tightened, 0, replace_best=best.infeasibility <= self.best.infeasibility)
 
     def conflict(self, problem: Problem) -> dict[str, float | None]:
         """Return the limits that the best compromise exceeds most, and the smallest ratio that each can reach alone.
@@ -350,19 +374,21 @@ class Descents:
         kept.
         """
         tightened, found = self.tightened(problem), dict[str, float | None]()
-        worst = largest(self._evaluate.slopes(tightened, self.share[None]).c, 0.0)[0]
+        worst = largest(self._evaluate.measure_with_gradients(tightened, self.normalised[None]).c, 0.0)[0]
         for row in np.flatnonzero(worst >= 1.0 + (worst.max() - 1.0) * (1.0 - CONFLICTING)):
             others = np.arange(worst.size) != row
             seen: list[tuple[float, float]] = []
 
-            def keep(one: Sloped, row: int = int(row), others: np.ndarray = others, seen: list = seen) -> None:
+            def keep(
+                one: MeasuredWithGradients, row: int = int(row), others: np.ndarray = others, seen: list = seen
+            ) -> None:
                 each = largest(one.c, 0.0)[0]
                 seen.append((float(each[others].max(initial=0.0)), float(each[row])))
 
-            descend(
-                partial(self._evaluate.slopes, tightened),
-                Best(self.share, worst.size, self._margin),
-                Start(self.share, CAREFUL),
+            search_locally(
+                partial(self._evaluate.measure_with_gradients, tightened),
+                Best(self.normalised, worst.size, self._margin),
+                Start(self.normalised, CAREFUL),
                 self._steps,
                 keep,
                 relaxed=Relaxed(rows=[int(row)], to_the_end=True),
@@ -374,20 +400,20 @@ class Descents:
 
     def _finish(self, problem: Problem) -> None:
         self._report("finishing", 0, 1, *self.so_far)
-        for _ in range(LOOKS):
-            if not self._hand_over_elsewhere(problem):
+        for _ in range(HAND_OVER_ATTEMPTS):
+            if not self._try_other_hand_overs(problem):
                 break
-        self._descend(problem, self._from, Start(self.share, CAREFUL), self._steps, close=FINISH * CLOSE)
-        self._hand_over_on_a_sample(problem)
+        self._search(problem, self._from, Start(self.normalised, CAREFUL), self._steps, close=FINISH * CLOSE)
+        self._move_hand_over_to_sample(problem)
         times = [k for k, name in enumerate(problem.names) if name in TIMES]
         others = [k for k in range(len(problem.names)) if k not in times]
         if self._scenario_gains is not None and others:
-            self._take_back(problem, self._scenario_gains, others)
+            self._restore_scenario_gains(problem, self._scenario_gains, others)
 
-    def _take_back(self, problem: Problem, scenario_gains: np.ndarray, indices: Sequence[int]) -> None:
+    def _restore_scenario_gains(self, problem: Problem, scenario_gains: np.ndarray, indices: Sequence[int]) -> None:
         """Reset as many gains as possible to the scenario's values.
 
-        F may grow by `SAME`, and the violation may not grow.
+        F may grow by `SAME_F`, and the violation may not grow.
 
         Args:
             problem: the tuning problem.
@@ -398,13 +424,13 @@ class Descents:
 
         def judged(changes: Sequence[Sequence[int]]) -> list[Best]:
             back = [np.isin(np.arange(scenario_gains.size), change) for change in changes]
-            share = np.clip(
-                [self._evaluate.bounds.replaced(current.share, scenario_gains, which) for which in back], 0.0, 1.0
+            normalised = np.clip(
+                [self._evaluate.bounds.replaced(current.normalised, scenario_gains, which) for which in back], 0.0, 1.0
             )
-            flown = self._evaluate.slopes(tightened, share)  # this program is already compiled
-            bests = [Best(one, len(problem.rows), self._margin) for one in share]
+            measured = self._evaluate.measure_with_gradients(tightened, normalised)  # this program is already compiled
+            bests = [Best(one, len(problem.rows), self._margin) for one in normalised]
             for k, best in enumerate(bests):
-                best.offer(share[k : k + 1], flown.at(k))
+                best.offer(normalised[k : k + 1], measured.at(k))
             return bests
 
         alone = dict(zip(indices, judged([[k] for k in indices]), strict=True))
@@ -414,46 +440,55 @@ class Descents:
             self._best = next((best for best in reversed(together) if self._as_good(best)), current)
 
     def _as_good(self, best: Best) -> bool:
-        return best.beyond <= self.best.beyond and best.f <= self.best.f + SAME
+        return best.infeasibility <= self.best.infeasibility and best.f <= self.best.f + SAME_F
 
-    def _hand_over_elsewhere(self, problem: Problem) -> bool:
+    def _try_other_hand_overs(self, problem: Problem) -> bool:
         """Try other hand-over times, search locally from the best of them, and return whether that was better.
 
         The noise samples in the window change with delta. F of a few hundred trials therefore has ripples of 1 % over
         delta, and a local search can end in the local minimum of a ripple.
         """
-        found, share = self.best, hand_overs.elsewhere(problem, self._evaluate.bounds, self.share)
-        if found.over > 0.0 or not share:
+        found, normalised = self.best, hand_overs.other_hand_overs(problem, self._evaluate.bounds, self.normalised)
+        if found.violation > 0.0 or not normalised:
             return False
         tightened = self.tightened(problem)
-        flown = self._evaluate.fly(tightened, np.stack(share))
-        price = prices(self._evaluate.slopes(tightened, found.share[None]), found.share)
+        measured = self._evaluate.measure(tightened, np.stack(normalised))
+        multiplier = multipliers(
+            self._evaluate.measure_with_gradients(tightened, found.normalised[None]), found.normalised
+        )
         # for small violations, the multipliers estimate F after the other gains have restored the limits
-        paid = flown.f + np.maximum(ended(flown.c).max(axis=2, initial=-1.0), 0.0) @ price
-        known = np.isfinite(paid) & (failures(flown.c) == 0) & (flown.beyond <= NEARLY)
-        paid = np.where(known, paid, np.inf)
-        first = int(paid.argmin())
-        if paid[first] < found.f - SAME:
-            self._descend(problem, self._from, Start(share[first], CAREFUL), self._steps)
+        estimate = measured.f + np.maximum(ended(measured.c).max(axis=2, initial=-1.0), 0.0) @ multiplier
+        known = np.isfinite(estimate) & (failures(measured.c) == 0) & (measured.largest_c <= NEARLY)
+        estimate = np.where(known, estimate, np.inf)
+        first = int(estimate.argmin())
+        if estimate[first] < found.f - SAME_F:
+            self._search(problem, self._from, Start(normalised[first], CAREFUL), self._steps)
         return self.best is not found
 
-    def _hand_over_on_a_sample(self, problem: Problem) -> None:
+    def _move_hand_over_to_sample(self, problem: Problem) -> None:
         """Move the hand-over of the best point onto a sample, as on a flight computer, and search the other gains.
 
         If the best point was admissible and the new point is not, the results of other local searches are tried.
         """
-        admissible, moved = self.best.over == 0.0, False
+        admissible, moved = self.best.violation == 0.0, False
         times = [k for k, name in enumerate(problem.names) if name in TIMES]
         others = [(k, end) for k, end in _ranked(self._ends) if k != self._from]
         for number, end in [(self._from, self.best), *others]:
-            for share in hand_overs.on_samples(problem, self._evaluate.bounds, end.share):
-                self._descend(problem, number, Start(share, CAREFUL, times), self._steps, afresh=not moved)
+            for normalised in hand_overs.on_samples(problem, self._evaluate.bounds, end.normalised):
+                self._search(problem, number, Start(normalised, CAREFUL, times), self._steps, replace_best=not moved)
                 moved = True
-            if not admissible or self.best.over == 0.0:
+            if not admissible or self.best.violation == 0.0:
                 return
 
-    def _descend(
-        self, problem: Problem, number: int, start: Start, steps: int, close: float = CLOSE, *, afresh: bool = False
+    def _search(
+        self,
+        problem: Problem,
+        number: int,
+        start: Start,
+        steps: int,
+        close: float = CLOSE,
+        *,
+        replace_best: bool = False,
     ) -> None:
         """Run a local search and take its result.
 
@@ -463,25 +498,33 @@ class Descents:
             start: starting point.
             steps: largest number of measured points.
             close: change of F at which the search ends.
-            afresh: replace the best point so far, because the problem has changed.
+            replace_best: replace the best point so far, because the problem has changed.
         """
-        best, tightened = Best(start.share, len(problem.rows), self._margin), self.tightened(problem)
+        best, tightened = Best(start.normalised, len(problem.rows), self._margin), self.tightened(problem)
         try:
-            keep = partial(self._keep, number)
-            descend(partial(self._evaluate.slopes, tightened), best, start, steps, keep, close, _relaxed(problem))
+            keep = partial(self._record, number)
+            search_locally(
+                partial(self._evaluate.measure_with_gradients, tightened),
+                best,
+                start,
+                steps,
+                keep,
+                close,
+                _relaxed(problem),
+            )
         finally:  # also after an interrupt
-            self._take(best, tightened, number, afresh=afresh)
+            self._update_best(best, tightened, number, replace_best=replace_best)
 
-    def _take(self, best: Best, tightened: Problem, start: int, *, afresh: bool) -> None:
-        """Replace the best point by a better one, or, with `afresh`, by any result, because the problem has changed."""
+    def _update_best(self, best: Best, tightened: Problem, start: int, *, replace_best: bool) -> None:
+        """Replace the best point by a better one. With `replace_best`, any result replaces it."""
         if np.isfinite(best.f):
             self._ends[start] = best
-        if self._best is None or (np.isfinite(best.f) and (afresh or best.rank < self._best.rank)):
+        if self._best is None or (np.isfinite(best.f) and (replace_best or best.rank < self._best.rank)):
             self._best, self._problem, self._from = best, tightened, start
 
-    def _keep(self, start: int, seen: Measured) -> None:
+    def _record(self, start: int, seen: Measured) -> None:
         worst = np.where(failures(seen.c)[0] > 0, np.inf, largest(seen.c, self._margin)[0])
-        step = Step(start, seen.gains[0], float(seen.goal[0]), worst)
+        step = Step(start, seen.gains[0], float(seen.objective[0]), worst)
         self._history.setdefault(start, []).append(step)
 
     def tightened(self, problem: Problem) -> Problem:
@@ -491,7 +534,7 @@ class Descents:
 
 def _relaxed(problem: Problem) -> Relaxed | None:
     """Return what a local search minimises, if that is not F subject to the limits."""
-    return Relaxed(to_the_end=True) if problem.goal == LIMITS else None
+    return Relaxed(to_the_end=True) if problem.objective == LIMITS else None
 
 
 def _ranked(ends: Mapping[int, Best]) -> list[tuple[int, Best]]:

@@ -1,4 +1,4 @@
-"""Simulation of trials at many gains, without and with gradients. Read `fly` and `sloped` first.
+"""Simulation of trials at many gains, with or without gradients. Read `simulate` first.
 
 All steps of the tuner simulate the same parts with other gains, numbers of trials and directions of derivatives. One
 compiled program without gradients and one with gradients serve all of them. A program simulates rows of `ROW` trials.
@@ -24,10 +24,10 @@ from ptsmc_jax.simulation.rollout import Parts
 from tuning.search.gains import with_gains
 
 ROW = 40  # trials in a row
-ROWS, SLOPED = 64, 8  # largest number of rows of a device in one call: without gradients; with gradients
+ROWS, ROWS_WITH_DERIVATIVES = 64, 8  # largest number of rows of a device in one call: without gradients; with gradients
 
 
-class Fleet(NamedTuple):
+class Batch(NamedTuple):
     """The trials to simulate at every point, with their parts and dispersions."""
 
     parts: Parts
@@ -49,12 +49,12 @@ class Fleet(NamedTuple):
         return self.parts, self.dispersion, jnp.uint32(self.seed)
 
 
-class Slopes(NamedTuple):
+class Derivatives(NamedTuple):
     """Metrics and statuses, with derivatives of the metrics along directions."""
 
     metrics: np.ndarray  # (points, trials, metrics)
     status: np.ndarray  # (points, trials) codes, see `rollout.STATUS`
-    slopes: np.ndarray  # (points, trials, directions, metrics) derivatives
+    derivatives: np.ndarray  # (points, trials, directions, metrics) derivatives
 
 
 def movable(dispersion: Dispersion) -> tuple[str, ...]:
@@ -62,32 +62,32 @@ def movable(dispersion: Dispersion) -> tuple[str, ...]:
     return tuple(name for name in dispersion.kinds if name != INERTIA)
 
 
-def fly(fleet: Fleet, gains: np.ndarray) -> Flown:
+def simulate(batch: Batch, gains: np.ndarray) -> Flown:
     """Simulate the trials at every point of gains, (points, gains). Return arrays (points, trials)."""
-    rows = _Rows(len(gains), len(fleet.trials), ROWS)
+    rows = _Rows(len(gains), len(batch.trials), ROWS)
 
     def call(some: dict[str, Any], needed: np.int32) -> Flown:
-        return _fly(*fleet.shared, some, needed, fleet.names, fleet.pointing, rows.devices)
+        return _simulate(*batch.shared, some, needed, batch.names, batch.pointing, rows.devices)
 
-    return rows.flown(call, {"gains": gains}, fleet.by_trial)
+    return rows.apply(call, {"gains": gains}, batch.by_trial)
 
 
-def trials(fleet: Fleet, gains: np.ndarray) -> Trials:
+def simulate_trials(batch: Batch, gains: np.ndarray) -> Trials:
     """Simulate the trials at one point of gains, (gains,)."""
-    return Trials(np.asarray(fleet.trials), *jax.tree.map(lambda v: v[0], fly(fleet, gains[None])))
+    return Trials(np.asarray(batch.trials), *jax.tree.map(lambda v: v[0], simulate(batch, gains[None])))
 
 
-def sloped(
-    fleet: Fleet,
+def simulate_with_derivatives(
+    batch: Batch,
     gains: np.ndarray,
     directions: np.ndarray,
     metrics: tuple[str, ...],
     shifts: Mapping[str, np.ndarray] | None = None,
-) -> Slopes:
+) -> Derivatives:
     """Simulate the trials at every point of gains, with derivatives of the metrics along directions.
 
     Args:
-        fleet: the trials.
+        batch: the trials.
         gains: (points, gains) gains.
         directions: (points, directions, gains) derivative of the gains along each direction.
         metrics: names of the metrics.
@@ -97,24 +97,24 @@ def sloped(
     Returns:
         Metrics, statuses and derivatives.
     """
-    rows, count = _Rows(len(gains), len(fleet.trials), SLOPED), directions.shape[1]
+    rows, count = _Rows(len(gains), len(batch.trials), ROWS_WITH_DERIVATIVES), directions.shape[1]
     if shifts is None:
-        free = {name: np.shape(fleet.coordinates[name]) for name in movable(fleet.dispersion)}
+        free = {name: np.shape(batch.coordinates[name]) for name in movable(batch.dispersion)}
         shifts = {name: np.zeros((shape[0], count, *shape[1:])) for name, shape in free.items()}
 
     def call(some: dict[str, Any], needed: np.int32) -> tuple[jax.Array, jax.Array]:
-        return _sloped(*fleet.shared, some, needed, fleet.names, metrics, rows.devices)
+        return _simulate_with_derivatives(*batch.shared, some, needed, batch.names, metrics, rows.devices)
 
     by_point = {"gains": gains, "directions": directions}
-    values, slopes = rows.flown(call, by_point, {**fleet.by_trial, "shifts": dict(shifts)})
-    return Slopes(values[..., :-1], values[..., -1].astype(int), slopes[..., :-1])
+    values, derivatives = rows.apply(call, by_point, {**batch.by_trial, "shifts": dict(shifts)})
+    return Derivatives(values[..., :-1], values[..., -1].astype(int), derivatives[..., :-1])
 
 
-def prepare(fleet: Fleet) -> None:
-    """Compile the program of `fly` in the background."""
-    rows = _Rows(1, len(fleet.trials), ROWS)
-    some, _ = rows.some(0, {"gains": np.zeros((1, len(fleet.names)))}, fleet.by_trial)
-    _fly.prepare(*fleet.shared, some, np.int32(0), fleet.names, fleet.pointing, rows.devices)
+def prepare(batch: Batch) -> None:
+    """Compile the program of `simulate` in the background."""
+    rows = _Rows(1, len(batch.trials), ROWS)
+    some, _ = rows.some(0, {"gains": np.zeros((1, len(batch.names)))}, batch.by_trial)
+    _simulate.prepare(*batch.shared, some, np.int32(0), batch.names, batch.pointing, rows.devices)
 
 
 class _Rows:
@@ -135,19 +135,19 @@ class _Rows:
             by_trial: arguments with trials on the first axis.
         """
         count = min(self._rows - first, self.devices * self._most)
-        places, share = montecarlo.shared_out(count, self.devices, self._most)
+        places, needed = montecarlo.shared_out(count, self.devices, self._most)
         point, row = np.divmod(first + places, len(self._trials))
         trial = self._trials[row]
         by_row = {name: np.asarray(v)[point] for name, v in by_point.items()}
-        return by_row | jax.tree.map(lambda v: np.asarray(v)[trial], by_trial), share
+        return by_row | jax.tree.map(lambda v: np.asarray(v)[trial], by_trial), needed
 
-    def flown(self, program: Callable, by_point: dict[str, Any], by_trial: dict[str, Any]) -> Any:
+    def apply(self, program: Callable, by_point: dict[str, Any], by_trial: dict[str, Any]) -> Any:
         """Apply a program to all rows. Return arrays (points, trials, ..)."""
         calls = []
         for first in range(0, self._rows, self.devices * self._most):
-            some, share = self.some(first, by_point, by_trial)
-            results = program(some, np.int32(share))
-            calls.append(jax.tree.map(lambda v, share=share: montecarlo.gathered(v, share), results))
+            some, needed = self.some(first, by_point, by_trial)
+            results = program(some, np.int32(needed))
+            calls.append(jax.tree.map(lambda v, needed=needed: montecarlo.gathered(v, needed), results))
 
         def joined(*calls: np.ndarray) -> np.ndarray:
             rows = np.concatenate(calls)[: self._rows]
@@ -162,7 +162,7 @@ class _Rows:
     batch=True,
     title="the simulations of the search",
 )
-def _fly(
+def _simulate(
     parts: Parts,
     dispersion: Dispersion,
     seed: jax.Array,
@@ -180,18 +180,18 @@ def _fly(
 
     def one(gains: jax.Array, trial: jax.Array, coordinates: Coordinates) -> Flown:
         moved = with_gains(parts, dict(zip(names, gains, strict=True)))
-        flown = montecarlo.one(moved, dispersion, seed, trial, coordinates)
-        metrics = Metrics({name: value for name, value in flown.metrics.items() if name not in skipped})
-        return flown._replace(metrics=metrics)
+        simulated = montecarlo.one(moved, dispersion, seed, trial, coordinates)
+        metrics = Metrics({name: value for name, value in simulated.metrics.items() if name not in skipped})
+        return simulated._replace(metrics=metrics)
 
-    def flown(row: dict[str, Any]) -> Flown:
+    def simulate_row(row: dict[str, Any]) -> Flown:
         return lanes.vmap(one, (None, 0, 0), kernel=montecarlo.by_kernel())(
             row["gains"], row["trial"], row["coordinates"]
         )
 
     first = jax.tree.map(lambda v: v[0, 0, 0], {name: rows[name] for name in ("trial", "coordinates")})
     result = jax.eval_shape(one, rows["gains"][0, 0], first["trial"], first["coordinates"])
-    return montecarlo.row_by_row(flown, result, ROW, rows, needed, devices)
+    return montecarlo.row_by_row(simulate_row, result, ROW, rows, needed, devices)
 
 
 @programs.jit(
@@ -200,7 +200,7 @@ def _fly(
     batch=True,
     title="the gradients of the simulations",
 )
-def _sloped(
+def _simulate_with_derivatives(
     parts: Parts,
     dispersion: Dispersion,
     seed: jax.Array,
@@ -214,18 +214,18 @@ def _sloped(
 
     def one(gains: jax.Array, trial: jax.Array, fixed: Coordinates, free: Coordinates) -> jax.Array:
         moved = with_gains(parts, dict(zip(names, gains, strict=True)))
-        flown = montecarlo.one(moved, dispersion, seed, trial, {**fixed, **free})
-        return jnp.stack([*(getattr(flown.metrics, name) for name in metrics), flown.status.astype(float)])
+        simulated = montecarlo.one(moved, dispersion, seed, trial, {**fixed, **free})
+        return jnp.stack([*(getattr(simulated.metrics, name) for name in metrics), simulated.status.astype(float)])
 
-    def sloped(row: dict[str, Any]) -> tuple[jax.Array, jax.Array]:
+    def with_derivatives(row: dict[str, Any]) -> tuple[jax.Array, jax.Array]:
         shifts = jax.tree.map(lambda v: jnp.moveaxis(v, 1, 0), row["shifts"])
         fixed = {name: v for name, v in row["coordinates"].items() if name not in shifts}
         free = {name: row["coordinates"][name] for name in shifts}
-        values, slopes = lanes.jvp(one, (None, 0, 0, 0), kernel=montecarlo.by_kernel())(
+        values, derivatives = lanes.jvp(one, (None, 0, 0, 0), kernel=montecarlo.by_kernel())(
             (row["gains"], row["trial"], fixed, free), (row["directions"], None, None, shifts)
         )
-        return values, jnp.moveaxis(slopes, 0, 1)
+        return values, jnp.moveaxis(derivatives, 0, 1)
 
     values = len(metrics) + 1
     result = jax.eval_shape(lambda: (jnp.zeros(values), jnp.zeros((rows["directions"].shape[2], values))))
-    return montecarlo.row_by_row(sloped, result, ROW, rows, needed, devices)
+    return montecarlo.row_by_row(with_derivatives, result, ROW, rows, needed, devices)

@@ -1,7 +1,7 @@
-"""Local search by sequential quadratic programming (SciPy's SLSQP). Read `descend` first.
+"""Local search by sequential quadratic programming (SciPy's SLSQP). Read `search_locally` first.
 
 F is the logarithm of the objective. c = metric / limit - 1 is the constraint of one limit in one trial, and is met if
-c <= 0. Gains are normalised (`share`): 0 is the lower bound and 1 the upper bound of a gain.
+c <= 0. Gains are normalised: 0 is the lower bound and 1 the upper bound of a gain.
 """
 
 import contextlib
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import minimize, nnls
 
-from tuning.search.evaluate import Measured, Sloped
+from tuning.search.evaluate import Measured, MeasuredWithGradients
 from tuning.search.objective import ended, failures
 
 ACTIVE = 1e-3  # a limit is active if c > -ACTIVE
@@ -40,58 +40,58 @@ def largest(c: np.ndarray, margin: ArrayLike) -> np.ndarray:
 class Best:
     """The best point so far, ordered by number of failed trials, then by violation, then by F."""
 
-    def __init__(self, share: np.ndarray, requirements: int, margin: ArrayLike):
+    def __init__(self, normalised: np.ndarray, requirements: int, margin: ArrayLike):
         """Begin without a measured point.
 
         Args:
-            share: (gains,) normalised gains of the starting point.
+            normalised: (gains,) normalised gains of the starting point.
             requirements: number of rows of c.
             margin: relative tightening of each limit, (rows,) or one number [-].
         """
         self.margin = np.asarray(margin)
-        self.share = share.copy()  # (gains,) the starting point until a better point is offered
-        self.f = self.value = self.over = self.lost = np.inf
+        self.normalised = normalised.copy()  # (gains,) the starting point until a better point is offered
+        self.f = self.value = self.violation = self.failed_trials = np.inf
         self.worst = np.full(requirements, np.inf)  # largest metric / limit
 
     @property
     def failed(self) -> bool:
         """Whether a trial fails or lacks a metric at the best point."""
-        return 0.0 < self.lost < np.inf
+        return 0.0 < self.failed_trials < np.inf
 
     @property
-    def beyond(self) -> tuple[float, float]:
+    def infeasibility(self) -> tuple[float, float]:
         """Number of failed trials, and relative violation. It is (0, 0) if every limit is met."""
-        return self.lost, self.over
+        return self.failed_trials, self.violation
 
     @property
     def rank(self) -> tuple[float, float, float]:
         """Sort key, best first: failed trials, violation, F."""
-        return self.lost, self.over, self.f
+        return self.failed_trials, self.violation, self.f
 
     @property
     def so_far(self) -> tuple[float, float]:
         """Objective and relative violation of the best point, or NaN if no point was offered yet."""
-        return (self.value, self.over) if np.isfinite(self.f) else (np.nan, np.nan)
+        return (self.value, self.violation) if np.isfinite(self.f) else (np.nan, np.nan)
 
-    def offer(self, share: np.ndarray, seen: Measured) -> None:
+    def offer(self, normalised: np.ndarray, seen: Measured) -> None:
         """Replace the best point by the best of these points, if that is better.
 
         Args:
-            share: (points, gains) normalised gains.
+            normalised: (points, gains) normalised gains.
             seen: the measurement at these points with tightened limits. A point is admissible if it meets them.
         """
         worst = largest(seen.c, self.margin)
-        over = np.maximum((worst - (1.0 - self.margin)).max(axis=1, initial=-1.0) - SLACK, 0.0)
-        lost = np.where(np.isfinite(seen.f), failures(seen.c), np.inf)
-        over = over + BROKEN * lost
-        first = int(np.lexsort((seen.f, over, lost))[0])
-        if np.isfinite(seen.f[first]) and (lost[first], over[first], seen.f[first]) < self.rank:
-            self.share, self.worst = share[first].copy(), worst[first]
-            self.f, self.value = float(seen.f[first]), float(seen.goal[first])
-            self.lost, self.over = float(lost[first]), float(over[first])
+        violation = np.maximum((worst - (1.0 - self.margin)).max(axis=1, initial=-1.0) - SLACK, 0.0)
+        failed_trials = np.where(np.isfinite(seen.f), failures(seen.c), np.inf)
+        violation = violation + BROKEN * failed_trials
+        first = int(np.lexsort((seen.f, violation, failed_trials))[0])
+        if np.isfinite(seen.f[first]) and (failed_trials[first], violation[first], seen.f[first]) < self.rank:
+            self.normalised, self.worst = normalised[first].copy(), worst[first]
+            self.f, self.value = float(seen.f[first]), float(seen.objective[first])
+            self.failed_trials, self.violation = float(failed_trials[first]), float(violation[first])
 
 
-class _EnoughError(Exception):
+class _StepsUsedError(Exception):
     """A local search has measured its largest number of points."""
 
 
@@ -99,11 +99,11 @@ class _EnoughError(Exception):
 class Start:
     """Starting point of a local search, and its options."""
 
-    share: np.ndarray  # (gains,)
+    normalised: np.ndarray  # (gains,)
     scale: float = BOLD  # scaling of the variables, see `BOLD` and `CAREFUL`
     fixed: Sequence[int] = ()  # indices of gains that are not changed
     # measurements of a shorter search from the same starting point, which a longer search reuses
-    seen: dict[bytes, Sloped] = field(default_factory=dict)
+    seen: dict[bytes, MeasuredWithGradients] = field(default_factory=dict)
 
 
 class _FeasibleError(Exception):
@@ -118,12 +118,12 @@ class Relaxed:
     to_the_end: bool = False  # continue after every limit is met, to maximise the distance from the limits
 
 
-def descend(
-    slopes: Callable[[np.ndarray], Sloped],
+def search_locally(
+    slopes: Callable[[np.ndarray], MeasuredWithGradients],
     best: Best,
     start: Start,
     steps: int,
-    keep: Callable[[Sloped], None] = lambda _: None,
+    keep: Callable[[MeasuredWithGradients], None] = lambda _: None,
     close: float = CLOSE,
     relaxed: Relaxed | None = None,
     steepest: float = STEEPEST,
@@ -147,8 +147,8 @@ def descend(
         steepest: largest element of the gradients of F and c; larger gradients are scaled down.
     """
     local = _Local(slopes, best, start, steps, keep, close, steepest)
-    first = start.scale * start.share
-    with contextlib.suppress(_EnoughError):
+    first = start.scale * start.normalised
+    with contextlib.suppress(_StepsUsedError):
         keep(local.at(first))
         if relaxed is not None:
             local.least_violation(first, relaxed)
@@ -172,27 +172,27 @@ class _Local:
 
     def __init__(
         self,
-        slopes: Callable[[np.ndarray], Sloped],
+        slopes: Callable[[np.ndarray], MeasuredWithGradients],
         best: Best,
         start: Start,
         steps: int,
-        keep: Callable[[Sloped], None],
+        keep: Callable[[MeasuredWithGradients], None],
         close: float,
         steepest: float,
     ):
         self._steepest = steepest
         self._slopes, self._best, self._start = slopes, best, start
-        self._steps, self._keep, self._close = steps, keep, close
+        self._steps, self._record, self._close = steps, keep, close
         self._seen, self._scale = start.seen, start.scale
-        scaled = self._scale * start.share
+        scaled = self._scale * start.normalised
         self._bounds = [(value, value) if k in start.fixed else (0.0, self._scale) for k, value in enumerate(scaled)]
 
-    def at(self, scaled: np.ndarray) -> Sloped:
+    def at(self, scaled: np.ndarray) -> MeasuredWithGradients:
         """Return the measurement at a point. A point is measured once."""
         key, point = scaled.tobytes(), np.clip(scaled / self._scale, 0.0, 1.0)[None]
         if key not in self._seen:
             if len(self._seen) == self._steps:
-                raise _EnoughError
+                raise _StepsUsedError
             self._seen[key] = self._slopes(point)
         if self._seen[key].finite[0]:
             self._best.offer(point, self._seen[key])
@@ -212,11 +212,11 @@ class _Local:
         found = minimize(
             lambda x: float(self.at(x).f[0]),
             scaled.copy(),
-            jac=lambda x: _usable(self.at(x).f_slope, self._steepest)[0] / self._scale,
+            jac=lambda x: _clipped(self.at(x).f_gradient, self._steepest)[0] / self._scale,
             method="SLSQP",
             bounds=self._bounds,
             constraints=[limits] if self.at(scaled).c.shape[1] else [],
-            callback=self._passed,
+            callback=self._accept,
             options={"maxiter": self._steps, "ftol": self._close},
         )
         return np.clip(found.x, *np.transpose(self._bounds))
@@ -251,49 +251,49 @@ class _Local:
                 method="SLSQP",
                 bounds=[*self._bounds, (-1.0, None)],
                 constraints=[limits],
-                callback=lambda y: self._passed(y[:-1]),
+                callback=lambda y: self._accept(y[:-1]),
                 options={"maxiter": self._steps, "ftol": self._close},
             )
         except _FeasibleError:
             return reached
         return np.clip(found.x[:-1], *np.transpose(self._bounds))
 
-    def _passed(self, scaled: np.ndarray) -> None:
+    def _accept(self, scaled: np.ndarray) -> None:
         key = np.ascontiguousarray(scaled).tobytes()
         if key in self._seen:
-            self._keep(self._seen[key])
+            self._record(self._seen[key])
 
 
-def _compressed(seen: Sloped, steepest: float) -> tuple[np.ndarray, np.ndarray]:
+def _compressed(seen: MeasuredWithGradients, steepest: float) -> tuple[np.ndarray, np.ndarray]:
     """Return ln(1 + c) for c above 0, else c, (limits,), and its derivatives, (limits, gains).
 
     c spans orders of magnitude far beyond a limit. The logarithm has the same sign as c and the same derivative at 0.
     """
     c = ended(seen.c).reshape(-1)
-    beyond = np.maximum(c, 0.0)
-    slopes = seen.c_slope.reshape(c.size, -1) / (1.0 + beyond)[:, None]
-    return np.where(c > 0.0, np.log1p(beyond), c), _usable(slopes, steepest)
+    excess = np.maximum(c, 0.0)
+    slopes = seen.c_gradient.reshape(c.size, -1) / (1.0 + excess)[:, None]
+    return np.where(c > 0.0, np.log1p(excess), c), _clipped(slopes, steepest)
 
 
-def prices(at: Sloped, share: np.ndarray) -> np.ndarray:
+def multipliers(at: MeasuredWithGradients, normalised: np.ndarray) -> np.ndarray:
     """Return the Lagrange multiplier of each limit at an optimum, (rows,). It is 0 for inactive limits.
 
     The multipliers are estimated by nonnegative least squares over the gains that are not on a bound.
 
     Args:
         at: the measurement at the optimum.
-        share: (gains,) normalised gains of the optimum.
+        normalised: (gains,) normalised gains of the optimum.
     """
-    c, inside = ended(at.c[0]), (share > 0.0) & (share < 1.0)
+    c, inside = ended(at.c[0]), (normalised > 0.0) & (normalised < 1.0)
     active = np.flatnonzero(c.max(axis=1, initial=-1.0) > -ACTIVE)
-    slopes = at.c_slope[0, active, c[active].argmax(axis=1)]
-    paid = np.zeros(len(c))
+    slopes = at.c_gradient[0, active, c[active].argmax(axis=1)]
+    estimate = np.zeros(len(c))
     if active.size and inside.any():
-        paid[active] = nnls(_usable(slopes)[:, inside].T, -_usable(at.f_slope)[0, inside])[0]
-    return paid
+        estimate[active] = nnls(_clipped(slopes)[:, inside].T, -_clipped(at.f_gradient)[0, inside])[0]
+    return estimate
 
 
-def _usable(slopes: np.ndarray, steepest: float = STEEPEST) -> np.ndarray:
+def _clipped(slopes: np.ndarray, steepest: float = STEEPEST) -> np.ndarray:
     """Return gradients, (rows, gains), with no element above `steepest`. Rows that are not finite become zero."""
     size = np.abs(slopes).max(axis=1, keepdims=True)
     known = np.where(np.isfinite(size), slopes, 0.0)

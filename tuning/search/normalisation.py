@@ -1,6 +1,6 @@
 """Bounds of the free gains, and the map between gains and normalised gains. Read `Bounds` first.
 
-A normalised gain (`share`) is 0 at the lower bound and 1 at the upper bound.
+A normalised gain is 0 at the lower bound and 1 at the upper bound.
 """
 
 from dataclasses import dataclass, field
@@ -34,18 +34,18 @@ class Scale:
     width: int | None = field(metadata={"static": True})  # index of a sign_width whose lower bound moves with `hop`
     observers: tuple[int, ...] = field(metadata={"static": True})  # indices of the observer's gains
 
-    def gains(self, share: Any) -> Any:
+    def gains(self, normalised: Any) -> Any:
         """Return the gains of normalised gains, (gains,), as a NumPy or JAX array.
 
         Only the ratio of the bounds enters on a log scale, so the normalised gains do not depend on the units.
         """
-        xp, low, high, log = share.__array_namespace__(), self.lower, self.upper, np.asarray(self.log)
+        xp, low, high, log = normalised.__array_namespace__(), self.lower, self.upper, np.asarray(self.log)
         ratio = xp.where(log, high, 1.0) / xp.where(log, low, 1.0)
-        gains = xp.where(log, low * ratio**share, low + (high - low) * share)
+        gains = xp.where(log, low * ratio**normalised, low + (high - low) * normalised)
         if self.width is None:
             return gains
         k, least = self.width, self.least_width(gains)
-        return xp.where(np.arange(len(self.log)) == k, least * (high[k] / least) ** share[k], gains)
+        return xp.where(np.arange(len(self.log)) == k, least * (high[k] / least) ** normalised[k], gains)
 
     def least_width(self, gains: Any) -> Any:
         """Return the lower bound of sign_width. It depends only on the observer's gains among the gains, (gains,)."""
@@ -80,32 +80,32 @@ class Bounds:
         log = tuple(map(bool, self.logarithmic))
         return Scale(np.asarray(self.lower), np.asarray(self.upper), np.asarray(self.hop), log, width, observers)
 
-    def gains(self, share: Any) -> Any:
+    def gains(self, normalised: Any) -> Any:
         """Return the gains of normalised gains, (gains,), see `Scale.gains`."""
-        return self.scale.gains(share)
+        return self.scale.gains(normalised)
 
-    def share(self, gains: np.ndarray) -> np.ndarray:
+    def normalise(self, gains: np.ndarray) -> np.ndarray:
         """Return the normalised gains of gains, (gains,). Gains beyond a bound are clipped to the bound."""
-        return np.clip(self._share(gains), 0.0, 1.0)
+        return np.clip(self._normalise(gains), 0.0, 1.0)
 
-    def replaced(self, share: np.ndarray, gains: np.ndarray, which: np.ndarray) -> np.ndarray:
+    def replaced(self, normalised: np.ndarray, gains: np.ndarray, which: np.ndarray) -> np.ndarray:
         """Return normalised gains, (gains,), with some of the gains replaced and all other gains unchanged.
 
         The lower bound of sign_width depends on the observer's gain. If the observer's gain is replaced, the normalised
         sign_width therefore changes, and it is below 0 if the same width is now below its lower bound.
 
         Args:
-            share: (gains,) normalised gains.
+            normalised: (gains,) normalised gains.
             gains: (gains,) the new values.
             which: (gains,) bool, the gains to replace.
         """
-        both = np.where(which, self.share(gains), share)
+        both = np.where(which, self.normalise(gains), normalised)
         if self.hop:
             width = self.names.index("sign_width")
-            both[width] = self._share(np.where(which, gains, self.gains(share)))[width]
+            both[width] = self._normalise(np.where(which, gains, self.gains(normalised)))[width]
         return both
 
-    def _share(self, gains: np.ndarray) -> np.ndarray:
+    def _normalise(self, gains: np.ndarray) -> np.ndarray:
         """Return the normalised gains of gains, (gains,), without clipping."""
         scale = self.scale
         low, high, log = scale.lower.copy(), scale.upper, np.asarray(scale.log)
@@ -117,9 +117,9 @@ class Bounds:
 
     def at_bound(self, gains: np.ndarray) -> dict[str, str]:
         """Return "lower" or "upper" by name for each gain, (gains,), that is on a bound to within `NEAR`."""
-        shares = dict(zip(self.names, self.share(gains).tolist(), strict=True))
-        return {name: "lower" if share < NEAR else "upper" for name, share in shares.items()
-                if not NEAR <= share <= 1.0 - NEAR}  # fmt: skip
+        normalised_by_name = dict(zip(self.names, self.normalise(gains).tolist(), strict=True))
+        return {name: "lower" if normalised < NEAR else "upper" for name, normalised in normalised_by_name.items()
+                if not NEAR <= normalised <= 1.0 - NEAR}  # fmt: skip
 
     def rounded(self, gains: np.ndarray, digits: int) -> dict[str, float]:
         """Return gains (gains,) by name, rounded to significant digits and kept within the bounds.

@@ -9,33 +9,35 @@ import numpy as np
 import pytest
 
 from tests.search.test_tuning import WITHIN, problem
-from tuning.search import descent, descents, hand_overs, shares, starts
-from tuning.search.evaluate import Evaluator, Sloped
+from tuning.search import hand_overs, local_search, local_searches, normalisation, starts
+from tuning.search.evaluate import Evaluator, MeasuredWithGradients
 
 
 class Valley(Evaluator):
     """Rosenbrock function F = (x0 - 0.2)^2 + 100 (x1 - x0^2)^2 without limits. x2 has no effect. Points are counted."""
 
-    def slopes(self, problem, share):
-        self.gradients += len(share)
-        x0, x1, _ = share.T
-        f, c = (x0 - 0.2) ** 2 + 100 * (x1 - x0**2) ** 2, np.full((len(share), 0, 8), -1.0)
+    def measure_with_gradients(self, problem, normalised):
+        self.gradients += len(normalised)
+        x0, x1, _ = normalised.T
+        f, c = (x0 - 0.2) ** 2 + 100 * (x1 - x0**2) ** 2, np.full((len(normalised), 0, 8), -1.0)
         slope = np.stack([2 * (x0 - 0.2) - 400 * x0 * (x1 - x0**2), 200 * (x1 - x0**2), 0.0 * x0], axis=1)
-        return Sloped(share, f, c, f, slope, np.zeros((*c.shape, 3)))
+        return MeasuredWithGradients(normalised, f, c, f, slope, np.zeros((*c.shape, 3)))
 
 
-THREE = shares.Bounds(("eta", "k1", "sign_width"), (2.05, 0.1, 1e-5), (6.0, 50.0, 1e-1))
+THREE = normalisation.Bounds(("eta", "k1", "sign_width"), (2.05, 0.1, 1e-5), (6.0, 50.0, 1e-1))
 
 
 def test_a_longer_local_search_continues_a_shorter_one_from_the_same_point():
     ends, counts = [], []
     for parts_of_it in ((7, 30), (30,)):
-        evaluate, start = Valley(THREE), descent.Start(np.array([0.9, 0.1, 0.5]))
-        best, kept = descent.Best(start.share, 0, 0.0), []
+        evaluate, start = Valley(THREE), local_search.Start(np.array([0.9, 0.1, 0.5]))
+        best, kept = local_search.Best(start.normalised, 0, 0.0), []
         for steps in parts_of_it:
             kept.clear()
-            descent.descend(partial(evaluate.slopes, problem()), best, start, steps, kept.append)
-        ends.append((best.f, best.share.tolist(), [float(one.f[0]) for one in kept]))
+            local_search.search_locally(
+                partial(evaluate.measure_with_gradients, problem()), best, start, steps, kept.append
+            )
+        ends.append((best.f, best.normalised.tolist(), [float(one.f[0]) for one in kept]))
         counts.append(evaluate.gradients)
     assert ends[0] == ends[1]
     assert counts[0] == counts[1] > 7
@@ -45,14 +47,14 @@ def test_a_longer_local_search_continues_a_shorter_one_from_the_same_point():
 def test_hand_over_is_moved_to_samples_by_delta_and_by_t_f_if_both_are_free():
     """If t_f is as short as possible, another delta may break a limit, so longer t_f are tried too."""
     some = replace(problem(2), names=("t_f", "delta"))
-    evaluate = Evaluator(shares.Bounds(("t_f", "delta"), (10.0, 0.2), (20.0, 5.0)))
-    run = descents.Descents(evaluate, 0.0, 2, np.random.default_rng(0))
+    evaluate = Evaluator(normalisation.Bounds(("t_f", "delta"), (10.0, 0.2), (20.0, 5.0)))
+    run = local_searches.LocalSearches(evaluate, 0.0, 2, np.random.default_rng(0))
     scenario_gains = np.array([15.13, 0.79])  # the hand-over at 14.34 s lies between samples 71 and 72
-    share = evaluate.bounds.share(scenario_gains)
-    run._take(descent.Best(share, 0, 0.0), some, 0, afresh=True)
+    normalised = evaluate.bounds.normalise(scenario_gains)
+    run._update_best(local_search.Best(normalised, 0, 0.0), some, 0, replace_best=True)
     moved = [
         np.asarray(evaluate.bounds.gains(jnp.asarray(one)))
-        for one in hand_overs.on_samples(some, evaluate.bounds, run.share)
+        for one in hand_overs.on_samples(some, evaluate.bounds, run.normalised)
     ]
     on_samples = np.asarray([(t_f - delta) / 0.2 for t_f, delta in moved])
     np.testing.assert_allclose(on_samples, np.round(on_samples), atol=1e-9)
@@ -65,12 +67,14 @@ def test_hand_over_is_moved_to_samples_by_delta_and_by_t_f_if_both_are_free():
 def test_hand_over_is_moved_to_samples_by_t_f_if_delta_is_not_free():
     """A flight computer would delay a hand-over between two samples to the next sample."""
     some = replace(problem(2), names=("t_f",))
-    evaluate = Evaluator(shares.Bounds(("t_f",), (10.0,), (20.0,)))
-    run = descents.Descents(evaluate, 0.0, 2, np.random.default_rng(0))
-    run._take(descent.Best(evaluate.bounds.share(np.array([15.13])), 0, 0.0), some, 0, afresh=True)
+    evaluate = Evaluator(normalisation.Bounds(("t_f",), (10.0,), (20.0,)))
+    run = local_searches.LocalSearches(evaluate, 0.0, 2, np.random.default_rng(0))
+    run._update_best(
+        local_search.Best(evaluate.bounds.normalise(np.array([15.13])), 0, 0.0), some, 0, replace_best=True
+    )
     moved = [
         float(evaluate.bounds.gains(jnp.asarray(one))[0])
-        for one in hand_overs.on_samples(some, evaluate.bounds, run.share)
+        for one in hand_overs.on_samples(some, evaluate.bounds, run.normalised)
     ]
     delta = float(some.parts.controller.delta)
     before = np.floor((15.13 - delta) / 0.2)
@@ -84,20 +88,20 @@ class Conflicting(Evaluator):
     """
 
     def __init__(self, a, b, third):
-        super().__init__(shares.Bounds(("eta", "k1"), (1.0, 1.0), (2.0, 2.0)))
+        super().__init__(normalisation.Bounds(("eta", "k1"), (1.0, 1.0), (2.0, 2.0)))
         self.a, self.b, self.third = a, b, third
 
-    def slopes(self, problem, share):
-        (x0, x1), zero = share.T, np.zeros(len(share))
+    def measure_with_gradients(self, problem, normalised):
+        (x0, x1), zero = normalised.T, np.zeros(len(normalised))
         y, along = (x1 - 0.3) ** 2, 2.0 * (x1 - 0.3)
         c = np.stack([2.0 * (self.a - x0) + y, x0 - self.b + y, zero + self.third], axis=1)
         by_share = np.stack(
             [np.stack(one, axis=1) for one in ((zero - 2.0, along), (zero + 1.0, along), (zero, zero))], axis=1
         )
-        f_slope = np.stack([zero + 1.0, zero], axis=1)
-        return Sloped(share, x0, c[:, :, None], x0, f_slope, by_share[:, :, None])
+        f_gradient = np.stack([zero + 1.0, zero], axis=1)
+        return MeasuredWithGradients(normalised, x0, c[:, :, None], x0, f_gradient, by_share[:, :, None])
 
-    fly = slopes
+    measure = measure_with_gradients
 
 
 @pytest.mark.parametrize(
@@ -111,9 +115,9 @@ def test_a_search_ends_at_the_best_compromise_and_finds_the_limits_that_conflict
     """Limits at x0 >= 0.7 and x0 <= 0.1: the largest violation is least at x0 = 0.5, where it is 0.4."""
     evaluate = Conflicting(0.7, 0.1, third)
     some = replace(problem(2), names=evaluate.bounds.names)
-    run = descents.Descents(evaluate, 0.0, 60, np.random.default_rng(0))
-    run.descend(some, {0: np.array([0.95, 0.8])})
-    np.testing.assert_allclose(run.share, [0.5, 0.3], atol=1e-2)  # y is flat there
+    run = local_searches.LocalSearches(evaluate, 0.0, 60, np.random.default_rng(0))
+    run.search_locally(some, {0: np.array([0.95, 0.8])})
+    np.testing.assert_allclose(run.normalised, [0.5, 0.3], atol=1e-2)  # y is flat there
     np.testing.assert_allclose(run.best.worst.max(), 1.4, atol=1e-3)
     found = run.conflict(some)
     assert list(found) == list(expected)
@@ -125,17 +129,20 @@ def test_a_search_ends_at_the_best_compromise_and_finds_the_limits_that_conflict
     ("relaxed", "x0"),
     [
         (None, 0.3),  # F is least on the first limit
-        (descent.Relaxed(to_the_end=True), 0.4),  # both are 0.2 inside their limits
-        (descent.Relaxed(rows=[0], to_the_end=True), 0.6),  # as far inside the first limit as the second one allows
-        (descent.Relaxed(rows=[1], to_the_end=True), 0.3),
+        (local_search.Relaxed(to_the_end=True), 0.4),  # both are 0.2 inside their limits
+        (
+            local_search.Relaxed(rows=[0], to_the_end=True),
+            0.6,
+        ),  # as far inside the first limit as the second one allows
+        (local_search.Relaxed(rows=[1], to_the_end=True), 0.3),
     ],
 )
 def test_a_local_search_minimises_the_objective_or_the_violation_of_some_limits(relaxed, x0):
     """Limits at x0 >= 0.3 and x0 <= 0.6. The search starts outside of them."""
-    evaluate, start = Conflicting(0.3, 0.6, -1.0), descent.Start(np.array([0.95, 0.3]))
-    best, kept = descent.Best(start.share, 3, 0.0), []
-    asked = partial(evaluate.slopes, problem(2))
-    descent.descend(asked, best, start, 60, kept.append, relaxed=relaxed)
+    evaluate, start = Conflicting(0.3, 0.6, -1.0), local_search.Start(np.array([0.95, 0.3]))
+    best, kept = local_search.Best(start.normalised, 3, 0.0), []
+    asked = partial(evaluate.measure_with_gradients, problem(2))
+    local_search.search_locally(asked, best, start, 60, kept.append, relaxed=relaxed)
     np.testing.assert_allclose(kept[-1].gains[0], [x0, 0.3], atol=1e-3)
 
 
@@ -144,8 +151,8 @@ def test_a_search_starts_from_the_best_design_if_that_is_better_than_the_scenari
     some, scenario_gains = replace(problem(2), names=evaluate.bounds.names), np.array([1.6, 1.3])
     designs = np.array([[1.9, 1.3], [1.2, 1.3], [1.65, 1.3]])
     for given, first in ((designs, designs[1]), (designs[::2], scenario_gains), (np.zeros((0, 2)), scenario_gains)):
-        run = descents.Descents(evaluate, 0.0, 2, np.random.default_rng(0))
-        run.set_out(some, scenario_gains, given)
+        run = local_searches.LocalSearches(evaluate, 0.0, 2, np.random.default_rng(0))
+        run.begin(some, scenario_gains, given)
         np.testing.assert_allclose(evaluate.bounds.gains(run.history[0].gains), first, rtol=1e-12)
 
 
@@ -155,95 +162,104 @@ class Narrow(Evaluator):
     The period is 0.2 s. If delta < 2, a limit is broken within 0.3 periods of each sample.
     """
 
-    def slopes(self, problem, share):
-        gains = np.asarray(jax.vmap(self.bounds.gains)(jnp.asarray(share)))
-        by_share = np.asarray(jax.vmap(jax.jacfwd(self.bounds.gains))(jnp.asarray(share)))[:, 0, 0]
+    def measure_with_gradients(self, problem, normalised):
+        gains = np.asarray(jax.vmap(self.bounds.gains)(jnp.asarray(normalised)))
+        by_share = np.asarray(jax.vmap(jax.jacfwd(self.bounds.gains))(jnp.asarray(normalised)))[:, 0, 0]
         delta = gains[:, 0]
         near, off = delta < 2.0, np.abs(delta / 0.2 - np.round(delta / 0.2))
         f = np.where(near, (delta - 1.1) ** 2, 1.0 + (delta - 3.5) ** 2)
-        f_slope = 2.0 * np.where(near, delta - 1.1, delta - 3.5) * by_share
+        f_gradient = 2.0 * np.where(near, delta - 1.1, delta - 3.5) * by_share
         broken = np.where(near, 0.3 - off, -1.0)[:, None, None]
-        shape = (len(share), 1, problem.trials.size)
-        return Sloped(gains, f, np.broadcast_to(broken, shape), f, f_slope[:, None], np.zeros((*shape, 1)))
+        shape = (len(normalised), 1, problem.trials.size)
+        return MeasuredWithGradients(
+            gains, f, np.broadcast_to(broken, shape), f, f_gradient[:, None], np.zeros((*shape, 1))
+        )
 
-    fly = slopes
+    measure = measure_with_gradients
 
 
 def test_another_local_search_is_used_if_the_hand_over_on_a_sample_breaks_a_limit():
     """The search would otherwise end with gains that break a limit, although it has found gains that meet it."""
     some = replace(problem(peak_torque=1.0), names=("delta",))
-    evaluate = Narrow(shares.Bounds(("delta",), (0.2,), (5.0,)))
-    run = descents.Descents(evaluate, 0.0, 20, np.random.default_rng(0))
-    run.descend(some, {k: evaluate.bounds.share(np.array([delta])) for k, delta in enumerate((1.1, 3.5))})
-    assert run.best.over == 0.0
+    evaluate = Narrow(normalisation.Bounds(("delta",), (0.2,), (5.0,)))
+    run = local_searches.LocalSearches(evaluate, 0.0, 20, np.random.default_rng(0))
+    run.search_locally(some, {k: evaluate.bounds.normalise(np.array([delta])) for k, delta in enumerate((1.1, 3.5))})
+    assert run.best.violation == 0.0
     np.testing.assert_allclose(run.best.f, 1.01, rtol=1e-6)  # on the samples next to 3.5 s
 
 
 class Rippled(Evaluator):
     """F = 0.02 (delta - 1.8)^2 + 0.01 (1 - cos(2 pi delta / 0.6)), with the limit c = 1.7 - delta."""
 
-    def slopes(self, problem, share):
-        gains = np.asarray(jax.vmap(self.bounds.gains)(jnp.asarray(share)))
-        by_share = np.asarray(jax.vmap(jax.jacfwd(self.bounds.gains))(jnp.asarray(share)))[:, 0, 0]
+    def measure_with_gradients(self, problem, normalised):
+        gains = np.asarray(jax.vmap(self.bounds.gains)(jnp.asarray(normalised)))
+        by_share = np.asarray(jax.vmap(jax.jacfwd(self.bounds.gains))(jnp.asarray(normalised)))[:, 0, 0]
         delta, rate = gains[:, 0], 2 * np.pi / 0.6
         f = 0.02 * (delta - 1.8) ** 2 + 0.01 * (1 - np.cos(rate * delta))
-        f_slope = (0.04 * (delta - 1.8) + 0.01 * rate * np.sin(rate * delta)) * by_share
-        shape = (len(share), 1, problem.trials.size)
-        over, slope = (np.broadcast_to(v[:, None, None], shape) for v in (1.7 - delta, -by_share))
-        return Sloped(gains, f, over, f, f_slope[:, None], slope[..., None])
+        f_gradient = (0.04 * (delta - 1.8) + 0.01 * rate * np.sin(rate * delta)) * by_share
+        shape = (len(normalised), 1, problem.trials.size)
+        violation, slope = (np.broadcast_to(v[:, None, None], shape) for v in (1.7 - delta, -by_share))
+        return MeasuredWithGradients(gains, f, violation, f, f_gradient[:, None], slope[..., None])
 
-    fly = slopes
+    measure = measure_with_gradients
 
 
 @pytest.mark.parametrize("delta", [3.0, 4.8])
 def test_a_search_finds_the_best_local_minimum_among_ripples_over_delta(delta):
     """Two searches that differed only in rounding once ended 2.4 % apart, in different ripples."""
     some = replace(problem(peak_torque=1.0), names=("delta",))
-    evaluate = Rippled(shares.Bounds(("delta",), (0.2,), (5.0,)))
-    run = descents.Descents(evaluate, 0.0, 20, np.random.default_rng(0))
-    run.descend(some, {0: evaluate.bounds.share(np.array([delta]))})
+    evaluate = Rippled(normalisation.Bounds(("delta",), (0.2,), (5.0,)))
+    run = local_searches.LocalSearches(evaluate, 0.0, 20, np.random.default_rng(0))
+    run.search_locally(some, {0: evaluate.bounds.normalise(np.array([delta]))})
     np.testing.assert_allclose(run.gains, 1.8, rtol=1e-9)
 
 
 def test_prices_are_the_lagrange_multipliers_of_the_limits():
     """F = x0 - 2 x1 subject to x1 - x0 / 2 <= 0, on the bound x0 = 0, with a second limit that is inactive."""
-    f_slope, c_slope = np.array([[1.0, -2.0]]), np.array([[-0.5, 1.0], [3.0, 3.0]])
+    f_gradient, c_gradient = np.array([[1.0, -2.0]]), np.array([[-0.5, 1.0], [3.0, 3.0]])
     c = np.array([[[-0.3, 0.0], [-0.5, -0.2]]])
-    at = Sloped(np.zeros((1, 2)), np.zeros(1), c, np.zeros(1), f_slope, np.stack([0 * c_slope, c_slope], axis=1)[None])
-    np.testing.assert_allclose(descent.prices(at, np.array([0.0, 0.4])), [2.0, 0.0], rtol=1e-12)
-    none = Sloped(np.zeros((1, 2)), np.zeros(1), c[:, :0], np.zeros(1), f_slope, np.zeros((1, 0, 2, 2)))
-    assert descent.prices(none, np.array([0.0, 0.4])).size == 0
+    at = MeasuredWithGradients(
+        np.zeros((1, 2)), np.zeros(1), c, np.zeros(1), f_gradient, np.stack([0 * c_gradient, c_gradient], axis=1)[None]
+    )
+    np.testing.assert_allclose(local_search.multipliers(at, np.array([0.0, 0.4])), [2.0, 0.0], rtol=1e-12)
+    none = MeasuredWithGradients(
+        np.zeros((1, 2)), np.zeros(1), c[:, :0], np.zeros(1), f_gradient, np.zeros((1, 0, 2, 2))
+    )
+    assert local_search.multipliers(none, np.array([0.0, 0.4])).size == 0
 
 
 def test_other_hand_overs_lie_on_samples_within_the_bounds_and_a_factor_of_two():
     some = replace(problem(2), names=("t_f", "delta"))
-    bounds = shares.Bounds(("t_f", "delta"), (10.0, 0.9), (20.0, 5.0))
-    looked = hand_overs.elsewhere(some, bounds, bounds.share(np.array([15.13, 1.5])))
+    bounds = normalisation.Bounds(("t_f", "delta"), (10.0, 0.9), (20.0, 5.0))
+    looked = hand_overs.other_hand_overs(some, bounds, bounds.normalise(np.array([15.13, 1.5])))
     t_f, delta = np.asarray([bounds.gains(jnp.asarray(one)) for one in looked]).T
     np.testing.assert_allclose(t_f, 15.13)
     np.testing.assert_allclose((t_f - delta) / 0.2, np.round((t_f - delta) / 0.2), atol=1e-9)
     np.testing.assert_allclose([delta.max(), delta.min()], [2.93, 0.93], atol=1e-9)
     assert (
-        hand_overs.elsewhere(replace(some, names=("t_f",)), shares.Bounds(("t_f",), (10.0,), (20.0,)), np.ones(1)) == []
+        hand_overs.other_hand_overs(
+            replace(some, names=("t_f",)), normalisation.Bounds(("t_f",), (10.0,), (20.0,)), np.ones(1)
+        )
+        == []
     )
 
 
 def test_only_gains_without_effect_are_reset_to_the_scenarios_values():
     """This also holds if the lower bound of sign_width depends on the observer's gain and lies above the value."""
-    hops = shares.Bounds(("observer_gain", *THREE.names[1:]), (2.05, 0.1, 1e-5), (600.0, 50.0, 1e-1), hop=5e-3)
+    hops = normalisation.Bounds(("observer_gain", *THREE.names[1:]), (2.05, 0.1, 1e-5), (600.0, 50.0, 1e-1), hop=5e-3)
     for bounds, width, kept in ((THREE, 2e-3, True), (THREE, 2e-3, False), (hops, 2e-3, True), (hops, 1e-3, True)):
         some, scenario_gains = replace(problem(), names=bounds.names), np.array([3.0, 5.0, width])
-        run = descents.Descents(Valley(bounds), 0.0, 40, np.random.default_rng(0))
+        run = local_searches.LocalSearches(Valley(bounds), 0.0, 40, np.random.default_rng(0))
         if kept:
-            run.set_out(some, scenario_gains, np.zeros((0, 3)))
-        run.descend(some, {0: np.array([0.9, 0.1, 0.1])})
-        np.testing.assert_allclose(run.share[:2], [0.2, 0.04], atol=0.02)
+            run.begin(some, scenario_gains, np.zeros((0, 3)))
+        run.search_locally(some, {0: np.array([0.9, 0.1, 0.1])})
+        np.testing.assert_allclose(run.normalised[:2], [0.2, 0.04], atol=0.02)
         np.testing.assert_allclose(run.gains[2], width if kept else 1e-5 * 1e4**0.1)
 
 
 def test_starting_points_are_the_best_far_apart_points_and_then_nearer_ones():
-    share = np.array([[0.1, 0.1], [0.1, 0.15], [0.9, 0.1], [0.12, 0.45], [0.1, 0.1]])
-    apart = starts.distances(share)
+    normalised = np.array([[0.1, 0.1], [0.1, 0.15], [0.9, 0.1], [0.12, 0.45], [0.1, 0.1]])
+    apart = starts.distances(normalised)
     np.testing.assert_allclose(apart[0], [0.0, 0.05, 0.8, 0.35, 0.0], atol=1e-12)
     assert [starts.far_apart([1, 0, 2, 3], apart, count) for count in (1, 2, 3, 4)] == [
         [1], [1, 2], [1, 2, 3], [1, 2, 3, 0],
@@ -254,19 +270,23 @@ def test_a_local_search_keeps_its_number_of_points_and_survives_useless_gradient
     """F = ln(1 + |x - a|^2), whose gradient is scaled by 1e30 at the first point and is NaN at the third point."""
 
     class Bowl(Evaluator):
-        def slopes(self, problem, share):
+        def slopes(self, problem, normalised):
             self.gradients += 1
-            off = share[0] - np.array([0.3, 0.8])
+            off = normalised[0] - np.array([0.3, 0.8])
             f = np.log1p(off @ off)
             slope = 2 * off / (1 + off @ off) * (1e30 if self.gradients == 1 else 1.0)
             slope = np.where(self.gradients == 3, np.nan, slope)
             c = np.full((1, 0, 8), -1.0)
-            return Sloped(share, np.array([f]), c, np.array([f]), slope[None], np.zeros((1, 0, 8, 2)))
+            return MeasuredWithGradients(
+                normalised, np.array([f]), c, np.array([f]), slope[None], np.zeros((1, 0, 8, 2))
+            )
 
     for steps, near in ((3, 1.0), (40, 1e-4)):
-        start = descent.Start(np.array([0.9, 0.1]))
-        evaluate, best, path = Bowl(WITHIN), descent.Best(start.share, 0, 0.0), []
-        descent.descend(partial(evaluate.slopes, problem()), best, start, steps, path.append, close=1e-12)
+        start = local_search.Start(np.array([0.9, 0.1]))
+        evaluate, best, path = Bowl(WITHIN), local_search.Best(start.normalised, 0, 0.0), []
+        local_search.search_locally(
+            partial(evaluate.measure_with_gradients, problem()), best, start, steps, path.append, close=1e-12
+        )
         assert evaluate.gradients <= steps
         assert best.f < near
         assert len(path) <= evaluate.gradients
