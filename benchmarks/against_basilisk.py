@@ -106,7 +106,7 @@ FLIGHTS: dict[str, dict[str, Any]] = {
 SPIN = 1e-3  # spin inertia of a wheel [kg m^2]: how its momentum is shared between speed and inertia does not matter
 
 
-def flown_again(run: Any, table: dict[str, Any]) -> np.ndarray:
+def simulated_again(run: Any, table: dict[str, Any]) -> np.ndarray:
     """Apply the torques of a run; return attitudes (rows, 4), scalar last, at the times of its rows."""
     from Basilisk.architecture import messaging  # pyright: ignore[reportMissingImports]
     from Basilisk.simulation import (  # pyright: ignore[reportMissingImports]
@@ -187,8 +187,8 @@ def apart() -> None:
 
     say("largest angle between the library's flight and Basilisk's of the same torques, 45 s [rad]")
     for name, table in FLIGHTS.items():
-        run = runs.fly(scenario.study(scenario.from_tables({**SLEW, **table})))
-        theirs = Rotation.from_quat(flown_again(run, table))
+        run = runs.simulate(scenario.study(scenario.from_tables({**SLEW, **table})))
+        theirs = Rotation.from_quat(simulated_again(run, table))
         angle = (Rotation.from_quat(run.log.x.q).inv() * theirs).magnitude().max()
         say(f"| {name} | {angle:.1e} | {run.status}, {run.parts.substeps} steps a period |")
 

@@ -64,12 +64,12 @@ def batch(metrics: bool) -> None:
     """Print rates and ratios of many trials without noise."""
     quiet, noisy = study(), study(noise=True)
     numbers = np.arange(TRIALS)
-    flown = montecarlo.run(quiet.parts, quiet.dispersion, 0, numbers)
+    simulated = montecarlo.run(quiet.parts, quiet.dispersion, 0, numbers)
     programs = {"C, any inertia": Program(metrics=metrics), "C, principal axes": Program(metrics=metrics, full=False)}
-    fly = {name: program.prepare(quiet.parts, flown.vectors("initial_q")) for name, program in programs.items()}
+    fly = {name: program.prepare(quiet.parts, simulated.vectors("initial_q")) for name, program in programs.items()}
     if metrics:
         for name, run in fly.items():
-            check_same(name, run(), flown, C_METRICS)
+            check_same(name, run(), simulated, C_METRICS)
 
     @partial(jax.jit, static_argnames=("devices",), compiler_options=BATCHED)
     def peaks(parts, dispersion, trials, devices):

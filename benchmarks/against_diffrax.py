@@ -64,14 +64,14 @@ def main() -> None:
     """Print both rates and their ratio."""
     ready = study()
     numbers = np.arange(TRIALS)
-    flown = montecarlo.run(ready.parts, ready.dispersion, 0, numbers)
+    simulated = montecarlo.run(ready.parts, ready.dispersion, 0, numbers)
     aligned = jax.vmap(lambda x: ready.parts.controller.kinematics.align(x, ready.parts.reference(jnp.zeros(()))))(
-        AttitudeState(jnp.asarray(flown.vectors("initial_q")), jnp.asarray(flown.vectors("initial_w")))
+        AttitudeState(jnp.asarray(simulated.vectors("initial_q")), jnp.asarray(simulated.vectors("initial_w")))
     )
     by_diffrax = jax.jit(lambda x0: jax.vmap(lambda x: loop(ready.parts, x))(x0))
     found = np.asarray(by_diffrax(aligned))
     # its observer treats the partial first period as a whole one
-    say(f"largest torques differ by at most {np.max(np.abs(found / flown.metrics.peak_torque - 1)):.1e}")
+    say(f"largest torques differ by at most {np.max(np.abs(found / simulated.metrics.peak_torque - 1)):.1e}")
     seconds = medians({
         "diffrax, vmap": lambda: by_diffrax(aligned),
         "ptsmc_jax": lambda: montecarlo.run(ready.parts, ready.dispersion, 0, numbers).metrics,

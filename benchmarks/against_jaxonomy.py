@@ -98,9 +98,9 @@ def jaxonomy(cores: int) -> None:
         end = simulator.advance_to(PERIODS * PERIOD, start.with_subcontext(body.system_id, mine).with_time(0.0))
         return end.context[body.system_id].continuous_state
 
-    flown, x = jax.pmap(jax.vmap(fly)), jnp.asarray(slews(TRIALS).reshape(cores, -1, 7))
+    simulated, x = jax.pmap(jax.vmap(fly)), jnp.asarray(slews(TRIALS).reshape(cores, -1, 7))
     for line in chain(["first"], sys.stdin):
-        found = np.asarray(flown(x))
+        found = np.asarray(simulated(x))
         if line == "first":
             assert np.abs(found[0, 0] - by_hand(np.asarray(x[0, 0]))).max() < 1e-9, "not the same slews"
         print("done", flush=True)

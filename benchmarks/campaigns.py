@@ -30,9 +30,9 @@ def main() -> None:
             started = time.monotonic()
             done = subprocess.run([sys.executable, "-c", RUN, *options], text=True, capture_output=True, check=False)
             seconds = time.monotonic() - started
-            flown = json.loads((out / "summary.json").read_text())["flown"]
+            trials = json.loads((out / "summary.json").read_text())["simulated"]
             size = sum(path.stat().st_size for path in out.rglob("*.parquet")) / 2**20
-            say(f"{flown:8d} trials: {seconds:5.1f} s with start, summary and figures, {flown / seconds:.0f} a second, "
+            say(f"{trials:8d} trials: {seconds:5.1f} s with start, summary and figures, {trials / seconds:.0f} a s, "
                 f"largest memory {float(done.stderr.split()[-1]):.2f} GiB, rows {size:.0f} MiB")  # fmt: skip
 
 

@@ -177,7 +177,7 @@ class Program:
         out = np.zeros((len(q0), len(C_METRICS) + 2 if self.metrics else 1))
 
         def fly() -> np.ndarray:
-            self.library.fly(at(constants), at(nodes), len(nodes) - 1, at(aligned), len(q0), at(out))
+            self.library.simulate(at(constants), at(nodes), len(nodes) - 1, at(aligned), len(q0), at(out))
             return out
 
         return fly

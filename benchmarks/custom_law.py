@@ -39,10 +39,10 @@ def main() -> None:
         "custom": study(noise=True, tune=None, controller=law),
     }
     trials = np.arange(TRIALS)
-    flown = {name: montecarlo.run(one.parts, one.dispersion, 0, trials) for name, one in both.items()}
+    simulated = {name: montecarlo.run(one.parts, one.dispersion, 0, trials) for name, one in both.items()}
     apart = [
         float(np.nanmax(np.abs(np.asarray(mine) - np.asarray(other)) / np.maximum(np.abs(np.asarray(other)), 1e-300)))
-        for mine, other in zip(*(jax.tree.leaves(one.metrics) for one in flown.values()), strict=True)
+        for mine, other in zip(*(jax.tree.leaves(one.metrics) for one in simulated.values()), strict=True)
         if np.isfinite(other).any()
     ]
     times = medians(

@@ -35,13 +35,13 @@ def compared(name: str, count: int) -> None:
         generated = time.perf_counter() - begin
         library, single = (Library(Path(place) / "c", real) for real in ("double", "float"))
     dispersion = vectors.known_alike(made.ready.dispersion)
-    flown = vectors.fly_many(made.ready.parts, dispersion, jnp.uint32(0), jnp.arange(count, dtype=jnp.uint32))
-    flown = jax.tree.map(np.asarray, flown)
+    simulated = vectors.simulate_many(made.ready.parts, dispersion, jnp.uint32(0), jnp.arange(count, dtype=jnp.uint32))
+    simulated = jax.tree.map(np.asarray, simulated)
     worst, worst_of_peak, used = 0.0, 0.0, 0
     given = np.empty((0, 0))
     at = library.columns["out"].index("command[0]")
     for k in range(count):
-        samples = vectors.one(flown, k)
+        samples = vectors.one(simulated, k)
         if not vectors.usable(samples):
             continue
         used += 1
@@ -87,10 +87,10 @@ def single_precision(ready: Any, library: Any, count: int) -> str:
     trials, said = jnp.arange(count, dtype=jnp.uint32), []
     for software in (rollout.OURS, InTheLoop(library, ready.parts).software):
         status, error, peak = (np.asarray(v) for v in fly(trials, software))
-        flown = np.isin(status, rollout.FINISHED)
-        said.append((np.sqrt(np.mean(error[flown] ** 2)), np.mean(peak[flown]), int(flown.sum())))
-    (error, peak, flown), (other, its_peak, its_flown) = said
-    return f"{abs(other / error - 1):.1e}, {abs(its_peak / peak - 1):.1e}, {its_flown} of {flown}"
+        simulated = np.isin(status, rollout.FINISHED)
+        said.append((np.sqrt(np.mean(error[simulated] ** 2)), np.mean(peak[simulated]), int(simulated.sum())))
+    (error, peak, simulated), (other, its_peak, its_simulated) = said
+    return f"{abs(other / error - 1):.1e}, {abs(its_peak / peak - 1):.1e}, {its_simulated} of {simulated}"
 
 
 def main() -> None:

@@ -59,7 +59,7 @@ def modal() -> dict[str, Any]:
     return {"spacecraft": {"inertia": left[:3, :3].tolist()}, "flexible": flexible}
 
 
-def flown_again(run: Any) -> tuple[np.ndarray, np.ndarray]:
+def simulated_again(run: Any) -> tuple[np.ndarray, np.ndarray]:
     """Apply the torques of a run; return attitudes (rows, 4), scalar last, and angles of the panels (rows, 2)."""
     from Basilisk.architecture import messaging  # pyright: ignore[reportMissingImports]
     from Basilisk.simulation import (  # pyright: ignore[reportMissingImports]
@@ -126,8 +126,8 @@ def main() -> None:
             "disturbance": {"kind": "none"},
             "loop": {"mode": "sampled", "clock": "flight", "period": PERIOD, "t_end": SECONDS},
         }
-        run = runs.fly(scenario.study(scenario.from_tables(table)))
-        theirs, angles = flown_again(run)
+        run = runs.simulate(scenario.study(scenario.from_tables(table)))
+        theirs, angles = simulated_again(run)
         off = (Rotation.from_quat(run.log.x.q).inv() * Rotation.from_quat(theirs)).magnitude().max()
         print(
             f"slew of {100 * share:g} %: largest angle apart {off:.1e} rad, "

@@ -36,8 +36,8 @@ def main() -> None:
         print(f"{name} ({time.monotonic() - started:.0f} s): {said}", flush=True)
     for name, chosen in found.items():
         made = gains.in_scenario(loaded, chosen) if chosen else loaded
-        flown = judging.judge(made, judging.seed_of_judge(0))
-        done, metrics = flown.finished, flown.metrics
+        simulated = judging.judge(made, judging.seed_of_judge(0))
+        done, metrics = simulated.finished, simulated.metrics
         print(
             f"{name} on the flexible body: {done.sum()} of {done.size} flown, "
             f"RMS window error {np.sqrt(np.mean(metrics.window_error[done] ** 2)):.3e}, "

@@ -26,8 +26,8 @@ def main() -> None:
         sets[f"tuned for {name} sampling"] = gains.in_scenario(flight, found)
     for name, one in sets.items():
         for sampling in ("explicit", "implicit"):
-            flown = scenario.replace(one, controller__sampling=sampling)
-            trials = judging.judge(flown, judging.seed_of_judge(0))
+            simulated = scenario.replace(one, controller__sampling=sampling)
+            trials = judging.judge(simulated, judging.seed_of_judge(0))
             errors, peaks, chattering = (
                 np.asarray(getattr(trials.metrics, key)) for key in ("window_error", "peak_torque", "chattering")
             )

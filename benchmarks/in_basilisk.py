@@ -108,7 +108,7 @@ class Basilisk:
         return told | {"wheel_momentum": SPIN * (speeds + self.axes.T @ w), "sigma": np.asarray(true.sigma_BN)}
 
 
-def flown(made: Any, library: Any, trial: int, seed: int = 0) -> tuple[float, float, int]:
+def simulated(made: Any, library: Any, trial: int, seed: int = 0) -> tuple[float, float, int]:
     """Simulate a trial; return RMS window error [-], peak torque of a wheel [N m], and samples with another status."""
     import jax.numpy as jnp
     from scipy.spatial.transform import Rotation
@@ -177,7 +177,7 @@ def main() -> None:
             store.write(Path(place) / "c", lambda making, made=made: folder.write_program(making, made))
             library = Library(Path(place) / "c")
         ours = montecarlo.run(made.ready.parts, made.ready.dispersion, 0, np.arange(trials))
-        theirs = np.array([flown(made, library, k) for k in range(trials)])
+        theirs = np.array([simulated(made, library, k) for k in range(trials)])
         rms = [float(np.sqrt(np.mean(np.square(v)))) for v in (theirs[:, 0], ours.metrics.window_error)]
         peaks = theirs[:, 1].max(), float(np.max(ours.metrics.peak_wheel_torque))
         print(f"| {name} | {rms[0]:.3e} | {rms[1]:.3e} | {peaks[0]:.4f} | {peaks[1]:.4f} | {int(theirs[:, 2].sum())} |")

@@ -32,7 +32,7 @@ CASES = {
 SHOWN = "terminal_error window_error peak_torque settling_time".split()
 
 
-def flown(one: scenario.Scenario, trials: int) -> montecarlo.Trials:
+def simulated(one: scenario.Scenario, trials: int) -> montecarlo.Trials:
     """Return the trials in the current precision."""
     ready = scenario.study(one)
     return montecarlo.run(ready.parts, ready.dispersion, 3, np.arange(trials))
@@ -42,9 +42,9 @@ if __name__ == "__main__":
     trials = int(sys.argv[1]) if len(sys.argv) > 1 else 1000
     say(machine())
     for name, one in CASES.items():
-        double = flown(one, trials)
+        double = simulated(one, trials)
         with jax.enable_x64(False):
-            single = flown(one, trials)
+            single = simulated(one, trials)
         same = int(np.sum(double.status == single.status))
         say(f"\n{name}: {same} of {trials} with the same status")
         for metric in SHOWN:

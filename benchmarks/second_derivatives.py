@@ -26,8 +26,8 @@ def main() -> None:
     parts, at = study(noise=True).parts, jnp.array(list(GAINS.values()))
 
     def loss(values: jax.Array) -> jax.Array:
-        flown = ptsmc.with_gains(parts, dict(zip(GAINS, values, strict=True)))
-        return jnp.log(ptsmc.simulate_parts(flown, np.uint32(0), np.uint32(0)).metrics.window_error)
+        simulated = ptsmc.with_gains(parts, dict(zip(GAINS, values, strict=True)))
+        return jnp.log(ptsmc.simulate_parts(simulated, np.uint32(0), np.uint32(0)).metrics.window_error)
 
     def ready(function: Callable) -> tuple[Callable, float]:
         start = time.perf_counter()

@@ -103,7 +103,7 @@ def main() -> None:
         loaded = scenario.from_tables(CHAIN) if name == "chain" else scenario.read(SCENARIOS / f"{FILES[name]}.toml")
         table = loaded.tune
         assert table is not None
-        posed = posing.pose(loaded, 0)
+        posed = posing.tuning_problem(loaded, 0)
         evaluate = posed.evaluate
         for seed in range(seeds):
             for variant, inside in variants().items():
@@ -136,9 +136,9 @@ def _table(rows: list[dict]) -> None:
         for variant in dict.fromkeys(row["variant"] for row in of_it):
             some = [row for row in of_it if row["variant"] == variant]
             far = np.asarray([row["goal"] / best - 1.0 if row["kept"] else np.inf for row in some])
-            flown = [np.median([row[kind] for row in some]) for kind in ("rollouts", "gradients")]
+            simulated = [np.median([row[kind] for row in some]) for kind in ("rollouts", "gradients")]
             print(f"| {problem} | {variant} | {len(some)} | {np.sum(far <= 0.01)} | {100 * np.median(far):.2f} %, "
-                  f"{100 * far.max():.2f} % | {flown[0]:.0f} | {flown[1]:.0f} |")  # fmt: skip
+                  f"{100 * far.max():.2f} % | {simulated[0]:.0f} | {simulated[1]:.0f} |")  # fmt: skip
 
 
 if __name__ == "__main__":

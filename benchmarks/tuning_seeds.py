@@ -23,15 +23,15 @@ def held_out_trials(loaded, names, values) -> str:
     made = gains.in_scenario(loaded, dict(zip(names, values.tolist(), strict=True)))
     rms, above, off, peaks = [], [], [], []
     for seed in range(3):
-        flown = judging.judge(made, judging.seed_of_judge(seed))
-        squares = flown.metrics.window_error[flown.finished] ** 2
+        simulated = judging.judge(made, judging.seed_of_judge(seed))
+        squares = simulated.metrics.window_error[simulated.finished] ** 2
         rms.append(float(np.sqrt(squares.mean())))
         error = squares.std() / np.sqrt(squares.size) / (2 * rms[-1])  # 1 sigma of the RMS
         floor = judging.floor_of(made, judging.seed_of_judge(seed))
         if floor:
             above.append(rms[-1] / floor)
             off.append((rms[-1] - floor) / error)
-        peaks.append(float(flown.metrics.peak_torque.max()))
+        peaks.append(float(simulated.metrics.peak_torque.max()))
     told = f"RMS {', '.join(f'{v:.4g}' for v in rms)}, largest peak torque {max(peaks):.4g}"
     if off:
         told += f"; {min(above):.3f} to {max(above):.3f} floors, {min(off):.0f} sigma above it at least"
@@ -55,7 +55,7 @@ def main() -> None:
         loaded = scenario.replace(loaded, tune__free=sys.argv[3].split(","), tune__bounds=None)
     table = loaded.tune
     assert table is not None
-    posed = posing.pose(loaded, 0)
+    posed = posing.tuning_problem(loaded, 0)
     ready, problem, evaluate, scenario_gains, found = (
         posed.ready,
         posed.problem,
@@ -70,11 +70,11 @@ def main() -> None:
         )
         one = optimise.search(evaluate, problem, ready.requirements, scenario_gains, settings)
         took = time.monotonic() - started
-        flown, slopes = evaluate.rollouts - before[0], evaluate.gradients - before[1]
+        simulated, slopes = evaluate.rollouts - before[0], evaluate.gradients - before[1]
         found.append(one)
         gained = ", ".join(f"{gain:.4g}" for gain in one.gains)
         print(f"seed {seed:2}: goal {one.value:.5e}, largest metric/limit {one.worst.max(initial=0.0):.5f}, "
-              f"{one.rounds} rounds, {flown} rollouts, {slopes} gradients, {took:.0f} s, gains {gained}",
+              f"{one.rounds} rounds, {simulated} rollouts, {slopes} gradients, {took:.0f} s, gains {gained}",
               flush=True)  # fmt: skip
         print(f"         fresh: {held_out_trials(loaded, problem.names, one.gains)}", flush=True)
     best = min(found, key=lambda one: one.value if one.worst.max(initial=0.0) <= 1.0 else np.inf)

@@ -78,7 +78,7 @@ _ = axes.legend()
 
 # %% [markdown]
 # Try it: the sliders change η, δ and the period and fly 64 attitudes at each stop, by one program: its clock has room for
-# the samples of the shortest period. Where there is no `ipywidgets`, one setting is flown and printed instead.
+# the samples of the shortest period. Where there is no `ipywidgets`, one setting is simulated and printed instead.
 
 
 # %%

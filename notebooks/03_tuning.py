@@ -83,11 +83,11 @@ Figures({"front": study_plots.front(front.points, front.labelled(), 0.5, ("-", "
 
 # %%
 def chosen(point):
-    flown = gains.in_scenario(small, point.gains)
+    simulated = gains.in_scenario(small, point.gains)
     print("gains:", ", ".join(f"{name} = {value:.4g}" for name, value in point.gains.items()))
-    for where, least in stability.worst(ptsmc.study(flown)).items():
+    for where, least in stability.worst(ptsmc.study(simulated)).items():
         print(where, {name: least[name] for name in ("gain_margin", "phase_margin")}, "dB and deg; None: unlimited")
-    return ptsmc.simulate(flown, trial=7).plot("error", "torque")
+    return ptsmc.simulate(simulated, trial=7).plot("error", "torque")
 
 
 def clicked(trace, places, state):

@@ -58,7 +58,7 @@ flight = ptsmc.replace(
 place = Path(tempfile.mkdtemp()) / "campaign"
 folder = campaign_folder.Folder(place, flight, seed=1, trials=20_000)
 campaign_folder.begin(folder, force=False)
-campaign_folder.fly(folder, (1, 1), lambda standing: None)
+campaign_folder.simulate(folder, (1, 1), lambda standing: None)
 found = campaign_summary.summarise(folder)
 terminal.show(campaign_report.of(summaries.read(summaries.Campaign, found)), Path("campaign"))
 

@@ -112,8 +112,8 @@ heavier = system(
     D=lambda t, x_1, x_2: jnp.eye(1) / 0.55,
 )
 for name, truth in (("as the law knows it", pendulum), ("a tenth heavier", heavier)):
-    flown = ptsmc.simulate(ptsmc.replace(swing, plant__truth=truth))
-    print(f"{name}: {flown.metrics['window_error']:.2e} rad in the second after t_f")
+    simulated = ptsmc.simulate(ptsmc.replace(swing, plant__truth=truth))
+    print(f"{name}: {simulated.metrics['window_error']:.2e} rad in the second after t_f")
 
 # %% [markdown]
 # ## A law of your own

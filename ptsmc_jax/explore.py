@@ -171,9 +171,9 @@ def simulate(
     """
     draws.check_whole_number("seed", seed)
     draws.check_whole_number("trial", 0 if trial is None else trial)
-    loaded = _read(what) if controller is None else folder.flown(_read(what))
+    loaded = _read(what) if controller is None else folder.on_flight_clock(_read(what))
     ready = scenario.study(loaded, drawn=trial is not None)
-    return Flight(loaded, runs.fly(ready, seed, trial, _software(controller, ready)))
+    return Flight(loaded, runs.simulate(ready, seed, trial, _software(controller, ready)))
 
 
 def trials(
@@ -206,7 +206,7 @@ def trials(
             number nor a table.
     """
     draws.check_whole_number("seed", seed)
-    ready = _ready(what if controller is None else folder.flown(_read(what)))
+    ready = _ready(what if controller is None else folder.on_flight_clock(_read(what)))
     software = _software(controller, ready)
     drawn = campaign.Campaign(ready, seed, custom_metrics, software=software)
     try:
@@ -223,7 +223,7 @@ def trials(
         allowed = "a whole number, or a polars table with a row for each trial"
         raise ValueError(f"count is a {type(count).__name__}, but must be {allowed}")
     draws.check_whole_number("count", count, 1)
-    return drawn.fly(range(count))
+    return drawn.simulate(range(count))
 
 
 def _software(controller: str | Path | None, ready: Study) -> Software:

@@ -118,8 +118,8 @@ def roomy(timing: Any) -> Any:
 def fly(run: Parts, seed: int = 0, trial: int = 0) -> Any:
     """Simulate a run with its history as NumPy arrays. One program serves all parts with the same structure."""
     numbers = jax.tree.map(np.asarray, run)  # without the weak types of Python numbers
-    flown = rollout.simulate_parts(numbers, np.uint32(seed), np.uint32(trial), record=True, software=rollout.OURS)
-    return jax.tree.map(np.asarray, flown)
+    simulated = rollout.simulate_parts(numbers, np.uint32(seed), np.uint32(trial), record=True, software=rollout.OURS)
+    return jax.tree.map(np.asarray, simulated)
 
 
 @programs.jit
@@ -305,7 +305,7 @@ def refused(command, tmp_path, *args):
 
 
 def small_search(monkeypatch, fresh=40):
-    """Make searches small: a few points, few trials, and `fresh` held-out trials."""
+    """Make searches small: a few points, few trials, and `held_out` held-out trials."""
     from tuning.search import confirm, evolution, local_searches, simulations, starts, worst
 
     for module, name, value in (

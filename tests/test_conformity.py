@@ -290,8 +290,8 @@ def one_by_one(parts, still, dispersion, sloped):
     if hasattr(still.controller, "sign_width"):
         width = still.controller.sign_width
         begun[-1] = replace(begun[-1], controller=replace(begun[-1].controller, sign_width=width))
-    flown = [rollout.simulate_parts(run, SEED, np.uint32(trial)) for trial, run in enumerate(begun)]
-    each = [(dict(one.metrics), one.status, one.bad_time, {}) for one in flown]
+    simulated = [rollout.simulate_parts(run, SEED, np.uint32(trial)) for trial, run in enumerate(begun)]
+    each = [(dict(one.metrics), one.status, one.bad_time, {}) for one in simulated]
     return jax.tree.map(lambda *v: np.stack(v), *each)
 
 

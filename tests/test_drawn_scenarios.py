@@ -91,9 +91,9 @@ def test_a_random_scenario_gives_equal_results_by_all_ways_to_run(seed, tmp_path
     if "peak_rate" in rows:  # a rotation of a radian per period amplifies rounding
         alike &= rows["peak_rate"].fill_null(np.inf).to_numpy() * known.loop.period < 1.0
     software = InTheLoop(Library(tmp_path / "controller"), ready.parts).software
-    flown = montecarlo.run(ready.parts, ready.dispersion, SEED, np.arange(TRIALS), software=software)
+    simulated = montecarlo.run(ready.parts, ready.dispersion, SEED, np.arange(TRIALS), software=software)
     for name in METRICS:
-        by_c = np.asarray(getattr(flown.metrics, name))
+        by_c = np.asarray(getattr(simulated.metrics, name))
         close(by_c[alike], rows[name].to_numpy()[alike], err_msg=name)
 
 

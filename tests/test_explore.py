@@ -26,7 +26,7 @@ def flight():
 
 
 def test_simulate_gives_the_run_of_the_trial(flight):
-    run = runs.fly(scenario.study(flight.scenario), 3, 7)
+    run = runs.simulate(scenario.study(flight.scenario), 3, 7)
     assert list(flight.metrics) == list(run.metrics)
     np.testing.assert_array_equal(list(flight.metrics.values()), list(run.metrics.values()))
     assert flight.status == run.status == "ok"

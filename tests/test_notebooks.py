@@ -65,7 +65,7 @@ def test_notebook_cells_run_with_traced_runs(monkeypatch):
     """Runs are only traced, and their results are made up with the right shapes, so that little is compiled."""
     traced = {}
 
-    def flown(*args, **how):
+    def simulated(*args, **how):
         structure = jax.tree.structure(args)
         if structure not in traced:
             traced[structure] = jax.eval_shape(partial(rollout.simulate, **how), *args)
@@ -73,7 +73,7 @@ def test_notebook_cells_run_with_traced_runs(monkeypatch):
         made_up = jax.tree.map(lambda v: np.linspace(1.0, 2.0, v.size).reshape(v.shape).astype(v.dtype), shapes)
         return made_up._replace(status=np.asarray(rollout.OK))
 
-    monkeypatch.setattr(rollout, "single_run_program", lambda parts: flown)
+    monkeypatch.setattr(rollout, "single_run_program", lambda parts: simulated)
     slope = "jax.jacfwd(peak)(jnp.asarray(3.0))"
     shape = slope.replace("(peak)(", "(peak), ")
     monkeypatch.setitem(SMALLER["05_your_own_plant"], slope, f"jnp.ones(jax.eval_shape({shape}.shape)")

@@ -55,25 +55,25 @@ class Campaign:
         """Return the numbers of these trials, or their rows in the run table."""
         return trials if self.run_table is None else self.run_table.rows(trials, self.seed)
 
-    def fly(self, trials: Sequence[int] | np.ndarray) -> pl.DataFrame:
+    def simulate(self, trials: Sequence[int] | np.ndarray) -> pl.DataFrame:
         """Simulate these trials; return their rows."""
         # at least as many as the usual program simulates, so that rows are equal to the last digit
         wanted = np.resize(np.asarray(trials, dtype=np.uint32), max(len(trials), montecarlo.FEW))
         parts, rows = self.ready.parts, self.rows(wanted)
-        flown = montecarlo.run(
+        simulated = montecarlo.run(
             parts, self.ready.dispersion, self.seed, rows, custom_metrics=self.custom_metrics, software=self.software
         )
-        statuses = [rollout.STATUS[int(code)] for code in flown.status]
+        statuses = [rollout.STATUS[int(code)] for code in simulated.status]
         frame = pl.DataFrame({
             "trial": wanted,
             "status": [status for status, _ in statuses],
             "reason": [reason for _, reason in statuses],
-            "bad_time": flown.bad_time,
+            "bad_time": simulated.bad_time,
             **self._origin(wanted),
-            **{name: getattr(flown.metrics, name) for name in self.ready.catalogue},
-            **_counted(flown.samples),
-            **flown.drawn,
-            **flown.custom_metrics,
+            **{name: getattr(simulated.metrics, name) for name in self.ready.catalogue},
+            **_counted(simulated.samples),
+            **simulated.drawn,
+            **simulated.custom_metrics,
         })  # fmt: skip
         return frame.head(len(trials)).with_columns(pl.col(pl.Float64, pl.Float32).fill_nan(None))
 
@@ -110,14 +110,14 @@ class Campaign:
             return returned
 
         about = self.ready.parts, self.ready.dispersion, self.seed, 0
-        flown = jax.eval_shape(lambda: montecarlo.one(*about, custom_metrics=asked, software=self.software))
-        counted = _counted(flown.samples)
-        for name in flown.custom_metrics:
+        simulated = jax.eval_shape(lambda: montecarlo.one(*about, custom_metrics=asked, software=self.software))
+        counted = _counted(simulated.samples)
+        for name in simulated.custom_metrics:
             if not custom_checks.names_column(name):
                 raise ValueError(f"its {name!r} is no name of a column; allowed are names that can be printed")
-            if name in {"trial", *run_tables.OF_ROWS.values(), *run_tables.RESULTS, *counted, *flown.drawn}:
+            if name in {"trial", *run_tables.OF_ROWS.values(), *run_tables.RESULTS, *counted, *simulated.drawn}:
                 raise ValueError(f"its {name} has the name of a column that the rows have already")
-        return list(flown.custom_metrics)
+        return list(simulated.custom_metrics)
 
 
 def _counted(samples: dict[str, Any]) -> dict[str, Any]:

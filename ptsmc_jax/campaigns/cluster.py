@@ -41,7 +41,7 @@ class Cluster:
         from distributed import as_completed
 
         recipe, rows, here = folder.recipe(), folder.rows, store.packages()
-        futures = [self._client.submit(_fly, recipe, *part, pure=False, retries=0) for part in wanted]
+        futures = [self._client.submit(_simulate_part, recipe, *part, pure=False, retries=0) for part in wanted]
         try:
             for future in as_completed(futures, loop=self._client.loop):
                 error = future.exception()
@@ -118,10 +118,10 @@ def _campaign(make: Callable[..., tuple[Campaign, Rows]], arguments: tuple) -> t
     return make(*arguments)
 
 
-def _fly(recipe: tuple[Callable, tuple], first: int, count: int) -> tuple:
+def _simulate_part(recipe: tuple[Callable, tuple], first: int, count: int) -> tuple:
     """On a worker: simulate and write a part. Return first trial, count, file name, failures and versions."""
     with _one_at_a_time:
         campaign, rows = _campaign(*recipe)
-        frame = campaign.fly(range(first, first + count))
+        frame = campaign.simulate(range(first, first + count))
     part = rows.write(first, frame)
     return first, count, part.path.name, failures(frame), store.packages()

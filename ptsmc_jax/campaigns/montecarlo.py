@@ -73,7 +73,7 @@ class Trials:
 CustomMetrics = Callable[[rollout.Result, Parts], dict[str, jax.Array]]
 
 
-class Flown(NamedTuple):
+class Simulated(NamedTuple):
     """The result of one trial, see `Trials`."""
 
     metrics: Metrics
@@ -94,7 +94,7 @@ def one(
     coordinates: Coordinates | None = None,
     custom_metrics: CustomMetrics | None = None,
     software: Software = OURS,
-) -> Flown:
+) -> Simulated:
     """Simulate one trial: a pure function, for any transformation.
 
     Args:
@@ -120,8 +120,8 @@ def one(
     drawn = about.dispersion.at(about.parts, coordinates)
     result = rollout.simulate(drawn, about.seed, about.trial, record=custom_metrics is not None, software=software)
     found = {} if custom_metrics is None else custom_metrics(result, drawn)
-    flown_with = _values(dispersion, drawn, about, coordinates)
-    return Flown(result.metrics, result.status, result.bad_time, flown_with, found, result.samples)
+    dispersed_values = _values(dispersion, drawn, about, coordinates)
+    return Simulated(result.metrics, result.status, result.bad_time, dispersed_values, found, result.samples)
 
 
 @programs.jit
@@ -201,7 +201,9 @@ def run(
         chosen = k + places.reshape(devices, rows, block)
         numbers = jax.tree.map(lambda v, chosen=chosen: jnp.asarray(v[chosen]), trials)
         needed = jnp.int32(-(-share // block))
-        results = _fly(parts, dispersion, jnp.uint32(seed), numbers, needed, devices, custom_metrics, kernel, software)
+        results = _simulate_rows(
+            parts, dispersion, jnp.uint32(seed), numbers, needed, devices, custom_metrics, kernel, software
+        )
         flat = jax.tree.map(lambda v: np.asarray(v).reshape(devices, rows * block, *v.shape[3:]), results)
         calls.append(jax.tree.map(lambda v, k=k, share=share: gathered(v, share)[: count - k], flat))
     return Trials(number, *jax.tree.map(lambda *many: np.concatenate(many), *calls))
@@ -243,7 +245,7 @@ def gathered(results: np.ndarray, share: int) -> np.ndarray:
 
 
 def _slots(count: int, block: int | None = None) -> tuple[int, int, int]:
-    """Return the shape (devices, rows, block) of the program that simulates `count` trials, see `_fly`."""
+    """Return the shape (devices, rows, block) of the program that simulates `count` trials, see `_simulate_rows`."""
     devices = len(configure.devices())
     if count < FEW:
         return devices, 1, -(-FEW // devices)
@@ -255,7 +257,7 @@ def prepare(parts: Parts, dispersion: Dispersion, count: int) -> None:
     """Start to compile the program for `count` trials of such parts in the background."""
     slots = _slots(count)
     numbers = np.zeros(slots, dtype=np.uint32)
-    _fly.prepare(parts, dispersion, jnp.uint32(0), numbers, jnp.int32(0), slots[0], None, by_kernel(), OURS)
+    _simulate_rows.prepare(parts, dispersion, jnp.uint32(0), numbers, jnp.int32(0), slots[0], None, by_kernel(), OURS)
 
 
 @programs.jit(
@@ -264,7 +266,7 @@ def prepare(parts: Parts, dispersion: Dispersion, count: int) -> None:
     batch=True,
     title="the simulations of many trials",
 )
-def _fly(
+def _simulate_rows(
     parts: Parts,
     dispersion: Dispersion,
     seed: jax.Array,
@@ -274,22 +276,24 @@ def _fly(
     custom_metrics: CustomMetrics | None,
     kernel: bool,
     software: Software,
-) -> Flown:
+) -> Simulated:
     """Return the results of (devices, rows, block) trials; rows from `needed` on are zero."""
 
-    def fly(trial: jax.Array | Row) -> Flown:
+    def simulate_one(trial: jax.Array | Row) -> Simulated:
         return one(parts, dispersion, seed, trial, custom_metrics=custom_metrics, software=software)
 
-    result = jax.eval_shape(fly, jax.tree.map(lambda v: v[0, 0, 0], trials))
+    result = jax.eval_shape(simulate_one, jax.tree.map(lambda v: v[0, 0, 0], trials))
     width = jax.tree.leaves(trials)[0].shape[2]
-    return row_by_row(lanes.vmap(fly, kernel=kernel), result, width, trials, needed, devices)
+    return row_by_row(lanes.vmap(simulate_one, kernel=kernel), result, width, trials, needed, devices)
 
 
-def row_by_row(flown: Callable, result: PyTree, width: int, rows: PyTree, needed: jax.Array, devices: int) -> PyTree:
+def row_by_row(
+    simulated: Callable, result: PyTree, width: int, rows: PyTree, needed: jax.Array, devices: int
+) -> PyTree:
     """Evaluate one row after the other on each device.
 
     Args:
-        flown: the function of a row of trials.
+        simulated: the function of a row of trials.
         result: shapes and types of the result of one trial; tracing a whole row for them takes long.
         width: trials in a row.
         rows: arrays (devices, rows, ..).
@@ -306,7 +310,7 @@ def row_by_row(flown: Callable, result: PyTree, width: int, rows: PyTree, needed
         empty = jax.tree.map(lambda v: jnp.zeros((count, width, *v.shape), v.dtype), result)
 
         def step(k: jax.Array, done: PyTree) -> PyTree:
-            row = flown(jax.tree.map(lambda v: v[k], here))
+            row = simulated(jax.tree.map(lambda v: v[k], here))
             return jax.tree.map(lambda into, v: into.at[k].set(v), done, row)
 
         return jax.tree.map(lambda v: v[None], jax.lax.fori_loop(0, needed, step, empty))
@@ -324,21 +328,21 @@ def by_kernel() -> bool:
     return configure.backend() == "gpu"
 
 
-def blocks(fly: Callable, trials: PyTree) -> PyTree:
-    """Return `lanes.vmap(fly)(trials)`, evaluated in blocks of equal size of at most `block_size()` trials.
+def blocks(function: Callable, trials: PyTree) -> PyTree:
+    """Return `lanes.vmap(function)(trials)`, evaluated in blocks of equal size of at most `block_size()` trials.
 
-    trials: arguments of `fly`, with a leading axis over trials.
+    trials: arguments of `function`, with a leading axis over trials.
     """
     count = jax.tree.leaves(trials)[0].shape[0]
     rows = max(1, -(-count // block_size()))
     size = -(-count // rows)
     if rows == 1:
-        return lanes.vmap(fly)(trials)
+        return lanes.vmap(function)(trials)
 
     def split(v: jax.Array) -> jax.Array:
         return jnp.concatenate([v, v[: rows * size - count]]).reshape(rows, size, *v.shape[1:])
 
-    results = jax.lax.map(lanes.vmap(fly), jax.tree.map(split, trials))
+    results = jax.lax.map(lanes.vmap(function), jax.tree.map(split, trials))
     return jax.tree.map(lambda v: v.reshape(rows * size, *v.shape[2:])[:count], results)
 
 

@@ -81,7 +81,7 @@ def numbered(name: str, block: ArrayLike) -> dict[str, np.ndarray]:
     return {f"{name}{k + 1}": column for k, column in enumerate(np.asarray(block).T)}
 
 
-def fly(ready: Study, seed: int = 0, trial: int | Row | None = None, software: Software = OURS) -> Run:
+def simulate(ready: Study, seed: int = 0, trial: int | Row | None = None, software: Software = OURS) -> Run:
     """Simulate one run.
 
     Args:
@@ -94,11 +94,11 @@ def fly(ready: Study, seed: int = 0, trial: int | Row | None = None, software: S
     Returns:
         The run with its verdicts.
     """
-    run = _fly(ready, seed, trial, software)
+    run = _simulate(ready, seed, trial, software)
     return replace(run, verdicts=[*run.verdicts, *margin_verdicts.of_loop(run.parts, ready.margins)])
 
 
-def _fly(ready: Study, seed: int, trial: int | Row | None, software: Software = OURS) -> Run:
+def _simulate(ready: Study, seed: int, trial: int | Row | None, software: Software = OURS) -> Run:
     row = trial if isinstance(trial, Row) else Row(np.uint32(seed), np.uint32(trial or 0), {})
     key, number = np.uint32(row.seed), np.uint32(row.trial)
     about = trial if isinstance(trial, Row) else number
@@ -141,5 +141,5 @@ def floor(ready: Study, seed: int = 0, rows: Sequence[int | Row] = ()) -> float 
         The bound, or None if no run has one.
     """
     trials = rows or (range(FLOORS) if ready.dispersion.varies else (None,))
-    runs = [_fly(ready, seed, trial) for trial in trials]
+    runs = [_simulate(ready, seed, trial) for trial in trials]
     return error_floor.pooled(error_floor.along_each([(run.parts, run.log) for run in runs if run.has_floor]))

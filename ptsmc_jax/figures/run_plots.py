@@ -142,13 +142,13 @@ def convergence(parts: Parts, log: Log, title: str = "Convergence") -> Figure:
     before = log.t < float(law.hand_over) * (1 - 1e-12)
     t = np.asarray(log.t)[before]
     tau = t_f - t
-    flown = {
+    simulated = {
         symbol: (np.linalg.norm(log.error, axis=1)[before], eta, STYLES[0]),
         "|s|": (np.linalg.norm(log.s, axis=1)[before], eta + n - 2, STYLES[1]),
     }
     exact = solutions.exact_sizes(parts, t)
-    bottom = min(np.min(size[size > 0], initial=1.0) for size, _, _ in flown.values())
-    for (name, (size, _, (colour, style))), ideal in zip(flown.items(), exact, strict=True):
+    bottom = min(np.min(size[size > 0], initial=1.0) for size, _, _ in simulated.values())
+    for (name, (size, _, (colour, style))), ideal in zip(simulated.items(), exact, strict=True):
         axes.loglog(tau, size, color=colour, ls=style, label=f"{name}, simulated")
         axes.loglog(tau, ideal, **EXACT)
     # short lines with the slopes of the theory, above the error and, if it differs, below s

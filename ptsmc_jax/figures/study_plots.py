@@ -136,7 +136,7 @@ def profiles(gains: Mapping[str, Profile], goal: str) -> Figure:
     axes = figure.subplots(len(gains), 1, sharey=True, squeeze=False)[:, 0]
     for ax, (name, one) in zip(axes, gains.items(), strict=True):
         ax.update_datalim(np.stack([one.gain, one.gain], axis=1), updatey=False)  # where no trial has a goal, too
-        ax.semilogy(one.gain, one.goal, color="0.6", lw=1.2, label="goal")
+        ax.semilogy(one.gain, one.goal, color="0.6", lw=1.2, label="objective")
         within = one.over <= 1.0
         ax.semilogy(one.gain[within], one.goal[within], "o", color=STYLES[0][0], label="limits kept")
         for of, mark in marks.items():

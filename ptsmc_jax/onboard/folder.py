@@ -30,7 +30,7 @@ class Controller:
 
     def __init__(self, scenario: Scenario, name: str, source: str):
         """Trace the flight computer. Raises ScenarioError if it cannot be written in C."""
-        self.scenario = flown(scenario)
+        self.scenario = on_flight_clock(scenario)
         self.ready: Study = scenarios.study(self.scenario)
         self.board: Board = board(self.ready.parts)
         try:
@@ -55,7 +55,7 @@ class Controller:
         return float(self.ready.parts.controller.delta) + self.period
 
 
-def flown(scenario: Scenario) -> Scenario:
+def on_flight_clock(scenario: Scenario) -> Scenario:
     """Return the scenario with the flight clock, which the exported controller uses.
 
     Raises:
@@ -81,7 +81,7 @@ def identifier(text: str) -> str:
     return plain if plain and not plain[0].isdigit() else f"c_{plain}".rstrip("_")
 
 
-def fly(made: Controller, seed: int, trials: int) -> dict[int, vectors.Samples]:
+def simulate(made: Controller, seed: int, trials: int) -> dict[int, vectors.Samples]:
     """Return simulated trials that can be used as test vectors, by number of the trial.
 
     Args:
@@ -94,8 +94,8 @@ def fly(made: Controller, seed: int, trials: int) -> dict[int, vectors.Samples]:
     """
     dispersion = vectors.known_alike(made.ready.dispersion)
     numbers = np.arange(trials, dtype=np.uint32)
-    flown = vectors.fly_many(made.ready.parts, dispersion, jnp.uint32(seed), jnp.asarray(numbers))
-    each = {int(k): vectors.one(flown, int(k)) for k in numbers}
+    simulated = vectors.simulate_many(made.ready.parts, dispersion, jnp.uint32(seed), jnp.asarray(numbers))
+    each = {int(k): vectors.one(simulated, int(k)) for k in numbers}
     usable = {k: samples for k, samples in each.items() if vectors.usable(samples)}
     if not usable:
         raise ScenarioError(
@@ -104,7 +104,7 @@ def fly(made: Controller, seed: int, trials: int) -> dict[int, vectors.Samples]:
     return usable
 
 
-def table(made: Controller, flown: dict[int, vectors.Samples]) -> tuple[list[str], list[list[Any]]]:
+def table(made: Controller, simulated: dict[int, vectors.Samples]) -> tuple[list[str], list[list[Any]]]:
     """Return the header and the rows of vectors.csv."""
     lists = made.code.columns
     header = [
@@ -114,7 +114,7 @@ def table(made: Controller, flown: dict[int, vectors.Samples]) -> tuple[list[str
         *(f"{kind}.{name}" for kind in ("in", "out", "state") for name in lists[kind]),
     ]
     rows: list[list[Any]] = []
-    for k, samples in flown.items():
+    for k, samples in simulated.items():
         given, out, state = vectors.rows(made.board, samples)
         nothing = [0.0] * (given.shape[1] + out.shape[1])
         rows.append([k, -1, 0, *nothing, *vectors.first_state(made.board, samples).tolist()])
@@ -132,10 +132,10 @@ def write(folder: Path, made: Controller, seed: int, trials: int) -> None:
         seed: seed of the trials in the test vectors.
         trials: number of these trials.
     """
-    flown, t_f = fly(made, seed, trials), float(made.ready.parts.controller.t_f)
+    simulated, t_f = simulate(made, seed, trials), float(made.ready.parts.controller.t_f)
     rounding = made.board.model.error_rounding
-    header, rows = table(made, flown)
-    steepness = min(vectors.steepness(one, rounding, t_f, made.last) for one in flown.values())
+    header, rows = table(made, simulated)
+    steepness = min(vectors.steepness(one, rounding, t_f, made.last) for one in simulated.values())
     write_program(folder, made, steepness)
     store.write_csv(folder / "vectors.csv", header, rows)
     made_by = {"command": "export", "seed": seed, **custom.digests(made.scenario)}

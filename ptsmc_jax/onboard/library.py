@@ -225,13 +225,16 @@ class InTheLoop:
     @property
     def otherwise(self) -> str:
         """A sentence with the parameters of C that differ from the parts; empty if there are none."""
-        flown, made = dict(zip(self.library.columns["params"], self.library.parameters, strict=True)), named(self.board)
+        simulated, made = (
+            dict(zip(self.library.columns["params"], self.library.parameters, strict=True)),
+            named(self.board),
+        )
         fields, differing = {field.name: field.elements() for field in made.fields}, list[str]()
         for name, values in made.values.items():
             off = SAME * np.max(np.abs(values), initial=0.0, where=np.isfinite(values))
             for element, value in zip(fields[name], np.ravel(values), strict=True):
-                if element in flown and not np.isclose(flown[element], value, rtol=0.0, atol=off):
-                    differing.append(f"{element} = {flown[element]:.6g} instead of {value:.6g}")
+                if element in simulated and not np.isclose(simulated[element], value, rtol=0.0, atol=off):
+                    differing.append(f"{element} = {simulated[element]:.6g} instead of {value:.6g}")
         if not differing:
             return ""
         more = f" and {len(differing) - NAMED} more" if len(differing) > NAMED else ""

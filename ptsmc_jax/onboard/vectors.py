@@ -1,6 +1,6 @@
 """Test vectors for exported C: inputs, outputs and state of the simulated flight computer at each sample.
 
-Read `fly` first.
+Read `simulate` first.
 """
 
 from dataclasses import replace
@@ -27,7 +27,7 @@ class Samples(NamedTuple):
     """The samples of a run, arrays (samples, ..); None for values that the scenario does not have."""
 
     t: Array  # time [s].
-    flown: Array  # bool: whether the period has a nonzero length.
+    simulated: Array  # bool: whether the period has a nonzero length.
     inputs: dict[str, Array]  # inputs from the sensors, see `Sensor.inputs`.
     before: dict[str, Array]  # attitude filter before the sample, see `Sensor.remembered`.
     after: dict[str, Array]  # attitude filter after the sample.
@@ -50,7 +50,7 @@ class Samples(NamedTuple):
     clearance_unit: Array  # unit of `clearance`.
 
 
-def fly(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Samples:
+def simulate(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Samples:
     """Simulate a trial without timing jitter and return its samples.
 
     Args:
@@ -75,7 +75,7 @@ def fly(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Samples:
         distance = law.clearance(computer.seen, target)
         unit = jnp.where(jnp.isnan(unit), law.kinematics.clearance_unit(distance), unit)
         row = Samples(
-            t=now.t, flown=now.t_next > now.t, inputs=inputs,
+            t=now.t, simulated=now.t_next > now.t, inputs=inputs,
             before=sensors.remembered(sensing), after=sensors.remembered(computer.sensors),
             applied=state.applied[0], acting=state.actuators.v, momentum=state.actuators.h,
             seen=computer.seen, observer=computer.observer,
@@ -91,7 +91,7 @@ def fly(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Samples:
 
 
 @programs.jit(compiler_options=programs.QUICKLY)
-def fly_many(parts: Parts, dispersion: Dispersion, seed: Array, trials: Array) -> Samples:
+def simulate_many(parts: Parts, dispersion: Dispersion, seed: Array, trials: Array) -> Samples:
     """Simulate trials and return their samples, (trials, samples, ..).
 
     Args:
@@ -100,7 +100,7 @@ def fly_many(parts: Parts, dispersion: Dispersion, seed: Array, trials: Array) -
         seed: seed of the campaign.
         trials: numbers of the trials (trials,).
     """
-    return lapack.vmap(lambda trial: fly(parts, dispersion, seed, trial))(trials)
+    return lapack.vmap(lambda trial: simulate(parts, dispersion, seed, trial))(trials)
 
 
 def known_alike(dispersion: Dispersion) -> Dispersion:
@@ -136,7 +136,7 @@ def steepness(samples: Samples, rounding: float, t_f: float, last: float) -> flo
 def one(samples: Samples, trial: int) -> Samples:
     """Return one of many trials in NumPy arrays, without samples whose period has length 0."""
     found = jax.tree.map(lambda v: np.asarray(v[trial]), samples)
-    return jax.tree.map(lambda v: v[found.flown], found)
+    return jax.tree.map(lambda v: v[found.simulated], found)
 
 
 def rows(board: Board, samples: Samples) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -43,7 +43,7 @@ class Claim:
 
 def fly_cases() -> dict[str, Run]:
     """Simulate every case of the paper in continuous time; return the runs by name."""
-    return {name: runs.fly(study(from_tables(tables))) for name, (_, _, tables) in CASES.items()}
+    return {name: runs.simulate(study(from_tables(tables))) for name, (_, _, tables) in CASES.items()}
 
 
 def claims(cases: dict[str, Run]) -> list[Claim]:
@@ -179,7 +179,7 @@ def _independent_of_the_start() -> Claim:
     for kind, tables in (("quiet", quiet), ("disturbed", {"controller": {"t_f": 35.0}})):
         for angle in (20, 80, 140):
             start = {"initial": {"rotvec_deg": [angle / 3**0.5] * 3}}
-            times[f"{kind}_{angle}"] = _reached(runs.fly(study(from_tables({**start, **tables}))))
+            times[f"{kind}_{angle}"] = _reached(runs.simulate(study(from_tables({**start, **tables}))))
         reached = [value for name, value in times.items() if name.startswith(kind)]
         spread[f"spread_{kind}"] = max(reached) - min(reached)
     disturbed = ", ".join(f"{times[f'disturbed_{angle}']:.2f} s" for angle in (20, 80, 140))
@@ -220,7 +220,7 @@ def _bounded_when_sampled(cases: dict[str, Run]) -> Claim:
             "loop": {"mode": "sampled", "clock": "flight"},
             "hardware": {"attitude_noise": 2e-5, "rate_noise": 1e-6},
         }
-        values[name] = runs.fly(study(from_tables(tables))).metrics["peak_torque"]
+        values[name] = runs.simulate(study(from_tables(tables))).metrics["peak_torque"]
         values[f"{name}_continuous"] = cases[name].metrics["peak_torque"]
     three, five = values["case_2_eta_3"], values["case_2_eta_5"]
     more = max(three / values["case_2_eta_3_continuous"], five / values["case_2_eta_5_continuous"])

@@ -47,7 +47,7 @@ def measure() -> list[Measured]:
 def _measured(observer: str, sign: str) -> Measured:
     table = {"kind": observer, "t_o": 1.0} if observer == "prescribed_time" else {"kind": observer}
     controller = {**_TABLES["controller"], "sign_width": SIGNS[sign]}
-    run = runs.fly(study(from_tables({**_TABLES, "observer": table, "controller": controller})))
+    run = runs.simulate(study(from_tables({**_TABLES, "observer": table, "controller": controller})))
     t, off = np.asarray(run.log.t), np.linalg.norm(run.log.d_hat - run.log.disturbance, axis=1)
     unsettled = np.flatnonzero(off > SETTLED * np.linalg.norm(run.log.disturbance, axis=1).max())
     settled = float("nan") if unsettled[-1] + 1 >= len(off) else float(t[unsettled[-1] + 1])

@@ -83,7 +83,7 @@ def _expansion() -> Slip:
 def _theorem_3() -> Slip:
     tables = claims.CASES["third_order"][2]
     quiet = {"disturbance": {"amplitude": [0.0]}, "controller": {**tables["controller"], "disturbance_bound": 0.0}}
-    run = runs.fly(study(from_tables({**tables, **quiet})))
+    run = runs.simulate(study(from_tables({**tables, **quiet})))
     law, n = run.parts.controller, run.parts.controller.order
     before = run.log.t < float(law.hand_over)
     tau = float(law.t_f) - run.log.t[before]
@@ -162,7 +162,7 @@ def _initial_estimate() -> Slip:
     tables = {"disturbance": {"frequency": [0.0] * 3, "phase": [np.pi / 2] * 3}}  # constant
     true_bound = {**bound, "initial_estimate_error": 0.01 * 3**0.5}
     ratios = [
-        _over_bound(runs.fly(study(from_tables({**tables, "controller": controller}))), 1.0)
+        _over_bound(runs.simulate(study(from_tables({**tables, "controller": controller}))), 1.0)
         for controller in (bound, true_bound)
     ]
     return Slip(
@@ -180,7 +180,7 @@ def _effective_gain() -> Slip:
         "disturbance": claims.CALM,
         "controller": {"disturbance_rate_bound": 0.0, "delta": 5.0, "k1": 1.6},
     }
-    run = runs.fly(study(from_tables(tables)))
+    run = runs.simulate(study(from_tables(tables)))
     hold = (run.log.t > 26.0) & (run.log.t < 34.0)
     rate = -float(np.polyfit(run.log.t[hold], np.log(np.linalg.norm(run.log.s[hold], axis=1)), 1)[0])
     return Slip(
@@ -217,7 +217,7 @@ def _sign_of_q4() -> Slip:
 
     def at_t_f(controller: PrescribedTime) -> tuple[float, float]:
         """Return the norm of eps_1 and the angle to the reference [deg] at t_f."""
-        run = runs.fly(replace(ready, parts=replace(ready.parts, controller=controller)))
+        run = runs.simulate(replace(ready, parts=replace(ready.parts, controller=controller)))
         k = int(np.flatnonzero(run.log.t <= float(law.t_f))[-1])
         angle = attitude.angle(jnp.asarray(run.log.x.q[k]), jnp.asarray(run.log.reference.q[k]))
         return float(np.linalg.norm(run.log.error[k])), float(np.rad2deg(angle))

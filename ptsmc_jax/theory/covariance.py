@@ -52,8 +52,8 @@ def noise(parts: Parts) -> Noise:
     ticks = jax.tree.map(np.asarray, run.period.now)
     lasting = np.flatnonzero(ticks.t_next - ticks.t > 1e-9 * float(parts.period))  # beyond rounding
     ticks = jax.tree.map(lambda v: v[lasting], ticks)
-    flown = getattr(parts.controller, "sign_width", None)
-    if flown is None:
+    simulated = getattr(parts.controller, "sign_width", None)
+    if simulated is None:
         return _covariance(parts, ticks, linear.opened_in(parts, run, lasting, late=False))[0]
     flat = linear.opened_in(parts, run, lasting, np.full(lasting.size, FLAT), late=False)
     own = _State(parts, ticks, flat).rows(flat.s_command, flat.s_direct).noise  # effect of each sample's own noise on s
@@ -61,11 +61,11 @@ def noise(parts: Parts) -> Noise:
     if parts.controller.prescribed:
         units[~ticks.hold] = float(parts.controller.layer_time) ** (parts.controller.order - 1)
     sigmas = [float(np.sqrt(np.sum(by**2) / len(by))) / unit for by, unit in zip(own, units, strict=True)]
-    found = np.asarray([_mean_width(float(flown), sigma) for sigma in sigmas])
+    found = np.asarray([_mean_width(float(simulated), sigma) for sigma in sigmas])
     sizes, converged = None, False
     for _ in range(ROUNDS):
         widths = found
-        sign = _Sign(linear.opened_in(parts, run, lasting, widths, late=False).loop, widths, float(flown), units)
+        sign = _Sign(linear.opened_in(parts, run, lasting, widths, late=False).loop, widths, float(simulated), units)
         sizes, found = _covariance(parts, ticks, flat, sign)
         converged = bool(np.allclose(found, widths, rtol=0.01, atol=0.0))
         if converged:
@@ -83,7 +83,7 @@ class _Sign(NamedTuple):
 
     loops: Any
     widths: np.ndarray  # (periods,) equivalent widths.
-    flown: float  # Width in the scenario.
+    simulated: float  # Width in the scenario.
     units: np.ndarray  # (periods,) unit of s, relative to its unit after the hand-over.
 
 
@@ -206,7 +206,7 @@ def _covariance(parts: Parts, ticks: Any, opened: linear.Opened, sign: _Sign | N
         squares[j] = square(opened.error[j]), 0.0, np.mean(np.diag(s))
         share = 0.0
         if sign is not None:
-            widths[j] = _mean_width(sign.flown, min(float(np.sqrt(squares[j, 2])) / sign.units[j], BEYOND))
+            widths[j] = _mean_width(sign.simulated, min(float(np.sqrt(squares[j, 2])) / sign.units[j], BEYOND))
             share = sign.widths[j] / widths[j] if widths[j] > 0.0 else 1.0
         commanded = command.at(j, sloped[0], share).covariance(p)
         torque = max(torque, float(np.sqrt(np.diag(commanded).max())))

@@ -339,7 +339,7 @@ def _linear(parts: Parts, log: Log, ticks: Ticks) -> _Linear:
         taken = star_state(parts, tick, motion(x, jnp.zeros_like(pushed)).at)
         change = getattr(parts.sensors, "change", None)
 
-        def flown(z: Float[Array, " n"], push: Float[Array, " m"]) -> tuple[Array, Array, Array, Array]:
+        def simulated(z: Float[Array, " n"], push: Float[Array, " m"]) -> tuple[Array, Array, Array, Array]:
             near = plant.retract(x, z)
             moving, early, now = motion(near, push), jnp.zeros(0), jnp.zeros(0)
             near_next = moving.after(dt)
@@ -354,7 +354,7 @@ def _linear(parts: Parts, log: Log, ticks: Ticks) -> _Linear:
             return plant.local_coordinates(x_next, near_next), jnp.concatenate([start, middle, end]), early, now
 
         still = jnp.zeros_like(plant.local_coordinates(x, x))
-        by = jax.jacfwd(flown, argnums=(0, 1))(still, jnp.zeros(plant.inputs))
+        by = jax.jacfwd(simulated, argnums=(0, 1))(still, jnp.zeros(plant.inputs))
         (move, push), (seen, seen_push), (early, early_push), (now, _) = by
         return _Linear(move, push, seen, seen_push, early, early_push, now)
 

@@ -186,7 +186,7 @@ def opened(parts: Parts, during: Nominal, *, late: bool = True) -> Opened:
     z0, x0, known, u0 = (jnp.zeros(n) for n in (sum(here.sizes), *here.sizes[:2], plant.inputs))
     target = parts.reference(now.t)
 
-    def flown(z: Array, seen: Array, new: Array, d: Array) -> tuple[Array, Array, Array]:
+    def simulated(z: Array, seen: Array, new: Array, d: Array) -> tuple[Array, Array, Array]:
         carry = here.retract(z)
         seen = parts.observer.model.retract(plant.visible(before.x), seen)
         decision, computer, model = _computed(parts, k2, period, carry, seen)
@@ -205,7 +205,7 @@ def opened(parts: Parts, during: Nominal, *, late: bool = True) -> Opened:
 
         return jax.jacfwd(ended, argnums=(0, 1))(u0, u0)
 
-    by_all = jax.jacfwd(flown, argnums=(0, 1, 2, 3))(z0, known, u0, u0)
+    by_all = jax.jacfwd(simulated, argnums=(0, 1, 2, 3))(z0, known, u0, u0)
     (a, seen, new, disturbed), (command, direct, *_), (s_command, s_direct, *_) = by_all
     old, new = lapack.vmap(pushed)(jnp.asarray(NODES)) if late else (jnp.zeros_like(new)[None], new[None])
     loop = Loop(a, seen, new, old, command, direct, disturbed, dt, delay=parts.actuators.delay)

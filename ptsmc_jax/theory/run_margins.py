@@ -104,30 +104,30 @@ class TimedMargins(NamedTuple):
     margins: Margins  # (times, m)
 
 
-def at(parts: Parts, left: Float[Array, " times"], flown: linear.Nominal | None = None) -> TimedMargins:
+def at(parts: Parts, left: Float[Array, " times"], simulated: linear.Nominal | None = None) -> TimedMargins:
     """Return the margins at some times to go and in the hold phase.
 
     Args:
         parts: the sampled scenario.
         left: times to go (times,) [s].
-        flown: its nominal run, or None to simulate it.
+        simulated: its nominal run, or None to simulate it.
     """
-    run: linear.Nominal = linear.nominal_jit(parts) if flown is None else flown
+    run: linear.Nominal = linear.nominal_jit(parts) if simulated is None else simulated
     indices = np.asarray(_moments(parts, run, left))
     loops = linear.loops_in(parts, run, indices)
     ticks = jax.tree.map(lambda v: np.asarray(v)[indices], run.period.now)
     return TimedMargins(ticks.t, ticks.hold, loops, margins.in_turn(loops))
 
 
-def judged_loops(parts: Parts, flown: linear.Nominal | None = None, *, late: bool = True) -> tuple[Loop, Array]:
+def judged_loops(parts: Parts, simulated: linear.Nominal | None = None, *, late: bool = True) -> tuple[Loop, Array]:
     """Return the loops whose margins are judged (times + 1, ..), h in [s], and which of them are in the hold phase.
 
     Args:
         parts: the sampled scenario.
-        flown: its nominal run, or None to simulate it.
+        simulated: its nominal run, or None to simulate it.
         late: whether the loops support fractional delays, see `linear.opened`.
     """
-    run = linear.nominal(parts) if flown is None else flown
+    run = linear.nominal(parts) if simulated is None else simulated
     indices = moments(parts, run, judged_times(parts))
     return linear.loops_at(parts, run, indices, late=late), run.period.now.hold[indices]
 

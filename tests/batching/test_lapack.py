@@ -117,7 +117,7 @@ def trace_analyses(parts, dispersion):
     trials, seed, run = jnp.arange(4, dtype=jnp.uint32), jnp.uint32(0), jax.eval_shape(linear.nominal, parts)
     run_margins._moments.trace(parts, run, run_margins.judged_times(parts))
     rest._unexplained.trace(parts, run)
-    vectors.fly_many.trace(parts, dispersion, seed, trials)
+    vectors.simulate_many.trace(parts, dispersion, seed, trials)
     design._predicted.trace(parts, dispersion, seed, trials, jnp.asarray(3.0))
 
 

@@ -21,45 +21,45 @@ def of_scenario(tables, seed):
 
 
 @pytest.fixture(scope="module")
-def flown():
+def simulated():
     made = of_scenario(untuned(SHORT_CHAIN), 3)
-    return made, made.fly(range(300))
+    return made, made.simulate(range(300))
 
 
-def test_row_has_all_results_and_inputs_of_its_trial(flown):
-    made, frame = flown
+def test_row_has_all_results_and_inputs_of_its_trial(simulated):
+    made, frame = simulated
     assert frame.columns[:4] == ["trial", "status", "reason", "bad_time"]
     assert frame.columns[4 : 4 + len(made.ready.catalogue)] == list(made.ready.catalogue)
     assert frame.columns[4 + len(made.ready.catalogue) :] == ["initial_angle", "initial_x1", "initial_x2"]
     assert frame["trial"].to_list() == list(range(300))
     assert frame["bad_time"].null_count() == 300
-    run = runs.fly(made.ready, 3, 250)
+    run = runs.simulate(made.ready, 3, 250)
     for name, value in run.metrics.items():
         row = frame[name][250]
         assert row is None if np.isnan(value) else row == pytest.approx(value, rel=1e-12), name
 
 
 @pytest.mark.parametrize(("first", "count"), [(0, 1), (7, 63), (44, 256)])
-def test_rows_do_not_depend_on_the_parts(flown, first, count):
-    made, frame = flown
-    same(made.fly(range(first, first + count)), frame[first : first + count])
+def test_rows_do_not_depend_on_the_parts(simulated, first, count):
+    made, frame = simulated
+    same(made.simulate(range(first, first + count)), frame[first : first + count])
 
 
 BLOCKS = [(128, 4096, 1), (16, 4096, 2), (64, 128, 2), (32, 64, 1)]
 
 
 @pytest.mark.parametrize(("block", "capacity", "devices"), short(BLOCKS, BLOCKS[3:]))
-def test_rows_do_not_depend_on_blocks_and_devices(flown, monkeypatch, block, capacity, devices):
-    made, frame = flown
+def test_rows_do_not_depend_on_blocks_and_devices(simulated, monkeypatch, block, capacity, devices):
+    made, frame = simulated
     monkeypatch.setattr(montecarlo, "CAPACITY", capacity)
     monkeypatch.setattr(montecarlo, "run", partial(montecarlo.run, block=block))
     found = jax.local_devices()[:devices]
     monkeypatch.setattr(configure, "devices", lambda: found)
-    same(made.fly(range(300)), frame)
+    same(made.simulate(range(300)), frame)
 
 
-def test_drawn_inputs_equal_the_inputs_of_the_simulated_rows(flown):
-    made, frame = flown
+def test_drawn_inputs_equal_the_inputs_of_the_simulated_rows(simulated):
+    made, frame = simulated
     run_table = made.draw(range(300))
     assert run_table.columns == ["trial", *frame.columns[4 + len(made.ready.catalogue) :]]
     same(run_table, frame.select(run_table.columns))
@@ -69,7 +69,7 @@ def test_failed_trials_do_not_affect_the_others():
     """Initial angles are near 180 deg, so that a third of the trials reaches the law's singularity or diverges."""
     far = {"kind": "axis_angle", "min_deg": 170.0, "max_deg": 180.0}
     made = of_scenario({**untuned(SHORT), "dispersion": {"attitude": far}}, 0)
-    frame = made.fly(range(600))
+    frame = made.simulate(range(600))
     assert frame.columns[4 + len(made.ready.catalogue) :] == [
         "initial_angle", *(f"initial_q{k}" for k in range(1, 5)), *(f"initial_w{k}" for k in range(1, 4))
     ]  # fmt: skip
@@ -105,13 +105,13 @@ def test_missing_parts_of_a_campaign():
     assert [len(share) for share in shares] == [3, 2, 2]
 
 
-def test_parts_are_written_one_after_the_other(flown, tmp_path, monkeypatch):
-    made, frame = flown
+def test_parts_are_written_one_after_the_other(simulated, tmp_path, monkeypatch):
+    made, frame = simulated
     monkeypatch.setattr(campaign, "PART", 100)
     kept = rows.Rows(tmp_path / "trials", b"k")
     seen = []
     campaign.follow(
-        campaign.here(made.fly, kept, campaign.missing([], 300)),
+        campaign.here(made.simulate, kept, campaign.missing([], 300)),
         campaign.tally([], 300),
         lambda standing: seen.append((standing.done, standing.total, standing.failed)),
     )
@@ -120,9 +120,9 @@ def test_parts_are_written_one_after_the_other(flown, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("together", short([2, 3, 16], [3]))
-def test_parts_simulated_in_one_call_are_the_same(flown, tmp_path, monkeypatch, together):
+def test_parts_simulated_in_one_call_are_the_same(simulated, tmp_path, monkeypatch, together):
     """Accelerators simulate several parts of a shard together. They are not adjacent, and the last one is shorter."""
-    made, frame = flown
+    made, frame = simulated
     monkeypatch.setattr(campaign, "PART", 40)
     monkeypatch.setattr(montecarlo, "run", partial(montecarlo.run, block=montecarlo.BLOCK))  # program of `flown`
     monkeypatch.setattr(montecarlo, "block_size", lambda: 40 * together // len(configure.devices()))
@@ -130,7 +130,7 @@ def test_parts_simulated_in_one_call_are_the_same(flown, tmp_path, monkeypatch, 
 
     def make(trials):
         flights.append(len(trials))
-        return made.fly(trials)
+        return made.simulate(trials)
 
     kept = rows.Rows(tmp_path / "trials", b"k")
     wanted = campaign.missing([], 300, (2, 2))
@@ -142,23 +142,23 @@ def test_parts_simulated_in_one_call_are_the_same(flown, tmp_path, monkeypatch, 
         same(rows.read([part]), frame[part.first : part.end])
 
 
-def test_finished_parts_remain_if_a_later_part_fails(flown, tmp_path, monkeypatch):
-    made, _ = flown
+def test_finished_parts_remain_if_a_later_part_fails(simulated, tmp_path, monkeypatch):
+    made, _ = simulated
     monkeypatch.setattr(campaign, "PART", 100)
     kept = rows.Rows(tmp_path / "trials", b"k")
 
     def make(trials):
         if trials[0] == 200:
             raise KeyboardInterrupt
-        return made.fly(trials)
+        return made.simulate(trials)
 
     with pytest.raises(KeyboardInterrupt):
         campaign.follow(campaign.here(make, kept, campaign.missing([], 300)), campaign.tally([], 300), lambda _: None)
     assert [part.first for part in kept.parts()[0]] == [0, 100]
 
 
-def test_failures_are_counted_in_the_progress(flown, tmp_path):
-    _, frame = flown
+def test_failures_are_counted_in_the_progress(simulated, tmp_path):
+    _, frame = simulated
     kept = rows.Rows(tmp_path / "trials", b"k")
     worse = frame.with_columns(
         status=pl.when(pl.col("trial") % 3 == 0).then(pl.lit("diverged")).otherwise(pl.col("status"))
@@ -177,9 +177,9 @@ def test_custom_metrics_are_columns_of_the_rows():
     made = of_scenario(untuned(SHORT_CHAIN), 3)
     with_metrics = replace(made, custom_metrics=overshoot)
     assert with_metrics.custom_metric_names() == ["overshoot", "rows"]
-    more = with_metrics.fly(range(100))
-    same(more.drop("overshoot", "rows"), made.fly(range(100)))
-    log = runs.fly(made.ready, 3, 42).log
+    more = with_metrics.simulate(range(100))
+    same(more.drop("overshoot", "rows"), made.simulate(range(100)))
+    log = runs.simulate(made.ready, 3, 42).log
     after = np.linalg.norm(log.error, axis=1)[log.t > 5.0].max()
     assert more["overshoot"][42] == pytest.approx(after, rel=1e-12)
     assert more["rows"][42] == len(log.t)
@@ -211,16 +211,16 @@ def test_custom_metrics_are_columns_of_the_rows():
         ),
     ],
 )
-def test_invalid_custom_metrics_are_refused(flown, made_of, said):
+def test_invalid_custom_metrics_are_refused(simulated, made_of, said):
     with pytest.raises(ValueError, match=said):
-        replace(flown[0], custom_metrics=made_of).custom_metric_names()
+        replace(simulated[0], custom_metrics=made_of).custom_metric_names()
 
 
-def test_histories_equal_those_of_single_runs(flown):
-    made, _ = flown
+def test_histories_equal_those_of_single_runs(simulated):
+    made, _ = simulated
     t, error = campaign.history(made, np.array([3, 250], dtype=np.uint32))
     for k, trial in enumerate((3, 250)):
-        log = runs.fly(made.ready, 3, trial).log
+        log = runs.simulate(made.ready, 3, trial).log
         np.testing.assert_allclose(t, log.t, rtol=1e-14)
         np.testing.assert_allclose(error[k], np.linalg.norm(log.error, axis=1), rtol=1e-9)
 
@@ -228,13 +228,13 @@ def test_histories_equal_those_of_single_runs(flown):
 @pytest.mark.parametrize("kind", [np.float64, np.float32])
 def test_missing_values_are_null_in_both_precisions(monkeypatch, kind):
     made = of_scenario(tomllib.loads(SHORT_CHAIN), 3)
-    flown = montecarlo.run(made.ready.parts, made.ready.dispersion, 3, np.arange(montecarlo.FEW))
-    lacking = Metrics({**flown.metrics, "settling_time": np.full(montecarlo.FEW, np.nan)})
+    simulated = montecarlo.run(made.ready.parts, made.ready.dispersion, 3, np.arange(montecarlo.FEW))
+    lacking = Metrics({**simulated.metrics, "settling_time": np.full(montecarlo.FEW, np.nan)})
     as_kind = replace(
-        flown,
+        simulated,
         metrics=jax.tree.map(lambda v: np.asarray(v, kind), lacking),
-        bad_time=flown.bad_time.astype(kind),
+        bad_time=simulated.bad_time.astype(kind),
     )
     monkeypatch.setattr(montecarlo, "run", lambda *_, **__: as_kind)
-    frame = made.fly(range(5))
+    frame = made.simulate(range(5))
     assert [frame[name].null_count() for name in ("bad_time", "settling_time", "window_error")] == [5, 5, 0]

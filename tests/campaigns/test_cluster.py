@@ -42,7 +42,7 @@ def _dask(monkeypatch):
     monkeypatch.setattr(distributed, "as_completed", lambda futures, **_: iter(futures))
 
 
-def flown_by(monkeypatch, tmp_path, receipt):
+def simulated_by(monkeypatch, tmp_path, receipt):
     """Return a folder whose parts are simulated by a worker that returns this result."""
     monkeypatch.setattr(cluster, "_fly", lambda recipe, first, count: receipt(first, count))
     return SimpleNamespace(recipe=lambda: (None, "x"), rows=Rows(tmp_path, b"k"))
@@ -71,7 +71,7 @@ def test_a_local_cluster_listens_on_the_loopback_only(monkeypatch):
 def test_results_of_workers_become_parts(monkeypatch, tmp_path):
     here = store.packages()
     (tmp_path / "p.parquet").write_bytes(b"")
-    folder = flown_by(monkeypatch, tmp_path, lambda first, count: (first, count, "p.parquet", 7, here))
+    folder = simulated_by(monkeypatch, tmp_path, lambda first, count: (first, count, "p.parquet", 7, here))
     found = list(cluster.connected("tcp://a:1", {})(folder, [(0, 10), (10, 5)]))
     assert [(part.first, part.count, failed) for part, failed in found] == [(0, 10, 7), (10, 5, 7)]
 
@@ -92,7 +92,7 @@ def test_results_of_other_versions_or_failed_workers_are_refused(monkeypatch, tm
         versions = store.packages() | (change or {})
         return first, count, "gone.parquet", 0, versions
 
-    folder = flown_by(monkeypatch, tmp_path, receipt)
+    folder = simulated_by(monkeypatch, tmp_path, receipt)
     with pytest.raises(RefusedError, match=said):
         list(cluster.connected("tcp://a:1", {})(folder, [(0, 10)]))
     assert len(FakeClient.made.cancelled) == 1  # the other futures are cancelled

@@ -194,7 +194,7 @@ DRAWN = {
 def posed_of(plant):
     """Return the tuning problem of this plant with its dispersions."""
     tables = DRAWN[plant]
-    return posing.pose(
+    return posing.tuning_problem(
         scenario.from_tables({**tables, "requirements": {**tables["requirements"], "peak_torque": 5.0}}), 3
     )
 
@@ -287,9 +287,9 @@ def test_evaluator_appends_margins_of_the_hardest_trials(drawn, monkeypatch):
     posed = drawn
     assert posed.problem.rows == ("peak_torque", "gain_margin", "peak_sensitivity")
     share = posed.evaluate.bounds.normalise(posed.scenario_gains)[None]
-    flown = {"gains": share, "f": np.zeros(1), "c": np.array([[[-0.3, -0.2, -0.4]]]), "value": np.zeros(1)}
-    monkeypatch.setattr(posed.evaluate, "_fly", lambda *_: dict(flown))
-    c = posed.evaluate.fly(posed.problem, share).c[0]
+    simulated = {"gains": share, "f": np.zeros(1), "c": np.array([[[-0.3, -0.2, -0.4]]]), "value": np.zeros(1)}
+    monkeypatch.setattr(posed.evaluate, "_fly", lambda *_: dict(simulated))
+    c = posed.evaluate.simulate(posed.problem, share).c[0]
     assert c[0].tolist() == [-0.3, -0.2, -0.4] + [-1.0] * (c.shape[1] - 3)  # padded to the length of margin rows
     verdicts = margin_verdicts.over_trials(posed.ready, 3)
     assert [v.trials for v in verdicts] == [TRIALS, TRIALS]

@@ -29,31 +29,31 @@ def chain():
 
 
 @pytest.fixture(scope="module")
-def flown(chain):
+def simulated(chain):
     return montecarlo.run(chain.parts, chain.dispersion, 5, np.arange(256))
 
 
-def test_batched_trials_equal_single_simulations(chain, flown):
+def test_batched_trials_equal_single_simulations(chain, simulated):
     """The test simulates every fifth trial alone, and the first and the last trial of each device."""
     draw = jax.jit(lambda trial: chain.dispersion.apply(chain.parts, np.uint32(5), trial))
     for k in {*range(0, 256, 5), 127, 128, 255}:
         drawn = draw(np.uint32(k))
         alone = rollout.simulate_parts(drawn, np.uint32(5), np.uint32(k), record=True)
-        assert int(alone.status) == flown.status[k]
-        np.testing.assert_allclose(drawn.initial, flown.vectors("initial_x")[k], atol=1e-15)
+        assert int(alone.status) == simulated.status[k]
+        np.testing.assert_allclose(drawn.initial, simulated.vectors("initial_x")[k], atol=1e-15)
         for name in alone.metrics:
-            a, b = float(alone.metrics[name]), float(flown.metrics[name][k])
+            a, b = float(alone.metrics[name]), float(simulated.metrics[name][k])
             assert a == pytest.approx(b, rel=1e-12, abs=1e-12, nan_ok=True), (k, name)
 
 
 @pytest.mark.parametrize("count", [1, 3, 63, 64, 65, 129, 255])
-def test_any_number_of_trials_can_be_simulated(chain, flown, count):
+def test_any_number_of_trials_can_be_simulated(chain, simulated, count):
     """Trials are distributed over two devices, in blocks of 128 or fewer. No trial is lost or repeated."""
     some = montecarlo.run(chain.parts, chain.dispersion, 5, np.arange(count))
     assert some.status.shape == some.metrics.window_error.shape == (count,)
     # fewer than `FEW` trials use another compiled program with other rounding errors
-    np.testing.assert_allclose(some.vectors("initial_x"), flown.vectors("initial_x")[:count], rtol=0, atol=1e-15)
-    np.testing.assert_allclose(some.metrics.window_error, flown.metrics.window_error[:count], rtol=1e-12)
+    np.testing.assert_allclose(some.vectors("initial_x"), simulated.vectors("initial_x")[:count], rtol=0, atol=1e-15)
+    np.testing.assert_allclose(some.metrics.window_error, simulated.metrics.window_error[:count], rtol=1e-12)
 
 
 @pytest.mark.parametrize("count", [1, 63, 64, 1000])
@@ -82,11 +82,11 @@ def test_invalid_trial_numbers_are_refused(chain, trials, said):
         montecarlo.run(chain.parts, chain.dispersion, 5, trials)
 
 
-def test_a_trial_does_not_depend_on_the_others(chain, flown):
+def test_a_trial_does_not_depend_on_the_others(chain, simulated):
     some = np.array([200, 3, 3, 77])
     again = montecarlo.run(chain.parts, chain.dispersion, 5, some)
-    np.testing.assert_allclose(again.metrics.window_error, flown.metrics.window_error[some], rtol=1e-12)
-    np.testing.assert_allclose(again.vectors("initial_x"), flown.vectors("initial_x")[some], atol=1e-15)
+    np.testing.assert_allclose(again.metrics.window_error, simulated.metrics.window_error[some], rtol=1e-12)
+    np.testing.assert_allclose(again.vectors("initial_x"), simulated.vectors("initial_x")[some], atol=1e-15)
     other = montecarlo.run(chain.parts, chain.dispersion, 6, some)
     assert not np.any(other.metrics.window_error == again.metrics.window_error)
 

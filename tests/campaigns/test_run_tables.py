@@ -88,7 +88,7 @@ def of_run_table(made, table):
 @pytest.mark.parametrize("which", ["of_a_chain", pytest.param("everything", marks=pytest.mark.long)])
 def test_campaign_of_a_written_run_table_has_identical_rows(which, request, tmp_path):
     made, run_table = request.getfixturevalue(which)
-    frame = made.fly(range(FLOWN))
+    frame = made.simulate(range(FLOWN))
     run_table.write_csv(tmp_path / "run_table.csv")
     run_table.write_parquet(tmp_path / "run_table.parquet")
     digests = set()
@@ -97,14 +97,16 @@ def test_campaign_of_a_written_run_table_has_identical_rows(which, request, tmp_
         digests.add(run_tables.checked(run_tables.read(tmp_path / name), made.ready.parts).digest)
         assert again.run_table is not None
         assert not again.run_table.given  # the program of the original campaign simulates it
-        assert_frame_equal(again.fly(range(FLOWN)), frame, check_exact=True)
+        assert_frame_equal(again.simulate(range(FLOWN)), frame, check_exact=True)
     assert len(digests) == 1
     # rows of a campaign are a valid run table; their results are ignored, and each row has the noise of its trial
     some = of_run_table(made, frame[[40, 7]])
-    flown = some.fly(range(2))
-    assert flown["run_trial"].to_list() == [40, 7]
-    assert_frame_equal(flown.select(frame.columns[1:]), frame[[40, 7]].select(frame.columns[1:]), check_exact=True)
-    assert of_run_table(made, flown).fly(range(2)).equals(flown)  # rows of this campaign are a run table too
+    simulated = some.simulate(range(2))
+    assert simulated["run_trial"].to_list() == [40, 7]
+    assert_frame_equal(simulated.select(frame.columns[1:]), frame[[40, 7]].select(frame.columns[1:]), check_exact=True)
+    assert (
+        of_run_table(made, simulated).simulate(range(2)).equals(simulated)
+    )  # rows of this campaign are a run table too
 
 
 def test_written_run_table_has_the_exact_inputs_of_the_campaign(everything, tmp_path):
@@ -203,17 +205,17 @@ def test_simulation_with_parts_set_by_hand_reproduces_a_row(everything, corners,
     """Every number of a row is written into the nominal parts by hand."""
     made, rows = everything[0], everything[1].head(2)
     if kind == "alone":
-        flown = [alone(made.ready.parts, made.ready.dispersion, jnp.uint32(SEED), jnp.uint32(k)) for k in range(2)]
-        metrics = {name: [float(getattr(one.metrics, name)) for one in flown] for name in made.ready.catalogue}
-        status = [rollout.STATUS[int(one.status)][0] for one in flown]
-        for name in flown[0].drawn:
-            np.testing.assert_allclose(rows[name], [one.drawn[name] for one in flown], rtol=1e-12, err_msg=name)
+        simulated = [alone(made.ready.parts, made.ready.dispersion, jnp.uint32(SEED), jnp.uint32(k)) for k in range(2)]
+        metrics = {name: [float(getattr(one.metrics, name)) for one in simulated] for name in made.ready.catalogue}
+        status = [rollout.STATUS[int(one.status)][0] for one in simulated]
+        for name in simulated[0].drawn:
+            np.testing.assert_allclose(rows[name], [one.drawn[name] for one in simulated], rtol=1e-12, err_msg=name)
         rows = rows.with_columns(status=pl.Series(status), **{name: pl.Series(v) for name, v in metrics.items()})
     elif kind == "drawn":
-        rows = made.fly(range(2))
+        rows = made.simulate(range(2))
     else:
         table, from_table = corners
-        rows = from_table.fly(range(2))
+        rows = from_table.simulate(range(2))
         stands(rows, table)
     for row in rows.iter_rows(named=True):
         by_hand = set_by_hand(made.ready.parts, row)
@@ -318,12 +320,12 @@ def test_chain_is_simulated_with_a_run_table():
     flight = scenario.from_tables(untuned(SHORT_CHAIN.replace("[dispersion]", noise)))
     states = {"initial_x1": [1.1, -0.4], "initial_x2": [0.2, 0.3]}
     whose = {"trial": [2, 0], "seed": [SEED, 11]}
-    flown = ptsmc.trials(flight, pl.DataFrame(whose | states), seed=SEED)
-    assert flown["run_trial"].to_list() == whose["trial"]
-    assert flown["run_seed"].to_list() == whose["seed"]
+    simulated = ptsmc.trials(flight, pl.DataFrame(whose | states), seed=SEED)
+    assert simulated["run_trial"].to_list() == whose["trial"]
+    assert simulated["run_seed"].to_list() == whose["seed"]
     known = scenario.study(flight)
     for k, (trial, seed) in enumerate(zip(*whose.values(), strict=True)):
-        row, at = flown.row(k, named=True), (jnp.uint32(seed), jnp.uint32(trial))
+        row, at = simulated.row(k, named=True), (jnp.uint32(seed), jnp.uint32(trial))
         assert [row[name] for name in states] == [values[k] for values in states.values()]
         drawn = known.dispersion.apply(known.parts, *at)
         start = vector([row[name] for name in states])

@@ -12,10 +12,10 @@ from ptsmc_jax.campaigns import runs
 from ptsmc_jax.theory import error_floor
 
 
-@pytest.mark.parametrize(("varies", "rows", "flown"), [
+@pytest.mark.parametrize(("varies", "rows", "simulated"), [
     (True, (), [0, 1, 2, 3]), (False, (), [None]), (True, (7, 9), [7, 9]), (False, (7,), [7]),
 ])  # fmt: skip
-def test_lower_bound_is_pooled_over_the_first_trials_or_rows(monkeypatch, varies, rows, flown):
+def test_lower_bound_is_pooled_over_the_first_trials_or_rows(monkeypatch, varies, rows, simulated):
     """Trial k has the lower bound k + 1. The second simulated trial fails and has no bound."""
     seen: list[Any] = []
 
@@ -23,15 +23,15 @@ def test_lower_bound_is_pooled_over_the_first_trials_or_rows(monkeypatch, varies
         seen.append((seed, trial))
         return SimpleNamespace(has_floor=len(seen) != 2, parts=1.0 + (trial or 0), log=None)
 
-    def along_each(flown):
-        return [error_floor.Floor(floor, np.zeros(1), np.zeros(1)) for floor, _ in flown]
+    def along_each(simulated):
+        return [error_floor.Floor(floor, np.zeros(1), np.zeros(1)) for floor, _ in simulated]
 
     monkeypatch.setattr(runs, "_fly", fly)
     monkeypatch.setattr(error_floor, "along_each", along_each)
     ready: Any = SimpleNamespace(dispersion=SimpleNamespace(varies=varies))
-    squares = [(1.0 + (k or 0)) ** 2 for j, k in enumerate(flown) if j != 1]
+    squares = [(1.0 + (k or 0)) ** 2 for j, k in enumerate(simulated) if j != 1]
     assert runs.floor(ready, 5, rows) == pytest.approx(math.sqrt(sum(squares) / len(squares)))
-    assert seen == [(5, k) for k in flown]
+    assert seen == [(5, k) for k in simulated]
 
 
 @pytest.mark.parametrize("status", ["not_converged", "singular", "diverged"])

@@ -44,7 +44,7 @@ def summary(folder):
 
 
 @pytest.fixture
-def flown(command, tmp_path):
+def simulated(command, tmp_path):
     """A campaign of 250 trials that meets its requirement."""
     assert command("montecarlo", "s.toml", "--trials", 250, "--seed", 3, "--no-figures", "--quiet") == (0, "", "")
     return tmp_path / FOLDER
@@ -77,7 +77,7 @@ def test_montecarlo_writes_rows_summary_and_figures(command, tmp_path, monkeypat
     read = checked(folder)
     assert "ptsmc montecarlo s.toml --trials 250 --seed 3" in read.text
     found, rows = summary(folder), rows_of(folder)
-    assert (found["status"], found["flown"], found["counts"]["ok"]) == ("met", 250, 250)
+    assert (found["status"], found["simulated"], found["counts"]["ok"]) == ("met", 250, 250)
     errors = rows["window_error"].to_numpy()
     told = found["quantiles"]["window_error"]
     least = found["floor"]
@@ -96,9 +96,9 @@ def test_montecarlo_writes_rows_summary_and_figures(command, tmp_path, monkeypat
 
 @pytest.mark.parametrize(("drawn", "instead"), short([(r"\[0.5, 0.1\]", "[0, 0]"), ("x0 = {.*", "")],
                                                      [(r"\[0.5, 0.1\]", "[0, 0]")]))  # fmt: skip
-def test_equal_trials_are_reported(command, tmp_path, flown, drawn, instead):
+def test_equal_trials_are_reported(command, tmp_path, simulated, drawn, instead):
     """The scenario has no dispersion, or one of zero width, which compiled programs of other tests can simulate."""
-    assert not [said for said in summary(flown)["cautions"] if "the same flight" in said]
+    assert not [said for said in summary(simulated)["cautions"] if "the same flight" in said]
     text = re.sub(drawn, instead, SHORT_CHAIN).replace("[2e-5, 1e-5]", "[0, 0]")
     (tmp_path / "same.toml").write_text(text)
     _, said, _ = command("montecarlo", "same.toml", "--trials", 250, "--no-figures")
@@ -114,11 +114,11 @@ def test_failed_trials_are_not_reported_as_equal():
     assert campaign_summary._alike(at_rest, 5, drawn=True) == campaign_summary._alike(at_rest, 5) == []
 
 
-def test_more_trials_extend_an_existing_campaign(command, flown):
-    before = rows_of(flown)
-    files = {path: path.stat().st_mtime_ns for path in (flown / "trials").iterdir()}
+def test_more_trials_extend_an_existing_campaign(command, simulated):
+    before = rows_of(simulated)
+    files = {path: path.stat().st_mtime_ns for path in (simulated / "trials").iterdir()}
     assert command("montecarlo", "s.toml", "--trials", 420, "--seed", 3, "--no-figures", "--quiet")[0] == 0
-    after = rows_of(flown)
+    after = rows_of(simulated)
     assert after["trial"].to_list() == list(range(420))
     same(after[:250], before)
     kept = [path for path in files if path.exists() and path.stat().st_mtime_ns == files[path]]
@@ -138,12 +138,12 @@ def test_repeated_part_is_not_counted_twice_in_the_progress(command, monkeypatch
     assert [(tally.done, tally.total) for tally in standing] == [(0, 10), (10, 10), (0, 20), (20, 20)]
 
 
-def test_repeated_command_simulates_no_trials(command, flown):
-    files = {path: path.stat().st_mtime_ns for path in (flown / "trials").iterdir()}
+def test_repeated_command_simulates_no_trials(command, simulated):
+    files = {path: path.stat().st_mtime_ns for path in (simulated / "trials").iterdir()}
     code, said, _ = command("montecarlo", "s.toml", "--trials", 250, "--seed", 3, "--no-figures")
     assert code == 0
     assert "250 ok" in said
-    assert {path: path.stat().st_mtime_ns for path in (flown / "trials").iterdir()} == files
+    assert {path: path.stat().st_mtime_ns for path in (simulated / "trials").iterdir()} == files
 
 
 @pytest.mark.parametrize(
@@ -154,9 +154,9 @@ def test_repeated_command_simulates_no_trials(command, flown):
         ("eta", "holds a run of another scenario: controller.eta is 3.0 there, and 2.7 here"),
     ],
 )
-def test_another_campaign_in_the_same_folder_is_refused(command, flown, tmp_path, change, said):
+def test_another_campaign_in_the_same_folder_is_refused(command, simulated, tmp_path, change, said):
     (tmp_path / "m.py").write_text(OVERSHOOT)
-    before = rows_of(flown)
+    before = rows_of(simulated)
     options = ["--seed", 3]
     if change == "eta":
         text = (tmp_path / "s.toml").read_text()
@@ -167,20 +167,20 @@ def test_another_campaign_in_the_same_folder_is_refused(command, flown, tmp_path
     assert (code, out) == (2, "")
     assert said in error
     assert error.count("\n") == 1
-    same(rows_of(flown), before)
+    same(rows_of(simulated), before)
     if "--metrics" not in options:  # custom metrics would compile another program
         again = ("montecarlo", "s.toml", "--trials", 110, *options, "--force", "--no-figures", "--quiet")
         mine = "runs/mine.parquet", "run_table.parquet", "controller/mine.c", "figures/mine.png"  # a user's own
         for name in mine:
-            (flown / name).parent.mkdir(exist_ok=True)
-            (flown / name).write_text("mine")
+            (simulated / name).parent.mkdir(exist_ok=True)
+            (simulated / name).write_text("mine")
         assert command(*again, "--dry-run")[0] == 0
-        assert [(flown / name).read_text() for name in mine] == ["mine"] * 4
-        assert not (flown / "summary.json").exists()  # the summary of the earlier campaign must not remain
-        (flown / "trials" / "mine.parquet").write_text("mine")
+        assert [(simulated / name).read_text() for name in mine] == ["mine"] * 4
+        assert not (simulated / "summary.json").exists()  # the summary of the earlier campaign must not remain
+        (simulated / "trials" / "mine.parquet").write_text("mine")
         code, _, error = command(*again)
         assert (code, "mine.parquet is no part of a campaign; it is kept as mine.parquet.damaged" in error) == (0, True)
-        assert rows_of(flown)["trial"].to_list() == list(range(110))
+        assert rows_of(simulated)["trial"].to_list() == list(range(110))
 
 
 @pytest.mark.parametrize(
@@ -229,15 +229,15 @@ def test_until_confident_stops_at_the_required_interval_width(command, tmp_path)
     found = summary(tmp_path / FOLDER)
     assert code == 1
     assert "NOT met" in said
-    assert found["flown"] == found["trials"] == 400
+    assert found["simulated"] == found["trials"] == 400
     low, high = found["verdicts"][0]["share_interval"]
     assert 0.0 < high - low <= 0.11
     again = command("montecarlo", "s.toml", "--until-confident", "0.11", "--trials", 5000, "--no-figures")
     assert again[0] == 1
-    assert summary(tmp_path / FOLDER)["flown"] == 400
+    assert summary(tmp_path / FOLDER)["simulated"] == 400
     command("montecarlo", "s.toml", "--trials", 600, "--no-figures")
     command("montecarlo", "s.toml", "--until-confident", "0.11", "--trials", 5000, "--no-figures")
-    assert summary(tmp_path / FOLDER)["flown"] == 600  # existing trials count
+    assert summary(tmp_path / FOLDER)["simulated"] == 600  # existing trials count
 
 
 @pytest.mark.parametrize("before", [0, 150])
@@ -268,7 +268,7 @@ def test_interrupted_until_confident_ends_with_the_same_number_of_trials(command
         assert command(*confident, *out)[0] == 1
     whole, again = (tmp_path / "out" / name for name in ("False", "True"))
     assert summary(whole) == summary(again)
-    assert summary(whole)["flown"] == (400 if before == 0 else 300)
+    assert summary(whole)["simulated"] == (400 if before == 0 else 300)
     made = [store.read_versions(folder) | {"command_line": ""} for folder in (whole, again)]
     assert made[0] == made[1]
     assert rows_of(whole).equals(rows_of(again))
@@ -298,8 +298,8 @@ def test_dry_run_writes_the_inputs_of_the_trials(command, tmp_path):
     same(run_table, rows_of(folder).select(run_table.columns))
 
 
-def test_shards_in_one_folder_or_several_make_the_whole_campaign(command, flown, tmp_path):
-    whole, options = rows_of(flown), ["--trials", 250, "--seed", 3, "--no-figures"]
+def test_shards_in_one_folder_or_several_make_the_whole_campaign(command, simulated, tmp_path):
+    whole, options = rows_of(simulated), ["--trials", 250, "--seed", 3, "--no-figures"]
     for k in (1, 2):
         code, said, _ = command("montecarlo", "s.toml", *options, "--shard", f"{k}/2", "--out", "one")
         assert code == 0
@@ -315,15 +315,15 @@ def test_shards_in_one_folder_or_several_make_the_whole_campaign(command, flown,
         same(rows_of(tmp_path / folder), whole)
 
 
-def test_campaign_of_another_code_version_is_not_extended(command, flown):
-    store.write_json(flown / "versions.json", store.read_versions(flown) | {"code_checksum": "before"})
-    before, more = tree(flown), ("montecarlo", "s.toml", "--trials", 260, "--seed", 3, "--no-figures", "--quiet")
+def test_campaign_of_another_code_version_is_not_extended(command, simulated):
+    store.write_json(simulated / "versions.json", store.read_versions(simulated) | {"code_checksum": "before"})
+    before, more = tree(simulated), ("montecarlo", "s.toml", "--trials", 260, "--seed", 3, "--no-figures", "--quiet")
     code, _, error = command(*more)
     assert (code, error.count("\n")) == (2, 1)
     assert "another version of the source code (checksum before, not " in error
-    assert tree(flown) == before
+    assert tree(simulated) == before
     assert command(*more, "--force") == (0, "", "")
-    assert store.read_versions(flown)["code_checksum"] == store.packages()["code_checksum"]
+    assert store.read_versions(simulated)["code_checksum"] == store.packages()["code_checksum"]
 
 
 def test_a_shard_does_not_delete_the_rows_of_other_shards(command, tmp_path):
@@ -336,9 +336,9 @@ def test_a_shard_does_not_delete_the_rows_of_other_shards(command, tmp_path):
     assert command("montecarlo", "s.toml", *options, "--shard", "1/1", "--force") == (0, "", "")
 
 
-def test_damaged_part_is_reported_and_simulated_again(command, flown):
-    whole = rows_of(flown)
-    part = sorted((flown / "trials").iterdir())[1]
+def test_damaged_part_is_reported_and_simulated_again(command, simulated):
+    whole = rows_of(simulated)
+    part = sorted((simulated / "trials").iterdir())[1]
     part.write_bytes(part.read_bytes()[:-100])
     for asked in (["summarize", FOLDER], ["worst", FOLDER]):
         code, out, error = command(*asked)
@@ -348,14 +348,14 @@ def test_damaged_part_is_reported_and_simulated_again(command, flown):
     code, _, error = command("montecarlo", "s.toml", "--trials", 250, "--seed", 3, "--no-figures", "--quiet")
     assert code == 0
     assert f"{part.name} is damaged and is simulated again" in error
-    same(rows_of(flown), whole)
+    same(rows_of(simulated), whole)
     assert part.with_name(part.name + ".damaged").exists()  # damaged files are renamed, not deleted
 
 
-def test_worst_lists_trials_that_replay_reproduces(command, flown, tmp_path):
-    whole = rows_of(flown)
+def test_worst_lists_trials_that_replay_reproduces(command, simulated, tmp_path):
+    whole = rows_of(simulated)
     code, said, _ = command("worst", FOLDER, "--by", "peak_torque", "-n", 3)
-    kept = pl.read_csv(flown / "worst.csv")
+    kept = pl.read_csv(simulated / "worst.csv")
     order = whole.sort("peak_torque", descending=True)[:3]
     assert code == 0
     assert kept["trial"].to_list() == order["trial"].to_list()
@@ -366,9 +366,9 @@ def test_worst_lists_trials_that_replay_reproduces(command, flown, tmp_path):
     code, said, _ = command("replay", FOLDER, "--trial", trial, "--no-figures")
     assert code == 0
     assert "its row" in said
-    made = json.loads((flown / "replay" / str(trial) / "summary.json").read_text())
+    made = json.loads((simulated / "replay" / str(trial) / "summary.json").read_text())
     assert made["peak_torque"] == pytest.approx(order["peak_torque"][0], rel=1e-12)
-    assert (flown / "replay" / str(trial) / "trajectory.csv").exists()
+    assert (simulated / "replay" / str(trial) / "trajectory.csv").exists()
     code, _, error = command("replay", FOLDER, "--trial", 250)
     assert (code, "--trial is 250, but must be a whole number from 0 to 249" in error) == (2, True)
     code, _, error = command("worst", FOLDER, "--by", "peek_torque")
@@ -378,11 +378,11 @@ def test_worst_lists_trials_that_replay_reproduces(command, flown, tmp_path):
     assert error.count(",") < 8
 
 
-def test_replay_that_differs_from_its_row_is_reported(command, flown):
+def test_replay_that_differs_from_its_row_is_reported(command, simulated):
     """The changed row has a valid checksum, as if another version had computed it."""
     from tuning.studies import campaign_folder
 
-    opened = campaign_folder.opened(flown)
+    opened = campaign_folder.opened(simulated)
     first = opened.whole_parts()[0]
     changed = pl.read_parquet(first.path).with_columns(effort=pl.col("effort") * (1 + 1e-9))
     first.path.unlink()
@@ -438,15 +438,15 @@ WILD = SHORT.replace("min_deg = 20.0, max_deg = 90.0", "min_deg = 170.0, max_deg
 ASKED = "[requirements]\npeak_torque = 30.0\n"
 
 
-@pytest.fixture(params=short(["made up", "flown"], ["made up"]))
+@pytest.fixture(params=short(["made up", "simulated"], ["made up"]))
 def lost(request, tmp_path, monkeypatch):
     """Return a function that makes trials fail, and returns how.
 
     "made up" sets the status of every fourth trial, "flown" simulates initial angles near 180 deg.
     """
 
-    def run(parts, dispersion, seed, trials, *more, flown=montecarlo.run, **how):
-        result, fails = flown(parts, dispersion, seed, trials, *more, **how), np.asarray(trials) % 4 == 0
+    def run(parts, dispersion, seed, trials, *more, simulated=montecarlo.run, **how):
+        result, fails = simulated(parts, dispersion, seed, trials, *more, **how), np.asarray(trials) % 4 == 0
         codes = np.where(np.asarray(trials) % 8 == 0, rollout.DIVERGED, rollout.SINGULAR)
         return replace(
             result,

@@ -77,10 +77,10 @@ def test_tune_command_writes_results_and_repeats_them(command, tmp_path, monkeyp
     status, _, _ = command("tune", "s.toml", "--out", "t")
     summary = json.loads((tmp_path / "t" / "summary.json").read_text())
     assert status == (0 if summary["status"] == "met" else 1)
-    assert {"gains", "training", "fresh", "paper", "verdicts"} <= set(summary)
-    assert summary["fresh"]["trials"] == 40
-    assert summary["fresh"]["seed"] != summary["training"]["seed"]
-    known = {"fresh": summary["gains"], "paper": {"eta": 3.0, "delta": 0.1}}  # published 0.05 s is below one period
+    assert {"gains", "training", "held_out", "paper", "verdicts"} <= set(summary)
+    assert summary["held_out"]["trials"] == 40
+    assert summary["held_out"]["seed"] != summary["training"]["seed"]
+    known = {"held_out": summary["gains"], "paper": {"eta": 3.0, "delta": 0.1}}  # published 0.05 s is below one period
     for group, of_group in known.items():
         assert 0.0 < summary[group]["floor"] < summary[group]["window_error"]["rms"]
         assert summary[group]["gains"].items() >= of_group.items()
@@ -91,16 +91,16 @@ def test_tune_command_writes_results_and_repeats_them(command, tmp_path, monkeyp
     assert tuned.controller.eta == summary["gains"]["eta"]
     assert tuned.controller.delta == summary["gains"]["delta"]
     ready = scenario.study(tuned)  # tuned.toml reproduces the held-out trials
-    again = montecarlo.run(ready.parts, ready.dispersion, summary["fresh"]["seed"], np.arange(40))
+    again = montecarlo.run(ready.parts, ready.dispersion, summary["held_out"]["seed"], np.arange(40))
     rms = np.sqrt(np.mean(again.metrics.window_error**2))
-    assert rms == pytest.approx(summary["fresh"]["window_error"]["rms"], rel=1e-12)
+    assert rms == pytest.approx(summary["held_out"]["window_error"]["rms"], rel=1e-12)
     assert (tuned.loop.clock, tuned.controller.sign_width) == ("flight", 1e-3)
     header, *rows = (tmp_path / "t" / "history.csv").read_text().splitlines()
     assert header == "step,start,rms_window_error,eta,delta,peak_torque_over_limit"
     assert len(rows) == summary["search"]["steps"] >= 2
     # The tuned gains are more accurate than the scenario's gains on the same trials. They need not be more accurate
     # than the published gains, whose faster surface and observer are not free in this search.
-    assert summary["fresh"]["window_error"]["rms"] < summary["before"]["window_error"]["rms"]
+    assert summary["held_out"]["window_error"]["rms"] < summary["before"]["window_error"]["rms"]
 
     assert summary["trust"]["margins"] == stability.worst(scenario.study(tuned))
     assert summary["shortest_t_f"]["theory"] > 0.0
@@ -109,7 +109,7 @@ def test_tune_command_writes_results_and_repeats_them(command, tmp_path, monkeyp
     left = summary["trust"]["margins"]["hold"]["gain_margin"]
     assert f"margins of the nominal loop in the hold phase: gain {left:.3g} dB" in read.text
     assert set(read.charts) == {"search"}
-    times = summary["fresh"]["window_error"]["rms"] / summary["fresh"]["floor"]
+    times = summary["held_out"]["window_error"]["rms"] / summary["held_out"]["floor"]
     assert f"{formats.ratio(times)} times the lower bound of " in read.text
     assert len(read.charts["search"]["data"]) == summary["search"]["starts"]
     gains = ", ".join(f"{name} {value:.6g}" for name, value in summary["gains"].items())
@@ -353,7 +353,7 @@ def test_interrupted_search_writes_its_best_gains_and_resumes(command, tmp_path,
             best = json.loads((tmp_path / "cut" / "summary.json").read_text())
             assert best["status"] == "interrupted"
             assert scenario.read(tmp_path / "cut" / "tuned.toml").controller.eta == best["gains"]["eta"]
-            assert best["fresh"]["trials"] == 40
+            assert best["held_out"]["trials"] == 40
     assert command("simulate", "s.toml", "--out", "cut")[0] == 2  # the folder belongs to another command
 
     with monkeypatch.context() as patch:
@@ -432,7 +432,7 @@ def test_internal_error_is_raised_with_its_traceback(tmp_path, monkeypatch):
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("ptsmc_jax.configure.configure", lambda **_: None)
-    monkeypatch.setattr(runs, "fly", broken)
+    monkeypatch.setattr(runs, "simulate", broken)
     monkeypatch.setattr(sys, "argv", ["ptsmc", "simulate"])
     with pytest.raises(ValueError, match="ours"):
         main.main()
@@ -490,8 +490,8 @@ def test_exit_statuses_of_a_process(tmp_path):
     asked |= {"JAX_NUMPY_DTYPE_PROMOTION": "strict", "JAX_TRANSFER_GUARD": "disallow"}
     not_met = in_a_process(*run, **asked)
     assert (not_met.returncode, not_met.stdout, not_met.stderr) == (1, "", "")
-    flown = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert (flown["status"], flown["verdicts"]["peak_torque"]["met"]) == ("ok", False)
+    simulated = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert (simulated["status"], simulated["verdicts"]["peak_torque"]["met"]) == ("ok", False)
     (tmp_path / "s.toml").write_text("controller.eta = 2")
     bad = in_a_process("simulate", tmp_path / "s.toml", "--out", tmp_path / "other")
     assert (bad.returncode, bad.stdout) == (2, "")
@@ -514,10 +514,10 @@ def test_simulate_refuses_a_nominal_initial_state_at_the_singularity(command, tm
     assert command("simulate", "s.toml", "--trial", 0, "--no-figures", "--quiet")[0] in (0, 1)  # random initial state
 
 
-@pytest.fixture(params=short(["made up", "flown"], ["made up"]))
+@pytest.fixture(params=short(["made up", "simulated"], ["made up"]))
 def cells(request, monkeypatch):
     """Cells of a map with invented results. `tests/studies/test_mapping.py` computes real ones."""
-    if request.param == "flown":
+    if request.param == "simulated":
         return
     metrics = Metrics(dict.fromkeys(catalogues.CATALOGUE, np.full(2, 1e-3)))
     trials = montecarlo.Trials(np.arange(2), metrics, np.full(2, rollout.OK), np.full(2, np.nan), {})

@@ -36,7 +36,7 @@ def test_commands_of_the_guide_run(command, tmp_path, monkeypatch):
     law = '[controller]\nkind = "custom"\ncode = "mine.py:Growing"'
     (tmp_path / "mine.toml").write_text((here / "first_flight.toml").read_text().replace("[controller]", law))
     shutil.copy(tmp_path / "mine.py", here)
-    flown = 0
+    simulated = 0
     for call in calls():
         for whole, small in SMALLER.items():
             call = call.replace(whole, small)
@@ -50,5 +50,5 @@ def test_commands_of_the_guide_run(command, tmp_path, monkeypatch):
         status, out, err = command(*rest)
         assert status in (0, 1), f"{call}: {err}"  # 1: gains of a small search may violate a requirement
         assert out
-        flown += 1
-    assert flown >= 14
+        simulated += 1
+    assert simulated >= 14

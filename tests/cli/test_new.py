@@ -196,9 +196,9 @@ def test_installed_wheel_simulates_an_example(tmp_path):
     run = {"check": True, "cwd": away, "env": {**os.environ, "PYTHONPATH": str(tmp_path / "site")}}
     ptsmc = sys.executable, tmp_path / "site" / "bin" / "ptsmc"
     subprocess.run([*ptsmc, "examples", "--quiet"], **run)
-    subprocess.run([*ptsmc, "simulate", "scenarios/two_link_arm.toml", "--out", "flown"], **run)
+    subprocess.run([*ptsmc, "simulate", "scenarios/two_link_arm.toml", "--out", "simulated"], **run)
     where = subprocess.run(
         [sys.executable, "-c", "import ptsmc_jax; print(ptsmc_jax.__file__)"], capture_output=True, text=True, **run
     )
     assert str(tmp_path / "site") in where.stdout
-    assert (away / "flown" / "summary.json").exists()
+    assert (away / "simulated" / "summary.json").exists()

@@ -44,8 +44,8 @@ def one_by_one():
     def one(parts, dispersion, seed, trial):
         at = np.uint32(seed), np.uint32(trial)
         run = rollout.simulate_parts(drawn(parts, dispersion, *at), *at, record=True, software=rollout.OURS)
-        flown = values(parts, dispersion, *at)
-        return jax.tree.map(np.asarray, (run.metrics, run.status, run.bad_time, flown, {}, run.samples))
+        simulated = values(parts, dispersion, *at)
+        return jax.tree.map(np.asarray, (run.metrics, run.status, run.bad_time, simulated, {}, run.samples))
 
     def run(parts, dispersion, seed, trials, **_):
         for trial in trials:
@@ -59,7 +59,7 @@ def one_by_one():
 
 # `test_montecarlo.py` and `test_lanes.py` test batches
 @pytest.fixture(params=short(["alone", "in a batch"], ["alone"]))
-def flown(request, command, tmp_path, monkeypatch, one_by_one):
+def simulated(request, command, tmp_path, monkeypatch, one_by_one):
     if request.param == "alone":
         monkeypatch.setattr(montecarlo, "run", one_by_one)
         monkeypatch.setattr(montecarlo, "prepare", lambda *_: None)
@@ -71,8 +71,8 @@ def flown(request, command, tmp_path, monkeypatch, one_by_one):
     return code, said, rows, json.loads((tmp_path / FOLDER / "summary.json").read_text())
 
 
-def test_pointing_requirements_have_verdicts_budget_and_table(flown, tmp_path):
-    code, said, rows, found = flown
+def test_pointing_requirements_have_verdicts_budget_and_table(simulated, tmp_path):
+    code, said, rows, found = simulated
     verdicts = {told["metric"]: told for told in found["verdicts"]}
     assert code == (0 if all(told["met"] for told in verdicts.values()) else 1)
     assert {"within_ape_boresight", "within_ake_x"} <= set(rows.columns)
@@ -111,8 +111,8 @@ def test_pointing_requirements_have_verdicts_budget_and_table(flown, tmp_path):
     assert [row[9] for row in table.rows] == ["22", "4", "every run"]  # 0.9^22 <= 0.1
 
 
-def test_worst_fraction_of_time_is_the_smallest(command, flown, tmp_path):
-    _, said, rows, found = flown
+def test_worst_fraction_of_time_is_the_smallest(command, simulated, tmp_path):
+    _, said, rows, found = simulated
     within = rows["within_ape_boresight"].to_numpy()
     ordered = np.sort(within)
     told = found["quantiles"]["within_ape_boresight"]
@@ -132,10 +132,10 @@ def test_worst_fraction_of_time_is_the_smallest(command, flown, tmp_path):
     assert set(why["trial"]) == set(np.argsort(within, kind="stable")[:3])
 
 
-def test_pointing_budget_is_an_order_statistic(monkeypatch, flown):
+def test_pointing_budget_is_an_order_statistic(monkeypatch, simulated):
     from tuning.studies import campaign_summary
 
-    rows, found = flown[2:]
+    rows, found = simulated[2:]
     monkeypatch.setattr(campaign_summary, "SHOWN", 0.9)
     from pathlib import Path
 
@@ -149,24 +149,24 @@ def test_pointing_budget_is_an_order_statistic(monkeypatch, flown):
     assert formats.angle(again["mpe"]["y"]) in str(pointing_report.budget(read))
 
 
-@pytest.mark.parametrize(("flown", "ok", "not_converged", "said"), [
+@pytest.mark.parametrize(("simulated", "ok", "not_converged", "said"), [
     (2000, 2000, 0, "without 1109 runs that all reach their end (852 for 90 % confidence)"),
     (1108, 1098, 0, "without 1109 runs that all reach their end"),  # too few runs for 95 % confidence
     (1109, 1099, 0, "because 10 runs did not reach their end"),
     (1109, 1049, 50, "because 10 runs did not reach their end"),  # runs that do not converge by t_f have angles
 ])  # fmt: skip
-def test_report_explains_a_missing_budget_value(flown, ok, not_converged, said):
+def test_report_explains_a_missing_budget_value(simulated, ok, not_converged, said):
     told = {"after": 0.0, "boresight": [1.0, 0.0, 0.0], "probability": 0.9973, "confidence": 0.95, "window": 1.0,
             "budget": {"ape": {"x": None}}}  # fmt: skip
-    found = examples.campaign(pointing=told, flown=flown, counts={"ok": ok, "not_converged": not_converged})
+    found = examples.campaign(pointing=told, simulated=simulated, counts={"ok": ok, "not_converged": not_converged})
     *_, last = pointing_report.heading(found)
     assert last.startswith(f"an angle is - {said}")
 
 
-def test_single_run_has_the_pointing_indices(command, flown, tmp_path):
+def test_single_run_has_the_pointing_indices(command, simulated, tmp_path):
     code, said, _ = command("simulate", "s.toml", "--trial", 3, "--no-figures", "--out", "one")
     made = json.loads((tmp_path / "one" / "summary.json").read_text())
-    row = flown[2].row(3, named=True)
+    row = simulated[2].row(3, named=True)
     for name in ("ape_x", "rpe_boresight", "mke_z", "within_ape_boresight"):
         assert made[name] == pytest.approx(row[name], rel=1e-9), name
     assert code == (0 if all(told["met"] for told in made["verdicts"].values()) else 1)

@@ -103,7 +103,7 @@ def test_commanded_torque_is_the_filtered_torque():
             {**ALONE, "hardware": {"command_filter": {"kind": "notch", "corner": 3.0, "damping": 0.5}}}
         )
     )
-    run = runs.fly(ready)
+    run = runs.simulate(ready)
     assert run.status == "ok"
     np.testing.assert_array_equal(run.log.commanded, run.log.u)  # the actuators are ideal
     assert run.metrics["peak_torque"] == np.abs(run.log.commanded).max()

@@ -48,11 +48,11 @@ def test_channels_follow_their_differential_equation(lag, rate_limit):
                 expected = start + step
             else:
                 limit = np.inf if rate_limit is None else rate_limit
-                flown = solve_ivp(
+                simulated = solve_ivp(
                     lambda _, v, target=target, limit=limit: np.clip((target - v) / lag, -limit, limit),
                     (0.0, s), [start], rtol=1e-10, atol=1e-12, max_step=0.01,
                 )  # fmt: skip
-                expected = flown.y[0, -1]
+                expected = simulated.y[0, -1]
             np.testing.assert_allclose(found[-1], expected, rtol=0, atol=1e-8)
             np.testing.assert_allclose(impulse[-1], np.trapezoid(found, times), rtol=0, atol=1e-6)
             np.testing.assert_allclose(second[-1], np.trapezoid(impulse, times), rtol=0, atol=1e-6)
@@ -177,8 +177,8 @@ def test_wheels_exchange_momentum_with_the_body(momentum, lag, limit):
     }
     ready = scenario.study(scenario.from_tables({**tables, "wheels": {"momentum": momentum}}))
     assert ready.parts.substeps <= MOST
-    flown = runs.fly(as_many(ready))
-    log, axes, inertia = flown.log, PYRAMID.T, np.asarray(FULL_INERTIA)
+    simulated = runs.simulate(as_many(ready))
+    log, axes, inertia = simulated.log, PYRAMID.T, np.asarray(FULL_INERTIA)
     assert log.wheels is not None
     total = [
         Rotation.from_quat(q).apply(inertia @ w + axes @ h)
@@ -190,8 +190,8 @@ def test_wheels_exchange_momentum_with_the_body(momentum, lag, limit):
     off = Rotation.from_quat(q).inv() * Rotation.from_quat(log.x.q[intervals])
     assert off.magnitude() < 1e-9
     np.testing.assert_allclose(log.wheels[0][intervals], h, rtol=0, atol=1e-12 * max(np.abs(momentum)) + 1e-13)
-    assert list(flown.columns())[-8:] == ["h1", "h2", "h3", "h4", "v1", "v2", "v3", "v4"]  # of trajectory.csv
-    largest = flown.metrics["peak_wheel_momentum"]
+    assert list(simulated.columns())[-8:] == ["h1", "h2", "h3", "h4", "v1", "v2", "v3", "v4"]  # of trajectory.csv
+    largest = simulated.metrics["peak_wheel_momentum"]
     assert largest >= np.abs(log.wheels[0]).max()  # t = 0 counts too
     np.testing.assert_allclose(largest, np.abs(log.wheels[0]).max(), rtol=2e-3)
 

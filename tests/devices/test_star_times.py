@@ -56,15 +56,15 @@ def test_every_star_tracker_sample_is_used_once_at_the_next_control_sample(inter
         assert np.abs(off).max() <= (found.pattern[0] > 10)
 
 
-def by_hand(parts, flown):
+def by_hand(parts, simulated):
     """The filter's attitude (as a rotation) and bias at each sample, computed with NumPy and SciPy."""
     known = parts.sensors.filter
     k1, k2 = float(known.attitude_gain), float(known.bias_gain)
-    said = [(Rotation.from_quat(flown.before["attitude"][0]), flown.before["bias"][0])]
-    gyro = flown.inputs["rate"]
+    said = [(Rotation.from_quat(simulated.before["attitude"][0]), simulated.before["bias"][0])]
+    gyro = simulated.inputs["rate"]
     rates = np.concatenate([gyro[:1], gyro])  # entry k: rate at the previous sample, for the first its own
-    moments = np.concatenate([flown.t[:1], flown.t])
-    for k in range(len(flown.t)):
+    moments = np.concatenate([simulated.t[:1], simulated.t])
+    for k in range(len(simulated.t)):
         q, bias = said[-1]
         t0, t1, w0, w1 = moments[k], moments[k + 1], rates[k], rates[k + 1]
         taken = 0.25 * math.floor(t1 / 0.25 + 1e-6)
@@ -76,7 +76,7 @@ def by_hand(parts, flown):
             q = q * Rotation.from_rotvec(h / 2 * (a + b) + h * h / 12 * np.cross(a, b))
             at, w = stop, there
             if star:
-                residual = 2 * (q.inv() * Rotation.from_quat(flown.inputs["attitude"][k])).as_quat()
+                residual = 2 * (q.inv() * Rotation.from_quat(simulated.inputs["attitude"][k])).as_quat()
                 residual = residual[:3] * np.sign(residual[3])
                 q, bias = q * Rotation.from_rotvec(k1 * residual), bias - k2 * residual
         said.append((q, bias))
@@ -88,25 +88,25 @@ def run():
     """The parts of a scenario at 10 Hz with a star tracker at 4 Hz, and the samples of a run."""
     ready = of(star_tracker_period=0.25, rate_bias=1e-4)
     parts = dataclasses.replace(ready.parts, walk_rate=None)
-    flown = vectors.fly_many(parts, ready.dispersion, jnp.uint32(3), jnp.arange(1, dtype=jnp.uint32))
-    return parts, vectors.one(flown, 0)
+    simulated = vectors.simulate_many(parts, ready.dispersion, jnp.uint32(3), jnp.arange(1, dtype=jnp.uint32))
+    return parts, vectors.one(simulated, 0)
 
 
 def test_filter_equals_the_independent_computation(run):
-    parts, flown = run
-    valid = flown.inputs["attitude_valid"] > 0.0
+    parts, simulated = run
+    valid = simulated.inputs["attitude_valid"] > 0.0
     assert np.flatnonzero(valid[:12]).tolist() == [0, 3, 5, 8, 10]
-    np.testing.assert_allclose(flown.inputs["attitude_age"][valid][:4], [0.0, 0.05, 0.0, 0.05], atol=1e-12)
-    said = by_hand(parts, flown)
+    np.testing.assert_allclose(simulated.inputs["attitude_age"][valid][:4], [0.0, 0.05, 0.0, 0.05], atol=1e-12)
+    said = by_hand(parts, simulated)
     for k, (q, bias) in enumerate(said):
-        off = (q.inv() * Rotation.from_quat(flown.after["attitude"][k])).magnitude()
+        off = (q.inv() * Rotation.from_quat(simulated.after["attitude"][k])).magnitude()
         assert off < 1e-12, k
-        np.testing.assert_allclose(flown.after["bias"][k], bias, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(simulated.after["bias"][k], bias, rtol=0, atol=1e-12)
 
 
 def test_star_tracker_measures_the_attitude_at_its_own_sample_time(run):
     """An independent RK4 integration gives the true attitude at 0.25, 0.5, .. s. The test subtracts the noise."""
-    parts, flown = run
+    parts, simulated = run
     inertia, steps = np.array([10.0, 12.0, 14.0]), parts.substeps
 
     def rate(t, x, u):
@@ -129,13 +129,13 @@ def test_star_tracker_measures_the_attitude_at_its_own_sample_time(run):
     x, looked_at = np.concatenate([parts.initial.q, parts.initial.w]), 0
     for k in range(30):
         if k > 0:
-            t, u, h = flown.t[k - 1], flown.torque[k - 1], flown.t[k] - flown.t[k - 1]
-            there = moved(t, x, u, h - flown.inputs["attitude_age"][k])
+            t, u, h = simulated.t[k - 1], simulated.torque[k - 1], simulated.t[k] - simulated.t[k - 1]
+            there = moved(t, x, u, h - simulated.inputs["attitude_age"][k])
             x = moved(t, x, u, h)
-            if flown.inputs["attitude_valid"][k]:
+            if simulated.inputs["attitude_valid"][k]:
                 noise, _ = parts.sensors.noise(keys, jnp.asarray(k))
                 off = Rotation.from_quat(there[:4]) * Rotation.from_rotvec(np.array(noise))
-                off = off.inv() * Rotation.from_quat(flown.inputs["attitude"][k])
+                off = off.inv() * Rotation.from_quat(simulated.inputs["attitude"][k])
                 assert off.magnitude() < 1e-12, k
                 looked_at += 1
     assert looked_at == 11  # 0.25 to 2.75 s
@@ -248,5 +248,7 @@ def test_in_step_gives_the_same_correction_and_noise_per_interval():
 
 def test_a_constant_gyro_bias_has_no_effect_with_the_filter():
     """The filter starts in its steady state, so that the error of its bias estimate does not depend on the bias."""
-    without, with_bias = (runs.fly(of(star_tracker_period=0.25, **bias), 3, 2) for bias in ({}, {"rate_bias": 1e-3}))
+    without, with_bias = (
+        runs.simulate(of(star_tracker_period=0.25, **bias), 3, 2) for bias in ({}, {"rate_bias": 1e-3})
+    )
     np.testing.assert_allclose(with_bias.metrics["window_error"], without.metrics["window_error"], rtol=1e-6)

@@ -66,7 +66,7 @@ METRICS = ("window_error", "peak_torque", "effort", "residual_modal", "peak_torq
 
 
 def test_every_trial_equals_a_run_that_is_built_from_its_columns(dispersed):
-    trials = [runs.fly(dispersed, 5, trial) for trial in range(3)]
+    trials = [runs.simulate(dispersed, 5, trial) for trial in range(3)]
     for trial, run in enumerate(trials):
         row = dispersed.dispersion.values(run.parts)
         rebuilt = with_hardware_errors(
@@ -85,7 +85,7 @@ def test_every_trial_equals_a_run_that_is_built_from_its_columns(dispersed):
 
 
 def test_torque_on_the_body_has_scale_and_misalignment_that_the_flight_software_does_not_know(dispersed):
-    run = runs.fly(dispersed, 5, 1)
+    run = runs.simulate(dispersed, 5, 1)
     device = run.parts.actuators
     assert device is not None
     delivered = run.log.commanded[:-1] * np.asarray(device.scale)
@@ -158,7 +158,7 @@ def test_other_wheels_take_over_a_failure_if_it_is_known(known):
     failure = {"kind": "uniform", "earliest": 1.0, "latest": 3.0, "known": known}
     dispersion = {"wheel_failure": failure, "star_tracker_outage": {"kind": "uniform", "duration": 0.5, "latest": 3.0}}
     ready = scenario.study(scenario.from_tables({**WHEELED, "dispersion": dispersion}))
-    run = runs.fly(ready, 0, 2)
+    run = runs.simulate(ready, 0, 2)
     row = {key: float(v) for key, v in ready.dispersion.values(run.parts).items() if key.startswith("wheel_")}
     when, wheel = row["wheel_failure_time"], round(row["wheel_failure_wheel"]) - 1
     assert 1.0 <= when <= 3.0
@@ -201,7 +201,7 @@ def test_outage_of_the_whole_run_equals_a_filter_without_corrections():
     after_end = {"kind": "uniform", "earliest": 50.0, "latest": 60.0, "known": True}
     dispersion = {"star_tracker_outage": lasting, "wheel_failure": after_end}
     ready = scenario.study(scenario.from_tables({**WHEELED, "dispersion": dispersion}))
-    run = runs.fly(ready, 0, 0)
+    run = runs.simulate(ready, 0, 0)
     assert {key: float(v) for key, v in ready.dispersion.values(run.parts).items()}["star_tracker_outage_begin"] == 0.0
     no_outage = replace(run.parts.sensors, outage=vector([50.0, 60.0]))  # after the end
     assert no_outage.filter is not None
@@ -226,7 +226,7 @@ CHAIN = {
 def test_timing_jitter_equals_an_independent_loop():
     """The motion of the double integrator is exact over periods of any length. The law assumes nominal periods."""
     ready = scenario.study(scenario.from_tables(CHAIN))
-    run = runs.fly(ready, 3, 2)
+    run = runs.simulate(ready, 3, 2)
     jitter = float(ready.dispersion.values(run.parts)["timing_jitter"])
     assert 0.2 <= jitter <= 0.4
     key, h, x = draws.stream(3, 2, control_period.SAMPLE_TIMES), 0.1, np.array([1.0, -0.3])
@@ -255,7 +255,7 @@ def test_error_with_timing_jitter_is_relative_to_the_reference_at_the_true_time(
     tables = {key: FLIGHT[key] for key in ("controller", "initial", "loop")}
     spin = {"kind": "spin", "rate": [0.0, 0.0, 0.2]}
     tables |= {"reference": spin, "dispersion": CHAIN["dispersion"]}
-    run = runs.fly(scenario.study(scenario.from_tables(tables)), 3, 2)
+    run = runs.simulate(scenario.study(scenario.from_tables(tables)), 3, 2)
     log = run.log
     np.testing.assert_allclose(log.reference.q[:, 2], np.sin(0.1 * log.t), rtol=0, atol=1e-14)
     later = max(np.linalg.norm(log.error[log.t > 5.0], axis=1))

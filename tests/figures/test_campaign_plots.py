@@ -52,8 +52,8 @@ def test_each_outcome_is_counted_and_drawn():
     ):
         drawn = np.all(np.asarray(points.get_linewidth()) > 0.0)
         assert drawn or MarkerStyle(marker).is_filled(), marker  # otherwise it is invisible
-    flown = x[np.isin(outcome, ("ok", campaign_plots.AT_TIMES, campaign_plots.BEYOND, "not_converged"))]
-    assert axes.get_ylim() == pytest.approx((flown.min() / 1.3, flown.max() * 1.5))
+    simulated = x[np.isin(outcome, ("ok", campaign_plots.AT_TIMES, campaign_plots.BEYOND, "not_converged"))]
+    assert axes.get_ylim() == pytest.approx((simulated.min() / 1.3, simulated.max() * 1.5))
 
 
 @pytest.mark.parametrize("limit", [1e-3, 1e3])

@@ -54,7 +54,7 @@ def test_a_tradeoff_figure_has_each_trial_and_their_rms():
 def test_profiles_name_the_violated_limit_and_their_numbers_do_not_overlap(low, high, least):
     at = np.geomspace(low, high, 4)
     over, nearest = np.array([1.2, 0.5, 1.1, 1.5]), ["peak_torque", "peak_torque", "gain_margin", "peak_torque"]
-    figure = study_plots.profiles({"sign_width": study_plots.Profile("-", at, at, over, nearest, 1e-3)}, "goal")
+    figure = study_plots.profiles({"sign_width": study_plots.Profile("-", at, at, over, nearest, 1e-3)}, "objective")
     (axes,) = figure.axes
     drawn = {line.get_label(): np.asarray(line.get_xdata()).tolist() for line in axes.lines}
     assert drawn["limits kept"] == [at[1]]
@@ -94,7 +94,7 @@ def test_a_profile_with_few_values_shows_the_whole_interval_of_its_gain(known):
     one = study_plots.Profile("-", at, goal, np.full(4, 1e9), ["peak_torque"] * 4, 0.1)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        figure = study_plots.profiles({"k1": one}, "goal")
+        figure = study_plots.profiles({"k1": one}, "objective")
         figure.draw_without_rendering()
     low, high = figure.axes[0].get_xlim()
     assert low < 1e-3

@@ -27,7 +27,7 @@ def chain(tmp_path_factory):
 def parts(name, **loop):
     """The parts of a scenario in FLIGHTS, with changes of its loop table."""
     tables = {**FLIGHTS[name], "loop": {**FLIGHTS[name]["loop"], **loop}}
-    return scenario.study(folder.flown(scenario.reading.complete(scenario.from_tables(tables)))).parts
+    return scenario.study(folder.on_flight_clock(scenario.reading.complete(scenario.from_tables(tables)))).parts
 
 
 @needs_compiler

@@ -72,14 +72,14 @@ FLOWN = {
 
 def off(known, library):
     """Largest difference of the commands of C and of the library, relative to the largest command, in two trials."""
-    ready = scenario.study(folder.flown(known))
+    ready = scenario.study(folder.on_flight_clock(known))
     computer, trials = board(ready.parts), jnp.arange(2, dtype=jnp.uint32)
     parts = replace(ready.parts, substeps=10)  # equal for all gains, to share one compiled program
-    flown = vectors.fly_many(parts, vectors.known_alike(ready.dispersion), jnp.uint32(0), trials)
-    flown = jax.tree.map(np.asarray, flown)
+    simulated = vectors.simulate_many(parts, vectors.known_alike(ready.dispersion), jnp.uint32(0), trials)
+    simulated = jax.tree.map(np.asarray, simulated)
     at, worst = library.columns["out"].index("command[0]"), 0.0
     for k in range(len(trials)):
-        samples = vectors.one(flown, k)
+        samples = vectors.one(simulated, k)
         assert vectors.usable(samples)
         given, out, _ = vectors.rows(computer, samples)
         state, commands = vectors.first_state(computer, samples), slice(at, at + samples.command.shape[1])

@@ -125,8 +125,8 @@ class Named(ptsmc.AccelerationLaw):
 def with_custom_law(law):
     """A short scenario with a custom law and a moving reference."""
     moving = {"kind": "spin", "rate": [0.01, 0.02, -0.01]}
-    flown = {**FLIGHTS["raw"], "reference": moving, "controller": {"kind": "custom", "code": law, "t_f": 5.0}}
-    return scenario.reading.complete(scenario.from_tables(flown))
+    simulated = {**FLIGHTS["raw"], "reference": moving, "controller": {"kind": "custom", "code": law, "t_f": 5.0}}
+    return scenario.reading.complete(scenario.from_tables(simulated))
 
 
 @needs_make
@@ -208,8 +208,8 @@ class Lost(ptsmc.AccelerationLaw):
     ],
 )
 def test_export_raises_an_error_for_unsupported_or_diverging_laws(tmp_path, law, said):
-    flown = {**FLIGHTS["chain"], "controller": {"kind": "custom", "code": law, "t_f": 5.0}}
-    made = scenario.reading.complete(scenario.from_tables(flown))
+    simulated = {**FLIGHTS["chain"], "controller": {"kind": "custom", "code": law, "t_f": 5.0}}
+    made = scenario.reading.complete(scenario.from_tables(simulated))
     with pytest.raises(ScenarioError, match=said):
         folder.export(made, tmp_path / "controller", name="law", trials=1)
 
@@ -315,8 +315,8 @@ def test_command_filter_advances_by_one_period_after_missed_samples():
              "before.command_filter": np.zeros(3), "now.attitude": parts.initial.q, "now.rate": np.zeros(3),
              "before.clearance_unit": 1.0, "last.command": np.ones(3), "last.s": np.zeros(3)}  # fmt: skip
 
-    def commanded(flown, gap):
-        made = board(flown)
+    def commanded(simulated, gap):
+        made = board(simulated)
         (stage,) = (one for one in made.stages if one.name == "command")
         read = {name: jax.tree.map(jnp.asarray, (known | {"dt": gap})[name]) for name in stage.reads}
         return np.asarray(stage.run(made.parameters, read)["out.command"])

@@ -55,10 +55,10 @@ def exported(tmp_path_factory):
 @pytest.mark.parametrize("name", short(list(FLIGHTS), ["wheels"]))
 def test_compiled_controller_in_the_loop_equals_the_simulation(name, exported):
     made, library = exported(name)
-    ours = runs.fly(made.ready, 3, 2)
+    ours = runs.simulate(made.ready, 3, 2)
     parts = made.ready.parts
     longer = replace(parts, clock=replace(parts.clock, count=parts.clock.count + 3))  # adds periods of length 0
-    theirs = runs.fly(replace(made.ready, parts=longer), 3, 2, InTheLoop(library, parts).software)
+    theirs = runs.simulate(replace(made.ready, parts=longer), 3, 2, InTheLoop(library, parts).software)
     assert sum(theirs.samples.values()) == theirs.samples["ok"] + theirs.samples["saturated"] == len(ours.log.t) - 1
     assert ours.samples == {}
     for column, value in ours.columns().items():
@@ -87,7 +87,7 @@ def given(made):
     return np.stack([columns.get(name, none) for name in names_of(made.board)["in"]], axis=1)
 
 
-def flown(library, samples):
+def simulated(library, samples):
     """Statuses and outputs of a sequence of samples."""
     state, statuses, outputs = library.first(), [], []
     for row in samples:
@@ -124,14 +124,14 @@ def changed(library, samples, at, **values):
 )
 def test_invalid_input_gives_a_status_and_the_last_output_and_leaves_the_state_unchanged(filtered, bad):
     library, samples = filtered
-    assert not flown(library, samples)[0].any()
-    statuses, outputs = flown(library, changed(library, samples, 10, **bad))
+    assert not simulated(library, samples)[0].any()
+    statuses, outputs = simulated(library, changed(library, samples, 10, **bad))
     assert statuses[10] == INPUT
     np.testing.assert_array_equal(outputs[10], outputs[9])
     assert statuses[11] == MISSED
     assert not np.delete(statuses, (10, 11)).any()
     # the effect is the same as that of a missed sample
-    np.testing.assert_array_equal(outputs[11:], flown(library, np.delete(samples, 10, axis=0))[1][10:])
+    np.testing.assert_array_equal(outputs[11:], simulated(library, np.delete(samples, 10, axis=0))[1][10:])
 
 
 @needs_compiler
@@ -144,7 +144,7 @@ def test_the_sign_of_a_measured_quaternion_has_no_effect(name, exported):
     signs = np.random.default_rng(0).choice([-1.0, 1.0], size=len(samples))
     signs[0] = -1.0
     turned[:, columns] *= signs[:, None]
-    (statuses, outputs), (again, others) = flown(library, samples), flown(library, turned)
+    (statuses, outputs), (again, others) = simulated(library, samples), simulated(library, turned)
     assert not statuses.any()
     assert not again.any()
     np.testing.assert_array_equal(others, outputs)
@@ -154,7 +154,7 @@ def test_the_sign_of_a_measured_quaternion_has_no_effect(name, exported):
 @needs_compiler
 def test_a_sample_without_star_tracker_attitude_is_not_a_missed_sample(filtered):
     library, samples = filtered
-    statuses, outputs = flown(library, changed(library, samples, 10, attitude_valid=0.0, attitude=np.nan))
+    statuses, outputs = simulated(library, changed(library, samples, 10, attitude_valid=0.0, attitude=np.nan))
     assert not statuses.any()
     assert np.all(np.isfinite(outputs))
 
@@ -189,7 +189,7 @@ def test_an_invalid_attitude_is_not_used_in_computations(name, exported, tmp_pat
     for at, said in ((10, 0.0), (15, np.nan), (20, 1e300)):
         samples[at, of_star] = said
         samples[at, names.index("attitude_valid")] = 0.0
-    statuses, _ = flown(library, samples)
+    statuses, _ = simulated(library, samples)
     assert library._made.raised() == 0
     assert not statuses.any()
 
@@ -205,11 +205,11 @@ def test_the_age_of_an_attitude_is_clipped_to_the_period_and_must_not_be_nan(exp
     turned = other.copy()
     half = 0.25 + 0.01 * (samples[:, 0] - 0.04)
     turned[1:, 1], turned[1:, 4] = np.sin(half[1:]), np.cos(half[1:])
-    np.testing.assert_allclose(flown(library, turned)[1][-1], flown(library, samples)[1][-1], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(simulated(library, turned)[1][-1], simulated(library, samples)[1][-1], rtol=0, atol=1e-9)
     for age, there, wanted in ((np.nan, 0.0, OK), (np.nan, 1.0, INPUT), (-1.0, 1.0, OK), (1e9, 1.0, OK)):
         other = samples.copy()
         other[10, at], other[10, valid] = age, there
-        statuses, outputs = flown(library, other)
+        statuses, outputs = simulated(library, other)
         assert statuses[10] == wanted, age
         assert np.all(np.isfinite(outputs))
 
@@ -221,17 +221,17 @@ def test_invalid_wheel_telemetry_is_invalid_input(exported):
     for bad in (np.nan, np.inf, 1e9):
         other = samples.copy()
         other[10, at] = bad
-        statuses, outputs = flown(library, other)
+        statuses, outputs = simulated(library, other)
         assert (statuses[10], statuses[11]) == (INPUT, MISSED)
         assert set(np.delete(statuses, (10, 11))) <= {OK, SATURATED}
         assert np.all(np.isfinite(outputs))
-        np.testing.assert_array_equal(outputs[11:], flown(library, np.delete(samples, 10, axis=0))[1][10:])
+        np.testing.assert_array_equal(outputs[11:], simulated(library, np.delete(samples, 10, axis=0))[1][10:])
 
 
 @needs_compiler
 def test_a_missed_sample_gives_a_status_and_does_not_update_the_observer(filtered):
     library, samples = filtered
-    statuses, outputs = flown(library, np.delete(samples, slice(10, 15), axis=0))
+    statuses, outputs = simulated(library, np.delete(samples, slice(10, 15), axis=0))
     assert statuses[10] == MISSED
     assert not np.delete(statuses, 10).any()
     assert np.all(np.isfinite(outputs))
@@ -249,7 +249,7 @@ def test_a_singular_attitude_gives_the_last_valid_command(exported):
     samples[:, 0] = 0.1 * np.arange(len(angles))
     samples[:, names.index("attitude[0]")] = np.sin(angles / 2.0)
     samples[:, names.index("attitude[3]")] = np.cos(angles / 2.0)
-    statuses, outputs = flown(library, samples)
+    statuses, outputs = simulated(library, samples)
     assert statuses.tolist() == [OK] * 10 + [SINGULAR] + [OK] * 10  # singular if half the angle is near 90 deg
     at = names_of(made.board)["out"].index("command[0]")
     np.testing.assert_array_equal(outputs[10, at : at + 3], outputs[9, at : at + 3])
@@ -263,7 +263,7 @@ def test_an_unknown_status_is_counted_as_other(exported, tmp_path):
     last = "    return status;\n"
     assert code.read_text().count(last) == 1
     code.write_text(code.read_text().replace(last, "    return in->t > 2.0 ? 7 : in->t > 1.0 ? -1 : status;\n"))
-    run = runs.fly(made.ready, 3, 2, InTheLoop(Library(code.parent), made.ready.parts).software)
+    run = runs.simulate(made.ready, 3, 2, InTheLoop(Library(code.parent), made.ready.parts).software)
     late = int(np.sum(run.log.t[:-1] > 1.0))
     assert (*map(str.lower, STATUS), "other") == computer.SAMPLES
     assert run.samples == {**dict.fromkeys(run.samples, 0), "ok": len(run.log.t) - 1 - late, "other": late}
@@ -300,7 +300,7 @@ def test_trials_with_a_compiled_controller_equal_single_simulations(exported, mo
         rows = ptsmc.trials(study, 3, seed=5, controller=library.folder)
     assert rows["status"].to_list() == ["ok"] * 3
     for trial in range(3):
-        run = runs.fly(made.ready, 5, trial)
+        run = runs.simulate(made.ready, 5, trial)
         assert rows["controller_ok"][trial] == len(run.log.t) - 1
         shares += [rows[name][trial] / run.metrics[name] - 1.0 for name in ("window_error", "peak_torque", "effort")]
     assert np.max(np.abs(shares)) < 1e-9
@@ -325,7 +325,7 @@ def test_trials_with_a_compiled_controller_equal_single_simulations(exported, mo
 def test_a_controller_with_other_parts_and_the_same_inputs_raises_an_error(exported, flight, said):
     """Otherwise the simulation would silently use another law, observer or reference."""
     _, library = exported("raw")
-    parts = scenario.study(folder.flown(scenario.from_tables(FLIGHTS[flight]))).parts
+    parts = scenario.study(folder.on_flight_clock(scenario.from_tables(FLIGHTS[flight]))).parts
     with pytest.raises(ptsmc.ScenarioError, match=re.escape(said)):
         InTheLoop(library, parts)
 
@@ -388,16 +388,16 @@ def test_parameters_that_a_trial_changes_are_passed_to_c(name, exported):
     drawn = {"reference": {"kind": "normal", "std_deg": 20.0}}
     if name != "filter":
         drawn["torque_limit"] = {"kind": "relative_normal", "std": 0.2}
-    ready = scenario.study(folder.flown(scenario.from_tables({**FLIGHTS[name], "dispersion": drawn})))
+    ready = scenario.study(folder.on_flight_clock(scenario.from_tables({**FLIGHTS[name], "dispersion": drawn})))
     ready = replace(ready, dispersion=replace(ready.dispersion, custom=Measured()))
-    ours = runs.fly(ready, 3, 2)
+    ours = runs.simulate(ready, 3, 2)
     software = InTheLoop(library, ready.parts, ready.dispersion).software
-    theirs = runs.fly(ready, 3, 2, software)
+    theirs = runs.simulate(ready, 3, 2, software)
     assert theirs.samples["saturated"] > 0 or name == "filter"
     for metric in ("window_error", "peak_torque", "peak_torque_delivered"):
         np.testing.assert_allclose(theirs.metrics[metric], ours.metrics[metric], rtol=1e-9, err_msg=metric)
     if name != "filter":  # the nominal torque limit is used in the nominal run
-        nominal = runs.fly(made.ready, 0, 0, software)
+        nominal = runs.simulate(made.ready, 0, 0, software)
         assert nominal.samples["saturated"] > 0
         assert np.max(np.abs(nominal.log.u)) <= 3.0
 
@@ -437,7 +437,7 @@ def test_single_precision_gives_the_same_metrics(exported, name):
     """The metrics of one run agree to 1e-3. See `benchmarks/exported_c.py` for statistics of many trials."""
     made, library = exported(name, "float")
     single = InTheLoop(library, made.ready.parts).software
-    ours, theirs = runs.fly(made.ready, 3, 2), runs.fly(made.ready, 3, 2, single)
+    ours, theirs = runs.simulate(made.ready, 3, 2), runs.simulate(made.ready, 3, 2, single)
     for name in ("peak_torque", "window_error", "effort"):
         np.testing.assert_allclose(theirs.metrics[name], ours.metrics[name], rtol=1e-3, err_msg=name)
 

@@ -49,7 +49,7 @@ def suite(tmp_path_factory):
     """The compiled controller, and inputs, outputs and states of a simulated trial, with the initial state first."""
     place = tmp_path_factory.mktemp("suite") / "controller"
     made = program(TABLES, place)
-    samples = folder.fly(made, 3, 1)[0]
+    samples = folder.simulate(made, 3, 1)[0]
     given, out, states = vectors.rows(made.board, samples)
     return Library(place), given, out, np.vstack([vectors.first_state(made.board, samples), states])
 

@@ -23,10 +23,10 @@ def tune(search: dict[str, Any] | None = None, trust: dict[str, Any] | None = No
         "confirmed": [], "hardest": None, "worst_case": False, "averaged": 256, "rollouts": 1, "gradients": 1,
         "seconds": 1.0, "seconds_by_step": {},
     }  # fmt: skip
-    known = {"influence": {}, "margins": None, "slopes_off_central_differences": {"start": 1e-9, "end": 1e-9}}
+    known = {"influence": {}, "margins": None, "gradient_error": {"start": 1e-9, "end": 1e-9}}
     summary = {
         "status": "met", "plant": "spacecraft", "gain_units": {}, "gains": {}, "at_bound": {},
-        "accuracy_gain_over_paper": None, "accuracy_gain_interval": None, "training": group(), "fresh": group(),
+        "accuracy_gain_over_paper": None, "accuracy_gain_interval": None, "training": group(), "held_out": group(),
         "paper_refused": None, "published_label": "published", "shortest_t_f": None, "broken_by": {}, "verdicts": [],
         "judged_on": "flight clock", "cautions": [], "differential_evolution": None,
     }  # fmt: skip
@@ -48,7 +48,7 @@ def law(**changes: Any) -> dict[str, Any]:
     numbers = ("window_error", "window_error_interval", "floor", "peak_torque", "largest_peak_torque", "effort",
                "chattering", "settling_time", "settling_near_far", "margins")  # fmt: skip
     return {**dict.fromkeys(numbers), "gains": {}, "at_bound": {}, "met": True, "counts": {"ok": 8}, "unsettled": 0,
-            "untold": {}, "verdicts": [], **changes}  # fmt: skip
+            "model_errors": {}, "verdicts": [], **changes}  # fmt: skip
 
 
 def compare(laws: dict[str, Any], **changes: Any) -> summaries.Compare:
@@ -61,7 +61,7 @@ def compare(laws: dict[str, Any], **changes: Any) -> summaries.Compare:
 
 def campaign(**changes: Any) -> summaries.Campaign:
     """Return the summary of a campaign."""
-    summary = {"status": "met", "plant": "spacecraft", "seed": 1, "run_table": None, "trials": 8, "flown": 8,
+    summary = {"status": "met", "plant": "spacecraft", "seed": 1, "run_table": None, "trials": 8, "simulated": 8,
                "unjudged": [], "counts": {"ok": 8}, "reasons": [], "floor": None, "verdicts": [], "quantiles": {},
                "drivers": {}, "driver_trials": {}, "cautions": []}  # fmt: skip
     return summaries.read(summaries.Campaign, {**summary, **changes})

@@ -89,7 +89,7 @@ def test_chance_is_no_driver():
 
     def driven(drivers):
         found = {"drivers": {"window_error": drivers}, "driver_trials": {"window_error": 300}}
-        return list(campaign_report.drivers(examples.campaign(flown=10_000, trials=10_000, **found)))
+        return list(campaign_report.drivers(examples.campaign(simulated=10_000, trials=10_000, **found)))
 
     assert driven(drivers) == []
     (line,) = driven(statistics.drivers({"y": metric + rng.normal(size=300)}, metric))
@@ -103,7 +103,7 @@ def test_command_that_replays_the_worst_trial_can_be_pasted_into_a_shell():
 
 
 def test_best_pair_of_a_map_has_the_fewest_failed_trials():
-    pair = {"status": "flown", "failures": 0.0, "not_converged": 0.0, "window_error": 2e-6, "peak_torque": 0.3}
+    pair = {"status": "simulated", "failures": 0.0, "not_converged": 0.0, "window_error": 2e-6, "peak_torque": 0.3}
     pairs = [
         {**pair, "x": 1.0, "y": 1.0, "failures": 3.0, "window_error": 1e-6},
         {**pair, "x": 1.0, "y": 2.0},

@@ -44,30 +44,30 @@ def kept(tmp_path_factory):
 
 
 @pytest.fixture
-def flown(command, kept, tmp_path):
+def simulated(command, kept, tmp_path):
     """Results of one run, flown once: a copy."""
     if not kept.exists():
         assert command("simulate", "s.toml", "--trial", 3, "--seed", 5, "--out", kept, "--quiet")[0] in (0, 1)
     return shutil.copytree(kept, tmp_path / "run")
 
 
-def test_a_run_becomes_a_page(command, flown):
-    before = tree(flown)
+def test_a_run_becomes_a_page(command, simulated):
+    before = tree(simulated)
     code, said, error = command("report", "run")
     assert (code, said.strip(), error) == (0, f"page in {os.path.join('run', 'report.html')}", "")
-    after = tree(flown)
+    after = tree(simulated)
     assert {name: content for name, content in after.items() if name != "report.html"} == before
-    read = checked(flown)
-    assert after["report.html"].decode() == page.build(flown)
+    read = checked(simulated)
+    assert after["report.html"].decode() == page.build(simulated)
     assert store.MADE_OF_RESULTS["report.html"] in after["report.html"][:1024]
-    summary = json.loads((flown / "summary.json").read_text())
+    summary = json.loads((simulated / "summary.json").read_text())
     for name in ("window_error", "peak_torque", "hold_error"):
         assert f"{summary[name]:.5g}" in read.text
     assert summary["settling_time"] is None
     assert "settling_time never s" in read.text
     assert "ptsmc simulate s.toml --trial 3 --seed 5" in read.text
-    assert (flown / "scenario.toml").read_text().split("\n")[0] in read.text
-    rows = np.genfromtxt(flown / "trajectory.csv", delimiter=",", names=True)
+    assert (simulated / "scenario.toml").read_text().split("\n")[0] in read.text
+    rows = np.genfromtxt(simulated / "trajectory.csv", delimiter=",", names=True)
     history = {line["name"]: line for line in read.charts["history"]["data"]}
     assert set(history) == set(rows.dtype.names or ()) - {"t"}
     marked = {note["text"]: note["x"] for note in read.charts["history"]["layout"]["annotations"]}
@@ -79,9 +79,9 @@ def test_a_run_becomes_a_page(command, flown):
     assert command("report", "run", "--quiet") == (0, "", "")  # again, in place
 
 
-def test_the_body_turns_as_it_flew(flown):
-    made = checked(flown).charts["attitude"]
-    rows = np.genfromtxt(flown / "trajectory.csv", delimiter=",", names=True)
+def test_the_body_turns_as_it_flew(simulated):
+    made = checked(simulated).charts["attitude"]
+    rows = np.genfromtxt(simulated / "trajectory.csv", delimiter=",", names=True)
     times = np.array([float(frame["name"]) for frame in made["frames"]])
     assert times[0] == 0.0
     assert times[-1] == pytest.approx(rows["t"][-1])
@@ -99,12 +99,12 @@ def test_the_body_turns_as_it_flew(flown):
     ("not_converged", "bad", "the run failed: not converged"),
     ("diverged", "bad", "the run failed: diverged"),
 ])  # fmt: skip
-def test_the_verdict_comes_first(flown, status, mood, said):
-    summary = json.loads((flown / "summary.json").read_text())
+def test_the_verdict_comes_first(simulated, status, mood, said):
+    summary = json.loads((simulated / "summary.json").read_text())
     verdict = {**summary["verdicts"]["peak_torque"], "limit": 30.0, "margin": 0.5, "met": True}
     summary.update(status=status, reason="", verdicts={"peak_torque": verdict})
-    (flown / "summary.json").write_text(json.dumps(summary))
-    read = checked(flown)
+    (simulated / "summary.json").write_text(json.dumps(summary))
+    read = checked(simulated)
     (header,) = [attrs for tag, attrs in read.found if tag == "header"]
     assert header["class"] == mood
     assert read.text.index(said) < read.text.index("Requirements")
@@ -112,8 +112,8 @@ def test_the_verdict_comes_first(flown, status, mood, said):
     assert bar == 150.0  # of a limit at 300
     assert "50 % of the limit" in read.text
     summary["verdicts"]["peak_torque"] |= {"limit": 0.01, "margin": None, "met": False}
-    (flown / "summary.json").write_text(json.dumps(summary))
-    assert [attrs["class"] for tag, attrs in checked(flown).found if tag == "header"] == ["bad"]
+    (simulated / "summary.json").write_text(json.dumps(summary))
+    assert [attrs["class"] for tag, attrs in checked(simulated).found if tag == "header"] == ["bad"]
 
 
 @pytest.mark.parametrize(("status", "asked", "mood"), [
@@ -125,10 +125,10 @@ def test_what_failed_looks_bad_whether_or_not_anything_was_asked(status, asked, 
     assert report.headline(status, verdicts if asked else [])[1] == mood
 
 
-def hostile_folder(flown):
+def hostile_folder(simulated):
     """The same result as a user could have named everything in it."""
-    folder = flown.with_name(re.sub("/", "", HOSTILE))
-    flown.rename(folder)
+    folder = simulated.with_name(re.sub("/", "", HOSTILE))
+    simulated.rename(folder)
     summary = json.loads((folder / "summary.json").read_text())
     (folder / "summary.json").write_text(json.dumps({**summary, "status": "diverged", "reason": HOSTILE}))
     versions = json.loads((folder / "versions.json").read_text())
@@ -141,50 +141,50 @@ def hostile_folder(flown):
     return folder
 
 
-def test_what_a_user_typed_is_text(flown):
-    plain = [tag for tag, _ in checked(flown).found]
-    folder = hostile_folder(flown)
+def test_what_a_user_typed_is_text(simulated):
+    plain = [tag for tag, _ in checked(simulated).found]
+    folder = hostile_folder(simulated)
     read = checked(folder)  # which knows every element and attribute that may be there
     assert [tag for tag in plain if tag in ("script", "img")] == [t for t, _ in read.found if t in ("script", "img")]
     assert read.text.count("onerror=document.title=1") >= 4
     assert HOSTILE in [line["name"] for line in read.charts["history"]["data"]]
 
 
-def test_links_out_of_the_folder_and_other_files_than_pictures_are_not_embedded(command, flown, tmp_path):
+def test_links_out_of_the_folder_and_other_files_than_pictures_are_not_embedded(command, simulated, tmp_path):
     """A page is made to be sent, and a folder may come from anybody."""
     picture = page.PNG + b"secret"
     (tmp_path / "elsewhere.png").write_bytes(picture)
-    (flown / "figures" / "outside.png").symlink_to(tmp_path / "elsewhere.png")
-    (flown / "figures" / "gone.png").symlink_to(tmp_path / "not-there.png")
-    (flown / "figures" / "loop.png").symlink_to("loop.png")
-    (flown / "figures" / "key.png").write_text("secret")
-    (flown / "inside.png").write_bytes(page.PNG + b"inside")
-    (flown / "figures" / "linked.png").symlink_to("../inside.png")
+    (simulated / "figures" / "outside.png").symlink_to(tmp_path / "elsewhere.png")
+    (simulated / "figures" / "gone.png").symlink_to(tmp_path / "not-there.png")
+    (simulated / "figures" / "loop.png").symlink_to("loop.png")
+    (simulated / "figures" / "key.png").write_text("secret")
+    (simulated / "inside.png").write_bytes(page.PNG + b"inside")
+    (simulated / "figures" / "linked.png").symlink_to("../inside.png")
     code, _, error = command("report", "run")
     assert code == 0
     omitted = [f"run/figures/{name}.png" for name in ("gone", "key", "loop", "outside")]
     assert [line.split()[1] for line in error.splitlines()] == omitted
-    read = (flown / "report.html").read_text()
+    read = (simulated / "report.html").read_text()
     embedded = [base64.b64decode(data) for data in re.findall(r"data:image/png;base64,([^\"]*)", read)]
     assert page.PNG + b"inside" in embedded
     assert not any(b"secret" in content for content in embedded)
 
 
 @pytest.mark.parametrize("name", ["scenario.toml", "versions.json", "summary.json", "trajectory.csv"])
-def test_a_result_file_that_is_a_link_out_of_the_folder_is_refused(command, flown, tmp_path, name):
-    (flown / name).rename(tmp_path / name)
-    (flown / name).symlink_to(tmp_path / name)
+def test_a_result_file_that_is_a_link_out_of_the_folder_is_refused(command, simulated, tmp_path, name):
+    (simulated / name).rename(tmp_path / name)
+    (simulated / name).symlink_to(tmp_path / name)
     code, out, error = command("report", "run")
     assert (code, out, error.count("\n")) == (2, "", 1)
     assert error.startswith(f"ptsmc: run/{name} is a link out of the folder")
-    assert not (flown / "report.html").exists()
+    assert not (simulated / "report.html").exists()
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
 @pytest.mark.parametrize("hostile", short([False, True], [True]))
-def test_chromium_draws_it_without_an_error_or_a_request(flown, tmp_path, hostile):
+def test_chromium_draws_it_without_an_error_or_a_request(simulated, tmp_path, hostile):
     """The policy forbids every request and foreign script; one that was tried would be on the console."""
-    folder = hostile_folder(flown) if hostile else flown
+    folder = hostile_folder(simulated) if hostile else simulated
     place = tmp_path / "page.html"
     place.write_text(page.build(folder))
     drawn, console = in_chromium(place, tmp_path, "--dump-dom")
@@ -203,7 +203,7 @@ def test_chromium_draws_it_without_an_error_or_a_request(flown, tmp_path, hostil
     assert not any("hare" in title for title in re.findall(r'data-title="([^"]*)"', body))  # nothing is uploaded
 
 
-def test_what_is_no_result_is_refused(command, flown, tmp_path):
+def test_what_is_no_result_is_refused(command, simulated, tmp_path):
     (tmp_path / "empty").mkdir()
     for folder, said in (
         ("none", "none is no folder"),
@@ -214,7 +214,7 @@ def test_what_is_no_result_is_refused(command, flown, tmp_path):
         assert (code, out) == (2, "")
         assert error.startswith(f"ptsmc: {said}; allowed is ")
         assert error.count("\n") == 1
-    kept = tree(flown)
+    kept = tree(simulated)
     for name, content, said in (
         ("summary.json", None, "run holds a simulate that is not finished; run the same command to its end"),
         ("summary.json", "{", "run holds a file that cannot be read: "),
@@ -230,18 +230,18 @@ def test_what_is_no_result_is_refused(command, flown, tmp_path):
         ("trajectory.csv", "t,x1\n0.0,1.0\n0.1,1.0e-", "run holds a file that cannot be read: "),
     ):
         if content is None:
-            (flown / name).unlink()
+            (simulated / name).unlink()
         else:
-            (flown / name).write_text(content)
+            (simulated / name).write_text(content)
         code, out, error = command("report", "run")
         assert (code, out) == (2, ""), name
         assert error.startswith(f"ptsmc: {said}"), error
-        assert "report.html" not in tree(flown)
+        assert "report.html" not in tree(simulated)
         for path, old in kept.items():
-            (flown / path).write_bytes(old)
+            (simulated / path).write_bytes(old)
 
 
-def test_without_plotly_it_says_how_to_install_it(command, flown, monkeypatch):
+def test_without_plotly_it_says_how_to_install_it(command, simulated, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "plotly.offline", None)
     code, _, error = command("report", "run")
     assert code == 2

@@ -22,8 +22,8 @@ def broken(times, searched=0.97):
 
 
 def test_headline_states_the_pointing_error_first_and_then_the_requirements():
-    fresh = examples.group(window_error=errors(1e-6, (9e-7, 1.2e-6)), floor=5e-7)
-    report = tune_report.of(examples.tune(fresh=fresh, verdicts=[examples.torque(0.9)]))
+    held_out = examples.group(window_error=errors(1e-6, (9e-7, 1.2e-6)), floor=5e-7)
+    report = tune_report.of(examples.tune(held_out=held_out, verdicts=[examples.torque(0.9)]))
     assert report.headline == "RMS pointing error 0.413 arcsec: every requirement is met"
     assert report.mood == "good"
     assert report.lines[0] == (
@@ -31,7 +31,7 @@ def test_headline_states_the_pointing_error_first_and_then_the_requirements():
         "arcsec"
     )
     assert [section.title for section in report.sections] == ["Requirements", "Gains", "Can the result be trusted?"]
-    chain = tune_report.of(examples.tune(fresh=fresh, plant="chain", status="not met"))
+    chain = tune_report.of(examples.tune(held_out=held_out, plant="chain", status="not met"))
     assert (chain.headline, chain.mood) == ("RMS error 1e-06 x1: NOT every trial reached its end", "bad")
 
 
@@ -82,7 +82,7 @@ def test_margins_are_relative_to_their_limits():
     """4.8 dB of 6 dB are 0.8 times the limit, although `violation_ratio` is 1.2."""
     margin = {"metric": "gain_margin", "limit": 6.0, "unit": "dB", "worst": 4.8, "margin": 1.2, "failures": 1,
               "trials": 1, "met": False, "at_least": True}  # fmt: skip
-    earlier = {"margins": {"gain_margin": 0.03}, "over": {"gain_margin": 1.1}, "fresh_seed": 7}
+    earlier = {"margins": {"gain_margin": 0.03}, "over": {"gain_margin": 1.1}, "held_out_seed": 7}
     found = {"largest_over_limit": {"gain_margin": 1.2}, "earlier": [earlier], "margins": {"gain_margin": 0.05}}
     _, compromise, before, *_ = tune_report.search(examples.tune(found, verdicts=[margin]))
     assert compromise == "best compromise: gain_margin reaches 0.8 times its limit of 6 dB on the training trials"
@@ -93,7 +93,7 @@ def test_confidence_pays_for_every_look_at_held_out_trials():
     """Three looks at 95 % were reported as 95 %; gains that just miss a quantile pass one of them with 14 %."""
     asked = Requirement("peak_torque", 0.5, quantile=0.9, confidence=0.95)
     verdict = asked.verdict(np.zeros(1000), np.ones(1000, bool)).in_summary()
-    earlier = {"margins": {"peak_torque": 0.03}, "over": {"peak_torque": 1.1}, "fresh_seed": 7}
+    earlier = {"margins": {"peak_torque": 0.03}, "over": {"peak_torque": 1.1}, "held_out_seed": 7}
 
     def confidences(looks):
         found = {"earlier": (looks - 1) * [earlier], "margins": {"peak_torque": 0.05}}
@@ -117,14 +117,14 @@ def test_confidence_pays_for_every_look_at_held_out_trials():
 )
 def test_table_shows_an_observer_that_is_tuned_by_axis(tuned, shown):
     paper = examples.group(gains={"observer_gain": 10.0})
-    table = tune_report.gains(examples.tune(plant="chain", paper=paper, fresh=examples.group(gains=tuned)))
+    table = tune_report.gains(examples.tune(plant="chain", paper=paper, held_out=examples.group(gains=tuned)))
     assert {row[0] for row in table.rows if row[0].startswith("observer_gain")} == shown
 
 
 def test_table_has_errors_as_angles_and_their_ratio_to_the_lower_bound():
-    fresh = examples.group(window_error=errors(1e-6, largest=2e-6), floor=5e-7, peak_torque=errors(0.25))
+    held_out = examples.group(window_error=errors(1e-6, largest=2e-6), floor=5e-7, peak_torque=errors(0.25))
     paper = examples.group(window_error=errors(1e-4), floor=5e-7, counts={"ok": 60, "not_converged": 4})
-    rows = {row[0]: row[1:] for row in tune_report.gains(examples.tune(fresh=fresh, paper=paper)).rows}
+    rows = {row[0]: row[1:] for row in tune_report.gains(examples.tune(held_out=held_out, paper=paper)).rows}
     assert rows["RMS pointing error"] == ("41.3 arcsec", "0.413 arcsec", "")
     assert rows["ratio to the lower bound"] == ("200", "2", "")
     assert rows["largest pointing error"] == ("41.3 arcsec", "0.825 arcsec", "")
@@ -153,7 +153,7 @@ def test_less_accurate_gains_are_compared_by_their_larger_error():
 
 def test_gains_whose_trials_all_fail_are_not_compared():
     lost = examples.group(counts={"ok": 0, "not_converged": 60, "diverged": 4})
-    (line,) = beside(0.08, fresh=lost)
+    (line,) = beside(0.08, held_out=lost)
     assert line == "64 of 64 held-out trials fail with the tuned gains: 60 not converged, 4 diverged"
 
 
@@ -248,10 +248,10 @@ def test_column_of_the_published_gains_is_named_after_their_source():
 @pytest.mark.parametrize("kind", ["chain", "spacecraft"])
 def test_the_papers_law_replaces_another_on_every_plant(kind):
     order = {"order": 2} if kind == "chain" else {}
-    flown = scenario.from_tables(
+    simulated = scenario.from_tables(
         {"plant": {"kind": kind, **order}, "loop": {"mode": "sampled"}, "controller": {"kind": "pd", "t_f": 12.0}}
     )
-    published_scenario = gains.published_scenario(flown)
+    published_scenario = gains.published_scenario(simulated)
     assert (
         published_scenario.controller.kind,
         published_scenario.controller.t_f,
@@ -263,8 +263,8 @@ def test_the_papers_law_replaces_another_on_every_plant(kind):
 @pytest.mark.parametrize(("most", "count"), [(0.0633, 1), (0.0, 0)])
 def test_saturated_actuators_are_reported(most, count):
     """A peak torque of twice the actuators' limit was in the table without a word."""
-    fresh = examples.group(saturated={"mean": 0.0059, "rms": 0.01, "max": most})
-    lines = list(tune_report.accuracy(examples.tune(fresh=fresh)))
+    held_out = examples.group(saturated={"mean": 0.0059, "rms": 0.01, "max": most})
+    lines = list(tune_report.accuracy(examples.tune(held_out=held_out)))
     assert len(lines) == count
     assert all(line.endswith("0.59 % of a trial on average, 6.33 % at most") for line in lines)
 
@@ -272,7 +272,7 @@ def test_saturated_actuators_are_reported(most, count):
 @pytest.mark.parametrize("gradients", [None, {"start": 1e-9, "end": 1e-9}])
 def test_margins_of_a_discontinuous_sign_are_reported_without_it(gradients):
     hold = {"stable": True, "gain_margin": 9.0, "phase_margin": 40.0, "delay_margin": 0.1, "peak_sensitivity": 3.0}
-    trust = {"margins": {"hold": hold}, "slopes_off_central_differences": gradients}
+    trust = {"margins": {"hold": hold}, "gradient_error": gradients}
     text = " ".join(tune_report.diagnostics(examples.tune(trust=trust)))
     assert "gain 9 dB" in text
     assert (NO_SIGN in text) == (gradients is None)
@@ -283,7 +283,7 @@ def test_margins_of_a_discontinuous_sign_are_reported_without_it(gradients):
     (3.0, 2.0, "gradients differ from finite differences by 3e+00 at the start and 2e+00 at the end"),
 ])  # fmt: skip
 def test_check_of_the_gradients(start, end, text):
-    trust = {"slopes_off_central_differences": {"start": start, "end": end}}
+    trust = {"gradient_error": {"start": start, "end": end}}
     (line,) = tune_report.diagnostics(examples.tune(trust=trust))
     assert line.startswith(text)
 
@@ -298,7 +298,7 @@ def test_gains_without_a_trial_that_ends_have_an_unknown_influence():
 @pytest.mark.parametrize(("least", "lines"), [(2.0, []), (2.36, ["tune with tune.trials = 64"])])
 def test_gains_that_fit_their_training_trials_too_closely_are_reported(least, lines):
     """By intervals without a common value: 1.73e-6 (1.49 to 2.01) in training, 2.42e-6 from 2.36 on elsewhere."""
-    at = {"training": (1.49, 2.01), "fresh": (least, 2.48)}
+    at = {"training": (1.49, 2.01), "held_out": (least, 2.48)}
     groups = {on: examples.group(window_error=errors(1.0, interval)) for on, interval in at.items()}
     told = list(tune_report.advice(examples.tune({"averaged": 16}, **groups)))
     assert [line.rpartition(": ")[2] for line in told] == lines

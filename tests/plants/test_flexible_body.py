@@ -65,14 +65,14 @@ def independent(t, y, torque):
 
 
 @pytest.fixture(scope="module")
-def flown():
+def simulated():
     """A sampled run of the satellite with steps of 0.025 rad of the fastest mode: their error is about 1e-11."""
     ready = scenario.study(scenario.from_tables(SATELLITE))
-    return runs.fly(replace(ready, parts=replace(ready.parts, substeps=FINE)))
+    return runs.simulate(replace(ready, parts=replace(ready.parts, substeps=FINE)))
 
 
-def test_a_run_matches_an_independent_integration(flown):
-    log, D = flown.log, np.array(COUPLING)
+def test_a_run_matches_an_independent_integration(simulated):
+    log, D = simulated.log, np.array(COUPLING)
     modes = log.x.modes
     y = np.concatenate([log.x.q[0], log.x.w[0], np.zeros(4), D @ log.x.w[0]])
     for k in range(len(log.t) - 1):
@@ -86,9 +86,9 @@ def test_a_run_matches_an_independent_integration(flown):
     assert np.abs(modes.e).max() > 1e-3  # the modes were excited
 
 
-def test_default_steps_keep_modes_accurate_to_a_millionth_for_given_torques(flown):
+def test_default_steps_keep_modes_accurate_to_a_millionth_for_given_torques(simulated):
     """The torques of the run are applied with the default steps. The test below includes the loop."""
-    made, log = scenario.study(scenario.from_tables(SATELLITE)).parts, flown.log
+    made, log = scenario.study(scenario.from_tables(SATELLITE)).parts, simulated.log
     actuators = made.actuators
     assert 1 < made.substeps < 20
 
@@ -107,13 +107,13 @@ def test_default_steps_keep_modes_accurate_to_a_millionth_for_given_torques(flow
     np.testing.assert_allclose(found.q, log.x.q[1:], rtol=0, atol=1e-7)
 
 
-def test_metrics_and_columns_of_the_modes(flown):
-    log, metrics = flown.log, flown.metrics
+def test_metrics_and_columns_of_the_modes(simulated):
+    log, metrics = simulated.log, simulated.metrics
     size = np.sqrt(np.sum(log.x.modes.e**2 + (log.x.modes.rate / FREQUENCY) ** 2, axis=1))
     np.testing.assert_allclose(metrics["peak_modal"], size.max(), rtol=1e-13)
     np.testing.assert_allclose(metrics["residual_modal"], size[log.t >= 12.0].max(), rtol=1e-13)
     assert metrics["residual_modal"] < metrics["peak_modal"]
-    columns = flown.columns()
+    columns = simulated.columns()
     assert list(columns)[-8:] == [*(f"e{k}" for k in range(1, 5)), *(f"e_dot{k}" for k in range(1, 5))]
     np.testing.assert_array_equal(columns["e_dot2"], log.x.modes.rate[:, 1])
     D = np.array(COUPLING)
@@ -183,7 +183,7 @@ def test_a_random_inertia_changes_the_rigid_rest_and_impossible_bodies_are_marke
     np.testing.assert_allclose(plant.with_rest_inverse().rest_inverse, plant.rest_inverse, rtol=1e-12)
     light = plant.with_inertia(*(vector(v) for v in (0.1 * INERTIA, np.linalg.inv(0.1 * INERTIA))))
     ready = scenario.study(scenario.from_tables(SATELLITE))
-    run = runs.fly(replace(ready, parts=replace(ready.parts, plant=light, substeps=FINE)))
+    run = runs.simulate(replace(ready, parts=replace(ready.parts, plant=light, substeps=FINE)))
     assert run.status == "diverged"
 
 

@@ -463,5 +463,5 @@ def test_steps_follow_the_run_with_the_shortest_t_f_of_a_search(monkeypatch):
         return visited(parts)
 
     monkeypatch.setattr(solutions, "visited", spied)
-    posing.pose(scenario.from_tables(tables), 0)
+    posing.tuning_problem(scenario.from_tables(tables), 0)
     assert looked_at == [(0.5, 10.5)]

@@ -64,7 +64,7 @@ def made(file, name) -> Any:
     return systems.item(f"{file}:{name}", systems.WHERE)
 
 
-def flown(tables, record=True):
+def simulated(tables, record=True):
     return rollout.simulate_parts(scenario.study(scenario.from_tables(tables)).parts, record=record)
 
 
@@ -77,7 +77,7 @@ def test_the_published_law_as_a_custom_law_gives_the_same_run(plant):
     error, rate = ({"error": "additive"}, 1.5) if plant == "spacecraft" else ({}, 0.75)  # k1 of (29) is half of (60)'s
     both = []
     for law in (MINE | error | {"k1": 1.5}, {"kind": "prescribed_time", "t_f": 5.0, "k1": rate}):
-        both.append(flown({**tables, "controller": {**law, "eta": 2.7, "delta": 0.5}}))
+        both.append(simulated({**tables, "controller": {**law, "eta": 2.7, "delta": 0.5}}))
     # equal to the last bit with the settings of `ptsmc`; here two programs may fuse differently, and gains amplify it
     for mine, builtin in zip(*map(jax.tree.leaves, both), strict=True):
         np.testing.assert_allclose(mine, builtin, rtol=1e-9, atol=1e-10)
@@ -91,7 +91,7 @@ def test_a_custom_part_can_be_registered_as_a_pytree_already(here):
         + OTHER.replace("class Wave(", "@pytree\n@dataclass(frozen=True)\nclass Wave(")
     )
     (here / "other.py").write_text(HEAD + OTHER)
-    one, other = (flown({**CHAIN, "disturbance": {"kind": "custom", "code": f"{file}.py:Wave"}}, record=False)
+    one, other = (simulated({**CHAIN, "disturbance": {"kind": "custom", "code": f"{file}.py:Wave"}}, record=False)
                   for file in ("said", "other"))  # fmt: skip
     assert one.metrics.effort == other.metrics.effort > 0.0
 
@@ -258,8 +258,8 @@ def test_only_declared_numbers_of_a_custom_disturbance_are_dispersed(here, what)
     said = f"    drawn = {{'{what}': '{what}'}}\n    {what}: float = 0.02"
     (here / "other.py").write_text(HEAD + named.replace(f"    {what}: float = 0.02", said))
     ready = scenario.study(scenario.from_tables(tables))
-    flown = [ready.dispersion.apply(ready.parts, 0, trial).disturbance for trial in range(2)]
-    assert getattr(flown[0], what) != getattr(flown[1], what)
+    simulated = [ready.dispersion.apply(ready.parts, 0, trial).disturbance for trial in range(2)]
+    assert getattr(simulated[0], what) != getattr(simulated[1], what)
 
 
 @pytest.mark.parametrize("beside", ["none", "random_walk"])
@@ -278,12 +278,12 @@ def test_a_custom_disturbance_and_observer_match_built_in_parts_and_a_loop_by_ha
     custom_one = {**CHAIN, "controller": law, "disturbance": {"kind": "custom", "code": "other.py:Wave", "size": 0.03}}
     waves = [{"kind": "sinusoid", "amplitude": [0.03], "frequency": [w], "phase": [0.0]} for w in (0.5, 1.5)]
     known = {**CHAIN, "controller": law, "disturbance": {"kind": "sum", "terms": waves}}
-    one, other = (flown(tables) for tables in (custom_one, known))
+    one, other = (simulated(tables) for tables in (custom_one, known))
     np.testing.assert_allclose(one.log.x, other.log.x, rtol=0, atol=1e-14)
     steps = [scenario.study(scenario.from_tables(tables)).parts.substeps for tables in (custom_one, known)]
     assert steps[0] == steps[1]  # `fastest` sets the steps like the keys of the built-in sum
 
-    watched = flown({**custom_one, "observer": {"kind": "custom", "code": "other.py:Filtered", "share": 0.7}})
+    watched = simulated({**custom_one, "observer": {"kind": "custom", "code": "other.py:Filtered", "share": 0.7}})
     kept = np.asarray(watched.log.has_length)
     t, x, u = (np.asarray(v)[kept] for v in (watched.log.t, watched.log.x, watched.log.u))
     seen = np.diff(x[:, 1]) / np.diff(t) - u[:-1, 0]  # x_2' = u + d: the mean of d over each period
@@ -624,7 +624,7 @@ def test_a_law_integrates_the_error_in_its_memory():
             return -2.0 * error - 2.0 * error_rate - self.k * memory, error, memory
 
     tables = {**CHAIN, "controller": {"kind": "custom", "code": Integral, "t_f": 5.0}}
-    log = flown(tables).log
+    log = simulated(tables).log
     kept = np.asarray(log.has_length)
     t, x, u = (np.asarray(v)[kept] for v in (log.t, log.x, log.u))
     total = np.cumsum(np.diff(t) * x[:-1, 0])
@@ -647,7 +647,7 @@ def test_the_first_sample_of_a_law_sees_the_initial_error(clock):
             return -self.k * error - 2.0 * error_rate, start, start
 
     table = {"kind": "custom", "code": First, "t_f": 5.03, "delta": 0.5}  # not a whole number of periods
-    log = flown({**CHAIN, "controller": table, "loop": {**SAMPLED, "clock": clock}}).log
+    log = simulated({**CHAIN, "controller": table, "loop": {**SAMPLED, "clock": clock}}).log
     kept = np.asarray(log.has_length)
     assert kept.any()
     np.testing.assert_array_equal(np.asarray(log.s)[kept], np.asarray(log.x)[kept][0, 0])
@@ -750,6 +750,6 @@ class Forgetful(ptsmc.AccelerationLaw):
 """
     (here / "mine.py").write_text(HEAD + forgetful)
     tables = {**CHAIN, "controller": {"kind": "custom", "code": "mine.py:Forgetful", "t_f": 5.0}}
-    result = flown(tables, record=False)
+    result = simulated(tables, record=False)
     assert rollout.STATUS[int(result.status)][0] == "diverged"
     np.testing.assert_allclose(result.bad_time, 2.2, rtol=1e-12)  # the end of the first period after 2 s

@@ -84,7 +84,7 @@ def home(command, places, monkeypatch):
 
 
 @pytest.fixture
-def flown(home):
+def simulated(home):
     """The folder of the campaign."""
     return home / FOLDER
 
@@ -97,93 +97,96 @@ def ran(folder):
     return found
 
 
-def test_summarize_worst_and_report_run_no_custom_code(command, flown, home):
-    rows = pl.read_parquet(flown / "trials")
+def test_summarize_worst_and_report_run_no_custom_code(command, simulated, home):
+    rows = pl.read_parquet(simulated / "trials")
     code, said, error = command("summarize", FOLDER)
     assert (code, error) == (0, "")
     assert "farthest" in said
-    assert (flown / "figures" / "distributions.png").exists()
-    assert not (flown / "figures" / "fan.png").exists()  # this figure needs histories, which would need a run
+    assert (simulated / "figures" / "distributions.png").exists()
+    assert not (simulated / "figures" / "fan.png").exists()  # this figure needs histories, which would need a run
     code, said, _ = command("worst", FOLDER, "--by", "farthest", "-n", 1)
-    assert (code, f"ptsmc replay {FOLDER} --trial {pl.read_csv(flown / 'worst.csv')['trial'][0]} --trust" in said) == (
+    assert (
+        code,
+        f"ptsmc replay {FOLDER} --trial {pl.read_csv(simulated / 'worst.csv')['trial'][0]} --trust" in said,
+    ) == (
         0,
         True,
     )
-    assert pl.read_csv(flown / "worst.csv")["farthest"][0] == rows["farthest"].max()
+    assert pl.read_csv(simulated / "worst.csv")["farthest"][0] == rows["farthest"].max()
     assert command("report", FOLDER)[0] == 0
     assert not ran(home)
-    page = (flown / "report.html").read_text()
+    page = (simulated / "report.html").read_text()
     assert "farthest" in page
     assert "--metrics my.py:farthest" in page
 
 
-def test_rows_can_be_read_without_the_custom_file(command, flown, home):
+def test_rows_can_be_read_without_the_custom_file(command, simulated, home):
     (home / "my.py").unlink()
     for asked in ("summarize", "worst", "report"):
         assert command(asked, FOLDER)[0] == 0, asked
 
 
-def test_replay_names_the_custom_file_and_runs_it_with_trust_only(command, flown, home):
+def test_replay_names_the_custom_file_and_runs_it_with_trust_only(command, simulated, home):
     code, out, error = command("replay", FOLDER, "--trial", 3, "--no-figures")
     assert (code, out) == (2, "")
     for said in (f"{home}/my.py (plant.system, --metrics)", "--trust"):
         assert said in error
     assert error.count("\n") == 1
     assert not ran(home)
-    assert not (flown / "replay").exists()
+    assert not (simulated / "replay").exists()
     code, out, error = command("replay", FOLDER, "--trial", 3, "--no-figures", "--trust")
     assert (code, "equals its row" in out) == (0, True)
     assert f"ptsmc: runs {home}/my.py, which plant.system and --metrics of {FOLDER} name\n" in error
     assert ran(home)
 
 
-def test_a_changed_custom_file_is_refused_even_with_trust(command, flown, home):
-    shutil.copy(home / "my.py", flown)
-    text = (flown / "scenario.toml").read_text().replace(f"{home}/my.py", "my.py")
-    (flown / "scenario.toml").write_text(text)
-    (flown / "my.py").write_text(PROGRAM + "# another\n")
+def test_a_changed_custom_file_is_refused_even_with_trust(command, simulated, home):
+    shutil.copy(home / "my.py", simulated)
+    text = (simulated / "scenario.toml").read_text().replace(f"{home}/my.py", "my.py")
+    (simulated / "scenario.toml").write_text(text)
+    (simulated / "my.py").write_text(PROGRAM + "# another\n")
     (home / "my.py").write_text(PROGRAM + "# another\n")
     assert "--trust" in command("replay", FOLDER, "--trial", 3)[2]
     for asked in (["replay", FOLDER, "--trial", 3], ["simulate", f"{FOLDER}/scenario.toml", "--out", "new"]):
         code, out, error = command(*asked, "--trust", "--no-figures")
         assert (code, out) == (2, "")
-        assert f"was made with another plant.system than {flown}/my.py is now" in error
+        assert f"was made with another plant.system than {simulated}/my.py is now" in error
     code, _, error = command("montecarlo", "mine.toml", "--trials", 30, "--metrics", "my.py:farthest")
     assert (code, "holds a run with system_sha256" in error) == (2, True)
-    assert not ran(flown)
-    other = campaign_folder.opened(flown)  # as a worker on another computer does
+    assert not ran(simulated)
+    other = campaign_folder.opened(simulated)  # as a worker on another computer does
     with pytest.raises(RefusedError, match=r"was made with another plant\.system"):
-        campaign_folder.made_again(str(flown), other.rows.key.hex())
-    assert not ran(flown)
+        campaign_folder.made_again(str(simulated), other.rows.key.hex())
+    assert not ran(simulated)
 
 
-def test_the_same_campaign_resumes_without_a_flag(command, flown, home):
+def test_the_same_campaign_resumes_without_a_flag(command, simulated, home):
     code, _, error = command(
         "montecarlo", "mine.toml", "--trials", 30, "--metrics", "my.py:farthest", "--no-figures", "--quiet"
     )
     assert (code, error) == (0, reported(home))
-    assert pl.read_parquet(flown / "trials").height == 30
-    assert campaign_folder.opened(flown).custom_metric_names == ["farthest"]
+    assert pl.read_parquet(simulated / "trials").height == 30
+    assert campaign_folder.opened(simulated).custom_metric_names == ["farthest"]
 
 
-def test_a_scenario_in_results_needs_trust_wherever_its_file_is(command, flown, home, capsys):
-    shutil.copy(home / "my.py", flown)
-    (flown / "evil.toml").write_text(SCENARIO)
-    (flown / "scenarios" / "deeper").mkdir(parents=True)
-    (flown / "scenarios" / "law.toml").write_text(SCENARIO.replace("my.py", "../my.py"))
-    (flown / "scenarios" / "deeper" / "law.toml").write_text(SCENARIO.replace("my.py", "../../my.py"))
-    (home / "link.toml").symlink_to(flown / "evil.toml")
+def test_a_scenario_in_results_needs_trust_wherever_its_file_is(command, simulated, home, capsys):
+    shutil.copy(home / "my.py", simulated)
+    (simulated / "evil.toml").write_text(SCENARIO)
+    (simulated / "scenarios" / "deeper").mkdir(parents=True)
+    (simulated / "scenarios" / "law.toml").write_text(SCENARIO.replace("my.py", "../my.py"))
+    (simulated / "scenarios" / "deeper" / "law.toml").write_text(SCENARIO.replace("my.py", "../../my.py"))
+    (home / "link.toml").symlink_to(simulated / "evil.toml")
     inside = ("scenario.toml", "evil.toml", "scenarios/law.toml", "scenarios/deeper/law.toml")
     for path in (*(f"{FOLDER}/{name}" for name in inside), "link.toml"):
         for asked in ("simulate", "tune", "montecarlo", "map", "pareto"):
             code, out, error = command(asked, path, "--out", "new")
             assert (code, out) == (2, "")
             assert "names custom code" in error
-    assert not ran(flown)
+    assert not ran(simulated)
     assert not ran(home)
-    loaded = scenario.read(flown / "evil.toml")
-    custom_parts.allow_scenario(flown / "evil.toml", loaded, True)
-    assert capsys.readouterr().err == reported(flown, flown / "evil.toml")
+    loaded = scenario.read(simulated / "evil.toml")
+    custom_parts.allow_scenario(simulated / "evil.toml", loaded, True)
+    assert capsys.readouterr().err == reported(simulated, simulated / "evil.toml")
 
 
 @pytest.mark.parametrize(

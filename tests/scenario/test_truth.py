@@ -77,7 +77,7 @@ def test_a_true_plant_with_a_hidden_state_matches_the_matrix_exponential():
     ready = scenario.study(scenario.from_tables({**HIDDEN, "hardware": {"state_noise": [0.0, 0.0]}}))
     parts = ready.parts
     assert parts.substeps > 1
-    run = runs.fly(ready, 0)
+    run = runs.simulate(ready, 0)
     x, u = np.asarray(run.log.x), np.asarray(run.log.u)
     motion = np.array([[0.0, 1.0, 0.0, 0.0], [-0.5, 0.0, 1.0, 0.0], [0.0, 0.0, -1 / 0.3, 1 / 0.3], [0.0] * 4])
     block, state = expm(PERIOD * motion), np.array([1.0, -0.2, 0.1])
@@ -102,11 +102,11 @@ def test_dispersions_and_rows_contain_only_visible_states():
     """Dispersions, rows and run tables contain the visible initial state only; z begins at z0."""
     drawn = {"x0": {"kind": "uniform", "half_width": [0.1, 0.0]}}
     ready = scenario.study(scenario.from_tables({**HIDDEN, "dispersion": drawn}))
-    flown = montecarlo.run(ready.parts, ready.dispersion, 0, np.arange(3))
-    assert [name for name in flown.drawn if name.startswith("initial_x")] == ["initial_x1", "initial_x2"]
-    by_hand = replace(ready.parts, initial=jnp.array([flown.drawn["initial_x1"][2], -0.2, 0.1]))
+    simulated = montecarlo.run(ready.parts, ready.dispersion, 0, np.arange(3))
+    assert [name for name in simulated.drawn if name.startswith("initial_x")] == ["initial_x1", "initial_x2"]
+    by_hand = replace(ready.parts, initial=jnp.array([simulated.drawn["initial_x1"][2], -0.2, 0.1]))
     again = rollout.simulate_parts(by_hand, 0, 2).metrics
-    np.testing.assert_allclose(flown.metrics.window_error[2], again.window_error, rtol=1e-12)
+    np.testing.assert_allclose(simulated.metrics.window_error[2], again.window_error, rtol=1e-12)
 
 
 def test_exact_motion_names_and_exported_code_ignore_hidden_states():

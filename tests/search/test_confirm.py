@@ -36,12 +36,12 @@ def test_probability_of_a_met_verdict_agrees_with_bayes_rule_on_a_grid(requireme
 
 @pytest.mark.parametrize("requirement", [SHOWN, SEEN, replace(SHOWN, quantile=0.9973, confidence=0.9)])
 def test_allowed_is_the_largest_count_with_a_sure_verdict(requirement):
-    fresh = confirm.held_out_trials([requirement])
-    trials = max(confirm.FEWEST, confirm.TIMES * fresh)
-    most = confirm.allowed(requirement, fresh, trials)
+    held_out = confirm.held_out_trials([requirement])
+    trials = max(confirm.FEWEST, confirm.TIMES * held_out)
+    most = confirm.allowed(requirement, held_out, trials)
     assert most is not None
-    assert confirm.probability(requirement, fresh, trials, most) >= confirm.SURE
-    assert confirm.probability(requirement, fresh, trials, most + 1) < confirm.SURE
+    assert confirm.probability(requirement, held_out, trials, most) >= confirm.SURE
+    assert confirm.probability(requirement, held_out, trials, most + 1) < confirm.SURE
     assert most < (1.0 - requirement.quantile) * trials  # fewer than the fraction itself, because the verdict is random
 
 
@@ -65,11 +65,11 @@ def test_a_band_contains_the_trials_ranked_around_the_last_that_may_break_the_li
     """Trial n has the error n. The band begins 16 trials before the last trial that may break the limit."""
     loose = replace(SHOWN, quantile=0.9)
     count = confirm.counted_on([loose])
-    flown = SimpleNamespace(finished=np.arange(count) != 5)  # a failed trial is the worst one
+    simulated = SimpleNamespace(finished=np.arange(count) != 5)  # a failed trial is the worst one
 
     def fly(numbers, gains):
-        flown.metrics = SimpleNamespace(window_error=numbers.astype(float))
-        return flown
+        simulated.metrics = SimpleNamespace(window_error=numbers.astype(float))
+        return simulated
 
     monkeypatch.setattr(confirm.simulations, "simulate_trials", fly)
     some: Any = SimpleNamespace(others=lambda numbers: numbers)
@@ -146,7 +146,7 @@ def test_gains_keep_a_quantile_limit_on_held_out_trials(monkeypatch, quantile, c
 
     Eight trials cannot represent a quantile of 99 % with 95 % confidence, so a band replaces them.
     """
-    helpers.small_search(monkeypatch, fresh=200)
+    helpers.small_search(monkeypatch, held_out=200)
     limits = normalisation.Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 4.0))
     limit, seed = 0.7, 2  # with this seed, the first eight trials are easy
     wanted = [Requirement("peak_torque", limit, None, quantile, confidence)]

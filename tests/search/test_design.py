@@ -194,10 +194,10 @@ SPINNING = {
 }
 
 
-@pytest.mark.parametrize(("limit", "flown"), [(5.0, True), (0.14, False)])
-def test_a_reference_that_reaches_the_singularity_prevents_only_the_simulated_time(limit, flown):
+@pytest.mark.parametrize(("limit", "follows"), [(5.0, True), (0.14, False)])
+def test_a_reference_that_reaches_the_singularity_prevents_only_the_simulated_time(limit, follows):
     """If the law cannot follow the reference until t_f, only the time from theory is returned."""
     found = design.shortest_time(scenario.from_tables(SPINNING), Requirement("peak_torque", limit), 0, np.arange(1))
     assert found.theory is not None
-    assert (found.theory < 20.0) == flown
-    assert (found.simulated is not None) == flown
+    assert (found.theory < 20.0) == follows
+    assert (found.simulated is not None) == follows

@@ -26,7 +26,7 @@ def test_rows_of_trials_and_of_margins_are_padded_without_changing_the_result(mo
     The largest c is therefore a measured one, and the padding has a gradient of zero.
     """
     rng = np.random.default_rng(0)
-    flown = {"c": rng.uniform(-0.9, -0.5, (2, 2, trials)), "c_gradient": rng.normal(size=(2, 2, trials, 2))}
+    simulated = {"c": rng.uniform(-0.9, -0.5, (2, 2, trials)), "c_gradient": rng.normal(size=(2, 2, trials, 2))}
     of_loop = {"c": rng.uniform(-0.9, -0.5, (2, 1, loops)), "c_gradient": rng.normal(size=(2, 1, loops, 2))}
     normalised = np.array([[0.0, 0.0], [1.0, 1.0]])
     monkeypatch.setattr(evaluate.margin_rows, "of_points", lambda margins, bounds, normalised: of_loop)
@@ -34,15 +34,15 @@ def test_rows_of_trials_and_of_margins_are_padded_without_changing_the_result(mo
     evaluator = Evaluator(Bounds(("eta", "delta"), (2.0, 0.1), (3.0, 1.0)))
     rest = {"gains": normalised, "f": np.zeros(2), "value": np.zeros(2), "f_gradient": np.zeros((2, 2))}
     found = MeasuredWithGradients(
-        **evaluator._measured(lambda problem, normalised: {**rest, **flown}, some, normalised)
+        **evaluator._measured(lambda problem, normalised: {**rest, **simulated}, some, normalised)
     )
     assert found.c.shape == (2, 3, 5)
     for name, filled in (("c", -1.0), ("c_gradient", 0.0)):
         seen = getattr(found, name)
-        for rows, expected, size in ((seen[:, :2], flown[name], trials), (seen[:, 2:], of_loop[name], loops)):
+        for rows, expected, size in ((seen[:, :2], simulated[name], trials), (seen[:, 2:], of_loop[name], loops)):
             np.testing.assert_array_equal(rows[:, :, :size], expected)
             assert np.all(rows[:, :, size:] == filled)
-    largest = np.maximum(flown["c"].max(axis=(1, 2)), of_loop["c"].max(axis=(1, 2)))
+    largest = np.maximum(simulated["c"].max(axis=(1, 2)), of_loop["c"].max(axis=(1, 2)))
     np.testing.assert_array_equal(found.largest_c, largest)
 
 
@@ -103,7 +103,7 @@ def test_goal_limits_minimises_the_largest_metric_over_its_limit():
 
 def test_goal_limits_includes_the_margins(monkeypatch):
     """F and its gradient follow the largest row: a metric's at the first point, a margin's at the second point."""
-    flown = {"c": np.array([[[0.3, -0.2]], [[-0.5, -0.4]]]), "c_gradient": np.arange(8.0).reshape(2, 1, 2, 2)}
+    simulated = {"c": np.array([[[0.3, -0.2]], [[-0.5, -0.4]]]), "c_gradient": np.arange(8.0).reshape(2, 1, 2, 2)}
     of_loop = {"c": np.array([[[-0.1]], [[0.6]]]), "c_gradient": 10.0 + np.arange(4.0).reshape(2, 1, 1, 2)}
     monkeypatch.setattr(evaluate.margin_rows, "of_points", lambda margins, scale, normalised: of_loop)
     some: Any = SimpleNamespace(margins=object(), objective="limits")
@@ -111,7 +111,7 @@ def test_goal_limits_includes_the_margins(monkeypatch):
     normalised = np.zeros((2, 2))
     rest = {"gains": normalised, "f": np.zeros(2), "value": np.zeros(2), "f_gradient": np.zeros((2, 2))}
     found = MeasuredWithGradients(
-        **evaluator._measured(lambda problem, normalised: {**rest, **flown}, some, normalised)
+        **evaluator._measured(lambda problem, normalised: {**rest, **simulated}, some, normalised)
     )
     np.testing.assert_allclose(np.exp(found.f), [1.3, 1.6], rtol=1e-12)
     np.testing.assert_array_equal(found.value, found.f)

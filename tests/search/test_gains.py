@@ -60,7 +60,7 @@ OTHERS = {
 def wide(tables=None):
     """Return the scenario and its parts, with a clock that has samples for all gains within their bounds."""
     scenario = from_tables({**BASE, "tune": TUNED, **(tables or {})})
-    return scenario, posing.pose(scenario, 0).ready
+    return scenario, posing.tuning_problem(scenario, 0).ready
 
 
 @pytest.mark.parametrize("name", OTHERS)
@@ -188,7 +188,7 @@ def test_gains_of_a_chain_and_its_observer_are_set_in_parts(kind):
         "tune": {"free": ["t_f", "eta", "observer_gain"]},
     }
     scenario = from_tables(tables)
-    ready = posing.pose(scenario, 0).ready
+    ready = posing.tuning_problem(scenario, 0).ready
     wanted = {"t_f": 9.0, "eta": 3.4, "observer_gain": gains.gains_of(ready.parts)["observer_gain"] * 1.5}
     moved = gains.with_gains(ready.parts, wanted)
     changed = study(gains.in_scenario(scenario, wanted))

@@ -217,7 +217,7 @@ def test_differential_evolution_finds_the_same_optimum(monkeypatch):
     assert global_check.check(evaluate, lost, 0).distance > 0.5
 
 
-@pytest.mark.parametrize(("share", "kept"), [(0.985, True), (1.01, False)])
+@pytest.mark.parametrize(("normalised", "kept"), [(0.985, True), (1.01, False)])
 def test_the_global_check_reports_the_original_limits(monkeypatch, normalised, kept):
     """Gains that keep the original limit, but not the tightened limit, count as keeping it."""
     monkeypatch.setattr(global_check, "GENERATIONS", 1)

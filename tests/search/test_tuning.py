@@ -198,20 +198,20 @@ def looked_at(some, *gains):
     return found.f[0], found.c[0], found.value[0]
 
 
-def flown_at(some, trials, *gains):
+def simulated_at(some, trials, *gains):
     """Return the metrics of these trials."""
     return simulations.simulate_trials(some.others(np.asarray(trials)), np.asarray(gains)).metrics
 
 
 def test_measure_returns_the_rms_of_the_worst_trials_weighted_by_the_torque_and_the_ratios_to_the_limits():
     some = replace(problem(peak_torque=0.7, effort=5.0), tail=3, torque_weight=0.3)
-    flown = flown_at(some, np.arange(8), 3.0, 0.7)
-    error, torque = (np.sqrt(np.mean(np.sort(v)[-3:] ** 2)) for v in (flown.window_error, flown.peak_torque))
+    simulated = simulated_at(some, np.arange(8), 3.0, 0.7)
+    error, torque = (np.sqrt(np.mean(np.sort(v)[-3:] ** 2)) for v in (simulated.window_error, simulated.peak_torque))
     for f, c, value in (measure(some, vector([3.0, 0.7])), looked_at(some, 3.0, 0.7)):
         np.testing.assert_allclose(np.exp(value), error, rtol=1e-10)
         np.testing.assert_allclose(np.exp(f), error * torque**0.3, rtol=1e-10)
-        np.testing.assert_allclose(c[0] + 1, flown.peak_torque / 0.7, rtol=1e-10)
-        np.testing.assert_allclose(c[1] + 1, flown.effort / 5.0, rtol=1e-10)
+        np.testing.assert_allclose(c[0] + 1, simulated.peak_torque / 0.7, rtol=1e-10)
+        np.testing.assert_allclose(c[1] + 1, simulated.effort / 5.0, rtol=1e-10)
 
 
 @pytest.mark.parametrize(
@@ -233,11 +233,11 @@ def test_a_quantile_limit_is_a_limit_on_an_order_statistic(least):
     some = problem(may_break=8 - least, peak_torque=0.7, effort=5.0)
     some = objective.with_trials(some, np.arange(8, 11))  # they must keep the limits on every trial
     f, c, _ = looked_at(some, 3.0, 0.7)
-    flown = flown_at(some, np.arange(11), 3.0, 0.7)
-    np.testing.assert_allclose(np.exp(f), np.sqrt(np.mean(flown.window_error[:8] ** 2)), rtol=1e-10)
-    expected = np.sort(flown.peak_torque[:8])[least - 1] / 0.7 - 1
+    simulated = simulated_at(some, np.arange(11), 3.0, 0.7)
+    np.testing.assert_allclose(np.exp(f), np.sqrt(np.mean(simulated.window_error[:8] ** 2)), rtol=1e-10)
+    expected = np.sort(simulated.peak_torque[:8])[least - 1] / 0.7 - 1
     np.testing.assert_allclose(c[0].max(), expected, rtol=1e-10)
-    np.testing.assert_allclose(c[1] + 1, flown.effort / 5.0, rtol=1e-10)
+    np.testing.assert_allclose(c[1] + 1, simulated.effort / 5.0, rtol=1e-10)
 
 
 @programs.jit
@@ -470,9 +470,9 @@ def test_a_problem_with_fewer_trials_keeps_added_trials_and_fractions():
     assert np.asarray(fewer.trials).tolist() == [0, 1, 2, 3, 8, 9, 10]
     assert (fewer.averaged, fewer.may_break, fewer.tail) == (4, (1, None, None), 1)
     _, c, _ = looked_at(fewer, 3.0, 0.7)
-    flown = flown_at(some, np.r_[:4, 8:11], 3.0, 0.7)
-    np.testing.assert_allclose(c[1] + 1, flown.effort / 5.0, rtol=1e-10)
-    np.testing.assert_allclose(c[0].max(), np.sort(flown.peak_torque[:4])[2] / 0.7 - 1, rtol=1e-10)
+    simulated = simulated_at(some, np.r_[:4, 8:11], 3.0, 0.7)
+    np.testing.assert_allclose(c[1] + 1, simulated.effort / 5.0, rtol=1e-10)
+    np.testing.assert_allclose(c[0].max(), np.sort(simulated.peak_torque[:4])[2] / 0.7 - 1, rtol=1e-10)
     assert objective.fewer_trials(some, 8) is some
     assert objective.fewer_trials(replace(some, may_break=(1,) * 3), 4).may_break[0] == 0
 
@@ -482,7 +482,7 @@ def test_a_problem_with_fewer_trials_keeps_added_trials_and_fractions():
 ])  # fmt: skip
 def test_only_a_discontinuous_sign_leads_to_a_search_without_gradients(width, free, with_gradients):
     tables = {"loop": {"mode": "sampled"}, "controller": {"sign_width": width}, "tune": {"free": free, "trials": 4}}
-    posed = posing.pose(scenario.from_tables(tables), 0)
+    posed = posing.tuning_problem(scenario.from_tables(tables), 0)
     assert posed.with_gradients == with_gradients
     assert float(posed.problem.parts.controller.sign_width) == width
 
@@ -526,7 +526,7 @@ def test_statistics_count_failures_and_cover_the_other_trials(monkeypatch):
 def test_the_objective_can_be_t_f_or_another_metric():
     some = problem()
     f, _, value = looked_at(replace(some, objective="peak_torque", tail=1), 3.0, 0.7)
-    largest = flown_at(some, np.arange(8), 3.0, 0.7).peak_torque.max()
+    largest = simulated_at(some, np.arange(8), 3.0, 0.7).peak_torque.max()
     np.testing.assert_allclose(np.exp([f, value]), largest, rtol=1e-10)
     rules = replace(some, names=("eta", "t_f"), objective="t_f").rules
     f, _, value = objective.judge(rules, vector([3.0, 19.0]), jnp.ones((8, 5)), jnp.zeros(8, int))

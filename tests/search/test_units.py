@@ -49,9 +49,9 @@ def test_other_units_rescale_the_tuned_gains_and_change_nothing_else(tables):
     assert there.gradients == here.gradients
     assert there.search.value == pytest.approx(here.search.value, rel=1e-9)
     for metric in ("window_error", "terminal_angle", "saturated"):
-        one, other = (np.asarray(getattr(run.fresh["tuned"].metrics, metric)) for run in (here, there))
+        one, other = (np.asarray(getattr(run.held_out["tuned"].metrics, metric)) for run in (here, there))
         np.testing.assert_allclose(other, one, rtol=1e-7)
     torque = INERTIA * TIME**-2.0
-    one, other = (np.asarray(run.fresh["tuned"].metrics.peak_torque) for run in (here, there))
+    one, other = (np.asarray(run.held_out["tuned"].metrics.peak_torque) for run in (here, there))
     np.testing.assert_allclose(other, torque * one, rtol=1e-7)
-    np.testing.assert_array_equal(here.fresh["tuned"].status, there.fresh["tuned"].status)
+    np.testing.assert_array_equal(here.held_out["tuned"].status, there.held_out["tuned"].status)

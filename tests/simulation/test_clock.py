@@ -71,8 +71,8 @@ def test_rounding_adds_no_sample_just_after_the_first_sample(t_f, delta):
         return ticks.t_next - ticks.t
 
     at = vector(delta)
-    flown = np.asarray(lengths(at))[np.asarray(lengths(at)) > 0]
-    np.testing.assert_allclose(flown, [0.1] * round((t_f + 4.0) / 0.1) + [0.03], atol=1e-12)
+    simulated = np.asarray(lengths(at))[np.asarray(lengths(at)) > 0]
+    np.testing.assert_allclose(simulated, [0.1] * round((t_f + 4.0) / 0.1) + [0.03], atol=1e-12)
     for function in (starts, lengths):  # derivatives of a slightly larger delta
         np.testing.assert_array_equal(jax.jacfwd(function)(at), jax.jacfwd(function)(at + 1e-6))
 
@@ -88,10 +88,10 @@ def test_rounding_adds_no_sample_just_before_the_end(delta, t_end):
 
     at = vector(delta)
     for function in (lengths, jax.jit(lengths)):  # has other rounding errors
-        flown = np.asarray(function(at))
-        np.testing.assert_allclose(flown[flown > 0.0], [0.1] * round(t_end / 0.1), atol=1e-12)
+        simulated = np.asarray(function(at))
+        np.testing.assert_allclose(simulated[simulated > 0.0], [0.1] * round(t_end / 0.1), atol=1e-12)
         np.testing.assert_array_equal(
-            jax.jacfwd(function)(at)[flown > 0.0], [-1.0, *[0.0] * (sum(flown > 0.0) - 2), 1.0]
+            jax.jacfwd(function)(at)[simulated > 0.0], [-1.0, *[0.0] * (sum(simulated > 0.0) - 2), 1.0]
         )
 
 

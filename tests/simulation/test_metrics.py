@@ -26,7 +26,7 @@ from ptsmc_jax.simulation.interval import (
 from tests.helpers import chain_flight, chain_parts, fly, parts, short, vector
 
 
-def flown(**changes):
+def simulated(**changes):
     run = parts(20.0, 3.0, 0.5, **changes)
     result = fly(run, 1, 4)
     log = result.log
@@ -36,7 +36,7 @@ def flown(**changes):
 @pytest.fixture(scope="module", params=short(["continuous", "sampled", "flight"], ["continuous", "sampled"]))
 def run(request):
     noisy = {"period": 0.05, "noise": (2e-4, 1e-5)}
-    return flown(**{"continuous": {}, "sampled": noisy, "flight": {**noisy, "flight": True}}[request.param])
+    return simulated(**{"continuous": {}, "sampled": noisy, "flight": {**noisy, "flight": True}}[request.param])
 
 
 def test_window_metrics_match_integrals_of_squared_error_and_angle(run):

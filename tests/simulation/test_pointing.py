@@ -226,15 +226,15 @@ rke_x = { limit = 1e-5, probability = 0.95, interpretation = "mixed" }
 
 
 @pytest.fixture(scope="module")
-def flown():
+def simulated():
     tables = untuned(POINTED)
     tables["loop"] |= {"clock": "flight"}
     ready = scenario.study(scenario.from_tables(tables))
     return ready, fly(ready.parts, 3, 5)
 
 
-def test_indices_of_a_run_match_its_history(flown):
-    ready, result = flown
+def test_indices_of_a_run_match_its_history(simulated):
+    ready, result = simulated
     frame = np.array(ready.parts.pointing.frame)
     log = result.log
     kept = log.has_length
@@ -273,21 +273,21 @@ def test_indices_of_a_run_match_its_history(flown):
     assert 0.1 < relative < 0.9
 
 
-def test_a_run_that_never_meets_a_limit_has_a_fraction_of_0(flown):
+def test_a_run_that_never_meets_a_limit_has_a_fraction_of_0(simulated):
     """Times beyond the limit add up to the observation only within rounding, which differs between programs."""
-    observed = flown[0].parts.pointing
+    observed = simulated[0].parts.pointing
     observed = dataclasses.replace(observed, limits={name: vector(1e-12) for name in observed.limits})
     for after in (0.2, 0.25, 0.3, 0.31, 0.37):
         run = dataclasses.replace(
-            flown[0].parts, pointing=dataclasses.replace(observed, after=vector(after), window=vector(0.11))
+            simulated[0].parts, pointing=dataclasses.replace(observed, after=vector(after), window=vector(0.11))
         )
         found = fly(run, 3, 5).metrics
         for share in (found.within_ape_boresight, found.within_rke_x):
             assert float(share) == 0.0
 
 
-def test_knowledge_errors_are_the_measurement_noise(flown):
-    ready, result = flown
+def test_knowledge_errors_are_the_measurement_noise(simulated):
+    ready, result = simulated
     keys = ready.parts.sensors.keys(jnp.uint32(3), jnp.uint32(5))
     samples = np.arange(50, 65)
     turns = np.stack([np.asarray(ready.parts.sensors.noise(keys, jnp.int32(k))[0]) for k in samples])
@@ -346,8 +346,8 @@ def test_gradients_of_indices_match_finite_differences():
     assert np.all(np.abs(slopes) > 1e-6)
 
 
-def test_every_index_is_a_metric_of_a_scenario_with_pointing(flown):
-    ready, _ = flown
+def test_every_index_is_a_metric_of_a_scenario_with_pointing(simulated):
+    ready, _ = simulated
     named = {f"{index}_{axis}" for index in catalogues.INDICES for axis in catalogues.AXES}
     assert named | {"within_ape_boresight", "within_rpe_boresight", "within_rke_x"} <= set(ready.catalogue)
     assert not {"within_ape_x", "within_ake_boresight"} & set(ready.catalogue)

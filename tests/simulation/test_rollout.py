@@ -173,7 +173,7 @@ def test_the_last_row_has_the_estimate_and_s_of_a_sample_at_t_end(kind):
 
     def history(t_end):
         tables = {"controller": {"t_f": 3.0, "delta": 1.0}, "loop": {**loop, "t_end": t_end}, "hardware": noise}
-        return runs.fly(scenario.study(scenario.from_tables(tables))).log
+        return runs.simulate(scenario.study(scenario.from_tables(tables))).log
 
     log, longer = history(4.5), history(5.0)
     end = log.t.size - 1
@@ -237,9 +237,9 @@ def test_a_run_that_starts_on_the_target_is_missed_beyond_ten_settling_angles(di
     np.testing.assert_equal(float(result.bad_time), 5.0 if status == rollout.NOT_CONVERGED else np.nan)
 
 
-def flown(plant, mode, **tables):
+def simulated(plant, mode, **tables):
     loop = {"mode": mode, "settling_angle": 1e-3}
-    return runs.fly(scenario.study(scenario.from_tables({"plant": plant, "loop": loop, **tables})))
+    return runs.simulate(scenario.study(scenario.from_tables({"plant": plant, "loop": loop, **tables})))
 
 
 MASS = second_order.system(1, lambda t, a, b: b, lambda t, a, b: 0 * a, lambda t, a, b: jnp.eye(1))
@@ -253,7 +253,7 @@ LOOPS = [(CHAIN, "continuous"), (CHAIN, "sampled"), (SYSTEM, "continuous"), (SYS
 def test_a_run_with_a_metric_that_is_not_finite_is_not_ok(plant, mode):
     """The state stays finite, but its square overflows (1.8e308), so the RMS over the window has no value."""
     needs = {"requirements": {"peak_torque": 1e300, "window_error": 1e300}}
-    large, lost = (flown({**plant, "x0": [x, 0.0]}, mode, **needs) for x in (1e140, 1e160))
+    large, lost = (simulated({**plant, "x0": [x, 0.0]}, mode, **needs) for x in (1e140, 1e160))
     assert (large.status, large.met) == ("ok", True)
     assert all(np.isfinite(value) for name, value in large.metrics.items() if name != "settling_time")
     assert np.isnan(large.metrics["settling_time"])  # a run that never settles can still be ok

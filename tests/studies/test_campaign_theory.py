@@ -27,8 +27,8 @@ def test_bound_and_margins_use_the_first_trials_and_are_computed_once(tmp_path, 
     monkeypatch.setattr(runs, "floor", floor)
     monkeypatch.setattr(margin_verdicts, "over_trials", over_trials)
     table = SimpleNamespace(count=count, row=lambda k, seed: (k, seed), rows=lambda numbers, seed: np.asarray(numbers))
-    flown = SimpleNamespace(ready="ready", run_table=None if count is None else table)
-    folder: Any = SimpleNamespace(path=tmp_path, seed=7, campaign=flown, scenario=SimpleNamespace(requirements={}))
+    simulated = SimpleNamespace(ready="ready", run_table=None if count is None else table)
+    folder: Any = SimpleNamespace(path=tmp_path, seed=7, campaign=simulated, scenario=SimpleNamespace(requirements={}))
     campaign_theory.find(folder)
     assert asked == [("ready", 7, looked), ("ready", 7, [(k, 7) for k in rows])]
     assert json.loads((tmp_path / "floor.json").read_text()) == {"window_error": 1e-6, "margins": []}

@@ -95,12 +95,12 @@ def test_custom_law_of_the_scenario_keeps_the_settings_of_the_scenario(tmp_path)
 
 
 def test_checksums_accept_only_the_custom_laws_of_the_comparison(tmp_path):
-    for name in ("flown", "beside", "other"):
+    for name in ("simulated", "beside", "other"):
         (tmp_path / f"{name}.py").write_text(f"# {name}\n")
-    where = {name: f"{tmp_path}/{name}.py:Mine" for name in ("flown", "beside", "other")}
-    of_scenario = {"controller_sha256": systems.digest(where["flown"])}
+    where = {name: f"{tmp_path}/{name}.py:Mine" for name in ("simulated", "beside", "other")}
+    of_scenario = {"controller_sha256": systems.digest(where["simulated"])}
     of_rivals = {"custom_laws": {where["beside"]: systems.digest(where["beside"])}}
-    for made, names in ((of_scenario | of_rivals, ("flown", "beside")), (of_rivals, ("beside",))):
+    for made, names in ((of_scenario | of_rivals, ("simulated", "beside")), (of_rivals, ("beside",))):
         for name in names:
             custom_parts.check_unchanged({"controller.code": where[name]}, tmp_path, made)
         with pytest.raises(RefusedError, match="was made with another"):
@@ -161,7 +161,7 @@ def test_model_errors_change_the_plant_but_not_the_law(eight):
     base = scenario.from_tables(TABLES)
     parts = scenario.study(base).parts
     others = compare.perturbed(base)
-    assert tuple(others) == compare.UNTOLD
+    assert tuple(others) == compare.MODEL_ERRORS
     for name, factor in (("heavier", 1.1), ("lighter", 0.9), ("later", 1.0)):
         other = scenario.study(others[name]).parts
         np.testing.assert_allclose(other.plant.inertia, factor * np.asarray(parts.plant.inertia), rtol=1e-15)
@@ -175,7 +175,7 @@ def test_model_errors_change_the_plant_but_not_the_law(eight):
     assert getattr(scenario.study(again["later"]).parts.actuators, "delay", 0) == 2
     ok = rollout.OK
     lost = changed(eight, [ok] * 7 + [rollout.NOT_CONVERGED], window_error=[2.0] * 7 + [2.0], peak_torque=[0.3] * 8)
-    said = compare.figures_of(replace(contender(eight), changed={"later": lost}))["untold"]
+    said = compare.figures_of(replace(contender(eight), changed={"later": lost}))["model_errors"]
     assert said == {"later": {"window_error": 2.0, "window_error_interval": None,
                               "largest_peak_torque": 0.3, "failures": 1}}  # fmt: skip
 
@@ -255,7 +255,7 @@ def test_all_laws_have_free_gains_if_t_f_is_minimised():
 
 @pytest.fixture(scope="module")
 def eight():
-    ready = scenario.study(judging.as_flown(scenario.from_tables(TABLES)))  # the compiled program of judging
+    ready = scenario.study(judging.on_flight_clock(scenario.from_tables(TABLES)))  # the compiled program of judging
     return montecarlo.run(ready.parts, ready.dispersion, 0, np.arange(8))
 
 
@@ -300,11 +300,11 @@ def rivals(monkeypatch, eight, interrupt=None):
         assert tries == 1  # more tries would judge on different trials
         law = posed.controller.kind
         asked.append(("tune", law, seed))
-        return SimpleNamespace(tuned=posed, gains={}, at_bound={}, fresh={"tuned": eight}, verdicts=[],
+        return SimpleNamespace(tuned=posed, gains={}, at_bound={}, held_out={"tuned": eight}, verdicts=[],
                                floors={"tuned": None},
                                search=SimpleNamespace(interrupted=law == interrupt))  # fmt: skip
 
-    def judge(flown, seed):
+    def judge(simulated, seed):
         asked.append(("judge", "paper", seed))
         return eight
 
@@ -322,7 +322,9 @@ def test_all_laws_are_tuned_by_one_seed_and_judged_by_another(monkeypatch, eight
     assert made.status == "met"
     lost = {**made.contenders, compare.OURS: contender(changed(eight, [rollout.DIVERGED] * 8))}
     assert replace(made, contenders=lost).status == "not met"
-    assert compare.identity(made.contenders["paper"].flown, 5) != compare.identity(made.contenders["paper"].flown, 6)
+    assert compare.identity(made.contenders["paper"].simulated, 5) != compare.identity(
+        made.contenders["paper"].simulated, 6
+    )
 
 
 def test_an_interruption_ends_the_comparison(monkeypatch, eight):
@@ -348,8 +350,8 @@ def lines_of(summary):
 @pytest.mark.parametrize(("period", "scaled"), [(0.05, False), (0.2, True)])
 def test_report_says_if_published_gains_are_scaled(eight, period, scaled):
     """The published delta of 0.05 s is shorter than a period of 0.2 s."""
-    flown = gains.published_scenario(scenario.from_tables({"loop": {"mode": "sampled", "period": period}}))
-    made = {compare.PAPER: replace(contender(eight), flown=flown), compare.OURS: contender(eight)}
+    simulated = gains.published_scenario(scenario.from_tables({"loop": {"mode": "sampled", "period": period}}))
+    made = {compare.PAPER: replace(contender(eight), simulated=simulated), compare.OURS: contender(eight)}
     lines = lines_of(compare.summary(compare.Comparison(made, 0, False)))
     assert any(line.startswith("published gains, scaled to this body and period: ") for line in lines) == scaled
     assert any(line.startswith("published gains: ") for line in lines) != scaled

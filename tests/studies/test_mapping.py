@@ -50,9 +50,9 @@ def asked(x, y, text=SHORT):
     return scenario.from_tables(tomllib.loads(text)), mapping.axis(x, "--x"), mapping.axis(y, "--y")
 
 
-def flown(x, y, text=SHORT, trials=6):
+def simulated(x, y, text=SHORT, trials=6):
     loaded, across, up = asked(x, y, text)
-    return loaded, across, up, mapping.fly(loaded, across, up, 3, trials, lambda done, total: None).cells
+    return loaded, across, up, mapping.simulate(loaded, across, up, 3, trials, lambda done, total: None).cells
 
 
 @pytest.mark.parametrize(
@@ -119,13 +119,13 @@ def test_invalid_axes_are_refused(text):
 
 @pytest.fixture(scope="module")
 def mapped():
-    return flown("loop.period=0.05:0.2:2", "controller.delta=0.1:0.5:2", CHAIN)
+    return simulated("loop.period=0.05:0.2:2", "controller.delta=0.1:0.5:2", CHAIN)
 
 
 def test_cells_agree_with_separate_simulations_of_their_pair(mapped, monkeypatch):
     loaded, x, y, cells = mapped
     assert [(c.x, c.y) for c in cells] == [(a, b) for b in y.values for a in x.values]
-    refused = [c for c in cells if c.status != "flown"]
+    refused = [c for c in cells if c.status != "simulated"]
     assert [(c.x, c.y) for c in refused] == [(0.2, 0.1)]  # delta is shorter than one period
     assert all("at least one control period" in c.status for c in refused)
     for cell in cells:
@@ -144,14 +144,14 @@ def test_cells_agree_with_separate_simulations_of_their_pair(mapped, monkeypatch
                 np.testing.assert_allclose(getattr(cell, f"{name}delay_margin"), left.delay.min(), rtol=1e-6)
                 factor = 10.0 ** (left.gain_up.min() / 20.0)
                 np.testing.assert_allclose(getattr(cell, f"{name}gain_margin"), factor, rtol=1e-6)
-        if cell.status == "flown":
+        if cell.status == "simulated":
             assert (cell.trials, cell.failures) == (6, 0)
             assert np.isfinite(cell.linear_window_error) == (cell.radius < 1.0)
     assert any(cell.radius < 1.0 for cell in cells)
 
 
 @pytest.fixture
-def unflown(monkeypatch):
+def not_simulated(monkeypatch):
     """Replace the simulation, which takes longest to compile, for tests that do not use trials."""
     zeros = Metrics(dict.fromkeys(CATALOGUE, np.zeros(1)))
     trials = montecarlo.Trials(np.arange(1), zeros, np.full(1, rollout.OK), np.full(1, np.nan), {})
@@ -163,7 +163,7 @@ def test_margins_of_a_pd_law_agree_with_the_closed_form():
     """The loop is a PD law, a zero-order hold and a double integrator. Earlier, maps had margins of one law only."""
     text = CHAIN.replace("t_f = 5.0, delta = 0.5", 'kind = "pd", t_f = 5.0')
     text = text.replace('{ kind = "nonlinear", gain = [10.0] }', '{ kind = "none" }')
-    _, _, _, cells = flown("controller.k_p=1:2:2", "controller.k_d=2:3:2", text, trials=1)
+    _, _, _, cells = simulated("controller.k_p=1:2:2", "controller.k_d=2:3:2", text, trials=1)
     h = 0.1
     for cell in cells:
         moved, pushed = np.array([[1.0, h], [0.0, 1.0]]), np.array([[h * h / 2.0], [h]])
@@ -197,7 +197,7 @@ def test_value_is_set_on_all_axes_and_in_missing_keys():
 
 def test_map_without_a_valid_pair_is_refused():
     with pytest.raises(ScenarioError, match=r"controller.eta is 1.0"):
-        flown("controller.eta=1:2:2", "controller.delta=0.2:0.3:2")
+        simulated("controller.eta=1:2:2", "controller.delta=0.2:0.3:2")
 
 
 def test_time_after_t_f_is_constant_if_t_f_is_mapped():
@@ -215,7 +215,7 @@ def test_random_walk_disturbance_makes_trials_differ():
 
 def test_period_axis_needs_the_sampled_loop():
     with pytest.raises(ScenarioError, match=r"loop\.period needs the sampled loop"):
-        flown("loop.period=0.1:0.2:2", "controller.delta=0.2:0.3:2", "controller.t_f = 5.0")
+        simulated("loop.period=0.1:0.2:2", "controller.delta=0.2:0.3:2", "controller.t_f = 5.0")
 
 
 def test_stability_limits_are_drawn_over_period_and_delta_only():
@@ -243,7 +243,7 @@ def test_result_folder_of_a_map(mapped, tmp_path):
     with (tmp_path / "map.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [float(row["loop.period"]) for row in rows] == [c.x for c in cells]
-    assert rows[0]["status"] == "flown"
+    assert rows[0]["status"] == "simulated"
     assert float(rows[0]["window_error"]) == cells[0].window_error
     assert rows[1]["window_error"] == ""  # refused
     assert (tmp_path / "figures" / "map.png").stat().st_size > 10_000
@@ -277,7 +277,7 @@ def test_spillover_limit_separates_stable_and_unstable_pairs(monkeypatch):
         return {"hand_over": (none, 1.1), "hold": (none, float(in_hold))}
 
     monkeypatch.setattr(mapping.run_margins, "at_ends", at_ends)
-    loaded, x, y, cells = flown(*MODES)
+    loaded, x, y, cells = simulated(*MODES)
     # all pairs are unstable at the hand-over, so that the only limit is in the hold phase
     ((label, (across, up)),) = mapping.spillover(mapping.Map(loaded, x, y, cells)).items()
     assert label == "the same in hold"

@@ -131,12 +131,12 @@ def test_pareto_command_computes_a_torque_front(command, tmp_path, monkeypatch, 
     peaks = [float(row["peak_torque"]) for row in rows]
     assert peaks == sorted(peaks)
     # the scenario's torque limit is a target, and its gains are at least as accurate as all known feasible gains
-    (trained,) = [float(row["trained_goal"]) for row in rows if float(row["limit"]) == limit]
+    (trained,) = [float(row["trained_objective"]) for row in rows if float(row["limit"]) == limit]
     ((problems, known, evaluate),) = begun
-    flown = evaluate.measure(problems[limit].tightened(1.0 - pareto.MARGIN), known)
+    simulated = evaluate.measure(problems[limit].tightened(1.0 - pareto.MARGIN), known)
     assert len(known) > len(searched)  # including other local minima of the searches
     assert searched.count(limit) == 1
-    assert trained <= np.exp(flown.value[flown.largest_c <= local_search.SLACK].min()) * (1.0 + 1e-9)
+    assert trained <= np.exp(simulated.value[simulated.largest_c <= local_search.SLACK].min()) * (1.0 + 1e-9)
     for row in rows:
         assert float(row["rms_low"]) <= float(row["rms_window_error"]) <= float(row["rms_high"])
         # simulate the gains of the row again
@@ -144,9 +144,9 @@ def test_pareto_command_computes_a_torque_front(command, tmp_path, monkeypatch, 
         made = scenario.replace(
             scenario.read(tmp_path / "s.toml"), **{f"controller__{k}": v for k, v in values.items()}
         )
-        flown = judging.judge(made, summary["seed"])
-        np.testing.assert_allclose(np.sqrt(np.mean(flown.metrics.window_error**2)), float(row["rms_window_error"]))
-        np.testing.assert_allclose(flown.metrics.peak_torque.max(), float(row["peak_torque"]))
+        simulated = judging.judge(made, summary["seed"])
+        np.testing.assert_allclose(np.sqrt(np.mean(simulated.metrics.window_error**2)), float(row["rms_window_error"]))
+        np.testing.assert_allclose(simulated.metrics.peak_torque.max(), float(row["peak_torque"]))
     assert f"{len(kept)} points, each judged on 60 held-out trials" in told
     read = checked(tmp_path / "p")
     assert set(read.charts) == {"front"}

@@ -43,12 +43,12 @@ def test_larger_margins_reduce_the_accuracy(command, tmp_path, monkeypatch):
     assert rows[0]["peak_sensitivity"] > 6.0
     known = scenario.read(tmp_path / "c.toml")
     for row in rows:
-        flown = scenario.replace(known, controller__k1=row["k1"], controller__sign_width=row["sign_width"])
-        trials = judging.judge(flown, told["seed"])
+        simulated = scenario.replace(known, controller__k1=row["k1"], controller__sign_width=row["sign_width"])
+        trials = judging.judge(simulated, told["seed"])
         errors = trials.metrics.window_error[:60]
         np.testing.assert_allclose(row["rms_window_error"], np.sqrt(np.mean(errors**2)), rtol=1e-9)
         np.testing.assert_allclose(row["peak_torque"], np.max(trials.metrics.peak_torque[:60]), rtol=1e-9)
-        by_place = stability.worst(scenario.study(judging.as_flown(flown))) or {}
+        by_place = stability.worst(scenario.study(judging.on_flight_clock(simulated))) or {}
         for name in MARGINS:
             worst = max if name == "peak_sensitivity" else min
             limited = [place[name] for place in by_place.values() if place[name] is not None]
@@ -164,11 +164,11 @@ def test_faster_slew_needs_more_torque_and_is_less_accurate(command, tmp_path, m
 def test_every_prescribed_time_has_its_own_search(monkeypatch):
     """Other times may have other local minima. All times use the difficult trials of the first two times."""
     small_search(monkeypatch, 8)
-    searched, flown, joined, search = [], [], [], posing.Posed.search
+    searched, simulated, joined, search = [], [], [], posing.Posed.search
 
     def note(posed, problem, scenario_gains, starts, *asked, **told):
         searched.append((float(problem.parts.controller.t_f), starts > 1))
-        flown.append(np.asarray(problem.trials).tolist())
+        simulated.append(np.asarray(problem.trials).tolist())
         outcome = search(posed, problem, scenario_gains, starts, *asked, **told)
         joined.append(np.asarray(outcome.problem.trials).tolist())
         return outcome
@@ -177,8 +177,8 @@ def test_every_prescribed_time_has_its_own_search(monkeypatch):
     usual = SHORT_CHAIN.replace(", delta = [0.1, 2.0]", "")  # default bounds, up to 2.55 s for t_f = 5 s
     pareto.trace(trades.SlewTime(scenario.from_tables(tomllib.loads(usual)), (3.9, 4.5, 5.0)), 0)
     assert searched == [(5.0, True), (3.9, True), (4.5, True)]
-    assert set(joined[0]) > set(flown[0])
-    assert flown[1:] == joined[:2]
+    assert set(joined[0]) > set(simulated[0])
+    assert simulated[1:] == joined[:2]
 
 
 @pytest.mark.parametrize(

@@ -47,7 +47,7 @@ def test_search_is_repeated_if_held_out_trials_break_a_limit(small):
     found = tuner.tune(loaded, 0, trusted=False)
     first, second = found.earlier
     assert found.met
-    seeds = [one.fresh_seed for one in (first, second, found)]
+    seeds = [one.held_out_seed for one in (first, second, found)]
     assert seeds == [judging.seed_of_judge(0), judging.seed_of_judge(0, 1), judging.seed_of_judge(0, 2)]
     assert len(set(seeds)) == 3
 
@@ -56,7 +56,7 @@ def test_search_is_repeated_if_held_out_trials_break_a_limit(small):
         return judging.judge(made, seed).metrics.peak_torque.max() / LIMIT
 
     for one in (first, second):
-        np.testing.assert_allclose(peak(one.gains, one.fresh_seed), one.over["peak_torque"], rtol=1e-12)
+        np.testing.assert_allclose(peak(one.gains, one.held_out_seed), one.over["peak_torque"], rtol=1e-12)
     assert first.over["peak_torque"] > second.over["peak_torque"] > 1.0
     # the violation on the held-out trials, and 2 % more
     reached = min(found.search.history, key=lambda step: abs(step.gains - [*second.gains.values()]).max()).worst[0]
@@ -85,10 +85,10 @@ def test_tuning_of_delta_or_t_f_uses_the_anchored_clock(free, anchored):
     """On the flight clock, small changes of delta have no effect, and its gradient is zero."""
     bounds = {"eta": [2.6, 3.1], "delta": [0.1, 2.0], "t_f": [4.0, 6.0]}
     tables = tomllib.loads(SHORT_CHAIN) | {"tune": {"free": free, "bounds": {name: bounds[name] for name in free}}}
-    flown = scenario.replace(scenario.from_tables(tables), loop__clock="flight")
-    posed = posing.pose(flown, 0)
+    simulated = scenario.replace(scenario.from_tables(tables), loop__clock="flight")
+    posed = posing.tuning_problem(simulated, 0)
     assert posed.problem.parts.clock.anchored is anchored
-    assert posed.ready.scenario == (scenario.from_tables(tables) if anchored else flown)
+    assert posed.ready.scenario == (scenario.from_tables(tables) if anchored else simulated)
 
 
 def test_reach_covers_the_bounds_and_the_own_values_of_the_gains():
@@ -119,22 +119,22 @@ def test_single_nominal_trial_is_judged_without_the_quantile():
 def test_accuracy_gain_uses_trials_that_both_sets_of_gains_finish():
     """Both sets of gains finish ten trials, with an error ratio of five. Trials that one of them loses do not count."""
 
-    def flown(errors: Any, lost: int) -> Any:
+    def simulated(errors: Any, lost: int) -> Any:
         finished = np.arange(12) != lost
         return SimpleNamespace(finished=finished, metrics=SimpleNamespace(window_error=np.where(finished, errors, 1e3)))
 
     errors = np.linspace(1.0, 2.0, 12)
-    told = tune_files._accuracy_gain({"tuned": flown(errors, 3), "paper": flown(5.0 * errors, 7)})
+    told = tune_files._accuracy_gain({"tuned": simulated(errors, 3), "paper": simulated(5.0 * errors, 7)})
     assert told["accuracy_gain_over_paper"] == pytest.approx(5.0, rel=1e-12)
     assert told["accuracy_gain_interval"] == pytest.approx((5.0, 5.0), rel=1e-9)
     nothing = {"accuracy_gain_over_paper": None, "accuracy_gain_interval": None}
-    assert tune_files._accuracy_gain({"tuned": flown(errors, 3)}) == nothing
+    assert tune_files._accuracy_gain({"tuned": simulated(errors, 3)}) == nothing
 
 
-@pytest.mark.parametrize(("goal", "said"), [(np.nan, "unknown"), (1e-3, "none")])
-def test_influence_of_a_gain_is_unknown_if_no_trial_finishes(goal, said):
+@pytest.mark.parametrize(("objective", "said"), [(np.nan, "unknown"), (1e-3, "none")])
+def test_influence_of_a_gain_is_unknown_if_no_trial_finishes(objective, said):
     """If no trial has an objective, its replacement value is equal for all gains, which is no evidence."""
-    profile = trust.Profile(np.arange(3.0), np.full(3, goal), np.ones(3), np.zeros(3))
+    profile = trust.Profile(np.arange(3.0), np.full(3, objective), np.ones(3), np.zeros(3))
     found: Any = SimpleNamespace(gradient_error=None, profiles={"eta": profile}, sensitivities={}, margins={})
     tuning: Any = SimpleNamespace(tuned=SimpleNamespace(sampled=True, hardware=None), at_bound={"eta": "upper"})
     assert tune_files._trust(found, tuning)["influence"] == {"eta": said}
@@ -201,7 +201,7 @@ def test_search_widens_default_bounds_of_gains_that_matter(monkeypatch):
     """The bound of K1 is multiplied by ten, at most three times. The bound of eta stays, because eta has no effect."""
     tables = {"controller": {"t_f": 30.0}, "tune": {"free": ["eta", "k1"]}}
     searched = list[dict[str, tuple[float, float]]]()
-    monkeypatch.setattr(posing, "pose", lambda made, *_, **__: Rising(made, searched))
+    monkeypatch.setattr(posing, "tuning_problem", lambda made, *_, **__: Rising(made, searched))
     monkeypatch.setattr(tuner, "_after", lambda before, more: more)
     some, told = scenario.from_tables(tables), []
     first, usual = Rising(some, searched), some.search.bounds
@@ -250,27 +250,27 @@ def test_default_gain_equals_its_explicit_value():
 def test_requirements_broken_by_more_accurate_gains_are_listed(monkeypatch):
     """Errors are compared over the trials that both sets of gains finish."""
 
-    def flown(errors, finished=(True, True)):
+    def simulated(errors, finished=(True, True)):
         return SimpleNamespace(metrics=SimpleNamespace(window_error=np.array(errors)), finished=np.array(finished))
 
     verdicts = {"paper": [("gain_margin", False), ("effort", True)], "before": [("effort", True)]}
     monkeypatch.setattr(
         judging, "verdicts_of", lambda name, *_: [SimpleNamespace(metric=m, met=met) for m, met in verdicts[name]]
     )
-    tuned, names = flown([2.0, 2.0]), {name: name for name in ("tuned", "paper", "before")}
+    tuned, names = simulated([2.0, 2.0]), {name: name for name in ("tuned", "paper", "before")}
 
     def broken_by(paper, before):
-        fresh: Any = {"tuned": tuned, "paper": paper, "before": before}
-        return tuner._broken_by(cast(Any, names), fresh, 0)
+        held_out: Any = {"tuned": tuned, "paper": paper, "before": before}
+        return tuner._broken_by(cast(Any, names), held_out, 0)
 
-    assert broken_by(flown([1.0, 2.0]), flown([1.0, 1.0])) == {"paper": ["gain_margin"], "before": []}
-    assert broken_by(flown([3.0, 2.0]), flown([2.0, 2.0])) == {}
-    assert [*broken_by(flown([1.0, 9.0], (True, False)), flown([0.0, 0.0], (False, False)))] == ["paper"]
+    assert broken_by(simulated([1.0, 2.0]), simulated([1.0, 1.0])) == {"paper": ["gain_margin"], "before": []}
+    assert broken_by(simulated([3.0, 2.0]), simulated([2.0, 2.0])) == {}
+    assert [*broken_by(simulated([1.0, 9.0], (True, False)), simulated([0.0, 0.0], (False, False)))] == ["paper"]
 
 
 def test_judging_changes_only_the_clock():
     loaded = scenario.read(FIRST_FLIGHT)
-    flown = judging.as_flown(loaded)
-    assert flown.loop.clock == "flight"
-    assert flown.controller == loaded.controller
-    assert judging.as_flown(scenario.from_tables({})) == scenario.from_tables({})
+    simulated = judging.on_flight_clock(loaded)
+    assert simulated.loop.clock == "flight"
+    assert simulated.controller == loaded.controller
+    assert judging.on_flight_clock(scenario.from_tables({})) == scenario.from_tables({})

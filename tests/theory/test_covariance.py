@@ -68,15 +68,15 @@ def test_covariance_predicts_the_error_of_simulated_trials(case, trials, start):
     rms = []
     for one in (noisy, still):
         ready = scenario.study(one)
-        flown = montecarlo.run(ready.parts, ready.dispersion, 0, np.arange(trials))
-        assert np.all(flown.finished)
-        rms.append(float(np.sqrt(np.mean(flown.metrics.window_error**2))))
+        simulated = montecarlo.run(ready.parts, ready.dispersion, 0, np.arange(trials))
+        assert np.all(simulated.finished)
+        rms.append(float(np.sqrt(np.mean(simulated.metrics.window_error**2))))
     share = np.sqrt(rms[0] ** 2 - rms[1] ** 2)
     assert share > 0.4 * rms[0]  # noise is a large part of the error
     np.testing.assert_allclose(covariance.noise(scenario.study(noisy).parts).window_error, share, rtol=0.1)
 
 
-def flown_chain(**changes):
+def simulated_chain(**changes):
     """Window error of 2 000 trials of a chain of order 2 at rest on its target, by one compiled program."""
     tables = {
         "plant": {"kind": "chain", "x0": [0.0, 0.0]},
@@ -109,26 +109,26 @@ def test_noise_reports_whether_the_statistical_linearisation_converged(monkeypat
 
 def test_window_error_includes_the_error_between_samples():
     """The window contains only one sample, 0.49 s after t_f."""
-    parts, flown = flown_chain(
+    parts, simulated = simulated_chain(
         controller={"t_f": 15.01, "delta": 0.9, "k1": 3.0, "sign_width": 0.01, "surface_rate": 1.5},
         observer={"kind": "nonlinear", "gain": [5.0]},
         disturbance={"kind": "random_walk", "density": [1e-16]},
         loop={"period": 0.5, "t_end": 18.0, "window": 0.6},
         hardware={"state_noise": [2e-5, 1e-6]},
     )
-    np.testing.assert_allclose(covariance.noise(parts).window_error, flown, rtol=0.05)
+    np.testing.assert_allclose(covariance.noise(parts).window_error, simulated, rtol=0.05)
 
 
 def test_a_random_walk_acts_from_the_start_of_its_period():
     """The window has few periods of 1 s. A step that acts one period later would predict a much smaller error."""
-    parts, flown = flown_chain(
+    parts, simulated = simulated_chain(
         controller={"t_f": 4.0, "delta": 2.0, "k1": 0.5, "sign_width": 1e3},
         observer={"kind": "nonlinear", "gain": [0.3]},
         disturbance={"kind": "random_walk", "density": [1e-5]},
         loop={"period": 1.0, "t_end": 5.0},
         hardware={"state_noise": [1e-12, 1e-12]},
     )
-    np.testing.assert_allclose(covariance.noise(parts).window_error, flown, rtol=0.04)
+    np.testing.assert_allclose(covariance.noise(parts).window_error, simulated, rtol=0.04)
 
 
 def test_filter_covariance_stays_at_its_initial_steady_state():
@@ -205,8 +205,8 @@ def test_equivalent_width_follows_the_noise_of_each_period():
     }
     parts = scenario.study(scenario.from_tables(tables)).parts
     fly = jax.jit(jax.vmap(lambda k: rollout.simulate(parts, np.uint32(0), k, record=True)))
-    flown, expected = fly(np.arange(200, dtype=np.uint32)), covariance.noise(parts)
-    command, s, t = (np.asarray(v) for v in (flown.log.commanded, flown.log.s, flown.log.t))
+    simulated, expected = fly(np.arange(200, dtype=np.uint32)), covariance.noise(parts)
+    command, s, t = (np.asarray(v) for v in (simulated.log.commanded, simulated.log.s, simulated.log.t))
     np.testing.assert_allclose(expected.torque, command.std(axis=0).max(), rtol=0.2)
     np.testing.assert_allclose(expected.s, np.sqrt(np.mean(s[:, t[0] >= 6.0].var(axis=0))), rtol=0.1)
     assert s.std(axis=0).max() > 10.0 * expected.s

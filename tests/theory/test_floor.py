@@ -35,7 +35,7 @@ def still(made):
     return log(t, held, none, none, none, none, none, None, none, None, np.ones(periods + 1, bool))
 
 
-def flown_at(made, **changes):
+def simulated_at(made, **changes):
     """The parts with the flight clock and changed devices."""
     return dataclasses.replace(made, clock=clock.flight(PERIOD, float(made.t_end)), **changes)
 
@@ -120,7 +120,7 @@ def test_lower_bound_of_a_chain_equals_least_squares(order, delay):
     """RK4 and the metric's cubic are exact up to order 3, because the motion under a held input is a polynomial."""
     made = chain_parts([0.5, -0.2, 0.1][:order], t_f=2.0, period=PERIOD, noise=[1e-3, 5e-2, 2e-4][:order])
     density = 3e-3
-    made = flown_at(made, walk_rate=vector([density]), actuators=delayed(delay))
+    made = simulated_at(made, walk_rate=vector([density]), actuators=delayed(delay))
     found = error_floor.along(made, still(made))
     periods, n = len(found.t), order
 
@@ -143,7 +143,7 @@ def test_lower_bound_of_a_chain_equals_least_squares(order, delay):
 
 def test_lower_bound_uses_the_actual_sample_times():
     """A chain has early and late samples. Least squares moves all samples to the time of the last one."""
-    made = flown_at(chain_parts([0.5, -0.2], t_f=2.0, period=PERIOD, noise=[1e-3, 5e-3]))
+    made = simulated_at(chain_parts([0.5, -0.2], t_f=2.0, period=PERIOD, noise=[1e-3, 5e-3]))
     log = still(made)
     late = 0.4 * PERIOD * np.sin(7.0 * np.arange(len(log.t)))
     late[[0, -1]] = 0.0
@@ -185,7 +185,9 @@ def test_lower_bound_of_a_spacecraft_at_rest_equals_least_squares(kind):
     outage, scale = (0.4, 2.2) if kind == "outage" else (0.0, 0.0), 1.1 if kind == "scale" else 1.0
     misfits = {"outage": {"outage": vector(outage)}, "scale": {"rate_scale": vector([scale] * 3)}}
     sensor = dataclasses.replace(sensor, **misfits.get(kind, {}))
-    made = flown_at(parts(**AT_REST, delta=2 * PERIOD), sensors=sensor, walk_rate=vector(walk), actuators=delayed(1))
+    made = simulated_at(
+        parts(**AT_REST, delta=2 * PERIOD), sensors=sensor, walk_rate=vector(walk), actuators=delayed(1)
+    )
     first = 0
     if kind == "later":
         made, first = dataclasses.replace(made, clock=parts(**AT_REST, delta=2 * PERIOD).clock), -22
@@ -222,17 +224,17 @@ def test_along_each_equals_separate_calls():
 
     def chain(t_f=2.0, noise: Any = (1e-3, 5e-2), delay=0):
         made = chain_parts([0.5, -0.2], t_f=t_f, period=PERIOD, noise=noise)
-        return flown_at(made, actuators=delayed(delay))
+        return simulated_at(made, actuators=delayed(delay))
 
     runs = [chain(), chain(noise=(2e-3, 1e-2)), chain(delay=2), chain(t_f=2.2), chain(noise=None), chain(delay=2)]
-    flown = [(made, still(made)) for made in runs]
-    for (made, log), found in zip(flown, error_floor.along_each(flown), strict=True):
+    simulated = [(made, still(made)) for made in runs]
+    for (made, log), found in zip(simulated, error_floor.along_each(simulated), strict=True):
         alone = error_floor.along(made, log)
         # QR of the same matrices, batched or one after the other
         np.testing.assert_allclose(found.error, alone.error, rtol=1e-13)
         np.testing.assert_allclose(found.window_error, alone.window_error, rtol=1e-13)
         np.testing.assert_array_equal(found.t, alone.t)
-    floors = [found.window_error for found in error_floor.along_each(flown)]
+    floors = [found.window_error for found in error_floor.along_each(simulated)]
     assert len(set(floors)) == 5  # two of the six runs are equal
     assert floors[4] == 0.0
     assert error_floor.along_each([]) == []
@@ -240,7 +242,7 @@ def test_along_each_equals_separate_calls():
 
 def test_a_state_measured_without_noise_is_known():
     """The rate is known to be zero, so that the best estimate of the position is the mean of all samples."""
-    made = flown_at(chain_parts([1.0, 0.0], t_f=2.0, period=PERIOD, noise=[1e-3, 0.0]))
+    made = simulated_at(chain_parts([1.0, 0.0], t_f=2.0, period=PERIOD, noise=[1e-3, 0.0]))
     found = error_floor.along(made, still(made))
     np.testing.assert_allclose(found.error, 1e-3 / np.sqrt(1.0 + np.arange(len(found.t))), rtol=1e-9)
 
@@ -248,7 +250,7 @@ def test_a_state_measured_without_noise_is_known():
 def test_without_noise_only_the_random_walk_is_unknown():
     """All states are measured exactly. Only the effect of the walk's step within a period remains."""
     density = 0.2
-    made = flown_at(chain_parts([1.0, 0.0], t_f=2.0, period=PERIOD), walk_rate=vector([density]))
+    made = simulated_at(chain_parts([1.0, 0.0], t_f=2.0, period=PERIOD), walk_rate=vector([density]))
     found = error_floor.along(made, still(made))
     np.testing.assert_allclose(found.error, density * PERIOD * PERIOD**2 / 2, rtol=1e-6)  # EXACT, over one period
 
@@ -256,7 +258,7 @@ def test_without_noise_only_the_random_walk_is_unknown():
 @pytest.mark.parametrize("delay", [0, 2])
 def test_lower_bound_is_zero_if_exact_positions_determine_the_rate(delay):
     """It is zero from the second sample on for any noise of the rate. Rounding of 1e-14 must not appear as a bound."""
-    made = flown_at(chain_parts([1.0, 0.0], t_f=2.0, period=PERIOD, noise=[0.0, 1e-3]), actuators=delayed(delay))
+    made = simulated_at(chain_parts([1.0, 0.0], t_f=2.0, period=PERIOD, noise=[0.0, 1e-3]), actuators=delayed(delay))
     found = error_floor.along(made, still(made))
     np.testing.assert_allclose(found.error[delay], (1 + delay) * PERIOD * 1e-3, rtol=1e-9)  # by its only sample
     np.testing.assert_array_equal(found.error[delay + 1 :], 0.0)
@@ -267,7 +269,7 @@ def test_lower_bound_is_zero_without_noise():
     continuous = parts(t_f=3.0)
     assert error_floor.along(continuous, still(continuous)).window_error == 0.0
     for noise in (None, [0.0, 0.0]):
-        made = flown_at(chain_parts([1.0, 0.0], t_f=2.0, period=PERIOD, noise=noise))
+        made = simulated_at(chain_parts([1.0, 0.0], t_f=2.0, period=PERIOD, noise=noise))
         found = error_floor.along(made, still(made))
         assert found.window_error == 0.0
         np.testing.assert_array_equal(found.error, 0.0)
@@ -278,7 +280,7 @@ def test_wheel_momentum_couples_the_axes():
     momentum = np.array([3.0, -2.0, 1.0])
     device = reaction_wheels.wheels(np.eye(3), momentum)
     calm = parts(**AT_REST, noise=(2e-5, 1e-6), disturbance=disturbances.Constant(jnp.zeros(3)))
-    made = flown_at(calm, actuators=actuators.Actuators(wheels=device))
+    made = simulated_at(calm, actuators=actuators.Actuators(wheels=device))
     ticks, log = error_floor._lasting(made, still(made))
     linear = error_floor._linear(made, log, ticks)
     coupled = np.asarray(made.plant.inertia_inverse) @ np.cross(momentum, np.eye(3)).T
@@ -307,7 +309,7 @@ def test_a_filter_with_kalman_gains_attains_the_lower_bound():
     held = attitude_filter.AttitudeFilter(vector(k1), vector(k2), vector(np.tile(np.linalg.cholesky(p), (every, 1, 1))))
     sensor = sensors.Sensors(vector(star), vector(gyro), vector(1e-3), vector(drift), held, every)
     made = parts(**{**AT_REST, "t_end": 40.0})
-    made = flown_at(made, sensors=sensor, walk_rate=vector([1e3] * 3))
+    made = simulated_at(made, sensors=sensor, walk_rate=vector([1e3] * 3))
     ticks, log = error_floor._lasting(made, still(made))
     at_start = error_floor.deviations(error_floor._model(made, log, ticks))[:, :3]
     after_star = at_start[::every]

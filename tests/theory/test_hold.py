@@ -22,7 +22,7 @@ RATES = [(0.3, 1.1), (1.0, 1.0), (1.0, 0.5), (2.5, 2.5), (2.5, 0.7)]
 GRID = (4000, 800)
 
 
-def flown(law, c, k):
+def simulated(law, c, k):
     """A run without disturbance or switching, whose hand-over 2 s before t_f = 10 s leaves a large error."""
     t_end = 12.0
     grid = clock.Graded(vector(t_end), vector(1.0), vector(1.5 * 10.0 / GRID[0]), jnp.zeros(0), *GRID)
@@ -61,7 +61,7 @@ LAWS = {
 def test_runs_follow_the_closed_form_in_the_hold_phase(law, c, k):
     """The closed form begins at t = 0. The error of RK4 is below 1e-11, with half of the default step or less."""
     law = LAWS[law]
-    run = flown(law, c, k)
+    run = simulated(law, c, k)
     result = fly(run)
     after = result.log.t >= 8.0
     error = result.log.x[:, :1] if isinstance(law, int) else result.log.error
@@ -111,7 +111,7 @@ def test_gradient_by_the_surface_rate_equals_the_closed_form():
 
     with_gradients = jax.jit(lambda run, c: jax.jvp(lambda c: measured(run, c), (c,), (jnp.ones_like(c),)))
     for c, k in ((1.0, 1.0), (2.5, 0.7)):
-        run, at, h = flown(2, c, k), vector(c), 1e-3
+        run, at, h = simulated(2, c, k), vector(c), 1e-3
         forward = float(with_gradients(run, at)[1])
         # the error of the trapezium rule is (1/400)^2 / 12 times a second derivative of about 10
         np.testing.assert_allclose(forward, jax.jacfwd(expected, 1)(run, at), rtol=1e-5)
@@ -122,7 +122,7 @@ def test_gradient_by_the_surface_rate_equals_the_closed_form():
 
 def test_hold_envelopes_are_within_a_factor_of_ten():
     """Without a disturbance the envelopes decay like the run. They are larger, because they ignore the sign of s."""
-    run = flown(2, 2.5, 0.7)
+    run = simulated(2, 2.5, 0.7)
     log = fly(run).log
     t = log.t[log.t >= 8.0]
     for size, bound in (

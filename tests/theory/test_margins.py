@@ -149,12 +149,12 @@ def test_margin_derivatives_equal_finite_differences():
         np.testing.assert_allclose(exact, numeric, rtol=1e-6, atol=1e-9 * np.abs(exact).max())
 
 
-def flown(parts, run, index, gain, late):
+def simulated(parts, run, index, gain, late):
     """Growth rate per period of a small deviation from the nominal run, with changed gains and delays.
 
     The simulation repeats one period of the nominal run, so that the gains are frozen.
     """
-    sizes = np.asarray(_flown(linear.quiet(parts), run, *map(jnp.asarray, (index, gain, late))))
+    sizes = np.asarray(_simulated(linear.quiet(parts), run, *map(jnp.asarray, (index, gain, late))))
     beyond = np.flatnonzero((sizes > np.log(1e-3)) | (sizes < np.log(1e-8)))  # nonlinear, or rounding
     last = beyond[0] if beyond.size else sizes.size
     second = sizes[last // 2 : last]
@@ -162,7 +162,7 @@ def flown(parts, run, index, gain, late):
 
 
 @jax.jit
-def _flown(parts, run, index, gain, late):
+def _simulated(parts, run, index, gain, late):
     period, carry_0, _, base = jax.tree.map(lambda v: v[index], run)
     k2 = parts.observer.error_bound()
     delay = parts.actuators.delay
@@ -300,12 +300,12 @@ def test_simulated_loop_loses_stability_at_its_margins(kind):
                 gain = np.where(only, share * border, 1.0)
                 expected = np.log(linear.radius(loop, np.diag(gain)))
                 if abs(expected) * 3000 > 1.0:  # slower growth would not show in the simulated time
-                    growth = flown(parts, run, index, gain, np.zeros(m))
+                    growth = simulated(parts, run, index, gain, np.zeros(m))
                     assert (growth > 0.0) == ((share > 1) == (way > 0)), (name, share, growth, expected)
                     checked += 1
         for share in (0.99, 1.01):
             late = np.where(only, share * found.delay[axis] / float(loop.period), 0.0)
-            growth = flown(parts, run, index, np.ones(m), late)
+            growth = simulated(parts, run, index, np.ones(m), late)
             # stored momentum is constant when everything else decays
             assert (growth > margins.NEUTRAL) == (share > 1), ("delay", share, growth)
             checked += 1

@@ -14,7 +14,7 @@ from ptsmc_jax.simulation import rollout
 from ptsmc_jax.theory import covariance, error_floor
 from tests import suites
 from tests.helpers import parts, vector
-from tests.theory.test_floor import AT_REST, PERIOD, delayed, flown_at, pooled_in_window, still
+from tests.theory.test_floor import AT_REST, PERIOD, delayed, pooled_in_window, simulated_at, still
 
 
 def history(moments, walks):
@@ -52,7 +52,7 @@ def test_lower_bound_with_two_star_trackers_equals_an_independent_kalman_filter(
     suite = suites.two_star_trackers(PERIOD, intervals, latencies)
     walk = np.array([1e-3, 2e-3, 0.0])
     made = parts(**AT_REST, delta=2 * PERIOD, disturbance=disturbances.Constant(jnp.zeros(3)))
-    made = flown_at(made, sensors=suite, walk_rate=vector(walk), actuators=delayed(1))
+    made = simulated_at(made, sensors=suite, walk_rate=vector(walk), actuators=delayed(1))
     found = error_floor.along(made, still(made))
     periods = len(found.t)
     state = history(np.diag(np.asarray(made.plant.inertia)), range(periods))

@@ -78,8 +78,8 @@ def test_covariance_of_noise_and_random_walk_equals_simulated_trials():
         "initial": {"quat_xyzw": [0.0, 0.0, 0.0, 1.0]},
     }
     fly_each = jax.jit(jax.vmap(lambda parts, k: rollout.simulate(parts, np.uint32(0), k), (None, 0)))
-    flown = fly_each(parts_of(**NOISY, **changes), np.arange(512, dtype=np.uint32))
-    measured = np.sqrt(np.mean(np.asarray(flown.metrics.window_error) ** 2))
+    simulated = fly_each(parts_of(**NOISY, **changes), np.arange(512, dtype=np.uint32))
+    measured = np.sqrt(np.mean(np.asarray(simulated.metrics.window_error) ** 2))
     np.testing.assert_allclose(covariance.noise(in_theory(**changes)).window_error, measured, rtol=0.1)
 
 

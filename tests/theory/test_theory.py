@@ -109,8 +109,8 @@ def test_exact_path_equals_the_simulated_path():
     log = fly(quiet).log
     t, _, square = solutions.exact_path(run)
     before = log.t < 29.9
-    flown = log.x.q[:, 3] ** 2
-    np.testing.assert_allclose(np.interp(log.t[before], t, square), flown[before], atol=1e-4)  # interpolation
+    simulated = log.x.q[:, 3] ** 2
+    np.testing.assert_allclose(np.interp(log.t[before], t, square), simulated[before], atol=1e-4)  # interpolation
 
 
 def random_body(rng):
@@ -203,10 +203,10 @@ def test_shortest_time_is_sufficient_for_fifty_spacecraft(below):
         eta, limit = rng.uniform(2.05, 2.4) if below else rng.uniform(2.4, 6.0), rng.uniform(0.05, 2.0)
         start = slew(seed, eta, 30.0)
         t_f = float(rules.shortest_time(start.plant.inertia, start.initial.q, vector(eta), vector(limit)))
-        flown = fly(slew(seed, eta, t_f))
-        assert int(flown.status) == rollout.OK
+        simulated = fly(slew(seed, eta, t_f))
+        assert int(simulated.status) == rollout.OK
         # the torque of an undisturbed slew is proportional to 1 / t_f^2
-        needed = t_f * np.sqrt(float(flown.metrics.peak_torque) / limit)
+        needed = t_f * np.sqrt(float(simulated.metrics.peak_torque) / limit)
         assert needed <= t_f * (1 + 1e-6)
         assert below or needed >= 0.99 * t_f
 
@@ -219,11 +219,11 @@ def test_exact_input_equals_the_simulated_input():
     for reference, start, eta in ((still, rest, 2.1), (spin, rate, 3.0), (spin, rest, 5.0)):
         run = parts(25.0, eta, 0.5, inertia=FULL_INERTIA, reference=reference, rate=start, disturbance=QUIET)
         run = dataclasses.replace(run, observer=dataclasses.replace(run.observer, disturbance_rate_bound=vector(0.0)))
-        flown = fly(run)
-        before = flown.log.t < 24.49
-        u = inputs_along(run, flown.log.t)[before]
+        simulated = fly(run)
+        before = simulated.log.t < 24.49
+        u = inputs_along(run, simulated.log.t)[before]
         # state errors of 1e-9 times gains 2 J eta^2 / tau^2 < 3000
-        np.testing.assert_allclose(flown.log.u[before], u, rtol=0, atol=3e-6)
+        np.testing.assert_allclose(simulated.log.u[before], u, rtol=0, atol=3e-6)
         _, u, _ = solutions.exact_path(run, 400)
         np.testing.assert_allclose(solutions.exact_peak(run), np.abs(u).max())
     pushed = dataclasses.replace(run, disturbance=disturbances.Constant(vector([0.01, -0.02, 0.0])))

@@ -139,7 +139,7 @@ def montecarlo(
         raise UsageError("--until-confident needs [requirements] on metrics in the scenario")
     from tuning.studies import campaign_folder
 
-    loaded = loaded if controller is None else flight_commands.flown(loaded)
+    loaded = loaded if controller is None else flight_commands.on_flight_clock(loaded)
     folder = campaign_folder.Folder(
         path, loaded, seed, 10_000 if trials is None else trials, metrics, bits, controller=controller
     )
@@ -169,7 +169,7 @@ def montecarlo(
                 campaign_folder.write_run_table(folder, report)
                 done = folder
             else:
-                done = _flown(folder, share, report, elsewhere, until_confident)
+                done = _simulated(folder, share, report, elsewhere, until_confident)
         if not a_part:
             return _summarised(done, common.quiet, common.figures)
     if not common.quiet:
@@ -198,7 +198,7 @@ def _elsewhere(cluster: str | None, tls: dict[str, str]) -> "contextlib.Abstract
     return contextlib.closing(clusters.connected(cluster, tls))
 
 
-def _flown(
+def _simulated(
     folder: "Folder",
     share: tuple[int, int],
     report: CampaignProgress,
@@ -210,12 +210,12 @@ def _flown(
 
     campaign_theory.prepare(folder)
     if width is None:
-        campaign_folder.fly(folder, share, report, elsewhere)
+        campaign_folder.simulate(folder, share, report, elsewhere)
     else:
         from tuning.studies import campaign_summary  # imported during the simulation
 
         stopped = campaign_summary.until_confident(
-            folder, width, lambda first: campaign_folder.fly(folder, share, report, elsewhere, first)
+            folder, width, lambda first: campaign_folder.simulate(folder, share, report, elsewhere, first)
         )
         folder = campaign_folder.settle(folder, stopped)
     campaign_theory.find(folder)

@@ -54,11 +54,11 @@ def export(
     return 0
 
 
-def flown(scenario: "Scenario") -> "Scenario":
+def on_flight_clock(scenario: "Scenario") -> "Scenario":
     """Return the scenario on the flight clock of exported C. Raises ScenarioError without one."""
     from ptsmc_jax.onboard import folder
 
-    return folder.flown(scenario)
+    return folder.on_flight_clock(scenario)
 
 
 def compiled(controller: Path, ready: "Study") -> "InTheLoop":

@@ -70,14 +70,14 @@ def simulate(
     from ptsmc_jax.simulation.computer import OURS
     from tuning.studies import single
 
-    loaded = loaded if controller is None else flight_commands.flown(loaded)
+    loaded = loaded if controller is None else flight_commands.on_flight_clock(loaded)
     ready = study(loaded, drawn=trial is not None)
     computer = None if controller is None else flight_commands.compiled(controller, ready)
     steps = timing.steps(ready.parts)
     if steps > LONG and not common.quiet:
         terminal.say(f"simulating {steps} integration steps with their history")
     with store.in_use(folder, force=common.force):
-        run = runs.fly(ready, seed, trial, OURS if computer is None else computer.software)
+        run = runs.simulate(ready, seed, trial, OURS if computer is None else computer.software)
         store.write(folder, lambda making: single.write(making, loaded, run, seed, trial, common.figures, computer))
     if not common.quiet:
         from tuning.output import run_report, summaries
@@ -147,14 +147,14 @@ def map_(
         raise UsageError(f"--y is {up.text}, but must be another key than --x")
     with store.in_use(folder, force=common.force):
         with progress.Progress(common.quiet) as report:
-            flown = mapping.fly(
+            simulated = mapping.simulate(
                 loaded, across, up, seed, trials, lambda done, total: report("simulating pairs", done, total)
             )
-        store.write(folder, lambda making: mapping.write(making, flown, seed, common.figures))
+        store.write(folder, lambda making: mapping.write(making, simulated, seed, common.figures))
     if not common.quiet:
         from tuning.output import map_report
 
-        pairs = [dataclasses.asdict(cell) for cell in flown.cells]
+        pairs = [dataclasses.asdict(cell) for cell in simulated.cells]
         terminal.say(*map_report.lines(pairs, (across.key, up.key), loaded.plant.kind), f"results in {folder}")
     return 0
 

@@ -56,12 +56,12 @@ def verdict(entry: Entry) -> str:
 
 def counts(summary: Campaign) -> Iterator[str]:
     """Return how the trials ended, and the reasons of failures."""
-    if summary.flown < summary.trials:
-        yield f"NOT finished: {summary.flown} of {summary.trials} trials are simulated"
+    if summary.simulated < summary.trials:
+        yield f"NOT finished: {summary.simulated} of {summary.trials} trials are simulated"
     for name in summary.unjudged:
         yield f"NOT finished: {name} is required and not judged yet; run the same `ptsmc montecarlo` again"
     source = f"the run table {summary.run_table} and seed" if summary.run_table else "seed"
-    yield f"{many(summary.flown, 'trial')} of {source} {summary.seed}: {listed(summary.counts)}"
+    yield f"{many(summary.simulated, 'trial')} of {source} {summary.seed}: {listed(summary.counts)}"
     for reason in summary.reasons:
         first = "" if reason.first_bad_time is None else f", the first at {reason.first_bad_time:.4g} s"
         yield f"  {reason.trials} {reason.status}: {reason.reason}{first}"

@@ -54,8 +54,10 @@ def _untold(name: str, change: str) -> Value:
     return Value(
         name,
         "arcsec",
-        lambda law: _angle(law.untold[change].window_error) if change in law.untold else None,
-        interval=lambda law: _angles(law.untold[change].window_error_interval) if change in law.untold else None,
+        lambda law: _angle(law.model_errors[change].window_error) if change in law.model_errors else None,
+        interval=lambda law: (
+            _angles(law.model_errors[change].window_error_interval) if change in law.model_errors else None
+        ),
     )
 
 
@@ -239,7 +241,7 @@ def lines(summary: Compare) -> Iterator[str]:
         if failures:
             yield f"  {sum(failures.values())} of {summary.trials} trials fail: {listed(failures)}"
         yield from (f"  {verdict}" for verdict in law.verdicts if not verdict.met)
-        for change, results in law.untold.items():
+        for change, results in law.model_errors.items():
             if results.failures:
                 yield f"  {results.failures} of {summary.trials} trials fail with {CHANGES[change]}"
     yield f"a trial has settled when its angle stays below {summary.settling_angle:g} rad"

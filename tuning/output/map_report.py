@@ -31,7 +31,7 @@ def lines(pairs: Sequence[Mapping[str, Any]], keys: tuple[str, str], plant: str)
         keys: across and up.
         plant: its kind.
     """
-    simulated = [pair for pair in pairs if pair["status"] == "flown"]
+    simulated = [pair for pair in pairs if pair["status"] == "simulated"]
     with_error = [pair for pair in simulated if pair["window_error"] == pair["window_error"]]  # not NaN
     if with_error:
         best = min(with_error, key=lambda pair: (_failed(pair), pair["window_error"]))

@@ -49,8 +49,10 @@ def heading(summary: Campaign) -> Iterator[str]:
     )
     if any(value is None for axes in pointing.budget.values() for value in axes.values()):
         few, more = (fewest_trials(pointing.probability, confidence) for confidence in USUAL)
-        ended_early = summary.flown - summary.counts["ok"] - summary.counts.get("not_converged", 0)  # without angles
-        if summary.flown >= more and ended_early:
+        ended_early = (
+            summary.simulated - summary.counts["ok"] - summary.counts.get("not_converged", 0)
+        )  # without angles
+        if summary.simulated >= more and ended_early:
             yield f"an angle is - because {ended_early} runs did not reach their end"
         else:
             yield f"an angle is - without {more} runs that all reach their end ({few} for 90 % confidence)"

@@ -86,7 +86,7 @@ class Group(msgspec.Struct, frozen=True):
 class Earlier(msgspec.Struct, frozen=True):
     """A search whose gains broke a limit on held-out trials."""
 
-    fresh_seed: int
+    held_out_seed: int
     margins: dict[str, float]
     over: dict[str, float]
 
@@ -160,7 +160,7 @@ class Trust(msgspec.Struct, frozen=True):
 
     influence: dict[str, str]
     margins: dict[str, Left] | None
-    slopes_off_central_differences: Numbers | None
+    gradient_error: Numbers | None
 
 
 class Check(msgspec.Struct, frozen=True):
@@ -193,7 +193,7 @@ class Tune(msgspec.Struct, frozen=True, kw_only=True):
     accuracy_gain_over_paper: Number
     accuracy_gain_interval: Interval
     training: Group
-    fresh: Group
+    held_out: Group
     paper: Group | None = None
     before: Group | None = None
     paper_refused: str | None
@@ -234,7 +234,7 @@ class Law(msgspec.Struct, frozen=True, kw_only=True):
     settling_time: Numbers | None
     settling_near_far: tuple[Number, Number] | None
     margins: dict[str, Left] | None
-    untold: dict[str, Changed]
+    model_errors: dict[str, Changed]
     verdicts: list[Entry]
 
 
@@ -313,7 +313,7 @@ class Campaign(msgspec.Struct, frozen=True, kw_only=True):
     seed: int
     run_table: str | None
     trials: int
-    flown: int
+    simulated: int
     unjudged: list[str]
     counts: dict[str, int]
     reasons: list[Reason]
@@ -397,7 +397,7 @@ def run(summary: Mapping[str, Any], plant: str) -> Run:
 
 def tune(summary: Mapping[str, Any]) -> Tune:
     """Return the summary of a tuning; see `read`."""
-    groups = {name: _folded(summary[name]) for name in ("training", "fresh", "paper", "before") if summary.get(name)}
+    groups = {name: _folded(summary[name]) for name in ("training", "held_out", "paper", "before") if summary.get(name)}
     return read(Tune, {**summary, **groups})
 
 

@@ -21,7 +21,7 @@ PAPER = {  # columns of the published gains in words
 
 def of(summary: Tune) -> Report:
     """Return the report of a tuning."""
-    first = formats.named_error(summary.fresh.number("window_error", "rms"), summary.plant, "RMS ")
+    first = formats.named_error(summary.held_out.number("window_error", "rms"), summary.plant, "RMS ")
     headline, mood = report.headline(summary.status, summary.verdicts, first)
     trust = [*advice(summary), *search(summary), *diagnostics(summary), *_shortest(summary)]
     sections = [
@@ -34,7 +34,7 @@ def of(summary: Tune) -> Report:
 
 def _groups(summary: Tune) -> dict[str, Group]:
     """Return the gains side by side, by the headings of their columns."""
-    groups = {summary.published_label: summary.paper, "before": summary.before, "tuned": summary.fresh}
+    groups = {summary.published_label: summary.paper, "before": summary.before, "tuned": summary.held_out}
     return {name: group for name, group in groups.items() if group is not None}
 
 
@@ -46,7 +46,7 @@ def gains(summary: Tune) -> Table:
     quantity, rows = formats.error_name(plant), list[tuple[str, ...]]()
     for gain in dict.fromkeys(name for group in groups.values() for name in group.gains):
         values = [group.gains.get(gain, group.gains.get(base(gain))) for group in groups.values()]
-        by_axis = gain == "observer_gain" and "observer_gain_1" in summary.fresh.gains
+        by_axis = gain == "observer_gain" and "observer_gain_1" in summary.held_out.gains
         if len(set(values)) > 1 and not by_axis:
             rows.append((gain, *(digits(v, ".6g") for v in values), summary.gain_units.get(base(gain), "-")))
 
@@ -54,7 +54,7 @@ def gains(summary: Tune) -> Table:
         rows.append((label, *map(text, groups.values()), unit))
 
     row(f"RMS {quantity}", lambda group: error(group.number("window_error", "rms"), plant))
-    if summary.fresh.floor:
+    if summary.held_out.floor:
         row(
             "ratio to the lower bound",
             lambda group: ratio(over_bound(group.number("window_error", "rms"), group.floor)),
@@ -67,42 +67,42 @@ def gains(summary: Tune) -> Table:
     ):
         unit = CATALOGUES[plant][metric].unit
         row(label, lambda group, m=metric, s=statistic: digits(group.number(m, s), ".4g"), unit)
-    row("failed or not converged", lambda group: str(summary.fresh.trials - group.counts["ok"]))
-    note = f"Results on {many(summary.fresh.trials, 'held-out trial')} ({summary.judged_on})."
+    row("failed or not converged", lambda group: str(summary.held_out.trials - group.counts["ok"]))
+    note = f"Results on {many(summary.held_out.trials, 'held-out trial')} ({summary.judged_on})."
     return Table(("", *groups, "unit"), rows, note)
 
 
 def accuracy(summary: Tune) -> Iterator[str]:
     """Return the error next to the lower bound and to the published gains."""
-    fresh, plant = summary.fresh, summary.plant
+    held_out, plant = summary.held_out, summary.plant
 
     def text(value: float) -> str:
         return error(value, plant)
 
     if summary.status == "interrupted":
         yield "these are the best gains so far; the same command resumes the search"
-    failures = failed(fresh.counts)
+    failures = failed(held_out.counts)
     if failures:
         count = sum(failures.values())
-        yield f"{count} of {fresh.trials} held-out trials fail with the tuned gains: {listed(failures)}"
-    on_fresh, on_training = fresh.metrics.get("window_error"), summary.training.metrics.get("window_error")
-    if on_fresh is not None and on_fresh.rms is not None:
-        times = over_bound(on_fresh.rms, fresh.floor)
-        bound = "" if times is None else f", {ratio(times)} times the lower bound of {error(fresh.floor, plant)}"
-        spread = interval(on_fresh.rms_interval, text)
-        yield f"held-out trials: {text(on_fresh.rms)}{spread}{bound}"
+        yield f"{count} of {held_out.trials} held-out trials fail with the tuned gains: {listed(failures)}"
+    on_held_out, on_training = held_out.metrics.get("window_error"), summary.training.metrics.get("window_error")
+    if on_held_out is not None and on_held_out.rms is not None:
+        times = over_bound(on_held_out.rms, held_out.floor)
+        bound = "" if times is None else f", {ratio(times)} times the lower bound of {error(held_out.floor, plant)}"
+        spread = interval(on_held_out.rms_interval, text)
+        yield f"held-out trials: {text(on_held_out.rms)}{spread}{bound}"
     if on_training is not None and on_training.rms is not None:
         spread = interval(on_training.rms_interval, text)
         yield f"training trials: {text(on_training.rms)}{spread}"
     yield from _beside_paper(summary)
     if summary.gains:
         yield f"tuned gains: {', '.join(f'{name} {value:.6g}' for name, value in summary.gains.items())}"
-    saturated = fresh.metrics.get("saturated")
+    saturated = held_out.metrics.get("saturated")
     if saturated and saturated.max and saturated.mean is not None:
         often = f"{percent(saturated.mean)} % of a trial on average, {percent(saturated.max)} % at most"
         yield f"the actuators saturate with the tuned gains: {often}"
     before = None if summary.before is None else summary.before.number("window_error", "rms")
-    after = fresh.number("window_error", "rms")
+    after = held_out.number("window_error", "rms")
     if before is not None and after is not None and before < after:
         theirs = summary.broken_by.get("before")
         why = f"they break {' and '.join(theirs)}" if theirs else "see tune.bounds and the requirements"
@@ -118,7 +118,7 @@ def _beside_paper(summary: Tune) -> Iterator[str]:
     )
     if summary.paper_refused:
         yield f"the published gains cannot be simulated in this scenario: {summary.paper_refused}"
-    if times is None or not summary.fresh.counts.get("ok", 0):
+    if times is None or not summary.held_out.counts.get("ok", 0):
         return
     if times >= 1.0:
         yield f"{ratio(times)} times as accurate as {paper}{interval(bounds, ratio)}"
@@ -195,8 +195,8 @@ def _continued(record: Search) -> Iterator[str]:
         for metric, reached in one.over.items():
             yield (
                 f"earlier gains reached {_of_limit(metric, reached):.4g} times the limit of {metric} on held-out "
-                f"trials (seed {one.fresh_seed}); the search continued with a reserve of {100 * margins[metric]:.2g} % "
-                f"instead of {100 * one.margins[metric]:.2g} %"
+                f"trials (seed {one.held_out_seed}); the search continued with a reserve of "
+                f"{100 * margins[metric]:.2g} % instead of {100 * one.margins[metric]:.2g} %"
             )
 
 
@@ -280,11 +280,11 @@ def advice(summary: Tune) -> Iterator[str]:
                 f"{verdict.metric}: kept in the search, but held-out trials reach {over:.3g} times the limit: tune "
                 f"with {larger} or {stricter}"
             )
-    trained, fresh = (
+    trained, held_out = (
         one.rms_interval if one else None
-        for one in (summary.training.metrics.get("window_error"), summary.fresh.metrics.get("window_error"))
+        for one in (summary.training.metrics.get("window_error"), summary.held_out.metrics.get("window_error"))
     )
-    if trained and fresh and trained[1] < fresh[0]:
+    if trained and held_out and trained[1] < held_out[0]:
         yield f"the gains fit the training trials too closely: tune with {larger}"
 
 
@@ -324,7 +324,7 @@ def diagnostics(summary: Tune) -> Iterator[str]:
         yield f"the influence of {unknown} is unknown: no training trial reaches its end between the bounds"
     if found is None:
         return
-    gradients = found.slopes_off_central_differences
+    gradients = found.gradient_error
     # a discontinuous sign has no margins to require
     required = gradients is None or any(v.metric in MARGINS for v in summary.verdicts)
     yield from margins_report.tuned(found.margins, required=required)

@@ -1,6 +1,6 @@
-"""Evaluation of a tuning problem at many points: simulation by `flights`, judgement by `objective`, and a journal.
+"""Evaluation of a tuning problem at many points, with a journal. `simulations` simulates and `objective` judges.
 
-`Evaluator` does the evaluation. Its results are `Measured` and, with gradients, `Sloped`.
+`Evaluator` does the evaluation. Its results are `Measured` and, with gradients, `MeasuredWithGradients`.
 """
 
 import re

@@ -15,7 +15,7 @@ import numpy as np
 from ptsmc_jax import configure, programs
 from ptsmc_jax.batching import lanes
 from ptsmc_jax.campaigns import montecarlo
-from ptsmc_jax.campaigns.montecarlo import Flown, Trials
+from ptsmc_jax.campaigns.montecarlo import Simulated, Trials
 from ptsmc_jax.dispersions.base import INERTIA, Coordinates
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.simulation.catalogues import POINTING
@@ -62,11 +62,11 @@ def movable(dispersion: Dispersion) -> tuple[str, ...]:
     return tuple(name for name in dispersion.kinds if name != INERTIA)
 
 
-def simulate(batch: Batch, gains: np.ndarray) -> Flown:
+def simulate(batch: Batch, gains: np.ndarray) -> Simulated:
     """Simulate the trials at every point of gains, (points, gains). Return arrays (points, trials)."""
     rows = _Rows(len(gains), len(batch.trials), ROWS)
 
-    def call(some: dict[str, Any], needed: np.int32) -> Flown:
+    def call(some: dict[str, Any], needed: np.int32) -> Simulated:
         return _simulate(*batch.shared, some, needed, batch.names, batch.pointing, rows.devices)
 
     return rows.apply(call, {"gains": gains}, batch.by_trial)
@@ -171,20 +171,20 @@ def _simulate(
     names: tuple[str, ...],
     pointing: tuple[str, ...],
     devices: int,
-) -> Flown:
+) -> Simulated:
     """Simulate rows and return arrays (devices, rows, trials). Rows from index `needed` on are zero.
 
     The 52 pointing metrics make up half of the program. It therefore contains only the pointing metrics in `pointing`.
     """
     skipped = {*POINTING} - {*pointing}
 
-    def one(gains: jax.Array, trial: jax.Array, coordinates: Coordinates) -> Flown:
+    def one(gains: jax.Array, trial: jax.Array, coordinates: Coordinates) -> Simulated:
         moved = with_gains(parts, dict(zip(names, gains, strict=True)))
         simulated = montecarlo.one(moved, dispersion, seed, trial, coordinates)
         metrics = Metrics({name: value for name, value in simulated.metrics.items() if name not in skipped})
         return simulated._replace(metrics=metrics)
 
-    def simulate_row(row: dict[str, Any]) -> Flown:
+    def simulate_row(row: dict[str, Any]) -> Simulated:
         return lanes.vmap(one, (None, 0, 0), kernel=montecarlo.by_kernel())(
             row["gains"], row["trial"], row["coordinates"]
         )

@@ -36,7 +36,7 @@ def of(folder: Folder, summary: dict[str, Any]) -> dict[str, Figure]:
 
     figures: dict[str, Figure] = {}
     if finished.any():
-        if folder.flies:  # campaigns store no histories, so the figure simulates its trials again
+        if folder.can_simulate:  # campaigns store no histories, so the figure simulates its trials again
             figures |= _fan(folder, frame, finished)
         figures["distributions"] = plots.distributions(
             {name: column(name, np.where(finished, frame[name].to_numpy(), np.nan)) for name in names}
@@ -98,6 +98,6 @@ def _fan(folder: Folder, frame: pl.DataFrame, finished: np.ndarray) -> dict[str,
     trials, window = frame["trial"].to_numpy(), frame["window_error"].to_numpy()  # a shard has some of the trials
     shown = trials[:DRAWN]
     hardest = int(np.argmax(np.where(finished & np.isfinite(window), window, -np.inf)))
-    t, error = flying.history(folder.flights, np.append(shown, trials[hardest]).astype(np.uint32))
-    flown, worst, ended = folder.scenario, (int(trials[hardest]), error[-1]), error[:-1][finished[: shown.size]]
-    return {"fan": plots.fan(t, ended, worst, flown.controller.t_f, flown.plant.kind)} if ended.any() else {}
+    t, error = flying.history(folder.without_metrics, np.append(shown, trials[hardest]).astype(np.uint32))
+    simulated, worst, ended = folder.scenario, (int(trials[hardest]), error[-1]), error[:-1][finished[: shown.size]]
+    return {"fan": plots.fan(t, ended, worst, simulated.controller.t_f, simulated.plant.kind)} if ended.any() else {}

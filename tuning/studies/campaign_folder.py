@@ -1,7 +1,7 @@
 """Campaign folders: create, open and identify a Monte Carlo campaign, and simulate its trials.
 
 A campaign is identified by its scenario, its seed and checksums of all custom code. `Folder` has these data. `begin`
-creates a folder, `opened` reads one, and `fly` simulates the missing trials. Read `Folder` first.
+creates a folder, `opened` reads one, and `simulate` simulates the missing trials. Read `Folder` first.
 """
 
 import contextlib
@@ -151,7 +151,7 @@ class Folder:
         """
         if self.controller is None:
             return None
-        if not self.flies:
+        if not self.can_simulate:
             raise self._untrusted
         assert self.ready is not None
         self._check_unchanged(custom_parts.CONTROLLER)
@@ -170,7 +170,7 @@ class Folder:
         return OURS if self.computer is None else self.computer.software
 
     @property
-    def flies(self) -> bool:
+    def can_simulate(self) -> bool:
         """Whether the trials can be simulated without executing untrusted code, apart from custom metrics."""
         return self.ready is not None and (self.controller is None or self.trusted)
 
@@ -191,7 +191,7 @@ class Folder:
         return table
 
     @cached_property
-    def flights(self) -> Campaign:
+    def without_metrics(self) -> Campaign:
         """The campaign without custom metrics. Raises RefusedError if it needs untrusted code."""
         if self.ready is None:
             raise self._untrusted
@@ -209,8 +209,8 @@ class Folder:
         """
         custom_metrics = (
             self._with_custom_metrics.custom_metrics
-        )  # before `flights`, so that errors of the metrics are raised first
-        return replace(self.flights, custom_metrics=custom_metrics)
+        )  # before `without_metrics`, so that errors of the metrics are raised first
+        return replace(self.without_metrics, custom_metrics=custom_metrics)
 
     @cached_property
     def _with_custom_metrics(self) -> Campaign:
@@ -319,7 +319,7 @@ def opened(path: Path) -> Folder:
         made = msgspec.convert(versions, Made, strict=True)
         if made.metrics is not None:
             systems.named(made.metrics, CUSTOM)
-        flown = scenario.read(path / "scenario.toml")
+        simulated = scenario.read(path / "scenario.toml")
     except ScenarioError as error:
         raise RefusedError(f"{path} holds a campaign of no scenario that can be read: {error}") from None
     except RefusedError:
@@ -329,7 +329,7 @@ def opened(path: Path) -> Folder:
     digests = {name: value for name, value in versions.items() if name.endswith("_sha256") and isinstance(value, str)}
     return Folder(
         path=path,
-        scenario=flown,
+        scenario=simulated,
         seed=made.seed,
         trials=made.trials,
         custom_metrics=made.metrics,
@@ -362,7 +362,7 @@ def made_again(path: str, key: str) -> tuple[Campaign, Rows]:
     return folder.campaign, folder.rows
 
 
-def fly(
+def simulate(
     folder: Folder,
     shard: tuple[int, int],
     report: Callable[[Tally], None],
@@ -390,7 +390,7 @@ def fly(
     if alone:  # else other processes may be writing into the folder
         folder.rows.tidy(parts)
     wanted = flying.missing(parts, trials, shard)
-    landing = elsewhere(folder, wanted) if elsewhere else flying.here(folder.campaign.fly, folder.rows, wanted)
+    landing = elsewhere(folder, wanted) if elsewhere else flying.here(folder.campaign.simulate, folder.rows, wanted)
     flying.follow(landing, flying.tally(flying.staying(parts, wanted), trials), report)
     if alone:
         folder.rows.tidy(folder.rows.parts()[0])

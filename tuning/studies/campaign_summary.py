@@ -148,7 +148,7 @@ def summarise(folder: Folder) -> dict[str, Any]:
         "seed": folder.seed,
         "run_table": folder.table_name,
         "trials": folder.trials,
-        "flown": done,
+        "simulated": done,
         "unjudged": waiting,
         "counts": counts,
         "reasons": reasons,
@@ -348,9 +348,9 @@ class Replay:
 def replay(folder: Folder, trial: int) -> Replay:
     """Simulate a trial again: once as the campaign does, for its row, and once with its history."""
     campaign = folder.campaign
-    flown = trial if campaign.run_table is None else campaign.run_table.row(trial, folder.seed)
-    run = runs.fly(campaign.ready, folder.seed, flown, campaign.software)
-    again = campaign.fly([trial]).row(0, named=True)
+    simulated = trial if campaign.run_table is None else campaign.run_table.row(trial, folder.seed)
+    run = runs.simulate(campaign.ready, folder.seed, simulated, campaign.software)
+    again = campaign.simulate([trial]).row(0, named=True)
     rounding = max(_off(value, again[name]) for name, value in run.metrics.items())
     if run.status != again["status"]:
         rounding = np.inf

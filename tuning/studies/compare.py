@@ -35,7 +35,7 @@ from tuning.studies import judging, stability, tuner
 
 OURS, PAPER = "prescribed_time", "paper"  # the prescribed-time law with tuned gains, and with published gains
 OFF = 0.1  # relative difference between the true inertia and the design model
-UNTOLD = ("heavier", "lighter", "later")
+MODEL_ERRORS = ("heavier", "lighter", "later")
 # keys of `tune` that are the same for every law
 KEPT = ("minimise", "statistic", "level", "torque_weight", "worst_case", "trials", "starts", "steps")
 
@@ -44,7 +44,7 @@ KEPT = ("minimise", "statistic", "level", "torque_weight", "worst_case", "trials
 class Contender:
     """A law with its gains, judged on held-out trials."""
 
-    flown: Scenario
+    simulated: Scenario
     gains: dict[str, float]
     at_bound: dict[str, str]
     trials: Trials
@@ -64,7 +64,7 @@ class Comparison:
     """All contenders on the same trials: first the published gains if they can be simulated, then the tuned laws."""
 
     contenders: dict[str, Contender]
-    fresh_seed: int
+    held_out_seed: int
     interrupted: bool
     paper_refused: str | None = None  # reason why the published gains cannot be simulated
 
@@ -207,30 +207,30 @@ def _posed(other: Scenario, tune: tables.Tune, same: dict[str, Any]) -> Scenario
     return replace(other, tune={**same, "free": free, "bounds": {"t_f": tune.bounds["t_f"]}})
 
 
-def perturbed(flown: Scenario) -> dict[str, Scenario]:
-    """Return the scenario with each model error that the law does not know, by the names in `UNTOLD`.
+def perturbed(simulated: Scenario) -> dict[str, Scenario]:
+    """Return the scenario with each model error that the law does not know, by the names in `MODEL_ERRORS`.
 
     The true inertia is 10 % larger or smaller than in the design model, or the delay is one control period longer. A
     variant that is not a valid scenario is left out.
     """
-    assert isinstance(flown, SpacecraftScenario)
-    inertia = np.asarray(flown.true_inertia)
+    assert isinstance(simulated, SpacecraftScenario)
+    inertia = np.asarray(simulated.true_inertia)
     changes: list[dict[str, Any]] = [
         {"spacecraft__true_inertia": ((1.0 + OFF) * inertia).tolist()},
         {"spacecraft__true_inertia": ((1.0 - OFF) * inertia).tolist()},
-        {"hardware__delay": flown.devices.delay_periods + 1},
+        {"hardware__delay": simulated.devices.delay_periods + 1},
     ]
     others = {}
-    for name, change in zip(UNTOLD, changes, strict=True):
+    for name, change in zip(MODEL_ERRORS, changes, strict=True):
         with contextlib.suppress(ScenarioError):
-            others[name] = replace(flown, **change)
+            others[name] = replace(simulated, **change)
     return others
 
 
-def _with_more(one: Contender, fresh_seed: int) -> Contender:
+def _with_more(one: Contender, held_out_seed: int) -> Contender:
     """Return the contender with its stability margins, and with the trials under the model errors of `perturbed`."""
-    changed = {name: judging.judge(other, fresh_seed) for name, other in perturbed(one.flown).items()}
-    return dataclasses.replace(one, margins=stability.worst(study(one.flown)), changed=changed)
+    changed = {name: judging.judge(other, held_out_seed) for name, other in perturbed(one.simulated).items()}
+    return dataclasses.replace(one, margins=stability.worst(study(one.simulated)), changed=changed)
 
 
 def compare(
@@ -255,31 +255,31 @@ def compare(
     Raises:
         ScenarioError: a law cannot control the scenario.
     """
-    fresh_seed = judging.seed_of_judge(seed)
+    held_out_seed = judging.seed_of_judge(seed)
     rivals = that_fly(scenario) if rivals is None else rivals
     others, refused = judging.beside(scenario)
     found, interrupted = {}, False
     if PAPER in others:
         tell("published gains: verifying on held-out trials", 0, 0, np.nan, 0.0)
-        found[PAPER] = _with_more(_papers(judging.as_flown(others[PAPER]), fresh_seed), fresh_seed)
+        found[PAPER] = _with_more(_published(judging.on_flight_clock(others[PAPER]), held_out_seed), held_out_seed)
     for law, posed in rivals.items():
         report = headed(tell, law)
         # more tries would judge the laws on different held-out trials
         tuned = tuner.tune(posed, seed, report, journal, trusted=False, tries=1)
-        fresh, floor = tuned.fresh["tuned"], tuned.floors["tuned"]
-        found[law] = Contender(tuned.tuned, tuned.gains, tuned.at_bound, fresh, tuned.verdicts, floor)
+        held_out, floor = tuned.held_out["tuned"], tuned.floors["tuned"]
+        found[law] = Contender(tuned.tuned, tuned.gains, tuned.at_bound, held_out, tuned.verdicts, floor)
         interrupted = tuned.search.interrupted
         if interrupted:
             break
         report("judging with another inertia and delay than it knows", 0, 0, np.nan, 0.0)
-        found[law] = _with_more(found[law], fresh_seed)
-    return Comparison(found, fresh_seed, interrupted, refused)
+        found[law] = _with_more(found[law], held_out_seed)
+    return Comparison(found, held_out_seed, interrupted, refused)
 
 
-def _papers(flown: Scenario, fresh_seed: int) -> Contender:
-    trials = judging.judge(flown, fresh_seed)
-    verdicts, floor = judging.verdicts_of(flown, trials, fresh_seed), judging.floor_of(flown, fresh_seed)
-    return Contender(flown, gains.gains_of(study(flown).parts), {}, trials, verdicts, floor)
+def _published(simulated: Scenario, held_out_seed: int) -> Contender:
+    trials = judging.judge(simulated, held_out_seed)
+    verdicts, floor = judging.verdicts_of(simulated, trials, held_out_seed), judging.floor_of(simulated, held_out_seed)
+    return Contender(simulated, gains.gains_of(study(simulated).parts), {}, trials, verdicts, floor)
 
 
 def figures_of(contender: Contender) -> dict[str, Any]:
@@ -313,7 +313,7 @@ def figures_of(contender: Contender) -> dict[str, Any]:
         "settling_by_angle": float(rank(angle[settled], times)[0]) if spread else None,
         "settling_near_far": _near_far(angle, times_or_never) if spread else None,
         "margins": contender.margins,
-        "untold": {name: _perturbed_figures(other) for name, other in contender.changed.items()},
+        "model_errors": {name: _perturbed_figures(other) for name, other in contender.changed.items()},
         "verdicts": [verdict.in_summary() for verdict in contender.verdicts],
     }
 
@@ -356,14 +356,14 @@ def summary(comparison: Comparison) -> dict[str, Any]:
     first = next(iter(found.values()))
     return {
         "status": comparison.status,
-        "seed": comparison.fresh_seed,
+        "seed": comparison.held_out_seed,
         "trials": int(first.trials.status.size),
         "paper_refused": comparison.paper_refused,
-        "published_label": gains.published_label(found[PAPER].flown) if PAPER in found else None,
+        "published_label": gains.published_label(found[PAPER].simulated) if PAPER in found else None,
         "judged_on": "flight clock",  # no sign function is named here, because the laws have different ones
-        "settling_angle": first.flown.loop.settling_angle,
+        "settling_angle": first.simulated.loop.settling_angle,
         "laws": {law: figures_of(contender) for law, contender in found.items()},
-        "cautions": list(dict.fromkeys(text for one in found.values() for text in cautions.of(one.flown))),
+        "cautions": list(dict.fromkeys(text for one in found.values() for text in cautions.of(one.simulated))),
     }
 
 
@@ -381,7 +381,7 @@ def write(folder: Path, scenario: Scenario, comparison: Comparison, figures: boo
     store.record(folder, parsing.dump(scenario), known_by, said)
     (folder / "scenarios").mkdir()
     for law, contender in comparison.contenders.items():
-        tables = custom_parts.carry(parsing.dump(contender.flown), folder / "scenarios")
+        tables = custom_parts.carry(parsing.dump(contender.simulated), folder / "scenarios")
         store.write_toml(folder / "scenarios" / f"{law}.toml", tables)
     store.write_csv(folder / "compare.csv", *_rows(scenario, said))
     if figures:
@@ -398,7 +398,8 @@ def _rows(scenario: Scenario, said: Mapping[str, Any]) -> tuple[list[str], list[
     required = [name for name in catalogues.MARGINS if name in scenario.requirements]
     nominal = [name for name in catalogues.MARGINS if name not in required]  # of the nominal loop in the hold phase
     head = ["law", *_COLUMNS, *(f"settling_time_{100 * float(q):g}" for q in _SHARES), *required, *nominal,
-            "window_error_low", "window_error_high", *(f"window_error_{name}" for name in UNTOLD), "gains"]  # fmt: skip
+            "window_error_low", "window_error_high", *(f"window_error_{name}" for name in MODEL_ERRORS),
+            "gains"]  # fmt: skip
 
     def row(law: str, figures: Mapping[str, Any]) -> list[Any]:
         worst = {v["metric"]: v["worst"] for v in figures["verdicts"]}
@@ -406,7 +407,7 @@ def _rows(scenario: Scenario, said: Mapping[str, Any]) -> tuple[list[str], list[
         return [
             law, *(figures[name] for name in _COLUMNS), *((figures["settling_time"] or {}).get(q) for q in _SHARES),
             *map(worst.get, required), *map(hold.get, nominal), *(figures["window_error_interval"] or (None, None)),
-            *(figures["untold"].get(name, {}).get("window_error") for name in UNTOLD),
+            *(figures["model_errors"].get(name, {}).get("window_error") for name in MODEL_ERRORS),
             "; ".join(f"{name} = {value:.6g}" for name, value in figures["gains"].items()),
         ]  # fmt: skip
 
@@ -416,12 +417,12 @@ def _rows(scenario: Scenario, said: Mapping[str, Any]) -> tuple[list[str], list[
 def _figures(comparison: Comparison) -> Iterator[tuple[str, Any]]:
     sets = {law: contender.trials for law, contender in comparison.contenders.items()}
     ours = comparison.contenders[OURS]
-    t_f = ours.flown.controller.t_f
+    t_f = ours.simulated.controller.t_f
     yield "settling", study_plots.settling_by_angle(
         {law: (np.degrees(t.drawn["initial_angle"]), np.where(t.finished, t.metrics.settling_time, np.nan))
          for law, t in sets.items()}, t_f,
     )  # fmt: skip
-    limit = tables.limit_of(ours.flown, "peak_torque")
+    limit = tables.limit_of(ours.simulated, "peak_torque")
     yield "tradeoff", study_plots.tradeoff(
         {law: (t.metrics.window_error[t.finished], t.metrics.peak_torque[t.finished]) for law, t in sets.items()
          if t.finished.any()}, limit,

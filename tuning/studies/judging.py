@@ -30,8 +30,8 @@ def seed_of_judge(seed: int, turn: int = 0) -> int:
         turn: number of earlier searches whose gains broke a limit on their held-out trials.
     """
     name = f"fresh trials {turn}" if turn else "fresh trials"
-    fresh = draws.derive(seed, name)
-    return fresh if fresh != seed else draws.derive(seed, f"{name}, others")
+    held_out = draws.derive(seed, name)
+    return held_out if held_out != seed else draws.derive(seed, f"{name}, others")
 
 
 def beside(scenario: Scenario) -> tuple[dict[str, Scenario], str | None]:
@@ -44,45 +44,45 @@ def beside(scenario: Scenario) -> tuple[dict[str, Scenario], str | None]:
     """
     try:
         paper = gains.published_scenario(scenario)
-        study(as_flown(paper))
+        study(on_flight_clock(paper))
     except ScenarioError as error:
         return {"before": scenario}, str(error)
     return {"paper": paper} | ({"before": scenario} if gains.differ(scenario, paper) else {}), None
 
 
-def judge(scenario: Scenario, fresh_seed: int, reach: Reach | None = None) -> Trials:
+def judge(scenario: Scenario, held_out_seed: int, reach: Reach | None = None) -> Trials:
     """Simulate a scenario on its held-out trials, on the flight clock.
 
     Args:
         scenario: with the gains.
-        fresh_seed: of the held-out trials.
+        held_out_seed: of the held-out trials.
         reach: ranges of the gains that share a compiled program; None: those of the scenario.
     """
-    flown = study(as_flown(scenario), reach=reach)
-    return montecarlo.run(flown.parts, flown.dispersion, fresh_seed, np.arange(held_out_trials(flown)))
+    simulated = study(on_flight_clock(scenario), reach=reach)
+    return montecarlo.run(simulated.parts, simulated.dispersion, held_out_seed, np.arange(held_out_trials(simulated)))
 
 
-def floor_of(scenario: Scenario, fresh_seed: int) -> float | None:
+def floor_of(scenario: Scenario, held_out_seed: int) -> float | None:
     """Return the lower bound of the RMS window error on the flight clock, see `runs.floor`."""
-    return runs.floor(study(as_flown(scenario)), fresh_seed)
+    return runs.floor(study(on_flight_clock(scenario)), held_out_seed)
 
 
-def verdicts_of(scenario: Scenario, trials: Trials, fresh_seed: int) -> list[Verdict]:
+def verdicts_of(scenario: Scenario, trials: Trials, held_out_seed: int) -> list[Verdict]:
     """Return the verdicts on the requirements, and on the required margins of the loop.
 
     Args:
         scenario: with the requirements and the gains.
         trials: the held-out trials of these gains.
-        fresh_seed: of these trials.
+        held_out_seed: of these trials.
     """
-    ready = study(as_flown(scenario))
+    ready = study(on_flight_clock(scenario))
     one = 0 if trials.status.size == 1 else slice(None)  # one nominal trial: a required fraction has no meaning
 
     def values(name: str) -> np.ndarray:
         return getattr(trials.metrics, name)[one]
 
-    flown = requirements.verdicts(ready.requirements, values, trials.finished[one])
-    return [*flown, *margin_verdicts.over_trials(ready, fresh_seed)]
+    simulated = requirements.verdicts(ready.requirements, values, trials.finished[one])
+    return [*simulated, *margin_verdicts.over_trials(ready, held_out_seed)]
 
 
 def met(verdicts: Sequence[Verdict], trials: Trials) -> bool:
@@ -119,18 +119,18 @@ def largest(name: str, scenario: Scenario, trials: Trials) -> float:
     return statistics.value_at(values, min(1.0, share * trials.status.size / values.size)) if values.size else np.nan
 
 
-def as_flown(scenario: Scenario) -> Scenario:
+def on_flight_clock(scenario: Scenario) -> Scenario:
     """Return the scenario on the flight clock. A scenario with the continuous loop does not change."""
     return replace(scenario, loop__clock="flight") if scenario.sampled else scenario
 
 
-def judged_on(flown: Scenario) -> str:
+def judged_on(simulated: Scenario) -> str:
     """Return the clock and the sign function of the simulations in words, for reports."""
-    if not flown.sampled:
+    if not simulated.sampled:
         return "the continuous loop"
-    if getattr(flown.controller, "implicit", False):
+    if getattr(simulated.controller, "implicit", False):
         return "flight clock, the sign solved for"
-    width = getattr(flown.controller, "sign_width", None)
+    width = getattr(simulated.controller, "sign_width", None)
     if width is None:
         return "flight clock"
     return "flight clock, " + (f"sign {width:g} wide" if width else "exact sign")

@@ -1,7 +1,7 @@
 """`ptsmc map`: accuracy, peak torque and stability margins over a grid of values for two scenario keys.
 
 Each pair of values is simulated. Linear covariance analysis and the poles of the frozen loop give the predictions of
-linear theory. Read `fly` first.
+linear theory. Read `simulate` first.
 """
 
 from collections.abc import Callable
@@ -132,7 +132,7 @@ def usual_deltas(scenario: Scenario) -> str:
     return f"{DELTA}={min(delta, shortest):.4g}:{longest:.4g}:9"
 
 
-def fly(scenario: Scenario, x: Axis, y: Axis, seed: int, trials: int, tell: Callable[[int, int], None]) -> Map:
+def simulate(scenario: Scenario, x: Axis, y: Axis, seed: int, trials: int, tell: Callable[[int, int], None]) -> Map:
     """Simulate the scenario's trials for every pair of values.
 
     Args:
@@ -219,9 +219,9 @@ def _common(parts: list[Parts]) -> Callable[[Parts], Parts]:
 def _cell(x: float, y: float, ready: Study, common: Callable[[Parts], Parts], seed: int, trials: int) -> Cell:
     count = judging.trials_of(ready, trials)
     parts = common(ready.parts)
-    flown = montecarlo.run(parts, ready.dispersion, seed, np.arange(count))
-    done, counts = flown.finished, flown.counts()
-    errors, peaks = flown.metrics.window_error[done], flown.metrics.peak_torque[done]
+    simulated = montecarlo.run(parts, ready.dispersion, seed, np.arange(count))
+    done, counts = simulated.finished, simulated.counts()
+    errors, peaks = simulated.metrics.window_error[done], simulated.metrics.peak_torque[done]
     figures: dict[str, float] = {}
     if done.any():
         figures = {
@@ -244,7 +244,7 @@ def _cell(x: float, y: float, ready: Study, common: Callable[[Parts], Parts], se
             expected = covariance.noise(parts)
             if expected.converged:
                 figures |= {"linear_window_error": expected.window_error, "linear_torque": expected.torque}
-    return Cell(x, y, "flown", count, int(np.sum(~done)), counts["not_converged"], **figures)
+    return Cell(x, y, "simulated", count, int(np.sum(~done)), counts["not_converged"], **figures)
 
 
 def lines(scenario: Scenario, x: Axis, y: Axis) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -280,7 +280,7 @@ def lines(scenario: Scenario, x: Axis, y: Axis) -> dict[str, tuple[np.ndarray, n
     return drawn
 
 
-def spillover(flown: Map) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def spillover(simulated: Map) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Return the stability limits of a loop with flexible modes, which the law does not model, by label.
 
     Each curve is the contour where the spectral radius of the frozen loop is 1, at the hand-over or in the hold phase.
@@ -288,13 +288,13 @@ def spillover(flown: Map) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     Returns:
         Coordinates x (points,) and y (points,) of each curve; NaN separates its pieces. Empty without flexible modes.
     """
-    if getattr(flown.scenario, "flexible", None) is None:
+    if getattr(simulated.scenario, "flexible", None) is None:
         return {}
-    axes = flown.x, flown.y
+    axes = simulated.x, simulated.y
     across, up = (np.log(one.values) if one.logarithmic else np.asarray(one.values) for one in axes)
     drawn = {}
     for name, label in (("radius", "border by linear theory, at the hand-over"), ("hold_radius", "the same in hold")):
-        grid = flown.grid(name)
+        grid = simulated.grid(name)
         off = np.ma.masked_invalid(np.log(np.where(grid > 0.0, grid, np.nan)))
         pieces: Any = contour_generator(across, up, off).lines(margins.NEUTRAL)
         if pieces:
@@ -312,16 +312,16 @@ def _label(scenario: Scenario, key: str) -> str:
     return f"{key} [{unit}]" if unit else key
 
 
-def write(folder: Path, flown: Map, seed: int, figures: bool) -> None:
+def write(folder: Path, simulated: Map, seed: int, figures: bool) -> None:
     """Write a result folder: `map.csv` and figures.
 
     Args:
         folder: an empty folder.
-        flown: the results.
+        simulated: the results.
         seed: of dispersions and noise.
         figures: write figures too.
     """
-    scenario, x, y, cells = flown.scenario, flown.x, flown.y, flown.cells
+    scenario, x, y, cells = simulated.scenario, simulated.x, simulated.y, simulated.cells
     trials = max((cell.trials for cell in cells), default=0)
     made_by = {"command": "map", "seed": seed, "x": x.text, "y": y.text, "trials": trials, **custom.digests(scenario)}
     store.record(folder, parsing.dump(scenario), made_by)
@@ -331,7 +331,7 @@ def write(folder: Path, flown: Map, seed: int, figures: bool) -> None:
     store.write_csv(folder / "map.csv", [x.key, y.key, *fields], rows)
     if figures:
         names = ("window_error", "linear_window_error", "peak_torque", "largest_peak_torque")
-        grids = {name: flown.grid(name) for name in names}
+        grids = {name: simulated.grid(name) for name in names}
         if not any(np.isfinite(grid).any() for grid in grids.values()):
             return  # every trial of every pair failed, so that there is nothing to plot
         across, up = (study_plots.MapAxis(_label(scenario, one.key), one.values, one.logarithmic) for one in (x, y))
@@ -339,8 +339,8 @@ def write(folder: Path, flown: Map, seed: int, figures: bool) -> None:
             across,
             up,
             grids,
-            flown.grid("failures") + flown.grid("not_converged") > 0,
-            lines(scenario, x, y) | spillover(flown),
+            simulated.grid("failures") + simulated.grid("not_converged") > 0,
+            lines(scenario, x, y) | spillover(simulated),
             scenario.plant.kind,
         )
         style.save({"map": drawn}, folder / "figures")

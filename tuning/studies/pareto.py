@@ -46,21 +46,21 @@ def trace(trade: Trade, seed: int, tell: Report = lambda *_: None, journal: Jour
         tell: called with the progress after every step.
         journal: evaluations of an interrupted search, which then resumes.
     """
-    posed = posing.pose(trade.base, seed, journal, **trade.farther)
+    posed = posing.tuning_problem(trade.base, seed, journal, **trade.farther)
     reach = posing.reach(trade.base, trade.base.search, **trade.farther) if trade.farther else None
     targets, known = trade.targets(posed, tell)
     best = refined(targets, known, posed, tell)
-    chosen, fresh_seed, judged = apart(best) if trade.merged else best, judging.seed_of_judge(seed), []
+    chosen, held_out_seed, judged = apart(best) if trade.merged else best, judging.seed_of_judge(seed), []
     for done, k in enumerate(sorted(chosen)):
         tell("judging on held-out trials", done, len(chosen), np.nan, 0.0)
         found, value = posed.named(chosen[k].normalised), targets[k].value
         tuned = trade.tuned(value, found)
-        judged.append(_judged(trade, Point(value, found, trained=chosen[k].value), tuned, fresh_seed, reach))
+        judged.append(_judged(trade, Point(value, found, trained=chosen[k].value), tuned, held_out_seed, reach))
     others, refused = judging.beside(trade.scenario) if trade.compared else ({}, None)
     scenario = trade.scenario
 
     def reference(one: Scenario) -> Point:
-        return _judged(trade, Point(np.nan, gains.gains_of(study(one).parts)), one, fresh_seed, reach)[0]
+        return _judged(trade, Point(np.nan, gains.gains_of(study(one).parts)), one, held_out_seed, reach)[0]
 
     return Front(
         against=trade.against,
@@ -69,9 +69,9 @@ def trace(trade: Trade, seed: int, tell: Report = lambda *_: None, journal: Jour
         idle=[targets[k].value for k in best if k not in chosen],
         without=[target.value for k, target in enumerate(targets) if k not in best],
         trials=judged[0][1].status.size if judged else 0,
-        seed=fresh_seed,
+        seed=held_out_seed,
         interval_confidence=trust.CONFIDENCE,
-        floor=None if trade.farther else judging.floor_of(scenario, fresh_seed),  # it depends on t_f
+        floor=None if trade.farther else judging.floor_of(scenario, held_out_seed),  # it depends on t_f
         rollouts=posed.evaluate.rollouts,
         gradients=posed.evaluate.gradients,
         requirements=list(scenario.requirements),
@@ -118,10 +118,10 @@ def refined(targets: Sequence[Target], known: list[np.ndarray], posed: posing.Po
 def _refined(posed: posing.Posed, problem: Problem, known: np.ndarray) -> Best | None:
     """Return the best feasible gains, known ones or those of searches from the most promising known ones."""
     run = LocalSearches(posed.evaluate, MARGIN, STEPS, np.random.default_rng(0))
-    flown = posed.evaluate.measure(run.tightened(problem), known)
-    chosen = known[np.lexsort((flown.f, np.maximum(flown.largest_c - NEARLY, 0.0)))[:WARM]]
+    simulated = posed.evaluate.measure(run.tightened(problem), known)
+    chosen = known[np.lexsort((simulated.f, np.maximum(simulated.largest_c - NEARLY, 0.0)))[:WARM]]
     best = Best(known[0], len(problem.rows), MARGIN)
-    best.offer(known, flown)
+    best.offer(known, simulated)
     if posed.with_gradients:
         run.search_locally(problem, dict(enumerate(chosen)))
     else:
@@ -160,7 +160,7 @@ def _dominates(one: Judged, other: Judged) -> bool:
     if a is b or a.failures > b.failures or not (a.peak <= b.peak and a.rms < b.rms):
         return False
     both = trials.finished & others.finished
-    errors, error_of_others = (np.asarray(flown.metrics.window_error)[both] for flown in (trials, others))
+    errors, error_of_others = (np.asarray(simulated.metrics.window_error)[both] for simulated in (trials, others))
     interval = trust.ratio_interval(error_of_others, errors)
     return trials.status.size == 1 if interval is None else interval[0] > 1.0
 
@@ -188,7 +188,7 @@ def write(folder: Path, trade: Trade, front: Front, figures: bool, known_by: dic
     """
     kind, names = KINDS[front.against], gains.named(trade.scenario)
     store.record(folder, parsing.dump(trade.scenario), known_by, front.summary())
-    error, marks = ("rms_window_error", "rms_low", "rms_high"), ("dominated", "knee", "trained_goal")
+    error, marks = ("rms_window_error", "rms_low", "rms_high"), ("dominated", "knee", "trained_objective")
     costs = front.points[0].costs if front.points else ()
     header = [kind.column, *names, *error, *costs, "failures", "meets", *(marks if trade.compared else ())]
     rows = [

@@ -1,6 +1,6 @@
 """Turn a scenario into a tuning problem: training trials, limits, bounds of the gains, starting points.
 
-`pose` builds the problem, and `Posed.search` solves it. Read `pose` first.
+`tuning_problem` builds the problem, and `Posed.search` solves it. Read `tuning_problem` first.
 """
 
 import dataclasses
@@ -78,7 +78,7 @@ def with_bounds(scenario: Scenario, moved: Mapping[str, tuple[float, float]]) ->
     return msgspec.structs.replace(scenario, tune=tune)
 
 
-def pose(scenario: Scenario, seed: int, journal: Journal | None = None, **farther: float) -> Posed:
+def tuning_problem(scenario: Scenario, seed: int, journal: Journal | None = None, **farther: float) -> Posed:
     """Return the tuning problem of a scenario.
 
     Args:

@@ -17,7 +17,7 @@ from tuning.search import custom_parts, trust
 from tuning.search import gains as gain_names
 from tuning.search.local_searches import Step
 from tuning.studies import judging
-from tuning.studies.tuner import Beyond, Trust, Tuning
+from tuning.studies.tuner import BeyondBound, Trust, Tuning
 
 JUDGED = {"window_error": "rms", "peak_torque": "mean", "effort": "mean"}  # statistics with an interval
 
@@ -57,12 +57,12 @@ def summary(tuning: Tuning) -> dict[str, Any]:
     kind, search = tuning.tuned.plant.kind, tuning.search
     groups = {
         name: {
-            "seed": tuning.fresh_seed,
+            "seed": tuning.held_out_seed,
             "gains": tuning.judged_gains[name],
             "floor": tuning.floors[name],
             **statistics(trials, kind),
         }
-        for name, trials in tuning.fresh.items()
+        for name, trials in tuning.held_out.items()
     }
     hardest = None
     if search.hardest is not None:
@@ -76,10 +76,10 @@ def summary(tuning: Tuning) -> dict[str, Any]:
         "gain_units": gain_names.units_of(tuning.tuned),
         "gains": tuning.gains,
         "at_bound": tuning.at_bound,
-        **_accuracy_gain(tuning.fresh),
+        **_accuracy_gain(tuning.held_out),
         "interval_confidence": trust.CONFIDENCE,
         "training": {"seed": tuning.seed, **statistics(tuning.training, kind)},
-        "fresh": groups["tuned"],
+        "held_out": groups["tuned"],
         **{name: group for name, group in groups.items() if name != "tuned"},
         "paper_refused": tuning.paper_refused,
         "published_label": gain_names.published_label(tuning.tuned),
@@ -91,7 +91,7 @@ def summary(tuning: Tuning) -> dict[str, Any]:
         "search": {
             "objective": objective_name(tuning.tuned.search),
             "minimise": tuning.tuned.search.minimise,
-            "goal": search.value,
+            "objective_value": search.value,
             "starts": len({step.start for step in search.history}),
             "steps": len(search.history),
             "rounds_with_harder_trials": search.rounds,
@@ -118,15 +118,15 @@ def summary(tuning: Tuning) -> dict[str, Any]:
     }
 
 
-def _accuracy_gain(fresh: Mapping[str, Trials]) -> dict[str, Any]:
+def _accuracy_gain(held_out: Mapping[str, Trials]) -> dict[str, Any]:
     """Return the ratio of the published gains' RMS window error to the tuned gains' error, and its interval.
 
     The ratio is over the trials that reach their end with both sets of gains.
     """
-    both = fresh["tuned"].finished & fresh["paper"].finished if "paper" in fresh else np.zeros(0, bool)
+    both = held_out["tuned"].finished & held_out["paper"].finished if "paper" in held_out else np.zeros(0, bool)
     if not both.any():
         return {"accuracy_gain_over_paper": None, "accuracy_gain_interval": None}
-    paper, tuned = (np.asarray(fresh[name].metrics.window_error)[both] for name in ("paper", "tuned"))
+    paper, tuned = (np.asarray(held_out[name].metrics.window_error)[both] for name in ("paper", "tuned"))
     return {
         "accuracy_gain_over_paper": trust.rms(paper) / trust.rms(tuned),
         "accuracy_gain_interval": trust.ratio_interval(paper, tuned),
@@ -153,7 +153,7 @@ def _trust(found: Trust, tuning: Tuning) -> dict[str, Any]:
             influence[name] = border or _beyond(tuning.beyond.get(name), bound)
     slopes = found.gradient_error
     return {
-        "slopes_off_central_differences": None if slopes is None else dict(zip(("start", "end"), slopes, strict=True)),
+        "gradient_error": None if slopes is None else dict(zip(("start", "end"), slopes, strict=True)),
         "influence": influence,
         "sensitivities": found.sensitivities,
         "margins": found.margins,
@@ -161,7 +161,7 @@ def _trust(found: Trust, tuning: Tuning) -> dict[str, Any]:
     }
 
 
-def _beyond(seen: Beyond | None, bound: float) -> str:
+def _beyond(seen: BeyondBound | None, bound: float) -> str:
     """Return the results beyond a bound in words."""
     if seen is None:
         return f"on its bound {bound:g}; values beyond it were not simulated"
@@ -255,7 +255,7 @@ def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
         gain_names.published_label(scenario) if name == "paper" else name: (
             trials.metrics.window_error[trials.finished], trials.metrics.peak_torque[trials.finished]
         )
-        for name, trials in tuning.fresh.items()
+        for name, trials in tuning.held_out.items()
         if trials.finished.any()
     }  # fmt: skip
     if ended:

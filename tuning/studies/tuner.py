@@ -47,7 +47,7 @@ class Trust:
 
 
 @dataclass(frozen=True)
-class Beyond:
+class BeyondBound:
     """The results on held-out trials after moving one gain from its bound to a value beyond."""
 
     value: float  # of the gain
@@ -64,7 +64,7 @@ class Beyond:
 class Try:
     """A search whose gains kept every limit on the training trials, but broke a limit on the held-out trials."""
 
-    fresh_seed: int  # of the held-out trials
+    held_out_seed: int  # of the held-out trials
     gains: dict[str, float]
     margins: dict[str, float]  # distance from the limit of each metric in the search, as a fraction of the limit
     over: dict[str, float]  # judged value over the limit, for each metric that broke its limit on the held-out trials
@@ -80,17 +80,17 @@ class Tuning:
     earlier: list[Try]
     at_bound: dict[str, str]
     training: Trials  # tuned gains on the training trials
-    fresh: dict[str, Trials]  # held-out trials: "tuned" and the keys of `judging.beside`
+    held_out: dict[str, Trials]  # held-out trials: "tuned" and the keys of `judging.beside`
     paper_refused: str | None  # reason why the published gains cannot be simulated
     seed: int  # of the training trials and the search
-    fresh_seed: int  # of the held-out trials
-    judged_gains: dict[str, dict[str, float]]  # gains by name, for each key of `fresh`
-    floors: dict[str, float | None]  # lower bound of the RMS window error, for each key of `fresh`
+    held_out_seed: int  # of the held-out trials
+    judged_gains: dict[str, dict[str, float]]  # gains by name, for each key of `held_out`
+    floors: dict[str, float | None]  # lower bound of the RMS window error, for each key of `held_out`
     verdicts: list[Verdict]  # of the tuned gains on the held-out trials
     broken_by: dict[str, list[str]]  # gains that are more accurate than the tuned ones, and the metrics that they break
     shortest: ShortestTime | None  # shortest t_f that the torque limit allows; None: no torque limit, or t_f is tuned
     trust: Trust | None  # None: interrupted, or not requested
-    beyond: dict[str, Beyond]  # results beyond the bounds of gains that ended on a bound
+    beyond: dict[str, BeyondBound]  # results beyond the bounds of gains that ended on a bound
     check: Check | None  # comparison with a global search, if requested
     rollouts: int  # simulations of the search without gradients
     gradients: int  # simulations of the search with gradients
@@ -99,7 +99,7 @@ class Tuning:
     @property
     def met(self) -> bool:
         """Whether the held-out trials meet every requirement, and none of them failed."""
-        return judging.met(self.verdicts, self.fresh["tuned"])
+        return judging.met(self.verdicts, self.held_out["tuned"])
 
     @property
     def status(self) -> str:
@@ -150,7 +150,7 @@ def tune(
     """
     started = time.monotonic()
     report("compiling", 0, 0, np.nan, 0.0)
-    posed = posing.pose(scenario, seed, journal)
+    posed = posing.tuning_problem(scenario, seed, journal)
     others, refused = judging.beside(scenario)
     judged, earlier, posed = _search_and_judge(scenario, posed, journal, report, tries)
     evaluate = posed.evaluate
@@ -162,8 +162,8 @@ def tune(
     training = simulations.simulate_trials(
         problem.others(np.arange(problem.averaged)), np.asarray([*judged.gains.values()])
     )
-    candidates = {"tuned": judged.scenario} | {name: judging.as_flown(other) for name, other in others.items()}
-    fresh = {"tuned": judged.trials} | {name: judging.judge(other, judged.seed) for name, other in others.items()}
+    candidates = {"tuned": judged.scenario} | {name: judging.on_flight_clock(other) for name, other in others.items()}
+    held_out = {"tuned": judged.trials} | {name: judging.judge(other, judged.seed) for name, other in others.items()}
     shortest = _shortest(posed, judged)
     trust_in_it, beyond, at_bound = None, {}, evaluate.bounds.at_bound(outcome.gains)
     if trusted and not outcome.interrupted:
@@ -178,14 +178,14 @@ def tune(
         earlier=earlier,
         at_bound=at_bound,
         training=training,
-        fresh=fresh,
+        held_out=held_out,
         paper_refused=refused,
         seed=seed,
-        fresh_seed=judged.seed,
+        held_out_seed=judged.seed,
         judged_gains={name: gains.gains_of(study(one).parts) for name, one in candidates.items()},
         floors={name: judging.floor_of(one, judged.seed) for name, one in candidates.items()},
         verdicts=judged.verdicts,
-        broken_by=_broken_by(candidates, fresh, judged.seed),
+        broken_by=_broken_by(candidates, held_out, judged.seed),
         shortest=shortest,
         trust=trust_in_it,
         beyond=beyond,
@@ -240,7 +240,7 @@ def _in_larger_bounds(outcome: Search, posed: Posed, journal: Journal | None, re
         if not moved:
             break
         report(f"searching beyond the bounds of {', '.join(moved)}", 0, 0, outcome.value, outcome.violation)
-        larger = posing.pose(posing.with_bounds(scenario, moved), posed.seed, journal)
+        larger = posing.tuning_problem(posing.with_bounds(scenario, moved), posed.seed, journal)
         larger.evaluate.count_on(posed.evaluate)
         more = larger.search(larger.problem, outcome.gains, 1, report=report)
         history = [*outcome.history, *_after(outcome.history, more.history)]
@@ -264,13 +264,15 @@ def _that_matter(posed: Posed, outcome: Search, sides: dict[str, str]) -> dict[s
     return {name: side for (name, side), change in zip(sides.items(), changes[1:], strict=True) if change > trust.FLAT}
 
 
-def _judge(scenario: Scenario, posed: Posed, outcome: Search, fresh_seed: int) -> _Judged:
+def _judge(scenario: Scenario, posed: Posed, outcome: Search, held_out_seed: int) -> _Judged:
     """Simulate the rounded gains of a search on held-out trials."""
     begun = time.monotonic()
     rounded = posed.named(outcome.normalised)
-    flown = judging.as_flown(gains.in_scenario(scenario, rounded))
-    trials = judging.judge(flown, fresh_seed)
-    return _Judged(outcome, rounded, flown, fresh_seed, trials, judging.verdicts_of(flown, trials, fresh_seed), begun)
+    simulated = judging.on_flight_clock(gains.in_scenario(scenario, rounded))
+    trials = judging.judge(simulated, held_out_seed)
+    return _Judged(
+        outcome, rounded, simulated, held_out_seed, trials, judging.verdicts_of(simulated, trials, held_out_seed), begun
+    )
 
 
 def _shortest(posed: Posed, judged: _Judged) -> ShortestTime | None:
@@ -284,25 +286,25 @@ def _shortest(posed: Posed, judged: _Judged) -> ShortestTime | None:
     return shortest_time(judged.scenario, asked, judged.seed, judged.trials.trial)
 
 
-def _broken_by(candidates: dict[str, Scenario], fresh: dict[str, Trials], seed: int) -> dict[str, list[str]]:
+def _broken_by(candidates: dict[str, Scenario], held_out: dict[str, Trials], seed: int) -> dict[str, list[str]]:
     """Return the gains that are more accurate than the tuned gains, and the metrics whose requirements they break.
 
     Accuracy is compared over the trials that reach their end with both sets of gains.
 
     Args:
         candidates: scenario of each set of gains, by name.
-        fresh: their held-out trials, with the tuned gains as "tuned".
+        held_out: their held-out trials, with the tuned gains as "tuned".
         seed: of these trials.
     """
 
     def more_accurate(trials: Trials) -> bool:
-        both = trials.finished & fresh["tuned"].finished
-        there, here = (np.sum(np.asarray(t.metrics.window_error)[both] ** 2) for t in (trials, fresh["tuned"]))
+        both = trials.finished & held_out["tuned"].finished
+        there, here = (np.sum(np.asarray(t.metrics.window_error)[both] ** 2) for t in (trials, held_out["tuned"]))
         return bool(there < here)
 
     return {
         name: [one.metric for one in judging.verdicts_of(candidates[name], trials, seed) if not one.met]
-        for name, trials in fresh.items()
+        for name, trials in held_out.items()
         if more_accurate(trials)
     }
 
@@ -345,7 +347,7 @@ def _after(history: list[Step], more: list[Step]) -> list[Step]:
     return [replace(step, start=first + step.start) for step in more]
 
 
-def _beyond(judged: _Judged, at_bound: dict[str, str]) -> dict[str, Beyond]:
+def _beyond(judged: _Judged, at_bound: dict[str, str]) -> dict[str, BeyondBound]:
     """Simulate each gain that ended on a bound at a value beyond the bound, with the other gains unchanged.
 
     The result is empty for the continuous loop, and if the objective is not the window error. Gains without a valid
@@ -355,7 +357,7 @@ def _beyond(judged: _Judged, at_bound: dict[str, str]) -> dict[str, Beyond]:
         judged: the tuned gains.
         at_bound: "lower" or "upper" for each gain on a bound, by its name.
     """
-    beyond, tuned = dict[str, Beyond](), judged.scenario
+    beyond, tuned = dict[str, BeyondBound](), judged.scenario
     if not tuned.sampled or tuned.search.minimise != "window_error":
         return beyond
     for name, side in at_bound.items():
@@ -363,14 +365,14 @@ def _beyond(judged: _Judged, at_bound: dict[str, str]) -> dict[str, Beyond]:
         if value is None:
             continue
         try:
-            other = judging.as_flown(gains.in_scenario(tuned, {**judged.gains, name: value}))
+            other = judging.on_flight_clock(gains.in_scenario(tuned, {**judged.gains, name: value}))
             trials = judging.judge(other, judged.seed)
         except ScenarioError:  # no valid scenario beyond the bound
             continue
         both = trials.finished & judged.trials.finished
         there, here = (trust.rms(np.asarray(t.metrics.window_error)[both]) for t in (trials, judged.trials))
         broken = _broken(judging.verdicts_of(other, trials, judged.seed), trials)
-        beyond[name] = Beyond(value, float(there / here) if both.any() and here > 0.0 else None, broken)
+        beyond[name] = BeyondBound(value, float(there / here) if both.any() and here > 0.0 else None, broken)
     return beyond
 
 
@@ -385,7 +387,7 @@ def _broken(verdicts: list[Verdict], trials: Trials) -> str | None:
 
 def _prepare(scenario: Scenario) -> None:
     """Start to compile the programs that judge gains, in the background."""
-    flown = study(judging.as_flown(scenario))
-    montecarlo.prepare(flown.parts, flown.dispersion, judging.held_out_trials(flown))
+    simulated = study(judging.on_flight_clock(scenario))
+    montecarlo.prepare(simulated.parts, simulated.dispersion, judging.held_out_trials(simulated))
     if scenario.sampled:
-        run_margins.judged_jit.prepare(flown.parts)
+        run_margins.judged_jit.prepare(simulated.parts)
