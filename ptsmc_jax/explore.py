@@ -26,7 +26,7 @@ from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.computer import OURS, Software
 from ptsmc_jax.simulation.requirements import Verdict
-from ptsmc_jax.theory.error_floor import Floor
+from ptsmc_jax.theory.lower_bound import LowerBound
 
 
 class Quantities(Mapping[str, float]):
@@ -100,7 +100,7 @@ class Flight:
         return self.run.verdicts
 
     @property
-    def floor(self) -> Floor | None:
+    def floor(self) -> LowerBound | None:
         """Lower bound of the error along this run (posterior Cramer-Rao bound), over time.
 
         It is None if the run is incomplete or if its sensors are custom, since their measurement model is unknown.
@@ -242,7 +242,7 @@ def _software(controller: str | Path | None, ready: Study) -> Software:
 def floor(what: Scenario | Study | str | Path, *, seed: int = 0) -> float | None:
     """Return the lower bound of the RMS window error of a scenario, in the unit of the metric.
 
-    It is the posterior Cramer-Rao bound of a few trials, combined by `runs.floor`. `error_floor` lists the assumptions.
+    It is the posterior Cramer-Rao bound of a few trials, combined by `runs.floor`. `lower_bound` lists the assumptions.
     The bound is 0 if nothing is unknown, and None if no trial is complete or if the sensors are custom.
     """
     draws.check_whole_number("seed", seed)

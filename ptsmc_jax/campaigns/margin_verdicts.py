@@ -21,7 +21,7 @@ from ptsmc_jax.scenario import Study
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.catalogues import MARGINS
 from ptsmc_jax.simulation.requirements import Requirement, Verdict
-from ptsmc_jax.theory import linear, margins, rest, run_margins
+from ptsmc_jax.theory import limit_cycles, linear, margins, run_margins
 
 TRIALS = 256  # number of trials whose loops are judged if they differ
 # quantities that change the linearised loop: hardware errors, the body, and the trajectory
@@ -39,13 +39,13 @@ BOUNDS = (0.0, margins.MOST, -margins.MOST, 180.0, -180.0)
 def of_loop(parts: Parts, asked: Sequence[Requirement]) -> list[Verdict]:
     """Return the verdict on each required margin of the loop of these parts, see `run_margins.judged`.
 
-    There are no margins if the nominal run does not come to rest, see `rest`.
+    There are no margins if the nominal run does not come to rest, see `limit_cycles`.
     """
     if not asked:
         return []
     left, hold, history = jax.tree.map(np.asarray, run_margins.judged_jit(parts))
-    if rest.swing(parts, history) is not None:
-        left = rest.none_left(left, hold)
+    if limit_cycles.find(parts, history) is not None:
+        left = limit_cycles.none_left(left, hold)
     return _verdicts(asked, left.worst())
 
 
@@ -61,7 +61,7 @@ def over_trials(ready: Study, seed: int, rows: np.ndarray | Row | None = None) -
         The verdicts. The nominal run decides whether runs come to rest.
     """
     trials = _whose_loops_differ(ready, rows)
-    if trials is None or rest.swing(ready.parts) is not None:
+    if trials is None or limit_cycles.find(ready.parts) is not None:
         return of_loop(ready.parts, ready.margins)
     limits = {requirement.metric: requirement.limit for requirement in ready.margins}
     return _verdicts(ready.margins, worst(ready.parts, ready.dispersion, seed, trials, limits))

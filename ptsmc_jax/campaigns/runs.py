@@ -19,8 +19,8 @@ from ptsmc_jax.simulation.catalogues import Entry
 from ptsmc_jax.simulation.computer import OURS, Software
 from ptsmc_jax.simulation.requirements import Verdict
 from ptsmc_jax.simulation.rollout import Log, Parts
-from ptsmc_jax.theory import error_floor
-from ptsmc_jax.theory.error_floor import Floor
+from ptsmc_jax.theory import lower_bound
+from ptsmc_jax.theory.lower_bound import LowerBound
 
 FLOORS = 4  # trials whose lower bounds are pooled: they differ by a few per cent
 
@@ -50,12 +50,12 @@ class Run:
         return next((v.limit for v in self.verdicts if v.metric.startswith("peak_torque")), None)
 
     @cached_property
-    def floor(self) -> Floor | None:
-        """The lower bound of the error along this run, see `error_floor`.
+    def floor(self) -> LowerBound | None:
+        """The lower bound of the error along this run, see `lower_bound`.
 
         None: the run did not reach the end, or its sensors are custom and have no linear model.
         """
-        return error_floor.along(self.parts, self.log) if self.has_floor else None
+        return lower_bound.along(self.parts, self.log) if self.has_floor else None
 
     @property
     def has_floor(self) -> bool:
@@ -129,7 +129,7 @@ def _drawn(dispersion: Dispersion, parts: Parts, seed: jax.Array, trial: jax.Arr
 
 
 def floor(ready: Study, seed: int = 0, rows: Sequence[int | Row] = ()) -> float | None:
-    """Return the lower bound of the RMS window error, in its unit, see `error_floor`; 0 if nothing is unknown.
+    """Return the lower bound of the RMS window error, in its unit, see `lower_bound`; 0 if nothing is unknown.
 
     Args:
         ready: the scenario, ready to simulate.
@@ -142,4 +142,4 @@ def floor(ready: Study, seed: int = 0, rows: Sequence[int | Row] = ()) -> float 
     """
     trials = rows or (range(FLOORS) if ready.dispersion.varies else (None,))
     runs = [_simulate(ready, seed, trial) for trial in trials]
-    return error_floor.pooled(error_floor.along_each([(run.parts, run.log) for run in runs if run.has_floor]))
+    return lower_bound.pooled(lower_bound.along_each([(run.parts, run.log) for run in runs if run.has_floor]))

@@ -94,7 +94,7 @@ class SampleTimes:
 
     @property
     def _rounding(self) -> Any:
-        return guards.rounding(self.period, self.period)
+        return guards.time_tolerance(self.period, self.period)
 
     def _time(self, sample: Any) -> Any:
         return jnp.asarray(sample, float) * self.period
@@ -102,7 +102,7 @@ class SampleTimes:
     def _count(self, sample: Any, latency: Any = 0.0) -> Any:
         """Return the number of the newest reading that is at least a latency [s] old at a control sample."""
         t = self._time(sample)
-        return jnp.floor((t - latency + guards.rounding(self.period, t)) / self.interval)
+        return jnp.floor((t - latency + guards.time_tolerance(self.period, t)) / self.interval)
 
 
 def sample_times(interval: float, latency: float, period: float) -> SampleTimes:

@@ -124,7 +124,7 @@ class PerfectSensors(Sensor):
 
 
 class Reading(NamedTuple):
-    """Linear measurement model of a sensor near the true state, for `error_floor`.
+    """Linear measurement model of a sensor near the true state, for `lower_bound`.
 
     The coordinates are the local coordinates (n,) of the plant, see `Plant.retract`, and the sensor's own states
     (own,), such as the gyro bias.

@@ -46,7 +46,7 @@ class StarTimes:
     def _last(self, sample: Any) -> Any:
         """Return the number of the newest star tracker sample."""
         t = self._time(sample)
-        return jnp.floor((t + guards.rounding(self.period, t)) / self.interval)
+        return jnp.floor((t + guards.time_tolerance(self.period, t)) / self.interval)
 
 
 def star_times(interval: float, period: float) -> StarTimes:

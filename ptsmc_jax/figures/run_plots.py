@@ -12,7 +12,7 @@ from ptsmc_jax.figures.style import LIMIT, STYLES, figure_of, plain_ticks, with_
 from ptsmc_jax.plants.base import Chart
 from ptsmc_jax.simulation.rollout import Log, Parts
 from ptsmc_jax.theory import envelopes, solutions
-from ptsmc_jax.theory.error_floor import Floor
+from ptsmc_jax.theory.lower_bound import LowerBound
 
 FAR_OFF = 3.0  # a limit or command beyond this multiple of the curves is only named in the legend
 SMALLEST, LARGEST = 1e-16, 1e100  # smallest error and s, and largest number, that are drawn
@@ -21,7 +21,7 @@ EXACT: Any = {"color": "0.25", "lw": 0.9, "ls": (0, (1, 1.5))}  # line of the ex
 BOUND: Any = {"color": "0.35", "lw": 1.0, "ls": "--", "label": "bound, no noise"}
 
 
-def run_figures(parts: Parts, log: Log, limit: float | None, floor: Floor | None) -> dict[str, Figure]:
+def run_figures(parts: Parts, log: Log, limit: float | None, floor: LowerBound | None) -> dict[str, Figure]:
     """Return the figures of one run by name; log: numpy arrays (time, component); limit: of the torque [N m]."""
     log = jax.tree.map(lambda v: np.where(np.abs(v) < LARGEST, v, np.nan), log)
     figures = {"torque": torque(parts, log, limit)}
@@ -49,7 +49,7 @@ def state(parts: Parts, log: Log, chart: Chart, title: str | None = None) -> Fig
     return figure
 
 
-def error(parts: Parts, log: Log, floor: Floor | None = None) -> Figure:
+def error(parts: Parts, log: Log, floor: LowerBound | None = None) -> Figure:
     """Plot the error's 2-norm on a log scale, with its upper bound, lower bound, and the window of window_error."""
     figure, axes = figure_of("Error", _error_label(parts))
     size = np.linalg.norm(log.error, axis=1)

@@ -111,11 +111,11 @@ class Law(declare.Tunable):
         u = self.kinematics.invert(x, target, acceleration, d_hat)
         return u, s, memory[0] if memory else now.memory
 
-    def clearance(self, x: Any, target: Any) -> Scalar:
+    def singularity_distance(self, x: Any, target: Any) -> Scalar:
         """Return the distance to the singularity of the kinematics, or 1 if the law does not invert them."""
         if type(self).__call__ is not Law.__call__:
             return jnp.ones(())
-        return self.kinematics.clearance(x, target)
+        return self.kinematics.singularity_distance(x, target)
 
     def in_hold(self, t: Array, t_next: Array, hold: Bool[Array, "..."]) -> Bool[Array, "..."]:
         """Return which periods use the gains of the hold phase.

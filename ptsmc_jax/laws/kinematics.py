@@ -51,11 +51,11 @@ class Kinematics:
         """Return the same initial state in the representation that the law needs, such as the other sign of q."""
         return x
 
-    def clearance(self, x: Any, target: Any) -> Scalar:
+    def singularity_distance(self, x: Any, target: Any) -> Scalar:
         """Return the signed distance to the singularity: 0 on it, and 1 everywhere if there is none."""
         return jnp.ones(())
 
-    def clearance_unit(self, first: Scalar) -> Scalar:
+    def singularity_distance_unit(self, first: Scalar) -> Scalar:
         """Return the divisor that makes the distances to the singularity of a run start positive.
 
         Args:
@@ -145,7 +145,8 @@ class AdditiveKinematics(AttitudeKinematics):
     """The additive error eps_1 = q_1 - q_1f of the paper (4), which is singular at q4 = 0.
 
     At q4 = 0 the body is 180 degrees away from the inertial frame, for any reference. A law that inverts the kinematics
-    cannot cross the singularity. So `align` chooses the sign of q, and `clearance` is the distance to the singularity.
+    cannot cross the singularity. So `align` chooses the sign of q, and `singularity_distance` measures the
+    distance.
     The paper's bounded control is not global, because the bound grows like 1/q4. The body does not always take the
     shorter path: from 150 to -150 degrees about an axis it rotates by 300 degrees.
     """
@@ -158,7 +159,7 @@ class AdditiveKinematics(AttitudeKinematics):
         opposite = x.q[3] * target.q[3] < 0.0
         return x._replace(q=jnp.where(opposite, -x.q, x.q))
 
-    def clearance(self, x: AttitudeState, target: Target) -> Scalar:
+    def singularity_distance(self, x: AttitudeState, target: Target) -> Scalar:
         """Return q4 [-] with the sign that is positive on the reference's side. At 0 the law is singular."""
         return jnp.where(target.q[3] < 0.0, -x.q[3], x.q[3])
 
@@ -207,7 +208,7 @@ class MultiplicativeKinematics(AttitudeKinematics):
         opposite = jnp.dot(x.q, target.q) < 0.0
         return x._replace(q=jnp.where(opposite, -x.q, x.q))
 
-    def clearance(self, x: AttitudeState, target: Target) -> Scalar:
+    def singularity_distance(self, x: AttitudeState, target: Target) -> Scalar:
         """Return q_e4 [-], which is 0 at an error angle of 180 degrees."""
         return jnp.dot(x.q, target.q)
 
@@ -256,12 +257,12 @@ class SecondOrderKinematics(Kinematics):
 
     model: System
 
-    def clearance(self, x: State, target: Scalar) -> Scalar:
+    def singularity_distance(self, x: State, target: Scalar) -> Scalar:
         """Return the determinant of dF/dx2 G, which is 0 at a singularity."""
         jacobian, gain = self.model.slope(target, x), self.model.input_gain(target, x)
         return matrices.determinant(jacobian @ gain)
 
-    def clearance_unit(self, first: Scalar) -> Scalar:
+    def singularity_distance_unit(self, first: Scalar) -> Scalar:
         """Return the determinant at t = 0, so that the ratio does not depend on units."""
         return first
 

@@ -129,7 +129,7 @@ class PrescribedTimeLaw(Law):
         """Return which periods use the gains of the hold phase. With implicit sampling, also periods that end in it."""
         if not self.implicit:
             return hold
-        tolerance = guards.rounding(t_next - t, t_next)  # rounding errors must not shift the change by a period
+        tolerance = guards.time_tolerance(t_next - t, t_next)  # rounding errors must not shift the change by a period
         return hold | (t_next > self.hand_over - tolerance)
 
     def time_left(self, t: Scalar, hold: Bool[Array, ""]) -> Scalar:

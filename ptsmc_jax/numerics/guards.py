@@ -1,7 +1,7 @@
 """Smooth or guarded versions of functions that have no finite derivative at some points.
 
 `smooth_sign` is the boundary-layer form of sign(s). `norm`, `signed_root` and `signed_power` have derivatives that are
-finite everywhere. `rounding` is the tolerance for comparisons of times.
+finite everywhere. `time_tolerance` is the tolerance for comparisons of times.
 """
 
 from typing import Any
@@ -87,7 +87,7 @@ def select(condition: Array, a: Any, b: Any) -> Any:
     return jax.tree.map(lambda x, y: jnp.where(condition, x, y), a, b)
 
 
-def rounding(period: Any, t: Any) -> Any:
+def time_tolerance(period: Any, t: Any) -> Any:
     """Return the tolerance for comparisons of times near t [s].
 
     It is the sum of 1e-9 periods and the rounding error of t. With 64 bits the rounding error is the smaller term. With

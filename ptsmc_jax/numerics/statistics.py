@@ -1,7 +1,7 @@
 """Statistics of a campaign: confidence intervals of fractions, means and quantiles, and sensitivities to inputs.
 
 A fraction is a binomial proportion, for example the fraction of trials that meet a requirement. Start with
-`share_interval`, `quantile_interval` and `drivers`, the sensitivity of a metric to each dispersed input.
+`fraction_interval`, `quantile_interval` and `drivers`, the sensitivity of a metric to each dispersed input.
 """
 
 import bisect
@@ -18,7 +18,7 @@ SIGNIFICANCE = 0.0027  # probability of a normal number beyond three sigma, the 
 ROUNDING = 1e-12  # relative to the largest value: smaller differences between values are rounding errors
 
 
-def share_interval(successes: int, trials: int, confidence: float) -> tuple[float, float]:
+def fraction_interval(successes: int, trials: int, confidence: float) -> tuple[float, float]:
     """Return the two-sided confidence interval of a fraction (Clopper and Pearson, Biometrika 26, 1934).
 
     Args:
@@ -34,10 +34,10 @@ def share_interval(successes: int, trials: int, confidence: float) -> tuple[floa
     '0.9913 0.9994'
     """
     one_sided = (1.0 + confidence) / 2.0
-    return share_bound(successes, trials, one_sided), 1.0 - share_bound(trials - successes, trials, one_sided)
+    return fraction_bound(successes, trials, one_sided), 1.0 - fraction_bound(trials - successes, trials, one_sided)
 
 
-def share_bound(successes: int, trials: int, confidence: float) -> float:
+def fraction_bound(successes: int, trials: int, confidence: float) -> float:
     """Return the one-sided lower confidence bound of a fraction (Clopper and Pearson).
 
     It is the quantile 1 - confidence of the beta distribution with the parameters k and trials - k + 1.
@@ -75,7 +75,7 @@ def mean_bound(fractions: np.ndarray, confidence: float) -> float:
     # Shifted and scaled so that 0 and 1 are always among the numbers. The quantile of a weighted mean scales with them.
     x, counts = np.unique(np.append((fractions - low) / (1.0 - low), 1.0), return_counts=True)
     if x.size == 2:
-        return low + (1.0 - low) * (1.0 - share_bound(int(counts[0]), fractions.size, confidence))
+        return low + (1.0 - low) * (1.0 - fraction_bound(int(counts[0]), fractions.size, confidence))
     tilt: Any = optimize.brentq(
         lambda tilt: _tilted_mean(x, counts, tilt)[0] - confidence, -MAX_TILT, MAX_TILT, xtol=1e-10
     )
@@ -295,7 +295,7 @@ def fewest_for(failures: int, quantile: float, confidence: float) -> int:
     """
 
     def is_verified(trials: int) -> bool:
-        return share_bound(trials - failures, trials, confidence) >= quantile
+        return fraction_bound(trials - failures, trials, confidence) >= quantile
 
     enough = failures + 1
     while not is_verified(enough):

@@ -371,22 +371,22 @@ def _commanding(computer: Board, law: Law, observer: Observer, command_filter: C
         computer.state["command_filter"] = jax.eval_shape(lambda: command_filter.begin(m))
         computer.about["command_filter"] = "integrators of the command's filter, advanced by half a period"
         memories, shaped = ["law", "command_filter"], (command_filter,)
-    traced = jax.make_jaxpr(law.clearance)(x, target)
-    singular = any(dependence(traced.jaxpr, [True] * len(traced.jaxpr.invars)))  # the clearance is no constant
+    traced = jax.make_jaxpr(law.singularity_distance)(x, target)
+    singular = any(dependence(traced.jaxpr, [True] * len(traced.jaxpr.invars)))  # the distance is no constant
     if singular:
-        computer.state |= {"clearance": real(), "clearance_unit": real()}
-        computer.about |= {"clearance": "distance from the law's singularity, by `clearance_unit` [-]",
-                       "clearance_unit": "what that is counted in"}  # fmt: skip
+        computer.state |= {"singularity_distance": real(), "singularity_distance_unit": real()}
+        computer.about |= {"singularity_distance": "distance to the law's singularity, over its unit [-]",
+                           "singularity_distance_unit": "unit of singularity_distance"}  # fmt: skip
 
     reads = ("t", "tracking", "out.d_hat", *(f"before.{name}" for name in memories), *computer.names("now"),
              *(("dt",) if shaped else ()),
-             *(("before.clearance_unit", "last.command", "last.s") if singular else ()))  # fmt: skip
+             *(("before.singularity_distance_unit", "last.command", "last.s") if singular else ()))  # fmt: skip
 
     def command(parameters: Given, given: Given) -> Given:
         known, period, t = parameters["law"], parameters["period"], given["t"]
         last = {name: given[f"before.{name}"] for name in memories}
         now, reference = computer.seen(given, "now"), parameters["reference"](t)
-        hold = t >= known.hand_over - guards.rounding(period, known.hand_over)  # as the clock has it
+        hold = t >= known.hand_over - guards.time_tolerance(period, known.hand_over)  # as the clock has it
 
         def decided() -> tuple[Any, Any, dict[str, Any]]:
             sample, d_hat, k2 = Sample(t, hold, period, last["law"]), given["out.d_hat"], parameters["bound"](t)
@@ -399,13 +399,15 @@ def _commanding(computer: Board, law: Law, observer: Observer, command_filter: C
             return u, s, {"law": law, "command_filter": integrators}
 
         if singular:
-            distance = known.clearance(now, reference)
+            distance = known.singularity_distance(now, reference)
             unit = jnp.where(
-                given["tracking"] != 0, given["before.clearance_unit"], known.kinematics.clearance_unit(distance)
+                given["tracking"] != 0,
+                given["before.singularity_distance_unit"],
+                known.kinematics.singularity_distance_unit(distance),
             )
-            clearance, stays = distance / unit, (given["last.command"], given["last.s"], last)
-            u, s, kept = jax.lax.cond(clearance >= run_state.SINGULAR_CLEARANCE, decided, lambda: stays)
-            kept |= {"clearance": clearance, "clearance_unit": unit}
+            singularity_distance, stays = distance / unit, (given["last.command"], given["last.s"], last)
+            u, s, kept = jax.lax.cond(singularity_distance >= run_state.SINGULAR_DISTANCE, decided, lambda: stays)
+            kept |= {"singularity_distance": singularity_distance, "singularity_distance_unit": unit}
         else:
             u, s, kept = decided()
         return {"out.command": u, "out.s": s} | {f"now.{name}": value for name, value in kept.items()}

@@ -20,8 +20,8 @@ from ptsmc_jax.onboard.sources import LAYOUT
 from ptsmc_jax.onboard.templates import About
 from ptsmc_jax.onboard.translate import NoRuleError
 from ptsmc_jax.scenario import custom, parsing
+from ptsmc_jax.scenario.assembly import Study
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
-from ptsmc_jax.scenario.flyable import Study
 from ptsmc_jax.scenario.tables import Scenario
 
 

@@ -183,8 +183,8 @@ def _step(code: Code) -> dict[str, str]:
     ahead = ["static void derive(const ptsmc_params *p, ptsmc_derived *d);\n"] if code.derived else []
     arguments = re.findall(r"\w+", " ".join(call.values()))
     derive = "    derive(p, &state->derived);" if code.derived else ""
-    least = number(run_state.SINGULAR_CLEARANCE, REAL)
-    singular = (f"    now.tracking = now.clearance >= {least};\n"
+    least = number(run_state.SINGULAR_DISTANCE, REAL)
+    singular = (f"    now.tracking = now.singularity_distance >= {least};\n"
                 "    if (!now.tracking) {\n        status = PTSMC_SINGULAR;\n    }")  # fmt: skip
     saturated = f"    if ({call.get('act')} && status == PTSMC_OK) {{\n        status = PTSMC_SATURATED;\n    }}"
     return {
@@ -198,7 +198,9 @@ def _step(code: Code) -> dict[str, str]:
         "tracking": "    const int tracking = state->tracking;" if "tracking" in arguments else "",
         **{stage: call[stage] for stage in ("sense", "observe", "command")},
         "act": saturated if "act" in call else "",
-        "regularity": singular if any(field.name == "clearance" for field in code.state) else "    now.tracking = 1;",
+        "regularity": singular
+        if any(field.name == "singularity_distance" for field in code.state)
+        else "    now.tracking = 1;",
     }
 
 

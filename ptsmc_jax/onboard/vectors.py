@@ -20,7 +20,7 @@ from ptsmc_jax.numerics import stacking
 from ptsmc_jax.onboard.board import Board
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.control_period import State, Tick, control_period, schedule, start
-from ptsmc_jax.simulation.run_state import SINGULAR_CLEARANCE
+from ptsmc_jax.simulation.run_state import SINGULAR_DISTANCE
 
 
 class Samples(NamedTuple):
@@ -46,8 +46,8 @@ class Samples(NamedTuple):
     torque: Array  # torque on the body from this sample on [N m].
     wheel_torque: Array | None  # torque of each wheel [N m].
     limited: Array  # bool: whether a limit reduces the command.
-    clearance: Array  # distance to the singularity, in `clearance_unit` [-].
-    clearance_unit: Array  # unit of `clearance`.
+    singularity_distance: Array  # distance to the singularity, in `clearance_unit` [-].
+    singularity_distance_unit: Array  # unit of `singularity_distance`.
 
 
 def simulate(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Samples:
@@ -72,8 +72,8 @@ def simulate(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Sam
         assert drive is not None
         visible, sensing = parts.plant.visible(state.x), state.computer.sensors
         inputs, _ = sensors.inputs(sensing, visible, now, tick.dt_before, state.star_x)
-        distance = law.clearance(computer.seen, target)
-        unit = jnp.where(jnp.isnan(unit), law.kinematics.clearance_unit(distance), unit)
+        distance = law.singularity_distance(computer.seen, target)
+        unit = jnp.where(jnp.isnan(unit), law.kinematics.singularity_distance_unit(distance), unit)
         row = Samples(
             t=now.t, simulated=now.t_next > now.t, inputs=inputs,
             before=sensors.remembered(sensing), after=sensors.remembered(computer.sensors),
@@ -83,7 +83,7 @@ def simulate(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Sam
             d_hat=d_hat, command=u, s=s, error=law.kinematics.errors(computer.seen, target)[0],
             torque=drive.c if wheels is None else wheels.axes @ drive.c,
             wheel_torque=None if wheels is None else drive.c, limited=drive.limited,
-            clearance=distance / unit, clearance_unit=unit,
+            singularity_distance=distance / unit, singularity_distance_unit=unit,
         )  # fmt: skip
         return (after, unit), row
 
@@ -111,7 +111,7 @@ def known_alike(dispersion: Dispersion) -> Dispersion:
 def usable(samples: Samples) -> bool:
     """Return whether a trial is finite and stays away from the law's singularity."""
     finite = all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(samples))
-    return finite and bool(np.min(samples.clearance) >= SINGULAR_CLEARANCE)
+    return finite and bool(np.min(samples.singularity_distance) >= SINGULAR_DISTANCE)
 
 
 def steepness(samples: Samples, rounding: float, t_f: float, last: float) -> float:
@@ -144,8 +144,9 @@ def rows(board: Board, samples: Samples) -> tuple[np.ndarray, np.ndarray, np.nda
     inputs = samples.inputs | {"wheel_momentum": samples.momentum, "applied": samples.applied, "acting": samples.acting}
     state_by_name = {**samples.after, **board.model.signals_of(samples.seen), "observer": samples.observer,
                      "law": samples.law, "queue": samples.queue, "command_filter": samples.command_filter,
-                     "wheel_momentum": samples.momentum, "acting": samples.acting, "clearance": samples.clearance,
-                     "clearance_unit": samples.clearance_unit}  # fmt: skip
+                     "wheel_momentum": samples.momentum, "acting": samples.acting,
+                     "singularity_distance": samples.singularity_distance,
+                     "singularity_distance_unit": samples.singularity_distance_unit}  # fmt: skip
     outputs_by_name = {name: getattr(samples, name) for name in ("d_hat", "command", "s", "torque", "wheel_torque")}
     one = np.ones_like(samples.t)
     outputs = _columns(board.outputs, outputs_by_name)

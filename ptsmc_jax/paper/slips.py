@@ -200,7 +200,7 @@ class _Unaligned(AdditiveKinematics):
     def align(self, x: rigid_body.AttitudeState, target: Target) -> rigid_body.AttitudeState:
         return x
 
-    def clearance(self, x: rigid_body.AttitudeState, target: Target) -> jax.Array:
+    def singularity_distance(self, x: rigid_body.AttitudeState, target: Target) -> jax.Array:
         return jnp.abs(x.q[3])
 
 

@@ -1,6 +1,6 @@
 """Build the simulation parts of a validated scenario: law, observer, disturbance, sensors, actuators, dispersions.
 
-Start with `setup`. `timing` adds the clock, and `flyable.study` combines both.
+Start with `setup`. `timing` adds the clock, and `assembly.study` combines both.
 """
 
 import dataclasses

@@ -10,7 +10,7 @@ from typing import Any
 
 from ptsmc_jax.declare import Scaled
 from ptsmc_jax.scenario import mission
-from ptsmc_jax.theory import borders
+from ptsmc_jax.theory import stability_limits
 
 LEFT = 5e-5  # remaining fraction of an error after one period that counts as deadbeat
 SHARE = 0.05  # relative change of the mean derivative of the sign at s = 0 that counts as no influence
@@ -31,7 +31,8 @@ def dead_beat_gain(scenario: Any) -> float:
 def largest_k1(scenario: Any, surface_rate: float) -> float:
     """Return the largest K1 [1/s] that stabilises the sampled hold phase, 0 if no K1 does.
 
-    The limit is K1 h / 2 = `borders.largest_reaching` for a spacecraft (60), and K1 h for the K1 of (10) and (29).
+    The limit is K1 h / 2 = `stability_limits.largest_reaching` for a spacecraft (60), and K1 h for the K1 of (10) and
+    (29).
     Without delay it is 2 - c h. Implicit sampling without delay has no stability limit. Its largest K1 decreases s to
     the fraction `LEFT` in one period. For an order above 2 the limit is an estimate from the slowest pole of the
     surface.
@@ -43,7 +44,7 @@ def largest_k1(scenario: Any, surface_rate: float) -> float:
     h = scenario.loop.period
     delay = float(scenario.devices.delay_periods)
     implicit = scenario.controller.implicit
-    border = borders.largest_reaching(surface_rate * h, delay, implicit=implicit)
+    border = stability_limits.largest_reaching(surface_rate * h, delay, implicit=implicit)
     reaching = min(border, math.log(1.0 / LEFT)) / h
     return scenario.reaching * reaching
 
@@ -61,7 +62,7 @@ def narrowest_that_matters(noise: float) -> float:
 def largest_rate(scenario: Any) -> float:
     """Return half of the stability limit of the surface rate c [1/s] in the sampled hold phase, at the best K1."""
     h, delay = scenario.loop.period, scenario.devices.delay_periods
-    limit = borders.largest_surface(delay, implicit=scenario.controller.implicit)
+    limit = stability_limits.largest_surface(delay, implicit=scenario.controller.implicit)
     return 0.5 * min(limit, math.log(1.0 / LEFT)) / h
 
 

@@ -16,7 +16,7 @@ from ptsmc_jax.dispersions.base import INITIAL_ATTITUDE, REFERENCE
 from ptsmc_jax.plants.second_order import System
 from ptsmc_jax.scenario import attitude_keys, errors
 from ptsmc_jax.scenario.errors import ScenarioError
-from ptsmc_jax.simulation.rollout import SINGULAR_CLEARANCE, Parts
+from ptsmc_jax.simulation.rollout import SINGULAR_DISTANCE, Parts
 from ptsmc_jax.theory import solutions
 
 SINGULAR_CONDITION = 1e14  # condition number of a matrix that counts as singular in double precision
@@ -91,7 +91,7 @@ def reference(scenario: Any, parts: Parts) -> None:
         )
     worst = int(np.argmin(np.abs(held)))
     crosses = np.any(np.sign(held) != np.sign(held[0]))
-    if crosses or abs(held[worst]) < SINGULAR_CLEARANCE:
+    if crosses or abs(held[worst]) < SINGULAR_DISTANCE:
         when = float(grid[int(np.argmax(np.sign(held) != np.sign(held[0])))]) if crosses else float(grid[worst])
         raise ScenarioError(
             f"reference.kind is {errors.show(scenario.reference.kind)}, but its attitude reaches {_SINGULAR}, "
@@ -115,14 +115,14 @@ def attitude(scenario: Any, parts: Parts) -> None:
         times, _, square = (np.asarray(v) for v in solutions.exact_path(parts))
     else:  # the path of other laws is not known, so only the start is checked
         target = parts.reference(jnp.zeros_like(parts.t_end))
-        first = law.clearance(law.kinematics.align(parts.initial, target), target)
+        first = law.singularity_distance(law.kinematics.align(parts.initial, target), target)
         times, square = np.zeros(1), np.square([float(first)])
-    if square[0] < SINGULAR_CLEARANCE**2:
-        allowed = f"{name} of at least {SINGULAR_CLEARANCE}"
+    if square[0] < SINGULAR_DISTANCE**2:
+        allowed = f"{name} of at least {SINGULAR_DISTANCE}"
         raise errors.refused(f"initial.{key}", value, f", but lies at {singular}; allowed is {allowed}", allowed)
-    if square.min() < SINGULAR_CLEARANCE**2:
+    if square.min() < SINGULAR_DISTANCE**2:
         when = float(times[int(np.argmin(square))])
-        allowed = f"a start whose path keeps {name} above {SINGULAR_CLEARANCE}"
+        allowed = f"a start whose path keeps {name} above {SINGULAR_DISTANCE}"
         reason = (
             f" with initial.rate = {errors.brief(scenario.initial.rate)}, but from there the path to the reference "
             f"meets {singular}, at t = {when:.4g} s; allowed is {allowed}"

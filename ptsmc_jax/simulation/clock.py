@@ -22,7 +22,7 @@ COARSEST = 0.25  # longest step before the hand-over over the time to go; the wi
 
 
 def _not_above(t: Array, limit: Scalar, rounding: Scalar | float = 0.0) -> Array:
-    """Return min(t, limit), with the derivative of `limit` if they are equal within `rounding`."""
+    """Return min(t, limit), with the derivative of `limit` if they are equal within `time_tolerance`."""
     return jnp.where(t < limit - rounding, t, limit)
 
 
@@ -64,8 +64,8 @@ class Anchored:
         # one array of nodes, so that each interval ends exactly where the next begins
         nominal = (t_f - delta) + jnp.arange(-self.before, self.after + 1).astype(float) * self.period
         # rounding may put the sample at t = 0 slightly after it; then there would be two samples
-        begun = nominal > guards.rounding(self.period, t_f)
-        nodes = _not_above(jnp.where(begun, nominal, 0.0), self.t_end, guards.rounding(self.period, self.t_end))
+        begun = nominal > guards.time_tolerance(self.period, t_f)
+        nodes = _not_above(jnp.where(begun, nominal, 0.0), self.t_end, guards.time_tolerance(self.period, self.t_end))
         t, t_next = nodes[:-1], nodes[1:]
         # decided by the start of the period: by rounding its fraction of a complete period may be 1 or more
         partial = ~begun[:-1]
@@ -91,9 +91,9 @@ class Flight:
     def ticks(self, t_f: Scalar, delta: Scalar) -> Ticks:
         """Control periods for this prescribed time and delta [s]."""
         nominal = jnp.arange(self.count + 1).astype(float) * self.period
-        nodes = _not_above(nominal, self.t_end, guards.rounding(self.period, self.t_end))
+        nodes = _not_above(nominal, self.t_end, guards.time_tolerance(self.period, self.t_end))
         t, t_next = nodes[:-1], nodes[1:]
-        hold = t >= t_f - delta - guards.rounding(self.period, t_f)  # rounding must not delay the hand-over
+        hold = t >= t_f - delta - guards.time_tolerance(self.period, t_f)  # rounding must not delay the hand-over
         return _complete(t, t_next, hold)
 
 

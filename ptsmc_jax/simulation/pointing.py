@@ -248,12 +248,12 @@ def update(
     share = jnp.clip((begins - t) / length, 0.0, 1.0)  # fraction of the interval before the observation
     window_end = begins + (tally.windows + 1.0) * window
     until = jnp.clip((window_end - t) / length, share, 1.0)  # where the window ends in the interval
-    by_rounding = guards.rounding(window, t_next)
+    by_rounding = guards.time_tolerance(window, t_next)
     observed = t_next > begins + by_rounding
     closes = observed & (window_end <= t_next + by_rounding)
     first, last = error.at(share), error.at(until)
     # the start of the observation counts; later intervals begin at the end of the one before
-    opens = t <= begins + guards.rounding(window, t)
+    opens = t <= begins + guards.time_tolerance(window, t)
     opened = guards.select(opens, tally.window.including(first), tally.window)
     largest = jnp.where(opens, jnp.maximum(tally.largest, _sizes(first)), tally.largest)
     integral = opened.integral + error.integral(until) - error.integral(share)

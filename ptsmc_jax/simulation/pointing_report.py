@@ -99,4 +99,4 @@ def _indices(tally: Tally, names: tuple[str, str, str], observed: Pointing, leng
 def _fraction_within(beyond: Array, total: Array) -> Array:
     """Return the fraction of a time [s] that is not beyond limits; by rounding the times beyond may sum up to more."""
     left = total - beyond
-    return jnp.where(left <= guards.rounding(total, total), 0.0, left / total)
+    return jnp.where(left <= guards.time_tolerance(total, total), 0.0, left / total)

@@ -18,7 +18,7 @@ def must_keep(trials: int, quantile: float | None, confidence: float | None) -> 
     """Return the number of trials that must keep a limit, or None if there are too few trials to verify it.
 
     Without a quantile all trials must keep it. With a confidence, it is the smallest number for which the one-sided
-    lower bound on the probability, `statistics.share_bound`, reaches the quantile.
+    lower bound on the probability, `statistics.fraction_bound`, reaches the quantile.
 
     Args:
         trials: number of trials.
@@ -31,10 +31,10 @@ def must_keep(trials: int, quantile: float | None, confidence: float | None) -> 
         return max(1, math.ceil(quantile * trials - 1e-9))
     if trials < fewest_trials(quantile, confidence):
         return None
-    from ptsmc_jax.numerics.statistics import share_bound  # imports SciPy, which takes a while
+    from ptsmc_jax.numerics.statistics import fraction_bound  # imports SciPy, which takes a while
 
     def shown(within: int) -> bool:
-        return share_bound(within, trials, confidence) >= quantile
+        return fraction_bound(within, trials, confidence) >= quantile
 
     # the bound increases with the count, and reaches the quantile if all `trials` keep the limit
     return 1 + bisect.bisect_left(range(1, trials), True, key=shown)
@@ -85,7 +85,7 @@ class Verdict:
     at_least: bool = False  # the limit is the smallest allowed value, and `worst` is the smallest value
     interpretation: str = "ensemble"
     # fraction of the time within the limit: the smallest of all runs, or, mixed, the mean over the runs
-    share_of_time: float | None = None
+    fraction_of_time: float | None = None
     shown: float | None = None  # its lower bound with the confidence
 
     @property
@@ -110,7 +110,7 @@ class Verdict:
 
     def __str__(self) -> str:
         """The verdict in one line."""
-        return self._of_trials() if self.share_of_time is None else self._of_time(self.share_of_time)
+        return self._of_trials() if self.fraction_of_time is None else self._of_time(self.fraction_of_time)
 
     def _of_time(self, share: float) -> str:
         assert self.quantile is not None
@@ -232,7 +232,7 @@ class Requirement:
         worst, margin = float(np.max(np.where(ok, values, np.nan))), (1.0 - shown) / (1.0 - self.quantile)
         return Verdict(
             self.metric, self.limit, self.stated_unit, worst, margin, failures, int(values.size), self.quantile,
-            confidence, interpretation=self.interpretation, share_of_time=least, shown=shown,
+            confidence, interpretation=self.interpretation, fraction_of_time=least, shown=shown,
         )  # fmt: skip
 
 

@@ -25,7 +25,7 @@ from ptsmc_jax.simulation.run_state import (
     NOT_CONVERGED,
     OK,
     SINGULAR,
-    SINGULAR_CLEARANCE,
+    SINGULAR_DISTANCE,
     STATUS,
     TOO_FAST,
     UNBOUNDED,
@@ -41,7 +41,7 @@ __all__ = [
     "NOT_CONVERGED",
     "OK",
     "SINGULAR",
-    "SINGULAR_CLEARANCE",
+    "SINGULAR_DISTANCE",
     "STATUS",
     "TOO_FAST",
     "UNBOUNDED",
@@ -78,7 +78,7 @@ def simulate(
     target = parts.reference(jnp.zeros_like(parts.t_end))
     # the initial state may have integers or single precision; the run uses the precision of JAX
     x0 = jax.tree.map(lambda v: jnp.asarray(v, float), parts.aligned_initial)
-    unit = parts.controller.kinematics.clearance_unit(parts.controller.clearance(x0, target))
+    unit = parts.controller.kinematics.singularity_distance_unit(parts.controller.singularity_distance(x0, target))
     target_t_f = parts.reference(criteria.t_f)
     unit, gap = jax.lax.stop_gradient(unit), _first_missing(parts, ticks)
     run = Run(parts, ticks, criteria, x0, target, target_t_f, unit, gap, record)
@@ -130,7 +130,7 @@ def _check_shape(name: str, value: Any, allowed: list[tuple[int, ...]]) -> None:
 def _gap(ticks: Ticks, t_end: Scalar) -> Scalar:
     """Return the first time without samples [s], or NaN. A clock built for a shorter t_f or delta has too few."""
     first, last = ticks.t[0], ticks.t_next[-1]
-    ends = jnp.where(last < t_end - guards.rounding(t_end, t_end), last, jnp.nan)
+    ends = jnp.where(last < t_end - guards.time_tolerance(t_end, t_end), last, jnp.nan)
     return jax.lax.stop_gradient(jnp.where(first > 0.0, 0.0, ends))
 
 

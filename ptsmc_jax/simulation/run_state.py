@@ -29,7 +29,7 @@ STATUS = {
 }
 FINISHED = (OK, NOT_CONVERGED)  # statuses of runs that were simulated to t_end
 # clearance from the singularity of the law; its gain grows like 1 / clearance and is 1000 times as large here
-SINGULAR_CLEARANCE = 1e-3
+SINGULAR_DISTANCE = 1e-3
 # a run has not converged if its angle at t_f is larger than both of these
 NOT_CONVERGED_FRACTION = 0.05  # fraction of the initial angle
 NOT_CONVERGED_SETTLING_ANGLES = 10.0
@@ -77,7 +77,7 @@ class Run(NamedTuple):
     x0: Any
     target_0: Any  # reference at t = 0
     target_t_f: Any  # reference at t_f
-    clearance_unit: Array  # unit of the distance to the singularity of the law
+    singularity_distance_unit: Array  # unit of the distance to the singularity of the law
     gap: Array  # first time without samples of the clock [s]; NaN: there are samples from t = 0 to t_end
     record: bool  # whether the history is recorded
 
@@ -228,7 +228,7 @@ def _judged(
     numbers = [leaf for leaf in jax.tree.leaves((x, u, memory)) if jnp.issubdtype(jnp.asarray(leaf).dtype, jnp.inexact)]
     finite = jnp.isfinite(sum(jnp.sum(leaf) for leaf in numbers))
     fast = plant.too_fast(x, step)
-    near = ~(law.clearance(x, target) / run.clearance_unit >= SINGULAR_CLEARANCE)
+    near = ~(law.singularity_distance(x, target) / run.singularity_distance_unit >= SINGULAR_DISTANCE)
     code = jnp.where(~finite, DIVERGED, jnp.where(near, SINGULAR, jnp.where(fast, TOO_FAST, OK))).astype(jnp.int32)
     first = (score.status == OK) & (code != OK)
     return score._replace(status=jnp.where(first, code, score.status), bad_time=jnp.where(first, t, score.bad_time))

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from ptsmc_jax.simulation.assembly import Parts
-from ptsmc_jax.theory import error_floor, linear
+from ptsmc_jax.theory import linear, lower_bound
 
 ROUNDS = 8  # Largest number of iterations of the statistical linearisation.
 BEYOND = 1e60  # Upper limit of the deviation of s, if the covariance overflows.
@@ -125,7 +125,7 @@ class _State:
         self._n, self._m, k = loop.a.shape[1], loop.command.shape[1], loop.seen.shape[2]
         self.plant = slice(0, opened.error.shape[2])
         sensors = parts.sensors.in_step()
-        self._reading = reading = error_floor.reading_of(sensors, k, ticks)
+        self._reading = reading = lower_bound.reading_of(sensors, k, ticks)
         self._waiting = loop.delay * self._m
         before = self._n + self._waiting
         self._own = slice(before, before + reading.own.size)
@@ -138,7 +138,7 @@ class _State:
         self._from_readings = None if place is not None else np.linalg.pinv(reading.rows[:, :k])
         # Process noise, 1 sigma per second. The random-walk torque changes at the start of a period and acts in that
         # period. The sensor states change after the sample.
-        self.walk = np.concatenate([np.zeros(self.size - self._m), error_floor.walk_of(parts)])
+        self.walk = np.concatenate([np.zeros(self.size - self._m), lower_bound.walk_of(parts)])
         self.drift = np.concatenate([np.zeros(before), reading.own_drift, np.zeros(self._m)])
 
     def start(self) -> np.ndarray:
@@ -215,7 +215,7 @@ def _covariance(parts: Parts, ticks: Any, opened: linear.Opened, sign: _Sign | N
         squares[j, 1] = np.trace(_middle(opened, j, float(length), later, state.plant).covariance(p))
         p = later.covariance(p) + np.diag((state.drift * length) ** 2)
     squares[-1, 0] = square(opened.error[-1])
-    error = error_floor.window_error(parts, ticks, np.stack([squares[:-1, 0], squares[:-1, 1], squares[1:, 0]], axis=1))
+    error = lower_bound.window_error(parts, ticks, np.stack([squares[:-1, 0], squares[:-1, 1], squares[1:, 0]], axis=1))
     t, t_f = ticks.t, float(parts.controller.t_f)
     in_window = (t >= t_f - 1e-9 * float(parts.period)) & (t <= t_f + float(parts.window))
     return Noise(error, torque, float(np.sqrt(np.mean(squares[:-1][in_window, 2])))), widths

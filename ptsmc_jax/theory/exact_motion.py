@@ -27,7 +27,7 @@ class Motion(NamedTuple):
 
     x: Any  # state
     w_dot: Array  # (m,) derivative of the velocity
-    clearance: Array  # distance to the singularity, positive before it is reached
+    singularity_distance: Array  # distance to the singularity, positive before it is reached
 
 
 def exact(law: PrescribedTimeLaw, t: Scalar, start: Float[Array, "m n"]) -> tuple[Vector, Vector]:
@@ -114,4 +114,4 @@ def _(kinematics: SecondOrderKinematics, target: Any, start: Any, errors: Errors
 
     x = jax.lax.fori_loop(0, 8, newton, jnp.concatenate([error, start[n : 2 * n]]))
     w_dot = matrices.solve(model.slope(target, x), acceleration - model.coasting_acceleration(target, x))
-    return Motion(x, w_dot, kinematics.clearance(x, target))
+    return Motion(x, w_dot, kinematics.singularity_distance(x, target))

@@ -15,10 +15,10 @@ from ptsmc_jax.batching import lapack
 from ptsmc_jax.numerics.pytrees import Scalar
 from ptsmc_jax.simulation import run_state
 from ptsmc_jax.simulation.assembly import Parts
-from ptsmc_jax.theory import linear, margins, rest
+from ptsmc_jax.theory import limit_cycles, linear, margins
+from ptsmc_jax.theory.limit_cycles import History, history
 from ptsmc_jax.theory.linear import Loop
 from ptsmc_jax.theory.margins import FIELDS, Margins
-from ptsmc_jax.theory.rest import History, history
 
 SLOWEST = 10  # Shortest time to go in periods. The gains then change by a tenth from one period to the next.
 TIMES, SHARE = 4, 0.25  # Number of times at which margins are judged, and the longest time to go as a fraction of t_f.
@@ -33,9 +33,9 @@ class Course(NamedTuple):
     at_input: Margins  # (times, m)
     at_sensors: Margins  # (k,) in the hold phase.
     together: dict[str, float]  # Margins of all axes of the input at once, in the hold phase.
-    clearance: float  # Smallest distance to the singularity, in the unit of `run_state.SINGULAR_CLEARANCE`.
+    singularity_distance: float  # Smallest distance to the singularity, in the unit of `run_state.SINGULAR_DISTANCE`.
     not_converged: bool  # Whether the run has not converged at t_f, see `run_state.is_not_converged`.
-    swing: rest.Swing | None = None  # Limit cycle in the hold phase, if there is one.
+    limit_cycle: limit_cycles.LimitCycle | None = None  # Limit cycle in the hold phase, if there is one.
 
     @property
     def hold(self) -> tuple[Loop, Margins]:
@@ -149,10 +149,10 @@ def along(parts: Parts, times: int = 24) -> Course:
     """Return the margins of sampled parts along their nominal run.
 
     The times are the judged ones, one in the hold phase, and about `times` further ones. If there is a limit cycle, the
-    margins in the hold phase are zero, see `rest`.
+    margins in the hold phase are zero, see `limit_cycles`.
     """
     run = linear.nominal_jit(parts)
-    looked_at, commands, clearance, not_converged = _along(parts, run, times)
+    looked_at, commands, singularity_distance, not_converged = _along(parts, run, times)
     at_times = at(parts, looked_at, run)
     first_at = {t: k for k, t in reversed(list(enumerate(at_times.t.tolist()))) if not at_times.hold[k]}
     order = np.asarray([k for _, k in sorted(first_at.items())] + [len(at_times.t) - 1])
@@ -160,14 +160,19 @@ def along(parts: Parts, times: int = 24) -> Course:
     counts = (order < TIMES) | (order == order[-1])
     last = jax.tree.map(lambda v: v[-1:], loops)
     at_sensors = margins.of_each(last, sensors=True)
-    swing = rest.swing(parts, commands)
-    if swing is None:
+    limit_cycle = limit_cycles.find(parts, commands)
+    if limit_cycle is None:
         at_once = margins.together(jax.tree.map(lambda v: v[0], last))
     else:
         at_once = dict.fromkeys(FIELDS, float("nan"))
-        at_input, at_sensors = rest.none_left(at_input, order == order[-1]), rest.none_left(at_sensors, [True])
+        at_input, at_sensors = (
+            limit_cycles.none_left(at_input, order == order[-1]),
+            limit_cycles.none_left(at_sensors, [True]),
+        )
     at_sensors = jax.tree.map(lambda v: np.asarray(v)[0], at_sensors)
-    return Course(t, counts, loops, at_input, at_sensors, at_once, float(clearance), bool(not_converged), swing)
+    return Course(
+        t, counts, loops, at_input, at_sensors, at_once, float(singularity_distance), bool(not_converged), limit_cycle
+    )
 
 
 @programs.jit(static_argnames="times", compiler_options=programs.QUICKLY)
@@ -180,8 +185,8 @@ def _along(parts: Parts, run: linear.Nominal, times: int) -> tuple[Array, Histor
     """
     law = parts.controller
     besides = jnp.geomspace(parts.period, law.t_f, times)
-    clear = lapack.vmap(lambda x, t: law.clearance(x, parts.reference(t)))(run.carry.x, run.period.now.t)
-    nearest = jnp.min(clear / law.kinematics.clearance_unit(clear[0]))
+    clear = lapack.vmap(lambda x, t: law.singularity_distance(x, parts.reference(t)))(run.carry.x, run.period.now.t)
+    nearest = jnp.min(clear / law.kinematics.singularity_distance_unit(clear[0]))
     t = run.period.now.t
     first, arrived = (
         law.kinematics.angle(jax.tree.map(lambda v, k=k: v[k], run.carry.x), parts.reference(t[k]))

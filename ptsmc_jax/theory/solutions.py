@@ -94,7 +94,7 @@ def exact_input(parts: Setup, t: Scalar) -> tuple[Array, Scalar]:
     motion = exact_motion(parts.controller, t, parts.reference(t), parts.initial, starts(parts))
     d = parts.disturbance(t, parts.plant.with_hidden_at_rest(motion.x))
     plant = parts.plant.to_plan_by(parts.controller.model)
-    return plant.input_for(t, motion.x, motion.w_dot, d), motion.clearance
+    return plant.input_for(t, motion.x, motion.w_dot, d), motion.singularity_distance
 
 
 def visited(parts: Setup) -> tuple[Array, Any]:
@@ -136,8 +136,8 @@ def exact_path(parts: Setup, points: int = 2000) -> tuple[Array, Array, Array]:
 def _exact_path(parts: Setup, points: int) -> tuple[Array, Array, Array]:
     law = parts.controller
     t = law.t_f - law.t_f * (law.delta / law.t_f) ** jnp.linspace(0.0, 1.0, points)
-    u, clearance = lapack.vmap(lambda time: exact_input(parts, time))(t)
-    return t, u, clearance
+    u, singularity_distance = lapack.vmap(lambda time: exact_input(parts, time))(t)
+    return t, u, singularity_distance
 
 
 def exact_peak(parts: Setup, points: int = 400) -> Scalar:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ptsmc_jax.campaigns import runs
-from ptsmc_jax.theory import error_floor
+from ptsmc_jax.theory import lower_bound
 
 
 @pytest.mark.parametrize(("varies", "rows", "simulated"), [
@@ -24,10 +24,10 @@ def test_lower_bound_is_pooled_over_the_first_trials_or_rows(monkeypatch, varies
         return SimpleNamespace(has_floor=len(seen) != 2, parts=1.0 + (trial or 0), log=None)
 
     def along_each(simulated):
-        return [error_floor.Floor(floor, np.zeros(1), np.zeros(1)) for floor, _ in simulated]
+        return [lower_bound.LowerBound(floor, np.zeros(1), np.zeros(1)) for floor, _ in simulated]
 
     monkeypatch.setattr(runs, "_fly", fly)
-    monkeypatch.setattr(error_floor, "along_each", along_each)
+    monkeypatch.setattr(lower_bound, "along_each", along_each)
     ready: Any = SimpleNamespace(dispersion=SimpleNamespace(varies=varies))
     squares = [(1.0 + (k or 0)) ** 2 for j, k in enumerate(simulated) if j != 1]
     assert runs.floor(ready, 5, rows) == pytest.approx(math.sqrt(sum(squares) / len(squares)))

@@ -98,7 +98,7 @@ def test_montecarlo_writes_rows_summary_and_figures(command, tmp_path, monkeypat
                                                      [(r"\[0.5, 0.1\]", "[0, 0]")]))  # fmt: skip
 def test_equal_trials_are_reported(command, tmp_path, simulated, drawn, instead):
     """The scenario has no dispersion, or one of zero width, which compiled programs of other tests can simulate."""
-    assert not [said for said in summary(simulated)["cautions"] if "the same flight" in said]
+    assert not [said for said in summary(simulated)["warnings"] if "the same flight" in said]
     text = re.sub(drawn, instead, SHORT_CHAIN).replace("[2e-5, 1e-5]", "[0, 0]")
     (tmp_path / "same.toml").write_text(text)
     _, said, _ = command("montecarlo", "same.toml", "--trials", 250, "--no-figures")
@@ -230,7 +230,7 @@ def test_until_confident_stops_at_the_required_interval_width(command, tmp_path)
     assert code == 1
     assert "NOT met" in said
     assert found["simulated"] == found["trials"] == 400
-    low, high = found["verdicts"][0]["share_interval"]
+    low, high = found["verdicts"][0]["fraction_interval"]
     assert 0.0 < high - low <= 0.11
     again = command("montecarlo", "s.toml", "--until-confident", "0.11", "--trials", 5000, "--no-figures")
     assert again[0] == 1

@@ -59,7 +59,7 @@ def test_parameters_that_differ_in_the_controller_are_reported(command, tmp_path
     )
     assert (status, err) == (0, f"ptsmc: {said}\n")
     (place,) = (tmp_path / "out").iterdir()
-    assert json.loads((place / "summary.json").read_text())["cautions"] == [said]
+    assert json.loads((place / "summary.json").read_text())["warnings"] == [said]
 
 
 @needs_compiler
@@ -88,7 +88,7 @@ def test_campaign_runs_the_exported_controller_and_copies_it(command, tmp_path):
     kept = {path.name.replace("ptsmc_of_c", "") for path in (tmp_path / "r" / "controller").iterdir()}
     assert kept == {"controller.json", ".c", ".h", "_flat.h", "_parameters.c"}
     told = json.loads((tmp_path / "r" / "summary.json").read_text())
-    assert "law_eta = 3 instead of 2.9" in told["cautions"][0]
+    assert "law_eta = 3 instead of 2.9" in told["warnings"][0]
     samples = told["controller_samples"]
     assert samples["ok"] == {"samples": 40 * 65, "trials": 40}
     assert samples["singular"] == {"samples": 0, "trials": 0}
@@ -106,7 +106,7 @@ def test_campaign_runs_the_exported_controller_and_copies_it(command, tmp_path):
     assert command("summarize", "r", "--no-figures", "--quiet")[0] == 0  # it does not execute the C code
     assert json.loads((tmp_path / "r" / "summary.json").read_text()) == told
     replayed = tmp_path / "r" / "replay" / "7"
-    assert json.loads((replayed / "summary.json").read_text())["cautions"] == told["cautions"][:1]
+    assert json.loads((replayed / "summary.json").read_text())["warnings"] == told["warnings"][:1]
     kept = tmp_path / "r" / "controller"
     before = tree(kept)
     with (kept / "ptsmc_of_c.c").open("a") as file:

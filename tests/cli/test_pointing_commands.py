@@ -81,13 +81,13 @@ def test_pointing_requirements_have_verdicts_budget_and_table(simulated, tmp_pat
     mixed, within = verdicts["ape_boresight"], rows["within_ape_boresight"].to_numpy()
     assert 0.1 < within.mean() < 1.0
     assert mixed["share"] == pytest.approx(within.mean())
-    assert mixed["share_bound"] == pytest.approx(1.0 - statistics.mean_bound(1.0 - within, 0.9))
-    assert mixed["met"] == (mixed["share_bound"] >= 0.5)
+    assert mixed["fraction_bound"] == pytest.approx(1.0 - statistics.mean_bound(1.0 - within, 0.9))
+    assert mixed["met"] == (mixed["fraction_bound"] >= 0.5)
     assert mixed["fewest_trials"] == 4  # 0.5^4 <= 0.1
-    low, high = mixed["share_interval"]
+    low, high = mixed["fraction_interval"]
     assert low < mixed["share"] < high
     temporal = verdicts["ake_x"]
-    assert temporal["share_of_time"] == pytest.approx(rows["within_ake_x"].min())
+    assert temporal["fraction_of_time"] == pytest.approx(rows["within_ake_x"].min())
     assert temporal["met"]
     ensemble = verdicts["rpe_boresight"]
     assert ensemble["failures"] == int((rows["rpe_boresight"] > 0.02).sum())
@@ -143,7 +143,7 @@ def test_pointing_budget_is_an_order_statistic(monkeypatch, simulated):
 
     again = campaign_summary.summarise(campaign_folder.opened(Path(FOLDER)))["pointing"]["budget"]
     ordered = np.sort(rows["mpe_y"].to_numpy())
-    least = next(k for k in range(1, 151) if statistics.share_bound(k, 150, 0.95) >= 0.9)
+    least = next(k for k in range(1, 151) if statistics.fraction_bound(k, 150, 0.95) >= 0.9)
     assert again["mpe"]["y"] == ordered[least - 1]
     read = summaries.read(summaries.Campaign, {**found, "pointing": {**found["pointing"], "budget": again}})
     assert formats.angle(again["mpe"]["y"]) in str(pointing_report.budget(read))

@@ -157,9 +157,9 @@ def test_pd_returns_its_sliding_variable_and_has_no_singularity():
     s = helpers.commanded(law, T, jnp.asarray(False), X, TARGET, D, vector(0.7))[1]
     np.testing.assert_allclose(s, q_e[:3] + 0.9 / 0.4 * w_e, rtol=1e-12)
     turned = rigid_body.AttitudeState(half, X.w)
-    assert law.clearance(turned, TARGET) == 1.0
+    assert law.singularity_distance(turned, TARGET) == 1.0
     for name in SLIDING:
-        np.testing.assert_allclose(LAWS[name].clearance(turned, TARGET), 0.0, atol=1e-15)
+        np.testing.assert_allclose(LAWS[name].singularity_distance(turned, TARGET), 0.0, atol=1e-15)
 
 
 @pytest.mark.parametrize("name", SLIDING)

@@ -112,8 +112,8 @@ def test_align_chooses_the_sign_of_the_reference_and_clearance_is_positive_there
             target = references.Fixed(flip_f * vector(0.0, 0.6, 0.0, 0.8))(vector(0.0))
             aligned = law.kinematics.align(AttitudeState(flip_x * x.q, x.w), target)
             assert float(aligned.q[3] * target.q[3]) > 0
-            np.testing.assert_allclose(law.clearance(aligned, target), x.q[3])
-            assert float(law.clearance(AttitudeState(-aligned.q, x.w), target)) < 0
+            np.testing.assert_allclose(law.singularity_distance(aligned, target), x.q[3])
+            assert float(law.singularity_distance(AttitudeState(-aligned.q, x.w), target)) < 0
 
 
 @pytest.mark.parametrize("hold", [False, True])
@@ -139,7 +139,9 @@ def test_multiplicative_error_and_rate_equal_vector_part_of_scipy_error_quaterni
         error, error_rate = law.kinematics.errors(x, SWING(t))
         found = Rotation.from_quat(np.asarray(SWING(t).q)).inv() * Rotation.from_quat(np.asarray(x.q))
         q_e = found.as_quat()
-        np.testing.assert_allclose(error * np.sign(law.clearance(x, SWING(t))), q_e[:3] * np.sign(q_e[3]), atol=1e-15)
+        np.testing.assert_allclose(
+            error * np.sign(law.singularity_distance(x, SWING(t))), q_e[:3] * np.sign(q_e[3]), atol=1e-15
+        )
 
         def error_at(time, x=x, t=t):
             body = AttitudeState(x.q + (time - t) * attitude.derivative(x.q, x.w), x.w)
@@ -244,7 +246,7 @@ def test_multiplicative_error_is_singular_at_180_degrees_only():
     opposite = references.Fixed(vector(Rotation.from_rotvec([0.0, np.pi, 0.0]).as_quat()))(vector(0.0))
     near = Rotation.from_rotvec([0.0, 1e-3, 0.0])
     x = AttitudeState(vector(near.as_quat()), jnp.zeros(3))
-    assert abs(float(law.clearance(x, opposite))) == pytest.approx(np.sin(5e-4), rel=1e-9)
+    assert abs(float(law.singularity_distance(x, opposite))) == pytest.approx(np.sin(5e-4), rel=1e-9)
     # a fast initial rate away from the reference: |v| exceeds 1, at a node of the time grid or between two nodes
     run = slew(KINEMATICS[1], fixed([0.0, 0.0, 0.0, 1.0]), vector(0.0, 0.6, 0.0, 0.8), (0.0, 0.9, 0.0))
     assert fly(run).status in (rollout.SINGULAR, rollout.TOO_FAST)

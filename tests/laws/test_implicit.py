@@ -16,7 +16,7 @@ from ptsmc_jax.plants import integrator_chain, rigid_body, system
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.signals import references
 from ptsmc_jax.simulation import clock, rollout
-from ptsmc_jax.theory import borders, linear, margins
+from ptsmc_jax.theory import linear, margins, stability_limits
 from tests.helpers import FULL_INERTIA, fly, short, vector
 from tuning.search.gains import with_gains
 
@@ -141,17 +141,17 @@ def test_implicit_gains_equal_the_law_and_are_stable_for_any_delta(eta):
     for tau in (2.1, 3.5, 20.0):
         now = Sample(vector(T_F - tau * H), jnp.asarray(False), vector(H))
         jacobian = jax.jit(jax.jacfwd(lambda x, now=now: law(now, x, None, jnp.zeros(1), vector(0.0))[0]))(jnp.zeros(2))
-        kp, kd = borders.implicit_gains(eta, tau)
+        kp, kd = stability_limits.implicit_gains(eta, tau)
         np.testing.assert_allclose(jacobian, [[-kp / H**2, -kd / H]], rtol=1e-12)
-        assert borders.radius(kp, kd, 1.0) < 1.0
-    assert borders.smallest_delta(eta, H, implicit=True) == 0.0
-    delayed = [borders.smallest_delta(eta, H, 1.0, implicit=implicit) for implicit in (True, False)]
+        assert stability_limits.radius(kp, kd, 1.0) < 1.0
+    assert stability_limits.smallest_delta(eta, H, implicit=True) == 0.0
+    delayed = [stability_limits.smallest_delta(eta, H, 1.0, implicit=implicit) for implicit in (True, False)]
     assert 0.0 < delayed[0] < delayed[1]
 
 
 def test_hold_phase_has_no_largest_k1_without_delay():
-    assert borders.largest_reaching(0.05, implicit=True) == np.inf
-    delayed = [borders.largest_reaching(0.05, 1.0, implicit=implicit) for implicit in (True, False)]
+    assert stability_limits.largest_reaching(0.05, implicit=True) == np.inf
+    delayed = [stability_limits.largest_reaching(0.05, 1.0, implicit=implicit) for implicit in (True, False)]
     assert delayed[0] > delayed[1]
 
 
@@ -214,9 +214,9 @@ def test_simulated_loop_is_stable_beyond_the_stability_limit_of_explicit_samplin
         loop = jax.tree.map(lambda v: np.asarray(v)[0], linear.loops_in(parts, run, last))
         radius[sampling] = linear.radius(loop)
         tau = float(law.t_f - run.period.now.t[last[0]]) / H
-        kp, kd = borders.implicit_gains(4.0, tau) if law.implicit else (16.0 / tau**2, 7.0 / tau)
+        kp, kd = stability_limits.implicit_gains(4.0, tau) if law.implicit else (16.0 / tau**2, 7.0 / tau)
         # without an observer its memory is constant, which is a pole at 1
-        np.testing.assert_allclose(radius[sampling], max(1.0, borders.radius(kp, kd, 1.0)), rtol=1e-6)
+        np.testing.assert_allclose(radius[sampling], max(1.0, stability_limits.radius(kp, kd, 1.0)), rtol=1e-6)
     assert radius["implicit"] < 1.0 + margins.NEUTRAL < 1.1 < radius["explicit"]
 
 

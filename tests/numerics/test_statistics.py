@@ -13,11 +13,11 @@ from ptsmc_jax.simulation.requirements import fewest_trials, must_keep
 @pytest.mark.parametrize(("successes", "trials"), [(0, 20), (3, 20), (20, 20), (2398, 2400), (999_999, 1_000_000)])
 @pytest.mark.parametrize("confidence", [0.9, 0.95])
 def test_fraction_interval_and_bound_equal_exact_binomial_test(successes, trials, confidence):
-    low, high = statistics.share_interval(successes, trials, confidence)
+    low, high = statistics.fraction_interval(successes, trials, confidence)
     exact = stats.binomtest(successes, trials).proportion_ci(confidence, "exact")
     np.testing.assert_allclose((low, high), (exact.low, exact.high), rtol=1e-9)
     bound = stats.binomtest(successes, trials, alternative="greater").proportion_ci(confidence, "exact")
-    np.testing.assert_allclose(statistics.share_bound(successes, trials, confidence), bound.low, rtol=1e-9)
+    np.testing.assert_allclose(statistics.fraction_bound(successes, trials, confidence), bound.low, rtol=1e-9)
 
 
 def test_fewest_trials_equal_published_tables_and_one_fewer_is_not_enough():
@@ -178,9 +178,9 @@ def test_intervals_of_fractions_and_quantiles_have_a_coverage_of_95_to_96_percen
     n = 2000
     chance = stats.binom.pmf(np.arange(n + 1), n, quantile)
     likely = [k for k in range(n + 1) if chance[k] > 1e-12]  # the sum of the others is below 1e-8
-    intervals = {k: statistics.share_interval(k, n, 0.95) for k in likely}
+    intervals = {k: statistics.fraction_interval(k, n, 0.95) for k in likely}
     assert 0.95 <= sum(chance[k] for k in likely if intervals[k][0] <= quantile <= intervals[k][1]) < 0.96
-    assert 0.95 <= sum(chance[k] for k in likely if statistics.share_bound(k, n, 0.95) <= quantile) < 0.96
+    assert 0.95 <= sum(chance[k] for k in likely if statistics.fraction_bound(k, n, 0.95) <= quantile) < 0.96
     low, high = statistics.quantile_interval(1.0 + np.arange(n), quantile, 0.95)  # the l-th and the u-th smallest
     assert 0.95 <= chance[int(low) : int(high)].sum() < 0.96
 
@@ -197,7 +197,7 @@ def test_statistics_equal_scipy_stats(seed):
     n = int(rng.integers(1, 3000))
     k, quantile, confidence = int(rng.integers(1, n + 1)), rng.uniform(), rng.uniform(0.5, 0.9999)
     bound = stats.beta.ppf(1.0 - confidence, k, n - k + 1)
-    np.testing.assert_allclose(statistics.share_bound(k, n, confidence), bound, rtol=1e-12)
+    np.testing.assert_allclose(statistics.fraction_bound(k, n, confidence), bound, rtol=1e-12)
     low, high = (
         stats.binom.ppf((1.0 - confidence) / 2.0, n, quantile),
         stats.binom.isf((1.0 - confidence) / 2.0, n, quantile),

@@ -293,9 +293,9 @@ def test_exported_c_has_the_names_and_equations_of_the_law(exported):
 
 
 def test_singularity_limit_in_c_equals_that_of_the_simulator(monkeypatch):
-    monkeypatch.setattr(run_state, "SINGULAR_CLEARANCE", 0.0125)
+    monkeypatch.setattr(run_state, "SINGULAR_DISTANCE", 0.0125)
     made = folder.Controller(scenario.from_tables(flight()), "short", "a scenario")
-    limits = re.findall(r"clearance >= R\((.*?)\)", templates.texts(made.code, made.about)["ptsmc_short.c"])
+    limits = re.findall(r"singularity_distance >= R\((.*?)\)", templates.texts(made.code, made.about)["ptsmc_short.c"])
     assert limits == ["0.0125", "0.0125"]
 
 
@@ -313,7 +313,7 @@ def test_command_filter_advances_by_one_period_after_missed_samples():
     parts: Any = scenario.study(scenario.from_tables(tables)).parts
     known = {"t": 1.0, "tracking": 1, "out.d_hat": np.zeros(3), "before.law": parts.controller.begin(),
              "before.command_filter": np.zeros(3), "now.attitude": parts.initial.q, "now.rate": np.zeros(3),
-             "before.clearance_unit": 1.0, "last.command": np.ones(3), "last.s": np.zeros(3)}  # fmt: skip
+             "before.singularity_distance_unit": 1.0, "last.command": np.ones(3), "last.s": np.zeros(3)}  # fmt: skip
 
     def commanded(simulated, gap):
         made = board(simulated)

@@ -28,7 +28,7 @@ def tune(search: dict[str, Any] | None = None, trust: dict[str, Any] | None = No
         "status": "met", "plant": "spacecraft", "gain_units": {}, "gains": {}, "at_bound": {},
         "accuracy_gain_over_paper": None, "accuracy_gain_interval": None, "training": group(), "held_out": group(),
         "paper_refused": None, "published_label": "published", "shortest_t_f": None, "broken_by": {}, "verdicts": [],
-        "judged_on": "flight clock", "cautions": [], "differential_evolution": None,
+        "judged_on": "flight clock", "warnings": [], "differential_evolution": None,
     }  # fmt: skip
     trusted = None if trust is None else {**known, **trust}
     return summaries.tune({**summary, "search": {**record, **(search or {})}, "trust": trusted, **changes})
@@ -55,7 +55,7 @@ def compare(laws: dict[str, Any], **changes: Any) -> summaries.Compare:
     """Return the summary of a comparison."""
     summary = {"status": "met", "trials": 8, "paper_refused": None, "published_label": None,
                "judged_on": "flight clock",
-               "settling_angle": 1e-3, "cautions": []}  # fmt: skip
+               "settling_angle": 1e-3, "warnings": []}  # fmt: skip
     return summaries.read(summaries.Compare, {**summary, "laws": laws, **changes})
 
 
@@ -63,5 +63,5 @@ def campaign(**changes: Any) -> summaries.Campaign:
     """Return the summary of a campaign."""
     summary = {"status": "met", "plant": "spacecraft", "seed": 1, "run_table": None, "trials": 8, "simulated": 8,
                "unjudged": [], "counts": {"ok": 8}, "reasons": [], "floor": None, "verdicts": [], "quantiles": {},
-               "drivers": {}, "driver_trials": {}, "cautions": []}  # fmt: skip
+               "drivers": {}, "driver_trials": {}, "warnings": []}  # fmt: skip
     return summaries.read(summaries.Campaign, {**summary, **changes})

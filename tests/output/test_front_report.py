@@ -17,7 +17,7 @@ def front(*points, **changes):
         **{
             "against": "torque", "plant": "spacecraft", "points": list(points), "idle": [], "without": [],
             "trials": 1000, "seed": 1, "interval_confidence": 0.95, "floor": None, "rollouts": 1, "gradients": 1,
-            "requirements": [], "gain_units": {"eta": "-", "observer_gain": "kg m^2/s"}, "cautions": [],
+            "requirements": [], "gain_units": {"eta": "-", "observer_gain": "kg m^2/s"}, "warnings": [],
             "published_label": "published", **changes,
         }
     )  # fmt: skip

@@ -12,7 +12,7 @@ from ptsmc_jax import scenario
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.observers.nonlinear import NonlinearObserver
 from ptsmc_jax.plants import rigid_body
-from ptsmc_jax.scenario import build, cautions, disturbance_bounds, free_gains, parsing, reading
+from ptsmc_jax.scenario import build, disturbance_bounds, free_gains, parsing, plausibility, reading
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.signals.disturbances import Disturbance
 from tests.helpers import FULL_INERTIA
@@ -254,7 +254,7 @@ QUIET = {"kind": "constant", "amplitude": [1e-6] * 3}
     ids=str,
 )  # fmt: skip
 def test_unusual_bounds_and_noisy_estimates_cause_a_warning(tables, said):
-    found = cautions.of(scenario.from_tables(tables))
+    found = plausibility.warnings(scenario.from_tables(tables))
     assert len(found) == bool(said)
     assert all(words in found[0] for words in said)
 
@@ -262,11 +262,11 @@ def test_unusual_bounds_and_noisy_estimates_cause_a_warning(tables, said):
 @pytest.mark.parametrize(("share", "said"), [(1.02, False), (0.98, True)])
 def test_an_estimate_with_more_noise_than_the_disturbance_causes_a_warning(share, said):
     observed = {**NOISY, "observer": {"gain": [0.07] * 3}}
-    noise = cautions.estimate_noise(scenario.from_tables({**observed, "disturbance": {"kind": "none"}}))
+    noise = plausibility.estimate_noise(scenario.from_tables({**observed, "disturbance": {"kind": "none"}}))
     acting = {"kind": "constant", "amplitude": [share * noise, 0.0, 0.0]}
     tables = {**observed, "disturbance": acting}
-    assert cautions.estimate_noise(scenario.from_tables(tables)) == noise  # for any disturbance
-    assert any("look at a smaller gain" in one for one in cautions.of(scenario.from_tables(tables))) is said
+    assert plausibility.estimate_noise(scenario.from_tables(tables)) == noise  # for any disturbance
+    assert any("look at a smaller gain" in one for one in plausibility.warnings(scenario.from_tables(tables))) is said
 
 
 def test_the_predicted_noise_of_the_estimate_matches_the_observer():
@@ -283,7 +283,7 @@ def test_the_predicted_noise_of_the_estimate_matches_the_observer():
 
     _, estimates = jax.lax.scan(step, jnp.zeros(3), impulses)
     assert np.std(np.asarray(estimates)[200:], axis=0).max() == pytest.approx(
-        cautions.estimate_noise(scenario.from_tables(tables)), rel=0.02
+        plausibility.estimate_noise(scenario.from_tables(tables)), rel=0.02
     )
 
 
@@ -391,7 +391,7 @@ def test_a_custom_disturbance_that_disperses_an_unknown_field_is_refused(drawn, 
     ],
 )
 def test_a_noisy_star_tracker_with_a_perfect_gyro_causes_a_warning(hardware, said):
-    found = cautions.of(scenario.from_tables({"loop": {"mode": "sampled"}, "hardware": hardware}))
+    found = plausibility.warnings(scenario.from_tables({"loop": {"mode": "sampled"}, "hardware": hardware}))
     assert [one for one in found if "hardware.attitude_noise is 2e-05" in one and "perfectly" in one] == found
     assert bool(found) == said
 
@@ -399,7 +399,7 @@ def test_a_noisy_star_tracker_with_a_perfect_gyro_causes_a_warning(hardware, sai
 @pytest.mark.parametrize(("delay", "said"), [(0, False), (59, False), (60, True), (599, True)])
 def test_a_delay_that_is_probably_in_seconds_causes_a_warning(delay, said):
     """The warning begins at a tenth of t_f = 30 s, 60 periods of 0.05 s."""
-    every = cautions.of(scenario.from_tables({"loop": {"mode": "sampled"}, "hardware": {"delay": delay}}))
+    every = plausibility.warnings(scenario.from_tables({"loop": {"mode": "sampled"}, "hardware": {"delay": delay}}))
     found = [one for one in every if "surface_rate" not in one]  # the surface is too fast for this delay
     known = f"hardware.delay is {delay}, which are {delay * 0.05:g} s: it counts control periods, of 0.05 s each"
     assert found == [f"{known}, and no time"] * said
@@ -408,7 +408,7 @@ def test_a_delay_that_is_probably_in_seconds_causes_a_warning(delay, said):
 @pytest.mark.parametrize(("noise", "said"), [(10.0, True), (0.1, True), (1e-2, False), ("10 arcsec", False)])
 def test_an_implausible_star_tracker_noise_causes_a_warning(noise, said):
     tables = {"loop": {"mode": "sampled"}, "hardware": {"attitude_noise": noise, "rate_noise": 0.0}}
-    found = [one for one in cautions.of(scenario.from_tables(tables)) if "another unit" in one]
+    found = [one for one in plausibility.warnings(scenario.from_tables(tables)) if "another unit" in one]
     assert len(found) == said
     assert not said or f'"{noise:g} arcsec"' in found[0]
 
@@ -437,5 +437,5 @@ def test_a_surface_rate_without_a_stable_k1_causes_a_warning(changes, said):
     tables = {"loop": {"mode": "sampled", "period": 5.0}, "disturbance": QUIET, **changes, "controller": law}
     if "plant" in changes:
         del tables["disturbance"]
-    found = [one for one in cautions.of(scenario.from_tables(tables)) if "surface_rate" in one]
+    found = [one for one in plausibility.warnings(scenario.from_tables(tables)) if "surface_rate" in one]
     assert len(found) == said

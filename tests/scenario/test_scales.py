@@ -14,7 +14,7 @@ from ptsmc_jax.plants import rigid_body, second_order
 from ptsmc_jax.plants.rigid_body import AttitudeState
 from ptsmc_jax.scenario import scales
 from ptsmc_jax.signals.references import Target
-from ptsmc_jax.theory import borders
+from ptsmc_jax.theory import stability_limits
 from tests.helpers import FIRST_FLIGHT, FULL_INERTIA, commanded, parts, vector
 
 ARM = {"plant": {"kind": "system", "system": second_order.system(
@@ -62,11 +62,11 @@ def growth(c, k, late, keep=0.6, period=1.0):
 @pytest.mark.parametrize("surface", [0.02, 0.1, 0.25])
 def test_the_stability_limit_of_the_hold_phase_matches_a_loop_computed_by_hand(surface, late):
     """The observer in the loop, which the limit ignores, changes nothing: its residual error is constant."""
-    border = borders.largest_reaching(surface, float(late))
+    border = stability_limits.largest_reaching(surface, float(late))
     inside, outside = growth(surface, 0.98 * border, late), growth(surface, 1.02 * border, late)
     assert inside < 1e-6 < 1e-3 < outside
     # the two rates can be exchanged
-    np.testing.assert_allclose(borders.largest_reaching(border, float(late)), surface, rtol=1e-6)
+    np.testing.assert_allclose(stability_limits.largest_reaching(border, float(late)), surface, rtol=1e-6)
     if late == 0:
         np.testing.assert_allclose(border, 2.0 - surface, rtol=1e-9)
 
@@ -74,7 +74,7 @@ def test_the_stability_limit_of_the_hold_phase_matches_a_loop_computed_by_hand(s
 def test_the_largest_k1_of_a_spacecraft_is_twice_the_stability_limit():
     np.testing.assert_allclose(scales.largest_k1(flight(), 1.0), 2.0 * (2.0 / 0.05 - 1.0), rtol=1e-9)
     late = flight(hardware__delay=1)
-    np.testing.assert_allclose(scales.largest_k1(late, 3.0), 2.0 * borders.largest_reaching(0.15, 1.0) / 0.05)
+    np.testing.assert_allclose(scales.largest_k1(late, 3.0), 2.0 * stability_limits.largest_reaching(0.15, 1.0) / 0.05)
     assert scales.largest_k1(flight(), 41.0) == 0.0
     loop = {"mode": "sampled", "period": 0.05}
     for plant in ({"kind": "chain", "order": 2}, ARM["plant"]):

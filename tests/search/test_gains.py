@@ -19,7 +19,7 @@ from ptsmc_jax.scenario.gain_bounds import Choice
 from ptsmc_jax.scenario.law_tables import LAWS
 from ptsmc_jax.scenario.observer_tables import OBSERVERS
 from ptsmc_jax.simulation import rollout
-from ptsmc_jax.theory import borders
+from ptsmc_jax.theory import stability_limits
 from tests.helpers import FIRST_FLIGHT, SHORT, finer, short, ticks_of, vector
 from tuning.search import gains, normalisation
 from tuning.studies import judging, posing
@@ -258,8 +258,8 @@ def test_default_bounds_of_surface_rate_begin_at_1_75_over_t_f_and_end_at_half_o
     np.testing.assert_allclose(made.tune.bounds["surface_rate"], expected)
     if period is not None:  # the stability limit itself, without K1 and the switching term
         for c, stable in ((1.999 / period, True), (2.001 / period, False)):
-            kp, kd = borders.gains(np.asarray(t_f), t_f, 3.0, 0.5, 0.0, 0.0, c)
-            assert (borders.radius(float(kp) + 1e-9, float(kd), period) < 1.0) == stable
+            kp, kd = stability_limits.gains(np.asarray(t_f), t_f, 3.0, 0.5, 0.0, 0.0, c)
+            assert (stability_limits.radius(float(kp) + 1e-9, float(kd), period) < 1.0) == stable
 
 
 @pytest.mark.parametrize(

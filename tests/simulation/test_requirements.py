@@ -213,7 +213,7 @@ def test_mixed_requires_a_fraction_of_the_time_of_all_runs():
     # half of the runs exceed the limit for 1/200 of the time, which would violate an ensemble requirement
     kept = np.where(np.arange(RUNS) % 2, 1.0, 0.995)
     told = of_time("mixed", kept)
-    assert (told.met, told.share_of_time) == (True, pytest.approx(0.9975))
+    assert (told.met, told.fraction_of_time) == (True, pytest.approx(0.9975))
     assert "99.73 % of the time of all runs: a random run at a random time: 99.75 %: met" in str(told)
     many = np.tile(kept, 20)
     sure = of_time("mixed", many, confidence=0.9)
@@ -228,7 +228,7 @@ def test_mixed_requires_a_fraction_of_the_time_of_all_runs():
     assert fewer.shown is not None
     assert sure.margin <= 1.0 < fewer.margin == pytest.approx((1.0 - fewer.shown) / (1.0 - 0.9973))
     failed = of_time("mixed", kept, ok=np.arange(RUNS) > 0)
-    assert failed.share_of_time == pytest.approx(0.9975 - 0.995 / RUNS)
+    assert failed.fraction_of_time == pytest.approx(0.9975 - 0.995 / RUNS)
 
 
 def test_a_single_run_is_judged_by_its_fraction_of_the_time():

@@ -12,7 +12,7 @@ import pytest
 
 from ptsmc_jax import scenario
 from ptsmc_jax.scenario.errors import ScenarioError
-from ptsmc_jax.theory import margins, rest, run_margins
+from ptsmc_jax.theory import limit_cycles, margins, run_margins
 from tests.helpers import SHORT, SHORT_CHAIN, short, untuned
 from tests.theory.loops import held
 from tuning.output import margins_report, page, summaries
@@ -114,15 +114,15 @@ def test_simulate_checks_required_margins(command, tmp_path):
 
 
 def test_run_with_a_limit_cycle_has_no_margins(command, tmp_path, monkeypatch):
-    """`theory/test_rest.py` tests the detection of limit cycles."""
+    """`theory/test_limit_cycles.py` tests the detection of limit cycles."""
     (tmp_path / "asks.toml").write_text(ASKS)
-    monkeypatch.setattr(rest, "swing", lambda *_: rest.Swing(0.04, 2.0))
+    monkeypatch.setattr(limit_cycles, "limit_cycle", lambda *_: limit_cycles.LimitCycle(0.04, 2.0))
     status, said, _ = command("margins", "asks.toml", "--no-figures")
     assert status == 1
     assert "the nominal run does NOT come to rest in the hold phase" in said
     found = json.loads((tmp_path / "out" / "margins-asks" / "summary.json").read_text())
     assert found["worst"]["gain_margin"] == found["worst"]["delay_margin"] == 0.0
-    assert found["swing"] == {"size": 0.04, "periods": 2.0, "unit": "u"}
+    assert found["limit_cycle"] == {"size": 0.04, "periods": 2.0, "unit": "u"}
     assert not found["stable"]
     status, said, _ = command("simulate", "asks.toml", "--no-figures")
     assert status == 1
@@ -199,9 +199,9 @@ def test_nominal_run_near_the_singularity_is_refused(monkeypatch):
     """Earlier, `margins` reported a stable loop."""
     ready = at_hand_over(0.1)
     course = run_margins.along(ready.parts)
-    assert course.clearance == 1.0  # a chain's law has no singularity
+    assert course.singularity_distance == 1.0  # a chain's law has no singularity
     stability.find(ready.scenario)
-    monkeypatch.setattr(run_margins, "along", lambda _: course._replace(clearance=0.9e-3))
+    monkeypatch.setattr(run_margins, "along", lambda _: course._replace(singularity_distance=0.9e-3))
     with pytest.raises(ScenarioError, match="which ends singular: the law's singularity came nearer than 1e-3"):
         stability.find(ready.scenario)
 

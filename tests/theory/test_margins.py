@@ -12,7 +12,7 @@ from scipy import optimize, signal
 from ptsmc_jax import scenario
 from ptsmc_jax.batching import lapack
 from ptsmc_jax.plants import second_order
-from ptsmc_jax.theory import borders, crossings, linear, margins, rest, run_margins
+from ptsmc_jax.theory import crossings, limit_cycles, linear, margins, run_margins, stability_limits
 from ptsmc_jax.theory.carries import Local
 from tests.helpers import equations, fly, short
 from tests.helpers import parts as a_body
@@ -117,9 +117,9 @@ def test_margins_equal_those_of_an_independent_transfer_function(k1, period, rat
     )
     np.testing.assert_allclose(found.peak_sensitivity, -20 * np.log10(peak.fun), atol=1e-8)
     assert np.isinf(found.gain_down)  # a double integrator is stable with any small gain
-    late = float(found.delay[0]) / period  # `borders` models delayed commands independently
+    late = float(found.delay[0]) / period  # `stability_limits` models delayed commands independently
     for share, stable in ((1 - 1e-7, True), (1 + 1e-7, False)):
-        assert (borders.radius(kp, kd, period, delay + share * late) < 1.0) == stable
+        assert (stability_limits.radius(kp, kd, period, delay + share * late) < 1.0) == stable
 
 
 def test_gain_margin_of_a_sampled_double_integrator():
@@ -654,7 +654,7 @@ def test_lapack_receives_one_matrix_at_a_time():
         "their slopes": jax.make_jaxpr(with_gradients)(1.0),
         "roughly": jax.make_jaxpr(lambda loops: jax.lax.map(margins.roughly, loops))(loops),
         "responses": margins._responses.trace(loop),
-        "at rest": rest._unexplained.trace(body, jax.eval_shape(linear.nominal, body)),
+        "at rest": limit_cycles._unexplained.trace(body, jax.eval_shape(linear.nominal, body)),
     }
     for name, trace in traces.items():
         solved = [e for e in equations(trace.jaxpr) if e.primitive.name in lapack.COUNTED | lapack.SHARED]

@@ -11,10 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from ptsmc_jax.signals import disturbances
 from ptsmc_jax.simulation import rollout
-from ptsmc_jax.theory import covariance, error_floor
+from ptsmc_jax.theory import covariance, lower_bound
 from tests import suites
 from tests.helpers import parts, vector
-from tests.theory.test_floor import AT_REST, PERIOD, delayed, pooled_in_window, simulated_at, still
+from tests.theory.test_lower_bound import AT_REST, PERIOD, delayed, pooled_in_window, simulated_at, still
 
 
 def history(moments, walks):
@@ -53,7 +53,7 @@ def test_lower_bound_with_two_star_trackers_equals_an_independent_kalman_filter(
     walk = np.array([1e-3, 2e-3, 0.0])
     made = parts(**AT_REST, delta=2 * PERIOD, disturbance=disturbances.Constant(jnp.zeros(3)))
     made = simulated_at(made, sensors=suite, walk_rate=vector(walk), actuators=delayed(1))
-    found = error_floor.along(made, still(made))
+    found = lower_bound.along(made, still(made))
     periods = len(found.t)
     state = history(np.diag(np.asarray(made.plant.inertia)), range(periods))
     factor, bias = np.asarray(suite.filter.first_factor(0, 1.0)), np.asarray(suite.rate_bias)

@@ -12,7 +12,7 @@ from tuning.output import terminal
 
 if TYPE_CHECKING:
     from ptsmc_jax.onboard.library import InTheLoop
-    from ptsmc_jax.scenario.flyable import Study
+    from ptsmc_jax.scenario.assembly import Study
     from ptsmc_jax.scenario.tables import Scenario
 
 ControllerFolder = Annotated[

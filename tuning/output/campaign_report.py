@@ -11,7 +11,7 @@ from ptsmc_jax.simulation.catalogues import percent
 from tuning.output import pointing_report, report
 from tuning.output.formats import digits, listed, many, named_error
 from tuning.output.report import Block, Report, Section, Table, Text
-from tuning.output.run_report import bound, cautions
+from tuning.output.run_report import bound, warnings
 from tuning.output.summaries import Campaign, Entry, Quantile
 
 WEAK = 0.05  # rank correlation or fraction of the variance below which an input is not named
@@ -35,19 +35,19 @@ def of(summary: Campaign) -> Report:
         Section("Metrics", blocks),
         *pointing_report.sections(summary),
     ]
-    lines = [*bound(error, summary.floor, summary.plant), *counts(summary), *cautions(summary.cautions)]
+    lines = [*bound(error, summary.floor, summary.plant), *counts(summary), *warnings(summary.warnings)]
     return Report(headline, mood, lines, sections)
 
 
 def verdict(entry: Entry) -> str:
     """Return a verdict with the fraction of trials within the limit."""
     text = str(entry)
-    if entry.share_of_time is not None or entry.share is None or entry.share_interval is None:
+    if entry.fraction_of_time is not None or entry.share is None or entry.fraction_interval is None:
         return text
-    low, high = entry.share_interval
+    low, high = entry.fraction_interval
     text += f"; {percent(entry.share)} % of trials keep the limit (95 %: {percent(low)} to {percent(high)} %)"
-    if entry.quantile is not None and entry.confidence is not None and entry.share_bound is not None:
-        text += f", at least {percent(entry.share_bound)} % at {100 * entry.confidence:g} % one-sided confidence"
+    if entry.quantile is not None and entry.confidence is not None and entry.fraction_bound is not None:
+        text += f", at least {percent(entry.fraction_bound)} % at {100 * entry.confidence:g} % one-sided confidence"
         if entry.share > entry.quantile:
             failures = "as many failures" if entry.failures else "no failure"
             text += f"; {entry.fewest_trials} trials with {failures} are enough"

@@ -9,7 +9,7 @@ from ptsmc_jax.simulation.catalogues import MARGINS
 from tuning.output import page_charts
 from tuning.output.formats import digits, failed, listed, many, over_bound, pointing, ratio
 from tuning.output.report import Chart, Report, Section, Table, Text
-from tuning.output.run_report import cautions
+from tuning.output.run_report import warnings
 from tuning.output.summaries import Compare, Entry, Interval, Law, Number
 
 ARCSEC = math.degrees(1.0) * 3600.0
@@ -159,7 +159,7 @@ def of(summary: Compare) -> Report:
     )
     sections.append(Section("Gains", [Text(list(lines(summary)))]))
     mood = "good" if summary.status == "met" else "bad"
-    return Report(headline, mood, [winner(summary.laws), how, *cautions(summary.cautions)], sections)
+    return Report(headline, mood, [winner(summary.laws), how, *warnings(summary.warnings)], sections)
 
 
 def _chart(question: Question, laws: dict[str, Law], k: int) -> Chart:

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from tuning.output import margins_report
 from tuning.output.formats import digits, error, many, over_bound, ratio, valued
 from tuning.output.report import Report, Section, Table, Text
-from tuning.output.run_report import cautions
+from tuning.output.run_report import warnings
 from tuning.studies.front import KINDS, Front, Point, titled, unit_of
 
 USUAL = margins_report.ENOUGH["gain_margin"]  # limit on |S| that the summary states first [dB]
@@ -20,7 +20,7 @@ def of(front: Front) -> Report:
     else:
         headline, mood = heading(front), "calm"
     blocks = [results(front), Text(list(remarks(front))), gains(front)]
-    lines = [*answers(front), *([heading(front)] if front.requirements else []), *cautions(front.cautions)]
+    lines = [*answers(front), *([heading(front)] if front.requirements else []), *warnings(front.warnings)]
     return Report(headline, mood, lines, [Section(KINDS[front.against].title, blocks)])
 
 

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 from ptsmc_jax.simulation.catalogues import MARGINS
 from tuning.output.formats import digits
 from tuning.output.report import Report, Section, Table
-from tuning.output.summaries import Left, Margins, Numbers, Swing
+from tuning.output.summaries import Left, LimitCycle, Margins, Numbers
 
 ENOUGH = {"gain_margin": 6.0, "phase_margin": 30.0}  # usual requirements
 PHASES = {"hold": "hold phase", "before": "approach phase"}
@@ -48,8 +48,8 @@ def _lines(summary: Margins) -> Iterator[str]:
     """Return what limits the meaning of the margins."""
     if summary.stable and not summary.open:
         yield "these are the smallest margins at any input, in the hold phase and the frozen approach phase"
-    if summary.swing is not None:
-        yield from swinging(summary.swing)
+    if summary.limit_cycle is not None:
+        yield from oscillation(summary.limit_cycle)
     if summary.start_deg is not None:
         yield f"the nominal run starts {summary.start_deg:.4g} deg from the reference; change [initial] for another"
     if summary.not_converged:
@@ -113,9 +113,13 @@ def tuned(margins: Mapping[str, Left] | None, *, required: bool) -> Iterator[str
         left = (margins or {}).get(where)
         if left is None:
             continue
-        if left.swing is not None or not left.stable:
+        if left.limit_cycle is not None or not left.stable:
             short = True
-            yield from swinging(left.swing) if left.swing else [f"the nominal loop is NOT stable in the {phase}"]
+            yield from (
+                oscillation(left.limit_cycle)
+                if left.limit_cycle
+                else [f"the nominal loop is NOT stable in the {phase}"]
+            )
             continue
         yield f"margins of the nominal loop in the {phase}: {shown(left.numbers)}"
         few = [
@@ -131,12 +135,13 @@ def tuned(margins: Mapping[str, Left] | None, *, required: bool) -> Iterator[str
         yield f"for larger margins, tune with {more}; ptsmc pareto --against margins shows their cost"
 
 
-def swinging(swing: Swing) -> Iterator[str]:
+def oscillation(limit_cycle: LimitCycle) -> Iterator[str]:
     """Return the description of a limit cycle in the hold phase."""
     yield "the nominal run does NOT come to rest in the hold phase, so its margins count as zero"
     yield (
-        f"without noise and disturbance its command oscillates by {swing.size:.3g} {swing.unit} every "
-        f"{swing.periods:.3g} control periods; the boundary layer is too thin, or the gains are at the stability limit"
+        f"without noise and disturbance its command oscillates by {limit_cycle.size:.3g} {limit_cycle.unit} every "
+        f"{limit_cycle.periods:.3g} control periods; the boundary layer is too thin, or the gains are at "
+        "the stability limit"
     )
 
 

@@ -150,6 +150,6 @@ def distance(entry: "Entry") -> str:
     """Return the deciding value in per cent of the limit; empty if there is none."""
     if entry.margin is None or entry.at_least or entry.limit == 0.0:
         return ""
-    if entry.share_of_time is not None:
+    if entry.fraction_of_time is not None:
         return f"; {ratio(100 * entry.margin)} % of the time allowed beyond the limit"
     return f"; {ratio(100 * entry.margin)} % of the limit"

@@ -17,7 +17,7 @@ def of(summary: Run, plant: str) -> Report:
     first = named_error(summary.metrics.get("window_error"), plant)
     headline, mood = report.headline(status, summary.verdicts, first)
     sections = [*report.requirements(summary.verdicts), Section("Metrics", [metrics(summary, plant)])]
-    return Report(headline, mood, [*_lines(summary, plant), *cautions(summary.cautions)], sections)
+    return Report(headline, mood, [*_lines(summary, plant), *warnings(summary.warnings)], sections)
 
 
 def _lines(summary: Run, plant: str) -> Iterator[str]:
@@ -48,6 +48,6 @@ def metrics(summary: Run, plant: str) -> Table:
     return Table(("metric", "value", "unit", "meaning"), rows)
 
 
-def cautions(texts: list[str]) -> list[str]:
+def warnings(texts: list[str]) -> list[str]:
     """Return the cautions about a scenario as lines."""
     return [f"CAUTION: {text}" for text in texts]

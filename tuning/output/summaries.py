@@ -33,12 +33,12 @@ class Entry(msgspec.Struct, frozen=True):
     confidence: Number = None
     at_least: bool = False
     interpretation: str = "ensemble"
-    share_of_time: Number = None
+    fraction_of_time: Number = None
     shown: Number = None
     # of a campaign: the fraction of trials within the limit, its interval, its lower bound, and enough trials
     share: Number = None
-    share_interval: Interval = None
-    share_bound: Number = None
+    fraction_interval: Interval = None
+    fraction_bound: Number = None
     fewest_trials: int | None = None
 
     def __str__(self) -> str:
@@ -55,7 +55,7 @@ class Run(msgspec.Struct, frozen=True, kw_only=True):
     floor: Number
     metrics: Numbers
     verdicts: list[Entry]
-    cautions: list[str]
+    warnings: list[str]
     controller_statuses: dict[str, int] = {}
 
 
@@ -131,7 +131,7 @@ class Search(msgspec.Struct, frozen=True, kw_only=True):
     seconds_by_step: dict[str, float]
 
 
-class Swing(msgspec.Struct, frozen=True):
+class LimitCycle(msgspec.Struct, frozen=True):
     """A limit cycle in the hold phase."""
 
     size: float
@@ -147,7 +147,7 @@ class Left(msgspec.Struct, frozen=True):
     phase_margin: Number
     delay_margin: Number
     peak_sensitivity: Number
-    swing: Swing | None = None
+    limit_cycle: LimitCycle | None = None
 
     @property
     def numbers(self) -> Numbers:
@@ -202,7 +202,7 @@ class Tune(msgspec.Struct, frozen=True, kw_only=True):
     broken_by: dict[str, list[str]]
     verdicts: list[Entry]
     judged_on: str
-    cautions: list[str]
+    warnings: list[str]
     search: Search
     trust: Trust | None
     differential_evolution: Check | None
@@ -248,7 +248,7 @@ class Compare(msgspec.Struct, frozen=True):
     judged_on: str
     settling_angle: float
     laws: dict[str, Law]
-    cautions: list[str]
+    warnings: list[str]
 
 
 class Quantile(msgspec.Struct, frozen=True):
@@ -324,7 +324,7 @@ class Campaign(msgspec.Struct, frozen=True, kw_only=True):
     driver_trials: dict[str, int]
     controller_samples: dict[str, Samples] = {}
     pointing: Pointing | None = None
-    cautions: list[str]
+    warnings: list[str]
 
 
 class Frozen(msgspec.Struct, frozen=True):
@@ -352,7 +352,7 @@ class Margins(msgspec.Struct, frozen=True, kw_only=True):
     dispersed: int | None = None
     said: str | None
     start_deg: Number = None
-    swing: Swing | None = None
+    limit_cycle: LimitCycle | None = None
 
 
 class Claim(msgspec.Struct, frozen=True):

@@ -7,7 +7,7 @@ from ptsmc_jax.simulation.catalogues import CATALOGUES, MARGINS, NO_SIGN, percen
 from tuning.output import formats, margins_report, report
 from tuning.output.formats import digits, error, failed, interval, listed, many, over_bound, ratio
 from tuning.output.report import Report, Section, Table, Text
-from tuning.output.run_report import cautions
+from tuning.output.run_report import warnings
 from tuning.output.summaries import Check, Entry, Group, Hardest, Search, Tune
 
 AGREE = 0.01  # largest relative difference of gradients from finite differences
@@ -29,7 +29,7 @@ def of(summary: Tune) -> Report:
         Section("Gains", [gains(summary)]),
         Section("Can the result be trusted?", [Text(trust)]),
     ]
-    return Report(headline, mood, [*accuracy(summary), *cautions(summary.cautions)], sections)
+    return Report(headline, mood, [*accuracy(summary), *warnings(summary.warnings)], sections)
 
 
 def _groups(summary: Tune) -> dict[str, Group]:
@@ -290,7 +290,7 @@ def advice(summary: Tune) -> Iterator[str]:
 
 def _reached(verdict: Entry) -> float | None:
     """Return the value on the held-out trials relative to the limit; None without a value."""
-    if verdict.share_of_time is None:
+    if verdict.fraction_of_time is None:
         return verdict.margin
     return None if verdict.worst is None else verdict.worst / verdict.limit
 

@@ -83,11 +83,11 @@ def _outcomes(frame: pl.DataFrame, wanted: Sequence[Requirement]) -> np.ndarray:
 
 def _of_time(verdict: Verdict) -> str:
     """Return the required and the observed fraction of time in words, or "" if the requirement counts trials."""
-    if verdict.share_of_time is None or verdict.quantile is None:
+    if verdict.fraction_of_time is None or verdict.quantile is None:
         return ""
     asked = f"required: {100 * verdict.quantile:g} % of {INTERPRETATIONS[verdict.interpretation].split(':')[0]}"
     least = "at least " if verdict.interpretation == "temporal" else ""
-    return f"{asked}; seen: {least}{percent(verdict.share_of_time)} %"
+    return f"{asked}; seen: {least}{percent(verdict.fraction_of_time)} %"
 
 
 def _fan(folder: Folder, frame: pl.DataFrame, finished: np.ndarray) -> dict[str, Figure]:

@@ -17,7 +17,7 @@ from ptsmc_jax.campaigns import rows, run_tables, runs, store
 from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.dispersions.quantities import CATEGORIES
 from ptsmc_jax.numerics import statistics
-from ptsmc_jax.scenario import cautions, parsing
+from ptsmc_jax.scenario import parsing, plausibility
 from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.requirements import Requirement, Verdict, must_keep
 from ptsmc_jax.simulation.rollout import STATUS
@@ -67,7 +67,7 @@ def until_confident(folder: Folder, width: float, fly_first: Callable[[int], Non
     while True:
         count = min(count, folder.trials)
         fly_first(count)
-        intervals = [verdict["share_interval"] for verdict in judged(folder, first=count)]
+        intervals = [verdict["fraction_interval"] for verdict in judged(folder, first=count)]
         widths = [high - low for low, high in intervals]
         if count == folder.trials or all(w <= width for w in widths):
             return count
@@ -104,12 +104,15 @@ def _in_summary(verdict: Verdict, wanted: Requirement, beyond: np.ndarray) -> di
     if beyond.size:  # fraction of time: the samples of one run depend on each other, but the runs are independent
         each = (1.0 + CONFIDENCE) / 2.0
         entry["share"] = 1.0 - beyond.mean()
-        entry["share_interval"] = 1.0 - statistics.mean_bound(beyond, each), statistics.mean_bound(1.0 - beyond, each)
-        entry["share_bound"] = 1.0 - statistics.mean_bound(beyond, confidence)
+        entry["fraction_interval"] = (
+            1.0 - statistics.mean_bound(beyond, each),
+            statistics.mean_bound(1.0 - beyond, each),
+        )
+        entry["fraction_bound"] = 1.0 - statistics.mean_bound(beyond, confidence)
     else:
         entry["share"] = within / verdict.trials
-        entry["share_interval"] = statistics.share_interval(within, verdict.trials, CONFIDENCE)
-        entry["share_bound"] = statistics.share_bound(within, verdict.trials, confidence)
+        entry["fraction_interval"] = statistics.fraction_interval(within, verdict.trials, CONFIDENCE)
+        entry["fraction_bound"] = statistics.fraction_bound(within, verdict.trials, confidence)
     if wanted.quantile is not None and wanted.confidence is not None:
         failures = verdict.failures if wanted.timed is None else 0
         entry["fewest_trials"] = statistics.fewest_for(failures, wanted.quantile, wanted.confidence)
@@ -160,8 +163,8 @@ def summarise(folder: Folder) -> dict[str, Any]:
         "drivers": drivers,
         "driver_trials": driver_trials,  # number of trials that have the metric
         **_samples(folder, parts),
-        "cautions": [
-            *cautions.of(folder.scenario),
+        "warnings": [
+            *plausibility.warnings(folder.scenario),
             *filter(None, [folder.otherwise]),
             *_alike(quantiles, done, drawn=differ),
         ],

@@ -19,7 +19,7 @@ from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.montecarlo import Trials
 from ptsmc_jax.figures import study_plots, style
 from ptsmc_jax.numerics.statistics import value_at, vary
-from ptsmc_jax.scenario import cautions, custom, errors, free_gains, parsing, replace, study, systems, tables
+from ptsmc_jax.scenario import custom, errors, free_gains, parsing, plausibility, replace, study, systems, tables
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.law_tables import LAWS, common_keys
 from ptsmc_jax.scenario.spacecraft_scenario import SpacecraftScenario
@@ -363,7 +363,9 @@ def summary(comparison: Comparison) -> dict[str, Any]:
         "judged_on": "flight clock",  # no sign function is named here, because the laws have different ones
         "settling_angle": first.simulated.loop.settling_angle,
         "laws": {law: figures_of(contender) for law, contender in found.items()},
-        "cautions": list(dict.fromkeys(text for one in found.values() for text in cautions.of(one.simulated))),
+        "warnings": list(
+            dict.fromkeys(text for one in found.values() for text in plausibility.warnings(one.simulated))
+        ),
     }
 
 

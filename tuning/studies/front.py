@@ -95,7 +95,7 @@ class Front:
     gradients: int
     requirements: list[str]
     gain_units: dict[str, str]
-    cautions: list[str]
+    warnings: list[str]
     published_label: str  # label of the published gains
     paper_refused: str | None = None  # reason why the published gains cannot be simulated
     others: dict[str, Point] = field(default_factory=dict)  # "paper": published gains; "before": the scenario's gains

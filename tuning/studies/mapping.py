@@ -19,7 +19,7 @@ from ptsmc_jax.scenario import replace as changed
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation.rollout import Parts
-from ptsmc_jax.theory import borders, covariance, margins, run_margins
+from ptsmc_jax.theory import covariance, margins, run_margins, stability_limits
 from tuning.errors import UsageError
 from tuning.search import trust
 from tuning.studies import judging
@@ -256,8 +256,8 @@ def lines(scenario: Scenario, x: Axis, y: Axis) -> dict[str, tuple[np.ndarray, n
         y: the vertical axis.
 
     Returns:
-        Coordinates x (points,) and y (points,) of each curve [s], see `borders.smallest_delta`. The result is empty for
-        other keys, for other laws, and for plants whose order is not 2.
+        Coordinates x (points,) and y (points,) of each curve [s], see `stability_limits.smallest_delta`. The result is
+        empty for other keys, for other laws, and for plants whose order is not 2.
     """
     papers_loop = scenario.sampled and scenario.controller.law.prescribed and scenario.order == 2
     if {x.key, y.key} != {PERIOD, DELTA} or not papers_loop:
@@ -275,7 +275,7 @@ def lines(scenario: Scenario, x: Axis, y: Axis) -> dict[str, tuple[np.ndarray, n
     drawn = {}
     for label, periods in delays.items():
         how = {"anchored": anchored, "implicit": implicit and periods > 0.0}
-        delta = np.array([borders.smallest_delta(eta, float(period), periods, **how) for period in h])
+        delta = np.array([stability_limits.smallest_delta(eta, float(period), periods, **how) for period in h])
         drawn[label] = (h, delta) if x.key == PERIOD else (delta, h)
     return drawn
 

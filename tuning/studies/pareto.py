@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.montecarlo import Trials
 from ptsmc_jax.figures import study_plots, style
-from ptsmc_jax.scenario import cautions, parsing, study, tables
+from ptsmc_jax.scenario import parsing, plausibility, study, tables
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.scenario.timing import Reach
 from tuning.search import gains, trust
@@ -76,7 +76,7 @@ def trace(trade: Trade, seed: int, tell: Report = lambda *_: None, journal: Jour
         gradients=posed.evaluate.gradients,
         requirements=list(scenario.requirements),
         gain_units=gains.units_of(scenario),
-        cautions=cautions.of(scenario),
+        warnings=plausibility.warnings(scenario),
         published_label=gains.published_label(scenario),
         paper_refused=refused,
         others={name: reference(one) for name, one in others.items()},

@@ -13,14 +13,14 @@ import numpy as np
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.runs import Run
 from ptsmc_jax.onboard import sources
-from ptsmc_jax.scenario import cautions, custom, parsing
+from ptsmc_jax.scenario import custom, parsing, plausibility
 from ptsmc_jax.scenario.tables import Scenario
 
 if TYPE_CHECKING:  # runs without C code do not need this import
     from ptsmc_jax.onboard.library import InTheLoop
 
 # fields of a verdict on a requirement that allows violations for some of the time
-OF_TIME = ("quantile", "confidence", "interpretation", "share_of_time", "shown")
+OF_TIME = ("quantile", "confidence", "interpretation", "fraction_of_time", "shown")
 
 
 def summary(run: Run, scenario: Scenario, computer: "InTheLoop | None" = None) -> dict[str, Any]:
@@ -34,18 +34,18 @@ def summary(run: Run, scenario: Scenario, computer: "InTheLoop | None" = None) -
     verdicts = {
         v.metric: {
             **{"limit": v.limit, "margin": v.margin, "met": v.met, "worst": v.worst, "at_least": v.at_least},
-            **({} if v.share_of_time is None else {name: getattr(v, name) for name in OF_TIME}),
+            **({} if v.fraction_of_time is None else {name: getattr(v, name) for name in OF_TIME}),
         }
         for v in run.verdicts
     }
     heading = {"status": run.status, "reason": run.reason, "bad_time": run.bad_time}
     floor = None if run.floor is None else run.floor.window_error
-    said, decided_by = cautions.of(scenario), {}
+    said, decided_by = plausibility.warnings(scenario), {}
     if computer is not None:
         said += [computer.otherwise] if computer.otherwise else []
         statuses = {name: count for name, count in run.samples.items() if count}
         decided_by = {"controller_statuses": statuses, "controller": computer.library.digest}
-    return {**heading, **run.metrics, "floor": floor, "verdicts": verdicts, "cautions": said, **decided_by}
+    return {**heading, **run.metrics, "floor": floor, "verdicts": verdicts, "warnings": said, **decided_by}
 
 
 def write(

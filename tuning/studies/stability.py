@@ -16,10 +16,10 @@ from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.catalogues import CATALOGUES, NO_SIGN
-from ptsmc_jax.theory import margins, rest, run_margins
+from ptsmc_jax.theory import limit_cycles, margins, run_margins
 from ptsmc_jax.theory.crossings import MOST
+from ptsmc_jax.theory.limit_cycles import LimitCycle
 from ptsmc_jax.theory.margins import FIELDS
-from ptsmc_jax.theory.rest import Swing
 from ptsmc_jax.theory.run_margins import Course
 
 
@@ -34,7 +34,7 @@ def find(scenario: Scenario) -> tuple[Study, Course]:
     ready = study(scenario)
     course = run_margins.along(ready.parts)
     without_slopes, code = np.isnan(course.hold[1].peak_sensitivity).any(), rollout.OK
-    if course.clearance < rollout.SINGULAR_CLEARANCE:
+    if course.singularity_distance < rollout.SINGULAR_DISTANCE:
         code = rollout.SINGULAR
     elif without_slopes:
         code = int(rollout.simulate_parts(ready.parts, np.uint32(0), np.uint32(0)).status)
@@ -54,8 +54,8 @@ def worst(ready: Study) -> dict[str, dict[str, Any]] | None:
 
     Returns:
         Margins in [dB], [deg] and [s] for both phases, and whether the loops of all axes are "stable". If the nominal
-        run ends in a limit cycle, positive margins in "hold" are replaced by 0, and "swing" has the amplitude and the
-        period of the cycle. The result is None for a continuous loop, and if the loop has no finite derivatives in the
+        run ends in a limit cycle, positive margins in "hold" are replaced by 0, and "limit_cycle" has the amplitude
+        and the period of the cycle. The result is None for a continuous loop, and if the loop has no finite derivatives in the
         hold phase.
     """
     if not ready.scenario.sampled:
@@ -63,23 +63,23 @@ def worst(ready: Study) -> dict[str, dict[str, Any]] | None:
     left, hold, history = jax.tree.map(np.asarray, run_margins.judged_jit(ready.parts))
     if np.isnan(left.peak_sensitivity[-1]).any():
         return None
-    swing = rest.swing(ready.parts, history)
-    if swing is not None:
-        left = rest.none_left(left, hold)
+    limit_cycle = limit_cycles.find(ready.parts, history)
+    if limit_cycle is not None:
+        left = limit_cycles.none_left(left, hold)
     each = {}
     for where, rows in (("before", ~hold), ("hold", hold)):
         if rows.any():
             there = jax.tree.map(lambda v, rows=rows: v[rows], left)
             least = {name: _number(value) for name, value in there.worst().items()}
             each[where] = {"stable": bool(there.stable.all()), **least}
-    if swing is not None:
-        each["hold"] |= _swing(ready.scenario, swing)
+    if limit_cycle is not None:
+        each["hold"] |= _limit_cycle(ready.scenario, limit_cycle)
     return each
 
 
-def _swing(scenario: Scenario, swing: Swing) -> dict[str, Any]:
+def _limit_cycle(scenario: Scenario, limit_cycle: LimitCycle) -> dict[str, Any]:
     unit = CATALOGUES[scenario.plant.kind]["peak_torque"].unit
-    return {"swing": {**swing._asdict(), "unit": unit}}
+    return {"limit_cycle": {**limit_cycle._asdict(), "unit": unit}}
 
 
 def _number(value: Any) -> float | None:
@@ -132,7 +132,7 @@ def summary(ready: Study, course: Course) -> dict[str, Any]:
         **({"dispersed": margin_verdicts.TRIALS} if margin_verdicts.differ(ready.dispersion) else {}),
         "said": NO_SIGN if ready.scenario.exact_sign else None,
         **_start(ready),
-        **({} if course.swing is None else _swing(ready.scenario, course.swing)),
+        **({} if course.limit_cycle is None else _limit_cycle(ready.scenario, course.limit_cycle)),
     }
 
 

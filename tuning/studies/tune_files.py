@@ -10,7 +10,7 @@ import numpy as np
 
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.montecarlo import Trials
-from ptsmc_jax.scenario import cautions, custom, free_gains, parsing, tables
+from ptsmc_jax.scenario import custom, free_gains, parsing, plausibility, tables
 from ptsmc_jax.scenario.tables import LIMITS, T_F, Scenario, objective_name
 from ptsmc_jax.simulation import catalogues
 from tuning.search import custom_parts, trust
@@ -87,7 +87,7 @@ def summary(tuning: Tuning) -> dict[str, Any]:
         "broken_by": tuning.broken_by,
         "verdicts": [verdict.in_summary() for verdict in tuning.verdicts],
         "judged_on": judging.judged_on(tuning.tuned),
-        "cautions": cautions.of(tuning.tuned),
+        "warnings": plausibility.warnings(tuning.tuned),
         "search": {
             "objective": objective_name(tuning.tuned.search),
             "minimise": tuning.tuned.search.minimise,

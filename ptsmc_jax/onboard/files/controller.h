@@ -52,7 +52,7 @@ ${derived_struct}
 typedef struct {
     double t; /* of the last sample [s] */
     int started; /* 0 until the first sample */
-    int tracking; /* 0: the sign of the attitude and the law's clearance are chosen again */
+    int tracking; /* 0: the sign of the attitude and the distance to the singularity are chosen again */
 ${state_members}
     ptsmc_out last; /* good one */
 ${derived_member}

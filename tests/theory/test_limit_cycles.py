@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ptsmc_jax import scenario
-from ptsmc_jax.theory import linear, margins, rest
+from ptsmc_jax.theory import limit_cycles, linear, margins
 from tests.helpers import short
 
 K, C, H = 0.02, 1.0, 0.05  # bound on the disturbance [1/s^2], surface rate [1/s], period [s]
@@ -21,7 +21,7 @@ CHAIN = {
 
 
 def swing(**changes):
-    return rest.swing(scenario.study(scenario.replace(scenario.from_tables(CHAIN), **changes)).parts)
+    return limit_cycles.find(scenario.study(scenario.replace(scenario.from_tables(CHAIN), **changes)).parts)
 
 
 @pytest.mark.parametrize("k1", short([1.0, 4.0, 8.0], [1.0, 8.0]))
@@ -43,8 +43,8 @@ def test_size_of_a_slow_limit_cycle_is_peak_to_peak(delay):
     """The command changes between two samples by much less than from peak to peak."""
     delayed = {"controller__sign_width": 1e-7, "hardware__delay": delay}
     parts = scenario.study(scenario.replace(scenario.from_tables(CHAIN), **delayed)).parts
-    seen = rest.history(parts, linear.nominal_jit(parts))
-    found = rest.swing(parts, seen)
+    seen = limit_cycles.history(parts, linear.nominal_jit(parts))
+    found = limit_cycles.find(parts, seen)
     assert found is not None
     assert found.periods > 4 * delay
     last = np.asarray(seen.command)[np.flatnonzero(seen.in_hold)][-100:]
@@ -72,16 +72,16 @@ def test_no_limit_cycle_for_a_discontinuous_sign_or_a_short_hold_phase():
 def test_limit_cycle_detection_needs_sixteen_full_periods(whole, judged):
     """The run has a limit cycle throughout. The test marks only the last periods as hold phase."""
     parts = scenario.study(scenario.replace(scenario.from_tables(CHAIN), controller__sign_width=1e-7)).parts
-    seen = rest.history(parts, linear.nominal_jit(parts))
+    seen = limit_cycles.history(parts, linear.nominal_jit(parts))
     in_hold = np.flatnonzero(seen.in_hold)
     told = np.isin(np.arange(len(seen.in_hold)), in_hold[-whole:])
-    assert (rest.swing(parts, seen._replace(in_hold=told)) is not None) == judged
+    assert (limit_cycles.find(parts, seen._replace(in_hold=told)) is not None) == judged
 
 
 def test_none_left_sets_positive_margins_to_zero_and_keeps_negative_ones():
     stable = np.array([[True], [True], [False]])
     values: Any = {name: np.array([[3.0], [3.0], [-3.0]]) for name in margins.Margins._fields} | {"stable": stable}
-    left = rest.none_left(margins.Margins(**values), [False, True, True])
+    left = limit_cycles.none_left(margins.Margins(**values), [False, True, True])
     for name, of in left._asdict().items():
         none = {"peak_sensitivity": 100.0, "stable": False, "crossover": np.nan}.get(
             name, 0.0
@@ -105,7 +105,7 @@ def test_a_moving_reference_or_quantisation_is_not_a_limit_cycle(kind):
         "loop": {"mode": "sampled", "period": 0.05, "t_end": 20.0, "window": 1.0},
         **REFERENCES[kind],
     }
-    assert rest.swing(scenario.study(scenario.from_tables(tables)).parts) is None
+    assert limit_cycles.find(scenario.study(scenario.from_tables(tables)).parts) is None
 
 
 def test_limit_cycle_of_a_law_without_sign_width_is_detected(monkeypatch):
@@ -114,7 +114,7 @@ def test_limit_cycle_of_a_law_without_sign_width_is_detected(monkeypatch):
     law: Any = SimpleNamespace(controller=SimpleNamespace())
     run = SimpleNamespace(command=turning)
     monkeypatch.setattr(linear, "nominal_jit", lambda _: run)
-    seen = rest.History(jnp.asarray(turning), jnp.ones(40, bool))
-    for left, found in ((0.9, rest.Swing(1.0, 2.0)), (0.0, None)):
-        monkeypatch.setattr(rest, "_unexplained", lambda *_, left=left: (left * turning, turning))
-        assert rest.swing(law, seen) == found
+    seen = limit_cycles.History(jnp.asarray(turning), jnp.ones(40, bool))
+    for left, found in ((0.9, limit_cycles.LimitCycle(1.0, 2.0)), (0.0, None)):
+        monkeypatch.setattr(limit_cycles, "_unexplained", lambda *_, left=left: (left * turning, turning))
+        assert limit_cycles.find(law, seen) == found

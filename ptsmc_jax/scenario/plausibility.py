@@ -10,14 +10,14 @@ import numpy as np
 
 from ptsmc_jax.scenario import disturbance_bounds, errors
 from ptsmc_jax.scenario.tables import Scenario
-from ptsmc_jax.theory import borders
+from ptsmc_jax.theory import stability_limits
 
 FAR = 10.0  # largest ratio of a stated bound to the bound of the disturbance, or its inverse, without a warning
 LATE = 0.1  # fraction of t_f: a longer delay was probably given in another unit
 COARSE = np.deg2rad(5.0)  # [rad]: a larger noise was probably given in another unit
 
 
-def of(scenario: Scenario) -> list[str]:
+def warnings(scenario: Scenario) -> list[str]:
     """Return the warnings of a scenario, one sentence each.
 
     Bounds and estimate are not examined if custom code that defines the disturbance has not run yet.
@@ -48,7 +48,7 @@ def _fast_surface(scenario: Scenario) -> list[str]:
         return []
     period, delay = scenario.loop.period, scenario.devices.delay_periods
     share = getattr(law, "a", (1.0,))[0]  # the surface of a chain has the rate c a_1
-    border = borders.largest_surface(delay, implicit=law.implicit) / (share * period)
+    border = stability_limits.largest_surface(delay, implicit=law.implicit) / (share * period)
     if law.surface_rate < border:
         return []
     late = f" and a delay of {delay}" if delay else ""

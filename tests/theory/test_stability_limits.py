@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ptsmc_jax.plants.rigid_body import AttitudeState
-from ptsmc_jax.theory import borders
+from ptsmc_jax.theory import stability_limits
 from tests.helpers import commanded, parts, vector
 
 
@@ -24,12 +24,12 @@ def test_gains_are_the_derivatives_of_the_law(t):
 
     by_error, by_rate = jax.jacfwd(acceleration, (0, 1))(jnp.zeros(3), jnp.zeros(3))
     slope = np.sqrt(3.0) / 10.0 * 0.02 / 0.05
-    kp, kd = (float(v) for v in borders.gains(np.asarray(t), 20.0, 3.4, 1.0, 1.7, slope, 2.3))
+    kp, kd = (float(v) for v in stability_limits.gains(np.asarray(t), 20.0, 3.4, 1.0, 1.7, slope, 2.3))
     np.testing.assert_allclose(by_error, -kp * np.eye(3), atol=1e-9 * kp)
     np.testing.assert_allclose(by_rate, -kd * np.eye(3), atol=1e-9 * kd)
 
 
-def flown_radius(kp, kd, h, late):
+def simulated_radius(kp, kd, h, late):
     """Growth per period of a double integrator under delayed sampled feedback, by time stepping."""
     fine = 20
     state, commands = np.array([1.0, 0.3]), [0.0] * 10
@@ -47,28 +47,32 @@ def flown_radius(kp, kd, h, late):
 @pytest.mark.parametrize("late", [0.0, 1.0, 2.0, 0.25, 1.5])
 def test_spectral_radius_equals_growth_of_time_stepping(late):
     for kp, kd in ((0.2, 0.5), (1.0, 0.9), (0.05, 0.2)):
-        np.testing.assert_allclose(borders.radius(kp, kd, 1.0, late), flown_radius(kp, kd, 1.0, late), rtol=0.03)
+        np.testing.assert_allclose(
+            stability_limits.radius(kp, kd, 1.0, late), simulated_radius(kp, kd, 1.0, late), rtol=0.03
+        )
 
 
 def test_stability_limits_equal_the_documented_values():
     for eta in (2.2, 3.0, 5.0, 8.0):
-        np.testing.assert_allclose(borders.largest_index(eta), 2.0, rtol=1e-9)
-        np.testing.assert_allclose(borders.smallest_delta(eta, 0.05), max(0.0, (eta - 1.5) * 0.05), rtol=1e-8)
-        np.testing.assert_allclose(borders.smallest_delta(eta, 0.05, anchored=False), (eta - 0.5) * 0.05, rtol=1e-8)
-        assert 0.74 < borders.largest_index(eta, 1.0) < 0.85  # "about 0.75"
-        assert borders.largest_index(eta, 2.0) < borders.largest_index(eta, 1.0)
+        np.testing.assert_allclose(stability_limits.largest_index(eta), 2.0, rtol=1e-9)
+        np.testing.assert_allclose(stability_limits.smallest_delta(eta, 0.05), max(0.0, (eta - 1.5) * 0.05), rtol=1e-8)
+        np.testing.assert_allclose(
+            stability_limits.smallest_delta(eta, 0.05, anchored=False), (eta - 0.5) * 0.05, rtol=1e-8
+        )
+        assert 0.74 < stability_limits.largest_index(eta, 1.0) < 0.85  # "about 0.75"
+        assert stability_limits.largest_index(eta, 2.0) < stability_limits.largest_index(eta, 1.0)
 
 
 @pytest.mark.parametrize("implicit", [False, True])
 @pytest.mark.parametrize("delay", [0, 1, 2, 5])
 def test_no_reaching_rate_is_stable_above_the_largest_surface_rate(delay, implicit):
-    border = borders.largest_surface(delay, implicit=implicit)
+    border = stability_limits.largest_surface(delay, implicit=implicit)
     if implicit and not delay:
         assert border == np.inf
-        assert borders.largest_reaching(1e3, 0.0, implicit=True) > 0.0
+        assert stability_limits.largest_reaching(1e3, 0.0, implicit=True) > 0.0
         return
-    assert borders.largest_reaching(0.999 * border, float(delay), implicit=implicit) > 0.0
-    assert borders.largest_reaching(1.001 * border, float(delay), implicit=implicit) == 0.0
+    assert stability_limits.largest_reaching(0.999 * border, float(delay), implicit=implicit) > 0.0
+    assert stability_limits.largest_reaching(1.001 * border, float(delay), implicit=implicit) == 0.0
 
 
 @pytest.mark.parametrize("anchored", [False, True])
@@ -76,8 +80,8 @@ def test_no_reaching_rate_is_stable_above_the_largest_surface_rate(delay, implic
 def test_smallest_delta_puts_the_last_sample_before_the_hand_over_at_the_stability_limit(implicit, anchored):
     """Its time to go is delta on the flight clock, one period more on the anchored clock, one more if implicit."""
     eta, h = 4.0, 0.05
-    delta = borders.smallest_delta(eta, h, 1.0, anchored=anchored, implicit=implicit)
+    delta = stability_limits.smallest_delta(eta, h, 1.0, anchored=anchored, implicit=implicit)
     tau = delta / h + anchored + implicit
-    kp, kd = borders.implicit_gains(eta, tau) if implicit else ((eta / tau) ** 2, (2 * eta - 1) / tau)
+    kp, kd = stability_limits.implicit_gains(eta, tau) if implicit else ((eta / tau) ** 2, (2 * eta - 1) / tau)
     assert delta > 0.0
-    assert borders.radius(kp, kd, 1.0, 1.0) == pytest.approx(1.0, abs=1e-6)
+    assert stability_limits.radius(kp, kd, 1.0, 1.0) == pytest.approx(1.0, abs=1e-6)

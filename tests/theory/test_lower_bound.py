@@ -13,8 +13,8 @@ from scipy.linalg import expm
 from ptsmc_jax.devices import actuators, attitude_filter, reaction_wheels, sensors, star_times
 from ptsmc_jax.signals import disturbances
 from ptsmc_jax.simulation import clock, rollout
-from ptsmc_jax.theory import error_floor
-from ptsmc_jax.theory.error_floor import Model
+from ptsmc_jax.theory import lower_bound
+from ptsmc_jax.theory.lower_bound import Model
 from tests.helpers import chain_parts, parts, vector
 from tuning.output import run_report, summaries
 
@@ -22,7 +22,7 @@ PERIOD = 0.125  # a power of two, so that t_f and the ends of the window are exa
 
 
 def still(made):
-    """A history at rest with the duration of the scenario; only the fields that `error_floor` reads have values."""
+    """A history at rest with the duration of the scenario; only the fields that `lower_bound` reads have values."""
     periods = int(np.ceil(float(made.t_end) / PERIOD))
 
     def kept(v):
@@ -109,7 +109,7 @@ def test_deviations_attain_farrenkopfs_steady_state():
     first, last = np.array([[1.0, 0.0]]), move[:1]
     output = np.stack([np.vstack([first, last])] * periods)
     model = Model(np.diag([1.0, 1e-3]), first, np.full((periods, 1), star), kicks, moves, output)
-    found = error_floor.deviations(model)
+    found = lower_bound.deviations(model)
     np.testing.assert_allclose(found[-2, 1], before, rtol=1e-9)
     np.testing.assert_allclose(found[-1, 0], after, rtol=1e-9)  # nothing moves in this last period
 
@@ -121,7 +121,7 @@ def test_lower_bound_of_a_chain_equals_least_squares(order, delay):
     made = chain_parts([0.5, -0.2, 0.1][:order], t_f=2.0, period=PERIOD, noise=[1e-3, 5e-2, 2e-4][:order])
     density = 3e-3
     made = simulated_at(made, walk_rate=vector([density]), actuators=delayed(delay))
-    found = error_floor.along(made, still(made))
+    found = lower_bound.along(made, still(made))
     periods, n = len(found.t), order
 
     def motion(t):
@@ -148,7 +148,7 @@ def test_lower_bound_uses_the_actual_sample_times():
     late = 0.4 * PERIOD * np.sin(7.0 * np.arange(len(log.t)))
     late[[0, -1]] = 0.0
     log = log._replace(t=log.t + late)
-    found = error_floor.along(made, log)
+    found = lower_bound.along(made, log)
     np.testing.assert_allclose(found.t, log.t[1:], rtol=1e-15)
     for k, wanted in enumerate(found.error):
         since = log.t[: k + 1] - log.t[k + 1]
@@ -191,7 +191,7 @@ def test_lower_bound_of_a_spacecraft_at_rest_equals_least_squares(kind):
     first = 0
     if kind == "later":
         made, first = dataclasses.replace(made, clock=parts(**AT_REST, delta=2 * PERIOD).clock), -22
-    found = error_floor.along(made, still(made))
+    found = lower_bound.along(made, still(made))
     periods = len(found.t)
     squares = np.zeros((periods, 3))
     numbers = first + np.arange(periods)
@@ -228,22 +228,22 @@ def test_along_each_equals_separate_calls():
 
     runs = [chain(), chain(noise=(2e-3, 1e-2)), chain(delay=2), chain(t_f=2.2), chain(noise=None), chain(delay=2)]
     simulated = [(made, still(made)) for made in runs]
-    for (made, log), found in zip(simulated, error_floor.along_each(simulated), strict=True):
-        alone = error_floor.along(made, log)
+    for (made, log), found in zip(simulated, lower_bound.along_each(simulated), strict=True):
+        alone = lower_bound.along(made, log)
         # QR of the same matrices, batched or one after the other
         np.testing.assert_allclose(found.error, alone.error, rtol=1e-13)
         np.testing.assert_allclose(found.window_error, alone.window_error, rtol=1e-13)
         np.testing.assert_array_equal(found.t, alone.t)
-    floors = [found.window_error for found in error_floor.along_each(simulated)]
+    floors = [found.window_error for found in lower_bound.along_each(simulated)]
     assert len(set(floors)) == 5  # two of the six runs are equal
     assert floors[4] == 0.0
-    assert error_floor.along_each([]) == []
+    assert lower_bound.along_each([]) == []
 
 
 def test_a_state_measured_without_noise_is_known():
     """The rate is known to be zero, so that the best estimate of the position is the mean of all samples."""
     made = simulated_at(chain_parts([1.0, 0.0], t_f=2.0, period=PERIOD, noise=[1e-3, 0.0]))
-    found = error_floor.along(made, still(made))
+    found = lower_bound.along(made, still(made))
     np.testing.assert_allclose(found.error, 1e-3 / np.sqrt(1.0 + np.arange(len(found.t))), rtol=1e-9)
 
 
@@ -251,7 +251,7 @@ def test_without_noise_only_the_random_walk_is_unknown():
     """All states are measured exactly. Only the effect of the walk's step within a period remains."""
     density = 0.2
     made = simulated_at(chain_parts([1.0, 0.0], t_f=2.0, period=PERIOD), walk_rate=vector([density]))
-    found = error_floor.along(made, still(made))
+    found = lower_bound.along(made, still(made))
     np.testing.assert_allclose(found.error, density * PERIOD * PERIOD**2 / 2, rtol=1e-6)  # EXACT, over one period
 
 
@@ -259,7 +259,7 @@ def test_without_noise_only_the_random_walk_is_unknown():
 def test_lower_bound_is_zero_if_exact_positions_determine_the_rate(delay):
     """It is zero from the second sample on for any noise of the rate. Rounding of 1e-14 must not appear as a bound."""
     made = simulated_at(chain_parts([1.0, 0.0], t_f=2.0, period=PERIOD, noise=[0.0, 1e-3]), actuators=delayed(delay))
-    found = error_floor.along(made, still(made))
+    found = lower_bound.along(made, still(made))
     np.testing.assert_allclose(found.error[delay], (1 + delay) * PERIOD * 1e-3, rtol=1e-9)  # by its only sample
     np.testing.assert_array_equal(found.error[delay + 1 :], 0.0)
     assert found.window_error == 0.0
@@ -267,10 +267,10 @@ def test_lower_bound_is_zero_if_exact_positions_determine_the_rate(delay):
 
 def test_lower_bound_is_zero_without_noise():
     continuous = parts(t_f=3.0)
-    assert error_floor.along(continuous, still(continuous)).window_error == 0.0
+    assert lower_bound.along(continuous, still(continuous)).window_error == 0.0
     for noise in (None, [0.0, 0.0]):
         made = simulated_at(chain_parts([1.0, 0.0], t_f=2.0, period=PERIOD, noise=noise))
-        found = error_floor.along(made, still(made))
+        found = lower_bound.along(made, still(made))
         assert found.window_error == 0.0
         np.testing.assert_array_equal(found.error, 0.0)
 
@@ -281,8 +281,8 @@ def test_wheel_momentum_couples_the_axes():
     device = reaction_wheels.wheels(np.eye(3), momentum)
     calm = parts(**AT_REST, noise=(2e-5, 1e-6), disturbance=disturbances.Constant(jnp.zeros(3)))
     made = simulated_at(calm, actuators=actuators.Actuators(wheels=device))
-    ticks, log = error_floor._lasting(made, still(made))
-    linear = error_floor._linear(made, log, ticks)
+    ticks, log = lower_bound._lasting(made, still(made))
+    linear = lower_bound._linear(made, log, ticks)
     coupled = np.asarray(made.plant.inertia_inverse) @ np.cross(momentum, np.eye(3)).T
     # the error of RK4 is 0.04^5 / 120 for 0.3 rad/s over a period
     np.testing.assert_allclose(linear.move[0][3:, 3:], expm(coupled * PERIOD), rtol=0, atol=1e-9)
@@ -310,8 +310,8 @@ def test_a_filter_with_kalman_gains_attains_the_lower_bound():
     sensor = sensors.Sensors(vector(star), vector(gyro), vector(1e-3), vector(drift), held, every)
     made = parts(**{**AT_REST, "t_end": 40.0})
     made = simulated_at(made, sensors=sensor, walk_rate=vector([1e3] * 3))
-    ticks, log = error_floor._lasting(made, still(made))
-    at_start = error_floor.deviations(error_floor._model(made, log, ticks))[:, :3]
+    ticks, log = lower_bound._lasting(made, still(made))
+    at_start = lower_bound.deviations(lower_bound._model(made, log, ticks))[:, :3]
     after_star = at_start[::every]
     assert len(after_star) > 50
     # the error is half an angle
@@ -321,7 +321,7 @@ def test_a_filter_with_kalman_gains_attains_the_lower_bound():
 @pytest.mark.parametrize("least", [None, 0.0])
 def test_run_without_a_lower_bound_has_no_ratio_to_it(least):
     """The bound is 0 without noise, and None if no run reaches its end."""
-    run = {"status": "ok", "reason": "", "bad_time": None, "window_error": 1e-5, "verdicts": {}, "cautions": []}
+    run = {"status": "ok", "reason": "", "bad_time": None, "window_error": 1e-5, "verdicts": {}, "warnings": []}
     report = run_report.of(summaries.run({**run, "floor": least}, "spacecraft"), "spacecraft")
     assert report.headline == "pointing error 4.13 arcsec: the run reached its end"
     assert report.lines == []

@@ -4,7 +4,7 @@ A limit cycle occurs, for example, if the boundary layer is too thin for the con
 loop is then at its stability limit, and all its margins are zero. The linearisation does not show this, because the
 derivative of the saturated sign is zero at every sample.
 
-`swing`, which is the function to read first, examines the second half of the full periods in the hold phase, without
+`find`, which is the function to read first, examines the second half of the full periods in the hold phase, without
 noise and disturbance. Three criteria exclude other motions:
 
 - A run that converges gets slower.
@@ -48,14 +48,14 @@ def history(parts: Parts, run: linear.Nominal) -> History:
     return History(run.command, linear.is_full(run.period.now, parts.period) & run.period.now.hold)
 
 
-class Swing(NamedTuple):
+class LimitCycle(NamedTuple):
     """Limit cycle of the command, on its worst axis."""
 
     size: float  # peak-to-peak amplitude of the command [N m]
     periods: float  # period of the limit cycle in control periods
 
 
-def swing(parts: Parts, seen: History | None = None) -> Swing | None:
+def find(parts: Parts, seen: History | None = None) -> LimitCycle | None:
     """Return the limit cycle of the nominal run in the hold phase, or None.
 
     The result is None if the run converges or oscillates linearly. It is also None for a law with a discontinuous sign,
@@ -87,7 +87,7 @@ def swing(parts: Parts, seen: History | None = None) -> Swing | None:
     return max(_measured(u[last, axis], off[:, axis]) for axis in np.flatnonzero(suspect))
 
 
-def _measured(u: np.ndarray, off: np.ndarray) -> Swing:
+def _measured(u: np.ndarray, off: np.ndarray) -> LimitCycle:
     """Return the limit cycle of one axis.
 
     The amplitude is the median over windows of one cycle, so that slower motions contribute little.
@@ -98,7 +98,7 @@ def _measured(u: np.ndarray, off: np.ndarray) -> Swing:
     """
     periods = 2.0 * (off.size - 1) / float(np.count_nonzero(_reversals(off, 0.0)))
     turns = np.lib.stride_tricks.sliding_window_view(u, int(np.ceil(periods)))
-    return Swing(float(np.median(np.ptp(turns, axis=1))), periods)
+    return LimitCycle(float(np.median(np.ptp(turns, axis=1))), periods)
 
 
 def _reversals(values: np.ndarray, least: Any) -> np.ndarray:

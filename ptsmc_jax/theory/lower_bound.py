@@ -44,7 +44,7 @@ EXACT = 1e-10  # 1 sigma of a sensor without noise, relative to the largest devi
 
 
 @dataclass(frozen=True)
-class Floor:
+class LowerBound:
     """Lower bound on the error of a run; 0 if nothing is unknown."""
 
     window_error: float  # RMS over the window after t_f, in the unit of the metric
@@ -68,12 +68,12 @@ class Model(NamedTuple):
     output: np.ndarray  # (periods, .., outputs, n) Derivatives of the outputs by z + B v.
 
 
-def along(parts: Parts, log: Log) -> Floor:
+def along(parts: Parts, log: Log) -> LowerBound:
     """Return the lower bound along a run with this history (`rollout.simulate`, record=True)."""
     return along_each([(parts, log)])[0]
 
 
-def along_each(runs: Sequence[tuple[Parts, Log]]) -> list[Floor]:
+def along_each(runs: Sequence[tuple[Parts, Log]]) -> list[LowerBound]:
     """Return the lower bound along each of several runs of a scenario; runs with equal shapes are computed together."""
     lasting = [(parts, *_lasting(parts, log)) for parts, log in runs]
     alike = dict[tuple, dict[int, Model]]()  # by delay, available samples and shapes
@@ -89,7 +89,7 @@ def along_each(runs: Sequence[tuple[Parts, Log]]) -> list[Floor]:
             squares[k] = np.sum(sizes[:, number].reshape(len(sizes), 3, -1) ** 2, axis=2)
     # `squares` are mean squares of the error at the start, in the middle and at the end of each period
     return [
-        Floor(window_error(parts, ticks, of_run), np.asarray(ticks.t_next), np.sqrt(of_run[:, 2]))
+        LowerBound(window_error(parts, ticks, of_run), np.asarray(ticks.t_next), np.sqrt(of_run[:, 2]))
         for (parts, ticks, _), of_run in zip(lasting, squares, strict=True)
     ]
 
@@ -114,7 +114,7 @@ def window_error(parts: Parts, ticks: Ticks, squares: np.ndarray) -> float:
     return float(np.sqrt(total / float(parts.window)))
 
 
-def pooled(floors: Iterable[Floor]) -> float | None:
+def pooled(floors: Iterable[LowerBound]) -> float | None:
     """Return the RMS of the bounds of several runs, pooled like window errors, or None without runs."""
     squares = [one.window_error**2 for one in floors]
     return float(np.sqrt(np.mean(squares))) if squares else None
