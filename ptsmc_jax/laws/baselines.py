@@ -93,7 +93,7 @@ class Terminal(ComparisonLaw):
     component of v reaches zero after the time |v|^(1 - 1/p) p / ((p - 1) b^(1/p)), which grows with the initial error.
     """
 
-    p: Leaf = gain(1.3, (1.05, 1.95), above=1.0, below=2.0, meaning="power of the surface")
+    p: Leaf = gain(1.3, (1.05, 1.95), above=1.0, below=2.0, meaning="exponent of the surface")
     b: Leaf = gain(
         Scaled(0.1, time=lambda table: -table.p), "terminal_surface", unit="1/s^p", meaning="scale of the surface"
     )
@@ -147,10 +147,10 @@ class FixedTime(ComparisonLaw):
         Scaled(1.0, time=lambda table: table.p - 2.0), "fixed_time_reaching", unit="1/s^(2-p)",
         meaning="reaching law, weight of |s|^n, near the surface",
     )  # fmt: skip
-    p: Leaf = gain(1.25, "fixed_time_p", above=1.0, below=2.0, meaning="power of the surface")
-    gamma: Leaf = gain(2.0, "fixed_time_gamma", above=1.0, meaning="power of the surface")
-    m: Leaf = gain(1.5, (1.05, 3.0), above=1.0, meaning="power of the reaching law")
-    n: Leaf = gain(0.5, (0.05, 0.95), below=1.0, meaning="power of the reaching law")
+    p: Leaf = gain(1.25, "fixed_time_p", above=1.0, below=2.0, meaning="exponent of the surface")
+    gamma: Leaf = gain(2.0, "fixed_time_gamma", above=1.0, meaning="exponent of the surface")
+    m: Leaf = gain(1.5, (1.05, 3.0), above=1.0, meaning="exponent of the reaching law")
+    n: Leaf = gain(0.5, (0.05, 0.95), below=1.0, meaning="exponent of the reaching law")
     sign_width: Leaf = boundary_layer(1e-3)
 
     def acceleration(self, now: Sample, error: Vector, error_rate: Vector, bound: Scalar) -> tuple[Vector, Vector]:
@@ -197,10 +197,10 @@ class Scaling(ComparisonLaw):
     delta: Leaf = gain(
         Scaled(2.0, time=1), "delta", unit="s", meaning="time before t_f at which the gains become constant"
     )
-    m: Leaf = gain(1.0, (1.0, 5.0), at_least=1.0, meaning="excess of the power of the scaling")
+    m: Leaf = gain(1.0, (1.0, 5.0), at_least=1.0, meaning="m of the scaling exponent 2 + m")
     k1: Leaf = gain(Scaled(1.0, time=-1), Rates(0.3, 0.5, sampled=True), unit="1/s", meaning="rate of the scaled error")
     k: Leaf = gain(
-        Scaled(1e-3, time=-1), Rates(1e-5, 10.0), unit="1/s", meaning="rate of its surface, while the scaling is 1"
+        Scaled(1e-3, time=-1), Rates(1e-5, 10.0), unit="1/s", meaning="rate of the surface when the scaling is 1"
     )
     switches: ClassVar[bool] = False
 
@@ -253,8 +253,8 @@ class PredefinedTime(ComparisonLaw):
         0.6, (0.05, 0.95), below=1.0,
         meaning="fraction of t_f in which the error settles on the surface; the surface is reached before",
     )  # fmt: skip
-    q1: Leaf = gain(0.3, (0.05, 0.49), at_most=0.5, meaning="power of the surface")
-    q2: Leaf = gain(0.3, (0.05, 0.95), below=1.0, meaning="power of the reaching law")
+    q1: Leaf = gain(0.3, (0.05, 0.49), at_most=0.5, meaning="exponent of the surface")
+    q2: Leaf = gain(0.3, (0.05, 0.95), below=1.0, meaning="exponent of the reaching law")
     sign_width: Leaf = boundary_layer(Scaled(1e-2, time=-1), "1/s")
 
     def acceleration(self, now: Sample, error: Vector, error_rate: Vector, bound: Scalar) -> tuple[Vector, Vector]:
@@ -304,7 +304,7 @@ class SuperTwisting(ComparisonLaw):
     )
     lipschitz: Leaf = gain(
         Scaled(0.01, time=-3), Rates(0.1, 1e4, 3), unit="1/s^3",
-        meaning="L, bound on each component of the derivative of eps'' that the disturbance makes",
+        meaning="bound L on each component of the disturbance's contribution to eps'''",
     )  # fmt: skip
     sign_width: Leaf = boundary_layer(Scaled(1e-3, time=-1), "1/s")
     switches: ClassVar[bool] = False

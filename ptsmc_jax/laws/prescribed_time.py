@@ -33,7 +33,8 @@ class PrescribedTimeLaw(Law):
     t_f: Leaf
     eta: Leaf = gain(
         Scaled(3.0), "eta", above=2.0, allowed="a number greater than 2 (Theorem 2)",
-        meaning="power of the approach: the error falls like (t_f - t)^eta, up to a logarithm; 3 in the paper",
+        meaning="exponent of the approach phase: the error decreases like (t_f - t)^eta, up to a "
+                "logarithm; 3 in the paper",
     )  # fmt: skip
     delta: Leaf = gain(
         Scaled(0.05, time=1), "delta", unit="s",
@@ -41,7 +42,7 @@ class PrescribedTimeLaw(Law):
     )  # fmt: skip
     k1: Leaf = gain(
         Scaled(1.0, time=-1), "k1", unit="1/s", free="sampled",
-        meaning="K1, rate of s from the hand-over on, halved by (60) for a spacecraft; 1 in the paper",
+        meaning="reaching gain K1 of the hold phase; (60) halves it for a spacecraft; 1 in the paper",
     )  # fmt: skip
     sign_width: Leaf = gain(
         Scaled(1e-3, time=-1), "sign_width", at_least=0.0, unit=("1/s", "unit of s"), free="sampled",
@@ -49,7 +50,8 @@ class PrescribedTimeLaw(Law):
     )  # fmt: skip
     surface_rate: Leaf = gain(
         Scaled(1.0, time=-1), "surface_rate", unit="1/s", free="sampled",
-        meaning="c of s = eps' + c eps, the error's rate on the surface from the hand-over on; 1 in the paper",
+        meaning="c of the surface s = eps' + c eps in the hold phase: the error decays like exp(-c t); 1 "
+                "in the paper",
     )  # fmt: skip
     # whether the held input is chosen for s at the end of the period, see `landing`, and not for its rate at the sample
     implicit: bool = field(default=False, metadata={"static": True}, kw_only=True)
@@ -250,7 +252,7 @@ class PrescribedTimeChain(PrescribedTimeLaw):
     kinematics: ChainKinematics
     eta: Leaf = gain(
         Scaled(3.0), "eta", allowed="a number greater than the order (Theorems 1 and 3)",
-        meaning="power of the approach; default: order + 1",
+        meaning="exponent of the approach phase; default: order + 1",
     )  # fmt: skip
     sign_width: Leaf = gain(
         Scaled(1e-3, time=1, order=-1), "sign_width", at_least=0.0, unit="unit of s", free="sampled",

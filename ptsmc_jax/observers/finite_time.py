@@ -53,13 +53,13 @@ class FiniteTimeObserver(Observer):
 
     gain: Leaf = declare.gain(  # (m,)
         None, "finite_time", each=True, unit="unit of d/s",
-        meaning="c, at least controller.disturbance_rate_bound; default: 20 times that",
+        meaning="c, at least controller.disturbance_rate_bound; default: 20 times this bound",
     )  # fmt: skip
     disturbance_rate_bound: Leaf  # pyright: ignore[reportGeneralTypeIssues]  # bound on each component of d' [N m/s], at most `gain`
     initial_error: Leaf  # pyright: ignore[reportGeneralTypeIssues]  # bound on |d_hat(0) - d(0)| [N m]
     sign_width: Leaf = declare.number(
         Scaled(1e-5, inertia=1, time=1, order=-1), at_least=0.0, unit=("N m s", ""),
-        meaning="thickness of its boundary layer in the continuous loop; the digital form needs none",
+        meaning="thickness of the boundary layer in the continuous loop; the sampled loop needs none",
     )  # fmt: skip
 
     def begin(self) -> Memory:

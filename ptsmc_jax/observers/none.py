@@ -12,7 +12,7 @@ from ptsmc_jax.observers.base import ErrorBound, Matrix, Memory, Observer, const
 @pytree
 @dataclass(frozen=True)
 class NoObserver(Observer):
-    """None: d_hat = 0, and K switches against the whole disturbance.
+    """No observer: d_hat = 0, and the switching gain K must exceed the whole disturbance.
 
     No estimate: d_hat = 0, and the switching gain must cover the disturbance itself, as in (10), (29) and (40).
 

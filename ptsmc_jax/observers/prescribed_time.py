@@ -49,7 +49,7 @@ class PrescribedTimeBound(NamedTuple):
 @pytree
 @dataclass(frozen=True)
 class PrescribedTimeObserver(Linear):
-    """An observer that has converged by t_o, the nonlinear one from then on.
+    """An observer that converges by t_o. Afterwards it is the nonlinear observer.
 
     The nonlinear observer with l = diag(gain) + mu M/(T_o - t) until T_o - delta_o: its error is gone by T_o.
 
@@ -59,7 +59,8 @@ class PrescribedTimeObserver(Linear):
 
     mu: Leaf = declare.number(
         2.0, above=1.0,
-        meaning="the error at t = 0 falls like (t_o - t)^mu; what a moving disturbance adds, like c (t_o - t)/(mu - 1)",
+        meaning="exponent of the convergence: the initial error decreases like (t_o - t)^mu, the error "
+                "from the disturbance's rate like c (t_o - t)/(mu - 1)",
     )  # fmt: skip
     t_o: Leaf = declare.number(
         None, above=0.0, unit="s", meaning="prescribed time of convergence; default: a third of t_f", kw_only=True

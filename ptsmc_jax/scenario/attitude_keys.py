@@ -26,7 +26,7 @@ class Attitude(Table, frozen=True):
     euler_deg: Annotated[Three | None, Meaning("three angles of the axes in `sequence`", "deg")] = None
     sequence: Annotated[
         Annotated[str, Meta(description='three axes in SciPy\'s notation, such as "ZYX" or "zyx"')] | None,
-        Meaning("three axes; capitals: intrinsic, about the body's; small letters: extrinsic"),
+        Meaning("three axes: capitals for intrinsic rotations about body axes, small letters for extrinsic rotations"),
     ] = None
 
 

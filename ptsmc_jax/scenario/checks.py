@@ -33,17 +33,21 @@ def _check_requirements(scenario: Scenario) -> None:
         if key.startswith(catalogues.WITHIN):
             ask = '{ limit = .., probability = .., interpretation = "mixed" }'
             name = f"requirements.{key.removeprefix(catalogues.WITHIN)}"
-            raise ScenarioError(f"requirements.{key} is a share of the time, to be large; allowed is {name} = {ask}")
+            raise ScenarioError(
+                f"requirements.{key} is not a limit but a fraction of the time; allowed is {name} = {ask}"
+            )
         if key.startswith(catalogues.KNOWLEDGE) and not scenario.measured:
-            raise ScenarioError(f"requirements.{key} needs noise in [hardware]: the law sees the true state")
+            raise ScenarioError(
+                f"requirements.{key} needs sensor noise in [hardware], but there is none: the law has the true state"
+            )
         if isinstance(value, tables.Limit):
             _check_limit(key, value)
         if key in catalogues.MARGINS:
             scenario.need_samples(f"requirements.{key}")
             if scenario.exact_sign:
                 raise ScenarioError(
-                    f"requirements.{key} needs a sign with a slope, but controller.sign_width is 0, the exact sign; "
-                    "allowed is a width greater than 0"
+                    f"requirements.{key} needs a boundary layer, but controller.sign_width is 0, a discontinuous sign; "
+                    "allowed is a number greater than 0"
                 )
 
 
@@ -51,21 +55,25 @@ def _check_limit(metric: str, limit: tables.Limit) -> None:
     """Raise ScenarioError if the keys of a requirement table contradict each other."""
     key = f"requirements.{metric}"
     if limit.quantile is not None and limit.probability is not None:
-        raise ScenarioError(f"{key} has both quantile and probability, but must have one of them: they are the same")
+        raise ScenarioError(
+            f"{key} has both quantile and probability, but must have only one of them: they mean the same"
+        )
     if limit.confidence is not None and limit.share is None:
-        raise ScenarioError(f"{key}.confidence is {limit.confidence}, but goes with a quantile or a probability only")
+        raise ScenarioError(
+            f"{key}.confidence is {limit.confidence}, but is allowed only together with quantile or probability"
+        )
     if limit.interpretation in (None, "ensemble"):
         return
     said = f"{key}.interpretation is {errors.show(limit.interpretation)}"
     if metric not in catalogues.AT_A_TIME:
         known = ", ".join(catalogues.AT_A_TIME)
-        raise ScenarioError(f'{said}, but must be "ensemble": shares of time are known of {known}')
+        raise ScenarioError(f'{said}, but must be "ensemble": only {known} can be judged by a fraction of the time')
     if limit.probability is None:
-        raise ScenarioError(f"{said}, but there is no probability beside it, the share of the time")
+        raise ScenarioError(f"{said}, which needs the key probability, the fraction of the time")
     if limit.interpretation == "temporal" and limit.confidence is not None:
         raise ScenarioError(
-            f"{said}, which every run that is flown must keep, but confidence is {limit.confidence}; "
-            'allowed is none, or "ensemble" or "mixed"'
+            f"{said}, which every simulated run must keep, but confidence is {limit.confidence}; "
+            'allowed is no confidence, or the interpretation "ensemble" or "mixed"'
         )
 
 
@@ -80,15 +88,17 @@ def check_sensors(scenario: Scenario) -> None:
     for key in (*scenario.devices.noises, "star_tracker_every", "star_tracker_period"):
         value = getattr(scenario.hardware, key, None)
         if value is not None:
-            raise wrong(f"hardware.{key}", value, "absent where [sensors] says what is seen")
+            raise wrong(f"hardware.{key}", value, "absent, because [sensors] defines the measurements")
     if getattr(getattr(scenario, "filter", None), "on", False):
-        raise ScenarioError('filter.kind is "steady_state", but must be absent where [sensors] says what is seen')
+        raise ScenarioError(
+            'filter.kind is "steady_state", but must be absent, because [sensors] defines the measurements'
+        )
     noises = (key for key, given_by in scenario.devices.levels.items() if set(given_by) <= {*scenario.devices.noises})
     for key in (*noises, *OF_SENSORS):
         if getattr(scenario.dispersion, key, None) is not None:
             raise ScenarioError(
-                f"dispersion.{key} is drawn of what [hardware] says, but [sensors] says what is seen; allowed is "
-                "dispersion.custom, which can draw numbers of these sensors"
+                f"dispersion.{key} changes the sensors of [hardware], but [sensors] replaces them; allowed is "
+                "dispersion.custom, which can change these sensors"
             )
 
 
@@ -138,9 +148,7 @@ def _check_periods(scenario: Scenario) -> None:
         raise wrong("loop.window", window, f"at least one control period, loop.period = {loop.period}")
     delay, t_f = scenario.devices.delay_periods, scenario.controller.t_f
     if delay * loop.period >= t_f:
-        least = (
-            f"a number of control periods, of {loop.period:g} s each, that are shorter than controller.t_f, {t_f:g} s"
-        )
+        least = f"a number of control periods ({loop.period:g} s each) that is shorter than controller.t_f, {t_f:g} s"
         raise wrong("hardware.delay", delay, least)
     samples = math.ceil(scenario.end / loop.period * (1 - 1e-9))
     every = getattr(scenario.hardware, "star_tracker_every", None) or 0
@@ -200,12 +208,12 @@ def _check_misfits(scenario: Scenario) -> None:
     for key, name in (("star_tracker_misalignment", "attitude_noise"), ("gyro_scale", "rate_noise")):
         given = any(getattr(devices, one) is not None for one in devices.levels.get(name, ()))
         if asked(key) and not given:
-            raise ScenarioError(f"dispersion.{key} needs hardware.{name}, which is absent; 0 will do")
+            raise ScenarioError(f"dispersion.{key} needs hardware.{name}, which is absent; {name} = 0 is allowed")
     if asked("wheel_failure") and scenario.reaction_wheels is None:
         raise ScenarioError("dispersion.wheel_failure needs reaction wheels, but there is no [wheels] table")
     if asked("star_tracker_outage") and not scenario.estimator.on:
         raise ScenarioError(
-            "dispersion.star_tracker_outage needs an attitude filter, without which the law has no attitude; "
+            "dispersion.star_tracker_outage needs an attitude filter, which estimates the attitude in the outage; "
             'allowed is [filter] with kind = "steady_state"'
         )
     for key in asked("star_tracker_outage", "wheel_failure"):

@@ -144,7 +144,7 @@ def read(table: Any, name: str, code: object) -> Any:
         base = table.base
         if not (isinstance(item, type) and issubclass(item, base)):
             what = f"a class {item.__name__}" if isinstance(item, type) else f"a {type(item).__name__}"
-            raise ValueError(f"it names {what}, which is not derived from ptsmc_jax.{base.__name__}")
+            raise ValueError(f"it is {what}, but must be a class derived from ptsmc_jax.{base.__name__}")
         return _with_keys(table, item, (_again, table.remake, name, code))
     except ValueError as error:
         shown = brief(code) if isinstance(code, str) else getattr(code, "__name__", type(code).__name__)
@@ -184,7 +184,7 @@ def _with_keys(table: Any, found: Any, remake: tuple) -> Any:
             r"observer_gain_\d+", table.prefix + field.name
         ):
             raise ValueError(
-                f"the name of its field must be another than {field.name}: gain has a number for each axis, gain_1 .."
+                f"its field {field.name} needs another name: gain_1, gain_2 .. are the numbers of gain for each axis"
             )
         declared[field.name] = _declaration(table, found, field)
     return schema.extended(table, found, "custom", declared, remake=remake)
@@ -198,7 +198,7 @@ def _annotated(found: type, base: type) -> Iterator[str]:
 
 
 def _taken(found: type, name: str, allowed: str) -> ValueError:
-    taken = f"a field of the class {found.__name__} is called {name}, which has its meaning already"
+    taken = f"the class {found.__name__} has a field {name}, a name that the base class already uses"
     return ValueError(f"{taken}; allowed is {allowed}")
 
 
@@ -222,8 +222,8 @@ def fastest(table: Any, name: str, part: Any) -> float:
         other = "nothing" if said is None else f"a {type(said).__name__}"
         shown = brief(said) if isinstance(said, int | float | str) else other
         raise ScenarioError(
-            f"{name}.code names a class {table.made.__name__} whose fastest returns {shown}, but must return a number "
-            "of at least 0 [rad/s]"
+            f"{name}.code is the class {table.made.__name__}, whose method fastest returns {shown}, but must return an "
+            "angular frequency of at least 0 rad/s"
         )
     return rate
 
@@ -238,7 +238,7 @@ def _declaration(table: Any, found: Any, field: dataclasses.Field) -> Declaratio
     numbers = value if isinstance(value, tuple) and value and not (one and one.gain) else (value,)
     if not all(map(_plain, numbers)):
         shown = "none" if value is missing else show(value)
-        allowed = "a number, the first argument of gain" if one and one.gain else "a number, or several in parentheses"
+        allowed = "a number, the first argument of gain" if one and one.gain else "a number or a tuple of numbers"
         raise ValueError(f"the default of {field.name} is {shown}, but must be {allowed}")
     value = tuple(map(float, value)) if isinstance(value, tuple) else float(value)
     one = (one or Declaration(value, "", "", Limits()))._replace(default=value)
@@ -260,9 +260,11 @@ def _plain(value: object) -> typing.TypeGuard[float]:
 def _check_gain(table: Any, found: Any, name: str, gain: Declaration) -> None:
     """Raise ValueError if a field that is a gain cannot be one of such a table, or has no sensible bounds."""
     if not table.tuned:
-        raise ValueError(f"its field {name} is a gain, but of such a part none is tuned; allowed is a number")
+        raise ValueError(
+            f"its field {name} is a gain, but the tuner cannot change parts of this kind; allowed is a number"
+        )
     if not table.prefix and is_reserved(name):
-        raise ValueError(f"the name of its gain {name} stands for one of another part")
+        raise ValueError(f"its gain {name} needs another name: a gain of a built-in part has this name")
     usual: Any = gain.usual
     if usual is None:
         raise ValueError(

@@ -51,9 +51,10 @@ def check(parts: Parts, dispersion: Dispersion, scenario: Scenario) -> None:
 def what_fails(error: BaseException, file: str) -> str:
     """Return the reason why custom code in a file failed when it was called or traced, as the end of a sentence."""
     if isinstance(error, TRACED):
-        return f"needs the value of a number that is known in flight only{systems.line(error, file)}; {INSTEAD}"
+        line = systems.line(error, file)
+        return f"needs the value of a traced number, which is known only during the simulation{line}; {INSTEAD}"
     if isinstance(error, jax.errors.UnexpectedTracerError):
-        return "keeps a number of a run where a later call finds it; allowed is what its arguments and its memory hold"
+        return "stores a traced number outside its memory; it may use only its arguments and its memory"
     return f"fails: {systems.failure(error, file)}"
 
 
@@ -107,7 +108,7 @@ class _Asked:
         if got.shape != shape:
             raise self.refused(method, f"{what} of shape {got.shape}", f"one of shape {shape}")
         if got.dtype.kind not in "iuf" or not np.all(np.isfinite(got)):
-            raise self.refused(method, f"{what} {got.tolist()}", "finite numbers, real ones")
+            raise self.refused(method, f"{what} {got.tolist()}", "finite real numbers")
 
     def same_memory(self, method: str, before: Any, after: Any) -> None:
         """Raise ScenarioError if a memory changes its shapes or types.
@@ -153,8 +154,8 @@ def _changed(parts: Parts, drawn: Parts) -> str:
     for field in dataclasses.fields(parts):
         was, now = (getattr(one, field.name) for one in (parts, drawn))
         if jax.tree.structure(was) != jax.tree.structure(now):
-            return f"{field.name} {_kind_of(now)} in place of {_kind_of(was)}"
-    return "other parts in them"
+            return f"{field.name} {_kind_of(now)} instead of {_kind_of(was)}"
+    return "a different structure"
 
 
 def _kind_of(part: Any) -> str:
@@ -182,13 +183,13 @@ def _sensors(parts: Parts, ask: _Asked) -> None:
     period = jnp.asarray(parts.period)
     returned = ask("see", custom.see, memory, x, jnp.zeros(custom.draws), zero, period)
     if not isinstance(returned, tuple) or len(returned) != 2:
-        raise ask.refused("see", _described(returned), "the state as seen and its memory")
+        raise ask.refused("see", _described(returned), "two values, the measured state and its memory")
     was, now = (jax.tree.map(_kind, one) for one in (jax.tree.map(jnp.asarray, x), returned[0]))
     if was != now:
         raise ask.refused("see", f"a state {now}", f"one as the plant's, {was}")
     ask.same_memory("see", memory, returned[1])
     first = ask("see", custom.see, memory, x, jnp.zeros(custom.draws), zero, zero)
-    for (seen, _), where in ((returned, ""), (first, ", also where dt is 0, at the first sample")):
+    for (seen, _), where in ((returned, ""), (first, ", also at the first sample, where dt is 0")):
         if not all(np.all(np.isfinite(v)) for v in jax.tree.leaves(seen)):
             raise ask.refused("see", f"a state {jax.tree.map(np.asarray, seen)}", f"finite numbers{where}")
 
@@ -201,10 +202,10 @@ def _draw(parts: Parts, dispersion: Dispersion, ask: _Asked) -> None:
     was, now = (jax.tree.map(lambda v: _kind(jnp.asarray(v)), one) for one in (parts, drawn))
     if jax.tree.structure(was) != jax.tree.structure(now):
         what = f"parts with {_changed(parts, drawn)}" if isinstance(drawn, Parts) else _described(drawn)
-        raise ask.refused("at", what, "the parts with other numbers, by dataclasses.replace")
+        raise ask.refused("at", what, "the same parts with other numbers (use dataclasses.replace)")
     for one, other, value in zip(*map(jax.tree.leaves, (was, now, drawn)), strict=True):
         if one != other:
-            raise ask.refused("at", f"parts with {other} in place of {one}", "numbers of the same shapes")
+            raise ask.refused("at", f"parts with {other} instead of {one}", "numbers of the same shapes")
         if not np.all(np.isfinite(value)):
             raise ask.refused("at", "parts with numbers that are not finite", "finite ones")
     values = ask("values", custom.values, c)
@@ -213,9 +214,9 @@ def _draw(parts: Parts, dispersion: Dispersion, ask: _Asked) -> None:
     for name, value in values.items():
         ask.check("values", f"a number {name}", value, ())
         if name in taken:
-            raise ask.refused("values", f"a number {name}", "names that no column of the rows has")
+            raise ask.refused("values", f"a number {name}", "a name that no column of the result file has")
         if not names_column(name):
-            raise ask.refused("values", f"a number {name!r}", "names that can be printed")
+            raise ask.refused("values", f"a number {name!r}", "a printable name")
 
 
 def _observer(parts: Parts, ask: _Asked) -> None:

@@ -44,17 +44,17 @@ def _check_count(made: Any, table: str, field: str, least: int) -> None:
 
 
 def _unfit(made: Any, table: str, field: str, must: str) -> ScenarioError:
-    names = f"{table}.code names a class whose {field} is {show(getattr(made, field))}"
+    names = f"{table}.code is a class whose {field} is {show(getattr(made, field))}"
     return ScenarioError(f"{names}, but must be {must}")
 
 
 SENSORS: Kinds = {  # those that are built in are keys of [hardware] and [filter]
     "custom": custom_kind(
         SensorTable, custom_sensors.SampledSensor, ("see",), tuned=True,
-        summary="Custom sensors, a class derived from ptsmc_jax.SampledSensor; its fields are further keys. They take "
-        "the place of what [hardware] says of noise, and of [filter].",
+        summary="Custom sensors, a class derived from ptsmc_jax.SampledSensor; its fields are further keys. They "
+        "replace the noise of [hardware] and the table [filter].",
     )
 }  # fmt: skip
 CUSTOM_DRAW: Any = custom_kind(
-    DrawTable, Draw, ("at",), "Any custom draw, a class derived from ptsmc_jax.Draw; its fields are further keys."
+    DrawTable, Draw, ("at",), "A custom dispersion, a class derived from ptsmc_jax.Draw; its fields are further keys."
 )

@@ -49,7 +49,7 @@ class Actuators(Table, frozen=True):
     """Actuators between the commanded torque and the plant. A device without a key is off."""
 
     command_filter: Annotated[
-        CommandFilterTable | None, Meaning("between the law and all that follows, an inline table with a kind")
+        CommandFilterTable | None, Meaning("filter between the law and the actuators, an inline table with a kind")
     ] = None
     torque_limit: Annotated[Positive | None, Meaning("largest torque about an axis, or largest input", "unit of u")] = (
         None
@@ -115,34 +115,39 @@ class Hardware(Actuators, frozen=True):
     attitude_noise: Annotated[
         NotNegative | None,
         Meaning(
-            "of the star tracker, 1 sigma per axis and sample, a small rotation; the largest of the axes "
-            "if they differ, or a custom sensor in [sensors] instead",
+            "noise of the star tracker: 1 sigma of a small rotation about each axis, at each sample. If "
+            "the axes differ, use the largest, or [[sensors]]",
             "rad",
         ),
     ] = None
-    rate_noise: Annotated[NotNegative | None, Meaning("of the gyro, 1 sigma per axis and sample", "rad/s")] = None
+    rate_noise: Annotated[NotNegative | None, Meaning("noise of the gyro, 1 sigma per axis and sample", "rad/s")] = None
     rate_noise_density: Annotated[
         NotNegative | None,
         Meaning(
-            'instead of rate_noise, which is then this / sqrt(period): the angle random walk, as in "0.02 deg/sqrt(h)"',
+            'angle random walk of the gyro, such as "0.02 deg/sqrt(h)"; it replaces rate_noise, which is '
+            "then rate_noise_density / sqrt(period)",
             "rad/s/sqrt(Hz)",
         ),
     ] = None
     rate_bias: Annotated[
         NotNegative | None,
         Meaning(
-            "of the gyro, 1 sigma per axis, constant over a run; without effect behind a [filter], which "
-            "starts in its steady state and knows a constant bias",
+            "constant bias of the gyro in each run, 1 sigma per axis; it has no effect with [filter], "
+            "which has estimated a constant bias before t = 0",
             "rad/s",
         ),
     ] = None
-    rate_bias_walk: Annotated[NotNegative | None, Meaning("random walk of that bias", "rad/s/sqrt(s)")] = None
+    rate_bias_walk: Annotated[NotNegative | None, Meaning("random walk of the bias", "rad/s/sqrt(s)")] = None
     star_tracker_every: Annotated[
         Count | None, Meaning("control periods between star tracker samples, with a filter")
     ] = None
     star_tracker_period: Annotated[
         Positive | None,
-        Meaning("instead of it, time between them, at least loop.period and not only whole periods", "s"),
+        Meaning(
+            "instead of star_tracker_every: time between star tracker samples, at least loop.period; "
+            "it need not be a multiple of it",
+            "s",
+        ),
     ] = None
     levels: ClassVar[Mapping[str, tuple[str, ...]]] = {
         "attitude_noise": ("attitude_noise",),
@@ -171,10 +176,10 @@ class Hardware(Actuators, frozen=True):
         """Raise ScenarioError for two gyro noises, or for a slow star tracker without a filter."""
         super().check(scenario)
         if self.rate_noise is not None and self.rate_noise_density is not None:
-            raise wrong("hardware.rate_noise_density", self.rate_noise_density, "absent where rate_noise is given")
+            raise wrong("hardware.rate_noise_density", self.rate_noise_density, "absent if rate_noise is given")
         tracker_period, every, period = self.star_tracker_period, self.star_tracker_every, scenario.loop.period
         if tracker_period is not None and every is not None:
-            raise wrong("hardware.star_tracker_period", tracker_period, "absent where star_tracker_every is given")
+            raise wrong("hardware.star_tracker_period", tracker_period, "absent if star_tracker_every is given")
         if tracker_period is not None and tracker_period < period * (1.0 - SAME):
             raise wrong("hardware.star_tracker_period", tracker_period, f"at least loop.period, {period}")
         if self.periods_apart(period) != 1 and not scenario.estimator.on:
@@ -266,7 +271,7 @@ class FilterTable(PartTable, frozen=True):
 
 
 class NoFilter(FilterTable, frozen=True):
-    """None: the law sees the samples themselves."""
+    """No filter: the law uses the raw samples."""
 
     kind: Literal["none"] = "none"
     on: ClassVar[bool] = False
@@ -278,7 +283,7 @@ class SteadyStateFilter(FilterTable, frozen=True):
     kind: Literal["steady_state"] = "steady_state"
     bandwidth: Annotated[
         Positive | None,
-        Meaning("of the corrections; default: where star tracker and gyro noise weigh the same", "rad/s"),
+        Meaning("bandwidth of the corrections; default: star tracker and gyro noise contribute equally", "rad/s"),
     ] = None
     gains: ClassVar[tuple[str, ...]] = ("filter_bandwidth",)
     usual: ClassVar[Mapping[str, str]] = {"bandwidth": "bandwidth"}
@@ -330,8 +335,8 @@ class WheelLimits(Table, frozen=True):
     momentum: Annotated[
         Annotated[tuple[float, ...], Meta(description="a list of numbers, one for each wheel")] | None,
         Meaning(
-            "at t = 0, one number for each wheel, absolute: spin inertia times the sum of wheel speed and"
-            " body rate about its axis; default: 0 each",
+            "absolute momentum of each wheel at t = 0: spin inertia times the sum of wheel speed and body"
+            " rate about its axis; default: 0 each",
             "N m s",
         ),
     ] = None
@@ -363,12 +368,12 @@ class WheelLimits(Table, frozen=True):
 
 
 class PyramidWheels(WheelLimits, frozen=True):
-    """Four reaction wheels at 45, 135, 225 and 315 degrees about z; lag, step and rate limit as in [hardware]."""
+    """Four reaction wheels at 45, 135, 225 and 315 degrees about z, with the lag, step and rate limit of [hardware]."""
 
     kind: Literal["pyramid"] = "pyramid"
     cant_deg: Annotated[
         Annotated[float, Meta(gt=0, lt=90, description="an angle between 0 and 90 degrees")],
-        Meaning("by which their axes are tilted toward +z; by default equally strong about all axes", "deg"),
+        Meaning("tilt of the spin axes toward +z; the default gives equal torque about all axes", "deg"),
     ] = 35.264389682754654
 
     def spin_axes(self) -> Any:
@@ -382,7 +387,7 @@ class PyramidWheels(WheelLimits, frozen=True):
 
 
 class AxesWheels(WheelLimits, frozen=True):
-    """Any number of reaction wheels; lag, step and rate limit of [hardware] are theirs."""
+    """Any number of reaction wheels. Lag, step and rate limit of [hardware] apply to the wheels."""
 
     kind: Literal["axes"] = "axes"
     axes: Annotated[

@@ -116,11 +116,11 @@ UniformRate = _numbers(
     "UniformRate", Uniform, "Each axis uniform about initial.rate.", "largest deviation per axis" + _BY_RATE, *_RATE
 )
 NormalBias = _numbers(
-    "NormalBias", Numbers, "Normal about what [disturbance] says.", "1 sigma of each component" + _BY_BIAS, *_BIAS
+    "NormalBias", Numbers, "Normal about the value in [disturbance].", "1 sigma of each component" + _BY_BIAS, *_BIAS
 )
 UniformBias = _numbers(
-    "UniformBias", Uniform, "Uniform about what [disturbance] says.", "largest deviation of each component" + _BY_BIAS,
-    *_BIAS,
+    "UniformBias", Uniform, "Uniform about the value in [disturbance].",
+    "largest deviation of each component" + _BY_BIAS, *_BIAS,
 )  # fmt: skip
 UniformState = _numbers(
     "UniformState", Uniform, "Every state uniform about x0.", "largest deviation" + _ONE_EACH, "", (), NotNegatives
@@ -131,20 +131,26 @@ NormalState = _numbers(
 NormalFactor = _numbers(
     "NormalFactor",
     Relative,
-    "Times 1 + a normal number, truncated at three sigma.",
-    "1 sigma of the share",
+    "The value times 1 + a normal number, truncated at three sigma.",
+    "relative standard deviation",
     "",
     0.1,
     Share,
 )
 UniformFactor = _numbers(
-    "UniformFactor", RelativeUniform, "Times 1 + a uniform number.", "largest share", "", 0.2, BelowOne
+    "UniformFactor",
+    RelativeUniform,
+    "The value times 1 + a uniform number.",
+    "largest relative deviation",
+    "",
+    0.2,
+    BelowOne,
 )
 NormalTurn = _numbers(
-    "NormalTurn", Numbers, "Turned by a normal rotation vector.", "1 sigma per component", "deg", 0.1, deg=True
+    "NormalTurn", Numbers, "Rotated by a normal rotation vector.", "1 sigma per component", "deg", 0.1, deg=True
 )
 UniformTurn = _numbers(
-    "UniformTurn", Uniform, "Turned by a rotation vector whose components are uniform.", "largest size of a component",
+    "UniformTurn", Uniform, "Rotated by a rotation vector with uniform components.", "largest size of a component",
     "deg", 0.1, deg=True,
 )  # fmt: skip
 FACTORS, TURNS = (NormalFactor, UniformFactor), (NormalTurn, UniformTurn)
@@ -181,7 +187,7 @@ class AxisAngle(Table, frozen=True):
 
 
 class NormalAttitude(Table, frozen=True):
-    """The nominal attitude, turned by a normal rotation vector."""
+    """The nominal attitude, rotated by a normal rotation vector."""
 
     kind: Literal["normal"] = "normal"
     std_deg: Annotated[NotNegative, Meaning("1 sigma per axis", "deg")] = 1.0
@@ -200,7 +206,7 @@ class RelativeInertia(Table, frozen=True):
 
     farthest: ClassVar[float] = 3.0  # largest deviation of a moment, over std
     kind: Literal["relative_normal"] = "relative_normal"
-    std: Annotated[Share, Meaning("1 sigma of the share")] = 0.05
+    std: Annotated[Share, Meaning("relative standard deviation")] = 0.05
     axes_deg: Annotated[NotNegative, Meaning("1 sigma of the small rotation of the principal axes", "deg")] = 0.0
 
     def build(self, parts: Any, count: int) -> Any:
@@ -222,8 +228,8 @@ class UniformPhase(Table, frozen=True):
 class Interval(Table, frozen=True):
     """A uniform time between two times."""
 
-    earliest: Annotated[NotNegative, Meaning("from when on it may be", "s")] = 0.0
-    latest: Annotated[NotNegative | None, Meaning("until when; default: loop.t_end", "s")] = None
+    earliest: Annotated[NotNegative, Meaning("earliest start", "s")] = 0.0
+    latest: Annotated[NotNegative | None, Meaning("latest start; default: loop.t_end", "s")] = None
 
     def numbers(self, parts: Any, low: float, high: float) -> RandomNumbers:
         """Return a uniform random time [s] and a uniform random number.
@@ -242,7 +248,7 @@ class Outage(Interval, frozen=True):
 
     kind: Literal["uniform"] = "uniform"
     duration: Annotated[
-        Positive | None, Meaning("how long it lasts; default: 10, scaled to the mission", "s")
+        Positive | None, Meaning("duration; default: 10, scaled to the mission", "s")
     ] = None  # fmt: skip
     scaled: ClassVar[Mapping[str, Scaled]] = {"duration": Scaled(10.0, time=1)}
 
@@ -256,7 +262,7 @@ class Failure(Interval, frozen=True):
     """One random wheel fails at a uniform time between two times."""
 
     kind: Literal["uniform"] = "uniform"
-    known: Annotated[Truth, Meaning("the torque is given to the other wheels from then on")] = False
+    known: Annotated[Truth, Meaning("whether the allocation uses the other wheels after the failure")] = False
 
     def build(self, parts: Any, count: int) -> Any:
         """Return `dispersions.numbers.RandomNumbers`: the time, and a number on (0, 1) that chooses the wheel."""
@@ -268,9 +274,9 @@ class Jitter(Table, frozen=True):
 
     kind: Literal["uniform"] = "uniform"
     largest: Annotated[
-        Positive, Meaning("share of loop.period by which a sample may come early or late, below a half")
+        Positive, Meaning("largest timing error, as a fraction of loop.period below 0.5")
     ] = 0.1  # fmt: skip
-    smallest: Annotated[NotNegative, Meaning("likewise")] = 0.0
+    smallest: Annotated[NotNegative, Meaning("smallest value of the largest timing error")] = 0.0
 
     def build(self, parts: Any, count: int) -> Any:
         """Return `dispersions.numbers.RandomNumbers`."""
@@ -279,31 +285,31 @@ class Jitter(Table, frozen=True):
 
 # by key: its meaning and its kinds, the default first
 _DISTURBANCE: dict[str, tuple[str, tuple[Any, ...]]] = {
-    "disturbance_phase": ("of every sinusoid, and of the orbit", (UniformPhase,)),
-    "disturbance_amplitude": ("of each sinusoid and constant, an independent factor on each component", FACTORS),
-    "disturbance_bias": ("a constant disturbance, added", (NormalBias, UniformBias)),
+    "disturbance_phase": ("phase of every sinusoid and of the orbit", (UniformPhase,)),
+    "disturbance_amplitude": ("independent factor on each component of each sinusoid and constant", FACTORS),
+    "disturbance_bias": ("an additional constant disturbance", (NormalBias, UniformBias)),
 }
 _ANY: dict[str, tuple[str, tuple[Any, ...]]] = {
     "torque_limit": ("factor on hardware.torque_limit", FACTORS),
     "timing_jitter": (
-        "share of loop.period by which samples come early or late, of which flight software knows nothing", (Jitter,),
+        "timing error of the samples as a fraction of loop.period; the flight software does not know it", (Jitter,),
     ),
-    "custom": ("what custom code makes of random numbers", (CUSTOM_DRAW,)),
+    "custom": ("random quantities of custom code", (CUSTOM_DRAW,)),
 }  # fmt: skip
 _SPACECRAFT: dict[str, tuple[str, tuple[Any, ...]]] = {
     "attitude": ("of the body at t = 0", (AxisAngle, UniformAttitude, NormalAttitude)),
     "rate": ("of the body at t = 0", (NormalRate, UniformRate)),
-    "inertia": ("of the true body, about true_inertia; the law keeps spacecraft.inertia", (RelativeInertia,)),
-    "reference": ("the whole reference turned", (NormalAttitude, UniformAttitude, AxisAngle)),
+    "inertia": ("inertia of the true body about true_inertia; the law uses spacecraft.inertia", (RelativeInertia,)),
+    "reference": ("a rotation of the whole reference", (NormalAttitude, UniformAttitude, AxisAngle)),
     **_DISTURBANCE,
     "attitude_noise": ("factor on hardware.attitude_noise", FACTORS),
     "rate_noise": ("factor on hardware.rate_noise", FACTORS),
-    "actuator_scale": ("factor on the torque of each axis, or wheel, that flight software does not know", FACTORS),
-    "actuator_misalignment": ("each axis, or wheel, turned from where flight software takes it to be", TURNS),
-    "star_tracker_misalignment": ("the star tracker turned in the body", TURNS),
-    "gyro_scale": ("factor on the rate that the gyro reads about each axis", FACTORS),
+    "actuator_scale": ("factor on the torque of each axis or wheel that the flight software does not know", FACTORS),
+    "actuator_misalignment": ("a rotation of each axis or wheel that the flight software does not know", TURNS),
+    "star_tracker_misalignment": ("a rotation of the star tracker in the body", TURNS),
+    "gyro_scale": ("factor on the gyro's reading about each axis", FACTORS),
     "star_tracker_outage": ("an interval without samples of the star tracker, with a filter", (Outage,)),
-    "wheel_failure": ("a wheel that gives no torque any more", (Failure,)),
+    "wheel_failure": ("failure of one wheel: it has no torque from a random time on", (Failure,)),
     "mode_frequency": ("factor on each of flexible.frequency", FACTORS),
     "mode_coupling": ("factor on each row of flexible.coupling", FACTORS),
     **_ANY,

@@ -87,7 +87,7 @@ class DisturbanceTable(PartTable, frozen=True):
 
 
 class NoDisturbance(DisturbanceTable, frozen=True):
-    """Nothing disturbs."""
+    """No disturbance."""
 
     kind: Literal["none"] = "none"
 
@@ -159,7 +159,7 @@ class SumDisturbance(Table, frozen=True):
     kind: Literal["sum"] = "sum"
     terms: Annotated[
         Annotated[tuple[Any, ...], Meta(description=TERMS)],
-        Meaning("the disturbances, each an inline table with a kind of its own; needed"),
+        Meaning("the disturbances, each an inline table with its kind; required"),
     ] = ()
 
     def filled(self, scenario: Any) -> Any:

@@ -24,15 +24,26 @@ KINEMATICS = {"chain": kinematics.ChainKinematics, "system": kinematics.SecondOr
 class LawTable(PartTable, frozen=True):
     """A law for any plant."""
 
-    t_f: Annotated[Positive, Meaning("the prescribed time, or when the error is judged", "s")] = 30.0
+    t_f: Annotated[
+        Positive,
+        Meaning(
+            "prescribed time of convergence; for laws without a prescribed time,"
+            " the time from which the error is evaluated",
+            "s",
+        ),
+    ] = 30.0
     disturbance_rate_bound: Annotated[
         NotNegative | None,
-        Meaning("c of Assumption 1, on each component of d'; default: by [disturbance] as drawn", "unit of d/s"),
+        Meaning(
+            "bound c on each component of d' (Assumption 1); default: the bound of [disturbance] with its dispersions",
+            "unit of d/s",
+        ),
     ] = None
     disturbance_bound: Annotated[
         NotNegative | None,
         Meaning(
-            "K of Assumption 1, on each component of d, used without an observer; default: by [disturbance] as drawn",
+            "bound K on each component of d (Assumption 1), used without an observer; default: the bound "
+            "of [disturbance] with its dispersions",
             "unit of d",
         ),
     ] = None
@@ -137,7 +148,8 @@ class PrescribedTable(LawTable, frozen=True):
     sampling: Annotated[
         Literal["explicit", "implicit"],
         Meaning(
-            "held input by s at the sample, or by where s is to land at the period's end, which needs no sign_width"
+            "explicit: the torque follows from s at the sample. implicit: it follows from s at the end of"
+            " the period, and needs no sign_width"
         ),
     ] = "explicit"
 
@@ -147,7 +159,10 @@ class AttitudeTable(PrescribedTable, frozen=True):
 
     error: Annotated[
         Literal["additive", "multiplicative"],
-        Meaning("the paper's q_1 - q_1f, or the vector part of q_f* q, singular 180 degrees from the reference only"),
+        Meaning(
+            "definition of the error: additive, the paper's q_1 - q_1f, or multiplicative, the vector"
+            " part of q_f* q, which is singular only 180 degrees from the reference"
+        ),
     ] = "additive"
 
 
@@ -156,7 +171,7 @@ class CustomTable(LawTable, frozen=True):
 
     delta: Annotated[
         Positive | None,
-        Meaning("time from the hand-over to t_f, if the law hands over; default: one control period", "s"),
+        Meaning("time from the hand-over to t_f, for a law with a hand-over; default: one control period", "s"),
     ] = None
     gains: ClassVar[tuple[str, ...]] = ("delta", "t_f")
 
@@ -166,7 +181,9 @@ class CustomAttitudeTable(CustomTable, frozen=True):
 
     error: Annotated[
         Literal["multiplicative", "additive"],
-        Meaning("what it drives to zero: the vector part of q_f* q, or the paper's q_1 - q_1f"),
+        Meaning(
+            "definition of the error: multiplicative, the vector part of q_f* q, or additive, the paper's q_1 - q_1f"
+        ),
     ] = "multiplicative"
 
 

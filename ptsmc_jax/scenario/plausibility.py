@@ -33,8 +33,8 @@ def _late(scenario: Scenario) -> list[str]:
     if delay * period < LATE * scenario.controller.t_f:
         return []
     return [
-        f"hardware.delay is {delay}, which are {delay * period:g} s: it counts control periods, of {period:g} s each, "
-        "and no time"
+        f"hardware.delay is {delay} control periods of {period:g} s, together {delay * period:g} s; the key is not a "
+        "time in seconds"
     ]
 
 
@@ -53,8 +53,8 @@ def _fast_surface(scenario: Scenario) -> list[str]:
         return []
     late = f" and a delay of {delay}" if delay else ""
     return [
-        f"controller.surface_rate is {law.surface_rate:g} 1/s: at a period of {period:g} s{late} no k1 makes the loop "
-        f"after the hand-over stable; below {border:.3g} 1/s some do: give a smaller one, or name it in tune.free"
+        f"controller.surface_rate is {law.surface_rate:g} 1/s: at a period of {period:g} s{late} no k1 stabilises "
+        f"the hold phase; use a surface_rate below {border:.3g} 1/s, or add it to tune.free"
     ]
 
 
@@ -64,8 +64,8 @@ def _coarse(scenario: Scenario) -> list[str]:
     if not noise or noise < COARSE:
         return []
     return [
-        f"hardware.attitude_noise is {noise:g} rad, {np.rad2deg(noise):.3g} deg: a number in another unit has it: "
-        f'"{noise:g} arcsec"'
+        f"hardware.attitude_noise is {noise:g} rad, {np.rad2deg(noise):.3g} deg, which is very large; a number in "
+        f'another unit has the unit in its value: "{noise:g} arcsec"'
     ]
 
 
@@ -77,8 +77,8 @@ def _perfect_rate(scenario: Scenario) -> list[str]:
     if not star or scenario.sensors is not None or any(getattr(device, name) is not None for name in gyro):
         return []
     return [
-        f"hardware.attitude_noise is {star:g}, but no error of the gyro is given: the law knows the body's rate "
-        "perfectly; give hardware.rate_noise or rate_noise_density, or rate_noise = 0 if that is meant"
+        f"hardware.attitude_noise is {star:g}, but the gyro has no error: the law measures the true rate; "
+        "set hardware.rate_noise or rate_noise_density, or rate_noise = 0 to confirm a perfect gyro"
     ]
 
 
@@ -95,10 +95,13 @@ def _far_off(scenario: Scenario, largest: float, fastest: float) -> list[str]:
     stated = getattr(scenario.controller, name)
     if stated is None or max(stated, follows) <= FAR * min(stated, follows):
         return []
-    what = f"controller.{name} is {stated:g}, but [disturbance] as it is drawn reaches {follows:g}"
+    what = f"controller.{name} is {stated:g}, but the disturbance of [disturbance] and [dispersion] has {follows:g}"
     if stated > follows:
-        return [f"{what}: the law switches against what is not there, and chatters; leave the key out"]
-    return [f"{what}: the law need not hold it; leave the key out"]
+        return [
+            f"{what}: the law switches more than necessary, and chatters; remove the key to use the bound of the "
+            "disturbance"
+        ]
+    return [f"{what}: the law may not reject it; remove the key to use the bound of the disturbance"]
 
 
 def _noisy(scenario: Scenario, largest: float) -> list[str]:
@@ -110,8 +113,8 @@ def _noisy(scenario: Scenario, largest: float) -> list[str]:
     shown = errors.brief([float(f"{one:.4g}") for one in gain] if len(set(gain)) > 1 else float(f"{gain[0]:.4g}"))
     unit = " N m" if scenario.motion == "spacecraft" else ""
     return [
-        f"observer.gain is {shown}, with which the estimate has {noise:.2g}{unit} of noise (1 sigma), more than the "
-        f"disturbance that it estimates, at most {largest:.3g}{unit}: look at a smaller gain"
+        f"observer.gain is {shown}: the noise of its estimate, {noise:.2g}{unit} (1 sigma), is larger than the "
+        f"disturbance, at most {largest:.3g}{unit}; try a smaller gain"
     ]
 
 

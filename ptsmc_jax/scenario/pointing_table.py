@@ -22,13 +22,16 @@ class Pointing(Table, frozen=True):
 
     boresight: Annotated[
         Three,
-        Meaning("direction of an instrument in body axes, of any length; its half-cones are given beside the axes"),
+        Meaning(
+            "direction of an instrument in body axes, of any length; the indices of its half-cone "
+            "angle are then computed too"
+        ),
     ] = (0.0, 0.0, 1.0)
     window: Annotated[
         ResolvedPositive,
-        Meaning("time over which means are taken (MPE, RPE, PDE), one window after the other; default: t_f / 30", "s"),
+        Meaning("length of the windows for mean errors (MPE, RPE, PDE); default: t_f / 30", "s"),
     ] = ABSENT
-    after: Annotated[NotNegative, Meaning("from t_f to when the observation begins", "s")] = 0.0
+    after: Annotated[NotNegative, Meaning("time from t_f to the start of the observation", "s")] = 0.0
     scaled: ClassVar[Mapping[str, Scaled]] = {"window": Scaled(1.0, time=1)}
 
     def check(self, scenario: Any) -> None:

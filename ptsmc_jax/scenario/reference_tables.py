@@ -48,7 +48,7 @@ class SlewTable(ReferenceTable, frozen=True):
         0.0,
         1.0,
     )
-    way: Annotated[Literal["short", "long"], Meaning("the short way, or the long way round")] = "short"
+    way: Annotated[Literal["short", "long"], Meaning("rotate by the smaller or by the larger angle")] = "short"
 
     @property
     def turn(self) -> np.ndarray:

@@ -47,12 +47,12 @@ class AttitudeSensorTable(SensorTable, frozen=True):
 
     boresight: Annotated[Three | None, Meaning("direction of its boresight in body axes; default: the z axis")] = None
     rotvec_deg: Annotated[
-        Three | None, Meaning("instead of boresight, rotation vector from body axes to its axes", "deg")
+        Three | None, Meaning("instead of boresight: rotation vector from the body axes to the sensor's axes", "deg")
     ] = None
     period: Annotated[
-        Positive | None, Meaning("time between readings, at least loop.period, which is the default", "s")
+        Positive | None, Meaning("time between readings, at least loop.period; default: loop.period", "s")
     ] = None
-    latency: Annotated[NotNegative, Meaning("time from a reading until the flight software has it", "s")] = 0.0
+    latency: Annotated[NotNegative, Meaning("time from a reading until the flight software receives it", "s")] = 0.0
 
     def check_alone(self, place: str) -> None:
         """Raise ScenarioError also for two mountings or a zero boresight."""
@@ -115,7 +115,9 @@ class StarTracker(AttitudeSensorTable, frozen=True):
 
     kind: Literal["star_tracker"] = "star_tracker"
     noise_across: Annotated[Noise, Meaning("1 sigma of a reading about each axis across the boresight", "rad")] = None
-    noise_about: Annotated[Noise, Meaning("about the boresight; default: noise_across", "rad")] = None
+    noise_about: Annotated[Noise, Meaning("1 sigma of a reading about the boresight; default: noise_across", "rad")] = (
+        None
+    )
     required: ClassVar[tuple[str, ...]] = ("noise_across",)
 
     def sigmas(self) -> tuple[float, ...]:
@@ -139,8 +141,8 @@ class VectorSensor(AttitudeSensorTable, frozen=True):
     """A sun sensor or magnetometer: it measures a direction that is known in inertial axes."""
 
     kind: Literal["vector_sensor"] = "vector_sensor"
-    direction: Annotated[Three | None, Meaning("in inertial axes")] = None
-    noise: Annotated[Noise, Meaning("1 sigma of each component of the direction, in its own axes", "rad")] = None
+    direction: Annotated[Three | None, Meaning("measured direction, in inertial axes")] = None
+    noise: Annotated[Noise, Meaning("1 sigma of each component of the direction, in the sensor's axes", "rad")] = None
     required: ClassVar[tuple[str, ...]] = ("direction", "noise")
 
     def check_alone(self, place: str) -> None:
@@ -170,9 +172,7 @@ class VectorSensor(AttitudeSensorTable, frozen=True):
 class CustomTable(AttitudeSensorTable, frozen=True):
     """A custom sensor of the attitude."""
 
-    noise: Annotated[tuple[Size, ...] | None, Meaning("1 sigma of each component of a reading, a list of numbers")] = (
-        None
-    )
+    noise: Annotated[tuple[Size, ...] | None, Meaning("1 sigma of each component of a reading")] = None
     required: ClassVar[tuple[str, ...]] = ("noise",)
 
     def sigmas(self) -> tuple[float, ...]:
@@ -205,12 +205,15 @@ class Gyro(SensorTable, frozen=True):
     kind: Literal["gyro"] = "gyro"
     rate_noise: Annotated[Noise, Meaning("1 sigma per axis and sample", "rad/s")] = None
     rate_noise_density: Annotated[
-        Noise, Meaning('instead of rate_noise, the angle random walk, as in "0.02 deg/sqrt(h)"', "rad/s/sqrt(Hz)")
+        Noise, Meaning('angle random walk instead of rate_noise, such as "0.02 deg/sqrt(h)"', "rad/s/sqrt(Hz)")
     ] = None
     rate_bias: Annotated[
-        Bias, Meaning("1 sigma per axis, at t = 0; the filter starts in its steady state, whatever it is", "rad/s")
+        Bias,
+        Meaning(
+            "bias at t = 0, 1 sigma per axis; it has no effect, because the filter starts in its steady state", "rad/s"
+        ),
     ] = 0.0
-    rate_bias_walk: Annotated[Bias, Meaning("random walk of that bias", "rad/s/sqrt(s)")] = 0.0
+    rate_bias_walk: Annotated[Bias, Meaning("random walk of the bias", "rad/s/sqrt(s)")] = 0.0
 
     def check_alone(self, place: str) -> None:
         """Raise ScenarioError unless exactly one noise is given."""

@@ -72,7 +72,7 @@ class Flexible(Table, frozen=True):
             tuple[Positive, ...], Meta(min_length=1, description="a list of numbers greater than 0, one for each mode")
         ]
         | None,
-        Meaning("W of each mode, the body held; default: 6, scaled to the mission", "rad/s"),
+        Meaning("cantilevered frequency W of each mode; default: 6, scaled to the mission", "rad/s"),
     ] = None
     damping: Annotated[
         Annotated[
@@ -84,8 +84,8 @@ class Flexible(Table, frozen=True):
     coupling: Annotated[
         Annotated[tuple[Three, ...], Meta(min_length=1, description="a list of rows of three numbers")] | None,
         Meaning(
-            "D, a row for each mode: how much it turns the body about each axis; default: 0.8 about x, "
-            "scaled to the mission",
+            "coupling D of the modes with the rotation about each axis, one row for each mode; default: "
+            "0.8 about x, scaled to the mission",
             "sqrt(kg) m",
         ),
     ] = None

@@ -32,7 +32,7 @@ class ChainPlant(Table, frozen=True):
     kind: Literal["chain"] = "chain"
     order: Annotated[
         Annotated[int, Meta(ge=2, le=20, description="a whole number from 2 to 20")],
-        Meaning("number n of states; as many as x0 has where it is absent"),
+        Meaning("number n of states; default: the length of x0"),
     ] = 2
     x0: Annotated[Numbers, Meaning("initial state x_1 to x_n")] = (5.0, 3.0)
 
@@ -47,13 +47,16 @@ class SystemPlant(Table, frozen=True):
     kind: Literal["system"] = "system"
     system: Annotated[
         Annotated[Any, Meta(description='"FILE.py:NAME", a system made with plants.system')],
-        Meaning('where it stands, "FILE.py:NAME" with the file beside the scenario, or "package.module:NAME"; needed'),
+        Meaning(
+            'location of the system: "FILE.py:NAME" with the file in the folder of the scenario, or '
+            '"package.module:NAME"; required'
+        ),
     ] = None
     truth: Annotated[
         Annotated[Any, Meta(description='"FILE.py:NAME", a system with as many inputs')] | None,
         Meaning(
-            "the system that flies, where it is another one than law and observer know, of as many "
-            "inputs; states that they do not know of it may have besides (Z, z0)"
+            "true plant, if it differs from the design model `system`: a system with the same number of "
+            "inputs; it may have hidden states (Z, z0)"
         ),
     ] = None
     x0: Annotated[Numbers, Meaning("initial state, x_1 and then x_2")] = (1.0, 0.0)

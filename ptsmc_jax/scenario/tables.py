@@ -34,33 +34,45 @@ class Loop(Table, frozen=True):
     """Type of the control loop, and the times of a run."""
 
     mode: Annotated[
-        Literal["continuous", "sampled"], Meaning("the law inside the integrator, or computed and held once a period")
+        Literal["continuous", "sampled"],
+        Meaning(
+            "continuous: the law is evaluated inside the "
+            "integrator. sampled: it is computed once a control "
+            "period and held"
+        ),
     ] = "continuous"
     period: Annotated[
         ResolvedPositive,
-        Meaning("control period, sampled loop only; default: t_f / 600, of other plants t_f / 100", "s"),
+        Meaning(
+            "control period of the sampled loop; default: t_f / 600 for a spacecraft, t_f / 100 for other plants", "s"
+        ),
     ] = ABSENT
     clock: Annotated[
         Literal["anchored", "flight"],
-        Meaning("a sample at t_f - delta, as `tune` has where it moves either, or at whole periods, as a computer has"),
+        Meaning(
+            "anchored: one sample is at t_f - delta. flight: samples are at multiples of the period, "
+            "as on a flight computer"
+        ),
     ] = "anchored"
     t_end: Annotated[
         Positive | None,
-        Meaning("end of the run; default: 4/3 t_f, or longer for the window; of other plants 3 t_f", "s"),
+        Meaning(
+            "end of the run; default: 4/3 t_f or the end of the window for a spacecraft, 3 t_f for other plants", "s"
+        ),
     ] = None
     window: Annotated[
         Positive | None,
         Meaning(
-            "time after t_f over which window_error is taken; default: t_f / 30, or a control period if "
-            "longer; of other plants t_f / 5",
+            "length of the window after t_f in which window_error is computed; default: t_f / 30 or a "
+            "control period for a spacecraft, t_f / 5 for other plants",
             "s",
         ),
     ] = None
     settling_angle: Annotated[
         ResolvedPositive,
         Meaning(
-            "angle to the reference that counts as settled; default: 1e-3, less for small initial errors,"
-            " at least five sigma of the noise; of other plants |x_1|",
+            "largest angle to the reference of a settled run, for other plants |x_1|; default: 1e-3, less"
+            " for small initial errors, at least five sigma of the noise",
             "rad",
         ),
     ] = ABSENT
@@ -74,20 +86,29 @@ class Limit(Table, frozen=True):
     """A requirement as a table: metric <= limit in a fraction of the trials or of the time."""
 
     limit: Annotated[
-        NotNegative, Meaning('the largest value allowed, a number or with its unit, "0.05 deg"; 0 of `saturated` only')
+        NotNegative,
+        Meaning(
+            'largest allowed value, a number or a string with a unit such as "0.05 deg";'
+            " 0 is allowed for `saturated` only"
+        ),
     ]
     quantile: Annotated[
         Quantile | None, Meaning("fraction of the trials that must keep the limit; default: all simulated trials")
     ] = None
     probability: Annotated[
-        Quantile | None, Meaning("of what `interpretation` says; of an ensemble it is the quantile")
+        Quantile | None,
+        Meaning('fraction of trials or of the time, as `interpretation` defines; for "ensemble" it is the quantile'),
     ] = None
     confidence: Annotated[
-        Quantile | None, Meaning("of the one-sided bound by which that share must be shown; default: none asked")
+        Quantile | None,
+        Meaning("confidence of the one-sided bound that must show this fraction; default: no bound is required"),
     ] = None
     interpretation: Annotated[
         Literal["ensemble", "temporal", "mixed"] | None,
-        Meaning("of the runs, at all times (default); of the time, in every run; of the time of all runs"),
+        Meaning(
+            "ensemble (default): fraction of the runs, at all times. temporal: fraction of the time, "
+            "in every run. mixed: fraction of the time of all runs"
+        ),
     ] = None
 
     @property
@@ -109,50 +130,53 @@ class Tune(Table, frozen=True):
     free: Annotated[
         FreeGains | None,
         Meaning(
-            "the gains to find; default: all but t_f; without sampling all but k1, sign_width and surface_rate too"
+            "gains to tune; default: all except t_f, and in the continuous loop except k1, sign_width and surface_rate"
         ),
     ] = None
     bounds: Annotated[
         Annotated[dict[str, Interval], Meta(description="a table of two numbers for each gain")],
         Meaning(
-            "two numbers for each gain; defaults follow the mission and move with the search: see "
-            "scenario.toml of a run"
+            "lower and upper bound of each gain; default: from the mission; the search may widen default "
+            "bounds, see scenario.toml in the results"
         ),
     ] = {}  # noqa: RUF012
-    per_axis: Annotated[Truth, Meaning("observer_gain as one number for each axis")] = False
+    per_axis: Annotated[Truth, Meaning("tune one observer_gain for each axis")] = False
     minimise: Annotated[
         Annotated[str, Meta(description='a metric, "t_f" or "limits"')],
         Meaning(
-            'the objective: a metric, "t_f" (the shortest for the requirements), or "limits" (the largest'
-            " metric over its limit: as far inside all limits as possible)"
+            'the objective: a metric, "t_f" (the shortest t_f that meets the requirements), or "limits" '
+            "(the largest ratio of a metric to its limit)"
         ),
     ] = "window_error"
     statistic: Annotated[
         Literal["rms", "mean", "worst", "quantile", "cvar"],
         Meaning(
-            "of that metric over the trials: its RMS, mean, largest value, a quantile, or CVaR (the RMS "
-            "of the worst 1 - level of the trials)"
+            "statistic of this metric over the trials: RMS, mean, largest value, a quantile, or CVaR (the"
+            " RMS of the worst 1 - level of the trials)"
         ),
     ] = "rms"
-    level: Annotated[Quantile | None, Meaning("of the quantile or the CVaR; default: 0.9")] = None
+    level: Annotated[Quantile | None, Meaning("level of the quantile or the CVaR; default: 0.9")] = None
     torque_weight: Annotated[
-        NotNegative, Meaning("weight of ln(RMS peak torque) beside ln(error), Remark 1's trade-off")
+        NotNegative, Meaning("weight of ln(RMS peak torque) in the objective, besides ln(error) (Remark 1)")
     ] = 0.0
     worst_case: Annotated[
-        Truth, Meaning("keep the requirements in the worst case inside the dispersions too, not only where drawn")
+        Truth,
+        Meaning("require the limits also in the worst case within the dispersions, not only in the random trials"),
     ] = False
     # all trials run at once, in memory
     trials: Annotated[
         Annotated[int, Meta(ge=1, le=10**6, description="a whole number from 1 to 1000000")],
-        Meaning("trials to tune on; requirements with a quantile add more of them"),
+        Meaning("number of training trials; requirements with a quantile add trials"),
     ] = 256
     starts: Annotated[
         Annotated[int, Meta(ge=1, le=100, description="a whole number from 1 to 100")],
-        Meaning("starting points of local searches: the scenario's gains, designs, and the best of a sweep"),
+        Meaning(
+            "number of starting points: the scenario's gains, analytical designs, and the best of a Sobol sequence"
+        ),
     ] = 12
     steps: Annotated[
         Annotated[int, Meta(ge=1, le=10**5, description="a whole number from 1 to 100000")],
-        Meaning("largest number of points with gradients in one local search"),
+        Meaning("largest number of gradient evaluations in one local search"),
     ] = 40
 
     @property

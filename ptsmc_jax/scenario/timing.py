@@ -278,7 +278,7 @@ def _grid(
         if by_key[worst] <= steps() * 1.5:
             raise wrong("loop.t_end", t_end, f"earlier: {asks}")
         if worst == "controller.sign_width":
-            raise wrong(worst, scenario.controller.sign_width, f"larger, or 0 for the exact sign: {asks}")
+            raise wrong(worst, scenario.controller.sign_width, f"larger, or 0 for the discontinuous sign: {asks}")
         raise _lower(scenario, worst, asks)
     grid = clock.graded(reach.t_f, reach.smallest_delta, t_end, scenario.window, rate, frequency, layer, saves, order)
     return dataclasses.replace(grid, t_end=vector(loop.t_end))

@@ -128,7 +128,7 @@ class Sinusoid(Disturbance):
 @pytree
 @dataclass(frozen=True)
 class GravityGradient(Disturbance):
-    """The gravity gradient of a circular orbit, on the true body; the attitude key is that of the orbit's frame.
+    """The gravity gradient torque on the true body in a circular orbit.
 
     The frame's z is along the orbit's normal, its x points to where the phase counts from. The torque is 3 n^2 c x J c,
     c the unit vector to the planet in body axes.
@@ -140,7 +140,7 @@ class GravityGradient(Disturbance):
     inertia: Leaf  # (3, 3) of the true body [kg m^2]
     orbit: Leaf  # (4,) quaternion of the orbit's frame: z along its normal, x to where the phase counts from
     orbit_rate: Leaf = number(1.1e-3, above=0.0, at_most=1.0, unit="rad/s", meaning="mean motion n")
-    phase: Leaf = number(0.0, unit="rad", meaning="where on the orbit the run starts")
+    phase: Leaf = number(0.0, unit="rad", meaning="angle on the orbit at t = 0")
     drawn: ClassVar[Mapping[str, str]] = {"phase": "phase"}
 
     def __call__(self, t: Scalar, x: AttitudeState) -> Float[Array, "3"]:
@@ -156,11 +156,11 @@ class GravityGradient(Disturbance):
 
 @dataclass(frozen=True)
 class RandomWalk(Disturbance):
-    """A disturbance that wanders from zero, a new step each period; sampled loop only."""
+    """A random walk from zero, with a new step each control period. It needs the sampled loop."""
 
     density: Leaf = number(
         Scaled(1e-4, inertia=1, time=-0.5, order=-1, each=True), at_least=0.0, unit="unit of d/sqrt(s)", each=True,
-        meaning="of the walk's white noise, for each component; default: 1e-4 each, scaled to the mission",
+        meaning="noise density of each component; default: 1e-4 each, scaled to the mission",
     )  # fmt: skip
 
 

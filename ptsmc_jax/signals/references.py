@@ -100,7 +100,7 @@ class Fixed(Reference):
 class Spin(Reference):
     """The attitude at t = 0, turning from then on at a constant body rate: q_f(t) = q(0) exp(w t)."""
 
-    rate: Leaf = number((0.0, 0.0, 0.0), unit="rad/s", meaning="of the reference, its own axes")
+    rate: Leaf = number((0.0, 0.0, 0.0), unit="rad/s", meaning="rate of the reference, in its own axes")
     paced_by: ClassVar[str] = "rate"
 
     def __call__(self, t: Scalar) -> Target:
@@ -121,7 +121,7 @@ class Swing(Reference):
     q_f(t) = q exp(r(t)).
     """
 
-    amplitude: Leaf = number((0.1, 0.1, 0.1), unit="rad", meaning="of the rotation vector, per axis")
+    amplitude: Leaf = number((0.1, 0.1, 0.1), unit="rad", meaning="amplitude of the rotation vector on each axis")
     frequency: Leaf = number(
         Scaled((0.1, 0.1, 0.1), time=-1), unit="rad/s", meaning="per axis; default: 0.1 each, scaled to the mission"
     )
@@ -147,7 +147,7 @@ class Slew(Reference):
 
     turn: Leaf  # (3,) rotation vector from the attitude at t = 0 to that from t = duration on [rad]
     duration: Leaf = number(
-        Scaled(30.0, time=1), above=0.0, unit="s", meaning="how long it takes; default: 30, scaled to the mission"
+        Scaled(30.0, time=1), above=0.0, unit="s", meaning="duration of the slew; default: 30, scaled to the mission"
     )
     paced_by: ClassVar[str] = "duration"
 

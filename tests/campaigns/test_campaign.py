@@ -207,7 +207,7 @@ def test_custom_metrics_are_columns_of_the_rows():
         (lambda result: {}, "it fails: TypeError: .* takes 1 positional argument but 2 were given"),
         (
             lambda result, parts: {"x": float(result.status)},
-            "it needs the value of a number that is known in flight only",
+            "it needs the value of a traced number, which is known only during the simulation",
         ),
     ],
 )

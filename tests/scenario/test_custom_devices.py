@@ -253,17 +253,17 @@ SEES = [
     ("x + self.sigma", "1 / 0 + self.sigma", "see fails: ZeroDivisionError: division by zero (line 18 of mine.py)"),
 ]
 DRAWS = [
-    ("std: float = 0.1", "std: float = ptsmc.gain(1.0, (0.1, 2.0))", "of such a part none is tuned"),
+    ("std: float = 0.1", "std: float = ptsmc.gain(1.0, (0.1, 2.0))", "the tuner cannot change parts of this kind"),
     ("def at", "def be", "the class Drift has no method at"),
     ("return dataclasses.replace(parts, disturbance", "return dict(d", "at returns a dict at t = 0"),
-    ("initial=parts.initial + 0.01 * c[1]", "initial=jnp.zeros(3)", "parts with f64(3,) in place of f64(2,)"),
-    ("initial=parts.initial + 0.01 * c[1]", "initial=None", "parts with initial absent in place of an array of shape"),
+    ("initial=parts.initial + 0.01 * c[1]", "initial=jnp.zeros(3)", "parts with f64(3,) instead of f64(2,)"),
+    ("initial=parts.initial + 0.01 * c[1]", "initial=None", "parts with initial absent instead of an array of shape"),
     ("0.01 * c[1]", "jnp.inf * c[1]", "numbers that are not finite"),
     ("0.01 * c[1]", "0.01 * c[2]", "at fails: IndexError: index 2 is out of bounds for axis 0 with size 2 (line"),
     ("0.01 * c[1]", "1 / 0 * c[1]", "at fails: ZeroDivisionError"),
-    ('{"drift": 1.0', '{" ": 1.0', "returns a number ' ' at t = 0, but must return names that can be printed"),
-    ('{"drift": 1.0', '{"status": 1.0', "names that no column of the rows has"),
-    ('{"drift": 1.0', '{"run_trial": 1.0', "names that no column of the rows has"),  # would replace this column
+    ('{"drift": 1.0', '{" ": 1.0', "returns a number ' ' at t = 0, but must return a printable name"),
+    ('{"drift": 1.0', '{"status": 1.0', "a name that no column of the result file has"),
+    ('{"drift": 1.0', '{"run_trial": 1.0', "a name that no column of the result file has"),  # would replace this column
     ('{"drift": 1.0 + self.std * c[0]}', '{"drift": c[0] > 0.0}', "a number drift True"),  # a summary cannot rank it
     ('{"drift": 1.0 + self.std * c[0]}', "[c[0]]", "must return a dict of numbers by name"),
     ('{"drift": 1.0 + self.std * c[0]}', '{"drift": 1 / 0}', "values fails: ZeroDivisionError"),
@@ -288,7 +288,7 @@ def test_errors_in_custom_sensors_and_dispersions_are_one_sentence(here, old, ne
 @pytest.mark.parametrize(
     ("tables", "said"),
     [
-        ({"hardware": {"state_noise": [1.0, 1.0]}}, "hardware.state_noise is [1.0, 1.0], but must be absent where"),
+        ({"hardware": {"state_noise": [1.0, 1.0]}}, "hardware.state_noise is [1.0, 1.0], but must be absent, because"),
         ({"loop": {"mode": "continuous"}, "controller": {"t_f": 5.0}}, "[sensors] needs the sampled loop"),
     ],
 )
@@ -301,7 +301,7 @@ def test_custom_sensors_exclude_built_in_sensors_and_filters(tables, said):
         scenario.from_tables({**flight, "filter": {}})  # earlier: an error about its bandwidth
     for key in ("attitude_noise", "rate_noise", "star_tracker_misalignment", "gyro_scale", "star_tracker_outage"):
         with pytest.raises(
-            ScenarioError, match=rf"^dispersion\.{key} is drawn of what \[hardware\] says, but \[sensors\]"
+            ScenarioError, match=rf"^dispersion\.{key} changes the sensors of \[hardware\], but \[sensors\]"
         ):
             scenario.from_tables({**flight, "dispersion": {key: {}}})  # not an error about noise
     assert dataclasses.is_dataclass(ptsmc.SampledSensor)

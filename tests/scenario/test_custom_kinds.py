@@ -351,7 +351,7 @@ BAD = [
     (changed("return 0.5 * wanted, s", "0.5 * wanted, s"), {}, "acceleration returns nothing", "a sliding variable"),
     (  # an earlier version ran it as 0 and 1, and margins ended in a traceback
         changed("return 0.5 * wanted, s", "return 0.5 * wanted, s > 0.0"), {},
-        "acceleration returns a sliding variable [", "must return finite numbers, real ones",
+        "acceleration returns a sliding variable [", "must return finite real numbers",
     ),
     (  # an earlier error named the class MineOnErrorOfChain
         changed("return 0.5 * wanted", "return self.width_ * wanted"), {},
@@ -366,7 +366,8 @@ BAD = [
     ),
     (
         changed("return 0.5 * wanted", "return wanted if wanted[0] > 9.0 else 0.5 * wanted"), {},
-        "acceleration needs the value of a number that is known in flight only (line", "jax.numpy.where in place of if",
+        "acceleration needs the value of a traced number, which is known only during the simulation (line",
+        "jax.numpy.where in place of if",
     ),
     (
         changed("return 0.5 * wanted", "return float(wanted[0]) * wanted"), {},
@@ -393,16 +394,16 @@ BAD = [
     (changed("(2.1, 6.0)", "(3.1, 6.0)"), {}, "the default of the gain eta is 3, but", "a number from 3.1 to 6"),
     (changed("width: float = 1e-3", "width: str = 'x'"), {}, 'the default of width is "x"', "a number"),
     (changed("width: float = 1e-3", "width: float"), {}, "cannot have such fields", "width"),
-    ("Mine = [3]", {}, "a list, which is not derived from", "ptsmc_jax.AccelerationLaw"),
-    (changed("width: float", "code: float"), {}, "a field of the class Mine is called code", "has its meaning"),
-    (changed("width: float", "check: float"), {}, "a field of the class Mine is called check", "has its meaning"),
-    (changed("width: float", "order: float"), {}, "a field of the class Mine is called order", "has its meaning"),
-    (changed("width: float", "kinematics: float"), {}, "of the class Mine is called kinematics", "another name"),
-    (changed("width: float = 1e-3", "t_f: float = 1.0"), {}, "a field of the class Mine is called t_f", "another name"),
-    (changed("return 0.5 * wanted", "return 1j * wanted"), {}, "returns an acceleration [", "real ones"),
+    ("Mine = [3]", {}, "it is a list, but must be a class derived from", "ptsmc_jax.AccelerationLaw"),
+    (changed("width: float", "code: float"), {}, "the class Mine has a field code", "already uses"),
+    (changed("width: float", "check: float"), {}, "the class Mine has a field check", "already uses"),
+    (changed("width: float", "order: float"), {}, "the class Mine has a field order", "already uses"),
+    (changed("width: float", "kinematics: float"), {}, "the class Mine has a field kinematics", "another name"),
+    (changed("width: float = 1e-3", "t_f: float = 1.0"), {}, "the class Mine has a field t_f", "another name"),
+    (changed("return 0.5 * wanted", "return 1j * wanted"), {}, "returns an acceleration [", "real numbers"),
     (LAW, {"eta": float("nan")}, "controller.eta is nan", "finite numbers"),
-    ("Mine = 3", {}, "a int, which is not derived from", "ptsmc_jax.AccelerationLaw"),
-    ("class Mine:\n    pass", {}, "a class Mine, which is not derived from", "ptsmc_jax.AccelerationLaw"),
+    ("Mine = 3", {}, "it is a int, but must be a class derived from", "ptsmc_jax.AccelerationLaw"),
+    ("class Mine:\n    pass", {}, "it is a class Mine, but must be a class derived from", "ptsmc_jax.AccelerationLaw"),
     ("Other = 3", {}, "mine.py has no such name", "FILE.py:NAME"),
     ("x = = 1", {}, "running mine.py fails: SyntaxError", "mine.py"),
     (LAW, {"etta": 3.0}, "controller.etta is not a known key", "controller.eta"),
@@ -437,7 +438,7 @@ def test_errors_in_a_custom_law_are_one_sentence(here, law, keys, of_what, allow
         ("observer", "    share: float", "    gain: float = 0.5\n    share: float", "another than gain"),
         ("observer", "    share: float", "    gain: tuple = (0.5,)\n    share: float", "another than gain"),
         ("observer", "share: float", "gain_2: float", "another than gain_2"),
-        ("observer", "share: float", "update: float", "a field of the class Filtered is called update, which has its"),
+        ("observer", "share: float", "update: float", "the class Filtered has a field update, a name that"),
         (
             "observer",
             "def estimate",
@@ -448,16 +449,16 @@ def test_errors_in_a_custom_law_are_one_sentence(here, law, keys, of_what, allow
             "disturbance",
             "float(self.rates[1])",
             "'fast'",
-            'disturbance.code names a class Wave whose fastest returns "fa',
+            'disturbance.code is the class Wave, whose method fastest returns "fa',
         ),
         (
             "disturbance",
             "float(self.rates[1])",
             "None",
-            "whose fastest returns nothing, but must return a number of at least 0",
+            "whose method fastest returns nothing, but must return an angular frequency",
         ),
-        ("disturbance", "float(self.rates[1])", "float('nan')", "whose fastest returns nan"),
-        ("disturbance", "float(self.rates[1])", "-1.0", "whose fastest returns -1.0"),
+        ("disturbance", "float(self.rates[1])", "float('nan')", "whose method fastest returns nan"),
+        ("disturbance", "float(self.rates[1])", "-1.0", "whose method fastest returns -1.0"),
         ("disturbance", "* jnp.ones(1)", "* jnp.ones(3)", "__call__ returns a disturbance of shape (3,)"),
         ("disturbance", "jnp.sin(self.rates[0] * t)", "jnp.log(-1.0)", "returns a disturbance [nan]"),
         ("disturbance", "(0.5, 1.5)", "(0.5, 1e9)", "disturbance.frequency"),
@@ -482,7 +483,7 @@ def test_errors_in_other_custom_parts_are_one_sentence(here, name, old, new, of_
         (
             "    def attitude",
             "    def fastest(self):\n        pass\n\n    def attitude",
-            "Turning whose fastest returns nothing",
+            "Turning, whose method fastest returns nothing",
         ),
     ],
 )
@@ -695,7 +696,7 @@ def test_helper_modules_come_from_the_folder_of_the_file_and_are_current(tmp_pat
 def test_a_custom_law_cannot_reuse_the_gain_name_of_another_part(here, name):
     gain = f"{name}: float = ptsmc.gain(1.0, (0.5, 2.0))\n    width: float"
     (here / "mine.py").write_text(HEAD + LAW.replace("width: float", gain))
-    with pytest.raises(ScenarioError, match=f"the name of its gain {name} stands for one of another part"):
+    with pytest.raises(ScenarioError, match=f"its gain {name} needs another name"):
         scenario.study(scenario.from_tables({**CHAIN, "controller": MINE}))
 
 

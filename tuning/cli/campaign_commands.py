@@ -46,7 +46,7 @@ def montecarlo(
     /,
     *,
     trials: Annotated[
-        int | None, whole("Trials, 1 to 4294967296; none: 10000.", 1, MOST, group=(SHOWN, TRIALS))
+        int | None, whole("Number of trials, 1 to 4294967296; default: 10000.", 1, MOST, group=(SHOWN, TRIALS))
     ] = None,
     runs: Annotated[
         Path | None,
@@ -64,7 +64,8 @@ def montecarlo(
         Parameter(
             validator=Number(gt=0, lt=1),
             group=(SHOWN, CONFIDENT, PARTS),
-            help="Stop when the fraction of trials within every limit is known to within this width, between 0 and 1.",
+            help="Stop when the 95 % interval of the fraction of trials that keep each limit is narrower than this "
+            "width, between 0 and 1.",
         ),
     ] = None,
     metrics: Annotated[
@@ -81,7 +82,7 @@ def montecarlo(
         str | None,
         Parameter(
             group=(SHOWN, PLACES),
-            help="Simulate on a Dask cluster: address or scheduler file; or local:N, N processes here.",
+            help="Simulate on a Dask cluster: ADDRESS or scheduler file, or local:N for N processes on this machine.",
         ),
     ] = None,
     tls_ca: Annotated[Path | None, Parameter(help="TLS: certificate authority's file.")] = None,
@@ -103,7 +104,7 @@ def montecarlo(
     controller: flight_commands.ControllerFolder = None,
     common: Common = USUAL,
 ) -> int:
-    """Simulate a campaign of many trials, and keep a row of each; every trial can be replayed.
+    """Simulate many dispersed trials and write one row for each. `ptsmc replay` repeats any trial.
 
     After Ctrl-C or a kill, the same command resumes the campaign. With more --trials it adds trials. The default folder
     is out/montecarlo-NAME, followed by the names of --controller and --runs.
@@ -248,7 +249,8 @@ def worst(
     by: Annotated[
         str,
         Parameter(
-            help="Column of the rows. Its largest values are the worst, of `within_*` and `controller_ok` the smallest."
+            help="Column that ranks the trials: the largest value is the worst, or the smallest of `within_*` and "
+            "`controller_ok`."
         ),
     ] = "window_error",
     n: Annotated[int, whole("Number of trials, 1 to 10000.", 1, 10_000, name=("--n", "-n"))] = 5,
@@ -256,12 +258,12 @@ def worst(
         bool,
         Parameter(
             negative="",
-            help="List the inputs of these trials as percentiles of all trials, for every required metric too.",
+            help="Write why.csv: the inputs of these trials as percentiles of all trials, for every required metric.",
         ),
     ] = False,
     quiet: Quiet = False,
 ) -> int:
-    """Print the worst trials of a campaign, failed ones first, and write worst.csv, with --why also why.csv.
+    """Print the worst trials of a campaign, failed trials first, and write them to worst.csv.
 
     Exit status: 0 done, 2 configuration error.
     """

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 ControllerFolder = Annotated[
     Path | None,
-    Parameter(help="Folder of ptsmc export: its C is compiled and runs in the loop, on the flight clock."),
+    Parameter(help="Folder of `ptsmc export`: its C code is compiled and controls the simulation."),
 ]
 
 
@@ -35,7 +35,7 @@ def export(
     force: Force = False,
     quiet: Quiet = False,
 ) -> int:
-    """Write the scenario's flight computer as C99 with test vectors: attitude filter, observer, law, wheels.
+    """Export attitude filter, observer, law and wheel allocation of a scenario as C99, with test vectors.
 
     Exit status: 0 done, 2 configuration error, or a part that cannot be written in C.
     """

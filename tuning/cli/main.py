@@ -38,7 +38,7 @@ from tuning.output import progress, terminal
 
 app = App(
     name="ptsmc",
-    help="Prescribed-time sliding mode control: reproduce the paper, simulate, tune the gains.",
+    help="Prescribed-time sliding mode attitude control: simulate, tune, verify and export.",
     version=ptsmc_jax.__version__,
     help_format="plaintext",
     suppress_keyboard_interrupt=False,
@@ -55,7 +55,7 @@ def simulate(
     out: Out = None,
     seed: Seed = 0,
     trial: Annotated[
-        int | None, whole("Simulate this trial's dispersions; none: nominal, with trial 0's noise.")
+        int | None, whole("Simulate this dispersed trial; default: nominal parameters with the noise of trial 0.")
     ] = None,
     controller: flight_commands.ControllerFolder = None,
     common: Common = USUAL,
@@ -167,9 +167,10 @@ def margins(
     out: Out = None,
     common: Common = USUAL,
 ) -> int:
-    """Print gain, phase, delay and sensitivity margins of the nominal loop: hold phase, and approach phase frozen.
+    """Print the gain, phase and delay margins and the peak sensitivity of the nominal loop.
 
-    The nominal loop has no dispersions. `tune` and `montecarlo` judge required margins by the worst dispersed loop.
+    They are computed in the hold phase and in the frozen approach phase. The nominal loop has no dispersions. `tune`
+    and `montecarlo` judge required margins by the worst dispersed loop.
 
     Exit status: 0 stable in the hold phase, 1 not stable in the hold phase, 2 configuration error.
     """
@@ -198,7 +199,7 @@ def tune(
     out: Out = None,
     seed: Seed = 0,
     global_check: Annotated[
-        bool, Parameter(negative="", help="Compare with the result of differential evolution.")
+        bool, Parameter(negative="", help="Check the result by differential evolution, an independent global search.")
     ] = False,
     device: Device = "cpu",
     common: Common = USUAL,

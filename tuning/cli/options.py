@@ -67,19 +67,24 @@ Against = Annotated[
     tuple[str, ...] | None,
     Parameter(
         negative="",
-        help="Law to compare with, several times: pd, terminal, fixed_time, time_base_pd, time_base_sliding, scaling, "
-        "predefined_time, super_twisting; none: all of them.",
+        help="Law to compare with: pd, terminal, fixed_time, time_base_pd, time_base_sliding, scaling, "
+        "predefined_time, super_twisting; repeat the option for several. Default: all of them.",
     ),
 ]
 Laws = Annotated[
-    tuple[str, ...], Parameter(negative="", help="FILE.py:NAME of a custom law to compare with too, several times.")
+    tuple[str, ...],
+    Parameter(
+        negative="", help="Custom law, FILE.py:NAME, to include in the comparison; repeat the option for several."
+    ),
 ]
 Device = Annotated[Literal["cpu", "gpu"], Parameter(help="Hardware that batches run on.")]
 
 FrontAgainst = Annotated[
     Literal["torque", "margins", "t_f"], Parameter(help="Quantity that the accuracy is traded against.")
 ]
-Points = Annotated[int | None, whole("Number of limits on the torque to tune for, 3 to 100; default: 20.", 3, 100)]
+Points = Annotated[
+    int | None, whole("Number of torque limits, each with its own tuned gains, 3 to 100; default: 20.", 3, 100)
+]
 Times = Annotated[
     str | None,
     Parameter(

@@ -16,7 +16,7 @@ Overwrite = Annotated[bool, Parameter(negative="", help="Overwrite existing file
 def report(
     folder: Annotated[Path, Parameter(name="DIR", help="Result folder of a command.")], /, *, quiet: Quiet = False
 ) -> int:
-    """Write the results in a folder as one page of HTML, DIR/report.html, which needs no other file.
+    """Write the results of a folder as one self-contained HTML page, DIR/report.html.
 
     Exit status: 0 done, 2 configuration error.
     """
@@ -66,7 +66,7 @@ def schema(
     force: Overwrite = False,
     quiet: Quiet = False,
 ) -> int:
-    """Write the JSON Schema of scenario files, with which editors complete keys and check values.
+    """Write a JSON Schema of scenario files. Editors use it to complete keys and to check values.
 
     Exit status: 0 done, 2 configuration error.
     """
@@ -81,7 +81,7 @@ def schema(
 
 
 def examples(
-    folder: Annotated[Path, Parameter(name="DIR", help="Folder for them.")] = Path("scenarios"),
+    folder: Annotated[Path, Parameter(name="DIR", help="Folder to write the files to.")] = Path("scenarios"),
     /,
     *,
     force: Overwrite = False,

@@ -129,11 +129,11 @@ def judged_on(simulated: Scenario) -> str:
     if not simulated.sampled:
         return "the continuous loop"
     if getattr(simulated.controller, "implicit", False):
-        return "flight clock, the sign solved for"
+        return "flight clock, implicit sampling"
     width = getattr(simulated.controller, "sign_width", None)
     if width is None:
         return "flight clock"
-    return "flight clock, " + (f"sign {width:g} wide" if width else "exact sign")
+    return "flight clock, " + (f"boundary layer of {width:g}" if width else "discontinuous sign")
 
 
 def trials_of(ready: Study, wanted: int) -> int:

@@ -55,8 +55,8 @@ def worst(ready: Study) -> dict[str, dict[str, Any]] | None:
     Returns:
         Margins in [dB], [deg] and [s] for both phases, and whether the loops of all axes are "stable". If the nominal
         run ends in a limit cycle, positive margins in "hold" are replaced by 0, and "limit_cycle" has the amplitude
-        and the period of the cycle. The result is None for a continuous loop, and if the loop has no finite derivatives in the
-        hold phase.
+        and the period of the cycle. The result is None for a continuous loop, and if the loop has no finite derivatives
+        in the hold phase.
     """
     if not ready.scenario.sampled:
         return None

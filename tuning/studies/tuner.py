@@ -336,7 +336,7 @@ def _over(outcome: Search, verdicts: list[Verdict]) -> dict[str, float]:
             for one in verdicts if not one.met and one.limit}  # fmt: skip
     helped = bool(np.all(outcome.worst <= 1.0)) and all(np.isfinite(share) and share > 1.0 for share in over.values())
     reached = dict(zip(outcome.problem.rows, outcome.worst, strict=True))  # 0: the training trials do not depend on it
-    # a loop with a limit cycle has no margins, see `theory.rest`; more distance from the limits does not help
+    # a loop with a limit cycle has no margins, see `theory.limit_cycles`; more distance from the limits does not help
     swings = any(one.at_least and one.worst == 0.0 for one in verdicts)
     return over if helped and not swings and all(reached[name] > 0.0 for name in over) else {}
 
