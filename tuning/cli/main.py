@@ -295,7 +295,7 @@ def compare(
     rivals.check()
     comparing.check(loaded)
     loaded = searches.with_tune(loaded)
-    posed = functools.cache(lambda: comparing.that_fly(loaded, rivals))
+    posed = functools.cache(lambda: comparing.that_can_be_simulated(loaded, rivals))
     known_by = comparing.identity(loaded, seed, rivals) | {"device": device}
     search = searches.LongSearch(
         known_by,

@@ -27,7 +27,7 @@ class LongSearch:
     """A search that takes minutes to hours."""
 
     known_by: dict[str, Any]  # entries of versions.json that identify it, see `store.begin`
-    goal: str  # name of the objective in the progress
+    objective: str  # name of the objective in the progress
     work: Callable[[Progress, "Journal"], Any]  # runs the search; its result has a `status`
     write: Callable[[Path, Any], None]  # fills a result folder with a result
     report: Callable[[dict[str, Any]], "Report"]  # of the content of summary.json
@@ -98,7 +98,7 @@ def _run(search: LongSearch, loaded: "Scenario", folder: Path, *, force: bool, q
 
     with resumable(force):
         threading.Thread(target=lambda: [*map(importlib.import_module, search.needs)], daemon=True).start()
-        with Progress(quiet, search.goal) as report:
+        with Progress(quiet, search.objective, loaded.plant.kind) as report:
             outcome = search.work(report, journal)
         store.write(folder, lambda making: search.write(making, outcome))
     if outcome.status != "interrupted":

@@ -77,6 +77,17 @@ def named_error(value: float | None, plant: str, statistic: str = "") -> str:
     return "" if (text := error(value, plant)) == "-" else f"{statistic}{error_name(plant)} {text}"
 
 
+def objective(name: str, value: float, plant: str) -> str:
+    """Return an objective with its name, a window error as a pointing angle.
+
+    >>> objective("RMS window error", 1e-6, "spacecraft"), objective("t_f", 30.0, "chain")
+    ('RMS pointing error 0.413 arcsec', 't_f 30')
+    """
+    if name.endswith("window error"):
+        return f"{name.removesuffix('window error')}{error_name(plant)} {error(value, plant)}"
+    return f"{name} {value:.4g}"
+
+
 def valued(value: float, metric: str, plant: str) -> str:
     """Return a metric of this kind of plant with its unit.
 

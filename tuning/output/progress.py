@@ -6,7 +6,7 @@ import threading
 import time
 from typing import TYPE_CHECKING, Self
 
-from tuning.output.formats import ratio
+from tuning.output.formats import objective, ratio
 
 if TYPE_CHECKING:
     from ptsmc_jax.campaigns.campaign import Tally
@@ -104,17 +104,24 @@ class Bar:
 class Progress(Bar):
     """The progress of a search or a study with the best objective so far."""
 
-    def __init__(self, quiet: bool, objective: str = ""):
-        super().__init__(quiet, counted=True)
-        self._objective, self._total = objective, 0
+    def __init__(self, quiet: bool, objective: str = "", plant: str = "spacecraft"):
+        """Begin without a step.
 
-    def __call__(self, what: str, done: int, total: int, value: float = float("nan"), over: float = 0.0) -> None:
+        Args:
+            quiet: print nothing.
+            objective: name of the objective.
+            plant: kind of the plant, which decides the unit of a window error.
+        """
+        super().__init__(quiet, counted=True)
+        self._objective, self._plant, self._total = objective, plant, 0
+
+    def __call__(self, what: str, done: int, total: int, value: float = float("nan"), violation: float = 0.0) -> None:
         """Report the current step, the number of steps done and in all, the best objective, and its violation."""
         if total != self._total:
             self._total = total
             self._bar.reset(self._task, total=total or None)
-        limits = "limits met" if over == 0.0 else f"{ratio(100.0 * over)} % beyond a limit"
-        best = f": {self._objective} {value:.4g}, {limits}" if value == value else ""
+        limits = "limits met" if violation == 0.0 else f"{ratio(100.0 * violation)} % beyond a limit"
+        best = f": {objective(self._objective, value, self._plant)}, {limits}" if value == value else ""
         self._bar.update(self._task, completed=done, total=total or None)
         self._lines(what + best, done, total)
 

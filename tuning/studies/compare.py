@@ -178,7 +178,7 @@ def _is(table: Any, law: Mapping[str, str]) -> bool:
     return isinstance(table.code, str) and place(table.code) == place(law["code"])
 
 
-def that_fly(scenario: Scenario, rivals: Rivals = Rivals()) -> dict[str, Scenario]:
+def that_can_be_simulated(scenario: Scenario, rivals: Rivals = Rivals()) -> dict[str, Scenario]:
     """Return the contenders, see `contenders`.
 
     Raises ScenarioError if a law cannot control the scenario. The check comes before the search, which may take hours.
@@ -247,7 +247,7 @@ def compare(
         seed: of the searches. The seed of the held-out trials follows from it.
         tell: called with the progress after every step.
         journal: evaluations of an interrupted comparison, which then resumes.
-        rivals: the scenario with each law, as `that_fly` returns it; None: all built-in laws.
+        rivals: the scenario with each law, as `that_can_be_simulated` returns it; None: all built-in laws.
 
     Returns:
         The results of each law. If the comparison is interrupted, the laws after the interruption are missing.
@@ -256,7 +256,7 @@ def compare(
         ScenarioError: a law cannot control the scenario.
     """
     held_out_seed = judging.seed_of_judge(seed)
-    rivals = that_fly(scenario) if rivals is None else rivals
+    rivals = that_can_be_simulated(scenario) if rivals is None else rivals
     others, refused = judging.beside(scenario)
     found, interrupted = {}, False
     if PAPER in others:
