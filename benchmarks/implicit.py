@@ -21,7 +21,7 @@ IMPLICIT = {"eta": 2.86403, "delta": 0.6, "observer_gain": 1144.06, "k1": 8.1920
 def main() -> None:
     """Print the results on 1 000 held-out trials."""
     flight = scenario.read(SCENARIO)
-    sets = {"paper's gains": gains.papers(flight)}
+    sets = {"paper's gains": gains.published_scenario(flight)}
     for name, found in (("explicit", EXPLICIT), ("implicit", IMPLICIT)):
         sets[f"tuned for {name} sampling"] = gains.in_scenario(flight, found)
     for name, one in sets.items():

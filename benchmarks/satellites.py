@@ -33,7 +33,7 @@ def tuned(name: str, seed: int, trials: int | None, half: str | None, *, globall
         scenario = replace(scenario, **{f"requirements__{half}": limit})
     begun = time.monotonic()
     found = tuner.tune(scenario, seed, globally=globally)
-    errors = found.fresh["tuned"].metrics.window_error[found.fresh["tuned"].finished]
+    errors = found.held_out["tuned"].metrics.window_error[found.held_out["tuned"].finished]
     rms = float((errors**2).mean() ** 0.5) if errors.size else None
     floor = found.floors["tuned"]
     return {

@@ -65,7 +65,7 @@ def compiling() -> None:
     for name, ready in cases.items():
         trials = jnp.arange(512, dtype=jnp.uint32).reshape(2, -1, montecarlo.BLOCK)
         batch = (ready.parts, ready.dispersion, jnp.uint32(0), trials, jnp.int32(2), 2, None, False, OURS)
-        for what, function, args in (("batch", montecarlo._fly, batch), ("one run", rollout.simulate_parts,
+        for what, function, args in (("batch", montecarlo._simulate_rows, batch), ("one run", rollout.simulate_parts,
                                                                          (ready.parts, 0, 0))):  # fmt: skip
             start = time.perf_counter()
             lowered = function.trace(*args).lower()

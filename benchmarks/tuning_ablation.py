@@ -54,7 +54,7 @@ def variants() -> dict[str, Callable]:
         """A search without successive halving: every local search has half of the steps."""
 
         def _successive_halving(self, problem, starts, stages, what, **others):
-            stages = ((len(starts), max(2, self._steps // 2)),) if what == local_searches.SEARCHING else stages
+            stages = ((len(starts), max(2, self._steps // 2)),) if what == "searching" else stages
             return super()._successive_halving(problem, starts, stages, what, **others)
 
     class Evolved(everything):

@@ -73,7 +73,7 @@ def main() -> None:
             started = time.monotonic()
             found = tuner.tune(loaded, seed, trusted=False, tries=1)
             search = found.search
-            training = bool((search.worst <= 1.0).all()) and all(one.held for one in search.counts)
+            training = bool((search.worst <= 1.0).all()) and all(one.confirmed for one in search.counts)
             fresh = all(verdict.met for verdict in found.verdicts)
             runs, said, kept = runs + 1, said + training, kept + (training and fresh)
             counts = "; ".join(f"{v.metric} {v.failures} of {v.trials}" for v in found.verdicts)

@@ -304,7 +304,7 @@ def refused(command, tmp_path, *args):
     return line
 
 
-def small_search(monkeypatch, fresh=40):
+def small_search(monkeypatch, held_out=40):
     """Make searches small: a few points, few trials, and `held_out` held-out trials."""
     from tuning.search import confirm, evolution, local_searches, simulations, starts, worst
 
@@ -312,7 +312,7 @@ def small_search(monkeypatch, fresh=40):
         (simulations, "ROW", 10),
         (worst, "SCREENED", 48),
         (worst, "STEPS", 5),
-        (confirm, "FRESH", fresh),
+        (confirm, "HELD_OUT", held_out),
         (confirm, "FEWEST", 64),
         (starts, "SWEPT", 16),
         (starts, "WIDELY", 64),

@@ -116,10 +116,10 @@ def test_a_cache_that_other_users_can_write_is_not_used(tmp_path, mode):
     folder.mkdir()
     folder.chmod(mode)
     if mode == 0o700:
-        assert setup._clipped(folder) == folder
+        assert setup._usable(folder) == folder
     else:
         with pytest.warns(RuntimeWarning, match="is not used: it must be a folder that belongs to you"):
-            assert setup._clipped(folder) is None
+            assert setup._usable(folder) is None
 
 
 @pytest.mark.parametrize("case", ["of somebody else", "a link", "a file", "closed"])
@@ -139,11 +139,11 @@ def test_a_cache_folder_of_another_user_is_not_used(tmp_path, monkeypatch, case)
 
         monkeypatch.setattr(setup.Path, "mkdir", refused)
     with pytest.warns(RuntimeWarning, match="is not used"):
-        assert setup._clipped(folder) is None
+        assert setup._usable(folder) is None
 
 
 def test_a_new_cache_is_closed_to_others(tmp_path):
-    assert setup._clipped(tmp_path / "a" / "cache") == tmp_path / "a" / "cache"
+    assert setup._usable(tmp_path / "a" / "cache") == tmp_path / "a" / "cache"
     assert (tmp_path / "a" / "cache").stat().st_mode & 0o777 == 0o700
 
 
@@ -152,7 +152,7 @@ def test_a_read_only_cache_causes_one_warning(tmp_path, monkeypatch):
     monkeypatch.setattr(setup.os, "access", lambda *_: False)
     with warnings.catch_warnings(record=True) as shown:
         warnings.simplefilter("default")
-        assert setup._clipped(tmp_path) == tmp_path
+        assert setup._usable(tmp_path) == tmp_path
         for k in range(3):
             warnings.warn(f"Error writing persistent compilation cache entry for 'jit_{k}': why", stacklevel=1)
         warnings.warn("something else", stacklevel=1)

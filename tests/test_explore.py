@@ -137,7 +137,7 @@ def test_figures_by_name(flight):
 def test_trials_returns_the_rows_of_the_campaign(flight):
     rows = ptsmc_jax.trials(flight.scenario, 70, seed=3)
     made = campaign.Campaign(scenario.study(flight.scenario), 3)
-    assert rows.equals(made.measure(range(70)))
+    assert rows.equals(made.simulate(range(70)))
     assert rows["window_error"][7] == pytest.approx(flight.metrics["window_error"], rel=1e-12)
     (verdict,) = ptsmc_jax.verdicts(flight.scenario, rows)
     assert verdict.met

@@ -133,9 +133,9 @@ def test_tune_command_writes_results_and_repeats_them(command, tmp_path, monkeyp
 def test_compare_command_writes_its_results(command, tmp_path, monkeypatch, others):
     small_search(monkeypatch)
     monkeypatch.setattr(compare, "laws", lambda: [compare.OURS, *others])  # every further law compiles more programs
-    untold = compare.UNTOLD if others else ("heavier", "lighter")  # "later" compiles another program too
+    model_errors = compare.MODEL_ERRORS if others else ("heavier", "lighter")  # "later" compiles another program too
     perturbed = compare.perturbed
-    monkeypatch.setattr(compare, "perturbed", lambda flown: {name: perturbed(flown)[name] for name in untold})
+    monkeypatch.setattr(compare, "perturbed", lambda flown: {name: perturbed(flown)[name] for name in model_errors})
     code, said, _ = command("compare", "s.toml")
     folder = tmp_path / "out/compare-s"
     found = json.loads((folder / "summary.json").read_text())
@@ -144,8 +144,8 @@ def test_compare_command_writes_its_results(command, tmp_path, monkeypatch, othe
     assert found["judged_on"] == "flight clock"  # without the sign function of one law
     assert code == (0 if found["laws"]["prescribed_time"]["met"] else 1)
     for said_of in found["laws"].values():  # another inertia changes the error slightly
-        assert tuple(said_of["untold"]) == untold
-        for other in said_of["untold"].values():
+        assert tuple(said_of["model_errors"]) == model_errors
+        for other in said_of["model_errors"].values():
             assert other["window_error"] != said_of["window_error"]
     assert {path.name for path in (folder / "figures").iterdir()} == {"settling.png", "tradeoff.png"}
     rows = list(csv.DictReader((folder / "compare.csv").read_text().splitlines()))
@@ -374,9 +374,9 @@ def test_killed_search_resumes(tmp_path):
     (tmp_path / "s.toml").write_text(SHORT)
     code = (
         "import sys; from tuning.cli import main; "
-        "from tuning.search import confirm, descents, evolution, starts, worst; "
-        "starts.SWEPT = 16; descents.MANY = 16; evolution.GENERATIONS = 3; "
-        "worst.SCREENED = 48; confirm.FRESH = 40; main.main()"
+        "from tuning.search import confirm, evolution, local_searches, starts, worst; "
+        "starts.SWEPT = 16; local_searches.MANY = 16; evolution.GENERATIONS = 3; "
+        "worst.SCREENED = 48; confirm.HELD_OUT = 40; main.main()"
     )
     run = [sys.executable, "-c", code, "tune", "s.toml", "--out", "t", "--quiet", "--no-figures"]
     journal = tmp_path / "t" / "journal.bin"
