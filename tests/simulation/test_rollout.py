@@ -10,7 +10,8 @@ from ptsmc_jax.campaigns import runs
 from ptsmc_jax.devices.actuators import Actuators
 from ptsmc_jax.laws.baselines import PD
 from ptsmc_jax.laws.kinematics import MultiplicativeKinematics
-from ptsmc_jax.plants import rigid_body, second_order
+from ptsmc_jax.observers import nonlinear
+from ptsmc_jax.plants import integrator_chain, rigid_body, second_order
 from ptsmc_jax.signals import disturbances, references
 from ptsmc_jax.simulation import clock, control_period, rollout, sampled
 from ptsmc_jax.simulation.gains import with_gains
@@ -168,12 +169,12 @@ def test_motion_under_held_torque_matches_an_adaptive_integrator():
 @pytest.mark.parametrize("kind", ["anchored", "flight"])
 def test_the_last_row_has_the_estimate_and_s_of_a_sample_at_t_end(kind):
     """It equals the row at this time in a longer run, which has a sample there. The torque is still the held one."""
-    noise = {"attitude_noise": 1e-5, "rate_noise": 1e-6}
+    chain = {"plant": {"kind": "chain", "order": 2}, "observer": {"kind": "nonlinear"},
+             "controller": {"t_f": 3.0, "delta": 1.0}, "hardware": {"state_noise": [1e-5, 1e-6]}}  # fmt: skip
     loop = {"mode": "sampled", "period": 0.25, "window": 1.0, "clock": kind}
 
     def history(t_end):
-        tables = {"controller": {"t_f": 3.0, "delta": 1.0}, "loop": {**loop, "t_end": t_end}, "hardware": noise}
-        return runs.simulate(scenario.study(scenario.from_tables(tables))).log
+        return runs.simulate(scenario.study(scenario.from_tables({**chain, "loop": {**loop, "t_end": t_end}}))).log
 
     log, longer = history(4.5), history(5.0)
     end = log.t.size - 1
@@ -300,10 +301,11 @@ def test_other_numbers_use_the_same_compiled_program(monkeypatch):
 
 
 def test_a_run_is_its_control_periods_one_after_the_other():
-    run = parts(5.0, 3.0, 0.5, period=0.5, noise=(2e-5, 1e-6), t_end=6.0)
+    observer = nonlinear.NonlinearObserver(integrator_chain.chain(2), vector([10.0]), vector(1e-3), vector(0.0))
+    run = chain_parts([1.0, 0.2], delta=0.5, period=0.5, noise=[2e-5, 1e-6], observer=observer)
     log = fly(run, 1, 2).log
     ticks = run.clock.ticks(run.controller.t_f, run.controller.delta)
-    start = jax.tree.map(lambda rows: rows[0], log.x)
+    start = jnp.asarray(log.x[0])
     vehicle, state = control_period.start(run, ticks, start, np.uint32(1), np.uint32(2))
 
     @jax.jit
@@ -317,7 +319,7 @@ def test_a_run_is_its_control_periods_one_after_the_other():
             times = np.where(log.has_length, log.t, np.inf)
             row = int(np.argmin(np.abs(times - ticks.t[k])))
             np.testing.assert_allclose(command, log.commanded[row], rtol=1e-9)
-    np.testing.assert_allclose(state.x.q, log.x.q[-1], rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(state.x, log.x[-1], rtol=1e-10, atol=1e-12)
 
 
 @pytest.mark.long
