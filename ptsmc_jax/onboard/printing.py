@@ -299,6 +299,9 @@ class Printer:
             return f"whole{_suffix(node.kind)}({self.text(node.args[0])})", ATOM
         if node.op == "convert":
             return f"({declared(node.kind)}){self._at_least(node.args[0], UNARY + 1)}", UNARY
+        if node.op == "row":  # of a parameter; its first index is 0
+            table, index = node.args
+            return table.value.replace("[0]", f"[{self.text(index)}]", 1), ATOM
         if node.op == "entry":
             return f"{self._name(node.args[0])}[{self.text(node.args[1])}]", ATOM
         listed = ", ".join(self.text(arg) for arg in node.args)

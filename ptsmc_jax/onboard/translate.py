@@ -216,6 +216,9 @@ class Translator:
         if not open_places:
             return [self._at(eqn, values, arrays, None, 0)]
         chosen, bound = open_places[0], max(values[0].shape)
+        row = self._row(eqn, values, arrays, chosen)
+        if row is not None:
+            return [row]
         least = 0 if chosen.kind.startswith("u") else -1
         index = self._at(eqn, values, arrays, chosen, bound)  # for all indices beyond the end; -1: below 0
         for k in range(bound - 1, least - 1, -1):
@@ -227,6 +230,25 @@ class Translator:
                 case.shape,
             )
         return [index]
+
+    def _row(
+        self, eqn: Any, values: Sequence[np.ndarray], arrays: Sequence[np.ndarray], chosen: Node
+    ) -> np.ndarray | None:
+        """Return a row of a table of parameters at a computed index as C's table[index], or None if it is no such row.
+
+        A choice among all indices would have an operation for each entry of the table.
+        """
+        table, count = values[0], len(values[0])
+        if eqn.primitive.name != "dynamic_slice" or count < 2 or table.flat[0].op != "place":
+            return None
+        cases = [self._at(eqn, values, arrays, chosen, k) for k in (0, 1, count - 1)]
+        for first, *others in zip(*(case.flat for case in cases), strict=True):
+            expected = (first.value.replace("[0]", f"[{k}]", 1) for k in (1, count - 1)) if first.op == "place" else ()
+            if [node.value for node in others] != [*expected]:
+                return None
+        low, high = (self.pool.constant(k, chosen.kind) for k in (0, count - 1))
+        index = self.pool.make("min", self.pool.make("max", chosen, low, kind=chosen.kind), high, kind=chosen.kind)
+        return self._each(lambda node: self.pool.make("row", node, index, kind=node.kind), cases[:1], cases[0].shape)
 
     def _at(
         self, eqn: Any, values: Sequence[np.ndarray], arrays: Sequence[np.ndarray], chosen: Node | None, k: int
