@@ -23,12 +23,13 @@ PLANTS = {"spacecraft": "A spacecraft", "chain": "An integrator chain", "system"
 SCENARIOS = """\
 A scenario is a TOML file of tables. Every table and every key is optional, and has a default. Defaults with * are
 those of the paper's case. For any other body or t_f they [follow the mission](theory/default_gains.md), and gains are
-designed for the sampled loop. `flexible`, `hardware`, `sensors`, `wheels`, `filter`, `pointing`, `dispersion`,
-`requirements` and `tune` are off if they are absent. A key that is unknown, has the wrong type, is out of range or is
-not finite is refused with its name. `ptsmc new` writes a file with all of this.
+designed for the sampled loop. `orbit`, `flexible`, `hardware`, `sensors`, `wheels`, `filter`, `pointing`,
+`dispersion`, `requirements` and `tune` are off if they are absent. A key that is unknown, has the wrong type, is out of
+range or is not finite is refused with its name. `ptsmc new` writes a file with all of this.
 
-Numbers are in the unit of their key. Numbers in rad, rad/s, N m, N m s, s or the unit of a noise may have another
-unit: `"10 arcsec"`, `"2 deg/h"`, `"0.02 deg/sqrt(h)"`, `"5 mN m"`, `"50 ms"`. In a list each number may have its own.
+Numbers are in the unit of their key. Numbers in rad, rad/s, N m, N m s, s, m or the unit of a noise may have another
+unit: `"10 arcsec"`, `"2 deg/h"`, `"0.02 deg/sqrt(h)"`, `"5 mN m"`, `"50 ms"`, `"6878 km"`. In a list
+each number may have its own.
 
 A table with a `kind` has the keys of that kind. Commands that simulate write the complete scenario as `scenario.toml`
 beside their results. Conditions on several keys, such as `delta` of at least one control period, are reported if a

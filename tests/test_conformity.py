@@ -5,6 +5,7 @@ row, and another new part joins a row.
 """
 
 import contextlib
+import itertools
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -21,12 +22,13 @@ from ptsmc_jax.dispersions import variation
 from ptsmc_jax.laws.kinematics import ChainKinematics
 from ptsmc_jax.plants import integrator_chain, rigid_body
 from ptsmc_jax.scenario.disturbance_tables import DISTURBANCES
-from ptsmc_jax.scenario.law_tables import LAWS
+from ptsmc_jax.scenario.law_tables import BASELINES, LAWS
 from ptsmc_jax.scenario.observer_tables import OBSERVERS
 from ptsmc_jax.scenario.reference_tables import REFERENCES
 from ptsmc_jax.signals import references
 from ptsmc_jax.simulation import rollout
 from tests.helpers import FULL_INERTIA, ROOT, short
+from tests.onboard.flights import MOVING
 from tuning.search.gains import with_gains
 
 SEED, NUMBERS = np.uint32(3), np.arange(4, dtype=np.uint32)
@@ -37,6 +39,7 @@ SHORT = {"t_end": 7.5, "window": 1.0}
 SAMPLED = {"mode": "sampled", "period": 0.25, **SHORT}
 SPREAD = {"attitude": {"kind": "axis_angle", "min_deg": 5.0, "max_deg": 60.0}}
 NOISE = {"attitude_noise": 2e-4, "rate_noise": 1e-5}
+SPIN = {"reference": {"kind": "spin", "rate": [0.01, -0.02, 0.03]}}
 
 QUICK = {  # gains that reach the target in such a short run; other laws have their defaults
     "pd": {"k_p": 2.0, "k_d": 2.5},
@@ -127,13 +130,12 @@ ROWS: dict[str, dict] = {
         f"baseline {kind}": {
             "spacecraft": {"inertia": FULL_INERTIA},
             "controller": {"kind": kind, "t_f": 6.0, **QUICK.get(kind, {})},
-            "reference": {"kind": "spin", "rate": [0.01, -0.02, 0.03]},
-            "loop": SAMPLED,
             "hardware": NOISE,
             "dispersion": SPREAD,
+            **moving,
+            "loop": {**SAMPLED, **moving.get("loop", {})},
         }
-        for kind, law in LAWS["spacecraft"].items()
-        if kind != "custom" and not law.made.prescribed
+        for kind, moving in zip(BASELINES, itertools.cycle((SPIN, *MOVING.values())), strict=False)
     },
     "system": {
         "plant": {"kind": "system", "system": ARM, "x0": [0.4, -0.3, 0.0, 0.0]},

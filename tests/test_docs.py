@@ -21,6 +21,7 @@ from ptsmc_jax import scenario
 from ptsmc_jax.scenario import from_tables, layouts
 from ptsmc_jax.simulation import catalogues
 from tests.helpers import SHORT
+from tests.onboard.flights import PROFILE
 from tests.tree import ROOT, modules
 from tuning.cli.main import app
 
@@ -105,6 +106,8 @@ def test_scenarios_in_the_text_are_valid(path, tmp_path, monkeypatch):
         table = tomllib.loads(block)
         if "system" in table.get("plant", {}):
             table["plant"]["system"] = f"{tmp_path}/{table['plant']['system']}"
+        if "file" in table.get("reference", {}):
+            table["reference"]["file"] = PROFILE
         from_tables(table)
 
 
@@ -114,7 +117,7 @@ def test_names_in_the_text_exist(path):
     text = FENCE.sub("", path.read_text())
     for place, name in re.findall(r"`((?:[a-z_\d]+\.)+)([A-Za-z_]\w*)(?:\([^`]*\))?`", text):
         meant = [module for module in modules() if f".{module}.".endswith(f".{place}")]
-        if meant and name not in "csv html ipynb json md png py toml".split():
+        if meant and name not in "aem csv html ipynb json md png py toml".split():
             assert any(hasattr(importlib.import_module(module), name) for module in meant), place + name
     for file in re.findall(r"`((?:tests|docs|scenarios|benchmarks|notebooks)/[a-z\d_./]+)`", text):
         assert (ROOT / file).exists(), file

@@ -14,10 +14,10 @@ import jax
 import numpy as np
 import polars as pl
 
-from ptsmc_jax.campaigns import csv_tables
 from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.dispersions.quantities import QUANTITIES, UnfitError
 from ptsmc_jax.dispersions.table_rows import OF_ROWS, SEED, TRIAL, Row
+from ptsmc_jax.numerics import csv_tables
 from ptsmc_jax.scenario import parsing
 from ptsmc_jax.simulation import computer
 from ptsmc_jax.simulation.catalogues import CATALOGUE

@@ -62,7 +62,7 @@ def disturbance(scenario: Scenario, plant: Plant) -> tuple[Any, Any]:
     signal, walk = [], None
     inertia = getattr(plant, "inertia", None)
     for table in scenario.terms:
-        acting, step = table.build(inertia), table.walk(scenario.loop.period)
+        acting, step = table.build(inertia, scenario), table.walk(scenario.loop.period)
         signal += [] if acting is None else [acting]
         if step is not None:
             walk = step if walk is None else jnp.sqrt(walk**2 + step**2)  # variances of independent walks add up

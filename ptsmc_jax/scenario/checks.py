@@ -6,7 +6,7 @@
 import math
 from typing import Any
 
-from ptsmc_jax.scenario import custom, errors, tables
+from ptsmc_jax.scenario import custom, epochs, errors, tables
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.scenario.values import MOST_STEPS
@@ -105,6 +105,8 @@ def check_sensors(scenario: Scenario) -> None:
 def _check_loop(scenario: Scenario) -> None:
     controller, loop = scenario.controller, scenario.loop
     t_f, delta, window = controller.t_f, scenario.hand_over, scenario.window
+    if loop.epoch is not None:
+        epochs.of_key(loop.epoch)
     if not controller.law.prescribed:
         scenario.need_samples(f"controller.kind = {errors.show(controller.kind)}")
     controller.check(scenario)

@@ -23,6 +23,7 @@ from ptsmc_jax.scenario.values import Meaning, Table
 from ptsmc_jax.simulation.gains import is_reserved
 
 KEYS = ("system", "truth", "code")  # keys that name code, in any table
+DATA = "reference.file"  # key that names a data file
 CONTROLLER = "--controller"  # option that names the exported C code, unlike the key `controller.code`
 DECLARED = "delta"  # field of the base class that a custom law may declare again, as a gain
 Code = Annotated[Any, Meta(description=systems.WHERE), Meaning('the class, "FILE.py:NAME" or "package.module:NAME"')]
@@ -120,7 +121,20 @@ def digest_name(key: str) -> str:
 def digests(scenario: Table) -> dict[str, str]:
     """Return the current SHA-256 checksums of the files that a scenario names, by their names in `versions.json`."""
     found = {digest_name(key): systems.digest(where) for key, where in programs(scenario).items()}
+    found |= {digest_name(key): systems.sha256(file) for key, file in data_files(scenario).items()}
     return {name: digest for name, digest in found.items() if digest is not None}
+
+
+def data_tables(raw: Mapping[str, Any]) -> list[dict]:
+    """Return the tables of a parsed file that name a data file."""
+    table = raw.get("reference")
+    return [table] if isinstance(table, dict) and isinstance(table.get("file"), str) else []
+
+
+def data_files(scenario: Table) -> dict[str, str]:
+    """Return the paths of the data files that a scenario names, by key."""
+    file = getattr(getattr(scenario, "reference", None), "file", None)
+    return {} if file is None else {DATA: file}
 
 
 def waits(scenario: Table) -> bool:

@@ -103,7 +103,7 @@ def turning(scenario: Any) -> float:
     It is the sum of the initial rate, the rate of the reference, and 2 pi / t_f, which is twice the mean rate of half a
     turn within t_f.
     """
-    target = sum(scenario.reference.frequencies().values())
+    target = sum(scenario.reference.frequencies(scenario).values())
     return scenario.turning + target + 2.0 * math.pi / scenario.controller.t_f
 
 
@@ -112,24 +112,30 @@ def target_waits(scenario: Any) -> bool:
     return getattr(getattr(scenario, "reference", None), "waits", False)
 
 
-def gravity_gradient(scenario: Any, orbit_rate: float) -> Bounds:
+def gravity_gradient(scenario: Any, orbit_rate: float, eccentricity: float = 0.0) -> Bounds:
     """Return bounds of the gravity-gradient torque 3 n^2 c x J c, where c is the unit vector to the central body.
 
     They follow from |c x J c| <= (J_3 - J_1) / 2 and |(c x J c)'| <= (J_3 - J_1) |c'|. J_1 and J_3 are the smallest and
     the largest principal moment of the true body. If the inertia is dispersed, J_1 is decreased and J_3 increased by
     three sigma. c moves in body axes with the rates of the orbit and of the body.
 
+    On an eccentric orbit the torque is largest at perigee, where 3 n^2 becomes 3 n^2 / (1 - e)^3. The relative rate of
+    the distance is at most e times the angular rate of the radius vector at perigee.
+
     Args:
         scenario: a scenario of a spacecraft whose reference is known.
         orbit_rate: n [rad/s].
+        eccentricity: e of the orbit [-].
     """
     inertia = np.asarray(scenario.true_inertia, dtype=float)
     moments = np.sort(inertia) if inertia.ndim == 1 else np.linalg.eigvalsh(inertia)
     drawn = getattr(scenario.dispersion, "inertia", None)
     off = 0.0 if drawn is None else SIGMAS * drawn.std
     apart = moments[2] * (1.0 + off) - moments[0] * (1.0 - off)
-    most = 3.0 * orbit_rate * orbit_rate * apart
-    return Bounds(np.full(3, 0.5 * most), np.full(3, most * (orbit_rate + turning(scenario))))
+    e = eccentricity
+    most = 3.0 * orbit_rate * orbit_rate * apart / (1.0 - e) ** 3
+    perigee_rate = orbit_rate * math.sqrt(1.0 + e) / (1.0 - e) ** 1.5
+    return Bounds(np.full(3, 0.5 * most), np.full(3, most * ((1.0 + 1.5 * e) * perigee_rate + turning(scenario))))
 
 
 def along_the_run(scenario: Any, signal: Any, fastest: float = 0.0) -> Bounds:
@@ -192,7 +198,7 @@ def _attitudes(scenario: Any, t: np.ndarray, left: np.ndarray) -> Any:
     """
     from ptsmc_jax.batching import lapack
 
-    reference = scenario.reference.build()
+    reference = scenario.reference.build(scenario)
     target = lapack.vmap(lambda time: reference(time).q)(jnp.asarray(t))
     start = jnp.asarray(attitude_keys.quaternion(scenario.initial, "initial"))
     off = attitude.multiply(attitude.conjugate(target[0]), start)

@@ -7,6 +7,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
+import jax
 import msgspec
 import numpy as np
 from msgspec import Meta
@@ -17,10 +18,12 @@ from ptsmc_jax.scenario import attitude_keys, disturbance_bounds
 from ptsmc_jax.scenario.attitude_keys import Attitude
 from ptsmc_jax.scenario.custom import Custom, custom_kind, fastest
 from ptsmc_jax.scenario.disturbance_bounds import Bounds
-from ptsmc_jax.scenario.errors import ScenarioError, brief
+from ptsmc_jax.scenario.errors import ScenarioError, brief, wrong
 from ptsmc_jax.scenario.schema import PartTable, table
 from ptsmc_jax.scenario.values import Meaning, Table
 from ptsmc_jax.signals import disturbances
+
+CIRCULAR_RATE = 1.1e-3  # mean motion of an orbit of 550 km [rad/s]
 
 
 class DisturbanceTable(PartTable, frozen=True):
@@ -53,15 +56,15 @@ class DisturbanceTable(PartTable, frozen=True):
         if self.made is None or disturbance_bounds.target_waits(scenario):
             return None
         if isinstance(self, Custom):
-            return disturbance_bounds.along_the_run(scenario, self.build(None), self.quickest())
+            return disturbance_bounds.along_the_run(scenario, self.build(None, scenario), self.quickest())
         known: Any = self
         largest = np.abs(known.amplitude) * disturbance_bounds.drawn_factor(scenario)
         return Bounds(*self.made.bounds(msgspec.structs.replace(known, amplitude=largest)))
 
-    def check(self, name: str) -> None:
+    def check(self, name: str, scenario: Any) -> None:
         """Raise ScenarioError if keys contradict each other; name: of the table, for errors."""
 
-    def build(self, inertia: Any) -> Any:
+    def build(self, inertia: Any, scenario: Any) -> Any:
         """Return the part of `signals.disturbances`, None if nothing acts.
 
         `inertia` is the inertia of the true body (3, 3) [kg m^2], None for a plant without a body. ScenarioError is
@@ -95,16 +98,29 @@ class NoDisturbance(DisturbanceTable, frozen=True):
         """Return zeros."""
         return Bounds(np.zeros(scenario.inputs), np.zeros(scenario.inputs))
 
-    def build(self, inertia: Any) -> Any:
+    def build(self, inertia: Any, scenario: Any) -> Any:
         """Return None."""
 
 
 class GravityTable(Attitude, DisturbanceTable, frozen=True):
-    """The gravity gradient of a circular orbit."""
+    """The gravity gradient of the orbit of [orbit], or of a circular orbit."""
 
-    def check(self, name: str) -> None:
-        """Raise ScenarioError for two attitudes or an invalid attitude."""
+    @property
+    def rate(self) -> float:
+        """Mean motion of the circular orbit without [orbit] [rad/s]."""
+        stated: float | None = self.orbit_rate  # pyright: ignore[reportAttributeAccessIssue]
+        return CIRCULAR_RATE if stated is None else stated
+
+    def check(self, name: str, scenario: Any) -> None:
+        """Raise ScenarioError for two attitudes, an invalid attitude, and a second orbit beside [orbit]."""
         attitude_keys.at_most_one(name, self)
+        if scenario.orbit is not None:
+            known: Any = self
+            stated = {key: getattr(self, key) for key in (*attitude_keys.ATTITUDE_KEYS, "orbit_rate")}
+            stated |= {"phase": known.phase or None}
+            for key, value in stated.items():
+                if value is not None:
+                    raise wrong(f"{name}.{key}", value, "absent: [orbit] determines the gravity gradient")
         if attitude_keys.has_attitude(self):
             attitude_keys.quaternion(self, name)
         elif self.sequence is not None:
@@ -122,13 +138,22 @@ class GravityTable(Attitude, DisturbanceTable, frozen=True):
         """Return the bounds of `disturbance_bounds.gravity_gradient`."""
         if disturbance_bounds.target_waits(scenario):
             return None
-        return disturbance_bounds.gravity_gradient(scenario, self.orbit_rate)  # pyright: ignore[reportAttributeAccessIssue]
+        if scenario.orbit is None:
+            return disturbance_bounds.gravity_gradient(scenario, self.rate)
+        orbit = scenario.orbit.build(scenario.loop.epoch)
+        return disturbance_bounds.gravity_gradient(scenario, float(orbit.rate()), float(orbit.eccentricity))
 
-    def build(self, inertia: Any) -> Any:
-        """Return the gravity gradient. The orbit frame is the inertial frame if no attitude is given."""
+    def build(self, inertia: Any, scenario: Any) -> Any:
+        """Return the gravity gradient.
+
+        Without [orbit], the frame of the circular orbit is the inertial frame if no attitude is given.
+        """
+        if scenario.orbit is not None:
+            orbit = jax.tree.map(vector, scenario.orbit.build(scenario.loop.epoch))
+            return disturbances.KeplerGravityGradient(inertia, orbit)
         turned = attitude_keys.has_attitude(self)
         orbit = attitude_keys.quaternion(self, "disturbance") if turned else np.array([0.0, 0.0, 0.0, 1.0])
-        return self.part(inertia=inertia, orbit=vector(orbit))
+        return self.part(inertia=inertia, orbit=vector(orbit), orbit_rate=vector(self.rate))
 
 
 class RandomWalkTable(DisturbanceTable, frozen=True):
@@ -142,7 +167,7 @@ class RandomWalkTable(DisturbanceTable, frozen=True):
         wandered = disturbance_bounds.SIGMAS * density * np.sqrt(scenario.loop.t_end)
         return Bounds(wandered, disturbance_bounds.walk_rate(scenario, density))
 
-    def build(self, inertia: Any) -> Any:
+    def build(self, inertia: Any, scenario: Any) -> Any:
         """Return None: the rollout adds the steps of the walk."""
 
     def walk(self, period: float) -> Any:

@@ -20,6 +20,7 @@ SCENARIOS: dict[str, type[Scenario]] = {
 }
 TABLES: dict[str, Mapping[str, type[Table] | Kinds]] = {kind: made.TABLES for kind, made in SCENARIOS.items()}
 OPTIONAL = (
+    "orbit",
     "flexible",
     "hardware",
     "sensors",

@@ -17,7 +17,7 @@ import msgspec
 
 from ptsmc_jax.scenario import attitude_keys, custom, device_tables, disturbance_tables, keys, layouts, systems
 from ptsmc_jax.scenario import sensor_tables as sensing
-from ptsmc_jax.scenario.attitude_keys import ATTITUDE_KEYS
+from ptsmc_jax.scenario.attitude_keys import ATTITUDE_KEYS, Attitude
 from ptsmc_jax.scenario.errors import MOST_BITS, ScenarioError, brief, show, wrong
 from ptsmc_jax.scenario.layouts import SCENARIOS, TABLES
 from ptsmc_jax.scenario.tables import Limit, Scenario
@@ -66,6 +66,8 @@ def load(path: str | Path) -> dict[str, Any]:
     except OSError as error:
         raise ScenarioError(f"the scenario file {path} cannot be read: {error.strerror}") from None
     raw = toml(text, f"the scenario file {path}")
+    for table in custom.data_tables(raw):
+        table["file"] = os.path.realpath(Path(path).parent / table["file"])
     for table, key in custom.named(raw):
         file, _, name = table[key].rpartition(":")
         if file.endswith(".py") and not os.path.isabs(file) and file.isprintable():
@@ -101,12 +103,12 @@ def parse(raw: Mapping[str, Any], *, run: bool = False) -> Scenario:
     law = raw.get("controller", {}).get("kind", next(iter(typing.cast(Kinds, layout["controller"]))))
     fallback = kind_of_scenario.fallback(plant, raw.get("plant", {}).keys(), law)
     tables: dict[str, Any] = {
-        name: _table(name, _with_defaults(raw.get(name, {}), fallback.get(name, {})), kinds, context)
+        name: _table(name, _with_defaults(raw.get(name, {}), fallback.get(name, {}), kinds), kinds, context)
         for name, kinds in layout.items()
         if name in raw or name not in layouts.OPTIONAL
     }
     for name in ("initial", "reference"):
-        if name in tables:
+        if isinstance(tables.get(name), Attitude):
             attitude_keys.at_most_one(name, tables[name])
     if isinstance(suite, list | tuple):
         tables["sensors"] = _suite(suite, context)
@@ -158,9 +160,13 @@ def _unknown(name: str, value: Any, kind: str) -> ScenarioError:
     return ScenarioError(f"{name} = {brief(value)} stands outside a table; the nearest known key is {place}")
 
 
-def _with_defaults(given: Mapping[str, Any], fallback: Mapping[str, Any]) -> Mapping[str, Any]:
+def _with_defaults(
+    given: Mapping[str, Any], fallback: Mapping[str, Any], kinds: type[Table] | Kinds
+) -> Mapping[str, Any]:
     """Return a table with absent keys filled in. An attitude that is given replaces the default attitude."""
-    if any(key in given for key in ATTITUDE_KEYS):
+    struct = kinds.get(given.get("kind", next(iter(kinds)))) if isinstance(kinds, Mapping) else kinds
+    has_attitude = struct is not None and issubclass(struct, Attitude)
+    if any(key in given for key in ATTITUDE_KEYS) or not has_attitude:
         fallback = {key: value for key, value in fallback.items() if key not in ATTITUDE_KEYS}
     return {**fallback, **given}
 

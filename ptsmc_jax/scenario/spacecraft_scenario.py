@@ -20,6 +20,7 @@ from ptsmc_jax.scenario.disturbance_tables import DISTURBANCES
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.law_tables import LAWS
 from ptsmc_jax.scenario.observer_tables import OBSERVERS
+from ptsmc_jax.scenario.orbit_table import ORBITS, OrbitTable
 from ptsmc_jax.scenario.pointing_table import Pointing
 from ptsmc_jax.scenario.reference_tables import REFERENCES, Initial
 from ptsmc_jax.scenario.sensor_tables import KalmanFilter, SensorSuite
@@ -145,6 +146,7 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
     spacecraft: Spacecraft
     initial: Initial
     reference: Any  # `reference_tables.ReferenceTable`
+    orbit: OrbitTable | None = None
     flexible: Flexible | None = None
     wheels: WheelLimits | None = None
     filter: FilterTable | None = None
@@ -155,6 +157,7 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
         "spacecraft": Spacecraft,
         "flexible": Flexible,
         "initial": Initial,
+        "orbit": ORBITS,
         "reference": REFERENCES,
         "disturbance": DISTURBANCES["spacecraft"],
         "controller": LAWS["spacecraft"],
@@ -245,10 +248,8 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
 
     def start_angle(self) -> float:
         """Return the largest angle to the reference at t = 0 [rad], dispersions included."""
-        start, target = (
-            np.asarray(attitude_keys.quaternion(table, name), dtype=float)
-            for table, name in ((self.initial, "initial"), (self.reference, "reference"))
-        )
+        start = np.asarray(attitude_keys.quaternion(self.initial, "initial"), dtype=float)
+        target = np.asarray(self.reference.first(self), dtype=float)
         target = target * np.copysign(1.0, start @ target)  # both signs are the same attitude
         angle = 4.0 * float(np.arctan2(np.linalg.norm(start - target), np.linalg.norm(start + target)))
         for table in (getattr(self.dispersion, "attitude", None), getattr(self.dispersion, "reference", None)):
@@ -302,13 +303,16 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
         settled = self.loop.settling_angle
         if settled >= math.pi:  # probably degrees; every attitude would count as settled
             raise wrong("loop.settling_angle", settled, 'less than pi [rad], or with its unit, such as "0.5 deg"')
-        self.reference.check()
+        self.reference.check(self)
         for place, term in self.placed_terms.items():
-            term.check(place)
+            term.check(place, self)
         if self.pointing is not None:
             self.pointing.check(self)
         if self.flexible is not None:
             self.flexible.check_drawn(self.true_inertia, self.dispersion)
+
+    def check_until(self, last: float) -> None:
+        self.reference.check_until(self, last, "tune.bounds.t_f")
 
     def observation(self) -> Any:
         """Return the observation of pointing errors, None without [pointing]."""
@@ -332,7 +336,7 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
 
     def target(self) -> Any:
         """Return the reference."""
-        return self.reference.build()
+        return self.reference.build(self)
 
     @property
     def turning(self) -> float:
@@ -353,7 +357,7 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
             setup: the parts without a clock.
             t_f: shortest prescribed time [s].
         """
-        found = {**self._turning, **self.reference.frequencies()}
+        found = {**self._turning, **self.reference.frequencies(self)}
         key, rate = self.controller.turning(t_f)
         if not self.controller.law.prescribed:
             rate = min(rate, 0.5 * BASELINES * 0.025 / self.loop.period)

@@ -142,12 +142,12 @@ def digest(where: object) -> str | None:
         except (Exception, SystemExit):  # `item` reports it
             spec = None
         file = None if spec is None else spec.origin
-    if not file or _sha(file) is None:
+    if not file or sha256(file) is None:
         return None
     first, *others = imported(Path(file), Path(_home(place)))
     if not others:
-        return _sha(str(first))
-    each = sorted((one.name, str(_sha(str(one)))) for one in (first, *others))
+        return sha256(str(first))
+    each = sorted((one.name, str(sha256(str(one)))) for one in (first, *others))
     return hashlib.sha256(repr(each).encode()).hexdigest()
 
 
@@ -209,10 +209,10 @@ def _run(path: Path, content: bytes) -> ModuleType:
     """
     known = os.path.realpath(path), hashlib.sha256(content).hexdigest()
     ran = _ran.get(known)
-    if ran is not None and all(_sha(file) == sha for file, sha in ran.helpers.items()):
+    if ran is not None and all(sha256(file) == sha for file, sha in ran.helpers.items()):
         return ran.module
     home = _home(str(path))
-    if not all(file.startswith(home + os.sep) and _sha(file) == sha for file, sha in _helpers.values()):
+    if not all(file.startswith(home + os.sep) and sha256(file) == sha for file, sha in _helpers.values()):
         for name in _helpers:  # remove all of them, since they may import each other
             sys.modules.pop(name, None)
         _helpers.clear()
@@ -241,11 +241,11 @@ def _beside(home: str, before: set[str]) -> dict[str, tuple[str, str | None]]:
     for name in set(sys.modules) - before:
         top, file = name.partition(".")[0], os.path.realpath(getattr(sys.modules[name], "__file__", None) or "")
         if top not in OURS and top not in before and file.startswith(os.path.join(home, top)):
-            found[name] = file, _sha(file)
+            found[name] = file, sha256(file)
     return found
 
 
-def _sha(file: str) -> str | None:
+def sha256(file: str) -> str | None:
     """Return the SHA-256 of a file, None if it cannot be read."""
     try:
         return hashlib.sha256(Path(file).read_bytes()).hexdigest()

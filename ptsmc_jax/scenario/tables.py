@@ -11,7 +11,7 @@ import msgspec
 from msgspec import Meta
 
 from ptsmc_jax.declare import Scaled
-from ptsmc_jax.scenario import keys
+from ptsmc_jax.scenario import epochs, keys
 from ptsmc_jax.scenario.device_tables import NoFilter
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.law_tables import LAWS
@@ -54,6 +54,9 @@ class Loop(Table, frozen=True):
             "as on a flight computer"
         ),
     ] = "anchored"
+    epoch: Annotated[
+        Annotated[str, Meta(description=epochs.ALLOWED)] | None, Meaning("calendar time of t = 0, UTC")
+    ] = None
     t_end: Annotated[
         Positive | None,
         Meaning(
@@ -406,6 +409,9 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
 
     def check_plant(self) -> None:
         """Raise ScenarioError if keys that concern the plant contradict each other."""
+
+    def check_until(self, last: float) -> None:
+        """Raise ScenarioError if a search over t_f has runs until `last` [s], for which the reference is not known."""
 
     def model(self) -> Any:
         """Return the design model of law and observer, a part of `plants`."""

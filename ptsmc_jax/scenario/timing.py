@@ -17,7 +17,7 @@ from ptsmc_jax.batching import lapack
 from ptsmc_jax.laws.prescribed_time import PrescribedTime
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.plants.second_order import System
-from ptsmc_jax.scenario.errors import ScenarioError, wrong
+from ptsmc_jax.scenario.errors import ScenarioError, show, wrong
 from ptsmc_jax.scenario.tables import Scenario, check_scenario
 from ptsmc_jax.scenario.values import MOST_STEPS
 from ptsmc_jax.simulation import clock
@@ -105,6 +105,8 @@ def timing(scenario: Scenario, setup: Setup, reach: Reach, saves: object) -> tup
         ScenarioError: the run would need too many steps; the message names the key that causes them.
     """
     loop, frequencies, visited = scenario.loop, _frequencies(scenario, setup, reach), None
+    if reach.t_f > scenario.controller.t_f:
+        scenario.check_until(scenario.end + reach.t_f - scenario.controller.t_f)
     if setup.plant.custom_functions:
         hurried = _with_papers_law(setup.with_t_f(vector(reach.smallest_t_f)))
         visited = solutions.visited(hurried)
@@ -177,6 +179,8 @@ def _lower(scenario: Scenario, key: str, asks: str) -> ScenarioError:
     table, _, name = key.partition(".")
     if name == "code":
         return ScenarioError(f"{key} says that it is too fast: {asks}")
+    if key in ("reference.file", "reference.kind"):
+        return ScenarioError(f"{key} is {show(getattr(scenario.reference, name))}, whose attitude is too fast: {asks}")
     if key == "controller.eta":  # a short t_f is the cause: eta may be at its lower bound already
         eta = f"with controller.eta = {scenario.controller.eta}"
         shorter = ", or loop.period shorter" if scenario.sampled else ""

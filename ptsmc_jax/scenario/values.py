@@ -8,6 +8,7 @@ from msgspec import Meta
 
 from ptsmc_jax.declare import Scaled
 
+Number = Annotated[float, Meta(description="a number")]
 Positive = Annotated[float, Meta(gt=0, description="a number greater than 0")]
 NotNegative = Annotated[float, Meta(ge=0, description="a number, at least 0")]
 Truth = Annotated[bool, Meta(description="true or false")]

@@ -15,6 +15,7 @@ from ptsmc_jax.declare import Scaled, number
 from ptsmc_jax.numerics import attitude
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
 from ptsmc_jax.plants.rigid_body import AttitudeState
+from ptsmc_jax.signals.orbits import Orbit
 
 
 @dataclass(frozen=True)
@@ -128,10 +129,10 @@ class Sinusoid(Disturbance):
 @pytree
 @dataclass(frozen=True)
 class GravityGradient(Disturbance):
-    """The gravity gradient torque on the true body in a circular orbit.
+    """The gravity gradient torque on the true body, on the orbit of [orbit] or else on a circular orbit.
 
-    The frame's z is along the orbit's normal, its x points to where the phase counts from. The torque is 3 n^2 c x J c,
-    c the unit vector to the planet in body axes.
+    The attitude key is that of the circular orbit's frame. The frame's z is along the orbit's normal, its x points to
+    where the phase counts from. The torque is 3 n^2 c x J c, c the unit vector to the planet in body axes.
 
     c depends on the true attitude. Wie, Space Vehicle Dynamics and
     Control (2008), eq. (6.128).
@@ -139,8 +140,10 @@ class GravityGradient(Disturbance):
 
     inertia: Leaf  # (3, 3) of the true body [kg m^2]
     orbit: Leaf  # (4,) quaternion of the orbit's frame: z along its normal, x to where the phase counts from
-    orbit_rate: Leaf = number(1.1e-3, above=0.0, at_most=1.0, unit="rad/s", meaning="mean motion n")
-    phase: Leaf = number(0.0, unit="rad", meaning="angle on the orbit at t = 0")
+    orbit_rate: Leaf = number(
+        None, above=0.0, at_most=1.0, unit="rad/s", meaning="mean motion n; default: 1.1e-3, or of [orbit]"
+    )
+    phase: Leaf = number(0.0, unit="rad", meaning="angle on the orbit at t = 0; 0 with [orbit]")
     drawn: ClassVar[Mapping[str, str]] = {"phase": "phase"}
 
     def __call__(self, t: Scalar, x: AttitudeState) -> Float[Array, "3"]:
@@ -149,6 +152,25 @@ class GravityGradient(Disturbance):
         radial = jnp.stack([cosine, sine, jnp.zeros_like(sine)])
         c = attitude.rotate(attitude.multiply(attitude.conjugate(x.q), self.orbit), radial)
         return 3.0 * self.orbit_rate**2 * attitude.cross(c, self.inertia @ c)
+
+    def on_body(self, inertia: Float[Array, "3 3"]) -> Any:
+        return replace(self, inertia=inertia)
+
+
+@pytree
+@dataclass(frozen=True)
+class KeplerGravityGradient(Disturbance):
+    """The gravity gradient on a Keplerian orbit: 3 mu / r^3 c x J c, c the unit vector to the planet in body axes."""
+
+    inertia: Leaf  # (3, 3) of the true body [kg m^2]
+    orbit: Orbit
+
+    def __call__(self, t: Scalar, x: AttitudeState) -> Float[Array, "3"]:
+        """Torque at t [s] in the state x, (3,) [N m]."""
+        place = self.orbit(t)
+        c = -attitude.rotate(attitude.conjugate(x.q), place.radial)
+        strength = 3.0 * self.orbit.rate() ** 2 * (self.orbit.semi_major_axis / place.radius) ** 3
+        return strength * attitude.cross(c, self.inertia @ c)
 
     def on_body(self, inertia: Float[Array, "3 3"]) -> Any:
         return replace(self, inertia=inertia)

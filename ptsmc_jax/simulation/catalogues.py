@@ -63,6 +63,7 @@ UNITS: dict[str, dict[str, float]] = {
     "N m s": {"N m s": 1.0, "mN m s": 1e-3, "uN m s": 1e-6},
     "N m/s": {"N m/s": 1.0, "mN m/s": 1e-3, "uN m/s": 1e-6},
     "s": {"s": 1.0, "ms": 1e-3, "min": 60.0},
+    "m": {"m": 1.0, "km": 1e3},
     "sqrt(kg) m": {"sqrt(kg) m": 1.0},
 }  # fmt: skip
 CATALOGUES = {"spacecraft": CATALOGUE, "chain": STATE_CATALOGUE, "system": STATE_CATALOGUE}  # by the kind of the plant

@@ -4,8 +4,9 @@ import numpy as np
 import polars as pl
 import pytest
 
-from ptsmc_jax.campaigns import csv_tables, run_tables
+from ptsmc_jax.campaigns import run_tables
 from ptsmc_jax.campaigns.store import RefusedError
+from ptsmc_jax.numerics import csv_tables
 
 PLAIN = "x1,x2\n1.5,-0.25\n1e-3,0.02\n"
 NUMBERS = [[1.5, -0.25], [1e-3, 0.02]]

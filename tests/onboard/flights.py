@@ -25,6 +25,18 @@ def flight(**tables: Any) -> dict[str, Any]:
     return found
 
 
+PROFILE = str(ROOT / "tests" / "attitude_profile.csv")
+ORBIT = {"eccentricity": 0.02, "inclination": 1.7}
+# moving references with the tables that they need, by kind
+MOVING: dict[str, dict[str, Any]] = {
+    "table": {"reference": {"kind": "table", "file": PROFILE}},
+    "nadir": {"reference": {"kind": "nadir"}, "orbit": ORBIT, "disturbance": {"kind": "gravity_gradient"}},
+    "ground_target": {"reference": {"kind": "ground_target", "latitude": 0.1, "longitude": -0.1}, "orbit": ORBIT},
+    "two_vector": {
+        "reference": {"kind": "two_vector", "primary": "sun", "secondary": "nadir"},
+        "orbit": {**ORBIT, "ascending_node": 1.0}, "loop": {"epoch": "2026-06-01T06:00:00"},
+    },
+}  # fmt: skip
 FILTER = {"filter": {"kind": "steady_state"}}
 CHAIN = {"plant": {"kind": "chain", "order": 2, "x0": [1.0, -0.2]}, "loop": LOOP, "controller": LAW,
          "hardware": {"state_noise": [1e-5, 1e-5]},
@@ -71,6 +83,7 @@ FLIGHTS: dict[str, dict[str, Any]] = {
     "slew": flight(controller={"error": "multiplicative"},
                    reference={"kind": "slew", "to_quat_xyzw": [0.0, 0.0, 0.3826834323650898, 0.9238795325112867],
                               "duration": 4.0}),
+    **{kind: flight(controller={"error": "multiplicative"}, **tables) for kind, tables in MOVING.items()},
     **{kind: {**flight(), "controller": {"kind": kind, "t_f": 5.0}} for kind in
        BASELINES},
     # for larger angles the body turns by more than 1 rad in a period, which the C rejects

@@ -309,3 +309,17 @@ def test_constants_of_unsupported_types_raise_an_error(known):
     """The error is one sentence instead of a traceback."""
     with pytest.raises(NoRuleError, match=rf"^{known.dtype} cannot be written in C, which has no number for it here$"):
         body(lambda x: (x * known).real, X)
+
+
+@needs_compiler
+@pytest.mark.parametrize("index", [-3, 0, 4, 6, 11])
+def test_an_entry_at_a_computed_index_is_read_from_the_table_itself(tmp_path, index):
+    table, at = np.linspace(1.0, 4.0, 7), np.array(float(index))
+
+    def entry(table, at):
+        return jax.lax.dynamic_index_in_dim(table, at.astype(jnp.int32), keepdims=False, allow_negative_indices=False)
+
+    found, expected = both(tmp_path, entry, table, at)
+    np.testing.assert_array_equal(found, expected)
+    lines, _ = body(entry, table, at)
+    assert "?" not in "".join(lines)  # no choice among the entries

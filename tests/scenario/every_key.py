@@ -4,6 +4,7 @@ import re
 import tomllib
 
 from ptsmc_jax.scenario.attitude_keys import ATTITUDE_KEYS
+from tests.onboard.flights import PROFILE
 from tuning.cli import new
 
 KEY = re.compile(r"^#?([a-z]\w*) = ")
@@ -77,7 +78,10 @@ def complete(plant):
         )  # default bounds of delta follow the loop's mode
         if name == "sensors":  # custom sensors exclude noise in [hardware]
             around = around | {"hardware": {}}
+        if name == "reference":  # directions need an orbit and an epoch
+            around = around | {"orbit": {}, "loop": {**around["loop"], "epoch": "2026-03-20T12:00:00"}}
         more = {"loop": {"mode": "sampled"}, "tune": {"statistic": "cvar"}}.get(name, {})  # key `level` needs cvar
         for table in map(values, groups):
+            table |= {"file": PROFILE} if "file" in table else {}
             every.append((name, {**around, name: hardware if name == "hardware" else {**table, **more}}))
     return every

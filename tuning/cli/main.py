@@ -58,6 +58,9 @@ def simulate(
         int | None, whole("Simulate this dispersed trial; default: nominal parameters with the noise of trial 0.")
     ] = None,
     controller: flight_commands.ControllerFolder = None,
+    aem: Annotated[
+        bool, Parameter(help="Write attitude.aem too, a CCSDS attitude ephemeris message.", negative="")
+    ] = False,
     common: Common = USUAL,
 ) -> int:
     """Simulate one run and write its history, metrics and figures.
@@ -70,6 +73,8 @@ def simulate(
     from ptsmc_jax.simulation.computer import OURS
     from tuning.studies import single
 
+    if aem and loaded.motion != "spacecraft":
+        raise UsageError("--aem is given, but the plant is no spacecraft and has no attitude")
     loaded = loaded if controller is None else flight_commands.on_flight_clock(loaded)
     ready = study(loaded, drawn=trial is not None)
     computer = None if controller is None else flight_commands.compiled(controller, ready)
@@ -78,7 +83,11 @@ def simulate(
         terminal.say(f"simulating {steps} integration steps with their history")
     with store.in_use(folder, force=common.force):
         run = runs.simulate(ready, seed, trial, OURS if computer is None else computer.software)
-        store.write(folder, lambda making: single.write(making, loaded, run, seed, trial, common.figures, computer))
+
+        def write(making: Path) -> None:
+            single.write(making, loaded, run, seed, trial, common.figures, computer, aem=aem)
+
+        store.write(folder, write)
     if not common.quiet:
         from tuning.output import run_report, summaries
 

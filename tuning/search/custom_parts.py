@@ -37,11 +37,13 @@ def named(scenario: Scenario, metrics: str | None = None, controller: Path | Non
 
 def location(key: str, where: str) -> str:
     """Return the path of the file, or the name of the module, that would be run."""
-    return os.path.realpath(where) if key == CONTROLLER else systems.location(where)
+    return os.path.realpath(where) if key in (CONTROLLER, custom.DATA) else systems.location(where)
 
 
 def digest(key: str, where: str) -> str | None:
-    """Return the present SHA-256 checksum of the code, or None if it is in no file."""
+    """Return the present SHA-256 checksum of the code or the data file, or None if it is in no file."""
+    if key == custom.DATA:
+        return systems.sha256(where)
     return sources.digest(Path(where)) if key == CONTROLLER else systems.digest(where)
 
 
@@ -123,21 +125,26 @@ def _digests(made: Mapping[str, Any], key: str) -> list[str]:
 
 
 def carry(tables: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Copy the Python files of a scenario into a folder, and refer to the copies in its tables.
+    """Copy the Python and data files of a scenario into a folder, and refer to the copies in its tables.
 
     Modules, and files that need other files (see `alone`), are not copied. The tables are changed and returned.
     """
     for table, key in custom.named(tables):
         place, _, name = table[key].rpartition(":")
-        file = Path(place)
-        if not place.endswith(".py") or not alone(file):
-            continue
-        content = file.read_bytes()
-        copies = (folder / (file.name if k == 1 else f"{file.stem}_{k}.py") for k in itertools.count(1))
-        copy = next(one for one in copies if not one.exists() or one.read_bytes() == content)
-        copy.write_bytes(content)
-        table[key] = f"{copy.name}:{name}"
+        if place.endswith(".py") and alone(Path(place)):
+            table[key] = f"{_copied(Path(place), folder).name}:{name}"
+    for table in custom.data_tables(tables):
+        table["file"] = _copied(Path(table["file"]), folder).name
     return tables
+
+
+def _copied(file: Path, folder: Path) -> Path:
+    """Return a copy of a file in a folder, with a number in its name if another file has the name."""
+    content = file.read_bytes()
+    copies = (folder / (file.name if k == 1 else f"{file.stem}_{k}{file.suffix}") for k in itertools.count(1))
+    copy = next(one for one in copies if not one.exists() or one.read_bytes() == content)
+    copy.write_bytes(content)
+    return copy
 
 
 def alone(file: Path) -> bool:

@@ -79,13 +79,18 @@ class Folder:
         return custom_parts.named(self.scenario, self.custom_metrics, self.controller)
 
     @cached_property
+    def files(self) -> dict[str, str]:
+        """The locations of custom code and data files, by scenario key or option."""
+        return self.programs | custom.data_files(self.scenario)
+
+    @cached_property
     def identity(self) -> dict[str, Any]:
         """The entries of `versions.json` that identify the campaign.
 
         The checksums are those in the folder if it exists, else those of the present files.
         """
         digests = {}
-        for key, where in self.programs.items():
+        for key, where in self.files.items():
             name = custom.digest_name(key)
             digests[name] = self.digests.get(name) if self.made else custom_parts.digest(key, where)
         if self.table is not None:
@@ -139,7 +144,7 @@ class Folder:
         named = set(self.programs) - {custom_parts.METRICS, custom_parts.CONTROLLER}
         if named and not self.trusted:
             return None
-        for key in named:
+        for key in (*named, *custom.data_files(self.scenario)):
             self._check_unchanged(key)
         return scenario.study(self.scenario)
 
@@ -233,7 +238,7 @@ class Folder:
 
     def _check_unchanged(self, key: str) -> None:
         if self.made is not None:
-            custom_parts.check_unchanged({key: self.programs[key]}, self.path, self.identity)
+            custom_parts.check_unchanged({key: self.files[key]}, self.path, self.identity)
 
     def recipe(self) -> tuple[Callable, tuple[str, str]]:
         """Return a function and its arguments: another process calls it to rebuild the campaign and its rows."""

@@ -13,6 +13,7 @@ import numpy as np
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.runs import Run
 from ptsmc_jax.onboard import sources
+from ptsmc_jax.scenario import aem as attitude_messages
 from ptsmc_jax.scenario import custom, parsing, plausibility
 from ptsmc_jax.scenario.tables import Scenario
 
@@ -57,6 +58,7 @@ def write(
     figures: bool,
     computer: "InTheLoop | None" = None,
     replayed: Mapping[str, Any] = MappingProxyType({}),
+    aem: bool = False,
 ) -> None:
     """Write a result folder: `summary.json`, `trajectory.csv` and figures.
 
@@ -69,6 +71,7 @@ def write(
         figures: write figures too.
         computer: the C code that controlled the run; None: the simulated law did.
         replayed: further entries of `versions.json` if the run repeats a trial of a campaign.
+        aem: write `attitude.aem` too, an attitude ephemeris message.
     """
     made_by = {"command": "simulate", "seed": seed, "trial": trial, **replayed, **custom.digests(scenario)}
     if computer is not None:
@@ -77,6 +80,10 @@ def write(
     store.record(folder, parsing.dump(scenario), made_by, summary(run, scenario, computer))
     columns = run.columns()
     store.write_csv(folder / "trajectory.csv", list(columns), np.column_stack(list(columns.values())).tolist())
+    if aem:
+        x, t = run.log.x, np.asarray(run.log.t)
+        text = attitude_messages.write("SPACECRAFT", t, np.asarray(x.q), np.asarray(x.w), scenario.loop.epoch)
+        store.write_text(folder / "attitude.aem", text)
     if figures:
         from ptsmc_jax.figures import run_plots, style  # the import takes 0.3 s, which only figures need
 

@@ -1,0 +1,33 @@
+"""The table [orbit] of scenario files. The numbers of an orbit are declared in `signals.orbits`."""
+
+import dataclasses
+from typing import Annotated, Any
+
+import numpy as np
+
+from ptsmc_jax.scenario import epochs
+from ptsmc_jax.scenario.schema import PartTable, table
+from ptsmc_jax.scenario.values import Kinds, Meaning, Number
+from ptsmc_jax.signals import orbits
+
+
+class OrbitTable(PartTable, frozen=True):
+    """The orbit of references that point to the Earth, and of the gravity gradient."""
+
+    true_anomaly: Annotated[Number, Meaning("angle from perigee to the spacecraft at t = 0", "rad")] = 0.0
+
+    @property
+    def mean_anomaly(self) -> float:
+        """Mean anomaly at t = 0 [rad]."""
+        return orbits.mean_anomaly(self.true_anomaly, float(self.eccentricity))  # pyright: ignore
+
+    def build(self, epoch: str | None) -> Any:
+        """Return the orbit with numbers of NumPy; epoch: `loop.epoch`."""
+        names = [field.name for field in dataclasses.fields(orbits.Orbit)]
+        numbers = {name: getattr(self, name) for name in names}
+        if numbers["earth_angle"] is None:
+            numbers["earth_angle"] = 0.0 if epoch is None else orbits.earth_angle(epochs.of_key(epoch).days)
+        return orbits.Orbit(**{name: np.float64(value) for name, value in numbers.items()})
+
+
+ORBITS: Kinds = {"kepler": table(OrbitTable, orbits.Orbit, "kepler")}

@@ -1,0 +1,125 @@
+"""A reference attitude that interpolates samples with continuous rate and acceleration. Start with `interpolated`."""
+
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array
+
+from ptsmc_jax.numerics import attitude
+from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree, vector
+from ptsmc_jax.signals.references import Reference, Target
+
+MOST_INTERVALS = 1_000_000  # of the search table, so that it needs at most 4 MB
+ENDS = 5  # samples that determine the rate at an end; its error is then proportional to h^4, as at other samples
+LARGEST_TURN = np.pi / 2  # between two samples [rad]: a turn of pi has no unique direction
+
+
+@pytree
+@dataclass(frozen=True)
+class TableReference(Reference):
+    """An attitude from a file, exact at its samples, with continuous rate and acceleration in between.
+
+    q_f(t) = s(t) / |s(t)| q, where s is a cubic spline through unit quaternions. It has two continuous derivatives. The
+    attitude q is the identity, unless dispersions turn it. Outside of the samples, the attitude is the first or the
+    last one, at rest. With the sample interval h, the errors between samples are proportional to h^4 (attitude), h^3
+    (rate) and h^2 (acceleration).
+    """
+
+    times: Leaf  # (n,) increasing [s]
+    samples: Leaf  # (n, 4) unit quaternions without jumps of their signs [-]
+    slopes: Leaf  # (n, 4) time derivative of s at the samples [1/s]
+    first: Leaf  # (m,) for each of m equal intervals of time, the number of the last sample before it, int32
+    intervals: Leaf  # number of these intervals per second [1/s]
+
+    def __call__(self, t: Scalar) -> Target:
+        """Return the target at the time t [s]."""
+        begin, end = self.times[0], self.times[-1]
+        inside = (t >= begin - 1e-9 * (end - begin)) & (t <= end + 1e-9 * (end - begin))
+        t = jnp.where(inside, t, jnp.clip(t, begin, end))
+        interval = jnp.clip(jnp.floor((t - begin) * self.intervals), 0, self.first.shape[0] - 1).astype(jnp.int32)
+        k = _entry(self.first, interval)
+        k = jnp.where((t >= _entry(self.times, k + 1)) & (k < self.times.shape[0] - 2), k + 1, k)
+        t_0, s_0, d_0 = (_entry(table, k) for table in (self.times, self.samples, self.slopes))
+        t_1, s_1, d_1 = (_entry(table, k + 1) for table in (self.times, self.samples, self.slopes))
+        h = t_1 - t_0
+        x, chord = (t - t_0) / h, (s_1 - s_0) / h
+        # cubic Hermite polynomial s_0 + h x (d_0 + x (a + x b)), its first and second time derivative
+        a, b = 3.0 * chord - 2.0 * d_0 - d_1, d_0 + d_1 - 2.0 * chord
+        s = s_0 + h * x * (d_0 + x * (a + x * b))
+        s_dot = d_0 + x * (2.0 * a + 3.0 * x * b)
+        s_ddot = (2.0 * a + 6.0 * x * b) / h
+        square, inverse = jnp.dot(s, s), attitude.conjugate(s)
+        # s* s' / |s|^2 is q* q' plus a scalar
+        w = 2.0 * attitude.multiply(inverse, s_dot)[:3] / square
+        w_dot = 2.0 * attitude.multiply(inverse, s_ddot)[:3] / square - 2.0 * jnp.dot(s, s_dot) / square * w
+        to_body = attitude.conjugate(self.q)
+        rates = (jnp.where(inside, attitude.rotate(to_body, rate), 0.0) for rate in (w, w_dot))
+        return Target(attitude.multiply(attitude.normalise(s), self.q), *rates)
+
+
+def _entry(table: Array, k: Array) -> Array:
+    """Return row k of an array; k: between 0 and the number of rows less 1."""
+    return lax.dynamic_index_in_dim(table, k, keepdims=False, allow_negative_indices=False)
+
+
+def interpolated(times: np.ndarray, quaternions: np.ndarray, ends: np.ndarray | None = None) -> TableReference:
+    """Return the reference through samples of an attitude.
+
+    Args:
+        times: (n,) increasing [s], n >= 2.
+        quaternions: (n, 4) unit quaternions; their signs are made continuous.
+        ends: (2, 3) rates of the first and of the last sample in reference axes [rad/s]; None: those of the polynomials
+            through the first and the last `ENDS` samples.
+    """
+    samples = continuous(quaternions)
+    count = intervals(times)
+    starts = times[0] + (times[-1] - times[0]) / count * np.arange(count)
+    first = np.clip(np.searchsorted(times, starts, side="right") - 1, 0, len(times) - 2)
+    return TableReference(
+        vector([0.0, 0.0, 0.0, 1.0]), vector(times), vector(samples),
+        vector(_slopes(times, samples, ends)),
+        jnp.asarray(first.astype(np.int32)), vector(count / (times[-1] - times[0])),
+    )  # fmt: skip
+
+
+def _slopes(times: np.ndarray, samples: np.ndarray, ends: np.ndarray | None) -> np.ndarray:
+    """Return the time derivatives (n, 4) [1/s] of the spline at its samples; see `interpolated`."""
+    from scipy.interpolate import CubicSpline, KroghInterpolator
+
+    if ends is None:
+        sides = ((times[:ENDS], samples[:ENDS]), (times[-ENDS:][::-1], samples[-ENDS:][::-1]))
+        slopes = [KroghInterpolator(*side).derivative(side[0][0]) for side in sides]
+    else:
+        slopes = [_slope(samples[k], ends[k]) for k in (0, -1)]
+    return CubicSpline(times, samples, bc_type=[(1, slope) for slope in slopes])(times, 1)
+
+
+def rates(times: np.ndarray, samples: np.ndarray, ends: np.ndarray | None = None) -> np.ndarray:
+    """Return the rates (n, 3) [rad/s] at the samples in reference axes, 2 vec(q* q').
+
+    Args:
+        times: (n,) [s].
+        samples: (n, 4) unit quaternions without jumps of their signs.
+        ends: see `interpolated`.
+    """
+    slopes = _slopes(times, samples, ends)
+    v, s, v_dot, s_dot = samples[:, :3], samples[:, 3:], slopes[:, :3], slopes[:, 3:]
+    return 2.0 * (s * v_dot - s_dot * v - np.cross(v, v_dot))
+
+
+def _slope(q: np.ndarray, w: np.ndarray) -> np.ndarray:
+    """Return the time derivative (4,) [1/s] of a quaternion (4,) that turns with the rate w (3,) [rad/s]."""
+    return 0.5 * np.append(q[3] * w + np.cross(q[:3], w), -np.dot(q[:3], w))
+
+
+def continuous(quaternions: np.ndarray) -> np.ndarray:
+    """Return quaternions (n, 4) with the signs that make successive ones nearest to each other."""
+    signs = np.where(np.einsum("ij,ij->i", quaternions[1:], quaternions[:-1]) < 0.0, -1.0, 1.0)
+    return quaternions * np.cumprod(np.append(1.0, signs))[:, None]
+
+
+def intervals(times: np.ndarray) -> int:
+    """Return the number of equal intervals of which each contains at most one sample inside."""
+    return int(np.ceil((times[-1] - times[0]) / np.min(np.diff(times)) * (1.0 + 1e-9)))

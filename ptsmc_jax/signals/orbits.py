@@ -1,0 +1,256 @@
+"""Keplerian orbits, and directions from a spacecraft on an orbit: to the Earth's centre, the Sun or a ground point.
+
+The inertial frame has its x axis at the vernal equinox and its z axis along the Earth's rotation axis. Precession,
+nutation, polar motion and orbit perturbations are neglected. Start with `Orbit`.
+
+The functions also run in NumPy, because reading a scenario must not start JAX: defaults follow from the first attitude.
+"""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from ptsmc_jax.declare import number
+from ptsmc_jax.numerics import attitude, elementary
+from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
+
+EARTH_RATE = 7.292115e-5  # of the WGS-84 Earth [rad/s]
+EQUATORIAL_RADIUS, FLATTENING = 6_378_137.0, 1.0 / 298.257223563  # WGS-84 ellipsoid [m, -]
+DAY = 86_400.0  # [s]
+OBLIQUITY = np.deg2rad(23.4392911)  # of the ecliptic, at J2000 [rad]
+ITERATIONS = 4  # of Kepler's equation: they converge to rounding for an eccentricity of at most 0.9
+DIFFERENTIATED = 2  # further iterations, which are differentiated
+
+
+class Place(NamedTuple):
+    """Position of the spacecraft on its orbit, at one time or at several times."""
+
+    radial: Any  # (.., 3) unit vector from the Earth's centre, inertial axes
+    along: Any  # (.., 3) unit vector of the horizontal velocity
+    radius: Any  # (..,) distance from the Earth's centre [m]
+    anomaly: Any  # (..,) true anomaly, increasing over many orbits [rad]
+
+    @property
+    def normal(self) -> Any:
+        """Unit vector (.., 3) of the orbit's angular momentum."""
+        return cross(self.radial, self.along)
+
+
+@pytree
+@dataclass(frozen=True)
+class Orbit:
+    """A Keplerian orbit, and the rotation angle of the Earth, both at t = 0."""
+
+    mean_anomaly: Leaf  # at t = 0 [rad]
+    earth_angle: Leaf = number(
+        None, unit="rad", meaning="Earth rotation angle at t = 0; default: from loop.epoch, or 0 without it"
+    )
+    semi_major_axis: Leaf = number(6_878_137.0, above=0.0, unit="m", meaning="half of the ellipse's longest diameter")
+    eccentricity: Leaf = number(0.0, at_least=0.0, at_most=0.9, meaning="0 is a circle")
+    inclination: Leaf = number(1.7, unit="rad", meaning="angle between orbit plane and equator")
+    ascending_node: Leaf = number(0.0, unit="rad", meaning="right ascension of the ascending node")
+    perigee: Leaf = number(0.0, unit="rad", meaning="argument of perigee, from the ascending node")
+    gravitational_parameter: Leaf = number(3.986004418e14, above=0.0, unit="m^3/s^2", meaning="of the Earth")
+
+    def rate(self) -> Any:
+        """Return the mean motion [rad/s]."""
+        return (self.gravitational_parameter / self.semi_major_axis**3) ** 0.5
+
+    def fastest(self) -> Any:
+        """Return the largest angular rate of the radius vector, at perigee [rad/s]."""
+        return self.rate() * (1.0 + self.eccentricity) ** 0.5 / (1.0 - self.eccentricity) ** 1.5
+
+    def anomalies(self, t: Any, xp: Any = jnp) -> tuple[Any, Any]:
+        """Return the true and the eccentric anomaly (..,) [rad] at times (..,) [s].
+
+        The true anomaly f follows from Kepler's equation M = E - e sin E and from
+        f = E + 2 atan(b sin E / (1 - b cos E)), b = e / (1 + sqrt(1 - e^2)). It has no jumps after a revolution.
+
+        Args:
+            t: the times.
+            xp: JAX's or NumPy's functions.
+        """
+        e, mean = self.eccentricity, self.mean_anomaly + self.rate() * t
+        eccentric = mean + _eccentric_less_mean(mean, e, xp)
+        b = e / (1.0 + (1.0 - e * e) ** 0.5)
+        arctan2 = elementary.arctan2 if xp is jnp else np.arctan2
+        return eccentric + 2.0 * arctan2(b * xp.sin(eccentric), 1.0 - b * xp.cos(eccentric)), eccentric
+
+    def __call__(self, t: Any, xp: Any = jnp) -> Place:
+        """Return the place on the orbit at times (..,) [s]; see `anomalies`."""
+        anomaly, eccentric = self.anomalies(t, xp)
+        node, tilt, angle = self.ascending_node, self.inclination, self.perigee + anomaly
+        cosine, sine = xp.cos(angle), xp.sin(angle)
+        zero = 0.0 * angle
+        x = xp.stack([xp.cos(node) + zero, xp.sin(node) + zero, zero], axis=-1)  # to the ascending node
+        up = xp.sin(tilt) + zero
+        y = xp.stack([-xp.cos(tilt) * xp.sin(node) + zero, xp.cos(tilt) * xp.cos(node) + zero, up], axis=-1)
+        cosine, sine = cosine[..., None], sine[..., None]
+        radius = self.semi_major_axis * (1.0 - self.eccentricity * xp.cos(eccentric))
+        return Place(cosine * x + sine * y, cosine * y - sine * x, radius, anomaly)
+
+    def quaternion(self, t: Scalar) -> Float[Array, "4"]:
+        """Return the quaternion (4,) [-] from the axes radial, along, normal to inertial axes at the time t [s].
+
+        It has no jumps after a revolution.
+        """
+        node, tilt, half = (
+            0.5 * self.ascending_node,
+            0.5 * self.inclination,
+            0.5 * (self.perigee + self.anomalies(t)[0]),
+        )
+        plane = jnp.stack([jnp.sin(tilt) * jnp.cos(node), jnp.sin(tilt) * jnp.sin(node),
+                           jnp.cos(tilt) * jnp.sin(node), jnp.cos(tilt) * jnp.cos(node)])  # fmt: skip
+        zero = jnp.zeros_like(half)
+        return attitude.multiply(plane, jnp.stack([zero, zero, jnp.sin(half), jnp.cos(half)]))
+
+
+def cross(a: Any, b: Any) -> Any:
+    """Return the cross product of vectors (.., 3), in JAX or NumPy."""
+    (a_x, a_y, a_z), (b_x, b_y, b_z) = ((v[..., 0], v[..., 1], v[..., 2]) for v in (a, b))
+    xp = np if isinstance(a_x, np.ndarray | np.generic) and isinstance(b_x, np.ndarray | np.generic) else jnp
+    return xp.stack([a_y * b_z - a_z * b_y, a_z * b_x - a_x * b_z, a_x * b_y - a_y * b_x], axis=-1)
+
+
+def unit(v: Any) -> Any:
+    """Return vectors (.., 3) with the length 1, in JAX or NumPy."""
+    return v / ((v * v).sum(-1) ** 0.5)[..., None]
+
+
+def _eccentric_less_mean(mean: Any, e: Any, xp: Any) -> Any:
+    """Return E - M [rad] of Kepler's equation.
+
+    Halley's iterations start at Danby's value (Celestial Mechanics 40, 1987). They are constants of differentiation.
+    Newton's iterations follow. `DIFFERENTIATED` = 2 of them give three correct derivatives.
+    """
+    d = 0.85 * e * xp.sign(xp.sin(mean))
+    for _ in range(ITERATIONS):
+        sine, slope = e * xp.sin(mean + d), 1.0 - e * xp.cos(mean + d)
+        step = (d - sine) / slope
+        d = d - step / (1.0 - 0.5 * step * sine / slope)
+    d = lax.stop_gradient(d) if xp is jnp else d
+    for _ in range(DIFFERENTIATED):
+        d = d - (d - e * xp.sin(mean + d)) / (1.0 - e * xp.cos(mean + d))
+    return d
+
+
+def mean_anomaly(true_anomaly: float, eccentricity: float) -> float:
+    """Return the mean anomaly [rad] of a true anomaly [rad]."""
+    e, f = eccentricity, true_anomaly
+    b = e / (1.0 + np.sqrt(1.0 - e * e))
+    eccentric = f - 2.0 * np.arctan2(b * np.sin(f), 1.0 + b * np.cos(f))
+    return float(eccentric - e * np.sin(eccentric))
+
+
+def ground_point(latitude: float, longitude: float, height: float) -> np.ndarray:
+    """Return Earth-fixed coordinates (3,) [m] of geodetic latitude and longitude [rad] and height [m] on WGS-84."""
+    square = FLATTENING * (2.0 - FLATTENING)  # of the first eccentricity
+    normal = EQUATORIAL_RADIUS / np.sqrt(1.0 - square * np.sin(latitude) ** 2)
+    across = (normal + height) * np.cos(latitude)
+    up = (normal * (1.0 - square) + height) * np.sin(latitude)
+    return np.array([across * np.cos(longitude), across * np.sin(longitude), up])
+
+
+def earth_angle(days: float) -> float:
+    """Return the Earth rotation angle [rad] for UT1 days since J2000 (IERS Conventions 2010, eq. 5.15)."""
+    return float(2.0 * np.pi * ((0.7790572732640 + 0.00273781191135448 * days + days % 1.0) % 1.0))
+
+
+@dataclass(frozen=True)
+class Direction:
+    """Base of directions in inertial axes."""
+
+    needs_orbit: ClassVar[bool] = True
+
+    def __call__(self, t: Any, place: Any, orbit: Any, xp: Any) -> Any:
+        """Return vectors (.., 3) of any length in inertial axes.
+
+        Args:
+            t: times (..,) [s].
+            place: the place on the orbit, None without an orbit.
+            orbit: the orbit, or None.
+            xp: JAX's or NumPy's functions.
+        """
+        raise NotImplementedError
+
+
+@pytree
+@dataclass(frozen=True)
+class Fixed(Direction):
+    """A constant direction."""
+
+    vector: Leaf  # (3,)
+    needs_orbit: ClassVar[bool] = False
+
+    def __call__(self, t: Any, place: Any, orbit: Any, xp: Any) -> Any:
+        return self.vector + 0.0 * xp.asarray(t)[..., None]
+
+
+@pytree
+@dataclass(frozen=True)
+class Nadir(Direction):
+    """The direction to the Earth's centre."""
+
+    def __call__(self, t: Any, place: Any, orbit: Any, xp: Any) -> Any:
+        return -place.radial
+
+
+@pytree
+@dataclass(frozen=True)
+class Velocity(Direction):
+    """The direction of the velocity."""
+
+    def __call__(self, t: Any, place: Any, orbit: Any, xp: Any) -> Any:
+        outward, along = orbit.eccentricity * xp.sin(place.anomaly), 1.0 + orbit.eccentricity * xp.cos(place.anomaly)
+        return outward[..., None] * place.radial + along[..., None] * place.along
+
+
+@pytree
+@dataclass(frozen=True)
+class OrbitNormal(Direction):
+    """The direction of the orbit's angular momentum."""
+
+    def __call__(self, t: Any, place: Any, orbit: Any, xp: Any) -> Any:
+        return place.normal
+
+
+@pytree
+@dataclass(frozen=True)
+class GroundPoint(Direction):
+    """The direction from the spacecraft to a point on the rotating Earth."""
+
+    point: Leaf  # (3,) Earth-fixed coordinates [m]
+
+    def __call__(self, t: Any, place: Any, orbit: Any, xp: Any) -> Any:
+        angle = orbit.earth_angle + EARTH_RATE * t
+        sine, cosine = xp.sin(angle), xp.cos(angle)
+        x, y, z = (self.point[k] for k in range(3))
+        target = xp.stack([cosine * x - sine * y, sine * x + cosine * y, z + 0.0 * angle], axis=-1)
+        return target / place.radius[..., None] - place.radial
+
+
+@pytree
+@dataclass(frozen=True)
+class Sun(Direction):
+    """The direction from the Earth to the Sun, to 0.01 deg (Astronomical Almanac, low-precision formulas)."""
+
+    longitude: Leaf  # mean longitude at t = 0 [rad]
+    anomaly: Leaf  # mean anomaly at t = 0 [rad]
+    needs_orbit: ClassVar[bool] = False
+
+    def __call__(self, t: Any, place: Any, orbit: Any, xp: Any) -> Any:
+        g = self.anomaly + np.deg2rad(0.9856003) / DAY * t
+        mean = self.longitude + np.deg2rad(0.9856474) / DAY * t
+        ecliptic = mean + np.deg2rad(1.915) * xp.sin(g) + np.deg2rad(0.020) * xp.sin(2.0 * g)
+        sine = xp.sin(ecliptic)
+        return xp.stack([xp.cos(ecliptic), np.cos(OBLIQUITY) * sine, np.sin(OBLIQUITY) * sine], axis=-1)
+
+
+def sun(days: float) -> Sun:
+    """Return the direction to the Sun for days since J2000 at t = 0."""
+    turn = 2.0 * np.pi
+    return Sun(np.deg2rad(280.460 + 0.9856474 * days) % turn, np.deg2rad(357.528 + 0.9856003 * days) % turn)
