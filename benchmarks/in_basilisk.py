@@ -4,15 +4,18 @@
     benchmarks/.venv-basilisk/bin/python -m pip install --editable . bsk==2.12.1
     benchmarks/.venv-basilisk/bin/python benchmarks/in_basilisk.py [TRIALS]
 
-In each period Basilisk integrates the body. `ptsmc_step` reads its star tracker and inertial measurement unit, and
-commands the motors of the wheels. Attitudes at t = 0, the start of the filter and its gains are those of the library's
-trials. The noise is Basilisk's own, white and of the scenario's size. The scenario's disturbance is an external torque,
-constant in a period at its mean.
+In each period Basilisk integrates the body. The exported module `basilisk.py` reads its star tracker and inertial
+measurement unit, and commands the motors of the wheels. Attitudes at t = 0, the start of the filter and its gains are
+those of the library's trials. The noise is Basilisk's own, white and of the scenario's size. The scenario's disturbance
+is an external torque, constant in a period at its mean.
 """
 
+import runpy
+import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -32,9 +35,9 @@ TUNED: dict[str, Any] = {
 
 
 class Basilisk:
-    """A spacecraft of Basilisk with wheels, star tracker and gyro, at rest at an initial attitude (4,)."""
+    """A spacecraft of Basilisk with wheels, star tracker, gyro and flight computer, at rest at an attitude (4,)."""
 
-    def __init__(self, parts: Any, attitude: np.ndarray, seed: int):
+    def __init__(self, parts: Any, attitude: np.ndarray, seed: int, computer: Any):
         from Basilisk.architecture import messaging  # pyright: ignore[reportMissingImports]
         from Basilisk.simulation import (  # pyright: ignore[reportMissingImports]
             extForceTorque,
@@ -52,7 +55,9 @@ class Basilisk:
 
         self.period, self.axes, self._nano = float(parts.clock.period), parts.actuators.wheels.axes, macros.sec2nano
         self.sim = SimulationBaseClass.SimBaseClass()
-        self.sim.CreateNewProcess("process").addTask(self.sim.CreateNewTask("task", self._nano(self.period) // FINER))
+        process, nanoseconds = self.sim.CreateNewProcess("process"), self._nano(self.period)
+        process.addTask(self.sim.CreateNewTask("dynamics", nanoseconds // FINER), 2)  # first
+        process.addTask(self.sim.CreateNewTask("flight software", nanoseconds), 1)
         self.body, inertia = spacecraft.Spacecraft(), np.asarray(parts.plant.inertia)
         factory, wheels = simIncludeRW.rwFactory(), reactionWheelStateEffector.ReactionWheelStateEffector()
         limit = parts.actuators.wheels.torque_limit
@@ -66,9 +71,8 @@ class Basilisk:
         factory.addToSpacecraft("wheels", wheels, self.body)
         push = extForceTorque.ExtForceTorque()
         self.body.addDynamicEffector(push)
-        self._motors, self._pushed = messaging.ArrayMotorTorqueMsg(), messaging.CmdTorqueBodyMsg()
-        self._motor, self._torque = messaging.ArrayMotorTorqueMsgPayload, messaging.CmdTorqueBodyMsgPayload
-        wheels.rwMotorCmdInMsg.subscribeTo(self._motors)
+        self._pushed, self._torque = messaging.CmdTorqueBodyMsg(), messaging.CmdTorqueBodyMsgPayload
+        wheels.rwMotorCmdInMsg.subscribeTo(computer.motorsOutMsg)
         push.cmdTorqueInMsg.subscribeTo(self._pushed)
         white, still = np.zeros((3, 3)).tolist(), [[0.0]] * 3  # errors without memory
         self.star, self.gyro, self.wheels = starTracker.StarTracker(), imuSensor.ImuSensor(), wheels
@@ -84,31 +88,30 @@ class Basilisk:
         for sensor in (self.star, self.gyro):
             sensor.scStateInMsg.subscribeTo(self.body.scStateOutMsg)
         for model in (push, wheels, self.body, self.star, self.gyro):  # commands are read, then the body moves
-            self.sim.AddModelToTask("task", model)
-        self.act(0, np.zeros(self.axes.shape[1]), np.zeros(3))
+            self.sim.AddModelToTask("dynamics", model)
+        computer.starInMsg.subscribeTo(self.star.sensorOutMsg)
+        computer.gyroInMsg.subscribeTo(self.gyro.sensorOutMsg)
+        computer.speedsInMsg.subscribeTo(wheels.rwSpeedOutMsg)
+        self._wheels = factory.getConfigMessage()
+        computer.wheelsInMsg.subscribeTo(self._wheels)
+        self.sim.AddModelToTask("flight software", computer)
+        self.push(0, np.zeros(3))
         self.sim.InitializeSimulation()
 
-    def act(self, k: int, wheel_torque: np.ndarray, disturbance: np.ndarray) -> None:
-        """Apply the torques of the wheels (wheels,) and the disturbance (3,) from period k on [N m]."""
-        motors, torque = self._motor(), self._torque()
-        motors.motorTorque = (-wheel_torque).tolist()  # on the wheel
+    def push(self, k: int, disturbance: np.ndarray) -> None:
+        """Apply the disturbance (3,) from period k on [N m]."""
+        torque = self._torque()
         torque.torqueRequestBody = disturbance.tolist()
-        self._motors.write(motors, self._nano(self.period * k))
         self._pushed.write(torque, self._nano(self.period * k))
 
-    def until(self, k: int) -> dict[str, np.ndarray]:
-        """Simulate up to sample k; return the measurements and the true state."""
+    def until(self, k: int) -> np.ndarray:
+        """Simulate up to sample k, with the sample; return the true attitude, modified Rodrigues parameters (3,)."""
         self.sim.ConfigureStopTime(self._nano(self.period * k))
         self.sim.ExecuteSimulation()
-        true = self.body.scStateOutMsg.read()
-        w, star = np.asarray(true.omega_BN_B), np.roll(self.star.sensorOutMsg.read().qInrtl2Case, -1)
-        speeds = np.asarray(self.wheels.rwSpeedOutMsg.read().wheelSpeeds)[: self.axes.shape[1]]
-        gyro = np.asarray(self.gyro.sensorOutMsg.read().AngVelPlatform)
-        told = {"attitude": star, "attitude_valid": np.ones(1), "rate": gyro}
-        return told | {"wheel_momentum": SPIN * (speeds + self.axes.T @ w), "sigma": np.asarray(true.sigma_BN)}
+        return np.asarray(self.body.scStateOutMsg.read().sigma_BN)
 
 
-def simulated(made: Any, library: Any, trial: int, seed: int = 0) -> tuple[float, float, int]:
+def simulated(made: Any, library: Any, module: Any, trial: int, seed: int = 0) -> tuple[float, float, int]:
     """Simulate a trial; return RMS window error [-], peak torque of a wheel [N m], and samples with another status."""
     import jax.numpy as jnp
     from scipy.spatial.transform import Rotation
@@ -117,27 +120,21 @@ def simulated(made: Any, library: Any, trial: int, seed: int = 0) -> tuple[float
 
     parts = made.ready.dispersion.apply(made.ready.parts, jnp.uint32(seed), jnp.uint32(trial))
     first = made.first(parts)
-    loop = InTheLoop(library, parts)
-    computer = loop.boot(parts, jnp.uint32(seed), jnp.uint32(trial), parts.initial, first)
-    state = np.asarray(computer.sensors[1])
-    craft = Basilisk(parts, np.asarray(parts.initial.q), trial)
+    booted = InTheLoop(library, parts).boot(parts, jnp.uint32(seed), jnp.uint32(trial), parts.initial, first)
+    computer = module.FlightComputer(library.folder)
+    computer.start = np.asarray(booted.sensors[1])
+    craft = Basilisk(parts, np.asarray(parts.initial.q), trial, computer)
     target = Rotation.from_quat(np.asarray(parts.reference(jnp.asarray(0.0)).q)).as_quat()
-    names, outputs = list(loop.board.inputs), library.columns["out"]
-    at = outputs.index("wheel_torque[0]")
     h, t_f, window, t_end = (float(v) for v in (craft.period, parts.controller.t_f, parts.window, parts.t_end))
     t = h * np.arange(round(t_end / h) + 1)
     errors, peak, odd = np.zeros(len(t)), 0.0, 0
-    count = craft.axes.shape[1]
     for k, now in enumerate(t):
-        seen = craft.until(k)
-        q = Rotation.from_mrp(seen["sigma"]).as_quat()
+        q = Rotation.from_mrp(craft.until(k)).as_quat()
         q = q if q @ target > 0.0 else -q
         errors[k] = np.linalg.norm(q[:3] - target[:3])
-        state, out, status = library.many(state, np.concatenate([[now], *(seen[name] for name in names)]))
-        odd += int(status != 0)
-        torque = out[at : at + count]
-        peak = max(peak, float(np.max(np.abs(torque))))
-        craft.act(k, torque, np.asarray(made.disturbance(parts, now + h / 2)))
+        odd += int(computer.status != 0)
+        peak = max(peak, float(np.max(np.abs(computer.values("wheel_torque")))))
+        craft.push(k, np.asarray(made.disturbance(parts, now + h / 2)))
     inside = (t >= t_f - 1e-9) & (t <= t_f + window + 1e-9)
     squares = errors[inside] ** 2
     mean = np.sum((squares[1:] + squares[:-1]) / 2) / (len(squares) - 1)
@@ -176,8 +173,10 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as place:
             store.write(Path(place) / "c", lambda making, made=made: folder.write_program(making, made))
             library = Library(Path(place) / "c")
+            subprocess.run(["make", "-C", f"{place}/c", "shared"], check=True, stdout=subprocess.DEVNULL)
+            module = SimpleNamespace(**runpy.run_path(f"{place}/c/basilisk.py"))
+            theirs = np.array([simulated(made, library, module, k) for k in range(trials)])
         ours = montecarlo.run(made.ready.parts, made.ready.dispersion, 0, np.arange(trials))
-        theirs = np.array([simulated(made, library, k) for k in range(trials)])
         rms = [float(np.sqrt(np.mean(np.square(v)))) for v in (theirs[:, 0], ours.metrics.window_error)]
         peaks = theirs[:, 1].max(), float(np.max(ours.metrics.peak_wheel_torque))
         print(f"| {name} | {rms[0]:.3e} | {rms[1]:.3e} | {peaks[0]:.4f} | {peaks[1]:.4f} | {int(theirs[:, 2].sum())} |")

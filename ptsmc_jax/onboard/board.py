@@ -34,6 +34,7 @@ from ptsmc_jax.observers.base import Observer
 from ptsmc_jax.onboard import derived
 from ptsmc_jax.plants.base import Plant, State
 from ptsmc_jax.plants.rigid_body import AttitudeState
+from ptsmc_jax.signals.references import Target
 from ptsmc_jax.simulation import run_state
 from ptsmc_jax.simulation.assembly import Parts
 
@@ -66,6 +67,7 @@ class Board:
     stages: list[Stage] = field(default_factory=list)
     rules: list[derived.Rule] = field(default_factory=list)  # rules that derive parameters from other parameters
     about: dict[str, str] = field(default_factory=dict)  # meaning of each value, by name
+    always: tuple[str, ...] = ("period",)  # parameters that C has even if no stage reads them
 
     @property
     def unit(self) -> str:
@@ -114,8 +116,13 @@ def integer() -> jax.ShapeDtypeStruct:
 SCALARS = {"t": real, "dt": real, "regular": integer, "tracking": integer}  # scalar arguments of the C functions
 
 
-def board(parts: Parts) -> Board:
-    """Return the flight computer of a scenario with a sampled loop."""
+def board(parts: Parts, reference_input: bool = False) -> Board:
+    """Return the flight computer of a scenario with a sampled loop.
+
+    Args:
+        parts: the scenario.
+        reference_input: whether the reference is an input instead of a function of time in the code.
+    """
     observer, law = parts.observer, parts.controller
     device = parts.actuators
     parameters, inputs = known(parts), observer.model.inputs
@@ -133,6 +140,35 @@ def board(parts: Parts) -> Board:
     computer.stages.append(Stage("begin", "What is remembered before the first sample.", (), begin))
     if not device.ideal:
         _acting(computer, device, inputs)
+    return _with_reference_input(computer) if reference_input else computer
+
+
+def _with_reference_input(computer: Board) -> Board:
+    """Return the flight computer with an input for the reference. The sign of its quaternion does not matter."""
+    target = jax.eval_shape(computer.parameters["reference"], real())
+    about = {"reference_q": "reference attitude", "reference_w": "its rate, in reference axes [rad/s]",
+             "reference_w_dot": "time derivative of that rate [rad/s^2]"}  # fmt: skip
+    computer.inputs["reference"], computer.parameters = target, {**computer.parameters}
+    del computer.parameters["reference"]
+    computer.about |= about if isinstance(target, Target) else {"reference": "reference at this sample"}
+    if isinstance(target, Target):
+        computer.state["reference"] = real(4)
+        computer.about["reference"] = "reference attitude at the last sample"
+
+    def following(stage: Stage) -> Stage:
+        def run(parameters: Given, given: Given) -> Given:
+            target = given["in.reference"]
+            if isinstance(target, Target):
+                q = attitude.unit(target.q)
+                target = target._replace(q=jnp.where(jnp.dot(q, given["before.reference"]) < 0.0, -q, q))
+            written = stage.run({**parameters, "reference": lambda t: target}, given)
+            kept = stage.name == "sense" and isinstance(target, Target)
+            return written | ({"now.reference": target.q} if kept else {})
+
+        reads = ("in.reference", *(("before.reference",) if isinstance(target, Target) else ()))
+        return dataclasses.replace(stage, reads=(*stage.reads, *reads), run=run)
+
+    computer.stages = [following(stage) if stage.name in ("sense", "command") else stage for stage in computer.stages]
     return computer
 
 
@@ -360,10 +396,10 @@ def _commanding(computer: Board, law: Law, observer: Observer, command_filter: C
 
     computer.state["law"] = jax.eval_shape(law.begin)
     computer.outputs |= {"command": real(m), "s": real(*jax.eval_shape(once, law, x, target).shape)}
-    filtered = "" if command_filter is None else " behind the filter of its command"
+    filtered = "" if command_filter is None else ", after the filter of its command"
     computer.about |= {
         "law": "memory of the law",
-        "command": f"what the law asks for{filtered}{computer.unit}",
+        "command": f"command of the law{filtered}{computer.unit}",
         "s": "sliding variable",
     }
     memories, shaped = ["law"], ()
@@ -412,7 +448,7 @@ def _commanding(computer: Board, law: Law, observer: Observer, command_filter: C
             u, s, kept = decided()
         return {"out.command": u, "out.s": s} | {f"now.{name}": value for name, value in kept.items()}
 
-    about = f"The law: the input for the state as it is seen{filtered}; the last one where the law is singular."
+    about = f"The law: the command for the measured state{filtered}; the last command if the law is singular."
     computer.stages.append(Stage("command", about, reads, command, (law, law.kinematics, *shaped)))
 
 
@@ -437,8 +473,12 @@ def _acting(computer: Board, device: Actuators, m: int) -> None:
         computer.inputs.setdefault("acting", real(m))
         computer.about["acting"] = "torque of each axis, or wheel, at this sample, from telemetry [N m]"
         reads.append("in.acting")
-    computer.outputs["torque"] = real(m)
-    computer.about["torque"] = "on the body from this sample on, as far as it is known [N m]"
+    compensated = "" if wheels is None else ", plus the compensation of the wheels' momentum"
+    computer.outputs |= {"sent_torque": real(m), "torque": real(m)}
+    computer.about["sent_torque"] = (
+        f"sent to the actuators at this sample: `command` within its limit{compensated}{computer.unit}"
+    )
+    computer.about["torque"] = "torque on the body from this sample on, as the flight computer assumes it [N m]"
     if wheels is not None:
         computer.outputs["wheel_torque"] = real(*np.shape(wheels.initial))
         computer.about["wheel_torque"] = "of each wheel on the body, about its axis, from this sample on [N m]"
@@ -449,10 +489,11 @@ def _acting(computer: Board, device: Actuators, m: int) -> None:
         state = ActuatorState(given.get("before.queue"), given.get("in.acting"), given.get("in.wheel_momentum"))
         rate = given.get("now.rate", jnp.zeros_like(u))
         drive, queue = actuators.command(state, u, rate, jnp.zeros(()), parameters["period"], jnp.ones(()))
-        written = {"limited": drive.limited} | ({} if queue is None else {"now.queue": queue})
+        written = {"limited": drive.limited, "out.sent_torque": actuators.send(state, u, rate)[0]}
+        written |= {} if queue is None else {"now.queue": queue}
         if wheels is None:
             return {**written, "out.torque": drive.c}
         return {**written, "out.torque": actuators.wheels.axes @ drive.c, "out.wheel_torque": drive.c}
 
-    what = "What of the command acts on the body: limits, delay, wheels."
+    what = "Actuators: limits, delay, allocation to wheels."
     computer.stages.append(Stage("act", what, tuple(reads), act, (device,)))

@@ -11,6 +11,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from ptsmc_jax.devices.actuators import Actuators
 from ptsmc_jax.devices.attitude_filter import filter_gains
 from ptsmc_jax.devices.kalman_filter import KalmanFilter
 from ptsmc_jax.numerics import matrices
@@ -73,11 +74,16 @@ def _filtering(sensors: Any) -> Rule:
 
 
 def _allocation(given: Given) -> Given:
-    """Derive the pseudo-inverse of the wheels' axes, A' (A A')^-1, which exists because they span all directions."""
-    device = given["actuators"]
-    axes = device.wheels.axes
+    return given | {"actuators": allocated(given["actuators"])}
+
+
+def allocated(device: Actuators) -> Actuators:
+    """Return actuators with the pseudo-inverse of the wheels' axes, A' (A A')^-1, which span all directions."""
+    if device.wheels is None:
+        return device
+    axes = jnp.asarray(device.wheels.axes)
     allocation = axes.T @ matrices.solve(axes @ axes.T, jnp.eye(len(axes)))
-    return given | {"actuators": replace(device, wheels=replace(device.wheels, allocation=allocation))}
+    return replace(device, wheels=replace(device.wheels, allocation=allocation))
 
 
 def bandwidth(sensors: Any, period: Any) -> np.ndarray:

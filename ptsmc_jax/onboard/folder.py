@@ -4,7 +4,7 @@ import hashlib
 import json
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,9 +12,12 @@ import numpy as np
 from ptsmc_jax import scenario as scenarios
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.numerics import draws
+from ptsmc_jax.onboard import fmu as units
 from ptsmc_jax.onboard import templates, vectors
 from ptsmc_jax.onboard.board import Board, board
 from ptsmc_jax.onboard.generate import Code, generate
+from ptsmc_jax.onboard.library import compiler
+from ptsmc_jax.onboard.plant import plant_board
 from ptsmc_jax.onboard.readme import readme
 from ptsmc_jax.onboard.sources import LAYOUT
 from ptsmc_jax.onboard.templates import About
@@ -28,11 +31,12 @@ from ptsmc_jax.scenario.tables import Scenario
 class Controller:
     """The flight computer of a scenario, in C."""
 
-    def __init__(self, scenario: Scenario, name: str, source: str):
+    def __init__(self, scenario: Scenario, name: str, source: str, reference_input: bool = False):
         """Trace the flight computer. Raises ScenarioError if it cannot be written in C."""
         self.scenario = on_flight_clock(scenario)
         self.ready: Study = scenarios.study(self.scenario)
-        self.board: Board = board(self.ready.parts)
+        self.reference_input = reference_input  # whether the reference is an input
+        self.board: Board = board(self.ready.parts, reference_input)
         try:
             self.code: Code = generate(self.board)
         except NoRuleError as error:
@@ -40,7 +44,7 @@ class Controller:
         law, device = self.ready.parts.controller, self.ready.parts.actuators
         self.about = About(
             name, source, digest(self.scenario), type(law).__qualname__, self.board.parameters["filter"] is not None,
-            self.board.model.largest_measurement, device.wheels is not None,
+            self.board.model.largest_measurement,
             device.delay, float((law.t_f / self.last) ** 2),
         )  # fmt: skip
 
@@ -123,7 +127,63 @@ def table(made: Controller, simulated: dict[int, vectors.Samples]) -> tuple[list
     return header, rows
 
 
-def write(folder: Path, made: Controller, seed: int, trials: int) -> None:
+def controller_model(made: Controller) -> units.Model:
+    """Return the controller as the model of an FMU."""
+    texts, stem = templates.texts(made.code, made.about), f"ptsmc_{made.about.name}"
+    filtered = [field for field in made.code.state if made.about.filtered and field.name in units.FILTER_STATE]
+    title, t_end = f"controller of {made.about.scenario}", float(made.ready.parts.t_end)
+    kept = {name: texts[name] for name in (f"{stem}.c", f"{stem}.h")}
+    return units.Model(made.code, made.about, title, kept, t_end, filtered)
+
+
+def plant_model(made: Controller) -> units.Model:
+    """Return the true plant of a controller's scenario as the model of an FMU.
+
+    Raises:
+        ScenarioError: if it cannot be written in C.
+    """
+    ready, about = made.ready, made.about._replace(name=f"{made.about.name}_plant", filtered=False)
+    try:
+        code = generate(plant_board(ready.parts, ready.dispersion, made.board))
+    except NoRuleError as error:
+        raise ScenarioError(str(error)) from None
+    if code.fixed:
+        raise ScenarioError(f"the plant cannot be exported: {next(iter(code.fixed.values()))}")
+    title = f"plant of {about.scenario}"
+    return units.Model(code, about, title, templates.plant_texts(code, about), float(ready.parts.t_end), plant=True)
+
+
+class Wanted(NamedTuple):
+    """The FMUs to write beside the C."""
+
+    controller: bool = False
+    plant: bool = False
+    version: int | None = None  # version of FMI, 2 or 3; None: both
+    binary: bool = True  # whether they contain a binary for this machine
+
+    def models(self, made: Controller) -> dict[str, units.Model]:
+        """Return the models by the first part of their file names.
+
+        Raises:
+            ScenarioError: if the plant cannot be written in C, or a binary is wanted without a C compiler.
+        """
+        makers = {"controller": controller_model, "plant": plant_model}
+        found = {name: makers[name](made) for name in makers if getattr(self, name)}
+        if found and self.binary:
+            compiler()
+        return found
+
+    def write(self, folder: Path, models: dict[str, units.Model]) -> None:
+        """Write the FMUs of these models into a folder."""
+        for name, model in models.items():
+            for version in units.VERSIONS if self.version is None else (self.version,):
+                units.write(folder / f"{name}_fmi{version}.fmu", model, version, binary=self.binary)
+
+
+NO_FMU = Wanted()
+
+
+def write(folder: Path, made: Controller, seed: int, trials: int, wanted: Wanted = NO_FMU) -> None:
     """Write all files into an existing folder.
 
     Args:
@@ -131,12 +191,15 @@ def write(folder: Path, made: Controller, seed: int, trials: int) -> None:
         made: the controller.
         seed: seed of the trials in the test vectors.
         trials: number of these trials.
+        wanted: the FMUs to write.
     """
+    models = wanted.models(made)
     simulated, t_f = simulate(made, seed, trials), float(made.ready.parts.controller.t_f)
     rounding = made.board.model.error_rounding
     header, rows = table(made, simulated)
     steepness = min(vectors.steepness(one, rounding, t_f, made.last) for one in simulated.values())
     write_program(folder, made, steepness)
+    wanted.write(folder, models)
     store.write_csv(folder / "vectors.csv", header, rows)
     made_by = {"command": "export", "seed": seed, **custom.digests(made.scenario)}
     store.record(folder, parsing.dump(made.scenario), made_by)
@@ -155,13 +218,15 @@ def write_program(folder: Path, made: Controller, steepness: float = 0.0) -> Non
     for name, text in texts.items():
         store.write_text(folder / name, templates.prefixed(text, about.name))
     layout = {"name": about.name, "digest": about.digest, "period": made.period, "parts": made.board.parts}
+    layout["reference_input"] = made.reference_input
     layout["columns"] = code.columns
     store.write_json(folder / LAYOUT, layout)
 
 
 def export(
     what: Scenario | str | Path, folder: str | Path, *, name: str | None = None, trials: int = 3, seed: int = 0,
-    force: bool = False,
+    force: bool = False, reference_input: bool = False, fmu: bool = False, fmu_plant: bool = False,
+    fmi: int | None = None, binary: bool = True,
 ) -> Path:  # fmt: skip
     """Write a scenario's flight computer as C99 into a folder, with test vectors.
 
@@ -172,22 +237,30 @@ def export(
         trials: number of trials in the test vectors.
         seed: seed of the trials.
         force: whether to write into a folder that has content.
+        reference_input: whether the reference is an input of the C instead of a function of time in it.
+        fmu: whether to write the controller as an FMU.
+        fmu_plant: whether to write the true plant as an FMU.
+        fmi: version of FMI, 2 or 3; None: both.
+        binary: whether an FMU contains a binary for this machine besides its sources.
 
     Returns:
         The folder.
 
     Raises:
-        ScenarioError: if the loop is continuous, or C cannot express a part.
+        ScenarioError: if the loop is continuous, C cannot express a part, or there is no C compiler for an FMU.
         RefusedError: if the folder has content, and `force` is not set.
-        ValueError: if `trials` or `seed` is not a valid number.
+        ValueError: if `trials`, `seed` or `fmi` is not a valid number.
     """
-    path = Path(folder)
+    path, wanted = Path(folder), Wanted(fmu, fmu_plant, fmi, binary)
+    if fmi not in (None, 2, 3):
+        raise ValueError(f"fmi is {fmi!r}, but must be 2, 3 or None for both")
     draws.check_whole_number("trials", trials, 1)
     draws.check_whole_number("seed", seed)
     store.check(path, force)
     known = what if isinstance(what, Scenario) else scenarios.read(what)
     source = "a scenario" if isinstance(what, Scenario) else Path(what).name
-    made = Controller(known, identifier(name or ("flight" if isinstance(what, Scenario) else Path(what).stem)), source)
+    stem = identifier(name or ("flight" if isinstance(what, Scenario) else Path(what).stem))
+    made = Controller(known, stem, source, reference_input)
     with store.in_use(path, force=force):
-        store.write(path, lambda making: write(making, made, seed, trials))
+        store.write(path, lambda making: write(making, made, seed, trials, wanted))
     return path

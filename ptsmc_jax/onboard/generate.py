@@ -58,7 +58,7 @@ class Code:
 def generate(board: Board) -> Code:
     """Return the C of a flight computer. Raises NoRuleError if an operation has no counterpart in C."""
     known, structs = parameters.parameters(board), _structs(board)
-    known.used.add("period")
+    known.used.update(board.always)
     inputs, state, outputs = map(_listed, structs.values())
     code = Code([], {}, inputs, state, outputs)
     for stage in board.stages:

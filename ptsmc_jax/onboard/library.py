@@ -63,6 +63,7 @@ class Library:
             layout = json.loads((self.folder / sources.LAYOUT).read_text(encoding="utf-8"))
             self.name, self.digest, self.columns = layout["name"], layout["digest"], layout["columns"]
             self.period = float(layout["period"])  # [s]
+            self.reference_input = bool(layout.get("reference_input", False))
             self.parts = dict(layout.get("parts", {}))  # as `Board.parts`; empty in earlier versions
             sizes = [len(self.columns[kind]) for kind in ("in", "out", "state", "params")]
             if not re.fullmatch(r"\w+", self.name, re.ASCII):
@@ -173,7 +174,7 @@ class InTheLoop:
 
     def __init__(self, library: Library, parts: Parts, dispersion: Dispersion | None = None):
         """Check the controller. Raises ScenarioError if it has other parts, or cannot have the dispersions."""
-        self.library, self.board, self.nominal = library, board(parts), parts
+        self.library, self.board, self.nominal = library, board(parts, library.reference_input), parts
         mine = names_of(self.board)
         for kind, said in (("in", "inputs"), ("out", "outputs"), ("state", "state")):
             if library.columns[kind] != mine[kind]:
@@ -279,10 +280,11 @@ class InTheLoop:
         """
         (now, dt_before, *_), (sensing, state, counts) = period, computer.sensors
         inputs, sensing = parts.sensors.inputs(sensing, x, now, dt_before, star_x)
-        inputs |= {"wheel_momentum": acting.h, "acting": acting.v}
+        inputs |= {"wheel_momentum": acting.h, "acting": acting.v, "reference": parts.reference(now.t)}
         if computer.applied is not None:
             inputs["applied"] = computer.applied[0]
-        row = jnp.concatenate([now.t[None], *(jnp.ravel(inputs[name]) for name in self.board.inputs)])
+        leaves = jax.tree.leaves([inputs[name] for name in self.board.inputs])
+        row = jnp.concatenate([now.t[None], *map(jnp.ravel, leaves)])
         after, out, status = self.library.called(state, row, self._told(parts))
         has_length = period.length > 0.0
         after = jnp.where(has_length, after, state)

@@ -17,7 +17,8 @@ LONGEST = 90  # characters of an expression inside another expression
 RESERVED = set(
     "auto break case char const continue default do double else enum extern float for goto if inline int long register "
     "restrict return short signed sizeof static struct switch typedef union unsigned void volatile while real R in p d "
-    "out before now y0 y1 yn j0 j1 jn gamma main index div abs larger smaller sign_of resolution NAN INFINITY".split()
+    "out before now y0 y1 yn j0 j1 jn gamma main index div abs larger smaller sign_of resolution NAN INFINITY "
+    "threefry erf_inv".split()
 )
 # of math.h: a variable of this name would hide the function
 MATH = ("acos acosh asin asinh atan atan2 atanh cbrt ceil cos cosh erf erfc exp exp2 expm1 fabs floor fmod lgamma log "
@@ -27,6 +28,7 @@ INFIX = {"add": ("+", 12), "sub": ("-", 12), "mul": ("*", 13), "div": ("/", 13),
          "le": ("<=", 10), "gt": (">", 10), "ge": (">=", 10), "eq": ("==", 9), "ne": ("!=", 9), "and": ("&&", 5),
          "or": ("||", 4)}  # fmt: skip
 PLAIN = {"max": "larger", "min": "smaller", "sign": "sign_of"}  # helper functions in C, by operation
+CALLED = ("threefry", "erf_inv")  # further helper functions in C, with the names of their operations
 # integer types: format of a constant, and the least real number that is too large
 WHOLE = {"int32_t": ("{}", "2147483648"), "int64_t": ("{}", "9223372036854775808.0"),
          "uint32_t": ("{}u", "4294967296")}  # fmt: skip
@@ -307,6 +309,8 @@ class Printer:
         listed = ", ".join(self.text(arg) for arg in node.args)
         if node.op in PLAIN:
             return f"{PLAIN[node.op]}{_suffix(node.kind)}({listed})", ATOM
+        if node.op in CALLED:
+            return f"{node.op}({listed})", ATOM
         if node.op == "abs" and node.kind != REAL:
             return f"larger{_suffix(node.kind)}({listed}, -{self._at_least(node.args[0], UNARY + 1)})", ATOM
         if node.op == "isfinite":

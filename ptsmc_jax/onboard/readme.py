@@ -26,14 +26,12 @@ def readme(code: Code, about: About) -> str:
         deriving=f" After a change of parameters, and in `ptsmc_init`, {deriving} more." if deriving else "",
         stack=stack(code),
         derived=_derived(code),
-        motors=" and `ArrayMotorTorqueMsg` (the torque on a wheel is minus `wheel_torque`)" if about.wheels else "",
     )
 
 
 def _delay(about: About) -> str:
     periods = f"{about.delay} control period{'s' if about.delay != 1 else ''}"
-    wheels = filled("delay_wheels.md").rstrip() if about.wheels else ""
-    return filled("delay.md", delay=periods, wheels=wheels).rstrip()
+    return filled("delay.md", delay=periods).rstrip()
 
 
 def _counted(counts: Mapping[str, int]) -> str:

@@ -125,7 +125,7 @@ def _one_over(pool: Pool, x: Node) -> Node:
 
 ELEMENTWISE: dict[str, Callable] = {
     **{op: _plain(op) for op in "add sub mul neg max min abs sign lt le gt ge eq ne sqrt cbrt exp exp2 expm1 log log1p "
-       "lgamma sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh erf erfc nextafter floor ceil"
+       "lgamma sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh erf erfc erf_inv nextafter floor ceil"
        .split()},
     **{f"{op}_to": _plain(op) for op in ("lt", "le", "eq")},
     "is_finite": lambda pool, params, kind, x: pool.make("isfinite", x, kind=BOOL),

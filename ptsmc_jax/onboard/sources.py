@@ -5,12 +5,12 @@ import shutil
 from pathlib import Path
 
 LAYOUT = "controller.json"
-CHECKS = ("check.c", "fuzz.c")  # separate programs
+OTHERS = ("check.c", "fuzz.c", "udp.c", "rows.c")  # separate programs
 
 
 def listed(folder: Path) -> list[Path]:
     """Return these files by name, including files that the user has added."""
-    code = {*folder.glob("*.c"), *folder.glob("*.h")} - {folder / name for name in CHECKS}
+    code = {*folder.glob("*.c"), *folder.glob("*.h")} - {folder / name for name in OTHERS}
     return sorted(path for path in {*code, *folder.glob(LAYOUT)} if path.is_file())  # no lock of an editor
 
 

@@ -25,7 +25,11 @@ STATUS = {
     "OVERFLOW": "a result is not finite: the last good output; nothing is kept",
 }
 # columns of vectors.csv whose rounding errors are compared with the largest number of the whole group
-TORQUES, RATES = ("d_hat", "observer", "command", "torque"), ("rate", "bias", "gyro")
+TORQUES, RATES = ("d_hat", "observer", "command", "torque", "sent"), ("rate", "bias", "gyro")
+
+
+# files beside the controller
+PROGRAMS = ("check.c", "fuzz.c", "Makefile", "udp.c", "udp.py", "rows.c", "basilisk.py")
 
 
 class About(NamedTuple):
@@ -37,7 +41,6 @@ class About(NamedTuple):
     law: str  # class name of the law
     filtered: bool  # whether there is an attitude filter
     largest: float  # largest accepted size of a measured number
-    wheels: bool  # whether there are reaction wheels
     delay: int  # delay of the commands in control periods
     steepness: float  # growth of the gains until the hand-over, at least (t_f / time to go of the last sample)^2
 
@@ -75,11 +78,40 @@ def texts(code: Code, about: About) -> dict[str, str]:
     """Return the text of each file of a controller, by file name, except for README.md and tables of numbers."""
     stem = f"ptsmc_{about.name}"
     files = {f"{stem}.h": "controller.h", f"{stem}.c": "controller.c", f"{stem}_parameters.c": "parameters.c",
-             f"{stem}_flat.h": "flat.h", "check.c": "check.c", "fuzz.c": "fuzz.c", "Makefile": "Makefile"}  # fmt: skip
+             f"{stem}_flat.h": "flat.h"} | {name: name for name in PROGRAMS}  # fmt: skip
     origin = {"name": about.name, "upper": about.name.upper(), "scenario": about.scenario, "digest": about.digest,
               "law": about.law}  # fmt: skip
-    values = origin | _structs(code, about) | _checks(code, about) | _step(code) | _rows(code, about)
+    values = origin | _structs(code, about) | _checks(code, about) | _step(code) | rows(code, about)
+    values["head"] = filled("head.c", name=about.name, functions=values["functions"]).rstrip()
     return {name: filled(file, **values) for name, file in files.items()}
+
+
+def plant_texts(code: Code, about: About) -> dict[str, str]:
+    """Return the text of each file of a plant in C, by file name."""
+    stem, call = f"ptsmc_{about.name}", code.calls
+    values = {"name": about.name, "upper": about.name.upper(), "scenario": about.scenario, "digest": about.digest}
+    functions = "\n".join([*_helpers(code), "\n\n".join(code.functions)])
+    head = filled("head.c", name=about.name, functions=functions).rstrip()
+    values |= _structs(code, about) | {
+        "head": head,
+        "derive": "    derive(p, &state->derived);" if code.derived else "",
+        "keep": "    now.derived = state->derived;" if code.derived else "",
+        "begin": call["begin"],
+        "advance": call["advance"],
+        "usable": _all([_called("all_finite", field, "in->") for field in _reals(code.inputs)]),
+        "sound": _all([_called("all_finite", field, "now.") for field in _reals(code.state)]),
+        "unused": "" if code.derived or "(p" in call["begin"] + call["advance"] else "    (void)p;",
+        "derivation": f"\n{code.derivation}" if code.derived else "",
+    }
+    files = {f"{stem}.h": "plant.h", f"{stem}.c": "plant.c"}
+    return {name: filled(file, **values) for name, file in files.items()}
+
+
+def _helpers(code: Code) -> list[str]:
+    """Return the helper functions that the code calls, and the declaration of `derive`."""
+    text = "\n".join([*code.functions, code.derivation])
+    ahead = ["static void derive(const ptsmc_params *p, ptsmc_derived *d);\n"] if code.derived else []
+    return [*(helper for name, helper in HELPERS.items() if f"{name}(" in text), *ahead]
 
 
 def members(fields: Iterable[Field]) -> str:
@@ -132,6 +164,7 @@ def _checks(code: Code, about: About) -> dict[str, str]:
     usable += ["rotation(in->attitude)"] if "attitude" in names and not sensors else _attitudes(sensors)
     usable += [f"(in->{field.name}_valid == 0 || isfinite(in->{field.name}_age))"
                for field in sensors if f"{field.name}_age" in names]  # fmt: skip
+    usable += ["rotation(in->reference_q)"] if "reference_q" in names else []
     usable += ["turn < R(1)"] if turning else []
     sound = [_called("all_finite", field, "now->") for field in _reals(code.state)]
     sound += [_called("all_finite", field, "out->") for field in code.outputs]
@@ -178,9 +211,7 @@ def _all(terms: Sequence[str]) -> str:
 
 def _step(code: Code) -> dict[str, str]:
     """Return the values of the rest of the program: functions of the stages, `ptsmc_init` and `ptsmc_step`."""
-    stages, call = "\n\n".join(code.functions), code.calls
-    helpers = [text for name, text in HELPERS.items() if f"{name}(" in stages + code.derivation]
-    ahead = ["static void derive(const ptsmc_params *p, ptsmc_derived *d);\n"] if code.derived else []
+    call = code.calls
     arguments = re.findall(r"\w+", " ".join(call.values()))
     derive = "    derive(p, &state->derived);" if code.derived else ""
     least = number(run_state.SINGULAR_DISTANCE, REAL)
@@ -188,7 +219,7 @@ def _step(code: Code) -> dict[str, str]:
                 "    if (!now.tracking) {\n        status = PTSMC_SINGULAR;\n    }")  # fmt: skip
     saturated = f"    if ({call.get('act')} && status == PTSMC_OK) {{\n        status = PTSMC_SATURATED;\n    }}"
     return {
-        "functions": "\n".join([*helpers, *ahead, stages]),
+        "functions": "\n".join([*_helpers(code), "\n\n".join(code.functions)]),
         "derivation": f"\n{code.derivation}" if code.derived else "",  # long, and not what a reader looks for
         "derive": derive,
         "derive_again": f"    if (!current(p, &state->derived)) {{\n    {derive}\n    }}" if derive else "",
@@ -204,7 +235,7 @@ def _step(code: Code) -> dict[str, str]:
     }
 
 
-def _rows(code: Code, about: About) -> dict[str, str | int]:
+def rows(code: Code, about: About) -> dict[str, str | int]:
     """Return the values of the flat header and of the programs that check the controller by rows of numbers."""
     columns = code.columns
     every = (*code.inputs, *code.state, *code.outputs, *code.parameters)

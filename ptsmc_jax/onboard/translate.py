@@ -18,7 +18,7 @@ from ptsmc_jax.batching import components
 from ptsmc_jax.batching.components import object_array
 from ptsmc_jax.batching.dependence import called_jaxpr, open_jaxpr
 from ptsmc_jax.batching.lapack import COUNTED, SHARED
-from ptsmc_jax.numerics import elementary
+from ptsmc_jax.numerics import draws, elementary
 from ptsmc_jax.onboard import origins
 from ptsmc_jax.onboard.control import CONTROL
 from ptsmc_jax.onboard.expressions import BOOL, Node, NoRuleError, Pool, Title, kind_of
@@ -98,6 +98,10 @@ class Translator:
             ours = getattr(debug_info, "func_filename", None) == elementary.__file__
             if known is not None and ours and len(eqn.outvars) == 1:
                 return [self._each(lambda *entry: self.pool.make(known, *entry), values, eqn.outvars[0].aval.shape)]
+        if _is_threefry(eqn):
+            word = [self.pool.constant(k, "int32_t") for k in (0, 1)]
+            return [self._each(lambda *entry, k=k: self.pool.make("threefry", *entry, k, kind="uint32_t"),
+                               values, eqn.outvars[0].aval.shape) for k in word]  # fmt: skip
         if inner is not None:
             outer, self.held = self.held, where
             results = self.evaluate(inner, values)
@@ -292,6 +296,13 @@ class Translator:
                 both: Any = total[at], more[index]
                 total[at] = self.pool.make(_ADDS[eqn.primitive.name], *both, kind=kind_of(types[0]))
         return total
+
+
+def _is_threefry(eqn: Any) -> bool:
+    """Return whether an equation is a call of `draws.threefry`, whose integers of 64 bits C does not need."""
+    jaxpr = getattr(eqn.params.get("jaxpr"), "jaxpr", None)
+    info = getattr(jaxpr, "debug_info", None)
+    return getattr(info, "func_filename", None) == draws.__file__ and eqn.params.get("name") == "threefry"
 
 
 def _numbering(eqn: Any) -> Any:

@@ -34,6 +34,7 @@ class Samples(NamedTuple):
     applied: Array  # mean torque over the last period [N m].
     acting: Array | None  # torque of the channels [N m].
     momentum: Array | None  # momentum of the wheels [N m s].
+    target: Any  # reference.
     seen: Any  # measured state.
     observer: Any  # memory of the observer.
     law: Any  # memory of the law.
@@ -41,6 +42,7 @@ class Samples(NamedTuple):
     queue: Array | None  # delayed commands [N m].
     d_hat: Array  # estimated disturbance [N m].
     command: Array  # command of the law [N m].
+    sent_torque: Array  # torque that is sent to the actuators [N m].
     s: Array  # sliding variable.
     error: Array  # error of the measured state.
     torque: Array  # torque on the body from this sample on [N m].
@@ -78,9 +80,11 @@ def simulate(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Sam
             t=now.t, simulated=now.t_next > now.t, inputs=inputs,
             before=sensors.remembered(sensing), after=sensors.remembered(computer.sensors),
             applied=state.applied[0], acting=state.actuators.v, momentum=state.actuators.h,
-            seen=computer.seen, observer=computer.observer,
+            target=target, seen=computer.seen, observer=computer.observer,
             law=computer.law, command_filter=computer.command_filter, queue=after.actuators.queue,
-            d_hat=d_hat, command=u, s=s, error=law.kinematics.errors(computer.seen, target)[0],
+            d_hat=d_hat, command=u, s=s,
+            sent_torque=parts.actuators.send(state.actuators, u, record.decision.w)[0],
+            error=law.kinematics.errors(computer.seen, target)[0],
             torque=drive.c if wheels is None else wheels.axes @ drive.c,
             wheel_torque=None if wheels is None else drive.c, limited=drive.limited,
             singularity_distance=distance / unit, singularity_distance_unit=unit,
@@ -141,13 +145,16 @@ def one(samples: Samples, trial: int) -> Samples:
 
 def rows(board: Board, samples: Samples) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return inputs, outputs and state of one trial, (samples, columns) each, in the order of `generate.columns`."""
-    inputs = samples.inputs | {"wheel_momentum": samples.momentum, "applied": samples.applied, "acting": samples.acting}
+    inputs = samples.inputs | {"wheel_momentum": samples.momentum, "applied": samples.applied,
+                               "acting": samples.acting, "reference": samples.target}  # fmt: skip
     state_by_name = {**samples.after, **board.model.signals_of(samples.seen), "observer": samples.observer,
                      "law": samples.law, "queue": samples.queue, "command_filter": samples.command_filter,
                      "wheel_momentum": samples.momentum, "acting": samples.acting,
                      "singularity_distance": samples.singularity_distance,
-                     "singularity_distance_unit": samples.singularity_distance_unit}  # fmt: skip
-    outputs_by_name = {name: getattr(samples, name) for name in ("d_hat", "command", "s", "torque", "wheel_torque")}
+                     "singularity_distance_unit": samples.singularity_distance_unit,
+                     "reference": getattr(samples.target, "q", None)}  # fmt: skip
+    names = ("d_hat", "command", "s", "sent_torque", "torque", "wheel_torque")
+    outputs_by_name = {name: getattr(samples, name) for name in names}
     one = np.ones_like(samples.t)
     outputs = _columns(board.outputs, outputs_by_name)
     state = np.column_stack([samples.t, one, one, _columns(board.state, state_by_name), outputs])

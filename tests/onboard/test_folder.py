@@ -18,7 +18,7 @@ from ptsmc_jax import scenario
 from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.onboard import folder, templates
 from ptsmc_jax.onboard.board import board
-from ptsmc_jax.onboard.library import compiler
+from ptsmc_jax.onboard.library import Library, compiler
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.law_tables import LAWS
 from ptsmc_jax.simulation import run_state
@@ -225,6 +225,33 @@ def test_check_starts_each_sample_from_the_simulated_state(exported, tmp_path):
     done = make(place, "check", QUICK)
     assert done.returncode != 0
     assert "130 samples; other status: 1;" in done.stdout
+
+
+@needs_make
+def test_reference_as_an_input_replays_the_simulation(tmp_path):
+    """The reference of the vectors moves. Its quaternion may change its sign from sample to sample."""
+    made = scenario.reading.complete(scenario.from_tables(FLIGHTS["slew"]))
+    place = folder.export(made, tmp_path / "controller", name="led", trials=1, reference_input=True)
+    done = make(place, "check", QUICK)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "65 samples; other status: 0" in done.stdout
+    library = Library(place, options=("-O0",))
+    first = library.columns["in"].index("reference_q[0]")
+    with (place / "vectors.csv").open() as file:
+        _, *rows = csv.reader(file)
+    given = np.array([row[3 : 3 + len(library.columns["in"])] for row in rows[1:]], float)
+    assert np.ptp(given[:, first + 2]) > 0.3
+    states, found = [library.first(), library.first()], []
+    for k, row in enumerate(given):
+        other = row.copy()
+        other[first : first + 4] *= (-1.0) ** k
+        for j, one in enumerate((row, other)):
+            states[j], out, status = library.many(states[j], one)
+            found.append(out)
+            assert status == 0
+        assert found[-1].tobytes() == found[-2].tobytes()
+    row[first : first + 4] = 0.1  # not a rotation
+    assert library.many(states[0], row)[2] == 4
 
 
 @needs_make

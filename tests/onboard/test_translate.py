@@ -6,8 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.special
 
-from ptsmc_jax.numerics import attitude, elementary, guards, matrices
+from ptsmc_jax.numerics import attitude, draws, elementary, guards, matrices
 from ptsmc_jax.onboard.fields import struct
 from ptsmc_jax.onboard.translate import NoRuleError
 from tests.onboard.compiled import body, both, needs_compiler
@@ -175,6 +176,19 @@ FUNCTIONS = {
         ),
         X,
     ),
+    "random words": (
+        lambda k: tuple(draws.threefry(draws.Key(k, k + jnp.uint32(9)), (jnp.uint32(4_000_000_000), k))),
+        np.uint32(7),
+    ),
+    "random numbers": (
+        lambda k: (
+            draws.uniforms(draws.stream(k, 3, "a"), 3, k),
+            draws.normals(draws.stream(5, k, "b"), 5, k - 8),
+            draws.streams(k, 2, ["c", "d"])[1].b,
+        ),
+        np.uint32(7),
+    ),
+    "inverse of erf": (lambda x: jax.lax.erf_inv(x), np.array([-0.9, -0.3, -1e-9, 0.0, 1e-5, 0.49, 0.51, 0.99])),
     "counted loop": (counted, X),
     "loop over a table": (gone_through, X),
     "loop backwards": (backwards, X),
@@ -204,6 +218,13 @@ def test_a_function_in_c_equals_the_function_in_jax(name, tmp_path):
     found, expected = both(tmp_path, function, *args)
     # a few rounding errors of numbers of order one
     np.testing.assert_allclose(found, expected, rtol=2e-15, atol=2e-15)
+
+
+@needs_compiler
+def test_inverse_of_erf_is_accurate_next_to_its_poles(tmp_path):
+    """At 0.999999 the function of XLA is off by 1.5e-12."""
+    x = np.array([-0.999999, 1.0 - 1e-9, 1.0 - 1e-15, 1.0, -1.0, 2.0])
+    np.testing.assert_allclose(both(tmp_path, jax.lax.erf_inv, x)[0], scipy.special.erfinv(x), rtol=1e-14)
 
 
 def text(function, *args):

@@ -3,7 +3,7 @@
 import shlex
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
@@ -31,6 +31,17 @@ def export(
     name: Annotated[str | None, Parameter(help="Name of the C files; default: the name of the scenario file.")] = None,
     trials: Annotated[int, whole("Trials in vectors.csv, 1 to 100.", 1, 100)] = 3,
     seed: Seed = 0,
+    reference_input: Annotated[
+        bool, Parameter(negative="", help="Make the reference an input instead of a function of time in the C.")
+    ] = False,
+    fmu: Annotated[bool, Parameter(negative="", help="Write the controller as an FMU, too.")] = False,
+    fmu_plant: Annotated[
+        bool, Parameter(negative="", help="Write the true plant with actuators and sensors as an FMU, too.")
+    ] = False,
+    fmi: Annotated[Literal[2, 3] | None, Parameter(help="Version of FMI; default: a file for each.")] = None,
+    no_binary: Annotated[
+        bool, Parameter(negative="", help="Write FMUs without a binary for this machine; sources only.")
+    ] = False,
     trust: Trust = False,
     force: Force = False,
     quiet: Quiet = False,
@@ -44,9 +55,11 @@ def export(
     from ptsmc_jax.onboard import folder as controllers
     from ptsmc_jax.onboard import templates
 
-    controller = controllers.Controller(loaded, controllers.identifier(name or scenario.stem), scenario.name)
+    stem = controllers.identifier(name or scenario.stem)
+    controller = controllers.Controller(loaded, stem, scenario.name, reference_input)
+    wanted = controllers.Wanted(fmu, fmu_plant, fmi, not no_binary)
     with store.in_use(folder, force=force):
-        store.write(folder, lambda making: controllers.write(making, controller, seed, trials))
+        store.write(folder, lambda making: controllers.write(making, controller, seed, trials, wanted))
     if not quiet:
         costs = ", ".join(f"{n} {what}" for what, n in templates.operations(controller.code.counts).items() if n)
         check = f"make -C {shlex.quote(str(folder))} check"

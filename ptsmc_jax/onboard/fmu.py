@@ -1,0 +1,282 @@
+"""Functional mock-up units (FMI 2.0 and 3.0, co-simulation) of an exported controller or plant. Read `write` first."""
+
+import hashlib
+import math
+import platform
+import re
+import subprocess
+import sys
+import tempfile
+import zipfile
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+
+from ptsmc_jax.onboard import templates
+from ptsmc_jax.onboard.expressions import REAL
+from ptsmc_jax.onboard.fields import Field
+from ptsmc_jax.onboard.generate import Code
+from ptsmc_jax.onboard.library import compiler
+from ptsmc_jax.onboard.templates import STATUS, About
+from ptsmc_jax.scenario.errors import ScenarioError
+
+VERSIONS = (2, 3)
+NEAR = 1e-3  # communication points count as equal within this fraction of a period
+OPTIONS = ("-std=c99", "-O2", "-fPIC", "-shared", "-fvisibility=hidden")
+TYPES = {2: {"r": "Real", "i": "Integer", "u": "Integer"}, 3: {"r": "Float64", "i": "Int32", "u": "UInt32"}}
+# exponents of the base units in each unit that a description may contain
+UNITS = {"rad": {"rad": 1}, "s": {"s": 1}, "m": {"m": 1}, "kg": {"kg": 1}, "N": {"kg": 1, "m": 1, "s": -2}, "1": {}}
+FILTER_STATE = ("attitude", "bias", "gyro", "past_attitude", "past_rate")  # may be set before the first sample
+
+
+class Unit(NamedTuple):
+    """A physical unit."""
+
+    name: str  # such as "N.m"
+    exponents: dict[str, int]  # of the base units
+
+
+class Variable(NamedTuple):
+    """A variable of an FMU. Its value reference is its index in the list of all variables."""
+
+    name: str
+    kind: str  # "r" real, "i" integer or "u" unsigned integer
+    role: str  # "i" input, "o" output, "f" fixed parameter, "t" tunable parameter or "c" constant
+    start: float
+    about: str
+
+    @property
+    def unit(self) -> Unit | None:
+        """The unit in the description, or None without exactly one unit."""
+        found = re.findall(r"\[([^\]]+)\]", self.about)
+        return unit(found[0]) if len(found) == 1 and self.kind == "r" else None
+
+
+class Model(NamedTuple):
+    """A program in C as the model of an FMU."""
+
+    code: Code
+    about: About  # its `name` is that of the C files
+    title: str  # such as "controller of first_flight.toml"
+    texts: dict[str, str]  # text of each C file, by file name
+    t_end: float  # end of the run [s]
+    filter_state: Sequence[Field] = ()  # parts of the state that can be set before the first sample
+    plant: bool = False  # whether it is the plant: its samples are at the end of a step, and its parameters are fixed
+
+    @property
+    def period(self) -> float:
+        """The control period [s]."""
+        return float(self.code.values["period"])
+
+
+def unit(text: str) -> Unit | None:
+    """Return the unit of a text such as "N m/s^2", or None if it is not a product of integer powers of known units."""
+    exponents, names = dict[str, int](), list[str]()
+    for k, part in enumerate(text.split("/")):
+        for token in part.split():
+            found = re.fullmatch(r"([A-Za-z]+|1)(?:\^(\d+))?", token)
+            if found is None or found[1] not in UNITS:
+                return None
+            power = int(found[2] or 1)
+            for base, exponent in UNITS[found[1]].items():
+                exponents[base] = exponents.get(base, 0) + (-1 if k else 1) * exponent * power
+        names.append(".".join(part.replace("^", "").split()))
+    return Unit("/".join(names), {base: power for base, power in exponents.items() if power})
+
+
+def variables(model: Model) -> list[Variable]:
+    """Return the variables of an FMU in the order of their value references."""
+    code = model.code
+
+    def listed(fields: Iterable[Field], role: str, values: dict[str, Any], prefix: str = "") -> Iterable[Variable]:
+        for field in fields:
+            kind = {REAL: "r", "uint32_t": "u"}.get(field.kind, "i")
+            own = role
+            if role == "t" and (field.name == "period" or model.plant):
+                own = "c" if field.name == "period" and model.plant else "f"
+            start = np.broadcast_to(values.get(field.name, _rest(field)), field.shape)
+            for index in np.ndindex(*field.shape):
+                at = f"[{','.join(str(k + 1) for k in index)}]" if index else ""
+                yield Variable(f"{prefix}{field.name}{at}", kind, own, float(start[index]), _meaning(field.about))
+
+    statuses = ", ".join(f"{k} {name.lower()}" for k, name in enumerate(STATUS))
+    taken = {field.name for field in (*code.inputs, *code.outputs)}
+    zeros = {field.name: 0.0 for field in (*model.filter_state, *code.outputs)}
+    return [
+        *listed(code.inputs, "i", {}),
+        *listed(code.outputs, "o", zeros),
+        Variable("status", "i", "o", 0.0, f"of the last sample: {statuses}"),
+        *listed(model.filter_state, "f", zeros, "initial_"),
+        *(made for field in code.parameters
+          for made in listed([field], "t", code.values, "nominal_" if field.name in taken else "")),
+    ]  # fmt: skip
+
+
+def _meaning(about: str) -> str:
+    """Return the meaning of a field without its shape and its default value in a scenario."""
+    text = re.sub(r"^\([^)]*,[^)]*\)\s*", "", " ".join(about.split()))
+    return re.sub(r"; default: [^[]*(?=\[)", " ", text)
+
+
+def _rest(field: Field) -> Any:
+    """Return the start value of an input: the identity for a quaternion, otherwise zero."""
+    return [0.0, 0.0, 0.0, 1.0] if field.shape == (4,) and "wheel" not in field.name else 0.0
+
+
+def sources(model: Model, version: int) -> dict[str, str]:
+    """Return the texts of the C files of an FMU, by file name, the translation units first."""
+    code, listed = model.code, variables(model)
+    rows = templates.rows(code, model.about)
+    elements = [element for field in model.filter_state for element in field.elements()]
+    lines = [f"    m->state.{element} = (ptsmc_real)m->v[FIRST_START + {k}];" for k, element in enumerate(elements)]
+    first = len(listed) - len(code.columns["params"])
+    values = {
+        "name": model.about.name,
+        "inputs": len(code.columns["in"]) - 1,
+        "outputs": len(code.columns["out"]),
+        "parameters": len(code.columns["params"]),
+        "starts": len(elements),
+        "at_end": int(model.plant),
+        "near": repr(NEAR),
+        "kinds": _strings(variable.kind for variable in listed),
+        "roles": _strings(variable.role.replace("c", "o") for variable in listed),  # neither can be set
+        "values": "\n".join(f"    {_number(variable.start)}," for variable in listed),
+        "filter": "\n".join(lines),
+        "period": first + code.columns["params"].index("period"),
+        "rejected": "a sample was rejected, see the output status",
+        **{name: rows[name] for name in ("in_from", "params_from", "out_to")},
+    }
+    texts = {f"fmi{version}.c": templates.filled(f"fmi{version}.c"), **model.texts}
+    header = templates.filled("fmu.h", token="${token}", **values)
+    token = hashlib.sha256("".join([*texts.values(), header]).encode()).hexdigest()
+    texts["fmu.h"] = header.replace("${token}", token)
+    return {name: templates.prefixed(text, model.about.name) for name, text in texts.items()}
+
+
+def _strings(letters: Iterable[str]) -> str:
+    """Return a C string of letters, 100 on a line."""
+    text = "".join(letters)
+    return "\n".join(f'    "{text[k : k + 100]}"' for k in range(0, len(text), 100))
+
+
+def _number(value: float) -> str:
+    return repr(value) if math.isfinite(value) else "INFINITY" if value > 0.0 else "-INFINITY"
+
+
+def description(model: Model, version: int, token: str, units: Sequence[str]) -> str:
+    """Return modelDescription.xml.
+
+    Args:
+        model: the model.
+        version: version of FMI.
+        token: checksum that the binary compares.
+        units: names of the C files that are compiled.
+    """
+    listed = variables(model)
+    found = {one.name: one for one in (variable.unit for variable in listed) if one is not None}
+    bases = {
+        name: "".join(f' {base}="{power}"' for base, power in one.exponents.items()) for name, one in found.items()
+    }
+    outputs = [k for k, variable in enumerate(listed) if variable.role == "o"]
+    unknown = '    <Output valueReference="{}"/>', '    <InitialUnknown valueReference="{}"/>'
+    if version == 2:
+        outputs = [k + 1 for k in outputs]
+        unknown = ('      <Unknown index="{}"/>',) * 2
+    made = {
+        "title": model.title,
+        "token": token,
+        "about": f"{model.title}, one sample every {model.period:g} s",
+        "identifier": identifier(model),
+        "sources": "\n".join(f'      <File name="{name}"/>' for name in units),
+        "units": "\n".join(f'    <Unit name="{name}"><BaseUnit{text}/></Unit>' for name, text in bases.items()),
+        "stop": f"{model.t_end:g}",
+        "step": repr(model.period),
+        "variables": "\n".join(_variable(variable, k, version) for k, variable in enumerate(listed)),
+        "outputs": "\n".join(unknown[0].format(k) for k in outputs),
+        "unknowns": "\n".join(unknown[1].format(k) for k in outputs),
+    }
+    plain = ("sources", "units", "variables", "outputs", "unknowns")
+    made = {name: text if name in plain else quoteattr(text)[1:-1] for name, text in made.items()}
+    if version == 3:
+        time = f'    <Float64 name="time" valueReference="{len(listed)}" causality="independent" unit="s"/>'
+        made["variables"] += "\n" + time
+        made.pop("sources")
+    return templates.filled(f"fmi{version}.xml", **made)
+
+
+def _variable(variable: Variable, reference: int, version: int) -> str:
+    """Return the element of a variable."""
+    causality = {"i": "input", "o": "output", "c": "local"}.get(variable.role, "parameter")
+    variability = {"f": "fixed", "t": "tunable", "c": "constant"}.get(variable.role)
+    variability = variability or ("continuous" if variable.kind == "r" else "discrete")
+    named = f'name="{variable.name}" valueReference="{reference}" causality="{causality}" variability="{variability}"'
+    named += f" description={quoteattr(variable.about)}" if variable.about else ""
+    values = "" if variable.unit is None else f' unit="{variable.unit.name}"'
+    if variable.role != "o":
+        values += f' start="{variable.start!r}"' if variable.kind == "r" else f' start="{int(variable.start)}"'
+    if version == 3:
+        return f"    <{TYPES[3][variable.kind]} {named}{values}/>"
+    return f"    <ScalarVariable {named}><{TYPES[2][variable.kind]}{values}/></ScalarVariable>"
+
+
+def identifier(model: Model) -> str:
+    """Return the model identifier, which is the name of the binary."""
+    return f"ptsmc_{model.about.name}"
+
+
+def place(version: int) -> str:
+    """Return the path of the binary for this machine, without its name, and with its suffix after a colon."""
+    system = {"darwin": "darwin", "win32": "windows"}.get(sys.platform, "linux")
+    machine = {"amd64": "x86_64", "arm64": "aarch64"}.get(platform.machine().lower(), platform.machine().lower())
+    folder = f"{machine}-{system}"
+    if version == 2 and machine == "x86_64":
+        folder = {"linux": "linux64", "windows": "win64", "darwin": "darwin64"}[system]
+    return f"binaries/{folder}/:{ {'linux': '.so', 'windows': '.dll', 'darwin': '.dylib'}[system] }"
+
+
+def write(file: Path, model: Model, version: int, *, binary: bool = True) -> None:
+    """Write an FMU.
+
+    Args:
+        file: the new file.
+        model: the model.
+        version: version of FMI, 2 or 3.
+        binary: whether to compile it for this machine; the sources are always in the file.
+
+    Raises:
+        ScenarioError: if there is no C compiler, and a binary is asked for.
+    """
+    texts = sources(model, version)
+    units = [name for name in texts if name.endswith(".c")]
+    token = re.findall(r'#define TOKEN "(\w+)"', texts["fmu.h"])[0]
+    content: dict[str, str | bytes] = {f"sources/{name}": text for name, text in texts.items()}
+    content["modelDescription.xml"] = description(model, version, token, units)
+    if version == 3:
+        listed = "\n".join(f'      <SourceFile name="{name}"/>' for name in units)
+        content["sources/buildDescription.xml"] = templates.filled(
+            "build.xml", identifier=identifier(model), sources=listed
+        )
+    if binary:
+        folder, _, suffix = place(version).partition(":")
+        content[f"{folder}{identifier(model)}{suffix}"] = compiled(texts, units)
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in content.items():
+            info = zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0))  # the same content gives the same file
+            info.compress_type, info.external_attr = zipfile.ZIP_DEFLATED, 0o644 << 16
+            archive.writestr(info, data)
+
+
+def compiled(texts: dict[str, str], units: Sequence[str]) -> bytes:
+    """Return the shared library of these C files. Raises ScenarioError without a compiler."""
+    command = compiler()
+    with tempfile.TemporaryDirectory(prefix="ptsmc-") as made:
+        for name, text in texts.items():
+            (Path(made) / name).write_text(text, encoding="utf-8")
+        run = [*command, *OPTIONS, *units, "-o", "binary", "-lm"]
+        done = subprocess.run(run, cwd=made, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise ScenarioError(f"the C compiler {command[0]} fails: {done.stderr.strip().splitlines()[:1]}")
+        return (Path(made) / "binary").read_bytes()

@@ -1,0 +1,86 @@
+"""FMUs in FMPy, and a master that steps a controller and a plant one after the other."""
+
+import tempfile
+
+import fmpy
+from fmpy.fmi2 import FMU2Slave
+from fmpy.fmi3 import FMU3Slave
+
+
+class Unit:
+    """An FMU that FMPy has loaded. Its variables are read and written by name."""
+
+    def __init__(self, file):
+        self.described = fmpy.read_model_description(str(file))
+        self.place = fmpy.extract(str(file), tempfile.mkdtemp(prefix="ptsmc-fmu-"))
+        self.of = {v.name: v for v in self.described.modelVariables}
+        self.three = self.described.fmiVersion.startswith("3")
+        self.period = float(self.described.defaultExperiment.stepSize)
+        self.unit = self.instance()
+
+    def instance(self):
+        """A new instance."""
+        made = (FMU3Slave if self.three else FMU2Slave)(
+            guid=self.described.guid, unzipDirectory=self.place, instanceName="unit",
+            modelIdentifier=self.described.coSimulation.modelIdentifier,
+        )  # fmt: skip
+        made.instantiate()
+        return made
+
+    def _of_type(self, names, prefix, unit):
+        """Groups of names by their type, with the function that reads or writes it."""
+        groups = {}
+        for name in names:
+            groups.setdefault(self.of[name].type, []).append(name)
+        return [(getattr(unit, f"{prefix}{kind}"), found) for kind, found in groups.items()]
+
+    def write(self, values, unit=None):
+        """Set variables."""
+        for function, names in self._of_type(values, "set", unit or self.unit):
+            function([self.of[name].valueReference for name in names], [values[name] for name in names])
+
+    def read(self, names, unit=None):
+        """Values of variables by name."""
+        found = {}
+        for function, some in self._of_type(names, "get", unit or self.unit):
+            found |= dict(zip(some, function([self.of[name].valueReference for name in some]), strict=True))
+        return {name: found[name] for name in names}
+
+    def begin(self, values=(), unit=None):
+        """Initialise an instance with these start values."""
+        unit = unit or self.unit
+        if self.three:
+            self.write(dict(values), unit)
+            unit.enterInitializationMode()
+        else:
+            unit.setupExperiment()
+            self.write(dict(values), unit)
+            unit.enterInitializationMode()
+        unit.exitInitializationMode()
+
+    def step(self, k, unit=None):
+        """Make step k, of one control period."""
+        (unit or self.unit).doStep(currentCommunicationPoint=k * self.period, communicationStepSize=self.period)
+
+    def names(self, causality):
+        """Names of the variables of this causality."""
+        return [v.name for v in self.described.modelVariables if v.causality == causality]
+
+
+def closed_loop(loop, count, parameters=()):
+    """Simulate `count` periods of controller and plant; return the plant's outputs and the commands at each sample."""
+    controller, plant = loop
+    plant.begin(parameters)
+    readings = plant.read(plant.names("output"))
+    controller.begin({name: readings[name] for name in controller.names("parameter") if name in readings})
+    given, sent = controller.names("input"), plant.names("input")
+    rows = []
+    for k in range(count):
+        controller.write({name: readings[name] for name in given})
+        controller.step(k)
+        commands = controller.read(controller.names("output"))
+        rows.append((readings, commands))
+        plant.write({name: commands[name] for name in sent})
+        plant.step(k)
+        readings = plant.read(plant.names("output"))
+    return rows

@@ -1,0 +1,349 @@
+"""FMUs of controller and plant: validity, closed loop against the simulator, saved states, errors of use."""
+
+import json
+import re
+import subprocess
+import zipfile
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import ptsmc_jax as ptsmc
+from ptsmc_jax import scenario
+from ptsmc_jax.onboard import fmu as units
+from ptsmc_jax.onboard import folder
+from ptsmc_jax.onboard.library import Library, compiler
+from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.simulation import rollout
+from tests.onboard.compiled import STRICT, needs_compiler, program
+from tests.onboard.flights import FLIGHTS, FULL, SIX, flight
+from tests.onboard.test_sensor_suite_export import TABLES
+from tests.tree import ROOT
+
+pytest.importorskip("fmpy")
+from fmpy.validation import validate_fmu
+
+from tests.onboard.fmus import Unit, closed_loop
+
+pytestmark = needs_compiler
+
+SEED, SAMPLES = 5, 65
+OTHERS = ("wheels with lag, limits, delay", "star tracker out of step", "system", "suite")
+# wheels with failures, delay, filter with a slow star tracker, gyro bias, random walk of the disturbance, jitter
+RICH = flight(
+    filter={"kind": "steady_state"},
+    spacecraft={"inertia": FULL},
+    hardware={"star_tracker_every": 3, "rate_bias": 1e-5, "rate_bias_walk": 1e-7, "delay": 1, "torque_lag": 0.02},
+    wheels={"torque_limit": 2.0, "momentum_limit": 3.0},
+    controller={"delta": 1.0},
+    dispersion={
+        "attitude": {"kind": "axis_angle", "min_deg": 20.0, "max_deg": 60.0},
+        "inertia": {"kind": "relative_normal", "std": 0.02, "axes_deg": 2.0},
+        "actuator_scale": {"kind": "relative_uniform", "half_width": 0.05},
+        "wheel_failure": {"kind": "uniform", "latest": 4.0},
+        "timing_jitter": {"largest": 0.3},
+    },
+)
+
+
+def made_from(tables, reference_input=False):
+    complete = scenario.reading.complete(scenario.from_tables(tables))
+    return folder.Controller(complete, "flight", "a scenario", reference_input)
+
+
+def simulated(made, seed, trials):
+    """Histories of trials: true states (trials, samples, n) in the order of the FMU, with their disturbances."""
+    plant = made.ready.parts.plant
+
+    def run(trial):
+        parts = made.ready.dispersion.apply(made.ready.parts, jnp.uint32(seed), trial)
+        log = rollout.simulate(parts, jnp.uint32(seed), trial, record=True).log
+        assert log is not None
+        signals = jax.vmap(lambda x: plant.signals_of(plant.visible(x)))(log.x)
+        columns = [signals[name].reshape(len(log.t), -1) for name in sorted(signals)]
+        return jnp.concatenate([*columns, log.disturbance.reshape(len(log.t), -1)], axis=1)
+
+    return np.asarray(jax.jit(jax.vmap(run))(jnp.asarray(trials, jnp.uint32)))
+
+
+def of_plant(made, rows):
+    """The same values of a closed loop of FMUs, (samples, n)."""
+    names = [*sorted(made.ready.parts.plant.signals), "disturbance"]
+    columns = [name for one in names for name in rows[0][0] if name.partition("[")[0] == f"true_{one}"]
+    return np.array([[readings[name] for name in columns] for readings, _ in rows])
+
+
+@pytest.fixture(scope="module")
+def rich():
+    return made_from(RICH)
+
+
+@pytest.fixture(scope="module")
+def files(rich, tmp_path_factory):
+    """The folder of the FMUs of controller and plant for both versions of FMI."""
+    place = tmp_path_factory.mktemp("fmus")
+    wanted = folder.Wanted(controller=True, plant=True)
+    wanted.write(place, wanted.models(rich))
+    return place
+
+
+@pytest.fixture(scope="module")
+def expected(rich):
+    """Trials 0 and 3 as the simulator computes them."""
+    return simulated(rich, SEED, [0, 3])
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory):
+    """The exported C, compiled."""
+    place = tmp_path_factory.mktemp("exported") / "c"
+    program(RICH, place)
+    return Library(place)
+
+
+@pytest.fixture(scope="module", params=units.VERSIONS)
+def loop(files, request):
+    """Controller and plant of one version of FMI."""
+    return tuple(Unit(files / f"{name}_fmi{request.param}.fmu") for name in ("controller", "plant"))
+
+
+def run(loop, trial=0, count=SAMPLES):
+    for one in loop:
+        one.unit.reset()
+    return closed_loop(loop, count, {"seed": SEED, "trial": trial})
+
+
+def test_fmpy_finds_no_problem(files):
+    found = {path.name: validate_fmu(str(path)) for path in sorted(files.iterdir())}
+    assert found == {f"{name}_fmi{k}.fmu": [] for name in ("controller", "plant") for k in (2, 3)}
+
+
+def test_closed_loop_of_fmus_equals_the_simulation(rich, expected, loop):
+    assert not np.allclose(expected[0], expected[1])
+    for k, trial in enumerate((0, 3)):
+        rows = run(loop, trial)
+        np.testing.assert_allclose(of_plant(rich, rows), expected[k, :SAMPLES], rtol=0.0, atol=1e-10)
+        assert all(commands["status"] in (0, 1) for _, commands in rows)
+
+
+def test_controller_has_the_outputs_of_the_exported_c(library, loop):
+    controller, _ = loop
+    rows, state, columns = run(loop, 3), library.first(), library.columns
+    for name, value in rows[0][0].items():
+        if name.startswith("initial_"):
+            element = name.removeprefix("initial_").replace("[", " ").replace("]", "").split()
+            state[columns["state"].index(f"{element[0]}[{int(element[1]) - 1}]")] = value
+    inputs = controller.names("input")
+    for k, (readings, commands) in enumerate(rows):
+        given = [k * controller.period, *(readings[name] for name in inputs)]
+        state, out, status = library.many(state, np.array(given))
+        found = np.array([v for name, v in commands.items() if name != "status"])
+        assert found.tobytes() == out.tobytes()
+        assert status == commands["status"]
+
+
+def test_saved_and_restored_states_replay_to_the_last_bit(loop):
+    """After a saved state is set again, also from bytes and after a reset, both FMUs return the same numbers."""
+    rows = run(loop, 1, 40)
+    whole = run(loop, 1, 20)
+    assert whole == rows[:20]  # reset
+    states = [one.unit.getFMUState() for one in loop]
+    blobs = [one.unit.serializeFMUState(state) for one, state in zip(loop, states, strict=True)]
+    controller, plant = loop
+
+    def proceed(first):
+        readings, found = first, []
+        for k in range(20, 40):
+            controller.write({name: readings[name] for name in controller.names("input")})
+            controller.step(k)
+            commands = controller.read(controller.names("output"))
+            found.append((readings, commands))
+            plant.write({name: commands[name] for name in plant.names("input")})
+            plant.step(k)
+            readings = plant.read(plant.names("output"))
+        return found
+
+    first = plant.read(plant.names("output"))
+    assert proceed(first) == rows[20:]
+    for one, state in zip(loop, states, strict=True):
+        one.unit.setFMUState(state)
+    assert proceed(first) == rows[20:]
+    for one, blob in zip(loop, blobs, strict=True):
+        one.unit.setFMUState(one.unit.deserializeFMUState(blob))
+    assert proceed(first) == rows[20:]
+
+
+def test_two_instances_are_independent(loop):
+    _, plant = loop
+    alone = run(loop, 2, 10)
+    other = plant.instance()
+    plant.unit.reset()
+    plant.begin({"seed": SEED, "trial": 2})
+    plant.begin({"seed": SEED, "trial": 9}, other)
+    for k, (readings, commands) in enumerate(alone):
+        assert plant.read(list(readings)) == readings
+        assert plant.read(["true_attitude[1]"], other)["true_attitude[1]"] != readings["true_attitude[1]"]
+        plant.write({name: commands[name] for name in plant.names("input")})
+        plant.step(k)
+        plant.step(k, other)
+    other.terminate()
+
+
+def test_shorter_communication_steps_give_the_same_samples(loop):
+    """With a quarter of the period, the FMUs sample at the same times as with the period."""
+    controller, plant = loop
+    expected = run(loop, 1, 20)
+    for one in loop:
+        one.unit.reset()
+    plant.begin({"seed": SEED, "trial": 1})
+    readings = plant.read(plant.names("output"))
+    controller.begin({name: readings[name] for name in controller.names("parameter") if name in readings})
+    for k in range(80):
+        if k % 4 == 0:
+            assert readings == expected[k // 4][0]
+        controller.write({name: readings[name] for name in controller.names("input")})
+        t, length = 0.25 * k * controller.period, 0.25 * controller.period
+        controller.unit.doStep(t, length)
+        commands = controller.read(controller.names("output"))
+        assert commands == expected[k // 4][1]
+        plant.write({name: commands[name] for name in plant.names("input")})
+        plant.unit.doStep(t, length)
+        readings = plant.read(plant.names("output"))
+
+
+def test_gains_are_tunable_and_the_period_is_fixed(loop):
+    controller, _ = loop
+    usual = run(loop, 1, 12)
+    for one in loop:
+        one.unit.reset()
+    (gain,) = (name for name in controller.of if name == "law_eta")
+    before = controller.read([gain])[gain]
+    half = closed_loop(loop, 6, {"seed": SEED, "trial": 1})
+    assert half == usual[:6]
+    controller.write({gain: 1.5 * before})
+    controller.write({name: usual[6][0][name] for name in controller.names("input")})
+    controller.step(6)
+    assert controller.read(["command[1]"])["command[1]"] != usual[6][1]["command[1]"]
+    for name, value in (("period", 0.2), ("command[1]", 1.0), (gain, np.nan)):
+        with pytest.raises(Exception, match=r"status 3 \(error\)"):
+            controller.write({name: value})
+    with pytest.raises(Exception, match=r"status 3 \(error\)"):
+        controller.unit.doStep(0.0, controller.period)  # earlier than the last step's end
+
+
+def test_inertia_of_the_plant_can_be_changed_before_a_run(tmp_path):
+    """The inverse follows. The body turns as in closed form under a constant torque about a principal axis."""
+    tables = flight(hardware={"attitude_noise": 0.0, "rate_noise": 0.0}, dispersion={},
+                    disturbance={"kind": "constant", "amplitude": [0.0, 0.0, 0.0]})  # fmt: skip
+    made = made_from(tables)
+    wanted = folder.Wanted(plant=True, version=3)
+    wanted.write(tmp_path, wanted.models(made))
+    plant = Unit(tmp_path / "plant_fmi3.fmu")
+    plant.begin({"plant_inertia[3,3]": 20.0})
+    for k in range(10):
+        plant.write({"command[3]": 0.5})
+        plant.step(k)
+    assert plant.read(["true_rate[3]"])["true_rate[3]"] == pytest.approx(0.5 / 20.0 * 10 * plant.period, rel=1e-12)
+
+
+def test_unusable_inputs_return_a_warning_and_the_last_command(loop):
+    controller, _ = loop
+    rows = run(loop, 1, 5)
+    controller.write({name: rows[-1][0][name] for name in controller.names("input")} | {"rate[1]": np.nan})
+    controller.step(5)  # FMPy raises from the status "discard" on
+    found = controller.read(controller.names("output"))
+    assert found == rows[-1][1] | {"status": 4}
+
+
+@pytest.mark.parametrize("model", [pytest.param("controller", marks=pytest.mark.long), "plant"])
+def test_sanitizers_find_nothing(rich, tmp_path, model):
+    made = {"controller": folder.controller_model, "plant": folder.plant_model}[model](rich)
+    texts = units.sources(made, 3)
+    for name, text in texts.items():
+        (tmp_path / name).write_text(text)
+    driver = str(ROOT / "tests" / "onboard" / "fmu_driver.c")
+    strict = [flag for flag in STRICT if flag != "-Wconversion"]
+    names = [str(tmp_path / name) for name in texts if name.endswith(".c")]
+    flags = ["-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+    built = [*compiler(), *strict, *flags, *names, driver, "-o", str(tmp_path / "driver"), "-lm"]
+    done = subprocess.run(built, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    token = texts["fmu.h"].partition('#define TOKEN "')[2][:64]
+    sizes = [len(made.code.columns["in"]) - 1, len(made.code.columns["out"])]
+    ran = [str(tmp_path / "driver"), token, repr(made.period), *map(str, sizes)]
+    done = subprocess.run(ran, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_without_a_compiler_only_sources_are_written(tmp_path, monkeypatch):
+    monkeypatch.setenv("CC", "no-compiler")
+    tables = scenario.reading.complete(scenario.from_tables(FLIGHTS["chain"]))
+    with pytest.raises(ScenarioError, match="there is no C compiler no-compiler"):
+        ptsmc.export(tables, tmp_path / "made", trials=1, fmu=True)
+    assert not (tmp_path / "made").exists()
+    ptsmc.export(tables, tmp_path / "made", trials=1, fmu=True, fmu_plant=True, fmi=2, binary=False)
+    found = sorted(path.name for path in (tmp_path / "made").glob("*.fmu"))
+    assert found == ["controller_fmi2.fmu", "plant_fmi2.fmu"]
+    names = zipfile.ZipFile(tmp_path / "made" / "plant_fmi2.fmu").namelist()
+    assert "sources/fmi2.c" in names
+    assert not any(name.startswith("binaries") for name in names)
+
+
+def test_program_of_the_documentation_runs(files, monkeypatch, capsys):
+    """The program for FMPy in docs/fmu.md prints the attitude at the end of trial 3."""
+    text = (ROOT / "docs" / "fmu.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    monkeypatch.chdir(files)
+    exec(compile(code.replace('["seed"], 0)', f'["seed"], {SEED})'), "fmu.md", "exec"), {"__name__": "fmu"})
+    assert len(json.loads(capsys.readouterr().out)) == 4
+
+
+class Unwritable(ptsmc.Disturbance):
+    """A disturbance with an operation that C does not have."""
+
+    def __call__(self, t, x):
+        """Return a torque (3,) [N m]."""
+        return 1e-3 * jnp.linalg.svd(jnp.outer(x.w, x.w) + jnp.eye(3))[1]
+
+
+def test_plant_that_c_cannot_express_is_refused():
+    made = made_from(flight(disturbance={"kind": "custom", "code": f"{__file__}:Unwritable"}))
+    with pytest.raises(ScenarioError, match=r"jnp.linalg.svd.* cannot be written in C"):
+        folder.plant_model(made)
+
+
+def test_units_are_products_of_base_units():
+    assert units.unit("N m s") == ("N.m.s", {"kg": 1, "m": 2, "s": -1})
+    assert units.unit("rad/s^2") == ("rad/s2", {"rad": 1, "s": -2})
+    assert units.unit("1/s") == ("1/s", {"s": -1})
+    assert units.unit("rad/s/sqrt(s)") is None
+    assert units.unit("-") is None
+
+
+@pytest.mark.long
+def test_plant_supplies_the_reference_of_a_trial(tmp_path):
+    """With the reference as an input, closed loops with a random reference equal the simulation."""
+    about = {"kind": "normal", "std_deg": 3.0}
+    made = made_from(FLIGHTS["slew"] | {"dispersion": {"reference": about}}, reference_input=True)
+    wanted = folder.Wanted(controller=True, plant=True, version=2)
+    wanted.write(tmp_path, wanted.models(made))
+    loop = tuple(Unit(tmp_path / f"{one}_fmi2.fmu") for one in ("controller", "plant"))
+    expected = simulated(made, SEED, range(5))
+    for trial in range(5):
+        found = of_plant(made, run(loop, trial))
+        np.testing.assert_allclose(found, expected[trial, :SAMPLES], rtol=0.0, atol=1e-10)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", [*SIX, *OTHERS])
+def test_closed_loops_of_other_scenarios_equal_the_simulation(name, tmp_path):
+    made = made_from({**FLIGHTS, "suite": TABLES}[name])
+    wanted, count = folder.Wanted(controller=True, plant=True, version=3), 1000 if name in SIX else 100
+    wanted.write(tmp_path, wanted.models(made))
+    loop = tuple(Unit(tmp_path / f"{one}_fmi3.fmu") for one in ("controller", "plant"))
+    expected = simulated(made, SEED, range(count))
+    for trial in range(count):
+        found = of_plant(made, run(loop, trial))  # 1e-10: rounding of exp and log, amplified by the gains
+        np.testing.assert_allclose(found, expected[trial, :SAMPLES], rtol=0.0, atol=1e-10, err_msg=f"trial {trial}")
