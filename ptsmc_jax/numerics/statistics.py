@@ -29,7 +29,7 @@ def fraction_interval(successes: int, trials: int, confidence: float) -> tuple[f
     Returns:
         Lower and upper bound [-].
 
-    >>> low, high = share_interval(successes=997, trials=1000, confidence=0.95)
+    >>> low, high = fraction_interval(successes=997, trials=1000, confidence=0.95)
     >>> f"{low:.4f} {high:.4f}"
     '0.9913 0.9994'
     """
