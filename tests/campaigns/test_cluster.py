@@ -44,7 +44,7 @@ def _dask(monkeypatch):
 
 def simulated_by(monkeypatch, tmp_path, receipt):
     """Return a folder whose parts are simulated by a worker that returns this result."""
-    monkeypatch.setattr(cluster, "_fly", lambda recipe, first, count: receipt(first, count))
+    monkeypatch.setattr(cluster, "_simulate_part", lambda recipe, first, count: receipt(first, count))
     return SimpleNamespace(recipe=lambda: (None, "x"), rows=Rows(tmp_path, b"k"))
 
 

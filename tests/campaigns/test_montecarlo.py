@@ -61,7 +61,7 @@ def test_prepared_program_is_the_program_of_the_simulation(chain, count, monkeyp
     """A program with other shapes or types would be compiled in vain."""
     ready, trials = (chain.parts, chain.dispersion), np.arange(count)
     prepare, run = (lambda: montecarlo.prepare(*ready, count)), (lambda: montecarlo.run(*ready, 5, trials))
-    assert_prepared(monkeypatch, montecarlo, "_fly", prepare, run)
+    assert_prepared(monkeypatch, montecarlo, "_simulate_rows", prepare, run)
 
 
 @pytest.mark.parametrize(

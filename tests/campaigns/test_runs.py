@@ -26,7 +26,7 @@ def test_lower_bound_is_pooled_over_the_first_trials_or_rows(monkeypatch, varies
     def along_each(simulated):
         return [lower_bound.LowerBound(floor, np.zeros(1), np.zeros(1)) for floor, _ in simulated]
 
-    monkeypatch.setattr(runs, "_fly", fly)
+    monkeypatch.setattr(runs, "_simulate", fly)
     monkeypatch.setattr(lower_bound, "along_each", along_each)
     ready: Any = SimpleNamespace(dispersion=SimpleNamespace(varies=varies))
     squares = [(1.0 + (k or 0)) ** 2 for j, k in enumerate(simulated) if j != 1]
