@@ -64,6 +64,7 @@ def _log_jvp(primals: tuple, tangents: tuple) -> tuple:
     return log(*primals), tangents[0] / primals[0]
 
 
+@jax.custom_jvp
 @jax.jit
 def cos_sin_turns(u: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     """Return cos(2 pi u) and sin(2 pi u) for u from 0 to 1. For float32 they are `jnp.cos` and `jnp.sin`."""
@@ -81,6 +82,13 @@ def cos_sin_turns(u: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Ar
         jnp.where((quarter == 1.0) | (quarter == 2.0), -cosine, cosine),
         jnp.where((quarter == 2.0) | (quarter == 3.0), -sine, sine),
     )
+
+
+@cos_sin_turns.defjvp
+def _cos_sin_turns_jvp(primals: tuple, tangents: tuple) -> tuple:
+    cosine, sine = cos_sin_turns(*primals)
+    change = 2.0 * np.pi * tangents[0]
+    return (cosine, sine), (-sine * change, cosine * change)
 
 
 @jax.custom_jvp

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ptsmc_jax.declare import Scaled, number
-from ptsmc_jax.numerics import attitude
+from ptsmc_jax.numerics import attitude, elementary
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
 from ptsmc_jax.plants.rigid_body import AttitudeState
 from ptsmc_jax.signals.orbits import Orbit
@@ -85,7 +85,8 @@ def _sin_cos_of_sum(angle: Array, phase: Any) -> tuple[Array, Array]:
     If phases differ by trial, all trials of a batch use the same sin and cos of the angle, and the sin and cos of the
     phases are computed only once.
     """
-    sine, cosine = jnp.sin(angle), jnp.cos(angle)
+    turns = angle / (2.0 * np.pi)
+    cosine, sine = elementary.cos_sin_turns(turns - jnp.floor(turns))  # vector arithmetic if times differ by trial
     sine_0, cosine_0 = jnp.sin(phase), jnp.cos(phase)
     return sine * cosine_0 + cosine * sine_0, cosine * cosine_0 - sine * sine_0
 
