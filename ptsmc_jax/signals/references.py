@@ -35,8 +35,10 @@ def target_of(path: Callable[[Scalar], Float[Array, "4"]], t: Scalar) -> Target:
     Rates are exact, by automatic differentiation: w = 2 vec(q* q') and w' = 2 vec(q* q''), because the product
     q*' q' = |q'|^2 has no vector part.
     """
-    q = path(t)
-    q_dot, q_ddot = time_derivative(path, t), time_derivative(lambda t: time_derivative(path, t), t)
+    t = jnp.asarray(t, jnp.result_type(float))
+    one = jnp.ones_like(t)
+    # one nested jvp traces the path once, with its tangents
+    (q, q_dot), (_, q_ddot) = jax.jvp(lambda t: jax.jvp(path, (t,), (one,)), (t,), (one,))
     inverse = attitude.conjugate(q)
     return Target(q, 2.0 * attitude.multiply(inverse, q_dot)[:3], 2.0 * attitude.multiply(inverse, q_ddot)[:3])
 
