@@ -36,24 +36,36 @@ def check_axes(key: str, axis: tuple[float, ...], other: tuple[float, ...] | Non
             raise wrong(key, axis, f"an axis that is not parallel to reference.primary_axis = {list(other)}")
 
 
-def orbit(scenario: Any, what: str) -> Any:
-    """Return the orbit of a scenario; raise ScenarioError if it has none. `what` needs it, such as a key."""
-    if scenario.orbit is None:
+class Mission(NamedTuple):
+    """The keys of a scenario that directions depend on."""
+
+    orbit: Any  # `OrbitTable`, or None
+    epoch: str | None  # `loop.epoch`
+    end: float  # of the run [s]
+
+
+def of(scenario: Any) -> Mission:
+    """Return the keys of a scenario that directions depend on."""
+    return Mission(scenario.orbit, scenario.loop.epoch, scenario.end)
+
+
+def orbit(mission: Mission, what: str) -> Any:
+    """Return the orbit; raise ScenarioError if there is none. `what` needs it, such as a key with its value."""
+    if mission.orbit is None:
         raise ScenarioError(f"{what}, which needs an orbit, but there is no [orbit] table")
-    return scenario.orbit.build(scenario.loop.epoch)
+    return mission.orbit.build(mission.epoch)
 
 
-def direction(key: str, value: Any, scenario: Any) -> Any:
+def direction(key: str, value: Any, mission: Mission) -> Any:
     """Return the direction of a key: a name, or a vector (3,); raise ScenarioError if another table is missing."""
     if not isinstance(value, str):
         check_axes(key, value)
         return orbits.Fixed(np.array(value, dtype=float))
     if value == "sun":
-        epoch = scenario.loop.epoch
-        if epoch is None:
+        if mission.epoch is None:
             raise ScenarioError(f'{key} is "sun", which needs loop.epoch, such as "2026-03-20T12:00:00"')
-        return orbits.sun(epochs.of_key(epoch).days)
-    orbit(scenario, f'{key} is "{value}"')
+        return orbits.sun(epochs.of_key(mission.epoch).days)
+    orbit(mission, f'{key} is "{value}"')
     return {"nadir": orbits.Nadir, "velocity": orbits.Velocity, "orbit_normal": orbits.OrbitNormal}[value]()
 
 
@@ -63,68 +75,70 @@ class Along(NamedTuple):
     anchors: np.ndarray  # (n, 4) quaternions of the frame at equal intervals of `span`, see `TwoVectorReference`
     span: float  # [s]
     fastest: float  # largest rate, plus the root of the largest acceleration [rad/s]
-    least_angle: float  # between the two directions [rad]
-    when: float  # time of the least angle [s]
     matrix: np.ndarray  # (3, 3) rotation at t = 0 from the axes of the frame to inertial axes
 
 
-def along(table: Any, scenario: Any) -> Along:
-    """Return a reference with two directions along the run, and for as long again, since tuning may move t_end."""
-    return _along(table, scenario.orbit, scenario.loop.epoch, scenario.end)
-
-
-class _Known(NamedTuple):
-    """The keys of a scenario that determine directions."""
-
-    orbit: Any
-    loop: Any
-
-
-class _Epoch(NamedTuple):
-    epoch: str | None
-
-
 @functools.lru_cache(maxsize=32)
-def _along(table: Any, orbit_table: Any, epoch: str | None, end: float) -> Along:
-    part, span, count = _part(table, _Known(orbit_table, _Epoch(epoch))), 2.0 * end, POINTS
+def along(table: Any, mission: Mission) -> Along:
+    """Return a reference with two directions along the run, and for as long again if possible: tuning may move t_end.
+
+    Raises:
+        ScenarioError: the directions are parallel during the run.
+    """
+    part, ahead, count = _part(table, mission), 2, POINTS
     while True:
-        step = span / count
+        step = ahead * mission.end / count
         times = step * np.arange(count)
         sines = np.linalg.norm(np.cross(*part.directions(times, np)), axis=1)
-        least = int(np.argmin(sines[: count // 2 + 1]))  # of the run
+        least = int(np.argmin(sines))
+        if sines[least] < np.sin(LEAST) and times[least] <= mission.end:
+            raise _parallel(table, times[least], np.arcsin(sines[least]))
         if sines[least] < np.sin(LEAST):
-            return Along(IDENTITY[None], span, 0.0, float(np.arcsin(sines[least])), least * step, np.eye(3))
+            ahead = 1
+            continue
         matrices = part.matrix(times, np)
         turns = mission_references.turns(matrices)
         if np.all(np.linalg.norm(turns, axis=1) < FINE) or count >= MOST_POINTS:
             break
         count *= 4
-    rates = turns[: count // 2] / step
+    rates = turns[: count // ahead] / step
     fastest = np.linalg.norm(rates, axis=1).max() + np.sqrt(np.linalg.norm(np.diff(rates, axis=0), axis=1).max() / step)
-    anchors = mission_references.anchored(matrices)
-    least_angle = float(np.arcsin(min(sines[least], 1.0)))
-    return Along(anchors, span, float(fastest), least_angle, least * step, matrices[0])
+    return Along(mission_references.anchored(matrices), ahead * mission.end, float(fastest), matrices[0])
 
 
-def _part(table: Any, scenario: Any, anchors: np.ndarray = IDENTITY[None], rate: float = 0.0) -> Any:
-    """Return the part of a table with two directions, with numbers of NumPy."""
-    primary, secondary = table.directions(scenario)
-    needed = primary.needs_orbit or secondary.needs_orbit
-    return table.made(
-        q=IDENTITY, mount=table.mount, primary=primary, secondary=secondary,
-        orbit=orbit(scenario, "reference") if needed else None, anchors=anchors, anchor_rate=np.float64(rate),
+def _parallel(table: Any, t: float, angle: float) -> ScenarioError:
+    return refused(
+        "reference.secondary", table.secondary,
+        f", but at t = {t:.6g} s that is {np.rad2deg(angle):.2g} deg from the primary direction or its opposite, and "
+        f"at least {np.rad2deg(LEAST):.2g} deg are needed",
     )  # fmt: skip
 
 
-def anchored(table: Any, scenario: Any) -> Any:
-    """Return the reference of a table with two directions, for a run of the scenario."""
-    found = along(table, scenario)
-    return jax.tree.map(vector, _part(table, scenario, found.anchors, len(found.anchors) / found.span))
+def _part(table: Any, mission: Mission, anchors: np.ndarray = IDENTITY[None], rate: float = 0.0) -> Any:
+    """Return the part of a table with two directions, with numbers of NumPy."""
+    primary, secondary = table.directions(mission)
+    needed = primary.needs_orbit or secondary.needs_orbit
+    return table.made(
+        q=IDENTITY, mount=table.mount, primary=primary, secondary=secondary,
+        orbit=orbit(mission, "reference") if needed else None, anchors=anchors, anchor_rate=np.float64(rate),
+    )  # fmt: skip
 
 
-def first(table: Any, scenario: Any) -> np.ndarray:
-    """Return the quaternion (4,) of a reference with two directions at t = 0."""
-    return turned(along(table, scenario).matrix, table.mount)
+def anchored(table: Any, mission: Mission) -> Any:
+    """Return the reference of a table with two directions, for a run of the mission."""
+    found = along(table, mission)
+    return jax.tree.map(vector, _part(table, mission, found.anchors, len(found.anchors) / found.span))
+
+
+def lowest_elevation(table: Any, mission: Mission) -> tuple[float, float]:
+    """Return the lowest elevation of the spacecraft above the horizon of a ground target [rad], and its time [s]."""
+    times = np.linspace(0.0, mission.end, POINTS)
+    to_target, _ = _part(table, mission).directions(times, np)
+    angle = orbit(mission, "reference").earth_angle + orbits.EARTH_RATE * times + table.longitude
+    across = np.cos(table.latitude)
+    up = np.stack([across * np.cos(angle), across * np.sin(angle), np.full_like(angle, np.sin(table.latitude))], axis=1)
+    sines = -np.sum(to_target * up, axis=1)
+    return float(np.arcsin(sines.min())), float(times[np.argmin(sines)])
 
 
 def turned(matrix: np.ndarray, mount: np.ndarray) -> np.ndarray:
@@ -132,14 +146,3 @@ def turned(matrix: np.ndarray, mount: np.ndarray) -> np.ndarray:
     from scipy.spatial.transform import Rotation
 
     return (Rotation.from_matrix(matrix) * Rotation.from_quat(mount)).as_quat()
-
-
-def check_apart(table: Any, scenario: Any) -> None:
-    """Raise ScenarioError if the two directions of a reference are parallel during the run."""
-    found = along(table, scenario)
-    if found.least_angle < LEAST:
-        raise refused(
-            "reference.secondary", table.secondary,
-            f", but at t = {found.when:.6g} s that is {np.rad2deg(found.least_angle):.2g} deg from the primary "
-            f"direction or its opposite, and at least {np.rad2deg(LEAST):.2g} deg are needed",
-        )  # fmt: skip

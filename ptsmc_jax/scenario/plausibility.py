@@ -24,7 +24,22 @@ def warnings(scenario: Scenario) -> list[str]:
     """
     bounds = disturbance_bounds.of(scenario)
     bounded = [] if bounds is None else [*_far_off(scenario, *bounds), *_noisy(scenario, bounds[0])]
-    return [*bounded, *_perfect_rate(scenario), *_coarse(scenario), *_late(scenario), *_fast_surface(scenario)]
+    others = (_perfect_rate, _coarse, _late, _fast_surface, _below_horizon)
+    return [*bounded, *(text for warn in others for text in warn(scenario))]
+
+
+def _below_horizon(scenario: Scenario) -> list[str]:
+    """Warn about a ground target that the Earth hides during the run."""
+    reference = getattr(scenario, "reference", None)
+    if not hasattr(reference, "lowest_elevation"):
+        return []
+    elevation, t = reference.lowest_elevation(scenario)
+    if elevation >= 0.0:
+        return []
+    return [
+        f"reference.kind is {errors.show(reference.kind)}, but at t = {t:.4g} s the Earth hides the target: seen from "
+        f"there the spacecraft is {-np.rad2deg(elevation):.3g} deg below the horizon"
+    ]
 
 
 def _late(scenario: Scenario) -> list[str]:

@@ -175,7 +175,7 @@ class NadirTable(MissionTable, frozen=True):
     """Local vertical, local horizontal."""
 
     def _orbit(self, scenario: Any) -> Any:
-        return missions.orbit(scenario, 'reference.kind is "nadir"')
+        return missions.orbit(missions.of(scenario), 'reference.kind is "nadir"')
 
     def frequencies(self, scenario: Any) -> dict[str, float]:
         return {"reference.kind": float(self._orbit(scenario).fastest())}
@@ -201,23 +201,23 @@ class NadirTable(MissionTable, frozen=True):
 class DirectionsTable(MissionTable, frozen=True):
     """References with a primary and a secondary direction."""
 
-    def directions(self, scenario: Any) -> tuple[Any, Any]:
+    def directions(self, mission: missions.Mission) -> tuple[Any, Any]:
         """Return the primary and the secondary direction, parts of `signals.orbits`."""
         raise NotImplementedError
 
     def frequencies(self, scenario: Any) -> dict[str, float]:
-        return {"reference.kind": missions.along(self, scenario).fastest}
+        return {"reference.kind": missions.along(self, missions.of(scenario)).fastest}
 
     def check(self, scenario: Any) -> None:
         super().check(scenario)
-        missions.check_apart(self, scenario)
+        missions.along(self, missions.of(scenario))
 
     def build(self, scenario: Any) -> Any:
-        return missions.anchored(self, scenario)
+        return missions.anchored(self, missions.of(scenario))
 
     def first(self, scenario: Any) -> np.ndarray:
         self.check(scenario)
-        return missions.first(self, scenario)
+        return missions.turned(missions.along(self, missions.of(scenario)).matrix, self.mount)
 
 
 SECONDARY = Meaning("direction of `secondary_axis`: a name, or three numbers in inertial axes")
@@ -236,9 +236,13 @@ class GroundTargetTable(DirectionsTable, frozen=True):
             raise wrong("reference.latitude", self.latitude, 'from -pi/2 to pi/2 [rad], or with its unit, as "48 deg"')
         super().check(scenario)
 
-    def directions(self, scenario: Any) -> tuple[Any, Any]:
+    def lowest_elevation(self, scenario: Any) -> tuple[float, float]:
+        """Return the lowest elevation above the horizon of the target [rad], and its time [s]."""
+        return missions.lowest_elevation(self, missions.of(scenario))
+
+    def directions(self, mission: missions.Mission) -> tuple[Any, Any]:
         point = orbits.ground_point(self.latitude, self.longitude, self.height)
-        return orbits.GroundPoint(point), missions.direction("reference.secondary", self.secondary, scenario)
+        return orbits.GroundPoint(point), missions.direction("reference.secondary", self.secondary, mission)
 
 
 class TwoVectorTable(DirectionsTable, frozen=True):
@@ -247,9 +251,9 @@ class TwoVectorTable(DirectionsTable, frozen=True):
     primary: Annotated[Vector, Meaning(f"direction of `primary_axis`: {DIRECTIONS}")] = "sun"
     secondary: Annotated[Vector, SECONDARY] = (0.0, 0.0, 1.0)
 
-    def directions(self, scenario: Any) -> tuple[Any, Any]:
+    def directions(self, mission: missions.Mission) -> tuple[Any, Any]:
         named = ("reference.primary", self.primary), ("reference.secondary", self.secondary)
-        primary, secondary = (missions.direction(*each, scenario) for each in named)
+        primary, secondary = (missions.direction(*each, mission) for each in named)
         return primary, secondary
 
 

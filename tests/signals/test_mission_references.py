@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from ptsmc_jax import scenario
 from ptsmc_jax.batching import lanes, lapack
 from ptsmc_jax.plants.rigid_body import AttitudeState
-from ptsmc_jax.scenario import epochs
+from ptsmc_jax.scenario import epochs, plausibility
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.signals import mission_references, orbits
 
@@ -163,6 +163,14 @@ def test_nadir_and_ground_target_equal_those_of_basilisk():
         np.testing.assert_allclose(target.w_dot[k], matrix @ row["acceleration"], rtol=0, atol=1e-3 * TOLERANCE)
         axis = Rotation.from_quat(np.asarray(pointed.q[k])).apply([0.0, 0.6, 0.8])
         np.testing.assert_allclose(axis, row["target_direction"], rtol=0, atol=TOLERANCE)
+
+
+def test_a_target_below_the_horizon_gives_a_warning():
+    orbit = {"inclination": 0.0, "earth_angle": 0.0}  # over longitude 0 at t = 0
+    for longitude, hidden in ((0.05, False), (0.6, True)):
+        table = {"kind": "ground_target", "longitude": longitude, "secondary": "orbit_normal"}
+        read = scenario.from_tables({"orbit": orbit, "reference": table, **MULTIPLICATIVE})
+        assert any("horizon" in text for text in plausibility.warnings(read)) == hidden
 
 
 def test_gravity_gradient_is_that_of_the_orbit_and_within_its_bounds():
