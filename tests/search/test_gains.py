@@ -385,16 +385,6 @@ def test_gains_are_compared_with_the_published_ones_only_if_these_can_be_simulat
     assert list(judging.beside(found["paper"])[0]) == ["paper"]
 
 
-@pytest.mark.parametrize(
-    ("plant", "kind"), [(plant, kind) for plant, laws in LAWS.items() for kind in laws if kind != "custom"]
-)
-def test_tables_of_laws_list_the_tunable_gains_of_the_laws(plant, kind):
-    table = LAWS[plant][kind]
-    assert set(table.gains) == set(table.made.tunable)
-    assert {*table.free_by_default, *table.free_if_sampled} <= set(table.gains)
-    assert set(table.gains) <= set(gains.units(plant))
-
-
 PLANTS = {
     "spacecraft": {"loop": {"mode": "sampled"}},
     "chain": {"plant": {"kind": "chain"}, "loop": {"mode": "sampled"}},

@@ -13,7 +13,7 @@ import pytest
 from ptsmc_jax import scenario
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.theory import limit_cycles, margins, run_margins
-from tests.helpers import SHORT, SHORT_CHAIN, short, untuned
+from tests.helpers import SHORT, SHORT_CHAIN, refused, short, untuned
 from tests.theory.loops import held
 from tuning.output import margins_report, page, summaries
 from tuning.studies import stability
@@ -165,10 +165,8 @@ def reported(summary):
 
 def test_margins_need_the_sampled_loop(command, tmp_path):
     (tmp_path / "smooth.toml").write_text("[controller]\nt_f = 5.0\n")
-    status, out, err = command("margins", "smooth.toml")
-    assert (status, out) == (2, "")
-    assert 'margins need the sampled loop, but loop.mode is "continuous"' in err
-    assert not (tmp_path / "out").exists()
+    said = refused(command, tmp_path, "margins", "smooth.toml")
+    assert 'margins need the sampled loop, but loop.mode is "continuous"' in said
 
 
 def test_inputs_and_measured_signals_of_a_chain_have_names():
