@@ -5,7 +5,7 @@ import shutil
 from pathlib import Path
 
 LAYOUT = "controller.json"
-OTHERS = ("check.c", "fuzz.c", "udp.c", "rows.c")  # separate programs
+OTHERS = ("check.c", "fuzz.c", "udp.c", "shared.c")  # separate programs
 
 
 def listed(folder: Path) -> list[Path]:

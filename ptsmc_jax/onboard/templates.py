@@ -28,8 +28,9 @@ STATUS = {
 TORQUES, RATES = ("d_hat", "observer", "command", "torque", "sent"), ("rate", "bias", "gyro")
 
 
-# files beside the controller
-PROGRAMS = ("check.c", "fuzz.c", "Makefile", "udp.c", "udp.py", "rows.c", "basilisk.py")
+# files beside the controller, and their templates; Python has another suffix there, because it is no module here
+PROGRAMS = {name: name for name in ("check.c", "fuzz.c", "Makefile", "udp.c", "shared.c")}
+PROGRAMS |= {name: f"{name}.in" for name in ("udp.py", "basilisk.py")}
 
 
 class About(NamedTuple):
@@ -78,7 +79,7 @@ def texts(code: Code, about: About) -> dict[str, str]:
     """Return the text of each file of a controller, by file name, except for README.md and tables of numbers."""
     stem = f"ptsmc_{about.name}"
     files = {f"{stem}.h": "controller.h", f"{stem}.c": "controller.c", f"{stem}_parameters.c": "parameters.c",
-             f"{stem}_flat.h": "flat.h"} | {name: name for name in PROGRAMS}  # fmt: skip
+             f"{stem}_flat.h": "flat.h"} | PROGRAMS  # fmt: skip
     origin = {"name": about.name, "upper": about.name.upper(), "scenario": about.scenario, "digest": about.digest,
               "law": about.law}  # fmt: skip
     values = origin | _structs(code, about) | _checks(code, about) | _step(code) | rows(code, about)

@@ -250,8 +250,8 @@ def test_reference_as_an_input_replays_the_simulation(tmp_path):
             found.append(out)
             assert status == 0
         assert found[-1].tobytes() == found[-2].tobytes()
-    row[first : first + 4] = 0.1  # not a rotation
-    assert library.many(states[0], row)[2] == 4
+    given[0, first : first + 4] = 0.1  # not a rotation
+    assert library.many(library.first(), given[0])[2] == 4
 
 
 @needs_make

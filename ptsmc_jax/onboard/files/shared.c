@@ -1,4 +1,4 @@
-/* rows.c: the controller as a shared library for other languages. Rows are doubles in the order of controller.json. */
+/* shared.c: the controller as a shared library for other languages. Rows are doubles in the order of controller.json. */
 #include <stdlib.h>
 
 #include "ptsmc_${name}_flat.h"
