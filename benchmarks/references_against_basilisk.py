@@ -43,9 +43,9 @@ def record() -> dict:
     """Return orbit, target and the outputs of the modules at `TIMES`."""
     from Basilisk.architecture import messaging  # pyright: ignore[reportMissingImports]
     from Basilisk.fswAlgorithms import hillPoint, locationPointing  # pyright: ignore[reportMissingImports]
-    from Basilisk.utilities import (
-        RigidBodyKinematics,  # pyright: ignore[reportMissingImports]
-        orbitalMotion,  # pyright: ignore[reportMissingImports]
+    from Basilisk.utilities import (  # pyright: ignore[reportMissingImports]
+        RigidBodyKinematics,
+        orbitalMotion,
     )
 
     rows = []

@@ -27,7 +27,7 @@ class OrbitTable(PartTable, frozen=True):
         numbers = {name: getattr(self, name) for name in names}
         if numbers["earth_angle"] is None:
             numbers["earth_angle"] = 0.0 if epoch is None else orbits.earth_angle(epochs.of_key(epoch).days)
-        return orbits.Orbit(**{name: np.float64(value) for name, value in numbers.items()})
+        return self.made(**{name: np.float64(value) for name, value in numbers.items()})
 
 
 ORBITS: Kinds = {"kepler": table(OrbitTable, orbits.Orbit, "kepler")}

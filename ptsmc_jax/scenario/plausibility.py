@@ -30,7 +30,7 @@ def warnings(scenario: Scenario) -> list[str]:
 
 def _below_horizon(scenario: Scenario) -> list[str]:
     """Warn about a ground target that the Earth hides during the run."""
-    reference = getattr(scenario, "reference", None)
+    reference: Any = getattr(scenario, "reference", None)
     if not hasattr(reference, "lowest_elevation"):
         return []
     elevation, t = reference.lowest_elevation(scenario)

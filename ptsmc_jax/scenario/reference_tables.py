@@ -189,7 +189,7 @@ class NadirTable(MissionTable, frozen=True):
         return mission_references.nadir_mounting(self.primary_axis, self.secondary_axis)
 
     def build(self, scenario: Any) -> Any:
-        part = mission_references.NadirReference(missions.IDENTITY, self.mount, self._orbit(scenario))
+        part = self.made(q=missions.IDENTITY, mount=self.mount, orbit=self._orbit(scenario))
         return jax.tree.map(vector, part)
 
     def first(self, scenario: Any) -> np.ndarray:

@@ -183,7 +183,7 @@ class Direction:
 class Fixed(Direction):
     """A constant direction."""
 
-    vector: Leaf  # (3,)
+    vector: Any  # (3,)
     needs_orbit: ClassVar[bool] = False
 
     def __call__(self, t: Any, place: Any, orbit: Any, xp: Any) -> Any:
@@ -223,7 +223,7 @@ class OrbitNormal(Direction):
 class GroundPoint(Direction):
     """The direction from the spacecraft to a point on the rotating Earth."""
 
-    point: Leaf  # (3,) Earth-fixed coordinates [m]
+    point: Any  # (3,) Earth-fixed coordinates [m]
 
     def __call__(self, t: Any, place: Any, orbit: Any, xp: Any) -> Any:
         angle = orbit.earth_angle + EARTH_RATE * t
@@ -238,8 +238,8 @@ class GroundPoint(Direction):
 class Sun(Direction):
     """The direction from the Earth to the Sun, to 0.01 deg (Astronomical Almanac, low-precision formulas)."""
 
-    longitude: Leaf  # mean longitude at t = 0 [rad]
-    anomaly: Leaf  # mean anomaly at t = 0 [rad]
+    longitude: Any  # mean longitude at t = 0 [rad]
+    anomaly: Any  # mean anomaly at t = 0 [rad]
     needs_orbit: ClassVar[bool] = False
 
     def __call__(self, t: Any, place: Any, orbit: Any, xp: Any) -> Any:

@@ -3,6 +3,7 @@
 import json
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -25,12 +26,13 @@ def test_simulate_writes_an_ephemeris_that_is_a_reference_of_another_run(command
     text = (tmp_path / "r" / "attitude.aem").read_text()
     assert "START_TIME = 2026-03-20T12:00:00.000000000000" in text
     found = aem.segment(text)
+    assert found.rates is not None
     np.testing.assert_array_equal(found.quaternions, table["q1", "q2", "q3", "q4"].to_numpy())
     np.testing.assert_allclose(found.rates, table["w1", "w2", "w3"].to_numpy(), rtol=1e-14, atol=1e-300)
     np.testing.assert_allclose(found.times, table["t"].to_numpy(), atol=1e-11)
     for file in ("attitude.aem", "trajectory.csv"):
         tables = tomllib.loads(MULTIPLICATIVE) | {"reference": {"kind": "table", "file": str(tmp_path / "r" / file)}}
-        read = scenario.from_tables(tables)
+        read: Any = scenario.from_tables(tables)
         np.testing.assert_allclose(read.reference.first(read), found.quaternions[0], atol=1e-12)
 
 
@@ -57,4 +59,5 @@ def test_tune_finds_gains_for_a_reference_from_a_file_and_copies_it(command, tmp
     assert summary
     (tmp_path / "profile.csv").unlink()
     assert (tmp_path / "r" / "profile.csv").read_text() == content
-    assert scenario.read(tmp_path / "r" / "tuned.toml").reference.kind == "table"
+    tuned: Any = scenario.read(tmp_path / "r" / "tuned.toml")
+    assert tuned.reference.file == str(tmp_path / "r" / "profile.csv")

@@ -1,5 +1,7 @@
 """Attitudes from CSV, Parquet and attitude ephemeris messages: equal samples in all forms, errors with their place."""
 
+from typing import Any
+
 import numpy as np
 import polars as pl
 import pytest
@@ -209,13 +211,15 @@ def test_runs_beyond_the_file_are_configuration_errors(tmp_path):
 def test_relative_paths_start_at_the_scenario_file(tmp_path):
     GOOD.write_csv(tmp_path / "attitude.csv")
     (tmp_path / "s.toml").write_text('[reference]\nkind = "table"\nfile = "attitude.csv"\n[controller]\nt_f = 4.0\n')
-    assert scenario.read(tmp_path / "s.toml").reference.file == str((tmp_path / "attitude.csv").resolve())
+    read: Any = scenario.read(tmp_path / "s.toml")
+    assert read.reference.file == str((tmp_path / "attitude.csv").resolve())
 
 
 def test_written_messages_are_read_back_with_equal_numbers(tmp_path):
     rates = np.deg2rad(RATE)
     text = aem.write("SAT", TIMES, S, rates, "2026-03-20T12:00:00")
     found = aem.segment(text)
+    assert found.rates is not None
     np.testing.assert_array_equal(found.quaternions, S)
     np.testing.assert_allclose(found.rates, rates, rtol=1e-15)
     np.testing.assert_allclose(found.times, TIMES, atol=1e-12)

@@ -1,5 +1,7 @@
 """References from samples: exact at the samples, two continuous derivatives, and the accuracy of a sampled slew."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,8 +25,8 @@ def wander(times):
     ).as_quat()
 
 
-def at(reference, times):
-    return references.Target(*map(np.asarray, lapack.vmap(reference)(jnp.asarray(times))))
+def at(reference, times) -> Any:
+    return jax.tree.map(np.asarray, lapack.vmap(reference)(jnp.asarray(times)))
 
 
 def apart(q, p):

@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -28,7 +29,7 @@ TOLERANCE = 1e-9  # rad, rad/s; rounding of angles that grow to 10 rad is 1e-14
 
 
 def built(table, orbit=ORBIT, **others):
-    read = scenario.from_tables({"orbit": orbit, "reference": table, **MULTIPLICATIVE, **others})
+    read: Any = scenario.from_tables({"orbit": orbit, "reference": table, **MULTIPLICATIVE, **others})
     return read.reference.build(read)
 
 
