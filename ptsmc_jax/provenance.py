@@ -11,9 +11,9 @@ FOLDER = Path(__file__).parent.parent  # of the packages
 @functools.cache
 def code_checksum(*packages: str) -> str:
     """Return the SHA-256 of the Python files of some of `PACKAGES`, read at the first call."""
-    digest = hashlib.sha256()
+    checksum = hashlib.sha256()
     for package in packages:
         for path in sorted((FOLDER / package).rglob("*.py")):
-            digest.update(f"{path.relative_to(FOLDER)} {path.stat().st_size}".encode())
-            digest.update(path.read_bytes())
-    return digest.hexdigest()
+            checksum.update(f"{path.relative_to(FOLDER)} {path.stat().st_size}".encode())
+            checksum.update(path.read_bytes())
+    return checksum.hexdigest()

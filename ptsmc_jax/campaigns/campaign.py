@@ -165,7 +165,7 @@ def of_run_table(
     campaign = Campaign(ready, seed, custom_metrics, table.without(same))
     if table.angle is not None or table.custom:
         rows = drawn if drawn is not None and not campaign.table_sets_values else campaign.draw(range(table.count))
-        run_tables.check_drawn(table.custom, rows, where)
+        run_tables.check_custom_numbers(table.custom, rows, where)
         if table.angle is not None:
             run_tables.check_angle(table.angle, rows[run_tables.ANGLE].to_numpy(), where)
     return campaign

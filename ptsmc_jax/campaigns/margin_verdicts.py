@@ -43,7 +43,7 @@ def of_loop(parts: Parts, asked: Sequence[Requirement]) -> list[Verdict]:
     """
     if not asked:
         return []
-    left, hold, history = jax.tree.map(np.asarray, run_margins.judged_jit(parts))
+    left, hold, history = jax.tree.map(np.asarray, run_margins.judged_margins_jit(parts))
     if limit_cycles.find(parts, history) is not None:
         left = limit_cycles.none_left(left, hold)
     return _verdicts(asked, left.worst())
@@ -74,7 +74,7 @@ def prepare(ready: Study, rows: np.ndarray | Row | None = None) -> None:
         late = any(requirement.metric == DELAY for requirement in ready.margins)
         _look.prepare(*_looked_at(ready.parts, ready.dispersion, 0, trials, late))
     elif ready.margins:
-        run_margins.judged_jit.prepare(ready.parts)
+        run_margins.judged_margins_jit.prepare(ready.parts)
 
 
 def _whose_loops_differ(ready: Study, rows: np.ndarray | Row | None) -> np.ndarray | Row | None:

@@ -90,21 +90,21 @@ class Rows:
                 path.unlink(missing_ok=True)
 
     def _digest_of(self, path: Path, first: int, count: int) -> str:
-        """Return the digest of a file's content; a file that has not changed since the last call is not read again."""
+        """Return the checksum of a file's content; an unchanged file is not read again."""
         about = path.stat()
         if time.time_ns() - about.st_mtime_ns < RECENT:
             return self._digest(first, count, path.read_bytes())
         return _digest_of_version(self, path, (about.st_ino, about.st_size, about.st_mtime_ns), first, count)
 
     def _digest(self, first: int, count: int, content: bytes) -> str:
-        digest = hashlib.blake2b(content, digest_size=16, key=self.key)
-        digest.update(f"{first}+{count}".encode())
-        return digest.hexdigest()
+        checksum = hashlib.blake2b(content, digest_size=16, key=self.key)
+        checksum.update(f"{first}+{count}".encode())
+        return checksum.hexdigest()
 
 
 @functools.cache
 def _digest_of_version(rows: Rows, path: Path, version: tuple[int, int, int], first: int, count: int) -> str:
-    """Return the digest of a file's content; version: inode, size and time of the last change [ns]."""
+    """Return the checksum of a file's content; version: inode, size and time of the last change [ns]."""
     return rows._digest(first, count, path.read_bytes())
 
 

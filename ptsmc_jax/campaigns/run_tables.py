@@ -44,16 +44,16 @@ class RunTable:
     custom: dict[str, np.ndarray] = field(default_factory=dict)  # (rows,) numbers of custom dispersions, by name
 
     @property
-    def digest(self) -> str:
+    def checksum(self) -> str:
         """SHA-256 of its trials: tables with the same trials have the same checksum."""
-        digest = hashlib.sha256(str(self.count).encode())
-        for name, values in [*sorted(self.given.items()), *self._whose_draws.items()]:
+        checksum = hashlib.sha256(str(self.count).encode())
+        for name, values in [*sorted(self.given.items()), *self._random_number_columns.items()]:
             plain = np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<"))
-            digest.update(name.encode() + plain.tobytes())
-        return digest.hexdigest()
+            checksum.update(name.encode() + plain.tobytes())
+        return checksum.hexdigest()
 
     @property
-    def _whose_draws(self) -> dict[str, np.ndarray]:
+    def _random_number_columns(self) -> dict[str, np.ndarray]:
         """The columns that name the random numbers of the rows, if any."""
         return {name: values for name, values in ((TRIAL, self.trial), (SEED, self.seed)) if values is not None}
 
@@ -77,11 +77,11 @@ class RunTable:
 
     def origin(self, numbers: np.ndarray) -> dict[str, np.ndarray]:
         """Return the columns of a campaign's rows that name the random numbers of these rows."""
-        return {OF_ROWS[name]: values[numbers] for name, values in self._whose_draws.items()}
+        return {OF_ROWS[name]: values[numbers] for name, values in self._random_number_columns.items()}
 
     def frame(self, parts: Parts) -> pl.DataFrame:
         """Return the table as a data frame, in one form for equal run tables."""
-        columns = self._whose_draws
+        columns = self._random_number_columns
         for name, values in self.given.items():
             columns |= dict(zip(QUANTITIES[name].columns(parts), values.T, strict=True))
         return pl.DataFrame(columns or {TRIAL: np.arange(self.count, dtype=np.uint32)})
@@ -118,7 +118,7 @@ def checked(
         parts: the nominal parts; the quantities depend on them.
         where: the name of the table in errors.
         custom_metrics: names of custom metrics, which are allowed as columns.
-        drawn: names of the numbers of custom dispersions, see `check_drawn`.
+        drawn: names of the numbers of custom dispersions, see `check_custom_numbers`.
 
     Returns:
         The checked run table.
@@ -182,7 +182,7 @@ def check_angle(stated: np.ndarray, simulated: np.ndarray, where: str) -> None:
     _refuse(off, where, ANGLE, stated, lambda row: f"{simulated[row]:.9g} there, which {why}")
 
 
-def check_drawn(stated: dict[str, np.ndarray], rows: pl.DataFrame, where: str) -> None:
+def check_custom_numbers(stated: dict[str, np.ndarray], rows: pl.DataFrame, where: str) -> None:
     """Raise RefusedError if the table has other numbers of custom dispersions, (rows,) by name, than the trials.
 
     A table cannot set them, since only `Draw.at` knows the parts that follow from them.

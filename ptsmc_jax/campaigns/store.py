@@ -93,7 +93,7 @@ def previous(folder: Path, scenario: Tables, made_by: Tables) -> dict[str, Any] 
 
 
 def begun(folder: Path, scenario: Tables, made_by: Tables) -> bool:
-    """Return whether the folder contains this run, unfinished, see `begin`.
+    """Return whether the folder contains this run and it is incomplete, see `begin`.
 
     Raises:
         RefusedError: it contains another unfinished run, or one of other versions.

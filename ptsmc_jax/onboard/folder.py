@@ -43,7 +43,7 @@ class Controller:
             raise ScenarioError(str(error)) from None
         law, device = self.ready.parts.controller, self.ready.parts.actuators
         self.about = About(
-            name, source, digest(self.scenario), type(law).__qualname__, self.board.parameters["filter"] is not None,
+            name, source, checksum(self.scenario), type(law).__qualname__, self.board.parameters["filter"] is not None,
             self.board.model.largest_measurement,
             device.delay, float((law.t_f / self.last) ** 2),
         )  # fmt: skip
@@ -73,9 +73,9 @@ def on_flight_clock(scenario: Scenario) -> Scenario:
     return scenarios.replace(scenario, loop__clock="flight")
 
 
-def digest(scenario: Scenario) -> str:
+def checksum(scenario: Scenario) -> str:
     """Return the SHA-256 of a scenario's tables with all defaults, and of the files that it names."""
-    said = json.dumps([parsing.dump(scenario), custom.digests(scenario)], sort_keys=True, default=str)
+    said = json.dumps([parsing.dump(scenario), custom.checksums(scenario)], sort_keys=True, default=str)
     return hashlib.sha256(said.encode()).hexdigest()
 
 
@@ -201,7 +201,7 @@ def write(folder: Path, made: Controller, seed: int, trials: int, wanted: Wanted
     write_program(folder, made, steepness)
     wanted.write(folder, models)
     store.write_csv(folder / "vectors.csv", header, rows)
-    made_by = {"command": "export", "seed": seed, **custom.digests(made.scenario)}
+    made_by = {"command": "export", "seed": seed, **custom.checksums(made.scenario)}
     store.record(folder, parsing.dump(made.scenario), made_by)
 
 
@@ -217,7 +217,7 @@ def write_program(folder: Path, made: Controller, steepness: float = 0.0) -> Non
     texts = {**templates.texts(code, about), "README.md": readme(code, about)}
     for name, text in texts.items():
         store.write_text(folder / name, templates.prefixed(text, about.name))
-    layout = {"name": about.name, "digest": about.digest, "period": made.period, "parts": made.board.parts}
+    layout = {"name": about.name, "digest": about.checksum, "period": made.period, "parts": made.board.parts}
     layout["reference_input"] = made.reference_input
     layout["columns"] = code.columns
     store.write_json(folder / LAYOUT, layout)

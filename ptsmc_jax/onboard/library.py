@@ -61,7 +61,7 @@ class Library:
         none = ScenarioError(f"the controller is {self.folder}, but must be a folder that ptsmc export has written")
         try:
             layout = json.loads((self.folder / sources.LAYOUT).read_text(encoding="utf-8"))
-            self.name, self.digest, self.columns = layout["name"], layout["digest"], layout["columns"]
+            self.name, self.checksum, self.columns = layout["name"], layout["digest"], layout["columns"]
             self.period = float(layout["period"])  # [s]
             self.reference_input = bool(layout.get("reference_input", False))
             self.parts = dict(layout.get("parts", {}))  # as `Board.parts`; empty in earlier versions
@@ -86,7 +86,7 @@ class Library:
             raise none
         # in the order of columns["params"], (columns,); the array is the memory of C
         self.parameters = np.ctypeslib.as_array((ctypes.c_double * sizes[-1]).in_dll(self._made, "ptsmc_given"))
-        self.target = f"ptsmc_{self.name}_{self.digest}_{real}_{next(_loaded)}"  # its name in XLA
+        self.target = f"ptsmc_{self.name}_{self.checksum}_{real}_{next(_loaded)}"  # its name in XLA
         jax.ffi.register_ffi_target(self.target, jax.ffi.pycapsule(self._made.ptsmc_called), platform="cpu")
 
     def _compiled(self, place: Path, real: str, options: tuple[str, ...]) -> Path:

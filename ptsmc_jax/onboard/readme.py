@@ -15,7 +15,7 @@ def readme(code: Code, about: About) -> str:
         name=about.name,
         law=about.law + " with its observer" + (" and attitude filter" if about.filtered else ""),
         scenario=about.scenario,
-        digest=about.digest,
+        checksum=about.checksum,
         stages="\n".join(f"{k}. `{name}`: {text}" for k, (name, text) in enumerate(code.about.items(), 1)),
         inputs=_rows(code.inputs),
         outputs=_rows(code.outputs),

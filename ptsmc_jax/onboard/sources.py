@@ -14,7 +14,7 @@ def listed(folder: Path) -> list[Path]:
     return sorted(path for path in {*code, *folder.glob(LAYOUT)} if path.is_file())  # no lock of an editor
 
 
-def digest(folder: Path) -> str | None:
+def checksum(folder: Path) -> str | None:
     """Return the SHA-256 of their names and contents; None if there are no readable files."""
     try:
         read = [(path.name, path.read_bytes()) for path in listed(folder)]

@@ -104,12 +104,12 @@ def _places(scenario: Table) -> Iterator[tuple[str, Any]]:
             yield name, table
 
 
-def digest_name(key: str) -> str:
+def checksum_name(key: str) -> str:
     """Return the name in `versions.json` for the checksum of the code that a key names.
 
-    >>> digest_name("plant.system"), digest_name("controller.code"), digest_name("disturbance.terms[0].code")
+    >>> checksum_name("plant.system"), checksum_name("controller.code"), checksum_name("disturbance.terms[0].code")
     ('system_sha256', 'controller_sha256', 'disturbance_terms_0_sha256')
-    >>> digest_name("--metrics"), digest_name("--controller")  # not the name of `controller.code`
+    >>> checksum_name("--metrics"), checksum_name("--controller")  # not the name of `controller.code`
     ('metrics_sha256', 'flight_code_sha256')
     """
     if key == CONTROLLER:
@@ -118,11 +118,11 @@ def digest_name(key: str) -> str:
     return re.sub(r"\W+", "_", place).strip("_") + "_sha256"
 
 
-def digests(scenario: Table) -> dict[str, str]:
+def checksums(scenario: Table) -> dict[str, str]:
     """Return the current SHA-256 checksums of the files that a scenario names, by their names in `versions.json`."""
-    found = {digest_name(key): systems.digest(where) for key, where in programs(scenario).items()}
-    found |= {digest_name(key): systems.sha256(file) for key, file in data_files(scenario).items()}
-    return {name: digest for name, digest in found.items() if digest is not None}
+    found = {checksum_name(key): systems.checksum(where) for key, where in programs(scenario).items()}
+    found |= {checksum_name(key): systems.sha256(file) for key, file in data_files(scenario).items()}
+    return {name: checksum for name, checksum in found.items() if checksum is not None}
 
 
 def data_tables(raw: Mapping[str, Any]) -> list[dict]:

@@ -1,6 +1,6 @@
 """Load custom systems, classes and functions by name, "FILE.py:NAME" or "package.module:NAME".
 
-Start with `item`. `named` and `location` examine the name only. `item` and `load` run the code, and `digest` may run
+Start with `item`. `named` and `location` examine the name only. `item` and `load` run the code, and `checksum` may run
 packages around a module.
 """
 
@@ -128,7 +128,7 @@ def line(error: BaseException, place: str) -> str:
     return f" (line {numbers[-1]} of {Path(place).name})" if numbers else ""
 
 
-def digest(where: object) -> str | None:
+def checksum(where: object) -> str | None:
     """Return the SHA-256 of the file of a system or a function and of the files beside it that it imports.
 
     The result is None if there is no file. To find a module, Python runs the packages that contain it.

@@ -154,7 +154,7 @@ class _State:
         return factor @ factor.T
 
     def rows(self, by_z: Any, by_seen: Any) -> _Rows:
-        """Return the map of an output with derivatives `by_z` and `by_seen` (NumPy).
+        """Return the linear map from the state of the covariance to an output, given the output's derivatives (NumPy).
 
         Args:
             by_z: derivatives by z, (rows, n) or (periods, rows, n).

@@ -158,7 +158,7 @@ def brackets(w: Array, seen: Array) -> Brackets:
     real, factor = real_at(seen)
     # the tolerance of 0.1 keeps crossings near -1, because refinement may move them to the other side of -1
     more, less = (jnp.where(real & (side * factor > -0.1), side * factor, jnp.inf) for side in (1.0, -1.0))
-    even, phase = even_at(seen)
+    even, phase = unit_gain_at(seen)
     least = (near[1:-1] <= near[:-2]) & (near[1:-1] <= near[2:])
     nearest = jnp.append(jnp.inf, jnp.where(least, near[1:-1], jnp.inf))
     how_far = (more, less, jnp.where(even, jnp.abs(phase), jnp.inf), nearest)
@@ -221,14 +221,14 @@ def _through_infinity(seen: Array) -> Array:
     return back & jnp.append(True, grows) & jnp.append(falls, True)
 
 
-def even_at(seen: Array) -> tuple[Array, Array]:
+def unit_gain_at(seen: Array) -> tuple[Array, Array]:
     """Return the intervals in which |L| crosses 1, bool, and the phase from -1 to L there, in (-pi, pi] [rad]."""
-    there, share = _even(seen)
+    there, share = _unit_gain_crossings(seen)
     turned = jnp.angle(seen[1:] / seen[:-1])
     return there, jnp.angle(-seen[:-1] * jnp.exp(1j * share * turned))
 
 
-def _even(seen: Array) -> tuple[Array, Array]:
+def _unit_gain_crossings(seen: Array) -> tuple[Array, Array]:
     """Return the intervals in which |L| crosses 1, and the fraction of the interval, by interpolation of ln |L|."""
     size = jnp.log(jnp.abs(seen))
     there = size[:-1] * size[1:] < 0.0
@@ -240,8 +240,8 @@ def delay_at(w: Array, seen: Array) -> tuple[Array, Array]:
 
     The second result is the frequency of each crossing [rad/s].
     """
-    there, left = even_at(seen)
-    at = w[:-1] * (w[1:] / w[:-1]) ** jnp.where(there, _even(seen)[1], 0.0)
+    there, left = unit_gain_at(seen)
+    at = w[:-1] * (w[1:] / w[:-1]) ** jnp.where(there, _unit_gain_crossings(seen)[1], 0.0)
     return jnp.where(there, jnp.where(left < 0.0, left + 2.0 * jnp.pi, left) / at, jnp.inf), at
 
 
@@ -286,7 +286,7 @@ def ends_at(ends: Array) -> Array:
     return jnp.abs(ends.imag) < REAL * jnp.abs(ends.real)
 
 
-def straight(seen: Complex[Array, " points"]) -> tuple[Array, Array, Array]:
+def margins_on_grid(seen: Complex[Array, " points"]) -> tuple[Array, Array, Array]:
     """Return gain margin [dB] (infinite if there is none), phase margin [deg] and peak sensitivity [dB] of a grid.
 
     The function interpolates between grid points: crossings in ln L, the distance to -1 along straight lines.
@@ -299,7 +299,7 @@ def straight(seen: Complex[Array, " points"]) -> tuple[Array, Array, Array]:
     real = ends_at(ends) & (ends.real < 0.0)
     factors = jnp.append(factor, -jnp.log(jnp.where(real, -ends.real, 1.0)))
     gain = jnp.min(jnp.where(jnp.append(there, real) & (factors != 0.0), jnp.abs(factors), jnp.inf))
-    even, left = even_at(seen)
+    even, left = unit_gain_at(seen)
     phase = jnp.min(jnp.where(even, jnp.abs(left), jnp.pi))
     step = seen[1:] - seen[:-1]
     size = jnp.maximum(jnp.abs(step) ** 2, 1e-300)

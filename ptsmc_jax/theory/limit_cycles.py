@@ -76,12 +76,12 @@ def find(parts: Parts, seen: History | None = None) -> LimitCycle | None:
     last = whole[whole.size // 2 :]
     if whole.size < FEWEST or not np.isfinite(u[last]).all():
         return None
-    turns = _turns(np.diff(u[last], axis=0), ROUNDING * np.abs(u).max())
+    turns = _oscillates(np.diff(u[last], axis=0), ROUNDING * np.abs(u).max())
     suspect = turns & _stays(u[last])
     if not suspect.any():
         return None
     off, size = (np.asarray(v)[last] for v in _unexplained(parts, linear.nominal_jit(parts) if run is None else run))
-    suspect &= _turns(off, SHARE * np.abs(off).max(axis=0)) & (np.ptp(off, axis=0) > SHARE * np.ptp(size, axis=0))
+    suspect &= _oscillates(off, SHARE * np.abs(off).max(axis=0)) & (np.ptp(off, axis=0) > SHARE * np.ptp(size, axis=0))
     if not suspect.any():
         return None
     return max(_measured(u[last, axis], off[:, axis]) for axis in np.flatnonzero(suspect))
@@ -107,7 +107,7 @@ def _reversals(values: np.ndarray, least: Any) -> np.ndarray:
     return signs[1:] != signs[:-1]
 
 
-def _turns(values: np.ndarray, least: Any) -> np.ndarray:
+def _oscillates(values: np.ndarray, least: Any) -> np.ndarray:
     """Return which columns of values (times, m) change their sign often enough, (m,)."""
     least = np.broadcast_to(least, values.shape[1])
     turns = [np.count_nonzero(_reversals(v, low)) for v, low in zip(values.T, least, strict=True)]

@@ -272,7 +272,7 @@ def loops_in(parts: Parts, run: Nominal, indices: np.ndarray) -> Loop:
         run: the nominal run.
         indices: numbers of the periods (periods,).
     """
-    several = _interval(parts, indices)
+    several = _averaged_periods(parts, indices)
     return _means(opened_in(parts, run, several.reshape(-1)).loop, several.shape)
 
 
@@ -285,7 +285,7 @@ def loops_at(parts: Parts, run: Nominal, indices: Array, *, late: bool = True) -
         indices: numbers of the periods (periods,).
         late: see `opened`.
     """
-    several = _interval(parts, indices)
+    several = _averaged_periods(parts, indices)
 
     def one(index: Array) -> Loop:
         return opened(parts, jax.tree.map(lambda v: v[index], run), late=late).loop
@@ -298,8 +298,8 @@ def averaged(parts: Parts) -> int:
     return getattr(parts.sensors, "every", 1)
 
 
-def _interval(parts: Parts, indices: Any) -> Any:
-    """Return the numbers of the periods to average for each index, (periods, every)."""
+def _averaged_periods(parts: Parts, indices: Any) -> Any:
+    """Return the numbers of the periods whose loops are averaged for each index, (indices, every)."""
     return (indices[:, None] - np.arange(averaged(parts))[None]).clip(0)
 
 

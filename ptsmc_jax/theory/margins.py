@@ -157,7 +157,7 @@ def of(loop: Loop, sensors: bool = False, with_delay: bool = True) -> Margins:
 def _of(spectrum: _Spectrum, with_delay: bool) -> Margins:
     """Return the margins of each axis of an opened loop, see `of`."""
     brackets = jax.vmap(partial(crossings.brackets, spectrum.w))(spectrum.each)
-    root = jax.lax.stop_gradient(_closed_in(spectrum, brackets))
+    root = jax.lax.stop_gradient(_refined_crossings(spectrum, brackets))
     L, slope = spectrum.at(jnp.append(root, brackets.elsewhere, axis=1), sloped=True)
     in_axes = (0, 0, 0, 0, None, None)
     values = jax.vmap(_axis, in_axes=in_axes)(root, L, slope, brackets.there, spectrum.stable, spectrum.w[0])
@@ -174,7 +174,7 @@ def _crossed(L: Array) -> Array:
     return jnp.append(L[..., : SPLIT[0]].imag, jnp.log(jnp.abs(L[..., SPLIT[0] : SPLIT[1]])), axis=-1)
 
 
-def _closed_in(spectrum: _Spectrum, brackets: Brackets) -> Array:
+def _refined_crossings(spectrum: _Spectrum, brackets: Brackets) -> Array:
     """Return the frequencies (m, places) [rad/s] of all crossings of all axes.
 
     The function uses the Illinois variant of regula falsi (Dowell and Jarratt, BIT 11, 1971). It stops when the
@@ -206,7 +206,7 @@ def roughly(loop: Loop) -> dict[str, Array]:
     The keys are those of `catalogues.MARGINS`. The function takes about a tenth of the time of `of`.
     """
     spectrum = _spectrum(loop)
-    gain, phase, peak_sensitivity = jax.vmap(crossings.straight)(spectrum.each)
+    gain, phase, peak_sensitivity = jax.vmap(crossings.margins_on_grid)(spectrum.each)
     delay = jnp.min(jax.vmap(partial(crossings.delay_at, spectrum.w))(spectrum.each)[0], axis=1)
     sign = jnp.where(spectrum.stable, 1.0, -1.0)
     each = {

@@ -132,7 +132,7 @@ def judged_loops(parts: Parts, simulated: linear.Nominal | None = None, *, late:
     return linear.loops_at(parts, run, indices, late=late), run.period.now.hold[indices]
 
 
-def judged(parts: Parts) -> tuple[Margins, Array, History]:
+def judged_margins(parts: Parts) -> tuple[Margins, Array, History]:
     """Return the margins of `judged_loops` (times + 1, m), which of them are in the hold phase, and the commands.
 
     The function supports all JAX transformations.
@@ -142,7 +142,9 @@ def judged(parts: Parts) -> tuple[Margins, Array, History]:
     return margins.of_each(loops), hold, history(parts, run)
 
 
-judged_jit = programs.jit(judged, compiler_options=programs.QUICKLY, title="the margins of the nominal run")
+judged_margins_jit = programs.jit(
+    judged_margins, compiler_options=programs.QUICKLY, title="the margins of the nominal run"
+)
 
 
 def along(parts: Parts, times: int = 24) -> Course:

@@ -91,14 +91,14 @@ def test_campaign_of_a_written_run_table_has_identical_rows(which, request, tmp_
     frame = made.simulate(range(FLOWN))
     run_table.write_csv(tmp_path / "run_table.csv")
     run_table.write_parquet(tmp_path / "run_table.parquet")
-    digests = set()
+    checksums = set()
     for name in ("run_table.csv", "run_table.parquet"):
         again = of_run_table(made, run_tables.read(tmp_path / name))
-        digests.add(run_tables.checked(run_tables.read(tmp_path / name), made.ready.parts).digest)
+        checksums.add(run_tables.checked(run_tables.read(tmp_path / name), made.ready.parts).checksum)
         assert again.run_table is not None
         assert not again.run_table.given  # the program of the original campaign simulates it
         assert_frame_equal(again.simulate(range(FLOWN)), frame, check_exact=True)
-    assert len(digests) == 1
+    assert len(checksums) == 1
     # rows of a campaign are a valid run table; their results are ignored, and each row has the noise of its trial
     some = of_run_table(made, frame[[40, 7]])
     simulated = some.simulate(range(2))
@@ -465,8 +465,8 @@ def test_run_tables_of_different_trials_have_different_checksums():
         dataclasses.replace(some, seed=three),
         dataclasses.replace(some, given={}, count=3),
     ]
-    assert len({one.digest for one in (some, *others)}) == 6
-    assert dataclasses.replace(some, angle=np.ones(2)).digest == some.digest
+    assert len({one.checksum for one in (some, *others)}) == 6
+    assert dataclasses.replace(some, angle=np.ones(2)).checksum == some.checksum
 
 
 @pytest.mark.parametrize("folder", ["tables[1]", "tables*"])

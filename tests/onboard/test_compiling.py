@@ -54,9 +54,9 @@ def test_compiled_files_are_those_that_a_campaign_copies_and_checks(chain, tmp_p
     (changed / ".#ptsmc_flight.c").symlink_to("somebody@elsewhere:1")  # lock file of an editor, a dangling link
     (changed / "board.h").touch()
     Library(changed)
-    before = sources.digest(changed)
+    before = sources.checksum(changed)
     (changed / "board.h").write_text("/* changed */\n")
-    assert sources.digest(changed) != before
+    assert sources.checksum(changed) != before
     sources.copy(changed, tmp_path / "kept")
     Library(tmp_path / "kept")
     (changed / "other").mkdir()

@@ -67,8 +67,8 @@ def checked(folder):
     read = Page(made)
     (policy,) = [attrs["content"] for tag, attrs in read.found if attrs.get("http-equiv") == "Content-Security-Policy"]
     assert policy.startswith("default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; script-src ")
-    digests = [base64.b64encode(hashlib.sha256(one.encode()).digest()).decode() for one in read.scripts[1:]]
-    assert re.findall(r"'sha256-([^']+)'", policy) == digests
+    checksums = [base64.b64encode(hashlib.sha256(one.encode()).digest()).decode() for one in read.scripts[1:]]
+    assert re.findall(r"'sha256-([^']+)'", policy) == checksums
     places = {attrs["id"] for tag, attrs in read.found if tag == "div" and attrs.get("class", "").startswith("chart")}
     assert set(read.charts) == places
     assert len(read.scripts) == (3 if places else 0)

@@ -434,10 +434,10 @@ def test_custom_files_can_import_helpers_and_cannot_exit_the_command(tmp_path):
     for name, said in (("leaves.py", "SystemExit: 0"), ("broken.py", "SyntaxError: ")):
         with pytest.raises(ValueError, match=rf"^running .*{name} fails: {said}[^\n]*$"):
             systems.load(f"{tmp_path}/{name}:mine")
-    before = systems.digest(f"{tmp_path}/future.py:mine")
+    before = systems.checksum(f"{tmp_path}/future.py:mine")
     (tmp_path / "future.py").write_text(FILES["future.py"] + "# changed\n")
-    assert systems.digest(f"{tmp_path}/future.py:mine") != before
-    assert systems.digest(spacecraft_as_system(SPIN)) is None
+    assert systems.checksum(f"{tmp_path}/future.py:mine") != before
+    assert systems.checksum(spacecraft_as_system(SPIN)) is None
 
 
 def test_a_written_system_from_python_cannot_be_read(tmp_path):

@@ -159,7 +159,7 @@ def test_custom_sensors_of_a_spacecraft_measure_attitude_and_rate(command, here)
     status, _, error = command("simulate", "s.toml", "--no-figures", "--quiet")
     assert (status, error) == (0, f"ptsmc: runs {here}/mine.py, which sensors.code of s.toml names\n")
     made = store.read_versions(here / "out" / "simulate-s")
-    assert made["sensors_sha256"] == systems.digest("mine.py:Tilted")
+    assert made["sensors_sha256"] == systems.checksum("mine.py:Tilted")
     again = command("simulate", "out/simulate-s/scenario.toml", "--quiet", "--out", "new")
     assert again[0] == 2
     assert "(sensors.code), which this command would run" in again[2]
@@ -226,7 +226,7 @@ def test_keys_of_custom_sensors_and_dispersions_are_read_and_written(command, he
     loaded = scenario.from_tables({**CHAIN, "sensors": {**NOISY, "sigma": [1.0, 2.0]}, "dispersion": DRIFT})
     assert custom.waits(loaded)
     assert set(custom.programs(loaded)) == {"sensors.code", "dispersion.custom.code"}
-    assert set(custom.digests(loaded)) == {"sensors_sha256", "dispersion_custom_sha256"}
+    assert set(custom.checksums(loaded)) == {"sensors_sha256", "dispersion_custom_sha256"}
     whole = reading.complete(loaded)
     assert whole.dispersion is not None
     assert (whole.sensors.sigma, whole.dispersion.custom.std) == ((1.0, 2.0), 0.1)

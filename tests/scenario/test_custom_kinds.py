@@ -520,7 +520,7 @@ def test_results_with_custom_code_need_trust(command, here):
     found = tomllib.loads(left.read_text())
     assert found["controller"]["code"] == f"{here}/mine.py:Mine"
     assert found["controller"]["eta"] == 3.0
-    assert store.read_versions(left.parent)["controller_sha256"] == systems.digest(f"{here}/mine.py:Mine")
+    assert store.read_versions(left.parent)["controller_sha256"] == systems.checksum(f"{here}/mine.py:Mine")
     again = "simulate", "out/simulate-s/scenario.toml", "--no-figures", "--quiet", "--out", "new"
     code, _, error = command(*again)
     assert (code, "(controller.code), which this command would run" in error) == (2, True)

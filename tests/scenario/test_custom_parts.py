@@ -225,7 +225,7 @@ def test_reading_a_scenario_imports_no_module_and_no_package_around_it(tmp_path,
     assert parsing.dump(loaded)["plant"]["system"] == "around.inside:mine"
     with pytest.raises(ScenarioError, match=r"running around\.inside fails: SystemExit: was run"):
         scenario.study(loaded)
-    assert systems.digest("around.inside:mine") is None
+    assert systems.checksum("around.inside:mine") is None
 
 
 def test_the_source_of_a_custom_file_is_run_and_never_a_compiled_copy(tmp_path):
@@ -251,7 +251,7 @@ def test_a_run_records_the_checksum_of_its_custom_file(command, tmp_path):
     (tmp_path / "my.py").write_text(PROGRAM)
     (tmp_path / "mine.toml").write_text(SCENARIO)
     assert command("simulate", "mine.toml", "--out", "run", "--quiet", "--no-figures")[0] == 0
-    assert store.read_versions(tmp_path / "run")["system_sha256"] == systems.digest(f"{tmp_path}/my.py:mine")
+    assert store.read_versions(tmp_path / "run")["system_sha256"] == systems.checksum(f"{tmp_path}/my.py:mine")
 
 
 @pytest.mark.parametrize(

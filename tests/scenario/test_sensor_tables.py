@@ -113,7 +113,7 @@ def test_a_custom_sensor_has_keys_and_a_checksum():
     sensor = scenario.study(made).parts.sensors.sensors[1]
     assert (sensor.name, float(sensor.scale), sensor.times.wait) == ("custom_1", 3.0, 1)
     np.testing.assert_allclose(sensor.sensitivity(jnp.array([0.0, 0.0, 0.0, 1.0])), [[0.0, 3.0, 0.0]], atol=1e-15)
-    assert list(custom.digests(made)) == ["sensors_1_sha256"]
+    assert list(custom.checksums(made)) == ["sensors_1_sha256"]
     tables = parsing.dump(made)
     assert parsing.dump(scenario.reading.complete(scenario.from_tables(tables))) == tables
 

@@ -178,7 +178,7 @@ def test_comparison_laws_control_a_custom_system(kind):
 def test_a_custom_true_plant_is_reported_as_custom_code():
     loaded = scenario.from_tables(TABLES)
     assert set(custom.programs(loaded)) == {"plant.system", "plant.truth"}
-    assert set(custom.digests(loaded)) == {"system_sha256", "truth_sha256"}
+    assert set(custom.checksums(loaded)) == {"system_sha256", "truth_sha256"}
 
 
 @pytest.mark.parametrize(

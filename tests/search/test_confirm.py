@@ -64,7 +64,7 @@ def test_a_quantile_limit_applies_to_the_training_trials_or_to_a_band():
 def test_a_band_contains_the_trials_ranked_around_the_last_that_may_break_the_limit(monkeypatch):
     """Trial n has the error n. The band begins 16 trials before the last trial that may break the limit."""
     loose = replace(SHOWN, quantile=0.9)
-    count = confirm.counted_on([loose])
+    count = confirm.confirmation_trials([loose])
     simulated = SimpleNamespace(finished=np.arange(count) != 5)  # a failed trial is the worst one
 
     def fly(numbers, gains):
@@ -111,7 +111,7 @@ def test_confirmation_uses_trials_that_the_search_has_not_simulated(monkeypatch)
     some, wanted, seen = problem(peak_torque=0.7), [replace(SHOWN, metric="peak_torque", limit=0.7)], list[range]()
     posed = objective.problem(some.parts, SPREAD, 3, np.arange(8), some.names, wanted, may_break=(2,), banded=(True,))
     limits, at = normalisation.Bounds(some.names, (2.05, 0.2), (6.0, 4.0)), np.array([3.0, 0.7])
-    many = confirm.counted_on(wanted)
+    many = confirm.confirmation_trials(wanted)
 
     def count(posed, asked, gains, first, turn):
         seen.append(range(first + turn * many, first + (turn + 1) * many))  # as in `confirm.count`

@@ -44,8 +44,8 @@ def test_a_file_named_by_several_keys_is_reported_once(tmp_path, capsys):
         RefusedError, match=rf"custom code, {law} \(controller.code, observer.code, reference.code\), which"
     ):
         custom_parts.allow(programs, tmp_path, {}, trusted=False)
-    digests = {custom.digest_name(key): systems.digest(where) for key, where in programs.items()}
-    custom_parts.allow(programs, tmp_path, digests, trusted=True)
+    checksums = {custom.checksum_name(key): systems.checksum(where) for key, where in programs.items()}
+    custom_parts.allow(programs, tmp_path, checksums, trusted=True)
     keys = "controller.code, observer.code and reference.code"
     assert capsys.readouterr().err == f"ptsmc: runs {law}, which {keys} of {tmp_path} name\n"
 
@@ -55,7 +55,7 @@ def test_a_program_without_a_checksum_in_the_results_is_reported(tmp_path, capsy
     law.write_text("")
     other.write_text("")
     programs = {"controller.code": f"{law}:Mine", "observer.code": f"{other}:Mine"}
-    made = {"controller_sha256": systems.digest(f"{law}:Mine")}
+    made = {"controller_sha256": systems.checksum(f"{law}:Mine")}
     assert custom_parts.check_unchanged(programs, tmp_path, made) == ["observer.code"]
     custom_parts.allow(programs, tmp_path, made, trusted=True)
     (said,) = [line for line in capsys.readouterr().err.splitlines() if "no checksum" in line]
@@ -71,12 +71,12 @@ def test_checksum_covers_imported_files_in_the_same_folder(tmp_path):
         (tmp_path / name).write_text(text)
     (tmp_path / "other.py").write_text("")
     where = f"{tmp_path}/mine.py:Mine"
-    known = [systems.digest(where)]
+    known = [systems.checksum(where)]
     for name, text in files.items():
         (tmp_path / name).write_text(f"{text}# changed\n")
-        known.append(systems.digest(where))
+        known.append(systems.checksum(where))
     assert len(set(known)) == 4
     (tmp_path / "other.py").write_text("x = 1\n")
-    assert systems.digest(where) == known[-1]
+    assert systems.checksum(where) == known[-1]
     with pytest.raises(RefusedError, match=r"was made with another controller\.code"):
         custom_parts.check_unchanged({"controller.code": where}, tmp_path, {"controller_sha256": known[0]})

@@ -200,7 +200,7 @@ def looked_at(some, *gains):
 
 def simulated_at(some, trials, *gains):
     """Return the metrics of these trials."""
-    return simulations.simulate_trials(some.others(np.asarray(trials)), np.asarray(gains)).metrics
+    return simulations.simulate_trials(some.batch_of(np.asarray(trials)), np.asarray(gains)).metrics
 
 
 def test_measure_returns_the_rms_of_the_worst_trials_weighted_by_the_torque_and_the_ratios_to_the_limits():

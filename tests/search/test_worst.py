@@ -54,7 +54,7 @@ def test_a_search_computes_only_the_pointing_metrics_that_its_problem_needs():
     problem, _ = posed(spread, Requirement("ape_z", 1e-3))
     problem = replace(problem, parts=replace(problem.parts, pointing=observed))
     gains = np.array([ETA, 1.0])
-    found = simulations.simulate_trials(problem.others(np.arange(8)), gains).metrics
+    found = simulations.simulate_trials(problem.batch_of(np.arange(8)), gains).metrics
     every = montecarlo.run(problem.parts, spread, 5, np.arange(8)).metrics
     np.testing.assert_allclose(found.ape_z, every.ape_z, rtol=1e-12)
     np.testing.assert_allclose(found.hold_error, every.hold_error, rtol=1e-12)
@@ -188,7 +188,7 @@ def test_gradients_of_the_ascent_agree_with_finite_differences(what):
     else:
         limits = {"effort": 3.0, "peak_rate": 0.05}
         problem, _ = swinging(0.0, [1.0, 0.1], 0.01, **limits)
-    batch = problem.others(np.arange(4, 7))
+    batch = problem.batch_of(np.arange(4, 7))
     y = np.concatenate([worst._charted(problem, name, v) for name, v in batch.coordinates.items()], axis=1)
     at = np.array([ETA, 1.0])
 
@@ -326,7 +326,7 @@ def test_the_hardest_screened_trial_is_the_worst_case_if_nothing_can_be_moved():
     # with more trials than a row, the results keep the order of the trials
     assert trials.size > simulations.ROW
     some = trials[[3, -1, -2]]
-    alone = simulations.simulate_trials(problem.others(some), at)
+    alone = simulations.simulate_trials(problem.batch_of(some), at)
     np.testing.assert_allclose(alone.metrics.peak_rate / 0.1, ratio[[3, -1, -2]], rtol=1e-12)
 
 

@@ -98,8 +98,8 @@ def test_checksums_accept_only_the_custom_laws_of_the_comparison(tmp_path):
     for name in ("simulated", "beside", "other"):
         (tmp_path / f"{name}.py").write_text(f"# {name}\n")
     where = {name: f"{tmp_path}/{name}.py:Mine" for name in ("simulated", "beside", "other")}
-    of_scenario = {"controller_sha256": systems.digest(where["simulated"])}
-    of_rivals = {"custom_laws": {where["beside"]: systems.digest(where["beside"])}}
+    of_scenario = {"controller_sha256": systems.checksum(where["simulated"])}
+    of_rivals = {"custom_laws": {where["beside"]: systems.checksum(where["beside"])}}
     for made, names in ((of_scenario | of_rivals, ("simulated", "beside")), (of_rivals, ("beside",))):
         for name in names:
             custom_parts.check_unchanged({"controller.code": where[name]}, tmp_path, made)

@@ -202,27 +202,27 @@ def laws(
     return {"data": data, "layout": _layout(xaxis=across, yaxis=up, shapes=lines, annotations=notes)}
 
 
-def search(rows: Sequence[Mapping[str, str]], goal: str) -> Chart:
-    """The goal of every start over the steps of a `history.csv`; hollow: beyond a limit."""
+def search(rows: Sequence[Mapping[str, str]], objective: str) -> Chart:
+    """The objective of every local search over the steps of a `history.csv`; hollow: beyond a limit."""
     starts: dict[str, list[Mapping[str, str]]] = {}
     for row in rows:
         starts.setdefault(row["start"], []).append(row)
     over = [name for name in rows[0] if name.endswith("_over_limit")]
-    gains = [name for name in rows[0] if name not in ("step", "start", goal, *over)]
+    gains = [name for name in rows[0] if name not in ("step", "start", objective, *over)]
     data = []
     for k, (start, steps) in enumerate(starts.items()):
         met = [all(float(row[name] or "nan") <= 1.0 for name in over) for row in steps]
         data.append({
             "type": "scatter", "mode": "lines+markers", "name": f"start {start}",
             "x": [int(row["step"]) for row in steps],
-            "y": numbers(np.array([float(row[goal] or "nan") for row in steps])),
+            "y": numbers(np.array([float(row[objective] or "nan") for row in steps])),
             "text": [", ".join(f"{name} {float(row[name]):.4g}" for name in gains) for row in steps],
             "hovertemplate": "step %{x}: %{y:.3e}<br>%{text}<extra></extra>",
             "marker": {"size": 6, "symbol": ["circle" if one else "circle-open" for one in met]},
             "line": {"width": 1, "color": COLOURS[k % len(COLOURS)]},
         })  # fmt: skip
-    up = {"title": {"text": goal.replace("_", " ")}, **_DECADES}
-    return {"data": data, "layout": _layout(xaxis={"title": {"text": "step of the descent"}}, yaxis=up)}
+    up = {"title": {"text": objective.replace("_", " ")}, **_DECADES}
+    return {"data": data, "layout": _layout(xaxis={"title": {"text": "step of the local search"}}, yaxis=up)}
 
 
 def numbers(values: np.ndarray) -> list[float | None]:

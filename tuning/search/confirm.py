@@ -45,7 +45,7 @@ def held_out_trials(requirements: Sequence[Requirement]) -> int:
     return max([HELD_OUT, *(SHOWN * count for count in needed)])
 
 
-def counted_on(requirements: Sequence[Requirement]) -> int:
+def confirmation_trials(requirements: Sequence[Requirement]) -> int:
     """Return the number of confirmation trials."""
     return max(FEWEST, TIMES * held_out_trials(requirements))
 
@@ -70,7 +70,8 @@ def may_break(requirement: Requirement, requirements: Sequence[Requirement], tri
         least = must_keep(trials, quantile, confidence)
         assert least is not None
         return trials - least, False
-    return min(FARTHER, allowed(requirement, held_out_trials(requirements), counted_on(requirements)) or 0), True
+    most = allowed(requirement, held_out_trials(requirements), confirmation_trials(requirements))
+    return min(FARTHER, most or 0), True
 
 
 def probability(requirement: Requirement, held_out: int, trials: int, violations: int) -> float:
@@ -127,9 +128,9 @@ def count(
     Returns:
         The count for each requirement.
     """
-    held_out, many = held_out_trials(requirements), counted_on(requirements)
+    held_out, many = held_out_trials(requirements), confirmation_trials(requirements)
     numbers = (first + turn * many + np.arange(many)).astype(np.uint32)
-    simulated = simulations.simulate_trials(problem.others(numbers), gains)
+    simulated = simulations.simulate_trials(problem.batch_of(numbers), gains)
     counts = []
     for requirement in requirements:
         values = np.where(simulated.finished, getattr(simulated.metrics, requirement.metric), np.inf)

@@ -40,11 +40,11 @@ def location(key: str, where: str) -> str:
     return os.path.realpath(where) if key in (CONTROLLER, custom.DATA) else systems.location(where)
 
 
-def digest(key: str, where: str) -> str | None:
+def checksum(key: str, where: str) -> str | None:
     """Return the present SHA-256 checksum of the code or the data file, or None if it is in no file."""
     if key == custom.DATA:
         return systems.sha256(where)
-    return sources.digest(Path(where)) if key == CONTROLLER else systems.digest(where)
+    return sources.checksum(Path(where)) if key == CONTROLLER else systems.checksum(where)
 
 
 def allow_scenario(path: Path, scenario: Scenario, trusted: bool) -> None:
@@ -105,7 +105,7 @@ def check_unchanged(programs: Mapping[str, str], results: Path, made: Mapping[st
     """
     unknown = []
     for key, where in programs.items():
-        known, now = _digests(made, key), digest(key, where)
+        known, now = _digests(made, key), checksum(key, where)
         if not known:
             unknown.append(key)
         elif now is not None and now not in known:
@@ -120,8 +120,8 @@ def check_unchanged(programs: Mapping[str, str], results: Path, made: Mapping[st
 def _digests(made: Mapping[str, Any], key: str) -> list[str]:
     """Return the known checksums of custom code. A comparison has one for each of its laws, under the same key."""
     laws = made.get("custom_laws") if key == "controller.code" else None
-    digests = (made.get(custom.digest_name(key)), *(laws.values() if isinstance(laws, dict) else ()))
-    return list(dict.fromkeys(map(str, filter(None, digests))))
+    checksums = (made.get(custom.checksum_name(key)), *(laws.values() if isinstance(laws, dict) else ()))
+    return list(dict.fromkeys(map(str, filter(None, checksums))))
 
 
 def carry(tables: dict[str, Any], folder: Path) -> dict[str, Any]:
@@ -131,7 +131,7 @@ def carry(tables: dict[str, Any], folder: Path) -> dict[str, Any]:
     """
     for table, key in custom.named(tables):
         place, _, name = table[key].rpartition(":")
-        if place.endswith(".py") and alone(Path(place)):
+        if place.endswith(".py") and is_self_contained(Path(place)):
             table[key] = f"{_copied(Path(place), folder).name}:{name}"
     for table in custom.data_tables(tables):
         table["file"] = _copied(Path(table["file"]), folder).name
@@ -147,7 +147,7 @@ def _copied(file: Path, folder: Path) -> Path:
     return copy
 
 
-def alone(file: Path) -> bool:
+def is_self_contained(file: Path) -> bool:
     """Return whether a copy of a Python file can run: it imports nothing from its folder and uses no `__file__`."""
     try:
         nodes = ast.walk(ast.parse(file.read_bytes()))

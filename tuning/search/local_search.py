@@ -119,7 +119,7 @@ class Relaxed:
 
 
 def search_locally(
-    slopes: Callable[[np.ndarray], MeasuredWithGradients],
+    measure: Callable[[np.ndarray], MeasuredWithGradients],
     best: Best,
     start: Start,
     steps: int,
@@ -137,7 +137,7 @@ def search_locally(
     not minimised.
 
     Args:
-        slopes: function that measures one point, (1, gains) normalised gains, with gradients.
+        measure: function that measures one point, (1, gains) normalised gains, with gradients.
         best: is offered every point.
         start: starting point and scaling of the variables.
         steps: largest number of points to measure.
@@ -146,7 +146,7 @@ def search_locally(
         relaxed: if given, only the violation of these limits is minimised, and the other limits are constraints.
         steepest: largest element of the gradients of F and c; larger gradients are scaled down.
     """
-    local = _Local(slopes, best, start, steps, keep, close, steepest)
+    local = _Local(measure, best, start, steps, keep, close, steepest)
     first = start.scale * start.normalised
     with contextlib.suppress(_StepsUsedError):
         keep(local.at(first))
@@ -172,7 +172,7 @@ class _Local:
 
     def __init__(
         self,
-        slopes: Callable[[np.ndarray], MeasuredWithGradients],
+        measure: Callable[[np.ndarray], MeasuredWithGradients],
         best: Best,
         start: Start,
         steps: int,
@@ -181,7 +181,7 @@ class _Local:
         steepest: float,
     ):
         self._steepest = steepest
-        self._slopes, self._best, self._start = slopes, best, start
+        self._measure, self._best, self._start = measure, best, start
         self._steps, self._record, self._close = steps, keep, close
         self._seen, self._scale = start.seen, start.scale
         scaled = self._scale * start.normalised
@@ -193,7 +193,7 @@ class _Local:
         if key not in self._seen:
             if len(self._seen) == self._steps:
                 raise _StepsUsedError
-            self._seen[key] = self._slopes(point)
+            self._seen[key] = self._measure(point)
         if self._seen[key].finite[0]:
             self._best.offer(point, self._seen[key])
         return self._seen[key]

@@ -91,8 +91,8 @@ class Problem(Rules):
         pointing = tuple(name for name in POINTING if name in names)
         return Batch(self.parts, self.dispersion, self.seed, self.names, trials, coordinates, pointing)
 
-    def others(self, trials: np.ndarray) -> Batch:
-        """Return the fleet with other trials, (trials,), of the same seed."""
+    def batch_of(self, trials: np.ndarray) -> Batch:
+        """Return a batch of other trials, (trials,), of the same seed."""
         coordinates = coordinates_of(self.dispersion, int(self.seed), trials)
         return self.batch._replace(trials=np.asarray(trials, dtype=np.uint32), coordinates=coordinates)
 

@@ -119,7 +119,7 @@ def sensitivities(
         Sensitivities [-] by metric and gain.
     """
     less, more = (np.clip(gains + side * np.diag(STEP * gains), bounds.lower, bounds.upper) for side in (-1.0, 1.0))
-    trials = problem.others(np.asarray(problem.trials)[: problem.averaged])
+    trials = problem.batch_of(np.asarray(problem.trials)[: problem.averaged])
     simulated = simulations.simulate(trials, np.concatenate([less, more]))
     finished = np.isin(simulated.status, rollout.FINISHED)
     metrics = (getattr(simulated.metrics, name) for name in names)

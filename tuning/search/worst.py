@@ -85,7 +85,7 @@ def screen(problem: Problem, requirements: Sequence[Requirement], gains: np.ndar
         fails or lacks a metric.
     """
     trials = np.arange(problem.averaged, problem.averaged + SCREENED, dtype=np.uint32)
-    simulated = simulations.simulate_trials(problem.others(trials), gains)
+    simulated = simulations.simulate_trials(problem.batch_of(trials), gains)
     ratios = np.stack(
         [violation_ratio(getattr(simulated.metrics, r.metric), r.limit, at_least=False) for r in requirements]
     )
@@ -110,7 +110,7 @@ def hardest(
     trials, ratio = screened or screen(problem, requirements, gains)
     chosen = trials[np.argsort(-ratio, kind="stable")][:ASCENTS]
     limits = {r.metric: r.limit for r in requirements}
-    batch = problem.others(chosen)
+    batch = problem.batch_of(chosen)
     moved = simulations.movable(problem.dispersion)
     charted = [_charted(problem, name, batch.coordinates[name]) for name in moved]
     y = np.concatenate([np.zeros((chosen.size, 0)), *charted], axis=1)

@@ -66,7 +66,7 @@ class Folder:
     custom_metrics: str | None = None  # FILE.py:NAME of the function that computes custom metrics
     bits: int = 64  # floating-point precision
     made: Made | None = None  # content of the existing folder; None: the folder does not exist yet
-    digests: Mapping[str, str] = field(default_factory=dict)  # checksums of custom code in the existing folder
+    checksums: Mapping[str, str] = field(default_factory=dict)  # checksums of custom code in the existing folder
     trusted: bool = True  # custom systems and metrics may be executed
     table_name: str | None = None  # file name of the run table
     table: pl.DataFrame | None = None  # content of the run table
@@ -89,14 +89,14 @@ class Folder:
 
         The checksums are those in the folder if it exists, else those of the present files.
         """
-        digests = {}
+        checksums = {}
         for key, where in self.files.items():
-            name = custom.digest_name(key)
-            digests[name] = self.digests.get(name) if self.made else custom_parts.digest(key, where)
+            name = custom.checksum_name(key)
+            checksums[name] = self.checksums.get(name) if self.made else custom_parts.checksum(key, where)
         if self.table is not None:
-            digests[RUN_TABLE] = self.digests.get(RUN_TABLE) if self.made else self.run_table.digest
+            checksums[RUN_TABLE] = self.checksums.get(RUN_TABLE) if self.made else self.run_table.checksum
         metrics = {} if self.custom_metrics is None else {"metrics": self.custom_metrics}
-        known = {name: digest for name, digest in digests.items() if digest is not None}
+        known = {name: checksum for name, checksum in checksums.items() if checksum is not None}
         return {"command": "montecarlo", "seed": self.seed, "precision": self.bits, **metrics, **known}
 
     @property
@@ -191,7 +191,7 @@ class Folder:
         where = f"the run table {self.table_name}"
         drawn = self.ready.dispersion.custom_names()
         table = run_tables.checked(self.table, self.ready.parts, where, self.custom_metric_names, drawn)
-        if self.made is not None and table.digest != self.digests.get(RUN_TABLE):
+        if self.made is not None and table.checksum != self.checksums.get(RUN_TABLE):
             raise RefusedError(f"{self.path / TABLE} is not the run table that the campaign was begun with")
         return table
 
@@ -264,7 +264,7 @@ def begin(wanted: Folder, force: bool) -> None:
     """
     tables, path = parsing.dump(wanted.scenario), wanted.path
     made = store.read_versions(path)  # files that no campaign wrote belong to the user
-    kept = sources.listed(path / C) if custom.digest_name(custom_parts.CONTROLLER) in made else []
+    kept = sources.listed(path / C) if custom.checksum_name(custom_parts.CONTROLLER) in made else []
     if wanted.controller is not None and kept != sources.listed(path / C):
         raise RefusedError(f"--out is {path}, whose {C} holds C that no campaign left there; allowed is another folder")
     if force and path.is_dir():
@@ -310,7 +310,7 @@ def _begun(wanted: Folder, tables: Mapping[str, Any]) -> bool:
     if not same or before.controller is None:
         return same
     key = custom_parts.CONTROLLER  # the folder's copy may be missing or changed
-    return custom_parts.digest(key, before.programs[key]) == before.digests.get(custom.digest_name(key))
+    return custom_parts.checksum(key, before.programs[key]) == before.checksums.get(custom.checksum_name(key))
 
 
 def opened(path: Path) -> Folder:
@@ -331,7 +331,7 @@ def opened(path: Path) -> Folder:
         raise
     except (ValueError, msgspec.ValidationError):
         raise RefusedError(f"{path} holds no campaign; allowed is a folder made by `ptsmc montecarlo`") from None
-    digests = {name: value for name, value in versions.items() if name.endswith("_sha256") and isinstance(value, str)}
+    checksums = {name: value for name, value in versions.items() if name.endswith("_sha256") and isinstance(value, str)}
     return Folder(
         path=path,
         scenario=simulated,
@@ -340,11 +340,11 @@ def opened(path: Path) -> Folder:
         custom_metrics=made.metrics,
         bits=made.precision,
         made=made,
-        digests=digests,
+        checksums=checksums,
         trusted=False,
         table_name=made.run_table,
         table=None if made.run_table is None else run_tables.read(path / TABLE),
-        controller=path / C if custom.digest_name(custom_parts.CONTROLLER) in digests else None,
+        controller=path / C if custom.checksum_name(custom_parts.CONTROLLER) in checksums else None,
         first_look=made.first_look,
     )
 

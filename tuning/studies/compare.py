@@ -131,8 +131,8 @@ class Rivals:
 
     def identity(self) -> dict[str, Any]:
         """Return the entries of `versions.json` that identify these laws; empty for the default laws."""
-        digests = {code: systems.digest(code) for code in self._codes}
-        return {"laws": list(self.named), "custom_laws": digests} if self != Rivals() else {}
+        checksums = {code: systems.checksum(code) for code in self._codes}
+        return {"laws": list(self.named), "custom_laws": checksums} if self != Rivals() else {}
 
 
 def _free_name(name: str, taken: Iterable[str]) -> str:
@@ -439,4 +439,4 @@ def identity(scenario: Scenario, seed: int, against: Rivals = Rivals()) -> dict[
         seed: of the searches.
         against: the other laws.
     """
-    return {"command": "compare", "seed": seed, **custom.digests(scenario), **against.identity()}
+    return {"command": "compare", "seed": seed, **custom.checksums(scenario), **against.identity()}

@@ -54,7 +54,7 @@ class Cell:
 
     x: float
     y: float
-    status: str  # "flown", or the reason why the pair was not simulated
+    status: str  # "simulated", or the reason why the pair was not simulated
     trials: int = 0
     failures: int = 0  # trials that did not reach their end
     not_converged: int = 0  # trials that did not converge by t_f
@@ -323,7 +323,7 @@ def write(folder: Path, simulated: Map, seed: int, figures: bool) -> None:
     """
     scenario, x, y, cells = simulated.scenario, simulated.x, simulated.y, simulated.cells
     trials = max((cell.trials for cell in cells), default=0)
-    made_by = {"command": "map", "seed": seed, "x": x.text, "y": y.text, "trials": trials, **custom.digests(scenario)}
+    made_by = {"command": "map", "seed": seed, "x": x.text, "y": y.text, "trials": trials, **custom.checksums(scenario)}
     store.record(folder, parsing.dump(scenario), made_by)
     fields = [name for name in Cell.__dataclass_fields__ if name not in ("x", "y")]
     cells_of = ((cell.x, cell.y, *(getattr(cell, name) for name in fields)) for cell in cells)

@@ -45,7 +45,7 @@ def summary(run: Run, scenario: Scenario, computer: "InTheLoop | None" = None) -
     if computer is not None:
         said += [computer.otherwise] if computer.otherwise else []
         statuses = {name: count for name, count in run.samples.items() if count}
-        decided_by = {"controller_statuses": statuses, "controller": computer.library.digest}
+        decided_by = {"controller_statuses": statuses, "controller": computer.library.checksum}
     return {**heading, **run.metrics, "floor": floor, "verdicts": verdicts, "warnings": said, **decided_by}
 
 
@@ -73,10 +73,13 @@ def write(
         replayed: further entries of `versions.json` if the run repeats a trial of a campaign.
         aem: write `attitude.aem` too, an attitude ephemeris message.
     """
-    made_by = {"command": "simulate", "seed": seed, "trial": trial, **replayed, **custom.digests(scenario)}
+    made_by = {"command": "simulate", "seed": seed, "trial": trial, **replayed, **custom.checksums(scenario)}
     if computer is not None:
         place = computer.library.folder
-        made_by |= {"controller": str(place.absolute()), custom.digest_name(custom.CONTROLLER): sources.digest(place)}
+        made_by |= {
+            "controller": str(place.absolute()),
+            custom.checksum_name(custom.CONTROLLER): sources.checksum(place),
+        }
     store.record(folder, parsing.dump(scenario), made_by, summary(run, scenario, computer))
     columns = run.columns()
     store.write_csv(folder / "trajectory.csv", list(columns), np.column_stack(list(columns.values())).tolist())

@@ -60,7 +60,7 @@ def worst(ready: Study) -> dict[str, dict[str, Any]] | None:
     """
     if not ready.scenario.sampled:
         return None
-    left, hold, history = jax.tree.map(np.asarray, run_margins.judged_jit(ready.parts))
+    left, hold, history = jax.tree.map(np.asarray, run_margins.judged_margins_jit(ready.parts))
     if np.isnan(left.peak_sensitivity[-1]).any():
         return None
     limit_cycle = limit_cycles.find(ready.parts, history)
@@ -165,7 +165,7 @@ def write(folder: Path, ready: Study, course: Course, figures: bool) -> None:
         figures: write figures too.
     """
     scenario = ready.scenario
-    made_by = {"command": "margins", "seed": None, **custom.digests(scenario)}
+    made_by = {"command": "margins", "seed": None, **custom.checksums(scenario)}
     store.record(folder, parsing.dump(scenario), made_by, summary(ready, course))
     inputs, _ = names(ready)
     t_f = float(ready.parts.controller.t_f)

@@ -105,7 +105,7 @@ class Trade(ABC):
 
     def identity(self, seed: int) -> dict[str, Any]:
         """Return the entries of `versions.json` that identify a finished or interrupted front."""
-        return {"command": "pareto", "seed": seed, **self.options(), **custom.digests(self.scenario)}
+        return {"command": "pareto", "seed": seed, **self.options(), **custom.checksums(self.scenario)}
 
 
 @dataclass(frozen=True)

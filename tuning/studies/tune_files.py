@@ -190,7 +190,7 @@ def write(folder: Path, scenario: Scenario, tuning: Tuning, figures: bool, known
     store.write_toml(folder / "tuned.toml", custom_parts.carry(parsing.dump(tuning.tuned), folder))
     rows = [
         [step, row.start, row.value, *row.gains, *row.worst]
-        for path in _paths(tuning.search.history)
+        for path in _points_by_start(tuning.search.history)
         for step, row in enumerate(path)
     ]
     store.write_csv(folder / "history.csv", history_columns(scenario, tuning.search.problem.rows), rows)
@@ -207,7 +207,7 @@ def history_columns(scenario: Scenario, limited: Iterable[str]) -> list[str]:
     return ["step", "start", goal, *gain_names.named(scenario), *(f"{metric}_over_limit" for metric in limited)]
 
 
-def _paths(history: Sequence[Step]) -> list[list[Step]]:
+def _points_by_start(history: Sequence[Step]) -> list[list[Step]]:
     """Return the evaluated points of each starting point."""
     return [list(path) for _, path in itertools.groupby(history, lambda step: step.start)]
 
@@ -220,7 +220,12 @@ def identity(scenario: Scenario, seed: int, *, globally: bool) -> dict[str, Any]
         seed: of the search.
         globally: the run includes a global search for comparison.
     """
-    return {"command": "tune", "seed": seed, **({"global_check": True} if globally else {}), **custom.digests(scenario)}
+    return {
+        "command": "tune",
+        "seed": seed,
+        **({"global_check": True} if globally else {}),
+        **custom.checksums(scenario),
+    }
 
 
 def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
@@ -230,7 +235,7 @@ def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
     kind, names = scenario.plant.kind, gain_names.named(scenario)
     unit_of = gain_names.units_of(scenario)
     units = [unit_of[gain_names.base(name)] for name in names]
-    paths = _paths(tuning.search.history)
+    paths = _points_by_start(tuning.search.history)
     longest = max(map(len, paths))
 
     def over_steps(of: Callable[[Step], Any], missing: Any = np.nan) -> np.ndarray:  # (steps, starts, ...)

@@ -160,7 +160,7 @@ def tune(
         check = global_check.check(evaluate, outcome, seed, report, with_gradients=posed.with_gradients)
     problem = posed.problem
     training = simulations.simulate_trials(
-        problem.others(np.arange(problem.averaged)), np.asarray([*judged.gains.values()])
+        problem.batch_of(np.arange(problem.averaged)), np.asarray([*judged.gains.values()])
     )
     candidates = {"tuned": judged.scenario} | {name: judging.on_flight_clock(other) for name, other in others.items()}
     held_out = {"tuned": judged.trials} | {name: judging.judge(other, judged.seed) for name, other in others.items()}
@@ -390,4 +390,4 @@ def _prepare(scenario: Scenario) -> None:
     simulated = study(judging.on_flight_clock(scenario))
     montecarlo.prepare(simulated.parts, simulated.dispersion, judging.held_out_trials(simulated))
     if scenario.sampled:
-        run_margins.judged_jit.prepare(simulated.parts)
+        run_margins.judged_margins_jit.prepare(simulated.parts)
