@@ -44,7 +44,7 @@ def test_inputs_of_the_worst_trial_have_percentile_median_and_sensitivity(monkey
     told = why(Rows(), ["peak_torque"], 1)
     assert [one["input"] for one in told] == ["initial_angle", "initial_w1"]  # q4 duplicates the angle
     assert told[0] == {"metric": "peak_torque", "trial": 400, "value": 4.0, "input": "initial_angle", "drawn": 2.0,
-                       "unit": "rad", "percentile": 100.0, "median": 1.0, "share": None,
+                       "unit": "rad", "percentile": 100.0, "median": 1.0, "fraction": None,
                        "rank_correlation": pytest.approx(1.0, rel=1e-12),
                        "first_order": pytest.approx(1.0, abs=0.05), "trials": 401}  # fmt: skip
     assert told[1]["percentile"] == 100.0 * np.mean(rate <= rate[400])
@@ -60,7 +60,7 @@ def test_inputs_of_the_worst_trial_have_percentile_median_and_sensitivity(monkey
     table = table.with_columns(peak_torque=(wheel == 2.0) + 1e-3 * rate, wheel_failure_wheel=wheel)
     told = why(Rows(), ["peak_torque"], 1)
     (one,) = [row for row in told if row["input"] == "wheel_failure_wheel"]
-    assert (one["percentile"], one["median"], one["share"]) == (None, None, pytest.approx(100 / 401))
+    assert (one["percentile"], one["median"], one["fraction"]) == (None, None, pytest.approx(100 / 401))
     assert one["rank_correlation"] is None
     assert one["first_order"] > 0.5
     assert "wheel_failure_wheel 2 as in 24.9 % of the trials" in "".join(trials_report.why(told, "spacecraft"))
@@ -113,7 +113,7 @@ def test_every_random_input_may_be_a_reason(monkeypatch):
 def test_insignificant_correlation_in_few_trials_is_not_a_reason():
     """A correlation of 0.15 is not significant in 200 trials, for example if only these settle."""
     told = [{"metric": "settling_time", "trial": 3, "value": 1.0, "input": "initial_w1", "drawn": 2.0, "unit": "rad/s",
-             "percentile": 70.0, "median": 1.0, "share": None, "rank_correlation": 0.15, "first_order": 0.06,
+             "percentile": 70.0, "median": 1.0, "fraction": None, "rank_correlation": 0.15, "first_order": 0.06,
              "trials": 200}]  # fmt: skip
     (said,) = trials_report.why(told, "spacecraft")
     assert said.endswith("no sampled input explains it; sensor noise remains")
@@ -126,8 +126,8 @@ def test_report_lists_the_four_most_unusual_inputs_of_a_failed_trial():
     ranked = {"initial_angle": 70.0, "initial_w1": 52.0, "initial_w2": 1.0}  # distances 20, 2 and 49
     shared = {"wheel_failure_wheel": 0.25, "custom_1": 0.9}  # distances 37.5 and 5
     told = [
-        *({**alike, "input": name, "percentile": at, "median": 1.0, "share": None} for name, at in ranked.items()),
-        *({**alike, "input": name, "percentile": None, "median": None, "share": at} for name, at in shared.items()),
+        *({**alike, "input": name, "percentile": at, "median": 1.0, "fraction": None} for name, at in ranked.items()),
+        *({**alike, "input": name, "percentile": None, "median": None, "fraction": at} for name, at in shared.items()),
     ]
     (said,) = trials_report.why(told, "spacecraft")
     assert said.startswith("no effort in trial 3: ")

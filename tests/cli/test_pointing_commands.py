@@ -80,12 +80,12 @@ def test_pointing_requirements_have_verdicts_budget_and_table(simulated, tmp_pat
 
     mixed, within = verdicts["ape_boresight"], rows["within_ape_boresight"].to_numpy()
     assert 0.1 < within.mean() < 1.0
-    assert mixed["share"] == pytest.approx(within.mean())
+    assert mixed["fraction"] == pytest.approx(within.mean())
     assert mixed["fraction_bound"] == pytest.approx(1.0 - statistics.mean_bound(1.0 - within, 0.9))
     assert mixed["met"] == (mixed["fraction_bound"] >= 0.5)
     assert mixed["fewest_trials"] == 4  # 0.5^4 <= 0.1
     low, high = mixed["fraction_interval"]
-    assert low < mixed["share"] < high
+    assert low < mixed["fraction"] < high
     temporal = verdicts["ake_x"]
     assert temporal["fraction_of_time"] == pytest.approx(rows["within_ake_x"].min())
     assert temporal["met"]

@@ -734,7 +734,7 @@ def test_a_law_that_computes_its_own_torque_has_no_singularity(here):
     trials = montecarlo.run(ready.parts, ready.dispersion, 0, np.arange(20))
     assert trials.counts()["singular"] == 0
     assert trials.finished.all()
-    assert "clearance" not in board(ready.parts).state
+    assert "singularity_distance" not in board(ready.parts).state
 
 
 def test_a_run_whose_law_memory_becomes_nan_has_diverged(here):

@@ -120,7 +120,7 @@ def test_goal_limits_includes_the_margins(monkeypatch):
 
 def test_the_objective_is_nan_if_no_trial_completes():
     """F then contains the penalty `FAILED`, which must not appear as an error of 1e9 in histories and progress."""
-    shape = {"limits": np.array([0.5]), "among": np.zeros((1, 2), bool), "counted": np.ones((1, 2), bool)}
+    shape = {"limits": np.array([0.5]), "quantile_sample": np.zeros((1, 2), bool), "counted": np.ones((1, 2), bool)}
     rules = Rules(averaged=2, names=("eta",), may_break=(None,), **shape)
     status = jnp.asarray([[rollout.OK, rollout.DIVERGED], [rollout.DIVERGED] * 2], jnp.int32)
     judged = [judge(rules, jnp.asarray([3.0]), jnp.asarray([[4.0, 0.3, 0.3], [5.0, 0.2, 0.2]]), one) for one in status]

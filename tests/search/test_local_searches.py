@@ -270,7 +270,7 @@ def test_a_local_search_keeps_its_number_of_points_and_survives_useless_gradient
     """F = ln(1 + |x - a|^2), whose gradient is scaled by 1e30 at the first point and is NaN at the third point."""
 
     class Bowl(Evaluator):
-        def slopes(self, problem, normalised):
+        def measure_with_gradients(self, problem, normalised):
             self.gradients += 1
             off = normalised[0] - np.array([0.3, 0.8])
             f = np.log1p(off @ off)

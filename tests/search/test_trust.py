@@ -71,7 +71,7 @@ def test_a_profile_varies_only_its_own_gain():
         gains, none = np.stack([bounds.gains(one) for one in normalised]), np.zeros(len(normalised))
         return Measured(gains, none, np.zeros((len(normalised), 0, 1)), gains @ [0.0, 0.0, 1.0])
 
-    evaluate: Any = SimpleNamespace(bounds=bounds, fly=fly)
+    evaluate: Any = SimpleNamespace(bounds=bounds, measure=fly)
     asked: Any = SimpleNamespace(rows=(), names=names)
     profiles = trust.profiles(evaluate, asked, bounds.normalise(found))
     for name in ("eta", "observer_gain"):
@@ -96,7 +96,7 @@ def test_profiles_and_gradient_check_handle_failed_trials():
     def measure_with_gradients(problem: Any, normalised: np.ndarray) -> Any:
         return SimpleNamespace(f_gradient=np.zeros_like(normalised))
 
-    evaluate: Any = SimpleNamespace(bounds=bounds, fly=fly, measure_with_gradients=measure_with_gradients)
+    evaluate: Any = SimpleNamespace(bounds=bounds, measure=fly, measure_with_gradients=measure_with_gradients)
     asked: Any = SimpleNamespace(rows=("peak_torque",), names=("k",))
     found = trust.profiles(evaluate, asked, bounds.normalise(np.array([0.7])))["k"]
     np.testing.assert_array_equal(found.violation_ratio <= 1.0, found.gain >= 0.5)

@@ -40,10 +40,10 @@ def test_mixed_requirement_averages_time_fractions_and_counts_a_missing_one_as_z
     np.testing.assert_allclose(beyond, [0.0, 0.1, 0.5, 1.0, 1.0], rtol=1e-12)
     verdict = asked.verdict(frame["ape_z"].to_numpy(), ended, frame["within_ape_z"].fill_null(np.nan).to_numpy())
     told = campaign_summary._in_summary(verdict, asked, beyond)
-    assert told["share"] == pytest.approx(told["fraction_of_time"], rel=1e-12)
-    assert told["share"] == pytest.approx((1.0 + 0.9 + 0.5) / 5.0, rel=1e-12)
+    assert told["fraction"] == pytest.approx(told["fraction_of_time"], rel=1e-12)
+    assert told["fraction"] == pytest.approx((1.0 + 0.9 + 0.5) / 5.0, rel=1e-12)
     low, high = told["fraction_interval"]
-    assert low < told["fraction_bound"] < told["share"] < high  # two-sided 95 % interval, one-sided 95 % bound
+    assert low < told["fraction_bound"] < told["fraction"] < high  # two-sided 95 % interval, one-sided 95 % bound
     of_trials = Requirement("ape_z", 1.0, "rad", quantile=0.8)
     assert campaign_summary._beyond(frame, of_trials, ended).size == 0
 

@@ -42,13 +42,13 @@ def of(summary: Campaign) -> Report:
 def verdict(entry: Entry) -> str:
     """Return a verdict with the fraction of trials within the limit."""
     text = str(entry)
-    if entry.fraction_of_time is not None or entry.share is None or entry.fraction_interval is None:
+    if entry.fraction_of_time is not None or entry.fraction is None or entry.fraction_interval is None:
         return text
     low, high = entry.fraction_interval
-    text += f"; {percent(entry.share)} % of trials keep the limit (95 %: {percent(low)} to {percent(high)} %)"
+    text += f"; {percent(entry.fraction)} % of trials keep the limit (95 %: {percent(low)} to {percent(high)} %)"
     if entry.quantile is not None and entry.confidence is not None and entry.fraction_bound is not None:
         text += f", at least {percent(entry.fraction_bound)} % at {100 * entry.confidence:g} % one-sided confidence"
-        if entry.share > entry.quantile:
+        if entry.fraction > entry.quantile:
             failures = "as many failures" if entry.failures else "no failure"
             text += f"; {entry.fewest_trials} trials with {failures} are enough"
     return text

@@ -36,7 +36,7 @@ class Entry(msgspec.Struct, frozen=True):
     fraction_of_time: Number = None
     shown: Number = None
     # of a campaign: the fraction of trials within the limit, its interval, its lower bound, and enough trials
-    share: Number = None
+    fraction: Number = None
     fraction_interval: Interval = None
     fraction_bound: Number = None
     fewest_trials: int | None = None

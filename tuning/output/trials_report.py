@@ -64,14 +64,14 @@ def why(inputs: list[dict[str, Any]], plant: str) -> Iterator[str]:
 
 def _among(row: dict[str, Any]) -> str:
     """Return the percentile of an input among all trials."""
-    if row["share"] is not None:
-        return f"as in {percent(row['share'])} % of the trials"
+    if row["fraction"] is not None:
+        return f"as in {percent(row['fraction'])} % of the trials"
     return f"at {row['percentile']:.1f} % (median {row['median']:.3g})"
 
 
 def _unusual(row: dict[str, Any]) -> float:
     """Return the distance of an input from the median in per cent, or how few trials have the same value."""
-    return 50.0 * (1.0 - row["share"]) if row["share"] is not None else abs(row["percentile"] - 50.0)
+    return 50.0 * (1.0 - row["fraction"]) if row["fraction"] is not None else abs(row["percentile"] - 50.0)
 
 
 def _with_unit(value: float, unit: str) -> str:

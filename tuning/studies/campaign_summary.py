@@ -103,14 +103,14 @@ def _in_summary(verdict: Verdict, wanted: Requirement, beyond: np.ndarray) -> di
     entry = verdict.in_summary()
     if beyond.size:  # fraction of time: the samples of one run depend on each other, but the runs are independent
         each = (1.0 + CONFIDENCE) / 2.0
-        entry["share"] = 1.0 - beyond.mean()
+        entry["fraction"] = 1.0 - beyond.mean()
         entry["fraction_interval"] = (
             1.0 - statistics.mean_bound(beyond, each),
             statistics.mean_bound(1.0 - beyond, each),
         )
         entry["fraction_bound"] = 1.0 - statistics.mean_bound(beyond, confidence)
     else:
-        entry["share"] = within / verdict.trials
+        entry["fraction"] = within / verdict.trials
         entry["fraction_interval"] = statistics.fraction_interval(within, verdict.trials, CONFIDENCE)
         entry["fraction_bound"] = statistics.fraction_bound(within, verdict.trials, confidence)
     if wanted.quantile is not None and wanted.confidence is not None:

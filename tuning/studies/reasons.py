@@ -65,5 +65,5 @@ def why(folder: Folder, metrics: Sequence[str], count: int) -> list[dict[str, An
 def _among(name: str, values: np.ndarray, drawn: float) -> dict[str, float | None]:
     """Return the percentile rank of an input among all trials, or the fraction of equal trials for a category."""
     if name in CATEGORIES:
-        return {"percentile": None, "median": None, "share": float(np.mean(values == drawn))}
-    return {"percentile": statistics.percentile(values, drawn), "median": float(np.median(values)), "share": None}
+        return {"percentile": None, "median": None, "fraction": float(np.mean(values == drawn))}
+    return {"percentile": statistics.percentile(values, drawn), "median": float(np.median(values)), "fraction": None}
