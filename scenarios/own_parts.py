@@ -10,8 +10,8 @@ import ptsmc_jax as ptsmc
 class Scaling(ptsmc.AccelerationLaw):
     """Prescribed time by scaling (Song, Wang, Holloway, Krstic, Automatica 83, 2017)."""
 
-    delta: float = ptsmc.gain(2.0, (0.2, 5.0), unit="s", meaning="gains are held from so long before t_f on")
-    m: float = ptsmc.gain(1.0, (1.0, 4.0), above=0.0, meaning="excess of the power of the scaling")
+    delta: float = ptsmc.gain(2.0, (0.2, 5.0), unit="s", meaning="time before t_f at which the gains become constant")
+    m: float = ptsmc.gain(1.0, (1.0, 4.0), above=0.0, meaning="m of the scaling exponent 2 + m")
     k1: float = ptsmc.gain(1.0, lambda t_f, h: (0.3 / t_f, 0.5 / h), unit="1/s", meaning="rate of the scaled error")
     k: float = ptsmc.gain(1e-3, lambda t_f, h: (1e-5 / t_f, 1.0 / t_f), unit="1/s", meaning="rate of its surface")
 

@@ -1,4 +1,4 @@
-"""A two-link arm in a vertical plane, as a plant of one's own: M(q) q'' + C(q, q') q' + g(q) = u + d.
+"""A two-link arm in a vertical plane, as a custom plant: M(q) q'' + C(q, q') q' + g(q) = u + d.
 
 The Pelican arm of R. Kelly, V. Santibanez, A. Loria, Control of Robot Manipulators in Joint Space (2005), Table 5.1 and
 eqs. (5.3) to (5.8); angles from the downward vertical, the second one relative to the first link. It follows
@@ -47,7 +47,7 @@ def H(t, x_1, x_2):  # noqa: N802
 
 
 def G(t, x_1, x_2):  # noqa: N802
-    """What a torque does to q'': M^-1, and so does a disturbing torque."""
+    """Return the input matrix M^-1 of q'', which also multiplies disturbing torques."""
     return solve(mass(x_1 + desired(t)), jnp.eye(2))
 
 

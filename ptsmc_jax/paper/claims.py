@@ -26,7 +26,7 @@ CASES: dict[str, tuple[str, str, dict[str, Any]]] = {
 _CHAINS = ("second_order", "third_order")
 SPACECRAFT = tuple(name for name in CASES if name not in _CHAINS)
 VERDICTS = ("holds", "holds in part", "differs")
-STABILISED = 1e-3  # largest error after t_f over the initial one that counts as stabilised
+STABILISED = 1e-3  # largest ratio of the error after t_f to the initial error of a stabilised run
 
 
 @dataclass(frozen=True)
@@ -114,8 +114,8 @@ def _accuracy(where: str, claim: str, stated: float, cases: dict[str, Run], *nam
         f"{claim} (read as {stated:g})",
         f"largest component {at:.1e} at t_f, {after:.1e} in the 10 s after it",
         verdict,
-        "an accurate integration of the paper's own equations is far better at the instant t_f; what was estimated "
-        f"wrongly is then held, {side} the paper's figure",
+        "an accurate integration of the paper's equations is far better at t_f; the law then holds the "
+        f"estimation error, {side} the paper's figure",
         {"at_t_f": at, "largest_after": after, "paper": stated},
     )
 
@@ -128,8 +128,8 @@ def _larger_eta_is_more_accurate(cases: dict[str, Run]) -> Claim:
         "a larger eta gives a smaller error (10E-5 for 5, 10E-4 for 3)",
         f"eta = 5 over eta = 3: {high[0] / low[0]:.2f} at t_f, {high[1] / low[1]:.2f} after it",
         "holds" if better else "differs",
-        "near t_f the estimation error rules, not r^eta: it leaves a tau^2 / (eta - 2)^2, and what is held after t_f "
-        "does not depend on eta",
+        "near t_f the estimation error dominates r^eta: the error is a tau^2 / (eta - 2)^2, and the error that is held "
+        "after t_f does not depend on eta",
         {"ratio_at_t_f": high[0] / low[0], "ratio_after": high[1] / low[1]},
     )
 

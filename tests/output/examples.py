@@ -7,7 +7,7 @@ from tuning.output import summaries
 
 
 def entry(verdict: Verdict, **changes: Any) -> summaries.Entry:
-    """Return a verdict as it is read from a summary."""
+    """Return a verdict in the form that a summary has."""
     return summaries.read(summaries.Entry, {**verdict.in_summary(), **changes})
 
 
@@ -35,7 +35,7 @@ def tune(search: dict[str, Any] | None = None, trust: dict[str, Any] | None = No
 
 
 def torque(times: float | None, failures: int = 0, trials: int = 64) -> dict[str, Any]:
-    """Return the verdict on a peak torque of at most 0.5 N m that reaches so many times the limit."""
+    """Return the verdict on a peak torque of at most 0.5 N m that reaches `times` the limit."""
     verdict = Requirement("peak_torque", 0.5).verdict
     import numpy as np
 

@@ -1,4 +1,4 @@
-"""Reads a report page strictly: what it is made of, and that nothing in it comes from elsewhere or from a user."""
+"""Read a report page strictly: its elements are known, and no content is loaded or inserted by a user."""
 
 import base64
 import hashlib

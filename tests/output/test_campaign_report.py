@@ -81,7 +81,7 @@ def test_inputs_that_rank_the_trials_alike_are_one_driver():
 
 
 def test_chance_is_no_driver():
-    """Of twenty inputs without an influence, some had a correlation of 0.1, and were named."""
+    """In an earlier version, some of twenty inputs without influence were named, with correlations of 0.1."""
     rng = np.random.default_rng(0)
     inputs, metric = {f"x{k}": rng.normal(size=300) for k in range(20)}, rng.normal(size=300)
     drivers = statistics.drivers(inputs, metric)

@@ -24,7 +24,7 @@ HOSTILE = "<img src=x onerror=document.title=1>\"'&</script><script>alert(1)</sc
 
 
 def in_chromium(path, tmp_path, *options):
-    """What Chromium makes of a page, and what it says on its console."""
+    """A page rendered by Chromium, and its console messages."""
     assert CHROMIUM is not None
     with tempfile.TemporaryDirectory() as home:
         done = subprocess.run(
@@ -45,7 +45,7 @@ def kept(tmp_path_factory):
 
 @pytest.fixture
 def simulated(command, kept, tmp_path):
-    """Results of one run, flown once: a copy."""
+    """A copy of the results of one run."""
     if not kept.exists():
         assert command("simulate", "s.toml", "--trial", 3, "--seed", 5, "--out", kept, "--quiet")[0] in (0, 1)
     return shutil.copytree(kept, tmp_path / "run")
@@ -183,7 +183,7 @@ def test_a_result_file_that_is_a_link_out_of_the_folder_is_refused(command, simu
 @pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
 @pytest.mark.parametrize("hostile", short([False, True], [True]))
 def test_chromium_draws_it_without_an_error_or_a_request(simulated, tmp_path, hostile):
-    """The policy forbids every request and foreign script; one that was tried would be on the console."""
+    """The policy forbids requests and foreign scripts. The console would show a forbidden attempt."""
     folder = hostile_folder(simulated) if hostile else simulated
     place = tmp_path / "page.html"
     place.write_text(page.build(folder))

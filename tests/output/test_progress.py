@@ -15,7 +15,7 @@ from tuning.output.report import Table
 
 
 def test_a_line_comes_also_while_nothing_new_is_said(capsys, monkeypatch):
-    """As where a law is compiled for minutes: what was said last, and how long ago the command began."""
+    """The last line is repeated with the elapsed time, for example while a law is compiled for minutes."""
     monkeypatch.setattr(progress, "EVERY", 0.05)
     with progress.Progress(quiet=False) as tell:  # the tests' output is no terminal
         tell("pd: compiling", 0, 0)
@@ -48,7 +48,7 @@ def test_trials_a_second_are_those_flown_since_the_command_began(monkeypatch):
 
 @pytest.fixture
 def unread():
-    """A stream into a pipe that nobody reads any more."""
+    """A stream into a pipe whose reader has closed it."""
     reading, writing = os.pipe()
     os.close(reading)
     with contextlib.suppress(OSError), os.fdopen(writing, "w") as stream:

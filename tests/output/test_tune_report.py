@@ -17,7 +17,7 @@ def errors(rms, interval=None, largest=None):
 
 
 def broken(times, searched=0.97):
-    """Held-out trials that reach so many times a limit of 0.5 N m, and the same of the search."""
+    """Return a summary whose held-out trials reach `times` the limit of 0.5 N m, and its training trials `searched`."""
     return examples.tune({"largest_over_limit": {"peak_torque": searched}}, verdicts=[examples.torque(times)])
 
 
