@@ -41,7 +41,7 @@ def test_simulate_gives_the_run_of_the_trial(flight):
 def test_simulate_reads_a_file_and_raises_the_errors_of_the_command(tmp_path):
     (tmp_path / "s.toml").write_text(SHORT)
     assert ptsmc_jax.simulate(tmp_path / "s.toml").status == "ok"
-    with pytest.raises(ScenarioError, match="is not there"):
+    with pytest.raises(ScenarioError, match="does not exist"):
         ptsmc_jax.simulate(tmp_path / "none.toml")
     with pytest.raises(ScenarioError, match=r"controller\.eta is 1\.5, but must be a number greater than 2") as caught:
         ptsmc_jax.replace(scenario.from_tables(TABLES), controller__eta=1.5)

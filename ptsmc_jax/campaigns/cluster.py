@@ -97,7 +97,7 @@ def connected(address: str, tls: Mapping[str, str]) -> Cluster:
     where: dict[str, Any] = {"address": address if local is None else local}
     if address.endswith(".json"):
         if not Path(address).is_file():
-            raise RefusedError(f"--cluster is {address}, which is not there")
+            raise RefusedError(f"--cluster is {address}, which does not exist")
         where = {"scheduler_file": address}
     try:
         return Cluster(Client(**where, security=security, timeout="10s", set_as_default=False), local)

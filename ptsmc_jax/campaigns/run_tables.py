@@ -90,7 +90,7 @@ class RunTable:
 def read(path: Path) -> pl.DataFrame:
     """Return the table of a file, or of a folder that `--dry-run` wrote. Raises RefusedError if it is not a table."""
     if not path.exists():
-        raise RefusedError(f"--runs is {path}, which is not there; allowed is {ALLOWED}")
+        raise RefusedError(f"--runs is {path}, which does not exist; allowed is {ALLOWED}")
     files = sorted(path.glob("*.parquet")) if path.is_dir() else [path]
     kinds = {file.suffix.lower() for file in files}
     if not kinds or not (kinds == {".parquet"} or kinds == {".csv"}):

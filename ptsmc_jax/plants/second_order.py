@@ -218,7 +218,7 @@ def system(
 
 # errors of JAX for the value of a traced number, and the advice
 TRACED = (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError)
-INSTEAD = "allowed are jax.numpy.where in place of if, and jax.numpy in place of numpy and float()"
+INSTEAD = "use jax.numpy.where instead of if, and jax.numpy instead of numpy and float()"
 
 
 def _check(name: str, function: Callable, arguments: tuple, shape: tuple[int, ...]) -> None:

@@ -14,7 +14,7 @@ from ptsmc_jax.scenario.values import Four, Matrix, Meaning, Table, Three
 
 
 class Attitude(Table, frozen=True):
-    """Exactly one attitude key, of the body relative to the inertial frame; `sequence` goes with `euler_deg`."""
+    """Exactly one attitude key, of the body relative to the inertial frame; `sequence` belongs to `euler_deg`."""
 
     quat_xyzw: Annotated[Four | None, Meaning("unit quaternion, scalar last")] = None
     quat_wxyz: Annotated[Four | None, Meaning("unit quaternion, scalar first")] = None
@@ -53,7 +53,9 @@ def quaternion(table: Attitude, name: str) -> np.ndarray:
     key, value = attitude_key(table)
     full = f"{name}.{key}"
     if table.sequence is not None and key != "euler_deg":
-        raise ScenarioError(f"{name}.sequence is {errors.brief(table.sequence)}, but goes with euler_deg only")
+        raise ScenarioError(
+            f"{name}.sequence is {errors.brief(table.sequence)}, but is allowed only together with euler_deg"
+        )
     if key in ("quat_xyzw", "quat_wxyz"):
         given = unit(full, value)
         return given if key == "quat_xyzw" else np.roll(given, -1)

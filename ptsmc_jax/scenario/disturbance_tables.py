@@ -124,7 +124,9 @@ class GravityTable(Attitude, DisturbanceTable, frozen=True):
         if attitude_keys.has_attitude(self):
             attitude_keys.quaternion(self, name)
         elif self.sequence is not None:
-            raise ScenarioError(f"{name}.sequence is {brief(self.sequence)}, but goes with euler_deg only")
+            raise ScenarioError(
+                f"{name}.sequence is {brief(self.sequence)}, but is allowed only together with euler_deg"
+            )
 
     def quickest(self) -> float:
         """Return 0, since an orbit is slow compared with the loop."""

@@ -84,7 +84,9 @@ def _check(scenario: Scenario, tune: tables.Tune) -> None:
 def _check_objective(scenario: Scenario, tune: tables.Tune, said: str) -> None:
     """Raise ScenarioError if the objective is not possible; said: the beginning of a message about tune.free."""
     if tune.level is not None and tune.statistic not in tables.LEVELS:
-        raise ScenarioError(f'tune.level is {tune.level}, but goes with tune.statistic = "quantile" or "cvar" only')
+        raise ScenarioError(
+            f'tune.level is {tune.level}, but is allowed only with tune.statistic = "quantile" or "cvar"'
+        )
     shown = f"tune.minimise is {errors.show(tune.minimise)}"
     if tune.minimise in (tables.T_F, tables.LIMITS):
         if tune.minimise == tables.T_F and "t_f" not in tune.gains:

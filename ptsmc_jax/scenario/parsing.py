@@ -58,7 +58,7 @@ def load(path: str | Path) -> dict[str, Any]:
     try:
         text = Path(path).read_text(encoding="utf-8-sig")  # some editors begin a file with a byte order mark
     except FileNotFoundError:
-        raise ScenarioError(f"the scenario file {path} is not there") from None
+        raise ScenarioError(f"the scenario file {path} does not exist") from None
     except IsADirectoryError:
         raise ScenarioError(f"the scenario file {path} is a folder, but must be a TOML file") from None
     except UnicodeDecodeError:
@@ -149,7 +149,7 @@ def _unknown(name: str, value: Any, kind: str) -> ScenarioError:
     layout = TABLES[kind]
     others = [other for other, theirs in TABLES.items() if name in theirs]
     if others:
-        return ScenarioError(f"[{name}] goes with plant.kind = {show(others[0])} only, but it is {show(kind)}")
+        return ScenarioError(f"[{name}] needs plant.kind = {show(others[0])}, but it is {show(kind)}")
     if isinstance(value, Mapping):
         of_kind = f"such a plant is [plant] with kind = {show(name)}"
         hint = of_kind if name in TABLES else nearest(name, (*layout, "requirements"), "[{}]")
@@ -157,7 +157,7 @@ def _unknown(name: str, value: Any, kind: str) -> ScenarioError:
     homes = keys.homes(layout)
     closest = difflib.get_close_matches(name, homes, n=1, cutoff=0.0)[0]
     place = f"{homes[closest][-1]}.{closest}"
-    return ScenarioError(f"{name} = {brief(value)} stands outside a table; the nearest known key is {place}")
+    return ScenarioError(f"{name} = {brief(value)} is outside of any table; the nearest known key is {place}")
 
 
 def _with_defaults(
@@ -310,9 +310,7 @@ def _sum(name: str, raw: Mapping[str, Any], kinds: Kinds, context: Context) -> T
 def _suite(each: Any, context: Context) -> Table:
     """Return the table of [[sensors]]."""
     if context.plant.motion != "spacecraft":
-        raise ScenarioError(
-            '[[sensors]] goes with plant.kind = "spacecraft" only; allowed is [sensors] with kind = "custom"'
-        )
+        raise ScenarioError('[[sensors]] needs plant.kind = "spacecraft"; allowed is [sensors] with kind = "custom"')
     if not each or not all(isinstance(one, Mapping) for one in each):
         raise wrong("sensors", each, "tables with a kind, [[sensors]] for each sensor")
     made = sensing.SensorSuite(

@@ -180,7 +180,7 @@ def _content(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except (FileNotFoundError, NotADirectoryError):
-        raise ValueError(f"the file {path} is not there") from None
+        raise ValueError(f"the file {path} does not exist") from None
     except OSError as error:
         raise ValueError(f"it cannot be read: {error.strerror}") from None
 

@@ -71,7 +71,7 @@ class Setup:
 
         def changed(plant: Any, name: str) -> Any:
             if not hasattr(plant, "with_inertia"):
-                raise ValueError(f"the {name} is a {type(plant).__name__}, but with_inertia goes with a spacecraft")
+                raise ValueError(f"the {name} is a {type(plant).__name__}, but with_inertia needs a spacecraft")
             return plant.with_inertia(body.inertia, body.inertia_inverse)
 
         acting = disturbances.on_body(self.disturbance, body.inertia)

@@ -482,7 +482,7 @@ def test_run_table_in_a_folder_with_wildcards_in_its_name_is_read(tmp_path, fold
 
 def test_files_that_are_not_run_tables_are_refused(tmp_path):
     for name, content, said in (
-        ("none.csv", None, "which is not there; allowed is a .csv or .parquet file with a row for each trial"),
+        ("none.csv", None, "which does not exist; allowed is a .csv or .parquet file with a row for each trial"),
         ("run_table.txt", b"trial\n1\n", "run_table.txt, but must be a .csv or .parquet file"),
         ("cut.parquet", b"PAR1", "cut.parquet, which cannot be read: "),
         ("empty.csv", b"", "empty.csv, which cannot be read: "),

@@ -98,18 +98,18 @@ def test_montecarlo_writes_rows_summary_and_figures(command, tmp_path, monkeypat
                                                      [(r"\[0.5, 0.1\]", "[0, 0]")]))  # fmt: skip
 def test_equal_trials_are_reported(command, tmp_path, simulated, drawn, instead):
     """The scenario has no dispersion, or one of zero width, which compiled programs of other tests can simulate."""
-    assert not [said for said in summary(simulated)["warnings"] if "the same flight" in said]
+    assert not [said for said in summary(simulated)["warnings"] if "are equal: neither" in said]
     text = re.sub(drawn, instead, SHORT_CHAIN).replace("[2e-5, 1e-5]", "[0, 0]")
     (tmp_path / "same.toml").write_text(text)
     _, said, _ = command("montecarlo", "same.toml", "--trials", 250, "--no-figures")
-    assert "CAUTION: all 250 trials are the same flight: nothing is drawn" in said
+    assert "WARNING: all 250 trials are equal: neither" in said
 
 
 def test_failed_trials_are_not_reported_as_equal():
     assert campaign_summary._alike({"window_error": {"without_value": 5}}, 5) == []
     at_rest = {"window_error": {"without_value": 0, "mean": 0.0, "max": 0.0}}
     (said,) = campaign_summary._alike(at_rest, 5, drawn=True)  # for example a dispersed inertia of a body at rest
-    assert said == "all 5 trials have the same metrics: what is drawn in them changes none"
+    assert said == "all 5 trials have the same metrics: the dispersions change no metric"
     at_rest["window_error"]["without_value"] = 4  # only one trial has a value
     assert campaign_summary._alike(at_rest, 5, drawn=True) == campaign_summary._alike(at_rest, 5) == []
 
@@ -200,9 +200,9 @@ def test_another_campaign_in_the_same_folder_is_refused(command, simulated, tmp_
         (["--until-confident", "0.1", "--dry-run"], "Mutually exclusive arguments: {--until-confident, --dry-run}"),
         (["--cluster", "local:2", "--shard", "1/2"], "Mutually exclusive arguments: {--shard, --cluster}"),
         (["--cluster", "local:none"], "--cluster is local:none, but must be local:N"),
-        (["--cluster", "there.json"], "--cluster is there.json, which is not there"),
+        (["--cluster", "there.json"], "--cluster is there.json, which does not exist"),
         (["--tls-ca", "ca.pem"], "--tls-ca, --tls-cert and --tls-key need --cluster"),
-        (["--metrics", "none.py:f"], "--metrics is none.py:f: the file none.py is not there"),
+        (["--metrics", "none.py:f"], "--metrics is none.py:f: the file none.py does not exist"),
         (["--metrics", "m.py:nothing"], "--metrics is m.py:nothing: it is a int; allowed is"),
         (["--metrics", "m.py:no"], "--metrics is m.py:no: m.py has no such name; allowed is"),
     ],

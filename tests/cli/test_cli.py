@@ -189,7 +189,7 @@ NUMBERS = {
             for option in ("seed", "trial")
             for value, allowed in NUMBERS.items()
         ),
-        (("simulate", "nothere.toml"), ("nothere.toml is not there",)),
+        (("simulate", "nothere.toml"), ("nothere.toml does not exist",)),
         (("simulate", "folder"), ("folder is a folder, but must be a TOML file",)),
         (("simulate", "broken.toml"), ("broken.toml is no valid TOML",)),
         (("simulate", "eta.toml"), ("controller.eta is 1.0, but must be a number greater than 2",)),

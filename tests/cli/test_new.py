@@ -149,7 +149,7 @@ def test_file_name_is_escaped_if_the_output_encoding_lacks_its_letters(command, 
         (["nowhere/s.toml"], "the file is nowhere/s.toml, but nowhere is no folder; allowed is one that exists"),
         (["."], "the file is ., which is there already; allowed is another name"),
         (["a.toml", "--plant", "boat"], f"--plant is boat, but must be {PLANTS}"),
-        (["a.toml", "--like", "none.toml"], "the scenario file none.toml is not there"),
+        (["a.toml", "--like", "none.toml"], "the scenario file none.toml does not exist"),
     ],
 )
 def test_new_command_refuses_invalid_options_and_writes_nothing(command, tmp_path, options, said):

@@ -71,7 +71,7 @@ def test_run_table_is_simulated_resumed_replayed_and_reported(command, tmp_path)
     for again in (["replay", folder, "--trial", 1], ["replay", folder, "--trial", 0]):
         code, out, error = command(*again)
         assert (code, out) == (2, "")
-        assert "run_table.parquet is not the run table that the campaign was begun with" in error
+        assert "run_table.parquet is not the run table with which the campaign began" in error
     assert command(*asked, "--force", "--quiet")[0] == 0
     assert rows_of(folder)["initial_x2"][2] == -0.03
     assert command("montecarlo", "s.toml", "--out", folder, "--force", "--quiet", "--trials", 5, "--no-figures")[0] == 0
@@ -81,7 +81,7 @@ def test_run_table_is_simulated_resumed_replayed_and_reported(command, tmp_path)
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--runs", "none.csv"], "--runs is none.csv, which is not there"),
+        (["--runs", "none.csv"], "--runs is none.csv, which does not exist"),
         (["--runs", "s.toml"], "--runs is s.toml, but must be a .csv or .parquet file"),
         (["--runs", "bad.csv"], "the run table bad.csv has initial_x2 nan in row 1, but must have a finite number"),
         (["--runs", "bad.csv", "--trials", "5"], "Mutually exclusive arguments: {--trials, --runs}"),

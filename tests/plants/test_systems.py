@@ -258,7 +258,7 @@ def test_an_invalid_system_is_refused_in_one_sentence():
         second_order.system(2, F, F, G, inertia=-np.eye(2))
     with pytest.raises(ValueError, match=r"^F\(t, x_1, x_2\) fails .*TracerBoolConversionError: [^\n]*$"):
         second_order.system(2, lambda t, a, b: b if a[0] > 0 else -b, F, G)
-    with pytest.raises(ValueError, match=r"traced array [^\n]*; allowed are jax\.numpy\.where in place of if"):
+    with pytest.raises(ValueError, match=r"traced array [^\n]*; use jax\.numpy\.where instead of if"):
         second_order.system(2, lambda t, a, b: float(t) * b, F, G)
     with pytest.raises(ValueError, match="n is True"):
         second_order.system(True, F, F, lambda t, a, b: jnp.eye(1))
@@ -275,7 +275,7 @@ def test_an_invalid_system_is_refused_in_one_sentence():
     [
         ({"kind": "system"}, "plant.system is absent"),
         ({"kind": "system", "system": 3.0}, "plant.system is 3"),
-        ({"kind": "system", "system": "nowhere.py:arm", "x0": [1, 0]}, "the file nowhere.py is not there"),
+        ({"kind": "system", "system": "nowhere.py:arm", "x0": [1, 0]}, "the file nowhere.py does not exist"),
         ({"kind": "system", "system": ARM + "s"}, "has no such name"),
         ({"kind": "system", "system": ARM.replace(":arm", ":mass")}, "has a function of that name"),
         ({"kind": "system", "system": "numpy:pi"}, "has a float of that name"),

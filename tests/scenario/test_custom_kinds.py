@@ -367,11 +367,11 @@ BAD = [
     (
         changed("return 0.5 * wanted", "return wanted if wanted[0] > 9.0 else 0.5 * wanted"), {},
         "acceleration needs the value of a traced number, which is known only during the simulation (line",
-        "jax.numpy.where in place of if",
+        "jax.numpy.where instead of if",
     ),
     (
         changed("return 0.5 * wanted", "return float(wanted[0]) * wanted"), {},
-        "acceleration needs the value", "jax.numpy in place of numpy and float()",
+        "acceleration needs the value", "jax.numpy instead of numpy and float()",
     ),
     (
         changed("3.0, (2.1, 6.0), above=2.0", "3.0"), {},
@@ -408,7 +408,7 @@ BAD = [
     ("x = = 1", {}, "running mine.py fails: SyntaxError", "mine.py"),
     (LAW, {"etta": 3.0}, "controller.etta is not a known key", "controller.eta"),
     (LAW, {"eta": 1.5}, "controller.eta is 1.5", "greater than 2"),
-    (LAW, {"code": "gone.py:Mine"}, "the file gone.py is not there", "gone.py"),
+    (LAW, {"code": "gone.py:Mine"}, "the file gone.py does not exist", "gone.py"),
     (LAW, {"code": "mine"}, 'controller.code is "mine"', "FILE.py:NAME"),
     (LAW, {"code": None}, "controller.code is absent", "FILE.py:NAME"),
     (REMEMBERS, {}, "acceleration returns 2 values", "a sliding variable, its memory"),

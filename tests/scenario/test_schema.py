@@ -288,7 +288,7 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path, content, said):
 def test_a_file_that_is_not_there_is_named(tmp_path):
     with pytest.raises(ScenarioError) as caught:
         parsing.load(tmp_path / "none.toml")
-    assert str(caught.value) == f"the scenario file {tmp_path / 'none.toml'} is not there"
+    assert str(caught.value) == f"the scenario file {tmp_path / 'none.toml'} does not exist"
 
 
 def test_every_kind_of_a_table_can_be_pickled():

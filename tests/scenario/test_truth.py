@@ -187,7 +187,7 @@ def test_a_custom_true_plant_is_reported_as_custom_code():
         ("my.py", 'plant.truth is "my.py": it names nothing'),
         ("my.py:gone", "plant.truth is"),
         ("my.py:number", "my.py has a int of that name"),
-        ("gone.py:true", "the file gone.py is not there"),
+        ("gone.py:true", "the file gone.py does not exist"),
         ("my.py:two", 'plant.truth is "my.py:two", which has n = 2; allowed is n = 1, as plant.system'),
         (3, "plant.truth is 3"),
     ],

@@ -97,7 +97,7 @@ def test_invalid_attitudes_and_inertias_are_refused_in_one_sentence():
     wrong = parts(8.0, 3.0, 0.5, reference=lambda t: jnp.zeros(3))
     with pytest.raises(TypeError, match=r"must return a quaternion \(4,\), scalar last, or a Target"):
         wrong.reference(jnp.asarray(0.0))
-    with pytest.raises(ValueError, match="the plant is a Chain, but with_inertia goes with a spacecraft"):
+    with pytest.raises(ValueError, match="the plant is a Chain, but with_inertia needs a spacecraft"):
         chain_parts([1.0, 0.0]).with_inertia([1.0, 1.0, 1.0])
 
 

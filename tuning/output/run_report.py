@@ -49,5 +49,5 @@ def metrics(summary: Run, plant: str) -> Table:
 
 
 def warnings(texts: list[str]) -> list[str]:
-    """Return the cautions about a scenario as lines."""
-    return [f"CAUTION: {text}" for text in texts]
+    """Return the warnings about a scenario as lines."""
+    return [f"WARNING: {text}" for text in texts]

@@ -81,7 +81,7 @@ def allow(programs: Mapping[str, str], results: Path, made: Mapping[str, Any], t
         listed = " and ".join(f"{file} ({', '.join(keys)})" for file, keys in _by_file(programs).items())
         raise RefusedError(
             f"{results} names custom code, {listed}, which this command would run; "
-            "allowed is --trust, for one who has read it"
+            "allowed is --trust after you have read the code"
         )
     unknown = check_unchanged(programs, results, made)
     _report(programs, results)

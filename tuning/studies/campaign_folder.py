@@ -192,7 +192,7 @@ class Folder:
         drawn = self.ready.dispersion.custom_names()
         table = run_tables.checked(self.table, self.ready.parts, where, self.custom_metric_names, drawn)
         if self.made is not None and table.checksum != self.checksums.get(RUN_TABLE):
-            raise RefusedError(f"{self.path / TABLE} is not the run table that the campaign was begun with")
+            raise RefusedError(f"{self.path / TABLE} is not the run table with which the campaign began")
         return table
 
     @cached_property
@@ -266,7 +266,7 @@ def begin(wanted: Folder, force: bool) -> None:
     made = store.read_versions(path)  # files that no campaign wrote belong to the user
     kept = sources.listed(path / C) if custom.checksum_name(custom_parts.CONTROLLER) in made else []
     if wanted.controller is not None and kept != sources.listed(path / C):
-        raise RefusedError(f"--out is {path}, whose {C} holds C that no campaign left there; allowed is another folder")
+        raise RefusedError(f"--out is {path}, whose {C} contains C code of the user; allowed is another folder")
     if force and path.is_dir():
         for rows_of in (wanted.rows, wanted.dry):
             rows_of.tidy(())
@@ -304,7 +304,7 @@ def _begun(wanted: Folder, tables: Mapping[str, Any]) -> bool:
     before = opened(path)
     if before.trials > wanted.trials:
         raise RefusedError(
-            f"--trials is {wanted.trials}, but must be at least {before.trials}, which {path} was begun with"
+            f"--trials is {wanted.trials}, but must be at least {before.trials}, the number of trials in {path}"
         )
     same = before.trials == wanted.trials and before.made == _made(wanted) and before.identity == wanted.identity
     if not same or before.controller is None:

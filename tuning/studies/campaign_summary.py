@@ -204,17 +204,16 @@ def drawn_columns(folder: Folder, parts: list[rows.Part]) -> list[str]:
 
 
 def _alike(quantiles: dict[str, Any], trials: int, *, drawn: bool = False) -> list[str]:
-    """Return a caution if all trials have the same metrics; drawn: the inputs of the trials differ."""
+    """Return a warning if all trials have the same metrics; drawn: the inputs of the trials differ."""
     known = [metric for metric in quantiles.values() if "max" in metric]
     if trials < 2 or not known or any(abs(m["max"] - m["mean"]) > SAME * abs(m["max"]) for m in known):
         return []
     if any(m["without_value"] for m in known):  # failed trials differ from the others
         return []
     if drawn:  # for example a dispersed inertia of a body that stays at rest
-        return [f"all {trials} trials have the same metrics: what is drawn in them changes none"]
+        return [f"all {trials} trials have the same metrics: the dispersions change no metric"]
     return [
-        f"all {trials} trials are the same flight: nothing is drawn in them, neither by [dispersion] nor as noise of "
-        "[hardware], and one would do"
+        f"all {trials} trials are equal: neither [dispersion] nor the noise of [hardware] differs; one trial is enough"
     ]
 
 

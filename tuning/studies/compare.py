@@ -86,7 +86,7 @@ def check(scenario: Scenario) -> None:
         )
     if not scenario.sampled:
         mode = errors.show(scenario.loop.mode)
-        raise ScenarioError(f'loop.mode is {mode}, but must be "sampled": the other laws fly there')
+        raise ScenarioError(f'loop.mode is {mode}, but must be "sampled": the other laws need the sampled loop')
 
 
 def laws() -> list[str]:
