@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from ptsmc_jax import programs
 from ptsmc_jax.campaigns import margin_verdicts, montecarlo
+from ptsmc_jax.devices.attitude_sensors import StarTracker
 from ptsmc_jax.dispersions import table_rows
 from ptsmc_jax.dispersions.table_rows import Row
 from ptsmc_jax.dispersions.variation import Dispersion
@@ -64,20 +65,49 @@ class Run:
         return known and self.status in montecarlo.FINISHED
 
     def columns(self) -> dict[str, np.ndarray]:
-        """Return the history by column, (time,) each: t [s], state, estimate, delivered torque, s, wheels, modes."""
+        """Return the history by column, (time,) each: t [s], state, estimate, delivered torque, s, wheels, modes.
+
+        The readings of the sensors and the torque that the computer sends to the actuators follow, for `identify`.
+        """
         log = self.log
         blocks = {**self.parts.plant.columns(log.x), "d_hat": log.d_hat, "u": log.u, "s": log.s}
         if log.wheels is not None:
             blocks["h"], blocks["v"] = log.wheels
-        blocks |= self.parts.plant.hidden_columns(log.x)
+        blocks |= self.parts.plant.hidden_columns(log.x) | self._measured()
         columns = {"t": np.asarray(log.t)}
         for name, block in blocks.items():
             columns |= numbered(name, block)
         return columns
 
 
+    def _measured(self) -> dict[str, np.ndarray]:
+        """Return the readings of the sensors and the torque that the computer sends, empty if they are not logged.
+
+        A sample without a reading of the attitude has NaN.
+        """
+        log, sensors = self.log, self.parts.sensors
+        if log.readings is None or log.sent is None:
+            return {}
+        readings, found = dict(log.readings), {}
+        tracker = next((one for one in getattr(sensors, "sensors", ()) if isinstance(one, StarTracker)), None)
+        if tracker is not None:  # of a suite
+            readings["attitude"] = np.asarray(jax.vmap(tracker.body)(readings[tracker.name]))
+            for name in ("valid", "age"):
+                readings[f"attitude_{name}"] = readings[f"{tracker.name}_{name}"]
+        if "attitude" in readings:
+            valid = np.asarray(readings.get("attitude_valid", np.ones(len(log.t))), bool)
+            found["measured_q"] = np.where(valid[:, None], readings["attitude"], np.nan)
+        if "attitude_age" in readings:
+            found["measured_age"] = readings["attitude_age"]
+        names = {"rate": "measured_w", "x": "measured_x"}
+        found |= {new: readings[name] for name, new in names.items() if name in readings}
+        return {**found, "sent": log.sent}
+
+
 def numbered(name: str, block: ArrayLike) -> dict[str, np.ndarray]:
-    """Return the columns of a (time, component) array, named by a number from 1."""
+    """Return the columns of a (time, component) array, named by a number from 1; of a (time,) array, the column."""
+    if np.ndim(block) == 1:
+        return {name: np.asarray(block)}
     return {f"{name}{k + 1}": column for k, column in enumerate(np.asarray(block).T)}
 
 

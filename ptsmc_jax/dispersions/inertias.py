@@ -7,10 +7,11 @@ from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ptsmc_jax.dispersions.numbers import FARTHEST
-from ptsmc_jax.numerics import attitude, draws, guards
+from ptsmc_jax.numerics import attitude, draws, guards, matrices
 from ptsmc_jax.numerics.pytrees import Leaf, pytree
 
 CANDIDATES = 16  # samples; the first physical one is used
@@ -94,6 +95,51 @@ class RelativeInertia:
         u, v = _to_normal(low + (high - low) * (1.0 + _to_uniform(n[2])) / 2.0), n[3]
         errors = jnp.stack([s, (a * u + b * v) / r, (a * v - b * u) / r])
         return errors @ permutation, accepts_plus | accepts_minus
+
+
+@pytree
+@dataclass(frozen=True)
+class CorrelatedInertia:
+    """True inertia with six correlated random coordinates. Every value of the coordinates gives a physical body.
+
+    The coordinates c are the logarithms of the diagonal and the lower triangle of L in S = R L L' R', where S is the
+    pseudo-inertia tr(J) I / 2 - J and R R' is the nominal one. S is positive definite if and only if each moment is
+    positive and less than the sum of the other two (Rucker and Wensing, IEEE Robotics and Automation Letters 7(2),
+    2022).
+    """
+
+    root: Leaf  # (3, 3) R [sqrt(kg) m]
+    factor: Leaf  # (6, 6) a factor of the covariance of c [-]
+    drawn: ClassVar[draws.Distribution] = "normal"
+    count: ClassVar[int] = 6
+
+    def at(self, c: Float[Array, "6"]) -> tuple[Float[Array, "3 3"], Float[Array, "3 3"]]:
+        """Return the inertia [kg m^2] and its inverse, (3, 3) each, for standard normal numbers c (6,) [-]."""
+        inertia = from_coordinates(self.root, self.factor @ c)
+        return inertia, matrices.solve(inertia, jnp.eye(3))
+
+
+def pseudo_root(inertia: np.ndarray) -> np.ndarray:
+    """Return a factor R (3, 3) [sqrt(kg) m] of the pseudo-inertia tr(J) I / 2 - J of an inertia (3, 3) [kg m^2].
+
+    A flat body, whose largest moment is the sum of the others, gets a thickness: its smallest pseudo-moment becomes
+    1e-6 of the largest.
+    """
+    sizes, axes = np.linalg.eigh(0.5 * np.trace(inertia) * np.eye(3) - inertia)
+    return np.linalg.cholesky((axes * np.maximum(sizes, 1e-6 * sizes[-1])) @ axes.T)
+
+
+def from_coordinates(root: Float[Array, "3 3"], c: Float[Array, "6"]) -> Float[Array, "3 3"]:
+    """Return the inertia (3, 3) [kg m^2] at coordinates (6,) [-], see `CorrelatedInertia`; zeros give the nominal one.
+
+    Args:
+        root: factor of the nominal pseudo-inertia (3, 3) [sqrt(kg) m].
+        c: logarithms of the diagonal, then the entries 21, 31, 32.
+    """
+    lower = jnp.diag(jnp.exp(c[:3])).at[jnp.array([1, 2, 2]), jnp.array([0, 0, 1])].set(c[3:])
+    factor = root @ lower
+    pseudo = factor @ factor.T
+    return jnp.trace(pseudo) * jnp.eye(3) - pseudo
 
 
 def _to_uniform(normal: Float[Array, "..."]) -> Float[Array, "..."]:

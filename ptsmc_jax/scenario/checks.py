@@ -6,7 +6,7 @@
 import math
 from typing import Any
 
-from ptsmc_jax.scenario import custom, epochs, errors, tables
+from ptsmc_jax.scenario import custom, epochs, errors, identify_tables, tables
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.scenario.values import MOST_STEPS
@@ -23,6 +23,7 @@ def check(scenario: Scenario) -> None:
     scenario.observer.check(scenario)
     _check_loop(scenario)
     _check_dispersion(scenario)
+    identify_tables.check(scenario.identify, scenario.telemetry)
 
 
 def _check_requirements(scenario: Scenario) -> None:

@@ -30,5 +30,7 @@ OPTIONAL = (
     "dispersion",
     "requirements",
     "tune",
+    "telemetry",
+    "identify",
 )  # tables that are off if they are absent
 KINDS: dict[str, Kinds] = {"hardware.command_filter": COMMAND_FILTERS}  # keys that are an inline table with a kind

@@ -13,7 +13,7 @@ from ptsmc_jax.declare import Scaled
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.plants.flexible_body import flexible
 from ptsmc_jax.plants.rigid_body import AttitudeState, spacecraft
-from ptsmc_jax.scenario import attitude_keys, dispersion_tables, errors, tables
+from ptsmc_jax.scenario import attitude_keys, dispersion_tables, errors, identify_tables, tables
 from ptsmc_jax.scenario.custom_devices import SENSORS
 from ptsmc_jax.scenario.device_tables import FILTERS, WHEELS, FilterTable, Hardware, NoFilter, WheelLimits
 from ptsmc_jax.scenario.disturbance_tables import DISTURBANCES
@@ -170,6 +170,8 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
         "pointing": Pointing,
         "dispersion": dispersion_tables.Dispersion,
         "tune": Tune,
+        "telemetry": identify_tables.Telemetry,
+        "identify": identify_tables.Identify,
     }
     unit_of_d: ClassVar[str] = "N m"
     metrics: ClassVar[Any] = CATALOGUE

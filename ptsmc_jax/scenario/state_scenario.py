@@ -12,7 +12,7 @@ from msgspec import Meta
 
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.plants.integrator_chain import chain
-from ptsmc_jax.scenario import device_tables, dispersion_tables, errors, systems, tables
+from ptsmc_jax.scenario import device_tables, dispersion_tables, errors, identify_tables, systems, tables
 from ptsmc_jax.scenario.custom_devices import SENSORS
 from ptsmc_jax.scenario.disturbance_tables import DISTURBANCES
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
@@ -74,6 +74,8 @@ def tables_of(plant: type[Table], kind: str) -> dict[str, type[Table] | Kinds]:
         "sensors": SENSORS,
         "dispersion": dispersion_tables.StateDispersion,
         "tune": Tune,
+        "telemetry": identify_tables.StateTelemetry,
+        "identify": identify_tables.Identify,
     }
 
 

@@ -226,6 +226,8 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
     dispersion: Any = None
     requirements: dict[str, float | Limit] = {}  # noqa: RUF012
     tune: Tune | None = None
+    telemetry: Any = None  # `identify_tables.Telemetry` or `StateTelemetry`
+    identify: Any = None  # `identify_tables.Identify`
 
     TABLES: ClassVar[Mapping[str, type[Table] | Kinds]] = {}  # class of each table, or classes by kind
     unit_of_d: ClassVar[str] = keys.UNIT_OF_D

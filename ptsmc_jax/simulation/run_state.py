@@ -52,6 +52,8 @@ class Log(NamedTuple):
     error: Array  # error that the law drives to zero: the attitude error vector [-]; for a chain x_1
     wheels: tuple[Array, Array] | None  # momentum of each reaction wheel [N m s], and its torque [N m]
     has_length: Array  # bool: the interval of this row has a positive length, or the row is the last
+    readings: dict[str, Array] | None = None  # of the sensors, see `Sensor.inputs`; None in the continuous loop
+    sent: Array | None = None  # torque that the computer sends to the actuators [N m]
 
     __repr__ = listing
 
@@ -139,16 +141,29 @@ def advance(run: Run, score: Score, before: State, after: State, record: Record)
     return _judged(run, score, after.x, target_next, now.t_next, record.step, u_end, after.computer.law)
 
 
-def row(run: Run, before: State, after: State, record: Record) -> Log:
+def row(run: Run, before: State, after: State, record: Record, dt_before: Scalar | None = None) -> Log:
     """Return the row of the history at the start of a control period or of a step of the continuous loop.
 
-    The arguments are as in `advance`.
+    The other arguments are as in `advance`.
+
+    Args:
+        run: constants of the run.
+        before: state at the start of the period.
+        after: state at its end.
+        record: record of the period.
+        dt_before: nominal length of the period before [s]; None in the continuous loop.
     """
     now, drive, decision, wheels = record.now, record.drive, record.decision, None
     if drive is not None and record.torques.wheel_torque is not None:
         wheels = drive.h, record.torques.wheel_torque[0]
     u, has_length = record.torques.delivered[0], now.t_next > now.t
-    return row_at(run, now.t, before.x, decision, u, has_length, after.walk, wheels)
+    found = row_at(run, now.t, before.x, decision, u, has_length, after.walk, wheels)
+    if dt_before is None or decision.channels is not None:  # exported C has a computer of another form
+        return found
+    parts, nominal = run.parts, now if before.offset is None else now._replace(t=now.t - before.offset)
+    seen = parts.plant.visible(before.x)
+    readings, _ = parts.sensors.inputs(before.computer.sensors, seen, nominal, dt_before, before.star_x)
+    return found._replace(readings=readings, sent=parts.actuators.send(before.actuators, decision.u, decision.w)[0])
 
 
 def row_at(

@@ -21,7 +21,7 @@ def simulate(run: Run, seed: WholeNumber, trial: WholeNumber, software: Software
     def step(carry: tuple[State, Score], tick: Tick) -> tuple[tuple[State, Score], Log | None]:
         state, score = carry
         after, record = control_period(vehicle, state, tick)
-        row = run_state.row(run, state, after, record) if run.record else None
+        row = run_state.row(run, state, after, record, tick.dt_before) if run.record else None
         return (after, run_state.advance(run, score, state, after, record)), row
 
     first = run_state.begin(run)
@@ -35,10 +35,13 @@ def simulate(run: Run, seed: WholeNumber, trial: WholeNumber, software: Software
 def _last_row(run: Run, state: State, rows: Log) -> Log:
     """Return the row at t_end: the estimate and s of a sample there, and the torque held until then."""
     parts, t, x, torque = run.parts, run.criteria.t_end, state.x, state.torque
-    d_hat, s = (signal[jnp.argmax(rows.t >= t)] for signal in (rows.d_hat, rows.s))
+    end = jnp.argmax(rows.t >= t)
+    d_hat, s = rows.d_hat[end], rows.s[end]
     decision = Decision(parts.reference(t), d_hat, torque, s)
     wheels = None if state.actuators.h is None else (state.actuators.h, state.actuators.v)
-    return run_state.row_at(run, t, x, decision, torque, jnp.asarray(True), state.walk, wheels)
+    last = run_state.row_at(run, t, x, decision, torque, jnp.asarray(True), state.walk, wheels)
+    readings, sent = jax.tree.map(lambda many: many[end], (rows.readings, rows.sent))
+    return last._replace(readings=readings, sent=sent)
 
 
 def _with_end(ticks: Ticks, t_end: Scalar) -> Ticks:

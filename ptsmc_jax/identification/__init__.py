@@ -1,0 +1,1 @@
+"""Estimate the parameters of a scenario's true plant from telemetry. Start with `estimation.identify`."""

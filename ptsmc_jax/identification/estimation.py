@@ -1,0 +1,450 @@
+"""Maximum-likelihood estimates of the free parameters of a scenario from telemetry. Start with `identify`.
+
+The likelihood is that of the innovations of the filter. Its maximum is found by Fisher scoring with the step control of
+Levenberg and Marquardt: each step solves (I + damping) step = gradient, with the exact gradient and the Fisher
+information I of the innovations and their variances (Astrom, Automatica 16(5), 1980; Gupta and Mehra, IEEE TAC 19(6),
+1974). Both come from the derivatives of the innovations in forward mode.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import polars as pl
+from jaxtyping import Array
+from scipy import stats
+
+from ptsmc_jax.identification import filtering, parameters, telemetry
+from ptsmc_jax.identification.filtering import Innovations, Kind, Rows, Track
+from ptsmc_jax.identification.parameters import Problem
+from ptsmc_jax.identification.telemetry import Measurements
+from ptsmc_jax.scenario import reading
+from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.scenario.tables import Scenario
+
+BUCKET = 256  # rows of a log are padded to a multiple of it, so that similar logs share compiled programs
+STEPS = 40  # largest number of steps of a local search
+CONVERGED = 1e-3  # largest step of a converged search, in sigmas of the estimate
+SCREENINGS = 4  # largest number of times that outliers are determined again
+POOR = 1.5  # mean normalised square of the innovations above which other starting points are tried
+LAGS = 25  # of the autocorrelation
+WHITE = 0.05  # largest autocorrelation that counts as white in a long log
+CONSISTENT = (0.8, 1.25)  # mean normalised square of innovations that fit their variance
+CONFIDENCE = 0.95
+CLEAR = 0.3  # smallest component of an undetermined direction that is named
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Innovations of a log for estimated parameters."""
+
+    log: Measurements
+    rows: Rows
+    innovations: Innovations  # arrays (rows - 1, components)
+    track: Track
+
+    @property
+    def whitened(self) -> np.ndarray:
+        """Innovations over their 1 sigma (samples, components) [-], NaN without a reading."""
+        value, variance, accepted = self.innovations
+        sampled = self.rows.source[1:] >= 0
+        return np.where(accepted, value / np.sqrt(variance), np.nan)[sampled]
+
+    @property
+    def square(self) -> float:
+        """Mean square of the whitened innovations [-]; 1 if they fit their variance."""
+        return float(np.nanmean(self.whitened**2))
+
+    @property
+    def outliers(self) -> int:
+        """The number of rejected components."""
+        return int(np.sum(self.rows.valid[1:] & ~self.innovations.accepted))
+
+    @property
+    def samples(self) -> int:
+        """The number of accepted components."""
+        return int(np.sum(self.innovations.accepted))
+
+    def autocorrelation(self) -> np.ndarray:
+        """Return the autocorrelation (LAGS, components) [-] of the whitened innovations at the lags 1, 2, ..
+
+        Lags are counted in readings of the component.
+        """
+        return np.stack([_autocorrelation(column[np.isfinite(column)]) for column in self.whitened.T], axis=1)
+
+    @property
+    def white(self) -> bool:
+        """Whether the innovations fit their variance and are uncorrelated in time."""
+        bound = np.maximum(WHITE, 4.0 / np.sqrt(np.maximum(np.sum(np.isfinite(self.whitened), axis=0), 1)))
+        return CONSISTENT[0] < self.square < CONSISTENT[1] and bool(np.all(np.abs(self.autocorrelation()) < bound))
+
+
+def _autocorrelation(values: np.ndarray) -> np.ndarray:
+    if values.size <= LAGS:
+        return np.zeros(LAGS)
+    total = np.sum(values**2)
+    return np.array([np.sum(values[lag:] * values[:-lag]) for lag in range(1, LAGS + 1)]) / total
+
+
+@dataclass(frozen=True)
+class Identification:
+    """Estimated parameters of a scenario."""
+
+    scenario: Scenario
+    problem: Problem
+    z: np.ndarray  # estimated coordinates (n,)
+    covariance_z: np.ndarray  # (n, n) of the coordinates
+    start: np.ndarray  # numbers of the scenario (k,)
+    prior: np.ndarray  # their prior 1 sigma (k,), infinite without prior knowledge
+    estimate: np.ndarray  # (k,)
+    covariance: np.ndarray  # (k, k)
+    undetermined: list[str]  # sentences on combinations that the data do not determine
+    fits: list[Fit]
+    validation: list[Fit]
+    converged: bool
+    steps: int
+    log_likelihood: float
+
+    @property
+    def std(self) -> np.ndarray:
+        """1 sigma of the estimates (k,), in their units."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def white(self) -> bool:
+        """Whether the innovations of all logs are consistent and white."""
+        return all(fit.white for fit in [*self.fits, *self.validation])
+
+    @property
+    def good(self) -> bool:
+        """Whether the model explains the logs and every free parameter is determined."""
+        return self.converged and self.white and not self.undetermined
+
+    def table(self) -> pl.DataFrame:
+        """Return a row for each number: estimate, 1 sigma, 95 % interval, start, prior 1 sigma and unit."""
+        problem, reach = self.problem, float(stats.norm.ppf(0.5 + CONFIDENCE / 2.0))
+        return pl.DataFrame({
+            "parameter": problem.labels, "estimate": self.estimate, "std": self.std,
+            "lower": self.estimate - reach * self.std, "upper": self.estimate + reach * self.std,
+            "start": self.start, "prior_std": self.prior, "unit": problem.units,
+        })  # fmt: skip
+
+    def gyro_bias(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return the gyro bias at the end of each log and its 1 sigma, (3,) each [rad/s]."""
+        if not self.problem.bias:
+            return []
+        size = self.problem.model.walk.size if self.problem.model.walk is not None else 0
+        found = []
+        for fit in self.fits:
+            p = np.diag(fit.track.covariance[-1])
+            at = len(p) - size - 3
+            found.append((fit.track.bias[-1], np.sqrt(p[at : at + 3])))
+        return found
+
+    def __repr__(self) -> str:
+        lines = [
+            f"{row['parameter']:28s} {row['estimate']:12.6g} +- {row['std']:.2g} {row['unit']}"
+            for row in self.table().iter_rows(named=True)
+        ]
+        return "\n".join([*lines, *self.undetermined])
+
+
+def identify(
+    what: Scenario | str | Any,
+    log: pl.DataFrame | Sequence[pl.DataFrame],
+    *,
+    validate: Sequence[pl.DataFrame] = (),
+    free: Sequence[str] | None = None,
+    report: Callable[[str], None] = lambda text: None,
+) -> Identification:
+    """Estimate parameters of a scenario's true plant from telemetry.
+
+    Args:
+        what: a scenario, or the path of its file. [telemetry] names the columns and [identify] the parameters.
+        log: a table with a row for each time, or several tables of separate runs.
+        validate: logs that are predicted with the estimates and not used for them.
+        free: names of the parameters; by default those of the scenario.
+        report: called with the progress in words.
+
+    Returns:
+        The estimates, their covariance and the innovations.
+
+    Raises:
+        ScenarioError: a parameter is unknown.
+        RefusedError: a log cannot be used; the sentence names row and column.
+    """
+    loaded = reading.complete(reading.of(what))
+    frames = [log] if isinstance(log, pl.DataFrame) else list(log)
+    logs = [telemetry.measurements(loaded, frame, f"log {k + 1}") for k, frame in enumerate(frames)]
+    others = [telemetry.measurements(loaded, frame, f"validation log {k + 1}") for k, frame in enumerate(validate)]
+    return of_logs(loaded, logs, others, free, report)
+
+
+def of_logs(
+    loaded: Scenario,
+    logs: Sequence[Measurements],
+    others: Sequence[Measurements] = (),
+    free: Sequence[str] | None = None,
+    report: Callable[[str], None] = lambda text: None,
+) -> Identification:
+    """Estimate parameters from logs that are read already; see `identify`.
+
+    Args:
+        loaded: a complete scenario.
+        logs: the logs.
+        others: logs that are only predicted.
+        free: names of the parameters.
+        report: called with the progress in words.
+    """
+    _check_alike([*logs, *others])
+    problem = parameters.build(loaded, logs, free)
+    every = [rows(problem, one) for one in logs]
+    search = Search(problem, [(one, Kind.of(log)) for one, log in zip(every, logs, strict=True)], _gate(loaded), report)
+    best = search.run(np.zeros(problem.size))
+    draws = np.random.default_rng(0)
+    for k in range(1, 3 if loaded.identify is None else loaded.identify.starts):
+        if best.square < POOR:
+            break
+        report(f"the fit is poor; starting point {k + 1}")
+        other = search.run(draws.standard_normal(problem.size))
+        best = max(best, other, key=lambda found: found.value)
+    return _result(loaded, problem, search, best, logs, others)
+
+
+def _check_alike(logs: Sequence[Measurements]) -> None:
+    """Raise ScenarioError if logs have different readings or commands."""
+    first = logs[0]
+    for log in logs[1:]:
+        same = (set(log.readings), log.by_channel, log.wheel_inertia) == (
+            set(first.readings), first.by_channel, first.wheel_inertia
+        )  # fmt: skip
+        if not same:
+            raise ScenarioError(f"{log.name} has other readings than {first.name}, but all logs must have the same")
+
+
+def rows(problem: Problem, log: Measurements) -> Rows:
+    """Return a log for the filter, padded so that logs of similar lengths share a program."""
+    count = len(filtering.rows_of(log, problem.step).t)
+    return filtering.rows_of(log, problem.step, -(-count // BUCKET) * BUCKET)
+
+
+def _gate(loaded: Scenario) -> float:
+    """Return the normalised square of an outlier, for one component."""
+    rate = 1e-6 if loaded.identify is None else loaded.identify.outliers
+    return float(stats.chi2.isf(rate, 3) / 3.0) if rate > 0.0 else np.inf
+
+
+class Found(NamedTuple):
+    """The end of a local search."""
+
+    z: np.ndarray
+    value: float  # log-likelihood with the prior
+    information: np.ndarray
+    square: float
+    converged: bool
+    steps: int
+
+
+class Search:
+    """Local searches for the estimates from some logs; programs are compiled once for logs of the same length."""
+
+    def __init__(
+        self, problem: Problem, logs: Sequence[tuple[Rows, Kind]], gate: float, report: Callable[[str], None]
+    ):
+        """Args: the problem, the logs, the normalised square of outliers, and a function that reports progress."""
+        self.problem, self.logs, self.gate, self.report = problem, list(logs), gate, report
+        self.known = problem.known().astype(float)
+        self._filter = jax.jit(self._filtered, static_argnames="kind")
+        self._derivatives = jax.jit(self._differentiated, static_argnames="kind")
+
+    def _filtered(self, z: Array, rows: Rows, gate: Any, kind: Kind) -> tuple[Innovations, Track]:
+        return filtering.innovations(self.problem.at(z), rows, kind, gate)
+
+    def _differentiated(self, z: Array, rows: Rows, kind: Kind) -> tuple[Array, Array, Array, Array]:
+        """Return log-likelihood, gradient, Fisher information and mean normalised square of one log."""
+
+        def of(z: Array) -> tuple[tuple[Array, Array], Array]:
+            found, _ = filtering.innovations(self.problem.at(z), rows, kind)
+            return (found.value, found.variance), found.accepted
+
+        (value, variance), accepted = of(z)
+        by_value, by_variance = jax.jacfwd(lambda z: of(z)[0])(z)
+        by_value = by_value / jnp.sqrt(variance)[..., None]
+        by_variance = by_variance / variance[..., None]
+        whitened = value / jnp.sqrt(variance)
+        gradient = jnp.einsum("kmi,km->i", by_variance, 0.5 * (whitened**2 - 1.0))
+        gradient = gradient - jnp.einsum("kmi,km->i", by_value, whitened)
+        information = jnp.einsum("kmi,kmj->ij", by_value, by_value)
+        information = information + 0.5 * jnp.einsum("kmi,kmj->ij", by_variance, by_variance)
+        count = jnp.maximum(jnp.sum(accepted), 1)
+        return _log_likelihood(value, variance, accepted), gradient, information, jnp.sum(whitened**2) / count
+
+    def filtered(self, z: np.ndarray, log: tuple[Rows, Kind], gate: float = np.inf) -> tuple[Innovations, Track]:
+        """Return innovations and estimates of the filter for a log, as NumPy arrays."""
+        rows, kind = log
+        return jax.tree.map(np.asarray, self._filter(jnp.asarray(z), _numbers(rows), gate, kind=kind))
+
+    def value(self, z: np.ndarray, logs: Sequence[tuple[Rows, Kind]]) -> float:
+        """Return the log-likelihood of the logs and of the prior."""
+        total = -0.5 * float(self.known @ z**2)
+        for log in logs:
+            total += float(_log_likelihood(*self.filtered(z, log)[0]))
+        return total
+
+    def derivatives(
+        self, z: np.ndarray, logs: Sequence[tuple[Rows, Kind]]
+    ) -> tuple[float, np.ndarray, np.ndarray, float]:
+        """Return log-likelihood, gradient (n,), information (n, n) of logs and prior, and the mean square."""
+        value, gradient, information = -0.5 * float(self.known @ z**2), -self.known * z, np.diag(self.known)
+        squares = []
+        for rows, kind in logs:
+            one = jax.tree.map(np.asarray, self._derivatives(jnp.asarray(z), _numbers(rows), kind=kind))
+            value, gradient, information = value + float(one[0]), gradient + one[1], information + one[2]
+            squares.append(float(one[3]))
+        return value, gradient, information, float(np.mean(squares))
+
+    def run(self, z: np.ndarray) -> Found:
+        """Return the end of the local search from coordinates (n,), with its outliers rejected."""
+        logs, before = self.logs, None
+        found = None
+        for _ in range(SCREENINGS if np.isfinite(self.gate) else 1):
+            if np.isfinite(self.gate):
+                logs = [self.screened(z, log) for log in self.logs]
+                masks = np.concatenate([log[0].valid.ravel() for log in logs])
+                if before is not None and np.array_equal(masks, before):
+                    break
+                before = masks
+            found = self.climb(z, logs)
+            z = found.z
+        assert found is not None
+        self.accepted = logs
+        return found
+
+    def screened(self, z: np.ndarray, log: tuple[Rows, Kind]) -> tuple[Rows, Kind]:
+        """Return the log without its outliers at these coordinates.
+
+        The limit is relative to the median of the squares, so that good samples stay while the model is still poor.
+        """
+        scale = 1.0
+        for gate in (np.inf, self.gate):
+            found, _ = self.filtered(z, log, gate * scale)
+            squares = (found.value**2 / found.variance)[found.accepted]
+            scale = max(scale, float(np.median(squares)) / float(stats.chi2.median(1)))
+        rows, kind = log
+        return rows._replace(valid=np.concatenate([rows.valid[:1], found.accepted])), kind
+
+    def climb(self, z: np.ndarray, logs: Sequence[tuple[Rows, Kind]]) -> Found:
+        """Return the nearest maximum of the likelihood of these logs."""
+        value, gradient, information, square = self.derivatives(z, logs)
+        damping, converged, steps = 1e-3, False, 0
+        for steps in range(1, STEPS + 1):
+            determined = _determined(information)
+            while True:
+                damped = information + damping * np.diag(np.diag(information))
+                step = np.linalg.solve(determined.T @ damped @ determined, determined.T @ gradient)
+                step = determined @ step
+                size = float(np.sqrt(step @ information @ step))
+                new = z + step * min(1.0, 3.0 / max(float(np.linalg.norm(step)), 1e-300))
+                better = self.value(new, logs)
+                if better >= value - 1e-9 * abs(value) and np.isfinite(better):
+                    break
+                damping *= 10.0
+                if damping > 1e8:
+                    return Found(z, value, information, square, size < CONVERGED, steps)
+            z, damping = new, max(damping / 10.0, 1e-9)
+            value, gradient, information, square = self.derivatives(z, logs)
+            self.report(f"step {steps}: mean square of the innovations {square:.4g}")
+            if size < CONVERGED:
+                converged = True
+                break
+        return Found(z, value, information, square, converged, steps)
+
+
+def _log_likelihood(value: Any, variance: Any, accepted: Any) -> Any:
+    """Return the log-likelihood of the innovations, without the constant."""
+    return -0.5 * jnp.sum(jnp.where(accepted, value**2 / variance + jnp.log(variance), 0.0))
+
+
+def _numbers(rows: Rows) -> Rows:
+    """Return the rows as arrays for JAX; `source` is not used there."""
+    return jax.tree.map(jnp.asarray, rows._replace(source=np.zeros(0)))
+
+
+def _determined(information: np.ndarray) -> np.ndarray:
+    """Return orthonormal directions (n, k) in that the estimates are better than the prior or the usual uncertainty."""
+    sizes, directions = np.linalg.eigh(information)
+    return directions[:, sizes >= 1.0]
+
+
+def covariance(information: np.ndarray) -> np.ndarray:
+    """Return the covariance (n, n) of the coordinates; 1 in directions that are not determined."""
+    sizes, directions = np.linalg.eigh(information)
+    return (directions / np.maximum(sizes, 1.0)) @ directions.T
+
+
+def undetermined(problem: Problem, of_data: np.ndarray) -> list[str]:
+    """Return a sentence for each combination of coordinates that the data do not determine.
+
+    Args:
+        problem: the problem.
+        of_data: Fisher information (n, n) of the data alone, in sigmas of the prior.
+    """
+    sizes, directions = np.linalg.eigh(of_data)
+    sentences = []
+    for direction in directions[:, sizes < 1.0].T:
+        blocks, at, ratios = [], 0, []
+        for one in problem.parameters:
+            part = direction[at : at + one.size]
+            at += one.size
+            if np.linalg.norm(part) < CLEAR:
+                continue
+            common = None if one.common is None else one.common / np.linalg.norm(one.common)
+            alike = common is not None and abs(part @ common) > 0.9 * np.linalg.norm(part)
+            ratios.append(alike)
+            named = [one.labels[k] for k in range(one.size) if abs(part[k]) > CLEAR] if len(one.labels) == one.size else []
+            blocks.append(one.name if alike or not named or one.name == "inertia" else " and ".join(named))
+        if len(blocks) == 2 and all(ratios):
+            sentences.append(f"only the ratio of {blocks[0]} to {blocks[1]} is determined; the common factor is kept")
+        elif len(blocks) == 1:
+            sentences.append(f"the data do not determine {blocks[0]}, which is kept")
+        else:
+            sentences.append(f"the data do not determine a combination of {', '.join(blocks)}, which is kept")
+    return list(dict.fromkeys(sentences))
+
+
+def _result(
+    loaded: Scenario, problem: Problem, search: Search, best: Found, logs: Sequence[Any], others: Sequence[Any]
+) -> Identification:
+    z = best.z
+    of_z = covariance(best.information)
+    numbers = jax.jit(lambda z: problem.read(problem.at(z)))
+    by_z = np.asarray(jax.jacfwd(numbers)(jnp.asarray(z)))
+    by_start = np.asarray(jax.jacfwd(numbers)(jnp.zeros(problem.size)))
+    known = problem.known()
+    prior = np.sqrt(np.sum(by_start[:, known] ** 2, axis=1))
+    prior = np.where(np.any(by_start[:, ~known] != 0.0, axis=1) | (prior == 0.0), np.inf, prior)
+
+    def fitted(log: Measurements) -> Fit:
+        one = rows(problem, log), Kind.of(log)
+        screened = search.screened(z, one) if np.isfinite(search.gate) else one
+        return Fit(log, one[0], *search.filtered(z, screened))
+
+    return Identification(
+        scenario=loaded,
+        problem=problem,
+        z=z,
+        covariance_z=of_z,
+        start=np.asarray(numbers(jnp.zeros(problem.size))),
+        prior=prior,
+        estimate=np.asarray(numbers(jnp.asarray(z))),
+        covariance=by_z @ of_z @ by_z.T,
+        undetermined=undetermined(problem, best.information - np.diag(known.astype(float))),
+        fits=[fitted(log) for log in logs],
+        validation=[fitted(log) for log in others],
+        converged=best.converged,
+        steps=best.steps,
+        log_likelihood=best.value,
+    )

@@ -1,0 +1,453 @@
+"""The parameters that can be estimated: their names, units, prior knowledge, and how they change the model.
+
+The coordinates of a parameter are 0 for the scenario's value. They are scaled so that 1 is one sigma of the prior
+knowledge, or of a usual uncertainty without it. Start with `build`.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.tree_util import keystr, tree_flatten_with_path
+from jaxtyping import Array
+
+from ptsmc_jax.devices.actuators import Actuators
+from ptsmc_jax.dispersions import inertias
+from ptsmc_jax.dispersions.quantities import PAIRS
+from ptsmc_jax.identification.filtering import Model
+from ptsmc_jax.identification.telemetry import Measurements
+from ptsmc_jax.numerics import attitude, matrices
+from ptsmc_jax.numerics.pytrees import vector
+from ptsmc_jax.scenario import build as building
+from ptsmc_jax.scenario.errors import ScenarioError, wrong
+from ptsmc_jax.scenario.parsing import nearest
+from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.signals import disturbances
+
+GYRO_BIAS = "gyro_bias"  # a state of the filter, not a constant
+UNKNOWN_BIAS = 0.02  # 1 sigma of a gyro bias of which nothing is known [rad/s]
+USUAL = {  # 1 sigma of a parameter without a dispersion: relative, or in rad
+    "inertia": 0.3, "actuator_scale": 0.1, "actuator_misalignment": 0.03, "gyro_scale": 0.02,
+    "star_tracker_misalignment": 0.02, "noise": 1.0, "torque_lag": 0.7, "mode_frequency": 0.2, "mode_damping": 1.0,
+    "mode_coupling": 0.3, "disturbance_amplitude": 1.0, "disturbance_phase": 2.0, "disturbance_frequency": 0.3,
+    "plant": 0.3,
+}  # fmt: skip
+
+
+class Parameter(NamedTuple):
+    """A group of numbers that are estimated together.
+
+    Attributes:
+        name: as in `identify.free`.
+        labels: name of each number in results.
+        unit: of the numbers.
+        factor: (numbers.., coordinates) a factor of the prior covariance of the changes that `write` takes.
+        known: whether the factor is prior knowledge, from [dispersion].
+        write: (model, changes) -> model; zero changes nothing.
+        read: (model) -> numbers [unit].
+        common: coordinates of a common factor of e on all numbers, to first order; None if it has no meaning.
+    """
+
+    name: str
+    labels: list[str]
+    unit: str
+    factor: np.ndarray
+    known: bool
+    write: Callable[[Model, Array], Model]
+    read: Callable[[Model], Array]
+    common: np.ndarray | None = None
+
+    @property
+    def size(self) -> int:
+        """The number of coordinates."""
+        return self.factor.shape[1]
+
+
+class Problem(NamedTuple):
+    """The model of a scenario and its free parameters."""
+
+    model: Model
+    parameters: list[Parameter]
+    step: float  # longest integration step [s]
+    bias: bool  # whether the gyro bias is estimated
+
+    @property
+    def size(self) -> int:
+        """The number of all coordinates."""
+        return sum(one.size for one in self.parameters)
+
+    def at(self, z: Array) -> Model:
+        """Return the model at coordinates (n,) [-]."""
+        model, at = self.model, 0
+        for one in self.parameters:
+            model = one.write(model, jnp.asarray(one.factor) @ z[at : at + one.size])
+            at += one.size
+        return model
+
+    def read(self, model: Model) -> Array:
+        """Return the numbers of all parameters, one after another, in their units."""
+        return jnp.concatenate([jnp.zeros(0), *(jnp.ravel(one.read(model)) for one in self.parameters)])
+
+    @property
+    def labels(self) -> list[str]:
+        """The name of each number."""
+        return [label for one in self.parameters for label in one.labels]
+
+    @property
+    def units(self) -> list[str]:
+        """The unit of each number."""
+        return [one.unit for one in self.parameters for _ in one.labels]
+
+    def known(self) -> np.ndarray:
+        """Return whether each coordinate has prior knowledge, (n,) bool."""
+        return np.concatenate([np.zeros(0, bool), *(np.full(one.size, one.known) for one in self.parameters)])
+
+
+def build(scenario: Scenario, logs: Sequence[Measurements], names: Sequence[str] | None = None) -> Problem:
+    """Return the model of a scenario and its free parameters.
+
+    Args:
+        scenario: a complete scenario.
+        logs: the logs, which have the same readings.
+        names: free parameters; by default those of [identify].
+
+    Raises:
+        ScenarioError: a parameter is unknown, or the scenario does not have it.
+    """
+    setup = building.setup(scenario)
+    table = scenario.identify
+    names = names or (None if table is None else table.free) or _usual(scenario)
+    logged = logs[0]
+    interval = float(np.median(np.diff(logged.t)))
+    model, estimated = _model(scenario, setup, logs, interval, GYRO_BIAS in names)
+    prior = scenario.dispersion if table is None or table.prior == "dispersion" else None
+    catalogue = _catalogue(scenario, model, logs, interval, prior)
+    found = []
+    for name in dict.fromkeys((*(one for one in names if one != GYRO_BIAS), *estimated)):
+        if name not in catalogue:
+            known = [*catalogue, *([GYRO_BIAS] if "rate" in logged.readings else [])]
+            raise ScenarioError(f"identify.free has {name}, which this scenario does not have; {nearest(name, known)}")
+        model, parameter = catalogue[name](model)
+        found.append(parameter)
+    if not found:
+        raise wrong("identify.free", names, "a list with a parameter of the model too")
+    return Problem(model, found, _step(scenario, setup, interval), GYRO_BIAS in names)
+
+
+def _usual(scenario: Scenario) -> tuple[str, ...]:
+    return ("inertia", GYRO_BIAS) if scenario.plant.kind == "spacecraft" else ("actuator_scale",)
+
+
+def _step(scenario: Scenario, setup: Any, interval: float) -> float:
+    """Return the longest integration step [s]: an interval of the log, or less for fast modes and disturbances."""
+    quick = [float(np.max(np.asarray(getattr(setup.plant, "frequency", [0.0]))))]
+    for term in scenario.terms:
+        quick.append(term.quickest())
+    fastest = max(quick)
+    return min(interval * 1.5, 0.2 / fastest if fastest > 0.0 else np.inf)
+
+
+def _model(
+    scenario: Any, setup: Any, logs: Sequence[Measurements], interval: float, with_bias: bool
+) -> tuple[Model, list[str]]:
+    """Return the model of the scenario, and the noises that it does not give, which are estimated."""
+    table, devices, plant = scenario.identify, scenario.devices, setup.plant
+    actuators: Actuators = replace(setup.actuators, delay=0, spare_allocations=None, failure_times=None)
+    if logs[0].by_channel:
+        actuators = replace(actuators, torque_limit=None)
+    noises, estimated, period = {}, [], scenario.loop.period
+    given = {
+        "attitude": getattr(devices, "attitude_noise", None),
+        "rate": devices.gyro_noise(period) if hasattr(devices, "gyro_noise") else None,
+        "x": getattr(devices, "state_noise", None),
+    }
+    for name, readings in logs[0].readings.items():
+        if given[name]:
+            noises[name] = vector(given[name]) * jnp.ones(min(readings.shape[1], 3) if name != "x" else readings.shape[1])
+        else:
+            noises[name] = vector(np.maximum(np.mean([_roughness(name, log) for log in logs], axis=0), 1e-12))
+            estimated.append("state_noise" if name == "x" else f"{name}_noise")
+    bias = getattr(devices, "rate_bias", None)
+    nothing = table is not None and table.prior == "none"
+    known_bias = 0.0 if bias is None else bias
+    walk = setup.walk_rate if setup.walk_rate is None else setup.walk_rate * np.sqrt(period)
+    if table is not None and table.torque_walk is not None:
+        walk = vector(table.torque_walk) * jnp.ones(plant.inputs) if table.torque_walk > 0.0 else None
+    model = Model(
+        plant=plant,
+        disturbance=setup.disturbance,
+        actuators=actuators,
+        delay=vector(devices.delay_periods * (period or 0.0)),
+        noises=noises,
+        rate_scale=jnp.ones(3),
+        misalignment=jnp.zeros(3),
+        bias=vector(UNKNOWN_BIAS if with_bias and (nothing or not known_bias) else known_bias),
+        bias_walk=vector(getattr(devices, "rate_bias_walk", None) or 0.0),
+        walk=walk,
+        modes=_hidden_spread(plant, logs),
+    )
+    return model, estimated
+
+
+def _roughness(name: str, log: Measurements) -> np.ndarray:
+    """Return a robust estimate of the noise from third differences, whose variance is 20 times that of the noise."""
+    values = log.readings[name]
+    there = ~np.isnan(values).any(axis=1)
+    values = 2.0 * values[there] if name == "attitude" else values[there]
+    if len(values) < 8:
+        return np.full(3 if name != "x" else values.shape[1], 1e-3)
+    sizes = 1.4826 * np.median(np.abs(np.diff(values, 3, axis=0)), axis=0) / np.sqrt(20.0)
+    return np.full(3, np.max(sizes)) if name != "x" else np.maximum(sizes, 1e-9 * (1e-3 + np.ptp(values, axis=0)))
+
+
+def _hidden_spread(plant: Any, logs: Sequence[Measurements]) -> Array:
+    """Return the prior 1 sigma of modal coordinates and their rates: ten times the deflection by the largest torque."""
+    if not hasattr(plant, "coupling"):
+        size = plant.z0.shape[-1] if hasattr(plant, "z0") else 0
+        return jnp.zeros(size)
+    largest = 1.0 if logs[0].wheel_inertia is not None else max(float(np.abs(log.command).max()) for log in logs)
+    deflection = 10.0 * np.abs(np.asarray(plant.coupling @ plant.inertia_inverse)) @ np.full(3, largest)
+    frequency = np.asarray(plant.frequency)
+    return vector(np.concatenate([deflection / frequency**2, deflection / frequency]))
+
+
+Maker = Callable[[Model], tuple[Model, Parameter]]
+
+
+def _catalogue(
+    scenario: Any, model: Model, logs: Sequence[Measurements], interval: float, prior: Any
+) -> dict[str, Maker]:
+    """Return functions that make the parameters of this scenario, by name."""
+    plant, actuators = model.plant, model.actuators
+    inputs = plant.inputs
+    axes = np.eye(inputs) if actuators.wheels is None else np.asarray(actuators.wheels.axes)
+    torque = max(float(np.sqrt(np.mean(log.command**2))) for log in logs) or 1.0
+    unit = plant.input_unit
+
+    def spread(name: str, count: int) -> tuple[np.ndarray, bool]:
+        """Return the 1 sigma of each number, (count,), and whether [dispersion] gives it."""
+        table = getattr(prior, name, None)
+        if table is None:
+            return np.full(count, USUAL["noise" if name.endswith("_noise") else name]), False
+        return np.maximum(table.of(count) * (1.0 if table.name.endswith("normal") else 1.0 / np.sqrt(3.0)), 1e-9), True
+
+    def field(
+        name: str, path: Callable[[Model], Any], put: Callable[[Model, Array], Model], count: int, unit: str, how: str
+    ) -> Maker:
+        """Return the maker of numbers that are multiplied by e^c ("log") or 1 + c, or to which c is added."""
+
+        def make(model: Model) -> tuple[Model, Parameter]:
+            sizes, known = spread(name, count)
+            start = jnp.asarray(path(model), float) * jnp.ones(count)
+
+            def write(model: Model, c: Array) -> Model:
+                new = start * jnp.exp(c) if how == "log" else start * (1.0 + c) if how == "factor" else start + c
+                return put(model, new)
+
+            common = 1.0 / sizes if how in ("log", "factor") else None
+            read = lambda model: jnp.asarray(path(model), float) * jnp.ones(count)  # noqa: E731
+            labels = [name] if count == 1 else [f"{name}_{k + 1}" for k in range(count)]
+            return put(model, start), Parameter(name, labels, unit, np.diag(sizes), known, write, read, common)
+
+        return make
+
+    def with_actuators(model: Model, **changes: Any) -> Model:
+        return replace(model, actuators=replace(model.actuators, **changes))
+
+    channels = axes.shape[1]
+    made: dict[str, Maker] = {
+        "actuator_scale": field(
+            "actuator_scale",
+            lambda model: jnp.ones(channels) if model.actuators.scale is None else model.actuators.scale,
+            lambda model, new: with_actuators(model, scale=new),
+            channels, "-", "factor",
+        ),
+        "delay": lambda model: (model, _delay(interval)),
+        "disturbance_bias": lambda model: (model, _bias(inputs, unit, torque, getattr(prior, "disturbance_bias", None))),
+    }  # fmt: skip
+    if actuators.lag is not None:
+        made["torque_lag"] = field(
+            "torque_lag", lambda m: m.actuators.lag, lambda m, new: with_actuators(m, lag=new[0]), 1, "s", "log"
+        )
+    for name, noise in model.noises.items():
+        key, count = ("state_noise", noise.size) if name == "x" else (f"{name}_noise", 1)
+        own_unit = {"attitude": "rad", "rate": "rad/s", "x": ""}[name]
+
+        def put(model: Model, new: Array, name: str = name, size: int = noise.size) -> Model:
+            return replace(model, noises={**model.noises, name: new * jnp.ones(size)})
+
+        made[key] = field(key, lambda m, n=name, c=count: m.noises[n][:c], put, count, own_unit, "log")
+    for name, quantity_unit, how in (
+        ("disturbance_amplitude", unit, "factor"),
+        ("disturbance_phase", "rad", "add"),
+    ):
+        quantity: Any = name.removeprefix("disturbance_")
+        count = disturbances.count(model.disturbance, quantity)
+        if count:
+            made[name] = field(
+                name,
+                lambda m, q=quantity: disturbances.values(m.disturbance, q),
+                lambda m, new, q=quantity: replace(m, disturbance=disturbances.with_values(m.disturbance, q, new)),
+                count, quantity_unit, how,
+            )  # fmt: skip
+    if model.spacecraft:
+        made["inertia"] = lambda model: (model, _inertia(np.asarray(model.plant.inertia), prior))
+        made["actuator_misalignment"] = lambda model: _misalignment(model, axes, *spread("actuator_misalignment", 1))
+        if "attitude" in model.noises:
+            made["star_tracker_misalignment"] = field(
+                "star_tracker_misalignment", lambda m: m.misalignment,
+                lambda m, new: replace(m, misalignment=new), 3, "rad", "add",
+            )  # fmt: skip
+        if "rate" in model.noises:
+            made["gyro_scale"] = field(
+                "gyro_scale", lambda m: m.rate_scale, lambda m, new: replace(m, rate_scale=new), 3, "-", "factor"
+            )
+    if hasattr(plant, "coupling"):
+        modes = plant.frequency.size
+        made["mode_frequency"] = field(
+            "mode_frequency", lambda m: m.plant.frequency,
+            lambda m, new: replace(m, plant=replace(m.plant, frequency=new)), modes, "rad/s", "log",
+        )  # fmt: skip
+        made["mode_damping"] = field(
+            "mode_damping", lambda m: jnp.maximum(m.plant.damping, 1e-4),
+            lambda m, new: replace(m, plant=replace(m.plant, damping=new)), modes, "-", "log",
+        )  # fmt: skip
+        made["mode_coupling"] = lambda model: (model, _coupling(model, *spread("mode_coupling", 1)))
+    for path, leaf in _leaves(plant):
+        made.setdefault(path, lambda model, path=path, leaf=leaf: (model, _leaf(path, leaf)))
+    return made
+
+
+def _leaves(plant: Any) -> list[tuple[str, np.ndarray]]:
+    """Return the numbers inside a custom plant, by the path that names them in `identify.free`."""
+    if hasattr(plant, "with_inertia"):
+        return []
+    leaves, _ = tree_flatten_with_path(plant)
+    paths = [("plant" + keystr(path), np.asarray(leaf)) for path, leaf in leaves]
+    return [(path, leaf) for path, leaf in paths if not path.startswith(("plant.inertia", "plant.z0"))]
+
+
+def _leaf(path: str, start: np.ndarray) -> Parameter:
+    sizes = USUAL["plant"] * np.where(start == 0.0, np.max(np.abs(start), initial=0.0) or 1.0, np.abs(start)).ravel()
+
+    def place(model: Model) -> tuple[list[Any], Any, int]:
+        leaves, tree = jax.tree.flatten(model.plant)
+        names = ["plant" + keystr(one) for one, _ in tree_flatten_with_path(model.plant)[0]]
+        return leaves, tree, names.index(path)
+
+    def write(model: Model, c: Array) -> Model:
+        leaves, tree, at = place(model)
+        leaves[at] = jnp.asarray(start, float) + c.reshape(start.shape)
+        return replace(model, plant=jax.tree.unflatten(tree, leaves))
+
+    def read(model: Model) -> Array:
+        leaves, _, at = place(model)
+        return jnp.ravel(leaves[at])
+
+    labels = [path] if start.size == 1 else [f"{path}_{k + 1}" for k in range(start.size)]
+    return Parameter(path, labels, "", np.diag(sizes), False, write, read)
+
+
+def _delay(interval: float) -> Parameter:
+    def write(model: Model, c: Array) -> Model:
+        # below zero the delay has no meaning; a tiny delay keeps its derivative
+        return replace(model, delay=jnp.maximum(model.delay + c[0], 1e-9))
+
+    return Parameter(
+        "delay", ["delay"], "s", np.array([[interval]]), False, write, lambda model: jnp.reshape(model.delay, 1)
+    )
+
+
+def _bias(inputs: int, unit: str, torque: float, table: Any) -> Parameter:
+    sizes = np.full(inputs, 0.1 * torque) if table is None else table.of(inputs)
+
+    def write(model: Model, c: Array) -> Model:
+        start = disturbances.bias(model.disturbance, inputs)
+        return replace(model, disturbance=disturbances.with_bias(model.disturbance, start + c))
+
+    labels = [f"disturbance_bias_{k + 1}" for k in range(inputs)]
+    return Parameter(
+        "disturbance_bias", labels, unit, np.diag(sizes), table is not None, write,
+        lambda model: disturbances.bias(model.disturbance, inputs),
+    )  # fmt: skip
+
+
+def _misalignment(model: Model, axes: np.ndarray, sizes: np.ndarray, known: bool) -> tuple[Model, Parameter]:
+    """Return small rotations of each channel about two axes across it; one about its own axis has no effect."""
+    directions = axes if model.actuators.directions is None else np.asarray(model.actuators.directions)
+    across = [np.linalg.svd(direction[None])[2][1:] for direction in directions.T]  # (2, 3) each
+
+    def write(model: Model, c: Array) -> Model:
+        turned = []
+        for k, direction in enumerate(directions.T):
+            turn = c[2 * k] * across[k][0] + c[2 * k + 1] * across[k][1]
+            turned.append(attitude.rotate(attitude.from_rotation_vector(turn), jnp.asarray(direction)))
+        return replace(model, actuators=replace(model.actuators, directions=jnp.stack(turned, axis=1)))
+
+    def read(model: Model) -> Array:
+        now = directions if model.actuators.directions is None else model.actuators.directions
+        turns = [attitude.cross(jnp.asarray(a), jnp.asarray(b)) for a, b in zip(directions.T, now.T, strict=True)]
+        return jnp.concatenate([jnp.asarray(across[k]) @ turn for k, turn in enumerate(turns)])
+
+    count = 2 * directions.shape[1]
+    labels = [f"actuator_misalignment_{k // 2 + 1}{'ab'[k % 2]}" for k in range(count)]
+    factor = float(sizes[0]) * np.eye(count)
+    return model, Parameter("actuator_misalignment", labels, "rad", factor, known, write, read)
+
+
+def _coupling(model: Model, sizes: np.ndarray, known: bool) -> Parameter:
+    start = np.asarray(model.plant.coupling)
+    rows = np.linalg.norm(start, axis=1, keepdims=True) * np.ones(3)
+
+    def write(model: Model, c: Array) -> Model:
+        plant = replace(model.plant, coupling=jnp.asarray(start) + c.reshape(start.shape)).with_rest_inverse()
+        return replace(model, plant=plant)
+
+    labels = [f"mode_coupling_{k + 1}{i + 1}" for k in range(len(start)) for i in range(3)]
+    factor = np.diag(float(sizes[0]) * rows.ravel())
+    return Parameter(
+        "mode_coupling", labels, "sqrt(kg) m", factor, known, write, lambda model: jnp.ravel(model.plant.coupling)
+    )
+
+
+def _inertia(start: np.ndarray, prior: Any) -> Parameter:
+    """Return the inertia in log-Cholesky coordinates of its pseudo-inertia, so that every value is that of a body."""
+    table = getattr(prior, "inertia", None)
+    root = inertias.pseudo_root(start)
+    by_coordinates = np.asarray(jax.jacfwd(lambda c: _entries(inertias.from_coordinates(root, c)))(jnp.zeros(6)))
+    if table is not None and hasattr(table, "factor"):
+        factor = np.asarray(table.factor, dtype=float)
+    else:
+        std = USUAL["inertia"] if table is None else max(table.std, 1e-6)
+        turn = std if table is None or not table.axes_deg else np.deg2rad(table.axes_deg)
+        moments, axes = np.linalg.eigh(start)
+        changes = [std * moments[k] * np.outer(axes[:, k], axes[:, k]) for k in range(3)]
+        for k in range(3):
+            cross = np.cross(np.eye(3), axes[:, k]).T * -1.0
+            changes.append(turn * (cross @ start - start @ cross))
+        by_prior = np.stack([np.asarray(_entries(jnp.asarray(change))) for change in changes], axis=1)
+        factor = np.linalg.solve(by_coordinates, _full_rank(by_prior, std * np.min(moments)))
+
+    def write(model: Model, c: Array) -> Model:
+        inertia = inertias.from_coordinates(jnp.asarray(root), c)
+        plant = model.plant.with_inertia(inertia, matrices.solve(inertia, jnp.eye(3)))
+        return replace(model, plant=plant, disturbance=disturbances.on_body(model.disturbance, inertia))
+
+    labels = [f"inertia_{i + 1}{j + 1}" for i, j in PAIRS]
+    common = np.linalg.lstsq(factor, np.repeat([0.5, 0.0], 3), rcond=None)[0]
+    return Parameter(
+        "inertia", labels, "kg m^2", factor, table is not None, write, lambda model: _entries(model.plant.inertia), common
+    )
+
+
+def _full_rank(factor: np.ndarray, size: float) -> np.ndarray:
+    """Return the factor with singular values of at least 0.3 `size`: equal moments have no axes of their own."""
+    u, s, vt = np.linalg.svd(factor)
+    return (u * np.maximum(s, 0.3 * size)) @ vt
+
+
+def _entries(inertia: Array) -> Array:
+    return jnp.stack([inertia[i, j] for i, j in PAIRS])
