@@ -19,6 +19,7 @@ _NAMES = {
     "dispersions.base": "Draw",
     "dispersions.variation": "Dispersion",
     "explore": "floor simulate trials verdicts write",
+    "identification.estimation": "Identification identify",
     "laws.base": "AccelerationLaw",
     "laws.kinematics": "AdditiveKinematics ChainKinematics MultiplicativeKinematics SecondOrderKinematics",
     "laws.prescribed_time": "PrescribedTime PrescribedTimeChain",
@@ -60,6 +61,8 @@ if TYPE_CHECKING:
     from ptsmc_jax.explore import trials as trials
     from ptsmc_jax.explore import verdicts as verdicts
     from ptsmc_jax.explore import write as write
+    from ptsmc_jax.identification.estimation import Identification as Identification
+    from ptsmc_jax.identification.estimation import identify as identify
     from ptsmc_jax.laws.base import AccelerationLaw as AccelerationLaw
     from ptsmc_jax.laws.kinematics import AdditiveKinematics as AdditiveKinematics
     from ptsmc_jax.laws.kinematics import ChainKinematics as ChainKinematics

@@ -79,7 +79,6 @@ class Run:
             columns |= numbered(name, block)
         return columns
 
-
     def _measured(self) -> dict[str, np.ndarray]:
         """Return the readings of the sensors and the torque that the computer sends, empty if they are not logged.
 

@@ -157,9 +157,9 @@ def _read_directions(parts: Parts) -> Numbers:
 
 
 def _rotate_channels(random: Random, nominal: Numbers, parts: Parts) -> Numbers:
-    """Return the directions (3 channels,) [-] of the design model, each rotated by its rotation vector [rad]."""
-    turns, axes = random.reshape(-1, 3), channels(parts)
-    rotated = [attitude.rotate(attitude.from_rotation_vector(turns[k]), axes[:, k]) for k in range(axes.shape[1])]
+    """Return the nominal directions (3 channels,) [-], each rotated by its rotation vector [rad]."""
+    turns, axes = random.reshape(-1, 3), nominal.reshape(-1, 3)
+    rotated = [attitude.rotate(attitude.from_rotation_vector(turns[k]), axes[k]) for k in range(axes.shape[0])]
     return jnp.concatenate(rotated)
 
 

@@ -20,7 +20,7 @@ from ptsmc_jax.dispersions.base import (
     Coordinates,
     Draw,
 )
-from ptsmc_jax.dispersions.inertias import RelativeInertia
+from ptsmc_jax.dispersions.inertias import CorrelatedInertia, RelativeInertia
 from ptsmc_jax.dispersions.numbers import RandomNumbers
 from ptsmc_jax.dispersions.quantities import QUANTITIES
 from ptsmc_jax.numerics import draws, paths
@@ -46,7 +46,7 @@ class Dispersion:
         custom: a custom dispersion, which is applied last.
     """
 
-    numbers: dict[str, RandomNumbers | RelativeInertia] = field(default_factory=dict)
+    numbers: dict[str, RandomNumbers | RelativeInertia | CorrelatedInertia] = field(default_factory=dict)
     custom: Draw | None = None
 
     @property
@@ -62,7 +62,7 @@ class Dispersion:
         return tuple(jax.eval_shape(self.custom.values, numbers))
 
     @property
-    def kinds(self) -> Mapping[str, RandomNumbers | RelativeInertia | Draw]:
+    def kinds(self) -> Mapping[str, RandomNumbers | RelativeInertia | CorrelatedInertia | Draw]:
         """Random quantities by the name of their stream, in the order of `QUANTITIES`, the custom dispersion last."""
         kinds = {name: self.numbers[name] for name in QUANTITIES if name in self.numbers}
         return kinds if self.custom is None else {**kinds, CUSTOM: self.custom}
@@ -88,7 +88,7 @@ class Dispersion:
             if isinstance(kind, RandomNumbers):
                 parts = QUANTITIES[name].disperse(parts, kind.at(c), kind.distribution)
             elif isinstance(
-                kind, RelativeInertia
+                kind, RelativeInertia | CorrelatedInertia
             ):  # it returns the inverse as well, which `write` would have to compute
                 body = paths.get(parts, "plant").with_inertia(*kind.at(c))
                 parts = quantities.with_body(parts, body)

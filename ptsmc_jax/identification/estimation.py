@@ -27,6 +27,7 @@ from ptsmc_jax.scenario.tables import Scenario
 
 BUCKET = 256  # rows of a log are padded to a multiple of it, so that similar logs share compiled programs
 STEPS = 40  # largest number of steps of a local search
+LONGEST = 3.0  # step, in sigmas of the prior
 CONVERGED = 1e-3  # largest step of a converged search, in sigmas of the estimate
 SCREENINGS = 4  # largest number of times that outliers are determined again
 POOR = 1.5  # mean normalised square of the innovations above which other starting points are tried
@@ -102,6 +103,7 @@ class Identification:
     estimate: np.ndarray  # (k,)
     covariance: np.ndarray  # (k, k)
     undetermined: list[str]  # sentences on combinations that the data do not determine
+    complete: bool  # whether data and prior knowledge together determine every combination
     fits: list[Fit]
     validation: list[Fit]
     converged: bool
@@ -120,8 +122,8 @@ class Identification:
 
     @property
     def good(self) -> bool:
-        """Whether the model explains the logs and every free parameter is determined."""
-        return self.converged and self.white and not self.undetermined
+        """Whether the model explains the logs, and data and prior knowledge determine every free parameter."""
+        return self.converged and self.white and self.complete
 
     def table(self) -> pl.DataFrame:
         """Return a row for each number: estimate, 1 sigma, 95 % interval, start, prior 1 sigma and unit."""
@@ -251,9 +253,7 @@ class Found(NamedTuple):
 class Search:
     """Local searches for the estimates from some logs; programs are compiled once for logs of the same length."""
 
-    def __init__(
-        self, problem: Problem, logs: Sequence[tuple[Rows, Kind]], gate: float, report: Callable[[str], None]
-    ):
+    def __init__(self, problem: Problem, logs: Sequence[tuple[Rows, Kind]], gate: float, report: Callable[[str], None]):
         """Args: the problem, the logs, the normalised square of outliers, and a function that reports progress."""
         self.problem, self.logs, self.gate, self.report = problem, list(logs), gate, report
         self.known = problem.known().astype(float)
@@ -266,12 +266,11 @@ class Search:
     def _differentiated(self, z: Array, rows: Rows, kind: Kind) -> tuple[Array, Array, Array, Array]:
         """Return log-likelihood, gradient, Fisher information and mean normalised square of one log."""
 
-        def of(z: Array) -> tuple[tuple[Array, Array], Array]:
+        def of(z: Array) -> tuple[tuple[Array, Array], Innovations]:
             found, _ = filtering.innovations(self.problem.at(z), rows, kind)
-            return (found.value, found.variance), found.accepted
+            return (found.value, found.variance), found
 
-        (value, variance), accepted = of(z)
-        by_value, by_variance = jax.jacfwd(lambda z: of(z)[0])(z)
+        (by_value, by_variance), (value, variance, accepted) = jax.jacfwd(of, has_aux=True)(z)
         by_value = by_value / jnp.sqrt(variance)[..., None]
         by_variance = by_variance / variance[..., None]
         whitened = value / jnp.sqrt(variance)
@@ -339,22 +338,22 @@ class Search:
     def climb(self, z: np.ndarray, logs: Sequence[tuple[Rows, Kind]]) -> Found:
         """Return the nearest maximum of the likelihood of these logs."""
         value, gradient, information, square = self.derivatives(z, logs)
-        damping, converged, steps = 1e-3, False, 0
+        damping, converged, steps = 0.0, False, 0
         for steps in range(1, STEPS + 1):
-            determined = _determined(information)
+            sizes, directions = np.linalg.eigh(information)
+            directions = directions[:, sizes >= 1.0]  # the others keep their prior
+            sizes = sizes[sizes >= 1.0]
             while True:
-                damped = information + damping * np.diag(np.diag(information))
-                step = np.linalg.solve(determined.T @ damped @ determined, determined.T @ gradient)
-                step = determined @ step
+                step = directions @ ((directions.T @ gradient) / (sizes + damping))
+                step = step * min(1.0, LONGEST / max(float(np.linalg.norm(step)), 1e-300))
                 size = float(np.sqrt(step @ information @ step))
-                new = z + step * min(1.0, 3.0 / max(float(np.linalg.norm(step)), 1e-300))
-                better = self.value(new, logs)
-                if better >= value - 1e-9 * abs(value) and np.isfinite(better):
+                better = self.value(z + step, logs)
+                if np.isfinite(better) and better >= value - 1e-9 * abs(value):
                     break
-                damping *= 10.0
-                if damping > 1e8:
+                damping = max(10.0 * damping, float(np.min(sizes, initial=1.0)))
+                if damping > 1e12:
                     return Found(z, value, information, square, size < CONVERGED, steps)
-            z, damping = new, max(damping / 10.0, 1e-9)
+            z, damping = z + step, damping / 100.0
             value, gradient, information, square = self.derivatives(z, logs)
             self.report(f"step {steps}: mean square of the innovations {square:.4g}")
             if size < CONVERGED:
@@ -373,45 +372,44 @@ def _numbers(rows: Rows) -> Rows:
     return jax.tree.map(jnp.asarray, rows._replace(source=np.zeros(0)))
 
 
-def _determined(information: np.ndarray) -> np.ndarray:
-    """Return orthonormal directions (n, k) in that the estimates are better than the prior or the usual uncertainty."""
-    sizes, directions = np.linalg.eigh(information)
-    return directions[:, sizes >= 1.0]
-
-
 def covariance(information: np.ndarray) -> np.ndarray:
     """Return the covariance (n, n) of the coordinates; 1 in directions that are not determined."""
     sizes, directions = np.linalg.eigh(information)
     return (directions / np.maximum(sizes, 1.0)) @ directions.T
 
 
-def undetermined(problem: Problem, of_data: np.ndarray) -> list[str]:
-    """Return a sentence for each combination of coordinates that the data do not determine.
+def undetermined(problem: Problem, information: np.ndarray, by_z: np.ndarray) -> list[str]:
+    """Return a sentence for each combination of parameters that the data do not determine.
 
     Args:
         problem: the problem.
-        of_data: Fisher information (n, n) of the data alone, in sigmas of the prior.
+        information: Fisher information (n, n) of the data alone, in sigmas of the prior.
+        by_z: derivatives of the numbers (k, n) by the coordinates.
     """
-    sizes, directions = np.linalg.eigh(of_data)
-    sentences = []
+    sizes, directions = np.linalg.eigh(information)
+    usual, known, sentences = np.linalg.norm(by_z, axis=1), problem.known(), []
     for direction in directions[:, sizes < 1.0].T:
-        blocks, at, ratios = [], 0, []
+        change = (by_z @ direction) / np.where(usual > 0.0, usual, 1.0)
+        clear = np.abs(change) > CLEAR * np.max(np.abs(change))
+        names, common, at, row = [], [], 0, 0
         for one in problem.parameters:
-            part = direction[at : at + one.size]
-            at += one.size
+            part, here = direction[at : at + one.size], clear[row : row + len(one.labels)]
+            at, row = at + one.size, row + len(one.labels)
             if np.linalg.norm(part) < CLEAR:
                 continue
-            common = None if one.common is None else one.common / np.linalg.norm(one.common)
-            alike = common is not None and abs(part @ common) > 0.9 * np.linalg.norm(part)
-            ratios.append(alike)
-            named = [one.labels[k] for k in range(one.size) if abs(part[k]) > CLEAR] if len(one.labels) == one.size else []
-            blocks.append(one.name if alike or not named or one.name == "inertia" else " and ".join(named))
-        if len(blocks) == 2 and all(ratios):
-            sentences.append(f"only the ratio of {blocks[0]} to {blocks[1]} is determined; the common factor is kept")
-        elif len(blocks) == 1:
-            sentences.append(f"the data do not determine {blocks[0]}, which is kept")
+            factor = one.common
+            alike = factor is not None and abs(part @ factor) > 0.9 * np.linalg.norm(part) * np.linalg.norm(factor)
+            common.append(one.name if alike else None)
+            names += [label for label, is_clear in zip(one.labels, here, strict=True) if is_clear]
+        kept = "the prior knowledge is kept" if np.all(known[np.abs(direction) > CLEAR]) else "the start is kept"
+        if len(common) == 2 and all(common):
+            sentences.append(
+                f"the data determine only the ratio of {common[0]} to {common[1]}; {kept} for their product"
+            )
+        elif len(names) == 1:
+            sentences.append(f"the data do not determine {names[0]}; {kept}")
         else:
-            sentences.append(f"the data do not determine a combination of {', '.join(blocks)}, which is kept")
+            sentences.append(f"the data do not determine a combination of {', '.join(names)}; {kept}")
     return list(dict.fromkeys(sentences))
 
 
@@ -441,7 +439,8 @@ def _result(
         prior=prior,
         estimate=np.asarray(numbers(jnp.asarray(z))),
         covariance=by_z @ of_z @ by_z.T,
-        undetermined=undetermined(problem, best.information - np.diag(known.astype(float))),
+        undetermined=undetermined(problem, best.information - np.diag(known.astype(float)), by_start),
+        complete=bool(np.min(np.linalg.eigvalsh(best.information)) >= 1.0),
         fits=[fitted(log) for log in logs],
         validation=[fitted(log) for log in others],
         converged=best.converged,

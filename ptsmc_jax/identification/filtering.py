@@ -244,9 +244,7 @@ def _axes(turn: Float[Array, "3"]) -> Float[Array, "3 3"]:
     return jnp.stack([attitude.rotate(q, axis) for axis in jnp.eye(3)], axis=1)
 
 
-def _predicted(
-    model: Model, carry: _Carry, t: Scalar, dt: Scalar, command: Array, due: Array, kind: Kind
-) -> _Carry:
+def _predicted(model: Model, carry: _Carry, t: Scalar, dt: Scalar, command: Array, due: Array, kind: Kind) -> _Carry:
     """Return the filter after an interval, before the readings at its end."""
     plant, actuators = model.plant, model.actuators
     sizes = model.modes.size + (6 if model.spacecraft else carry.x.size - model.modes.size)

@@ -166,7 +166,9 @@ def _model(
     }
     for name, readings in logs[0].readings.items():
         if given[name]:
-            noises[name] = vector(given[name]) * jnp.ones(min(readings.shape[1], 3) if name != "x" else readings.shape[1])
+            noises[name] = vector(given[name]) * jnp.ones(
+                min(readings.shape[1], 3) if name != "x" else readings.shape[1]
+            )
         else:
             noises[name] = vector(np.maximum(np.mean([_roughness(name, log) for log in logs], axis=0), 1e-12))
             estimated.append("state_noise" if name == "x" else f"{name}_noise")
@@ -182,8 +184,8 @@ def _model(
         actuators=actuators,
         delay=vector(devices.delay_periods * (period or 0.0)),
         noises=noises,
-        rate_scale=jnp.ones(3),
-        misalignment=jnp.zeros(3),
+        rate_scale=vector(getattr(devices, "gyro_scale", None) or np.ones(3)),
+        misalignment=vector(np.deg2rad(getattr(devices, "star_tracker_misalignment_deg", None) or np.zeros(3))),
         bias=vector(UNKNOWN_BIAS if with_bias and (nothing or not known_bias) else known_bias),
         bias_walk=vector(getattr(devices, "rate_bias_walk", None) or 0.0),
         walk=walk,
@@ -439,7 +441,14 @@ def _inertia(start: np.ndarray, prior: Any) -> Parameter:
     labels = [f"inertia_{i + 1}{j + 1}" for i, j in PAIRS]
     common = np.linalg.lstsq(factor, np.repeat([0.5, 0.0], 3), rcond=None)[0]
     return Parameter(
-        "inertia", labels, "kg m^2", factor, table is not None, write, lambda model: _entries(model.plant.inertia), common
+        "inertia",
+        labels,
+        "kg m^2",
+        factor,
+        table is not None,
+        write,
+        lambda model: _entries(model.plant.inertia),
+        common,
     )
 
 

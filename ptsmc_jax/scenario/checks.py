@@ -13,6 +13,7 @@ from ptsmc_jax.scenario.values import MOST_STEPS
 from ptsmc_jax.simulation import catalogues
 
 OF_SENSORS = ("star_tracker_misalignment", "gyro_scale", "star_tracker_outage")  # dispersions of the built-in sensors
+SENSOR_ERRORS = ("gyro_scale", "star_tracker_misalignment_deg")  # keys of [hardware]
 SHORTEST_WINDOW = 1e-5  # fraction of t_f, continuous loop: 80 times the resolution of a 32-bit float at t_f
 
 
@@ -86,7 +87,7 @@ def check_sensors(scenario: Scenario) -> None:
     if scenario.sensors is None:
         return
     scenario.need_samples("[sensors]")
-    for key in (*scenario.devices.noises, "star_tracker_every", "star_tracker_period"):
+    for key in (*scenario.devices.noises, *SENSOR_ERRORS, "star_tracker_every", "star_tracker_period"):
         value = getattr(scenario.hardware, key, None)
         if value is not None:
             raise wrong(f"hardware.{key}", value, "absent, because [sensors] defines the measurements")

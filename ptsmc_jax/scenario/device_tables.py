@@ -4,6 +4,7 @@ Start with `Hardware`. A new filter needs its physics in `devices`, a table here
 need a row in `WHEELS`.
 """
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
@@ -11,6 +12,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import msgspec
 import numpy as np
 from msgspec import Meta
+from scipy.spatial.transform import Rotation
 
 from ptsmc_jax import formulas
 from ptsmc_jax.devices import command_filter
@@ -65,6 +67,10 @@ class Actuators(Table, frozen=True):
             "does not predict over it"
         ),
     ] = None
+    actuator_scale: Annotated[
+        Annotated[tuple[Positive, ...], Meta(min_length=1, description="a list of numbers greater than 0")] | None,
+        Meaning("ratio of the true torque of each axis, wheel or input to the torque that the computer knows"),
+    ] = None
     levels: ClassVar[Mapping[str, tuple[str, ...]]] = {}  # by dispersion key: the keys here that set the nominal value
     noises: ClassVar[tuple[str, ...]] = ()  # keys of sensor errors
 
@@ -89,6 +95,12 @@ class Actuators(Table, frozen=True):
         if step is not None and limit is not None and step >= 2.0 * limit and getattr(scenario, "wheels", None) is None:
             allowed = f"less than twice hardware.torque_limit, {limit}: larger ones round every torque to zero"
             raise wrong("hardware.torque_step", step, allowed)
+        wheels = scenario.reaction_wheels
+        channels = scenario.inputs if wheels is None else len(wheels.spin_axes())
+        for key in ("actuator_scale", "actuator_misalignment_deg"):
+            value = getattr(self, key, None)
+            if value is not None and len(value) != channels:
+                raise wrong(f"hardware.{key}", value, f"a list of {channels}, one for each axis, wheel or input")
 
     def noise_of_error(self, scenario: Any) -> tuple[float, float]:
         """Return the noise of the error and of its rate [1/s], 1 sigma per axis and raw sample."""
@@ -106,7 +118,8 @@ class Actuators(Table, frozen=True):
         """Return the actuators; wheels: the part of `devices.reaction_wheels`, or None."""
         values = (self.torque_limit, self.torque_rate_limit, self.torque_lag, self.torque_step)
         limit, rate_limit, lag, step = (None if v is None else vector(v) for v in values)
-        return ActuatorsPart(limit, rate_limit, lag, step, wheels, self.delay_periods)
+        scale = None if self.actuator_scale is None else vector(self.actuator_scale)
+        return ActuatorsPart(limit, rate_limit, lag, step, wheels, self.delay_periods, scale)
 
 
 class Hardware(Actuators, frozen=True):
@@ -149,6 +162,14 @@ class Hardware(Actuators, frozen=True):
             "s",
         ),
     ] = None
+    actuator_misalignment_deg: Annotated[
+        Annotated[tuple[Three, ...], Meta(min_length=1, description="a list of rows of three numbers")] | None,
+        Meaning("rotation vector of each axis, or wheel, from the axis that the computer knows", "deg"),
+    ] = None
+    gyro_scale: Annotated[Three | None, Meaning("ratio of the reading of the gyro to the true rate, by axis")] = None
+    star_tracker_misalignment_deg: Annotated[
+        Three | None, Meaning("rotation vector of the star tracker in the body that the computer does not know", "deg")
+    ] = None
     levels: ClassVar[Mapping[str, tuple[str, ...]]] = {
         "attitude_noise": ("attitude_noise",),
         "rate_noise": ("rate_noise", "rate_noise_density"),
@@ -187,6 +208,20 @@ class Hardware(Actuators, frozen=True):
             allowed = f'{one}, or [filter] with kind = "steady_state"'
             reason = f", but without a filter the law needs a sample every period; allowed is {allowed}"
             raise errors.refused(f"hardware.star_tracker_{key}", value, reason, allowed)
+        for key in ("gyro_scale", "star_tracker_misalignment_deg"):
+            if getattr(self, key) is not None and not scenario.measured:
+                raise ScenarioError(
+                    f"hardware.{key} needs noise of the sensors: without it the law sees the true state"
+                )
+
+    def actuators(self, wheels: Any) -> Any:
+        """Return the actuators; wheels: the part of `devices.reaction_wheels`, or None."""
+        made = super().actuators(wheels)
+        if self.actuator_misalignment_deg is None:
+            return made
+        turns = Rotation.from_rotvec(np.deg2rad(self.actuator_misalignment_deg))
+        axes = np.eye(3) if wheels is None else np.asarray(wheels.axes)
+        return dataclasses.replace(made, directions=vector(turns.apply(axes.T).T))
 
     def noise_of_error(self, scenario: Any) -> tuple[float, float]:
         """Return half of the star tracker noise [-] and half of the gyro noise [1/s].
@@ -200,7 +235,7 @@ class Hardware(Actuators, frozen=True):
         """Return star tracker, gyro and filter."""
         if not scenario.measured:
             return PerfectSensors()
-        period, walk = scenario.loop.period, self.rate_bias_walk
+        period, walk, turn = scenario.loop.period, self.rate_bias_walk, self.star_tracker_misalignment_deg
         return Sensors(
             vector(self.attitude_noise or 0.0),
             vector(self.gyro_noise(period)),
@@ -209,6 +244,8 @@ class Hardware(Actuators, frozen=True):
             scenario.estimator.build(scenario),
             self.periods_apart(period) or 1,
             own_times=self.star_times(period),
+            rate_scale=None if self.gyro_scale is None else vector(self.gyro_scale),
+            misalignment=None if turn is None else vector(np.deg2rad(turn)),
         )
 
     def star_times(self, period: float) -> Any:

@@ -215,6 +215,28 @@ class RelativeInertia(Table, frozen=True):
         return inertias.RelativeInertia(*map(vector, (moments, axes, self.std, np.deg2rad(self.axes_deg))))
 
 
+class CorrelatedInertia(Table, frozen=True):
+    """Correlated errors of the true inertia, normal in coordinates that every body has, as `ptsmc identify` writes them.
+
+    The coordinates are those of `dispersions.inertias.CorrelatedInertia`, and zeros give the nominal inertia.
+    """
+
+    kind: Literal["correlated"] = "correlated"
+    factor: Annotated[
+        Annotated[
+            tuple[Annotated[tuple[float, ...], Meta(min_length=6, max_length=6)], ...],
+            Meta(min_length=6, max_length=6, description="six rows of six numbers"),
+        ],
+        Meaning("a factor A of the covariance A A' of the coordinates; needed"),
+    ] = ((0.0,) * 6,) * 6
+
+    def build(self, parts: Any, count: int) -> Any:
+        """Return `dispersions.inertias.CorrelatedInertia` about the inertia of the true body."""
+        return inertias.CorrelatedInertia(
+            vector(inertias.pseudo_root(np.asarray(parts.plant.inertia))), vector(self.factor)
+        )
+
+
 class UniformPhase(Table, frozen=True):
     """Uniform over the circle."""
 
@@ -299,7 +321,10 @@ _ANY: dict[str, tuple[str, tuple[Any, ...]]] = {
 _SPACECRAFT: dict[str, tuple[str, tuple[Any, ...]]] = {
     "attitude": ("of the body at t = 0", (AxisAngle, UniformAttitude, NormalAttitude)),
     "rate": ("of the body at t = 0", (NormalRate, UniformRate)),
-    "inertia": ("inertia of the true body about true_inertia; the law uses spacecraft.inertia", (RelativeInertia,)),
+    "inertia": (
+        "inertia of the true body about true_inertia; the law uses spacecraft.inertia",
+        (RelativeInertia, CorrelatedInertia),
+    ),
     "reference": ("a rotation of the whole reference", (NormalAttitude, UniformAttitude, AxisAngle)),
     **_DISTURBANCE,
     "attitude_noise": ("factor on hardware.attitude_noise", FACTORS),

@@ -33,9 +33,9 @@ class Telemetry(Table, frozen=True):
         Column | None,
         Meaning("age of the attitude in s" + NOT_THERE.format("measured_age")),
     ] = None
-    rate: Annotated[
-        Axes | None, Meaning("body rate of the gyro" + NOT_THERE.format("measured_w1 to measured_w3"))
-    ] = None
+    rate: Annotated[Axes | None, Meaning("body rate of the gyro" + NOT_THERE.format("measured_w1 to measured_w3"))] = (
+        None
+    )
     rate_unit: Annotated[Literal["rad/s", "deg/s", "deg/h"], Meaning("unit of the rate columns")] = "rad/s"
     torque: Annotated[
         Axes | None,

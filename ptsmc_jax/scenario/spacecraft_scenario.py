@@ -124,7 +124,7 @@ class Flexible(Table, frozen=True):
         rows, moments = (getattr(drawn, key, None) for key in ("mode_coupling", "inertia"))
         longest = smallest = 1.0
         said, body = "", ""
-        if moments is not None and moments.std > 0.0:
+        if getattr(moments, "std", 0.0) > 0.0:
             smallest = 1.0 - moments.farthest * moments.std
             said, body = f"dispersion.inertia.std is {moments.std}", f", and moments {smallest:.6g} times as large"
         if rows is not None and not rows.nothing:

@@ -11,7 +11,7 @@ from cyclopts import App, CycloptsError, Parameter
 from cyclopts.exceptions import UnusedCliTokensError
 
 import ptsmc_jax
-from tuning.cli import INTERRUPTED, campaign_commands, flight_commands, searches, writing_commands
+from tuning.cli import INTERRUPTED, campaign_commands, flight_commands, identify_command, searches, writing_commands
 from tuning.cli.options import (
     USUAL,
     Against,
@@ -330,7 +330,8 @@ def completion(
     return 0
 
 
-for _command in (*writing_commands.COMMANDS, *campaign_commands.COMMANDS, *flight_commands.COMMANDS):
+_MODULES = (writing_commands, campaign_commands, flight_commands, identify_command)
+for _command in (one for module in _MODULES for one in module.COMMANDS):
     app.command(_command)
 
 

@@ -26,6 +26,7 @@ from tuning.output import (
     campaign_report,
     compare_report,
     front_report,
+    identify_report,
     map_report,
     margins_report,
     page_captions,
@@ -204,6 +205,7 @@ REPORTS: dict[str, Callable[[Result], Report]] = {
     "compare": lambda result: compare_report.of(summaries.read(summaries.Compare, result.summary)),
     "montecarlo": _montecarlo,
     "map": _map,
+    "identify": lambda result: identify_report.of(summaries.read(summaries.Identified, result.summary)),
     "margins": lambda result: margins_report.of(summaries.read(summaries.Margins, result.summary)),
     "reproduce": lambda result: paper_report.of(summaries.read(summaries.Paper, result.summary)),
 }

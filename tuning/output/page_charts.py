@@ -45,6 +45,9 @@ def read(path: Path) -> dict[str, np.ndarray]:
     return dict(zip(head, values.T, strict=True))
 
 
+LOGGED = ("measured", "sent")  # columns for `ptsmc identify`, which have gaps
+
+
 def history(columns: Mapping[str, np.ndarray], spacecraft: bool, marks: Mapping[str, float]) -> Chart:
     """The columns of a `trajectory.csv` over time, one panel each for state, estimate, input and sliding variable.
 
@@ -54,7 +57,7 @@ def history(columns: Mapping[str, np.ndarray], spacecraft: bool, marks: Mapping[
     kept = np.unique(np.linspace(0, t.size - 1, min(POINTS, t.size)).round().astype(int))
     blocks: dict[str, list[str]] = {}
     for name in columns:
-        if name != "t":
+        if name != "t" and not name.startswith(LOGGED):
             blocks.setdefault(name.rstrip("0123456789"), []).append(name)
     above = {"yref": "paper", "yanchor": "bottom", "showarrow": False}
     notes = [{**above, "x": at, "y": 1.0, "text": what} for what, at in marks.items()]

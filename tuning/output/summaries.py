@@ -355,6 +355,54 @@ class Margins(msgspec.Struct, frozen=True, kw_only=True):
     limit_cycle: LimitCycle | None = None
 
 
+class Estimate(msgspec.Struct, frozen=True):
+    """An estimated number of `ptsmc identify`."""
+
+    parameter: str
+    estimate: float
+    std: float
+    lower: float
+    upper: float
+    start: float
+    prior_std: Number
+    unit: str
+
+
+class LogFit(msgspec.Struct, frozen=True):
+    """How well the identified model predicts a log."""
+
+    log: str
+    rows: int
+    duration: float
+    readings: int
+    outliers: int
+    mean_square: float
+    white: bool
+    prediction_rms: Numbers
+    largest_autocorrelation: Numbers
+
+
+class GyroBias(msgspec.Struct, frozen=True):
+    """The gyro bias at the end of a log [rad/s]."""
+
+    log: str
+    estimate: list[float]
+    std: list[float]
+
+
+class Identified(msgspec.Struct, frozen=True, kw_only=True):
+    """The summary of `ptsmc identify`."""
+
+    status: str
+    verdict: list[str]
+    converged: bool
+    parameters: list[Estimate]
+    undetermined: list[str]
+    gyro_bias: list[GyroBias]
+    logs: list[LogFit]
+    validation: list[LogFit]
+
+
 class Claim(msgspec.Struct, frozen=True):
     """A claim of the paper."""
 

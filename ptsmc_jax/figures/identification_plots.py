@@ -1,0 +1,103 @@
+"""Figures of an identification: measured and predicted signals, innovations, their autocorrelation, estimates."""
+
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from ptsmc_jax.figures import style
+
+POINTS = 4000  # of a line
+
+
+def _panels(count: int, width: float = 8.0) -> tuple[Figure, Any]:
+    figure = Figure(figsize=(width, 1.0 + 1.5 * count), layout="constrained")
+    return figure, np.ravel(figure.subplots(count, 1, sharex=True))
+
+
+@style.styled
+def signals(t: np.ndarray, panels: list[tuple[str, np.ndarray, np.ndarray]]) -> Figure:
+    """Draw measured and predicted signals over time.
+
+    Args:
+        t: times (rows,) [s].
+        panels: label, measured and predicted values (rows, components) of each signal.
+    """
+    figure, axes = _panels(len(panels))
+    kept = np.unique(np.linspace(0, len(t) - 1, min(POINTS, len(t))).round().astype(int))
+    for one, (label, measured, predicted) in zip(axes, panels, strict=True):
+        for k, (colour, _) in zip(range(measured.shape[1]), style.STYLES, strict=False):
+            one.plot(t[kept], measured[kept, k], ".", ms=2, color=colour, alpha=0.4)
+            one.plot(t[kept], predicted[kept, k], "-", lw=0.9, color=colour)
+        one.set_ylabel(label)
+    axes[0].set_title("Measured (dots) and predicted (lines)", loc="left")
+    axes[-1].set_xlabel(style.TIME)
+    return figure
+
+
+@style.styled
+def innovations(t: np.ndarray, names: list[str], values: np.ndarray, sigma: np.ndarray) -> Figure:
+    """Draw the innovations of each component with their 3 sigma bands.
+
+    Args:
+        t: times (rows,) [s].
+        names: of the components.
+        values: innovations (rows, components), NaN without a reading.
+        sigma: their 1 sigma (rows, components).
+    """
+    figure, axes = _panels(len(names))
+    kept = np.unique(np.linspace(0, len(t) - 1, min(POINTS, len(t))).round().astype(int))
+    for k, (one, name) in enumerate(zip(axes, names, strict=True)):
+        band = np.where(np.isfinite(values[:, k]), 3.0 * sigma[:, k], np.nan)
+        there = kept[np.isfinite(band[kept])]
+        one.fill_between(t[there], -band[there], band[there], color="0.9")
+        one.plot(t[there], values[there, k], ".", ms=2, color=style.STYLES[0][0])
+        one.set_ylabel(name)
+    axes[0].set_title("Innovations and their 3 sigma bands", loc="left")
+    axes[-1].set_xlabel(style.TIME)
+    return figure
+
+
+@style.styled
+def autocorrelation(names: list[str], values: np.ndarray, counts: np.ndarray) -> Figure:
+    """Draw the autocorrelation of the whitened innovations with its 95 % band.
+
+    Args:
+        names: of the components.
+        values: (lags, components) [-].
+        counts: number of readings of each component.
+    """
+    figure, axes = _panels(len(names))
+    lags = np.arange(1, len(values) + 1)
+    for k, (one, name) in enumerate(zip(axes, names, strict=True)):
+        reach = 1.96 / np.sqrt(max(counts[k], 1))
+        one.axhspan(-reach, reach, color="0.9")
+        one.vlines(lags, 0.0, values[:, k], color=style.STYLES[0][0])
+        one.set_ylabel(name)
+    axes[0].set_title("Autocorrelation of the innovations and its 95 % band", loc="left")
+    axes[-1].set_xlabel("lag [readings]")
+    return figure
+
+
+@style.styled
+def estimates(table: Any) -> Figure:
+    """Draw the change of each number, relative to the largest number of its parameter, with its 95 % interval.
+
+    The prior interval is drawn beside it in grey. `table` is that of `Identification.table`.
+    """
+    rows = list(table.iter_rows(named=True))
+    figure = Figure(figsize=(8.0, 1.2 + 0.4 * len(rows)), layout="constrained")
+    axes = figure.subplots()
+    for k, row in enumerate(rows):
+        alike = [
+            one for one in rows if one["parameter"].rstrip("0123456789ab") == row["parameter"].rstrip("0123456789ab")
+        ]
+        size = max(max(abs(one["start"]), abs(one["estimate"])) for one in alike) or 1.0
+        change, reach = 100.0 * (row["estimate"] - row["start"]) / size, 196.0 * row["std"] / size
+        if np.isfinite(row["prior_std"]):
+            axes.errorbar(0.0, k + 0.2, xerr=196.0 * row["prior_std"] / size, color="0.6", capsize=3, fmt="o", ms=3)
+        axes.errorbar(change, k, xerr=reach, color=style.STYLES[0][0], capsize=3, fmt="o", ms=4)
+    axes.set_yticks(range(len(rows)), [row["parameter"] for row in rows])
+    axes.invert_yaxis()
+    axes.set_xlabel("change in % of the largest number of the parameter, with the 95 % interval; grey: prior knowledge")
+    return figure

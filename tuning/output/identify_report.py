@@ -1,0 +1,51 @@
+"""The report of an identification."""
+
+from tuning.output.formats import digits
+from tuning.output.report import Report, Section, Table
+from tuning.output.summaries import Identified, LogFit
+
+
+def of(summary: Identified) -> Report:
+    """Return the report of `ptsmc identify`."""
+    good = summary.status == "identified"
+    headline = "The model explains the telemetry" if good else "The model is DOUBTFUL"
+    sections = [Section("Estimates", [estimates(summary)]), Section("Logs", [logs(summary)])]
+    return Report(headline, "good" if good else "bad", summary.verdict, sections)
+
+
+def estimates(summary: Identified) -> Table:
+    """Return the table of the estimated numbers."""
+    rows = [
+        (one.parameter, f"{one.estimate:.6g}", f"{one.std:.2g}", f"{one.lower:.5g} to {one.upper:.5g}",
+         f"{one.start:.6g}", digits(one.prior_std, ".2g", "none"), one.unit or "-")
+        for one in summary.parameters
+    ]  # fmt: skip
+    for bias in summary.gyro_bias:
+        for axis, value, std in zip("xyz", bias.estimate, bias.std, strict=True):
+            name = f"gyro bias {axis} at the end of {bias.log}"
+            interval = f"{value - 1.96 * std:.5g} to {value + 1.96 * std:.5g}"
+            rows.append((name, f"{value:.6g}", f"{std:.2g}", interval, "-", "-", "rad/s"))
+    head = ("parameter", "estimate", "1 sigma", "95 % interval", "scenario", "prior 1 sigma", "unit")
+    return Table(head, rows)
+
+
+def logs(summary: Identified) -> Table:
+    """Return the table of the logs and of their prediction errors."""
+
+    def row(one: LogFit, use: str) -> tuple[str, ...]:
+        largest = max((abs(value or 0.0) for value in one.largest_autocorrelation.values()), default=0.0)
+        numbers = (
+            f"{one.duration:.4g}",
+            str(one.readings),
+            str(one.outliers),
+            f"{one.mean_square:.4g}",
+            f"{largest:.2g}",
+        )
+        return one.log, use, *numbers, "yes" if one.white else "NO"
+
+    rows = [row(one, "estimation") for one in summary.logs] + [row(one, "validation") for one in summary.validation]
+    head = ("log", "use", "duration [s]", "readings", "outliers", "mean square", "autocorrelation", "white")
+    return Table(
+        head, rows, "Mean square of the innovations over their variance, and largest autocorrelation; white innovations "
+        "have a mean square of 1 and no autocorrelation.",
+    )  # fmt: skip
