@@ -247,7 +247,6 @@ def _axes(turn: Float[Array, "3"]) -> Float[Array, "3 3"]:
 def _predicted(model: Model, carry: _Carry, t: Scalar, dt: Scalar, command: Array, due: Array, kind: Kind) -> _Carry:
     """Return the filter after an interval, before the readings at its end."""
     plant, actuators = model.plant, model.actuators
-    sizes = model.modes.size + (6 if model.spacecraft else carry.x.size - model.modes.size)
     if kind.wheel_inertia is not None:  # the momentum is measured
         scale = 1.0 if actuators.scale is None else actuators.scale
         drive = Drive(None, due, scale * kind.wheel_inertia * command, jnp.asarray(False))
@@ -257,30 +256,46 @@ def _predicted(model: Model, carry: _Carry, t: Scalar, dt: Scalar, command: Arra
         drive = drive._replace(c=due) if kind.by_channel else drive
     torque = actuators.over(drive, jnp.zeros_like(dt), dt)
 
-    def moved(x: Any, walk: Array) -> Any:
-        def rate(time: Scalar, y: Any) -> Any:
-            d = model.disturbance(time, y)
-            d = d + walk if walk.size else d
-            return plant.rate(time, y, torque.at(time - t, plant.velocity(y)), d)
+    def rate(time: Scalar, y: Any, walk: Array) -> Any:
+        d = model.disturbance(time, y)
+        return plant.rate(time, y, torque.at(time - t, plant.velocity(y)), d + walk if walk.size else d)
 
-        return plant.normalise(integrators.rk4(rate, t, x, dt, rolled=True))
-
-    after = moved(carry.x, carry.walk)
-
-    def change(by: Array) -> Array:
-        return plant.local_coordinates(after, moved(plant.retract(carry.x, by[:sizes]), carry.walk + by[sizes:]))
-
-    by_state = jax.jacfwd(change)(jnp.zeros(sizes + carry.walk.size))
+    after = integrators.rk4(lambda time, y: rate(time, y, carry.walk), t, carry.x, dt, rolled=True)
+    after = plant.normalise(after)
     m, b = carry.walk.size, carry.bias.size
-    f = jnp.eye(sizes + b + m)
-    f = f.at[:sizes, :sizes].set(by_state[:, :sizes])
-    f = f.at[:sizes, sizes + b :].set(by_state[:, sizes:]) if m else f
+    sizes = carry.p.shape[0] - b - m
+    moved = _transition(plant, rate, carry, after, t, dt)
+    f = jnp.eye(sizes + b + m).at[:sizes, :sizes].set(moved[:sizes, :sizes])
+    f = f.at[:sizes, sizes + b :].set(moved[:sizes, sizes:]) if m else f
     # the steps of the random walks come at the start of the interval, as in a simulation
     noise = [jnp.zeros(sizes), model.bias_walk**2 * dt * jnp.ones(b)]
     noise += [jnp.broadcast_to(model.walk**2 * dt, (m,))] if m else []
     p = f @ (carry.p + jnp.diag(jnp.concatenate(noise))) @ f.T
     ended = carry.actuators if kind.wheel_inertia is not None else actuators.end(carry.actuators, drive, None, dt)
     return carry._replace(x=after, p=p, actuators=ended)
+
+
+def _transition(plant: Any, rate: Any, carry: _Carry, after: Any, t: Scalar, dt: Scalar) -> Array:
+    """Return the derivatives of the state's change over an interval by the state and the random-walk torque.
+
+    They are e^(A dt) to fourth order, with the derivatives A of the local coordinates' rate in the middle of the
+    interval. The last rows, of the constant torque, are those of the identity.
+    """
+    middle = plant.retract(carry.x, 0.5 * plant.local_coordinates(carry.x, after))
+    time, m = t + dt / 2, carry.walk.size
+    own = rate(time, middle, carry.walk)
+    n = carry.p.shape[0] - carry.bias.size - m
+
+    def local_rate(by: Array) -> Array:
+        near = plant.retract(middle, by[:n])
+        rates = own, rate(time, near, carry.walk + by[n:])
+        return jax.jvp(plant.local_coordinates, (middle, near), rates)[1]
+
+    a = jnp.zeros((n + m, n + m)).at[:n].set(jax.jacfwd(local_rate)(jnp.zeros(n + m)))
+    one = power = jnp.eye(n + m)
+    for k in (4, 3, 2, 1):
+        power = one + (dt / k) * a @ power
+    return power
 
 
 def _corrected(
