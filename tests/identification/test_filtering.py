@@ -1,0 +1,129 @@
+"""The filter of `ptsmc identify` against independent filters, closed forms and finite differences."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import polars as pl
+import pytest
+from scipy.linalg import expm
+
+from ptsmc_jax import scenario
+from ptsmc_jax.identification import estimation, filtering, parameters, telemetry
+from ptsmc_jax.identification.filtering import Kind
+
+NOISE, WALK = (2e-3, 5e-3), 0.02
+
+
+def chain(free, **identify):
+    return scenario.from_tables(
+        {
+            "plant": {"kind": "chain", "order": 2, "x0": [1.0, 0.0]},
+            "controller": {"t_f": 5.0},
+            "disturbance": {"kind": "none"},
+            "loop": {"mode": "sampled", "period": 0.1},
+            "hardware": {"state_noise": list(NOISE)},
+            "identify": {"free": free, "prior": "none", "outliers": 0.0, **identify},
+        }
+    )
+
+
+def chain_log(rows=60, bias=0.3, walk=0.0, scale=1.0):
+    """A log of a double integrator at irregular times with gaps, and its exact model."""
+    rng = np.random.default_rng(3)
+    dt = rng.uniform(0.03, 0.12, rows)
+    t = np.cumsum(dt) - dt[0]
+    u = np.sin(1.3 * t) + 0.2 * rng.standard_normal(rows)
+    x, d, states = np.array([1.0, -0.4]), bias, []
+    for k in range(rows):
+        states.append(x + np.asarray(NOISE) * rng.standard_normal(2))
+        if k + 1 < rows:
+            h = t[k + 1] - t[k]
+            d = d + walk * np.sqrt(h) * rng.standard_normal()
+            x = np.array([[1.0, h], [0.0, 1.0]]) @ x + np.array([h**2 / 2, h]) * (scale * u[k] + d)
+    y = np.stack(states)
+    y[5:8, 0], y[20:22] = np.nan, np.nan
+    columns = {"t": t, "measured_x1": y[:, 0], "measured_x2": y[:, 1], "sent1": u}
+    return pl.DataFrame(columns), t, u, y
+
+
+def prepared(loaded, frame):
+    log = telemetry.measurements(loaded, frame)
+    problem = parameters.build(loaded, [log])
+    return problem, (estimation.rows(problem, log), Kind.of(log))
+
+
+def test_innovations_are_those_of_an_independent_kalman_filter():
+    frame, t, u, y = chain_log()
+    problem, (rows, kind) = prepared(chain(["actuator_scale"], torque_walk=WALK), frame)
+    found, track = jax.jit(lambda rows: filtering.innovations(problem.model, rows, kind))(
+        jax.tree.map(jnp.asarray, rows)
+    )
+    # exact discretisation by the matrix exponential, joint update of both readings, covariance form of Joseph
+    whitened = np.where(found.accepted, found.value / np.sqrt(found.variance), np.nan)[rows.source[1:] >= 0]
+    z, p = np.append(y[0], 0.0), np.diag([*np.square(NOISE), 0.0])
+    expected, ends = np.full((len(t) - 1, 2), np.nan), np.flatnonzero(rows.source[1:] >= 0)
+    steps = np.append(rows.t, np.nan)
+    row = 0
+    for k in range(1, len(t)):
+        while rows.source[row + 1] != k:
+            row += 1
+        last = next(j for j in range(row, -1, -1) if rows.source[j] == k - 1)
+        for j in range(last, row + 1):
+            h = steps[j + 1] - steps[j]
+            f = expm(h * np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]]))
+            g = expm(h * np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]]))[:, 2]
+            p = p + np.diag([0.0, 0.0, WALK**2 * h])
+            z, p = f @ z + np.append(g[:2], 0.0) * u[k - 1], f @ p @ f.T
+        there = ~np.isnan(y[k])
+        c, r = np.eye(2, 3)[there], np.diag(np.square(NOISE))[there][:, there]
+        if there.any():
+            s = c @ p @ c.T + r
+            error = y[k, there] - c @ z
+            expected[k - 1, there] = np.linalg.solve(np.linalg.cholesky(s), error)
+            gain = p @ c.T @ np.linalg.inv(s)
+            keep = np.eye(3) - gain @ c
+            z, p = z + gain @ error, keep @ p @ keep.T + gain @ r @ gain.T
+    # rounding of 60 updates; the squares of the innovations add up to about 100
+    np.testing.assert_allclose(whitened, expected, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(np.asarray(track.covariance)[ends[-1]], p, rtol=1e-8, atol=1e-14)
+
+
+def test_a_linear_gaussian_estimate_is_that_of_generalised_least_squares():
+    frame, t, u, y = chain_log()
+    found = estimation.identify(chain(["disturbance_bias"]), frame)
+    # unknown initial state and constant disturbance: a linear regression with known noise
+    design, forced, state = [], [], np.zeros(2)
+    response = np.eye(2, 3)
+    for k in range(len(t)):
+        if k:
+            h = t[k] - t[k - 1]
+            f, b = np.array([[1.0, h], [0.0, 1.0]]), np.array([h**2 / 2, h])
+            response = f @ response + np.outer(b, [0.0, 0.0, 1.0])
+            state = f @ state + b * u[k - 1]
+        design.append(response / np.asarray(NOISE)[:, None])
+        forced.append((y[k] - state) / NOISE)
+    a, b = np.concatenate(design), np.concatenate(forced)
+    a, b = a[np.isfinite(b)], b[np.isfinite(b)]
+    estimate, covariance = np.linalg.lstsq(a, b, rcond=None)[0], np.linalg.inv(a.T @ a)
+    np.testing.assert_allclose(found.estimate, estimate[2:], rtol=1e-6)  # the search stops at 1e-3 sigma
+    np.testing.assert_allclose(found.std, np.sqrt(covariance[2, 2]), rtol=1e-6)
+    assert found.good
+
+
+def test_the_gradient_of_the_likelihood_agrees_with_finite_differences():
+    frame, *_ = chain_log(scale=1.1)
+    names = ["actuator_scale", "state_noise", "disturbance_bias", "delay"]
+    problem, log = prepared(chain(names, torque_walk=WALK), frame)
+    search = estimation.Search(problem, [log], np.inf, lambda text: None)
+    z = 0.3 * np.random.default_rng(1).standard_normal(problem.size)
+    z[-1] = 0.37  # a delay between two nodes of the command, where its derivative is continuous
+    value, gradient, information, _ = search.derivatives(z, search.logs)
+    assert value == pytest.approx(search.value(z, search.logs), rel=1e-12)
+    step = 1e-5
+    differences = [
+        (search.value(z + step * one, search.logs) - search.value(z - step * one, search.logs)) / (2.0 * step)
+        for one in np.eye(problem.size)
+    ]
+    # the truncation error of the differences is about step^2 = 1e-10, their rounding error 1e-16 * value / step
+    np.testing.assert_allclose(gradient, differences, rtol=1e-6, atol=1e-6 * np.max(np.abs(gradient)))
+    assert np.linalg.eigvalsh(information)[0] > 0.0

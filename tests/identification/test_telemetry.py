@@ -1,0 +1,163 @@
+"""Reading telemetry: units, orders, gaps, times, and one sentence for each broken table."""
+
+import numpy as np
+import polars as pl
+import pytest
+from scipy.spatial.transform import Rotation
+
+from ptsmc_jax import scenario
+from ptsmc_jax.campaigns.store import RefusedError
+from ptsmc_jax.identification import telemetry
+from ptsmc_jax.scenario.errors import ScenarioError
+
+ROWS = 40
+T = 0.5 * np.arange(ROWS)
+RATE = np.stack([0.05 * np.sin(0.4 * T), 0.04 * np.cos(0.3 * T), 0.03 + 0.0 * T], axis=1)
+
+
+def attitudes():
+    turned = [Rotation.from_rotvec([0.1, -0.2, 0.3])]
+    for k in range(ROWS - 1):
+        fine = np.linspace(T[k], T[k + 1], 20)
+        rates = np.stack([0.05 * np.sin(0.4 * fine), 0.04 * np.cos(0.3 * fine), 0.03 + 0.0 * fine], axis=1)
+        last = turned[-1]
+        for rate in rates[:-1]:
+            last = last * Rotation.from_rotvec(rate * (fine[1] - fine[0]))
+        turned.append(last)
+    return np.stack([one.as_quat() for one in turned])
+
+
+Q = attitudes()
+
+
+def frame(**changes):
+    columns = {"t": T}
+    columns |= {f"measured_q{k + 1}": Q[:, k] for k in range(4)}
+    columns |= {f"measured_w{k + 1}": RATE[:, k] for k in range(3)}
+    columns |= {f"sent{k + 1}": 0.01 * np.cos(T + k) for k in range(3)}
+    return pl.DataFrame({name: value for name, value in {**columns, **changes}.items() if value is not None})
+
+
+def loaded(**table):
+    wheels = {} if "wheel_speed" not in table and "wheel_torque" not in table else {"wheels": {"kind": "axes"}}
+    sampled = {"loop": {"mode": "sampled"}, **wheels}
+    return scenario.from_tables({**sampled, **({"telemetry": table} if table else {})})
+
+
+def with_value(column, row, value):
+    values = list(frame()[column])
+    values[row] = value
+    return frame(**{column: pl.Series(values, dtype=pl.String if isinstance(value, str) else pl.Float64, strict=False)})
+
+
+def test_orders_signs_units_and_blanks_give_the_same_log():
+    plain = telemetry.measurements(loaded(), frame())
+    signs = np.where(np.arange(ROWS) % 3 == 0, -1.0, 1.0)
+    other = frame(
+        **{f"measured_q{k + 1}": (signs[:, None] * np.roll(Q, 1, axis=1) * [1.0, -1.0, -1.0, -1.0])[:, k] for k in range(4)},
+        **{f"measured_w{k + 1}": np.rad2deg(RATE[:, k]) for k in range(3)},
+        **{f"sent{k + 1}": 1e3 * frame()[f"sent{k + 1}"].to_numpy() for k in range(3)},
+        t=[f"2026-03-01T12:00:{time:09.6f}Z" for time in T],
+    )
+    table = {"order": "wxyz", "rotation": "inertial_to_body", "rate_unit": "deg/s", "torque_unit": "mN m"}
+    again = telemetry.measurements(loaded(**table), other)
+    np.testing.assert_allclose(again.t, plain.t, atol=1e-6)
+    np.testing.assert_allclose(again.command, plain.command, rtol=1e-12)
+    np.testing.assert_allclose(again.readings["rate"], plain.readings["rate"], rtol=1e-12)
+    sign = np.sign(again.readings["attitude"][0, 3] * plain.readings["attitude"][0, 3])
+    np.testing.assert_allclose(sign * again.readings["attitude"], plain.readings["attitude"], atol=1e-12)
+
+
+def test_blank_commands_hold_and_blank_readings_are_missing():
+    q, u = [list(Q[:, k]) for k in range(4)], list(0.01 * np.cos(T))
+    u[3] = None
+    for column in q:
+        column[1], column[2] = None, float("nan")
+    columns = {f"measured_q{k + 1}": pl.Series(q[k], dtype=pl.Float64) for k in range(4)}
+    log = telemetry.measurements(loaded(), frame(**columns, sent1=pl.Series(u, dtype=pl.Float64)))
+    assert np.isnan(log.readings["attitude"][1:3]).all()
+    assert log.command[3, 0] == log.command[2, 0]
+
+
+def test_an_attitude_with_an_age_gets_a_row_of_its_own():
+    log = telemetry.measurements(loaded(), frame(measured_age=np.full(ROWS, 0.2)))
+    assert log.t[0] == 0.0
+    there = ~np.isnan(log.readings["attitude"][:, 0])
+    np.testing.assert_allclose(np.diff(log.t[there]), 0.5, atol=1e-12)
+    rates = ~np.isnan(log.readings["rate"][:, 0])
+    assert not np.any(there & rates)
+    np.testing.assert_allclose(log.t[rates][0] - log.t[there][0], 0.2, atol=1e-12)
+
+
+def test_wheel_speeds_in_rpm():
+    speeds = {f"n{k}": 100.0 * np.sin(0.1 * T + k) for k in range(3)}
+    table = {"wheel_speed": ["n0", "n1", "n2"], "speed_unit": "rpm", "wheel_inertia": 1e-4}
+    log = telemetry.measurements(loaded(**table), frame(**speeds))
+    assert log.wheel_inertia == 1e-4
+    np.testing.assert_allclose(log.command[:, 0], speeds["n0"] * np.pi / 30.0)
+
+
+BROKEN = [
+    ({}, frame()[:5], "has 5 rows, but must have at least"),
+    ({}, frame(t=None), "has no column t"),
+    ({"time": "seconds"}, frame(), "has no column seconds"),
+    ({"attitude": ["a", "b", "c", "d"]}, frame(), "has no column a"),
+    ({"rate": ["measured_w1", "measured_w2", "gyro"]}, frame(), "has no column gyro"),
+    ({}, frame(sent2=None), "has no column sent2"),
+    ({}, frame(measured_q1=None, measured_w1=None), "has no attitude and no rate"),
+    ({}, with_value("t", 7, None), "has t empty in row 7"),
+    ({}, with_value("t", 7, "noon"), "has t noon in row 7, but must have a number of seconds, or a date"),
+    ({}, with_value("t", 7, T[6]), "in row 7, but must have a time after that of row 6"),
+    ({}, with_value("t", 7, 0.1), "has t 0.1 in row 7, but must have a time after"),
+    ({}, with_value("measured_q2", 9, 0.9), "in row 9, but must have a unit quaternion"),
+    ({}, with_value("measured_q2", 9, None), "has measured_q2 empty in row 9, but must have a number there"),
+    ({}, with_value("measured_w3", 4, None), "has measured_w3 empty in row 4"),
+    ({}, with_value("measured_w3", 4, "fast"), "has measured_w3 fast in row 4, but must have a finite number"),
+    ({}, with_value("measured_w3", 4, np.inf), "in row 4, but must have a finite number"),
+    ({}, with_value("sent1", 0, None), "has sent1 empty in row 0, but must have a number in the first row"),
+    ({"rate_unit": "deg/s"}, frame(), "has rates that do not fit its attitudes"),
+    ({"order": "wxyz"}, frame(), "has rates that do not fit its attitudes"),
+    ({"rotation": "inertial_to_body"}, frame(), "has rates that do not fit its attitudes"),
+    ({"wheel_torque": ["sent1", "sent2"]}, frame(), "telemetry.wheel_torque has 2 columns, but must have 3"),
+    (
+        {"wheel_speed": ["sent1", "sent2", "n"], "wheel_inertia": 1.0},
+        frame(n=pl.Series([None] * ROWS, dtype=pl.Float64)),
+        "has no number in the column n",
+    ),
+    ({}, frame(measured_age=np.full(ROWS, -1.0)), "has measured_age -1.0 in row 0, but must have an age of at least 0"),
+]
+
+
+@pytest.mark.parametrize(("table", "rows", "words"), BROKEN, ids=[words[:40] for _, _, words in BROKEN])
+def test_a_broken_table_is_refused_in_one_sentence_with_row_and_column(table, rows, words):
+    with pytest.raises(RefusedError) as refused:
+        telemetry.measurements(loaded(**table), rows)
+    assert words in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ({"torque": ["a", "b", "c"], "wheel_torque": ["d", "e", "f"]}, "has torque and wheel_torque"),
+        ({"wheel_speed": ["a", "b", "c"]}, "telemetry.wheel_inertia is absent"),
+        ({"rate_unit": "rpm"}, "telemetry.rate_unit is"),
+        ({"attitude": ["a", "b"]}, "telemetry.attitude is"),
+        ({"attitud": ["a"]}, "telemetry.attitud is not a known key"),
+    ],
+)
+def test_a_contradictory_table_is_a_configuration_error(table, words):
+    with pytest.raises(ScenarioError, match=words.replace("[", r"\[")):
+        scenario.from_tables({"loop": {"mode": "sampled"}, "wheels": {"kind": "axes"}, "telemetry": table})
+
+
+def test_files(tmp_path):
+    frame().write_csv(tmp_path / "log.csv")
+    frame().write_parquet(tmp_path / "log.parquet")
+    both = [telemetry.measurements(loaded(), telemetry.read(tmp_path / f"log.{end}")) for end in ("csv", "parquet")]
+    np.testing.assert_allclose(both[0].readings["attitude"], both[1].readings["attitude"], rtol=1e-12)
+    (tmp_path / "log.txt").write_text("t\n1\n")
+    (tmp_path / "twice.csv").write_text("t,t\n1,2\n")
+    for name in ("log.txt", "absent.csv", "twice.csv"):
+        with pytest.raises(RefusedError, match="the log"):
+            telemetry.read(tmp_path / name)
