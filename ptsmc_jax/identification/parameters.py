@@ -418,7 +418,7 @@ def _coupling(model: Model, sizes: np.ndarray, known: bool) -> Parameter:
 def _inertia(start: np.ndarray, prior: Any) -> Parameter:
     """Return the inertia in log-Cholesky coordinates of its pseudo-inertia, so that every value is that of a body."""
     table = getattr(prior, "inertia", None)
-    root = inertias.pseudo_root(start)
+    root = vector(inertias.pseudo_root(start))
     by_coordinates = np.asarray(jax.jacfwd(lambda c: _entries(inertias.from_coordinates(root, c)))(jnp.zeros(6)))
     if table is not None and hasattr(table, "factor"):
         factor = np.asarray(table.factor, dtype=float)
@@ -434,7 +434,7 @@ def _inertia(start: np.ndarray, prior: Any) -> Parameter:
         factor = np.linalg.solve(by_coordinates, _full_rank(by_prior, std * np.min(moments)))
 
     def write(model: Model, c: Array) -> Model:
-        inertia = inertias.from_coordinates(jnp.asarray(root), c)
+        inertia = inertias.from_coordinates(root, c)
         plant = model.plant.with_inertia(inertia, matrices.solve(inertia, jnp.eye(3)))
         return replace(model, plant=plant, disturbance=disturbances.on_body(model.disturbance, inertia))
 

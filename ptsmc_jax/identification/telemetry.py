@@ -24,6 +24,7 @@ FEWEST = 10  # rows of a log
 UNIT_NORM = 1e-3  # largest error of the norm of a quaternion: telemetry often has few digits
 RPM = 2.0 * np.pi / 60.0  # [rad/s]
 MISFIT = 0.5  # difference between the attitude's and the gyro's motion, relative to the motion, that is refused
+OUTLIER = 10.0  # third difference of an outlier, relative to the median
 PARTS = 400  # of a log for this comparison
 Values = np.ndarray
 
@@ -187,7 +188,7 @@ def _of_state(scenario: Scenario, given: Any, table: _Table, t: Values) -> Measu
     complete = ~np.isnan(x).any(axis=1)
     if not complete.any():
         raise RefusedError(f"{table.name} has no row with every component of the state, but must have one")
-    first = int(np.argmax(complete))
+    first = _first_row({"x": x}, complete)
     return Measurements(table.name, t[first:] - t[first], {"x": x[first:]}, command[first:])
 
 
@@ -214,10 +215,28 @@ def _of_spacecraft(scenario: Scenario, given: Any, table: _Table, t: Values) -> 
     _check_motion(table, t, readings)
     lead = readings.get("attitude", readings.get("rate"))
     assert lead is not None
-    first = int(np.argmax(~np.isnan(lead[:, 0])))
+    first = _first_row(readings, ~np.isnan(lead[:, 0]))
     rest = {name: values[first:] for name, values in readings.items()}
     inertia = given.wheel_inertia if given.wheel_speed is not None else None
     return Measurements(table.name, t[first:] - t[first], rest, command[first:], by_channel, inertia)
+
+
+def _first_row(readings: dict[str, Values], complete: Values) -> int:
+    """Return the first complete row without an outlier, because the filter starts from its readings.
+
+    A reading is no outlier if the third difference of the readings from it on is not far beyond the usual one.
+
+    Args:
+        readings: by name.
+        complete: whether a row has the readings that the filter needs, (rows,) bool.
+    """
+    good = complete.copy()
+    for values in readings.values():
+        there = np.flatnonzero(~np.isnan(values).any(axis=1))
+        if there.size > FEWEST:
+            sizes = np.max(np.abs(np.diff(values[there], 3, axis=0)), axis=1)
+            good[there[:-3][sizes > OUTLIER * np.median(sizes)]] = False
+    return int(np.argmax(good)) if good.any() else int(np.argmax(complete))
 
 
 def _attitude(given: Any, table: _Table, columns: Sequence[str]) -> Values:

@@ -216,7 +216,7 @@ class RelativeInertia(Table, frozen=True):
 
 
 class CorrelatedInertia(Table, frozen=True):
-    """Correlated errors of the true inertia, normal in coordinates that every body has, as `ptsmc identify` writes them.
+    """Correlated errors of the true inertia, in coordinates of which all values are physical; see `ptsmc identify`.
 
     The coordinates are those of `dispersions.inertias.CorrelatedInertia`, and zeros give the nominal inertia.
     """

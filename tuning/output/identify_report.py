@@ -5,6 +5,10 @@ from tuning.output.report import Report, Section, Table
 from tuning.output.summaries import Identified, LogFit
 
 
+NOTE = """mean square: of the innovations over their variance. White innovations have a mean square of 1 and no
+autocorrelation."""
+
+
 def of(summary: Identified) -> Report:
     """Return the report of `ptsmc identify`."""
     good = summary.status == "identified"
@@ -45,7 +49,4 @@ def logs(summary: Identified) -> Table:
 
     rows = [row(one, "estimation") for one in summary.logs] + [row(one, "validation") for one in summary.validation]
     head = ("log", "use", "duration [s]", "readings", "outliers", "mean square", "autocorrelation", "white")
-    return Table(
-        head, rows, "Mean square of the innovations over their variance, and largest autocorrelation; white innovations "
-        "have a mean square of 1 and no autocorrelation.",
-    )  # fmt: skip
+    return Table(head, rows, NOTE)

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.identification import results
 from ptsmc_jax.identification.estimation import Fit, Identification
-from ptsmc_jax.scenario import own, parsing
-from tuning.search import own_parts
+from ptsmc_jax.scenario import custom, parsing
+from tuning.search import custom_parts
 
 
 def write(folder: Path, found: Identification, figures: bool, made_by: Mapping[str, Any]) -> None:
@@ -23,10 +23,10 @@ def write(folder: Path, found: Identification, figures: bool, made_by: Mapping[s
         figures: write figures too.
         made_by: entries of `versions.json`.
     """
-    made = {"command": "identify", "seed": None, **made_by, **own.digests(found.scenario)}
+    made = {"command": "identify", "seed": None, **made_by, **custom.digests(found.scenario)}
     store.record(folder, parsing.dump(found.scenario), made, results.summary(found))
     identified = results.identified(found)
-    store.write_toml(folder / "identified.toml", own_parts.carry(parsing.dump(identified), folder))
+    store.write_toml(folder / "identified.toml", custom_parts.carry(parsing.dump(identified), folder))
     for k, fit in enumerate([*found.fits, *found.validation]):
         name = "innovations" if k == 0 else f"innovations_{k + 1}"
         names = results.components(fit)

@@ -1,0 +1,133 @@
+"""Estimates of `ptsmc identify` from logs of an independent simulation, and the identified scenario."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import polars as pl
+import pytest
+
+from ptsmc_jax import formulas, scenario
+from ptsmc_jax.dispersions import inertias
+from ptsmc_jax.dispersions.quantities import PAIRS
+from ptsmc_jax.identification import estimation, results
+from ptsmc_jax.scenario import parsing
+from ptsmc_jax.scenario.errors import ScenarioError
+from tests.identification import synthetic
+
+TRUE = np.array([[0.05, 0.002, -0.001], [0.002, 0.09, 0.003], [-0.001, 0.003, 0.11]])
+ENTRIES = np.array([TRUE[i, j] for i, j in PAIRS])
+
+
+def satellite(free=("inertia", "gyro_bias"), **tables):
+    """A model whose inertia is up to 30 % off."""
+    return scenario.from_tables(
+        {
+            "spacecraft": {"inertia": [0.065, 0.072, 0.12]},
+            "loop": {"mode": "sampled", "period": 0.25},
+            "disturbance": {"kind": "none"},
+            "hardware": {"attitude_noise": 5e-5, "rate_noise": 1.4e-4, "torque_lag": 0.05},
+            "wheels": {"kind": "axes"},
+            "identify": {"free": list(free), "prior": "none"},
+            **tables,
+        }
+    )
+
+
+def flight(rng, **others):
+    (frame,), drift = synthetic.logs(rng, TRUE, dt=0.25, rows=257, wheels=True, lag=0.05, **others)
+    return frame, drift[0]
+
+
+def spoiled(frame, rng):
+    """A log with 1 % gross outliers and 30 % missing samples of each sensor."""
+    columns = {name: frame[name].to_numpy().copy() for name in frame.columns}
+    for block, size in (("measured_q", 4), ("measured_w", 3)):
+        names = [f"{block}{k + 1}" for k in range(size)]
+        for row in rng.choice(frame.height, 3, replace=False):
+            wild = rng.standard_normal(size)
+            for name, value in zip(names, wild / np.linalg.norm(wild), strict=True):
+                columns[name][row] = value
+        for row in rng.choice(frame.height, int(0.3 * frame.height), replace=False):
+            for name in names:
+                columns[name][row] = np.nan
+    return pl.DataFrame(columns)
+
+
+@pytest.fixture(scope="module")
+def identified():
+    rng = np.random.default_rng(5)
+    frame, drift = flight(rng)
+    found = estimation.identify(satellite(), spoiled(frame, rng), validate=[flight(rng)[0]])
+    return found, drift
+
+
+def test_outliers_and_missing_samples_do_not_spoil_the_estimates(identified):
+    found, drift = identified
+    assert found.converged and found.good, results.verdict(found)
+    assert np.all(np.abs(found.estimate - ENTRIES) < 3.5 * found.std)  # all of six within 3.5 sigma: 99.7 %
+    assert np.all(found.std < 0.02 * 0.11)  # the start is 30 % off
+    bias, std = found.gyro_bias()[0]
+    assert np.all(np.abs(bias - drift) < 3.5 * std)
+    assert found.fits[0].outliers >= 10  # 18 components were spoiled, some in rows that are blank
+
+
+def test_a_log_that_was_not_used_is_predicted(identified):
+    found, _ = identified
+    (fit,) = found.validation
+    assert fit.white
+    assert fit.outliers == 0
+    assert 0.9 < fit.square < 1.1  # 1500 numbers of which the standard deviation is 0.04
+
+
+def test_the_identified_scenario_has_the_estimate_and_its_covariance(identified):
+    found, _ = identified
+    again = scenario.from_tables(parsing.dump(results.identified(found)))  # as from identified.toml
+    ready = scenario.study(again)
+    np.testing.assert_allclose(np.asarray(ready.parts.plant.inertia)[np.triu_indices(3)], found.estimate, rtol=1e-12)
+    draw = jax.jit(jax.vmap(lambda trial: ready.dispersion.apply(ready.parts, 0, trial).plant.inertia))
+    bodies = np.asarray(draw(jnp.arange(4000)))
+    assert formulas.bodies(bodies).all()
+    # the covariance of 4000 random samples differs by a few per cent; the density is normal in other coordinates
+    std = np.std(bodies, axis=0)[np.triu_indices(3)]
+    np.testing.assert_allclose(std, found.std, rtol=0.1)
+    correlation = np.corrcoef(bodies[:, 0, 0], bodies[:, 1, 1])[0, 1]
+    expected = found.covariance[0, 3] / (found.std[0] * found.std[3])
+    assert abs(correlation - expected) < 0.1
+
+
+def test_the_summary_is_complete(identified):
+    found, _ = identified
+    summary = results.summary(found)
+    assert summary["status"] == "identified"
+    assert [row["parameter"] for row in summary["parameters"]] == found.problem.labels
+    assert "is white" in summary["verdict"][0] or "white" in summary["verdict"][0]
+
+
+def test_every_value_of_the_coordinates_is_the_inertia_of_a_body():
+    rng = np.random.default_rng(0)
+    root = jnp.asarray(inertias.pseudo_root(np.diag([0.05, 0.09, 0.1399])))  # nearly flat
+    many = jax.vmap(lambda c: inertias.from_coordinates(root, c))(3.0 * rng.standard_normal((500, 6)))
+    moments = np.linalg.eigvalsh(np.asarray(many))
+    assert np.all(moments[:, 0] > 0.0)
+    assert np.all(moments[:, 2] <= (moments[:, 0] + moments[:, 1]) * (1.0 + 1e-12))
+    np.testing.assert_allclose(inertias.from_coordinates(root, jnp.zeros(6)), np.diag([0.05, 0.09, 0.1399]), rtol=1e-12)
+
+
+@pytest.mark.long
+def test_only_the_ratio_of_inertia_to_actuator_scale_is_determined():
+    frame, _ = flight(np.random.default_rng(2))
+    body = {"hardware": {"attitude_noise": 5e-5, "rate_noise": 1.4e-4, "torque_lag": 0.05}}
+    found = estimation.identify(satellite(("inertia", "actuator_scale", "gyro_bias"), **body), frame)
+    assert any("only the ratio of inertia to actuator_scale" in line for line in found.undetermined)
+    assert not found.good
+
+
+def test_unknown_parameters_and_logs_that_differ_are_refused():
+    frame, _ = flight(np.random.default_rng(2))
+    with pytest.raises(ScenarioError, match="identify.free has inertias, which this scenario does not have; the near"):
+        estimation.identify(satellite(["inertias"]), frame)
+    with pytest.raises(ScenarioError, match="identify.free has mode_frequency, which this scenario does not have"):
+        estimation.identify(satellite(["mode_frequency"]), frame)
+    without = frame.drop("measured_q1", "measured_q2", "measured_q3", "measured_q4")
+    with pytest.raises(ScenarioError, match="log 2 has other readings than log 1"):
+        estimation.identify(satellite(), [frame, without])
