@@ -7,7 +7,7 @@ information I of the innovations and their variances (Astrom, Automatica 16(5), 
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -34,23 +34,30 @@ POOR = 1.5  # mean normalised square of the innovations above which other starti
 LAGS = 25  # of the autocorrelation
 WHITE = 0.05  # largest autocorrelation that counts as white in a long log
 CONSISTENT = (0.8, 1.25)  # mean normalised square of innovations that fit their variance
+FARTHEST = 3.0  # distance of the most likely parameters of a validation log, RMS in sigmas of the estimates
 CONFIDENCE = 0.95
 CLEAR = 0.3  # smallest component of an undetermined direction that is named
 
 
 @dataclass(frozen=True)
 class Fit:
-    """Innovations of a log for estimated parameters."""
+    """Innovations of a log for estimated parameters.
+
+    The estimates have errors that change the predictions of a validation log. `adjusted` are its innovations for the
+    most likely parameters within the uncertainty of the estimates, and `moved` is their distance from the estimates.
+    """
 
     log: Measurements
     rows: Rows
     innovations: Innovations  # arrays (rows - 1, components)
     track: Track
+    adjusted: Innovations | None = None
+    moved: float = 0.0  # RMS over the parameters, in sigmas
 
     @property
     def whitened(self) -> np.ndarray:
-        """Innovations over their 1 sigma (samples, components) [-], NaN without a reading."""
-        value, variance, accepted = self.innovations
+        """Innovations over their 1 sigma (samples, components) [-], adjusted ones if there are; NaN: no reading."""
+        value, variance, accepted = self.innovations if self.adjusted is None else self.adjusted
         sampled = self.rows.source[1:] >= 0
         return np.where(accepted, value / np.sqrt(variance), np.nan)[sampled]
 
@@ -80,7 +87,8 @@ class Fit:
     def white(self) -> bool:
         """Whether the innovations fit their variance and are uncorrelated in time."""
         bound = np.maximum(WHITE, 4.0 / np.sqrt(np.maximum(np.sum(np.isfinite(self.whitened), axis=0), 1)))
-        return CONSISTENT[0] < self.square < CONSISTENT[1] and bool(np.all(np.abs(self.autocorrelation()) < bound))
+        good = CONSISTENT[0] < self.square < CONSISTENT[1] and self.moved < FARTHEST
+        return good and bool(np.all(np.abs(self.autocorrelation()) < bound))
 
 
 def _autocorrelation(values: np.ndarray) -> np.ndarray:
@@ -430,6 +438,15 @@ def _result(
         screened = search.screened(z, one) if np.isfinite(search.gate) else one
         return Fit(log, one[0], *search.filtered(z, screened))
 
+    def predicted(log: Measurements) -> Fit:
+        fit, one = fitted(log), (rows(problem, log), Kind.of(log))
+        good = search.screened(z, one) if np.isfinite(search.gate) else one
+        _, gradient, information, _ = search.derivatives(z, [good])
+        kept = np.linalg.pinv(of_z)  # the prior is in it already
+        step = np.linalg.solve(information - np.diag(search.known) + kept, gradient + search.known * z)
+        moved = float(np.sqrt(step @ kept @ step / step.size))
+        return replace(fit, adjusted=search.filtered(z + step, good)[0], moved=moved)
+
     return Identification(
         scenario=loaded,
         problem=problem,
@@ -442,7 +459,7 @@ def _result(
         undetermined=undetermined(problem, best.information - np.diag(known.astype(float)), by_start),
         complete=bool(np.min(np.linalg.eigvalsh(best.information)) >= 1.0),
         fits=[fitted(log) for log in logs],
-        validation=[fitted(log) for log in others],
+        validation=[predicted(log) for log in others],
         converged=best.converged,
         steps=best.steps,
         log_likelihood=best.value,

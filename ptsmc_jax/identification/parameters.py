@@ -268,7 +268,7 @@ def _catalogue(
             channels, "-", "factor",
         ),
         "delay": lambda model: (model, _delay(interval)),
-        "disturbance_bias": lambda model: (model, _bias(inputs, unit, torque, getattr(prior, "disturbance_bias", None))),
+        "disturbance_bias": lambda model: (model, _bias(inputs, unit, torque, prior)),
     }  # fmt: skip
     if actuators.lag is not None:
         made["torque_lag"] = field(
@@ -363,7 +363,8 @@ def _delay(interval: float) -> Parameter:
     )
 
 
-def _bias(inputs: int, unit: str, torque: float, table: Any) -> Parameter:
+def _bias(inputs: int, unit: str, torque: float, prior: Any) -> Parameter:
+    table = getattr(prior, "disturbance_bias", None)
     sizes = np.full(inputs, 0.1 * torque) if table is None else table.of(inputs)
 
     def write(model: Model, c: Array) -> Model:

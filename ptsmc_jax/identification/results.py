@@ -1,10 +1,14 @@
-"""Results of an identification: the identified scenario, the summary, and the verdict in words. Start with `summary`."""
+"""Results of an identification: identified scenario, summary, and verdict in words. Start with `summary`."""
 
 from collections.abc import Mapping
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
+from ptsmc_jax.dispersions import inertias
+from ptsmc_jax.dispersions.quantities import PAIRS
 from ptsmc_jax.identification.estimation import LAGS, Fit, Identification
 from ptsmc_jax.scenario import parsing, reading
 from ptsmc_jax.scenario.tables import Scenario
@@ -39,7 +43,7 @@ def _put(
     relative = {"kind": "relative_normal", "std": float(min(np.max(std / np.abs(values), initial=0.0), LARGEST_SHARE))}
     numbers = [float(value) for value in values]
     if name == "inertia":
-        entries = dict(zip([(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)], numbers, strict=True))
+        entries = dict(zip(PAIRS, numbers, strict=True))
         tensor = [[entries[min(i, j), max(i, j)] for j in range(3)] for i in range(3)]
         body = {key: value for key, value in tables.get("spacecraft", {}).items() if key != "true_inertia"}
         tables["spacecraft"] = {**body, "inertia": tensor}
@@ -103,12 +107,6 @@ def _put_disturbance(
 
 def _inertia_factor(found: Identification, tensor: np.ndarray) -> np.ndarray:
     """Return a factor (6, 6) of the covariance of the estimated inertia in its own log-Cholesky coordinates."""
-    import jax
-    import jax.numpy as jnp
-
-    from ptsmc_jax.dispersions import inertias
-    from ptsmc_jax.dispersions.quantities import PAIRS
-
     root = jnp.asarray(inertias.pseudo_root(tensor))
     entries = lambda c: jnp.stack([inertias.from_coordinates(root, c)[i, j] for i, j in PAIRS])  # noqa: E731
     by_coordinates = np.asarray(jax.jacfwd(entries)(jnp.zeros(6)))
@@ -161,6 +159,7 @@ def _fit(fit: Fit) -> dict[str, Any]:
         "readings": fit.samples,
         "outliers": fit.outliers,
         "mean_square": fit.square,
+        "moved": fit.moved,
         "white": fit.white,
         "prediction_rms": dict(zip(names, map(float, rms), strict=True)),
         "largest_autocorrelation": dict(zip(names, map(float, largest), strict=True)),
@@ -181,6 +180,8 @@ def verdict(found: Identification) -> list[str]:
     for fit in [*found.fits, *found.validation]:
         used = "validation " if fit in found.validation else ""
         ends = f"mean square {fit.square:.3g} of its expected value"
+        if fit.adjusted is not None:
+            ends += f", for parameters {fit.moved:.2g} sigma from the estimates"
         if fit.white:
             lines.append(f"the model explains {used}{fit.log.name}: its innovations are white, with {ends}")
         else:

@@ -54,7 +54,10 @@ def test_orders_signs_units_and_blanks_give_the_same_log():
     plain = telemetry.measurements(loaded(), frame())
     signs = np.where(np.arange(ROWS) % 3 == 0, -1.0, 1.0)
     other = frame(
-        **{f"measured_q{k + 1}": (signs[:, None] * np.roll(Q, 1, axis=1) * [1.0, -1.0, -1.0, -1.0])[:, k] for k in range(4)},
+        **{
+            f"measured_q{k + 1}": (signs[:, None] * np.roll(Q, 1, axis=1) * [1.0, -1.0, -1.0, -1.0])[:, k]
+            for k in range(4)
+        },
         **{f"measured_w{k + 1}": np.rad2deg(RATE[:, k]) for k in range(3)},
         **{f"sent{k + 1}": 1e3 * frame()[f"sent{k + 1}"].to_numpy() for k in range(3)},
         t=[f"2026-03-01T12:00:{time:09.6f}Z" for time in T],

@@ -4,7 +4,6 @@ from tuning.output.formats import digits
 from tuning.output.report import Report, Section, Table
 from tuning.output.summaries import Identified, LogFit
 
-
 NOTE = """mean square: of the innovations over their variance. White innovations have a mean square of 1 and no
 autocorrelation."""
 

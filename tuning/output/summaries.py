@@ -377,6 +377,7 @@ class LogFit(msgspec.Struct, frozen=True):
     readings: int
     outliers: int
     mean_square: float
+    moved: float
     white: bool
     prediction_rms: Numbers
     largest_autocorrelation: Numbers
