@@ -62,7 +62,7 @@ def main() -> None:
             search.screened(np.zeros(problem.size), one)
             print(f"compiling and a first evaluation: {time.perf_counter() - begun:.1f} s", flush=True)
         begun, processor = time.perf_counter(), time.process_time()
-        found = search.run(rng.standard_normal(problem.size))
+        found = search.run(rng.standard_normal(problem.size), parameters.acceleration(problem.model, log))
         seconds.append((time.perf_counter() - begun, time.process_time() - processor))
         steps.append(found.steps)
         _, _, information, _ = search.derivatives(np.zeros(problem.size), search.logs)

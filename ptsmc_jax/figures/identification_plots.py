@@ -101,3 +101,16 @@ def estimates(table: Any) -> Figure:
     axes.invert_yaxis()
     axes.set_xlabel("change in % of the largest number of the parameter, with the 95 % interval; grey: prior knowledge")
     return figure
+
+
+@style.styled
+def profile(t: np.ndarray, panels: list[tuple[str, np.ndarray]]) -> Figure:
+    """Draw a proposed manoeuvre over time; panels: label and values (rows, components) of each signal, t: in s."""
+    figure, axes = _panels(len(panels))
+    for one, (label, values) in zip(axes, panels, strict=True):
+        for column, (colour, line) in zip(values.T, style.STYLES, strict=False):
+            one.plot(t, column, color=colour, ls=line)
+        one.set_ylabel(label)
+    axes[0].set_title("Proposed manoeuvre", loc="left")
+    axes[-1].set_xlabel(style.TIME)
+    return figure

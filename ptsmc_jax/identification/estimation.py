@@ -18,7 +18,7 @@ from jaxtyping import Array
 from scipy import stats
 
 from ptsmc_jax.identification import filtering, parameters, telemetry
-from ptsmc_jax.identification.filtering import Innovations, Kind, Rows, Track
+from ptsmc_jax.identification.filtering import Innovations, Kind, Model, Rows, Track
 from ptsmc_jax.identification.parameters import Problem
 from ptsmc_jax.identification.telemetry import Measurements
 from ptsmc_jax.scenario import reading
@@ -29,6 +29,7 @@ BUCKET = 256  # rows of a log are padded to a multiple of it, so that similar lo
 STEPS = 40  # largest number of steps of a local search
 LONGEST = 3.0  # step, in sigmas of the prior
 CONVERGED = 1e-3  # largest step of a converged search, in sigmas of the estimate
+SLACK = (0.3, 0.01)  # noise of the acceleration at the begin of a search, relative to the acceleration [s^0.5]
 SCREENINGS = 4  # largest number of times that outliers are determined again
 POOR = 1.5  # mean normalised square of the innovations above which other starting points are tried
 LAGS = 25  # of the autocorrelation
@@ -39,7 +40,7 @@ CONFIDENCE = 0.95
 CLEAR = 0.3  # smallest component of an undetermined direction that is named
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Fit:
     """Innovations of a log for estimated parameters.
 
@@ -98,7 +99,7 @@ def _autocorrelation(values: np.ndarray) -> np.ndarray:
     return np.array([np.sum(values[lag:] * values[:-lag]) for lag in range(1, LAGS + 1)]) / total
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Identification:
     """Estimated parameters of a scenario."""
 
@@ -213,13 +214,14 @@ def of_logs(
     problem = parameters.build(loaded, logs, free)
     every = [rows(problem, one) for one in logs]
     search = Search(problem, [(one, Kind.of(log)) for one, log in zip(every, logs, strict=True)], _gate(loaded), report)
-    best = search.run(np.zeros(problem.size))
+    usual = max(parameters.acceleration(problem.model, log) for log in logs)
+    best = search.run(np.zeros(problem.size), usual)
     draws = np.random.default_rng(0)
     for k in range(1, 3 if loaded.identify is None else loaded.identify.starts):
         if best.square < POOR:
             break
         report(f"the fit is poor; starting point {k + 1}")
-        other = search.run(draws.standard_normal(problem.size))
+        other = search.run(draws.standard_normal(problem.size), usual)
         best = max(best, other, key=lambda found: found.value)
     return _result(loaded, problem, search, best, logs, others)
 
@@ -265,17 +267,25 @@ class Search:
         """Args: the problem, the logs, the normalised square of outliers, and a function that reports progress."""
         self.problem, self.logs, self.gate, self.report = problem, list(logs), gate, report
         self.known = problem.known().astype(float)
+        self.slack = jnp.zeros(())
         self._filter = jax.jit(self._filtered, static_argnames="kind")
+        self._errors = jax.jit(self._innovations, static_argnames="kind")
         self._derivatives = jax.jit(self._differentiated, static_argnames="kind")
 
-    def _filtered(self, z: Array, rows: Rows, gate: Any, kind: Kind) -> tuple[Innovations, Track]:
-        return filtering.innovations(self.problem.at(z), rows, kind, gate)
+    def _at(self, z: Array, slack: Array) -> Model:
+        return replace(self.problem.at(z), slack=slack)
 
-    def _differentiated(self, z: Array, rows: Rows, kind: Kind) -> tuple[Array, Array, Array, Array]:
+    def _filtered(self, z: Array, rows: Rows, kind: Kind) -> tuple[Innovations, Any]:
+        return filtering.filtered(self.problem.at(z), rows, kind)
+
+    def _innovations(self, z: Array, slack: Array, rows: Rows, gate: Any, kind: Kind) -> Innovations:
+        return filtering.innovations(self._at(z, slack), rows, kind, gate)
+
+    def _differentiated(self, z: Array, slack: Array, rows: Rows, kind: Kind) -> tuple[Array, Array, Array, Array]:
         """Return log-likelihood, gradient, Fisher information and mean normalised square of one log."""
 
         def of(z: Array) -> tuple[tuple[Array, Array], Innovations]:
-            found, _ = filtering.innovations(self.problem.at(z), rows, kind)
+            found = filtering.innovations(self._at(z, slack), rows, kind)
             return (found.value, found.variance), found
 
         (by_value, by_variance), (value, variance, accepted) = jax.jacfwd(of, has_aux=True)(z)
@@ -289,16 +299,21 @@ class Search:
         count = jnp.maximum(jnp.sum(accepted), 1)
         return _log_likelihood(value, variance, accepted), gradient, information, jnp.sum(whitened**2) / count
 
-    def filtered(self, z: np.ndarray, log: tuple[Rows, Kind], gate: float = np.inf) -> tuple[Innovations, Track]:
+    def filtered(self, z: np.ndarray, log: tuple[Rows, Kind]) -> tuple[Innovations, Track]:
         """Return innovations and estimates of the filter for a log, as NumPy arrays."""
         rows, kind = log
-        return jax.tree.map(np.asarray, self._filter(jnp.asarray(z), _numbers(rows), gate, kind=kind))
+        return jax.tree.map(np.asarray, self._filter(jnp.asarray(z), _numbers(rows), kind=kind))
+
+    def innovations(self, z: np.ndarray, log: tuple[Rows, Kind], gate: float = np.inf) -> Innovations:
+        """Return the innovations of a log, as NumPy arrays."""
+        rows, kind = log
+        return jax.tree.map(np.asarray, self._errors(jnp.asarray(z), self.slack, _numbers(rows), gate, kind=kind))
 
     def value(self, z: np.ndarray, logs: Sequence[tuple[Rows, Kind]]) -> float:
         """Return the log-likelihood of the logs and of the prior."""
         total = -0.5 * float(self.known @ z**2)
         for log in logs:
-            total += float(_log_likelihood(*self.filtered(z, log)[0]))
+            total += float(_log_likelihood(*self.innovations(z, log)))
         return total
 
     def derivatives(
@@ -308,16 +323,37 @@ class Search:
         value, gradient, information = -0.5 * float(self.known @ z**2), -self.known * z, np.diag(self.known)
         squares = []
         for rows, kind in logs:
-            one = jax.tree.map(np.asarray, self._derivatives(jnp.asarray(z), _numbers(rows), kind=kind))
+            one = jax.tree.map(np.asarray, self._derivatives(jnp.asarray(z), self.slack, _numbers(rows), kind=kind))
             value, gradient, information = value + float(one[0]), gradient + one[1], information + one[2]
             squares.append(float(one[3]))
         return value, gradient, information, float(np.mean(squares))
 
-    def run(self, z: np.ndarray) -> Found:
-        """Return the end of the local search from coordinates (n,), with its outliers rejected."""
-        logs, before = self.logs, None
-        found = None
-        for _ in range(SCREENINGS if np.isfinite(self.gate) else 1):
+    def run(self, z: np.ndarray, acceleration: float = 0.0) -> Found:
+        """Return the end of the local search from coordinates (n,), with its outliers rejected.
+
+        A model that is far off predicts a long log badly, and its likelihood has many maxima. If the fit is poor, the
+        search therefore begins with noise on the acceleration, so that the filter follows the log, and reduces it.
+
+        Args:
+            z: starting point.
+            acceleration: usual acceleration in the logs [rad/s^2]; 0: no noise is added.
+        """
+        if acceleration > 0.0 and self.mean_square(z) > POOR:
+            for factor in SLACK:
+                self.slack = jnp.asarray(factor * acceleration)
+                self.report(f"the fit is poor: a filter with noise of {float(self.slack):.2g} rad/s^1.5")
+                z = self._run(z, screenings=1).z
+            self.slack = jnp.zeros(())
+        return self._run(z, SCREENINGS)
+
+    def mean_square(self, z: np.ndarray) -> float:
+        """Return the median of the normalised squares of the innovations over that of a good fit."""
+        scales = [self._scale(self.innovations(z, log)) for log in self.logs]
+        return max(scales)
+
+    def _run(self, z: np.ndarray, screenings: int) -> Found:
+        logs, before, found = self.logs, None, None
+        for _ in range(screenings if np.isfinite(self.gate) else 1):
             if np.isfinite(self.gate):
                 logs = [self.screened(z, log) for log in self.logs]
                 masks = np.concatenate([log[0].valid.ravel() for log in logs])
@@ -327,8 +363,12 @@ class Search:
             found = self.climb(z, logs)
             z = found.z
         assert found is not None
-        self.accepted = logs
         return found
+
+    @staticmethod
+    def _scale(found: Innovations) -> float:
+        squares = (found.value**2 / found.variance)[found.accepted]
+        return float(np.median(squares)) / float(stats.chi2.median(1))
 
     def screened(self, z: np.ndarray, log: tuple[Rows, Kind]) -> tuple[Rows, Kind]:
         """Return the log without its outliers at these coordinates.
@@ -337,9 +377,8 @@ class Search:
         """
         scale = 1.0
         for gate in (np.inf, self.gate):
-            found, _ = self.filtered(z, log, gate * scale)
-            squares = (found.value**2 / found.variance)[found.accepted]
-            scale = max(scale, float(np.median(squares)) / float(stats.chi2.median(1)))
+            found = self.innovations(z, log, gate * scale)
+            scale = max(scale, self._scale(found))
         rows, kind = log
         return rows._replace(valid=np.concatenate([rows.valid[:1], found.accepted])), kind
 
@@ -445,7 +484,7 @@ def _result(
         kept = np.linalg.pinv(of_z)  # the prior is in it already
         step = np.linalg.solve(information - np.diag(search.known) + kept, gradient + search.known * z)
         moved = float(np.sqrt(step @ kept @ step / step.size))
-        return replace(fit, adjusted=search.filtered(z + step, good)[0], moved=moved)
+        return replace(fit, adjusted=search.innovations(z + step, good), moved=moved)
 
     return Identification(
         scenario=loaded,

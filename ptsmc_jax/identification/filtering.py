@@ -40,6 +40,7 @@ class Model:
     bias_walk: Leaf  # density of its random walk [rad/s/sqrt(s)]
     walk: Leaf  # (m,) density of the random-walk torque [N m/sqrt(s)]
     modes: Leaf  # (n,) prior 1 sigma of hidden coordinates at the first row
+    slack: Leaf  # density of white noise on the acceleration, while a search is far from the estimate [rad/s^1.5]
 
     @property
     def spacecraft(self) -> bool:
@@ -185,7 +186,14 @@ def with_wheels(model: Model, wheel_inertia: float | None) -> Model:
     return replace(model, plant=plant, actuators=actuators)
 
 
-def innovations(model: Model, rows: Rows, kind: Kind, gate: Any = jnp.inf) -> tuple[Innovations, Track]:
+def innovations(model: Model, rows: Rows, kind: Kind, gate: Any = jnp.inf) -> Innovations:
+    """Return the prediction errors of a log; see `filtered`."""
+    return filtered(model, rows, kind, gate, tracked=False)[0]
+
+
+def filtered(
+    model: Model, rows: Rows, kind: Kind, gate: Any = jnp.inf, *, tracked: bool = True
+) -> tuple[Innovations, Track | None]:
     """Return the prediction errors of a log and the estimates of the filter.
 
     Args:
@@ -193,15 +201,17 @@ def innovations(model: Model, rows: Rows, kind: Kind, gate: Any = jnp.inf) -> tu
         rows: the log.
         kind: its structure.
         gate: a group of readings whose normalised square exceeds this number times its size is rejected.
+        tracked: whether the estimates are returned, which need the memory of a covariance for each row.
     """
     model = with_wheels(model, kind.wheel_inertia)
     due = acting(model, rows, kind.wheel_inertia)
     carry = _start(model, rows)
 
-    def step(carry: _Carry, row: Any) -> tuple[_Carry, tuple[Innovations, Track]]:
+    def step(carry: _Carry, row: Any) -> tuple[_Carry, tuple[Innovations, Track | None]]:
         t, dt, command, due, readings, valid = row
         carry = _predicted(model, carry, t, dt, command, due, kind)
-        return _corrected(model, carry, readings, valid, gate)
+        carry, found = _corrected(model, carry, readings, valid, gate)
+        return carry, (found, Track(carry.x, carry.bias, carry.walk, carry.p) if tracked else None)
 
     inputs = rows.t[:-1], rows.dt[:-1], rows.command[:-1], due[:-1]
     later = jax.tree.map(lambda v: v[1:], (rows.readings, rows.valid))
@@ -268,7 +278,9 @@ def _predicted(model: Model, carry: _Carry, t: Scalar, dt: Scalar, command: Arra
     f = jnp.eye(sizes + b + m).at[:sizes, :sizes].set(moved[:sizes, :sizes])
     f = f.at[:sizes, sizes + b :].set(moved[:sizes, sizes:]) if m else f
     # the steps of the random walks come at the start of the interval, as in a simulation
-    noise = [jnp.zeros(sizes), model.bias_walk**2 * dt * jnp.ones(b)]
+    first = 3 if model.spacecraft else sizes - model.modes.size - plant.inputs  # of the velocity
+    noise = [jnp.zeros(first), model.slack**2 * dt * jnp.ones(plant.inputs), jnp.zeros(sizes - first - plant.inputs)]
+    noise += [model.bias_walk**2 * dt * jnp.ones(b)]
     noise += [jnp.broadcast_to(model.walk**2 * dt, (m,))] if m else []
     p = f @ (carry.p + jnp.diag(jnp.concatenate(noise))) @ f.T
     ended = carry.actuators if kind.wheel_inertia is not None else actuators.end(carry.actuators, drive, None, dt)
@@ -300,7 +312,7 @@ def _transition(plant: Any, rate: Any, carry: _Carry, after: Any, t: Scalar, dt:
 
 def _corrected(
     model: Model, carry: _Carry, readings: dict[str, Array], valid: Array, gate: Any
-) -> tuple[_Carry, tuple[Innovations, Track]]:
+) -> tuple[_Carry, Innovations]:
     """Return the filter after the readings of a row, one component after the other."""
     residual, rows, noise = _residuals(model, carry, readings)
     shift, p, at = jnp.zeros(carry.p.shape[0]), carry.p, 0
@@ -332,7 +344,7 @@ def _corrected(
     found = Innovations(
         jnp.where(accepted, jnp.stack(values), 0.0), jnp.where(accepted, jnp.stack(variances), 1.0), accepted
     )
-    return after, (found, Track(after.x, after.bias, after.walk, p))
+    return after, found
 
 
 def _residuals(model: Model, carry: _Carry, readings: dict[str, Array]) -> tuple[Array, Array, Array]:

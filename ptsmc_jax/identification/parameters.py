@@ -21,6 +21,7 @@ from ptsmc_jax.identification.filtering import Model
 from ptsmc_jax.identification.telemetry import Measurements
 from ptsmc_jax.numerics import attitude, matrices
 from ptsmc_jax.numerics.pytrees import vector
+from ptsmc_jax.plants.rigid_body import AttitudeState
 from ptsmc_jax.scenario import build as building
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.parsing import nearest
@@ -190,8 +191,23 @@ def _model(
         bias_walk=vector(getattr(devices, "rate_bias_walk", None) or 0.0),
         walk=walk,
         modes=_hidden_spread(plant, logs),
+        slack=vector(0.0),
     )
     return model, estimated
+
+
+def acceleration(model: Model, log: Measurements) -> float:
+    """Return the RMS acceleration that the commands of a log give the plant at its first reading [rad/s^2]."""
+    command = log.command
+    if log.wheel_inertia is not None:
+        command = log.wheel_inertia * np.diff(command, axis=0) / np.diff(log.t)[:, None]
+    size = jnp.asarray(np.sqrt(np.mean(command**2, axis=0)))
+    size = model.actuators.on_body(size) if log.by_channel or log.wheel_inertia is not None else size
+    plant, zero = model.plant, jnp.zeros(model.plant.inputs)
+    x = log.readings["x"][0] if "x" in log.readings else AttitudeState(np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3))
+    x = plant.with_hidden_at_rest(jax.tree.map(jnp.asarray, x))
+    pushed, free = (plant.velocity(plant.rate(jnp.zeros(()), x, u, zero)) for u in (size, zero))
+    return float(jnp.max(jnp.abs(pushed - free)))
 
 
 def _roughness(name: str, log: Measurements) -> np.ndarray:

@@ -343,6 +343,7 @@ _STATE = {
     "x0": ("initial state", (UniformState, NormalState)),
     **_DISTURBANCE,
     "state_noise": ("factor on hardware.state_noise", FACTORS),
+    "actuator_scale": ("factor on each input that the computer does not know", FACTORS),
     **_ANY,
 }
 

@@ -35,7 +35,8 @@ def test_simulate_writes_its_result_folder(command, tmp_path):
     figures = {f"figures/{name}.png" for name in names}
     assert set(tree(folder)) == {"trajectory.csv", "summary.json", "scenario.toml", "versions.json", *figures}
     header, *rows = (folder / "trajectory.csv").read_text().splitlines()
-    assert header == "t,q1,q2,q3,q4,w1,w2,w3,d_hat1,d_hat2,d_hat3,u1,u2,u3,s1,s2,s3"
+    logged = "measured_q1,measured_q2,measured_q3,measured_q4,measured_w1,measured_w2,measured_w3,sent1,sent2,sent3"
+    assert header == f"t,q1,q2,q3,q4,w1,w2,w3,d_hat1,d_hat2,d_hat3,u1,u2,u3,s1,s2,s3,{logged}"
     values = np.array([[float(v) for v in row.split(",")] for row in rows])
     assert values[0, 0] == 0.0
     assert values[-1, 0] == 6.5

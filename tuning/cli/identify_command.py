@@ -4,23 +4,33 @@ from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
+from cyclopts.validators import Number
 
 from tuning.cli.options import Figures, Force, Out, Quiet, Trust, prepare
+from tuning.errors import UsageError
 from tuning.output import progress, terminal
 
-LogFiles = Annotated[
-    tuple[Path, ...], Parameter(name="LOG", help="Telemetry, .csv or .parquet; [telemetry] maps columns.")
-]
+Positive = Number(gt=0)
 
 
 def identify(
     scenario: Annotated[Path, Parameter(name="SCENARIO", help="Scenario file (TOML) with today's model.")],
-    logs: LogFiles,
-    /,
-    *,
+    *logs: Annotated[Path, Parameter(name="LOG", help="Telemetry, .csv or .parquet; [telemetry] maps its columns.")],
     validate: Annotated[
         tuple[Path, ...], Parameter(negative="", help="Log that is predicted only, to check the model; several times.")
     ] = (),
+    design: Annotated[
+        bool, Parameter(negative="", help="Propose a torque profile that determines the parameters; without logs.")
+    ] = False,
+    duration: Annotated[
+        float | None, Parameter(validator=Positive, help="Duration of the profile [s]; default: 300.")
+    ] = None,
+    rate: Annotated[
+        float | None, Parameter(validator=Positive, help="Largest rate in the profile [rad/s]; default: 0.05.")
+    ] = None,
+    torque: Annotated[
+        float | None, Parameter(validator=Positive, help="Largest torque [N m]; default: of the actuators.")
+    ] = None,
     out: Out = None,
     trust: Trust = False,
     force: Force = False,
@@ -29,26 +39,48 @@ def identify(
 ) -> int:
     """Estimate the parameters in [identify] of a scenario from telemetry, and write the identified scenario.
 
+    With --design it proposes the manoeuvre to record instead.
+
     Exit status: 0 the model explains the logs and every parameter is determined, 1 not, 2 configuration error.
     """
+    if design == bool(logs):
+        raise UsageError("there are logs, but --design needs none" if design else "there is no LOG, but must be one")
+    limits = {"--duration": duration, "--rate": rate, "--torque": torque}
+    alone = next((name for name, value in limits.items() if value is not None), None)
+    if alone is not None and not design:
+        raise UsageError(f"{alone} is {limits[alone]}, but must be absent without --design")
+    if design and validate:
+        raise UsageError("--validate needs a log for the estimates, and does not go with --design")
     loaded, folder = prepare(scenario, "identify", out, trust=trust, force=force)
     from ptsmc_jax.campaigns import store
+    from ptsmc_jax.identification import design as designing
     from ptsmc_jax.identification import estimation, results, telemetry
+    from tuning.output import identify_report, summaries
     from tuning.studies import identifying
 
-    read = [telemetry.measurements(loaded, telemetry.read(path), path.name) for path in logs]
-    others = [telemetry.measurements(loaded, telemetry.read(path), path.name) for path in validate]
+    read, others = (
+        [telemetry.measurements(loaded, telemetry.read(path), path.name) for path in paths]
+        for paths in (logs, validate)
+    )
     with store.in_use(folder, force=force):
         with progress.Progress(quiet) as report:
-            found = estimation.of_logs(loaded, read, others, report=lambda text: report(text, 0, 0))
-        made_by = {"logs": [str(path) for path in logs], "validate": [str(path) for path in validate]}
-        store.write(folder, lambda making: identifying.write(making, found, figures, made_by))
+            if design:
+                given = {"duration": duration or 300.0, "rate": rate or designing.RATE, "torque": torque}
+                proposed = designing.design(loaded, **given, report=lambda text: report(text, 0, 0))
+            else:
+                found = estimation.of_logs(loaded, read, others, report=lambda text: report(text, 0, 0))
+        if design:
+            store.write(folder, lambda making: identifying.write_design(making, loaded, proposed, figures, given))
+            shown = identify_report.of_design(
+                summaries.read(summaries.Designed, identifying.design_summary(proposed, given))
+            )
+        else:
+            made_by = {"logs": [str(path) for path in logs], "validate": [str(path) for path in validate]}
+            store.write(folder, lambda making: identifying.write(making, found, figures, made_by))
+            shown = identify_report.of(summaries.read(summaries.Identified, results.summary(found)))
     if not quiet:
-        from tuning.output import identify_report, summaries
-
-        summary = summaries.read(summaries.Identified, results.summary(found))
-        terminal.show(identify_report.of(summary), folder)
-    return 0 if found.good else 1
+        terminal.show(shown, folder)
+    return 0 if design or found.good else 1
 
 
 COMMANDS = (identify,)

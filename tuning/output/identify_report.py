@@ -2,7 +2,7 @@
 
 from tuning.output.formats import digits
 from tuning.output.report import Report, Section, Table
-from tuning.output.summaries import Identified, LogFit
+from tuning.output.summaries import Designed, Identified, LogFit
 
 NOTE = """mean square: of the innovations over their variance. White innovations have a mean square of 1 and no
 autocorrelation."""
@@ -49,3 +49,22 @@ def logs(summary: Identified) -> Table:
     rows = [row(one, "estimation") for one in summary.logs] + [row(one, "validation") for one in summary.validation]
     head = ("log", "use", "duration [s]", "readings", "outliers", "mean square", "autocorrelation", "white")
     return Table(head, rows, NOTE)
+
+
+def of_design(summary: Designed) -> Report:
+    """Return the report of `ptsmc identify --design`."""
+    rows = [
+        (
+            str(one["parameter"]),
+            *(f"{one[key]:.3g}" for key in ("value", "expected_std", "plain_std")),
+            str(one["unit"]),
+        )
+        for one in summary.parameters
+    ]
+    table = Table(
+        ("parameter", "scenario", "expected 1 sigma", "after plain slews", "unit"), rows,
+        "Plain slews: one about each axis, one after another, within the same limits and time.",
+    )  # fmt: skip
+    lines = ["send the torque in profile.csv, and record attitude, rate and torque for ptsmc identify"]
+    headline = f"Proposed a manoeuvre of {summary.duration:.4g} s"
+    return Report(headline, "calm", [*lines, *summary.undetermined], [Section("Expected accuracy", [table])])

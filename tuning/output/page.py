@@ -193,6 +193,12 @@ def _montecarlo(result: Result) -> Report:
     return _with(report, Section("Gains", [campaign_report.gains(result.scenario, result.plant)]))
 
 
+def _identify(result: Result) -> Report:
+    if result.summary.get("status") == "designed":
+        return identify_report.of_design(summaries.read(summaries.Designed, result.summary))
+    return identify_report.of(summaries.read(summaries.Identified, result.summary))
+
+
 def _map(result: Result) -> Report:
     head, *rows = result.rows("map.csv")
     return map_report.of(head, rows, result.plant)
@@ -205,7 +211,7 @@ REPORTS: dict[str, Callable[[Result], Report]] = {
     "compare": lambda result: compare_report.of(summaries.read(summaries.Compare, result.summary)),
     "montecarlo": _montecarlo,
     "map": _map,
-    "identify": lambda result: identify_report.of(summaries.read(summaries.Identified, result.summary)),
+    "identify": _identify,
     "margins": lambda result: margins_report.of(summaries.read(summaries.Margins, result.summary)),
     "reproduce": lambda result: paper_report.of(summaries.read(summaries.Paper, result.summary)),
 }

@@ -391,6 +391,15 @@ class GyroBias(msgspec.Struct, frozen=True):
     std: list[float]
 
 
+class Designed(msgspec.Struct, frozen=True, kw_only=True):
+    """The summary of `ptsmc identify --design`."""
+
+    status: str
+    duration: float
+    parameters: list[dict[str, float | str]]
+    undetermined: list[str]
+
+
 class Identified(msgspec.Struct, frozen=True, kw_only=True):
     """The summary of `ptsmc identify`."""
 

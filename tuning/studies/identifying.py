@@ -5,12 +5,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import polars as pl
 from scipy.spatial.transform import Rotation
 
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.identification import results
+from ptsmc_jax.identification.design import Design
 from ptsmc_jax.identification.estimation import Fit, Identification
 from ptsmc_jax.scenario import custom, parsing
+from ptsmc_jax.scenario.tables import Scenario
 from tuning.search import custom_parts
 
 
@@ -37,6 +40,37 @@ def write(folder: Path, found: Identification, figures: bool, made_by: Mapping[s
         from ptsmc_jax.figures import style
 
         style.save(figures_of(found), folder / "figures")
+
+
+def design_summary(design: Design, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the content of `summary.json` of a design; given: its duration [s] and limits."""
+    rows = list(design.table().iter_rows(named=True))
+    return {"status": "designed", **given, "parameters": rows, "undetermined": design.undetermined}
+
+
+def write_design(folder: Path, scenario: Scenario, design: Design, figures: bool, given: Mapping[str, Any]) -> None:
+    """Write a result folder: `profile.csv`, `summary.json` and a figure of the profile.
+
+    Args:
+        folder: an empty folder.
+        scenario: the scenario.
+        design: the proposed manoeuvre.
+        figures: write figures too.
+        given: its duration [s] and limits.
+    """
+    made = {"command": "identify", "seed": None, "design": True, **custom.digests(scenario)}
+    store.record(folder, parsing.dump(scenario), made, design_summary(design, given))
+    frame = design.frame
+    store.write_csv(folder / "profile.csv", frame.columns, frame.rows())
+    if figures:
+        from ptsmc_jax.figures import identification_plots, style
+
+        blocks = {"sent": "command", "measured_w": "rate [rad/s]", "measured_x": "state"}
+        panels = [
+            (label, frame.select(pl.col(f"^{name}\\d+$")).to_numpy()) for name, label in blocks.items()
+            if f"{name}1" in frame.columns
+        ]  # fmt: skip
+        style.save({"profile": identification_plots.profile(frame["t"].to_numpy(), panels)}, folder / "figures")
 
 
 def innovations(fit: Fit) -> tuple[np.ndarray, np.ndarray]:

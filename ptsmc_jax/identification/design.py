@@ -1,0 +1,198 @@
+"""Propose the torque profile whose log determines the free parameters best. Start with `design`.
+
+The momentum about each axis is a sum of sines that are zero at both ends, so that the manoeuvre goes from rest to rest.
+Its amplitudes maximise log det of the Fisher information, within the limits of torque, rate and wheel momentum.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import numpy as np
+import polars as pl
+
+from ptsmc_jax.identification import estimation, parameters
+from ptsmc_jax.identification.estimation import Search
+from ptsmc_jax.identification.filtering import Kind
+from ptsmc_jax.identification.parameters import Problem
+from ptsmc_jax.identification.telemetry import Measurements
+from ptsmc_jax.scenario import reading
+from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.scenario.tables import Scenario
+
+HALF_WAVES = (1, 2, 3, 4, 6, 8)  # of each sine in the manoeuvre
+CANDIDATES, REFINEMENTS = 24, 40  # random profiles, and changes of the best one
+RATE = 0.05  # default limit of the rate [rad/s]
+
+
+@dataclass(frozen=True)
+class Design:
+    """A proposed manoeuvre and the expected accuracy."""
+
+    problem: Problem
+    frame: pl.DataFrame  # t [s], sent1.. [N m] and the expected readings, with the columns of `trajectory.csv`
+    std: np.ndarray  # expected 1 sigma of each number (k,)
+    plain: np.ndarray  # of one slew about each axis, one after another, within the same limits (k,)
+    undetermined: list[str]
+
+    def table(self) -> pl.DataFrame:
+        """Return a row for each number: value, expected 1 sigma, 1 sigma after plain slews, unit."""
+        numbers = np.asarray(self.problem.read(self.problem.model))
+        return pl.DataFrame({
+            "parameter": self.problem.labels, "value": numbers, "expected_std": self.std, "plain_std": self.plain,
+            "unit": self.problem.units,
+        })  # fmt: skip
+
+
+def design(
+    what: Scenario | str | Any,
+    duration: float = 300.0,
+    *,
+    rate: float = RATE,
+    torque: float | None = None,
+    report: Callable[[str], None] = lambda text: None,
+) -> Design:
+    """Return the profile of commanded torque that determines the free parameters best.
+
+    Args:
+        what: a scenario, or the path of its file. [identify] names the parameters, [hardware] the noises.
+        duration: of the manoeuvre [s].
+        rate: largest rate about an axis, of other plants the largest velocity [rad/s].
+        torque: largest torque about an axis [N m]; by default that of the actuators.
+        report: called with the progress in words.
+
+    Raises:
+        ScenarioError: no limit of the torque is known, or the manoeuvre is shorter than 20 control periods.
+    """
+    loaded = reading.complete(reading.of(what))
+    period = loaded.loop.period
+    if not loaded.sampled or duration < 20.0 * period:
+        raise ScenarioError("a design needs the sampled loop and a manoeuvre of at least 20 control periods")
+    t = period * np.arange(round(duration / period) + 1)
+    shapes = np.stack([np.sin(np.pi * k * t / t[-1]) for k in HALF_WAVES])  # momentum
+    log = _silent(loaded, t)
+    problem = parameters.build(loaded, [log])
+    limits = _Limits.of(loaded, problem, rate, torque)
+    search = Search(problem, [], np.inf, lambda text: None)
+    kind = Kind.of(log)
+
+    def information(momentum: np.ndarray) -> tuple[np.ndarray, Measurements]:
+        command = np.append(np.diff(momentum, axis=0) / period, np.zeros((1, momentum.shape[1])), axis=0)
+        expected = _expected(problem, search, log._replace(command=command), kind)
+        return search.derivatives(np.zeros(problem.size), [(estimation.rows(problem, expected), kind)])[2], expected
+
+    def value(momentum: np.ndarray) -> float:
+        sizes = np.linalg.eigvalsh(information(momentum)[0])
+        return float(np.sum(np.log(np.maximum(sizes, 1e-12))))
+
+    inputs = log.command.shape[1]
+    plain = limits.scaled(_one_after_another(t, inputs), period)
+    best, amplitudes = value(plain), None
+    chosen, random = plain, np.random.default_rng(0)
+    for k in range(CANDIDATES + REFINEMENTS):
+        if amplitudes is None or k < CANDIDATES:
+            new = random.standard_normal((inputs, len(HALF_WAVES)))
+        else:
+            new = amplitudes + 0.5 * np.std(amplitudes) * random.standard_normal(amplitudes.shape)
+        momentum = limits.scaled((new @ shapes).T, period)
+        found = value(momentum)
+        if found > best:
+            best, amplitudes, chosen = found, new, momentum
+        report(f"profile {k + 1} of {CANDIDATES + REFINEMENTS}: log det of the information {best:.5g}")
+    numbers = jax.jit(lambda z: problem.read(problem.at(z)))
+    by_z = np.asarray(jax.jacfwd(numbers)(np.zeros(problem.size)))
+
+    def std(information: np.ndarray) -> np.ndarray:
+        return np.sqrt(np.diag(by_z @ estimation.covariance(information) @ by_z.T))
+
+    of_best, expected = information(chosen)
+    return Design(
+        problem,
+        _frame(expected),
+        std(of_best),
+        std(information(plain)[0]),
+        estimation.undetermined(problem, of_best, by_z),
+    )
+
+
+@dataclass(frozen=True)
+class _Limits:
+    """Limits of a manoeuvre."""
+
+    torque: float  # [N m]
+    rate: float  # [rad/s]
+    inverse: np.ndarray  # (m, m) rate per momentum
+    channels: np.ndarray  # (channels, m) torque of each channel for a torque about each axis
+    momentum: float  # of each wheel [N m s]
+
+    @staticmethod
+    def of(loaded: Any, problem: Problem, rate: float, torque: float | None) -> "_Limits":
+        wheels = loaded.reaction_wheels
+        limits = [torque, loaded.devices.torque_limit, None if wheels is None else wheels.torque_limit]
+        known = [one for one in limits if one is not None]
+        if not known:
+            raise ScenarioError(
+                "hardware.torque_limit is absent, but a design needs the largest torque; allowed is --torque too"
+            )
+        plant, actuators = problem.model.plant, problem.model.actuators
+        channels = np.eye(plant.inputs) if actuators.wheels is None else np.asarray(actuators.wheels.allocation)
+        momentum = np.inf if wheels is None or wheels.momentum_limit is None else wheels.momentum_limit
+        return _Limits(min(known), rate, np.asarray(plant.inertia_inverse), channels, momentum)
+
+    def scaled(self, momentum: np.ndarray, period: float) -> np.ndarray:
+        """Return a momentum profile (rows, m) with a factor that makes it meet all limits with 5 % to spare."""
+        stored, push = momentum @ self.channels.T, np.diff(momentum, axis=0) / period
+        largest = [
+            np.max(np.abs(push)) / self.torque,
+            np.max(np.abs(push @ self.channels.T)) / self.torque,
+            np.max(np.abs(momentum @ self.inverse.T)) / self.rate,
+            np.max(np.abs(stored)) / self.momentum,
+        ]
+        return momentum * (0.95 / max(largest))
+
+
+def _one_after_another(t: np.ndarray, inputs: int) -> np.ndarray:
+    """Return the momentum of one slew about each axis, one after another."""
+    length = t[-1] / inputs
+    momentum = np.zeros((len(t), inputs))
+    for k in range(inputs):
+        within = (t >= k * length) & (t < (k + 1) * length)
+        momentum[within, k] = np.sin(np.pi * (t[within] - k * length) / length) ** 2
+    return momentum
+
+
+def _silent(loaded: Any, t: np.ndarray) -> Measurements:
+    """Return a log at rest with the sensors of the scenario."""
+    if loaded.plant.kind != "spacecraft":
+        x = np.tile(np.asarray(loaded.plant.x0, float), (len(t), 1))
+        return Measurements("design", t, {"x": x}, np.zeros((len(t), loaded.inputs)))
+    q = np.tile([0.0, 0.0, 0.0, 1.0], (len(t), 1))
+    every = max(1, round(loaded.devices.interval(loaded.loop.period) / loaded.loop.period))
+    q[np.arange(len(t)) % every != 0] = np.nan
+    return Measurements("design", t, {"attitude": q, "rate": np.zeros((len(t), 3))}, np.zeros((len(t), 3)))
+
+
+def _expected(problem: Problem, search: Search, log: Measurements, kind: Kind) -> Measurements:
+    """Return the log with the readings that the model predicts without noise."""
+    rows = estimation.rows(problem, log)
+    blind = rows._replace(valid=np.concatenate([rows.valid[:1], np.zeros_like(rows.valid[1:])]))
+    _, track = search.filtered(np.zeros(problem.size), (blind, kind))
+    sampled = rows.source[1:] >= 0
+    x = jax.tree.map(lambda v: v[sampled], track.x)
+    readings = dict(log.readings)
+    if "x" in readings:
+        readings["x"] = np.concatenate([readings["x"][:1], np.asarray(jax.vmap(problem.model.plant.visible)(x))])
+    else:
+        there = ~np.isnan(readings["attitude"][:, :1])
+        q = np.concatenate([readings["attitude"][:1], x.q])
+        readings = {"attitude": np.where(there, q, np.nan), "rate": np.concatenate([readings["rate"][:1], x.w])}
+    return log._replace(readings=readings)
+
+
+def _frame(log: Measurements) -> pl.DataFrame:
+    columns = {"t": log.t}
+    blocks = {"attitude": "measured_q", "rate": "measured_w", "x": "measured_x"}
+    for name, values in (*log.readings.items(), ("sent", log.command)):
+        columns |= {f"{blocks.get(name, name)}{k + 1}": column for k, column in enumerate(values.T)}
+    return pl.DataFrame(columns)

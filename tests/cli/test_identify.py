@@ -1,0 +1,98 @@
+"""The command `ptsmc identify`: the round trip from a simulated run, its files, and its refusals."""
+
+import json
+
+import polars as pl
+import pytest
+
+from ptsmc_jax import scenario
+from tests.helpers import tree
+
+CHAIN = """
+[plant]
+kind = "chain"
+order = 2
+x0 = [1.0, 0.0]
+[controller]
+t_f = 5.0
+[disturbance]
+kind = "none"
+[loop]
+mode = "sampled"
+period = 0.1
+[hardware]
+state_noise = [1e-3, 1e-3]
+torque_limit = 2.0
+[identify]
+free = ["actuator_scale", "disturbance_bias"]
+prior = "none"
+"""
+
+
+@pytest.fixture
+def logged(command, tmp_path):
+    """A scenario whose input has 0.8 of the torque that the log's plant has, and the log."""
+    (tmp_path / "true.toml").write_text(CHAIN.replace("[hardware]", "[hardware]\nactuator_scale = [1.25]"))
+    (tmp_path / "s.toml").write_text(CHAIN)
+    assert command("simulate", "true.toml", "--out", "run", "--no-figures", "--quiet")[0] == 0
+    return tmp_path
+
+
+def test_a_simulated_run_gives_its_parameters_and_a_page(command, logged):
+    log = "run/trajectory.csv"
+    status, out, err = command("identify", "s.toml", log, "--validate", log, "--out", "found")
+    assert status == 0, err
+    assert out.startswith("The model explains the telemetry")
+    folder = logged / "found"
+    names = ["estimates"] + [
+        f"{name}{k}" for name in ("autocorrelation", "innovations", "prediction") for k in ("", "_2")
+    ]
+    files = {
+        "scenario.toml",
+        "versions.json",
+        "summary.json",
+        "identified.toml",
+        "innovations.csv",
+        "innovations_2.csv",
+    }
+    assert set(tree(folder)) == files | {f"figures/{name}.png" for name in names}
+    summary = json.loads((folder / "summary.json").read_text())
+    scale = summary["parameters"][0]
+    assert abs(scale["estimate"] - 1.25) < 3.5 * scale["std"] < 0.02
+    assert summary["validation"][0]["white"]
+    identified = scenario.read(folder / "identified.toml")
+    assert identified.hardware.actuator_scale == (scale["estimate"],)
+    assert identified.dispersion.actuator_scale.std == pytest.approx(scale["std"] / scale["estimate"])
+    assert command("simulate", "found/identified.toml", "--out", "again", "--trial", 1, "--no-figures")[0] == 0
+    assert command("report", "found")[0] == 0
+    assert "actuator_scale" in (folder / "report.html").read_text()
+
+
+def test_a_design_has_a_profile_within_the_limits(command, logged):
+    status, out, err = command("identify", "s.toml", "--design", "--duration", 6, "--rate", 0.5, "--out", "plan")
+    assert status == 0, err
+    assert out.startswith("Proposed a manoeuvre of 6 s")
+    profile = pl.read_csv(logged / "plan" / "profile.csv")
+    assert profile["sent1"].abs().max() <= 2.0
+    assert profile["measured_x2"].abs().max() <= 0.5 + 1e-9
+    rows = json.loads((logged / "plan" / "summary.json").read_text())["parameters"]
+    assert 0.0 < rows[0]["expected_std"] < rows[0]["plain_std"]
+    assert command("report", "plan")[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ([], "there is no LOG, but must be one"),
+        (["run/trajectory.csv", "--design"], "there are logs, but --design needs none"),
+        (["run/trajectory.csv", "--rate", "0.1"], "--rate is 0.1, but must be absent without --design"),
+        (["absent.csv"], "the log absent.csv is not there"),
+        (["s.toml"], "the log is s.toml, but must be a .csv or .parquet file"),
+    ],
+)
+def test_wrong_options_and_files_are_refused_and_nothing_is_written(command, tmp_path, options, words):
+    (tmp_path / "s.toml").write_text(CHAIN)
+    status, _, err = command("identify", "s.toml", *options)
+    assert status == 2
+    assert words in err
+    assert not (tmp_path / "out").exists()
