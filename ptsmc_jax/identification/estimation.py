@@ -1,9 +1,9 @@
 """Maximum-likelihood estimates of the free parameters of a scenario from telemetry. Start with `identify`.
 
-The likelihood is that of the innovations of the filter. Its maximum is found by Fisher scoring with the step control of
-Levenberg and Marquardt: each step solves (I + damping) step = gradient, with the exact gradient and the Fisher
-information I of the innovations and their variances (Astrom, Automatica 16(5), 1980; Gupta and Mehra, IEEE TAC 19(6),
-1974). Both come from the derivatives of the innovations in forward mode.
+The likelihood is that of the innovations of the filter. Fisher scoring finds its maximum, with the step control of
+Levenberg and Marquardt. Each step solves (I + damping) step = gradient. The gradient is exact, and I is the Fisher
+information of the innovations and their variances (Gupta and Mehra, IEEE Trans. Automatic Control 19(6), 1974). Both
+come from the derivatives of the innovations in forward mode.
 """
 
 from collections.abc import Callable, Sequence

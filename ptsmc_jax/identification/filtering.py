@@ -1,10 +1,10 @@
 """Prediction errors of a log: an extended Kalman filter over the true plant, with its actuators and disturbances.
 
-The filter is multiplicative for a spacecraft: its error state is a small rotation about the body axes, the error of the
-rate, of modal coordinates, of the gyro bias, and of a random-walk torque (Lefferts, Markley, Shuster, JGCD 5(5), 1982).
-Other plants have their own states instead. The torque is constant between samples before delay and lag. Components of
-a sample have independent noise, so they correct the state one after the other: each innovation is a scalar with its
-variance (Bierman, Factorization Methods for Discrete Sequential Estimation, 1977, chapter 2). Read `innovations` first.
+The filter is multiplicative for a spacecraft (Lefferts, Markley, Shuster, JGCD 5(5), 1982). Its error state is a small
+rotation about the body axes, and the errors of rate, modes, gyro bias and random-walk torque. Other plants have their
+own states instead. The command is constant between samples, before delay and lag. The components of a sample have
+independent noise and correct the state one after the other. Each innovation is therefore a scalar with a variance
+(Bierman, Factorization Methods for Discrete Sequential Estimation, 1977, chapter 2). Read `filtered` first.
 """
 
 from dataclasses import dataclass, replace

@@ -29,7 +29,7 @@ from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.signals import disturbances
 
 GYRO_BIAS = "gyro_bias"  # a state of the filter, not a constant
-UNKNOWN_BIAS = 0.02  # 1 sigma of a gyro bias of which nothing is known [rad/s]
+UNKNOWN_BIAS = 0.02  # 1 sigma of an unknown gyro bias [rad/s]
 USUAL = {  # 1 sigma of a parameter without a dispersion: relative, or in rad
     "inertia": 0.3, "actuator_scale": 0.1, "actuator_misalignment": 0.03, "gyro_scale": 0.02,
     "star_tracker_misalignment": 0.02, "noise": 1.0, "torque_lag": 0.7, "mode_frequency": 0.2, "mode_damping": 1.0,
@@ -255,7 +255,7 @@ def _catalogue(
     def field(
         name: str, path: Callable[[Model], Any], put: Callable[[Model, Array], Model], count: int, unit: str, how: str
     ) -> Maker:
-        """Return the maker of numbers that are multiplied by e^c ("log") or 1 + c, or to which c is added."""
+        """Return the maker of numbers that change by a factor e^c ("log"), by a factor 1 + c ("factor"), or by c."""
 
         def make(model: Model) -> tuple[Model, Parameter]:
             sizes, known = spread(name, count)

@@ -94,7 +94,7 @@ class Identify(Table, frozen=True):
     ] = 3
     outliers: Annotated[
         Annotated[float, Meta(ge=0, lt=1, description="a number from 0 to below 1")],
-        Meaning("probability that a sample without error is rejected as an outlier; 0: none is rejected"),
+        Meaning("probability that a sample without error is rejected as an outlier; 0: no sample is rejected"),
     ] = 1e-6
 
 

@@ -76,7 +76,7 @@ def test_a_log_that_was_not_used_is_predicted(identified):
     (fit,) = found.validation
     assert fit.white
     assert fit.outliers == 0
-    assert 0.9 < fit.square < 1.1  # 1500 numbers of which the standard deviation is 0.04
+    assert 0.9 < fit.square < 1.1  # the mean of 1500 squares has a standard deviation of 0.04
 
 
 def test_the_identified_scenario_has_the_estimate_and_its_covariance(identified):
