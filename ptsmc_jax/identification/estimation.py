@@ -28,6 +28,7 @@ from ptsmc_jax.scenario.tables import Scenario
 BUCKET = 256  # rows of a log are padded to a multiple of it, so that similar logs share compiled programs
 STEPS = 40  # largest number of steps of a local search
 LONGEST = 3.0  # step, in sigmas of the prior
+NEAR = 0.3  # largest step that ends a search with noise on the acceleration, in sigmas of the estimate
 CONVERGED = 1e-3  # largest step of a converged search, in sigmas of the estimate
 SLACK = (0.3, 0.01)  # noise of the acceleration at the begin of a search, relative to the acceleration [s^0.5]
 SCREENINGS = 4  # largest number of times that outliers are determined again
@@ -342,16 +343,16 @@ class Search:
             for factor in SLACK:
                 self.slack = jnp.asarray(factor * acceleration)
                 self.report(f"the fit is poor: a filter with noise of {float(self.slack):.2g} rad/s^1.5")
-                z = self._run(z, screenings=1).z
+                z = self._run(z, 1, NEAR).z
             self.slack = jnp.zeros(())
-        return self._run(z, SCREENINGS)
+        return self._run(z, SCREENINGS, CONVERGED)
 
     def mean_square(self, z: np.ndarray) -> float:
         """Return the median of the normalised squares of the innovations over that of a good fit."""
         scales = [self._scale(self.innovations(z, log)) for log in self.logs]
         return max(scales)
 
-    def _run(self, z: np.ndarray, screenings: int) -> Found:
+    def _run(self, z: np.ndarray, screenings: int, enough: float) -> Found:
         logs, before, found = self.logs, None, None
         for _ in range(screenings if np.isfinite(self.gate) else 1):
             if np.isfinite(self.gate):
@@ -360,7 +361,7 @@ class Search:
                 if before is not None and np.array_equal(masks, before):
                     break
                 before = masks
-            found = self.climb(z, logs)
+            found = self.climb(z, logs, enough)
             z = found.z
         assert found is not None
         return found
@@ -382,8 +383,8 @@ class Search:
         rows, kind = log
         return rows._replace(valid=np.concatenate([rows.valid[:1], found.accepted])), kind
 
-    def climb(self, z: np.ndarray, logs: Sequence[tuple[Rows, Kind]]) -> Found:
-        """Return the nearest maximum of the likelihood of these logs."""
+    def climb(self, z: np.ndarray, logs: Sequence[tuple[Rows, Kind]], enough: float) -> Found:
+        """Return the nearest maximum of the likelihood of these logs; it ends after a step below `enough` sigma."""
         value, gradient, information, square = self.derivatives(z, logs)
         damping, converged, steps = 0.0, False, 0
         for steps in range(1, STEPS + 1):
@@ -399,11 +400,11 @@ class Search:
                     break
                 damping = max(10.0 * damping, float(np.min(sizes, initial=1.0)))
                 if damping > 1e12:
-                    return Found(z, value, information, square, size < CONVERGED, steps)
+                    return Found(z, value, information, square, size < enough, steps)
             z, damping = z + step, damping / 100.0
             value, gradient, information, square = self.derivatives(z, logs)
             self.report(f"step {steps}: mean square of the innovations {square:.4g}")
-            if size < CONVERGED:
+            if size < enough:
                 converged = True
                 break
         return Found(z, value, information, square, converged, steps)

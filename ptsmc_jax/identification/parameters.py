@@ -248,7 +248,7 @@ def _catalogue(
     def spread(name: str, count: int) -> tuple[np.ndarray, bool]:
         """Return the 1 sigma of each number, (count,), and whether [dispersion] gives it."""
         table = getattr(prior, name, None)
-        if table is None:
+        if not hasattr(table, "of"):  # without a dispersion, or with a phase that is uniform over the circle
             return np.full(count, USUAL["noise" if name.endswith("_noise") else name]), False
         return np.maximum(table.of(count) * (1.0 if table.name.endswith("normal") else 1.0 / np.sqrt(3.0)), 1e-9), True
 

@@ -68,7 +68,11 @@ class Actuators(Table, frozen=True):
         ),
     ] = None
     actuator_scale: Annotated[
-        Annotated[tuple[Positive, ...], Meta(min_length=1, description="a list of numbers greater than 0")] | None,
+        Annotated[
+            tuple[Positive, ...],
+            Meta(min_length=1, description="a list of numbers greater than 0, one for each axis, wheel or input"),
+        ]
+        | None,
         Meaning("ratio of the true torque of each axis, wheel or input to the torque that the computer knows"),
     ] = None
     levels: ClassVar[Mapping[str, tuple[str, ...]]] = {}  # by dispersion key: the keys here that set the nominal value
@@ -163,7 +167,11 @@ class Hardware(Actuators, frozen=True):
         ),
     ] = None
     actuator_misalignment_deg: Annotated[
-        Annotated[tuple[Three, ...], Meta(min_length=1, description="a list of rows of three numbers")] | None,
+        Annotated[
+            tuple[Three, ...],
+            Meta(min_length=1, description="a list of rows of three numbers, one for each axis, wheel or input"),
+        ]
+        | None,
         Meaning("rotation vector of each axis, or wheel, from the axis that the computer knows", "deg"),
     ] = None
     gyro_scale: Annotated[Three | None, Meaning("ratio of the reading of the gyro to the true rate, by axis")] = None

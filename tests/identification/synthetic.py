@@ -4,6 +4,9 @@ import numpy as np
 import polars as pl
 
 
+SPIN_INERTIA = 1e-5  # of each wheel [kg m^2]
+
+
 def cross(a, b):
     return np.stack([
         a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1],
@@ -27,6 +30,8 @@ def logs(
     star=5e-5, gyro=1.4e-4, bias=1e-4, walk=0.0, disturbance=lambda t: np.zeros(3),
 ):  # fmt: skip
     """Return frames with the columns of `trajectory.csv`, and the true gyro bias of each at its end [rad/s].
+
+    The columns speed1 to speed3 have the speeds of the wheels relative to the body [rad/s].
 
     The torque has `slews` smooth slews about random axes, each with an acceleration and a deceleration.
 
@@ -56,13 +61,14 @@ def logs(
     q, w, h = np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)), np.zeros((count, 3)), np.zeros((count, 3))
     v = np.zeros((count, 3))
     drift = bias * rng.standard_normal((count, 3))
-    attitudes, rates = [], []
+    attitudes, rates, speeds = [], [], []
     steps = 4
     for k in range(rows):
         if k:
             drift = drift + walk * np.sqrt(dt) * rng.standard_normal((count, 3))
         attitudes.append(multiply(q, small(star * rng.standard_normal((count, 3)))))
         rates.append(w + drift + gyro * rng.standard_normal((count, 3)))
+        speeds.append(h / SPIN_INERTIA - w)
         target = command[:, k]
         for j in range(steps):
             s = dt / steps
@@ -86,11 +92,12 @@ def logs(
             y = y + s / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
             q, w, h = y[:, :4] / np.linalg.norm(y[:, :4], axis=1, keepdims=True), y[:, 4:7], y[:, 7:]
             v = target + (v - target) * np.exp(-s / lag) if lag else target
-    attitudes, rates = np.stack(attitudes, 1), np.stack(rates, 1)
+    attitudes, rates, speeds = np.stack(attitudes, 1), np.stack(rates, 1), np.stack(speeds, 1)
     frames = []
     for k in range(count):
         columns = {"t": t}
-        for name, block in (("measured_q", attitudes[k]), ("measured_w", rates[k]), ("sent", command[k])):
+        blocks = {"measured_q": attitudes[k], "measured_w": rates[k], "sent": command[k], "speed": speeds[k]}
+        for name, block in blocks.items():
             columns |= {f"{name}{i + 1}": block[:, i] for i in range(block.shape[1])}
         frames.append(pl.DataFrame(columns))
     return frames, drift

@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from ptsmc_jax import formulas, scenario
+from ptsmc_jax import explore, formulas, scenario
 from ptsmc_jax.dispersions import inertias
 from ptsmc_jax.dispersions.quantities import PAIRS
 from ptsmc_jax.identification import estimation, results
@@ -120,6 +120,34 @@ def test_only_the_ratio_of_inertia_to_actuator_scale_is_determined():
     found = estimation.identify(satellite(("inertia", "actuator_scale", "gyro_bias"), **body), frame)
     assert any("only the ratio of inertia to actuator_scale" in line for line in found.undetermined)
     assert not found.good
+
+
+@pytest.mark.long
+def test_wheel_speeds_replace_the_commanded_torque():
+    frame, _ = flight(np.random.default_rng(4))
+    table = {"wheel_speed": ["speed1", "speed2", "speed3"], "wheel_inertia": synthetic.SPIN_INERTIA}
+    found = estimation.identify(satellite(telemetry=table), frame.drop("sent1", "sent2", "sent3"))
+    assert found.good, results.verdict(found)
+    assert np.all(np.abs(found.estimate - ENTRIES) < 3.5 * found.std)
+
+
+@pytest.mark.long
+def test_a_mode_is_identified_from_a_simulated_run():
+    loaded = scenario.from_tables({
+        "spacecraft": {"inertia": [4.0, 5.0, 6.0]},
+        "flexible": {"frequency": [3.0], "damping": [0.01], "coupling": [[0.7, 0.0, 0.0]]},
+        "controller": {"t_f": 15.0, "error": "multiplicative"},
+        "loop": {"mode": "sampled", "period": 0.1},
+        "disturbance": {"kind": "none"},
+        "hardware": {"attitude_noise": 2e-5, "rate_noise": 1e-5},
+        "identify": {"free": ["mode_frequency", "mode_coupling", "inertia"], "prior": "none"},
+    })  # fmt: skip
+    frame = explore.simulate(loaded).to_polars()
+    off = scenario.replace(loaded, flexible__frequency=[3.3], flexible__coupling=[[0.6, 0.0, 0.0]])
+    found = estimation.identify(off, frame)
+    true = np.array([3.0, 0.7, 0.0, 0.0, 4.0, 0.0, 0.0, 5.0, 0.0, 6.0])
+    assert found.fits[0].white
+    assert np.all(np.abs(found.estimate - true) < 3.5 * found.std + 1e-12)
 
 
 def test_unknown_parameters_and_logs_that_differ_are_refused():

@@ -55,9 +55,7 @@ def prepared(loaded, frame):
 def test_innovations_are_those_of_an_independent_kalman_filter():
     frame, t, u, y = chain_log()
     problem, (rows, kind) = prepared(chain(["actuator_scale"], torque_walk=WALK), frame)
-    found, track = jax.jit(lambda rows: filtering.filtered(problem.model, rows, kind))(
-        jax.tree.map(jnp.asarray, rows)
-    )
+    found, track = jax.jit(lambda rows: filtering.filtered(problem.model, rows, kind))(jax.tree.map(jnp.asarray, rows))
     # exact discretisation by the matrix exponential, joint update of both readings, covariance form of Joseph
     whitened = np.where(found.accepted, found.value / np.sqrt(found.variance), np.nan)[rows.source[1:] >= 0]
     z, p = np.append(y[0], 0.0), np.diag([*np.square(NOISE), 0.0])

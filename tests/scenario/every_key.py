@@ -10,6 +10,7 @@ from tuning.cli import new
 KEY = re.compile(r"^#?([a-z]\w*) = ")
 TABLE = re.compile(r"^#?\[(\w+)\]")
 ATTITUDE = {*ATTITUDE_KEYS, "sequence"}
+COMMANDS = {"torque", "wheel_torque", "wheel_speed"}
 
 
 def key_of(line):
@@ -64,7 +65,9 @@ def complete(plant):
     hardware = values(found["hardware"])
     for key in ("rate_noise_density", "star_tracker_every", "star_tracker_period"):  # exclude rate_noise, need a filter
         hardware.pop(key, None)
-    base = {**written, "loop": {**written["loop"], "mode": "sampled"}, "hardware": hardware}
+    # keys with a row for each axis or wheel, which do not fit four wheels
+    alike = {key: value for key, value in hardware.items() if not key.startswith("actuator_")}
+    base = {**written, "loop": {**written["loop"], "mode": "sampled"}, "hardware": alike}
     drawn = base | ({"flexible": {}, "wheels": {}, "filter": {}} if plant == "spacecraft" else {})  # for dispersions
     every = []
     for name, lines in found.items():
@@ -73,6 +76,8 @@ def complete(plant):
             groups = [[line] for line in lines]
         elif name == "initial":
             groups = attitudes(lines)
+        elif name == "telemetry" and plant == "spacecraft":  # one of three kinds of commands
+            groups = [[line for line in lines if key_of(line) not in COMMANDS - {key}] for key in sorted(COMMANDS)]
         around = {"tune": written, "dispersion": drawn}.get(
             name, base
         )  # default bounds of delta follow the loop's mode

@@ -59,6 +59,10 @@ EXAMPLES: dict[str, Any] = {
     "hardware.star_tracker_every": 4,
     "hardware.star_tracker_period": 0.25,
     "hardware.state_noise": 1e-4,
+    "hardware.actuator_scale": 1.02,
+    "hardware.actuator_misalignment_deg": [0.0, 0.0, 0.1],
+    "hardware.gyro_scale": [1.001, 0.999, 1.0],
+    "hardware.star_tracker_misalignment_deg": [0.0, 0.01, 0.0],
     "wheels.torque_limit": 0.2,
     "wheels.momentum_limit": 4.0,
     "wheels.momentum": 0.0,
@@ -67,6 +71,17 @@ EXAMPLES: dict[str, Any] = {
     "dispersion.latest": 30.0,
     "dispersion.std": 1.0,
     "tune.level": 0.9,
+    "telemetry.attitude": ["measured_q1", "measured_q2", "measured_q3", "measured_q4"],
+    "telemetry.attitude_age": "measured_age",
+    "telemetry.rate": ["measured_w1", "measured_w2", "measured_w3"],
+    "telemetry.torque": ["sent1", "sent2", "sent3"],
+    "telemetry.wheel_torque": ["torque1", "torque2", "torque3", "torque4"],
+    "telemetry.wheel_speed": ["speed1", "speed2", "speed3", "speed4"],
+    "telemetry.wheel_inertia": 1e-5,
+    "telemetry.state": ["measured_x1", "measured_x2"],
+    "telemetry.input": ["sent1"],
+    "identify.free": ["inertia", "gyro_bias"],
+    "identify.torque_walk": 1e-6,
 }
 REQUIREMENTS = {"window_error": {"limit": 1e-4, "quantile": 0.9973, "confidence": 0.9}, "peak_torque": 0.5}
 INTRODUCTION = """\
@@ -200,6 +215,8 @@ class _File:
         value = EXAMPLES[f"{table}.{key.name}"]
         if key.allowed.endswith("for each state"):
             return [value] * len(self.resolved.plant.x0)
+        if key.allowed.endswith("for each axis, wheel or input"):
+            return [value] * self.resolved.inputs
         return [value] * (4 if kind == "pyramid" else 3) if key.allowed.endswith("for each wheel") else value
 
 
