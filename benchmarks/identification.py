@@ -4,7 +4,7 @@
 
 The logs come from `tests.identification.synthetic`, an independent simulation in NumPy with reaction wheels. The script
 prints the RMS error of each entry of the inertia over its Cramer-Rao bound, the coverage of the 95 % intervals, the
-number of converged searches, and the time. Starting points are random, 30 % (1 sigma) off in each prior coordinate.
+number of converged searches, and the time. Starting points are random: moments up to 30 % and axes up to 17 deg off.
 """
 
 import argparse
@@ -52,7 +52,7 @@ def main() -> None:
     numbers = jax.jit(lambda z: problem.read(problem.at(z)))
     derivatives = jax.jit(jax.jacfwd(numbers))
     truth = np.asarray(numbers(jnp.zeros(problem.size)))
-    errors, bounds, inside, converged, seconds, steps = [], [], [], 0, [], []
+    errors, bounds, inside, converged, seconds = [], [], [], 0, []
     for k, log in enumerate(logs):
         one = estimation.rows(problem, log), Kind.of(log)
         search.logs = [one]
@@ -62,9 +62,9 @@ def main() -> None:
             search.screened(np.zeros(problem.size), one)
             print(f"compiling and a first evaluation: {time.perf_counter() - begun:.1f} s", flush=True)
         begun, processor = time.perf_counter(), time.process_time()
-        found = search.run(rng.standard_normal(problem.size), parameters.acceleration(problem.model, log))
+        start = rng.uniform(-1.0, 1.0, problem.size)
+        found = search.best(start, parameters.acceleration(problem.model, log), 3)
         seconds.append((time.perf_counter() - begun, time.process_time() - processor))
-        steps.append(found.steps)
         _, _, information, _ = search.derivatives(np.zeros(problem.size), search.logs)
         at_truth = np.asarray(derivatives(jnp.zeros(problem.size)))
         bound = np.sqrt(np.diag(at_truth @ np.linalg.inv(information) @ at_truth.T))
@@ -76,10 +76,10 @@ def main() -> None:
         bounds.append(bound)
         inside.append(np.abs(error) < 1.96 * std)
         if k % 5 == 4 or k == len(logs) - 1:
-            ratio, cover = np.sqrt(np.mean(np.square(errors), 0)), np.mean(inside)
-            print(f"{k + 1} logs: RMS error / bound {np.round(ratio, 3)}, all {np.sqrt(np.mean(np.square(errors))):.3f}; "
-                  f"coverage {cover:.3f}; {converged} converged in {np.mean(steps):.1f} steps; "
-                  f"{np.mean(seconds, 0)[0]:.1f} s each, {np.mean(seconds, 0)[1]:.1f} s of processor time", flush=True)  # fmt: skip
+            ratio = np.sqrt(np.mean(np.square(errors), 0))
+            elapsed, processor = np.mean(seconds, 0)
+            print(f"{k + 1} logs: RMS error / bound {np.round(ratio, 3)}, coverage {np.mean(inside):.3f}", flush=True)
+            print(f"  {converged} converged; {elapsed:.1f} s each, {processor:.1f} s of processor time", flush=True)
     print(f"bounds [kg m^2]: {np.mean(bounds, 0)}")
 
 

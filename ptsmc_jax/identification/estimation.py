@@ -216,14 +216,8 @@ def of_logs(
     every = [rows(problem, one) for one in logs]
     search = Search(problem, [(one, Kind.of(log)) for one, log in zip(every, logs, strict=True)], _gate(loaded), report)
     usual = max(parameters.acceleration(problem.model, log) for log in logs)
-    best = search.run(np.zeros(problem.size), usual)
-    draws = np.random.default_rng(0)
-    for k in range(1, 3 if loaded.identify is None else loaded.identify.starts):
-        if best.square < POOR:
-            break
-        report(f"the fit is poor; starting point {k + 1}")
-        other = search.run(draws.standard_normal(problem.size), usual)
-        best = max(best, other, key=lambda found: found.value)
+    starts = 3 if loaded.identify is None else loaded.identify.starts
+    best = search.best(np.zeros(problem.size), usual, starts)
     return _result(loaded, problem, search, best, logs, others)
 
 
@@ -328,6 +322,23 @@ class Search:
             value, gradient, information = value + float(one[0]), gradient + one[1], information + one[2]
             squares.append(float(one[3]))
         return value, gradient, information, float(np.mean(squares))
+
+    def best(self, z: np.ndarray, acceleration: float, starts: int) -> Found:
+        """Return the best of the local searches from z and, while the fit is poor, from random starting points.
+
+        Args:
+            z: first starting point (n,).
+            acceleration: see `run`.
+            starts: largest number of starting points.
+        """
+        best, draws = self.run(z, acceleration), np.random.default_rng(0)
+        for k in range(1, starts):
+            if best.square < POOR:
+                break
+            self.report(f"the fit is poor; starting point {k + 1}")
+            other = self.run(draws.standard_normal(self.problem.size), acceleration)
+            best = max(best, other, key=lambda found: found.value)
+        return best
 
     def run(self, z: np.ndarray, acceleration: float = 0.0) -> Found:
         """Return the end of the local search from coordinates (n,), with its outliers rejected.

@@ -438,7 +438,7 @@ def _inertia(start: np.ndarray, prior: Any) -> Parameter:
     root = vector(inertias.pseudo_root(start))
     by_coordinates = np.asarray(jax.jacfwd(lambda c: _entries(inertias.from_coordinates(root, c)))(jnp.zeros(6)))
     if table is not None and hasattr(table, "factor"):
-        factor = np.asarray(table.factor, dtype=float)
+        factor = table.matrix()
     else:
         std = USUAL["inertia"] if table is None else max(table.std, 1e-6)
         turn = std if table is None or not table.axes_deg else np.deg2rad(table.axes_deg)

@@ -47,7 +47,7 @@ def _put(
         tensor = [[entries[min(i, j), max(i, j)] for j in range(3)] for i in range(3)]
         body = {key: value for key, value in tables.get("spacecraft", {}).items() if key != "true_inertia"}
         tables["spacecraft"] = {**body, "inertia": tensor}
-        dispersion["inertia"] = {"kind": "correlated", "factor": _inertia_factor(found, np.array(tensor)).tolist()}
+        dispersion["inertia"] = {"kind": "correlated", "factor": _rows(_inertia_factor(found, np.array(tensor)))}
     elif name == "actuator_scale":
         hardware["actuator_scale"], dispersion[name] = numbers, relative
     elif name == "actuator_misalignment":
@@ -106,7 +106,7 @@ def _put_disturbance(
 
 
 def _inertia_factor(found: Identification, tensor: np.ndarray) -> np.ndarray:
-    """Return a factor (6, 6) of the covariance of the estimated inertia in its own log-Cholesky coordinates."""
+    """Return a lower triangular factor (6, 6) of the covariance of the estimate in its log-Cholesky coordinates."""
     root = jnp.asarray(inertias.pseudo_root(tensor))
     entries = lambda c: jnp.stack([inertias.from_coordinates(root, c)[i, j] for i, j in PAIRS])  # noqa: E731
     by_coordinates = np.asarray(jax.jacfwd(entries)(jnp.zeros(6)))
@@ -114,7 +114,12 @@ def _inertia_factor(found: Identification, tensor: np.ndarray) -> np.ndarray:
     of_entries = found.covariance[at : at + 6, at : at + 6]
     inverse = np.linalg.inv(by_coordinates)
     sizes, directions = np.linalg.eigh(inverse @ of_entries @ inverse.T)
-    return directions * np.sqrt(np.maximum(sizes, 0.0))
+    lower = np.linalg.qr((directions * np.sqrt(np.maximum(sizes, 0.0))).T, mode="r").T
+    return lower * np.where(np.diag(lower) < 0.0, -1.0, 1.0)
+
+
+def _rows(lower: np.ndarray) -> list[list[float]]:
+    return [row[: k + 1].tolist() for k, row in enumerate(lower)]
 
 
 def _turns(found: Identification) -> np.ndarray:

@@ -17,7 +17,7 @@ from ptsmc_jax.dispersions import inertias
 from ptsmc_jax.dispersions.numbers import RandomNumbers, any_attitude, axis_angle, interval
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.scenario.custom_devices import CUSTOM_DRAW
-from ptsmc_jax.scenario.values import Kinds, Meaning, NotNegative, NotNegatives, Positive, Table, Truth
+from ptsmc_jax.scenario.values import Four, Kinds, Meaning, NotNegative, NotNegatives, Positive, Table, Three, Truth
 
 Angle = Annotated[float, Meta(ge=0, le=180, description="an angle from 0 to 180 degrees")]
 Share = Annotated[float, Meta(ge=0, le=0.3, description="a number from 0 to 0.3")]
@@ -224,16 +224,27 @@ class CorrelatedInertia(Table, frozen=True):
     kind: Literal["correlated"] = "correlated"
     factor: Annotated[
         Annotated[
-            tuple[Annotated[tuple[float, ...], Meta(min_length=6, max_length=6)], ...],
-            Meta(min_length=6, max_length=6, description="six rows of six numbers"),
+            tuple[
+                tuple[float],
+                tuple[float, float],
+                Three,
+                Four,
+                tuple[float, float, float, float, float],
+                tuple[float, float, float, float, float, float],
+            ],
+            Meta(description="six rows of 1 to 6 numbers"),
         ],
-        Meaning("a factor A of the covariance A A' of the coordinates; needed"),
-    ] = ((0.0,) * 6,) * 6
+        Meaning("lower triangular factor A of the covariance A A' of the coordinates, by rows"),
+    ] = tuple((0.0,) * k for k in range(1, 7))  # pyright: ignore[reportAssignmentType]
+
+    def matrix(self) -> np.ndarray:
+        """Return the factor (6, 6) [-]."""
+        return np.array([[*row, *(0.0,) * (6 - len(row))] for row in self.factor])
 
     def build(self, parts: Any, count: int) -> Any:
         """Return `dispersions.inertias.CorrelatedInertia` about the inertia of the true body."""
         return inertias.CorrelatedInertia(
-            vector(inertias.pseudo_root(np.asarray(parts.plant.inertia))), vector(self.factor)
+            vector(inertias.pseudo_root(np.asarray(parts.plant.inertia))), vector(self.matrix())
         )
 
 

@@ -3,7 +3,6 @@
 import numpy as np
 import polars as pl
 
-
 SPIN_INERTIA = 1e-5  # of each wheel [kg m^2]
 
 
