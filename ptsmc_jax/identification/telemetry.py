@@ -13,8 +13,8 @@ import numpy as np
 import polars as pl
 from scipy.spatial.transform import Rotation
 
-from ptsmc_jax.campaigns import csv_tables
 from ptsmc_jax.campaigns.store import RefusedError
+from ptsmc_jax.numerics import csv_tables
 from ptsmc_jax.scenario.identify_tables import StateTelemetry, Telemetry
 from ptsmc_jax.scenario.parsing import nearest
 from ptsmc_jax.scenario.tables import Scenario
@@ -188,7 +188,7 @@ def _of_state(scenario: Scenario, given: Any, table: _Table, t: Values) -> Measu
     complete = ~np.isnan(x).any(axis=1)
     if not complete.any():
         raise RefusedError(f"{table.name} has no row with every component of the state, but must have one")
-    first = _first_row({"x": x}, complete)
+    first = _first_row(t, {"x": x}, complete)
     return Measurements(table.name, t[first:] - t[first], {"x": x[first:]}, command[first:])
 
 
@@ -215,18 +215,19 @@ def _of_spacecraft(scenario: Scenario, given: Any, table: _Table, t: Values) -> 
     _check_motion(table, t, readings)
     lead = readings.get("attitude", readings.get("rate"))
     assert lead is not None
-    first = _first_row(readings, ~np.isnan(lead[:, 0]))
+    first = _first_row(t, readings, ~np.isnan(lead[:, 0]))
     rest = {name: values[first:] for name, values in readings.items()}
     inertia = given.wheel_inertia if given.wheel_speed is not None else None
     return Measurements(table.name, t[first:] - t[first], rest, command[first:], by_channel, inertia)
 
 
-def _first_row(readings: dict[str, Values], complete: Values) -> int:
+def _first_row(t: Values, readings: dict[str, Values], complete: Values) -> int:
     """Return the first complete row without an outlier, because the filter starts from its readings.
 
-    A reading is no outlier if the third difference of the readings from it on is not far beyond the usual one.
+    A reading is an outlier if the third divided difference of the readings from it on is far beyond the usual one.
 
     Args:
+        t: times (rows,) [s].
         readings: by name.
         complete: whether a row has the readings that the filter needs, (rows,) bool.
     """
@@ -234,7 +235,10 @@ def _first_row(readings: dict[str, Values], complete: Values) -> int:
     for values in readings.values():
         there = np.flatnonzero(~np.isnan(values).any(axis=1))
         if there.size > FEWEST:
-            sizes = np.max(np.abs(np.diff(values[there], 3, axis=0)), axis=1)
+            change = values[there]
+            for k in (1, 2, 3):
+                change = np.diff(change, axis=0) / (t[there[k:]] - t[there[:-k]])[:, None]
+            sizes = np.max(np.abs(change), axis=1)
             good[there[:-3][sizes > OUTLIER * np.median(sizes)]] = False
     return int(np.argmax(good)) if good.any() else int(np.argmax(complete))
 

@@ -6,7 +6,7 @@ from typing import Annotated
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from tuning.cli.options import Figures, Force, Out, Quiet, Trust, prepare
+from tuning.cli.options import USUAL, Common, Out, prepare
 from tuning.errors import UsageError
 from tuning.output import progress, terminal
 
@@ -32,10 +32,7 @@ def identify(
         float | None, Parameter(validator=Positive, help="Largest torque [N m]; default: of the actuators.")
     ] = None,
     out: Out = None,
-    trust: Trust = False,
-    force: Force = False,
-    quiet: Quiet = False,
-    figures: Figures = True,
+    common: Common = USUAL,
 ) -> int:
     """Estimate the parameters in [identify] of a scenario from telemetry, and write the identified scenario.
 
@@ -51,7 +48,7 @@ def identify(
         raise UsageError(f"{alone} is {limits[alone]}, but must be absent without --design")
     if design and validate:
         raise UsageError("--validate needs a log for the estimates, and does not go with --design")
-    loaded, folder = prepare(scenario, "identify", out, trust=trust, force=force)
+    loaded, folder = prepare(scenario, "identify", out, trust=common.trust, force=common.force)
     from ptsmc_jax.campaigns import store
     from ptsmc_jax.identification import design as designing
     from ptsmc_jax.identification import estimation, results, telemetry
@@ -62,23 +59,25 @@ def identify(
         [telemetry.measurements(loaded, telemetry.read(path), path.name) for path in paths]
         for paths in (logs, validate)
     )
-    with store.in_use(folder, force=force):
-        with progress.Progress(quiet) as report:
+    with store.in_use(folder, force=common.force):
+        with progress.Progress(common.quiet) as report:
             if design:
                 given = {"duration": duration or 300.0, "rate": rate or designing.RATE, "torque": torque}
                 proposed = designing.design(loaded, **given, report=lambda text: report(text, 0, 0))
             else:
                 found = estimation.of_logs(loaded, read, others, report=lambda text: report(text, 0, 0))
         if design:
-            store.write(folder, lambda making: identifying.write_design(making, loaded, proposed, figures, given))
+            store.write(
+                folder, lambda making: identifying.write_design(making, loaded, proposed, common.figures, given)
+            )
             shown = identify_report.of_design(
                 summaries.read(summaries.Designed, identifying.design_summary(proposed, given))
             )
         else:
             made_by = {"logs": [str(path) for path in logs], "validate": [str(path) for path in validate]}
-            store.write(folder, lambda making: identifying.write(making, found, figures, made_by))
+            store.write(folder, lambda making: identifying.write(making, found, common.figures, made_by))
             shown = identify_report.of(summaries.read(summaries.Identified, results.summary(found)))
-    if not quiet:
+    if not common.quiet:
         terminal.show(shown, folder)
     return 0 if design or found.good else 1
 
