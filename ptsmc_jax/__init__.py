@@ -32,7 +32,7 @@ _NAMES = {
     "plants.integrator_chain": "Chain chain",
     "plants.rigid_body": "AttitudeState Spacecraft spacecraft",
     "plants.second_order": "System system",
-    "scenario": "Study read replace study",
+    "scenario": "Study from_tables read replace study",
     "scenario.errors": "ScenarioError",
     "scenario.tables": "Scenario",
     "scenario.timing": "Reach reach_of",
@@ -84,6 +84,7 @@ if TYPE_CHECKING:
     from ptsmc_jax.plants.second_order import System as System
     from ptsmc_jax.plants.second_order import system as system
     from ptsmc_jax.scenario import Study as Study
+    from ptsmc_jax.scenario import from_tables as from_tables
     from ptsmc_jax.scenario import read as read
     from ptsmc_jax.scenario import replace as replace
     from ptsmc_jax.scenario import study as study

@@ -5,7 +5,7 @@ The pure function of JAX underneath is `rollout.simulate`.
 
 import html
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -110,10 +110,7 @@ class Flight:
     def plot(self, *names: str) -> "Figures":
         """Return all figures of the run, or the named ones; raise ValueError for an unknown name."""
         figures = run_plots.run_figures(self.run.parts, self.run.log, self.run.torque_limit, self.run.floor)
-        unknown = [name for name in names if name not in figures]
-        if unknown:
-            raise ValueError(f"there is no figure {unknown[0]!r}; allowed are {', '.join(figures)}")
-        return Figures({name: figures[name] for name in names or figures})
+        return Figures(figures).only(names)
 
     def animate(self, frames: int = 40) -> "animation.Animation":
         """Animate the rotation of the body to its reference in 3D; raise ValueError if the plant is no spacecraft."""
@@ -136,18 +133,24 @@ class Flight:
 
 
 class Figures(dict[str, Figure]):
-    """Figures by name. Notebooks show them one below the other."""
+    """Figures by name. Notebooks show them one below the other, as PNG images."""
 
-    def _repr_html_(self) -> str:
-        import base64
+    def only(self, names: Sequence[str]) -> "Figures":
+        """Return the named figures, all of them without names; raise ValueError for an unknown name."""
+        unknown = [name for name in names if name not in self]
+        if unknown:
+            raise ValueError(f"there is no figure {unknown[0]!r}; allowed are {', '.join(self)}")
+        return Figures({name: self[name] for name in names or self})
+
+    def _ipython_display_(self) -> None:
         import io
 
-        images = []
+        from IPython.display import Image, display  # a notebook has it
+
         for figure in self.values():
             buffer = io.BytesIO()
             figure.savefig(buffer, dpi=90)
-            images.append(f'<img src="data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode()}">')
-        return "".join(images)
+            display(Image(buffer.getvalue()))
 
 
 def simulate(

@@ -10,12 +10,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import ptsmc_jax
+import tuning
+import tuning.explore
 from ptsmc_jax import explore, scenario
 from ptsmc_jax.campaigns import campaign, runs, store
 from ptsmc_jax.figures import animation
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import catalogues
-from tests.helpers import SHORT, SHORT_CHAIN, untuned
+from tests.helpers import SHORT, SHORT_CHAIN, small_search, untuned
+from tuning.output.report import Chart, Report, Section, Table, Text
 
 TABLES, CHAIN = untuned(SHORT), untuned(SHORT_CHAIN)
 
@@ -125,11 +128,14 @@ def test_tables_show_units_and_escape_what_they_show(flight):
     assert explore.units()["effort"] == catalogues.CATALOGUE["effort"][0]
 
 
-def test_figures_by_name(flight):
+def test_figures_by_name(flight, monkeypatch):
     assert set(flight.plot()) == {"attitude", "rate", "error", "sliding", "torque", "convergence", "disturbance"}
     two = flight.plot("error", "torque")
     assert list(two) == ["error", "torque"]
-    assert two._repr_html_().count('<img src="data:image/png;base64,') == 2
+    images: list[Any] = []
+    monkeypatch.setattr("IPython.display.display", images.append)
+    two._ipython_display_()
+    assert [image.data[:4] for image in images] == [b"\x89PNG", b"\x89PNG"]
     with pytest.raises(ValueError, match="there is no figure 'eror'; allowed are"):
         flight.plot("eror")
 
@@ -261,3 +267,78 @@ def test_trials_and_floor_use_the_given_seed(monkeypatch):
     seed: Any = explore.trials(made, run_table, seed=3)
     assert seed == 3
     assert explore.floor(made, seed=5) == 5
+
+
+# --- the functions of `tuning` ---
+
+
+class Reported(tuning.explore.Outcome):
+    @property
+    def report(self):
+        table = Table(("gain", "tuned"), [("eta", "2.9"), ("observer_gain", "3 & 4")])
+        blocks = [Text(["one", "two"]), Chart("none", {}, "")]
+        return Report(
+            "RMS <error> 1 arcsec", "good", ["a line"], [Section("Gains", [table]), Section("Remarks", blocks)]
+        )
+
+    def _figures(self):
+        return dict.fromkeys("ab")
+
+
+def test_outcome_shows_its_report_as_text_and_as_escaped_tables():
+    shown = Reported()
+    assert repr(shown).splitlines() == [
+        "RMS <error> 1 arcsec",
+        "a line",
+        "",
+        "Gains",
+        "gain           tuned",
+        "eta            2.9",
+        "observer_gain  3 & 4",
+        "",
+        "Remarks",
+        "one",
+        "two",
+    ]
+    page = shown._repr_html_()
+    assert "RMS &lt;error&gt; 1 arcsec" in page
+    assert "<tr><td>observer_gain</td><td>3 &amp; 4</td></tr>" in page
+    assert "<ul><li>one</li><li>two</li></ul>" in page
+    assert list(shown.plot()) == ["a", "b"]
+    assert list(shown.plot("b")) == ["b"]
+    with pytest.raises(ValueError, match="there is no figure 'c'; allowed are a, b"):
+        shown.plot("c")
+
+
+def test_the_campaign_has_the_trials_of_trials(flight, tmp_path):
+    found = tuning.montecarlo(flight.scenario, 20, seed=3, folder=tmp_path / "c")
+    rows = ptsmc_jax.trials(flight.scenario, 20, seed=3)
+    assert found.rows.select(rows.columns).equals(rows)
+    assert found.met == all(v.met for v in ptsmc_jax.verdicts(flight.scenario, rows))
+    largest = rows.sort("peak_torque", descending=True)["trial"][0]
+    assert found.worst("peak_torque", 1)["trial"].to_list() == [largest]
+    assert "peak_torque at most 30 N m" in repr(found)
+    assert list(found.plot("distributions")) == ["distributions"]
+    again = tuning.montecarlo(flight.scenario, 20, seed=3, folder=tmp_path / "c")  # nothing is missing
+    assert again.rows.equals(found.rows)
+
+
+@pytest.mark.long
+def test_tuned_gains_meet_the_requirements_again(monkeypatch):
+    small_search(monkeypatch)
+    tuned = tuning.tune(scenario.from_tables(tomllib.loads(SHORT)))
+    assert tuned.met
+    assert tuned.gains.items() <= ptsmc_jax.gains_of(scenario.study(tuned.scenario).parts).items()
+    trials = ptsmc_jax.trials(tuned.scenario, 20, seed=99)
+    assert all(v.met for v in ptsmc_jax.verdicts(tuned.scenario, trials))
+    assert repr(tuned).startswith("RMS pointing error")
+    left = tuning.margins(tuned.scenario)
+    assert left.worst["gain_margin"] == min(
+        v["gain_margin"] for v in tuned.summary["trust"]["margins"].values() if v["gain_margin"] is not None
+    )
+    assert {"history", "tradeoff"} <= set(tuned.plot())
+
+
+def test_tuning_has_no_other_names():
+    with pytest.raises(AttributeError, match="module 'tuning' has no attribute 'nothing'"):
+        tuning.nothing  # noqa: B018

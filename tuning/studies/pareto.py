@@ -198,10 +198,10 @@ def write(folder: Path, trade: Trade, front: Front, figures: bool, known_by: dic
     ]  # fmt: skip
     store.write_csv(folder / f"{kind.file}.csv", header, rows)
     if figures and front.points:
-        style.save({kind.file: _figure(trade, front)}, folder / "figures")
+        style.save({kind.file: figure_of(trade, front)}, folder / "figures")
 
 
-def _figure(trade: Trade, front: Front) -> Figure:
+def figure_of(trade: Trade, front: Front) -> Figure:
     """Plot the error over the peak torque, or the error and the costs over the traded quantity."""
     kind, scenario = KINDS[front.against], trade.scenario
     if trade.compared:

@@ -72,10 +72,11 @@ def write(folder: Path, reproduction: Reproduction, figures: bool) -> None:
     for name, (_, _, tables) in claims.CASES.items():
         store.write_toml(folder / "scenarios" / f"{name}.toml", parsing.dump(from_tables(tables)))
     if figures:
-        style.save(_figures(reproduction), folder / "figures")
+        style.save(figures_of(reproduction), folder / "figures")
 
 
-def _figures(reproduction: Reproduction) -> dict[str, Figure]:
+def figures_of(reproduction: Reproduction) -> dict[str, Figure]:
+    """Return the figures of the paper's cases and observers by name."""
     figures = {}
     for name, run in reproduction.cases.items():
         numbers, title, _ = claims.CASES[name]

@@ -178,13 +178,20 @@ def write(folder: Path, ready: Study, course: Course, figures: bool) -> None:
     units = ("gain_up_dB", "gain_down_dB", "phase_deg", "delay_s", "peak_sensitivity_dB", "crossover_rad_s", "stable")
     store.write_csv(folder / "margins.csv", ["t", "time_to_go", "axis", *units], rows)
     if figures:
-        from ptsmc_jax.figures import margin_plots, style
+        from ptsmc_jax.figures import style
 
-        loop, hold = course.hold
-        w, seen = margins.responses(loop)
-        drawn = {
-            "nichols": margin_plots.nichols(seen, inputs),
-            "sensitivity": margin_plots.sensitivity(w, seen, inputs),
-            "margins": margin_plots.over_time(t_f - course.t[:-1], course.before, hold),
-        }
-        style.save(drawn, folder / "figures")
+        style.save(figures_of(ready, course), folder / "figures")
+
+
+def figures_of(ready: Study, course: Course) -> dict[str, Any]:
+    """Return the figures of the margins by name."""
+    from ptsmc_jax.figures import margin_plots  # slow import, not needed without figures
+
+    inputs, _ = names(ready)
+    loop, hold = course.hold
+    w, seen = margins.responses(loop)
+    return {
+        "nichols": margin_plots.nichols(seen, inputs),
+        "sensitivity": margin_plots.sensitivity(w, seen, inputs),
+        "margins": margin_plots.over_time(float(ready.parts.controller.t_f) - course.t[:-1], course.before, hold),
+    }

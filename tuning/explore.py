@@ -1,0 +1,337 @@
+"""Short functions for notebooks: tune gains, trace a Pareto front, find margins, run a campaign. Start with `tune`.
+
+Each result has the report of the command of the same name. Notebooks show the report as tables, `print` as text.
+"""
+
+import html
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import polars as pl
+
+from ptsmc_jax import scenario
+from ptsmc_jax.campaigns import rows
+from ptsmc_jax.explore import Figures
+from ptsmc_jax.onboard.folder import on_flight_clock
+from ptsmc_jax.scenario import Study, free_gains, reading
+from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.theory.run_margins import Course
+from tuning.output import campaign_report, front_report, margins_report, paper_report, summaries, tune_report
+from tuning.output.report import Bars, Report, Table, Text
+from tuning.studies import (
+    campaign_figures,
+    campaign_folder,
+    campaign_summary,
+    campaign_theory,
+    reproduction,
+    stability,
+    trades,
+    tune_files,
+    tuner,
+)
+from tuning.studies import pareto as fronts
+from tuning.studies.campaign_folder import Folder
+from tuning.studies.front import KINDS, Front, Point
+from tuning.studies.reproduction import Reproduction
+from tuning.studies.tuner import Tuning
+
+
+class Outcome:
+    """The result of a study. It prints as the report of the command, and notebooks show it as tables."""
+
+    @property
+    def report(self) -> Report:
+        """The content of the report."""
+        raise NotImplementedError
+
+    def _figures(self) -> dict[str, Any]:
+        """Return all figures by name."""
+        raise NotImplementedError
+
+    def plot(self, *names: str) -> Figures:
+        """Return all figures of the result, or the named ones; raise ValueError for an unknown name."""
+        return Figures(self._figures()).only(names)
+
+    def __repr__(self) -> str:
+        lines = [self.report.headline, *self.report.lines]
+        for title, content in _sections(self.report):
+            lines += ["", title, *(_columns(content) if isinstance(content, Table) else content)]
+        return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        text = f"<p><b>{html.escape(self.report.headline)}</b></p>{_listed(self.report.lines)}"
+        for title, content in _sections(self.report):
+            shown = _table(content) if isinstance(content, Table) else _listed(content)
+            text += f"<p><b>{html.escape(title)}</b></p>{shown}"
+        return text
+
+
+def _sections(report: Report) -> Iterator[tuple[str, Table | list[str]]]:
+    """Yield the tables and the lines of a report, each with its title; a title is empty after its first block."""
+    for section in report.sections:
+        title = section.title
+        for block in section.blocks:
+            if isinstance(block, Table):
+                yield title, block
+            elif isinstance(block, Text):
+                yield title, block.lines
+            elif isinstance(block, Bars):
+                yield title, block.texts
+            else:  # a chart of the page
+                continue
+            title = ""
+
+
+def _columns(table: Table) -> list[str]:
+    """Return the lines of a table with aligned columns."""
+    cells = [table.head, *table.rows]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    return ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in cells]
+
+
+def _table(table: Table) -> str:
+    def row(cells: tuple[str, ...], tag: str) -> str:
+        return "<tr>" + "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in cells) + "</tr>"
+
+    body = "".join(row(cells, "td") for cells in table.rows)
+    return f"<table><thead>{row(table.head, 'th')}</thead><tbody>{body}</tbody></table>"
+
+
+def _listed(lines: list[str]) -> str:
+    return "<ul>" + "".join(f"<li>{html.escape(line)}</li>" for line in lines) + "</ul>" if lines else ""
+
+
+@dataclass(frozen=True, repr=False)
+class Tuned(Outcome):
+    """Gains that a search found, verified on held-out trials. Its figures are those of `ptsmc tune`."""
+
+    given: Scenario  # before the search
+    tuning: Tuning
+
+    @property
+    def scenario(self) -> Scenario:
+        """The scenario with the tuned gains, on the flight clock."""
+        return self.tuning.tuned
+
+    @property
+    def gains(self) -> dict[str, float]:
+        """The tuned gains by name."""
+        return self.tuning.gains
+
+    @property
+    def met(self) -> bool:
+        """Whether the held-out trials meet every requirement."""
+        return self.tuning.met
+
+    @cached_property
+    def summary(self) -> dict[str, Any]:
+        """The content of `summary.json`."""
+        return tune_files.summary(self.tuning)
+
+    @property
+    def report(self) -> Report:
+        """The report of `ptsmc tune`."""
+        return tune_report.of(summaries.tune(self.summary))
+
+    def _figures(self) -> dict[str, Any]:
+        return tune_files.figures_of(self.given, self.tuning)
+
+
+def tune(what: Scenario | Study | str | Path, *, seed: int = 0) -> Tuned:
+    """Find the gains with the smallest error that meet every requirement, as `ptsmc tune` does.
+
+    Args:
+        what: a scenario, the path of its file, or a study. Its table `tune` has the settings of the search.
+        seed: seed of the search and its trials.
+
+    Raises:
+        ScenarioError: the scenario is not valid, or no gain is free.
+    """
+    given = _with_tune(what)
+    return Tuned(given, tuner.tune(given, seed))
+
+
+@dataclass(frozen=True, repr=False)
+class Traced(Outcome):
+    """A Pareto front, verified on held-out trials. Its figure is the one of `ptsmc pareto`."""
+
+    trade: trades.Trade
+    front: Front
+
+    @property
+    def points(self) -> list[Point]:
+        """The points that no other point dominates, in the order of the traded quantity."""
+        return self.front.kept
+
+    @property
+    def report(self) -> Report:
+        """The report of `ptsmc pareto`."""
+        return front_report.of(self.front)
+
+    def _figures(self) -> dict[str, Any]:
+        return {KINDS[self.front.against].file: fronts.figure_of(self.trade, self.front)}
+
+
+def pareto(
+    what: Scenario | Study | str | Path,
+    *,
+    against: Literal["torque", "margins", "t_f"] = "torque",
+    points: int | None = None,
+    values: tuple[float, ...] = (),
+    seed: int = 0,
+) -> Traced:
+    """Trace the smallest error over another quantity, as `ptsmc pareto` does.
+
+    Args:
+        what: a scenario, the path of its file, or a study.
+        against: the peak torque, the peak sensitivity (margins), or the prescribed time t_f.
+        points: number of limits on the peak torque; None: 20.
+        values: limits on the peak sensitivity [dB], or prescribed times [s]; empty: the defaults of the command.
+        seed: seed of the search and its trials.
+
+    Raises:
+        ScenarioError: the scenario is not valid, or the study does not apply to it.
+    """
+    trade = trades.of(against, _with_tune(what), points, values)
+    return Traced(trade, fronts.trace(trade, seed))
+
+
+@dataclass(frozen=True, repr=False)
+class Margins(Outcome):
+    """Stability margins of the nominal loop. Its figures are those of `ptsmc margins`."""
+
+    ready: Study
+    course: Course
+
+    @property
+    def worst(self) -> dict[str, float]:
+        """The smallest margins of any input in both phases [dB], [deg], [s], and the peak sensitivity [dB]."""
+        return {name: float(value) for name, value in self.course.worst().items()}
+
+    @property
+    def report(self) -> Report:
+        """The report of `ptsmc margins`."""
+        return margins_report.of(summaries.read(summaries.Margins, stability.summary(self.ready, self.course)))
+
+    def _figures(self) -> dict[str, Any]:
+        return stability.figures_of(self.ready, self.course)
+
+
+def margins(what: Scenario | Study | str | Path) -> Margins:
+    """Linearise the nominal loop and find its margins, as `ptsmc margins` does.
+
+    Args:
+        what: a scenario, the path of its file, or a study.
+
+    Raises:
+        ScenarioError: the loop is continuous, or it has no finite derivatives.
+    """
+    return Margins(*stability.find(_read(what)))
+
+
+@dataclass(frozen=True, repr=False)
+class Campaign(Outcome):
+    """A Monte Carlo campaign. Its figures are those of `ptsmc montecarlo`."""
+
+    folder: Folder
+
+    @cached_property
+    def summary(self) -> dict[str, Any]:
+        """The content of `summary.json`."""
+        return campaign_summary.summarise(self.folder)
+
+    @property
+    def met(self) -> bool:
+        """Whether every requirement is met."""
+        return self.summary["status"] == "met"
+
+    @property
+    def report(self) -> Report:
+        """The report of `ptsmc montecarlo`."""
+        return campaign_report.of(summaries.read(summaries.Campaign, self.summary))
+
+    @property
+    def rows(self) -> pl.DataFrame:
+        """One row for each trial, see `ptsmc_jax.trials`."""
+        return rows.read(self.folder.whole_parts())
+
+    def worst(self, by: str = "window_error", count: int = 5) -> pl.DataFrame:
+        """Return the rows of the worst trials, failed trials first.
+
+        Args:
+            by: column that orders the trials.
+            count: number of rows.
+        """
+        return campaign_summary.worst(self.folder, by, count)
+
+    def _figures(self) -> dict[str, Any]:
+        return campaign_figures.of(self.folder, self.summary)
+
+
+def montecarlo(
+    what: Scenario | Study | str | Path,
+    trials: int = 10_000,
+    *,
+    seed: int = 1000,
+    folder: str | Path | None = None,
+    controller: str | Path | None = None,
+) -> Campaign:
+    """Simulate a campaign and keep its rows in a folder, as `ptsmc montecarlo` does.
+
+    The same call again resumes an interrupted campaign.
+
+    Args:
+        what: a scenario, the path of its file, or a study.
+        trials: number of trials.
+        seed: seed of the dispersions and the noise. It must differ from the seed of the tuning.
+        folder: folder of the campaign; None: a temporary folder, which is not deleted.
+        controller: a folder that `ptsmc_jax.export` wrote. Its C code then computes the torque.
+
+    Raises:
+        RefusedError: the folder has another campaign.
+        ScenarioError: the scenario is not valid, or the controller does not belong to it.
+    """
+    path = Path(tempfile.mkdtemp()) / "campaign" if folder is None else Path(folder)
+    loaded = _read(what) if controller is None else on_flight_clock(_read(what))
+    begun = Folder(path, loaded, seed, trials, controller=None if controller is None else Path(controller))
+    campaign_folder.begin(begun, force=False)
+    campaign_theory.prepare(begun)
+    campaign_folder.simulate(begun, (1, 1), lambda tally: None)
+    campaign_theory.find(begun)
+    return Campaign(begun)
+
+
+@dataclass(frozen=True, repr=False)
+class Reproduced(Outcome):
+    """The claims of the paper beside the measurements. Its figures are those of `ptsmc reproduce`."""
+
+    found: Reproduction
+
+    @property
+    def report(self) -> Report:
+        """The report of `ptsmc reproduce`."""
+        return paper_report.of(summaries.read(summaries.Paper, reproduction.summary(self.found)))
+
+    def _figures(self) -> dict[str, Any]:
+        return reproduction.figures_of(self.found)
+
+
+def reproduce() -> Reproduced:
+    """Simulate the cases of the paper and compare its claims with the measurements, as `ptsmc reproduce` does."""
+    return Reproduced(reproduction.reproduce())
+
+
+def _read(what: Scenario | Study | str | Path) -> Scenario:
+    return reading.of(what.scenario if isinstance(what, Study) else what)
+
+
+def _with_tune(what: Scenario | Study | str | Path) -> Scenario:
+    """Return the scenario with a table `tune`. Raises ScenarioError without a free gain."""
+    loaded = _read(what)
+    loaded = loaded if loaded.tune is not None else scenario.replace(loaded, tune={})
+    free_gains.need_some(loaded)
+    return loaded
