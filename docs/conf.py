@@ -4,6 +4,7 @@ import ast
 import inspect
 import re
 import textwrap
+from pathlib import Path
 from typing import Any
 
 import latex2mathml.converter
@@ -15,7 +16,9 @@ import ptsmc_jax
 project = "ptsmc-jax"
 author = "the ptsmc-jax developers"
 release = version = ptsmc_jax.__version__
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+nb_execution_mode = "off"  # the notebooks are stored with their outputs
+nb_merge_streams = True
 myst_enable_extensions = ["dollarmath", "deflist"]
 myst_heading_anchors = 3
 html_theme = "furo"
@@ -69,7 +72,18 @@ def block(self: Any, node: nodes.math_block) -> None:
     raise nodes.SkipNode
 
 
+def copy_notebooks(app: Sphinx, config: Any) -> None:
+    """Copy the notebooks to docs/tutorials, with links to the pages from there."""
+    folder = Path(app.srcdir) / "tutorials"
+    folder.mkdir(exist_ok=True)
+    for path in (folder.parent.parent / "notebooks").glob("0*.ipynb"):
+        copied, text = folder / path.name, path.read_text(encoding="utf-8").replace("](../docs/", "](../")
+        if not copied.exists() or copied.read_text(encoding="utf-8") != text:  # unchanged pages are not built again
+            copied.write_text(text, encoding="utf-8")
+
+
 def setup(app: Sphinx) -> None:
     """Register the functions above; Sphinx calls this."""
+    app.connect("config-inited", copy_notebooks)
     app.add_html_math_renderer("mathml", (inline, None), (block, None))
     app.connect("autodoc-process-docstring", as_written)

@@ -1,4 +1,4 @@
-"""Executes every notebook, and keeps it with its outputs beside its source: `python notebooks/execute.py`."""
+"""Execute notebooks and store them with their outputs: `python notebooks/execute.py [NAME ...]`."""
 
 import sys
 import time
@@ -11,18 +11,17 @@ HERE = Path(__file__).parent
 
 
 def executed(source: Path):
-    """The notebook of a source file, executed; raises what a cell raises."""
+    """Return the executed notebook of a source file. Raises CellExecutionError if a cell raises an error."""
     book = jupytext.read(source)
-    NotebookClient(book, timeout=600, kernel_name="python3", resources={"metadata": {"path": str(HERE)}}).execute()
-    for place, cell in enumerate(book.cells):  # times, process numbers and drawn ids would be a change each time
+    NotebookClient(book, timeout=3600, kernel_name="python3", resources={"metadata": {"path": str(HERE)}}).execute()
+    for place, cell in enumerate(book.cells):  # times and random ids would change each time
         cell.metadata.pop("execution", None)
         cell["id"] = f"cell-{place}"
-    book.metadata.pop("widgets", None)  # what a widget shows needs its kernel, and names hosts
     return book
 
 
 def main() -> None:
-    """Write NAME.ipynb for each of the named, or all, NAME.py."""
+    """Write NAME.ipynb for each named NAME.py, or for all of them."""
     names = sys.argv[1:] or [path.stem for path in sorted(HERE.glob("0*.py"))]
     for name in names:
         started = time.monotonic()
