@@ -440,7 +440,7 @@ def test_internal_error_is_raised_with_its_traceback(tmp_path, monkeypatch):
 
 
 def test_full_disk_prints_one_line_and_leaves_no_files(command, tmp_path, monkeypatch):
-    def full(*_):
+    def full(*_, **__):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("tuning.studies.single.write", full)
