@@ -164,7 +164,11 @@ def _with_defaults(
     given: Mapping[str, Any], fallback: Mapping[str, Any], kinds: type[Table] | Kinds
 ) -> Mapping[str, Any]:
     """Return a table with absent keys filled in. An attitude that is given replaces the default attitude."""
-    struct = kinds.get(given.get("kind", next(iter(kinds)))) if isinstance(kinds, Mapping) else kinds
+    if isinstance(kinds, Mapping):
+        kind = given.get("kind", next(iter(kinds)))
+        struct = kinds.get(kind) if isinstance(kind, str) else None  # `_table` refuses other types
+    else:
+        struct = kinds
     has_attitude = struct is not None and issubclass(struct, Attitude)
     if any(key in given for key in ATTITUDE_KEYS) or not has_attitude:
         fallback = {key: value for key, value in fallback.items() if key not in ATTITUDE_KEYS}
