@@ -72,7 +72,7 @@ def test_a_band_contains_the_trials_ranked_around_the_last_that_may_break_the_li
         return simulated
 
     monkeypatch.setattr(confirm.simulations, "simulate_trials", fly)
-    some: Any = SimpleNamespace(others=lambda numbers: numbers)
+    some: Any = SimpleNamespace(batch_of=lambda numbers: numbers)
     (found,) = confirm.count(some, [loose], np.zeros(2), 100, 2)
     assert found.allowed is not None
     first = 100 + 2 * count
@@ -125,7 +125,7 @@ def test_confirmation_uses_trials_that_the_search_has_not_simulated(monkeypatch)
     monkeypatch.setattr(rounds.worst_case.simulations, "simulate_trials", trials)
     evaluate = Evaluator(limits)
     search = rounds.Rounds(evaluate, posed, wanted, robust=False)
-    told: Any = SimpleNamespace(averaged=search.problem.averaged, others=lambda numbers: numbers)
+    told: Any = SimpleNamespace(averaged=search.problem.averaged, batch_of=lambda numbers: numbers)
     rounds.worst_case.screen(told, wanted, at)
     for _ in range(2):
         search._count(at)

@@ -123,7 +123,7 @@ def test_a_zero_gain_has_no_sensitivity_and_the_other_gains_have_one(monkeypatch
         return SimpleNamespace(status=np.zeros((len(gains), 4), int), metrics=SimpleNamespace(window_error=errors))
 
     monkeypatch.setattr(trust.simulations, "simulate", fly)
-    problem: Any = SimpleNamespace(others=lambda trials: trials, trials=np.arange(4), averaged=4, names=("k", "lead"))
+    problem: Any = SimpleNamespace(batch_of=lambda trials: trials, trials=np.arange(4), averaged=4, names=("k", "lead"))
     bounds = Bounds(problem.names, (1.0, -1.0), (3.0, 1.0))
     found = trust.sensitivities(problem, bounds, np.array([2.0, 0.0]), ("window_error",))
     assert list(found["window_error"]) == ["k"]

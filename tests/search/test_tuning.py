@@ -501,7 +501,7 @@ def test_a_search_without_gradients_finds_the_same_optimum(monkeypatch):
 
 
 def test_statistics_count_failures_and_cover_the_other_trials(monkeypatch):
-    trials = simulations.simulate_trials(problem().others(np.arange(8)), np.array([3.0, 0.5]))
+    trials = simulations.simulate_trials(problem().batch_of(np.arange(8)), np.array([3.0, 0.5]))
     lost = np.array([1, 4, 6])
     trials.status[lost] = rollout.SINGULAR
     for values in trials.metrics.values():
