@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import jax
 import numpy as np
@@ -87,7 +88,8 @@ class Run:
         log, sensors = self.log, self.parts.sensors
         if log.readings is None or log.sent is None:
             return {}
-        readings, found = dict(log.readings), {}
+        readings: dict[str, Any] = dict(log.readings)
+        found: dict[str, Any] = {}
         tracker = next((one for one in getattr(sensors, "sensors", ()) if isinstance(one, StarTracker)), None)
         if tracker is not None:  # of a suite
             readings["attitude"] = np.asarray(jax.vmap(tracker.body)(readings[tracker.name]))

@@ -120,7 +120,8 @@ def build(scenario: Scenario, logs: Sequence[Measurements], names: Sequence[str]
     """
     setup = building.setup(scenario)
     table = scenario.identify
-    names = names or (None if table is None else table.free) or _usual(scenario)
+    stated = None if table is None else table.free
+    names = tuple(names or stated or _usual(scenario))
     logged = logs[0]
     interval = float(np.median(np.diff(logged.t)))
     model, estimated = _model(scenario, setup, logs, interval, GYRO_BIAS in names)
@@ -176,7 +177,7 @@ def _model(
     bias = getattr(devices, "rate_bias", None)
     nothing = table is not None and table.prior == "none"
     known_bias = 0.0 if bias is None else bias
-    walk = setup.walk_rate if setup.walk_rate is None else setup.walk_rate * np.sqrt(period)
+    walk: Any = setup.walk_rate if setup.walk_rate is None else setup.walk_rate * np.sqrt(period)
     if table is not None and table.torque_walk is not None:
         walk = vector(table.torque_walk) * jnp.ones(plant.inputs) if table.torque_walk > 0.0 else None
     model = Model(
@@ -204,8 +205,8 @@ def acceleration(model: Model, log: Measurements) -> float:
     size = jnp.asarray(np.sqrt(np.mean(command**2, axis=0)))
     size = model.actuators.on_body(size) if log.by_channel or log.wheel_inertia is not None else size
     plant, zero = model.plant, jnp.zeros(model.plant.inputs)
-    x = log.readings["x"][0] if "x" in log.readings else AttitudeState(np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3))
-    x = plant.with_hidden_at_rest(jax.tree.map(jnp.asarray, x))
+    still = AttitudeState(jnp.array([0.0, 0.0, 0.0, 1.0]), jnp.zeros(3))
+    x = plant.with_hidden_at_rest(jnp.asarray(log.readings["x"][0]) if "x" in log.readings else still)
     pushed, free = (plant.velocity(plant.rate(jnp.zeros(()), x, u, zero)) for u in (size, zero))
     return float(jnp.max(jnp.abs(pushed - free)))
 
@@ -247,7 +248,7 @@ def _catalogue(
 
     def spread(name: str, count: int) -> tuple[np.ndarray, bool]:
         """Return the 1 sigma of each number, (count,), and whether [dispersion] gives it."""
-        table = getattr(prior, name, None)
+        table: Any = getattr(prior, name, None)
         if not hasattr(table, "of"):  # without a dispersion, or with a phase that is uniform over the circle
             return np.full(count, USUAL["noise" if name.endswith("_noise") else name]), False
         return np.maximum(table.of(count) * (1.0 if table.name.endswith("normal") else 1.0 / np.sqrt(3.0)), 1e-9), True

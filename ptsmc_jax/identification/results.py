@@ -114,7 +114,8 @@ def _inertia_factor(found: Identification, tensor: np.ndarray) -> np.ndarray:
     of_entries = found.covariance[at : at + 6, at : at + 6]
     inverse = np.linalg.inv(by_coordinates)
     sizes, directions = np.linalg.eigh(inverse @ of_entries @ inverse.T)
-    lower = np.linalg.qr((directions * np.sqrt(np.maximum(sizes, 0.0))).T, mode="r").T
+    upper: Any = np.linalg.qr((directions * np.sqrt(np.maximum(sizes, 0.0))).T, mode="r")
+    lower = upper.T
     return lower * np.where(np.diag(lower) < 0.0, -1.0, 1.0)
 
 
@@ -124,7 +125,7 @@ def _rows(lower: np.ndarray) -> list[list[float]]:
 
 def _turns(found: Identification) -> np.ndarray:
     """Return the rotation vector of each channel (channels, 3) [rad] from its axis in the design model."""
-    actuators = found.problem.at(found.z).actuators
+    actuators = found.problem.at(jnp.asarray(found.z)).actuators
     axes = np.eye(3) if actuators.wheels is None else np.asarray(actuators.wheels.axes)
     cross = np.cross(axes.T, np.asarray(actuators.directions).T)
     sine = np.linalg.norm(cross, axis=1, keepdims=True)

@@ -178,17 +178,17 @@ def _names(prefix: str, count: int) -> list[str]:
 
 def _of_state(scenario: Scenario, given: Any, table: _Table, t: Values) -> Measurements:
     """Return the log of a chain or a custom system."""
-    states, inputs = len(scenario.plant.x0), scenario.inputs  # pyright: ignore[reportAttributeAccessIssue]
+    states, inputs = len(scenario.plant.x0), scenario.inputs
     for key, count in (("state", states), ("input", inputs)):
         columns = getattr(given, key)
         if columns is not None and len(columns) != count:
             raise RefusedError(f"telemetry.{key} has {len(columns)} columns, but must have {count} for this plant")
     x = table.numbers(given.state or _names("measured_x", states))
     command = table.held(given.input or _names("sent", inputs), 1.0)
-    complete = ~np.isnan(x).any(axis=1)
+    complete = np.all(~np.isnan(x), axis=1)
     if not complete.any():
         raise RefusedError(f"{table.name} has no row with every component of the state, but must have one")
-    first = _first_row(t, {"x": x}, complete)
+    first = _first_row(t, {"x": x}, np.asarray(complete))
     return Measurements(table.name, t[first:] - t[first], {"x": x[first:]}, command[first:])
 
 

@@ -55,31 +55,29 @@ def identify(
     from tuning.output import identify_report, summaries
     from tuning.studies import identifying
 
+    if design:
+        given = {"duration": duration or 300.0, "rate": rate or designing.RATE, "torque": torque}
+        with store.in_use(folder, force=common.force):
+            with progress.Progress(common.quiet) as report:
+                proposed = designing.design(loaded, **given, report=lambda text: report(text, 0, 0))
+            write = identifying.write_design
+            store.write(folder, lambda making: write(making, loaded, proposed, common.figures, given))
+        if not common.quiet:
+            summary = identifying.design_summary(proposed, given)
+            terminal.show(identify_report.of_design(summaries.read(summaries.Designed, summary)), folder)
+        return 0
     read, others = (
         [telemetry.measurements(loaded, telemetry.read(path), path.name) for path in paths]
         for paths in (logs, validate)
     )
     with store.in_use(folder, force=common.force):
         with progress.Progress(common.quiet) as report:
-            if design:
-                given = {"duration": duration or 300.0, "rate": rate or designing.RATE, "torque": torque}
-                proposed = designing.design(loaded, **given, report=lambda text: report(text, 0, 0))
-            else:
-                found = estimation.of_logs(loaded, read, others, report=lambda text: report(text, 0, 0))
-        if design:
-            store.write(
-                folder, lambda making: identifying.write_design(making, loaded, proposed, common.figures, given)
-            )
-            shown = identify_report.of_design(
-                summaries.read(summaries.Designed, identifying.design_summary(proposed, given))
-            )
-        else:
-            made_by = {"logs": [str(path) for path in logs], "validate": [str(path) for path in validate]}
-            store.write(folder, lambda making: identifying.write(making, found, common.figures, made_by))
-            shown = identify_report.of(summaries.read(summaries.Identified, results.summary(found)))
+            found = estimation.of_logs(loaded, read, others, report=lambda text: report(text, 0, 0))
+        made_by = {"logs": [str(path) for path in logs], "validate": [str(path) for path in validate]}
+        store.write(folder, lambda making: identifying.write(making, found, common.figures, made_by))
     if not common.quiet:
-        terminal.show(shown, folder)
-    return 0 if design or found.good else 1
+        terminal.show(identify_report.of(summaries.read(summaries.Identified, results.summary(found))), folder)
+    return 0 if found.good else 1
 
 
 COMMANDS = (identify,)
