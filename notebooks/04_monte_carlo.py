@@ -146,5 +146,5 @@ again.plot("error", "torque")
 # 2. Use `custom_metrics=` of `ptsmc.trials` to add a custom metric to the rows.
 # 3. How many trials does a requirement of 99.99 % with 90 % confidence need?
 #
-# **Next:** [From a data sheet to flight code](08_data_sheet_to_flight_code.ipynb) uses all steps for a CubeSat. For other
-# plants and laws, go on with [A custom plant](05_your_own_plant.ipynb).
+# **Next:** the [guide by task](../docs/guide.md) uses all steps for a CubeSat. For other plants and laws, go on with
+# [A custom plant](05_your_own_plant.ipynb).

@@ -164,4 +164,4 @@ _ = axes.set(xlabel="step of Adam", ylabel="RMS pointing error [arcsec]", title=
 # 2. Add $t_f$ to the gains. Which term of the loss prevents a very long slew?
 # 3. Differentiate the pointing error by the *initial attitude*, and find the worst axis of rotation.
 #
-# **Next:** [From a data sheet to flight code](08_data_sheet_to_flight_code.ipynb) uses all steps for one CubeSat.
+# **Next:** the [guide by task](../docs/guide.md) uses all steps for one CubeSat.
