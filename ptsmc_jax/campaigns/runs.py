@@ -102,7 +102,8 @@ class Run:
             found["measured_age"] = readings["attitude_age"]
         names = {"rate": "measured_w", "x": "measured_x"}
         found |= {new: readings[name] for name, new in names.items() if name in readings}
-        return {**found, "sent": log.sent}
+        found["sent"] = log.sent
+        return jax.tree.map(np.asarray, found)
 
 
 def numbered(name: str, block: ArrayLike) -> dict[str, np.ndarray]:

@@ -121,7 +121,8 @@ class Flexible(Table, frozen=True):
             inertia: inertia of the true body [kg m^2].
             drawn: the table [dispersion].
         """
-        rows, moments = (getattr(drawn, key, None) for key in ("mode_coupling", "inertia"))
+        rows: Any = getattr(drawn, "mode_coupling", None)
+        moments: Any = getattr(drawn, "inertia", None)
         longest = smallest = 1.0
         said, body = "", ""
         if getattr(moments, "std", 0.0) > 0.0:

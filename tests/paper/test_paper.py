@@ -109,7 +109,7 @@ def test_each_figure_has_the_number_and_the_content_of_the_paper(monkeypatch):
         return SimpleNamespace(parts=SimpleNamespace(plant=plant), log=name)
 
     cases = {name: run(name) for name in claims.CASES}
-    drawn: Any = reproduction._figures(reproduction.Reproduction(cases, [], [], []))
+    drawn: Any = reproduction.figures_of(reproduction.Reproduction(cases, [], [], []))
     paper = {
         "fig_01a_states": "second_order", "fig_01b_control": "second_order", "fig_02a_states": "third_order",
         "fig_02b_control": "third_order", "fig_03_attitude": "case_1_30", "fig_04_torque": "case_1_30",

@@ -26,7 +26,7 @@ def write(folder: Path, found: Identification, figures: bool, made_by: Mapping[s
         figures: write figures too.
         made_by: entries of `versions.json`.
     """
-    made = {"command": "identify", "seed": None, **made_by, **custom.digests(found.scenario)}
+    made = {"command": "identify", "seed": None, **made_by, **custom.checksums(found.scenario)}
     store.record(folder, parsing.dump(found.scenario), made, results.summary(found))
     identified = results.identified(found)
     store.write_toml(folder / "identified.toml", custom_parts.carry(parsing.dump(identified), folder))
@@ -58,7 +58,7 @@ def write_design(folder: Path, scenario: Scenario, design: Design, figures: bool
         figures: write figures too.
         given: its duration [s] and limits.
     """
-    made = {"command": "identify", "seed": None, "design": True, **custom.digests(scenario)}
+    made = {"command": "identify", "seed": None, "design": True, **custom.checksums(scenario)}
     store.record(folder, parsing.dump(scenario), made, design_summary(design, given))
     frame = design.frame
     store.write_csv(folder / "profile.csv", frame.columns, frame.rows())
