@@ -217,7 +217,7 @@ def write_program(folder: Path, made: Controller, steepness: float = 0.0) -> Non
     texts = {**templates.texts(code, about), "README.md": readme(code, about)}
     for name, text in texts.items():
         store.write_text(folder / name, templates.prefixed(text, about.name))
-    layout = {"name": about.name, "digest": about.checksum, "period": made.period, "parts": made.board.parts}
+    layout = {"name": about.name, "checksum": about.checksum, "period": made.period, "parts": made.board.parts}
     layout["reference_input"] = made.reference_input
     layout["columns"] = code.columns
     store.write_json(folder / LAYOUT, layout)

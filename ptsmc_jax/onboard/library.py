@@ -61,7 +61,7 @@ class Library:
         none = ScenarioError(f"the controller is {self.folder}, but must be a folder that ptsmc export has written")
         try:
             layout = json.loads((self.folder / sources.LAYOUT).read_text(encoding="utf-8"))
-            self.name, self.checksum, self.columns = layout["name"], layout["digest"], layout["columns"]
+            self.name, self.checksum, self.columns = layout["name"], layout["checksum"], layout["columns"]
             self.period = float(layout["period"])  # [s]
             self.reference_input = bool(layout.get("reference_input", False))
             self.parts = dict(layout.get("parts", {}))  # as `Board.parts`; empty in earlier versions

@@ -80,7 +80,7 @@ def texts(code: Code, about: About) -> dict[str, str]:
     stem = f"ptsmc_{about.name}"
     files = {f"{stem}.h": "controller.h", f"{stem}.c": "controller.c", f"{stem}_parameters.c": "parameters.c",
              f"{stem}_flat.h": "flat.h"} | PROGRAMS  # fmt: skip
-    origin = {"name": about.name, "upper": about.name.upper(), "scenario": about.scenario, "digest": about.checksum,
+    origin = {"name": about.name, "upper": about.name.upper(), "scenario": about.scenario, "checksum": about.checksum,
               "law": about.law}  # fmt: skip
     values = origin | _structs(code, about) | _checks(code, about) | _step(code) | rows(code, about)
     values["head"] = filled("head.c", name=about.name, functions=values["functions"]).rstrip()
@@ -90,7 +90,7 @@ def texts(code: Code, about: About) -> dict[str, str]:
 def plant_texts(code: Code, about: About) -> dict[str, str]:
     """Return the text of each file of a plant in C, by file name."""
     stem, call = f"ptsmc_{about.name}", code.calls
-    values = {"name": about.name, "upper": about.name.upper(), "scenario": about.scenario, "digest": about.checksum}
+    values = {"name": about.name, "upper": about.name.upper(), "scenario": about.scenario, "checksum": about.checksum}
     functions = "\n".join([*_helpers(code), "\n\n".join(code.functions)])
     head = filled("head.c", name=about.name, functions=functions).rstrip()
     values |= _structs(code, about) | {

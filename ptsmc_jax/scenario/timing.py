@@ -180,7 +180,8 @@ def _lower(scenario: Scenario, key: str, asks: str) -> ScenarioError:
     if name == "code":
         return ScenarioError(f"{key} says that it is too fast: {asks}")
     if key in ("reference.file", "reference.kind"):
-        return ScenarioError(f"{key} is {show(getattr(getattr(scenario, table), name))}, whose attitude is too fast: {asks}")
+        shown = show(getattr(getattr(scenario, table), name))
+        return ScenarioError(f"{key} is {shown}, whose attitude is too fast: {asks}")
     if key == "controller.eta":  # a short t_f is the cause: eta may be at its lower bound already
         eta = f"with controller.eta = {scenario.controller.eta}"
         shorter = ", or loop.period shorter" if scenario.sampled else ""

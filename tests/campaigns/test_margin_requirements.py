@@ -289,7 +289,7 @@ def test_evaluator_appends_margins_of_the_hardest_trials(drawn, monkeypatch):
     share = posed.evaluate.bounds.normalise(posed.scenario_gains)[None]
     simulated = {"gains": share, "f": np.zeros(1), "c": np.array([[[-0.3, -0.2, -0.4]]]), "value": np.zeros(1)}
     monkeypatch.setattr(posed.evaluate, "_metrics", lambda *_: dict(simulated))
-    c = posed.evaluate.simulate(posed.problem, share).c[0]
+    c = posed.evaluate.measure(posed.problem, share).c[0]
     assert c[0].tolist() == [-0.3, -0.2, -0.4] + [-1.0] * (c.shape[1] - 3)  # padded to the length of margin rows
     verdicts = margin_verdicts.over_trials(posed.ready, 3)
     assert [v.trials for v in verdicts] == [TRIALS, TRIALS]

@@ -39,7 +39,7 @@ def refined(valley, start, seed=3, size=evolution.WIDELY):
     some = objective.problem(parts(20.0, 3.0, 1.0), TURNED, 0, np.arange(1), names, [Requirement("peak_torque", 1.0)])
     normalised = 0.5 + np.asarray(start)
     best, told = Best(normalised, 1, 0.0), []
-    best.offer(normalised[None], valley.simulate(some, normalised[None]))
+    best.offer(normalised[None], valley.measure(some, normalised[None]))
     path = []
     evolution.evolve(valley, some, best, normalised, seed, lambda *at: told.append(at), path.append, size)
     assert len(path) == len(told)

@@ -116,7 +116,7 @@ def test_simulate_checks_required_margins(command, tmp_path):
 def test_run_with_a_limit_cycle_has_no_margins(command, tmp_path, monkeypatch):
     """`theory/test_limit_cycles.py` tests the detection of limit cycles."""
     (tmp_path / "asks.toml").write_text(ASKS)
-    monkeypatch.setattr(limit_cycles, "limit_cycle", lambda *_: limit_cycles.LimitCycle(0.04, 2.0))
+    monkeypatch.setattr(limit_cycles, "find", lambda *_: limit_cycles.LimitCycle(0.04, 2.0))
     status, said, _ = command("margins", "asks.toml", "--no-figures")
     assert status == 1
     assert "the nominal run does NOT come to rest in the hold phase" in said

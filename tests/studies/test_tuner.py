@@ -164,7 +164,7 @@ class Found:
     gains: np.ndarray
     value: float
     problem: Any = None
-    over: float = 0.0
+    violation: float = 0.0
     interrupted: bool = False
     history: tuple[Step, ...] = ()
 

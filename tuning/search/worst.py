@@ -231,7 +231,7 @@ def ratio_with_gradient(
         ratios_or_nan = jnp.asarray(violation_ratio(simulated.metrics[:, columns], limit, at_least=False))
         ratios = np.asarray(judged(ratios_or_nan, jnp.asarray(simulated.status[:, None])))
         nearest, value = ratios.argmax(axis=1), ratios.max(axis=1)
-        slope = np.take_along_axis(simulated.slopes[:, :, columns], nearest[:, None, None], axis=2)[:, :, 0]
+        slope = np.take_along_axis(simulated.derivatives[:, :, columns], nearest[:, None, None], axis=2)[:, :, 0]
         slopes.append(np.where(value[:, None] < FAILED, slope / (limit + (limit == 0.0))[nearest][:, None], 0.0))
     return value, np.concatenate(slopes, axis=1)[:, :count]
 

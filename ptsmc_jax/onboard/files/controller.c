@@ -1,5 +1,5 @@
 /* ptsmc_${name}.c: ${law}, from ${scenario}.
- * Made by ptsmc export; scenario SHA-256 ${digest}. Headings name the functions of the source that this is traced
+ * Made by ptsmc export; scenario SHA-256 ${checksum}. Headings name the functions of the source that this is traced
  * from, with the equations of Chen, Ju, Wang, Li, The prescribed time sliding mode control for attitude tracking of
  * spacecraft.
  */

@@ -1,5 +1,5 @@
 /* ptsmc_${name}.h: ${law}, from ${scenario}.
- * Made by ptsmc export; scenario SHA-256 ${digest}.
+ * Made by ptsmc export; scenario SHA-256 ${checksum}.
  */
 
 #ifndef PTSMC_${upper}_H
@@ -24,7 +24,7 @@ typedef PTSMC_REAL ptsmc_real;
 #define ptsmc_step PTSMC_SUFFIXED(ptsmc_step, PTSMC_REAL)
 #define ptsmc_parameters PTSMC_SUFFIXED(ptsmc_parameters, PTSMC_REAL)
 
-#define PTSMC_SCENARIO "${digest}"
+#define PTSMC_SCENARIO "${checksum}"
 
 /* What ptsmc_step returns, the most severe last. */
 enum ptsmc_status {

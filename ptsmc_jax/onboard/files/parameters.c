@@ -1,4 +1,4 @@
-/* The parameters of ${scenario} (SHA-256 ${digest}). */
+/* The parameters of ${scenario} (SHA-256 ${checksum}). */
 #include "ptsmc_${name}.h"
 
 #define R(x) ((ptsmc_real)(x))

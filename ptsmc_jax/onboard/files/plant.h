@@ -1,5 +1,5 @@
 /* ptsmc_${name}.h: the true plant of ${scenario}: actuators, disturbance, motion and sensors.
- * Made by ptsmc export; scenario SHA-256 ${digest}.
+ * Made by ptsmc export; scenario SHA-256 ${checksum}.
  */
 
 #ifndef PTSMC_${upper}_H
