@@ -148,6 +148,9 @@ def test_code_in_the_text_runs_without_errors(path, small, monkeypatch, tmp_path
         monkeypatch.setattr("ptsmc_jax.read", lambda name: scenario.read(name) and from_tables(tomllib.loads(SHORT)))
     if path.name == "export.md":  # the page calls the command instead
         ptsmc_jax.export("scenarios/first_flight.toml", "out/controller")
+    if path.name == "identification.md":
+        Path("mine.toml").write_text(SHORT_CHAIN)
+        ptsmc_jax.simulate("mine.toml").to_polars().write_csv("slew_1.csv")
     space = {}
     for block in blocks(path, "python"):
         exec(compile(block, str(path), "exec"), space)

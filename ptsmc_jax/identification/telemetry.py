@@ -250,7 +250,7 @@ def _attitude(given: Any, table: _Table, columns: Sequence[str]) -> Values:
     off = np.abs(norm - 1.0) > UNIT_NORM
     table.refuse(off, columns[0], lambda row: f"a unit quaternion in its four columns (the norm is {norm[row]:.6g})")
     q = q / norm[:, None]
-    q = np.roll(q, -1, axis=1) if given.order == "wxyz" else q
+    q = np.roll(q, -1, axis=1) if given.quaternion_order == "wxyz" else q
     if given.rotation == "inertial_to_body":
         q[:, :3] *= -1.0
     there = np.flatnonzero(~np.isnan(q[:, 0]))

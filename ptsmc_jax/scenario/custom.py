@@ -252,7 +252,7 @@ def _declaration(table: Any, found: Any, field: dataclasses.Field) -> Declaratio
     numbers = value if isinstance(value, tuple) and value and not (one and one.gain) else (value,)
     if not all(map(_plain, numbers)):
         shown = "none" if value is missing else show(value)
-        allowed = "a number, the first argument of gain" if one and one.gain else "a number or a tuple of numbers"
+        allowed = "a number, the first argument of gain" if one and one.gain else "one number or several numbers"
         raise ValueError(f"the default of {field.name} is {shown}, but must be {allowed}")
     value = tuple(map(float, value)) if isinstance(value, tuple) else float(value)
     one = (one or Declaration(value, "", "", Limits()))._replace(default=value)

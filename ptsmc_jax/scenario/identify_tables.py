@@ -10,7 +10,8 @@ from ptsmc_jax.scenario.values import Count, Meaning, NotNegative, Positive, Tab
 Column = Annotated[str, Meta(min_length=1, description="the name of a column")]
 Columns = Annotated[tuple[Column, ...], Meta(min_length=1, description="a list of names of columns")]
 Quaternion = Annotated[
-    tuple[Column, Column, Column, Column], Meta(description="a list of four names of columns, in the order of `order`")
+    tuple[Column, Column, Column, Column],
+    Meta(description="a list of four names of columns, in the order of `quaternion_order`"),
 ]
 Axes = Annotated[tuple[Column, Column, Column], Meta(description="a list of three names of columns")]
 NOT_THERE = "; default: {}, if the log has them"
@@ -24,7 +25,7 @@ class Telemetry(Table, frozen=True):
         Quaternion | None,
         Meaning("unit quaternion of the star tracker" + NOT_THERE.format("measured_q1 to measured_q4")),
     ] = None
-    order: Annotated[Literal["xyzw", "wxyz"], Meaning("scalar part last or first")] = "xyzw"
+    quaternion_order: Annotated[Literal["xyzw", "wxyz"], Meaning("scalar part last or first")] = "xyzw"
     rotation: Annotated[
         Literal["body_to_inertial", "inertial_to_body"],
         Meaning("the axes that the quaternion rotates from and to"),

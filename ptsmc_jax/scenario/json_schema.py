@@ -76,7 +76,7 @@ def _leaf(hint: Any) -> Schema:
     found: Schema = msgspec.json.schema(hint)
     some = [one for one in found.get("anyOf", []) if one.get("type") != "null"]
     one = {**(some[0] if len(some) == 1 else found)}
-    if "prefixItems" in one:  # numbers of one kind
+    if "prefixItems" in one and all(other == one["prefixItems"][0] for other in one["prefixItems"]):
         one["items"] = one.pop("prefixItems")[0]
     return one
 

@@ -151,14 +151,15 @@ def row(run: Run, before: State, after: State, record: Record, dt_before: Scalar
         before: state at the start of the period.
         after: state at its end.
         record: record of the period.
-        dt_before: nominal length of the period before [s]; None in the continuous loop.
+        dt_before: nominal length of the period before [s]; None in the continuous loop and with exported C, whose
+            memory of the sensors has another form. The row then has no readings.
     """
     now, drive, decision, wheels = record.now, record.drive, record.decision, None
     if drive is not None and record.torques.wheel_torque is not None:
         wheels = drive.h, record.torques.wheel_torque[0]
     u, has_length = record.torques.delivered[0], now.t_next > now.t
     found = row_at(run, now.t, before.x, decision, u, has_length, after.walk, wheels)
-    if dt_before is None or decision.channels is not None:  # exported C has a computer of another form
+    if dt_before is None:
         return found
     parts, nominal = run.parts, now if before.offset is None else now._replace(t=now.t - before.offset)
     seen = parts.plant.visible(before.x)

@@ -42,7 +42,7 @@ BODY = {
         ({"requirements": {"gain_margin": {"limit": 6.0, "quantile": 0.9}}}, "which every loop must keep"),
         ({"requirements": {"phase_margin": -3.0}}, "requirements.phase_margin is -3.0"),
         ({"loop": {"mode": "continuous"}, "hardware": {}}, "requirements.gain_margin needs the sampled loop"),
-        ({"controller": {"t_f": 8.0, "sign_width": 0.0}}, "needs a sign with a slope, but controller.sign_width is 0"),
+        ({"controller": {"t_f": 8.0, "sign_width": 0.0}}, "needs a boundary layer, but controller.sign_width is 0"),
     ],
 )
 def test_invalid_margin_requirements_are_refused(changes, said):

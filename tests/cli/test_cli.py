@@ -418,7 +418,7 @@ def test_infeasible_limit_is_reported(command, tmp_path, monkeypatch):
 
 
 def test_an_interrupted_run_writes_nothing(command, tmp_path, monkeypatch):
-    def stop(*_):
+    def stop(*_, **__):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(single, "write", stop)

@@ -190,7 +190,16 @@ def test_wheels_exchange_momentum_with_the_body(momentum, lag, limit):
     off = Rotation.from_quat(q).inv() * Rotation.from_quat(log.x.q[intervals])
     assert off.magnitude() < 1e-9
     np.testing.assert_allclose(log.wheels[0][intervals], h, rtol=0, atol=1e-12 * max(np.abs(momentum)) + 1e-13)
-    assert list(simulated.columns())[-8:] == ["h1", "h2", "h3", "h4", "v1", "v2", "v3", "v4"]  # of trajectory.csv
+    assert [name for name in simulated.columns() if name[0] in "hv"] == [
+        "h1",
+        "h2",
+        "h3",
+        "h4",
+        "v1",
+        "v2",
+        "v3",
+        "v4",
+    ]  # of trajectory.csv
     largest = simulated.metrics["peak_wheel_momentum"]
     assert largest >= np.abs(log.wheels[0]).max()  # t = 0 counts too
     np.testing.assert_allclose(largest, np.abs(log.wheels[0]).max(), rtol=2e-3)

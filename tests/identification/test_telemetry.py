@@ -62,7 +62,7 @@ def test_orders_signs_units_and_blanks_give_the_same_log():
         **{f"sent{k + 1}": 1e3 * frame()[f"sent{k + 1}"].to_numpy() for k in range(3)},
         t=[f"2026-03-01T12:00:{time:09.6f}Z" for time in T],
     )
-    table = {"order": "wxyz", "rotation": "inertial_to_body", "rate_unit": "deg/s", "torque_unit": "mN m"}
+    table = {"quaternion_order": "wxyz", "rotation": "inertial_to_body", "rate_unit": "deg/s", "torque_unit": "mN m"}
     again = telemetry.measurements(loaded(**table), other)
     np.testing.assert_allclose(again.t, plain.t, atol=1e-6)
     np.testing.assert_allclose(again.command, plain.command, rtol=1e-12)
@@ -119,7 +119,7 @@ BROKEN = [
     ({}, with_value("measured_w3", 4, np.inf), "in row 4, but must have a finite number"),
     ({}, with_value("sent1", 0, None), "has sent1 empty in row 0, but must have a number in the first row"),
     ({"rate_unit": "deg/s"}, frame(), "has rates that do not fit its attitudes"),
-    ({"order": "wxyz"}, frame(), "has rates that do not fit its attitudes"),
+    ({"quaternion_order": "wxyz"}, frame(), "has rates that do not fit its attitudes"),
     ({"rotation": "inertial_to_body"}, frame(), "has rates that do not fit its attitudes"),
     ({"wheel_torque": ["sent1", "sent2"]}, frame(), "telemetry.wheel_torque has 2 columns, but must have 3"),
     (

@@ -158,8 +158,11 @@ SENSORS = ("devices.sensors", "devices.sensor_suite")  # a run has one of the tw
 
 
 def stream_names():
-    """Return the stream names that the source passes to functions of `draws`; constants of a module are resolved."""
-    found = {module: module_stream_names(module, path) for module, path in modules().items()}
+    """Return the stream names that the source passes to functions of `draws`; constants of a module are resolved.
+
+    The export has the streams of the simulation, whose numbers its plant must repeat.
+    """
+    found = {module: module_stream_names(module, path) for module, path in modules().items() if "onboard" not in module}
     sensors = {name for module, names in found.items() if module.endswith(SENSORS) for name in names}
     others = [name for module, names in found.items() if not module.endswith(SENSORS) for name in names]
     return [*sensors, *others]

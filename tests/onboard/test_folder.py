@@ -316,7 +316,7 @@ def test_exported_c_has_the_names_and_equations_of_the_law(exported):
         "const real acceleration_3 = -switching_3",
     ):
         assert line in text
-    assert "power of the approach" in (exported / "ptsmc_short.h").read_text()
+    assert "exponent of the approach phase" in (exported / "ptsmc_short.h").read_text()
 
 
 def test_singularity_limit_in_c_equals_that_of_the_simulator(monkeypatch):

@@ -16,7 +16,7 @@ def test_fractions_have_the_digits_that_matter():
     """59 of 60 trials were 98.3333 %; near all of them the missing ones count."""
     asked = Requirement("peak_torque", 0.5, quantile=0.95)
     verdict = asked.verdict(np.r_[np.zeros(59), 1.0], np.ones(60, bool))
-    found = examples.entry(verdict, share=59 / 60, fraction_interval=[0.91056, 0.99957], fraction_bound=0.92333)
+    found = examples.entry(verdict, fraction=59 / 60, fraction_interval=[0.91056, 0.99957], fraction_bound=0.92333)
     text = campaign_report.verdict(found)
     assert "98.33 % of trials keep the limit (95 %: 91.06 to 99.957 %)" in text
     wide = Requirement("ape_x", 1.0, quantile=0.9, interpretation="mixed")

@@ -69,7 +69,7 @@ def test_a_run_becomes_a_page(command, simulated):
     assert (simulated / "scenario.toml").read_text().split("\n")[0] in read.text
     rows = np.genfromtxt(simulated / "trajectory.csv", delimiter=",", names=True)
     history = {line["name"]: line for line in read.charts["history"]["data"]}
-    assert set(history) == set(rows.dtype.names or ()) - {"t"}
+    assert set(history) == {name for name in rows.dtype.names or () if not name.startswith(("t", "measured", "sent"))}
     marked = {note["text"]: note["x"] for note in read.charts["history"]["layout"]["annotations"]}
     assert {name: marked[name] for name in ("t_f", "t_f - delta")} == {"t_f": 5.0, "t_f - delta": 4.5}
     assert [shape["x0"] for shape in read.charts["history"]["layout"]["shapes"]] == [5.0, 4.5]
@@ -265,7 +265,9 @@ def test_other_plants_have_pages_too(command, tmp_path):
     command("simulate", "c.toml", "--out", "chain", "--quiet")
     folder = tmp_path / "chain"
     assert set(checked(folder).charts) == {"history"}
-    assert (folder / "trajectory.csv").read_text().splitlines()[0] == "t,x1,x2,d_hat1,u1,s1"
+    assert (folder / "trajectory.csv").read_text().splitlines()[
+        0
+    ] == "t,x1,x2,d_hat1,u1,s1,measured_x1,measured_x2,sent1"
     names = {path.stem for path in (folder / "figures").iterdir()}
     assert names == {"states", "error", "torque", "sliding", "convergence"}
     summary = json.loads((folder / "summary.json").read_text())

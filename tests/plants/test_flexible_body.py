@@ -114,7 +114,8 @@ def test_metrics_and_columns_of_the_modes(simulated):
     np.testing.assert_allclose(metrics["residual_modal"], size[log.t >= 12.0].max(), rtol=1e-13)
     assert metrics["residual_modal"] < metrics["peak_modal"]
     columns = simulated.columns()
-    assert list(columns)[-8:] == [*(f"e{k}" for k in range(1, 5)), *(f"e_dot{k}" for k in range(1, 5))]
+    modes = [*(f"e{k}" for k in range(1, 5)), *(f"e_dot{k}" for k in range(1, 5))]
+    assert [name for name in columns if name in modes] == modes
     np.testing.assert_array_equal(columns["e_dot2"], log.x.modes.rate[:, 1])
     D = np.array(COUPLING)
     np.testing.assert_allclose(

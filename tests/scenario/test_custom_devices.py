@@ -247,7 +247,7 @@ SEES = [
     ("return jnp.concatenate([memory, seen[1:]]), seen[:1]", "return seen[:1], seen[:1]", "a state float64(1,)"),
     ("seen[1:]]), seen[:1]", "seen[1:]]), seen", "see returns a memory f64(2,)"),
     ("x + self.sigma", "jnp.nan * x + self.sigma", "must return finite numbers"),
-    ("x + self.sigma", "x + 0.0 / dt + self.sigma", "finite numbers, also where dt is 0, at the first sample"),
+    ("x + self.sigma", "x + 0.0 / dt + self.sigma", "finite numbers, also at the first sample, where dt is 0"),
     ("draws = 2\n    sigma", "draws = 2.5\n    sigma", "draws is 2.5, but must be a whole number of at least 0"),
     ("sigma * noise", "sigma * noise[2]", "see fails: IndexError: index 2 is out of bounds for axis 0 with size 2"),
     ("x + self.sigma", "1 / 0 + self.sigma", "see fails: ZeroDivisionError: division by zero (line 18 of mine.py)"),

@@ -362,7 +362,7 @@ BAD = [
     (changed("return 0.5 * wanted", "exit(0)"), {}, "acceleration fails: SystemExit", "line 19 of mine.py"),
     (
         changed("return 0.5 * wanted", "return jnp.log(-1.0) * wanted"), {},
-        "returns an acceleration [nan]", "finite numbers",
+        "returns an acceleration [nan]", "finite real numbers",
     ),
     (
         changed("return 0.5 * wanted", "return wanted if wanted[0] > 9.0 else 0.5 * wanted"), {},
@@ -392,7 +392,7 @@ BAD = [
     ),
     (changed("gain(3.0,", "gain(1.0,"), {}, "the default of eta is 1", "a number greater than 2"),
     (changed("(2.1, 6.0)", "(3.1, 6.0)"), {}, "the default of the gain eta is 3, but", "a number from 3.1 to 6"),
-    (changed("width: float = 1e-3", "width: str = 'x'"), {}, 'the default of width is "x"', "a number"),
+    (changed("width: float = 1e-3", "width: str = 'x'"), {}, 'the default of width is "x"', "one number or several"),
     (changed("width: float = 1e-3", "width: float"), {}, "cannot have such fields", "width"),
     ("Mine = [3]", {}, "it is a list, but must be a class derived from", "ptsmc_jax.AccelerationLaw"),
     (changed("width: float", "code: float"), {}, "the class Mine has a field code", "already uses"),
@@ -434,10 +434,10 @@ def test_errors_in_a_custom_law_are_one_sentence(here, law, keys, of_what, allow
     [
         ("observer", 'return {"last": d_mean,', 'return {"last": jnp.zeros(3),', "observer.code is"),
         ("observer", "def step", "def stop", "has no method step"),
-        ("observer", "share: float", "gain: float", "another than gain"),
-        ("observer", "    share: float", "    gain: float = 0.5\n    share: float", "another than gain"),
-        ("observer", "    share: float", "    gain: tuple = (0.5,)\n    share: float", "another than gain"),
-        ("observer", "share: float", "gain_2: float", "another than gain_2"),
+        ("observer", "share: float", "gain: float", "needs another name"),
+        ("observer", "    share: float", "    gain: float = 0.5\n    share: float", "needs another name"),
+        ("observer", "    share: float", "    gain: tuple = (0.5,)\n    share: float", "needs another name"),
+        ("observer", "share: float", "gain_2: float", "needs another name"),
         ("observer", "share: float", "update: float", "the class Filtered has a field update, a name that"),
         (
             "observer",
@@ -545,7 +545,7 @@ def test_late_errors_in_custom_code_are_one_sentence(command, here, monkeypatch)
     assert code == 2
     runs, refused = error.splitlines()
     assert runs == f"ptsmc: runs {here}/mine.py, which controller.code of s.toml names"
-    check_sentence(refused.removeprefix("ptsmc: "), f"{here}/mine.py keeps a number of a run", "its memory")
+    check_sentence(refused.removeprefix("ptsmc: "), f"{here}/mine.py stores a traced number", "its memory")
     assert not (here / "out").exists()
     with pytest.raises(ZeroDivisionError) as caught:
         made("mine.py", "fails")()
@@ -565,7 +565,7 @@ def test_a_custom_law_that_stores_a_number_between_calls_is_refused(command, her
     (here / "s.toml").write_text(SHORT_CUSTOM)
     for asked in (["simulate", "s.toml"], ["montecarlo", "s.toml", "--trials", 2]):
         code, _, error = command(*asked, "--no-figures", "--quiet")
-        assert (code, "its acceleration keeps a number of a run" in error) == (2, True)
+        assert (code, "its acceleration stores a traced number" in error) == (2, True)
 
 
 def test_custom_code_that_exits_is_a_configuration_error(command, here):

@@ -7,7 +7,7 @@ import pytest
 
 from ptsmc_jax.scenario.json_schema import json_schema
 from tests.helpers import ROOT
-from tests.scenario.test_schema import COMPLETE, changed, leaves
+from tests.scenario.test_schema import BUILT_IN, changed, leaves
 
 VALIDATOR = jsonschema.Draft202012Validator(json_schema())
 PACKAGED = [*(ROOT / "scenarios").glob("*.toml"), *(ROOT / "benchmarks" / "satellites").glob("*.toml")]
@@ -20,9 +20,9 @@ def test_packaged_scenarios_are_valid(path):
 
 
 def test_the_schema_has_every_key_and_no_other():
-    for tables in COMPLETE:
+    for _, tables in BUILT_IN:
         VALIDATOR.validate(tables)
-        for path, _ in leaves(tables):
+        for path, _ in leaves(tables) if "code" not in str(tables) else ():  # a custom part may have any key
             if isinstance(path[-1], str) and "bounds" not in path:
                 misspelt = changed(tables, [*path[:-1], f"{path[-1]}_"], 1.0)
                 assert not VALIDATOR.is_valid(misspelt), path
