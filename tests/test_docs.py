@@ -20,7 +20,7 @@ import ptsmc_jax
 from ptsmc_jax import scenario
 from ptsmc_jax.scenario import from_tables, layouts
 from ptsmc_jax.simulation import catalogues
-from tests.helpers import SHORT
+from tests.helpers import SHORT, SHORT_CHAIN
 from tests.onboard.flights import PROFILE
 from tests.tree import ROOT, modules
 from tuning.cli.main import app
