@@ -45,7 +45,7 @@ def test_simulate_runs_the_exported_controller(command, tmp_path, exported):
     assert (status, err) == (0, "")
     told = json.loads((tmp_path / "r" / "summary.json").read_text())
     layout = json.loads((exported / "controller.json").read_text())
-    assert told["controller"] == layout["digest"]
+    assert told["controller"] == layout["checksum"]
     assert told["controller_statuses"] == {"ok": 65}
     assert told["status"] == "ok"
 
@@ -76,7 +76,7 @@ def test_campaign_runs_the_exported_controller_and_copies_it(command, tmp_path):
     (tmp_path / "mine" / "controller").mkdir(parents=True)
     (tmp_path / "mine" / "controller" / "mine.c").write_text("")
     code, _, err = command(*flight, "--controller", "c", "--out", "mine", "--force")
-    assert (code, "whose controller holds C that no campaign left there" in err) == (2, True)
+    assert (code, "whose controller contains C code of the user" in err) == (2, True)
     assert command("montecarlo", "of_c.toml", *options, "--out", "o")[0] == 0
     by_c, by_us = (pl.read_parquet(tmp_path / name / "trials") for name in ("r", "o"))
     for name in ("window_error", "peak_torque", "effort"):

@@ -46,7 +46,7 @@ def test_each_outcome_is_counted_and_drawn():
     x, totals = 1.0 + np.arange(outcome.size), dict.fromkeys(campaign_plots.MARKS, 7)
     start, torque = campaign_plots.Column("rad", x), campaign_plots.Column("N m", x)
     (axes,) = campaign_plots.torque_by_angle(start, torque, outcome, totals).axes
-    assert axes.get_legend_handles_labels()[1] == [f"{name}: 7" for name in outcome]
+    assert axes.get_legend_handles_labels()[1] == [f"{name.replace('_', ' ')}: 7" for name in outcome]
     for points, marker in zip(
         axes.collections, (marker for _, marker, _ in campaign_plots.MARKS.values()), strict=True
     ):

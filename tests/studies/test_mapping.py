@@ -158,7 +158,7 @@ def not_simulated(monkeypatch):
     monkeypatch.setattr(montecarlo, "run", lambda *_: trials)
 
 
-@pytest.mark.usefixtures("unflown")
+@pytest.mark.usefixtures("not_simulated")
 def test_margins_of_a_pd_law_agree_with_the_closed_form():
     """The loop is a PD law, a zero-order hold and a double integrator. Earlier, maps had margins of one law only."""
     text = CHAIN.replace("t_f = 5.0, delta = 0.5", 'kind = "pd", t_f = 5.0')
@@ -265,7 +265,7 @@ flexible = { frequency = [3.0, 9.0], damping = [0.002, 0.02], coupling = [[1.0, 
 MODES = ("flexible.frequency[0]=2.0:8.0:3", "controller.delta=1.0:2.0:2", FLEXIBLE, 1)
 
 
-@pytest.mark.usefixtures("unflown")
+@pytest.mark.usefixtures("not_simulated")
 def test_spillover_limit_separates_stable_and_unstable_pairs(monkeypatch):
     """The logarithm of the poles is linear in frequency and delta, so that the stability limit is a straight line."""
 
