@@ -28,8 +28,9 @@ def signals(t: np.ndarray, panels: list[tuple[str, np.ndarray, np.ndarray]]) -> 
     for one, (label, measured, predicted) in zip(axes, panels, strict=True):
         for k, (colour, _) in zip(range(measured.shape[1]), style.STYLES, strict=False):
             one.plot(t[kept], measured[kept, k], ".", ms=2, color=colour, alpha=0.4)
-            one.plot(t[kept], predicted[kept, k], "-", lw=0.9, color=colour)
+            one.plot(t[kept], predicted[kept, k], "-", lw=0.9, color=colour, label=f"component {k + 1}")
         one.set_ylabel(label)
+    axes[0].legend(ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0))
     axes[0].set_title("Measured (dots) and predicted (lines)", loc="left")
     axes[-1].set_xlabel(style.TIME)
     return figure
@@ -41,7 +42,7 @@ def innovations(t: np.ndarray, names: list[str], values: np.ndarray, sigma: np.n
 
     Args:
         t: times (rows,) [s].
-        names: of the components.
+        names: of the components, with units.
         values: innovations (rows, components), NaN without a reading.
         sigma: their 1 sigma (rows, components).
     """
@@ -52,6 +53,9 @@ def innovations(t: np.ndarray, names: list[str], values: np.ndarray, sigma: np.n
         there = kept[np.isfinite(band[kept])]
         one.fill_between(t[there], -band[there], band[there], color="0.9")
         one.plot(t[there], values[there, k], ".", ms=2, color=style.STYLES[0][0])
+        if there.size:  # the first bands may be wide, because little is known of the state at the start
+            reach = 1.5 * max(np.nanquantile(band, 0.9), np.nanquantile(np.abs(values[:, k]), 0.99))
+            one.set_ylim(-reach, reach)
         one.set_ylabel(name)
     axes[0].set_title("Innovations and their 3 sigma bands", loc="left")
     axes[-1].set_xlabel(style.TIME)
@@ -99,7 +103,8 @@ def estimates(table: Any) -> Figure:
         axes.errorbar(change, k, xerr=reach, color=style.STYLES[0][0], capsize=3, fmt="o", ms=4)
     axes.set_yticks(range(len(rows)), [row["parameter"] for row in rows])
     axes.invert_yaxis()
-    axes.set_xlabel("change in % of the largest number of the parameter, with the 95 % interval; grey: prior knowledge")
+    axes.set_title("Estimates with 95 % intervals; grey: prior knowledge", loc="left")
+    axes.set_xlabel("change in % of the largest number of the parameter")
     return figure
 
 

@@ -16,6 +16,8 @@ from ptsmc_jax.scenario import custom, parsing
 from ptsmc_jax.scenario.tables import Scenario
 from tuning.search import custom_parts
 
+UNITS = {"attitude": "rad", "rate": "rad/s"}  # of innovations
+
 
 def write(folder: Path, found: Identification, figures: bool, made_by: Mapping[str, Any]) -> None:
     """Write a result folder: `identified.toml`, `summary.json`, `innovations.csv` and figures.
@@ -83,13 +85,15 @@ def innovations(fit: Fit) -> tuple[np.ndarray, np.ndarray]:
 def figures_of(found: Identification) -> dict[str, Any]:
     """Return the figures by name; those of the second log and of later ones have its number."""
     from ptsmc_jax.figures import identification_plots as plots
+    from ptsmc_jax.figures import style
 
     figures: dict[str, Any] = {"estimates": plots.estimates(found.table())}
     for k, fit in enumerate([*found.fits, *found.validation]):
         end = "" if k == 0 else f"_{k + 1}"
         names, t = results.components(fit), fit.log.t[1:]
         values, sigma = innovations(fit)
-        figures[f"innovations{end}"] = plots.innovations(t, names, values, sigma)
+        labels = [style.with_unit(name, UNITS.get(name.split("_")[0], "")) for name in names]
+        figures[f"innovations{end}"] = plots.innovations(t, labels, values, sigma)
         counts = np.sum(np.isfinite(values), axis=0)
         figures[f"autocorrelation{end}"] = plots.autocorrelation(names, fit.autocorrelation(), counts)
         figures[f"prediction{end}"] = plots.signals(t, _panels(fit, values))
