@@ -198,6 +198,11 @@ class SumDisturbance(Table, frozen=True):
         return {f"{name}.terms[{k}]": term for k, term in enumerate(self.terms)}
 
 
+def single(kinds: Mapping[str, type[Table]]) -> dict[str, type[Table]]:
+    """Return the kinds of disturbances that a sum may contain."""
+    return {kind: struct for kind, struct in kinds.items() if struct is not SumDisturbance}
+
+
 def _disturbances(first: str, body: bool) -> Mapping[str, type[Table]]:
     """Return the disturbances by kind; first: the default kind, body: whether the plant is a spacecraft."""
     quicker = () if body else (("frequency", Scaled(1.0, time=-1, each=True)),)  # as in the paper's Figs. 1 and 2

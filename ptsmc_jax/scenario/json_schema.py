@@ -6,7 +6,7 @@ from typing import Any
 
 import msgspec
 
-from ptsmc_jax.scenario import keys, layouts, sensor_tables
+from ptsmc_jax.scenario import disturbance_tables, keys, layouts, sensor_tables
 from ptsmc_jax.scenario.custom import Custom
 from ptsmc_jax.scenario.tables import Limit, Scenario
 from ptsmc_jax.scenario.values import Kinds, NotNegative, Table
@@ -47,8 +47,15 @@ def _kinds(name: str, kinds: type[Table] | Kinds, unit_of_d: str) -> Schema:
     first, found = next(iter(kinds)), []
     for kind, struct in kinds.items():
         one = _struct(struct, unit_of_d, name)
+        required = [] if kind == first else ["kind"]
         one["properties"] = {"kind": {"const": kind}, **one["properties"]}
-        found.append(one if kind == first else one | {"required": ["kind"]})
+        if struct is disturbance_tables.SumDisturbance:
+            one["properties"]["terms"] |= {
+                "items": _kinds(name, disturbance_tables.single(kinds), unit_of_d),
+                "minItems": 1,
+            }
+            required.append("terms")
+        found.append(one | {"required": required} if required else one)
     return {"anyOf": found}
 
 

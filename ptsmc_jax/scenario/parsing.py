@@ -306,7 +306,7 @@ def _sum(name: str, raw: Mapping[str, Any], kinds: Kinds, context: Context) -> T
     terms = raw.get("terms", ())
     if not isinstance(terms, list | tuple) or not terms or not all(isinstance(term, Mapping) for term in terms):
         raise wrong(f"{name}.terms", terms, disturbance_tables.TERMS)
-    single = {kind: struct for kind, struct in kinds.items() if struct is not disturbance_tables.SumDisturbance}
+    single = disturbance_tables.single(kinds)
     found = tuple(_table(f"{name}.terms[{k}]", term, single, context) for k, term in enumerate(terms))
     return disturbance_tables.SumDisturbance(terms=found)
 
