@@ -25,6 +25,14 @@ def test_importing_the_package_and_the_command_does_not_import_jax():
     assert not {"jax", "jaxlib", "numpy", "scipy", "matplotlib", "optax"} & set(loaded)
 
 
+def test_reading_a_scenario_imports_no_package_that_only_some_scenarios_need():
+    loaded = python(
+        "from ptsmc_jax import scenario; scenario.from_tables({}); import json, sys; print(json.dumps([*sys.modules]))"
+    )
+    assert "ptsmc_jax.scenario.device_tables" in loaded
+    assert not {"scipy.spatial", "scipy.interpolate", "polars", "matplotlib"} & set(loaded)
+
+
 def test_importing_the_library_changes_no_setting_of_jax_or_the_environment():
     """The user can call `configure` after the import. A study warns if the call is missing."""
     names = list(modules())

@@ -12,7 +12,6 @@ from typing import Annotated, Any, ClassVar, Literal
 import msgspec
 import numpy as np
 from msgspec import Meta
-from scipy.spatial.transform import Rotation
 
 from ptsmc_jax import formulas
 from ptsmc_jax.devices import command_filter
@@ -227,6 +226,8 @@ class Hardware(Actuators, frozen=True):
         made = super().actuators(wheels)
         if self.actuator_misalignment_deg is None:
             return made
+        from scipy.spatial.transform import Rotation  # the import takes 0.15 s, and most scenarios do not need it
+
         turns = Rotation.from_rotvec(np.deg2rad(self.actuator_misalignment_deg))
         axes = np.eye(3) if wheels is None else np.asarray(wheels.axes)
         return dataclasses.replace(made, directions=vector(turns.apply(axes.T).T))
