@@ -165,10 +165,12 @@ def _check_periods(scenario: Scenario) -> None:
 
 def _check_dispersion(scenario: Scenario) -> None:
     dispersion = scenario.dispersion
+    kinds: Any = scenario.TABLES["disturbance"]
+    if getattr(scenario, "orbit", None) is not None:  # it has no dispersion
+        kinds = {kind: one for kind, one in kinds.items() if kind != "gravity_gradient"}
     for article, what in (("a", "phase"), ("an", "amplitude")):
         asked = getattr(dispersion, f"disturbance_{what}", None) is not None
-        if asked and not any(_has(term, what) for term in scenario.terms):
-            kinds: Any = scenario.TABLES["disturbance"]
+        if asked and not any(_has(term, what) for term in scenario.terms if term.kind in kinds):
             allowed = " or ".join(errors.show(kind) for kind, one in kinds.items() if what in one.__struct_fields__)
             raise ScenarioError(
                 f"dispersion.disturbance_{what} needs a disturbance that has {article} {what}, but disturbance.kind is "

@@ -318,7 +318,7 @@ class Jitter(Table, frozen=True):
 
 # by key: its meaning and its kinds, the default first
 _DISTURBANCE: dict[str, tuple[str, tuple[Any, ...]]] = {
-    "disturbance_phase": ("phase of every sinusoid and of the orbit", (UniformPhase,)),
+    "disturbance_phase": ("phase of every sinusoid, and of gravity_gradient without [orbit]", (UniformPhase,)),
     "disturbance_amplitude": ("independent factor on each component of each sinusoid and constant", FACTORS),
     "disturbance_bias": ("an additional constant disturbance", (NormalBias, UniformBias)),
 }
