@@ -27,6 +27,11 @@ from ptsmc_jax.scenario.schema import PartTable, table
 from ptsmc_jax.scenario.values import Count, Kinds, Meaning, NotNegative, NotNegatives, Positive, Table, Three
 
 SAME = 1e-9  # relative tolerance for a whole number of periods
+EACH = "one for each axis, wheel or input"
+PositiveEach = Annotated[
+    tuple[Positive, ...], Meta(min_length=1, description=f"a list of numbers greater than 0, {EACH}")
+]
+ThreeEach = Annotated[tuple[Three, ...], Meta(min_length=1, description=f"a list of rows of three numbers, {EACH}")]
 
 
 class CommandFilterTable(PartTable, frozen=True):
@@ -67,11 +72,7 @@ class Actuators(Table, frozen=True):
         ),
     ] = None
     actuator_scale: Annotated[
-        Annotated[
-            tuple[Positive, ...],
-            Meta(min_length=1, description="a list of numbers greater than 0, one for each axis, wheel or input"),
-        ]
-        | None,
+        PositiveEach | None,
         Meaning("ratio of the true torque of each axis, wheel or input to the torque that the computer knows"),
     ] = None
     levels: ClassVar[Mapping[str, tuple[str, ...]]] = {}  # by dispersion key: the keys here that set the nominal value
@@ -103,7 +104,7 @@ class Actuators(Table, frozen=True):
         for key in ("actuator_scale", "actuator_misalignment_deg"):
             value = getattr(self, key, None)
             if value is not None and len(value) != channels:
-                raise wrong(f"hardware.{key}", value, f"a list of {channels}, one for each axis, wheel or input")
+                raise wrong(f"hardware.{key}", value, f"a list of {channels}, {EACH}")
 
     def noise_of_error(self, scenario: Any) -> tuple[float, float]:
         """Return the noise of the error and of its rate [1/s], 1 sigma per axis and raw sample."""
@@ -166,11 +167,7 @@ class Hardware(Actuators, frozen=True):
         ),
     ] = None
     actuator_misalignment_deg: Annotated[
-        Annotated[
-            tuple[Three, ...],
-            Meta(min_length=1, description="a list of rows of three numbers, one for each axis, wheel or input"),
-        ]
-        | None,
+        ThreeEach | None,
         Meaning("rotation vector of each axis, or wheel, from the axis that the computer knows", "deg"),
     ] = None
     gyro_scale: Annotated[Three | None, Meaning("ratio of the reading of the gyro to the true rate, by axis")] = None

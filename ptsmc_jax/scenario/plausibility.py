@@ -1,7 +1,7 @@
-"""Warn about valid scenarios whose values are probably mistakes. Start with `of`.
+"""Warn about valid scenarios whose values are probably mistakes. Start with `warnings`.
 
 The warnings concern disturbance bounds far from the disturbance, noisy estimates, a missing gyro error, values in wrong
-units, and a sliding surface that is too fast for the control period.
+units, a sliding surface that is too fast for the control period, and a ground target below the horizon.
 """
 
 from typing import Any

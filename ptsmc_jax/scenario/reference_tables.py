@@ -19,7 +19,7 @@ from ptsmc_jax.scenario.schema import PartTable, table
 from ptsmc_jax.scenario.values import Four, Kinds, Meaning, Number, Three
 from ptsmc_jax.signals import attitude_tables, mission_references, orbits, references
 
-HALF_TURN = np.pi / 2  # largest latitude [rad]
+LARGEST_LATITUDE = np.pi / 2  # [rad]
 
 
 class Initial(Attitude, frozen=True):
@@ -232,7 +232,7 @@ class GroundTargetTable(DirectionsTable, frozen=True):
     secondary: Annotated[Vector, SECONDARY] = "velocity"
 
     def check(self, scenario: Any) -> None:
-        if abs(self.latitude) > HALF_TURN:
+        if abs(self.latitude) > LARGEST_LATITUDE:
             raise wrong("reference.latitude", self.latitude, 'from -pi/2 to pi/2 [rad], or with its unit, as "48 deg"')
         super().check(scenario)
 
