@@ -137,6 +137,11 @@ def vector(*values: Any) -> Any:
     return jnp.asarray(np.asarray(values[0] if len(values) == 1 else values, dtype=float), dtype=float)
 
 
+def time_derivative(signal: Any) -> Any:
+    """Return the time derivative of a signal as a function of time [1/s], by automatic differentiation."""
+    return lambda t: jax.jvp(signal, (t,), (jnp.ones_like(t),))[1]
+
+
 def random_turns(smallest, largest):
     """Return the dispersion that turns the start from the reference by an angle between these [rad]."""
     return Dispersion({"initial_attitude": numbers.axis_angle(smallest, largest)})

@@ -14,6 +14,7 @@ import numpy as np
 
 from ptsmc_jax.scenario import epochs
 from ptsmc_jax.scenario.epochs import Epoch
+from ptsmc_jax.signals import attitude_tables
 
 VERSIONS = ("1.0", "2.0")
 INERTIAL = ("EME2000", "J2000", "GCRF", "ICRF", "MOD", "TOD", "TEME", "MEME", "EMEJ2000")
@@ -21,8 +22,6 @@ BODY = re.compile(r"SC_BODY(_\w+)?|SC(_\w+)?|BODY(_\w+)?|.*_BODY(_\w+)?")
 UNIVERSAL = ("UTC", "UT1")
 WIDTHS = {"QUATERNION": 4, "QUATERNION/DERIVATIVE": 8, "QUATERNION/RATE": 7, "QUATERNION/ANGVEL": 7}
 SPLINES = re.compile(r"CUBIC_?SPLINE|SPLINE")
-# `loop.epoch` of a message without one: the standard has calendar times only
-NO_EPOCH = epochs.Epoch(0, 0.0)
 
 
 @dataclass
@@ -37,6 +36,11 @@ class Block:
         if name not in self.keywords and default is None:
             raise ValueError(f"a segment has no {name}, which the standard demands")
         return self.keywords[name][0].upper() if name in self.keywords else str(default)
+
+    @property
+    def kind(self) -> str:
+        """The attitude type, such as QUATERNION/RATE."""
+        return self.get("ATTITUDE_TYPE").replace(" ", "/")
 
     def refused(self, name: str, reason: str) -> ValueError:
         """Return the error for the value of a keyword."""
@@ -162,8 +166,7 @@ def _check_interpolation(block: Block, any_interpolation: bool) -> None:
 
 def _data(block: Block) -> tuple[list[Epoch], np.ndarray]:
     """Return the epochs and the numbers (n, width) of the data lines."""
-    kind = block.get("ATTITUDE_TYPE")
-    kind = kind.replace(" ", "/")
+    kind = block.kind
     if kind not in WIDTHS:
         raise block.refused("ATTITUDE_TYPE", f"but must be {' or '.join(WIDTHS)}: only quaternions are read")
     times, rows = [], []
@@ -192,7 +195,7 @@ def _number(cell: str) -> float:
 
 def _attitudes(block: Block, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
     """Return quaternions (n, 4) from body to inertial axes, scalar last, and body rates (n, 3) [rad/s] or None."""
-    kind = block.get("ATTITUDE_TYPE").replace(" ", "/")
+    kind = block.kind
     place = block.get("QUATERNION_TYPE", "LAST")
     if place not in ("FIRST", "LAST"):
         raise block.refused("QUATERNION_TYPE", "but must be FIRST or LAST")
@@ -200,18 +203,15 @@ def _attitudes(block: Block, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarra
     if way not in ("A2B", "B2A"):
         raise block.refused("ATTITUDE_DIR", "but must be A2B or B2A")
 
-    def scalar_last(values: np.ndarray) -> np.ndarray:
-        return np.roll(values, -1, axis=1) if place == "FIRST" else values
-
-    quaternions, rates = scalar_last(numbers[:, :4]), None
     inertial_first = block.get("REF_FRAME_A") in INERTIAL
-    if inertial_first != (way == "A2B"):  # from the body to the inertial frame
-        quaternions = quaternions * [-1.0, -1.0, -1.0, 1.0]
+
+    def body_to_inertial(values: np.ndarray) -> np.ndarray:
+        values = np.roll(values, -1, axis=1) if place == "FIRST" else values
+        return values if inertial_first == (way == "A2B") else values * attitude_tables.CONJUGATE
+
+    quaternions, rates = body_to_inertial(numbers[:, :4]), None
     if kind == "QUATERNION/DERIVATIVE":
-        slopes = scalar_last(numbers[:, 4:])
-        slopes = slopes if inertial_first == (way == "A2B") else slopes * [-1.0, -1.0, -1.0, 1.0]
-        v, s, v_dot, s_dot = quaternions[:, :3], quaternions[:, 3:], slopes[:, :3], slopes[:, 3:]
-        rates = 2.0 * (s * v_dot - s_dot * v - np.cross(v, v_dot))
+        rates = attitude_tables.body_rates(quaternions, body_to_inertial(numbers[:, 4:]))
     elif kind != "QUATERNION":
         rates = np.deg2rad(numbers[:, 4:])
         rates = rates if inertial_first else -rates  # they are rates of frame B relative to frame A
@@ -243,7 +243,7 @@ def write(name: str, times: np.ndarray, quaternions: np.ndarray, rates: np.ndarr
         rates: (n, 3) body rates, body axes [rad/s].
         epoch: calendar time of t = 0, UTC; None: 2000-01-01T12:00:00, with a comment.
     """
-    zero = NO_EPOCH if epoch is None else epochs.of_key(epoch)
+    zero = Epoch(0, 0.0) if epoch is None else epochs.of_key(epoch)  # the standard has calendar times only
     begin, end = (zero.after(float(times[k])) for k in (0, -1))
     created = dt.datetime.now(dt.UTC).strftime("%Y-%m-%dT%H:%M:%S")
     unknown = ["COMMENT The scenario has no epoch: t = 0 is at 2000-01-01T12:00:00."] if epoch is None else []

@@ -138,7 +138,7 @@ def _table(
     quaternions = np.stack([_numbers(frame, names[name]) for name in columns], axis=1)
     quaternions = quaternions if last else np.roll(quaternions, -1, axis=1)
     if direction == "inertial_to_body":
-        quaternions = quaternions * [-1.0, -1.0, -1.0, 1.0]
+        quaternions = quaternions * attitude_tables.CONJUGATE
     group = next((group for group in RATES if any(name in names for name in group)), None)
     absent = next((name for name in group or () if name not in names), None)
     if absent is not None:

@@ -13,6 +13,7 @@ from ptsmc_jax.signals.references import Reference, Target
 
 MOST_INTERVALS = 1_000_000  # of the search table, so that it needs at most 4 MB
 ENDS = 5  # samples that determine the rate at an end; its error is then proportional to h^4, as at other samples
+CONJUGATE = np.array([-1.0, -1.0, -1.0, 1.0])  # times a unit quaternion: the inverse rotation
 LARGEST_TURN = np.pi / 2  # between two samples [rad]: a turn of pi has no unique direction
 
 
@@ -97,15 +98,19 @@ def _slopes(times: np.ndarray, samples: np.ndarray, ends: np.ndarray | None) -> 
 
 
 def rates(times: np.ndarray, samples: np.ndarray, ends: np.ndarray | None = None) -> np.ndarray:
-    """Return the rates (n, 3) [rad/s] at the samples in reference axes, 2 vec(q* q').
+    """Return the rates (n, 3) [rad/s] at the samples in reference axes.
 
     Args:
         times: (n,) [s].
         samples: (n, 4) unit quaternions without jumps of their signs.
         ends: see `interpolated`.
     """
-    slopes = _slopes(times, samples, ends)
-    v, s, v_dot, s_dot = samples[:, :3], samples[:, 3:], slopes[:, :3], slopes[:, 3:]
+    return body_rates(samples, _slopes(times, samples, ends))
+
+
+def body_rates(q: np.ndarray, q_dot: np.ndarray) -> np.ndarray:
+    """Return the rates 2 vec(q* q') (n, 3) [rad/s] of quaternions (n, 4) with derivatives (n, 4) [1/s]."""
+    v, s, v_dot, s_dot = q[:, :3], q[:, 3:], q_dot[:, :3], q_dot[:, 3:]
     return 2.0 * (s * v_dot - s_dot * v - np.cross(v, v_dot))
 
 

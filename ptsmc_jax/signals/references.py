@@ -142,7 +142,7 @@ class Swing(Reference):
 @pytree
 @dataclass(frozen=True)
 class Slew(Reference):
-    """From the attitude, at rest, to another one, at rest, about one axis: q_f(t) = q exp(share(t / duration) turn).
+    """From the attitude, at rest, to another one, at rest, about one axis: q_f(t) = q exp(f(t / duration) turn).
 
     The fraction f(x) = 10 x^3 - 15 x^4 + 6 x^5 rises from 0 to 1, with zero first and second derivatives at both ends.
     """
@@ -181,9 +181,3 @@ class CurrentTime:
     def __call__(self, t: Scalar) -> Scalar:
         """Return t [s]."""
         return t
-
-
-def time_derivative(signal: Callable, t: Scalar) -> Array:
-    """Return the time derivative [1/s] of a signal at the time t [s], (its shape), by automatic differentiation."""
-    t = jnp.asarray(t, jnp.result_type(float))
-    return jax.jvp(signal, (t,), (jnp.ones_like(t),))[1]

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ptsmc_jax.numerics import attitude
-from tests.helpers import vector
+from tests.helpers import time_derivative, vector
 
 EPS = np.finfo(float).eps
 TURNS = Rotation.random(24, rng=np.random.default_rng(0))
@@ -95,9 +95,6 @@ def test_vector_rates_equal_automatic_derivatives_of_a_moving_attitude():
     def q(t):
         x = a + b[0] * jnp.sin(t) + b[1] * jnp.cos(2 * t)
         return x / jnp.sqrt(jnp.sum(x * x))
-
-    def time_derivative(f):
-        return lambda t: jax.jvp(f, (t,), (jnp.ones_like(t),))[1]
 
     def rate(t):  # w = 2 (q* q')_v
         x, x_dot = q(t), time_derivative(q)(t)

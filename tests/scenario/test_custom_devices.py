@@ -80,15 +80,8 @@ CHAIN = {
 }
 NOISY = {"kind": "custom", "code": "mine.py:Noisy"}
 DRIFT = {"custom": {"kind": "custom", "code": "mine.py:Drift"}}
-
-
-@pytest.fixture(autouse=True)
-def here(tmp_path, monkeypatch):
-    """An empty folder with the parts in mine.py; no custom file counts as run yet."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(systems, "_ran", {})
-    (tmp_path / "mine.py").write_text(FILE)
-    return tmp_path
+FILES = {"mine.py": FILE}
+pytestmark = pytest.mark.usefixtures("here")
 
 
 def parts_of(**tables):

@@ -48,15 +48,8 @@ MINE = {"kind": "custom", "code": "mine.py:Mine", "t_f": 5.0}
 SHORT_CUSTOM = SHORT.replace("[controller]\n", '[controller]\nkind = "custom"\ncode = "mine.py:Mine"\n').replace(
     "surface_rate = 1.0\nsign_width = 1e-3\n", ""
 )
-
-
-@pytest.fixture(autouse=True)
-def here(tmp_path, monkeypatch):
-    """An empty folder with the law in mine.py; no custom file counts as run yet."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(systems, "_ran", {})
-    (tmp_path / "mine.py").write_text(HEAD + LAW)
-    return tmp_path
+FILES = {"mine.py": HEAD + LAW}
+pytestmark = pytest.mark.usefixtures("here")
 
 
 def made(file, name) -> Any:

@@ -12,7 +12,7 @@ from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo, runs
 from ptsmc_jax.onboard import board
 from ptsmc_jax.plants import system
-from ptsmc_jax.scenario import custom, systems
+from ptsmc_jax.scenario import custom
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.theory import linear, margins, solutions
@@ -35,15 +35,8 @@ TABLES = {
     "controller": {"kind": "pd", "k_p": 2.0, "k_d": 1.5, "t_f": 5.0},
     "loop": {"mode": "sampled", "period": PERIOD, "t_end": 6.5, "clock": "flight"},
 }
-
-
-@pytest.fixture(autouse=True)
-def here(tmp_path, monkeypatch):
-    """An empty folder with the systems in my.py; no custom file counts as run yet."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(systems, "_ran", {})
-    (tmp_path / "my.py").write_text(FILE)
-    return tmp_path
+FILES = {"my.py": FILE}
+pytestmark = pytest.mark.usefixtures("here")
 
 
 def test_the_true_plant_is_simulated_with_a_law_for_the_design_model():

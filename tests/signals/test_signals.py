@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from ptsmc_jax import scenario
 from ptsmc_jax.numerics import attitude
 from ptsmc_jax.signals import disturbances, references
-from tests.helpers import vector
+from tests.helpers import time_derivative, vector
 
 EPS = np.finfo(float).eps
 START = Rotation.from_rotvec([0.4, -1.0, 2.0])
@@ -23,8 +23,8 @@ target = jax.jit(lambda signal, t: signal(t))
 position_and_rates = jax.jit(
     lambda signal, t: (
         signal(t).q,
-        references.time_derivative(lambda t: signal(t).q, t),
-        references.time_derivative(lambda t: references.time_derivative(lambda t: signal(t).q, t), t),
+        time_derivative(lambda t: signal(t).q)(t),
+        time_derivative(time_derivative(lambda t: signal(t).q))(t),
         attitude.derivative(signal(t).q, signal(t).w),
         signal(t).vector_rates(),
     )
@@ -92,20 +92,13 @@ def test_sinusoid_and_its_time_derivative_equal_closed_forms():
         value = [b + a * math.sin(y) for a, y, b in zip(amplitude, x, bias, strict=True)]
         np.testing.assert_allclose(signal(vector(t)), value, rtol=0, atol=0.02 * tolerance)
         derivative = [a * f * math.cos(y) for a, f, y in zip(amplitude, frequency, x, strict=True)]
-        np.testing.assert_allclose(
-            references.time_derivative(signal, vector(t)), derivative, rtol=0, atol=0.06 * tolerance
-        )
+        np.testing.assert_allclose(time_derivative(signal)(vector(t)), derivative, rtol=0, atol=0.06 * tolerance)
 
 
 def test_constant_disturbance_has_derivative_zero():
     signal = disturbances.Constant(vector([0.1, -0.2, 0.3]))
     np.testing.assert_array_equal(signal(vector(5.0)), [0.1, -0.2, 0.3])
-    np.testing.assert_array_equal(references.time_derivative(signal, vector(5.0)), np.zeros(3))
-
-
-def test_time_derivative_accepts_concrete_times():
-    signal = disturbances.Sinusoid(*(vector([x] * 3) for x in (1.0, 1.0, 0.0, 0.0)))
-    np.testing.assert_allclose(references.time_derivative(signal, jnp.asarray(2.0)), [math.cos(2)] * 3, rtol=4 * EPS)
+    np.testing.assert_array_equal(time_derivative(signal)(vector(5.0)), np.zeros(3))
 
 
 @pytest.mark.parametrize(
