@@ -6,24 +6,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from ptsmc_jax.devices.actuators import ActuatorState
 from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.dispersions.variation import Dispersion
-from ptsmc_jax.numerics import draws
+from ptsmc_jax.observers.none import NoObserver
 from ptsmc_jax.onboard import derived
 from ptsmc_jax.onboard.board import Board, Given, Stage
 from ptsmc_jax.onboard.fmu import FILTER_STATE
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.computer import Computer, Decision, Software
-from ptsmc_jax.simulation.control_period import (
-    DISTURBANCE_WALK,
-    SAMPLE_TIMES,
-    State,
-    Tick,
-    Vehicle,
-    control_period,
-    star_state,
-)
+from ptsmc_jax.simulation.control_period import State, Tick, Vehicle, control_period, start
 
 # parts that the plant consists of; the reference because initial attitudes may be relative to it
 PARTS = ("plant", "disturbance", "sensors", "actuators", "initial", "reference", "walk_rate", "jitter")
@@ -52,22 +43,22 @@ def plant_board(parts: Parts, dispersion: Dispersion, controller: Board) -> Boar
         return given | {"drawn": _picked(_of_trial(parts, dispersion, given))}
 
     def begin(given: Given, _: Given) -> Given:
-        vehicle, state, memory, filtered = _begin(
-            _assembled(parts, given, given["drawn"]), given["seed"], given["trial"]
-        )
-        return _written(vehicle, state, memory, jnp.int32(0), controller) | {
-            f"out.initial_{name}": value for name, value in filtered.items() if name in controller.state
-        }
+        trial = _assembled(parts, given, given["drawn"])
+        vehicle, state = _begin(trial, given["seed"], given["trial"])
+        filtered = trial.sensors.remembered(state.computer.sensors)
+        return _written(trial, state, jnp.int32(0), controller) | {
+            "now.keys": (vehicle.walk_key, vehicle.jitter_key),
+            **{f"out.initial_{name}": filtered[name] for name in FILTER_STATE
+               if name in filtered and name in controller.state},
+        }  # fmt: skip
 
     def advance(given: Given, values: Given) -> Given:
-        now, sample = values["before.plant"], values["before.sample"]
-        vehicle = _vehicle(_assembled(parts, given, given["drawn"]), values["in." + command], now["keys"])
-        state = State(now["x"], now["torque"], Computer(None, None, None, None, now["applied"]), now["actuators"],
-                      now["walk"], now["star_x"], now["offset"])  # fmt: skip
-        after, _ = control_period(
-            vehicle, state, Tick(_period(vehicle.parts, sample), jnp.zeros(()), jnp.asarray(False))
-        )
-        return _written(vehicle, after, now["sensors"], sample + 1, controller)
+        trial, sample, none = _assembled(parts, given, given["drawn"]), values["before.sample"], jnp.zeros(())
+        software, bound = _commanding(values["in." + command]), trial.observer.error_bound()
+        vehicle = Vehicle(trial, software, bound, none, none, *values["before.keys"])
+        tick = Tick(_period(trial, sample), none, jnp.asarray(False))
+        after, _ = control_period(vehicle, values["before.plant"], tick)
+        return _written(trial, after, sample + 1, controller)
 
     computer.rules.append(draw)
     written = jax.eval_shape(lambda given: begin(given, {}), parameters)
@@ -78,7 +69,7 @@ def plant_board(parts: Parts, dispersion: Dispersion, controller: Board) -> Boar
     computer.stages = [
         Stage("begin", "The plant at the first sample: dispersions, sensors, first readings.", (), begin),
         Stage("advance", "A control period: actuators, disturbance, motion, then the readings at the next sample.",
-              ("in." + command, "before.plant", "before.sample"), advance, (parts.plant,)),
+              ("in." + command, "before.plant", "before.sample", "before.keys"), advance, (parts.plant,)),
     ]  # fmt: skip
     return computer
 
@@ -128,46 +119,39 @@ def _period(parts: Parts, sample: Any) -> Ticks:
     return Ticks(t, t_next, jnp.asarray(False), sample, jnp.ones(()), jnp.asarray(False))
 
 
-def _vehicle(parts: Parts, command: Any, keys: Any) -> Vehicle:
-    """Return the constants of a run, with a flight computer that commands an input (m,) [N m]."""
-    zero = jnp.zeros(parts.plant.inputs)
+def _commanding(command: Any) -> Software:
+    """Return a flight computer that commands an input (m,) [N m]."""
+    zero = jnp.zeros_like(command)
+
+    def boot(parts: Parts, seed: Any, trial: Any, x0: Any, first: Ticks) -> Computer:
+        return Computer(parts.sensors.begin(seed, trial, x0, first), None, None, None, (zero, None))
 
     def decide(parts: Parts, k2: Any, period: Any, computer: Computer, *_: Any) -> tuple[Decision, Computer]:
         return Decision(None, zero, command, zero, zero), computer
 
-    software, nothing = Software(lambda *_: None, decide), jnp.zeros(())  # pyright: ignore[reportArgumentType]
-    return Vehicle(parts, software, parts.observer.error_bound(), nothing, nothing, *keys)
+    return Software(boot, decide)
 
 
-def _begin(parts: Parts, seed: Any, trial: Any) -> tuple[Vehicle, State, Any, dict[str, Any]]:
-    """Return the run and its state at the first sample, the memory of the sensors, and the state of a filter."""
-    actuators, inputs, x = parts.actuators, parts.plant.inputs, parts.initial
-    walk_key = None if parts.walk_rate is None else draws.stream(seed, trial, DISTURBANCE_WALK)
-    jitter_key = None if parts.jitter is None else draws.stream(seed, trial, SAMPLE_TIMES)
-    vehicle, first = _vehicle(parts, jnp.zeros(inputs), (walk_key, jitter_key)), _period(parts, jnp.int32(0))
-    zero = jnp.zeros(inputs)
-    computer = Computer(None, None, None, None, None if actuators.holds else (zero, None))
-    state = State(x, zero, computer, actuators.begin(inputs), None if walk_key is None else zero,
-                  star_state(parts, first, lambda t: x), vehicle.draw_offset(first.t, first.sample))  # fmt: skip
-    memory = parts.sensors.begin(seed, trial, parts.plant.visible(x), first)
-    filtered = {name: v for name, v in parts.sensors.remembered(memory).items() if name in FILTER_STATE}
-    return vehicle, state, memory, filtered
+def _begin(parts: Parts, seed: Any, trial: Any) -> tuple[Vehicle, State]:
+    """Return the run and its state at the first sample."""
+    ticks = jax.tree.map(lambda v: v[None], _period(parts, jnp.int32(0)))
+    parts = replace(parts, observer=NoObserver(parts.plant, jnp.zeros(())))  # C may be unable to express the observer
+    return start(parts, ticks, parts.initial, seed, trial, _commanding(jnp.zeros(parts.plant.inputs)))
 
 
-def _written(vehicle: Vehicle, state: State, memory: Any, sample: Any, controller: Board) -> Given:
+def _written(parts: Parts, state: State, sample: Any, controller: Board) -> Given:
     """Return the state and the outputs at a sample, by name, after its readings.
 
     Args:
-        vehicle: the constants of the run.
-        state: state of the run at the sample.
-        memory: memory of the sensors after the last sample.
+        parts: the scenario of the trial.
+        state: state of the run at the sample, with the memory of the sensors after the last sample.
         sample: number of the sample.
         controller: the flight computer, whose inputs are outputs of the plant.
     """
-    parts, now = vehicle.parts, _period(vehicle.parts, sample)
+    now = _period(parts, sample)
     before = jnp.where(sample > 0, now.t - (sample - 1).astype(float) * parts.period, 0.0)
     visible = parts.plant.visible(state.x)
-    named, memory = parts.sensors.inputs(memory, visible, now, before, state.star_x)
+    named, memory = parts.sensors.inputs(state.computer.sensors, visible, now, before, state.star_x)
     named |= {"wheel_momentum": state.actuators.h, "acting": state.actuators.v, "applied": state.applied[0],
               "reference": parts.reference(now.t)}  # fmt: skip
     d = parts.disturbance(now.t if state.offset is None else now.t + state.offset, state.x)
@@ -178,13 +162,8 @@ def _written(vehicle: Vehicle, state: State, memory: Any, sample: Any, controlle
     outputs = {name: jax.tree.map(lambda v, of: v.astype(of.dtype), named[name], shape)
                for name, shape in controller.inputs.items()}  # fmt: skip
     outputs |= {f"true_{name}": value for name, value in true.items()}
+    if hasattr(memory, "estimate"):  # the flight computer has the filter
+        memory = memory._replace(estimate=None)
     applied = None if state.computer.applied is None else (state.applied[0], None)
-    kept = {"x": state.x, "torque": state.torque, "applied": applied, "walk": state.walk, "offset": state.offset,
-            "actuators": ActuatorState(*state.actuators), "star_x": state.star_x, "sensors": _without_filter(memory),
-            "keys": (vehicle.walk_key, vehicle.jitter_key)}  # fmt: skip
+    kept = state._replace(computer=state.computer._replace(sensors=memory, applied=applied))
     return {"now.plant": kept, "now.sample": sample} | {f"out.{name}": value for name, value in outputs.items()}
-
-
-def _without_filter(memory: Any) -> Any:
-    """Return the memory of sensors without the estimate of the flight computer's filter."""
-    return memory._replace(estimate=None) if hasattr(memory, "estimate") else memory
