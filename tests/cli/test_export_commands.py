@@ -125,6 +125,9 @@ def test_campaign_runs_the_exported_controller_and_copies_it(command, tmp_path):
         (SHORT, ("--trials", "0"), 'Invalid value "0" for --trials. Must be >= 1.'),
         (SHORT, ("--trials", "101"), 'Invalid value "101" for --trials. Must be <= 100.'),
         (SHORT, ("--seed", "-1"), 'Invalid value "-1" for --seed. Must be >= 0.'),
+        (SHORT, ("--fmu", "--fmi", "4"), 'Invalid value "4" for --fmi. Choose from: 2, 3.'),
+        (SHORT, ("--fmi", "2"), "--fmi is 2, but must be absent without --fmu or --fmu-plant"),
+        (SHORT, ("--no-binary",), "--no-binary is given, but must be absent without --fmu or --fmu-plant"),
     ],
 )  # fmt: skip
 def test_export_refuses_invalid_scenarios_and_options(command, tmp_path, text, args, said):

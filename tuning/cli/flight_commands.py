@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 from tuning.cli.options import Force, Out, Quiet, Seed, Trust, prepare, whole
+from tuning.errors import UsageError
 from tuning.output import terminal
 
 if TYPE_CHECKING:
@@ -50,6 +51,9 @@ def export(
 
     Exit status: 0 done, 2 configuration error, or a part that cannot be written in C.
     """
+    if not (fmu or fmu_plant) and (fmi is not None or no_binary):
+        option = "--no-binary is given" if fmi is None else f"--fmi is {fmi}"
+        raise UsageError(f"{option}, but must be absent without --fmu or --fmu-plant")
     loaded, folder = prepare(scenario, "export", out, trust=trust, force=force)
     from ptsmc_jax.campaigns import store
     from ptsmc_jax.onboard import folder as controllers
