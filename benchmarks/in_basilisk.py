@@ -15,7 +15,6 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -111,17 +110,18 @@ class Basilisk:
         return np.asarray(self.body.scStateOutMsg.read().sigma_BN)
 
 
-def simulated(made: Any, library: Any, module: Any, trial: int, seed: int = 0) -> tuple[float, float, int]:
+def simulated(made: Any, library: Any, flight_computer: Any, trial: int, seed: int = 0) -> tuple[float, float, int]:
     """Simulate a trial; return RMS window error [-], peak torque of a wheel [N m], and samples with another status."""
     import jax.numpy as jnp
     from scipy.spatial.transform import Rotation
 
     from ptsmc_jax.onboard.library import InTheLoop
+    from ptsmc_jax.simulation.control_period import first_period
 
     parts = made.ready.dispersion.apply(made.ready.parts, jnp.uint32(seed), jnp.uint32(trial))
-    first = made.first(parts)
+    first = first_period(parts.clock.ticks(parts.controller.t_f, parts.controller.delta))
     booted = InTheLoop(library, parts).boot(parts, jnp.uint32(seed), jnp.uint32(trial), parts.initial, first)
-    computer = module.FlightComputer(library.folder)
+    computer = flight_computer(library.folder)
     computer.start = np.asarray(booted.sensors[1])
     craft = Basilisk(parts, np.asarray(parts.initial.q), trial, computer)
     target = Rotation.from_quat(np.asarray(parts.reference(jnp.asarray(0.0)).q)).as_quat()
@@ -134,7 +134,7 @@ def simulated(made: Any, library: Any, module: Any, trial: int, seed: int = 0) -
         errors[k] = np.linalg.norm(q[:3] - target[:3])
         odd += int(computer.status != 0)
         peak = max(peak, float(np.max(np.abs(computer.values("wheel_torque")))))
-        craft.push(k, np.asarray(made.disturbance(parts, now + h / 2)))
+        craft.push(k, np.asarray(parts.disturbance(jnp.asarray(now + h / 2), parts.initial)))
     inside = (t >= t_f - 1e-9) & (t <= t_f + window + 1e-9)
     squares = errors[inside] ** 2
     mean = np.sum((squares[1:] + squares[:-1]) / 2) / (len(squares) - 1)
@@ -146,36 +146,24 @@ def main() -> None:
     from ptsmc_jax.configure import configure
 
     configure()
-    import jax.numpy as jnp
-
     from ptsmc_jax import scenario
     from ptsmc_jax.campaigns import montecarlo, store
     from ptsmc_jax.onboard import folder
     from ptsmc_jax.onboard.library import Library
-    from ptsmc_jax.simulation.control_period import first_period
-
-    class Controller(folder.Controller):
-        """A controller with the first control period and the disturbance of a trial."""
-
-        def first(self, parts: Any) -> Any:
-            return first_period(parts.clock.ticks(parts.controller.t_f, parts.controller.delta))
-
-        def disturbance(self, parts: Any, t: float) -> Any:
-            return parts.disturbance(jnp.asarray(t), parts.initial)
 
     trials = int(sys.argv[1]) if len(sys.argv) > 1 else 100
     flight = scenario.read(ROOT / "scenarios" / "filtered_flight.toml")
     flight = scenario.replace(flight, tune=None, wheels={"kind": "pyramid"}, loop__clock="flight")
     print(f"| gains, {trials} trials | RMS window error in Basilisk | in the library | largest wheel torque [N m] | "
           "in the library | status not ok |")  # fmt: skip
-    for name, gains in (("the paper's", {}), ("tuned", TUNED)):
-        made = Controller(scenario.replace(flight, **gains), "flight", name)
+    for name, gains in (("published", {}), ("tuned", TUNED)):
+        made = folder.Controller(scenario.replace(flight, **gains), "flight", name)
         with tempfile.TemporaryDirectory() as place:
             store.write(Path(place) / "c", lambda making, made=made: folder.write_program(making, made))
             library = Library(Path(place) / "c")
             subprocess.run(["make", "-C", f"{place}/c", "shared"], check=True, stdout=subprocess.DEVNULL)
-            module = SimpleNamespace(**runpy.run_path(f"{place}/c/basilisk.py"))
-            theirs = np.array([simulated(made, library, module, k) for k in range(trials)])
+            flight_computer = runpy.run_path(f"{place}/c/basilisk.py")["FlightComputer"]
+            theirs = np.array([simulated(made, library, flight_computer, k) for k in range(trials)])
         ours = montecarlo.run(made.ready.parts, made.ready.dispersion, 0, np.arange(trials))
         rms = [float(np.sqrt(np.mean(np.square(v)))) for v in (theirs[:, 0], ours.metrics.window_error)]
         peaks = theirs[:, 1].max(), float(np.max(ours.metrics.peak_wheel_torque))
