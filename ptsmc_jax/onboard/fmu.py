@@ -4,7 +4,6 @@ import hashlib
 import math
 import platform
 import re
-import subprocess
 import sys
 import tempfile
 import zipfile
@@ -19,13 +18,11 @@ from ptsmc_jax.onboard import templates
 from ptsmc_jax.onboard.expressions import REAL
 from ptsmc_jax.onboard.fields import Field
 from ptsmc_jax.onboard.generate import Code
-from ptsmc_jax.onboard.library import compiler
+from ptsmc_jax.onboard.library import build
 from ptsmc_jax.onboard.templates import STATUS, About
 from ptsmc_jax.scenario.errors import ScenarioError
 
 VERSIONS = (2, 3)
-NEAR = 1e-3  # communication points count as equal within this fraction of a period
-OPTIONS = ("-std=c99", "-O2", "-fPIC", "-shared", "-fvisibility=hidden")
 TYPES = {2: {"r": "Real", "i": "Integer", "u": "Integer"}, 3: {"r": "Float64", "i": "Int32", "u": "UInt32"}}
 # exponents of the base units in each unit that a description may contain
 UNITS = {"rad": {"rad": 1}, "s": {"s": 1}, "m": {"m": 1}, "kg": {"kg": 1}, "N": {"kg": 1, "m": 1, "s": -2}, "1": {}}
@@ -94,24 +91,23 @@ def variables(model: Model) -> list[Variable]:
     def listed(fields: Iterable[Field], role: str, values: dict[str, Any], prefix: str = "") -> Iterable[Variable]:
         for field in fields:
             kind = {REAL: "r", "uint32_t": "u"}.get(field.kind, "i")
-            own = role
-            if role == "t" and (field.name == "period" or model.plant):
-                own = "c" if field.name == "period" and model.plant else "f"
             start = np.broadcast_to(values.get(field.name, _rest(field)), field.shape)
             for index in np.ndindex(*field.shape):
                 at = f"[{','.join(str(k + 1) for k in index)}]" if index else ""
-                yield Variable(f"{prefix}{field.name}{at}", kind, own, float(start[index]), _meaning(field.about))
+                yield Variable(f"{prefix}{field.name}{at}", kind, role, float(start[index]), _meaning(field.about))
 
     statuses = ", ".join(f"{k} {name.lower()}" for k, name in enumerate(STATUS))
     taken = {field.name for field in (*code.inputs, *code.outputs)}
     zeros = {field.name: 0.0 for field in (*model.filter_state, *code.outputs)}
+    fixed, of_period = ("f", "c") if model.plant else ("t", "f")
     return [
         *listed(code.inputs, "i", {}),
         *listed(code.outputs, "o", zeros),
         Variable("status", "i", "o", 0.0, f"of the last sample: {statuses}"),
         *listed(model.filter_state, "f", zeros, "initial_"),
         *(made for field in code.parameters
-          for made in listed([field], "t", code.values, "nominal_" if field.name in taken else "")),
+          for made in listed([field], of_period if field.name == "period" else fixed, code.values,
+                             "nominal_" if field.name in taken else "")),
     ]  # fmt: skip
 
 
@@ -126,8 +122,8 @@ def _rest(field: Field) -> Any:
     return [0.0, 0.0, 0.0, 1.0] if field.shape == (4,) and "wheel" not in field.name else 0.0
 
 
-def sources(model: Model, version: int) -> dict[str, str]:
-    """Return the texts of the C files of an FMU, by file name, the translation units first."""
+def sources(model: Model, version: int) -> tuple[dict[str, str], str]:
+    """Return the texts of the C files of an FMU, by file name, and the token that the binary compares."""
     code, listed = model.code, variables(model)
     rows = templates.rows(code, model.about)
     elements = [element for field in model.filter_state for element in field.elements()]
@@ -140,20 +136,18 @@ def sources(model: Model, version: int) -> dict[str, str]:
         "parameters": len(code.columns["params"]),
         "starts": len(elements),
         "at_end": int(model.plant),
-        "near": repr(NEAR),
         "kinds": _strings(variable.kind for variable in listed),
         "roles": _strings(variable.role.replace("c", "o") for variable in listed),  # neither can be set
         "values": "\n".join(f"    {_number(variable.start)}," for variable in listed),
         "filter": "\n".join(lines),
         "period": first + code.columns["params"].index("period"),
-        "rejected": "a sample was rejected, see the output status",
         **{name: rows[name] for name in ("in_from", "params_from", "out_to")},
     }
     texts = {f"fmi{version}.c": templates.filled(f"fmi{version}.c"), **model.texts}
-    header = templates.filled("fmu.h", token="${token}", **values)
+    header = templates.filled("fmu.h", token="", **values)
     token = hashlib.sha256("".join([*texts.values(), header]).encode()).hexdigest()
-    texts["fmu.h"] = header.replace("${token}", token)
-    return {name: templates.prefixed(text, model.about.name) for name, text in texts.items()}
+    texts["fmu.h"] = templates.filled("fmu.h", token=token, **values)
+    return {name: templates.prefixed(text, model.about.name) for name, text in texts.items()}, token
 
 
 def _strings(letters: Iterable[str]) -> str:
@@ -186,10 +180,10 @@ def description(model: Model, version: int, token: str, units: Sequence[str]) ->
         outputs = [k + 1 for k in outputs]
         unknown = ('      <Unknown index="{}"/>',) * 2
     made = {
-        "title": model.title,
+        "title": quoteattr(model.title),
         "token": token,
-        "about": f"{model.title}, one sample every {model.period:g} s",
-        "identifier": identifier(model),
+        "about": quoteattr(f"{model.title}, one sample every {model.period:g} s"),
+        "identifier": model.about.stem,
         "sources": "\n".join(f'      <File name="{name}"/>' for name in units),
         "units": "\n".join(f'    <Unit name="{name}"><BaseUnit{text}/></Unit>' for name, text in bases.items()),
         "stop": f"{model.t_end:g}",
@@ -198,12 +192,9 @@ def description(model: Model, version: int, token: str, units: Sequence[str]) ->
         "outputs": "\n".join(unknown[0].format(k) for k in outputs),
         "unknowns": "\n".join(unknown[1].format(k) for k in outputs),
     }
-    plain = ("sources", "units", "variables", "outputs", "unknowns")
-    made = {name: text if name in plain else quoteattr(text)[1:-1] for name, text in made.items()}
     if version == 3:
         time = f'    <Float64 name="time" valueReference="{len(listed)}" causality="independent" unit="s"/>'
         made["variables"] += "\n" + time
-        made.pop("sources")
     return templates.filled(f"fmi{version}.xml", **made)
 
 
@@ -222,19 +213,15 @@ def _variable(variable: Variable, reference: int, version: int) -> str:
     return f"    <ScalarVariable {named}><{TYPES[2][variable.kind]}{values}/></ScalarVariable>"
 
 
-def identifier(model: Model) -> str:
-    """Return the model identifier, which is the name of the binary."""
-    return f"ptsmc_{model.about.name}"
-
-
-def place(version: int) -> str:
-    """Return the path of the binary for this machine, without its name, and with its suffix after a colon."""
+def binary_path(name: str, version: int) -> str:
+    """Return the path of the binary for this machine in an FMU."""
     system = {"darwin": "darwin", "win32": "windows"}.get(sys.platform, "linux")
     machine = {"amd64": "x86_64", "arm64": "aarch64"}.get(platform.machine().lower(), platform.machine().lower())
     folder = f"{machine}-{system}"
     if version == 2 and machine == "x86_64":
         folder = {"linux": "linux64", "windows": "win64", "darwin": "darwin64"}[system]
-    return f"binaries/{folder}/:{ {'linux': '.so', 'windows': '.dll', 'darwin': '.dylib'}[system] }"
+    suffix = {"linux": ".so", "windows": ".dll", "darwin": ".dylib"}[system]
+    return f"binaries/{folder}/{name}{suffix}"
 
 
 def write(file: Path, model: Model, version: int, *, binary: bool = True) -> None:
@@ -247,36 +234,30 @@ def write(file: Path, model: Model, version: int, *, binary: bool = True) -> Non
         binary: whether to compile it for this machine; the sources are always in the file.
 
     Raises:
-        ScenarioError: if there is no C compiler, and a binary is asked for.
+        ScenarioError: if there is no C compiler for the binary.
     """
-    texts = sources(model, version)
+    (texts, token), name = sources(model, version), model.about.stem
     units = [name for name in texts if name.endswith(".c")]
-    token = re.findall(r'#define TOKEN "(\w+)"', texts["fmu.h"])[0]
-    content: dict[str, str | bytes] = {f"sources/{name}": text for name, text in texts.items()}
+    content: dict[str, str | bytes] = {f"sources/{file}": text for file, text in texts.items()}
     content["modelDescription.xml"] = description(model, version, token, units)
     if version == 3:
-        listed = "\n".join(f'      <SourceFile name="{name}"/>' for name in units)
-        content["sources/buildDescription.xml"] = templates.filled(
-            "build.xml", identifier=identifier(model), sources=listed
-        )
+        listed = "\n".join(f'      <SourceFile name="{unit}"/>' for unit in units)
+        content["sources/buildDescription.xml"] = templates.filled("build.xml", identifier=name, sources=listed)
     if binary:
-        folder, _, suffix = place(version).partition(":")
-        content[f"{folder}{identifier(model)}{suffix}"] = compiled(texts, units)
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, data in content.items():
-            info = zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0))  # the same content gives the same file
+        content[binary_path(name, version)] = compiled(texts, units)
+    with zipfile.ZipFile(file, "w") as archive:
+        for path, data in content.items():
+            info = zipfile.ZipInfo(path, (1980, 1, 1, 0, 0, 0))  # the same content gives the same file
             info.compress_type, info.external_attr = zipfile.ZIP_DEFLATED, 0o644 << 16
             archive.writestr(info, data)
 
 
 def compiled(texts: dict[str, str], units: Sequence[str]) -> bytes:
-    """Return the shared library of these C files. Raises ScenarioError without a compiler."""
-    command = compiler()
+    """Return the shared library of these C files. Raises ScenarioError without a compiler, or if it fails."""
     with tempfile.TemporaryDirectory(prefix="ptsmc-") as made:
         for name, text in texts.items():
             (Path(made) / name).write_text(text, encoding="utf-8")
-        run = [*command, *OPTIONS, *units, "-o", "binary", "-lm"]
-        done = subprocess.run(run, cwd=made, capture_output=True, text=True, check=False)
-        if done.returncode:
-            raise ScenarioError(f"the C compiler {command[0]} fails: {done.stderr.strip().splitlines()[:1]}")
+        error = build("-fvisibility=hidden", *units, "-o", "binary", folder=Path(made))
+        if error:
+            raise ScenarioError(f"the C code of the FMU does not compile: {error}")
         return (Path(made) / "binary").read_bytes()

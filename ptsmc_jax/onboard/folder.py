@@ -16,7 +16,6 @@ from ptsmc_jax.onboard import fmu as units
 from ptsmc_jax.onboard import templates, vectors
 from ptsmc_jax.onboard.board import Board, board
 from ptsmc_jax.onboard.generate import Code, generate
-from ptsmc_jax.onboard.library import compiler
 from ptsmc_jax.onboard.plant import plant_board
 from ptsmc_jax.onboard.readme import readme
 from ptsmc_jax.onboard.sources import LAYOUT
@@ -129,7 +128,7 @@ def table(made: Controller, simulated: dict[int, vectors.Samples]) -> tuple[list
 
 def controller_model(made: Controller) -> units.Model:
     """Return the controller as the model of an FMU."""
-    texts, stem = templates.texts(made.code, made.about), f"ptsmc_{made.about.name}"
+    texts, stem = templates.texts(made.code, made.about), made.about.stem
     filtered = [field for field in made.code.state if made.about.filtered and field.name in units.FILTER_STATE]
     title, t_end = f"controller of {made.about.scenario}", float(made.ready.parts.t_end)
     kept = {name: texts[name] for name in (f"{stem}.c", f"{stem}.h")}
@@ -153,7 +152,7 @@ def plant_model(made: Controller) -> units.Model:
     return units.Model(code, about, title, templates.plant_texts(code, about), float(ready.parts.t_end), plant=True)
 
 
-class Wanted(NamedTuple):
+class Fmus(NamedTuple):
     """The FMUs to write beside the C."""
 
     controller: bool = False
@@ -161,29 +160,23 @@ class Wanted(NamedTuple):
     version: int | None = None  # version of FMI, 2 or 3; None: both
     binary: bool = True  # whether they contain a binary for this machine
 
-    def models(self, made: Controller) -> dict[str, units.Model]:
-        """Return the models by the first part of their file names.
+    def write(self, folder: Path, made: Controller) -> None:
+        """Write the FMUs of a controller and of its plant into a folder.
 
         Raises:
-            ScenarioError: if the plant cannot be written in C, or a binary is wanted without a C compiler.
+            ScenarioError: if the plant cannot be written in C, or there is no C compiler for a binary.
         """
-        makers = {"controller": controller_model, "plant": plant_model}
-        found = {name: makers[name](made) for name in makers if getattr(self, name)}
-        if found and self.binary:
-            compiler()
-        return found
-
-    def write(self, folder: Path, models: dict[str, units.Model]) -> None:
-        """Write the FMUs of these models into a folder."""
-        for name, model in models.items():
-            for version in units.VERSIONS if self.version is None else (self.version,):
-                units.write(folder / f"{name}_fmi{version}.fmu", model, version, binary=self.binary)
+        for name, model_of in (("controller", controller_model), ("plant", plant_model)):
+            if getattr(self, name):
+                model = model_of(made)
+                for version in units.VERSIONS if self.version is None else (self.version,):
+                    units.write(folder / f"{name}_fmi{version}.fmu", model, version, binary=self.binary)
 
 
-NO_FMU = Wanted()
+NO_FMUS = Fmus()
 
 
-def write(folder: Path, made: Controller, seed: int, trials: int, wanted: Wanted = NO_FMU) -> None:
+def write(folder: Path, made: Controller, seed: int, trials: int, fmus: Fmus = NO_FMUS) -> None:
     """Write all files into an existing folder.
 
     Args:
@@ -191,15 +184,14 @@ def write(folder: Path, made: Controller, seed: int, trials: int, wanted: Wanted
         made: the controller.
         seed: seed of the trials in the test vectors.
         trials: number of these trials.
-        wanted: the FMUs to write.
+        fmus: the FMUs to write.
     """
-    models = wanted.models(made)
+    fmus.write(folder, made)
     simulated, t_f = simulate(made, seed, trials), float(made.ready.parts.controller.t_f)
     rounding = made.board.model.error_rounding
     header, rows = table(made, simulated)
     steepness = min(vectors.steepness(one, rounding, t_f, made.last) for one in simulated.values())
     write_program(folder, made, steepness)
-    wanted.write(folder, models)
     store.write_csv(folder / "vectors.csv", header, rows)
     made_by = {"command": "export", "seed": seed, **custom.checksums(made.scenario)}
     store.record(folder, parsing.dump(made.scenario), made_by)
@@ -251,8 +243,8 @@ def export(
         RefusedError: if the folder has content, and `force` is not set.
         ValueError: if `trials`, `seed` or `fmi` is not a valid number.
     """
-    path, wanted = Path(folder), Wanted(fmu, fmu_plant, fmi, binary)
-    if fmi not in (None, 2, 3):
+    path = Path(folder)
+    if fmi not in (None, *units.VERSIONS):
         raise ValueError(f"fmi is {fmi!r}, but must be 2, 3 or None for both")
     draws.check_whole_number("trials", trials, 1)
     draws.check_whole_number("seed", seed)
@@ -261,6 +253,7 @@ def export(
     source = "a scenario" if isinstance(what, Scenario) else Path(what).name
     stem = identifier(name or ("flight" if isinstance(what, Scenario) else Path(what).stem))
     made = Controller(known, stem, source, reference_input)
+    fmus = Fmus(fmu, fmu_plant, fmi, binary)
     with store.in_use(path, force=force):
-        store.write(path, lambda making: write(making, made, seed, trials, wanted))
+        store.write(path, lambda making: write(making, made, seed, trials, fmus))
     return path

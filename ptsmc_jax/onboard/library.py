@@ -30,8 +30,6 @@ from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.computer import OURS, SAMPLES, Computer, Decision, Period, Software
 
-# XLA's headers are system headers, so that compilers warn of our code only
-OPTIONS = ("-std=c99", "-O2", "-shared", "-fPIC", "-isystem", jax.ffi.include_dir())
 SAME = 1e-6  # relative to the largest element; smaller differences come from 32 bits
 NAMED = 4  # largest number of parameters in a message
 _loaded = itertools.count()
@@ -50,6 +48,21 @@ def compiler() -> list[str]:
             f"there is no C compiler{f' {said}' if said else ''}; allowed is cc, gcc or clang, or what CC names"
         )
     return found
+
+
+def build(*arguments: str, folder: Path | None = None) -> str:
+    """Compile a shared library in a folder; return the first error of the compiler, empty if there is none.
+
+    Raises:
+        ScenarioError: if there is no C compiler.
+    """
+    command = [*compiler(), "-std=c99", "-O2", "-shared", "-fPIC", *arguments, "-lm"]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    if done.returncode == 0:
+        return ""
+    lines = done.stderr.strip().splitlines() or ["without a message"]
+    errors = [line for line in lines if "error: " in line and not line.startswith("collect2: ")]
+    return (errors or lines)[0]
 
 
 class Library:
@@ -95,17 +108,11 @@ class Library:
         alone = place / "controller"  # only the files that campaigns keep and check
         sources.copy(self.folder, alone)
         files = [str(alone / f"ptsmc_{self.name}{end}.c") for end in ("", "_parameters")]
-        command = [*compiler(), *OPTIONS, *options, f"-DPTSMC_REAL={real}", f"-I{alone}", *files]
-        compiled = subprocess.run(
-            [*command, str(glue), "-o", str(library), "-lm"], capture_output=True, text=True, check=False
-        )
-        if compiled.returncode:
-            said = compiled.stderr.replace(str(alone), str(self.folder))
-            lines = said.strip().splitlines() or ["without a message"]
-            errors = [line for line in lines if "error: " in line and not line.startswith("collect2: ")]
-            raise ScenarioError(
-                f"the controller in {self.folder} does not compile from the *.c and *.h in it: {(errors or lines)[0]}"
-            )
+        # XLA's headers are system headers, so that compilers warn of our code only
+        flags = "-isystem", jax.ffi.include_dir(), *options, f"-DPTSMC_REAL={real}", f"-I{alone}"
+        error = build(*flags, *files, str(glue), "-o", str(library)).replace(str(alone), str(self.folder))
+        if error:
+            raise ScenarioError(f"the controller in {self.folder} does not compile from the *.c and *.h in it: {error}")
         return library
 
     def first(self) -> np.ndarray:

@@ -45,6 +45,11 @@ class About(NamedTuple):
     delay: int  # delay of the commands in control periods
     steepness: float  # growth of the gains until the hand-over, at least (t_f / time to go of the last sample)^2
 
+    @property
+    def stem(self) -> str:
+        """The beginning of the names of its C files."""
+        return f"ptsmc_{self.name}"
+
 
 # public names of a controller: the templates have them after ptsmc_ and PTSMC_, exported files after ptsmc_NAME_
 _SYMBOLS = ("init", "step", "parameters")  # linked
@@ -77,7 +82,7 @@ def filled(file: str, **values: str | int) -> str:
 
 def texts(code: Code, about: About) -> dict[str, str]:
     """Return the text of each file of a controller, by file name, except for README.md and tables of numbers."""
-    stem = f"ptsmc_{about.name}"
+    stem = about.stem
     files = {f"{stem}.h": "controller.h", f"{stem}.c": "controller.c", f"{stem}_parameters.c": "parameters.c",
              f"{stem}_flat.h": "flat.h"} | PROGRAMS  # fmt: skip
     origin = {"name": about.name, "upper": about.name.upper(), "scenario": about.scenario, "checksum": about.checksum,
@@ -89,7 +94,7 @@ def texts(code: Code, about: About) -> dict[str, str]:
 
 def plant_texts(code: Code, about: About) -> dict[str, str]:
     """Return the text of each file of a plant in C, by file name."""
-    stem, call = f"ptsmc_{about.name}", code.calls
+    stem, call = about.stem, code.calls
     values = {"name": about.name, "upper": about.name.upper(), "scenario": about.scenario, "checksum": about.checksum}
     functions = "\n".join([*_helpers(code), "\n\n".join(code.functions)])
     head = filled("head.c", name=about.name, functions=functions).rstrip()

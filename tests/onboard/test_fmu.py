@@ -4,6 +4,7 @@ import json
 import re
 import subprocess
 import zipfile
+from xml.etree import ElementTree
 
 import jax
 import jax.numpy as jnp
@@ -84,8 +85,8 @@ def rich():
 def files(rich, tmp_path_factory):
     """The folder of the FMUs of controller and plant for both versions of FMI."""
     place = tmp_path_factory.mktemp("fmus")
-    wanted = folder.Wanted(controller=True, plant=True)
-    wanted.write(place, wanted.models(rich))
+    fmus = folder.Fmus(controller=True, plant=True)
+    fmus.write(place, rich)
     return place
 
 
@@ -237,8 +238,8 @@ def test_inertia_of_the_plant_can_be_changed_before_a_run(tmp_path):
     tables = flight(hardware={"attitude_noise": 0.0, "rate_noise": 0.0}, dispersion={},
                     disturbance={"kind": "constant", "amplitude": [0.0, 0.0, 0.0]})  # fmt: skip
     made = made_from(tables)
-    wanted = folder.Wanted(plant=True, version=3)
-    wanted.write(tmp_path, wanted.models(made))
+    fmus = folder.Fmus(plant=True, version=3)
+    fmus.write(tmp_path, made)
     plant = Unit(tmp_path / "plant_fmi3.fmu")
     plant.begin({"plant_inertia[3,3]": 20.0})
     for k in range(10):
@@ -259,7 +260,7 @@ def test_unusable_inputs_return_a_warning_and_the_last_command(loop):
 @pytest.mark.parametrize("model", [pytest.param("controller", marks=pytest.mark.long), "plant"])
 def test_sanitizers_find_nothing(rich, tmp_path, model):
     made = {"controller": folder.controller_model, "plant": folder.plant_model}[model](rich)
-    texts = units.sources(made, 3)
+    texts, token = units.sources(made, 3)
     for name, text in texts.items():
         (tmp_path / name).write_text(text)
     driver = str(ROOT / "tests" / "onboard" / "fmu_driver.c")
@@ -269,7 +270,6 @@ def test_sanitizers_find_nothing(rich, tmp_path, model):
     built = [*compiler(), *strict, *flags, *names, driver, "-o", str(tmp_path / "driver"), "-lm"]
     done = subprocess.run(built, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    token = texts["fmu.h"].partition('#define TOKEN "')[2][:64]
     sizes = [len(made.code.columns["in"]) - 1, len(made.code.columns["out"])]
     ran = [str(tmp_path / "driver"), token, repr(made.period), *map(str, sizes)]
     done = subprocess.run(ran, capture_output=True, text=True, check=False)
@@ -313,6 +313,13 @@ def test_plant_that_c_cannot_express_is_refused():
         folder.plant_model(made)
 
 
+def test_names_of_scenario_files_may_contain_quotes(rich):
+    model = folder.controller_model(rich)._replace(title='controller of "a" & b.toml')
+    for version in units.VERSIONS:
+        described = ElementTree.fromstring(units.description(model, version, "token", []).encode())
+        assert described.attrib["modelName"] == model.title
+
+
 def test_units_are_products_of_base_units():
     assert units.unit("N m s") == ("N.m.s", {"kg": 1, "m": 2, "s": -1})
     assert units.unit("rad/s^2") == ("rad/s2", {"rad": 1, "s": -2})
@@ -326,8 +333,8 @@ def test_plant_supplies_the_reference_of_a_trial(tmp_path):
     """With the reference as an input, closed loops with a random reference equal the simulation."""
     about = {"kind": "normal", "std_deg": 3.0}
     made = made_from(FLIGHTS["slew"] | {"dispersion": {"reference": about}}, reference_input=True)
-    wanted = folder.Wanted(controller=True, plant=True, version=2)
-    wanted.write(tmp_path, wanted.models(made))
+    fmus = folder.Fmus(controller=True, plant=True, version=2)
+    fmus.write(tmp_path, made)
     loop = tuple(Unit(tmp_path / f"{one}_fmi2.fmu") for one in ("controller", "plant"))
     expected = simulated(made, SEED, range(5))
     for trial in range(5):
@@ -339,8 +346,8 @@ def test_plant_supplies_the_reference_of_a_trial(tmp_path):
 @pytest.mark.parametrize("name", [*SIX, *OTHERS])
 def test_closed_loops_of_other_scenarios_equal_the_simulation(name, tmp_path):
     made = made_from({**FLIGHTS, "suite": TABLES}[name])
-    wanted, count = folder.Wanted(controller=True, plant=True, version=3), 1000 if name in SIX else 100
-    wanted.write(tmp_path, wanted.models(made))
+    fmus, count = folder.Fmus(controller=True, plant=True, version=3), 1000 if name in SIX else 100
+    fmus.write(tmp_path, made)
     loop = tuple(Unit(tmp_path / f"{one}_fmi3.fmu") for one in ("controller", "plant"))
     expected = simulated(made, SEED, range(count))
     for trial in range(count):

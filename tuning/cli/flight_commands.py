@@ -61,9 +61,9 @@ def export(
 
     stem = controllers.identifier(name or scenario.stem)
     controller = controllers.Controller(loaded, stem, scenario.name, reference_input)
-    wanted = controllers.Wanted(fmu, fmu_plant, fmi, not no_binary)
+    fmus = controllers.Fmus(fmu, fmu_plant, fmi, not no_binary)
     with store.in_use(folder, force=force):
-        store.write(folder, lambda making: controllers.write(making, controller, seed, trials, wanted))
+        store.write(folder, lambda making: controllers.write(making, controller, seed, trials, fmus))
     if not quiet:
         costs = ", ".join(f"{n} {what}" for what, n in templates.operations(controller.code.counts).items() if n)
         check = f"make -C {shlex.quote(str(folder))} check"

@@ -15,6 +15,7 @@
 #endif
 
 #define TOKEN "${token}"
+#define NEAR 1e-3 /* communication points count as equal within this fraction of a period */
 
 enum {
     INPUTS = ${inputs},
@@ -110,13 +111,13 @@ static int advance(memory *m, double end)
     m->end = end;
     end = (end - m->start) / p.period; /* in periods, from here on */
     for (;;) {
-        if (!m->taken && m->sample < end - ${near}) {
+        if (!m->taken && m->sample < end - NEAR) {
             memcpy(m->held + 1, m->v, INPUTS * sizeof(double));
             m->taken = 1;
             status = AT_END ? status : step(m, &p);
         }
         worst = status > worst ? status : worst;
-        if (!m->taken || m->sample + 1.0 > end + ${near}) {
+        if (!m->taken || m->sample + 1.0 > end + NEAR) {
             return worst;
         }
         status = AT_END ? step(m, &p) : status;
@@ -160,7 +161,7 @@ static const char *unsteppable(const memory *m, double t, double length)
     if (!(length > 0.0 && length < 1e9 * period)) {
         return "a communication step must be positive and finite";
     }
-    return fabs(t - m->end) <= ${near} * period ? NULL : "a step must begin where the last step ended";
+    return fabs(t - m->end) <= NEAR * period ? NULL : "a step must begin where the last step ended";
 }
 
 typedef enum { OK, WARNING, DISCARD, FAILED } result; /* with the values of fmi2Status and fmi3Status */
@@ -310,7 +311,7 @@ static result do_step(instance *c, double t, double length)
     if (wrong != NULL) {
         return say(c, FAILED, wrong);
     }
-    return advance(&c->m, t + length) < PTSMC_INPUT ? OK : say(c, WARNING, "${rejected}");
+    return advance(&c->m, t + length) < PTSMC_INPUT ? OK : say(c, WARNING, "a sample was rejected, see the output status");
 }
 
 /* Functions of capabilities that the FMU does not have. The caller removes further arguments. */
