@@ -88,6 +88,7 @@ class Program:
         functools.update_wrapper(self, function)
         self._function, self._static, self._signature = function, static, inspect.signature(function)
         self._batch, self._title = batch, title
+        options = options or (BATCHED if batch else None)
         self._jitted = jax.jit(function, static_argnames=static, compiler_options=options)
         self._stored = jax.jit(self._restored(), static_argnames=static, compiler_options=options)
         self._prepared: list[Future] = []
@@ -239,7 +240,7 @@ def jit(
     Args:
         function: a function at the top of a module of this project; others are compiled, but never stored.
         static_argnames: names of the arguments that are constants of the program.
-        compiler_options: as of `jax.jit`.
+        compiler_options: as of `jax.jit`; None: `BATCHED` for a batch, otherwise the defaults.
         batch: run on JAX's default device instead of the CPU.
         title: plural noun for progress reports; programs without a title are not reported, see `compiling`.
     """

@@ -262,7 +262,6 @@ def prepare(parts: Parts, dispersion: Dispersion, count: int) -> None:
 
 @programs.jit(
     static_argnames=("devices", "custom_metrics", "kernel", "software"),
-    compiler_options=programs.BATCHED,
     batch=True,
     title="the simulations of many trials",
 )

@@ -156,12 +156,7 @@ class _Rows:
         return jax.tree.map(joined, *calls)
 
 
-@programs.jit(
-    static_argnames=("names", "pointing", "devices"),
-    compiler_options=programs.BATCHED,
-    batch=True,
-    title="the simulations of the search",
-)
+@programs.jit(static_argnames=("names", "pointing", "devices"), batch=True, title="the simulations of the search")
 def _simulate(
     parts: Parts,
     dispersion: Dispersion,
@@ -194,12 +189,7 @@ def _simulate(
     return montecarlo.row_by_row(simulate_row, result, ROW, rows, needed, devices)
 
 
-@programs.jit(
-    static_argnames=("names", "metrics", "devices"),
-    compiler_options=programs.BATCHED,
-    batch=True,
-    title="the gradients of the simulations",
-)
+@programs.jit(static_argnames=("names", "metrics", "devices"), batch=True, title="the gradients of the simulations")
 def _simulate_with_derivatives(
     parts: Parts,
     dispersion: Dispersion,
