@@ -151,6 +151,7 @@ def test_file_name_is_escaped_if_the_output_encoding_lacks_its_letters(command, 
     [
         (["nowhere/s.toml"], "the file is nowhere/s.toml, but nowhere is no folder; allowed is one that exists"),
         (["."], "the file is ., which is there already; allowed is another name"),
+        (["chain"], "FILE is chain, which is a kind of plant; allowed are --plant chain and other file names"),
         (["a.toml", "--plant", "boat"], f"--plant is boat, but must be {PLANTS}"),
         (["a.toml", "--like", "none.toml"], "the scenario file none.toml does not exist"),
     ],

@@ -8,6 +8,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from tuning.cli.options import Quiet
+from tuning.errors import UsageError
 from tuning.output import terminal
 
 Overwrite = Annotated[bool, Parameter(negative="", help="Overwrite existing files.")]
@@ -48,9 +49,11 @@ def new(
     Exit status: 0 done, 2 configuration error.
     """
     from ptsmc_jax.campaigns import store
-    from ptsmc_jax.scenario import parsing
+    from ptsmc_jax.scenario import layouts, parsing
     from tuning.cli import new as templates
 
+    if str(file) in layouts.TABLES:
+        raise UsageError(f"FILE is {file}, which is a kind of plant; allowed are --plant {file} and other file names")
     store.check_file(file, force)
     raw = parsing.load(like) if like is not None else {}
     store.write_text(file, templates.text(plant, raw))
