@@ -78,7 +78,7 @@ def write(scenario: Scenario, file: str | Path, *, force: bool = False) -> None:
 
 
 @dataclass(frozen=True)
-class Flight:
+class Simulation:
     """A simulated run of a scenario, with its metrics, verdicts and plots."""
 
     scenario: Scenario
@@ -159,7 +159,7 @@ def simulate(
     seed: int = 0,
     trial: int | None = None,
     controller: str | Path | None = None,
-) -> Flight:
+) -> Simulation:
     """Simulate a scenario once.
 
     Args:
@@ -176,7 +176,7 @@ def simulate(
     draws.check_whole_number("trial", 0 if trial is None else trial)
     loaded = _read(what) if controller is None else folder.on_flight_clock(_read(what))
     ready = scenario.study(loaded, drawn=trial is not None)
-    return Flight(loaded, runs.simulate(ready, seed, trial, _software(controller, ready)))
+    return Simulation(loaded, runs.simulate(ready, seed, trial, _software(controller, ready)))
 
 
 def trials(

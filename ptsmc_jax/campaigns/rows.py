@@ -57,7 +57,7 @@ class Rows:
     def put(self, first: int, count: int, content: bytes) -> Part:
         """Write a part with this content. Raises OSError if the disk is full."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        path = self.folder / f"{first:010d}-{first + count - 1:010d}-{self._digest(first, count, content)}.parquet"
+        path = self.folder / f"{first:010d}-{first + count - 1:010d}-{self._checksum(first, count, content)}.parquet"
         with store.whole(path) as making, making.open("xb") as file:
             file.write(content)
             file.flush()
@@ -70,7 +70,7 @@ class Rows:
         for path in sorted(self.folder.glob("*.parquet")):
             name = _NAME.fullmatch(path.name)
             first, count = (int(name[1]), int(name[2]) - int(name[1]) + 1) if name else (0, 0)
-            if name is not None and self._digest_of(path, first, count) == name[3]:
+            if name is not None and self._checksum_of(path, first, count) == name[3]:
                 whole.append(Part(first, count, path))
             else:
                 broken.append(path)
@@ -89,23 +89,23 @@ class Rows:
             if path not in whole and named(path):
                 path.unlink(missing_ok=True)
 
-    def _digest_of(self, path: Path, first: int, count: int) -> str:
+    def _checksum_of(self, path: Path, first: int, count: int) -> str:
         """Return the checksum of a file's content; an unchanged file is not read again."""
         about = path.stat()
         if time.time_ns() - about.st_mtime_ns < RECENT:
-            return self._digest(first, count, path.read_bytes())
-        return _digest_of_version(self, path, (about.st_ino, about.st_size, about.st_mtime_ns), first, count)
+            return self._checksum(first, count, path.read_bytes())
+        return _checksum_of_version(self, path, (about.st_ino, about.st_size, about.st_mtime_ns), first, count)
 
-    def _digest(self, first: int, count: int, content: bytes) -> str:
+    def _checksum(self, first: int, count: int, content: bytes) -> str:
         checksum = hashlib.blake2b(content, digest_size=16, key=self.key)
         checksum.update(f"{first}+{count}".encode())
         return checksum.hexdigest()
 
 
 @functools.cache
-def _digest_of_version(rows: Rows, path: Path, version: tuple[int, int, int], first: int, count: int) -> str:
+def _checksum_of_version(rows: Rows, path: Path, version: tuple[int, int, int], first: int, count: int) -> str:
     """Return the checksum of a file's content; version: inode, size and time of the last change [ns]."""
-    return rows._digest(first, count, path.read_bytes())
+    return rows._checksum(first, count, path.read_bytes())
 
 
 def key_of(scenario: store.Tables, made_by: store.Tables) -> bytes:

@@ -15,7 +15,7 @@ BANDS = ((99.7, "0.85"), (90.0, "0.68"), (50.0, "0.45"))  # central fraction of 
 # runs to the end that violate a limit on fractions of time, which may be met all the same, or on trials
 AT_TIMES = "beyond a limit that may be left at times"
 BEYOND = "beyond a limit"
-FLOWN = ("ok", AT_TIMES, BEYOND, "not_converged")  # to the end
+COMPLETE = ("ok", AT_TIMES, BEYOND, "not_converged")  # to the end
 # outcome: colour, marker, size
 MARKS = {
     "ok": (STYLES[0][0], "o", 6.0),
@@ -61,9 +61,9 @@ def fan(t: np.ndarray, errors: np.ndarray, worst: tuple[int, np.ndarray], t_f: f
     unit = CATALOGUES[kind]["terminal_error"].unit
     trials = f"{len(errors)} trial{'s' if len(errors) != 1 else ''}"
     figure, axes = figure_of(f"Error of {trials}, median in white", f"2-norm of the error [{unit}]")
-    for share, grey in BANDS:
-        low, high = np.percentile(errors, [50.0 - share / 2, 50.0 + share / 2], axis=0)
-        axes.fill_between(t, low, high, color=grey, lw=0.0, label=f"{share:g} % of the trials")
+    for central, grey in BANDS:
+        low, high = np.percentile(errors, [50.0 - central / 2, 50.0 + central / 2], axis=0)
+        axes.fill_between(t, low, high, color=grey, lw=0.0, label=f"{central:g} % of the trials")
     axes.semilogy(t, np.median(errors, axis=0), color="white", lw=1.6)
     axes.semilogy(t, worst[1], color=STYLES[1][0], lw=1.2, label=f"largest window error: trial {worst[0]}")
     axes.axvline(t_f, color="0.3", lw=0.9, ls=":")
@@ -90,8 +90,9 @@ def distributions(metrics: Mapping[str, Column]) -> Figure:
         # all ranks near both ends, fewer between
         ranks = np.unique(np.concatenate([np.geomspace(1, n, 600), n + 1 - np.geomspace(1, n, 600)]).astype(int))
         ranks = ranks[ranks <= known]
-        share = (ranks - 0.5) / n
-        axes.step(ordered[ranks - 1], share, where="post", color=STYLES[0][0], marker="." if known < 50 else None)
+        axes.step(
+            ordered[ranks - 1], (ranks - 0.5) / n, where="post", color=STYLES[0][0], marker="." if known < 50 else None
+        )
         axes.set_yscale("logit")
         edge = 0.3 / n
         axes.set_ylim(edge, 1.0 - edge)
@@ -103,7 +104,7 @@ def distributions(metrics: Mapping[str, Column]) -> Figure:
         if column.limit is not None:
             axes.axvline(column.limit, color=STYLES[1][0], ls="--", label=column.within())
             axes.legend(fontsize=9, loc=_free(axes, column.limit, ordered[:known]))
-        axes.set(xlabel=column.label(name), ylabel="share of the trials")
+        axes.set(xlabel=column.label(name), ylabel="fraction of the trials")
     return figure
 
 
@@ -138,7 +139,7 @@ def torque_by_angle(
     limit = torque.limit
     if limit is not None:
         axes.axhline(limit, **LIMIT, label=f"limit {limit:g} {torque.unit}")
-    finished = torque.values[np.isin(outcome, FLOWN) & np.isfinite(torque.values)]
+    finished = torque.values[np.isin(outcome, COMPLETE) & np.isfinite(torque.values)]
     if finished.size and finished.min() > 0.0:
         shown = [*finished, limit] if limit else finished
         logarithmic(axes, "y")

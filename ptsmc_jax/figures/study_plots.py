@@ -323,7 +323,7 @@ def accuracy_map(
     error_unit, unit = (CATALOGUES[kind][name].unit for name in ("window_error", "peak_torque"))
     titles = {
         "window_error": f"RMS window error [{error_unit}]",
-        "linear_window_error": f"its share from noise, linear theory [{error_unit}]",
+        "linear_window_error": f"its part from noise, linear theory [{error_unit}]",
         "peak_torque": f"mean peak torque [{unit}]",
         "largest_peak_torque": f"largest peak torque [{unit}]",
     }

@@ -100,9 +100,9 @@ def test_missing_parts_of_a_campaign():
     there = [part(0, full, nowhere), part(2 * full, 1, nowhere)]
     assert campaign.missing(there, 2 * full + 1) == [(full, full)]
     assert campaign.missing(there, 3 * full) == [(full, full), (2 * full, full)]  # the short last part is repeated
-    shares = [campaign.missing([], 7 * full, (k, 3)) for k in (1, 2, 3)]
-    assert sorted(chain(*shares)) == campaign.missing([], 7 * full)
-    assert [len(share) for share in shares] == [3, 2, 2]
+    shards = [campaign.missing([], 7 * full, (k, 3)) for k in (1, 2, 3)]
+    assert sorted(chain(*shards)) == campaign.missing([], 7 * full)
+    assert [len(shard) for shard in shards] == [3, 2, 2]
 
 
 def test_parts_are_written_one_after_the_other(simulated, tmp_path, monkeypatch):
@@ -124,7 +124,7 @@ def test_parts_simulated_in_one_call_are_the_same(simulated, tmp_path, monkeypat
     """Accelerators simulate several parts of a shard together. They are not adjacent, and the last one is shorter."""
     made, frame = simulated
     monkeypatch.setattr(campaign, "PART", 40)
-    monkeypatch.setattr(montecarlo, "run", partial(montecarlo.run, block=montecarlo.BLOCK))  # program of `flown`
+    monkeypatch.setattr(montecarlo, "run", partial(montecarlo.run, block=montecarlo.BLOCK))  # program of `simulated`
     monkeypatch.setattr(montecarlo, "block_size", lambda: 40 * together // len(configure.devices()))
     flights = []
 

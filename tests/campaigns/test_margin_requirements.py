@@ -146,9 +146,9 @@ def worst_of(each):
     return {name: farthest(name, v, 1) for name, v in each.items()}
 
 
-def sloped(asked, bounds, share):
+def sloped(asked, bounds, normalised):
     """Return the constraints and their gradients at one point."""
-    return {name: v[0] for name, v in margin_rows.of_points(asked, bounds.scale, np.asarray(share)[None]).items()}
+    return {name: v[0] for name, v in margin_rows.of_points(asked, bounds.scale, np.asarray(normalised)[None]).items()}
 
 
 def farthest(name, values, axis):
@@ -208,30 +208,30 @@ def drawn(request):
 def test_margin_constraints_agree_with_verdicts_and_finite_differences(drawn):
     """Compare gradients with central differences of order 4 along a direction that changes all gains."""
     posed = drawn
-    asked, bounds, share = (
+    asked, bounds, normalised = (
         posed.problem.margins,
         posed.evaluate.bounds,
         posed.evaluate.bounds.normalise(posed.scenario_gains),
     )
     assert asked is not None
-    found = sloped(asked, bounds, share)
+    found = sloped(asked, bounds, normalised)
     verdicts = margin_verdicts.over_trials(posed.ready, 3)
     for row, verdict in zip(np.asarray(found["c"]), verdicts, strict=True):
         np.testing.assert_allclose(row.max() + 1.0, verdict.margin, rtol=1e-9)
     step, along = 1e-4, np.array([0.6, -0.9, 1.0, 0.7])
-    points = [share + k * step * along for k in (-2, -1, 1, 2)]
+    points = [normalised + k * step * along for k in (-2, -1, 1, 2)]
     c = margin_rows.of_points(asked, bounds.scale, np.stack(points[:3]))["c"]  # one point more than devices
     c = [*c, sloped(asked, bounds, points[3])["c"]]
     numeric = (c[0] - 8 * c[1] + 8 * c[2] - c[3]) / (12 * step)
     slopes = np.asarray(found["c_gradient"])
-    assert np.all(np.abs(slopes).reshape(-1, share.size).max(axis=0) > 0.0)  # every gain has an effect
+    assert np.all(np.abs(slopes).reshape(-1, normalised.size).max(axis=0) > 0.0)  # every gain has an effect
     exact = slopes @ along
     np.testing.assert_allclose(exact, numeric, rtol=1e-6, atol=1e-8 * np.abs(exact).max())
     rows = pl.DataFrame({"trial": [0, 1], "status": ["ok", "ok"], "peak_torque": [1.0, 2.0]})  # not used by margins
     told = explore.verdicts(posed.ready.scenario, rows, seed=3)[-2:]
     assert [v.worst for v in told] == [v.worst for v in verdicts]  # loops of the same trials
     tight = dataclasses.replace(asked, limits=asked.limits * 0.9)
-    np.testing.assert_allclose(sloped(tight, bounds, share)["c"] + 1, (found["c"] + 1) / 0.9, rtol=1e-12)
+    np.testing.assert_allclose(sloped(tight, bounds, normalised)["c"] + 1, (found["c"] + 1) / 0.9, rtol=1e-12)
 
 
 def products_for_each_case(of, posed):
@@ -258,9 +258,9 @@ def test_cases_are_computed_one_after_the_other(of_two_trials):
     """`_by_case` gets an angular momentum as its function, instead of runs and loops."""
     asked, bounds = of_two_trials.problem.margins, of_two_trials.evaluate.bounds
 
-    def momenta(share):
+    def momenta(normalised):
         rates = np.ones((2, 3))
-        return margin_rows._by_case(asked, bounds.gains(share), lambda parts, w: parts.plant.inertia @ w, rates)
+        return margin_rows._by_case(asked, bounds.gains(normalised), lambda parts, w: parts.plant.inertia @ w, rates)
 
     assert products_for_each_case(momenta, of_two_trials) == ([], True)
 
@@ -286,10 +286,10 @@ def test_margin_gradients_with_dispersed_inertia_compile_if_delta_is_free():
 def test_evaluator_appends_margins_of_the_hardest_trials(drawn, monkeypatch):
     posed = drawn
     assert posed.problem.rows == ("peak_torque", "gain_margin", "peak_sensitivity")
-    share = posed.evaluate.bounds.normalise(posed.scenario_gains)[None]
-    simulated = {"gains": share, "f": np.zeros(1), "c": np.array([[[-0.3, -0.2, -0.4]]]), "value": np.zeros(1)}
+    normalised = posed.evaluate.bounds.normalise(posed.scenario_gains)[None]
+    simulated = {"gains": normalised, "f": np.zeros(1), "c": np.array([[[-0.3, -0.2, -0.4]]]), "value": np.zeros(1)}
     monkeypatch.setattr(posed.evaluate, "_metrics", lambda *_: dict(simulated))
-    c = posed.evaluate.measure(posed.problem, share).c[0]
+    c = posed.evaluate.measure(posed.problem, normalised).c[0]
     assert c[0].tolist() == [-0.3, -0.2, -0.4] + [-1.0] * (c.shape[1] - 3)  # padded to the length of margin rows
     verdicts = margin_verdicts.over_trials(posed.ready, 3)
     assert [v.trials for v in verdicts] == [TRIALS, TRIALS]

@@ -24,7 +24,7 @@ from ptsmc_jax.signals import disturbances
 from ptsmc_jax.simulation import catalogues, rollout
 from tests.helpers import SHORT_CHAIN, untuned, vector
 
-SEED, FLOWN = 3, 50  # number of trials, small enough for the compiled program of few trials
+SEED, TRIALS = 3, 50  # number of trials, small enough for the compiled program of few trials
 EVERYTHING = """
 [controller]
 t_f = 3.0
@@ -70,14 +70,14 @@ def ready(text):
 def everything():
     """A spacecraft campaign with a dispersion of every quantity, and its run table."""
     made = campaign.Campaign(ready(EVERYTHING), SEED)
-    return made, made.draw(range(FLOWN))
+    return made, made.draw(range(TRIALS))
 
 
 @pytest.fixture(scope="module")
 def of_a_chain():
     """A campaign that uses the compiled program of other tests, and its run table."""
     made = campaign.Campaign(scenario.study(scenario.from_tables(untuned(SHORT_CHAIN))), SEED)
-    return made, made.draw(range(FLOWN))
+    return made, made.draw(range(TRIALS))
 
 
 def of_run_table(made, table):
@@ -88,7 +88,7 @@ def of_run_table(made, table):
 @pytest.mark.parametrize("which", ["of_a_chain", pytest.param("everything", marks=pytest.mark.long)])
 def test_campaign_of_a_written_run_table_has_identical_rows(which, request, tmp_path):
     made, run_table = request.getfixturevalue(which)
-    frame = made.simulate(range(FLOWN))
+    frame = made.simulate(range(TRIALS))
     run_table.write_csv(tmp_path / "run_table.csv")
     run_table.write_parquet(tmp_path / "run_table.parquet")
     checksums = set()
@@ -97,7 +97,7 @@ def test_campaign_of_a_written_run_table_has_identical_rows(which, request, tmp_
         checksums.add(run_tables.checked(run_tables.read(tmp_path / name), made.ready.parts).checksum)
         assert again.run_table is not None
         assert not again.run_table.given  # the program of the original campaign simulates it
-        assert_frame_equal(again.simulate(range(FLOWN)), frame, check_exact=True)
+        assert_frame_equal(again.simulate(range(TRIALS)), frame, check_exact=True)
     assert len(checksums) == 1
     # rows of a campaign are a valid run table; their results are ignored, and each row has the noise of its trial
     some = of_run_table(made, frame[[40, 7]])
@@ -115,7 +115,7 @@ def test_written_run_table_has_the_exact_inputs_of_the_campaign(everything, tmp_
     again = of_run_table(made, run_tables.read(tmp_path / "run_table.csv"))
     assert again.run_table is not None
     assert not again.run_table.given
-    assert_frame_equal(again.draw(range(FLOWN)).select(run_table.columns), run_table, check_exact=True)
+    assert_frame_equal(again.draw(range(TRIALS)).select(run_table.columns), run_table, check_exact=True)
 
 
 class Farther(ptsmc.Draw):

@@ -442,7 +442,7 @@ ASKED = "[requirements]\npeak_torque = 30.0\n"
 def lost(request, tmp_path, monkeypatch):
     """Return a function that makes trials fail, and returns how.
 
-    "made up" sets the status of every fourth trial, "flown" simulates initial angles near 180 deg.
+    "made up" sets the status of every fourth trial, "simulated" simulates initial angles near 180 deg.
     """
 
     def run(parts, dispersion, seed, trials, *more, simulated=montecarlo.run, **how):

@@ -136,7 +136,7 @@ def test_compare_command_writes_its_results(command, tmp_path, monkeypatch, othe
     monkeypatch.setattr(compare, "laws", lambda: [compare.OURS, *others])  # every further law compiles more programs
     model_errors = compare.MODEL_ERRORS if others else ("heavier", "lighter")  # "later" compiles another program too
     perturbed = compare.perturbed
-    monkeypatch.setattr(compare, "perturbed", lambda flown: {name: perturbed(flown)[name] for name in model_errors})
+    monkeypatch.setattr(compare, "perturbed", lambda one: {name: perturbed(one)[name] for name in model_errors})
     code, said, _ = command("compare", "s.toml")
     folder = tmp_path / "out/compare-s"
     found = json.loads((folder / "summary.json").read_text())
@@ -155,8 +155,8 @@ def test_compare_command_writes_its_results(command, tmp_path, monkeypatch, othe
         assert float(row["window_error"]) == found["laws"][law]["window_error"]
         assert law.split("_")[0] in said
         again = scenario.read(folder / "scenarios" / f"{law}.toml")  # the judged scenario
-        flown, _ = judging.window_error(judging.judge(again, found["seed"]))  # simulated again on the same trials
-        assert flown == pytest.approx(found["laws"][law]["window_error"], rel=1e-9)
+        error, _ = judging.window_error(judging.judge(again, found["seed"]))  # simulated again on the same trials
+        assert error == pytest.approx(found["laws"][law]["window_error"], rel=1e-9)
         assert found["laws"][law]["margins"] == stability.worst(scenario.study(again))
         assert found["laws"][law]["gains"].keys() >= {"pd": {"k_p", "k_d"}}.get(law, {"eta", "delta"})
         for name, value in found["laws"][law]["gains"].items():

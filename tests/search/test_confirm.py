@@ -24,12 +24,12 @@ SEEN = Requirement("window_error", 1e-4, None, 0.9, None)
 @pytest.mark.parametrize("beyond", [0, 3, 30])
 def test_probability_of_a_met_verdict_agrees_with_bayes_rule_on_a_grid(requirement, beyond):
     """The reference integrates over the fraction on a grid, with a uniform prior and the binomial of the verdict."""
-    share = (np.arange(20_000) + 0.5) / 20_000
-    weight = binom.pmf(beyond, 4096, share)
+    fraction = (np.arange(20_000) + 0.5) / 20_000
+    weight = binom.pmf(beyond, 4096, fraction)
     least = must_keep(1000, requirement.quantile, requirement.confidence)
     assert least is not None
     most = 1000 - least
-    expected = np.sum(weight * binom.cdf(most, 1000, share)) / np.sum(weight)
+    expected = np.sum(weight * binom.cdf(most, 1000, fraction)) / np.sum(weight)
     # the fraction is known to 2e-4, so the midpoint rule with a step of 5e-5 has a relative error of about 1e-3
     np.testing.assert_allclose(confirm.probability(requirement, 1000, 4096, beyond), expected, rtol=2e-3)
 

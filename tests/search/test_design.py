@@ -14,7 +14,7 @@ from tuning.search import design
 from tuning.search.gains import in_scenario, with_gains
 
 SPREAD = {"attitude": {"kind": "axis_angle", "min_deg": 20.0, "max_deg": 120.0}}
-FLOWN = {
+CASE = {
     "controller": {"t_f": 20.0, "eta": 3.2, "delta": 1.0},
     "loop": {"mode": "sampled", "clock": "flight", "period": 0.1, "t_end": 22.0},
     "hardware": {"attitude_noise": 1e-5, "rate_noise": 1e-6},
@@ -36,12 +36,12 @@ def largest(tables, t_f, trials):
 @pytest.mark.long
 def test_shortest_time_is_the_crossing_of_the_limit_in_simulations():
     limit, trials = 0.6, 32
-    found = design.shortest_time(scenario.from_tables(FLOWN), Requirement("peak_torque", limit), 4, np.arange(trials))
+    found = design.shortest_time(scenario.from_tables(CASE), Requirement("peak_torque", limit), 4, np.arange(trials))
     assert found.theory is not None
     assert found.simulated is not None
     assert found.simulated == pytest.approx(found.theory, rel=0.03)  # disturbance 1e-3 N m and noise 1 % of 0.6 N m
-    assert largest(FLOWN, found.simulated, trials) <= limit
-    assert largest(FLOWN, 0.995 * found.simulated, trials) > limit
+    assert largest(CASE, found.simulated, trials) <= limit
+    assert largest(CASE, 0.995 * found.simulated, trials) > limit
 
 
 PLANTS = short(["chain", "spacecraft"], ["chain"])
@@ -102,8 +102,8 @@ def test_t_f_ends_after_the_observer_time_for_any_torque_limit(fails_until, monk
     A failed run breaks every limit, even if its torque is small.
     """
 
-    def run(parts, *others, flown=montecarlo.run):
-        result = flown(parts, *others)
+    def run(parts, *others, simulated=montecarlo.run):
+        result = simulated(parts, *others)
         fails = fails_until is not None and parts.controller.t_f < fails_until
         return replace(result, status=np.full_like(result.status, rollout.DIVERGED)) if fails else result
 
@@ -176,7 +176,7 @@ def test_the_bracket_is_halved_if_peaks_hardly_decrease_with_t_f():
 
 
 def test_setting_t_f_changes_only_the_times_that_depend_on_it():
-    parts = scenario.study(scenario.from_tables(FLOWN)).parts
+    parts = scenario.study(scenario.from_tables(CASE)).parts
     moved = with_gains(parts, {"t_f": 15.0})
     assert (float(moved.controller.t_f), float(moved.t_end), float(moved.clock.t_end)) == (15.0, 17.0, 17.0)
     back = replace(with_gains(moved, {"t_f": 20.0}), initial=parts.initial)

@@ -456,7 +456,7 @@ def test_a_gain_of_a_custom_law_is_set_in_the_law_whatever_its_name_begins_with(
 
 
 def test_a_name_of_two_gains_is_rejected():
-    """The gain `normalised` of an observer is also called `observer_share`."""
+    """The gain `share` of an observer is also called `observer_share`."""
     parts = shared(study(from_tables(BASE)).parts)
     observer = replace(parts.observer)
     object.__setattr__(observer, "tunable", ("share",))

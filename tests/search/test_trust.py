@@ -244,7 +244,7 @@ class Told:
 
 
 class Steps:
-    """Evaluates F = 3 + share, infinite above 0.9, and a given c. It counts the points with margins."""
+    """Evaluates F = 3 + normalised gain, infinite above 0.9, and a given c. It counts the points with margins."""
 
     def __init__(self, c):
         self.c, self.rollouts, self.judged = c, 0, 0

@@ -200,9 +200,9 @@ def test_own_torque_limit_replaces_the_nearest_default_limit(limit):
 def test_refined_target_is_not_worse_than_the_known_feasible_gains(monkeypatch, found, best):
     """F is the gain itself. Gain 1 breaks the limit, gain 2 keeps it. The local search finds nothing, 3 or 1.5."""
 
-    def measured(problem, share):
-        f = share[:, 0]
-        return Measured(share, f, np.where(f < 1.4, 0.1, -0.1)[:, None, None], f)
+    def measured(problem, normalised):
+        f = normalised[:, 0]
+        return Measured(normalised, f, np.where(f < 1.4, 0.1, -0.1)[:, None, None], f)
 
     class Found(local_searches.LocalSearches):
         def search_locally(self, problem, starts):

@@ -105,7 +105,7 @@ def check_unchanged(programs: Mapping[str, str], results: Path, made: Mapping[st
     """
     unknown = []
     for key, where in programs.items():
-        known, now = _digests(made, key), checksum(key, where)
+        known, now = _known_checksums(made, key), checksum(key, where)
         if not known:
             unknown.append(key)
         elif now is not None and now not in known:
@@ -117,7 +117,7 @@ def check_unchanged(programs: Mapping[str, str], results: Path, made: Mapping[st
     return unknown
 
 
-def _digests(made: Mapping[str, Any], key: str) -> list[str]:
+def _known_checksums(made: Mapping[str, Any], key: str) -> list[str]:
     """Return the known checksums of custom code. A comparison has one for each of its laws, under the same key."""
     laws = made.get("custom_laws") if key == "controller.code" else None
     checksums = (made.get(custom.checksum_name(key)), *(laws.values() if isinstance(laws, dict) else ()))

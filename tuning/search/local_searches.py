@@ -393,7 +393,7 @@ class LocalSearches:
                 keep,
                 relaxed=Relaxed(rows=[int(row)], to_the_end=True),
             )
-            kept = [share_of_start for rest, share_of_start in seen if rest <= 1.0 + 10.0 * SLACK]
+            kept = [ratio for rest, ratio in seen if rest <= 1.0 + 10.0 * SLACK]
             margin = float(np.broadcast_to(self._margin, worst.size)[row])
             found[problem.rows[row]] = (1.0 - margin) * min(kept) if kept else None
         return found

@@ -115,8 +115,8 @@ def largest(name: str, scenario: Scenario, trials: Trials) -> float:
     """
     values = np.sort(np.asarray(getattr(trials.metrics, name))[trials.finished])
     asked = scenario.requirements.get(name)
-    share = (asked.share if isinstance(asked, Limit) else None) or 1.0
-    return statistics.value_at(values, min(1.0, share * trials.status.size / values.size)) if values.size else np.nan
+    fraction = (asked.share if isinstance(asked, Limit) else None) or 1.0
+    return statistics.value_at(values, min(1.0, fraction * trials.status.size / values.size)) if values.size else np.nan
 
 
 def on_flight_clock(scenario: Scenario) -> Scenario:

@@ -67,9 +67,9 @@ class Posed:
         )
         return search(self.evaluate, problem, asked, gains, settings, **callbacks)
 
-    def named(self, share: np.ndarray) -> dict[str, float]:
-        """Return rounded gains by name; share: gains as fractions of the bounds' intervals (gains,) [-]."""
-        return self.evaluate.bounds.rounded(self.evaluate.bounds.gains(share), DIGITS)
+    def named(self, normalised: np.ndarray) -> dict[str, float]:
+        """Return rounded gains by name from normalised gains, (gains,)."""
+        return self.evaluate.bounds.rounded(self.evaluate.bounds.gains(normalised), DIGITS)
 
 
 def with_bounds(scenario: Scenario, moved: Mapping[str, tuple[float, float]]) -> Scenario:

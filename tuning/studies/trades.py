@@ -157,7 +157,9 @@ class Torque(Trade):
         targets = [Target(float(one), f"peak torque {one:.3g}", under(one, free.problem)) for one in limits]
         # the best local minimum between the ends may differ from those at the ends
         between = _found(posed, targets[middle].problem, headed(tell, targets[middle].name), asked=())
-        return targets, [share for found in (free, least, between) for share in (found.normalised, *found.ends)]
+        return targets, [
+            normalised for found in (free, least, between) for normalised in (found.normalised, *found.ends)
+        ]
 
     def costs(self, tuned: Scenario, trials: Trials, seed: int) -> dict[str, float]:
         """Return the largest and the mean peak torque [N m]."""

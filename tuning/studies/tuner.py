@@ -334,7 +334,7 @@ def _over(outcome: Search, verdicts: list[Verdict]) -> dict[str, float]:
     # the search treats a requirement on a fraction of time as a limit at all times
     over = {one.metric: one.margin if one.interpretation == "ensemble" else one.worst / one.limit
             for one in verdicts if not one.met and one.limit}  # fmt: skip
-    helped = bool(np.all(outcome.worst <= 1.0)) and all(np.isfinite(share) and share > 1.0 for share in over.values())
+    helped = bool(np.all(outcome.worst <= 1.0)) and all(np.isfinite(ratio) and ratio > 1.0 for ratio in over.values())
     reached = dict(zip(outcome.problem.rows, outcome.worst, strict=True))  # 0: the training trials do not depend on it
     # a loop with a limit cycle has no margins, see `theory.limit_cycles`; more distance from the limits does not help
     swings = any(one.at_least and one.worst == 0.0 for one in verdicts)
