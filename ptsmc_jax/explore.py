@@ -5,7 +5,7 @@ The pure function of JAX underneath is `rollout.simulate`.
 
 import html
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -48,13 +48,25 @@ class Quantities(Mapping[str, float]):
         return "\n".join(f"{name:24s} {value:12.5g} {self._catalogue[name].unit}" for name, value in self.items())
 
     def _repr_html_(self) -> str:
-        head = "".join(f"<th>{heading}</th>" for heading in ("metric", "value", "unit", "meaning"))
-        body = ""
-        for name, value in self.items():
-            entry = self._catalogue[name]
-            cells = (name, "-" if value != value else f"{value:.5g}", entry.unit, entry.meaning)
-            body += "<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in cells) + "</tr>"
-        return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+        entries = [(name, value, self._catalogue[name]) for name, value in self.items()]
+        rows = [(name, "-" if value != value else f"{value:.5g}", e.unit, e.meaning) for name, value, e in entries]
+        return html_table(("metric", "value", "unit", "meaning"), rows)
+
+
+def html_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return an HTML table with these cells, which are escaped."""
+
+    def line(cells: Sequence[str], tag: str) -> str:
+        return "<tr>" + "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in cells) + "</tr>"
+
+    body = "".join(line(cells, "td") for cells in rows)
+    return f"<table><thead>{line(head, 'th')}</thead><tbody>{body}</tbody></table>"
+
+
+def html_list(lines: Iterable[object]) -> str:
+    """Return an HTML list of these lines, which are escaped; empty without lines."""
+    items = "".join(f"<li>{html.escape(str(line))}</li>" for line in lines)
+    return f"<ul>{items}</ul>" if items else ""
 
 
 def write(scenario: Scenario, file: str | Path, *, force: bool = False) -> None:
@@ -124,8 +136,7 @@ class Simulation:
         return "\n".join([self._ending(), repr(self.metrics), *map(str, self.verdicts)])
 
     def _repr_html_(self) -> str:
-        verdicts = "".join(f"<li>{html.escape(str(v))}</li>" for v in self.verdicts)
-        return f"<p>{html.escape(self._ending())}</p>{self.metrics._repr_html_()}<ul>{verdicts}</ul>"
+        return f"<p>{html.escape(self._ending())}</p>{self.metrics._repr_html_()}{html_list(self.verdicts)}"
 
     def _ending(self) -> str:
         why = f", {self.run.reason}, at {self.run.bad_time:.4g} s" if self.run.reason else ""

@@ -5,7 +5,6 @@ Each result has the report of the command of the same name. Notebooks show the r
 
 import html
 import tempfile
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,20 +12,20 @@ from typing import Any, Literal
 
 import polars as pl
 
-from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import rows
-from ptsmc_jax.explore import Figures
+from ptsmc_jax.explore import Figures, html_list, html_table
 from ptsmc_jax.onboard.folder import on_flight_clock
-from ptsmc_jax.scenario import Study, free_gains, reading
+from ptsmc_jax.scenario import Study, reading
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.theory.run_margins import Course
 from tuning.output import campaign_report, front_report, margins_report, paper_report, summaries, tune_report
-from tuning.output.report import Bars, Report, Table, Text
+from tuning.output.report import Report, Table
 from tuning.studies import (
     campaign_figures,
     campaign_folder,
     campaign_summary,
     campaign_theory,
+    posing,
     reproduction,
     stability,
     trades,
@@ -57,33 +56,19 @@ class Outcome:
         return Figures(self._figures()).only(names)
 
     def __repr__(self) -> str:
-        lines = [self.report.headline, *self.report.lines]
-        for title, content in _sections(self.report):
-            lines += ["", title, *(_columns(content) if isinstance(content, Table) else content)]
+        report = self.report
+        lines = [report.headline, *report.lines]
+        for title, content in report.printed():
+            lines += [*(("", title) if title else ()), *(_columns(content) if isinstance(content, Table) else content)]
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
-        text = f"<p><b>{html.escape(self.report.headline)}</b></p>{_listed(self.report.lines)}"
-        for title, content in _sections(self.report):
-            shown = _table(content) if isinstance(content, Table) else _listed(content)
-            text += f"<p><b>{html.escape(title)}</b></p>{shown}"
+        report = self.report
+        text = f"<p><b>{html.escape(report.headline)}</b></p>{html_list(report.lines)}"
+        for title, content in report.printed():
+            text += f"<p><b>{html.escape(title)}</b></p>" if title else ""
+            text += html_table(content.head, content.rows) if isinstance(content, Table) else html_list(content)
         return text
-
-
-def _sections(report: Report) -> Iterator[tuple[str, Table | list[str]]]:
-    """Yield the tables and the lines of a report, each with its title; a title is empty after its first block."""
-    for section in report.sections:
-        title = section.title
-        for block in section.blocks:
-            if isinstance(block, Table):
-                yield title, block
-            elif isinstance(block, Text):
-                yield title, block.lines
-            elif isinstance(block, Bars):
-                yield title, block.texts
-            else:  # a chart of the page
-                continue
-            title = ""
 
 
 def _columns(table: Table) -> list[str]:
@@ -91,18 +76,6 @@ def _columns(table: Table) -> list[str]:
     cells = [table.head, *table.rows]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     return ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in cells]
-
-
-def _table(table: Table) -> str:
-    def row(cells: tuple[str, ...], tag: str) -> str:
-        return "<tr>" + "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in cells) + "</tr>"
-
-    body = "".join(row(cells, "td") for cells in table.rows)
-    return f"<table><thead>{row(table.head, 'th')}</thead><tbody>{body}</tbody></table>"
-
-
-def _listed(lines: list[str]) -> str:
-    return "<ul>" + "".join(f"<li>{html.escape(line)}</li>" for line in lines) + "</ul>" if lines else ""
 
 
 @dataclass(frozen=True, repr=False)
@@ -151,7 +124,7 @@ def tune(what: Scenario | Study | str | Path, *, seed: int = 0) -> Tuned:
     Raises:
         ScenarioError: the scenario is not valid, or no gain is free.
     """
-    given = _with_tune(what)
+    given = posing.with_tune(_read(what))
     return Tuned(given, tuner.tune(given, seed))
 
 
@@ -196,7 +169,7 @@ def pareto(
     Raises:
         ScenarioError: the scenario is not valid, or the study does not apply to it.
     """
-    trade = trades.of(against, _with_tune(what), points, values)
+    trade = trades.of(against, posing.with_tune(_read(what)), points, values)
     return Traced(trade, fronts.trace(trade, seed))
 
 
@@ -327,11 +300,3 @@ def reproduce() -> Reproduced:
 
 def _read(what: Scenario | Study | str | Path) -> Scenario:
     return reading.of(what.scenario if isinstance(what, Study) else what)
-
-
-def _with_tune(what: Scenario | Study | str | Path) -> Scenario:
-    """Return the scenario with a table `tune`. Raises ScenarioError without a free gain."""
-    loaded = _read(what)
-    loaded = loaded if loaded.tune is not None else scenario.replace(loaded, tune={})
-    free_gains.need_some(loaded)
-    return loaded

@@ -223,9 +223,9 @@ def tune(
     loaded, folder = prepare(scenario, "tune", out, device, trust=common.trust)
     from ptsmc_jax.scenario.tables import objective_name
     from tuning.output import summaries, tune_report
-    from tuning.studies import tune_files, tuner
+    from tuning.studies import posing, tune_files, tuner
 
-    loaded = searches.with_tune(loaded)
+    loaded = posing.with_tune(loaded)
     known_by = tune_files.identity(loaded, seed, globally=global_check) | {"device": device}
     search = searches.LongSearch(
         known_by,
@@ -261,10 +261,10 @@ def pareto(
     listed = listed_against(against, points, times, limits)
     loaded, folder = prepare(scenario, "pareto", out, device, trust=common.trust)
     from tuning.output import front_report
-    from tuning.studies import front, trades
+    from tuning.studies import front, posing, trades
     from tuning.studies import pareto as fronts
 
-    trade = trades.of(against, searches.with_tune(loaded), points, listed)
+    trade = trades.of(against, posing.with_tune(loaded), points, listed)
     loaded, known_by = trade.scenario, trade.identity(seed) | {"device": device}
     search = searches.LongSearch(
         known_by,
@@ -299,11 +299,12 @@ def compare(
     from ptsmc_jax.scenario.tables import objective_name
     from tuning.output import compare_report, summaries
     from tuning.studies import compare as comparing
+    from tuning.studies import posing
 
     rivals = comparing.Rivals(against, law)
     rivals.check()
     comparing.check(loaded)
-    loaded = searches.with_tune(loaded)
+    loaded = posing.with_tune(loaded)
     posed = functools.cache(lambda: comparing.that_can_be_simulated(loaded, rivals))
     known_by = comparing.identity(loaded, seed, rivals) | {"device": device}
     search = searches.LongSearch(

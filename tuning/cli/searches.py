@@ -50,15 +50,6 @@ def say_seen(scenario: Path, seed: int) -> None:
         )
 
 
-def with_tune(scenario: "Scenario") -> "Scenario":
-    """Return the scenario with a `tune` table. Raises ScenarioError without a free gain."""
-    from ptsmc_jax.scenario import free_gains, replace
-
-    scenario = scenario if scenario.tune is not None else replace(scenario, tune={})
-    free_gains.need_some(scenario)
-    return scenario
-
-
 def run(search: LongSearch, loaded: "Scenario", folder: Path, *, force: bool, quiet: bool) -> int:
     """Show a finished search, resume an interrupted one, or begin a new one. Returns the exit status."""
     from ptsmc_jax.campaigns import store

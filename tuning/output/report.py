@@ -1,6 +1,6 @@
 """The content of a result for its readers: a headline, lines, and sections. The terminal and the page render it."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -41,7 +41,7 @@ class Bars:
     """Requirements, each with a bar relative to its limit."""
 
     verdicts: "list[Entry]"
-    texts: list[str]
+    lines: list[str]
     note: str = "The line is the limit; a bar that ends before it keeps the limit."
 
     kind: ClassVar[str] = "bars"
@@ -52,7 +52,7 @@ class Bars:
         return [
             {"label": entry.metric.replace("_", " "), "text": text, "met": entry.met, "limit": 300,
              "width": round(min(400.0, 300.0 * nearness(entry)), 1)}
-            for entry, text in zip(self.verdicts, self.texts, strict=True)
+            for entry, text in zip(self.verdicts, self.lines, strict=True)
         ]  # fmt: skip
 
 
@@ -109,6 +109,15 @@ class Report:
     lines: list[str]
     sections: list[Section] = field(default_factory=list)
 
+    def printed(self) -> Iterator[tuple[str, Table | list[str]]]:
+        """Yield the tables and lines of all sections, the first of a section with its title and the others with ""."""
+        for section in self.sections:
+            title = section.title
+            for block in section.blocks:
+                if isinstance(block, Table | Text | Bars):
+                    yield title, block if isinstance(block, Table) else block.lines
+                    title = ""
+
 
 HEADLINES = {
     "met": "every requirement is met",
@@ -137,8 +146,8 @@ def headline(status: str, verdicts: "Sequence[Entry]", first: str = "") -> tuple
 
 def requirements(verdicts: "Sequence[Entry]", text: "Callable[[Entry], str]" = str) -> list[Section]:
     """Return the section of the requirements, none without any; text: returns a verdict in words."""
-    texts = [f"{text(one)}{distance(one)}" for one in verdicts]
-    return [Section("Requirements", [Bars(list(verdicts), texts)])] if verdicts else []
+    lines = [f"{text(one)}{distance(one)}" for one in verdicts]
+    return [Section("Requirements", [Bars(list(verdicts), lines)])] if verdicts else []
 
 
 def nearness(entry: "Entry") -> float:

@@ -4,7 +4,7 @@ import contextlib
 from pathlib import Path
 from typing import Any
 
-from tuning.output.report import Bars, Report, Table, Text
+from tuning.output.report import Report, Table
 
 WIDE = 1000  # columns of a file or a pipe
 UNBROKEN = 24  # largest number of columns of a cell that is never broken
@@ -19,14 +19,13 @@ def show(report: Report, folder: Path | str, *, earlier: bool = False) -> None:
         earlier: an earlier run wrote the result.
     """
     say(report.headline, *report.lines)
-    for section in report.sections:
-        for k, block in enumerate(block for block in section.blocks if isinstance(block, Table | Text | Bars)):
-            if k == 0:
-                say("", section.title)
-            if isinstance(block, Table):
-                table(block)
-            else:
-                say(*(block.texts if isinstance(block, Bars) else block.lines))
+    for title, content in report.printed():
+        if title:
+            say("", title)
+        if isinstance(content, Table):
+            table(content)
+        else:
+            say(*content)
     say("", f"results in {folder}" + (" (from an earlier run)" if earlier else ""))
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from ptsmc_jax.scenario import Study, replace, study, tables
+from ptsmc_jax.scenario import Study, free_gains, replace, study, tables
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.scenario.timing import Reach, reach_of
 from ptsmc_jax.simulation.requirements import Requirement
@@ -70,6 +70,13 @@ class Posed:
     def named(self, normalised: np.ndarray) -> dict[str, float]:
         """Return rounded gains by name from normalised gains, (gains,)."""
         return self.evaluate.bounds.rounded(self.evaluate.bounds.gains(normalised), DIGITS)
+
+
+def with_tune(scenario: Scenario) -> Scenario:
+    """Return the scenario with a table `tune`. Raises ScenarioError without a free gain."""
+    scenario = scenario if scenario.tune is not None else replace(scenario, tune={})
+    free_gains.need_some(scenario)
+    return scenario
 
 
 def with_bounds(scenario: Scenario, moved: Mapping[str, tuple[float, float]]) -> Scenario:
