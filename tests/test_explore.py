@@ -323,6 +323,22 @@ def test_the_campaign_has_the_trials_of_trials(flight, tmp_path):
     assert again.rows.equals(found.rows)
 
 
+def test_a_campaign_is_refused_before_anything_is_written(tmp_path):
+    turned = scenario.from_tables({"loop": {"mode": "sampled"}, "initial": {"rotvec_deg": [180.0, 0.0, 0.0]}})
+    with pytest.raises(ScenarioError, match="q4 = 0"):
+        tuning.montecarlo(turned, 2, folder=tmp_path / "c")
+    chain = scenario.from_tables(CHAIN)
+    for count, seed in ((2, -1), (0, 1000)):
+        with pytest.raises(ValueError, match="but must be a whole number from"):
+            tuning.montecarlo(chain, count, seed=seed, folder=tmp_path / "c")
+    for search in (tuning.tune, tuning.pareto):
+        with pytest.raises(ValueError, match="seed is -1, but must be a whole number from 0"):
+            search(chain, seed=-1)
+    with store.in_use(tmp_path / "c"), pytest.raises(store.InUseError, match="is in use by another"):
+        tuning.montecarlo(chain, 2, folder=tmp_path / "c")
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.long
 def test_tuned_gains_meet_the_requirements_again(monkeypatch):
     small_search(monkeypatch)

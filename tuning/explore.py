@@ -12,8 +12,9 @@ from typing import Any, Literal
 
 import polars as pl
 
-from ptsmc_jax.campaigns import rows
+from ptsmc_jax.campaigns import rows, store
 from ptsmc_jax.explore import Figures, html_list, html_table
+from ptsmc_jax.numerics import draws
 from ptsmc_jax.onboard.folder import on_flight_clock
 from ptsmc_jax.scenario import Study, reading
 from ptsmc_jax.scenario.tables import Scenario
@@ -123,7 +124,9 @@ def tune(what: Scenario | Study | str | Path, *, seed: int = 0) -> Tuned:
 
     Raises:
         ScenarioError: the scenario is not valid, or no gain is free.
+        ValueError: `seed` is not a whole number from 0 to 2^32 - 1.
     """
+    draws.check_whole_number("seed", seed)
     given = posing.with_tune(_read(what))
     return Tuned(given, tuner.tune(given, seed))
 
@@ -168,7 +171,9 @@ def pareto(
 
     Raises:
         ScenarioError: the scenario is not valid, or the study does not apply to it.
+        ValueError: `seed` is not a whole number from 0 to 2^32 - 1.
     """
+    draws.check_whole_number("seed", seed)
     trade = trades.of(against, posing.with_tune(_read(what)), points, values)
     return Traced(trade, fronts.trace(trade, seed))
 
@@ -265,16 +270,21 @@ def montecarlo(
         controller: a folder that `ptsmc_jax.export` wrote. Its C code then computes the torque.
 
     Raises:
-        RefusedError: the folder has another campaign.
+        RefusedError: the folder has another campaign, or another process writes into it.
         ScenarioError: the scenario is not valid, or the controller does not belong to it.
+        ValueError: `seed` or `trials` is not a whole number from 0, or from 1, to 2^32 - 1.
     """
+    draws.check_whole_number("seed", seed)
+    draws.check_whole_number("trials", trials, 1)
     path = Path(tempfile.mkdtemp()) / "campaign" if folder is None else Path(folder)
     loaded = _read(what) if controller is None else on_flight_clock(_read(what))
     begun = Folder(path, loaded, seed, trials, controller=None if controller is None else Path(controller))
-    campaign_folder.begin(begun, force=False)
-    campaign_theory.prepare(begun)
-    campaign_folder.simulate(begun, (1, 1), lambda tally: None)
-    campaign_theory.find(begun)
+    _ = begun.campaign  # raises ScenarioError before anything is written
+    with store.in_use(path):
+        campaign_folder.begin(begun, force=False)
+        campaign_theory.prepare(begun)
+        campaign_folder.simulate(begun, (1, 1), lambda tally: None)
+        campaign_theory.find(begun)
     return Campaign(begun)
 
 
