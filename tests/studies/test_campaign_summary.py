@@ -49,16 +49,19 @@ def test_mixed_requirement_averages_time_fractions_and_counts_a_missing_one_as_z
 
 
 def test_failed_trial_counts_as_zero_in_quantiles_of_a_time_fraction():
-    told = campaign_summary._of_share(np.array([0.9, np.nan, 0.5, 0.8]), np.array([True, False, True, True]))
+    told = campaign_summary._of_larger_is_better(np.array([0.9, np.nan, 0.5, 0.8]), np.array([True, False, True, True]))
     assert (told["min"], told["max"], told["without_value"]) == (0.0, 0.9, 1)
     assert (told["0.0027"]["value"], told["0.1"]["value"], told["0.5"]["value"]) == (0.0, 0.0, 0.8)
-    shares, ended = np.linspace(0.0, 1.0, 200), np.arange(200) % 50 > 0
-    told, mirrored = campaign_summary._of_share(shares, ended), campaign_summary._of_metric(1.0 - shares, ended)
+    fractions, ended = np.linspace(0.0, 1.0, 200), np.arange(200) % 50 > 0
+    told, mirrored = (
+        campaign_summary._of_larger_is_better(fractions, ended),
+        campaign_summary._of_metric(1.0 - fractions, ended),
+    )
     assert told["0.1"]["value"] == pytest.approx(1.0 - mirrored["0.9"]["value"])
     assert told["0.1"]["low"] == pytest.approx(1.0 - mirrored["0.9"]["high"])
     assert told["0.1"]["high"] == pytest.approx(1.0 - mirrored["0.9"]["low"])
     assert told["0.1"]["low"] < told["0.1"]["value"] < told["0.1"]["high"]
-    none = campaign_summary._of_share(np.array([np.nan]), np.array([False]))
+    none = campaign_summary._of_larger_is_better(np.array([np.nan]), np.array([False]))
     assert none["0.5"]["value"] == 0.0
 
 

@@ -49,7 +49,7 @@ def _angles(bounds: Interval) -> Interval:
     return None if bounds is None else (ARCSEC * pointing(bounds[0]), ARCSEC * pointing(bounds[1]))
 
 
-def _untold(name: str, change: str) -> Value:
+def _with_model_error(name: str, change: str) -> Value:
     """Return the error with a change that the law does not know, a key of `CHANGES`."""
     return Value(
         name,
@@ -131,9 +131,9 @@ QUESTIONS = (
         "What if the model is wrong?",
         (
             dataclasses.replace(ERROR, name="as modelled"),
-            _untold("inertia + 10 %", "heavier"),
-            _untold("inertia - 10 %", "lighter"),
-            _untold("a period later", "later"),
+            _with_model_error("inertia + 10 %", "heavier"),
+            _with_model_error("inertia - 10 %", "lighter"),
+            _with_model_error("a period later", "later"),
         ),
         4,
         what="RMS pointing error",

@@ -157,15 +157,10 @@ class LocalSearches:
             scenario_gains: (gains,) gains of the scenario.
             designs: (designs, gains) gains of designs that follow from the mission.
         """
-        few = _few_trials(problem)
-        self._scenario_gains, self._designs = (
-            scenario_gains,
-            np.asarray([self._evaluate.bounds.normalise(one) for one in designs]),
-        )
+        few, normalise = _few_trials(problem), self._evaluate.bounds.normalise
+        self._scenario_gains, self._designs = scenario_gains, np.asarray([normalise(one) for one in designs])
         self._report("setting out", 0, 2, *self.so_far)
-        points = np.concatenate(
-            [self._evaluate.bounds.normalise(scenario_gains)[None], self._designs.reshape(-1, scenario_gains.size)]
-        )
+        points = np.concatenate([normalise(scenario_gains)[None], self._designs.reshape(-1, scenario_gains.size)])
         first = points[0]
         if len(points) > 1:
             (first,) = promising(self._evaluate, self.tightened(few), points, 1, lambda *_: None)
@@ -257,23 +252,16 @@ class LocalSearches:
         return ranked
 
     def _search_in_lockstep(
-        self,
-        problem: Problem,
-        contenders: Mapping[int, _Contender],
-        steps: int,
-        what: str,
-        *,
-        replace_best: bool,
+        self, problem: Problem, contenders: Mapping[int, _Contender], steps: int, what: str, *, replace_best: bool
     ) -> None:
         """Run local searches from these starting points, with `TOGETHER` of them at a time for each device."""
         tightened, bests, reports = self.tightened(problem), dict[int, Best](), 0
 
-        def race(k: int, ask: Ask) -> None:
-            bests[k] = Best(contenders[k].start.normalised, len(problem.rows), self._margin)
+        def search(k: int, ask: Ask) -> None:
+            start, keep = contenders[k].start, partial(self._record, k)
+            bests[k] = self._unmeasured(problem, start.normalised)
             self._history[k] = list(contenders[k].before)  # the longer search repeats the points of the shorter one
-            search_locally(
-                ask, bests[k], contenders[k].start, steps, partial(self._record, k), relaxed=_relaxed(problem)
-            )
+            search_locally(ask, bests[k], start, steps, keep, relaxed=_relaxed(problem))
 
         def tell() -> None:
             nonlocal reports
@@ -283,13 +271,13 @@ class LocalSearches:
                 self._report(what, reports, len(contenders), *best.so_far)
                 reports += 1
 
-        def fly(points: list[np.ndarray]) -> list[MeasuredWithGradients]:
+        def measure(points: list[np.ndarray]) -> list[MeasuredWithGradients]:
             tell()
             measured = self._evaluate.measure_with_gradients(tightened, np.concatenate(points))
             return [measured.at(k) for k in range(len(points))]
 
         try:
-            in_step([partial(race, k) for k in contenders], fly, TOGETHER * len(configure.devices()))
+            in_step([partial(search, k) for k in contenders], measure, TOGETHER * len(configure.devices()))
             tell()
         finally:  # also after an interrupt
             for k in contenders:
@@ -337,12 +325,13 @@ class LocalSearches:
         self._record(0, measured)  # if the search is interrupted now, the history has this point
         self._update_best(best, tightened, 0, replace_best=True)
 
+    def _unmeasured(self, problem: Problem, normalised: np.ndarray) -> Best:
+        """Return a `Best` before the first measured point; normalised: (gains,) of the starting point."""
+        return Best(normalised, len(problem.rows), self._margin)
+
     def _best_of(self, tightened: Problem, normalised: np.ndarray) -> tuple[Best, Measured]:
         """Measure points (points, gains) without gradients. Return the best point and the measurement."""
-        best, measured = (
-            Best(normalised[0], len(tightened.rows), self._margin),
-            self._evaluate.measure(tightened, normalised),
-        )
+        best, measured = self._unmeasured(tightened, normalised[0]), self._evaluate.measure(tightened, normalised)
         best.offer(normalised, measured)
         return best, measured
 
@@ -374,7 +363,8 @@ class LocalSearches:
         kept.
         """
         tightened, found = self.tightened(problem), dict[str, float | None]()
-        worst = largest(self._evaluate.measure_with_gradients(tightened, self.normalised[None]).c, 0.0)[0]
+        measure = partial(self._evaluate.measure_with_gradients, tightened)
+        worst = largest(measure(self.normalised[None]).c, 0.0)[0]
         for row in np.flatnonzero(worst >= 1.0 + (worst.max() - 1.0) * (1.0 - CONFLICTING)):
             others = np.arange(worst.size) != row
             seen: list[tuple[float, float]] = []
@@ -385,14 +375,8 @@ class LocalSearches:
                 each = largest(one.c, 0.0)[0]
                 seen.append((float(each[others].max(initial=0.0)), float(each[row])))
 
-            search_locally(
-                partial(self._evaluate.measure_with_gradients, tightened),
-                Best(self.normalised, worst.size, self._margin),
-                Start(self.normalised, CAREFUL),
-                self._steps,
-                keep,
-                relaxed=Relaxed(rows=[int(row)], to_the_end=True),
-            )
+            best, relaxed = self._unmeasured(tightened, self.normalised), Relaxed(rows=[int(row)], to_the_end=True)
+            search_locally(measure, best, Start(self.normalised, CAREFUL), self._steps, keep, relaxed=relaxed)
             kept = [ratio for rest, ratio in seen if rest <= 1.0 + 10.0 * SLACK]
             margin = float(np.broadcast_to(self._margin, worst.size)[row])
             found[problem.rows[row]] = (1.0 - margin) * min(kept) if kept else None
@@ -428,7 +412,7 @@ class LocalSearches:
                 [self._evaluate.bounds.replaced(current.normalised, scenario_gains, which) for which in back], 0.0, 1.0
             )
             measured = self._evaluate.measure_with_gradients(tightened, normalised)  # this program is already compiled
-            bests = [Best(one, len(problem.rows), self._margin) for one in normalised]
+            bests = [self._unmeasured(problem, one) for one in normalised]
             for k, best in enumerate(bests):
                 best.offer(normalised[k : k + 1], measured.at(k))
             return bests
@@ -500,18 +484,10 @@ class LocalSearches:
             close: change of F at which the search ends.
             replace_best: replace the best point so far, because the problem has changed.
         """
-        best, tightened = Best(start.normalised, len(problem.rows), self._margin), self.tightened(problem)
+        best, tightened = self._unmeasured(problem, start.normalised), self.tightened(problem)
+        measure, keep = partial(self._evaluate.measure_with_gradients, tightened), partial(self._record, number)
         try:
-            keep = partial(self._record, number)
-            search_locally(
-                partial(self._evaluate.measure_with_gradients, tightened),
-                best,
-                start,
-                steps,
-                keep,
-                close,
-                _relaxed(problem),
-            )
+            search_locally(measure, best, start, steps, keep, close, _relaxed(problem))
         finally:  # also after an interrupt
             self._update_best(best, tightened, number, replace_best=replace_best)
 

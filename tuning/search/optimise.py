@@ -56,7 +56,7 @@ class Search:
     rounds: int = 0  # number of further searches with harder trials
     margins: dict[str, float] = field(default_factory=dict)  # relative tightening of the limit of each metric
     violation: float = 0.0  # relative violation of the tightened limits at the best point, as in progress reports
-    # if no gains meet every requirement: the limits that conflict, see `Descents.conflict`
+    # if no gains meet every requirement: the limits that conflict, see `LocalSearches.conflict`
     conflict: dict[str, float | None] = field(default_factory=dict)
     globally: bool = False  # a global search of the whole box followed
     hardest: Hardest | None = None  # worst case of the gains; None: no requirement on every trial
@@ -149,8 +149,8 @@ def _search_with_gradients(
     starts, seed = settings.starts, settings.seed
     local_searches.begin(rounds.problem, scenario_gains, settings.designs)
     rounds.begin(local_searches.gains)
-    shares = local_searches.explore(rounds.problem, starts, seed) if starts > 1 else {0: local_searches.normalised}
-    local_searches.search_locally(rounds.problem, shares)
+    best = local_searches.explore(rounds.problem, starts, seed) if starts > 1 else {0: local_searches.normalised}
+    local_searches.search_locally(rounds.problem, best)
     _repeat_with_harder_trials(rounds, local_searches, local_searches.again, tell)
     if starts > 1 and local_searches.best.violation > 0.0:
         tell(GLOBALLY)

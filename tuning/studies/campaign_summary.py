@@ -136,7 +136,9 @@ def summarise(folder: Folder) -> dict[str, Any]:
     inputs = rows.read(parts, drawn).head(min(SEARCHED, folder.trials))
     for name in (*scenario.catalogue(folder.scenario), *folder.custom_metric_names):
         values = rows.read(parts, [name]).head(folder.trials)[name].to_numpy().astype(float)
-        quantiles[name] = (_of_share if name in catalogues.LARGER_IS_BETTER else _of_metric)(values, finished)
+        quantiles[name] = (_of_larger_is_better if name in catalogues.LARGER_IS_BETTER else _of_metric)(
+            values, finished
+        )
         known = np.isfinite(values[:SEARCHED]) & finished[:SEARCHED]
         driver_trials[name] = int(known.sum())
         of = {key: inputs[key].to_numpy()[known] for key in drawn}
@@ -250,7 +252,7 @@ def _of_metric(values: np.ndarray, finished: np.ndarray) -> dict[str, Any]:
     return _of_known(values, has) | {str(quantile): _at(ordered, quantile) for quantile in QUANTILES}
 
 
-def _of_share(values: np.ndarray, finished: np.ndarray) -> dict[str, Any]:
+def _of_larger_is_better(values: np.ndarray, finished: np.ndarray) -> dict[str, Any]:
     """Return statistics of a metric that is better when larger: as `_of_metric`, the minimum, and low quantiles.
 
     Quantiles count a trial without a value as 0. Key "0.0027" has the value that 99.73 % of the trials reach.

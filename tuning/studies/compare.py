@@ -390,7 +390,7 @@ def write(folder: Path, scenario: Scenario, comparison: Comparison, figures: boo
         style.save(dict(_figures(comparison)), folder / "figures")
 
 
-_SHARES = ("0.01", "0.5", "0.99")
+_QUANTILES = ("0.01", "0.5", "0.99")
 _COLUMNS = ("met", "window_error", "peak_torque", "largest_peak_torque", "effort", "chattering", "unsettled",
             "settling_by_angle")  # fmt: skip
 
@@ -399,7 +399,7 @@ def _rows(scenario: Scenario, said: Mapping[str, Any]) -> tuple[list[str], list[
     """Return the header and the rows of `compare.csv`, one row for each law."""
     required = [name for name in catalogues.MARGINS if name in scenario.requirements]
     nominal = [name for name in catalogues.MARGINS if name not in required]  # of the nominal loop in the hold phase
-    head = ["law", *_COLUMNS, *(f"settling_time_{100 * float(q):g}" for q in _SHARES), *required, *nominal,
+    head = ["law", *_COLUMNS, *(f"settling_time_{100 * float(q):g}" for q in _QUANTILES), *required, *nominal,
             "window_error_low", "window_error_high", *(f"window_error_{name}" for name in MODEL_ERRORS),
             "gains"]  # fmt: skip
 
@@ -407,7 +407,7 @@ def _rows(scenario: Scenario, said: Mapping[str, Any]) -> tuple[list[str], list[
         worst = {v["metric"]: v["worst"] for v in figures["verdicts"]}
         hold = (figures["margins"] or {}).get("hold", {})
         return [
-            law, *(figures[name] for name in _COLUMNS), *((figures["settling_time"] or {}).get(q) for q in _SHARES),
+            law, *(figures[name] for name in _COLUMNS), *((figures["settling_time"] or {}).get(q) for q in _QUANTILES),
             *map(worst.get, required), *map(hold.get, nominal), *(figures["window_error_interval"] or (None, None)),
             *(figures["model_errors"].get(name, {}).get("window_error") for name in MODEL_ERRORS),
             "; ".join(f"{name} = {value:.6g}" for name, value in figures["gains"].items()),
