@@ -3,8 +3,9 @@
     python benchmarks/tuning_ablation.py [SEEDS [PROBLEM ...]]
 
 Each search adds a line to out/tuning_ablation.jsonl and is not repeated. The table has a row for each problem and
-variant: the median and largest distance from the best objective of all variants, the seeds within 1 % of it, and the
-number of simulations. Differential evolution of `tuning.search.global_check` is a variant, on the first seed.
+variant. Its columns are the median and largest distance from the best objective of all variants, the seeds within 1 %
+of it, and the number of simulations. Differential evolution of `tuning.search.global_check` is a variant, on the first
+seed.
 """
 
 import json

@@ -1,11 +1,8 @@
-"""Draw the figures of the documentation from the code: `python docs/figures.py` writes docs/slew.png and docs/images.
+"""Draw the figure of the README from the code: `python docs/figures.py` writes docs/slew.png.
 
-It needs the result of `make tune` in out/tune-first_flight, and Chromium for the screenshot of its report.
+It needs the result of `make tune` in out/tune-first_flight.
 """
 
-import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 from ptsmc_jax.configure import configure
@@ -66,30 +63,10 @@ def slew(published: Scenario, tuned: Scenario) -> Figure:
     return figure
 
 
-def run(*words: str | Path) -> None:
-    """Run a command of `ptsmc`, whose exit status may report an unmet requirement."""
-    program = [sys.executable, "-c", "from tuning.cli import command; command()"]
-    done = subprocess.run([*program, *map(str, words), "--quiet"], check=False)
-    assert done.returncode in (0, 1), words
-
-
-def screenshot(page: Path, image: Path, size: tuple[int, int]) -> None:
-    """Write the upper part of a page as a PNG image of this size [pixels]."""
-    browser = shutil.which("chromium")
-    assert browser, "the screenshot needs Chromium"
-    options = ["--headless", "--no-sandbox", "--hide-scrollbars", "--virtual-time-budget=10000"]
-    shape = f"--window-size={size[0]},{size[1]}"
-    subprocess.run([browser, *options, shape, f"--screenshot={image}", page.as_uri()], check=True, capture_output=True)
-
-
 def main() -> None:
-    """Write the figures."""
-    published, tuned = ROOT / "scenarios/first_flight.toml", ROOT / "out/tune-first_flight"
-    slew(ptsmc.read(published), ptsmc.read(tuned / "tuned.toml")).savefig(ROOT / "docs/slew.png", dpi=130)
-    run("map", published, "--out", ROOT / "out/map-first_flight", "--force")
-    shutil.copy(ROOT / "out/map-first_flight/figures/map.png", ROOT / "docs/images/map.png")
-    run("report", tuned)
-    screenshot(tuned / "report.html", ROOT / "docs/images/report.png", (1000, 1250))
+    """Write docs/slew.png."""
+    published, tuned = (ROOT / path for path in ("scenarios/first_flight.toml", "out/tune-first_flight/tuned.toml"))
+    slew(ptsmc.read(published), ptsmc.read(tuned)).savefig(ROOT / "docs/slew.png", dpi=130)
 
 
 if __name__ == "__main__":

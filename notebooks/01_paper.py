@@ -83,8 +83,8 @@ run.plot("error")
 run.plot("torque")
 
 # %% [markdown]
-# On logarithmic axes both curves are almost straight lines with the slope $\eta$. In the last 10 s the sliding variable
-# $s$ leaves its line. There the error of the observer is larger than the motion that the law controls.
+# On logarithmic axes both curves are almost straight lines, because they fall like $\tau^\eta$. In the last 10 s the
+# sliding variable $s$ leaves its line. There the error of the observer is larger than the motion that the law controls.
 
 # %%
 run.plot("convergence")

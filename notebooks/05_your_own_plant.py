@@ -38,11 +38,12 @@ plt.style.use("ptsmc_jax.figures.ptsmc")
 # The law controls any system of the form
 #
 # $$
-# \dot x_1 = F(t, x), \qquad \dot x_2 = H(t, x) + G(t, x)\,u + D(t, x)\,d ,
+# \dot x_1 = F(t, x), \qquad \dot x_2 = H(t, x) + G(t, x)\,u + D(t, x)\,d .
 # $$
 #
-# with the input $u$ and the disturbance $d$. The state $x_1$ is the error, which the law brings to zero at $t_f$. Our
-# example is a pendulum with the angle $\varphi$, which has to follow $\sin t$:
+# Here $u$ is the input and $d$ is the disturbance. The state $x_1$ is the error, which the law brings to zero at $t_f$.
+#
+# Our example is a pendulum. Its angle $\varphi$ must follow $\sin t$:
 #
 # $$
 # J\,\ddot\varphi = -J\,g\,\sin\varphi - J\,b\,\dot\varphi + u + d, \qquad J = 0.5,\; g = 9.81,\; b = 0.1 .

@@ -111,8 +111,8 @@ runs["custom"].plot("torque")
 # %% [markdown]
 # ## Tune it
 #
-# The tuner takes the gains and their bounds from the class. These lines tune it for a torque limit and margins. They run
-# for several minutes, because the law is compiled with its derivatives.
+# The tuner takes the gains and their bounds from the class. The next lines tune it for a torque limit and margins. They
+# run for several minutes, because the law is compiled with its derivatives.
 #
 # ```python
 # import tuning

@@ -87,15 +87,13 @@ Points = Annotated[
 ]
 Times = Annotated[
     str | None,
-    Parameter(
-        help="Prescribed times to tune for, with --against t_f [s], such as 20,30,45; default: t_f / 2 to 2 t_f."
-    ),
+    Parameter(help="Prescribed times to tune for, with --against t_f [s], such as 20,30. Default: t_f / 2 to 2 t_f."),
 ]
 SensitivityLimits = Annotated[
     str | None,
     Parameter(
-        help="Limits on the peak sensitivity max |S| to tune for, with --against margins [dB], such as 4,6,9; default: "
-        "3 to 12. The gains without a limit are found too."
+        help="Limits on the peak sensitivity max |S| to tune for, with --against margins [dB], such as 4,6. Default: "
+        "3 to 12. The gains without a limit are found, too."
     ),
 ]
 
