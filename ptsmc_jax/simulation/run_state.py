@@ -13,7 +13,7 @@ from ptsmc_jax.numerics.pytrees import Scalar, listing
 from ptsmc_jax.simulation import metrics, pointing
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.computer import Decision
-from ptsmc_jax.simulation.control_period import Record, State
+from ptsmc_jax.simulation.control_period import Record, State, Tick
 from ptsmc_jax.simulation.interval import Arrival, Criteria, Errors, Interval, Snapshot, Start
 
 OK, DIVERGED, TOO_FAST, SINGULAR, NOT_CONVERGED, UNBOUNDED, INCOMPLETE = range(7)
@@ -141,7 +141,7 @@ def advance(run: Run, score: Score, before: State, after: State, record: Record)
     return _judged(run, score, after.x, target_next, now.t_next, record.step, u_end, after.computer.law)
 
 
-def row(run: Run, before: State, after: State, record: Record, dt_before: Scalar | None = None) -> Log:
+def row(run: Run, before: State, after: State, record: Record, tick: Tick | None = None) -> Log:
     """Return the row of the history at the start of a control period or of a step of the continuous loop.
 
     The other arguments are as in `advance`.
@@ -151,19 +151,19 @@ def row(run: Run, before: State, after: State, record: Record, dt_before: Scalar
         before: state at the start of the period.
         after: state at its end.
         record: record of the period.
-        dt_before: nominal length of the period before [s]; None in the continuous loop and with exported C, whose
-            memory of the sensors has another form. The row then has no readings.
+        tick: the period at its nominal times. It is None in the continuous loop, and with exported C, whose memory of
+            the sensors has another form. The row then has no readings.
     """
     now, drive, decision, wheels = record.now, record.drive, record.decision, None
     if drive is not None and record.torques.wheel_torque is not None:
         wheels = drive.h, record.torques.wheel_torque[0]
     u, has_length = record.torques.delivered[0], now.t_next > now.t
     found = row_at(run, now.t, before.x, decision, u, has_length, after.walk, wheels)
-    if dt_before is None:
+    if tick is None:
         return found
-    parts, nominal = run.parts, now if before.offset is None else now._replace(t=now.t - before.offset)
-    seen = parts.plant.visible(before.x)
-    readings, _ = parts.sensors.inputs(before.computer.sensors, seen, nominal, dt_before, before.star_x)
+    # the flight software measured the same; the compiler merges both computations
+    parts, memory, seen = run.parts, before.computer.sensors, run.parts.plant.visible(before.x)
+    readings, _ = parts.sensors.inputs(memory, seen, tick.now, tick.dt_before, before.star_x)
     return found._replace(readings=readings, sent=parts.actuators.send(before.actuators, decision.u, decision.w)[0])
 
 

@@ -21,8 +21,8 @@ def simulate(run: Run, seed: WholeNumber, trial: WholeNumber, software: Software
     def step(carry: tuple[State, Score], tick: Tick) -> tuple[tuple[State, Score], Log | None]:
         state, score = carry
         after, record = control_period(vehicle, state, tick)
-        dt_before = None if software.on_processor else tick.dt_before
-        row = run_state.row(run, state, after, record, dt_before) if run.record else None
+        measured = None if software.on_processor else tick
+        row = run_state.row(run, state, after, record, measured) if run.record else None
         return (after, run_state.advance(run, score, state, after, record)), row
 
     first = run_state.begin(run)
