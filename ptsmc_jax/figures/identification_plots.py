@@ -1,5 +1,6 @@
 """Figures of an identification: measured and predicted signals, innovations, their autocorrelation, estimates."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,9 +11,20 @@ from ptsmc_jax.figures import style
 POINTS = 4000  # of a line
 
 
-def _panels(count: int, width: float = 8.0) -> tuple[Figure, Any]:
-    figure = Figure(figsize=(width, 1.0 + 1.5 * count), layout="constrained")
-    return figure, np.ravel(figure.subplots(count, 1, sharex=True))
+def _panels(labels: Sequence[str], title: str, xlabel: str = style.TIME) -> tuple[Figure, Any]:
+    """Return a figure with a plot for each label, and the plots."""
+    figure = Figure(figsize=(8.0, 1.0 + 1.5 * len(labels)), layout="constrained")
+    axes = np.ravel(figure.subplots(len(labels), 1, sharex=True))
+    for one, label in zip(axes, labels, strict=True):
+        one.set_ylabel(label)
+    axes[0].set_title(title, loc="left")
+    axes[-1].set_xlabel(xlabel)
+    return figure, axes
+
+
+def _some(count: int) -> np.ndarray:
+    """Return the rows of a log that are drawn, at most `POINTS`."""
+    return np.unique(np.linspace(0, count - 1, min(POINTS, count)).round().astype(int))
 
 
 @style.styled
@@ -23,16 +35,13 @@ def signals(t: np.ndarray, panels: list[tuple[str, np.ndarray, np.ndarray]]) -> 
         t: times (rows,) [s].
         panels: label, measured and predicted values (rows, components) of each signal.
     """
-    figure, axes = _panels(len(panels))
-    kept = np.unique(np.linspace(0, len(t) - 1, min(POINTS, len(t))).round().astype(int))
-    for one, (label, measured, predicted) in zip(axes, panels, strict=True):
+    figure, axes = _panels([label for label, *_ in panels], "Measured (dots) and predicted (lines)")
+    kept = _some(len(t))
+    for one, (_, measured, predicted) in zip(axes, panels, strict=True):
         for k, (colour, _) in zip(range(measured.shape[1]), style.STYLES, strict=False):
             one.plot(t[kept], measured[kept, k], ".", ms=2, color=colour, alpha=0.4)
             one.plot(t[kept], predicted[kept, k], "-", lw=0.9, color=colour, label=f"component {k + 1}")
-        one.set_ylabel(label)
     axes[0].legend(ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0))
-    axes[0].set_title("Measured (dots) and predicted (lines)", loc="left")
-    axes[-1].set_xlabel(style.TIME)
     return figure
 
 
@@ -46,9 +55,9 @@ def innovations(t: np.ndarray, names: list[str], values: np.ndarray, sigma: np.n
         values: innovations (rows, components), NaN without a reading.
         sigma: their 1 sigma (rows, components).
     """
-    figure, axes = _panels(len(names))
-    kept = np.unique(np.linspace(0, len(t) - 1, min(POINTS, len(t))).round().astype(int))
-    for k, (one, name) in enumerate(zip(axes, names, strict=True)):
+    figure, axes = _panels(names, "Innovations and their 3 sigma bands")
+    kept = _some(len(t))
+    for k, one in enumerate(axes):
         band = np.where(np.isfinite(values[:, k]), 3.0 * sigma[:, k], np.nan)
         there = kept[np.isfinite(band[kept])]
         one.fill_between(t[there], -band[there], band[there], color="0.9")
@@ -56,9 +65,6 @@ def innovations(t: np.ndarray, names: list[str], values: np.ndarray, sigma: np.n
         if there.size:  # the first bands may be wide, because little is known of the state at the start
             reach = 1.5 * max(np.nanquantile(band, 0.9), np.nanquantile(np.abs(values[:, k]), 0.99))
             one.set_ylim(-reach, reach)
-        one.set_ylabel(name)
-    axes[0].set_title("Innovations and their 3 sigma bands", loc="left")
-    axes[-1].set_xlabel(style.TIME)
     return figure
 
 
@@ -71,15 +77,12 @@ def autocorrelation(names: list[str], values: np.ndarray, counts: np.ndarray) ->
         values: (lags, components) [-].
         counts: number of readings of each component.
     """
-    figure, axes = _panels(len(names))
+    figure, axes = _panels(names, "Autocorrelation of the innovations and its 95 % band", "lag [readings]")
     lags = np.arange(1, len(values) + 1)
-    for k, (one, name) in enumerate(zip(axes, names, strict=True)):
+    for k, one in enumerate(axes):
         reach = 1.96 / np.sqrt(max(counts[k], 1))
         one.axhspan(-reach, reach, color="0.9")
         one.vlines(lags, 0.0, values[:, k], color=style.STYLES[0][0])
-        one.set_ylabel(name)
-    axes[0].set_title("Autocorrelation of the innovations and its 95 % band", loc="left")
-    axes[-1].set_xlabel("lag [readings]")
     return figure
 
 
@@ -111,11 +114,8 @@ def estimates(table: Any) -> Figure:
 @style.styled
 def profile(t: np.ndarray, panels: list[tuple[str, np.ndarray]]) -> Figure:
     """Draw a proposed manoeuvre over time; panels: label and values (rows, components) of each signal, t: in s."""
-    figure, axes = _panels(len(panels))
-    for one, (label, values) in zip(axes, panels, strict=True):
+    figure, axes = _panels([label for label, _ in panels], "Proposed manoeuvre")
+    for one, (_, values) in zip(axes, panels, strict=True):
         for column, (colour, line) in zip(values.T, style.STYLES, strict=False):
             one.plot(t, column, color=colour, ls=line)
-        one.set_ylabel(label)
-    axes[0].set_title("Proposed manoeuvre", loc="left")
-    axes[-1].set_xlabel(style.TIME)
     return figure
