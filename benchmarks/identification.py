@@ -23,12 +23,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     configure()
-    import jax
-    import jax.numpy as jnp
-
     from ptsmc_jax import scenario
     from ptsmc_jax.identification import estimation, parameters, telemetry
-    from ptsmc_jax.identification.filtering import Kind
     from tests.identification import synthetic
 
     rng = np.random.default_rng(arguments.seed)
@@ -49,28 +45,27 @@ def main() -> None:
     problem = parameters.build(loaded, logs)
     gate = estimation._gate(loaded)
     search = estimation.Search(problem, [], gate, lambda text: None)
-    numbers = jax.jit(lambda z: problem.read(problem.at(z)))
-    derivatives = jax.jit(jax.jacfwd(numbers))
-    truth = np.asarray(numbers(jnp.zeros(problem.size)))
+    zero = np.zeros(problem.size)
+    truth = problem.numbers(zero)
     errors, bounds, inside, converged, seconds = [], [], [], 0, []
     for k, log in enumerate(logs):
-        one = estimation.rows(problem, log), Kind.of(log)
+        one = estimation.prepared(problem, log)
         search.logs = [one]
         if k == 0:
             begun = time.perf_counter()
-            search.derivatives(np.zeros(problem.size), search.logs)
-            search.screened(np.zeros(problem.size), one)
+            search.derivatives(zero, search.logs)
+            search.screened(zero, one)
             print(f"compiling and a first evaluation: {time.perf_counter() - begun:.1f} s", flush=True)
         begun, processor = time.perf_counter(), time.process_time()
         start = rng.uniform(-1.0, 1.0, problem.size)
         found = search.best(start, parameters.acceleration(problem.model, log), 3)
         seconds.append((time.perf_counter() - begun, time.process_time() - processor))
-        _, _, information, _ = search.derivatives(np.zeros(problem.size), search.logs)
-        at_truth = np.asarray(derivatives(jnp.zeros(problem.size)))
+        _, _, information, _ = search.derivatives(zero, search.logs)
+        at_truth = problem.derivatives(zero)
         bound = np.sqrt(np.diag(at_truth @ np.linalg.inv(information) @ at_truth.T))
-        at_estimate = np.asarray(derivatives(jnp.asarray(found.z)))
+        at_estimate = problem.derivatives(found.z)
         std = np.sqrt(np.diag(at_estimate @ estimation.covariance(found.information) @ at_estimate.T))
-        error = np.asarray(numbers(jnp.asarray(found.z))) - truth
+        error = problem.numbers(found.z) - truth
         converged += found.converged
         errors.append(error / bound)
         bounds.append(bound)

@@ -14,7 +14,6 @@ import polars as pl
 
 from ptsmc_jax.identification import estimation, parameters
 from ptsmc_jax.identification.estimation import Search
-from ptsmc_jax.identification.filtering import Kind
 from ptsmc_jax.identification.parameters import Problem
 from ptsmc_jax.identification.telemetry import Measurements
 from ptsmc_jax.scenario import reading
@@ -38,7 +37,7 @@ class Design:
 
     def table(self) -> pl.DataFrame:
         """Return a row for each number: value, expected 1 sigma, 1 sigma after plain slews, unit."""
-        numbers = np.asarray(self.problem.read(self.problem.model))
+        numbers = self.problem.numbers(np.zeros(self.problem.size))
         return pl.DataFrame({
             "parameter": self.problem.labels, "value": numbers, "expected_std": self.std, "plain_std": self.plain,
             "unit": self.problem.units,
@@ -75,12 +74,11 @@ def design(
     problem = parameters.build(loaded, [log])
     limits = _Limits.of(loaded, problem, rate, torque)
     search = Search(problem, [], np.inf, lambda text: None)
-    kind = Kind.of(log)
 
     def information(momentum: np.ndarray) -> tuple[np.ndarray, Measurements]:
         command = np.append(np.diff(momentum, axis=0) / period, np.zeros((1, momentum.shape[1])), axis=0)
-        expected = _expected(problem, search, log._replace(command=command), kind)
-        return search.derivatives(np.zeros(problem.size), [(estimation.rows(problem, expected), kind)])[2], expected
+        expected = _expected(problem, search, log._replace(command=command))
+        return search.derivatives(np.zeros(problem.size), [estimation.prepared(problem, expected)])[2], expected
 
     def value(momentum: np.ndarray) -> float:
         sizes = np.linalg.eigvalsh(information(momentum)[0])
@@ -100,8 +98,7 @@ def design(
         if found > best:
             best, amplitudes, chosen = found, new, momentum
         report(f"profile {k + 1} of {CANDIDATES + REFINEMENTS}: log det of the information {best:.5g}")
-    numbers = jax.jit(lambda z: problem.read(problem.at(z)))
-    by_z = np.asarray(jax.jacfwd(numbers)(np.zeros(problem.size)))
+    by_z = problem.derivatives(np.zeros(problem.size))
 
     def std(information: np.ndarray) -> np.ndarray:
         return np.sqrt(np.diag(by_z @ estimation.covariance(information) @ by_z.T))
@@ -173,9 +170,9 @@ def _silent(loaded: Any, t: np.ndarray) -> Measurements:
     return Measurements("design", t, {"attitude": q, "rate": np.zeros((len(t), 3))}, np.zeros((len(t), 3)))
 
 
-def _expected(problem: Problem, search: Search, log: Measurements, kind: Kind) -> Measurements:
+def _expected(problem: Problem, search: Search, log: Measurements) -> Measurements:
     """Return the log with the readings that the model predicts without noise."""
-    rows = estimation.rows(problem, log)
+    rows, kind = estimation.prepared(problem, log)
     blind = rows._replace(valid=np.concatenate([rows.valid[:1], np.zeros_like(rows.valid[1:])]))
     _, track = search.filtered(np.zeros(problem.size), (blind, kind))
     sampled = rows.source[1:] >= 0

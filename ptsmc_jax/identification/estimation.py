@@ -39,6 +39,7 @@ CONSISTENT = (0.8, 1.25)  # mean normalised square of innovations that fit their
 FARTHEST = 3.0  # distance of the most likely parameters of a validation log, RMS in sigmas of the estimates
 CONFIDENCE = 0.95
 CLEAR = 0.3  # smallest component of an undetermined direction that is named
+Prepared = tuple[Rows, Kind]  # a log for the filter
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +108,6 @@ class Identification:
     scenario: Scenario
     problem: Problem
     z: np.ndarray  # estimated coordinates (n,)
-    covariance_z: np.ndarray  # (n, n) of the coordinates
     start: np.ndarray  # numbers of the scenario (k,)
     prior: np.ndarray  # their prior 1 sigma (k,), infinite without prior knowledge
     estimate: np.ndarray  # (k,)
@@ -213,8 +213,7 @@ def of_logs(
     """
     _check_alike([*logs, *others])
     problem = parameters.build(loaded, logs, free)
-    every = [rows(problem, one) for one in logs]
-    search = Search(problem, [(one, Kind.of(log)) for one, log in zip(every, logs, strict=True)], _gate(loaded), report)
+    search = Search(problem, [prepared(problem, one) for one in logs], _gate(loaded), report)
     usual = max(parameters.acceleration(problem.model, log) for log in logs)
     starts = 3 if loaded.identify is None else loaded.identify.starts
     best = search.best(np.zeros(problem.size), usual, starts)
@@ -232,10 +231,9 @@ def _check_alike(logs: Sequence[Measurements]) -> None:
             raise ScenarioError(f"{log.name} has other readings than {first.name}, but all logs must have the same")
 
 
-def rows(problem: Problem, log: Measurements) -> Rows:
-    """Return a log for the filter, padded so that logs of similar lengths share a program."""
-    count = len(filtering.rows_of(log, problem.step).t)
-    return filtering.rows_of(log, problem.step, -(-count // BUCKET) * BUCKET)
+def prepared(problem: Problem, log: Measurements) -> Prepared:
+    """Return a log for the filter."""
+    return filtering.rows_of(log, problem.step, BUCKET), Kind.of(log)
 
 
 def _gate(loaded: Scenario) -> float:
@@ -258,7 +256,7 @@ class Found(NamedTuple):
 class Search:
     """Local searches for the estimates from some logs; programs are compiled once for logs of the same length."""
 
-    def __init__(self, problem: Problem, logs: Sequence[tuple[Rows, Kind]], gate: float, report: Callable[[str], None]):
+    def __init__(self, problem: Problem, logs: Sequence[Prepared], gate: float, report: Callable[[str], None]):
         """Args: the problem, the logs, the normalised square of outliers, and a function that reports progress."""
         self.problem, self.logs, self.gate, self.report = problem, list(logs), gate, report
         self.known = problem.known().astype(float)
@@ -294,26 +292,24 @@ class Search:
         count = jnp.maximum(jnp.sum(accepted), 1)
         return _log_likelihood(value, variance, accepted), gradient, information, jnp.sum(whitened**2) / count
 
-    def filtered(self, z: np.ndarray, log: tuple[Rows, Kind]) -> tuple[Innovations, Track]:
+    def filtered(self, z: np.ndarray, log: Prepared) -> tuple[Innovations, Track]:
         """Return innovations and estimates of the filter for a log, as NumPy arrays."""
         rows, kind = log
         return jax.tree.map(np.asarray, self._filter(jnp.asarray(z), _numbers(rows), kind=kind))
 
-    def innovations(self, z: np.ndarray, log: tuple[Rows, Kind], gate: float = np.inf) -> Innovations:
+    def innovations(self, z: np.ndarray, log: Prepared, gate: float = np.inf) -> Innovations:
         """Return the innovations of a log, as NumPy arrays."""
         rows, kind = log
         return jax.tree.map(np.asarray, self._errors(jnp.asarray(z), self.slack, _numbers(rows), gate, kind=kind))
 
-    def value(self, z: np.ndarray, logs: Sequence[tuple[Rows, Kind]]) -> float:
+    def value(self, z: np.ndarray, logs: Sequence[Prepared]) -> float:
         """Return the log-likelihood of the logs and of the prior."""
         total = -0.5 * float(self.known @ z**2)
         for log in logs:
             total += float(_log_likelihood(*self.innovations(z, log)))
         return total
 
-    def derivatives(
-        self, z: np.ndarray, logs: Sequence[tuple[Rows, Kind]]
-    ) -> tuple[float, np.ndarray, np.ndarray, float]:
+    def derivatives(self, z: np.ndarray, logs: Sequence[Prepared]) -> tuple[float, np.ndarray, np.ndarray, float]:
         """Return log-likelihood, gradient (n,), information (n, n) of logs and prior, and the mean square."""
         value, gradient, information = -0.5 * float(self.known @ z**2), -self.known * z, np.diag(self.known)
         squares = []
@@ -340,7 +336,7 @@ class Search:
             best = max(best, other, key=lambda found: found.value)
         return best
 
-    def run(self, z: np.ndarray, acceleration: float = 0.0) -> Found:
+    def run(self, z: np.ndarray, acceleration: float) -> Found:
         """Return the end of the local search from coordinates (n,), with its outliers rejected.
 
         A model that is far off predicts a long log badly, and its likelihood has many maxima. If the fit is poor, the
@@ -350,7 +346,7 @@ class Search:
             z: starting point.
             acceleration: usual acceleration in the logs [rad/s^2]; 0: no noise is added.
         """
-        if acceleration > 0.0 and self.mean_square(z) > POOR:
+        if acceleration > 0.0 and max(self._scale(self.innovations(z, log)) for log in self.logs) > POOR:
             for factor in SLACK:
                 self.slack = jnp.asarray(factor * acceleration)
                 self.report(f"the fit is poor: a filter with noise of {float(self.slack):.2g} rad/s^1.5")
@@ -358,35 +354,31 @@ class Search:
             self.slack = jnp.zeros(())
         return self._run(z, SCREENINGS, CONVERGED)
 
-    def mean_square(self, z: np.ndarray) -> float:
-        """Return the median of the normalised squares of the innovations over that of a good fit."""
-        scales = [self._scale(self.innovations(z, log)) for log in self.logs]
-        return max(scales)
-
     def _run(self, z: np.ndarray, screenings: int, enough: float) -> Found:
-        logs, before, found = self.logs, None, None
-        for _ in range(screenings if np.isfinite(self.gate) else 1):
-            if np.isfinite(self.gate):
-                logs = [self.screened(z, log) for log in self.logs]
-                masks = np.concatenate([log[0].valid.ravel() for log in logs])
-                if before is not None and np.array_equal(masks, before):
-                    break
-                before = masks
-            found = self.climb(z, logs, enough)
+        before, found = None, None
+        for _ in range(screenings):
+            logs = [self.screened(z, log) for log in self.logs]
+            masks = np.concatenate([log[0].valid.ravel() for log in logs])
+            if before is not None and np.array_equal(masks, before):
+                break
+            before, found = masks, self.climb(z, logs, enough)
             z = found.z
         assert found is not None
         return found
 
     @staticmethod
     def _scale(found: Innovations) -> float:
+        """Return the median of the normalised squares of the innovations over the median of a good fit."""
         squares = (found.value**2 / found.variance)[found.accepted]
         return float(np.median(squares)) / float(stats.chi2.median(1))
 
-    def screened(self, z: np.ndarray, log: tuple[Rows, Kind]) -> tuple[Rows, Kind]:
+    def screened(self, z: np.ndarray, log: Prepared) -> Prepared:
         """Return the log without its outliers at these coordinates.
 
         The limit is relative to the median of the squares, so that good samples stay while the model is still poor.
         """
+        if not np.isfinite(self.gate):
+            return log
         scale = 1.0
         for gate in (np.inf, self.gate):
             found = self.innovations(z, log, gate * scale)
@@ -394,7 +386,7 @@ class Search:
         rows, kind = log
         return rows._replace(valid=np.concatenate([rows.valid[:1], found.accepted])), kind
 
-    def climb(self, z: np.ndarray, logs: Sequence[tuple[Rows, Kind]], enough: float) -> Found:
+    def climb(self, z: np.ndarray, logs: Sequence[Prepared], enough: float) -> Found:
         """Return the nearest maximum of the likelihood of these logs; it ends after a step below `enough` sigma."""
         value, gradient, information, square = self.derivatives(z, logs)
         damping, converged, steps = 0.0, False, 0
@@ -475,23 +467,18 @@ def undetermined(problem: Problem, information: np.ndarray, by_z: np.ndarray) ->
 def _result(
     loaded: Scenario, problem: Problem, search: Search, best: Found, logs: Sequence[Any], others: Sequence[Any]
 ) -> Identification:
-    z = best.z
-    of_z = covariance(best.information)
-    numbers = jax.jit(lambda z: problem.read(problem.at(z)))
-    by_z = np.asarray(jax.jacfwd(numbers)(jnp.asarray(z)))
-    by_start = np.asarray(jax.jacfwd(numbers)(jnp.zeros(problem.size)))
-    known = problem.known()
+    z, zero, known = best.z, np.zeros(problem.size), problem.known()
+    of_z, by_z, by_start = covariance(best.information), problem.derivatives(z), problem.derivatives(zero)
     prior = np.sqrt(np.sum(by_start[:, known] ** 2, axis=1))
     prior = np.where(np.any(by_start[:, ~known] != 0.0, axis=1) | (prior == 0.0), np.inf, prior)
 
-    def fitted(log: Measurements) -> Fit:
-        one = rows(problem, log), Kind.of(log)
-        screened = search.screened(z, one) if np.isfinite(search.gate) else one
-        return Fit(log, one[0], *search.filtered(z, screened))
+    def fitted(log: Measurements) -> tuple[Fit, Prepared]:
+        one = prepared(problem, log)
+        good = search.screened(z, one)
+        return Fit(log, one[0], *search.filtered(z, good)), good
 
     def predicted(log: Measurements) -> Fit:
-        fit, one = fitted(log), (rows(problem, log), Kind.of(log))
-        good = search.screened(z, one) if np.isfinite(search.gate) else one
+        fit, good = fitted(log)
         _, gradient, information, _ = search.derivatives(z, [good])
         kept = np.linalg.pinv(of_z)  # the prior is in it already
         step = np.linalg.solve(information - np.diag(search.known) + kept, gradient + search.known * z)
@@ -502,14 +489,13 @@ def _result(
         scenario=loaded,
         problem=problem,
         z=z,
-        covariance_z=of_z,
-        start=np.asarray(numbers(jnp.zeros(problem.size))),
+        start=problem.numbers(zero),
         prior=prior,
-        estimate=np.asarray(numbers(jnp.asarray(z))),
+        estimate=problem.numbers(z),
         covariance=by_z @ of_z @ by_z.T,
-        undetermined=undetermined(problem, best.information - np.diag(known.astype(float)), by_start),
+        undetermined=undetermined(problem, best.information - np.diag(search.known), by_start),
         complete=bool(np.min(np.linalg.eigvalsh(best.information)) >= 1.0),
-        fits=[fitted(log) for log in logs],
+        fits=[fitted(log)[0] for log in logs],
         validation=[predicted(log) for log in others],
         converged=best.converged,
         steps=best.steps,

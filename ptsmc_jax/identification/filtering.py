@@ -15,12 +15,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.devices.actuators import Actuators, ActuatorState, Drive
 from ptsmc_jax.identification.telemetry import Measurements
 from ptsmc_jax.numerics import attitude, guards, integrators, matrices
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
 from ptsmc_jax.plants.rigid_body import AttitudeState
 
+MOST = 10_000_000  # integration steps of a log
 WIDE = 10.0  # prior 1 sigma of a state without a reading in the first row, relative to its estimate
 
 
@@ -85,16 +87,16 @@ class _Carry(NamedTuple):
     actuators: ActuatorState
 
 
-def groups(readings: Any) -> list[tuple[str, int]]:
-    """Return name and number of components of each group of readings that is rejected together."""
-    if "x" in readings:
-        return [("x", 1)] * readings["x"].shape[-1]
-    return [(name, 3) for name in ("attitude", "rate") if name in readings]
+def rows_of(log: Measurements, step: float, bucket: int = 1) -> Rows:
+    """Return a log for the filter. Intervals longer than the step [s] are divided.
 
-
-def rows_of(log: Measurements, step: float, length: int | None = None) -> Rows:
-    """Return a log for the filter. Intervals longer than the step [s] are divided; `length` pads the rows."""
+    The rows are padded to a multiple of `bucket`, so that logs of similar lengths share a program. RefusedError is
+    raised for a log that needs too many steps.
+    """
     pieces = np.maximum(1, np.ceil(np.diff(log.t) / step * (1.0 - 1e-9)).astype(int))
+    if pieces.sum() > MOST:
+        raise RefusedError(f"{log.name} needs {pieces.sum()} integration steps, but may need at most {MOST}; check its "
+                           f"times, which have a gap of {np.max(np.diff(log.t)):.3g} s")  # fmt: skip
     first = np.append(0, np.cumsum(pieces))
     count = int(first[-1]) + 1
     source = np.full(count, -1)
@@ -109,21 +111,19 @@ def rows_of(log: Measurements, step: float, length: int | None = None) -> Rows:
         there = (source >= 0)[:, None] & ~np.isnan(values[before])
         readings[name] = np.where(there, np.nan_to_num(values[before]), np.eye(4)[3] if values.shape[1] == 4 else 0.0)
         valid.append(there[:, :3] if name == "attitude" else there)
-    more = 0 if length is None else length - count
+    more = -count % bucket
 
     def padded(values: np.ndarray) -> np.ndarray:
         return np.concatenate([values, np.repeat(values[-1:], more, axis=0)])
 
-    dt = np.append(np.diff(t), 0.0)
-    full_valid = np.concatenate([np.concatenate(valid, axis=1), np.zeros((more, sum(v.shape[1] for v in valid)), bool)])
     return Rows(
         np.append(t, t[-1] + np.arange(1.0, more + 1.0)),  # increasing, so that commands can be interpolated
-        np.append(dt, np.zeros(more)),
+        np.pad(np.diff(t), (0, 1 + more)),
         {name: padded(values) for name, values in readings.items()},
-        full_valid,
+        np.pad(np.concatenate(valid, axis=1), ((0, more), (0, 0))),
         padded(command),
         _start_rate(log),
-        np.append(source, np.full(more, -1)),
+        np.pad(source, (0, more), constant_values=-1),
     )
 
 
@@ -315,9 +315,10 @@ def _corrected(
 ) -> tuple[_Carry, Innovations]:
     """Return the filter after the readings of a row, one component after the other."""
     residual, rows, noise = _residuals(model, carry, readings)
-    shift, p, at = jnp.zeros(carry.p.shape[0]), carry.p, 0
+    shift, p = jnp.zeros(carry.p.shape[0]), carry.p
     values, variances, taken = [], [], []
-    for _, size in groups(readings):
+    size = 1 if "x" in readings else 3  # components that are rejected together
+    for at in range(0, residual.size, size):
         new_shift, new_p, square = shift, p, jnp.zeros(())
         for k in range(at, at + size):
             gain = new_p @ rows[k]
@@ -333,7 +334,6 @@ def _corrected(
         accepted = square <= gate * size
         taken += [valid[k] & accepted for k in range(at, at + size)]
         shift, p = guards.select(accepted, (new_shift, new_p), (shift, p))
-        at += size
     p = 0.5 * (p + p.T)
     n = p.shape[0] - carry.bias.size - carry.walk.size
     by_state, by_bias, by_walk = jnp.split(shift, [n, n + carry.bias.size])

@@ -5,7 +5,8 @@ knowledge, or of a usual uncertainty without it. Start with `build`.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import jax
@@ -33,7 +34,7 @@ UNKNOWN_BIAS = 0.02  # 1 sigma of an unknown gyro bias [rad/s]
 USUAL = {  # 1 sigma of a parameter without a dispersion: relative, or in rad
     "inertia": 0.3, "actuator_scale": 0.1, "actuator_misalignment": 0.03, "gyro_scale": 0.02,
     "star_tracker_misalignment": 0.02, "noise": 1.0, "torque_lag": 0.7, "mode_frequency": 0.2, "mode_damping": 1.0,
-    "mode_coupling": 0.3, "disturbance_amplitude": 1.0, "disturbance_phase": 2.0, "disturbance_frequency": 0.3,
+    "mode_coupling": 0.3, "disturbance_amplitude": 1.0, "disturbance_phase": 2.0,
     "plant": 0.3,
 }  # fmt: skip
 
@@ -67,7 +68,8 @@ class Parameter(NamedTuple):
         return self.factor.shape[1]
 
 
-class Problem(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Problem:
     """The model of a scenario and its free parameters."""
 
     model: Model
@@ -91,6 +93,18 @@ class Problem(NamedTuple):
     def read(self, model: Model) -> Array:
         """Return the numbers of all parameters, one after another, in their units."""
         return jnp.concatenate([jnp.zeros(0), *(jnp.ravel(one.read(model)) for one in self.parameters)])
+
+    @cached_property
+    def _numbers(self) -> Callable[[Array], Array]:
+        return jax.jit(lambda z: self.read(self.at(z)))
+
+    def numbers(self, z: np.ndarray) -> np.ndarray:
+        """Return the numbers of all parameters at coordinates (n,) [-], in their units."""
+        return np.asarray(self._numbers(jnp.asarray(z)))
+
+    def derivatives(self, z: np.ndarray) -> np.ndarray:
+        """Return the derivatives (k, n) of `numbers` by the coordinates (n,) [-]."""
+        return np.asarray(jax.jacfwd(self._numbers)(jnp.asarray(z)))
 
     @property
     def labels(self) -> list[str]:
@@ -121,26 +135,29 @@ def build(scenario: Scenario, logs: Sequence[Measurements], names: Sequence[str]
     setup = building.setup(scenario)
     table = scenario.identify
     stated = None if table is None else table.free
-    names = tuple(names or stated or _usual(scenario))
-    logged = logs[0]
-    interval = float(np.median(np.diff(logged.t)))
+    has_gyro = "rate" in logs[0].readings
+    names = tuple(names or stated or _usual(scenario, has_gyro))
+    interval = float(np.median(np.diff(logs[0].t)))
     model, estimated = _model(scenario, setup, logs, interval, GYRO_BIAS in names)
     prior = scenario.dispersion if table is None or table.prior == "dispersion" else None
     catalogue = _catalogue(scenario, model, logs, interval, prior)
     found = []
-    for name in dict.fromkeys((*(one for one in names if one != GYRO_BIAS), *estimated)):
-        if name not in catalogue:
-            known = [*catalogue, *([GYRO_BIAS] if "rate" in logged.readings else [])]
+    for name in dict.fromkeys((*names, *estimated)):
+        if name in catalogue:
+            model, parameter = catalogue[name](model)
+            found.append(parameter)
+        elif name != GYRO_BIAS or not has_gyro:
+            known = [*catalogue, *([GYRO_BIAS] if has_gyro else [])]
             raise ScenarioError(f"identify.free has {name}, which this scenario does not have; {nearest(name, known)}")
-        model, parameter = catalogue[name](model)
-        found.append(parameter)
     if not found:
         raise wrong("identify.free", names, "a list with a parameter of the model too")
     return Problem(model, found, _step(scenario, setup, interval), GYRO_BIAS in names)
 
 
-def _usual(scenario: Scenario) -> tuple[str, ...]:
-    return ("inertia", GYRO_BIAS) if scenario.plant.kind == "spacecraft" else ("actuator_scale",)
+def _usual(scenario: Scenario, has_gyro: bool) -> tuple[str, ...]:
+    if scenario.plant.kind != "spacecraft":
+        return ("actuator_scale",)
+    return ("inertia", GYRO_BIAS) if has_gyro else ("inertia",)
 
 
 def _step(scenario: Scenario, setup: Any, interval: float) -> float:
@@ -241,16 +258,15 @@ def _catalogue(
 ) -> dict[str, Maker]:
     """Return functions that make the parameters of this scenario, by name."""
     plant, actuators = model.plant, model.actuators
-    inputs = plant.inputs
-    axes = np.eye(inputs) if actuators.wheels is None else np.asarray(actuators.wheels.axes)
+    axes = np.eye(plant.inputs) if actuators.wheels is None else np.asarray(actuators.wheels.axes)
     torque = max(float(np.sqrt(np.mean(log.command**2))) for log in logs) or 1.0
-    unit = plant.input_unit
+    usual = {**USUAL, "delay": interval, "disturbance_bias": 0.1 * torque}
 
     def spread(name: str, count: int) -> tuple[np.ndarray, bool]:
         """Return the 1 sigma of each number, (count,), and whether [dispersion] gives it."""
         table: Any = getattr(prior, name, None)
         if not hasattr(table, "of"):  # without a dispersion, or with a phase that is uniform over the circle
-            return np.full(count, USUAL["noise" if name.endswith("_noise") else name]), False
+            return np.full(count, usual["noise" if name.endswith("_noise") else name]), False
         return np.maximum(table.of(count) * (1.0 if table.name.endswith("normal") else 1.0 / np.sqrt(3.0)), 1e-9), True
 
     def field(
@@ -284,8 +300,15 @@ def _catalogue(
             lambda model, new: with_actuators(model, scale=new),
             channels, "-", "factor",
         ),
-        "delay": lambda model: (model, _delay(interval)),
-        "disturbance_bias": lambda model: (model, _bias(inputs, unit, torque, prior)),
+        "delay": field(  # below zero it has no meaning; a tiny delay keeps its derivative
+            "delay", lambda m: m.delay, lambda m, new: replace(m, delay=jnp.maximum(new[0], 1e-9)), 1, "s", "add"
+        ),
+        "disturbance_bias": field(
+            "disturbance_bias",
+            lambda m: disturbances.bias(m.disturbance, plant.inputs),
+            lambda m, new: replace(m, disturbance=disturbances.with_bias(m.disturbance, new)),
+            plant.inputs, plant.input_unit, "add",
+        ),
     }  # fmt: skip
     if actuators.lag is not None:
         made["torque_lag"] = field(
@@ -300,7 +323,7 @@ def _catalogue(
 
         made[key] = field(key, lambda m, n=name, c=count: m.noises[n][:c], put, count, own_unit, "log")
     for name, quantity_unit, how in (
-        ("disturbance_amplitude", unit, "factor"),
+        ("disturbance_amplitude", plant.input_unit, "factor"),
         ("disturbance_phase", "rad", "add"),
     ):
         quantity: Any = name.removeprefix("disturbance_")
@@ -370,31 +393,6 @@ def _leaf(path: str, start: np.ndarray) -> Parameter:
     return Parameter(path, labels, "", np.diag(sizes), False, write, read)
 
 
-def _delay(interval: float) -> Parameter:
-    def write(model: Model, c: Array) -> Model:
-        # below zero the delay has no meaning; a tiny delay keeps its derivative
-        return replace(model, delay=jnp.maximum(model.delay + c[0], 1e-9))
-
-    return Parameter(
-        "delay", ["delay"], "s", np.array([[interval]]), False, write, lambda model: jnp.reshape(model.delay, 1)
-    )
-
-
-def _bias(inputs: int, unit: str, torque: float, prior: Any) -> Parameter:
-    table = getattr(prior, "disturbance_bias", None)
-    sizes = np.full(inputs, 0.1 * torque) if table is None else table.of(inputs)
-
-    def write(model: Model, c: Array) -> Model:
-        start = disturbances.bias(model.disturbance, inputs)
-        return replace(model, disturbance=disturbances.with_bias(model.disturbance, start + c))
-
-    labels = [f"disturbance_bias_{k + 1}" for k in range(inputs)]
-    return Parameter(
-        "disturbance_bias", labels, unit, np.diag(sizes), table is not None, write,
-        lambda model: disturbances.bias(model.disturbance, inputs),
-    )  # fmt: skip
-
-
 def _misalignment(model: Model, axes: np.ndarray, sizes: np.ndarray, known: bool) -> tuple[Model, Parameter]:
     """Return small rotations of each channel about two axes across it; one about its own axis has no effect."""
     directions = axes if model.actuators.directions is None else np.asarray(model.actuators.directions)
@@ -437,7 +435,6 @@ def _inertia(start: np.ndarray, prior: Any) -> Parameter:
     """Return the inertia in log-Cholesky coordinates of its pseudo-inertia, so that every value is that of a body."""
     table = getattr(prior, "inertia", None)
     root = vector(inertias.pseudo_root(start))
-    by_coordinates = np.asarray(jax.jacfwd(lambda c: _entries(inertias.from_coordinates(root, c)))(jnp.zeros(6)))
     if table is not None and hasattr(table, "factor"):
         factor = table.matrix()
     else:
@@ -449,7 +446,7 @@ def _inertia(start: np.ndarray, prior: Any) -> Parameter:
             cross = np.cross(np.eye(3), axes[:, k]).T * -1.0
             changes.append(turn * (cross @ start - start @ cross))
         by_prior = np.stack([np.asarray(_entries(jnp.asarray(change))) for change in changes], axis=1)
-        factor = np.linalg.solve(by_coordinates, _full_rank(by_prior, std * np.min(moments)))
+        factor = np.linalg.solve(by_coordinates(start), _full_rank(by_prior, std * np.min(moments)))
 
     def write(model: Model, c: Array) -> Model:
         inertia = inertias.from_coordinates(root, c)
@@ -458,16 +455,14 @@ def _inertia(start: np.ndarray, prior: Any) -> Parameter:
 
     labels = [f"inertia_{i + 1}{j + 1}" for i, j in PAIRS]
     common = np.linalg.lstsq(factor, np.repeat([0.5, 0.0], 3), rcond=None)[0]
-    return Parameter(
-        "inertia",
-        labels,
-        "kg m^2",
-        factor,
-        table is not None,
-        write,
-        lambda model: _entries(model.plant.inertia),
-        common,
-    )
+    read = lambda model: _entries(model.plant.inertia)  # noqa: E731
+    return Parameter("inertia", labels, "kg m^2", factor, table is not None, write, read, common)
+
+
+def by_coordinates(inertia: np.ndarray) -> np.ndarray:
+    """Return the derivatives (6, 6) [kg m^2] of the entries of an inertia (3, 3) by its log-Cholesky coordinates."""
+    root = vector(inertias.pseudo_root(inertia))
+    return np.asarray(jax.jacfwd(lambda c: _entries(inertias.from_coordinates(root, c)))(jnp.zeros(6)))
 
 
 def _full_rank(factor: np.ndarray, size: float) -> np.ndarray:

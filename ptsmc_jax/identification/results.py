@@ -3,12 +3,11 @@
 from collections.abc import Mapping
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ptsmc_jax.dispersions import inertias
 from ptsmc_jax.dispersions.quantities import PAIRS
+from ptsmc_jax.identification import parameters
 from ptsmc_jax.identification.estimation import LAGS, Fit, Identification
 from ptsmc_jax.scenario import parsing, reading
 from ptsmc_jax.scenario.tables import Scenario
@@ -40,32 +39,26 @@ def _put(
 ) -> None:
     """Write the estimate of one parameter into the tables, and its uncertainty into [dispersion]."""
     hardware = dict(tables.get("hardware", {}))
-    relative = {"kind": "relative_normal", "std": float(min(np.max(std / np.abs(values), initial=0.0), LARGEST_SHARE))}
+    relative = _relative(std, values)
     numbers = [float(value) for value in values]
     if name == "inertia":
         entries = dict(zip(PAIRS, numbers, strict=True))
         tensor = [[entries[min(i, j), max(i, j)] for j in range(3)] for i in range(3)]
         body = {key: value for key, value in tables.get("spacecraft", {}).items() if key != "true_inertia"}
         tables["spacecraft"] = {**body, "inertia": tensor}
-        dispersion["inertia"] = {"kind": "correlated", "factor": _rows(_inertia_factor(found, np.array(tensor)))}
-    elif name == "actuator_scale":
-        hardware["actuator_scale"], dispersion[name] = numbers, relative
-    elif name == "actuator_misalignment":
-        turns = _turns(found)
-        hardware["actuator_misalignment_deg"] = np.rad2deg(turns).tolist()
+        dispersion["inertia"] = {"kind": "correlated", "factor": _inertia_factor(found, np.array(tensor))}
+    elif name in ("actuator_scale", "gyro_scale"):
+        hardware[name], dispersion[name] = numbers, relative
+    elif name in ("actuator_misalignment", "star_tracker_misalignment"):
+        turns = _turns(found) if name == "actuator_misalignment" else values
+        hardware[f"{name}_deg"] = np.rad2deg(turns).tolist()
         dispersion[name] = {"kind": "normal", "std_deg": float(np.rad2deg(np.max(std)))}
-    elif name == "gyro_scale":
-        hardware["gyro_scale"], dispersion[name] = numbers, relative
-    elif name == "star_tracker_misalignment":
-        hardware["star_tracker_misalignment_deg"] = np.rad2deg(values).tolist()
-        dispersion[name] = {"kind": "normal", "std_deg": float(np.rad2deg(np.max(std)))}
-    elif name == "torque_lag":
-        hardware["torque_lag"] = numbers[0]
     elif name == "delay":
         hardware["delay"] = round(numbers[0] / found.scenario.loop.period)
-    elif name in ("attitude_noise", "rate_noise"):
-        hardware.pop("rate_noise_density" if name == "rate_noise" else "", None)
+    elif name in ("torque_lag", "attitude_noise", "rate_noise"):
         hardware[name] = numbers[0]
+        if name == "rate_noise":
+            hardware.pop("rate_noise_density", None)
     elif name == "state_noise":
         hardware["state_noise"] = numbers
     elif name.startswith("mode_"):
@@ -73,13 +66,17 @@ def _put(
         modes = np.array(numbers).reshape(-1, 3).tolist() if key == "coupling" else numbers
         tables["flexible"] = {**tables.get("flexible", {}), key: modes}
         if key != "damping":
-            size = np.abs(values) if key == "frequency" else np.repeat(np.linalg.norm(modes, axis=1), 3)
-            share = float(min(np.max(std / size), LARGEST_SHARE))
-            dispersion[name] = {"kind": "relative_normal", "std": share}
+            size = values if key == "frequency" else np.repeat(np.linalg.norm(modes, axis=1), 3)
+            dispersion[name] = _relative(std, size)
     elif name.startswith("disturbance_"):
         _put_disturbance(tables, dispersion, name, numbers, std, relative)
     if hardware:
         tables["hardware"] = hardware
+
+
+def _relative(std: np.ndarray, values: np.ndarray) -> dict[str, Any]:
+    share = min(np.max(std / np.abs(values), initial=0.0), LARGEST_SHARE)
+    return {"kind": "relative_normal", "std": float(share)}
 
 
 def _put_disturbance(
@@ -105,21 +102,14 @@ def _put_disturbance(
     tables["disturbance"] = terms[0] if len(terms) == 1 else {"kind": "sum", "terms": terms}
 
 
-def _inertia_factor(found: Identification, tensor: np.ndarray) -> np.ndarray:
-    """Return a lower triangular factor (6, 6) of the covariance of the estimate in its log-Cholesky coordinates."""
-    root = jnp.asarray(inertias.pseudo_root(tensor))
-    entries = lambda c: jnp.stack([inertias.from_coordinates(root, c)[i, j] for i, j in PAIRS])  # noqa: E731
-    by_coordinates = np.asarray(jax.jacfwd(entries)(jnp.zeros(6)))
+def _inertia_factor(found: Identification, tensor: np.ndarray) -> list[list[float]]:
+    """Return the rows of a lower triangular factor of the covariance of the inertia's log-Cholesky coordinates."""
     at = found.problem.labels.index("inertia_11")
     of_entries = found.covariance[at : at + 6, at : at + 6]
-    inverse = np.linalg.inv(by_coordinates)
+    inverse = np.linalg.inv(parameters.by_coordinates(tensor))
     sizes, directions = np.linalg.eigh(inverse @ of_entries @ inverse.T)
     upper: Any = np.linalg.qr((directions * np.sqrt(np.maximum(sizes, 0.0))).T, mode="r")
-    lower = upper.T
-    return lower * np.where(np.diag(lower) < 0.0, -1.0, 1.0)
-
-
-def _rows(lower: np.ndarray) -> list[list[float]]:
+    lower = upper.T * np.where(np.diag(upper) < 0.0, -1.0, 1.0)
     return [row[: k + 1].tolist() for k, row in enumerate(lower)]
 
 

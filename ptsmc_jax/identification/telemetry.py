@@ -18,6 +18,7 @@ from ptsmc_jax.numerics import csv_tables
 from ptsmc_jax.scenario.identify_tables import StateTelemetry, Telemetry
 from ptsmc_jax.scenario.parsing import nearest
 from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.signals import attitude_tables
 from ptsmc_jax.simulation.catalogues import UNITS
 
 FEWEST = 10  # rows of a log
@@ -102,9 +103,9 @@ class _Table:
             row = int(np.argmax(bad))
             raise self.refusal(column, row, allowed if isinstance(allowed, str) else allowed(row))
 
-    def has(self, columns: Sequence[str]) -> bool:
-        """Return whether all columns are there."""
-        return all(column in self.frame.columns for column in columns)
+    def has_any(self, columns: Sequence[str]) -> bool:
+        """Return whether one of the columns is there."""
+        return any(column in self.frame.columns for column in columns)
 
     def column(self, column: str) -> pl.Series:
         """Return a column; raise RefusedError if it is not there."""
@@ -196,10 +197,10 @@ def _of_spacecraft(scenario: Scenario, given: Any, table: _Table, t: Values) -> 
     """Return the log of a spacecraft, from the first row with an attitude on."""
     readings = {}
     columns = given.attitude or _names("measured_q", 4)
-    if given.attitude is not None or table.has(columns):
+    if given.attitude is not None or table.has_any(columns):
         readings["attitude"] = _attitude(given, table, columns)
     columns = given.rate or _names("measured_w", 3)
-    if given.rate is not None or table.has(columns):
+    if given.rate is not None or table.has_any(columns):
         readings["rate"] = table.vectors(columns, UNITS["rad/s"][given.rate_unit])
     if not readings or all(np.isnan(values).all() for values in readings.values()):
         raise RefusedError(
@@ -207,7 +208,7 @@ def _of_spacecraft(scenario: Scenario, given: Any, table: _Table, t: Values) -> 
             "such as attitude = [..] or rate = [..]"
         )
     command, by_channel = _commands(scenario, given, table, t)
-    age = given.attitude_age or ("measured_age" if table.has(["measured_age"]) else None)
+    age = given.attitude_age or ("measured_age" if table.has_any(["measured_age"]) else None)
     if age is not None and "attitude" in readings:
         ages = np.nan_to_num(table.numbers([age])[:, 0])
         table.refuse(ages < 0.0, age, "an age of at least 0 s")
@@ -253,9 +254,8 @@ def _attitude(given: Any, table: _Table, columns: Sequence[str]) -> Values:
     q = np.roll(q, -1, axis=1) if given.quaternion_order == "wxyz" else q
     if given.rotation == "inertial_to_body":
         q[:, :3] *= -1.0
-    there = np.flatnonzero(~np.isnan(q[:, 0]))
-    signs = np.where(np.sum(q[there[1:]] * q[there[:-1]], axis=1) < 0.0, -1.0, 1.0)
-    q[there[1:]] *= np.cumprod(signs)[:, None]
+    there = ~np.isnan(q[:, 0])
+    q[there] = attitude_tables.continuous(q[there])
     return q
 
 

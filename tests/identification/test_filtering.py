@@ -9,7 +9,6 @@ from scipy.linalg import expm
 
 from ptsmc_jax import scenario
 from ptsmc_jax.identification import estimation, filtering, parameters, telemetry
-from ptsmc_jax.identification.filtering import Kind
 
 NOISE, WALK = (2e-3, 5e-3), 0.02
 
@@ -49,7 +48,7 @@ def chain_log(rows=60, bias=0.3, walk=0.0, scale=1.0):
 def prepared(loaded, frame):
     log = telemetry.measurements(loaded, frame)
     problem = parameters.build(loaded, [log])
-    return problem, (estimation.rows(problem, log), Kind.of(log))
+    return problem, estimation.prepared(problem, log)
 
 
 def test_innovations_are_those_of_an_independent_kalman_filter():
