@@ -1,7 +1,7 @@
 /* The sampled closed loop of `scenarios/cubesat.toml` by hand, to compare `montecarlo.run` with: star tracker and gyro
  * with noise and a drifting bias, steady-state attitude filter, disturbance observer, the law on the error quaternion,
- * one period of delay, three wheels with limits and a first-order lag, drawn inertia and disturbance phase, four RK4
- * steps a period. `LANES` trials side by side; each loop over them is vectors, and what they share is computed once.
+ * one period of delay, three wheels with limits and a first-order lag, drawn inertia and disturbance phase, one RK4
+ * step a period. `LANES` trials side by side; each loop over them is vectors, and what they share is computed once.
  *
  * POINTING = 1 adds APE, MPE, RPE, PDE, AKE, MKE and RKE. FULL = 0: the model and the wheels are along the body axes.
  * The noise is the library's (Threefry-2x32-20, Box and Muller), so that both compute the same trials.
@@ -13,7 +13,7 @@
 #ifndef POINTING
 #define POINTING 1
 #endif
-#define SUBSTEPS 4
+#define SUBSTEPS 1
 #define DIRECTIONS 16
 #define PROJECTIONS (3 + DIRECTIONS)
 #define FAR 1e300

@@ -88,11 +88,6 @@ class Actuators(Table, frozen=True):
         """Control periods from the measurement to the torque."""
         return self.delay or 0
 
-    @property
-    def moving(self) -> bool:
-        """Whether the torque changes within a control period."""
-        return self.torque_rate_limit is not None or self.torque_lag is not None
-
     def check(self, scenario: Any) -> None:
         """Raise ScenarioError if keys contradict each other or the scenario."""
         step, limit = self.torque_step, self.torque_limit

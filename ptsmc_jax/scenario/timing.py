@@ -26,7 +26,6 @@ from ptsmc_jax.theory import rates, solutions
 from ptsmc_jax.theory.exact_motion import plant_motion
 
 MOST_SUBSTEPS = 200  # largest number of integration steps in a control period
-MOVING = 4  # smallest number of steps in a control period if the torque changes within it
 # keys for which steps of 0.1 rad are accurate enough, see `_substeps`
 _SMOOTHED = ("disturbance.frequency", "plant.system", "flexible.frequency")
 
@@ -140,8 +139,7 @@ def _check_steps(scenario: Scenario, last: float, period: float, substeps: int) 
         )
         if last > scenario.end:
             raise ScenarioError(f"tune.bounds.t_f asks for runs of {last:.6g} s, but must be lower: {asks}")
-        longer = f", or loop.period longer than {period}" if substeps <= MOVING else ""
-        raise wrong("loop.t_end", scenario.loop.t_end, f"earlier{longer}: {asks}")
+        raise wrong("loop.t_end", scenario.loop.t_end, f"earlier: {asks}")
 
 
 def _frequencies(scenario: Scenario, setup: Setup, reach: Reach) -> dict[str, float]:
@@ -160,14 +158,15 @@ def _substeps(scenario: Scenario, period: float, frequencies: Mapping[str, float
     """Return the number of integration steps in a control period [s].
 
     RK4 with 0.025 rad per step has an error of about 1e-9 rad over 100 s. For disturbances, flexible modes and custom
-    systems, 0.1 rad per step gives a relative error of about 1e-7.
+    systems, 0.1 rad per step gives a relative error of about 1e-7. A torque that changes within the period, because of
+    a lag or a rate limit, needs no further steps: its impulse and first moment are exact, see `Actuators.over`.
     """
     frequencies = {key: value / (4 if key in _SMOOTHED else 1) for key, value in frequencies.items()}
     needed = period * _fastest(frequencies) / 0.025
     if needed > MOST_SUBSTEPS:
         asks = f"loop.period = {period} would take more than {MOST_SUBSTEPS} integration steps a period"
         raise _lower(scenario, max(frequencies, key=lambda key: frequencies[key]), asks)
-    steps = max(MOVING if scenario.devices.moving else 1, math.ceil(needed))
+    steps = max(1, math.ceil(needed))
     # round up to a power of 2 or 1.5 times one: nearly all gains then share one compiled program
     power = 2 ** (steps.bit_length() - 1)
     return next(allowed for allowed in (power, power + power // 2, 2 * power) if allowed >= steps)
