@@ -117,8 +117,9 @@ class Program:
             if not all(future.done() for future in self._prepared):
                 self._begin(awaited=True)
             for future in self._prepared:
-                with contextlib.suppress(CancelledError):  # by `stop`
-                    future.exception()  # an error comes again from the call itself
+                if not future.cancel():  # a program that has not begun is compiled here instead
+                    with contextlib.suppress(CancelledError):  # by `stop`
+                        future.exception()  # an error comes again from the call itself
         if thread is not threading.main_thread():
             return self._call_stored(*args, **kwargs)
         return _caller().submit(_with_settings(self._call_stored), *args, **kwargs).result()

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ptsmc_jax.simulation.requirements import Requirement
-from tuning.search import confirm, simulations
+from tuning.search import confirm
 from tuning.search.evaluate import Evaluator
 from tuning.search.evolution import NEARBY
 from tuning.search.local_searches import LocalSearches, Step
@@ -106,7 +106,6 @@ def search(
 
     try:
         if with_gradients:
-            simulations.prepare(rounds.problem.batch)
             prepare()
             _search_with_gradients(rounds, local_searches, scenario_gains, settings, tell)
         else:

@@ -98,9 +98,7 @@ def simulate_with_derivatives(
         Metrics, statuses and derivatives.
     """
     rows, count = _Rows(len(gains), len(batch.trials), ROWS_WITH_DERIVATIVES), directions.shape[1]
-    if shifts is None:
-        free = {name: np.shape(batch.coordinates[name]) for name in movable(batch.dispersion)}
-        shifts = {name: np.zeros((shape[0], count, *shape[1:])) for name, shape in free.items()}
+    shifts = _no_shifts(batch, count) if shifts is None else shifts
 
     def call(some: dict[str, Any], needed: np.int32) -> tuple[jax.Array, jax.Array]:
         return _simulate_with_derivatives(*batch.shared, some, needed, batch.names, metrics, rows.devices)
@@ -110,11 +108,24 @@ def simulate_with_derivatives(
     return Derivatives(values[..., :-1], values[..., -1].astype(int), derivatives[..., :-1])
 
 
-def prepare(batch: Batch) -> None:
-    """Compile the program of `simulate` in the background."""
-    rows = _Rows(1, len(batch.trials), ROWS)
-    some, _ = rows.some(0, {"gains": np.zeros((1, len(batch.names)))}, batch.by_trial)
-    _simulate.prepare(*batch.shared, some, np.int32(0), batch.names, batch.pointing, rows.devices)
+def _no_shifts(batch: Batch, directions: int) -> dict[str, np.ndarray]:
+    return {
+        name: np.zeros((len(v), directions, *np.shape(v)[1:]))
+        for name, v in batch.coordinates.items()
+        if name in movable(batch.dispersion)
+    }
+
+
+def prepare(batch: Batch, metrics: tuple[str, ...]) -> None:
+    """Compile the programs of `simulate`, and of `simulate_with_derivatives` along all gains, in the background."""
+    count, trials = len(batch.names), len(batch.trials)
+    rows, gains = _Rows(1, trials, ROWS), {"gains": np.zeros((1, count))}
+    some, needed = rows.some(0, gains, batch.by_trial)
+    _simulate.prepare(*batch.shared, some, np.int32(needed), batch.names, batch.pointing, rows.devices)
+    rows = _Rows(1, trials, ROWS_WITH_DERIVATIVES)
+    by_point = {**gains, "directions": np.zeros((1, count, count))}
+    some, needed = rows.some(0, by_point, {**batch.by_trial, "shifts": _no_shifts(batch, count)})
+    _simulate_with_derivatives.prepare(*batch.shared, some, np.int32(needed), batch.names, metrics, rows.devices)
 
 
 class _Rows:

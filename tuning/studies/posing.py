@@ -15,7 +15,7 @@ from ptsmc_jax.scenario import Study, free_gains, replace, study, tables
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.scenario.timing import Reach, reach_of
 from ptsmc_jax.simulation.requirements import Requirement
-from tuning.search import confirm, gains, margin_rows, objective
+from tuning.search import confirm, gains, margin_rows, objective, simulations
 from tuning.search import normalisation as gain_bounds
 from tuning.search.evaluate import Evaluator
 from tuning.search.journal import Journal
@@ -113,10 +113,12 @@ def tuning_problem(scenario: Scenario, seed: int, journal: Journal | None = None
         tail=_tail(table, trained),
         statistic=table.statistic,
         torque_weight=table.torque_weight,
-        margins=margin_rows.ask(ready, bounds, seed),
     )
-    scenario_gains = np.asarray(gains.present_values(ready.parts, bounds.names))
     exact = scenario.exact_sign and "sign_width" not in bounds.names
+    if not exact:  # before the margins, so that these programs are compiled meanwhile
+        simulations.prepare(problem.batch, objective.watched(problem))
+    problem = dataclasses.replace(problem, margins=margin_rows.ask(ready, bounds, seed))
+    scenario_gains = np.asarray(gains.present_values(ready.parts, bounds.names))
     designs = np.asarray(gains.design_gains(scenario, ready.parts, bounds.names))
     return Posed(ready, problem, Evaluator(bounds, journal), scenario_gains, not exact, asked, seed, designs)
 
