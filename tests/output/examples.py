@@ -21,7 +21,7 @@ def tune(search: dict[str, Any] | None = None, trust: dict[str, Any] | None = No
     record = {
         "largest_over_limit": {}, "conflict": None, "searched_globally": False, "margins": {}, "earlier": [],
         "confirmed": [], "hardest": None, "worst_case": False, "averaged": 256, "rollouts": 1, "gradients": 1,
-        "seconds": 1.0, "seconds_by_step": {},
+        "seconds": 1.0,
     }  # fmt: skip
     known = {"influence": {}, "margins": None, "gradient_error": {"start": 1e-9, "end": 1e-9}}
     summary = {

@@ -128,7 +128,6 @@ class Search(msgspec.Struct, frozen=True, kw_only=True):
     rollouts: int
     gradients: int
     seconds: float
-    seconds_by_step: dict[str, float]
 
 
 class LimitCycle(msgspec.Struct, frozen=True):

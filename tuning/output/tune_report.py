@@ -155,10 +155,9 @@ def search(summary: Tune) -> Iterator[str]:
         yield f"no requirement on a fraction of the trials was confirmed, because {names} is out of reach"
     if record.hardest is not None:
         yield _worst_case(record.hardest, tuned_for=record.worst_case)
-    steps = "".join(f", {what} {spent:.0f} s" for what, spent in record.seconds_by_step.items() if spent >= 1.0)
     yield (
-        f"the search took {record.seconds:.0f} s and simulated {record.rollouts} trials, and {record.gradients} with "
-        f"gradients{steps}"
+        f"the search took {record.seconds:.0f} s with compiling, and simulated {record.rollouts} trials, and "
+        f"{record.gradients} with gradients"
     )
     if summary.differential_evolution is not None:
         yield _beside_evolution(summary.differential_evolution, record)

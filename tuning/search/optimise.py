@@ -16,7 +16,7 @@ from tuning.search.evaluate import Evaluator
 from tuning.search.evolution import NEARBY
 from tuning.search.local_searches import LocalSearches, Step
 from tuning.search.objective import Problem
-from tuning.search.progress import Report, timed
+from tuning.search.progress import Report
 from tuning.search.rounds import Rounds
 from tuning.search.worst import Hardest
 
@@ -61,7 +61,6 @@ class Search:
     globally: bool = False  # a global search of the whole box followed
     hardest: Hardest | None = None  # worst case of the gains; None: no requirement on every trial
     counts: list[confirm.Count] = field(default_factory=list)  # confirmations of quantile requirements
-    seconds: dict[str, float] = field(default_factory=dict)  # duration of each step of the search [s]
     interrupted: bool = False
 
 
@@ -95,8 +94,6 @@ def search(
     with_gradients = settings.with_gradients
     rounds = Rounds(evaluate, problem, requirements, robust=settings.robust)
     margins = {row: max(settings.margins.get(row, 0.0), rounds.margin) for row in rounds.problem.rows}
-    seconds = dict[str, float]()
-    report = timed(report, seconds)
     kept = np.asarray([*margins.values()])
     local_searches = LocalSearches(evaluate, kept, settings.steps, np.random.default_rng(settings.seed), report)
     interrupted, conflict = False, dict[str, float | None]()
@@ -137,7 +134,6 @@ def search(
         globally=local_searches.globally,
         hardest=rounds.hardest,
         counts=[] if interrupted else rounds.counts,
-        seconds=seconds,
         interrupted=interrupted,
     )
 

@@ -111,7 +111,6 @@ def summary(tuning: Tuning) -> dict[str, Any]:
             "rollouts": tuning.rollouts,
             "gradients": tuning.gradients,
             "seconds": tuning.seconds,
-            "seconds_by_step": search.seconds,
         },
         "trust": None if tuning.trust is None else _trust(tuning.trust, tuning),
         "differential_evolution": None if tuning.check is None else asdict(tuning.check),
