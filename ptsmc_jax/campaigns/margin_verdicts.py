@@ -10,7 +10,7 @@ from jaxtyping import Array
 from numpy.typing import ArrayLike
 
 from ptsmc_jax import configure, programs
-from ptsmc_jax.batching import lapack
+from ptsmc_jax.batching import lanes, lapack
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.dispersions import table_rows
 from ptsmc_jax.dispersions.base import CUSTOM, INERTIA, INITIAL_ATTITUDE, INITIAL_RATE, INITIAL_STATE, REFERENCE
@@ -194,11 +194,15 @@ def _look(
     def rough(loop: linear.Loop) -> dict[str, Array]:
         return {name: _over(name, v) for name, v in margins.roughly(loop).items()}
 
-    def one(trial: Array | Row) -> linear.Loop:
-        return run_margins.judged_loops(table_rows.about(parts, dispersion, seed, trial).drawn, late=late)[0]
+    def simulated(trial: Array | Row) -> tuple[Parts, linear.Nominal]:
+        drawn = table_rows.about(parts, dispersion, seed, trial).drawn
+        return drawn, linear.nominal(drawn)
+
+    def loops_of(drawn: Parts, run: linear.Nominal) -> linear.Loop:
+        return run_margins.judged_loops(drawn, run, late=late)[0]
 
     def some(trials: Array | Row) -> tuple[linear.Loop, dict[str, Array]]:
-        loops = lapack.vmap(one)(trials)
+        loops = lapack.vmap(loops_of)(*lanes.vmap(simulated)(trials))
         values = jax.lax.map(rough, jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), loops))
         return loops, {name: v.reshape(CALL, -1) for name, v in values.items()}
 
