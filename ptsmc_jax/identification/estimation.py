@@ -17,6 +17,8 @@ import polars as pl
 from jaxtyping import Array
 from scipy import stats
 
+from ptsmc_jax import configure
+from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.identification import filtering, parameters, telemetry
 from ptsmc_jax.identification.filtering import Innovations, Kind, Model, Rows, Track
 from ptsmc_jax.identification.parameters import Problem
@@ -281,7 +283,16 @@ class Search:
             found = filtering.innovations(self._at(z, slack), rows, kind)
             return (found.value, found.variance), found
 
-        (by_value, by_variance), (value, variance, accepted) = jax.jacfwd(of, has_aux=True)(z)
+        def along(directions: Array) -> Any:  # of one device
+            one = jax.vmap(lambda d: jax.jvp(of, (z,), (d,), has_aux=True)[1:], out_axes=(-1, None))(directions[0])
+            return jax.tree.map(lambda v: v[None], one)
+
+        devices = min(len(configure.devices()), z.size)
+        each = -(-z.size // devices)  # directions of a device
+        directions = jnp.eye(devices * each, z.size).reshape(devices, each, z.size)
+        slopes, found = montecarlo.spread(along, directions, devices)
+        by_value, by_variance = (jnp.concatenate([*v], axis=-1)[..., : z.size] for v in slopes)
+        value, variance, accepted = (v[0] for v in found)
         by_value = by_value / jnp.sqrt(variance)[..., None]
         by_variance = by_variance / variance[..., None]
         whitened = value / jnp.sqrt(variance)
@@ -301,13 +312,6 @@ class Search:
         """Return the innovations of a log, as NumPy arrays."""
         rows, kind = log
         return jax.tree.map(np.asarray, self._errors(jnp.asarray(z), self.slack, _numbers(rows), gate, kind=kind))
-
-    def value(self, z: np.ndarray, logs: Sequence[Prepared]) -> float:
-        """Return the log-likelihood of the logs and of the prior."""
-        total = -0.5 * float(self.known @ z**2)
-        for log in logs:
-            total += float(_log_likelihood(*self.innovations(z, log)))
-        return total
 
     def derivatives(self, z: np.ndarray, logs: Sequence[Prepared]) -> tuple[float, np.ndarray, np.ndarray, float]:
         """Return log-likelihood, gradient (n,), information (n, n) of logs and prior, and the mean square."""
@@ -398,14 +402,14 @@ class Search:
                 step = directions @ ((directions.T @ gradient) / (sizes + damping))
                 step = step * min(1.0, LONGEST / max(float(np.linalg.norm(step)), 1e-300))
                 size = float(np.sqrt(step @ information @ step))
-                better = self.value(z + step, logs)
-                if np.isfinite(better) and better >= value - 1e-9 * abs(value):
+                there = self.derivatives(z + step, logs)
+                if np.isfinite(there[0]) and there[0] >= value - 1e-9 * abs(value):
                     break
                 damping = max(10.0 * damping, float(np.min(sizes, initial=1.0)))
                 if damping > 1e12:
                     return Found(z, value, information, square, size < enough, steps)
             z, damping = z + step, damping / 100.0
-            value, gradient, information, square = self.derivatives(z, logs)
+            value, gradient, information, square = there
             self.report(f"step {steps}: mean square of the innovations {square:.4g}")
             if size < enough:
                 converged = True
