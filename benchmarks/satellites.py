@@ -35,7 +35,7 @@ def tuned(name: str, seed: int, trials: int | None, half: str | None, *, globall
     found = tuner.tune(scenario, seed, globally=globally)
     errors = found.held_out["tuned"].metrics.window_error[found.held_out["tuned"].finished]
     rms = float((errors**2).mean() ** 0.5) if errors.size else None
-    floor = found.floors["tuned"]
+    bound = found.lower_bounds["tuned"]
     return {
         "name": name,
         "seed": seed,
@@ -45,7 +45,7 @@ def tuned(name: str, seed: int, trials: int | None, half: str | None, *, globall
         "over": dict(zip(found.search.problem.rows, found.search.worst.tolist(), strict=True)),
         "conflict": found.search.conflict,
         "rms": rms,
-        "ratio": rms / floor if rms and floor else None,
+        "ratio": rms / bound if rms and bound else None,
         "verdicts": {one.metric: [one.worst, one.limit, one.met] for one in found.verdicts},
         "gains": found.gains,
         "at_bound": found.at_bound,

@@ -27,14 +27,14 @@ def held_out_trials(loaded, names, values) -> str:
         squares = simulated.metrics.window_error[simulated.finished] ** 2
         rms.append(float(np.sqrt(squares.mean())))
         error = squares.std() / np.sqrt(squares.size) / (2 * rms[-1])  # 1 sigma of the RMS
-        floor = judging.floor_of(made, judging.seed_of_judge(seed))
-        if floor:
-            above.append(rms[-1] / floor)
-            off.append((rms[-1] - floor) / error)
+        bound = judging.rms_lower_bound(made, judging.seed_of_judge(seed))
+        if bound:
+            above.append(rms[-1] / bound)
+            off.append((rms[-1] - bound) / error)
         peaks.append(float(simulated.metrics.peak_torque.max()))
     told = f"RMS {', '.join(f'{v:.4g}' for v in rms)}, largest peak torque {max(peaks):.4g}"
     if off:
-        told += f"; {min(above):.3f} to {max(above):.3f} floors, {min(off):.0f} sigma above it at least"
+        told += f"; {min(above):.3f} to {max(above):.3f} times the lower bound, {min(off):.0f} sigma above it at least"
     return told
 
 
@@ -95,8 +95,8 @@ def main() -> None:
     tuned = judging.judge(gains.in_scenario(loaded, named), fresh)
     rms = [float(np.sqrt(np.mean(one.metrics.window_error[one.finished] ** 2))) for one in (paper, tuned)]
     peak = [float(np.mean(one.metrics.peak_torque[one.finished])) for one in (paper, tuned)]
-    floor = judging.floor_of(gains.in_scenario(loaded, named), fresh) or np.nan
-    print(f"on {tuned.status.size} fresh trials: {rms[1]:.4e}, {rms[1] / floor:.3f} times the floor; "
+    bound = judging.rms_lower_bound(gains.in_scenario(loaded, named), fresh) or np.nan
+    print(f"on {tuned.status.size} fresh trials: {rms[1]:.4e}, {rms[1] / bound:.3f} times the lower bound; "
           f"{rms[0] / rms[1]:.2f} times the paper's accuracy at {peak[1] / peak[0]:.3f} of its mean peak torque, "
           f"largest {np.max(tuned.metrics.peak_torque[tuned.finished]):.4f} N m")  # fmt: skip
 

@@ -51,7 +51,7 @@ def slew(published: Scenario, tuned: Scenario) -> Figure:
         low, middle, high = np.quantile(angle, (0.05, 0.5, 0.95), axis=0)
         axes.fill_between(t, low, high, color=color, alpha=0.2, lw=0)
         axes.plot(t, middle, line, color=color, label=name)
-    parts, bound = ptsmc.study(tuned).parts, ptsmc.floor(tuned)
+    parts, bound = ptsmc.study(tuned).parts, ptsmc.lower_bound(tuned)
     t_f, t_end = float(parts.controller.t_f), float(parts.t_end)
     assert bound is not None
     axes.hlines(2.0 * np.arcsin(bound) * ARCSEC, t_f, t_end, **style.FLOOR, label="lower bound")

@@ -36,7 +36,7 @@ beside their results. Conditions on several keys, such as `delta` of at least on
 scenario violates them."""
 METRICS = """\
 Metrics are in `summary.json`, in the rows of a campaign and in `[requirements]`. For many trials the summary lists
-mean, largest value and quantiles. For `window_error` it lists the RMS and `floor`, the [lower
+mean, largest value and quantiles. For `window_error` it lists the RMS and `lower_bound`, the [lower
 bound](theory/lower_bound.md).
 
 | run | in the summary |

@@ -18,7 +18,7 @@ _NAMES = {
     "devices.sensors": "Sensors",
     "dispersions.base": "Draw",
     "dispersions.variation": "Dispersion",
-    "explore": "floor simulate trials verdicts write",
+    "explore": "lower_bound simulate trials verdicts write",
     "identification.estimation": "Identification identify",
     "laws.base": "AccelerationLaw",
     "laws.kinematics": "AdditiveKinematics ChainKinematics MultiplicativeKinematics SecondOrderKinematics",
@@ -56,7 +56,7 @@ if TYPE_CHECKING:
     from ptsmc_jax.devices.sensors import Sensors as Sensors
     from ptsmc_jax.dispersions.base import Draw as Draw
     from ptsmc_jax.dispersions.variation import Dispersion as Dispersion
-    from ptsmc_jax.explore import floor as floor
+    from ptsmc_jax.explore import lower_bound as lower_bound
     from ptsmc_jax.explore import simulate as simulate
     from ptsmc_jax.explore import trials as trials
     from ptsmc_jax.explore import verdicts as verdicts

@@ -112,16 +112,16 @@ class Simulation:
         return self.run.verdicts
 
     @property
-    def floor(self) -> LowerBound | None:
+    def lower_bound(self) -> LowerBound | None:
         """Lower bound of the error along this run (posterior Cramer-Rao bound), over time.
 
         It is None if the run is incomplete or if its sensors are custom, since their measurement model is unknown.
         """
-        return self.run.floor
+        return self.run.lower_bound
 
     def plot(self, *names: str) -> "Figures":
         """Return all figures of the run, or the named ones; raise ValueError for an unknown name."""
-        figures = run_plots.run_figures(self.run.parts, self.run.log, self.run.torque_limit, self.run.floor)
+        figures = run_plots.run_figures(self.run.parts, self.run.log, self.run.torque_limit, self.run.lower_bound)
         return Figures(figures).only(names)
 
     def animate(self, frames: int = 40) -> "animation.Animation":
@@ -253,14 +253,15 @@ def _software(controller: str | Path | None, ready: Study) -> Software:
     return computer.software
 
 
-def floor(what: Scenario | Study | str | Path, *, seed: int = 0) -> float | None:
+def lower_bound(what: Scenario | Study | str | Path, *, seed: int = 0) -> float | None:
     """Return the lower bound of the RMS window error of a scenario, in the unit of the metric.
 
-    It is the posterior Cramer-Rao bound of a few trials, combined by `runs.floor`. `lower_bound` lists the assumptions.
+    It is the posterior Cramer-Rao bound of a few trials, pooled by `runs.rms_lower_bound`. The module
+    `theory.lower_bound` lists the assumptions.
     The bound is 0 if nothing is unknown, and None if no trial is complete or if the sensors are custom.
     """
     draws.check_whole_number("seed", seed)
-    return runs.floor(_ready(what), seed)
+    return runs.rms_lower_bound(_ready(what), seed)
 
 
 def _read(what: Scenario | Study | str | Path) -> Scenario:

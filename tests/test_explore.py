@@ -259,14 +259,14 @@ def test_an_animation_draws_body_and_reference_at_even_times(monkeypatch):
             )
 
 
-def test_trials_and_floor_use_the_given_seed(monkeypatch):
+def test_trials_and_lower_bound_use_the_given_seed(monkeypatch):
     monkeypatch.setattr(campaign.Campaign, "simulate", lambda self, trials: self.seed)
-    monkeypatch.setattr(runs, "floor", lambda ready, seed=0, rows=(): seed)
+    monkeypatch.setattr(runs, "rms_lower_bound", lambda ready, seed=0, rows=(): seed)
     made = scenario.from_tables(TABLES)
     run_table = pl.DataFrame({f"initial_w{k}": [0.01, 0.0] for k in (1, 2, 3)})
     seed: Any = explore.trials(made, run_table, seed=3)
     assert seed == 3
-    assert explore.floor(made, seed=5) == 5
+    assert explore.lower_bound(made, seed=5) == 5
 
 
 # --- the functions of `tuning` ---

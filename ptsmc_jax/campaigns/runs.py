@@ -24,7 +24,7 @@ from ptsmc_jax.simulation.rollout import Log, Parts
 from ptsmc_jax.theory import lower_bound
 from ptsmc_jax.theory.lower_bound import LowerBound
 
-FLOORS = 4  # trials whose lower bounds are pooled: they differ by a few per cent
+BOUND_TRIALS = 4  # trials whose lower bounds are pooled: they differ by a few per cent
 
 
 @dataclass(frozen=True)
@@ -52,16 +52,16 @@ class Run:
         return next((v.limit for v in self.verdicts if v.metric.startswith("peak_torque")), None)
 
     @cached_property
-    def floor(self) -> LowerBound | None:
+    def lower_bound(self) -> LowerBound | None:
         """The lower bound of the error along this run, see `lower_bound`.
 
         None: the run did not reach the end, or its sensors are custom and have no linear model.
         """
-        return lower_bound.along(self.parts, self.log) if self.has_floor else None
+        return lower_bound.along(self.parts, self.log) if self.has_lower_bound else None
 
     @property
-    def has_floor(self) -> bool:
-        """Whether the run has a lower bound, see `floor`."""
+    def has_lower_bound(self) -> bool:
+        """Whether the run has a lower bound, see `lower_bound`."""
         known = self.parts.sensors.perfect or hasattr(self.parts.sensors, "reading")
         return known and self.status in montecarlo.FINISHED
 
@@ -160,18 +160,18 @@ def _drawn(dispersion: Dispersion, parts: Parts, seed: jax.Array, trial: jax.Arr
     return table_rows.about(parts, dispersion, seed, trial).drawn
 
 
-def floor(ready: Study, seed: int = 0, rows: Sequence[int | Row] = ()) -> float | None:
+def rms_lower_bound(ready: Study, seed: int = 0, rows: Sequence[int | Row] = ()) -> float | None:
     """Return the lower bound of the RMS window error, in its unit, see `lower_bound`; 0 if nothing is unknown.
 
     Args:
         ready: the scenario, ready to simulate.
         seed: of dispersions and noise.
-        rows: rows of a run table. By default the bound is that of the nominal run, or pooled over the first `FLOORS`
-            trials if the scenario has dispersions.
+        rows: rows of a run table. By default the nominal run, or the first `BOUND_TRIALS` trials if the
+            scenario has dispersions. The bounds of several runs are pooled.
 
     Returns:
         The bound, or None if no run has one.
     """
-    trials = rows or (range(FLOORS) if ready.dispersion.varies else (None,))
+    trials = rows or (range(BOUND_TRIALS) if ready.dispersion.varies else (None,))
     runs = [_simulate(ready, seed, trial) for trial in trials]
-    return lower_bound.pooled(lower_bound.along_each([(run.parts, run.log) for run in runs if run.has_floor]))
+    return lower_bound.pooled(lower_bound.along_each([(run.parts, run.log) for run in runs if run.has_lower_bound]))

@@ -21,12 +21,12 @@ EXACT: Any = {"color": "0.25", "lw": 0.9, "ls": (0, (1, 1.5))}  # line of the ex
 BOUND: Any = {"color": "0.35", "lw": 1.0, "ls": "--", "label": "bound, no noise"}
 
 
-def run_figures(parts: Parts, log: Log, limit: float | None, floor: LowerBound | None) -> dict[str, Figure]:
+def run_figures(parts: Parts, log: Log, limit: float | None, lower_bound: LowerBound | None) -> dict[str, Figure]:
     """Return the figures of one run by name; log: numpy arrays (time, component); limit: of the torque [N m]."""
     log = jax.tree.map(lambda v: np.where(np.abs(v) < LARGEST, v, np.nan), log)
     figures = {"torque": torque(parts, log, limit)}
     if np.any(log.error):  # log axes cannot show zeros
-        figures = {"error": error(parts, log, floor), "sliding": sliding(parts, log), **figures}
+        figures = {"error": error(parts, log, lower_bound), "sliding": sliding(parts, log), **figures}
         if parts.controller.prescribed and any(map(np.any, solutions.exact_sizes(parts, log.t[:1]))):
             figures["convergence"] = convergence(parts, log)
     if np.any(log.d_hat):
@@ -49,7 +49,7 @@ def state(parts: Parts, log: Log, chart: Chart, title: str | None = None) -> Fig
     return figure
 
 
-def error(parts: Parts, log: Log, floor: LowerBound | None = None) -> Figure:
+def error(parts: Parts, log: Log, lower_bound: LowerBound | None = None) -> Figure:
     """Plot the error's 2-norm on a log scale, with its upper bound, lower bound, and the window of window_error."""
     figure, axes = figure_of("Error", _error_label(parts))
     size = np.linalg.norm(log.error, axis=1)
@@ -57,9 +57,10 @@ def error(parts: Parts, log: Log, floor: LowerBound | None = None) -> Figure:
     if parts.controller.prescribed:
         before = log.t[log.t < float(parts.controller.hand_over)]
         axes.plot(before, envelopes.error_bound(parts, before), **BOUND)
-    if floor is not None and floor.window_error > 0.0:
-        known = (floor.error > 0.0) & (floor.error < size.max())  # nothing is known before the first samples
-        axes.plot(floor.t[known], floor.error[known], color=STYLES[2][0], lw=1.2, label="lower bound")
+    if lower_bound is not None and lower_bound.window_error > 0.0:
+        least = lower_bound.error
+        known = (least > 0.0) & (least < size.max())  # nothing is known before the first samples
+        axes.plot(lower_bound.t[known], least[known], color=STYLES[2][0], lw=1.2, label="lower bound")
     t_f = float(parts.controller.t_f)
     axes.axvspan(t_f, t_f + float(parts.window), color="0.85", label="window of window_error")
     _above_smallest(axes)

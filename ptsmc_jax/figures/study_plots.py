@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-from ptsmc_jax.figures.style import FLOOR, LIMIT, STYLES, figure_of, logarithmic, plain_ticks, styled
+from ptsmc_jax.figures.style import LIMIT, LOWER_BOUND, STYLES, figure_of, logarithmic, plain_ticks, styled
 from ptsmc_jax.scenario.gain_bounds import wide
 from ptsmc_jax.simulation.catalogues import CATALOGUES
 
@@ -157,7 +157,7 @@ def tradeoff(
     sets: Mapping[str, tuple[ArrayLike, ArrayLike]],
     limit: float | None,
     kind: str = "spacecraft",
-    floor: float | None = None,
+    lower_bound: float | None = None,
 ) -> Figure:
     """Plot accuracy against torque, a point a trial.
 
@@ -165,7 +165,7 @@ def tradeoff(
         sets: window errors (trials,) [-] and peak torques (trials,) [N m] by label.
         limit: of the torque.
         kind: of the plant; it determines the units.
-        floor: lower bound of the RMS error.
+        lower_bound: lower bound of the RMS error.
     """
     error_unit, unit = (CATALOGUES[kind][name].unit for name in ("window_error", "peak_torque"))
     figure, axes = figure_of("Accuracy against torque, held-out trials", f"peak torque [{unit}]")
@@ -177,8 +177,8 @@ def tradeoff(
         axes.loglog(rms, mean, marker, ms=9, color=colour, mec="white", label=text)
     if limit is not None:
         axes.axhline(limit, **LIMIT, label=f"limit {limit:g} {unit}")
-    if floor:
-        axes.axvline(floor, **FLOOR, label=f"lower bound {floor:.2g}")
+    if lower_bound:
+        axes.axvline(lower_bound, **LOWER_BOUND, label=f"lower bound {lower_bound:.2g}")
     axes.set_xlabel(f"window error [{error_unit}]")
     _legend_below(figure, len(arrays) + 2, columns=1)
     return figure
@@ -211,7 +211,7 @@ def front(
     others: Mapping[str, Any],
     limit: float | None,
     units: tuple[str, ...],
-    floor: float | None = None,
+    lower_bound: float | None = None,
 ) -> Figure:
     """Plot window error against peak torque of a Pareto front, with intervals.
 
@@ -220,7 +220,7 @@ def front(
         others: further points by label.
         limit: required limit of the torque, if any.
         units: of error and torque.
-        floor: lower bound of the error.
+        lower_bound: lower bound of the error.
     """
     figure, axes = figure_of("Accuracy against torque: Pareto front, held-out trials", f"RMS window error [{units[0]}]")
     on_front, dominated = ([p for p in points if p.dominated == is_so] for is_so in (False, True))
@@ -238,8 +238,8 @@ def front(
             axes.loglog(p.peak, p.rms, marker, ms=8, color=style[0], label=f"{label}: {p.rms:.2e}")
     if limit is not None:
         axes.axvline(limit, **LIMIT, label=f"limit {limit:g} {units[1]}")
-    if floor:
-        axes.axhline(floor, **FLOOR, label=f"lower bound {floor:.2g}")
+    if lower_bound:
+        axes.axhline(lower_bound, **LOWER_BOUND, label=f"lower bound {lower_bound:.2g}")
     axes.set_xlabel(f"largest peak torque [{units[1]}]")
     plain_ticks(axes.xaxis)
     axes.legend(fontsize=9)

@@ -24,8 +24,8 @@ RC: Any = {
     "legend.frameon": False,
 }
 styled = matplotlib.rc_context(RC)  # decorator of functions that draw in this style
-LIMIT: Any = {"color": "0.3", "lw": 1.0, "ls": (0, (6, 3))}  # line of a limit; `FLOOR`: of a lower bound
-FLOOR: Any = {"color": "0.3", "lw": 1.0, "ls": ":"}
+LIMIT: Any = {"color": "0.3", "lw": 1.0, "ls": (0, (6, 3))}  # line of a limit; `LOWER_BOUND`: of a lower bound
+LOWER_BOUND: Any = {"color": "0.3", "lw": 1.0, "ls": ":"}
 MANY = 1e4  # ratio of an axis's ends above which numbers between powers of ten would overlap
 
 

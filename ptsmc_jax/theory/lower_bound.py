@@ -114,9 +114,9 @@ def window_error(parts: Parts, ticks: Ticks, squares: np.ndarray) -> float:
     return float(np.sqrt(total / float(parts.window)))
 
 
-def pooled(floors: Iterable[LowerBound]) -> float | None:
+def pooled(bounds: Iterable[LowerBound]) -> float | None:
     """Return the RMS of the bounds of several runs, pooled like window errors, or None without runs."""
-    squares = [one.window_error**2 for one in floors]
+    squares = [one.window_error**2 for one in bounds]
     return float(np.sqrt(np.mean(squares))) if squares else None
 
 

@@ -96,7 +96,7 @@ def residual_error(acceleration: Scalar, eta: Scalar, delta: Scalar) -> tuple[Sc
     return acceleration * delta**2 * share, acceleration * delta**2 * (0.5 - share)
 
 
-def hold_floor(
+def ramp_error(
     disturbance_rate: Scalar, gain: Scalar, k1: Scalar, switching: Scalar, width: Scalar, surface_rate: Scalar
 ) -> Scalar:
     """Return the approximate error of an axis in the hold phase under a ramp disturbance [-].

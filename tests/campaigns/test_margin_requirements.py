@@ -333,9 +333,9 @@ def test_prepared_margin_program_is_the_program_of_the_search(drawn, monkeypatch
     ("owner", "program", "prepare", "ask"),
     [
         (margin_verdicts, "_look", margin_verdicts.prepare, lambda ready: margin_verdicts.over_trials(ready, 3)),
-        (rollout, "simulate_once", runs.prepare, lambda ready: runs.floor(ready, 3)),
+        (rollout, "simulate_once", runs.prepare, lambda ready: runs.rms_lower_bound(ready, 3)),
     ],
-    ids=["margins", "floor"],
+    ids=["margins", "lower_bound"],
 )
 def test_prepared_programs_of_a_campaign_are_those_that_it_uses(drawn, monkeypatch, owner, program, prepare, ask):
     """A program with other shapes or types would be compiled in vain."""
@@ -433,7 +433,7 @@ def test_assumed_error_of_delay_margins_is_a_fraction_of_a_period(monkeypatch, p
     ("left", "of_loops"),
     [
         pytest.param(None, True, marks=pytest.mark.long),  # with real loops
-        (None, False), ('{"window_error": 1e-6, "marg', False), ('{"window_error": 1e-6}', False),
+        (None, False), ('{"lower_bound": 1e-6, "marg', False), ('{"lower_bound": 1e-6}', False),
     ],
 )  # fmt: skip
 def test_campaign_without_its_margin_verdicts_is_unfinished(command, tmp_path, monkeypatch, left, of_loops):
@@ -446,11 +446,11 @@ def test_campaign_without_its_margin_verdicts_is_unfinished(command, tmp_path, m
     store.write_toml(tmp_path / "s.toml", tables)
     again, folder = ("montecarlo", "s.toml", "--trials", 2, "--no-figures"), tmp_path / "out" / "montecarlo-s"
     assert command(*again, "--quiet") == (0, "", "")
-    whole = (folder / "floor.json").read_text()
-    (folder / "floor.json").unlink() if left is None else (folder / "floor.json").write_text(left)
+    whole = (folder / "theory.json").read_text()
+    (folder / "theory.json").unlink() if left is None else (folder / "theory.json").write_text(left)
     code, said, _ = command("summarize", folder, "--no-figures")
     assert code == 1
     assert "NOT finished: gain_margin is required and not judged yet; " in said
     assert json.loads((folder / "summary.json").read_text())["status"] == "incomplete"
     assert command(*again, "--quiet") == (0, "", "")
-    assert (folder / "floor.json").read_text() == whole
+    assert (folder / "theory.json").read_text() == whole

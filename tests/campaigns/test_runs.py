@@ -21,16 +21,16 @@ def test_lower_bound_is_pooled_over_the_first_trials_or_rows(monkeypatch, varies
 
     def fly(ready, seed, trial):
         seen.append((seed, trial))
-        return SimpleNamespace(has_floor=len(seen) != 2, parts=1.0 + (trial or 0), log=None)
+        return SimpleNamespace(has_lower_bound=len(seen) != 2, parts=1.0 + (trial or 0), log=None)
 
     def along_each(simulated):
-        return [lower_bound.LowerBound(floor, np.zeros(1), np.zeros(1)) for floor, _ in simulated]
+        return [lower_bound.LowerBound(bound, np.zeros(1), np.zeros(1)) for bound, _ in simulated]
 
     monkeypatch.setattr(runs, "_simulate", fly)
     monkeypatch.setattr(lower_bound, "along_each", along_each)
     ready: Any = SimpleNamespace(dispersion=SimpleNamespace(varies=varies))
     squares = [(1.0 + (k or 0)) ** 2 for j, k in enumerate(simulated) if j != 1]
-    assert runs.floor(ready, 5, rows) == pytest.approx(math.sqrt(sum(squares) / len(squares)))
+    assert runs.rms_lower_bound(ready, 5, rows) == pytest.approx(math.sqrt(sum(squares) / len(squares)))
     assert seen == [(5, k) for k in simulated]
 
 

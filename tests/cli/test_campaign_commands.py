@@ -65,7 +65,7 @@ def test_montecarlo_writes_rows_summary_and_figures(command, tmp_path, monkeypat
     assert "250 trials of seed 3: 250 ok" in said
     assert f"peak_torque at most {limit}: worst" in said
     assert "100 % of trials keep the limit (95 %: 98.54 to 100 %)" in said  # 0.025^(1/250)
-    names = {"scenario.toml", "versions.json", "floor.json", "summary.json", "trials", "figures"}
+    names = {"scenario.toml", "versions.json", "theory.json", "summary.json", "trials", "figures"}
     assert {path.name for path in folder.iterdir()} == names
     assert [path.name[:21] for path in sorted((folder / "trials").iterdir())] == [
         "0000000000-0000000099", "0000000100-0000000199", "0000000200-0000000249"
@@ -80,7 +80,7 @@ def test_montecarlo_writes_rows_summary_and_figures(command, tmp_path, monkeypat
     assert (found["status"], found["simulated"], found["counts"]["ok"]) == ("met", 250, 250)
     errors = rows["window_error"].to_numpy()
     told = found["quantiles"]["window_error"]
-    least = found["floor"]
+    least = found["lower_bound"]
     assert 0.0 < least < told["rms"]
     for place in (said, read.text):
         assert f"RMS error {told['rms']:.3g} x1: every requirement is met" in place

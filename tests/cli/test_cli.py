@@ -47,7 +47,8 @@ def test_simulate_writes_its_result_folder(command, tmp_path):
     assert summary["peak_torque"] == pytest.approx(np.abs(values[:, 11:14]).max(), rel=1e-12)
     first, second, *_ = out.splitlines()
     assert first == f"pointing error {formats.error(summary['window_error'], 'spacecraft')}: every requirement is met"
-    assert second.startswith(f"{formats.ratio(summary['window_error'] / summary['floor'])} times the lower bound of ")
+    times = formats.ratio(summary["window_error"] / summary["lower_bound"])
+    assert second.startswith(f"{times} times the lower bound of ")
     assert scenario.read(folder / "scenario.toml") == scenario.read(tmp_path / "s.toml")
     made = json.loads((folder / "versions.json").read_text())
     assert (made["command"], made["seed"], made["trial"]) == ("simulate", 7, 3)
@@ -83,7 +84,7 @@ def test_tune_command_writes_results_and_repeats_them(command, tmp_path, monkeyp
     assert summary["held_out"]["seed"] != summary["training"]["seed"]
     known = {"held_out": summary["gains"], "paper": {"eta": 3.0, "delta": 0.1}}  # published 0.05 s is below one period
     for group, of_group in known.items():
-        assert 0.0 < summary[group]["floor"] < summary[group]["window_error"]["rms"]
+        assert 0.0 < summary[group]["lower_bound"] < summary[group]["window_error"]["rms"]
         assert summary[group]["gains"].items() >= of_group.items()
     files = {"tuned.toml", "history.csv", "summary.json", "scenario.toml", "versions.json"}
     drawn = {f"figures/{name}.png" for name in ("history", "tradeoff", "sensitivities", "profiles")}
@@ -110,7 +111,7 @@ def test_tune_command_writes_results_and_repeats_them(command, tmp_path, monkeyp
     left = summary["trust"]["margins"]["hold"]["gain_margin"]
     assert f"margins of the nominal loop in the hold phase: gain {left:.3g} dB" in read.text
     assert set(read.charts) == {"search"}
-    times = summary["held_out"]["window_error"]["rms"] / summary["held_out"]["floor"]
+    times = summary["held_out"]["window_error"]["rms"] / summary["held_out"]["lower_bound"]
     assert f"{formats.ratio(times)} times the lower bound of " in read.text
     assert len(read.charts["search"]["data"]) == summary["search"]["starts"]
     gains = ", ".join(f"{name} {value:.6g}" for name, value in summary["gains"].items())

@@ -41,7 +41,7 @@ def test_the_search_is_coloured_where_the_requirements_are_met():
 def test_a_tradeoff_figure_has_each_trial_and_their_rms():
     """Errors of 3e-6, 4e-6 and 12e-6 have an RMS of 13e-6 / sqrt(3)."""
     errors, peaks = np.array([3e-6, 4e-6, 12e-6]), np.array([0.2, 0.4, 0.3])
-    figure = study_plots.tradeoff({"tuned": (errors, peaks)}, limit=0.5, floor=1e-6)
+    figure = study_plots.tradeoff({"tuned": (errors, peaks)}, limit=0.5, lower_bound=1e-6)
     (axes,) = figure.axes
     trials, (whole,) = (np.asarray(line.get_xydata()) for line in axes.lines[:2])
     np.testing.assert_array_equal(trials, np.stack([errors, peaks], axis=1))

@@ -13,7 +13,7 @@ def entry(verdict: Verdict, **changes: Any) -> summaries.Entry:
 
 def group(**changes: Any) -> dict[str, Any]:
     """Return gains and the statistics of their trials."""
-    return {"gains": {}, "floor": None, "trials": 64, "counts": {"ok": 64}, **changes}
+    return {"gains": {}, "lower_bound": None, "trials": 64, "counts": {"ok": 64}, **changes}
 
 
 def tune(search: dict[str, Any] | None = None, trust: dict[str, Any] | None = None, **changes: Any) -> summaries.Tune:
@@ -45,7 +45,7 @@ def torque(times: float | None, failures: int = 0, trials: int = 64) -> dict[str
 
 def law(**changes: Any) -> dict[str, Any]:
     """Return a law of a comparison without numbers."""
-    numbers = ("window_error", "window_error_interval", "floor", "peak_torque", "largest_peak_torque", "effort",
+    numbers = ("window_error", "window_error_interval", "lower_bound", "peak_torque", "largest_peak_torque", "effort",
                "chattering", "settling_time", "settling_near_far", "margins")  # fmt: skip
     return {**dict.fromkeys(numbers), "gains": {}, "at_bound": {}, "met": True, "counts": {"ok": 8}, "unsettled": 0,
             "model_errors": {}, "verdicts": [], **changes}  # fmt: skip
@@ -62,6 +62,6 @@ def compare(laws: dict[str, Any], **changes: Any) -> summaries.Compare:
 def campaign(**changes: Any) -> summaries.Campaign:
     """Return the summary of a campaign."""
     summary = {"status": "met", "plant": "spacecraft", "seed": 1, "run_table": None, "trials": 8, "simulated": 8,
-               "unjudged": [], "counts": {"ok": 8}, "reasons": [], "floor": None, "verdicts": [], "quantiles": {},
+               "unjudged": [], "counts": {"ok": 8}, "reasons": [], "lower_bound": None, "verdicts": [], "quantiles": {},
                "drivers": {}, "driver_trials": {}, "warnings": []}  # fmt: skip
     return summaries.read(summaries.Campaign, {**summary, **changes})

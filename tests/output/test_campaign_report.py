@@ -36,11 +36,11 @@ def test_no_largest_settling_time_if_a_run_that_ended_never_settled(without, lar
     assert table.rows == [("settling_time", "56", "56", "55..57", largest, "s")]
 
 
-@pytest.mark.parametrize("floor", [None, 0.0])
-def test_no_lower_bound_without_noise(floor):
+@pytest.mark.parametrize("lower_bound", [None, 0.0])
+def test_no_lower_bound_without_noise(lower_bound):
     at = {"value": 1e-5, "low": 1e-5, "high": 1e-5}
     error = {"without_value": 0, "rms": 1e-5, "max": 1e-5, "0.5": at, "0.9973": at}
-    report = campaign_report.of(examples.campaign(quantiles={"window_error": error}, floor=floor))
+    report = campaign_report.of(examples.campaign(quantiles={"window_error": error}, lower_bound=lower_bound))
     assert report.headline == "RMS pointing error 4.13 arcsec: every trial reached its end"
     assert report.lines == ["8 trials of seed 1: 8 ok"]
 

@@ -21,12 +21,13 @@ def test_each_law_has_the_number_of_trials_that_break_each_requirement():
 
 def test_numbers_of_laws_have_no_exponents_below_a_million():
     """1500 times the lower bound was printed as 1.5e+03."""
-    laws = examples.compare({"a": examples.law(window_error=1.5e-3, floor=1e-6), "b": examples.law(floor=1e-6)}).laws
+    first, second = examples.law(window_error=1.5e-3, lower_bound=1e-6), examples.law(lower_bound=1e-6)
+    laws = examples.compare({"a": first, "b": second}).laws
     assert [compare_report.cell(compare_report.BOUND, law) for law in laws.values()] == ["1500", "-"]
 
 
 def test_chart_shows_the_smallest_lower_bound_and_a_required_limit():
-    laws = [examples.law(floor=floor) for floor in (2e-6, 1e-6, None)]
+    laws = [examples.law(lower_bound=lower_bound) for lower_bound in (2e-6, 1e-6, None)]
     asked = examples.law(verdicts=[examples.torque(0.9)])
     found = list(examples.compare({str(k): law for k, law in enumerate([*laws, asked])}).laws.values())
     accuracy, torque, *_ = compare_report.QUESTIONS

@@ -16,7 +16,7 @@ def front(*points, **changes):
     made = Front(
         **{
             "against": "torque", "plant": "spacecraft", "points": list(points), "idle": [], "without": [],
-            "trials": 1000, "seed": 1, "interval_confidence": 0.95, "floor": None, "rollouts": 1, "gradients": 1,
+            "trials": 1000, "seed": 1, "interval_confidence": 0.95, "lower_bound": None, "rollouts": 1, "gradients": 1,
             "requirements": [], "gain_units": {"eta": "-", "observer_gain": "kg m^2/s"}, "warnings": [],
             "published_label": "published", **changes,
         }
@@ -40,7 +40,7 @@ def slew(t_f, rms, peak, **changes):
 
 def test_torque_front_states_pointing_error_at_each_end_and_the_knee():
     points = [torque(0.1, 0.09, 1e-4), torque(0.2, 0.19, 1e-5, knee=True), torque(0.5, 0.49, 2e-6, meets=True)]
-    made = front(*points, floor=1e-6, requirements=["peak_torque"])
+    made = front(*points, lower_bound=1e-6, requirements=["peak_torque"])
     assert list(front_report.answers(made)) == [
         "RMS error 0.825 arcsec at a largest peak torque of 0.49 N m (most torque)",
         "RMS error 4.13 arcsec at a largest peak torque of 0.19 N m (knee)",
@@ -96,7 +96,7 @@ def test_limit_exceeded_on_held_out_trials_is_not_compared_with_no_limit():
 
 def test_unstable_loops_and_limits_without_gains_are_reported():
     loose = robust(math.inf, 1e-5, gain_margin=-0.3, peak_sensitivity=100.0)
-    made = front(loose, robust(6.0, 2e-5), against="margins", idle=[60.0], without=[3.0], floor=1e-6)
+    made = front(loose, robust(6.0, 2e-5), against="margins", idle=[60.0], without=[3.0], lower_bound=1e-6)
     assert list(front_report.answers(made)) == [
         "RMS error 8.25 arcsec with |S| at most 6 dB, 2 times the error without a limit",
         "without a limit on |S| some loops of the held-out trials are unstable",
@@ -127,9 +127,9 @@ def test_slew_times_state_the_shortest_time_and_the_cost_of_the_fastest_slew():
     assert list(front_report.answers(front(against="t_f"))) == []
 
 
-@pytest.mark.parametrize("floor", [None, 0.0])
-def test_no_lower_bound_without_noise(floor):
-    made = front(torque(0.2, 0.2, 1e-5), floor=floor)
+@pytest.mark.parametrize("lower_bound", [None, 0.0])
+def test_no_lower_bound_without_noise(lower_bound):
+    made = front(torque(0.2, 0.2, 1e-5), lower_bound=lower_bound)
     assert list(front_report.remarks(made)) == []
     assert "times the lower bound" not in front_report.results(made).head
 

@@ -22,7 +22,7 @@ def broken(times, searched=0.97):
 
 
 def test_headline_states_the_pointing_error_first_and_then_the_requirements():
-    held_out = examples.group(window_error=errors(1e-6, (9e-7, 1.2e-6)), floor=5e-7)
+    held_out = examples.group(window_error=errors(1e-6, (9e-7, 1.2e-6)), lower_bound=5e-7)
     report = tune_report.of(examples.tune(held_out=held_out, verdicts=[examples.torque(0.9)]))
     assert report.headline == "RMS pointing error 0.413 arcsec: every requirement is met"
     assert report.mood == "good"
@@ -122,8 +122,8 @@ def test_table_shows_an_observer_that_is_tuned_by_axis(tuned, shown):
 
 
 def test_table_has_errors_as_angles_and_their_ratio_to_the_lower_bound():
-    held_out = examples.group(window_error=errors(1e-6, largest=2e-6), floor=5e-7, peak_torque=errors(0.25))
-    paper = examples.group(window_error=errors(1e-4), floor=5e-7, counts={"ok": 60, "not_converged": 4})
+    held_out = examples.group(window_error=errors(1e-6, largest=2e-6), lower_bound=5e-7, peak_torque=errors(0.25))
+    paper = examples.group(window_error=errors(1e-4), lower_bound=5e-7, counts={"ok": 60, "not_converged": 4})
     rows = {row[0]: row[1:] for row in tune_report.gains(examples.tune(held_out=held_out, paper=paper)).rows}
     assert rows["RMS pointing error"] == ("41.3 arcsec", "0.413 arcsec", "")
     assert rows["ratio to the lower bound"] == ("200", "2", "")

@@ -148,7 +148,7 @@ def test_custom_sensors_of_a_spacecraft_measure_attitude_and_rate(command, here)
     run = explore.simulate(scenario.read("s.toml"))
     turned = np.asarray(run.run.log.x.q)[-1]
     np.testing.assert_allclose(2.0 * np.linalg.norm(turned[:3]), 2e-3, rtol=0.05)  # the rest is the observer's lag
-    assert run.run.floor is None
+    assert run.run.lower_bound is None
     status, _, error = command("simulate", "s.toml", "--no-figures", "--quiet")
     assert (status, error) == (0, f"ptsmc: runs {here}/mine.py, which sensors.code of s.toml names\n")
     made = store.read_versions(here / "out" / "simulate-s")

@@ -16,7 +16,7 @@ def test_bound_and_margins_use_the_first_trials_and_are_computed_once(tmp_path, 
     """A run table has the lower bound of at most its first 4 rows, and the margins of at most its first 256 rows."""
     asked: list[Any] = []
 
-    def floor(ready, seed, first):
+    def lower_bound(ready, seed, first):
         asked.append((ready, seed, first))
         return 1e-6
 
@@ -24,14 +24,14 @@ def test_bound_and_margins_use_the_first_trials_and_are_computed_once(tmp_path, 
         asked.append((ready, seed, None if some is None else len(some)))
         return []
 
-    monkeypatch.setattr(runs, "floor", floor)
+    monkeypatch.setattr(runs, "rms_lower_bound", lower_bound)
     monkeypatch.setattr(margin_verdicts, "over_trials", over_trials)
     table = SimpleNamespace(count=count, row=lambda k, seed: (k, seed), rows=lambda numbers, seed: np.asarray(numbers))
     simulated = SimpleNamespace(ready="ready", run_table=None if count is None else table)
     folder: Any = SimpleNamespace(path=tmp_path, seed=7, campaign=simulated, scenario=SimpleNamespace(requirements={}))
     campaign_theory.find(folder)
     assert asked == [("ready", 7, looked), ("ready", 7, [(k, 7) for k in rows])]
-    assert json.loads((tmp_path / "floor.json").read_text()) == {"window_error": 1e-6, "margins": []}
+    assert json.loads((tmp_path / "theory.json").read_text()) == {"lower_bound": 1e-6, "margins": []}
     campaign_theory.find(folder)
     assert len(asked) == 2
-    assert campaign_theory.floor_of(folder) == 1e-6
+    assert campaign_theory.lower_bound_of(folder) == 1e-6

@@ -301,7 +301,7 @@ def rivals(monkeypatch, eight, interrupt=None):
         law = posed.controller.kind
         asked.append(("tune", law, seed))
         return SimpleNamespace(tuned=posed, gains={}, at_bound={}, held_out={"tuned": eight}, verdicts=[],
-                               floors={"tuned": None},
+                               lower_bounds={"tuned": None},
                                search=SimpleNamespace(interrupted=law == interrupt))  # fmt: skip
 
     def judge(simulated, seed):

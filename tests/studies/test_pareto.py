@@ -150,10 +150,10 @@ def test_pareto_command_computes_a_torque_front(command, tmp_path, monkeypatch, 
     assert f"{len(kept)} points, each judged on 60 held-out trials" in told
     read = checked(tmp_path / "p")
     assert set(read.charts) == {"front"}
-    assert all(float(row["rms_window_error"]) > summary["floor"] > 0.0 for row in rows)
+    assert all(float(row["rms_window_error"]) > summary["lower_bound"] > 0.0 for row in rows)
     assert "lower bound on the RMS error with these sensors" in told
     drawn = read.charts["front"]["layout"]["shapes"][-1]
-    assert drawn["y0"] == drawn["y1"] == summary["floor"]
+    assert drawn["y0"] == drawn["y1"] == summary["lower_bound"]
     assert f"{sum(not point['dominated'] for point in summary['points'])} points, each judged on" in read.text
     assert command("pareto", "s.toml", "--points", 4, "--out", "p")[1].endswith("(from an earlier run)\n")
     assert command("pareto", "s.toml", "--points", 5, "--out", "p")[0] == 2

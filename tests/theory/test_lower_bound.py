@@ -234,9 +234,9 @@ def test_along_each_equals_separate_calls():
         np.testing.assert_allclose(found.error, alone.error, rtol=1e-13)
         np.testing.assert_allclose(found.window_error, alone.window_error, rtol=1e-13)
         np.testing.assert_array_equal(found.t, alone.t)
-    floors = [found.window_error for found in lower_bound.along_each(simulated)]
-    assert len(set(floors)) == 5  # two of the six runs are equal
-    assert floors[4] == 0.0
+    lower_bounds = [found.window_error for found in lower_bound.along_each(simulated)]
+    assert len(set(lower_bounds)) == 5  # two of the six runs are equal
+    assert lower_bounds[4] == 0.0
     assert lower_bound.along_each([]) == []
 
 
@@ -322,6 +322,6 @@ def test_a_filter_with_kalman_gains_attains_the_lower_bound():
 def test_run_without_a_lower_bound_has_no_ratio_to_it(least):
     """The bound is 0 without noise, and None if no run reaches its end."""
     run = {"status": "ok", "reason": "", "bad_time": None, "window_error": 1e-5, "verdicts": {}, "warnings": []}
-    report = run_report.of(summaries.run({**run, "floor": least}, "spacecraft"), "spacecraft")
+    report = run_report.of(summaries.run({**run, "lower_bound": least}, "spacecraft"), "spacecraft")
     assert report.headline == "pointing error 4.13 arcsec: the run reached its end"
     assert report.lines == []

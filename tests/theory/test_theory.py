@@ -253,7 +253,7 @@ def test_residual_error_equals_the_error_under_a_constant_disturbance():
 
 
 @pytest.mark.parametrize("rate", short([1.0, 2.5], [2.5]))
-def test_hold_floor_equals_the_simulated_error_under_a_ramp(rate):
+def test_ramp_error_equals_the_simulated_error_under_a_ramp(rate):
     """Rule 3.7: a ramp disturbance causes the final error d'/(l c (K1 + |T J^-1| K2/width))."""
     ramp = 2e-5
     gain, width = 20.0, 0.05
@@ -273,7 +273,7 @@ def test_hold_floor_equals_the_simulated_error_under_a_ramp(rate):
     )
     log = fly(run).log
     switching = float(np.sqrt(3.0) / 10.0 * run.observer.error_bound().floor)
-    expected = rules.hold_floor(vector(ramp), vector(gain), vector(1.0), vector(switching), vector(width), vector(rate))
+    expected = rules.ramp_error(vector(ramp), vector(gain), vector(1.0), vector(switching), vector(width), vector(rate))
     np.testing.assert_allclose(np.abs(log.error[-1]), expected, rtol=2e-2)  # a slow sinusoid approximates the ramp
 
 

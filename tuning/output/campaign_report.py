@@ -35,7 +35,7 @@ def of(summary: Campaign) -> Report:
         Section("Metrics", blocks),
         *pointing_report.sections(summary),
     ]
-    lines = [*bound(error, summary.floor, summary.plant), *counts(summary), *warnings(summary.warnings)]
+    lines = [*bound(error, summary.lower_bound, summary.plant), *counts(summary), *warnings(summary.warnings)]
     return Report(headline, mood, lines, sections)
 
 

@@ -80,7 +80,7 @@ ERROR = Value(
     "RMS pointing error", "arcsec", lambda law: _angle(law.window_error),
     interval=lambda law: _angles(law.window_error_interval),
 )  # fmt: skip
-BOUND = Value("ratio to the lower bound", "", lambda law: over_bound(law.window_error, law.floor))
+BOUND = Value("ratio to the lower bound", "", lambda law: over_bound(law.window_error, law.lower_bound))
 CHANGES = {
     "heavier": "an inertia 10 % larger than the law knows",
     "lighter": "an inertia 10 % smaller than the law knows",
@@ -177,7 +177,7 @@ def _chart(question: Question, laws: dict[str, Law], k: int) -> Chart:
 def marks(question: Question, laws: list[Law]) -> dict[str, float]:
     """Return the lines of a chart: the smallest lower bound of the laws, or a required limit."""
     if question.judged:
-        bounds = [bound for law in laws if (bound := _angle(law.floor))]
+        bounds = [bound for law in laws if (bound := _angle(law.lower_bound))]
         return {"lower bound": min(bounds)} if bounds else {}
     limits = {verdict.metric: verdict.limit for law in laws for verdict in law.verdicts}
     return {"limit": limits[question.limit]} if question.limit in limits else {}

@@ -34,7 +34,7 @@ def results(front: Front) -> Table:
     rows, plant = _rows(front), front.plant
     costs = list(rows[0][1].costs) if rows else []
     vector = [f"RMS error vector [{unit_of('window_error', plant)}]"] if plant == "spacecraft" else []
-    bound = ["times the lower bound"] if front.floor else []
+    bound = ["times the lower bound"] if front.lower_bound else []
     heads = [titled(name, plant) for name in costs]
     cells = [
         (
@@ -42,7 +42,7 @@ def results(front: Front) -> Table:
             error(point.rms, plant),
             spread(point),
             *(digits(point.rms, ".3e") for _ in vector),
-            *(ratio(over_bound(point.rms, front.floor)) for _ in bound),
+            *(ratio(over_bound(point.rms, front.lower_bound)) for _ in bound),
             *(digits(point.costs[name], ".4g", "none" if name.endswith("margin") else "-") for name in costs),
             _marks(point),
         )
@@ -86,8 +86,9 @@ def answers(front: Front) -> Iterator[str]:
 def remarks(front: Front) -> Iterator[str]:
     """Return the lower bound, the missing points, and a warning if no point meets every requirement."""
     kind = KINDS[front.against]
-    if front.floor:
-        yield f"lower bound on the RMS error with these sensors: {error(front.floor, front.plant)}, whatever the torque"
+    if front.lower_bound:
+        least = error(front.lower_bound, front.plant)
+        yield f"lower bound on the RMS error with these sensors: {least}, whatever the torque"
     if front.idle:
         yield f"no separate point for {kind.quantity}: {_listed(front, front.idle)}; another point has the same gains"
     if front.without:

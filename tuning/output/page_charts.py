@@ -158,10 +158,11 @@ def front(found: Front, limit: float | None) -> Chart:
     up = {"title": {"text": f"RMS window error [{unit_of('window_error', found.plant)}]"}, **_DECADES}
     shapes = [] if limit is None else [_upright(limit, dash="dash")]
     notes = []
-    if found.floor:
-        level = {"y0": found.floor, "y1": found.floor, "xref": "paper", "x0": 0, "x1": 1}
+    if found.lower_bound:
+        least = found.lower_bound
+        level = {"y0": least, "y1": least, "xref": "paper", "x0": 0, "x1": 1}
         shapes.append({"type": "line", **level, "line": {"dash": "dot"}})
-        notes.append({"text": "lower bound", "xref": "paper", "x": 1, "xanchor": "right", "y": np.log10(found.floor),
+        notes.append({"text": "lower bound", "xref": "paper", "x": 1, "xanchor": "right", "y": np.log10(least),
                       "yanchor": "bottom", "showarrow": False})  # fmt: skip
     return {"data": data, "layout": _layout(xaxis=along, yaxis=up, shapes=shapes, annotations=notes)}
 

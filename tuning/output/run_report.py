@@ -22,7 +22,7 @@ def of(summary: Run, plant: str) -> Report:
 
 def _lines(summary: Run, plant: str) -> Iterator[str]:
     """Return the ratio to the lower bound, the reason of a failure, and the status of the samples of C code."""
-    yield from bound(summary.metrics.get("window_error"), summary.floor, plant)
+    yield from bound(summary.metrics.get("window_error"), summary.lower_bound, plant)
     if summary.reason:
         when = "" if summary.bad_time is None else f", at {summary.bad_time:.4g} s"
         yield f"status {summary.status}: {summary.reason}{when}"
@@ -30,11 +30,11 @@ def _lines(summary: Run, plant: str) -> Iterator[str]:
         yield f"samples of the controller: {listed(summary.controller_statuses)}"
 
 
-def bound(value: float | None, floor: float | None, plant: str) -> Iterator[str]:
+def bound(value: float | None, lower_bound: float | None, plant: str) -> Iterator[str]:
     """Return the ratio of an error to its lower bound; nothing without a bound."""
-    times = over_bound(value, floor)
+    times = over_bound(value, lower_bound)
     if times is not None:
-        yield f"{ratio(times)} times the lower bound of {error(floor, plant)} with these sensors"
+        yield f"{ratio(times)} times the lower bound of {error(lower_bound, plant)} with these sensors"
 
 
 def metrics(summary: Run, plant: str) -> Table:

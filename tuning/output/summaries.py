@@ -52,7 +52,7 @@ class Run(msgspec.Struct, frozen=True, kw_only=True):
     status: str
     reason: str
     bad_time: Number
-    floor: Number
+    lower_bound: Number
     metrics: Numbers
     verdicts: list[Entry]
     warnings: list[str]
@@ -75,7 +75,7 @@ class Group(msgspec.Struct, frozen=True):
     counts: dict[str, int]
     metrics: dict[str, Statistics | None]
     gains: dict[str, float] = {}
-    floor: Number = None
+    lower_bound: Number = None
 
     def number(self, metric: str, statistic: str) -> Number:
         """Return a statistic of a metric; None without trials that have it."""
@@ -224,7 +224,7 @@ class Law(msgspec.Struct, frozen=True, kw_only=True):
     counts: dict[str, int]
     window_error: Number
     window_error_interval: Interval
-    floor: Number
+    lower_bound: Number
     peak_torque: Number
     largest_peak_torque: Number
     effort: Number
@@ -316,7 +316,7 @@ class Campaign(msgspec.Struct, frozen=True, kw_only=True):
     unjudged: list[str]
     counts: dict[str, int]
     reasons: list[Reason]
-    floor: Number
+    lower_bound: Number
     verdicts: list[Entry]
     quantiles: dict[str, Quantiles]
     drivers: dict[str, dict[str, Driver]]

@@ -54,10 +54,10 @@ def gains(summary: Tune) -> Table:
         rows.append((label, *map(text, groups.values()), unit))
 
     row(f"RMS {quantity}", lambda group: error(group.number("window_error", "rms"), plant))
-    if summary.held_out.floor:
+    if summary.held_out.lower_bound:
         row(
             "ratio to the lower bound",
-            lambda group: ratio(over_bound(group.number("window_error", "rms"), group.floor)),
+            lambda group: ratio(over_bound(group.number("window_error", "rms"), group.lower_bound)),
         )
     row(f"largest {quantity}", lambda group: error(group.number("window_error", "max"), plant))
     for label, metric, statistic in (
@@ -87,8 +87,9 @@ def accuracy(summary: Tune) -> Iterator[str]:
         yield f"{count} of {held_out.trials} held-out trials fail with the tuned gains: {listed(failures)}"
     on_held_out, on_training = held_out.metrics.get("window_error"), summary.training.metrics.get("window_error")
     if on_held_out is not None and on_held_out.rms is not None:
-        times = over_bound(on_held_out.rms, held_out.floor)
-        bound = "" if times is None else f", {ratio(times)} times the lower bound of {error(held_out.floor, plant)}"
+        times = over_bound(on_held_out.rms, held_out.lower_bound)
+        least = error(held_out.lower_bound, plant)
+        bound = "" if times is None else f", {ratio(times)} times the lower bound of {least}"
         spread = interval(on_held_out.rms_interval, text)
         yield f"held-out trials: {text(on_held_out.rms)}{spread}{bound}"
     if on_training is not None and on_training.rms is not None:

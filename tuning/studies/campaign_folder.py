@@ -35,7 +35,7 @@ from ptsmc_jax.simulation.computer import OURS, Software
 from tuning.search import custom_parts
 
 C = "controller"  # subfolder with the C code of the controller, if C code controls the simulated spacecraft
-FLOOR = "floor.json"  # lower bound and margins, see `campaign_theory`
+THEORY = "theory.json"  # lower bound and margins, see `campaign_theory`
 TABLE = "run_table.parquet"  # the run table; `--dry-run` writes a folder instead
 RUN_TABLE = "run_table_sha256"  # key of the checksum of the run table in `versions.json`
 CUSTOM = f"{systems.WHERE}, a function of a run's Result and its Parts that returns named numbers"
@@ -270,7 +270,7 @@ def begin(wanted: Folder, force: bool) -> None:
     if force and path.is_dir():
         for rows_of in (wanted.rows, wanted.dry):
             rows_of.tidy(())
-        for name in (FLOOR, *([TABLE] if RUN_TABLE in made else [])):
+        for name in (THEORY, *([TABLE] if RUN_TABLE in made else [])):
             (path / name).unlink(missing_ok=True)
     elif _begun(wanted, tables):
         return

@@ -22,7 +22,7 @@ from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.requirements import Requirement, Verdict, must_keep
 from ptsmc_jax.simulation.rollout import STATUS
 from tuning.studies.campaign_folder import Folder, opened
-from tuning.studies.campaign_theory import floor_of, margins_of, unjudged
+from tuning.studies.campaign_theory import lower_bound_of, margins_of, unjudged
 
 SAME = 1e-12  # largest relative difference of equal results
 CONFIDENCE = 0.95  # of the intervals, unless a requirement has its own confidence
@@ -158,7 +158,7 @@ def summarise(folder: Folder) -> dict[str, Any]:
         "counts": counts,
         "reasons": reasons,
         "interval_confidence": CONFIDENCE,
-        "floor": floor_of(folder),
+        "lower_bound": lower_bound_of(folder),
         "verdicts": verdicts,
         **_pointing(folder, parts, finished),
         "quantiles": quantiles,

@@ -1,6 +1,6 @@
 """The lower bound of the error and the verdicts on stability margins of a campaign.
 
-`find` computes both and writes them to `floor.json` in the campaign's folder. The other functions read this file.
+`find` computes both and writes them to `theory.json` in the campaign's folder. The other functions read this file.
 """
 
 import json
@@ -11,21 +11,22 @@ import numpy as np
 from ptsmc_jax.campaigns import margin_verdicts, runs, store
 from ptsmc_jax.dispersions.table_rows import Row
 from ptsmc_jax.simulation import catalogues
-from tuning.studies.campaign_folder import FLOOR, Folder
+from tuning.studies.campaign_folder import THEORY, Folder
 
 
 def find(folder: Folder) -> None:
-    """Write `floor.json` if it is missing, incomplete or damaged.
+    """Write `theory.json` if it is missing, incomplete or damaged.
 
     It has the lower bound of the RMS window error, and the verdicts on the required stability margins.
     """
     if _lacks_theory(folder):
         ready, table = folder.campaign.ready, folder.campaign.run_table
-        first = [] if table is None else [table.row(k, folder.seed) for k in range(min(runs.FLOORS, table.count))]
+        pooled = 0 if table is None else min(runs.BOUND_TRIALS, table.count)
+        first = [] if table is None else [table.row(k, folder.seed) for k in range(pooled)]
         verdicts = margin_verdicts.over_trials(ready, folder.seed, _looked_at(folder))
-        floor = runs.floor(ready, folder.seed, first)
-        theory = {"window_error": floor, "margins": [verdict.in_summary() for verdict in verdicts]}
-        store.write_json(folder.path / FLOOR, theory)
+        lower_bound = runs.rms_lower_bound(ready, folder.seed, first)
+        theory = {"lower_bound": lower_bound, "margins": [verdict.in_summary() for verdict in verdicts]}
+        store.write_json(folder.path / THEORY, theory)
 
 
 def prepare(folder: Folder) -> None:
@@ -36,7 +37,7 @@ def prepare(folder: Folder) -> None:
 
 
 def _lacks_theory(folder: Folder) -> bool:
-    return "window_error" not in _theory(folder) or bool(unjudged(folder))
+    return "lower_bound" not in _theory(folder) or bool(unjudged(folder))
 
 
 def _looked_at(folder: Folder) -> np.ndarray | Row | None:
@@ -45,9 +46,9 @@ def _looked_at(folder: Folder) -> np.ndarray | Row | None:
     return None if table is None else table.rows(np.arange(min(margin_verdicts.TRIALS, table.count)), folder.seed)
 
 
-def floor_of(folder: Folder) -> float | None:
+def lower_bound_of(folder: Folder) -> float | None:
     """Return the lower bound of the RMS window error that `find` wrote; None: there is none."""
-    return _theory(folder).get("window_error")
+    return _theory(folder).get("lower_bound")
 
 
 def margins_of(folder: Folder) -> list[dict[str, Any]]:
@@ -56,13 +57,13 @@ def margins_of(folder: Folder) -> list[dict[str, Any]]:
 
 
 def unjudged(folder: Folder) -> list[str]:
-    """Return the required margins without a verdict: the campaign was interrupted, or `floor.json` is damaged."""
+    """Return the required margins without a verdict: the campaign was interrupted, or `theory.json` is damaged."""
     judged = {verdict["metric"] for verdict in margins_of(folder)}
     return [name for name in catalogues.MARGINS if name in folder.scenario.requirements and name not in judged]
 
 
 def _theory(folder: Folder) -> dict[str, Any]:
     try:
-        return dict(json.loads((folder.path / FLOOR).read_text(encoding="utf-8")))
+        return dict(json.loads((folder.path / THEORY).read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError):
         return {}

@@ -49,7 +49,7 @@ class Contender:
     at_bound: dict[str, str]
     trials: Trials
     verdicts: list[Verdict]
-    floor: float | None  # lower bound of the RMS window error
+    lower_bound: float | None  # lower bound of the RMS window error
     margins: dict[str, dict[str, Any]] | None = None  # of the nominal loop, see `stability.worst`
     changed: Mapping[str, Trials] = field(default_factory=dict)  # trials with unknown model errors, see `perturbed`
 
@@ -266,8 +266,8 @@ def compare(
         report = headed(tell, law)
         # more tries would judge the laws on different held-out trials
         tuned = tuner.tune(posed, seed, report, journal, trusted=False, tries=1)
-        held_out, floor = tuned.held_out["tuned"], tuned.floors["tuned"]
-        found[law] = Contender(tuned.tuned, tuned.gains, tuned.at_bound, held_out, tuned.verdicts, floor)
+        held_out, lower_bound = tuned.held_out["tuned"], tuned.lower_bounds["tuned"]
+        found[law] = Contender(tuned.tuned, tuned.gains, tuned.at_bound, held_out, tuned.verdicts, lower_bound)
         interrupted = tuned.search.interrupted
         if interrupted:
             break
@@ -278,8 +278,9 @@ def compare(
 
 def _published(simulated: Scenario, held_out_seed: int) -> Contender:
     trials = judging.judge(simulated, held_out_seed)
-    verdicts, floor = judging.verdicts_of(simulated, trials, held_out_seed), judging.floor_of(simulated, held_out_seed)
-    return Contender(simulated, gains.gains_of(study(simulated).parts), {}, trials, verdicts, floor)
+    verdicts = judging.verdicts_of(simulated, trials, held_out_seed)
+    lower_bound = judging.rms_lower_bound(simulated, held_out_seed)
+    return Contender(simulated, gains.gains_of(study(simulated).parts), {}, trials, verdicts, lower_bound)
 
 
 def figures_of(contender: Contender) -> dict[str, Any]:
@@ -303,7 +304,7 @@ def figures_of(contender: Contender) -> dict[str, Any]:
         "met": contender.met,
         "counts": trials.counts(),
         "window_error": error,
-        "floor": contender.floor,
+        "lower_bound": contender.lower_bound,
         "window_error_interval": interval,
         **mean,
         "largest_peak_torque": _largest_peak(trials),

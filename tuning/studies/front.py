@@ -90,7 +90,7 @@ class Front:
     trials: int  # held-out trials
     seed: int  # of these trials
     interval_confidence: float
-    floor: float | None  # lower bound on the RMS window error
+    lower_bound: float | None  # lower bound on the RMS window error
     rollouts: int
     gradients: int
     requirements: list[str]

@@ -62,9 +62,9 @@ def judge(scenario: Scenario, held_out_seed: int, reach: Reach | None = None) ->
     return montecarlo.run(simulated.parts, simulated.dispersion, held_out_seed, np.arange(held_out_trials(simulated)))
 
 
-def floor_of(scenario: Scenario, held_out_seed: int) -> float | None:
-    """Return the lower bound of the RMS window error on the flight clock, see `runs.floor`."""
-    return runs.floor(study(on_flight_clock(scenario)), held_out_seed)
+def rms_lower_bound(scenario: Scenario, held_out_seed: int) -> float | None:
+    """Return the lower bound of the RMS window error on the flight clock, see `runs.rms_lower_bound`."""
+    return runs.rms_lower_bound(study(on_flight_clock(scenario)), held_out_seed)
 
 
 def verdicts_of(scenario: Scenario, trials: Trials, held_out_seed: int) -> list[Verdict]:

@@ -71,7 +71,7 @@ def trace(trade: Trade, seed: int, tell: Report = lambda *_: None, journal: Jour
         trials=judged[0][1].status.size if judged else 0,
         seed=held_out_seed,
         interval_confidence=trust.CONFIDENCE,
-        floor=None if trade.farther else judging.floor_of(scenario, held_out_seed),  # it depends on t_f
+        lower_bound=None if trade.farther else judging.rms_lower_bound(scenario, held_out_seed),  # it depends on t_f
         rollouts=posed.evaluate.rollouts,
         gradients=posed.evaluate.gradients,
         requirements=list(scenario.requirements),
@@ -207,7 +207,7 @@ def figure_of(trade: Trade, front: Front) -> Figure:
     if trade.compared:
         units = (unit_of("window_error", front.plant), unit_of(TORQUE, front.plant))
         limit = tables.limit_of(scenario, TORQUE)
-        return study_plots.front(front.points, front.labelled(), limit, units, floor=front.floor)
+        return study_plots.front(front.points, front.labelled(), limit, units, lower_bound=front.lower_bound)
     columns = {"window_error": [one.rms for one in front.points]} | {
         name: [one.costs[name] for one in front.points] for name in front.points[0].costs if name != SENSITIVITY
     }

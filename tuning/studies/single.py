@@ -40,13 +40,13 @@ def summary(run: Run, scenario: Scenario, computer: "InTheLoop | None" = None) -
         for v in run.verdicts
     }
     heading = {"status": run.status, "reason": run.reason, "bad_time": run.bad_time}
-    floor = None if run.floor is None else run.floor.window_error
+    lower_bound = None if run.lower_bound is None else run.lower_bound.window_error
     said, decided_by = plausibility.warnings(scenario), {}
     if computer is not None:
         said += [computer.otherwise] if computer.otherwise else []
         statuses = {name: count for name, count in run.samples.items() if count}
         decided_by = {"controller_statuses": statuses, "controller": computer.library.checksum}
-    return {**heading, **run.metrics, "floor": floor, "verdicts": verdicts, "warnings": said, **decided_by}
+    return {**heading, **run.metrics, "lower_bound": lower_bound, "verdicts": verdicts, "warnings": said, **decided_by}
 
 
 def write(
@@ -90,4 +90,4 @@ def write(
     if figures:
         from ptsmc_jax.figures import run_plots, style  # the import takes 0.3 s, which only figures need
 
-        style.save(run_plots.run_figures(run.parts, run.log, run.torque_limit, run.floor), folder / "figures")
+        style.save(run_plots.run_figures(run.parts, run.log, run.torque_limit, run.lower_bound), folder / "figures")

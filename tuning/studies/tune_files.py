@@ -59,7 +59,7 @@ def summary(tuning: Tuning) -> dict[str, Any]:
         name: {
             "seed": tuning.held_out_seed,
             "gains": tuning.judged_gains[name],
-            "floor": tuning.floors[name],
+            "lower_bound": tuning.lower_bounds[name],
             **statistics(trials, kind),
         }
         for name, trials in tuning.held_out.items()
@@ -263,8 +263,8 @@ def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
         if trials.finished.any()
     }  # fmt: skip
     if ended:
-        limit, floor = tables.limit_of(scenario, "peak_torque"), tuning.floors["tuned"]
-        figures["tradeoff"] = study_plots.tradeoff(ended, limit, kind, floor)
+        limit, lower_bound = tables.limit_of(scenario, "peak_torque"), tuning.lower_bounds["tuned"]
+        figures["tradeoff"] = study_plots.tradeoff(ended, limit, kind, lower_bound)
     if tuning.trust is not None and tuning.trust.sensitivities:  # empty if no trial reaches its end
         figures["sensitivities"] = study_plots.tornado(tuning.trust.sensitivities)
     if tuning.trust is not None:

@@ -85,7 +85,7 @@ class Tuning:
     seed: int  # of the training trials and the search
     held_out_seed: int  # of the held-out trials
     judged_gains: dict[str, dict[str, float]]  # gains by name, for each key of `held_out`
-    floors: dict[str, float | None]  # lower bound of the RMS window error, for each key of `held_out`
+    lower_bounds: dict[str, float | None]  # lower bound of the RMS window error, for each key of `held_out`
     verdicts: list[Verdict]  # of the tuned gains on the held-out trials
     broken_by: dict[str, list[str]]  # gains that are more accurate than the tuned ones, and the metrics that they break
     shortest: ShortestTime | None  # shortest t_f that the torque limit allows; None: no torque limit, or t_f is tuned
@@ -183,7 +183,7 @@ def tune(
         seed=seed,
         held_out_seed=judged.seed,
         judged_gains={name: gains.gains_of(study(one).parts) for name, one in candidates.items()},
-        floors={name: judging.floor_of(one, judged.seed) for name, one in candidates.items()},
+        lower_bounds={name: judging.rms_lower_bound(one, judged.seed) for name, one in candidates.items()},
         verdicts=judged.verdicts,
         broken_by=_broken_by(candidates, held_out, judged.seed),
         shortest=shortest,
