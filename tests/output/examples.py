@@ -26,8 +26,9 @@ def tune(search: dict[str, Any] | None = None, trust: dict[str, Any] | None = No
     known = {"influence": {}, "margins": None, "gradient_error": {"start": 1e-9, "end": 1e-9}}
     summary = {
         "status": "met", "plant": "spacecraft", "gain_units": {}, "gains": {}, "at_bound": {},
-        "accuracy_gain_over_paper": None, "accuracy_gain_interval": None, "training": group(), "held_out": group(),
-        "paper_refused": None, "published_label": "published", "shortest_t_f": None, "broken_by": {}, "verdicts": [],
+        "accuracy_gain_over_published": None, "accuracy_gain_interval": None, "training": group(), "held_out": group(),
+        "published_unavailable": None, "published_label": "published", "shortest_t_f": None, "broken_by": {},
+        "verdicts": [],
         "judged_on": "flight clock", "warnings": [], "differential_evolution": None,
     }  # fmt: skip
     trusted = None if trust is None else {**known, **trust}
@@ -53,7 +54,7 @@ def law(**changes: Any) -> dict[str, Any]:
 
 def compare(laws: dict[str, Any], **changes: Any) -> summaries.Compare:
     """Return the summary of a comparison."""
-    summary = {"status": "met", "trials": 8, "paper_refused": None, "published_label": None,
+    summary = {"status": "met", "trials": 8, "published_unavailable": None, "published_label": None,
                "judged_on": "flight clock",
                "settling_angle": 1e-3, "warnings": []}  # fmt: skip
     return summaries.read(summaries.Compare, {**summary, "laws": laws, **changes})

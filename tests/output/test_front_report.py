@@ -57,7 +57,7 @@ def test_torque_front_states_pointing_error_at_each_end_and_the_knee():
 
 def test_missing_and_dominated_points_and_missed_requirements_are_reported():
     points = [torque(0.1, 0.1, 1e-5), torque(0.2, 0.2, 2e-5, dominated=True)]
-    made = front(*points, idle=[0.5], without=[0.01, 0.02], requirements=["effort"], paper_refused="eta is 2")
+    made = front(*points, idle=[0.5], without=[0.01, 0.02], requirements=["effort"], published_unavailable="eta is 2")
     assert list(front_report.remarks(made)) == [
         "no separate point for limit on the peak torque: 0.5 N m; another point has the same gains",
         "no gains found keep all limits on the training trials for limit on the peak torque: 0.01, 0.02 N m",
@@ -70,7 +70,7 @@ def test_missing_and_dominated_points_and_missed_requirements_are_reported():
 
 def test_points_without_a_completed_trial_have_no_numbers():
     lost = torque(0.1, math.nan, math.nan, failures=9)
-    made = front(lost, others={"paper": lost})
+    made = front(lost, others={"published": lost})
     row = ("-", "-", "-", "-", "-", "9 failed or not converged")
     assert front_report.results(made).rows == [("0.1", *row), ("published", *row)]
     assert list(front_report.answers(made)) == []
@@ -79,7 +79,7 @@ def test_points_without_a_completed_trial_have_no_numbers():
 
 def test_gains_of_each_axis_next_to_one_gain_for_all_axes_or_none():
     each = torque(0.3, 0.3, 1e-5, {"observer_gain_1": 5.0, "observer_gain_2": 6.0})
-    others = {"paper": torque(1.0, 1.0, 1e-5, {"observer_gain": 10.0}), "before": torque(1.0, 1.0, 1e-5, {})}
+    others = {"published": torque(1.0, 1.0, 1e-5, {"observer_gain": 10.0}), "before": torque(1.0, 1.0, 1e-5, {})}
     table = front_report.gains(front(each, others=others, published_label="published, scaled"))
     assert table.rows == [("0.3", "5", "6"), ("published, scaled", "10", "10"), ("before", "-", "-")]
     assert table.head[1:] == ("observer_gain_1 [kg m^2/s]", "observer_gain_2 [kg m^2/s]")
@@ -145,7 +145,7 @@ def test_chart_of_a_front_has_intervals_knee_limit_and_no_point_without_an_error
     def point(peak, rms, **changes):
         return torque(peak, peak, rms, **{"interval": (0.9 * rms, 1.2 * rms), **changes})
 
-    others = {"paper": point(5.0, 1e-4, interval=None), "before": torque(1.0, math.nan, math.nan)}
+    others = {"published": point(5.0, 1e-4, interval=None), "before": torque(1.0, math.nan, math.nan)}
     points = [point(1.0, 4e-5, knee=True), point(2.0, 1e-5), point(3.0, 2e-5, dominated=True)]
     drawn = page_charts.front(front(*points, others=others), 1.5)
     named = {trace["name"]: trace for trace in drawn["data"]}

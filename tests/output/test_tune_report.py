@@ -116,15 +116,15 @@ def test_confidence_pays_for_every_look_at_held_out_trials():
     ],
 )
 def test_table_shows_an_observer_that_is_tuned_by_axis(tuned, shown):
-    paper = examples.group(gains={"observer_gain": 10.0})
-    table = tune_report.gains(examples.tune(plant="chain", paper=paper, held_out=examples.group(gains=tuned)))
+    published = examples.group(gains={"observer_gain": 10.0})
+    table = tune_report.gains(examples.tune(plant="chain", published=published, held_out=examples.group(gains=tuned)))
     assert {row[0] for row in table.rows if row[0].startswith("observer_gain")} == shown
 
 
 def test_table_has_errors_as_angles_and_their_ratio_to_the_lower_bound():
     held_out = examples.group(window_error=errors(1e-6, largest=2e-6), lower_bound=5e-7, peak_torque=errors(0.25))
-    paper = examples.group(window_error=errors(1e-4), lower_bound=5e-7, counts={"ok": 60, "not_converged": 4})
-    rows = {row[0]: row[1:] for row in tune_report.gains(examples.tune(held_out=held_out, paper=paper)).rows}
+    published = examples.group(window_error=errors(1e-4), lower_bound=5e-7, counts={"ok": 60, "not_converged": 4})
+    rows = {row[0]: row[1:] for row in tune_report.gains(examples.tune(held_out=held_out, published=published)).rows}
     assert rows["RMS pointing error"] == ("41.3 arcsec", "0.413 arcsec", "")
     assert rows["ratio to the lower bound"] == ("200", "2", "")
     assert rows["largest pointing error"] == ("41.3 arcsec", "0.825 arcsec", "")
@@ -133,7 +133,7 @@ def test_table_has_errors_as_angles_and_their_ratio_to_the_lower_bound():
 
 
 def beside(times, **changes):
-    return list(tune_report.accuracy(examples.tune(accuracy_gain_over_paper=times, **changes)))
+    return list(tune_report.accuracy(examples.tune(accuracy_gain_over_published=times, **changes)))
 
 
 def test_less_accurate_gains_are_compared_by_their_larger_error():
@@ -144,7 +144,7 @@ def test_less_accurate_gains_are_compared_by_their_larger_error():
         "less accurate than the published gains, scaled to this body and period: 12.5 times the error "
         "(95 % interval: 10 to 20)"
     )
-    (line,) = beside(0.08, **less, broken_by={"paper": ["gain_margin", "effort"]})
+    (line,) = beside(0.08, **less, broken_by={"published": ["gain_margin", "effort"]})
     assert line.endswith("10 to 20); these break gain_margin and effort")
     assert beside(40.0, published_label="paper's law") == [
         "40 times as accurate as the paper's law with the published gains"
@@ -234,15 +234,16 @@ def test_confirmation_that_is_skipped_is_reported():
 
 
 def test_column_of_the_published_gains_is_named_after_their_source():
-    paper = scenario.from_tables({"loop": {"mode": "sampled"}})
-    assert gains.published_label(paper) == "published"
+    published = scenario.from_tables({"loop": {"mode": "sampled"}})
+    assert gains.published_label(published) == "published"
     assert (
-        gains.published_label(scenario.replace(paper, loop__period=0.5)) == "published, scaled"
+        gains.published_label(scenario.replace(published, loop__period=0.5)) == "published, scaled"
     )  # a hand-over of a period
     assert (
-        gains.published_label(scenario.replace(paper, spacecraft={"inertia": [0.1, 0.1, 0.1]})) == "published, scaled"
+        gains.published_label(scenario.replace(published, spacecraft={"inertia": [0.1, 0.1, 0.1]}))
+        == "published, scaled"
     )
-    assert gains.published_label(scenario.replace(paper, controller={"kind": "pd"})) == "paper's law"
+    assert gains.published_label(scenario.replace(published, controller={"kind": "pd"})) == "paper's law"
 
 
 @pytest.mark.parametrize("kind", ["chain", "spacecraft"])

@@ -381,8 +381,8 @@ def test_gains_are_compared_with_the_published_ones_only_if_these_can_be_simulat
     )
     found, refused = judging.beside(tiny)
     assert refused is None
-    assert found["paper"].controller.delta == 0.001  # one period, longer than the scaled delta
-    assert list(judging.beside(found["paper"])[0]) == ["paper"]
+    assert found["published"].controller.delta == 0.001  # one period, longer than the scaled delta
+    assert list(judging.beside(found["published"])[0]) == ["published"]
 
 
 PLANTS = {

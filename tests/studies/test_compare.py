@@ -108,8 +108,8 @@ def test_checksums_accept_only_the_custom_laws_of_the_comparison(tmp_path):
 
 
 def test_custom_laws_with_equal_names_get_different_labels():
-    named = compare.Rivals((), ("a.py:Mine", "b.py:Mine", "c.py:Mine", "a.py:Mine", "a.py:paper")).named
-    assert list(named) == ["prescribed_time", "Mine", "custom Mine", "custom custom Mine", "custom paper"]
+    named = compare.Rivals((), ("a.py:Mine", "b.py:Mine", "c.py:Mine", "a.py:Mine", "a.py:published")).named
+    assert list(named) == ["prescribed_time", "Mine", "custom Mine", "custom custom Mine", "custom published"]
     assert len({law.get("code") for law in named.values()}) == 5
 
 
@@ -186,7 +186,7 @@ def test_every_law_appears_in_table_page_and_figures(eight, tmp_path):
     margins = {"hold": {"stable": True, "gain_margin": 7.5, "phase_margin": 40.0, "delay_margin": None,
                         "peak_sensitivity": 3.0}}  # fmt: skip
     one = replace(contender(eight), margins=margins, changed={"heavier": eight})
-    names = ["paper", *compare.laws()]
+    names = ["published", *compare.laws()]
     found = compare.Comparison(dict.fromkeys(names, one), 0, False)
     (tmp_path / "out").mkdir()
     compare.write(tmp_path / "out", base, found, True, compare.identity(base, 0))
@@ -305,7 +305,7 @@ def rivals(monkeypatch, eight, interrupt=None):
                                search=SimpleNamespace(interrupted=law == interrupt))  # fmt: skip
 
     def judge(simulated, seed):
-        asked.append(("judge", "paper", seed))
+        asked.append(("judge", "published", seed))
         return eight
 
     monkeypatch.setattr(compare, "_with_more", lambda one, seed: one)
@@ -317,13 +317,13 @@ def rivals(monkeypatch, eight, interrupt=None):
 def test_all_laws_are_tuned_by_one_seed_and_judged_by_another(monkeypatch, eight):
     asked = rivals(monkeypatch, eight)
     made = compare.compare(scenario.from_tables(TABLES), 5, lambda *told: None)
-    assert asked == [("judge", "paper", judging.seed_of_judge(5)),
+    assert asked == [("judge", "published", judging.seed_of_judge(5)),
                      *(("tune", law, 5) for law in compare.laws())]  # fmt: skip
     assert made.status == "met"
     lost = {**made.contenders, compare.OURS: contender(changed(eight, [rollout.DIVERGED] * 8))}
     assert replace(made, contenders=lost).status == "not met"
-    assert compare.identity(made.contenders["paper"].simulated, 5) != compare.identity(
-        made.contenders["paper"].simulated, 6
+    assert compare.identity(made.contenders["published"].simulated, 5) != compare.identity(
+        made.contenders["published"].simulated, 6
     )
 
 
@@ -351,7 +351,7 @@ def lines_of(summary):
 def test_report_says_if_published_gains_are_scaled(eight, period, scaled):
     """The published delta of 0.05 s is shorter than a period of 0.2 s."""
     simulated = gains.published_scenario(scenario.from_tables({"loop": {"mode": "sampled", "period": period}}))
-    made = {compare.PAPER: replace(contender(eight), simulated=simulated), compare.OURS: contender(eight)}
+    made = {compare.PUBLISHED: replace(contender(eight), simulated=simulated), compare.OURS: contender(eight)}
     lines = lines_of(compare.summary(compare.Comparison(made, 0, False)))
     assert any(line.startswith("published gains, scaled to this body and period: ") for line in lines) == scaled
     assert any(line.startswith("published gains: ") for line in lines) != scaled
@@ -361,7 +361,7 @@ def test_required_margins_appear_in_table_csv_file_and_report(eight, tmp_path):
     """The table and compare.csv have the margins of every law. The report has those that break a limit."""
     asked = Requirement("gain_margin", 6.0, "dB", at_least=True), Requirement("delay_margin", 0.1, "s", at_least=True)
     base = scenario.from_tables({**TABLES, "requirements": {one.metric: one.limit for one in asked}})
-    values = {"paper": ([9.5, 5.04], [np.inf, np.inf]), compare.OURS: ([6.5, np.nan], [0.3, 0.2])}
+    values = {"published": ([9.5, 5.04], [np.inf, np.inf]), compare.OURS: ([6.5, np.nan], [0.3, 0.2])}
     made = {
         law: contender(eight, verdicts=[
             one.verdict(np.array(v), ~np.isnan(v)) for one, v in zip(asked, both, strict=True)])

@@ -124,10 +124,10 @@ def test_accuracy_gain_uses_trials_that_both_sets_of_gains_finish():
         return SimpleNamespace(finished=finished, metrics=SimpleNamespace(window_error=np.where(finished, errors, 1e3)))
 
     errors = np.linspace(1.0, 2.0, 12)
-    told = tune_files._accuracy_gain({"tuned": simulated(errors, 3), "paper": simulated(5.0 * errors, 7)})
-    assert told["accuracy_gain_over_paper"] == pytest.approx(5.0, rel=1e-12)
+    told = tune_files._accuracy_gain({"tuned": simulated(errors, 3), "published": simulated(5.0 * errors, 7)})
+    assert told["accuracy_gain_over_published"] == pytest.approx(5.0, rel=1e-12)
     assert told["accuracy_gain_interval"] == pytest.approx((5.0, 5.0), rel=1e-9)
-    nothing = {"accuracy_gain_over_paper": None, "accuracy_gain_interval": None}
+    nothing = {"accuracy_gain_over_published": None, "accuracy_gain_interval": None}
     assert tune_files._accuracy_gain({"tuned": simulated(errors, 3)}) == nothing
 
 
@@ -242,9 +242,9 @@ def test_violations_that_a_repeated_search_cannot_fix_are_ignored(metric, values
 def test_default_gain_equals_its_explicit_value():
     """The scenario omits the bandwidth of the filter. Its default equals the published gain."""
     loaded = scenario.read(ROOT / "scenarios" / "filtered_flight.toml")
-    assert list(judging.beside(loaded)[0]) == ["paper"]
+    assert list(judging.beside(loaded)[0]) == ["published"]
     other = scenario.replace(loaded, controller__eta=4.0)
-    assert list(judging.beside(other)[0]) == ["paper", "before"]
+    assert list(judging.beside(other)[0]) == ["published", "before"]
 
 
 def test_requirements_broken_by_more_accurate_gains_are_listed(monkeypatch):
@@ -253,19 +253,19 @@ def test_requirements_broken_by_more_accurate_gains_are_listed(monkeypatch):
     def simulated(errors, finished=(True, True)):
         return SimpleNamespace(metrics=SimpleNamespace(window_error=np.array(errors)), finished=np.array(finished))
 
-    verdicts = {"paper": [("gain_margin", False), ("effort", True)], "before": [("effort", True)]}
+    verdicts = {"published": [("gain_margin", False), ("effort", True)], "before": [("effort", True)]}
     monkeypatch.setattr(
         judging, "verdicts_of", lambda name, *_: [SimpleNamespace(metric=m, met=met) for m, met in verdicts[name]]
     )
-    tuned, names = simulated([2.0, 2.0]), {name: name for name in ("tuned", "paper", "before")}
+    tuned, names = simulated([2.0, 2.0]), {name: name for name in ("tuned", "published", "before")}
 
-    def broken_by(paper, before):
-        held_out: Any = {"tuned": tuned, "paper": paper, "before": before}
+    def broken_by(published, before):
+        held_out: Any = {"tuned": tuned, "published": published, "before": before}
         return tuner._broken_by(cast(Any, names), held_out, 0)
 
-    assert broken_by(simulated([1.0, 2.0]), simulated([1.0, 1.0])) == {"paper": ["gain_margin"], "before": []}
+    assert broken_by(simulated([1.0, 2.0]), simulated([1.0, 1.0])) == {"published": ["gain_margin"], "before": []}
     assert broken_by(simulated([3.0, 2.0]), simulated([2.0, 2.0])) == {}
-    assert [*broken_by(simulated([1.0, 9.0], (True, False)), simulated([0.0, 0.0], (False, False)))] == ["paper"]
+    assert [*broken_by(simulated([1.0, 9.0], (True, False)), simulated([0.0, 0.0], (False, False)))] == ["published"]
 
 
 def test_judging_changes_only_the_clock():

@@ -226,14 +226,14 @@ def lines(summary: Compare) -> Iterator[str]:
             f"interrupted while {_name(list(summary.laws)[-1])} was tuned: its gains are the best so far, and the "
             "other laws are missing; the same command resumes the search"
         )
-    if summary.paper_refused:
-        yield f"the published gains cannot be simulated in this scenario: {summary.paper_refused}"
+    if summary.published_unavailable:
+        yield f"the published gains cannot be simulated in this scenario: {summary.published_unavailable}"
     for name, law in summary.laws.items():
         gains = ", ".join(f"{gain} {value:.4g}" for gain, value in law.gains.items())
         bound = "".join(f"; {gain} on its {side} bound" for gain, side in law.at_bound.items())
         scaled = (
             ", scaled to this body and period"
-            if (name, summary.published_label) == ("paper", "published, scaled")
+            if (name, summary.published_label) == ("published", "published, scaled")
             else ""
         )
         yield f"{_name(name)}{scaled}: {gains}{bound}"
@@ -264,4 +264,4 @@ def winner(laws: dict[str, Law]) -> str:
 
 
 def _name(law: str) -> str:
-    return "published gains" if law == "paper" else law.replace("_", " ")
+    return "published gains" if law == "published" else law.replace("_", " ")

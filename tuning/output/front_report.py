@@ -101,8 +101,8 @@ def remarks(front: Front) -> Iterator[str]:
         yield f"omitted: {many(dominated, 'point')} with more torque and a larger error, beyond its interval"
     if front.requirements and front.status != "met":
         yield "no point meets every requirement on the held-out trials"
-    if front.paper_refused:
-        yield f"the published gains cannot be simulated in this scenario: {front.paper_refused}"
+    if front.published_unavailable:
+        yield f"the published gains cannot be simulated in this scenario: {front.published_unavailable}"
 
 
 def _of_torque(front: Front) -> Iterator[str]:

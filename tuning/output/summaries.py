@@ -189,13 +189,13 @@ class Tune(msgspec.Struct, frozen=True, kw_only=True):
     gain_units: dict[str, str]
     gains: dict[str, float]
     at_bound: dict[str, str]
-    accuracy_gain_over_paper: Number
+    accuracy_gain_over_published: Number
     accuracy_gain_interval: Interval
     training: Group
     held_out: Group
-    paper: Group | None = None
+    published: Group | None = None
     before: Group | None = None
-    paper_refused: str | None
+    published_unavailable: str | None
     published_label: str
     shortest_t_f: ShortestTime | None
     broken_by: dict[str, list[str]]
@@ -242,7 +242,7 @@ class Compare(msgspec.Struct, frozen=True):
 
     status: str
     trials: int
-    paper_refused: str | None
+    published_unavailable: str | None
     published_label: str | None
     judged_on: str
     settling_angle: float
@@ -454,7 +454,8 @@ def run(summary: Mapping[str, Any], plant: str) -> Run:
 
 def tune(summary: Mapping[str, Any]) -> Tune:
     """Return the summary of a tuning; see `read`."""
-    groups = {name: _folded(summary[name]) for name in ("training", "held_out", "paper", "before") if summary.get(name)}
+    names = ("training", "held_out", "published", "before")
+    groups = {name: _folded(summary[name]) for name in names if summary.get(name)}
     return read(Tune, {**summary, **groups})
 
 

@@ -12,7 +12,7 @@ from tuning.output.summaries import Check, Entry, Group, Hardest, Search, Tune
 
 AGREE = 0.01  # largest relative difference of gradients from finite differences
 HOPELESS = 1.1  # see `optimise.HOPELESS`, whose import takes a second
-PAPER = {  # columns of the published gains in words
+PUBLISHED = {  # columns of the published gains in words
     "published": "the published gains",
     "published, scaled": "the published gains, scaled to this body and period",
     "paper's law": "the paper's law with the published gains",
@@ -34,7 +34,7 @@ def of(summary: Tune) -> Report:
 
 def _groups(summary: Tune) -> dict[str, Group]:
     """Return the gains side by side, by the headings of their columns."""
-    groups = {summary.published_label: summary.paper, "before": summary.before, "tuned": summary.held_out}
+    groups = {summary.published_label: summary.published, "before": summary.before, "tuned": summary.held_out}
     return {name: group for name, group in groups.items() if group is not None}
 
 
@@ -95,7 +95,7 @@ def accuracy(summary: Tune) -> Iterator[str]:
     if on_training is not None and on_training.rms is not None:
         spread = interval(on_training.rms_interval, text)
         yield f"training trials: {text(on_training.rms)}{spread}"
-    yield from _beside_paper(summary)
+    yield from _beside_published(summary)
     if summary.gains:
         yield f"tuned gains: {', '.join(f'{name} {value:.6g}' for name, value in summary.gains.items())}"
     saturated = held_out.metrics.get("saturated")
@@ -110,24 +110,21 @@ def accuracy(summary: Tune) -> Iterator[str]:
         yield f"the scenario's own gains are more accurate than the tuned ones; {why}"
 
 
-def _beside_paper(summary: Tune) -> Iterator[str]:
+def _beside_published(summary: Tune) -> Iterator[str]:
     """Return the comparison with the published gains."""
-    times, bounds, paper = (
-        summary.accuracy_gain_over_paper,
-        summary.accuracy_gain_interval,
-        PAPER[summary.published_label],
-    )
-    if summary.paper_refused:
-        yield f"the published gains cannot be simulated in this scenario: {summary.paper_refused}"
+    times, bounds = summary.accuracy_gain_over_published, summary.accuracy_gain_interval
+    published = PUBLISHED[summary.published_label]
+    if summary.published_unavailable:
+        yield f"the published gains cannot be simulated in this scenario: {summary.published_unavailable}"
     if times is None or not summary.held_out.counts.get("ok", 0):
         return
     if times >= 1.0:
-        yield f"{ratio(times)} times as accurate as {paper}{interval(bounds, ratio)}"
+        yield f"{ratio(times)} times as accurate as {published}{interval(bounds, ratio)}"
         return
     turned = None if bounds is None else (1.0 / bounds[1], 1.0 / bounds[0])
-    theirs = summary.broken_by.get("paper")
+    theirs = summary.broken_by.get("published")
     but = f"; these break {' and '.join(theirs)}" if theirs else ""
-    yield f"less accurate than {paper}: {ratio(1.0 / times)} times the error{interval(turned, ratio)}{but}"
+    yield f"less accurate than {published}: {ratio(1.0 / times)} times the error{interval(turned, ratio)}{but}"
 
 
 def search(summary: Tune) -> Iterator[str]:

@@ -33,7 +33,7 @@ from tuning.search.objective import T_F
 from tuning.search.progress import Report, headed
 from tuning.studies import judging, stability, tuner
 
-OURS, PAPER = "prescribed_time", "paper"  # the prescribed-time law with tuned gains, and with published gains
+OURS, PUBLISHED = "prescribed_time", "published"  # the prescribed-time law with tuned gains, and with published gains
 OFF = 0.1  # relative difference between the true inertia and the design model
 MODEL_ERRORS = ("heavier", "lighter", "later")
 # keys of `tune` that are the same for every law
@@ -66,7 +66,7 @@ class Comparison:
     contenders: dict[str, Contender]
     held_out_seed: int
     interrupted: bool
-    paper_refused: str | None = None  # reason why the published gains cannot be simulated
+    published_unavailable: str | None = None  # reason why the published gains cannot be simulated
 
     @property
     def status(self) -> str:
@@ -137,7 +137,7 @@ class Rivals:
 
 def _free_name(name: str, taken: Iterable[str]) -> str:
     """Return a unique label for a custom law: its class name, after "custom" if another law has this label."""
-    while name in (PAPER, *taken):
+    while name in (PUBLISHED, *taken):
         name = f"custom {name}"
     return name
 
@@ -259,9 +259,10 @@ def compare(
     rivals = that_can_be_simulated(scenario) if rivals is None else rivals
     others, refused = judging.beside(scenario)
     found, interrupted = {}, False
-    if PAPER in others:
+    if PUBLISHED in others:
         tell("published gains: verifying on held-out trials", 0, 0, np.nan, 0.0)
-        found[PAPER] = _with_more(_published(judging.on_flight_clock(others[PAPER]), held_out_seed), held_out_seed)
+        judged = _published(judging.on_flight_clock(others[PUBLISHED]), held_out_seed)
+        found[PUBLISHED] = _with_more(judged, held_out_seed)
     for law, posed in rivals.items():
         report = headed(tell, law)
         # more tries would judge the laws on different held-out trials
@@ -359,8 +360,8 @@ def summary(comparison: Comparison) -> dict[str, Any]:
         "status": comparison.status,
         "seed": comparison.held_out_seed,
         "trials": int(first.trials.status.size),
-        "paper_refused": comparison.paper_refused,
-        "published_label": gains.published_label(found[PAPER].simulated) if PAPER in found else None,
+        "published_unavailable": comparison.published_unavailable,
+        "published_label": gains.published_label(found[PUBLISHED].simulated) if PUBLISHED in found else None,
         "judged_on": "flight clock",  # no sign function is named here, because the laws have different ones
         "settling_angle": first.simulated.loop.settling_angle,
         "laws": {law: figures_of(contender) for law, contender in found.items()},

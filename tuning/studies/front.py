@@ -97,8 +97,8 @@ class Front:
     gain_units: dict[str, str]
     warnings: list[str]
     published_label: str  # label of the published gains
-    paper_refused: str | None = None  # reason why the published gains cannot be simulated
-    others: dict[str, Point] = field(default_factory=dict)  # "paper": published gains; "before": the scenario's gains
+    published_unavailable: str | None = None  # reason why the published gains cannot be simulated
+    others: dict[str, Point] = field(default_factory=dict)  # keys "published" and "before", see `judging.beside`
 
     @property
     def kept(self) -> list[Point]:
@@ -112,7 +112,7 @@ class Front:
 
     def labelled(self) -> dict[str, Point]:
         """Return the points of `others` by the labels that tables and figures show."""
-        return {self.published_label if name == "paper" else name: point for name, point in self.others.items()}
+        return {self.published_label if name == "published" else name: point for name, point in self.others.items()}
 
     def summary(self) -> dict[str, Any]:
         """Return the content of `summary.json`."""

@@ -38,16 +38,16 @@ def beside(scenario: Scenario) -> tuple[dict[str, Scenario], str | None]:
     """Return the scenarios that tuned gains are compared with, and why the published gains cannot be simulated.
 
     Returns:
-        "paper": the scenario with the published gains; "before": the scenario, if its gains differ from these. If the
-        published gains are not valid in the scenario, "paper" is missing, and the second value is the error message.
-        Otherwise the second value is None.
+        First a dictionary: "published" is the scenario with the published gains, and "before" is the scenario itself if
+        its gains differ from the published ones. Then the reason why the published gains are not valid in the
+        scenario, or None. In this case "published" is missing.
     """
     try:
-        paper = gains.published_scenario(scenario)
-        study(on_flight_clock(paper))
+        published = gains.published_scenario(scenario)
+        study(on_flight_clock(published))
     except ScenarioError as error:
         return {"before": scenario}, str(error)
-    return {"paper": paper} | ({"before": scenario} if gains.differ(scenario, paper) else {}), None
+    return {"published": published} | ({"before": scenario} if gains.differ(scenario, published) else {}), None
 
 
 def judge(scenario: Scenario, held_out_seed: int, reach: Reach | None = None) -> Trials:

@@ -78,7 +78,7 @@ def trace(trade: Trade, seed: int, tell: Report = lambda *_: None, journal: Jour
         gain_units=gains.units_of(scenario),
         warnings=plausibility.warnings(scenario),
         published_label=gains.published_label(scenario),
-        paper_refused=refused,
+        published_unavailable=refused,
         others={name: reference(one) for name, one in others.items()},
     )
 

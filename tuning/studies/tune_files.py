@@ -81,7 +81,7 @@ def summary(tuning: Tuning) -> dict[str, Any]:
         "training": {"seed": tuning.seed, **statistics(tuning.training, kind)},
         "held_out": groups["tuned"],
         **{name: group for name, group in groups.items() if name != "tuned"},
-        "paper_refused": tuning.paper_refused,
+        "published_unavailable": tuning.published_unavailable,
         "published_label": gain_names.published_label(tuning.tuned),
         "shortest_t_f": None if tuning.shortest is None else asdict(tuning.shortest),
         "broken_by": tuning.broken_by,
@@ -122,13 +122,16 @@ def _accuracy_gain(held_out: Mapping[str, Trials]) -> dict[str, Any]:
 
     The ratio is over the trials that reach their end with both sets of gains.
     """
-    both = held_out["tuned"].finished & held_out["paper"].finished if "paper" in held_out else np.zeros(0, bool)
+    nothing = {"accuracy_gain_over_published": None, "accuracy_gain_interval": None}
+    if "published" not in held_out:
+        return nothing
+    both = held_out["tuned"].finished & held_out["published"].finished
     if not both.any():
-        return {"accuracy_gain_over_paper": None, "accuracy_gain_interval": None}
-    paper, tuned = (np.asarray(held_out[name].metrics.window_error)[both] for name in ("paper", "tuned"))
+        return nothing
+    published, tuned = (np.asarray(held_out[name].metrics.window_error)[both] for name in ("published", "tuned"))
     return {
-        "accuracy_gain_over_paper": trust.rms(paper) / trust.rms(tuned),
-        "accuracy_gain_interval": trust.ratio_interval(paper, tuned),
+        "accuracy_gain_over_published": trust.rms(published) / trust.rms(tuned),
+        "accuracy_gain_interval": trust.ratio_interval(published, tuned),
     }
 
 
@@ -256,7 +259,7 @@ def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
         ),
     }
     ended = {
-        gain_names.published_label(scenario) if name == "paper" else name: (
+        gain_names.published_label(scenario) if name == "published" else name: (
             trials.metrics.window_error[trials.finished], trials.metrics.peak_torque[trials.finished]
         )
         for name, trials in tuning.held_out.items()

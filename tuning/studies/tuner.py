@@ -81,7 +81,7 @@ class Tuning:
     at_bound: dict[str, str]
     training: Trials  # tuned gains on the training trials
     held_out: dict[str, Trials]  # held-out trials: "tuned" and the keys of `judging.beside`
-    paper_refused: str | None  # reason why the published gains cannot be simulated
+    published_unavailable: str | None  # reason why the published gains cannot be simulated
     seed: int  # of the training trials and the search
     held_out_seed: int  # of the held-out trials
     judged_gains: dict[str, dict[str, float]]  # gains by name, for each key of `held_out`
@@ -179,7 +179,7 @@ def tune(
         at_bound=at_bound,
         training=training,
         held_out=held_out,
-        paper_refused=refused,
+        published_unavailable=refused,
         seed=seed,
         held_out_seed=judged.seed,
         judged_gains={name: gains.gains_of(study(one).parts) for name, one in candidates.items()},
