@@ -45,11 +45,11 @@ def read(path: Path) -> pl.DataFrame:
     """Return the table of a .csv or .parquet file.
 
     Raises:
-        RefusedError: the file is not there, has another type or is damaged.
+        RefusedError: the file is missing, has another type or is damaged.
     """
     allowed = "a .csv or .parquet file with a row for each time"
     if not path.is_file():
-        raise RefusedError(f"the log {path} is not there; allowed is {allowed}")
+        raise RefusedError(f"there is no file {path}; a log is {allowed}")
     try:
         if path.suffix.lower() == ".csv":
             return csv_tables.read(path)

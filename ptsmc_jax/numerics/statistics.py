@@ -14,6 +14,7 @@ from scipy import special  # instead of `scipy.stats`, whose import takes half a
 MAX_TILT = 60.0  # largest exponential tilt of `_tilted_mean`; the mean then equals the largest or smallest value
 SOBOL_BINS = 32  # bins of an input with equal numbers of trials
 DUPLICATE_CORRELATION = 0.9999  # rank correlation above which two inputs are duplicates
+EXPLAINS = 0.05  # fraction of the variance of a metric's ranks that an input explains at least to be named
 SIGNIFICANCE = 0.0027  # probability of a normal number beyond three sigma, the level of the test of categories
 ROUNDING = 1e-12  # relative to the largest value: smaller differences between values are rounding errors
 
@@ -211,22 +212,26 @@ def drivers(
     return effects
 
 
-def beyond_chance(driver: Mapping[str, float | None], trials: int) -> bool:
-    """Return whether a sensitivity is significant: beyond three sigma of the sensitivity to an unrelated input.
+def explained_variance(driver: Mapping[str, float | None], trials: int) -> float:
+    """Return the fraction of the variance of a metric's ranks that one input explains; 0 if it is not significant.
+
+    The fraction is the larger of the first-order index and the square of the rank correlation, which is the fraction
+    that a linear function of the input's ranks explains. It is significant if one of the two sensitivities is beyond
+    three sigma of the sensitivity to an unrelated input.
 
     Args:
         driver: one entry of the result of `drivers`. The index of a category is 0 if it is not significant.
         trials: number of trials.
 
-    >>> weak = {"rank_correlation": 0.1, "first_order": 0.01}
-    >>> beyond_chance(weak, 300), beyond_chance(weak, 3000)
-    (False, True)
+    >>> weak = {"rank_correlation": 0.1, "first_order": 0.0}
+    >>> explained_variance(weak, 300), round(explained_variance(weak, 3000), 6)
+    (0.0, 0.01)
     """
-    if driver["rank_correlation"] is None:
-        return bool(driver["first_order"])
-    sigmas = {"rank_correlation": 1.0 / np.sqrt(trials), "first_order": np.sqrt(2.0 * (SOBOL_BINS - 1)) / trials}
-    pairs = ((driver[name], sigma) for name, sigma in sigmas.items())
-    return any(value is not None and abs(value) > 3.0 * sigma for value, sigma in pairs)
+    rank, index = driver["rank_correlation"], driver["first_order"] or 0.0
+    if rank is None:
+        return index
+    significant = abs(rank) > 3.0 / np.sqrt(trials) or index > 3.0 * np.sqrt(2.0 * (SOBOL_BINS - 1)) / trials
+    return max(index, rank**2) if significant else 0.0
 
 
 def _first_order_index(bins: Sequence[np.ndarray], count: int) -> float:

@@ -84,10 +84,10 @@ def test_a_design_has_a_profile_within_the_limits(command, logged):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ([], "there is no LOG, but must be one"),
-        (["run/trajectory.csv", "--design"], "there are logs, but --design needs none"),
+        ([], "give at least one log file after the scenario, or --design"),
+        (["run/trajectory.csv", "--design"], "--design needs no log: leave the log files out"),
         (["run/trajectory.csv", "--rate", "0.1"], "--rate is 0.1, but must be absent without --design"),
-        (["absent.csv"], "the log absent.csv is not there"),
+        (["absent.csv"], "there is no file absent.csv; a log is a .csv or .parquet file"),
         (["s.toml"], "the log is s.toml, but must be a .csv or .parquet file"),
     ],
 )

@@ -80,20 +80,32 @@ def test_inputs_that_rank_the_trials_alike_are_one_driver():
     assert list(statistics.drivers(inputs, angle + other)) == ["initial_angle", "other"]
 
 
+NO_DRIVER = "no dispersed quantity alone explains 5 % of the variance of the ranks of window_error"
+
+
+def driver_lines(drivers, trials):
+    found = {"drivers": {"window_error": drivers}, "driver_trials": {"window_error": trials}}
+    return list(campaign_report.drivers(examples.campaign(simulated=10_000, trials=10_000, **found)))
+
+
 def test_chance_is_no_driver():
     """In an earlier version, some of twenty inputs without influence were named, with correlations of 0.1."""
     rng = np.random.default_rng(0)
     inputs, metric = {f"x{k}": rng.normal(size=300) for k in range(20)}, rng.normal(size=300)
     drivers = statistics.drivers(inputs, metric)
     assert max(abs(one["rank_correlation"]) for one in drivers.values()) > 0.1
-
-    def driven(drivers):
-        found = {"drivers": {"window_error": drivers}, "driver_trials": {"window_error": 300}}
-        return list(campaign_report.drivers(examples.campaign(simulated=10_000, trials=10_000, **found)))
-
-    assert driven(drivers) == []
-    (line,) = driven(statistics.drivers({"y": metric + rng.normal(size=300)}, metric))
+    assert driver_lines(drivers, 300) == [NO_DRIVER]
+    assert driver_lines({}, 300) == []
+    (line,) = driver_lines(statistics.drivers({"y": metric + rng.normal(size=300)}, metric), 300)
     assert line.startswith("window_error is driven by y (rank correlation +0.")
+
+
+@pytest.mark.parametrize(("correlation", "trials", "named"), [(0.22, 1000, False), (0.3, 1000, True), (0.3, 90, False)])
+def test_driver_explains_a_significant_part_of_the_variance(correlation, trials, named):
+    """A rank correlation of 0.22 explains 4.8 % of the variance. One of 0.3 is insignificant in 90 trials."""
+    (line,) = driver_lines({"initial_angle": {"rank_correlation": correlation, "first_order": 0.0}}, trials)
+    driven = "window_error is driven by initial_angle (rank correlation +0.30, 9 % of the variance of the ranks)"
+    assert line == (driven if named else NO_DRIVER)
 
 
 def test_command_that_replays_the_worst_trial_can_be_pasted_into_a_shell():

@@ -41,7 +41,11 @@ def identify(
     Exit status: 0 the model explains the logs and every parameter is determined, 1 not, 2 configuration error.
     """
     if design == bool(logs):
-        raise UsageError("there are logs, but --design needs none" if design else "there is no LOG, but must be one")
+        raise UsageError(
+            "--design needs no log: leave the log files out"
+            if design
+            else "give at least one log file after the scenario, or --design"
+        )
     limits = {"--duration": duration, "--rate": rate, "--torque": torque}
     alone = next((name for name, value in limits.items() if value is not None), None)
     if alone is not None and not design:

@@ -14,7 +14,6 @@ from tuning.output.report import Block, Report, Section, Table, Text
 from tuning.output.run_report import bound, warnings
 from tuning.output.summaries import Campaign, Entry, Quantile
 
-WEAK = 0.05  # rank correlation or fraction of the variance below which an input is not named
 NOTES = {
     "max": "Quantiles with 95 % intervals; a failed trial is beyond every quantile. -: so many trials fail or never "
     "settle, or so few were simulated, that there is no value.",
@@ -99,22 +98,31 @@ def _rows(summary: Campaign, extreme: str) -> list[tuple[str, ...]]:
 
 
 def drivers(summary: Campaign) -> Iterator[str]:
-    """Return the inputs that drive the error and the required metrics by more than chance."""
-    for name in dict.fromkeys(("window_error", *(one.metric for one in summary.verdicts))):
-        known = summary.drivers.get(name, {})
-        strength: dict[str, float] = {}
-        for key, driver in known.items():
-            entries = msgspec.structs.asdict(driver)
-            if statistics.beyond_chance(entries, summary.driver_trials[name]):
-                strength[key] = max(abs(v) for v in entries.values() if v is not None)
-        strongest = sorted((key for key in strength if strength[key] >= WEAK), key=lambda key: -strength[key])[:3]
+    """Return the inputs that explain the error and the required metrics best, or that none explains them.
+
+    An input is named if it explains a significant fraction of at least `statistics.EXPLAINS` of the variance.
+    """
+    unexplained = list[str]()
+    for metric in dict.fromkeys(("window_error", *(one.metric for one in summary.verdicts))):
+        sensitivities = summary.drivers.get(metric, {})
+        explained = {
+            name: statistics.explained_variance(msgspec.structs.asdict(driver), summary.driver_trials[metric])
+            for name, driver in sensitivities.items()
+        }
+        strongest = sorted((name for name in explained if explained[name] >= statistics.EXPLAINS),
+                           key=lambda name: -explained[name])[:3]  # fmt: skip
         texts = []
-        for key in strongest:
-            rank, explained = known[key].rank_correlation, known[key].first_order or 0.0
+        for name in strongest:
+            rank = sensitivities[name].rank_correlation
             correlation = "" if rank is None else f"rank correlation {rank:+.2f}, "  # none for the number of a wheel
-            texts.append(f"{key} ({correlation}{100 * explained:.0f} % of the variance of the ranks)")
+            texts.append(f"{name} ({correlation}{100 * explained[name]:.0f} % of the variance of the ranks)")
         if texts:
-            yield f"{name} is driven by {', '.join(texts)}"
+            yield f"{metric} is driven by {', '.join(texts)}"
+        elif sensitivities:
+            unexplained.append(metric)
+    if unexplained:
+        least = f"{100 * statistics.EXPLAINS:g} % of the variance of the ranks"
+        yield f"no dispersed quantity alone explains {least} of {', '.join(unexplained)}"
 
 
 def gains(scenario: dict[str, Any], plant: str) -> Table:

@@ -14,7 +14,6 @@ from tuning.output.report import Table
 if TYPE_CHECKING:
     import polars as pl
 
-COUNTS = 0.05  # fraction of a metric's variance that an input explains at least to be named as a reason
 ROUND_OFF = 1e-9  # relative: the programs of a campaign and of a run with its history round differently
 
 
@@ -49,10 +48,11 @@ def why(inputs: list[dict[str, Any]], plant: str) -> Iterator[str]:
     for (metric, trial), group in itertools.groupby(inputs, lambda row: (row["metric"], row["trial"])):
         rows = list(group)
         value = rows[0]["value"]
-        explained = [row for row in rows if row["first_order"] is not None]
-        if explained and value is not None:
-            explained = [row for row in explained if statistics.beyond_chance(row, row["trials"])]
-            rows = sorted((row for row in explained if _explained(row) >= COUNTS), key=_explained, reverse=True)
+        measured = [row for row in rows if row["first_order"] is not None]
+        if measured and value is not None:
+            explained = [(statistics.explained_variance(row, row["trials"]), row) for row in measured]
+            explained.sort(key=lambda pair: pair[0], reverse=True)
+            rows = [row for fraction, row in explained if fraction >= statistics.EXPLAINS]
         else:
             rows.sort(key=_unusual, reverse=True)
         texts = [f"{row['input']} {_with_unit(row['drawn'], row['unit'])} {_among(row)}" for row in rows[:4]]
@@ -76,11 +76,6 @@ def _unusual(row: dict[str, Any]) -> float:
 
 def _with_unit(value: float, unit: str) -> str:
     return f"{value:.4g} {unit}".rstrip(" -")
-
-
-def _explained(row: dict[str, Any]) -> float:
-    """Return the fraction of the metric's variance that an input explains."""
-    return max(row["first_order"], (row["rank_correlation"] or 0.0) ** 2)
 
 
 def replayed(off: float | None, rounding: float, same: float) -> Iterator[str]:
