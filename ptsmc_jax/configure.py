@@ -134,15 +134,15 @@ def configure(
 def _set_compiler_options(fast: bool, device: str | None) -> None:
     """Set XLA_FLAGS; raise RuntimeError if JAX has already started with others."""
     before = os.environ.get("XLA_FLAGS", "")
-    wanted = _flags(before, _options(device) if fast else ())
-    if sorted(wanted.split()) == sorted(before.split()):
+    new_flags = _flags(before, _options(device) if fast else ())
+    if sorted(new_flags.split()) == sorted(before.split()):
         return
     if _has_started():
         raise RuntimeError(
             "configure() comes too late: JAX has already run something in this process, with other compiler options "
             f"than fast={fast} asks for; call it first, right after the imports"
         )
-    os.environ["XLA_FLAGS"] = wanted
+    os.environ["XLA_FLAGS"] = new_flags
 
 
 def _options(device: str | None) -> tuple[str, ...]:

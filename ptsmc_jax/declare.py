@@ -52,11 +52,11 @@ class Limits(NamedTuple):
             return f" greater than {above} and at most {at_most}"
         if at_least and (below or at_most):
             return f" from {at_least} to {at_most or f'below {below}'}"
-        said = [f"greater than {above}"] * bool(above) + [f"of at least {at_least}"] * bool(at_least)
-        said += [f"below {below}"] * bool(below) + [f"of at most {at_most}"] * bool(at_most)
-        if said == [f"of at least {at_least}"] and not several:
+        limits = [f"greater than {above}"] * bool(above) + [f"of at least {at_least}"] * bool(at_least)
+        limits += [f"below {below}"] * bool(below) + [f"of at most {at_most}"] * bool(at_most)
+        if limits == [f"of at least {at_least}"] and not several:
             return f", at least {at_least}"
-        return " " + " and ".join(said) if said else ""
+        return " " + " and ".join(limits) if limits else ""
 
 
 class Declaration(NamedTuple):
@@ -89,8 +89,8 @@ class Declaration(NamedTuple):
             return Annotated[tuple[one, ...], Meta(description=self.allowed, min_length=1)]
         if not self.each:
             size = len(value)
-            said = f"{'three' if size == 3 else f'a list of {size}'} numbers{words}"
-            return Annotated[tuple[one, ...], Meta(description=said, min_length=size, max_length=size)]
+            description = f"{'three' if size == 3 else f'a list of {size}'} numbers{words}"
+            return Annotated[tuple[one, ...], Meta(description=description, min_length=size, max_length=size)]
         if body:
             return Annotated[tuple[one, one, one], Meta(description=f"three numbers{words}")]
         return Annotated[tuple[one, ...], Meta(description=f"a list of numbers{words}, one for each input")]

@@ -29,7 +29,7 @@ UNROLLED = 8  # length of the longest loop that is unrolled
 MAPPED = 256  # length of the longest loop without carries that is unrolled; its results are stacked
 MAX_COMPONENTS = 1024  # entries of the largest array; all arrays are split into components
 
-_CUSTOM_CALLS = ("custom_jvp_call", "custom_vjp_call")  # functions are differentiated before the kernel is built
+_CUSTOM_CALLS = ("custom_jvp_call", "custom_vjp_call")  # inlined: derivatives are taken before the kernel is built
 # primitives that `components` has a rule for, and Triton has no lowering for
 _NOT_LOWERED = set(
     """complex conj copy copy_p digamma eq_to erf erf_inv erfc imag le_to lgamma lt_to real reduce_precision

@@ -169,7 +169,10 @@ class _Interpreter:
         return dependence.interpret(jaxpr, consts, arguments, BatchedArray.unbatched, self.apply)
 
     def evaluate_inside(self, closed: Any, arguments: Sequence[BatchedArray]) -> list[BatchedArray]:
-        """Return the outputs of a jaxpr inside a function that JAX traces: no array of its trace leaves it."""
+        """Return the outputs of a jaxpr inside a function that JAX traces, by an interpreter of its own.
+
+        Arrays of the inner trace must not be stored in this interpreter.
+        """
         return _Interpreter(self.trials, self.strict, self.directions).evaluate(closed, arguments)
 
     def apply(self, eqn: Any, values: list[BatchedArray]) -> list[BatchedArray]:

@@ -33,7 +33,7 @@ from ptsmc_jax.simulation.rollout import Parts
 
 PART = 4096  # trials in one part
 
-Wanted = tuple[int, int]  # first trial and count of a part to fly
+Block = tuple[int, int]  # first trial and number of trials of a part to simulate
 
 
 @dataclass(frozen=True)
@@ -176,7 +176,7 @@ def _draw(parts: Parts, dispersion: Dispersion, seed: jax.Array, trials: jax.Arr
     return lanes.vmap(lambda trial: montecarlo.values(parts, dispersion, seed, trial))(trials)
 
 
-def missing(parts: Iterable[Part], trials: int, shard: tuple[int, int] = (1, 1)) -> list[Wanted]:
+def missing(parts: Iterable[Part], trials: int, shard: tuple[int, int] = (1, 1)) -> list[Block]:
     """Return the parts that a campaign still needs.
 
     Args:
@@ -190,7 +190,7 @@ def missing(parts: Iterable[Part], trials: int, shard: tuple[int, int] = (1, 1))
     return [(first, count) for first, count in every[number - 1 :: shards] if there.get(first, 0) < count]
 
 
-def staying(parts: Iterable[Part], wanted: Iterable[Wanted]) -> list[Part]:
+def staying(parts: Iterable[Part], wanted: Iterable[Block]) -> list[Part]:
     """Return the parts on disk that are not simulated again."""
     again = {first for first, _ in wanted}
     return [part for part in parts if part.first not in again]
@@ -226,7 +226,7 @@ def verdicts(asked: Iterable[Requirement], frame: pl.DataFrame) -> list[Verdict]
     return requirements.verdicts(asked, lambda name: frame[name].to_numpy().astype(float), finished(frame))
 
 
-def here(make: Callable[[np.ndarray], pl.DataFrame], rows: Rows, wanted: list[Wanted]) -> Iterator[tuple[Part, int]]:
+def here(make: Callable[[np.ndarray], pl.DataFrame], rows: Rows, wanted: list[Block]) -> Iterator[tuple[Part, int]]:
     """Make the wanted parts on this machine and write them. Accelerators make several parts at a time.
 
     Args:
@@ -240,7 +240,7 @@ def here(make: Callable[[np.ndarray], pl.DataFrame], rows: Rows, wanted: list[Wa
     together = max(1, montecarlo.block_size() * len(configure.devices()) // PART)
     groups = [wanted[k : k + together] for k in range(0, len(wanted), together)]
 
-    def made(group: list[Wanted]) -> list[tuple[Part, int]]:
+    def made(group: list[Block]) -> list[tuple[Part, int]]:
         frame = make(np.concatenate([np.arange(first, first + count) for first, count in group]))
         parts, begin = [], 0
         for first, count in group:

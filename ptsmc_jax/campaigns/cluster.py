@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ptsmc_jax.campaigns import store
-from ptsmc_jax.campaigns.campaign import Campaign, Wanted, failures
+from ptsmc_jax.campaigns.campaign import Block, Campaign, failures
 from ptsmc_jax.campaigns.rows import Part, Rows
 from ptsmc_jax.campaigns.store import RefusedError
 
@@ -25,7 +25,7 @@ class Cluster:
     def __init__(self, client: Any, local: Any = None):
         self._client, self._local = client, local
 
-    def __call__(self, folder: Any, wanted: list[Wanted]) -> Iterator[tuple[Part, int]]:
+    def __call__(self, folder: Any, wanted: list[Block]) -> Iterator[tuple[Part, int]]:
         """Have the wanted parts simulated.
 
         Args:

@@ -197,15 +197,15 @@ def run(
     kernel = by_kernel() if kernel is None else kernel
     calls = []
     for k in range(0, count, size):
-        places, share = shared_out(min(size, count - k), devices, rows * block)
+        places, per_device = shared_out(min(size, count - k), devices, rows * block)
         chosen = k + places.reshape(devices, rows, block)
         numbers = jax.tree.map(lambda v, chosen=chosen: jnp.asarray(v[chosen]), trials)
-        needed = jnp.int32(-(-share // block))
+        needed = jnp.int32(-(-per_device // block))
         results = _simulate_rows(
             parts, dispersion, jnp.uint32(seed), numbers, needed, devices, custom_metrics, kernel, software
         )
         flat = jax.tree.map(lambda v: np.asarray(v).reshape(devices, rows * block, *v.shape[3:]), results)
-        calls.append(jax.tree.map(lambda v, k=k, share=share: gathered(v, share)[: count - k], flat))
+        calls.append(jax.tree.map(lambda v, k=k, per_device=per_device: gathered(v, per_device)[: count - k], flat))
     return Trials(number, *jax.tree.map(lambda *many: np.concatenate(many), *calls))
 
 
@@ -232,15 +232,15 @@ def shared_out(count: int, devices: int, slots: int) -> tuple[np.ndarray, int]:
     Returns:
         The item in each slot, (devices, slots), and the number of used slots of a device. Other slots repeat items.
     """
-    share = -(-count // devices)
+    per_device = -(-count // devices)
     places = np.zeros((devices, slots), int)
-    places[:, :share] = np.resize(np.arange(count), (devices, share))
-    return places, share
+    places[:, :per_device] = np.resize(np.arange(count), (devices, per_device))
+    return places, per_device
 
 
-def gathered(results: np.ndarray, share: int) -> np.ndarray:
-    """Return the results of `shared_out` items in their order, (devices, slots, ..) -> (devices * share, ..)."""
-    counted = np.asarray(results)[:, :share]
+def gathered(results: np.ndarray, per_device: int) -> np.ndarray:
+    """Return the results of `shared_out` items in their order, (devices, slots, ..) -> (devices * per_device, ..)."""
+    counted = np.asarray(results)[:, :per_device]
     return counted.reshape(-1, *counted.shape[2:])
 
 

@@ -38,7 +38,7 @@ class AttitudeFilter:
     spread: Leaf
 
     def begin(
-        self, q: Float[Array, "4"], bias: Float[Array, "3"], normals: Float[Array, "6"], sample: Array, share: Scalar
+        self, q: Float[Array, "4"], bias: Float[Array, "3"], normals: Float[Array, "6"], sample: Array, fraction: Scalar
     ) -> Estimate:
         """Return an estimate [-, rad/s] with random steady-state errors, because the filter has run before the slew.
 
@@ -47,16 +47,16 @@ class AttitudeFilter:
             bias: true bias of the gyro (3,) [rad/s].
             normals: standard normal numbers for the errors (6,).
             sample: number of the first sample; the estimate is the one just before it.
-            share: length of a partial first period as a fraction of a full one, else 1. The error covariance is
+            fraction: length of a partial first period as a fraction of a full one, else 1. The error covariance is
                 interpolated between this sample and the next one.
         """
-        turn, drift = self.first_spread(sample, share) @ normals.reshape(2, 3)
+        turn, drift = self.first_spread(sample, fraction) @ normals.reshape(2, 3)
         return Estimate(attitude.multiply(q, attitude.from_rotation_vector(turn)), bias + drift)
 
-    def first_spread(self, sample: Any, share: Scalar) -> Float[Array, "2 2"]:
+    def first_spread(self, sample: Any, fraction: Scalar) -> Float[Array, "2 2"]:
         """Return the covariance factor (2, 2) [rad, rad/s] of the errors in `begin`, which explains the arguments."""
         every = self.spread.shape[0]
-        return guards.lerp(share, self.spread[(sample - 1) % every], self.spread[sample % every])
+        return guards.lerp(fraction, self.spread[(sample - 1) % every], self.spread[sample % every])
 
     def propagate(self, old: Estimate, w: Float[Array, "3"], w_next: Float[Array, "3"], dt: Scalar) -> Estimate:
         """Return the estimate after a control period, with the coning correction to second order.
@@ -106,8 +106,8 @@ class AttitudeFilter:
             age: time from the sample to the end of the period [s].
             weight: weight of the correction [-]; 0 if there is no sample.
         """
-        share = 1.0 - age / jnp.where(dt > 0.0, dt, 1.0)
-        w_at_sample = w + share * (w_next - w)
+        fraction = 1.0 - age / jnp.where(dt > 0.0, dt, 1.0)
+        w_at_sample = w + fraction * (w_next - w)
         corrected = self.correct(self.propagate(old, w, w_at_sample, dt - age), measured, weight)
         return self.propagate(corrected, w_at_sample, w_next, age)
 

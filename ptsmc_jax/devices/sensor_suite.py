@@ -153,19 +153,19 @@ class SensorSuite(SpacecraftSensors):
         sensors = tuple(sensor.in_step() for sensor in self.sensors)
         return replace(self, sensors=sensors, filter=self.filter.in_step())
 
-    def reading(self, sample: int = 0, share: float = 1.0) -> Reading:
+    def reading(self, sample: int = 0, fraction: float = 1.0) -> Reading:
         """Return the readings of the attitude sensors and the gyro to first order, and the gyro bias.
 
         Args:
             sample: number of the first control sample.
-            share: its weight, see `KalmanFilter.begin`.
+            fraction: its weight, see `KalmanFilter.begin`.
         """
         still = jnp.array([0.0, 0.0, 0.0, 1.0])
         axes = [np.pad(sensor.sensitivity(still), ((0, 0), (0, 6))) for sensor in self.sensors]
         rows = np.vstack([*axes, self.gyro_rows()])
         noise = np.concatenate([sigma for _, sigma, _ in self.noises])
         early = self._each([sensor.times.every is None for sensor in self.sensors], False)
-        start = ATTITUDE_AND_BIAS, np.asarray(self.filter.first_factor(sample, share))
+        start = ATTITUDE_AND_BIAS, np.asarray(self.filter.first_factor(sample, fraction))
         return Reading(rows, noise, np.asarray(self.rate_bias), np.asarray(self.bias_rate), start, early)
 
     def change(self, x: AttitudeState, near: AttitudeState, taken: Any = None, near_taken: Any = None) -> Array:

@@ -369,18 +369,18 @@ class Sensors(SpacecraftSensors):
         turn = attitude.small_rotation(memory.estimate.q, other.estimate.q)
         return jnp.concatenate([turn, other.estimate.bias - memory.estimate.bias, other.rate - memory.rate])
 
-    def reading(self, sample: int = 0, share: float = 1.0) -> Reading:
+    def reading(self, sample: int = 0, fraction: float = 1.0) -> Reading:
         """Return the linear measurement model: rotation [rad] and rate with bias [rad/s], at each control sample.
 
         Args:
             sample: number of the first control sample.
-            share: its weight, see `AttitudeFilter.begin`.
+            fraction: its weight, see `AttitudeFilter.begin`.
         """
         star, gyro = (float(v) for v in (self.attitude_noise, self.rate_noise))
         bias, drift = (0.0 if v is None else float(v) for v in (self.rate_bias, self.bias_rate))
         start = early = None
         if self.filter is not None:
-            root = np.asarray(self.filter.first_spread(sample, jnp.asarray(share)))
+            root = np.asarray(self.filter.first_spread(sample, jnp.asarray(fraction)))
             start = ATTITUDE_AND_BIAS, np.kron(root, np.eye(3))
         if self.own_times is not None:
             early = np.repeat([True, False], 3)
@@ -400,9 +400,9 @@ class Sensors(SpacecraftSensors):
         """
         if self.own_times is None or self.filter is None:
             return self
-        share, old = self.own_times.period / self.own_times.interval, self.filter
-        weaker = replace(old, attitude_gain=share * old.attitude_gain, bias_gain=share * old.bias_gain)
-        return replace(self, attitude_noise=self.attitude_noise / jnp.sqrt(share), filter=weaker, own_times=None)
+        fraction, old = self.own_times.period / self.own_times.interval, self.filter
+        weaker = replace(old, attitude_gain=fraction * old.attitude_gain, bias_gain=fraction * old.bias_gain)
+        return replace(self, attitude_noise=self.attitude_noise / jnp.sqrt(fraction), filter=weaker, own_times=None)
 
 
 @pytree
@@ -437,7 +437,7 @@ class StateSensor(Sensor):
         """Return the sensor without noise."""
         return replace(self, sigma=0.0 * self.sigma)
 
-    def reading(self, sample: int = 0, share: float = 1.0) -> Reading:
+    def reading(self, sample: int = 0, fraction: float = 1.0) -> Reading:
         """Return the linear measurement model: every state, at each control sample."""
         sigma = np.asarray(self.sigma)
         return Reading(np.eye(sigma.size), sigma, np.zeros(0), np.zeros(0))

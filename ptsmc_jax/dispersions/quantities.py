@@ -54,7 +54,7 @@ _PAIR_INDICES = [[PAIRS.index((min(i, j), max(i, j))) for j in range(3)] for i i
 
 
 def level_name(name: str) -> str:
-    """Return the name of a quantity with one common random factor for all its components, such as `torque_limit`."""
+    """Return the name of the quantity that is one common random factor on all components: `torque_limit_level`."""
     return f"{name}_level"
 
 

@@ -70,18 +70,18 @@ def of_run(parts: Parts, log: Log, frames: int = 40) -> Animation:
         axes = figure.add_subplot(projection="3d")
         box = [axes.plot([], [], [], color="0.45", lw=1.0)[0] for _ in _EDGES]
         body_axes = [axes.plot([], [], [], color=STYLES[k][0], lw=2.6)[0] for k in range(3)]
-        wanted = [axes.plot([], [], [], color=STYLES[k][0], lw=1.4, ls="--")[0] for k in range(3)]
+        reference_axes = [axes.plot([], [], [], color=STYLES[k][0], lw=1.4, ls="--")[0] for k in range(3)]
         axes.set(xlim=(-1, 1), ylim=(-1, 1), zlim=(-1, 1), xticks=[], yticks=[], zticks=[])
         axes.set_box_aspect((1, 1, 1))
         title = axes.set_title("")
 
         def draw(k: int) -> list:
             edges, axes_of_body = body(q[k])
-            for lines, ends in ((box, edges), (body_axes, axes_of_body), (wanted, body(q_f[k])[1])):
+            for lines, ends in ((box, edges), (body_axes, axes_of_body), (reference_axes, body(q_f[k])[1])):
                 for line, both in zip(lines, ends, strict=True):
                     line.set_data_3d(*both.T)
             title.set_text(f"t = {t[shown[k]]:.1f} s; dashed: reference")
-            return [*box, *body_axes, *wanted, title]
+            return [*box, *body_axes, *reference_axes, title]
 
         content = FuncAnimation(figure, draw, frames=frames, interval=120).to_jshtml(default_mode="once")
     return Animation(_alone(content))

@@ -307,7 +307,7 @@ def accuracy_map(
     y: MapAxis,
     grids: Mapping[str, np.ndarray],
     failed: np.ndarray,
-    borders: Mapping[str, tuple[np.ndarray, np.ndarray]],
+    limit_lines: Mapping[str, tuple[np.ndarray, np.ndarray]],
     kind: str = "spacecraft",
 ) -> Figure:
     """Plot simulated window error, window error by linear theory, and peak torques over two keys.
@@ -317,7 +317,7 @@ def accuracy_map(
         y: the vertical key.
         grids: (y, x) by name; grids without finite numbers are not drawn.
         failed: (y, x) bool, a trial failed or did not converge at t_f.
-        borders: lines (x, y) by label.
+        limit_lines: lines (x, y) by label.
         kind: of the plant; it determines the units.
     """
     error_unit, unit = (CATALOGUES[kind][name].unit for name in ("window_error", "peak_torque"))
@@ -337,7 +337,7 @@ def accuracy_map(
         _coloured(axes, x, y, grids[name], [grids[other] for other in drawn if kind_of_number in other])
         axes.plot(column[failed], row[failed], ls="", **FAILED)
         limits = axes.get_xlim(), axes.get_ylim()
-        for (label, line), style in zip(borders.items(), ("-", "--", ":"), strict=False):
+        for (label, line), style in zip(limit_lines.items(), ("-", "--", ":"), strict=False):
             axes.plot(*line, color="white", lw=3.0, ls=style)
             axes.plot(*line, color="black", lw=1.4, ls=style, label=label)
         axes.set(xlim=limits[0], ylim=limits[1], title=titles[name])

@@ -239,7 +239,7 @@ def prepared(problem: Problem, log: Measurements) -> Prepared:
 
 
 def _gate(loaded: Scenario) -> float:
-    """Return the normalised square of an outlier, for one component."""
+    """Return the largest accepted normalised square of a group of readings, divided by the size of the group."""
     rate = 1e-6 if loaded.identify is None else loaded.identify.outliers
     return float(stats.chi2.isf(rate, 3) / 3.0) if rate > 0.0 else np.inf
 

@@ -46,11 +46,12 @@ class Parameter(NamedTuple):
         name: as in `identify.free`.
         labels: name of each number in results.
         unit: of the numbers.
-        factor: (numbers.., coordinates) a factor of the prior covariance of the changes that `write` takes.
+        factor: (numbers.., coordinates) matrix F. The changes that `write` takes are F z with coordinates z, whose
+            prior 1 sigma is 1.
         known: whether the factor is prior knowledge, from [dispersion].
         write: (model, changes) -> model; zero changes nothing.
         read: (model) -> numbers [unit].
-        common: coordinates of a common factor of e on all numbers, to first order; None if it has no meaning.
+        common: coordinates that multiply all numbers by e, to first order; None if such a factor has no meaning.
     """
 
     name: str

@@ -12,7 +12,7 @@ from ptsmc_jax.identification.estimation import LAGS, Fit, Identification
 from ptsmc_jax.scenario import parsing, reading
 from ptsmc_jax.scenario.tables import Scenario
 
-LARGEST_SHARE = 0.3  # of a relative dispersion in a scenario
+LARGEST_STD = 0.3  # of a relative dispersion in a scenario
 
 
 def identified(found: Identification) -> Scenario:
@@ -75,8 +75,8 @@ def _put(
 
 
 def _relative(std: np.ndarray, values: np.ndarray) -> dict[str, Any]:
-    share = min(np.max(std / np.abs(values), initial=0.0), LARGEST_SHARE)
-    return {"kind": "relative_normal", "std": float(share)}
+    largest = min(np.max(std / np.abs(values), initial=0.0), LARGEST_STD)
+    return {"kind": "relative_normal", "std": float(largest)}
 
 
 def _put_disturbance(

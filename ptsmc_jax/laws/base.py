@@ -130,9 +130,12 @@ class Law(declare.Tunable):
     # The methods below use the numbers of the fields only: scenarios call them with a table that has the same numbers
 
     def turning(self, t_f: float) -> tuple[str, Scalar | float]:
-        """Return the field that sets how fast the law turns a body, and that rate for a t_f [s], at most [rad/s].
+        """Return the name of the field that sets how fast the law turns a body, and the largest body rate [rad/s].
 
-        The default is twice the mean rate of half a turn, since nothing is known of the law.
+        The default is twice the mean rate of half a turn in t_f, because a custom law can be anything.
+
+        Args:
+            t_f: prescribed time [s].
         """
         return "t_f", 2.0 * math.pi / t_f
 

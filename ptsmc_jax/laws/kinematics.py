@@ -32,7 +32,9 @@ class Kinematics:
     """
 
     model: Any  # the nominal plant
-    additive: ClassVar[bool] = False  # the paper's q_1 - q_1f, singular where the body is, wherever the reference is
+    additive: ClassVar[bool] = (
+        False  # the error is q_1 - q_1f, as in the paper; it is singular at body attitudes of 180 deg
+    )
     symbol: ClassVar[str] = "$|x_1|$"  # of the error's norm, in figures
     error_unit: ClassVar[str] = ""  # of error and sliding variable; empty: the plant has units of its own
     angle_unit: ClassVar[str] = "x1"
@@ -44,7 +46,7 @@ class Kinematics:
         return 2
 
     def reference_from(self, function: Any) -> Any:
-        """Return a reference, a pytree, from a function of time; a reference is returned as it is."""
+        """Return a reference, a pytree, from a function of time. A reference is returned unchanged."""
         return Function(function) if is_function(function) else function
 
     def align(self, x: Any, target: Any) -> Any:

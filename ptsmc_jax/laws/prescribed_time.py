@@ -64,13 +64,16 @@ class PrescribedTimeLaw(Law):
 
     @staticmethod
     def designed(design: Any, published: Mapping[str, float]) -> Mapping[str, float]:
-        """Return both hold poles [1/s] at the design's, with `reaching` the factor of K1 in (60)."""
+        """Return gains that put both poles of the hold phase at the designed pole.
+
+        `design.reaching` is the factor of K1 in (60).
+        """
         pole = design.pole
         gains = {"k1": design.reaching * pole, "sign_width": design.width, "surface_rate": pole}
         return {"eta": design.eta, "delta": design.delta, **gains}
 
     def turning(self, t_f: float) -> tuple[str, Scalar | float]:
-        """On its surface, at the start [rad/s]."""
+        """Return eta, and the body rate on the sliding surface at the start [rad/s]."""
         return "eta", 2.0 * self.eta / t_f
 
     @property

@@ -93,7 +93,7 @@ class TimeBase(ComparisonLaw):
         return profile.acceleration + a, s, start
 
     def turning(self, t_f: float) -> tuple[str, Scalar | float]:
-        """In the middle of half a turn [rad/s]."""
+        """Return t_f, and the body rate in the middle of half a turn [rad/s]."""
         return "t_f", 15.0 / 8.0 * math.pi / t_f
 
 
@@ -119,7 +119,7 @@ class TimeBasePD(TimeBase):
 
     @staticmethod
     def designed(design: Any, published: Mapping[str, float]) -> Mapping[str, float]:
-        """Return both poles of the tracking loop [1/s] at the design's."""
+        """Return gains that put both poles of the tracking loop at the designed pole."""
         return {"k_p": design.pole**2, "k_d": 2.0 * design.pole}
 
 
@@ -143,5 +143,5 @@ class TimeBaseSliding(TimeBase):
 
     @staticmethod
     def designed(design: Any, published: Mapping[str, float]) -> Mapping[str, float]:
-        """Return both poles of the tracking loop [1/s] at the design's."""
+        """Return gains that put both poles of the tracking loop at the designed pole."""
         return {"surface_rate": design.pole, "k": design.pole, "sign_width": design.width}

@@ -66,7 +66,9 @@ class Observer(declare.Tunable, ABC):
 
     model: Plant  # the nominal plant
     estimates: ClassVar[bool] = True  # False: d_hat is always 0
-    linear: ClassVar[bool] = False  # the estimate is linear in what is measured, and its bound inverse to the gain
+    linear: ClassVar[bool] = (
+        False  # the estimate is linear in the measurements, and K2 is inversely proportional to the gain
+    )
 
     def begin(self) -> Memory:
         """Return the memory at t = 0, with d_hat = 0 [N m]."""

@@ -90,9 +90,9 @@ def bandwidth(sensors: Any, period: Any) -> np.ndarray:
     """Return the bandwidth of the sensors' attitude filter [rad/s], as the shortest number that gives its gains."""
     exact = float(sensors.bandwidth(period))
     interval = float(period) * sensors.every if sensors.own_times is None else float(sensors.own_times.interval)
-    wanted = float(sensors.filter.attitude_gain)
+    gain = float(sensors.filter.attitude_gain)
     for digits in range(3, 17):
         short = float(f"{exact:.{digits}g}")
-        if abs(float(filter_gains(short, interval)[0]) - wanted) < 1e-15:
+        if abs(float(filter_gains(short, interval)[0]) - gain) < 1e-15:
             return np.asarray(short)
     return np.asarray(exact)

@@ -128,7 +128,7 @@ def kind_of(dtype: Any) -> str:
 
 
 class Pool:
-    """Makes nodes in the current block."""
+    """Creates the nodes of expressions in the current block. Equal expressions in reach are one node."""
 
     def __init__(self) -> None:
         self.block = Block()

@@ -74,8 +74,8 @@ def on_flight_clock(scenario: Scenario) -> Scenario:
 
 def checksum(scenario: Scenario) -> str:
     """Return the SHA-256 of a scenario's tables with all defaults, and of the files that it names."""
-    said = json.dumps([parsing.dump(scenario), custom.checksums(scenario)], sort_keys=True, default=str)
-    return hashlib.sha256(said.encode()).hexdigest()
+    content = json.dumps([parsing.dump(scenario), custom.checksums(scenario)], sort_keys=True, default=str)
+    return hashlib.sha256(content.encode()).hexdigest()
 
 
 def identifier(text: str) -> str:

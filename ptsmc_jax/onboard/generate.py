@@ -198,8 +198,8 @@ def _titled(result: np.ndarray, name: str) -> None:
 
 
 def _documents(stage: Stage) -> list[str]:
-    said = [stage.about]
+    paragraphs = [stage.about]
     for part in stage.parts:
         for name, text in origins.documents(part, COMMON):
-            said += [" ".join(one.split()) for one in f"{name}: {text}".split("\n\n")]
-    return printing.comment("\n".join(said))
+            paragraphs += [" ".join(one.split()) for one in f"{name}: {text}".split("\n\n")]
+    return printing.comment("\n".join(paragraphs))

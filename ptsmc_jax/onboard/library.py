@@ -37,15 +37,15 @@ _loaded = itertools.count()
 
 def compiler() -> list[str]:
     """Return the command of the C compiler. Raises ScenarioError if there is none."""
-    said = os.environ.get("CC", "")
+    command = os.environ.get("CC", "")
     try:
-        named = shlex.split(said)
+        named = shlex.split(command)
     except ValueError as error:
-        raise ScenarioError(f"CC is {said}, but must be a command: {error}") from None
+        raise ScenarioError(f"CC is {command}, but must be a command: {error}") from None
     found = named or [name for name in ("cc", "gcc", "clang") if shutil.which(name)][:1]
     if not found or shutil.which(found[0]) is None:
         raise ScenarioError(
-            f"there is no C compiler{f' {said}' if said else ''}; allowed is cc, gcc or clang, or what CC names"
+            f"there is no C compiler{f' {command}' if command else ''}; allowed is cc, gcc or clang, or what CC names"
         )
     return found
 
@@ -292,7 +292,7 @@ class InTheLoop:
             inputs["applied"] = computer.applied[0]
         leaves = jax.tree.leaves([inputs[name] for name in self.board.inputs])
         row = jnp.concatenate([now.t[None], *map(jnp.ravel, leaves)])
-        after, out, status = self.library.called(state, row, self._told(parts))
+        after, out, status = self.library.called(state, row, self._changed_parameters(parts))
         has_length = period.length > 0.0
         after = jnp.where(has_length, after, state)
         other = SAMPLES.index("other")
@@ -311,14 +311,14 @@ class InTheLoop:
         """Return the number of samples of a run with each status."""
         return dict(zip(SAMPLES, computer.sensors[2], strict=True))
 
-    def _told(self, parts: Parts) -> Any:
+    def _changed_parameters(self, parts: Parts) -> Any:
         """Return the parameters (columns,) that a trial changes, with NaN for unchanged ones."""
-        told = jnp.full(len(self.library.columns["params"]), jnp.nan)
+        changed = jnp.full(len(self.library.columns["params"]), jnp.nan)
         drawn, nominal = (dict(jax.tree_util.tree_leaves_with_path(known(of))) for of in (parts, self.nominal))
         for path, at in self._columns.items():
             value = jnp.where(jnp.any(drawn[path] != nominal[path]), jnp.ravel(drawn[path]), jnp.nan)
-            told = told.at[at : at + value.size].set(value)
-        return told
+            changed = changed.at[at : at + value.size].set(value)
+        return changed
 
     def _with(self, state: Any, name: str, value: Any) -> Any:
         at = self.library.columns["state"].index(name + "[0]" * value.ndim)

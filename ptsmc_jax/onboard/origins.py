@@ -173,7 +173,7 @@ def documents(part: Any, until: tuple[type, ...]) -> list[tuple[str, str]]:
         if cls in until or cls.__module__ in ("builtins", "abc", "typing"):
             continue
         text = cls.__dict__.get("__doc__")
-        if text and not text.startswith(f"{cls.__name__}(") and text not in [said for _, said in texts]:
+        if text and not text.startswith(f"{cls.__name__}(") and text not in [known for _, known in texts]:
             texts.append((cls.__name__, inspect.cleandoc(text)))
     return texts
 

@@ -183,8 +183,8 @@ class Printer:
         if section is None or section == self.section:
             return []
         self.section = section
-        said = f"{section.name}, {section.place}" + (f": {section.about}" if section.about else "")
-        return ["", *comment(said, indent)]
+        title = f"{section.name}, {section.place}" + (f": {section.about}" if section.about else "")
+        return ["", *comment(title, indent)]
 
     def _branch(self, region: Region, indent: str) -> list[str]:
         live = [id(node) in self.nodes for node in region.results]

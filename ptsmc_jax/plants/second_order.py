@@ -231,8 +231,8 @@ def _check(name: str, function: Callable, arguments: tuple, shape: tuple[int, ..
             return jax.eval_shape(of, *arguments)
         except (Exception, SystemExit) as error:
             first_line = (str(error).splitlines() or [""])[0]
-            told = f"{first_line.rstrip('.')}; {INSTEAD}" if isinstance(error, TRACED) else first_line
-            failure = f"{type(error).__name__}: {told}"
+            reason = f"{first_line.rstrip('.')}; {INSTEAD}" if isinstance(error, TRACED) else first_line
+            failure = f"{type(error).__name__}: {reason}"
             raise ValueError(f"{name} {what} for x_1 and x_2 of shape ({n},): {failure}") from error
 
     returned = traced("fails", function)

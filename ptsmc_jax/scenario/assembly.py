@@ -60,7 +60,7 @@ def requirements(scenario: Scenario) -> tuple[Requirement, ...]:
             name,
             value.limit,
             units[name].unit,
-            value.share,
+            value.fraction,
             value.confidence,
             interpretation=value.interpretation or "ensemble",
         )

@@ -103,7 +103,7 @@ def attitude_key(table: Attitude) -> tuple[str, Any]:
 
 def at_most_one(name: str, table: Any) -> None:
     """Raise ScenarioError if a table has more than one attitude key; name: of the table, for errors."""
-    said = [key for key in ATTITUDE_KEYS if getattr(table, key) is not None]
-    if len(said) > 1:
-        two, allowed = " and ".join(said), ", ".join(ATTITUDE_KEYS)
+    present = [key for key in ATTITUDE_KEYS if getattr(table, key) is not None]
+    if len(present) > 1:
+        two, allowed = " and ".join(present), ", ".join(ATTITUDE_KEYS)
         raise ScenarioError(f"{name} has the attitude keys {two}, but must have exactly one of {allowed}")

@@ -60,21 +60,21 @@ def _check_limit(metric: str, limit: tables.Limit) -> None:
         raise ScenarioError(
             f"{key} has both quantile and probability, but must have only one of them: they mean the same"
         )
-    if limit.confidence is not None and limit.share is None:
+    if limit.confidence is not None and limit.fraction is None:
         raise ScenarioError(
             f"{key}.confidence is {limit.confidence}, but is allowed only together with quantile or probability"
         )
     if limit.interpretation in (None, "ensemble"):
         return
-    said = f"{key}.interpretation is {errors.show(limit.interpretation)}"
+    stated = f"{key}.interpretation is {errors.show(limit.interpretation)}"
     if metric not in catalogues.AT_A_TIME:
         known = ", ".join(catalogues.AT_A_TIME)
-        raise ScenarioError(f'{said}, but must be "ensemble": only {known} can be judged by a fraction of the time')
+        raise ScenarioError(f'{stated}, but must be "ensemble": only {known} can be judged by a fraction of the time')
     if limit.probability is None:
-        raise ScenarioError(f"{said}, which needs the key probability, the fraction of the time")
+        raise ScenarioError(f"{stated}, which needs the key probability, the fraction of the time")
     if limit.interpretation == "temporal" and limit.confidence is not None:
         raise ScenarioError(
-            f"{said}, which every simulated run must keep, but confidence is {limit.confidence}; "
+            f"{stated}, which every simulated run must keep, but confidence is {limit.confidence}; "
             'allowed is no confidence, or the interpretation "ensemble" or "mixed"'
         )
 

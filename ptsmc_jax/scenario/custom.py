@@ -227,14 +227,14 @@ def fastest(table: Any, name: str, part: Any) -> float:
     Raises:
         ScenarioError: the method does not return a number of at least 0.
     """
-    said = table.made.fastest(part)
+    returned = table.made.fastest(part)
     try:
-        rate = float(said)
+        rate = float(returned)
     except (TypeError, ValueError):
         rate = math.nan
     if not rate >= 0.0:
-        other = "nothing" if said is None else f"a {type(said).__name__}"
-        shown = brief(said) if isinstance(said, int | float | str) else other
+        other = "nothing" if returned is None else f"a {type(returned).__name__}"
+        shown = brief(returned) if isinstance(returned, int | float | str) else other
         raise ScenarioError(
             f"{name}.code is the class {table.made.__name__}, whose method fastest returns {shown}, but must return an "
             "angular frequency of at least 0 rad/s"

@@ -68,7 +68,7 @@ class _Asked:
 
     def __init__(self, name: str, table: Any):
         shown = brief(table.code) if isinstance(table.code, str) else table.made.__name__
-        self._said, self._made = f"{name}.code is {shown}, but its", table.made
+        self._beginning, self._made = f"{name}.code is {shown}, but its", table.made
 
     def __call__(self, method: str, function: Callable, *args: Any) -> Any:
         try:
@@ -80,8 +80,8 @@ class _Asked:
             check_indices(function, *args)
             return returned
         except (Exception, SystemExit) as error:
-            told = what_fails(error, inspect.getsourcefile(self._made) or "")
-            raise ScenarioError(f"{self._said} {method} {told}") from None
+            reason = what_fails(error, inspect.getsourcefile(self._made) or "")
+            raise ScenarioError(f"{self._beginning} {method} {reason}") from None
 
     def refused(self, method: str, returns: str, must: str) -> ScenarioError:
         """Return the error for a returned value.
@@ -91,7 +91,7 @@ class _Asked:
             returns: description of the returned value.
             must: description of the required value.
         """
-        return ScenarioError(f"{self._said} {method} returns {returns} at t = 0, but must return {must}")
+        return ScenarioError(f"{self._beginning} {method} returns {returns} at t = 0, but must return {must}")
 
     def check(self, method: str, what: str, value: Any, shape: tuple[int, ...]) -> None:
         """Raise ScenarioError if a value is not an array, not finite, or of another shape.

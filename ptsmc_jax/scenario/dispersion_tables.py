@@ -20,7 +20,7 @@ from ptsmc_jax.scenario.custom_devices import CUSTOM_DRAW
 from ptsmc_jax.scenario.values import Four, Kinds, Meaning, NotNegative, NotNegatives, Positive, Table, Three, Truth
 
 Angle = Annotated[float, Meta(ge=0, le=180, description="an angle from 0 to 180 degrees")]
-Share = Annotated[float, Meta(ge=0, le=0.3, description="a number from 0 to 0.3")]
+SmallFraction = Annotated[float, Meta(ge=0, le=0.3, description="a number from 0 to 0.3")]
 BelowOne = Annotated[float, Meta(ge=0, lt=1, description="a number from 0 to below 1")]
 
 
@@ -135,7 +135,7 @@ NormalFactor = _numbers(
     "relative standard deviation",
     "",
     0.1,
-    Share,
+    SmallFraction,
 )
 UniformFactor = _numbers(
     "UniformFactor",
@@ -206,7 +206,7 @@ class RelativeInertia(Table, frozen=True):
 
     farthest: ClassVar[float] = 3.0  # largest deviation of a moment, over std
     kind: Literal["relative_normal"] = "relative_normal"
-    std: Annotated[Share, Meaning("relative standard deviation")] = 0.05
+    std: Annotated[SmallFraction, Meaning("relative standard deviation")] = 0.05
     axes_deg: Annotated[NotNegative, Meaning("1 sigma of the small rotation of the principal axes", "deg")] = 0.0
 
     def build(self, parts: Any, count: int) -> Any:

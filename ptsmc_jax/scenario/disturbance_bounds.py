@@ -204,7 +204,7 @@ def _attitudes(scenario: Any, t: np.ndarray, left: np.ndarray) -> Any:
     off = attitude.multiply(attitude.conjugate(target[0]), start)
     off = off * jnp.where(off[3] < 0.0, -1.0, 1.0)
     turned = attitude.rotation_vector(off[:3])
-    q = jax.vmap(lambda one, share: attitude.multiply(one, attitude.from_rotation_vector(share * turned)))(
+    q = jax.vmap(lambda one, fraction: attitude.multiply(one, attitude.from_rotation_vector(fraction * turned)))(
         target, jnp.asarray(left)
     )
     q_dot = jnp.asarray(np.gradient(np.asarray(q), t, axis=0))

@@ -68,21 +68,21 @@ def _check(scenario: Scenario, tune: tables.Tune) -> None:
         raise wrong("tune.free", free, "a list that names each gain once")
     if not set(free) <= {*tables.FREE, *present}:
         raise wrong("tune.free", free, tables.FREE_ALLOWED)
-    said = f"tune.free is {errors.brief(free)}, but"
+    beginning = f"tune.free is {errors.brief(free)}, but"
     for name in free:
         if name not in present:
-            raise ScenarioError(f"{said} {_absent(scenario, name)}")
+            raise ScenarioError(f"{beginning} {_absent(scenario, name)}")
     if "t_f" in free and observer_follows(scenario):
-        raise ScenarioError(f"{said} observer.t_o then follows t_f; allowed is t_f with observer.t_o given")
+        raise ScenarioError(f"{beginning} observer.t_o then follows t_f; allowed is t_f with observer.t_o given")
     if tune.per_axis and "observer_gain" not in free:
         raise ScenarioError(f"tune.per_axis is true, but tune.free is {errors.brief(free)}, without observer_gain")
-    _check_objective(scenario, tune, said)
+    _check_objective(scenario, tune, beginning)
     for name in tune.bounds:
         _check_bounds(Choice(scenario, free, tune.bounds), name)
 
 
-def _check_objective(scenario: Scenario, tune: tables.Tune, said: str) -> None:
-    """Raise ScenarioError if the objective is not possible; said: the beginning of a message about tune.free."""
+def _check_objective(scenario: Scenario, tune: tables.Tune, beginning: str) -> None:
+    """Raise ScenarioError if the objective is not possible; beginning: the first words of a message about tune.free."""
     if tune.level is not None and tune.statistic not in tables.LEVELS:
         raise ScenarioError(
             f'tune.level is {tune.level}, but is allowed only with tune.statistic = "quantile" or "cvar"'
@@ -90,7 +90,7 @@ def _check_objective(scenario: Scenario, tune: tables.Tune, said: str) -> None:
     shown = f"tune.minimise is {errors.show(tune.minimise)}"
     if tune.minimise in (tables.T_F, tables.LIMITS):
         if tune.minimise == tables.T_F and "t_f" not in tune.gains:
-            raise ScenarioError(f'{said} tune.minimise = "t_f" needs t_f to be free')
+            raise ScenarioError(f'{beginning} tune.minimise = "t_f" needs t_f to be free')
         if not scenario.requirements:
             raise ScenarioError(
                 f"{shown}, but there is no requirement; allowed is a metric, or [requirements] with one"
@@ -172,7 +172,7 @@ def _present_values(scenario: Scenario, name: str) -> tuple[float, ...]:
     return value if isinstance(value, tuple) else (float(value),)
 
 
-def border(scenario: Scenario, name: str, side: str, bound: float) -> str | None:
+def reason_of_bound(scenario: Scenario, name: str, side: str, bound: float) -> str | None:
     """Return the reason, in words, why a gain beyond a bound is useless; None if no reason is known.
 
     A reason is known only for a bound that is at or beyond the usual bound.
@@ -207,11 +207,11 @@ def beyond(scenario: Scenario, name: str, side: str) -> float | None:
         side: "lower" or "upper".
 
     Returns:
-        The value, or None if `border` knows the reason of the bound or if no value beyond it is allowed.
+        The value. None: `reason_of_bound` gives a reason, or no value beyond the bound is allowed.
     """
     tune = scenario.search
     low, high = tune.bounds[name]
-    if border(scenario, name, side, low if side == "lower" else high) is not None:
+    if reason_of_bound(scenario, name, side, low if side == "lower" else high) is not None:
         return None
     least, most, _ = gain_bounds.of(scenario, name).allowed(Choice(scenario, tune.gains, tune.bounds))
     if wide(low, high):
@@ -241,7 +241,7 @@ def widened(
     for name, side in sides.items():
         low, high = tune.bounds[name]
         by_default = ("tune", "bounds", name) in defaulted
-        if not by_default or border(scenario, name, side, low if side == "lower" else high) is not None:
+        if not by_default or reason_of_bound(scenario, name, side, low if side == "lower" else high) is not None:
             continue
         least, most, _ = gain_bounds.of(scenario, name).allowed(Choice(scenario, tune.gains, tune.bounds))
         if name == "delta":  # the upper bound stays: the clock has samples for it only

@@ -103,8 +103,8 @@ def _declared(declared: Declaration, called: str) -> GainBounds:
             ends: Any = usual(choice.t_f, choice.scenario.loop.period) if callable(usual) else usual
             low, high = (float(end) for end in ends)
         except (Exception, SystemExit) as error:
-            said = f"{type(error).__name__}: {error}"
-            raise ScenarioError(f"the usual bounds of the {called} fail: {said}") from None
+            reason = f"{type(error).__name__}: {error}"
+            raise ScenarioError(f"the usual bounds of the {called} fail: {reason}") from None
         if not (limits.above < low < high < limits.below and limits.at_least <= low and high <= limits.at_most):
             raise ScenarioError(
                 f"the usual bounds of the {called} are [{low:g}, {high:g}], but must be two "
@@ -112,8 +112,8 @@ def _declared(declared: Declaration, called: str) -> GainBounds:
             )
         return low, high
 
-    near_border = "so large that the sampled loop comes near its border of stability"
-    return GainBounds(interval, lambda _: allowed, above=near_border if getattr(usual, "sampled", False) else None)
+    near_limit = "so large that the sampled loop comes near its stability limit"
+    return GainBounds(interval, lambda _: allowed, above=near_limit if getattr(usual, "sampled", False) else None)
 
 
 def _converged(scenario: Any) -> float:
@@ -192,7 +192,7 @@ def _usual_gamma(choice: Choice) -> Interval:
 
 
 def _allowed_gamma(choice: Choice) -> Allowed:
-    """Return the gamma with gamma - 1/p > 1 for every p of the search."""
+    """Return the allowed values of gamma: gamma - 1/p > 1 must hold for every p within its bounds."""
     return Allowed(1.0 + 1.0 / choice.smallest("p"), math.inf)
 
 
@@ -239,7 +239,7 @@ BOUNDS = {
         below="a narrower one is lost in the noise, or hops from side to side",
         above="so wide that hardly a switching term is left",
     ),
-    "k1": GainBounds(_usual_k1, above="the stability border of the sampled loop"),
+    "k1": GainBounds(_usual_k1, above="the stability limit of the sampled loop"),
     "surface_rate": GainBounds(_usual_rate, above="half of the stability limit of the sampled hold phase"),
     "dead_beat": GainBounds(_dead_beat, above="a dead-beat observer: nothing of its error is left after a period"),
     "finite_time": GainBounds(_usual_bound, _allowed_bound),

@@ -74,8 +74,8 @@ def _struct(struct: type[Table], unit_of_d: str, name: str = "") -> Schema:
 
 
 def _object(description: str, properties: Schema, *, more: bool = False) -> Schema:
-    said = {"type": "object", "description": description}
-    return {**said, "properties": properties, "additionalProperties": more}
+    head = {"type": "object", "description": description}
+    return {**head, "properties": properties, "additionalProperties": more}
 
 
 def _leaf(hint: Any) -> Schema:

@@ -115,9 +115,9 @@ def bare(kind: Any) -> Any:
 
 def allowed(kind: Any) -> str:
     """Return the values that a type allows, in words."""
-    said = next((one.description for one in getattr(kind, "__metadata__", ()) if isinstance(one, msgspec.Meta)), None)
-    if said is not None:
-        return said
+    limits = next((one for one in getattr(kind, "__metadata__", ()) if isinstance(one, msgspec.Meta)), None)
+    if limits is not None and limits.description is not None:
+        return limits.description
     kind = bare(kind)
     if typing.get_origin(kind) in (types.UnionType, typing.Union):
         return " or ".join(dict.fromkeys(allowed(k) for k in typing.get_args(kind) if k is not type(None)))

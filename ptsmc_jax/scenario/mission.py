@@ -124,7 +124,7 @@ class Design(NamedTuple):
 
     @property
     def rate(self) -> float:
-        """Factor on the published rates of laws whose gains scale with 1 / t_f [-], at most 2 p."""
+        """Factor on published gains that scale with 1 / t_f: 1 / `time`, but at most the number 2 p in 1/s."""
         return min(1.0 / self.time, 2.0 * self.pole)
 
 

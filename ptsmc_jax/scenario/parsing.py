@@ -127,8 +127,8 @@ def _check_shape(raw: Mapping[str, Any]) -> None:
             if isinstance(value, Mapping):
                 for key, within in value.items():
                     if not (isinstance(key, str) and key.isprintable() and 0 < len(key) <= LONGEST_KEY):
-                        said = brief(key) if isinstance(key, str) else repr(key)
-                        raise ScenarioError(f"{top or 'the scenario'} has the key {said}, which is not a known one")
+                        shown = brief(key) if isinstance(key, str) else repr(key)
+                        raise ScenarioError(f"{top or 'the scenario'} has the key {shown}, which is not a known one")
                     inside.append((top or key, within))
             elif isinstance(value, list | tuple):
                 inside += [(top, within) for within in value]
@@ -201,17 +201,17 @@ def stated(scenario: Scenario) -> dict[str, Any]:
     return tables
 
 
-def not_said(raw: Mapping[str, Any], tables: Mapping[str, Any]) -> dict[tuple[str, ...], Any]:
+def unstated(raw: Mapping[str, Any], tables: Mapping[str, Any]) -> dict[tuple[str, ...], Any]:
     """Return the values of keys in `tables` that `raw` does not have, by the path of the key."""
-    unsaid: dict[tuple[str, ...], Any] = {}
+    missing: dict[tuple[str, ...], Any] = {}
     for key, value in tables.items():
         if isinstance(value, Mapping):
             within = raw.get(key, {})
-            inside = not_said(within if isinstance(within, Mapping) else {}, value)
-            unsaid |= {(key, *path): one for path, one in inside.items()}
+            inside = unstated(within if isinstance(within, Mapping) else {}, value)
+            missing |= {(key, *path): one for path, one in inside.items()}
         elif key not in raw:
-            unsaid[(key,)] = value
-    return unsaid
+            missing[(key,)] = value
+    return missing
 
 
 def plain(table: Table) -> dict[str, Any]:
@@ -281,7 +281,10 @@ def _table(name: str, raw: Mapping[str, Any], kinds: type[Table] | Kinds, contex
 
 
 def _custom(name: str, raw: Mapping[str, Any], struct: Any, context: Context) -> Table:
-    """Return the table of a custom part. It has the keys of its class if the code may run or is a class already."""
+    """Return the table of a custom part.
+
+    It has the keys of its class only if the class is given as an object or if its file may be executed.
+    """
     code = raw.get("code")
     if code is None:
         raise ScenarioError(f"{name}.code is absent, but must be given: {systems.WHERE}")
@@ -422,8 +425,8 @@ def _in_words(name: str, value: Any, struct: type[Table], kind: Any, context: Co
     Other values are returned unchanged.
     """
     several = isinstance(value, list | tuple)
-    said = isinstance(value, str) or (several and any(isinstance(one, str) for one in value))
-    if not said or name in layouts.KINDS or _fits(value, kind):
+    has_text = isinstance(value, str) or (several and any(isinstance(one, str) for one in value))
+    if not has_text or name in layouts.KINDS or _fits(value, kind):
         return value
     key = name.rpartition(".")[2]
     unit = next((one.unit for one in keys.of(struct, context.plant.unit_of_d) if one.name == key), "")
@@ -450,8 +453,8 @@ def _fields(
     hints = typing.get_type_hints(struct, include_extras=True)
     for key in raw:
         _check_known(name, key, struct, context, kinds)
-    said = {key: _in_words(f"{name}.{key}", value, struct, hints[key], context) for key, value in raw.items()}
-    return struct(**{key: _key(f"{name}.{key}", value, hints[key], context) for key, value in said.items()})
+    values = {key: _in_words(f"{name}.{key}", value, struct, hints[key], context) for key, value in raw.items()}
+    return struct(**{key: _key(f"{name}.{key}", value, hints[key], context) for key, value in values.items()})
 
 
 def _check_known(name: str, key: str, struct: type[Table], context: Context, kinds: Kinds | None = None) -> None:

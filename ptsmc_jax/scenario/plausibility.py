@@ -62,14 +62,14 @@ def _fast_surface(scenario: Scenario) -> list[str]:
     if not scenario.sampled or law.kind != "prescribed_time" or scenario.order != 2:
         return []
     period, delay = scenario.loop.period, scenario.devices.delay_periods
-    share = getattr(law, "a", (1.0,))[0]  # the surface of a chain has the rate c a_1
-    border = stability_limits.largest_surface(delay, implicit=law.implicit) / (share * period)
-    if law.surface_rate < border:
+    first_coefficient = getattr(law, "a", (1.0,))[0]  # the surface of a chain has the rate c a_1
+    stability_limit = stability_limits.largest_surface(delay, implicit=law.implicit) / (first_coefficient * period)
+    if law.surface_rate < stability_limit:
         return []
     late = f" and a delay of {delay}" if delay else ""
     return [
         f"controller.surface_rate is {law.surface_rate:g} 1/s: at a period of {period:g} s{late} no k1 stabilises "
-        f"the hold phase; use a surface_rate below {border:.3g} 1/s, or add it to tune.free"
+        f"the hold phase; use a surface_rate below {stability_limit:.3g} 1/s, or add it to tune.free"
     ]
 
 

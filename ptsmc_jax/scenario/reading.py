@@ -53,7 +53,7 @@ def _checked(raw: Mapping[str, Any], run: bool) -> Scenario:
     checks.check(scenario)
     if scenario.tune is not None and not custom.waits(scenario):
         scenario = msgspec.structs.replace(scenario, tune=free_gains.resolve(scenario, scenario.tune))
-    return msgspec.structs.replace(scenario, defaulted=parsing.not_said(raw, parsing.dump(scenario)))
+    return msgspec.structs.replace(scenario, defaulted=parsing.unstated(raw, parsing.dump(scenario)))
 
 
 def resolve(scenario: Scenario) -> Scenario:
@@ -86,7 +86,11 @@ def resolve(scenario: Scenario) -> Scenario:
 
 
 def complete(scenario: Scenario) -> Scenario:
-    """Return a scenario with the keys and gains of its custom parts, whose code is run; raise ScenarioError."""
+    """Return a scenario with the keys and gains of its custom parts. It executes their code.
+
+    Raises:
+        ScenarioError: the code fails, or a key is not valid.
+    """
     return from_tables(parsing.stated(scenario), run=True) if custom.waits(scenario) else scenario
 
 

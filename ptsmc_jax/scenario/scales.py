@@ -13,7 +13,7 @@ from ptsmc_jax.scenario import mission
 from ptsmc_jax.theory import stability_limits
 
 LEFT = 5e-5  # remaining fraction of an error after one period that counts as deadbeat
-SHARE = 0.05  # relative change of the mean derivative of the sign at s = 0 that counts as no influence
+NEGLIGIBLE = 0.05  # relative change of the mean derivative of the sign at s = 0 that counts as no influence
 WIDEST = 1e4  # thickest boundary layer over the noise of s: the switching term then nearly vanishes
 QUIET = (1e-2, 1e2)  # thinnest and thickest boundary layer without noise, over the default one
 
@@ -44,8 +44,8 @@ def largest_k1(scenario: Any, surface_rate: float) -> float:
     h = scenario.loop.period
     delay = float(scenario.devices.delay_periods)
     implicit = scenario.controller.implicit
-    border = stability_limits.largest_reaching(surface_rate * h, delay, implicit=implicit)
-    reaching = min(border, math.log(1.0 / LEFT)) / h
+    limit = stability_limits.largest_reaching(surface_rate * h, delay, implicit=implicit)
+    reaching = min(limit, math.log(1.0 / LEFT)) / h
     return scenario.reaching * reaching
 
 
@@ -54,9 +54,9 @@ def narrowest_that_matters(noise: float) -> float:
 
     Averaged over Gaussian noise n, tanh((s + n) / width) has the derivative sqrt(2 / pi) / noise at s = 0, times
     1 - (pi^2 / 24) (width / noise)^2. The first factor belongs to the discontinuous sign. The function returns the
-    width at which the second factor is 1 - `SHARE`.
+    width at which the second factor is 1 - `NEGLIGIBLE`.
     """
-    return math.sqrt(24.0 * SHARE) / math.pi * noise
+    return math.sqrt(24.0 * NEGLIGIBLE) / math.pi * noise
 
 
 def largest_rate(scenario: Any) -> float:

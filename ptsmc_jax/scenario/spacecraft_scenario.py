@@ -124,20 +124,21 @@ class Flexible(Table, frozen=True):
         rows: Any = getattr(drawn, "mode_coupling", None)
         moments: Any = getattr(drawn, "inertia", None)
         longest = smallest = 1.0
-        said, body = "", ""
+        stated, body = "", ""
         if getattr(moments, "std", 0.0) > 0.0:
             smallest = 1.0 - moments.farthest * moments.std
-            said, body = f"dispersion.inertia.std is {moments.std}", f", and moments {smallest:.6g} times as large"
+            stated, body = f"dispersion.inertia.std is {moments.std}", f", and moments {smallest:.6g} times as large"
         if rows is not None and not rows.nothing:
             longest = 1.0 + rows.farthest * float(rows.of()[0])
-            said = f"dispersion.mode_coupling.{rows.width} is {getattr(rows, rows.width)}"
-        if not said:
+            stated = f"dispersion.mode_coupling.{rows.width} is {getattr(rows, rows.width)}"
+        if not stated:
             return
         try:
             formulas.rest_inertia(smallest * formulas.check_inertia(inertia), longest * np.asarray(self.coupling))
         except ValueError as error:
             raise ScenarioError(
-                f"{said}, but with rows {longest:.6g} times those of flexible.coupling{body}, as may be drawn, {error}"
+                f"{stated}, but with rows {longest:.6g} times those of flexible.coupling{body}, "
+                f"which a trial may have, {error}"
             ) from None
 
 
@@ -385,9 +386,9 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
             return {}
         wheels = setup.actuators.wheels
         least, middle, largest = np.linalg.eigvalsh(np.asarray(setup.plant.inertia))
-        shares = {
+        each = {
             "wheels.momentum": np.linalg.norm(np.asarray(wheels.axes) @ np.asarray(wheels.initial)),
             **{key: largest * rate for key, rate in self._turning.items()},
             "disturbance.amplitude": sum(term.impulse(self.end) for term in self.terms),
         }
-        return {key: float(share) / math.sqrt(least * middle) for key, share in shares.items()}
+        return {key: float(moment) / math.sqrt(least * middle) for key, moment in each.items()}

@@ -34,7 +34,7 @@ class _Ran(NamedTuple):
     helpers: dict[str, str | None]  # files beside it that were imported, by path: their SHA-256
 
 
-_NO_SLOPES = re.compile("support JVP|Differentiation rule for")  # in JAX's messages for code without derivatives
+_NO_DERIVATIVES = re.compile("support JVP|Differentiation rule for")  # in JAX's messages for code without derivatives
 _files: set[str] = set()  # real paths of all files that were run
 _ran: dict[tuple[str, str], _Ran] = {}  # by path and SHA-256, so that a changed file is run again
 # helper modules that custom files imported from their own folder: path and SHA-256 by name
@@ -115,7 +115,7 @@ def at_fault(error: BaseException) -> str | None:
     JAX reports leaked tracers and missing derivatives later, when no custom file is in the traceback. All custom files
     that were run are then returned, joined by "or".
     """
-    if type(error).__name__ == "UnexpectedTracerError" or _NO_SLOPES.search(str(error)):
+    if type(error).__name__ == "UnexpectedTracerError" or _NO_DERIVATIVES.search(str(error)):
         return " or ".join(sorted(_files)) or None
     walked = [os.path.realpath(frame.f_code.co_filename) for frame, _ in traceback.walk_tb(error.__traceback__)]
     return next((file for file in reversed(walked) if file in _files), None)

@@ -115,7 +115,7 @@ class Limit(Table, frozen=True):
     ] = None
 
     @property
-    def share(self) -> float | None:
+    def fraction(self) -> float | None:
         """The required fraction, given as `quantile` or as `probability`."""
         return self.quantile if self.probability is None else self.probability
 

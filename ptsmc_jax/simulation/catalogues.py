@@ -43,7 +43,7 @@ CATALOGUE = {
         for axis, where in AXES.items()
     },
     **{
-        f"{WITHIN}{name}": Entry("-", f"share of the observation in which {name} is within its limit", "pointing")
+        f"{WITHIN}{name}": Entry("-", f"fraction of the observation in which {name} is within its limit", "pointing")
         for name in AT_A_TIME
     },
 }
@@ -71,7 +71,7 @@ ANGLE_UNITS = {"spacecraft": "rad", "chain": "x1", "system": "x1"}  # of the col
 
 
 class Margin(NamedTuple):
-    """A margin of the loop, see `margins`."""
+    """Unit and meaning of a stability margin, see `theory.margins`."""
 
     unit: str
     meaning: str
@@ -79,9 +79,9 @@ class Margin(NamedTuple):
 
 
 MARGINS = {
-    "gain_margin": Margin("dB", "factor on the gain, up or down, to the border of stability"),
-    "phase_margin": Margin("deg", "phase, either way, to the border of stability"),
-    "delay_margin": Margin("s", "further delay to the border of stability"),
+    "gain_margin": Margin("dB", "factor on the gain, up or down, to the stability limit"),
+    "phase_margin": Margin("deg", "phase, either way, to the stability limit"),
+    "delay_margin": Margin("s", "further delay to the stability limit"),
     "peak_sensitivity": Margin(
         "dB", "peak sensitivity M_s = max |S|: 1 / the smallest distance of L from -1", at_least=False
     ),
@@ -94,12 +94,12 @@ def units(kind: str) -> dict[str, str]:
     return {name: entry.unit for name, entry in CATALOGUES[kind].items()} | {"initial_angle": ANGLE_UNITS[kind]}
 
 
-def percent(share: float) -> str:
+def percent(fraction: float) -> str:
     """Return a fraction in per cent, with three digits of it or of its difference to 100 %.
 
     >>> percent(59 / 60), percent(0.99973), percent(1.0), percent(0.000412), percent(0.5)
     ('98.33', '99.973', '100', '0.0412', '50')
     """
-    nearest = 100.0 * min(share, 1.0 - share)
+    nearest = 100.0 * min(fraction, 1.0 - fraction)
     decimals = min(2 - math.floor(math.log10(nearest)), 8) if nearest > 0.0 else 1
-    return f"{100.0 * share:.{decimals}f}".rstrip("0").rstrip(".")
+    return f"{100.0 * fraction:.{decimals}f}".rstrip("0").rstrip(".")

@@ -69,8 +69,8 @@ class Anchored:
         t, t_next = nodes[:-1], nodes[1:]
         # decided by the start of the period: by rounding its fraction of a complete period may be 1 or more
         partial = ~begun[:-1]
-        share = jnp.where(partial, (t_next - t) / self.period, 1.0)
-        return Ticks(t, t_next, sample >= 0, sample, share, partial)
+        fraction = jnp.where(partial, (t_next - t) / self.period, 1.0)
+        return Ticks(t, t_next, sample >= 0, sample, fraction, partial)
 
 
 @pytree
@@ -109,7 +109,9 @@ class Graded:
     window: Leaf  # [s]
     max_step: Leaf  # largest step [s]
     saves: Leaf  # (m,) further nodes [s]
-    before: int = field(metadata={"static": True})  # steps before the hand-over, more than t_s / max_step
+    before: int = field(
+        metadata={"static": True}
+    )  # number of steps before the hand-over at t_s; more than t_s / max_step
     after: int = field(metadata={"static": True})  # steps after it
     sampled: ClassVar[bool] = False
     anchored: ClassVar[bool] = False

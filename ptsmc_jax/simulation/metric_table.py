@@ -141,10 +141,10 @@ def _settled_at(memory: Array, interval: Interval, criteria: Criteria) -> Array:
 def _variation(memory: Array, interval: Interval, errors: Errors, criteria: Criteria) -> Array:
     """Return the total variation of the torque delivered from t_f on, (m,) [N m]."""
     delivered = interval.torques.delivered
-    by_rounding = guards.time_tolerance(interval.length, criteria.t_f)  # the jump of a sample at t_f must not count
-    jump = jnp.where(interval.t > criteria.t_f + by_rounding, jnp.abs(delivered[0] - interval.last_torque), 0.0)
+    tolerance = guards.time_tolerance(interval.length, criteria.t_f)  # the jump of a sample at t_f must not count
+    jump = jnp.where(interval.t > criteria.t_f + tolerance, jnp.abs(delivered[0] - interval.last_torque), 0.0)
     inside = sum((jnp.abs(v - u) for u, v in pairwise(delivered)), start=jnp.zeros_like(jump))
-    return memory + jump + jnp.where(interval.t >= criteria.t_f - by_rounding, inside, 0.0)
+    return memory + jump + jnp.where(interval.t >= criteria.t_f - tolerance, inside, 0.0)
 
 
 def _chattering(memory: Array, running: Running, criteria: Criteria) -> Array:

@@ -175,7 +175,7 @@ class Segments(NamedTuple):
         """Return the time in which the error minus its mean is beyond limits [s]; NaN if a segment was dropped."""
 
         def of_segment(ends: Array, length: Scalar) -> Array:
-            return length * _share_beyond(_sizes(ends[0] - mean), _sizes(ends[1] - mean), limits)
+            return length * _fraction_beyond(_sizes(ends[0] - mean), _sizes(ends[1] - mean), limits)
 
         total = jnp.sum(jax.vmap(of_segment)(self.ends, self.lengths), axis=0)
         return jnp.where(self.filled > self.lengths.size, jnp.nan, total)
@@ -245,27 +245,27 @@ def update(
         limits: on the error, on its means and on the relative error, about each axis and of the half-cone [rad].
     """
     length = error.length
-    share = jnp.clip((begins - t) / length, 0.0, 1.0)  # fraction of the interval before the observation
+    since = jnp.clip((begins - t) / length, 0.0, 1.0)  # fraction of the interval before the observation
     window_end = begins + (tally.windows + 1.0) * window
-    until = jnp.clip((window_end - t) / length, share, 1.0)  # where the window ends in the interval
+    until = jnp.clip((window_end - t) / length, since, 1.0)  # where the window ends in the interval
     by_rounding = guards.time_tolerance(window, t_next)
     observed = t_next > begins + by_rounding
     closes = observed & (window_end <= t_next + by_rounding)
-    first, last = error.at(share), error.at(until)
+    first, last = error.at(since), error.at(until)
     # the start of the observation counts; later intervals begin at the end of the one before
     opens = t <= begins + guards.time_tolerance(window, t)
     opened = guards.select(opens, tally.window.including(first), tally.window)
     largest = jnp.where(opens, jnp.maximum(tally.largest, _sizes(first)), tally.largest)
-    integral = opened.integral + error.integral(until) - error.integral(share)
+    integral = opened.integral + error.integral(until) - error.integral(since)
     segments = opened.segments
     if segments is not None:
-        segments = segments.added(first, last, length * (until - share))
+        segments = segments.added(first, last, length * (until - since))
     present = opened._replace(integral=integral, segments=segments).including(last)
     first_sizes, end_sizes = _sizes(first), _sizes(error.end)
     still_open = tally._replace(
         largest=jnp.maximum(largest, end_sizes),
         window=present,
-        beyond=tally.beyond + length * (1.0 - share) * _share_beyond(first_sizes, end_sizes, limits[0]),
+        beyond=tally.beyond + length * (1.0 - since) * _fraction_beyond(first_sizes, end_sizes, limits[0]),
     )
 
     def closed() -> Tally:
@@ -318,7 +318,7 @@ def _sizes_of(projections: Array) -> Array:
     return jnp.append(projections[:3], jnp.max(projections[3:]) / np.cos(0.5 * np.pi / DIRECTIONS))
 
 
-def _share_beyond(start: Array, end: Array, limits: Array) -> Array:
+def _fraction_beyond(start: Array, end: Array, limits: Array) -> Array:
     """Return the fraction of an interval in which sizes are beyond limits, if they are linear between its ends."""
     within, within_next = start <= limits, end <= limits
     uncrossed = jnp.where(within & within_next, 0.0, 1.0)

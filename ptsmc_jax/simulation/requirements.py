@@ -57,8 +57,8 @@ def violation_ratio(values: Any, limit: Any, *, at_least: bool) -> Any:
     """
     zero = limit == 0.0
     with np.errstate(over="ignore"):
-        share = (values + zero * (values > 0.0)) / (limit + zero)
-    return 2.0 - share.clip(max=2.0) if at_least else share
+        ratio = (values + zero * (values > 0.0)) / (limit + zero)
+    return 2.0 - ratio.clip(max=2.0) if at_least else ratio
 
 
 # interpretations of a probability (ECSS-E-ST-60-10C): the quantile is a fraction of ...
@@ -112,27 +112,28 @@ class Verdict:
         """The verdict in one line."""
         return self._of_trials() if self.fraction_of_time is None else self._of_time(self.fraction_of_time)
 
-    def _of_time(self, share: float) -> str:
+    def _of_time(self, fraction: float) -> str:
         assert self.quantile is not None
         most = f"{self.limit:g} {self.unit}{_in_degrees(self.limit, self.unit)}"
-        wanted = f"{self.metric} at most {most} in {100 * self.quantile:g} % of {INTERPRETATIONS[self.interpretation]}"
+        whole = INTERPRETATIONS[self.interpretation]
+        requirement = f"{self.metric} at most {most} in {100 * self.quantile:g} % of {whole}"
         met = "met" if self.met else "NOT met"
         if self.interpretation == "temporal":
             beyond = "" if self.met or self.trials == 1 else f", {self.failures} of {self.trials} runs have less"
-            return f"{wanted}: the least of a run is {percent(share)} %: {met}{beyond}"
-        seen = f"{percent(share)} %"
+            return f"{requirement}: the least of a run is {percent(fraction)} %: {met}{beyond}"
+        seen = f"{percent(fraction)} %"
         if self.confidence is not None and self.shown is not None:
             seen += f", at least {percent(self.shown)} % at {100 * self.confidence:g} % confidence"
-        return f"{wanted}: {seen}: {met}"
+        return f"{requirement}: {seen}: {met}"
 
     def _of_trials(self) -> str:
         failures, trials, worst = self.failures, self.trials, self.worst
         each = "loops" if self.metric in MARGINS else "trials"  # margins may be computed for more loops than trials
-        wanted = f"{self.metric} at {'least' if self.at_least else 'most'} {self.limit:g} {self.unit}".rstrip(" -")
-        wanted += _in_degrees(self.limit, self.unit)
+        requirement = f"{self.metric} at {'least' if self.at_least else 'most'} {self.limit:g} {self.unit}".rstrip(" -")
+        requirement += _in_degrees(self.limit, self.unit)
         if self.quantile is not None:
-            wanted += f" in {100 * self.quantile:g} % of trials"
-            wanted += f" with {100 * self.confidence:g} % confidence" if self.confidence is not None else ""
+            requirement += f" in {100 * self.quantile:g} % of trials"
+            requirement += f" with {100 * self.confidence:g} % confidence" if self.confidence is not None else ""
         if self.at_least and not failures and not math.isfinite(worst):
             seen = "unlimited"  # an infinite margin, which JSON cannot store
         elif math.isnan(worst):
@@ -143,11 +144,11 @@ class Verdict:
         least = must_keep(trials, self.quantile, self.confidence)
         if least is None and self.quantile is not None and self.confidence is not None:
             few = fewest_trials(self.quantile, self.confidence)
-            return f"{wanted}: {seen}: NOT shown, which takes at least {few} trials"
+            return f"{requirement}: {seen}: NOT shown, which takes at least {few} trials"
         if self.met:
-            return f"{wanted}: {seen}: met" + (f", beyond it {failures} of {trials} {each}" if failures else "")
+            return f"{requirement}: {seen}: met" + (f", beyond it {failures} of {trials} {each}" if failures else "")
         allowed = f", at most {trials - least} allowed" if least is not None and trials > least else ""
-        return f"{wanted}: {seen}: NOT met" + (f" in {failures} of {trials} {each}{allowed}" if trials > 1 else "")
+        return f"{requirement}: {seen}: NOT met" + (f" in {failures} of {trials} {each}{allowed}" if trials > 1 else "")
 
 
 def _in_degrees(value: float, unit: str) -> str:

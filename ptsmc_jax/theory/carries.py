@@ -57,8 +57,8 @@ class _Stored:
     def retract(self, x: Any, z: Array) -> Array:
         """Return the wheel momenta (wheels,) [N m s] with coordinates z (wheels,) at the true state x."""
         near, total = self._h + z, self._total_there + self._on_body(z)
-        wanted = attitude.rotate(attitude.conjugate(x.q), total) - self._plant.momentum(x)
-        return near + self._inverse(wanted - self._on_body(near))
+        wheel_momentum = attitude.rotate(attitude.conjugate(x.q), total) - self._plant.momentum(x)
+        return near + self._inverse(wheel_momentum - self._on_body(near))
 
     def local_coordinates(self, x: Any, h: Array) -> Array:
         """Return the coordinates (wheels,) of wheel momenta h (wheels,) [N m s] at the true state x."""

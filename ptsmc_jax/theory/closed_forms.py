@@ -135,7 +135,6 @@ def from_modes(t: Scalar, t_f: Scalar, eta: Scalar, y: list[Scalar], size=lambda
     falling = [jnp.ones_like(eta)]
     for k in range(len(y)):
         falling.append(-falling[-1] * (eta - k))
-    slopes = [size(falling[p] * r ** (eta - p) * t_f**-p) for p in range(len(y))]
-    return [
-        sum((math.comb(k, j) * slopes[k - j] * y[j] for j in range(k + 1)), jnp.zeros_like(r)) for k in range(len(y))
-    ]
+    derivatives = [size(falling[p] * r ** (eta - p) * t_f**-p) for p in range(len(y))]
+    zero = jnp.zeros_like(r)
+    return [sum((math.comb(k, j) * derivatives[k - j] * y[j] for j in range(k + 1)), zero) for k in range(len(y))]

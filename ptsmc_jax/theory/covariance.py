@@ -91,11 +91,11 @@ def _mean_width(width: float, sigma: float) -> float:
     """Return the equivalent width: 1 / E[sech^2(s / width) / width] for Gaussian s with deviation sigma."""
     if sigma == 0.0:
         return width
-    share = width / sigma
-    if share < 1.0:  # the integration grid _AT is in units of the narrower function, sech^2 or the Gaussian density
-        weighed = np.exp(-((share * _AT) ** 2) / 2.0) @ _SLOPE
+    ratio = width / sigma
+    if ratio < 1.0:  # the integration grid _AT is in units of the narrower function, sech^2 or the Gaussian density
+        weighed = np.exp(-((ratio * _AT) ** 2) / 2.0) @ _SLOPE
     else:
-        weighed = _GAUSS @ (1.0 / np.cosh(_AT / share) ** 2) / share
+        weighed = _GAUSS @ (1.0 / np.cosh(_AT / ratio) ** 2) / ratio
     return sigma / float(weighed * (_AT[1] - _AT[0]) / np.sqrt(2.0 * np.pi))
 
 
@@ -109,12 +109,12 @@ class _Rows(NamedTuple):
         """Return the output covariance (rows, rows), given p (size, size), the state covariance before the sample."""
         return self.state @ p @ self.state.T + self.noise @ self.noise.T
 
-    def at(self, j: int, other: "_Rows | None" = None, share: float = 0.0) -> "_Rows":
-        """Return the map of period j, interpolated linearly toward `other` by the fraction `share` (0: this map)."""
+    def at(self, j: int, other: "_Rows | None" = None, fraction: float = 0.0) -> "_Rows":
+        """Return the map of period j, interpolated linearly toward `other` by the fraction `fraction` (0: this map)."""
         mine = _Rows(self.state[j], self.noise[j])
         if other is None:
             return mine
-        return _Rows(*(a + share * (b[j] - a) for a, b in zip(mine, other, strict=True)))
+        return _Rows(*(a + fraction * (b[j] - a) for a, b in zip(mine, other, strict=True)))
 
 
 class _State:
@@ -204,13 +204,13 @@ def _covariance(parts: Parts, ticks: Any, opened: linear.Opened, sign: _Sign | N
     for j, length in enumerate(lengths):
         s = sliding.at(j).covariance(p)
         squares[j] = square(opened.error[j]), 0.0, np.mean(np.diag(s))
-        share = 0.0
+        fraction = 0.0
         if sign is not None:
             widths[j] = _mean_width(sign.simulated, min(float(np.sqrt(squares[j, 2])) / sign.units[j], BEYOND))
-            share = sign.widths[j] / widths[j] if widths[j] > 0.0 else 1.0
-        commanded = command.at(j, sloped[0], share).covariance(p)
+            fraction = sign.widths[j] / widths[j] if widths[j] > 0.0 else 1.0
+        commanded = command.at(j, sloped[0], fraction).covariance(p)
         torque = max(torque, float(np.sqrt(np.diag(commanded).max())))
-        later = moved.at(j, sloped[1], share)
+        later = moved.at(j, sloped[1], fraction)
         p = p + np.diag((state.walk * length) ** 2)
         squares[j, 1] = np.trace(_middle(opened, j, float(length), later, state.plant).covariance(p))
         p = later.covariance(p) + np.diag((state.drift * length) ** 2)

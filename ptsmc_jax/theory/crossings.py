@@ -164,7 +164,7 @@ def brackets(w: Array, seen: Array) -> Brackets:
     how_far = (more, less, jnp.where(even, jnp.abs(phase), jnp.inf), nearest)
     values, places = zip(*map(smallest, how_far), strict=True)
     j, k = jnp.concatenate(places[:3]), jnp.maximum(places[3], 1)
-    slope = (near[1:] - near[:-1]) / jnp.where(w[1:] == w[:-1], 1.0, w[1:] - w[:-1]) / 2
+    derivative = (near[1:] - near[:-1]) / jnp.where(w[1:] == w[:-1], 1.0, w[1:] - w[:-1]) / 2
 
     def crossed(at: Array) -> Array:
         return jnp.append(turned[at][: SPLIT[0]], size[at][SPLIT[0] :])
@@ -172,8 +172,8 @@ def brackets(w: Array, seen: Array) -> Brackets:
     return Brackets(
         low=jnp.append(w[j], w[k - 1]),
         high=jnp.append(w[j + 1], w[k + 1]),
-        at_low=jnp.append(crossed(j), slope[k - 1]),
-        at_high=jnp.append(crossed(j + 1), slope[k]),
+        at_low=jnp.append(crossed(j), derivative[k - 1]),
+        at_high=jnp.append(crossed(j + 1), derivative[k]),
         there=jnp.isfinite(jnp.concatenate(values)),
         elsewhere=w[jnp.stack([jnp.argmin(near), 0, -1])],
     )
@@ -203,8 +203,8 @@ def real_at(seen: Array) -> tuple[Array, Array]:
     at 1. Sign changes of Im L at a pole on the unit circle, where L is infinite, are ignored as well.
     """
     real, imag = seen.real, seen.imag
-    share = imag[:-1] / jnp.where(imag[:-1] == imag[1:], 1.0, imag[:-1] - imag[1:])
-    crossing = real[:-1] + share * (real[1:] - real[:-1])
+    fraction = imag[:-1] / jnp.where(imag[:-1] == imag[1:], 1.0, imag[:-1] - imag[1:])
+    crossing = real[:-1] + fraction * (real[1:] - real[:-1])
     limit = 10.0 ** (MOST / 20.0)
     there = (imag[:-1] * imag[1:] < 0.0) & (crossing < -1.0 / limit) & (crossing > -limit) & ~_through_infinity(seen)
     return there, -jnp.log(jnp.where(there, -crossing, 1.0))
@@ -223,9 +223,9 @@ def _through_infinity(seen: Array) -> Array:
 
 def unit_gain_at(seen: Array) -> tuple[Array, Array]:
     """Return the intervals in which |L| crosses 1, bool, and the phase from -1 to L there, in (-pi, pi] [rad]."""
-    there, share = _unit_gain_crossings(seen)
+    there, fraction = _unit_gain_crossings(seen)
     turned = jnp.angle(seen[1:] / seen[:-1])
-    return there, jnp.angle(-seen[:-1] * jnp.exp(1j * share * turned))
+    return there, jnp.angle(-seen[:-1] * jnp.exp(1j * fraction * turned))
 
 
 def _unit_gain_crossings(seen: Array) -> tuple[Array, Array]:

@@ -32,7 +32,7 @@ from ptsmc_jax.theory.crossings import MOST
 FEWEST = 16  # Smallest number of full hold periods for a decision.
 TURNS, SLOWEST = 4, 40  # Smallest number of reversals of the command, and largest number of samples between them.
 STAYS = 0.75  # Smallest ratio of the activity in the second half of the examined periods to that in the first half.
-SHARE = 0.1  # Smallest fraction of the oscillation that the linearisation does not explain.
+BEYOND = 0.1  # Smallest fraction of a limit cycle that the linearised loop does not explain.
 ROUNDING = 1e-8  # Rounding error, relative to the largest command.
 
 
@@ -81,7 +81,8 @@ def find(parts: Parts, seen: History | None = None) -> LimitCycle | None:
     if not suspect.any():
         return None
     off, size = (np.asarray(v)[last] for v in _unexplained(parts, linear.nominal_jit(parts) if run is None else run))
-    suspect &= _oscillates(off, SHARE * np.abs(off).max(axis=0)) & (np.ptp(off, axis=0) > SHARE * np.ptp(size, axis=0))
+    suspect &= _oscillates(off, BEYOND * np.abs(off).max(axis=0))
+    suspect &= np.ptp(off, axis=0) > BEYOND * np.ptp(size, axis=0)
     if not suspect.any():
         return None
     return max(_measured(u[last, axis], off[:, axis]) for axis in np.flatnonzero(suspect))

@@ -306,13 +306,15 @@ class _Linear(NamedTuple):
     `now` has all readings of a sensor suite, assuming that they are taken at the start of the period.
     """
 
-    move: Array  # (periods, n, n) State at the end, by z.
-    push: Array  # (periods, n, m) State at the end, by p.
-    seen: Array  # (periods, 3 m, n) Error, by z.
-    seen_push: Array  # (periods, 3 m, m) Error, by p.
-    early: Array  # (periods, k, n) By z; no rows if all readings are taken at control samples.
-    early_push: Array  # (periods, k, m) By p.
-    now: Array  # (periods, readings, n) By z; no rows without a sensor suite.
+    move: Array  # (periods, n, n) Derivative of the state at the end by z.
+    push: Array  # (periods, n, m) Derivative of the state at the end by p.
+    seen: Array  # (periods, 3 m, n) Derivative of the error by z.
+    seen_push: Array  # (periods, 3 m, m) Derivative of the error by p.
+    early: (
+        Array  # (periods, k, n) Derivative of the sensed state by z; no rows if readings are at control samples only.
+    )
+    early_push: Array  # (periods, k, m) Derivative of the sensed state by p.
+    now: Array  # (periods, readings, n) Derivative of the readings by z; no rows without a sensor suite.
 
 
 @programs.jit(compiler_options=programs.QUICKLY)
@@ -322,9 +324,9 @@ def _linear(parts: Parts, log: Log, ticks: Ticks) -> _Linear:
     before, after = (jax.tree.map(lambda v, k=k: v[k : v.shape[0] - 1 + k], log.x) for k in (0, 1))
 
     def acted(state: Any, now: tuple) -> tuple:
-        tick, x, wanted = now
+        tick, x, commanded = now
         dt = tick.t_next - tick.t
-        drive, queue = actuators.command(state, wanted, plant.velocity(x), tick.t, dt, tick.noise_weight)
+        drive, queue = actuators.command(state, commanded, plant.velocity(x), tick.t, dt, tick.noise_weight)
         return actuators.end(state, drive, queue, dt), drive
 
     _, drives = stacking.scan(acted, actuators.begin(plant.inputs), (ticks, before, log.commanded[:-1]))

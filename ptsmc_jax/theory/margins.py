@@ -230,7 +230,7 @@ def _axis(root: Array, L: Array, slope: Array, there: Array, stable: Array, lowe
         lowest: lowest frequency of the grid [rad/s].
     """
     crosses = SPLIT[1]
-    ends = L[-2:]  # a gain can move a pole to 1 or to -1 there
+    ends = L[-2:]  # L at w = 0 and at the Nyquist frequency, where a gain can move a pole to 1 or to -1
     on_ends = crossings.ends_at(ends.at[0].add(-lowest * slope[-2]))  # extrapolated to w = 0, which slow loops need
     slope = slope[:crosses]
     fall = jnp.append(slope[: SPLIT[0]].imag, (slope / L[:crosses]).real[SPLIT[0] :])
@@ -352,8 +352,8 @@ def _delay_step(loop: Loop, of_a: tuple[Array, Array], axis: Array, x: Array) ->
         far = jnp.stack([jnp.log(jnp.abs(value)), jnp.angle(value)])
         return far, far
 
-    slopes, far = jax.jacfwd(off, has_aux=True)(x)
-    (a, b), (c, d) = jax.lax.stop_gradient(slopes)
+    jacobian, far = jax.jacfwd(off, has_aux=True)(x)
+    (a, b), (c, d) = jax.lax.stop_gradient(jacobian)
     by = jnp.stack([d * far[0] - b * far[1], a * far[1] - c * far[0]]) / (a * d - b * c)  # Cramer's rule
     most = jnp.stack([0.2 * jnp.ones_like(a), 0.5 + 0.1 * jnp.abs(x[1])])
     return jnp.clip(by, -most, most)

@@ -92,8 +92,8 @@ def residual_error(acceleration: Scalar, eta: Scalar, delta: Scalar) -> tuple[Sc
         eta: exponent of the law [-].
         delta: time between the hand-over and t_f [s].
     """
-    share = 1.0 / (eta - 2.0) ** 2
-    return acceleration * delta**2 * share, acceleration * delta**2 * (0.5 - share)
+    factor = 1.0 / (eta - 2.0) ** 2
+    return acceleration * delta**2 * factor, acceleration * delta**2 * (0.5 - factor)
 
 
 def ramp_error(

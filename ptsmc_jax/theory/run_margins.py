@@ -21,7 +21,8 @@ from ptsmc_jax.theory.linear import Loop
 from ptsmc_jax.theory.margins import FIELDS, Margins
 
 SLOWEST = 10  # Shortest time to go in periods. The gains then change by a tenth from one period to the next.
-TIMES, SHARE = 4, 0.25  # Number of times at which margins are judged, and the longest time to go as a fraction of t_f.
+TIMES = 4  # number of times to go at which margins are computed
+LONGEST = 0.25  # longest of them, as a fraction of t_f
 
 
 class Course(NamedTuple):
@@ -57,21 +58,22 @@ def judged_times(parts: Parts) -> Float[Array, " times"]:
     """Return times to go [s] at which a loop with frozen gains is meaningful, shortest first, logarithmically spaced.
 
     The shortest is at the hand-over, where gains are largest, but at least `SLOWEST` periods. The gains then change by
-    at most a tenth from one sample to the next. The longest is the fraction `SHARE` of t_f, where the settling time of
-    the loop equals the time to go. The times are differentiable by t_f and delta.
+    at most a tenth from one sample to the next. The longest is the fraction `LONGEST` of t_f. There the settling time
+    of the loop equals the time to go. The times are differentiable by t_f and delta.
     """
     law = parts.controller
     shortest = jnp.maximum(law.delta, SLOWEST * parts.period)
-    longest = jnp.maximum(SHARE * law.t_f, shortest)
+    longest = jnp.maximum(LONGEST * law.t_f, shortest)
     return shortest * (longest / shortest) ** (jnp.arange(TIMES) / (TIMES - 1))
 
 
 def moments(parts: Parts, run: linear.Nominal, times: Array) -> Array:
-    """Return the numbers of the full control periods nearest to some times to go, and of one period in the hold phase.
+    """Return the indices of the full control periods nearest to some times to go, and of one period in the hold phase.
 
-    If there is no full period before the hand-over, all are the period in the hold phase. The latter is the last one.
-    If the loop diverges, it is the last one whose initial error is at most twice the error at the hand-over. If loops
-    are averaged over a star tracker's interval, this interval must fit into the hold phase.
+    The period in the hold phase is the last period of the run. If the loop diverges, it is the last period whose
+    initial error is at most twice the error at the hand-over. If loops are averaged over a star tracker's interval,
+    this interval must fit into the hold phase. If there is no full period before the hand-over, every index is the
+    index of the period in the hold phase.
 
     Args:
         parts: the sampled scenario.

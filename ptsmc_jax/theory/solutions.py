@@ -48,8 +48,8 @@ def state_envelope(t: Scalar, t_f: Scalar, eta: Scalar, x0: Vector, s0: Scalar, 
     widths = []
     for j in range(n):
         p = n - 2 - j
-        share = 1.0 / ((eta - n / 2 + j) * math.factorial(p)) if p >= 0 else 1.0
-        left = scale * share * tau**-j * (t_f / tau) ** eta
+        factor = 1.0 / ((eta - n / 2 + j) * math.factorial(p)) if p >= 0 else 1.0
+        left = scale * factor * tau**-j * (t_f / tau) ** eta
         widths.append(jnp.abs(s0 * forced[j]) + left)
     centre = from_modes(t, t_f, eta, free)[:n]
     half = from_modes(t, t_f, eta, [*widths, jnp.zeros_like(tau)], jnp.abs)[:n]
@@ -108,7 +108,7 @@ def visited(parts: Setup) -> tuple[Array, Any]:
 
 @programs.jit
 def _visited(parts: Setup) -> tuple[Array, Any]:
-    law, share = parts.controller, jnp.linspace(0.0, 1.0, VISITED)
+    law, fractions = parts.controller, jnp.linspace(0.0, 1.0, VISITED)
     none = (jnp.zeros(parts.plant.inputs),) * 3
 
     def on_the_way(t: Scalar) -> tuple[Any, Any]:
@@ -119,8 +119,8 @@ def _visited(parts: Setup) -> tuple[Array, Any]:
         target = parts.reference(t)
         return target, plant_motion(law.kinematics, target, parts.initial, none).x
 
-    early = lapack.vmap(on_the_way)(law.t_f - law.t_f * (law.delta / law.t_f) ** share)
-    late = lapack.vmap(at_rest)(parts.t_end * share)
+    early = lapack.vmap(on_the_way)(law.t_f - law.t_f * (law.delta / law.t_f) ** fractions)
+    late = lapack.vmap(at_rest)(parts.t_end * fractions)
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), early, late)
 
 

@@ -100,7 +100,7 @@ def implicit_gains(eta: float, tau: float) -> tuple[float, float]:
 
     They solve (1 - 1/tau)^eta s = s_0 + g a, see `laws.prescribed_time.PrescribedTimeLaw.next_s`:
 
-        kp = eta (1 - share) / g,  kd = (tau - 1 + eta - share tau) / g,  share = (1 - 1/tau)^eta,  g = tau - 1 + eta/2
+        kp = eta (1 - decay) / g,  kd = (tau - 1 + eta - decay tau) / g,  decay = (1 - 1/tau)^eta,  g = tau - 1 + eta/2
 
     On s = 0 a period multiplies the error by
 
@@ -112,8 +112,8 @@ def implicit_gains(eta: float, tau: float) -> tuple[float, float]:
         eta: exponent of the law [-].
         tau: time to go in periods.
     """
-    share, g = (1.0 - 1.0 / tau) ** eta, tau - 1.0 + eta / 2
-    return eta * (1.0 - share) / g, (tau - 1.0 + eta - share * tau) / g
+    decay, g = (1.0 - 1.0 / tau) ** eta, tau - 1.0 + eta / 2
+    return eta * (1.0 - decay) / g, (tau - 1.0 + eta - decay * tau) / g
 
 
 def largest_index(eta: float, delay: float = 0.0, *, implicit: bool = False) -> float:
@@ -164,10 +164,10 @@ def largest_surface(delay: int = 0, *, implicit: bool = False) -> float:
         delay: d, delay of the command in whole periods.
         implicit: whether the law uses implicit sampling.
     """
-    border = 2.0 * float(np.sin(np.pi / (4 * delay + 2)))
+    limit = 2.0 * float(np.sin(np.pi / (4 * delay + 2)))
     if not implicit:
-        return border
-    return border / (1.0 - border / 2) if delay else float("inf")
+        return limit
+    return limit / (1.0 - limit / 2) if delay else float("inf")
 
 
 def largest_reaching(surface: float, delay: float = 0.0, *, implicit: bool = False) -> float:

@@ -303,8 +303,8 @@ def test_the_lower_bound_of_delta_is_one_period_and_a_message_names_it_if_delta_
     made = from_tables({"controller": {"delta": delta}, "loop": {"mode": "sampled", "period": 0.02}, "tune": {}})
     assert made.tune is not None
     assert made.tune.bounds["delta"] == (0.02, 7.5)  # t_f / 4
-    assert "one period" in str(free_gains.border(made, "delta", "lower", 0.02))
-    assert free_gains.border(made, "delta", "lower", 0.05) is None
+    assert "one period" in str(free_gains.reason_of_bound(made, "delta", "lower", 0.02))
+    assert free_gains.reason_of_bound(made, "delta", "lower", 0.05) is None
 
 
 def test_default_bounds_are_widened_on_the_side_where_a_gain_ended():

@@ -151,7 +151,7 @@ def test_loop_that_is_unstable_in_the_approach_phase_is_not_called_stable(judged
     """Earlier, with a period of t_f / 2, the page called a loop with -1.9 dB and -180 deg stable."""
     left = dict.fromkeys(("gain_up", "gain_down", "phase", "delay", "peak_sensitivity"), 6.0)
     summary = {
-        "stable": True, "open": [], "cut": [], "said": None, "hold": {"u1": left}, "together": left, "sensors": {},
+        "stable": True, "open": [], "cut": [], "note": None, "hold": {"u1": left}, "together": left, "sensors": {},
         "before": [{"time_to_go": 1.0, "judged": judged, "stable": False, "open": [], "cut": []}],
         "worst": {"gain_margin": -1.9, "phase_margin": None, "delay_margin": None, "peak_sensitivity": None},
     }  # fmt: skip
@@ -189,7 +189,9 @@ def test_diverged_nominal_run_has_nan_margins_in_maps_and_is_refused_by_margins(
     for left, radius in run_margins.at_ends(lost.parts).values():
         assert np.isnan([radius, *left.gain_up, *left.delay]).all()
     monkeypatch.setattr(stability, "study", lambda _: lost)
-    with pytest.raises(ScenarioError, match="nominal run, which ends diverged: the state, the torque"):
+    with pytest.raises(
+        ScenarioError, match="nominal run that reaches its end, but it ends diverged: the state, the torque"
+    ):
         stability.find(lost.scenario)
 
 
@@ -200,7 +202,7 @@ def test_nominal_run_near_the_singularity_is_refused(monkeypatch):
     assert course.singularity_distance == 1.0  # a chain's law has no singularity
     stability.find(ready.scenario)
     monkeypatch.setattr(run_margins, "along", lambda _: course._replace(singularity_distance=0.9e-3))
-    with pytest.raises(ScenarioError, match="which ends singular: the law's singularity came nearer than 1e-3"):
+    with pytest.raises(ScenarioError, match="but it ends singular: the law's singularity came nearer than 1e-3"):
         stability.find(ready.scenario)
 
 

@@ -112,14 +112,14 @@ def montecarlo(
     Exit status: 0 every requirement met (without requirements: every trial converged at t_f), 1 not met, 2
     configuration error or a full disk, 130 interrupted.
     """
-    share = _shard(shard)
+    this_shard = _shard(shard)
     tls_files = {"tls_ca_file": tls_ca, "tls_client_cert": tls_cert, "tls_client_key": tls_key}
     tls = {name: str(path) for name, path in tls_files.items() if path is not None}
-    confident, clustered, a_part = until_confident is not None, cluster is not None, share != (1, 1) or dry_run
+    confident, clustered, a_part = until_confident is not None, cluster is not None, this_shard != (1, 1) or dry_run
     for refused, sentence in (
         (tls and not clustered, "--tls-ca, --tls-cert and --tls-key need --cluster"),
         (
-            common.force and share != (1, 1),
+            common.force and this_shard != (1, 1),
             "--force starts the whole campaign again, which would delete the rows of other shards, and does not go "
             "with --shard; remove the folder before the first shard starts, or choose another with --out",
         ),
@@ -162,7 +162,7 @@ def montecarlo(
     if folder.computer is not None:
         flight_commands.say_otherwise(folder.computer)
 
-    shared = share != (1, 1) and not dry_run
+    shared = this_shard != (1, 1) and not dry_run
     with resumable(common.force), store.in_use(folder.path, shared=shared), _elsewhere(cluster, tls) as elsewhere:
         campaign_folder.begin(folder, common.force)
         with CampaignProgress(common.quiet) as report:
@@ -170,22 +170,22 @@ def montecarlo(
                 campaign_folder.write_run_table(folder, report)
                 done = folder
             else:
-                done = _simulated(folder, share, report, elsewhere, until_confident)
+                done = _simulated(folder, this_shard, report, elsewhere, until_confident)
         if not a_part:
             return _summarised(done, common.quiet, common.figures)
     if not common.quiet:
-        _say_share(done, share, dry_run=dry_run)
+        _print_shard(done, this_shard, dry_run=dry_run)
     return 0
 
 
-def _say_share(folder: "Folder", share: tuple[int, int], *, dry_run: bool) -> None:
+def _print_shard(folder: "Folder", this_shard: tuple[int, int], *, dry_run: bool) -> None:
     """Print that a shard of a campaign, or its run table, is done."""
     if dry_run:
         terminal.say(f"run table of {folder.trials} trials in {folder.dry.folder}; nothing was simulated")
         return
     there = sum(part.count for part in folder.rows.parts()[0])
     terminal.say(
-        f"shard {share[0]}/{share[1]} done: {there} of {folder.trials} trials are in {folder.path}",
+        f"shard {this_shard[0]}/{this_shard[1]} done: {there} of {folder.trials} trials are in {folder.path}",
         "when all are there, in this folder or gathered into one: ptsmc summarize DIR",
     )
 
@@ -201,7 +201,7 @@ def _elsewhere(cluster: str | None, tls: dict[str, str]) -> "contextlib.Abstract
 
 def _simulated(
     folder: "Folder",
-    share: tuple[int, int],
+    this_shard: tuple[int, int],
     report: CampaignProgress,
     elsewhere: "Cluster | None",
     width: float | None,
@@ -211,12 +211,12 @@ def _simulated(
 
     campaign_theory.prepare(folder)
     if width is None:
-        campaign_folder.simulate(folder, share, report, elsewhere)
+        campaign_folder.simulate(folder, this_shard, report, elsewhere)
     else:
         from tuning.studies import campaign_summary  # imported during the simulation
 
         stopped = campaign_summary.until_confident(
-            folder, width, lambda first: campaign_folder.simulate(folder, share, report, elsewhere, first)
+            folder, width, lambda first: campaign_folder.simulate(folder, this_shard, report, elsewhere, first)
         )
         folder = campaign_folder.settle(folder, stopped)
     campaign_theory.find(folder)
@@ -355,12 +355,12 @@ def _summarised(folder: "Folder", quiet: bool, figures: bool, *, write: bool = T
 def _shard(value: str) -> tuple[int, int]:
     trial, _, of = value.partition("/")
     try:
-        share = int(trial), int(of)
+        parsed = int(trial), int(of)
     except ValueError:
-        share = (0, 0)
-    if not 1 <= share[0] <= share[1]:
+        parsed = (0, 0)
+    if not 1 <= parsed[0] <= parsed[1]:
         raise UsageError(f"--shard is {value}, but must be I/N with I from 1 to N")
-    return share
+    return parsed
 
 
 COMMANDS = (montecarlo, summarize, worst, replay)

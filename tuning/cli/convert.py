@@ -48,7 +48,7 @@ def lines(q: np.ndarray, sequence: str | None = None) -> list[str]:
     order = SEQUENCE if sequence is None else sequence
     turn = Rotation.from_quat(q)
     x, y, z, w = (float(v) for v in q)
-    vector = np.round(turn.as_rotvec(degrees=True), DIGITS)  # of a whole turn there is rounding left
+    vector = np.round(turn.as_rotvec(degrees=True), DIGITS)  # a whole turn is 0 up to rounding
     angle = float(np.linalg.norm(vector))
     try:
         with warnings.catch_warnings(record=True) as caught:

@@ -93,9 +93,9 @@ The keys of other kinds follow a table, and replace the keys of its kind."""
 class _File:
     """The lines of a scenario file."""
 
-    def __init__(self, said: Scenario, resolved: Scenario):
+    def __init__(self, stated: Scenario, resolved: Scenario):
         self.resolved, self.plant = resolved, resolved.plant.kind
-        self.live = parsing.as_parsed(said)
+        self.live = parsing.as_parsed(stated)
         self.values = parsing.dump(resolved)
         # with the gains that are known without running custom code
         default = parsing.plain(free_gains.resolve(resolved, Tune()))
@@ -235,12 +235,12 @@ def text(plant: str | None, raw: Mapping[str, Any]) -> str:
         raise UsageError(f"--plant is {plant}, but must be {' or '.join(layouts.TABLES)}")
     kind = plant or "spacecraft"
     given = raw or {"plant": {"kind": kind, **({"system": EXAMPLES["plant.system"]} if kind == "system" else {})}}
-    said = parsing.parse(given)
-    if plant not in (None, said.plant.kind):
-        raise UsageError(f"--plant is {plant}, but the scenario of --like has plant.kind = {said.plant.kind}")
+    stated = parsing.parse(given)
+    if plant not in (None, stated.plant.kind):
+        raise UsageError(f"--plant is {plant}, but the scenario of --like has plant.kind = {stated.plant.kind}")
     # the file of the system does not exist yet, so the scenario cannot be checked
-    resolved = reading.resolve(said) if kind == "system" and not raw else scenario.from_tables(given)
-    return "\n".join(_File(said, resolved).lines()) + "\n"
+    resolved = reading.resolve(stated) if kind == "system" and not raw else scenario.from_tables(given)
+    return "\n".join(_File(stated, resolved).lines()) + "\n"
 
 
 def _meaning(key: keys.Key) -> str:

@@ -79,7 +79,7 @@ def spread(point: Point) -> str:
 
 
 def answers(front: Front) -> Iterator[str]:
-    """Return the errors that a user chooses between, and their costs."""
+    """Return the main results: errors of a few points of the front, with their torque, margins or time."""
     yield from {"torque": _of_torque, "margins": _of_margins, "t_f": _of_times}[front.against](front)
 
 

@@ -45,7 +45,7 @@ def table(summary: Margins) -> Table:
 
 
 def _lines(summary: Margins) -> Iterator[str]:
-    """Return what limits the meaning of the margins."""
+    """Return the conditions under which the margins hold, and warnings."""
     if summary.stable and not summary.open:
         yield "these are the smallest margins at any input, in the hold phase and the frozen approach phase"
     if summary.limit_cycle is not None:
@@ -66,8 +66,8 @@ def _lines(summary: Margins) -> Iterator[str]:
         if times:
             yield f"in the approach phase, the loop with frozen gains is unstable at {_span(times)}{caveat}"
     yield from _openings(summary)
-    if summary.said:
-        yield summary.said
+    if summary.note:
+        yield summary.note
 
 
 def _openings(summary: Margins) -> Iterator[str]:

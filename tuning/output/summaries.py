@@ -349,7 +349,7 @@ class Margins(msgspec.Struct, frozen=True, kw_only=True):
     before: list[Frozen]
     not_converged: bool = False
     dispersed: int | None = None
-    said: str | None
+    note: str | None
     start_deg: Number = None
     limit_cycle: LimitCycle | None = None
 

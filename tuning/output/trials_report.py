@@ -19,8 +19,8 @@ ROUND_OFF = 1e-9  # relative: the programs of a campaign and of a run with its h
 
 def worst(frame: "pl.DataFrame", by: str, plant: str) -> Table:
     """Return the table of the worst trials by a metric, the worst first; plant: its kind."""
-    wanted = ("trial", "status", by, "window_error", "peak_torque", "settling_time", "initial_angle")
-    names = [name for name in dict.fromkeys(wanted) if name in frame.columns]
+    columns = ("trial", "status", by, "window_error", "peak_torque", "settling_time", "initial_angle")
+    names = [name for name in dict.fromkeys(columns) if name in frame.columns]
     rows = [
         tuple("-" if v is None else f"{v:.5g}" if isinstance(v, float) else str(v) for v in row)
         for row in frame.select(names).iter_rows()

@@ -120,7 +120,7 @@ class Evaluator:
     def _metrics_with_gradients(self, problem: Problem, normalised: np.ndarray) -> dict[str, np.ndarray]:
         gains, along = self._gains(normalised)
         values = simulations.simulate_with_derivatives(problem.batch, gains, along, watched(problem))
-        return {"gains": gains, **_in_calls(partial(_judged_slopes, problem.rules), gains, along, *values)}
+        return {"gains": gains, **_in_calls(partial(_judged_derivatives, problem.rules), gains, along, *values)}
 
     def _gains(self, normalised: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the gains, (points, gains), and their derivatives by the normalised gains, (points, gains, gains)."""
@@ -155,14 +155,14 @@ _ADDRESS = re.compile("0x[0-9a-f]+")  # address of a custom function, different 
 
 def _request(kind: bytes, problem: Problem, normalised: np.ndarray) -> bytes:
     leaves, structure = jax.tree.flatten(problem)
-    said = _ADDRESS.sub("", str(structure)).encode()
-    return b"|".join([kind, normalised.tobytes(), said, *(np.asarray(leaf).tobytes() for leaf in leaves)])
+    described = _ADDRESS.sub("", str(structure)).encode()
+    return b"|".join([kind, normalised.tobytes(), described, *(np.asarray(leaf).tobytes() for leaf in leaves)])
 
 
 @programs.jit(compiler_options=programs.QUICKLY)
 def _gains(normalised: jax.Array, scale: Scale) -> dict[str, jax.Array]:
-    slopes = jax.vmap(jax.jacfwd(scale.gains))(normalised)
-    return {"gains": jax.vmap(scale.gains)(normalised), "along": jnp.swapaxes(slopes, 1, 2)}
+    derivatives = jax.vmap(jax.jacfwd(scale.gains))(normalised)
+    return {"gains": jax.vmap(scale.gains)(normalised), "along": jnp.swapaxes(derivatives, 1, 2)}
 
 
 @programs.jit(compiler_options=programs.QUICKLY)
@@ -171,20 +171,20 @@ def _judged(rules: Rules, gains: jax.Array, metrics: jax.Array, status: jax.Arra
 
 
 @programs.jit(compiler_options=programs.QUICKLY)
-def _judged_slopes(
-    rules: Rules, gains: jax.Array, along: jax.Array, metrics: jax.Array, status: jax.Array, slopes: jax.Array
+def _judged_derivatives(
+    rules: Rules, gains: jax.Array, along: jax.Array, metrics: jax.Array, status: jax.Array, derivatives: jax.Array
 ) -> dict[str, jax.Array]:
     """Return F, constraints and objective with gradients, by the chain rule from gradients of gains and metrics."""
 
-    def one(gains: jax.Array, along: jax.Array, metrics: jax.Array, status: jax.Array, slopes: jax.Array) -> dict:
+    def one(gains: jax.Array, along: jax.Array, metrics: jax.Array, status: jax.Array, derivatives: jax.Array) -> dict:
         def of(gains: jax.Array, metrics: jax.Array) -> tuple:
             f, c, value = judge(rules, gains, metrics, status)
             return (f, c), value
 
         (f, c), value = of(gains, metrics)
         f_gradient, c_gradient = jax.vmap(
-            lambda by, slope: jax.jvp(of, (gains, metrics), (by, slope), has_aux=True)[1], in_axes=(0, 1), out_axes=-1
-        )(along, slopes)
+            lambda by, change: jax.jvp(of, (gains, metrics), (by, change), has_aux=True)[1], in_axes=(0, 1), out_axes=-1
+        )(along, derivatives)
         return {"f": f, "c": c, "value": value, "f_gradient": f_gradient, "c_gradient": c_gradient}
 
-    return jax.vmap(one)(gains, along, metrics, status, slopes)
+    return jax.vmap(one)(gains, along, metrics, status, derivatives)

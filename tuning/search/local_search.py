@@ -271,8 +271,8 @@ def _compressed(seen: MeasuredWithGradients, steepest: float) -> tuple[np.ndarra
     """
     c = ended(seen.c).reshape(-1)
     excess = np.maximum(c, 0.0)
-    slopes = seen.c_gradient.reshape(c.size, -1) / (1.0 + excess)[:, None]
-    return np.where(c > 0.0, np.log1p(excess), c), _clipped(slopes, steepest)
+    gradients = seen.c_gradient.reshape(c.size, -1) / (1.0 + excess)[:, None]
+    return np.where(c > 0.0, np.log1p(excess), c), _clipped(gradients, steepest)
 
 
 def multipliers(at: MeasuredWithGradients, normalised: np.ndarray) -> np.ndarray:
@@ -286,15 +286,15 @@ def multipliers(at: MeasuredWithGradients, normalised: np.ndarray) -> np.ndarray
     """
     c, inside = ended(at.c[0]), (normalised > 0.0) & (normalised < 1.0)
     active = np.flatnonzero(c.max(axis=1, initial=-1.0) > -ACTIVE)
-    slopes = at.c_gradient[0, active, c[active].argmax(axis=1)]
+    gradients = at.c_gradient[0, active, c[active].argmax(axis=1)]
     estimate = np.zeros(len(c))
     if active.size and inside.any():
-        estimate[active] = nnls(_clipped(slopes)[:, inside].T, -_clipped(at.f_gradient)[0, inside])[0]
+        estimate[active] = nnls(_clipped(gradients)[:, inside].T, -_clipped(at.f_gradient)[0, inside])[0]
     return estimate
 
 
-def _clipped(slopes: np.ndarray, steepest: float = STEEPEST) -> np.ndarray:
+def _clipped(gradients: np.ndarray, steepest: float = STEEPEST) -> np.ndarray:
     """Return gradients, (rows, gains), with no element above `steepest`. Rows that are not finite become zero."""
-    size = np.abs(slopes).max(axis=1, keepdims=True)
-    known = np.where(np.isfinite(size), slopes, 0.0)
+    size = np.abs(gradients).max(axis=1, keepdims=True)
+    known = np.where(np.isfinite(size), gradients, 0.0)
     return known * np.minimum(1.0, steepest / np.maximum(np.where(np.isfinite(size), size, 1.0), 1e-300))

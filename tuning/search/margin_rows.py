@@ -42,7 +42,7 @@ class RequiredMargins:
     dispersion: Dispersion
     seed: Leaf  # uint32
     coordinates: Coordinates  # random numbers of the dispersions, cases on the first axis; empty: the nominal loop only
-    wanted: Leaf  # (margins,) the limits in their units
+    required: Leaf  # (margins,) the required limits in their units
     limits: Leaf  # (margins,) largest violation ratio, see `violation_ratio`: 1 less the margin of the search
     metrics: tuple[str, ...] = field(metadata={"static": True})
     names: tuple[str, ...] = field(metadata={"static": True})  # names of the free gains
@@ -71,7 +71,7 @@ def ask(ready: Study, bounds: Bounds, seed: int) -> RequiredMargins | None:
         dispersion=ready.dispersion,
         seed=jnp.uint32(seed),
         coordinates={},
-        wanted=jnp.asarray([one.limit for one in ready.margins]),
+        required=jnp.asarray([one.limit for one in ready.margins]),
         limits=jnp.ones(len(ready.margins)),
         metrics=tuple(one.metric for one in ready.margins),
         names=bounds.names,
@@ -98,7 +98,7 @@ def hardest(asked: RequiredMargins, gains: Float[np.ndarray, " gains"]) -> tuple
     if not margin_verdicts.differ(asked.dispersion):
         return asked, 0.0
     parts, seed = with_gains(asked.parts, dict(zip(asked.names, gains, strict=True))), int(asked.seed)
-    limits = dict(zip(asked.metrics, np.asarray(asked.wanted).tolist(), strict=True))
+    limits = dict(zip(asked.metrics, np.asarray(asked.required).tolist(), strict=True))
     each = margin_verdicts.worst(parts, asked.dispersion, seed, np.arange(margin_verdicts.TRIALS), limits, CASES)
     ratios = [margin_verdicts.nearness(each[name], limit, name) for name, limit in limits.items()]
     near = np.max(np.nan_to_num(ratios, nan=WITHOUT, neginf=-1e9), axis=0)
@@ -130,8 +130,8 @@ def rows(
     loops = jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), each)
     values = margins.of_each(loops, with_delay=late).each()
     ratios = [
-        violation_ratio(values[name].reshape(-1), wanted, at_least=MARGINS[name].at_least)
-        for name, wanted in zip(asked.metrics, asked.wanted, strict=True)
+        violation_ratio(values[name].reshape(-1), limit, at_least=MARGINS[name].at_least)
+        for name, limit in zip(asked.metrics, asked.required, strict=True)
     ]
     near = jnp.stack([jnp.where(jnp.isnan(ratio), WITHOUT, ratio) for ratio in ratios])
     return near / asked.limits[:, None] - 1.0
@@ -223,7 +223,7 @@ def rows_with_derivatives(asked: RequiredMargins, scale: Scale, normalised: Arra
     """
 
     def on_device(normalised: Array) -> dict[str, Array]:
-        c, slope = with_derivatives(asked, scale, normalised[0])
-        return {"c": c[None], "c_gradient": jnp.nan_to_num(slope)[None]}
+        c, gradient = with_derivatives(asked, scale, normalised[0])
+        return {"c": c[None], "c_gradient": jnp.nan_to_num(gradient)[None]}
 
     return montecarlo.spread(on_device, normalised, normalised.shape[0])

@@ -19,7 +19,7 @@ MARGIN = 0.03  # relative tightening of limits in the search: held-out trials ca
 SURE_MARGIN = 0.003  # the same if no trial can be harder: with a search for the worst case, or without dispersions
 HARDEST = 8  # number of worst screened trials that join the constraints
 SPARE = 8  # slots for trials of later rounds: another number of trials would need another compilation
-BAND = confirm.FARTHER + confirm.NEARER  # slots of a band
+BAND = confirm.FARTHER + confirm.NEARER  # number of trials in a band, see `confirm`
 ROUNDS = 6  # largest number of further searches
 
 

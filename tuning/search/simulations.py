@@ -129,7 +129,10 @@ def prepare(batch: Batch, metrics: tuple[str, ...]) -> None:
 
 
 class _Rows:
-    """Trials at points as rows of `ROW` trials. A call has at most `most` rows for each device."""
+    """Splits the trials of all points into rows of `ROW` trials, and the rows into calls of a program.
+
+    A call has at most `most` rows for each device.
+    """
 
     def __init__(self, points: int, trials: int, most: int):
         self.devices = len(configure.devices())

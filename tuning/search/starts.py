@@ -103,9 +103,9 @@ def held_by_limits(at: MeasuredWithGradients) -> list[int]:
     nearest = at.c[0].argmax(axis=1)
     held: list[int] = []
     for row in np.argsort(-at.c[0].max(axis=1)):
-        largest, slope = at.c[0, row, nearest[row]], np.abs(at.c_gradient[0, row, nearest[row]])
-        free = [k for k in np.argsort(-slope) if k not in held]
-        if largest > -NEARLY and len(free) > 2 and slope[free[0]] > 0.0:
+        largest, gradient = at.c[0, row, nearest[row]], np.abs(at.c_gradient[0, row, nearest[row]])
+        free = [k for k in np.argsort(-gradient) if k not in held]
+        if largest > -NEARLY and len(free) > 2 and gradient[free[0]] > 0.0:
             held.append(int(free[0]))
     return held
 

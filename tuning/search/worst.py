@@ -32,16 +32,16 @@ _ADAM = optax.adam(optax.cosine_decay_schedule(RATE, STEPS, LAST_RATE / RATE), b
 
 
 @programs.jit
-def _ascended(y: jax.Array, slope: jax.Array, state: optax.OptState) -> tuple[jax.Array, optax.OptState]:
+def _ascended(y: jax.Array, gradient: jax.Array, state: optax.OptState) -> tuple[jax.Array, optax.OptState]:
     """Return the variables after one step of Adam along the normalised gradient, and the new state of Adam.
 
     Args:
         y: (cases, variables) variables.
-        slope: (cases, variables) gradient.
+        gradient: (cases, variables) gradient.
         state: state of Adam.
     """
-    size = jnp.linalg.norm(slope, axis=1, keepdims=True)
-    updates, state = _ADAM.update(-slope / jnp.where(size > 0.0, size, 1.0), state)
+    size = jnp.linalg.norm(gradient, axis=1, keepdims=True)
+    updates, state = _ADAM.update(-gradient / jnp.where(size > 0.0, size, 1.0), state)
     return jnp.asarray(optax.apply_updates(y, updates)), state
 
 
@@ -117,10 +117,10 @@ def hardest(
     best, best_y = np.full(len(y), -np.inf), y.copy()
 
     def evaluate(y: np.ndarray) -> np.ndarray:
-        value, slope = ratio_with_gradient(batch, gains, y, watched(problem), limits)
+        value, gradient = ratio_with_gradient(batch, gains, y, watched(problem), limits)
         better = value > best
         best[better], best_y[better] = value[better], y[better]
-        return np.where(np.isfinite(slope), slope, 0.0)
+        return np.where(np.isfinite(gradient), gradient, 0.0)
 
     state = _ADAM.init(y)
     for _ in range(STEPS + 1 if moved else 0):
@@ -176,7 +176,7 @@ def _farthest(count: int) -> float:
     return float(np.sqrt(2.0 * special.gammaincinv(count / 2.0, HELD)))  # quantile of the chi-squared distribution
 
 
-def _within(y: np.ndarray, normal: list[tuple[slice, float]], slope: np.ndarray | None = None) -> np.ndarray:
+def _within(y: np.ndarray, normal: list[tuple[slice, float]], gradient: np.ndarray | None = None) -> np.ndarray:
     """Return the variables with the normal ones moved just inside their balls, where gradients are not clipped.
 
     If a gradient is given, the normal variables move to the point of the sphere in its direction. This is a step of the
@@ -186,16 +186,16 @@ def _within(y: np.ndarray, normal: list[tuple[slice, float]], slope: np.ndarray 
     Args:
         y: (cases, variables) variables.
         normal: slice and radius of each normal dispersion.
-        slope: (cases, variables) gradient, or None.
+        gradient: (cases, variables) gradient, or None.
     """
     y = y.copy()
     for place, farthest in normal:
         part, edge = y[:, place], (1.0 - 1e-9) * farthest
         size = np.linalg.norm(part, axis=1, keepdims=True)
         part = part * np.minimum(1.0, edge / np.maximum(size, 1e-12))
-        if slope is not None:
-            steep = np.linalg.norm(slope[:, place], axis=1, keepdims=True)
-            part = np.where(steep > 0.0, edge * slope[:, place] / np.where(steep > 0.0, steep, 1.0), part)
+        if gradient is not None:
+            steep = np.linalg.norm(gradient[:, place], axis=1, keepdims=True)
+            part = np.where(steep > 0.0, edge * gradient[:, place] / np.where(steep > 0.0, steep, 1.0), part)
         y[:, place] = part
     return y
 
@@ -221,7 +221,7 @@ def ratio_with_gradient(
     coordinates, shifts = _moved_to(batch, y)
     batch, count, width = batch._replace(coordinates=coordinates), y.shape[1], len(batch.names)
     columns, limit = [metrics.index(name) for name in limits], np.asarray([*limits.values()], dtype=float)
-    value, slopes = np.zeros(len(y)), list[np.ndarray]()
+    value, gradients = np.zeros(len(y)), list[np.ndarray]()
     for k in range(0, count, width):
         shift = {name: _filled(v[:, k : k + width], width) for name, v in shifts.items()}
         simulated = jax.tree.map(
@@ -231,9 +231,9 @@ def ratio_with_gradient(
         ratios_or_nan = jnp.asarray(violation_ratio(simulated.metrics[:, columns], limit, at_least=False))
         ratios = np.asarray(judged(ratios_or_nan, jnp.asarray(simulated.status[:, None])))
         nearest, value = ratios.argmax(axis=1), ratios.max(axis=1)
-        slope = np.take_along_axis(simulated.derivatives[:, :, columns], nearest[:, None, None], axis=2)[:, :, 0]
-        slopes.append(np.where(value[:, None] < FAILED, slope / (limit + (limit == 0.0))[nearest][:, None], 0.0))
-    return value, np.concatenate(slopes, axis=1)[:, :count]
+        gradient = np.take_along_axis(simulated.derivatives[:, :, columns], nearest[:, None, None], axis=2)[:, :, 0]
+        gradients.append(np.where(value[:, None] < FAILED, gradient / (limit + (limit == 0.0))[nearest][:, None], 0.0))
+    return value, np.concatenate(gradients, axis=1)[:, :count]
 
 
 def _filled(v: np.ndarray, width: int) -> np.ndarray:
@@ -269,5 +269,5 @@ def _moved(dispersion: Dispersion, coordinates: Coordinates, y: jax.Array, names
                 moved[name] = part * jnp.minimum(1.0, _farthest(part.size) / jnp.maximum(jnp.linalg.norm(part), 1e-12))
         return moved
 
-    slopes = jax.vmap(jax.jacfwd(of))(y)
-    return jax.vmap(of)(y), {name: jnp.swapaxes(v, 1, 2) for name, v in slopes.items()}
+    gradients = jax.vmap(jax.jacfwd(of))(y)
+    return jax.vmap(of)(y), {name: jnp.swapaxes(v, 1, 2) for name, v in gradients.items()}

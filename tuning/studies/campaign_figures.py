@@ -8,7 +8,7 @@ import polars as pl
 from matplotlib.figure import Figure
 
 from ptsmc_jax import scenario
-from ptsmc_jax.campaigns import campaign as flying
+from ptsmc_jax.campaigns import campaign as running
 from ptsmc_jax.campaigns import rows
 from ptsmc_jax.figures import campaign_plots as plots
 from ptsmc_jax.simulation.catalogues import percent
@@ -22,12 +22,12 @@ POINTS = 5000  # largest number of trials in a scatter plot
 def of(folder: Folder, summary: dict[str, Any]) -> dict[str, Figure]:
     """Return the figures of a campaign by name; summary: the content of its `summary.json`."""
     parts = folder.whole_parts()
-    wanted = scenario.requirements(folder.scenario)
-    limits = {r.metric: r.limit for r in wanted}
+    required = scenario.requirements(folder.scenario)
+    limits = {r.metric: r.limit for r in required}
     names = list(dict.fromkeys((*limits, "window_error", "peak_torque")))
-    timed = [r.timed for r in wanted if r.timed is not None]
+    timed = [r.timed for r in required if r.timed is not None]
     frame = rows.read(parts, ["trial", "status", "initial_angle", *names, *timed]).head(folder.trials)
-    finished = flying.finished(frame)
+    finished = running.finished(frame)
     of_time = {v["metric"]: _of_time(Verdict.read(v)) for v in summary["verdicts"]}
     units = folder.units
 
@@ -41,7 +41,7 @@ def of(folder: Folder, summary: dict[str, Any]) -> dict[str, Figure]:
         figures["distributions"] = plots.distributions(
             {name: column(name, np.where(finished, frame[name].to_numpy(), np.nan)) for name in names}
         )
-    outcome = _outcomes(frame, wanted)
+    outcome = _outcomes(frame, required)
     totals = {name: int((outcome == name).sum()) for name in plots.MARKS}
     fine = np.isin(outcome, ("ok", plots.AT_TIMES))
     bad, good = np.flatnonzero(~fine)[: POINTS // 2], np.flatnonzero(fine)
@@ -63,7 +63,7 @@ def of(folder: Folder, summary: dict[str, Any]) -> dict[str, Figure]:
     return figures
 
 
-def _outcomes(frame: pl.DataFrame, wanted: Sequence[Requirement]) -> np.ndarray:
+def _outcomes(frame: pl.DataFrame, required: Sequence[Requirement]) -> np.ndarray:
     """Return the outcome of each trial, a key of `plots.MARKS`, (trials,).
 
     Some requirements ask for a fraction of the time within the limit. A single trial can break such a requirement if
@@ -71,7 +71,7 @@ def _outcomes(frame: pl.DataFrame, wanted: Sequence[Requirement]) -> np.ndarray:
     """
     outcome = frame["status"].to_numpy().astype(object)
     ok = outcome == "ok"
-    for one in wanted:
+    for one in required:
         beyond = ok & ~(frame[one.metric].to_numpy() <= one.limit)
         breaks = beyond if one.timed is None else np.zeros_like(ok)
         if one.timed is not None and one.interpretation == "temporal":
@@ -98,6 +98,6 @@ def _fan(folder: Folder, frame: pl.DataFrame, finished: np.ndarray) -> dict[str,
     trials, window = frame["trial"].to_numpy(), frame["window_error"].to_numpy()  # a shard has some of the trials
     shown = trials[:DRAWN]
     hardest = int(np.argmax(np.where(finished & np.isfinite(window), window, -np.inf)))
-    t, error = flying.history(folder.without_metrics, np.append(shown, trials[hardest]).astype(np.uint32))
+    t, error = running.history(folder.without_metrics, np.append(shown, trials[hardest]).astype(np.uint32))
     simulated, worst, ended = folder.scenario, (int(trials[hardest]), error[-1]), error[:-1][finished[: shown.size]]
     return {"fan": plots.fan(t, ended, worst, simulated.controller.t_f, simulated.plant.kind)} if ended.any() else {}

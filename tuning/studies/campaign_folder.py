@@ -18,9 +18,9 @@ import polars as pl
 from msgspec import Meta
 
 from ptsmc_jax import scenario
-from ptsmc_jax.campaigns import campaign as flying
+from ptsmc_jax.campaigns import campaign as running
 from ptsmc_jax.campaigns import rows, run_tables, store
-from ptsmc_jax.campaigns.campaign import Campaign, Tally, Wanted
+from ptsmc_jax.campaigns.campaign import Block, Campaign, Tally
 from ptsmc_jax.campaigns.rows import Part, Rows
 from ptsmc_jax.campaigns.run_tables import RunTable
 from ptsmc_jax.campaigns.store import RefusedError
@@ -203,7 +203,7 @@ class Folder:
         campaign = Campaign(self.ready, self.seed)
         if self.table is not None:
             where = f"the run table {self.table_name}"
-            campaign = flying.of_run_table(self.ready, self.seed, self.run_table, where=where)
+            campaign = running.of_run_table(self.ready, self.seed, self.run_table, where=where)
         return replace(campaign, software=self.software)
 
     @cached_property
@@ -257,32 +257,32 @@ class Folder:
         return parts
 
 
-def begin(wanted: Folder, force: bool) -> None:
+def begin(folder: Folder, force: bool) -> None:
     """Create the folder, or check that it contains the same campaign. Raises RefusedError if it contains another one.
 
     force: discard the results of an existing campaign.
     """
-    tables, path = parsing.dump(wanted.scenario), wanted.path
+    tables, path = parsing.dump(folder.scenario), folder.path
     made = store.read_versions(path)  # files that no campaign wrote belong to the user
     kept = sources.listed(path / C) if custom.checksum_name(custom_parts.CONTROLLER) in made else []
-    if wanted.controller is not None and kept != sources.listed(path / C):
+    if folder.controller is not None and kept != sources.listed(path / C):
         raise RefusedError(f"--out is {path}, whose {C} contains C code of the user; allowed is another folder")
     if force and path.is_dir():
-        for rows_of in (wanted.rows, wanted.dry):
+        for rows_of in (folder.rows, folder.dry):
             rows_of.tidy(())
         for name in (THEORY, *([TABLE] if RUN_TABLE in made else [])):
             (path / name).unlink(missing_ok=True)
-    elif _begun(wanted, tables):
+    elif _begun(folder, tables):
         return
 
     def fill(making: Path) -> None:
         store.write_toml(making / "scenario.toml", tables)
-        store.write_json(making / "versions.json", wanted.versions)
-        if wanted.table is not None:
-            parts = wanted.campaign.ready.parts
-            (making / TABLE).write_bytes(rows.encoded(wanted.run_table.frame(parts)))
-        if wanted.controller is not None:
-            sources.copy(wanted.controller, making / C)
+        store.write_json(making / "versions.json", folder.versions)
+        if folder.table is not None:
+            parts = folder.campaign.ready.parts
+            (making / TABLE).write_bytes(rows.encoded(folder.run_table.frame(parts)))
+        if folder.controller is not None:
+            sources.copy(folder.controller, making / C)
         for file in kept:  # not earlier: these files may be the source of the copy
             file.unlink(missing_ok=True)
         store.forget(path)  # results of another campaign, or of fewer trials
@@ -290,23 +290,23 @@ def begin(wanted: Folder, force: bool) -> None:
     store.write(path, fill)
 
 
-def _begun(wanted: Folder, tables: Mapping[str, Any]) -> bool:
+def _begun(folder: Folder, tables: Mapping[str, Any]) -> bool:
     """Return whether the folder contains exactly this campaign.
 
     Raises RefusedError if the folder can neither be continued nor extended to this campaign.
     """
-    path = wanted.path
+    path = folder.path
     store.check(path, force=True)
     if not path.is_dir() or store.is_empty(path):
         return False
     programs = [name for name in store.read_versions(path) if name == "metrics" or name.endswith("_sha256")]
-    store.refuse_others(path, tables, {**dict.fromkeys(programs), **wanted.identity, **store.packages()})
+    store.refuse_others(path, tables, {**dict.fromkeys(programs), **folder.identity, **store.packages()})
     before = opened(path)
-    if before.trials > wanted.trials:
+    if before.trials > folder.trials:
         raise RefusedError(
-            f"--trials is {wanted.trials}, but must be at least {before.trials}, the number of trials in {path}"
+            f"--trials is {folder.trials}, but must be at least {before.trials}, the number of trials in {path}"
         )
-    same = before.trials == wanted.trials and before.made == _made(wanted) and before.identity == wanted.identity
+    same = before.trials == folder.trials and before.made == _made(folder) and before.identity == folder.identity
     if not same or before.controller is None:
         return same
     key = custom_parts.CONTROLLER  # the folder's copy may be missing or changed
@@ -371,7 +371,7 @@ def simulate(
     folder: Folder,
     shard: tuple[int, int],
     report: Callable[[Tally], None],
-    elsewhere: Callable[[Folder, list[Wanted]], Iterator[tuple[Part, int]]] | None = None,
+    elsewhere: Callable[[Folder, list[Block]], Iterator[tuple[Part, int]]] | None = None,
     trials: int | None = None,
 ) -> None:
     """Simulate the missing trials. Damaged parts are reported, renamed and simulated again.
@@ -394,9 +394,9 @@ def simulate(
     alone = shard == (1, 1) and elsewhere is None
     if alone:  # else other processes may be writing into the folder
         folder.rows.tidy(parts)
-    wanted = flying.missing(parts, trials, shard)
-    landing = elsewhere(folder, wanted) if elsewhere else flying.here(folder.campaign.simulate, folder.rows, wanted)
-    flying.follow(landing, flying.tally(flying.staying(parts, wanted), trials), report)
+    wanted = running.missing(parts, trials, shard)
+    landing = elsewhere(folder, wanted) if elsewhere else running.here(folder.campaign.simulate, folder.rows, wanted)
+    running.follow(landing, running.tally(running.staying(parts, wanted), trials), report)
     if alone:
         folder.rows.tidy(folder.rows.parts()[0])
 
@@ -405,9 +405,9 @@ def write_run_table(folder: Folder, report: Callable[[Tally], None]) -> None:
     """Write the dispersions of each trial without simulating it (`ptsmc montecarlo --dry-run`)."""
     parts, _ = folder.dry.parts()
     folder.dry.tidy(parts)
-    wanted = flying.missing(parts, folder.trials)
-    landing = flying.here(folder.campaign.draw, folder.dry, wanted)
-    flying.follow(landing, Tally(sum(part.count for part in flying.staying(parts, wanted)), folder.trials, 0), report)
+    wanted = running.missing(parts, folder.trials)
+    landing = running.here(folder.campaign.draw, folder.dry, wanted)
+    running.follow(landing, Tally(sum(part.count for part in running.staying(parts, wanted)), folder.trials, 0), report)
 
 
 def settle(folder: Folder, trials: int) -> Folder:

@@ -12,7 +12,7 @@ import numpy as np
 import polars as pl
 
 from ptsmc_jax import scenario
-from ptsmc_jax.campaigns import campaign as flying
+from ptsmc_jax.campaigns import campaign as running
 from ptsmc_jax.campaigns import rows, run_tables, runs, store
 from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.dispersions.quantities import CATEGORIES
@@ -61,7 +61,7 @@ def until_confident(folder: Folder, width: float, fly_first: Callable[[int], Non
     Returns:
         The number of trials.
     """
-    count, there = folder.first_look or flying.PART, _there(folder)
+    count, there = folder.first_look or running.PART, _there(folder)
     while count < there:  # use all existing trials
         count *= 2
     while True:
@@ -80,26 +80,26 @@ def _there(folder: Folder) -> int:
 
 def judged(folder: Folder, first: int | None = None) -> list[dict[str, Any]]:
     """Return the verdict on each requirement except margins, as in `summary.json`; first: use only the first trials."""
-    wanted = scenario.requirements(folder.scenario)
-    names = dict.fromkeys(name for r in wanted for name in (r.metric, r.timed) if name is not None)
+    required = scenario.requirements(folder.scenario)
+    names = dict.fromkeys(name for r in required for name in (r.metric, r.timed) if name is not None)
     frame = rows.read(folder.whole_parts(), ["status", *names]).head(first or folder.trials)
-    finished = flying.finished(frame)
-    verdicts = flying.verdicts(wanted, frame)
-    return [_in_summary(v, r, _beyond(frame, r, finished)) for v, r in zip(verdicts, wanted, strict=True)]
+    finished = running.finished(frame)
+    verdicts = running.verdicts(required, frame)
+    return [_in_summary(v, r, _beyond(frame, r, finished)) for v, r in zip(verdicts, required, strict=True)]
 
 
-def _beyond(frame: pl.DataFrame, wanted: Requirement, ok: np.ndarray) -> np.ndarray:
+def _beyond(frame: pl.DataFrame, required: Requirement, ok: np.ndarray) -> np.ndarray:
     """Return the fraction of time that each trial is beyond a limit, (trials,).
 
     A failed trial counts as beyond the limit at all times. The array is empty if the requirement is not "mixed".
     """
-    if wanted.interpretation != "mixed" or wanted.timed is None:
+    if required.interpretation != "mixed" or required.timed is None:
         return np.zeros(0)
-    return np.where(ok, 1.0 - frame[wanted.timed].fill_null(0.0).to_numpy(), 1.0)
+    return np.where(ok, 1.0 - frame[required.timed].fill_null(0.0).to_numpy(), 1.0)
 
 
-def _in_summary(verdict: Verdict, wanted: Requirement, beyond: np.ndarray) -> dict[str, Any]:
-    within, confidence = verdict.trials - verdict.failures, wanted.confidence or CONFIDENCE
+def _in_summary(verdict: Verdict, required: Requirement, beyond: np.ndarray) -> dict[str, Any]:
+    within, confidence = verdict.trials - verdict.failures, required.confidence or CONFIDENCE
     entry = verdict.in_summary()
     if beyond.size:  # fraction of time: the samples of one run depend on each other, but the runs are independent
         each = (1.0 + CONFIDENCE) / 2.0
@@ -113,9 +113,9 @@ def _in_summary(verdict: Verdict, wanted: Requirement, beyond: np.ndarray) -> di
         entry["fraction"] = within / verdict.trials
         entry["fraction_interval"] = statistics.fraction_interval(within, verdict.trials, CONFIDENCE)
         entry["fraction_bound"] = statistics.fraction_bound(within, verdict.trials, confidence)
-    if wanted.quantile is not None and wanted.confidence is not None:
-        failures = verdict.failures if wanted.timed is None else 0
-        entry["fewest_trials"] = statistics.fewest_for(failures, wanted.quantile, wanted.confidence)
+    if required.quantile is not None and required.confidence is not None:
+        failures = verdict.failures if required.timed is None else 0
+        entry["fewest_trials"] = statistics.fewest_for(failures, required.quantile, required.confidence)
     return entry
 
 
@@ -125,7 +125,7 @@ def summarise(folder: Folder) -> dict[str, Any]:
     verdicts, waiting = [*judged(folder), *margins_of(folder)], unjudged(folder)
     head = rows.read(parts, ["status", "reason", "bad_time"]).head(folder.trials)
     counts = {status: int((head["status"] == status).sum()) for status in dict.fromkeys(s for s, _ in STATUS.values())}
-    finished, failed = flying.finished(head), head.filter(pl.col("status") != "ok")
+    finished, failed = running.finished(head), head.filter(pl.col("status") != "ok")
     reasons = [
         {"status": status, "reason": reason, "trials": int(part.height), "first_bad_time": part["bad_time"].min()}
         for (status, reason), part in sorted(failed.group_by(["status", "reason"]))
@@ -180,14 +180,14 @@ def _samples(folder: Folder, parts: list[rows.Part]) -> dict[str, Any]:
     kept = rows.columns_of(parts[0])
     names = [name for name in run_tables.SAMPLES if name in kept]  # most severe status last
     counts = rows.read(parts, names).head(folder.trials)
-    told = {
+    samples = {
         name.removeprefix(run_tables.COUNTED): {
             "samples": int(counts[name].sum()),
             "trials": int((counts[name] > 0).sum()),
         }
         for name in names
     }
-    return {"controller_samples": told}
+    return {"controller_samples": samples}
 
 
 def drawn_columns(folder: Folder, parts: list[rows.Part]) -> list[str]:
@@ -321,7 +321,7 @@ def worst(folder: Folder, by: str, count: int) -> pl.DataFrame:
         listed = f"the head of {folder.path / 'worst.csv'}, which ptsmc worst writes without --by, has all of them"
         raise RefusedError(f"--by is {by}, but must be a column of the rows; {parsing.like(by, allowed, listed)}")
     frame = rows.read(parts, [by, "status"]).head(folder.trials)
-    failed = ~flying.finished(frame)
+    failed = ~running.finished(frame)
     chosen = most_extreme(by, frame[by].fill_null(float("nan")).to_numpy(), failed, count)
     return rows.read(parts).head(folder.trials)[chosen]
 

@@ -381,13 +381,13 @@ def write(folder: Path, scenario: Scenario, comparison: Comparison, figures: boo
         figures: write figures too.
         known_by: entries of `versions.json`, see `identity`.
     """
-    said = summary(comparison)
-    store.record(folder, parsing.dump(scenario), known_by, said)
+    content = summary(comparison)
+    store.record(folder, parsing.dump(scenario), known_by, content)
     (folder / "scenarios").mkdir()
     for law, contender in comparison.contenders.items():
         tables = custom_parts.carry(parsing.dump(contender.simulated), folder / "scenarios")
         store.write_toml(folder / "scenarios" / f"{law}.toml", tables)
-    store.write_csv(folder / "compare.csv", *_rows(scenario, said))
+    store.write_csv(folder / "compare.csv", *_rows(scenario, content))
     if figures:
         style.save(dict(_figures(comparison)), folder / "figures")
 
@@ -397,7 +397,7 @@ _COLUMNS = ("met", "window_error", "peak_torque", "largest_peak_torque", "effort
             "settling_by_angle")  # fmt: skip
 
 
-def _rows(scenario: Scenario, said: Mapping[str, Any]) -> tuple[list[str], list[list[Any]]]:
+def _rows(scenario: Scenario, content: Mapping[str, Any]) -> tuple[list[str], list[list[Any]]]:
     """Return the header and the rows of `compare.csv`, one row for each law."""
     required = [name for name in catalogues.MARGINS if name in scenario.requirements]
     nominal = [name for name in catalogues.MARGINS if name not in required]  # of the nominal loop in the hold phase
@@ -415,7 +415,7 @@ def _rows(scenario: Scenario, said: Mapping[str, Any]) -> tuple[list[str], list[
             "; ".join(f"{name} = {value:.6g}" for name, value in figures["gains"].items()),
         ]  # fmt: skip
 
-    return head, [row(law, figures) for law, figures in said["laws"].items()]
+    return head, [row(law, figures) for law, figures in content["laws"].items()]
 
 
 def _figures(comparison: Comparison) -> Iterator[tuple[str, Any]]:

@@ -115,7 +115,7 @@ def largest(name: str, scenario: Scenario, trials: Trials) -> float:
     """
     values = np.sort(np.asarray(getattr(trials.metrics, name))[trials.finished])
     asked = scenario.requirements.get(name)
-    fraction = (asked.share if isinstance(asked, Limit) else None) or 1.0
+    fraction = (asked.fraction if isinstance(asked, Limit) else None) or 1.0
     return statistics.value_at(values, min(1.0, fraction * trials.status.size / values.size)) if values.size else np.nan
 
 
@@ -136,9 +136,9 @@ def judged_on(simulated: Scenario) -> str:
     return "flight clock, " + (f"boundary layer of {width:g}" if width else "discontinuous sign")
 
 
-def trials_of(ready: Study, wanted: int) -> int:
-    """Return the number of trials to simulate: 1 if all trials are equal, else the wanted number."""
-    return wanted if ready.drawn else 1
+def trials_of(ready: Study, count: int) -> int:
+    """Return the number of trials to simulate: 1 if all trials are equal, else `count`."""
+    return count if ready.drawn else 1
 
 
 def held_out_trials(ready: Study) -> int:

@@ -96,15 +96,15 @@ def axis(text: str, option: str) -> Axis:
     """
     key, _, span = text.partition("=")
     parts = span.split(":")
-    wanted = f"{option} is {text}, but must be KEY=LOW:HIGH:COUNT, such as controller.delta=0.05:3:9"
+    message = f"{option} is {text}, but must be KEY=LOW:HIGH:COUNT, such as controller.delta=0.05:3:9"
     if len(parts) != 3 or key.count(".") != 1:
-        raise UsageError(wanted)
+        raise UsageError(message)
     try:
         low, high, count = float(parts[0]), float(parts[1]), int(parts[2])
     except ValueError:
-        raise UsageError(wanted) from None
+        raise UsageError(message) from None
     if not (np.isfinite(low) and np.isfinite(high) and low < high and 2 <= count <= 100):
-        raise UsageError(f"{wanted}, with LOW below HIGH and COUNT from 2 to 100")
+        raise UsageError(f"{message}, with LOW below HIGH and COUNT from 2 to 100")
     spaced = np.geomspace if Axis(key, (low, high)).logarithmic else np.linspace
     values = spaced(low, high, count)
     if key in WHOLE_NUMBERS:
@@ -112,7 +112,7 @@ def axis(text: str, option: str) -> Axis:
     different = tuple(dict.fromkeys(float(f"{v:.6g}") for v in values))
     if len(different) < 2:  # a map needs at least two values
         those = "two whole numbers" if key in WHOLE_NUMBERS else "two values that differ in six digits"
-        raise UsageError(f"{wanted}, with {those} between LOW and HIGH at least")
+        raise UsageError(f"{message}, with {those} between LOW and HIGH at least")
     return Axis(key, different, span if len(different) < count or key in WHOLE_NUMBERS else "")
 
 
@@ -265,9 +265,9 @@ def lines(scenario: Scenario, x: Axis, y: Axis) -> dict[str, tuple[np.ndarray, n
     eta, delay = scenario.controller.eta, scenario.devices.delay_periods
     h = np.asarray(x.values if x.key == PERIOD else y.values)
     anchored = scenario.loop.clock == "anchored"
-    implicit, border = scenario.controller.implicit, f"$\\delta = (\\eta - {3 if anchored else 1}/2) h$"
+    implicit, formula = scenario.controller.implicit, f"$\\delta = (\\eta - {3 if anchored else 1}/2) h$"
     # without delay, implicit sampling has no stability limit; the limit of explicit sampling is drawn instead
-    without = f"{border}, of explicit sampling only" if implicit else border
+    without = f"{formula}, of explicit sampling only" if implicit else formula
     delayed = "with {} of delay" if implicit else "the same with {} of delay"
     delays = {without: 0.0, delayed.format("a period"): 1.0}
     if delay > 1:
@@ -293,7 +293,8 @@ def spillover(simulated: Map) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     axes = simulated.x, simulated.y
     across, up = (np.log(one.values) if one.logarithmic else np.asarray(one.values) for one in axes)
     drawn = {}
-    for name, label in (("radius", "border by linear theory, at the hand-over"), ("hold_radius", "the same in hold")):
+    labels = {"radius": "stability limit by linear theory, at the hand-over", "hold_radius": "the same in hold"}
+    for name, label in labels.items():
         grid = simulated.grid(name)
         off = np.ma.masked_invalid(np.log(np.where(grid > 0.0, grid, np.nan)))
         pieces: Any = contour_generator(across, up, off).lines(margins.NEUTRAL)

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from ptsmc_jax.campaigns import campaign as flying
+from ptsmc_jax.campaigns import campaign as running
 from ptsmc_jax.campaigns import rows
 from ptsmc_jax.dispersions.quantities import CATEGORIES
 from ptsmc_jax.numerics import statistics
@@ -37,7 +37,7 @@ def why(folder: Folder, metrics: Sequence[str], count: int) -> list[dict[str, An
     varied = {name: values for name, values in inputs.items() if statistics.vary(values)}
     distinct = statistics.distinct({name: values for name, values in varied.items() if name not in CATEGORIES})
     names = [name for name in varied if name in distinct or name in CATEGORIES]
-    failed = ~flying.finished(frame)
+    failed = ~running.finished(frame)
     explained: list[dict[str, Any]] = []
     for metric in metrics:
         values = frame[metric].fill_null(float("nan")).to_numpy()

@@ -41,12 +41,13 @@ def summary(run: Run, scenario: Scenario, computer: "InTheLoop | None" = None) -
     }
     heading = {"status": run.status, "reason": run.reason, "bad_time": run.bad_time}
     lower_bound = None if run.lower_bound is None else run.lower_bound.window_error
-    said, decided_by = plausibility.warnings(scenario), {}
+    warnings, decided_by = plausibility.warnings(scenario), {}
     if computer is not None:
-        said += [computer.otherwise] if computer.otherwise else []
+        warnings += [computer.otherwise] if computer.otherwise else []
         statuses = {name: count for name, count in run.samples.items() if count}
         decided_by = {"controller_statuses": statuses, "controller": computer.library.checksum}
-    return {**heading, **run.metrics, "lower_bound": lower_bound, "verdicts": verdicts, "warnings": said, **decided_by}
+    judged = {"lower_bound": lower_bound, "verdicts": verdicts, "warnings": warnings}
+    return {**heading, **run.metrics, **judged, **decided_by}
 
 
 def write(

@@ -33,18 +33,19 @@ def find(scenario: Scenario) -> tuple[Study, Course]:
         raise ScenarioError(f'margins need the sampled loop, but loop.mode is "{scenario.loop.mode}"')
     ready = study(scenario)
     course = run_margins.along(ready.parts)
-    without_slopes, code = np.isnan(course.hold[1].peak_sensitivity).any(), rollout.OK
+    without_derivatives, code = np.isnan(course.hold[1].peak_sensitivity).any(), rollout.OK
     if course.singularity_distance < rollout.SINGULAR_DISTANCE:
         code = rollout.SINGULAR
-    elif without_slopes:
+    elif without_derivatives:
         code = int(rollout.simulate_parts(ready.parts, np.uint32(0), np.uint32(0)).status)
     if code not in rollout.FINISHED:
         status, why = rollout.STATUS[code]
-        raise ScenarioError(f"margins are those about the nominal run, which ends {status}: {why}")
-    if without_slopes:
+        raise ScenarioError(f"margins need a nominal run that reaches its end, but it ends {status}: {why}")
+    if without_derivatives:
         raise ScenarioError(
             f"margins need derivatives of the loop by all of its states, but with controller.kind = "
-            f"{errors.show(scenario.controller.kind)} one is not finite in hold; allowed is a law that has them there"
+            f"{errors.show(scenario.controller.kind)} one is not finite in the hold phase; "
+            "allowed is a law with finite derivatives there"
         )
     return ready, course
 
@@ -130,7 +131,7 @@ def summary(ready: Study, course: Course) -> dict[str, Any]:
         ],
         **({"not_converged": True} if course.not_converged else {}),
         **({"dispersed": margin_verdicts.TRIALS} if margin_verdicts.differ(ready.dispersion) else {}),
-        "said": NO_SIGN if ready.scenario.exact_sign else None,
+        "note": NO_SIGN if ready.scenario.exact_sign else None,
         **_start(ready),
         **({} if course.limit_cycle is None else _limit_cycle(ready.scenario, course.limit_cycle)),
     }

@@ -211,7 +211,7 @@ class Margins(Trade):
         at, targets, known = asked.metrics.index(SENSITIVITY), [], []
         for value in self.values:
             name = f"|S| at most {value:g} dB" if value < np.inf else "no limit on |S|"
-            limited = replace(posed.problem, margins=replace(asked, wanted=replaced(asked.wanted, at, value)))
+            limited = replace(posed.problem, margins=replace(asked, required=replaced(asked.required, at, value)))
             found = _found(posed, limited, headed(tell, name), FEWER if targets else None)
             targets.append(Target(value, name, found.problem))
             known.append(found.normalised)

@@ -151,11 +151,11 @@ def _trust(found: Trust, tuning: Tuning) -> dict[str, Any]:
         else:
             gain, side = gain_names.base(name), tuning.at_bound[name]
             bound = tuning.tuned.search.bounds[gain][side == "upper"]
-            border = free_gains.border(tuning.tuned, gain, side, bound)
-            influence[name] = border or _beyond(tuning.beyond.get(name), bound)
-    slopes = found.gradient_error
+            reason = free_gains.reason_of_bound(tuning.tuned, gain, side, bound)
+            influence[name] = reason or _beyond(tuning.beyond.get(name), bound)
+    errors = found.gradient_error
     return {
-        "gradient_error": None if slopes is None else dict(zip(("start", "end"), slopes, strict=True)),
+        "gradient_error": None if errors is None else dict(zip(("start", "end"), errors, strict=True)),
         "influence": influence,
         "sensitivities": found.sensitivities,
         "margins": found.margins,
