@@ -39,7 +39,7 @@ def main() -> None:
         simulated = judging.judge(made, judging.seed_of_judge(0))
         done, metrics = simulated.finished, simulated.metrics
         print(
-            f"{name} on the flexible body: {done.sum()} of {done.size} flown, "
+            f"{name} on the flexible body: {done.sum()} of {done.size} runs complete, "
             f"RMS window error {np.sqrt(np.mean(metrics.window_error[done] ** 2)):.3e}, "
             f"largest peak torque {metrics.peak_torque[done].max():.3f} N m, "
             f"largest residual_modal {metrics.residual_modal[done].max():.3e}"

@@ -32,10 +32,10 @@ def main() -> None:
                 np.asarray(getattr(trials.metrics, key)) for key in ("window_error", "peak_torque", "chattering")
             )
             interval = trust.interval(errors, trust.rms)
-            assert interval is not None  # of so many trials
+            assert interval is not None  # there are enough trials
             low, high = interval
             say(
-                f"{name}, flown {sampling}: RMS {trust.rms(errors):.3e} (95 %: {low:.3e} to {high:.3e}), mean peak "
+                f"{name}, {sampling} sampling: RMS {trust.rms(errors):.3e} (95 %: {low:.3e} to {high:.3e}), mean peak "
                 f"{peaks.mean():.3f} N m, largest {peaks.max():.3f} N m, chattering {chattering.mean():.4f} N m/s"
             )
 

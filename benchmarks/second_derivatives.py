@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 from ptsmc_jax.configure import configure
 
-configure(cache=None)  # what is compiled is to be seen
+configure(cache=None)  # measure the compilation too
 
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
@@ -17,7 +17,7 @@ from common import machine, say, study  # noqa: E402
 
 import ptsmc_jax as ptsmc  # noqa: E402
 
-GAINS = {"eta": 3.1, "delta": 1.02, "observer_gain": 5.0}  # delta off a whole period, where slopes are one-sided
+GAINS = {"eta": 3.1, "delta": 1.02, "observer_gain": 5.0}  # delta off a whole period, where derivatives are one-sided
 STEP = 1e-4  # relative, of the differences
 
 

@@ -73,7 +73,7 @@ def rest_inertia(inertia: np.ndarray, coupling: Any) -> np.ndarray:
     if not flexible_bodies(inertia[None], rows[None])[0]:
         least = float(np.linalg.eigvalsh(rest)[0])
         raise ValueError(
-            "the inertia less D'D, what is left when all modes move along, must be positive definite "
+            "the inertia minus D'D, the inertia without the modes, must be positive definite "
             f"(its smallest principal moment is {least:.6g} kg m^2)"
         )
     return rest

@@ -60,7 +60,7 @@ def test_a_scenario_with_other_gains_can_be_written_and_read(flight, tmp_path):
     assert ptsmc_jax.gains_of(scenario.study(again).parts) == gains
     for one, two in zip(*(jax.tree.leaves(scenario.study(s).parts) for s in (other, again)), strict=True):
         np.testing.assert_array_equal(one, two)
-    with pytest.raises(store.RefusedError, match="is there already"):
+    with pytest.raises(store.RefusedError, match="exists already"):
         ptsmc_jax.write(other, tmp_path / "s.toml")
     ptsmc_jax.write(flight.scenario, tmp_path / "s.toml", force=True)
     assert ptsmc_jax.read(tmp_path / "s.toml").controller.eta == 3.0

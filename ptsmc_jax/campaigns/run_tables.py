@@ -24,12 +24,12 @@ from ptsmc_jax.simulation.catalogues import CATALOGUE
 from ptsmc_jax.simulation.rollout import Parts
 
 ALLOWED = "a .csv or .parquet file with a row for each trial, or a folder of such .parquet files"
-ANGLE = "initial_angle"  # follows from others
-HEADING = ("status", "reason", "bad_time")  # of a row
+ANGLE = "initial_angle"  # follows from other columns
+HEADING = ("status", "reason", "bad_time")  # first columns of a result
 RESULTS = {*HEADING, *CATALOGUE}
-COUNTED = "controller_"  # and how samples of exported C end: how many of them
+COUNTED = "controller_"  # beginning of the columns with numbers of samples by the status that exported C returned
 SAMPLES = tuple(f"{COUNTED}{ended}" for ended in computer.SAMPLES)
-MOST = 2**32  # of trials and seeds
+MOST = 2**32  # largest number of trials, and of seeds
 
 
 @dataclass(frozen=True)

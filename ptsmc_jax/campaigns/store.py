@@ -134,7 +134,7 @@ def begin(folder: Path, scenario: Tables, made_by: Tables, *, fresh: bool) -> Pa
 
 
 def forget(folder: Path) -> None:
-    """Remove the summary of a result and the files made from it, so that they do not pass for the next result's."""
+    """Remove the summary of a result and the files made from it, which would not belong to the next result."""
     if not ((folder / SUMMARY).exists() or "command" in read_versions(folder)):
         return
     for pattern, mark in MADE_OF_RESULTS.items():
@@ -277,10 +277,12 @@ def _flock(file: IO[str], *, shared: bool) -> bool:
 def check_file(file: Path, force: bool, way: str = "--force") -> None:
     """Raise RefusedError if this file must not be written; way: the option for `force`."""
     if not file.parent.is_dir():
-        raise RefusedError(f"the file is {file}, but {file.parent} is no folder; allowed is one that exists")
+        raise RefusedError(
+            f"the file is {file}, but {file.parent} is no folder; allowed is a file in an existing folder"
+        )
     if file.is_dir() or (file.exists() and not force):
         allowed = "another name" if file.is_dir() else f"another name, or {way} to write over it"
-        raise RefusedError(f"the file is {file}, which is there already; allowed is {allowed}")
+        raise RefusedError(f"the file is {file}, which exists already; allowed is {allowed}")
 
 
 def write(folder: Path, fill: Callable[[Path], None]) -> None:

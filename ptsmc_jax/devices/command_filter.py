@@ -17,7 +17,7 @@ from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector, pytree
 
 
 class FilterState(NamedTuple):
-    """Integrators of a second-order filter between samples, advanced by half of the next period."""
+    """Memory of a second-order filter between samples: its integrators, half a period ahead of the last sample."""
 
     first: Array  # (m,) integrator of the band-pass output [N m]
     second: Array  # (m,) integrator of the low-pass output [N m]

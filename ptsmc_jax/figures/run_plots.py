@@ -135,7 +135,7 @@ def sliding(parts: Parts, log: Log) -> Figure:
 
 
 def convergence(parts: Parts, log: Log, title: str = "Convergence") -> Figure:
-    """Plot error and s against time to go on log axes, with the exact motion and the slopes of the theory."""
+    """Plot error and s against time to go on log axes, with the exact motion and the theoretical slopes."""
     symbol = parts.controller.kinematics.symbol
     law, n = parts.controller, parts.controller.order
     t_f, eta, delta = float(law.t_f), float(law.eta), float(law.delta)

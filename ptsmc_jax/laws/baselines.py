@@ -251,7 +251,7 @@ class PredefinedTime(ComparisonLaw):
 
     share: Leaf = gain(
         0.6, (0.05, 0.95), below=1.0,
-        meaning="fraction of t_f in which the error settles on the surface; the surface is reached before",
+        meaning="fraction of t_f for the motion on the surface; the rest is for reaching the surface",
     )  # fmt: skip
     q1: Leaf = gain(0.3, (0.05, 0.49), at_most=0.5, meaning="exponent of the surface")
     q2: Leaf = gain(0.3, (0.05, 0.95), below=1.0, meaning="exponent of the reaching law")

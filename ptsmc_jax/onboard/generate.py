@@ -85,7 +85,7 @@ def _derivation(code: Code, known: parameters.Parameters) -> None:
     known.use(printer)
     code.basis = [made for made in known.listed("p") if any(made.name in names for names in follows.values())]
     copies = [f"    d->of_{element} = p->{element};" for made in code.basis for element in made.elements()]
-    about = printing.comment("What follows from the parameters, and the parameters that it follows from.")
+    about = printing.comment("Compute the derived numbers from the parameters, and copy these parameters.")
     head = [*about, "static void derive(const ptsmc_params *p, ptsmc_derived *d)", "{"]
     code.derivation = "\n".join([*head, *body, "", *copies, "}"])
     code.deriving = dict(printer.counts)

@@ -94,11 +94,11 @@ class Printer:
         self.uses: Counter[int] = Counter()
         self.nodes: dict[int, Node] = {}
         self.kept: set[int] = set()
-        self.lengths: dict[int, int] = {}  # of expressions, roughly
+        self.lengths: dict[int, int] = {}  # approximate length of the text of each expression
         self.counts: Counter[str] = Counter()
         self.section: Any = None
         self.count = 0
-        self.entries = 0  # of the tables of its loops
+        self.entries = 0  # number of entries of the tables that counted loops read
         self.open = False  # whether a loop has an unknown number of passes; `counts` has one pass of it
 
     @property

@@ -9,13 +9,13 @@ OTHERS = ("check.c", "fuzz.c", "udp.c", "shared.c")  # separate programs
 
 
 def listed(folder: Path) -> list[Path]:
-    """Return these files by name, including files that the user has added."""
+    """Return the files that determine the commands, by name, including files that the user has added."""
     code = {*folder.glob("*.c"), *folder.glob("*.h")} - {folder / name for name in OTHERS}
     return sorted(path for path in {*code, *folder.glob(LAYOUT)} if path.is_file())  # no lock of an editor
 
 
 def checksum(folder: Path) -> str | None:
-    """Return the SHA-256 of their names and contents; None if there are no readable files."""
+    """Return the SHA-256 of the names and contents of the `listed` files; None if no file can be read."""
     try:
         read = [(path.name, path.read_bytes()) for path in listed(folder)]
     except OSError:
@@ -27,7 +27,7 @@ def checksum(folder: Path) -> str | None:
 
 
 def copy(folder: Path, to: Path) -> None:
-    """Copy these files into a new folder."""
+    """Copy the `listed` files into a new folder."""
     to.mkdir()
     for path in listed(folder):
         shutil.copyfile(path, to / path.name)

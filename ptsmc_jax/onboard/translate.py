@@ -306,7 +306,7 @@ def _is_threefry(eqn: Any) -> bool:
 
 
 def _numbering(eqn: Any) -> Any:
-    """Return the equation that moves the numbers of entries, with -1 outside of the array."""
+    """Return the equation for an array of indices instead of values; indices outside of the array become -1."""
     return eqn.replace(params={**eqn.params, "fill_value": -1}) if "fill_value" in eqn.params else eqn
 
 

@@ -216,7 +216,7 @@ class RelativeInertia(Table, frozen=True):
 
 
 class CorrelatedInertia(Table, frozen=True):
-    """Correlated errors of the true inertia, in coordinates of which all values are physical; see `ptsmc identify`.
+    """Correlated errors of the true inertia, as `ptsmc identify` estimates them. Every sample is a physical inertia.
 
     The coordinates are those of `dispersions.inertias.CorrelatedInertia`, and zeros give the nominal inertia.
     """
@@ -303,7 +303,7 @@ class Failure(Interval, frozen=True):
 
 
 class Jitter(Table, frozen=True):
-    """A uniform largest jitter for each trial. Each sample is early or late by a uniform time up to it."""
+    """Random sample times. A trial has a random largest error, and each sample a uniform error up to this size."""
 
     kind: Literal["uniform"] = "uniform"
     largest: Annotated[

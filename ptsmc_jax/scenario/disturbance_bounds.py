@@ -51,7 +51,7 @@ def of(scenario: Any) -> tuple[float, float] | None:
         largest = sum((one.size for one in known), np.zeros(inputs)) + _drawn_bias(scenario)
         fastest = sum((one.rate for one in known), np.zeros(inputs))
     if not np.all(np.isfinite([largest, fastest])):
-        raise ScenarioError("disturbance is larger or faster than any number; allowed are smaller numbers in it")
+        raise ScenarioError("disturbance has an infinite amplitude or rate; allowed are smaller numbers in the table")
     return float(np.max(largest)), float(np.max(fastest))
 
 

@@ -282,7 +282,7 @@ class SensorSuite(Table, frozen=True):
             table.check_alone(place)
         if not self.gyros:
             raise ScenarioError(
-                "[[sensors]] has no gyro, but must have one, by which the filter propagates the attitude"
+                "[[sensors]] has no gyro, but must have one: the filter propagates the attitude with gyro readings"
             )
         values = np.linalg.eigvalsh(sum((table.information() for table in self.attitude.values()), np.zeros((3, 3))))
         if not values[0] > 1e-9 * values[-1]:

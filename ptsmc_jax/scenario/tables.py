@@ -413,7 +413,7 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
         """Raise ScenarioError if keys that concern the plant contradict each other."""
 
     def check_until(self, last: float) -> None:
-        """Raise ScenarioError if a search over t_f has runs until `last` [s], for which the reference is not known."""
+        """Raise ScenarioError if the reference ends before `last` [s], the end of the longest run of a search."""
 
     def model(self) -> Any:
         """Return the design model of law and observer, a part of `plants`."""

@@ -26,7 +26,7 @@ from ptsmc_jax.theory import rates, solutions
 from ptsmc_jax.theory.exact_motion import plant_motion
 
 MOST_SUBSTEPS = 200  # largest number of integration steps in a control period
-# keys for which steps of 0.1 rad are accurate enough, see `_substeps`
+# keys of smooth motions: steps of 0.1 rad are accurate enough, see `_substeps`
 _SMOOTHED = ("disturbance.frequency", "plant.system", "flexible.frequency")
 
 

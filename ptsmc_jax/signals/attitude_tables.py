@@ -126,5 +126,5 @@ def continuous(quaternions: np.ndarray) -> np.ndarray:
 
 
 def intervals(times: np.ndarray) -> int:
-    """Return the number of equal intervals of which each contains at most one sample inside."""
+    """Return the number of equal intervals, so that each interval has at most one sample inside."""
     return int(np.ceil((times[-1] - times[0]) / np.min(np.diff(times)) * (1.0 + 1e-9)))

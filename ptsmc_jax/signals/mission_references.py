@@ -123,7 +123,7 @@ def mounting(primary: object, secondary: object) -> np.ndarray:
 
 
 def nadir_mounting(primary: object, secondary: object) -> np.ndarray:
-    """Return the quaternion (4,) from body axes to orbit axes, in which nadir is -x and the horizontal velocity is y.
+    """Return the quaternion (4,) from body axes to orbit axes. Nadir is -x and the horizontal velocity is y there.
 
     Args:
         primary: body axis (3,) that points to the Earth's centre, of any length.
@@ -146,7 +146,7 @@ def anchored(matrices: np.ndarray) -> np.ndarray:
     """Return quaternions (n, 4) of rotation matrices (m, 3, 3) at equal intervals of time, without jumps of sign.
 
     Each anchor is the attitude at the start of one of n equal intervals. m and n are powers of two. n is the smallest
-    one for which the attitude turns by less than 90 degrees in every interval, or m.
+    of them with turns of less than 90 degrees in all intervals, but at most m.
     """
     from scipy.spatial.transform import Rotation
 

@@ -18,12 +18,12 @@ from ptsmc_jax.declare import number
 from ptsmc_jax.numerics import attitude, elementary
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
 
-EARTH_RATE = 7.292115e-5  # of the WGS-84 Earth [rad/s]
+EARTH_RATE = 7.292115e-5  # rotation rate of the Earth, WGS-84 [rad/s]
 EQUATORIAL_RADIUS, FLATTENING = 6_378_137.0, 1.0 / 298.257223563  # WGS-84 ellipsoid [m, -]
 DAY = 86_400.0  # [s]
-OBLIQUITY = np.deg2rad(23.4392911)  # of the ecliptic, at J2000 [rad]
-ITERATIONS = 4  # of Kepler's equation: they converge to rounding for an eccentricity of at most 0.9
-DIFFERENTIATED = 2  # further iterations, which are differentiated
+OBLIQUITY = np.deg2rad(23.4392911)  # angle between ecliptic and equator at J2000 [rad]
+ITERATIONS = 4  # steps that solve Kepler's equation up to rounding, for eccentricities of at most 0.9
+DIFFERENTIATED = 2  # further steps. Only these are differentiated.
 
 
 class Place(NamedTuple):

@@ -1,1 +1,1 @@
-"""The time loop: clocks, the flight computer, what a run is judged by, and the rollout."""
+"""The time loop: clocks, the flight computer, metrics and requirements, and the rollout."""

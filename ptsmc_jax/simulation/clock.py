@@ -27,7 +27,7 @@ def _not_above(t: Array, limit: Scalar, rounding: Scalar | float = 0.0) -> Array
 
 
 def _complete(t: Array, t_next: Array, hold: Array) -> Ticks:
-    """Return intervals that are numbered from 0, none of which is partial."""
+    """Return complete intervals, numbered from 0."""
     return Ticks(t, t_next, hold, jnp.arange(t.size, dtype=jnp.int32), jnp.ones_like(t), jnp.zeros_like(hold))
 
 

@@ -17,8 +17,8 @@ from ptsmc_jax.simulation.catalogues import CATALOGUE, MARGINS, WITHIN, percent
 def must_keep(trials: int, quantile: float | None, confidence: float | None) -> int | None:
     """Return the number of trials that must keep a limit, or None if there are too few trials to verify it.
 
-    Without a quantile all trials must keep it. With a confidence, it is the smallest number for which the one-sided
-    lower bound on the probability, `statistics.fraction_bound`, reaches the quantile.
+    Without a quantile all trials must keep it. With a confidence, the one-sided lower bound on
+    the probability (`statistics.fraction_bound`) must reach the quantile.
 
     Args:
         trials: number of trials.
@@ -193,7 +193,7 @@ class Requirement:
         """Return the verdict on trials. A trial that failed or has no value breaks the limit.
 
         Args:
-            values: of the metric, (trials,) in its unit, or () for a single run, to which no quantile applies.
+            values: of the metric, (trials,) in its unit, or () for a single run. A single run has no quantile.
             ok: whether each trial has finished, bool of the same shape.
             within: fraction of the time within the limit, same shape; needed if the requirement is on the time.
         """

@@ -158,7 +158,7 @@ class _SimulateProgram(programs.Program):
 simulate_parts = _SimulateProgram(simulate, ("record", "software"), title="the simulation")
 # for a single run: compiles in half to a tenth of the time, and runs 3 to 8 times as long
 simulate_once = _SimulateProgram(simulate, ("record", "software"), programs.QUICKLY, title="the simulation")
-LONG = 20_000  # periods of a run from which fast compilation no longer pays
+LONG = 20_000  # periods of a run. Longer runs are worth a slow compilation.
 
 
 def single_run_program(parts: Parts) -> programs.Program:

@@ -24,11 +24,11 @@ GIVEN_AWAY = 0.2785  # max of x (1 - tanh x): loss of the smooth sign per compon
 
 
 def sliding_envelope(parts: Parts) -> tuple[float, float]:
-    """Return s0 and floor of |s|_2^2 <= s0^2 r^(2 (eta+n-2)) + floor tau^n, for the continuous loop without noise.
+    """Return s0 and c of |s|_2^2 <= s0^2 r^(2 (eta+n-2)) + c tau^n, for the continuous loop without noise.
 
-        floor = 2 beta / (2 eta + n - 4),  beta = (factor of tau^(n-1) sign(s) in s') * components * 0.2785 width
+        c = 2 beta / (2 eta + n - 4),  beta = (factor of tau^(n-1) sign(s) in s') * components * 0.2785 width
 
-    The floor is 0 for the discontinuous sign, which gives (15), (32) and (43) of the paper.
+    c is 0 for the discontinuous sign, which gives (15), (32) and (43) of the paper.
     """
     law, n = parts.controller, parts.controller.order
     beta = switching_rate(parts) * parts.plant.inputs * GIVEN_AWAY * float(law.layer(jnp.asarray(False)))
@@ -74,10 +74,10 @@ def narrowest_sign(parts: Parts, period: float) -> float:
 def sliding_bound(parts: Parts, t: ArrayLike) -> np.ndarray:
     """Return the bound on |s|_2 of `sliding_envelope` at times t (time,) [s] before the hand-over."""
     law, n = parts.controller, parts.controller.order
-    s0, floor = sliding_envelope(parts)
+    s0, residual = sliding_envelope(parts)
     tau = np.maximum(float(law.t_f) - np.asarray(t), 0.0)
     falling = s0 * (tau / float(law.t_f)) ** (float(law.eta) + n - 2.0)
-    return np.hypot(falling, np.sqrt(floor * tau**n))
+    return np.hypot(falling, np.sqrt(residual * tau**n))
 
 
 def error_bound(parts: Parts, t: ArrayLike) -> np.ndarray:
@@ -85,16 +85,16 @@ def error_bound(parts: Parts, t: ArrayLike) -> np.ndarray:
 
     The error is |v|_2 of the attitude error vector v, or |x_1| of a chain.
     """
-    s0, floor = (jnp.asarray(v) for v in sliding_envelope(parts))
-    return np.asarray(_error_bound(parts, jnp.asarray(t), s0, floor))
+    s0, residual = (jnp.asarray(v) for v in sliding_envelope(parts))
+    return np.asarray(_error_bound(parts, jnp.asarray(t), s0, residual))
 
 
 @programs.jit
-def _error_bound(parts: Parts, t: Array, s0: Scalar, floor: Scalar) -> Array:
+def _error_bound(parts: Parts, t: Array, s0: Scalar, residual: Scalar) -> Array:
     law = parts.controller
 
     def component(time: Scalar, x0: Vector) -> Scalar:
-        centre, half = state_envelope(time, law.t_f, law.eta, x0, s0, floor)
+        centre, half = state_envelope(time, law.t_f, law.eta, x0, s0, residual)
         return jnp.abs(centre[0]) + half[0]
 
     sizes = jax.vmap(lambda time: jax.vmap(lambda x0: component(time, x0))(starts(parts)))(t)

@@ -75,9 +75,9 @@ def sliding_bound(parts: Parts, t: ArrayLike) -> np.ndarray:
     The bound on |s_i(t_s)| follows from `solutions.state_envelope`. Equations (23) and (51) are the special case
     beta = 0, the discontinuous sign.
     """
-    law, (_, _, s, floor) = parts.controller, _at_hand_over(parts)
+    law, (_, _, s, limit) = parts.controller, _at_hand_over(parts)
     fallen = np.exp(-2.0 * float(law.reaching_rate) * (np.asarray(t) - float(law.hand_over)))[:, None]
-    return np.sqrt(np.sum(np.asarray(s) ** 2 * fallen + float(floor) ** 2 * (1.0 - fallen), axis=1))
+    return np.sqrt(np.sum(np.asarray(s) ** 2 * fallen + float(limit) ** 2 * (1.0 - fallen), axis=1))
 
 
 def error_bound(parts: Parts, t: ArrayLike) -> np.ndarray:
@@ -98,26 +98,26 @@ class _HandOver(NamedTuple):
     centre: Array  # (m, n) The error and its derivatives are between centre - half and centre + half.
     half: Array  # (m, n)
     s: Array  # (m,) Bound on |s|.
-    floor: Array  # Limit of the bound on |s_i| for t -> infinity, (beta/k)^(1/2).
+    limit: Array  # Limit of the bound on |s_i| for t -> infinity, (beta/k)^(1/2).
 
 
 def _at_hand_over(parts: Parts) -> _HandOver:
     law = parts.controller
     beta = envelopes.switching_rate(parts) * envelopes.GIVEN_AWAY * float(law.sign_width)
-    floor = np.sqrt(beta / float(law.reaching_rate))
-    return _handed(parts, *(jnp.asarray(v) for v in (*envelopes.sliding_envelope(parts), floor)))
+    limit = np.sqrt(beta / float(law.reaching_rate))
+    return _handed(parts, *(jnp.asarray(v) for v in (*envelopes.sliding_envelope(parts), limit)))
 
 
 @programs.jit
-def _handed(parts: Parts, s0: Scalar, floor_before: Scalar, floor: Scalar) -> _HandOver:
+def _handed(parts: Parts, s0: Scalar, residual_before: Scalar, limit: Scalar) -> _HandOver:
     law = parts.controller
 
     def component(x0: Vector) -> tuple[Vector, Vector]:
-        return solutions.state_envelope(law.hand_over, law.t_f, law.eta, x0, s0, floor_before)
+        return solutions.state_envelope(law.hand_over, law.t_f, law.eta, x0, s0, residual_before)
 
     centre, half = jax.vmap(component)(solutions.starts(parts))
     weights = jnp.append(law.surface(), 1.0)
-    return _HandOver(centre, half, jnp.abs(centre @ weights) + half @ jnp.abs(weights), floor)
+    return _HandOver(centre, half, jnp.abs(centre @ weights) + half @ jnp.abs(weights), limit)
 
 
 @programs.jit
@@ -131,6 +131,6 @@ def _error_bound(parts: Parts, known: _HandOver, lags: Vector, t: Array) -> Arra
         slid = integrators.phi_functions(hold_matrix(surface, rate) * after, 0)[0][0] @ on_it
         falling, staying = (exact_hold(after, lags, k, off_it).x[0] for k in (rate, jnp.zeros_like(rate)))
         each = jnp.abs(known.centre[:, :-1] @ slid) + known.half[:, :-1] @ jnp.abs(slid)
-        return guards.norm(each + known.s * falling + known.floor * staying)
+        return guards.norm(each + known.s * falling + known.limit * staying)
 
     return jax.vmap(size)(t - law.hand_over)

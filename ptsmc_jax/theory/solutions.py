@@ -27,10 +27,12 @@ Vector = Float[Array, " n"]
 VISITED = 64  # number of times in the approach phase, and on the target
 
 
-def state_envelope(t: Scalar, t_f: Scalar, eta: Scalar, x0: Vector, s0: Scalar, floor: Scalar) -> tuple[Vector, Vector]:
+def state_envelope(
+    t: Scalar, t_f: Scalar, eta: Scalar, x0: Vector, s0: Scalar, residual: Scalar
+) -> tuple[Vector, Vector]:
     """Return centre and half width, (n,) each, of the interval that contains x_1 .. x_n before the hand-over.
 
-    The interval follows from |s|^2 <= s0^2 r^(2 (eta+n-2)) + floor tau^n of `envelopes.sliding_envelope`. The centre is
+    The interval follows from |s|^2 <= s0^2 r^(2 (eta+n-2)) + c tau^n of `envelopes.sliding_envelope`. The centre is
     the exact solution without s. Each of the n-1 integrations of |y^(n-1)| <= |s| / tau^(eta+n-1) adds to the width.
     The result generalises (20)-(22) and (47)-(50), with explicit constants.
 
@@ -40,11 +42,11 @@ def state_envelope(t: Scalar, t_f: Scalar, eta: Scalar, x0: Vector, s0: Scalar, 
         eta: exponent of the law [-].
         x0: states at t = 0, (n,), in the states' own units.
         s0: bound on |s| at t = 0, see `envelopes.sliding_envelope`.
-        floor: coefficient of tau^n, see `envelopes.sliding_envelope`.
+        residual: coefficient c of tau^n, see `envelopes.sliding_envelope`.
     """
     n, tau = x0.shape[0], t_f - t
     free, forced = modes(t, t_f, eta, x0)
-    scale = jnp.sqrt(floor) * tau ** (n / 2)  # bound on the residual |s| of the smooth sign
+    scale = jnp.sqrt(residual) * tau ** (n / 2)  # bound on the residual |s| of the smooth sign
     widths = []
     for j in range(n):
         p = n - 2 - j

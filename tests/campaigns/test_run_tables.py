@@ -388,9 +388,7 @@ COUPLING = [f"mode_coupling_1{i}" for i in (1, 2, 3)]
 OUTAGE = ["star_tracker_outage_begin", "star_tracker_outage_end"]
 FAILURE = ["wheel_failure_time", "wheel_failure_wheel"]
 ONE_WHEEL = "but must have a time and the number of a wheel, from 1 to 4, or 0 for none"
-NO_BODY = (
-    "but must have a flexible body's coupling (the inertia less D'D, what is left when all modes move along, must be "
-)
+NO_BODY = "but must have a flexible body's coupling (the inertia minus D'D, the inertia without the modes, must be "
 MISFIT = [
     (OUTAGE, [(3.0, 9.0), (9.0, 3.0)],
      f"{OUTAGE[0]} to {OUTAGE[1]} = 9, 3 in row 1, but must have a begin and an end that is not before it"),

@@ -131,7 +131,7 @@ def test_new_command_does_not_overwrite_files(command, tmp_path):
     code, _, error = command("new")
     assert (code, error) == (
         2,
-        "ptsmc: the file is scenario.toml, which is there already; allowed is another name, or --force to write "
+        "ptsmc: the file is scenario.toml, which exists already; allowed is another name, or --force to write "
         "over it\n",
     )
     assert command("new", "--like", FLIGHT, "--force", "--quiet") == (0, "", "")
@@ -149,8 +149,8 @@ def test_file_name_is_escaped_if_the_output_encoding_lacks_its_letters(command, 
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["nowhere/s.toml"], "the file is nowhere/s.toml, but nowhere is no folder; allowed is one that exists"),
-        (["."], "the file is ., which is there already; allowed is another name"),
+        (["nowhere/s.toml"], "but nowhere is no folder; allowed is a file in an existing folder"),
+        (["."], "the file is ., which exists already; allowed is another name"),
         (["chain"], "FILE is chain, which is a kind of plant; allowed are --plant chain and other file names"),
         (["a.toml", "--plant", "boat"], f"--plant is boat, but must be {PLANTS}"),
         (["a.toml", "--like", "none.toml"], "the scenario file none.toml does not exist"),

@@ -71,7 +71,7 @@ def test_run_table_is_simulated_resumed_replayed_and_reported(command, tmp_path)
     for again in (["replay", folder, "--trial", 1], ["replay", folder, "--trial", 0]):
         code, out, error = command(*again)
         assert (code, out) == (2, "")
-        assert "run_table.parquet is not the run table with which the campaign began" in error
+        assert "run_table.parquet has changed: it is not the run table of the campaign" in error
     assert command(*asked, "--force", "--quiet")[0] == 0
     assert rows_of(folder)["initial_x2"][2] == -0.03
     assert command("montecarlo", "s.toml", "--out", folder, "--force", "--quiet", "--trials", 5, "--no-figures")[0] == 0

@@ -217,7 +217,7 @@ def test_invalid_times_are_refused(command, tmp_path, options, said):
         ({"requirements": {"gain_margin": 6.0}, "tune": {}}, "requirements.gain_margin is asked of one loop"),
         (  # t_o would stay a third of the scenario's t_f at every time
             {"observer": {"kind": "prescribed_time"}, "tune": {}},
-            "observer.t_o is absent and would follow t_f; allowed is one that is given",
+            "observer.t_o is absent and would follow t_f; allowed is a given t_o",
         ),
     ],
 )

@@ -15,8 +15,8 @@ from tuning.output.run_report import bound, warnings
 from tuning.output.summaries import Campaign, Entry, Quantile
 
 NOTES = {
-    "max": "Quantiles with 95 % intervals; a failed trial is beyond every quantile. -: so many trials fail or never "
-    "settle, or so few were simulated, that there is no value.",
+    "max": "Quantiles with 95 % intervals; a failed trial is beyond every quantile. -: there is no value, "
+    "because too many trials fail or never settle, or too few were simulated.",
     "min": "Fractions of the time within a limit, larger is better: the value that 99.73 % of the trials reach, and "
     "the smallest. A failed trial counts as 0.",
 }

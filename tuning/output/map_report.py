@@ -9,8 +9,8 @@ from tuning.output.report import Report, Section, Table
 NOTE = (
     "linear_window_error and linear_torque are predictions of linear theory for the noise alone, with explicit "
     "sampling. radius, gain_margin and delay_margin belong to the loop at the hand-over with frozen gains, hold_radius "
-    "and the others with hold_ to the hold phase. The loop is stable up to a radius of 1. gain_margin is the factor on "
-    "the gain up to which the loop is stable; below 1 it is unstable."
+    "and the others with hold_ to the hold phase. The loop is stable up to a radius of 1. gain_margin is the largest "
+    "factor on the gain with a stable loop; below 1 the loop is unstable."
 )
 
 

@@ -81,7 +81,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Code:
-    """Text that is printed as it is."""
+    """Text that is printed without changes, such as a command."""
 
     text: str
     note: str = ""

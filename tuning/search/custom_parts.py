@@ -112,7 +112,7 @@ def check_unchanged(programs: Mapping[str, str], results: Path, made: Mapping[st
             then = " or ".join(was[:12] for was in known)
             raise RefusedError(
                 f"{results} was made with another {key} than {location(key, where)} is now "
-                f"(SHA-256 {then} then, {now[:12]} now); allowed is the file as it was"
+                f"(SHA-256 {then} then, {now[:12]} now); allowed is the file with its earlier content"
             )
     return unknown
 

@@ -65,7 +65,7 @@ class Bounds:
     names: tuple[str, ...]
     lower: tuple[float, ...]
     upper: tuple[float, ...]
-    hop: float = 0.0  # units of s times units of the observer's gain; 0: the lower bound of sign_width is fixed
+    hop: float = 0.0  # see above [unit of s times unit of observer_gain]; 0: the lower bound of sign_width is fixed
 
     @property
     def logarithmic(self) -> np.ndarray:

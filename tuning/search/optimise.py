@@ -22,7 +22,7 @@ from tuning.search.worst import Hardest
 
 Announce = Callable[[str], None]  # reports the name of the current step
 
-GLOBALLY = "no gains so far meet every requirement: searching globally"
+GLOBALLY = "no gains that meet every requirement are found yet: searching globally"
 HOPELESS = 1.1  # if the best gains have a larger metric / limit, harder trials cannot help and none join
 
 

@@ -192,7 +192,7 @@ class Folder:
         drawn = self.ready.dispersion.custom_names()
         table = run_tables.checked(self.table, self.ready.parts, where, self.custom_metric_names, drawn)
         if self.made is not None and table.checksum != self.checksums.get(RUN_TABLE):
-            raise RefusedError(f"{self.path / TABLE} is not the run table with which the campaign began")
+            raise RefusedError(f"{self.path / TABLE} has changed: it is not the run table of the campaign")
         return table
 
     @cached_property
@@ -319,7 +319,7 @@ def opened(path: Path) -> Folder:
         versions = store.read_versions(path)
         if versions.get("command", "montecarlo") != "montecarlo":
             raise RefusedError(
-                f"{path} holds results of `ptsmc {versions['command']}`, but must be one of `ptsmc montecarlo`"
+                f"{path} has results of `ptsmc {versions['command']}`, but must have results of `ptsmc montecarlo`"
             )
         made = msgspec.convert(versions, Made, strict=True)
         if made.metrics is not None:

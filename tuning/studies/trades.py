@@ -247,9 +247,7 @@ class SlewTime(Trade):
         if T_F in scenario.search.gains:
             raise wrong("tune.free", list(scenario.search.gains), f"without t_f {self.purpose}")
         if free_gains.observer_follows(scenario):
-            raise ScenarioError(
-                f"observer.t_o is absent and would follow t_f; allowed is one that is given {self.purpose}"
-            )
+            raise ScenarioError(f"observer.t_o is absent and would follow t_f; allowed is a given t_o {self.purpose}")
         for key in scenario.requirements:
             if key in MARGINS:
                 raise ScenarioError(
