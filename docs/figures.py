@@ -54,7 +54,7 @@ def slew(published: Scenario, tuned: Scenario) -> Figure:
     parts, bound = ptsmc.study(tuned).parts, ptsmc.lower_bound(tuned)
     t_f, t_end = float(parts.controller.t_f), float(parts.t_end)
     assert bound is not None
-    axes.hlines(2.0 * np.arcsin(bound) * ARCSEC, t_f, t_end, **style.FLOOR, label="lower bound")
+    axes.hlines(2.0 * np.arcsin(bound) * ARCSEC, t_f, t_end, **style.LOWER_BOUND, label="lower bound")
     axes.axvline(t_f, **style.LIMIT)
     axes.text(t_f, 1.0, "$t_f$", transform=axes.get_xaxis_transform(), ha="center", va="bottom")
     axes.set(yscale="log", xlabel=style.TIME, ylabel="pointing error [arcsec]", xlim=(0.0, t_end))
