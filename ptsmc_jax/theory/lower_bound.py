@@ -310,9 +310,7 @@ class _Linear(NamedTuple):
     push: Array  # (periods, n, m) Derivative of the state at the end by p.
     seen: Array  # (periods, 3 m, n) Derivative of the error by z.
     seen_push: Array  # (periods, 3 m, m) Derivative of the error by p.
-    early: (
-        Array  # (periods, k, n) Derivative of the sensed state by z; no rows if readings are at control samples only.
-    )
+    early: Array  # (periods, k, n) Derivative of the sensed state by z; no rows without readings between samples.
     early_push: Array  # (periods, k, m) Derivative of the sensed state by p.
     now: Array  # (periods, readings, n) Derivative of the readings by z; no rows without a sensor suite.
 
