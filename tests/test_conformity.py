@@ -331,16 +331,6 @@ def test_every_part_gives_equal_results_in_lanes_vmap_and_loop_with_finite_gradi
         agree({metric: values[:-1] for metric, values in alone.items()}, metrics, 1e-12, name)
 
 
-@pytest.mark.parametrize(
-    "name", short(("chain, finite-time observer", "raw samples, full inertia, other truth"), KINDS[-1:])
-)
-def test_runs_without_jit_give_equal_results(name):
-    ready = scenario.study(scenario.from_tables(ROWS[name]))
-    run = ready.dispersion.apply(ready.parts, SEED, NUMBERS[0])
-    one, other = (dict(fly(run, SEED, NUMBERS[0]).metrics) for fly in (rollout.simulate, rollout.simulate_parts))
-    agree(jax.tree.map(np.asarray, one), other, 1e-12, name)
-
-
 @pytest.mark.parametrize("name", short(ROWS, KINDS))
 def test_results_have_the_same_shapes_alone_and_in_a_batch(name):
     """The result of a run has the same shapes and types alone and in a batch of one, so nothing is broadcast.

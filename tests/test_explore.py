@@ -164,17 +164,6 @@ def test_verdicts_accepts_all_kinds_of_scenarios_and_validates_rows(flight, tmp_
             ptsmc_jax.verdicts(flight.scenario, other)
 
 
-def test_margins_come_from_the_trials_of_the_rows(monkeypatch):
-    asked: list[Any] = []
-    monkeypatch.setattr(explore.margin_verdicts, "over_trials", lambda ready, seed: asked.append((ready, seed)) or [])
-    tables = tomllib.loads(SHORT_CHAIN) | {"requirements": {"gain_margin": 3.0, "peak_torque": 3.0}}
-    ready = scenario.study(scenario.from_tables(tables))
-    rows = pl.DataFrame({"status": ["ok", "ok"], "peak_torque": [1.0, 2.0]})
-    (verdict,) = ptsmc_jax.verdicts(ready, rows, seed=7)
-    assert (verdict.metric, verdict.worst) == ("peak_torque", 2.0)
-    assert asked == [(ready, 7)]
-
-
 def test_an_animation_is_one_page_without_external_files(flight, tmp_path):
     made = flight.animate(frames=4)
     content = made._repr_html_()
@@ -257,16 +246,6 @@ def test_an_animation_draws_body_and_reference_at_even_times(monkeypatch):
             np.testing.assert_allclose(
                 [end for _, end in three], animation.turned(np.asarray(at), np.eye(3)), atol=1e-12
             )
-
-
-def test_trials_and_lower_bound_use_the_given_seed(monkeypatch):
-    monkeypatch.setattr(campaign.Campaign, "simulate", lambda self, trials: self.seed)
-    monkeypatch.setattr(runs, "rms_lower_bound", lambda ready, seed=0, rows=(): seed)
-    made = scenario.from_tables(TABLES)
-    run_table = pl.DataFrame({f"initial_w{k}": [0.01, 0.0] for k in (1, 2, 3)})
-    seed: Any = explore.trials(made, run_table, seed=3)
-    assert seed == 3
-    assert explore.lower_bound(made, seed=5) == 5
 
 
 # --- the functions of `tuning` ---

@@ -112,16 +112,6 @@ def test_a_thread_with_another_precision_has_other_programs(folder):
     assert count(folder) == 3
 
 
-def test_a_later_command_in_the_same_process_can_prepare_programs_too(folder):
-    program, _ = spied()
-    for size in range(1, 5):  # `stop` cancels the last ones
-        program.prepare(X[:size])
-    programs.stop()
-    program.prepare(X)
-    for size in range(1, 6):
-        assert program(X[:size])["both"].shape == (size,)
-
-
 def test_a_prepared_program_is_read_and_compiled_once(folder):
     spied()[0](X)
     again, traced = spied()
@@ -191,13 +181,6 @@ def test_an_error_of_the_function_is_raised_by_the_call(folder):
     for _ in range(2):
         with pytest.raises(OverflowError, match="too large"):
             program(X)
-
-
-def test_no_program_is_compiled_or_stored_if_jit_is_disabled(folder):
-    program, _ = spied()
-    with jax.disable_jit():
-        np.testing.assert_allclose(program(X)["both"], np.sin(2 * X) + 5.0, rtol=1e-15)
-    assert not folder.exists()
 
 
 def test_every_dependence_of_a_program_changes_its_file(folder, monkeypatch):
@@ -312,23 +295,6 @@ def test_a_damaged_file_is_traced_again(folder, damage):
     np.testing.assert_allclose(again(X)["both"], np.sin(2 * X) + 5.0, rtol=1e-15)
     assert len(traced) == 1
     assert stored.read_bytes() == content
-
-
-def test_a_reader_never_sees_an_incomplete_file(folder):
-    """Several threads write the same file, others read it."""
-    program, _ = spied()
-    program(X)
-    (stored,) = folder.iterdir()
-    content = programs._read(stored)
-    assert content is not None
-    stored.unlink()
-    with ThreadPoolExecutor(6) as pool:
-        writing = [pool.submit(programs._write, stored, content) for _ in range(40)]
-        found = [pool.submit(lambda: (stored.exists(), programs._read(stored))) for _ in range(40)]
-        assert all(read.result()[1] == content for read in found if read.result()[0])
-        for one in writing:
-            one.result()
-    assert list(folder.iterdir()) == [stored]
 
 
 def test_programs_in_a_folder_that_cannot_be_written_are_read(folder, monkeypatch):

@@ -145,23 +145,6 @@ def test_two_processes_killed_in_one_folder_lose_no_row(folder, whole, options):
     assert [path.name for path in (folder / "out").iterdir()] == ["montecarlo-s"]
 
 
-@pytest.mark.long
-def test_interrupted_campaign_keeps_finished_parts_and_resumes(folder, whole):
-    run = started(folder, "--trials", str(TRIALS))
-    assert await_parts(folder, 2, run)
-    run.send_signal(signal.SIGINT)
-    code, error = ended(run)
-    assert code == 130
-    assert "interrupted; the same command resumes it" in error
-    assert "Traceback" not in error
-    done = parts(folder)
-    assert 2 <= len(done) < PARTS
-    run = started(folder, "--trials", str(TRIALS))
-    assert ended(run) == (0, "")
-    assert set(done) <= set(parts(folder))
-    same(rows_of(folder), whole)
-
-
 @pytest.fixture
 def cluster(folder):
     """Start a Dask scheduler and two workers on the loopback device, and return the processes of the workers."""

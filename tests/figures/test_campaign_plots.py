@@ -66,30 +66,6 @@ def test_a_limit_in_the_legend_is_on_the_axis(limit):
     assert low < limit < high
 
 
-def test_the_legend_of_a_narrow_figure_stays_inside_it():
-    outcome = np.array([campaign_plots.AT_TIMES, campaign_plots.BEYOND, "ok"], dtype=object)
-    x, totals = np.arange(3.0), dict.fromkeys(campaign_plots.MARKS, 1000)
-    figure = campaign_plots.inputs(
-        {"initial_w1": campaign_plots.Column("rad/s", x)}, {"ape_z": campaign_plots.Column("rad", x)}, outcome, totals
-    )
-    assert (figure.axes[0].get_xlabel(), figure.axes[0].get_ylabel()) == ("initial_w1 [rad/s]", "ape_z\n[rad]")
-    figure.draw_without_rendering()
-    (legend,) = figure.legends
-    assert figure.bbox.x0 <= legend.get_window_extent().x0
-
-
-def test_axes_of_metrics_over_dispersions_have_plain_numbers():
-    """The numbers have the form of other campaign figures, not 2 x 10^-1."""
-    x = np.geomspace(0.03, 0.9, 5)
-    column, outcome = campaign_plots.Column("N m", x), np.full(5, "ok", dtype=object)
-    totals = dict.fromkeys(campaign_plots.MARKS, 5)
-    figure = campaign_plots.inputs({"initial_w1": column}, {"peak_torque": column}, outcome, totals)
-    figure.draw_without_rendering()
-    labels = [tick.get_text() for tick in figure.axes[0].get_yticklabels(which="both")]
-    assert {"0.05", "0.1", "0.2", "0.5"} <= set(labels)
-    assert not any("10^" in label for label in labels)
-
-
 @pytest.mark.parametrize(("unit", "shown", "factor"), [("rad", "[deg]", 180.0 / np.pi), ("x1", "[x1]", 1.0)])
 def test_initial_angles_are_drawn_in_the_unit_of_their_axis(unit, shown, factor):
     angle, outcome = np.array([0.5, 1.0, 2.0]), np.full(3, "ok", dtype=object)

@@ -29,16 +29,6 @@ def test_a_peak_of_the_command_is_labelled_as_commanded(text, delay, unit, said)
     assert any(re.match(said, label) for label in axes.get_legend_handles_labels()[1])
 
 
-def test_the_axis_of_the_time_to_go_has_plain_numbers_in_run_figures():
-    """The axis runs from t_f down to delta. An earlier version printed 60 s as 6x10^1."""
-    figure = ptsmc_jax.simulate(from_tables(untuned(SHORT))).plot("convergence")["convergence"]
-    (axes,) = figure.axes
-    figure.draw_without_rendering()
-    labels = [label.get_text() for label in axes.get_xticklabels(which="both") if label.get_text()]
-    assert labels
-    assert all(re.fullmatch(r"[\d.]+", label) for label in labels)
-
-
 def test_no_two_of_twenty_states_look_alike():
     """An earlier version drew x6, x11 and x16 with the same colour, style and width."""
     axes = Figure().subplots()
@@ -88,16 +78,6 @@ def test_a_command_far_beyond_the_delivered_torque_is_cut_by_the_axis():
     assert flight.metrics["peak_torque"] > 100 * 1e-3
     assert max(map(abs, axes.get_ylim())) == pytest.approx(run_plots.FAR_OFF * 1e-3)
     assert any(label.endswith("beyond this axis") for label in axes.get_legend_handles_labels()[1])
-
-
-@pytest.mark.parametrize(("points", "where"), [(100, "best"), (300_000, "upper right")])
-def test_the_legend_of_a_long_run_has_a_fixed_corner(points, where, monkeypatch):
-    """For the best place of a legend, Matplotlib examines each point, and it warns if this is slow."""
-    axes, asked = Figure().subplots(), []
-    axes.plot(np.zeros(points), label="q")
-    monkeypatch.setattr(axes, "legend", lambda **how: asked.append(how["loc"]))
-    run_plots._legend(axes)
-    assert asked == [where]
 
 
 def test_a_run_that_diverges_is_drawn_without_warnings():

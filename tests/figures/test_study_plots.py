@@ -128,19 +128,6 @@ def test_every_grid_with_numbers_has_a_map(count):
     assert len(figure.axes) == 2 * count  # each map has a colour bar
 
 
-@pytest.mark.parametrize("high", [2.3, 50.0])
-def test_the_colour_bar_of_a_map_has_plain_numbers(high):
-    """The numbers have the form of the axes, 0.5 and 2, not 6 x 10^-1."""
-    axis = study_plots.MapAxis("delta [s]", [1.0, 2.0], False)
-    grid = np.array([[0.15, 1.0], [0.3, high]])
-    figure = study_plots.accuracy_map(axis, axis, dict.fromkeys(NAMES, grid), np.zeros((2, 2), bool), {})
-    figure.draw_without_rendering()
-    for bar in [axes for axes in figure.axes if not axes.get_title()]:
-        labels = [label.get_text() for label in bar.get_yticklabels(which="both") if label.get_text()]
-        assert len(labels) >= 2
-        assert not [label for label in labels if "$" in label]
-
-
 @pytest.mark.parametrize(("low", "high"), [(1e-3, 1e-1), (1e-2, 1.0), (0.05, 5.0), (1e-5, 1.0)])
 def test_numbers_of_a_maps_logarithmic_axis_do_not_overlap(low, high):
     across = study_plots.MapAxis("sign_width", np.geomspace(low, high, 2), True)

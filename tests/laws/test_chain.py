@@ -8,11 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import strategies as st
-from scipy.integrate import solve_ivp
 
 from ptsmc_jax import formulas
 from ptsmc_jax.laws.prescribed_time import expansion
-from ptsmc_jax.observers import nonlinear
 from ptsmc_jax.plants import integrator_chain
 from ptsmc_jax.signals import disturbances
 from ptsmc_jax.simulation import rollout
@@ -263,23 +261,6 @@ def test_exact_chain_solves_the_equations_of_chain_and_law(n):
         np.testing.assert_allclose((u[0], s[0]), (at.acceleration, at.s), rtol=1e-8, atol=1e-11 * size)
 
 
-def test_exact_chain_of_order_3_equals_adaptive_integration():
-    eta, t_f = 3.4, 6.0
-    c = (eta * (eta + 1), 2 * eta)
-
-    def rate(t, x):
-        tau = t_f - t
-        s = c[0] * x[0] + c[1] * tau * x[1] + tau**2 * x[2]
-        u = -((c[0] - c[1]) * x[1] + (c[1] - 2.0) * tau * x[2]) / tau**2 - (eta + 1) * s / tau**3
-        return [x[1], x[2], u]
-
-    times = np.array([0.5, 3.0, 5.9])
-    truth = solve_ivp(rate, (0.0, 5.9), [1.0, -0.5, 2.0], t_eval=times, rtol=1e-12, atol=1e-13).y
-    for k, t in enumerate(times):
-        found = solutions.exact_chain(vector(t), vector(t_f), vector(eta), vector([1.0, -0.5, 2.0]))
-        np.testing.assert_allclose(found.x, truth[:, k], rtol=0, atol=1e-9)
-
-
 @pytest.mark.parametrize("x0", short([[5.0, 3.0], [5.0, 3.0, 2.0]], [[5.0, 3.0, 2.0]]))
 def test_sampled_chain_converges_to_the_continuous_chain_with_order_1(x0):
     wave = disturbances.Sinusoid(*(vector([v]) for v in (0.01, 1.0, 0.0, 0.0)))
@@ -291,19 +272,6 @@ def test_sampled_chain_converges_to_the_continuous_chain_with_order_1(x0):
     gaps = [abs(float(fly(run).metrics.window_error / truth) - 1.0) for run in sampled]
     ratios = np.array(gaps[:-1]) / np.array(gaps[1:])
     assert np.all((ratios > 1.7) & (ratios < 2.3))  # a zero-order hold has an error of order 1
-
-
-def test_observer_error_on_a_chain_is_within_its_bound():
-    wave = disturbances.Sinusoid(*(vector([v]) for v in (0.05, 1.0, 0.0, 0.02)))
-    model = integrator_chain.chain(3)
-    observer = nonlinear.NonlinearObserver(model, vector([20.0]), vector(0.05), vector(0.02))
-    for period in (None, 0.02):
-        run = chain_parts([1.0, 0.0, 0.0], disturbance=wave, observer=observer, period=period, delta=0.3)
-        log = fly(run).log
-        off = np.abs(log.d_hat - log.disturbance)[:, 0]
-        bound = np.asarray(jax.vmap(observer.error_bound())(log.t))
-        # a sampled estimate is one period old
-        assert np.all(off <= bound * (1 + 1e-6) + (0.0 if period is None else 0.05 * period))
 
 
 def test_law_cancels_known_drift_and_gain_exactly():
@@ -356,7 +324,3 @@ def test_metrics_that_a_chain_lacks_are_nan():
     assert np.isnan(float(result.metrics.peak_momentum))
     assert float(result.metrics.peak_rate) == pytest.approx(np.abs(result.log.x[:, 1]).max())
     assert float(result.metrics.terminal_angle) == float(result.metrics.terminal_error)
-
-
-def test_speed_of_a_chain_is_the_magnitude_of_x_2():
-    assert float(integrator_chain.chain(3).speed(vector([0.5, -2.0, 7.0]))) == 2.0

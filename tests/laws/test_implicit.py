@@ -155,16 +155,6 @@ def test_hold_phase_has_no_largest_k1_without_delay():
     assert delayed[0] > delayed[1]
 
 
-def test_implicit_sampling_is_better_than_explicit_for_a_delta_of_one_period():
-    """For eta = 4 explicit sampling is unstable for delta < (eta - 3/2) h = 2.5 periods, and the error grows again."""
-    found = {}
-    for sampling in ("explicit", "implicit"):
-        run = fly(chain_parts(eta=4.0, delta=H, sampling=sampling, sign_width=1e-3))
-        found[sampling] = float(run.metrics.window_error), float(run.metrics.peak_torque)
-    assert found["implicit"][0] < found["explicit"][0]
-    assert found["implicit"][1] <= found["explicit"][1]
-
-
 def test_hand_over_one_period_before_t_f_does_not_amplify_position_noise():
     """A hand-over target from the s of the approach phase would turn position noise into a rate of eta / h times it.
 

@@ -215,16 +215,6 @@ def sheet():
     return np.asarray(rows(jnp.arange(-8192, 8192)))
 
 
-def test_moments_equal_the_moments_of_the_normal_distribution(sheet):
-    n = sheet.size
-    for power, moment, variance in ((1, 0, 1), (2, 1, 2), (3, 0, 15), (4, 3, 96), (6, 15, 10395 - 225)):
-        assert abs(np.mean(sheet**power) - moment) <= SIGMAS * math.sqrt(variance / n)
-
-
-def test_normals_pass_the_kolmogorov_smirnov_test(sheet):
-    assert stats.kstest(sheet.ravel(), "norm").pvalue > ALARM
-
-
 def test_normals_have_the_right_tails_up_to_five_sigma():
     key, batches, batch = draws.stream(4, 5, "tails"), 8, 2**19
     limits = range(1, 6)
@@ -244,41 +234,9 @@ def test_normals_have_the_right_tails_up_to_five_sigma():
     assert max(float(c[1]) for c in counted) < 6.77
 
 
-def test_all_bits_of_uniforms_are_uniform():
-    rows = jax.jit(jax.vmap(partial(draws.uniforms, draws.stream(6, 7, "bits"), 4)))(jnp.arange(2**18))
-    numbers = np.asarray(rows) * 2.0**32 - 0.5
-    assert np.all(numbers == np.floor(numbers))  # the 32-bit words
-    assert numbers.min() >= 0
-    assert numbers.max() < 2**32
-    for shift in (0, 8, 16, 24):
-        cells = np.bincount((numbers.ravel().astype(np.int64) >> shift) & 255, minlength=256)
-        assert stats.chisquare(cells).pvalue > ALARM
-
-
 def test_streams_are_uncorrelated_across_trials_names_and_components(sheet):
     # 128 columns have 8128 pairs: a pair has a false alarm with a probability of 1e-6 / 8128
     limit = -stats.norm.ppf(ALARM / 2 / 8128) / math.sqrt(len(sheet))
     for values in (sheet, sheet**2, np.sign(sheet), np.abs(sheet)):
         correlations = np.corrcoef(values.T) - np.eye(sheet.shape[1])
         assert np.abs(correlations).max() < limit
-
-
-def test_successive_samples_are_uncorrelated(sheet):
-    limit = -stats.norm.ppf(ALARM / 2 / (50 * sheet.shape[1])) / math.sqrt(len(sheet))
-    for values in (sheet, sheet**2):
-        values = (values - values.mean(axis=0)) / values.std(axis=0)
-        for lag in range(1, 51):
-            assert np.abs(np.mean(values[lag:] * values[:-lag], axis=0)).max() < limit
-        # columns are also uncorrelated with the next sample of other columns: 128^2 pairs
-        crossed = values[1:].T @ values[:-1] / len(values)
-        assert np.abs(crossed).max() < -stats.norm.ppf(ALARM / 2 / crossed.size) / math.sqrt(len(sheet))
-
-
-def test_neighbouring_seeds_are_uncorrelated():
-    def row(seed):
-        key = draws.stream(seed, 0, "attitude_noise")
-        return jax.vmap(partial(draws.normals, key, 2))(jnp.arange(4096)).reshape(-1)
-
-    rows = np.asarray(jax.jit(jax.vmap(row))(jnp.arange(64, dtype=jnp.uint32)))
-    limit = -stats.norm.ppf(ALARM / 2 / 2016) / math.sqrt(rows.shape[1])  # 2016 pairs
-    assert np.abs(np.corrcoef(rows) - np.eye(64)).max() < limit

@@ -1,4 +1,3 @@
-import dataclasses
 import itertools
 from functools import partial
 
@@ -125,16 +124,6 @@ def test_normalise_changes_only_the_norm():
 
 
 # as a part
-
-
-def test_the_spacecraft_is_a_frozen_pytree_of_arrays():
-    body = rigid_body.spacecraft(FULL_INERTIA)
-    leaves = jax.tree.leaves(body)
-    assert len(leaves) == 2
-    assert all(isinstance(leaf, jax.Array) and leaf.dtype == jnp.float64 and leaf.shape == (3, 3) for leaf in leaves)
-    np.testing.assert_allclose(body.inertia @ body.inertia_inverse, np.eye(3), rtol=0, atol=20 * EPS)
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        body.inertia = jnp.eye(3)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def test_three_moments_give_a_diagonal_tensor():

@@ -165,15 +165,6 @@ def test_coriolis_forces_of_the_arm_match_the_lagrangian():
         np.testing.assert_allclose(load(q, rate) - load(q, 0 * rate), coriolis, rtol=0, atol=1e-14)
 
 
-def test_jacobians_of_the_arm_match_those_derived_by_hand():
-    arm: Any = scenario.study(scenario.from_tables(arm_tables())).parts.plant
-    t, x = vector(0.7), vector(0.3, -0.2, 0.5, 0.1)
-    np.testing.assert_array_equal(arm.slope(t, x), np.eye(2))
-    # F = q' - q_d': dF/dt = -q_d''
-    second = [0.6 * 0.64 * np.sin(0.8 * 0.7), 0.5 * np.cos(0.7)]
-    np.testing.assert_allclose(arm.coasting_acceleration(t, x), second, rtol=1e-14)
-
-
 @pytest.mark.parametrize("mode", short(["continuous", "sampled"], ["sampled"]))
 def test_a_run_that_meets_a_singular_input_gain_is_marked_with_the_time(mode):
     """The input gain x_1 - 0.2, alone or off the diagonal of a matrix, is singular on the way of x_1 from 0.5 to 0."""

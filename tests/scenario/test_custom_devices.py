@@ -121,17 +121,6 @@ def test_a_period_of_length_zero_does_not_change_the_sensor_memory():
     assert abs(float(new[0]) - 5.0) < 0.1
 
 
-def test_a_perfect_custom_sensor_gives_the_run_without_sensors():
-    class Clear(ptsmc.SampledSensor):
-        def see(self, memory, x, noise, t, dt):
-            return x, memory
-
-    with_it = rollout.simulate_parts(parts_of(sensors={"kind": "custom", "code": Clear}))
-    without = rollout.simulate_parts(parts_of())
-    for one, other in zip(*map(jax.tree.leaves, (with_it.metrics, without.metrics)), strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-12)  # two programs
-
-
 def test_custom_sensors_of_a_spacecraft_measure_attitude_and_rate(command, here):
     """A sensor with an attitude bias brings the body to rest with this error, and every row is predicted."""
     (here / "mine.py").write_text(

@@ -13,7 +13,7 @@ import pytest
 
 import ptsmc_jax as ptsmc
 from ptsmc_jax import scenario
-from ptsmc_jax.campaigns import montecarlo, store
+from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.laws.base import Sample
 from ptsmc_jax.onboard.board import board
 from ptsmc_jax.scenario import custom, parsing, reading, systems
@@ -174,18 +174,6 @@ def test_default_bounds_of_a_gain_of_any_sign_contain_its_value(here, value, bou
     whole = reading.complete(scenario.from_tables({**CHAIN, "controller": law, "tune": {}}))
     assert whole.tune is not None
     assert whole.tune.bounds == {"lead": bounds}
-
-
-def test_a_class_from_python_needs_no_file():
-    law = made("mine.py", "Mine")
-    base = scenario.from_tables({**CHAIN, "controller": {"kind": "pd", "t_f": 5.0}})
-    whole = scenario.replace(base, controller={"kind": "custom", "code": law, "t_f": 5.0, "eta": 2.5})
-    assert whole.controller.eta == 2.5
-    np.testing.assert_array_equal(scenario.study(whole).parts.controller.eta, flown_with_file().controller.eta)
-
-
-def flown_with_file():
-    return scenario.study(scenario.from_tables({**CHAIN, "controller": {**MINE, "eta": 2.5}})).parts
 
 
 OTHER = """
@@ -503,29 +491,6 @@ def test_a_file_that_names_a_class_from_python_cannot_be_read(here):
     ptsmc.write(made_here, "s.toml")
     with pytest.raises(ScenarioError, match=r'^controller\.code is "<Mine made in Python>": it names nothing'):
         scenario.read("s.toml")
-
-
-def test_results_with_custom_code_need_trust(command, here):
-    text = SHORT_CHAIN.replace("[controller]\n", '[controller]\nkind = "custom"\ncode = "mine.py:Mine"\n')
-    (here / "s.toml").write_text(text)
-    assert command("simulate", "s.toml", "--no-figures", "--quiet")[0] == 0
-    left = here / "out/simulate-s/scenario.toml"
-    found = tomllib.loads(left.read_text())
-    assert found["controller"]["code"] == f"{here}/mine.py:Mine"
-    assert found["controller"]["eta"] == 3.0
-    assert store.read_versions(left.parent)["controller_sha256"] == systems.checksum(f"{here}/mine.py:Mine")
-    again = "simulate", "out/simulate-s/scenario.toml", "--no-figures", "--quiet", "--out", "new"
-    code, _, error = command(*again)
-    assert (code, "(controller.code), which this command would run" in error) == (2, True)
-    (here / "mine.py").write_text(HEAD + LAW + "\n# another\n")
-    code, _, error = command(*again, "--trust")
-    assert (code, "was made with another controller.code" in error) == (2, True)
-    (here / "mine.py").write_text(HEAD + LAW)
-    code, _, error = command(*again, "--trust")
-    assert (code, error) == (
-        0,
-        f"ptsmc: runs {here}/mine.py, which controller.code of out/simulate-s/scenario.toml names\n",
-    )
 
 
 def test_late_errors_in_custom_code_are_one_sentence(command, here, monkeypatch):

@@ -12,7 +12,7 @@ from ptsmc_jax import scenario
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.observers.nonlinear import NonlinearObserver
 from ptsmc_jax.plants import rigid_body
-from ptsmc_jax.scenario import build, disturbance_bounds, free_gains, parsing, plausibility, reading
+from ptsmc_jax.scenario import disturbance_bounds, free_gains, parsing, plausibility, reading
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.signals.disturbances import Disturbance
 from tests.helpers import FULL_INERTIA
@@ -301,19 +301,6 @@ def test_probe_values_beyond_a_bound_stay_in_the_allowed_range():
     assert other.search.bounds["observer_gain"][0] == 0.123456
     for gain in ("m", "observer_gain"):  # the bound is the smallest allowed value
         assert free_gains.beyond(other, gain, "lower") is None
-
-
-def test_a_built_disturbance_stays_within_its_bounds_over_a_run():
-    """The disturbance of a whole run with a gravity gradient stays within the bounds."""
-    tables = {"disturbance": {"kind": "gravity_gradient", "orbit_rate": 1e-2}, "initial": {"rate": [0.05, 0.0, 0.02]}}
-    said = scenario.from_tables(tables)
-    known = disturbance_bounds.of(said)
-    assert known is not None
-    size, rate = known
-    signal, _ = build.disturbance(said, rigid_body.spacecraft([10.0, 12.0, 14.0]))
-    found = disturbance_bounds.along_the_run(said, signal)
-    assert 0.2 * size < found.size.max() <= size
-    assert found.rate.max() <= rate
 
 
 class Vibration(Disturbance):

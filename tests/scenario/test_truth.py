@@ -134,32 +134,6 @@ def test_invalid_hidden_states_are_refused(changes, said):
     assert said in str(caught.value)
 
 
-def test_the_observer_estimates_the_difference_between_truth_and_model():
-    """At rest off the origin the true plant has the force -0.5 x_1. An observer of a double integrator estimates it."""
-    tables = {**TABLES, "observer": {"kind": "nonlinear", "gain": [5.0]}}
-    log = rollout.simulate_parts(scenario.study(scenario.from_tables(tables)).parts, record=True).log
-    kept = np.asarray(log.has_length)
-    x, u, seen = (np.asarray(v)[kept] for v in (log.x, log.u, log.d_hat))
-    left_out = -0.5 * x[:, 0] - 0.3 * x[:, 1] + 0.2 * u[:, 0]
-    # the estimate has the rate 5 1/s, the force about 1 1/s: the lag is a fifth of the force's rate, plus a period
-    late = slice(10, -2)
-    assert np.abs(seen[late, 0] - left_out[late]).max() < 0.5 * np.abs(left_out).max()
-    assert np.corrcoef(seen[late, 0], left_out[late])[0, 1] > 0.9
-
-
-def test_a_true_plant_equal_to_the_model_changes_nothing():
-    same = {**TABLES, "plant": {**TABLES["plant"], "truth": "my.py:known"}}
-    none = {**TABLES, "plant": {key: value for key, value in TABLES["plant"].items() if key != "truth"}}
-    both = [
-        rollout.simulate_parts(scenario.study(scenario.from_tables(t)).parts, record=True).log for t in (same, none)
-    ]
-    np.testing.assert_array_equal(both[0].x, both[1].x)
-    made = system(1, lambda t, a, b: b, lambda t, a, b: -0.5 * a - 0.3 * b, lambda t, a, b: 1.2 * jnp.eye(1))
-    from_python = {**TABLES, "plant": {**TABLES["plant"], "truth": made}}
-    found = [rollout.simulate_parts(scenario.study(scenario.from_tables(t)).parts) for t in (from_python, TABLES)]
-    assert float(found[0].metrics.window_error) == float(found[1].metrics.window_error)
-
-
 @pytest.mark.parametrize("kind", ["terminal", "time_base_pd", "predefined_time"])
 def test_comparison_laws_control_a_custom_system(kind):
     """The rates of a system come from the motion under the published law, for every law."""

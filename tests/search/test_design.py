@@ -155,19 +155,6 @@ def test_search_finds_the_last_crossing(power):
     )
 
 
-def test_a_repeated_guess_does_not_stall_the_search():
-    """With peaks proportional to 1 / t^2, few evaluations suffice, without repeated halving."""
-    asked = []
-
-    def peak(t):
-        asked.append(t)
-        return (30.0 / t) ** 2
-
-    found = design._smallest(peak, 1.0, 31.0, 1.0, 1e3, 1e-3, 60)
-    assert found == pytest.approx(30.0, rel=1e-3)
-    assert len(asked) == len(set(asked)) <= 4
-
-
 def test_the_bracket_is_halved_if_peaks_hardly_decrease_with_t_f():
     """Steps after the rule 1 / t^2 are tiny in this case, from both sides."""
     for start in (60.0, 10.0):

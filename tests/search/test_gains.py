@@ -1,6 +1,5 @@
 """Tests of gains by name: set in parts and in scenarios, for single axes, and their default bounds."""
 
-import tomllib
 from dataclasses import dataclass, fields, replace
 from typing import ClassVar
 
@@ -20,7 +19,7 @@ from ptsmc_jax.scenario.law_tables import LAWS
 from ptsmc_jax.scenario.observer_tables import OBSERVERS
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.theory import stability_limits
-from tests.helpers import FIRST_FLIGHT, SHORT, finer, short, ticks_of, vector
+from tests.helpers import FIRST_FLIGHT, finer, short, ticks_of, vector
 from tuning.search import gains, normalisation
 from tuning.studies import judging, posing
 
@@ -329,22 +328,6 @@ def test_default_bounds_are_widened_on_the_side_where_a_gain_ended():
     assert free_gains.widened(made, sides, set()) == {}
 
 
-def test_default_bounds_of_comparison_laws_contain_only_valid_gains():
-    from tuning.search import gains, normalisation
-
-    for kind, more in (("pd", {}), ("terminal", {}), ("fixed_time", {}), ("fixed_time", {"gamma": 1.8, "p": 1.3})):
-        base = scenario.replace(
-            scenario.from_tables(tomllib.loads(SHORT)), tune=None, controller={"kind": kind, "t_f": 5.0, **more}
-        )
-        free = {"free": ["p", "b1"]} if more else {}
-        base = scenario.replace(base, tune=free)
-        box = normalisation.of_scenario(base, scenario.study(base).parts)
-        for corner in (box.lower, box.upper):
-            scenario.study(gains.in_scenario(base, dict(zip(box.names, corner, strict=True))))
-    with pytest.raises(ScenarioError, match=r"tune.bounds.p is \[1.05, 1.2\], but must be two numbers above 1.25"):
-        scenario.replace(base, tune={"free": ["p"], "bounds": {"p": [1.05, 1.2]}})
-
-
 @pytest.mark.parametrize(
     ("other", "where", "needed"),
     [
@@ -453,12 +436,3 @@ def test_a_gain_of_a_custom_law_is_set_in_the_law_whatever_its_name_begins_with(
     moved = gains.with_gains(parts, {"observer_share": 0.25, "observer_gain": 4.0})
     assert (float(moved.controller.observer_share), gains.gains_of(moved)["observer_share"]) == (0.25, 0.25)
     np.testing.assert_array_equal(moved.observer.gain, [4.0] * 3)
-
-
-def test_a_name_of_two_gains_is_rejected():
-    """The gain `share` of an observer is also called `observer_share`."""
-    parts = shared(study(from_tables(BASE)).parts)
-    observer = replace(parts.observer)
-    object.__setattr__(observer, "tunable", ("share",))
-    with pytest.raises(ValueError, match="observer_share is a gain of the law and of another part"):
-        gains.with_gains(replace(parts, observer=observer), {"eta": 3.0})

@@ -85,13 +85,3 @@ def test_records_of_other_questions_are_removed_only_after_the_answer_is_compute
     with pytest.raises(KeyboardInterrupt):
         journal.get(b"another", killed)
     assert (tmp_path / "j").read_bytes() == data
-
-
-def test_an_incomplete_record_is_replaced(tmp_path):
-    journal, asked = Journal(tmp_path / "j"), []
-    ask(journal, 1, [])
-    with (tmp_path / "j").open("ab") as file:
-        file.write(b"half a record")
-    journal.get(b"question 1", lambda: {"f": np.ones(1)})
-    ask(Journal(tmp_path / "j"), 2, asked)
-    assert asked == []

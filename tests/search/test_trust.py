@@ -139,14 +139,6 @@ def test_a_gain_is_flat_if_objective_and_limits_change_by_less_than_one_percent(
     assert trust.Profile(ones, moved, 0.0 * ones, np.log(moved)).flat == flat  # no requirements
 
 
-def test_profiles_without_requirements_depend_on_the_objective_only(quiet):
-    free = objective.problem(quiet.parts, quiet.dispersion, 3, np.arange(8), BOUNDS.names)
-    found = trust.profiles(
-        Evaluator(BOUNDS), replace(free, objective="peak_torque"), BOUNDS.normalise(np.array([3.3, 1.0, 19.0]))
-    )
-    assert {name: profile.flat for name, profile in found.items()} == {"eta": False, "delta": True, "t_f": False}
-
-
 def test_gradients_are_checked_against_finite_differences():
     noisy = moved_in_time()
     # t_f - delta is not a multiple of the period, because the noise of the first period has a kink there

@@ -344,13 +344,6 @@ def test_a_search_whose_limit_is_out_of_reach_adds_no_trials(monkeypatch, count)
     assert seeds == [(count, 2)] * (count > 1)
 
 
-@pytest.mark.parametrize(("joined", "averaged"), [(0, 32), (8, 24), (16, 16), (24, 16)])
-def test_first_searches_use_few_trials_including_the_trials_that_joined(joined, averaged):
-    few = local_searches._few_trials(objective.with_trials(problem(40, peak_torque=0.7), np.arange(40, 40 + joined)))
-    assert np.asarray(few.trials).tolist() == [*range(averaged), *range(40, 40 + joined)]
-    assert few.averaged == averaged
-
-
 @pytest.mark.parametrize("far", [0.5, 1e7])
 def test_a_failed_trial_is_worse_than_any_violation(far):
     """At the first of two points, one of two trials fails. At the second point, both violations are larger."""

@@ -294,9 +294,3 @@ def test_scenarios_and_studies_print_their_tables():
     assert any(line.startswith("  controller: PrescribedTime(t_f=30.0, ") for line in shown)
     assert not any("defaulted" in line or "=None" in line or line.startswith("  hardware") for line in shown)
     assert f"    {shown[1]}" in repr(scenario.study(FLIGHT))
-
-
-def test_the_main_names_are_exported_by_the_package():
-    for name in ("one", "run", "study", "Reach", "reach_of"):
-        assert callable(getattr(ptsmc, name))
-    assert len(dir(ptsmc)) == len(set(dir(ptsmc)))

@@ -20,7 +20,7 @@ from ptsmc_jax.scenario.law_tables import BASELINES
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.metrics import Metrics
 from ptsmc_jax.simulation.requirements import Requirement
-from tests.helpers import FIRST_FLIGHT, ROOT, SHORT, refused
+from tests.helpers import ROOT, SHORT, refused
 from tests.output import examples
 from tests.output.pages import checked
 from tuning.cli import options
@@ -224,13 +224,6 @@ def test_settling_times_of_small_and_large_initial_angles():
     assert compare._near_far(angle, np.where(angle > 2.0, np.inf, settling)) == (30.0, None)
 
 
-def test_first_flight_scenario_is_valid_with_every_law():
-    posed = compare.contenders(scenario.replace(scenario.read(FIRST_FLIGHT), tune__trials=32))
-    for other in posed.values():
-        assert tuned(other).trials == 32
-        scenario.study(other)
-
-
 def test_search_settings_and_known_bounds_are_passed_to_all_laws():
     asked = {"minimise": "effort", "statistic": "cvar", "level": 0.8, "torque_weight": 0.1, "worst_case": True,
              "trials": 7, "starts": 3, "steps": 5}  # fmt: skip
@@ -345,16 +338,6 @@ def test_scenario_that_a_law_cannot_control_is_refused_before_any_search(monkeyp
 
 def lines_of(summary):
     return list(compare_report.lines(summaries.read(summaries.Compare, summary)))
-
-
-@pytest.mark.parametrize(("period", "scaled"), [(0.05, False), (0.2, True)])
-def test_report_says_if_published_gains_are_scaled(eight, period, scaled):
-    """The published delta of 0.05 s is shorter than a period of 0.2 s."""
-    simulated = gains.published_scenario(scenario.from_tables({"loop": {"mode": "sampled", "period": period}}))
-    made = {compare.PUBLISHED: replace(contender(eight), simulated=simulated), compare.OURS: contender(eight)}
-    lines = lines_of(compare.summary(compare.Comparison(made, 0, False)))
-    assert any(line.startswith("published gains, scaled to this body and period: ") for line in lines) == scaled
-    assert any(line.startswith("published gains: ") for line in lines) != scaled
 
 
 def test_required_margins_appear_in_table_csv_file_and_report(eight, tmp_path):

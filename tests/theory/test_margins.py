@@ -415,33 +415,6 @@ def test_zeros_of_linear_functions_are_found_exactly():
     np.testing.assert_allclose((rows[0], points[0]), (2.4, 8.0), rtol=1e-12)
 
 
-@pytest.mark.long  # short tests of this test and the following ones: the random loops above
-def test_delay_margin_is_the_smallest_over_all_crossings():
-    """With a notch, the crossing of the smallest estimate has twice the delay margin of another crossing."""
-    tables = {
-        "spacecraft": {"inertia": [5.2, 4.3, 5.5]},
-        "initial": {"rotvec_deg": [8.0, 2.0, -9.0], "rate": [-0.018, -0.016, -0.029]},
-        "disturbance": {"kind": "constant", "amplitude": [0.1, 0.01, 0.04]},
-        "controller": {"kind": "terminal", "t_f": 6.0, "p": 1.16, "b": 2.6, "k": 0.18, "sign_width": 0.047},
-        "observer": {"kind": "finite_time"},
-        "loop": {"mode": "sampled", "period": 0.143, "clock": "flight", "t_end": 8.86},
-        "hardware": {"command_filter": {"kind": "notch", "corner": 7.9, "damping": 0.74}},
-    }
-    loop = opened(scenario.study(scenario.from_tables(tables)).parts, hold=False)
-    of_a = crossings.triangle(loop.closed_at_sensors()[0])
-
-    def border(start):
-        """The delay [periods] to which Newton's method converges, or infinity."""
-        step = jax.jit(lambda x: margins._delay_step(loop, of_a, jnp.int32(1), x))
-        x = jax.lax.fori_loop(0, 30, lambda _, x: x - step(x), start)
-        good = jnp.all(jnp.abs(step(x)) < 1e-9) & (x[1] > 0.0) & (jnp.exp(x[0]) * loop.period < jnp.pi)
-        return jnp.where(good, x[1], jnp.inf)
-
-    w, late = jnp.meshgrid(jnp.geomspace(2.0, 20.0, 10), jnp.linspace(0.1, 1.5, 6), indexing="ij")
-    least = jax.jit(jax.vmap(border))(jnp.stack([jnp.log(w.ravel()), late.ravel()], axis=1)).min()
-    assert of(loop).delay[1] == pytest.approx(float(least * loop.period), rel=1e-6)
-
-
 @pytest.mark.long
 def test_delay_search_does_not_skip_a_moving_stability_limit():
     """The command of this plant has a delay of two periods. Its limit moves by more than a step of the search."""
