@@ -306,82 +306,47 @@ def test_a_custom_reference_has_exact_rates(here):
 REMEMBERS = LAW.replace(
     "def acceleration(self, now,", "def begin(self):\n        return jnp.zeros(1)\n\n    def acceleration(self, now,"
 )
-
-
-def changed(old, new):
-    """Return the code of the law with an error in it."""
-    assert old in LAW
-    return LAW.replace(old, new)
-
-
+RETURNS = "return 0.5 * wanted"
+# a part of the law, what replaces it, and the expected text about it and about the allowed values
 # fmt: off
+CHANGED = [
+    (f"{RETURNS}, s", "return jnp.zeros(2), s", "acceleration", "shape"),
+    (f"{RETURNS}, s", "return [0.5 * wanted[0]], s", "returns an acceleration that is a list", "array of shape (1,)"),
+    (f"{RETURNS}, s", "return [0.5 * wanted, s]", "returns a list of 2 values", "a sliding variable, in parentheses"),
+    (f"{RETURNS}, s", RETURNS, "returns an array of shape (1,)", "an acceleration, a sliding variable"),
+    (f"{RETURNS}, s", "0.5 * wanted, s", "acceleration returns nothing", "a sliding variable"),
+    # an earlier version ran this as 0 and 1, and margins ended in a traceback
+    (f"{RETURNS}, s", f"{RETURNS}, s > 0.0", "returns a sliding variable [", "must return finite real numbers"),
+    # an earlier error named the class MineOnErrorOfChain
+    (RETURNS, "return self.width_ * wanted", "AttributeError: 'Mine' object has no attribute 'width_'", "line 21 of"),
+    ("def acceleration", "def accelerate", "the class Mine has no method", "acceleration or __call__"),
+    (f"{RETURNS}, s", "return 1 / 0 * wanted, s", "acceleration fails", "line 21 of mine.py"),
+    (RETURNS, "exit(0)", "acceleration fails: SystemExit", "line 21 of mine.py"),
+    (RETURNS, "return jnp.log(-1.0) * wanted", "returns an acceleration [nan]", "finite real numbers"),
+    (RETURNS, "return wanted if wanted[0] > 9.0 else 0.5 * wanted", "needs the value of a traced number",
+     "jax.numpy.where instead of if"),
+    (RETURNS, "return float(wanted[0]) * wanted", "needs the value", "jax.numpy instead of numpy and float()"),
+    ("        left =", "        kept.append(error)\n        error = kept[-2:][0]\n        left =",
+     "its acceleration stores a traced number", "memory"),
+    ("3.0, (2.1, 6.0), above=2.0", "3.0", "the gain eta of the class Mine has no bounds", "usual=(lower, upper)"),
+    ("(2.1, 6.0)", "(6.0, 2.1)", "usual bounds of the gain eta of the class Mine are [6, 2.1]", "lower one first"),
+    # an earlier error named tune.bounds.eta, which is not in the file
+    ("(2.1, 6.0)", "(2.0, 6.0)", "usual bounds of the gain eta of the class Mine are [2, 6]", "numbers greater than 2"),
+    ("lambda t_f, h: (1.0 / t_f, 0.5 / h)", "lambda t_f: 1.0", "usual bounds of the gain k1", "TypeError"),
+    ("gain(3.0,", "gain(1.0,", "the default of eta is 1", "a number greater than 2"),
+    ("(2.1, 6.0)", "(3.1, 6.0)", "the default of the gain eta is 3, but", "a number from 3.1 to 6"),
+    ("width: float = 1e-3", "width: str = 'x'", 'the default of width is "x"', "one number or several"),
+    ("width: float = 1e-3", "width: float", "cannot have such fields", "width"),
+    *(("width: float", f"{name}: float", f"the class Mine has a field {name}", "already uses")
+      for name in ("code", "check", "order")),
+    ("width: float", "kinematics: float", "the class Mine has a field kinematics", "another name"),
+    ("width: float = 1e-3", "t_f: float = 1.0", "the class Mine has a field t_f", "another name"),
+    (RETURNS, "return 1j * wanted", "returns an acceleration [", "real numbers"),
+]
+# the code, other keys of the scenario, and the expected text
 BAD = [
-    (changed("return 0.5 * wanted, s", "return jnp.zeros(2), s"), {}, "acceleration", "shape"),
-    (
-        changed("return 0.5 * wanted, s", "return [0.5 * wanted[0]], s"), {},
-        "acceleration returns an acceleration that is a list", "an array of shape (1,)",
-    ),
-    (
-        changed("return 0.5 * wanted, s", "return [0.5 * wanted, s]"), {},
-        "acceleration returns a list of 2 values", "a sliding variable, in parentheses",
-    ),
-    (
-        changed("return 0.5 * wanted, s", "return 0.5 * wanted"), {},
-        "acceleration returns an array of shape (1,)", "an acceleration, a sliding variable",
-    ),
-    (changed("return 0.5 * wanted, s", "0.5 * wanted, s"), {}, "acceleration returns nothing", "a sliding variable"),
-    (  # an earlier version ran it as 0 and 1, and margins ended in a traceback
-        changed("return 0.5 * wanted, s", "return 0.5 * wanted, s > 0.0"), {},
-        "acceleration returns a sliding variable [", "must return finite real numbers",
-    ),
-    (  # an earlier error named the class MineOnErrorOfChain
-        changed("return 0.5 * wanted", "return self.width_ * wanted"), {},
-        "acceleration fails: AttributeError: 'Mine' object has no attribute 'width_'", "line 19 of mine.py",
-    ),
-    (changed("def acceleration", "def accelerate"), {}, "the class Mine has no method", "acceleration or __call__"),
-    (changed("return 0.5 * wanted, s", "return 1 / 0 * wanted, s"), {}, "acceleration fails", "line 19 of mine.py"),
-    (changed("return 0.5 * wanted", "exit(0)"), {}, "acceleration fails: SystemExit", "line 19 of mine.py"),
-    (
-        changed("return 0.5 * wanted", "return jnp.log(-1.0) * wanted"), {},
-        "returns an acceleration [nan]", "finite real numbers",
-    ),
-    (
-        changed("return 0.5 * wanted", "return wanted if wanted[0] > 9.0 else 0.5 * wanted"), {},
-        "acceleration needs the value of a traced number, which is known only during the simulation (line",
-        "jax.numpy.where instead of if",
-    ),
-    (
-        changed("return 0.5 * wanted", "return float(wanted[0]) * wanted"), {},
-        "acceleration needs the value", "jax.numpy instead of numpy and float()",
-    ),
-    (
-        changed("3.0, (2.1, 6.0), above=2.0", "3.0"), {},
-        "the gain eta of the class Mine has no bounds", "usual=(lower, upper)",
-    ),
-    (
-        changed("(2.1, 6.0)", "(6.0, 2.1)"), {"tune": {}},
-        "the usual bounds of the gain eta of the class Mine are [6, 2.1]", "lower one first",
-    ),
-    (  # an earlier error named tune.bounds.eta, which is not in the file
-        changed("(2.1, 6.0)", "(2.0, 6.0)"), {"tune": {}},
-        "the usual bounds of the gain eta of the class Mine are [2, 6]",
-        "two numbers greater than 2, the lower one first",
-    ),
-    (
-        changed("lambda t_f, h: (1.0 / t_f, 0.5 / h)", "lambda t_f: 1.0"), {"tune": {}},
-        "the usual bounds of the gain k1 of the class Mine fail", "TypeError",
-    ),
-    (changed("gain(3.0,", "gain(1.0,"), {}, "the default of eta is 1", "a number greater than 2"),
-    (changed("(2.1, 6.0)", "(3.1, 6.0)"), {}, "the default of the gain eta is 3, but", "a number from 3.1 to 6"),
-    (changed("width: float = 1e-3", "width: str = 'x'"), {}, 'the default of width is "x"', "one number or several"),
-    (changed("width: float = 1e-3", "width: float"), {}, "cannot have such fields", "width"),
+    *((f"kept = []\n\n{LAW.replace(old, new)}", {}, *said) for old, new, *said in CHANGED),
     ("Mine = [3]", {}, "it is a list, but must be a class derived from", "ptsmc_jax.AccelerationLaw"),
-    (changed("width: float", "code: float"), {}, "the class Mine has a field code", "already uses"),
-    (changed("width: float", "check: float"), {}, "the class Mine has a field check", "already uses"),
-    (changed("width: float", "order: float"), {}, "the class Mine has a field order", "already uses"),
-    (changed("width: float", "kinematics: float"), {}, "the class Mine has a field kinematics", "another name"),
-    (changed("width: float = 1e-3", "t_f: float = 1.0"), {}, "the class Mine has a field t_f", "another name"),
-    (changed("return 0.5 * wanted", "return 1j * wanted"), {}, "returns an acceleration [", "real numbers"),
     (LAW, {"eta": float("nan")}, "controller.eta is nan", "finite numbers"),
     ("Mine = 3", {}, "it is a int, but must be a class derived from", "ptsmc_jax.AccelerationLaw"),
     ("class Mine:\n    pass", {}, "it is a class Mine, but must be a class derived from", "ptsmc_jax.AccelerationLaw"),
@@ -402,86 +367,61 @@ BAD = [
     ("law", "keys", "of_what", "allowed"), BAD, ids=[f"{k} {row[2][:40]}" for k, row in enumerate(BAD)]
 )
 def test_errors_in_a_custom_law_are_one_sentence(here, law, keys, of_what, allowed):
+    assert law not in (LAW, f"kept = []\n\n{LAW}") or keys
     (here / "mine.py").write_text(HEAD + law)
-    controller = {key: value for key, value in {**MINE, **keys}.items() if value is not None and key != "tune"}
-    tables = {**CHAIN, "controller": controller, **({"tune": {}} if "tune" in keys else {})}
+    controller = {key: value for key, value in {**MINE, **keys}.items() if value is not None}
+    tables = {**CHAIN, "controller": controller, **({"tune": {}} if "usual bounds" in of_what else {})}
     with pytest.raises(ScenarioError) as caught:
         scenario.study(scenario.from_tables(tables))
     check_sentence(str(caught.value).replace("Error", ""), of_what.replace("Error", ""), allowed.replace("Error", ""))
 
 
-@pytest.mark.parametrize(
-    ("name", "old", "new", "of_what"),
-    [
-        ("observer", 'return {"last": d_mean,', 'return {"last": jnp.zeros(3),', "observer.code is"),
-        ("observer", "def step", "def stop", "has no method step"),
-        ("observer", "share: float", "gain: float", "needs another name"),
-        ("observer", "    share: float", "    gain: float = 0.5\n    share: float", "needs another name"),
-        ("observer", "    share: float", "    gain: tuple = (0.5,)\n    share: float", "needs another name"),
-        ("observer", "share: float", "gain_2: float", "needs another name"),
-        ("observer", "share: float", "update: float", "the class Filtered has a field update, a name that"),
-        (
-            "observer",
-            "def estimate",
-            "def error_bound(self):\n        return lambda t: 0.1\n\n    def estimate",
-            "error_bound returns a function at t = 0, but must return a bound such as",
-        ),
-        (
-            "disturbance",
-            "float(self.rates[1])",
-            "'fast'",
-            'disturbance.code is the class Wave, whose method fastest returns "fa',
-        ),
-        (
-            "disturbance",
-            "float(self.rates[1])",
-            "None",
-            "whose method fastest returns nothing, but must return an angular frequency",
-        ),
-        ("disturbance", "float(self.rates[1])", "float('nan')", "whose method fastest returns nan"),
-        ("disturbance", "float(self.rates[1])", "-1.0", "whose method fastest returns -1.0"),
-        ("disturbance", "* jnp.ones(1)", "* jnp.ones(3)", "__call__ returns a disturbance of shape (3,)"),
-        ("disturbance", "jnp.sin(self.rates[0] * t)", "jnp.log(-1.0)", "returns a disturbance [nan]"),
-        ("disturbance", "(0.5, 1.5)", "(0.5, 1e9)", "disturbance.frequency"),
+# a part of OTHER, what replaces it, and the expected text, by the table that names the class
+# fmt: off
+OTHERS = {
+    "observer": [
+        ('return {"last": d_mean,', 'return {"last": jnp.zeros(3),', "observer.code is"),
+        ("def step", "def stop", "has no method step"),
+        ("share: float", "gain: float", "needs another name"),
+        ("    share: float", "    gain: float = 0.5\n    share: float", "needs another name"),
+        ("    share: float", "    gain: tuple = (0.5,)\n    share: float", "needs another name"),
+        ("share: float", "gain_2: float", "needs another name"),
+        ("share: float", "update: float", "the class Filtered has a field update, a name that"),
+        ("def estimate", "def error_bound(self):\n        return lambda t: 0.1\n\n    def estimate",
+         "error_bound returns a function at t = 0, but must return a bound such as"),
     ],
-)
-def test_errors_in_other_custom_parts_are_one_sentence(here, name, old, new, of_what):
-    assert old in OTHER
-    (here / "other.py").write_text(HEAD + OTHER.replace(old, new))
-    kind = {"observer": "Filtered", "disturbance": "Wave"}[name]
-    tables = {**CHAIN, "controller": {"kind": "pd", "t_f": 5.0}, name: {"kind": "custom", "code": f"other.py:{kind}"}}
-    with pytest.raises(ScenarioError) as caught:
-        scenario.study(scenario.from_tables(tables))
-    assert of_what in str(caught.value) or "disturbance is too fast" in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "said"),
-    [
+    "disturbance": [
+        ("float(self.rates[1])", "'fast'", 'disturbance.code is the class Wave, whose method fastest returns "fa'),
+        ("float(self.rates[1])", "None", "fastest returns nothing, but must return an angular frequency"),
+        ("float(self.rates[1])", "float('nan')", "whose method fastest returns nan"),
+        ("float(self.rates[1])", "-1.0", "whose method fastest returns -1.0"),
+        ("* jnp.ones(1)", "* jnp.ones(3)", "__call__ returns a disturbance of shape (3,)"),
+        ("jnp.sin(self.rates[0] * t)", "jnp.log(-1.0)", "returns a disturbance [nan]"),
+        ("(0.5, 1.5)", "(0.5, 1e9)", "disturbance.frequency"),
+    ],
+    "reference": [
         ("jnp.cos(half)", "2.0 * jnp.cos(half)", "one of length 1"),
         ("jnp.stack([0.0 * half, ", "jnp.stack([", "(4,)"),
-        (
-            "    def attitude",
-            "    def fastest(self):\n        pass\n\n    def attitude",
-            "Turning, whose method fastest returns nothing",
-        ),
+        ("    def attitude", "    def fastest(self):\n        pass\n\n    def attitude",
+         "Turning, whose method fastest returns nothing"),
+        ("jnp.cos(half)", "jnp.where(t > 3.0, jnp.nan, jnp.cos(half))", "its attitude is not finite at t = 3.0"),
     ],
-)
-def test_a_custom_reference_that_returns_no_attitude_is_refused(here, old, new, said):
+}
+# fmt: on
+CLASSES = {"observer": "Filtered", "disturbance": "Wave", "reference": "Turning"}
+
+
+@pytest.mark.parametrize(("name", "old", "new", "said"), [(name, *row) for name in OTHERS for row in OTHERS[name]])
+def test_errors_in_other_custom_parts_are_one_sentence(here, name, old, new, said):
+    assert old in OTHER
     (here / "other.py").write_text(HEAD + OTHER.replace(old, new))
-    tables = {"loop": SAMPLED, "controller": {"kind": "pd", "t_f": 5.0},
-              "reference": {"kind": "custom", "code": "other.py:Turning"}}  # fmt: skip
-    with pytest.raises(ScenarioError, match=r"reference\.code") as caught:
+    law = {} if "not finite" in said else {"kind": "pd"}  # the published law once reported a singularity here
+    plant = {"loop": SAMPLED} if name == "reference" else CHAIN
+    tables = {**plant, "controller": {**law, "t_f": 5.0}, name: {"kind": "custom", "code": f"other.py:{CLASSES[name]}"}}
+    with pytest.raises(ScenarioError) as caught:
         scenario.study(scenario.from_tables(tables))
-    assert said in str(caught.value)
-
-
-def test_a_reference_that_becomes_nan_is_not_reported_as_singular(here):
-    (here / "other.py").write_text(HEAD + OTHER.replace("jnp.cos(half)", "jnp.where(t > 3.0, jnp.nan, jnp.cos(half))"))
-    tables = {"loop": SAMPLED, "controller": {"t_f": 5.0}, "reference": {"kind": "custom", "code": "other.py:Turning"}}
-    with pytest.raises(ScenarioError, match=r"^reference.*its attitude is not finite at t = 3\.00. s; allowed are"):
-        scenario.study(scenario.from_tables(tables))
+    assert said in str(caught.value) or "disturbance is too fast" in str(caught.value)
+    assert "\n" not in str(caught.value)
 
 
 def test_a_file_that_names_a_class_from_python_cannot_be_read(here):
@@ -514,16 +454,6 @@ def test_late_errors_in_custom_code_are_one_sentence(command, here, monkeypatch)
     with pytest.raises(ValueError, match="JVP") as no_slopes:  # as in a search: the traceback contains only JAX
         jax.jvp(lambda x: jax.pure_callback(lambda x: x, x, x), (1.0,), (1.0,))
     assert systems.at_fault(no_slopes.value) == str(here / "mine.py")
-
-
-def test_a_custom_law_that_stores_a_number_between_calls_is_refused(command, here):
-    """Every sample of a run would use the number that the check at t = 0 stored."""
-    kept = LAW.replace("        left =", "        kept.append(error)\n        error = kept[-2:][0]\n        left =")
-    (here / "mine.py").write_text(HEAD + "kept = []\n\n\n" + kept)
-    (here / "s.toml").write_text(SHORT_CUSTOM)
-    for asked in (["simulate", "s.toml"], ["montecarlo", "s.toml", "--trials", 2]):
-        code, _, error = command(*asked, "--no-figures", "--quiet")
-        assert (code, "its acceleration stores a traced number" in error) == (2, True)
 
 
 def test_custom_code_that_exits_is_a_configuration_error(command, here):
