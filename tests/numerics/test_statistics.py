@@ -237,3 +237,10 @@ def test_influential_category_is_detected_with_few_trials_and_an_unrelated_one_i
         false += statistics.explained_variance(unrelated, 128) > 0.0
     assert detected > 0.95 * 300
     assert false <= 4  # 0.8 are expected
+
+
+def test_inputs_that_rank_the_trials_alike_are_one_driver():
+    rng = np.random.default_rng(0)
+    angle, other = rng.uniform(0.3, 2.4, 1000), rng.normal(size=1000)
+    inputs = {"initial_angle": angle, "initial_q4": np.cos(angle / 2), "other": other}
+    assert list(statistics.drivers(inputs, angle + other)) == ["initial_angle", "other"]

@@ -436,3 +436,30 @@ def test_a_gain_of_a_custom_law_is_set_in_the_law_whatever_its_name_begins_with(
     moved = gains.with_gains(parts, {"observer_share": 0.25, "observer_gain": 4.0})
     assert (float(moved.controller.observer_share), gains.gains_of(moved)["observer_share"]) == (0.25, 0.25)
     np.testing.assert_array_equal(moved.observer.gain, [4.0] * 3)
+
+
+def test_column_of_the_published_gains_is_named_after_their_source():
+    paper = scenario.from_tables({"loop": {"mode": "sampled"}})
+    assert gains.published_label(paper) == "published"
+    assert (
+        gains.published_label(scenario.replace(paper, loop__period=0.5)) == "published, scaled"
+    )  # a hand-over of a period
+    assert (
+        gains.published_label(scenario.replace(paper, spacecraft={"inertia": [0.1, 0.1, 0.1]})) == "published, scaled"
+    )
+    assert gains.published_label(scenario.replace(paper, controller={"kind": "pd"})) == "paper's law"
+
+
+@pytest.mark.parametrize("kind", ["chain", "spacecraft"])
+def test_the_papers_law_replaces_another_on_every_plant(kind):
+    order = {"order": 2} if kind == "chain" else {}
+    simulated = scenario.from_tables(
+        {"plant": {"kind": kind, **order}, "loop": {"mode": "sampled"}, "controller": {"kind": "pd", "t_f": 12.0}}
+    )
+    published_scenario = gains.published_scenario(simulated)
+    assert (
+        published_scenario.controller.kind,
+        published_scenario.controller.t_f,
+        published_scenario.controller.eta,
+    ) == ("prescribed_time", 12.0, 3.0)
+    assert getattr(published_scenario.controller, "error", "multiplicative") == "multiplicative"

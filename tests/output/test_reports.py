@@ -1,0 +1,417 @@
+"""Reports of tunings, fronts, campaigns, maps and comparisons: their complete text, compared with `reports.txt`.
+
+`python -m tests.output.test_reports` writes the file again. A change of it is a change of what users read.
+"""
+
+import json
+import math
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+
+from ptsmc_jax.campaigns.store import plain
+from ptsmc_jax.numerics import statistics
+from ptsmc_jax.simulation.catalogues import MARGINS
+from ptsmc_jax.simulation.requirements import Requirement
+from tests.output import examples
+from tuning.output import (
+    campaign_report,
+    compare_report,
+    front_report,
+    map_report,
+    margins_report,
+    page_charts,
+    summaries,
+    trials_report,
+    tune_report,
+)
+from tuning.output.report import Report, Table
+from tuning.studies.front import Front, Point, read
+
+EXPECTED = Path(__file__).with_name("reports.txt")
+
+
+def text_of(value: Any) -> str:
+    """Return a report, a table or lines as text."""
+    if isinstance(value, Report):
+        parts = [text_of(block if isinstance(block, Table) else [title, *block]) for title, block in value.printed()]
+        return "\n".join([f"[{value.mood}] {value.headline}", *value.lines, *parts])
+    if isinstance(value, Table):
+        return "\n".join(" | ".join(row).strip() for row in [value.head, *value.rows])
+    return value if isinstance(value, str) else "\n".join(text_of(one) for one in value).rstrip()
+
+
+# ---- tunings
+
+
+def errors(rms: float, interval: Any = None, largest: float | None = None) -> dict[str, Any]:
+    return {"mean": rms, "rms": rms, "max": largest or rms, "rms_interval": interval}
+
+
+def broken(times: float | None, searched: float = 0.97) -> summaries.Tune:
+    """Return a summary whose held-out trials reach `times` the limit of 0.5 N m, and its training trials `searched`."""
+    return examples.tune({"largest_over_limit": {"peak_torque": searched}}, verdicts=[examples.torque(times)])
+
+
+HELD_OUT = examples.group(window_error=errors(1e-6, (9e-7, 1.2e-6), 2e-6), floor=5e-7, peak_torque=errors(0.25))
+LOST = examples.group(window_error=errors(1e-4), floor=5e-7, counts={"ok": 60, "not_converged": 4})
+MARGIN = {"metric": "gain_margin", "limit": 6.0, "unit": "dB", "worst": 5.0, "margin": 1.1, "failures": 1, "trials": 1,
+          "met": False, "at_least": True}  # fmt: skip
+
+
+def earlier(metric: str) -> dict[str, Any]:
+    """Return an earlier search whose gains exceeded a limit by a tenth on held-out trials."""
+    return {"margins": {metric: 0.03}, "over": {metric: 1.1}, "held_out_seed": 7}
+
+
+def advice(verdict: dict[str, Any], **search: Any) -> Iterable[str]:
+    return tune_report.advice(
+        examples.tune({"largest_over_limit": {verdict["metric"]: 0.99}, **search}, verdicts=[verdict])
+    )
+
+
+def advice_on_time(interpretation: str) -> Iterable[Any]:
+    """3 % of the time beyond, 30 times as much as allowed, by errors of 1.1 of the limit; then a failed run."""
+    asked = Requirement("ape_x", 0.5, quantile=0.999, interpretation=interpretation)
+    verdict = asked.verdict(np.full(4, 0.55), np.ones(4, bool), np.full(4, 0.97)).in_summary()
+    return advice(verdict), advice({**verdict, "worst": None})
+
+
+def advice_on_margin(metric: str, limit: float, worst: float) -> Iterable[Any]:
+    """38 of 256 loops break the limit; then the verdict on one loop, which is the nominal one."""
+    asked = Requirement(metric, limit, at_least=metric != "peak_sensitivity", unit=MARGINS[metric].unit)
+    verdict = asked.verdict(np.where(np.arange(256) < 38, worst, limit), np.ones(256, bool)).in_summary()
+    return advice(verdict), advice({**verdict, "trials": 1})
+
+
+def looks(count: int) -> Iterable[str]:
+    """Return the report of a search after this number of looks at held-out trials, each at 95 % confidence."""
+    asked = Requirement("peak_torque", 0.5, quantile=0.9, confidence=0.95)
+    found = {"earlier": (count - 1) * [earlier("peak_torque")], "margins": {"peak_torque": 0.05}}
+    return tune_report.search(
+        examples.tune(found, verdicts=[asked.verdict(np.zeros(1000), np.ones(1000, bool)).in_summary()])
+    )
+
+
+def conflict(**limits: float | None) -> Iterable[str]:
+    found = {"largest_over_limit": {"peak_torque": 1.12, "gain_margin": 1.119}, "conflict": limits,
+             "searched_globally": True}  # fmt: skip
+    return tune_report.search(examples.tune(found, verdicts=[examples.torque(1.1), MARGIN]))
+
+
+def skipped(reached: float, **changes: Any) -> Iterable[str]:
+    """Return the report of a search that does not confirm a quantile if it exceeds a limit by more than a tenth."""
+    asked = Requirement("effort", 9.0, quantile=0.9).verdict(np.zeros(10), np.ones(10, bool)).in_summary()
+    found = {"largest_over_limit": {"peak_torque": reached, "effort": 0.5}}
+    return tune_report.search(examples.tune(found, verdicts=[examples.torque(1.2), {**asked, **changes}]))
+
+
+def accuracy(times: float | None, **changes: Any) -> Iterable[str]:
+    return tune_report.accuracy(examples.tune(accuracy_gain_over_paper=times, **changes))
+
+
+def shortest(theory: float | None, simulated: float | None, quantile: float | None = None) -> Any:
+    times = {"limit": 0.5, "theory": theory, "simulated": simulated, "quantile": quantile, "unit": "N m"}
+    return tune_report.of(examples.tune(shortest_t_f=times))
+
+
+def diagnostics(at_bound: dict[str, str] | None = None, **trust: Any) -> Iterable[str]:
+    return tune_report.diagnostics(examples.tune(trust=trust, at_bound=at_bound or {}))
+
+
+def gains_by_axis(**tuned: float) -> Table:
+    paper = examples.group(gains={"observer_gain": 10.0})
+    return tune_report.gains(examples.tune(plant="chain", paper=paper, held_out=examples.group(gains=tuned)))
+
+
+def fitted(least: float) -> Iterable[str]:
+    """Return the advice for an RMS of 1.49 to 2.01 in 16 training trials, and from `least` on in held-out trials."""
+    at = {"training": (1.49, 2.01), "held_out": (least, 2.48)}
+    groups = {on: examples.group(window_error=errors(1.0, interval)) for on, interval in at.items()}
+    return tune_report.advice(examples.tune({"averaged": 16}, **groups))
+
+
+def margins_of(required: bool = False, **ends: dict[str, Any]) -> Iterable[str]:
+    known = {"stable": True, "gain_margin": 6.0, "phase_margin": 30.0, "delay_margin": 0.1, "peak_sensitivity": 5.0}
+    loops = {name: summaries.read(summaries.Left, {**known, **changes}) for name, changes in ends.items()}
+    return margins_report.tuned(loops, required=required)
+
+
+FEW = {"gain_margin": 5.9, "phase_margin": 0.0, "peak_sensitivity": 7.0}
+UNLIMITED = {"gain_margin": None, "phase_margin": 61.0, "delay_margin": None, "peak_sensitivity": 1.0}
+HOLD = {"stable": True, "gain_margin": 9.0, "phase_margin": 40.0, "delay_margin": 0.1, "peak_sensitivity": 3.0}
+SCALED = {"published_label": "published, scaled", "accuracy_gain_interval": [0.05, 0.1]}
+TUNINGS: dict[str, Callable[[], Any]] = {
+    "tuned": lambda: tune_report.of(examples.tune(held_out=HELD_OUT, paper=LOST, verdicts=[examples.torque(0.9)])),
+    "tuned, a trial of a chain fails": lambda: tune_report.of(
+        examples.tune(held_out=HELD_OUT, plant="chain", status="not met")
+    ),
+    "held-out trials break a limit": lambda: tune_report.advice(broken(1.1)),
+    "held-out trials fail": lambda: tune_report.advice(broken(None)),
+    "held-out trials keep the limit": lambda: tune_report.advice(broken(0.9)),
+    "the search broke the limit too": lambda: tune_report.advice(broken(1.1, searched=1.2)),
+    "a fraction of the time of each run": lambda: advice_on_time("temporal"),
+    "a fraction of the time of all runs": lambda: advice_on_time("mixed"),
+    "held-out loops break a gain margin": lambda: advice_on_margin("gain_margin", 6.0, 5.2),
+    "held-out loops break a peak sensitivity": lambda: advice_on_margin("peak_sensitivity", 6.0, 7.5),
+    "held-out loops have no phase margin": lambda: advice_on_margin("phase_margin", 30.0, 0.0),
+    # 4.8 dB of 6 dB are 0.8 times the limit, although `violation_ratio` is 1.2
+    "margins relative to their limits": lambda: tune_report.search(
+        examples.tune(
+            {"largest_over_limit": {"gain_margin": 1.2}, "margins": {"gain_margin": 0.05},
+             "earlier": [earlier("gain_margin")]},
+            verdicts=[{**MARGIN, "worst": 4.8, "margin": 1.2}],
+        )
+    ),
+    "one look at held-out trials": lambda: looks(1),
+    "three looks at held-out trials": lambda: looks(3),  # 0.95^3 were reported as 95 %
+    "one gain of the observer": lambda: gains_by_axis(observer_gain=50.0),
+    "gains of the observer by axis": lambda: gains_by_axis(
+        observer_gain=45.0, observer_gain_1=50.0, observer_gain_2=40.0
+    ),
+    "less accurate than the published gains": lambda: accuracy(0.08, **SCALED),
+    "less accurate than gains that break limits": lambda: accuracy(
+        0.08, **SCALED, broken_by={"paper": ["gain_margin", "effort"]}
+    ),
+    "more accurate than the paper's law": lambda: accuracy(40.0, published_label="paper's law"),
+    "all held-out trials fail": lambda: accuracy(
+        0.08, held_out=examples.group(counts={"ok": 0, "not_converged": 60, "diverged": 4})
+    ),
+    "all but two training trials fail": lambda: tune_report.search(
+        examples.tune({"largest_over_limit": {"peak_torque": None, "effort": None, "chattering": math.inf}},
+                      training=examples.group(trials=16, counts={"ok": 2, "not_converged": 14}))
+    ),
+    "no gains meet a limit": lambda: tune_report.search(broken(1.2, searched=1.234)),
+    "a torque limit may give way": lambda: conflict(peak_torque=1.3),
+    "a margin may give way": lambda: conflict(gain_margin=1.25),
+    "a margin cannot give way": lambda: conflict(gain_margin=2.5),
+    "a limit can be met by another": lambda: conflict(peak_torque=0.98),
+    "two limits conflict": lambda: conflict(peak_torque=1.3, gain_margin=None),
+    "shortest time by theory and simulation": lambda: shortest(20.1234, 20.5, 0.9),
+    "no shortest time": lambda: shortest(None, None),
+    "shortest time without simulation": lambda: shortest(20.1234, None),
+    "no confirmation, out of reach": lambda: skipped(1.2),
+    "a confirmation": lambda: skipped(1.05),
+    "no confirmation needed": lambda: skipped(1.2, quantile=None),
+    "saturated actuators": lambda: accuracy(None, held_out=examples.group(
+        saturated={"mean": 0.0059, "rms": 0.01, "max": 0.0633})),
+    "actuators that do not saturate": lambda: accuracy(None, held_out=examples.group(
+        saturated={"mean": 0.0, "rms": 0.0, "max": 0.0})),
+    "margins without the discontinuous sign": lambda: diagnostics(margins={"hold": HOLD}, gradient_error=None),
+    "margins and gradients": lambda: diagnostics(margins={"hold": HOLD}, gradient_error={"start": 1e-9, "end": 1e-9}),
+    "gradients are not checked": lambda: diagnostics(gradient_error={"start": None, "end": None}),
+    "gradients are checked at the start": lambda: diagnostics(gradient_error={"start": 1e-9, "end": None}),
+    "wrong gradients": lambda: diagnostics(gradient_error={"start": 3.0, "end": 2.0}),
+    "no trial ends": lambda: diagnostics({"eta": "upper"}, influence={"eta": "unknown", "delta": "unknown"}),
+    "too few training trials": lambda: fitted(2.36),
+    "enough training trials": lambda: fitted(2.0),
+    "margins of the tuned gains": lambda: margins_of(hold={}, before=UNLIMITED),
+    "small margins in the hold phase": lambda: margins_of(hold=FEW, before={}),
+    "small margins in the approach phase": lambda: margins_of(hold={}, before=FEW),
+    "an unstable loop": lambda: margins_of(hold={"gain_margin": -1.2, "stable": False}),
+    "small margins that are required": lambda: margins_of(True, hold=FEW),
+}  # fmt: skip
+
+# ---- fronts
+
+
+def front(*points: Point, **changes: Any) -> Front:
+    """Return a front after a round trip through summary.json."""
+    known: Any = {
+        "against": "torque", "plant": "spacecraft", "points": list(points), "idle": [], "without": [], "trials": 1000,
+        "seed": 1, "interval_confidence": 0.95, "floor": None, "rollouts": 1, "gradients": 1, "requirements": [],
+        "gain_units": {"eta": "-", "observer_gain": "kg m^2/s"}, "warnings": [], "published_label": "published",
+    }  # fmt: skip
+    return read(plain(Front(**known | changes).summary()))
+
+
+def torque(limit: float, peak: float, rms: float, gains: Any = (("eta", 3.0),), **changes: Any) -> Point:
+    return Point(limit, dict(gains), rms, costs={"peak_torque": peak, "mean_peak_torque": peak / 2}, **changes)
+
+
+def robust(limit: float, rms: float, **margins: float) -> Point:
+    costs = {"gain_margin": 6.1, "phase_margin": 40.0, "delay_margin": math.inf, "peak_sensitivity": 5.8, **margins}
+    interval = (0.95 * rms, 1.05 * rms)
+    return Point(limit, {"eta": 3.0, "observer_gain_2": 25.0}, rms, interval, {"peak_torque": 0.2, **costs}, meets=True)
+
+
+def slew(t_f: float, rms: float, peak: float, **changes: Any) -> Point:
+    return Point(t_f, {"eta": 3.0}, rms, (0.9 * rms, 1.1 * rms), {"peak_torque": peak}, **changes)
+
+
+NO_TRIAL = torque(0.1, math.nan, math.nan, failures=9)
+BY_AXIS = torque(0.3, 0.3, 1e-5, {"observer_gain_1": 5.0, "observer_gain_2": 6.0})
+WITHOUT_AXES = {"paper": torque(1.0, 1.0, 1e-5, {"observer_gain": 10.0}), "before": torque(1.0, 1.0, 1e-5, {})}
+FRONTS: dict[str, Callable[[], Front]] = {
+    "front over the torque": lambda: front(
+        torque(0.1, 0.09, 1e-4), torque(0.2, 0.19, 1e-5, knee=True), torque(0.5, 0.49, 2e-6, meets=True), floor=1e-6,
+        requirements=["peak_torque"],
+    ),
+    "missing and dominated points": lambda: front(
+        torque(0.1, 0.1, 1e-5), torque(0.2, 0.2, 2e-5, dominated=True), idle=[0.5], without=[0.01, 0.02],
+        requirements=["effort"], paper_refused="eta is 2",
+    ),
+    "a point without a completed trial": lambda: front(NO_TRIAL, others={"paper": NO_TRIAL}),
+    "gains by axis": lambda: front(BY_AXIS, others=WITHOUT_AXES, published_label="published, scaled"),
+    "a limit exceeded on held-out trials": lambda: front(
+        robust(math.inf, 1e-5), robust(6.0, 2e-5, gain_margin=-100.0, peak_sensitivity=100.0),
+        robust(4.0, 3e-5, peak_sensitivity=4.02), against="margins", plant="chain",
+    ),
+    "unstable loops": lambda: front(
+        robust(math.inf, 1e-5, gain_margin=-0.3, peak_sensitivity=100.0), robust(6.0, 2e-5), against="margins",
+        idle=[60.0], without=[3.0], floor=1e-6,
+    ),
+    "no gains for any limit": lambda: front(against="margins", without=[math.inf, 6.0], requirements=["effort"]),
+    "front over the slew time": lambda: front(
+        slew(8.0, 1e-5, 0.2, failures=2), slew(16.0, 4e-6, 0.05, meets=True), against="t_f", without=[4.0],
+        requirements=["peak_torque"],
+    ),
+    "no slew": lambda: front(against="t_f"),
+    "a lower bound of zero": lambda: front(torque(0.2, 0.2, 1e-5), floor=0.0),
+}  # fmt: skip
+
+# ---- campaigns, maps and comparisons
+
+AT = {"value": 56.0, "low": 55.0, "high": 57.0}
+ERROR = {"without_value": 0, "rms": 1e-5, "max": 1e-5, "0.5": {"value": 1e-5, "low": 1e-5, "high": 1e-5}}
+
+
+def fractions() -> Iterable[str]:
+    """59 of 60 trials keep the limit; a digit is lost if 98.33 % is rounded."""
+    asked = Requirement("peak_torque", 0.5, quantile=0.95)
+    verdict = asked.verdict(np.r_[np.zeros(59), 1.0], np.ones(60, bool))
+    found = examples.entry(verdict, fraction=59 / 60, fraction_interval=[0.91056, 0.99957], fraction_bound=0.92333)
+    wide = Requirement("ape_x", 1.0, quantile=0.9, interpretation="mixed")
+    seen = wide.verdict(np.ones(3), np.ones(3, bool), np.array([1.0, 0.95, 1.0]))
+    return campaign_report.verdict(found), str(examples.entry(seen))
+
+
+def settling(without: int) -> Iterable[Table]:
+    """Return the quantiles if some trials never settled, of which one failed."""
+    times = {"without_value": without, "max": 57.2, "0.5": AT, "0.9973": AT}
+    counts = {"ok": 58, "not_converged": 1, "diverged": 1}
+    return campaign_report.quantiles(examples.campaign(counts=counts, quantiles={"settling_time": times}))
+
+
+def campaign_gains(**tables: dict[str, Any]) -> Table:
+    return campaign_report.gains(tables, "spacecraft")
+
+
+def pairs(count: int) -> Iterable[str]:
+    pair = {"status": "simulated", "failures": 0.0, "not_converged": 0.0, "window_error": 2e-6, "peak_torque": 0.3}
+    every = [
+        {**pair, "x": 1.0, "y": 1.0, "failures": 3.0, "window_error": 1e-6},
+        {**pair, "x": 1.0, "y": 2.0},
+        {**pair, "x": 2.0, "y": 1.0, "not_converged": 2.0, "window_error": 1e-6},
+        {**pair, "x": 2.0, "y": 2.0, "status": "not allowed", "window_error": math.nan},
+    ]
+    return map_report.lines(every[:count], ("loop.period", "controller.delta"), "spacecraft")
+
+
+def compared() -> Table:
+    def law(failures: int, **changes: Any) -> dict[str, Any]:
+        verdict = Requirement("peak_torque", 0.5).verdict(np.arange(1000) < failures, np.ones(1000, bool))
+        return examples.law(window_error=1e-5, verdicts=[verdict.in_summary()], met=verdict.met, **changes)
+
+    laws = examples.compare({"pd": law(12), "prescribed_time": law(0, floor=6.6e-9)}).laws
+    return compare_report.table(compare_report.QUESTIONS[0], laws)
+
+
+OTHERS: dict[str, Callable[[], Any]] = {
+    "fractions of the trials": fractions,
+    "a trial that failed has no settling time": lambda: settling(1),
+    "a trial that ended never settled": lambda: settling(2),
+    "campaign without a lower bound": lambda: campaign_report.of(
+        examples.campaign(quantiles={"window_error": {**ERROR, "0.9973": ERROR["0.5"]}}, floor=0.0)
+    ),
+    "gains of a campaign": lambda: campaign_gains(
+        controller={"kind": "prescribed_time", "eta": 3.0}, observer={"kind": "nonlinear", "gain": [1.0, 2.0, 3.0]}
+    ),
+    # the gain of the nonlinear observer is in N m s
+    "gains of a finite-time observer": lambda: campaign_gains(
+        controller={"kind": "pd", "disturbance_bound": 0.1}, observer={"kind": "finite_time", "gain": [0.02]}
+    ),
+    # its class may have another unit than a built-in k
+    "gains of a custom law": lambda: campaign_gains(controller={"kind": "custom", "t_f": 30.0, "k": 2.0}),
+    "how to replay a trial": lambda: trials_report.how_to_replay(
+        pl.DataFrame({"trial": [7], "window_error": [0.1]}), Path("my out"), custom=True
+    ),
+    "best pair of a map": lambda: pairs(4),
+    "one pair of a map": lambda: pairs(1),
+    "comparison of two laws": compared,  # 1.5e+03 times the lower bound are 1500
+}
+
+
+CASES = {**TUNINGS, **{name: lambda made=made: front_report.of(made()) for name, made in FRONTS.items()}, **OTHERS}
+
+
+def expected() -> dict[str, str]:
+    """Return the texts of the file by the names of their cases."""
+    blocks = EXPECTED.read_text(encoding="utf-8").removeprefix("## ").split("\n\n## ")
+    return {name: text.rstrip("\n") for name, _, text in (block.partition("\n") for block in blocks)}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_report_has_the_expected_text(name):
+    assert text_of(CASES[name]()) == expected()[name]
+
+
+def test_every_expected_text_has_a_case():
+    assert expected().keys() == CASES.keys()
+
+
+# ---- charts and drivers
+
+
+def test_chart_of_a_front_has_intervals_knee_limit_and_no_point_without_an_error():
+    def point(peak, rms, **changes):
+        return torque(peak, peak, rms, **{"interval": (0.9 * rms, 1.2 * rms), **changes})
+
+    others = {"paper": point(5.0, 1e-4, interval=None), "before": torque(1.0, math.nan, math.nan)}
+    points = [point(1.0, 4e-5, knee=True), point(2.0, 1e-5), point(3.0, 2e-5, dominated=True)]
+    drawn = page_charts.front(front(*points, others=others), 1.5)
+    named = {trace["name"]: trace for trace in drawn["data"]}
+    assert {name: trace["x"] for name, trace in named.items()} == {
+        "front": [1.0, 2.0], "knee": [1.0], "dominated": [3.0], "published": [5.0],
+    }  # fmt: skip
+    np.testing.assert_allclose(named["front"]["error_y"]["array"], [0.8e-5, 0.2e-5])
+    np.testing.assert_allclose(named["front"]["error_y"]["arrayminus"], [0.4e-5, 0.1e-5])
+    assert named["published"]["error_y"]["array"] == [0.0]
+    assert drawn["layout"]["shapes"][0]["x0"] == 1.5
+    assert "peak torque [N m]" in json.dumps(drawn["layout"])
+
+
+def test_chart_shows_the_smallest_lower_bound_and_a_required_limit():
+    laws = [examples.law(floor=floor) for floor in (2e-6, 1e-6, None)]
+    asked = examples.law(verdicts=[examples.torque(0.9)])
+    found = list(examples.compare({str(k): law for k, law in enumerate([*laws, asked])}).laws.values())
+    accuracy, torque, *_ = compare_report.QUESTIONS
+    (level,) = compare_report.marks(accuracy, found).values()
+    np.testing.assert_allclose(level, 2e-6 * 180 * 3600 / np.pi)  # arcsec
+    assert compare_report.marks(accuracy, found[2:]) == {}
+    assert compare_report.marks(torque, found[:3]) == {}
+    assert compare_report.marks(torque, found) == {"limit": 0.5}
+
+
+def test_chance_is_no_driver():
+    """In an earlier version, some of twenty inputs without influence were named, with correlations of 0.1."""
+    rng = np.random.default_rng(0)
+    inputs, metric = {f"x{k}": rng.normal(size=300) for k in range(20)}, rng.normal(size=300)
+    drivers = statistics.drivers(inputs, metric)
+    assert max(abs(one["rank_correlation"]) for one in drivers.values()) > 0.1
+
+    def driven(drivers):
+        found = {"drivers": {"window_error": drivers}, "driver_trials": {"window_error": 300}}
+        return list(campaign_report.drivers(examples.campaign(simulated=10_000, trials=10_000, **found)))
+
+    assert driven(drivers) == []
+    (line,) = driven(statistics.drivers({"y": metric + rng.normal(size=300)}, metric))
+    assert line.startswith("window_error is driven by y (rank correlation +0.")
+
+
+if __name__ == "__main__":
+    EXPECTED.write_text("\n\n".join(f"## {name}\n{text_of(case())}" for name, case in CASES.items()) + "\n")
