@@ -2,7 +2,6 @@
 
 import ast
 import importlib
-import inspect
 import json
 import subprocess
 import sys
@@ -90,12 +89,3 @@ def test_type_checkers_see_the_same_exports(package):
             assert alias.asname == alias.name  # marks a re-export
             seen[alias.name] = str(node.module).removeprefix(f"{package}.")
     assert seen == importlib.import_module(package)._EXPORTS
-
-
-@pytest.mark.parametrize("package", ["ptsmc_jax", "ptsmc_jax.scenario"])
-def test_exported_functions_have_type_annotations(package):
-    offering = importlib.import_module(package)
-    functions = [item for item in map(offering.__getattr__, offering._EXPORTS) if inspect.isfunction(item)]
-    assert len(functions) > 3  # functions were found
-    for function in functions:
-        assert set(inspect.signature(function).parameters) <= set(function.__annotations__), function.__name__

@@ -312,15 +312,6 @@ def test_versions_describe_command_code_and_platform(monkeypatch):
     assert made["machine"]
 
 
-def test_nested_arrays_are_on_one_line(tmp_path):
-    tables = {"a": {"flat": [1.0, 2.0], "deep": [[1.0, 0.0], [0.0, 1.0]], "words": ["x, [y]", "]"], "none": []}}
-    store.write_toml(tmp_path / "t.toml", tables)
-    text = (tmp_path / "t.toml").read_text()
-    deep, words = "deep = [[1.0, 0.0], [0.0, 1.0]]", 'words = ["x, [y]", "]"]'
-    assert text.splitlines() == ["[a]", "flat = [1.0, 2.0]", deep, words, "none = []"]
-    assert tomllib.loads(text) == tables
-
-
 def test_unfinished_run_resumes_only_with_the_same_command(tmp_path):
     tables, folder = {"controller": {"eta": 3.0}}, tmp_path / "new"
     assert not store.begun(folder, tables, TOLD)

@@ -517,11 +517,9 @@ def test_simulate_refuses_a_nominal_initial_state_at_the_singularity(command, tm
     assert command("simulate", "s.toml", "--trial", 0, "--no-figures", "--quiet")[0] in (0, 1)  # random initial state
 
 
-@pytest.fixture(params=short(["made up", "simulated"], ["made up"]))
-def cells(request, monkeypatch):
+@pytest.fixture
+def cells(monkeypatch):
     """Cells of a map with invented results. `tests/studies/test_mapping.py` computes real ones."""
-    if request.param == "simulated":
-        return
     metrics = Metrics(dict.fromkeys(catalogues.CATALOGUE, np.full(2, 1e-3)))
     trials = montecarlo.Trials(np.arange(2), metrics, np.full(2, rollout.OK), np.full(2, np.nan), {})
     ones: dict[str, Any] = dict.fromkeys(margins.Margins._fields, np.ones(1))

@@ -121,35 +121,24 @@ def test_new_and_stored_results_of_a_search_have_the_same_report(tmp_path):
     assert shown == 2 * [{"status": "not met", "without": [None, 6.0], "slews": [{"rms": None}]}]
 
 
-@pytest.mark.parametrize("status", ["interrupted", "met"])
-def test_search_of_another_code_version_does_not_resume(tmp_path, capsys, status):
+def test_search_of_another_code_version_is_shown_with_a_note_and_repeated_with_force(tmp_path, capsys):
+    """`campaigns/test_store.py` tests that an unfinished search of another code version is refused."""
     (tmp_path / "s.toml").write_text(SHORT_CHAIN)
     loaded, folder, asked = scenario.read(tmp_path / "s.toml"), tmp_path / "out", []
     search = searches.LongSearch(
         {"command": "tune", "seed": 0},
         "window error",
-        work=lambda report, journal: SimpleNamespace(status=asked.append(1) or status),
-        write=lambda making, outcome: store.record(
-            making, parsing.dump(loaded), search.known_by, {"status": outcome.status}
-        ),
+        work=lambda report, journal: SimpleNamespace(status=asked.append(1) or "met"),
+        write=lambda making, _: store.record(making, parsing.dump(loaded), search.known_by, {"status": "met"}),
         report=lambda _: EMPTY,
     )
-
-    def run(**force):
-        return searches.run(search, loaded, folder, **{"force": False, "quiet": True, **force})
-
-    assert run() == searches.STATUS[status]
+    assert searches.run(search, loaded, folder, force=False, quiet=True) == 0
     store.write_json(folder / "versions.json", store.read_versions(folder) | {"code_checksum": "before"})
     before = tree(folder)
-    capsys.readouterr()
-    if status == "interrupted":
-        with pytest.raises(store.RefusedError, match="another version of the source code"):
-            run()
-    else:  # a finished result is shown, with a note
-        assert run() == 0
-        assert "another version of the source code" in capsys.readouterr().err
+    assert searches.run(search, loaded, folder, force=False, quiet=True) == 0
+    assert "another version of the source code" in capsys.readouterr().err
     assert (len(asked), tree(folder)) == (1, before)
-    run(force=True)
+    searches.run(search, loaded, folder, force=True, quiet=True)
     assert len(asked) == 2
     assert store.read_versions(folder)["code_checksum"] != "before"
 

@@ -129,13 +129,6 @@ def test_trial_does_not_depend_on_the_batch(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_another_seed_has_other_attitudes(kind):
-    trials = jnp.arange(64, dtype=jnp.uint32)
-    first, second = (np.asarray(initial_attitudes(KINDS[kind], seed, trials)) for seed in (1, 2))
-    assert np.abs(first - second).max(axis=1).min() > 1e-6
-
-
-@pytest.mark.parametrize("kind", KINDS)
 def test_random_numbers_depend_only_on_seed_trial_and_quantity(kind):
     """Parts with another loop and other sensors have the same random numbers."""
     other = helpers.parts(
@@ -174,18 +167,6 @@ def uniform_phases(count):
 def parts_of_trials(dispersion, run=PARTS, count=TRIALS, seed=4):
     """Return the parts of many trials, with a leading axis."""
     return jax.jit(jax.vmap(lambda k: dispersion.apply(run, seed, k)))(jnp.arange(count, dtype=jnp.uint32))
-
-
-def test_initial_rates_have_their_distribution():
-    nominal, distributions = np.array([0.01, -0.02, 0.03]), {"uniform": ("uniform", (-1, 2)), "normal": ("norm", ())}
-    for name in distributions:
-        got = parts_of_trials(Dispersion({"initial_rate": RandomNumbers(name, vector([0.02] * 3))}))
-        np.testing.assert_array_equal(got.initial.q, np.broadcast_to(PARTS.initial.q, (TRIALS, 4)))
-        standard = (np.asarray(got.initial.w) - nominal) / 0.02
-        for axis in standard.T:
-            assert stats.kstest(axis, distributions[name][0], distributions[name][1]).pvalue > ALARM
-        limit = -stats.norm.ppf(ALARM / 2) / math.sqrt(TRIALS)
-        assert np.abs(np.corrcoef(standard.T) - np.eye(3)).max() < limit
 
 
 def sample_inertias(moments, std, turn=0.0, axes=None):

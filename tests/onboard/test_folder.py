@@ -15,7 +15,6 @@ import pytest
 
 import ptsmc_jax as ptsmc
 from ptsmc_jax import scenario
-from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.onboard import folder, templates
 from ptsmc_jax.onboard.board import board
 from ptsmc_jax.onboard.library import Library, compiler
@@ -324,14 +323,6 @@ def test_singularity_limit_in_c_equals_that_of_the_simulator(monkeypatch):
     made = folder.Controller(scenario.from_tables(flight()), "short", "a scenario")
     limits = re.findall(r"singularity_distance >= R\((.*?)\)", templates.texts(made.code, made.about)["ptsmc_short.c"])
     assert limits == ["0.0125", "0.0125"]
-
-
-def test_export_raises_an_error_for_a_continuous_loop_or_a_full_folder(exported, tmp_path):
-    with pytest.raises(ScenarioError, match=r'^loop.mode is "continuous", but must be "sampled" to be exported'):
-        folder.export(scenario.from_tables({}), tmp_path / "x")
-    with pytest.raises(RefusedError, match="holds something already"):
-        folder.export(scenario.from_tables({"loop": {"mode": "sampled"}}), exported)
-    assert not (tmp_path / "x").exists()
 
 
 def test_command_filter_advances_by_one_period_after_missed_samples():

@@ -441,14 +441,3 @@ def test_single_precision_gives_the_same_metrics(exported, name):
     ours, theirs = runs.simulate(made.ready, 3, 2), runs.simulate(made.ready, 3, 2, single)
     for name in ("peak_torque", "window_error", "effort"):
         np.testing.assert_allclose(theirs.metrics[name], ours.metrics[name], rtol=1e-3, err_msg=name)
-
-
-@needs_compiler
-def test_report_of_many_different_parameters_names_some_and_counts_the_others(exported):
-    made, library = exported("chain")
-    parameters = library.parameters.copy()
-    changed = np.flatnonzero(parameters)[:6]
-    library.parameters[changed] = 2.0 * parameters[changed]
-    said = InTheLoop(library, made.ready.parts).otherwise
-    assert said.count(" instead of ") == 4
-    assert said.endswith(" and 2 more")
