@@ -129,23 +129,13 @@ NormalState = _numbers(
     "NormalState", Numbers, "Every state normal about x0.", "1 sigma" + _ONE_EACH, "", (), NotNegatives
 )
 NormalFactor = _numbers(
-    "NormalFactor",
-    Relative,
-    "The value times 1 + a normal number, truncated at three sigma.",
-    "relative standard deviation",
-    "",
-    0.1,
-    SmallFraction,
-)
+    "NormalFactor", Relative, "The value times 1 + a normal number, truncated at three sigma.",
+    "relative standard deviation", "", 0.1, SmallFraction,
+)  # fmt: skip
 UniformFactor = _numbers(
-    "UniformFactor",
-    RelativeUniform,
-    "The value times 1 + a uniform number.",
-    "largest relative deviation",
-    "",
-    0.2,
-    BelowOne,
-)
+    "UniformFactor", RelativeUniform, "The value times 1 + a uniform number.",
+    "largest relative deviation", "", 0.2, BelowOne,
+)  # fmt: skip
 NormalTurn = _numbers(
     "NormalTurn", Numbers, "Rotated by a normal rotation vector.", "1 sigma per component", "deg", 0.1, deg=True
 )
@@ -280,9 +270,7 @@ class Outage(Interval, frozen=True):
     """Begins at a uniform time between two times."""
 
     kind: Literal["uniform"] = "uniform"
-    duration: Annotated[
-        Positive | None, Meaning("duration; default: 10, scaled to the mission", "s")
-    ] = None  # fmt: skip
+    duration: Annotated[Positive | None, Meaning("duration; default: 10, scaled to the mission", "s")] = None
     scaled: ClassVar[Mapping[str, Scaled]] = {"duration": Scaled(10.0, time=1)}
 
     def build(self, parts: Any, count: int) -> Any:
@@ -366,9 +354,8 @@ def _dispersion(name: str, rows: Mapping[str, tuple[str, tuple[Any, ...]]]) -> A
     return msgspec.defstruct(name, keys, bases=(Table,), frozen=True, kw_only=True, namespace=space)
 
 
-def _by_kind(kinds: tuple[Any, ...]) -> Kinds:
-    return {typing.get_args(typing.get_type_hints(one)["kind"])[0]: one for one in kinds}
-
-
 Dispersion, StateDispersion = _dispersion("Dispersion", _SPACECRAFT), _dispersion("StateDispersion", _STATE)
-DISPERSIONS: dict[str, Kinds] = {key: _by_kind(kinds) for key, (_, kinds) in {**_SPACECRAFT, **_STATE}.items()}
+DISPERSIONS: dict[str, Kinds] = {
+    key: {typing.get_args(typing.get_type_hints(one)["kind"])[0]: one for one in kinds}
+    for key, (_, kinds) in {**_SPACECRAFT, **_STATE}.items()
+}

@@ -67,16 +67,12 @@ class Allowed(NamedTuple):
     lower_included: bool = False
 
 
-def _positive(_: Choice) -> Allowed:
-    return Allowed(0.0, math.inf)
-
-
 class GainBounds(NamedTuple):
     """The bounds of a gain, as functions of a `Choice`."""
 
     usual: Callable[[Choice], Interval]  # the bounds if a scenario gives none
     # No range contains sign_width = 0, since the discontinuous sign has no gradient
-    allowed: Callable[[Choice], Allowed] = _positive
+    allowed: Callable[[Choice], Allowed] = lambda _: Allowed(0.0, math.inf)
     below: str | None = None  # why values below the usual lower bound are useless in the sampled loop, in words
     above: str | None = None  # the same for values above the usual upper bound
 
@@ -143,10 +139,6 @@ def _usual_delta(choice: Choice) -> Interval:
     return lower, min(upper, (lower + t_f) / 2.0)
 
 
-def _usual_width(choice: Choice) -> Interval:
-    return scales.widths(choice.scenario) if choice.sampled else scales.quiet(choice.scenario)
-
-
 def _usual_k1(choice: Choice) -> Interval:
     """From a decay that takes t_f to the stability limit; if c is free, to the limit for the smallest c."""
     least = SLOWEST_DECAY / choice.t_f
@@ -160,10 +152,6 @@ def _usual_rate(choice: Choice) -> Interval:
     least = SLOWEST_DECAY / (2.0 * choice.t_f)
     high = scales.largest_rate(choice.scenario) if choice.sampled else 0.0
     return least, high if high > least else 200.0 * least
-
-
-def _usual_eta(choice: Choice) -> Interval:
-    return choice.scenario.least_eta + 0.05, choice.scenario.least_eta + 6.0
 
 
 def _in_mission(low: float, high: float, power: Callable[[Any], float]) -> Callable[[Choice], Interval]:
@@ -227,7 +215,10 @@ def _usual_bandwidth(choice: Choice) -> Interval:
 
 
 BOUNDS = {
-    "eta": GainBounds(_usual_eta, lambda choice: Allowed(choice.scenario.least_eta, math.inf)),
+    "eta": GainBounds(
+        lambda choice: (choice.scenario.least_eta + 0.05, choice.scenario.least_eta + 6.0),
+        lambda choice: Allowed(choice.scenario.least_eta, math.inf),
+    ),
     "t_f": GainBounds(_usual_t_f, _allowed_t_f),
     "delta": GainBounds(
         _usual_delta,
@@ -235,7 +226,7 @@ BOUNDS = {
         below="one period, the shortest hand-over that there is",
     ),
     "sign_width": GainBounds(
-        _usual_width,
+        lambda choice: (scales.widths if choice.sampled else scales.quiet)(choice.scenario),
         below="a narrower one is lost in the noise, or hops from side to side",
         above="so wide that hardly a switching term is left",
     ),

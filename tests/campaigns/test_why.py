@@ -110,31 +110,6 @@ def test_every_random_input_may_be_a_reason(monkeypatch):
     assert inspect.unwrap(campaign_summary.drawn_columns)(folder, [None]) == columns
 
 
-def test_insignificant_correlation_in_few_trials_is_not_a_reason():
-    """A correlation of 0.15 is not significant in 200 trials, for example if only these settle."""
-    told = [{"metric": "settling_time", "trial": 3, "value": 1.0, "input": "initial_w1", "drawn": 2.0, "unit": "rad/s",
-             "percentile": 70.0, "median": 1.0, "fraction": None, "rank_correlation": 0.15, "first_order": 0.06,
-             "trials": 200}]  # fmt: skip
-    (said,) = trials_report.why(told, "spacecraft")
-    assert said.endswith("no sampled input explains it; sensor noise remains")
-
-
-def test_report_lists_the_four_most_unusual_inputs_of_a_failed_trial():
-    """Inputs are ranked by their distance from the 50 % percentile, categories by half the fraction of other trials."""
-    alike: dict[str, Any] = {"metric": "effort", "trial": 3, "value": None, "drawn": 2.0, "unit": "",
-                             "rank_correlation": None, "first_order": None}  # fmt: skip
-    ranked = {"initial_angle": 70.0, "initial_w1": 52.0, "initial_w2": 1.0}  # distances 20, 2 and 49
-    shared = {"wheel_failure_wheel": 0.25, "custom_1": 0.9}  # distances 37.5 and 5
-    told = [
-        *({**alike, "input": name, "percentile": at, "median": 1.0, "fraction": None} for name, at in ranked.items()),
-        *({**alike, "input": name, "percentile": None, "median": None, "fraction": at} for name, at in shared.items()),
-    ]
-    (said,) = trials_report.why(told, "spacecraft")
-    assert said.startswith("no effort in trial 3: ")
-    named = [part.split()[0] for part in said.split(": ")[1].split(", ")]
-    assert named == ["initial_w2", "wheel_failure_wheel", "initial_angle", "custom_1"]
-
-
 def test_dispersion_of_zero_width_is_not_a_reason():
     """Angles with a dispersion from 100 to 100 deg differ by rounding errors of the quaternion only."""
     random = np.random.default_rng(3)

@@ -12,7 +12,6 @@ from ptsmc_jax.numerics import statistics
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.catalogues import percent
 from tests.helpers import short
-from tests.output import examples
 from tests.output.pages import checked
 from tuning.output import formats, pointing_report, summaries
 
@@ -147,20 +146,6 @@ def test_pointing_budget_is_an_order_statistic(monkeypatch, simulated):
     assert again["mpe"]["y"] == ordered[least - 1]
     read = summaries.read(summaries.Campaign, {**found, "pointing": {**found["pointing"], "budget": again}})
     assert formats.angle(again["mpe"]["y"]) in str(pointing_report.budget(read))
-
-
-@pytest.mark.parametrize(("simulated", "ok", "not_converged", "said"), [
-    (2000, 2000, 0, "without 1109 runs that all reach their end (852 for 90 % confidence)"),
-    (1108, 1098, 0, "without 1109 runs that all reach their end"),  # too few runs for 95 % confidence
-    (1109, 1099, 0, "because 10 runs did not reach their end"),
-    (1109, 1049, 50, "because 10 runs did not reach their end"),  # runs that do not converge by t_f have angles
-])  # fmt: skip
-def test_report_explains_a_missing_budget_value(simulated, ok, not_converged, said):
-    told = {"after": 0.0, "boresight": [1.0, 0.0, 0.0], "probability": 0.9973, "confidence": 0.95, "window": 1.0,
-            "budget": {"ape": {"x": None}}}  # fmt: skip
-    found = examples.campaign(pointing=told, simulated=simulated, counts={"ok": ok, "not_converged": not_converged})
-    *_, last = pointing_report.heading(found)
-    assert last.startswith(f"an angle is - {said}")
 
 
 def test_single_run_has_the_pointing_indices(command, simulated, tmp_path):

@@ -25,6 +25,8 @@ from tuning.output import (
     map_report,
     margins_report,
     page_charts,
+    pointing_report,
+    run_report,
     summaries,
     trials_report,
     tune_report,
@@ -321,6 +323,43 @@ def compared() -> Table:
     return compare_report.table(compare_report.QUESTIONS[0], laws)
 
 
+def budget(simulated: int, ok: int, not_converged: int = 0) -> str:
+    """Return the reason of an absent angle of a budget; runs that do not converge by t_f have angles."""
+    told = {"after": 0.0, "boresight": [1.0, 0.0, 0.0], "probability": 0.9973, "confidence": 0.95, "window": 1.0,
+            "budget": {"ape": {"x": None}}}  # fmt: skip
+    counts = {"ok": ok, "not_converged": not_converged}
+    return [*pointing_report.heading(examples.campaign(pointing=told, simulated=simulated, counts=counts))][-1]
+
+
+def winner(least: float) -> str:
+    errors = {"pd": least, "prescribed_time": 4e-6}
+    laws = examples.compare({name: examples.law(window_error=error) for name, error in errors.items()}).laws
+    return compare_report.winner(laws)
+
+
+def run(floor: float | None) -> Report:
+    told = {"status": "ok", "reason": "", "bad_time": None, "window_error": 1e-5, "verdicts": {}, "warnings": []}
+    return run_report.of(summaries.run({**told, "floor": floor}, "spacecraft"), "spacecraft")
+
+
+def approach(judged: bool) -> Report:
+    """Return the report of a loop that is unstable at one sample of the approach phase."""
+    left = dict.fromkeys(("gain_up", "gain_down", "phase", "delay", "peak_sensitivity"), 6.0)
+    summary = {
+        "stable": True, "open": [], "cut": [], "said": None, "hold": {"u1": left}, "together": left, "sensors": {},
+        "before": [{"time_to_go": 1.0, "judged": judged, "stable": False, "open": [], "cut": []}],
+        "worst": {"gain_margin": -1.9, "phase_margin": None, "delay_margin": None, "peak_sensitivity": None},
+    }  # fmt: skip
+    return margins_report.of(summaries.read(summaries.Margins, summary))
+
+
+def why(*rows: dict[str, Any], **changes: Any) -> Iterable[str]:
+    """Return the reasons of a trial. Each row is an input, in which a category has a fraction of equal trials."""
+    alike = {"metric": "effort", "trial": 3, "value": None, "drawn": 2.0, "unit": "", "fraction": None, "median": 1.0,
+             "percentile": None, "rank_correlation": None, "first_order": None, **changes}  # fmt: skip
+    return trials_report.why([{**alike, **row} for row in rows], "spacecraft")
+
+
 OTHERS: dict[str, Callable[[], Any]] = {
     "fractions of the trials": fractions,
     "a trial that failed has no settling time": lambda: settling(1),
@@ -343,7 +382,26 @@ OTHERS: dict[str, Callable[[], Any]] = {
     "best pair of a map": lambda: pairs(4),
     "one pair of a map": lambda: pairs(1),
     "comparison of two laws": compared,  # 1.5e+03 times the lower bound are 1500
-}
+    # 1109 runs are needed for 95 % confidence, and all must reach their end
+    "pointing budget without an angle": lambda: [
+        budget(2000, 2000), budget(1108, 1098), budget(1109, 1099), budget(1109, 1049, 50),
+    ],
+    "most accurate law, also without an error": lambda: [winner(2e-6), winner(0.0)],
+    # the bound is 0 without noise, and None if no run reaches its end
+    "run without a lower bound": lambda: [text_of(run(None)), text_of(run(0.0))],
+    "unstable sample of the approach phase": lambda: approach(judged=True),
+    "unstable sample that is not judged": lambda: approach(judged=False),
+    # a correlation of 0.15 is not significant in 200 trials, for example if only these settle
+    "no reason of a worst trial": lambda: why(
+        {"input": "initial_w1", "unit": "rad/s", "percentile": 70.0},
+        metric="settling_time", value=1.0, rank_correlation=0.15, first_order=0.06, trials=200,
+    ),
+    # by the distance from the 50 % percentile: 49, 37.5, 20, 5 and 2; categories by half the fraction of other trials
+    "the four most unusual inputs of a failed trial": lambda: why(
+        *({"input": f"initial_{name}", "percentile": at} for name, at in (("angle", 70.0), ("w1", 52.0), ("w2", 1.0))),
+        *({"input": name, "fraction": at} for name, at in (("wheel_failure_wheel", 0.25), ("custom_1", 0.9))),
+    ),
+}  # fmt: skip
 
 
 CASES = {**TUNINGS, **{name: lambda made=made: front_report.of(made()) for name, made in FRONTS.items()}, **OTHERS}

@@ -143,22 +143,6 @@ def test_unstable_hold_phase_is_reported_with_negative_margins(command, tmp_path
     assert found["worst"]["gain_margin"] < 0.0
 
 
-@pytest.mark.parametrize(("judged", "mood", "headline"), [
-    (True, "bad", "Stable in the hold phase, NOT stable in the approach phase: gain -1.9 dB"),
-    (False, "calm", "The nominal loop is stable: gain -1.9 dB"),  # this sample is not judged
-])  # fmt: skip
-def test_loop_that_is_unstable_in_the_approach_phase_is_not_called_stable(judged, mood, headline):
-    """Earlier, with a period of t_f / 2, the page called a loop with -1.9 dB and -180 deg stable."""
-    left = dict.fromkeys(("gain_up", "gain_down", "phase", "delay", "peak_sensitivity"), 6.0)
-    summary = {
-        "stable": True, "open": [], "cut": [], "note": None, "hold": {"u1": left}, "together": left, "sensors": {},
-        "before": [{"time_to_go": 1.0, "judged": judged, "stable": False, "open": [], "cut": []}],
-        "worst": {"gain_margin": -1.9, "phase_margin": None, "delay_margin": None, "peak_sensitivity": None},
-    }  # fmt: skip
-    report = reported(summary)
-    assert (report.mood, report.headline) == (mood, headline)
-
-
 def reported(summary):
     return margins_report.of(summaries.read(summaries.Margins, summary))
 

@@ -16,7 +16,6 @@ from ptsmc_jax.simulation import clock, rollout
 from ptsmc_jax.theory import lower_bound
 from ptsmc_jax.theory.lower_bound import Model
 from tests.helpers import chain_parts, parts, vector
-from tuning.output import run_report, summaries
 
 PERIOD = 0.125  # a power of two, so that t_f and the ends of the window are exactly at samples
 
@@ -316,12 +315,3 @@ def test_a_filter_with_kalman_gains_attains_the_lower_bound():
     assert len(after_star) > 50
     # the error is half an angle
     np.testing.assert_allclose(after_star[-1], math.sqrt(own[0, 0]) / 2, rtol=0.02)
-
-
-@pytest.mark.parametrize("least", [None, 0.0])
-def test_run_without_a_lower_bound_has_no_ratio_to_it(least):
-    """The bound is 0 without noise, and None if no run reaches its end."""
-    run = {"status": "ok", "reason": "", "bad_time": None, "window_error": 1e-5, "verdicts": {}, "warnings": []}
-    report = run_report.of(summaries.run({**run, "lower_bound": least}, "spacecraft"), "spacecraft")
-    assert report.headline == "pointing error 4.13 arcsec: the run reached its end"
-    assert report.lines == []
