@@ -337,8 +337,9 @@ def test_closed_loop_is_the_same_for_both_openings(delay):
     np.testing.assert_allclose(elsewhere, here, rtol=0.0, atol=1e-14 * np.abs(here).max())
 
 
-def alone_as_together(loop):
-    """Check that margins of one axis and of all axes at once are equal for a loop with one input."""
+def test_margins_of_one_input_equal_margins_of_all_at_once():
+    """Three integrators also become unstable with less gain."""
+    loop = held(*INTEGRATORS, 0.5)
     found, at_once = of(loop), margins.together(loop)
     for name in ("gain_up", "gain_down", "phase", "delay"):
         assert 0.0 < at_once[name] < np.inf
@@ -346,13 +347,13 @@ def alone_as_together(loop):
     np.testing.assert_allclose(at_once["peak_sensitivity"], found.peak_sensitivity[0], atol=1e-3)  # on the grid
 
 
-def test_margins_of_one_input_equal_margins_of_all_at_once():
-    """Three integrators also become unstable with less gain."""
-    alone_as_together(held(*INTEGRATORS, 0.5))
+def test_phase_margin_of_each_sensor_is_accurate_for_five_integrators():
+    """A pole leaves the unit circle at the phase margin of each sensor.
 
-
-def held_by_each_sensor(loop):
-    """Check that a pole leaves the unit circle at the phase margin of each sensor."""
+    The loop of all sensors is so large at low frequencies that its rounding once gave a wrong margin of 0.1 deg.
+    """
+    poles = -np.array([0.6, 0.6, 0.6, 0.6, 1.0])
+    loop = held(np.eye(5, k=1), np.eye(5)[:, 4:], -np.poly(poles)[None, :0:-1], 0.05, sensors=True)
     opening = jax.tree.map(np.asarray, linear.at_sensors(loop))
     size = loop.seen.shape[1]
     assert np.abs(np.linalg.eigvals(opening.closed())).max() < 1.0
@@ -365,12 +366,6 @@ def held_by_each_sensor(loop):
     for sensor, phase in enumerate(of(loop, sensors=True).phase):
         assert 5.0 < phase < 180.0
         assert radius(sensor, 0.9999 * phase) < 1.0 < radius(sensor, 1.0001 * phase)
-
-
-def test_phase_margin_of_each_sensor_is_accurate_for_five_integrators():
-    """The loop of all sensors is so large at low frequencies that its rounding once gave a wrong margin of 0.1 deg."""
-    poles = -np.array([0.6, 0.6, 0.6, 0.6, 1.0])
-    held_by_each_sensor(held(np.eye(5, k=1), np.eye(5)[:, 4:], -np.poly(poles)[None, :0:-1], 0.05, sensors=True))
 
 
 def bears_delays_below_its_margin(loop, most=1.0):
@@ -458,8 +453,9 @@ def test_delay_margin_is_found_for_a_crossing_near_the_nyquist_frequency():
         assert 0.01 < late < 0.02
 
 
-def sensitive_together(loop):
-    """Check the peak sensitivity of all inputs on a uniform grid, and that no single input exceeds it."""
+def test_peak_sensitivity_of_all_inputs_is_the_largest_singular_value():
+    """The matrix is (I + L)^-1. No axis alone has a larger peak."""
+    loop = drawn_loop(LATE[0])
     opening = linear.at_input(loop)
     a, b, c = (np.asarray(v) for v in (opening.a, opening.b, opening.c))
     z = np.exp(1j * np.pi * np.linspace(1e-3, 1.0, 4000))
@@ -470,11 +466,6 @@ def sensitive_together(loop):
     found = margins.together(loop)["peak_sensitivity"]
     np.testing.assert_allclose(found, peak, atol=5e-3)  # both on grids
     assert found > of(loop).peak_sensitivity.max() - 5e-3
-
-
-def test_peak_sensitivity_of_all_inputs_is_the_largest_singular_value():
-    """The matrix is (I + L)^-1. No axis alone has a larger peak."""
-    sensitive_together(drawn_loop(LATE[0]))
 
 
 def test_loop_of_a_slow_star_tracker_is_the_mean_over_its_interval():
