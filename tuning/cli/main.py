@@ -252,11 +252,11 @@ def pareto(
     device: Device = "cpu",
     common: Common = USUAL,
 ) -> int:
-    """Find the front of accuracy against peak torque, or the cost of margins or of a faster slew, on held-out trials.
+    """Trace the Pareto front of accuracy against peak torque, margins or slew time, verified on held-out trials.
 
     After Ctrl-C or a kill, the same command resumes the search.
 
-    Exit status: 0 some gains on the front meet every requirement, 1 none do, 2 configuration error, 130 interrupted.
+    Exit status: 0 a point of the front meets every requirement, 1 none does, 2 configuration error, 130 interrupted.
     """
     listed = listed_against(against, points, times, limits)
     loaded, folder = prepare(scenario, "pareto", out, device, trust=common.trust)
