@@ -117,7 +117,7 @@ for width in (0.0, 1e-3):
     axes.step(history["t"], history["u1"], where="post", lw=1.0, label=label)
 axes.axvline(30.0, color="0.3", ls="--", lw=1)
 axes.set(xlim=(28, 34), ylim=(-0.03, 0.03), xlabel="time [s]", ylabel="torque $u_1$ [N m]")
-axes.set_title("The discontinuous sign switches the torque in every period")
+axes.set_title("With the discontinuous sign the torque chatters")
 _ = axes.legend()
 
 # %% [markdown]

@@ -83,8 +83,9 @@ for label, case in {"published": flight, "tuned": tuned.scenario}.items():
     axes.step(history["t"], history["u1"], where="post", lw=1.2, label=f"{label} gains")
 for sign in (-1.0, 1.0):
     axes.axhline(0.5 * sign, color="0.3", ls="--", lw=1)
-axes.set(xlabel="time [s]", ylabel="torque $u_1$ [N m]", title="Tuned gains need no torque for noise")
-_ = axes.legend()
+axes.set(xlabel="time [s]", ylabel="torque $u_1$ [N m]")
+axes.set_title("Tuned gains remove the torque peak that noise causes")
+_ = axes.legend(loc="lower left")
 
 # %% [markdown]
 # ## Margins
