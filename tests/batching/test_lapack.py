@@ -121,6 +121,7 @@ def trace_analyses(parts, dispersion):
     design._predicted.trace(parts, dispersion, seed, trials, jnp.asarray(3.0))
 
 
+@pytest.mark.filterwarnings("ignore::ptsmc_jax.batching.lanes.LanesWarning")  # `jax.vmap` evaluates eigh
 def test_analyses_of_a_system_never_batch_eigh(batched_calls):
     """This includes bounds of the disturbance, integration steps, and linearised loops of many periods and trials."""
     plant = system(2, rate_of_x_1, lambda t, x_1, x_2: identity_by_eigh(-x_1), lambda t, x_1, x_2: jnp.eye(2))

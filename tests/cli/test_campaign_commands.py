@@ -419,7 +419,7 @@ def test_a_folder_without_a_campaign_is_refused(command, tmp_path, asked):
         assert (code, out) == (2, "")
         assert f"{folder} holds no campaign; allowed is a folder made by `ptsmc montecarlo`" in error
     assert command("simulate", "s.toml", "--out", "run", "--no-figures", "--quiet")[0] == 0
-    assert "holds results of `ptsmc simulate`" in command(asked[0], "run", *asked[1:])[2]
+    assert "run has results of `ptsmc simulate`" in command(asked[0], "run", *asked[1:])[2]
 
 
 def test_repeated_summary_does_not_depend_on_the_order_of_limits(command, tmp_path):

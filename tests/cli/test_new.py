@@ -149,7 +149,10 @@ def test_file_name_is_escaped_if_the_output_encoding_lacks_its_letters(command, 
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["nowhere/s.toml"], "but nowhere is no folder; allowed is a file in an existing folder"),
+        (
+            ["nowhere/s.toml"],
+            "the file is nowhere/s.toml, but nowhere is no folder; allowed is a file in an existing folder",
+        ),
         (["."], "the file is ., which exists already; allowed is another name"),
         (["chain"], "FILE is chain, which is a kind of plant; allowed are --plant chain and other file names"),
         (["a.toml", "--plant", "boat"], f"--plant is boat, but must be {PLANTS}"),
