@@ -149,6 +149,16 @@ judged_margins_jit = programs.jit(
 )
 
 
+def judged(parts: Parts) -> tuple[Margins, np.ndarray, limit_cycles.LimitCycle | None]:
+    """Return the margins of `judged_loops` (times + 1, m), which of them are in the hold phase, and the limit cycle.
+
+    If there is a limit cycle, the margins in the hold phase are zero, see `limit_cycles`.
+    """
+    found, hold, commands = jax.tree.map(np.asarray, judged_margins_jit(parts))
+    limit_cycle = limit_cycles.find(parts, commands)
+    return (found if limit_cycle is None else limit_cycles.none_left(found, hold)), hold, limit_cycle
+
+
 def along(parts: Parts, times: int = 24) -> Course:
     """Return the margins of sampled parts along their nominal run.
 

@@ -16,7 +16,7 @@ from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.catalogues import CATALOGUES, NO_SIGN
-from ptsmc_jax.theory import limit_cycles, margins, run_margins
+from ptsmc_jax.theory import margins, run_margins
 from ptsmc_jax.theory.crossings import MOST
 from ptsmc_jax.theory.limit_cycles import LimitCycle
 from ptsmc_jax.theory.margins import FIELDS
@@ -61,12 +61,9 @@ def worst(ready: Study) -> dict[str, dict[str, Any]] | None:
     """
     if not ready.scenario.sampled:
         return None
-    left, hold, history = jax.tree.map(np.asarray, run_margins.judged_margins_jit(ready.parts))
+    left, hold, limit_cycle = run_margins.judged(ready.parts)
     if np.isnan(left.peak_sensitivity[-1]).any():
         return None
-    limit_cycle = limit_cycles.find(ready.parts, history)
-    if limit_cycle is not None:
-        left = limit_cycles.none_left(left, hold)
     each = {}
     for where, rows in (("before", ~hold), ("hold", hold)):
         if rows.any():
