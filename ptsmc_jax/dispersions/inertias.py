@@ -102,10 +102,10 @@ class RelativeInertia:
 class CorrelatedInertia:
     """True inertia with six correlated random coordinates. Every value of the coordinates gives a physical body.
 
-    The coordinates c are the logarithms of the diagonal and the lower triangle of L in S = R L L' R', where S is the
-    pseudo-inertia tr(J) I / 2 - J and R R' is the nominal one. S is positive definite if and only if each moment is
-    positive and less than the sum of the other two (Rucker and Wensing, IEEE Robotics and Automation Letters 7(2),
-    2022).
+    S = tr(J) I / 2 - J is the pseudo-inertia, and R R' is that of the nominal inertia. A lower triangular L with
+    S = R L L' R' has six coordinates: the logarithms of its diagonal, and its other entries. S is positive definite if
+    and only if each moment is positive and less than the sum of the other two (Rucker and Wensing, IEEE Robotics and
+    Automation Letters 7(2), 2022).
     """
 
     root: Leaf  # (3, 3) R [sqrt(kg) m]
@@ -120,7 +120,7 @@ class CorrelatedInertia:
 
 
 def pseudo_root(inertia: np.ndarray) -> np.ndarray:
-    """Return a factor R (3, 3) [sqrt(kg) m] of the pseudo-inertia tr(J) I / 2 - J of an inertia (3, 3) [kg m^2].
+    """Return a factor R [sqrt(kg) m] of the pseudo-inertia R R' = tr(J) I / 2 - J of an inertia J [kg m^2], all (3, 3).
 
     A flat body, whose largest moment is the sum of the others, gets a thickness: its smallest pseudo-moment becomes
     1e-6 of the largest.

@@ -1,7 +1,7 @@
 """Warn about valid scenarios whose values are probably mistakes. Start with `warnings`.
 
-The warnings concern disturbance bounds far from the disturbance, noisy estimates, a missing gyro error, values in wrong
-units, a sliding surface that is too fast for the control period, and a ground target below the horizon.
+Three warnings concern noise: disturbance bounds far from the disturbance, noisy estimates, a missing gyro error. The
+others concern values in wrong units, a sliding surface too fast for the period, and a ground target below the horizon.
 """
 
 from typing import Any

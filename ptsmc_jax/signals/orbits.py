@@ -67,8 +67,8 @@ class Orbit:
     def anomalies(self, t: Any, xp: Any = jnp) -> tuple[Any, Any]:
         """Return the true and the eccentric anomaly (..,) [rad] at times (..,) [s].
 
-        The true anomaly f follows from Kepler's equation M = E - e sin E and from
-        f = E + 2 atan(b sin E / (1 - b cos E)), b = e / (1 + sqrt(1 - e^2)). It has no jumps after a revolution.
+        The eccentric anomaly E solves Kepler's equation M = E - e sin E. With b = e / (1 + sqrt(1 - e^2)) the true
+        anomaly is f = E + 2 atan(b sin E / (1 - b cos E)). It has no jumps after a revolution.
 
         Args:
             t: the times.
