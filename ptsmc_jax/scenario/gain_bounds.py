@@ -13,7 +13,7 @@ from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.values import MOST_STEPS
 
 Interval = tuple[float, float]
-SLOWEST_DECAY = 3.5  # t_f times the least K1
+SLOWEST_DECAY = 3.5  # least K1 over `Choice.slowest`
 
 
 def wide(low: Any, high: Any) -> Any:
@@ -53,6 +53,14 @@ class Choice(NamedTuple):
     def shortest_delta(self) -> float:
         """The shortest delta [s]: a control period in the sampled loop, otherwise 0."""
         return self.scenario.loop.period if self.sampled else 0.0
+
+    @property
+    def slowest(self) -> float:
+        """1 / t_f [1/s], or down to a tenth of it if modes, dead time or noise allow only slower poles."""
+        rate = 1.0 / self.t_f
+        if not self.sampled:
+            return rate
+        return min(rate, max(mission.fastest_pole(self.scenario) / SLOWEST_DECAY, 0.1 * rate))
 
     def smallest(self, name: str) -> float:
         """Return the smallest value of a gain of the law: its lower bound, or its value if it is not free."""
@@ -140,16 +148,16 @@ def _usual_delta(choice: Choice) -> Interval:
 
 
 def _usual_k1(choice: Choice) -> Interval:
-    """From a decay that takes t_f to the stability limit; if c is free, to the limit for the smallest c."""
-    least = SLOWEST_DECAY / choice.t_f
+    """From the slowest decay to the stability limit; if c is free, to the limit for the smallest c."""
+    least = SLOWEST_DECAY * choice.slowest
     surface = choice.smallest("surface_rate") if "surface_rate" in choice.free else choice.law.surface_rate
     limit = scales.largest_k1(choice.scenario, surface) if choice.sampled else 0.0
     return least, limit if limit > least else 100.0 * least
 
 
 def _usual_rate(choice: Choice) -> Interval:
-    """From a decay that takes t_f to half of the stability limit of the sampled loop."""
-    least = SLOWEST_DECAY / (2.0 * choice.t_f)
+    """From the slowest decay to half of the stability limit of the sampled loop."""
+    least = 0.5 * SLOWEST_DECAY * choice.slowest
     high = scales.largest_rate(choice.scenario) if choice.sampled else 0.0
     return least, high if high > least else 200.0 * least
 
@@ -185,8 +193,8 @@ def _allowed_gamma(choice: Choice) -> Allowed:
 
 
 def _dead_beat(choice: Choice) -> Interval:
-    """Return observer gains [N m s] from l / J = 1.5 / t_f to the gain of a deadbeat observer."""
-    least = mission.SLOWEST_OBSERVER / choice.t_f * choice.scenario.mean_inertia
+    """Return observer gains [N m s] from the slowest decay to the gain of a deadbeat observer."""
+    least = mission.SLOWEST_OBSERVER * choice.slowest * choice.scenario.mean_inertia
     high = scales.dead_beat_gain(choice.scenario) if choice.sampled else 0.0
     return least, high if high > least else 600.0 * least
 

@@ -162,6 +162,12 @@ def dead_time(scenario: Any) -> float:
     )
 
 
+def fastest_pole(scenario: Any) -> float:
+    """Return the largest p [1/s] that dead time, flexible modes, and noise against the torque limit allow."""
+    stable = STABLE * 2.0 / scenario.order  # n poles at -p put the crossover near n p
+    return min(stable / dead_time(scenario), _with_modes(scenario), _with_noise(scenario))
+
+
 def _design(scenario: Any, pole: float, eta: float, observer: float) -> Design:
     law, period = scenario.controller, scenario.loop.period
     longest = 0.5 * (law.t_f + period)  # largest delta [s]
@@ -188,12 +194,10 @@ def _limits(scenario: Any) -> _Limits:
     - sigma (h / p)^(1/2), from the rate noise.
     """
     t_f, period = scenario.controller.t_f, scenario.loop.period
-    stable = STABLE * 2.0 / scenario.order  # n poles at -p put the crossover near n p
-    most = min(stable / dead_time(scenario), _with_modes(scenario), _with_noise(scenario))
-    least = SLOWEST / t_f
+    least, most = SLOWEST / t_f, fastest_pole(scenario)
     if most <= least:  # the larger of this limit and the p with delta = t_f / 2
         slow = max(most, (2.0 * _least_eta(scenario) - 1.0) / t_f)
-        return _Limits(slow, slow, slow)
+        return _Limits(max(most, 0.1 * slow), slow, slow)
     position, velocity = scenario.devices.noise_of_error(scenario)
     position = 0.0 if scenario.estimator.on else position  # an attitude filter passes slow errors only
     rates = least * (most / least) ** np.linspace(1.0, 0.0, TRIED)  # descending: argmin prefers fast rates

@@ -426,3 +426,20 @@ def test_a_surface_rate_without_a_stable_k1_causes_a_warning(changes, said):
         del tables["disturbance"]
     found = [one for one in plausibility.warnings(scenario.from_tables(tables)) if "surface_rate" in one]
     assert len(found) == said
+
+
+@pytest.mark.parametrize("damping", [0.1, 0.03, 0.003])  # p t_f / 3.5 is 1.6, 0.48 and 0.048
+def test_bounds_extend_to_slow_gains_if_a_mode_needs_them(damping):
+    """A late mode limits the pole of the hold phase to p = z w / (2 k), k the inertia of mode over hub."""
+    base = {
+        "spacecraft": {"inertia": [100.0, 100.0, 100.0]},
+        "controller": {"t_f": 100.0},
+        "loop": {**SAMPLED, "period": 0.5},
+        "tune": {},
+    }
+    modes = {"frequency": [2.0], "damping": [damping], "coupling": [[math.sqrt(80.0), 0.0, 0.0]]}
+    pole = damping * 2.0 / math.sqrt(0.2) / (2.0 * 4.0)  # 80 of 100 kg m^2: k = 80 / 20, and the body is free
+    rigid, flexible = scenario.from_tables(base), scenario.from_tables({**base, "flexible": modes})
+    for name in ("observer_gain", "k1", "surface_rate"):
+        ratio = flexible.search.bounds[name][0] / rigid.search.bounds[name][0]
+        assert ratio == pytest.approx(min(1.0, max(0.1, pole * 100.0 / 3.5)), rel=1e-9)
