@@ -107,7 +107,8 @@ def replace(scenario: Scenario | str | Path, **changes: Any) -> Scenario:
 
     Args:
         scenario: a scenario or the path of its file.
-        changes: values by key, written table__key, or whole tables by name. None restores the default.
+        changes: values by key, written table__key, or whole tables by name, also those of another scenario. None
+            restores the default.
 
     Raises:
         ScenarioError: a value or a combination of values is not allowed.
@@ -134,7 +135,7 @@ def replace(scenario: Scenario | str | Path, **changes: Any) -> Scenario:
             elif key in within:  # in a copy: the table may belong to the caller
                 tables[table] = {other: kept for other, kept in within.items() if other != key}
         elif not key:
-            tables[table] = value
+            tables[table] = parsing.plain(value) if isinstance(value, Table) else value
         elif key == "kind" and getattr(getattr(scenario, table, None), "kind", None) != value:
             tables[table] = {"kind": value}
         else:

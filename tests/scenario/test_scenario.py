@@ -448,6 +448,15 @@ def test_replace_does_not_change_its_arguments():
     assert given == {"t_f": 20.0, "eta": 4.0}
 
 
+def test_replace_takes_a_table_of_another_scenario():
+    drawn = {"attitude": {"kind": "axis_angle", "min_deg": 10.0, "max_deg": 20.0}}
+    hardware = {"attitude_noise": "2 arcsec", "rate_noise": 1e-6}
+    loop = {"mode": "sampled", "period": 0.1}
+    other = from_tables({"dispersion": drawn, "hardware": hardware, "loop": loop})
+    one = replace(from_tables({"loop": loop}), dispersion=other.dispersion, hardware=other.hardware)
+    assert (one.dispersion, one.hardware) == (other.dispersion, other.hardware)
+
+
 def test_replace_adds_a_table():
     tune = replace(from_tables({}), tune__steps=5).tune
     assert tune is not None
