@@ -169,8 +169,24 @@ class Fmus(NamedTuple):
         for name, model_of in (("controller", controller_model), ("plant", plant_model)):
             if getattr(self, name):
                 model = model_of(made)
-                for version in units.VERSIONS if self.version is None else (self.version,):
-                    units.write(folder / f"{name}_fmi{version}.fmu", model, version, binary=self.binary)
+                for version in self.versions:
+                    units.write(folder / _file(name, version), model, version, binary=self.binary)
+
+    @property
+    def versions(self) -> tuple[int, ...]:
+        """The versions of FMI to write."""
+        return units.VERSIONS if self.version is None else (self.version,)
+
+    @property
+    def files(self) -> list[str]:
+        """The names of the FMUs."""
+        kinds = [name for name in ("controller", "plant") if getattr(self, name)]
+        return [_file(name, version) for name in kinds for version in self.versions]
+
+
+def _file(name: str, version: int) -> str:
+    """Return the name of an FMU; name: controller or plant, version: of FMI."""
+    return f"{name}_fmi{version}.fmu"
 
 
 NO_FMUS = Fmus()

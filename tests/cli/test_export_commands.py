@@ -39,6 +39,13 @@ def test_export_writes_a_folder_and_prints_the_cost_of_a_step(command, tmp_path,
     assert files[0] == files[1]
 
 
+def test_export_names_the_fmus_that_it_writes(command, tmp_path):
+    status, out, _ = command("export", "s.toml", "--trials", 1, "--out", "c", "--fmu", "--fmi", 3, "--no-binary")
+    assert status == 0
+    assert "controller, controller_fmi3.fmu in c;" in out
+    assert [path.name for path in (tmp_path / "c").glob("*.fmu")] == ["controller_fmi3.fmu"]
+
+
 @needs_compiler
 def test_simulate_runs_the_exported_controller(command, tmp_path, exported):
     status, _, err = command("simulate", "s.toml", "--controller", exported, "--no-figures", "--out", "r")

@@ -67,7 +67,8 @@ def export(
     if not quiet:
         costs = ", ".join(f"{n} {what}" for what, n in templates.operations(controller.code.counts).items() if n)
         check = f"make -C {shlex.quote(str(folder))} check"
-        terminal.say(f"a step takes at most {costs}", f"controller in {folder}; {check}")
+        written = ", ".join(["controller", *fmus.files])
+        terminal.say(f"a step takes at most {costs}", f"{written} in {folder}; {check}")
     return 0
 
 
