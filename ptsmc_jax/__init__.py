@@ -18,8 +18,8 @@ _NAMES = {
     "devices.sensors": "Sensors",
     "dispersions.base": "Draw",
     "dispersions.variation": "Dispersion",
-    "explore": "lower_bound simulate trials verdicts write",
-    "identification.estimation": "Identification identify",
+    "explore": "identify lower_bound simulate trials verdicts write",
+    "identification.estimation": "Identification",
     "laws.base": "AccelerationLaw",
     "laws.kinematics": "AdditiveKinematics ChainKinematics MultiplicativeKinematics SecondOrderKinematics",
     "laws.prescribed_time": "PrescribedTime PrescribedTimeChain",
@@ -56,13 +56,13 @@ if TYPE_CHECKING:
     from ptsmc_jax.devices.sensors import Sensors as Sensors
     from ptsmc_jax.dispersions.base import Draw as Draw
     from ptsmc_jax.dispersions.variation import Dispersion as Dispersion
+    from ptsmc_jax.explore import identify as identify
     from ptsmc_jax.explore import lower_bound as lower_bound
     from ptsmc_jax.explore import simulate as simulate
     from ptsmc_jax.explore import trials as trials
     from ptsmc_jax.explore import verdicts as verdicts
     from ptsmc_jax.explore import write as write
     from ptsmc_jax.identification.estimation import Identification as Identification
-    from ptsmc_jax.identification.estimation import identify as identify
     from ptsmc_jax.laws.base import AccelerationLaw as AccelerationLaw
     from ptsmc_jax.laws.kinematics import AdditiveKinematics as AdditiveKinematics
     from ptsmc_jax.laws.kinematics import ChainKinematics as ChainKinematics

@@ -1,12 +1,12 @@
-"""Short functions for notebooks: simulate a scenario, plot it, run trials, compute verdicts. Start with `simulate`.
+"""Short functions for notebooks: simulate, plot, run trials, compute verdicts, identify. Start with `simulate`.
 
 The pure function of JAX underneath is `rollout.simulate`.
 """
 
 import html
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,8 @@ from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import campaign, margin_verdicts, run_tables, runs, store
 from ptsmc_jax.campaigns.montecarlo import CustomMetrics
 from ptsmc_jax.campaigns.runs import Run
-from ptsmc_jax.figures import animation, run_plots
+from ptsmc_jax.figures import animation, identification_plots, run_plots
+from ptsmc_jax.identification import estimation, results
 from ptsmc_jax.numerics import draws
 from ptsmc_jax.onboard import folder
 from ptsmc_jax.onboard.library import InTheLoop, Library
@@ -141,6 +142,36 @@ class Simulation:
     def _ending(self) -> str:
         why = f", {self.run.reason}, at {self.run.bad_time:.4g} s" if self.run.reason else ""
         return f"status: {self.status}{why}"
+
+
+@dataclass(frozen=True)
+class Identified(estimation.Identification):
+    """Parameters of a scenario, estimated from telemetry, with a verdict and figures."""
+
+    @property
+    def identified_scenario(self) -> Scenario:
+        """The scenario with the estimates, and with their covariance in [dispersion]."""
+        return results.identified(self)
+
+    @property
+    def verdict(self) -> list[str]:
+        """Whether the model explains the logs, and which combinations of parameters are not determined, in words."""
+        return results.verdict(self)
+
+    def plot(self, *names: str) -> "Figures":
+        """Return all figures of the identification, or the named ones; raise ValueError for an unknown name."""
+        return Figures(identification_plots.figures_of(self)).only(names)
+
+    def __repr__(self) -> str:
+        return "\n".join([*self.verdict, super().__repr__()])
+
+    def _repr_html_(self) -> str:
+        head = ("parameter", "estimate", "1 sigma", "start", "unit")
+        rows = [
+            (row["parameter"], f"{row['estimate']:.6g}", f"{row['std']:.2g}", f"{row['start']:.6g}", row["unit"])
+            for row in self.table().iter_rows(named=True)
+        ]
+        return html_list(self.verdict) + html_table(head, rows)
 
 
 class Figures(dict[str, Figure]):
@@ -300,6 +331,34 @@ def verdicts(what: Scenario | Study | str | Path, rows: pl.DataFrame, *, seed: i
         raise ValueError(f"the rows have no {missing[0]}" if missing else "there are no rows, but must be one at least")
     of_margins = margin_verdicts.over_trials(_ready(what), seed) if scenario.margin_requirements(loaded) else []
     return [*campaign.verdicts(asked, rows), *of_margins]
+
+
+def identify(
+    what: Scenario | str | Path,
+    log: pl.DataFrame | Sequence[pl.DataFrame],
+    *,
+    validate: Sequence[pl.DataFrame] = (),
+    free: Sequence[str] | None = None,
+    report: Callable[[str], None] = lambda text: None,
+) -> Identified:
+    """Estimate parameters of a scenario's true plant from telemetry.
+
+    Args:
+        what: a scenario, or the path of its file. [telemetry] names the columns and [identify] the parameters.
+        log: a table with a row for each time, or several tables of separate runs.
+        validate: logs that are predicted with the estimates and not used for them.
+        free: names of the parameters; by default those of the scenario.
+        report: called with the progress in words.
+
+    Returns:
+        The estimates, their covariance and the innovations.
+
+    Raises:
+        ScenarioError: a parameter is unknown.
+        RefusedError: a log cannot be used; the sentence names row and column.
+    """
+    found = estimation.identify(what, log, validate=validate, free=free, report=report)
+    return Identified(**{field.name: getattr(found, field.name) for field in fields(found)})
 
 
 def units(kind: str = "spacecraft") -> dict[str, str]:

@@ -5,10 +5,51 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from scipy.spatial.transform import Rotation
 
 from ptsmc_jax.figures import style
+from ptsmc_jax.identification import results
+from ptsmc_jax.identification.estimation import Fit, Identification
 
 POINTS = 4000  # of a line
+UNITS = {"attitude": "rad", "rate": "rad/s"}  # of innovations
+
+
+def figures_of(found: Identification) -> dict[str, Figure]:
+    """Return the figures by name; those of the second log and of later ones have its number."""
+    figures: dict[str, Figure] = {"estimates": estimates(found.table())}
+    for k, fit in enumerate([*found.fits, *found.validation]):
+        end = "" if k == 0 else f"_{k + 1}"
+        names, t = results.components(fit), fit.log.t[1:]
+        values, sigma = results.innovations(fit)
+        labels = [style.with_unit(name, UNITS.get(name.split("_")[0], "")) for name in names]
+        figures[f"innovations{end}"] = innovations(t, labels, values, sigma)
+        counts = np.sum(np.isfinite(values), axis=0)
+        figures[f"autocorrelation{end}"] = autocorrelation(names, fit.autocorrelation(), counts)
+        figures[f"prediction{end}"] = signals(t, _predictions(fit, values))
+    return figures
+
+
+def _predictions(fit: Fit, values: np.ndarray) -> list[tuple[str, np.ndarray, np.ndarray]]:
+    """Return label, measured and predicted values of each signal; the attitude is the rotation from the first row."""
+    panels, at = [], 0
+    for name, readings in fit.log.readings.items():
+        measured = readings[1:]
+        size = 3 if name == "attitude" else readings.shape[1]
+        errors = values[:, at : at + size]
+        at += size
+        if name == "attitude":
+            there = ~np.isnan(measured[:, 0]) & ~np.isnan(errors[:, 0])
+            angles, predicted = np.full((len(measured), 3), np.nan), np.full((len(measured), 3), np.nan)
+            first, now = Rotation.from_quat(readings[0]), Rotation.from_quat(measured[there])
+            angles[there] = np.rad2deg((first.inv() * now).as_rotvec())
+            back = now * Rotation.from_rotvec(-errors[there])
+            predicted[there] = np.rad2deg((first.inv() * back).as_rotvec())
+            panels.append(("rotation [deg]", angles, predicted))
+        else:
+            label = "rate [rad/s]" if name == "rate" else "state"
+            panels.append((label, measured, measured - errors))
+    return panels
 
 
 def _panels(labels: Sequence[str], title: str, xlabel: str = style.TIME) -> tuple[Figure, Any]:

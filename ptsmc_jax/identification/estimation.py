@@ -193,7 +193,7 @@ def identify(
     loaded = reading.complete(reading.of(what))
     frames = [log] if isinstance(log, pl.DataFrame) else list(log)
     logs = [telemetry.measurements(loaded, frame, f"log {k + 1}") for k, frame in enumerate(frames)]
-    others = [telemetry.measurements(loaded, frame, f"validation log {k + 1}") for k, frame in enumerate(validate)]
+    others = [telemetry.measurements(loaded, frame, f"log {len(logs) + k + 1}") for k, frame in enumerate(validate)]
     return of_logs(loaded, logs, others, free, report)
 
 

@@ -170,24 +170,31 @@ def components(fit: Fit) -> list[str]:
     return [f"{name}_{axis}" for name in ("attitude", "rate") if name in readings for axis in "xyz"]
 
 
+def innovations(fit: Fit) -> tuple[np.ndarray, np.ndarray]:
+    """Return innovations and their 1 sigma at the rows of the log but the first, NaN without a reading."""
+    sampled = fit.rows.source[1:] >= 0
+    value, variance, accepted = (part[sampled] for part in fit.innovations)
+    return np.where(accepted, value, np.nan), np.where(accepted, np.sqrt(variance), np.nan)
+
+
 def verdict(found: Identification) -> list[str]:
     """Return in words whether the model explains the logs, and how well each parameter is known."""
     lines = []
     for fit in [*found.fits, *found.validation]:
-        used = "validation " if fit in found.validation else ""
+        name = f"{fit.log.name} (validation)" if fit in found.validation else fit.log.name
         ends = f"mean square {fit.square:.3g} of its expected value"
         if fit.adjusted is not None:
             ends += f", for parameters {fit.moved:.2g} sigma from the estimates"
         if fit.white:
-            lines.append(f"the model explains {used}{fit.log.name}: its innovations are white, with {ends}")
+            lines.append(f"the model explains {name}: its innovations are white, with {ends}")
         else:
             largest = float(np.max(np.abs(fit.autocorrelation())))
             lines.append(
-                f"the model does NOT explain {used}{fit.log.name}: innovations with {ends} and an autocorrelation of "
+                f"the model does NOT explain {name}: innovations with {ends} and an autocorrelation of "
                 f"{largest:.2g} within {LAGS} readings; free more parameters, or add torque_walk to [identify]"
             )
         if fit.outliers:
-            lines.append(f"{fit.outliers} readings of {used}{fit.log.name} are outliers and were not used")
+            lines.append(f"{fit.outliers} readings of {name} are outliers and were not used")
     if not found.converged:
         lines.append("the search did NOT converge; its estimates are preliminary")
     return [*lines, *found.undetermined]

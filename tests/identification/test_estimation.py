@@ -57,13 +57,13 @@ def spoiled(frame, rng):
 def identified():
     rng = np.random.default_rng(5)
     frame, drift = flight(rng)
-    found = estimation.identify(satellite(), spoiled(frame, rng), validate=[flight(rng)[0]])
+    found = explore.identify(satellite(), spoiled(frame, rng), validate=[flight(rng)[0]])
     return found, drift
 
 
 def test_outliers_and_missing_samples_do_not_spoil_the_estimates(identified):
     found, drift = identified
-    assert found.good, results.verdict(found)
+    assert found.good, found.verdict
     assert np.all(np.abs(found.estimate - ENTRIES) < 3.5 * found.std)  # all of six within 3.5 sigma: 99.7 %
     assert np.all(found.std < 0.02 * 0.11)  # the start is 30 % off
     bias, std = found.gyro_bias()[0]
@@ -81,7 +81,7 @@ def test_a_log_that_was_not_used_is_predicted(identified):
 
 def test_the_identified_scenario_has_the_estimate_and_its_covariance(identified):
     found, _ = identified
-    again = scenario.from_tables(parsing.dump(results.identified(found)))  # as from identified.toml
+    again = scenario.from_tables(parsing.dump(found.identified_scenario))  # as from identified.toml
     ready = scenario.study(again)
     np.testing.assert_allclose(np.asarray(ready.parts.plant.inertia)[np.triu_indices(3)], found.estimate, rtol=1e-12)
     draw = jax.jit(jax.vmap(lambda trial: ready.dispersion.apply(ready.parts, 0, trial).plant.inertia))
@@ -101,6 +101,15 @@ def test_the_summary_is_complete(identified):
     assert summary["status"] == "identified"
     assert [row["parameter"] for row in summary["parameters"]] == found.problem.labels
     assert len(summary["logs"]) == len(summary["validation"]) == 1
+
+
+def test_a_notebook_shows_the_verdict_the_estimates_and_the_figures_of_each_log(identified):
+    found, _ = identified
+    assert all(line in found._repr_html_() for line in found.verdict)
+    assert all(label in repr(found) for label in found.problem.labels)
+    each = ("innovations", "autocorrelation", "prediction")
+    assert set(found.plot()) == {"estimates", *each, *(f"{name}_2" for name in each)}
+    assert list(found.plot("prediction_2")) == ["prediction_2"]
 
 
 def test_every_value_of_the_coordinates_is_the_inertia_of_a_body():
@@ -127,7 +136,7 @@ def test_wheel_speeds_replace_the_commanded_torque():
     frame, _ = flight(np.random.default_rng(4))
     table = {"wheel_speed": ["speed1", "speed2", "speed3"], "wheel_inertia": synthetic.SPIN_INERTIA}
     found = estimation.identify(satellite(telemetry=table), frame.drop("sent1", "sent2", "sent3"))
-    assert found.good, results.verdict(found)
+    assert found.good, found.verdict
     assert np.all(np.abs(found.estimate - ENTRIES) < 3.5 * found.std)
 
 
