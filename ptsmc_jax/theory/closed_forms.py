@@ -36,10 +36,9 @@ class ChainMotion(NamedTuple):
 def exact_error(t: Scalar, t_f: Scalar, eta: Scalar, error: Vector, error_rate: Vector) -> ExactError:
     """Return the motion of each component of the attitude error vector under the second-order law.
 
-        x(t) = r^eta (x(0) - s(0) ln r),  s(t) = s(0) r^eta,  s(0) = t_f x'(0) + eta x(0)
-
+        x(t) = r^eta (x(0) - s(0) ln r),  s(t) = s(0) r^eta,  s(0) = t_f x'(0) + eta x(0),  r = (t_f - t) / t_f
     Args:
-        t: time before the hand-over [s], below t_f.
+        t: time since the start of the run [s], in the approach phase (below t_f).
         t_f: prescribed time [s].
         eta: exponent of the law [-].
         error: x(0), attitude error vector at t = 0, (m,) [-].
@@ -61,7 +60,7 @@ def exact_chain(t: Scalar, t_f: Scalar, eta: Scalar, x0: Vector) -> ChainMotion:
     y = x_1 / tau^eta, n-1 times.
 
     Args:
-        t: time before the hand-over [s], below t_f.
+        t: time since the start of the run [s], in the approach phase (below t_f).
         t_f: prescribed time [s].
         eta: exponent of the law [-].
         x0: states at t = 0, (n,), in the states' own units.
@@ -86,10 +85,10 @@ def surface_at_start(t_f: Scalar, eta: Scalar, x: Vector) -> Scalar:
 
 
 def modes(t: Scalar, t_f: Scalar, eta: Scalar, x0: Vector) -> tuple[list[Scalar], list[Scalar]]:
-    """Return y, y', .. y^(n) of y = x_1 / r^eta as two parts: the free response and the response to s(0) = 1.
+    """Return the two parts of y, y', .. y^(n) for y = x_1 / r^eta: the free response and the response to s(0) = 1.
 
     Args:
-        t: time before the hand-over [s].
+        t: time since the start of the run [s], in the approach phase.
         t_f: prescribed time [s].
         eta: exponent of the law [-].
         x0: states at t = 0, (n,), in the states' own units.
@@ -125,11 +124,11 @@ def from_modes(t: Scalar, t_f: Scalar, eta: Scalar, y: list[Scalar], size=lambda
     """Return x_1, x_1', .. of x_1 = r^eta y by Leibniz's rule, as many as y has values.
 
     Args:
-        t: time before the hand-over [s].
+        t: time since the start of the run [s], in the approach phase.
         t_f: prescribed time [s].
         eta: exponent of the law [-].
         y: y, y', .. at t, see `modes`.
-        size: applied to each factor of y. With `abs`, bounds on y give bounds on x_1 and its derivatives.
+        size: function applied to each factor of y. With `abs`, bounds on y give bounds on x_1 and its derivatives.
     """
     r = (t_f - t) / t_f
     falling = [jnp.ones_like(eta)]

@@ -12,8 +12,8 @@ from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.theory import linear, lower_bound
 
 ROUNDS = 8  # Largest number of iterations of the statistical linearisation.
-BEYOND = 1e60  # Upper limit of the deviation of s, if the covariance overflows.
-FLAT = 1e30  # Width of a sign whose derivative is practically zero.
+BEYOND = 1e60  # Upper limit of 1 sigma of s, if the covariance overflows.
+FLAT = 1e30  # Thickness of a boundary layer in which the switching term is practically zero.
 _AT = np.linspace(-20.0, 20.0, 401)
 _SLOPE, _GAUSS = 1.0 / np.cosh(_AT) ** 2, np.exp(-(_AT**2) / 2.0)
 
@@ -28,11 +28,11 @@ class Noise(NamedTuple):
 
 
 def predicts(parts: Parts) -> bool:
-    """Return whether `noise` applies to these sampled parts, for noise of any size [-].
+    """Return whether `noise` applies to these sampled parts.
 
     It needs sensors with a linear model (`reading`) and a linear observer. It does not apply to implicit sampling.
-    There s reaches zero in one period if the noise is within the reach of the switching term, and rarely otherwise.
-    A linearisation about the noise-free run cannot tell which case prevails.
+    With implicit sampling, s reaches zero in one period if the switching term can compensate the noise of s, and
+    rarely otherwise. A linearisation about the noise-free run does not show which of the two cases occurs.
     """
     readable = hasattr(parts.sensors, "reading")
     return readable and parts.observer.linear and not getattr(parts.controller, "implicit", False)
@@ -43,14 +43,14 @@ def noise(parts: Parts) -> Noise:
 
     The parts must satisfy `predicts`. If there is an attitude filter, it starts with its steady-state covariance.
 
-    Statistical linearisation replaces the smooth sign in each period by its mean derivative under the noise of s,
+    Statistical linearisation replaces tanh(s / width) in each period by its mean derivative under the noise of s,
     E[sech^2(s / width)] / width. This derivative depends on the covariance and thus on the earlier periods. The
     function therefore iterates until the equivalent widths of two iterations agree to 1 %. After `ROUNDS` iterations
     it stops, and the result has `converged` = False.
     """
     run = linear.nominal_jit(parts)
     ticks = jax.tree.map(np.asarray, run.period.now)
-    lasting = np.flatnonzero(ticks.t_next - ticks.t > 1e-9 * float(parts.period))  # beyond rounding
+    lasting = np.flatnonzero(ticks.t_next - ticks.t > 1e-9 * float(parts.period))  # nonzero, apart from rounding
     ticks = jax.tree.map(lambda v: v[lasting], ticks)
     simulated = getattr(parts.controller, "sign_width", None)
     if simulated is None:
@@ -75,7 +75,7 @@ def noise(parts: Parts) -> Noise:
 
 
 class _Sign(NamedTuple):
-    """Loops that are linearised with equivalent widths of the smooth sign.
+    """Loops that are linearised with equivalent thicknesses of the boundary layer.
 
     `_covariance` interpolates the loops in 1/width. This is exact if s is zero in the noise-free run. Otherwise its
     error vanishes as the interpolated widths approach `widths`.
@@ -88,7 +88,7 @@ class _Sign(NamedTuple):
 
 
 def _mean_width(width: float, sigma: float) -> float:
-    """Return the equivalent width: 1 / E[sech^2(s / width) / width] for Gaussian s with deviation sigma."""
+    """Return the equivalent width 1 / E[sech^2(s / width) / width] for Gaussian s with standard deviation sigma."""
     if sigma == 0.0:
         return width
     ratio = width / sigma
@@ -100,7 +100,7 @@ def _mean_width(width: float, sigma: float) -> float:
 
 
 class _Rows(NamedTuple):
-    """Linear map from the propagated state and the noise of one sample to an output, or such maps of all periods."""
+    """Linear map from the propagated state and the noise of one sample to an output, for one or for all periods."""
 
     state: np.ndarray  # (rows, size).
     noise: np.ndarray  # (rows, readings), multiplied by 1 sigma.
@@ -154,7 +154,7 @@ class _State:
         return factor @ factor.T
 
     def rows(self, by_z: Any, by_seen: Any) -> _Rows:
-        """Return the linear map from the state of the covariance to an output, given the output's derivatives (NumPy).
+        """Return the linear map from the propagated state to an output, given the output's derivatives as NumPy arrays.
 
         Args:
             by_z: derivatives by z, (rows, n) or (periods, rows, n).
@@ -194,7 +194,7 @@ def _covariance(parts: Parts, ticks: Any, opened: linear.Opened, sign: _Sign | N
     state = _State(parts, ticks, opened)
     p, sliding = state.start(), state.rows(opened.s_command, opened.s_direct)
     command, moved = state.moved(opened.loop)
-    sloped = (None, None) if sign is None else state.moved(sign.loops)
+    with_sign = (None, None) if sign is None else state.moved(sign.loops)
     # columns of `squares`: error at the start of a period, error in its middle, mean square of the components of s
     squares, torque, widths = np.zeros((len(lengths) + 1, 3)), 0.0, np.zeros(len(lengths))
 
@@ -208,9 +208,9 @@ def _covariance(parts: Parts, ticks: Any, opened: linear.Opened, sign: _Sign | N
         if sign is not None:
             widths[j] = _mean_width(sign.simulated, min(float(np.sqrt(squares[j, 2])) / sign.units[j], BEYOND))
             fraction = sign.widths[j] / widths[j] if widths[j] > 0.0 else 1.0
-        commanded = command.at(j, sloped[0], fraction).covariance(p)
+        commanded = command.at(j, with_sign[0], fraction).covariance(p)
         torque = max(torque, float(np.sqrt(np.diag(commanded).max())))
-        later = moved.at(j, sloped[1], fraction)
+        later = moved.at(j, with_sign[1], fraction)
         p = p + np.diag((state.walk * length) ** 2)
         squares[j, 1] = np.trace(_middle(opened, j, float(length), later, state.plant).covariance(p))
         p = later.covariance(p) + np.diag((state.drift * length) ** 2)

@@ -17,8 +17,8 @@ LOWEST, POINTS = 1e-6, 240  # Lowest grid frequency as a fraction of the Nyquist
 AROUND = np.array([-3.0, -1.0, -0.3, 0.3, 1.0, 3.0])  # Offsets of grid points from a pole, in units of its damping.
 NEAREST = 3  # Crossings of each kind that are refined.
 SPLIT = (2 * NEAREST, 3 * NEAREST)  # Indices that split the crossings: L real, |L| = 1, L nearest to -1.
-REAL = 1e-2  # Largest |Im L / Re L| that counts as real, at the ends of the grid.
-EVEN = 1e-6  # Relative difference of |L| that counts as none, for grid points that coincide.
+REAL = 1e-2  # L counts as real at an end of the grid if |Im L / Re L| is smaller.
+EVEN = 1e-6  # Relative differences of |L| below this count as zero, for grid points that coincide.
 CHUNK = 64  # Grid points in one evaluation of L, few enough for the processor's cache.
 MOST = 100.0  # dB. Larger gain margins count as infinite; peak sensitivity reported for an unstable loop.
 
@@ -47,7 +47,7 @@ def grid(poles: Complex[Array, "loops n"], h: Any) -> Float[Array, " points"]:
 
 
 class Triangles(NamedTuple):
-    """An opened loop in Schur coordinates, for cheap evaluation at many points. Gradients are stopped."""
+    """State space of an opened loop in Schur coordinates, for fast evaluation at many z. Gradients are stopped."""
 
     opening: Opening  # With a triangular A.
     axes: Array  # (n, n) unitary, with the Schur vectors as columns.
@@ -88,14 +88,19 @@ def triangle(a: ArrayLike) -> tuple[Array, Array]:
 
 
 def in_triangles(opening: Opening, known: tuple[Array, Array] | None = None) -> Triangles:
-    """Return the opened loop L [-] in Schur coordinates; known: the `triangle` of its A, if available."""
+    """Transform the state space of an opened loop L [-] to Schur coordinates, where A is triangular.
+
+    Args:
+        opening: the opened loop.
+        known: result of `triangle` for its A, or None to compute it.
+    """
     fixed = jax.lax.stop_gradient(opening)
     a, axes = known or triangle(fixed.a)
     return Triangles(Opening(a, jnp.conj(axes.T) @ fixed.b, fixed.c @ axes), axes)
 
 
 def response(opening: Opening, quick: Triangles, z: Complex[Array, " points"]) -> tuple[Array, Array]:
-    """Return L [-] at many z, differentiable by the loop, and its derivative by z, (points, m, m) each.
+    """Return L [-] at many z and its derivative by z, (points, m, m) each. L has gradients by `opening`.
 
     L = Y (z X - A X - B) - C X with X and Y of `Triangles.halves`, whose gradients are stopped. The bracket is zero for
     an exact X. Rounding errors of X and Y, and their dependence on the loop, therefore enter in second order only.
@@ -146,19 +151,24 @@ class Brackets(NamedTuple):
 
     low: Array  # [rad/s] Lower end.
     high: Array  # [rad/s] Upper end.
-    at_low: Array  # Function with a zero in the interval, at its lower end: `sine`, ln |L|, d|1 + L|^2/dw.
-    at_high: Array  # The same at the upper end.
+    at_low: Array  # Value at the lower end of the function with a zero in the interval: `sine`, ln |L|, d|1 + L|^2/dw.
+    at_high: Array  # Value of this function at the upper end.
     there: Array  # bool
     elsewhere: Array  # [rad/s] Further frequencies to evaluate: the grid point with L nearest to -1, and both ends.
 
 
-def brackets(w: Array, seen: Array) -> Brackets:
-    """Return the `Brackets` of an L [-] at frequencies w [rad/s], (points,) each."""
-    turned, size, near = sine(seen), jnp.log(jnp.abs(seen)), jnp.abs(1.0 + seen) ** 2
-    real, factor = real_at(seen)
+def brackets(w: Array, L: Array) -> Brackets:
+    """Return the grid intervals that contain crossings of one axis.
+
+    Args:
+        w: grid frequencies (points,) [rad/s], ascending.
+        L: values of L at these frequencies (points,) [-].
+    """
+    turned, size, near = sine(L), jnp.log(jnp.abs(L)), jnp.abs(1.0 + L) ** 2
+    real, factor = real_at(L)
     # the tolerance of 0.1 keeps crossings near -1, because refinement may move them to the other side of -1
     more, less = (jnp.where(real & (side * factor > -0.1), side * factor, jnp.inf) for side in (1.0, -1.0))
-    even, phase = unit_gain_at(seen)
+    even, phase = unit_gain_at(L)
     least = (near[1:-1] <= near[:-2]) & (near[1:-1] <= near[2:])
     nearest = jnp.append(jnp.inf, jnp.where(least, near[1:-1], jnp.inf))
     how_far = (more, less, jnp.where(even, jnp.abs(phase), jnp.inf), nearest)
@@ -196,52 +206,52 @@ def smallest(values: Array, count: int = NEAREST) -> tuple[Array, Array]:
     return jnp.stack(least), jnp.stack(places)
 
 
-def real_at(seen: Array) -> tuple[Array, Array]:
-    """Return the intervals in which L [-] crosses the negative real axis, bool, and ln of the gain that makes it -1.
+def real_at(L: Array) -> tuple[Array, Array]:
+    """Return which intervals have a crossing of the negative real axis by L [-], and ln of the gain that makes L = -1.
 
     Crossings that need a gain change of more than `MOST` are ignored, because such a large L is rounding near poles
     at 1. Sign changes of Im L at a pole on the unit circle, where L is infinite, are ignored as well.
     """
-    real, imag = seen.real, seen.imag
+    real, imag = L.real, L.imag
     fraction = imag[:-1] / jnp.where(imag[:-1] == imag[1:], 1.0, imag[:-1] - imag[1:])
     crossing = real[:-1] + fraction * (real[1:] - real[:-1])
     limit = 10.0 ** (MOST / 20.0)
-    there = (imag[:-1] * imag[1:] < 0.0) & (crossing < -1.0 / limit) & (crossing > -limit) & ~_through_infinity(seen)
+    there = (imag[:-1] * imag[1:] < 0.0) & (crossing < -1.0 / limit) & (crossing > -limit) & ~_through_infinity(L)
     return there, -jnp.log(jnp.where(there, -crossing, 1.0))
 
 
-def _through_infinity(seen: Array) -> Array:
-    """Return the intervals with a pole on the unit circle, (points - 1,) bool.
+def _through_infinity(L: Array) -> Array:
+    """Return which intervals have a pole on the unit circle, (points - 1,) bool.
 
     There |L| grows toward the interval from both sides, and the phase of L jumps by more than 90 deg.
     """
-    size = jnp.abs(seen)
+    size = jnp.abs(L)
     grows, falls = size[1:-1] >= (1.0 - EVEN) * size[:-2], size[1:-1] >= (1.0 - EVEN) * size[2:]
-    back = (seen[1:] * jnp.conj(seen[:-1])).real < 0.0
+    back = (L[1:] * jnp.conj(L[:-1])).real < 0.0
     return back & jnp.append(True, grows) & jnp.append(falls, True)
 
 
-def unit_gain_at(seen: Array) -> tuple[Array, Array]:
-    """Return the intervals in which |L| crosses 1, bool, and the phase from -1 to L there, in (-pi, pi] [rad]."""
-    there, fraction = _unit_gain_crossings(seen)
-    turned = jnp.angle(seen[1:] / seen[:-1])
-    return there, jnp.angle(-seen[:-1] * jnp.exp(1j * fraction * turned))
+def unit_gain_at(L: Array) -> tuple[Array, Array]:
+    """Return which intervals have a crossing of |L| = 1, and the angle from -1 to L there, in (-pi, pi] [rad]."""
+    there, fraction = _unit_gain_crossings(L)
+    turned = jnp.angle(L[1:] / L[:-1])
+    return there, jnp.angle(-L[:-1] * jnp.exp(1j * fraction * turned))
 
 
-def _unit_gain_crossings(seen: Array) -> tuple[Array, Array]:
-    """Return the intervals in which |L| crosses 1, and the fraction of the interval, by interpolation of ln |L|."""
-    size = jnp.log(jnp.abs(seen))
+def _unit_gain_crossings(L: Array) -> tuple[Array, Array]:
+    """Return which intervals have a crossing of |L| = 1, and its place as a fraction, by interpolation of ln |L|."""
+    size = jnp.log(jnp.abs(L))
     there = size[:-1] * size[1:] < 0.0
     return there, size[:-1] / jnp.where(there, size[:-1] - size[1:], 1.0)
 
 
-def delay_at(w: Array, seen: Array) -> tuple[Array, Array]:
+def delay_at(w: Array, L: Array) -> tuple[Array, Array]:
     """Return delays [s] that rotate L to -1 if |L| crosses 1 in an interval, else infinity, (points - 1,).
 
     The second result is the frequency of each crossing [rad/s].
     """
-    there, left = unit_gain_at(seen)
-    at = w[:-1] * (w[1:] / w[:-1]) ** jnp.where(there, _unit_gain_crossings(seen)[1], 0.0)
+    there, left = unit_gain_at(L)
+    at = w[:-1] * (w[1:] / w[:-1]) ** jnp.where(there, _unit_gain_crossings(L)[1], 0.0)
     return jnp.where(there, jnp.where(left < 0.0, left + 2.0 * jnp.pi, left) / at, jnp.inf), at
 
 
@@ -286,23 +296,23 @@ def ends_at(ends: Array) -> Array:
     return jnp.abs(ends.imag) < REAL * jnp.abs(ends.real)
 
 
-def margins_on_grid(seen: Complex[Array, " points"]) -> tuple[Array, Array, Array]:
+def margins_on_grid(L: Complex[Array, " points"]) -> tuple[Array, Array, Array]:
     """Return gain margin [dB] (infinite if there is none), phase margin [deg] and peak sensitivity [dB] of a grid.
 
     The function interpolates between grid points: crossings in ln L, the distance to -1 along straight lines.
     """
-    there, _ = real_at(seen)
-    size, angle = jnp.log(jnp.abs(seen)), jnp.angle(-seen)
+    there, _ = real_at(L)
+    size, angle = jnp.log(jnp.abs(L)), jnp.angle(-L)
     apart = angle[:-1] - angle[1:]
     factor = -size[:-1] + angle[:-1] / jnp.where(there, apart, 1.0) * (size[:-1] - size[1:])
-    ends = seen[jnp.array([0, -1])]
+    ends = L[jnp.array([0, -1])]
     real = ends_at(ends) & (ends.real < 0.0)
     factors = jnp.append(factor, -jnp.log(jnp.where(real, -ends.real, 1.0)))
     gain = jnp.min(jnp.where(jnp.append(there, real) & (factors != 0.0), jnp.abs(factors), jnp.inf))
-    even, left = unit_gain_at(seen)
+    even, left = unit_gain_at(L)
     phase = jnp.min(jnp.where(even, jnp.abs(left), jnp.pi))
-    step = seen[1:] - seen[:-1]
+    step = L[1:] - L[:-1]
     size = jnp.maximum(jnp.abs(step) ** 2, 1e-300)
-    along = jnp.clip(-(jnp.conj(step) * (1.0 + seen[:-1])).real / size, 0.0, 1.0)
-    near = jnp.min(jnp.abs(1.0 + seen[:-1] + along * step))
+    along = jnp.clip(-(jnp.conj(step) * (1.0 + L[:-1])).real / size, 0.0, 1.0)
+    near = jnp.min(jnp.abs(1.0 + L[:-1] + along * step))
     return 20.0 / np.log(10.0) * gain, jnp.rad2deg(phase), -20.0 * jnp.log10(near)

@@ -20,7 +20,7 @@ from ptsmc_jax.theory.solutions import starts, state_envelope, visited
 
 Vector = Float[Array, " n"]
 
-GIVEN_AWAY = 0.2785  # max of x (1 - tanh x): loss of the smooth sign per component, in units of its width
+GIVEN_AWAY = 0.2785  # max of x (1 - tanh x): loss of tanh(s / width) against sign(s) per component, in units of width
 
 
 def sliding_envelope(parts: Parts) -> tuple[float, float]:
@@ -56,7 +56,7 @@ def _switching_rates(parts: Parts) -> tuple[Scalar, Scalar]:
 
 
 def narrowest_sign(parts: Parts, period: float) -> float:
-    """Return the width below which a sampled smooth sign overshoots, in the units of s after the hand-over.
+    """Return the boundary layer thickness below which the sampled s overshoots, in the units of s in the hold phase.
 
     The switching term alone gives s' = -c tanh(s / width), with c = tau^(n-1) times `switching_rate`, held for a period
     h. If width = c h, s reaches 0 in one period from inside the boundary layer. If width < c h / 2, the sign of s
@@ -72,7 +72,7 @@ def narrowest_sign(parts: Parts, period: float) -> float:
 
 
 def sliding_bound(parts: Parts, t: ArrayLike) -> np.ndarray:
-    """Return the bound on |s|_2 of `sliding_envelope` at times t (time,) [s] before the hand-over."""
+    """Return the bound on |s|_2 of `sliding_envelope` at times t (time,) [s] in the approach phase."""
     law, n = parts.controller, parts.controller.order
     s0, residual = sliding_envelope(parts)
     tau = np.maximum(float(law.t_f) - np.asarray(t), 0.0)
@@ -81,7 +81,7 @@ def sliding_bound(parts: Parts, t: ArrayLike) -> np.ndarray:
 
 
 def error_bound(parts: Parts, t: ArrayLike) -> np.ndarray:
-    """Return a bound on the error at times t (time,) [s] before the hand-over.
+    """Return a bound on the error at times t (time,) [s] in the approach phase.
 
     The error is |v|_2 of the attitude error vector v, or |x_1| of a chain.
     """

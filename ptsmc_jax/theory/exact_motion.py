@@ -27,15 +27,15 @@ class Motion(NamedTuple):
 
     x: Any  # state
     w_dot: Array  # (m,) derivative of the velocity
-    singularity_distance: Array  # distance to the singularity, positive before it is reached
+    singularity_distance: Array  # distance to the singularity, positive until the motion reaches the singularity
 
 
 def exact(law: PrescribedTimeLaw, t: Scalar, start: Float[Array, "m n"]) -> tuple[Vector, Vector]:
-    """Return the error and s, (m,) each, of the exact motion at t [s] before the hand-over.
+    """Return the error and s, (m,) each, of the exact motion at time t [s] in the approach phase.
 
     Args:
         law: the prescribed-time law.
-        t: time before the hand-over [s].
+        t: time since the start of the run [s], in the approach phase.
         start: each component of the error and its derivatives at t = 0, (m, n), see `Kinematics.derivatives`.
     """
     if isinstance(law, PrescribedTimeChain):
@@ -50,7 +50,7 @@ def exact_motion(law: PrescribedTimeLaw, t: Scalar, target: Any, start: Any, err
 
     Args:
         law: the prescribed-time law.
-        t: time before the hand-over [s].
+        t: time since the start of the run [s], in the approach phase.
         target: the reference at t.
         start: the initial state.
         errors: each component of the error and its derivatives at t = 0, (m, n).
@@ -69,7 +69,7 @@ def plant_motion(kinematics: Kinematics, target: Any, start: Any, errors: Errors
     Args:
         kinematics: error kinematics, which select the implementation.
         target: the reference.
-        start: the initial state, which chooses the branch if there are several.
+        start: the initial state, near which the solution is selected if several states have this error.
         errors: eps, eps' [1/s] and eps'' [1/s^2], (m,) each.
 
     Raises:

@@ -124,12 +124,12 @@ def _handed(parts: Parts, s0: Scalar, residual_before: Scalar, limit: Scalar) ->
 def _error_bound(parts: Parts, known: _HandOver, lags: Vector, t: Array) -> Array:
     law, n = parts.controller, parts.controller.order
     surface, rate = law.surface(), law.reaching_rate
-    on_it = jnp.eye(n, n - 1).at[-1].set(-surface)  # states with s = 0, where x_n follows from the others
-    off_it = jnp.eye(n)[-1]  # the state with s = 1 and all other states 0
+    on_surface = jnp.eye(n, n - 1).at[-1].set(-surface)  # basis (columns) of the states with s = 0
+    off_surface = jnp.eye(n)[-1]  # the state with s = 1 and all other states 0
 
     def size(after: Scalar) -> Scalar:
-        slid = integrators.phi_functions(hold_matrix(surface, rate) * after, 0)[0][0] @ on_it
-        falling, staying = (exact_hold(after, lags, k, off_it).x[0] for k in (rate, jnp.zeros_like(rate)))
+        slid = integrators.phi_functions(hold_matrix(surface, rate) * after, 0)[0][0] @ on_surface
+        falling, staying = (exact_hold(after, lags, k, off_surface).x[0] for k in (rate, jnp.zeros_like(rate)))
         each = jnp.abs(known.centre[:, :-1] @ slid) + known.half[:, :-1] @ jnp.abs(slid)
         return guards.norm(each + known.s * falling + known.limit * staying)
 

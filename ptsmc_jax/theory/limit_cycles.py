@@ -8,7 +8,7 @@ derivative of the saturated sign is zero at every sample.
 noise and disturbance. Three criteria exclude other motions:
 
 - A run that converges gets slower.
-- A reference or a disturbance turns back less often than once in `SLOWEST` samples.
+- A reference or a disturbance reverses less often than once in `SLOWEST` samples.
 - The linearisation explains a linear oscillation, such as a flexible mode.
 
 The third criterion compares the command u at the seen state x with the command at the state x_0 of zero error, all else
@@ -31,13 +31,13 @@ from ptsmc_jax.theory.crossings import MOST
 
 FEWEST = 16  # Smallest number of full hold periods for a decision.
 TURNS, SLOWEST = 4, 40  # Smallest number of reversals of the command, and largest number of samples between them.
-STAYS = 0.75  # Smallest ratio of the activity in the second half of the examined periods to that in the first half.
-BEYOND = 0.1  # Smallest fraction of a limit cycle that the linearised loop does not explain.
+STAYS = 0.75  # Smallest ratio of the command's variation in the second half of the examined periods to the first half.
+BEYOND = 0.1  # Smallest nonlinear fraction of a limit cycle: residual relative to the change of the command.
 ROUNDING = 1e-8  # Rounding error, relative to the largest command.
 
 
 class History(NamedTuple):
-    """Commands of a nominal run."""
+    """Commands of a nominal run in each control period."""
 
     command: Array  # (periods, m) [N m]
     in_hold: Array  # (periods,) bool: full periods in the hold phase
@@ -49,7 +49,7 @@ def history(parts: Parts, run: linear.Nominal) -> History:
 
 
 class LimitCycle(NamedTuple):
-    """Limit cycle of the command, on its worst axis."""
+    """Limit cycle of the command, on the axis with the largest amplitude."""
 
     size: float  # peak-to-peak amplitude of the command [N m]
     periods: float  # period of the limit cycle in control periods
@@ -109,7 +109,7 @@ def _reversals(values: np.ndarray, least: Any) -> np.ndarray:
 
 
 def _oscillates(values: np.ndarray, least: Any) -> np.ndarray:
-    """Return which columns of values (times, m) change their sign often enough, (m,)."""
+    """Return which columns of values (times, m) change their sign often enough to be a limit cycle, (m,) bool."""
     least = np.broadcast_to(least, values.shape[1])
     turns = [np.count_nonzero(_reversals(v, low)) for v, low in zip(values.T, least, strict=True)]
     return np.asarray(turns) >= max(TURNS, values.shape[0] / SLOWEST)
@@ -140,15 +140,20 @@ def _unexplained(parts: Parts, run: linear.Nominal) -> tuple[Array, Array]:
         zero = jnp.zeros(model.local_coordinates(seen, seen).size)
         # LAPACK, because `matrices.solve` of six equations takes longer to compile than everything else here
         way = -jnp.linalg.solve(jax.jacfwd(error)(zero), error(zero))
-        here, sloped = jax.jvp(commanded, (zero,), (way,))
-        whole = commanded(way) - here
-        return whole - sloped, whole
+        here, linear_change = jax.jvp(commanded, (zero,), (way,))
+        change = commanded(way) - here
+        return change - linear_change, change
 
     return lapack.vmap(one)(run.period, run.carry.computer, run.after.computer.seen)
 
 
 def none_left(margins: Any, rows: Any) -> Any:
-    """Return the `Margins` of loops (times, m) with zero margins in the marked rows (times,), except negative ones."""
+    """Set the margins of the marked rows to zero, because of a limit cycle. Negative margins do not change.
+
+    Args:
+        margins: `Margins` of loops, (times, m).
+        rows: which rows to change, bool (times,).
+    """
     values = jax.tree.map(np.asarray, margins)
     lost = np.asarray(rows)[:, None] & values.stable
     none = dict.fromkeys(values._fields, 0.0) | {"peak_sensitivity": MOST, "stable": False, "crossover": np.nan}

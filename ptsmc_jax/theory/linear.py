@@ -44,15 +44,15 @@ _WEIGHTS = np.where(np.isin(np.arange(13), (0, 12)), 0.5, 1.0) * (-1.0) ** np.ar
 @pytree
 @dataclass(frozen=True)
 class Loop:
-    """One period of the opened loop, as the module describes: z (n,), u (m,). The first k of z are x_seen."""
+    """One period of the opened loop, with the equations of the module: z (n,), u (m,). The first k of z are x_seen."""
 
-    a: Leaf  # (n, n) A
-    seen: Leaf  # (n, k) B
-    new: Leaf  # (nodes, n, m) N, for `part` at each of NODES; only for the first of them with `opened(late=False)`
-    old: Leaf  # (nodes, n, m) O
-    command: Leaf  # (m, n) C
-    direct: Leaf  # (m, k) D
-    disturbed: Leaf  # (n, m) E
+    a: Leaf  # (n, n) A, derivative of z' by z
+    seen: Leaf  # (n, k) B, derivative of z' by x_seen
+    new: Leaf  # (nodes, n, m) N, derivative of z' by u_new, for `part` at each of NODES; `opened(late=False)`: part 0
+    old: Leaf  # (nodes, n, m) O, derivative of z' by u_old, for the same values of `part`
+    command: Leaf  # (m, n) C, derivative of u by z
+    direct: Leaf  # (m, k) D, derivative of u by x_seen
+    disturbed: Leaf  # (n, m) E, derivative of z' by d
     period: Leaf  # h [s]
     delay: int = field(metadata={"static": True})  # delay of the actuators in whole periods
 
@@ -105,7 +105,7 @@ nominal_jit = programs.jit(nominal, compiler_options=programs.QUICKLY)
 def _computed(
     parts: Parts, k2: Any, period: Period, carry: Carry, seen: Any
 ) -> tuple[Decision, Computer, ActuatorState]:
-    """Return the decision of the flight software, its memory, and the actuator state in its own model.
+    """Return the decision of the flight software, its memory, and the state of its actuator model.
 
     Args:
         parts: the scenario.
@@ -162,7 +162,7 @@ class Opened(NamedTuple):
 
     loop: Loop
     error: Array  # (m, x) Derivative of the error by the plant's local coordinates.
-    error_rate: Array  # (m, x) Derivative of the error's rate by the same.
+    error_rate: Array  # (m, x) Derivative of the error's rate by the same coordinates.
     s_command: Array  # (components, n) Derivative of s by z.
     s_direct: Array  # (components, k) Derivative of s by x_seen.
 
@@ -214,10 +214,10 @@ def opened(parts: Parts, during: Nominal, *, late: bool = True) -> Opened:
 
 
 def _whole(period: Period) -> Period:
-    """Return the period; if it is a full one, its length [s] and derivatives become those of the clock's period.
+    """Return the period; a full period gets exactly the length of the clock's period [s], with its derivatives.
 
-    Otherwise the last full period could end at t_end. Its length would then have a wrong derivative by delta, because
-    the sample before it depends on delta and t_end does not.
+    Without this, the length of the last full period could have a wrong derivative by delta: its sample depends on
+    delta, but its end t_end does not.
     """
     now, length = period.now, period.full_length
     ends = jnp.where(is_full(now, length), now.t + length, now.t_next)
@@ -232,13 +232,13 @@ def opened_in(
 ) -> Opened:
     """Linearise and open the loop in several periods, h in [s]; the first axis of the result is the period.
 
-    One compiled program serves any number of periods.
+    The same compiled program is used for any number of periods.
 
     Args:
         parts: the scenario.
         run: the nominal run.
         indices: numbers of the periods (periods,).
-        widths: width of the law's smooth sign in each period (periods,), or None for the law's own width.
+        widths: thickness of the law's boundary layer in each period (periods,), or None for the law's `sign_width`.
         late: see `opened`.
     """
     parts = replace(parts, clock=clock.flight(1.0, 1.0))
@@ -277,7 +277,7 @@ def loops_in(parts: Parts, run: Nominal, indices: np.ndarray) -> Loop:
 
 
 def loops_at(parts: Parts, run: Nominal, indices: Array, *, late: bool = True) -> Loop:
-    """Return the loops of `loops_in`, h in [s], for indices that may be traced by JAX transformations.
+    """Return the loops of `loops_in`, h in [s], inside a JAX transformation: the indices may be tracers.
 
     Args:
         parts: the scenario.

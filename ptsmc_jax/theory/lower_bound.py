@@ -39,7 +39,7 @@ from ptsmc_jax.simulation.control_period import PeriodMotion, star_state
 from ptsmc_jax.simulation.interval import Criteria, integral_in_window
 from ptsmc_jax.simulation.rollout import Log, Parts
 
-UNKNOWN = 1e5  # Initial 1 sigma of an unknown state, relative to its sensor's, so that the first sample outweighs it.
+UNKNOWN = 1e5  # Initial 1 sigma of an unknown state, relative to 1 sigma of its sensor: the first sample outweighs it.
 EXACT = 1e-10  # 1 sigma of a sensor without noise, relative to the largest deviation of its reading so far.
 
 
@@ -95,7 +95,7 @@ def along_each(runs: Sequence[tuple[Parts, Log]]) -> list[LowerBound]:
 
 
 def _together(models: Sequence[Model]) -> Model:
-    """Return the models of several runs as one model."""
+    """Stack the models of several runs along an axis of the runs, see `Model`."""
     start, *others = zip(*models, strict=True)
     return Model(np.stack(start), *(np.stack(some, axis=1) for some in others))
 
@@ -121,7 +121,7 @@ def pooled(bounds: Iterable[LowerBound]) -> float | None:
 
 
 def _lasting(parts: Parts, log: Log) -> tuple[Any, Any]:
-    """Return the `Ticks` of nonzero length (beyond rounding), and the `Log` at their starts and at t_end, in NumPy.
+    """Return the control periods of nonzero length, and the `Log` at their starts and at t_end, as NumPy arrays.
 
     The ticks begin and end at the actual sample times, which may differ from the nominal times.
     """
@@ -140,7 +140,7 @@ def _ticks(clock: Any, t_f: Array, delta: Array) -> Ticks:
 
 
 def _unknown(model: Model, delay: int) -> np.ndarray:
-    """Return `deviations`, with 0 for those that only result from the small noise `EXACT` of noise-free sensors."""
+    """Return `deviations`, but 0 for a deviation that results only from the small noise `EXACT` of exact sensors."""
     sizes = deviations(model, delay)
     if np.all(model.noise > 0.0):
         return sizes
@@ -149,7 +149,7 @@ def _unknown(model: Model, delay: int) -> np.ndarray:
 
 
 def deviations(model: Model, delay: int = 0, exact: float = EXACT) -> np.ndarray:
-    """Return 1 sigma of each output (periods, .., outputs), given all samples up to `delay` periods before.
+    """Return 1 sigma of each output (periods, .., outputs), given the samples up to `delay` periods earlier.
 
     The function propagates factors S of P = S S' by orthogonal transformations (Kaminski, Bryson, Schmidt, IEEE TAC
     16(6), 1971). It subtracts and inverts nothing, so that the noise levels may differ by many orders of magnitude.
@@ -244,8 +244,8 @@ def _model(parts: Parts, log: Log, ticks: Ticks) -> Model:
     drift = np.diag(np.concatenate([np.zeros(n), reading.own_drift, walk_of(parts), np.zeros(len(places))]))
     move = np.tile(np.eye(size), (periods, 1, 1))
     move[:, :n, :n], move[:, :n, torque] = linear.move, linear.push
-    output = np.zeros((periods, linear.seen.shape[1], size))
-    output[:, :, :n], output[:, :, torque] = linear.seen, linear.seen_push
+    output = np.zeros((periods, linear.error.shape[1], size))
+    output[:, :, :n], output[:, :, torque] = linear.error, linear.error_push
     # a reading that is used at a later sample is stored in extra states, which form a shift register
     rows = now.copy()
     for (k, number), place in places.items():
@@ -271,9 +271,10 @@ def _places(lag: np.ndarray, early: np.ndarray, first: int) -> dict[tuple[int, i
     """Return the index of each state that stores a delayed reading, by (reading, position in its shift register).
 
     Args:
-        lag: whole control samples between a reading, or the sample after it, and its use, (periods, readings).
+        lag: number of control periods between a reading and its use, (periods, readings). A reading between two
+            samples counts from the later sample.
         early: whether readings are taken between control samples (readings,).
-        first: index of the first such state.
+        first: index of the first state that stores a reading.
     """
     numbers = np.max(lag, axis=0) + early
     waiting = [(k, number) for k, depth in enumerate(numbers) for number in range(1, depth + 1)]
@@ -294,25 +295,27 @@ def reading_of(sensors: Any, size: int, ticks: Ticks) -> Reading:
 
 
 def walk_of(parts: Parts) -> np.ndarray:
-    """Return 1 sigma of the change of the random-walk torque per second, (m,) [N m/s]; zero without a random walk."""
+    """Return the intensity r of the random-walk torque, (m,) [N m/s], or zeros without a random walk.
+
+    At the start of a period of length h the torque changes by a Gaussian step with 1 sigma r h.
+    """
     return np.zeros(parts.plant.inputs) if parts.walk_rate is None else np.asarray(parts.walk_rate)
 
 
 class _Linear(NamedTuple):
-    """Derivatives by the plant's local coordinates z at the start of a period and by a torque p held through it.
+    """Jacobians of each control period with respect to the initial state and to a constant torque.
 
-    `seen` is the error at the start, in the middle and at the end. The middle is interpolated as in `window_error`.
-    `early` is the state that sensors see at the times of `star_state`; a sensor suite has its readings there instead.
-    `now` has all readings of a sensor suite, assuming that they are taken at the start of the period.
+    z (n,) are the plant's local coordinates at the start of the period. p (m,) is a torque on the plant that is
+    constant in the period [N m].
     """
 
-    move: Array  # (periods, n, n) Derivative of the state at the end by z.
-    push: Array  # (periods, n, m) Derivative of the state at the end by p.
-    seen: Array  # (periods, 3 m, n) Derivative of the error by z.
-    seen_push: Array  # (periods, 3 m, m) Derivative of the error by p.
-    early: Array  # (periods, k, n) Derivative of the sensed state by z; no rows without readings between samples.
-    early_push: Array  # (periods, k, m) Derivative of the sensed state by p.
-    now: Array  # (periods, readings, n) Derivative of the readings by z; no rows without a sensor suite.
+    move: Array  # (periods, n, n) State at the end by z.
+    push: Array  # (periods, n, m) State at the end by p.
+    error: Array  # (periods, 3 m, n) Error at the start, in the middle (interpolated) and at the end by z.
+    error_push: Array  # (periods, 3 m, m) The same errors by p.
+    early: Array  # (periods, k, n) Measured quantities at sample times within the period by z; k = 0 without them.
+    early_push: Array  # (periods, k, m) The same quantities by p.
+    now: Array  # (periods, readings, n) Readings of a sensor suite at the start of the period by z; else no rows.
 
 
 @programs.jit(compiler_options=programs.QUICKLY)
@@ -355,7 +358,7 @@ def _linear(parts: Parts, log: Log, ticks: Ticks) -> _Linear:
 
         still = jnp.zeros_like(plant.local_coordinates(x, x))
         by = jax.jacfwd(simulated, argnums=(0, 1))(still, jnp.zeros(plant.inputs))
-        (move, push), (seen, seen_push), (early, early_push), (now, _) = by
-        return _Linear(move, push, seen, seen_push, early, early_push, now)
+        (move, push), (error, error_push), (early, early_push), (now, _) = by
+        return _Linear(move, push, error, error_push, early, early_push, now)
 
     return lapack.vmap(period)(ticks, before, after, drives, log.disturbance[:-1])

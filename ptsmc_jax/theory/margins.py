@@ -26,7 +26,7 @@ NEUTRAL = 1e-6  # Tolerance of the unit circle, because rounding moves the poles
 NEAREST = 3  # Crossings |L| = 1 that start a search for the delay margin, those with the smallest estimates.
 LOOKED, PARTS = 8, 16  # Range of the grid search for the delay margin in periods, and its steps per period.
 NEAR = 6  # Results of the grid search that start a search for the delay margin.
-PAIR = 2  # Loops in one call of the compiled program, because a cell of a map has two.
+PAIR = 2  # Loops in one call of the compiled program: each point of a margin map has two.
 STARTS, FARTHER = 8, 0.15  # Largest number of Newton starts for a delay, and the distance between them in periods.
 
 
@@ -79,7 +79,11 @@ def of_each(loops: Loop, sensors: bool = False, with_delay: bool = True) -> Marg
 
 
 def in_turn(loops: Loop) -> Margins:
-    """Return the margins of several loops in NumPy; the first axis is the loop. One program serves any number."""
+    """Return the margins of several loops as NumPy arrays; the first axis is the loop.
+
+    The function calls the same compiled program for `PAIR` loops at a time, so that it is not compiled for each number
+    of loops.
+    """
     count = np.shape(loops.period)[0]
 
     def call(k: int) -> Margins:
@@ -101,15 +105,15 @@ class _Spectrum(NamedTuple):
     w: Array  # (points,) [rad/s]
     each: Array  # (m, points) L of each axis, with stopped gradients.
 
-    def at(self, w: Array, *, sloped: bool) -> tuple[Array, Array]:
+    def at(self, w: Array, *, by_loop: bool) -> tuple[Array, Array]:
         """Return L of each axis and its derivative by w, at frequencies w (m, places) [rad/s] of each axis.
 
-        sloped: whether L is differentiable by the loop.
+        by_loop: whether L has gradients by the loop.
         """
         m, places = w.shape
         z = jnp.exp(1j * w.reshape(-1) * jax.lax.stop_gradient(self.loop.period))
         by_w = 1j * jax.lax.stop_gradient(self.loop.period) * z
-        L, by_z = crossings.response(self.opening, self.quick, z) if sloped else self.quick.response(z)
+        L, by_z = crossings.response(self.opening, self.quick, z) if by_loop else self.quick.response(z)
 
         def own(axis: Array, L: Array, by: Array) -> tuple[Array, Array]:
             return jax.jvp(lambda L: crossings.one_axis(L, axis), (L,), (by,))
@@ -158,7 +162,7 @@ def _of(spectrum: _Spectrum, with_delay: bool) -> Margins:
     """Return the margins of each axis of an opened loop, see `of`."""
     brackets = jax.vmap(partial(crossings.brackets, spectrum.w))(spectrum.each)
     root = jax.lax.stop_gradient(_refined_crossings(spectrum, brackets))
-    L, slope = spectrum.at(jnp.append(root, brackets.elsewhere, axis=1), sloped=True)
+    L, slope = spectrum.at(jnp.append(root, brackets.elsewhere, axis=1), by_loop=True)
     in_axes = (0, 0, 0, 0, None, None)
     values = jax.vmap(_axis, in_axes=in_axes)(root, L, slope, brackets.there, spectrum.stable, spectrum.w[0])
     axes = jnp.arange(root.shape[0])
@@ -175,17 +179,17 @@ def _crossed(L: Array) -> Array:
 
 
 def _refined_crossings(spectrum: _Spectrum, brackets: Brackets) -> Array:
-    """Return the frequencies (m, places) [rad/s] of all crossings of all axes.
+    """Return the frequencies (m, places) [rad/s] of the zeros in all `Brackets` of all axes.
 
     The function uses the Illinois variant of regula falsi (Dowell and Jarratt, BIT 11, 1971). It stops when the
-    remaining error is small enough for the Newton step that follows.
+    remaining error is small enough for the final Newton step in `_axis`.
     """
 
     def closer(state: tuple[Array, tuple, Array]) -> tuple[Array, tuple, Array]:
         k, (a, b, f_a, f_b), _ = state
         c = b - f_b * (b - a) / jnp.where(f_b == f_a, 1.0, f_b - f_a)
         c = jnp.clip(c, jnp.minimum(a, b), jnp.maximum(a, b))
-        L, slope = spectrum.at(c, sloped=False)
+        L, slope = spectrum.at(c, by_loop=False)
         crossed = crossings.sine(L[:, : SPLIT[0]]), _crossed(L)[:, SPLIT[0] :]
         f_c = jnp.concatenate([*crossed, (jnp.conj(1.0 + L) * slope).real[:, SPLIT[1] :]], axis=1)
         between = f_c * f_b < 0.0
@@ -261,7 +265,7 @@ def _delay(loop: Loop, w: Array, seen: Array, axis: Array) -> Scalar:
     # no LAPACK solver: jaxlib's wait for threads of XLA, and two of them at the same time deadlock
     of_a = crossings.triangle(loop.closed_at_sensors()[0])
     still, fixed = jax.lax.stop_gradient((loop, of_a))
-    near = _looked_through(still, fixed, w, axis)
+    near = _delay_grid_search(still, fixed, w, axis)
     estimates, crossed = crossings.delay_at(w, seen)
     sizes, crossed = jax.lax.stop_gradient((estimates, crossed))
     # the estimates ignore that commands are held, so that the smallest estimate need not give the smallest delay
@@ -269,7 +273,7 @@ def _delay(loop: Loop, w: Array, seen: Array, axis: Array) -> Scalar:
     starts = jnp.append(near, jnp.stack([jnp.log(crossed[places]), values / still.period], axis=1), axis=0)
     tries = jnp.append(jnp.ones(len(near), int), jnp.full(NEAREST, STARTS))
 
-    def border(of: tuple) -> tuple[Array, Array]:  # ln w and delay in periods at a stability limit; whether found
+    def limit(of: tuple) -> tuple[Array, Array]:  # ln w and delay in periods at a stability limit; whether found
         start, tries = of
         known = jnp.isfinite(start[1])
 
@@ -279,17 +283,17 @@ def _delay(loop: Loop, w: Array, seen: Array, axis: Array) -> Scalar:
             x = x - by
             settled = jnp.all(jnp.abs(by) <= 1e-9 * jnp.maximum(jnp.abs(x), 1.0))  # convergence is quadratic
             found = settled & (x[1] > 0.0)
-            lost = ~found & (settled | (steps == 11) | ~jnp.all(jnp.isfinite(x)))  # delay not positive, or diverged
-            starts = starts + lost
-            x = jnp.where(lost, start.at[1].add(FARTHER * starts), x)
-            return jnp.where(lost, 0, steps + 1), starts, x, found
+            failed = ~found & (settled | (steps == 11) | ~jnp.all(jnp.isfinite(x)))  # delay not positive, or diverged
+            starts = starts + failed
+            x = jnp.where(failed, start.at[1].add(FARTHER * starts), x)
+            return jnp.where(failed, 0, steps + 1), starts, x, found
 
         zero = jnp.zeros((), int)
         begun = (zero, zero, jnp.where(known, start, 1.0), ~known)
         *_, root, found = jax.lax.while_loop(lambda at: ~at[3] & (at[1] < tries), newton, begun)
         return root, known & found
 
-    roots, found = jax.lax.map(border, (starts, tries))
+    roots, found = jax.lax.map(limit, (starts, tries))
     # a start in the range of the grid search without a limit is ignored, unless no start leads to a limit
     counts = jnp.where((starts[:, 1] < LOOKED) & jnp.any(found), jnp.inf, starts[:, 1])
     first = jnp.argmin(jnp.where(found, roots[:, 1], counts))  # smallest delay
@@ -298,11 +302,11 @@ def _delay(loop: Loop, w: Array, seen: Array, axis: Array) -> Scalar:
     return jnp.where(found[first], exact, jnp.append(near[:, 1] * still.period, estimates[places])[first])
 
 
-def _looked_through(loop: Loop, of_a: tuple[Array, Array], w: Array, axis: Array) -> Array:
-    """Return approximate stability limits by a grid search over delay and frequency, (NEAR, 2): ln w and the delay.
+def _delay_grid_search(loop: Loop, of_a: tuple[Array, Array], w: Array, axis: Array) -> Array:
+    """Return approximate stability limits (NEAR, 2), ln w and delay in periods, by a search on a grid of both.
 
-    A zero of 1 + L is inside a grid cell around which 1 + L winds around zero. The function returns the zeros with the
-    smallest delays in periods, and infinity if there are fewer.
+    A grid cell contains a zero of 1 + L if 1 + L winds around 0 along the edges of the cell. The function returns the
+    zeros with the smallest delays. The delay is infinite if there are fewer than `NEAR` zeros.
 
     Args:
         loop: the loop.
@@ -336,7 +340,7 @@ def _looked_through(loop: Loop, of_a: tuple[Array, Array], w: Array, axis: Array
 
 @jax.jit
 def _delay_step(loop: Loop, of_a: tuple[Array, Array], axis: Array, x: Array) -> Array:
-    """Return the Newton step toward L = -1 of one delayed axis; the new estimate is x minus the step.
+    """Return the Newton step of ln w and the delay toward L = -1 of one axis; the new estimate is x minus the step.
 
     Args:
         loop: the loop.

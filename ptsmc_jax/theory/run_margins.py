@@ -70,10 +70,10 @@ def judged_times(parts: Parts) -> Float[Array, " times"]:
 def moments(parts: Parts, run: linear.Nominal, times: Array) -> Array:
     """Return the indices of the full control periods nearest to some times to go, and of one period in the hold phase.
 
-    The period in the hold phase is the last period of the run. If the loop diverges, it is the last period whose
-    initial error is at most twice the error at the hand-over. If loops are averaged over a star tracker's interval,
-    this interval must fit into the hold phase. If there is no full period before the hand-over, every index is the
-    index of the period in the hold phase.
+    The period in the hold phase is the last period of the run. If the loop diverges, it is the last period that starts
+    with at most twice the error at the hand-over. If loops are averaged over a star tracker's interval, the interval
+    that ends there is in the hold phase, if the run is long enough. If there is no full period before the hand-over,
+    every index is the index of the period in the hold phase.
 
     Args:
         parts: the sampled scenario.
@@ -122,7 +122,9 @@ def at(parts: Parts, left: Float[Array, " times"], simulated: linear.Nominal | N
 
 
 def judged_loops(parts: Parts, simulated: linear.Nominal | None = None, *, late: bool = True) -> tuple[Loop, Array]:
-    """Return the loops whose margins are judged (times + 1, ..), h in [s], and which of them are in the hold phase.
+    """Return the loops at the `judged_times` and in the hold phase, and which of them are in the hold phase.
+
+    The first axis (times + 1) of the loops is the time; the last one is in the hold phase. The unit of h is [s].
 
     Args:
         parts: the sampled scenario.

@@ -24,7 +24,7 @@ from ptsmc_jax.theory.exact_motion import exact, exact_motion, plant_motion
 
 Vector = Float[Array, " n"]
 
-VISITED = 64  # number of times in the approach phase, and on the target
+VISITED = 64  # number of states on the exact motion, and number of states with zero error
 
 
 def state_envelope(
@@ -37,7 +37,7 @@ def state_envelope(
     The result generalises (20)-(22) and (47)-(50), with explicit constants.
 
     Args:
-        t: time before the hand-over [s].
+        t: time since the start of the run [s], in the approach phase.
         t_f: prescribed time [s].
         eta: exponent of the law [-].
         x0: states at t = 0, (n,), in the states' own units.
@@ -46,7 +46,7 @@ def state_envelope(
     """
     n, tau = x0.shape[0], t_f - t
     free, forced = modes(t, t_f, eta, x0)
-    scale = jnp.sqrt(residual) * tau ** (n / 2)  # bound on the residual |s| of the smooth sign
+    scale = jnp.sqrt(residual) * tau ** (n / 2)  # bound on |s| inside the boundary layer
     widths = []
     for j in range(n):
         p = n - 2 - j
@@ -74,7 +74,7 @@ def starts(parts: Setup) -> Float[Array, "m n"]:
 
 
 def exact_sizes(parts: Setup, t: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Return the 2-norms of the error and of s along the exact motion at times t (time,) [s] before the hand-over."""
+    """Return the 2-norms of the error and of s along the exact motion at times t (time,) [s] in the approach phase."""
     error, s = _exact_sizes(bare(parts), jnp.asarray(t))
     return np.asarray(error), np.asarray(s)
 
@@ -91,7 +91,8 @@ def _exact_sizes(parts: Setup, t: Array) -> tuple[Array, Array]:
 def exact_input(parts: Setup, t: Scalar) -> tuple[Array, Scalar]:
     """Return the input (m,) [N m] of the exact motion at t [s], and the distance to the singularity.
 
-    For attitudes this distance is 1 - |v|^2 [-], the square of the scalar part. No motion exists at or below 0.
+    For attitudes this distance is 1 - |v|^2 [-], the square of the scalar part. The motion does not exist if it is 0
+    or less.
     """
     motion = exact_motion(parts.controller, t, parts.reference(t), parts.initial, starts(parts))
     d = parts.disturbance(t, parts.plant.with_hidden_at_rest(motion.x))
@@ -102,8 +103,8 @@ def exact_input(parts: Setup, t: Scalar) -> tuple[Array, Scalar]:
 def visited(parts: Setup) -> tuple[Array, Any]:
     """Return targets and states of a second-order run, (2 VISITED,) each, in the states' own units.
 
-    The first half is on the exact motion, at times that become denser toward the hand-over. The second half is on the
-    target.
+    The first half is on the exact motion, at times that become denser toward the hand-over. In the second half the
+    error is zero.
     """
     return _visited(bare(parts))
 
@@ -113,21 +114,21 @@ def _visited(parts: Setup) -> tuple[Array, Any]:
     law, fractions = parts.controller, jnp.linspace(0.0, 1.0, VISITED)
     none = (jnp.zeros(parts.plant.inputs),) * 3
 
-    def on_the_way(t: Scalar) -> tuple[Any, Any]:
+    def approaching(t: Scalar) -> tuple[Any, Any]:
         target = parts.reference(t)
         return target, exact_motion(law, t, target, parts.initial, starts(parts)).x
 
-    def at_rest(t: Scalar) -> tuple[Any, Any]:
+    def without_error(t: Scalar) -> tuple[Any, Any]:
         target = parts.reference(t)
         return target, plant_motion(law.kinematics, target, parts.initial, none).x
 
-    early = lapack.vmap(on_the_way)(law.t_f - law.t_f * (law.delta / law.t_f) ** fractions)
-    late = lapack.vmap(at_rest)(parts.t_end * fractions)
+    early = lapack.vmap(approaching)(law.t_f - law.t_f * (law.delta / law.t_f) ** fractions)
+    late = lapack.vmap(without_error)(parts.t_end * fractions)
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), early, late)
 
 
 def exact_path(parts: Setup, points: int = 2000) -> tuple[Array, Array, Array]:
-    """Return times before the hand-over [s], inputs (points, m) and distances to the singularity of the exact motion.
+    """Return times in the approach phase [s], inputs (points, m) and distances to the singularity of the exact motion.
 
     See `exact_input`.
     """

@@ -54,9 +54,9 @@ def _closed(kp: float, kd: float, h: float, delay: float) -> np.ndarray:
     move = np.eye(n)
     move[0, 1] = h
 
-    def push(share_from: float, share_to: float) -> tuple[float, float]:
-        """Change of eps and eps' over the period by a unit acceleration between two fractions of it."""
-        a, b = share_from * h, share_to * h
+    def push(begin: float, end: float) -> tuple[float, float]:
+        """Return the changes of eps and eps' by a unit acceleration between two fractions of the period."""
+        a, b = begin * h, end * h
         return (h - a) ** 2 / 2 - (h - b) ** 2 / 2, b - a
 
     late_push, early_push = push(part, 1.0), push(0.0, part)
@@ -117,7 +117,7 @@ def implicit_gains(eta: float, tau: float) -> tuple[float, float]:
 
 
 def largest_index(eta: float, delay: float = 0.0, *, implicit: bool = False) -> float:
-    """Return the largest (2 eta - 1) h / tau with a stable frozen loop before the hand-over [-]: 2 without delay.
+    """Return the largest (2 eta - 1) h / tau with a stable frozen loop before the hand-over [-]; 2 without delay.
 
     Args:
         eta: exponent of the law [-].
@@ -138,9 +138,10 @@ def smallest_delta(eta: float, h: float, delay: float = 0.0, *, anchored: bool =
     """Return the smallest delta [s] that keeps the frozen loop stable at the last sample before the hand-over.
 
     The limit depends on the time to go tau at that sample. The anchored clock has tau = delta + h, so that the smallest
-    delta is (eta - 3/2) h without delay. The flight clock may have tau = delta, so that it is (eta - 1/2) h. Implicit
-    sampling adds one period to tau on both clocks, because its last such period ends before the hand-over. It has no
-    limit without delay, and the result is 0. The result is never negative.
+    delta is (eta - 3/2) h without delay. The flight clock may have tau = delta, so that it is (eta - 1/2) h.
+
+    With implicit sampling, tau is one period longer on both clocks: a period that ends in the hold phase already uses
+    the gains of the hold phase. Without delay the loop is then stable for every tau, and the result is 0.
 
     Args:
         eta: exponent of the law [-].
