@@ -21,8 +21,8 @@ def boundary_layer(default: Any, unit: str = "") -> Any:
     """Declare the field `sign_width`, the thickness of the boundary layer of tanh(s / sign_width).
 
     Args:
-        default: as for `declare.gain`.
-        unit: of s.
+        default: default value, see `declare.gain`.
+        unit: unit of s.
     """
     meaning = "thickness of the boundary layer; 0 is the discontinuous sign"
     return declare.gain(default, "sign_width", at_least=0.0, free="sampled", unit=unit, meaning=meaning)
@@ -38,20 +38,20 @@ class Sample(NamedTuple):
 
 
 class Law(declare.Tunable):
-    """A control law: gains, and one call. Its error and the plant's model are in the field `kinematics`.
+    """Base class of the control laws. A law is called at each sample, and its gains are fields.
 
-    The field `kinematics` defines the error eps and holds the design model of the plant. Most laws define
+    The field `kinematics` defines the error eps and contains the design model of the plant. Most laws define
     `acceleration`, the commanded eps''. Others override `__call__`. Errors, accelerations and inputs are (m,), in the
     units of the kinematics: for a spacecraft [-], [1/s^2] and [N m]. At the hand-over time t_f - delta the approach
     phase ends and the hold phase begins. Some laws use other gains in the hold phase (Remark 1).
     """
 
-    kinematics: Kinematics  # of the error that the law drives to zero
-    t_f: Leaf  # prescribed time, or when the error is judged [s]
-    delta: Leaf  # hand-over this long before t_f [s]
-    tunable: ClassVar[tuple[str, ...]] = ("t_f",)  # gains that tuning may move
-    prescribed: ClassVar[bool] = False  # one of the paper's: its exact solution and its bounds are known
-    switches: ClassVar[bool] = True  # against the bound on the disturbance that is not estimated
+    kinematics: Kinematics  # definition of the error that the law drives to zero
+    t_f: Leaf  # prescribed time; for a law without it, the time from which the error is evaluated [s]
+    delta: Leaf  # time between the hand-over and t_f [s]
+    tunable: ClassVar[tuple[str, ...]] = ("t_f",)  # fields that tuning may change; `gain` adds its fields
+    prescribed: ClassVar[bool] = False  # whether the law is from the paper, with known exact solution and bounds
+    switches: ClassVar[bool] = True  # whether it has a switching term, sized by the bound on the estimation error
 
     @property
     def model(self) -> Any:
@@ -74,7 +74,7 @@ class Law(declare.Tunable):
         return False
 
     def begin(self) -> Any:
-        """Return the memory of the law before its first sample, a pytree of arrays. None: the law has no memory."""
+        """Return the memory of the law before its first sample, a pytree of arrays, or None for a law without it."""
         return None
 
     def acceleration(self, now: Sample, error: Vector, error_rate: Vector, bound: Scalar) -> tuple[Any, ...]:
@@ -127,7 +127,7 @@ class Law(declare.Tunable):
         """
         return hold
 
-    # The methods below use the numbers of the fields only: scenarios call them with a table that has the same numbers
+    # The methods below use only the numbers in the fields, because a scenario calls them with its configuration table
 
     def turning(self, t_f: float) -> tuple[str, Scalar | float]:
         """Return the name of the field that sets how fast the law turns a body, and the largest body rate [rad/s].
@@ -142,37 +142,41 @@ class Law(declare.Tunable):
     def noise_of_s(self, position: float, velocity: float) -> float:
         """Return the noise of the sliding variable (1 sigma) for noise of the error [-] and of its rate [1/s].
 
-        The default is that of s = eps' + c eps, with c = 1 / t_f if the law has no `surface_rate`.
+        The default is for s = eps' + c eps, with c = 1 / t_f if the law has no `surface_rate`.
         """
         return math.hypot(velocity, (getattr(self, "surface_rate", None) or 1.0 / float(self.t_f)) * position)
 
     @staticmethod
     def designed(design: Any, published: Mapping[str, float]) -> Mapping[str, float]:
-        """Return gains for a design of the sampled loop, by field.
+        """Return the gains for a design of the sampled loop, by field name.
 
         Args:
             design: a `scenario.mission.Design`, with rates in [1/s].
-            published: the published gains, within the bandwidth of the design.
+            published: the published gains, limited to the bandwidth of the design.
         """
         return published
 
     def refusal(self, order: int) -> tuple[str, str] | None:
-        """Return a field whose value is refused for a plant of this order, and the allowed values, or None."""
+        """Check conditions on several fields, or on a field and the order of the plant.
+
+        Returns:
+            The name of a field whose value is not allowed, and the allowed values; or None.
+        """
         return None
 
 
 @dataclass(frozen=True)
 class AccelerationLaw(Law):
-    """Base of the laws for comparison and of custom laws. It is for kinematics of order 2 and the sampled loop."""
+    """Base of the laws for comparison and of custom laws, for an error of order 2 and the sampled loop."""
 
     kinematics: Kinematics
-    t_f: Leaf  # prescribed time, or when the error is judged [s]
-    delta: Leaf  # a sample of the anchored clock falls on t_f - delta [s]
+    t_f: Leaf  # prescribed time; for a law without it, the time from which the error is evaluated [s]
+    delta: Leaf  # time between the hand-over and t_f [s]; the anchored clock has a sample at the hand-over
     tunable: ClassVar[tuple[str, ...]] = ("delta", "t_f")
 
 
 @dataclass(frozen=True)
 class ComparisonLaw(AccelerationLaw):
-    """The base of the laws to compare with. They do not hand over, unless they declare `delta`."""
+    """Base of the laws for comparison. Their hand-over has no effect, unless they declare the gain `delta`."""
 
     tunable: ClassVar[tuple[str, ...]] = ("t_f",)

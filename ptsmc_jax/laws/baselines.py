@@ -40,7 +40,7 @@ class PD(ComparisonLaw):
         return -self.k_p * error - self.k_d * error_rate, error + self.k_d / self.k_p * error_rate
 
     def turning(self, t_f: float) -> tuple[str, Scalar | float]:
-        """Return k_p, and the body rate at the target [rad/s] if all potential energy of the spring becomes motion."""
+        """Return "k_p", and the body rate [rad/s] at zero error after half a turn without damping."""
         return "k_p", 2.0 * math.sqrt(self.k_p)
 
 
@@ -110,7 +110,7 @@ class Terminal(ComparisonLaw):
         return math.hypot(position, velocity**self.p / self.b)
 
     def turning(self, t_f: float) -> tuple[str, Scalar | float]:
-        """Return b, and the body rate on the sliding surface at |v| = 1 [rad/s]."""
+        """Return "b", and the body rate on the sliding surface at |v| = 1 [rad/s]."""
         return "b", 2.0 * self.b ** (1.0 / self.p)
 
 
@@ -165,7 +165,7 @@ class FixedTime(ComparisonLaw):
         return equivalent - bound * guards.smooth_sign(s, self.sign_width), s
 
     def turning(self, t_f: float) -> tuple[str, Scalar | float]:
-        """Return a1, and the body rate on the sliding surface at |v| = 1 [rad/s]."""
+        """Return "a1", and the body rate on the sliding surface at |v| = 1 [rad/s]."""
         return "a1", 2.0 * (self.a1 + self.b1)
 
     def noise_of_s(self, position: float, velocity: float) -> float:
@@ -173,7 +173,7 @@ class FixedTime(ComparisonLaw):
         return math.hypot(position, (velocity / self.b1) ** self.p)
 
     def refusal(self, order: int) -> tuple[str, str] | None:
-        """Its surface is nonsingular for gamma - 1/p > 1 only."""
+        """Check gamma - 1/p > 1, without which the surface is singular; see `Law.refusal`."""
         fits = self.gamma - 1.0 / self.p > 1.0
         return None if fits else ("gamma", f"greater than 1 + 1/p, {1.0 + 1.0 / self.p:.6g}")
 
@@ -217,7 +217,7 @@ class Scaling(ComparisonLaw):
         return {**published, "delta": design.delta, "k1": design.pole}
 
     def turning(self, t_f: float) -> tuple[str, Scalar | float]:
-        """Return m, and the body rate at the start [rad/s]."""
+        """Return "m", and the body rate at the start [rad/s]."""
         return "m", 2.0 * (2.0 + self.m) / t_f
 
 
@@ -274,11 +274,11 @@ class PredefinedTime(ComparisonLaw):
 
     @staticmethod
     def designed(design: Any, published: Mapping[str, float]) -> Mapping[str, float]:
-        """Return no gains: they follow from t_f, in the sampled loop too."""
+        """Return no gains, because the defaults follow from t_f in the sampled loop too."""
         return {}
 
     def turning(self, t_f: float) -> tuple[str, Scalar | float]:
-        """Return q1, and the body rate on the sliding surface at |v| = 1 [rad/s]."""
+        """Return "q1", and the body rate on the sliding surface at |v| = 1 [rad/s]."""
         return "q1", 2.0 * math.pi / (self.q1 * self.share * t_f)
 
 
@@ -331,5 +331,5 @@ class SuperTwisting(ComparisonLaw):
         return {**published, "sign_width": design.width}
 
     def turning(self, t_f: float) -> tuple[str, Scalar | float]:
-        """Return surface_rate, and the body rate on the sliding surface at |v| = 1 [rad/s]."""
+        """Return "surface_rate", and the body rate on the sliding surface at |v| = 1 [rad/s]."""
         return "surface_rate", 2.0 * self.surface_rate

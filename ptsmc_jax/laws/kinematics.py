@@ -31,14 +31,14 @@ class Kinematics:
     T(q) in (57) or dF/dx2 G in (29) has no inverse.
     """
 
-    model: Any  # the nominal plant
+    model: Any  # design model of the plant
     additive: ClassVar[bool] = (
         False  # the error is q_1 - q_1f, as in the paper; it is singular at body attitudes of 180 deg
     )
-    symbol: ClassVar[str] = "$|x_1|$"  # of the error's norm, in figures
-    error_unit: ClassVar[str] = ""  # of error and sliding variable; empty: the plant has units of its own
-    angle_unit: ClassVar[str] = "x1"
-    reaching_factor: ClassVar[float] = 1.0  # rate of s after the hand-over, in units of K1: 1 in (29)
+    symbol: ClassVar[str] = "$|x_1|$"  # symbol of the error's norm in figures
+    error_unit: ClassVar[str] = ""  # unit of error and sliding variable; empty if it depends on the plant
+    angle_unit: ClassVar[str] = "x1"  # unit of `angle`
+    reaching_factor: ClassVar[float] = 1.0  # decay rate of s in the hold phase divided by K1; 1 in (29)
 
     @property
     def order(self) -> int:
@@ -58,7 +58,7 @@ class Kinematics:
         return jnp.ones(())
 
     def singularity_distance_unit(self, first: Scalar) -> Scalar:
-        """Return the divisor that makes the distances to the singularity of a run start positive.
+        """Return the number that divides the distances to the singularity of a run, so that the first is positive.
 
         Args:
             first: distance to the singularity at t = 0.
@@ -74,7 +74,7 @@ class Kinematics:
         return jnp.stack(self.errors(x, target), axis=1)
 
     def angle(self, x: Any, target: Any) -> Scalar:
-        """Return the size of the error: the angle to the reference [rad], or |x_1| for other plants."""
+        """Return the size of the error: the angle to the reference [rad], or |x_1| for other plants in their unit."""
         raise NotImplementedError
 
     def middle_angle(self, start: tuple[Any, Any], end: tuple[Any, Any], dt: Scalar) -> Scalar:
@@ -103,7 +103,7 @@ class Kinematics:
         raise NotImplementedError
 
     def straight_coordinates(self, error: Vector) -> Vector:
-        """Map an error (m,) to coordinates with straight shortest paths to zero. Zero is mapped to zero."""
+        """Map an error (m,) to coordinates in which the shortest path to zero error is a straight line to 0."""
         return error
 
     def from_straight_coordinates(self, straight: Vector) -> Vector:
@@ -265,7 +265,7 @@ class SecondOrderKinematics(Kinematics):
         return matrices.determinant(jacobian @ gain)
 
     def singularity_distance_unit(self, first: Scalar) -> Scalar:
-        """Return the determinant at t = 0, so that the ratio does not depend on units."""
+        """Return the determinant at t = 0. The distances of a run, divided by it, do not depend on units."""
         return first
 
     def errors(self, x: State, target: Scalar) -> tuple[Vector, Vector]:

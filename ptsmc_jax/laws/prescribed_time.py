@@ -25,8 +25,9 @@ from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector, pytree
 class PrescribedTimeLaw(Law):
     """Base of the laws of the paper: their gains, and the hand-over at t_f - delta (Remark 1).
 
-    After t_f the proofs of the paper use LaSalle's invariance principle, which requires an autonomous system. The
-    inequality V' <= -2 K1 V with V(t_f) = 0 is sufficient instead. With delta > 0, V(t_f) is small but not zero.
+    For t > t_f the proofs of the paper use LaSalle's invariance principle, which requires an autonomous system. The
+    inequality V' <= -2 K1 V of the Lyapunov function V proves the same: V stays 0 if V(t_f) = 0. With delta > 0, V(t_f)
+    is small but not zero.
     """
 
     kinematics: Kinematics
@@ -53,7 +54,8 @@ class PrescribedTimeLaw(Law):
         meaning="c of the surface s = eps' + c eps in the hold phase: the error decays like exp(-c t); 1 "
                 "in the paper",
     )  # fmt: skip
-    # whether the held input is chosen for s at the end of the period, see `landing`, and not for its rate at the sample
+    # whether the law computes the constant input of a period from s at the end of the period (implicit Euler, see
+    # `next_s`), not from the derivative of s at the sample
     implicit: bool = field(default=False, metadata={"static": True}, kw_only=True)
     layer_time: Leaf = declare.number(
         Scaled(1.0, time=1), above=0.0, unit="s", kw_only=True,
@@ -66,14 +68,15 @@ class PrescribedTimeLaw(Law):
     def designed(design: Any, published: Mapping[str, float]) -> Mapping[str, float]:
         """Return gains that put both poles of the hold phase at the designed pole.
 
-        `design.reaching` is the factor of K1 in (60).
+        The decay rates of s and of the error on the surface are then equal: K1 is `design.reaching` times the pole, 2
+        for a spacecraft by (60), and `surface_rate` is the pole.
         """
         pole = design.pole
         gains = {"k1": design.reaching * pole, "sign_width": design.width, "surface_rate": pole}
         return {"eta": design.eta, "delta": design.delta, **gains}
 
     def turning(self, t_f: float) -> tuple[str, Scalar | float]:
-        """Return eta, and the body rate on the sliding surface at the start [rad/s]."""
+        """Return "eta", and the body rate on the sliding surface at t = 0 [rad/s]."""
         return "eta", 2.0 * self.eta / t_f
 
     @property
@@ -96,8 +99,8 @@ class PrescribedTimeLaw(Law):
     def layer(self, hold: Bool[Array, ""]) -> Scalar:
         """Return the thickness of the boundary layer, in the units of s in the present phase.
 
-        In the approach phase, s has n - 1 more powers of time than in the hold phase. The paper uses the same number in
-        both phases with time in seconds, so `layer_time` is 1 s by default.
+        The unit of s in the approach phase is s^(n-1) times its unit in the hold phase. The paper uses the same number
+        for the thickness in both phases, with time in seconds. Therefore `layer_time` is 1 s by default.
         """
         return jnp.where(hold, self.sign_width, self.sign_width * self.layer_time ** (self.order - 1))
 
@@ -164,8 +167,7 @@ class SurfaceGains(NamedTuple):
 class PrescribedTime(PrescribedTimeLaw):
     """The paper's law: (56) and (57) for a spacecraft before the hand-over, (59) and (60) after it; (29) for a system.
 
-    It is written for an error vector eps whose second derivative the input sets. In the approach phase (26), with
-    tau = t_f - t:
+    The law computes the second derivative of an error vector eps. In the approach phase (26), with tau = t_f - t:
 
         s = tau eps' + eta eps
         eps'' = -(eta-1) eps'/tau - eta s/tau^2 - N K2 sign(s) / 2.
@@ -177,9 +179,9 @@ class PrescribedTime(PrescribedTimeLaw):
 
     c is `surface_rate`, 1 1/s in the paper. b is `reaching_rate`, K1 in (29) and K1/2 in (60). N is the Frobenius norm
     of the matrix 2 d(eps'')/dd, where d is the disturbance: |T J^-1| in (57) and 2 |dF/dx2 D| in (29). The norm
-    includes the input matrix D of the disturbance, because K2 bounds d. The paper does not say which norm it means. The
-    proof needs at least the spectral norm if K2 bounds the 2-norm of the estimation error. The Frobenius norm is not
-    less than the spectral norm, and it is smooth.
+    includes the input matrix D of the disturbance, because K2 bounds d. The paper does not define its norm. The proof
+    needs at least the spectral norm if K2 bounds the 2-norm of the estimation error. The Frobenius norm is not less
+    than the spectral norm, and it is smooth.
 
     With `AdditiveKinematics` it is the law of the paper for a spacecraft, (56) and (57) in the approach phase, (59) and
     (60) in the hold phase. With `MultiplicativeKinematics` the law does not depend on the inertial frame. With
@@ -235,12 +237,10 @@ class PrescribedTime(PrescribedTimeLaw):
 @pytree
 @dataclass(frozen=True)
 class PrescribedTimeChain(PrescribedTimeLaw):
-    """The paper's law (52) for an integrator chain; without an observer (36) to (40).
+    """The paper's law (52) for the integrator chain (35); without an observer it is (36) to (40).
 
-    Law (52) for the integrator chain (35), with the surfaces (37) before and (39) after the hand-over.
-
-    For order 2 it is the law (24) for the system (6). `surface_rate` c multiplies the poles of (39), because a_i is
-    replaced by a_i c^(n-i). The paper has c = 1.
+    The surface is (37) in the approach phase and (39) in the hold phase. For order 2 the law is (24) for the system
+    (6). `surface_rate` c multiplies the poles of (39), because a_i is replaced by a_i c^(n-i). The paper has c = 1.
 
     Differences from the paper:
 
@@ -267,7 +267,7 @@ class PrescribedTimeChain(PrescribedTimeLaw):
     )  # fmt: skip
 
     def refusal(self, order: int) -> tuple[str, str] | None:
-        """Theorems 1 and 3, and a surface (39) that is stable."""
+        """Check the condition on eta (Theorems 1 and 3) and the stability of the surface (39); see `Law.refusal`."""
         if not self.eta > order:
             return "eta", f"greater than plant.order, {order} ({'Theorem 1' if order == 2 else 'Theorem 3'})"
         if len(self.a) != order - 1:
@@ -321,7 +321,7 @@ class PrescribedTimeChain(PrescribedTimeLaw):
         return (s_end - s_0) / g
 
     def surface(self) -> Float[Array, " roots"]:
-        """Return a_i c^(n-i) [1/s^(n-i)], which makes the motion on the surface c times as fast."""
+        """Return a_i c^(n-i) [1/s^(n-i)]: the poles of (39) times c."""
         n = self.order
         return jnp.stack([self.a[i] * self.surface_rate ** (n - 1 - i) for i in range(n - 1)])
 

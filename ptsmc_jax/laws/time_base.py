@@ -93,16 +93,16 @@ class TimeBase(ComparisonLaw):
         return profile.acceleration + a, s, start
 
     def turning(self, t_f: float) -> tuple[str, Scalar | float]:
-        """Return t_f, and the body rate in the middle of half a turn [rad/s]."""
+        """Return "t_f", and the body rate in the middle of half a turn [rad/s]."""
         return "t_f", 15.0 / 8.0 * math.pi / t_f
 
 
 @pytree
 @dataclass(frozen=True)
 class TimeBasePD(TimeBase):
-    """A profile from the first error to zero at t_f, a quintic about the eigenaxis, under PD (Becerra and others 2018).
+    """PD tracking of a quintic profile of the error that ends at zero at t_f (Becerra and others 2018).
 
-    a = r'' - k_d E' - k_p E with E = eps - r; its s is E' + (k_p/k_d) E.
+    a = r'' - k_d E' - k_p E with E = eps - r; its s is E' + (k_p/k_d) E. r is the profile of `TimeBase`.
     """
 
     k_p: Leaf = gain(
@@ -126,9 +126,9 @@ class TimeBasePD(TimeBase):
 @pytree
 @dataclass(frozen=True)
 class TimeBaseSliding(TimeBase):
-    """The same profile under a sliding mode, s = E' + c E (Becerra and others 2018).
+    """Sliding mode tracking of a quintic profile of the error that ends at zero at t_f (Becerra and others 2018).
 
-    s = E' + c E with E = eps - r, a = r'' - c E' - k s - K sign(s).
+    s = E' + c E with E = eps - r, a = r'' - c E' - k s - K sign(s). r is the profile of `TimeBase`.
     """
 
     surface_rate: Leaf = gain(
