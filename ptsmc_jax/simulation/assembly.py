@@ -1,4 +1,4 @@
-"""The parts of a run."""
+"""The parts of a run: `Parts`, and `Setup` without the clock."""
 
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, TypeVar
@@ -33,10 +33,10 @@ class Setup:
     initial: Any  # state of the plant
     t_end: Leaf  # [s]
     window: Leaf  # length of the window after t_f, for window_error [s]
-    settling_angle: Leaf  # [rad]
+    settling_angle: Leaf  # limit of the angle for `settling_time` [rad]
     actuators: Actuators = field(default_factory=Actuators)  # by default they hold the commanded torque over a period
-    walk_rate: Leaf | None = None  # (m,) 1 sigma of the step of a random walk, over the length of the period [N m/s]
-    command_filter: CommandFilter | None = None  # between the law and the actuators
+    walk_rate: Leaf | None = None  # (m,) 1 sigma of a random-walk step of the disturbance per period length [N m/s]
+    command_filter: CommandFilter | None = None  # filter between the law and the actuators
     jitter: Leaf | None = None  # largest error of a sample time, as a fraction of the control period [-]
     pointing: Pointing | None = None  # None: pointing errors are not observed
 
@@ -98,7 +98,7 @@ def check_parts(what: object) -> None:
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class Parts(Setup):
-    """Everything a run is made of."""
+    """All parts of a run, including its clock."""
 
     clock: Anchored | Flight | Graded  # Graded: continuous loop; the others: sampled loop
     substeps: int = field(default=1, metadata={"static": True})  # RK4 steps of the plant in a control period

@@ -29,7 +29,7 @@ INDICES = {
 }
 AXES = {"x": "about x", "y": "about y", "z": "about z", "boresight": "half-cone of the boresight"}
 TIMED = ("ape", "mpe", "rpe", "ake", "mke", "rke")  # indices that a limit on a fraction of the time may use
-RELATIVE = ("rpe", "rke")  # indices that need the samples of a window for it
+RELATIVE = ("rpe", "rke")  # indices of TIMED that need the stored samples of a window
 AT_A_TIME = tuple(f"{index}_{axis}" for index in TIMED for axis in AXES)
 WITHIN = "within_"  # prefix of the metric that is the fraction of the time within the limit of another metric
 # prefixes of metrics that only a run with measurement noise has
@@ -50,7 +50,7 @@ CATALOGUE = {
 POINTING = tuple(name for name, entry in CATALOGUE.items() if entry.table == "pointing")
 # metrics of other plants, whose x_1 is the error, in the units of their states and inputs
 STATE_CATALOGUE = {name: Entry(*metric.of_states) for name, metric in METRICS.items() if metric.of_states is not None}
-MAY_BE_ZERO = ("saturated",)  # a limit of zero on these can be kept
+MAY_BE_ZERO = ("saturated",)  # metrics that a requirement may limit to zero
 LARGER_IS_BETTER = tuple(f"{WITHIN}{name}" for name in AT_A_TIME)  # all other metrics are better if smaller
 # units that a limit may be stated in, by the unit of its metric or key: name -> value in that unit
 UNITS: dict[str, dict[str, float]] = {
@@ -67,7 +67,7 @@ UNITS: dict[str, dict[str, float]] = {
     "sqrt(kg) m": {"sqrt(kg) m": 1.0},
 }  # fmt: skip
 CATALOGUES = {"spacecraft": CATALOGUE, "chain": STATE_CATALOGUE, "system": STATE_CATALOGUE}  # by the kind of the plant
-ANGLE_UNITS = {"spacecraft": "rad", "chain": "x1", "system": "x1"}  # of the column `initial_angle`
+ANGLE_UNITS = {"spacecraft": "rad", "chain": "x1", "system": "x1"}  # unit of the column `initial_angle`
 
 
 class Margin(NamedTuple):

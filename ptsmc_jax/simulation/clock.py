@@ -18,7 +18,7 @@ from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.numerics import guards
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree, vector
 
-COARSEST = 0.25  # longest step before the hand-over over the time to go; the window error is then 5e-4 off
+COARSEST = 0.25  # longest step before the hand-over, divided by the time to go; it changes window_error by 5e-4
 
 
 def _not_above(t: Array, limit: Scalar, rounding: Scalar | float = 0.0) -> Array:
@@ -26,8 +26,8 @@ def _not_above(t: Array, limit: Scalar, rounding: Scalar | float = 0.0) -> Array
     return jnp.where(t < limit - rounding, t, limit)
 
 
-def _complete(t: Array, t_next: Array, hold: Array) -> Ticks:
-    """Return complete intervals, numbered from 0."""
+def _full(t: Array, t_next: Array, hold: Array) -> Ticks:
+    """Return `Ticks` of intervals that are all full, with sample numbers from 0."""
     return Ticks(t, t_next, hold, jnp.arange(t.size, dtype=jnp.int32), jnp.ones_like(t), jnp.zeros_like(hold))
 
 
@@ -67,7 +67,7 @@ class Anchored:
         begun = nominal > guards.time_tolerance(self.period, t_f)
         nodes = _not_above(jnp.where(begun, nominal, 0.0), self.t_end, guards.time_tolerance(self.period, self.t_end))
         t, t_next = nodes[:-1], nodes[1:]
-        # decided by the start of the period: by rounding its fraction of a complete period may be 1 or more
+        # the start of a period decides, because rounding may make its length equal to a full period or longer
         partial = ~begun[:-1]
         fraction = jnp.where(partial, (t_next - t) / self.period, 1.0)
         return Ticks(t, t_next, sample >= 0, sample, fraction, partial)
@@ -94,7 +94,7 @@ class Flight:
         nodes = _not_above(nominal, self.t_end, guards.time_tolerance(self.period, self.t_end))
         t, t_next = nodes[:-1], nodes[1:]
         hold = t >= t_f - delta - guards.time_tolerance(self.period, t_f)  # rounding must not delay the hand-over
-        return _complete(t, t_next, hold)
+        return _full(t, t_next, hold)
 
 
 @pytree
@@ -109,10 +109,8 @@ class Graded:
     window: Leaf  # [s]
     max_step: Leaf  # largest step [s]
     saves: Leaf  # (m,) further nodes [s]
-    before: int = field(
-        metadata={"static": True}
-    )  # number of steps before the hand-over at t_s; more than t_s / max_step
-    after: int = field(metadata={"static": True})  # steps after it
+    before: int = field(metadata={"static": True})  # steps before the hand-over at t_s; more than t_s / max_step
+    after: int = field(metadata={"static": True})  # steps after the hand-over
     sampled: ClassVar[bool] = False
     anchored: ClassVar[bool] = False
 
@@ -136,7 +134,7 @@ class Graded:
         late = jnp.sort(jnp.concatenate([late, extra, jnp.clip(self.saves, t_s, self.t_end)]))
         t, t_next = jnp.concatenate([early[:-1], late[:-1]]), jnp.concatenate([early[1:], late[1:]])
         hold = jnp.arange(t.size) >= early.size - 1
-        return _complete(t, t_next, hold)
+        return _full(t, t_next, hold)
 
     def too_coarse(self, t_f: Any, delta: Any, xp: Any = jnp) -> Any:
         """Return whether steps are longer than `COARSEST` allows, as for twice the t_f of the grid. Times in [s]."""
@@ -152,9 +150,8 @@ class Graded:
         start, end = a * jnp.log(t_f) + t_f / self.max_step, a * jnp.log(delta) + delta / self.max_step
         level = start + (end - start) * jnp.arange(self.before + 1).astype(float) / self.before
 
-        def newton(
-            u: Array,
-        ) -> Array:  # solves a u + e^u / max_step = level, u = ln tau; convex, so it converges from above
+        # solves a u + e^u / max_step = level for u = ln tau; the function is convex, so Newton converges from above
+        def newton(u: Array) -> Array:
             derivative = a + jnp.exp(u) / self.max_step
             return u - (a * u + jnp.exp(u) / self.max_step - level) / derivative
 
@@ -189,8 +186,8 @@ def graded(
 
     It has 200 graded steps, each at most t_f/200. The error in the states is then about 1e-8 in the cases of the paper,
     and falls with the fourth power of the step. Chains of order n have 3 n - 4 times as many steps, for an error of
-    1e-9 of the largest state. The explicit steps must also resolve the boundary layer of the smooth sign. The
-    largest error was 3e-5 in the last state, for a layer of width 0.02 and a disturbance without observer.
+    1e-9 of the largest state. The explicit steps must also resolve the boundary layer. The largest error was 3e-5 in
+    the last state, for a boundary layer of thickness 0.02 and a disturbance without observer.
 
     Args:
         t_f: prescribed time [s].
@@ -227,7 +224,7 @@ def graded_steps(
 
 
 def _refinement(order: int) -> int:
-    """Return the number of steps of a chain over the number of steps of a second-order motion."""
+    """Return the ratio of the number of steps for a chain to the number for a motion of order 2."""
     return max(1, 3 * order - 4)
 
 

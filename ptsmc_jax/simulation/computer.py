@@ -22,8 +22,8 @@ class Computer(NamedTuple):
     sensors: Any  # memory of the sensors
     seen: Any  # state that the sensors measured at the last sample
     observer: Any  # memory of the observer
-    law: Any  # memory of the law; None: it has no memory
-    # of the last period: mean torque [N m] and wheel momentum [N m s], as the flight software assumes them
+    law: Any  # memory of the law; None: the law has no memory
+    # mean torque [N m] and wheel momentum [N m s] of the last period, as the flight software assumes them
     applied: tuple[Array, Array | None] | None  # None: see `control_period.State`
     command_filter: Any = None  # memory of the command filter; None: there is no filter
 
@@ -76,7 +76,7 @@ class Software(NamedTuple):
     decide: Callable[[Parts, Bound, Period, Computer, Any, Any, ActuatorState], tuple[Decision, Computer]]
     # number of samples of a run that ended with each status, by its name
     statuses: Callable[[Computer], dict[str, Array]] = no_statuses
-    on_processor: bool = False  # it runs on the host processor only
+    on_processor: bool = False  # whether it runs on the host processor only
 
 
 def boot(parts: Parts, seed: WholeNumber, trial: WholeNumber, x0: Any, first: Ticks) -> Computer:

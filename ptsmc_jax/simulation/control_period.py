@@ -40,7 +40,7 @@ class State(NamedTuple):
     computer: Computer  # memory of the flight software; its `applied` is None if the actuators hold `torque`
     actuators: ActuatorState = ActuatorState(None, None, None)
     walk: Array | None = None  # (m,) random walk of the disturbance [N m]; None: there is none
-    star_x: Any = None  # `star_state` of the last period
+    star_x: Any = None  # true states at sensors' own sample times in the last period, see `star_state`
     offset: Array | None = None  # delay of the next sample after its nominal time [s]; None: no timing jitter
 
     @property
@@ -53,11 +53,11 @@ class Record(NamedTuple):
     """The events of a control period, or of an integration step of the continuous loop."""
 
     now: Ticks  # true times
-    decision: Decision  # of the flight software; its target is the reference at the true time
+    decision: Decision  # decision of the flight software; its target is the reference at the true time
     torques: Torques
     x_at: Callable[[Scalar], Any]  # time in the interval [s] -> true state then
     step: Scalar  # longest integration step [s]
-    drive: Drive | None = None  # of the actuators
+    drive: Drive | None = None  # input of the actuators in the period
 
 
 class Vehicle(NamedTuple):
@@ -65,11 +65,11 @@ class Vehicle(NamedTuple):
 
     parts: Parts
     software: Software
-    k2: Bound  # on the error of the estimated disturbance
-    matrix: Array  # `Observer.update_matrix` of a whole period
-    first_matrix: Array  # of the partial first period
-    walk_key: draws.Key | None  # None: no random walk of the disturbance
-    jitter_key: draws.Key | None  # None: samples come at their nominal times
+    k2: Bound  # bound K2(t) on the error of the estimated disturbance
+    matrix: Array  # `Observer.update_matrix` of a full period
+    first_matrix: Array  # `Observer.update_matrix` of the partial first period
+    walk_key: draws.Key | None  # random key of the disturbance's random walk; None: no random walk
+    jitter_key: draws.Key | None  # random key of the timing jitter; None: samples come at their nominal times
 
     def period(self, tick: Tick) -> Period:
         """Return the control period of a tick, at its nominal times."""
@@ -86,7 +86,7 @@ class Vehicle(NamedTuple):
         return largest * (2.0 * draws.uniforms(self.jitter_key, 1, sample)[0] - 1.0)
 
     def advance_walk(self, walk: Array | None, dt: Scalar, sample: Array) -> Array | None:
-        """Return the random walk of the disturbance, (m,) [N m], after a further step over a period of dt [s]."""
+        """Return the random walk of the disturbance, (m,) [N m], after one more step for a period of dt [s]."""
         if walk is None or self.walk_key is None or self.parts.walk_rate is None:
             return None
         return walk + self.parts.walk_rate * dt * draws.normals(self.walk_key, walk.size, sample)
@@ -97,7 +97,7 @@ def control_period(vehicle: Vehicle, state: State, tick: Tick) -> tuple[State, R
 
     Args:
         vehicle: the constants of the run.
-        state: at the sample that begins the period.
+        state: state of the loop at the sample that begins the period.
         tick: the period.
 
     Returns:

@@ -17,8 +17,8 @@ from ptsmc_jax.simulation.assembly import Parts, check_parts
 
 WHOLE, AXIS = "observer_gain", "observer_gain_"
 BANDWIDTH, T_F = "sensors.filter.bandwidth", "controller.t_f"  # both change more than one field of the parts
-LAST = ("k1", "sign_width", "surface_rate", "t_f")  # gains of a law that reports list after those of the observer
-MADE_ANEW = "build the parts for them, with ptsmc_jax.replace or with the argument reach of scenario.study"
+LAST = ("k1", "sign_width", "surface_rate", "t_f")  # gains of the law that reports list after the observer's gains
+BUILD_AGAIN = "build the parts for them, with ptsmc_jax.replace or with the argument reach of scenario.study"
 
 
 def base(name: str) -> str:
@@ -87,7 +87,7 @@ def with_gains(parts: Parts, gains: Mapping[str, Array | float]) -> Parts:
         if name not in known:
             raise ValueError(f"{name} is no gain of these parts; allowed are {', '.join(sorted(known))}")
     numbers = {name: _number(name, value) for name, value in gains.items()}
-    for name, path in known.items():  # in this order: a gain of a single axis overrides the gain of all axes
+    for name, path in known.items():  # single axes come last, so that they override the gain of all axes
         if name in numbers:
             parts = _put(parts, path, numbers[name])
     _check_clock(parts)
@@ -114,16 +114,16 @@ def _check_clock(parts: Parts) -> None:
     """Raise ValueError if a clock has too few samples or steps for t_f and delta. Traced values are not checked."""
     clock: Any = parts.clock
     law = parts.controller
-    longest = clock.period if clock.sampled else clock.max_step  # step
+    longest = clock.period if clock.sampled else clock.max_step  # longest step [s]
     times = [law.t_f, law.delta, parts.t_end, longest]
     if any(isinstance(v, core.Tracer) or np.ndim(v) > 0 for v in times):
         return
     t_f, delta, t_end, longest = map(float, times)
-    # with plain numbers: if another gain is traced, arrays of JAX would be traced, too
+    # plain numbers, because JAX arrays would become tracers if another gain is traced
     if not clock.sampled and replace(clock, max_step=longest).too_coarse(t_f, delta, np):
         raise ValueError(
             f"t_f = {t_f:g} s with delta = {delta:g} s needs more than the {clock.before} steps that the parts' "
-            f"continuous loop has before the hand-over; {MADE_ANEW}"
+            f"continuous loop has before the hand-over; {BUILD_AGAIN}"
         )
     if not clock.anchored:
         return
@@ -132,7 +132,7 @@ def _check_clock(parts: Parts) -> None:
         if needed > samples * longest * (1.0 + 1e-9):
             raise ValueError(
                 f"t_f = {t_f:g} s with delta = {delta:g} s needs {needed:g} s of samples {where} the hand-over, but "
-                f"the parts' clock has {samples * longest:g}; {MADE_ANEW}"
+                f"the parts' clock has {samples * longest:g}; {BUILD_AGAIN}"
             )
 
 

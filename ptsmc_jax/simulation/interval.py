@@ -23,26 +23,26 @@ class Criteria(NamedTuple):
 class Snapshot(NamedTuple):
     """The true state at one time, as far as the metrics need it."""
 
-    angle: Array  # to the reference [rad]; for other plants |x_1|
+    angle: Array  # angle to the reference [rad]; for other plants |x_1|
     rate: Array  # `Plant.speed`, |w| [rad/s]
     momentum: Array | None  # |J w| [N m s]; None: the plant has no momentum
-    modal_amplitude: Array | None = None  # `Plant.modal_amplitude`, of a flexible body [sqrt(kg) m]
+    modal_amplitude: Array | None = None  # `Plant.modal_amplitude` of a flexible body [sqrt(kg) m]
 
 
 class Start(NamedTuple):
-    """A run at t = 0."""
+    """Data at t = 0 from which the metrics are initialised."""
 
     snapshot: Snapshot
-    inputs: int  # of the plant
+    inputs: int  # number of inputs of the plant
     wheel_momentum: Array | None  # (wheels,) [N m s]; None: no wheels
-    measured: bool = False  # the law gets the measured state, not the true one
+    measured: bool = False  # whether the law gets a measured state instead of the true state
 
 
 class Arrival(NamedTuple):
     """The true state at t_f; zero before."""
 
     error: Array  # (m,) error that the law drives to zero [-]; for other plants x_1
-    angle: Array  # to the reference [rad]
+    angle: Array  # angle to the reference [rad]
 
 
 class Errors(NamedTuple):
@@ -78,9 +78,8 @@ class Interval(NamedTuple):
     last_torque: Array  # (m,) torque delivered at the end of the previous interval [N m]
     torques: Torques
     attitude_error: Callable[[], ErrorPath] | None = None  # None: pointing is not observed
-    knowledge_error: Callable[[], ConstantPath] | None = (
-        None  # of the attitude measured at the start; None: not measured
-    )
+    # error of the attitude that is measured at the start; None: the law gets the true attitude
+    knowledge_error: Callable[[], ConstantPath] | None = None
 
     @property
     def length(self) -> Array:
@@ -99,7 +98,7 @@ def integral_in_window(t: Any, t_next: Any, squares: tuple[Any, Any, Any], crite
         t: start of the interval [s], an array of JAX or NumPy.
         t_next: end of the interval [s].
         squares: squared error at the start, in the middle and at the end.
-        criteria: of the run, with t_f and the window [s].
+        criteria: criteria of the run, with t_f and the window [s].
 
     Returns:
         The integral [unit of the squares times s].

@@ -43,29 +43,34 @@ def _zero(start: Start, criteria: Criteria) -> Array:
 class Metric:
     """A metric of a run.
 
-    The memory that `init` returns changes after every interval of positive length by `update`. If the metric has
-    `update_after_t_f` instead, the memory changes after every interval that reaches t_f or begins after it; this
-    function also gets the errors at the interval's ends. `value` returns the metric at t_end.
+    `init` returns the initial accumulator, called memory. `update` changes it after every interval of positive length.
+    `update_after_t_f` instead changes it only after intervals that end at t_f or later; it also gets the errors at the
+    ends of the interval. `value` returns the metric at t_end.
     """
 
     unit: str
     meaning: str
-    of_states: tuple[str, str] | None = None  # unit and meaning for chains and systems; None: they lack the metric
+    of_states: tuple[str, str] | None = None  # unit and meaning for chains and systems; None: only for spacecraft
     table: str | None = None  # table of the scenario that a run needs to have the metric; None: every run has it
     init: Callable[[Start, Criteria], Any] = _zero  # returns None if the run lacks the metric
     update: Callable[[Any, Interval, Criteria], Any] | None = None
     update_after_t_f: Callable[[Any, Interval, Errors, Criteria], Any] | None = None
     value: Callable[[Any, Running, Criteria], Array] = lambda memory, running, criteria: memory
-    may_be_nan: bool = False  # also at the end of a run that is finite
+    may_be_nan: bool = False  # whether the metric may be NaN in a run that did not diverge
 
 
 def _peak(during: Callable[[Interval], Any], init: Callable[[Start, Criteria], Any] = _zero) -> dict[str, Any]:
-    """Return the functions of the largest value at t = 0, by default 0, and in every interval."""
+    """Return `init` and `update` of the metric that is the largest value over all intervals.
+
+    Args:
+        during: function from an interval to its largest value.
+        init: value at t = 0, by default 0.
+    """
     return {"init": init, "update": lambda memory, interval, criteria: jnp.maximum(memory, during(interval))}
 
 
 def _hold_peak(at_end: Callable[[Interval, Errors], Array], at_t_f: Callable[[Arrival], Array]) -> dict[str, Any]:
-    """Return the functions of the largest value at t_f and at the ends of intervals after it."""
+    """Return the functions of the metric that is the largest value at t_f and at the ends of intervals after t_f."""
 
     def update(memory: Array, interval: Interval, errors: Errors, criteria: Criteria) -> Array:
         return jnp.where(interval.t_next > criteria.t_f, jnp.maximum(memory, at_end(interval, errors)), memory)
@@ -77,7 +82,7 @@ def _hold_peak(at_end: Callable[[Interval, Errors], Array], at_t_f: Callable[[Ar
 
 
 def _window_rms(squares: Callable[[Interval, Errors], tuple[Array, Array, Array]]) -> dict[str, Any]:
-    """Return the functions of the RMS over the window after t_f.
+    """Return the functions of the metric that is the RMS over the window after t_f.
 
     The memory is the integral of the parabola through the squares at the start, the middle and the end of each
     interval. It is of fourth order and once differentiable in t_f.
@@ -94,14 +99,14 @@ def _window_rms(squares: Callable[[Interval, Errors], tuple[Array, Array, Array]
 
 
 def _squared_errors(interval: Interval, errors: Errors) -> tuple[Array, Array, Array]:
-    """Return |error|^2. The error in the middle is that of the cubic through both ends and their rates (Hermite)."""
+    """Return |error|^2 at start, middle and end. The middle error is from cubic Hermite interpolation."""
     middle = integrators.hermite_middle(*errors, interval.length)
     g0, g1, g2 = (jnp.sum(e * e) for e in (errors.start, middle, errors.end))
     return g0, g1, g2
 
 
 def _squared_angles(interval: Interval, errors: Errors) -> tuple[Array, Array, Array]:
-    """Return angle^2. An angle has a kink at zero, so the angle in the middle comes from the cubic of the error."""
+    """Return angle^2 at start, middle and end. The angle has a kink at zero, so the error vector is interpolated."""
     start, middle, end = interval.start.angle, interval.middle_angle(), interval.end.angle
     return start * start, middle * middle, end * end
 
@@ -115,7 +120,7 @@ def _size(of_wheels: Any) -> Array:
 
 
 def _limited_fraction(memory: Array, running: Running, criteria: Criteria) -> Array:
-    """Return NaN if a delivered torque was NaN, because the limits then mean nothing."""
+    """Return the fraction of the time with a limited command, or NaN if a delivered torque was NaN."""
     return jnp.where(jnp.isnan(running.memories["effort"]), jnp.nan, memory / criteria.t_end)
 
 
@@ -130,7 +135,7 @@ def _unsettled(snapshot: Snapshot, criteria: Criteria) -> Array:
 
 
 def _settled_at(memory: Array, interval: Interval, criteria: Criteria) -> Array:
-    """Return the end of the last time above the settling angle [s], interpolated; infinite while above it."""
+    """Return the last time at which the angle falls below the settling angle [s]; infinite while it is above."""
     start, end = interval.start, interval.end
     above, above_next = _unsettled(start, criteria), _unsettled(end, criteria)
     drop = jnp.where(above & ~above_next, start.angle - end.angle, 1.0)
@@ -153,7 +158,10 @@ def _chattering(memory: Array, running: Running, criteria: Criteria) -> Array:
 
 
 def _residual(memory: Array, interval: Interval, criteria: Criteria) -> Array:
-    """Return the largest amplitude at the ends of intervals from t_f on; the first of them replaces the memory."""
+    """Return the largest amplitude of the flexible modes at the ends of intervals from t_f on.
+
+    Before t_f the memory is the initial amplitude. It does not count and is replaced at t_f.
+    """
     amplitude = interval.end.modal_amplitude
     assert amplitude is not None
     early, reached = interval.t < criteria.t_f, interval.t_next >= criteria.t_f

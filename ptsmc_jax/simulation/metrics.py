@@ -22,9 +22,9 @@ from ptsmc_jax.simulation.pointing_report import PointingErrors
 
 @jax.tree_util.register_pytree_with_keys_class
 class Metrics(dict[str, Any]):
-    """The metrics that a run has, scalars by name; units and meanings are in `catalogues`.
+    """The metrics of a run, scalars by name; units and meanings are in `catalogues`.
 
-    Each is an attribute, too. The attribute of a metric that the run lacks is NaN.
+    Each metric is also an attribute. The attribute is NaN if the run does not have the metric.
     """
 
     def __getattr__(self, name: str) -> Any:
@@ -54,15 +54,15 @@ def _shown(value: Any) -> str:
 
 
 class Running(NamedTuple):
-    """The metrics of a run so far."""
+    """Accumulators of the metrics of a run up to the present time."""
 
     arrival: Arrival
-    memories: dict[str, Any]  # of the metrics that the run has, by name
-    pointing: PointingErrors | None  # None: no pointing is observed
+    memories: dict[str, Any]  # accumulators of the metrics that the run has, by name
+    pointing: PointingErrors | None  # accumulators of the pointing errors; None: pointing errors are not observed
 
 
 def begin(start: Start, criteria: Criteria) -> Running:
-    """Return the metrics at t = 0."""
+    """Return the accumulators at t = 0 (accumulator pattern: `begin`, `update`, `finish`)."""
     arrival = Arrival(jnp.zeros(start.inputs), jnp.zeros_like(criteria.t_f))
     memories = {name: metric.init(start, criteria) for name, metric in METRICS.items()}
     present = {name: memory for name, memory in memories.items() if memory is not None}
@@ -70,7 +70,7 @@ def begin(start: Start, criteria: Criteria) -> Running:
 
 
 def update(running: Running, interval: Interval, criteria: Criteria) -> Running:
-    """Return the metrics after one interval; an interval of length zero changes nothing."""
+    """Return the accumulators after one more interval. An interval of length zero changes nothing."""
     has_length, old = interval.length > 0.0, running.memories
     new = {name: m.update(old[name], interval, criteria) for name, m in METRICS.items() if name in old and m.update}
     late = {name: old[name] for name, metric in METRICS.items() if name in old and metric.update_after_t_f}
@@ -84,7 +84,7 @@ def update(running: Running, interval: Interval, criteria: Criteria) -> Running:
 
 
 def _update_after_t_f(running: Running, interval: Interval, criteria: Criteria) -> Running:
-    """Return the values that change after an interval that reaches t_f; `memories` has only these, too."""
+    """Update the accumulators that only change in intervals that end at t_f or later; `memories` has no others."""
     errors = interval.errors()
     arrival = jax.lax.cond(interval.t < criteria.t_f, interval.arrival, lambda: running.arrival)
     updates = {name: METRICS[name].update_after_t_f for name in running.memories}
@@ -95,13 +95,13 @@ def _update_after_t_f(running: Running, interval: Interval, criteria: Criteria) 
 
 
 def finish(running: Running, criteria: Criteria) -> Metrics:
-    """Return the metrics at t_end."""
+    """Return the metrics of the complete run from the accumulators at t_end."""
     memories = running.memories
     values = {name: m.value(memories[name], running, criteria) for name, m in METRICS.items() if name in memories}
     return Metrics(values | pointing_report.values(running.pointing, criteria))
 
 
 def unbounded(values: Metrics) -> Array:
-    """Return whether a metric is infinite or NaN, such as the square of a number that is too large."""
+    """Return whether a metric is infinite or NaN, for example because a square overflows."""
     checked = [values[name] for name in METRICS if name in values and not METRICS[name].may_be_nan]
     return ~jnp.all(jnp.isfinite(jnp.stack(checked)))

@@ -57,7 +57,7 @@ class Pointing:
 
 
 def across(boresight: Any) -> np.ndarray:
-    """Return the frame of a boresight (3,), which need not be a unit vector: rows are it and two directions across."""
+    """Return the frame (3, 3) of a boresight (3,) of any length: rows are its unit vector and two directions across."""
     b = np.asarray(boresight, dtype=float)
     b = b / np.linalg.norm(b)
     first = np.cross(b, np.eye(3)[np.argmin(np.abs(b))])
@@ -100,7 +100,7 @@ class ErrorPath(NamedTuple):
     rise: Array
     a: Array
     b: Array
-    length: Scalar  # of the interval [s]
+    length: Scalar  # length of the interval [s]
 
     def at(self, x: Scalar) -> Array:
         """Return the error at the fraction x of the interval."""
@@ -118,7 +118,7 @@ class ConstantPath(NamedTuple):
     """An `attitude_error` (5,) that is constant over an interval."""
 
     end: Array  # [rad]
-    length: Scalar  # of the interval [s]
+    length: Scalar  # length of the interval [s]
 
     def at(self, x: Scalar) -> Array:
         """Return the error."""
@@ -153,14 +153,14 @@ def constant_path(
 
 
 class Segments(NamedTuple):
-    """The segments of the error in the present window. They are needed because the mean is known only at its end."""
+    """Buffer of the error's segments in the present window, because its mean is known only at its end."""
 
-    ends: Array  # (segments, 2, 5) at the start and the end of each [rad]
-    lengths: Array  # (segments,) [s]; 0: not filled yet
+    ends: Array  # (segments, 2, 5) error at the start and at the end of each segment [rad]
+    lengths: Array  # (segments,) length of each segment [s]; 0: not filled yet
     filled: Array  # number of filled segments
 
     def added(self, start: Array, end: Array, length: Scalar) -> "Segments":
-        """Return the segments with a further one. Without free space it is dropped, and `filled` exceeds the size."""
+        """Append a segment. If no space is left, it is dropped and `filled` exceeds the number of places."""
         return Segments(
             self.ends.at[self.filled].set(jnp.stack([start, end])),
             self.lengths.at[self.filled].set(length),
@@ -168,7 +168,7 @@ class Segments(NamedTuple):
         )
 
     def emptied(self) -> "Segments":
-        """Return no segments."""
+        """Return the buffer without segments."""
         return Segments(self.ends, jnp.zeros_like(self.lengths), jnp.zeros_like(self.filled))
 
     def time_beyond(self, mean: Array, limits: Float[Array, "4"]) -> Float[Array, "4"]:
@@ -182,37 +182,37 @@ class Segments(NamedTuple):
 
 
 class Window(NamedTuple):
-    """The present window so far."""
+    """Accumulator of the present window."""
 
-    integral: Array  # (5,) of the error [rad s]
+    integral: Array  # (5,) time integral of the error [rad s]
     high: Array  # (3 + DIRECTIONS,) largest projections of the error [rad]
-    low: Array  # (3 + DIRECTIONS,) smallest projections [rad]
+    low: Array  # (3 + DIRECTIONS,) smallest projections of the error [rad]
     segments: Segments | None  # None: no limit on the relative error needs them
 
     def including(self, error: Array) -> "Window":
-        """Return the window with a further value (5,) of the error in its extremes."""
+        """Return the window with `high` and `low` updated by one more value of the error, (5,) [rad]."""
         projections = _projections(error)
         return self._replace(high=jnp.maximum(self.high, projections), low=jnp.minimum(self.low, projections))
 
 
 class Tally(NamedTuple):
-    """The indices of one error so far, about each axis and of the half-cone, (4,) each [rad]."""
+    """Accumulator of the indices of one pointing error. Arrays (4,) are about each axis and of the half-cone."""
 
-    largest: Array  # of the error
-    mean: Array  # largest mean of a window
-    relative: Array  # largest relative error
+    largest: Array  # (4,) largest absolute error up to now [rad]
+    mean: Array  # (4,) largest mean of a complete window [rad]
+    relative: Array  # (4,) largest relative error in a complete window [rad]
     window: Window
-    means_high: Array  # (3 + DIRECTIONS,) largest means of complete windows
-    means_low: Array  # smallest means
+    means_high: Array  # (3 + DIRECTIONS,) largest projections of the means of complete windows [rad]
+    means_low: Array  # (3 + DIRECTIONS,) smallest projections of these means [rad]
     windows: Scalar  # number of complete windows
     # times beyond limits are exactly 0 in a run that keeps them; times within would have rounding errors
-    beyond: Array  # time in which the error is beyond its limits [s]
-    means_beyond: Array  # length of the complete windows whose mean is beyond its limits [s]
-    relative_beyond: Array  # time in complete windows in which the relative error is beyond its limits [s]
+    beyond: Array  # (4,) time with the error beyond its limits [s]
+    means_beyond: Array  # (4,) total length of the complete windows with a mean beyond its limits [s]
+    relative_beyond: Array  # (4,) time with the relative error beyond its limits, in complete windows [s]
 
 
 def begin(zero: Scalar, segments: int = 0) -> Tally:
-    """Return the tally before the observation.
+    """Return the accumulator before the observation.
 
     Args:
         zero: a zero with the type of the numbers of the run.
@@ -233,16 +233,16 @@ def update(
     window: Scalar,
     limits: Float[Array, "3 4"],
 ) -> Tally:
-    """Return the tally after an interval, which is at most as long as a window.
+    """Return the accumulator after an interval, which is at most as long as a window.
 
     Args:
-        tally: tally before the interval.
+        tally: accumulator before the interval.
         error: error over the interval.
         t: start of the interval [s].
         t_next: end of the interval [s].
         begins: start of the observation [s].
         window: length D of a window [s].
-        limits: on the error, on its means and on the relative error, about each axis and of the half-cone [rad].
+        limits: limits (3, 4) of the error, its mean and the relative error, about each axis and of the half-cone [rad].
     """
     length = error.length
     since = jnp.clip((begins - t) / length, 0.0, 1.0)  # fraction of the interval before the observation
@@ -279,7 +279,7 @@ def update(
             segments = segments.emptied().added(last, error.end, length * (1.0 - until))
         projections = _projections(last)
         new = Window(rest, projections, projections, segments).including(error.end)
-        if isinstance(error, ConstantPath):  # it jumps here: the value that ends with a window is not in the next one
+        if isinstance(error, ConstantPath):  # the error jumps here: its old value is not part of the next window
             lasts = t_next > window_end + by_rounding
             high, low = jnp.where(lasts, new.high, -jnp.inf), jnp.where(lasts, new.low, jnp.inf)
             new = new._replace(high=high, low=low)
@@ -314,12 +314,12 @@ def _sizes(error: Array) -> Array:
 
 
 def _sizes_of(projections: Array) -> Array:
-    """Return the sizes about each axis and of the half-cone, (4,), from the largest projections, see `DIRECTIONS`."""
+    """Return the sizes about each axis and of the half-cone, (4,) [rad], from projections, see `DIRECTIONS`."""
     return jnp.append(projections[:3], jnp.max(projections[3:]) / np.cos(0.5 * np.pi / DIRECTIONS))
 
 
 def _fraction_beyond(start: Array, end: Array, limits: Array) -> Array:
-    """Return the fraction of an interval in which sizes are beyond limits, if they are linear between its ends."""
+    """Return the fraction of an interval with sizes beyond the limits, if the sizes are linear in the interval."""
     within, within_next = start <= limits, end <= limits
     uncrossed = jnp.where(within & within_next, 0.0, 1.0)
     crosses = within != within_next

@@ -1,4 +1,4 @@
-"""The pointing error indices of a run as one accumulator, and its values by the names of their columns."""
+"""Accumulators of all pointing error indices of a run, and their values by metric name."""
 
 from typing import NamedTuple
 
@@ -15,18 +15,18 @@ ATTITUDE, KNOWLEDGE = ("ape", "mpe", "rpe"), ("ake", "mke", "rke")  # absolute, 
 
 
 class PointingErrors(NamedTuple):
-    """The indices of the pointing errors so far."""
+    """Accumulators of the pointing error indices."""
 
-    attitude: Tally
-    knowledge: Tally | None  # of the attitude that the law is given; None: the true one
+    attitude: Tally  # error of the true attitude
+    knowledge: Tally | None  # error of the attitude that the law gets; None: the law gets the true attitude
 
 
 def begin(criteria: Criteria, *, measured: bool) -> PointingErrors | None:
     """Return the accumulator at t = 0, or None if no pointing is observed.
 
     Args:
-        criteria: of the run.
-        measured: whether the law is given a measured attitude.
+        criteria: criteria of the run.
+        measured: whether the law gets a measured attitude.
     """
     observed, zero = criteria.pointing, jnp.zeros_like(criteria.t_f)
     if observed is None:
@@ -53,7 +53,7 @@ def update(errors: PointingErrors | None, interval: Interval, criteria: Criteria
 
 
 def _limits(observed: Pointing, names: tuple[str, ...]) -> Array:
-    """Return the limits on indices about each axis and of the half-cone, (indices, 4) [rad]; infinite if none."""
+    """Return the limits of the indices about each axis and of the half-cone, (indices, 4) [rad]; infinite: no limit."""
     limits = [[jnp.asarray(observed.limits.get(f"{name}_{axis}", jnp.inf)) for axis in AXES] for name in names]
     return jnp.stack([jnp.stack(of_axes) for of_axes in limits])
 
@@ -74,10 +74,10 @@ def _indices(tally: Tally, names: tuple[str, str, str], observed: Pointing, leng
     """Return the values of each index, (4,) [rad], and the fractions of the time within limits, (4,) [-].
 
     Args:
-        tally: of one error.
-        names: of its absolute, mean and relative index.
+        tally: accumulator of one error.
+        names: names of its absolute, mean and relative index.
         observed: the observation.
-        length: of the observation [s].
+        length: length of the observation [s].
     """
     absolute, mean, relative = names
     in_windows = tally.windows * observed.window
@@ -97,6 +97,6 @@ def _indices(tally: Tally, names: tuple[str, str, str], observed: Pointing, leng
 
 
 def _fraction_within(beyond: Array, total: Array) -> Array:
-    """Return the fraction of a time [s] that is not beyond limits; by rounding the times beyond may sum up to more."""
+    """Return the fraction of a total time [s] within limits. Rounding may make the time beyond them longer than it."""
     left = total - beyond
     return jnp.where(left <= guards.time_tolerance(total, total), 0.0, left / total)

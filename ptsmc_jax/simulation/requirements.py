@@ -50,7 +50,7 @@ def fewest_trials(quantile: float, confidence: float) -> int:
 
 
 def violation_ratio(values: Any, limit: Any, *, at_least: bool) -> Any:
-    """Return values over a limit, as arrays of NumPy or JAX. The ratio is 1 at the limit and larger beyond it.
+    """Return the ratio of values to a limit, as NumPy or JAX arrays. It is 1 at the limit and larger beyond it.
 
     If values must be at least the limit, the ratio is 2 - value / limit, and 0 for an infinite value. For a limit of
     zero it is 0 if the limit is kept, and above 1 otherwise.
@@ -76,21 +76,21 @@ class Verdict:
     metric: str
     limit: float
     unit: str
-    worst: float  # largest value, NaN if a trial failed
-    margin: float  # deciding value over the limit, see `violation_ratio`: met up to 1; NaN or infinite: not met
+    worst: float  # largest value over the trials (smallest with `at_least`), NaN if a trial failed
+    margin: float  # `violation_ratio` of the quantile or the worst value: met up to 1; NaN or infinite: not met
     failures: int  # trials beyond the limit or without a value
     trials: int
     quantile: float | None = None  # fraction of trials that must keep the limit; None: all of them
     confidence: float | None = None  # confidence that the fraction of all possible trials is at least the quantile
-    at_least: bool = False  # the limit is the smallest allowed value, and `worst` is the smallest value
+    at_least: bool = False  # whether the limit is the smallest allowed value
     interpretation: str = "ensemble"
     # fraction of the time within the limit: the smallest of all runs, or, mixed, the mean over the runs
     fraction_of_time: float | None = None
-    shown: float | None = None  # its lower bound with the confidence
+    shown: float | None = None  # lower bound of `fraction_of_time` with the confidence
 
     @property
     def met(self) -> bool:
-        """Whether enough trials keep the limit, or all trials for enough of the time."""
+        """Whether the requirement is met, in its `interpretation` of the probability."""
         if self.interpretation == "mixed" and self.shown is not None:
             return self.quantile is not None and self.shown >= self.quantile
         if self.interpretation == "temporal":
@@ -167,7 +167,7 @@ class Requirement:
 
     metric: str
     limit: float
-    unit: str | None = None  # of the metric; None: the unit that a spacecraft has
+    unit: str | None = None  # unit of the metric; None: its unit for a spacecraft
     quantile: float | None = None  # fraction of the runs or of the time, see `INTERPRETATIONS`
     confidence: float | None = None
     at_least: bool = False
@@ -193,7 +193,7 @@ class Requirement:
         """Return the verdict on trials. A trial that failed or has no value breaks the limit.
 
         Args:
-            values: of the metric, (trials,) in its unit, or () for a single run. A single run has no quantile.
+            values: values of the metric, (trials,) in its unit, or () for a single run. A single run has no quantile.
             ok: whether each trial has finished, bool of the same shape.
             within: fraction of the time within the limit, same shape; needed if the requirement is on the time.
         """
@@ -241,7 +241,7 @@ def verdicts(requirements: Iterable[Requirement], values: Callable[[str], Any], 
     """Return a verdict for each requirement.
 
     Args:
-        requirements: on metrics.
+        requirements: requirements on metrics.
         values: function from the name of a metric to its values, (trials,), or () for a single run.
         finished: whether each run has finished, bool of the same shape.
     """

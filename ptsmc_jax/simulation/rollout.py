@@ -156,7 +156,7 @@ class _SimulateProgram(programs.Program):
 
 # one compiled program for all parts of the same structure
 simulate_parts = _SimulateProgram(simulate, ("record", "software"), title="the simulation")
-# for a single run: compiles in half to a tenth of the time, and runs 3 to 8 times as long
+# the same function for a single run: compiles 2 to 10 times as fast, and runs 3 to 8 times as slowly
 simulate_once = _SimulateProgram(simulate, ("record", "software"), programs.QUICKLY, title="the simulation")
 LONG = 20_000  # periods of a run. Longer runs are worth a slow compilation.
 

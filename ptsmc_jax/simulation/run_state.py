@@ -28,7 +28,7 @@ STATUS = {
     INCOMPLETE: ("incomplete", "the clock was made for other gains, and has too few samples or steps for these"),
 }
 FINISHED = (OK, NOT_CONVERGED)  # statuses of runs that were simulated to t_end
-# clearance from the singularity of the law; its gain grows like 1 / clearance and is 1000 times as large here
+# distance to the singularity of the law at which a run counts as singular; the law's gain grows like 1 / distance
 SINGULAR_DISTANCE = 1e-3
 # a run has not converged if its angle at t_f is larger than both of these
 NOT_CONVERGED_FRACTION = 0.05  # fraction of the initial angle
@@ -36,7 +36,7 @@ NOT_CONVERGED_SETTLING_ANGLES = 10.0
 
 
 class Log(NamedTuple):
-    """History at the start of each interval and at t_end; arrays (time, component), time (time,).
+    """History at the start of each interval and at t_end: arrays (time, component), and `t` (time,).
 
     In the sampled loop the row at t_end has d_hat and s of a further sample, and the torques held until t_end.
     """
@@ -52,7 +52,7 @@ class Log(NamedTuple):
     error: Array  # error that the law drives to zero: the attitude error vector [-]; for a chain x_1
     wheels: tuple[Array, Array] | None  # momentum of each reaction wheel [N m s], and its torque [N m]
     has_length: Array  # bool: the interval of this row has a positive length, or the row is the last
-    readings: dict[str, Array] | None = None  # of the sensors, see `Sensor.inputs`; None in the continuous loop
+    readings: dict[str, Array] | None = None  # sensor readings, see `Sensor.inputs`; None in the continuous loop
     sent: Array | None = None  # torque that the computer sends to the actuators [N m]
 
     __repr__ = listing
@@ -63,7 +63,7 @@ class Result(NamedTuple):
 
     metrics: metrics.Metrics
     status: Array  # code, see `STATUS`
-    bad_time: Array  # time at which the status became other than ok [s]; NaN: it is ok
+    bad_time: Array  # time of the first failure, at which the status changed [s]; NaN: the status is ok
     log: Log | None  # history; None: not recorded
     samples: dict[str, Array]  # number of samples by the status that exported C reports; empty for simulated software
 
@@ -79,8 +79,8 @@ class Run(NamedTuple):
     x0: Any
     target_0: Any  # reference at t = 0
     target_t_f: Any  # reference at t_f
-    singularity_distance_unit: Array  # unit of the distance to the singularity of the law
-    gap: Array  # first time without samples of the clock [s]; NaN: there are samples from t = 0 to t_end
+    singularity_distance_unit: Array  # divisor of the distance to the law's singularity, see `Kinematics`
+    gap: Array  # first time that the clock has no samples for [s]; NaN: there are samples from t = 0 to t_end
     record: bool  # whether the history is recorded
 
 
@@ -94,7 +94,7 @@ class Score(NamedTuple):
 
 
 def begin(run: Run) -> Score:
-    """Return the score at t = 0."""
+    """Return the accumulated metrics and the status at t = 0."""
     parts, zero, no_torque = run.parts, jnp.zeros_like(run.criteria.t_f), jnp.zeros(run.parts.plant.inputs)
     snapshot = _snapshot(parts, run.target_0, run.x0)
     momentum = None if parts.actuators.wheels is None else parts.actuators.wheels.initial
@@ -176,7 +176,7 @@ def row_at(
         run: constants of the run.
         t: time [s].
         x: true state.
-        decision: of the flight software.
+        decision: decision of the flight software.
         u: delivered torque, (m,) [N m].
         has_length: see `Log`.
         walk: random walk of the disturbance, (m,) [N m], or None.
@@ -198,8 +198,8 @@ def finish(run: Run, first: Score, score: Score, log: Log | None, samples: dict[
 
     Args:
         run: constants of the run.
-        first: score at t = 0.
-        score: score at t_end.
+        first: metrics and status at t = 0.
+        score: metrics and status at t_end.
         log: history, or None.
         samples: see `Result`.
     """
@@ -221,7 +221,7 @@ def is_not_converged(angle_at_t_f: Scalar, first: Scalar, settling_angle: Scalar
     Args:
         angle_at_t_f: angle to the reference at t_f [rad].
         first: angle to the reference at t = 0 [rad].
-        settling_angle: of the scenario [rad].
+        settling_angle: settling angle of the scenario [rad].
     """
     return angle_at_t_f > jnp.maximum(NOT_CONVERGED_FRACTION * first, NOT_CONVERGED_SETTLING_ANGLES * settling_angle)
 
@@ -236,7 +236,7 @@ def _snapshot(parts: Parts, target: Any, x: Any) -> Snapshot:
 def _judged(
     run: Run, score: Score, x: Any, target: Any, t: Scalar, step: Scalar, u: Array, memory: Any = None
 ) -> Score:
-    """Return the score with status and first bad time after a check of the state at t. The first failure is kept.
+    """Check the state at t, and return the score with status and `bad_time` of the first failure.
 
     Exported code rejects a memory of the law that is not finite, so the simulated run counts as diverged, too.
     """
