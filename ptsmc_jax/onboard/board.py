@@ -38,7 +38,7 @@ from ptsmc_jax.signals.references import Target
 from ptsmc_jax.simulation import run_state
 from ptsmc_jax.simulation.assembly import Parts
 
-KNOWN = 0.25  # |q|^2 of an attitude that has been set
+KNOWN = 0.25  # an attitude quaternion in the state has been set if |q|^2 is larger; it is 0 before
 
 
 Given = dict[str, Any]  # values by name
@@ -52,7 +52,7 @@ class Stage:
     about: str
     reads: tuple[str, ...]
     run: Callable[[Given, Given], Given]  # (parameters, values that it reads) -> values that it writes, by name
-    parts: tuple[Any, ...] = ()  # parts whose docstrings describe the stage in the C
+    parts: tuple[Any, ...] = ()  # parts whose docstrings the C function has as a comment
 
 
 @dataclass
@@ -104,12 +104,12 @@ def _kind(part: Any) -> str:
 
 
 def real(*shape: int) -> jax.ShapeDtypeStruct:
-    """Return the shape of real numbers."""
+    """Return shape and dtype of an array of real numbers with these dimensions."""
     return jax.ShapeDtypeStruct(shape, jnp.result_type(float))
 
 
 def integer() -> jax.ShapeDtypeStruct:
-    """Return the shape of a flag."""
+    """Return shape and dtype of a flag."""
     return jax.ShapeDtypeStruct((), jnp.int32)
 
 
@@ -127,7 +127,7 @@ def board(parts: Parts, reference_input: bool = False) -> Board:
     device = parts.actuators
     parameters, inputs = known(parts), observer.model.inputs
     computer = Board(observer.model, parameters, rules=derived.rules(parts))
-    computer.about["period"] = "of the control loop [s]"
+    computer.about["period"] = "control period [s]"
     computer.about["observer_matrix"] = _summary(type(observer).update_matrix).rstrip(".")
     if parameters["filter"] is None:
         _reading(computer, parts)
@@ -137,14 +137,14 @@ def board(parts: Parts, reference_input: bool = False) -> Board:
         _filtering(computer, parts)
     _observing(computer, observer, device)
     _commanding(computer, law, observer, parts.command_filter)
-    computer.stages.append(Stage("begin", "What is remembered before the first sample.", (), begin))
+    computer.stages.append(Stage("begin", "Initial memory of observer, law and filters.", (), begin))
     if not device.ideal:
         _acting(computer, device, inputs)
     return _with_reference_input(computer) if reference_input else computer
 
 
 def _with_reference_input(computer: Board) -> Board:
-    """Return the flight computer with an input for the reference. The sign of its quaternion does not matter."""
+    """Return the flight computer with the reference as an input. Both signs of its quaternion give the same result."""
     target = jax.eval_shape(computer.parameters["reference"], real())
     about = {"reference_q": "reference attitude", "reference_w": "its rate, in reference axes [rad/s]",
              "reference_w_dot": "time derivative of that rate [rad/s^2]"}  # fmt: skip
@@ -173,7 +173,7 @@ def _with_reference_input(computer: Board) -> Board:
 
 
 def known(parts: Parts) -> dict[str, Any]:
-    """Return all parameters of the flight computer [SI units], by name; in a trial, the values that it knows."""
+    """Return all parameters of the flight computer by name [SI units], as known on board: not the true plant's."""
     observer, sensors, period = parts.observer, parts.sensors, parts.period
     parameters = {
         "law": parts.controller,
@@ -202,7 +202,7 @@ def _summary(documented: Any) -> str:
 def _continued(parameters: Given, given: Given, x: State, before: State) -> State:
     """Return the state in one of its equivalent forms, such as the sign of q.
 
-    It is the form nearest to the last sample. At the first sample the law chooses the form.
+    The form is the nearest to the state at the last sample. At the first sample it is `Kinematics.align`.
     """
     law, target = parameters["law"], parameters["reference"](given["t"])
     near, first = law.model.nearest(x, before), law.kinematics.align(x, target)
@@ -222,24 +222,24 @@ def _reading(computer: Board, parts: Parts) -> None:
         return {f"now.{name}": value for name, value in model.signals_of(x).items()}
 
     reads = ("tracking", "t", *computer.names("in"), *computer.names("before"))
-    computer.stages.append(Stage("sense", "The state for the law: as measured.", reads, sense))
+    computer.stages.append(Stage("sense", "The measured state, which the law uses without a filter.", reads, sense))
 
 
 def _filtering(computer: Board, parts: Parts) -> None:
-    """Add a stage that filters star tracker and gyro."""
+    """Add the stage of the attitude filter with constant gains, from star tracker and gyro."""
     sensors: Any = parts.sensors
     aged = sensors.own_times is not None  # the star tracker has its own clock
-    computer.parameters["filter_bandwidth"] = derived.bandwidth(sensors, parts.period)  # a short number
+    computer.parameters["filter_bandwidth"] = derived.bandwidth(sensors, parts.period)  # rounded to few digits
     age = {"attitude_age": real()} if aged else {}
     computer.inputs |= {"attitude": real(4), "attitude_valid": integer(), **age, "rate": real(3)}
     computer.state |= {"attitude": real(4), "rate": real(3), "bias": real(3), "gyro": real(3)}
     computer.about |= computer.model.signals | {
         "attitude_valid": "whether the star tracker has an attitude at this sample: 0 or 1",
-        "attitude_age": "how long before this sample that attitude was taken, from 0 to the time since the last [s]",
-        "bias": "of the gyro, estimated [rad/s]",
-        "gyro": "rate as the gyro measured it last [rad/s]",
-        "filter_bandwidth": "of the corrections by the star tracker [rad/s]",
-        "star_tracker_interval": "between its samples [s]",
+        "attitude_age": "age of this attitude at the sample, at most the time since the last sample [s]",
+        "bias": "estimated gyro bias [rad/s]",
+        "gyro": "rate that the gyro measured at the last sample [rad/s]",
+        "filter_bandwidth": "bandwidth of the corrections by the star tracker [rad/s]",
+        "star_tracker_interval": "time between two samples of the star tracker [s]",
     }
 
     def sense(parameters: Given, given: Given) -> Given:
@@ -265,14 +265,14 @@ def _filtering(computer: Board, parts: Parts) -> None:
         x = _continued(parameters, given, AttitudeState(estimate.q, rate), AttitudeState(start, rate))
         return {"now.attitude": x.q, "now.rate": rate, "now.bias": estimate.bias, "now.gyro": gyro}
 
-    about = "Attitude and rate as the law sees them: the gyro carries the attitude, the star tracker corrects it."
+    about = "Attitude filter: propagates the attitude with the gyro and corrects it with the star tracker."
     reads = ("in.attitude", "in.attitude_valid", "in.rate", "before.attitude", "before.bias", "before.gyro", "dt",
              "tracking", "t", *(("in.attitude_age",) if age else ()))  # fmt: skip
     computer.stages.append(Stage("sense", about, reads, sense, (sensors.filter,)))
 
 
 def _estimating(computer: Board, estimator: KalmanFilter) -> None:
-    """Add a stage that combines a gyro and attitude sensors in a Kalman filter of the attitude."""
+    """Add the stage of the attitude Kalman filter, from a gyro and attitude sensors."""
     computer.inputs["rate"] = real(3)
     computer.about["rate"] = computer.model.signals["rate"]
     for sensor in estimator.sensors:
@@ -282,18 +282,19 @@ def _estimating(computer: Board, estimator: KalmanFilter) -> None:
         computer.about[f"{name}_valid"] = f"whether {name} has a reading at this sample: 0 or 1"
         if sensor.times.every is None:
             computer.inputs[f"{name}_age"] = real()
-            computer.about[f"{name}_age"] = f"how long before this sample the reading of {name} was taken [s]"
+            computer.about[f"{name}_age"] = f"age of the reading of {name} at the sample [s]"
     past, size = estimator.past, 9 + 3 * estimator.past
     computer.state |= {"attitude": real(4), "rate": real(3), "bias": real(3), "gyro": real(3)}
     computer.state |= {"past_attitude": real(past, 4)} if past else {}
     computer.state |= {"past_rate": real(past, 3)} if estimator.between else {}
     computer.state["covariance"] = real(size, size)
     computer.about |= {
-        "bias": "of the gyro, estimated [rad/s]",
-        "gyro": "rate as the gyro measured it last, less its estimated noise [rad/s]",
-        "past_attitude": "estimates at the last samples, the newest first",
-        "past_rate": "estimated body rates then [rad/s]",
-        "covariance": "of the errors of attitude [rad], bias [rad/s], last gyro sample [rad/s], past attitudes [rad]",
+        "bias": "estimated gyro bias [rad/s]",
+        "gyro": "rate that the gyro measured at the last sample, minus its estimated noise [rad/s]",
+        "past_attitude": "estimated attitudes at the last samples, the newest first",
+        "past_rate": "estimated body rates at these samples [rad/s]",
+        "covariance": "covariance of the errors of attitude [rad], bias [rad/s], last gyro sample [rad/s] and past "
+        "attitudes [rad]",
     }
     states = [name for name in computer.state if name != "rate"]
     reads = (*(f"in.{name}" for name in computer.inputs), *(f"before.{name}" for name in states), "dt", "tracking", "t")
@@ -333,7 +334,7 @@ def _estimating(computer: Board, estimator: KalmanFilter) -> None:
         }
         return {f"now.{name}": value for name, value in now.items() if value is not None}
 
-    about = "Attitude and rate as the law sees them: the gyro carries the attitude, the attitude sensors correct it."
+    about = "Attitude Kalman filter: propagates the attitude with the gyro and corrects it with the attitude sensors."
     computer.stages.append(Stage("sense", about, reads, sense, (estimator,)))
 
 
@@ -342,12 +343,14 @@ def _observing(computer: Board, observer: Observer, device: Actuators) -> None:
     m, wheels = observer.model.inputs, device.wheels
     computer.state["observer"] = jax.eval_shape(observer.begin)
     computer.outputs["d_hat"] = real(m)
-    computer.about |= {"observer": "memory of the observer, which begins with the estimate",
+    computer.about |= {"observer": "memory of the observer; the first numbers are the estimate",
                    "d_hat": f"estimated disturbance{computer.unit}"}  # fmt: skip
     measured = {}  # wheel telemetry that determines the torque over the next period
     if wheels is not None:
         each = real(*np.shape(wheels.initial))
-        computer.about["wheel_momentum"] = "of each wheel: spin inertia times (wheel speed + axis . body rate) [N m s]"
+        computer.about["wheel_momentum"] = (
+            "absolute momentum of each wheel: spin inertia times (wheel speed + axis . body rate) [N m s]"
+        )
         measured = {"wheel_momentum": each, **({"acting": each} if device.moves else {})}
         computer.inputs |= measured
         computer.state |= measured
@@ -380,7 +383,7 @@ def _observing(computer: Board, observer: Observer, device: Actuators) -> None:
     telemetry = [f"{when}.{name}" for when in ("before", "in") for name in measured]
     states = (*computer.names("before"), *computer.names("now"))
     reads = ("t", "dt", "regular", "before.observer", *states, acted, *telemetry)
-    about = "The disturbance that explains the motion since the last sample, through the observer."
+    about = "Disturbance observer: estimates the disturbance from the motion since the last sample."
     computer.stages.append(Stage("observe", about, reads, observe, (observer,)))
 
 
@@ -396,7 +399,7 @@ def _commanding(computer: Board, law: Law, observer: Observer, command_filter: C
 
     computer.state["law"] = jax.eval_shape(law.begin)
     computer.outputs |= {"command": real(m), "s": real(*jax.eval_shape(once, law, x, target).shape)}
-    filtered = "" if command_filter is None else ", after the filter of its command"
+    filtered = "" if command_filter is None else ", after the command filter"
     computer.about |= {
         "law": "memory of the law",
         "command": f"command of the law{filtered}{computer.unit}",
@@ -405,13 +408,13 @@ def _commanding(computer: Board, law: Law, observer: Observer, command_filter: C
     memories, shaped = ["law"], ()
     if command_filter is not None:
         computer.state["command_filter"] = jax.eval_shape(lambda: command_filter.begin(m))
-        computer.about["command_filter"] = "integrators of the command's filter, advanced by half a period"
+        computer.about["command_filter"] = "states of the command filter, half a period ahead"
         memories, shaped = ["law", "command_filter"], (command_filter,)
     traced = jax.make_jaxpr(law.singularity_distance)(x, target)
-    singular = any(dependence(traced.jaxpr, [True] * len(traced.jaxpr.invars)))  # the distance is no constant
+    singular = any(dependence(traced.jaxpr, [True] * len(traced.jaxpr.invars)))  # whether the distance varies
     if singular:
         computer.state |= {"singularity_distance": real(), "singularity_distance_unit": real()}
-        computer.about |= {"singularity_distance": "distance to the law's singularity, over its unit [-]",
+        computer.about |= {"singularity_distance": "distance to the law's singularity, divided by its unit [-]",
                            "singularity_distance_unit": "unit of singularity_distance"}  # fmt: skip
 
     reads = ("t", "tracking", "out.d_hat", *(f"before.{name}" for name in memories), *computer.names("now"),
@@ -422,7 +425,7 @@ def _commanding(computer: Board, law: Law, observer: Observer, command_filter: C
         known, period, t = parameters["law"], parameters["period"], given["t"]
         last = {name: given[f"before.{name}"] for name in memories}
         now, reference = computer.seen(given, "now"), parameters["reference"](t)
-        hold = t >= known.hand_over - guards.time_tolerance(period, known.hand_over)  # as the clock has it
+        hold = t >= known.hand_over - guards.time_tolerance(period, known.hand_over)  # as in `clock.Flight`
 
         def decided() -> tuple[Any, Any, dict[str, Any]]:
             sample, d_hat, k2 = Sample(t, hold, period, last["law"]), given["out.d_hat"], parameters["bound"](t)
@@ -448,7 +451,7 @@ def _commanding(computer: Board, law: Law, observer: Observer, command_filter: C
             u, s, kept = decided()
         return {"out.command": u, "out.s": s} | {f"now.{name}": value for name, value in kept.items()}
 
-    about = f"The law: the command for the measured state{filtered}; the last command if the law is singular."
+    about = f"Control law: the command for the measured state{filtered}; the last command if the law is singular."
     computer.stages.append(Stage("command", about, reads, command, (law, law.kinematics, *shaped)))
 
 
@@ -467,21 +470,21 @@ def _acting(computer: Board, device: Actuators, m: int) -> None:
     wheels, reads = device.wheels, ["out.command"]
     if device.delay:
         computer.state["queue"] = real(device.delay, m)
-        computer.about["queue"] = "commands on their way, the oldest first [N m]"
+        computer.about["queue"] = "delayed commands, the oldest first [N m]"
         reads.append("before.queue")
     if device.moves:
         computer.inputs.setdefault("acting", real(m))
-        computer.about["acting"] = "torque of each axis, or wheel, at this sample, from telemetry [N m]"
+        computer.about["acting"] = "torque of each axis or wheel at this sample, from telemetry [N m]"
         reads.append("in.acting")
     compensated = "" if wheels is None else ", plus the compensation of the wheels' momentum"
     computer.outputs |= {"sent_torque": real(m), "torque": real(m)}
     computer.about["sent_torque"] = (
-        f"sent to the actuators at this sample: `command` within its limit{compensated}{computer.unit}"
+        f"torque to send to the actuators at this sample: `command` within its limit{compensated}{computer.unit}"
     )
     computer.about["torque"] = "torque on the body from this sample on, as the flight computer assumes it [N m]"
     if wheels is not None:
         computer.outputs["wheel_torque"] = real(*np.shape(wheels.initial))
-        computer.about["wheel_torque"] = "of each wheel on the body, about its axis, from this sample on [N m]"
+        computer.about["wheel_torque"] = "torque of each wheel on the body about its axis, from this sample on [N m]"
         reads += ["in.wheel_momentum", "now.rate"]
 
     def act(parameters: Given, given: Given) -> Given:

@@ -1,4 +1,4 @@
-"""Branches and loops of a trace as regions of C; short loops of fixed length are unrolled."""
+"""Branches and loops of a jaxpr as regions of C; short loops of fixed length are unrolled."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -11,7 +11,7 @@ from ptsmc_jax.batching.dependence import split_scan_operands, unpack_while
 from ptsmc_jax.onboard.expressions import BOOL, Block, Node, Region, kind_of
 
 UNROLLED = 8  # largest number of passes of an unrolled loop
-WRITTEN = 200  # largest number of their operations
+WRITTEN = 200  # largest number of operations of an unrolled loop
 
 
 def _inside(to: Any, region: Region, made: Callable[[], list[np.ndarray]]) -> None:
@@ -28,7 +28,7 @@ def _flat(arrays: Sequence[np.ndarray]) -> list[Node]:
 
 
 def _variables(to: Any, like: Sequence[Any]) -> list[np.ndarray]:
-    """Return variables for the components of these variables of the trace."""
+    """Return new C variables for the components of these variables of the jaxpr."""
     shapes, kinds = [v.aval.shape for v in like], [kind_of(v.aval.dtype) for v in like]
     return [object_array(shape, [to.pool.fresh(kind) for _ in range(math.prod(shape))])
             for shape, kind in zip(shapes, kinds, strict=True)]  # fmt: skip
@@ -51,7 +51,7 @@ def branch(to: Any, eqn: Any, values: list[np.ndarray]) -> list[np.ndarray]:
 
     Args:
         to: the translator.
-        eqn: the equation of the trace.
+        eqn: the equation of the jaxpr.
         values: components of its inputs.
 
     Returns:
@@ -65,7 +65,7 @@ def branch(to: Any, eqn: Any, values: list[np.ndarray]) -> list[np.ndarray]:
 
 
 def _switch(to: Any, eqn: Any, test: Node, branches: Sequence[Any], operands: list[np.ndarray]) -> list[np.ndarray]:
-    """Translate a choice between the last branch and the branches before it."""
+    """Translate lax.switch as an if statement: the last branch, or else the branches before it."""
     last = len(branches) - 1
     if test.kind == BOOL:
         on = test
@@ -135,7 +135,10 @@ def scan(to: Any, eqn: Any, values: list[np.ndarray]) -> list[np.ndarray]:
 
 
 def _entries(to: Any, region: Region, x: np.ndarray) -> np.ndarray:
-    """Return the entries of x (passes, ..) in one pass of a counted loop; each component becomes a table."""
+    """Return the entries of an input x (passes, ..) in one pass of a counted loop.
+
+    Each component of x becomes a C array, which the loop reads at its index.
+    """
     nodes = []
     for column in x.reshape(len(x), -1).T:
         table = to.pool.fresh(column[0].kind, "table")
@@ -145,7 +148,7 @@ def _entries(to: Any, region: Region, x: np.ndarray) -> np.ndarray:
 
 
 def _filled(to: Any, region: Region, aval: Any, order: range) -> np.ndarray:
-    """Return a stacked output (passes, ..) of a counted loop: tables that the loop fills."""
+    """Return a stacked output (passes, ..) of a counted loop, from C arrays that the loop fills."""
     kind, columns = kind_of(aval.dtype), []
     for _ in range(math.prod(aval.shape)):
         table = to.pool.fresh(kind, "table")
@@ -155,4 +158,4 @@ def _filled(to: Any, region: Region, aval: Any, order: range) -> np.ndarray:
     return object_array((len(order), *aval.shape), (column[k] for k in range(len(order)) for column in columns))
 
 
-CONTROL = {"scan": scan, "while": loop, "cond": branch}  # by primitive; `to` is the translator
+CONTROL = {"scan": scan, "while": loop, "cond": branch}  # rules by primitive; `to` is the translator

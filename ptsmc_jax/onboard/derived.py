@@ -64,9 +64,9 @@ def _filtering(sensors: Any) -> Rule:
     every = sensors.every
 
     def run(given: Given) -> Given:
-        """Derive the gains of `attitude_filter.filter_gains` with `expm1` against cancellation in single precision."""
+        """Compute the gains of `attitude_filter.filter_gains`, with `expm1` for accuracy in single precision."""
         interval = given.get("star_tracker_interval", given["period"] * every)
-        gone = -jnp.expm1(-given["filter_bandwidth"] * interval)  # 1 - p
+        gone = -jnp.expm1(-given["filter_bandwidth"] * interval)  # 1 - p with the pole p of the filter
         known = replace(given["filter"], attitude_gain=gone * (2.0 - gone), bias_gain=gone**2 / interval)
         return given | {"filter": known}
 

@@ -1,4 +1,4 @@
-"""Scalar expressions, between a trace and C.
+"""Scalar expressions: the intermediate representation between a jaxpr and C.
 
 A node is an operation on other nodes. `Pool` makes nodes: it reuses equal nodes (common subexpressions), folds
 constants, and simplifies x + 0, 1 x and, for finite x, 0 x.
@@ -11,11 +11,12 @@ from typing import Any, ClassVar
 import numpy as np
 
 PASSING = ("neg", "abs", "max", "min", "sign", "sin", "cos", "tanh", "atan", "select")  # finite for finite operands
-REAL, BOOL = "real", "bool"  # kinds of numbers; the others are C's names of whole ones
+REAL, BOOL = "real", "bool"  # kinds of numbers; the other kinds are C's integer types, such as "int32_t"
+TYPES = "bool, float32, float64, int8 to int64 or uint8 to uint32"  # dtypes that have a kind
 
 
 class NoRuleError(ValueError):
-    """C has no counterpart. The message is one sentence with the operation and its line."""
+    """An operation or a type has no counterpart in C. The message names the operation and its line in the source."""
 
 
 class Title:
@@ -36,14 +37,14 @@ class Node:
         self.serial = Node.made  # operands have smaller numbers
         self.op, self.args, self.kind, self.value, self.block = op, args, kind, value, block
         self.finite = self._is_finite()
-        self.title: Title | None = None  # its name in the source
-        self.part = ""  # its component of the named value
-        self.section: Any = None  # the function of the source that computes it
+        self.title: Title | None = None  # name of the value in the source
+        self.part = ""  # indices of the component within this value
+        self.section: Any = None  # function of the source that computes the value
 
     def _is_finite(self) -> bool:
-        """Return whether the value is finite for certain, so that 0 times it is 0 and not NaN.
+        """Return whether the value is always finite, so that its product with 0 is 0 and not NaN.
 
-        C checks that its inputs and its state are finite. Parameters are finite, since a scenario has no others.
+        C checks that its inputs and its state are finite. Parameters are finite, because scenarios reject others.
         """
         if self.kind != REAL:
             return True
@@ -76,19 +77,19 @@ class Region:
     """A branch or a loop: its blocks and results."""
 
     def __init__(self, kind: str, test: Node | None = None):
-        self.kind, self.test = kind, test  # "branch", "while" or "count"
+        self.kind, self.test = kind, test  # "branch", "while" or "count"; condition of a branch
         self.blocks: list[Block] = []
-        self.outputs: list[list[Node]] = []  # of each block
-        self.results: list[Node] = []  # the outputs, as variables outside
-        self.carried: list[Node] = []  # of a loop: its state, as variables inside
-        self.initial: list[Node] = []
-        self.length = 0  # of a counted loop
-        self.index: Node | None = None
-        self.tables: list[tuple[Node, list[Node]]] = []  # tables that a counted loop reads: name, entries
-        self.rows: list[tuple[Node, int]] = []  # arrays that it fills: name, index of the output
+        self.outputs: list[list[Node]] = []  # outputs of each block
+        self.results: list[Node] = []  # variables that have the outputs after the region
+        self.carried: list[Node] = []  # variables of a loop's state
+        self.initial: list[Node] = []  # initial values of a loop's state
+        self.length = 0  # number of passes of a counted loop
+        self.index: Node | None = None  # index of a counted loop
+        self.tables: list[tuple[Node, list[Node]]] = []  # arrays that a counted loop reads: name, entries
+        self.rows: list[tuple[Node, int]] = []  # arrays that a counted loop fills: name, index of the output
 
 
-# op: its value for known operands
+# functions that evaluate an operation on constants, by operation
 FOLDED: dict[str, Callable] = {
     "add": lambda a, b: a + b,
     "sub": lambda a, b: a - b,
@@ -115,8 +116,8 @@ FOLDED: dict[str, Callable] = {
 
 
 def kind_of(dtype: Any) -> str:
-    """Return the kind of C's number for a type of JAX. Raises KeyError if there is none."""
-    if not isinstance(dtype, type | np.dtype):  # a type of JAX's own, of keys of random numbers
+    """Return the kind of the numbers of a dtype. Raises KeyError if there is none, see `TYPES`."""
+    if not isinstance(dtype, type | np.dtype):  # an extended dtype of JAX, for random keys
         raise KeyError(dtype)
     dtype = np.dtype(dtype)
     if dtype.kind == "b":
@@ -128,7 +129,7 @@ def kind_of(dtype: Any) -> str:
 
 
 class Pool:
-    """Creates the nodes of expressions in the current block. Equal expressions in reach are one node."""
+    """Creates the nodes of expressions in the current block. Equal expressions in the same scope are one node."""
 
     def __init__(self) -> None:
         self.block = Block()
@@ -137,7 +138,7 @@ class Pool:
     def constant(self, value: Any, kind: str) -> Node:
         """Return the node of a constant."""
         value = bool(value) if kind == BOOL else float(value) if kind == REAL else int(value)
-        # 0.0 and -0.0 are equal, but not the same; nan is not equal to itself
+        # distinguish 0.0 and -0.0, which are equal; find nan, which is not equal to itself
         key = ("constant", kind, math.copysign(1.0, value) if value == 0 else 0, "nan" if value != value else value)
         return self.block.find(key) or self._put(key, Node("constant", (), kind, value, self._outermost()))
 
@@ -146,9 +147,14 @@ class Pool:
         key = ("place", name)
         return self.block.find(key) or self._put(key, Node("place", (), kind, name, self._outermost()))
 
-    def fresh(self, kind: str, what: str = "variable") -> Node:
-        """Return a new variable of a loop or a branch."""
-        node = Node(what, (), kind, None, self.block)
+    def fresh(self, kind: str, op: str = "variable") -> Node:
+        """Return a new variable, index or table of a loop or a branch.
+
+        Args:
+            kind: kind of the number.
+            op: "variable", "index" or "table".
+        """
+        node = Node(op, (), kind, None, self.block)
         node.section = self.section
         return node
 

@@ -1,4 +1,4 @@
-"""Fields of C structs: pytrees taken apart, each leaf with its name, shape and meaning."""
+"""Fields of C structs: the leaves of pytrees, each with its name, shape and meaning."""
 
 import re
 from collections.abc import Mapping
@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from ptsmc_jax.batching.components import object_array
-from ptsmc_jax.onboard.expressions import NoRuleError, Pool, kind_of
+from ptsmc_jax.onboard.expressions import TYPES, NoRuleError, Pool, kind_of
 from ptsmc_jax.onboard.origins import comments
 
 
@@ -32,7 +32,12 @@ class Field:
         return [self.name + "".join(f"[{i}]" for i in index) for index in np.ndindex(*self.shape)]
 
     def nodes(self, pool: Pool, owner: str) -> np.ndarray:
-        """Return its elements as nodes, an array of its shape; owner: the text before its name, such as "in->"."""
+        """Return the elements as an array of nodes.
+
+        Args:
+            pool: makes the nodes.
+            owner: the text before the name in C, such as "in->".
+        """
         return object_array(self.shape, (pool.place(owner + element, self.kind) for element in self.elements()))
 
 
@@ -40,14 +45,14 @@ def struct(trees: Mapping[str, Any], about: Mapping[str, str]) -> dict[str, list
     """Return the fields of a struct, in order.
 
     Args:
-        trees: shapes, or trees of shapes, by name.
-        about: the meaning of single shapes, by name.
+        trees: pytrees of shapes and dtypes, by name.
+        about: the meaning of trees that are a single leaf, by name.
 
     Returns:
         A field for each leaf, by the name of the tree.
 
     Raises:
-        NoRuleError: C has no numbers of a leaf's type.
+        NoRuleError: the dtype of a leaf has no C type.
     """
     found: dict[str, list[Field]] = {}
     taken: set[str] = set()
@@ -62,7 +67,7 @@ def struct(trees: Mapping[str, Any], about: Mapping[str, str]) -> dict[str, list
             try:
                 kind = kind_of(leaf.dtype)
             except KeyError:
-                raise NoRuleError(f"{full} holds {leaf.dtype}, which C has no number for here") from None
+                raise NoRuleError(f"{full} has the type {leaf.dtype}, but must have the type {TYPES}") from None
             found[name].append(Field(full, tuple(leaf.shape), kind, meaning or ("" if path else about.get(name, ""))))
     return found
 

@@ -33,7 +33,7 @@ class Unit(NamedTuple):
     """A physical unit."""
 
     name: str  # such as "N.m"
-    exponents: dict[str, int]  # of the base units
+    exponents: dict[str, int]  # exponent of each base unit
 
 
 class Variable(NamedTuple):
@@ -47,7 +47,7 @@ class Variable(NamedTuple):
 
     @property
     def unit(self) -> Unit | None:
-        """The unit in the description, or None without exactly one unit."""
+        """The unit in brackets in `about`, or None if there is no or more than one unit."""
         found = re.findall(r"\[([^\]]+)\]", self.about)
         return unit(found[0]) if len(found) == 1 and self.kind == "r" else None
 
@@ -56,7 +56,7 @@ class Model(NamedTuple):
     """A program in C as the model of an FMU."""
 
     code: Code
-    about: About  # its `name` is that of the C files
+    about: About  # properties; `name` is the name of the C files
     title: str  # such as "controller of first_flight.toml"
     texts: dict[str, str]  # text of each C file, by file name
     t_end: float  # end of the run [s]
@@ -103,7 +103,7 @@ def variables(model: Model) -> list[Variable]:
     return [
         *listed(code.inputs, "i", {}),
         *listed(code.outputs, "o", zeros),
-        Variable("status", "i", "o", 0.0, f"of the last sample: {statuses}"),
+        Variable("status", "i", "o", 0.0, f"status of the last sample: {statuses}"),
         *listed(model.filter_state, "f", zeros, "initial_"),
         *(made for field in code.parameters
           for made in listed([field], of_period if field.name == "period" else fixed, code.values,
@@ -123,7 +123,7 @@ def _rest(field: Field) -> Any:
 
 
 def sources(model: Model, version: int) -> tuple[dict[str, str], str]:
-    """Return the texts of the C files of an FMU, by file name, and the token that the binary compares."""
+    """Return the C files of an FMU (texts by file name) and its instantiation token, a checksum of the files."""
     code, listed = model.code, variables(model)
     rows = templates.rows(code, model.about)
     elements = [element for field in model.filter_state for element in field.elements()]
@@ -166,7 +166,7 @@ def description(model: Model, version: int, token: str, units: Sequence[str]) ->
     Args:
         model: the model.
         version: version of FMI.
-        token: checksum that the binary compares.
+        token: instantiation token, which the binary compares with the token that a simulator passes.
         units: names of the C files that are compiled.
     """
     listed = variables(model)

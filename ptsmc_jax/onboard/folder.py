@@ -102,7 +102,8 @@ def simulate(made: Controller, seed: int, trials: int) -> dict[int, vectors.Samp
     usable = {k: samples for k, samples in each.items() if vectors.usable(samples)}
     if not usable:
         raise ScenarioError(
-            f"none of the first {trials} trials stays finite and away from the law's singularity: nothing to check by"
+            f"none of the first {trials} trials is finite and away from the law's singularity, but the test vectors "
+            "need at least one such trial"
         )
     return usable
 

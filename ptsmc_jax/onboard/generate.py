@@ -23,7 +23,7 @@ POINTERS = {"p": "const ptsmc_params *p", "d": "const ptsmc_derived *d", "in": "
             "before": "const ptsmc_state *before", "now": "ptsmc_state *now", "out": "ptsmc_out *out"}  # fmt: skip
 PASSED = {"d": "&state->derived", "before": "state", "now": "&now", "out": "&found"}  # arguments in ptsmc_step
 ARGUMENTS = {"t": "real t", "dt": "real dt", "regular": "int regular", "tracking": "int tracking"}
-COMMON = (object, Law, AccelerationLaw, Kinematics, AttitudeKinematics, Observer)  # not described in the C
+COMMON = (object, Law, AccelerationLaw, Kinematics, AttitudeKinematics, Observer)  # docstrings that C comments omit
 
 
 @dataclass
@@ -38,8 +38,8 @@ class Code:
     functions: list[str] = field(default_factory=list)  # text of the functions
     calls: dict[str, str] = field(default_factory=dict)  # text of the function calls, by stage
     about: dict[str, str] = field(default_factory=dict)  # description of each stage of a sample
-    counts: Counter[str] = field(default_factory=Counter)  # largest number of operations of a step
-    open: bool = False  # whether a loop has an unknown number of passes; `counts` has one pass of it
+    counts: Counter[str] = field(default_factory=Counter)  # largest number of operations of a step, by operation
+    open: bool = False  # whether a loop has an unknown number of passes; `counts` includes one pass of it
     derived: list[Field] = field(default_factory=list)  # numbers that C derives from parameters
     basis: list[Field] = field(default_factory=list)  # parameters that determine the derived numbers
     derivation: str = ""  # text of the function that computes the derived numbers
@@ -128,11 +128,11 @@ def columns(inputs: Sequence[Field], state: Sequence[Field], outputs: Sequence[F
 
 
 def names_of(board: Board) -> dict[str, list[str]]:
-    """Return the columns of a flight computer without generating its C."""
+    """Return the columns of vectors.csv for a flight computer, without generating its C."""
     return columns(*map(_listed, _structs(board).values()))
 
 
-# by the prefix of a name that a stage reads or writes: the struct, and the text before the field in C
+# struct, and text before the field in C, by the prefix of a name that a stage reads or writes
 STRUCTS = {"in": "in", "before": "before", "now": "before", "last": "out", "out": "out"}
 PLACES = {"in": "in->", "before": "before->", "now": "now->", "last": "before->last.", "out": "out->"}
 

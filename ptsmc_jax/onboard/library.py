@@ -30,7 +30,7 @@ from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.computer import OURS, SAMPLES, Computer, Decision, Period, Software
 
-SAME = 1e-6  # relative to the largest element; smaller differences come from 32 bits
+SAME = 1e-6  # relative to the largest element; smaller differences may be rounding to 32 bits
 NAMED = 4  # largest number of parameters in a message
 _loaded = itertools.count()
 
@@ -45,7 +45,7 @@ def compiler() -> list[str]:
     found = named or [name for name in ("cc", "gcc", "clang") if shutil.which(name)][:1]
     if not found or shutil.which(found[0]) is None:
         raise ScenarioError(
-            f"there is no C compiler{f' {command}' if command else ''}; allowed is cc, gcc or clang, or what CC names"
+            f"there is no C compiler{f' {command}' if command else ''}; install cc, gcc or clang, or set CC to one"
         )
     return found
 
@@ -97,7 +97,7 @@ class Library:
                 ) from None
         if sizes != list((ctypes.c_long * 4).in_dll(self._made, "ptsmc_sizes")):  # C of another controller.json
             raise none
-        # in the order of columns["params"], (columns,); the array is the memory of C
+        # parameters (columns,) in the order of columns["params"]; the array shares its memory with the C
         self.parameters = np.ctypeslib.as_array((ctypes.c_double * sizes[-1]).in_dll(self._made, "ptsmc_given"))
         self.target = f"ptsmc_{self.name}_{self.checksum}_{real}_{next(_loaded)}"  # its name in XLA
         jax.ffi.register_ffi_target(self.target, jax.ffi.pycapsule(self._made.ptsmc_called), platform="cpu")
@@ -194,12 +194,12 @@ class InTheLoop:
         if other is not None:
             raise ScenarioError(
                 f"the controller in {library.folder} has the {other} {theirs.get(other, 'none')}, "
-                f"but must have that of the scenario, {ours.get(other, 'none')}"
+                f"but must have the {other} of the scenario, {ours.get(other, 'none')}"
             )
         period, wanted = np.float32(parts.period), np.float32(library.period)  # both may have 32 bits
         if period != wanted:
             raise ScenarioError(
-                f"loop.period is {period!s} s, but must be {wanted!s} s, that of the controller in {library.folder}"
+                f"loop.period is {period!s} s, but must be {wanted!s} s as in the controller in {library.folder}"
             )
         columns, paths = library.columns["params"], jax.tree_util.tree_leaves_with_path(self.board.parameters)
         firsts = zip(paths, (made.elements()[:1] for made in named(self.board).fields), strict=True)
@@ -209,7 +209,7 @@ class InTheLoop:
             self._check_draw(Dispersion(custom=dispersion.custom))
 
     def _check_draw(self, dispersion: Dispersion) -> None:
-        """Raise ScenarioError if a custom dispersion changes only one of several parameters that are one in C."""
+        """Raise ScenarioError if a custom dispersion changes only one of several values that share a parameter in C."""
         made, numbers = parameters(self.board), (jnp.uint32(0), jnp.uint32(0))
         drawn = had = known(dispersion.apply(self.nominal, *numbers))
         for rule in made.rules:
@@ -225,14 +225,14 @@ class InTheLoop:
             off = SAME * float(jnp.max(jnp.abs(value), initial=0.0))
             if not np.allclose(stands, value, rtol=0.0, atol=off, equal_nan=True):
                 raise ScenarioError(
-                    f"dispersion.custom draws {jax.tree_util.keystr(path, simple=True, separator='.')} by itself, but "
-                    f"the controller in {self.library.folder} has one {field.name} for it and others; allowed are "
-                    "draws that change all of them alike"
+                    f"dispersion.custom changes {jax.tree_util.keystr(path, simple=True, separator='.')} alone, but "
+                    f"the controller in {self.library.folder} has the single parameter {field.name} for it and other "
+                    "values; change all of them in the same way"
                 )
 
     @property
     def otherwise(self) -> str:
-        """A sentence with the parameters of C that differ from the parts; empty if there are none."""
+        """A sentence that lists the parameters of C that differ from the scenario; empty if there are none."""
         simulated, made = (
             dict(zip(self.library.columns["params"], self.library.parameters, strict=True)),
             named(self.board),

@@ -13,7 +13,7 @@ import jax
 JAX = Path(jax.__file__).parent
 FOREIGN = ("jaxtyping", "beartype", "<")  # wrappers between caller and function
 LIBRARY = Path(__file__).parents[1]
-HELPERS = ("numerics/", "onboard/")  # files whose functions are not sections of the C
+HELPERS = ("numerics/", "onboard/")  # folders whose functions get no heading in the C
 
 
 class Section(NamedTuple):
@@ -29,11 +29,11 @@ class Frame(NamedTuple):
 
     file: str
     name: str
-    span: tuple[int, int, int, int]  # of the expression: first line and column, last line and column
+    span: tuple[int, int, int, int]  # position of the expression: first line and column, last line and column
 
 
 def frames(eqn: Any) -> list[Frame]:
-    """Return the frames of an equation, the innermost first, without those of JAX."""
+    """Return the stack frames of an equation, the innermost first, without frames of JAX."""
     trace = eqn.source_info.traceback
     codes, at = ((), ()) if trace is None else trace.raw_frames()
     calls = []
@@ -54,13 +54,13 @@ def _spans(code: Any) -> list[tuple[int, int, int, int]]:
 
 
 def line(calls: list[Frame]) -> str:
-    """Return file and line for an error, if possible in the user's code; empty if unknown."""
+    """Return file and line of a call for an error, if possible in the user's code; empty if unknown."""
     frame = _written(calls)
     return "" if frame is None else f"{frame.file}:{frame.span[0]}"
 
 
 def function(calls: list[Frame]) -> str:
-    """Return the function that the source calls at this line, such as jnp.linalg.solve; empty if it is no call."""
+    """Return the function that the source calls there, such as "jnp.linalg.solve"; empty if it is not a call."""
     frame = _written(calls)
     tree = None if frame is None else _tree(frame.file)
     if frame is None or tree is None:
@@ -70,14 +70,17 @@ def function(calls: list[Frame]) -> str:
 
 
 def _written(calls: list[Frame]) -> Frame | None:
-    """Return the call that an error names: the user's own if it is the innermost; None if nothing is known."""
+    """Return the frame that an error names: the innermost frame in the user's code, if the user's code made the call.
+
+    Otherwise it is the innermost frame of the library. The result is None without frames.
+    """
     users = [frame for frame in calls if not Path(frame.file).is_relative_to(LIBRARY)]
     inside = users if users and calls[0] in users else calls  # a user's call of the library is not the cause
     return inside[0] if inside else None
 
 
 def section(found: list[Frame]) -> Section | None:
-    """Return the function of an equation: the innermost function that is not a helper."""
+    """Return the section of an equation: the innermost function that is not in `HELPERS`."""
     for frame in found:
         place, name = _place(frame.file), _name(frame.name)
         if place and name:

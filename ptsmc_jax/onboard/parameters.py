@@ -75,11 +75,11 @@ def parameters(board: Board) -> Parameters:
     return made
 
 
-COMPUTED = ("bound", "observer_matrix")  # a leaf shared with these gets the name of the other parameter
+COMPUTED = ("bound", "observer_matrix")  # computed parameters; a leaf that they share is named after the other one
 
 
 def named(board: Board) -> Parameters:
-    """Return the parameters of a flight computer by name, before any is derived."""
+    """Return the parameters of a flight computer, none of which is marked as derived yet."""
     found: dict[int, Field] = {}
     listed = jax.tree_util.tree_flatten_with_path(board.parameters)[0]
     leaves = [leaf for _, leaf in listed]

@@ -16,7 +16,7 @@ from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.computer import Computer, Decision, Software
 from ptsmc_jax.simulation.control_period import State, Tick, Vehicle, control_period, start
 
-# parts that the plant consists of; the reference because initial attitudes may be relative to it
+# the parts of a run that make up the plant; the reference is one, because initial attitudes may be relative to it
 PARTS = ("plant", "disturbance", "sensors", "actuators", "initial", "reference", "walk_rate", "jitter")
 
 
@@ -68,7 +68,7 @@ def plant_board(parts: Parts, dispersion: Dispersion, controller: Board) -> Boar
     computer.about |= {f"true_{name}": f"{text}, without errors" for name, text in parts.plant.signals.items()}
     computer.stages = [
         Stage("begin", "The plant at the first sample: dispersions, sensors, first readings.", (), begin),
-        Stage("advance", "A control period: actuators, disturbance, motion, then the readings at the next sample.",
+        Stage("advance", "One control period: actuators, disturbance, motion, then the readings at the next sample.",
               ("in." + command, "before.plant", "before.sample", "before.keys"), advance, (parts.plant,)),
     ]  # fmt: skip
     return computer
@@ -77,7 +77,7 @@ def plant_board(parts: Parts, dispersion: Dispersion, controller: Board) -> Boar
 _ABOUT = {
     "seed": "seed of the random numbers",
     "trial": "number of the trial",
-    "period": "of the control loop [s]",
+    "period": "control period [s]",
     "t_end": "end of the run [s]",
     "true_torque": "torque on the body at the end of the last period [N m]",
     "initial_attitude": "attitude of a filter that has run before the first sample",
@@ -89,18 +89,24 @@ _ABOUT = {
 
 
 def _picked(parts: Parts) -> dict[str, Any]:
-    """Return the parts that the plant consists of, by name."""
+    """Return the parts of `PARTS` by name."""
     return {name: getattr(parts, name) for name in PARTS if getattr(parts, name) is not None}
 
 
 def _assembled(parts: Parts, given: Given, picked: Given) -> Parts:
-    """Return the parts with these values, and with the times in the parameters."""
+    """Replace parts of the run by traced values.
+
+    Args:
+        parts: the nominal parts.
+        given: parameters of the plant by name, for `period` and `t_end` [s].
+        picked: values of the parts in `PARTS`, by name.
+    """
     clock = replace(parts.clock, period=given["period"], t_end=given["t_end"])
     return replace(parts, clock=clock, t_end=given["t_end"], **{name: picked[name] for name in PARTS if name in picked})
 
 
 def _of_trial(parts: Parts, dispersion: Dispersion, given: Given) -> Parts:
-    """Return the parts of the trial in the parameters, with the initial state that the simulation begins from."""
+    """Apply the dispersions of the trial that the parameters `seed` and `trial` select, and align the initial state."""
     nominal = _assembled(parts, given, given)
     if hasattr(nominal.plant, "with_inertia"):  # the inverse and a gravity gradient follow from the inertia
         nominal = nominal.with_inertia(nominal.plant.inertia, known=False)
@@ -120,7 +126,7 @@ def _period(parts: Parts, sample: Any) -> Ticks:
 
 
 def _commanding(command: Any) -> Software:
-    """Return a flight computer that commands an input (m,) [N m]."""
+    """Return flight software that always commands the same input (m,) [N m]."""
     zero = jnp.zeros_like(command)
 
     def boot(parts: Parts, seed: Any, trial: Any, x0: Any, first: Ticks) -> Computer:
@@ -133,7 +139,7 @@ def _commanding(command: Any) -> Software:
 
 
 def _begin(parts: Parts, seed: Any, trial: Any) -> tuple[Vehicle, State]:
-    """Return the run and its state at the first sample."""
+    """Return the constants of the run, and its state at the first sample."""
     ticks = jax.tree.map(lambda v: v[None], _period(parts, jnp.int32(0)))
     parts = replace(parts, observer=NoObserver(parts.plant, jnp.zeros(())))  # C may be unable to express the observer
     return start(parts, ticks, parts.initial, seed, trial, _commanding(jnp.zeros(parts.plant.inputs)))

@@ -12,7 +12,7 @@ from ptsmc_jax.numerics import guards
 from ptsmc_jax.onboard.expressions import BOOL, REAL, Block, Node, Region
 
 FILES = Path(__file__).parent / "files"
-WIDTH = 110  # of a line
+WIDTH = 110  # characters of a line
 LONGEST = 90  # characters of an expression inside another expression
 RESERVED = set(
     "auto break case char const continue default do double else enum extern float for goto if inline int long register "
@@ -20,7 +20,7 @@ RESERVED = set(
     "out before now y0 y1 yn j0 j1 jn gamma main index div abs larger smaller sign_of resolution NAN INFINITY "
     "threefry erf_inv".split()
 )
-# of math.h: a variable of this name would hide the function
+# functions of math.h, which a variable of the same name would hide
 MATH = ("acos acosh asin asinh atan atan2 atanh cbrt ceil cos cosh erf erfc exp exp2 expm1 fabs floor fmod lgamma log "
         "log1p nextafter pow rint round sin sinh sqrt tan tanh")  # fmt: skip
 RESERVED |= {name + end for name in MATH.split() for end in ("", "f")}
@@ -29,11 +29,11 @@ INFIX = {"add": ("+", 12), "sub": ("-", 12), "mul": ("*", 13), "div": ("/", 13),
          "or": ("||", 4)}  # fmt: skip
 PLAIN = {"max": "larger", "min": "smaller", "sign": "sign_of"}  # helper functions in C, by operation
 CALLED = ("threefry", "erf_inv")  # further helper functions in C, with the names of their operations
-# integer types: format of a constant, and the least real number that is too large
+# integer types: format of a constant, and the smallest real number that is too large for the type
 WHOLE = {"int32_t": ("{}", "2147483648"), "int64_t": ("{}", "9223372036854775808.0"),
          "uint32_t": ("{}u", "4294967296")}  # fmt: skip
 ATOMS = ("constant", "place", "variable", "index", "table")
-ATOM, UNARY, CHOICE = 20, 14, 3  # precedences
+ATOM, UNARY, CHOICE = 20, 14, 3  # operator precedences in C: no operator, unary operator, ?:
 
 
 def _ends(kind: str) -> tuple[str, str]:
@@ -85,11 +85,11 @@ def declared(kind: str) -> str:
 
 
 class Printer:
-    """The statements of one function."""
+    """Prints the statements of one C function."""
 
     def __init__(self, taken: Iterable[str] = ()):
-        self.names: dict[int, str] = {}  # of nodes
-        self.bases: dict[int, str] = {}  # of titles
+        self.names: dict[int, str] = {}  # C names of the variables, by id of the node
+        self.bases: dict[int, str] = {}  # first parts of these names, by id of the `Title`
         self.taken = RESERVED | set(taken)
         self.uses: Counter[int] = Counter()
         self.nodes: dict[int, Node] = {}
@@ -107,11 +107,11 @@ class Printer:
         return len(self.names) + self.entries
 
     def body(self, block: Block, outputs: Sequence[tuple[str, Node]], returned: Node | None = None) -> list[str]:
-        """Return the lines of C of a function body.
+        """Return the lines of a function body in C.
 
         Args:
             block: the statements.
-            outputs: places in memory to set, and their values.
+            outputs: memory locations to assign, and their values.
             returned: value of the return statement, or None without one.
         """
         for node in [*(node for _, node in outputs), *([] if returned is None else [returned])]:
@@ -274,12 +274,12 @@ class Printer:
     # expressions
 
     def text(self, node: Node, inside: bool = False) -> str:
-        """Return the text of a node: its variable if it has one, or its expression (`inside`)."""
+        """Return the C text of a node: the name of its variable, or its expression if it has none or with `inside`."""
         return self._text(node, inside)[0]
 
     def _text(self, node: Node, inside: bool = False) -> tuple[str, int]:
         if node.op == "constant":
-            is_resolution = node.kind == REAL and node.value == guards.resolution()  # of the type in C
+            is_resolution = node.kind == REAL and node.value == guards.resolution()  # C has it for its own precision
             return "resolution()" if is_resolution else number(node.value, node.kind), ATOM
         if node.op == "place":
             return node.value, ATOM
@@ -301,7 +301,7 @@ class Printer:
             return f"whole{_suffix(node.kind)}({self.text(node.args[0])})", ATOM
         if node.op == "convert":
             return f"({declared(node.kind)}){self._at_least(node.args[0], UNARY + 1)}", UNARY
-        if node.op == "row":  # of a parameter; its first index is 0
+        if node.op == "row":  # replaces the first index of a parameter, which is 0
             table, index = node.args
             return table.value.replace("[0]", f"[{self.text(index)}]", 1), ATOM
         if node.op == "entry":
@@ -337,7 +337,7 @@ def wrapped(text: str, indent: str) -> list[str]:
 
 
 def inside_comment(text: str) -> str:
-    """Return the text without beginnings and ends of C comments."""
+    """Return the text with /* and */ broken by a space, so that it can be part of a C comment."""
     return text.replace("*/", "* /").replace("/*", "/ *")
 
 

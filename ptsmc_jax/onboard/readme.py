@@ -22,8 +22,8 @@ def readme(code: Code, about: About) -> str:
         statuses="\n".join(f"| `PTSMC_{name}` = {k} | {text} |" for k, (name, text) in enumerate(STATUS.items())),
         delay=_delay(about) if about.delay else "",
         costs=_counted(code.counts),
-        passes=", and one pass of each loop whose passes are not known" if code.open else "",
-        deriving=f" After a change of parameters, and in `ptsmc_init`, {deriving} more." if deriving else "",
+        passes=", and one pass of each loop with an unknown number of passes" if code.open else "",
+        deriving=f" After a change of parameters, and in `ptsmc_init`, there are {deriving} more." if deriving else "",
         stack=stack(code),
         derived=_derived(code),
     )
@@ -44,18 +44,18 @@ def _derived(code: Code) -> str:
     def table(heading: str, names: Iterable[str]) -> str:
         rows = (f"| `{name}` | {', '.join(f'`{other}`' for other in code.follows[name]) or 'constant'} |\n"
                 for name in names)  # fmt: skip
-        return f"| {heading} | from |\n|---|---|\n{''.join(rows)}"
+        return f"| {heading} | derived from |\n|---|---|\n{''.join(rows)}"
 
     text = ""
     if code.derived:
         text += (
-            "Numbers that follow from them are not parameters: `ptsmc_init` derives them, and `ptsmc_step` derives "
-            f"them again after a change of parameters.\n\n{table('derived', [made.name for made in code.derived])}"
+            "Some numbers are derived from the parameters: by `ptsmc_init`, and by `ptsmc_step` after a change of "
+            f"parameters.\n\n{table('derived', [made.name for made in code.derived])}"
         )
     if code.fixed:
         reasons = " ".join(f"{why}." for why in dict.fromkeys(code.fixed.values()))
         text += (
-            "\nThese parameters follow from others, too, but C cannot derive them. Export again if the others change."
+            "\nThese parameters also depend on others, but C cannot derive them. Export again if the others change."
             f"\n\n{table('parameter', code.fixed)}\n{reasons}\n"
         )
     return text.rstrip()

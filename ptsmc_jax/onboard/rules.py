@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from ptsmc_jax.onboard.expressions import BOOL, REAL, Node, Pool
 
-# functions of `numerics.elementary`, which XLA evaluates by arithmetic; C has them in math.h
+# functions of `numerics.elementary`, which are arithmetic in XLA, and their names in math.h
 KNOWN_FUNCTIONS = {"log": "log", "arctan2": "atan2"}
 
 
@@ -16,7 +16,7 @@ def power(pool: Pool, x: Node, exponent: int) -> Node:
     """Return x^exponent by squaring, as XLA does.
 
     Args:
-        pool: makes the nodes.
+        pool: creates the nodes.
         x: the base.
         exponent: an integer, which may be negative for a real base.
     """
@@ -36,13 +36,13 @@ def convert(pool: Pool, kind: str, x: Node) -> Node:
     """Return a number converted to another kind.
 
     Args:
-        pool: makes the nodes.
+        pool: creates the nodes.
         kind: kind of the result.
         x: the number.
     """
     if x.kind == kind:
         return x
-    if x.op == "constant" and (kind == REAL or 0 <= x.value < 2**31):  # others as C has them beyond its types
+    if x.op == "constant" and (kind == REAL or 0 <= x.value < 2**31):  # C itself converts constants that may overflow
         return pool.constant(x.value, kind)
     if kind == BOOL:
         return pool.make("ne", x, pool.constant(0, x.kind), kind=BOOL)
@@ -53,7 +53,7 @@ def convert(pool: Pool, kind: str, x: Node) -> Node:
 
 
 def _wide(dtype: Any, kind: str) -> str:
-    """Return the kind. Raises KeyError for a real type with fewer digits than C's."""
+    """Return the kind. Raises KeyError for a floating-point type with fewer digits than the numbers in C."""
     if kind == REAL and jnp.finfo(dtype).bits < jnp.finfo(jnp.result_type(float)).bits:
         raise KeyError(dtype)
     return kind
@@ -62,7 +62,7 @@ def _wide(dtype: Any, kind: str) -> str:
 def _rounded(pool: Pool, params: Any, kind: str, x: Node) -> Node:
     known = jnp.finfo(jnp.result_type(float))
     if params["exponent_bits"] < known.nexp or params["mantissa_bits"] < known.nmant:
-        raise KeyError("reduce_precision")  # to fewer digits
+        raise KeyError("reduce_precision")  # a rounding to fewer digits has no rule
     return x
 
 
@@ -73,7 +73,7 @@ def _plain(op: str) -> Callable:
 def _logical(op: str) -> Callable:
     def rule(pool: Pool, params: Any, kind: str, *x: Node) -> Node:
         if kind != BOOL:
-            raise KeyError(op)  # bits of whole numbers
+            raise KeyError(op)  # operations on the bits of integers have no rule
         return pool.make(op, *x, kind=BOOL)
 
     return rule
@@ -102,11 +102,11 @@ def _round(pool: Pool, params: Any, kind: str, x: Node) -> Node:
 
 
 def _integer_pow(pool: Pool, params: Any, kind: str, x: Node) -> Node:
-    return power(pool, x, params["y"])  # of whole numbers no quotients
+    return power(pool, x, params["y"])  # JAX allows negative exponents for real numbers only
 
 
 def _divided(op: str) -> Callable:
-    """Return the rule of a quotient or remainder. Integers divided by 0 give -1 and the dividend, as in XLA."""
+    """Return the rule of a quotient or remainder. As in XLA, k / 0 is -1 and k % 0 is k for integers."""
 
     def rule(pool: Pool, params: Any, kind: str, a: Node, b: Node) -> Node:
         if kind == REAL:

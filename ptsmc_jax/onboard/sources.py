@@ -5,13 +5,13 @@ import shutil
 from pathlib import Path
 
 LAYOUT = "controller.json"
-OTHERS = ("check.c", "fuzz.c", "udp.c", "shared.c")  # separate programs
+OTHERS = ("check.c", "fuzz.c", "udp.c", "shared.c")  # separate programs, which do not change the commands
 
 
 def listed(folder: Path) -> list[Path]:
     """Return the files that determine the commands, by name, including files that the user has added."""
     code = {*folder.glob("*.c"), *folder.glob("*.h")} - {folder / name for name in OTHERS}
-    return sorted(path for path in {*code, *folder.glob(LAYOUT)} if path.is_file())  # no lock of an editor
+    return sorted(path for path in {*code, *folder.glob(LAYOUT)} if path.is_file())  # without lock files of editors
 
 
 def checksum(folder: Path) -> str | None:
@@ -21,7 +21,7 @@ def checksum(folder: Path) -> str | None:
     except OSError:
         return None
     parts = (part for name, content in read for part in (name.encode(errors="surrogateescape"), content))
-    # with the length of each part, so that text moved from one file to another changes the checksum
+    # include the length of each part, so that moving text from one file to another changes the checksum
     lengths = (b"%d:%s" % (len(part), part) for part in parts)
     return hashlib.sha256(b"".join(lengths)).hexdigest() if read else None
 

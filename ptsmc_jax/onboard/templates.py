@@ -16,19 +16,19 @@ from ptsmc_jax.onboard.printing import FILES, HELPERS, comment, declared, inside
 from ptsmc_jax.simulation import run_state
 
 STATUS = {
-    "OK": "done",
-    "SATURATED": "done; a limit of the actuators reduces the command",
-    "MISSED": "done; the last sample is not one period ago, so the observer has left this one out",
-    "SINGULAR": "the law is next to its singularity: its last good command",
-    "INPUT": "an input that is not finite, beyond all measure, no rotation, or no later than the last: the last good "
-    "output; nothing is kept",
-    "OVERFLOW": "a result is not finite: the last good output; nothing is kept",
+    "OK": "new output",
+    "SATURATED": "new output; an actuator limit reduces the command",
+    "MISSED": "new output; the last sample is not one period ago, so the observer is not updated",
+    "SINGULAR": "the law is too near to its singularity; the last good command is returned",
+    "INPUT": "an input is not finite, too large, not a rotation, or not later than the last sample; the last good "
+    "output is returned and the state does not change",
+    "OVERFLOW": "a result is not finite; the last good output is returned and the state does not change",
 }
 # columns of vectors.csv whose rounding errors are compared with the largest number of the whole group
 TORQUES, RATES = ("d_hat", "observer", "command", "torque", "sent"), ("rate", "bias", "gyro")
 
 
-# files beside the controller, and their templates; Python has another suffix there, because it is no module here
+# further exported files, and their templates; Python templates end in .py.in, so that nothing imports them
 PROGRAMS = {name: name for name in ("check.c", "fuzz.c", "Makefile", "udp.c", "shared.c")}
 PROGRAMS |= {name: f"{name}.in" for name in ("udp.py", "basilisk.py")}
 
@@ -43,7 +43,7 @@ class About(NamedTuple):
     filtered: bool  # whether there is an attitude filter
     largest: float  # largest accepted size of a measured number
     delay: int  # delay of the commands in control periods
-    steepness: float  # growth of the gains until the hand-over, at least (t_f / time to go of the last sample)^2
+    steepness: float  # growth of rounding errors up to the hand-over, see `vectors.steepness`; at least of the gains
 
     @property
     def stem(self) -> str:
@@ -51,10 +51,10 @@ class About(NamedTuple):
         return f"ptsmc_{self.name}"
 
 
-# public names of a controller: the templates have them after ptsmc_ and PTSMC_, exported files after ptsmc_NAME_
-_SYMBOLS = ("init", "step", "parameters")  # linked
+# public names of a controller: templates prefix them with ptsmc_ and PTSMC_, exported files with ptsmc_NAME_
+_SYMBOLS = ("init", "step", "parameters")  # names with external linkage
 _TYPES = ("params", "in", "out", "state", "derived", "real", "status")
-_ROWS = ("in_from", "state_from", "params_from", "out_to", "state_to", "params_to")  # of the flat header
+_ROWS = ("in_from", "state_from", "params_from", "out_to", "state_to", "params_to")  # functions of the flat header
 _CONSTANTS = (*STATUS, "SCENARIO", *(f"{kind}_SIZE" for kind in ("IN", "OUT", "STATE", "PARAMS")))
 _PUBLIC = re.compile(
     rf"\b(ptsmc_)({'|'.join((*_SYMBOLS, *_TYPES, *_ROWS))})\b(?!\.[ch]\b)|\b(PTSMC_)({'|'.join(_CONSTANTS)})\b"
@@ -135,7 +135,7 @@ def members(fields: Iterable[Field]) -> str:
 def _structs(code: Code, about: About) -> dict[str, str]:
     """Return the values of the header, and the parameters' numbers."""
     statuses = [f"    PTSMC_{name} = {k}, /* {meaning} */" for k, (name, meaning) in enumerate(STATUS.items())]
-    note = ("\n * A filter that has run before the manoeuvre: set attitude and bias after that. Otherwise the filter "
+    note = ("\n * If the attitude filter has run before the manoeuvre, set attitude and bias afterwards. Otherwise it "
             "starts\n * from the first sample of the star tracker.\n")  # fmt: skip
     copies = [replace(field, name=f"of_{field.name}", about="") for field in code.basis]
     derived = members([*code.derived, *copies])
@@ -226,7 +226,7 @@ def _step(code: Code) -> dict[str, str]:
     saturated = f"    if ({call.get('act')} && status == PTSMC_OK) {{\n        status = PTSMC_SATURATED;\n    }}"
     return {
         "functions": "\n".join([*_helpers(code), "\n\n".join(code.functions)]),
-        "derivation": f"\n{code.derivation}" if code.derived else "",  # long, and not what a reader looks for
+        "derivation": f"\n{code.derivation}" if code.derived else "",  # at the end of the file, because it is long
         "derive": derive,
         "derive_again": f"    if (!current(p, &state->derived)) {{\n    {derive}\n    }}" if derive else "",
         "begin": call["begin"].replace("&now", "state"),
@@ -287,7 +287,7 @@ def operations(count: Mapping[str, int]) -> dict[str, int]:
 
 
 def stack(code: Code, real: int = 8) -> int:
-    """Return an upper bound on a step's stack [byte], as if no two variables shared a place."""
+    """Return an upper bound on the stack of a step [byte], if each variable has its own memory."""
     held = (*code.state, *code.outputs, *code.outputs, *code.derived, *code.basis)
     fields = sum(made.size * (real if made.kind == REAL else 4) for made in held)
     return int(math.ceil((fields + code.variables * real + 256) / 16) * 16)

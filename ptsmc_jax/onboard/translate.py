@@ -1,7 +1,7 @@
-"""Translation of a trace (jaxpr) into scalar expressions.
+"""Translation of a jaxpr (trace) into scalar expressions.
 
-As in `batching.lanes`, arrays are split into components: reshapes and slices move components, and small products are
-sums. Branches and loops become regions; short loops of fixed length are unrolled. A primitive without a rule is an
+As in `batching.lanes`, arrays are split into components: reshapes and slices move components, and small matrix products
+are sums. Branches and loops become regions; short loops of fixed length are unrolled. A primitive without a rule is an
 error.
 """
 
@@ -21,10 +21,10 @@ from ptsmc_jax.batching.lapack import COUNTED, SHARED
 from ptsmc_jax.numerics import draws, elementary
 from ptsmc_jax.onboard import origins
 from ptsmc_jax.onboard.control import CONTROL
-from ptsmc_jax.onboard.expressions import BOOL, Node, NoRuleError, Pool, Title, kind_of
+from ptsmc_jax.onboard.expressions import BOOL, TYPES, Node, NoRuleError, Pool, Title, kind_of
 from ptsmc_jax.onboard.rules import ELEMENTWISE, KNOWN_FUNCTIONS
 
-LARGEST = 4096  # components of an array
+LARGEST = 4096  # largest number of components of a constant array
 LINEAR_ALGEBRA = COUNTED | SHARED
 PLAIN = (
     "made of sums, products, quotients, powers, roots, elementary functions, comparisons, branches and loops of numbers"
@@ -33,26 +33,24 @@ SMALL_MATRICES = "plain arithmetic, or solve, determinant or smallest_eigenvalue
 
 
 class Translator:
-    """Evaluates traces on arrays of nodes."""
+    """Evaluates jaxprs on arrays of expression nodes."""
 
     def __init__(self, pool: Pool):
         self.pool = pool
-        self.held: list[origins.Frame] | None = None  # frames of the call that is being translated
+        self.held: list[origins.Frame] | None = None  # stack frames of the call that is being translated
 
     def constant(self, array: Any) -> np.ndarray:
         """Return the components of a constant array."""
-        if jnp.issubdtype(jnp.result_type(array), jax.dtypes.extended):
-            raise NoRuleError(f"{array.dtype} cannot be written in C, but must be numbers: C has no random ones here")
-        array = np.asarray(array)
-        if array.size > LARGEST:
-            raise NoRuleError(f"a table of {array.size} numbers is too large to be written in C, at most {LARGEST} are")
+        array = array if jnp.issubdtype(jnp.result_type(array), jax.dtypes.extended) else np.asarray(array)
         if not _has_kind(array.dtype):
-            raise NoRuleError(f"{array.dtype} cannot be written in C, which has no number for it here")
+            raise NoRuleError(f"a constant has the type {array.dtype}, but must have the type {TYPES}")
+        if array.size > LARGEST:
+            raise NoRuleError(f"a constant array has {array.size} numbers, but must have at most {LARGEST} in C")
         kind = kind_of(array.dtype)
         return object_array(array.shape, (self.pool.constant(v, kind) for v in array.reshape(-1)))
 
     def evaluate(self, closed: Any, args: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Return the components of a trace's outputs, for these components of its inputs."""
+        """Return the components of a jaxpr's outputs, given the components of its inputs."""
         jaxpr, consts = open_jaxpr(closed)
         known: dict[Any, np.ndarray] = dict(zip(jaxpr.constvars, map(self.constant, consts), strict=True))
         known |= dict(zip(jaxpr.invars, args, strict=True))
@@ -94,7 +92,7 @@ class Translator:
             inner = eqn.params.get("call_jaxpr", eqn.params.get("fun_jaxpr"))
             debug_info = getattr(getattr(inner, "jaxpr", inner), "debug_info", None)
             known = KNOWN_FUNCTIONS.get(getattr(debug_info, "func_name", ""))
-            # a user's function may have the same name
+            # a user's function may have the same name, so compare the file, too
             ours = getattr(debug_info, "func_filename", None) == elementary.__file__
             if known is not None and ours and len(eqn.outvars) == 1:
                 return [self._each(lambda *entry: self.pool.make(known, *entry), values, eqn.outvars[0].aval.shape)]
@@ -107,7 +105,7 @@ class Translator:
             results = self.evaluate(inner, values)
             self.held = outer
             return results
-        if not all(_has_kind(v.aval.dtype) for v in eqn.outvars):  # keys of random numbers, complex ones
+        if not all(_has_kind(v.aval.dtype) for v in eqn.outvars):  # such as random keys and complex numbers
             raise self.refused(eqn, where)
         if name in CONTROL:
             return CONTROL[name](self, eqn, values)
@@ -121,7 +119,7 @@ class Translator:
             found = self._elementwise(eqn, values)
             if found is not None:
                 return [found]
-        if name in _FOLDS and (kind_of(eqn.outvars[0].aval.dtype) == BOOL or name not in _OF_BITS):
+        if name in _FOLDS and (kind_of(eqn.outvars[0].aval.dtype) == BOOL or name not in _LOGICAL):
             return [self._reduction(eqn, values[0])]
         if name == "dot_general":
             return [self._contraction(eqn, *values)]
@@ -136,7 +134,7 @@ class Translator:
         raise self.refused(eqn, where)
 
     def refused(self, eqn: Any, where: list[origins.Frame]) -> NoRuleError:
-        """Return the error for a primitive without a rule: the function in the source, its line, what works instead."""
+        """Return the error for a primitive without a rule: function and line in the source, and allowed functions."""
         at, primitive = origins.line(where), eqn.primitive.name
         allowed = SMALL_MATRICES if primitive in LINEAR_ALGEBRA else PLAIN
         name = origins.function(where) or primitive
@@ -197,7 +195,10 @@ class Translator:
         return object_array(parts.shape[:-1], (one(parts[i]) for i in np.ndindex(*parts.shape[:-1])))
 
     def _moved(self, eqn: Any, values: Sequence[np.ndarray]) -> list[np.ndarray] | None:
-        """Return the components as the primitive moves them, by constant or computed indices."""
+        """Translate a primitive that only moves or adds array entries, such as slice, gather and scatter.
+
+        The indices may be constants or computed. The result is None if the primitive has no rule.
+        """
         match eqn.primitive.name:
             case "dynamic_slice":
                 arrays, places = values[:1], values[1:]
@@ -212,7 +213,7 @@ class Translator:
     def _indexed(
         self, eqn: Any, values: Sequence[np.ndarray], arrays: Sequence[np.ndarray], places: Sequence[np.ndarray]
     ) -> list[np.ndarray] | None:
-        """Return the entries of arrays at computed indices: a choice among all possible indices."""
+        """Translate a primitive with indices: at a computed index, C selects among the results for all indices."""
         flat = [node for place in places for node in place.flat]
         open_places = [node for node in flat if node.op != "constant"]
         if len({id(node) for node in open_places}) > 1:
@@ -224,7 +225,7 @@ class Translator:
         if row is not None:
             return [row]
         least = 0 if chosen.kind.startswith("u") else -1
-        index = self._at(eqn, values, arrays, chosen, bound)  # for all indices beyond the end; -1: below 0
+        index = self._at(eqn, values, arrays, chosen, bound)  # index beyond the end, where all results are equal
         for k in range(bound - 1, least - 1, -1):
             case = self._at(eqn, values, arrays, chosen, k)
             beyond = self.pool.make("le", chosen, self.pool.constant(k, chosen.kind), kind=BOOL)
@@ -238,9 +239,9 @@ class Translator:
     def _row(
         self, eqn: Any, values: Sequence[np.ndarray], arrays: Sequence[np.ndarray], chosen: Node
     ) -> np.ndarray | None:
-        """Return a row of a table of parameters at a computed index as C's table[index], or None if it is no such row.
+        """Translate a row of a parameter array at a computed index to table[index] in C; None for other operations.
 
-        A choice among all indices would have an operation for each entry of the table.
+        A selection among all indices would need an operation for each entry of the array.
         """
         table, count = values[0], len(values[0])
         if eqn.primitive.name != "dynamic_slice" or count < 2 or table.flat[0].op != "place":
@@ -257,7 +258,7 @@ class Translator:
     def _at(
         self, eqn: Any, values: Sequence[np.ndarray], arrays: Sequence[np.ndarray], chosen: Node | None, k: int
     ) -> np.ndarray:
-        """Return the moved components if the computed index `chosen` is k."""
+        """Return the results of a primitive with indices for the case that the computed index `chosen` is k."""
         if eqn.primitive.name in _ADDS:
             array, at, more = values
             return self._added(eqn, array, at, more, chosen, k)
@@ -284,7 +285,7 @@ class Translator:
         """Return an array with additions or subtractions at indices, if the computed index `chosen` is k."""
         known, types = _known(places, chosen, k), [variable.aval.dtype for variable in eqn.invars]
         total = array.copy()
-        for index in np.ndindex(*more.shape):  # where each of them comes
+        for index in np.ndindex(*more.shape):  # find the entries that each number is added to
             one = np.zeros(more.shape)
             one[index] = 1.0
             with jax.ensure_compile_time_eval():
@@ -299,14 +300,14 @@ class Translator:
 
 
 def _is_threefry(eqn: Any) -> bool:
-    """Return whether an equation is a call of `draws.threefry`, whose integers of 64 bits C does not need."""
+    """Return whether an equation is a call of `draws.threefry`. C has its own function with 32-bit integers."""
     jaxpr = getattr(eqn.params.get("jaxpr"), "jaxpr", None)
     info = getattr(jaxpr, "debug_info", None)
     return getattr(info, "func_filename", None) == draws.__file__ and eqn.params.get("name") == "threefry"
 
 
 def _numbering(eqn: Any) -> Any:
-    """Return the equation for an array of indices instead of values; indices outside of the array become -1."""
+    """Return the same gather for an array of indices instead of values; entries outside of the array become -1."""
     return eqn.replace(params={**eqn.params, "fill_value": -1}) if "fill_value" in eqn.params else eqn
 
 
@@ -317,7 +318,7 @@ def _filling(pool: Pool, eqn: Any) -> Node:
         limits = jnp.iinfo(dtype)
         value = limits.min or limits.max
     elif value is None:
-        value = math.nan  # as a truth: yes
+        value = math.nan  # true, if it is converted to bool
     return pool.constant(value, kind_of(dtype))
 
 
@@ -328,7 +329,7 @@ def _wraps(eqn: Any) -> bool:
 
 
 def _has_kind(dtype: Any) -> bool:
-    """Return whether C has numbers of a type of JAX."""
+    """Return whether a dtype has a C type."""
     try:
         return bool(kind_of(dtype))
     except KeyError:
@@ -342,14 +343,14 @@ def _known(value: np.ndarray, chosen: Node | None = None, k: int = 0) -> np.ndar
 
 _FOLDS = {"reduce_sum": "add", "reduce_max": "max", "reduce_min": "min", "reduce_prod": "mul", "reduce_and": "and",
           "reduce_or": "or"}  # fmt: skip
-_OF_BITS = ("reduce_and", "reduce_or")  # of whole numbers
+_LOGICAL = ("reduce_and", "reduce_or")  # reductions with a rule for bool only, not for the bits of integers
 _SCANS = {"cumsum": "add", "cumprod": "mul", "cummax": "max", "cummin": "min"}
 _MOVES = set(
     "broadcast_in_dim concatenate expand_dims pad reshape rev slice split squeeze stack tile transpose unstack "
     "dynamic_slice dynamic_update_slice gather scatter".split()
 )
 _ADDS = {"scatter-add": "add", "scatter-sub": "sub"}
-# primitives whose results are among their inputs
+# primitives that return some of their inputs, so that narrow integers cannot overflow
 _KEPT = {
     *_MOVES,
     *"clamp copy copy_p max min optimization_barrier reduce_max reduce_min select_n stop_gradient".split(),

@@ -48,7 +48,7 @@ class Samples(NamedTuple):
     torque: Array  # torque on the body from this sample on [N m].
     wheel_torque: Array | None  # torque of each wheel [N m].
     limited: Array  # bool: whether a limit reduces the command.
-    singularity_distance: Array  # distance to the singularity, in `clearance_unit` [-].
+    singularity_distance: Array  # distance to the singularity, divided by `singularity_distance_unit` [-].
     singularity_distance_unit: Array  # unit of `singularity_distance`.
 
 
@@ -108,7 +108,7 @@ def simulate_many(parts: Parts, dispersion: Dispersion, seed: Array, trials: Arr
 
 
 def known_alike(dispersion: Dispersion) -> Dispersion:
-    """Return the dispersion without reference and torque limit, because the C knows only their nominal values."""
+    """Return the dispersion without reference and torque limit, because the C has only their nominal values."""
     return dispersion.without((REFERENCE, level_name("torque_limit")))
 
 
@@ -126,7 +126,7 @@ def steepness(samples: Samples, rounding: float, t_f: float, last: float) -> flo
 
     Args:
         samples: the trial.
-        rounding: of the measured error, see `Plant.error_rounding`.
+        rounding: relative rounding error of the measured error, see `Plant.error_rounding`.
         t_f: the prescribed time [s].
         last: time to go of the last sample before the hand-over [s].
     """
@@ -172,7 +172,12 @@ def first_state(board: Board, samples: Samples) -> np.ndarray:
 
 
 def _columns(shapes: dict[str, Any], values: dict[str, Any]) -> np.ndarray:
-    """Return the columns of named trees, in their order, with zeros for missing values."""
+    """Flatten named pytrees (samples, ..) to a table (samples, columns).
+
+    Args:
+        shapes: shapes of the trees by name, in the order of the columns.
+        values: trees by name. The columns of missing trees are zero.
+    """
     found = []
     for name, shape in shapes.items():
         given = values.get(name)

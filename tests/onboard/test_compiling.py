@@ -37,7 +37,7 @@ def test_an_invalid_controller_raises_an_error(chain, tmp_path):
     library = Library(chain)
     with pytest.raises(ScenarioError, match="has other inputs than the scenario"):
         InTheLoop(library, parts("raw"))
-    with pytest.raises(ScenarioError, match=r"^loop\.period is 0\.2 s, but must be 0\.1 s, that of the controller in "):
+    with pytest.raises(ScenarioError, match=r"^loop\.period is 0\.2 s, but must be 0\.1 s as in the controller in "):
         InTheLoop(library, parts("chain", period=0.2))
     shutil.copytree(chain, tmp_path / "controller")
     (tmp_path / "controller" / "ptsmc_flight.c").write_text("int main(void) { return }\n")

@@ -176,7 +176,7 @@ class Halving(ptsmc.AccelerationLaw):
 @pytest.mark.parametrize(("law", "said"), [(Halving, True), (Odd, False)])
 def test_readme_reports_loops_with_an_unknown_number_of_passes(law, said, tmp_path):
     folder.write_program(tmp_path, folder.Controller(with_custom_law(law), "law", "a scenario"))
-    assert ("one pass of each loop whose passes are not known" in (tmp_path / "README.md").read_text()) == said
+    assert ("one pass of each loop with an unknown number of passes" in (tmp_path / "README.md").read_text()) == said
 
 
 class Unsigned(Odd):
@@ -202,8 +202,8 @@ class Lost(ptsmc.AccelerationLaw):
 @pytest.mark.parametrize(
     ("law", "said"),
     [
-        (Unsigned, "^law holds uint64, which C has no number for"),
-        (Lost, "^none of the first 1 trials stays finite and away from the law's singularity"),
+        (Unsigned, "^law has the type uint64, but must have"),
+        (Lost, "^none of the first 1 trials is finite and away from the law's singularity"),
     ],
 )
 def test_export_raises_an_error_for_unsupported_or_diverging_laws(tmp_path, law, said):

@@ -317,10 +317,13 @@ def test_trials_with_a_compiled_controller_equal_single_simulations(exported, mo
 @pytest.mark.parametrize(
     ("flight", "said"),
     [
-        ("implicit", "has the law PrescribedTime(implicit=False), but must have that of the scenario, PrescribedTime("),
-        ("no observer", "has the observer NonlinearObserver, but must have that of the scenario, NoObserver"),
-        ("spin", "has the reference Fixed, but must have that of the scenario, Spin"),
-        ("terminal", "has the law PrescribedTime(implicit=False), but must have that of the scenario, Terminal"),
+        (
+            "implicit",
+            "has the law PrescribedTime(implicit=False), but must have the law of the scenario, PrescribedTime(",
+        ),
+        ("no observer", "has the observer NonlinearObserver, but must have the observer of the scenario, NoObserver"),
+        ("spin", "has the reference Fixed, but must have the reference of the scenario, Spin"),
+        ("terminal", "has the law PrescribedTime(implicit=False), but must have the law of the scenario, Terminal"),
     ],
 )
 def test_a_controller_with_other_parts_and_the_same_inputs_raises_an_error(exported, flight, said):
@@ -428,7 +431,7 @@ class Apart(ptsmc.Draw):
 def test_a_draw_that_changes_one_of_several_shared_parameters_raises_an_error(where, exported):
     """C has one inertia for law and observer, so that it cannot use different values."""
     made, library = exported("delay, limit, quantised")
-    with pytest.raises(ScenarioError, match=r"dispersion\.custom draws .*inertia.* by itself, but the controller in"):
+    with pytest.raises(ScenarioError, match=r"dispersion\.custom changes .*inertia.* alone, but the controller in"):
         InTheLoop(library, made.ready.parts, Dispersion(custom=Apart(where)))
 
 

@@ -244,16 +244,16 @@ def test_the_error_for_linear_algebra_names_supported_functions(name):
 def test_random_keys_raise_an_error_as_constants_and_in_memories():
     """The error is one sentence instead of a traceback."""
     key = jax.random.key(0)
-    with pytest.raises(NoRuleError, match=r"^key<fry> cannot be written in C, but must be numbers"):
+    with pytest.raises(NoRuleError, match=r"^a constant has the type key<fry>, but must have"):
         body(lambda x: x + jax.random.normal(key), X)
-    with pytest.raises(NoRuleError, match=r"^law holds key<fry>, which C has no number for here$"):
+    with pytest.raises(NoRuleError, match=r"^law has the type key<fry>, but must have"):
         struct({"law": jax.ShapeDtypeStruct((), key.dtype)}, {})
 
 
 @pytest.mark.parametrize("known", [jnp.asarray([1.0 + 2.0j, 2.0, 3.0]), jnp.asarray([1, 2, 3], jnp.uint64)])
 def test_constants_of_unsupported_types_raise_an_error(known):
     """The error is one sentence instead of a traceback."""
-    with pytest.raises(NoRuleError, match=rf"^{known.dtype} cannot be written in C, which has no number for it here$"):
+    with pytest.raises(NoRuleError, match=rf"^a constant has the type {known.dtype}, but must have"):
         body(lambda x: (x * known).real, X)
 
 

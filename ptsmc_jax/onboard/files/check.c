@@ -1,9 +1,9 @@
 /* check.c: replays vectors.csv through ptsmc_step and compares every output, state and status.
  *
- * A row is trial, sample, status, inputs, outputs, state after the sample; sample -1 is the state before the first one.
- * Each sample begins with the state of the row before it.
- * A number is compared relative to the largest of its group in the file: those of an array, and torques with torques,
- * rates with rates, since an estimated disturbance or bias is a difference of these. Exit status 0: all agree.
+ * A row contains trial, sample, status, inputs, outputs, and state after the sample. Sample -1 is the initial state.
+ * Each sample starts from the state of the row before it.
+ * A number is compared relative to the largest number of its group in the file. The groups are: each array, all torques
+ * and all rates, because an estimated disturbance or bias is a difference of these. Exit status 0: all agree.
  */
 #include <math.h>
 #include <stdio.h>
@@ -26,7 +26,7 @@ static const struct {
 ${compared}
 };
 
-/* A row of numbers; 0 at the end of the file, -1 where it is no row. */
+/* Read a row of numbers. Return 0 at the end of the file and -1 if the line is not a row. */
 static int row(FILE *file, double *v)
 {
     static char line[LINE];
@@ -58,7 +58,7 @@ static int skip_heading(FILE *file)
 int main(int count, char **given)
 {
     const int single = sizeof(ptsmc_real) == 4;
-    /* what rounding of an attitude, times the gains just before the hand-over, is beside the largest torque */
+    /* effect of the attitude's rounding error on the torque just before the hand-over, relative to the largest torque */
     const double rounding = (single ? 4.8e-7 : 8.9e-16) * ${steepness};
     const double tolerance = count > 2 ? strtod(given[2], NULL) : fmax(single ? 1e-3 : 1e-12, fmin(rounding, 0.1));
     static double v[COLUMNS], largest[CHECKED], off[CHECKED], found[CHECKED];
@@ -105,7 +105,7 @@ int main(int count, char **given)
                 off[k] = error;
             }
         }
-        /* from where the simulator was: the loop is open here, and would add up what rounding leaves of each sample */
+        /* start from the simulated state: in this open loop the rounding errors of all samples would add up */
         ptsmc_state_from(v + HEAD + PTSMC_IN_SIZE + PTSMC_OUT_SIZE, &state);
         rows++;
     }

@@ -1,12 +1,12 @@
 /* ptsmc_${name}.c: ${law}, from ${scenario}.
- * Made by ptsmc export; scenario SHA-256 ${checksum}. Headings name the functions of the source that this is traced
- * from, with the equations of Chen, Ju, Wang, Li, The prescribed time sliding mode control for attitude tracking of
+ * Made by ptsmc export; scenario SHA-256 ${checksum}. Headings name the Python functions that the code is traced from.
+ * Equation numbers refer to Chen, Ju, Wang, Li, The prescribed time sliding mode control for attitude tracking of
  * spacecraft.
  */
 
 ${head}
 
-/* Finite and no larger than ${largest}: the observer would remember a larger number for long. */
+/* Return whether numbers are finite and at most ${largest}: the observer would forget larger ones very slowly. */
 static int within(const real *v, int count)
 {
     for (int k = 0; k < count; k++) {

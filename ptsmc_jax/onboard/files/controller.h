@@ -17,7 +17,7 @@ extern "C" {
 #endif
 typedef PTSMC_REAL ptsmc_real;
 
-/* Symbols contain the precision, so files of different PTSMC_REAL don't link. */
+/* Symbols contain the precision, so that files with different PTSMC_REAL do not link. */
 #define PTSMC_SUFFIXED_(name, real) name##_##real
 #define PTSMC_SUFFIXED(name, real) PTSMC_SUFFIXED_(name, real)
 #define ptsmc_init PTSMC_SUFFIXED(ptsmc_init, PTSMC_REAL)
@@ -26,7 +26,7 @@ typedef PTSMC_REAL ptsmc_real;
 
 #define PTSMC_SCENARIO "${checksum}"
 
-/* What ptsmc_step returns, the most severe last. */
+/* Return value of ptsmc_step, the most severe last. */
 enum ptsmc_status {
 ${statuses}
 };
@@ -38,7 +38,7 @@ ${params_members}
 
 /* The measurements at a sample. */
 typedef struct {
-    double t; /* of the sample, from the start of the manoeuvre [s]; double, since it is subtracted */
+    double t; /* time of the sample from the start of the manoeuvre [s]; double, because times are subtracted */
 ${in_members}
 } ptsmc_in;
 
@@ -48,24 +48,24 @@ ${out_members}
 } ptsmc_out;
 
 ${derived_struct}
-/* The memory from sample to sample; ptsmc_init fills it.${filter_note} */
+/* The memory between two samples; ptsmc_init initialises it.${filter_note} */
 typedef struct {
-    double t; /* of the last sample [s] */
+    double t; /* time of the last good sample [s] */
     int started; /* 0 until the first sample */
-    int tracking; /* 0: the sign of the attitude and the distance to the singularity are chosen again */
+    int tracking; /* 0: the next sample chooses the signs of the attitude and of the distance to the singularity */
 ${state_members}
-    ptsmc_out last; /* good one */
+    ptsmc_out last; /* output of the last good sample */
 ${derived_member}
 } ptsmc_state;
 
 /* The parameters of the scenario. */
 extern const ptsmc_params ptsmc_parameters;
 
-/* Before the first sample. */
+/* Initialise the memory before the first sample. */
 void ptsmc_init(const ptsmc_params *p, ptsmc_state *state);
 
-/* One sample, once a period: reads in, sets out, which is always finite, and returns a status.
- * No allocation, no global state.
+/* Call once in each control period: computes `out` from `in` and returns the status. `out` is always finite.
+ * There is no allocation and no global state.
  */
 int ptsmc_step(const ptsmc_params *p, ptsmc_state *state, const ptsmc_in *in, ptsmc_out *out);
 

@@ -1,4 +1,4 @@
-/* Numbers that follow from the parameters, and copies of these parameters. ptsmc_init computes them, and ptsmc_step
+/* Numbers that are derived from parameters, and copies of these parameters. ptsmc_init computes them, and ptsmc_step
  * computes them again after a parameter has changed.
  */
 typedef struct {

@@ -49,7 +49,7 @@ typedef struct {
     double start, end; /* first and present communication point [s] */
     double sample; /* number of the present sample */
     int taken; /* whether the inputs of the present sample have been read */
-    int mode; /* of enum mode */
+    int mode; /* value of enum mode */
     ptsmc_state state;
 } memory;
 
@@ -127,7 +127,7 @@ static int advance(memory *m, double end)
     }
 }
 
-/* Why a variable cannot be read or written as this type; NULL if it can. */
+/* Return the reason why a variable cannot be read or written as this type, or NULL if it can. */
 static const char *unreadable(size_t k, char kind)
 {
     return k < VARIABLES && (kinds[k] == kind || (kinds[k] == 'u' && kind == UNSIGNED)) ? NULL : "no variable of this type has this value reference";
@@ -150,7 +150,7 @@ static const char *unwritable(const memory *m, size_t k, char kind, double value
     return roles[k] != 'i' && !isfinite(value) ? "a parameter must be finite" : NULL;
 }
 
-/* Why a step cannot be made; NULL if it can. */
+/* Return the reason why a step is not possible, or NULL if it is. */
 static const char *unsteppable(const memory *m, double t, double length)
 {
     const double period = m->v[${period}];
@@ -168,7 +168,7 @@ typedef enum { OK, WARNING, DISCARD, FAILED } result; /* with the values of fmi2
 
 typedef struct {
     memory m;
-    void *environment; /* of the logger */
+    void *environment; /* argument of the logger */
     void (*logger)(void);
     char name[64];
 } instance;

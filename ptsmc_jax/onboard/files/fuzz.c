@@ -1,5 +1,5 @@
-/* fuzz.c: random inputs between the samples of vectors.csv. Whatever comes in, what goes out must be finite; what is
- * refused must leave the state as it was; and good samples must be good again in the end. Exit status 0: so it is.
+/* fuzz.c: random inputs between the samples of vectors.csv. Every output must be finite, a rejected input must not change
+ * the state, and good samples must be accepted again at the end. Exit status 0: all of this is true.
  */
 #include <math.h>
 #include <stdint.h>
@@ -34,7 +34,7 @@ static double uniform(void)
     return (double)(bits() >> 11) / 9007199254740992.0;
 }
 
-/* A number that may be anything. */
+/* Return a random number, which may be infinite, NaN or very large. */
 static double anything(void)
 {
     const double sign = bits() % 2 != 0 ? 1.0 : -1.0;
@@ -113,7 +113,7 @@ int main(int count, char **given)
     }
     ptsmc_init(&ptsmc_parameters, &state);
     for (long k = 0; k < rounds; k++) {
-        const int calm = k + 2000 >= rounds; /* good samples, to the end */
+        const int calm = k + 2000 >= rounds; /* from here on only good samples */
         double v[PTSMC_IN_SIZE];
         ptsmc_in in;
         ptsmc_out found;
@@ -153,7 +153,7 @@ ${flags}
             printf("sample %ld: status %d, and the state has changed\n", k, last);
             return 1;
         }
-        if (last >= PTSMC_INPUT && state.t > period * (double)k) { /* a clock that ran ahead: begin again */
+        if (last >= PTSMC_INPUT && state.t > period * (double)k) { /* the time jumped ahead: start again */
             ptsmc_init(&ptsmc_parameters, &state);
         }
         statuses[last]++;

@@ -1,11 +1,11 @@
-/* A controller's steps, a row each, for a program that flies it in the loop, and for XLA. */
+/* Steps of a controller, one for each row, for simulators and for XLA. */
 #include <math.h>
 
 #include "ptsmc_${name}_flat.h"
 #include "xla/ffi/api/c_api.h"
 
 const long ptsmc_sizes[4] = {PTSMC_IN_SIZE, PTSMC_OUT_SIZE, PTSMC_STATE_SIZE, PTSMC_PARAMS_SIZE};
-double ptsmc_given[PTSMC_PARAMS_SIZE]; /* parameters where none are told */
+double ptsmc_given[PTSMC_PARAMS_SIZE]; /* parameters that are used if a row has NaN */
 
 void ptsmc_first(double *state);
 void ptsmc_set(void);
@@ -27,12 +27,12 @@ void ptsmc_set(void)
     ptsmc_params_to(&ptsmc_parameters, ptsmc_given);
 }
 
-/* parameters (NaN: the given one), states, inputs -> states, outputs, statuses */
+/* parameters (NaN: ptsmc_given), states, inputs -> states, outputs, statuses */
 void ptsmc_many(long count, const double *params, const double *state, const double *in, double *after, double *out,
                 int *status)
 {
     ptsmc_params own;
-    ptsmc_state first; /* with what is derived, which is not among the columns */
+    ptsmc_state first; /* contains the derived numbers, which have no columns */
     ptsmc_params_from(ptsmc_given, &own);
     ptsmc_init(&own, &first);
     for (long k = 0; k < count; k++) {
@@ -69,7 +69,7 @@ static void put(const double *row, long k, long size, XLA_FFI_Buffer *to)
     for (long c = 0; c < size; c++) ((float *)to->data)[k * size + c] = (float)row[c];
 }
 
-/* what XLA calls: the same of its arrays, of double or of float */
+/* function that XLA calls: the same for arrays of double or float */
 XLA_FFI_Error *ptsmc_called(XLA_FFI_CallFrame *frame)
 {
     if (frame->extension_start != NULL && frame->extension_start->type == XLA_FFI_Extension_Metadata) {

@@ -1,5 +1,5 @@
 /* ptsmc_${name}.c: the true plant of ${scenario}: actuators, disturbance, motion and sensors.
- * Made by ptsmc export; scenario SHA-256 ${checksum}. Headings name the functions of the source that this is traced from.
+ * Made by ptsmc export; scenario SHA-256 ${checksum}. Headings name the Python functions that the code is traced from.
  */
 
 ${head}

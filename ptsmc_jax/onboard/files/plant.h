@@ -17,9 +17,9 @@ extern "C" {
 typedef PTSMC_REAL ptsmc_real;
 
 enum ptsmc_status {
-    PTSMC_OK = 0, /* done */
-    PTSMC_INPUT = 4, /* an input is not finite; nothing has changed */
-    PTSMC_OVERFLOW = 5 /* a result is not finite; nothing has changed */
+    PTSMC_OK = 0, /* new output */
+    PTSMC_INPUT = 4, /* an input is not finite; the state does not change */
+    PTSMC_OVERFLOW = 5 /* a result is not finite; the state does not change */
 };
 
 /* Nominal values, seed and trial. They must not change after ptsmc_init. */
@@ -29,7 +29,7 @@ ${params_members}
 
 /* The command that acts from this sample on. */
 typedef struct {
-    double t; /* of the sample, which the plant counts itself [s] */
+    double t; /* time of the sample [s]; not used, because the plant counts its samples */
 ${in_members}
 } ptsmc_in;
 

@@ -1,4 +1,4 @@
-/* udp.c: the controller as a process behind UDP, for software in the loop. ./udp PORT
+/* udp.c: the controller as a process that communicates by UDP, for software in the loop. Usage: ./udp PORT
  * A datagram has the members of ptsmc_in as doubles, in the order of controller.json; an empty one begins a run. The
  * answer has the status and the members of ptsmc_out, as doubles. The socket accepts programs on this machine only.
  */
