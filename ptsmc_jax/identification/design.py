@@ -20,7 +20,7 @@ from ptsmc_jax.scenario import reading
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
 
-HALF_WAVES = (1, 2, 3, 4, 6, 8)  # of each sine in the manoeuvre
+HALF_WAVES = (1, 2, 3, 4, 6, 8)  # numbers of half waves of the sines in the manoeuvre
 CANDIDATES, REFINEMENTS = 24, 40  # random profiles, and changes of the best one
 RATE = 0.05  # default limit of the rate [rad/s]
 
@@ -32,7 +32,7 @@ class Design:
     problem: Problem
     frame: pl.DataFrame  # t [s], sent1.. [N m] and the expected readings, with the columns of `trajectory.csv`
     std: np.ndarray  # expected 1 sigma of each number (k,)
-    plain: np.ndarray  # of one slew about each axis, one after another, within the same limits (k,)
+    plain: np.ndarray  # expected 1 sigma (k,) after one slew about each axis in turn, within the same limits
     undetermined: list[str]
 
     def table(self) -> pl.DataFrame:
@@ -56,9 +56,9 @@ def design(
 
     Args:
         what: a scenario, or the path of its file. [identify] names the parameters, [hardware] the noises.
-        duration: of the manoeuvre [s].
+        duration: duration of the manoeuvre [s].
         rate: largest rate about an axis, of other plants the largest velocity [rad/s].
-        torque: largest torque about an axis [N m]; by default that of the actuators.
+        torque: largest torque about an axis [N m]; by default the limit of the actuators.
         report: called with the progress in words.
 
     Raises:
@@ -69,7 +69,7 @@ def design(
     if not loaded.sampled or duration < 20.0 * period:
         raise ScenarioError("a design needs the sampled loop and a manoeuvre of at least 20 control periods")
     t = period * np.arange(round(duration / period) + 1)
-    shapes = np.stack([np.sin(np.pi * k * t / t[-1]) for k in HALF_WAVES])  # momentum
+    shapes = np.stack([np.sin(np.pi * k * t / t[-1]) for k in HALF_WAVES])  # (waves, rows) momentum per amplitude
     log = _silent(loaded, t)
     problem = parameters.build(loaded, [log])
     limits = _Limits.of(loaded, problem, rate, torque)
@@ -117,11 +117,11 @@ def design(
 class _Limits:
     """Limits of a manoeuvre."""
 
-    torque: float  # [N m]
-    rate: float  # [rad/s]
-    inverse: np.ndarray  # (m, m) rate per momentum
+    torque: float  # largest torque about an axis [N m]
+    rate: float  # largest rate about an axis [rad/s]
+    inverse: np.ndarray  # (m, m) map from momentum to rate: the inverse of the inertia
     channels: np.ndarray  # (channels, m) torque of each channel for a torque about each axis
-    momentum: float  # of each wheel [N m s]
+    momentum: float  # largest momentum of each wheel [N m s]
 
     @staticmethod
     def of(loaded: Any, problem: Problem, rate: float, torque: float | None) -> "_Limits":
@@ -160,7 +160,7 @@ def _one_after_another(t: np.ndarray, inputs: int) -> np.ndarray:
 
 
 def _silent(loaded: Any, t: np.ndarray) -> Measurements:
-    """Return a log at rest with the sensors of the scenario."""
+    """Return a synthetic log: a plant at rest without commands, read at the sample times of the scenario's sensors."""
     if loaded.plant.kind != "spacecraft":
         x = np.tile(np.asarray(loaded.plant.x0, float), (len(t), 1))
         return Measurements("design", t, {"x": x}, np.zeros((len(t), loaded.inputs)))

@@ -32,10 +32,10 @@ STEPS = 40  # largest number of steps of a local search
 LONGEST = 3.0  # step, in sigmas of the prior
 NEAR = 0.3  # largest step that ends a search with noise on the acceleration, in sigmas of the estimate
 CONVERGED = 1e-3  # largest step of a converged search, in sigmas of the estimate
-SLACK = (0.3, 0.01)  # noise of the acceleration at the begin of a search, relative to the acceleration [s^0.5]
+SLACK = (0.3, 0.01)  # noise of the acceleration at the start of a search, relative to the acceleration [s^0.5]
 SCREENINGS = 4  # largest number of times that outliers are determined again
 POOR = 1.5  # mean normalised square of the innovations above which other starting points are tried
-LAGS = 25  # of the autocorrelation
+LAGS = 25  # number of lags of the autocorrelation
 WHITE = 0.05  # largest autocorrelation that counts as white in a long log
 CONSISTENT = (0.8, 1.25)  # mean normalised square of innovations that fit their variance
 FARTHEST = 3.0  # distance of the most likely parameters of a validation log, RMS in sigmas of the estimates
@@ -61,7 +61,7 @@ class Fit:
 
     @property
     def whitened(self) -> np.ndarray:
-        """Innovations over their 1 sigma (samples, components) [-], adjusted ones if there are; NaN: no reading."""
+        """`adjusted` innovations, if available, divided by their 1 sigma (samples, components) [-]; NaN: no reading."""
         value, variance, accepted = self.innovations if self.adjusted is None else self.adjusted
         sampled = self.rows.source[1:] >= 0
         return np.where(accepted, value / np.sqrt(variance), np.nan)[sampled]
@@ -204,7 +204,7 @@ def of_logs(
     free: Sequence[str] | None = None,
     report: Callable[[str], None] = lambda text: None,
 ) -> Identification:
-    """Estimate parameters from logs that are read already; see `identify`.
+    """Estimate parameters from logs that are already read; see `identify`.
 
     Args:
         loaded: a complete scenario.
@@ -234,7 +234,7 @@ def _check_alike(logs: Sequence[Measurements]) -> None:
 
 
 def prepared(problem: Problem, log: Measurements) -> Prepared:
-    """Return a log for the filter."""
+    """Return the rows of a log for the filter, and their structure."""
     return filtering.rows_of(log, problem.step, BUCKET), Kind.of(log)
 
 
@@ -365,7 +365,7 @@ class Search:
             masks = np.concatenate([log[0].valid.ravel() for log in logs])
             if before is not None and np.array_equal(masks, before):
                 break
-            before, found = masks, self.climb(z, logs, enough)
+            before, found = masks, self.maximise(z, logs, enough)
             z = found.z
         assert found is not None
         return found
@@ -390,7 +390,7 @@ class Search:
         rows, kind = log
         return rows._replace(valid=np.concatenate([rows.valid[:1], found.accepted])), kind
 
-    def climb(self, z: np.ndarray, logs: Sequence[Prepared], enough: float) -> Found:
+    def maximise(self, z: np.ndarray, logs: Sequence[Prepared], enough: float) -> Found:
         """Return the nearest maximum of the likelihood of these logs; it ends after a step below `enough` sigma."""
         value, gradient, information, square = self.derivatives(z, logs)
         damping, converged, steps = 0.0, False, 0

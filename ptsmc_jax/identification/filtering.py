@@ -33,13 +33,13 @@ class Model:
 
     plant: Any  # true plant
     disturbance: Any
-    actuators: Actuators  # without delay
-    delay: Leaf  # from a command to its effect [s]
+    actuators: Actuators  # actuators without their delay
+    delay: Leaf  # time from a command to its effect [s]
     noises: dict[str, Leaf]  # 1 sigma of each component of a reading, by its name [rad, rad/s, unit of x]
     rate_scale: Leaf  # (3,) ratio of gyro reading to true rate [-]
     misalignment: Leaf  # (3,) rotation vector of the star tracker in the body [rad]
-    bias: Leaf  # prior 1 sigma of the gyro bias; 0: there is none [rad/s]
-    bias_walk: Leaf  # density of its random walk [rad/s/sqrt(s)]
+    bias: Leaf  # prior 1 sigma of the gyro bias; 0: no bias [rad/s]
+    bias_walk: Leaf  # density of the gyro bias's random walk [rad/s/sqrt(s)]
     walk: Leaf  # (m,) density of the random-walk torque [N m/sqrt(s)]
     modes: Leaf  # (n,) prior 1 sigma of hidden coordinates at the first row
     slack: Leaf  # density of white noise on the acceleration, while a search is far from the estimate [rad/s^1.5]
@@ -142,8 +142,8 @@ def _start_rate(log: Measurements) -> np.ndarray:
 def acting(model: Model, rows: Rows, wheel_inertia: float | None) -> Array:
     """Return the command that acts in each interval after the delay, (rows, channels), as the mean over the interval.
 
-    The mean keeps the impulse of a command that changes within the interval. Nothing acts before the first row. With
-    wheel speeds it is their torque on the body.
+    The mean has the impulse of a command that changes within the interval. No command acts before the first row. If
+    the log has wheel speeds, the command is the torque of the wheels on the body.
     """
     if wheel_inertia is not None:
         change = jnp.append(jnp.diff(rows.command, axis=0), jnp.zeros((1, rows.command.shape[1])), axis=0)
@@ -174,7 +174,7 @@ def with_wheels(model: Model, wheel_inertia: float | None) -> Model:
     """Return the model for measured wheel speeds.
 
     The speeds are relative to the body, so that the wheels' spin inertia turns with it: J becomes J + sum I a a'. The
-    wheels have no lag, because their speed is measured, and an error of their scale is one of their inertia.
+    wheels have no lag, because their speed is measured. A scale factor error is an error of their inertia.
     """
     if wheel_inertia is None:
         return model
@@ -220,7 +220,7 @@ def filtered(
 
 
 def _start(model: Model, rows: Rows) -> _Carry:
-    """Return the filter at the first row, whose readings determine the state; nothing is known of it before them."""
+    """Return the filter at the first row. Its readings determine the state, which has no other prior knowledge."""
     first = jax.tree.map(lambda v: v[0], rows.readings)
     walk = jnp.zeros(model.plant.inputs if model.walk is not None else 0)
     actuators = model.actuators.begin(model.plant.inputs)
@@ -278,7 +278,7 @@ def _predicted(model: Model, carry: _Carry, t: Scalar, dt: Scalar, command: Arra
     f = jnp.eye(sizes + b + m).at[:sizes, :sizes].set(moved[:sizes, :sizes])
     f = f.at[:sizes, sizes + b :].set(moved[:sizes, sizes:]) if m else f
     # the steps of the random walks come at the start of the interval, as in a simulation
-    first = 3 if model.spacecraft else sizes - model.modes.size - plant.inputs  # of the velocity
+    first = 3 if model.spacecraft else sizes - model.modes.size - plant.inputs  # index of the velocity
     noise = [jnp.zeros(first), model.slack**2 * dt * jnp.ones(plant.inputs), jnp.zeros(sizes - first - plant.inputs)]
     noise += [model.bias_walk**2 * dt * jnp.ones(b)]
     noise += [jnp.broadcast_to(model.walk**2 * dt, (m,))] if m else []
@@ -291,7 +291,7 @@ def _transition(plant: Any, rate: Any, carry: _Carry, after: Any, t: Scalar, dt:
     """Return the derivatives of the state's change over an interval by the state and the random-walk torque.
 
     They are e^(A dt) to fourth order, with the derivatives A of the local coordinates' rate in the middle of the
-    interval. The last rows, of the constant torque, are those of the identity.
+    interval. The last rows belong to the torque, which is constant, and are equal to rows of the identity.
     """
     middle = plant.retract(carry.x, 0.5 * plant.local_coordinates(carry.x, after))
     time, m = t + dt / 2, carry.walk.size

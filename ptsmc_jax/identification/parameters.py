@@ -43,9 +43,9 @@ class Parameter(NamedTuple):
     """A group of numbers that are estimated together.
 
     Attributes:
-        name: as in `identify.free`.
+        name: name in `identify.free`.
         labels: name of each number in results.
-        unit: of the numbers.
+        unit: unit of the numbers.
         factor: (numbers.., coordinates) matrix F. The changes that `write` takes are F z with coordinates z, whose
             prior 1 sigma is 1.
         known: whether the factor is prior knowledge, from [dispersion].
@@ -151,7 +151,7 @@ def build(scenario: Scenario, logs: Sequence[Measurements], names: Sequence[str]
             known = [*catalogue, *([GYRO_BIAS] if has_gyro else [])]
             raise ScenarioError(f"identify.free has {name}, which this scenario does not have; {nearest(name, known)}")
     if not found:
-        raise wrong("identify.free", names, "a list with a parameter of the model too")
+        raise wrong("identify.free", names, f"a list with at least one parameter besides {GYRO_BIAS}")
     return Problem(model, found, _step(scenario, setup, interval), GYRO_BIAS in names)
 
 
@@ -230,7 +230,7 @@ def acceleration(model: Model, log: Measurements) -> float:
 
 
 def _roughness(name: str, log: Measurements) -> np.ndarray:
-    """Return a robust estimate of the noise from third differences, whose variance is 20 times that of the noise."""
+    """Return a robust estimate of the noise from third differences. They have 20 times the variance of the noise."""
     values = log.readings[name]
     there = ~np.isnan(values).any(axis=1)
     values = 2.0 * values[there] if name == "attitude" else values[there]
@@ -257,7 +257,7 @@ Maker = Callable[[Model], tuple[Model, Parameter]]
 def _catalogue(
     scenario: Any, model: Model, logs: Sequence[Measurements], interval: float, prior: Any
 ) -> dict[str, Maker]:
-    """Return functions that make the parameters of this scenario, by name."""
+    """Return the functions that add each possible parameter to a model, by name; see `field`."""
     plant, actuators = model.plant, model.actuators
     axes = np.eye(plant.inputs) if actuators.wheels is None else np.asarray(actuators.wheels.axes)
     torque = max(float(np.sqrt(np.mean(log.command**2))) for log in logs) or 1.0
@@ -273,7 +273,16 @@ def _catalogue(
     def field(
         name: str, path: Callable[[Model], Any], put: Callable[[Model, Array], Model], count: int, unit: str, how: str
     ) -> Maker:
-        """Return the maker of numbers that change by a factor e^c ("log"), by a factor 1 + c ("factor"), or by c."""
+        """Return a function that adds a parameter to a model; see `Parameter`.
+
+        Args:
+            name: name of the parameter.
+            path: returns the parameter's present numbers in a model.
+            put: returns a model with other numbers.
+            count: number of numbers.
+            unit: unit of the numbers.
+            how: effect of a coordinate c: "log" multiplies by e^c, "factor" multiplies by 1 + c, others add c.
+        """
 
         def make(model: Model) -> tuple[Model, Parameter]:
             sizes, known = spread(name, count)
@@ -395,7 +404,10 @@ def _leaf(path: str, start: np.ndarray) -> Parameter:
 
 
 def _misalignment(model: Model, axes: np.ndarray, sizes: np.ndarray, known: bool) -> tuple[Model, Parameter]:
-    """Return small rotations of each channel about two axes across it; one about its own axis has no effect."""
+    """Return the parameter of the channels' misalignment: small rotations of each channel about two axes across it.
+
+    A rotation of a channel about its own axis has no effect.
+    """
     directions = axes if model.actuators.directions is None else np.asarray(model.actuators.directions)
     across = [np.linalg.svd(direction[None])[2][1:] for direction in directions.T]  # (2, 3) each
 
@@ -433,7 +445,7 @@ def _coupling(model: Model, sizes: np.ndarray, known: bool) -> Parameter:
 
 
 def _inertia(start: np.ndarray, prior: Any) -> Parameter:
-    """Return the inertia in log-Cholesky coordinates of its pseudo-inertia, so that every value is that of a body."""
+    """Return the inertia parameter, in log-Cholesky coordinates of the pseudo-inertia: every value is physical."""
     table = getattr(prior, "inertia", None)
     root = vector(inertias.pseudo_root(start))
     if table is not None and hasattr(table, "factor"):
@@ -467,7 +479,7 @@ def by_coordinates(inertia: np.ndarray) -> np.ndarray:
 
 
 def _full_rank(factor: np.ndarray, size: float) -> np.ndarray:
-    """Return the factor with singular values of at least 0.3 `size`: equal moments have no axes of their own."""
+    """Return the factor with singular values of at least 0.3 `size`: with equal moments, the axes are arbitrary."""
     u, s, vt = np.linalg.svd(factor)
     return (u * np.maximum(s, 0.3 * size)) @ vt
 

@@ -12,7 +12,7 @@ from ptsmc_jax.identification.estimation import LAGS, Fit, Identification
 from ptsmc_jax.scenario import parsing, reading
 from ptsmc_jax.scenario.tables import Scenario
 
-LARGEST_STD = 0.3  # of a relative dispersion in a scenario
+LARGEST_STD = 0.3  # largest 1 sigma of a relative dispersion in a scenario
 
 
 def identified(found: Identification) -> Scenario:
@@ -82,7 +82,7 @@ def _relative(std: np.ndarray, values: np.ndarray) -> dict[str, Any]:
 def _put_disturbance(
     tables: dict[str, Any], dispersion: dict[str, Any], name: str, numbers: list[float], std: np.ndarray, relative: Any
 ) -> None:
-    """Write the estimate of a disturbance into its terms; an added constant becomes a term of its own."""
+    """Write the estimate of a disturbance into its terms; an added constant becomes an additional term."""
     table = dict(tables.get("disturbance", {}))
     terms = [dict(term) for term in table.get("terms", [])] or [table]
     if name == "disturbance_bias":

@@ -21,23 +21,23 @@ from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.signals import attitude_tables
 from ptsmc_jax.simulation.catalogues import UNITS
 
-FEWEST = 10  # rows of a log
+FEWEST = 10  # smallest number of rows of a log
 UNIT_NORM = 1e-3  # largest error of the norm of a quaternion: telemetry often has few digits
 RPM = 2.0 * np.pi / 60.0  # [rad/s]
-MISFIT = 0.5  # difference between the attitude's and the gyro's motion, relative to the motion, that is refused
+MISFIT = 0.5  # largest difference between the rotations by attitude and by gyro, relative to the rotation
 OUTLIER = 10.0  # third difference of an outlier, relative to the median
-PARTS = 400  # of a log for this comparison
+PARTS = 400  # number of parts of a log in which attitude and gyro are compared
 Values = np.ndarray
 
 
 class Measurements(NamedTuple):
     """A log in SI units. Missing readings are NaN."""
 
-    name: str  # of the file or table, for errors and reports
-    t: Values  # (rows,) from 0 at the first row [s]
+    name: str  # name of the file or table, for errors and reports
+    t: Values  # (rows,) time since the first row [s]
     readings: dict[str, Values]  # "attitude" (rows, 4) [-] and "rate" (rows, 3) [rad/s], or "x" (rows, n)
     command: Values  # (rows, channels) held until the next row [N m]; with `wheel_inertia` wheel speeds [rad/s]
-    by_channel: bool = False  # the command is that of each actuator channel, not of each body axis
+    by_channel: bool = False  # whether the columns of `command` are actuator channels; otherwise they are body axes
     wheel_inertia: float | None = None  # [kg m^2]; None: the command is a torque
 
 
@@ -67,13 +67,13 @@ def measurements(scenario: Scenario, frame: pl.DataFrame, name: str = "the log")
     Args:
         scenario: its table [telemetry] names the columns.
         frame: a row for each time.
-        name: of the log, for errors.
+        name: name of the log, for errors.
 
     Returns:
         The log from its first row on.
 
     Raises:
-        RefusedError: a column is not there, or a value is not allowed. The sentence names the column and the row,
+        RefusedError: a column is missing, or a value is not allowed. The message names the column and the row,
             counted from 0.
     """
     table = _Table(frame, name)
@@ -104,17 +104,17 @@ class _Table:
             raise self.refusal(column, row, allowed if isinstance(allowed, str) else allowed(row))
 
     def has_any(self, columns: Sequence[str]) -> bool:
-        """Return whether one of the columns is there."""
+        """Return whether the log has at least one of the columns."""
         return any(column in self.frame.columns for column in columns)
 
     def column(self, column: str) -> pl.Series:
-        """Return a column; raise RefusedError if it is not there."""
+        """Return a column. Raises RefusedError if the log does not have it."""
         if column not in self.frame.columns:
             raise RefusedError(f"{self.name} has no column {column}; {nearest(column, self.frame.columns)}")
         return self.frame[column]
 
     def numbers(self, columns: Sequence[str], unit: float = 1.0) -> Values:
-        """Return columns (rows, columns) in SI units, NaN for a blank cell; unit: of the columns."""
+        """Return columns (rows, columns) in SI units, NaN for a blank cell; unit: unit of the columns in SI units."""
         found = []
         for name in columns:
             series = self.column(name)
@@ -229,7 +229,7 @@ def _first_row(t: Values, readings: dict[str, Values], complete: Values) -> int:
 
     Args:
         t: times (rows,) [s].
-        readings: by name.
+        readings: readings by name.
         complete: whether a row has the readings that the filter needs, (rows,) bool.
     """
     good = complete.copy()
@@ -260,7 +260,7 @@ def _attitude(given: Any, table: _Table, columns: Sequence[str]) -> Values:
 
 
 def _commands(scenario: Any, given: Any, table: _Table, t: Values) -> tuple[Values, bool]:
-    """Return the commands (rows, channels), and whether they are of each channel."""
+    """Return the commands (rows, channels), and `by_channel` of `Measurements`."""
     count = 3 if scenario.wheels is None else len(scenario.wheels.spin_axes())
     for key in ("wheel_torque", "wheel_speed"):
         columns = getattr(given, key)
@@ -291,8 +291,8 @@ def _taken_before(
     Args:
         t: times of the rows [s].
         ages: ages of the attitudes [s].
-        readings: by name.
-        command: of the rows, which hold until the next row.
+        readings: readings by name.
+        command: command of each row, which is held until the next row.
 
     Returns:
         Times, readings and commands of the new rows.
