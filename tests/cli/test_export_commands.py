@@ -104,7 +104,7 @@ def test_campaign_runs_the_exported_controller_and_copies_it(command, tmp_path):
     assert "holds a run with flight_code_sha256" in said
     assert "which is not used here" in said
     replay = "replay", "r", "--trial", 7, "--no-figures"
-    assert "r/controller (--controller), which this command would run; allowed is --trust" in refused(
+    assert "r/controller (--controller), which this command would run; read the code, then" in refused(
         command, tmp_path, *replay
     )
     code, out, err = command(*replay, "--trust")

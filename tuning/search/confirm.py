@@ -16,9 +16,9 @@ from tuning.search.objective import Problem
 
 HELD_OUT = 1000  # smallest number of held-out trials of the verdict
 FEWEST, TIMES = 4096, 8  # smallest number of confirmation trials: absolute, and relative to the held-out trials
-SHOWN = 2  # times the smallest number of trials that can verify a quantile, so that some trials may break its limit
+SHOWN = 2  # ratio of trials to the smallest number that can verify a quantile; with it some trials may break the limit
 SURE = 0.98  # a requirement is confirmed if its verdict will be met with at least this probability
-FARTHER, NEARER = 16, 8  # trials of a band that may break the limit (at most), and trials that may not
+FARTHER, NEARER = 16, 8  # in a band: largest number of trials that may break the limit, and number that must keep it
 
 
 @dataclass(frozen=True)

@@ -81,7 +81,7 @@ def allow(programs: Mapping[str, str], results: Path, made: Mapping[str, Any], t
         listed = " and ".join(f"{file} ({', '.join(keys)})" for file, keys in _by_file(programs).items())
         raise RefusedError(
             f"{results} names custom code, {listed}, which this command would run; "
-            "allowed is --trust after you have read the code"
+            "read the code, then repeat the command with --trust"
         )
     unknown = check_unchanged(programs, results, made)
     _report(programs, results)
@@ -112,7 +112,7 @@ def check_unchanged(programs: Mapping[str, str], results: Path, made: Mapping[st
             then = " or ".join(was[:12] for was in known)
             raise RefusedError(
                 f"{results} was made with another {key} than {location(key, where)} is now "
-                f"(SHA-256 {then} then, {now[:12]} now); allowed is the file with its earlier content"
+                f"(SHA-256 {then} then, {now[:12]} now); restore the earlier content of the file"
             )
     return unknown
 

@@ -29,8 +29,8 @@ class ShortestTime:
     """Shortest t_f [s] that keeps the largest input of all trials, or of a fraction of them, within the limit."""
 
     limit: float
-    theory: float | None  # along the exact motions; None: no t_f keeps the limit
-    simulated: float | None  # by simulation; None: not found
+    theory: float | None  # from the exact motions; None: no t_f keeps the limit
+    simulated: float | None  # found by simulation; None: not found
     trials: int
     quantile: float | None = None  # fraction of trials that must keep the limit; None: all trials
     unit: str | None = None  # unit of the limit

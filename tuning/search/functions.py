@@ -61,7 +61,7 @@ class Local:
 
     x: np.ndarray  # (n,)
     value: float  # objective
-    violation: float  # largest constraint less 1e-4, at least 0
+    violation: float  # largest constraint minus the tolerance 1e-4, at least 0
 
 
 @dataclass(frozen=True)

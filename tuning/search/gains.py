@@ -107,7 +107,7 @@ def published_scenario(scenario: Scenario) -> Scenario:
 def published_label(scenario: Scenario) -> str:
     """Return the label of the published gains in tables.
 
-    It tells whether the gains are unchanged, scaled to another body or period, or belong to another law.
+    The label reports whether the gains are unchanged, scaled to another body or period, or belong to another law.
     """
     if not scenario.controller.law.prescribed:
         return "paper's law"

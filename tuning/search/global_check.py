@@ -13,9 +13,9 @@ from tuning.search.optimise import Search
 from tuning.search.progress import Report
 
 POPULATION = 40  # points for each gain
-GENERATIONS = 80  # largest number of generations; `SPREAD` can end the evolution earlier
-STEPS = 100  # steps of the local search from the result of the evolution
-SPREAD = 1e-4  # standard deviation of F in the population at which the evolution ends
+GENERATIONS = 80  # largest number of generations of differential evolution; `SPREAD` can end it earlier
+STEPS = 100  # steps of the local search from the result of differential evolution
+SPREAD = 1e-4  # standard deviation of F in the population at which differential evolution ends
 FORBIDDEN = 100.0  # merit of a point that breaks a limit, larger than every F
 
 
@@ -25,7 +25,7 @@ class Check:
 
     gains: dict[str, float]
     value: float  # objective
-    distance: float  # F of the checked search less F of this result: ln of the ratio of the objectives
+    distance: float  # F of the checked search minus F of this result: ln of the ratio of the objectives
     kept: bool  # whether these gains keep every limit
     rollouts: int  # number of rollouts
 

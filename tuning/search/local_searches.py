@@ -99,11 +99,11 @@ class LocalSearches:
         self._evaluate, self._steps, self._rng, self._report = evaluate, steps, rng, report
         self._margin = np.asarray(margin)  # relative tightening of each limit, (rows,) or one number
         self._scenario_gains: np.ndarray | None = None  # (gains,) gains of the scenario
-        self.globally = False  # `search_globally` was called
+        self.globally = False  # whether `search_globally` was called
         self._designs = np.zeros((0, 0))  # (designs, gains) normalised gains of the designs
         self._best: Best | None = None
         self._problem: Problem | None = None
-        self._history: dict[int, list[Step]] = {}  # by number of the local search
+        self._history: dict[int, list[Step]] = {}  # accepted points by number of the local search
         self._ends: dict[int, Best] = {}  # best point of each local search
         self._from = 0  # number of the local search that found the best point
 
@@ -509,7 +509,7 @@ class LocalSearches:
 
 
 def _relaxed(problem: Problem) -> Relaxed | None:
-    """Return what a local search minimises, if that is not F subject to the limits."""
+    """Return the limits whose largest violation is minimised; None: F is minimised subject to the limits."""
     return Relaxed(to_the_end=True) if problem.objective == LIMITS else None
 
 

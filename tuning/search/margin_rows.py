@@ -30,7 +30,7 @@ from tuning.search.gains import with_gains
 from tuning.search.normalisation import Bounds, Scale
 
 CASES = 1  # number of random trials whose loops are constrained: the trials with the worst margins
-WITHOUT = 2.0  # violation ratio of a loop without derivatives: that of a margin of zero
+WITHOUT = 2.0  # violation ratio of a loop without finite derivatives, as for a margin of zero
 
 
 @pytree
@@ -43,7 +43,7 @@ class RequiredMargins:
     seed: Leaf  # uint32
     coordinates: Coordinates  # random numbers of the dispersions, cases on the first axis; empty: the nominal loop only
     required: Leaf  # (margins,) the required limits in their units
-    limits: Leaf  # (margins,) largest violation ratio, see `violation_ratio`: 1 less the margin of the search
+    limits: Leaf  # (margins,) largest allowed `violation_ratio`: 1, or less if the search tightens its limits
     metrics: tuple[str, ...] = field(metadata={"static": True})
     names: tuple[str, ...] = field(metadata={"static": True})  # names of the free gains
 
@@ -110,7 +110,7 @@ def rows(
 ) -> Float[Array, "margins entries"]:
     """Return the constraints c of the margins, which are met if c <= 0.
 
-    c is the violation ratio of a margin, see `violation_ratio`, divided by `limits`, minus 1. A loop without
+    c is the violation ratio of a margin, see `violation_ratio`, divided by `limits`, minus 1. A loop without finite
     derivatives counts as a loop with a margin of zero.
 
     Args:

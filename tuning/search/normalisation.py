@@ -25,7 +25,7 @@ NEAR = 0.01  # a gain within this fraction of its interval from a bound counts a
 @pytree
 @dataclass(frozen=True)
 class Scale:
-    """The map from normalised gains to gains, as a pytree: compiled programs serve other bounds too."""
+    """The map from normalised gains to gains. It is a pytree, so that the bounds are run-time arguments."""
 
     lower: Leaf | np.ndarray  # (gains,)
     upper: Leaf | np.ndarray  # (gains,)
@@ -65,7 +65,7 @@ class Bounds:
     names: tuple[str, ...]
     lower: tuple[float, ...]
     upper: tuple[float, ...]
-    hop: float = 0.0  # see above [unit of s times unit of observer_gain]; 0: the lower bound of sign_width is fixed
+    hop: float = 0.0  # [unit of s times unit of observer_gain]; 0: the lower bound of sign_width is fixed
 
     @property
     def logarithmic(self) -> np.ndarray:

@@ -31,7 +31,7 @@ from tuning.search.margin_rows import RequiredMargins
 from tuning.search.simulations import Batch
 
 FAILED = 1e9  # metric, and metric / limit, of a failed trial: larger than those of any completed trial
-LEAST = 1e-300  # smallest argument of a logarithm
+LEAST = 1e-300  # smallest argument of a logarithm, so that it is finite
 DRAWN = 128  # trials whose dispersions are computed in one call
 
 
@@ -52,8 +52,9 @@ class Rules:
     # largest number of trials of the sample that may break each limit; None: a limit on every trial
     may_break: tuple[int | None, ...] = field(metadata={"static": True})
     objective: str = field(default="window_error", metadata={"static": True})  # a metric, `T_F` or `LIMITS`
-    tail: int | None = field(default=None, metadata={"static": True})  # worst trials that count; None: all
-    # as key `statistic` of [tune]; a quantile is the smallest value of the tail, the worst case a tail of one trial
+    # number of worst trials that the objective covers, such as for the CVaR; None: all averaged trials
+    tail: int | None = field(default=None, metadata={"static": True})
+    # key `statistic` of [tune]; a quantile is the smallest value of the tail, the worst case has a tail of one trial
     statistic: str = field(default="rms", metadata={"static": True})
     torque_weight: float = field(default=0.0, metadata={"static": True})
 
@@ -61,7 +62,10 @@ class Rules:
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class Problem(Rules):
-    """A tuning problem: its rules and the simulation. Arrays over trials are NumPy arrays, which rounds can change."""
+    """A tuning problem: the `Rules`, and the data for the simulation of its trials.
+
+    Arrays with a trial axis are NumPy arrays, so that `rounds` can replace trials without a new compilation.
+    """
 
     parts: Parts
     dispersion: Dispersion

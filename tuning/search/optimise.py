@@ -23,7 +23,7 @@ from tuning.search.worst import Hardest
 Announce = Callable[[str], None]  # reports the name of the current step
 
 GLOBALLY = "no gains that meet every requirement are found yet: searching globally"
-HOPELESS = 1.1  # if the best gains have a larger metric / limit, harder trials cannot help and none join
+HOPELESS = 1.1  # if the best gains have a larger metric / limit, no harder trials are added, because they cannot help
 
 
 @dataclass(frozen=True)
@@ -33,9 +33,9 @@ class Settings:
     starts: int  # number of starting points
     steps: int  # largest number of measured points of each local search
     seed: int  # seed of the candidates for starting points
-    with_gradients: bool = True  # F has useful gradients
-    robust: bool = False  # the worst case inside the support of the dispersions joins the constraints
-    judged: bool = True  # find the worst case of the final gains, and conflicting requirements
+    with_gradients: bool = True  # whether F has useful gradients
+    robust: bool = False  # whether the worst case inside the support of the dispersions is added to the constraints
+    judged: bool = True  # whether to find the worst case of the final gains, and conflicting requirements
     # relative tightening of the limit of each metric, if larger than the default
     margins: Mapping[str, float] = field(default_factory=dict)
     designs: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))  # (designs, gains) further starting points
@@ -53,12 +53,12 @@ class Search:
     ends: list[np.ndarray]  # normalised gains of the final points of the local searches, the best first
     history: list[Step]  # measured points, by local search and step
     problem: Problem  # tuning problem with the trials that joined
-    rounds: int = 0  # number of further searches with harder trials
+    rounds: int = 0  # number of searches that were repeated with harder trials
     margins: dict[str, float] = field(default_factory=dict)  # relative tightening of the limit of each metric
     violation: float = 0.0  # relative violation of the tightened limits at the best point, as in progress reports
     # if no gains meet every requirement: the limits that conflict, see `LocalSearches.conflict`
     conflict: dict[str, float | None] = field(default_factory=dict)
-    globally: bool = False  # a global search of the whole box followed
+    globally: bool = False  # whether a global search of the whole box followed
     hardest: Hardest | None = None  # worst case of the gains; None: no requirement on every trial
     counts: list[confirm.Count] = field(default_factory=list)  # confirmations of quantile requirements
     interrupted: bool = False

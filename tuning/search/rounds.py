@@ -16,11 +16,11 @@ from tuning.search.objective import Problem, coordinates_of, kept_by_every_trial
 from tuning.search.worst import Hardest
 
 MARGIN = 0.03  # relative tightening of limits in the search: held-out trials can be harder than all screened trials
-SURE_MARGIN = 0.003  # the same if no trial can be harder: with a search for the worst case, or without dispersions
+SURE_MARGIN = 0.003  # `MARGIN` if no trial can be harder: with a search for the worst case, or without dispersions
 HARDEST = 8  # number of worst screened trials that join the constraints
 SPARE = 8  # slots for trials of later rounds: another number of trials would need another compilation
 BAND = confirm.FARTHER + confirm.NEARER  # number of trials in a band, see `confirm`
-ROUNDS = 6  # largest number of further searches
+ROUNDS = 6  # largest number of searches that are repeated with harder trials
 
 
 @dataclass(frozen=True)
@@ -69,10 +69,10 @@ class Rounds:
             problem = _with_room(problem, limits * HARDEST + SPARE)
         self._places = np.arange(problem.averaged, problem.trials.size)  # slots of trials that join
         self.problem = _with_room(problem, len(self._bands) * BAND)
-        self.count = 0  # number of further rounds
+        self.count = 0  # number of rounds that have added harder trials or loops
         self.hardest: Hardest | None = None  # worst case of the last gains
         self.counts: list[confirm.Count] = []
-        self._joined, self._counted = 0, 0  # number of joined trials; number of counts
+        self._joined, self._counted = 0, 0  # number of trials that have joined; number of calls of `confirm.count`
         self._known: worst_case.Screened | None = None
 
     def begin(self, gains: np.ndarray) -> None:
@@ -99,7 +99,7 @@ class Rounds:
             return False
         joining: list[Joining] = []
         nearer_loops, loops_break_limits = _harder_margins(self.problem, gains)
-        if self._quantiles:  # on other trials each time, none of them screened
+        if self._quantiles:  # each confirmation uses new trials, which were not screened
             tell("confirming on other trials")
             joining += self._confirmed(gains)
         if self._every and self._robust:
@@ -117,7 +117,7 @@ class Rounds:
         self.problem = nearer_loops if loops_break_limits else self.problem
         for more in joining:
             self._join(more)
-        self.hardest = None  # it belongs to gains that the next search replaces
+        self.hardest = None  # the next search replaces the gains of this worst case
         self.count += 1
         return True
 

@@ -23,8 +23,8 @@ from ptsmc_jax.simulation.metrics import Metrics
 from ptsmc_jax.simulation.rollout import Parts
 from tuning.search.gains import with_gains
 
-ROW = 40  # trials in a row
-ROWS, ROWS_WITH_DERIVATIVES = 64, 8  # largest number of rows of a device in one call: without gradients; with gradients
+ROW = 40  # number of trials that a program simulates together, with the same gains
+ROWS, ROWS_WITH_DERIVATIVES = 64, 8  # largest number of rows (of ROW trials) of a device in a call; with gradients
 
 
 class Batch(NamedTuple):

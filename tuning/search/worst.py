@@ -112,8 +112,8 @@ def hardest(
     limits = {r.metric: r.limit for r in requirements}
     batch = problem.batch_of(chosen)
     moved = simulations.movable(problem.dispersion)
-    charted = [_charted(problem, name, batch.coordinates[name]) for name in moved]
-    y = np.concatenate([np.zeros((chosen.size, 0)), *charted], axis=1)
+    variables = [_variables(problem, name, batch.coordinates[name]) for name in moved]
+    y = np.concatenate([np.zeros((chosen.size, 0)), *variables], axis=1)
     best, best_y = np.full(len(y), -np.inf), y.copy()
 
     def evaluate(y: np.ndarray) -> np.ndarray:
@@ -137,7 +137,7 @@ def hardest(
     ratios = {
         m: float(violation_ratio(getattr(simulated.metrics, m), limit, at_least=False)) for m, limit in limits.items()
     }
-    ratios = {m: np.inf if np.isnan(v) else v for m, v in ratios.items()}  # it never settles, for example
+    ratios = {m: np.inf if np.isnan(v) else v for m, v in ratios.items()}  # NaN, for example: the run never settles
     worst = max(ratios, key=ratios.__getitem__)
     return Hardest(
         metric=worst,
@@ -151,8 +151,11 @@ def hardest(
     )
 
 
-def _charted(problem: Problem, name: str, c: np.ndarray) -> np.ndarray:
-    """Return the variables y of coordinates c. A uniform c is (1 - cos pi y) / 2, which reaches both ends."""
+def _variables(problem: Problem, name: str, c: np.ndarray) -> np.ndarray:
+    """Map the random numbers c of a dispersion, called coordinates, to unbounded variables y.
+
+    A uniform c is (1 - cos pi y) / 2, which reaches both ends of its interval. Other c are equal to y.
+    """
     uniform = problem.dispersion.kinds[name].drawn == "uniform"
     return np.arccos(1.0 - 2.0 * c) / np.pi if uniform else c
 
