@@ -12,7 +12,7 @@ from ptsmc_jax.identification import results
 from ptsmc_jax.identification.estimation import Fit, Identification
 
 POINTS = 4000  # of a line
-UNITS = {"attitude": "rad", "rate": "rad/s"}  # of innovations
+UNITS = {"attitude": "rad", "rate": "rad/s"}  # units of innovations
 
 
 def figures_of(found: Identification) -> dict[str, Figure]:

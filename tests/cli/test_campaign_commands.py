@@ -203,7 +203,7 @@ def test_another_campaign_in_the_same_folder_is_refused(command, simulated, tmp_
         (["--cluster", "there.json"], "--cluster is there.json, which does not exist"),
         (["--tls-ca", "ca.pem"], "--tls-ca, --tls-cert and --tls-key need --cluster"),
         (["--metrics", "none.py:f"], "--metrics is none.py:f: the file none.py does not exist"),
-        (["--metrics", "m.py:nothing"], "--metrics is m.py:nothing: it is a int; allowed is"),
+        (["--metrics", "m.py:nothing"], "--metrics is m.py:nothing: it is of type int, but must be"),
         (["--metrics", "m.py:no"], "--metrics is m.py:no: m.py has no such name; allowed is"),
     ],
 )
@@ -417,7 +417,7 @@ def test_a_folder_without_a_campaign_is_refused(command, tmp_path, asked):
     for folder in ("empty", "not-there"):
         code, out, error = command(asked[0], folder, *asked[1:])
         assert (code, out) == (2, "")
-        assert f"{folder} holds no campaign; allowed is a folder made by `ptsmc montecarlo`" in error
+        assert f"{folder} is not a campaign, but must be a folder of `ptsmc montecarlo`" in error
     assert command("simulate", "s.toml", "--out", "run", "--no-figures", "--quiet")[0] == 0
     assert "run has results of `ptsmc simulate`" in command(asked[0], "run", *asked[1:])[2]
 

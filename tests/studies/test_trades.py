@@ -93,7 +93,7 @@ def test_invalid_limits_are_refused(command, tmp_path, options, said):
     ("tune", "said"),
     [
         ({"minimise": "t_f", "free": ["t_f"]}, 'tune.minimise is "t_f"'),
-        ({"worst_case": True}, "tune.worst_case is true, but must be false to ask what margins cost"),
+        ({"worst_case": True}, "tune.worst_case is true, but must be false for a front against margins"),
     ],
 )
 def test_margin_trade_refuses_other_objectives(tune, said):
@@ -208,16 +208,19 @@ def test_invalid_times_are_refused(command, tmp_path, options, said):
             {"controller": {"kind": "pd", "t_f": 5.0}, "tune": {}},
             'controller.kind is "pd", but must be prescribed_time',
         ),
-        ({"tune": {"free": ["eta", "t_f"]}}, "but must be without t_f to ask what a faster slew costs"),
+        ({"tune": {"free": ["eta", "t_f"]}}, "but must be without t_f for a front against t_f"),
         (
             {"tune": {"minimise": "t_f", "free": ["t_f"]}, "requirements": {"window_error": 1e-3}},
             'tune.minimise is "t_f"',
         ),
         ({"tune": {"worst_case": True}}, "tune.worst_case is true, but must be false"),
-        ({"requirements": {"gain_margin": 6.0}, "tune": {}}, "requirements.gain_margin is asked of one loop"),
+        (
+            {"requirements": {"gain_margin": 6.0}, "tune": {}},
+            "requirements.gain_margin must be absent for a front against t_f",
+        ),
         (  # t_o would stay a third of the scenario's t_f at every time
             {"observer": {"kind": "prescribed_time"}, "tune": {}},
-            "observer.t_o is absent and would follow t_f; allowed is a given t_o",
+            "observer.t_o is absent, but must be set for a front against t_f",
         ),
     ],
 )

@@ -51,7 +51,7 @@ class Made(msgspec.Struct, frozen=True):
     metrics: str | None = None
     metrics_names: tuple[str, ...] | None = None
     run_table: str | None = None  # file name of the run table
-    controller_otherwise: str | None = None  # see `Folder.otherwise`
+    controller_otherwise: str | None = None  # parameters of C code that differ from the scenario, in words
     first_look: Annotated[int, Meta(ge=1, le=2**32)] | None = None
 
 
@@ -229,7 +229,7 @@ class Folder:
         try:
             metrics: Any = systems.item(self.custom_metrics, CUSTOM)
             if not isinstance(metrics, Callable):
-                raise ValueError(f"it is a {type(metrics).__name__}; allowed is {CUSTOM}")
+                raise ValueError(f"it is of type {type(metrics).__name__}, but must be {CUSTOM}")
             campaign = Campaign(self.ready, self.seed, metrics, software=software)
             campaign.custom_metric_names()
             return campaign
@@ -326,11 +326,11 @@ def opened(path: Path) -> Folder:
             systems.named(made.metrics, CUSTOM)
         simulated = scenario.read(path / "scenario.toml")
     except ScenarioError as error:
-        raise RefusedError(f"{path} holds a campaign of no scenario that can be read: {error}") from None
+        raise RefusedError(f"{path} contains a campaign, but its scenario cannot be read: {error}") from None
     except RefusedError:
         raise
     except (ValueError, msgspec.ValidationError):
-        raise RefusedError(f"{path} holds no campaign; allowed is a folder made by `ptsmc montecarlo`") from None
+        raise RefusedError(f"{path} is not a campaign, but must be a folder of `ptsmc montecarlo`") from None
     checksums = {name: value for name, value in versions.items() if name.endswith("_sha256") and isinstance(value, str)}
     return Folder(
         path=path,
@@ -362,7 +362,7 @@ def made_again(path: str, key: str) -> tuple[Campaign, Rows]:
     """
     folder = opened(Path(path))
     if folder.rows.key.hex() != key:
-        raise RefusedError(f"{path} holds another campaign there than here")
+        raise RefusedError(f"{path} contains another campaign on this machine than on the machine that started it")
     folder = replace(folder, trusted=True)
     return folder.campaign, folder.rows
 

@@ -25,7 +25,7 @@ from tuning.studies.campaign_folder import Folder, opened
 from tuning.studies.campaign_theory import lower_bound_of, margins_of, unjudged
 
 SAME = 1e-12  # largest relative difference of equal results
-CONFIDENCE = 0.95  # of the intervals, unless a requirement has its own confidence
+CONFIDENCE = 0.95  # confidence level of the intervals, unless a requirement has its own
 QUANTILES = (0.5, 0.9, 0.99, 0.9973)
 SHOWN = 0.9973  # fraction of the runs that keep a pointing budget: three sigma of a normal distribution
 SEARCHED = 100_000  # largest number of trials for the sensitivities to inputs
@@ -344,7 +344,7 @@ def most_extreme(metric: str, values: np.ndarray, failed: np.ndarray, count: int
 class Replay:
     """A repeated simulation of a trial."""
 
-    run: runs.Run  # with its history
+    run: runs.Run  # the run with its history
     off: float | None  # largest relative difference between the new and the stored row; None: no row is stored
     rounding: float  # largest relative difference between `run`, from another compiled program, and the new row
 

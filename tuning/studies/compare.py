@@ -50,7 +50,7 @@ class Contender:
     trials: Trials
     verdicts: list[Verdict]
     lower_bound: float | None  # lower bound of the RMS window error
-    margins: dict[str, dict[str, Any]] | None = None  # of the nominal loop, see `stability.worst`
+    margins: dict[str, dict[str, Any]] | None = None  # margins of the nominal loop, see `stability.worst`
     changed: Mapping[str, Trials] = field(default_factory=dict)  # trials with unknown model errors, see `perturbed`
 
     @property
@@ -81,8 +81,8 @@ def check(scenario: Scenario) -> None:
     if scenario.motion != "spacecraft":
         kind = errors.show(scenario.plant.kind)
         raise ScenarioError(
-            f'plant.kind is {kind}, but must be "spacecraft": laws are compared with a wrong inertia, too; for another '
-            "plant ptsmc tune finds the gains of one law at a time"
+            f'plant.kind is {kind}, but must be "spacecraft", because the comparison changes the inertia; for another '
+            "plant use ptsmc tune for one law at a time"
         )
     if not scenario.sampled:
         mode = errors.show(scenario.loop.mode)
@@ -244,7 +244,7 @@ def compare(
 
     Args:
         scenario: the mission, requirements and dispersions for all laws.
-        seed: of the searches. The seed of the held-out trials follows from it.
+        seed: seed of the searches. The seed of the held-out trials follows from it.
         tell: called with the progress after every step.
         journal: evaluations of an interrupted comparison, which then resumes.
         rivals: the scenario with each law, as `that_can_be_simulated` returns it; None: all built-in laws.
@@ -400,7 +400,7 @@ _COLUMNS = ("met", "window_error", "peak_torque", "largest_peak_torque", "effort
 def _rows(scenario: Scenario, content: Mapping[str, Any]) -> tuple[list[str], list[list[Any]]]:
     """Return the header and the rows of `compare.csv`, one row for each law."""
     required = [name for name in catalogues.MARGINS if name in scenario.requirements]
-    nominal = [name for name in catalogues.MARGINS if name not in required]  # of the nominal loop in the hold phase
+    nominal = [name for name in catalogues.MARGINS if name not in required]  # columns of the nominal loop in hold
     head = ["law", *_COLUMNS, *(f"settling_time_{100 * float(q):g}" for q in _QUANTILES), *required, *nominal,
             "window_error_low", "window_error_high", *(f"window_error_{name}" for name in MODEL_ERRORS),
             "gains"]  # fmt: skip
@@ -438,7 +438,7 @@ def identity(scenario: Scenario, seed: int, against: Rivals = Rivals()) -> dict[
 
     Args:
         scenario: the scenario of the comparison.
-        seed: of the searches.
+        seed: seed of the searches.
         against: the other laws.
     """
     return {"command": "compare", "seed": seed, **custom.checksums(scenario), **against.identity()}

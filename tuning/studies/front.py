@@ -18,7 +18,7 @@ class Kind(NamedTuple):
     quantity: str
     unit: str  # a unit, or the metric that has the unit
     file: str  # name of the CSV file and the figure
-    column: str  # of the quantity in the CSV file
+    column: str  # name of the quantity's column in the CSV file
 
     def label(self, plant: str) -> str:
         """Return the quantity with its unit for this kind of plant."""
@@ -63,13 +63,13 @@ class Point:
 
     value: float  # largest peak torque [N m], largest |S| [dB] (infinite: no limit) or t_f [s] that they are tuned for
     gains: dict[str, float]
-    rms: float = math.nan  # window error
-    interval: tuple[float, float] | None = None  # of rms
+    rms: float = math.nan  # RMS window error
+    interval: tuple[float, float] | None = None  # confidence interval of `rms`
     costs: dict[str, float] = field(default_factory=dict)  # other metrics by name, see `trades`
     failures: int = 0  # trials that failed or did not converge at t_f
-    meets: bool = False  # every requirement
+    meets: bool = False  # whether the gains meet every requirement
     trained: float = math.nan  # objective over the training trials
-    dominated: bool = False  # by another point, beyond the interval of the ratio of their errors
+    dominated: bool = False  # whether another point dominates this one, see `pareto.marked`
     knee: bool = False
 
     @property
@@ -87,8 +87,8 @@ class Front:
     points: list[Point]
     idle: list[float]  # values that have the same gains as another value
     without: list[float]  # values without feasible gains
-    trials: int  # held-out trials
-    seed: int  # of these trials
+    trials: int  # number of held-out trials
+    seed: int  # seed of the held-out trials
     interval_confidence: float
     lower_bound: float | None  # lower bound on the RMS window error
     rollouts: int

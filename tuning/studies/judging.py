@@ -26,7 +26,7 @@ def seed_of_judge(seed: int, turn: int = 0) -> int:
     The hash of `draws.derive` maps one seed in 2^32 to itself for each name, for example 654735429 in turn 0.
 
     Args:
-        seed: of the search.
+        seed: seed of the search.
         turn: number of earlier searches whose gains broke a limit on their held-out trials.
     """
     name = f"fresh trials {turn}" if turn else "fresh trials"
@@ -54,8 +54,8 @@ def judge(scenario: Scenario, held_out_seed: int, reach: Reach | None = None) ->
     """Simulate a scenario on its held-out trials, on the flight clock.
 
     Args:
-        scenario: with the gains.
-        held_out_seed: of the held-out trials.
+        scenario: scenario with the gains.
+        held_out_seed: seed of the held-out trials.
         reach: ranges of the gains that share a compiled program; None: those of the scenario.
     """
     simulated = study(on_flight_clock(scenario), reach=reach)
@@ -71,9 +71,9 @@ def verdicts_of(scenario: Scenario, trials: Trials, held_out_seed: int) -> list[
     """Return the verdicts on the requirements, and on the required margins of the loop.
 
     Args:
-        scenario: with the requirements and the gains.
+        scenario: scenario with the requirements and the gains.
         trials: the held-out trials of these gains.
-        held_out_seed: of these trials.
+        held_out_seed: seed of these trials.
     """
     ready = study(on_flight_clock(scenario))
     one = 0 if trials.status.size == 1 else slice(None)  # one nominal trial: a required fraction has no meaning
@@ -106,7 +106,7 @@ def largest(name: str, scenario: Scenario, trials: Trials) -> float:
     result is the largest value of the trials that reach their end.
 
     Args:
-        name: of the metric.
+        name: name of the metric.
         scenario: its requirement defines the fraction; without a requirement the fraction is 1.
         trials: the trials.
 

@@ -60,14 +60,14 @@ class Cell:
     not_converged: int = 0  # trials that did not converge by t_f
     window_error: float = np.nan  # RMS over the trials
     peak_torque: float = np.nan  # mean over the trials [N m]
-    largest_peak_torque: float = np.nan  # over the trials [N m]
+    largest_peak_torque: float = np.nan  # largest over the trials [N m]
     linear_window_error: float = np.nan  # error due to noise alone, by linear covariance analysis
     linear_torque: float = np.nan  # torque due to noise alone, by linear covariance analysis [N m]
     radius: float = np.nan  # spectral radius of the frozen loop at the hand-over [-]
-    gain_margin: float = np.nan  # factor, at the hand-over [-]
-    delay_margin: float = np.nan  # at the hand-over [s]
-    hold_gain_margin: float = np.nan  # factor, in the hold phase [-]
-    hold_delay_margin: float = np.nan  # in the hold phase [s]
+    gain_margin: float = np.nan  # gain margin at the hand-over, as a factor [-]
+    delay_margin: float = np.nan  # delay margin at the hand-over [s]
+    hold_gain_margin: float = np.nan  # gain margin in the hold phase, as a factor [-]
+    hold_delay_margin: float = np.nan  # delay margin in the hold phase [s]
     hold_radius: float = np.nan  # spectral radius of the frozen loop in the hold phase [-]
 
 
@@ -139,7 +139,7 @@ def simulate(scenario: Scenario, x: Axis, y: Axis, seed: int, trials: int, tell:
         scenario: the scenario.
         x: the horizontal axis.
         y: the vertical axis.
-        seed: of dispersions and noise.
+        seed: seed of dispersions and noise.
         trials: number of trials for each pair; 1 is used if all trials are equal.
         tell: called with the number of finished cells and the number of all cells.
 
@@ -197,7 +197,7 @@ def _with(scenario: Scenario, values: dict[str, float]) -> Scenario:
             one = place.removesuffix("]")
             chosen = {int(one)} if one.isdecimal() else set(range(len(current)))
             if not chosen <= set(range(len(current))):
-                raise ScenarioError(f"{key} names a number that {table}.{name} = {errors.brief(current)} has not")
+                raise ScenarioError(f"{key} does not exist: {table}.{name} is {errors.brief(current)}")
             number = [value if k in chosen else old for k, old in enumerate(current)]
         changes[f"{table}__{name}"] = number
     if "loop.t_end" not in values and {"controller.t_f", "loop.window"} & set(values):  # keep t_end - t_f
@@ -319,7 +319,7 @@ def write(folder: Path, simulated: Map, seed: int, figures: bool) -> None:
     Args:
         folder: an empty folder.
         simulated: the results.
-        seed: of dispersions and noise.
+        seed: seed of dispersions and noise.
         figures: write figures too.
     """
     scenario, x, y, cells = simulated.scenario, simulated.x, simulated.y, simulated.cells

@@ -42,7 +42,7 @@ def trace(trade: Trade, seed: int, tell: Report = lambda *_: None, journal: Jour
 
     Args:
         trade: the scenario, and the quantity that its window error is traded against.
-        seed: of the search. The seed of the held-out trials follows from it.
+        seed: seed of the search. The seed of the held-out trials follows from it.
         tell: called with the progress after every step.
         journal: evaluations of an interrupted search, which then resumes.
     """
@@ -96,7 +96,7 @@ def refined(targets: Sequence[Target], known: list[np.ndarray], posed: posing.Po
     """Improve the gains of all targets from the last to the first and back, each from the gains known by then.
 
     Args:
-        targets: in the order of their values.
+        targets: the targets in the order of their values.
         known: gains as fractions of the bounds' intervals, (gains,) each; the gains found are added.
         posed: evaluates gains.
         tell: called with the progress.
@@ -131,7 +131,7 @@ def _refined(posed: posing.Posed, problem: Problem, known: np.ndarray) -> Best |
 
 
 def apart(best: dict[int, Best]) -> dict[int, Best]:
-    """Return the first target of those with the same gains, whose limits are not active."""
+    """Return the first target of each group with the same gains, because the limits of the others are not active."""
     kept: dict[int, Best] = {}
     for k in sorted(best):
         if all(np.abs(best[k].normalised - other.normalised).max() >= APART for other in kept.values()):

@@ -33,8 +33,8 @@ class Posed:
     ready: Study
     problem: Problem
     evaluate: Evaluator
-    scenario_gains: np.ndarray  # (gains,) of the scenario
-    with_gradients: bool  # F has useful gradients: the sign function is not discontinuous
+    scenario_gains: np.ndarray  # (gains,) gains of the scenario
+    with_gradients: bool  # whether F has useful gradients; it has none with the discontinuous sign
     asked: list[Requirement]  # constraints of the search
     seed: int
     designs: np.ndarray  # (designs, gains) starting points that follow from the mission
@@ -89,8 +89,8 @@ def tuning_problem(scenario: Scenario, seed: int, journal: Journal | None = None
     """Return the tuning problem of a scenario.
 
     Args:
-        scenario: with free gains.
-        seed: of the training trials and the search.
+        scenario: scenario with free gains.
+        seed: seed of the training trials and the search.
         journal: stored evaluations, which are not simulated again.
         farther: see `reach`.
     """

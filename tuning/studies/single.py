@@ -67,7 +67,7 @@ def write(
         folder: an empty folder.
         scenario: the scenario.
         run: the simulated run.
-        seed: of dispersions and noise.
+        seed: seed of dispersions and noise.
         trial: number of the trial; None: the nominal run.
         figures: write figures too.
         computer: the C code that controlled the run; None: the simulated law did.

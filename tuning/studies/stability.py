@@ -146,7 +146,7 @@ def _open(left: margins.Margins) -> np.ndarray:
 
 
 def _start(ready: Study) -> dict[str, float]:
-    """Return the angle between initial attitude and reference in the nominal run [deg]; nothing for other plants."""
+    """Return {"start_deg": initial angle to the reference in the nominal run [deg]}, or {} for other plants."""
     parts, kinematics = ready.parts, ready.parts.controller.kinematics
     if kinematics.angle_unit != "rad":
         return {}

@@ -28,10 +28,10 @@ from tuning.studies.posing import Posed
 
 TORQUE, SENSITIVITY = "peak_torque", "peak_sensitivity"
 POINTS = 20  # default number of limits on the peak torque
-OFF = 1e9  # a limit on the peak torque that no gains reach
-HARDLY = 0.05  # fraction of the largest useful peak torque that hardly any gains keep
+OFF = 1e9  # limit on the peak torque that is never active
+HARDLY = 0.05  # fraction of the largest useful peak torque; hardly any gains keep such a limit
 TIGHTER = 3  # largest number of searches for the least peak torque
-FEWER = 4  # starting points of a search whose gains are refined later
+FEWER = 4  # number of starting points of a search whose gains are refined later
 LIMITS = (3.0, 4.0, 5.0, 6.0, 8.0, 12.0)  # default limits on the peak sensitivity [dB]
 BOUNDED = ("gain_margin", "phase_margin", SENSITIVITY)  # margins that a limit on the sensitivity bounds
 SPAN = (0.5, 0.7, 1.0, 1.4, 2.0)  # default prescribed times, relative to the scenario's t_f
@@ -44,7 +44,7 @@ class Target:
     """A value of the traded quantity, and the tuning problem for it."""
 
     value: float
-    name: str  # in progress reports
+    name: str  # name of the target in progress reports
     problem: Problem
 
 
@@ -55,9 +55,9 @@ class Trade(ABC):
     scenario: Scenario
 
     against: ClassVar[str]  # value of the option --against
-    purpose: ClassVar[str]  # end of error messages
-    merged: ClassVar[bool] = True  # values with the same gains share a point
-    compared: ClassVar[bool] = False  # mark dominated points and the knee, and judge the published gains too
+    purpose: ClassVar[str]  # end of error messages, such as "for a front against t_f"
+    merged: ClassVar[bool] = True  # whether values with the same gains share a point
+    compared: ClassVar[bool] = False  # whether to mark dominated points and the knee, and to judge the published gains
 
     def check(self) -> None:
         """Raise ScenarioError if the study does not apply to the scenario."""
@@ -79,7 +79,11 @@ class Trade(ABC):
 
     @abstractmethod
     def targets(self, posed: Posed, tell: Report) -> tuple[list[Target], list[np.ndarray]]:
-        """Search from scratch. Raises KeyboardInterrupt on Ctrl-C.
+        """Search from the scenario's gains, without known gains. Raises KeyboardInterrupt on Ctrl-C.
+
+        Args:
+            posed: the tuning problem of `base`.
+            tell: called with the progress.
 
         Returns:
             The targets, and the gains that these searches found, (gains,) each, as fractions of the bounds' intervals.
@@ -96,12 +100,12 @@ class Trade(ABC):
         Args:
             tuned: the scenario with the gains.
             trials: the held-out trials of the gains.
-            seed: of these trials.
+            seed: seed of these trials.
         """
 
     @abstractmethod
     def options(self) -> dict[str, Any]:
-        """Return the options of the command that asks for these values."""
+        """Return the options of `ptsmc pareto` that select these values."""
 
     def identity(self, seed: int) -> dict[str, Any]:
         """Return the entries of `versions.json` that identify a finished or interrupted front."""
@@ -136,7 +140,7 @@ class Torque(Trade):
         return self.scenario if limited else _requiring(self.scenario, {TORQUE: OFF})
 
     def targets(self, posed: Posed, tell: Report) -> tuple[list[Target], list[np.ndarray]]:
-        """Search without a limit, for the least torque, and for a limit between these."""
+        """Search without a limit, for the least torque, and for a limit between both; see `Trade.targets`."""
         at = posed.problem.metrics.index(TORQUE)
 
         def under(limit: float, joined: Problem = posed.problem) -> Problem:
@@ -184,7 +188,7 @@ class Margins(Trade):
     limits: tuple[float, ...] = ()  # [dB]; empty: `LIMITS`, and the scenario's limit
 
     against = "margins"
-    purpose = "to ask what margins cost"
+    purpose = "for a front against margins"
 
     def check(self) -> None:
         """Raise ScenarioError if the study does not apply to the scenario."""
@@ -205,7 +209,7 @@ class Margins(Trade):
         return _requiring(self.scenario, {SENSITIVITY: self.values[-1]}, without=BOUNDED)
 
     def targets(self, posed: Posed, tell: Report) -> tuple[list[Target], list[np.ndarray]]:
-        """Search for each limit."""
+        """Search for the best gains under each limit; see `Trade.targets`."""
         asked = posed.problem.margins
         assert asked is not None
         at, targets, known = asked.metrics.index(SENSITIVITY), [], []
@@ -235,7 +239,7 @@ class SlewTime(Trade):
     times: tuple[float, ...] = ()  # [s]; empty: from half to twice the scenario's t_f
 
     against = "t_f"
-    purpose = "to ask what a faster slew costs"
+    purpose = "for a front against t_f"
     merged = False
 
     def check(self) -> None:
@@ -247,12 +251,10 @@ class SlewTime(Trade):
         if T_F in scenario.search.gains:
             raise wrong("tune.free", list(scenario.search.gains), f"without t_f {self.purpose}")
         if free_gains.observer_follows(scenario):
-            raise ScenarioError(f"observer.t_o is absent and would follow t_f; allowed is a given t_o {self.purpose}")
+            raise ScenarioError(f"observer.t_o is absent, but must be set {self.purpose}; its default depends on t_f")
         for key in scenario.requirements:
             if key in MARGINS:
-                raise ScenarioError(
-                    f"requirements.{key} is asked of one loop, not of several times; allowed is none {self.purpose}"
-                )
+                raise ScenarioError(f"requirements.{key} must be absent {self.purpose}, which does not compute margins")
         for t_f in self.values:
             self._at(t_f)
 
@@ -269,7 +271,7 @@ class SlewTime(Trade):
 
     @property
     def farther(self) -> dict[str, float]:
-        """Return the longest time."""
+        """Return the longest time as t_f [s]."""
         return {"t_f": self.values[-1]}
 
     def _at(self, t_f: float) -> Scenario:
@@ -282,9 +284,9 @@ class SlewTime(Trade):
         return scenarios.replace(timed, tune={**parsing.plain(tune), "bounds": bounds})
 
     def targets(self, posed: Posed, tell: Report) -> tuple[list[Target], list[np.ndarray]]:
-        """Search for the longest time, the shortest, and the others.
+        """Search for the best gains at the longest time, the shortest, and the others; see `Trade.targets`.
 
-        Difficult trials that the first two searches add to the training trials are used for all other times too.
+        Hard trials that the first two searches add to the training trials are used for all other times, too.
         """
         joined, last, known = posed.problem, len(self.values) - 1, []
         parts = [gains.with_gains(joined.parts, {"t_f": t_f}) for t_f in self.values]
@@ -303,7 +305,7 @@ class SlewTime(Trade):
         return gains.in_scenario(self._at(value), found)
 
     def costs(self, tuned: Scenario, trials: Trials, seed: int) -> dict[str, float]:
-        """Return the metrics of `SLEW_COSTS` that the scenario's runs have."""
+        """Return `judging.largest` of the metrics in `SLEW_COSTS` that runs of the scenario have."""
         needed = {name: tuned.metrics[name].table for name in SLEW_COSTS if name in tuned.metrics}
         has = [name for name, table in needed.items() if table is None or getattr(tuned, table, None) is not None]
         return {name: judging.largest(name, tuned, trials) for name in has}

@@ -25,7 +25,7 @@ JUDGED = {"window_error": "rms", "peak_torque": "mean", "effort": "mean"}  # sta
 def statistics(trials: Trials, kind: str) -> dict[str, Any]:
     """Return counts by status, and statistics of each metric over the trials that reached their end.
 
-    kind: of the plant, which defines the metrics.
+    kind: kind of the plant, which defines the metrics.
     """
     found: dict[str, Any] = {"trials": int(trials.status.size), "counts": trials.counts()}
     for name, entry in catalogues.CATALOGUES[kind].items():
@@ -219,7 +219,7 @@ def identity(scenario: Scenario, seed: int, *, globally: bool) -> dict[str, Any]
 
     Args:
         scenario: the scenario before tuning.
-        seed: of the search.
+        seed: seed of the search.
         globally: the run includes a global search for comparison.
     """
     return {

@@ -32,7 +32,7 @@ from tuning.studies.posing import Posed
 
 WIDENED = 3  # largest number of searches in wider bounds
 TRIES = 3  # largest number of searches; each is judged on its own held-out trials
-FARTHER = 1.02  # a repeated search divides a metric by its value over the limit on held-out trials, times this factor
+FARTHER = 1.02  # a repeated search tightens a limit by its ratio of value to limit on held-out trials and this factor
 SENSITIVE = ("window_error", "hold_error", "peak_torque", "effort", "chattering")  # metrics with sensitivities to gains
 
 
@@ -40,17 +40,17 @@ SENSITIVE = ("window_error", "hold_error", "peak_torque", "effort", "chattering"
 class Trust:
     """Checks of a result: gradient errors, profiles, sensitivities and stability margins, see `trust`."""
 
-    gradient_error: tuple[float, float] | None  # relative, at the first and the last point; None: discontinuous sign
+    gradient_error: tuple[float, float] | None  # relative error at the first and last point; None: discontinuous sign
     profiles: dict[str, Profile]  # objective along each gain
     sensitivities: dict[str, dict[str, float]]
-    margins: dict[str, dict[str, Any]] | None  # of the tuned gains, see `stability.worst`
+    margins: dict[str, dict[str, Any]] | None  # stability margins of the tuned gains, see `stability.worst`
 
 
 @dataclass(frozen=True)
 class BeyondBound:
     """The results on held-out trials after moving one gain from its bound to a value beyond."""
 
-    value: float  # of the gain
+    value: float  # value of the gain, in its unit
     times: float | None  # RMS window error, relative to the tuned gains; None: an error is missing or zero
     broken: str | None  # violated requirement, in words; None: all requirements are met, and no trial failed
 
@@ -64,7 +64,7 @@ class BeyondBound:
 class Try:
     """A search whose gains kept every limit on the training trials, but broke a limit on the held-out trials."""
 
-    held_out_seed: int  # of the held-out trials
+    held_out_seed: int  # seed of the held-out trials
     gains: dict[str, float]
     margins: dict[str, float]  # distance from the limit of each metric in the search, as a fraction of the limit
     over: dict[str, float]  # judged value over the limit, for each metric that broke its limit on the held-out trials
@@ -74,7 +74,7 @@ class Try:
 class Tuning:
     """The results of a tuning run, which may have been interrupted."""
 
-    tuned: Scenario  # with the tuned gains, on the flight clock
+    tuned: Scenario  # scenario with the tuned gains, on the flight clock
     gains: dict[str, float]
     search: Search
     earlier: list[Try]
@@ -82,11 +82,11 @@ class Tuning:
     training: Trials  # tuned gains on the training trials
     held_out: dict[str, Trials]  # held-out trials: "tuned" and the keys of `judging.beside`
     published_unavailable: str | None  # reason why the published gains cannot be simulated
-    seed: int  # of the training trials and the search
-    held_out_seed: int  # of the held-out trials
+    seed: int  # seed of the training trials and the search
+    held_out_seed: int  # seed of the held-out trials
     judged_gains: dict[str, dict[str, float]]  # gains by name, for each key of `held_out`
     lower_bounds: dict[str, float | None]  # lower bound of the RMS window error, for each key of `held_out`
-    verdicts: list[Verdict]  # of the tuned gains on the held-out trials
+    verdicts: list[Verdict]  # verdicts on the tuned gains from the held-out trials
     broken_by: dict[str, list[str]]  # gains that are more accurate than the tuned ones, and the metrics that they break
     shortest: ShortestTime | None  # shortest t_f that the torque limit allows; None: no torque limit, or t_f is tuned
     trust: Trust | None  # None: interrupted, or not requested
@@ -112,9 +112,9 @@ class _Judged:
     """The gains of a search, and their results on held-out trials."""
 
     search: Search
-    gains: dict[str, float]  # rounded
-    scenario: Scenario  # with the rounded gains, on the flight clock
-    seed: int  # of the held-out trials
+    gains: dict[str, float]  # rounded gains by name
+    scenario: Scenario  # scenario with the rounded gains, on the flight clock
+    seed: int  # seed of the held-out trials
     trials: Trials
     verdicts: list[Verdict]
     begun: float  # time of the monotonic clock after the search [s]
@@ -137,8 +137,8 @@ def tune(
     trials.
 
     Args:
-        scenario: with free gains.
-        seed: of the training trials and the search. The seeds of the held-out trials follow from it.
+        scenario: scenario with free gains.
+        seed: seed of the training trials and the search. The seeds of the held-out trials follow from it.
         report: called with the progress after every step.
         journal: evaluations of an interrupted run, which then resumes.
         globally: compare the result with a global search (differential evolution).
@@ -276,9 +276,9 @@ def _judge(scenario: Scenario, posed: Posed, outcome: Search, held_out_seed: int
 
 
 def _shortest(posed: Posed, judged: _Judged) -> ShortestTime | None:
-    """Return the shortest t_f that the torque limit allows.
+    """Return the shortest t_f [s] that the torque limit allows.
 
-    None: there is no torque limit, t_f is tuned, or the law has no prescribed time.
+    The result is None if there is no torque limit, t_f is tuned, or the law has no prescribed time.
     """
     asked = next((one for one in posed.ready.requirements if one.metric == "peak_torque"), None)
     if asked is None or T_F in posed.problem.names or not judged.scenario.controller.law.prescribed:
@@ -294,7 +294,7 @@ def _broken_by(candidates: dict[str, Scenario], held_out: dict[str, Trials], see
     Args:
         candidates: scenario of each set of gains, by name.
         held_out: their held-out trials, with the tuned gains as "tuned".
-        seed: of these trials.
+        seed: seed of these trials.
     """
 
     def more_accurate(trials: Trials) -> bool:
