@@ -245,7 +245,7 @@ def _gate(loaded: Scenario) -> float:
 
 
 class Found(NamedTuple):
-    """The end of a local search."""
+    """Result of a local search."""
 
     z: np.ndarray
     value: float  # log-likelihood with the prior
@@ -288,7 +288,7 @@ class Search:
             return jax.tree.map(lambda v: v[None], one)
 
         devices = min(len(configure.devices()), z.size)
-        each = -(-z.size // devices)  # directions of a device
+        each = -(-z.size // devices)  # number of directions that each device computes
         directions = jnp.eye(devices * each, z.size).reshape(devices, each, z.size)
         slopes, found = montecarlo.spread(along, directions, devices)
         by_value, by_variance = (jnp.concatenate([*v], axis=-1)[..., : z.size] for v in slopes)
@@ -341,7 +341,7 @@ class Search:
         return best
 
     def run(self, z: np.ndarray, acceleration: float) -> Found:
-        """Return the end of the local search from coordinates (n,), with its outliers rejected.
+        """Return the result of the local search from coordinates (n,), with outliers rejected.
 
         A model that is far off predicts a long log badly, and its likelihood has many maxima. If the fit is poor, the
         search therefore begins with noise on the acceleration, so that the filter follows the log, and reduces it.

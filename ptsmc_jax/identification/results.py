@@ -171,7 +171,7 @@ def components(fit: Fit) -> list[str]:
 
 
 def innovations(fit: Fit) -> tuple[np.ndarray, np.ndarray]:
-    """Return innovations and their 1 sigma at the rows of the log but the first, NaN without a reading."""
+    """Return innovations and their 1 sigma at all rows of the log except the first; NaN without a reading."""
     sampled = fit.rows.source[1:] >= 0
     value, variance, accepted = (part[sampled] for part in fit.innovations)
     return np.where(accepted, value, np.nan), np.where(accepted, np.sqrt(variance), np.nan)

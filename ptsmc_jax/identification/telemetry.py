@@ -335,7 +335,7 @@ def _check_motion(table: _Table, t: Values, readings: dict[str, Values]) -> None
     clear = (size > 0.02) & (size < 0.5)
     if clear.sum() >= 5 and np.median(off[clear] / size[clear]) > MISFIT:
         raise RefusedError(
-            f"{table.name} has rates that do not fit its attitudes: their integral differs from the rotation by "
-            f"{100.0 * np.median(off[clear] / size[clear]):.3g} % in the middle; check telemetry.rate_unit, order and "
+            f"{table.name} has rates that do not fit its attitudes: their integral differs from the rotation by a "
+            f"median of {100.0 * np.median(off[clear] / size[clear]):.3g} %; check telemetry.rate_unit, order and "
             "rotation"
         )

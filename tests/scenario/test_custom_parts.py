@@ -150,7 +150,7 @@ def test_a_changed_custom_file_is_refused_even_with_trust(command, simulated, ho
     for asked in (["replay", FOLDER, "--trial", 3], ["simulate", f"{FOLDER}/scenario.toml", "--out", "new"]):
         code, out, error = command(*asked, "--trust", "--no-figures")
         assert (code, out) == (2, "")
-        assert f"was made with another plant.system than {simulated}/my.py is now" in error
+        assert f"was made with another plant.system: {simulated}/my.py had" in error
     code, _, error = command("montecarlo", "mine.toml", "--trials", 30, "--metrics", "my.py:farthest")
     assert (code, "holds a run with system_sha256" in error) == (2, True)
     assert not ran(simulated)

@@ -111,8 +111,8 @@ def check_unchanged(programs: Mapping[str, str], results: Path, made: Mapping[st
         elif now is not None and now not in known:
             then = " or ".join(was[:12] for was in known)
             raise RefusedError(
-                f"{results} was made with another {key} than {location(key, where)} is now "
-                f"(SHA-256 {then} then, {now[:12]} now); restore the earlier content of the file"
+                f"{results} was made with another {key}: {location(key, where)} had the SHA-256 {then} then, and has "
+                f"{now[:12]} now; restore the earlier content of the file"
             )
     return unknown
 

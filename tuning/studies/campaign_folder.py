@@ -241,7 +241,7 @@ class Folder:
             custom_parts.check_unchanged({key: self.files[key]}, self.path, self.identity)
 
     def recipe(self) -> tuple[Callable, tuple[str, str]]:
-        """Return a function and its arguments: another process calls it to rebuild the campaign and its rows."""
+        """Return a function, and arguments with which another process calls it to rebuild the campaign and its rows."""
         return made_again, (str(self.path.resolve()), self._key.hex())
 
     def whole_parts(self) -> list[Part]:

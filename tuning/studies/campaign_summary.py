@@ -206,7 +206,7 @@ def drawn_columns(folder: Folder, parts: list[rows.Part]) -> list[str]:
 
 
 def _alike(quantiles: dict[str, Any], trials: int, *, drawn: bool = False) -> list[str]:
-    """Return a warning if all trials have the same metrics; drawn: the inputs of the trials differ."""
+    """Return a warning if all trials have the same metrics; drawn: whether the inputs of the trials differ."""
     known = [metric for metric in quantiles.values() if "max" in metric]
     if trials < 2 or not known or any(abs(m["max"] - m["mean"]) > SAME * abs(m["max"]) for m in known):
         return []

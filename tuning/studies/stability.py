@@ -43,9 +43,8 @@ def find(scenario: Scenario) -> tuple[Study, Course]:
         raise ScenarioError(f"margins need a nominal run that reaches its end, but it ends {status}: {why}")
     if without_derivatives:
         raise ScenarioError(
-            f"margins need derivatives of the loop by all of its states, but with controller.kind = "
-            f"{errors.show(scenario.controller.kind)} one is not finite in the hold phase; "
-            "allowed is a law with finite derivatives there"
+            f"margins need finite derivatives of the loop by all of its states, but with controller.kind = "
+            f"{errors.show(scenario.controller.kind)} a derivative is not finite in the hold phase; use another law"
         )
     return ready, course
 
