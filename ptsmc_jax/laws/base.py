@@ -130,9 +130,9 @@ class Law(declare.Tunable):
     # The methods below use only the numbers in the fields, because a scenario calls them with its configuration table
 
     def turning(self, t_f: float) -> tuple[str, Scalar | float]:
-        """Return the name of the field that sets how fast the law turns a body, and the largest body rate [rad/s].
+        """Return the field that sets how fast the law turns a body, and the largest body rate of a half turn [rad/s].
 
-        The default is twice the mean rate of half a turn in t_f, because a custom law can be anything.
+        A half turn has the initial error |v| = 1. The default rate is twice the mean rate of a half turn in t_f.
 
         Args:
             t_f: prescribed time [s].

@@ -43,7 +43,7 @@ class Code:
     derived: list[Field] = field(default_factory=list)  # numbers that C derives from parameters
     basis: list[Field] = field(default_factory=list)  # parameters that determine the derived numbers
     derivation: str = ""  # text of the function that computes the derived numbers
-    follows: dict[str, list[str]] = field(default_factory=dict)  # names of the parameters behind each derived number
+    follows: dict[str, list[str]] = field(default_factory=dict)  # parameters that each derived number depends on
     fixed: dict[str, str] = field(default_factory=dict)  # reason why C cannot derive a parameter, by name
     deriving: dict[str, int] = field(default_factory=dict)  # number of operations of the derivation
     variables: int = 0  # largest number of variables in a function

@@ -91,9 +91,9 @@ class Library:
             except (OSError, AttributeError) as error:  # another processor, another language, a missing function
                 reason = str(error).removeprefix(f"{made}: ")
                 raise ScenarioError(
-                    f"the controller in {self.folder} does not load as {shlex.join(compiler())} compiles it: {reason}; "
-                    f"allowed is a C compiler for this machine, and code that ptsmc_{self.name}.c and "
-                    f"ptsmc_{self.name}_parameters.c contain or #include"
+                    f"the controller in {self.folder} does not load after {shlex.join(compiler())} has compiled it: "
+                    f"{reason}; use a C compiler for this machine, and put or #include all code in "
+                    f"ptsmc_{self.name}.c and ptsmc_{self.name}_parameters.c"
                 ) from None
         if sizes != list((ctypes.c_long * 4).in_dll(self._made, "ptsmc_sizes")):  # C of another controller.json
             raise none
@@ -112,7 +112,7 @@ class Library:
         flags = "-isystem", jax.ffi.include_dir(), *options, f"-DPTSMC_REAL={real}", f"-I{alone}"
         error = build(*flags, *files, str(glue), "-o", str(library)).replace(str(alone), str(self.folder))
         if error:
-            raise ScenarioError(f"the controller in {self.folder} does not compile from the *.c and *.h in it: {error}")
+            raise ScenarioError(f"the *.c and *.h files of the controller in {self.folder} do not compile: {error}")
         return library
 
     def first(self) -> np.ndarray:

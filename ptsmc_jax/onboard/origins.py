@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax
 
 JAX = Path(jax.__file__).parent
-FOREIGN = ("jaxtyping", "beartype", "<")  # wrappers between caller and function
+FOREIGN = ("jaxtyping", "beartype", "<")  # parts of file names of wrappers, whose stack frames are ignored
 LIBRARY = Path(__file__).parents[1]
 HELPERS = ("numerics/", "onboard/")  # folders whose functions get no heading in the C
 

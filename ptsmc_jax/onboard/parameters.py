@@ -29,7 +29,7 @@ class Parameters:
     fields: list[Field]  # field of each leaf; leaves that are the same array share a field
     values: dict[str, np.ndarray]  # values by name
     derived: set[str] = field(default_factory=set)  # names of derived parameters
-    origins: dict[str, list[str]] = field(default_factory=dict)  # names of the parameters behind each derived one
+    origins: dict[str, list[str]] = field(default_factory=dict)  # parameters that each derived one depends on
     fixed: dict[str, str] = field(default_factory=dict)  # reason why C cannot derive a parameter, by name
     rules: list[Rule] = field(default_factory=list)  # rules that C can evaluate
     used: set[str] = field(default_factory=set)  # names that C reads

@@ -133,7 +133,7 @@ def members(fields: Iterable[Field]) -> str:
 
 
 def _structs(code: Code, about: About) -> dict[str, str]:
-    """Return the values of the header, and the parameters' numbers."""
+    """Return the template values of the header, and the numbers of the parameters."""
     statuses = [f"    PTSMC_{name} = {k}, /* {meaning} */" for k, (name, meaning) in enumerate(STATUS.items())]
     note = ("\n * If the attitude filter has run before the manoeuvre, set attitude and bias afterwards. Otherwise it "
             "starts\n * from the first sample of the star tracker.\n")  # fmt: skip
@@ -160,7 +160,7 @@ def _initial(value: np.ndarray, kind: str) -> str:
 
 
 def _checks(code: Code, about: About) -> dict[str, str]:
-    """Return the values of the functions that check input, results and derived numbers."""
+    """Return the template values of the functions that check input, results and derived numbers."""
     names = {field.name for field in code.inputs}
     sensors = [field for field in _reals(code.inputs) if f"{field.name}_valid" in names]  # readings may be missing
     usable = ["isfinite(in->t)", "(!state->started || in->t > state->t)"]
@@ -216,7 +216,7 @@ def _all(terms: Sequence[str]) -> str:
 
 
 def _step(code: Code) -> dict[str, str]:
-    """Return the values of the rest of the program: functions of the stages, `ptsmc_init` and `ptsmc_step`."""
+    """Return the template values of the functions of the stages, `ptsmc_init` and `ptsmc_step`."""
     call = code.calls
     arguments = re.findall(r"\w+", " ".join(call.values()))
     derive = "    derive(p, &state->derived);" if code.derived else ""
@@ -242,7 +242,7 @@ def _step(code: Code) -> dict[str, str]:
 
 
 def rows(code: Code, about: About) -> dict[str, str | int]:
-    """Return the values of the flat header and of the programs that check the controller by rows of numbers."""
+    """Return the template values of the flat header, and of the programs that read rows of vectors.csv."""
     columns = code.columns
     every = (*code.inputs, *code.state, *code.outputs, *code.parameters)
     kinds = {field.name: declared(field.kind).replace("real", "ptsmc_real") for field in every}

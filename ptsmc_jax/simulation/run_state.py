@@ -144,8 +144,6 @@ def advance(run: Run, score: Score, before: State, after: State, record: Record)
 def row(run: Run, before: State, after: State, record: Record, tick: Tick | None = None) -> Log:
     """Return the row of the history at the start of a control period or of a step of the continuous loop.
 
-    The other arguments are as in `advance`.
-
     Args:
         run: constants of the run.
         before: state at the start of the period.

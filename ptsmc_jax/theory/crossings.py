@@ -15,11 +15,11 @@ from ptsmc_jax.theory.linear import Opening
 
 LOWEST, POINTS = 1e-6, 240  # Lowest grid frequency as a fraction of the Nyquist frequency; grid size without poles.
 AROUND = np.array([-3.0, -1.0, -0.3, 0.3, 1.0, 3.0])  # Offsets of grid points from a pole, in units of its damping.
-NEAREST = 3  # Crossings of each kind that are refined.
+NEAREST = 3  # Number of crossings of each kind that are refined.
 SPLIT = (2 * NEAREST, 3 * NEAREST)  # Indices that split the crossings: L real, |L| = 1, L nearest to -1.
 REAL = 1e-2  # L counts as real at an end of the grid if |Im L / Re L| is smaller.
 EVEN = 1e-6  # Relative differences of |L| below this count as zero, for grid points that coincide.
-CHUNK = 64  # Grid points in one evaluation of L, few enough for the processor's cache.
+CHUNK = 64  # Number of grid points in one evaluation of L, small enough for the processor's cache.
 MOST = 100.0  # dB. Larger gain margins count as infinite; peak sensitivity reported for an unstable loop.
 
 

@@ -49,7 +49,7 @@ def switching_rate(parts: Parts) -> float:
 
 @programs.jit
 def _switching_rates(parts: Parts) -> tuple[Scalar, Scalar]:
-    """Return the largest factor for the largest K2, and for the K2 of a settled observer (at t_end)."""
+    """Return the factor of `switching_rate` for the largest K2, and for the K2 of a settled observer (at t_end)."""
     law, bound = parts.controller, parts.observer.error_bound()
     seen = visited(parts) if parts.plant.custom_functions else None
     return rates.switching_rate(law, bound.largest, seen), rates.switching_rate(law, bound(parts.t_end), seen)

@@ -23,9 +23,9 @@ from ptsmc_jax.theory.crossings import MOST, SPLIT, Brackets, Triangles
 from ptsmc_jax.theory.linear import Loop, Opening
 
 NEUTRAL = 1e-6  # Tolerance of the unit circle, because rounding moves the poles at 1 of stored momentum.
-NEAREST = 3  # Crossings |L| = 1 that start a search for the delay margin, those with the smallest estimates.
+NEAREST = 3  # Number of crossings |L| = 1, by smallest estimated delay, from which the delay margin is searched.
 LOOKED, PARTS = 8, 16  # Range of the grid search for the delay margin in periods, and its steps per period.
-NEAR = 6  # Results of the grid search that start a search for the delay margin.
+NEAR = 6  # Number of results of the grid search from which the delay margin is searched.
 PAIR = 2  # Loops in one call of the compiled program: each point of a margin map has two.
 STARTS, FARTHER = 8, 0.15  # Largest number of Newton starts for a delay, and the distance between them in periods.
 

@@ -41,7 +41,7 @@ def test_an_invalid_controller_raises_an_error(chain, tmp_path):
         InTheLoop(library, parts("chain", period=0.2))
     shutil.copytree(chain, tmp_path / "controller")
     (tmp_path / "controller" / "ptsmc_flight.c").write_text("int main(void) { return }\n")
-    with pytest.raises(ScenarioError, match=r"does not compile from the \*\.c and \*\.h in it: .*error: "):
+    with pytest.raises(ScenarioError, match=r"^the \*\.c and \*\.h files of .* do not compile: .*error: "):
         Library(tmp_path / "controller")
 
 
@@ -75,7 +75,7 @@ def test_a_second_c_file_must_be_included(chain, tmp_path):
     call = r"\1\n    if (mine(p->period) < 0.0) return 1;"
     calls = re.sub(r"^(int ptsmc_flight_step\([^{]*\{)", call, code.read_text(), flags=re.MULTILINE)
     code.write_text(f"double mine(double x);\n{calls}")
-    with pytest.raises(ScenarioError, match=r"undefined symbol: mine; allowed is .* ptsmc_flight_parameters\.c"):
+    with pytest.raises(ScenarioError, match=r"undefined symbol: mine; use a .* ptsmc_flight_parameters\.c"):
         Library(changed)
     code.write_text(f'#include "mine.c"\n{calls}')
     Library(changed)
@@ -100,7 +100,7 @@ def test_cc_may_have_options_and_must_compile_for_this_machine(chain, monkeypatc
     shutil.copytree(chain, "-c")
     monkeypatch.setenv("CC", f"{CC} -pedantic -Wall -Wextra -Werror")
     Library("-c")
-    for cc, said in (("true", "does not load as true compiles it: .* allowed is a C compiler for this machine"),
+    for cc, said in (("true", "does not load after true has compiled it: .* use a C compiler for this machine"),
                      ("'cc", "^CC is 'cc, but must be a command: No closing quotation$")):  # fmt: skip
         monkeypatch.setenv("CC", cc)
         with pytest.raises(ScenarioError, match=said):
