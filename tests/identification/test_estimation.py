@@ -136,7 +136,7 @@ def test_wheel_speeds_replace_the_commanded_torque():
     frame, _ = flight(np.random.default_rng(4))
     table = {"wheel_speed": ["speed1", "speed2", "speed3"], "wheel_inertia": synthetic.SPIN_INERTIA}
     found = estimation.identify(satellite(telemetry=table), frame.drop("sent1", "sent2", "sent3"))
-    assert found.good, found.verdict
+    assert found.good, results.verdict(found)
     assert np.all(np.abs(found.estimate - ENTRIES) < 3.5 * found.std)
 
 
