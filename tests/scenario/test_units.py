@@ -99,3 +99,11 @@ def test_a_slew_of_ten_milliseconds_is_accepted():
 def test_overflowing_defaults_are_refused():
     with pytest.raises(ScenarioError, match=r"controller\.t_f"):
         from_tables({"controller": {"t_f": 1e300}})
+
+
+def test_every_gain_has_a_unit_with_a_list_of_sensors_too():
+    raw = {key: value for key, value in SATELLITES["sixu"].items() if key not in ("hardware", "filter")}
+    star = {"kind": "star_tracker", "boresight": [0.0, 0.0, 1.0], "noise_across": 3e-5, "noise_about": 2e-4}
+    gyro = {"kind": "gyro", "rate_noise_density": 1e-5, "rate_bias_walk": 1e-7}
+    here = from_tables({**raw, "sensors": [star, gyro]})
+    assert set(here.gains) <= set(gain_names.units_of(here))
