@@ -165,9 +165,9 @@ def difference(folder: Path, scenario: Tables, made_by: Tables) -> str | None:
         old_tables = parsing.toml((folder / "scenario.toml").read_text(encoding="utf-8"), "scenario.toml")
     except (OSError, ValueError):
         return "files, but no scenario.toml of a run that can be read"
-    if not versions or not all(isinstance(table, dict) for table in old_tables.values()):
+    if not versions:
         return "files, but no versions.json of a run that can be read"
-    new_tables = json.loads(json.dumps(_named(scenario)))
+    old_values, new_values = _values(old_tables), _values(json.loads(json.dumps(_named(scenario))))
     for name, value in made_by.items():
         old = versions.get(name)
         if name == CODE and old is not None and old != value:
@@ -175,12 +175,21 @@ def difference(folder: Path, scenario: Tables, made_by: Tables) -> str | None:
         if old != value:
             here = "which is not used here" if value is None else f"not {value}"
             return f"a run without {name}" if old is None else f"a run with {name} {old}, {here}"
-    for table in dict.fromkeys((*old_tables, *new_tables)):
-        for key in dict.fromkeys((*old_tables.get(table, {}), *new_tables.get(table, {}))):
-            old, new = (tables.get(table, {}).get(key, "absent") for tables in (old_tables, new_tables))
-            if old != new:
-                return f"a run of another scenario: {table}.{key} is {old} there, and {new} here"
+    for key in dict.fromkeys((*old_values, *new_values)):
+        old, new = old_values.get(key, "absent"), new_values.get(key, "absent")
+        if old != new:
+            return f"a run of another scenario: {key} is {old} there, and {new} here"
     return None
+
+
+def _values(tables: Tables) -> dict[str, Any]:
+    """Return the values of a scenario by the names of their keys, such as loop.period or sensors[0].period."""
+    values: dict[str, Any] = {}
+    for name, content in tables.items():
+        listed = {f"{name}[{k}]": table for k, table in enumerate(content)} if isinstance(content, list) else {}
+        for place, table in (listed or {name: content}).items():
+            values |= {f"{place}.{k}": v for k, v in table.items()} if isinstance(table, dict) else {place: table}
+    return values
 
 
 def check(folder: Path, force: bool) -> None:

@@ -111,6 +111,19 @@ def test_earlier_result_needs_the_same_scenario_seed_and_command(tmp_path):
     assert store.previous(tmp_path / "none", tables, TOLD) is None
 
 
+def test_unfinished_run_with_a_list_of_sensors_resumes(tmp_path):
+    sensors = [{"kind": "star_tracker", "period": 0.25}, {"kind": "gyro"}]
+    tables, folder = {"loop": {"period": 0.125}, "sensors": sensors}, tmp_path / "out"
+    store.begin(folder, tables, TOLD, fresh=True)
+    assert store.begun(folder, tables, TOLD)
+    slower = {**tables, "sensors": [{**sensors[0], "period": 0.5}, sensors[1]]}
+    with pytest.raises(store.RefusedError, match=re.escape("sensors[0].period is 0.25 there, and 0.5 here")):
+        store.begun(folder, slower, TOLD)
+    for other in (sensors[:1], [], {"kind": "custom"}):
+        with pytest.raises(store.RefusedError, match="another scenario: sensors"):
+            store.begun(folder, {**tables, "sensors": other}, TOLD)
+
+
 def fill(folder):
     (folder / "figures").mkdir()
     (folder / "figures" / "a.png").write_text("new")
