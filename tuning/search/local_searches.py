@@ -159,7 +159,7 @@ class LocalSearches:
         """
         few, normalise = _few_trials(problem), self._evaluate.bounds.normalise
         self._scenario_gains, self._designs = scenario_gains, np.asarray([normalise(one) for one in designs])
-        self._report("setting out", 0, 2, *self.so_far)
+        self._report("first local search", 0, 2, *self.so_far)
         points = np.concatenate([normalise(scenario_gains)[None], self._designs.reshape(-1, scenario_gains.size)])
         first = points[0]
         if len(points) > 1:
@@ -181,7 +181,7 @@ class LocalSearches:
             Normalised gains, (gains,), of at most `FOLLOWED` results, by number of the local search.
         """
         problem, more = _few_trials(problem), max(2, self._steps // 2)
-        self._report("setting out", 1, 2, *self.so_far)
+        self._report("first local search", 1, 2, *self.so_far)
         self._search(problem, 0, Start(self.normalised, CAREFUL), more, replace_best=True)
         first = starting_points(
             self._evaluate, self.tightened(problem), self.normalised, self._designs, starts, seed, self._report
@@ -211,7 +211,7 @@ class LocalSearches:
         """
         half, self._ends = max(2, self._steps // 2), {}
         self._successive_halving(
-            problem, starts, ((len(starts), half), (1, self._steps)), "following the best", replace_best=True
+            problem, starts, ((len(starts), half), (1, self._steps)), "refining the best results", replace_best=True
         )
         self._finish(problem)
 
@@ -320,7 +320,9 @@ class LocalSearches:
         normalised = np.concatenate(
             [self._evaluate.bounds.normalise(scenario_gains)[None], spread(len(problem.names), MANY, self._rng)]
         )
-        normalised = promising(self._evaluate, tightened, normalised, 1, partial(self._report, "choosing starts"))
+        normalised = promising(
+            self._evaluate, tightened, normalised, 1, partial(self._report, "ranking starting points")
+        )
         best, measured = self._best_of(tightened, normalised)
         self._record(0, measured)  # if the search is interrupted now, the history has this point
         self._update_best(best, tightened, 0, replace_best=True)
@@ -347,7 +349,7 @@ class LocalSearches:
         best, _ = self._best_of(tightened, normalised[None])
         try:
             evolve(self._evaluate, tightened, best, normalised, int(self._rng.integers(2**31)),
-                   lambda done, steps: self._report("evolving", done, steps, *best.so_far),
+                   lambda done, steps: self._report("CMA-ES", done, steps, *best.so_far),
                    partial(self._record, 0), size)  # fmt: skip
         finally:  # also after an interrupt
             self._update_best(best, tightened, 0, replace_best=True)
@@ -383,7 +385,7 @@ class LocalSearches:
         return found
 
     def _finish(self, problem: Problem) -> None:
-        self._report("finishing", 0, 1, *self.so_far)
+        self._report("last local search", 0, 1, *self.so_far)
         for _ in range(HAND_OVER_ATTEMPTS):
             if not self._try_other_hand_overs(problem):
                 break

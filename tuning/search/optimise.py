@@ -116,7 +116,7 @@ def search(
         if not local_searches.started:
             raise
         interrupted = True
-    tell("done")
+    tell("end of the search")
     best = local_searches.best
     return Search(
         gains=local_searches.gains,

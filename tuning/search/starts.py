@@ -56,7 +56,7 @@ def starting_points(
     held = held_by_limits(evaluate.measure_with_gradients(problem, first[None]))
     normalised[:, held] = first[held]
     normalised = np.concatenate([designs.reshape(-1, first.size), normalised])
-    chosen = promising(evaluate, problem, normalised, starts - 1, partial(report, "choosing starts"))
+    chosen = promising(evaluate, problem, normalised, starts - 1, partial(report, "ranking starting points"))
     return np.concatenate([first[None], chosen])
 
 

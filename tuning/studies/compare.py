@@ -263,8 +263,8 @@ def compare(
         tell("published gains: verifying on held-out trials", 0, 0, np.nan, 0.0)
         judged = _published(judging.on_flight_clock(others[PUBLISHED]), held_out_seed)
         found[PUBLISHED] = _with_more(judged, held_out_seed)
-    for law, posed in rivals.items():
-        report = headed(tell, law)
+    for number, (law, posed) in enumerate(rivals.items(), 1):
+        report = headed(tell, f"{law}, law {number} of {len(rivals)}")
         # more tries would judge the laws on different held-out trials
         tuned = tuner.tune(posed, seed, report, journal, trusted=False, tries=1)
         held_out, lower_bound = tuned.held_out["tuned"], tuned.lower_bounds["tuned"]
@@ -272,7 +272,7 @@ def compare(
         interrupted = tuned.search.interrupted
         if interrupted:
             break
-        report("judging with another inertia and delay than it knows", 0, 0, np.nan, 0.0)
+        report("simulating a wrong inertia and a longer delay", 0, 0, np.nan, 0.0)
         found[law] = _with_more(found[law], held_out_seed)
     return Comparison(found, held_out_seed, interrupted, refused)
 
