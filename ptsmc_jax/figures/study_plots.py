@@ -70,7 +70,7 @@ def tuning_history(
     values: np.ndarray,
     admissible: np.ndarray,
     goal: str,
-    judged: tuple[float, Mapping[str, float]],
+    result: tuple[float, Mapping[str, float]],
 ) -> Figure:
     """Plot the objective and the gains of all starting points over the steps, and the final result.
 
@@ -79,7 +79,7 @@ def tuning_history(
         values: (steps, starts) of the objective; NaN after a starting point was given up.
         admissible: (steps, starts) bool, every requirement is met.
         goal: name and unit of the objective.
-        judged: objective and gains of the result, on held-out trials.
+        result: objective on the training trials, and gains.
     """
     figure = Figure(figsize=(8.0, 2.2 * (len(gains) + 1)), layout="constrained")
     axes = figure.subplots(len(gains) + 1, 1, sharex=True)
@@ -90,11 +90,11 @@ def tuning_history(
         axes[0].semilogy(steps, met, color=STYLES[0][0])
     axes[0].plot([], [], color=STYLES[0][0], label="requirements met")
     axes[0].plot([], [], color="0.75", label="beyond a limit")
-    judged_goal, judged_gains = judged
-    for ax, value in zip(axes, (judged_goal, *(judged_gains[name] for name in gains)), strict=True):
-        ax.axhline(value, color="black", lw=1.0, ls=":", zorder=3, label="result on held-out trials")
+    final_goal, final_gains = result
+    for ax, value in zip(axes, (final_goal, *(final_gains[name] for name in gains)), strict=True):
+        ax.axhline(value, color="black", lw=1.0, ls=":", zorder=3, label="result")
     axes[0].set_ylabel(goal)
-    figure.suptitle("Tuning, all starts")
+    figure.suptitle("Local searches on the training trials")
     axes[0].legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, fontsize=9)
     for ax, (name, (unit, courses)) in zip(axes[1:], gains.items(), strict=True):
         ax.plot(steps, courses, color=STYLES[1][0], lw=1.0)
@@ -170,11 +170,12 @@ def tradeoff(
     error_unit, unit = (CATALOGUES[kind][name].unit for name in ("window_error", "peak_torque"))
     figure, axes = figure_of("Accuracy against torque, held-out trials", f"peak torque [{unit}]")
     arrays = {label: (np.asarray(e), np.asarray(u)) for label, (e, u) in sets.items()}
-    for (label, (errors, torques)), (colour, marker) in zip(arrays.items(), _looks(len(arrays)), strict=True):
+    looks = zip(arrays.items(), _looks(len(arrays)), range(len(arrays), 0, -1), strict=True)
+    for (label, (errors, torques)), (colour, marker), above in looks:  # the first set is drawn above the others
         rms, mean = np.sqrt(np.nanmean(errors**2)), np.nanmean(torques)
-        axes.loglog(errors, torques, marker, ms=2.5, alpha=0.35, color=colour, mew=0)
+        axes.loglog(errors, torques, marker, ms=2.5, alpha=0.35, color=colour, mew=0, zorder=2)
         text = f"{label.replace('_', ' ')}: RMS {rms:.2e}, mean peak {mean:.3g} {unit}"
-        axes.loglog(rms, mean, marker, ms=9, color=colour, mec="white", label=text)
+        axes.loglog(rms, mean, marker, ms=9, color=colour, mec="white", label=text, zorder=2 + above)
     if limit is not None:
         axes.axhline(limit, **LIMIT, label=f"limit {limit:g} {unit}")
     if lower_bound:

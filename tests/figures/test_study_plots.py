@@ -27,8 +27,8 @@ def test_the_search_is_coloured_where_the_requirements_are_met():
     """All steps of a local search are grey, and the steps that meet the requirements are coloured."""
     values = np.array([[3.0, 5.0], [2.0, 4.0], [1.0, np.nan]])
     met = np.array([[False, True], [True, False], [True, False]])
-    judged = 0.9, {"eta": 3.1}
-    figure = study_plots.tuning_history({"eta": ("-", np.full((3, 2), 3.0))}, values, met, "window error", judged)
+    result = 0.9, {"eta": 3.1}
+    figure = study_plots.tuning_history({"eta": ("-", np.full((3, 2), 3.0))}, values, met, "window error", result)
     for axes, value in zip(figure.axes, (0.9, 3.1), strict=True):  # not the last step of a local search
         (line,) = [line for line in axes.lines if str(line.get_label()).startswith("result")]
         assert set(np.asarray(line.get_ydata()).tolist()) == {value}
@@ -48,6 +48,13 @@ def test_a_tradeoff_figure_has_each_trial_and_their_rms():
     np.testing.assert_allclose(whole, [13e-6 / np.sqrt(3.0), 0.3], rtol=1e-12)
     said = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
     assert said == ["tuned: RMS 7.51e-06, mean peak 0.3 N m", "limit 0.5 N m", "lower bound 1e-06"]
+
+
+def test_the_first_set_of_a_tradeoff_figure_is_not_hidden_by_a_later_one_at_the_same_place():
+    same = np.array([3e-6, 4e-6]), np.array([0.2, 0.4])
+    (axes,) = study_plots.tradeoff({"tuned": same, "before": same}, limit=None).axes
+    tuned, before = (line for line in axes.lines if ": RMS" in str(line.get_label()))
+    assert tuned.get_zorder() > before.get_zorder()
 
 
 @pytest.mark.parametrize(("low", "high", "least"), [(1e-6, 0.1, 5), (4.167e-5, 0.1188, 4)])  # second: long numbers
