@@ -157,7 +157,7 @@ def read(table: Any, name: str, code: object) -> Any:
         item = systems.item(code, f"{systems.WHERE} of a class") if isinstance(code, str) else code
         base = table.base
         if not (isinstance(item, type) and issubclass(item, base)):
-            what = f"a class {item.__name__}" if isinstance(item, type) else f"a {type(item).__name__}"
+            what = f"a class {item.__name__}" if isinstance(item, type) else f"of type {type(item).__name__}"
             raise ValueError(f"it is {what}, but must be a class derived from ptsmc_jax.{base.__name__}")
         return _with_keys(table, item, (_again, table.remake, name, code))
     except ValueError as error:

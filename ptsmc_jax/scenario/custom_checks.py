@@ -247,7 +247,7 @@ def _law(parts: Parts, ask: _Asked) -> None:
         method, function, arguments = "__call__", law.__call__, (now, x, target, jnp.zeros(m), k2)
     returned = ask(method, function, *arguments)
     if not isinstance(returned, tuple) or len(returned) != len(expected):
-        raise ask.refused(method, _described(returned), ", ".join(expected) + ", in parentheses")
+        raise ask.refused(method, _described(returned), f"({', '.join(expected)})")
     ask.check(method, expected[0], returned[0], (m,))
     ask.check(method, expected[1], returned[1], (m,))
     if len(expected) == 3:

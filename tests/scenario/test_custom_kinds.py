@@ -312,7 +312,7 @@ RETURNS = "return 0.5 * wanted"
 CHANGED = [
     (f"{RETURNS}, s", "return jnp.zeros(2), s", "acceleration", "shape"),
     (f"{RETURNS}, s", "return [0.5 * wanted[0]], s", "returns an acceleration that is a list", "array of shape (1,)"),
-    (f"{RETURNS}, s", "return [0.5 * wanted, s]", "returns a list of 2 values", "a sliding variable, in parentheses"),
+    (f"{RETURNS}, s", "return [0.5 * wanted, s]", "returns a list of 2 values", "(an acceleration, a sliding"),
     (f"{RETURNS}, s", RETURNS, "returns an array of shape (1,)", "an acceleration, a sliding variable"),
     (f"{RETURNS}, s", "0.5 * wanted, s", "acceleration returns nothing", "a sliding variable"),
     # an earlier version ran this as 0 and 1, and margins ended in a traceback
@@ -346,9 +346,9 @@ CHANGED = [
 # the code, other keys of the scenario, and the expected text
 BAD = [
     *((f"kept = []\n\n{LAW.replace(old, new)}", {}, *said) for old, new, *said in CHANGED),
-    ("Mine = [3]", {}, "it is a list, but must be a class derived from", "ptsmc_jax.AccelerationLaw"),
+    ("Mine = [3]", {}, "it is of type list, but must be a class derived from", "ptsmc_jax.AccelerationLaw"),
     (LAW, {"eta": float("nan")}, "controller.eta is nan", "finite numbers"),
-    ("Mine = 3", {}, "it is a int, but must be a class derived from", "ptsmc_jax.AccelerationLaw"),
+    ("Mine = 3", {}, "it is of type int, but must be a class derived from", "ptsmc_jax.AccelerationLaw"),
     ("class Mine:\n    pass", {}, "it is a class Mine, but must be a class derived from", "ptsmc_jax.AccelerationLaw"),
     ("Other = 3", {}, "mine.py has no such name", "FILE.py:NAME"),
     ("x = = 1", {}, "running mine.py fails: SyntaxError", "mine.py"),

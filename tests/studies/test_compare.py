@@ -364,4 +364,4 @@ def test_required_margins_appear_in_table_csv_file_and_report(eight, tmp_path):
 
 def test_missing_custom_law_is_refused_and_leaves_no_folder(command, tmp_path):
     said = refused(command, tmp_path, "compare", "s.toml", "--law", "gone.py:Mine")
-    assert "gone.py does not exist" in said
+    assert "--law is gone.py:Mine: the file gone.py does not exist" in said

@@ -102,14 +102,16 @@ class Rivals:
     custom: tuple[str, ...] = ()  # custom laws, "FILE.py:NAME"
 
     def check(self) -> None:
-        """Raise UsageError if a kind is unknown, or the location of a custom law is malformed."""
+        """Raise UsageError if a kind is unknown, or the location of a custom law is malformed or has no file."""
         others = laws()[1:]
         for kind in self.kinds or ():
             if kind not in others:
                 raise UsageError(f"--against is {kind}, but must be one of {', '.join(others)}")
         for where in self.custom:
             try:
-                systems.named(where, systems.WHERE)
+                place, _ = systems.named(where, systems.WHERE)
+                if place.endswith(".py") and not Path(place).is_file():
+                    raise ValueError(f"the file {place} does not exist")
             except ValueError as error:
                 raise UsageError(f"--law is {where}: {error}") from None
 
