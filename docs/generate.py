@@ -19,6 +19,7 @@ from tuning.cli.main import app
 
 HERE = Path(__file__).parent
 MADE = "<!-- Made by docs/generate.py from the code, where it is to be changed. -->"
+LISTS = ("three numbers", "a list of numbers")  # allowed values of a key that has a number for each component
 PLANTS = {"spacecraft": "A spacecraft", "chain": "An integrator chain", "system": "A custom system"}
 SCENARIOS = """\
 A scenario is a TOML file of tables. Every table and every key is optional, and has a default. Defaults with * are
@@ -170,7 +171,7 @@ def _keys(table: str, struct: type[Table], plant: str) -> Iterator[str]:
     for key in keys.of(struct):
         if f"{table}.{key.name}" in layouts.KINDS and plant == "spacecraft":
             yield f"The kinds of `{key.name}`:"
-            yield _grid("key what given how", list(_kinds(key, layouts.KINDS[f"{table}.{key.name}"])))
+            yield _grid("key meaning entries effect", list(_kinds(key, layouts.KINDS[f"{table}.{key.name}"])))
     if borrowed:
         yield "And one of the attitude keys of `[initial]`."
 
@@ -183,7 +184,7 @@ def _case_i(plant: str) -> Mapping[str, Mapping[str, Any]]:
 
 def _dispersion(struct: type[Table], unit_of_d: str) -> Iterator[str]:
     rows = [row for key in keys.of(struct) for row in _kinds(key, layouts.DISPERSIONS[key.name], unit_of_d)]
-    yield _grid("key what given how", rows)
+    yield _grid("key meaning entries effect", rows)
 
 
 def _kinds(key: keys.Key, kinds: Kinds, unit_of_d: str = keys.UNIT_OF_D) -> Iterator[list[str]]:
@@ -199,7 +200,9 @@ def _kinds(key: keys.Key, kinds: Kinds, unit_of_d: str = keys.UNIT_OF_D) -> Iter
 def _shown(key: keys.Key, struct: type[Table], fallback: Mapping[str, Any]) -> str:
     """Return the default of a key. A default that follows the mission has its value in the paper's case and a mark."""
     if key.name in struct.scaled and key.default is None:
-        return f"{_default(struct.scaled[key.name].value)} *"
+        value = struct.scaled[key.name].value
+        each = " each" if isinstance(value, float) and key.allowed.startswith(LISTS) else ""
+        return f"{_default(value)}{each} *"
     return _default(fallback.get(key.name, key.default))
 
 

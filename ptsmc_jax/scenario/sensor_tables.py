@@ -23,6 +23,10 @@ from ptsmc_jax.scenario.values import Kinds, Meaning, NotNegative, Positive, Tab
 
 LATEST = 8  # control periods until a reading is used; the filter keeps an attitude for each
 Size = Annotated[float, Meta(ge=1e-15, le=1e3, description="a number from 1e-15 to 1000")]
+Sizes = Annotated[
+    tuple[Size, ...],
+    Meta(description="a list of numbers from 1e-15 to 1000, one for each component of a reading"),
+]
 Noise = Size | None
 Bias = Annotated[float, Meta(ge=0, le=1e3, description="a number from 0 to 1000")]
 
@@ -172,7 +176,7 @@ class VectorSensor(AttitudeSensorTable, frozen=True):
 class CustomTable(AttitudeSensorTable, frozen=True):
     """A custom sensor of the attitude."""
 
-    noise: Annotated[tuple[Size, ...] | None, Meaning("1 sigma of each component of a reading")] = None
+    noise: Annotated[Sizes | None, Meaning("1 sigma of each component of a reading")] = None
     required: ClassVar[tuple[str, ...]] = ("noise",)
 
     def sigmas(self) -> tuple[float, ...]:
