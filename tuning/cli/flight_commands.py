@@ -29,7 +29,12 @@ def export(
     /,
     *,
     out: Out = None,
-    name: Annotated[str | None, Parameter(help="Name of the C files; default: the name of the scenario file.")] = None,
+    name: Annotated[
+        str | None,
+        Parameter(
+            help="Name of the C files, with _ for signs that C does not allow; default: the name of the scenario file."
+        ),
+    ] = None,
     trials: Annotated[int, whole("Trials in vectors.csv, 1 to 100.", 1, 100)] = 3,
     seed: Seed = 0,
     reference_input: Annotated[

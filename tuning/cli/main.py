@@ -292,8 +292,8 @@ def compare(
 
     After Ctrl-C or a kill, the same command resumes the search.
 
-    Exit status: 0 the tuned law of the paper meets every requirement, 1 it does not, 2 configuration error, 130
-    interrupted.
+    Exit status: 0 the tuned law of the paper meets every requirement, whatever the other laws do, 1 it does not, 2
+    configuration error, 130 interrupted.
     """
     loaded, folder = prepare(scenario, "compare", out, device, trust=common.trust)
     from ptsmc_jax.scenario.tables import objective_name

@@ -74,7 +74,9 @@ Against = Annotated[
 Laws = Annotated[
     tuple[str, ...],
     Parameter(
-        negative="", help="Custom law, FILE.py:NAME, to include in the comparison; repeat the option for several."
+        negative="",
+        show_default=False,
+        help="Custom law, FILE.py:NAME, to include in the comparison; repeat the option for several.",
     ),
 ]
 Device = Annotated[Literal["cpu", "gpu"], Parameter(help="Hardware that batches run on.")]
