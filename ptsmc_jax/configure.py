@@ -50,6 +50,7 @@ OPTIONS = (
 _DECISIVE = ("--xla_backend_extra_options", "--xla_disable_hlo_passes")  # no options are set if the user sets one
 
 programs: Path | None = None  # folder of stored programs, see `ptsmc_jax.programs`; None: do not store any
+for_command = False  # `keep_programs` of the last call; custom code sets `programs` to None, but not this
 _configured: tuple | None = None  # arguments of the last call of `configure`
 _warned = False  # whether the warning about a missing call of `configure` was issued
 
@@ -94,7 +95,7 @@ def configure(
         raise ValueError(f'device is {device!r}, but must be "cpu", "gpu", or None for the first that JAX finds')
     if devices is not None and not (isinstance(devices, int) and devices >= 1):
         raise ValueError(f"devices is {devices!r}, but must be a whole number from 1 on, or None for all cores")
-    global programs, _configured
+    global programs, for_command, _configured
     arguments = devices, cache, fast, device, bits, keep_programs
     if arguments == _configured:
         return
@@ -121,6 +122,7 @@ def configure(
             "first, right after the imports"
         ) from None
     folder = _usable(_cache_folder() if cache == "default" else cache)
+    for_command = keep_programs
     programs = folder / "programs" if keep_programs and folder is not None else None
     if folder is not None:
         jax.config.update("jax_compilation_cache_dir", str(folder))

@@ -109,8 +109,10 @@ class Program:
         return method(*args, **kwargs) if self._batch else call_on_cpu(method, *args, **kwargs)
 
     def _run(self, *args: Any, **kwargs: Any) -> Any:
-        if not _stores() or _is_traced(args, kwargs):
+        if _is_traced(args, kwargs):
             return self._jitted(*args, **kwargs)
+        if not _stores():
+            return _in_caller(self._jitted, *args, **kwargs) if configure.for_command else self._jitted(*args, **kwargs)
         thread = threading.current_thread()
         # a background thread must not wait for prepared programs: it would occupy the thread that compiles them
         if not thread.name.startswith(BACKGROUND):
@@ -120,9 +122,7 @@ class Program:
                 if not future.cancel():  # a program that has not begun is compiled here instead
                     with contextlib.suppress(CancelledError):  # by `stop`
                         future.exception()  # an error comes again from the call itself
-        if thread is not threading.main_thread():
-            return self._call_stored(*args, **kwargs)
-        return _caller().submit(_with_settings(self._call_stored), *args, **kwargs).result()
+        return _in_caller(self._call_stored, *args, **kwargs)
 
     def _call_stored(self, *args: Any, **kwargs: Any) -> Any:
         args, kwargs = _uncommitted(args, kwargs)
@@ -368,6 +368,13 @@ def _caller() -> ThreadPoolExecutor:
     process would end by a segmentation fault. An exit waits for threads.
     """
     return ThreadPoolExecutor(1, "running")
+
+
+def _in_caller(function: Callable, *args: Any, **kwargs: Any) -> Any:
+    """Call a function in the thread `_caller` if this is the main thread."""
+    if threading.current_thread() is not threading.main_thread():
+        return function(*args, **kwargs)
+    return _caller().submit(_with_settings(function), *args, **kwargs).result()
 
 
 def _with_settings(function: Callable) -> Callable:

@@ -100,6 +100,16 @@ def test_a_ctrl_c_does_not_interrupt_a_compilation(folder):
     assert not any(thread.daemon for thread in traced)
 
 
+@pytest.mark.parametrize("for_command", [True, False])
+def test_a_ctrl_c_does_not_interrupt_a_compilation_in_a_command_with_custom_code(monkeypatch, for_command):
+    """Custom code ends the storing of programs. A script calls in its own thread, whose settings of JAX apply."""
+    monkeypatch.setattr(configure, "programs", None)
+    monkeypatch.setattr(configure, "for_command", for_command)
+    program, traced = spied()
+    program(X)
+    assert [thread is threading.main_thread() for thread in traced] == [not for_command]
+
+
 def test_a_thread_with_another_precision_has_other_programs(folder):
     program, _ = spied()
     double = program(X)["both"]
