@@ -114,7 +114,7 @@ class Verdict:
 
     def _of_time(self, fraction: float) -> str:
         assert self.quantile is not None
-        most = f"{self.limit:g} {self.unit}{_in_degrees(self.limit, self.unit)}"
+        most = quantity(self.limit, self.unit, 6)
         whole = INTERPRETATIONS[self.interpretation]
         requirement = f"{self.metric} at most {most} in {100 * self.quantile:g} % of {whole}"
         met = "met" if self.met else "NOT met"
@@ -129,8 +129,8 @@ class Verdict:
     def _of_trials(self) -> str:
         failures, trials, worst = self.failures, self.trials, self.worst
         each = "loops" if self.metric in MARGINS else "trials"  # margins may be computed for more loops than trials
-        requirement = f"{self.metric} at {'least' if self.at_least else 'most'} {self.limit:g} {self.unit}".rstrip(" -")
-        requirement += _in_degrees(self.limit, self.unit)
+        limit = quantity(self.limit, self.unit, 6)
+        requirement = f"{self.metric} at {'least' if self.at_least else 'most'} {limit}"
         if self.quantile is not None:
             requirement += f" in {100 * self.quantile:g} % of trials"
             requirement += f" with {100 * self.confidence:g} % confidence" if self.confidence is not None else ""
@@ -140,7 +140,8 @@ class Verdict:
             seen = "no value" if trials == 1 else "no worst value"
         else:
             of_loops = f"of {trials} dispersed loops " if each == "loops" else ""
-            seen = (f"worst {of_loops}" if trials > 1 else "") + f"{worst:.4g}" + _in_degrees(worst, self.unit)
+            number = quantity(worst, self.unit, 4) if self.unit in ("rad", "rad/s") else f"{worst:.4g}"
+            seen = (f"worst {of_loops}" if trials > 1 else "") + number
         least = must_keep(trials, self.quantile, self.confidence)
         if least is None and self.quantile is not None and self.confidence is not None:
             few = fewest_trials(self.quantile, self.confidence)
@@ -151,9 +152,15 @@ class Verdict:
         return f"{requirement}: {seen}: NOT met" + (f" in {failures} of {trials} {each}{allowed}" if trials > 1 else "")
 
 
-def _in_degrees(value: float, unit: str) -> str:
-    """Return an angle or a rate in degrees, in parentheses, and an empty text for other units."""
-    return f" ({math.degrees(value):.4g} {unit.replace('rad', 'deg')})" if unit in ("rad", "rad/s") else ""
+def quantity(value: float, unit: str, digits: int) -> str:
+    """Return a number with its unit: angles in arcsec, from one degree on in degrees, and rates also in degrees."""
+    if unit == "rad/s":
+        return f"{value:.{digits}g} {unit} ({math.degrees(value):.4g} deg/s)"
+    if unit == "rad":
+        value, unit = math.degrees(value), "deg"
+        if abs(value) < 1.0:
+            value, unit = 3600.0 * value, "arcsec"
+    return f"{value:.{digits}g} {unit}".rstrip(" -")
 
 
 @dataclass(frozen=True)

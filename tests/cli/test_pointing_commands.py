@@ -97,7 +97,7 @@ def test_pointing_requirements_have_verdicts_budget_and_table(simulated, tmp_pat
     for place in (said, checked(tmp_path / FOLDER).text):
         assert "from 0.5 s after t_f to t_end, with 95 % confidence; boresight 1, 0, 0" in place
         assert "an angle is - without 1109 runs that all reach their end (852 for 90 % confidence)" in place
-        assert "ape_boresight at most 0.01 rad (0.573 deg) in 50 % of the time of all runs" in place
+        assert "ape_boresight at most 2062.65 arcsec in 50 % of the time of all runs" in place
     table = pointing_report.compliance(summaries.read(summaries.Campaign, found))
     assert table is not None
     assert [row[:7] for row in table.rows] == [
@@ -155,4 +155,4 @@ def test_single_run_has_the_pointing_indices(command, simulated, tmp_path):
     for name in ("ape_x", "rpe_boresight", "mke_z", "within_ape_boresight"):
         assert made[name] == pytest.approx(row[name], rel=1e-9), name
     assert code == (0 if all(told["met"] for told in made["verdicts"].values()) else 1)
-    assert "ake_x at most 0.0001 rad (0.00573 deg) in 99.73 % of the time, in every run" in said
+    assert "ake_x at most 20.6265 arcsec in 99.73 % of the time, in every run" in said

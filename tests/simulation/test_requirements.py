@@ -78,11 +78,11 @@ def test_a_verdict_prints_one_sentence():
     assert str(verdict([0.1], metric="saturated")) == "saturated at most 0.5: 0.1: met"
 
 
-def test_verdicts_print_angles_in_degrees_too():
+def test_verdicts_print_angles_in_arcsec_and_rates_in_degrees_too():
     turned = Requirement("hold_angle", np.deg2rad(0.1)).verdict(np.deg2rad([0.05, 0.02]), np.array([True, True]))
-    assert str(turned) == "hold_angle at most 0.00174533 rad (0.1 deg): worst 0.0008727 (0.05 deg): met"
+    assert str(turned) == "hold_angle at most 360 arcsec: worst 180 arcsec: met"
     turning = Requirement("peak_rate", np.deg2rad(2.0)).verdict(np.deg2rad(3.0), np.array(True))
-    assert str(turning) == "peak_rate at most 0.0349066 rad/s (2 deg/s): 0.05236 (3 deg/s): NOT met"
+    assert str(turning) == "peak_rate at most 0.0349066 rad/s (2 deg/s): 0.05236 rad/s (3 deg/s): NOT met"
 
 
 @pytest.mark.parametrize("quantile", [0.5, 0.9, 0.99, 0.9973])

@@ -93,9 +93,11 @@ def valued(value: float, metric: str, plant: str) -> str:
 
     >>> valued(0.2813, "peak_torque", "spacecraft"), valued(3.1e-5, "window_error", "spacecraft")
     ('0.281 N m', '3.1e-05')
+    >>> valued(1e-4, "ape_boresight", "spacecraft")
+    '20.6 arcsec'
     """
     unit = CATALOGUES[plant][metric].unit
-    return f"{value:.3g}" if unit == "-" else f"{value:.3g} {unit}"
+    return angle(value) if unit == "rad" else f"{value:.3g} {unit}".rstrip(" -")
 
 
 def with_unit(name: str, plant: str) -> str:

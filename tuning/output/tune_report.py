@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Iterator
 
 from ptsmc_jax.simulation.catalogues import CATALOGUES, MARGINS, NO_SIGN, percent
+from ptsmc_jax.simulation.requirements import quantity
 from tuning.output import formats, margins_report, report
 from tuning.output.formats import digits, error, failed, interval, listed, many, over_bound, ratio
 from tuning.output.report import Report, Section, Table, Text
@@ -178,8 +179,8 @@ def _conflict(summary: Tune) -> Iterator[str]:
         elif one.at_least and needed <= 0.0:
             yield f"{metric} alone cannot give way far enough: the loop would be unstable"
         else:
-            unit = "" if one.unit == "-" else f" {one.unit}"
-            yield f"if {metric} alone gives way, its limit must be {needed:.3g}{unit} instead of {one.limit:g}"
+            limits = f"{quantity(needed, one.unit, 3)} instead of {quantity(one.limit, one.unit, 6)}"
+            yield f"if {metric} alone gives way, its limit must be {limits}"
     ratios = [one for metric in conflict if (one := worst[metric]) is not None]
     if len(conflict) > 1 and len(ratios) == len(conflict):
         yield f"if all of them give way together, each must by {100.0 * (max(ratios) - 1.0):.2g} % of its limit"
@@ -244,7 +245,7 @@ def _beside_evolution(check: Check, record: Search) -> str:
 def _violation(summary: Tune, metric: str, reached: float | None) -> str:
     """Return the violation of a limit by the training trials, or the number of these that fail."""
     if reached is not None and math.isfinite(reached):
-        limit = next((f" of {v.limit:g} {v.unit}".rstrip(" -") for v in summary.verdicts if v.metric == metric), "")
+        limit = next((f" of {quantity(v.limit, v.unit, 6)}" for v in summary.verdicts if v.metric == metric), "")
         return f"{metric} reaches {_of_limit(metric, reached):.3g} times its limit{limit} on the training trials"
     failures = failed(summary.training.counts)
     if not failures:
