@@ -10,6 +10,7 @@ from matplotlib.ticker import MaxNLocator
 
 from ptsmc_jax.figures.style import LIMIT, STYLES, figure_of, logarithmic, styled, with_unit
 from ptsmc_jax.simulation.catalogues import CATALOGUES, percent
+from ptsmc_jax.simulation.requirements import quantity
 
 BANDS = ((99.7, "0.85"), (90.0, "0.68"), (50.0, "0.45"))  # central fraction of the trials [%], grey
 # runs to the end that violate a limit on fractions of time, which may be met all the same, or on trials
@@ -42,7 +43,8 @@ class Column(NamedTuple):
 
     def within(self) -> str:
         """Return a text with the limit and the fraction of trials within."""
-        limit, within = f"limit {self.limit:g} {self.unit}".rstrip(" -"), np.mean(self.values <= self.limit)
+        assert self.limit is not None
+        limit, within = f"limit {quantity(self.limit, self.unit, 6)}", np.mean(self.values <= self.limit)
         if not self.of_time:
             return f"{limit}: {percent(float(within))} % within"
         return f"{limit}: {percent(float(within))} % of the trials within at all times\n{self.of_time}"

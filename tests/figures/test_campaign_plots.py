@@ -8,9 +8,9 @@ from ptsmc_jax.figures import campaign_plots
 
 
 @pytest.mark.parametrize(("of_time", "said"), [
-    ("", "limit 2.5 rad: 50 % within"),
+    ("", "limit 143.239 deg: 50 % within"),
     ("required: 50 % of the time of all runs; seen: 80 %",
-     "limit 2.5 rad: 50 % of the trials within at all times\nrequired: 50 % of the time of all runs; seen: 80 %"),
+     "limit 143.239 deg: 50 % of the trials within at all times\nrequired: 50 % of the time of all runs; seen: 80 %"),
 ])  # fmt: skip
 def test_a_limit_on_a_fraction_of_the_time_is_labelled(of_time, said):
     column = campaign_plots.Column("rad", np.array([1.0, 2.0, 3.0, np.nan]), 2.5, of_time)
