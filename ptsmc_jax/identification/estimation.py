@@ -34,10 +34,11 @@ NEAR = 0.3  # largest step that ends a search with noise on the acceleration, in
 CONVERGED = 1e-3  # largest step of a converged search, in sigmas of the estimate
 SLACK = (0.3, 0.01)  # noise of the acceleration at the start of a search, relative to the acceleration [s^0.5]
 SCREENINGS = 4  # largest number of times that outliers are determined again
-POOR = 1.5  # mean normalised square of the innovations above which other starting points are tried
+POOR = 1.5  # normalised square of the innovations, by its median, above which a search begins with noise
 LAGS = 25  # number of lags of the autocorrelation
 WHITE = 0.05  # largest autocorrelation that counts as white in a long log
-CONSISTENT = (0.8, 1.25)  # mean normalised square of innovations that fit their variance
+CONSISTENT = (0.8, 1.25)  # mean normalised square of innovations that fit their variance, in a long log
+RARE = 4.0  # sigmas of an autocorrelation or of a mean square in a short log that count as a misfit
 FARTHEST = 3.0  # distance of the most likely parameters of a validation log, RMS in sigmas of the estimates
 CONFIDENCE = 0.95
 CLEAR = 0.3  # smallest component of an undetermined direction that is named
@@ -90,10 +91,15 @@ class Fit:
 
     @property
     def white(self) -> bool:
-        """Whether the innovations fit their variance and are uncorrelated in time."""
-        bound = np.maximum(WHITE, 4.0 / np.sqrt(np.maximum(np.sum(np.isfinite(self.whitened), axis=0), 1)))
-        good = CONSISTENT[0] < self.square < CONSISTENT[1] and self.moved < FARTHEST
-        return good and bool(np.all(np.abs(self.autocorrelation()) < bound))
+        """Whether the innovations fit their variance and are uncorrelated in time.
+
+        A correct model fails in about 1 % of logs, since the LAGS autocorrelations of each component are compared.
+        """
+        readings = np.maximum(np.sum(np.isfinite(self.whitened), axis=0), 1)
+        bound = np.maximum(WHITE, RARE / np.sqrt(readings))
+        spread = RARE * np.sqrt(2.0 / np.sum(readings))  # of the mean of squares of normal numbers
+        consistent = min(CONSISTENT[0], 1.0 - spread) < self.square < max(CONSISTENT[1], 1.0 + spread)
+        return consistent and self.moved < FARTHEST and bool(np.all(np.abs(self.autocorrelation()) < bound))
 
 
 def _autocorrelation(values: np.ndarray) -> np.ndarray:
@@ -333,7 +339,7 @@ class Search:
         """
         best, draws = self.run(z, acceleration), np.random.default_rng(0)
         for k in range(1, starts):
-            if best.square < POOR:
+            if best.square < CONSISTENT[1]:
                 break
             self.report(f"the fit is poor; starting point {k + 1}")
             other = self.run(draws.standard_normal(self.problem.size), acceleration)

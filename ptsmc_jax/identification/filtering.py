@@ -279,7 +279,11 @@ def _predicted(model: Model, carry: _Carry, t: Scalar, dt: Scalar, command: Arra
     f = f.at[:sizes, sizes + b :].set(moved[:sizes, sizes:]) if m else f
     # the steps of the random walks come at the start of the interval, as in a simulation
     first = 3 if model.spacecraft else sizes - model.modes.size - plant.inputs  # index of the velocity
-    noise = [jnp.zeros(first), model.slack**2 * dt * jnp.ones(plant.inputs), jnp.zeros(sizes - first - plant.inputs)]
+    hidden = sizes - first - plant.inputs
+    rates = jnp.zeros(hidden)
+    if hasattr(plant, "coupling"):  # the modes follow the log, too
+        rates = rates.at[hidden // 2 :].set(jnp.sum(plant.coupling**2, axis=1))
+    noise = [jnp.zeros(first), model.slack**2 * dt * jnp.concatenate([jnp.ones(plant.inputs), rates])]
     noise += [model.bias_walk**2 * dt * jnp.ones(b)]
     noise += [jnp.broadcast_to(model.walk**2 * dt, (m,))] if m else []
     p = f @ (carry.p + jnp.diag(jnp.concatenate(noise))) @ f.T

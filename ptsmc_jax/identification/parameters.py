@@ -31,9 +31,9 @@ from ptsmc_jax.signals import disturbances
 
 GYRO_BIAS = "gyro_bias"  # a state of the filter, not a constant
 UNKNOWN_BIAS = 0.02  # 1 sigma of an unknown gyro bias [rad/s]
-USUAL = {  # 1 sigma of a parameter without a dispersion: relative, or in rad
+USUAL = {  # 1 sigma of a parameter without a dispersion: relative, in rad, or a damping ratio
     "inertia": 0.3, "actuator_scale": 0.1, "actuator_misalignment": 0.03, "gyro_scale": 0.02,
-    "star_tracker_misalignment": 0.02, "noise": 1.0, "torque_lag": 0.7, "mode_frequency": 0.2, "mode_damping": 1.0,
+    "star_tracker_misalignment": 0.02, "noise": 1.0, "torque_lag": 0.7, "mode_frequency": 0.2, "mode_damping": 0.005,
     "mode_coupling": 0.3, "disturbance_amplitude": 1.0, "disturbance_phase": 2.0,
     "plant": 0.3,
 }  # fmt: skip
@@ -363,9 +363,9 @@ def _catalogue(
             "mode_frequency", lambda m: m.plant.frequency,
             lambda m, new: replace(m, plant=replace(m.plant, frequency=new)), modes, "rad/s", "log",
         )  # fmt: skip
-        made["mode_damping"] = field(
-            "mode_damping", lambda m: jnp.maximum(m.plant.damping, 1e-4),
-            lambda m, new: replace(m, plant=replace(m.plant, damping=new)), modes, "-", "log",
+        made["mode_damping"] = field(  # an estimate of a small ratio may be negative, within its uncertainty
+            "mode_damping", lambda m: m.plant.damping,
+            lambda m, new: replace(m, plant=replace(m.plant, damping=new)), modes, "-", "add",
         )  # fmt: skip
         made["mode_coupling"] = lambda model: (model, _coupling(model, *spread("mode_coupling", 1)))
     for path, leaf in _leaves(plant):

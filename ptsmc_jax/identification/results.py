@@ -63,7 +63,7 @@ def _put(
         hardware["state_noise"] = numbers
     elif name.startswith("mode_"):
         key = name.removeprefix("mode_")
-        modes = np.array(numbers).reshape(-1, 3).tolist() if key == "coupling" else numbers
+        modes = np.array(numbers).reshape(-1, 3).tolist() if key == "coupling" else np.maximum(numbers, 0.0).tolist()
         tables["flexible"] = {**tables.get("flexible", {}), key: modes}
         if key != "damping":
             size = values if key == "frequency" else np.repeat(np.linalg.norm(modes, axis=1), 3)

@@ -100,3 +100,18 @@ def logs(
             columns |= {f"{name}{i + 1}": block[:, i] for i in range(block.shape[1])}
         frames.append(pl.DataFrame(columns))
     return frames, drift
+
+
+def spoiled(frame, rng, outliers=0.01, missing=0.3):
+    """Return a log with gross outliers and missing samples of star tracker and gyro, as fractions of its rows."""
+    columns = {name: frame[name].to_numpy().copy() for name in frame.columns}
+    for block, size in (("measured_q", 4), ("measured_w", 3)):
+        names = [f"{block}{k + 1}" for k in range(size)]
+        for row in rng.choice(frame.height, round(outliers * frame.height), replace=False):
+            wild = rng.standard_normal(size)
+            for name, value in zip(names, wild / np.linalg.norm(wild), strict=True):
+                columns[name][row] = value
+        for row in rng.choice(frame.height, int(missing * frame.height), replace=False):
+            for name in names:
+                columns[name][row] = np.nan
+    return pl.DataFrame(columns)

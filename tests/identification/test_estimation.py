@@ -3,13 +3,12 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import polars as pl
 import pytest
 
 from ptsmc_jax import explore, formulas, scenario
 from ptsmc_jax.dispersions import inertias
 from ptsmc_jax.dispersions.quantities import PAIRS
-from ptsmc_jax.identification import estimation, results
+from ptsmc_jax.identification import estimation, filtering, results, telemetry
 from ptsmc_jax.scenario import parsing
 from ptsmc_jax.scenario.errors import ScenarioError
 from tests.identification import synthetic
@@ -38,26 +37,11 @@ def flight(rng, **others):
     return frame, drift[0]
 
 
-def spoiled(frame, rng):
-    """A log with 1 % gross outliers and 30 % missing samples of each sensor."""
-    columns = {name: frame[name].to_numpy().copy() for name in frame.columns}
-    for block, size in (("measured_q", 4), ("measured_w", 3)):
-        names = [f"{block}{k + 1}" for k in range(size)]
-        for row in rng.choice(frame.height, 3, replace=False):
-            wild = rng.standard_normal(size)
-            for name, value in zip(names, wild / np.linalg.norm(wild), strict=True):
-                columns[name][row] = value
-        for row in rng.choice(frame.height, int(0.3 * frame.height), replace=False):
-            for name in names:
-                columns[name][row] = np.nan
-    return pl.DataFrame(columns)
-
-
 @pytest.fixture(scope="module")
 def identified():
     rng = np.random.default_rng(5)
     frame, drift = flight(rng)
-    found = explore.identify(satellite(), spoiled(frame, rng), validate=[flight(rng)[0]])
+    found = explore.identify(satellite(), synthetic.spoiled(frame, rng), validate=[flight(rng)[0]])
     return found, drift
 
 
@@ -110,6 +94,24 @@ def test_a_notebook_shows_the_verdict_the_estimates_and_the_figures_of_each_log(
     each = ("innovations", "autocorrelation", "prediction")
     assert set(found.plot()) == {"estimates", *each, *(f"{name}_2" for name in each)}
     assert list(found.plot("prediction_2")) == ["prediction_2"]
+
+
+@pytest.mark.parametrize("samples", [11, 20, 60, 300])
+def test_the_verdict_on_short_logs_is_calibrated(samples):
+    rng, wrong, detected = np.random.default_rng(samples), 0, 0
+    t, there = np.arange(samples + 1.0), np.ones((samples + 1, 6), bool)
+    log = telemetry.Measurements("a log", t, {}, np.zeros((samples + 1, 3)))
+    rows = filtering.Rows(t, np.ones(samples + 1), {}, there, log.command, np.zeros(3), np.arange(samples + 1))
+    none = filtering.Track(None, None, None, None)
+    for _ in range(200):
+        value = rng.standard_normal((samples, 6))
+        fits = [
+            estimation.Fit(log, rows, filtering.Innovations(factor * value, np.ones_like(value), there[1:]), none)
+            for factor in (1.0, 2.0)
+        ]
+        wrong, detected = wrong + (not fits[0].white), detected + (not fits[1].white)
+    assert wrong <= 8  # of 200; 1 % of the verdicts are wrong, so that more has a probability of 2e-4
+    assert detected == 200  # the noise is twice as large as in the model
 
 
 def test_every_value_of_the_coordinates_is_the_inertia_of_a_body():

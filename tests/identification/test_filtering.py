@@ -1,5 +1,7 @@
 """The filter of `ptsmc identify` against independent filters, closed forms and finite differences."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -127,3 +129,23 @@ def test_the_gradient_of_the_likelihood_agrees_with_finite_differences():
     # the truncation error of the differences is about step^2 = 1e-10, their rounding error 1e-16 * value / step
     np.testing.assert_allclose(gradient, differences, rtol=1e-6, atol=1e-6 * np.max(np.abs(gradient)))
     assert np.linalg.eigvalsh(information)[0] > 0.0
+
+
+def test_noise_on_the_acceleration_moves_the_modes_too():
+    coupling = np.array([[0.7, 0.0, 0.2], [0.0, -0.4, 0.1]])
+    loaded = scenario.from_tables({
+        "spacecraft": {"inertia": [4.0, 5.0, 6.0]},
+        "flexible": {"frequency": [3.0, 4.0], "damping": [0.01, 0.01], "coupling": coupling.tolist()},
+        "loop": {"mode": "sampled", "period": 0.1},
+        "disturbance": {"kind": "none"},
+        "hardware": {"attitude_noise": 2e-5},
+        "identify": {"free": ["inertia"], "prior": "none"},
+    })  # fmt: skip
+    still = {f"measured_q{k + 1}": np.full(20, float(k == 3)) for k in range(4)}
+    silent = {f"sent{k + 1}": np.zeros(20) for k in range(3)}
+    problem, (rows, kind) = prepared(loaded, pl.DataFrame({"t": 1e-4 * np.arange(20), **still, **silent}))
+    model = replace(problem.model, slack=jnp.asarray(0.3), modes=jnp.zeros(4))
+    _, track = filtering.filtered(model, jax.tree.map(jnp.asarray, rows), kind)
+    variance = np.diag(np.asarray(track.covariance)[9])[8:10]
+    # white noise n on the acceleration of the body is -D n on that of the modes; other terms are of order dt
+    np.testing.assert_allclose(variance, 0.3**2 * 1e-3 * np.sum(coupling**2, axis=1), rtol=1e-2)
