@@ -32,7 +32,7 @@ STEPS = 40  # largest number of steps of a local search
 LONGEST = 3.0  # step, in sigmas of the prior
 NEAR = 0.3  # largest step that ends a search with noise on the acceleration, in sigmas of the estimate
 CONVERGED = 1e-3  # largest step of a converged search, in sigmas of the estimate
-SLACK = (0.3, 0.01)  # noise of the acceleration at the start of a search, relative to the acceleration [s^0.5]
+SLACK = (0.3, 0.03, 0.003, 0.0003)  # noise of the acceleration in a search, relative to the acceleration [s^0.5]
 SCREENINGS = 4  # largest number of times that outliers are determined again
 POOR = 1.5  # normalised square of the innovations, by its median, above which a search begins with noise
 LAGS = 25  # number of lags of the autocorrelation
@@ -398,7 +398,9 @@ class Search:
 
     def maximise(self, z: np.ndarray, logs: Sequence[Prepared], enough: float) -> Found:
         """Return the nearest maximum of the likelihood of these logs; it ends after a step below `enough` sigma."""
-        value, gradient, information, square = self.derivatives(z, logs)
+        value, gradient, information, square = here = self.derivatives(z, logs)
+        if not _finite(here):  # such as an inertia that is too small for the modes, after a random start
+            return Found(z, -np.inf, np.zeros_like(information), np.inf, False, 0)
         damping, converged, steps = 0.0, False, 0
         for steps in range(1, STEPS + 1):
             sizes, directions = np.linalg.eigh(information)
@@ -409,7 +411,7 @@ class Search:
                 step = step * min(1.0, LONGEST / max(float(np.linalg.norm(step)), 1e-300))
                 size = float(np.sqrt(step @ information @ step))
                 there = self.derivatives(z + step, logs)
-                if np.isfinite(there[0]) and there[0] >= value - 1e-9 * abs(value):
+                if _finite(there) and there[0] >= value - 1e-9 * abs(value):
                     break
                 damping = max(10.0 * damping, float(np.min(sizes, initial=1.0)))
                 if damping > 1e12:
@@ -421,6 +423,11 @@ class Search:
                 converged = True
                 break
         return Found(z, value, information, square, converged, steps)
+
+
+def _finite(derivatives: tuple[float, np.ndarray, np.ndarray, float]) -> bool:
+    """Return whether a likelihood and its derivatives are numbers; the motion of an impossible body overflows."""
+    return all(bool(np.all(np.isfinite(one))) for one in derivatives)
 
 
 def _log_likelihood(value: Any, variance: Any, accepted: Any) -> Any:

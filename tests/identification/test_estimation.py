@@ -1,5 +1,7 @@
 """Estimates of `ptsmc identify` from logs of an independent simulation, and the identified scenario."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -146,19 +148,22 @@ def test_wheel_speeds_replace_the_commanded_torque():
 def test_a_mode_is_identified_from_a_simulated_run():
     loaded = scenario.from_tables({
         "spacecraft": {"inertia": [4.0, 5.0, 6.0]},
-        "flexible": {"frequency": [3.0], "damping": [0.01], "coupling": [[0.7, 0.0, 0.0]]},
+        "flexible": {"frequency": [3.0], "damping": [0.0], "coupling": [[0.7, 0.0, 0.0]]},
         "controller": {"t_f": 15.0, "error": "multiplicative"},
         "loop": {"mode": "sampled", "period": 0.1},
         "disturbance": {"kind": "none"},
         "hardware": {"attitude_noise": 2e-5, "rate_noise": 1e-5},
-        "identify": {"free": ["mode_frequency", "mode_coupling", "inertia"], "prior": "none"},
+        "identify": {"free": ["mode_frequency", "mode_coupling", "mode_damping", "inertia"], "prior": "none"},
     })  # fmt: skip
     frame = explore.simulate(loaded).to_polars()
     off = scenario.replace(loaded, flexible__frequency=[3.3], flexible__coupling=[[0.6, 0.0, 0.0]])
-    found = estimation.identify(off, frame)
-    true = np.array([3.0, 0.7, 0.0, 0.0, 4.0, 0.0, 0.0, 5.0, 0.0, 6.0])
+    found = estimation.identify(scenario.replace(off, flexible__damping=[0.01]), frame)
+    true = np.array([3.0, 0.7, 0.0, 0.0, 0.0, 4.0, 0.0, 0.0, 5.0, 0.0, 6.0])
     assert found.fits[0].white
     assert np.all(np.abs(found.estimate - true) < 3.5 * found.std + 1e-12)
+    written: Any = results.identified(found)
+    (damping,) = written.flexible.damping
+    assert damping == max(found.estimate[4], 0.0)  # an estimate of zero may be negative
 
 
 def test_unknown_parameters_and_logs_that_differ_are_refused():

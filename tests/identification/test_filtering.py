@@ -131,21 +131,38 @@ def test_the_gradient_of_the_likelihood_agrees_with_finite_differences():
     assert np.linalg.eigvalsh(information)[0] > 0.0
 
 
-def test_noise_on_the_acceleration_moves_the_modes_too():
-    coupling = np.array([[0.7, 0.0, 0.2], [0.0, -0.4, 0.1]])
+def flexible_body():
+    """Two modes without motion, and their log with an interval of 0.1 ms."""
     loaded = scenario.from_tables({
         "spacecraft": {"inertia": [4.0, 5.0, 6.0]},
-        "flexible": {"frequency": [3.0, 4.0], "damping": [0.01, 0.01], "coupling": coupling.tolist()},
+        "flexible": {"frequency": [3.0, 4.0], "damping": [0.01, 0.01], "coupling": [[0.7, 0.0, 0.2], [0.0, -0.4, 0.1]]},
         "loop": {"mode": "sampled", "period": 0.1},
         "disturbance": {"kind": "none"},
         "hardware": {"attitude_noise": 2e-5},
-        "identify": {"free": ["inertia"], "prior": "none"},
+        "identify": {"free": ["inertia", "mode_frequency"], "prior": "none"},
     })  # fmt: skip
     still = {f"measured_q{k + 1}": np.full(20, float(k == 3)) for k in range(4)}
     silent = {f"sent{k + 1}": np.zeros(20) for k in range(3)}
-    problem, (rows, kind) = prepared(loaded, pl.DataFrame({"t": 1e-4 * np.arange(20), **still, **silent}))
+    return prepared(loaded, pl.DataFrame({"t": 1e-4 * np.arange(20), **still, **silent}))
+
+
+def test_noise_on_the_acceleration_moves_the_modes_too():
+    problem, (rows, kind) = flexible_body()
     model = replace(problem.model, slack=jnp.asarray(0.3), modes=jnp.zeros(4))
     _, track = filtering.filtered(model, jax.tree.map(jnp.asarray, rows), kind)
+    assert track is not None
     variance = np.diag(np.asarray(track.covariance)[9])[8:10]
     # white noise n on the acceleration of the body is -D n on that of the modes; other terms are of order dt
+    coupling = np.asarray(model.plant.coupling)
     np.testing.assert_allclose(variance, 0.3**2 * 1e-3 * np.sum(coupling**2, axis=1), rtol=1e-2)
+
+
+def test_a_search_from_a_motion_that_overflows_ends_without_an_estimate():
+    problem, log = flexible_body()
+    problem = replace(problem, model=replace(problem.model, modes=1e-3 * jnp.ones(4)))
+    search = estimation.Search(problem, [log], np.inf, lambda text: None)
+    start = np.append(np.zeros(6), [300.0, 0.0])  # a frequency of 3e26 rad/s
+    found = search.run(start, 0.0)
+    assert not found.converged
+    assert found.value == -np.inf
+    assert search.best(start, 0.0, 2).value > -np.inf  # from a random start
