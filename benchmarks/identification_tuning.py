@@ -9,6 +9,7 @@ models. The law has the inertia of its model, and 1 000 held-out trials have the
 
 import sys
 import time
+from typing import Any
 
 import numpy as np
 
@@ -25,7 +26,7 @@ def main() -> None:
     from tuning.search import gains
     from tuning.studies import judging, tuner
 
-    true = scenario.read(sys.argv[1] if len(sys.argv) > 1 else "scenarios/first_flight.toml")
+    true: Any = scenario.read(sys.argv[1] if len(sys.argv) > 1 else "scenarios/first_flight.toml")
     body = true.spacecraft.inertia
     off = scenario.replace(true, spacecraft__inertia=(np.array(body) * OFF).tolist())
     slew = explore.simulate(scenario.replace(off, spacecraft__true_inertia=body)).to_polars()
