@@ -78,7 +78,11 @@ for delta in (0.05, 0.52):
     moved = ptsmc.with_gains(parts, {"delta": delta})
     found = jax.vmap(simulate, (None, 0, 0))(moved, attitudes, jnp.arange(count, dtype=jnp.uint32)).metrics
     axes.plot(np.rad2deg(angles), found.peak_torque, ".", label=f"delta = {delta:g} s")
-axes.set(xlabel="initial angle [deg]", ylabel="peak torque [N m]", title="A late hand-over needs torque for noise")
+axes.set(
+    xlabel="initial angle [deg]",
+    ylabel="peak torque [N m]",
+    title="With a late hand-over, sensor noise sets the peak torque",
+)
 _ = axes.legend()
 
 # %% [markdown]
