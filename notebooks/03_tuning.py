@@ -128,7 +128,7 @@ front.plot()
 
 # %% [markdown]
 # The report lists the gains of every point. Four times the torque reduces the error only from 1.55 to 1.05 arcsec. With half
-# of the torque the error is 250 arcsec, because $\eta$ reaches its lower bound. The limit of 0.5 N m is at the knee.
+# of the torque the error is about 240 arcsec, because $\eta$ reaches its lower bound. The limit of 0.5 N m is at the knee.
 
 # %%
 front
