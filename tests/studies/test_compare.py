@@ -139,7 +139,7 @@ def test_baseline_law_of_the_scenario_keeps_the_bounds_of_the_scenario():
     ("tables", "said"),
     [
         ({"loop": {"mode": "continuous"}}, 'loop.mode is "continuous", but must be "sampled"'),
-        ({"plant": {"kind": "chain"}}, "for another plant ptsmc tune finds the gains of one law at a time"),
+        ({"plant": {"kind": "chain"}}, "for another plant use ptsmc tune for one law at a time"),
     ],
 )
 def test_comparison_refuses_the_continuous_loop_and_other_plants(tables, said):
