@@ -38,15 +38,15 @@ flight = ptsmc.replace(
 cad = ptsmc.replace(flight, dispersion__inertia={"kind": "relative_normal", "std": 0.1})
 
 # %% [markdown]
-# The satellite in orbit is about 20 % heavier, and its principal axes are not those of the body. This tutorial simulates it:
-# `true_inertia` is the inertia of the plant, and the law still uses that of the CAD model. With a real satellite you skip
-# this cell, read your telemetry by `polars.read_csv`, and name its columns in `[telemetry]`.
+# The satellite in orbit has moments of inertia that are about 20 % larger, and its principal axes are not the body axes. This
+# tutorial simulates it: `true_inertia` is the inertia of the plant, and the law still uses that of the CAD model. With a real
+# satellite you skip this cell, read your telemetry by `polars.read_csv`, and name its columns in `[telemetry]`.
 
 # %%
 true_inertia = [[12.1, 0.3, -0.2], [0.3, 14.2, 0.4], [-0.2, 0.4, 16.9]]  # kg m^2
 orbit = ptsmc.replace(flight, spacecraft__true_inertia=true_inertia)
 logs = [ptsmc.simulate(orbit, trial=trial).to_polars() for trial in range(3)]
-logs[0].select("t", "^measured_.*$", "^sent.*$").head()
+logs[0].select("t", "measured_q1", "measured_w1", "sent1").head()  # some of its columns
 
 # %% [markdown]
 # ## Identify
