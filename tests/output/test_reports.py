@@ -485,3 +485,9 @@ def test_driver_explains_a_significant_part_of_the_variance(correlation, trials,
 
 if __name__ == "__main__":
     EXPECTED.write_text("\n\n".join(f"## {name}\n{text_of(case())}" for name, case in CASES.items()) + "\n")
+
+
+def test_a_list_of_sensors_has_no_gains():
+    law = {"controller": {"kind": "prescribed_time", "eta": 3.0}}
+    sensors = {"sensors": [{"kind": "star_tracker"}, {"kind": "gyro"}]}
+    assert campaign_report.gains({**law, **sensors}, "spacecraft") == campaign_report.gains(law, "spacecraft")

@@ -133,6 +133,8 @@ def gains(scenario: dict[str, Any], plant: str) -> Table:
     rows: list[tuple[str, ...]] = []
     for table in ("controller", "observer", "filter", "sensors"):
         given = scenario.get(table, {})
+        if isinstance(given, list):  # [[sensors]] have no gains
+            continue
         custom = given.get("kind") == "custom"  # its class, which reading does not run, has the units
         kinds: Any = SCENARIOS[plant].TABLES.get(table, {})
         struct = kinds.get(given.get("kind"))
