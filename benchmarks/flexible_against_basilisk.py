@@ -59,23 +59,11 @@ def modal() -> dict[str, Any]:
     return {"spacecraft": {"inertia": left[:3, :3].tolist()}, "flexible": flexible}
 
 
-def simulated_again(run: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Apply the torques of a run; return attitudes (rows, 4), scalar last, and angles of the panels (rows, 2)."""
-    from Basilisk.architecture import messaging  # pyright: ignore[reportMissingImports]
-    from Basilisk.simulation import (  # pyright: ignore[reportMissingImports]
-        extForceTorque,
-        hingedRigidBodyStateEffector,
-        spacecraft,
-    )
-    from Basilisk.utilities import SimulationBaseClass, macros  # pyright: ignore[reportMissingImports]
-    from scipy.spatial.transform import Rotation
+def add_panels(body: Any) -> list[Any]:
+    """Add the hinged panels to a Basilisk spacecraft and return them."""
+    from Basilisk.simulation import hingedRigidBodyStateEffector  # pyright: ignore[reportMissingImports]
 
-    log, sim = run.log, SimulationBaseClass.SimBaseClass()
-    sim.CreateNewProcess("process").addTask(sim.CreateNewTask("task", macros.sec2nano(PERIOD) // FINER))
-    body, torque, panels = spacecraft.Spacecraft(), extForceTorque.ExtForceTorque(), []
-    body.hub.mHub, body.hub.IHubPntBc_B = HUB_MASS, HUB.tolist()
-    body.hub.sigma_BNInit = [[v] for v in Rotation.from_quat(log.x.q[0]).as_mrp()]
-    body.hub.omega_BN_BInit = [[v] for v in log.x.w[0]]
+    panels = []
     for (hinge, axes), k, c in zip(frames(), STIFF, DAMPER, strict=True):
         panel = hingedRigidBodyStateEffector.HingedRigidBodyStateEffector()
         panel.mass, panel.IPntS_S, panel.d = PANEL["mass"], PANEL["inertia"].tolist(), PANEL["arm"]
@@ -83,6 +71,23 @@ def simulated_again(run: Any) -> tuple[np.ndarray, np.ndarray]:
         panel.r_HB_B, panel.dcm_HB = [[v] for v in hinge], axes.tolist()
         body.addStateEffector(panel)
         panels.append(panel)
+    return panels
+
+
+def simulated_again(run: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Apply the torques of a run; return attitudes (rows, 4), scalar last, and angles of the panels (rows, 2)."""
+    from Basilisk.architecture import messaging  # pyright: ignore[reportMissingImports]
+    from Basilisk.simulation import extForceTorque, spacecraft  # pyright: ignore[reportMissingImports]
+    from Basilisk.utilities import SimulationBaseClass, macros  # pyright: ignore[reportMissingImports]
+    from scipy.spatial.transform import Rotation
+
+    log, sim = run.log, SimulationBaseClass.SimBaseClass()
+    sim.CreateNewProcess("process").addTask(sim.CreateNewTask("task", macros.sec2nano(PERIOD) // FINER))
+    body, torque = spacecraft.Spacecraft(), extForceTorque.ExtForceTorque()
+    body.hub.mHub, body.hub.IHubPntBc_B = HUB_MASS, HUB.tolist()
+    body.hub.sigma_BNInit = [[v] for v in Rotation.from_quat(log.x.q[0]).as_mrp()]
+    body.hub.omega_BN_BInit = [[v] for v in log.x.w[0]]
+    panels = add_panels(body)
     body.addDynamicEffector(torque)
     command = messaging.CmdTorqueBodyMsg()
     torque.cmdTorqueInMsg.subscribeTo(command)

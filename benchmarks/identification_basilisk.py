@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import polars as pl
-from flexible_against_basilisk import DAMPER, HUB, HUB_MASS, PANEL, STIFF, frames, modal
+from flexible_against_basilisk import HUB, HUB_MASS, add_panels, modal
 
 FINER = 4  # of Basilisk's steps in a sample interval
 PHASE = 10.0  # duration of a constant torque [s]
@@ -111,7 +111,6 @@ def telemetry(case: Case, seed: int) -> pl.DataFrame:
     from Basilisk.architecture import messaging  # pyright: ignore[reportMissingImports]
     from Basilisk.simulation import (  # pyright: ignore[reportMissingImports]
         extForceTorque,
-        hingedRigidBodyStateEffector,
         imuSensor,
         reactionWheelStateEffector,
         spacecraft,
@@ -143,13 +142,7 @@ def telemetry(case: Case, seed: int) -> pl.DataFrame:
         effectors.append(push)
     if case.panels:
         body.hub.IHubPntBc_B = HUB.tolist()
-        for (hinge, at_rest), stiffness, damper in zip(frames(), STIFF, DAMPER, strict=True):
-            panel = hingedRigidBodyStateEffector.HingedRigidBodyStateEffector()
-            panel.mass, panel.IPntS_S, panel.d = PANEL["mass"], PANEL["inertia"].tolist(), PANEL["arm"]
-            panel.k, panel.c = stiffness, damper
-            panel.r_HB_B, panel.dcm_HB = [[v] for v in hinge], at_rest.tolist()
-            body.addStateEffector(panel)
-            effectors.append(panel)
+        effectors += add_panels(body)
     star, gyro = starTracker.StarTracker(), imuSensor.ImuSensor()
     star_noise, gyro_noise = devices(case)
     white, still = np.zeros((3, 3)).tolist(), [[0.0]] * 3  # errors without memory
@@ -202,8 +195,7 @@ def main() -> None:
     parser.add_argument("--case", default="", help="part of the name of the cases to run")
     arguments = parser.parse_args()
     configure()
-    from ptsmc_jax import scenario
-    from ptsmc_jax.identification import estimation
+    from ptsmc_jax import explore, scenario
 
     for case in cases():
         if arguments.case not in case.name:
@@ -220,7 +212,7 @@ def main() -> None:
         })  # fmt: skip
         all_sigmas: list[float] = []
         for seed in range(arguments.logs):
-            found = estimation.identify(loaded, telemetry(case, seed))
+            found = explore.identify(loaded, telemetry(case, seed))
             (bias, bias_std) = found.gyro_bias()[0]
             truth = np.concatenate([*case.true_values.values(), BIAS])
             labels = [*found.problem.labels, *(f"gyro_bias_{k + 1}" for k in range(3))]

@@ -22,7 +22,7 @@ def main() -> None:
     """Print the identified inertia, and a row for each model."""
     configure()
     from ptsmc_jax import explore, scenario
-    from ptsmc_jax.identification import estimation, results
+    from ptsmc_jax.identification import results
     from tuning.search import gains
     from tuning.studies import judging, tuner
 
@@ -31,7 +31,7 @@ def main() -> None:
     off = scenario.replace(true, spacecraft__inertia=(np.array(body) * OFF).tolist())
     slew = explore.simulate(scenario.replace(off, spacecraft__true_inertia=body)).to_polars()
     free = scenario.replace(off, identify={"free": ["inertia"], "prior": "none"})
-    found = estimation.identify(free, slew)
+    found = explore.identify(free, slew)
     print(f"{found}\nwhite: {found.fits[0].white}", flush=True)
     print("| model | RMS terminal error | RMS window error | largest torque [N m] | complete trials |", flush=True)
     for name, model in (("true", true), ("identified", results.identified(found)), ("20 % off", off)):

@@ -18,7 +18,7 @@ from ptsmc_jax.campaigns import campaign, margin_verdicts, run_tables, runs, sto
 from ptsmc_jax.campaigns.montecarlo import CustomMetrics
 from ptsmc_jax.campaigns.runs import Run
 from ptsmc_jax.figures import animation, identification_plots, run_plots
-from ptsmc_jax.identification import estimation, results
+from ptsmc_jax.identification import estimation, results, telemetry
 from ptsmc_jax.numerics import draws
 from ptsmc_jax.onboard import folder
 from ptsmc_jax.onboard.library import InTheLoop, Library
@@ -357,7 +357,11 @@ def identify(
         ScenarioError: a parameter is unknown.
         RefusedError: a log cannot be used; the sentence names row and column.
     """
-    found = estimation.identify(what, log, validate=validate, free=free, report=report)
+    loaded = reading.complete(_read(what))
+    frames = [*([log] if isinstance(log, pl.DataFrame) else log), *validate]
+    logs = [telemetry.measurements(loaded, frame, f"log {k + 1}") for k, frame in enumerate(frames)]
+    used = len(logs) - len(validate)
+    found = estimation.of_logs(loaded, logs[:used], logs[used:], free, report)
     return Identified(**{field.name: getattr(found, field.name) for field in fields(found)})
 
 

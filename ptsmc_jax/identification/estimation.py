@@ -19,11 +19,10 @@ from scipy import stats
 
 from ptsmc_jax import configure
 from ptsmc_jax.campaigns import montecarlo
-from ptsmc_jax.identification import filtering, parameters, telemetry
+from ptsmc_jax.identification import filtering, parameters
 from ptsmc_jax.identification.filtering import Innovations, Kind, Model, Rows, Track
 from ptsmc_jax.identification.parameters import Problem
 from ptsmc_jax.identification.telemetry import Measurements
-from ptsmc_jax.scenario import reading
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
 
@@ -172,37 +171,6 @@ class Identification:
         return "\n".join([*lines, *self.undetermined])
 
 
-def identify(
-    what: Scenario | str | Any,
-    log: pl.DataFrame | Sequence[pl.DataFrame],
-    *,
-    validate: Sequence[pl.DataFrame] = (),
-    free: Sequence[str] | None = None,
-    report: Callable[[str], None] = lambda text: None,
-) -> Identification:
-    """Estimate parameters of a scenario's true plant from telemetry.
-
-    Args:
-        what: a scenario, or the path of its file. [telemetry] names the columns and [identify] the parameters.
-        log: a table with a row for each time, or several tables of separate runs.
-        validate: logs that are predicted with the estimates and not used for them.
-        free: names of the parameters; by default those of the scenario.
-        report: called with the progress in words.
-
-    Returns:
-        The estimates, their covariance and the innovations.
-
-    Raises:
-        ScenarioError: a parameter is unknown.
-        RefusedError: a log cannot be used; the sentence names row and column.
-    """
-    loaded = reading.complete(reading.of(what))
-    frames = [log] if isinstance(log, pl.DataFrame) else list(log)
-    logs = [telemetry.measurements(loaded, frame, f"log {k + 1}") for k, frame in enumerate(frames)]
-    others = [telemetry.measurements(loaded, frame, f"log {len(logs) + k + 1}") for k, frame in enumerate(validate)]
-    return of_logs(loaded, logs, others, free, report)
-
-
 def of_logs(
     loaded: Scenario,
     logs: Sequence[Measurements],
@@ -210,7 +178,7 @@ def of_logs(
     free: Sequence[str] | None = None,
     report: Callable[[str], None] = lambda text: None,
 ) -> Identification:
-    """Estimate parameters from logs that are already read; see `identify`.
+    """Estimate parameters from logs that are already read.
 
     Args:
         loaded: a complete scenario.

@@ -47,7 +47,7 @@ class Law(declare.Tunable):
     """
 
     kinematics: Kinematics  # definition of the error that the law drives to zero
-    t_f: Leaf  # prescribed time; for a law without it, the time from which the error is evaluated [s]
+    t_f: Leaf  # prescribed time; for a law without it, the start of the evaluation of the error [s]
     delta: Leaf  # time between the hand-over and t_f [s]
     tunable: ClassVar[tuple[str, ...]] = ("t_f",)  # fields that tuning may change; `gain` adds its fields
     prescribed: ClassVar[bool] = False  # whether the law is from the paper, with known exact solution and bounds
@@ -170,7 +170,7 @@ class AccelerationLaw(Law):
     """Base of the laws for comparison and of custom laws, for an error of order 2 and the sampled loop."""
 
     kinematics: Kinematics
-    t_f: Leaf  # prescribed time; for a law without it, the time from which the error is evaluated [s]
+    t_f: Leaf  # prescribed time; for a law without it, the start of the evaluation of the error [s]
     delta: Leaf  # time between the hand-over and t_f [s]; the anchored clock has a sample at the hand-over
     tunable: ClassVar[tuple[str, ...]] = ("delta", "t_f")
 

@@ -130,7 +130,7 @@ def test_every_value_of_the_coordinates_is_the_inertia_of_a_body():
 def test_only_the_ratio_of_inertia_to_actuator_scale_is_determined():
     frame, _ = flight(np.random.default_rng(2))
     body = {"hardware": {"attitude_noise": 5e-5, "rate_noise": 1.4e-4, "torque_lag": 0.05}}
-    found = estimation.identify(satellite(("inertia", "actuator_scale", "gyro_bias"), **body), frame)
+    found = explore.identify(satellite(("inertia", "actuator_scale", "gyro_bias"), **body), frame)
     assert any("only the ratio of inertia to actuator_scale" in line for line in found.undetermined)
     assert not found.good
 
@@ -139,7 +139,7 @@ def test_only_the_ratio_of_inertia_to_actuator_scale_is_determined():
 def test_wheel_speeds_replace_the_commanded_torque():
     frame, _ = flight(np.random.default_rng(4))
     table = {"wheel_speed": ["speed1", "speed2", "speed3"], "wheel_inertia": synthetic.SPIN_INERTIA}
-    found = estimation.identify(satellite(telemetry=table), frame.drop("sent1", "sent2", "sent3"))
+    found = explore.identify(satellite(telemetry=table), frame.drop("sent1", "sent2", "sent3"))
     assert found.good, results.verdict(found)
     assert np.all(np.abs(found.estimate - ENTRIES) < 3.5 * found.std)
 
@@ -157,7 +157,7 @@ def test_a_mode_is_identified_from_a_simulated_run():
     })  # fmt: skip
     frame = explore.simulate(loaded).to_polars()
     off = scenario.replace(loaded, flexible__frequency=[3.3], flexible__coupling=[[0.6, 0.0, 0.0]])
-    found = estimation.identify(scenario.replace(off, flexible__damping=[0.01]), frame)
+    found = explore.identify(scenario.replace(off, flexible__damping=[0.01]), frame)
     true = np.array([3.0, 0.7, 0.0, 0.0, 0.0, 4.0, 0.0, 0.0, 5.0, 0.0, 6.0])
     assert found.fits[0].white
     assert np.all(np.abs(found.estimate - true) < 3.5 * found.std + 1e-12)
@@ -169,9 +169,9 @@ def test_a_mode_is_identified_from_a_simulated_run():
 def test_unknown_parameters_and_logs_that_differ_are_refused():
     frame, _ = flight(np.random.default_rng(2))
     with pytest.raises(ScenarioError, match=r"identify.free has inertias, which this scenario does not have; the near"):
-        estimation.identify(satellite(["inertias"]), frame)
+        explore.identify(satellite(["inertias"]), frame)
     with pytest.raises(ScenarioError, match=r"identify.free has mode_frequency, which this scenario does not have"):
-        estimation.identify(satellite(["mode_frequency"]), frame)
+        explore.identify(satellite(["mode_frequency"]), frame)
     without = frame.drop("measured_q1", "measured_q2", "measured_q3", "measured_q4")
     with pytest.raises(ScenarioError, match="log 2 has other readings than log 1"):
-        estimation.identify(satellite(), [frame, without])
+        explore.identify(satellite(), [frame, without])

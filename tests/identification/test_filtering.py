@@ -9,7 +9,7 @@ import polars as pl
 import pytest
 from scipy.linalg import expm
 
-from ptsmc_jax import scenario
+from ptsmc_jax import explore, scenario
 from ptsmc_jax.identification import estimation, filtering, parameters, telemetry
 
 NOISE, WALK = (2e-3, 5e-3), 0.02
@@ -89,7 +89,7 @@ def test_innovations_are_those_of_an_independent_kalman_filter():
 
 def test_a_linear_gaussian_estimate_is_that_of_generalised_least_squares():
     frame, t, u, y = chain_log()
-    found = estimation.identify(chain(["disturbance_bias"]), frame)
+    found = explore.identify(chain(["disturbance_bias"]), frame)
     # unknown initial state and constant disturbance: a linear regression with known noise
     design, forced, state = [], [], np.zeros(2)
     response = np.eye(2, 3)

@@ -179,7 +179,7 @@ def _conflict(summary: Tune) -> Iterator[str]:
         elif one.at_least and needed <= 0.0:
             yield f"{metric} alone cannot give way far enough: the loop would be unstable"
         else:
-            limits = f"{quantity(needed, one.unit, 3)} instead of {quantity(one.limit, one.unit, 6)}"
+            limits = f"{quantity(needed, one.unit, 4)} instead of {quantity(one.limit, one.unit, 6)}"
             yield f"if {metric} alone gives way, its limit must be {limits}"
     ratios = [one for metric in conflict if (one := worst[metric]) is not None]
     if len(conflict) > 1 and len(ratios) == len(conflict):
