@@ -50,7 +50,7 @@ OPTIONS = (
 _DECISIVE = ("--xla_backend_extra_options", "--xla_disable_hlo_passes")  # no options are set if the user sets one
 
 programs: Path | None = None  # folder of stored programs, see `ptsmc_jax.programs`; None: do not store any
-for_command = False  # `keep_programs` of the last call; custom code sets `programs` to None, but not this
+for_command = False  # argument `keep_programs` of the last call; custom code does not change it
 _configured: tuple | None = None  # arguments of the last call of `configure`
 _warned = False  # whether the warning about a missing call of `configure` was issued
 
