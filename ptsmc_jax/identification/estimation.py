@@ -236,10 +236,11 @@ class Search:
         """Args: the problem, the logs, the normalised square of outliers, and a function that reports progress."""
         self.problem, self.logs, self.gate, self.report = problem, list(logs), gate, report
         self.known = problem.known().astype(float)
+        self._noise_is_free = any(one.name.endswith("_noise") for one in problem.parameters)
         self.slack = jnp.zeros(())
         self._filter = jax.jit(self._filtered, static_argnames="kind")
         self._errors = jax.jit(self._innovations, static_argnames="kind")
-        self._derivatives = jax.jit(self._differentiated, static_argnames="kind")
+        self._derivatives = jax.jit(self._differentiated, static_argnames=("kind", "exact"))
 
     def _at(self, z: Array, slack: Array) -> Model:
         return replace(self.problem.at(z), slack=slack)
@@ -250,11 +251,13 @@ class Search:
     def _innovations(self, z: Array, slack: Array, rows: Rows, gate: Any, kind: Kind) -> Innovations:
         return filtering.innovations(self._at(z, slack), rows, kind, gate)
 
-    def _differentiated(self, z: Array, slack: Array, rows: Rows, kind: Kind) -> tuple[Array, Array, Array, Array]:
+    def _differentiated(
+        self, z: Array, slack: Array, rows: Rows, kind: Kind, exact: bool
+    ) -> tuple[Array, Array, Array, Array]:
         """Return log-likelihood, gradient, Fisher information and mean normalised square of one log."""
 
         def of(z: Array) -> tuple[tuple[Array, Array], Innovations]:
-            found = filtering.innovations(self._at(z, slack), rows, kind)
+            found = filtering.innovations(self._at(z, slack), rows, kind, covariance_derivatives=exact)
             return (found.value, found.variance), found
 
         def along(directions: Array) -> Any:  # of one device
@@ -287,12 +290,18 @@ class Search:
         rows, kind = log
         return jax.tree.map(np.asarray, self._errors(jnp.asarray(z), self.slack, _numbers(rows), gate, kind=kind))
 
-    def derivatives(self, z: np.ndarray, logs: Sequence[Prepared]) -> tuple[float, np.ndarray, np.ndarray, float]:
-        """Return log-likelihood, gradient (n,), information (n, n) of logs and prior, and the mean square."""
+    def derivatives(
+        self, z: np.ndarray, logs: Sequence[Prepared], *, exact: bool = True
+    ) -> tuple[float, np.ndarray, np.ndarray, float]:
+        """Return log-likelihood, gradient (n,), information (n, n) of logs and prior, and the mean square.
+
+        If not exact, gradient and information lack the derivatives of the predicted covariance. They take half of the
+        time, and are good enough for a first search if no noise level is free.
+        """
         value, gradient, information = -0.5 * float(self.known @ z**2), -self.known * z, np.diag(self.known)
         squares = []
         for rows, kind in logs:
-            one = jax.tree.map(np.asarray, self._derivatives(jnp.asarray(z), self.slack, _numbers(rows), kind=kind))
+            one = jax.tree.map(np.asarray, self._derivatives(jnp.asarray(z), self.slack, _numbers(rows), kind, exact))
             value, gradient, information = value + float(one[0]), gradient + one[1], information + one[2]
             squares.append(float(one[3]))
         return value, gradient, information, float(np.mean(squares))
@@ -366,7 +375,8 @@ class Search:
 
     def maximise(self, z: np.ndarray, logs: Sequence[Prepared], enough: float) -> Found:
         """Return the nearest maximum of the likelihood of these logs; it ends after a step below `enough` sigma."""
-        value, gradient, information, square = here = self.derivatives(z, logs)
+        exact = enough <= CONVERGED or self._noise_is_free
+        value, gradient, information, square = here = self.derivatives(z, logs, exact=exact)
         if not _finite(here):  # such as an inertia that is too small for the modes, after a random start
             return Found(z, -np.inf, np.zeros_like(information), np.inf, False, 0)
         damping, converged, steps = 0.0, False, 0
@@ -378,7 +388,7 @@ class Search:
                 step = directions @ ((directions.T @ gradient) / (sizes + damping))
                 step = step * min(1.0, LONGEST / max(float(np.linalg.norm(step)), 1e-300))
                 size = float(np.sqrt(step @ information @ step))
-                there = self.derivatives(z + step, logs)
+                there = self.derivatives(z + step, logs, exact=exact)
                 if _finite(there) and there[0] >= value - 1e-9 * abs(value):
                     break
                 damping = max(10.0 * damping, float(np.min(sizes, initial=1.0)))

@@ -186,13 +186,21 @@ def with_wheels(model: Model, wheel_inertia: float | None) -> Model:
     return replace(model, plant=plant, actuators=actuators)
 
 
-def innovations(model: Model, rows: Rows, kind: Kind, gate: Any = jnp.inf) -> Innovations:
+def innovations(
+    model: Model, rows: Rows, kind: Kind, gate: Any = jnp.inf, *, covariance_derivatives: bool = True
+) -> Innovations:
     """Return the prediction errors of a log; see `filtered`."""
-    return filtered(model, rows, kind, gate, tracked=False)[0]
+    return filtered(model, rows, kind, gate, tracked=False, covariance_derivatives=covariance_derivatives)[0]
 
 
 def filtered(
-    model: Model, rows: Rows, kind: Kind, gate: Any = jnp.inf, *, tracked: bool = True
+    model: Model,
+    rows: Rows,
+    kind: Kind,
+    gate: Any = jnp.inf,
+    *,
+    tracked: bool = True,
+    covariance_derivatives: bool = True,
 ) -> tuple[Innovations, Track | None]:
     """Return the prediction errors of a log and the estimates of the filter.
 
@@ -202,6 +210,7 @@ def filtered(
         kind: its structure.
         gate: a group of readings whose normalised square exceeds this number times its size is rejected.
         tracked: whether the estimates are returned, which need the memory of a covariance for each row.
+        covariance_derivatives: whether derivatives of the innovations include those of the predicted covariance.
     """
     model = with_wheels(model, kind.wheel_inertia)
     due = acting(model, rows, kind.wheel_inertia)
@@ -210,6 +219,7 @@ def filtered(
     def step(carry: _Carry, row: Any) -> tuple[_Carry, tuple[Innovations, Track | None]]:
         t, dt, command, due, readings, valid = row
         carry = _predicted(model, carry, t, dt, command, due, kind)
+        carry = carry if covariance_derivatives else carry._replace(p=jax.lax.stop_gradient(carry.p))
         carry, found = _corrected(model, carry, readings, valid, gate)
         return carry, (found, Track(carry.x, carry.bias, carry.walk, carry.p) if tracked else None)
 

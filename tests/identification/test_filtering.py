@@ -11,6 +11,7 @@ from scipy.linalg import expm
 
 from ptsmc_jax import explore, scenario
 from ptsmc_jax.identification import estimation, filtering, parameters, telemetry
+from tests.identification import synthetic
 
 NOISE, WALK = (2e-3, 5e-3), 0.02
 
@@ -129,6 +130,29 @@ def test_the_gradient_of_the_likelihood_agrees_with_finite_differences():
     # the truncation error of the differences is about step^2 = 1e-10, their rounding error 1e-16 * value / step
     np.testing.assert_allclose(gradient, differences, rtol=1e-6, atol=1e-6 * np.max(np.abs(gradient)))
     assert np.linalg.eigvalsh(information)[0] > 0.0
+
+
+def test_derivatives_without_those_of_the_covariance_are_good_enough_for_a_first_search():
+    rng = np.random.default_rng(3)
+    inertia = np.array([[0.05, 0.002, -0.001], [0.002, 0.09, 0.003], [-0.001, 0.003, 0.11]])
+    (frame,), _ = synthetic.logs(rng, inertia, dt=0.25, rows=257, wheels=True, lag=0.05)
+    loaded = scenario.from_tables({
+        "spacecraft": {"inertia": inertia.tolist()},
+        "loop": {"mode": "sampled", "period": 0.25},
+        "disturbance": {"kind": "none"},
+        "hardware": {"attitude_noise": 5e-5, "rate_noise": 1.4e-4, "torque_lag": 0.05},
+        "wheels": {"kind": "axes"},
+        "identify": {"free": ["inertia"], "prior": "none"},
+    })  # fmt: skip
+    problem, log = prepared(loaded, frame)
+    search = estimation.Search(problem, [log], np.inf, lambda text: None)
+    z = 0.1 * rng.standard_normal(problem.size)
+    exact, approximate = (search.derivatives(z, search.logs, exact=is_exact) for is_exact in (True, False))
+    assert approximate[0] == exact[0]
+    step = [np.linalg.solve(information, gradient) for _, gradient, information, _ in (exact, approximate)]
+    # a search with noise on the acceleration ends at 0.3 sigma, so an error of 5 % of a step is small
+    error = step[1] - step[0]
+    assert 0.0 < np.sqrt(error @ exact[2] @ error) < 0.05 * np.sqrt(step[0] @ exact[2] @ step[0])
 
 
 def flexible_body():
