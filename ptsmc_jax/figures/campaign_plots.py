@@ -8,8 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from ptsmc_jax.figures.style import LIMIT, STYLES, figure_of, logarithmic, styled, with_unit
-from ptsmc_jax.simulation.catalogues import CATALOGUES, percent
+from ptsmc_jax.figures.style import ARCSEC, LIMIT, STYLES, figure_of, logarithmic, shown_error, styled, with_unit
+from ptsmc_jax.simulation.catalogues import percent
 from ptsmc_jax.simulation.requirements import quantity
 
 BANDS = ((99.7, "0.85"), (90.0, "0.68"), (50.0, "0.45"))  # central fraction of the trials [%], grey
@@ -41,6 +41,16 @@ class Column(NamedTuple):
         """Return the name with the unit."""
         return with_unit(name, self.unit)
 
+    def in_readable_unit(self) -> "Column":
+        """Return a column of angles [rad] in arcsec, or in degrees if an angle or the limit is at least one degree."""
+        if self.unit != "rad":
+            return self
+        known = self.values[np.isfinite(self.values)]
+        in_arcsec = max(np.max(np.abs(known), initial=0.0), self.limit or 0.0) < np.radians(1.0)
+        unit, factor = ("arcsec", ARCSEC) if in_arcsec else ("deg", np.degrees(1.0))
+        limit = None if self.limit is None else factor * self.limit
+        return self._replace(unit=unit, values=factor * self.values, limit=limit)
+
     def within(self) -> str:
         """Return a text with the limit and the fraction of trials within."""
         assert self.limit is not None
@@ -55,19 +65,20 @@ def fan(t: np.ndarray, errors: np.ndarray, worst: tuple[int, np.ndarray], t_f: f
 
     Args:
         t: (time,) [s].
-        errors: (trials, time) in the unit of this kind of plant.
+        errors: (trials, time) norms of the error, in the unit of this kind of plant.
         worst: the trial of the largest window error, and its errors (time,).
         t_f: the prescribed time [s].
         kind: of the plant; it determines the unit.
     """
-    unit = CATALOGUES[kind]["terminal_error"].unit
+    shown, name, unit = shown_error(kind)
+    errors, largest = shown(errors), shown(worst[1])
     trials = f"{len(errors)} trial{'s' if len(errors) != 1 else ''}"
-    figure, axes = figure_of(f"Error of {trials}, median in white", f"2-norm of the error [{unit}]")
+    figure, axes = figure_of(f"{name.capitalize()} of {trials}, median in white", with_unit(name, unit))
     for central, grey in BANDS:
         low, high = np.percentile(errors, [50.0 - central / 2, 50.0 + central / 2], axis=0)
         axes.fill_between(t, low, high, color=grey, lw=0.0, label=f"{central:g} % of the trials")
     axes.semilogy(t, np.median(errors, axis=0), color="white", lw=1.6)
-    axes.semilogy(t, worst[1], color=STYLES[1][0], lw=1.2, label=f"largest window error: trial {worst[0]}")
+    axes.semilogy(t, largest, color=STYLES[1][0], lw=1.2, label=f"largest window error: trial {worst[0]}")
     axes.axvline(t_f, color="0.3", lw=0.9, ls=":")
     axes.annotate("$t_f$", (t_f, 1.0), xycoords=("data", "axes fraction"), ha="center", va="bottom")
     positive = errors[errors > 0.0]
@@ -129,15 +140,14 @@ def torque_by_angle(
     """Plot peak torque against the initial error, a point a trial.
 
     Args:
-        start: initial error of each trial; an angle [rad] is drawn in degrees.
+        start: initial error of each trial.
         torque: peak torque of each trial.
         outcome: one of `MARKS` for each, (trials,).
         totals: how many trials of the whole campaign have each outcome.
     """
     figure, axes = figure_of("Peak torque by initial error", torque.label("peak torque"))
-    in_degrees = start.unit == "rad"
-    _points(axes, np.degrees(start.values) if in_degrees else start.values, torque.values, outcome, totals)
-    axes.set_xlabel("initial angle [deg]" if in_degrees else start.label("initial error"))
+    _points(axes, start.values, torque.values, outcome, totals)
+    axes.set_xlabel(start.label("initial angle" if start.unit in ("deg", "arcsec") else "initial error"))
     limit = torque.limit
     if limit is not None:
         axes.axhline(limit, **LIMIT, label=f"limit {limit:g} {torque.unit}")

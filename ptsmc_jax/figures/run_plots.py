@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-from ptsmc_jax.figures.style import LIMIT, STYLES, figure_of, plain_ticks, with_unit
+from ptsmc_jax.figures.style import LIMIT, STYLES, figure_of, plain_ticks, shown_error, with_unit
 from ptsmc_jax.plants.base import Chart
 from ptsmc_jax.simulation.rollout import Log, Parts
 from ptsmc_jax.theory import envelopes, solutions
@@ -51,14 +51,18 @@ def state(parts: Parts, log: Log, chart: Chart, title: str | None = None) -> Fig
 
 def error(parts: Parts, log: Log, lower_bound: LowerBound | None = None) -> Figure:
     """Plot the error's 2-norm on a log scale, with its upper bound, lower bound, and the window of window_error."""
-    figure, axes = figure_of("Error", _error_label(parts))
-    size = np.linalg.norm(log.error, axis=1)
+    if parts.controller.kinematics.angle_unit == "rad":
+        shown, name, unit = shown_error("spacecraft")
+        figure, axes = figure_of(name.capitalize(), with_unit(name, unit))
+    else:
+        shown, (figure, axes) = np.asarray, figure_of("Error", _error_label(parts))
+    size = shown(np.linalg.norm(log.error, axis=1))
     axes.semilogy(log.t, _positive(size), color=STYLES[0][0], label="simulated")
     if parts.controller.prescribed:
         before = log.t[log.t < float(parts.controller.hand_over)]
-        axes.plot(before, envelopes.error_bound(parts, before), **BOUND)
+        axes.plot(before, shown(envelopes.error_bound(parts, before)), **BOUND)
     if lower_bound is not None and lower_bound.window_error > 0.0:
-        least = lower_bound.error
+        least = shown(lower_bound.error)
         known = (least > 0.0) & (least < size.max())  # nothing is known before the first samples
         axes.plot(lower_bound.t[known], least[known], color=STYLES[2][0], lw=1.2, label="lower bound")
     t_f = float(parts.controller.t_f)
@@ -179,8 +183,10 @@ def disturbance(parts: Parts, log: Log) -> Figure:
     figure, axes = figure_of("Disturbance and its estimate", with_unit("disturbance", parts.plant.input_unit))
     _components(axes, log.t, log.d_hat, "\\hat d", alpha=0.7)
     axes.plot(log.t, log.disturbance, color="white", lw=2.6, zorder=4)
-    axes.plot(log.t, log.disturbance, color="black", lw=1.2, ls=(0, (5, 2)), zorder=5)
-    axes.plot([], [], color="black", lw=1.2, ls=(0, (5, 2)), label="true $d_i$")
+    for k, true in enumerate(np.asarray(log.disturbance).T):
+        axes.plot(
+            log.t, true, color="black", lw=1.2, ls=STYLES[k % len(STYLES)][1], zorder=5, label=f"true $d_{{{k + 1}}}$"
+        )
     _mark(axes, parts)
     _legend(axes, ncols=2)
     return figure

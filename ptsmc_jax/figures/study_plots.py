@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-from ptsmc_jax.figures.style import LIMIT, LOWER_BOUND, STYLES, figure_of, logarithmic, plain_ticks, styled
+from ptsmc_jax.figures.style import LIMIT, LOWER_BOUND, STYLES, figure_of, logarithmic, plain_ticks, shown_error, styled
 from ptsmc_jax.scenario.gain_bounds import wide
 from ptsmc_jax.simulation.catalogues import CATALOGUES
 
@@ -149,6 +149,7 @@ def profiles(gains: Mapping[str, Profile], goal: str) -> Figure:
         if wide(one.gain[0], one.gain[-1]):
             logarithmic(ax, "x")
         ax.set(xlabel=f"{name} [{one.unit}]", ylabel=goal)
+    plain_ticks(axes[0].yaxis)
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper left", ncols=2, fontsize=9)
     return figure
 
@@ -167,20 +168,23 @@ def tradeoff(
         kind: of the plant; it determines the units.
         lower_bound: lower bound of the RMS error.
     """
-    error_unit, unit = (CATALOGUES[kind][name].unit for name in ("window_error", "peak_torque"))
+    (shown, name, error_unit), unit = shown_error(kind), CATALOGUES[kind]["peak_torque"].unit
     figure, axes = figure_of("Accuracy against torque, held-out trials", f"peak torque [{unit}]")
     arrays = {label: (np.asarray(e), np.asarray(u)) for label, (e, u) in sets.items()}
     looks = zip(arrays.items(), _looks(len(arrays)), range(len(arrays), 0, -1), strict=True)
     for (label, (errors, torques)), (colour, marker), above in looks:  # the first set is drawn above the others
-        rms, mean = np.sqrt(np.nanmean(errors**2)), np.nanmean(torques)
-        axes.loglog(errors, torques, marker, ms=2.5, alpha=0.35, color=colour, mew=0, zorder=2)
-        text = f"{label.replace('_', ' ')}: RMS {rms:.2e}, mean peak {mean:.3g} {unit}"
+        rms, mean = shown(np.sqrt(np.nanmean(errors**2))), np.nanmean(torques)
+        axes.loglog(shown(errors), torques, marker, ms=2.5, alpha=0.35, color=colour, mew=0, zorder=2)
+        text = f"{label.replace('_', ' ')}: RMS {rms:.3g} {error_unit}, mean peak {mean:.3g} {unit}"
         axes.loglog(rms, mean, marker, ms=9, color=colour, mec="white", label=text, zorder=2 + above)
     if limit is not None:
         axes.axhline(limit, **LIMIT, label=f"limit {limit:g} {unit}")
     if lower_bound:
-        axes.axvline(lower_bound, **LOWER_BOUND, label=f"lower bound {lower_bound:.2g}")
-    axes.set_xlabel(f"window error [{error_unit}]")
+        least = float(shown(lower_bound))
+        axes.axvline(least, **LOWER_BOUND, label=f"lower bound {least:.3g} {error_unit}")
+    axes.set_xlabel(f"{name} in the window [{error_unit}]")
+    for line in (axes.xaxis, axes.yaxis):
+        plain_ticks(line)
     _legend_below(figure, len(arrays) + 2, columns=1)
     return figure
 
@@ -211,7 +215,7 @@ def front(
     points: Sequence[Any],
     others: Mapping[str, Any],
     limit: float | None,
-    units: tuple[str, ...],
+    kind: str,
     lower_bound: float | None = None,
 ) -> Figure:
     """Plot window error against peak torque of a Pareto front, with intervals.
@@ -220,41 +224,49 @@ def front(
         points: of a `front.Front`, with rms, interval, peak, dominated and knee.
         others: further points by label.
         limit: required limit of the torque, if any.
-        units: of error and torque.
+        kind: kind of the plant, which determines the units.
         lower_bound: lower bound of the error.
     """
-    figure, axes = figure_of("Accuracy against torque: Pareto front, held-out trials", f"RMS window error [{units[0]}]")
+    (shown, name, error_unit), unit = shown_error(kind), CATALOGUES[kind]["peak_torque"].unit
+    title = "Accuracy against torque: Pareto front, held-out trials"
+    figure, axes = figure_of(title, f"RMS {name} in the window [{error_unit}]")
     on_front, dominated = ([p for p in points if p.dominated == is_so] for is_so in (False, True))
-    axes.loglog([p.peak for p in on_front], [p.rms for p in on_front], color=STYLES[0][0], lw=1.2)
+    axes.loglog([p.peak for p in on_front], shown([p.rms for p in on_front]), color=STYLES[0][0], lw=1.2)
     for group, colour, label in ((on_front, STYLES[0][0], "front"), (dominated, "0.6", "dominated")):
         for k, p in enumerate(group):
-            low, high = p.interval or (p.rms, p.rms)
-            axes.errorbar(p.peak, p.rms, [[max(p.rms - low, 0.0)], [max(high - p.rms, 0.0)]], fmt="o", ms=4,
+            rms, (low, high) = shown(p.rms), shown(p.interval or (p.rms, p.rms))
+            axes.errorbar(p.peak, rms, [[max(rms - low, 0.0)], [max(high - rms, 0.0)]], fmt="o", ms=4,
                           color=colour, elinewidth=1.0, capsize=2, label=label if k == 0 else None)  # fmt: skip
     for p in on_front:
         if p.knee:
-            axes.loglog(p.peak, p.rms, "o", ms=13, mfc="none", mec=STYLES[3][0], mew=1.4, label="knee")
+            axes.loglog(p.peak, shown(p.rms), "o", ms=13, mfc="none", mec=STYLES[3][0], mew=1.4, label="knee")
     for (label, p), marker, style in zip(others.items(), ("^", "s", "D"), STYLES[1:], strict=False):
         if np.isfinite(p.rms):
-            axes.loglog(p.peak, p.rms, marker, ms=8, color=style[0], label=f"{label}: {p.rms:.2e}")
+            rms = shown(p.rms)
+            axes.loglog(p.peak, rms, marker, ms=8, color=style[0], label=f"{label}: {rms:.3g} {error_unit}")
     if limit is not None:
-        axes.axvline(limit, **LIMIT, label=f"limit {limit:g} {units[1]}")
+        axes.axvline(limit, **LIMIT, label=f"limit {limit:g} {unit}")
     if lower_bound:
-        axes.axhline(lower_bound, **LOWER_BOUND, label=f"lower bound {lower_bound:.2g}")
-    axes.set_xlabel(f"largest peak torque [{units[1]}]")
-    plain_ticks(axes.xaxis)
+        least = float(shown(lower_bound))
+        axes.axhline(least, **LOWER_BOUND, label=f"lower bound {least:.3g} {error_unit}")
+    axes.set_xlabel(f"largest peak torque [{unit}]")
+    for line in (axes.xaxis, axes.yaxis):
+        plain_ticks(line)
     axes.legend(fontsize=9)
     return figure
 
 
 @styled
-def costs(points: Sequence[Any], sweep: Sweep, panels: Mapping[str, tuple[np.ndarray, float | None]]) -> Figure:
+def costs(
+    points: Sequence[Any], sweep: Sweep, panels: Mapping[str, tuple[np.ndarray, float | None]], kind: str
+) -> Figure:
     """Plot the error and other metrics along a sweep, a panel each; dashed lines are the scenario's limits.
 
     Args:
         points: of the sweep, with rms, interval and meets.
         sweep: the values of the points.
         panels: values of each point, NaN if it has none, and the limit if there is one, by title; the error first.
+        kind: kind of the plant, which determines how the intervals of the error are shown.
     """
     columns = 3
     figure = Figure(figsize=(10.5, 3.0 * -(-len(panels) // columns)), layout="constrained")
@@ -268,7 +280,7 @@ def costs(points: Sequence[Any], sweep: Sweep, panels: Mapping[str, tuple[np.nda
                 x, y = ([numbers[k] for k in some] for numbers in (sweep.values, values))
                 axes.plot(x, y, "o", ms=5, mfc=fill, mec=STYLES[0][0], label=label)
         if not k:
-            low, high = zip(*(point.interval or (point.rms, point.rms) for point in points), strict=True)
+            low, high = shown_error(kind)[0]([point.interval or (point.rms, point.rms) for point in points]).T
             axes.fill_between(sweep.values, low, high, color=STYLES[0][0], alpha=0.2, lw=0)
             axes.legend(fontsize=8)
         known = values[np.isfinite(values)]
@@ -321,9 +333,10 @@ def accuracy_map(
         limit_lines: lines (x, y) by label.
         kind: of the plant; it determines the units.
     """
-    error_unit, unit = (CATALOGUES[kind][name].unit for name in ("window_error", "peak_torque"))
+    (shown, error, error_unit), unit = shown_error(kind), CATALOGUES[kind]["peak_torque"].unit
+    grids = {name: shown(grid) if "error" in name else grid for name, grid in grids.items()}
     titles = {
-        "window_error": f"RMS window error [{error_unit}]",
+        "window_error": f"RMS {error} in the window [{error_unit}]",
         "linear_window_error": f"its part from noise, linear theory [{error_unit}]",
         "peak_torque": f"mean peak torque [{unit}]",
         "largest_peak_torque": f"largest peak torque [{unit}]",

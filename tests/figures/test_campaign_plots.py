@@ -69,7 +69,16 @@ def test_a_limit_in_the_legend_is_on_the_axis(limit):
 @pytest.mark.parametrize(("unit", "shown", "factor"), [("rad", "[deg]", 180.0 / np.pi), ("x1", "[x1]", 1.0)])
 def test_initial_angles_are_drawn_in_the_unit_of_their_axis(unit, shown, factor):
     angle, outcome = np.array([0.5, 1.0, 2.0]), np.full(3, "ok", dtype=object)
-    start, torque = campaign_plots.Column(unit, angle), campaign_plots.Column("N m", angle)
+    start, torque = campaign_plots.Column(unit, angle).in_readable_unit(), campaign_plots.Column("N m", angle)
     (axes,) = campaign_plots.torque_by_angle(start, torque, outcome, {"ok": 3}).axes
     assert axes.get_xlabel().endswith(shown)
     np.testing.assert_allclose(np.asarray(axes.collections[0].get_offsets())[:, 0], factor * angle)
+
+
+@pytest.mark.parametrize(("largest", "limit", "unit"), [(1e-4, 2e-4, "arcsec"), (1e-4, 0.1, "deg"), (0.1, 1e-4, "deg")])
+def test_angles_of_a_column_are_in_arcsec_below_one_degree(largest, limit, unit):
+    factor = {"deg": 180.0 / np.pi, "arcsec": 180.0 * 3600.0 / np.pi}[unit]
+    column = campaign_plots.Column("rad", np.array([1e-5, largest, np.nan]), limit).in_readable_unit()
+    assert column.unit == unit
+    np.testing.assert_allclose(column.values, factor * np.array([1e-5, largest, np.nan]), rtol=1e-14)
+    assert column.limit == pytest.approx(factor * limit, rel=1e-14)

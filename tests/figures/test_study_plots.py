@@ -39,15 +39,16 @@ def test_the_search_is_coloured_where_the_requirements_are_met():
 
 
 def test_a_tradeoff_figure_has_each_trial_and_their_rms():
-    """Errors of 3e-6, 4e-6 and 12e-6 have an RMS of 13e-6 / sqrt(3)."""
+    """Errors of 3e-6, 4e-6 and 12e-6 have an RMS of 13e-6 / sqrt(3), and small angles are twice as large."""
     errors, peaks = np.array([3e-6, 4e-6, 12e-6]), np.array([0.2, 0.4, 0.3])
     figure = study_plots.tradeoff({"tuned": (errors, peaks)}, limit=0.5, lower_bound=1e-6)
     (axes,) = figure.axes
     trials, (whole,) = (np.asarray(line.get_xydata()) for line in axes.lines[:2])
-    np.testing.assert_array_equal(trials, np.stack([errors, peaks], axis=1))
-    np.testing.assert_allclose(whole, [13e-6 / np.sqrt(3.0), 0.3], rtol=1e-12)
+    arcsec = 2.0 * np.degrees(1.0) * 3600.0
+    np.testing.assert_allclose(trials, np.stack([arcsec * errors, peaks], axis=1), rtol=1e-10)
+    np.testing.assert_allclose(whole, [arcsec * 13e-6 / np.sqrt(3.0), 0.3], rtol=1e-10)
     said = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
-    assert said == ["tuned: RMS 7.51e-06, mean peak 0.3 N m", "limit 0.5 N m", "lower bound 1e-06"]
+    assert said == ["tuned: RMS 3.1 arcsec, mean peak 0.3 N m", "limit 0.5 N m", "lower bound 0.413 arcsec"]
 
 
 def test_the_first_set_of_a_tradeoff_figure_is_not_hidden_by_a_later_one_at_the_same_place():

@@ -19,7 +19,7 @@ from ptsmc_jax.onboard.library import Library, compiler
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import rollout
 from tests.onboard.compiled import STRICT, needs_compiler, program
-from tests.onboard.flights import FLIGHTS, FULL, SIX, flight
+from tests.onboard.flights import FLIGHTS, FULL, MOVING, SIX, flight
 from tests.onboard.test_sensor_suite_export import TABLES
 from tests.tree import ROOT
 
@@ -31,7 +31,7 @@ from tests.onboard.fmus import Unit, closed_loop
 pytestmark = needs_compiler
 
 SEED, SAMPLES = 5, 65
-OTHERS = ("wheels with lag, limits, delay", "star tracker out of step", "system", "suite")
+OTHERS = ("wheels with lag, limits, delay", "star tracker out of step", "system", "suite", *MOVING)
 # wheels with failures, delay, filter with a slow star tracker, gyro bias, random walk of the disturbance, jitter
 RICH = flight(
     filter={"kind": "steady_state"},

@@ -436,8 +436,9 @@ def test_chart_of_a_front_has_intervals_knee_limit_and_no_point_without_an_error
     assert {name: trace["x"] for name, trace in named.items()} == {
         "front": [1.0, 2.0], "knee": [1.0], "dominated": [3.0], "published": [5.0],
     }  # fmt: skip
-    np.testing.assert_allclose(named["front"]["error_y"]["array"], [0.8e-5, 0.2e-5])
-    np.testing.assert_allclose(named["front"]["error_y"]["arrayminus"], [0.4e-5, 0.1e-5])
+    arcsec = 2.0 * np.degrees(1.0) * 3600.0  # of a small error |v|, to 1e-9
+    np.testing.assert_allclose(named["front"]["error_y"]["array"], arcsec * np.array([0.8e-5, 0.2e-5]), rtol=1e-7)
+    np.testing.assert_allclose(named["front"]["error_y"]["arrayminus"], arcsec * np.array([0.4e-5, 0.1e-5]), rtol=1e-7)
     assert named["published"]["error_y"]["array"] == [0.0]
     assert drawn["layout"]["shapes"][0]["x0"] == 1.5
     assert "peak torque [N m]" in json.dumps(drawn["layout"])

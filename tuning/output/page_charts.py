@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ptsmc_jax.figures import animation
-from ptsmc_jax.figures.style import STYLES
+from ptsmc_jax.figures.style import STYLES, shown_error
 from tuning.studies.front import Front, Point, unit_of
 
 Chart = dict[str, Any]
@@ -138,28 +138,28 @@ def front(found: Front, limit: float | None) -> Chart:
         *((label, [point], {"mode": "markers", "marker": {"size": 12, "symbol": "diamond"}})
           for label, point in found.labelled().items()),
     ]  # fmt: skip
-    data = []
+    data, (shown, error, unit) = [], shown_error(found.plant)
     for k, (name, points, style) in enumerate(groups):
         group = [p for p in points if p.rms >= 0.0]  # NaN if no trial was simulated to its end
         if group:
-            intervals = [p.interval or (p.rms, p.rms) for p in group]
+            rms = shown([p.rms for p in group])
+            low, high = shown([p.interval or (p.rms, p.rms) for p in group]).T
             bars = {
                 "type": "data", "symmetric": False, "visible": True, "thickness": 1,
-                "array": [high - p.rms for p, (_, high) in zip(group, intervals, strict=True)],
-                "arrayminus": [p.rms - low for p, (low, _) in zip(group, intervals, strict=True)],
+                "array": (high - rms).tolist(), "arrayminus": (rms - low).tolist(),
             }  # fmt: skip
             data.append({
-                "type": "scatter", "name": name, "x": [p.peak for p in group], "y": [p.rms for p in group],
+                "type": "scatter", "name": name, "x": [p.peak for p in group], "y": rms.tolist(),
                 "text": [", ".join(f"{g} {v:.4g}" for g, v in p.gains.items()) for p in group],
-                "hovertemplate": "%{text}<br>error %{y:.3e}, peak %{x:.4g}<extra>" + name + "</extra>",
+                "hovertemplate": "%{text}<br>error %{y:.3g} " + unit + ", peak %{x:.4g}<extra>" + name + "</extra>",
                 "error_y": bars, **style, "marker": {**style["marker"], "color": COLOURS[k % len(COLOURS)]},
             })  # fmt: skip
     along = {"title": {"text": f"peak torque [{unit_of('peak_torque', found.plant)}]"}, "type": "log"}
-    up = {"title": {"text": f"RMS window error [{unit_of('window_error', found.plant)}]"}, **_DECADES}
+    up = {"title": {"text": f"RMS {error} in the window [{unit}]"}, **_DECADES}
     shapes = [] if limit is None else [_upright(limit, dash="dash")]
     notes = []
     if found.lower_bound:
-        least = found.lower_bound
+        least = float(shown(found.lower_bound))
         level = {"y0": least, "y1": least, "xref": "paper", "x0": 0, "x1": 1}
         shapes.append({"type": "line", **level, "line": {"dash": "dot"}})
         notes.append({"text": "lower bound", "xref": "paper", "x": 1, "xanchor": "right", "y": np.log10(least),

@@ -11,10 +11,12 @@ from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import campaign as running
 from ptsmc_jax.campaigns import rows
 from ptsmc_jax.figures import campaign_plots as plots
+from ptsmc_jax.figures.style import angle_of
 from ptsmc_jax.simulation.catalogues import percent
 from ptsmc_jax.simulation.requirements import INTERPRETATIONS, Requirement, Verdict
 from tuning.studies.campaign_folder import Folder
 
+ERRORS = ("terminal_error", "window_error", "hold_error")  # norms of error vectors
 DRAWN = 1000  # largest number of trials whose histories are plotted
 POINTS = 5000  # largest number of trials in a scatter plot
 
@@ -29,10 +31,13 @@ def of(folder: Folder, summary: dict[str, Any]) -> dict[str, Figure]:
     frame = rows.read(parts, ["trial", "status", "initial_angle", *names, *timed]).head(folder.trials)
     finished = running.finished(frame)
     of_time = {v["metric"]: _of_time(Verdict.read(v)) for v in summary["verdicts"]}
-    units = folder.units
+    units, spacecraft = folder.units, folder.scenario.plant.kind == "spacecraft"
 
     def column(name: str, values: np.ndarray) -> plots.Column:
-        return plots.Column(units.get(name, ""), values, limits.get(name), of_time.get(name, ""))
+        unit, limit = units.get(name, ""), limits.get(name)
+        if spacecraft and name in ERRORS:  # as an angle
+            unit, values, limit = "rad", angle_of(values), None if limit is None else float(angle_of(limit))
+        return plots.Column(unit, values, limit, of_time.get(name, "")).in_readable_unit()
 
     figures: dict[str, Figure] = {}
     if finished.any():

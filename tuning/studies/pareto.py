@@ -26,7 +26,7 @@ from tuning.search.objective import Problem
 from tuning.search.progress import Report
 from tuning.search.rounds import MARGIN
 from tuning.studies import judging, posing
-from tuning.studies.front import KINDS, Front, Point, titled, unit_of
+from tuning.studies.front import KINDS, Front, Point, titled
 from tuning.studies.trades import SENSITIVITY, TORQUE, Target, Trade
 
 WARM = 3  # starting points of a target among the known gains
@@ -205,18 +205,22 @@ def figure_of(trade: Trade, front: Front) -> Figure:
     """Plot the error over the peak torque, or the error and the costs over the traded quantity."""
     kind, scenario = KINDS[front.against], trade.scenario
     if trade.compared:
-        units = (unit_of("window_error", front.plant), unit_of(TORQUE, front.plant))
         limit = tables.limit_of(scenario, TORQUE)
-        return study_plots.front(front.points, front.labelled(), limit, units, lower_bound=front.lower_bound)
-    columns = {"window_error": [one.rms for one in front.points]} | {
-        name: [one.costs[name] for one in front.points] for name in front.points[0].costs if name != SENSITIVITY
+        return study_plots.front(front.points, front.labelled(), limit, front.plant, front.lower_bound)
+    shown, error, unit = style.shown_error(front.plant)
+    limit = tables.limit_of(scenario, "window_error")
+    rms = shown([one.rms for one in front.points])
+    panels = {f"RMS {error} in the window [{unit}]": (rms, None if limit is None else float(shown(limit)))} | {
+        titled(name, front.plant): (
+            np.array([one.costs[name] for one in front.points]),
+            tables.limit_of(scenario, name),
+        )
+        for name in front.points[0].costs
+        if name != SENSITIVITY
     }
     panels = {
-        titled(name, front.plant): (
-            np.where(np.isfinite(column), column, np.nan), tables.limit_of(scenario, name)
-        )
-        for name, column in columns.items()
-    }  # fmt: skip
+        title: (np.where(np.isfinite(column), column, np.nan), limit) for title, (column, limit) in panels.items()
+    }
     values = [one.value for one in front.points]
     finite = [value for value in values if np.isfinite(value)]
     # the point without a limit is as far from the loosest limit as the next limit
@@ -224,4 +228,6 @@ def figure_of(trade: Trade, front: Front) -> Figure:
     ticks = [f"{value:g}" if np.isfinite(value) else "none" for value in values] if len(finite) < len(values) else None
     places = [value if np.isfinite(value) else beyond for value in values]
     title = f"{kind.title}, held-out trials"
-    return study_plots.costs(front.points, study_plots.Sweep(title, kind.label(front.plant), places, ticks), panels)
+    return study_plots.costs(
+        front.points, study_plots.Sweep(title, kind.label(front.plant), places, ticks), panels, front.plant
+    )

@@ -232,7 +232,7 @@ def identity(scenario: Scenario, seed: int, *, globally: bool) -> dict[str, Any]
 
 def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
     """Return the figures of a tuning run by name."""
-    from ptsmc_jax.figures import study_plots  # slow import, not needed before the search ends
+    from ptsmc_jax.figures import study_plots, style  # slow import, not needed before the search ends
 
     kind, names = scenario.plant.kind, gain_names.named(scenario)
     unit_of = gain_names.units_of(scenario)
@@ -244,18 +244,19 @@ def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
         beyond = np.full_like(np.asarray(of(paths[0][0])), missing)
         return np.stack([[of(path[k]) if k < len(path) else beyond for path in paths] for k in range(longest)])
 
-    known = {T_F: "s", LIMITS: "-", **catalogues.units(kind)}
-    goal = (
-        f"{objective_name(scenario.search).replace(' window', chr(10) + 'window')} [{known[scenario.search.minimise]}]"
-    )
+    minimised, shown = scenario.search.minimise, np.asarray
+    unit = {T_F: "s", LIMITS: "-", **catalogues.units(kind)}[minimised]
+    if minimised == "window_error":
+        shown, _, unit = style.shown_error(kind)
+    goal = f"{objective_name(scenario.search).replace(' window', chr(10) + 'window')} [{unit}]"
     moved = over_steps(lambda step: step.gains)
     figures: dict[str, Any] = {
         "history": study_plots.tuning_history(
             {name: (units[k], moved[:, :, k]) for k, name in enumerate(names)},
-            over_steps(lambda step: step.value),
+            shown(over_steps(lambda step: step.value)),
             over_steps(lambda step: np.all(step.worst <= 1.0), missing=False),
             goal,
-            (tuning.search.value, dict(zip(names, map(float, tuning.search.gains), strict=True))),
+            (float(shown(tuning.search.value)), dict(zip(names, map(float, tuning.search.gains), strict=True))),
         ),
     }
     ended = {
@@ -274,7 +275,7 @@ def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
         figures["profiles"] = study_plots.profiles(
             {
                 name: study_plots.Profile(
-                    units[k], p.gain, p.value, p.violation_ratio, p.nearest, float(tuning.search.gains[k])
+                    units[k], p.gain, shown(p.value), p.violation_ratio, p.nearest, float(tuning.search.gains[k])
                 )
                 for k, (name, p) in enumerate(tuning.trust.profiles.items())
             },
