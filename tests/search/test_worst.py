@@ -276,6 +276,18 @@ def test_joining_trials_fill_free_slots_first_and_then_replace_the_oldest():
     np.testing.assert_array_equal(problem.coordinates["initial_attitude"], expected["initial_attitude"])
 
 
+def test_a_second_search_of_a_problem_keeps_the_trials_that_joined_in_the_first():
+    """Otherwise gains of `ptsmc pareto --against t_f` break a limit: the second search replaced the hardest trials."""
+    problem, wanted = posed(random_turns(0.4, 2.0))
+    evaluate = Evaluator(Bounds(("eta", "delta"), (2.5, 0.3), (6.0, 4.0)))
+    for first in (200, 300):
+        search = rounds.Rounds(evaluate, problem, wanted, robust=False)
+        search._join(rounds.Joining(first + np.arange(rounds.HARDEST), np.array([True])))
+        problem = search.problem
+    counted = np.asarray(problem.trials)[np.asarray(problem.counted)[0]]
+    assert {*range(200, 200 + rounds.HARDEST), *range(300, 300 + rounds.HARDEST)} <= {*counted.tolist()}
+
+
 def test_critical_trials_of_several_quantile_limits_are_all_kept():
     """The trials of one limit must not replace the trials of another limit in the same round."""
     problem, wanted = posed(random_turns(0.4, 2.0))

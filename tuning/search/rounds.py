@@ -65,9 +65,11 @@ class Rounds:
         limits = bool(self._every) + len(
             self._quantiles
         )  # number of limits that can add their hardest trials in a round
+        before = problem.trials.size
         if limits:
             problem = _with_room(problem, limits * HARDEST + SPARE)
-        self._places = np.arange(problem.averaged, problem.trials.size)  # slots of trials that join
+        # slots of trials that join; the last ones hold trials that joined in an earlier search of the problem
+        self._places = np.r_[before : problem.trials.size, problem.averaged : before]
         self.problem = _with_room(problem, len(self._bands) * BAND)
         self.count = 0  # number of rounds that have added harder trials or loops
         self.hardest: Hardest | None = None  # worst case of the last gains
