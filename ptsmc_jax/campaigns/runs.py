@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike
 
 from ptsmc_jax import programs
 from ptsmc_jax.campaigns import margin_verdicts, montecarlo
-from ptsmc_jax.devices.attitude_sensors import StarTracker
 from ptsmc_jax.dispersions import table_rows
 from ptsmc_jax.dispersions.table_rows import Row
 from ptsmc_jax.dispersions.variation import Dispersion
@@ -90,8 +89,8 @@ class Run:
             return {}
         readings: dict[str, Any] = dict(log.readings)
         found: dict[str, Any] = {}
-        tracker = next((one for one in getattr(sensors, "sensors", ()) if isinstance(one, StarTracker)), None)
-        if tracker is not None:  # of a suite
+        tracker = getattr(sensors, "star_tracker", None)  # of a suite
+        if tracker is not None:
             readings["attitude"] = np.asarray(jax.vmap(tracker.body)(readings[tracker.name]))
             for name in ("valid", "age"):
                 readings[f"attitude_{name}"] = readings[f"{tracker.name}_{name}"]

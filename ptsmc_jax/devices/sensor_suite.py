@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ptsmc_jax.devices.attitude_sensors import AttitudeSensor
+from ptsmc_jax.devices.attitude_sensors import AttitudeSensor, StarTracker
 from ptsmc_jax.devices.kalman_filter import KalmanFilter, Track
 from ptsmc_jax.devices.sensors import ATTITUDE_AND_BIAS, RATE_NOISE, Reading, SpacecraftSensors
 from ptsmc_jax.devices.ticks import Ticks
@@ -60,6 +60,11 @@ class SensorSuite(SpacecraftSensors):
     rate_scale: Leaf | None = None  # (3,) ratio of gyro reading to true rate [-]
     outage: Leaf | None = None  # (2,) start and end of an outage of the first attitude sensor [s]
     noise_free: bool = field(default=False, metadata={"static": True})  # whether no noise is generated, see `quiet`
+
+    @property
+    def star_tracker(self) -> StarTracker | None:
+        """Return the first star tracker, whose readings telemetry has; None if there is none."""
+        return next((one for one in self.sensors if isinstance(one, StarTracker)), None)
 
     @property
     def every(self) -> int:

@@ -36,6 +36,7 @@ class Model:
     actuators: Actuators  # actuators without their delay
     delay: Leaf  # time from a command to its effect [s]
     noises: dict[str, Leaf]  # 1 sigma of each component of a reading, by its name [rad, rad/s, unit of x]
+    tracker_axes: Leaf  # (3, 3) axes of the star tracker in body axes, one per row; its noise is about them
     rate_scale: Leaf  # (3,) ratio of gyro reading to true rate [-]
     misalignment: Leaf  # (3,) rotation vector of the star tracker in the body [rad]
     bias: Leaf  # prior 1 sigma of the gyro bias; 0: no bias [rad/s]
@@ -240,7 +241,7 @@ def _start(model: Model, rows: Rows) -> _Carry:
         return _Carry(x, jnp.zeros(0), walk, p, actuators)
     still = attitude.from_rotation_vector(-model.misalignment)
     q = attitude.multiply(first["attitude"], still) if "attitude" in first else jnp.array([0.0, 0.0, 0.0, 1.0])
-    turn = _axes(model.misalignment)
+    turn = _axes(model.misalignment) @ model.tracker_axes.T
     star = model.noises["attitude"] ** 2 if "attitude" in first else jnp.zeros(3)
     has_rate = rows.valid[0, -1] if "rate" in first else False
     gyro = model.noises["rate"] ** 2 if "rate" in first else jnp.zeros(3)
@@ -371,8 +372,9 @@ def _residuals(model: Model, carry: _Carry, readings: dict[str, Array]) -> tuple
     if "attitude" in readings:
         q = attitude.multiply(carry.x.q, attitude.from_rotation_vector(model.misalignment))
         error = attitude.multiply(attitude.conjugate(q), readings["attitude"])
-        residuals.append(attitude.rotation_vector(jnp.where(error[3] < 0.0, -1.0, 1.0) * error[:3]))
-        rows.append(jnp.zeros((3, n)).at[:, :3].set(_axes(model.misalignment).T))
+        turn = attitude.rotation_vector(jnp.where(error[3] < 0.0, -1.0, 1.0) * error[:3])
+        residuals.append(model.tracker_axes @ turn)
+        rows.append(jnp.zeros((3, n)).at[:, :3].set(model.tracker_axes @ _axes(model.misalignment).T))
         noise.append(model.noises["attitude"])
     if "rate" in readings:
         residuals.append(readings["rate"] - model.rate_scale * carry.x.w - carry.bias)

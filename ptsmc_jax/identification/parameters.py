@@ -26,9 +26,12 @@ from ptsmc_jax.plants.rigid_body import AttitudeState
 from ptsmc_jax.scenario import build as building
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.parsing import nearest
+from ptsmc_jax.scenario.sensor_tables import SensorSuite
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.signals import disturbances
 
+# parameters of sensors that only [hardware] has, and that [[sensors]] replaces
+OF_HARDWARE = ("attitude_noise", "rate_noise", "gyro_scale", "star_tracker_misalignment")
 GYRO_BIAS = "gyro_bias"  # a state of the filter, not a constant
 UNKNOWN_BIAS = 0.02  # 1 sigma of an unknown gyro bias [rad/s]
 USUAL = {  # 1 sigma of a parameter without a dispersion: relative, in rad, or a damping ratio
@@ -179,8 +182,9 @@ def _model(
     if logs[0].by_channel:
         actuators = replace(actuators, torque_limit=None)
     noises, estimated, period = {}, [], scenario.loop.period
+    tracker = getattr(setup.sensors, "star_tracker", None)  # of a sensor suite
     given = {
-        "attitude": getattr(devices, "attitude_noise", None),
+        "attitude": getattr(devices, "attitude_noise", None) if tracker is None else np.asarray(tracker.noise).tolist(),
         "rate": devices.gyro_noise(period) if hasattr(devices, "gyro_noise") else None,
         "x": getattr(devices, "state_noise", None),
     }
@@ -204,6 +208,7 @@ def _model(
         actuators=actuators,
         delay=vector(devices.delay_periods * (period or 0.0)),
         noises=noises,
+        tracker_axes=jnp.eye(3) if tracker is None else tracker.axes(),
         rate_scale=vector(getattr(devices, "gyro_scale", None) or np.ones(3)),
         misalignment=vector(np.deg2rad(getattr(devices, "star_tracker_misalignment_deg", None) or np.zeros(3))),
         bias=vector(UNKNOWN_BIAS if with_bias and (nothing or not known_bias) else known_bias),
@@ -370,6 +375,8 @@ def _catalogue(
         made["mode_coupling"] = lambda model: (model, _coupling(model, *spread("mode_coupling", 1)))
     for path, leaf in _leaves(plant):
         made.setdefault(path, lambda model, path=path, leaf=leaf: (model, _leaf(path, leaf)))
+    if isinstance(getattr(scenario, "sensors", None), SensorSuite):
+        made = {name: maker for name, maker in made.items() if name not in OF_HARDWARE}
     return made
 
 

@@ -166,6 +166,31 @@ def test_a_mode_is_identified_from_a_simulated_run():
     assert damping == max(found.estimate[4], 0.0)  # an estimate of zero may be negative
 
 
+def test_noise_of_a_star_tracker_is_about_its_own_axes():
+    """A run with a tilted star tracker, whose noise about the boresight is 10 times as large as across it."""
+    tables = {
+        "spacecraft": {"inertia": [3.0, 4.0, 5.0]},
+        "loop": {"mode": "sampled", "period": 0.25, "t_end": 80.0},
+        "initial": {"rotvec_deg": [20.0, -25.0, 15.0]},
+        "controller": {"t_f": 40.0, "delta": 2.0},
+        "disturbance": {"kind": "none"},
+        "sensors": [
+            {"kind": "star_tracker", "boresight": [1.0, 1.0, 0.5], "noise_across": 2e-5, "noise_about": 2e-4},
+            {"kind": "gyro", "rate_noise": 2e-5},
+        ],
+        "identify": {"prior": "none"},
+    }
+    loaded = scenario.from_tables(tables)
+    frame = explore.simulate(loaded, trial=3).to_polars()
+    found = explore.identify(loaded, frame)
+    (fit,) = found.fits
+    assert fit.white
+    each = np.nanmean(fit.whitened**2, axis=0)
+    assert np.all(np.abs(each - 1.0) < 4.0 * np.sqrt(2.0 / len(fit.whitened)))  # 4 sigma of a mean of squares
+    with pytest.raises(ScenarioError, match=r"identify.free has gyro_scale, which this scenario does not have"):
+        explore.identify(loaded, frame, free=["inertia", "gyro_scale"])
+
+
 def test_unknown_parameters_and_logs_that_differ_are_refused():
     frame, _ = flight(np.random.default_rng(2))
     with pytest.raises(ScenarioError, match=r"identify.free has inertias, which this scenario does not have; the near"):
