@@ -12,8 +12,8 @@ from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.theory import linear, lower_bound
 
 ROUNDS = 8  # Largest number of iterations of the statistical linearisation.
-BEYOND = 1e60  # Upper limit of 1 sigma of s, if the covariance overflows.
-FLAT = 1e30  # Thickness of a boundary layer in which the switching term is practically zero.
+LARGEST_SIGMA = 1e60  # Upper limit of 1 sigma of s, if the covariance overflows.
+FLAT_WIDTH = 1e30  # Thickness of a boundary layer in which the switching term is practically zero.
 _AT = np.linspace(-20.0, 20.0, 401)
 _SLOPE, _GAUSS = 1.0 / np.cosh(_AT) ** 2, np.exp(-(_AT**2) / 2.0)
 
@@ -55,7 +55,7 @@ def noise(parts: Parts) -> Noise:
     simulated = getattr(parts.controller, "sign_width", None)
     if simulated is None:
         return _covariance(parts, ticks, linear.opened_in(parts, run, lasting, late=False))[0]
-    flat = linear.opened_in(parts, run, lasting, np.full(lasting.size, FLAT), late=False)
+    flat = linear.opened_in(parts, run, lasting, np.full(lasting.size, FLAT_WIDTH), late=False)
     own = _State(parts, ticks, flat).rows(flat.s_command, flat.s_direct).noise  # effect of each sample's own noise on s
     units = np.ones(lasting.size)  # unit of s in each period, relative to its unit after the hand-over
     if parts.controller.prescribed:
@@ -138,7 +138,7 @@ class _State:
         self._from_readings = None if place is not None else np.linalg.pinv(reading.rows[:, :k])
         # Process noise, 1 sigma per second. The random-walk torque changes at the start of a period and acts in that
         # period. The sensor states change after the sample.
-        self.walk = np.concatenate([np.zeros(self.size - self._m), lower_bound.walk_of(parts)])
+        self.walk = np.concatenate([np.zeros(self.size - self._m), lower_bound.walk_intensity(parts)])
         self.drift = np.concatenate([np.zeros(before), reading.own_drift, np.zeros(self._m)])
 
     def start(self) -> np.ndarray:
@@ -206,7 +206,7 @@ def _covariance(parts: Parts, ticks: Any, opened: linear.Opened, sign: _Sign | N
         squares[j] = square(opened.error[j]), 0.0, np.mean(np.diag(s))
         fraction = 0.0
         if sign is not None:
-            widths[j] = _mean_width(sign.simulated, min(float(np.sqrt(squares[j, 2])) / sign.units[j], BEYOND))
+            widths[j] = _mean_width(sign.simulated, min(float(np.sqrt(squares[j, 2])) / sign.units[j], LARGEST_SIGMA))
             fraction = sign.widths[j] / widths[j] if widths[j] > 0.0 else 1.0
         commanded = command.at(j, with_sign[0], fraction).covariance(p)
         torque = max(torque, float(np.sqrt(np.diag(commanded).max())))

@@ -46,7 +46,7 @@ def grid(poles: Complex[Array, "loops n"], h: Any) -> Float[Array, " points"]:
     return jnp.sort(both) * jnp.pi / h
 
 
-class Triangles(NamedTuple):
+class SchurOpening(NamedTuple):
     """State space of an opened loop in Schur coordinates, for fast evaluation at many z. Gradients are stopped."""
 
     opening: Opening  # With a triangular A.
@@ -81,29 +81,29 @@ class Triangles(NamedTuple):
         return each.reshape(-1, *each.shape[2:])[: z.size]
 
 
-def triangle(a: ArrayLike) -> tuple[Array, Array]:
+def schur_form(a: ArrayLike) -> tuple[Array, Array]:
     """Return the complex Schur form of a matrix and its unitary basis, (n, n) each. Gradients are stopped."""
     upper, axes = jax.scipy.linalg.schur(jax.lax.stop_gradient(a), output="complex")
     return upper, axes
 
 
-def in_triangles(opening: Opening, known: tuple[Array, Array] | None = None) -> Triangles:
+def in_schur_coordinates(opening: Opening, known: tuple[Array, Array] | None = None) -> SchurOpening:
     """Transform the state space of an opened loop L [-] to Schur coordinates, where A is triangular.
 
     Args:
         opening: the opened loop.
-        known: result of `triangle` for its A, or None to compute it.
+        known: result of `schur_form` for its A, or None to compute it.
     """
     fixed = jax.lax.stop_gradient(opening)
-    a, axes = known or triangle(fixed.a)
-    return Triangles(Opening(a, jnp.conj(axes.T) @ fixed.b, fixed.c @ axes), axes)
+    a, axes = known or schur_form(fixed.a)
+    return SchurOpening(Opening(a, jnp.conj(axes.T) @ fixed.b, fixed.c @ axes), axes)
 
 
-def response(opening: Opening, quick: Triangles, z: Complex[Array, " points"]) -> tuple[Array, Array]:
+def response(opening: Opening, quick: SchurOpening, z: Complex[Array, " points"]) -> tuple[Array, Array]:
     """Return L [-] at many z and its derivative by z, (points, m, m) each. L has gradients by `opening`.
 
-    L = Y (z X - A X - B) - C X with X and Y of `Triangles.halves`, whose gradients are stopped. The bracket is zero for
-    an exact X. Rounding errors of X and Y, and their dependence on the loop, therefore enter in second order only.
+    L = Y (z X - A X - B) - C X with X and Y of `SchurOpening.halves`, whose gradients are stopped. The bracket is zero
+    for an exact X. Rounding errors of X and Y, and their dependence on the loop, therefore enter in second order only.
 
     Args:
         opening: the opened loop.
@@ -172,7 +172,7 @@ def brackets(w: Array, L: Array) -> Brackets:
     least = (near[1:-1] <= near[:-2]) & (near[1:-1] <= near[2:])
     nearest = jnp.append(jnp.inf, jnp.where(least, near[1:-1], jnp.inf))
     how_far = (more, less, jnp.where(even, jnp.abs(phase), jnp.inf), nearest)
-    values, places = zip(*map(smallest, how_far), strict=True)
+    values, places = zip(*map(smallest_values, how_far), strict=True)
     j, k = jnp.concatenate(places[:3]), jnp.maximum(places[3], 1)
     derivative = (near[1:] - near[:-1]) / jnp.where(w[1:] == w[:-1], 1.0, w[1:] - w[:-1]) / 2
 
@@ -195,7 +195,7 @@ def sine(L: Array) -> Array:
     return L.imag / jnp.where(size > 0.0, size, 1.0)
 
 
-def smallest(values: Array, count: int = NEAREST) -> tuple[Array, Array]:
+def smallest_values(values: Array, count: int = NEAREST) -> tuple[Array, Array]:
     """Return the `count` smallest values, in ascending order, and their indices. Faster than sorting all values."""
     least, places = [], []
     for _ in range(count):
@@ -278,7 +278,7 @@ def zeros_of(values: Complex[Array, "rows points"], count: int) -> tuple[Array, 
     by_points, by_rows = crossed((every, first), (every, later)), crossed((first, every), (later, every))
     turns = by_points[:-1] + by_rows[:, 1:] - by_points[1:] - by_rows[:, :-1]
     inside = jnp.append(turns != 0, x[:-1, -1:] * x[1:, -1:] < 0.0, axis=1)
-    rows, places = smallest(jnp.where(inside, jnp.arange(len(inside))[:, None], jnp.inf).reshape(-1), count)
+    rows, places = smallest_values(jnp.where(inside, jnp.arange(len(inside))[:, None], jnp.inf).reshape(-1), count)
     row, point = jnp.divmod(places, values.shape[1])
     last = point == values.shape[1] - 1
     # linear interpolation from three corners of the cell

@@ -20,7 +20,7 @@ from ptsmc_jax.theory.solutions import starts, state_envelope, visited
 
 Vector = Float[Array, " n"]
 
-GIVEN_AWAY = 0.2785  # max of x (1 - tanh x): loss of tanh(s / width) against sign(s) per component, in units of width
+TANH_LOSS = 0.2785  # max of x (1 - tanh x): loss of tanh(s / width) against sign(s) per component, in units of width
 
 
 def sliding_envelope(parts: Parts) -> tuple[float, float]:
@@ -31,13 +31,13 @@ def sliding_envelope(parts: Parts) -> tuple[float, float]:
     c is 0 for the discontinuous sign, which gives (15), (32) and (43) of the paper.
     """
     law, n = parts.controller, parts.controller.order
-    beta = switching_rate(parts) * parts.plant.inputs * GIVEN_AWAY * float(law.layer(jnp.asarray(False)))
-    s0 = math.hypot(*np.ravel(_outset(parts)))  # finite even if its square overflows
+    beta = switching_rate(parts) * parts.plant.inputs * TANH_LOSS * float(law.layer(jnp.asarray(False)))
+    s0 = math.hypot(*np.ravel(_s_at_start(parts)))  # finite even if its square overflows
     return s0, 2.0 * beta / (2.0 * float(law.eta) + n - 4.0)
 
 
 @programs.jit
-def _outset(parts: Parts) -> Array:
+def _s_at_start(parts: Parts) -> Array:
     """Return s at t = 0, (m,)."""
     return exact(parts.controller, jnp.zeros_like(parts.t_end), starts(parts))[1]
 

@@ -103,13 +103,13 @@ class _HandOver(NamedTuple):
 
 def _at_hand_over(parts: Parts) -> _HandOver:
     law = parts.controller
-    beta = envelopes.switching_rate(parts) * envelopes.GIVEN_AWAY * float(law.sign_width)
+    beta = envelopes.switching_rate(parts) * envelopes.TANH_LOSS * float(law.sign_width)
     limit = np.sqrt(beta / float(law.reaching_rate))
-    return _handed(parts, *(jnp.asarray(v) for v in (*envelopes.sliding_envelope(parts), limit)))
+    return _bounds_at_hand_over(parts, *(jnp.asarray(v) for v in (*envelopes.sliding_envelope(parts), limit)))
 
 
 @programs.jit
-def _handed(parts: Parts, s0: Scalar, residual_before: Scalar, limit: Scalar) -> _HandOver:
+def _bounds_at_hand_over(parts: Parts, s0: Scalar, residual_before: Scalar, limit: Scalar) -> _HandOver:
     law = parts.controller
 
     def component(x0: Vector) -> tuple[Vector, Vector]:

@@ -32,7 +32,7 @@ from ptsmc_jax.theory.crossings import MOST
 FEWEST = 16  # Smallest number of full hold periods for a decision.
 TURNS, SLOWEST = 4, 40  # Smallest number of reversals of the command, and largest number of samples between them.
 STAYS = 0.75  # Smallest ratio of the command's variation in the second half of the examined periods to the first half.
-BEYOND = 0.1  # Smallest nonlinear fraction of a limit cycle: residual relative to the change of the command.
+NONLINEAR = 0.1  # Smallest nonlinear fraction of a limit cycle: residual relative to the change of the command.
 ROUNDING = 1e-8  # Rounding error, relative to the largest command.
 
 
@@ -80,9 +80,10 @@ def find(parts: Parts, seen: History | None = None) -> LimitCycle | None:
     suspect = turns & _stays(u[last])
     if not suspect.any():
         return None
-    off, size = (np.asarray(v)[last] for v in _unexplained(parts, linear.nominal_jit(parts) if run is None else run))
-    suspect &= _oscillates(off, BEYOND * np.abs(off).max(axis=0))
-    suspect &= np.ptp(off, axis=0) > BEYOND * np.ptp(size, axis=0)
+    run = linear.nominal_jit(parts) if run is None else run
+    off, size = (np.asarray(v)[last] for v in _nonlinear_residual(parts, run))
+    suspect &= _oscillates(off, NONLINEAR * np.abs(off).max(axis=0))
+    suspect &= np.ptp(off, axis=0) > NONLINEAR * np.ptp(size, axis=0)
     if not suspect.any():
         return None
     return max(_measured(u[last, axis], off[:, axis]) for axis in np.flatnonzero(suspect))
@@ -122,32 +123,33 @@ def _stays(u: np.ndarray) -> np.ndarray:
 
 
 @programs.jit(compiler_options=programs.QUICKLY)
-def _unexplained(parts: Parts, run: linear.Nominal) -> tuple[Array, Array]:
+def _nonlinear_residual(parts: Parts, run: linear.Nominal) -> tuple[Array, Array]:
     """Return the residual of the module docstring and u(x_0) - u(x), (periods, m) each."""
     parts = linear.quiet(parts)
     k2, kinematics, model = parts.observer.error_bound(), parts.controller.kinematics, parts.observer.model
 
-    def one(period: computer.Period, before: computer.Computer, seen: Any) -> tuple[Array, Array]:
+    def in_period(period: computer.Period, before: computer.Computer, seen: Any) -> tuple[Array, Array]:
         target = parts.reference(period.now.t)
         d_hat, _ = computer.estimate(parts, period, before, seen)
 
-        def error(by: Array) -> Array:
-            return kinematics.derivatives(model.retract(seen, by), target).reshape(-1)
+        def error_derivatives(z: Array) -> Array:
+            """Return eps and its derivatives at local coordinates z of the measured state."""
+            return kinematics.derivatives(model.retract(seen, z), target).reshape(-1)
 
-        def commanded(by: Array) -> Array:
-            return computer.command(parts, k2, period, before, model.retract(seen, by), target, d_hat)[0]
+        def command(z: Array) -> Array:
+            return computer.command(parts, k2, period, before, model.retract(seen, z), target, d_hat)[0]
 
         zero = jnp.zeros(model.local_coordinates(seen, seen).size)
         # LAPACK, because `matrices.solve` of six equations takes longer to compile than everything else here
-        way = -jnp.linalg.solve(jax.jacfwd(error)(zero), error(zero))
-        here, linear_change = jax.jvp(commanded, (zero,), (way,))
-        change = commanded(way) - here
+        to_zero_error = -jnp.linalg.solve(jax.jacfwd(error_derivatives)(zero), error_derivatives(zero))
+        here, linear_change = jax.jvp(command, (zero,), (to_zero_error,))
+        change = command(to_zero_error) - here
         return change - linear_change, change
 
-    return lapack.vmap(one)(run.period, run.carry.computer, run.after.computer.seen)
+    return lapack.vmap(in_period)(run.period, run.carry.computer, run.after.computer.seen)
 
 
-def none_left(margins: Any, rows: Any) -> Any:
+def without_margins(margins: Any, rows: Any) -> Any:
     """Set the margins of the marked rows to zero, because of a limit cycle. Negative margins do not change.
 
     Args:

@@ -241,7 +241,7 @@ def _model(parts: Parts, log: Log, ticks: Ticks) -> Model:
     unknown = UNKNOWN * np.max(np.abs(now[0, :, :n]) * off[:, None], axis=0)
     start = np.diag(np.concatenate([unknown, reading.own, np.zeros(size - n - own)]))
     lengths = np.asarray(ticks.t_next - ticks.t)
-    drift = np.diag(np.concatenate([np.zeros(n), reading.own_drift, walk_of(parts), np.zeros(len(places))]))
+    drift = np.diag(np.concatenate([np.zeros(n), reading.own_drift, walk_intensity(parts), np.zeros(len(places))]))
     move = np.tile(np.eye(size), (periods, 1, 1))
     move[:, :n, :n], move[:, :n, torque] = linear.move, linear.push
     output = np.zeros((periods, linear.error.shape[1], size))
@@ -294,7 +294,7 @@ def reading_of(sensors: Any, size: int, ticks: Ticks) -> Reading:
     return sensors.reading(int(ticks.sample[0]), float(ticks.noise_weight[0]))
 
 
-def walk_of(parts: Parts) -> np.ndarray:
+def walk_intensity(parts: Parts) -> np.ndarray:
     """Return the intensity r of the random-walk torque, (m,) [N m/s], or zeros without a random walk.
 
     At the start of a period of length h the torque changes by a Gaussian step with 1 sigma r h.

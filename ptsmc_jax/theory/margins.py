@@ -19,7 +19,7 @@ from jaxtyping import Array
 from ptsmc_jax import programs
 from ptsmc_jax.numerics.pytrees import Scalar
 from ptsmc_jax.theory import crossings, linear
-from ptsmc_jax.theory.crossings import MOST, SPLIT, Brackets, Triangles
+from ptsmc_jax.theory.crossings import MOST, SPLIT, Brackets, SchurOpening
 from ptsmc_jax.theory.linear import Loop, Opening
 
 NEUTRAL = 1e-6  # Tolerance of the unit circle, because rounding moves the poles at 1 of stored momentum.
@@ -100,7 +100,7 @@ class _Spectrum(NamedTuple):
     finite: Array  # bool; if False, all numbers are meaningless.
     loop: Loop
     opening: Opening
-    quick: Triangles  # The opening in Schur coordinates.
+    quick: SchurOpening  # The opening in Schur coordinates.
     stable: Array  # bool
     w: Array  # (points,) [rad/s]
     each: Array  # (m, points) L of each axis, with stopped gradients.
@@ -128,7 +128,7 @@ def _spectrum(loop: Loop, opened: Callable[[Loop], Opening] = linear.at_input) -
     opening = opened(loop)
     fixed, h = jax.lax.stop_gradient((opening, loop.period))
     poles = crossings.poles_of(fixed)
-    quick, w = crossings.in_triangles(opening), crossings.grid(poles, h)
+    quick, w = crossings.in_schur_coordinates(opening), crossings.grid(poles, h)
     each = crossings.each_axis(quick.values(jnp.exp(1j * w * h)))
     stable = finite & (jnp.max(jnp.abs(poles[0])) < 1.0 + NEUTRAL)
     return _Spectrum(finite, loop, opening, quick, stable, w, each.T)
@@ -185,7 +185,7 @@ def _refined_crossings(spectrum: _Spectrum, brackets: Brackets) -> Array:
     remaining error is small enough for the final Newton step in `_axis`.
     """
 
-    def closer(state: tuple[Array, tuple, Array]) -> tuple[Array, tuple, Array]:
+    def false_position(state: tuple[Array, tuple, Array]) -> tuple[Array, tuple, Array]:
         k, (a, b, f_a, f_b), _ = state
         c = b - f_b * (b - a) / jnp.where(f_b == f_a, 1.0, f_b - f_a)
         c = jnp.clip(c, jnp.minimum(a, b), jnp.maximum(a, b))
@@ -196,11 +196,11 @@ def _refined_crossings(spectrum: _Spectrum, brackets: Brackets) -> Array:
         moves = jnp.any(brackets.there & (jnp.abs(c - b) > 1e-9 * b))
         return k + 1, (jnp.where(between, b, a), c, jnp.where(between, f_b, f_a / 2), f_c), moves
 
-    def goes_on(state: tuple[Array, tuple, Array]) -> Array:
+    def is_unfinished(state: tuple[Array, tuple, Array]) -> Array:
         return (state[0] < 10) & state[2]
 
     first = (jnp.zeros((), int), tuple(brackets[:4]), jnp.ones((), bool))
-    root = jax.lax.while_loop(goes_on, closer, jax.lax.stop_gradient(first))[1][1]
+    root = jax.lax.while_loop(is_unfinished, false_position, jax.lax.stop_gradient(first))[1][1]
     return jnp.where(jnp.isfinite(root), root, brackets.high)
 
 
@@ -227,10 +227,10 @@ def _axis(root: Array, L: Array, slope: Array, there: Array, stable: Array, lowe
     """Return the margins of one axis.
 
     Args:
-        root: frequencies of the crossings (crossings,) [rad/s].
-        L: L at the crossings and at `Brackets.elsewhere`.
+        root: frequencies of the crossings (crossings,) [rad/s], in the order of `SPLIT`.
+        L: open-loop response at the crossings, then at the three frequencies `Brackets.elsewhere`.
         slope: derivative of L by w at the same frequencies.
-        there: which crossings exist.
+        there: which crossings exist, bool (crossings,); numbers of the others are meaningless.
         stable: whether the loop is stable.
         lowest: lowest frequency of the grid [rad/s].
     """
@@ -263,13 +263,13 @@ def _axis(root: Array, L: Array, slope: Array, there: Array, stable: Array, lowe
 def _delay(loop: Loop, w: Array, seen: Array, axis: Array) -> Scalar:
     """Return the smallest additional delay [s] of one axis's command that brings the loop to its stability limit."""
     # no LAPACK solver: jaxlib's wait for threads of XLA, and two of them at the same time deadlock
-    of_a = crossings.triangle(loop.closed_at_sensors()[0])
+    of_a = crossings.schur_form(loop.closed_at_sensors()[0])
     still, fixed = jax.lax.stop_gradient((loop, of_a))
     near = _delay_grid_search(still, fixed, w, axis)
     estimates, crossed = crossings.delay_at(w, seen)
     sizes, crossed = jax.lax.stop_gradient((estimates, crossed))
     # the estimates ignore that commands are held, so that the smallest estimate need not give the smallest delay
-    values, places = crossings.smallest(sizes, NEAREST)
+    values, places = crossings.smallest_values(sizes, NEAREST)
     starts = jnp.append(near, jnp.stack([jnp.log(crossed[places]), values / still.period], axis=1), axis=0)
     tries = jnp.append(jnp.ones(len(near), int), jnp.full(NEAREST, STARTS))
 
@@ -317,7 +317,7 @@ def _delay_grid_search(loop: Loop, of_a: tuple[Array, Array], w: Array, axis: Ar
     a, command = loop.closed_at_sensors()
     z = jnp.exp(1j * w * loop.period)
     opening = Opening(a, loop.new[0], command)
-    quick = crossings.in_triangles(opening, of_a)
+    quick = crossings.in_schur_coordinates(opening, of_a)
     y = quick.halves(z)[1] * (z**-loop.delay)[None, None]
     into = jnp.conj(quick.axes.T)
     response = -jnp.einsum("nkp,nm->pkm", y, into @ loop.new[0])
@@ -344,20 +344,20 @@ def _delay_step(loop: Loop, of_a: tuple[Array, Array], axis: Array, x: Array) ->
 
     Args:
         loop: the loop.
-        of_a: `crossings.triangle` of A of the loop closed at its sensors.
+        of_a: `crossings.schur_form` of A of the loop closed at its sensors.
         axis: number of the delayed axis.
         x: ln w and the delay in periods.
     """
 
-    def off(at: Array) -> tuple[Array, Array]:  # ln(-L), as value to differentiate and as auxiliary value
+    def log_of_negated(at: Array) -> tuple[Array, Array]:  # ln(-L) twice, the second one as auxiliary value
         z = jnp.exp(1j * jnp.exp(at[0]) * loop.period)
         late = linear.late_axis(loop, z, at[1], axis)
-        L = crossings.response(late, crossings.in_triangles(late, of_a), z[None])[0][0]
+        L = crossings.response(late, crossings.in_schur_coordinates(late, of_a), z[None])[0][0]
         value = -crossings.one_axis(z**-loop.delay * L, axis)
         far = jnp.stack([jnp.log(jnp.abs(value)), jnp.angle(value)])
         return far, far
 
-    jacobian, far = jax.jacfwd(off, has_aux=True)(x)
+    jacobian, far = jax.jacfwd(log_of_negated, has_aux=True)(x)
     (a, b), (c, d) = jax.lax.stop_gradient(jacobian)
     by = jnp.stack([d * far[0] - b * far[1], a * far[1] - c * far[0]]) / (a * d - b * c)  # Cramer's rule
     most = jnp.stack([0.2 * jnp.ones_like(a), 0.5 + 0.1 * jnp.abs(x[1])])
@@ -407,7 +407,7 @@ def _responses(loop: Loop) -> tuple[Array, Array, Array]:
     """Return frequencies, L (points, m, m), and L of each axis with the other axes closed (points, m)."""
     opening = linear.at_input(loop)
     w = crossings.grid(crossings.poles_of(opening), loop.period)
-    seen, _ = crossings.in_triangles(opening).response(jnp.exp(1j * w * loop.period))
+    seen, _ = crossings.in_schur_coordinates(opening).response(jnp.exp(1j * w * loop.period))
     return w, seen, crossings.each_axis(seen)
 
 

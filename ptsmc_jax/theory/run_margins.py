@@ -20,9 +20,9 @@ from ptsmc_jax.theory.limit_cycles import History, history
 from ptsmc_jax.theory.linear import Loop
 from ptsmc_jax.theory.margins import FIELDS, Margins
 
-SLOWEST = 10  # Shortest time to go in periods. The gains then change by a tenth from one period to the next.
+SHORTEST = 10  # Shortest time to go, in periods. The gains then change by a tenth from one period to the next.
 TIMES = 4  # number of times to go at which margins are computed
-LONGEST = 0.25  # longest of them, as a fraction of t_f
+LONGEST = 0.25  # longest time to go at which margins are computed, as a fraction of t_f
 
 
 class Course(NamedTuple):
@@ -31,9 +31,9 @@ class Course(NamedTuple):
     t: np.ndarray  # (times,) [s] The last is in the hold phase, the others are before the hand-over.
     judged: np.ndarray  # (times,) bool: whether the frozen loop is meaningful, see `judged_times`.
     loops: Loop  # The first axis of all arrays is the time.
-    at_input: Margins  # (times, m)
-    at_sensors: Margins  # (k,) in the hold phase.
-    together: dict[str, float]  # Margins of all axes of the input at once, in the hold phase.
+    at_input: Margins  # (times, m) Margins of the loop opened at each input.
+    at_sensors: Margins  # (k,) Margins of the loop opened at each measured signal, in the hold phase.
+    together: dict[str, float]  # Hold phase: margins against the same change in all inputs, see `margins.together`.
     singularity_distance: float  # Smallest distance to the singularity, in the unit of `run_state.SINGULAR_DISTANCE`.
     not_converged: bool  # Whether the run has not converged at t_f, see `run_state.is_not_converged`.
     limit_cycle: limit_cycles.LimitCycle | None = None  # Limit cycle in the hold phase, if there is one.
@@ -44,7 +44,7 @@ class Course(NamedTuple):
         return jax.tree.map(lambda v: v[-1], (self.loops, self.at_input))
 
     @property
-    def before(self) -> Margins:
+    def before_hand_over(self) -> Margins:
         """The margins before the hand-over, (times, m)."""
         return jax.tree.map(lambda v: v[:-1], self.at_input)
 
@@ -57,12 +57,12 @@ class Course(NamedTuple):
 def judged_times(parts: Parts) -> Float[Array, " times"]:
     """Return times to go [s] at which a loop with frozen gains is meaningful, shortest first, logarithmically spaced.
 
-    The shortest is at the hand-over, where gains are largest, but at least `SLOWEST` periods. The gains then change by
+    The shortest is at the hand-over, where gains are largest, but at least `SHORTEST` periods. The gains then change by
     at most a tenth from one sample to the next. The longest is the fraction `LONGEST` of t_f. There the settling time
     of the loop equals the time to go. The times are differentiable by t_f and delta.
     """
     law = parts.controller
-    shortest = jnp.maximum(law.delta, SLOWEST * parts.period)
+    shortest = jnp.maximum(law.delta, SHORTEST * parts.period)
     longest = jnp.maximum(LONGEST * law.t_f, shortest)
     return shortest * (longest / shortest) ** (jnp.arange(TIMES) / (TIMES - 1))
 
@@ -158,7 +158,7 @@ def judged(parts: Parts) -> tuple[Margins, np.ndarray, limit_cycles.LimitCycle |
     """
     found, hold, commands = jax.tree.map(np.asarray, judged_margins_jit(parts))
     limit_cycle = limit_cycles.find(parts, commands)
-    return (found if limit_cycle is None else limit_cycles.none_left(found, hold)), hold, limit_cycle
+    return (found if limit_cycle is None else limit_cycles.without_margins(found, hold)), hold, limit_cycle
 
 
 def along(parts: Parts, times: int = 24) -> Course:
@@ -182,8 +182,8 @@ def along(parts: Parts, times: int = 24) -> Course:
     else:
         at_once = dict.fromkeys(FIELDS, float("nan"))
         at_input, at_sensors = (
-            limit_cycles.none_left(at_input, order == order[-1]),
-            limit_cycles.none_left(at_sensors, [True]),
+            limit_cycles.without_margins(at_input, order == order[-1]),
+            limit_cycles.without_margins(at_sensors, [True]),
         )
     at_sensors = jax.tree.map(lambda v: np.asarray(v)[0], at_sensors)
     return Course(

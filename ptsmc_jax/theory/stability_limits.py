@@ -49,13 +49,13 @@ def _closed(kp: float, kd: float, h: float, delay: float) -> np.ndarray:
         delay: delay of the command in periods, whole or fractional, at least 0.
     """
     whole = int(np.floor(delay))
-    part = delay - whole  # fraction of the period after which the command of `whole` periods ago replaces the older one
+    part = delay - whole  # fraction of the period; then the command of `whole` periods ago replaces the older command
     n = 2 + whole + (part > 0)
     move = np.eye(n)
     move[0, 1] = h
 
     def push(begin: float, end: float) -> tuple[float, float]:
-        """Return the changes of eps and eps' by a unit acceleration between two fractions of the period."""
+        """Return the changes of eps and eps' at the end of the period by a unit acceleration from `begin` to `end`."""
         a, b = begin * h, end * h
         return (h - a) ** 2 / 2 - (h - b) ** 2 / 2, b - a
 

@@ -116,7 +116,7 @@ def trace_analyses(parts, dispersion):
     """Trace the moments and the rest point of the loop, the test vectors of the C export, and predicted peaks."""
     trials, seed, run = jnp.arange(4, dtype=jnp.uint32), jnp.uint32(0), jax.eval_shape(linear.nominal, parts)
     run_margins._moments.trace(parts, run, run_margins.judged_times(parts))
-    limit_cycles._unexplained.trace(parts, run)
+    limit_cycles._nonlinear_residual.trace(parts, run)
     vectors.simulate_many.trace(parts, dispersion, seed, trials)
     design._predicted.trace(parts, dispersion, seed, trials, jnp.asarray(3.0))
 

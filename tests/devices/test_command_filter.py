@@ -90,7 +90,7 @@ def test_linearised_loop_includes_the_filter():
         run = linear.nominal_jit(parts)
         loops = linear.loops_in(parts, run, linear.full_periods(parts, run, hold=True)[-1:])
         opening = linear.at_input(jax.tree.map(lambda v: v[0], loops))
-        found.append(jax.jit(crossings.in_triangles(opening).response)(np.exp(1j * H * np.array(tones)))[0])
+        found.append(jax.jit(crossings.in_schur_coordinates(opening).response)(np.exp(1j * H * np.array(tones)))[0])
     b, a = signal.bilinear([36.0], [1.0, 2 * 0.7 * 6.0, 36.0], fs=6.0 / (2 * np.tan(6.0 * H / 2)))
     for w, without, behind in zip(tones, *found, strict=True):
         _, factor = signal.freqz(np.asarray(b), np.asarray(a), worN=np.array([w * H]))

@@ -78,10 +78,10 @@ def test_limit_cycle_detection_needs_sixteen_full_periods(whole, judged):
     assert (limit_cycles.find(parts, seen._replace(in_hold=told)) is not None) == judged
 
 
-def test_none_left_sets_positive_margins_to_zero_and_keeps_negative_ones():
+def test_without_margins_sets_positive_margins_to_zero_and_keeps_negative_ones():
     stable = np.array([[True], [True], [False]])
     values: Any = {name: np.array([[3.0], [3.0], [-3.0]]) for name in margins.Margins._fields} | {"stable": stable}
-    left = limit_cycles.none_left(margins.Margins(**values), [False, True, True])
+    left = limit_cycles.without_margins(margins.Margins(**values), [False, True, True])
     for name, of in left._asdict().items():
         none = {"peak_sensitivity": 100.0, "stable": False, "crossover": np.nan}.get(
             name, 0.0
@@ -116,5 +116,5 @@ def test_limit_cycle_of_a_law_without_sign_width_is_detected(monkeypatch):
     monkeypatch.setattr(linear, "nominal_jit", lambda _: run)
     seen = limit_cycles.History(jnp.asarray(turning), jnp.ones(40, bool))
     for left, found in ((0.9, limit_cycles.LimitCycle(1.0, 2.0)), (0.0, None)):
-        monkeypatch.setattr(limit_cycles, "_unexplained", lambda *_, left=left: (left * turning, turning))
+        monkeypatch.setattr(limit_cycles, "_nonlinear_residual", lambda *_, left=left: (left * turning, turning))
         assert limit_cycles.find(law, seen) == found

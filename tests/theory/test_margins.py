@@ -618,7 +618,7 @@ def test_lapack_receives_one_matrix_at_a_time():
         "their slopes": jax.make_jaxpr(with_gradients)(1.0),
         "roughly": jax.make_jaxpr(lambda loops: jax.lax.map(margins.roughly, loops))(loops),
         "responses": margins._responses.trace(loop),
-        "at rest": limit_cycles._unexplained.trace(body, jax.eval_shape(linear.nominal, body)),
+        "at rest": limit_cycles._nonlinear_residual.trace(body, jax.eval_shape(linear.nominal, body)),
     }
     for name, trace in traces.items():
         solved = [e for e in equations(trace.jaxpr) if e.primitive.name in lapack.COUNTED | lapack.SHARED]

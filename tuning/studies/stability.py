@@ -92,7 +92,7 @@ def names(ready: Study) -> tuple[list[str], list[str]]:
 def summary(ready: Study, course: Course) -> dict[str, Any]:
     """Return the content of `summary.json`: margins in [dB], [deg] and [s]; null: infinite, or no value."""
     inputs, seen = names(ready)
-    (_, hold), before = course.hold, course.before
+    (_, hold), before = course.hold, course.before_hand_over
 
     def table(left: margins.Margins, labels: list[str], fields: tuple[str, ...]) -> dict[str, Any]:
         return {label: {name: _number(getattr(left, name)[k]) for name in fields} for k, label in enumerate(labels)}
@@ -190,5 +190,7 @@ def figures_of(ready: Study, course: Course) -> dict[str, Any]:
     return {
         "nichols": margin_plots.nichols(seen, inputs),
         "sensitivity": margin_plots.sensitivity(w, seen, inputs),
-        "margins": margin_plots.over_time(float(ready.parts.controller.t_f) - course.t[:-1], course.before, hold),
+        "margins": margin_plots.over_time(
+            float(ready.parts.controller.t_f) - course.t[:-1], course.before_hand_over, hold
+        ),
     }
