@@ -129,7 +129,7 @@ class Law(declare.Tunable):
 
     # The methods below use only the numbers in the fields, because a scenario calls them with its configuration table
 
-    def turning(self, t_f: float) -> tuple[str, Scalar | float]:
+    def half_turn_rate(self, t_f: float) -> tuple[str, Scalar | float]:
         """Return the field that sets how fast the law turns a body, and the largest body rate of a half turn [rad/s].
 
         A half turn has the initial error |v| = 1. The default rate is twice the mean rate of a half turn in t_f.

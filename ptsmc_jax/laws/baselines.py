@@ -24,7 +24,7 @@ from ptsmc_jax.signals.references import Target
 class PD(ComparisonLaw):
     """PD on the error and its rate (Wie, Weiss, Arapostathis 1989).
 
-    a = -k_p eps - k_d eps'; its s is eps + (k_d/k_p) eps'.
+    The commanded acceleration is a = -k_p eps - k_d eps', and the sliding variable is s = eps + (k_d/k_p) eps'.
     """
 
     k_p: Leaf = gain(
@@ -39,7 +39,7 @@ class PD(ComparisonLaw):
     def acceleration(self, now: Sample, error: Vector, error_rate: Vector, bound: Scalar) -> tuple[Vector, Vector]:
         return -self.k_p * error - self.k_d * error_rate, error + self.k_d / self.k_p * error_rate
 
-    def turning(self, t_f: float) -> tuple[str, Scalar | float]:
+    def half_turn_rate(self, t_f: float) -> tuple[str, Scalar | float]:
         """Return "k_p", and the body rate [rad/s] at zero error after half a turn without damping."""
         return "k_p", 2.0 * math.sqrt(self.k_p)
 
@@ -109,7 +109,7 @@ class Terminal(ComparisonLaw):
         """Return the noise of s = v + sig^p(v') / b [-]."""
         return math.hypot(position, velocity**self.p / self.b)
 
-    def turning(self, t_f: float) -> tuple[str, Scalar | float]:
+    def half_turn_rate(self, t_f: float) -> tuple[str, Scalar | float]:
         """Return "b", and the body rate on the sliding surface at |v| = 1 [rad/s]."""
         return "b", 2.0 * self.b ** (1.0 / self.p)
 
@@ -164,7 +164,7 @@ class FixedTime(ComparisonLaw):
         equivalent = curvature - guards.signed_power(kappa, self.p) / self.p * reaching
         return equivalent - bound * guards.smooth_sign(s, self.sign_width), s
 
-    def turning(self, t_f: float) -> tuple[str, Scalar | float]:
+    def half_turn_rate(self, t_f: float) -> tuple[str, Scalar | float]:
         """Return "a1", and the body rate on the sliding surface at |v| = 1 [rad/s]."""
         return "a1", 2.0 * (self.a1 + self.b1)
 
@@ -216,7 +216,7 @@ class Scaling(ComparisonLaw):
         """Return k1 and delta for the designed pole in the hold phase and at the end of the approach phase."""
         return {**published, "delta": design.delta, "k1": design.pole}
 
-    def turning(self, t_f: float) -> tuple[str, Scalar | float]:
+    def half_turn_rate(self, t_f: float) -> tuple[str, Scalar | float]:
         """Return "m", and the body rate at the start [rad/s]."""
         return "m", 2.0 * (2.0 + self.m) / t_f
 
@@ -277,7 +277,7 @@ class PredefinedTime(ComparisonLaw):
         """Return no gains, because the defaults follow from t_f in the sampled loop too."""
         return {}
 
-    def turning(self, t_f: float) -> tuple[str, Scalar | float]:
+    def half_turn_rate(self, t_f: float) -> tuple[str, Scalar | float]:
         """Return "q1", and the body rate on the sliding surface at |v| = 1 [rad/s]."""
         return "q1", 2.0 * math.pi / (self.q1 * self.share * t_f)
 
@@ -330,6 +330,6 @@ class SuperTwisting(ComparisonLaw):
         """Return published gains within the bandwidth, and a boundary layer [1/s] thicker than the noise."""
         return {**published, "sign_width": design.width}
 
-    def turning(self, t_f: float) -> tuple[str, Scalar | float]:
+    def half_turn_rate(self, t_f: float) -> tuple[str, Scalar | float]:
         """Return "surface_rate", and the body rate on the sliding surface at |v| = 1 [rad/s]."""
         return "surface_rate", 2.0 * self.surface_rate

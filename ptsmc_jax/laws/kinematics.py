@@ -116,7 +116,7 @@ class AttitudeKinematics(Kinematics):
     """Base of the attitude errors of a spacecraft."""
 
     model: Spacecraft
-    reaching_factor: ClassVar[float] = 0.5  # (60)
+    reaching_factor: ClassVar[float] = 0.5  # K1/2 in (60)
     symbol: ClassVar[str] = "|v|"
     error_unit: ClassVar[str] = "-"
     angle_unit: ClassVar[str] = "rad"
@@ -130,7 +130,7 @@ class AttitudeKinematics(Kinematics):
         return attitude.angle(x.q, target.q)
 
     def middle_angle(self, start: tuple[Any, Any], end: tuple[Any, Any], dt: Scalar) -> Scalar:
-        """Return `angle` in the middle [rad], from the cubic of the quaternion q_f* q, which is smooth at angle 0."""
+        """Return `angle` in the middle [rad], from the cubic Hermite polynomial of q_f* q; smooth at angle 0."""
 
         def error_quaternion(x: AttitudeState, target: Target) -> tuple[Array, Array]:
             rates = attitude.derivative(target.q, target.w), attitude.derivative(x.q, x.w)

@@ -75,7 +75,7 @@ class PrescribedTimeLaw(Law):
         gains = {"k1": design.reaching * pole, "sign_width": design.width, "surface_rate": pole}
         return {"eta": design.eta, "delta": design.delta, **gains}
 
-    def turning(self, t_f: float) -> tuple[str, Scalar | float]:
+    def half_turn_rate(self, t_f: float) -> tuple[str, Scalar | float]:
         """Return "eta", and the body rate on the sliding surface at t = 0 [rad/s]."""
         return "eta", 2.0 * self.eta / t_f
 

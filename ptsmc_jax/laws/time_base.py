@@ -20,9 +20,9 @@ from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector, pytree
 class Start(NamedTuple):
     """Initial values of a profile, the memory of the law."""
 
-    measured: Scalar  # 0.0 before the first sample, then 1.0
+    measured: Scalar  # whether the profile is defined: 0.0 before the first sample, then 1.0
     error: Vector  # error at the first sample, in `Kinematics.straight_coordinates`
-    rate: Vector  # its time derivative [1/s]
+    rate: Vector  # time derivative of `error` [1/s]
 
 
 class Profile(NamedTuple):
@@ -92,7 +92,7 @@ class TimeBase(ComparisonLaw):
         a, s = self.feedback(error - profile.error, error_rate - profile.rate, bound)
         return profile.acceleration + a, s, start
 
-    def turning(self, t_f: float) -> tuple[str, Scalar | float]:
+    def half_turn_rate(self, t_f: float) -> tuple[str, Scalar | float]:
         """Return "t_f", and the body rate in the middle of half a turn [rad/s]."""
         return "t_f", 15.0 / 8.0 * math.pi / t_f
 

@@ -97,14 +97,14 @@ def observer_gain(scenario: Any) -> float:
     return observer_rate(scenario) * scenario.mean_inertia
 
 
-def turning(scenario: Any) -> float:
+def body_rate_bound(scenario: Any) -> float:
     """Return an approximate bound on the body rate [rad/s].
 
     It is the sum of the initial rate, the rate of the reference, and 2 pi / t_f, which is twice the mean rate of half a
     turn within t_f.
     """
     target = sum(scenario.reference.frequencies(scenario).values())
-    return scenario.turning + target + 2.0 * math.pi / scenario.controller.t_f
+    return scenario.initial_rate_bound + target + 2.0 * math.pi / scenario.controller.t_f
 
 
 def target_waits(scenario: Any) -> bool:
@@ -135,7 +135,9 @@ def gravity_gradient(scenario: Any, orbit_rate: float, eccentricity: float = 0.0
     e = eccentricity
     most = 3.0 * orbit_rate * orbit_rate * apart / (1.0 - e) ** 3
     perigee_rate = orbit_rate * math.sqrt(1.0 + e) / (1.0 - e) ** 1.5
-    return Bounds(np.full(3, 0.5 * most), np.full(3, most * ((1.0 + 1.5 * e) * perigee_rate + turning(scenario))))
+    return Bounds(
+        np.full(3, 0.5 * most), np.full(3, most * ((1.0 + 1.5 * e) * perigee_rate + body_rate_bound(scenario)))
+    )
 
 
 def along_the_run(scenario: Any, signal: Any, fastest: float = 0.0) -> Bounds:

@@ -120,9 +120,9 @@ class LawTable(PartTable, frozen=True):
         """
         return self.law.noise_of_s(self, position, velocity)
 
-    def turning(self, t_f: float) -> tuple[str, float]:
+    def half_turn_rate(self, t_f: float) -> tuple[str, float]:
         """Return the key that determines how fast the law turns the body, and the largest rate [rad/s]; t_f: [s]."""
-        key, rate = self.law.turning(self, t_f)
+        key, rate = self.law.half_turn_rate(self, t_f)
         return f"controller.{key}", rate
 
     def check(self, scenario: Any) -> None:

@@ -343,13 +343,13 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
         return self.reference.build(self)
 
     @property
-    def turning(self) -> float:
+    def initial_rate_bound(self) -> float:
         """Bound on the body rate at t = 0 [rad/s]; one dispersed rate in 10 000 exceeds it."""
-        return sum(self._turning.values())
+        return sum(self._initial_rates.values())
 
     @property
-    def _turning(self) -> dict[str, float]:
-        """The nominal and the dispersed part of `turning` [rad/s], by key."""
+    def _initial_rates(self) -> dict[str, float]:
+        """The nominal and the dispersed part of `initial_rate_bound` [rad/s], by key."""
         table = getattr(self.dispersion, "rate", None)
         drawn = {} if table is None else {f"dispersion.rate.{table.width}": float(table.widest * table.of()[0])}
         return {"initial.rate": float(np.linalg.norm(self.initial.rate)), **drawn}
@@ -361,8 +361,8 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
             setup: the parts without a clock.
             t_f: shortest prescribed time [s].
         """
-        found = {**self._turning, **self.reference.frequencies(self)}
-        key, rate = self.controller.turning(t_f)
+        found = {**self._initial_rates, **self.reference.frequencies(self)}
+        key, rate = self.controller.half_turn_rate(t_f)
         if not self.controller.law.prescribed:
             rate = min(rate, 0.5 * BASELINES * 0.025 / self.loop.period)
         found[key] = rate
@@ -388,7 +388,7 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
         least, middle, largest = np.linalg.eigvalsh(np.asarray(setup.plant.inertia))
         each = {
             "wheels.momentum": np.linalg.norm(np.asarray(wheels.axes) @ np.asarray(wheels.initial)),
-            **{key: largest * rate for key, rate in self._turning.items()},
+            **{key: largest * rate for key, rate in self._initial_rates.items()},
             "disturbance.amplitude": sum(term.impulse(self.end) for term in self.terms),
         }
         return {key: float(moment) / math.sqrt(least * middle) for key, moment in each.items()}

@@ -177,13 +177,15 @@ def test_largest_body_rate_of_a_sliding_law_is_its_surface_rate_at_180_degrees(n
     """At |v| = 1 the body rotates at the rate 2 |v'|."""
     law = LAWS[name]
     rate: Any = brentq(lambda v_dot: float(surface(law, vector([1.0]), vector([v_dot]))[0]), -10.0, -1e-3, xtol=1e-12)
-    assert law.turning(10.0)[1] == pytest.approx(-2.0 * rate, rel=1e-9)
+    assert law.half_turn_rate(10.0)[1] == pytest.approx(-2.0 * rate, rel=1e-9)
 
 
 def test_largest_body_rates_of_pd_and_time_base_laws_equal_closed_forms():
     """For PD by energy, theta'^2 / 2 = k_p (integral of sin(theta / 2)); for a time base by the rate of the quintic."""
     energy = 0.4 * quad(lambda angle: np.sin(angle / 2.0), 0.0, np.pi)[0]
-    assert baselines.PD(**COMMON, k_p=vector(0.4)).turning(7.0)[1] == pytest.approx(np.sqrt(2.0 * energy), rel=1e-12)
+    assert baselines.PD(**COMMON, k_p=vector(0.4)).half_turn_rate(7.0)[1] == pytest.approx(
+        np.sqrt(2.0 * energy), rel=1e-12
+    )
     slope = np.polynomial.Polynomial([0.0, 0.0, 0.0, 10.0, -15.0, 6.0]).deriv()(np.linspace(0.0, 1.0, 1001)).max()
     for law in (time_base.TimeBasePD(**COMMON), time_base.TimeBaseSliding(**COMMON)):
-        assert law.turning(7.0) == ("t_f", pytest.approx(slope * np.pi / 7.0, rel=1e-12))
+        assert law.half_turn_rate(7.0) == ("t_f", pytest.approx(slope * np.pi / 7.0, rel=1e-12))
