@@ -34,7 +34,7 @@ def compared(name: str, count: int) -> None:
         store.write(Path(place) / "c", lambda making: folder.write_program(making, made))
         generated = time.perf_counter() - begin
         library, single = (Library(Path(place) / "c", real) for real in ("double", "float"))
-    dispersion = vectors.known_alike(made.ready.dispersion)
+    dispersion = vectors.with_nominal_reference(made.ready.dispersion)
     simulated = vectors.simulate_many(made.ready.parts, dispersion, jnp.uint32(0), jnp.arange(count, dtype=jnp.uint32))
     simulated = jax.tree.map(np.asarray, simulated)
     worst, worst_of_peak, used = 0.0, 0.0, 0

@@ -38,7 +38,7 @@ from ptsmc_jax.signals.references import Target
 from ptsmc_jax.simulation import run_state
 from ptsmc_jax.simulation.assembly import Parts
 
-KNOWN = 0.25  # an attitude quaternion in the state has been set if |q|^2 is larger; it is 0 before
+ATTITUDE_IS_SET = 0.25  # |q|^2 of the quaternion in the state is larger if it has been set, and 0 before
 
 
 Given = dict[str, Any]  # values by name
@@ -86,20 +86,23 @@ class Board:
     def parts(self) -> dict[str, str]:
         """The type of each part and the values that are fixed in it, by name of the part."""
         made = {name: part for name, part in self.parameters.items() if dataclasses.is_dataclass(part)}
-        return {name: _kind(part) for name, part in made.items()}
+        return {name: _static_description(part) for name, part in made.items()}
 
 
-def _kind(part: Any) -> str:
-    """Return the type of a part, and the values that are fixed in it and in the parts that it contains."""
+def _static_description(part: Any) -> str:
+    """Return a part's class name with its compile-time constants, such as "Actuators(delay=2)".
+
+    Parts inside the part are described in the same way.
+    """
     fixed = []
     for entry in dataclasses.fields(part):
         value = getattr(part, entry.name)
         if entry.metadata.get("static"):
             fixed.append(f"{entry.name}={value!r}")
         elif isinstance(value, tuple) and all(map(dataclasses.is_dataclass, value)):
-            fixed += [f"{entry.name}[{k}]={_kind(one)}" for k, one in enumerate(value)]
+            fixed += [f"{entry.name}[{k}]={_static_description(one)}" for k, one in enumerate(value)]
         elif isinstance(value, SampleTimes):
-            fixed.append(f"{entry.name}={_kind(value)}")
+            fixed.append(f"{entry.name}={_static_description(value)}")
     return type(part).__qualname__ + (f"({', '.join(fixed)})" if fixed else "")
 
 
@@ -186,9 +189,10 @@ def known(parts: Parts) -> dict[str, Any]:
         "command_filter": parts.command_filter,
         "period": period,
     }
-    if isinstance(parameters["filter"], KalmanFilter):  # C starts at control sample 0
+    if isinstance(parameters["filter"], KalmanFilter):
+        # C starts at control sample 0, and so it does not need the initial covariances for other samples
         parameters["filter"] = dataclasses.replace(parameters["filter"], first=parameters["filter"].first[:1])
-    elif parameters["filter"] is not None:  # the parameters that determine its gains
+    elif parameters["filter"] is not None:  # C derives the filter's gains from its bandwidth
         parameters["filter_bandwidth"] = sensors.bandwidth(period)
         if sensors.own_times is not None:
             parameters["star_tracker_interval"] = sensors.own_times.interval
@@ -229,7 +233,7 @@ def _filtering(computer: Board, parts: Parts) -> None:
     """Add the stage of the attitude filter with constant gains, from star tracker and gyro."""
     sensors: Any = parts.sensors
     aged = sensors.own_times is not None  # the star tracker has its own clock
-    computer.parameters["filter_bandwidth"] = derived.bandwidth(sensors, parts.period)  # rounded to few digits
+    computer.parameters["filter_bandwidth"] = derived.bandwidth(sensors, parts.period)  # a number of few digits
     age = {"attitude_age": real()} if aged else {}
     computer.inputs |= {"attitude": real(4), "attitude_valid": integer(), **age, "rate": real(3)}
     computer.state |= {"attitude": real(4), "rate": real(3), "bias": real(3), "gyro": real(3)}
@@ -247,7 +251,7 @@ def _filtering(computer: Board, parts: Parts) -> None:
         before, gyro, gyro_before = given["before.attitude"], given["in.rate"], given["before.gyro"]
         valid = given["in.attitude_valid"] != 0
         measured = attitude.unit(jnp.where(valid, given["in.attitude"], before))  # an invalid input is not used
-        start = jnp.where(jnp.dot(before, before) > KNOWN, before, measured)
+        start = jnp.where(jnp.dot(before, before) > ATTITUDE_IS_SET, before, measured)
         old = Estimate(start, given["before.bias"])
         if aged:
             estimate = jax.lax.cond(
@@ -307,14 +311,14 @@ def _estimating(computer: Board, estimator: KalmanFilter) -> None:
             reading = jnp.where(valid, given[f"in.{sensor.name}"], sensor.read(start))
             if isinstance(sensor, StarTracker):
                 reading = attitude.unit(reading)
-                unknown = valid & (jnp.dot(start, start) <= KNOWN)
+                unknown = valid & (jnp.dot(start, start) <= ATTITUDE_IS_SET)
                 start = jnp.where(unknown, sensor.body(reading), start)
             readings.append((valid, reading))
         past = given.get("before.past_attitude")
         if past is not None:
-            past = jax.vmap(lambda q: jnp.where(jnp.dot(q, q) > KNOWN, q, start))(past)
+            past = jax.vmap(lambda q: jnp.where(jnp.dot(q, q) > ATTITUDE_IS_SET, q, start))(past)
         covariance = jax.lax.cond(
-            jnp.dot(before, before) > KNOWN, lambda: given["before.covariance"], lambda: known.unknown()
+            jnp.dot(before, before) > ATTITUDE_IS_SET, lambda: given["before.covariance"], lambda: known.unknown()
         )
         estimates = (given["before.bias"], given["before.gyro"], past, given.get("before.past_rate"))
         track = known.propagate(Track(start, *estimates, covariance), given["in.rate"], given["dt"])
@@ -411,7 +415,7 @@ def _commanding(computer: Board, law: Law, observer: Observer, command_filter: C
         computer.about["command_filter"] = "states of the command filter, half a period ahead"
         memories, shaped = ["law", "command_filter"], (command_filter,)
     traced = jax.make_jaxpr(law.singularity_distance)(x, target)
-    singular = any(dependence(traced.jaxpr, [True] * len(traced.jaxpr.invars)))  # whether the distance varies
+    singular = any(dependence(traced.jaxpr, [True] * len(traced.jaxpr.invars)))  # whether the distance can vary
     if singular:
         computer.state |= {"singularity_distance": real(), "singularity_distance_unit": real()}
         computer.about |= {"singularity_distance": "distance to the law's singularity, divided by its unit [-]",
@@ -425,7 +429,7 @@ def _commanding(computer: Board, law: Law, observer: Observer, command_filter: C
         known, period, t = parameters["law"], parameters["period"], given["t"]
         last = {name: given[f"before.{name}"] for name in memories}
         now, reference = computer.seen(given, "now"), parameters["reference"](t)
-        hold = t >= known.hand_over - guards.time_tolerance(period, known.hand_over)  # as in `clock.Flight`
+        hold = t >= known.hand_over - guards.time_tolerance(period, known.hand_over)  # the tolerance of `clock.Flight`
 
         def decided() -> tuple[Any, Any, dict[str, Any]]:
             sample, d_hat, k2 = Sample(t, hold, period, last["law"]), given["out.d_hat"], parameters["bound"](t)

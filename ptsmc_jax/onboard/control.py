@@ -10,8 +10,8 @@ from ptsmc_jax.batching.components import object_array
 from ptsmc_jax.batching.dependence import split_scan_operands, unpack_while
 from ptsmc_jax.onboard.expressions import BOOL, Block, Node, Region, kind_of
 
-UNROLLED = 8  # largest number of passes of an unrolled loop
-WRITTEN = 200  # largest number of operations of an unrolled loop
+MOST_PASSES = 8  # largest number of passes of an unrolled loop
+MOST_OPERATIONS = 200  # largest number of operations of an unrolled loop
 
 
 def _inside(to: Any, region: Region, made: Callable[[], list[np.ndarray]]) -> None:
@@ -109,7 +109,7 @@ def scan(to: Any, eqn: Any, values: list[np.ndarray]) -> list[np.ndarray]:
     consts, init, xs = split_scan_operands(params, values)
     carried = len(init)
     order = range(length)[:: -1 if params["reverse"] else 1]
-    if length <= 1 or (length <= UNROLLED and length * len(body.jaxpr.eqns) <= WRITTEN):
+    if length <= 1 or (length <= MOST_PASSES and length * len(body.jaxpr.eqns) <= MOST_OPERATIONS):
         carry, rows = list(init), [[] for _ in body.jaxpr.outvars[carried:]]
         for k in order:
             results = to.evaluate(body, [*consts, *carry, *(x[k, ...] for x in xs)])
@@ -131,7 +131,7 @@ def scan(to: Any, eqn: Any, values: list[np.ndarray]) -> list[np.ndarray]:
 
     _inside(to, region, passed)
     out = _region(to, region, state)
-    return [*out, *(_filled(to, region, v.aval, order) for v in stacked)]
+    return [*out, *(_stacked_output(to, region, v.aval, order) for v in stacked)]
 
 
 def _entries(to: Any, region: Region, x: np.ndarray) -> np.ndarray:
@@ -147,8 +147,15 @@ def _entries(to: Any, region: Region, x: np.ndarray) -> np.ndarray:
     return object_array(x.shape[1:], nodes)
 
 
-def _filled(to: Any, region: Region, aval: Any, order: range) -> np.ndarray:
-    """Return a stacked output (passes, ..) of a counted loop, from C arrays that the loop fills."""
+def _stacked_output(to: Any, region: Region, aval: Any, order: range) -> np.ndarray:
+    """Return a stacked output (passes, ..) of a counted loop, from C arrays that the loop fills.
+
+    Args:
+        to: the translator.
+        region: the loop. The arrays are added to it.
+        aval: shape and dtype of the output in one pass.
+        order: the passes in the order of the output's first axis.
+    """
     kind, columns = kind_of(aval.dtype), []
     for _ in range(math.prod(aval.shape)):
         table = to.pool.fresh(kind, "table")

@@ -34,7 +34,7 @@ class Node:
 
     def __init__(self, op: str, args: tuple["Node", ...], kind: str, value: Any, block: "Block"):
         Node.made += 1
-        self.serial = Node.made  # operands have smaller numbers
+        self.serial = Node.made  # number of creation: operands have smaller numbers
         self.op, self.args, self.kind, self.value, self.block = op, args, kind, value, block
         self.finite = self._is_finite()
         self.title: Title | None = None  # name of the value in the source
@@ -226,7 +226,7 @@ class Pool:
         if op == "mul":
             half, other = (a, b) if a.op == "constant" else (b, a)
             if holds(half, 0.5) and other.op == "add" and other.args[0] is other.args[1]:
-                return other.args[0]  # exact
+                return other.args[0]  # half of a + a is exactly a
             if (holds(a, 0) and b.finite) or (holds(b, 0) and a.finite):
                 return self.constant(0, kind)
             if holds(a, 1) or holds(b, 1):

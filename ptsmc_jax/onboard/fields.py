@@ -59,7 +59,7 @@ def struct(trees: Mapping[str, Any], about: Mapping[str, str]) -> dict[str, list
     for name, tree in trees.items():
         found[name] = []
         for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
-            parts, meaning = spoken(path, tree)
+            parts, meaning = names_and_comment(path, tree)
             full = re.sub(r"\W+", "_", "_".join([name, *parts])).strip("_").lower() or "x"
             while full in taken:  # keys of a memory may differ only in capitals or punctuation
                 full += "_"
@@ -72,7 +72,7 @@ def struct(trees: Mapping[str, Any], about: Mapping[str, str]) -> dict[str, list
     return found
 
 
-def spoken(path: Any, tree: Any) -> tuple[list[str], str]:
+def names_and_comment(path: Any, tree: Any) -> tuple[list[str], str]:
     """Return the attributes that lead to a leaf, and the comment beside its field in the source."""
     names, meaning, at = [], "", tree
     for key in path:

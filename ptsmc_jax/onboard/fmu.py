@@ -26,7 +26,8 @@ VERSIONS = (2, 3)
 TYPES = {2: {"r": "Real", "i": "Integer", "u": "Integer"}, 3: {"r": "Float64", "i": "Int32", "u": "UInt32"}}
 # exponents of the base units in each unit that a description may contain
 UNITS = {"rad": {"rad": 1}, "s": {"s": 1}, "m": {"m": 1}, "kg": {"kg": 1}, "N": {"kg": 1, "m": 1, "s": -2}, "1": {}}
-FILTER_STATE = ("attitude", "bias", "gyro", "past_attitude", "past_rate")  # may be set before the first sample
+# parts of the state that a user may set before the first sample
+FILTER_STATE = ("attitude", "bias", "gyro", "past_attitude", "past_rate")
 
 
 class Unit(NamedTuple):
@@ -137,7 +138,8 @@ def sources(model: Model, version: int) -> tuple[dict[str, str], str]:
         "starts": len(elements),
         "at_end": int(model.plant),
         "kinds": _strings(variable.kind for variable in listed),
-        "roles": _strings(variable.role.replace("c", "o") for variable in listed),  # neither can be set
+        # constants get the role of outputs, because neither can be set
+        "roles": _strings(variable.role.replace("c", "o") for variable in listed),
         "values": "\n".join(f"    {_number(variable.start)}," for variable in listed),
         "filter": "\n".join(lines),
         "period": first + code.columns["params"].index("period"),
@@ -147,7 +149,7 @@ def sources(model: Model, version: int) -> tuple[dict[str, str], str]:
     header = templates.filled("fmu.h", token="", **values)
     token = hashlib.sha256("".join([*texts.values(), header]).encode()).hexdigest()
     texts["fmu.h"] = templates.filled("fmu.h", token=token, **values)
-    return {name: templates.prefixed(text, model.about.name) for name, text in texts.items()}, token
+    return {name: templates.with_public_prefix(text, model.about.name) for name, text in texts.items()}, token
 
 
 def _strings(letters: Iterable[str]) -> str:
@@ -247,7 +249,7 @@ def write(file: Path, model: Model, version: int, *, binary: bool = True) -> Non
         content[binary_path(name, version)] = compiled(texts, units)
     with zipfile.ZipFile(file, "w") as archive:
         for path, data in content.items():
-            info = zipfile.ZipInfo(path, (1980, 1, 1, 0, 0, 0))  # the same content gives the same file
+            info = zipfile.ZipInfo(path, (1980, 1, 1, 0, 0, 0))  # fixed date: the same content gives the same file
             info.compress_type, info.external_attr = zipfile.ZIP_DEFLATED, 0o644 << 16
             archive.writestr(info, data)
 

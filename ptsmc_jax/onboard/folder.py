@@ -44,7 +44,7 @@ class Controller:
         self.about = About(
             name, source, checksum(self.scenario), type(law).__qualname__, self.board.parameters["filter"] is not None,
             self.board.model.largest_measurement,
-            device.delay, float((law.t_f / self.last) ** 2),
+            device.delay, float((law.t_f / self.last_time_to_go) ** 2),
         )  # fmt: skip
 
     @property
@@ -53,7 +53,7 @@ class Controller:
         return float(self.ready.parts.period)
 
     @property
-    def last(self) -> float:
+    def last_time_to_go(self) -> float:
         """The smallest possible time to go at the last sample before the hand-over [s]."""
         return float(self.ready.parts.controller.delta) + self.period
 
@@ -95,7 +95,7 @@ def simulate(made: Controller, seed: int, trials: int) -> dict[int, vectors.Samp
     Raises:
         ScenarioError: if no trial is usable, see `vectors.usable`.
     """
-    dispersion = vectors.known_alike(made.ready.dispersion)
+    dispersion = vectors.with_nominal_reference(made.ready.dispersion)
     numbers = np.arange(trials, dtype=np.uint32)
     simulated = vectors.simulate_many(made.ready.parts, dispersion, jnp.uint32(seed), jnp.asarray(numbers))
     each = {int(k): vectors.one(simulated, int(k)) for k in numbers}
@@ -207,7 +207,7 @@ def write(folder: Path, made: Controller, seed: int, trials: int, fmus: Fmus = N
     simulated, t_f = simulate(made, seed, trials), float(made.ready.parts.controller.t_f)
     rounding = made.board.model.error_rounding
     header, rows = table(made, simulated)
-    steepness = min(vectors.steepness(one, rounding, t_f, made.last) for one in simulated.values())
+    steepness = min(vectors.steepness(one, rounding, t_f, made.last_time_to_go) for one in simulated.values())
     write_program(folder, made, steepness)
     store.write_csv(folder / "vectors.csv", header, rows)
     made_by = {"command": "export", "seed": seed, **custom.checksums(made.scenario)}
@@ -225,7 +225,7 @@ def write_program(folder: Path, made: Controller, steepness: float = 0.0) -> Non
     code, about = made.code, made.about._replace(steepness=max(made.about.steepness, steepness))
     texts = {**templates.texts(code, about), "README.md": readme(code, about)}
     for name, text in texts.items():
-        store.write_text(folder / name, templates.prefixed(text, about.name))
+        store.write_text(folder / name, templates.with_public_prefix(text, about.name))
     layout = {"name": about.name, "checksum": about.checksum, "period": made.period, "parts": made.board.parts}
     layout["reference_input"] = made.reference_input
     layout["columns"] = code.columns

@@ -157,7 +157,7 @@ def _function(code: Code, board: Board, stage: Stage, structs: dict[str, Struct]
             args += [made.nodes(pool, PLACES[name.partition(".")[0]]) for made in fields_of(name)]
     results = iter(Translator(pool).evaluate(closed, [*known.nodes(pool), *args]))
     ends, returned, needed = list[tuple[str, Node]](), None, set[str]()
-    for name in sorted(written):  # JAX's order of a dict
+    for name in sorted(written):  # JAX flattens a dict in this order
         if name == "limited":
             returned = next(results).item()
             continue

@@ -25,13 +25,13 @@ from ptsmc_jax.onboard import sources
 from ptsmc_jax.onboard.board import board, known
 from ptsmc_jax.onboard.generate import names_of
 from ptsmc_jax.onboard.parameters import COMPUTED, named, parameters
-from ptsmc_jax.onboard.templates import filled, prefixed
+from ptsmc_jax.onboard.templates import filled, with_public_prefix
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.computer import OURS, SAMPLES, Computer, Decision, Period, Software
 
-SAME = 1e-6  # relative to the largest element; smaller differences may be rounding to 32 bits
-NAMED = 4  # largest number of parameters in a message
+EQUAL = 1e-6  # smaller differences, relative to the largest element, may be rounding to 32 bits
+MOST_LISTED = 4  # largest number of parameters that a message lists
 _loaded = itertools.count()
 
 
@@ -75,9 +75,9 @@ class Library:
         try:
             layout = json.loads((self.folder / sources.LAYOUT).read_text(encoding="utf-8"))
             self.name, self.checksum, self.columns = layout["name"], layout["checksum"], layout["columns"]
-            self.period = float(layout["period"])  # [s]
+            self.period = float(layout["period"])  # control period [s]
             self.reference_input = bool(layout.get("reference_input", False))
-            self.parts = dict(layout.get("parts", {}))  # as `Board.parts`; empty in earlier versions
+            self.parts = dict(layout.get("parts", {}))  # see `Board.parts`; files of earlier versions have none
             sizes = [len(self.columns[kind]) for kind in ("in", "out", "state", "params")]
             if not re.fullmatch(r"\w+", self.name, re.ASCII):
                 raise none
@@ -88,24 +88,25 @@ class Library:
             try:
                 self._made = ctypes.CDLL(str(made))
                 self._made.ptsmc_set()
-            except (OSError, AttributeError) as error:  # another processor, another language, a missing function
+            except (OSError, AttributeError) as error:  # built for another processor or language, or without a function
                 reason = str(error).removeprefix(f"{made}: ")
                 raise ScenarioError(
                     f"the controller in {self.folder} does not load after {shlex.join(compiler())} has compiled it: "
                     f"{reason}; use a C compiler for this machine, and put or #include all code in "
                     f"ptsmc_{self.name}.c and ptsmc_{self.name}_parameters.c"
                 ) from None
-        if sizes != list((ctypes.c_long * 4).in_dll(self._made, "ptsmc_sizes")):  # C of another controller.json
+        # other sizes: the C belongs to another controller.json
+        if sizes != list((ctypes.c_long * 4).in_dll(self._made, "ptsmc_sizes")):
             raise none
         # parameters (columns,) in the order of columns["params"]; the array shares its memory with the C
         self.parameters = np.ctypeslib.as_array((ctypes.c_double * sizes[-1]).in_dll(self._made, "ptsmc_given"))
-        self.target = f"ptsmc_{self.name}_{self.checksum}_{real}_{next(_loaded)}"  # its name in XLA
+        self.target = f"ptsmc_{self.name}_{self.checksum}_{real}_{next(_loaded)}"  # name of the C function in XLA
         jax.ffi.register_ffi_target(self.target, jax.ffi.pycapsule(self._made.ptsmc_called), platform="cpu")
 
     def _compiled(self, place: Path, real: str, options: tuple[str, ...]) -> Path:
         glue, library = place / "glue.c", place / "controller.so"
-        glue.write_text(prefixed(filled("in_the_loop.c", name=self.name), self.name), encoding="utf-8")
-        alone = place / "controller"  # only the files that campaigns keep and check
+        glue.write_text(with_public_prefix(filled("in_the_loop.c", name=self.name), self.name), encoding="utf-8")
+        alone = place / "controller"  # a copy of only those files that campaigns store and check
         sources.copy(self.folder, alone)
         files = [str(alone / f"ptsmc_{self.name}{end}.c") for end in ("", "_parameters")]
         # XLA's headers are system headers, so that compilers warn of our code only
@@ -196,7 +197,8 @@ class InTheLoop:
                 f"the controller in {library.folder} has the {other} {theirs.get(other, 'none')}, "
                 f"but must have the {other} of the scenario, {ours.get(other, 'none')}"
             )
-        period, wanted = np.float32(parts.period), np.float32(library.period)  # both may have 32 bits
+        # either number may have been rounded to 32 bits
+        period, wanted = np.float32(parts.period), np.float32(library.period)
         if period != wanted:
             raise ScenarioError(
                 f"loop.period is {period!s} s, but must be {wanted!s} s as in the controller in {library.folder}"
@@ -222,7 +224,7 @@ class InTheLoop:
             stands = derived.get(path) if field.name in made.derived else firsts.setdefault(field.name, value)
             if value is None or stands is None:
                 continue
-            off = SAME * float(jnp.max(jnp.abs(value), initial=0.0))
+            off = EQUAL * float(jnp.max(jnp.abs(value), initial=0.0))
             if not np.allclose(stands, value, rtol=0.0, atol=off, equal_nan=True):
                 raise ScenarioError(
                     f"dispersion.custom changes {jax.tree_util.keystr(path, simple=True, separator='.')} alone, but "
@@ -239,14 +241,14 @@ class InTheLoop:
         )
         fields, differing = {field.name: field.elements() for field in made.fields}, list[str]()
         for name, values in made.values.items():
-            off = SAME * np.max(np.abs(values), initial=0.0, where=np.isfinite(values))
+            off = EQUAL * np.max(np.abs(values), initial=0.0, where=np.isfinite(values))
             for element, value in zip(fields[name], np.ravel(values), strict=True):
                 if element in simulated and not np.isclose(simulated[element], value, rtol=0.0, atol=off):
                     differing.append(f"{element} = {simulated[element]:.6g} instead of {value:.6g}")
         if not differing:
             return ""
-        more = f" and {len(differing) - NAMED} more" if len(differing) > NAMED else ""
-        return f"the controller has other parameters than the scenario: {', '.join(differing[:NAMED])}{more}"
+        more = f" and {len(differing) - MOST_LISTED} more" if len(differing) > MOST_LISTED else ""
+        return f"the controller has other parameters than the scenario: {', '.join(differing[:MOST_LISTED])}{more}"
 
     @property
     def software(self) -> Software:

@@ -20,7 +20,7 @@ class Section(NamedTuple):
     """A function of the source."""
 
     name: str
-    place: str  # its file
+    place: str  # path of its file for a heading
     about: str  # the first sentence of its docstring
 
 

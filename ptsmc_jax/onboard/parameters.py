@@ -87,7 +87,7 @@ def named(board: Board) -> Parameters:
     for path, leaf in sorted(listed, key=lambda item: item[0][0].key in COMPUTED):
         if id(leaf) in found:
             continue
-        parts, meaning = fields.spoken(path, board.parameters)
+        parts, meaning = fields.names_and_comment(path, board.parameters)
         short = parts[parts.index("model") + 1 :] if "model" in parts[:-1] else parts
         name = "_".join(short).lower()
         name = name if name not in made.values else "_".join(parts).lower()
@@ -120,7 +120,7 @@ def _follow(made: Parameters, rule: Rule) -> None:
     for k, variable in enumerate(jaxpr.outvars):
         name = made.fields[k].name
         if not isinstance(variable, core.Literal) and variable in places:
-            made.fields[k] = made.fields[places[variable]]  # equal to another parameter
+            made.fields[k] = made.fields[places[variable]]  # the rule copies another parameter: they share a field
         elif name not in made.derived:
             gives[name] = [other.name for j, other in enumerate(made.fields) if of[k] >> j & 1]
     try:

@@ -32,15 +32,15 @@ def plant_board(parts: Parts, dispersion: Dispersion, controller: Board) -> Boar
         controller: the flight computer of the scenario. The plant has outputs with the names of its inputs.
     """
     numbers = {"seed": jnp.uint32(0), "trial": jnp.uint32(0), "period": parts.period, "t_end": parts.t_end}
-    nominal = _picked(parts)
-    trial = _picked(_of_trial(parts, dispersion, numbers | nominal))
+    nominal = _plant_parts(parts)
+    trial = _plant_parts(_of_trial(parts, dispersion, numbers | nominal))
     parameters = numbers | nominal | {"drawn": jax.tree.map(lambda leaf: jnp.array(leaf, copy=True), trial)}
     command = "command" if parts.actuators.ideal else "sent_torque"
     always = ("period", "seed", "trial")
     computer = Board(parts.plant, parameters, inputs={command: controller.outputs[command]}, always=always)
 
     def draw(given: Given) -> Given:
-        return given | {"drawn": _picked(_of_trial(parts, dispersion, given))}
+        return given | {"drawn": _plant_parts(_of_trial(parts, dispersion, given))}
 
     def begin(given: Given, _: Given) -> Given:
         trial = _assembled(parts, given, given["drawn"])
@@ -88,7 +88,7 @@ _ABOUT = {
 }
 
 
-def _picked(parts: Parts) -> dict[str, Any]:
+def _plant_parts(parts: Parts) -> dict[str, Any]:
     """Return the parts of `PARTS` by name."""
     return {name: getattr(parts, name) for name in PARTS if getattr(parts, name) is not None}
 
@@ -141,7 +141,8 @@ def _commanding(command: Any) -> Software:
 def _begin(parts: Parts, seed: Any, trial: Any) -> tuple[Vehicle, State]:
     """Return the constants of the run, and its state at the first sample."""
     ticks = jax.tree.map(lambda v: v[None], _period(parts, jnp.int32(0)))
-    parts = replace(parts, observer=NoObserver(parts.plant, jnp.zeros(())))  # C may be unable to express the observer
+    # the plant needs no observer, which may have no counterpart in C
+    parts = replace(parts, observer=NoObserver(parts.plant, jnp.zeros(())))
     return start(parts, ticks, parts.initial, seed, trial, _commanding(jnp.zeros(parts.plant.inputs)))
 
 
@@ -168,7 +169,7 @@ def _written(parts: Parts, state: State, sample: Any, controller: Board) -> Give
     outputs = {name: jax.tree.map(lambda v, of: v.astype(of.dtype), named[name], shape)
                for name, shape in controller.inputs.items()}  # fmt: skip
     outputs |= {f"true_{name}": value for name, value in true.items()}
-    if hasattr(memory, "estimate"):  # the flight computer has the filter
+    if hasattr(memory, "estimate"):  # the plant leaves out the filter, which is in the flight computer
         memory = memory._replace(estimate=None)
     applied = None if state.computer.applied is None else (state.applied[0], None)
     kept = state._replace(computer=state.computer._replace(sensors=memory, applied=applied))

@@ -79,8 +79,8 @@ def number(value: Any, kind: str) -> str:
     return f"R({short})"
 
 
-def declared(kind: str) -> str:
-    """Return the type in C."""
+def c_type(kind: str) -> str:
+    """Return the C type of a kind of numbers, see `expressions.kind_of`."""
     return {REAL: "real", BOOL: "int"}.get(kind, kind)
 
 
@@ -175,7 +175,7 @@ class Printer:
             elif id(node) in self.kept:
                 lines += self._heading(node, indent)
                 text = self.text(node, inside=True)
-                lines += wrapped(f"const {declared(node.kind)} {self._name(node)} = {text};", indent)
+                lines += wrapped(f"const {c_type(node.kind)} {self._name(node)} = {text};", indent)
         return lines
 
     def _heading(self, node: Node, indent: str) -> list[str]:
@@ -189,7 +189,7 @@ class Printer:
     def _branch(self, region: Region, indent: str) -> list[str]:
         live = [id(node) in self.nodes for node in region.results]
         results = [node for node, on in zip(region.results, live, strict=True) if on]
-        lines = [f"{indent}{declared(node.kind)} {self._name(node)};" for node in results]
+        lines = [f"{indent}{c_type(node.kind)} {self._name(node)};" for node in results]
         assert region.test is not None
         lines += wrapped(f"if ({self.text(region.test)}) {{", indent)
         for k, (block, outputs) in enumerate(zip(region.blocks, region.outputs, strict=True)):
@@ -208,14 +208,14 @@ class Printer:
         for node, start, result in zip(region.carried, region.initial, region.results, strict=True):
             node.title, node.part = result.title, result.part
             self.names[id(result)] = self._name(node)
-            lines += wrapped(f"{declared(node.kind)} {self._name(node)} = {self.text(start)};", indent)
+            lines += wrapped(f"{c_type(node.kind)} {self._name(node)} = {self.text(start)};", indent)
         self.entries += sum(len(entries) for _, entries in region.tables) + len(region.rows) * region.length
         for table, entries in region.tables:
             listed = ", ".join(self.text(entry) for entry in entries)
-            lines += wrapped(f"const {declared(table.kind)} {self._name(table)}[{len(entries)}] = {{{listed}}};",
+            lines += wrapped(f"const {c_type(table.kind)} {self._name(table)}[{len(entries)}] = {{{listed}}};",
                                    indent)  # fmt: skip
         for table, _ in region.rows:
-            lines.append(f"{indent}{declared(table.kind)} {self._name(table)}[{region.length}];")
+            lines.append(f"{indent}{c_type(table.kind)} {self._name(table)}[{region.length}];")
         if region.kind == "count":
             assert region.index is not None
             k = self._name(region.index)
@@ -233,7 +233,7 @@ class Printer:
             if output is node:
                 continue
             then = self._fresh(f"{self._name(node)}_next")
-            lines += wrapped(f"const {declared(node.kind)} {then} = {self.text(output)};", inner)
+            lines += wrapped(f"const {c_type(node.kind)} {then} = {self.text(output)};", inner)
             after.append(f"{inner}{self._name(node)} = {then};")
         for table, which in region.rows:
             k = self._name(region.index) if region.index is not None else ""
@@ -279,7 +279,8 @@ class Printer:
 
     def _text(self, node: Node, inside: bool = False) -> tuple[str, int]:
         if node.op == "constant":
-            is_resolution = node.kind == REAL and node.value == guards.resolution()  # C has it for its own precision
+            # C computes the resolution for its own type `real`, which may be float
+            is_resolution = node.kind == REAL and node.value == guards.resolution()
             return "resolution()" if is_resolution else number(node.value, node.kind), ATOM
         if node.op == "place":
             return node.value, ATOM
@@ -291,16 +292,16 @@ class Printer:
         if node.op in INFIX:
             return self._infix(*INFIX[node.op], *node.args)
         if node.op in ("neg", "not"):
-            return ("-" if node.op == "neg" else "!") + self._at_least(node.args[0], UNARY + 1), UNARY
+            return ("-" if node.op == "neg" else "!") + self._with_precedence(node.args[0], UNARY + 1), UNARY
         if node.op == "select":
-            test, yes, no = (self._at_least(arg, CHOICE + 1) for arg in node.args)
+            test, yes, no = (self._with_precedence(arg, CHOICE + 1) for arg in node.args)
             if node.kind == "int64_t":  # two small constants would be int
                 yes, no = (f"INT64_C({text})" if re.fullmatch(r"-?\d+", text) else text for text in (yes, no))
             return f"{test} ? {yes} : {no}", CHOICE
         if node.op == "convert" and node.args[0].kind == REAL:  # a cast in C must be in the range of its type
             return f"whole{_suffix(node.kind)}({self.text(node.args[0])})", ATOM
         if node.op == "convert":
-            return f"({declared(node.kind)}){self._at_least(node.args[0], UNARY + 1)}", UNARY
+            return f"({c_type(node.kind)}){self._with_precedence(node.args[0], UNARY + 1)}", UNARY
         if node.op == "row":  # replaces the first index of a parameter, which is 0
             table, index = node.args
             return table.value.replace("[0]", f"[{self.text(index)}]", 1), ATOM
@@ -312,7 +313,7 @@ class Printer:
         if node.op in CALLED:
             return f"{node.op}({listed})", ATOM
         if node.op == "abs" and node.kind != REAL:
-            return f"larger{_suffix(node.kind)}({listed}, -{self._at_least(node.args[0], UNARY + 1)})", ATOM
+            return f"larger{_suffix(node.kind)}({listed}, -{self._with_precedence(node.args[0], UNARY + 1)})", ATOM
         if node.op == "isfinite":
             return f"isfinite({listed})", ATOM
         return f"M({'fabs' if node.op == 'abs' else node.op})({listed})", ATOM
@@ -321,11 +322,12 @@ class Printer:
         # parentheses avoid compiler warnings about mixed && and ||, and about comparisons of comparisons
         mixed = {"&&": "or", "||": "and"}.get(sign)
         compared = level in (9, 10)
-        left = self._at_least(a, ATOM if a.op == mixed else 11 if compared else level)
-        right = self._at_least(b, ATOM if b.op == mixed else 11 if compared else level + 1)
+        left = self._with_precedence(a, ATOM if a.op == mixed else 11 if compared else level)
+        right = self._with_precedence(b, ATOM if b.op == mixed else 11 if compared else level + 1)
         return f"{left} {sign} {f'({right})' if right.startswith('-') else right}", level
 
-    def _at_least(self, node: Node, level: int) -> str:
+    def _with_precedence(self, node: Node, level: int) -> str:
+        """Return the C text of a node, in parentheses if the precedence of its operator is below `level`."""
         text, level_of_node = self._text(node)
         return text if level_of_node >= level else f"({text})"
 

@@ -52,8 +52,8 @@ def convert(pool: Pool, kind: str, x: Node) -> Node:
     return pool.make("convert", x, kind=kind)
 
 
-def _wide(dtype: Any, kind: str) -> str:
-    """Return the kind. Raises KeyError for a floating-point type with fewer digits than the numbers in C."""
+def _precise(dtype: Any, kind: str) -> str:
+    """Return `kind`, or raise KeyError if the dtype is a floating-point type with fewer digits than numbers in C."""
     if kind == REAL and jnp.finfo(dtype).bits < jnp.finfo(jnp.result_type(float)).bits:
         raise KeyError(dtype)
     return kind
@@ -133,7 +133,7 @@ ELEMENTWISE: dict[str, Callable] = {
     "add_any": _plain("add"), "integer_pow": _integer_pow, "select_n": _select, "round": _round,
     "pow": lambda pool, params, kind, x, y: pool.make("pow", x, convert(pool, REAL, y)),
     "square": lambda pool, params, kind, x: pool.make("mul", x, x, kind=kind),
-    "log2": lambda pool, params, kind, x: pool.make(  # as XLA does it
+    "log2": lambda pool, params, kind, x: pool.make(  # XLA scales the natural logarithm, too
         "mul", pool.make("log", x), pool.constant(1.0 / math.log(2.0), REAL)
     ),
     "one_minus_square": lambda pool, params, kind, x: pool.make(
@@ -147,7 +147,7 @@ ELEMENTWISE: dict[str, Callable] = {
     "logistic": lambda pool, params, kind, x: _one_over(
         pool, pool.make("add", pool.constant(1.0, REAL), pool.make("exp", pool.make("neg", x)))
     ),
-    "convert_element_type": lambda pool, params, kind, x: convert(pool, _wide(params["new_dtype"], kind), x),
+    "convert_element_type": lambda pool, params, kind, x: convert(pool, _precise(params["new_dtype"], kind), x),
     **dict.fromkeys("stop_gradient copy copy_p optimization_barrier pvary".split(), lambda pool, params, kind, x: x),
     "reduce_precision": _rounded,
 }  # fmt: skip

@@ -5,7 +5,7 @@ import shutil
 from pathlib import Path
 
 LAYOUT = "controller.json"
-OTHERS = ("check.c", "fuzz.c", "udp.c", "shared.c")  # separate programs, which do not change the commands
+OTHERS = ("check.c", "fuzz.c", "udp.c", "shared.c")  # sources of separate programs, which do not change the commands
 
 
 def listed(folder: Path) -> list[Path]:

@@ -12,7 +12,7 @@ import numpy as np
 from ptsmc_jax.onboard.expressions import REAL
 from ptsmc_jax.onboard.fields import Field
 from ptsmc_jax.onboard.generate import Code
-from ptsmc_jax.onboard.printing import FILES, HELPERS, comment, declared, inside_comment, number
+from ptsmc_jax.onboard.printing import FILES, HELPERS, c_type, comment, inside_comment, number
 from ptsmc_jax.simulation import run_state
 
 STATUS = {
@@ -61,7 +61,7 @@ _PUBLIC = re.compile(
 )
 
 
-def prefixed(text: str, name: str) -> str:
+def with_public_prefix(text: str, name: str) -> str:
     """Return a text with the controller's name in all public names, so that several controllers link together."""
 
     def renamed(found: re.Match[str]) -> str:
@@ -125,7 +125,7 @@ def members(fields: Iterable[Field]) -> str:
     lines = []
     for field in fields:
         size = "".join(f"[{n}]" for n in field.shape)
-        text = f"    {declared(field.kind).replace('real', 'ptsmc_real')} {field.name}{size};"
+        text = f"    {c_type(field.kind).replace('real', 'ptsmc_real')} {field.name}{size};"
         about = inside_comment(" ".join(field.about.split()))
         line = f"{text} /* {about} */" if about else text
         lines += [line] if len(line) <= 110 else [*comment(about, "    "), text]
@@ -162,7 +162,8 @@ def _initial(value: np.ndarray, kind: str) -> str:
 def _checks(code: Code, about: About) -> dict[str, str]:
     """Return the template values of the functions that check input, results and derived numbers."""
     names = {field.name for field in code.inputs}
-    sensors = [field for field in _reals(code.inputs) if f"{field.name}_valid" in names]  # readings may be missing
+    # sensors whose readings may be missing
+    sensors = [field for field in _reals(code.inputs) if f"{field.name}_valid" in names]
     usable = ["isfinite(in->t)", "(!state->started || in->t > state->t)"]
     usable += [_called("within", field, "in->") for field in _reals(code.inputs)
                if field not in sensors and not field.name.endswith("_age")]  # fmt: skip
@@ -245,7 +246,7 @@ def rows(code: Code, about: About) -> dict[str, str | int]:
     """Return the template values of the flat header, and of the programs that read rows of vectors.csv."""
     columns = code.columns
     every = (*code.inputs, *code.state, *code.outputs, *code.parameters)
-    kinds = {field.name: declared(field.kind).replace("real", "ptsmc_real") for field in every}
+    kinds = {field.name: c_type(field.kind).replace("real", "ptsmc_real") for field in every}
     kinds |= {"t": "double", "started": "int", "tracking": "int"}
 
     def kind(column: str) -> str:

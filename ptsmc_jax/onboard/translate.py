@@ -24,7 +24,7 @@ from ptsmc_jax.onboard.control import CONTROL
 from ptsmc_jax.onboard.expressions import BOOL, TYPES, Node, NoRuleError, Pool, Title, kind_of
 from ptsmc_jax.onboard.rules import ELEMENTWISE, KNOWN_FUNCTIONS
 
-LARGEST = 4096  # largest number of components of a constant array
+MOST_NUMBERS = 4096  # largest number of components of a constant array
 LINEAR_ALGEBRA = COUNTED | SHARED
 PLAIN = (
     "made of sums, products, quotients, powers, roots, elementary functions, comparisons, branches and loops of numbers"
@@ -44,8 +44,8 @@ class Translator:
         array = array if jnp.issubdtype(jnp.result_type(array), jax.dtypes.extended) else np.asarray(array)
         if not _has_kind(array.dtype):
             raise NoRuleError(f"a constant has the type {array.dtype}, but must have the type {TYPES}")
-        if array.size > LARGEST:
-            raise NoRuleError(f"a constant array has {array.size} numbers, but must have at most {LARGEST} in C")
+        if array.size > MOST_NUMBERS:
+            raise NoRuleError(f"a constant array has {array.size} numbers, but must have at most {MOST_NUMBERS} in C")
         kind = kind_of(array.dtype)
         return object_array(array.shape, (self.pool.constant(v, kind) for v in array.reshape(-1)))
 
@@ -111,7 +111,9 @@ class Translator:
             return CONTROL[name](self, eqn, values)
         if all(node.op == "constant" for value in values for node in value.flat):
             with jax.ensure_compile_time_eval():
-                known = [jnp.asarray(_known(value), v.aval.dtype) for value, v in zip(values, eqn.invars, strict=True)]
+                known = [
+                    jnp.asarray(_numbers(value), v.aval.dtype) for value, v in zip(values, eqn.invars, strict=True)
+                ]
                 return [self.constant(found) for found in components.bind(eqn, known)]
         if _wraps(eqn):
             raise self.refused(eqn, where)
@@ -273,7 +275,7 @@ class Translator:
             if id(value) in numbered:
                 operands.append(jnp.asarray(numbered[id(value)]))
             else:
-                operands.append(jnp.asarray(_known(value, chosen, k), dtype=variable.aval.dtype))
+                operands.append(jnp.asarray(_numbers(value, chosen, k), dtype=variable.aval.dtype))
         with jax.ensure_compile_time_eval():
             out = np.asarray(components.bind(_numbering(eqn), operands)[0])
         inside = (out >= 0) & (out < len(pool) - 1)
@@ -283,7 +285,7 @@ class Translator:
         self, eqn: Any, array: np.ndarray, places: np.ndarray, more: np.ndarray, chosen: Node | None, k: int
     ) -> np.ndarray:
         """Return an array with additions or subtractions at indices, if the computed index `chosen` is k."""
-        known, types = _known(places, chosen, k), [variable.aval.dtype for variable in eqn.invars]
+        known, types = _numbers(places, chosen, k), [variable.aval.dtype for variable in eqn.invars]
         total = array.copy()
         for index in np.ndindex(*more.shape):  # find the entries that each number is added to
             one = np.zeros(more.shape)
@@ -318,7 +320,7 @@ def _filling(pool: Pool, eqn: Any) -> Node:
         limits = jnp.iinfo(dtype)
         value = limits.min or limits.max
     elif value is None:
-        value = math.nan  # true, if it is converted to bool
+        value = math.nan  # becomes true if the type is bool
     return pool.constant(value, kind_of(dtype))
 
 
@@ -336,8 +338,8 @@ def _has_kind(dtype: Any) -> bool:
         return False
 
 
-def _known(value: np.ndarray, chosen: Node | None = None, k: int = 0) -> np.ndarray:
-    """Return the values of constant nodes, and k for the node `chosen`."""
+def _numbers(value: np.ndarray, chosen: Node | None = None, k: int = 0) -> np.ndarray:
+    """Return the numbers of an array of constant nodes. The node `chosen` counts as the constant k."""
     return np.asarray([k if node is chosen else node.value for node in value.flat]).reshape(value.shape)
 
 

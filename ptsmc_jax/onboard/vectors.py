@@ -107,8 +107,8 @@ def simulate_many(parts: Parts, dispersion: Dispersion, seed: Array, trials: Arr
     return lapack.vmap(lambda trial: simulate(parts, dispersion, seed, trial))(trials)
 
 
-def known_alike(dispersion: Dispersion) -> Dispersion:
-    """Return the dispersion without reference and torque limit, because the C has only their nominal values."""
+def with_nominal_reference(dispersion: Dispersion) -> Dispersion:
+    """Return the dispersion with nominal reference and torque limit, because the C has no other values of them."""
     return dispersion.without((REFERENCE, level_name("torque_limit")))
 
 

@@ -75,7 +75,7 @@ def off(known, library):
     ready = scenario.study(folder.on_flight_clock(known))
     computer, trials = board(ready.parts), jnp.arange(2, dtype=jnp.uint32)
     parts = replace(ready.parts, substeps=10)  # equal for all gains, to share one compiled program
-    simulated = vectors.simulate_many(parts, vectors.known_alike(ready.dispersion), jnp.uint32(0), trials)
+    simulated = vectors.simulate_many(parts, vectors.with_nominal_reference(ready.dispersion), jnp.uint32(0), trials)
     simulated = jax.tree.map(np.asarray, simulated)
     at, worst = library.columns["out"].index("command[0]"), 0.0
     for k in range(len(trials)):
