@@ -78,7 +78,7 @@ def segment(text: str, zero: Epoch | None = None, *, any_interpolation: bool = F
         if not holding:
             listed = ", ".join(f"{str(begin)[:19]} to {str(end)[:19]}" for begin, end in spans)
             raise ValueError(f"no segment contains loop.epoch; the segments are {listed}")
-        chosen = blocks[holding[-1]]  # at a common boundary the later one
+        chosen = blocks[holding[-1]]  # of two segments with a common boundary, the later one
     _check_frames(chosen)
     _check_interpolation(chosen, any_interpolation)
     system = chosen.get("TIME_SYSTEM")
@@ -214,7 +214,7 @@ def _attitudes(block: Block, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarra
         rates = attitude_tables.body_rates(quaternions, body_to_inertial(numbers[:, 4:]))
     elif kind != "QUATERNION":
         rates = np.deg2rad(numbers[:, 4:])
-        rates = rates if inertial_first else -rates  # they are rates of frame B relative to frame A
+        rates = rates if inertial_first else -rates  # rates in a message are of frame B relative to frame A
         name = "RATE_FRAME" if kind == "QUATERNION/RATE" else "ANGVEL_FRAME"
         frame = block.get(name, "")
         frame = block.get(frame) if frame in ("REF_FRAME_A", "REF_FRAME_B") else frame

@@ -31,7 +31,7 @@ class Samples:
     times: np.ndarray  # (n,) increasing [s], 0 at the start of the run
     quaternions: np.ndarray  # (n, 4) unit quaternions from body to inertial axes, scalar last
     ends: np.ndarray | None  # (2, 3) rates of the first and the last sample in body axes [rad/s], if known
-    usable_until: float  # [s]
+    usable_until: float  # end of the usable time [s]
     fastest: float  # largest rate, plus the root of the largest acceleration [rad/s]
 
 

@@ -166,7 +166,7 @@ def _check_periods(scenario: Scenario) -> None:
 def _check_dispersion(scenario: Scenario) -> None:
     dispersion = scenario.dispersion
     kinds: Any = scenario.TABLES["disturbance"]
-    if getattr(scenario, "orbit", None) is not None:  # it has no dispersion
+    if getattr(scenario, "orbit", None) is not None:  # the gravity gradient of [orbit] has no dispersion
         kinds = {kind: one for kind, one in kinds.items() if kind != "gravity_gradient"}
     for article, what in (("a", "phase"), ("an", "amplitude")):
         asked = getattr(dispersion, f"disturbance_{what}", None) is not None

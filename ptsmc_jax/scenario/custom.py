@@ -192,7 +192,7 @@ def _with_keys(table: Any, found: Any, remake: tuple) -> Any:
     for field in dataclasses.fields(found):
         if common.get(field.name) is not None and common[field.name].default is field.default:
             continue
-        if (hasattr(table, field.name) or field.name == "rest") and field.name not in common:  # in use
+        if (hasattr(table, field.name) or field.name == "rest") and field.name not in common:  # the name is in use
             raise _taken(found, field.name, "another name")
         if table.prefix + field.name == "observer_gain" or re.fullmatch(
             r"observer_gain_\d+", table.prefix + field.name

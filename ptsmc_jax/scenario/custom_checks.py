@@ -254,4 +254,4 @@ def _law(parts: Parts, ask: _Asked) -> None:
         ask.same_memory(method, memory, returned[2])
 
 
-_OF = {"reference": _reference, "sensors": _sensors, "observer": _observer, "controller": _law}  # by table
+_OF = {"reference": _reference, "sensors": _sensors, "observer": _observer, "controller": _law}  # check of each table

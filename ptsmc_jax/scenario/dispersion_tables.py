@@ -27,11 +27,11 @@ BelowOne = Annotated[float, Meta(ge=0, lt=1, description="a number from 0 to bel
 class Numbers(Table, frozen=True):
     """Random numbers about the nominal values of a scenario."""
 
-    name: ClassVar[str] = "normal"  # of the kind
-    distribution: ClassVar[str] = "normal"  # of `dispersions.numbers.RandomNumbers`
+    name: ClassVar[str] = "normal"  # name of the kind in scenario files
+    distribution: ClassVar[str] = "normal"  # distribution of `dispersions.numbers.RandomNumbers`
     width: ClassVar[str] = "std"  # the key that holds the spread; it is in degrees if its name ends with _deg
-    widest: ClassVar[float] = 4.6  # norm over spread that one vector of three in 10 000 exceeds
-    farthest: ClassVar[float] = 3.0  # largest deviation that bounds allow for, over the spread: three sigma
+    widest: ClassVar[float] = 4.6  # norm / spread that one vector of three in 10 000 exceeds
+    farthest: ClassVar[float] = 3.0  # largest deviation that bounds allow for / spread: three sigma
 
     def of(self, count: int = 1) -> np.ndarray:
         """Return the widths of `count` numbers (count,), converted to rad if the key is in degrees.
@@ -194,7 +194,7 @@ class NormalAttitude(Table, frozen=True):
 class RelativeInertia(Table, frozen=True):
     """Normal relative errors of the true principal moments, truncated at three sigma and to moments of a real body."""
 
-    farthest: ClassVar[float] = 3.0  # largest deviation of a moment, over std
+    farthest: ClassVar[float] = 3.0  # largest deviation of a moment / std
     kind: Literal["relative_normal"] = "relative_normal"
     std: Annotated[SmallFraction, Meaning("relative standard deviation")] = 0.05
     axes_deg: Annotated[NotNegative, Meaning("1 sigma of the small rotation of the principal axes", "deg")] = 0.0
@@ -275,7 +275,7 @@ class Outage(Interval, frozen=True):
 
     def build(self, parts: Any, count: int) -> Any:
         """Return `dispersions.numbers.RandomNumbers`: the random begin, and the duration."""
-        assert self.duration is not None  # a default is filled in
+        assert self.duration is not None  # `scenario.reading` has filled in the default
         return dataclasses.replace(self.numbers(parts, self.duration, self.duration), common=True)
 
 

@@ -220,7 +220,7 @@ def beyond(scenario: Scenario, name: str, side: str) -> float | None:
     else:
         value = low - 0.1 * (high - low) if side == "lower" else high + 0.1 * (high - low)
     value = max(value, 0.5 * (least + low)) if side == "lower" else min(value, 0.5 * (most + high))
-    return None if value in (low, high) else float(f"{value:.4g}")  # None: at the end of the allowed range
+    return None if value in (low, high) else float(f"{value:.4g}")  # None if the bound is the end of the allowed range
 
 
 def widened(

@@ -13,7 +13,7 @@ from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.values import MOST_STEPS
 
 Interval = tuple[float, float]
-SLOWEST_DECAY = 3.5  # least K1 over `Choice.slowest`
+SLOWEST_DECAY = 3.5  # smallest K1 / `Choice.slowest`
 
 
 def wide(low: Any, high: Any) -> Any:
@@ -82,7 +82,7 @@ class GainBounds(NamedTuple):
     # No range contains sign_width = 0, since the discontinuous sign has no gradient
     allowed: Callable[[Choice], Allowed] = lambda _: Allowed(0.0, math.inf)
     below: str | None = None  # why values below the usual lower bound are useless in the sampled loop, in words
-    above: str | None = None  # the same for values above the usual upper bound
+    above: str | None = None  # why values above the usual upper bound are useless
 
 
 def of(scenario: Any, name: str) -> GainBounds:
@@ -138,7 +138,7 @@ def _allowed_t_f(choice: Choice) -> Allowed:
 
 
 def _usual_delta(choice: Choice) -> Interval:
-    """A period to a quarter of t_f, or to twice the design's delta if that is longer."""
+    """Return delta from one period to a quarter of t_f, or to twice the design's delta if that is longer."""
     t_f = choice.smallest("t_f")  # delta must be below every t_f of the search
     lower = choice.shortest_delta or t_f / 600.0
     upper = max(t_f / 4.0, 4.0 * lower)
@@ -148,7 +148,7 @@ def _usual_delta(choice: Choice) -> Interval:
 
 
 def _usual_k1(choice: Choice) -> Interval:
-    """From the slowest decay to the stability limit; if c is free, to the limit for the smallest c."""
+    """Return K1 from the slowest decay to the stability limit, for the smallest c if c is free."""
     least = SLOWEST_DECAY * choice.slowest
     surface = choice.smallest("surface_rate") if "surface_rate" in choice.free else choice.law.surface_rate
     limit = scales.largest_k1(choice.scenario, surface) if choice.sampled else 0.0
@@ -156,7 +156,7 @@ def _usual_k1(choice: Choice) -> Interval:
 
 
 def _usual_rate(choice: Choice) -> Interval:
-    """From the slowest decay to half of the stability limit of the sampled loop."""
+    """Return c from the slowest decay to half of the stability limit of the sampled loop."""
     least = 0.5 * SLOWEST_DECAY * choice.slowest
     high = scales.largest_rate(choice.scenario) if choice.sampled else 0.0
     return least, high if high > least else 200.0 * least

@@ -22,24 +22,24 @@ CHAIN_TIME = 5.0  # t_f of the published integrator chains [s]
 # Largest p T, with p the rate of both hold poles and T the dead time. With an observer of l / J = p / 2 the loop then
 # has a phase margin of 35 deg and a gain margin of 7 dB.
 STABLE = 0.25
-OBSERVER = 0.5  # l / J over p
+OBSERVER = 0.5  # observer rate l / J, relative to the pole rate p
 # Modes with w T below this are phase stabilised: the resonance circle in the Nyquist plot stays 30 deg away from -1.
 FASTEST_MODE = math.pi / 3
 SIGMAS = 5.0  # largest noise sample assumed, in standard deviations
 NOISE_FRACTION = 0.5  # fraction of the torque limit that noise may use
-SLOWEST = 20.0  # smallest p t_f: the error at the hand-over then decays for five time constants within t_f / 4
-SLOWEST_OBSERVER = 1.5  # smallest t_f l / J
+SLOWEST = 20.0  # smallest product p t_f: the error then decays for five time constants within t_f / 4
+SLOWEST_OBSERVER = 1.5  # smallest product of t_f and the observer rate l / J
 LEAST_ETA = 2.4  # below 2.386 the braking peak exceeds the first torque, see `theory.rules.later_peak_ratio`
 TRIED = 256  # rates p among which the most accurate one is chosen
 
 
 class Scales(NamedTuple):
-    """Units of a mission: its mean moment of inertia and its t_f over those of the published case."""
+    """Ratios of a mission to the published case, which scale the published numbers to the mission."""
 
-    inertia: float
-    time: float
-    order: int = 2  # of the plant
-    inputs: int = 3
+    inertia: float  # mean moment of inertia / published mean moment
+    time: float  # t_f / published t_f
+    order: int = 2  # order n of the plant
+    inputs: int = 3  # number of inputs of the plant
 
     def of(self, scaled: Scaled, table: Any = None) -> Any:
         """Return a published number, or a tuple of numbers, in these units.
@@ -77,7 +77,7 @@ def published(scenario: Any) -> bool:
 
 
 def scales(scenario: Any) -> Scales:
-    """Return inertia and t_f over those of the published case.
+    """Return the ratios of inertia and t_f to the published case.
 
     Both are 1 for a published case. The inertia is 1 for a plant without a body.
     """
@@ -113,9 +113,9 @@ class Design(NamedTuple):
     eta: float
     pole: float  # p [1/s]
     observer: float  # l [N m s], or l [1/s] without a body
-    width: float  # of the boundary layer, in units of s
-    reaching: float  # K1 over the pole, see `Scenario.reaching`
-    time: float  # t_f over t_f of the published case, see `Scales`
+    width: float  # thickness of the boundary layer, in units of s
+    reaching: float  # K1 / pole, see `Scenario.reaching`
+    time: float  # t_f / published t_f, see `Scales`
 
     @property
     def delta(self) -> float:
@@ -170,7 +170,7 @@ def fastest_pole(scenario: Any) -> float:
 
 def _design(scenario: Any, pole: float, eta: float, observer: float) -> Design:
     law, period = scenario.controller, scenario.loop.period
-    longest = 0.5 * (law.t_f + period)  # largest delta [s]
+    longest = 0.5 * (law.t_f + period)  # largest delta of a design [s]
     eta = min(eta, max(0.5 + pole * longest, _least_eta(scenario)))
     rate = min(observer * pole, 1.0 / period)
     position, velocity = scenario.devices.noise_of_error(scenario)
@@ -200,7 +200,8 @@ def _limits(scenario: Any) -> _Limits:
         return _Limits(max(most, 0.1 * slow), slow, slow)
     position, velocity = scenario.devices.noise_of_error(scenario)
     position = 0.0 if scenario.estimator.on else position  # an attitude filter passes slow errors only
-    rates = least * (most / least) ** np.linspace(1.0, 0.0, TRIED)  # descending: argmin prefers fast rates
+    # descending, so that argmin returns the fastest of rates with equal errors
+    rates = least * (most / least) ** np.linspace(1.0, 0.0, TRIED)
     with np.errstate(all="ignore"):
         lag = _disturbance(scenario)[1] / (OBSERVER * rates**3)
         error = lag**2 + position**2 * rates * period + velocity**2 * period / rates

@@ -22,8 +22,8 @@ Vector = Annotated[
 ]
 IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 LEAST = np.deg2rad(0.1)  # smallest angle between the two directions, and between the two body axes [rad]
-POINTS, MOST_POINTS = 2048, 2**17  # smallest and largest number of times along the run
-FINE = 0.05  # largest rotation of the reference between them [rad]
+POINTS, MOST_POINTS = 2048, 2**17  # smallest and largest number of anchors along the run
+FINE = 0.05  # largest rotation of the reference between two anchors [rad]
 
 
 def check_axes(key: str, axis: tuple[float, ...], other: tuple[float, ...] | None = None) -> None:
@@ -41,7 +41,7 @@ class Mission(NamedTuple):
 
     orbit: Any  # `OrbitTable`, or None
     epoch: str | None  # `loop.epoch`
-    end: float  # of the run [s]
+    end: float  # end of the run [s]
 
 
 def of(scenario: Any) -> Mission:
@@ -73,7 +73,7 @@ class Along(NamedTuple):
     """A reference with two directions along a run."""
 
     anchors: np.ndarray  # (n, 4) quaternions of the frame at equal intervals of `span`, see `TwoVectorReference`
-    span: float  # [s]
+    span: float  # time from the first to the last anchor [s]
     fastest: float  # largest rate, plus the root of the largest acceleration [rad/s]
     matrix: np.ndarray  # (3, 3) rotation at t = 0 from the axes of the frame to inertial axes
 

@@ -25,7 +25,7 @@ from ptsmc_jax.scenario.values import Kinds, NotNegative, Positive, Table
 from ptsmc_jax.simulation import catalogues
 
 DEEPEST = 8  # nesting of tables and arrays; a rotation matrix of a disturbance in a sum has depth 6
-LONGEST_KEY = 100  # characters
+LONGEST_KEY = 100  # largest number of characters of a key
 _TOO_DEEP = f"but at most {DEEPEST} levels are allowed"
 # a very long dotted key: the memory that the parser needs for it grows with the square of its length
 _DOTTED = re.compile(r"""(?<![\w-])(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){20}""")

@@ -13,8 +13,8 @@ from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.theory import stability_limits
 
 FAR = 10.0  # largest ratio of a stated bound to the bound of the disturbance, or its inverse, without a warning
-LATE = 0.1  # fraction of t_f: a longer delay was probably given in another unit
-COARSE = np.deg2rad(5.0)  # [rad]: a larger noise was probably given in another unit
+LATE = 0.1  # delay as a fraction of t_f; a longer one was probably given in seconds
+COARSE = np.deg2rad(5.0)  # noise [rad]; a larger one was probably given in another unit
 
 
 def warnings(scenario: Scenario) -> list[str]:
@@ -23,8 +23,8 @@ def warnings(scenario: Scenario) -> list[str]:
     Bounds and estimate are not examined if custom code that defines the disturbance has not run yet.
     """
     bounds = disturbance_bounds.of(scenario)
-    bounded = [] if bounds is None else [*_far_off(scenario, *bounds), *_noisy(scenario, bounds[0])]
-    others = (_perfect_rate, _coarse, _late, _fast_surface, _below_horizon)
+    bounded = [] if bounds is None else [*_implausible_bound(scenario, *bounds), *_noisy_estimate(scenario, bounds[0])]
+    others = (_perfect_rate, _noise_in_wrong_unit, _delay_in_seconds, _fast_surface, _below_horizon)
     return [*bounded, *(text for warn in others for text in warn(scenario))]
 
 
@@ -42,7 +42,7 @@ def _below_horizon(scenario: Scenario) -> list[str]:
     ]
 
 
-def _late(scenario: Scenario) -> list[str]:
+def _delay_in_seconds(scenario: Scenario) -> list[str]:
     """Warn about a delay that was probably given in seconds: the key counts control periods."""
     delay, period = scenario.devices.delay_periods, scenario.loop.period
     if delay * period < LATE * scenario.controller.t_f:
@@ -73,7 +73,7 @@ def _fast_surface(scenario: Scenario) -> list[str]:
     ]
 
 
-def _coarse(scenario: Scenario) -> list[str]:
+def _noise_in_wrong_unit(scenario: Scenario) -> list[str]:
     """Warn about a star tracker whose noise is larger than that of any real device."""
     noise = getattr(scenario.hardware, "attitude_noise", None)
     if not noise or noise < COARSE:
@@ -97,7 +97,7 @@ def _perfect_rate(scenario: Scenario) -> list[str]:
     ]
 
 
-def _far_off(scenario: Scenario, largest: float, fastest: float) -> list[str]:
+def _implausible_bound(scenario: Scenario, largest: float, fastest: float) -> list[str]:
     """Warn about a stated bound that differs from the bound of the disturbance by more than the factor `FAR`.
 
     Only the bound that the law uses is examined: K without an observer, c with an observer.
@@ -119,7 +119,7 @@ def _far_off(scenario: Scenario, largest: float, fastest: float) -> list[str]:
     return [f"{what}: the law may not reject it; remove the key to use the bound of the disturbance"]
 
 
-def _noisy(scenario: Scenario, largest: float) -> list[str]:
+def _noisy_estimate(scenario: Scenario, largest: float) -> list[str]:
     """Warn about an observer whose estimate has more noise than the disturbance has amplitude."""
     noise = estimate_noise(scenario)
     if not noise > largest > 0.0:

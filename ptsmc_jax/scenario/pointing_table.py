@@ -14,7 +14,7 @@ from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.pointing import Pointing as PointingPart
 from ptsmc_jax.simulation.pointing import across
 
-LONGEST_STEP = 0.02  # largest step of the continuous loop in the hold phase, over t_f, see `clock`
+LONGEST_STEP = 0.02  # largest step of the continuous loop in the hold phase / t_f, see `clock`
 
 
 class Pointing(Table, frozen=True):

@@ -12,7 +12,7 @@ from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario, check_scenario
 from ptsmc_jax.scenario.values import Table
 
-AFTER = Scaled(10.0, time=1)  # from t_f to the end of a run [s]
+AFTER = Scaled(10.0, time=1)  # default time from t_f to the end of a run [s]
 
 
 def read(path: str | Path) -> Scenario:

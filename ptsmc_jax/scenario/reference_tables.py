@@ -38,7 +38,7 @@ class ReferenceTable(PartTable, frozen=True):
     def check(self, scenario: Any) -> None:
         """Raise ScenarioError if keys are not valid, or contradict other tables."""
 
-    def check_until(self, scenario: Any, last: float, key: str) -> None:
+    def check_reference_until(self, scenario: Any, last: float, key: str) -> None:
         """Raise ScenarioError if the reference ends before a run until `last` [s]; key: determines that time."""
 
     def build(self, scenario: Any) -> Any:
@@ -133,9 +133,9 @@ class FileReference(ReferenceTable, frozen=True):
             zero = "t = 0" if scenario.loop.epoch is None else f"loop.epoch = {show(scenario.loop.epoch)}"
             raise refused("reference.file", self.file, f", whose attitudes are from {begin:.9g} to {end:.9g} s after "
                           f"{zero}, which must be in between")  # fmt: skip
-        self.check_until(scenario, scenario.end, "loop.t_end")
+        self.check_reference_until(scenario, scenario.end, "loop.t_end")
 
-    def check_until(self, scenario: Any, last: float, key: str) -> None:
+    def check_reference_until(self, scenario: Any, last: float, key: str) -> None:
         end = self._samples(scenario).usable_until
         if last > end * (1.0 + 1e-9):
             stated = scenario.loop.t_end if key == "loop.t_end" else scenario.search.bounds.get("t_f")
@@ -149,7 +149,7 @@ class FileReference(ReferenceTable, frozen=True):
     def first(self, scenario: Any) -> np.ndarray:
         self.check(scenario)
         samples = self._samples(scenario)
-        k = int(np.argmin(np.abs(samples.times)))  # to one sample: a default follows from it
+        k = int(np.argmin(np.abs(samples.times)))  # the nearest sample is accurate enough for a default
         return samples.quaternions[k]
 
 

@@ -66,7 +66,7 @@ def registered(made: type) -> type:
     """Return a class registered as a JAX pytree, if it is not registered yet."""
     try:
         return pytree(made)
-    except ValueError:  # it is registered already
+    except ValueError:  # the class is already registered
         return made
 
 

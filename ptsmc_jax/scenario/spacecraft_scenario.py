@@ -305,7 +305,7 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
         """Raise ScenarioError for invalid attitudes, settling angle, disturbance, pointing or random modes."""
         attitude_keys.quaternion(self.initial, "initial")
         settled = self.loop.settling_angle
-        if settled >= math.pi:  # probably degrees; every attitude would count as settled
+        if settled >= math.pi:  # probably in degrees: every attitude would count as settled
             raise wrong("loop.settling_angle", settled, 'less than pi [rad], or with its unit, such as "0.5 deg"')
         self.reference.check(self)
         for place, term in self.placed_terms.items():
@@ -315,8 +315,8 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
         if self.flexible is not None:
             self.flexible.check_drawn(self.true_inertia, self.dispersion)
 
-    def check_until(self, last: float) -> None:
-        self.reference.check_until(self, last, "tune.bounds.t_f")
+    def check_reference_until(self, last: float) -> None:
+        self.reference.check_reference_until(self, last, "tune.bounds.t_f")
 
     def observation(self) -> Any:
         """Return the observation of pointing errors, None without [pointing]."""

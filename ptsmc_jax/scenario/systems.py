@@ -139,7 +139,7 @@ def checksum(where: object) -> str | None:
         try:
             with _importing_from(_home(place)):
                 spec = importlib.util.find_spec(place)
-        except (Exception, SystemExit):  # `item` reports it
+        except (Exception, SystemExit):  # `item` reports the error
             spec = None
         file = None if spec is None else spec.origin
     if not file or sha256(file) is None:
@@ -213,7 +213,7 @@ def _run(path: Path, content: bytes) -> ModuleType:
         return ran.module
     home = _home(str(path))
     if not all(file.startswith(home + os.sep) and sha256(file) == sha for file, sha in _helpers.values()):
-        for name in _helpers:  # remove all of them, since they may import each other
+        for name in _helpers:  # remove all helpers, since they may import each other
             sys.modules.pop(name, None)
         _helpers.clear()
         importlib.invalidate_caches()

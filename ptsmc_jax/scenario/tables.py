@@ -166,7 +166,7 @@ class Tune(Table, frozen=True):
         Truth,
         Meaning("require the limits also in the worst case within the dispersions, not only in the random trials"),
     ] = False
-    # all trials run at once, in memory
+    # limited, because all trials are simulated at once, in memory
     trials: Annotated[
         Annotated[int, Meta(ge=1, le=10**6, description="a whole number from 1 to 1000000")],
         Meaning("number of training trials; requirements with a quantile add trials"),
@@ -192,7 +192,7 @@ STATISTICS = {
     "rms": "RMS {}", "mean": "mean {}", "worst": "largest {}", "quantile": "{level:g} % quantile of {}",
     "cvar": "CVaR of the {}",
 }  # fmt: skip
-LEVELS = ("quantile", "cvar")  # statistics with a level
+LEVELS = ("quantile", "cvar")  # statistics that need a probability level
 T_F, LIMITS = "t_f", "limits"  # objectives that are no metric of a run
 
 
@@ -233,7 +233,7 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
     unit_of_d: ClassVar[str] = keys.UNIT_OF_D
     metrics: ClassVar[Mapping[str, Entry]] = {}
     motion: ClassVar[str] = ""  # selects the error kinematics: "spacecraft", "chain" or "system"
-    reaching: ClassVar[float] = 1.0  # K1 over the decay rate of s in the hold phase: 2 for a spacecraft, see (60)
+    reaching: ClassVar[float] = 1.0  # K1 / decay rate of s in the hold phase: 2 for a spacecraft, see (60)
 
     def __repr__(self) -> str:
         """Return the tables of the scenario, one line each."""
@@ -326,7 +326,7 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
         return None
 
     def start_tangent(self) -> float:
-        """Return the first acceleration of the error over eta^2 / t_f^2."""
+        """Return the initial acceleration of the error / (eta^2 / t_f^2)."""
         raise NotImplementedError
 
     def usual_settling(self) -> float:
@@ -412,7 +412,7 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
     def check_plant(self) -> None:
         """Raise ScenarioError if keys that concern the plant contradict each other."""
 
-    def check_until(self, last: float) -> None:
+    def check_reference_until(self, last: float) -> None:
         """Raise ScenarioError if the reference ends before `last` [s], the end of the longest run of a search."""
 
     def model(self) -> Any:

@@ -34,17 +34,17 @@ _SMOOTHED = ("disturbance.frequency", "plant.system", "flexible.frequency")
 class Reach:
     """Ranges of gains and control period that one compiled program covers. The clock is sized for them."""
 
-    smallest_t_f: float  # [s]
-    t_f: float  # largest [s]
-    delta: float  # largest [s]
-    smallest_delta: float  # [s]
+    smallest_t_f: float  # smallest t_f [s]
+    t_f: float  # largest t_f [s]
+    delta: float  # largest delta [s]
+    smallest_delta: float  # smallest delta [s]
     gain: float  # smallest observer gain [N m s]; not used without an observer
     largest_gain: float  # largest observer gain [N m s]
-    k1: float  # largest [1/s]
+    k1: float  # largest K1 [1/s]
     sign_width: float  # smallest thickness of the boundary layer
-    surface_rate: float  # largest [1/s]
-    smallest_period: float  # [s]; not used in the continuous loop
-    period: float  # largest [s]
+    surface_rate: float  # largest surface rate c [1/s]
+    smallest_period: float  # smallest control period [s]; not used in the continuous loop
+    period: float  # largest control period [s]
 
 
 _INTERVALS = (  # smallest and largest value in `Reach`
@@ -105,7 +105,7 @@ def timing(scenario: Scenario, setup: Setup, reach: Reach, saves: object) -> tup
     """
     loop, frequencies, visited = scenario.loop, _frequencies(scenario, setup, reach), None
     if reach.t_f > scenario.controller.t_f:
-        scenario.check_until(scenario.end + reach.t_f - scenario.controller.t_f)
+        scenario.check_reference_until(scenario.end + reach.t_f - scenario.controller.t_f)
     if setup.plant.custom_functions:
         hurried = _with_papers_law(setup.with_t_f(vector(reach.smallest_t_f)))
         visited = solutions.visited(hurried)
@@ -181,13 +181,13 @@ def _lower(scenario: Scenario, key: str, asks: str) -> ScenarioError:
     if key in ("reference.file", "reference.kind"):
         shown = show(getattr(getattr(scenario, table), name))
         return ScenarioError(f"{key} is {shown}, whose attitude is too fast: {asks}")
-    if key == "controller.eta":  # a short t_f is the cause: eta may be at its lower bound already
+    if key == "controller.eta":  # blame t_f, because eta may be at its lower bound already
         eta = f"with controller.eta = {scenario.controller.eta}"
         shorter = ", or loop.period shorter" if scenario.sampled else ""
         return wrong("controller.t_f", scenario.controller.t_f, f"longer {eta}{shorter}: {asks}")
     *tables, name = name.split(".")
     value = getattr(functools.reduce(getattr, tables, getattr(scenario, table)), name, None)
-    if value is None:  # the key belongs to a term of a sum
+    if value is None:  # the key belongs to terms of a sum of disturbances
         value = [getattr(term, name) for term in scenario.terms if hasattr(term, name)]
     if value == []:
         return ScenarioError(f"{table} is too fast: {asks}")
@@ -211,7 +211,7 @@ def _with_papers_law(setup: Setup) -> Setup:
 
 @programs.jit
 def _rates_of_system(setup: Setup, visited: tuple) -> tuple:
-    """Return the Jacobians of a custom system along a run, and acceleration and its rate on the reference."""
+    """Return Jacobians of a custom system at the visited states, and w' and w'' of the motion with zero error."""
     plant, kinematics = typing.cast(System, setup.plant), setup.controller.kinematics
     none = jnp.zeros(plant.inputs)
 
@@ -243,7 +243,7 @@ def _with_gain(observer: Any, gain: float) -> Any:
 def _fastest_layer(reach: Reach, law: Any, observer: Any, visited: Any) -> tuple[float, float]:
     """Return the fastest rates of boundary layer and observer before and after the hand-over, within reach [1/s]."""
     before = after = 0.0
-    if hasattr(observer, "gain"):  # K2 is largest with the smallest gain
+    if hasattr(observer, "gain"):  # the smallest gain gives the largest K2, the largest gain the fastest observer
         before = after = _with_gain(observer, reach.largest_gain).fastest()
         observer = _with_gain(observer, reach.gain)
     if reach.sign_width > 0.0:
@@ -277,7 +277,7 @@ def _grid(
         by_key |= {f"controller.{key}": steps(rate=value) for key, value in decays.items()}
         by_key["controller.sign_width"] = steps(layer=layer)
         worst = max(by_key, key=lambda key: by_key[key])
-        if not by_key["disturbance.frequency"] <= MOST_STEPS:  # the switching follows its rate too
+        if not by_key["disturbance.frequency"] <= MOST_STEPS:  # the switching term gets faster with it, too
             worst = "disturbance.frequency"
         if by_key[worst] <= steps() * 1.5:
             raise wrong("loop.t_end", t_end, f"earlier: {asks}")
