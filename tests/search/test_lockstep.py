@@ -4,7 +4,7 @@ import threading
 
 import pytest
 
-from tuning.search.lockstep import in_step
+from tuning.search.lockstep import run_in_lockstep
 
 
 def counting(upto, found, name):
@@ -24,14 +24,14 @@ def test_requests_of_all_running_functions_are_answered_together_in_order():
         asked.append(questions)
         return [2 * k for _, k in questions]
 
-    in_step([counting(n, found, name) for n, name in ((3, "a"), (1, "b"), (2, "c"))], answer, width=2)
+    run_in_lockstep([counting(n, found, name) for n, name in ((3, "a"), (1, "b"), (2, "c"))], answer, width=2)
     assert found == {"a": [2, 4, 6], "b": [2], "c": [2, 4]}
     assert asked == [[("a", 1), ("b", 1)], [("a", 2), ("c", 1)], [("a", 3), ("c", 2)]]
     asked.clear()
-    in_step([counting(2, {}, "a"), counting(1, {}, "b")], answer, width=1)
+    run_in_lockstep([counting(2, {}, "a"), counting(1, {}, "b")], answer, width=1)
     assert asked == [[("a", 1)], [("a", 2)], [("b", 1)]]
-    in_step([], answer, width=2)
-    in_step([lambda ask: None], answer, width=2)
+    run_in_lockstep([], answer, width=2)
+    run_in_lockstep([lambda ask: None], answer, width=2)
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError])
@@ -51,7 +51,7 @@ def test_an_exception_of_answer_is_raised_in_waiting_functions_and_in_the_caller
         return [None] * len(questions)
 
     with pytest.raises(error):
-        in_step([work, work, work], answer, width=2)
+        run_in_lockstep([work, work, work], answer, width=2)
     assert len(put_away) == 2  # the third function was not started
     assert threading.active_count() <= threads + 1  # the last thread may not have ended yet
 
@@ -63,7 +63,8 @@ def test_an_exception_of_a_function_stops_the_other_functions_and_is_raised():
         ask(("bad", 1))
         raise ZeroDivisionError
 
+    works = [fails, counting(10, found, "a"), counting(1, found, "b")]
     with pytest.raises(ZeroDivisionError):
-        in_step([fails, counting(10, found, "a"), counting(1, found, "b")], lambda q: [k for _, k in q], width=2)
+        run_in_lockstep(works, lambda q: [k for _, k in q], width=2)
     assert len(found["a"]) < 10
     assert "b" not in found

@@ -150,7 +150,7 @@ def test_gradients_are_checked_against_finite_differences():
             seen = super().measure_with_gradients(problem, normalised)
             return replace(seen, f_gradient=seen.f_gradient * np.array([1.0, 1.01, 1.0]))
 
-    behind = z + 3 * trust.DIFFERENCE * np.array([0.0, 1.0, 1.0])  # point of the gradients
+    behind = z + 3 * trust.DIFFERENCE_STEP * np.array([0.0, 1.0, 1.0])  # point of the gradients
     normalised = np.abs(evaluate.measure_with_gradients(noisy, behind[None]).f_gradient[0])
     expected = 0.01 * normalised[1] / (normalised * [1.0, 1.01, 1.0]).max()
     np.testing.assert_allclose(trust.gradient_error(Wrong(BOUNDS), noisy, z), expected, rtol=1e-3)

@@ -318,7 +318,7 @@ def test_a_large_violation_does_not_count_as_a_failed_trial(monkeypatch):
     )
     evaluate, settings = Evaluator(WITHIN), optimise.Settings(1, 2, 1)
     found = optimise.search(evaluate, some, wanted, np.array([3.0, 0.5]), settings)
-    assert found.worst[2] > local_search.BROKEN
+    assert found.worst[2] > local_search.FAILURE_PENALTY
     assert found.worst[:2].max() < 1.0
     np.testing.assert_array_equal(found.worst, found.ended)
     assert list(found.conflict) == ["window_error"]

@@ -248,8 +248,8 @@ def test_given_coordinates_are_simulated_as_random_ones():
     more = objective.with_trials(problem, np.asarray([40]))
     drawn_ones = objective.coordinates_of(problem.dispersion, 5, np.asarray([40]))
     drawn = {name: np.asarray(v)[0].tolist() for name, v in drawn_ones.items()}
-    roomy = rounds._with_room(problem, rounds.SPARE)
-    assert roomy.trials.size == 8 + rounds.SPARE
+    roomy = rounds._with_room(problem, rounds.SPARE_SLOTS)
+    assert roomy.trials.size == 8 + rounds.SPARE_SLOTS
     given = rounds._add(roomy, np.array([8]), rounds.Joining(np.asarray([7]), np.array([True]), drawn))
     assert roomy.trials[8] == roomy.trials[0]  # the original is not changed
     evaluate = Evaluator(Bounds(problem.names, (2.5, 0.3), (6.0, 4.0)))

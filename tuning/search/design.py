@@ -53,7 +53,8 @@ def shortest_time(loaded: Scenario, requirement: Requirement, seed: int, trials:
     drawn = ready.dispersion, jnp.uint32(seed), jnp.asarray(trials, dtype=jnp.uint32)
     limit, quantile = requirement.limit, None if len(trials) == 1 else requirement.implied_by.quantile
     context = len(trials), quantile, requirement.unit
-    deciding = (must_keep(len(trials), quantile, requirement.confidence) or len(trials)) - 1  # index in ascending order
+    # index of the trial that decides, in ascending order
+    deciding = (must_keep(len(trials), quantile, requirement.confidence) or len(trials)) - 1
 
     def predicted(t_f: float) -> float:
         return float(np.sort(_predicted(ready.parts, *drawn, t_f))[deciding])

@@ -102,7 +102,7 @@ class Evaluator:
         of_loop = margin_rows.of_points(problem.margins, self.bounds.scale, normalised)
         wide = max(values["c"].shape[2], of_loop["c"].shape[2])
 
-        def padded(c: np.ndarray, fill: float) -> np.ndarray:  # every row as long as the longest
+        def padded(c: np.ndarray, fill: float) -> np.ndarray:  # all rows get the length of the longest row
             widths = [(0, wide - c.shape[2] if k == 2 else 0) for k in range(c.ndim)]
             return np.pad(c, widths, constant_values=fill)
 

@@ -14,7 +14,7 @@ GENERATIONS = 80  # largest number of generations; `PATIENCE` can end the search
 WIDELY = 64, np.inf  # points of a generation; standard deviation of the first generation, in normalised gains
 NEARBY = 32, 0.05  # the same for a search from a point near the best
 PATIENCE, GAINED = 24, 1e-4  # the search ends if F decreases by less than `GAINED` in `PATIENCE` generations
-WORST = 1e9  # merit of a point that failed
+FAILED_MERIT = 1e9  # merit of a point that failed
 
 
 def evolve(
@@ -57,7 +57,7 @@ def evolve(
         best.offer(points.T[chosen : chosen + 1], seen.at(chosen))
         keep(seen.at(chosen))
         record.append(best.f if best.violation == 0.0 else np.inf)
-        return np.nan_to_num(merit(seen, STEEP), nan=WORST, posinf=WORST)
+        return np.nan_to_num(merit(seen, STEEP), nan=FAILED_MERIT, posinf=FAILED_MERIT)
 
     def stop(intermediate_result: object) -> bool:
         del intermediate_result

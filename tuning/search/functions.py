@@ -134,7 +134,7 @@ def minimise(
         )
         bests.append(best)
     ended = sorted((best for best in bests if np.isfinite(best.f)), key=lambda best: best.rank)
-    if not ended:  # no gradient is finite
+    if not ended:  # no starting point has a finite gradient
         raise ValueError("the objective has a finite gradient at no starting point")
     found = [Local(problem.x(best.normalised), best.f, best.violation) for best in ended]
     return Search(found, settings.sampled, problem.gradients)

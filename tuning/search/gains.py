@@ -21,7 +21,7 @@ from ptsmc_jax.simulation.gains import present_values as present_values
 from ptsmc_jax.simulation.gains import with_gains as with_gains
 from ptsmc_jax.simulation.rollout import Parts
 
-AS_PUBLISHED = 0.05  # published delta [s]
+AS_PUBLISHED = 0.05  # published delta of a spacecraft [s]
 
 
 def units(plant: str) -> dict[str, str]:

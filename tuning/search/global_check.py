@@ -97,6 +97,6 @@ def check(
         gains=dict(zip(problem.names, at_best.gains[0].tolist(), strict=True)),
         value=best.value,
         distance=float(at_search.f[0]) - best.f,
-        kept=not best.failed and bool(np.all(best.worst <= 1.0)),  # original limits, as in the verdict
+        kept=not best.failed and bool(np.all(best.worst <= 1.0)),  # with the original limits, which the verdict uses
         rollouts=evaluate.rollouts - before,
     )

@@ -18,7 +18,7 @@ from tuning.search.objective import ended, failures
 ACTIVE = 1e-3  # a limit is active if c > -ACTIVE
 SLACK = 1e-4  # largest c of an admissible point
 ELASTIC = 0.1  # if c is larger at the starting point, the violation is minimised before the objective
-BROKEN = 1e3  # added to the relative violation for each failed trial
+FAILURE_PENALTY = 1e3  # added to the relative violation for each failed trial
 CLOSE = 1e-5  # change of F at which a local search ends
 # Scaling of the variables. The first step is the gradient divided by the square of the scaling. It may leave the
 # neighbourhood of the starting point with 1, and stays in it with 4.
@@ -83,7 +83,7 @@ class Best:
         worst = largest(seen.c, self.margin)
         violation = np.maximum((worst - (1.0 - self.margin)).max(axis=1, initial=-1.0) - SLACK, 0.0)
         failed_trials = np.where(np.isfinite(seen.f), failures(seen.c), np.inf)
-        violation = violation + BROKEN * failed_trials
+        violation = violation + FAILURE_PENALTY * failed_trials
         first = int(np.lexsort((seen.f, violation, failed_trials))[0])
         if np.isfinite(seen.f[first]) and (failed_trials[first], violation[first], seen.f[first]) < self.rank:
             self.normalised, self.worst = normalised[first].copy(), worst[first]

@@ -28,7 +28,7 @@ from tuning.search.local_search import (
     multipliers,
     search_locally,
 )
-from tuning.search.lockstep import Ask, in_step
+from tuning.search.lockstep import Ask, run_in_lockstep
 from tuning.search.normalisation import TIMES
 from tuning.search.objective import LIMITS, Problem, ended, failures, fewer_trials
 from tuning.search.progress import Report
@@ -42,12 +42,12 @@ from tuning.search.starts import (
     starting_points,
 )
 
-CONTINUED = 3  # number of local searches that a further round continues
+CONTINUED_SEARCHES = 3  # number of local searches that a further round continues
 EXPLORED, AVERAGED = 32, 16  # trials of the first searches, constraints included; smallest number in the objective
 TOGETHER = 2  # concurrent local searches for each device, so that the device waits for SLSQP less often
-FOLLOWED = 3  # number of explored starting points that continue with all trials
+FOLLOWED_STARTS = 3  # number of explored starting points that continue with all trials
 SAME_F = 1e-4  # points are equally good if their F differs by less: 0.01 % of the objective
-FINISH = 1e-2  # factor on `CLOSE` for the last local search, from the best point
+FINAL_CLOSE = 1e-2  # factor on `CLOSE` for the last local search, from the best point
 CONFLICTING = 0.1  # limits whose excess is within this fraction of the largest excess count as conflicting
 HAND_OVER_ATTEMPTS = 3  # largest number of attempts with other hand-over times
 MANY = 512  # Sobol points of a search without gradients
@@ -178,7 +178,7 @@ class LocalSearches:
             seed: seed of the candidates for starting points.
 
         Returns:
-            Normalised gains, (gains,), of at most `FOLLOWED` results, by number of the local search.
+            Normalised gains, (gains,), of at most `FOLLOWED_STARTS` results, by number of the local search.
         """
         problem, more = _few_trials(problem), max(2, self._steps // 2)
         self._report("first local search", 1, 2, *self.so_far)
@@ -198,9 +198,9 @@ class LocalSearches:
         """
         few, more = max(2, self._steps // 4), max(2, self._steps // 2)
         contenders = dict(enumerate(first, number))
-        stages = ((len(contenders), few), (max(FOLLOWED, len(contenders) // 2), more))
+        stages = ((len(contenders), few), (max(FOLLOWED_STARTS, len(contenders) // 2), more))
         ranked = self._successive_halving(problem, contenders, stages, "searching", scales=(CAREFUL, BOLD))
-        return {k: self._ends[k].normalised for k in ranked[:FOLLOWED]} or {number: first[0]}
+        return {k: self._ends[k].normalised for k in ranked[:FOLLOWED_STARTS]} or {number: first[0]}
 
     def search_locally(self, problem: Problem, starts: Mapping[int, np.ndarray]) -> None:
         """Search locally with half of the steps from each starting point, then with all steps from the best one.
@@ -277,7 +277,7 @@ class LocalSearches:
             return [measured.at(k) for k in range(len(points))]
 
         try:
-            in_step([partial(search, k) for k in contenders], measure, TOGETHER * len(configure.devices()))
+            run_in_lockstep([partial(search, k) for k in contenders], measure, TOGETHER * len(configure.devices()))
             tell()
         finally:  # also after an interrupt
             for k in contenders:
@@ -287,7 +287,7 @@ class LocalSearches:
 
     def again(self, problem: Problem) -> None:
         """Continue from the best results, with the trials that joined the problem."""
-        for k, (start, end) in enumerate(_ranked(self._ends)[:CONTINUED]):
+        for k, (start, end) in enumerate(_ranked(self._ends)[:CONTINUED_SEARCHES]):
             self._search(problem, start, Start(end.normalised, CAREFUL), self._steps, replace_best=k == 0)
         self._finish(problem)
 
@@ -389,7 +389,7 @@ class LocalSearches:
         for _ in range(HAND_OVER_ATTEMPTS):
             if not self._try_other_hand_overs(problem):
                 break
-        self._search(problem, self._from, Start(self.normalised, CAREFUL), self._steps, close=FINISH * CLOSE)
+        self._search(problem, self._from, Start(self.normalised, CAREFUL), self._steps, close=FINAL_CLOSE * CLOSE)
         self._move_hand_over_to_sample(problem)
         times = [k for k, name in enumerate(problem.names) if name in TIMES]
         others = [k for k in range(len(problem.names)) if k not in times]
@@ -410,10 +410,11 @@ class LocalSearches:
 
         def judged(changes: Sequence[Sequence[int]]) -> list[Best]:
             back = [np.isin(np.arange(scenario_gains.size), change) for change in changes]
-            normalised = np.clip(
-                [self._evaluate.bounds.replaced(current.normalised, scenario_gains, which) for which in back], 0.0, 1.0
-            )
-            measured = self._evaluate.measure_with_gradients(tightened, normalised)  # this program is already compiled
+            bounds = self._evaluate.bounds
+            changed = [bounds.with_gains(current.normalised, scenario_gains, which) for which in back]
+            normalised = np.clip(changed, 0.0, 1.0)
+            # with gradients, because this program is already compiled
+            measured = self._evaluate.measure_with_gradients(tightened, normalised)
             bests = [self._unmeasured(problem, one) for one in normalised]
             for k, best in enumerate(bests):
                 best.offer(normalised[k : k + 1], measured.at(k))

@@ -1,6 +1,7 @@
 """Batches of requests from concurrent tasks: each task has a thread, and requests are answered together.
 
-The tuner runs several local searches side by side in this way, and simulates their points in one call. See `in_step`.
+The tuner runs several local searches side by side in this way, and simulates their points in one call.
+Read `run_in_lockstep` first.
 """
 
 import threading
@@ -46,11 +47,13 @@ class _Task:
         self._answer, self.waits = answer, False
 
 
-def in_step(works: Sequence[Callable[[Ask], None]], answer: Callable[[list[Any]], list[Any]], width: int) -> None:
+def run_in_lockstep(
+    works: Sequence[Callable[[Ask], None]], answer: Callable[[list[Any]], list[Any]], width: int
+) -> None:
     """Run functions concurrently and answer their requests in batches.
 
-    A function makes one request at a time, by calling its argument. All functions have stopped when `in_step` returns
-    or raises.
+    A function makes one request at a time, by calling its argument. All functions have stopped when
+    `run_in_lockstep` returns or raises.
 
     Args:
         works: the functions.

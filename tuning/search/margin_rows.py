@@ -30,7 +30,7 @@ from tuning.search.gains import with_gains
 from tuning.search.normalisation import Bounds, Scale
 
 CASES = 1  # number of random trials whose loops are constrained: the trials with the worst margins
-WITHOUT = 2.0  # violation ratio of a loop without finite derivatives, as for a margin of zero
+RATIO_OF_NAN = 2.0  # violation ratio of a loop without finite derivatives, as for a margin of zero
 
 
 @pytree
@@ -101,7 +101,7 @@ def hardest(asked: RequiredMargins, gains: Float[np.ndarray, " gains"]) -> tuple
     limits = dict(zip(asked.metrics, np.asarray(asked.required).tolist(), strict=True))
     each = margin_verdicts.worst(parts, asked.dispersion, seed, np.arange(margin_verdicts.TRIALS), limits, CASES)
     ratios = [margin_verdicts.nearness(each[name], limit, name) for name, limit in limits.items()]
-    near = np.max(np.nan_to_num(ratios, nan=WITHOUT, neginf=-1e9), axis=0)
+    near = np.max(np.nan_to_num(ratios, nan=RATIO_OF_NAN, neginf=-1e9), axis=0)
     return _of_trials(asked, np.argsort(-near, kind="stable")[:CASES]), max(float(near.max()), 0.0)
 
 
@@ -133,7 +133,7 @@ def rows(
         violation_ratio(values[name].reshape(-1), limit, at_least=MARGINS[name].at_least)
         for name, limit in zip(asked.metrics, asked.required, strict=True)
     ]
-    near = jnp.stack([jnp.where(jnp.isnan(ratio), WITHOUT, ratio) for ratio in ratios])
+    near = jnp.stack([jnp.where(jnp.isnan(ratio), RATIO_OF_NAN, ratio) for ratio in ratios])
     return near / asked.limits[:, None] - 1.0
 
 

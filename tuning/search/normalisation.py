@@ -18,7 +18,7 @@ from tuning.search import gains as gain_names
 
 TIMES, TIME_DIGITS = ("delta", "t_f"), 12  # with fewer digits, a hand-over may move past its sample
 
-HALF = 0.5  # largest lower bound of sign_width relative to its upper bound
+MOST_OF_UPPER = 0.5  # largest lower bound of sign_width relative to its upper bound
 NEAR = 0.01  # a gain within this fraction of its interval from a bound counts as on the bound
 
 
@@ -50,7 +50,7 @@ class Scale:
     def least_width(self, gains: Any) -> Any:
         """Return the lower bound of sign_width. It depends only on the observer's gains among the gains, (gains,)."""
         least = self.hop / gains[np.asarray(self.observers)].min()
-        return gains.__array_namespace__().clip(least, self.lower[self.width], HALF * self.upper[self.width])
+        return gains.__array_namespace__().clip(least, self.lower[self.width], MOST_OF_UPPER * self.upper[self.width])
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class Bounds:
         """Return the normalised gains of gains, (gains,). Gains beyond a bound are clipped to the bound."""
         return np.clip(self._normalise(gains), 0.0, 1.0)
 
-    def replaced(self, normalised: np.ndarray, gains: np.ndarray, which: np.ndarray) -> np.ndarray:
+    def with_gains(self, normalised: np.ndarray, gains: np.ndarray, which: np.ndarray) -> np.ndarray:
         """Return normalised gains, (gains,), with some of the gains replaced and all other gains unchanged.
 
         The lower bound of sign_width depends on the observer's gain. If the observer's gain is replaced, the normalised
@@ -136,18 +136,18 @@ def of_scenario(scenario: Scenario, parts: Parts) -> Bounds:
     names = gain_names.named(scenario)
     intervals = {name: scenario.search.bounds[gain_names.base(name)] for name in names}
     hop = 0.0
-    if "sign_width" in names and _hops(scenario, parts):
+    if "sign_width" in names and _can_overshoot(scenario, parts):
         hop = envelopes.narrowest_sign(parts, scenario.loop.period) / 2
         if parts.observer.linear and any(gain_names.base(name) == "observer_gain" for name in names):
             hop *= float(parts.observer.gain.min())
-        else:  # the lower bound depends on no gain
+        else:  # the lower bound of sign_width does not depend on a free gain
             low, high = intervals["sign_width"]
-            intervals["sign_width"], hop = (min(max(low, hop), HALF * high), high), 0.0
+            intervals["sign_width"], hop = (min(max(low, hop), MOST_OF_UPPER * high), high), 0.0
     lower, upper = zip(*intervals.values(), strict=True)
     return Bounds(names, lower, upper, hop)
 
 
-def _hops(scenario: Scenario, parts: Parts) -> bool:
+def _can_overshoot(scenario: Scenario, parts: Parts) -> bool:
     """Return whether sign_width has the default lower bound and the sampled switching term can overshoot."""
     if not scenario.sampled or not parts.controller.prescribed:
         return False

@@ -254,12 +254,12 @@ def measure(problem: Problem, gains: Float[Array, " gains"]) -> tuple[Array, Arr
     """
     parts, names = with_gains(problem.parts, dict(zip(problem.names, gains, strict=True))), watched(problem)
 
-    def fly(case: tuple[Array, Coordinates]) -> tuple[Array, Array]:
+    def simulated(case: tuple[Array, Coordinates]) -> tuple[Array, Array]:
         trial, coordinates = case
         metrics, status, *_ = montecarlo.one(parts, problem.dispersion, problem.seed, trial, coordinates)
         return jnp.stack([getattr(metrics, name) for name in names]), status
 
-    return judge(problem.rules, gains, *montecarlo.blocks(fly, (problem.trials, problem.coordinates)))
+    return judge(problem.rules, gains, *montecarlo.blocks(simulated, (problem.trials, problem.coordinates)))
 
 
 def judge(

@@ -18,7 +18,7 @@ from tuning.search.worst import Hardest
 MARGIN = 0.03  # relative tightening of limits in the search: held-out trials can be harder than all screened trials
 SURE_MARGIN = 0.003  # `MARGIN` if no trial can be harder: with a search for the worst case, or without dispersions
 HARDEST = 8  # number of worst screened trials that join the constraints
-SPARE = 8  # slots for trials of later rounds: another number of trials would need another compilation
+SPARE_SLOTS = 8  # slots for trials of later rounds: another number of trials would need another compilation
 BAND = confirm.FARTHER + confirm.NEARER  # number of trials in a band, see `confirm`
 ROUNDS = 6  # largest number of searches that are repeated with harder trials
 
@@ -67,7 +67,7 @@ class Rounds:
         )  # number of limits that can add their hardest trials in a round
         before = problem.trials.size
         if limits:
-            problem = _with_room(problem, limits * HARDEST + SPARE)
+            problem = _with_room(problem, limits * HARDEST + SPARE_SLOTS)
         # slots of trials that join; the last ones hold trials that joined in an earlier search of the problem
         self._places = np.r_[before : problem.trials.size, problem.averaged : before]
         self.problem = _with_room(problem, len(self._bands) * BAND)

@@ -137,7 +137,8 @@ class _Rows:
     def __init__(self, points: int, trials: int, most: int):
         self.devices = len(configure.devices())
         self._points, self._count, self._most = points, trials, most
-        self._trials = np.resize(np.arange(trials), (max(1, -(-trials // ROW)), ROW))  # trials of the rows of a point
+        # indices of the trials in the rows of one point
+        self._trials = np.resize(np.arange(trials), (max(1, -(-trials // ROW)), ROW))
         self._rows = points * len(self._trials)
 
     def some(self, first: int, by_point: dict[str, Any], by_trial: dict[str, Any]) -> tuple[dict[str, Any], int]:

@@ -17,7 +17,7 @@ from tuning.search.objective import FAILED, Problem, failures
 from tuning.search.progress import Report
 
 SWEPT = 64  # points that are simulated to choose starting points
-CALL = 16  # points between two reports
+REPORT_EVERY = 16  # points between two reports
 PENALTY = 3.0  # F is a logarithm: a metric at twice its limit counts like 2^3 times the error
 APART = (0.5, 0.35, 0.2, 0.0)  # smallest distances in the unit cube (maximum norm), tried in this order
 STEEP = 10.0  # factor on the violation in the penalty, if many points are close to a limit
@@ -47,7 +47,7 @@ def starting_points(
         designs: (designs, gains) normalised gains of designs that follow from the mission.
         starts: number of points to return.
         seed: seed of the Sobol sequence.
-        report: is called after every `CALL` points.
+        report: is called after every `REPORT_EVERY` points.
 
     Returns:
         Normalised gains, (starts, gains).
@@ -72,7 +72,7 @@ def global_starting_points(evaluate: Evaluator, problem: Problem, count: int, se
         problem: the tuning problem.
         count: number of points to return.
         seed: seed of the Sobol sequence.
-        report: is called after every `CALL` points.
+        report: is called after every `REPORT_EVERY` points.
 
     Returns:
         Normalised gains, (count, gains).
@@ -80,14 +80,14 @@ def global_starting_points(evaluate: Evaluator, problem: Problem, count: int, se
     normalised = spread(len(problem.names), WIDELY, np.random.default_rng(seed))
     without = problem if problem.margins is None else replace(problem, margins=None)
     merits = np.zeros(0)
-    for k in range(0, WIDELY, CALL):
-        merits = np.append(merits, merit(evaluate.measure(without, normalised[k : k + CALL]), STEEP))
-        report(SPREADING, k + CALL, WIDELY, np.nan, np.nan)
+    for k in range(0, WIDELY, REPORT_EVERY):
+        merits = np.append(merits, merit(evaluate.measure(without, normalised[k : k + REPORT_EVERY]), STEEP))
+        report(SPREADING, k + REPORT_EVERY, WIDELY, np.nan, np.nan)
     order = np.argsort(merits, kind="stable")
     if without is not problem:
         known = np.full(WIDELY, np.inf)
-        for k in range(0, MARGINS_LOOKED, CALL):
-            some = order[k : k + CALL]
+        for k in range(0, MARGINS_LOOKED, REPORT_EVERY):
+            some = order[k : k + REPORT_EVERY]
             if merits[some[0]] >= np.sort(known)[count]:
                 break
             known[some] = merit(evaluate.measure(problem, normalised[some]), STEEP)
@@ -139,15 +139,15 @@ def promising(evaluate: Evaluator, problem: Problem, normalised: np.ndarray, cou
         problem: the tuning problem.
         normalised: (points, gains) normalised gains to choose from.
         count: number of points to choose.
-        tell: is called after every `CALL` points, as a `Report` without its first argument.
+        tell: is called after every `REPORT_EVERY` points, as a `Report` without its first argument.
 
     Returns:
         Normalised gains, (count, gains).
     """
     measured = []
-    for k in range(0, len(normalised), CALL):
-        measured.append(evaluate.measure(problem, normalised[k : k + CALL]))
-        tell(min(k + CALL, len(normalised)), len(normalised), np.nan, np.nan)
+    for k in range(0, len(normalised), REPORT_EVERY):
+        measured.append(evaluate.measure(problem, normalised[k : k + REPORT_EVERY]))
+        tell(min(k + REPORT_EVERY, len(normalised)), len(normalised), np.nan, np.nan)
     apart = distances(normalised)
     orders = []
     for times in (1.0, STEEP):

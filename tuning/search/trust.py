@@ -15,20 +15,20 @@ from tuning.search.evaluate import Evaluator
 from tuning.search.normalisation import TIMES, Bounds
 from tuning.search.objective import Problem
 
-DIFFERENCE = 3e-4  # step of the finite differences, in normalised gains
+DIFFERENCE_STEP = 3e-4  # step of the finite differences, in normalised gains
 STEP = 1e-2  # relative step of a gain for sensitivities
-SMALLEST = 1e-6  # smallest scale of the relative gradient error
-ACROSS = 15  # number of values of a gain between its bounds, besides the final value
+SMALLEST_GRADIENT = 1e-6  # errors are relative to the gradient, or to this number if the gradient is smaller
+PROFILE_POINTS = 15  # number of values of a gain between its bounds, besides the final value
 FLAT = 0.01  # a quantity that changes by less than this fraction does not depend on the gain
 CONFIDENCE = 0.95  # confidence level of intervals
-RESAMPLED = 2000  # bootstrap samples of an interval
+BOOTSTRAP_SAMPLES = 2000  # bootstrap samples of an interval
 
 
 def gradient_error(evaluate: Evaluator, problem: Problem, normalised: np.ndarray) -> float:
     """Return the largest relative error of the gradient of F, from automatic differentiation, at a point.
 
-    The reference are central finite differences of order 4 with steps of `DIFFERENCE`. The error is relative to the
-    largest element of the gradient. Near a bound, the point is moved just inside the bound. A time gain is moved past
+    The reference are central finite differences of order 4 with steps of `DIFFERENCE_STEP`. The error is relative to
+    the largest element of the gradient. Near a bound, the point is moved just inside the bound. A time is moved past
     its sample, because F has a kink if the hand-over lies on a sample: the first period of the anchored clock vanishes.
 
     Args:
@@ -39,16 +39,16 @@ def gradient_error(evaluate: Evaluator, problem: Problem, normalised: np.ndarray
     Returns:
         The relative error [-]. It is NaN if F has no gradient: no trial completes, or the objective is zero.
     """
-    behind = 3 * DIFFERENCE * np.isin(problem.names, TIMES)
-    count, inside = normalised.size, np.clip(normalised + behind, 2 * DIFFERENCE, 1.0 - 2 * DIFFERENCE)
-    offsets = np.concatenate([k * DIFFERENCE * np.eye(count) for k in (-2, -1, 1, 2)])
+    behind = 3 * DIFFERENCE_STEP * np.isin(problem.names, TIMES)
+    count, inside = normalised.size, np.clip(normalised + behind, 2 * DIFFERENCE_STEP, 1.0 - 2 * DIFFERENCE_STEP)
+    offsets = np.concatenate([k * DIFFERENCE_STEP * np.eye(count) for k in (-2, -1, 1, 2)])
     measured = evaluate.measure(problem, inside + offsets)
-    if np.isnan(measured.objective).all():  # F is then a constant
+    if np.isnan(measured.objective).all():  # no trial has an objective, so F is a constant
         return np.nan
     f = measured.f.reshape(4, count)
-    numeric = (f[0] - 8 * f[1] + 8 * f[2] - f[3]) / (12 * DIFFERENCE)
+    numeric = (f[0] - 8 * f[1] + 8 * f[2] - f[3]) / (12 * DIFFERENCE_STEP)
     exact = evaluate.measure_with_gradients(problem, inside[None]).f_gradient[0]
-    return float(np.abs(exact - numeric).max() / max(np.abs(exact).max(), SMALLEST))
+    return float(np.abs(exact - numeric).max() / max(np.abs(exact).max(), SMALLEST_GRADIENT))
 
 
 @dataclass(frozen=True)
@@ -84,16 +84,16 @@ def profiles(evaluate: Evaluator, problem: Problem, normalised: np.ndarray) -> d
         normalised: (gains,) normalised gains of the final point.
     """
     count, bounds = normalised.size, evaluate.bounds
-    points = np.tile(normalised, (count, ACROSS + 1, 1))
+    points = np.tile(normalised, (count, PROFILE_POINTS + 1, 1))
     for k in range(count):
-        points[k, :, k] = np.sort(np.append(np.linspace(0.0, 1.0, ACROSS), normalised[k]))
-        points[k] = [bounds.replaced(normalised, bounds.gains(point), np.arange(count) == k) for point in points[k]]
+        points[k, :, k] = np.sort(np.append(np.linspace(0.0, 1.0, PROFILE_POINTS), normalised[k]))
+        points[k] = [bounds.with_gains(normalised, bounds.gains(point), np.arange(count) == k) for point in points[k]]
     measured = evaluate.measure(problem, points.reshape(-1, count))
     largest = measured.c.max(axis=2, initial=-1.0)  # (points, rows); a failed trial breaks every limit
     arrays = (measured.gains, measured.objective, largest.max(axis=1, initial=-1.0) + 1.0, measured.f)
-    gains, value, violation_ratio, f = (v.reshape(count, ACROSS + 1, -1) for v in arrays)
+    gains, value, violation_ratio, f = (v.reshape(count, PROFILE_POINTS + 1, -1) for v in arrays)
     rows = largest.argmax(axis=1) if problem.rows else np.zeros(len(largest), int)
-    nearest = np.asarray(problem.rows or ("",))[rows].reshape(count, ACROSS + 1)
+    nearest = np.asarray(problem.rows or ("",))[rows].reshape(count, PROFILE_POINTS + 1)
     return {
         name: Profile(gains[k, :, k], value[k, :, 0], violation_ratio[k, :, 0], f[k, :, 0], nearest[k].tolist())
         for k, name in enumerate(problem.names)
@@ -170,7 +170,7 @@ def _bootstrap(samples: tuple, statistic, *, paired: bool) -> tuple[float, float
     bootstrap = stats.bootstrap(
         samples,
         statistic,
-        n_resamples=RESAMPLED,
+        n_resamples=BOOTSTRAP_SAMPLES,
         batch=250,
         confidence_level=CONFIDENCE,
         paired=paired,

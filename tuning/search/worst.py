@@ -137,7 +137,9 @@ def hardest(
     ratios = {
         m: float(violation_ratio(getattr(simulated.metrics, m), limit, at_least=False)) for m, limit in limits.items()
     }
-    ratios = {m: np.inf if np.isnan(v) else v for m, v in ratios.items()}  # NaN, for example: the run never settles
+    ratios = {
+        m: np.inf if np.isnan(v) else v for m, v in ratios.items()
+    }  # a metric is NaN if it has no value, such as a settling time
     worst = max(ratios, key=ratios.__getitem__)
     return Hardest(
         metric=worst,
