@@ -284,7 +284,7 @@ def montecarlo(
         campaign_folder.begin(begun, force=False)
         campaign_theory.prepare(begun)
         campaign_folder.simulate(begun, (1, 1), lambda tally: None)
-        campaign_theory.find(begun)
+        campaign_theory.write_missing(begun)
     return Campaign(begun)
 
 

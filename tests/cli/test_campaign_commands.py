@@ -106,12 +106,12 @@ def test_equal_trials_are_reported(command, tmp_path, simulated, drawn, instead)
 
 
 def test_failed_trials_are_not_reported_as_equal():
-    assert campaign_summary._alike({"window_error": {"without_value": 5}}, 5) == []
+    assert campaign_summary._equal_trials({"window_error": {"without_value": 5}}, 5) == []
     at_rest = {"window_error": {"without_value": 0, "mean": 0.0, "max": 0.0}}
-    (said,) = campaign_summary._alike(at_rest, 5, drawn=True)  # for example a dispersed inertia of a body at rest
+    (said,) = campaign_summary._equal_trials(at_rest, 5, drawn=True)  # such as a dispersed inertia of a body at rest
     assert said == "all 5 trials have the same metrics: the dispersions change no metric"
     at_rest["window_error"]["without_value"] = 4  # only one trial has a value
-    assert campaign_summary._alike(at_rest, 5, drawn=True) == campaign_summary._alike(at_rest, 5) == []
+    assert campaign_summary._equal_trials(at_rest, 5, drawn=True) == campaign_summary._equal_trials(at_rest, 5) == []
 
 
 def test_more_trials_extend_an_existing_campaign(command, simulated):

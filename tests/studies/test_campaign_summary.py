@@ -36,7 +36,7 @@ def test_mixed_requirement_averages_time_fractions_and_counts_a_missing_one_as_z
     frame = pl.concat([FRAME, FRAME.head(1).with_columns(within_ape_z=pl.lit(None, pl.Float64))])
     ended = np.array([True, True, True, False, True])
     asked = Requirement("ape_z", 1.0, "rad", quantile=0.8, interpretation="mixed")
-    beyond = campaign_summary._beyond(frame, asked, ended)
+    beyond = campaign_summary._fraction_of_time_beyond(frame, asked, ended)
     np.testing.assert_allclose(beyond, [0.0, 0.1, 0.5, 1.0, 1.0], rtol=1e-12)
     verdict = asked.verdict(frame["ape_z"].to_numpy(), ended, frame["within_ape_z"].fill_null(np.nan).to_numpy())
     told = campaign_summary._in_summary(verdict, asked, beyond)
@@ -45,7 +45,7 @@ def test_mixed_requirement_averages_time_fractions_and_counts_a_missing_one_as_z
     low, high = told["fraction_interval"]
     assert low < told["fraction_bound"] < told["fraction"] < high  # two-sided 95 % interval, one-sided 95 % bound
     of_trials = Requirement("ape_z", 1.0, "rad", quantile=0.8)
-    assert campaign_summary._beyond(frame, of_trials, ended).size == 0
+    assert campaign_summary._fraction_of_time_beyond(frame, of_trials, ended).size == 0
 
 
 def test_failed_trial_counts_as_zero_in_quantiles_of_a_time_fraction():

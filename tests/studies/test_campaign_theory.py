@@ -29,9 +29,9 @@ def test_bound_and_margins_use_the_first_trials_and_are_computed_once(tmp_path, 
     table = SimpleNamespace(count=count, row=lambda k, seed: (k, seed), rows=lambda numbers, seed: np.asarray(numbers))
     simulated = SimpleNamespace(ready="ready", run_table=None if count is None else table)
     folder: Any = SimpleNamespace(path=tmp_path, seed=7, campaign=simulated, scenario=SimpleNamespace(requirements={}))
-    campaign_theory.find(folder)
+    campaign_theory.write_missing(folder)
     assert asked == [("ready", 7, looked), ("ready", 7, [(k, 7) for k in rows])]
     assert json.loads((tmp_path / "theory.json").read_text()) == {"lower_bound": 1e-6, "margins": []}
-    campaign_theory.find(folder)
+    campaign_theory.write_missing(folder)
     assert len(asked) == 2
     assert campaign_theory.lower_bound_of(folder) == 1e-6

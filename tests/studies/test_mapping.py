@@ -190,7 +190,7 @@ def test_gain_factor_below_one_gives_the_distance_to_the_nearest_stability_limit
 
 def test_value_is_set_on_all_axes_and_in_missing_keys():
     loaded, _, _ = asked("hardware.torque_lag=0.01:0.1:2", "controller.delta=1:2:2")
-    changed: Any = mapping._with(loaded, {"observer.gain": 7.0, "hardware.torque_lag": 0.2, "hardware.delay": 1.0})
+    changed: Any = mapping._with_keys(loaded, {"observer.gain": 7.0, "hardware.torque_lag": 0.2, "hardware.delay": 1.0})
     assert changed.observer.gain == (7.0, 7.0, 7.0)
     assert (changed.hardware.torque_lag, changed.hardware.delay) == (0.2, 1)
 
@@ -202,7 +202,7 @@ def test_map_without_a_valid_pair_is_refused():
 
 def test_time_after_t_f_is_constant_if_t_f_is_mapped():
     loaded, x, y = asked("controller.t_f=4:12:2", "loop.window=0.5:3:2")
-    ends = [mapping._with(loaded, {x.key: a, y.key: b}).loop.t_end for a in x.values for b in y.values]
+    ends = [mapping._with_keys(loaded, {x.key: a, y.key: b}).loop.t_end for a in x.values for b in y.values]
     assert ends == [6.0, 7.0, 14.0, 15.0]  # 2 s after t_f, or the window if it is longer
 
 
@@ -284,10 +284,10 @@ def test_spillover_limit_separates_stable_and_unstable_pairs(monkeypatch):
     drawn = np.isfinite(across)
     np.testing.assert_allclose(across[drawn], 6.0 - 1.6 * (up[drawn] - 1.5), atol=1e-4)
     assert (up[drawn].min(), up[drawn].max()) == (1.0, 2.0)
-    changed: Any = mapping._with(loaded, {"flexible.frequency[0]": 5.0})
+    changed: Any = mapping._with_keys(loaded, {"flexible.frequency[0]": 5.0})
     assert changed.flexible is not None
     assert changed.flexible.frequency == (5.0, 9.0)
     with pytest.raises(ScenarioError, match=r"flexible.frequency\[2\] does not exist: flexible.frequency is"):
-        mapping._with(loaded, {"flexible.frequency[2]": 5.0})
+        mapping._with_keys(loaded, {"flexible.frequency[2]": 5.0})
     rigid, *_ = asked("loop.period=0.1:0.4:3", "controller.delta=0.5:1:3")
     assert mapping.spillover(mapping.Map(rigid, x, y, cells)) == {}

@@ -178,7 +178,7 @@ def test_invalid_number_of_points_is_refused(command, tmp_path, points):
 
 def test_torque_front_does_not_need_a_torque_limit():
     made = scenario.from_tables({"requirements": {"effort": 9.0}, "tune": {}})
-    assert trades.Torque(made).base.requirements == {"effort": 9.0, "peak_torque": trades.OFF}
+    assert trades.Torque(made).base.requirements == {"effort": 9.0, "peak_torque": trades.INACTIVE_LIMIT}
     quantile = scenario.replace(made, requirements={"peak_torque": {"limit": 0.5, "quantile": 0.9}})
     assert trades.Torque(quantile).base is quantile
     with pytest.raises(ScenarioError, match="for a front of the window error"):

@@ -202,7 +202,7 @@ def test_search_widens_default_bounds_of_gains_that_matter(monkeypatch):
     tables = {"controller": {"t_f": 30.0}, "tune": {"free": ["eta", "k1"]}}
     searched = list[dict[str, tuple[float, float]]]()
     monkeypatch.setattr(posing, "tuning_problem", lambda made, *_, **__: Rising(made, searched))
-    monkeypatch.setattr(tuner, "_after", lambda before, more: more)
+    monkeypatch.setattr(tuner, "_renumbered", lambda before, more: more)
     some, told = scenario.from_tables(tables), []
     first, usual = Rising(some, searched), some.search.bounds
     outcome = first.search(None, None, 1, None)
@@ -236,7 +236,7 @@ def test_violations_that_a_repeated_search_cannot_fix_are_ignored(metric, values
     wanted = Requirement(metric, 0.5 if metric == "peak_torque" else 6.0, "", at_least=metric == "gain_margin")
     verdict = wanted.verdict(np.asarray(values), np.ones(2, bool))
     found = SimpleNamespace(worst=np.asarray([reached]), problem=SimpleNamespace(rows=[metric]))
-    assert tuner._over(cast("Any", found), [verdict]) == pytest.approx(over)
+    assert tuner._broken_ratios(cast("Any", found), [verdict]) == pytest.approx(over)
 
 
 def test_default_gain_equals_its_explicit_value():

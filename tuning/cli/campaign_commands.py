@@ -219,7 +219,7 @@ def _simulated(
             folder, width, lambda first: campaign_folder.simulate(folder, this_shard, report, elsewhere, first)
         )
         folder = campaign_folder.settle(folder, stopped)
-    campaign_theory.find(folder)
+    campaign_theory.write_missing(folder)
     return folder
 
 

@@ -137,9 +137,8 @@ def hardest(
     ratios = {
         m: float(violation_ratio(getattr(simulated.metrics, m), limit, at_least=False)) for m, limit in limits.items()
     }
-    ratios = {
-        m: np.inf if np.isnan(v) else v for m, v in ratios.items()
-    }  # a metric is NaN if it has no value, such as a settling time
+    # a metric is NaN if it has no value, such as the settling time of a run that never settles
+    ratios = {m: np.inf if np.isnan(v) else v for m, v in ratios.items()}
     worst = max(ratios, key=ratios.__getitem__)
     return Hardest(
         metric=worst,

@@ -100,7 +100,7 @@ def _fan(folder: Folder, frame: pl.DataFrame, finished: np.ndarray) -> dict[str,
 
     The result is empty if none of the first trials reaches its end, or if all errors are zero: the axis is logarithmic.
     """
-    trials, window = frame["trial"].to_numpy(), frame["window_error"].to_numpy()  # a shard has some of the trials
+    trials, window = frame["trial"].to_numpy(), frame["window_error"].to_numpy()  # a shard has only some of the trials
     shown = trials[:DRAWN]
     hardest = int(np.argmax(np.where(finished & np.isfinite(window), window, -np.inf)))
     t, error = running.history(folder.without_metrics, np.append(shown, trials[hardest]).astype(np.uint32))

@@ -34,7 +34,7 @@ from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.computer import OURS, Software
 from tuning.search import custom_parts
 
-C = "controller"  # subfolder with the C code of the controller, if C code controls the simulated spacecraft
+C_FOLDER = "controller"  # subfolder with the C code of the controller, if C code controls the simulated spacecraft
 THEORY = "theory.json"  # lower bound and margins, see `campaign_theory`
 TABLE = "run_table.parquet"  # the run table; `--dry-run` writes a folder instead
 RUN_TABLE = "run_table_sha256"  # key of the checksum of the run table in `versions.json`
@@ -106,7 +106,7 @@ class Folder:
         counts = {"trials": self.trials, "first_look": self.first_look}
         entries = {**self.identity, **counts, "metrics_names": names, "run_table": self.table_name}
         if self.controller is not None:
-            entries |= {C: C, "controller_otherwise": self.otherwise or None}
+            entries |= {C_FOLDER: C_FOLDER, "controller_otherwise": self.otherwise or None}
         return store.versions(**{name: value for name, value in entries.items() if value is not None})
 
     @cached_property
@@ -264,9 +264,9 @@ def begin(folder: Folder, force: bool) -> None:
     """
     tables, path = parsing.dump(folder.scenario), folder.path
     made = store.read_versions(path)  # files that no campaign wrote belong to the user
-    kept = sources.listed(path / C) if custom.checksum_name(custom_parts.CONTROLLER) in made else []
-    if folder.controller is not None and kept != sources.listed(path / C):
-        raise RefusedError(f"--out is {path}, whose {C} contains C code of the user; allowed is another folder")
+    kept = sources.listed(path / C_FOLDER) if custom.checksum_name(custom_parts.CONTROLLER) in made else []
+    if folder.controller is not None and kept != sources.listed(path / C_FOLDER):
+        raise RefusedError(f"--out is {path}, whose {C_FOLDER} contains C code of the user; allowed is another folder")
     if force and path.is_dir():
         for rows_of in (folder.rows, folder.dry):
             rows_of.tidy(())
@@ -282,10 +282,10 @@ def begin(folder: Folder, force: bool) -> None:
             parts = folder.campaign.ready.parts
             (making / TABLE).write_bytes(rows.encoded(folder.run_table.frame(parts)))
         if folder.controller is not None:
-            sources.copy(folder.controller, making / C)
-        for file in kept:  # not earlier: these files may be the source of the copy
+            sources.copy(folder.controller, making / C_FOLDER)
+        for file in kept:  # only now, because these files may be the source of the copy
             file.unlink(missing_ok=True)
-        store.forget(path)  # results of another campaign, or of fewer trials
+        store.forget(path)  # delete results of another campaign, or of fewer trials
 
     store.write(path, fill)
 
@@ -344,7 +344,7 @@ def opened(path: Path) -> Folder:
         trusted=False,
         table_name=made.run_table,
         table=None if made.run_table is None else run_tables.read(path / TABLE),
-        controller=path / C if custom.checksum_name(custom_parts.CONTROLLER) in checksums else None,
+        controller=path / C_FOLDER if custom.checksum_name(custom_parts.CONTROLLER) in checksums else None,
         first_look=made.first_look,
     )
 
@@ -387,12 +387,12 @@ def simulate(
     parts, broken = folder.rows.parts()
     for path in broken:
         aside = path.with_name(path.name + ".damaged")
-        with contextlib.suppress(FileNotFoundError):  # another shard has renamed it
+        with contextlib.suppress(FileNotFoundError):  # another shard may have renamed the part
             os.replace(path, aside)
         what = "is damaged and is simulated again" if rows.named(path) else "is no part of a campaign"
         print(f"ptsmc: {path} {what}; it is kept as {aside.name}", file=sys.stderr)
     alone = shard == (1, 1) and elsewhere is None
-    if alone:  # else other processes may be writing into the folder
+    if alone:  # otherwise other processes may be writing into the folder
         folder.rows.tidy(parts)
     wanted = running.missing(parts, trials, shard)
     landing = elsewhere(folder, wanted) if elsewhere else running.here(folder.campaign.simulate, folder.rows, wanted)

@@ -43,7 +43,7 @@ def first_look(folder: Folder, force: bool) -> int | None:
         before = None
     if before is None:
         return None
-    finished = before.trials < folder.trials and _there(before) >= before.trials
+    finished = before.trials < folder.trials and _existing_trials(before) >= before.trials
     return before.trials if finished else before.first_look
 
 
@@ -61,8 +61,8 @@ def until_confident(folder: Folder, width: float, fly_first: Callable[[int], Non
     Returns:
         The number of trials.
     """
-    count, there = folder.first_look or running.PART, _there(folder)
-    while count < there:  # use all existing trials
+    count, there = folder.first_look or running.PART, _existing_trials(folder)
+    while count < there:  # so that the first part has all existing trials
         count *= 2
     while True:
         count = min(count, folder.trials)
@@ -74,7 +74,7 @@ def until_confident(folder: Folder, width: float, fly_first: Callable[[int], Non
         count *= 2
 
 
-def _there(folder: Folder) -> int:
+def _existing_trials(folder: Folder) -> int:
     return sum(part.count for part in folder.rows.parts()[0])
 
 
@@ -85,10 +85,11 @@ def judged(folder: Folder, first: int | None = None) -> list[dict[str, Any]]:
     frame = rows.read(folder.whole_parts(), ["status", *names]).head(first or folder.trials)
     finished = running.finished(frame)
     verdicts = running.verdicts(required, frame)
-    return [_in_summary(v, r, _beyond(frame, r, finished)) for v, r in zip(verdicts, required, strict=True)]
+    pairs = zip(verdicts, required, strict=True)
+    return [_in_summary(v, r, _fraction_of_time_beyond(frame, r, finished)) for v, r in pairs]
 
 
-def _beyond(frame: pl.DataFrame, required: Requirement, ok: np.ndarray) -> np.ndarray:
+def _fraction_of_time_beyond(frame: pl.DataFrame, required: Requirement, ok: np.ndarray) -> np.ndarray:
     """Return the fraction of time that each trial is beyond a limit, (trials,).
 
     A failed trial counts as beyond the limit at all times. The array is empty if the requirement is not "mixed".
@@ -163,12 +164,12 @@ def summarise(folder: Folder) -> dict[str, Any]:
         **_pointing(folder, parts, finished),
         "quantiles": quantiles,
         "drivers": drivers,
-        "driver_trials": driver_trials,  # number of trials that have the metric
+        "driver_trials": driver_trials,  # number of trials with a value of the metric
         **_samples(folder, parts),
         "warnings": [
             *plausibility.warnings(folder.scenario),
             *filter(None, [folder.otherwise]),
-            *_alike(quantiles, done, drawn=differ),
+            *_equal_trials(quantiles, done, drawn=differ),
         ],
     }
 
@@ -178,7 +179,7 @@ def _samples(folder: Folder, parts: list[rows.Part]) -> dict[str, Any]:
     if folder.controller is None:
         return {}
     kept = rows.columns_of(parts[0])
-    names = [name for name in run_tables.SAMPLES if name in kept]  # most severe status last
+    names = [name for name in run_tables.SAMPLES if name in kept]  # the most severe status is the last one
     counts = rows.read(parts, names).head(folder.trials)
     samples = {
         name.removeprefix(run_tables.COUNTED): {
@@ -205,14 +206,14 @@ def drawn_columns(folder: Folder, parts: list[rows.Part]) -> list[str]:
     return [name for name in rows.columns_of(parts[0]) if name not in others]
 
 
-def _alike(quantiles: dict[str, Any], trials: int, *, drawn: bool = False) -> list[str]:
+def _equal_trials(quantiles: dict[str, Any], trials: int, *, drawn: bool = False) -> list[str]:
     """Return a warning if all trials have the same metrics; drawn: whether the inputs of the trials differ."""
     known = [metric for metric in quantiles.values() if "max" in metric]
     if trials < 2 or not known or any(abs(m["max"] - m["mean"]) > SAME * abs(m["max"]) for m in known):
         return []
-    if any(m["without_value"] for m in known):  # failed trials differ from the others
+    if any(m["without_value"] for m in known):  # failed trials differ from the other trials
         return []
-    if drawn:  # for example a dispersed inertia of a body that stays at rest
+    if drawn:  # such as a dispersed inertia of a body that stays at rest
         return [f"all {trials} trials have the same metrics: the dispersions change no metric"]
     return [
         f"all {trials} trials are equal: neither [dispersion] nor the noise of [hardware] differs; one trial is enough"
@@ -258,7 +259,7 @@ def _of_larger_is_better(values: np.ndarray, finished: np.ndarray) -> dict[str, 
     Quantiles count a trial without a value as 0. Key "0.0027" has the value that 99.73 % of the trials reach.
     """
     has = finished & np.isfinite(values)
-    ordered = np.sort(-np.where(has, values, 0.0))  # best value first
+    ordered = np.sort(-np.where(has, values, 0.0))  # sorted, the best value first
     entry = _of_known(values, has) | {"min": -ordered[-1]}
     for quantile in QUANTILES:
         at = _at(ordered, quantile)
@@ -355,18 +356,18 @@ def replay(folder: Folder, trial: int) -> Replay:
     simulated = trial if campaign.run_table is None else campaign.run_table.row(trial, folder.seed)
     run = runs.simulate(campaign.ready, folder.seed, simulated, campaign.software)
     again = campaign.simulate([trial]).row(0, named=True)
-    rounding = max(_off(value, again[name]) for name, value in run.metrics.items())
+    rounding = max(_relative_difference(value, again[name]) for name, value in run.metrics.items())
     if run.status != again["status"]:
         rounding = np.inf
     off = None
     for part in folder.rows.parts()[0]:
         if part.first <= trial < part.end:
             row = rows.read([part]).filter(pl.col("trial") == trial).row(0, named=True)
-            off = max(_off(value, again[name]) for name, value in row.items())
+            off = max(_relative_difference(value, again[name]) for name, value in row.items())
     return Replay(run, off, rounding)
 
 
-def _off(a: Any, b: Any) -> float:
+def _relative_difference(a: Any, b: Any) -> float:
     """Return the relative difference of two values of a row.
 
     It is 0 if both are equal or missing. It is infinite if they differ and are not both finite floats.

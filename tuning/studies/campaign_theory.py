@@ -1,6 +1,7 @@
 """The lower bound of the error and the verdicts on stability margins of a campaign.
 
-`find` computes both and writes them to `theory.json` in the campaign's folder. The other functions read this file.
+`write_missing` computes both and writes them to `theory.json` in the campaign's folder. The other functions read
+this file.
 """
 
 import json
@@ -14,7 +15,7 @@ from ptsmc_jax.simulation import catalogues
 from tuning.studies.campaign_folder import THEORY, Folder
 
 
-def find(folder: Folder) -> None:
+def write_missing(folder: Folder) -> None:
     """Write `theory.json` if it is missing, incomplete or damaged.
 
     It has the lower bound of the RMS window error, and the verdicts on the required stability margins.
@@ -23,16 +24,16 @@ def find(folder: Folder) -> None:
         ready, table = folder.campaign.ready, folder.campaign.run_table
         pooled = 0 if table is None else min(runs.BOUND_TRIALS, table.count)
         first = [] if table is None else [table.row(k, folder.seed) for k in range(pooled)]
-        verdicts = margin_verdicts.over_trials(ready, folder.seed, _looked_at(folder))
+        verdicts = margin_verdicts.over_trials(ready, folder.seed, _rows_with_margins(folder))
         lower_bound = runs.rms_lower_bound(ready, folder.seed, first)
         theory = {"lower_bound": lower_bound, "margins": [verdict.in_summary() for verdict in verdicts]}
         store.write_json(folder.path / THEORY, theory)
 
 
 def prepare(folder: Folder) -> None:
-    """Start to compile the programs of `find` in the background, while the trials are simulated."""
+    """Start to compile the programs of `write_missing` in the background, while the trials are simulated."""
     if _lacks_theory(folder):
-        margin_verdicts.prepare(folder.campaign.ready, _looked_at(folder))
+        margin_verdicts.prepare(folder.campaign.ready, _rows_with_margins(folder))
         runs.prepare(folder.campaign.ready)
 
 
@@ -40,19 +41,19 @@ def _lacks_theory(folder: Folder) -> bool:
     return "lower_bound" not in _theory(folder) or bool(unjudged(folder))
 
 
-def _looked_at(folder: Folder) -> np.ndarray | Row | None:
+def _rows_with_margins(folder: Folder) -> np.ndarray | Row | None:
     """Return the rows of the run table whose margins are computed, or None without a run table."""
     table = folder.campaign.run_table
     return None if table is None else table.rows(np.arange(min(margin_verdicts.TRIALS, table.count)), folder.seed)
 
 
 def lower_bound_of(folder: Folder) -> float | None:
-    """Return the lower bound of the RMS window error that `find` wrote; None: there is none."""
+    """Return the lower bound of the RMS window error that `write_missing` wrote; None: there is none."""
     return _theory(folder).get("lower_bound")
 
 
 def margins_of(folder: Folder) -> list[dict[str, Any]]:
-    """Return the verdicts on margins that `find` wrote, as in `summary.json`."""
+    """Return the verdicts on margins that `write_missing` wrote, as in `summary.json`."""
     return _theory(folder).get("margins", [])
 
 

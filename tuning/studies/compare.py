@@ -34,7 +34,7 @@ from tuning.search.progress import Report, headed
 from tuning.studies import judging, stability, tuner
 
 OURS, PUBLISHED = "prescribed_time", "published"  # the prescribed-time law with tuned gains, and with published gains
-OFF = 0.1  # relative difference between the true inertia and the design model
+INERTIA_ERROR = 0.1  # relative difference between the true inertia and the design model
 MODEL_ERRORS = ("heavier", "lighter", "later")
 # keys of `tune` that are the same for every law
 KEPT = ("minimise", "statistic", "level", "torque_weight", "worst_case", "trials", "starts", "steps")
@@ -154,7 +154,7 @@ def contenders(scenario: Scenario, rivals: Rivals = Rivals()) -> dict[str, Scena
     same = {key: getattr(tune, key) for key in KEPT if getattr(tune, key) is not None}
     posed = {}
     for name, law in rivals.named.items():
-        if _is(table, law):
+        if _is_law(table, law):
             posed[name] = scenario
         elif name == OURS:
             posed[name] = _posed(gains.published_scenario(scenario), tune, same)
@@ -169,7 +169,7 @@ def contenders(scenario: Scenario, rivals: Rivals = Rivals()) -> dict[str, Scena
     return posed
 
 
-def _is(table: Any, law: Mapping[str, str]) -> bool:
+def _is_law(table: Any, law: Mapping[str, str]) -> bool:
     """Return whether the scenario's law is this law. Custom laws are compared by file, links resolved, and name."""
     if table.kind != law["kind"] or table.kind != "custom":
         return table.kind == law["kind"]
@@ -218,8 +218,8 @@ def perturbed(simulated: Scenario) -> dict[str, Scenario]:
     assert isinstance(simulated, SpacecraftScenario)
     inertia = np.asarray(simulated.true_inertia)
     changes: list[dict[str, Any]] = [
-        {"spacecraft__true_inertia": ((1.0 + OFF) * inertia).tolist()},
-        {"spacecraft__true_inertia": ((1.0 - OFF) * inertia).tolist()},
+        {"spacecraft__true_inertia": ((1.0 + INERTIA_ERROR) * inertia).tolist()},
+        {"spacecraft__true_inertia": ((1.0 - INERTIA_ERROR) * inertia).tolist()},
         {"hardware__delay": simulated.devices.delay_periods + 1},
     ]
     others = {}

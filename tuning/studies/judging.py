@@ -76,7 +76,7 @@ def verdicts_of(scenario: Scenario, trials: Trials, held_out_seed: int) -> list[
         held_out_seed: seed of these trials.
     """
     ready = study(on_flight_clock(scenario))
-    one = 0 if trials.status.size == 1 else slice(None)  # one nominal trial: a required fraction has no meaning
+    one = 0 if trials.status.size == 1 else slice(None)  # a required fraction has no meaning for one nominal trial
 
     def values(name: str) -> np.ndarray:
         return getattr(trials.metrics, name)[one]

@@ -151,18 +151,18 @@ def simulate(scenario: Scenario, x: Axis, y: Axis, seed: int, trials: int, tell:
     """
     if PERIOD in (x.key, y.key):
         scenario.need_samples(PERIOD)
-    base = _with_its_gains(changed(scenario, tune=None))  # the bounds in [tune] may be invalid for some pairs
+    base = _with_explicit_gains(changed(scenario, tune=None))  # the bounds in [tune] may be invalid for some pairs
     pairs = [(a, b) for b in y.values for a in x.values]
     studies: list[Study | str] = []
     for a, b in pairs:
         try:
-            studies.append(study(_with(base, {x.key: a, y.key: b})))
+            studies.append(study(_with_keys(base, {x.key: a, y.key: b})))
         except ScenarioError as error:
             studies.append(str(error))
     allowed = [one for one in studies if isinstance(one, Study)]
     if not allowed:
         raise ScenarioError(str(studies[0]))
-    common = _common([one.parts for one in allowed])
+    common = _with_common_clock([one.parts for one in allowed])
     cells = []
     for k, ((a, b), one) in enumerate(zip(pairs, studies, strict=True)):
         cells.append(Cell(a, b, one) if isinstance(one, str) else _cell(a, b, one, common, seed, trials))
@@ -170,7 +170,7 @@ def simulate(scenario: Scenario, x: Axis, y: Axis, seed: int, trials: int, tell:
     return Map(scenario, x, y, cells)
 
 
-def _with_its_gains(scenario: Scenario) -> Scenario:
+def _with_explicit_gains(scenario: Scenario) -> Scenario:
     """Return the scenario with explicit values of its default gains, so that other keys do not change them."""
     stated = {
         f"{where}__{name.removeprefix(table.prefix)}": getattr(table, name.removeprefix(table.prefix))
@@ -181,7 +181,7 @@ def _with_its_gains(scenario: Scenario) -> Scenario:
     return changed(scenario, **{key: value for key, value in stated.items() if value is not None})
 
 
-def _with(scenario: Scenario, values: dict[str, float]) -> Scenario:
+def _with_keys(scenario: Scenario, values: dict[str, float]) -> Scenario:
     """Return the scenario with new values of some keys.
 
     If a key has a number for each axis or mode, all of them get the value. A key with an index, such as
@@ -207,7 +207,7 @@ def _with(scenario: Scenario, values: dict[str, float]) -> Scenario:
     return changed(scenario, **changes)
 
 
-def _common(parts: list[Parts]) -> Callable[[Parts], Parts]:
+def _with_common_clock(parts: list[Parts]) -> Callable[[Parts], Parts]:
     """Return a function that gives all parts clocks of equal size and equally many substeps.
 
     One compiled program then simulates all of them.

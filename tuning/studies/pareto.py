@@ -71,7 +71,7 @@ def trace(trade: Trade, seed: int, tell: Report = lambda *_: None, journal: Jour
         trials=judged[0][1].status.size if judged else 0,
         seed=held_out_seed,
         interval_confidence=trust.CONFIDENCE,
-        lower_bound=None if trade.farther else judging.rms_lower_bound(scenario, held_out_seed),  # it depends on t_f
+        lower_bound=None if trade.farther else judging.rms_lower_bound(scenario, held_out_seed),  # depends on t_f
         rollouts=posed.evaluate.rollouts,
         gradients=posed.evaluate.gradients,
         requirements=list(scenario.requirements),
@@ -172,7 +172,7 @@ def knee_of(points: np.ndarray) -> int:
         points: peak torque and error (count, 2), in order along the front.
     """
     off = np.log(points) - np.log(points[0])
-    along = off[-1]  # scaling an axis changes all distances by one factor
+    along = off[-1]  # a scaled axis changes all distances by the same factor
     return int(np.argmax(off[:, 0] * along[1] - off[:, 1] * along[0]))
 
 

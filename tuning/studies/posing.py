@@ -115,7 +115,7 @@ def tuning_problem(scenario: Scenario, seed: int, journal: Journal | None = None
         torque_weight=table.torque_weight,
     )
     exact = scenario.exact_sign and "sign_width" not in bounds.names
-    if not exact:  # before the margins, so that these programs are compiled meanwhile
+    if not exact:  # start before the margins, so that these programs compile meanwhile
         simulations.prepare(problem.batch, objective.watched(problem))
     problem = dataclasses.replace(problem, margins=margin_rows.ask(ready, bounds, seed))
     scenario_gains = np.asarray(gains.present_values(ready.parts, bounds.names))

@@ -28,12 +28,12 @@ from tuning.studies.posing import Posed
 
 TORQUE, SENSITIVITY = "peak_torque", "peak_sensitivity"
 POINTS = 20  # default number of limits on the peak torque
-OFF = 1e9  # limit on the peak torque that is never active
-HARDLY = 0.05  # fraction of the largest useful peak torque; hardly any gains keep such a limit
+INACTIVE_LIMIT = 1e9  # limit on the peak torque that is never active
+SMALLEST_LIMIT = 0.05  # fraction of the largest useful peak torque; hardly any gains keep such a limit
 TIGHTER = 3  # largest number of searches for the least peak torque
-FEWER = 4  # number of starting points of a search whose gains are refined later
+FEWER_STARTS = 4  # number of starting points of a search whose gains are refined later
 LIMITS = (3.0, 4.0, 5.0, 6.0, 8.0, 12.0)  # default limits on the peak sensitivity [dB]
-BOUNDED = ("gain_margin", "phase_margin", SENSITIVITY)  # margins that a limit on the sensitivity bounds
+BOUNDED = ("gain_margin", "phase_margin", SENSITIVITY)  # margins that a limit on the peak sensitivity bounds
 SPAN = (0.5, 0.7, 1.0, 1.4, 2.0)  # default prescribed times, relative to the scenario's t_f
 # metrics that a faster slew may increase
 SLEW_COSTS = ("peak_torque", "peak_momentum", "peak_wheel_torque", "peak_wheel_momentum", "peak_rate", "effort")
@@ -137,7 +137,7 @@ class Torque(Trade):
     def base(self) -> Scenario:
         """Return the scenario with a requirement on the peak torque."""
         limited = tables.limit_of(self.scenario, TORQUE) is not None
-        return self.scenario if limited else _requiring(self.scenario, {TORQUE: OFF})
+        return self.scenario if limited else _requiring(self.scenario, {TORQUE: INACTIVE_LIMIT})
 
     def targets(self, posed: Posed, tell: Report) -> tuple[list[Target], list[np.ndarray]]:
         """Search without a limit, for the least torque, and for a limit between both; see `Trade.targets`."""
@@ -146,13 +146,13 @@ class Torque(Trade):
         def under(limit: float, joined: Problem = posed.problem) -> Problem:
             return replace(joined, limits=replaced(posed.problem.limits, at, limit))
 
-        loose = [replace(one, limit=OFF) if one.metric == TORQUE else one for one in posed.asked]
-        free = _found(posed, under(OFF), headed(tell, "most torque"), asked=loose)
-        highest = free.ended[at] * OFF
+        loose = [replace(one, limit=INACTIVE_LIMIT) if one.metric == TORQUE else one for one in posed.asked]
+        free = _found(posed, under(INACTIVE_LIMIT), headed(tell, "most torque"), asked=loose)
+        highest = free.ended[at] * INACTIVE_LIMIT
 
         def search(limit: float) -> tuple[Search, float]:
             report = headed(tell, "least torque")
-            found = _found(posed, under(limit, free.problem), report, FEWER, asked=())
+            found = _found(posed, under(limit, free.problem), report, FEWER_STARTS, asked=())
             return found, found.ended[at] * limit
 
         least, lowest = least_torque(search, highest)
@@ -185,7 +185,7 @@ class Margins(Trade):
     Source: Skogestad and Postlethwaite, Multivariable Feedback Control, 2005, 2.4.3.
     """
 
-    limits: tuple[float, ...] = ()  # [dB]; empty: `LIMITS`, and the scenario's limit
+    limits: tuple[float, ...] = ()  # limits on M_s [dB]; empty: `LIMITS`, and the scenario's limit
 
     against = "margins"
     purpose = "for a front against margins"
@@ -205,7 +205,7 @@ class Margins(Trade):
 
     @cached_property
     def base(self) -> Scenario:
-        """Return the scenario with the tightest limit instead of the margins that it bounds."""
+        """Return the scenario that requires the tightest limit on M_s, in place of the margins in `BOUNDED`."""
         return _requiring(self.scenario, {SENSITIVITY: self.values[-1]}, without=BOUNDED)
 
     def targets(self, posed: Posed, tell: Report) -> tuple[list[Target], list[np.ndarray]]:
@@ -216,7 +216,7 @@ class Margins(Trade):
         for value in self.values:
             name = f"|S| at most {value:g} dB" if value < np.inf else "no limit on |S|"
             limited = replace(posed.problem, margins=replace(asked, required=replaced(asked.required, at, value)))
-            found = _found(posed, limited, headed(tell, name), FEWER if targets else None)
+            found = _found(posed, limited, headed(tell, name), FEWER_STARTS if targets else None)
             targets.append(Target(value, name, found.problem))
             known.append(found.normalised)
         return targets, known
@@ -236,7 +236,7 @@ class Margins(Trade):
 class SlewTime(Trade):
     """Prescribed times t_f. One compiled program simulates all of them."""
 
-    times: tuple[float, ...] = ()  # [s]; empty: from half to twice the scenario's t_f
+    times: tuple[float, ...] = ()  # prescribed times [s]; empty: from half to twice the scenario's t_f
 
     against = "t_f"
     purpose = "for a front against t_f"
@@ -292,7 +292,7 @@ class SlewTime(Trade):
         parts = [gains.with_gains(joined.parts, {"t_f": t_f}) for t_f in self.values]
         for k in (last, 0, *range(last - 1, 0, -1)):
             name = {last: "longest time", 0: "shortest time"}.get(k, f"{self.values[k]:g} s")
-            starts, asked = None if k == last else FEWER, None if k in (0, last) else ()
+            starts, asked = None if k == last else FEWER_STARTS, None if k in (0, last) else ()
             found = _found(posed, replace(joined, parts=parts[k]), headed(tell, name), starts, asked)
             known.append(found.normalised)
             joined = found.problem if k in (0, last) else joined
@@ -371,7 +371,7 @@ def least_torque(
     Returns:
         The last outcome, and its peak torque [N m].
     """
-    limit = HARDLY * highest
+    limit = SMALLEST_LIMIT * highest
     found, peak = search(limit)
     return (found, peak) if peak > limit or tighter == 1 else least_torque(search, limit, tighter - 1)
 

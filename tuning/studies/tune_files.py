@@ -32,7 +32,7 @@ def statistics(trials: Trials, kind: str) -> dict[str, Any]:
         values = getattr(trials.metrics, name)[trials.finished]
         known = values[np.isfinite(values)]
         if known.size == 0:
-            if entry.table is None:  # else the metric needs a table that the scenario does not have
+            if entry.table is None:  # the scenario must have the table that a metric needs
                 found[name] = None
             continue
         found[name] = {
@@ -42,7 +42,7 @@ def statistics(trials: Trials, kind: str) -> dict[str, Any]:
             "q99": np.quantile(known, 0.99),
             "max": known.max(),
         }
-        if name in catalogues.LARGER_IS_BETTER:  # small values are the bad ones
+        if name in catalogues.LARGER_IS_BETTER:  # report the smallest values, which are the worst
             found[name] |= {"q01": np.quantile(known, 0.01), "min": known.min()}
         if known.size < values.size:
             found[name]["without_value"] = int(values.size - known.size)
@@ -152,7 +152,7 @@ def _trust(found: Trust, tuning: Tuning) -> dict[str, Any]:
             gain, side = gain_names.base(name), tuning.at_bound[name]
             bound = tuning.tuned.search.bounds[gain][side == "upper"]
             reason = free_gains.reason_of_bound(tuning.tuned, gain, side, bound)
-            influence[name] = reason or _beyond(tuning.beyond.get(name), bound)
+            influence[name] = reason or _influence_beyond(tuning.beyond.get(name), bound)
     errors = found.gradient_error
     return {
         "gradient_error": None if errors is None else dict(zip(("start", "end"), errors, strict=True)),
@@ -163,7 +163,7 @@ def _trust(found: Trust, tuning: Tuning) -> dict[str, Any]:
     }
 
 
-def _beyond(seen: BeyondBound | None, bound: float) -> str:
+def _influence_beyond(seen: BeyondBound | None, bound: float) -> str:
     """Return the results beyond a bound in words."""
     if seen is None:
         return f"on its bound {bound:g}; values beyond it were not simulated"
@@ -240,7 +240,7 @@ def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
     paths = _points_by_start(tuning.search.history)
     longest = max(map(len, paths))
 
-    def over_steps(of: Callable[[Step], Any], missing: Any = np.nan) -> np.ndarray:  # (steps, starts, ...)
+    def over_steps(of: Callable[[Step], Any], missing: Any = np.nan) -> np.ndarray:  # result: (steps, starts, ...)
         beyond = np.full_like(np.asarray(of(paths[0][0])), missing)
         return np.stack([[of(path[k]) if k < len(path) else beyond for path in paths] for k in range(longest)])
 
@@ -269,7 +269,7 @@ def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
     if ended:
         limit, lower_bound = tables.limit_of(scenario, "peak_torque"), tuning.lower_bounds["tuned"]
         figures["tradeoff"] = study_plots.tradeoff(ended, limit, kind, lower_bound)
-    if tuning.trust is not None and tuning.trust.sensitivities:  # empty if no trial reaches its end
+    if tuning.trust is not None and tuning.trust.sensitivities:  # the table is empty if no trial reaches its end
         figures["sensitivities"] = study_plots.tornado(tuning.trust.sensitivities)
     if tuning.trust is not None:
         figures["profiles"] = study_plots.profiles(

@@ -170,7 +170,8 @@ def tune(
         report("profiles, sensitivities and margins of the gains found", 0, 0, outcome.value, outcome.violation)
         trust_in_it = _trust(posed, judged)
         profiles = trust_in_it.profiles
-        beyond = _beyond(judged, {name: side for name, side in at_bound.items() if not profiles[name].flat})
+        relevant = {name: side for name, side in at_bound.items() if not profiles[name].flat}
+        beyond = _results_beyond_bounds(judged, relevant)
     return Tuning(
         tuned=judged.scenario,
         gains=judged.gains,
@@ -215,26 +216,27 @@ def _search_and_judge(
     while True:
         report("verifying on held-out trials", 0, 0, outcome.value, outcome.violation)
         judged = _judge(scenario, posed, outcome, judging.seed_of_judge(seed, len(earlier)))
-        over = _over(outcome, judged.verdicts)
+        over = _broken_ratios(outcome, judged.verdicts)
         if not over or outcome.interrupted or len(earlier) + 1 >= tries:
             return judged, earlier, posed
         earlier.append(Try(judged.seed, judged.gains, outcome.margins, over))
         reached = dict(zip(outcome.problem.rows, outcome.worst, strict=True))  # value over limit on the training trials
         margins = {name: 1.0 - float(reached[name]) / (FARTHER * over[name]) for name in over}
         more = look(outcome.gains, starts, margins=outcome.margins | margins)
-        outcome = replace(more, history=[*outcome.history, *_after(outcome.history, more.history)])
+        outcome = replace(more, history=[*outcome.history, *_renumbered(outcome.history, more.history)])
 
 
 def _in_larger_bounds(outcome: Search, posed: Posed, journal: Journal | None, report: Report) -> tuple[Search, Posed]:
-    """Repeat the search in wider bounds while gains end on default bounds that affect the result, see `_that_matter`.
+    """Repeat the search in wider bounds while gains end on default bounds that affect the result.
 
-    The bounds of several gains may be widened at the same time. A search without improvement ends the repetition.
+    `_relevant_bounds` selects these gains. The bounds of several gains may be widened at the same time. A search
+    without improvement ends the repetition.
     """
     defaulted = posed.ready.scenario.defaulted
     for _ in range(WIDENED):
         if outcome.interrupted or not posed.with_gradients:
             break
-        sides = _that_matter(posed, outcome, posed.evaluate.bounds.at_bound(outcome.gains))
+        sides = _relevant_bounds(posed, outcome, posed.evaluate.bounds.at_bound(outcome.gains))
         scenario = posed.ready.scenario
         moved = free_gains.widened(scenario, {gains.base(name): side for name, side in sides.items()}, defaulted)
         if not moved:
@@ -243,7 +245,7 @@ def _in_larger_bounds(outcome: Search, posed: Posed, journal: Journal | None, re
         larger = posing.tuning_problem(posing.with_bounds(scenario, moved), posed.seed, journal)
         larger.evaluate.count_on(posed.evaluate)
         more = larger.search(larger.problem, outcome.gains, 1, report=report)
-        history = [*outcome.history, *_after(outcome.history, more.history)]
+        history = [*outcome.history, *_renumbered(outcome.history, more.history)]
         better = (more.violation, more.value) < (outcome.violation, outcome.value * (1.0 - trust.FLAT))
         if not better:
             posed.evaluate.count_on(larger.evaluate)
@@ -252,10 +254,10 @@ def _in_larger_bounds(outcome: Search, posed: Posed, journal: Journal | None, re
     return outcome, posed
 
 
-def _that_matter(posed: Posed, outcome: Search, sides: dict[str, str]) -> dict[str, str]:
-    """Return the gains on a bound that matters.
+def _relevant_bounds(posed: Posed, outcome: Search, sides: dict[str, str]) -> dict[str, str]:
+    """Return those gains on a bound whose change affects the result.
 
-    It matters if moving the gain inwards by a tenth of its interval changes F or the violation by more than 0.01.
+    The change moves the gain inwards by a tenth of its interval. It must change F or the violation by more than 0.01.
     """
     names, found = posed.evaluate.bounds.names, outcome.normalised
     points = np.asarray([found, *(np.where(np.isin(names, name), np.abs(found - 0.1), found) for name in sides)])
@@ -325,7 +327,7 @@ def _trust(posed: Posed, judged: _Judged) -> Trust:
     )
 
 
-def _over(outcome: Search, verdicts: list[Verdict]) -> dict[str, float]:
+def _broken_ratios(outcome: Search, verdicts: list[Verdict]) -> dict[str, float]:
     """Return value over limit for each metric that breaks its limit on the held-out trials.
 
     The result is empty if a search with more distance from the limits cannot help. It can help if the search kept every
@@ -335,19 +337,19 @@ def _over(outcome: Search, verdicts: list[Verdict]) -> dict[str, float]:
     over = {one.metric: one.margin if one.interpretation == "ensemble" else one.worst / one.limit
             for one in verdicts if not one.met and one.limit}  # fmt: skip
     helped = bool(np.all(outcome.worst <= 1.0)) and all(np.isfinite(ratio) and ratio > 1.0 for ratio in over.values())
-    reached = dict(zip(outcome.problem.rows, outcome.worst, strict=True))  # 0: the training trials do not depend on it
+    reached = dict(zip(outcome.problem.rows, outcome.worst, strict=True))  # 0 if no training trial depends on the limit
     # a loop with a limit cycle has no margins, see `theory.limit_cycles`; more distance from the limits does not help
     swings = any(one.at_least and one.worst == 0.0 for one in verdicts)
     return over if helped and not swings and all(reached[name] > 0.0 for name in over) else {}
 
 
-def _after(history: list[Step], more: list[Step]) -> list[Step]:
+def _renumbered(history: list[Step], more: list[Step]) -> list[Step]:
     """Return the steps of a repeated search with new numbers of starting points, which follow those of the history."""
     first = 1 + max((step.start for step in history), default=-1)
     return [replace(step, start=first + step.start) for step in more]
 
 
-def _beyond(judged: _Judged, at_bound: dict[str, str]) -> dict[str, BeyondBound]:
+def _results_beyond_bounds(judged: _Judged, at_bound: dict[str, str]) -> dict[str, BeyondBound]:
     """Simulate each gain that ended on a bound at a value beyond the bound, with the other gains unchanged.
 
     The result is empty for the continuous loop, and if the objective is not the window error. Gains without a valid
