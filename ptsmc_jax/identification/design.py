@@ -69,7 +69,7 @@ def design(
     if not loaded.sampled or duration < 20.0 * period:
         raise ScenarioError("a design needs the sampled loop and a manoeuvre of at least 20 control periods")
     t = period * np.arange(round(duration / period) + 1)
-    shapes = np.stack([np.sin(np.pi * k * t / t[-1]) for k in HALF_WAVES])  # (waves, rows) momentum per amplitude
+    shapes = np.stack([np.sin(np.pi * k * t / t[-1]) for k in HALF_WAVES])  # (waves, rows) for unit amplitudes
     log = _silent(loaded, t)
     problem = parameters.build(loaded, [log])
     limits = _Limits.of(loaded, problem, rate, torque)
@@ -115,13 +115,13 @@ def design(
 
 @dataclass(frozen=True)
 class _Limits:
-    """Limits of a manoeuvre."""
+    """Limits of rate, torque and momentum that a manoeuvre must keep, and the maps to compute them."""
 
     torque: float  # largest torque about an axis [N m]
     rate: float  # largest rate about an axis [rad/s]
-    inverse: np.ndarray  # (m, m) map from momentum to rate: the inverse of the inertia
-    channels: np.ndarray  # (channels, m) torque of each channel for a torque about each axis
-    momentum: float  # largest momentum of each wheel [N m s]
+    inertia_inverse: np.ndarray  # (m, m) map from momentum to rate
+    allocation: np.ndarray  # (channels, m) torque of each channel for a unit torque about each axis
+    momentum: float  # largest momentum of each wheel [N m s], infinite without a limit
 
     @staticmethod
     def of(loaded: Any, problem: Problem, rate: float, torque: float | None) -> "_Limits":
@@ -139,11 +139,11 @@ class _Limits:
 
     def scaled(self, momentum: np.ndarray, period: float) -> np.ndarray:
         """Return a momentum profile (rows, m) with a factor that makes it meet all limits with 5 % to spare."""
-        stored, push = momentum @ self.channels.T, np.diff(momentum, axis=0) / period
+        stored, push = momentum @ self.allocation.T, np.diff(momentum, axis=0) / period
         largest = [
             np.max(np.abs(push)) / self.torque,
-            np.max(np.abs(push @ self.channels.T)) / self.torque,
-            np.max(np.abs(momentum @ self.inverse.T)) / self.rate,
+            np.max(np.abs(push @ self.allocation.T)) / self.torque,
+            np.max(np.abs(momentum @ self.inertia_inverse.T)) / self.rate,
             np.max(np.abs(stored)) / self.momentum,
         ]
         return momentum * (0.95 / max(largest))

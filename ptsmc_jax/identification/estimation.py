@@ -28,12 +28,12 @@ from ptsmc_jax.scenario.tables import Scenario
 
 BUCKET = 256  # rows of a log are padded to a multiple of it, so that similar logs share compiled programs
 STEPS = 40  # largest number of steps of a local search
-LONGEST = 3.0  # step, in sigmas of the prior
-NEAR = 0.3  # largest step that ends a search with noise on the acceleration, in sigmas of the estimate
+LONGEST_STEP = 3.0  # longest step of a local search, in sigmas of the prior
+CONVERGED_WITH_NOISE = 0.3  # largest step that ends a search with noise on the acceleration, in sigmas of the estimate
 CONVERGED = 1e-3  # largest step of a converged search, in sigmas of the estimate
 SLACK = (0.3, 0.03, 0.003, 0.0003)  # noise of the acceleration in a search, relative to the acceleration [s^0.5]
 SCREENINGS = 4  # largest number of times that outliers are determined again
-POOR = 1.5  # normalised square of the innovations, by its median, above which a search begins with noise
+POOR_FIT = 1.5  # median normalised square of innovations above which a search begins with noise
 LAGS = 25  # number of lags of the autocorrelation
 WHITE = 0.05  # largest autocorrelation that counts as white in a long log
 CONSISTENT = (0.8, 1.25)  # mean normalised square of innovations that fit their variance, in a long log
@@ -57,7 +57,7 @@ class Fit:
     innovations: Innovations  # arrays (rows - 1, components)
     track: Track
     adjusted: Innovations | None = None
-    moved: float = 0.0  # RMS over the parameters, in sigmas
+    moved: float = 0.0  # distance of the most likely parameters from the estimates, RMS in sigmas
 
     @property
     def whitened(self) -> np.ndarray:
@@ -96,7 +96,7 @@ class Fit:
         """
         readings = np.maximum(np.sum(np.isfinite(self.whitened), axis=0), 1)
         bound = np.maximum(WHITE, RARE / np.sqrt(readings))
-        spread = RARE * np.sqrt(2.0 / np.sum(readings))  # of the mean of squares of normal numbers
+        spread = RARE * np.sqrt(2.0 / np.sum(readings))  # of the mean square of normal random numbers
         consistent = min(CONSISTENT[0], 1.0 - spread) < self.square < max(CONSISTENT[1], 1.0 + spread)
         return consistent and self.moved < FARTHEST and bool(np.all(np.abs(self.autocorrelation()) < bound))
 
@@ -116,7 +116,7 @@ class Identification:
     problem: Problem
     z: np.ndarray  # estimated coordinates (n,)
     start: np.ndarray  # numbers of the scenario (k,)
-    prior: np.ndarray  # their prior 1 sigma (k,), infinite without prior knowledge
+    prior: np.ndarray  # prior 1 sigma of the numbers (k,), infinite without prior knowledge
     estimate: np.ndarray  # (k,)
     covariance: np.ndarray  # (k, k)
     undetermined: list[str]  # sentences on combinations that the data do not determine
@@ -213,7 +213,7 @@ def prepared(problem: Problem, log: Measurements) -> Prepared:
 
 
 def _gate(loaded: Scenario) -> float:
-    """Return the largest accepted normalised square of a group of readings, divided by the size of the group."""
+    """Return the largest accepted mean normalised square of the innovations of a group of readings [-]."""
     rate = 1e-6 if loaded.identify is None else loaded.identify.outliers
     return float(stats.chi2.isf(rate, 3) / 3.0) if rate > 0.0 else np.inf
 
@@ -260,7 +260,7 @@ class Search:
             found = filtering.innovations(self._at(z, slack), rows, kind, covariance_derivatives=exact)
             return (found.value, found.variance), found
 
-        def along(directions: Array) -> Any:  # of one device
+        def along(directions: Array) -> Any:  # derivatives that one device computes
             one = jax.vmap(lambda d: jax.jvp(of, (z,), (d,), has_aux=True)[1:], out_axes=(-1, None))(directions[0])
             return jax.tree.map(lambda v: v[None], one)
 
@@ -293,10 +293,17 @@ class Search:
     def derivatives(
         self, z: np.ndarray, logs: Sequence[Prepared], *, exact: bool = True
     ) -> tuple[float, np.ndarray, np.ndarray, float]:
-        """Return log-likelihood, gradient (n,), information (n, n) of logs and prior, and the mean square.
+        """Return the log-likelihood of logs and prior, its derivatives, and the fit of the logs.
 
-        If not exact, gradient and information lack the derivatives of the predicted covariance. They take half of the
-        time, and are good enough for a first search if no noise level is free.
+        Args:
+            z: coordinates (n,) [-].
+            logs: the logs.
+            exact: whether gradient and information include the derivatives of the predicted covariance. Without them
+                they take half of the time, and are good enough for a first search if no noise level is free.
+
+        Returns:
+            Log-likelihood, its gradient (n,), and the information (n, n) of logs and prior. Then the mean square of the
+            innovations relative to their 1 sigma, averaged over the logs.
         """
         value, gradient, information = -0.5 * float(self.known @ z**2), -self.known * z, np.diag(self.known)
         squares = []
@@ -333,11 +340,11 @@ class Search:
             z: starting point.
             acceleration: usual acceleration in the logs [rad/s^2]; 0: no noise is added.
         """
-        if acceleration > 0.0 and max(self._scale(self.innovations(z, log)) for log in self.logs) > POOR:
+        if acceleration > 0.0 and max(self._scale(self.innovations(z, log)) for log in self.logs) > POOR_FIT:
             for factor in SLACK:
                 self.slack = jnp.asarray(factor * acceleration)
                 self.report(f"the fit is poor: a filter with noise of {float(self.slack):.2g} rad/s^1.5")
-                z = self._run(z, 1, NEAR).z
+                z = self._run(z, 1, CONVERGED_WITH_NOISE).z
             self.slack = jnp.zeros(())
         return self._run(z, SCREENINGS, CONVERGED)
 
@@ -382,11 +389,11 @@ class Search:
         damping, converged, steps = 0.0, False, 0
         for steps in range(1, STEPS + 1):
             sizes, directions = np.linalg.eigh(information)
-            directions = directions[:, sizes >= 1.0]  # the others keep their prior
+            directions = directions[:, sizes >= 1.0]  # other directions keep their prior
             sizes = sizes[sizes >= 1.0]
             while True:
                 step = directions @ ((directions.T @ gradient) / (sizes + damping))
-                step = step * min(1.0, LONGEST / max(float(np.linalg.norm(step)), 1e-300))
+                step = step * min(1.0, LONGEST_STEP / max(float(np.linalg.norm(step)), 1e-300))
                 size = float(np.sqrt(step @ information @ step))
                 there = self.derivatives(z + step, logs, exact=exact)
                 if _finite(there) and there[0] >= value - 1e-9 * abs(value):
@@ -475,7 +482,7 @@ def _result(
     def predicted(log: Measurements) -> Fit:
         fit, good = fitted(log)
         _, gradient, information, _ = search.derivatives(z, [good])
-        kept = np.linalg.pinv(of_z)  # the prior is in it already
+        kept = np.linalg.pinv(of_z)  # information of the estimate, which includes the prior
         step = np.linalg.solve(information - np.diag(search.known) + kept, gradient + search.known * z)
         moved = float(np.sqrt(step @ kept @ step / step.size))
         return replace(fit, adjusted=search.innovations(z + step, good), moved=moved)

@@ -22,7 +22,7 @@ from ptsmc_jax.numerics import attitude, guards, integrators, matrices
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
 from ptsmc_jax.plants.rigid_body import AttitudeState
 
-MOST = 10_000_000  # integration steps of a log
+MOST_STEPS = 10_000_000  # largest number of integration steps of a log
 WIDE = 10.0  # prior 1 sigma of a state without a reading in the first row, relative to its estimate
 
 
@@ -56,7 +56,7 @@ class Rows(NamedTuple):
 
     t: Any  # (rows,) [s]
     dt: Any  # (rows,) time to the next row [s]; 0 in the last row and in padding
-    readings: dict[str, Any]  # (rows, size), with any value for a missing component
+    readings: dict[str, Any]  # readings by name, (rows, size); the value of a missing component is arbitrary
     valid: Any  # (rows, components) bool
     command: Any  # (rows, channels), see `Measurements`
     start_rate: Any  # (3,) rate at the first row if the gyro has no reading there [rad/s]; (0,) for other plants
@@ -95,9 +95,9 @@ def rows_of(log: Measurements, step: float, bucket: int = 1) -> Rows:
     raised for a log that needs too many steps.
     """
     pieces = np.maximum(1, np.ceil(np.diff(log.t) / step * (1.0 - 1e-9)).astype(int))
-    if pieces.sum() > MOST:
-        raise RefusedError(f"{log.name} needs {pieces.sum()} integration steps, but may need at most {MOST}; check its "
-                           f"times, which have a gap of {np.max(np.diff(log.t)):.3g} s")  # fmt: skip
+    if pieces.sum() > MOST_STEPS:
+        raise RefusedError(f"{log.name} needs {pieces.sum()} integration steps, but may need at most {MOST_STEPS}; "
+                           f"check its times, which have a gap of {np.max(np.diff(log.t)):.3g} s")  # fmt: skip
     first = np.append(0, np.cumsum(pieces))
     count = int(first[-1]) + 1
     source = np.full(count, -1)
@@ -105,7 +105,7 @@ def rows_of(log: Measurements, step: float, bucket: int = 1) -> Rows:
     t = np.interp(np.arange(count), first, log.t)
     before = np.searchsorted(first, np.arange(count), side="right") - 1
     command = log.command[before]
-    if log.wheel_inertia is not None:  # speeds change linearly
+    if log.wheel_inertia is not None:  # wheel speeds change linearly
         command = np.stack([np.interp(t, log.t, column) for column in log.command.T], axis=1)
     valid, readings = [], {}
     for name, values in log.readings.items():
@@ -118,7 +118,7 @@ def rows_of(log: Measurements, step: float, bucket: int = 1) -> Rows:
         return np.concatenate([values, np.repeat(values[-1:], more, axis=0)])
 
     return Rows(
-        np.append(t, t[-1] + np.arange(1.0, more + 1.0)),  # increasing, so that commands can be interpolated
+        np.append(t, t[-1] + np.arange(1.0, more + 1.0)),  # increasing times, so that commands can be interpolated
         np.pad(np.diff(t), (0, 1 + more)),
         {name: padded(values) for name, values in readings.items()},
         np.pad(np.concatenate(valid, axis=1), ((0, more), (0, 0))),
@@ -268,7 +268,7 @@ def _axes(turn: Float[Array, "3"]) -> Float[Array, "3 3"]:
 def _predicted(model: Model, carry: _Carry, t: Scalar, dt: Scalar, command: Array, due: Array, kind: Kind) -> _Carry:
     """Return the filter after an interval, before the readings at its end."""
     plant, actuators = model.plant, model.actuators
-    if kind.wheel_inertia is not None:  # the momentum is measured
+    if kind.wheel_inertia is not None:  # the wheels' momentum is measured
         scale = 1.0 if actuators.scale is None else actuators.scale
         drive = Drive(None, due, scale * kind.wheel_inertia * command, jnp.asarray(False))
     else:
@@ -289,10 +289,10 @@ def _predicted(model: Model, carry: _Carry, t: Scalar, dt: Scalar, command: Arra
     f = jnp.eye(sizes + b + m).at[:sizes, :sizes].set(moved[:sizes, :sizes])
     f = f.at[:sizes, sizes + b :].set(moved[:sizes, sizes:]) if m else f
     # the steps of the random walks come at the start of the interval, as in a simulation
-    first = 3 if model.spacecraft else sizes - model.modes.size - plant.inputs  # index of the velocity
+    first = 3 if model.spacecraft else sizes - model.modes.size - plant.inputs  # first index of the velocity
     hidden = sizes - first - plant.inputs
     rates = jnp.zeros(hidden)
-    if hasattr(plant, "coupling"):  # the modes follow the log, too
+    if hasattr(plant, "coupling"):  # the noise drives the flexible modes, too
         rates = rates.at[hidden // 2 :].set(jnp.sum(plant.coupling**2, axis=1))
     noise = [jnp.zeros(first), model.slack**2 * dt * jnp.concatenate([jnp.ones(plant.inputs), rates])]
     noise += [model.bias_walk**2 * dt * jnp.ones(b)]

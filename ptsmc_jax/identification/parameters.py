@@ -32,9 +32,9 @@ from ptsmc_jax.signals import disturbances
 
 # parameters of sensors that only [hardware] has, and that [[sensors]] replaces
 OF_HARDWARE = ("attitude_noise", "rate_noise", "gyro_scale", "star_tracker_misalignment")
-GYRO_BIAS = "gyro_bias"  # a state of the filter, not a constant
+GYRO_BIAS = "gyro_bias"  # is estimated as a state of the filter, not as a constant
 UNKNOWN_BIAS = 0.02  # 1 sigma of an unknown gyro bias [rad/s]
-USUAL = {  # 1 sigma of a parameter without a dispersion: relative, in rad, or a damping ratio
+USUAL = {  # prior 1 sigma of a parameter without a dispersion: relative, in rad, or of a damping ratio
     "inertia": 0.3, "actuator_scale": 0.1, "actuator_misalignment": 0.03, "gyro_scale": 0.02,
     "star_tracker_misalignment": 0.02, "noise": 1.0, "torque_lag": 0.7, "mode_frequency": 0.2, "mode_damping": 0.005,
     "mode_coupling": 0.3, "disturbance_amplitude": 1.0, "disturbance_phase": 2.0,
@@ -271,7 +271,7 @@ def _catalogue(
     def spread(name: str, count: int) -> tuple[np.ndarray, bool]:
         """Return the 1 sigma of each number, (count,), and whether [dispersion] gives it."""
         table: Any = getattr(prior, name, None)
-        if not hasattr(table, "of"):  # without a dispersion, or with a phase that is uniform over the circle
+        if not hasattr(table, "of"):  # no dispersion is given, or a phase is uniform over the circle
             return np.full(count, usual["noise" if name.endswith("_noise") else name]), False
         return np.maximum(table.of(count) * (1.0 if table.name.endswith("normal") else 1.0 / np.sqrt(3.0)), 1e-9), True
 
@@ -315,7 +315,7 @@ def _catalogue(
             lambda model, new: with_actuators(model, scale=new),
             channels, "-", "factor",
         ),
-        "delay": field(  # below zero it has no meaning; a tiny delay keeps its derivative
+        "delay": field(  # a delay below 0 has no meaning, and at 0 the derivative would vanish
             "delay", lambda m: m.delay, lambda m, new: replace(m, delay=jnp.maximum(new[0], 1e-9)), 1, "s", "add"
         ),
         "disturbance_bias": field(
@@ -416,7 +416,7 @@ def _misalignment(model: Model, axes: np.ndarray, sizes: np.ndarray, known: bool
     A rotation of a channel about its own axis has no effect.
     """
     directions = axes if model.actuators.directions is None else np.asarray(model.actuators.directions)
-    across = [np.linalg.svd(direction[None])[2][1:] for direction in directions.T]  # (2, 3) each
+    across = [np.linalg.svd(direction[None])[2][1:] for direction in directions.T]  # (2, 3) for each channel
 
     def write(model: Model, c: Array) -> Model:
         turned = []
@@ -486,7 +486,10 @@ def by_coordinates(inertia: np.ndarray) -> np.ndarray:
 
 
 def _full_rank(factor: np.ndarray, size: float) -> np.ndarray:
-    """Return the factor with singular values of at least 0.3 `size`: with equal moments, the axes are arbitrary."""
+    """Return a factor of the prior covariance (n, n) with its singular values raised to at least 0.3 `size`.
+
+    With equal moments of inertia the principal axes are arbitrary, and the factor would be singular.
+    """
     u, s, vt = np.linalg.svd(factor)
     return (u * np.maximum(s, 0.3 * size)) @ vt
 

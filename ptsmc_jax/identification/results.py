@@ -98,7 +98,7 @@ def _put_disturbance(
         if key == "amplitude":
             dispersion[name] = relative
         else:
-            dispersion.pop(name, None)  # the phase is known now
+            dispersion.pop(name, None)  # the phase is no longer random
     tables["disturbance"] = terms[0] if len(terms) == 1 else {"kind": "sum", "terms": terms}
 
 
@@ -171,7 +171,10 @@ def components(fit: Fit) -> list[str]:
 
 
 def innovations(fit: Fit) -> tuple[np.ndarray, np.ndarray]:
-    """Return innovations and their 1 sigma at all rows of the log except the first; NaN without a reading."""
+    """Return the innovations and their 1 sigma at all rows of the log except the first.
+
+    They are NaN for missing readings and for outliers.
+    """
     sampled = fit.rows.source[1:] >= 0
     value, variance, accepted = (part[sampled] for part in fit.innovations)
     return np.where(accepted, value, np.nan), np.where(accepted, np.sqrt(variance), np.nan)

@@ -23,8 +23,8 @@ from ptsmc_jax.simulation.catalogues import UNITS
 
 FEWEST = 10  # smallest number of rows of a log
 UNIT_NORM = 1e-3  # largest error of the norm of a quaternion: telemetry often has few digits
-RPM = 2.0 * np.pi / 60.0  # [rad/s]
-MISFIT = 0.5  # largest difference between the rotations by attitude and by gyro, relative to the rotation
+RPM = 2.0 * np.pi / 60.0  # one revolution per minute [rad/s]
+GYRO_DISAGREES = 0.5  # largest median difference of the rotations by attitude and by gyro, relative to the rotation
 OUTLIER = 10.0  # third difference of an outlier, relative to the median
 PARTS = 400  # number of parts of a log in which attitude and gyro are compared
 Values = np.ndarray
@@ -38,7 +38,7 @@ class Measurements(NamedTuple):
     readings: dict[str, Values]  # "attitude" (rows, 4) [-] and "rate" (rows, 3) [rad/s], or "x" (rows, n)
     command: Values  # (rows, channels) held until the next row [N m]; with `wheel_inertia` wheel speeds [rad/s]
     by_channel: bool = False  # whether the columns of `command` are actuator channels; otherwise they are body axes
-    wheel_inertia: float | None = None  # [kg m^2]; None: the command is a torque
+    wheel_inertia: float | None = None  # inertia of a wheel [kg m^2]; None: the command is a torque
 
 
 def read(path: Path) -> pl.DataFrame:
@@ -333,7 +333,7 @@ def _check_motion(table: _Table, t: Values, readings: dict[str, Values]) -> None
     turns = (Rotation.from_quat(q[ends[:-1]]).inv() * Rotation.from_quat(q[ends[1:]])).as_rotvec()
     size, off = np.linalg.norm(turns, axis=1), np.linalg.norm(turns - np.diff(integral, axis=0), axis=1)
     clear = (size > 0.02) & (size < 0.5)
-    if clear.sum() >= 5 and np.median(off[clear] / size[clear]) > MISFIT:
+    if clear.sum() >= 5 and np.median(off[clear] / size[clear]) > GYRO_DISAGREES:
         raise RefusedError(
             f"{table.name} has rates that do not fit its attitudes: their integral differs from the rotation by a "
             f"median of {100.0 * np.median(off[clear] / size[clear]):.3g} %; check telemetry.rate_unit, order and "
