@@ -89,7 +89,7 @@ def _rows(summary: Campaign, extreme: str) -> list[tuple[str, ...]]:
         far: Quantile | None = found.high if extreme == "max" else found.low
         if pointing_report.is_index(name) or far is None:
             continue
-        never = found.without_value > failed  # such as runs that end but never settle
+        never = found.without_value > failed  # trials without a value, such as runs that end but never settle
         largest = "none" if never else digits(getattr(found, extreme), ".3g")
         between = f"{digits(far.low, '.3g')}..{digits(far.high, '.3g')}"
         values = (digits(found.median.value, ".3g"), digits(far.value, ".3g"))
@@ -114,7 +114,8 @@ def drivers(summary: Campaign) -> Iterator[str]:
         texts = []
         for name in strongest:
             rank = sensitivities[name].rank_correlation
-            correlation = "" if rank is None else f"rank correlation {rank:+.2f}, "  # none for the number of a wheel
+            # the number of a wheel has no rank correlation
+            correlation = "" if rank is None else f"rank correlation {rank:+.2f}, "
             texts.append(f"{name} ({correlation}{100 * explained[name]:.0f} % of the variance of the ranks)")
         if texts:
             yield f"{metric} is driven by {', '.join(texts)}"
@@ -135,7 +136,7 @@ def gains(scenario: dict[str, Any], plant: str) -> Table:
         given = scenario.get(table, {})
         if isinstance(given, list):  # [[sensors]] have no gains
             continue
-        custom = given.get("kind") == "custom"  # its class, which reading does not run, has the units
+        custom = given.get("kind") == "custom"  # units are in its class, which is not run here
         kinds: Any = SCENARIOS[plant].TABLES.get(table, {})
         struct = kinds.get(given.get("kind"))
         units = {key.name: key.unit for key in keys.of(struct, SCENARIOS[plant].unit_of_d)} if struct else {}

@@ -23,7 +23,7 @@ class Value:
     unit: str
     of: Callable[[Law], Number]
     digits: str = ".3g"
-    interval: Callable[[Law], Interval] = lambda law: None  # 95 %
+    interval: Callable[[Law], Interval] = lambda law: None  # 95 % interval of the number
 
 
 @dataclass(frozen=True)
@@ -49,8 +49,8 @@ def _angles(bounds: Interval) -> Interval:
     return None if bounds is None else (ARCSEC * pointing(bounds[0]), ARCSEC * pointing(bounds[1]))
 
 
-def _with_model_error(name: str, change: str) -> Value:
-    """Return the error with a change that the law does not know, a key of `CHANGES`."""
+def _error_column(name: str, change: str) -> Value:
+    """Return the column of the error with a change that the law does not know, a key of `CHANGES`."""
     return Value(
         name,
         "arcsec",
@@ -61,8 +61,11 @@ def _with_model_error(name: str, change: str) -> Value:
     )
 
 
-def _hold(name: str) -> Value:
-    """Return a margin of the nominal loop in the hold phase; if it is required, the worst of the dispersed loops."""
+def _margin_column(name: str) -> Value:
+    """Return the column of a margin in the hold phase.
+
+    The margin is the worst of the dispersed loops if it is required, otherwise the margin of the nominal loop.
+    """
 
     def of(law: Law) -> Number:
         verdict = next((one for one in law.verdicts if one.metric == name), None)
@@ -71,7 +74,7 @@ def _hold(name: str) -> Value:
         if law.margins is None or "hold" not in law.margins:
             return None
         left = law.margins["hold"].numbers[name]
-        return math.inf if left is None else left  # null is unlimited
+        return math.inf if left is None else left  # null means that the margin is unlimited
 
     return Value(name.removesuffix("_margin").replace("_", " "), MARGINS[name].unit, of)
 
@@ -119,7 +122,7 @@ QUESTIONS = (
     ),
     Question(
         "What margins are left?",
-        tuple(_hold(name) for name in MARGINS),
+        tuple(_margin_column(name) for name in MARGINS),
         1,
         logarithmic=False,
         limit="gain_margin",
@@ -131,9 +134,9 @@ QUESTIONS = (
         "What if the model is wrong?",
         (
             dataclasses.replace(ERROR, name="as modelled"),
-            _with_model_error("inertia + 10 %", "heavier"),
-            _with_model_error("inertia - 10 %", "lighter"),
-            _with_model_error("a period later", "later"),
+            _error_column("inertia + 10 %", "heavier"),
+            _error_column("inertia - 10 %", "lighter"),
+            _error_column("a period later", "later"),
         ),
         4,
         what="RMS pointing error",

@@ -20,7 +20,7 @@ def of(front: Front) -> Report:
     else:
         headline, mood = heading(front), "calm"
     blocks = [results(front), Text(list(remarks(front))), gains(front)]
-    lines = [*answers(front), *([heading(front)] if front.requirements else []), *warnings(front.warnings)]
+    lines = [*main_results(front), *([heading(front)] if front.requirements else []), *warnings(front.warnings)]
     return Report(headline, mood, lines, [Section(KINDS[front.against].title, blocks)])
 
 
@@ -78,9 +78,9 @@ def spread(point: Point) -> str:
     return f"{50 * (high - low) / point.rms:.1f} %"
 
 
-def answers(front: Front) -> Iterator[str]:
-    """Return the main results: errors of a few points of the front, with their torque, margins or time."""
-    yield from {"torque": _of_torque, "margins": _of_margins, "t_f": _of_times}[front.against](front)
+def main_results(front: Front) -> Iterator[str]:
+    """Return lines with the main results: errors of a few points of the front, with their torque, margins or time."""
+    yield from {"torque": _torque_results, "margins": _margin_results, "t_f": _time_results}[front.against](front)
 
 
 def remarks(front: Front) -> Iterator[str]:
@@ -105,8 +105,8 @@ def remarks(front: Front) -> Iterator[str]:
         yield f"the published gains cannot be simulated in this scenario: {front.published_unavailable}"
 
 
-def _of_torque(front: Front) -> Iterator[str]:
-    """Return the most accurate point, the knee and the point with the least torque."""
+def _torque_results(front: Front) -> Iterator[str]:
+    """Return lines on the most accurate point, the knee and the point with the least torque."""
     kept = sorted((point for point in front.kept if point.rms > 0.0), key=lambda point: point.peak)
     labelled = {id(point): "knee" for point in kept if point.knee}
     if len(kept) > 1:
@@ -117,8 +117,8 @@ def _of_torque(front: Front) -> Iterator[str]:
             yield f"RMS error {found} at a largest peak torque of {peak} ({labelled[id(point)]})"
 
 
-def _of_margins(front: Front) -> Iterator[str]:
-    """Return the cost of the usual limit on |S|, and the limits that the held-out trials exceed."""
+def _margin_results(front: Front) -> Iterator[str]:
+    """Return lines on the cost of the usual limit on |S|, and on limits that the held-out trials exceed."""
     loose = next((point for point in front.points if not math.isfinite(point.value)), None)
     limited = [point for point in front.points if math.isfinite(point.value)]
     keeping = [point for point in limited if point.rms > 0.0 and _keeps(point)]
@@ -137,8 +137,8 @@ def _of_margins(front: Front) -> Iterator[str]:
             yield f"the gains found for |S| at most {point.value:g} dB exceed it on the held-out trials: {found} dB"
 
 
-def _of_times(front: Front) -> Iterator[str]:
-    """Return the shortest time that meets every requirement, and the cost of the fastest slew."""
+def _time_results(front: Front) -> Iterator[str]:
+    """Return lines on the shortest time that meets every requirement, and on the cost of the fastest slew."""
     shortest = min((point for point in front.points if point.meets), key=lambda point: point.value, default=None)
     if shortest is not None and front.requirements:
         found = error(shortest.rms, front.plant)

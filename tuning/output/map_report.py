@@ -32,7 +32,7 @@ def lines(pairs: Sequence[Mapping[str, Any]], keys: tuple[str, str], plant: str)
         plant: its kind.
     """
     simulated = [pair for pair in pairs if pair["status"] == "simulated"]
-    with_error = [pair for pair in simulated if pair["window_error"] == pair["window_error"]]  # not NaN
+    with_error = [pair for pair in simulated if pair["window_error"] == pair["window_error"]]  # is not NaN
     if with_error:
         best = min(with_error, key=lambda pair: (_failed(pair), pair["window_error"]))
         failed = f"; {_failed(best):.0f} of its trials failed or did not converge at t_f" if _failed(best) else ""

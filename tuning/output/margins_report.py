@@ -7,7 +7,7 @@ from tuning.output.formats import digits
 from tuning.output.report import Report, Section, Table
 from tuning.output.summaries import Left, LimitCycle, Margins, Numbers
 
-ENOUGH = {"gain_margin": 6.0, "phase_margin": 30.0}  # usual requirements
+ENOUGH = {"gain_margin": 6.0, "phase_margin": 30.0}  # usual requirements [dB, deg]
 PHASES = {"hold": "hold phase", "before": "approach phase"}
 COLUMNS = {
     "gain_up": "gain up",
@@ -26,9 +26,10 @@ def of(summary: Margins) -> Report:
     elif not summary.stable:
         headline, mood = "The nominal loop is NOT stable in the hold phase", "bad"
     elif unstable:
-        headline, mood = f"Stable in the hold phase, NOT stable in the approach phase: {shown(summary.worst)}", "bad"
+        worst = limited_margins(summary.worst)
+        headline, mood = f"Stable in the hold phase, NOT stable in the approach phase: {worst}", "bad"
     else:
-        headline, mood = f"The nominal loop is stable: {shown(summary.worst)}", "calm"
+        headline, mood = f"The nominal loop is stable: {limited_margins(summary.worst)}", "calm"
     return Report(headline, mood, list(_lines(summary)), [Section("Margins in the hold phase", [table(summary)])])
 
 
@@ -121,7 +122,7 @@ def tuned(margins: Mapping[str, Left] | None, *, required: bool) -> Iterator[str
                 else [f"the nominal loop is NOT stable in the {phase}"]
             )
             continue
-        yield f"margins of the nominal loop in the {phase}: {shown(left.numbers)}"
+        yield f"margins of the nominal loop in the {phase}: {limited_margins(left.numbers)}"
         few = [
             f"{enough:g} {MARGINS[name].unit} of {_short(name)}"
             for name, enough in ENOUGH.items()
@@ -145,8 +146,8 @@ def oscillation(limit_cycle: LimitCycle) -> Iterator[str]:
     )
 
 
-def shown(margins: Numbers) -> str:
-    """Return the margins that are limited as text."""
+def limited_margins(margins: Numbers) -> str:
+    """Return a text with those margins that a scenario can require, `MARGINS`."""
     limited = {name: margins.get(name) for name in MARGINS}
     return ", ".join(
         f"{_short(name)} {value:.3g} {MARGINS[name].unit}" for name, value in limited.items() if value is not None

@@ -40,8 +40,8 @@ from tuning.output.report import Chart, Code, Picture, Report, Section, Table
 from tuning.studies import front
 
 HERE = Path(__file__).parent
-FILES = ("versions.json", store.SUMMARY, "scenario.toml", "trajectory.csv", "history.csv", "map.csv")  # that are read
-PNG = b"\x89PNG\r\n\x1a\n"  # how such a file begins
+FILES = ("versions.json", store.SUMMARY, "scenario.toml", "trajectory.csv", "history.csv", "map.csv")  # to read
+PNG = b"\x89PNG\r\n\x1a\n"  # first bytes of a PNG file
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Result:
     folder: Path
     versions: dict[str, Any]
     summary: dict[str, Any]
-    scenario: dict[str, Any]  # its tables; empty without a scenario
+    scenario: dict[str, Any]  # tables of scenario.toml; empty without a scenario
 
     @property
     def plant(self) -> str:
@@ -118,7 +118,7 @@ def build(folder: Path) -> str:
     except (msgspec.ValidationError, KeyError, AttributeError, TypeError) as error:
         by = result.versions.get("ptsmc-jax")
         raise RefusedError(f"{folder} holds a summary of another version ({by}): {error}; make it again") from None
-    except (csv.Error, IndexError, ValueError) as error:  # a table that is cut
+    except (csv.Error, IndexError, ValueError) as error:  # such as a table that is cut off
         raise RefusedError(f"{folder} holds a file that cannot be read: {error}") from None
     sections = [*report.sections, *_pictures(result), *_origin(result)]
     drawn = {block.name: block.figure for section in sections for block in section.blocks if isinstance(block, Chart)}

@@ -1,6 +1,6 @@
 """Captions of the figures on a page."""
 
-# under the scenario, by command: whose gains it has
+# caption of the scenario in a page, by command: whose gains it has
 SCENARIO = {
     "tune": "These are the gains before the search; tuned.toml is the same scenario with the tuned gains.",
     "pareto": "These are the gains before the search; the table above has the gains of each point.",

@@ -16,11 +16,11 @@ Chart = dict[str, Any]
 COLOURS = [colour for colour, _ in STYLES]
 DASHES = ("solid", "dash", "dashdot", "dot", "longdashdot")
 SYMBOLS = ("circle", "diamond", "triangle-up", "square")
-POINTS = 3000  # of a history, at most
-FRAMES = 60  # of a turning body
+POINTS = 3000  # largest number of points of a history in a chart
+FRAMES = 60  # number of frames of the animated body
 _DECADES = {"type": "log", "dtick": "D2", "tickformat": ".0e"}
-# of a spacecraft's history: what, unit; other plants have states without units
-BLOCKS = {
+# title and unit of each panel of a spacecraft's history; states of other plants have no units
+PANELS = {
     "q": ("attitude quaternion", "-"), "w": ("body rate", "rad/s"), "x": ("state", ""),
     "d_hat": ("disturbance estimate", "N m"), "u": ("delivered torque", "N m"), "s": ("sliding variable", "-"),
 }  # fmt: skip
@@ -71,7 +71,7 @@ def history(columns: Mapping[str, np.ndarray], spacecraft: bool, marks: Mapping[
                 "hovertemplate": f"{name} %{{y:.5g}} at %{{x:.4g}} s<extra></extra>",
                 "line": {"color": COLOURS[k % len(COLOURS)], "dash": DASHES[k % len(DASHES)], "width": 1.6},
             })  # fmt: skip
-        what, unit = BLOCKS.get(block, (block, "")) if spacecraft else (block, "")
+        what, unit = PANELS.get(block, (block, "")) if spacecraft else (block, "")
         top = 1.0 - (row + 0.18) / len(blocks)
         place = [1.0 - (row + 0.94) / len(blocks), top]
         axes[f"yaxis{number}"] = {"domain": place, "exponentformat": "e"}

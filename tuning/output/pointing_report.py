@@ -51,7 +51,7 @@ def heading(summary: Campaign) -> Iterator[str]:
         few, more = (fewest_trials(pointing.probability, confidence) for confidence in USUAL)
         ended_early = (
             summary.simulated - summary.counts["ok"] - summary.counts.get("not_converged", 0)
-        )  # without angles
+        )  # runs that ended early and have no angles
         if summary.simulated >= more and ended_early:
             yield f"an angle is - because {ended_early} runs did not reach their end"
         else:

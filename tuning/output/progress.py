@@ -11,7 +11,7 @@ from tuning.output.formats import objective, ratio
 if TYPE_CHECKING:
     from ptsmc_jax.campaigns.campaign import Tally
 
-EVERY = 10.0  # seconds
+EVERY = 10.0  # time between two printed lines [s]
 
 
 def line(what: str, done: int, total: int, seconds: float) -> str:

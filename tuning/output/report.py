@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from tuning.output.formats import ratio
 
-if TYPE_CHECKING:  # it imports NumPy, which a command that computes nothing need not wait for
+if TYPE_CHECKING:  # summaries imports NumPy, which a command that computes nothing need not wait for
     from tuning.output.summaries import Entry
 
 
@@ -51,7 +51,7 @@ class Bars:
         """Return labels, texts and widths; the limit is at 300 of 400."""
         return [
             {"label": entry.metric.replace("_", " "), "text": text, "met": entry.met, "limit": 300,
-             "width": round(min(400.0, 300.0 * nearness(entry)), 1)}
+             "width": round(min(400.0, 300.0 * relative_to_limit(entry)), 1)}
             for entry, text in zip(self.verdicts, self.lines, strict=True)
         ]  # fmt: skip
 
@@ -105,7 +105,7 @@ class Report:
     """A result: what decides first, then its sections."""
 
     headline: str
-    mood: str  # good, bad or calm
+    mood: str  # "good", "bad" or "calm", which selects the colour
     lines: list[str]
     sections: list[Section] = field(default_factory=list)
 
@@ -146,17 +146,17 @@ def headline(status: str, verdicts: "Sequence[Entry]", first: str = "") -> tuple
 
 def requirements(verdicts: "Sequence[Entry]", text: "Callable[[Entry], str]" = str) -> list[Section]:
     """Return the section of the requirements, none without any; text: returns a verdict in words."""
-    lines = [f"{text(one)}{distance(one)}" for one in verdicts]
+    lines = [f"{text(one)}{per_cent_of_limit(one)}" for one in verdicts]
     return [Section("Requirements", [Bars(list(verdicts), lines)])] if verdicts else []
 
 
-def nearness(entry: "Entry") -> float:
+def relative_to_limit(entry: "Entry") -> float:
     """Return the deciding value relative to the limit; infinite if a trial has no value."""
     return float("inf") if entry.margin is None else entry.margin
 
 
-def distance(entry: "Entry") -> str:
-    """Return the deciding value in per cent of the limit; empty if there is none."""
+def per_cent_of_limit(entry: "Entry") -> str:
+    """Return a text with the deciding value in per cent of the limit; empty if there is none."""
     if entry.margin is None or entry.at_least or entry.limit == 0.0:
         return ""
     if entry.fraction_of_time is not None:

@@ -35,7 +35,7 @@ class Entry(msgspec.Struct, frozen=True):
     interpretation: str = "ensemble"
     fraction_of_time: Number = None
     shown: Number = None
-    # of a campaign: the fraction of trials within the limit, its interval, its lower bound, and enough trials
+    # only in a campaign: fraction of trials within the limit, its interval and lower bound, and enough trials
     fraction: Number = None
     fraction_interval: Interval = None
     fraction_bound: Number = None
@@ -264,7 +264,7 @@ class Quantiles(msgspec.Struct, frozen=True):
     without_value: int
     median: Quantile = msgspec.field(name="0.5")
     high: Quantile | None = msgspec.field(name="0.9973", default=None)
-    low: Quantile | None = msgspec.field(name="0.0027", default=None)  # of a metric that is better when larger
+    low: Quantile | None = msgspec.field(name="0.0027", default=None)  # only for a metric that is better when larger
     rms: Number = None
     max: Number = None
     min: Number = None
@@ -287,7 +287,7 @@ class Driver(msgspec.Struct, frozen=True):
 
 
 class Samples(msgspec.Struct, frozen=True):
-    """Samples of the controller that ended with a status."""
+    """Number of controller samples that ended with a status, and number of trials with such a sample."""
 
     samples: int
     trials: int
@@ -341,7 +341,7 @@ class Margins(msgspec.Struct, frozen=True, kw_only=True):
 
     stable: bool
     open: list[str]  # inputs with an open loop
-    cut: list[str]  # those where a limit of the actuators opens it
+    cut: list[str]  # inputs where a limit of the actuators opens the loop
     worst: Numbers
     hold: dict[str, Numbers]
     together: Numbers

@@ -6,7 +6,7 @@ from typing import Any
 
 from tuning.output.report import Report, Table
 
-WIDE = 1000  # columns of a file or a pipe
+WIDE = 1000  # assumed number of columns of a file or a pipe
 UNBROKEN = 24  # largest number of columns of a cell that is never broken
 
 

@@ -56,7 +56,7 @@ def why(inputs: list[dict[str, Any]], plant: str) -> Iterator[str]:
         else:
             rows.sort(key=_unusual, reverse=True)
         texts = [f"{row['input']} {_with_unit(row['drawn'], row['unit'])} {_among(row)}" for row in rows[:4]]
-        unit = catalogues.units(plant).get(metric, "")  # a custom metric has none
+        unit = catalogues.units(plant).get(metric, "")  # a custom metric has no unit
         reached = f"no {metric}" if value is None else f"{metric} {_with_unit(value, unit)}"
         none = "no sampled input explains it; sensor noise remains"
         yield f"{reached} in trial {trial}: {', '.join(texts) or none}"

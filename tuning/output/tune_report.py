@@ -135,7 +135,7 @@ def search(summary: Tune) -> Iterator[str]:
     if over:
         globally = ", nor did a global search" if record.searched_globally else ""
         yield f"the search found no gains that meet every requirement{globally}"
-    # failed trials keep no limit: one line for all requirements
+    # failed trials violate all requirements with the same text, which is printed once
     for text in dict.fromkeys(_violation(summary, metric, one) for metric, one in over.items()):
         yield f"best compromise: {text}"
     yield from _conflict(summary)
@@ -231,7 +231,7 @@ def _worst_case(hardest: Hardest, *, tuned_for: bool) -> str:
 def _beside_evolution(check: Check, record: Search) -> str:
     """Return the comparison with differential evolution."""
     keeps = all(one is not None and one <= 1.0 for one in record.largest_over_limit.values())
-    far = check.distance  # of logarithms
+    far = check.distance  # difference of the logarithms of the objectives
     off = f"{math.exp(far):.3g} times" if far > math.log(2.0) else f"{100 * math.expm1(far):+.2f} % from"
     compared = {
         (True, True): f"the tuned gains are {off} that",
