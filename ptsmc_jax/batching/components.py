@@ -91,7 +91,7 @@ def object_array(shape: tuple[int, ...], items: Iterable) -> np.ndarray:
 
 def entries(array: Any, leading: int = 0) -> np.ndarray:
     """Return the object array of an array's entries over all axes but the first `leading` ones."""
-    if isinstance(array, np.ndarray) and not leading:  # a constant
+    if isinstance(array, np.ndarray) and not leading:  # constants stay NumPy numbers
         return object_array(array.shape, array.reshape(-1))
     kept, shape = array.shape[:leading], array.shape[leading:]
     if not shape:
@@ -223,15 +223,16 @@ def _is_zero(part: Any) -> bool:
     return isinstance(part, np.ndarray | np.generic) and part.ndim == 0 and part == 0
 
 
-def _sum_with_zero(a: Any, b: Any) -> Any:
+def _simplified_sum(a: Any, b: Any) -> Any:
+    """Return the other operand of a sum with a constant zero, or None if no operand is a constant zero."""
     return b if _is_zero(a) else a if _is_zero(b) else None
 
 
 # simplified results of operations with a constant zero; None if no operand is a constant zero
 _ZERO_RULES: dict[str, Callable] = {
     "mul": lambda a, b: a if _is_zero(a) else b if _is_zero(b) else None,
-    "add": _sum_with_zero,
-    "add_any": _sum_with_zero,
+    "add": _simplified_sum,
+    "add_any": _simplified_sum,
     "sub": lambda a, b: a if _is_zero(b) else None,
     "neg": lambda a: a if _is_zero(a) else None,
 }
@@ -335,7 +336,7 @@ _ELEMENTWISE = """abs acos acosh add add_any and asin asinh atan atan2 atanh cbr
     floor ge gt imag integer_pow is_finite le le_to lgamma log log1p log2 logistic lt lt_to max min mul ne
     neg nextafter not one_minus_square or population_count pow real reduce_precision rem round rsqrt select_n
     shift_left shift_right_arithmetic shift_right_logical sign sin sinh sqrt square stop_gradient sub
-    tan tanh xor""".split()  # log2 and one_minus_square since jax 0.11
+    tan tanh xor""".split()  # jax has log2 and one_minus_square since version 0.11
 _STRUCTURAL = """broadcast_in_dim concatenate expand_dims pad reshape rev slice split squeeze stack tile
     transpose unstack""".split()
 # An index that differs by trial needs whole arrays, and so does foreign code (ffi_call).
@@ -348,7 +349,7 @@ _RULES: dict[str, Callable[[ComponentRules, Any, Sequence[BatchedArray]], list[n
     **dict.fromkeys(_STRUCTURAL, ComponentRules._structural),
     **dict.fromkeys(_REDUCTIONS, ComponentRules._reduction),
     **dict.fromkeys(_CUMULATIVE, ComponentRules._cumulative),
-    "reshard": lambda rules, eqn, values: [values[0].components],  # on one device the identity
+    "reshard": lambda rules, eqn, values: [values[0].components],  # resharding on one device is the identity
     "bitcast_convert_type": ComponentRules._bitcast,
     "dot_general": ComponentRules._contraction,
 }

@@ -75,7 +75,7 @@ def split_scan_operands(
     """Split the operands of a `lax.scan`, or the inputs of its body, into constants, carries and xs."""
     if "num_consts" in params:
         consts, carries = params["num_consts"], params["num_carry"]
-    else:  # from jax 0.11 on: three branches of a tree
+    else:  # jax 0.11 and later store the three counts as branches of a tree
         consts, carries, _ = (len(branch) for branch in params["ft_in"].unpack())
     return operands[:consts], operands[consts : consts + carries], operands[consts + carries :]
 

@@ -159,7 +159,7 @@ class _Interpreter:
 
     def __init__(self, trials: int, strict: bool, directions: int = 0, use_kernel: bool = False):
         self.trials, self.directions, self.strict, self.use_kernel = trials, directions, strict, use_kernel
-        self.batch_shapes = ((), (trials,), (directions, 1), (directions, trials))  # by batch axes
+        self.batch_shapes = ((), (trials,), (directions, 1), (directions, trials))  # batch shape by `BatchedArray.axes`
         self.rules = components.ComponentRules()
 
     def evaluate(self, closed: Any, arguments: Sequence[BatchedArray]) -> list[BatchedArray]:

@@ -17,7 +17,7 @@ from jax.extend import core
 from ptsmc_jax import configure
 
 CAN_DEADLOCK = jaxlib.version.__version_info__ < (0, 11)
-# jaxlib 0.10.2 shares a call from 1.8 to 2.2e5 operations (matrices times order^3) on
+# jaxlib 0.10.2 splits a call among threads from about 2e5 operations (matrices times order^3) on
 MAX_BATCHED_OPERATIONS = 1 << 16
 COUNTED = frozenset(("lu", "cholesky", "triangular_solve"))  # primitives that may be batched up to this limit
 SHARED = frozenset(
