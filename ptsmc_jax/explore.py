@@ -329,7 +329,7 @@ def verdicts(what: Scenario | Study | str | Path, rows: pl.DataFrame, *, seed: i
     missing = [name for name in needed if name not in rows.columns]
     if missing or not rows.height:
         raise ValueError(f"the rows have no {missing[0]}" if missing else "there are no rows, but must be one at least")
-    of_margins = margin_verdicts.over_trials(_ready(what), seed) if scenario.margin_requirements(loaded) else []
+    of_margins = margin_verdicts.of_trials(_ready(what), seed) if scenario.margin_requirements(loaded) else []
     return [*campaign.verdicts(asked, rows), *of_margins]
 
 

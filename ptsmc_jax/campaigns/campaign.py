@@ -57,7 +57,7 @@ class Campaign:
 
     def simulate(self, trials: Sequence[int] | np.ndarray) -> pl.DataFrame:
         """Simulate these trials; return their rows."""
-        # at least as many as the usual program simulates, so that rows are equal to the last digit
+        # at least as many trials as the usual program simulates, so that rows are equal to the last digit
         wanted = np.resize(np.asarray(trials, dtype=np.uint32), max(len(trials), montecarlo.FEW))
         parts, rows = self.ready.parts, self.rows(wanted)
         simulated = montecarlo.run(
@@ -148,12 +148,12 @@ def of_run_table(
         RefusedError: initial angles or numbers of custom dispersions are not those of the trials.
     """
     kinds = {*ready.dispersion.kinds, RATE_BIAS}
-    same = []  # quantities that the table sets to the values that they have without it
-    drawn = None  # the quantities of its trials without it
+    same = []  # quantities to which the table gives the values that they have without a table
+    drawn = None  # the quantities of the trials without a table
     for name, values in table.given.items():
         quantity = QUANTITIES[name]
         columns, usual = quantity.columns(ready.parts), np.asarray(quantity.read(ready.parts))[None]
-        if not kinds.isdisjoint({name, CUSTOM}):  # a custom dispersion may change any
+        if not kinds.isdisjoint({name, CUSTOM}):  # a custom dispersion may change any quantity
             if drawn is None:
                 drawn = Campaign(ready, seed, custom_metrics, table.without(table.given)).draw(range(table.count))
             if set(columns) <= set(drawn.columns):
@@ -200,9 +200,9 @@ def staying(parts: Iterable[Part], wanted: Iterable[Block]) -> list[Part]:
 class Tally:
     """The progress of a campaign."""
 
-    done: int  # trials
-    total: int
-    failed: int  # that did not end well
+    done: int  # number of simulated trials
+    total: int  # number of all trials
+    failed: int  # number of failed trials
 
 
 def tally(parts: list[Part], total: int) -> Tally:
@@ -249,10 +249,10 @@ def here(make: Callable[[np.ndarray], pl.DataFrame], rows: Rows, wanted: list[Bl
             parts.append((rows.write(first, part), failures(part) if "status" in part.columns else 0))
         return parts
 
-    workers = ThreadPoolExecutor(2)  # one simulates while the other makes and writes rows
+    workers = ThreadPoolExecutor(2)  # one thread simulates while the other makes and writes rows
     try:
         for group in groups[:1]:
-            yield from made(group)  # alone, since it compiles
+            yield from made(group)  # the first group runs alone, since it compiles the program
         for parts in workers.map(made, groups[1:]):
             yield from parts
     finally:

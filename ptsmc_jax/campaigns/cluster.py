@@ -15,8 +15,8 @@ from ptsmc_jax.campaigns.campaign import Block, Campaign, failures
 from ptsmc_jax.campaigns.rows import Part, Rows
 from ptsmc_jax.campaigns.store import RefusedError
 
-LOST = 5  # workers that may be lost with a part before the campaign fails
-_one_at_a_time = threading.Lock()  # a part uses all devices of its process
+LOST = 5  # number of workers that may be lost with a part before the campaign fails
+_one_at_a_time = threading.Lock()  # because a part uses all devices of its process
 
 
 class Cluster:

@@ -25,15 +25,15 @@ from ptsmc_jax.theory import limit_cycles, linear, margins, run_margins
 
 TRIALS = 256  # number of trials whose loops are judged if they differ
 # quantities that change the linearised loop: hardware errors, the body, and the trajectory
-OF_LOOPS = {INERTIA, CUSTOM, INITIAL_ATTITUDE, INITIAL_RATE, INITIAL_STATE, REFERENCE}
-OF_LOOPS |= {name for name, quantity in QUANTITIES.items() if quantity.hardware}
-CALL = 32  # loops that are simulated and linearised at once
+LOOP_QUANTITIES = {INERTIA, CUSTOM, INITIAL_ATTITUDE, INITIAL_RATE, INITIAL_STATE, REFERENCE}
+LOOP_QUANTITIES |= {name for name, quantity in QUANTITIES.items() if quantity.hardware}
+LOOPS_PER_CALL = 32  # loops that are simulated and linearised at once
 JUDGED = 16  # loops whose exact margins are computed at a time
 DELAY = "delay_margin"  # the only margin that needs commands late within a period
 # first guess for the error of `margins.roughly`, in dB, deg, periods, dB; see `worst`
-OFF = {"gain_margin": 0.06, "phase_margin": 0.12, "delay_margin": 0.2, "peak_sensitivity": 0.01}
+ASSUMED_ERROR = {"gain_margin": 0.06, "phase_margin": 0.12, "delay_margin": 0.2, "peak_sensitivity": 0.01}
 # values that are not interpolated: of unstable loops, and of loops that no gain or phase makes unstable
-BOUNDS = (0.0, margins.MOST, -margins.MOST, 180.0, -180.0)
+NOT_INTERPOLATED = (0.0, margins.MOST, -margins.MOST, 180.0, -180.0)
 
 
 def of_loop(parts: Parts, asked: Sequence[Requirement]) -> list[Verdict]:
@@ -44,7 +44,7 @@ def of_loop(parts: Parts, asked: Sequence[Requirement]) -> list[Verdict]:
     return _verdicts(asked, run_margins.judged(parts)[0].worst()) if asked else []
 
 
-def over_trials(ready: Study, seed: int, rows: np.ndarray | Row | None = None) -> list[Verdict]:
+def of_trials(ready: Study, seed: int, rows: np.ndarray | Row | None = None) -> list[Verdict]:
     """Return the verdict on each required margin: of the nominal loop, or the worst of the first `TRIALS` trials.
 
     Args:
@@ -63,18 +63,18 @@ def over_trials(ready: Study, seed: int, rows: np.ndarray | Row | None = None) -
 
 
 def prepare(ready: Study, rows: np.ndarray | Row | None = None) -> None:
-    """Start to compile the programs of `over_trials` in the background."""
+    """Start to compile the programs of `of_trials` in the background."""
     trials = _whose_loops_differ(ready, rows)
     if trials is not None:
         late = any(requirement.metric == DELAY for requirement in ready.margins)
-        _look.prepare(*_looked_at(ready.parts, ready.dispersion, 0, trials, late))
+        _loops_and_margins.prepare(*_arguments(ready.parts, ready.dispersion, 0, trials, late))
     elif ready.margins:
         run_margins.judged_margins_jit.prepare(ready.parts)
 
 
 def _whose_loops_differ(ready: Study, rows: np.ndarray | Row | None) -> np.ndarray | Row | None:
     """Return the trials whose margins are required; None: only the nominal loop, or no margin is required."""
-    given_loops = isinstance(rows, Row) and not OF_LOOPS.isdisjoint(rows.given)
+    given_loops = isinstance(rows, Row) and not LOOP_QUANTITIES.isdisjoint(rows.given)
     if not ready.margins or not (given_loops or differ(ready.dispersion)):
         return None
     return np.arange(TRIALS) if rows is None else rows
@@ -88,10 +88,10 @@ def _verdicts(asked: Sequence[Requirement], by_name: Mapping[str, ArrayLike]) ->
 
 def differ(dispersion: Dispersion) -> bool:
     """Return whether the loops differ from trial to trial."""
-    return not OF_LOOPS.isdisjoint(dispersion.kinds)
+    return not LOOP_QUANTITIES.isdisjoint(dispersion.kinds)
 
 
-def nearness(value: Any, limit: Any, name: str) -> Any:
+def signed_violation_ratio(value: Any, limit: Any, name: str) -> Any:
     """Return the violation ratio of a margin. It may be negative, so that any two margins can be compared."""
     return 2.0 - value / limit if MARGINS[name].at_least else value / limit
 
@@ -110,10 +110,10 @@ def worst(
     margins are interpolated: they are farther from their limits, and on the right side, as far as the error is known.
 
     First, the margins of every loop are interpolated between the frequencies of the exact search (`margins.roughly`).
-    Then exact margins are computed, nearest to a limit first, until an error of `OFF` in the other loops can neither
-    change the worst loop nor move a loop across a limit. Each exact margin shows the error of the interpolation. If it
-    exceeds half of `OFF`, the assumed error becomes twice the observed error. Exact margins of all loops take about
-    six times as long with the delay margin, and twice as long without it.
+    Then exact margins are computed, nearest to a limit first, until an error of `ASSUMED_ERROR` in the other loops can
+    neither change the worst loop nor move a loop across a limit. Each exact margin shows the error of the
+    interpolation. If it exceeds half of `ASSUMED_ERROR`, the assumed error becomes twice the observed error. Exact
+    margins of all loops take about six times as long with the delay margin, and twice as long without it.
 
     Args:
         parts: the nominal parts.
@@ -128,14 +128,14 @@ def worst(
     """
     names, count = tuple(limits), jax.tree.leaves(trials)[0].shape[0]
     late = DELAY in names
-    looks = _look(*_looked_at(parts, dispersion, seed, trials, late))
+    looks = _loops_and_margins(*_arguments(parts, dispersion, seed, trials, late))
     loops, rough = jax.tree.map(lambda v: np.asarray(v)[:count].reshape(-1, *v.shape[2:]), looks)
-    values = np.stack([rough[name] for name in names])  # (names, loops)
+    values = np.stack([rough[name] for name in names])  # (margins, loops)
     limit = np.asarray([limits[name] for name in names])[:, None]
-    off = np.asarray([[OFF[name] * (loops.period[0] if name == DELAY else 1.0)] for name in names]) / limit
-    unsure = np.isfinite(values) & ~np.isin(values, BOUNDS)
+    off = np.asarray([[ASSUMED_ERROR[name] * (loops.period[0] if name == DELAY else 1.0)] for name in names]) / limit
+    unsure = np.isfinite(values) & ~np.isin(values, NOT_INTERPOLATED)
     while True:
-        near = _nearness(values, limit, names)
+        near = _violation_ratios(values, limit, names)
         low, high = near - np.where(unsure, off, 0.0), near + np.where(unsure, off, 0.0)
         by_trial = np.sort(low.reshape(len(names), count, -1).max(axis=(0, 2)))
         least = np.minimum(low.max(axis=1, keepdims=True), by_trial[-min(places, count)])
@@ -143,21 +143,21 @@ def worst(
         order = np.argsort(-np.where(unsettled, high, -np.inf).max(axis=0), kind="stable")
         chosen = order[: min(JUDGED, np.count_nonzero(unsettled.any(axis=0)))]
         if not chosen.size:
-            return {name: _over(name, v.reshape(count, -1)) for name, v in zip(names, values, strict=True)}
-        chosen = np.resize(chosen, JUDGED)  # one shape, one program
+            return {name: _worst_of(name, v.reshape(count, -1)) for name, v in zip(names, values, strict=True)}
+        chosen = np.resize(chosen, JUDGED)  # always the same shape, so that one program is compiled
         some = jax.tree.map(lambda v, chosen=chosen: v[chosen], loops)
         full = margins.of_each(some, with_delay=late).each()
-        exact = np.stack([_over(name, np.asarray(full[name])) for name in names])
-        apart = np.abs(_nearness(exact, limit, names) - near[:, chosen])
+        exact = np.stack([_worst_of(name, np.asarray(full[name])) for name in names])
+        apart = np.abs(_violation_ratios(exact, limit, names) - near[:, chosen])
         apart = np.where(np.isfinite(apart), apart, 0.0).max(axis=1, keepdims=True)
         off = np.where(apart > off / 2.0, 2.0 * apart, off)
         values[:, chosen], unsure[:, chosen] = exact, False
 
 
-def _looked_at(parts: Parts, dispersion: Dispersion, seed: int, trials: np.ndarray | Row, late: bool) -> tuple:
-    """Return the arguments of `_look`; trials are repeated to fill the last call on every device."""
+def _arguments(parts: Parts, dispersion: Dispersion, seed: int, trials: np.ndarray | Row, late: bool) -> tuple:
+    """Return the arguments of `_loops_and_margins`; trials are repeated to fill the last call on every device."""
     devices = len(configure.processors())
-    together = CALL * devices
+    together = LOOPS_PER_CALL * devices
 
     def padded(v: np.ndarray) -> Array:
         return jnp.asarray(np.resize(v, (-(-v.shape[0] // together) * together, *v.shape[1:])))
@@ -166,19 +166,19 @@ def _looked_at(parts: Parts, dispersion: Dispersion, seed: int, trials: np.ndarr
     return parts, dispersion, jnp.uint32(seed), some, devices, late
 
 
-def _nearness(values: np.ndarray, limit: np.ndarray, names: Sequence[str]) -> np.ndarray:
-    """Return the `nearness` of each margin, (margins, loops); a loop without a value comes last."""
-    near = np.stack([nearness(v, one, name) for v, one, name in zip(values, limit, names, strict=True)])
+def _violation_ratios(values: np.ndarray, limit: np.ndarray, names: Sequence[str]) -> np.ndarray:
+    """Return the `signed_violation_ratio` of each margin, (margins, loops); a loop without a value comes last."""
+    near = np.stack([signed_violation_ratio(v, one, name) for v, one, name in zip(values, limit, names, strict=True)])
     return np.where(np.isnan(near), -np.inf, near)
 
 
-def _over(name: str, values: Any) -> Any:
+def _worst_of(name: str, values: Any) -> Any:
     """Return the worst value along the last axis."""
     return values.min(axis=-1) if MARGINS[name].at_least else values.max(axis=-1)
 
 
 @programs.jit(static_argnames=("devices", "late"), title="the margins of many trials")
-def _look(
+def _loops_and_margins(
     parts: Parts, dispersion: Dispersion, seed: Array, trials: Array | Row, devices: int, late: bool
 ) -> tuple[linear.Loop, dict[str, Array]]:
     """Return the loops of each trial, (trials, times, ..), and their interpolated margins, the worst over the axes.
@@ -187,22 +187,22 @@ def _look(
     """
 
     def rough(loop: linear.Loop) -> dict[str, Array]:
-        return {name: _over(name, v) for name, v in margins.roughly(loop).items()}
+        return {name: _worst_of(name, v) for name, v in margins.roughly(loop).items()}
 
     def simulated(trial: Array | Row) -> tuple[Parts, linear.Nominal]:
         drawn = table_rows.about(parts, dispersion, seed, trial).drawn
         return drawn, linear.nominal(drawn)
 
-    def loops_of(drawn: Parts, run: linear.Nominal) -> linear.Loop:
+    def loops_of_trial(drawn: Parts, run: linear.Nominal) -> linear.Loop:
         return run_margins.judged_loops(drawn, run, late=late)[0]
 
     def some(trials: Array | Row) -> tuple[linear.Loop, dict[str, Array]]:
-        loops = lapack.vmap(loops_of)(*lanes.vmap(simulated)(trials))
+        loops = lapack.vmap(loops_of_trial)(*lanes.vmap(simulated)(trials))
         values = jax.lax.map(rough, jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), loops))
-        return loops, {name: v.reshape(CALL, -1) for name, v in values.items()}
+        return loops, {name: v.reshape(LOOPS_PER_CALL, -1) for name, v in values.items()}
 
     def on_device(trials: Array | Row) -> tuple[linear.Loop, dict[str, Array]]:
-        calls = jax.lax.map(some, jax.tree.map(lambda v: v.reshape(-1, CALL, *v.shape[1:]), trials))
+        calls = jax.lax.map(some, jax.tree.map(lambda v: v.reshape(-1, LOOPS_PER_CALL, *v.shape[1:]), trials))
         return jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), calls)
 
     return montecarlo.spread(on_device, trials, devices)

@@ -25,10 +25,10 @@ from ptsmc_jax.simulation.assembly import Parts, check_parts
 from ptsmc_jax.simulation.computer import OURS, Software
 from ptsmc_jax.simulation.metrics import Metrics
 
-FEW = 64  # fewer trials run in a program for this many: a step of one trial costs nearly as much
-CAPACITY = 4096  # trials in one call
-BLOCK = 128  # trials in one block: their states stay in the cache (benchmarks/README.md)
-BLOCK_ON_GPU = 65_536  # on an accelerator, where launches dominate the cost of a step
+FEW = 64  # smaller numbers of trials use a program for this many, because a step of one trial costs nearly as much
+CAPACITY = 4096  # largest number of trials in one call of a program
+BLOCK = 128  # number of trials in one block, whose states stay in the cache (benchmarks/README.md)
+BLOCK_ON_GPU = 65_536  # the same on an accelerator, where kernel launches dominate the cost of a step
 FINISHED = tuple(rollout.STATUS[code][0] for code in rollout.FINISHED)  # statuses of runs that reached the end
 
 
@@ -37,9 +37,9 @@ class Trials:
     """Results of many trials, (trials,) arrays."""
 
     trial: np.ndarray  # numbers of the trials
-    metrics: Metrics  # of arrays
-    status: np.ndarray  # codes, see rollout.STATUS
-    bad_time: np.ndarray  # first bad time [s], NaN if none
+    metrics: Metrics  # metrics, each an array (trials,)
+    status: np.ndarray  # codes of `rollout.STATUS`
+    bad_time: np.ndarray  # time of the first failure, at which the status changed [s]; NaN if the status is ok
     drawn: dict[str, np.ndarray]  # dispersed quantities by name, see `values`
     custom_metrics: dict[str, np.ndarray] = field(default_factory=dict)  # custom metrics
     samples: dict[str, np.ndarray] = field(default_factory=dict)  # see `rollout.Result`

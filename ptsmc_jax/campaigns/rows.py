@@ -20,7 +20,7 @@ import polars as pl
 from ptsmc_jax.campaigns import store
 
 FOLDER = "trials"
-RECENT = 1_000_000_000  # ns; a file changed so recently may change again with the same time of change
+RECENT = 1_000_000_000  # [ns] a file that changed so recently may change again with the same time of change
 _NAME = re.compile(r"(\d{10})-(\d{10})-([0-9a-f]{32})\.parquet")
 
 
@@ -33,7 +33,7 @@ def named(path: Path) -> bool:
 class Part:
     """A complete part on disk."""
 
-    first: int  # trial
+    first: int  # number of the first trial
     count: int
     path: Path
 
@@ -130,5 +130,5 @@ def read(parts: Sequence[Part], columns: Iterable[str] | None = None) -> pl.Data
 
 def columns_of(part: Part) -> list[str]:
     """Return the names of the columns of a part, in order."""
-    with part.path.open("rb") as file:  # a path would be taken as a pattern
+    with part.path.open("rb") as file:  # opened here, because Polars takes a path as a pattern
         return list(pl.read_parquet_schema(file))

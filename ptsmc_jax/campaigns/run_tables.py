@@ -24,7 +24,7 @@ from ptsmc_jax.simulation.catalogues import CATALOGUE
 from ptsmc_jax.simulation.rollout import Parts
 
 ALLOWED = "a .csv or .parquet file with a row for each trial, or a folder of such .parquet files"
-ANGLE = "initial_angle"  # follows from other columns
+ANGLE = "initial_angle"  # a column that follows from other columns
 HEADING = ("status", "reason", "bad_time")  # first columns of a result
 RESULTS = {*HEADING, *CATALOGUE}
 COUNTED = "controller_"  # beginning of the columns with numbers of samples by the status that exported C returned
@@ -37,10 +37,10 @@ class RunTable:
     """A checked run table, see `checked`."""
 
     given: dict[str, np.ndarray]  # numbers (rows, n) by the names of `QUANTITIES`
-    trial: np.ndarray | None  # (rows,) of the table
-    seed: np.ndarray | None  # (rows,)
+    trial: np.ndarray | None  # (rows,) trial numbers that the table states
+    seed: np.ndarray | None  # (rows,) seeds that the table states
     angle: np.ndarray | None  # (rows,) initial angle of the table [rad]
-    count: int  # rows
+    count: int  # number of rows
     custom: dict[str, np.ndarray] = field(default_factory=dict)  # (rows,) numbers of custom dispersions, by name
 
     @property
@@ -169,7 +169,7 @@ def checked(
         column = other if other in table.columns else name
         whose[name] = _whole_numbers(table, column, where) if column in table.columns else None
     if whose[TRIAL] is not None and np.array_equal(whose[TRIAL], np.arange(table.height)):
-        whose[TRIAL] = None  # their own numbers
+        whose[TRIAL] = None  # the rows' own numbers are the default
     angle = _numbers(table, ANGLE, where) if ANGLE in table.columns else None
     stated = {name: _cells(table[name]) for name in drawn if name in table.columns}
     return RunTable(given, whose[TRIAL], whose[SEED], angle, table.height, stated)

@@ -30,13 +30,13 @@ BOUND_TRIALS = 4  # trials whose lower bounds are pooled: they differ by a few p
 class Run:
     """A finished run."""
 
-    parts: Parts  # with their dispersions
+    parts: Parts  # parts with the dispersions of the trial
     log: Log  # numpy arrays (time, component), intervals of length zero left out
     metrics: dict[str, float]
     catalogue: dict[str, Entry]  # units and meanings of the metrics
     status: str
     reason: str
-    bad_time: float  # [s], NaN if none
+    bad_time: float  # time of the first failure [s]; NaN if the status is ok
     verdicts: list[Verdict]
     samples: dict[str, int]  # numbers of samples by the status of exported flight software
 
@@ -89,8 +89,8 @@ class Run:
             return {}
         readings: dict[str, Any] = dict(log.readings)
         found: dict[str, Any] = {}
-        tracker = getattr(sensors, "star_tracker", None)  # of a suite
-        if tracker is not None:
+        tracker = getattr(sensors, "star_tracker", None)
+        if tracker is not None:  # the sensors are a suite
             readings["attitude"] = np.asarray(jax.vmap(tracker.body)(readings[tracker.name]))
             for name in ("valid", "age"):
                 readings[f"attitude_{name}"] = readings[f"{tracker.name}_{name}"]

@@ -25,21 +25,21 @@ from ptsmc_jax.scenario import parsing
 
 try:
     import fcntl
-except ImportError:  # Windows
+except ImportError:  # Windows has no fcntl
     fcntl = None
 
-JOURNAL = "journal.bin"  # of an unfinished run
-SUMMARY = "summary.json"  # of a finished run
+JOURNAL = "journal.bin"  # file of an unfinished run
+SUMMARY = "summary.json"  # file of a finished run
 IDENTITY = (SUMMARY, "versions.json", "scenario.toml")  # files that differ between results
-MAKING = ".making-"  # in the names of temporary files and folders
-MADE_OF_RESULTS = {  # files made from a result, with a mark near the beginning: files of the user stay
+MAKING = ".making-"  # marks the names of temporary files and folders
+MADE_OF_RESULTS = {  # files made from a result, with a mark near their beginning; other files are the user's and stay
     "figures/*.png": b"Creator\0ptsmc",  # written by `style.save`
     "report.html": b'<meta name="generator" content="ptsmc">',
     "worst.csv": b"trial,status,reason,bad_time,",
     "why.csv": b"metric,trial,value,input,drawn,",
 }
-CODE, COMMAND_LINE = "code_checksum", "command_line"  # in `versions.json`
-Tables = Mapping[str, Any]  # of a scenario, or of versions.json
+CODE, COMMAND_LINE = "code_checksum", "command_line"  # keys of `versions.json`
+Tables = Mapping[str, Any]  # tables of a scenario, or of versions.json
 PACKAGES = ("ptsmc-jax", "jax", "jaxlib", "numpy", "scipy", "optax")
 
 
@@ -139,7 +139,7 @@ def forget(folder: Path) -> None:
         return
     for pattern, mark in MADE_OF_RESULTS.items():
         for path in folder.glob(pattern):
-            with contextlib.suppress(FileNotFoundError, IsADirectoryError):  # another shard may remove it, too
+            with contextlib.suppress(FileNotFoundError, IsADirectoryError):  # another shard may have removed the file
                 if mark in path.read_bytes()[:1024]:
                     path.unlink()
     (folder / SUMMARY).unlink(missing_ok=True)
@@ -227,7 +227,7 @@ def in_use(folder: Path, *, force: bool = True, shared: bool = False) -> Iterato
         InUseError: another process writes into the folder.
         RefusedError: see `check`.
     """
-    check(folder, force=True)  # before anything is made
+    check(folder, force=True)  # before a folder or a file is made
     path = _lock_file(folder)
     made = [parent for parent in path.parents if not parent.exists()]
     lock = _locked(path, shared=shared)
@@ -238,12 +238,12 @@ def in_use(folder: Path, *, force: bool = True, shared: bool = False) -> Iterato
         yield
     finally:
         with contextlib.suppress(OSError), lock:
-            if _flock(lock, shared=False):  # raises an error if others share it
+            if _flock(lock, shared=False):  # raises an error if other processes share the lock
                 for left in path.parent.glob(f"{glob.escape(path.stem)}{MAKING}????????"):
                     shutil.rmtree(left, ignore_errors=True)
             path.unlink()
         for parent in made:
-            with contextlib.suppress(OSError):  # it is not empty
+            with contextlib.suppress(OSError):  # the folder is not empty
                 parent.rmdir()
 
 
@@ -254,7 +254,7 @@ def _lock_file(folder: Path) -> Path:
 
 def _locked(path: Path, *, shared: bool) -> IO[str] | None:
     """Open and lock a file; return None if another process holds the lock."""
-    for _ in range(30):  # another process may release or remove it at this moment
+    for _ in range(30):  # another process may release or remove the lock file at this moment
         with contextlib.suppress(BlockingIOError, FileNotFoundError):
             path.parent.mkdir(parents=True, exist_ok=True)
             file = path.open("a+")
@@ -307,7 +307,7 @@ def write(folder: Path, fill: Callable[[Path], None]) -> None:
     try:
         fill(making)
         if not folder.exists():
-            with contextlib.suppress(OSError):  # another shard was first
+            with contextlib.suppress(OSError):  # another shard has made the folder
                 making.rename(folder)
                 return
         order = {"versions.json": -1, SUMMARY: 1}
@@ -342,7 +342,7 @@ def record(folder: Path, scenario: Tables, made_by: Tables, summary: Tables | No
 def write_toml(path: Path, tables: Tables) -> None:
     """Write a TOML file, with arrays on one line."""
     text, before = tomli_w.dumps(_named(tables)), ""
-    while text != before:  # innermost arrays first
+    while text != before:  # the innermost arrays are joined first
         text, before = re.sub(r"\[\n((?: +[^\]\s][^\n]*,\n)+) *\]", _one_line, text), text
     write_text(path, text)
 
@@ -375,7 +375,7 @@ def whole(path: Path) -> Iterator[Path]:
         os.replace(making, path)
     except OSError as error:
         if error.filename is not None:
-            error.filename = str(path)  # not the temporary file
+            error.filename = str(path)  # name this file in the error, not the temporary file
         raise
     finally:
         with contextlib.suppress(OSError):

@@ -137,12 +137,12 @@ def test_analyses_of_a_system_never_batch_eigh(batched_calls):
     trace_analyses(parts, dispersion)
     run = jax.eval_shape(linear.nominal, parts)
     some = jax.tree.map(lambda v: jnp.ones((4, *v.shape[1:]), v.dtype), run)
-    trials = jnp.arange(margin_verdicts.CALL, dtype=jnp.uint32)
+    trials = jnp.arange(margin_verdicts.LOOPS_PER_CALL, dtype=jnp.uint32)
     of_periods = jax.tree.map(lambda v: jnp.ones(v.shape, v.dtype), run)
     traces = {
         "loops": linear._opened.trace(parts, some, None, late=True),
         "loops of traced parts": jax.make_jaxpr(lambda k: linear.loops_at(parts, of_periods, k))(jnp.arange(4)),
-        "loops of trials": margin_verdicts._look.trace(parts, dispersion, jnp.uint32(0), trials, 1, True),
+        "loops of trials": margin_verdicts._loops_and_margins.trace(parts, dispersion, jnp.uint32(0), trials, 1, True),
         "steps": timing._rates_of_system.trace(parts, (jnp.linspace(0.0, 1.0, 4), jnp.ones((4, 4)))),
     }
     assert not any(lapack_calls(trace.jaxpr)[1] for trace in traces.values())

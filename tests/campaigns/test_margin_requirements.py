@@ -117,7 +117,7 @@ JUDGED = run_margins.TIMES + 1  # number of loops of one trial
 def _few_loops():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(margin_verdicts, "TRIALS", TRIALS)
-        patch.setattr(margin_verdicts, "CALL", 2)
+        patch.setattr(margin_verdicts, "LOOPS_PER_CALL", 2)
         patch.setattr(margin_verdicts, "JUDGED", JUDGED)
         patch.setattr(margin_rows, "CASES", 2)
         yield
@@ -125,7 +125,8 @@ def _few_loops():
 
 def looked_at(parts, dispersion, seed, late):
     """Return the loops (TRIALS, times, ..) of the first trials, and their interpolated margins."""
-    every = margin_verdicts._look(*margin_verdicts._looked_at(parts, dispersion, seed, np.arange(TRIALS), late))
+    arguments = margin_verdicts._arguments(parts, dispersion, seed, np.arange(TRIALS), late)
+    every = margin_verdicts._loops_and_margins(*arguments)
     return jax.tree.map(lambda v: np.asarray(v)[:TRIALS], every)
 
 
@@ -215,7 +216,7 @@ def test_margin_constraints_agree_with_verdicts_and_finite_differences(drawn):
     )
     assert asked is not None
     found = sloped(asked, bounds, normalised)
-    verdicts = margin_verdicts.over_trials(posed.ready, 3)
+    verdicts = margin_verdicts.of_trials(posed.ready, 3)
     for row, verdict in zip(np.asarray(found["c"]), verdicts, strict=True):
         np.testing.assert_allclose(row.max() + 1.0, verdict.margin, rtol=1e-9)
     step, along = 1e-4, np.array([0.6, -0.9, 1.0, 0.7])
@@ -260,7 +261,7 @@ def test_evaluator_appends_margins_of_the_hardest_trials(drawn, monkeypatch):
     monkeypatch.setattr(posed.evaluate, "_metrics", lambda *_: dict(simulated))
     c = posed.evaluate.measure(posed.problem, normalised).c[0]
     assert c[0].tolist() == [-0.3, -0.2, -0.4] + [-1.0] * (c.shape[1] - 3)  # padded to the length of margin rows
-    verdicts = margin_verdicts.over_trials(posed.ready, 3)
+    verdicts = margin_verdicts.of_trials(posed.ready, 3)
     assert [v.trials for v in verdicts] == [TRIALS, TRIALS]
     # the two hardest trials contain the worst margins of all trials
     for row, verdict in zip(c[1:], verdicts, strict=True):
@@ -301,7 +302,12 @@ def test_prepared_margin_program_is_the_program_of_the_search(drawn, monkeypatch
 @pytest.mark.parametrize(
     ("owner", "program", "prepare", "ask"),
     [
-        (margin_verdicts, "_look", margin_verdicts.prepare, lambda ready: margin_verdicts.over_trials(ready, 3)),
+        (
+            margin_verdicts,
+            "_loops_and_margins",
+            margin_verdicts.prepare,
+            lambda ready: margin_verdicts.of_trials(ready, 3),
+        ),
         (rollout, "simulate_once", runs.prepare, lambda ready: runs.rms_lower_bound(ready, 3)),
     ],
     ids=["margins", "lower_bound"],
@@ -336,7 +342,7 @@ def test_worst_margins_are_exact_without_exact_margins_of_all_loops(drawn, facto
         some = np.isfinite(values)
         np.testing.assert_array_equal(some, np.isfinite(rough[name]))
         apart = np.abs(values - rough[name])[some] / (period if name == "delay_margin" else 1.0)
-        assert apart.max(initial=0.0) < margin_verdicts.OFF[name] / 2, name
+        assert apart.max(initial=0.0) < margin_verdicts.ASSUMED_ERROR[name] / 2, name
     each = worst_of(every)
     judged = []
 
@@ -349,12 +355,14 @@ def test_worst_margins_are_exact_without_exact_margins_of_all_loops(drawn, facto
     # each limit is between the exact and the interpolated margin of one trial, which are on different sides of it
     both = {name: np.stack([v, worst_of(rough)[name]])[:, np.argsort(v)[TRIALS // 2]] for name, v in each.items()}
     limits = {name: float(abs(v.mean())) for name, v in both.items() if late or name != "delay_margin"}
-    for known in (margin_verdicts.OFF, dict.fromkeys(margin_verdicts.OFF, 1e-9)):  # a too small error is corrected
-        monkeypatch.setattr(margin_verdicts, "OFF", known)
+    usual = margin_verdicts.ASSUMED_ERROR
+    for known in (usual, dict.fromkeys(usual, 1e-9)):  # a too small error is corrected
+        monkeypatch.setattr(margin_verdicts, "ASSUMED_ERROR", known)
         for names in (list(limits), ["phase_margin", list(limits)[2]], ["phase_margin"]):
             asked = {name: limits[name] for name in names}
             found = margin_verdicts.worst(parts, dispersion, 3, np.arange(TRIALS), asked, places=2)
-            near = [np.max([margin_verdicts.nearness(one[n], limits[n], n) for n in names], 0) for one in (each, found)]
+            ratio = margin_verdicts.signed_violation_ratio
+            near = [np.max([ratio(one[n], limits[n], n) for n in names], 0) for one in (each, found)]
             first = [np.argsort(-v, kind="stable")[:2] for v in near]
             np.testing.assert_array_equal(first[0], first[1])
             np.testing.assert_allclose(near[1][first[0]], near[0][first[0]], rtol=1e-9)
@@ -389,7 +397,7 @@ def test_assumed_error_of_delay_margins_is_a_fraction_of_a_period(monkeypatch, p
         seen.update(loops.number.tolist())
         return SimpleNamespace(each=lambda: {"delay_margin": delays[loops.number][:, None]})
 
-    monkeypatch.setattr(margin_verdicts, "_look", looked)
+    monkeypatch.setattr(margin_verdicts, "_loops_and_margins", looked)
     monkeypatch.setattr(margin_verdicts, "JUDGED", 16)
     monkeypatch.setattr(margin_verdicts.margins, "of_each", of_each)
     nothing: Any = None
@@ -410,7 +418,7 @@ def test_campaign_without_its_margin_verdicts_is_unfinished(command, tmp_path, m
     tables = {**untuned(SHORT_CHAIN), "requirements": {"peak_torque": 50.0, "gain_margin": 0.1}}
     if not of_loops:
         told = Requirement("gain_margin", 0.1, "dB", at_least=True).verdict(np.asarray(7.0), np.asarray(True))
-        monkeypatch.setattr(margin_verdicts, "over_trials", lambda *_: [told])
+        monkeypatch.setattr(margin_verdicts, "of_trials", lambda *_: [told])
         monkeypatch.setattr(margin_verdicts, "prepare", lambda *_: None)
     store.write_toml(tmp_path / "s.toml", tables)
     again, folder = ("montecarlo", "s.toml", "--trials", 2, "--no-figures"), tmp_path / "out" / "montecarlo-s"

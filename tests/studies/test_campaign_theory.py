@@ -20,12 +20,12 @@ def test_bound_and_margins_use_the_first_trials_and_are_computed_once(tmp_path, 
         asked.append((ready, seed, first))
         return 1e-6
 
-    def over_trials(ready, seed, some):
+    def of_trials(ready, seed, some):
         asked.append((ready, seed, None if some is None else len(some)))
         return []
 
     monkeypatch.setattr(runs, "rms_lower_bound", lower_bound)
-    monkeypatch.setattr(margin_verdicts, "over_trials", over_trials)
+    monkeypatch.setattr(margin_verdicts, "of_trials", of_trials)
     table = SimpleNamespace(count=count, row=lambda k, seed: (k, seed), rows=lambda numbers, seed: np.asarray(numbers))
     simulated = SimpleNamespace(ready="ready", run_table=None if count is None else table)
     folder: Any = SimpleNamespace(path=tmp_path, seed=7, campaign=simulated, scenario=SimpleNamespace(requirements={}))

@@ -100,7 +100,7 @@ def hardest(asked: RequiredMargins, gains: Float[np.ndarray, " gains"]) -> tuple
     parts, seed = with_gains(asked.parts, dict(zip(asked.names, gains, strict=True))), int(asked.seed)
     limits = dict(zip(asked.metrics, np.asarray(asked.required).tolist(), strict=True))
     each = margin_verdicts.worst(parts, asked.dispersion, seed, np.arange(margin_verdicts.TRIALS), limits, CASES)
-    ratios = [margin_verdicts.nearness(each[name], limit, name) for name, limit in limits.items()]
+    ratios = [margin_verdicts.signed_violation_ratio(each[name], limit, name) for name, limit in limits.items()]
     near = np.max(np.nan_to_num(ratios, nan=RATIO_OF_NAN, neginf=-1e9), axis=0)
     return _of_trials(asked, np.argsort(-near, kind="stable")[:CASES]), max(float(near.max()), 0.0)
 

@@ -24,7 +24,7 @@ def write_missing(folder: Folder) -> None:
         ready, table = folder.campaign.ready, folder.campaign.run_table
         pooled = 0 if table is None else min(runs.BOUND_TRIALS, table.count)
         first = [] if table is None else [table.row(k, folder.seed) for k in range(pooled)]
-        verdicts = margin_verdicts.over_trials(ready, folder.seed, _rows_with_margins(folder))
+        verdicts = margin_verdicts.of_trials(ready, folder.seed, _rows_with_margins(folder))
         lower_bound = runs.rms_lower_bound(ready, folder.seed, first)
         theory = {"lower_bound": lower_bound, "margins": [verdict.in_summary() for verdict in verdicts]}
         store.write_json(folder.path / THEORY, theory)

@@ -82,7 +82,7 @@ def verdicts_of(scenario: Scenario, trials: Trials, held_out_seed: int) -> list[
         return getattr(trials.metrics, name)[one]
 
     simulated = requirements.verdicts(ready.requirements, values, trials.finished[one])
-    return [*simulated, *margin_verdicts.over_trials(ready, held_out_seed)]
+    return [*simulated, *margin_verdicts.of_trials(ready, held_out_seed)]
 
 
 def met(verdicts: Sequence[Verdict], trials: Trials) -> bool:

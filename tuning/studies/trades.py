@@ -224,7 +224,7 @@ class Margins(Trade):
     def costs(self, tuned: Scenario, trials: Trials, seed: int) -> dict[str, float]:
         """Return the largest peak torque [N m], and the worst margins of the held-out trials' loops."""
         asked = scenarios.replace(tuned, requirements=dict.fromkeys(MARGINS, 1.0))
-        verdicts = margin_verdicts.over_trials(study(judging.on_flight_clock(asked)), seed)
+        verdicts = margin_verdicts.of_trials(study(judging.on_flight_clock(asked)), seed)
         return {TORQUE: judging.largest(TORQUE, tuned, trials)} | {one.metric: one.worst for one in verdicts}
 
     def options(self) -> dict[str, Any]:
