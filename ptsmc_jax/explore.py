@@ -279,8 +279,8 @@ def _software(controller: str | Path | None, ready: Study) -> Software:
     if controller is None:
         return OURS
     computer = InTheLoop(Library(controller), ready.parts, ready.dispersion)
-    if computer.otherwise:
-        warnings.warn(computer.otherwise, RuntimeWarning, stacklevel=3)
+    if computer.parameter_differences:
+        warnings.warn(computer.parameter_differences, RuntimeWarning, stacklevel=3)
     return computer.software
 
 

@@ -275,7 +275,7 @@ def test_results_keep_their_structure(folder):
 
 def test_a_result_can_be_an_argument_of_a_program_for_several_devices(folder):
     def function(x, devices):
-        return montecarlo.spread(lambda part: 2.0 * part + x, jnp.arange(4.0), devices)
+        return montecarlo.over_devices(lambda part: 2.0 * part + x, jnp.arange(4.0), devices)
 
     one, two = spied()[0](1.0)["both"], programs.jit(ours(function, "several"), static_argnames="devices", batch=True)
     for results in (two(one, 2), two(two(one, 2)[0], 2)):
@@ -382,7 +382,7 @@ traced = []
 def poles(a, scale):
     traced.append(1)
     values = jnp.linalg.eigvals(a)
-    spread = montecarlo.spread(lambda x: jnp.sin(3.0 * x) * x + scale, jnp.arange(4.0), 2)
+    spread = montecarlo.over_devices(lambda x: jnp.sin(3.0 * x) * x + scale, jnp.arange(4.0), 2)
     return jnp.sort(jnp.abs(values)), spread
 
 poles.__module__, poles.__qualname__ = "ptsmc_jax.theory.linear", "poles"

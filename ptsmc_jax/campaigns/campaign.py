@@ -190,7 +190,7 @@ def missing(parts: Iterable[Part], trials: int, shard: tuple[int, int] = (1, 1))
     return [(first, count) for first, count in every[number - 1 :: shards] if there.get(first, 0) < count]
 
 
-def staying(parts: Iterable[Part], wanted: Iterable[Block]) -> list[Part]:
+def kept_parts(parts: Iterable[Part], wanted: Iterable[Block]) -> list[Part]:
     """Return the parts on disk that are not simulated again."""
     again = {first for first, _ in wanted}
     return [part for part in parts if part.first not in again]
@@ -226,7 +226,9 @@ def verdicts(asked: Iterable[Requirement], frame: pl.DataFrame) -> list[Verdict]
     return requirements.verdicts(asked, lambda name: frame[name].to_numpy().astype(float), finished(frame))
 
 
-def here(make: Callable[[np.ndarray], pl.DataFrame], rows: Rows, wanted: list[Block]) -> Iterator[tuple[Part, int]]:
+def make_parts(
+    make: Callable[[np.ndarray], pl.DataFrame], rows: Rows, wanted: list[Block]
+) -> Iterator[tuple[Part, int]]:
     """Make the wanted parts on this machine and write them. Accelerators make several parts at a time.
 
     Args:
@@ -259,7 +261,7 @@ def here(make: Callable[[np.ndarray], pl.DataFrame], rows: Rows, wanted: list[Bl
         workers.shutdown(cancel_futures=True)
 
 
-def follow(parts: Iterable[tuple[Part, int]], standing: Tally, report: Callable[[Tally], None]) -> None:
+def report_progress(parts: Iterable[tuple[Part, int]], standing: Tally, report: Callable[[Tally], None]) -> None:
     """Report the progress after each part."""
     report(standing)
     for part, failed in parts:

@@ -205,4 +205,4 @@ def _loops_and_margins(
         calls = jax.lax.map(some, jax.tree.map(lambda v: v.reshape(-1, LOOPS_PER_CALL, *v.shape[1:]), trials))
         return jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), calls)
 
-    return montecarlo.spread(on_device, trials, devices)
+    return montecarlo.over_devices(on_device, trials, devices)

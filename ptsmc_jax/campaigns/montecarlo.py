@@ -197,7 +197,7 @@ def run(
     kernel = by_kernel() if kernel is None else kernel
     calls = []
     for k in range(0, count, size):
-        places, per_device = shared_out(min(size, count - k), devices, rows * block)
+        places, per_device = scattered(min(size, count - k), devices, rows * block)
         chosen = k + places.reshape(devices, rows, block)
         numbers = jax.tree.map(lambda v, chosen=chosen: jnp.asarray(v[chosen]), trials)
         needed = jnp.int32(-(-per_device // block))
@@ -221,7 +221,7 @@ def _numbers(trials: ArrayLike) -> np.ndarray:
     return numbers.astype(np.uint32)
 
 
-def shared_out(count: int, devices: int, slots: int) -> tuple[np.ndarray, int]:
+def scattered(count: int, devices: int, slots: int) -> tuple[np.ndarray, int]:
     """Distribute items over devices.
 
     Args:
@@ -239,7 +239,7 @@ def shared_out(count: int, devices: int, slots: int) -> tuple[np.ndarray, int]:
 
 
 def gathered(results: np.ndarray, per_device: int) -> np.ndarray:
-    """Return the results of `shared_out` items in their order, (devices, slots, ..) -> (devices * per_device, ..)."""
+    """Return the results of `scattered` items in their order, (devices, slots, ..) -> (devices * per_device, ..)."""
     counted = np.asarray(results)[:, :per_device]
     return counted.reshape(-1, *counted.shape[2:])
 
@@ -314,7 +314,7 @@ def row_by_row(
 
         return jax.tree.map(lambda v: v[None], jax.lax.fori_loop(0, needed, step, empty))
 
-    return spread(on_device, rows, devices)
+    return over_devices(on_device, rows, devices)
 
 
 def block_size() -> int:
@@ -345,7 +345,7 @@ def blocks(function: Callable, trials: PyTree) -> PyTree:
     return jax.tree.map(lambda v: v.reshape(rows * size, *v.shape[2:])[:count], results)
 
 
-def spread(function: Callable, shared: PyTree, devices: int) -> PyTree:
+def over_devices(function: Callable, shared: PyTree, devices: int) -> PyTree:
     """Return function(shared), with the first axes of argument and results distributed over the devices."""
     if devices == 1:
         return function(shared)

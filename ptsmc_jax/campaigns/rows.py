@@ -58,7 +58,7 @@ class Rows:
         """Write a part with this content. Raises OSError if the disk is full."""
         self.folder.mkdir(parents=True, exist_ok=True)
         path = self.folder / f"{first:010d}-{first + count - 1:010d}-{self._checksum(first, count, content)}.parquet"
-        with store.whole(path) as making, making.open("xb") as file:
+        with store.replacing(path) as making, making.open("xb") as file:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())

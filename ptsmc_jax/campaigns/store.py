@@ -127,13 +127,13 @@ def begin(folder: Path, scenario: Tables, made_by: Tables, *, fresh: bool) -> Pa
         record(making, scenario, made_by)
         if fresh:
             (making / JOURNAL).touch()
-            forget(folder)
+            remove_summary(folder)
 
     write(folder, fill)
     return folder / JOURNAL
 
 
-def forget(folder: Path) -> None:
+def remove_summary(folder: Path) -> None:
     """Remove the summary of a result and the files made from it, which would not belong to the next result."""
     if not ((folder / SUMMARY).exists() or "command" in read_versions(folder)):
         return
@@ -313,7 +313,7 @@ def write(folder: Path, fill: Callable[[Path], None]) -> None:
         order = {"versions.json": -1, SUMMARY: 1}
         files = (path for path in making.rglob("*") if path.is_file())
         if any((making / name).exists() and not _alike(making / name, folder / name) for name in IDENTITY):
-            forget(folder)
+            remove_summary(folder)
         for path in sorted(files, key=lambda path: order.get(path.name, 0)):
             target = folder / path.relative_to(making)
             target.parent.mkdir(parents=True, exist_ok=True)
@@ -354,20 +354,20 @@ def write_json(path: Path, value: object) -> None:
 
 def write_text(path: Path, text: str) -> None:
     """Write a text file as a whole; bytes that are not UTF-8, from names of files, become escapes."""
-    with whole(path) as making:
+    with replacing(path) as making:
         making.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
     """Write a CSV file as a whole; numbers have enough digits to be read back exactly."""
-    with whole(path) as making, making.open("w", newline="", encoding="utf-8") as file:
+    with replacing(path) as making, making.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(header)
         writer.writerows([value.item() if hasattr(value, "item") else value for value in row] for row in rows)
 
 
 @contextlib.contextmanager
-def whole(path: Path) -> Iterator[Path]:
+def replacing(path: Path) -> Iterator[Path]:
     """Yield a temporary file beside it, which is then moved into place, or removed after an error."""
     making = path.with_name(f"{MAKING}{secrets.token_hex(8)}")
     try:

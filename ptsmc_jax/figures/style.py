@@ -35,7 +35,7 @@ MANY = 1e4  # ratio of an axis's ends above which numbers between powers of ten 
 
 
 def save(figures: Mapping[str, Figure], folder: Path) -> list[Path]:
-    """Write NAME.png for each figure into a folder, with a mark for `store.forget`; return the paths."""
+    """Write NAME.png for each figure into a folder, with a mark for `store.remove_summary`; return the paths."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, figure in figures.items():
         figure.savefig(folder / f"{name}.png", metadata={"Creator": "ptsmc"})

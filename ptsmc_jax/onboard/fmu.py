@@ -92,7 +92,7 @@ def variables(model: Model) -> list[Variable]:
     def listed(fields: Iterable[Field], role: str, values: dict[str, Any], prefix: str = "") -> Iterable[Variable]:
         for field in fields:
             kind = {REAL: "r", "uint32_t": "u"}.get(field.kind, "i")
-            start = np.broadcast_to(values.get(field.name, _rest(field)), field.shape)
+            start = np.broadcast_to(values.get(field.name, _default_start(field)), field.shape)
             for index in np.ndindex(*field.shape):
                 at = f"[{','.join(str(k + 1) for k in index)}]" if index else ""
                 yield Variable(f"{prefix}{field.name}{at}", kind, role, float(start[index]), _meaning(field.about))
@@ -118,7 +118,7 @@ def _meaning(about: str) -> str:
     return re.sub(r"; default: [^[]*(?=\[)", " ", text)
 
 
-def _rest(field: Field) -> Any:
+def _default_start(field: Field) -> Any:
     """Return the start value of an input: the identity for a quaternion, otherwise zero."""
     return [0.0, 0.0, 0.0, 1.0] if field.shape == (4,) and "wheel" not in field.name else 0.0
 

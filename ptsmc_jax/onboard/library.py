@@ -233,7 +233,7 @@ class InTheLoop:
                 )
 
     @property
-    def otherwise(self) -> str:
+    def parameter_differences(self) -> str:
         """A sentence that lists the parameters of C that differ from the scenario; empty if there are none."""
         simulated, made = (
             dict(zip(self.library.columns["params"], self.library.parameters, strict=True)),

@@ -36,7 +36,7 @@ ATOMS = ("constant", "place", "variable", "index", "table")
 ATOM, UNARY, CHOICE = 20, 14, 3  # operator precedences in C: no operator, unary operator, ?:
 
 
-def _ends(kind: str) -> tuple[str, str]:
+def _integer_limits(kind: str) -> tuple[str, str]:
     """Return C's names of the least and the largest integer of a type."""
     name = kind.removesuffix("_t").upper()
     return "0" if kind.startswith("u") else f"{name}_MIN", f"{name}_MAX"
@@ -52,7 +52,7 @@ def _helpers() -> dict[str, str]:
     text = [(FILES / "helpers.c").read_text(encoding="utf-8")]
     integers = Template((FILES / "integers.c").read_text(encoding="utf-8"))
     for kind, (_, beyond) in WHOLE.items():
-        low, high = _ends(kind)
+        low, high = _integer_limits(kind)
         sign = "x > 0" if low == "0" else "(x > 0) - (x < 0)"
         values = {"kind": kind, "suffix": _suffix(kind), "sign": sign, "low": low, "high": high, "beyond": beyond}
         text.append(integers.substitute(values))
@@ -69,7 +69,7 @@ def number(value: Any, kind: str) -> str:
         return "1" if value else "0"
     if kind != REAL:
         least = kind[0] == "i" and value == -(2 ** (int(kind[3:5]) - 1))
-        return _ends(kind)[0] if least else WHOLE[kind][0].format(int(value))
+        return _integer_limits(kind)[0] if least else WHOLE[kind][0].format(int(value))
     if value != value:
         return "R(NAN)"
     if value in (float("inf"), float("-inf")):

@@ -104,8 +104,8 @@ def plant_texts(code: Code, about: About) -> dict[str, str]:
         "keep": "    now.derived = state->derived;" if code.derived else "",
         "begin": call["begin"],
         "advance": call["advance"],
-        "usable": _all([_called("all_finite", field, "in->") for field in _reals(code.inputs)]),
-        "sound": _all([_called("all_finite", field, "now.") for field in _reals(code.state)]),
+        "usable": _conjunction([_called("all_finite", field, "in->") for field in _reals(code.inputs)]),
+        "sound": _conjunction([_called("all_finite", field, "now.") for field in _reals(code.state)]),
         "unused": "" if code.derived or "(p" in call["begin"] + call["advance"] else "    (void)p;",
         "derivation": f"\n{code.derivation}" if code.derived else "",
     }
@@ -183,9 +183,9 @@ def _checks(code: Code, about: About) -> dict[str, str]:
         "p": "p, " if turning else "",
         "rotation": filled("rotation.c").rstrip() + "\n" if turning else "",
         "turn": filled("turn.c").rstrip() if turning else "",
-        "usable": _all(usable),
-        "sound": _all(sound),
-        "current": filled("current.c", same=_all(same)).rstrip() if code.derived else "",
+        "usable": _conjunction(usable),
+        "sound": _conjunction(sound),
+        "current": filled("current.c", same=_conjunction(same)).rstrip() if code.derived else "",
     }
 
 
@@ -211,7 +211,7 @@ def _called(function: str, field: Field, *owners: str) -> str:
     return f"{function}({firsts}, {field.size})"
 
 
-def _all(terms: Sequence[str]) -> str:
+def _conjunction(terms: Sequence[str]) -> str:
     """Return an expression that is true if all terms are true, one term a line."""
     return " &&\n        ".join(terms)
 

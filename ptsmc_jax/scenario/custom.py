@@ -159,13 +159,13 @@ def read(table: Any, name: str, code: object) -> Any:
         if not (isinstance(item, type) and issubclass(item, base)):
             what = f"a class {item.__name__}" if isinstance(item, type) else f"of type {type(item).__name__}"
             raise ValueError(f"it is {what}, but must be a class derived from ptsmc_jax.{base.__name__}")
-        return _with_keys(table, item, (_again, table.remake, name, code))
+        return _with_keys(table, item, (_remade, table.remake, name, code))
     except ValueError as error:
         shown = brief(code) if isinstance(code, str) else getattr(code, "__name__", type(code).__name__)
         raise ScenarioError(f"{name}.code is {shown}: {error}") from None
 
 
-def _again(remake: tuple, name: str, code: object) -> Any:
+def _remade(remake: tuple, name: str, code: object) -> Any:
     make, *arguments = remake
     return read(make(*arguments), name, code)
 
@@ -179,9 +179,9 @@ def _with_keys(table: Any, found: Any, remake: tuple) -> Any:
     for name in _annotated(found, base):
         known = getattr(base, name, None)
         if name in common.keys() - {DECLARED} or callable(known) or isinstance(known, property):
-            raise _taken(found, name, "another name")
+            raise _name_in_use(found, name, "another name")
         if hasattr(base, name):
-            raise _taken(found, name, f"{name} = .. without a type")
+            raise _name_in_use(found, name, f"{name} = .. without a type")
     for cls in reversed(found.__mro__):  # custom base classes have fields too
         if issubclass(cls, base) and "__dataclass_fields__" not in cls.__dict__:
             try:
@@ -193,7 +193,7 @@ def _with_keys(table: Any, found: Any, remake: tuple) -> Any:
         if common.get(field.name) is not None and common[field.name].default is field.default:
             continue
         if (hasattr(table, field.name) or field.name == "rest") and field.name not in common:  # the name is in use
-            raise _taken(found, field.name, "another name")
+            raise _name_in_use(found, field.name, "another name")
         if table.prefix + field.name == "observer_gain" or re.fullmatch(
             r"observer_gain_\d+", table.prefix + field.name
         ):
@@ -211,7 +211,7 @@ def _annotated(found: type, base: type) -> Iterator[str]:
             yield from (name for name, kind in inspect.get_annotations(cls).items() if "ClassVar" not in str(kind))
 
 
-def _taken(found: type, name: str, allowed: str) -> ValueError:
+def _name_in_use(found: type, name: str, allowed: str) -> ValueError:
     taken = f"the class {found.__name__} has a field {name}, a name that the base class already uses"
     return ValueError(f"{taken}; allowed is {allowed}")
 

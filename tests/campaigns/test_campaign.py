@@ -110,8 +110,8 @@ def test_parts_are_written_one_after_the_other(simulated, tmp_path, monkeypatch)
     monkeypatch.setattr(campaign, "PART", 100)
     kept = rows.Rows(tmp_path / "trials", b"k")
     seen = []
-    campaign.follow(
-        campaign.here(made.simulate, kept, campaign.missing([], 300)),
+    campaign.report_progress(
+        campaign.make_parts(made.simulate, kept, campaign.missing([], 300)),
         campaign.tally([], 300),
         lambda standing: seen.append((standing.done, standing.total, standing.failed)),
     )
@@ -135,7 +135,7 @@ def test_parts_simulated_in_one_call_are_the_same(simulated, tmp_path, monkeypat
     kept = rows.Rows(tmp_path / "trials", b"k")
     wanted = campaign.missing([], 300, (2, 2))
     assert wanted == [(40, 40), (120, 40), (200, 40), (280, 20)]
-    landed = [part for part, _ in campaign.here(make, kept, wanted)]
+    landed = [part for part, _ in campaign.make_parts(make, kept, wanted)]
     assert flights == {2: [80, 60], 3: [120, 20], 16: [140]}[together]
     assert [(part.first, part.count) for part in landed] == wanted
     for part in landed:
@@ -153,7 +153,9 @@ def test_finished_parts_remain_if_a_later_part_fails(simulated, tmp_path, monkey
         return made.simulate(trials)
 
     with pytest.raises(KeyboardInterrupt):
-        campaign.follow(campaign.here(make, kept, campaign.missing([], 300)), campaign.tally([], 300), lambda _: None)
+        campaign.report_progress(
+            campaign.make_parts(make, kept, campaign.missing([], 300)), campaign.tally([], 300), lambda _: None
+        )
     assert [part.first for part in kept.parts()[0]] == [0, 100]
 
 

@@ -342,8 +342,8 @@ def test_differences_of_small_parameters_are_reported(exported):
     at = library.columns["params"].index("law_sign_width")
     for width, said in ((1e-9, "law_sign_width = 1e-09 instead of 2e-09"), (2e-9 * (1.0 + 1e-7), "")):
         library.parameters[at] = width
-        assert InTheLoop(library, parts).otherwise.endswith(said)
-        assert bool(InTheLoop(library, parts).otherwise) == bool(said)
+        assert InTheLoop(library, parts).parameter_differences.endswith(said)
+        assert bool(InTheLoop(library, parts).parameter_differences) == bool(said)
 
 
 @needs_compiler

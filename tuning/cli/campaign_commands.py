@@ -160,7 +160,7 @@ def montecarlo(
         folder = replace(folder, first_look=campaign_summary.first_look(folder, common.force))
     _ = folder.campaign  # raises configuration errors before anything is written
     if folder.computer is not None:
-        flight_commands.say_otherwise(folder.computer)
+        flight_commands.report_parameter_differences(folder.computer)
 
     shared = this_shard != (1, 1) and not dry_run
     with resumable(common.force), store.in_use(folder.path, shared=shared), _elsewhere(cluster, tls) as elsewhere:

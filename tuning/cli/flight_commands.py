@@ -92,14 +92,14 @@ def compiled(controller: Path, ready: "Study") -> "InTheLoop":
     from ptsmc_jax.onboard.library import InTheLoop, Library
 
     computer = InTheLoop(Library(controller), ready.parts, ready.dispersion)
-    say_otherwise(computer)
+    report_parameter_differences(computer)
     return computer
 
 
-def say_otherwise(computer: "InTheLoop") -> None:
+def report_parameter_differences(computer: "InTheLoop") -> None:
     """Print the parameters in which the compiled controller differs from the scenario."""
-    if computer.otherwise:
-        print(f"ptsmc: {computer.otherwise}", file=sys.stderr)
+    if computer.parameter_differences:
+        print(f"ptsmc: {computer.parameter_differences}", file=sys.stderr)
 
 
 COMMANDS = (export,)

@@ -96,7 +96,7 @@ def accuracy(summary: Tune) -> Iterator[str]:
     if on_training is not None and on_training.rms is not None:
         spread = interval(on_training.rms_interval, text)
         yield f"training trials: {text(on_training.rms)}{spread}"
-    yield from _beside_published(summary)
+    yield from _compared_with_published(summary)
     if summary.gains:
         yield f"tuned gains: {', '.join(f'{name} {value:.6g}' for name, value in summary.gains.items())}"
     saturated = held_out.metrics.get("saturated")
@@ -111,7 +111,7 @@ def accuracy(summary: Tune) -> Iterator[str]:
         yield f"the scenario's own gains are more accurate than the tuned ones; {why}"
 
 
-def _beside_published(summary: Tune) -> Iterator[str]:
+def _compared_with_published(summary: Tune) -> Iterator[str]:
     """Return the comparison with the published gains."""
     times, bounds = summary.accuracy_gain_over_published, summary.accuracy_gain_interval
     published = PUBLISHED[summary.published_label]
@@ -159,7 +159,7 @@ def search(summary: Tune) -> Iterator[str]:
         f"{record.gradients} with gradients"
     )
     if summary.differential_evolution is not None:
-        yield _beside_evolution(summary.differential_evolution, record)
+        yield _compared_with_evolution(summary.differential_evolution, record)
 
 
 def _conflict(summary: Tune) -> Iterator[str]:
@@ -228,7 +228,7 @@ def _worst_case(hardest: Hardest, *, tuned_for: bool) -> str:
     return f"{where}, {hardest.metric} {far}{tip}"
 
 
-def _beside_evolution(check: Check, record: Search) -> str:
+def _compared_with_evolution(check: Check, record: Search) -> str:
     """Return the comparison with differential evolution."""
     keeps = all(one is not None and one <= 1.0 for one in record.largest_over_limit.values())
     far = check.distance  # difference of the logarithms of the objectives

@@ -226,4 +226,4 @@ def rows_with_derivatives(asked: RequiredMargins, scale: Scale, normalised: Arra
         c, gradient = with_derivatives(asked, scale, normalised[0])
         return {"c": c[None], "c_gradient": jnp.nan_to_num(gradient)[None]}
 
-    return montecarlo.spread(on_device, normalised, normalised.shape[0])
+    return montecarlo.over_devices(on_device, normalised, normalised.shape[0])

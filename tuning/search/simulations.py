@@ -150,7 +150,7 @@ class _Rows:
             by_trial: arguments with trials on the first axis.
         """
         count = min(self._rows - first, self.devices * self._most)
-        places, needed = montecarlo.shared_out(count, self.devices, self._most)
+        places, needed = montecarlo.scattered(count, self.devices, self._most)
         point, row = np.divmod(first + places, len(self._trials))
         trial = self._trials[row]
         by_row = {name: np.asarray(v)[point] for name, v in by_point.items()}

@@ -106,7 +106,7 @@ class Folder:
         counts = {"trials": self.trials, "first_look": self.first_look}
         entries = {**self.identity, **counts, "metrics_names": names, "run_table": self.table_name}
         if self.controller is not None:
-            entries |= {C_FOLDER: C_FOLDER, "controller_otherwise": self.otherwise or None}
+            entries |= {C_FOLDER: C_FOLDER, "controller_otherwise": self.parameter_differences or None}
         return store.versions(**{name: value for name, value in entries.items() if value is not None})
 
     @cached_property
@@ -163,11 +163,11 @@ class Folder:
         return InTheLoop(Library(self.controller), self.ready.parts, self.ready.dispersion)
 
     @property
-    def otherwise(self) -> str:
+    def parameter_differences(self) -> str:
         """A sentence about parameters that differ between the C code and the scenario; empty if none differ."""
         if self.made is not None:
             return self.made.controller_otherwise or ""
-        return "" if self.computer is None else self.computer.otherwise
+        return "" if self.computer is None else self.computer.parameter_differences
 
     @property
     def software(self) -> Software:
@@ -285,7 +285,7 @@ def begin(folder: Folder, force: bool) -> None:
             sources.copy(folder.controller, making / C_FOLDER)
         for file in kept:  # only now, because these files may be the source of the copy
             file.unlink(missing_ok=True)
-        store.forget(path)  # delete results of another campaign, or of fewer trials
+        store.remove_summary(path)  # delete results of another campaign, or of fewer trials
 
     store.write(path, fill)
 
@@ -395,8 +395,10 @@ def simulate(
     if alone:  # otherwise other processes may be writing into the folder
         folder.rows.tidy(parts)
     wanted = running.missing(parts, trials, shard)
-    landing = elsewhere(folder, wanted) if elsewhere else running.here(folder.campaign.simulate, folder.rows, wanted)
-    running.follow(landing, running.tally(running.staying(parts, wanted), trials), report)
+    landing = (
+        elsewhere(folder, wanted) if elsewhere else running.make_parts(folder.campaign.simulate, folder.rows, wanted)
+    )
+    running.report_progress(landing, running.tally(running.kept_parts(parts, wanted), trials), report)
     if alone:
         folder.rows.tidy(folder.rows.parts()[0])
 
@@ -406,8 +408,9 @@ def write_run_table(folder: Folder, report: Callable[[Tally], None]) -> None:
     parts, _ = folder.dry.parts()
     folder.dry.tidy(parts)
     wanted = running.missing(parts, folder.trials)
-    landing = running.here(folder.campaign.draw, folder.dry, wanted)
-    running.follow(landing, Tally(sum(part.count for part in running.staying(parts, wanted)), folder.trials, 0), report)
+    landing = running.make_parts(folder.campaign.draw, folder.dry, wanted)
+    done = sum(part.count for part in running.kept_parts(parts, wanted))
+    running.report_progress(landing, Tally(done, folder.trials, 0), report)
 
 
 def settle(folder: Folder, trials: int) -> Folder:

@@ -168,7 +168,7 @@ def summarise(folder: Folder) -> dict[str, Any]:
         **_samples(folder, parts),
         "warnings": [
             *plausibility.warnings(folder.scenario),
-            *filter(None, [folder.otherwise]),
+            *filter(None, [folder.parameter_differences]),
             *_equal_trials(quantiles, done, drawn=differ),
         ],
     }

@@ -43,7 +43,7 @@ def summary(run: Run, scenario: Scenario, computer: "InTheLoop | None" = None) -
     lower_bound = None if run.lower_bound is None else run.lower_bound.window_error
     warnings, decided_by = plausibility.warnings(scenario), {}
     if computer is not None:
-        warnings += [computer.otherwise] if computer.otherwise else []
+        warnings += [computer.parameter_differences] if computer.parameter_differences else []
         statuses = {name: count for name, count in run.samples.items() if count}
         decided_by = {"controller_statuses": statuses, "controller": computer.library.checksum}
     judged = {"lower_bound": lower_bound, "verdicts": verdicts, "warnings": warnings}
