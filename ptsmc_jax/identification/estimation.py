@@ -37,7 +37,7 @@ POOR_FIT = 1.5  # median normalised square of innovations above which a search b
 LAGS = 25  # number of lags of the autocorrelation
 WHITE = 0.05  # largest autocorrelation that counts as white in a long log
 CONSISTENT = (0.8, 1.25)  # mean normalised square of innovations that fit their variance, in a long log
-RARE = 4.0  # sigmas of an autocorrelation or of a mean square in a short log that count as a misfit
+RARE = 4.0  # in a short log, an autocorrelation or a mean square beyond this number of sigmas is a misfit
 FARTHEST = 3.0  # distance of the most likely parameters of a validation log, RMS in sigmas of the estimates
 CONFIDENCE = 0.95
 CLEAR = 0.3  # smallest component of an undetermined direction that is named
@@ -117,8 +117,8 @@ class Identification:
     z: np.ndarray  # estimated coordinates (n,)
     start: np.ndarray  # numbers of the scenario (k,)
     prior: np.ndarray  # prior 1 sigma of the numbers (k,), infinite without prior knowledge
-    estimate: np.ndarray  # (k,)
-    covariance: np.ndarray  # (k, k)
+    estimate: np.ndarray  # estimated numbers (k,), in their units
+    covariance: np.ndarray  # covariance of the estimated numbers (k, k)
     undetermined: list[str]  # sentences on combinations that the data do not determine
     complete: bool  # whether data and prior knowledge together determine every combination
     fits: list[Fit]

@@ -23,14 +23,14 @@ Rule = Callable[[Given], Given]  # maps all parameters to all parameters, with t
 
 def rules(parts: Parts) -> list[Rule]:
     """Return the rules for the flight computer of these parts; each uses the result of the rule before it."""
-    found: list[Rule] = [_inverses, _estimation]
+    found: list[Rule] = [_inertia_inverses, _estimation]
     estimator = getattr(parts.sensors, "filter", None)
     if isinstance(estimator, KalmanFilter):
-        found.append(_clocks)
+        found.append(_copied_periods)
     elif estimator is not None:
         found.append(_filtering(parts.sensors))
     if parts.actuators.wheels is not None:
-        found.append(_allocation)
+        found.append(_wheel_allocation)
     return found
 
 
@@ -41,7 +41,7 @@ def _inverse(model: Any) -> Any:
     return replace(model, inertia_inverse=matrices.solve(model.inertia, jnp.eye(model.inputs)))
 
 
-def _inverses(given: Given) -> Given:
+def _inertia_inverses(given: Given) -> Given:
     law, observer = given["law"], given["observer"]
     law = replace(law, kinematics=replace(law.kinematics, model=_inverse(law.model)))
     return given | {"law": law, "observer": replace(observer, model=_inverse(observer.model))}
@@ -53,7 +53,7 @@ def _estimation(given: Given) -> Given:
     return given | {"observer_matrix": observer.update_matrix(given["period"]), "bound": observer.error_bound()}
 
 
-def _clocks(given: Given) -> Given:
+def _copied_periods(given: Given) -> Given:
     """Copy the control period into the Kalman filter and its sensors."""
     estimator, period = given["filter"], given["period"]
     sensors = (replace(sensor, times=replace(sensor.times, period=period)) for sensor in estimator.sensors)
@@ -73,7 +73,7 @@ def _filtering(sensors: Any) -> Rule:
     return run
 
 
-def _allocation(given: Given) -> Given:
+def _wheel_allocation(given: Given) -> Given:
     return given | {"actuators": allocated(given["actuators"])}
 
 

@@ -133,8 +133,8 @@ def names_of(board: Board) -> dict[str, list[str]]:
 
 
 # struct, and text before the field in C, by the prefix of a name that a stage reads or writes
-STRUCTS = {"in": "in", "before": "before", "now": "before", "last": "out", "out": "out"}
-PLACES = {"in": "in->", "before": "before->", "now": "now->", "last": "before->last.", "out": "out->"}
+STRUCT_OF_PREFIX = {"in": "in", "before": "before", "now": "before", "last": "out", "out": "out"}
+C_PREFIX = {"in": "in->", "before": "before->", "now": "now->", "last": "before->last.", "out": "out->"}
 
 
 def _function(code: Code, board: Board, stage: Stage, structs: dict[str, Struct], known: parameters.Parameters) -> None:
@@ -142,7 +142,7 @@ def _function(code: Code, board: Board, stage: Stage, structs: dict[str, Struct]
 
     def fields_of(name: str) -> list[Field]:
         prefix, _, key = name.partition(".")
-        return structs[STRUCTS[prefix]][key]
+        return structs[STRUCT_OF_PREFIX[prefix]][key]
 
     def run(leaves: list[Any], read: list[Any]) -> dict[str, Any]:
         return stage.run(known.tree(leaves), dict(zip(stage.reads, read, strict=True)))
@@ -154,7 +154,7 @@ def _function(code: Code, board: Board, stage: Stage, structs: dict[str, Struct]
         if name in SCALARS:
             args.append(object_array((), [pool.place(name, kind_of(shape.dtype))]))
         else:
-            args += [made.nodes(pool, PLACES[name.partition(".")[0]]) for made in fields_of(name)]
+            args += [made.nodes(pool, C_PREFIX[name.partition(".")[0]]) for made in fields_of(name)]
     results = iter(Translator(pool).evaluate(closed, [*known.nodes(pool), *args]))
     ends, returned, needed = list[tuple[str, Node]](), None, set[str]()
     for name in sorted(written):  # JAX flattens a dict in this order
@@ -166,7 +166,7 @@ def _function(code: Code, board: Board, stage: Stage, structs: dict[str, Struct]
         for made in fields_of(name):
             result = next(results)
             _titled(result, made.name)
-            places = (PLACES[prefix] + element for element in made.elements())
+            places = (C_PREFIX[prefix] + element for element in made.elements())
             ends += zip(places, result.flat, strict=True)
     printer = printing.Printer(ARGUMENTS)
     body = printer.body(pool.block, ends, returned=returned)
@@ -186,7 +186,7 @@ def _function(code: Code, board: Board, stage: Stage, structs: dict[str, Struct]
 
 def _shape_of(board: Board, name: str) -> Any:
     prefix, _, key = name.partition(".")
-    return SCALARS[name]() if name in SCALARS else _shapes(board)[STRUCTS[prefix]][key]
+    return SCALARS[name]() if name in SCALARS else _shapes(board)[STRUCT_OF_PREFIX[prefix]][key]
 
 
 def _titled(result: np.ndarray, name: str) -> None:

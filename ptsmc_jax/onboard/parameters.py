@@ -71,7 +71,7 @@ def parameters(board: Board) -> Parameters:
     """Return the parameters of a flight computer, with the derived ones marked."""
     made = named(board)
     for rule in board.rules:
-        _follow(made, rule)
+        _mark_results(made, rule)
     return made
 
 
@@ -111,7 +111,7 @@ def _traced(made: Parameters, rules: Iterable[Rule]) -> Any:
     return jax.make_jaxpr(run)(made.leaves)
 
 
-def _follow(made: Parameters, rule: Rule) -> None:
+def _mark_results(made: Parameters, rule: Rule) -> None:
     """Mark the results of a rule as derived, or as fixed if C cannot compute them."""
     closed = _traced(made, [*made.rules, rule])
     jaxpr, gives = closed.jaxpr, {}

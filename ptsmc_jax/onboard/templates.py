@@ -270,7 +270,7 @@ def rows(code: Code, about: About) -> dict[str, str | int]:
 
 
 def _group(column: str) -> str:
-    """Return the group of a column; its rounding errors are compared with the largest number of the group."""
+    """Return the group of a column of vectors.csv. Rounding errors are relative to the largest number of a group."""
     name = column.partition(".")[2].removeprefix("last.").partition("[")[0]
     return TORQUES[0] if name.startswith(TORQUES) else RATES[0] if name in RATES else name
 

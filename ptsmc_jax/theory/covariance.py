@@ -146,7 +146,8 @@ class _State:
         reading = self._reading
         factor = np.zeros((self.size, reading.own.size))
         factor[self._own] = np.diag(reading.own)
-        if reading.start is not None:  # filter errors of attitude and bias; the bias error depends on the gyro bias
+        # a filter starts with errors of attitude and bias; its bias error depends on the gyro bias
+        if reading.start is not None:
             start = np.zeros((self.size, 6))
             start[self.memory : self.memory + 6] = reading.start[1]
             factor[self.memory + 3 : self.memory + 6] = np.diag(reading.own)

@@ -96,7 +96,7 @@ class _HandOver(NamedTuple):
     """Bounds at the hand-over, for each component of the error."""
 
     centre: Array  # (m, n) The error and its derivatives are between centre - half and centre + half.
-    half: Array  # (m, n)
+    half: Array  # (m, n) Half width of this interval.
     s: Array  # (m,) Bound on |s|.
     limit: Array  # Limit of the bound on |s_i| for t -> infinity, (beta/k)^(1/2).
 

@@ -124,7 +124,7 @@ def _stays(u: np.ndarray) -> np.ndarray:
 
 @programs.jit(compiler_options=programs.QUICKLY)
 def _nonlinear_residual(parts: Parts, run: linear.Nominal) -> tuple[Array, Array]:
-    """Return the residual of the module docstring and u(x_0) - u(x), (periods, m) each."""
+    """Return the nonlinear residual of the command, see the module docstring, and u(x_0) - u(x), (periods, m) each."""
     parts = linear.quiet(parts)
     k2, kinematics, model = parts.observer.error_bound(), parts.controller.kinematics, parts.observer.model
 

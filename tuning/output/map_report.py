@@ -28,8 +28,8 @@ def lines(pairs: Sequence[Mapping[str, Any]], keys: tuple[str, str], plant: str)
 
     Args:
         pairs: the rows of a map by column; x and y are the values of the keys.
-        keys: across and up.
-        plant: its kind.
+        keys: keys of the horizontal and of the vertical axis.
+        plant: kind of the plant.
     """
     simulated = [pair for pair in pairs if pair["status"] == "simulated"]
     with_error = [pair for pair in simulated if pair["window_error"] == pair["window_error"]]  # is not NaN

@@ -38,7 +38,7 @@ def _layout(**others: Any) -> Chart:
 
 
 def read(path: Path) -> dict[str, np.ndarray]:
-    """The numbers of a `trajectory.csv` by the names of its columns, (time,) each."""
+    """Return the numbers of a `trajectory.csv` by the names of its columns, (time,) each."""
     with path.open(newline="", encoding="utf-8") as file:
         head, *rows = csv.reader(file)
     values = np.array([[float(cell or "nan") for cell in row] for row in rows])
@@ -49,9 +49,12 @@ LOGGED = ("measured", "sent")  # columns for `ptsmc identify`, which have gaps
 
 
 def history(columns: Mapping[str, np.ndarray], spacecraft: bool, marks: Mapping[str, float]) -> Chart:
-    """The columns of a `trajectory.csv` over time, one panel each for state, estimate, input and sliding variable.
+    """Return the chart of a `trajectory.csv` over time: panels for state, estimate, input and sliding variable.
 
-    marks: times to draw a line at, by what happens then.
+    Args:
+        columns: the columns by name, (time,) each.
+        spacecraft: whether the plant is a spacecraft.
+        marks: times of vertical lines [s], by their labels.
     """
     t = columns["t"]
     kept = np.unique(np.linspace(0, t.size - 1, min(POINTS, t.size)).round().astype(int))
@@ -83,12 +86,12 @@ def history(columns: Mapping[str, np.ndarray], spacecraft: bool, marks: Mapping[
 
 
 def _upright(at: float, **line: Any) -> Chart:
-    """A line across the whole height of a chart; line: how it is drawn."""
+    """Return a vertical line over the whole height of a chart; line: its style."""
     return {"type": "line", "x0": at, "x1": at, "yref": "paper", "y0": 0, "y1": 1, "line": line}
 
 
 def attitude(t: np.ndarray, q: np.ndarray) -> Chart:
-    """The body as a box with its axes, turning; q (time, 4) scalar last, body relative to inertial."""
+    """Return an animation of the body as a box with axes, from its quaternions q (time, 4), scalar last."""
     shown = np.unique(np.searchsorted(t, np.linspace(t[0], t[-1], FRAMES) * (1.0 - 1e-12)))
 
     def lines(at: np.ndarray) -> list[Chart]:
@@ -207,7 +210,7 @@ def laws(
 
 
 def search(rows: Sequence[Mapping[str, str]], objective: str) -> Chart:
-    """The objective of every local search over the steps of a `history.csv`; hollow: beyond a limit."""
+    """Return the chart of the objective over the steps of every local search; hollow points break a limit."""
     starts: dict[str, list[Mapping[str, str]]] = {}
     for row in rows:
         starts.setdefault(row["start"], []).append(row)
@@ -230,5 +233,5 @@ def search(rows: Sequence[Mapping[str, str]], objective: str) -> Chart:
 
 
 def numbers(values: np.ndarray) -> list[float | None]:
-    """JSON knows neither NaN nor infinity."""
+    """Return the values with None in place of NaN and infinity, which JSON does not have."""
     return [float(f"{v:.6g}") if np.isfinite(v) else None for v in values]

@@ -8,7 +8,7 @@ from tuning.output.formats import angle
 from tuning.output.report import Section, Table, Text
 from tuning.output.summaries import Campaign, Entry
 
-USUAL = (0.9, 0.95)  # confidences that reviews ask for
+REVIEW_CONFIDENCES = (0.9, 0.95)  # confidences that reviews ask for
 
 
 def sections(summary: Campaign) -> list[Section]:
@@ -48,7 +48,7 @@ def heading(summary: Campaign) -> Iterator[str]:
         f"with {100 * pointing.confidence:g} % confidence; boresight {boresight}"
     )
     if any(value is None for axes in pointing.budget.values() for value in axes.values()):
-        few, more = (fewest_trials(pointing.probability, confidence) for confidence in USUAL)
+        few, more = (fewest_trials(pointing.probability, confidence) for confidence in REVIEW_CONFIDENCES)
         ended_early = (
             summary.simulated - summary.counts["ok"] - summary.counts.get("not_converged", 0)
         )  # runs that ended early and have no angles
@@ -94,4 +94,4 @@ def _needed(verdict: Entry) -> str:
         return "every run"
     if verdict.confidence is not None:
         return str(fewest_trials(verdict.quantile, verdict.confidence))
-    return ", ".join(f"{fewest_trials(verdict.quantile, c)} ({100 * c:g} %)" for c in USUAL)
+    return ", ".join(f"{fewest_trials(verdict.quantile, c)} ({100 * c:g} %)" for c in REVIEW_CONFIDENCES)

@@ -24,7 +24,7 @@ def of(summary: Tune) -> Report:
     """Return the report of a tuning."""
     first = formats.named_error(summary.held_out.number("window_error", "rms"), summary.plant, "RMS ")
     headline, mood = report.headline(summary.status, summary.verdicts, first)
-    trust = [*advice(summary), *search(summary), *diagnostics(summary), *_shortest(summary)]
+    trust = [*advice(summary), *search(summary), *diagnostics(summary), *_shortest_time(summary)]
     sections = [
         *report.requirements(summary.verdicts),
         Section("Gains", [gains(summary)]),
@@ -347,7 +347,7 @@ def diagnostics(summary: Tune) -> Iterator[str]:
         )
 
 
-def _shortest(summary: Tune) -> Iterator[str]:
+def _shortest_time(summary: Tune) -> Iterator[str]:
     """Return the shortest t_f that the limit on the torque allows."""
     found = summary.shortest_t_f
     # the theory ignores noise: without a simulation that keeps the limit its t_f would contradict the verdict
