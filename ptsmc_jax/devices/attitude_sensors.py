@@ -35,6 +35,7 @@ class SampleTimes:
     every: int | None = field(metadata={"static": True})  # control periods between readings; None if not a whole number
     wait: int = field(metadata={"static": True})  # smallest number of control samples between a reading and its use
     split: bool = field(metadata={"static": True})  # whether this number is `wait` + 1 for some readings
+    pattern: tuple[int, int] = field(metadata={"static": True})  # see `star_times.pattern`
 
     @property
     def queue(self) -> int:
@@ -45,11 +46,6 @@ class SampleTimes:
     def past(self) -> int:
         """Return how many past control samples the filter needs to know the attitude at a reading."""
         return self.queue + (self.every is None)
-
-    @property
-    def cycle(self) -> int:
-        """Return the number of control periods after which the times repeat, exactly or nearly."""
-        return pattern(float(self.interval / self.period))[0] if self.every is None else self.every
 
     def taken(self, sample: Any) -> Any:
         """Return whether a reading was taken since the control sample before this one."""
@@ -90,7 +86,7 @@ class SampleTimes:
         """Return times at which a reading is taken at every control sample, for a sensor with its own clock."""
         if self.every is not None:
             return self
-        return replace(self, interval=self.period, every=1, wait=self.queue, split=False)
+        return replace(self, interval=self.period, every=1, wait=self.queue, split=False, pattern=(1, 1))
 
     @property
     def _rounding(self) -> Any:
@@ -118,7 +114,7 @@ def sample_times(interval: float, latency: float, period: float) -> SampleTimes:
     whole = abs(late - round(late)) < TOLERANCE * max(late, 1.0)
     wait = round(late) if whole else math.ceil(late) if every is not None else math.floor(late)
     apart, age, control = (jnp.asarray(float(v)) for v in (interval, latency, period))
-    return SampleTimes(apart, age, control, every, wait, split=every is None and not whole)
+    return SampleTimes(apart, age, control, every, wait, every is None and not whole, pattern(ratio))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -301,7 +301,7 @@ def _steady_state(found: KalmanFilter) -> np.ndarray:
     The function doubles the number of cycles until the covariance converges (Anderson and Moore, Optimal Filtering,
     1979, section 6.7).
     """
-    count = min(math.lcm(*(sensor.times.cycle for sensor in found.sensors)), LONGEST)
+    count = min(math.lcm(*(sensor.times.pattern[0] for sensor in found.sensors)), LONGEST)
     size, one = 9 + 3 * found.past, np.eye(9 + 3 * found.past)
     grown = np.asarray(_grown(found))
     half = float(found.period) / 2

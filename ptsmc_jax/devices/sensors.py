@@ -18,7 +18,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ptsmc_jax.devices.attitude_filter import AttitudeFilter, Estimate, attitude_filter
-from ptsmc_jax.devices.star_times import StarTimes, filter_between
+from ptsmc_jax.devices.attitude_sensors import SampleTimes
+from ptsmc_jax.devices.star_times import filter_between
 from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.numerics import attitude, draws, guards
 from ptsmc_jax.numerics.draws import WholeNumber
@@ -246,7 +247,7 @@ class Sensors(SpacecraftSensors):
     misalignment: Leaf | None = None  # (3,) rotation vector of the star tracker in the body [rad]
     rate_scale: Leaf | None = None  # (3,) ratio of gyro reading to true rate [-]
     outage: Leaf | None = None  # (2,) start and end of an outage of the star tracker [s]; with a filter
-    own_times: StarTimes | None = None  # sample times of a star tracker with its own clock, with a filter
+    own_times: SampleTimes | None = None  # sample times of a star tracker with its own clock, with a filter
     noise_free: bool = field(default=False, metadata={"static": True})  # whether no noise is generated, see `quiet`
 
     def star_attitude(self, q: Float[Array, "4"]) -> Float[Array, "4"]:
@@ -309,7 +310,7 @@ class Sensors(SpacecraftSensors):
 
         dt is the length of the period before the sample. The result is None for a star tracker without its own clock.
         """
-        return None if self.own_times is None else jnp.minimum(self.own_times.age(sample), dt)
+        return None if self.own_times is None else self.own_times.taken_ago(sample, dt)
 
     def inputs(
         self, memory: Memory, x: AttitudeState, now: Ticks, dt: Scalar, star_x: AttitudeState | None = None
@@ -340,7 +341,7 @@ class Sensors(SpacecraftSensors):
             estimate = self.filter.correct(self.filter.propagate(old, rate, read.w, dt), read.q, weight)
         else:
             # without a measurement the age is the length of the period, as in exported C
-            age = jnp.where(weight > 0.0, jnp.minimum(self.own_times.age(now.sample), dt), dt)
+            age = jnp.where(weight > 0.0, self.own_times.taken_ago(now.sample, dt), dt)
             estimate = self.filter.correct_between(old, rate, read.w, dt, read.q, age, weight)
         return AttitudeState(estimate.q, read.w - estimate.bias), memory_next._replace(estimate=estimate, rate=read.w)
 

@@ -1,11 +1,9 @@
-"""Sample times of a star tracker with its own clock, whose samples need not coincide with the control samples.
+"""The attitude filter of a star tracker with its own clock, whose samples need not coincide with the control samples.
 
-The star tracker samples at control sample 0 of the clock (t = 0, or the hand-over) and then once per `interval`, which
-is at least a control period. The flight software uses a measurement at the next control sample. Read `StarTimes` first.
+The flight software uses a measurement at the next control sample, see `attitude_sensors.SampleTimes`.
 """
 
 import math
-from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any
 
@@ -16,42 +14,10 @@ from jaxtyping import Array, Float
 
 from ptsmc_jax import programs
 from ptsmc_jax.devices.attitude_filter import AttitudeFilter, cholesky, filter_gains
-from ptsmc_jax.numerics import guards, matrices
-from ptsmc_jax.numerics.pytrees import Leaf, pytree
+from ptsmc_jax.numerics import matrices
 
 ROUNDING = 1e-9  # tolerance for equal ages, as a fraction of a period
 LONGEST = 1000  # largest number of control periods of a pattern
-
-
-@pytree
-@dataclass(frozen=True)
-class StarTimes:
-    """Sample times of a star tracker with its own clock."""
-
-    interval: Leaf  # time between star tracker samples [s]
-    period: Leaf  # control period [s]
-    pattern: tuple[int, int] = field(metadata={"static": True})  # see the function `pattern`
-
-    def age(self, sample: Any) -> Any:
-        """Return the age of the newest star tracker sample [s] at a control sample, given by its number."""
-        return jnp.maximum(self._time(sample) - self._last(sample) * self.interval, 0.0)
-
-    def due(self, sample: Any) -> Any:
-        """Return whether there is a new star tracker sample at a control sample, given by its number."""
-        return self._last(sample) > self._last(sample - 1)  # each is used exactly once, even with rounding errors
-
-    def _time(self, sample: Any) -> Any:
-        return jnp.asarray(sample, float) * self.period
-
-    def _last(self, sample: Any) -> Any:
-        """Return the number of the newest star tracker sample."""
-        t = self._time(sample)
-        return jnp.floor((t + guards.time_tolerance(self.period, t)) / self.interval)
-
-
-def star_times(interval: float, period: float) -> StarTimes:
-    """Return the sample times of a star tracker with this interval [s], for this control period [s]."""
-    return StarTimes(jnp.asarray(float(interval)), jnp.asarray(float(period)), pattern(interval / period))
 
 
 def pattern(ratio: float) -> tuple[int, int]:

@@ -17,9 +17,10 @@ from ptsmc_jax import formulas
 from ptsmc_jax.devices import command_filter
 from ptsmc_jax.devices.actuators import Actuators as ActuatorsPart
 from ptsmc_jax.devices.attitude_filter import attitude_filter
+from ptsmc_jax.devices.attitude_sensors import sample_times
 from ptsmc_jax.devices.reaction_wheels import wheels
 from ptsmc_jax.devices.sensors import PerfectSensors, Sensors, StateSensor
-from ptsmc_jax.devices.star_times import filter_between, star_times
+from ptsmc_jax.devices.star_times import filter_between
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.scenario import errors
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
@@ -251,7 +252,7 @@ class Hardware(Actuators, frozen=True):
 
     def star_times(self, period: float) -> Any:
         """Return the sample times of the star tracker, None if its interval is a whole number of control periods."""
-        return star_times(self.interval(period), period) if self.periods_apart(period) is None else None
+        return sample_times(self.interval(period), 0.0, period) if self.periods_apart(period) is None else None
 
 
 class StateHardware(Actuators, frozen=True):

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import runs
-from ptsmc_jax.devices import attitude_filter, sensors, star_times
+from ptsmc_jax.devices import attitude_filter, attitude_sensors, sensors, star_times
 from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.onboard import vectors
 from ptsmc_jax.plants import rigid_body
@@ -28,32 +28,16 @@ def of(**hardware):
     return scenario.study(scenario.from_tables({**tables, "dispersion": {}}))
 
 
-@pytest.mark.parametrize(
-    ("interval", "period", "times"),
-    [
-        (0.25, 0.1, [0.0, 0.25, 0.5, 0.75, 1.0]),
-        (0.1, 0.1, [k / 10 for k in range(11)]),
-        (0.3, 0.1, [0.0, 0.3, 0.6, 0.9]),
-        (1 / 3, 0.1, [0.0, 1 / 3, 2 / 3, 1.0]),
-        (0.1 * math.pi, 0.1, [0.0, 0.1 * math.pi, 0.2 * math.pi, 0.3 * math.pi]),
-    ],
-)
-def test_every_star_tracker_sample_is_used_once_at_the_next_control_sample(interval, period, times):
-    found = star_times.star_times(interval, period)
-    samples = jnp.arange(0, 11)
-    due, age = np.asarray(found.due(samples)), np.asarray(found.age(samples))
-    told = samples[due]
-    np.testing.assert_allclose(told * period - age[due], times, rtol=0, atol=1e-12)
-    assert np.all(age[due] < period)
-    before = np.asarray(found.due(jnp.arange(-40, 0)))  # equally often before the hand-over
-    assert abs(before.sum() - 40 * period / interval) <= 1.0
-    for first in (0, -18_000):  # half an hour, after which the resolution of 32 bits is a thousandth of a period
-        due = found.due(jnp.arange(first, first + 18_000))
+@pytest.mark.parametrize("interval", [0.25, 1 / 3, 0.1 * math.pi])
+def test_samples_are_used_at_the_same_times_in_32_bits(interval):
+    times, count = attitude_sensors.sample_times(interval, 0.0, 0.1), 18_000
+    for first in (0, -count):  # half an hour, after which the resolution of 32 bits is a thousandth of a period
+        due = times.due(jnp.arange(first, first + count))
         with jax.enable_x64(False):
-            short = star_times.StarTimes(vector(interval), vector(period), found.pattern)
-            off = np.cumsum(short.due(jnp.arange(first, first + 18_000))) - np.cumsum(due)
+            short = jax.tree.map(lambda v: v.astype(jnp.float32), times)
+            off = np.cumsum(short.due(jnp.arange(first, first + count))) - np.cumsum(due)
         # rounding may shift a sample by one if times nearly coincide
-        assert np.abs(off).max() <= (found.pattern[0] > 10)
+        assert np.abs(off).max() <= (times.pattern[0] > 10)
 
 
 def by_hand(parts, simulated):
@@ -160,7 +144,7 @@ def test_filter_between_equals_attitude_filter_for_an_integer_ratio(every):
 
 def test_filter_errors_have_the_steady_state_covariance_from_the_first_sample():
     """4 000 trials of a body at rest. The sample times repeat after five periods with two star tracker samples."""
-    times = star_times.star_times(0.625, 0.25)
+    times = attitude_sensors.sample_times(0.625, 0.0, 0.25)
     found = star_times.filter_between(*NOISES.values(), times.interval, times.pattern)
     walk = NOISES["bias_walk"] / np.sqrt(NOISES["period"])
     sensor = sensors.Sensors(vector(NOISES["attitude_noise"]), vector(NOISES["rate_noise"]), vector(1e-4),

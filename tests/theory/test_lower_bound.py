@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from ptsmc_jax.devices import actuators, attitude_filter, reaction_wheels, sensors, star_times
+from ptsmc_jax.devices import actuators, attitude_filter, attitude_sensors, reaction_wheels, sensors
 from ptsmc_jax.signals import disturbances
 from ptsmc_jax.simulation import clock, rollout
 from ptsmc_jax.theory import lower_bound
@@ -178,7 +178,7 @@ def test_lower_bound_of_a_spacecraft_at_rest_equals_least_squares(kind):
         every, walk = 1, 1e3 * walk  # large enough to have an effect within a period
     sensor = sensors.Sensors(vector(star), vector(gyro), *own, None, every)
     if kind == "own times":
-        sensor = dataclasses.replace(sensor, own_times=star_times.star_times(2.5 * PERIOD, PERIOD))
+        sensor = dataclasses.replace(sensor, own_times=attitude_sensors.sample_times(2.5 * PERIOD, 0.0, PERIOD))
     if kind not in ("raw", "bias"):
         sensor = sensor.with_bandwidth(0.2, vector(PERIOD))
     outage, scale = (0.4, 2.2) if kind == "outage" else (0.0, 0.0), 1.1 if kind == "scale" else 1.0
