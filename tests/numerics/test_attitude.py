@@ -131,13 +131,6 @@ def series(r):
     return values, derivatives
 
 
-def test_from_rotation_vector_equals_scipy():
-    vectors = 2 * np.random.default_rng(3).normal(size=(24, 3))
-    got = np.asarray(jax.vmap(attitude.from_rotation_vector)(vector(vectors)))
-    expected = Rotation.from_rotvec(vectors).as_quat()
-    np.testing.assert_allclose(got, expected, rtol=0, atol=8 * EPS)
-
-
 SIZES = [
     0.0,
     1e-160,

@@ -169,22 +169,6 @@ def test_mean_bound_exceeds_the_student_bound_by_at_most_3_over_n():
             assert students < statistics.mean_bound(fractions, 0.95) < students + 3.0 / runs
 
 
-@pytest.mark.parametrize("quantile", [0.5, 0.9])
-def test_intervals_of_fractions_and_quantiles_have_a_coverage_of_95_to_96_percent(quantile):
-    """`ensemble` requirements are verified by these intervals.
-
-    The number of successes is binomial, so that the exact coverage is a sum over its probabilities.
-    """
-    n = 2000
-    chance = stats.binom.pmf(np.arange(n + 1), n, quantile)
-    likely = [k for k in range(n + 1) if chance[k] > 1e-12]  # the sum of the others is below 1e-8
-    intervals = {k: statistics.fraction_interval(k, n, 0.95) for k in likely}
-    assert 0.95 <= sum(chance[k] for k in likely if intervals[k][0] <= quantile <= intervals[k][1]) < 0.96
-    assert 0.95 <= sum(chance[k] for k in likely if statistics.fraction_bound(k, n, 0.95) <= quantile) < 0.96
-    low, high = statistics.quantile_interval(1.0 + np.arange(n), quantile, 0.95)  # the l-th and the u-th smallest
-    assert 0.95 <= chance[int(low) : int(high)].sum() < 0.96
-
-
 def test_percentile_of_equal_values_is_their_mean_rank():
     """Regression: a value that nearly all rows of a run table had was reported as extreme, "at 80 %"."""
     assert statistics.percentile(np.array([1.0, 2.0, 3.0, 4.0]), 4.0) == 100.0

@@ -124,23 +124,6 @@ def test_changed_parameters_give_the_commands_of_the_library(name, tmp_path):
     assert off(changed(known, changes), library) < 1e-12
 
 
-@needs_compiler
-@pytest.mark.long
-@pytest.mark.parametrize("name", list(FLOWN))
-def test_each_changed_parameter_alone_gives_the_commands_of_the_library(name, tmp_path):
-    tables, changes = FLOWN[name]
-    known, library = exported(tables, tmp_path / "controller")
-    first = library.parameters.copy()
-    for key, (parameter, value) in changes.items():
-        library.parameters[:] = first
-        other = changed(known, {key: changes[key]})
-        before = off(other, library)
-        put(library, parameter, value)
-        after = off(other, library)
-        print(f"{name}, {parameter}: {after:.1e} of the largest command, {before:.1e} if it were not set")
-        assert after < 1e-12 < before, parameter
-
-
 MAIN = """
 #include <string.h>
 #include "ptsmc_flight_flat.h"
