@@ -1,5 +1,6 @@
 """Parts and scenarios that several tests use."""
 
+import contextlib
 import dataclasses
 import json
 import math
@@ -297,6 +298,20 @@ def drawn(check: Any, count: int, **cases: Any) -> Any:
 def tree(folder):
     """Return the contents of the files of a folder, by path."""
     return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+@contextlib.contextmanager
+def refuses(error, said):
+    """Assert that the code raises this error with one sentence, which contains the words."""
+    with pytest.raises(error) as caught:
+        yield caught
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def rows_of(folder):
+    """Return the rows of a campaign."""
+    return pl.concat([pl.read_parquet(path) for path in sorted((folder / "trials").glob("*.parquet"))])
 
 
 def refused(command, tmp_path, *args):

@@ -22,7 +22,7 @@ from ptsmc_jax.dispersions.quantities import QUANTITIES
 from ptsmc_jax.plants import rigid_body
 from ptsmc_jax.signals import disturbances
 from ptsmc_jax.simulation import catalogues, rollout
-from tests.helpers import SHORT_CHAIN, untuned, vector
+from tests.helpers import SHORT_CHAIN, refuses, untuned, vector
 
 SEED, TRIALS = 3, 50  # number of trials, small enough for the compiled program of few trials
 EVERYTHING = """
@@ -369,10 +369,8 @@ BAD = [
 
 @pytest.mark.parametrize(("columns", "said"), BAD, ids=[row[1][:50] for row in BAD])
 def test_invalid_values_are_refused_with_row_and_column(everything, columns, said):
-    with pytest.raises(RefusedError) as refused:
+    with refuses(RefusedError, said):
         run_tables.checked(pl.DataFrame(columns, strict=False), everything[0].ready.parts)
-    assert said in str(refused.value)
-    assert "\n" not in str(refused.value)
 
 
 HARDWARE = """
@@ -422,10 +420,8 @@ def table_of(columns, rows):
 
 @pytest.mark.parametrize(("columns", "rows", "said"), MISFIT, ids=[row[2][-60:] for row in MISFIT])
 def test_impossible_hardware_is_refused_with_row_and_column(misfit, columns, rows, said):
-    with pytest.raises(RefusedError) as refused:
+    with refuses(RefusedError, said):
         run_tables.checked(table_of(columns, rows), misfit)
-    assert said in str(refused.value)
-    assert "\n" not in str(refused.value)
 
 
 def test_limiting_cases_of_hardware_are_accepted(misfit):
@@ -490,7 +486,5 @@ def test_files_that_are_not_run_tables_are_refused(tmp_path):
             (tmp_path / name).write_bytes(content)
         if name == "folder":
             (tmp_path / name).mkdir()
-        with pytest.raises(RefusedError) as refused:
+        with refuses(RefusedError, said):
             run_tables.read(tmp_path / name)
-        assert said in str(refused.value)
-        assert "\n" not in str(refused.value)

@@ -11,7 +11,7 @@ from ptsmc_jax.campaigns import campaign, montecarlo, store
 from ptsmc_jax.numerics import statistics
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.catalogues import percent
-from tests.helpers import short
+from tests.helpers import rows_of, short
 from tests.output.pages import checked
 from tuning.output import formats, pointing_report, summaries
 
@@ -66,7 +66,7 @@ def simulated(request, command, tmp_path, monkeypatch, one_by_one):
     text = (tmp_path / "s.toml").read_text().replace("[requirements]\npeak_torque = 30.0\n", ASKED)
     (tmp_path / "s.toml").write_text(text)
     code, said, _ = command("montecarlo", "s.toml", "--trials", 150, "--seed", 0, "--no-figures")
-    rows = pl.concat([pl.read_parquet(path) for path in sorted((tmp_path / FOLDER / "trials").glob("*.parquet"))])
+    rows = rows_of(tmp_path / FOLDER)
     return code, said, rows, json.loads((tmp_path / FOLDER / "summary.json").read_text())
 
 

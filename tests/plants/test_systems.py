@@ -25,7 +25,7 @@ from ptsmc_jax.signals import references
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.theory import envelopes, solutions
 from ptsmc_jax.theory.exact_motion import plant_motion
-from tests.helpers import FULL_INERTIA, ROOT, commanded, errors_along, finer, fly, parts, short, vector
+from tests.helpers import FULL_INERTIA, ROOT, commanded, errors_along, finer, fly, parts, refuses, short, vector
 from tuning.studies import posing
 
 ARM = str(ROOT / "scenarios" / "two_link_arm.py") + ":arm"
@@ -281,10 +281,8 @@ def test_an_invalid_system_is_refused_in_one_sentence():
     ],
 )
 def test_invalid_system_names_are_refused(plant, said):
-    with pytest.raises(ScenarioError) as error:
+    with refuses(ScenarioError, said):
         scenario.study(scenario.from_tables({"plant": plant}))
-    assert said in str(error.value)
-    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from ptsmc_jax import scenario
 from ptsmc_jax.scenario import aem, attitude_files, epochs
 from ptsmc_jax.scenario.errors import ScenarioError
+from tests.helpers import refuses
 
 TIMES = np.array([0.0, 1.0, 2.5, 4.0, 6.0])
 TURNS = Rotation.from_rotvec(np.outer(np.sin(0.2 * TIMES), [0.5, 0.2, -0.4]) + np.array([0.0, 0.0, 2.5]))
@@ -162,10 +163,8 @@ REFUSED = {
 
 @pytest.mark.parametrize(("text", "named"), REFUSED.values(), ids=REFUSED)
 def test_messages_that_cannot_be_followed_are_refused_with_their_place(tmp_path, text, named):
-    with pytest.raises(ValueError, match=r".") as error:
+    with refuses(ValueError, named):
         read(tmp_path / "attitude.aem", text)
-    assert named in str(error.value)
-    assert "\n" not in str(error.value)
 
 
 def test_another_interpolation_is_allowed_by_key(tmp_path):
@@ -191,11 +190,9 @@ BROKEN = {
 def test_broken_tables_are_configuration_errors_with_their_place(tmp_path, frame, named):
     path = tmp_path / "attitude.csv"
     frame.write_csv(path)
-    with pytest.raises(ScenarioError, match=r".") as error:
+    with refuses(ScenarioError, named) as caught:
         scenario.from_tables({"reference": {"kind": "table", "file": str(path)}, "controller": {"t_f": 4.0}})
-    assert error.value.key == "reference.file"
-    assert named in str(error.value)
-    assert "\n" not in str(error.value)
+    assert caught.value.key == "reference.file"
 
 
 def test_runs_beyond_the_file_are_configuration_errors(tmp_path):

@@ -16,6 +16,7 @@ from ptsmc_jax.scenario import custom
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.theory import linear, margins, solutions
+from tests.helpers import refuses
 from tuning.studies import stability
 
 FILE = """
@@ -129,9 +130,8 @@ def test_exact_motion_names_and_exported_code_ignore_hidden_states():
 )
 def test_invalid_hidden_states_are_refused(changes, said):
     good = {"H": lambda t, a, b, z: z[:1], "Z": lambda t, a, b, z, u: -z, "z0": [0.0, 1.0]}
-    with pytest.raises(ValueError) as caught:  # noqa: PT011
+    with refuses(ValueError, said):
         system(1, lambda t, a, b: b, G=lambda t, a, b: jnp.eye(1), **{**good, **changes})
-    assert said in str(caught.value)
 
 
 @pytest.mark.parametrize("kind", ["terminal", "time_base_pd", "predefined_time"])
@@ -160,10 +160,8 @@ def test_a_custom_true_plant_is_reported_as_custom_code():
     ],
 )
 def test_an_invalid_true_plant_is_refused(truth, said):
-    with pytest.raises(ScenarioError) as caught:
+    with refuses(ScenarioError, said):
         scenario.study(scenario.from_tables({**TABLES, "plant": {**TABLES["plant"], "truth": truth}}))
-    assert said in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 def test_a_design_model_with_hidden_states_is_refused():

@@ -17,6 +17,7 @@ from ptsmc_jax.plants.rigid_body import AttitudeState
 from ptsmc_jax.scenario import epochs, plausibility
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.signals import mission_references, orbits
+from tests.helpers import refuses
 
 MU, EARTH_RATE = 3.986004418e14, 7.292115e-5
 ORBIT = {"semi_major_axis": 7.2e6, "eccentricity": 0.08, "inclination": 1.7, "ascending_node": 0.6, "perigee": -1.1,
@@ -251,7 +252,5 @@ def test_reference_in_lanes_equals_the_single_one():
     ],
 )
 def test_configuration_errors_name_the_key(table, others, named):
-    with pytest.raises(ScenarioError, match=r".") as error:
+    with refuses(ScenarioError, named):
         scenario.from_tables({"reference": table, **MULTIPLICATIVE, **others})
-    assert named in str(error.value)
-    assert "\n" not in str(error.value)
