@@ -53,12 +53,8 @@ class InUseError(RefusedError):
 
 def versions(command: str, seed: int | None, **others: object) -> dict[str, Any]:
     """Return the content of versions.json: command, seed (None: no random numbers), versions, machine."""
-    return {"command": command, "seed": seed, **others, COMMAND_LINE: _command_line(), **_surroundings()}
-
-
-def _command_line() -> str:
-    """Return the command line of this process, without the folder of the program."""
-    return shlex.join([*(Path(program).name for program in sys.argv[:1]), *sys.argv[1:]])
+    command_line = shlex.join([*(Path(program).name for program in sys.argv[:1]), *sys.argv[1:]])
+    return {"command": command, "seed": seed, **others, COMMAND_LINE: command_line, **_surroundings()}
 
 
 def _surroundings() -> dict[str, str]:

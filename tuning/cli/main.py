@@ -233,7 +233,6 @@ def tune(
         work=lambda report, journal: tuner.tune(loaded, seed, report, journal, globally=global_check),
         write=lambda making, tuning: tune_files.write(making, loaded, tuning, common.figures, known_by),
         report=lambda summary: tune_report.of(summaries.tune(summary)),
-        needs=("scipy.stats", *(["ptsmc_jax.figures.study_plots"] if common.figures else [])),
     )
     return searches.run(search, loaded, folder, force=common.force, quiet=common.quiet)
 

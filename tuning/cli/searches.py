@@ -1,8 +1,6 @@
 """Long searches of `tune`, `pareto` and `compare`: begun, resumed, or shown again."""
 
-import importlib
 import sys
-import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,7 +30,6 @@ class LongSearch:
     write: Callable[[Path, Any], None]  # fills a result folder with a result
     report: Callable[[dict[str, Any]], "Report"]  # of the content of summary.json
     check: Callable[[], Any] = lambda: None  # raises configuration errors that the scenario does not have
-    needs: tuple[str, ...] = ()  # modules that are imported during the first steps
 
 
 def say_seen(scenario: Path, seed: int) -> None:
@@ -86,9 +83,7 @@ def _run(search: LongSearch, loaded: "Scenario", folder: Path, *, force: bool, q
     from tuning.search.journal import Journal
 
     journal = Journal(store.begin(folder, tables, search.known_by, fresh=not going_on))
-
     with resumable(force):
-        threading.Thread(target=lambda: [*map(importlib.import_module, search.needs)], daemon=True).start()
         with Progress(quiet, search.objective, loaded.plant.kind) as report:
             outcome = search.work(report, journal)
         store.write(folder, lambda making: search.write(making, outcome))

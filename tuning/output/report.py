@@ -51,7 +51,7 @@ class Bars:
         """Return labels, texts and widths; the limit is at 300 of 400."""
         return [
             {"label": entry.metric.replace("_", " "), "text": text, "met": entry.met, "limit": 300,
-             "width": round(min(400.0, 300.0 * relative_to_limit(entry)), 1)}
+             "width": 400.0 if entry.margin is None else round(min(400.0, 300.0 * entry.margin), 1)}
             for entry, text in zip(self.verdicts, self.lines, strict=True)
         ]  # fmt: skip
 
@@ -148,11 +148,6 @@ def requirements(verdicts: "Sequence[Entry]", text: "Callable[[Entry], str]" = s
     """Return the section of the requirements, none without any; text: returns a verdict in words."""
     lines = [f"{text(one)}{per_cent_of_limit(one)}" for one in verdicts]
     return [Section("Requirements", [Bars(list(verdicts), lines)])] if verdicts else []
-
-
-def relative_to_limit(entry: "Entry") -> float:
-    """Return the deciding value relative to the limit; infinite if a trial has no value."""
-    return float("inf") if entry.margin is None else entry.margin
 
 
 def per_cent_of_limit(entry: "Entry") -> str:

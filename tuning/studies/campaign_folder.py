@@ -306,7 +306,8 @@ def _begun(folder: Folder, tables: Mapping[str, Any]) -> bool:
         raise RefusedError(
             f"--trials is {folder.trials}, but must be at least {before.trials}, the number of trials in {path}"
         )
-    same = before.trials == folder.trials and before.made == _made(folder) and before.identity == folder.identity
+    made = msgspec.convert(folder.versions, Made)  # of a campaign that may not exist yet
+    same = before.trials == folder.trials and before.made == made and before.identity == folder.identity
     if not same or before.controller is None:
         return same
     key = custom_parts.CONTROLLER  # the folder's copy may be missing or changed
@@ -347,11 +348,6 @@ def opened(path: Path) -> Folder:
         controller=path / C_FOLDER if custom.checksum_name(custom_parts.CONTROLLER) in checksums else None,
         first_look=made.first_look,
     )
-
-
-def _made(folder: Folder) -> Made:
-    """Return the entries of `versions.json` for a campaign that may not exist yet."""
-    return msgspec.convert(folder.versions, Made)
 
 
 def made_again(path: str, key: str) -> tuple[Campaign, Rows]:
