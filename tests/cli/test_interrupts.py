@@ -4,6 +4,7 @@ import math
 import signal
 import subprocess
 import sys
+import tomllib
 from types import SimpleNamespace
 
 import numpy as np
@@ -62,43 +63,41 @@ def test_first_ctrl_c_ends_the_command_and_a_second_kills_it(twice, status, out,
     assert (done.returncode, done.stdout, done.stderr) == (status, out, error)
 
 
+LOADED = scenario.from_tables(tomllib.loads(SHORT_CHAIN))
+
+
+def search_of(status, write, report=lambda _: EMPTY, command="tune"):
+    """Return a search that ends with this status; `write` fills its folder."""
+    made_by = {"command": command, "seed": 0}
+    return searches.LongSearch(made_by, "window error", lambda *_: SimpleNamespace(status=status), write, report)
+
+
+def recorded(summary, command="tune"):
+    """Return a function that writes a result folder with this summary."""
+    made_by = {"command": command, "seed": 0}
+    return lambda making, _: store.record(making, parsing.dump(LOADED), made_by, summary)
+
+
 @pytest.mark.parametrize(("force", "same"), [(False, "the same command"), (True, "the same command without --force")])
 def test_search_interrupted_during_writing_resumes(tmp_path, force, same):
     def stopped(making, outcome):
         (making / "summary.json").write_text(outcome.status)
         raise KeyboardInterrupt
 
-    (tmp_path / "s.toml").write_text(SHORT_CHAIN)
-    search = searches.LongSearch(
-        {"command": "tune", "seed": 0},
-        "window error",
-        work=lambda report, journal: SimpleNamespace(status=journal.get(b"asked", lambda: {}) or "met"),
-        write=stopped,
-        report=lambda _: pytest.fail("there is nothing to show"),
-    )
-    loaded = scenario.read(tmp_path / "s.toml")
+    search = search_of("met", stopped, lambda _: pytest.fail("there is nothing to show"))
     with pytest.raises(KeyboardInterrupt, match=f"^{same} resumes it$"):
-        searches.run(search, loaded, tmp_path / "out", force=force, quiet=True)
+        searches.run(search, LOADED, tmp_path / "out", force=force, quiet=True)
     assert set(tree(tmp_path / "out")) == {"journal.bin", "scenario.toml", "versions.json"}
 
 
 @pytest.mark.parametrize(("force", "same"), [(False, "the same command"), (True, "the same command without --force")])
 def test_interrupted_search_that_wrote_its_best_gains_resumes_without_force(tmp_path, capsys, force, same):
     """With --force, the same command would start again."""
-    (tmp_path / "s.toml").write_text(SHORT_CHAIN)
     shown = []
-
-    def write(making, outcome):
-        store.write_json(making / "summary.json", {"status": outcome.status})
-
-    search = searches.LongSearch(
-        {"command": "tune", "seed": 0},
-        "window error",
-        work=lambda report, journal: SimpleNamespace(status="interrupted"),
-        write=write,
-        report=lambda summary: shown.append(summary["status"]) or EMPTY,
+    search = search_of(
+        "interrupted", recorded({"status": "interrupted"}), lambda summary: shown.append(summary["status"]) or EMPTY
     )
-    assert searches.run(search, scenario.read(tmp_path / "s.toml"), tmp_path / "out", force=force, quiet=False) == 130
+    assert searches.run(search, LOADED, tmp_path / "out", force=force, quiet=False) == 130
     assert shown == ["interrupted"]
     assert capsys.readouterr().err == f"ptsmc: interrupted; {same} resumes it\n"
     assert {"journal.bin", "summary.json"} <= set(tree(tmp_path / "out"))
@@ -106,40 +105,26 @@ def test_interrupted_search_that_wrote_its_best_gains_resumes_without_force(tmp_
 
 def test_new_and_stored_results_of_a_search_have_the_same_report(tmp_path):
     """Earlier, the report of a new front without gains printed "|S| at most inf dB", but the stored one did not."""
-    (tmp_path / "s.toml").write_text(SHORT_CHAIN)
-    loaded, shown = scenario.read(tmp_path / "s.toml"), []
+    shown = []
     said = {"status": "not met", "without": [math.inf, 6.0], "slews": ({"rms": np.float64(math.nan)},)}
-    search = searches.LongSearch(
-        {"command": "pareto", "seed": 0},
-        "window error",
-        work=lambda report, journal: SimpleNamespace(status="not met"),
-        write=lambda making, _: store.record(making, parsing.dump(loaded), search.known_by, said),
-        report=lambda summary: shown.append(summary) or EMPTY,
+    search = search_of(
+        "not met", recorded(said, "pareto"), lambda summary: shown.append(summary) or EMPTY, command="pareto"
     )
     for _ in range(2):
-        assert searches.run(search, loaded, tmp_path / "out", force=False, quiet=False) == 1
+        assert searches.run(search, LOADED, tmp_path / "out", force=False, quiet=False) == 1
     assert shown == 2 * [{"status": "not met", "without": [None, 6.0], "slews": [{"rms": None}]}]
 
 
 def test_search_of_another_code_version_is_shown_with_a_note_and_repeated_with_force(tmp_path, capsys):
     """`campaigns/test_store.py` tests that an unfinished search of another code version is refused."""
-    (tmp_path / "s.toml").write_text(SHORT_CHAIN)
-    loaded, folder, asked = scenario.read(tmp_path / "s.toml"), tmp_path / "out", []
-    search = searches.LongSearch(
-        {"command": "tune", "seed": 0},
-        "window error",
-        work=lambda report, journal: SimpleNamespace(status=asked.append(1) or "met"),
-        write=lambda making, _: store.record(making, parsing.dump(loaded), search.known_by, {"status": "met"}),
-        report=lambda _: EMPTY,
-    )
-    assert searches.run(search, loaded, folder, force=False, quiet=True) == 0
+    folder, search = tmp_path / "out", search_of("met", recorded({"status": "met"}))
+    assert searches.run(search, LOADED, folder, force=False, quiet=True) == 0
     store.write_json(folder / "versions.json", store.read_versions(folder) | {"code_checksum": "before"})
     before = tree(folder)
-    assert searches.run(search, loaded, folder, force=False, quiet=True) == 0
+    assert searches.run(search, LOADED, folder, force=False, quiet=True) == 0
     assert "another version of the source code" in capsys.readouterr().err
-    assert (len(asked), tree(folder)) == (1, before)
-    searches.run(search, loaded, folder, force=True, quiet=True)
-    assert len(asked) == 2
+    assert tree(folder) == before
+    searches.run(search, LOADED, folder, force=True, quiet=True)
     assert store.read_versions(folder)["code_checksum"] != "before"
 
 
