@@ -83,3 +83,14 @@ def program(tables, place):
     made = folder.Controller(scenario.reading.complete(scenario.from_tables(tables)), "flight", "a scenario")
     store.write(place, lambda making: folder.write_program(making, made))
     return made
+
+
+def replayed(library, samples, state):
+    """Statuses, outputs and states of a compiled controller for a sequence of samples."""
+    statuses, outputs, states = [], [], []
+    for row in samples:
+        state, out, status = library.many(state, row)
+        statuses.append(int(status))
+        outputs.append(out)
+        states.append(state)
+    return np.array(statuses), np.array(outputs), np.array(states)

@@ -328,27 +328,20 @@ def test_units_are_products_of_base_units():
     assert units.unit("-") is None
 
 
-@pytest.mark.long
-def test_plant_supplies_the_reference_of_a_trial(tmp_path):
-    """With the reference as an input, closed loops with a random reference equal the simulation."""
-    about = {"kind": "normal", "std_deg": 3.0}
-    made = made_from(FLIGHTS["slew"] | {"dispersion": {"reference": about}}, reference_input=True)
-    fmus = folder.Fmus(controller=True, plant=True, version=2)
-    fmus.write(tmp_path, made)
-    loop = tuple(Unit(tmp_path / f"{one}_fmi2.fmu") for one in ("controller", "plant"))
-    expected = simulated(made, SEED, range(5))
-    for trial in range(5):
-        found = of_plant(made, run(loop, trial))
-        np.testing.assert_allclose(found, expected[trial, :SAMPLES], rtol=0.0, atol=1e-10)
+RANDOM = {**FLIGHTS["slew"], "dispersion": {"reference": {"kind": "normal", "std_deg": 3.0}}}
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", [*SIX, *OTHERS])
-def test_closed_loops_of_other_scenarios_equal_the_simulation(name, tmp_path):
-    made = made_from({**FLIGHTS, "suite": TABLES}[name])
-    fmus, count = folder.Fmus(controller=True, plant=True, version=3), 1000 if name in SIX else 100
+@pytest.mark.parametrize(
+    ("name", "count"), [*((name, 1000) for name in SIX), *((name, 100) for name in OTHERS), ("random reference", 5)]
+)
+def test_closed_loops_of_other_scenarios_equal_the_simulation(name, count, tmp_path):
+    """The plant supplies a random reference to the controller."""
+    supplied = name == "random reference"
+    made, version = made_from({**FLIGHTS, "suite": TABLES, "random reference": RANDOM}[name], supplied), 3 - supplied
+    fmus = folder.Fmus(controller=True, plant=True, version=version)
     fmus.write(tmp_path, made)
-    loop = tuple(Unit(tmp_path / f"{one}_fmi3.fmu") for one in ("controller", "plant"))
+    loop = tuple(Unit(tmp_path / f"{one}_fmi{version}.fmu") for one in ("controller", "plant"))
     expected = simulated(made, SEED, range(count))
     for trial in range(count):
         found = of_plant(made, run(loop, trial))  # 1e-10: rounding of exp and log, amplified by the gains

@@ -23,7 +23,7 @@ from ptsmc_jax.onboard.templates import STATUS
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import computer
 from tests.helpers import gpus, short
-from tests.onboard.compiled import needs_compiler, program
+from tests.onboard.compiled import needs_compiler, program, replayed
 from tests.onboard.flights import FLIGHTS
 
 OK, SATURATED, MISSED, SINGULAR, INPUT, OVERFLOW = range(len(STATUS))
@@ -90,12 +90,7 @@ def given(made):
 
 def simulated(library, samples):
     """Statuses and outputs of a sequence of samples."""
-    state, statuses, outputs = library.first(), [], []
-    for row in samples:
-        state, out, status = library.many(state, row)
-        statuses.append(int(status))
-        outputs.append(out)
-    return np.array(statuses), np.array(outputs)
+    return replayed(library, samples, library.first())[:2]
 
 
 def changed(library, samples, at, **values):

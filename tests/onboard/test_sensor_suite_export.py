@@ -10,7 +10,7 @@ from ptsmc_jax.numerics import attitude
 from ptsmc_jax.onboard import folder, vectors
 from ptsmc_jax.onboard.library import Library
 from ptsmc_jax.simulation.computer import SAMPLES
-from tests.onboard.compiled import needs_compiler, program
+from tests.onboard.compiled import needs_compiler, program, replayed
 from tests.onboard.flights import LAW, LOOP, SPREAD
 
 
@@ -52,17 +52,6 @@ def suite(tmp_path_factory):
     samples = folder.simulate(made, 3, 1)[0]
     given, out, states = vectors.rows(made.board, samples)
     return Library(place), given, out, np.vstack([vectors.first_state(made.board, samples), states])
-
-
-def replayed(library, given, state):
-    """Statuses, outputs and states of a sequence of samples."""
-    statuses, outputs, states = [], [], []
-    for row in given:
-        state, out, status = library.many(state, row)
-        statuses.append(int(status))
-        outputs.append(out)
-        states.append(state)
-    return np.array(statuses), np.array(outputs), np.array(states)
 
 
 def columns(library, name):

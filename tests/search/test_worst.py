@@ -231,15 +231,21 @@ def test_a_robust_search_keeps_the_limit_in_the_worst_case(monkeypatch, plant):
     np.testing.assert_allclose(plain.hardest.ratio, (plain.gains[0] / eta) ** 2, rtol=5e-3)
 
 
-def test_a_robust_search_with_quantile_limits_only_keeps_the_default_margin(monkeypatch):
+@pytest.mark.parametrize(
+    ("quantile", "options"),
+    [(0.9, {"robust": True}), (None, {"margins": {"peak_rate": 0.3}})],
+    ids=["robust", "broken"],
+)
+def test_a_limit_keeps_the_default_margin_if_only_others_are_robust_or_were_broken(monkeypatch, quantile, options):
     """A quantile limit does not depend on a single trial, so the option `robust` has no effect."""
     problem, wanted = swinging(1.0, [0.2, 0.1], 0.01)
-    wanted = [replace(one, quantile=0.9) for one in wanted]
+    wanted = [replace(one, quantile=quantile) for one in wanted]
     small_search(monkeypatch)
     evaluate = Evaluator(Bounds(("eta", "delta"), (2.5, 0.3), (6.0, 4.0)))
-    settings = optimise.Settings(1, 1, 0, robust=True)
-    found = optimise.search(evaluate, problem, wanted, np.array([3.0, 1.0]), settings)
-    assert {*found.margins.values()} == {rounds.MARGIN}
+    found = optimise.search(evaluate, problem, wanted, np.array([3.0, 1.0]), optimise.Settings(1, 1, 0, **options))
+    assert found.margins == {**dict.fromkeys(problem.rows, rounds.MARGIN), **options.get("margins", {})}
+    kept = np.asarray([*found.margins.values()])
+    np.testing.assert_allclose(problem.tightened(1.0 - kept).limits, problem.limits * (1.0 - kept), rtol=1e-15)
 
 
 def test_given_coordinates_are_simulated_as_random_ones():
@@ -303,17 +309,6 @@ def test_critical_trials_of_several_quantile_limits_are_all_kept():
     for row, first in enumerate((200, 300)):
         counted = trials[np.asarray(search.problem.counted)[row]]
         assert {*range(first, first + rounds.HARDEST)} <= {*counted.tolist()}
-
-
-def test_a_limit_broken_on_other_trials_does_not_tighten_the_others(monkeypatch):
-    problem, wanted = swinging(1.0, [0.2, 0.1], 0.01)
-    small_search(monkeypatch)
-    evaluate = Evaluator(Bounds(("eta", "delta"), (2.5, 0.3), (6.0, 4.0)))
-    settings = optimise.Settings(1, 1, 0, margins={wanted[0].metric: 0.3})
-    found = optimise.search(evaluate, problem, wanted, np.array([3.0, 1.0]), settings)
-    assert found.margins == {**dict.fromkeys(problem.rows, rounds.MARGIN), wanted[0].metric: 0.3}
-    kept = np.asarray([*found.margins.values()])
-    np.testing.assert_allclose(problem.tightened(1.0 - kept).limits, problem.limits * (1.0 - kept), rtol=1e-15)
 
 
 def test_the_hardest_screened_trial_is_the_worst_case_if_nothing_can_be_moved():
