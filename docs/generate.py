@@ -163,12 +163,12 @@ def _keys(table: str, struct: type[Table], plant: str) -> Iterator[str]:
     fallback = _case_i(plant).get(table, {}) if table in ("initial", "controller") else {}
     rows = [
         [f"`{key.name}`", key.allowed, _shown(key, struct, fallback), key.unit, key.meaning]
-        for key in keys.of(struct, layouts.SCENARIOS[plant].unit_of_d)
+        for key in keys.list_keys(struct, layouts.SCENARIOS[plant].unit_of_d)
         if not (borrowed and key.name in Attitude.__struct_fields__)
     ]
     if rows:
         yield _grid("key allowed default unit meaning", rows)
-    for key in keys.of(struct):
+    for key in keys.list_keys(struct):
         if f"{table}.{key.name}" in layouts.KINDS and plant == "spacecraft":
             yield f"The kinds of `{key.name}`:"
             yield _grid("key meaning entries effect", list(_kinds(key, layouts.KINDS[f"{table}.{key.name}"])))
@@ -183,7 +183,7 @@ def _case_i(plant: str) -> Mapping[str, Mapping[str, Any]]:
 
 
 def _dispersion(struct: type[Table], unit_of_d: str) -> Iterator[str]:
-    rows = [row for key in keys.of(struct) for row in _kinds(key, layouts.DISPERSIONS[key.name], unit_of_d)]
+    rows = [row for key in keys.list_keys(struct) for row in _kinds(key, layouts.DISPERSIONS[key.name], unit_of_d)]
     yield _grid("key meaning entries effect", rows)
 
 
@@ -191,7 +191,7 @@ def _kinds(key: keys.Key, kinds: Kinds, unit_of_d: str = keys.UNIT_OF_D) -> Iter
     """Yield a row for each kind of an inline table."""
     for kind, struct in kinds.items():
         given = [f'`kind = "{kind}"`']
-        for k in keys.of(struct, unit_of_d):
+        for k in keys.list_keys(struct, unit_of_d):
             said = [f"default {shown}" if (shown := _default(k.default)) else "", k.text]
             given.append(f"`{k.name}`: {', '.join(filter(None, said))}")
         yield [f"`{key.name}`", key.meaning, "; ".join(given), keys.about(struct)]

@@ -87,7 +87,7 @@ def write(scenario: Scenario, file: str | Path, *, force: bool = False) -> None:
     >>> write(scenario.replace(scenario.from_tables({}), controller__eta=4.0), "mine.toml")  # doctest: +SKIP
     """
     store.check_file(Path(file), force, "force=True")
-    store.write_toml(Path(file), parsing.dump(reading.of(scenario)))
+    store.write_toml(Path(file), parsing.dump(reading.to_scenario(scenario)))
 
 
 @dataclass(frozen=True)
@@ -296,7 +296,7 @@ def lower_bound(what: Scenario | Study | str | Path, *, seed: int = 0) -> float 
 
 
 def _read(what: Scenario | Study | str | Path) -> Scenario:
-    return reading.of(what.scenario if isinstance(what, Study) else what)
+    return reading.to_scenario(what.scenario if isinstance(what, Study) else what)
 
 
 def _ready(what: Scenario | Study | str | Path) -> Study:

@@ -47,7 +47,7 @@ def in_units(tables: Mapping[str, Any], inertia: float, time: float) -> dict[str
         return value * inertia**mass * time**second
 
     def of(table: dict[str, Any], struct: Any) -> None:
-        for key in keys.of(struct, catalogues.CATALOGUE["peak_torque"].unit):
+        for key in keys.list_keys(struct, catalogues.CATALOGUE["peak_torque"].unit):
             if key.name in table and key.unit and not isinstance(table[key.name], dict):
                 table[key.name] = times(table[key.name], key.unit)
 

@@ -109,7 +109,7 @@ class Tuned(Outcome):
     @property
     def report(self) -> Report:
         """The report of `ptsmc tune`."""
-        return tune_report.of(summaries.tune(self.summary))
+        return tune_report.build(summaries.tune(self.summary))
 
     def _figures(self) -> dict[str, Any]:
         return tune_files.figures_of(self.given, self.tuning)
@@ -146,7 +146,7 @@ class Traced(Outcome):
     @property
     def report(self) -> Report:
         """The report of `ptsmc pareto`."""
-        return front_report.of(self.front)
+        return front_report.build(self.front)
 
     def _figures(self) -> dict[str, Any]:
         return {KINDS[self.front.against].file: fronts.figure_of(self.trade, self.front)}
@@ -174,7 +174,7 @@ def pareto(
         ValueError: `seed` is not a whole number from 0 to 2^32 - 1.
     """
     draws.check_whole_number("seed", seed)
-    trade = trades.of(against, posing.with_tune(_read(what)), points, values)
+    trade = trades.build(against, posing.with_tune(_read(what)), points, values)
     return Traced(trade, fronts.trace(trade, seed))
 
 
@@ -193,7 +193,7 @@ class Margins(Outcome):
     @property
     def report(self) -> Report:
         """The report of `ptsmc margins`."""
-        return margins_report.of(summaries.read(summaries.Margins, stability.summary(self.ready, self.course)))
+        return margins_report.build(summaries.read(summaries.Margins, stability.summary(self.ready, self.course)))
 
     def _figures(self) -> dict[str, Any]:
         return stability.figures_of(self.ready, self.course)
@@ -230,7 +230,7 @@ class Campaign(Outcome):
     @property
     def report(self) -> Report:
         """The report of `ptsmc montecarlo`."""
-        return campaign_report.of(summaries.read(summaries.Campaign, self.summary))
+        return campaign_report.build(summaries.read(summaries.Campaign, self.summary))
 
     @property
     def rows(self) -> pl.DataFrame:
@@ -247,7 +247,7 @@ class Campaign(Outcome):
         return campaign_summary.worst(self.folder, by, count)
 
     def _figures(self) -> dict[str, Any]:
-        return campaign_figures.of(self.folder, self.summary)
+        return campaign_figures.build(self.folder, self.summary)
 
 
 def montecarlo(
@@ -297,7 +297,7 @@ class Reproduced(Outcome):
     @property
     def report(self) -> Report:
         """The report of `ptsmc reproduce`."""
-        return paper_report.of(summaries.read(summaries.Paper, reproduction.summary(self.found)))
+        return paper_report.build(summaries.read(summaries.Paper, reproduction.summary(self.found)))
 
     def _figures(self) -> dict[str, Any]:
         return reproduction.figures_of(self.found)
@@ -309,4 +309,4 @@ def reproduce() -> Reproduced:
 
 
 def _read(what: Scenario | Study | str | Path) -> Scenario:
-    return reading.of(what.scenario if isinstance(what, Study) else what)
+    return reading.to_scenario(what.scenario if isinstance(what, Study) else what)

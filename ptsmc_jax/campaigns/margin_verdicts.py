@@ -146,7 +146,7 @@ def worst(
             return {name: _worst_of(name, v.reshape(count, -1)) for name, v in zip(names, values, strict=True)}
         chosen = np.resize(chosen, JUDGED)  # always the same shape, so that one program is compiled
         some = jax.tree.map(lambda v, chosen=chosen: v[chosen], loops)
-        full = margins.of_each(some, with_delay=late).each()
+        full = margins.compute_each(some, with_delay=late).each()
         exact = np.stack([_worst_of(name, np.asarray(full[name])) for name in names])
         apart = np.abs(_violation_ratios(exact, limit, names) - near[:, chosen])
         apart = np.where(np.isfinite(apart), apart, 0.0).max(axis=1, keepdims=True)

@@ -64,7 +64,7 @@ def design(
     Raises:
         ScenarioError: no limit of the torque is known, or the manoeuvre is shorter than 20 control periods.
     """
-    loaded = reading.complete(reading.of(what))
+    loaded = reading.complete(reading.to_scenario(what))
     period = loaded.loop.period
     if not loaded.sampled or duration < 20.0 * period:
         raise ScenarioError("a design needs the sampled loop and a manoeuvre of at least 20 control periods")

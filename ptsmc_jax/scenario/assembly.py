@@ -106,7 +106,7 @@ def study(
     if not isinstance(reach, timing.Reach | None):
         raise TypeError(f"a reach is needed, as reach_of(scenario) returns it, but this is a {type(reach).__name__}")
     configure.warn_if_forgotten()
-    scenario = reading.complete(reading.of(scenario))
+    scenario = reading.complete(reading.to_scenario(scenario))
     setup = build.setup(scenario)
     parts = setup.timed(*timing.timing(scenario, setup, reach or timing.reach_of(scenario), saves))
     dispersion = build.dispersion(scenario, parts)

@@ -1,4 +1,4 @@
-"""Compute the disturbance bounds of Assumption 1 from a scenario's disturbance and its dispersions. Start with `of`.
+"""The disturbance bounds of Assumption 1 from a scenario's disturbance and its dispersions. Start with `compute`.
 
 K bounds each component of d, and c bounds each component of d'. The published bounds, 0.01 N m and 1e-3 N m/s, belong
 to the disturbance 0.01 sin(0.1 t) of Case I. Each disturbance table has a method `bounds`, and the bounds of a sum add
@@ -34,7 +34,7 @@ class Bounds(NamedTuple):
     rate: np.ndarray  # (m,) of d' [the same per second]
 
 
-def of(scenario: Any) -> tuple[float, float] | None:
+def compute(scenario: Any) -> tuple[float, float] | None:
     """Return K [N m, or unit of d] and c [the same per second] of a scenario's disturbance.
 
     The result is None if the disturbance, or the reference that determines it, is custom code that has not run yet.

@@ -136,7 +136,7 @@ def _check_bounds(choice: Choice, name: str) -> None:
         raise ScenarioError(f"{key} is not a known gain; {parsing.nearest(name, known)}")
     if name not in choice.free:
         raise ScenarioError(f"{key} bounds a gain that is not free; tune.free is {errors.brief(choice.free)}")
-    least, most, closed = gain_bounds.of(choice.scenario, name).allowed(choice)
+    least, most, closed = gain_bounds.bounds_of(choice.scenario, name).allowed(choice)
     if not (least <= lower if closed else least < lower) or not upper < most:
         allowed = f"two numbers {'from' if closed else 'above'} {least}"
         raise wrong(key, [lower, upper], allowed + (f" and below {most}" if math.isfinite(most) else ""))
@@ -150,7 +150,7 @@ def _default(choice: Choice, name: str) -> tuple[float, float]:
     The lower bound moves to the middle between the gain and the smallest allowed value. The upper bound moves to twice
     the gain's distance from the smallest allowed value, at most to the middle between the gain and the largest one.
     """
-    gain = gain_bounds.of(choice.scenario, name)
+    gain = gain_bounds.bounds_of(choice.scenario, name)
     (low, high), present = gain.usual(choice), _present_values(choice.scenario, name)
     if present:
         least, most, closed = gain.allowed(choice)
@@ -186,7 +186,7 @@ def reason_of_bound(scenario: Scenario, name: str, side: str, bound: float) -> s
     tune = scenario.tune
     if not scenario.sampled or tune is None:
         return None
-    gain = gain_bounds.of(scenario, name)
+    gain = gain_bounds.bounds_of(scenario, name)
     words = gain.below if side == "lower" else gain.above
     if words is None:
         return None
@@ -213,7 +213,7 @@ def beyond(scenario: Scenario, name: str, side: str) -> float | None:
     low, high = tune.bounds[name]
     if reason_of_bound(scenario, name, side, low if side == "lower" else high) is not None:
         return None
-    least, most, _ = gain_bounds.of(scenario, name).allowed(Choice(scenario, tune.gains, tune.bounds))
+    least, most, _ = gain_bounds.bounds_of(scenario, name).allowed(Choice(scenario, tune.gains, tune.bounds))
     if wide(low, high):
         step = (high / low) ** 0.1
         value = low / step if side == "lower" else high * step
@@ -243,7 +243,7 @@ def widened(
         by_default = ("tune", "bounds", name) in defaulted
         if not by_default or reason_of_bound(scenario, name, side, low if side == "lower" else high) is not None:
             continue
-        least, most, _ = gain_bounds.of(scenario, name).allowed(Choice(scenario, tune.gains, tune.bounds))
+        least, most, _ = gain_bounds.bounds_of(scenario, name).allowed(Choice(scenario, tune.gains, tune.bounds))
         if name == "delta":  # the upper bound stays: the clock has samples for it only
             most = high
         if side == "lower" and wide(low, high) and math.isfinite(least):
@@ -260,7 +260,7 @@ def widened(
 def usual(scenario: Scenario, name: str) -> tuple[float, float]:
     """Return the usual bounds of a free gain, before they are widened to include the scenario's gain."""
     tune = scenario.search
-    return gain_bounds.of(scenario, name).usual(Choice(scenario, tune.gains, tune.bounds))
+    return gain_bounds.bounds_of(scenario, name).usual(Choice(scenario, tune.gains, tune.bounds))
 
 
 def by_default(scenario: Scenario, name: str) -> tuple[float, float]:

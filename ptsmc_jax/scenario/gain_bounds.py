@@ -1,4 +1,4 @@
-"""Usual and allowed bounds of each gain of a search. Start with `of`.
+"""Usual and allowed bounds of each gain of a search. Start with `bounds_of`.
 
 The bounds are in `BOUNDS`, by the names that declarations of gains use, or in the declaration itself.
 """
@@ -85,7 +85,7 @@ class GainBounds(NamedTuple):
     above: str | None = None  # why values above the usual upper bound are useless
 
 
-def of(scenario: Any, name: str) -> GainBounds:
+def bounds_of(scenario: Any, name: str) -> GainBounds:
     """Return the bounds of a scenario's gain; name: of the gain, such as "observer_gain"."""
     table = next(table for table in scenario.tuned_tables.values() if name in table.gains)
     key = name.removeprefix(table.prefix)

@@ -62,7 +62,7 @@ def _kinds(name: str, kinds: type[Table] | Kinds, unit_of_d: str) -> Schema:
 def _struct(struct: type[Table], unit_of_d: str, name: str = "") -> Schema:
     """Return the schema of a table of one kind; name: of the table, for its inline tables."""
     hints, properties = typing.get_type_hints(struct, include_extras=True), {}
-    for key in keys.of(struct, unit_of_d):
+    for key in keys.list_keys(struct, unit_of_d):
         inline = layouts.DISPERSIONS.get(key.name) if name == "dispersion" else layouts.KINDS.get(f"{name}.{key.name}")
         one = _leaf(hints[key.name]) if inline is None else _kinds("", inline, unit_of_d)
         if key.unit in catalogues.UNITS:

@@ -1,4 +1,4 @@
-"""Meanings, units, allowed values and defaults of the keys of scenario files. Start with `of`.
+"""Meanings, units, allowed values and defaults of the keys of scenario files. Start with `list_keys`.
 
 They come from the declarations, types and defaults of the table classes. Error messages, the JSON Schema and the
 reference page of scenarios are made from them.
@@ -32,7 +32,7 @@ class Key(NamedTuple):
         return self.meaning + (f" [{self.unit}]" if self.unit else "")
 
 
-def of(struct: type[Table], unit_of_d: str = UNIT_OF_D) -> list[Key]:
+def list_keys(struct: type[Table], unit_of_d: str = UNIT_OF_D) -> list[Key]:
     """Return the keys of a table, without `kind`, in the order of the struct.
 
     For a custom kind, only the keys that all custom parts share are known here. The keys of its class are in `rest`.

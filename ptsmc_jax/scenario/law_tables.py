@@ -75,7 +75,7 @@ class LawTable(PartTable, frozen=True):
 
     def filled(self, scenario: Any) -> Any:
         """Fill absent bounds of Assumption 1 from the disturbance, then absent gains by `designed`."""
-        found = disturbance_bounds.of(scenario)
+        found = disturbance_bounds.compute(scenario)
         if found is not None:
             self = self._with(dict(zip(("disturbance_bound", "disturbance_rate_bound"), found, strict=True)))
         made = self._with(self.designed(msgspec.structs.replace(scenario, controller=self)))

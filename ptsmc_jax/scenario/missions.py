@@ -44,7 +44,7 @@ class Mission(NamedTuple):
     end: float  # end of the run [s]
 
 
-def of(scenario: Any) -> Mission:
+def build(scenario: Any) -> Mission:
     """Return the keys of a scenario that directions depend on."""
     return Mission(scenario.orbit, scenario.loop.epoch, scenario.end)
 

@@ -429,7 +429,7 @@ def _in_words(name: str, value: Any, struct: type[Table], kind: Any, context: Co
     if not has_text or name in layouts.KINDS or _fits(value, kind):
         return value
     key = name.rpartition(".")[2]
-    unit = next((one.unit for one in keys.of(struct, context.plant.unit_of_d) if one.name == key), "")
+    unit = next((one.unit for one in keys.list_keys(struct, context.plant.unit_of_d) if one.name == key), "")
     if unit not in catalogues.UNITS:
         return value
 

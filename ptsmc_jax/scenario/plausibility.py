@@ -22,7 +22,7 @@ def warnings(scenario: Scenario) -> list[str]:
 
     Bounds and estimate are not examined if custom code that defines the disturbance has not run yet.
     """
-    bounds = disturbance_bounds.of(scenario)
+    bounds = disturbance_bounds.compute(scenario)
     bounded = [] if bounds is None else [*_implausible_bound(scenario, *bounds), *_noisy_estimate(scenario, bounds[0])]
     others = (_perfect_rate, _noise_in_wrong_unit, _delay_in_seconds, _fast_surface, _below_horizon)
     return [*bounded, *(text for warn in others for text in warn(scenario))]

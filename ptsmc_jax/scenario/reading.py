@@ -20,7 +20,7 @@ def read(path: str | Path) -> Scenario:
     return from_tables(parsing.load(path))
 
 
-def of(what: object) -> Scenario:
+def to_scenario(what: object) -> Scenario:
     """Return a scenario, or read it if `what` is the path of a file; raise TypeError for anything else."""
     if isinstance(what, str | Path):
         return read(what)
@@ -120,7 +120,7 @@ def replace(scenario: Scenario | str | Path, **changes: Any) -> Scenario:
     Traceback (most recent call last):
     ptsmc_jax.scenario.errors.ScenarioError: controller.eta is 1.0, but must be a number greater than 2 (Theorem 2)
     """
-    scenario = of(scenario)
+    scenario = to_scenario(scenario)
     tables = parsing.stated(scenario)
     for name in sorted(changes, key=_comes):
         value, (table, _, key) = changes[name], name.partition("__")

@@ -175,7 +175,7 @@ class NadirTable(MissionTable, frozen=True):
     """Local vertical, local horizontal."""
 
     def _orbit(self, scenario: Any) -> Any:
-        return missions.orbit(missions.of(scenario), 'reference.kind is "nadir"')
+        return missions.orbit(missions.build(scenario), 'reference.kind is "nadir"')
 
     def frequencies(self, scenario: Any) -> dict[str, float]:
         return {"reference.kind": float(self._orbit(scenario).fastest())}
@@ -206,18 +206,18 @@ class DirectionsTable(MissionTable, frozen=True):
         raise NotImplementedError
 
     def frequencies(self, scenario: Any) -> dict[str, float]:
-        return {"reference.kind": missions.along(self, missions.of(scenario)).fastest}
+        return {"reference.kind": missions.along(self, missions.build(scenario)).fastest}
 
     def check(self, scenario: Any) -> None:
         super().check(scenario)
-        missions.along(self, missions.of(scenario))
+        missions.along(self, missions.build(scenario))
 
     def build(self, scenario: Any) -> Any:
-        return missions.anchored(self, missions.of(scenario))
+        return missions.anchored(self, missions.build(scenario))
 
     def first(self, scenario: Any) -> np.ndarray:
         self.check(scenario)
-        return missions.turned(missions.along(self, missions.of(scenario)).matrix, self.mount)
+        return missions.turned(missions.along(self, missions.build(scenario)).matrix, self.mount)
 
 
 SECONDARY = Meaning("direction of `secondary_axis`: a name, or three numbers in inertial axes")
@@ -238,7 +238,7 @@ class GroundTargetTable(DirectionsTable, frozen=True):
 
     def lowest_elevation(self, scenario: Any) -> tuple[float, float]:
         """Return the lowest elevation above the horizon of the target [rad], and its time [s]."""
-        return missions.lowest_elevation(self, missions.of(scenario))
+        return missions.lowest_elevation(self, missions.build(scenario))
 
     def directions(self, mission: missions.Mission) -> tuple[Any, Any]:
         point = orbits.ground_point(self.latitude, self.longitude, self.height)

@@ -23,7 +23,7 @@ def in_scenario(scenario: Scenario, gains: Mapping[str, Any]) -> Scenario:
         ScenarioError: a name is not a gain of the scenario, or a value is not allowed.
         TypeError: `gains` is not a mapping.
     """
-    scenario = reading.of(scenario)
+    scenario = reading.to_scenario(scenario)
     if not isinstance(gains, Mapping):
         raise TypeError(f"gains are needed by name, such as {{'eta': 3.0}}, but this is a {type(gains).__name__}")
     axes = list(getattr(scenario.observer, "gain", ()))

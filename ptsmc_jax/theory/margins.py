@@ -3,7 +3,7 @@
 The margins follow from L(e^(i w h)) of `linear.at_input` between 0 and the Nyquist frequency. Crossings are located on
 a grid that is dense around every pole, refined, and completed by a differentiable Newton step. The margins are exact
 for the sampled loop: at the gain or delay margin the simulated loop, with held commands, reaches its stability limit.
-There is no continuous approximation. Read `Margins` and `of` first.
+There is no continuous approximation. Read `Margins` and `compute` first.
 """
 
 from collections.abc import Callable
@@ -67,15 +67,15 @@ FIELDS = Margins._fields[:5]  # fields of `Margins` that are margins
 
 
 @programs.jit(static_argnames=("sensors", "with_delay"), title="the exact margins")
-def of_each(loops: Loop, sensors: bool = False, with_delay: bool = True) -> Margins:
+def compute_each(loops: Loop, sensors: bool = False, with_delay: bool = True) -> Margins:
     """Return the margins of several loops; the first axis is the loop.
 
     Args:
         loops: the loops.
-        sensors: see `of`.
-        with_delay: see `of`.
+        sensors: see `compute`.
+        with_delay: see `compute`.
     """
-    return jax.lax.map(partial(of, sensors=sensors, with_delay=with_delay), loops)
+    return jax.lax.map(partial(compute, sensors=sensors, with_delay=with_delay), loops)
 
 
 def in_turn(loops: Loop) -> Margins:
@@ -88,7 +88,7 @@ def in_turn(loops: Loop) -> Margins:
 
     def call(k: int) -> Margins:
         some = np.resize(np.arange(k, min(k + PAIR, count)), PAIR)
-        return jax.tree.map(np.asarray, of_each(jax.tree.map(lambda v: np.asarray(v)[some], loops)))
+        return jax.tree.map(np.asarray, compute_each(jax.tree.map(lambda v: np.asarray(v)[some], loops)))
 
     calls = [call(k) for k in range(0, count, PAIR)]
     return jax.tree.map(lambda *many: np.concatenate(many)[:count], *calls)
@@ -134,7 +134,7 @@ def _spectrum(loop: Loop, opened: Callable[[Loop], Opening] = linear.at_input) -
     return _Spectrum(finite, loop, opening, quick, stable, w, each.T)
 
 
-def of(loop: Loop, sensors: bool = False, with_delay: bool = True) -> Margins:
+def compute(loop: Loop, sensors: bool = False, with_delay: bool = True) -> Margins:
     """Return the margins of each axis of a loop, or NaN if the loop contains numbers that are not finite.
 
     Args:
@@ -159,7 +159,7 @@ def of(loop: Loop, sensors: bool = False, with_delay: bool = True) -> Margins:
 
 
 def _of(spectrum: _Spectrum, with_delay: bool) -> Margins:
-    """Return the margins of each axis of an opened loop, see `of`."""
+    """Return the margins of each axis of an opened loop, see `compute`."""
     brackets = jax.vmap(partial(crossings.brackets, spectrum.w))(spectrum.each)
     root = jax.lax.stop_gradient(_refined_crossings(spectrum, brackets))
     L, slope = spectrum.at(jnp.append(root, brackets.elsewhere, axis=1), by_loop=True)
@@ -207,7 +207,7 @@ def _refined_crossings(spectrum: _Spectrum, brackets: Brackets) -> Array:
 def roughly(loop: Loop) -> dict[str, Array]:
     """Return approximate margins of each axis (m,) by interpolation between grid points, with stopped gradients.
 
-    The keys are those of `catalogues.MARGINS`. The function takes a sixth of the time of `of`, and
+    The keys are those of `catalogues.MARGINS`. The function takes a sixth of the time of `compute`, and
     half of it without the delay margin (42 states).
     """
     spectrum = _spectrum(loop)

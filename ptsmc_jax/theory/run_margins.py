@@ -143,7 +143,7 @@ def judged_margins(parts: Parts) -> tuple[Margins, Array, History]:
     """
     run = linear.nominal(parts)
     loops, hold = judged_loops(parts, run)
-    return margins.of_each(loops), hold, history(parts, run)
+    return margins.compute_each(loops), hold, history(parts, run)
 
 
 judged_margins_jit = programs.jit(
@@ -175,7 +175,7 @@ def along(parts: Parts, times: int = 24) -> Course:
     t, _, loops, at_input = jax.tree.map(lambda v: v[order], at_times)
     counts = (order < TIMES) | (order == order[-1])
     last = jax.tree.map(lambda v: v[-1:], loops)
-    at_sensors = margins.of_each(last, sensors=True)
+    at_sensors = margins.compute_each(last, sensors=True)
     limit_cycle = limit_cycles.find(parts, commands)
     if limit_cycle is None:
         at_once = margins.together(jax.tree.map(lambda v: v[0], last))

@@ -136,7 +136,7 @@ def all_of(parts, dispersion, seed, late=False):
     If `late` is not set, the delay margin is the phase margin over the crossover frequency, without the hold.
     """
     loops, _ = looked_at(parts, dispersion, seed, late)
-    each = [margins.of_each(jax.tree.map(lambda v, k=k: v[k], loops), with_delay=late) for k in range(TRIALS)]
+    each = [margins.compute_each(jax.tree.map(lambda v, k=k: v[k], loops), with_delay=late) for k in range(TRIALS)]
     if not late:
         each = [one._replace(delay=np.deg2rad(one.phase) / one.crossover) for one in each]
     return {name: np.stack([farthest(name, one.each()[name], 1) for one in each]) for name in catalogues.MARGINS}
@@ -350,8 +350,8 @@ def test_worst_margins_are_exact_without_exact_margins_of_all_loops(drawn, facto
         judged.append(len(loops.a))
         return of_each(loops, **how)
 
-    of_each = margins.of_each
-    monkeypatch.setattr(margins, "of_each", counted)
+    of_each = margins.compute_each
+    monkeypatch.setattr(margins, "compute_each", counted)
     # each limit is between the exact and the interpolated margin of one trial, which are on different sides of it
     both = {name: np.stack([v, worst_of(rough)[name]])[:, np.argsort(v)[TRIALS // 2]] for name, v in each.items()}
     limits = {name: float(abs(v.mean())) for name, v in both.items() if late or name != "delay_margin"}
@@ -399,7 +399,7 @@ def test_assumed_error_of_delay_margins_is_a_fraction_of_a_period(monkeypatch, p
 
     monkeypatch.setattr(margin_verdicts, "_loops_and_margins", looked)
     monkeypatch.setattr(margin_verdicts, "JUDGED", 16)
-    monkeypatch.setattr(margin_verdicts.margins, "of_each", of_each)
+    monkeypatch.setattr(margin_verdicts.margins, "compute_each", of_each)
     nothing: Any = None
     found = margin_verdicts.worst(nothing, nothing, 3, np.arange(32), {"delay_margin": limit})
     np.testing.assert_array_equal(found["delay_margin"], delays)

@@ -91,7 +91,7 @@ def test_every_key_of_the_plant_is_written_with_its_meaning(plant):
         assert len(said) == len(structs)
         explained = set() if name == "initial" else ATTITUDE  # attitude keys are explained in [initial] only
         for lines, struct in zip(said, structs, strict=True):
-            wanted = {key.name: key.meaning for key in keys.of(struct) if key.name not in explained}
+            wanted = {key.name: key.meaning for key in keys.list_keys(struct) if key.name not in explained}
             assert {key_of(line) for line in lines} - {"kind", *explained} == set(wanted), (name, struct)
             assert all(meaning in text.replace("\n# ", " ") for meaning in wanted.values())
     assert ("[unit of d" in text) == (layouts.SCENARIOS[plant].unit_of_d == keys.UNIT_OF_D)
@@ -108,7 +108,7 @@ def test_commented_keys_are_valid(plant):
     layout = layouts.TABLES[plant]
     dispersion = layout["dispersion"]
     assert isinstance(dispersion, type)
-    drawn = sum(len(layouts.DISPERSIONS[key.name]) for key in keys.of(dispersion))
+    drawn = sum(len(layouts.DISPERSIONS[key.name]) for key in keys.list_keys(dispersion))
     others = sum(len(table) if isinstance(table, Mapping) else 1 for table in layout.values()) - 1
     attitudes = len(ATTITUDE_KEYS) - 1 if plant == "spacecraft" else 0
     commands = len(COMMANDS) - 1 if plant == "spacecraft" else 0  # a log has one of them

@@ -118,7 +118,7 @@ def accuracy(times: float | None, **changes: Any) -> Iterable[str]:
 
 def shortest(theory: float | None, simulated: float | None, quantile: float | None = None) -> Any:
     times = {"limit": 0.5, "theory": theory, "simulated": simulated, "quantile": quantile, "unit": "N m"}
-    return tune_report.of(examples.tune(shortest_t_f=times))
+    return tune_report.build(examples.tune(shortest_t_f=times))
 
 
 def diagnostics(at_bound: dict[str, str] | None = None, **trust: Any) -> Iterable[str]:
@@ -148,8 +148,10 @@ UNLIMITED = {"gain_margin": None, "phase_margin": 61.0, "delay_margin": None, "p
 HOLD = {"stable": True, "gain_margin": 9.0, "phase_margin": 40.0, "delay_margin": 0.1, "peak_sensitivity": 3.0}
 SCALED = {"published_label": "published, scaled", "accuracy_gain_interval": [0.05, 0.1]}
 TUNINGS: dict[str, Callable[[], Any]] = {
-    "tuned": lambda: tune_report.of(examples.tune(held_out=HELD_OUT, published=LOST, verdicts=[examples.torque(0.9)])),
-    "tuned, a trial of a chain fails": lambda: tune_report.of(
+    "tuned": lambda: tune_report.build(
+        examples.tune(held_out=HELD_OUT, published=LOST, verdicts=[examples.torque(0.9)])
+    ),
+    "tuned, a trial of a chain fails": lambda: tune_report.build(
         examples.tune(held_out=HELD_OUT, plant="chain", status="not met")
     ),
     "held-out trials break a limit": lambda: tune_report.advice(broken(1.1)),
@@ -339,7 +341,7 @@ def winner(least: float) -> str:
 
 def run(lower_bound: float | None) -> Report:
     told = {"status": "ok", "reason": "", "bad_time": None, "window_error": 1e-5, "verdicts": {}, "warnings": []}
-    return run_report.of(summaries.run({**told, "lower_bound": lower_bound}, "spacecraft"), "spacecraft")
+    return run_report.build(summaries.run({**told, "lower_bound": lower_bound}, "spacecraft"), "spacecraft")
 
 
 def approach(judged: bool) -> Report:
@@ -350,7 +352,7 @@ def approach(judged: bool) -> Report:
         "before": [{"time_to_go": 1.0, "judged": judged, "stable": False, "open": [], "cut": []}],
         "worst": {"gain_margin": -1.9, "phase_margin": None, "delay_margin": None, "peak_sensitivity": None},
     }  # fmt: skip
-    return margins_report.of(summaries.read(summaries.Margins, summary))
+    return margins_report.build(summaries.read(summaries.Margins, summary))
 
 
 def why(*rows: dict[str, Any], **changes: Any) -> Iterable[str]:
@@ -364,7 +366,7 @@ OTHERS: dict[str, Callable[[], Any]] = {
     "fractions of the trials": fractions,
     "a trial that failed has no settling time": lambda: settling(1),
     "a trial that ended never settled": lambda: settling(2),
-    "campaign without a lower bound": lambda: campaign_report.of(
+    "campaign without a lower bound": lambda: campaign_report.build(
         examples.campaign(quantiles={"window_error": {**ERROR, "0.9973": ERROR["0.5"]}}, lower_bound=0.0)
     ),
     "gains of a campaign": lambda: campaign_gains(
@@ -404,7 +406,7 @@ OTHERS: dict[str, Callable[[], Any]] = {
 }  # fmt: skip
 
 
-CASES = {**TUNINGS, **{name: lambda made=made: front_report.of(made()) for name, made in FRONTS.items()}, **OTHERS}
+CASES = {**TUNINGS, **{name: lambda made=made: front_report.build(made()) for name, made in FRONTS.items()}, **OTHERS}
 
 
 def expected() -> dict[str, str]:

@@ -321,7 +321,7 @@ class Vibration(Disturbance):
 def test_bounds_of_a_fast_custom_disturbance_are_not_aliased(rate):
     """An earlier version aliased a disturbance of 25 Hz with its sample times and found bounds of nearly zero."""
     said = scenario.from_tables({"disturbance": {"kind": "custom", "code": Vibration, "rate": rate}})
-    known = disturbance_bounds.of(said)
+    known = disturbance_bounds.compute(said)
     assert known is not None
     np.testing.assert_allclose(known, (0.01, 0.01 * rate), rtol=3e-3)
 
@@ -349,7 +349,7 @@ class Swell(Disturbance):
 )
 def test_bounds_of_a_custom_disturbance_include_dispersions(drawn, most):
     dispersion = {"dispersion": drawn} if drawn else {}
-    known = disturbance_bounds.of(
+    known = disturbance_bounds.compute(
         scenario.from_tables({"disturbance": {"kind": "custom", "code": Swell}, **dispersion})
     )
     assert known is not None

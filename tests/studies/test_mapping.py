@@ -182,7 +182,7 @@ def test_gain_factor_below_one_gives_the_distance_to_the_nearest_stability_limit
     parts = scenario.study(scenario.from_tables(tomllib.loads(CHAIN))).parts
     loops = run_margins.at(parts, jnp.asarray([1.0])).loops
     weak = replace(loops, new=1e-3 * loops.new, old=1e-3 * loops.old)
-    factor = float(10.0 ** (margins.of_each(weak).gain_up[-1, 0] / 20.0))
+    factor = float(10.0 ** (margins.compute_each(weak).gain_up[-1, 0] / 20.0))
     weak = jax.tree.map(lambda v: v[-1], weak)
     assert factor < 1.0 < linear.radius(weak, factor)
     assert linear.radius(weak, 0.999 / factor) > 1.0 > linear.radius(weak, 1.001 / factor)

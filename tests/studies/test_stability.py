@@ -144,7 +144,7 @@ def test_unstable_hold_phase_is_reported_with_negative_margins(command, tmp_path
 
 
 def reported(summary):
-    return margins_report.of(summaries.read(summaries.Margins, summary))
+    return margins_report.build(summaries.read(summaries.Margins, summary))
 
 
 def test_margins_need_the_sampled_loop(command, tmp_path):

@@ -35,7 +35,7 @@ def of(loop, **how):
         loop = larger(loop, *room)
         if loop.delay == 1:
             return jax.tree.map(np.asarray, with_gradients(loop, jax.tree.map(np.zeros_like, loop))[2])
-    each = margins.of_each(jax.tree.map(lambda v: np.asarray(v)[None], loop), **how)
+    each = margins.compute_each(jax.tree.map(lambda v: np.asarray(v)[None], loop), **how)
     return jax.tree.map(lambda v: np.asarray(v)[0] if how else np.asarray(v)[0, : sizes[2]], each)
 
 
@@ -44,7 +44,7 @@ def with_gradients(loop, way):
     """Margins of the first input, their derivatives along a direction, and the margins of all inputs."""
 
     def margins_of(loop):
-        found = margins.of(loop)
+        found = margins.compute(loop)
         return jnp.stack([getattr(found, name)[0] for name in margins.FIELDS]), found
 
     return jax.jvp(margins_of, (loop,), (way,), has_aux=True)

@@ -612,9 +612,9 @@ def test_lapack_receives_one_matrix_at_a_time():
     loop = replace(held(*INTEGRATORS, 0.5), delay=1)
     body = a_body(period=0.1)
     loops = jax.tree.map(lambda v: jnp.stack([v, v]), loop)
-    with_gradients = jax.jacfwd(lambda x: margins.of_each(jax.tree.map(lambda v: x * v, loops)))
+    with_gradients = jax.jacfwd(lambda x: margins.compute_each(jax.tree.map(lambda v: x * v, loops)))
     traces = {
-        "each": margins.of_each.trace(loops),
+        "each": margins.compute_each.trace(loops),
         "their slopes": jax.make_jaxpr(with_gradients)(1.0),
         "roughly": jax.make_jaxpr(lambda loops: jax.lax.map(margins.roughly, loops))(loops),
         "responses": margins._responses.trace(loop),

@@ -60,7 +60,7 @@ def in_hold(parts):
 def test_margins_include_the_mode_and_sensors_see_only_the_body():
     loop = in_hold(in_theory(controller=CALM))
     assert loop.seen.shape[1] == 6
-    assert jax.eval_shape(lambda loop: margins.of(loop, sensors=True), loop).gain_up.shape == (6,)
+    assert jax.eval_shape(lambda loop: margins.compute(loop, sensors=True), loop).gain_up.shape == (6,)
 
     def bears(axis, decibels):
         return linear.radius(loop, np.diag(10.0 ** (decibels * (np.arange(3) == axis) / 20.0))) < 1.0 + margins.NEUTRAL

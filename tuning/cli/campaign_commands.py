@@ -324,7 +324,7 @@ def replay(
 
         plant = opened.scenario.plant.kind
         summary = summaries.run(single.summary(again.run, opened.scenario, opened.computer), plant)
-        terminal.show(run_report.of(summary, plant), place)
+        terminal.show(run_report.build(summary, plant), place)
         terminal.say(*trials_report.replayed(again.off, again.rounding, campaign_summary.SAME))
     return 0 if again.off is None or again.off <= campaign_summary.SAME else 1
 
@@ -348,7 +348,7 @@ def _summarised(folder: "Folder", quiet: bool, figures: bool, *, write: bool = T
     if not quiet:
         from tuning.output import campaign_report, summaries
 
-        terminal.show(campaign_report.of(summaries.read(summaries.Campaign, summary)), folder.path)
+        terminal.show(campaign_report.build(summaries.read(summaries.Campaign, summary)), folder.path)
     return 0 if summary["status"] == "met" else 1
 
 

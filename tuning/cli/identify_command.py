@@ -80,7 +80,7 @@ def identify(
         made_by = {"logs": [str(path) for path in logs], "validate": [str(path) for path in validate]}
         store.write(folder, lambda making: identifying.write(making, found, common.figures, made_by))
     if not common.quiet:
-        terminal.show(identify_report.of(summaries.read(summaries.Identified, results.summary(found))), folder)
+        terminal.show(identify_report.build(summaries.read(summaries.Identified, results.summary(found))), folder)
     return 0 if found.good else 1
 
 

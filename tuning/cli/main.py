@@ -92,7 +92,7 @@ def simulate(
         from tuning.output import run_report, summaries
 
         summary = summaries.run(single.summary(run, loaded, computer), loaded.plant.kind)
-        terminal.show(run_report.of(summary, loaded.plant.kind), folder)
+        terminal.show(run_report.build(summary, loaded.plant.kind), folder)
     return 0 if run.met else 1
 
 
@@ -120,7 +120,7 @@ def reproduce(*, out: Out = None, force: Force = False, quiet: Quiet = False, fi
         from tuning.output import paper_report, summaries
 
         summary = summaries.read(summaries.Paper, reproduction.summary(reproduced))
-        terminal.show(paper_report.of(summary), folder)
+        terminal.show(paper_report.build(summary), folder)
     return 0 if reproduced.ok else 1
 
 
@@ -196,7 +196,7 @@ def margins(
     if not common.quiet:
         from tuning.output import margins_report, summaries
 
-        terminal.show(margins_report.of(summaries.read(summaries.Margins, summary)), folder)
+        terminal.show(margins_report.build(summaries.read(summaries.Margins, summary)), folder)
     return 0 if summary["stable"] else 1
 
 
@@ -232,7 +232,7 @@ def tune(
         objective_name(loaded.search),
         work=lambda report, journal: tuner.tune(loaded, seed, report, journal, globally=global_check),
         write=lambda making, tuning: tune_files.write(making, loaded, tuning, common.figures, known_by),
-        report=lambda summary: tune_report.of(summaries.tune(summary)),
+        report=lambda summary: tune_report.build(summaries.tune(summary)),
     )
     return searches.run(search, loaded, folder, force=common.force, quiet=common.quiet)
 
@@ -263,14 +263,14 @@ def pareto(
     from tuning.studies import front, posing, trades
     from tuning.studies import pareto as fronts
 
-    trade = trades.of(against, posing.with_tune(loaded), points, listed)
+    trade = trades.build(against, posing.with_tune(loaded), points, listed)
     loaded, known_by = trade.scenario, trade.identity(seed) | {"device": device}
     search = searches.LongSearch(
         known_by,
         "window error",
         work=lambda report, journal: fronts.trace(trade, seed, report, journal),
         write=lambda making, found: fronts.write(making, trade, found, common.figures, known_by),
-        report=lambda summary: front_report.of(front.read(summary)),
+        report=lambda summary: front_report.build(front.read(summary)),
     )
     return searches.run(search, loaded, folder, force=common.force, quiet=common.quiet)
 
@@ -311,7 +311,7 @@ def compare(
         objective_name(loaded.search),
         work=lambda report, journal: comparing.compare(loaded, seed, report, journal, posed()),
         write=lambda making, comparison: comparing.write(making, loaded, comparison, common.figures, known_by),
-        report=lambda summary: compare_report.of(summaries.read(summaries.Compare, summary)),
+        report=lambda summary: compare_report.build(summaries.read(summaries.Compare, summary)),
         check=posed,
     )
     return searches.run(search, loaded, folder, force=common.force, quiet=common.quiet)

@@ -146,7 +146,7 @@ class _File:
             yield from _line(live is None, "kind", kind, keys.about(struct))
         values = {**self.defaults(name, struct), **values}
         borrowed = Attitude.__struct_fields__ if name != "initial" else ()  # explained at [initial]
-        for key in keys.of(struct, self.resolved.unit_of_d):
+        for key in keys.list_keys(struct, self.resolved.unit_of_d):
             off = live is None or key.name not in live
             if f"{name}.{key.name}" in layouts.KINDS:
                 yield from self.inline(name, key, (live or {}).get(key.name, {}), layouts.KINDS[f"{name}.{key.name}"])
@@ -160,7 +160,7 @@ class _File:
         assert isinstance(struct, type)
         yield from _prose(keys.about(struct))
         yield f"{'#' if live is None else ''}[dispersion]"
-        for key in keys.of(struct, self.resolved.unit_of_d):
+        for key in keys.list_keys(struct, self.resolved.unit_of_d):
             chosen = (live or {}).get(key.name, {})
             yield from self.inline("dispersion", key, chosen, layouts.DISPERSIONS[key.name])
 
@@ -176,7 +176,7 @@ class _File:
         yield from _prose(f"{key.meaning}:")
         for kind, struct in kinds.items():
             scaled = {key: mission.scales(self.resolved).of(one) for key, one in struct.scaled.items()}
-            others = (k for k in keys.of(struct, self.resolved.unit_of_d) if k.name not in scaled)
+            others = (k for k in keys.list_keys(struct, self.resolved.unit_of_d) if k.name not in scaled)
             table = {"kind": kind, **scaled, **{k.name: self.example(name, kind, k) for k in others}}
             mine = chosen.get("kind") == kind
             yield from _line(not mine, key.name, chosen if mine else table, keys.about(struct))

@@ -22,7 +22,7 @@ NOTES = {
 }
 
 
-def of(summary: Campaign) -> Report:
+def build(summary: Campaign) -> Report:
     """Return the report of a campaign."""
     error = summary.quantiles["window_error"].rms
     first = named_error(error, summary.plant, "RMS ")
@@ -139,7 +139,7 @@ def gains(scenario: dict[str, Any], plant: str) -> Table:
         custom = given.get("kind") == "custom"  # units are in its class, which is not run here
         kinds: Any = SCENARIOS[plant].TABLES.get(table, {})
         struct = kinds.get(given.get("kind"))
-        units = {key.name: key.unit for key in keys.of(struct, SCENARIOS[plant].unit_of_d)} if struct else {}
+        units = {key.name: key.unit for key in keys.list_keys(struct, SCENARIOS[plant].unit_of_d)} if struct else {}
         for key, value in given.items():
             numbers = value if isinstance(value, list) else [value]
             each = [f"{one:.6g}" if isinstance(one, float | int) else str(one) for one in numbers]

@@ -145,7 +145,7 @@ QUESTIONS = (
 )  # fmt: skip
 
 
-def of(summary: Compare) -> Report:
+def build(summary: Compare) -> Report:
     """Return the report of a comparison; it has the charts that the page draws."""
     headline = {
         "met": "The tuned law of the paper meets every requirement",

@@ -12,7 +12,7 @@ from tuning.studies.front import KINDS, Front, Point, titled, unit_of
 USUAL = margins_report.ENOUGH["gain_margin"]  # limit on |S| that the summary states first [dB]
 
 
-def of(front: Front) -> Report:
+def build(front: Front) -> Report:
     """Return the report of a front."""
     if front.requirements:
         met, points = sum(point.meets for point in front.kept), len(front.kept)

@@ -8,7 +8,7 @@ NOTE = """mean square: of the innovations over their variance. White innovations
 autocorrelation."""
 
 
-def of(summary: Identified) -> Report:
+def build(summary: Identified) -> Report:
     """Return the report of `ptsmc identify`."""
     good = summary.status == "identified"
     headline = "The model explains the telemetry" if good else "The model is DOUBTFUL"

@@ -14,7 +14,7 @@ NOTE = (
 )
 
 
-def of(head: Sequence[str], rows: Sequence[Sequence[str]], plant: str) -> Report:
+def build(head: Sequence[str], rows: Sequence[Sequence[str]], plant: str) -> Report:
     """Return the report of a map.csv for this kind of plant; the first two columns are the keys."""
     pairs = [dict(zip(("x", "y", *head[2:]), map(number, row), strict=True)) for row in rows]
     first, *others = lines(pairs, (head[0], head[1]), plant)

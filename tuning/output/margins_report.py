@@ -18,7 +18,7 @@ COLUMNS = {
 }
 
 
-def of(summary: Margins) -> Report:
+def build(summary: Margins) -> Report:
     """Return the report of `ptsmc margins`."""
     unstable = any(loop.judged and not loop.stable for loop in summary.before)
     if summary.open:

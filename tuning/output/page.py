@@ -163,7 +163,7 @@ def _simulate(result: Result) -> Report:
         q = np.stack([columns[f"q{k + 1}"] for k in range(4)], axis=1)
         caption = "The body and its axes over time; dashed: the inertial axes. Drag to turn the view."
         charts.append(Chart("attitude", page_charts.attitude(columns["t"], q), caption, "square"))
-    report = run_report.of(summaries.run(result.summary, result.plant), result.plant)
+    report = run_report.build(summaries.run(result.summary, result.plant), result.plant)
     return _with(report, Section("History", [*charts]))
 
 
@@ -172,12 +172,12 @@ def _tune(result: Result) -> Report:
     points = [dict(zip(head, row, strict=True)) for row in rows]
     caption = "The objective along the local search from each starting point; a hollow point breaks a limit."
     chart = Chart("search", page_charts.search(points, head[2]), caption)
-    return _with(tune_report.of(summaries.tune(result.summary)), Section("Search", [chart]))
+    return _with(tune_report.build(summaries.tune(result.summary)), Section("Search", [chart]))
 
 
 def _pareto(result: Result) -> Report:
     found = front.read(result.summary)
-    report = front_report.of(found)
+    report = front_report.build(found)
     if found.against != "torque":
         return report
     caption = "Hover over a point for its gains. Bars are 95 % intervals; the dashed line is the required limit."
@@ -189,31 +189,31 @@ def _pareto(result: Result) -> Report:
 
 
 def _montecarlo(result: Result) -> Report:
-    report = campaign_report.of(summaries.read(summaries.Campaign, result.summary))
+    report = campaign_report.build(summaries.read(summaries.Campaign, result.summary))
     return _with(report, Section("Gains", [campaign_report.gains(result.scenario, result.plant)]))
 
 
 def _identify(result: Result) -> Report:
     if result.summary.get("status") == "designed":
         return identify_report.of_design(summaries.read(summaries.Designed, result.summary))
-    return identify_report.of(summaries.read(summaries.Identified, result.summary))
+    return identify_report.build(summaries.read(summaries.Identified, result.summary))
 
 
 def _map(result: Result) -> Report:
     head, *rows = result.rows("map.csv")
-    return map_report.of(head, rows, result.plant)
+    return map_report.build(head, rows, result.plant)
 
 
 REPORTS: dict[str, Callable[[Result], Report]] = {
     "simulate": _simulate,
     "tune": _tune,
     "pareto": _pareto,
-    "compare": lambda result: compare_report.of(summaries.read(summaries.Compare, result.summary)),
+    "compare": lambda result: compare_report.build(summaries.read(summaries.Compare, result.summary)),
     "montecarlo": _montecarlo,
     "map": _map,
     "identify": _identify,
-    "margins": lambda result: margins_report.of(summaries.read(summaries.Margins, result.summary)),
-    "reproduce": lambda result: paper_report.of(summaries.read(summaries.Paper, result.summary)),
+    "margins": lambda result: margins_report.build(summaries.read(summaries.Margins, result.summary)),
+    "reproduce": lambda result: paper_report.build(summaries.read(summaries.Paper, result.summary)),
 }
 
 

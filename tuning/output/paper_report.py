@@ -4,7 +4,7 @@ from tuning.output.report import Report, Section, Table
 from tuning.output.summaries import Paper
 
 
-def of(summary: Paper) -> Report:
+def build(summary: Paper) -> Report:
     """Return the report of `ptsmc reproduce`."""
     claims = [(one.verdict, f"{one.where}: {one.claim}", one.measured) for one in summary.claims]
     slips = [(one.where, one.correct, one.shown) for one in summary.slips]

@@ -9,7 +9,7 @@ from tuning.output.report import Report, Section, Table
 from tuning.output.summaries import Run
 
 
-def of(summary: Run, plant: str) -> Report:
+def build(summary: Run, plant: str) -> Report:
     """Return the report of a run of this kind of plant."""
     status = summary.status
     if status == "ok" and summary.verdicts:

@@ -20,7 +20,7 @@ PUBLISHED = {  # columns of the published gains in words
 }
 
 
-def of(summary: Tune) -> Report:
+def build(summary: Tune) -> Report:
     """Return the report of a tuning."""
     first = formats.named_error(summary.held_out.number("window_error", "rms"), summary.plant, "RMS ")
     headline, mood = report.headline(summary.status, summary.verdicts, first)

@@ -39,7 +39,7 @@ def units_of(scenario: Scenario) -> dict[str, str]:
 
 def _units(tables: Iterable[Any]) -> dict[str, str]:
     """Return the unit of each gain of these tables, by name. The first table with the gain defines its unit."""
-    named = [(table, key, table.prefix + key.name) for table in tables if table.gains for key in keys.of(table)]
+    named = [(table, key, table.prefix + key.name) for table in tables if table.gains for key in keys.list_keys(table)]
     return {name: key.unit or "-" for table, key, name in reversed(named) if name in table.gains}
 
 

@@ -128,7 +128,7 @@ def rows(
 
     each = _by_case(asked, gains, loops_of, runs)
     loops = jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), each)
-    values = margins.of_each(loops, with_delay=late).each()
+    values = margins.compute_each(loops, with_delay=late).each()
     ratios = [
         violation_ratio(values[name].reshape(-1), limit, at_least=MARGINS[name].at_least)
         for name, limit in zip(asked.metrics, asked.required, strict=True)

@@ -1,4 +1,4 @@
-"""Figures of a Monte Carlo campaign, made from its rows. Read `of` first."""
+"""Figures of a Monte Carlo campaign, made from its rows. Read `build` first."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -21,7 +21,7 @@ DRAWN = 1000  # largest number of trials whose histories are plotted
 POINTS = 5000  # largest number of trials in a scatter plot
 
 
-def of(folder: Folder, summary: dict[str, Any]) -> dict[str, Figure]:
+def build(folder: Folder, summary: dict[str, Any]) -> dict[str, Figure]:
     """Return the figures of a campaign by name; summary: the content of its `summary.json`."""
     parts = folder.whole_parts()
     required = scenario.requirements(folder.scenario)

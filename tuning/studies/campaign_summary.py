@@ -297,7 +297,7 @@ def write_summary(folder: Folder, summary: dict[str, Any], figures: bool) -> Non
             from ptsmc_jax.figures import style  # the import takes half a second, which only figures need
             from tuning.studies import campaign_figures
 
-            style.save(campaign_figures.of(folder, summary), making / "figures")
+            style.save(campaign_figures.build(folder, summary), making / "figures")
 
     store.write(folder.path, fill)
 

@@ -308,7 +308,7 @@ def _label(scenario: Scenario, key: str) -> str:
     """Return a key with its unit from the schema of its table; without a unit if the scenario has no such table."""
     table, _, name = key.partition(".")
     found = getattr(scenario, table, None)
-    known = [] if found is None else keys.of(type(found), scenario.unit_of_d)
+    known = [] if found is None else keys.list_keys(type(found), scenario.unit_of_d)
     unit = next((one.unit for one in known if one.name == name.partition("[")[0]), "")
     return f"{key} [{unit}]" if unit else key
 

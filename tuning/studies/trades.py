@@ -315,7 +315,7 @@ class SlewTime(Trade):
         return {"against": self.against, "times": _listed(self.values)}
 
 
-def of(against: str, scenario: Scenario, points: int | None, listed: tuple[float, ...]) -> Trade:
+def build(against: str, scenario: Scenario, points: int | None, listed: tuple[float, ...]) -> Trade:
     """Return the trade that the options of `ptsmc pareto` ask for.
 
     Args:
