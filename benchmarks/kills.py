@@ -33,6 +33,7 @@ COMMANDS = {
 }
 TWICE = 0.2  # fraction of starts with two processes
 ENDED = (0, 1)  # exit statuses of complete results: requirements met or not
+LATEST = 1.2  # latest time of a kill, as a multiple of the duration of an undisturbed run
 
 
 def started(folder: Path, kind: str) -> subprocess.Popen:
@@ -61,12 +62,19 @@ def same(one: Any, other: Any) -> bool:
     return one.equals(other) if isinstance(one, pl.DataFrame) else json.dumps(one) == json.dumps(other)
 
 
-def kills_until_the_end(folder: Path, kind: str, longest: float, draws: random.Random) -> int:
-    """Start and kill a command until it ends by itself, and return the number of kills."""
+def kills_until_the_end(folder: Path, kind: str, latest: float, draws: random.Random) -> int:
+    """Start and kill a command until it ends by itself, and return the number of kills.
+
+    Args:
+        folder: the working directory of the command.
+        kind: "campaign" or "search".
+        latest: latest time of a kill after the start of a process [s].
+        draws: random numbers.
+    """
     kills = 0
     while True:
         runs = [started(folder, kind) for _ in range(2 if draws.random() < TWICE else 1)]
-        until = [time.monotonic() + draws.uniform(0.0, longest) for _ in runs]
+        until = [time.monotonic() + draws.uniform(0.0, latest) for _ in runs]
         ended = False
         for run, at in sorted(zip(runs, until, strict=True), key=lambda one: one[1]):
             try:
@@ -90,7 +98,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     short = replace(read(ROOT / "scenarios" / "first_flight.toml"), tune={"trials": 16, "starts": 2, "steps": 10})
-    draws, expected, longest = random.Random(arguments.seed), dict[str, Any](), dict[str, float]()
+    draws, expected, seconds = random.Random(arguments.seed), dict[str, Any](), dict[str, float]()
     with tempfile.TemporaryDirectory() as there:
         for kind in COMMANDS:
             folder = Path(there) / kind
@@ -102,15 +110,15 @@ def main() -> None:
                 _, error = run.communicate()
                 if run.returncode not in ENDED:
                     raise SystemExit(error)
-                longest[kind] = 1.2 * (time.monotonic() - begun)
+                seconds[kind] = time.monotonic() - begun
             expected[kind] = RESULTS[kind](folder)
-            print(f"{kind}: {longest[kind] / 1.2:.1f} s undisturbed", flush=True)
+            print(f"{kind}: {seconds[kind]:.1f} s undisturbed", flush=True)
         total, rounds, wrong = 0, 0, 0
         while total < arguments.kills:
             for kind in COMMANDS:
                 folder = Path(there) / kind
                 shutil.rmtree(folder / "out")
-                kills = kills_until_the_end(folder, kind, longest[kind], draws)
+                kills = kills_until_the_end(folder, kind, LATEST * seconds[kind], draws)
                 equal = same(RESULTS[kind](folder), expected[kind])
                 total, rounds, wrong = total + kills, rounds + 1, wrong + (not equal)
                 print(f"{kind}: {kills} kills, {'equal' if equal else 'WRONG'}; {total} kills in all", flush=True)

@@ -17,13 +17,13 @@ from matplotlib.figure import Figure  # noqa: E402
 import ptsmc_jax as ptsmc  # noqa: E402
 from ptsmc_jax.batching import lanes  # noqa: E402
 from ptsmc_jax.figures import style  # noqa: E402
+from ptsmc_jax.formulas import ARCSEC, pointing_angle  # noqa: E402
 from ptsmc_jax.numerics import attitude  # noqa: E402
 from ptsmc_jax.scenario import Scenario  # noqa: E402
 from ptsmc_jax.simulation import rollout  # noqa: E402
 
 ROOT = Path(__file__).parent.parent
 SEED, TRIALS = 7, 100
-ARCSEC = 180.0 * 3600.0 / np.pi
 
 
 def errors(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
@@ -54,7 +54,7 @@ def slew(published: Scenario, tuned: Scenario) -> Figure:
     parts, bound = ptsmc.study(tuned).parts, ptsmc.lower_bound(tuned)
     t_f, t_end = float(parts.controller.t_f), float(parts.t_end)
     assert bound is not None
-    axes.hlines(2.0 * np.arcsin(bound) * ARCSEC, t_f, t_end, **style.LOWER_BOUND, label="lower bound")
+    axes.hlines(float(ARCSEC * pointing_angle(bound)), t_f, t_end, **style.LOWER_BOUND, label="lower bound")
     axes.axvline(t_f, **style.LIMIT)
     axes.text(t_f, 1.0, "$t_f$", transform=axes.get_xaxis_transform(), ha="center", va="bottom")
     axes.set(yscale="log", xlabel=style.TIME, ylabel="pointing error [arcsec]", xlim=(0.0, t_end))

@@ -1,8 +1,11 @@
-"""Formulas of plants and devices in plain NumPy, which validate scenarios before JAX is imported."""
+"""Formulas of plants, devices and angles in plain NumPy, which need no import of JAX."""
 
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
+
+ARCSEC = 180.0 * 3600.0 / np.pi  # arcsec in a radian
 
 
 def check_inertia(inertia: object) -> np.ndarray:
@@ -157,3 +160,17 @@ def best_bandwidth(attitude_noise: float, rate_noise: float, period: float, inte
         interval: time between star tracker samples [s].
     """
     return rate_noise * float(np.sqrt(period)) / (attitude_noise * float(np.sqrt(interval)))
+
+
+def pointing_angle(error: ArrayLike) -> np.ndarray:
+    """Return the angle 2 asin |v| [rad] of the norm |v| [-] of an error vector of the quaternion."""
+    return 2.0 * np.arcsin(np.minimum(error, 1.0))
+
+
+def angle_unit(largest: float) -> tuple[str, float]:
+    """Return the unit in which angles up to a largest angle [rad] are shown, and how many of it a radian has.
+
+    >>> angle_unit(0.01)[0], angle_unit(0.02)[0]
+    ('arcsec', 'deg')
+    """
+    return ("arcsec", ARCSEC) if largest < np.radians(1.0) else ("deg", float(np.degrees(1.0)))

@@ -148,7 +148,7 @@ def of_run_table(
         RefusedError: initial angles or numbers of custom dispersions are not those of the trials.
     """
     kinds = {*ready.dispersion.kinds, RATE_BIAS}
-    same = []  # quantities to which the table gives the values that they have without a table
+    same = []  # quantities that have the same values with and without the table
     drawn = None  # the quantities of the trials without a table
     for name, values in table.given.items():
         quantity = QUANTITIES[name]

@@ -8,7 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from ptsmc_jax.figures.style import ARCSEC, LIMIT, STYLES, figure_of, logarithmic, shown_error, styled, with_unit
+from ptsmc_jax.figures.style import LIMIT, STYLES, figure_of, logarithmic, shown_error, styled, with_unit
+from ptsmc_jax.formulas import angle_unit
 from ptsmc_jax.simulation.catalogues import percent
 from ptsmc_jax.simulation.requirements import quantity
 
@@ -46,8 +47,7 @@ class Column(NamedTuple):
         if self.unit != "rad":
             return self
         known = self.values[np.isfinite(self.values)]
-        in_arcsec = max(np.max(np.abs(known), initial=0.0), self.limit or 0.0) < np.radians(1.0)
-        unit, factor = ("arcsec", ARCSEC) if in_arcsec else ("deg", np.degrees(1.0))
+        unit, factor = angle_unit(max(np.max(np.abs(known), initial=0.0), self.limit or 0.0))
         limit = None if self.limit is None else factor * self.limit
         return self._replace(unit=unit, values=factor * self.values, limit=limit)
 

@@ -13,6 +13,7 @@ from matplotlib.axis import Axis, XAxis
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
+from ptsmc_jax.formulas import ARCSEC, pointing_angle
 from ptsmc_jax.simulation.catalogues import CATALOGUES
 
 # colours of Okabe and Ito, distinct for the colour-blind; line styles are distinct in grey
@@ -30,7 +31,6 @@ RC: Any = {
 styled = matplotlib.rc_context(RC)  # decorator of functions that draw in this style
 LIMIT: Any = {"color": "0.3", "lw": 1.0, "ls": (0, (6, 3))}  # line of a limit; `LOWER_BOUND`: of a lower bound
 LOWER_BOUND: Any = {"color": "0.3", "lw": 1.0, "ls": ":"}
-ARCSEC = 180.0 * 3600.0 / np.pi  # arcsec in a radian
 MANY = 1e4  # ratio of an axis's ends above which numbers between powers of ten would overlap
 
 
@@ -74,15 +74,10 @@ class _Decades(matplotlib.ticker.LogLocator):
         return max(3.0, 0.3 + 0.7 * max(len(f"{10.0**power:g}") for power in powers))
 
 
-def angle_of(error: ArrayLike) -> np.ndarray:
-    """Return the angle 2 asin |v| [rad] of the norm |v| [-] of an error vector of the quaternion."""
-    return 2.0 * np.arcsin(np.minimum(error, 1.0))
-
-
 def shown_error(plant: str) -> tuple[Callable[[ArrayLike], np.ndarray], str, str]:
     """Return how figures show the error of a kind of plant: a function of its norm, its name and the unit."""
     if plant == "spacecraft":
-        return lambda error: ARCSEC * angle_of(error), "pointing error", "arcsec"
+        return lambda error: ARCSEC * pointing_angle(error), "pointing error", "arcsec"
     return np.asarray, "error", CATALOGUES[plant]["window_error"].unit
 
 

@@ -103,7 +103,7 @@ class Kinematics:
         raise NotImplementedError
 
     def straight_coordinates(self, error: Vector) -> Vector:
-        """Map an error (m,) to coordinates in which the shortest path to zero error is a straight line to 0."""
+        """Map an error (m,) to coordinates where a straight line to 0 is the shortest path to zero error."""
         return error
 
     def from_straight_coordinates(self, straight: Vector) -> Vector:

@@ -79,7 +79,7 @@ COMPUTED = ("bound", "observer_matrix")  # computed parameters; a leaf that they
 
 
 def named(board: Board) -> Parameters:
-    """Return the parameters of a flight computer, none of which is marked as derived yet."""
+    """Return the parameters of a flight computer; none is marked as derived yet."""
     found: dict[int, Field] = {}
     listed = jax.tree_util.tree_flatten_with_path(board.parameters)[0]
     leaves = [leaf for _, leaf in listed]

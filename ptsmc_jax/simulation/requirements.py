@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ptsmc_jax.formulas import angle_unit
 from ptsmc_jax.simulation.catalogues import CATALOGUE, MARGINS, WITHIN, percent
 
 
@@ -157,9 +158,8 @@ def quantity(value: float, unit: str, digits: int) -> str:
     if unit == "rad/s":
         return f"{value:.{digits}g} {unit} ({math.degrees(value):.4g} deg/s)"
     if unit == "rad":
-        value, unit = math.degrees(value), "deg"
-        if abs(value) < 1.0:
-            value, unit = 3600.0 * value, "arcsec"
+        unit, factor = angle_unit(abs(value))
+        value *= factor
     return f"{value:.{digits}g} {unit}".rstrip(" -")
 
 

@@ -5,14 +5,13 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
+from ptsmc_jax.formulas import ARCSEC, pointing_angle
 from ptsmc_jax.simulation.catalogues import MARGINS
 from tuning.output import page_charts
-from tuning.output.formats import digits, failed, listed, many, over_bound, pointing, ratio
+from tuning.output.formats import digits, failed, listed, many, over_bound, ratio
 from tuning.output.report import Chart, Report, Section, Table, Text
 from tuning.output.run_report import warnings
 from tuning.output.summaries import Compare, Entry, Interval, Law, Number
-
-ARCSEC = math.degrees(1.0) * 3600.0
 
 
 @dataclass(frozen=True)
@@ -42,11 +41,14 @@ class Question:
 
 def _angle(error: Number) -> Number:
     """Return a window error |v| as an angle [arcsec]."""
-    return None if error is None else ARCSEC * pointing(error)
+    return None if error is None else float(ARCSEC * pointing_angle(error))
 
 
 def _angles(bounds: Interval) -> Interval:
-    return None if bounds is None else (ARCSEC * pointing(bounds[0]), ARCSEC * pointing(bounds[1]))
+    if bounds is None:
+        return None
+    low, high = (ARCSEC * pointing_angle(bounds)).tolist()
+    return low, high
 
 
 def _error_column(name: str, change: str) -> Value:

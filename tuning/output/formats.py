@@ -5,6 +5,7 @@ import re
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from ptsmc_jax.formulas import pointing_angle
 from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.catalogues import CATALOGUES
 
@@ -47,11 +48,6 @@ def arcsec(degrees: float) -> str:
     return f"{seconds:.0f}" if abs(seconds) >= 999.5 else f"{seconds:.3g}"
 
 
-def pointing(error: float) -> float:
-    """Return the angle [rad] of an error vector |v| of the quaternion."""
-    return 2.0 * math.asin(min(error, 1.0))
-
-
 def error(value: float | None, plant: str) -> str:
     """Return a window error as a pointing angle, or in the unit of the state of a plant that is no spacecraft.
 
@@ -60,7 +56,7 @@ def error(value: float | None, plant: str) -> str:
     """
     if value is None or math.isnan(value):
         return "-"
-    return angle(pointing(value)) if plant == "spacecraft" else valued(value, "window_error", plant)
+    return angle(float(pointing_angle(value))) if plant == "spacecraft" else valued(value, "window_error", plant)
 
 
 def error_name(plant: str) -> str:

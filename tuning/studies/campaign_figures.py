@@ -11,7 +11,7 @@ from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import campaign as running
 from ptsmc_jax.campaigns import rows
 from ptsmc_jax.figures import campaign_plots as plots
-from ptsmc_jax.figures.style import angle_of
+from ptsmc_jax.formulas import pointing_angle
 from ptsmc_jax.simulation.catalogues import percent
 from ptsmc_jax.simulation.requirements import INTERPRETATIONS, Requirement, Verdict
 from tuning.studies.campaign_folder import Folder
@@ -36,7 +36,7 @@ def build(folder: Folder, summary: dict[str, Any]) -> dict[str, Figure]:
     def column(name: str, values: np.ndarray) -> plots.Column:
         unit, limit = units.get(name, ""), limits.get(name)
         if spacecraft and name in ERRORS:  # as an angle
-            unit, values, limit = "rad", angle_of(values), None if limit is None else float(angle_of(limit))
+            unit, values, limit = "rad", pointing_angle(values), None if limit is None else float(pointing_angle(limit))
         return plots.Column(unit, values, limit, of_time.get(name, "")).in_readable_unit()
 
     figures: dict[str, Figure] = {}
