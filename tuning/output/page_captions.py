@@ -25,7 +25,7 @@ CAPTIONS = {
     "inputs": "Metrics (up) over the sampled inputs (across), a point for each trial; limits are dashed.",
     "wheels": "Momentum of each reaction wheel over time.",
     "wheel_torque": "Torque of each reaction wheel over time.",
-    "disturbance": "The disturbance as the observer estimates it; the true one is dashed in black.",
+    "disturbance": "The disturbance as the observer estimates it; the true one is black.",
     "torque_by_angle": "Peak torque over the initial angle from the reference.",
     "settling": "Settling time over the initial angle from the reference.",
     "error": "Attitude error, or the first state, over time.",

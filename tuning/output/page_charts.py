@@ -18,7 +18,7 @@ DASHES = ("solid", "dash", "dashdot", "dot", "longdashdot")
 SYMBOLS = ("circle", "diamond", "triangle-up", "square")
 POINTS = 3000  # largest number of points of a history in a chart
 FRAMES = 60  # number of frames of the animated body
-_DECADES = {"type": "log", "dtick": "D2", "tickformat": ".0e"}
+_DECADES = {"type": "log", "dtick": "D2", "tickformat": "~g", "automargin": True}
 # title and unit of each panel of a spacecraft's history; states of other plants have no units
 PANELS = {
     "q": ("attitude quaternion", "-"), "w": ("body rate", "rad/s"), "x": ("state", ""),
@@ -157,7 +157,7 @@ def front(found: Front, limit: float | None) -> Chart:
                 "hovertemplate": "%{text}<br>error %{y:.3g} " + unit + ", peak %{x:.4g}<extra>" + name + "</extra>",
                 "error_y": bars, **style, "marker": {**style["marker"], "color": COLOURS[k % len(COLOURS)]},
             })  # fmt: skip
-    along = {"title": {"text": f"peak torque [{unit_of('peak_torque', found.plant)}]"}, "type": "log"}
+    along = {"title": {"text": f"peak torque [{unit_of('peak_torque', found.plant)}]"}, **_DECADES}
     up = {"title": {"text": f"RMS {error} in the window [{unit}]"}, **_DECADES}
     shapes = [] if limit is None else [_upright(limit, dash="dash")]
     notes = []
