@@ -20,7 +20,7 @@ test: $(VENV)/.installed-dev
 
 types: $(VENV)/.types
 
-# looked at anew where something has changed since; folders: what is taken away, too
+# Pyright runs again if a source file has changed. The folders are listed because deleting a file changes them, too.
 $(VENV)/.types: $(VENV)/.installed-dev $(shell find $(TYPED) -mindepth 1 -name '*.py' -o -type d ! -name __pycache__)
 	$(BIN)/pyright
 	@touch $@
@@ -28,7 +28,7 @@ $(VENV)/.types: $(VENV)/.installed-dev $(shell find $(TYPED) -mindepth 1 -name '
 suite:
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
-# what `test` leaves out: more cases of each kind, and what takes minutes
+# the tests that `make test` leaves out: more cases of each kind, and tests that take minutes
 test-long: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m long
 
@@ -38,13 +38,13 @@ table: $(VENV)/.installed
 notebooks: $(VENV)/.installed-notebooks
 	$(BIN)/jupyter lab notebooks
 
-# the references made anew from the code, then all pages
+# generates the reference pages from the code, then builds all pages
 docs: $(VENV)/.installed-dev
 	$(BIN)/python docs/generate.py
 	$(BIN)/python -m sphinx -W --keep-going -q -b html docs out/docs
 	@echo "Documentation: out/docs/index.html"
 
-# the notebooks executed, and kept with their outputs beside their sources
+# executes the notebooks and writes them with their outputs next to their sources
 notebooks-kept: $(VENV)/.installed-dev
 	$(BIN)/python notebooks/execute.py
 
