@@ -5,7 +5,6 @@ import re
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from ptsmc_jax.formulas import pointing_angle
 from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.catalogues import CATALOGUES
 
@@ -56,7 +55,9 @@ def error(value: float | None, plant: str) -> str:
     """
     if value is None or math.isnan(value):
         return "-"
-    return angle(float(pointing_angle(value))) if plant == "spacecraft" else valued(value, "window_error", plant)
+    if plant != "spacecraft":
+        return valued(value, "window_error", plant)
+    return angle(2.0 * math.asin(min(value, 1.0)))  # as `pointing_angle`, which would import NumPy for `ptsmc --help`
 
 
 def error_name(plant: str) -> str:
